@@ -1,0 +1,66 @@
+//! The Gaussians of a scene, decoded: what every splat file is read into.
+
+use glam::DVec3;
+
+/// Zeroth spherical-harmonic basis function, 1 / (2 sqrt(pi)).
+pub const SH_C0: f32 = 0.282_094_79;
+
+/// 3D Gaussians, one column a field; every column has [`Gaussians::len`] rows.
+///
+/// Values are decoded: opacities are linear (not logits), scales are standard deviations (not
+/// logs), rotations are unit quaternions.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Gaussians {
+    /// Means, world frame.
+    pub means_in_world: Vec<DVec3>,
+    /// Rotations (world from the Gaussian's own axes), `wxyz`, unit length.
+    pub rotations_wxyz: Vec<[f32; 4]>,
+    /// Standard deviations along the Gaussian's own axes, world units.
+    pub scales: Vec<[f32; 3]>,
+    /// Opacities, 0..=1.
+    pub opacities: Vec<f32>,
+    /// Spherical-harmonic coefficients of degree 0; colour is `0.5 + SH_C0 * sh_dc`.
+    pub sh_dc: Vec<[f32; 3]>,
+    /// Higher coefficients `[N][(degree + 1)^2 - 1][3]`, RGB innermost; empty at degree 0.
+    pub sh_rest: Vec<f32>,
+    /// Degree of the spherical harmonics, 0..=3.
+    pub sh_degree: u8,
+}
+
+impl Gaussians {
+    /// Returns the number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.means_in_world.len()
+    }
+
+    /// Returns whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.means_in_world.is_empty()
+    }
+
+    /// Returns the number of higher coefficients a Gaussian has per colour channel.
+    pub fn sh_rest_per_channel(degree: u8) -> usize {
+        (usize::from(degree) + 1).pow(2) - 1
+    }
+
+    /// Returns the colour of degree 0, linear in the coefficients, not clamped.
+    pub fn rgb_dc(&self, index: usize) -> [f32; 3] {
+        self.sh_dc[index].map(|c| 0.5 + SH_C0 * c)
+    }
+
+    /// Returns whether a Gaussian can be drawn: every field finite and the rotation not degenerate.
+    /// Readers keep unusable rows (indices stay those of the file); stages skip and count them.
+    pub fn is_usable(&self, index: usize) -> bool {
+        let norm2: f32 = self.rotations_wxyz[index].iter().map(|q| q * q).sum();
+        self.means_in_world[index].is_finite()
+            && (norm2 - 1.0).abs() < 1e-3
+            && self.scales[index].iter().all(|s| s.is_finite() && *s >= 0.0)
+            && (0.0..=1.0).contains(&self.opacities[index])
+            && self.sh_dc[index].iter().all(|c| c.is_finite())
+    }
+
+    /// Returns the bytes that `count` Gaussians of `sh_degree` take once decoded.
+    pub fn decoded_bytes(count: usize, sh_degree: u8) -> usize {
+        count * (24 + 16 + 12 + 4 + 12 + 12 * Self::sh_rest_per_channel(sh_degree))
+    }
+}

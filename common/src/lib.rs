@@ -1,0 +1,13 @@
+//! Vocabulary, geometry, file formats and embedding arithmetic shared by the
+//! SLAG encoder (cloud) and edge (robot).
+//!
+//! Frames, units and transform names are defined once, in [`frames`].
+//! Nothing here performs network access, runs models or starts threads.
+#![forbid(unsafe_code)]
+
+pub mod camera;
+pub mod frames;
+pub mod gaussians;
+
+pub use camera::{Distortion, Intrinsics, View};
+pub use gaussians::Gaussians;

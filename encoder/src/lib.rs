@@ -1,0 +1,3 @@
+//! The cloud side of SLAG as a library: one module per stage of the pipeline.
+
+pub mod segment;
