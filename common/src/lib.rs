@@ -6,8 +6,13 @@
 #![forbid(unsafe_code)]
 
 pub mod camera;
+pub mod container;
 pub mod frames;
 pub mod gaussians;
+pub mod hash;
+pub mod manifest;
+pub mod shard;
 
 pub use camera::{Distortion, Intrinsics, View};
 pub use gaussians::Gaussians;
+pub use hash::Hash32;

@@ -1,0 +1,357 @@
+//! The sectioned file that shards, fields and view sums are: little-endian, 64-byte aligned,
+//! checksummed, usable through mmap without parsing. The byte table is in `docs/FORMAT.md`.
+
+use std::io::{self, Write};
+use std::ops::Range;
+
+use bytemuck::{AnyBitPattern, NoUninit};
+
+/// Sections start at multiples of this, so that a mapped file can be cast to any column type.
+pub const ALIGNMENT_BYTES: usize = 64;
+/// Bytes before the section table.
+pub const PREAMBLE_BYTES: usize = 32;
+/// Bytes of one row of the section table.
+pub const SECTION_ROW_BYTES: usize = 32;
+/// More sections than any format has; a larger count is damage.
+pub const MAX_SECTIONS: u32 = 64;
+
+#[cfg(target_endian = "big")]
+compile_error!("the on-disk columns are used in place and are little-endian");
+
+/// What is wrong with a container, and where.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum ContainerError {
+    /// The file is shorter than its header or its own stated length.
+    #[error(
+        "the file has {found_bytes} bytes, expected {expected_bytes}: it is cut; delete it, it is made or fetched again"
+    )]
+    Length {
+        /// Bytes expected.
+        expected_bytes: u64,
+        /// Bytes there.
+        found_bytes: u64,
+    },
+    /// Another kind of file.
+    #[error("byte 0: magic {found:02x?}, expected {expected:02x?}: this is another kind of file")]
+    Magic {
+        /// Magic expected.
+        expected: [u8; 8],
+        /// Magic found.
+        found: [u8; 8],
+    },
+    /// A version this program does not read.
+    #[error(
+        "byte 8: format version {found}, this program reads {expected}; use a matching program, or encode again"
+    )]
+    Version {
+        /// Version expected.
+        expected: u32,
+        /// Version found.
+        found: u32,
+    },
+    /// A header or table value that cannot be.
+    #[error("byte {offset_bytes}: {what}; the file is damaged, delete it, it is made or fetched again")]
+    Damaged {
+        /// Where.
+        offset_bytes: u64,
+        /// What was found and what was expected.
+        what: String,
+    },
+    /// A section's bytes do not have the checksum in the table.
+    #[error(
+        "section {id} at byte {offset_bytes}: checksum {found:#018x}, the table says {expected:#018x}; delete the file, it is made or fetched again"
+    )]
+    Checksum {
+        /// The section's id.
+        id: u32,
+        /// Its offset.
+        offset_bytes: u64,
+        /// Checksum in the table.
+        expected: u64,
+        /// Checksum of the bytes.
+        found: u64,
+    },
+    /// A section that the format needs is not there.
+    #[error("section {id} ({name}) is missing; the file is damaged or of a newer program")]
+    Missing {
+        /// The section's id.
+        id: u32,
+        /// The section's name.
+        name: &'static str,
+    },
+}
+
+/// Returns the first eight bytes of the BLAKE3 hash, little-endian.
+fn checksum(bytes: &[u8]) -> u64 {
+    let hash = blake3::hash(bytes);
+    u64::from_le_bytes(hash.as_bytes()[..8].try_into().expect("a hash has 32 bytes"))
+}
+
+fn align_up(n: usize) -> usize {
+    n.next_multiple_of(ALIGNMENT_BYTES)
+}
+
+/// Writes a container: preamble, table, then each section padded with zeros to 64 bytes.
+///
+/// # Errors
+/// Whatever the writer gives.
+pub fn write(mut out: impl Write, magic: [u8; 8], version: u32, sections: &[(u32, &[u8])]) -> io::Result<()> {
+    let mut offset = align_up(PREAMBLE_BYTES + SECTION_ROW_BYTES * sections.len());
+    let mut table = Vec::with_capacity(SECTION_ROW_BYTES * sections.len());
+    for (id, bytes) in sections {
+        table.extend(id.to_le_bytes());
+        table.extend(0u32.to_le_bytes());
+        table.extend((offset as u64).to_le_bytes());
+        table.extend((bytes.len() as u64).to_le_bytes());
+        table.extend(checksum(bytes).to_le_bytes());
+        offset = align_up(offset + bytes.len());
+    }
+    let mut head = Vec::with_capacity(PREAMBLE_BYTES + table.len());
+    head.extend(magic);
+    head.extend(version.to_le_bytes());
+    head.extend((sections.len() as u32).to_le_bytes());
+    head.extend((offset as u64).to_le_bytes());
+    let head_checksum = checksum(&[head.as_slice(), &table].concat());
+    head.extend(head_checksum.to_le_bytes());
+    head.extend(table);
+    let zeros = [0; ALIGNMENT_BYTES];
+    out.write_all(&head)?;
+    out.write_all(&zeros[..align_up(head.len()) - head.len()])?;
+    for (_, bytes) in sections {
+        out.write_all(bytes)?;
+        out.write_all(&zeros[..align_up(bytes.len()) - bytes.len()])?;
+    }
+    Ok(())
+}
+
+/// Where the sections of a checked container lie.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Layout {
+    sections: Vec<(u32, Range<usize>)>,
+}
+
+impl Layout {
+    /// Checks a whole container (bounds, table, every checksum) and returns where its sections lie.
+    ///
+    /// # Errors
+    /// [`ContainerError`], naming the byte, for anything that is not exactly what [`write`] makes.
+    pub fn check(bytes: &[u8], magic: [u8; 8], version: u32) -> Result<Self, ContainerError> {
+        let layout = Self::check_table(bytes, magic, version)?;
+        for (row, (id, range)) in layout.sections.iter().enumerate() {
+            let at = PREAMBLE_BYTES + row * SECTION_ROW_BYTES + 24;
+            let expected = read_u64(bytes, at);
+            let found = checksum(&bytes[range.clone()]);
+            if expected != found {
+                let offset_bytes = range.start as u64;
+                return Err(ContainerError::Checksum { id: *id, offset_bytes, expected, found });
+            }
+        }
+        Ok(layout)
+    }
+
+    /// Checks preamble and table alone; the sections' bytes are not read.
+    ///
+    /// # Errors
+    /// As [`Layout::check`], less the checksums of the sections.
+    pub fn check_table(bytes: &[u8], magic: [u8; 8], version: u32) -> Result<Self, ContainerError> {
+        let length = |expected: usize| ContainerError::Length {
+            expected_bytes: expected as u64,
+            found_bytes: bytes.len() as u64,
+        };
+        let damaged =
+            |offset: usize, what: String| ContainerError::Damaged { offset_bytes: offset as u64, what };
+        if bytes.len() < PREAMBLE_BYTES {
+            return Err(length(PREAMBLE_BYTES));
+        }
+        if bytes[..8] != magic {
+            let found = bytes[..8].try_into().expect("eight bytes");
+            return Err(ContainerError::Magic { expected: magic, found });
+        }
+        let found = read_u32(bytes, 8);
+        if found != version {
+            return Err(ContainerError::Version { expected: version, found });
+        }
+        let n_sections = read_u32(bytes, 12);
+        if n_sections > MAX_SECTIONS {
+            return Err(damaged(12, format!("{n_sections} sections, at most {MAX_SECTIONS} are possible")));
+        }
+        let head_bytes = PREAMBLE_BYTES + n_sections as usize * SECTION_ROW_BYTES;
+        let file_bytes = read_u64(bytes, 16);
+        if file_bytes != bytes.len() as u64 || bytes.len() < head_bytes {
+            return Err(ContainerError::Length {
+                expected_bytes: file_bytes,
+                found_bytes: bytes.len() as u64,
+            });
+        }
+        let expected = read_u64(bytes, 24);
+        let found = checksum(&[&bytes[..24], &bytes[PREAMBLE_BYTES..head_bytes]].concat());
+        if expected != found {
+            return Err(damaged(24, format!("header checksum {expected:#018x}, computed {found:#018x}")));
+        }
+        let mut end = align_up(head_bytes);
+        let mut sections = Vec::with_capacity(n_sections as usize);
+        for row in 0..n_sections as usize {
+            let at = PREAMBLE_BYTES + row * SECTION_ROW_BYTES;
+            let (id, start, len) = (read_u32(bytes, at), read_u64(bytes, at + 8), read_u64(bytes, at + 16));
+            // Sections lie in table order without gaps, so none can overlap another or the table.
+            let stop = start.checked_add(len).filter(|stop| *stop <= file_bytes);
+            let (true, Some(stop)) = (start == end as u64, stop) else {
+                return Err(damaged(
+                    at,
+                    format!(
+                        "section {id} lies at {start}+{len}, expected it at {end} within {file_bytes} bytes"
+                    ),
+                ));
+            };
+            if sections.iter().any(|(other, _)| *other == id) {
+                return Err(damaged(at, format!("section {id} occurs twice")));
+            }
+            sections.push((id, start as usize..stop as usize));
+            end = align_up(stop as usize);
+        }
+        if end as u64 != file_bytes {
+            return Err(damaged(16, format!("{file_bytes} bytes, the sections end at {end}")));
+        }
+        Ok(Self { sections })
+    }
+
+    /// Returns where a section lies, if it is there.
+    pub fn find(&self, id: u32) -> Option<Range<usize>> {
+        self.sections.iter().find(|(other, _)| *other == id).map(|(_, range)| range.clone())
+    }
+
+    /// Returns where a section of `expected_len` values of `T` lies.
+    ///
+    /// # Errors
+    /// [`ContainerError::Missing`], or [`ContainerError::Damaged`] if its length differs.
+    pub fn column<T>(
+        &self,
+        id: u32,
+        name: &'static str,
+        expected_len: usize,
+    ) -> Result<Range<usize>, ContainerError> {
+        let range = self.find(id).ok_or(ContainerError::Missing { id, name })?;
+        let expected_bytes = expected_len.checked_mul(size_of::<T>());
+        if expected_bytes != Some(range.len()) {
+            let what = format!(
+                "section {id} ({name}) has {} bytes, {expected_len} values need {expected_bytes:?}",
+                range.len()
+            );
+            return Err(ContainerError::Damaged { offset_bytes: range.start as u64, what });
+        }
+        Ok(range)
+    }
+
+    /// Returns a section as one value, copied out.
+    ///
+    /// # Errors
+    /// As [`Layout::column`].
+    pub fn value<T: AnyBitPattern>(
+        &self,
+        bytes: &[u8],
+        id: u32,
+        name: &'static str,
+    ) -> Result<T, ContainerError> {
+        Ok(bytemuck::pod_read_unaligned(&bytes[self.column::<T>(id, name, 1)?]))
+    }
+}
+
+fn read_u32(bytes: &[u8], at: usize) -> u32 {
+    u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four bytes"))
+}
+
+fn read_u64(bytes: &[u8], at: usize) -> u64 {
+    u64::from_le_bytes(bytes[at..at + 8].try_into().expect("eight bytes"))
+}
+
+/// Bytes at an address that every column type can be used at, for files that are read, not mapped.
+#[derive(Clone, Debug, Default)]
+pub struct AlignedBytes {
+    blocks: Vec<Block>,
+    len: usize,
+}
+
+#[derive(Clone, Copy, Debug, bytemuck::Zeroable, bytemuck::Pod)]
+#[repr(C, align(64))]
+struct Block([u8; ALIGNMENT_BYTES]);
+
+impl AlignedBytes {
+    /// Reads a file whole.
+    ///
+    /// # Errors
+    /// Whatever the file system gives, with the path.
+    pub fn read(path: &std::path::Path) -> io::Result<Self> {
+        use io::Read;
+        let mut file = fs_err::File::open(path)?;
+        let len = file.metadata()?.len() as usize;
+        let mut blocks = vec![Block([0; ALIGNMENT_BYTES]); len.div_ceil(ALIGNMENT_BYTES)];
+        file.read_exact(&mut bytemuck::cast_slice_mut::<Block, u8>(&mut blocks)[..len])?;
+        Ok(Self { blocks, len })
+    }
+
+    /// Copies bytes.
+    pub fn copy_of(bytes: &[u8]) -> Self {
+        let mut blocks = vec![Block([0; ALIGNMENT_BYTES]); bytes.len().div_ceil(ALIGNMENT_BYTES)];
+        bytemuck::cast_slice_mut::<Block, u8>(&mut blocks)[..bytes.len()].copy_from_slice(bytes);
+        Self { blocks, len: bytes.len() }
+    }
+}
+
+impl std::ops::Deref for AlignedBytes {
+    type Target = [u8];
+
+    fn deref(&self) -> &[u8] {
+        &bytemuck::cast_slice(&self.blocks)[..self.len]
+    }
+}
+
+/// Returns the bytes of a column, to hand to [`write`].
+pub fn bytes_of<T: NoUninit>(column: &[T]) -> &[u8] {
+    bytemuck::cast_slice(column)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MAGIC: [u8; 8] = *b"SLAGTEST";
+
+    fn sample() -> Vec<u8> {
+        let mut out = Vec::new();
+        let long: Vec<u32> = (0..100).collect();
+        write(&mut out, MAGIC, 3, &[(1, b"abc"), (7, bytes_of(&long)), (9, b"")]).expect("writes to memory");
+        out
+    }
+
+    #[test]
+    fn sections_come_back_aligned() {
+        let bytes = AlignedBytes::copy_of(&sample());
+        let layout = Layout::check(&bytes, MAGIC, 3).expect("valid");
+        assert_eq!(&bytes[layout.find(1).expect("there")], b"abc");
+        let column: &[u32] =
+            bytemuck::cast_slice(&bytes[layout.column::<u32>(7, "long", 100).expect("there")]);
+        assert_eq!(column[99], 99);
+        assert!(layout.column::<u32>(7, "long", 101).is_err());
+        assert_eq!(layout.find(9).expect("there").len(), 0);
+    }
+
+    /// Every cut and every single flipped bit is refused: nothing in the file but the zero padding
+    /// lies outside a checksum.
+    #[test]
+    fn every_cut_and_flip_is_refused() {
+        let bytes = sample();
+        for len in 0..bytes.len() {
+            assert!(Layout::check(&bytes[..len], MAGIC, 3).is_err(), "cut to {len}");
+        }
+        let layout = Layout::check(&bytes, MAGIC, 3).expect("valid");
+        let head = PREAMBLE_BYTES + 3 * SECTION_ROW_BYTES;
+        for at in 0..bytes.len() {
+            let covered = at < head || layout.sections.iter().any(|(_, range)| range.contains(&at));
+            for bit in 0..8 {
+                let mut flipped = bytes.clone();
+                flipped[at] ^= 1 << bit;
+                assert_eq!(Layout::check(&flipped, MAGIC, 3).is_err(), covered, "byte {at} bit {bit}");
+            }
+        }
+    }
+}

@@ -1,0 +1,80 @@
+//! Content hashes: what immutable files are named by.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+/// A 32-byte hash (BLAKE3 of content, or a digest of a description), shown as 64 hex digits.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct Hash32(pub [u8; 32]);
+
+impl Hash32 {
+    /// Returns the BLAKE3 hash of some bytes.
+    pub fn of(bytes: &[u8]) -> Self {
+        Self(*blake3::hash(bytes).as_bytes())
+    }
+
+    /// Returns the BLAKE3 hash of a stream and its length, reading in bounded pieces.
+    ///
+    /// # Errors
+    /// Whatever the reader gives.
+    pub fn of_reader(mut reader: impl std::io::Read) -> std::io::Result<(Self, u64)> {
+        let mut hasher = blake3::Hasher::new();
+        let mut buffer = vec![0; 1 << 16];
+        loop {
+            match reader.read(&mut buffer)? {
+                0 => return Ok((Self(*hasher.finalize().as_bytes()), hasher.count())),
+                n => hasher.update(&buffer[..n]),
+            };
+        }
+    }
+}
+
+impl fmt::Display for Hash32 {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&hex::encode(self.0))
+    }
+}
+
+impl fmt::Debug for Hash32 {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Hash32({self})")
+    }
+}
+
+/// A text that is not 64 hex digits.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{found:?} is not a hash: expected 64 hex digits")]
+pub struct NotAHash {
+    /// The text (cut to 80 characters).
+    pub found: String,
+}
+
+impl FromStr for Hash32 {
+    type Err = NotAHash;
+
+    fn from_str(text: &str) -> Result<Self, NotAHash> {
+        let mut bytes = [0; 32];
+        // Upper-case digits are refused: one content, one name.
+        if text.bytes().any(|b| b.is_ascii_uppercase()) || hex::decode_to_slice(text, &mut bytes).is_err() {
+            return Err(NotAHash { found: text.chars().take(80).collect() });
+        }
+        Ok(Self(bytes))
+    }
+}
+
+impl TryFrom<String> for Hash32 {
+    type Error = NotAHash;
+
+    fn try_from(text: String) -> Result<Self, NotAHash> {
+        text.parse()
+    }
+}
+
+impl From<Hash32> for String {
+    fn from(hash: Hash32) -> Self {
+        hash.to_string()
+    }
+}
