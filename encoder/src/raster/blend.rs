@@ -1,0 +1,369 @@
+//! Blends the Gaussians of a tile front to back, and sums their weights over regions.
+
+use rayon::prelude::*;
+
+use super::RegionWeight;
+use super::bin::Tiles;
+use super::constants::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, SUM_FRACTION_BITS, TILE_SIZE_PX};
+use super::project::ScreenGaussian;
+use super::{WeightKind, WeightKind::Blend, WeightKind::Falloff};
+use crate::segment::{NO_REGION, RegionMap};
+
+/// Pixels of a row that are worked on at once; the compiler turns the loops over them into SIMD.
+pub const LANES: usize = 8;
+/// Gaussians between two looks at which rows of a tile are finished.
+const LIVENESS_INTERVAL: usize = 16;
+
+/// One value for each pixel of a tile.
+pub type PerPixel<T> = [[T; TILE_SIZE_PX]; TILE_SIZE_PX];
+
+/// Where a tile lies; its pixels inside the image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TileRect {
+    /// Left edge, pixels.
+    pub x_px: usize,
+    /// Top edge, pixels.
+    pub y_px: usize,
+    /// Columns inside the image.
+    pub width_px: usize,
+    /// Rows inside the image.
+    pub height_px: usize,
+}
+
+impl TileRect {
+    /// Returns the tile in a column and row of the grid over an image.
+    pub fn new(column: usize, row: usize, image_width_px: usize, image_height_px: usize) -> Self {
+        let (x_px, y_px) = (column * TILE_SIZE_PX, row * TILE_SIZE_PX);
+        Self {
+            x_px,
+            y_px,
+            width_px: TILE_SIZE_PX.min(image_width_px - x_px),
+            height_px: TILE_SIZE_PX.min(image_height_px - y_px),
+        }
+    }
+}
+
+/// Takes the weights of a tile's Gaussians, near to far; `member` indexes the visible ones.
+pub trait WeightSink {
+    /// Takes the weights at pixels `x..x + LANES` of row `y`; 0 where it has none.
+    fn lanes(&mut self, member: u32, x: usize, y: usize, weights: &[f32; LANES]);
+    /// Ends a Gaussian.
+    fn end(&mut self, member: u32);
+}
+
+/// Walks the Gaussians of a tile and returns the transmittance left at each pixel.
+///
+/// With [`Falloff`] nothing hides anything and the transmittance stays 1.
+pub fn walk_tile(
+    visible: &[ScreenGaussian],
+    members: &[u32],
+    rect: TileRect,
+    kind: WeightKind,
+    sink: &mut impl WeightSink,
+) -> PerPixel<f32> {
+    match kind {
+        Blend => walk::<true>(visible, members, rect, sink),
+        Falloff => walk::<false>(visible, members, rect, sink),
+    }
+}
+
+fn walk<const BLEND: bool>(
+    visible: &[ScreenGaussian],
+    members: &[u32],
+    rect: TileRect,
+    sink: &mut impl WeightSink,
+) -> PerPixel<f32> {
+    // Negative means finished: the sign bit costs no second array, and fails every comparison below.
+    let mut transmittance = [[-1.0_f32; TILE_SIZE_PX]; TILE_SIZE_PX];
+    for row in &mut transmittance[..rect.height_px] {
+        row[..rect.width_px].fill(1.0);
+    }
+    let mut live = [false; TILE_SIZE_PX];
+    for (turn, &member) in members.iter().enumerate() {
+        if turn % LIVENESS_INTERVAL == 0 {
+            for (live, row) in live.iter_mut().zip(&transmittance) {
+                *live = row.iter().fold(-1.0_f32, |a, &b| a.max(b)) > 0.0;
+            }
+            if !live.contains(&true) {
+                break;
+            }
+        }
+        let gaussian = &visible[member as usize];
+        let local = InTile::new(gaussian, rect);
+        for y in local.first_row..local.end_row {
+            if !live[y] {
+                continue;
+            }
+            let Some((first, last)) = local.columns(y, rect.width_px) else { continue };
+            let (start, end) =
+                if last - first < LANES { (first.min(TILE_SIZE_PX - LANES), 1) } else { (0, 2) };
+            for block in 0..end {
+                let x = start + block * LANES;
+                let Some(lanes) = transmittance[y][x..].first_chunk_mut::<LANES>() else { continue };
+                let weights = local.blend::<BLEND>(x, y, lanes);
+                sink.lanes(member, x, y, &weights);
+            }
+        }
+        sink.end(member);
+    }
+    transmittance.map(|row| row.map(f32::abs))
+}
+
+/// A Gaussian relative to a tile, in `f32`: coordinates are small there, so little is lost.
+struct InTile {
+    /// `u` at the centre of the tile's first pixel.
+    u0: f32,
+    /// Step of `u` a pixel right.
+    u_x: f32,
+    /// Step of `u` a pixel down.
+    u_y: f32,
+    /// `v` at the centre of the tile's first pixel.
+    v0: f32,
+    /// Step of `v` a pixel down.
+    v_y: f32,
+    /// 1 / `u_x`, pixels.
+    width: f32,
+    reach2: f32,
+    opacity: f32,
+    first_row: usize,
+    end_row: usize,
+}
+
+impl InTile {
+    fn new(gaussian: &ScreenGaussian, rect: TileRect) -> Self {
+        let dx = rect.x_px as f64 + 0.5 - gaussian.mean_px.x;
+        let dy = rect.y_px as f64 + 0.5 - gaussian.mean_px.y;
+        let rows = ScreenGaussian::pixels_within(
+            0.5 - dy - gaussian.extent_px.y,
+            0.5 - dy + gaussian.extent_px.y,
+            rect.height_px as u32,
+        );
+        let (first_row, end_row) = rows.map_or((0, 0), |(a, b)| (a as usize, b as usize + 1));
+        Self {
+            u0: (gaussian.inv_width * (dx - gaussian.slope * dy)) as f32,
+            u_x: gaussian.inv_width as f32,
+            u_y: (-gaussian.inv_width * gaussian.slope) as f32,
+            v0: (gaussian.inv_height * dy) as f32,
+            v_y: gaussian.inv_height as f32,
+            width: gaussian.inv_width.recip() as f32,
+            reach2: gaussian.reach2 as f32,
+            opacity: gaussian.opacity,
+            first_row,
+            end_row,
+        }
+    }
+
+    /// Returns the first and last column of a row that the footprint may touch.
+    fn columns(&self, y: usize, width_px: usize) -> Option<(usize, usize)> {
+        let v = self.v0 + self.v_y * y as f32;
+        let left = self.reach2 - v * v;
+        if left < 0.0 {
+            return None;
+        }
+        let middle = -(self.u0 + self.u_y * y as f32) * self.width;
+        let half = left.sqrt() * self.width;
+        let first = (middle - half).ceil().max(0.0);
+        let last = (middle + half).floor().min((width_px - 1) as f32);
+        (first <= last).then_some((first as usize, last as usize))
+    }
+
+    /// Returns the weights at pixels `x..x + LANES` of row `y` and takes their light.
+    #[inline(always)]
+    fn blend<const BLEND: bool>(&self, x: usize, y: usize, transmittance: &mut [f32; LANES]) -> [f32; LANES] {
+        let v = self.v0 + self.v_y * y as f32;
+        let (u_row, power_v) = (self.u0 + self.u_y * y as f32, 0.5 * v * v);
+        let falloff: [f32; LANES] = std::array::from_fn(|i| {
+            let u = u_row + self.u_x * (x + i) as f32;
+            exp_of_minus(0.5 * u * u + power_v)
+        });
+        let mut weights = [0.0; LANES];
+        for i in 0..LANES {
+            let alpha = (self.opacity * falloff[i]).min(MAX_ALPHA);
+            let counts = alpha >= MIN_ALPHA;
+            let light = transmittance[i];
+            if BLEND {
+                let next = light * (1.0 - alpha);
+                let blends = counts & (next > MIN_TRANSMITTANCE);
+                weights[i] = if blends { alpha * light } else { 0.0 };
+                let finished = if counts { -light.abs() } else { light };
+                transmittance[i] = if blends { next } else { finished };
+            } else {
+                weights[i] = if counts & (light > 0.0) { falloff[i] } else { 0.0 };
+            }
+        }
+        weights
+    }
+}
+
+/// Returns `exp(-power)` for `power >= 0`, within 3e-7 of the result; beyond 80 it stays at `exp(-80)`.
+///
+/// Plain arithmetic instead of the platform's `exp`: vectorises, and has the same bits everywhere.
+#[inline(always)]
+fn exp_of_minus(power: f32) -> f32 {
+    /// Adding it rounds to an integer, which then stands in the low bits: 1.5 * 2^23.
+    const ROUND: f32 = 12_582_912.0;
+    let exponent = power.min(80.0) * -std::f32::consts::LOG2_E;
+    let shifted = exponent + ROUND;
+    let f = exponent - (shifted - ROUND);
+    // Taylor series of 2^f for |f| <= 1/2; the next term is below 1e-7 * 2^f / 5.
+    const C: [f32; 6] =
+        [0.693_147_2, 0.240_226_51, 0.055_504_11, 0.009_618_129, 0.001_333_355_8, 0.000_154_035_3];
+    let series = 1.0 + f * (C[0] + f * (C[1] + f * (C[2] + f * (C[3] + f * (C[4] + f * C[5])))));
+    f32::from_bits(series.to_bits().wrapping_add(shifted.to_bits() << 23))
+}
+
+/// A Gaussian's sum over the pixels of a region in one tile, or in all of them.
+#[derive(Clone, Copy)]
+struct Sum {
+    /// Index into the visible Gaussians.
+    member: u32,
+    region: u32,
+    /// In units of `2^-SUM_FRACTION_BITS`, so that adding is exact in any order.
+    fixed: u64,
+}
+
+/// Returns the sums above zero over the regions of a view, ordered by (Gaussian, region).
+pub fn region_sums(
+    visible: &[ScreenGaussian],
+    tiles: &Tiles,
+    regions: &RegionMap,
+    kind: WeightKind,
+) -> Vec<RegionWeight> {
+    let (width_px, height_px) = (tiles.width_px as usize, tiles.height_px as usize);
+    let sums: Vec<Vec<Sum>> = tiles
+        .rows
+        .par_iter()
+        .enumerate()
+        .flat_map_iter(|(row, tile_row)| {
+            tile_row.tiles().enumerate().filter_map(move |(column, members)| {
+                let mut sink = RegionSink::new(regions, TileRect::new(column, row, width_px, height_px))?;
+                walk_tile(visible, members, sink.rect, kind, &mut sink);
+                Some(sink.sums)
+            })
+        })
+        .collect();
+    merge(visible, &sums)
+}
+
+/// Adds up the sums of all tiles.
+fn merge(visible: &[ScreenGaussian], sums: &[Vec<Sum>]) -> Vec<RegionWeight> {
+    // A counting pass brings each Gaussian's few sums together; only those need sorting.
+    let mut ends = vec![0_usize; visible.len()];
+    for sum in sums.iter().flatten() {
+        ends[sum.member as usize] += 1;
+    }
+    let mut n_sums = 0;
+    for end in &mut ends {
+        n_sums += *end;
+        *end = n_sums - *end;
+    }
+    let mut by_member = vec![(0_u32, 0_u64); n_sums];
+    for sum in sums.iter().flatten() {
+        let end = &mut ends[sum.member as usize];
+        by_member[*end] = (sum.region, sum.fixed);
+        *end += 1;
+    }
+    let mut entries = Vec::new();
+    let mut start = 0;
+    for (on_screen, &end) in visible.iter().zip(&ends) {
+        let of_gaussian = &mut by_member[start..end];
+        of_gaussian.sort_unstable_by_key(|&(region, _)| region);
+        for same in of_gaussian.chunk_by(|a, b| a.0 == b.0) {
+            let fixed: u64 = same.iter().map(|&(_, fixed)| fixed).sum();
+            if fixed > 0 {
+                let weight = (fixed as f64 * 2.0_f64.powi(-SUM_FRACTION_BITS)) as f32;
+                entries.push(RegionWeight { gaussian: on_screen.gaussian, region: same[0].0, weight });
+            }
+        }
+        start = end;
+    }
+    entries
+}
+
+/// Adds weights up per region of a tile.
+struct RegionSink {
+    rect: TileRect,
+    /// Index into `regions` of each pixel.
+    slot_of_pixel: PerPixel<u16>,
+    /// End of the run of equal slots that starts at a pixel, within its row.
+    run_end: PerPixel<u8>,
+    /// Regions of the tile; [`NO_REGION`] may be one of them.
+    regions: Vec<u32>,
+    /// Weight of the current Gaussian per region: sums of up to 256 `f32` weights, which `f64` holds
+    /// with hardly any rounding, so that sums over regions add up.
+    weights: Vec<f64>,
+    /// Slots whose weight is not 0.
+    touched: Vec<u16>,
+    sums: Vec<Sum>,
+}
+
+impl RegionSink {
+    /// Relabels the regions of a tile; `None` if no pixel has one.
+    fn new(map: &RegionMap, rect: TileRect) -> Option<Self> {
+        let mut regions: Vec<u32> = Vec::new();
+        let mut slot_of_pixel = [[0; TILE_SIZE_PX]; TILE_SIZE_PX];
+        let mut run_end = [[TILE_SIZE_PX as u8; TILE_SIZE_PX]; TILE_SIZE_PX];
+        let row_of = |y: usize| {
+            let start = (rect.y_px + y) * map.width_px as usize + rect.x_px;
+            &map.region_of_pixel[start..start + rect.width_px]
+        };
+        (0..rect.height_px).for_each(|y| regions.extend_from_slice(row_of(y)));
+        regions.sort_unstable();
+        regions.dedup();
+        if regions == [NO_REGION] {
+            return None;
+        }
+        for y in 0..rect.height_px {
+            let (slots, ends) = (&mut slot_of_pixel[y], &mut run_end[y]);
+            for (slot, region) in slots.iter_mut().zip(row_of(y)) {
+                *slot = regions.partition_point(|r| r < region) as u16;
+            }
+            // Beyond the image every weight is 0: those pixels belong to any run.
+            for x in (0..rect.width_px.saturating_sub(1)).rev() {
+                ends[x] = if slots[x] == slots[x + 1] { ends[x + 1] } else { x as u8 + 1 };
+            }
+        }
+        let weights = vec![0.0; regions.len()];
+        Some(Self { rect, slot_of_pixel, run_end, regions, weights, touched: Vec::new(), sums: Vec::new() })
+    }
+
+    #[inline(always)]
+    fn add(&mut self, slot: u16, weight: f64) {
+        let total = &mut self.weights[usize::from(slot)];
+        if *total == 0.0 {
+            self.touched.push(slot);
+        }
+        *total += weight;
+    }
+}
+
+impl WeightSink for RegionSink {
+    #[inline(always)]
+    fn lanes(&mut self, _: u32, x: usize, y: usize, weights: &[f32; LANES]) {
+        if usize::from(self.run_end[y][x]) >= x + LANES {
+            let w = weights.map(f64::from);
+            let total = ((w[0] + w[4]) + (w[2] + w[6])) + ((w[1] + w[5]) + (w[3] + w[7]));
+            if total > 0.0 {
+                self.add(self.slot_of_pixel[y][x], total);
+            }
+        } else {
+            for (i, &weight) in weights.iter().enumerate() {
+                if weight > 0.0 {
+                    self.add(self.slot_of_pixel[y][x + i], f64::from(weight));
+                }
+            }
+        }
+    }
+
+    fn end(&mut self, member: u32) {
+        let Self { weights, regions, touched, sums, .. } = self;
+        for slot in touched.drain(..) {
+            let weight = std::mem::take(&mut weights[usize::from(slot)]);
+            let region = regions[usize::from(slot)];
+            if region != NO_REGION {
+                let fixed = (weight * 2.0_f64.powi(SUM_FRACTION_BITS)).round() as u64;
+                sums.push(Sum { member, region, fixed });
+            }
+        }
+    }
+}

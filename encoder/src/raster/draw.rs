@@ -1,0 +1,113 @@
+//! Draws colour, depth and coverage.
+
+use rayon::prelude::*;
+
+use super::bin::Tiles;
+use super::blend::{LANES, PerPixel, TileRect, WeightSink, walk_tile};
+use super::constants::TILE_SIZE_PX;
+use super::project::ScreenGaussian;
+use super::{ViewCounters, WeightKind};
+
+/// The picture of a scene in one view; every column is row-major.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Drawing {
+    /// Width, pixels.
+    pub width_px: u32,
+    /// Height, pixels.
+    pub height_px: u32,
+    /// Colour `[height * width][3]` over the background, at least 0, not limited to 1.
+    pub rgb: Vec<f32>,
+    /// Expected camera z of what is seen, world units: weighted by contribution; 0 where nothing is.
+    pub depth: Vec<f32>,
+    /// Share of the background that is hidden, 0..=1.
+    pub coverage: Vec<f32>,
+    /// What happened on the way.
+    pub counters: ViewCounters,
+}
+
+/// Draws the Gaussians of every tile; `colours` has one RGB a visible Gaussian.
+pub fn draw(
+    visible: &[ScreenGaussian],
+    colours: &[[f32; 3]],
+    tiles: &Tiles,
+    background: [f32; 3],
+) -> Drawing {
+    let (width_px, height_px) = (tiles.width_px as usize, tiles.height_px as usize);
+    let n_px = width_px * height_px;
+    let mut rgb = vec![0.0; n_px * 3];
+    let mut depth = vec![0.0; n_px];
+    let mut coverage = vec![0.0; n_px];
+    let band_px = width_px * TILE_SIZE_PX;
+    (rgb.par_chunks_mut(band_px * 3), depth.par_chunks_mut(band_px), coverage.par_chunks_mut(band_px))
+        .into_par_iter()
+        .zip(&tiles.rows)
+        .enumerate()
+        .for_each(|(row, ((rgb, depth, coverage), tile_row))| {
+            for (column, members) in tile_row.tiles().enumerate() {
+                let rect = TileRect::new(column, row, width_px, height_px);
+                let mut sink = PixelSink::new(visible, colours);
+                let transmittance = walk_tile(visible, members, rect, WeightKind::Blend, &mut sink);
+                for y in 0..rect.height_px {
+                    for x in 0..rect.width_px {
+                        let pixel = y * width_px + rect.x_px + x;
+                        let light = transmittance[y][x];
+                        for c in 0..3 {
+                            rgb[pixel * 3 + c] = sink.rgb[c][y][x] + light * background[c];
+                        }
+                        coverage[pixel] = 1.0 - light;
+                        if sink.weight[y][x] > 0.0 {
+                            depth[pixel] = sink.depth[y][x] / sink.weight[y][x];
+                        }
+                    }
+                }
+            }
+        });
+    Drawing {
+        width_px: tiles.width_px,
+        height_px: tiles.height_px,
+        rgb,
+        depth,
+        coverage,
+        ..Drawing::default()
+    }
+}
+
+/// Adds colour and depth up per pixel of a tile.
+struct PixelSink<'a> {
+    visible: &'a [ScreenGaussian],
+    colours: &'a [[f32; 3]],
+    rgb: [PerPixel<f32>; 3],
+    depth: PerPixel<f32>,
+    weight: PerPixel<f32>,
+}
+
+impl<'a> PixelSink<'a> {
+    fn new(visible: &'a [ScreenGaussian], colours: &'a [[f32; 3]]) -> Self {
+        let zero = [[0.0; TILE_SIZE_PX]; TILE_SIZE_PX];
+        Self { visible, colours, rgb: [zero; 3], depth: zero, weight: zero }
+    }
+}
+
+impl WeightSink for PixelSink<'_> {
+    #[inline(always)]
+    fn lanes(&mut self, member: u32, x: usize, y: usize, weights: &[f32; LANES]) {
+        let member = member as usize;
+        add_scaled(&mut self.weight[y], x, weights, 1.0);
+        add_scaled(&mut self.depth[y], x, weights, self.visible[member].depth);
+        for (plane, &value) in self.rgb.iter_mut().zip(&self.colours[member]) {
+            add_scaled(&mut plane[y], x, weights, value);
+        }
+    }
+
+    fn end(&mut self, _: u32) {}
+}
+
+/// Adds `factor * weights` to the pixels of a row from `x` on.
+#[inline(always)]
+fn add_scaled(row: &mut [f32; TILE_SIZE_PX], x: usize, weights: &[f32; LANES], factor: f32) {
+    if let Some(lanes) = row[x..].first_chunk_mut::<LANES>() {
+        for (sum, weight) in lanes.iter_mut().zip(weights) {
+            *sum += weight * factor;
+        }
+    }
+}

@@ -1,0 +1,300 @@
+//! Stage 3: which Gaussian contributes how much to which region of a view.
+//!
+//! The rasteriser follows gsplat 1.5.3: EWA projection, blending front to back, the constants of
+//! [`constants`]. [`CpuRasterizer`] is the reference; every backend has the same stages:
+//!
+//! | stage | job |
+//! |---|---|
+//! | [`project`] | Gaussian to screen ellipse, in `f64` relative to the camera |
+//! | [`bin`] | depth order, and the Gaussians of each 16x16 tile in that order |
+//! | [`blend`] | alpha and transmittance per pixel, sums per (Gaussian, region) |
+//! | [`draw`] | colour, depth and coverage per pixel |
+//! | [`sh`] | colour of a Gaussian as seen from the camera |
+
+pub mod bin;
+pub mod blend;
+pub mod constants;
+pub mod draw;
+pub mod project;
+pub mod sh;
+
+use glam::{DAffine3, DMat3};
+use slag_common::{Distortion, Gaussians, Intrinsics};
+
+use crate::segment::{NO_REGION, RegionMap};
+
+pub use draw::Drawing;
+
+/// A posed pinhole camera at raster resolution.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RasterView {
+    /// The rigid transform from world to camera (OpenCV axes).
+    pub camera_from_world: DAffine3,
+    /// The camera, without distortion.
+    pub intrinsics: Intrinsics,
+}
+
+/// What is summed over the pixels of a region.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum WeightKind {
+    /// `alpha * T`: what the Gaussian contributes to the picture, behind what lies in front of it.
+    Blend,
+    /// `exp(-d' S^-1 d / 2)` alone, as the paper prints it: no opacity, nothing in front. The
+    /// footprint still ends where alpha falls below 1/255.
+    Falloff,
+}
+
+/// The weight of a Gaussian summed over the pixels of a region.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RegionWeight {
+    /// Index of the Gaussian in the scene.
+    pub gaussian: u32,
+    /// Region of the view.
+    pub region: u32,
+    /// The sum, pixels; above 0.
+    pub weight: f32,
+}
+
+/// What happened to the Gaussians of a scene in one view.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ViewCounters {
+    /// Gaussians whose footprint holds a pixel of the image (they may still be hidden).
+    pub visible: usize,
+    /// (Gaussian, tile) pairs.
+    pub pairs: usize,
+    /// Gaussians that cannot be drawn: not finite, not a rotation, or beyond `f32` once projected.
+    pub unusable: usize,
+}
+
+/// The sparse sums of one view.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ViewWeights {
+    /// Sums above zero, ordered by (Gaussian, region), each pair once.
+    pub entries: Vec<RegionWeight>,
+    /// What happened on the way.
+    pub counters: ViewCounters,
+}
+
+/// Why a view cannot be rasterised.
+#[derive(Debug, thiserror::Error, PartialEq)]
+pub enum RasterError {
+    /// The columns of the scene differ in length.
+    #[error("scene column {column} has {found} values, {expected} expected; read the scene again")]
+    ColumnLength {
+        /// Field of [`Gaussians`].
+        column: &'static str,
+        /// Values that the number of means asks for.
+        expected: usize,
+        /// Values that are there.
+        found: usize,
+    },
+    /// More Gaussians than indices.
+    #[error("scene has {found} Gaussians, {max} at most; split it into parts", max = u32::MAX)]
+    SceneSize {
+        /// Number of Gaussians.
+        found: usize,
+    },
+    /// Spherical harmonics of a degree that no formula is known for.
+    #[error("spherical harmonics of degree {found}, 3 at most; convert the scene")]
+    ShDegree {
+        /// The scene's degree.
+        found: u8,
+    },
+    /// An image without pixels, or with too many.
+    #[error(
+        "image of {width_px} x {height_px} pixels, 1 to {max} in all; choose another raster width",
+        max = constants::MAX_IMAGE_PX
+    )]
+    ImageSize {
+        /// Width, pixels.
+        width_px: u32,
+        /// Height, pixels.
+        height_px: u32,
+    },
+    /// A lens model.
+    #[error("the camera has lens distortion; undistort the image and take its pinhole camera")]
+    Distorted,
+    /// Focal lengths or the principal point are not usable numbers.
+    #[error(
+        "focal lengths {focal_px:?} px, principal point {centre_px:?} px: not a camera; correct the intrinsics"
+    )]
+    Camera {
+        /// Focal lengths x, y.
+        focal_px: [f64; 2],
+        /// Principal point x, y.
+        centre_px: [f64; 2],
+    },
+    /// The pose is not a rotation and a finite translation.
+    #[error("the pose is not rigid (off by {off:e}); correct the view's rotation")]
+    Pose {
+        /// Largest entry of `R'R - I`; infinite for a reflection, NaN for numbers that are not finite.
+        off: f64,
+    },
+    /// The region map is of another image size.
+    #[error(
+        "region map of {found_px:?} pixels ({found_values} values), the view has {expected_px:?}; \
+         rasterise at the resolution of the masks"
+    )]
+    RegionMapSize {
+        /// Width and height of the view.
+        expected_px: [u32; 2],
+        /// Width and height that the map states.
+        found_px: [u32; 2],
+        /// Values that the map has.
+        found_values: usize,
+    },
+    /// A pixel names a region that does not exist.
+    #[error("pixel {pixel} is of region {found}, the map has {n_regions}; make the region map again")]
+    Region {
+        /// Row-major index of the pixel.
+        pixel: usize,
+        /// The region it names.
+        found: u32,
+        /// Number of regions.
+        n_regions: u32,
+    },
+}
+
+/// A backend that rasterises scenes.
+pub trait Rasterizer: Sync {
+    /// Returns the sums of each Gaussian's weight over each region; pixels of [`NO_REGION`] take
+    /// light but record nothing. The same input gives the same bits for any number of threads.
+    ///
+    /// # Errors
+    /// [`RasterError`] for input that contradicts itself; single bad Gaussians are counted instead.
+    fn weights(
+        &self,
+        scene: &Gaussians,
+        view: &RasterView,
+        regions: &RegionMap,
+        kind: WeightKind,
+    ) -> Result<ViewWeights, RasterError>;
+
+    /// Returns the picture of a scene over a background colour (linear in what was trained).
+    ///
+    /// # Errors
+    /// [`RasterError`] for input that contradicts itself.
+    fn draw(
+        &self,
+        scene: &Gaussians,
+        view: &RasterView,
+        background: [f32; 3],
+    ) -> Result<Drawing, RasterError>;
+}
+
+/// The reference backend; runs on the current rayon pool.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct CpuRasterizer;
+
+impl Rasterizer for CpuRasterizer {
+    fn weights(
+        &self,
+        scene: &Gaussians,
+        view: &RasterView,
+        regions: &RegionMap,
+        kind: WeightKind,
+    ) -> Result<ViewWeights, RasterError> {
+        check_scene(scene)?;
+        check_view(view)?;
+        check_regions(regions, &view.intrinsics)?;
+        let projection = project::project(scene, view);
+        let tiles = bin::bin(&projection.visible, &view.intrinsics);
+        let entries = blend::region_sums(&projection.visible, &tiles, regions, kind);
+        Ok(ViewWeights { entries, counters: counters(&projection, &tiles) })
+    }
+
+    fn draw(
+        &self,
+        scene: &Gaussians,
+        view: &RasterView,
+        background: [f32; 3],
+    ) -> Result<Drawing, RasterError> {
+        check_scene(scene)?;
+        check_view(view)?;
+        let projection = project::project(scene, view);
+        let tiles = bin::bin(&projection.visible, &view.intrinsics);
+        let position_in_world = view.camera_from_world.inverse().translation;
+        let colours = sh::colours(scene, &projection.visible, position_in_world);
+        let mut drawing = draw::draw(&projection.visible, &colours, &tiles, background);
+        drawing.counters = counters(&projection, &tiles);
+        Ok(drawing)
+    }
+}
+
+fn counters(projection: &project::Projection, tiles: &bin::Tiles) -> ViewCounters {
+    ViewCounters {
+        visible: projection.visible.len(),
+        pairs: tiles.rows.iter().map(|row| row.members.len()).sum(),
+        unusable: projection.unusable,
+    }
+}
+
+/// Checks that the columns of a scene fit each other.
+fn check_scene(scene: &Gaussians) -> Result<(), RasterError> {
+    let n = scene.len();
+    if u32::try_from(n).is_err() {
+        return Err(RasterError::SceneSize { found: n });
+    }
+    if scene.sh_degree > 3 {
+        return Err(RasterError::ShDegree { found: scene.sh_degree });
+    }
+    let rest = n * Gaussians::sh_rest_per_channel(scene.sh_degree) * 3;
+    for (column, found, expected) in [
+        ("rotations_wxyz", scene.rotations_wxyz.len(), n),
+        ("scales", scene.scales.len(), n),
+        ("opacities", scene.opacities.len(), n),
+        ("sh_dc", scene.sh_dc.len(), n),
+        ("sh_rest", scene.sh_rest.len(), rest),
+    ] {
+        if found != expected {
+            return Err(RasterError::ColumnLength { column, expected, found });
+        }
+    }
+    Ok(())
+}
+
+/// Checks that a view is a rigidly posed pinhole camera with pixels.
+fn check_view(view: &RasterView) -> Result<(), RasterError> {
+    let Intrinsics { width_px, height_px, focal_x_px, focal_y_px, centre_x_px, centre_y_px, distortion } =
+        view.intrinsics;
+    if !(1..=constants::MAX_IMAGE_PX).contains(&(u64::from(width_px) * u64::from(height_px))) {
+        return Err(RasterError::ImageSize { width_px, height_px });
+    }
+    if distortion != Distortion::None {
+        return Err(RasterError::Distorted);
+    }
+    let is_focal = |f: f64| f.is_finite() && f > 0.0;
+    if !(is_focal(focal_x_px) && is_focal(focal_y_px) && centre_x_px.is_finite() && centre_y_px.is_finite()) {
+        return Err(RasterError::Camera {
+            focal_px: [focal_x_px, focal_y_px],
+            centre_px: [centre_x_px, centre_y_px],
+        });
+    }
+    // Poses are often stored as f32 or rounded text; 1e-3 still is a rotation, a mirror or a scale is not.
+    let rotation = view.camera_from_world.matrix3;
+    let excess = rotation.transpose() * rotation - DMat3::IDENTITY;
+    let off =
+        excess.to_cols_array().into_iter().fold(0.0, |m: f64, e| if e.abs() <= m { m } else { e.abs() });
+    if !view.camera_from_world.is_finite() {
+        return Err(RasterError::Pose { off: f64::NAN });
+    }
+    if off > 1e-3 || rotation.determinant() < 0.0 {
+        return Err(RasterError::Pose { off: if off > 1e-3 { off } else { f64::INFINITY } });
+    }
+    Ok(())
+}
+
+/// Checks that a region map covers the view and names regions that exist.
+fn check_regions(regions: &RegionMap, intrinsics: &Intrinsics) -> Result<(), RasterError> {
+    let expected_px = [intrinsics.width_px, intrinsics.height_px];
+    let found_px = [regions.width_px, regions.height_px];
+    let found_values = regions.region_of_pixel.len();
+    if found_px != expected_px || found_values as u64 != u64::from(found_px[0]) * u64::from(found_px[1]) {
+        return Err(RasterError::RegionMapSize { expected_px, found_px, found_values });
+    }
+    let n_regions = regions.n_regions;
+    match regions.region_of_pixel.iter().position(|&r| r >= n_regions && r != NO_REGION) {
+        Some(pixel) => Err(RasterError::Region { pixel, found: regions.region_of_pixel[pixel], n_regions }),
+        None => Ok(()),
+    }
+}

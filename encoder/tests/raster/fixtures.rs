@@ -1,0 +1,105 @@
+//! Reads the shared test data.
+
+use std::fs::File;
+use std::io::BufReader;
+use std::path::{Path, PathBuf};
+
+use glam::{DAffine3, DMat3, DVec3};
+use npyz::Deserialize;
+use npyz::npz::NpzArchive;
+use slag_common::{Distortion, Gaussians, Intrinsics};
+use slag_encoder::raster::RasterView;
+use slag_encoder::segment::RegionMap;
+
+/// Returns a path of the shared data, or `None` (said aloud) where it is absent; CI must have it.
+pub fn shared(path: &str) -> Option<PathBuf> {
+    let root = std::env::var_os("SLAG_SHARED")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared"), PathBuf::from);
+    let found = root.join(path);
+    if found.exists() {
+        return Some(found);
+    }
+    assert!(std::env::var("CI").as_deref() != Ok("true"), "{} is absent", found.display());
+    println!("skipped: ../shared is absent");
+    None
+}
+
+/// An open archive of arrays.
+pub struct Npz(NpzArchive<BufReader<File>>);
+
+impl Npz {
+    pub fn open(path: &str) -> Option<Self> {
+        Some(Self(NpzArchive::open(shared(path)?).unwrap()))
+    }
+
+    pub fn array<T: Deserialize>(&mut self, name: &str) -> Vec<T> {
+        self.0.by_name(name).unwrap().unwrap_or_else(|| panic!("no array {name}")).into_vec().unwrap()
+    }
+
+    /// Returns the scene, with the means of the named array.
+    pub fn scene(&mut self, means_in_world: Vec<DVec3>) -> Gaussians {
+        let n = means_in_world.len();
+        Gaussians {
+            means_in_world,
+            rotations_wxyz: rows::<4, f32>(&self.array("quats")).map(normalized).collect(),
+            scales: rows(&self.array("scales")).collect(),
+            opacities: self.array("opacities"),
+            sh_dc: vec![[0.0; 3]; n],
+            sh_rest: Vec::new(),
+            sh_degree: 0,
+        }
+    }
+
+    /// Returns a camera of the size that the archive states.
+    pub fn intrinsics(&mut self, matrix: &[f32]) -> Intrinsics {
+        Intrinsics {
+            width_px: self.array::<i64>("width")[0] as u32,
+            height_px: self.array::<i64>("height")[0] as u32,
+            focal_x_px: matrix[0].into(),
+            focal_y_px: matrix[4].into(),
+            centre_x_px: matrix[2].into(),
+            centre_y_px: matrix[5].into(),
+            distortion: Distortion::None,
+        }
+    }
+
+    pub fn regions(&mut self, camera: &Intrinsics) -> RegionMap {
+        let region_of_pixel: Vec<u32> = self.array::<u8>("labels").into_iter().map(u32::from).collect();
+        RegionMap {
+            width_px: camera.width_px,
+            height_px: camera.height_px,
+            n_regions: region_of_pixel.iter().max().unwrap() + 1,
+            region_of_pixel,
+        }
+    }
+}
+
+fn normalized(q: [f32; 4]) -> [f32; 4] {
+    let norm = q.iter().map(|c| f64::from(*c).powi(2)).sum::<f64>().sqrt();
+    q.map(|c| (f64::from(c) / norm) as f32)
+}
+
+pub fn rows<const N: usize, T: Copy>(values: &[T]) -> impl Iterator<Item = [T; N]> + '_ {
+    values.chunks_exact(N).map(|row| row.try_into().unwrap())
+}
+
+pub fn points(values: &[f32]) -> Vec<DVec3> {
+    rows::<3, f32>(values).map(|p| DVec3::from_array(p.map(f64::from))).collect()
+}
+
+/// Returns a pose from a row-major 4x4 matrix.
+pub fn view(matrix: &[f64], intrinsics: Intrinsics) -> RasterView {
+    let m = |r: usize, c: usize| matrix[r * 4 + c];
+    let column = |c: usize| DVec3::new(m(0, c), m(1, c), m(2, c));
+    RasterView {
+        camera_from_world: DAffine3 {
+            matrix3: DMat3::from_cols(column(0), column(1), column(2)),
+            translation: column(3),
+        },
+        intrinsics,
+    }
+}
+
+pub fn widened(values: &[f32]) -> Vec<f64> {
+    values.iter().map(|&v| v.into()).collect()
+}

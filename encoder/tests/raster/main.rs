@@ -1,0 +1,4 @@
+//! The rasteriser and the scene check against recorded data and a brute-force oracle.
+
+mod fixtures;
+mod gsplat;
