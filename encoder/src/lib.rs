@@ -2,3 +2,4 @@
 
 pub mod raster;
 pub mod segment;
+pub mod store;

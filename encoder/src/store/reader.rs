@@ -1,0 +1,193 @@
+//! The lock-free side of a store: needs the manifest, the public key and the objects alone.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use slag_common::Hash32;
+use slag_common::container::AlignedBytes;
+use slag_common::manifest::{self, Manifest, ManifestError, TrustedKeys};
+
+use super::StoreError;
+
+pub(super) const MANIFEST: &str = "manifest";
+pub(super) const MANIFEST_PREVIOUS: &str = "manifest.previous";
+pub(super) const SECRET_KEY: &str = "keys/ed25519";
+pub(super) const PUBLIC_KEY: &str = "keys/ed25519.pub";
+
+/// Objects by name that belong to a generation but are not for robots.
+pub type Extras = BTreeMap<String, Hash32>;
+
+/// A published generation.
+#[derive(Clone, Debug)]
+pub struct Published {
+    /// The manifest.
+    pub manifest: Manifest,
+    /// Its signed bytes, as robots get them.
+    pub signed: Vec<u8>,
+    /// BLAKE3 of the signed bytes.
+    pub hash: Hash32,
+    /// Objects beside the shards.
+    pub extras: Extras,
+}
+
+impl Published {
+    fn read(dir: &Path, name: &str, own: &TrustedKeys) -> Result<Self, StoreError> {
+        let path = dir.join(name);
+        let Some(signed) = read_signed(&path)? else { return Err(StoreError::NotPublished { path }) };
+        let (manifest, _) =
+            Manifest::verify(&signed, own).map_err(|source| StoreError::Manifest { path, source })?;
+        let hash = Hash32::of(&signed);
+        let path = extras_path(dir, hash);
+        let extras = fs_err::read(&path)?;
+        let extras =
+            serde_json::from_slice(&extras).map_err(|e| StoreError::Extras { path, what: e.to_string() })?;
+        Ok(Self { manifest, signed, hash, extras })
+    }
+
+    /// Returns the lengths of the shards, by hash.
+    pub fn shard_lens(&self) -> BTreeMap<Hash32, u64> {
+        let shards = self.manifest.cells.iter().flat_map(|cell| cell.shards.values());
+        shards.map(|shard| (shard.hash, shard.len_bytes)).collect()
+    }
+
+    /// Returns the hashes of shards and extras.
+    pub(super) fn all_objects(&self) -> BTreeSet<Hash32> {
+        self.shard_lens().into_keys().chain(self.extras.values().copied()).collect()
+    }
+}
+
+/// Tells one version of a file from the next without reading it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Stamp {
+    modified: Option<SystemTime>,
+    len_bytes: u64,
+    inode: u64,
+}
+
+impl Stamp {
+    fn of(path: &Path) -> io::Result<Self> {
+        let metadata = fs_err::metadata(path)?;
+        #[cfg(unix)]
+        let inode = std::os::unix::fs::MetadataExt::ino(&metadata);
+        #[cfg(not(unix))]
+        let inode = 0;
+        Ok(Self { modified: metadata.modified().ok(), len_bytes: metadata.len(), inode })
+    }
+}
+
+/// A snapshot of what a store publishes; stays readable while a writer publishes the next generation.
+#[derive(Clone, Debug)]
+pub struct StoreReader {
+    dir: PathBuf,
+    current: Published,
+    previous: Option<Published>,
+    stamp: Stamp,
+}
+
+impl StoreReader {
+    /// Reads the manifest and verifies that this store's key signed it.
+    ///
+    /// # Errors
+    /// [`StoreError::NotPublished`] before the first publication, [`StoreError`] otherwise.
+    pub fn open(dir: &Path) -> Result<Self, StoreError> {
+        let path = dir.join(MANIFEST);
+        // Before the content: a manifest that is replaced in between is then noticed, not missed.
+        let stamp = Stamp::of(&path).map_err(|e| match e.kind() {
+            io::ErrorKind::NotFound => StoreError::NotPublished { path },
+            _ => e.into(),
+        })?;
+        let own = TrustedKeys::Only(vec![read_hex_key(&dir.join(PUBLIC_KEY))?]);
+        let current = Published::read(dir, MANIFEST, &own)?;
+        let previous = match Published::read(dir, MANIFEST_PREVIOUS, &own) {
+            Ok(previous) => Some(previous),
+            Err(StoreError::NotPublished { .. }) => None,
+            Err(e) => {
+                // It only serves fetches that began before the last publication.
+                tracing::warn!("the previous manifest is left aside: {e}");
+                None
+            }
+        };
+        Ok(Self { dir: dir.to_owned(), current, previous, stamp })
+    }
+
+    /// Returns whether the store still has the manifest that this reader read (one `stat`).
+    pub fn is_current(&self) -> bool {
+        Stamp::of(&self.dir.join(MANIFEST)).is_ok_and(|stamp| stamp == self.stamp)
+    }
+
+    /// Returns the store's folder.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
+    /// Returns the current generation.
+    pub fn current(&self) -> &Published {
+        &self.current
+    }
+
+    /// Returns the generation before it, if there was one.
+    pub fn previous(&self) -> Option<&Published> {
+        self.previous.as_ref()
+    }
+
+    /// Returns the current manifest.
+    pub fn manifest(&self) -> &Manifest {
+        &self.current.manifest
+    }
+
+    /// Returns where an object lies, whether or not it is there.
+    pub fn object_path(&self, hash: Hash32) -> PathBuf {
+        object_path(&self.dir, hash)
+    }
+
+    /// Reads an object and verifies its hash.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`], [`StoreError::ObjectHash`].
+    pub fn read_object(&self, hash: Hash32) -> Result<AlignedBytes, StoreError> {
+        let path = self.object_path(hash);
+        let bytes = AlignedBytes::read(&path)?;
+        match Hash32::of(&bytes) {
+            found if found == hash => Ok(bytes),
+            found => Err(StoreError::ObjectHash { path, found }),
+        }
+    }
+}
+
+pub(super) fn object_path(dir: &Path, hash: Hash32) -> PathBuf {
+    let name = hash.to_string();
+    dir.join("objects").join(&name[..2]).join(name)
+}
+
+pub(super) fn extras_path(dir: &Path, manifest_hash: Hash32) -> PathBuf {
+    dir.join("extras").join(manifest_hash.to_string())
+}
+
+/// Reads a signed manifest's bytes, unverified; `None` if there is no such file.
+pub(super) fn read_signed(path: &Path) -> Result<Option<Vec<u8>>, StoreError> {
+    let file = match fs_err::File::open(path) {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
+        file => file?,
+    };
+    let mut bytes = Vec::new();
+    file.take(manifest::MAX_BYTES + 1).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > manifest::MAX_BYTES {
+        let source = ManifestError::TooLong { len_bytes: bytes.len() as u64 };
+        return Err(StoreError::Manifest { path: path.to_owned(), source });
+    }
+    Ok(Some(bytes))
+}
+
+/// Reads 32 bytes of hex and a line end.
+pub(super) fn read_hex_key(path: &Path) -> Result<Hash32, StoreError> {
+    let mut text = String::new();
+    let file = fs_err::File::open(path)?;
+    let wrong = || StoreError::Key { path: path.to_owned() };
+    match file.take(256).read_to_string(&mut text) {
+        Err(e) if e.kind() == io::ErrorKind::InvalidData => return Err(wrong()),
+        read => read?,
+    };
+    text.trim_end().parse().map_err(|_| wrong())
+}

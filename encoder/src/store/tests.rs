@@ -1,0 +1,258 @@
+use std::collections::BTreeMap;
+
+use glam::DVec3;
+use slag_common::frames::Aabb;
+use slag_common::manifest::{EncoderRecord, ShardRecord, TrustedKeys, VERSION};
+use slag_common::shard::Profile;
+
+use super::*;
+
+/// A manifest whose cells list the given objects, one a cell.
+fn manifest(generation: u64, objects: &[(Hash32, u64)]) -> Manifest {
+    let cell = |(cell_id, (hash, len_bytes)): (usize, &(Hash32, u64))| {
+        let min = DVec3::splat(cell_id as f64);
+        let (hash, len_bytes) = (*hash, *len_bytes);
+        let record = ShardRecord { hash, len_bytes, n_rows: 1, score_error_bound: 0.0, position_error: 0.0 };
+        let bounds = Aabb { min, max: min + DVec3::ONE };
+        let shards = BTreeMap::from([(Profile::Compact, record)]);
+        CellRecord { cell_id: cell_id as u32, bounds, n_gaussians: 1, shards }
+    };
+    let encoder = EncoderRecord { name: "e".into(), id: Hash32([1; 32]), dim: 4, default_threshold: 0.5 };
+    Manifest {
+        version: VERSION,
+        scene: "yard".into(),
+        generation,
+        created_unix_secs: 1,
+        expires_unix_secs: None,
+        metric: true,
+        geo_reference: None,
+        encoder,
+        n_gaussians: objects.len() as u64,
+        n_without_evidence: 0,
+        n_rejected: 0,
+        cells: objects.iter().enumerate().map(cell).collect(),
+    }
+}
+
+fn put_many(store: &Store, texts: &[impl AsRef<[u8]>]) -> Vec<(Hash32, u64)> {
+    texts.iter().map(|text| store.put_bytes(text.as_ref()).expect("room")).collect()
+}
+
+fn object_names(store: &Store) -> BTreeSet<String> {
+    let folders = fs_err::read_dir(store.dir().join("objects")).expect("folder");
+    let files = folders.flat_map(|folder| fs_err::read_dir(folder.expect("entry").path()).expect("folder"));
+    files.map(|file| file.expect("entry").file_name().to_string_lossy().into_owned()).collect()
+}
+
+#[test]
+fn published_scene_is_read_back_verified() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    assert!(matches!(StoreReader::open(dir.path()), Err(StoreError::NotPublished { .. })));
+    assert_eq!(store.next_generation().expect("records"), 1);
+    let shards = put_many(&store, &["a", "bb"]);
+    let field = store.put_bytes(b"field").expect("room").0;
+    let extras = Extras::from([("field".to_owned(), field)]);
+    let hash = store.publish(&manifest(1, &shards), &extras).expect("publishes");
+
+    let reader = StoreReader::open(dir.path()).expect("published");
+    assert_eq!(*reader.manifest(), manifest(1, &shards));
+    assert_eq!((reader.current().hash, &reader.current().extras), (hash, &extras));
+    assert_eq!(Hash32::of(&fs_err::read(dir.path().join("manifest")).expect("there")), hash);
+    // The key by another way than the reader's: from the file, by `common` alone.
+    let public = fs_err::read_to_string(dir.path().join("keys/ed25519.pub")).expect("there");
+    let trusted = TrustedKeys::Only(vec![public.trim_end().parse().expect("hex")]);
+    assert!(Manifest::verify(&reader.current().signed, &trusted).is_ok());
+
+    assert_eq!(&*reader.read_object(shards[1].0).expect("intact"), b"bb");
+    fs_err::write(reader.object_path(shards[1].0), b"bx").expect("writable");
+    assert!(matches!(reader.read_object(shards[1].0), Err(StoreError::ObjectHash { .. })));
+    assert_eq!(store.cells().expect("records"), manifest(1, &shards).cells);
+
+    assert!(reader.is_current());
+    store.publish(&manifest(2, &shards[..1]), &Extras::new()).expect("publishes");
+    assert!(!reader.is_current());
+    assert_eq!(store.cells().expect("records").len(), 1);
+    assert_eq!(store.reader().expect("published").previous().map(|p| p.hash), Some(hash));
+}
+
+#[test]
+fn second_writer_is_refused_until_the_first_is_gone() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let first = Store::create_or_open(dir.path()).expect("opens");
+    let refused = Store::create_or_open(dir.path()).expect_err("locked");
+    let expected =
+        format!("another slag-encoder is writing to {}; wait for it or stop it", dir.path().display());
+    assert_eq!(refused.to_string(), expected);
+    drop(first);
+    Store::create_or_open(dir.path()).expect("the lock is released with its holder");
+}
+
+#[test]
+fn signing_key_is_made_once_and_private() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let secret = dir.path().join("keys/ed25519");
+    let first = Store::create_or_open(dir.path()).expect("opens").signing_key().to_bytes();
+    assert_eq!(fs_err::read_to_string(&secret).expect("there"), format!("{}\n", hex::encode(first)));
+    assert_eq!(Store::create_or_open(dir.path()).expect("opens").signing_key().to_bytes(), first);
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        let mode = fs_err::metadata(&secret).expect("there").permissions().mode();
+        assert_eq!(mode & 0o777, 0o600);
+    }
+    fs_err::write(&secret, "ab").expect("writable");
+    assert!(matches!(Store::create_or_open(dir.path()), Err(StoreError::Key { .. })));
+}
+
+#[test]
+fn objects_are_named_by_content_and_kept() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    let (hash, len_bytes) =
+        store.put_object(|out| (0..1000).try_for_each(|i| write!(out, "{i},"))).expect("room");
+    let expected: String = (0..1000).map(|i| format!("{i},")).collect();
+    assert_eq!((hash, len_bytes), (Hash32::of(expected.as_bytes()), expected.len() as u64));
+    let path = reader::object_path(dir.path(), hash);
+    let modified = |path: &Path| fs_err::metadata(path).expect("there").modified().expect("a clock");
+    let before = modified(&path);
+    std::thread::scope(|scope| {
+        for _ in 0..8 {
+            scope.spawn(|| store.put_bytes(expected.as_bytes()).expect("room"));
+        }
+    });
+    assert_eq!(modified(&path), before, "an object that is there is not written again");
+    fs_err::write(&path, b"cut").expect("writable");
+    store.put_bytes(expected.as_bytes()).expect("room");
+    assert_eq!(fs_err::read(&path).expect("there"), expected.as_bytes(), "a cut one is");
+
+    let failed = store.put_object(|out| {
+        out.write_all(b"half")?;
+        Err(io::Error::other("the callback failed"))
+    });
+    assert!(failed.is_err_and(|e| e.to_string().contains("the callback failed")));
+    assert_eq!(fs_err::read_dir(dir.path().join("tmp")).expect("folder").count(), 0);
+}
+
+#[test]
+fn what_is_not_whole_is_not_published() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    let shards = put_many(&store, &["a"]);
+    let nothing = Hash32::of(b"never put");
+    let missing =
+        |result: Result<Hash32, StoreError>| matches!(result, Err(StoreError::MissingObject { .. }));
+    assert!(missing(store.publish(&manifest(1, &[(nothing, 1)]), &Extras::new())));
+    assert!(missing(store.publish(&manifest(1, &[(shards[0].0, 2)]), &Extras::new())));
+    let extras = Extras::from([("field".to_owned(), nothing)]);
+    assert!(missing(store.publish(&manifest(1, &shards), &extras)));
+    let mut hostile = manifest(1, &shards);
+    hostile.cells.push(hostile.cells[0].clone());
+    assert!(matches!(store.publish(&hostile, &Extras::new()), Err(StoreError::Manifest { .. })));
+    assert!(matches!(store.reader(), Err(StoreError::NotPublished { .. })), "nothing was replaced");
+
+    store.publish(&manifest(5, &shards), &Extras::new()).expect("publishes");
+    store.publish(&manifest(5, &shards), &Extras::new()).expect("the same again is no error");
+    assert!(store.reader().expect("published").previous().is_none(), "and is not its own predecessor");
+    let back = Manifest { created_unix_secs: 2, ..manifest(5, &shards) };
+    let refused = store.publish(&back, &Extras::new());
+    assert!(matches!(refused, Err(StoreError::Generation { found: 5, current: 5 })));
+    assert_eq!(store.next_generation().expect("records"), 6);
+}
+
+#[test]
+fn prune_keeps_two_generations_with_their_extras() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    let all = put_many(&store, &["s1", "s2", "s3", "f1", "f2", "f3", "loose"]);
+    for generation in 1..=3usize {
+        let extras = Extras::from([("field".to_owned(), all[2 + generation].0)]);
+        let shards = &all[generation - 1..generation];
+        store.publish(&manifest(generation as u64, shards), &extras).expect("publishes");
+    }
+    assert_eq!(object_names(&store).len(), 7);
+    let pruned = store.prune().expect("readable");
+    assert_eq!(pruned.n_objects, 3);
+    let kept: BTreeSet<String> = [1, 2, 4, 5].map(|i: usize| all[i].0.to_string()).into();
+    assert_eq!(object_names(&store), kept);
+    let extras_records = fs_err::read_dir(dir.path().join("extras")).expect("folder").count();
+    assert_eq!(extras_records, 2);
+
+    fs_err::remove_file(reader::extras_path(dir.path(), store.reader().expect("published").current().hash))
+        .expect("there");
+    assert!(store.prune().is_err(), "what it cannot know, it does not delete");
+    assert_eq!(object_names(&store), kept);
+}
+
+#[test]
+fn records_behind_the_manifest_are_repaired() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let shards;
+    {
+        let store = Store::create_or_open(dir.path()).expect("opens");
+        shards = put_many(&store, &["a", "b", "c"]);
+        store.publish(&manifest(1, &shards), &Extras::new()).expect("publishes");
+        // A crash between the manifest's rename and the records' flush leaves exactly this.
+        let signed = manifest(2, &shards[1..]).sign(store.signing_key());
+        store.replace(&reader::extras_path(dir.path(), Hash32::of(&signed)), b"{}").expect("writable");
+        store.replace(&dir.path().join("manifest"), &signed).expect("writable");
+        fs_err::write(dir.path().join("tmp/9.part"), b"left over").expect("writable");
+    }
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    assert_eq!(store.next_generation().expect("records"), 3);
+    assert_eq!(store.cells().expect("records"), manifest(2, &shards[1..]).cells);
+    assert_eq!(fs_err::read_dir(dir.path().join("tmp")).expect("folder").count(), 0);
+}
+
+/// Publishes without end; run in a process of its own by the test below, which kills it.
+#[test]
+#[ignore = "the process that the kill test starts"]
+fn publish_until_killed() {
+    let Some(dir) = std::env::var_os("SLAG_TEST_STORE") else { return };
+    let store = Store::create_or_open(Path::new(&dir)).expect("opens");
+    loop {
+        let generation = store.next_generation().expect("records");
+        let texts: Vec<String> = (0..4).map(|i| format!("shard {i} of {generation}")).collect();
+        let shards = put_many(&store, &texts);
+        let field = store.put_bytes(format!("field of {generation}").as_bytes()).expect("room").0;
+        let extras = Extras::from([("field".to_owned(), field)]);
+        store.publish(&manifest(generation, &shards), &extras).expect("publishes");
+        store.prune().expect("prunes");
+    }
+}
+
+/// SIGKILL at any moment leaves a whole generation, never an older one than was seen before.
+#[test]
+#[cfg(unix)]
+fn killed_writer_leaves_a_whole_generation() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let mut last_generation = 0;
+    for round in 0..12u64 {
+        let mut child = std::process::Command::new(std::env::current_exe().expect("this test"))
+            .args(["--exact", "store::tests::publish_until_killed", "--include-ignored", "--quiet"])
+            .env("SLAG_TEST_STORE", dir.path())
+            .stdout(std::process::Stdio::null())
+            .stderr(std::process::Stdio::null())
+            .spawn()
+            .expect("starts");
+        // Lets it publish at least one generation more, then kills at a spread of phases.
+        while !StoreReader::open(dir.path()).is_ok_and(|r| r.manifest().generation > last_generation) {
+            assert!(child.try_wait().expect("a child").is_none(), "the writer stopped by itself");
+            std::thread::sleep(std::time::Duration::from_micros(500));
+        }
+        std::thread::sleep(std::time::Duration::from_micros(round * 1_700));
+        child.kill().expect("kills");
+        child.wait().expect("ends");
+        let reader = StoreReader::open(dir.path()).expect("a whole manifest");
+        let generation = reader.manifest().generation;
+        assert!(generation > last_generation);
+        for (hash, _) in reader.current().shard_lens() {
+            reader.read_object(hash).expect("a whole shard");
+        }
+        let field = reader.read_object(reader.current().extras["field"]).expect("a whole extra");
+        assert_eq!(&*field, format!("field of {generation}").as_bytes(), "extras of this very generation");
+        let store = Store::create_or_open(dir.path()).expect("opens after the kill");
+        assert_eq!(store.next_generation().expect("records"), generation + 1);
+        last_generation = generation;
+    }
+}
