@@ -8,6 +8,7 @@
 pub mod camera;
 pub mod frames;
 pub mod gaussians;
+pub mod poses;
 
 pub use camera::{Distortion, Intrinsics, View};
 pub use gaussians::Gaussians;
