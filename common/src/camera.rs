@@ -44,13 +44,111 @@ pub struct Intrinsics {
     pub distortion: Distortion,
 }
 
+/// Normalised radius beyond which a pinhole image is not considered: 89.4 degrees off the axis.
+const MAX_NORMALISED_RADIUS: f64 = 100.0;
+
+impl Distortion {
+    /// Moves an ideal normalised point (x/z, y/z) to where the lens images it.
+    ///
+    /// Brown: `x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)` and its like in y.
+    /// Fisheye: `x theta_d / r` with `theta = atan r`. Both as the OpenCV documentation of
+    /// `calib3d` prints them, and as COLMAP's models of the same names have them.
+    pub fn distort(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+        match *self {
+            Self::None => [x, y],
+            Self::Brown { k: [k1, k2, k3], p: [p1, p2] } => {
+                let r2 = x * x + y * y;
+                let radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+                [
+                    x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+                    y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+                ]
+            }
+            Self::Fisheye { k: [k1, k2, k3, k4] } => {
+                let r = x.hypot(y);
+                // The limit of theta_d / r at the axis; the series' next term is r^2 / 3.
+                if r < 1e-9 {
+                    return [x, y];
+                }
+                let theta = r.atan();
+                let t2 = theta * theta;
+                let scale = theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r;
+                [x * scale, y * scale]
+            }
+        }
+    }
+
+    /// Returns the normalised radius up to which the radial part grows with the radius.
+    ///
+    /// Beyond it the polynomial folds back, so that a second ideal point would fall onto the same
+    /// pixel: what lies there is no image of that direction. Tangential terms are left out of the
+    /// criterion (they are small wherever the model is meaningful).
+    pub fn monotonic_radius(&self) -> f64 {
+        match *self {
+            Self::None => MAX_NORMALISED_RADIUS,
+            Self::Brown { k: [k1, k2, k3], .. } => {
+                let max_r2 = MAX_NORMALISED_RADIUS * MAX_NORMALISED_RADIUS;
+                roots_between(&[1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3], 0.0, max_r2)
+                    .first()
+                    .map_or(MAX_NORMALISED_RADIUS, |r2| r2.sqrt())
+            }
+            Self::Fisheye { k: [k1, k2, k3, k4] } => {
+                let max_theta = MAX_NORMALISED_RADIUS.atan();
+                roots_between(&[1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4], 0.0, max_theta * max_theta)
+                    .first()
+                    .map_or(MAX_NORMALISED_RADIUS, |t2| t2.sqrt().tan())
+            }
+        }
+    }
+}
+
+/// Returns the ascending points of `low..high` where a polynomial (coefficients from the constant
+/// term up) changes sign: between two roots of its derivative there is at most one.
+fn roots_between(coefficients: &[f64], low: f64, high: f64) -> Vec<f64> {
+    if coefficients.len() < 2 {
+        return Vec::new();
+    }
+    let value = |x: f64| coefficients.iter().rev().fold(0.0, |sum, c| sum * x + c);
+    let derivative: Vec<f64> =
+        coefficients.iter().enumerate().skip(1).map(|(power, c)| power as f64 * c).collect();
+    let mut turns = vec![low];
+    turns.extend(roots_between(&derivative, low, high));
+    turns.push(high);
+    let mut roots = Vec::new();
+    for pair in turns.windows(2) {
+        let (mut a, mut b) = (pair[0], pair[1]);
+        if (value(a) > 0.0) == (value(b) > 0.0) {
+            continue;
+        }
+        let positive_at_a = value(a) > 0.0;
+        // 100 halvings exhaust the 53 bits of the mantissa for any interval used here.
+        for _ in 0..100 {
+            let middle = 0.5 * (a + b);
+            if (value(middle) > 0.0) == positive_at_a { a = middle } else { b = middle }
+        }
+        roots.push(a);
+    }
+    roots
+}
+
 impl Intrinsics {
-    /// Returns the same camera with another image width; the height keeps the aspect ratio
-    /// (rounded to a pixel, at least 1).
-    pub fn scaled_to_width(&self, width_px: u32) -> Self {
-        let height_px = ((f64::from(self.height_px) * f64::from(width_px) / f64::from(self.width_px)).round()
-            as u32)
-            .max(1);
+    /// Moves an ideal normalised point (x/z, y/z) to where the lens images it; see [`Distortion::distort`].
+    pub fn distort(&self, normalised: [f64; 2]) -> [f64; 2] {
+        self.distortion.distort(normalised)
+    }
+
+    /// Returns the image position, pixels, of a normalised point after distortion.
+    pub fn pixel_from_distorted(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+        [x * self.focal_x_px + self.centre_x_px, y * self.focal_y_px + self.centre_y_px]
+    }
+
+    /// Returns the normalised point, distortion still in it, of an image position in pixels.
+    pub fn distorted_from_pixel(&self, [u, v]: [f64; 2]) -> [f64; 2] {
+        [(u - self.centre_x_px) / self.focal_x_px, (v - self.centre_y_px) / self.focal_y_px]
+    }
+
+    /// Returns the same camera with another image size; focal lengths and centre scale along.
+    pub fn scaled_to(&self, width_px: u32, height_px: u32) -> Self {
         let sx = f64::from(width_px) / f64::from(self.width_px);
         let sy = f64::from(height_px) / f64::from(self.height_px);
         Self {
@@ -62,6 +160,15 @@ impl Intrinsics {
             centre_y_px: self.centre_y_px * sy,
             distortion: self.distortion,
         }
+    }
+
+    /// Returns the same camera with another image width; the height keeps the aspect ratio
+    /// (rounded to a pixel, at least 1).
+    pub fn scaled_to_width(&self, width_px: u32) -> Self {
+        let height_px = ((f64::from(self.height_px) * f64::from(width_px) / f64::from(self.width_px)).round()
+            as u32)
+            .max(1);
+        self.scaled_to(width_px, height_px)
     }
 
     /// Returns the same camera as an ideal pinhole.
@@ -87,5 +194,65 @@ impl View {
     /// Returns the camera's centre.
     pub fn position_in_world(&self) -> DVec3 {
         self.camera_from_world.inverse().translation
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const BROWN: Distortion =
+        Distortion::Brown { k: [-0.28340811, 0.07395907, 0.01], p: [0.00019359, 1.76187114e-05] };
+    const FISHEYE: Distortion = Distortion::Fisheye { k: [0.0034, 0.0007, -0.0018, 0.0004] };
+
+    /// Oracle: OpenCV 4 (`cv2.projectPoints` and `cv2.fisheye.projectPoints`, identity camera),
+    /// recorded; the Brown coefficients are those published with the EuRoC data set.
+    #[test]
+    fn distortion_is_opencvs() {
+        let recorded: &[(Distortion, [f64; 2], [f64; 2])] = &[
+            (BROWN, [0.0, 0.0], [0.0, 0.0]),
+            (BROWN, [0.3, -0.2], [0.289310878195434, -0.19284722514196803]),
+            (BROWN, [-0.55, 0.4], [-0.48721972669222113, 0.35443708108135896]),
+            (BROWN, [0.01, 0.7], [0.008811785885914027, 0.6163154453409821]),
+            (FISHEYE, [0.0, 0.0], [0.0, 0.0]),
+            (FISHEYE, [0.3, -0.2], [0.2880477031744145, -0.19203180211627635]),
+            (FISHEYE, [-0.55, 0.4], [-0.48359139982530824, 0.3517028362365878]),
+            (FISHEYE, [0.01, 0.7], [0.008735619095397057, 0.6114933366777938]),
+            (FISHEYE, [1.7, -2.0], [0.7836748590380883, -0.921970422397751]),
+        ];
+        for (distortion, ideal, expected) in recorded {
+            let found = distortion.distort(*ideal);
+            assert!((found[0] - expected[0]).abs() < 1e-12, "{distortion:?} {ideal:?}: {found:?}");
+            assert!((found[1] - expected[1]).abs() < 1e-12, "{distortion:?} {ideal:?}: {found:?}");
+        }
+    }
+
+    /// Oracle: a dense scan (to radius 5) for the first radius at which the imaged radius stops growing.
+    #[test]
+    fn the_monotonic_radius_is_where_the_image_folds() {
+        let cases = [
+            Distortion::Brown { k: [-0.3, 0.0, 0.0], p: [0.0; 2] },
+            Distortion::Brown { k: [-0.3, 0.09, -0.02], p: [0.0; 2] },
+            Distortion::Brown { k: [0.1, -0.2, 0.0], p: [0.0; 2] },
+            Distortion::Fisheye { k: [0.1, -0.3, 0.0, 0.0] },
+            FISHEYE,
+        ];
+        for distortion in cases {
+            let step = 1e-4;
+            let scanned = (0..50_000)
+                .map(|i| f64::from(i) * step)
+                .find(|r| distortion.distort([r + step, 0.0])[0] < distortion.distort([*r, 0.0])[0]);
+            let found = distortion.monotonic_radius();
+            match scanned {
+                Some(r) => assert!((found - r).abs() < 2.0 * step, "{distortion:?}: {found}, scanned {r}"),
+                None => assert!(found > 4.9, "{distortion:?}: {found}"),
+            }
+        }
+    }
+
+    #[test]
+    fn an_equidistant_fisheye_is_not_a_pinhole() {
+        let [x, _] = Distortion::Fisheye { k: [0.0; 4] }.distort([1.0, 0.0]);
+        assert!((x - std::f64::consts::FRAC_PI_4).abs() < 1e-15);
     }
 }

@@ -12,6 +12,7 @@ pub mod gaussians;
 pub mod hash;
 pub mod manifest;
 pub mod shard;
+pub mod poses;
 
 pub use camera::{Distortion, Intrinsics, View};
 pub use gaussians::Gaussians;

@@ -1,0 +1,367 @@
+//! COLMAP models: `cameras` and `images`, as text or binary (COLMAP's documentation, "Output
+//! Format", and its `src/colmap/sensor/models.h` for numbers and parameters of the lens models).
+//!
+//! Points and 2D features are not needed and are skipped without being stored.
+
+use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader, Read};
+use std::path::{Component, Path, PathBuf};
+
+use fs_err::File;
+
+use super::{
+    Place, PoseError, PoseProblem, PoseSource, ViewSet, affine_from_wxyz, check_intrinsics, parent, view_set,
+};
+use crate::camera::{Distortion, Intrinsics, View};
+
+/// Longest image name read from a binary file, bytes: what Linux allows for a path.
+const MAX_NAME_BYTES: u64 = 4096;
+/// Bytes of a 2D feature in `images.bin`: x, y (f64) and a point id (u64).
+const FEATURE_BYTES: u64 = 24;
+
+/// The supported lens models: number, name, number of parameters.
+const MODELS: [(i32, &str, usize); 6] = [
+    (0, "SIMPLE_PINHOLE", 3),
+    (1, "PINHOLE", 4),
+    (2, "SIMPLE_RADIAL", 4),
+    (3, "RADIAL", 5),
+    (4, "OPENCV", 8),
+    (5, "OPENCV_FISHEYE", 8),
+];
+
+type Cameras = BTreeMap<u32, Intrinsics>;
+
+pub(super) fn read(
+    model_dir: &Path,
+    source: PoseSource,
+    images_dir: Option<&Path>,
+) -> Result<ViewSet, PoseError> {
+    let images_dir = match images_dir {
+        Some(dir) => dir.to_owned(),
+        None => default_images_dir(model_dir)?,
+    };
+    let extension = if source == PoseSource::ColmapBinary { "bin" } else { "txt" };
+    let [cameras_path, images_path] =
+        ["cameras", "images"].map(|stem| model_dir.join(stem).with_extension(extension));
+    let views = match source {
+        PoseSource::ColmapBinary => {
+            images_from_binary(&images_path, &cameras_from_binary(&cameras_path)?, &images_dir)?
+        }
+        _ => images_from_text(&images_path, &cameras_from_text(&cameras_path)?, &images_dir)?,
+    };
+    view_set(&images_path, views, source)
+}
+
+/// Returns `images/` beside `sparse/0` or `sparse`, where that is what the model's folder is called
+/// and it exists, else `images/` beside or in the model's folder.
+fn default_images_dir(model_dir: &Path) -> Result<PathBuf, PoseError> {
+    let beside = parent(model_dir)?;
+    let mut candidates = vec![beside.join("images"), model_dir.join("images")];
+    if beside.file_name().is_some_and(|name| name == "sparse") {
+        candidates.insert(0, parent(&beside)?.join("images"));
+    }
+    let found = candidates.iter().position(|dir| dir.is_dir()).unwrap_or(0);
+    Ok(candidates.swap_remove(found))
+}
+
+/// Returns a camera of the given model; the order of the parameters is COLMAP's.
+fn intrinsics(model: &str, size_px: [f64; 2], params: &[f64]) -> Result<Intrinsics, PoseProblem> {
+    let brown = |k1, k2, p| Distortion::Brown { k: [k1, k2, 0.0], p };
+    let (focal, centre, distortion) = match (model, params) {
+        ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], Distortion::None),
+        ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy], [cx, cy], Distortion::None),
+        ("SIMPLE_RADIAL", &[f, cx, cy, k]) => ([f, f], [cx, cy], brown(k, 0.0, [0.0; 2])),
+        ("RADIAL", &[f, cx, cy, k1, k2]) => ([f, f], [cx, cy], brown(k1, k2, [0.0; 2])),
+        ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => ([fx, fy], [cx, cy], brown(k1, k2, [p1, p2])),
+        ("OPENCV_FISHEYE", &[fx, fy, cx, cy, k1, k2, k3, k4]) => {
+            ([fx, fy], [cx, cy], Distortion::Fisheye { k: [k1, k2, k3, k4] })
+        }
+        _ => {
+            return Err(PoseProblem::Expected {
+                expected: "as many parameters as the lens model has",
+                found: format!("{} for {model}", params.len()),
+            });
+        }
+    };
+    check_intrinsics(size_px, focal, centre, distortion)
+}
+
+/// Returns the view of an image record.
+fn view(
+    cameras: &Cameras,
+    images_dir: &Path,
+    name: &str,
+    camera_id: u32,
+    wxyz: [f64; 4],
+    translation: [f64; 3],
+) -> Result<View, PoseProblem> {
+    let name = name.replace('\\', "/");
+    let relative = Path::new(&name);
+    if name.is_empty()
+        || name.contains('\0')
+        || !relative.components().all(|c| matches!(c, Component::Normal(_)))
+    {
+        return Err(PoseProblem::UnsafeName { image: name });
+    }
+    let intrinsics = *cameras
+        .get(&camera_id)
+        .ok_or_else(|| PoseProblem::UnknownCamera { image: name.clone(), camera_id })?;
+    Ok(View {
+        image_path: images_dir.join(relative),
+        camera_from_world: affine_from_wxyz(&name, wxyz, translation)?,
+        name,
+        intrinsics,
+    })
+}
+
+fn insert(cameras: &mut Cameras, camera_id: u32, camera: Intrinsics) -> Result<(), PoseProblem> {
+    match cameras.insert(camera_id, camera) {
+        None => Ok(()),
+        Some(_) => Err(PoseProblem::DuplicateCamera { camera_id }),
+    }
+}
+
+/// The lines of a text file, one at a time and counted.
+struct Lines {
+    path: PathBuf,
+    reader: BufReader<File>,
+    line: String,
+    number: u64,
+}
+
+impl Lines {
+    fn open(path: &Path) -> Result<Self, PoseError> {
+        let reader = BufReader::new(File::open(path)?);
+        Ok(Self { path: path.to_owned(), reader, line: String::new(), number: 0 })
+    }
+
+    fn fail(&self, problem: PoseProblem) -> PoseError {
+        problem.at(&self.path, Place::Line(self.number))
+    }
+
+    /// Reads the next line; `false` at the end of the file.
+    fn advance(&mut self) -> Result<bool, PoseError> {
+        let mut bytes = std::mem::take(&mut self.line).into_bytes();
+        bytes.clear();
+        self.number += 1;
+        let n = self.reader.read_until(b'\n', &mut bytes)?;
+        self.line = String::from_utf8(bytes).map_err(|_| {
+            self.fail(PoseProblem::Expected { expected: "UTF-8 text", found: "other bytes".to_owned() })
+        })?;
+        Ok(n > 0)
+    }
+
+    /// Reads on to the next line that is neither empty nor a comment.
+    fn advance_to_record(&mut self) -> Result<bool, PoseError> {
+        while self.advance()? {
+            let line = self.line.trim();
+            if !line.is_empty() && !line.starts_with('#') {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+}
+
+/// Splits off the next word and parses it.
+fn take<T: std::str::FromStr>(rest: &mut &str, expected: &'static str) -> Result<T, PoseProblem> {
+    let trimmed = rest.trim_start();
+    let (word, after) = trimmed.split_at(trimmed.find(char::is_whitespace).unwrap_or(trimmed.len()));
+    *rest = after;
+    word.parse().map_err(|_| PoseProblem::Expected { expected, found: excerpt(word) })
+}
+
+/// Returns the start of a text, short enough for a message.
+fn excerpt(text: &str) -> String {
+    text.chars().take(40).collect()
+}
+
+fn take_numbers<const N: usize>(rest: &mut &str, expected: &'static str) -> Result<[f64; N], PoseProblem> {
+    let mut numbers = [0.0; N];
+    for number in &mut numbers {
+        *number = take(rest, expected)?;
+    }
+    Ok(numbers)
+}
+
+fn cameras_from_text(path: &Path) -> Result<Cameras, PoseError> {
+    let mut cameras = Cameras::new();
+    let mut lines = Lines::open(path)?;
+    while lines.advance_to_record()? {
+        let (camera_id, camera) = camera_from_line(&lines.line).map_err(|problem| lines.fail(problem))?;
+        insert(&mut cameras, camera_id, camera).map_err(|problem| lines.fail(problem))?;
+    }
+    Ok(cameras)
+}
+
+fn camera_from_line(line: &str) -> Result<(u32, Intrinsics), PoseProblem> {
+    let mut rest = line;
+    let camera_id = take(&mut rest, "a camera id")?;
+    let model: String = take(&mut rest, "a lens model")?;
+    if !MODELS.iter().any(|(_, name, _)| *name == model) {
+        return Err(PoseProblem::UnsupportedModel { camera_id, model: excerpt(&model) });
+    }
+    let size_px = take_numbers::<2>(&mut rest, "width and height in pixels")?;
+    let mut params = Vec::new();
+    while !rest.trim_start().is_empty() {
+        params.push(take(&mut rest, "a lens parameter")?);
+    }
+    Ok((camera_id, intrinsics(&model, size_px, &params)?))
+}
+
+fn images_from_text(path: &Path, cameras: &Cameras, images_dir: &Path) -> Result<Vec<View>, PoseError> {
+    let mut views = Vec::new();
+    let mut lines = Lines::open(path)?;
+    while lines.advance_to_record()? {
+        let view =
+            image_from_line(&lines.line, cameras, images_dir).map_err(|problem| lines.fail(problem))?;
+        views.push(view);
+        // The features' line is always there, though it may be empty. A file without these lines
+        // would lose every second image unseen, so its number of words is checked.
+        if lines.advance()? && lines.line.split_ascii_whitespace().count() % 3 != 0 {
+            let found = excerpt(&lines.line);
+            return Err(lines.fail(PoseProblem::Expected {
+                expected: "the image's 2D features (X Y POINT3D_ID ...) or an empty line",
+                found,
+            }));
+        }
+    }
+    Ok(views)
+}
+
+fn image_from_line(line: &str, cameras: &Cameras, images_dir: &Path) -> Result<View, PoseProblem> {
+    let mut rest = line;
+    let _image_id: u32 = take(&mut rest, "an image id")?;
+    let wxyz = take_numbers(&mut rest, "a quaternion QW QX QY QZ")?;
+    let translation = take_numbers(&mut rest, "a translation TX TY TZ")?;
+    let camera_id = take(&mut rest, "a camera id")?;
+    view(cameras, images_dir, rest.trim(), camera_id, wxyz, translation)
+}
+
+/// A binary file with its length known, so that no count is believed beyond it.
+struct Binary {
+    path: PathBuf,
+    reader: BufReader<File>,
+    offset_bytes: u64,
+    len_bytes: u64,
+}
+
+impl Binary {
+    fn open(path: &Path) -> Result<Self, PoseError> {
+        let file = File::open(path)?;
+        let len_bytes = file.metadata()?.len();
+        Ok(Self { path: path.to_owned(), reader: BufReader::new(file), offset_bytes: 0, len_bytes })
+    }
+
+    fn fail(&self, problem: PoseProblem) -> PoseError {
+        problem.at(&self.path, Place::Byte(self.offset_bytes))
+    }
+
+    fn take<const N: usize>(&mut self, expected: &'static str) -> Result<[u8; N], PoseError> {
+        let mut bytes = [0; N];
+        if self.len_bytes.saturating_sub(self.offset_bytes) < N as u64 {
+            return Err(self.fail(PoseProblem::Truncated { expected }));
+        }
+        self.reader.read_exact(&mut bytes)?;
+        self.offset_bytes += N as u64;
+        Ok(bytes)
+    }
+
+    fn u32(&mut self, expected: &'static str) -> Result<u32, PoseError> {
+        Ok(u32::from_le_bytes(self.take(expected)?))
+    }
+
+    fn u64(&mut self, expected: &'static str) -> Result<u64, PoseError> {
+        Ok(u64::from_le_bytes(self.take(expected)?))
+    }
+
+    fn numbers<const N: usize>(&mut self, expected: &'static str) -> Result<[f64; N], PoseError> {
+        let mut numbers = [0.0; N];
+        for number in &mut numbers {
+            *number = f64::from_le_bytes(self.take(expected)?);
+        }
+        Ok(numbers)
+    }
+
+    /// Reads a text that a zero byte ends.
+    fn name(&mut self) -> Result<String, PoseError> {
+        let mut bytes = Vec::new();
+        self.reader.by_ref().take(MAX_NAME_BYTES).read_until(0, &mut bytes)?;
+        let expected = "an image name of at most 4096 bytes that a zero byte ends";
+        if bytes.last() != Some(&0) {
+            return Err(self.fail(PoseProblem::Truncated { expected }));
+        }
+        bytes.pop();
+        let name = String::from_utf8(bytes).map_err(|e| {
+            self.fail(PoseProblem::Expected {
+                expected,
+                found: excerpt(&String::from_utf8_lossy(e.as_bytes())),
+            })
+        })?;
+        self.offset_bytes += name.len() as u64 + 1;
+        Ok(name)
+    }
+
+    /// Skips `count` records, all of which must be there.
+    fn skip(&mut self, count: u64, record_bytes: u64, expected: &'static str) -> Result<(), PoseError> {
+        let left = self.len_bytes.saturating_sub(self.offset_bytes);
+        match count.checked_mul(record_bytes) {
+            Some(bytes) if bytes <= left => {
+                // Within the file's length, which is an i64 on every platform.
+                self.reader.seek_relative(bytes as i64)?;
+                self.offset_bytes += bytes;
+                Ok(())
+            }
+            _ => Err(self.fail(PoseProblem::Truncated { expected })),
+        }
+    }
+
+    fn expect_end(&self) -> Result<(), PoseError> {
+        if self.offset_bytes == self.len_bytes {
+            return Ok(());
+        }
+        let found = format!("{} more bytes", self.len_bytes.saturating_sub(self.offset_bytes));
+        Err(self.fail(PoseProblem::Expected { expected: "the end of the file", found }))
+    }
+}
+
+fn cameras_from_binary(path: &Path) -> Result<Cameras, PoseError> {
+    let mut cameras = Cameras::new();
+    let mut file = Binary::open(path)?;
+    for _ in 0..file.u64("the number of cameras")? {
+        let camera_id = file.u32("a camera id")?;
+        let model_id = i32::from_le_bytes(file.take("a lens model's number")?);
+        let Some((_, model, n_params)) = MODELS.iter().find(|(id, ..)| *id == model_id) else {
+            return Err(
+                file.fail(PoseProblem::UnsupportedModel { camera_id, model: format!("number {model_id}") })
+            );
+        };
+        let size_px = [file.u64("the width")? as f64, file.u64("the height")? as f64];
+        let mut params = Vec::new();
+        for _ in 0..*n_params {
+            params.push(f64::from_le_bytes(file.take("a lens parameter")?));
+        }
+        let camera = intrinsics(model, size_px, &params).map_err(|problem| file.fail(problem))?;
+        insert(&mut cameras, camera_id, camera).map_err(|problem| file.fail(problem))?;
+    }
+    file.expect_end()?;
+    Ok(cameras)
+}
+
+fn images_from_binary(path: &Path, cameras: &Cameras, images_dir: &Path) -> Result<Vec<View>, PoseError> {
+    let mut views = Vec::new();
+    let mut file = Binary::open(path)?;
+    for _ in 0..file.u64("the number of images")? {
+        let _image_id = file.u32("an image id")?;
+        let wxyz = file.numbers("a quaternion")?;
+        let translation = file.numbers("a translation")?;
+        let camera_id = file.u32("a camera id")?;
+        let name = file.name()?;
+        let view = view(cameras, images_dir, &name, camera_id, wxyz, translation);
+        views.push(view.map_err(|problem| file.fail(problem))?);
+        let n_features = file.u64("the number of 2D features")?;
+        file.skip(n_features, FEATURE_BYTES, "the image's 2D features")?;
+    }
+    file.expect_end()?;
+    Ok(views)
+}

@@ -1,0 +1,320 @@
+//! Poses of real scenes, and of small files written for one case each.
+
+mod common;
+
+use std::path::Path;
+
+use common::shared;
+use glam::{DMat3, DVec3};
+use slag_common::camera::{Distortion, View};
+use slag_common::poses::{self, Place, PoseError, PoseProblem, PoseSource, ViewSet};
+
+fn largest_difference(a: &View, b: &View) -> f64 {
+    let columns = |view: &View| view.camera_from_world.to_cols_array();
+    columns(a).iter().zip(columns(b)).map(|(x, y)| (x - y).abs()).fold(0.0, f64::max)
+}
+
+/// Writes files into a fresh folder and reads the poses there.
+fn read_files(files: &[(&str, &[u8])]) -> Result<ViewSet, PoseError> {
+    let dir = tempfile::tempdir().unwrap();
+    for (name, bytes) in files {
+        let path = dir.path().join(name);
+        fs_err::create_dir_all(path.parent().unwrap()).unwrap();
+        fs_err::write(path, bytes).unwrap();
+    }
+    poses::read(dir.path(), None)
+}
+
+fn read_text(cameras: &str, images: &str) -> Result<ViewSet, PoseError> {
+    read_files(&[("cameras.txt", cameras.as_bytes()), ("images.txt", images.as_bytes())])
+}
+
+fn problem(result: Result<ViewSet, PoseError>) -> (Place, PoseProblem) {
+    match result {
+        Err(PoseError::Invalid { place, problem, .. }) => (place, problem),
+        other => panic!("not a located problem: {other:?}"),
+    }
+}
+
+/// Oracle: the reconstruction's own statement of the camera centres (geo.json, `cam_enu`), which a
+/// separate program computed and rounded to a millimetre.
+#[test]
+fn brighton_text_is_its_binary_and_lies_where_its_georeference_says() {
+    let Some(scene) = shared("scenes/brighton") else { return };
+    let binary = poses::read(&scene, None).unwrap();
+    let text = poses::read(&scene.join("sparse/0/images.txt"), None).unwrap();
+    assert_eq!((binary.source, text.source), (PoseSource::ColmapBinary, PoseSource::ColmapText));
+    assert_eq!((binary.views.len(), text.views.len()), (18, 18));
+    for (b, t) in binary.views.iter().zip(&text.views) {
+        assert_eq!((&b.name, &b.image_path, b.intrinsics), (&t.name, &t.image_path, t.intrinsics));
+        assert!(largest_difference(b, t) < 1e-12, "{}: {}", b.name, largest_difference(b, t));
+        assert!(b.image_path.is_file(), "{}", b.image_path.display());
+    }
+    let camera = binary.views[0].intrinsics;
+    assert_eq!((camera.width_px, camera.height_px, camera.distortion), (1574, 884, Distortion::None));
+    assert_eq!((camera.focal_x_px, camera.focal_y_px), (924.0, 924.0));
+    assert_eq!((camera.centre_x_px, camera.centre_y_px), (787.0, 442.0));
+
+    let geo: serde_json::Value =
+        serde_json::from_slice(&fs_err::read(scene.join("geo.json")).unwrap()).unwrap();
+    for view in &binary.views {
+        let stated = &geo["per_image"][&view.name]["cam_enu"];
+        let stated = DVec3::from_array([0, 1, 2].map(|axis| stated[axis].as_f64().unwrap()));
+        let found = view.position_in_world();
+        assert!((found - stated).abs().max_element() < 2e-3, "{}: {found} {stated}", view.name);
+        // A photo from the air: the optical axis points down.
+        let forward_in_world = view.camera_from_world.inverse().transform_vector3(DVec3::Z);
+        assert!(forward_in_world.z < -0.9, "{}: {forward_in_world}", view.name);
+    }
+}
+
+/// Oracle: the same 96 poses, once in OpenGL axes as world from camera, once in OpenCV axes as
+/// camera from world, both written by the scene's generator.
+#[test]
+fn house_transforms_and_colmap_agree() {
+    let Some(scene) = shared("scenes/house_a") else { return };
+    let colmap = poses::read(&scene, None).unwrap();
+    let transforms = poses::read(&scene.join("transforms.json"), None).unwrap();
+    assert_eq!((colmap.source, transforms.source), (PoseSource::ColmapText, PoseSource::Transforms));
+    assert_eq!((colmap.views.len(), transforms.views.len()), (96, 96));
+    for (c, t) in colmap.views.iter().zip(&transforms.views) {
+        assert_eq!((&c.name, c.intrinsics), (&t.name, t.intrinsics));
+        assert!(largest_difference(c, t) < 1e-5, "{}: {}", c.name, largest_difference(c, t));
+        assert!(c.image_path.is_file() && t.image_path.is_file());
+        for view in [c, t] {
+            let rotation = view.camera_from_world.matrix3;
+            let gram = rotation.transpose() * rotation - DMat3::IDENTITY;
+            assert!(gram.to_cols_array().iter().all(|v| v.abs() < 1e-14), "{}", view.name);
+        }
+    }
+    let test_views = poses::read(&scene.join("test"), None).unwrap();
+    assert_eq!(test_views.views.len(), 10);
+    assert!(test_views.views.iter().all(|view| view.image_path.is_file()));
+}
+
+#[test]
+fn an_image_folder_of_ones_own_replaces_the_default() {
+    let Some(scene) = shared("scenes/house_a") else { return };
+    for path in [scene.clone(), scene.join("transforms.json")] {
+        let views = poses::read(&path, Some(Path::new("photos"))).unwrap().views;
+        assert_eq!(views[7].image_path, Path::new("photos/0007.jpg"));
+    }
+}
+
+/// Every lens model, as text and as binary; the binary files are written here by hand.
+#[test]
+fn lens_models() {
+    let brown = |k1, k2, p| Distortion::Brown { k: [k1, k2, 0.0], p };
+    type Case = (i32, &'static str, &'static [f64], [f64; 4], Distortion);
+    let cases: [Case; 7] = [
+        (0, "SIMPLE_PINHOLE", &[50.0, 32.0, 24.0], [50.0, 50.0, 32.0, 24.0], Distortion::None),
+        (1, "PINHOLE", &[50.0, 51.0, 32.0, 24.0], [50.0, 51.0, 32.0, 24.0], Distortion::None),
+        (2, "SIMPLE_RADIAL", &[50.0, 32.0, 24.0, 0.1], [50.0, 50.0, 32.0, 24.0], brown(0.1, 0.0, [0.0; 2])),
+        (2, "SIMPLE_RADIAL", &[50.0, 32.0, 24.0, 0.0], [50.0, 50.0, 32.0, 24.0], Distortion::None),
+        (3, "RADIAL", &[50.0, 32.0, 24.0, 0.1, -0.2], [50.0, 50.0, 32.0, 24.0], brown(0.1, -0.2, [0.0; 2])),
+        (
+            4,
+            "OPENCV",
+            &[50.0, 51.0, 32.0, 24.0, 0.1, -0.2, 0.3, 0.4],
+            [50.0, 51.0, 32.0, 24.0],
+            brown(0.1, -0.2, [0.3, 0.4]),
+        ),
+        (
+            5,
+            "OPENCV_FISHEYE",
+            &[50.0, 51.0, 32.0, 24.0, 0.1, -0.2, 0.3, 0.4],
+            [50.0, 51.0, 32.0, 24.0],
+            Distortion::Fisheye { k: [0.1, -0.2, 0.3, 0.4] },
+        ),
+    ];
+    for (number, model, params, [fx, fy, cx, cy], distortion) in cases {
+        let words: Vec<String> = params.iter().map(f64::to_string).collect();
+        let text = read_text(
+            &format!("# cameras\n7 {model} 64 48 {}\n", words.join(" ")),
+            "3 1 0 0 0 1 2 3 7 with space/a b.jpg\n\n",
+        );
+
+        let mut cameras = 1_u64.to_le_bytes().to_vec();
+        cameras.extend([7_u32.to_le_bytes(), number.to_le_bytes()].concat());
+        cameras.extend([64_u64.to_le_bytes(), 48_u64.to_le_bytes()].concat());
+        cameras.extend(params.iter().flat_map(|p| p.to_le_bytes()));
+        let mut images = 1_u64.to_le_bytes().to_vec();
+        images.extend(3_u32.to_le_bytes());
+        images.extend([1.0_f64, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0].iter().flat_map(|v| v.to_le_bytes()));
+        images.extend(7_u32.to_le_bytes());
+        images.extend(b"with space/a b.jpg\0");
+        images.extend(2_u64.to_le_bytes());
+        images.extend([0xFF; 48]);
+        let binary = read_files(&[("sparse/cameras.bin", &cameras), ("sparse/images.bin", &images)]);
+
+        for set in [text.unwrap(), binary.unwrap()] {
+            let view = &set.views[0];
+            assert_eq!(view.name, "with space/a b.jpg");
+            assert!(view.image_path.ends_with("images/with space/a b.jpg"));
+            assert_eq!(view.position_in_world(), DVec3::new(-1.0, -2.0, -3.0));
+            let camera = view.intrinsics;
+            assert_eq!(
+                (camera.width_px, camera.height_px, camera.distortion),
+                (64, 48, distortion),
+                "{model}"
+            );
+            assert_eq!(
+                [camera.focal_x_px, camera.focal_y_px, camera.centre_x_px, camera.centre_y_px],
+                [fx, fy, cx, cy]
+            );
+        }
+    }
+}
+
+#[test]
+fn colmap_errors_say_what_and_where() {
+    const CAMERA: &str = "1 PINHOLE 64 48 50 50 32 24\n";
+    const IMAGE: &str = "1 1 0 0 0 0 0 0 1 a.jpg\n\n";
+
+    let (place, what) = problem(read_text("# comment\n1 FULL_OPENCV 64 48 1 1 1 1 0 0 0 0 0 0 0 0\n", IMAGE));
+    assert_eq!(place, Place::Line(2));
+    assert_eq!(what, PoseProblem::UnsupportedModel { camera_id: 1, model: "FULL_OPENCV".into() });
+    assert!(what.to_string().contains("image_undistorter"));
+
+    let (place, what) = problem(read_text(CAMERA, "1 1 0 0 0 0 0 0 2 a.jpg\n\n"));
+    assert_eq!(
+        (place, what),
+        (Place::Line(1), PoseProblem::UnknownCamera { image: "a.jpg".into(), camera_id: 2 })
+    );
+
+    let (_, what) = problem(read_text(CAMERA, "1 1.1 0 0 0 0 0 0 1 a.jpg\n\n"));
+    assert!(matches!(what, PoseProblem::NotARotation { image, .. } if image == "a.jpg"));
+    let (_, what) = problem(read_text(CAMERA, "1 NaN 0 0 0 0 0 0 1 a.jpg\n\n"));
+    assert!(matches!(what, PoseProblem::NotARotation { .. }));
+
+    // The features' lines are missing: the second image must not vanish.
+    let (place, _) = problem(read_text(CAMERA, "1 1 0 0 0 0 0 0 1 a.jpg\n2 1 0 0 0 0 0 0 1 b.jpg\n"));
+    assert_eq!(place, Place::Line(2));
+
+    let (_, what) = problem(read_text(CAMERA, &IMAGE.repeat(2)));
+    assert_eq!(what, PoseProblem::DuplicateImage { image: "a.jpg".into() });
+    for name in ["../a.jpg", "/a.jpg", "", "a/../../b.jpg"] {
+        let (_, what) = problem(read_text(CAMERA, &format!("1 1 0 0 0 0 0 0 1 {name}\n\n")));
+        assert!(matches!(what, PoseProblem::UnsafeName { .. }), "{name}: {what}");
+    }
+    for camera in
+        ["1 PINHOLE 0 48 50 50 32 24", "1 PINHOLE 64 48 -50 50 32 24", "1 PINHOLE 64 48 50 50 inf 24"]
+    {
+        let (place, what) = problem(read_text(camera, IMAGE));
+        assert_eq!(place, Place::Line(1));
+        assert!(matches!(what, PoseProblem::BadIntrinsics { .. }), "{camera}: {what}");
+    }
+    assert_eq!(problem(read_text(CAMERA, "# nothing\n")).1, PoseProblem::NoViews);
+    assert_eq!(problem(read_text(&CAMERA.repeat(2), IMAGE)).1, PoseProblem::DuplicateCamera { camera_id: 1 });
+    assert!(matches!(read_files(&[("cameras.txt", b"")]), Err(PoseError::NotFound { .. })));
+}
+
+/// A count of 2D features that the file does not hold, by one record and by overflow.
+#[test]
+fn counts_are_not_believed() {
+    let camera = [&1_u64.to_le_bytes()[..], &1_u32.to_le_bytes(), &0_i32.to_le_bytes()].concat();
+    let sizes = [64_u64.to_le_bytes(), 48_u64.to_le_bytes()].concat();
+    let params: Vec<u8> = [50.0_f64, 32.0, 24.0].iter().flat_map(|v| v.to_le_bytes()).collect();
+    let cameras = [camera, sizes, params].concat();
+    for n_features in [2, u64::MAX / 24, u64::MAX] {
+        let pose = [1.0_f64, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0].iter().flat_map(|v| v.to_le_bytes());
+        let mut images = [&1_u64.to_le_bytes()[..], &3_u32.to_le_bytes()].concat();
+        images.extend(pose.chain(1_u32.to_le_bytes()).chain(*b"a.jpg\0").chain(u64::to_le_bytes(n_features)));
+        images.extend([0; 24]);
+        let (place, what) = problem(read_files(&[("cameras.bin", &cameras), ("images.bin", &images)]));
+        assert_eq!(place, Place::Byte(8 + 4 + 56 + 4 + 6 + 8));
+        assert_eq!(what, PoseProblem::Truncated { expected: "the image's 2D features" });
+    }
+}
+
+fn read_json(json: serde_json::Value) -> Result<ViewSet, PoseError> {
+    read_files(&[("transforms.json", json.to_string().as_bytes())])
+}
+
+fn frame(file_path: &str) -> serde_json::Value {
+    serde_json::json!({"file_path": file_path,
+        "transform_matrix": [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]})
+}
+
+#[test]
+fn transforms_cameras_are_shared_or_a_frames_own() {
+    let mut own = frame("images/b.jpg");
+    own["fl_x"] = 70.into();
+    own["w"] = 100.0.into();
+    own["k1"] = 0.2.into();
+    own["camera_model"] = "OPENCV_FISHEYE".into();
+    let views = read_json(serde_json::json!({
+        "camera_model": "OPENCV", "fl_x": 60.5, "fl_y": 61, "cx": 31, "cy": 25, "w": 64, "h": 48,
+        "k1": 0.1, "p2": 0.3, "applied_transform": [[0, 1, 0, 0]], "frames": [own, frame("images/left/a.jpg")],
+    }))
+    .unwrap()
+    .views;
+    assert_eq!((views[0].name.as_str(), views[1].name.as_str()), ("b.jpg", "left/a.jpg"));
+    let [b, a] = [views[0].intrinsics, views[1].intrinsics];
+    assert_eq!((a.focal_x_px, a.focal_y_px, a.centre_x_px, a.centre_y_px), (60.5, 61.0, 31.0, 25.0));
+    assert_eq!(a.distortion, Distortion::Brown { k: [0.1, 0.0, 0.0], p: [0.0, 0.3] });
+    assert_eq!((b.focal_x_px, b.focal_y_px, b.width_px, b.height_px), (70.0, 61.0, 100, 48));
+    assert_eq!(b.distortion, Distortion::Fisheye { k: [0.2, 0.0, 0.0, 0.0] });
+    // OpenGL looks along -z and has y up: a point 5 ahead and 1 up of the camera.
+    let in_camera = a_point_in_camera(&views[1], DVec3::new(1.0, 3.0, -2.0));
+    assert!((in_camera - DVec3::new(0.0, -1.0, 5.0)).length() < 1e-12, "{in_camera}");
+}
+
+fn a_point_in_camera(view: &View, point_in_world: DVec3) -> DVec3 {
+    view.camera_from_world.transform_point3(point_in_world)
+}
+
+/// NeRF's first data sets: an angle only, no ending, no size.
+#[test]
+fn transforms_with_an_angle_and_bare_names() {
+    let dir = tempfile::tempdir().unwrap();
+    fs_err::create_dir(dir.path().join("train")).unwrap();
+    image::RgbImage::new(40, 30).save(dir.path().join("train/r_0.01.png")).unwrap();
+    let json =
+        serde_json::json!({"camera_angle_x": 90_f64.to_radians(), "frames": [frame("./train/r_0.01")]});
+    fs_err::write(dir.path().join("transforms.json"), json.to_string()).unwrap();
+    let view = &poses::read(dir.path(), None).unwrap().views[0];
+    assert_eq!(view.name, "train/r_0.01.png");
+    assert!(view.image_path.is_file());
+    let camera = view.intrinsics;
+    assert_eq!(
+        (camera.width_px, camera.height_px, camera.centre_x_px, camera.centre_y_px),
+        (40, 30, 20.0, 15.0)
+    );
+    assert!((camera.focal_x_px - 20.0).abs() < 1e-12 && (camera.focal_y_px - 20.0).abs() < 1e-12);
+    assert_eq!(camera.distortion, Distortion::None);
+}
+
+#[test]
+fn transforms_errors_say_what_and_where() {
+    let with = |key: &str, value: serde_json::Value| {
+        let mut json =
+            serde_json::json!({"fl_x": 60, "w": 64, "h": 48, "frames": [frame("a.jpg"), frame("b.jpg")]});
+        json[key] = value;
+        problem(read_json(json))
+    };
+    let (place, what) = with("camera_model", "EQUIRECTANGULAR".into());
+    assert_eq!(
+        (place, what),
+        (Place::Frame(0), PoseProblem::UnsupportedLens { model: "EQUIRECTANGULAR".into() })
+    );
+    assert!(matches!(with("k4", 0.1.into()).1, PoseProblem::UnsupportedLens { .. }));
+    assert!(matches!(with("w", 64.5.into()).1, PoseProblem::BadIntrinsics { .. }));
+    assert!(matches!(
+        with("h", serde_json::Value::Null).1,
+        PoseProblem::MissingIntrinsics { field: "w and h", .. }
+    ));
+    assert!(matches!(with("fl_x", serde_json::Value::Null).1, PoseProblem::MissingIntrinsics { .. }));
+
+    for (row, column, value) in [(0, 0, 1.1), (0, 0, -1.0), (1, 0, 0.1), (3, 3, 2.0)] {
+        let mut bad = frame("b.jpg");
+        bad["transform_matrix"][row][column] = value.into();
+        let (place, what) = with("frames", serde_json::json!([frame("a.jpg"), bad]));
+        assert_eq!(place, Place::Frame(1));
+        let names_it = matches!(&what, PoseProblem::NotARotation { image, .. } if image == "b.jpg");
+        assert!(names_it || row == 3, "{row} {column} {value}: {what}");
+    }
+    let twice = serde_json::json!([frame("images/a.jpg"), frame("images_2/a.jpg")]);
+    assert_eq!(with("frames", twice).1, PoseProblem::DuplicateImage { image: "a.jpg".into() });
+    assert!(matches!(read_files(&[("transforms.json", b"{\"frames\": 3}")]), Err(PoseError::Json { .. })));
+}

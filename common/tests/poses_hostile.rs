@@ -1,0 +1,153 @@
+//! Damaged pose files: an error or a valid result, never a panic, and no allocation that the size
+//! of the file does not justify.
+#![expect(unsafe_code, reason = "a global allocator that measures is unsafe to implement")]
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+
+use slag_common::poses::{self, PoseError};
+
+thread_local! {
+    static LARGEST_BYTES: Cell<usize> = const { Cell::new(0) };
+}
+
+/// The system's allocator, noting the largest request of each thread.
+struct Measuring;
+
+// SAFETY: every call is passed on to the system's allocator unchanged.
+unsafe impl GlobalAlloc for Measuring {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        LARGEST_BYTES.with(|largest| largest.set(largest.get().max(layout.size())));
+        // SAFETY: the caller's promises are the system allocator's.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's promises are the system allocator's.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Measuring = Measuring;
+
+/// Deterministic random numbers (SplitMix64; Steele, Lea and Flood 2014).
+struct Random(u64);
+
+impl Random {
+    fn below(&mut self, n: usize) -> usize {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        ((z ^ (z >> 31)) % n as u64) as usize
+    }
+}
+
+/// A file, whole or with its end cut off, a few bits flipped or eight bytes set to ones.
+fn damaged(bytes: &[u8], random: &mut Random) -> Vec<u8> {
+    let mut bytes = bytes.to_vec();
+    match random.below(3) {
+        0 => bytes.truncate(random.below(bytes.len())),
+        1 => {
+            for _ in 0..=random.below(4) {
+                let at = random.below(bytes.len());
+                bytes[at] ^= 1 << random.below(8);
+            }
+        }
+        _ => {
+            let at = random.below(bytes.len());
+            let end = (at + 8).min(bytes.len());
+            bytes[at..end].fill(0xFF);
+        }
+    }
+    bytes
+}
+
+fn text_model() -> [(&'static str, Vec<u8>); 2] {
+    let cameras =
+        "# Camera list\n1 PINHOLE 1574 884 924 924 787 442\n2 OPENCV 640 480 500 500 320 240 0.1 0.2 0 0\n";
+    let images = "1 0.6 0.8 0 0 1.5 2.5 3.5 1 a.jpg\n1.5 2.5 -1 3.5 4.5 17\n2 1 0 0 0 0 0 0 2 left/b.jpg\n\n";
+    [("cameras.txt", cameras.into()), ("images.txt", images.into())]
+}
+
+fn binary_model() -> [(&'static str, Vec<u8>); 2] {
+    let numbers = |values: &[f64]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
+    let camera = |id: u32, model: i32, params: &[f64]| {
+        [
+            &id.to_le_bytes()[..],
+            &model.to_le_bytes(),
+            &640_u64.to_le_bytes(),
+            &480_u64.to_le_bytes(),
+            &numbers(params),
+        ]
+        .concat()
+    };
+    let image = |id: u32, name: &str, n_features: u64| {
+        let mut record = id.to_le_bytes().to_vec();
+        record.extend(numbers(&[0.6, 0.8, 0.0, 0.0, 1.5, 2.5, 3.5]));
+        record.extend(id.to_le_bytes());
+        record.extend(name.bytes().chain([0]));
+        record.extend(n_features.to_le_bytes());
+        record.extend((0..n_features).flat_map(|_| [7_u8; 24]));
+        record
+    };
+    let two = 2_u64.to_le_bytes().to_vec();
+    let cameras =
+        [two.clone(), camera(1, 1, &[500.0, 500.0, 320.0, 240.0]), camera(2, 2, &[500.0, 320.0, 240.0, 0.1])];
+    let images = [two, image(1, "a.jpg", 3), image(2, "left/b.jpg", 0)];
+    [("cameras.bin", cameras.concat()), ("images.bin", images.concat())]
+}
+
+fn transforms() -> [(&'static str, Vec<u8>); 1] {
+    let json = r#"{"camera_model": "OPENCV", "fl_x": 500.5, "cx": 320, "cy": 240.0, "w": 640, "h": 480, "k1": 0.01,
+        "frames": [{"file_path": "images/a.jpg",
+        "transform_matrix": [[0.0, -1.0, 0, 1.5], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]},
+        {"file_path": "images/b.jpg", "fl_x": 400, "transform_matrix": [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3]]}]}"#;
+    [("transforms.json", json.into())]
+}
+
+/// Reads 1,000 damaged versions of each file; returns how many still gave views.
+fn survive(files: &[(&str, Vec<u8>)]) -> usize {
+    let dir = tempfile::tempdir().unwrap();
+    let write = |name: &str, bytes: &[u8]| fs_err::write(dir.path().join(name), bytes).unwrap();
+    files.iter().for_each(|(name, bytes)| write(name, bytes));
+    assert_eq!(poses::read(dir.path(), None).unwrap().views.len(), 2);
+    let mut n_read = 0;
+    for (name, bytes) in files {
+        let mut random = Random(bytes.len() as u64);
+        for round in 0..1_000 {
+            let bad = damaged(bytes, &mut random);
+            write(name, &bad);
+            LARGEST_BYTES.set(0);
+            let result = poses::read(dir.path(), None);
+            let largest_bytes = LARGEST_BYTES.get();
+            // The read buffer (8 KiB) and growing lists of small records; counts are never believed.
+            assert!(largest_bytes <= 16_384 + 8 * bad.len(), "{name} {round}: {largest_bytes} bytes");
+            match result {
+                Ok(set) => {
+                    n_read += 1;
+                    for view in &set.views {
+                        assert!(view.camera_from_world.is_finite(), "{name} {round}");
+                        assert!(!view.name.is_empty() && view.intrinsics.focal_x_px > 0.0, "{name} {round}");
+                    }
+                }
+                Err(PoseError::Io(error)) => panic!("{name} {round}: {error}"),
+                Err(error) => assert!(error.to_string().contains(dir.path().to_str().unwrap()), "{error}"),
+            }
+        }
+        write(name, bytes);
+    }
+    n_read
+}
+
+#[test]
+fn damaged_files_are_errors_or_valid() {
+    for (n_files, files) in
+        [(2, text_model().to_vec()), (2, binary_model().to_vec()), (1, transforms().to_vec())]
+    {
+        let n_read = survive(&files);
+        // Both outcomes must occur, or the damage is not what it should be.
+        assert!(n_read > 5 && n_read < 800 * n_files, "{}: {n_read}", files[0].0);
+    }
+}
