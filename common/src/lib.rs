@@ -8,6 +8,7 @@
 pub mod camera;
 pub mod frames;
 pub mod gaussians;
+pub mod splat;
 
 pub use camera::{Distortion, Intrinsics, View};
 pub use gaussians::Gaussians;
