@@ -12,7 +12,7 @@ const ROW_BYTES: usize = 32;
 /// Reads a `.splat` file; the format has no spherical harmonics above degree 0.
 pub(super) fn read(mut input: Input) -> Result<Gaussians, SplatError> {
     let len_bytes = input.len_bytes();
-    if len_bytes == 0 || len_bytes % ROW_BYTES as u64 != 0 {
+    if len_bytes == 0 || !len_bytes.is_multiple_of(ROW_BYTES as u64) {
         return Err(SplatError::malformed(
             input.path(),
             Place::Byte(len_bytes - len_bytes % ROW_BYTES as u64),

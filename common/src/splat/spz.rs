@@ -46,10 +46,11 @@ impl Header {
     /// The fixed part of all versions.
     const BYTES: usize = 16;
 
-    fn parse(path: &Path, raw: &[u8; Self::BYTES]) -> Result<Self, SplatError> {
+    /// Checks the header; `place` makes places of its offsets.
+    fn parse(path: &Path, raw: &[u8; Self::BYTES], place: fn(u64) -> Place) -> Result<Self, SplatError> {
         let word = |i: usize| u32::from_le_bytes([raw[i], raw[i + 1], raw[i + 2], raw[i + 3]]);
         let malformed = |offset, expected: &str, found: String| {
-            Err(SplatError::malformed(path, Place::DecompressedByte(offset), expected, found))
+            Err(SplatError::malformed(path, place(offset), expected, found))
         };
         let header = Self {
             version: word(4),
@@ -184,11 +185,11 @@ pub(super) fn read(mut input: Input, options: ReadOptions) -> Result<Gaussians, 
         stream
             .read_exact(&mut raw)
             .map_err(|source| SplatError::undecodable(&path, Place::Byte(0), "the gzip stream", source))?;
-        let header = Header::parse(&path, &raw)?;
+        let header = Header::parse(&path, &raw, Place::DecompressedByte)?;
         return read_whole(path, header, Box::new(stream), len_bytes, options);
     }
     input.fill(&mut raw, "the SPZ header")?;
-    let header = Header::parse(&path, &raw)?;
+    let header = Header::parse(&path, &raw, Place::Byte)?;
     if header.version < 4 {
         return read_whole(path, header, Box::new(input), len_bytes, options);
     }

@@ -119,6 +119,22 @@ fn spz_in_other_axes_is_refused() {
 }
 
 #[test]
+fn wrong_checksums_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (mut whole, columns) = spz_columns(3, 0, &[]);
+    whole.extend(columns.concat());
+    let (gz, zstd) = (gzip(&whole), spz_v4(0, &[], &[]));
+    // The checksum stands 8 bytes before the end of gzip, and at the end of a Zstandard frame.
+    for (bytes, from_end) in [(gz, 8), (zstd, 4)] {
+        read_bytes(folder.path(), "intact.spz", &bytes).unwrap_or_else(|e| panic!("{e}"));
+        let mut wrong = bytes.clone();
+        wrong[bytes.len() - from_end] ^= 1;
+        let error = read_bytes(folder.path(), "wrong.spz", &wrong).expect_err("is refused").to_string();
+        assert!(error.contains("wrong.spz: byte ") && error.contains("cannot be unpacked"), "{error}");
+    }
+}
+
+#[test]
 fn counts_that_lie_are_refused_before_memory_is_taken() {
     let folder = tempfile::tempdir().expect("a folder");
     let names = "x y z opacity rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2 f_dc_0 f_dc_1 f_dc_2";
