@@ -13,6 +13,7 @@ pub mod hash;
 pub mod manifest;
 pub mod shard;
 pub mod poses;
+pub mod splat;
 
 pub use camera::{Distortion, Intrinsics, View};
 pub use gaussians::Gaussians;

@@ -1,5 +1,16 @@
 //! The cloud side of SLAG as a library: one module per stage of the pipeline.
 
+pub mod cli;
+pub mod embed;
+pub mod encode;
+pub mod generate;
+pub mod ingest;
+pub mod lift;
+pub mod palette;
+pub mod progress;
+pub mod publish;
+pub mod query;
 pub mod raster;
 pub mod segment;
+pub mod shard;
 pub mod store;

@@ -1,2 +1,19 @@
-//! Binary.
-fn main() {}
+//! `slag-encoder`: gives a 3DGS scene a language field, cuts it into shards and serves them.
+
+use std::process::ExitCode;
+
+use clap::Parser;
+use slag_encoder::cli::{self, Cli};
+
+fn main() -> ExitCode {
+    let cli = Cli::parse();
+    tracing_subscriber::fmt()
+        .with_writer(std::io::stderr)
+        .with_env_filter(
+            tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| cli.log_level().into()),
+        )
+        .with_target(false)
+        .without_time()
+        .init();
+    cli::run(cli).into()
+}

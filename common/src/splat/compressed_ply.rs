@@ -1,0 +1,152 @@
+//! Compressed PLY as PlayCanvas has it: element `chunk` with the ranges of 256 Gaussians each,
+//! element `vertex` with four packed words a Gaussian, and optionally element `sh` with bytes.
+
+use glam::DVec3;
+
+use super::ply::sh_rest_properties;
+use super::ply_container::Ply;
+use super::{ReadOptions, SplatError, columns, dc_of_colour, unit_rotation, with_largest};
+use crate::Gaussians;
+
+const GAUSSIANS_PER_CHUNK: usize = 256;
+const RANGES: [&str; 12] = [
+    "min_x",
+    "min_y",
+    "min_z",
+    "max_x",
+    "max_y",
+    "max_z",
+    "min_scale_x",
+    "min_scale_y",
+    "min_scale_z",
+    "max_scale_x",
+    "max_scale_y",
+    "max_scale_z",
+];
+const COLOUR_RANGES: [&str; 6] = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"];
+const PACKED: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
+const EXPORT_AGAIN: &str = "export the compressed PLY again";
+
+/// The ranges of a chunk: minima and maxima of position, log scale and colour.
+#[derive(Clone, Copy)]
+struct Chunk([f32; 18]);
+
+impl Chunk {
+    /// Returns `unit`, 0..=1 on each axis, within the range that starts at entry `start`.
+    fn lerp(&self, start: usize, unit: [f64; 3]) -> [f64; 3] {
+        std::array::from_fn(|axis| {
+            let (min, max) = (f64::from(self.0[start + axis]), f64::from(self.0[start + 3 + axis]));
+            min * (1.0 - unit[axis]) + max * unit[axis]
+        })
+    }
+}
+
+/// Returns the `bits` of `word` from bit `shift` up as a fraction of their maximum.
+fn unit(word: u32, shift: u32, bits: u32) -> f64 {
+    let max = (1 << bits) - 1;
+    f64::from((word >> shift) & max) / f64::from(max)
+}
+
+/// Returns three fractions packed in 11, 10 and 11 bits.
+fn unit_11_10_11(word: u32) -> [f64; 3] {
+    [unit(word, 21, 11), unit(word, 11, 10), unit(word, 0, 11)]
+}
+
+/// Returns the rotation packed as index of the largest component and 10 bits for each other one,
+/// which lie within +-1/sqrt(2).
+fn unpack_rotation(word: u32) -> [f64; 4] {
+    let others = [20, 10, 0].map(|shift| (unit(word, shift, 10) - 0.5) * std::f64::consts::SQRT_2);
+    with_largest((word >> 30) as usize, others)
+}
+
+/// Reads the rows of a file whose header has been read.
+pub(super) fn read(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gaussians, SplatError> {
+    let Some(chunk) = ply.element("chunk") else {
+        return Err(SplatError::malformed(
+            ply.input.path(),
+            ply.input.place(),
+            "a header with an element \"chunk\"",
+            "none",
+        ));
+    };
+    let mut chunk_properties = Vec::new();
+    for name in RANGES {
+        chunk_properties.push(ply.property(chunk, name, EXPORT_AGAIN)?);
+    }
+    // Files of the first version lack them: colours then span 0..=1.
+    let has_colour_ranges = ply.elements[chunk].property(COLOUR_RANGES[0]).is_some();
+    for name in COLOUR_RANGES.into_iter().filter(|_| has_colour_ranges) {
+        chunk_properties.push(ply.property(chunk, name, EXPORT_AGAIN)?);
+    }
+    let mut packed = Vec::new();
+    for name in PACKED {
+        packed.push(ply.property(vertex, name, EXPORT_AGAIN)?);
+    }
+
+    ply.seek_element(chunk)?;
+    let mut chunks = Vec::with_capacity(ply.checked_count(chunk)?);
+    ply.rows(&chunk_properties, |row| {
+        let mut ranges =
+            [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0];
+        ranges.iter_mut().zip(row).for_each(|(range, value)| *range = *value as f32);
+        chunks.push(Chunk(ranges));
+    })?;
+
+    ply.seek_element(vertex)?;
+    let count = ply.checked_count(vertex)?;
+    if count.div_ceil(GAUSSIANS_PER_CHUNK) != chunks.len() {
+        return Err(SplatError::malformed(
+            ply.input.path(),
+            ply.input.place(),
+            format_args!("{} chunks for {count} Gaussians", count.div_ceil(GAUSSIANS_PER_CHUNK)),
+            chunks.len(),
+        ));
+    }
+    let sh = match ply.element("sh") {
+        Some(sh) if options.with_sh_rest => Some((sh, sh_rest_properties(&ply, sh)?)),
+        _ => None,
+    }
+    .filter(|(_, (degree, _))| *degree > 0);
+    // Room for the harmonics only once their bytes are known to be there.
+    let mut out = columns(count, 0);
+    ply.rows(&packed, |row| {
+        let chunk = chunks[out.means_in_world.len() / GAUSSIANS_PER_CHUNK];
+        let word = |i: usize| row[i] as u32;
+        out.means_in_world.push(DVec3::from_array(chunk.lerp(0, unit_11_10_11(word(0)))));
+        out.rotations_wxyz.push(unit_rotation(unpack_rotation(word(1))));
+        out.scales.push(chunk.lerp(6, unit_11_10_11(word(2))).map(|log| log.exp() as f32));
+        let colour = [24, 16, 8].map(|shift| unit(word(3), shift, 8));
+        out.sh_dc.push(chunk.lerp(12, colour).map(dc_of_colour));
+        out.opacities.push(unit(word(3), 0, 8) as f32);
+    })?;
+
+    if let Some((sh, (degree, properties))) = sh {
+        ply.seek_element(sh)?;
+        let sh_count = ply.checked_count(sh)?;
+        if sh_count != count {
+            return Err(SplatError::malformed(
+                ply.input.path(),
+                ply.input.place(),
+                format_args!("{count} rows of element \"sh\""),
+                sh_count,
+            ));
+        }
+        out.sh_degree = degree;
+        out.sh_rest.reserve_exact(count * properties.len());
+        ply.rows(&properties, |row| out.sh_rest.extend(row.iter().map(|byte| unpack_sh(*byte))))?;
+    }
+    Ok(out)
+}
+
+/// Returns a coefficient stored as a byte: buckets of 1/32 within +-4, the first and last of which
+/// stand for the ends themselves.
+fn unpack_sh(byte: f64) -> f32 {
+    let unit = if byte <= 0.0 {
+        0.0
+    } else if byte >= 255.0 {
+        1.0
+    } else {
+        (byte + 0.5) / 256.0
+    };
+    ((unit - 0.5) * 8.0) as f32
+}

@@ -1,0 +1,107 @@
+//! A file read front to back, which knows where it is and how much is left.
+
+use std::io::{self, BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+
+use super::{Place, SplatError};
+
+/// Large enough that system calls do not count, small against the columns.
+const BUFFER_BYTES: usize = 1 << 18;
+
+/// A file open for reading; reading through it keeps count.
+pub(super) struct Input {
+    reader: BufReader<fs_err::File>,
+    path: PathBuf,
+    len_bytes: u64,
+    offset_bytes: u64,
+}
+
+impl Input {
+    /// Opens a file.
+    pub fn open(path: &Path) -> Result<Self, SplatError> {
+        let file = fs_err::File::open(path)?;
+        let len_bytes = file.metadata()?.len();
+        Ok(Self {
+            reader: BufReader::with_capacity(BUFFER_BYTES, file),
+            path: path.into(),
+            len_bytes,
+            offset_bytes: 0,
+        })
+    }
+
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    pub fn len_bytes(&self) -> u64 {
+        self.len_bytes
+    }
+
+    pub fn remaining_bytes(&self) -> u64 {
+        self.len_bytes.saturating_sub(self.offset_bytes)
+    }
+
+    /// Returns the position as a place for an error.
+    pub fn place(&self) -> Place {
+        Place::Byte(self.offset_bytes)
+    }
+
+    /// Returns the next bytes without consuming them, fewer than `n` if the file is shorter; `n` must
+    /// not exceed what a freshly opened file buffers at once.
+    pub fn peek(&mut self, n: usize) -> Result<&[u8], SplatError> {
+        let buffered = self.reader.fill_buf()?;
+        Ok(&buffered[..n.min(buffered.len())])
+    }
+
+    /// Fills `buffer`; the end of the file is an error that names `what` was expected.
+    pub fn fill(&mut self, buffer: &mut [u8], what: &str) -> Result<(), SplatError> {
+        self.require(buffer.len() as u64, what)?;
+        Ok(self.read_exact(buffer)?)
+    }
+
+    /// Steps over `n` bytes.
+    pub fn skip(&mut self, n: u64, what: &str) -> Result<(), SplatError> {
+        self.require(n, what)?;
+        self.reader.seek_relative(n as i64)?;
+        self.offset_bytes += n;
+        Ok(())
+    }
+
+    /// Checks that `n` more bytes are there.
+    pub fn require(&self, n: u64, what: &str) -> Result<(), SplatError> {
+        if n <= self.remaining_bytes() {
+            return Ok(());
+        }
+        Err(SplatError::malformed(
+            &self.path,
+            self.place(),
+            format_args!("{n} bytes of {what}"),
+            format_args!("{} to the end of the file", self.remaining_bytes()),
+        ))
+    }
+
+    /// Reads a line with its line feed into `line`, at most `limit_bytes` of it; empty at the end.
+    pub fn read_line(&mut self, line: &mut Vec<u8>, limit_bytes: u64) -> Result<(), SplatError> {
+        line.clear();
+        Ok(self.take(limit_bytes).read_until(b'\n', line).map(drop)?)
+    }
+}
+
+impl Read for Input {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let n = self.reader.read(buffer)?;
+        self.offset_bytes += n as u64;
+        Ok(n)
+    }
+}
+
+impl BufRead for Input {
+    fn fill_buf(&mut self) -> io::Result<&[u8]> {
+        self.reader.fill_buf()
+    }
+
+    fn consume(&mut self, n: usize) {
+        self.reader.consume(n);
+        self.offset_bytes += n as u64;
+    }
+}

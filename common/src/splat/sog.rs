@@ -1,0 +1,397 @@
+//! SOG (PlayCanvas): a `meta.json` and lossless WebP images with a pixel a Gaussian, loose in a
+//! folder or in a ZIP bundle. Version 2 looks bytes up in codebooks, version 1 (no `version`) spreads
+//! them over ranges.
+
+use std::io::{BufReader, Cursor, Read};
+use std::path::{Component, Path, PathBuf};
+
+use glam::DVec3;
+use image::ImageDecoder;
+use image::codecs::webp::WebPDecoder;
+use serde::Deserialize;
+use zip::ZipArchive;
+
+use super::{Place, ReadOptions, SplatError, columns, plausible_count, sigmoid, unit_rotation, with_largest};
+use crate::Gaussians;
+
+/// Meta files take about 15 kB: three codebooks of 256 numbers.
+const MAX_META_BYTES: u64 = 1 << 20;
+/// Images may be larger than the count asks for by their last rows, or a square of a power of two.
+const SPARE_PIXELS: u64 = 1 << 16;
+/// The palette of harmonics has this many entries a row, and at most 65536: labels have 16 bits.
+const PALETTE_COLUMNS: usize = 64;
+const MAX_PALETTE_ROWS: u64 = 1024;
+/// Alpha of a rotation's pixel when the first component is the largest; up to 255 for the fourth.
+const ROTATION_TAG: u8 = 252;
+
+#[derive(Deserialize)]
+struct Meta {
+    version: Option<u64>,
+    count: Option<u64>,
+    means: Means,
+    scales: Quantised,
+    quats: Files,
+    sh0: Quantised,
+    #[serde(rename = "shN")]
+    sh_rest: Option<Quantised>,
+}
+
+#[derive(Deserialize)]
+struct Means {
+    mins: [f64; 3],
+    maxs: [f64; 3],
+    files: [String; 2],
+    /// Version 1 has the count here.
+    shape: Option<Vec<u64>>,
+}
+
+#[derive(Deserialize)]
+struct Files {
+    files: Vec<String>,
+}
+
+/// How bytes stand for numbers: a codebook (version 2), or a range a channel (version 1).
+#[derive(Deserialize)]
+struct Quantised {
+    codebook: Option<Vec<Option<f64>>>,
+    mins: Option<OneOrMany>,
+    maxs: Option<OneOrMany>,
+    files: Vec<String>,
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum OneOrMany {
+    One(f64),
+    Many(Vec<f64>),
+}
+
+impl OneOrMany {
+    fn get(&self, channel: usize) -> Option<f64> {
+        match self {
+            Self::One(value) => Some(*value),
+            Self::Many(values) => values.get(channel).copied(),
+        }
+    }
+}
+
+impl Quantised {
+    /// Returns the number that each byte of a channel stands for; NaN beyond a short codebook, which
+    /// makes the Gaussians that use it unusable.
+    fn table(&self, channel: usize) -> Option<[f64; 256]> {
+        if let Some(codebook) = &self.codebook {
+            let mut table = [f64::NAN; 256];
+            for (value, entry) in table.iter_mut().zip(codebook) {
+                *value = entry.unwrap_or(f64::NAN);
+            }
+            // Some exporters left null in the first place; PlayCanvas extrapolates it like this.
+            if codebook.first() == Some(&None) {
+                table[0] = table[1] + (table[1] - table[255]) / 255.0;
+            }
+            return Some(table);
+        }
+        let (min, max) = (self.mins.as_ref()?.get(channel)?, self.maxs.as_ref()?.get(channel)?);
+        Some(std::array::from_fn(|byte| min + (max - min) * (byte as f64 / 255.0)))
+    }
+}
+
+/// Where the parts of a SOG are.
+enum Parts {
+    Folder(PathBuf),
+    Bundle(Box<ZipArchive<BufReader<fs_err::File>>>),
+}
+
+/// A SOG whose meta has been read.
+struct Sog {
+    /// The bundle or the meta file, for errors.
+    path: PathBuf,
+    parts: Parts,
+    len_bytes: u64,
+}
+
+/// An image, four bytes a pixel.
+struct Pixels {
+    width: usize,
+    rgba: Vec<u8>,
+}
+
+impl Pixels {
+    fn get(&self, index: usize) -> [u8; 4] {
+        self.rgba.as_chunks().0[index]
+    }
+
+    fn iter(&self, count: usize) -> impl Iterator<Item = [u8; 4]> {
+        self.rgba.as_chunks().0.iter().copied().take(count)
+    }
+}
+
+/// Reads a SOG folder by the path of its meta file.
+pub(super) fn read_folder(meta_path: &Path, options: ReadOptions) -> Result<Gaussians, SplatError> {
+    let folder = meta_path.parent().unwrap_or(Path::new("")).to_path_buf();
+    let len_bytes = fs_err::metadata(meta_path)?.len();
+    let name = meta_path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let mut sog = Sog { path: meta_path.into(), parts: Parts::Folder(folder), len_bytes };
+    let meta = sog.meta(&name)?;
+    for file in meta.files() {
+        sog.len_bytes += fs_err::metadata(sog.path_in_folder(file)?)?.len();
+    }
+    sog.decode(&meta, options)
+}
+
+/// Reads a SOG bundle.
+pub(super) fn read_bundle(path: &Path, options: ReadOptions) -> Result<Gaussians, SplatError> {
+    let file = fs_err::File::open(path)?;
+    let len_bytes = file.metadata()?.len();
+    let archive = ZipArchive::new(BufReader::new(file))
+        .map_err(|source| SplatError::undecodable(path, Place::Byte(0), "the ZIP directory", source))?;
+    let mut sog = Sog { path: path.into(), parts: Parts::Bundle(Box::new(archive)), len_bytes };
+    let meta = sog.meta("meta.json")?;
+    sog.decode(&meta, options)
+}
+
+impl Meta {
+    fn files(&self) -> impl Iterator<Item = &String> {
+        let rest = self.sh_rest.iter().flat_map(|sh| &sh.files);
+        self.means
+            .files
+            .iter()
+            .chain(&self.scales.files)
+            .chain(&self.quats.files)
+            .chain(&self.sh0.files)
+            .chain(rest)
+    }
+}
+
+impl Sog {
+    fn malformed(
+        &self,
+        part: &str,
+        expected: impl std::fmt::Display,
+        found: impl std::fmt::Display,
+    ) -> SplatError {
+        SplatError::malformed(&self.path, Place::Part(part.into()), expected, found)
+    }
+
+    /// Returns where a part lies in the folder, which it must not leave.
+    fn path_in_folder(&self, part: &str) -> Result<PathBuf, SplatError> {
+        let mut components = Path::new(part).components();
+        match (&self.parts, components.next(), components.next()) {
+            (Parts::Folder(folder), Some(Component::Normal(name)), None) => Ok(folder.join(name)),
+            _ => Err(self.malformed("meta.json", "plain names of files", format_args!("{part:?}"))),
+        }
+    }
+
+    /// Returns the bytes of a part, of which there may be `max_bytes`.
+    fn bytes(&mut self, part: &str, max_bytes: u64) -> Result<Vec<u8>, SplatError> {
+        let mut bytes = Vec::new();
+        let failed = |path: &Path, source: std::io::Error| {
+            SplatError::undecodable(path, Place::Part(part.into()), "the part", source)
+        };
+        if let Parts::Folder(_) = self.parts {
+            let file = fs_err::File::open(self.path_in_folder(part)?)?;
+            file.take(max_bytes + 1).read_to_end(&mut bytes)?;
+        } else if let Parts::Bundle(archive) = &mut self.parts {
+            let entry = archive.by_name(part).map_err(|source| {
+                SplatError::undecodable(&self.path, Place::Part(part.into()), "the part", source)
+            })?;
+            entry.take(max_bytes + 1).read_to_end(&mut bytes).map_err(|source| failed(&self.path, source))?;
+        }
+        if bytes.len() as u64 > max_bytes {
+            return Err(self.malformed(part, format_args!("at most {max_bytes} bytes"), "more"));
+        }
+        Ok(bytes)
+    }
+
+    fn meta(&mut self, part: &str) -> Result<Meta, SplatError> {
+        let bytes = self.bytes(part, MAX_META_BYTES)?;
+        serde_json::from_slice(&bytes).map_err(|source| {
+            SplatError::undecodable(&self.path, Place::Part(part.into()), "the meta data", source)
+        })
+    }
+
+    /// Returns the image in the file number `index` of `files`, whose pixels must be within
+    /// `n_pixels`.
+    fn pixels(
+        &mut self,
+        files: &[String],
+        index: usize,
+        n_pixels: std::ops::RangeInclusive<u64>,
+    ) -> Result<Pixels, SplatError> {
+        let Some(part) = files.get(index) else {
+            return Err(self.malformed("meta.json", format_args!("{} files", index + 1), files.len()));
+        };
+        // Four bytes a pixel are what lossless WebP takes without compressing anything.
+        let bytes = self.bytes(part, n_pixels.end() * 5 + SPARE_PIXELS)?;
+        if !is_lossless_webp(&bytes) {
+            return Err(self.malformed(part, "a lossless WebP image", "another image"));
+        }
+        let undecodable = |source| {
+            SplatError::undecodable(&self.path, Place::Part(part.clone()), "the image", Box::new(source))
+        };
+        let decoder = WebPDecoder::new(Cursor::new(bytes)).map_err(undecodable)?;
+        let (width, height) = decoder.dimensions();
+        if !n_pixels.contains(&(u64::from(width) * u64::from(height))) {
+            return Err(self.malformed(
+                part,
+                format_args!("{} to {} pixels", n_pixels.start(), n_pixels.end()),
+                format_args!("{width} x {height}"),
+            ));
+        }
+        let channels = usize::from(decoder.color_type().channel_count());
+        let mut image = vec![0; decoder.total_bytes() as usize];
+        decoder.read_image(&mut image).map_err(undecodable)?;
+        let rgba = match channels {
+            4 => image,
+            _ => image.as_chunks().0.iter().flat_map(|[r, g, b]| [*r, *g, *b, 255]).collect(),
+        };
+        Ok(Pixels { width: width as usize, rgba })
+    }
+
+    /// Returns the tables of the first `N` channels.
+    fn tables<const N: usize>(
+        &self,
+        name: &str,
+        quantised: &Quantised,
+    ) -> Result<[[f64; 256]; N], SplatError> {
+        let mut tables = [[0.0; 256]; N];
+        for (channel, table) in tables.iter_mut().enumerate() {
+            *table = quantised.table(channel).ok_or_else(|| {
+                self.malformed(
+                    "meta.json",
+                    format_args!("`codebook`, or `mins` and `maxs`, in {name:?}"),
+                    "neither",
+                )
+            })?;
+        }
+        Ok(tables)
+    }
+
+    fn decode(&mut self, meta: &Meta, options: ReadOptions) -> Result<Gaussians, SplatError> {
+        let is_v1 = match meta.version {
+            None => true,
+            Some(2) => false,
+            Some(version) => {
+                return Err(SplatError::Unsupported {
+                    path: self.path.clone(),
+                    format: format!("SOG version {version}"),
+                    advice: "export it as SOG version 2, or as PLY",
+                });
+            }
+        };
+        let shape = || meta.means.shape.as_ref().and_then(|shape| shape.first()).copied();
+        let Some(count) = (if is_v1 { shape() } else { meta.count }) else {
+            return Err(self.malformed("meta.json", "the number of Gaussians (`count`)", "none"));
+        };
+        let place = Place::Part("meta.json".into());
+        let degree = if options.with_sh_rest && meta.sh_rest.is_some() { super::MAX_SH_DEGREE } else { 0 };
+        let n = plausible_count(&self.path, place, count, degree, self.len_bytes)?;
+        let n_pixels = count..=count.saturating_mul(2) + SPARE_PIXELS;
+        let mut out = columns(n, 0);
+
+        let low = self.pixels(&meta.means.files, 0, n_pixels.clone())?;
+        let high = self.pixels(&meta.means.files, 1, n_pixels.clone())?;
+        out.means_in_world.extend(low.iter(n).zip(high.iter(n)).map(|(low, high)| {
+            DVec3::from_array(std::array::from_fn(|axis| {
+                let unit = f64::from(u16::from_le_bytes([low[axis], high[axis]])) / 65535.0;
+                let (min, max) = (meta.means.mins[axis], meta.means.maxs[axis]);
+                // Stored is sign(x) ln(|x| + 1).
+                let log = min + (max - min) * unit;
+                log.abs().exp_m1().copysign(log)
+            }))
+        }));
+        drop((low, high));
+
+        let quats = self.pixels(&meta.quats.files, 0, n_pixels.clone())?;
+        out.rotations_wxyz.extend(quats.iter(n).map(|[a, b, c, tag]| match tag.checked_sub(ROTATION_TAG) {
+            Some(largest) => {
+                let others =
+                    [a, b, c].map(|q| (f64::from(q) / 127.5 - 1.0) * std::f64::consts::FRAC_1_SQRT_2);
+                unit_rotation(with_largest(largest.into(), others))
+            }
+            None => [0.0; 4],
+        }));
+        drop(quats);
+
+        let tables: [_; 3] = self.tables("scales", &meta.scales)?;
+        let scales = self.pixels(&meta.scales.files, 0, n_pixels.clone())?;
+        out.scales.extend(
+            scales
+                .iter(n)
+                .map(|codes| std::array::from_fn(|axis| tables[axis][usize::from(codes[axis])].exp() as f32)),
+        );
+        drop(scales);
+
+        let tables: [_; 3] = self.tables("sh0", &meta.sh0)?;
+        let sh0 = self.pixels(&meta.sh0.files, 0, n_pixels.clone())?;
+        out.sh_dc.extend(sh0.iter(n).map(|codes| -> [f32; 3] {
+            std::array::from_fn(|channel| tables[channel][usize::from(codes[channel])] as f32)
+        }));
+        if is_v1 {
+            let [.., logits]: [_; 4] = self.tables("sh0", &meta.sh0)?;
+            out.opacities.extend(sh0.iter(n).map(|codes| sigmoid(logits[usize::from(codes[3])])));
+        } else {
+            out.opacities.extend(sh0.iter(n).map(|codes| (f64::from(codes[3]) / 255.0) as f32));
+        }
+        drop(sh0);
+
+        if let Some(sh_rest) = meta.sh_rest.as_ref().filter(|_| options.with_sh_rest) {
+            self.decode_sh_rest(sh_rest, n, n_pixels, &mut out)?;
+        }
+        Ok(out)
+    }
+
+    /// Decodes the harmonics: each Gaussian has a label, each label a run of pixels in the palette.
+    fn decode_sh_rest(
+        &mut self,
+        sh_rest: &Quantised,
+        count: usize,
+        n_pixels: std::ops::RangeInclusive<u64>,
+        out: &mut Gaussians,
+    ) -> Result<(), SplatError> {
+        let [table]: [_; 1] = self.tables("shN", sh_rest)?;
+        let widest = PALETTE_COLUMNS * Gaussians::sh_rest_per_channel(super::MAX_SH_DEGREE);
+        let palette = self.pixels(&sh_rest.files, 0, 1..=widest as u64 * MAX_PALETTE_ROWS)?;
+        let Some(degree) = (1..=super::MAX_SH_DEGREE)
+            .find(|degree| palette.width == PALETTE_COLUMNS * Gaussians::sh_rest_per_channel(*degree))
+        else {
+            return Err(self.malformed("shN", "a palette 192, 512 or 960 pixels wide", palette.width));
+        };
+        let per_channel = Gaussians::sh_rest_per_channel(degree);
+        let n_entries = palette.rgba.len() / 4 / per_channel;
+        let labels = self.pixels(&sh_rest.files, 1, n_pixels)?;
+        out.sh_degree = degree;
+        out.sh_rest.reserve_exact(count * 3 * per_channel);
+        for [low, high, ..] in labels.iter(count) {
+            let label = usize::from(u16::from_le_bytes([low, high]));
+            if label >= n_entries {
+                return Err(self.malformed("shN", format_args!("labels below {n_entries}"), label));
+            }
+            for pixel in label * per_channel..(label + 1) * per_channel {
+                let [r, g, b, _] = palette.get(pixel);
+                out.sh_rest.extend([r, g, b].map(|code| table[usize::from(code)] as f32));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Returns whether a WebP file has a lossless image and nothing lossy or animated.
+fn is_lossless_webp(bytes: &[u8]) -> bool {
+    let Some((b"RIFF", mut chunks)) = bytes
+        .split_at_checked(4)
+        .and_then(|(riff, rest)| Some((<&[u8; 4]>::try_from(riff).ok()?, rest.get(8..)?)))
+    else {
+        return false;
+    };
+    let mut is_lossless = false;
+    while let Some(([a, b, c, d, l0, l1, l2, l3], rest)) = chunks.split_first_chunk::<8>() {
+        match &[*a, *b, *c, *d] {
+            b"VP8L" => is_lossless = true,
+            b"VP8 " | b"ANMF" => return false,
+            _ => {}
+        }
+        let len = u32::from_le_bytes([*l0, *l1, *l2, *l3]) as usize;
+        chunks = rest.get(len.saturating_add(len % 2)..).unwrap_or_default();
+    }
+    is_lossless
+}

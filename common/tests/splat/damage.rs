@@ -1,0 +1,208 @@
+//! Damaged files of every format: an error that names the file, or columns that agree; never a panic
+//! or memory out of proportion.
+
+#![expect(unsafe_code, reason = "an allocator that counts")]
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::io::Read;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::Path;
+
+use crate::generated::{gzip, write_sog_v1};
+use crate::{assert_columns_agree, read_all, shared};
+
+/// Counts what the current thread has allocated, now and at most.
+struct Counting;
+
+thread_local! {
+    static LIVE_BYTES: Cell<isize> = const { Cell::new(0) };
+    static PEAK_BYTES: Cell<isize> = const { Cell::new(0) };
+}
+
+fn count(change: isize) {
+    let live = LIVE_BYTES.get() + change;
+    LIVE_BYTES.set(live);
+    PEAK_BYTES.set(PEAK_BYTES.get().max(live));
+}
+
+// SAFETY: every call goes to the system's allocator unchanged.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count(layout.size() as isize);
+        // SAFETY: as required of our caller.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        count(layout.size() as isize);
+        // SAFETY: as required of our caller.
+        unsafe { System.alloc_zeroed(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        count(-(layout.size() as isize));
+        // SAFETY: as required of our caller.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// Returns what `work` returns and the most bytes it had allocated at a time.
+pub fn peak_bytes<T>(work: impl FnOnce() -> T) -> (T, usize) {
+    let before = LIVE_BYTES.get();
+    PEAK_BYTES.set(before);
+    let result = work();
+    (result, (PEAK_BYTES.get() - before) as usize)
+}
+
+/// xorshift64*: small, and the same everywhere.
+pub struct Random(pub u64);
+
+impl Random {
+    pub fn next(&mut self) -> u64 {
+        self.0 ^= self.0 >> 12;
+        self.0 ^= self.0 << 25;
+        self.0 ^= self.0 >> 27;
+        self.0.wrapping_mul(0x2545_F491_4F6C_DD1D)
+    }
+
+    fn below(&mut self, n: usize) -> usize {
+        (self.next() % n as u64) as usize
+    }
+}
+
+/// Damages a file: cut short, bits flipped, a word overwritten with an extreme value, a digit of the
+/// text changed. Half of the places lie near the front, where the headers are.
+fn damaged(bytes: &[u8], random: &mut Random) -> Vec<u8> {
+    let mut out = bytes.to_vec();
+    let n_changes = 1 + random.below(4);
+    for _ in 0..n_changes {
+        let reach = if random.below(2) == 0 { out.len().min(1500) } else { out.len() };
+        if reach == 0 {
+            break;
+        }
+        let at = random.below(reach);
+        match random.below(8) {
+            0 => out.truncate(at),
+            1 => {
+                let word = [u32::MAX, 0, 1 << 31, 0x00FF_FFFF, 1 << 20][random.below(5)].to_le_bytes();
+                out.iter_mut().skip(at).zip(word).for_each(|(byte, new)| *byte = new);
+            }
+            2 => {
+                let digits: Vec<_> = (0..reach).filter(|i| out[*i].is_ascii_digit()).collect();
+                if !digits.is_empty() {
+                    let digit = digits[random.below(digits.len())];
+                    out[digit] = b"0123456789eE-. "[random.below(15)];
+                }
+            }
+            _ => out[at] ^= 1 << random.below(8),
+        }
+    }
+    out
+}
+
+/// Reads `path`, whose files have `len_bytes` in all, and asserts the promise.
+fn assert_survives(path: &Path, len_bytes: usize, what: &str) -> bool {
+    let (result, peak) = peak_bytes(|| catch_unwind(AssertUnwindSafe(|| read_all(path))));
+    let result = result.unwrap_or_else(|_| panic!("{what}: panicked"));
+    let most = (64 << 20) + 64 * len_bytes;
+    assert!(peak <= most, "{what}: {peak} bytes allocated for {len_bytes}");
+    match result {
+        Ok(gaussians) => {
+            assert_columns_agree(&gaussians);
+            true
+        }
+        Err(error) => {
+            let text = error.to_string();
+            let folder = path.parent().expect("a file").display().to_string();
+            assert!(text.contains(&folder), "{what}: {text}");
+            false
+        }
+    }
+}
+
+/// Runs `n` damages of one file; `pack` makes the file of the damaged content.
+fn survives_damage(name: &str, content: &[u8], n: u64, pack: impl Fn(&[u8]) -> Vec<u8>) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join(name);
+    let mut n_read = 0;
+    for seed in 1..=n {
+        let file = pack(&damaged(content, &mut Random(seed)));
+        std::fs::write(&path, &file).expect("the temporary folder can be written");
+        n_read += usize::from(assert_survives(&path, file.len(), &format!("{name}, seed {seed}")));
+        // Overwriting instead would make ext4 wait for the disk.
+        std::fs::remove_file(&path).expect("was written");
+    }
+    println!("{name}: {n_read} of {n} still read");
+}
+
+fn fixture(name: &str) -> Option<Vec<u8>> {
+    Some(std::fs::read(shared("fixtures/formats")?.join(name)).expect("the fixture is there"))
+}
+
+#[test]
+fn damaged_files_as_they_are() {
+    for name in [
+        "gsplatrs_minimal_ascii.ply",
+        "gsplatrs_minimal_binary.ply",
+        "playbot_lod6.ply",
+        "playbot_lod6.compressed.ply",
+        "minimal-v2.spz",
+        "minimal-v3.spz",
+        "minimal-v4.spz",
+        "gsplatrs_minimal_v4_degree0.spz",
+        "playbot_lod6_v3.spz",
+        "playbot_lod6_v4.spz",
+        "minimal.splat",
+        "playbot_lod6.splat",
+        "playbot_lod6.sog",
+    ] {
+        let Some(bytes) = fixture(name) else { return };
+        survives_damage(name, &bytes, 1000, <[u8]>::to_vec);
+    }
+}
+
+/// Damage under an intact gzip wrapper, which its checksum would else stop.
+#[test]
+fn damaged_spz_in_intact_gzip() {
+    for name in ["minimal-v2.spz", "playbot_lod6_v3.spz"] {
+        let Some(bytes) = fixture(name) else { return };
+        let mut content = Vec::new();
+        flate2::read::GzDecoder::new(&bytes[..]).read_to_end(&mut content).expect("unpacks");
+        survives_damage(name, &content, 1000, gzip);
+    }
+}
+
+/// Damage in one file of a folder: the checksums of a bundle would else stop it.
+#[test]
+fn damaged_sog_folders() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let Some(bytes) = fixture("playbot_lod6.sog") else { return };
+    let v2 = folder.path().join("v2");
+    zip::ZipArchive::new(std::io::Cursor::new(bytes)).expect("opens").extract(&v2).expect("unpacks");
+    let v1 = folder.path().join("v1");
+    std::fs::create_dir(&v1).expect("the temporary folder can be written");
+    write_sog_v1(&v1);
+    for folder in [v1, v2] {
+        let mut files: Vec<_> =
+            std::fs::read_dir(&folder).expect("lists").map(|f| f.expect("lists").path()).collect();
+        files.sort();
+        let intact: Vec<_> = files.iter().map(|file| std::fs::read(file).expect("reads")).collect();
+        let len_bytes = intact.iter().map(Vec::len).sum();
+        let mut n_read = 0;
+        for seed in 1..=1000 {
+            let index = seed as usize % files.len();
+            let bytes = damaged(&intact[index], &mut Random(seed));
+            std::fs::remove_file(&files[index]).expect("was written");
+            std::fs::write(&files[index], bytes).expect("writes");
+            let what = format!("{}, seed {seed}", files[index].display());
+            n_read += usize::from(assert_survives(&folder.join("meta.json"), len_bytes, &what));
+            std::fs::remove_file(&files[index]).expect("was written");
+            std::fs::write(&files[index], &intact[index]).expect("writes");
+        }
+        println!("{}: {n_read} of 1000 still read", folder.display());
+    }
+}

@@ -1,0 +1,153 @@
+//! All formats against `expected.json`, recorded with splat-transform 2.7.1 and confirmed there by a
+//! second reader, and the trained scenes against a parse of their own layout.
+
+use serde_json::Value;
+use slag_common::splat::{ReadOptions, SplatError, read};
+
+use crate::{assert_columns_agree, assert_near, read_all, shared};
+
+fn numbers(value: &Value) -> Vec<f64> {
+    value.as_array().into_iter().flatten().map(|v| v.as_f64().expect("a number")).collect()
+}
+
+#[test]
+fn every_format_gives_the_recorded_gaussians() {
+    let Some(folder) = shared("fixtures/formats") else { return };
+    let text = std::fs::read(folder.join("expected.json")).expect("expected.json is there");
+    let expected: Value = serde_json::from_slice(&text).expect("expected.json is JSON");
+    let mut n_read = 0;
+    for (name, expected) in expected.as_object().expect("an object") {
+        if name.ends_with(".ksplat") {
+            continue;
+        }
+        let gaussians = read_all(&folder.join(name)).unwrap_or_else(|error| panic!("{error}"));
+        assert_columns_agree(&gaussians);
+        assert_eq!(gaussians.len() as u64, expected["count"], "{name}");
+        assert_eq!(gaussians.sh_degree, expected["sh_degree"], "{name}");
+        assert!((0..gaussians.len()).all(|i| gaussians.is_usable(i)), "{name}");
+        for (side, fold) in [("bbox_min", f64::min as fn(f64, f64) -> f64), ("bbox_max", f64::max)] {
+            for (axis, bound) in numbers(&expected[side]).into_iter().enumerate() {
+                let found = gaussians.means_in_world.iter().map(|m| m[axis]).reduce(fold);
+                assert_near(found.expect("not empty"), bound, 1e-6, &format!("{name} {side}"));
+            }
+        }
+        // .splat has bytes for rotations, and readers take 127.5 or 128 for zero: up to 0.9 degrees
+        // apart, so half of that between quaternions. Else f32 rounding of the recorded values.
+        let rotation_tolerance = if name.ends_with(".splat") { 0.008 } else { 2e-6 };
+        for row in expected["gaussians"].as_array().expect("an array") {
+            let i = row["index"].as_u64().expect("an index") as usize;
+            let what = |field: &str| format!("{name} {i} {field}");
+            for (axis, x) in numbers(&row["position"]).into_iter().enumerate() {
+                // f32 rounding: ours is f64.
+                assert_near(gaussians.means_in_world[i][axis], x, 2e-7, &what("position"));
+            }
+            for (axis, s) in numbers(&row["scale"]).into_iter().enumerate() {
+                // Relative: the recorded logarithms, up to 10, have f32 rounding of 1e-6.
+                assert_near(f64::from(gaussians.scales[i][axis]) / s, 1.0, 2e-6, &what("scale"));
+            }
+            let opacity = row["opacity"].as_f64().expect("a number");
+            // The recorded ones went through a logit clamped at 1e-6 and 1 - 1e-6.
+            assert_near(gaussians.opacities[i].into(), opacity, 1.1e-6, &what("opacity"));
+            for (channel, c) in numbers(&row["f_dc"]).into_iter().enumerate() {
+                assert_near(gaussians.sh_dc[i][channel].into(), c, 5e-7, &what("f_dc"));
+            }
+            let q = numbers(&row["rotation_wxyz"]);
+            let distance = |sign: f64| {
+                let found = gaussians.rotations_wxyz[i].iter().map(|q| f64::from(*q) * sign);
+                found.zip(&q).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+            };
+            assert!(distance(1.0).min(distance(-1.0)) <= rotation_tolerance, "{}", what("rotation"));
+            let rest = numbers(&row["f_rest"]);
+            let k = rest.len() / 3;
+            for (j, c) in rest.into_iter().enumerate() {
+                let found = gaussians.sh_rest[(i * k + j % k) * 3 + j / k];
+                assert_near(found.into(), c, 2e-7, &what("f_rest"));
+            }
+        }
+        n_read += 1;
+    }
+    assert_eq!(n_read, 14, "files with recorded values");
+}
+
+#[test]
+fn a_folder_is_read_as_its_meta_file() {
+    let Some(folder) = shared("fixtures/formats/playbot_lod3_sog") else { return };
+    let by_folder = read_all(&folder).expect("reads");
+    assert_eq!(by_folder.len(), 31_000);
+    assert_eq!(by_folder, read_all(&folder.join("meta.json")).expect("reads"));
+}
+
+#[test]
+fn higher_harmonics_are_left_out_unless_asked_for() {
+    let Some(folder) = shared("fixtures/formats") else { return };
+    for name in ["lod6.ply", "lod6.compressed.ply", "lod6_v3.spz", "lod6_v4.spz", "lod6.sog"] {
+        let path = folder.join(format!("playbot_{name}"));
+        let mut full = read_all(&path).expect("reads");
+        assert_eq!((full.sh_degree, full.sh_rest.len()), (2, 1873 * 24), "{name}");
+        (full.sh_degree, full.sh_rest) = (0, Vec::new());
+        assert_eq!(read(&path, &ReadOptions::default()).expect("reads"), full, "{name}");
+    }
+}
+
+#[test]
+fn small_ply_files_with_another_order_of_properties() {
+    let Some(folder) = shared("fixtures/formats") else { return };
+    let text = std::fs::read_to_string(folder.join("gsplatrs_minimal_ascii.ply")).expect("is there");
+    let rows = text.lines().skip_while(|line| *line != "end_header").skip(1);
+    let ascii = read_all(&folder.join("gsplatrs_minimal_ascii.ply")).expect("reads");
+    let binary = read_all(&folder.join("gsplatrs_minimal_binary.ply")).expect("reads");
+    assert_eq!((ascii.len(), binary.len()), (3, 3));
+    for (i, row) in rows.enumerate() {
+        let v: Vec<f64> = row.split_whitespace().map(|word| word.parse().expect("a number")).collect();
+        for gaussians in [&ascii, &binary] {
+            assert_near(gaussians.means_in_world[i].z, v[2], 1e-7, "z");
+            assert_near(gaussians.opacities[i].into(), 1.0 / (1.0 + (-v[3]).exp()), 1e-7, "opacity");
+            assert_near(gaussians.scales[i][1].into(), v[5].exp(), 1e-7, "scale");
+            assert_near(gaussians.rotations_wxyz[i][0].into(), v[7], 1e-7, "w");
+            assert_near(gaussians.sh_dc[i][2].into(), v[13], 1e-7, "blue");
+        }
+    }
+}
+
+/// Oracle: the layout of these files, 17 floats a row, read by position and decoded in f64.
+#[test]
+fn trained_scenes_row_by_row() {
+    for (scene, count) in [("brighton", 149_097), ("house_a", 104_878)] {
+        let Some(path) = shared(&format!("scenes/{scene}/point_cloud.ply")) else { return };
+        let gaussians = read_all(&path).unwrap_or_else(|error| panic!("{error}"));
+        assert_columns_agree(&gaussians);
+        assert_eq!((gaussians.len(), gaussians.sh_degree), (count, 0));
+        let bytes = std::fs::read(&path).expect("is there");
+        let rows = &bytes[bytes.len() - count * 68..];
+        assert!(bytes[..bytes.len() - count * 68].ends_with(b"end_header\n"));
+        for (i, row) in rows.chunks_exact(68).enumerate() {
+            let v: [f64; 17] = std::array::from_fn(|j| {
+                f32::from_le_bytes(row[4 * j..4 * j + 4].try_into().expect("4 bytes")).into()
+            });
+            assert_eq!(gaussians.means_in_world[i].to_array(), v[0..3], "{scene} {i}");
+            assert_eq!(gaussians.sh_dc[i].map(f64::from), v[6..9], "{scene} {i}");
+            assert_near(gaussians.opacities[i].into(), 1.0 / (1.0 + (-v[9]).exp()), 1e-7, scene);
+            let norm = v[13..17].iter().map(|q| q * q).sum::<f64>().sqrt();
+            for j in 0..4 {
+                assert_near(gaussians.rotations_wxyz[i][j].into(), v[13 + j] / norm, 1e-7, scene);
+            }
+            for j in 0..3 {
+                assert_near(f64::from(gaussians.scales[i][j]) / v[10 + j].exp(), 1.0, 1e-7, scene);
+            }
+        }
+    }
+}
+
+#[test]
+fn refusals_say_what_to_do() {
+    let Some(folder) = shared("fixtures/formats") else { return };
+    let error = read_all(&folder.join("minimal.ksplat")).expect_err("is refused");
+    assert!(matches!(error, SplatError::Unsupported { .. }));
+    let text = error.to_string();
+    assert!(text.contains("minimal.ksplat: .ksplat is not supported; convert it"), "{text}");
+    let error = read_all(&folder.join("README.md")).expect_err("is refused");
+    assert!(error.to_string().contains("README.md: byte 0: expected a PLY"), "{error}");
+    let error = read_all(&folder.join("absent.ply")).expect_err("is refused");
+    assert!(matches!(error, SplatError::Io { .. }));
+    assert!(error.to_string().contains("absent.ply"), "{error}");
+}

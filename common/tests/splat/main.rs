@@ -1,0 +1,54 @@
+//! Splat files against recorded values of other readers, own oracles, and damage.
+
+mod damage;
+mod formats;
+mod generated;
+mod memory;
+mod ply_variants;
+
+use std::path::{Path, PathBuf};
+
+use slag_common::Gaussians;
+use slag_common::splat::{ReadOptions, SplatError, read};
+
+/// Returns a path in the shared test data, or `None`, with a note, where that is absent.
+fn shared(path: &str) -> Option<PathBuf> {
+    let root = std::env::var_os("SLAG_SHARED")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared"), PathBuf::from);
+    if root.is_dir() {
+        return Some(root.join(path));
+    }
+    assert!(std::env::var("CI").as_deref() != Ok("true"), "{} is absent", root.display());
+    println!("skipped: ../shared is absent");
+    None
+}
+
+fn read_all(path: &Path) -> Result<Gaussians, SplatError> {
+    read(path, &ReadOptions { with_sh_rest: true })
+}
+
+/// Writes `bytes` to a file in `folder` and reads it.
+fn read_bytes(folder: &Path, name: &str, bytes: &[u8]) -> Result<Gaussians, SplatError> {
+    let path = folder.join(name);
+    std::fs::write(&path, bytes).expect("the temporary folder can be written");
+    read_all(&path)
+}
+
+fn assert_columns_agree(gaussians: &Gaussians) {
+    let n = gaussians.len();
+    let rest = n * 3 * Gaussians::sh_rest_per_channel(gaussians.sh_degree);
+    let lengths = [
+        gaussians.rotations_wxyz.len(),
+        gaussians.scales.len(),
+        gaussians.opacities.len(),
+        gaussians.sh_dc.len(),
+    ];
+    assert_eq!((lengths, gaussians.sh_rest.len()), ([n; 4], rest));
+}
+
+/// Asserts that `found` is within `tolerance` of `expected`, relative to 1 or the value if larger.
+#[track_caller]
+fn assert_near(found: f64, expected: f64, tolerance: f64, what: &str) {
+    let error = (found - expected).abs() / expected.abs().max(1.0);
+    assert!(error <= tolerance, "{what}: found {found}, expected {expected}");
+}

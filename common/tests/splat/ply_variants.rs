@@ -1,0 +1,191 @@
+//! PLY in every encoding, type and order of properties, and the writer.
+
+use slag_common::Gaussians;
+use slag_common::splat::ply;
+
+use crate::{assert_columns_agree, assert_near, read_all, read_bytes, shared};
+
+/// The properties and rows of a plain PLY of floats, parsed by hand.
+fn rows_of(bytes: &[u8]) -> (Vec<String>, Vec<Vec<f32>>) {
+    let end = bytes.windows(11).position(|w| w == b"end_header\n").expect("a header") + 11;
+    let names: Vec<_> = String::from_utf8_lossy(&bytes[..end])
+        .lines()
+        .filter_map(|line| line.strip_prefix("property float ").map(String::from))
+        .collect();
+    let floats =
+        |row: &[u8]| row.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().expect("4"))).collect();
+    let rows = bytes[end..].chunks_exact(4 * names.len()).map(floats).collect();
+    (names, rows)
+}
+
+/// Writes rows as the test asks: properties in reverse order between foreign ones, behind a foreign
+/// element with lists.
+fn variant(encoding: &str, kind: &str, names: &[String], rows: &[Vec<f32>]) -> Vec<u8> {
+    let mut out = format!("ply\r\nformat {encoding} 1.0\r\ncomment made here\r\nelement face 2\r\n");
+    out += "property double area\r\nproperty list uchar int vertex_indices\r\nproperty uchar flag\r\n";
+    out += &format!("element vertex {}\r\nproperty uchar tag\r\n", rows.len());
+    for name in names.iter().rev() {
+        out += &format!("property {kind} {name}\r\n");
+    }
+    out += "property short weight\r\nelement tail 1\r\nproperty int last\r\nend_header\r\n";
+    let mut out = out.into_bytes();
+    if encoding == "ascii" {
+        out.extend(b"0.5 3 7 8 9 1\n0.25 0 0\n\n");
+        for row in rows {
+            let words: Vec<_> = row.iter().rev().map(f32::to_string).collect();
+            out.extend(format!("7 {} -3\n", words.join(" ")).bytes());
+        }
+        out.extend(b"1\n");
+        return out;
+    }
+    let big = encoding == "binary_big_endian";
+    let mut put = |bytes: &[u8]| match big {
+        true => out.extend(bytes.iter().rev()),
+        false => out.extend(bytes),
+    };
+    for items in [3, 0] {
+        put(&0.5_f64.to_le_bytes());
+        put(&[items]);
+        (0..i32::from(items)).for_each(|item| put(&item.to_le_bytes()));
+        put(&[1]);
+    }
+    for row in rows {
+        put(&[7]);
+        for value in row.iter().rev() {
+            match kind {
+                "double" => put(&f64::from(*value).to_le_bytes()),
+                _ => put(&value.to_le_bytes()),
+            }
+        }
+        put(&(-3_i16).to_le_bytes());
+    }
+    put(&1_i32.to_le_bytes());
+    out
+}
+
+#[test]
+fn encodings_types_and_orders_give_the_same_gaussians() {
+    let Some(path) = shared("fixtures/formats/playbot_lod6.ply") else { return };
+    let expected = read_all(&path).expect("reads");
+    let (names, rows) = rows_of(&std::fs::read(&path).expect("is there"));
+    assert_eq!((names.len(), rows.len()), (38, 1873));
+    let folder = tempfile::tempdir().expect("a folder");
+    for (encoding, kind) in [
+        ("binary_little_endian", "float"),
+        ("binary_little_endian", "double"),
+        ("binary_big_endian", "float"),
+        ("binary_big_endian", "float64"),
+    ] {
+        let bytes = variant(encoding, kind.trim_end_matches("64"), &names, &rows);
+        let bytes = if kind == "float64" { variant(encoding, "double", &names, &rows) } else { bytes };
+        let found = read_bytes(folder.path(), "variant.ply", &bytes).unwrap_or_else(|e| panic!("{e}"));
+        assert!(found == expected, "{encoding} {kind}");
+    }
+    // ASCII is read in f64, so digits beyond f32 differ in the last place.
+    let bytes = variant("ascii", "float", &names, &rows);
+    let found = read_bytes(folder.path(), "variant.ply", &bytes).unwrap_or_else(|e| panic!("{e}"));
+    assert_eq!((found.len(), found.sh_degree), (1873, 2));
+    for i in 0..found.len() {
+        assert!((found.means_in_world[i] - expected.means_in_world[i]).length() < 1e-6);
+        assert_near(found.opacities[i].into(), expected.opacities[i].into(), 1e-7, "opacity");
+    }
+    assert_eq!(found.sh_rest, expected.sh_rest);
+}
+
+#[test]
+fn plain_colours_stand_in_for_harmonics() {
+    let header = "ply\nformat ascii 1.0\nelement vertex 1\n";
+    let names = "x y z opacity rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2";
+    let floats: String = names.split(' ').map(|name| format!("property float {name}\n")).collect();
+    let colours = "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n";
+    let text = format!("{header}{floats}{colours}1 2 3 0 2 0 0 0 0 0 0 255 0 51\n");
+    let folder = tempfile::tempdir().expect("a folder");
+    let found = read_bytes(folder.path(), "rgb.ply", text.as_bytes()).unwrap_or_else(|e| panic!("{e}"));
+    for (found, expected) in found.rgb_dc(0).into_iter().zip([1.0, 0.0, 0.2]) {
+        assert_near(found.into(), expected, 1e-6, "colour");
+    }
+    assert_eq!((found.opacities[0], found.rotations_wxyz[0]), (0.5, [1.0, 0.0, 0.0, 0.0]));
+}
+
+#[test]
+fn rows_that_cannot_be_drawn_keep_their_place() {
+    let header = "ply\nformat ascii 1.0\nelement vertex 4\n";
+    let names = "x y z opacity rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2 f_dc_0 f_dc_1 f_dc_2";
+    let floats: String = names.split(' ').map(|name| format!("property float {name}\n")).collect();
+    let rows = "nan 0 0 0 1 0 0 0 0 0 0 0 0 0\n0 0 0 0 0 0 0 0 0 0 0 0 0 0\n\
+                0 0 0 inf 1 0 0 0 -inf 0 0 0 0 0\n0 0 0 0 1 0 0 0 inf 0 0 0 0 0\n";
+    let folder = tempfile::tempdir().expect("a folder");
+    let text = format!("{header}{floats}end_header\n{rows}");
+    let found = read_bytes(folder.path(), "odd.ply", text.as_bytes()).unwrap_or_else(|e| panic!("{e}"));
+    assert_eq!([0, 1, 2, 3].map(|i| found.is_usable(i)), [false, false, true, false]);
+    assert_eq!((found.opacities[2], found.scales[2][0]), (1.0, 0.0));
+}
+
+#[test]
+fn missing_properties_are_named() {
+    let text = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n\
+                property float z\nend_header\n1 2 3\n";
+    let folder = tempfile::tempdir().expect("a folder");
+    let error = read_bytes(folder.path(), "cloud.ply", text.as_bytes()).expect_err("is refused").to_string();
+    assert!(error.contains("cloud.ply: line 7: expected a header with property \"rot_0\""), "{error}");
+    assert!(error.ends_with("pass the splat's PLY"), "{error}");
+}
+
+/// Random Gaussians of a degree, with the ends of the ranges among them.
+fn random_gaussians(n: usize, sh_degree: u8) -> Gaussians {
+    let mut random = crate::damage::Random(7);
+    let mut unit = || random.next() as f32 / u64::MAX as f32;
+    let mut out = Gaussians { sh_degree, ..Gaussians::default() };
+    for i in 0..n {
+        out.means_in_world.push(glam::DVec3::from_array([0; 3].map(|_| f64::from(unit() * 200.0 - 100.0))));
+        let q = [0; 4].map(|_| unit() - 0.5);
+        let norm = q.iter().map(|q| q * q).sum::<f32>().sqrt();
+        out.rotations_wxyz.push(q.map(|q| q / norm));
+        out.scales.push([unit() * 3.0, unit() * 1e-4, if i == 0 { 0.0 } else { unit() }]);
+        out.opacities.push(if i < 2 { i as f32 } else { unit() });
+        out.sh_dc.push([0; 3].map(|_| unit() * 4.0 - 2.0));
+        out.sh_rest.extend((0..3 * Gaussians::sh_rest_per_channel(sh_degree)).map(|_| unit() - 0.5));
+    }
+    out
+}
+
+#[test]
+fn what_is_written_is_read_back() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for degree in 0..=3 {
+        let path = folder.path().join(format!("{degree}.ply"));
+        let written = random_gaussians(300, degree);
+        ply::write(&path, &written).expect("writes");
+        let found = read_all(&path).unwrap_or_else(|error| panic!("{error}"));
+        assert_columns_agree(&found);
+        assert_eq!((found.len(), found.sh_degree), (300, degree));
+        assert_eq!((&found.means_in_world, &found.sh_dc), (&written.means_in_world, &written.sh_dc));
+        assert_eq!(found.sh_rest, written.sh_rest);
+        assert_eq!((found.opacities[0], found.opacities[1], found.scales[0][2]), (0.0, 1.0, 0.0));
+        for i in 0..300 {
+            // f32 logarithms down to -18 lose up to 1e-6 of the value.
+            for (found, written) in found.scales[i].into_iter().zip(written.scales[i]) {
+                assert!((found - written).abs() <= 2e-6 * written, "{found} {written}");
+            }
+            assert_near(found.opacities[i].into(), written.opacities[i].into(), 2e-7, "opacity");
+            for (found, written) in found.rotations_wxyz[i].into_iter().zip(written.rotations_wxyz[i]) {
+                assert_near(found.into(), written.into(), 2e-7, "rotation");
+            }
+        }
+        // The layout itself, by name and place: the reader alone would not see a consistent swap.
+        let (names, rows) = rows_of(&std::fs::read(&path).expect("is there"));
+        let per_channel = Gaussians::sh_rest_per_channel(degree);
+        assert_eq!(names.len(), 17 + 3 * per_channel);
+        assert_eq!(names[..9].join(" "), "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2");
+        let tail = "opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3";
+        assert_eq!(names[9 + 3 * per_channel..].join(" "), tail);
+        for j in 0..3 * per_channel {
+            let (channel, coefficient) = (j / per_channel, j % per_channel);
+            assert_eq!(rows[5][9 + j], written.sh_rest[(5 * per_channel + coefficient) * 3 + channel]);
+        }
+        let opacity = f64::from(written.opacities[5]);
+        let logit = (opacity / (1.0 - opacity)).ln();
+        assert_near(rows[5][9 + 3 * per_channel].into(), logit, 1e-6, "logit");
+        assert_near(rows[5][10 + 3 * per_channel].into(), f64::from(written.scales[5][0]).ln(), 1e-6, "log");
+    }
+}

@@ -1,0 +1,354 @@
+//! The flags.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+
+use crate::embed::Background;
+use crate::raster::WeightKind;
+
+/// Makes 3D Gaussian splatting scenes searchable by words.
+#[derive(Debug, Parser)]
+#[command(version, propagate_version = true)]
+pub struct Cli {
+    /// Prints less: no progress, warnings only.
+    #[arg(long, short, global = true)]
+    quiet: bool,
+    /// Prints the result, or the error, as one JSON object.
+    #[arg(long, global = true)]
+    pub json: bool,
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+impl Cli {
+    /// Returns the log level where RUST_LOG does not say otherwise.
+    pub fn log_level(&self) -> &'static str {
+        if self.quiet { "warn" } else { "info" }
+    }
+
+    /// Returns whether progress may be shown.
+    pub fn shows_progress(&self) -> bool {
+        !self.quiet && !self.json
+    }
+}
+
+/// What the program can do.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Renders the scene at sample views and compares it with the photos: do poses and scene fit?
+    Check(CheckArgs),
+    /// Encodes a scene into a store.
+    Encode(Box<EncodeArgs>),
+    /// Scores every Gaussian of a store against a text, in full precision.
+    Query(QueryArgs),
+    /// Serves a store's manifest and shards over HTTP.
+    Serve(ServeArgs),
+    /// Pushes a store elsewhere.
+    #[command(subcommand)]
+    Push(PushCommand),
+    /// Writes a furnished room as splat, photos, poses and truth.
+    Generate(GenerateArgs),
+    /// Generates a room, encodes, serves, fetches and asks: the whole system in one command.
+    Demo(DemoArgs),
+}
+
+/// Where models come from.
+#[derive(Clone, Debug, Args)]
+pub struct ModelArgs {
+    /// Model directory (with model.toml); the built-in stand-in if absent.
+    #[arg(long, value_name = "DIR")]
+    pub models: Option<PathBuf>,
+    /// ONNX Runtime library; searched beside the program and by the system if absent.
+    #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
+    pub runtime: Option<PathBuf>,
+}
+
+/// Scene, poses, photos.
+#[derive(Debug, Args)]
+pub struct InputArgs {
+    /// Splat: .ply, .spz, compressed .ply, .sog (file or folder) or .splat.
+    #[arg(long, value_name = "FILE")]
+    pub scene: PathBuf,
+    /// Poses: a COLMAP model's folder or a nerfstudio transforms.json.
+    #[arg(long, value_name = "PATH")]
+    pub views: PathBuf,
+    /// Photos, where they are not beside the poses.
+    #[arg(long, value_name = "DIR")]
+    pub images: Option<PathBuf>,
+    /// Treats a missing or unreadable photo or mask as an error instead of leaving the view out.
+    #[arg(long)]
+    pub strict: bool,
+}
+
+/// `check`.
+#[derive(Debug, Args)]
+pub struct CheckArgs {
+    /// Scene, poses, photos.
+    #[command(flatten)]
+    pub input: InputArgs,
+    /// Views to render, evenly spread.
+    #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..))]
+    pub samples: u32,
+    /// Width to render at, pixels.
+    #[arg(long, value_name = "PX", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(16..=8192))]
+    pub raster_width: u32,
+    /// Writes photo and rendering side by side as PNG into this folder.
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+}
+
+/// `encode`.
+#[derive(Debug, Args)]
+pub struct EncodeArgs {
+    /// Scene, poses, photos.
+    #[command(flatten)]
+    pub input: InputArgs,
+    /// Models.
+    #[command(flatten)]
+    pub models: ModelArgs,
+    /// Store to publish into; made if absent.
+    #[arg(long, value_name = "DIR")]
+    pub store: PathBuf,
+    /// `auto` for the built-in segmenter, or a folder of masks: id PNGs or COCO RLE JSON.
+    #[arg(long, value_name = "auto|DIR", default_value = "auto")]
+    pub masks: String,
+    /// Ids of mask PNGs that are no mask, beside 0.
+    #[arg(long, value_name = "ID", value_delimiter = ',')]
+    pub ignore_mask_ids: Vec<u32>,
+    /// Bundle of the method's choices. `paper`: blend weights, white background, plain average.
+    #[arg(long, value_enum, default_value = "paper")]
+    pub preset: Preset,
+    /// What fills a crop outside its mask; the preset's if absent.
+    #[arg(long, value_enum)]
+    pub background: Option<BackgroundArg>,
+    /// Weight that is summed; the preset's if absent. `falloff` is the paper's formula as printed.
+    #[arg(long, value_enum)]
+    pub weights: Option<WeightsArg>,
+    /// Views to use at most, evenly spread.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    pub views_limit: Option<u32>,
+    /// Width at which weights are rasterised; the photo's own, at most 1024, if absent.
+    #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
+    pub raster_width: Option<u32>,
+    /// Masks with fewer pixels are left out.
+    #[arg(long, value_name = "PX", default_value_t = 200)]
+    pub min_mask_px: u32,
+    /// Threads; all cores if absent.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub threads: Option<u32>,
+    /// Working memory for sums and region vectors: a number with KiB, MiB or GiB.
+    #[arg(long, value_name = "BYTES", default_value = "2GiB", value_parser = parse_bytes)]
+    pub memory: u64,
+    /// Name of the scene; the store's folder name if absent.
+    #[arg(long, value_name = "NAME")]
+    pub name: Option<String>,
+    /// Says that world units are metres (a geo-reference says so too).
+    #[arg(long)]
+    pub metric: bool,
+    /// Geo-reference JSON: {"origin": {"lat", "lon", "alt"}} of the world's east-north-up frame.
+    #[arg(long, value_name = "FILE")]
+    pub geo: Option<PathBuf>,
+    /// Gaussians a cell at most.
+    #[arg(long, value_name = "N", default_value_t = 65_536, value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    pub cell_gaussians: u32,
+    /// Width of a cell at most, metres, in metric scenes.
+    #[arg(long, value_name = "M", default_value_t = 25.0)]
+    pub cell_width_m: f64,
+    /// Palette rows a cell at most.
+    #[arg(long, value_name = "N", default_value_t = 1024, value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    pub palette_rows: u32,
+    /// Root-mean-square distance of embeddings from their palette row that is good enough.
+    #[arg(long, value_name = "R", default_value_t = 0.1)]
+    pub palette_rms: f32,
+    /// Days after which robots refuse the manifest; never if absent.
+    #[arg(long, value_name = "DAYS")]
+    pub expires_days: Option<u32>,
+    /// Drops an unfinished encode of other inputs or settings.
+    #[arg(long)]
+    pub restart: bool,
+}
+
+/// Bundles of choices.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Preset {
+    /// The paper's method.
+    Paper,
+}
+
+impl Preset {
+    /// Returns the background and the weight that the preset stands for.
+    pub fn choices(self) -> (Background, WeightKind) {
+        match self {
+            Self::Paper => (Background::White, WeightKind::Blend),
+        }
+    }
+}
+
+/// `--background`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum BackgroundArg {
+    /// White.
+    White,
+    /// Mid-grey.
+    Grey,
+    /// The photo, blurred.
+    Blur,
+    /// The photo as it is.
+    Keep,
+}
+
+impl From<BackgroundArg> for Background {
+    fn from(arg: BackgroundArg) -> Self {
+        match arg {
+            BackgroundArg::White => Self::White,
+            BackgroundArg::Grey => Self::Grey,
+            BackgroundArg::Blur => Self::Blur,
+            BackgroundArg::Keep => Self::Keep,
+        }
+    }
+}
+
+/// `--weights`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum WeightsArg {
+    /// Alpha times transmittance: what a Gaussian contributes to the picture.
+    Blend,
+    /// The Gaussian's falloff alone.
+    Falloff,
+}
+
+impl From<WeightsArg> for WeightKind {
+    fn from(arg: WeightsArg) -> Self {
+        match arg {
+            WeightsArg::Blend => Self::Blend,
+            WeightsArg::Falloff => Self::Falloff,
+        }
+    }
+}
+
+/// `query`.
+#[derive(Debug, Args)]
+pub struct QueryArgs {
+    /// Store.
+    #[arg(long, value_name = "DIR")]
+    pub store: PathBuf,
+    /// Models; the same that the store was encoded with.
+    #[command(flatten)]
+    pub models: ModelArgs,
+    /// What to look for.
+    pub text: String,
+    /// Gaussians to print, best first.
+    #[arg(long, default_value_t = 10)]
+    pub limit: u32,
+    /// Writes every Gaussian's score, in the input's order, as a NumPy array (NaN: no evidence).
+    #[arg(long, value_name = "FILE")]
+    pub scores: Option<PathBuf>,
+}
+
+/// `serve`.
+#[derive(Debug, Args)]
+pub struct ServeArgs {
+    /// Store.
+    #[arg(long, value_name = "DIR")]
+    pub store: PathBuf,
+    /// Address to listen on; other machines reach it only if this says so.
+    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:7733")]
+    pub listen: SocketAddr,
+}
+
+/// `push`.
+#[derive(Debug, Subcommand)]
+pub enum PushCommand {
+    /// Pushes every embedding with its position to a Qdrant collection; resumes where it stopped.
+    Qdrant(QdrantArgs),
+}
+
+/// `push qdrant`.
+#[derive(Debug, Args)]
+pub struct QdrantArgs {
+    /// Store.
+    #[arg(long, value_name = "DIR")]
+    pub store: PathBuf,
+    /// Qdrant's gRPC address.
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:6334")]
+    pub url: String,
+    /// Collection; made if absent.
+    #[arg(long, value_name = "NAME")]
+    pub collection: String,
+    /// API key.
+    #[arg(long, value_name = "KEY", env = "QDRANT_API_KEY", hide_env_values = true)]
+    pub api_key: Option<String>,
+    /// Points a request.
+    #[arg(long, value_name = "N", default_value_t = 256, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub batch: u32,
+}
+
+/// `generate`.
+#[derive(Debug, Args)]
+pub struct GenerateArgs {
+    /// Folder to write into; made if absent.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Chooses where things stand and how they are lit.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Photos.
+    #[arg(long, value_name = "N", default_value_t = 36, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub n_views: u32,
+}
+
+/// `demo`.
+#[derive(Debug, Args)]
+pub struct DemoArgs {
+    /// Folder to work in; emptied of an earlier demo.
+    #[arg(long, value_name = "DIR", default_value = "target/demo")]
+    pub out: PathBuf,
+    /// Chooses the room.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+    /// Leaves the robot's service running until ctrl-c, to try queries by hand.
+    #[arg(long)]
+    pub keep: bool,
+}
+
+/// Reads a number of bytes with an optional unit.
+fn parse_bytes(text: &str) -> Result<u64, String> {
+    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let factor: u64 = match &text[digits.len()..] {
+        "" | "B" => 1,
+        "KiB" => 1 << 10,
+        "MiB" => 1 << 20,
+        "GiB" => 1 << 30,
+        unit => return Err(format!("unit {unit:?}: expected none, KiB, MiB or GiB")),
+    };
+    let number: u64 = digits.parse().map_err(|_| format!("{text:?} is no number of bytes, as 512MiB is"))?;
+    let bytes = number.checked_mul(factor).ok_or_else(|| format!("{text:?} is too large"))?;
+    if bytes < 64 << 20 { Err(format!("{text:?} is below the least, 64MiB")) } else { Ok(bytes) }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn flags_are_consistent_and_checked() {
+        Cli::command().debug_assert();
+        let parse = |line: &str| Cli::try_parse_from(line.split(' '));
+        assert!(parse("slag-encoder encode --scene a.ply --views v --store s --memory 512MiB --masks auto").is_ok());
+        for wrong in ["--memory 1", "--memory 5TB", "--views-limit 0", "--threads 0", "--preset best", "--background red"] {
+            assert!(parse(&format!("slag-encoder encode --scene a.ply --views v --store s {wrong}")).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn bytes_have_units() {
+        assert_eq!(parse_bytes("2GiB"), Ok(2 << 30));
+        assert_eq!(parse_bytes("67108864"), Ok(1 << 26));
+        assert!(parse_bytes("99999999999GiB").is_err() && parse_bytes("-1").is_err() && parse_bytes("GiB").is_err());
+    }
+}

@@ -1,0 +1,98 @@
+//! The state of an unfinished encode: which views are done, and their files of sums.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use slag_common::Hash32;
+
+use super::EncodeError;
+use crate::lift::ViewSums;
+use crate::store::Store;
+
+const TREE: &str = "job";
+const FINGERPRINT_KEY: &[u8] = b"fingerprint";
+const VIEW_PREFIX: &str = "view/";
+
+/// An encode under way in a store.
+pub(super) struct Job<'a> {
+    store: &'a Store,
+    records: sled::Tree,
+    folder: PathBuf,
+}
+
+impl<'a> Job<'a> {
+    /// Takes up the unfinished encode with this fingerprint, or begins one.
+    ///
+    /// # Errors
+    /// [`EncodeError::OtherJob`] if another one is unfinished and `restart` is not set.
+    pub(super) fn open(store: &'a Store, fingerprint: Hash32, restart: bool) -> Result<Self, EncodeError> {
+        let folder = store.job_dir()?;
+        let records = store.db().open_tree(TREE).map_err(|source| records_error(store, source))?;
+        let job = Self { store, records, folder };
+        let found = job.records.get(FINGERPRINT_KEY).map_err(|source| records_error(store, source))?;
+        let same = found.as_deref() == Some(&fingerprint.0);
+        if found.is_some() && !same && !restart {
+            return Err(EncodeError::OtherJob { path: store.dir().to_owned(), n_done: job.done_views()?.len() });
+        }
+        if !same {
+            job.clear()?;
+            job.records.insert(FINGERPRINT_KEY, &fingerprint.0).map_err(|source| records_error(store, source))?;
+            job.flush()?;
+        }
+        fs_err::create_dir_all(job.folder.join("views"))?;
+        Ok(job)
+    }
+
+    /// Returns the folder for working files.
+    pub(super) fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Returns the views whose sums are on disk.
+    pub(super) fn done_views(&self) -> Result<BTreeSet<String>, EncodeError> {
+        let keys = self.records.scan_prefix(VIEW_PREFIX).keys();
+        keys.map(|key| {
+            let key = key.map_err(|source| records_error(self.store, source))?;
+            Ok(String::from_utf8_lossy(&key[VIEW_PREFIX.len()..]).into_owned())
+        })
+        .collect()
+    }
+
+    /// Returns where a view's sums lie.
+    pub(super) fn sums_path(&self, view: &str) -> PathBuf {
+        // Names hold separators and may be long; their hash does not.
+        self.folder.join("views").join(format!("{}.sums", Hash32::of(view.as_bytes())))
+    }
+
+    /// Keeps a view's sums: the file first, then the record that counts it as done.
+    pub(super) fn keep(&self, view: &str, sums: &ViewSums) -> Result<(), EncodeError> {
+        sums.write(&self.sums_path(view))?;
+        let key = format!("{VIEW_PREFIX}{view}");
+        self.records.insert(key, &[]).map_err(|source| records_error(self.store, source))?;
+        self.flush()
+    }
+
+    /// Forgets the job: it was published.
+    pub(super) fn finish(self) -> Result<(), EncodeError> {
+        self.clear()
+    }
+
+    /// Records go first: a file without a record is redone, a record without a file would be an error.
+    fn clear(&self) -> Result<(), EncodeError> {
+        self.records.clear().map_err(|source| records_error(self.store, source))?;
+        self.flush()?;
+        if self.folder.exists() {
+            fs_err::remove_dir_all(&self.folder)?;
+        }
+        Ok(())
+    }
+
+    fn flush(&self) -> Result<(), EncodeError> {
+        self.records.flush().map_err(|source| records_error(self.store, source))?;
+        Ok(())
+    }
+}
+
+fn records_error(store: &Store, source: sled::Error) -> EncodeError {
+    EncodeError::Records { path: store.dir().to_owned(), source }
+}

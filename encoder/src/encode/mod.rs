@@ -1,0 +1,515 @@
+//! The pipeline: photos, poses and a splat in, a published generation of shards out.
+//!
+//! Views are independent: each leaves one file of sums in the job's folder, so a killed encode
+//! resumes after the last finished view. Everything after that reads those files in the order of
+//! the views' names, so the store's bytes do not depend on threads, on the order of views or on where
+//! a run was interrupted.
+
+mod job;
+mod settings;
+mod view;
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::Instant;
+
+use serde::Serialize;
+use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
+use slag_common::poses::{self, PoseError};
+use slag_common::splat::{self, SplatError};
+use slag_common::{Hash32, View};
+use slag_models::{ModelDir, ModelError, SessionOptions};
+
+use crate::ingest::{self, GeoError, IngestError};
+use crate::lift::{CellBuckets, CellField, FieldError, RegionTable, SumsError, ViewSums};
+use crate::progress::Progress;
+use crate::raster::RasterError;
+use crate::segment::{GivenMasks, GraphSegmenter, SegmentError, Segmenter};
+use crate::shard::{self, cells};
+use crate::store::{Extras, Store, StoreError};
+use job::Job;
+pub use settings::{EncodeSettings, Masks};
+use view::ViewWorker;
+
+/// Name of the region table among a generation's extras.
+pub const EXTRA_REGIONS: &str = "regions";
+
+/// Returns the name of a cell's field among a generation's extras.
+pub fn extra_field(cell_id: u32) -> String {
+    format!("field/{cell_id}")
+}
+
+/// Why an encode ended without a new generation.
+#[derive(Debug, thiserror::Error)]
+pub enum EncodeError {
+    /// The scene cannot be read.
+    #[error(transparent)]
+    Splat(#[from] SplatError),
+    /// The poses cannot be read.
+    #[error(transparent)]
+    Poses(#[from] PoseError),
+    /// The geo-reference cannot be read.
+    #[error(transparent)]
+    Geo(#[from] GeoError),
+    /// A photo cannot be read, and `strict` is set.
+    #[error(transparent)]
+    Ingest(#[from] IngestError),
+    /// Masks cannot be made or read.
+    #[error(transparent)]
+    Segment(#[from] SegmentError),
+    /// A view cannot be rasterised.
+    #[error("view {view}: {source}")]
+    Raster {
+        /// The view.
+        view: String,
+        /// Why.
+        source: RasterError,
+    },
+    /// A model cannot be opened.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// A model failed on a view's crops.
+    #[error("view {view}: {source}")]
+    Embed {
+        /// The view.
+        view: String,
+        /// Why.
+        source: slag_models::EncodeError,
+    },
+    /// The store said no.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// A file of sums is damaged.
+    #[error(transparent)]
+    Sums(#[from] SumsError),
+    /// A working file could not be read or written.
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+    /// Job records.
+    #[error("{}: job records: {source}; run with --restart to begin anew", path.display())]
+    Records {
+        /// The store.
+        path: PathBuf,
+        /// What sled says.
+        source: sled::Error,
+    },
+    /// The unfinished job in the store is another one.
+    #[error(
+        "{}: an unfinished encode of other inputs or settings lies here ({n_done} views done); finish it with the \
+         settings it was started with, or drop it with --restart", path.display()
+    )]
+    OtherJob {
+        /// The store.
+        path: PathBuf,
+        /// Views that it finished.
+        n_done: usize,
+    },
+    /// Photos are missing, and `strict` is set.
+    #[error("{n_missing} of {n_views} photos are missing, the first is {}; give their folder with --images", first.display())]
+    MissingImages {
+        /// How many.
+        n_missing: usize,
+        /// Of how many.
+        n_views: usize,
+        /// The first of them.
+        first: PathBuf,
+    },
+    /// No view is left.
+    #[error("none of {n_views} views could be used ({reason}); give the photos' folder with --images")]
+    NoViews {
+        /// Views in the poses file.
+        n_views: usize,
+        /// The first reason.
+        reason: String,
+    },
+    /// The scene has no usable Gaussian.
+    #[error("{}: none of {n_gaussians} Gaussians is usable (finite, positive, a rotation); export the splat again", path.display())]
+    NoGaussians {
+        /// The splat file.
+        path: PathBuf,
+        /// Gaussians in it.
+        n_gaussians: usize,
+    },
+    /// The budget is too small for the region vectors.
+    #[error("the vectors of {n_regions} regions take {needed_bytes} bytes, half of --memory is {available_bytes}; raise --memory or lower --views-limit")]
+    Memory {
+        /// Regions in all views.
+        n_regions: usize,
+        /// Bytes they take.
+        needed_bytes: u64,
+        /// Bytes there are for them.
+        available_bytes: u64,
+    },
+    /// Stopped by the user; a rerun resumes.
+    #[error("interrupted after {n_done} of {n_views} views; run the same command again to resume")]
+    Interrupted {
+        /// Views finished.
+        n_done: usize,
+        /// Views in all.
+        n_views: usize,
+    },
+}
+
+/// A view that was left out.
+#[derive(Clone, Debug, Serialize)]
+pub struct SkippedView {
+    /// Its name.
+    pub view: String,
+    /// Why.
+    pub reason: String,
+}
+
+/// What an encode did.
+#[derive(Clone, Debug, Serialize)]
+pub struct EncodeSummary {
+    /// The generation that was published.
+    pub generation: u64,
+    /// Gaussians in cells.
+    pub n_gaussians: u64,
+    /// Those without an embedding.
+    pub n_without_evidence: u64,
+    /// Unusable Gaussians, in no cell.
+    pub n_rejected: u64,
+    /// Views that were used.
+    pub n_views: usize,
+    /// Of these, finished by an earlier, interrupted run.
+    pub n_views_resumed: usize,
+    /// Views without any mask: no mask file, or none large enough.
+    pub n_views_without_masks: usize,
+    /// Views that were left out, and why.
+    pub skipped_views: Vec<SkippedView>,
+    /// Masks embedded.
+    pub n_masks: usize,
+    /// Regions in all views.
+    pub n_regions: usize,
+    /// Sums per (Gaussian, region).
+    pub n_entries: u64,
+    /// Cells.
+    pub n_cells: usize,
+    /// Palette rows in all cells.
+    pub n_rows: u64,
+    /// Bytes of all shards by profile.
+    pub shard_bytes: BTreeMap<String, u64>,
+    /// Seconds spent in each stage, added over threads.
+    pub busy_secs: BTreeMap<String, f64>,
+    /// Seconds from start to end.
+    pub wall_secs: f64,
+    /// The encoder's name.
+    pub encoder: String,
+}
+
+/// Adds up the time spent in each stage, over all threads.
+#[derive(Default)]
+pub(crate) struct Stopwatch(Mutex<BTreeMap<&'static str, f64>>);
+
+impl Stopwatch {
+    pub(crate) fn time<T>(&self, stage: &'static str, work: impl FnOnce() -> T) -> T {
+        let start = Instant::now();
+        let result = work();
+        let seconds = start.elapsed().as_secs_f64();
+        *self.0.lock().unwrap_or_else(|e| e.into_inner()).entry(stage).or_default() += seconds;
+        result
+    }
+}
+
+/// Encodes a scene into a store and publishes the result as its next generation.
+///
+/// # Errors
+/// [`EncodeError`]; the store keeps its current generation, and finished views are not done again.
+pub fn encode(
+    settings: &EncodeSettings,
+    models: &ModelDir,
+    session: &SessionOptions,
+    progress: &dyn Progress,
+    cancel: &AtomicBool,
+) -> Result<EncodeSummary, EncodeError> {
+    let start = Instant::now();
+    let stopwatch = Stopwatch::default();
+    // First of all, so that a second encode into the same store fails at once.
+    let store = Store::create_or_open(&settings.store)?;
+    let geo_reference = settings.geo.as_deref().map(ingest::read_geo_reference).transpose()?;
+    let read_options = splat::ReadOptions { with_sh_rest: false };
+    let scene = stopwatch.time("read", || splat::read(&settings.scene, &read_options))?;
+    let (views, mut skipped) = choose_views(settings)?;
+    let split = stopwatch.time("cells", || cells::split(&scene, settings.cells));
+    if split.cells.is_empty() {
+        let n_gaussians = scene.len();
+        return Err(EncodeError::NoGaussians { path: settings.scene.clone(), n_gaussians });
+    }
+    let segmenter: Box<dyn Segmenter> = match &settings.masks {
+        Masks::Auto => Box::new(GraphSegmenter::default()),
+        Masks::Given { dir, ignore_ids } => Box::new(GivenMasks::open(dir, ignore_ids.clone())?),
+    };
+    let fingerprint = settings.fingerprint(models, segmenter.name(), &scene, &views)?;
+    let job = Job::open(&store, fingerprint, settings.restart)?;
+
+    let done = job.done_views()?;
+    let n_resumed = views.iter().filter(|view| done.contains(&view.name)).count();
+    let worker = ViewWorker {
+        settings,
+        scene: &scene,
+        split: &split,
+        segmenter: segmenter.as_ref(),
+        models,
+        session,
+        stopwatch: &stopwatch,
+    };
+    progress.begin("views", "view", views.len() as u64, n_resumed as u64);
+    skipped.extend(run_views(&worker, &views, &job, progress, cancel)?);
+    progress.end();
+    skipped.sort_by(|a, b| a.view.cmp(&b.view));
+    let used: Vec<&View> = views.iter().filter(|v| !skipped.iter().any(|s| s.view == v.name)).collect();
+    if let (true, Some(first)) = (used.is_empty(), skipped.first()) {
+        return Err(EncodeError::NoViews { n_views: skipped.len(), reason: first.reason.clone() });
+    }
+
+    let merged = stopwatch.time("merge", || merge(settings, &job, &used, split.cells.len(), models.dim()))?;
+    let Merged { table, mut buckets, n_masks, n_entries, n_views_without_masks } = merged;
+    let encoder_id = Hash32(models.encoder_id().hash());
+    let mut extras = Extras::new();
+    extras.insert(EXTRA_REGIONS.into(), store.put_bytes(&table.to_bytes())?.0);
+    let mut summary = EncodeSummary {
+        generation: store.next_generation()?,
+        n_gaussians: (scene.len() - split.n_rejected) as u64,
+        n_without_evidence: 0,
+        n_rejected: split.n_rejected as u64,
+        n_views: used.len(),
+        n_views_resumed: n_resumed,
+        n_views_without_masks,
+        skipped_views: skipped,
+        n_masks,
+        n_regions: table.len(),
+        n_entries,
+        n_cells: split.cells.len(),
+        n_rows: 0,
+        shard_bytes: BTreeMap::new(),
+        busy_secs: BTreeMap::new(),
+        wall_secs: 0.0,
+        encoder: models.encoder_id().to_string(),
+    };
+    let mut records = Vec::with_capacity(split.cells.len());
+    progress.begin("cells", "cell", split.cells.len() as u64, 0);
+    for (cell_id, cell) in (0u32..).zip(&split.cells) {
+        if cancel.load(Ordering::Relaxed) {
+            return Err(EncodeError::Interrupted { n_done: used.len(), n_views: used.len() });
+        }
+        let entries = buckets.take(cell_id)?;
+        let field = stopwatch.time("lift", || CellField::new(cell.gaussians.clone(), &entries, &table));
+        drop(entries);
+        let built = stopwatch.time("palette", || {
+            shard::build(&scene, cell_id, cell, &field, &table, encoder_id, &settings.palette)
+        });
+        extras.insert(extra_field(cell_id), store.put_bytes(&field.to_bytes())?.0);
+        let mut shards = BTreeMap::new();
+        for (profile, bytes) in &built.shards {
+            let (hash, len_bytes) = stopwatch.time("write", || store.put_bytes(bytes))?;
+            *summary.shard_bytes.entry(profile.to_string()).or_default() += len_bytes;
+            let record = ShardRecord {
+                hash,
+                len_bytes,
+                n_rows: built.n_rows,
+                score_error_bound: built.score_error_bound,
+                position_error: built.position_error,
+            };
+            shards.insert(*profile, record);
+        }
+        summary.n_rows += u64::from(built.n_rows);
+        summary.n_without_evidence += built.n_without_evidence as u64;
+        records.push(CellRecord { cell_id, bounds: cell.bounds, n_gaussians: cell.gaussians.len() as u32, shards });
+        progress.advance(1);
+    }
+    progress.end();
+
+    let manifest = Manifest {
+        version: manifest::VERSION,
+        scene: settings.scene_name.clone(),
+        generation: summary.generation,
+        created_unix_secs: settings.created_unix_secs,
+        expires_unix_secs: settings.expires_unix_secs,
+        metric: settings.metric || geo_reference.is_some(),
+        geo_reference,
+        encoder: EncoderRecord {
+            name: models.encoder_id().name.clone(),
+            id: encoder_id,
+            dim: models.dim() as u32,
+            default_threshold: models.threshold(),
+        },
+        n_gaussians: summary.n_gaussians,
+        n_without_evidence: summary.n_without_evidence,
+        n_rejected: summary.n_rejected,
+        cells: records,
+    };
+    store.publish(&manifest, &extras)?;
+    job.finish()?;
+    store.prune()?;
+    summary.busy_secs =
+        stopwatch.0.into_inner().unwrap_or_else(|e| e.into_inner()).into_iter().map(|(k, v)| (k.to_owned(), v)).collect();
+    summary.wall_secs = start.elapsed().as_secs_f64();
+    Ok(summary)
+}
+
+/// Reads the poses, leaves out views without a photo, and applies the limit.
+fn choose_views(settings: &EncodeSettings) -> Result<(Vec<View>, Vec<SkippedView>), EncodeError> {
+    let views = poses::read(&settings.views, settings.images.as_deref())?.views;
+    let missing: Vec<String> = ingest::missing_images(&views).into_iter().map(|v| v.name.clone()).collect();
+    if let (true, Some(first)) = (settings.strict, ingest::missing_images(&views).first()) {
+        let first = first.image_path.clone();
+        return Err(EncodeError::MissingImages { n_missing: missing.len(), n_views: views.len(), first });
+    }
+    let n_views = views.len();
+    let (there, gone): (Vec<View>, Vec<View>) = views.into_iter().partition(|v| !missing.contains(&v.name));
+    let skipped: Vec<SkippedView> = gone
+        .into_iter()
+        .map(|v| SkippedView { reason: format!("{}: no such photo", v.image_path.display()), view: v.name })
+        .collect();
+    if there.is_empty() {
+        let reason = skipped.first().map_or("there are none".into(), |s| s.reason.clone());
+        return Err(EncodeError::NoViews { n_views, reason });
+    }
+    let limit = settings.views_limit.unwrap_or(usize::MAX).clamp(1, there.len());
+    // Evenly spread over the order of names, which mostly is the order in which they were taken.
+    let n = there.len();
+    let chosen: Vec<usize> = (0..limit).map(|i| i * n / limit).collect();
+    let views = there.into_iter().enumerate().filter(|(i, _)| chosen.binary_search(i).is_ok()).map(|(_, v)| v);
+    Ok((views.collect(), skipped))
+}
+
+/// Works off the views that are not done yet, on as many threads as the settings say.
+fn run_views(
+    worker: &ViewWorker<'_>,
+    views: &[View],
+    job: &Job<'_>,
+    progress: &dyn Progress,
+    cancel: &AtomicBool,
+) -> Result<Vec<SkippedView>, EncodeError> {
+    let done = job.done_views()?;
+    let open: Vec<&View> = views.iter().filter(|view| !done.contains(&view.name)).collect();
+    let next = AtomicUsize::new(0);
+    let failed = AtomicBool::new(false);
+    let work = || -> Result<Vec<SkippedView>, EncodeError> {
+        let mut skipped = Vec::new();
+        let mut encoder = None;
+        while !cancel.load(Ordering::Relaxed) && !failed.load(Ordering::Relaxed) {
+            let Some(view) = open.get(next.fetch_add(1, Ordering::Relaxed)) else { break };
+            match worker.run(view, &mut encoder) {
+                Ok(sums) => {
+                    worker.stopwatch.time("write", || job.keep(&view.name, &sums))?;
+                    progress.advance(1);
+                }
+                // One bad photo or mask file of a thousand must not end an encode.
+                Err(error @ (EncodeError::Ingest(_) | EncodeError::Segment(_))) if !worker.settings.strict => {
+                    tracing::warn!("view {} is left out: {error}", view.name);
+                    skipped.push(SkippedView { view: view.name.clone(), reason: error.to_string() });
+                }
+                Err(error) => {
+                    failed.store(true, Ordering::Relaxed);
+                    return Err(error);
+                }
+            }
+        }
+        Ok(skipped)
+    };
+    let n_workers = worker.settings.threads.clamp(1, open.len().max(1));
+    let results: Vec<Result<Vec<SkippedView>, EncodeError>> = std::thread::scope(|scope| {
+        let workers: Vec<_> = (0..n_workers).map(|_| scope.spawn(work)).collect();
+        workers.into_iter().map(|w| w.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))).collect()
+    });
+    let skipped: Vec<SkippedView> = results.into_iter().collect::<Result<Vec<_>, _>>()?.concat();
+    if cancel.load(Ordering::Relaxed) {
+        return Err(EncodeError::Interrupted { n_done: job.done_views()?.len(), n_views: views.len() });
+    }
+    Ok(skipped)
+}
+
+struct Merged {
+    table: RegionTable,
+    buckets: CellBuckets,
+    n_masks: usize,
+    n_entries: u64,
+    n_views_without_masks: usize,
+}
+
+/// Brings the sums of all views together, in the order of their names.
+fn merge(
+    settings: &EncodeSettings,
+    job: &Job<'_>,
+    used: &[&View],
+    n_cells: usize,
+    dim: usize,
+) -> Result<Merged, EncodeError> {
+    let buckets = CellBuckets::new(job.folder().join("cells"), n_cells, settings.memory_bytes / 4)?;
+    let table = RegionTable::new(dim);
+    let mut merged = Merged { table, buckets, n_masks: 0, n_entries: 0, n_views_without_masks: 0 };
+    for view in used {
+        let sums = ViewSums::read(&job.sums_path(&view.name))?;
+        let first_region = merged.table.append(&sums);
+        let needed_bytes = (merged.table.vectors.len() * size_of::<f32>()) as u64;
+        if needed_bytes > settings.memory_bytes / 2 {
+            let available_bytes = settings.memory_bytes / 2;
+            return Err(EncodeError::Memory { n_regions: merged.table.len(), needed_bytes, available_bytes });
+        }
+        for (cell_id, entries) in &sums.entries_of_cell {
+            merged.buckets.put(*cell_id, first_region, entries)?;
+            merged.n_entries += entries.len() as u64;
+        }
+        let n_masks = sums.mask_vectors.len() / dim;
+        merged.n_masks += n_masks;
+        merged.n_views_without_masks += usize::from(n_masks == 0);
+    }
+    Ok(merged)
+}
+
+/// Reads the full-precision field of a published cell.
+///
+/// # Errors
+/// [`StoreError`], or [`FieldError`] as a string naming the object.
+pub fn read_field(
+    reader: &crate::store::StoreReader,
+    cell_id: u32,
+    n_regions: usize,
+) -> Result<CellField, ReadFieldError> {
+    let name = extra_field(cell_id);
+    let bytes = read_extra(reader, &name)?;
+    CellField::from_bytes(&bytes, n_regions).map_err(|source| ReadFieldError::Damaged { name, source })
+}
+
+/// Reads the region table of the published generation.
+///
+/// # Errors
+/// As [`read_field`].
+pub fn read_regions(reader: &crate::store::StoreReader) -> Result<RegionTable, ReadFieldError> {
+    let bytes = read_extra(reader, EXTRA_REGIONS)?;
+    RegionTable::from_bytes(&bytes).map_err(|source| ReadFieldError::Damaged { name: EXTRA_REGIONS.into(), source })
+}
+
+fn read_extra(
+    reader: &crate::store::StoreReader,
+    name: &str,
+) -> Result<slag_common::container::AlignedBytes, ReadFieldError> {
+    let hash = reader.current().extras.get(name).ok_or_else(|| ReadFieldError::Absent { name: name.to_owned() })?;
+    Ok(reader.read_object(*hash)?)
+}
+
+/// Why a published field cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum ReadFieldError {
+    /// The store said no.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The generation has no such part.
+    #[error("the store has no {name}: it was published by another program; encode again")]
+    Absent {
+        /// The part.
+        name: String,
+    },
+    /// The part is damaged.
+    #[error("{name}: {source}")]
+    Damaged {
+        /// The part.
+        name: String,
+        /// What is wrong.
+        source: FieldError,
+    },
+}

@@ -1,0 +1,129 @@
+//! What an encode is told, and the fingerprint by which an interrupted one is recognised.
+
+use std::path::PathBuf;
+
+use serde::Serialize;
+use slag_common::{Gaussians, Hash32, View};
+use slag_models::ModelDir;
+
+use super::EncodeError;
+use crate::embed::Background;
+use crate::palette::PaletteSettings;
+use crate::raster::WeightKind;
+use crate::shard::cells::CellLimits;
+
+/// Where masks come from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Masks {
+    /// From the built-in segmenter.
+    Auto,
+    /// From files that the user gives.
+    Given {
+        /// Their folder.
+        dir: PathBuf,
+        /// Ids of label images that are no masks (a "nothing" value such as 255).
+        ignore_ids: Vec<u32>,
+    },
+}
+
+/// What to encode and how.
+#[derive(Clone, Debug)]
+pub struct EncodeSettings {
+    /// The splat file.
+    pub scene: PathBuf,
+    /// The poses: a COLMAP model or a transforms.json.
+    pub views: PathBuf,
+    /// The photos' folder, where it is not beside the poses.
+    pub images: Option<PathBuf>,
+    /// Where masks come from.
+    pub masks: Masks,
+    /// The store to publish into.
+    pub store: PathBuf,
+    /// Name of the scene.
+    pub scene_name: String,
+    /// Whether a world unit is a metre; a geo-reference says so too.
+    pub metric: bool,
+    /// A geo-reference file.
+    pub geo: Option<PathBuf>,
+    /// Views to use at most, evenly spread.
+    pub views_limit: Option<usize>,
+    /// Width at which weights are rasterised; the photo's own, at most [`MAX_RASTER_WIDTH_PX`], if absent.
+    pub raster_width_px: Option<u32>,
+    /// What fills a crop outside its mask.
+    pub background: Background,
+    /// Masks with fewer pixels are left out.
+    pub min_mask_px: u32,
+    /// Which weight is summed.
+    pub weights: WeightKind,
+    /// Views worked on at a time.
+    pub threads: usize,
+    /// Working memory for sums and region vectors.
+    pub memory_bytes: u64,
+    /// Whether a missing or unreadable input ends the encode.
+    pub strict: bool,
+    /// Whether an unfinished encode of other settings is dropped.
+    pub restart: bool,
+    /// How large a cell may become.
+    pub cells: CellLimits,
+    /// How fine a palette is.
+    pub palette: PaletteSettings,
+    /// Creation time to sign, seconds since 1970.
+    pub created_unix_secs: u64,
+    /// Expiry to sign.
+    pub expires_unix_secs: Option<u64>,
+}
+
+/// Widest raster unless asked for: masks are coarser than this, and time grows with the square.
+pub const MAX_RASTER_WIDTH_PX: u32 = 1024;
+
+impl EncodeSettings {
+    /// Returns the hash of everything on which a view's sums depend.
+    pub(super) fn fingerprint(
+        &self,
+        models: &ModelDir,
+        segmenter: &str,
+        scene: &Gaussians,
+        views: &[View],
+    ) -> Result<Hash32, EncodeError> {
+        #[derive(Serialize)]
+        struct Inputs<'a> {
+            program: &'a str,
+            encoder_id: Hash32,
+            scene: Hash32,
+            segmenter: &'a str,
+            views: Vec<(&'a str, u64, String)>,
+            raster_width_px: Option<u32>,
+            background: String,
+            min_mask_px: u32,
+            weights: String,
+            cells: String,
+        }
+        let mut hasher = Vec::new();
+        for (mean, rotation) in scene.means_in_world.iter().zip(&scene.rotations_wxyz) {
+            hasher.extend_from_slice(bytemuck::bytes_of(&mean.to_array()));
+            hasher.extend_from_slice(bytemuck::bytes_of(rotation));
+        }
+        let columns = [hasher.as_slice(), bytemuck::cast_slice(&scene.scales), bytemuck::cast_slice(&scene.opacities)];
+        let scene = columns.map(|column| Hash32::of(column).0).concat();
+        let views = views
+            .iter()
+            .map(|view| {
+                let len_bytes = fs_err::metadata(&view.image_path).map(|m| m.len()).unwrap_or(0);
+                (view.name.as_str(), len_bytes, format!("{:?} {:?}", view.intrinsics, view.camera_from_world))
+            })
+            .collect();
+        let inputs = Inputs {
+            program: env!("CARGO_PKG_VERSION"),
+            encoder_id: Hash32(models.encoder_id().hash()),
+            scene: Hash32::of(&scene),
+            segmenter,
+            views,
+            raster_width_px: self.raster_width_px,
+            background: format!("{:?}", self.background),
+            min_mask_px: self.min_mask_px,
+            weights: format!("{:?}", self.weights),
+            cells: format!("{:?}", self.cells),
+        };
+        Ok(Hash32::of(&serde_json::to_vec(&inputs).map_err(std::io::Error::from)?))
+    }
+}

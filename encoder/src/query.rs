@@ -1,0 +1,158 @@
+//! Full-precision scores of a published field, for evaluation and trust.
+
+use std::io::{self, Write};
+
+use glam::DVec3;
+use serde::Serialize;
+use slag_common::shard::{Profile, ShardLayout};
+
+use crate::encode::{ReadFieldError, read_field, read_regions};
+use crate::store::{StoreError, StoreReader};
+
+/// Cosines of every Gaussian of the input with a query.
+#[derive(Clone, Debug)]
+pub struct Scores {
+    /// `[N]` in the order of the input file; NaN where a Gaussian has no evidence or is in no cell.
+    pub cosines: Vec<f32>,
+    /// `[N]`: the evidence, the blending weight under masks summed over all views.
+    pub total_weights: Vec<f32>,
+}
+
+/// Why scores cannot be had.
+#[derive(Debug, thiserror::Error)]
+pub enum QueryError {
+    /// The field cannot be read.
+    #[error(transparent)]
+    Field(#[from] ReadFieldError),
+    /// A shard cannot be read.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The query is a vector of another space.
+    #[error("the query has {found} components, the store's embeddings {expected}; use the models it was encoded with ({encoder})")]
+    Dimension {
+        /// Components of the store's embeddings.
+        expected: usize,
+        /// Components of the query.
+        found: usize,
+        /// The store's encoder.
+        encoder: String,
+    },
+    /// A field names a Gaussian that the scene does not have.
+    #[error("cell {cell_id}: Gaussian {index} of a scene of {n}; the store is damaged, encode again")]
+    Index {
+        /// The cell.
+        cell_id: u32,
+        /// The index found.
+        index: u32,
+        /// Gaussians in the scene.
+        n: usize,
+    },
+    /// A shard is damaged.
+    #[error("cell {cell_id}: {source}")]
+    Shard {
+        /// The cell.
+        cell_id: u32,
+        /// What is wrong.
+        source: slag_common::container::ContainerError,
+    },
+}
+
+/// Scores every Gaussian against a unit query vector.
+///
+/// # Errors
+/// [`QueryError`].
+pub fn scores(reader: &StoreReader, query: &[f32]) -> Result<Scores, QueryError> {
+    let manifest = reader.manifest();
+    let table = read_regions(reader)?;
+    if query.len() != table.dim {
+        let encoder = manifest.encoder.name.clone();
+        return Err(QueryError::Dimension { expected: table.dim, found: query.len(), encoder });
+    }
+    let region_scores = table.scores(query);
+    let n = (manifest.n_gaussians + manifest.n_rejected) as usize;
+    let mut scores = Scores { cosines: vec![f32::NAN; n], total_weights: vec![0.0; n] };
+    for cell in &manifest.cells {
+        let field = read_field(reader, cell.cell_id, table.len())?;
+        let cosines = field.cosines(&region_scores);
+        for (k, index) in field.input_indices.iter().enumerate() {
+            if *index as usize >= n {
+                return Err(QueryError::Index { cell_id: cell.cell_id, index: *index, n });
+            }
+            scores.cosines[*index as usize] = cosines[k];
+            scores.total_weights[*index as usize] = field.total_weights[k];
+        }
+    }
+    Ok(scores)
+}
+
+/// A Gaussian that answers a query.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct Hit {
+    /// Index in the input file.
+    pub index: u32,
+    /// Cosine with the query.
+    pub cosine: f32,
+    /// Mean, world frame.
+    pub position_in_world: DVec3,
+}
+
+/// Returns the `n` best Gaussians with their positions (from the exact shards), best first.
+///
+/// # Errors
+/// [`QueryError`].
+pub fn best(reader: &StoreReader, scores: &Scores, n: usize) -> Result<Vec<Hit>, QueryError> {
+    let mut order: Vec<u32> = (0..scores.cosines.len() as u32).filter(|i| !scores.cosines[*i as usize].is_nan()).collect();
+    order.sort_by(|a, b| scores.cosines[*b as usize].total_cmp(&scores.cosines[*a as usize]).then(a.cmp(b)));
+    order.truncate(n);
+    let mut hits = Vec::with_capacity(order.len());
+    for cell in &reader.manifest().cells {
+        let Some(shard) = cell.shards.get(&Profile::Exact) else { continue };
+        let bytes = reader.read_object(shard.hash)?;
+        let layout = ShardLayout::check(&bytes).map_err(|source| QueryError::Shard { cell_id: cell.cell_id, source })?;
+        let view = layout.view(&bytes);
+        let indices = view.exact.map_or(&[][..], |exact| exact.input_indices);
+        for (at, index) in indices.iter().enumerate() {
+            if order.contains(index) {
+                let cosine = scores.cosines[*index as usize];
+                hits.push(Hit { index: *index, cosine, position_in_world: view.position_in_world(at) });
+            }
+        }
+    }
+    hits.sort_by(|a, b| b.cosine.total_cmp(&a.cosine).then(a.index.cmp(&b.index)));
+    Ok(hits)
+}
+
+/// Writes values as a NumPy array of one dimension (`.npy` version 1.0, little-endian f32).
+///
+/// # Errors
+/// Whatever the writer gives.
+pub fn write_npy(mut out: impl Write, values: &[f32]) -> io::Result<()> {
+    let mut header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({},), }}", values.len());
+    // Magic, version and length take 10 bytes; the whole is a multiple of 64 and ends in a newline.
+    let padding = 63 - (10 + header.len()) % 64;
+    header.extend(std::iter::repeat_n(' ', padding));
+    header.push('\n');
+    out.write_all(b"\x93NUMPY\x01\x00")?;
+    out.write_all(&(header.len() as u16).to_le_bytes())?;
+    out.write_all(header.as_bytes())?;
+    out.write_all(bytemuck::cast_slice(values))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: another reader of the format.
+    #[test]
+    fn npy_is_read_by_another_reader() {
+        for n in [0usize, 1, 70, 1000] {
+            let values: Vec<f32> = (0..n).map(|i| i as f32 * 0.5).collect();
+            let mut bytes = Vec::new();
+            write_npy(&mut bytes, &values).expect("writes to memory");
+            let npy = npyz::NpyFile::new(&bytes[..]).expect("an npy file");
+            assert_eq!(npy.shape(), [n as u64]);
+            assert_eq!(npy.into_vec::<f32>().expect("f32"), values);
+            assert_eq!((bytes.len() - 4 * n) % 64, 0);
+        }
+    }
+}
