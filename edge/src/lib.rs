@@ -1,1 +1,3 @@
-//! Stub.
+//! The robot's side of SLAG: keeps the shards around it and answers text queries offline.
+
+pub mod store;
