@@ -1,0 +1,305 @@
+//! What each command does.
+
+use std::fmt::Display;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use anyhow::{Context, Result, anyhow};
+use serde::Serialize;
+use serde_json::json;
+use slag_common::{poses, splat};
+use slag_models::{ModelDir, SessionOptions, find_runtime};
+
+use super::Exit;
+use super::args::*;
+use super::progress::Shown;
+use crate::check::{self, CheckOptions, CheckView};
+use crate::demo;
+use crate::encode::{self, EncodeError, EncodeSettings, Masks};
+use crate::palette::PaletteSettings;
+use crate::progress::{Progress, Silent};
+use crate::publish::{qdrant, serve};
+use crate::raster::{CpuRasterizer, RasterView};
+use crate::shard::cells::CellLimits;
+use crate::store::StoreReader;
+use crate::{generate, ingest, query};
+
+/// Runs the program and says how it ended.
+pub fn run(cli: Cli) -> Exit {
+    let json = cli.json;
+    let progress: Box<dyn Progress> = if cli.shows_progress() { Box::new(Shown::new()) } else { Box::new(Silent) };
+    let result = match cli.command {
+        Command::Check(args) => run_check(&args, json),
+        Command::Encode(args) => run_encode(&args, progress.as_ref(), json),
+        Command::Query(args) => run_query(&args, json),
+        Command::Serve(args) => run_serve(&args),
+        Command::Push(PushCommand::Qdrant(args)) => run_push(&args, progress.as_ref(), json),
+        Command::Generate(args) => run_generate(&args, progress.as_ref()),
+        Command::Demo(args) => run_demo(&args, progress.as_ref(), json),
+    };
+    match result {
+        Ok(exit) => exit,
+        Err(error) if is_broken_pipe(&error) => Exit::Done,
+        Err(error) => {
+            let interrupted = matches!(error.downcast_ref(), Some(EncodeError::Interrupted { .. }));
+            if json {
+                println!("{}", json!({"error": {"message": format!("{error:#}"), "interrupted": interrupted}}));
+            } else {
+                eprintln!("{}: {error:#}", if interrupted { "interrupted" } else { "error" });
+            }
+            if interrupted { Exit::Interrupted } else { Exit::Failed }
+        }
+    }
+}
+
+/// A reader that went away (`| head`) is no failure.
+fn is_broken_pipe(error: &anyhow::Error) -> bool {
+    error.chain().filter_map(|e| e.downcast_ref::<std::io::Error>()).any(|e| e.kind() == std::io::ErrorKind::BrokenPipe)
+}
+
+/// Prints the result: as one JSON object, or as lines for people.
+fn print(json: bool, value: &impl Serialize, lines: impl Display) -> Result<()> {
+    let mut out = std::io::stdout().lock();
+    match json {
+        true => writeln!(out, "{}", serde_json::to_string(value)?)?,
+        false => write!(out, "{lines}")?,
+    }
+    Ok(out.flush()?)
+}
+
+/// Returns a flag that ctrl-c or SIGTERM sets; a second one ends the program at once.
+fn cancel_flag() -> Result<Arc<AtomicBool>> {
+    let flag = Arc::new(AtomicBool::new(false));
+    let seen = Arc::clone(&flag);
+    ctrlc::set_handler(move || {
+        if seen.swap(true, Ordering::Relaxed) {
+            std::process::exit(130);
+        }
+        eprintln!("stopping after the views at hand; once more to stop at once");
+    })
+    .context("cannot listen for ctrl-c")?;
+    Ok(flag)
+}
+
+fn now_unix_secs() -> u64 {
+    // Reproducible builds of a store: the convention of reproducible-builds.org.
+    let given = std::env::var("SOURCE_DATE_EPOCH").ok().and_then(|text| text.parse().ok());
+    given.unwrap_or_else(|| SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs()))
+}
+
+/// Opens the models and says how they are run.
+fn open_models(args: &ModelArgs) -> Result<(ModelDir, SessionOptions)> {
+    let models = match &args.models {
+        Some(dir) => ModelDir::open(dir)?,
+        None => ModelDir::builtin(),
+    };
+    let runtime = find_runtime(args.runtime.as_deref(), &runtime_folders())?;
+    Ok((models, SessionOptions::new(runtime)))
+}
+
+/// Returns where the set-up puts ONNX Runtime: beside the program, or in the build folder above it.
+fn runtime_folders() -> Vec<PathBuf> {
+    let exe = std::env::current_exe().unwrap_or_default();
+    let arch = Path::new("onnxruntime").join(std::env::consts::ARCH);
+    exe.ancestors().skip(1).take(3).flat_map(|folder| [folder.to_owned(), folder.join(&arch)]).collect()
+}
+
+fn run_check(args: &CheckArgs, json: bool) -> Result<Exit> {
+    let scene = splat::read(&args.input.scene, &splat::ReadOptions { with_sh_rest: true })?;
+    let all = poses::read(&args.input.views, args.input.images.as_deref())?.views;
+    let missing: Vec<_> = ingest::missing_images(&all).into_iter().map(|v| v.image_path.clone()).collect();
+    if let Some(first) = missing.first() {
+        let message = format!("{} of {} photos are missing, the first is {}", missing.len(), all.len(), first.display());
+        if args.input.strict || missing.len() == all.len() {
+            return Err(anyhow!("{message}; give their folder with --images"));
+        }
+        tracing::warn!("{message}");
+    }
+    let there: Vec<_> = all.into_iter().filter(|v| !missing.contains(&v.image_path)).collect();
+    let n = (args.samples as usize).min(there.len());
+    let mut views = Vec::with_capacity(n);
+    for i in 0..n {
+        let loaded = ingest::load_image(&there[i * there.len() / n])?;
+        let view = RasterView { camera_from_world: loaded.view.camera_from_world, intrinsics: loaded.view.intrinsics };
+        views.push(CheckView { name: loaded.view.name, image: loaded.image, view });
+    }
+    let options =
+        CheckOptions { width_px: args.raster_width, pictures_dir: args.out.clone(), ..CheckOptions::default() };
+    let report = check::check(&scene, &views, &CpuRasterizer, &options)?;
+    print(json, &report, &report)?;
+    Ok(if missing.is_empty() { Exit::Done } else { Exit::Partly })
+}
+
+/// Returns the settings that the flags stand for.
+fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
+    let (preset_background, preset_weights) = args.preset.choices();
+    // A geo-reference that lies beside the scene belongs to it.
+    let beside = args.input.scene.with_file_name("geo.json");
+    let geo = args.geo.clone().or_else(|| beside.is_file().then_some(beside));
+    let metric = args.metric || geo.is_some();
+    let folder_name = args.store.file_name().map(|name| name.to_string_lossy().into_owned());
+    let created_unix_secs = now_unix_secs();
+    let masks = match args.masks.as_str() {
+        "auto" => Masks::Auto,
+        dir => Masks::Given { dir: dir.into(), ignore_ids: args.ignore_mask_ids.clone() },
+    };
+    Ok(EncodeSettings {
+        scene: args.input.scene.clone(),
+        views: args.input.views.clone(),
+        images: args.input.images.clone(),
+        masks,
+        store: args.store.clone(),
+        scene_name: args.name.clone().or(folder_name).unwrap_or_else(|| "scene".into()),
+        metric,
+        geo,
+        views_limit: args.views_limit.map(|n| n as usize),
+        raster_width_px: args.raster_width,
+        background: args.background.map_or(preset_background, Into::into),
+        min_mask_px: args.min_mask_px,
+        weights: args.weights.map_or(preset_weights, Into::into),
+        threads: args.threads.map_or_else(available_threads, |n| n as usize),
+        memory_bytes: args.memory,
+        strict: args.input.strict,
+        restart: args.restart,
+        cells: CellLimits {
+            max_gaussians: args.cell_gaussians as usize,
+            max_width: metric.then_some(args.cell_width_m),
+        },
+        palette: PaletteSettings { max_rows: args.palette_rows as usize, max_rms: args.palette_rms },
+        created_unix_secs,
+        expires_unix_secs: args.expires_days.map(|days| created_unix_secs + u64::from(days) * 86_400),
+    })
+}
+
+fn available_threads() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
+}
+
+fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    let settings = encode_settings(args)?;
+    rayon::ThreadPoolBuilder::new().num_threads(settings.threads).build_global().context("cannot start threads")?;
+    let (models, session) = open_models(&args.models)?;
+    tracing::info!("models: {} ({})", models.encoder_id(), models.about());
+    let summary = encode::encode(&settings, &models, &session, progress, cancel_flag()?.as_ref())?;
+    let stages = summary.busy_secs.iter().map(|(stage, s)| format!("{stage} {s:.1}")).collect::<Vec<_>>().join(", ");
+    let sizes =
+        summary.shard_bytes.iter().map(|(p, b)| format!("{p} {:.1} MB", *b as f64 / 1e6)).collect::<Vec<_>>().join(", ");
+    let skipped = match summary.skipped_views.len() {
+        0 => String::new(),
+        n => format!("left out   {n} views, the first: {}\n", summary.skipped_views[0].reason),
+    };
+    let lines = format!(
+        "published  generation {} in {}\n\
+         Gaussians  {} ({} without evidence, {} unusable)\n\
+         views      {} ({} resumed, {} without masks)\n{skipped}\
+         masks      {} in {} regions, {} sums\n\
+         cells      {} with {} palette rows\n\
+         shards     {sizes}\n\
+         seconds    {:.1}; by stage, all threads: {stages}\n",
+        summary.generation,
+        settings.store.display(),
+        summary.n_gaussians,
+        summary.n_without_evidence,
+        summary.n_rejected,
+        summary.n_views,
+        summary.n_views_resumed,
+        summary.n_views_without_masks,
+        summary.n_masks,
+        summary.n_regions,
+        summary.n_entries,
+        summary.n_cells,
+        summary.n_rows,
+        summary.wall_secs,
+    );
+    print(json, &summary, lines)?;
+    Ok(if summary.skipped_views.is_empty() { Exit::Done } else { Exit::Partly })
+}
+
+fn run_query(args: &QueryArgs, json: bool) -> Result<Exit> {
+    let reader = StoreReader::open(&args.store)?;
+    let manifest = reader.manifest();
+    let (models, session) = open_models(&args.models)?;
+    let id = slag_common::Hash32(models.encoder_id().hash());
+    if id != manifest.encoder.id {
+        return Err(anyhow!(
+            "the store was encoded with {:?} ({}), the models at hand are {}; give the same with --models",
+            manifest.encoder.name, manifest.encoder.id, models.encoder_id()
+        ));
+    }
+    let vector = models.text_encoder(&session)?.encode(&args.text)?;
+    let scores = query::scores(&reader, &vector)?;
+    if let Some(path) = &args.scores {
+        let mut file = std::io::BufWriter::new(fs_err::File::create(path)?);
+        query::write_npy(&mut file, &scores.cosines)?;
+        file.flush()?;
+    }
+    let hits = query::best(&reader, &scores, args.limit as usize)?;
+    let threshold = manifest.encoder.default_threshold;
+    let n_matching = scores.cosines.iter().filter(|c| **c >= threshold).count();
+    let n_scored = scores.cosines.iter().filter(|c| !c.is_nan()).count();
+    let mut lines = format!("{n_matching} of {n_scored} Gaussians reach {threshold}\n");
+    for hit in &hits {
+        let p = hit.position_in_world;
+        lines += &format!("{:.4}  Gaussian {:>8}  at {:.2} {:.2} {:.2}\n", hit.cosine, hit.index, p.x, p.y, p.z);
+    }
+    let value = json!({
+        "text": args.text, "threshold": threshold, "n_matching": n_matching, "n_scored": n_scored, "best": hits,
+    });
+    print(json, &value, lines)?;
+    Ok(Exit::Done)
+}
+
+fn runtime() -> Result<tokio::runtime::Runtime> {
+    tokio::runtime::Builder::new_multi_thread().enable_all().build().context("cannot start the service's threads")
+}
+
+fn run_serve(args: &ServeArgs) -> Result<Exit> {
+    runtime()?.block_on(async {
+        let server = serve::Server::bind(&args.store, args.listen).await?;
+        tracing::info!("serving {} on http://{}", args.store.display(), server.address());
+        server.run(serve::termination()).await
+    })?;
+    Ok(Exit::Done)
+}
+
+fn run_push(args: &QdrantArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    let options = qdrant::PushOptions {
+        url: args.url.clone(),
+        collection: args.collection.clone(),
+        api_key: args.api_key.clone(),
+        batch: args.batch as usize,
+        ..qdrant::PushOptions::default()
+    };
+    let report = runtime()?.block_on(qdrant::push(&args.store, &options, progress, cancel_flag()?.as_ref()))?;
+    print(json, &report, format!("{report}\n"))?;
+    Ok(Exit::Done)
+}
+
+fn run_generate(args: &GenerateArgs, progress: &dyn Progress) -> Result<Exit> {
+    let room = generate::room(args.seed, args.n_views);
+    let written = room.write(&args.out, progress)?;
+    println!(
+        "{} Gaussians, {} objects, {} photos in {}",
+        room.gaussians.len(),
+        room.objects.len(),
+        room.views.len(),
+        args.out.display()
+    );
+    println!("next: slag-encoder encode --scene {} --views {} --metric --store STORE", written.scene.display(), written.views.display());
+    Ok(Exit::Done)
+}
+
+fn run_demo(args: &DemoArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    let edge = std::env::current_exe()?.with_file_name(format!("slag-edge{}", std::env::consts::EXE_SUFFIX));
+    let options = demo::DemoOptions { out: args.out.clone(), seed: args.seed, edge, created_unix_secs: now_unix_secs() };
+    let demo = runtime()?.block_on(async { demo::run(&options, progress, cancel_flag()?.as_ref()).await })?;
+    print(json, &demo.report, &demo.report)?;
+    if args.keep {
+        demo.keep()?;
+    }
+    Ok(if demo.report.all_right() { Exit::Done } else { Exit::Failed })
+}
+

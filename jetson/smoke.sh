@@ -1,0 +1,39 @@
+#!/bin/sh
+# Runs the aarch64 slag-edge under emulation: it fetches a small generated scene from a real server and
+# must give the very answers that this machine's own build gives.
+set -eu
+cd "$(dirname "$0")/.."
+encoder=target/debug/slag-encoder
+native=target/debug/slag-edge
+cargo build --locked --bin slag-encoder --bin slag-edge
+arm() {
+    qemu-aarch64-static -L /usr/aarch64-linux-gnu target/aarch64-unknown-linux-gnu/release/slag-edge "$@"
+}
+
+work=$(mktemp -d)
+server=
+trap '[ -z "$server" ] || kill "$server" 2>/dev/null; rm -rf "$work"' EXIT
+$encoder --quiet generate --out "$work/room" --n-views 12 >/dev/null
+$encoder --quiet encode --scene "$work/room/scene.ply" --views "$work/room/transforms.json" --metric \
+    --cell-gaussians 8192 --store "$work/store" >/dev/null
+$encoder serve --store "$work/store" --listen 127.0.0.1:0 2>"$work/log" &
+server=$!
+url=
+for _ in 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20; do
+    url=$(sed -n 's/.*\(http:[^ ]*\).*/\1/p' "$work/log" | head -n 1)
+    [ -n "$url" ] && break
+    sleep 0.5
+done
+[ -n "$url" ] || { cat "$work/log" >&2; exit 1; }
+
+$native fetch --from "$url" --at 3.5,2.7,0 --radius 3 --cache "$work/native" --json >/dev/null
+arm fetch --from "$url" --at 3.5,2.7,0 --radius 3 --cache "$work/arm" --json
+for question in red blue pink; do
+    $native query "$question" --cache "$work/native" --near 3.5,2.7,0 --json >"$work/native.json" || true
+    arm query "$question" --cache "$work/arm" --near 3.5,2.7,0 --json >"$work/arm.json" || true
+    # Times differ; answers must not.
+    sed 's/"[a-z_]*_\(ms\|secs\|us\)":[0-9.e-]*,\{0,1\}//g' "$work/native.json" >"$work/native.answers"
+    sed 's/"[a-z_]*_\(ms\|secs\|us\)":[0-9.e-]*,\{0,1\}//g' "$work/arm.json" >"$work/arm.answers"
+    cmp "$work/native.answers" "$work/arm.answers" || { cat "$work"/*.answers >&2; exit 1; }
+done
+echo "jetson: slag-edge on aarch64 fetched, verified and answered as on $(uname -m)"

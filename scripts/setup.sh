@@ -1,0 +1,37 @@
+#!/bin/sh
+# Installs what SLAG needs beside Rust: a C linker, Python's pip (to unpack ONNX Runtime), ONNX Runtime.
+# usage: setup.sh [cross]     cross: also what the aarch64 build and its smoke test need
+# Does nothing where all is there already. Made for Debian 12; elsewhere install the same by hand.
+set -eu
+cd "$(dirname "$0")/.."
+
+fail() {
+    echo "setup: $*" >&2
+    exit 1
+}
+
+# "command:package" pairs; the packages are Debian 12's, pinned by its major versions where it has several.
+wanted="cc:gcc-12 cc:gcc ld:binutils python3:python3 pip3:python3-pip"
+[ "${1:-}" = cross ] &&
+    wanted="$wanted aarch64-linux-gnu-gcc:gcc-aarch64-linux-gnu aarch64-linux-gnu-gcc:libc6-dev-arm64-cross qemu-aarch64-static:qemu-user-static"
+
+missing=
+for pair in $wanted; do
+    command -v "${pair%%:*}" >/dev/null 2>&1 || missing="$missing ${pair#*:}"
+done
+if [ -n "$missing" ]; then
+    command -v apt-get >/dev/null 2>&1 || fail "needs these Debian packages, or what they are called here:$missing"
+    as_root=
+    [ "$(id -u)" = 0 ] || as_root=sudo
+    echo "setup: installing$missing" >&2
+    $as_root apt-get update -qq
+    # shellcheck disable=SC2086  # a list
+    DEBIAN_FRONTEND=noninteractive $as_root apt-get install -y -qq --no-install-recommends libc6-dev $missing >&2
+fi
+
+command -v cargo >/dev/null 2>&1 || fail "needs Rust $(sed -n 's/^rust-version = "\(.*\)"/\1/p' Cargo.toml) or newer (cargo is not on the PATH)"
+if [ "${1:-}" = cross ]; then
+    rustup target list --installed | grep -qx aarch64-unknown-linux-gnu ||
+        rustup target add aarch64-unknown-linux-gnu >&2
+fi
+sh scripts/get-onnxruntime.sh >/dev/null
