@@ -10,6 +10,7 @@ pub mod palette;
 pub mod progress;
 pub mod publish;
 pub mod query;
+pub mod check;
 pub mod raster;
 pub mod segment;
 pub mod shard;

@@ -62,7 +62,7 @@ fn by_tile_row(visible: &[ScreenGaussian], height_px: u32) -> TileRow {
     let order: Vec<u32> = order.into_iter().map(|key| key as u32).collect();
     let rows_of = |index: u32| {
         let g = &visible[index as usize];
-        let (low, high) = (g.mean_px.y - g.extent_px.y, g.mean_px.y + g.extent_px.y);
+        let [low, high] = g.y_range_px();
         ScreenGaussian::pixels_within(low, high, height_px).map(|(a, b)| (a / TILE, b / TILE))
     };
     group(&order, height_px.div_ceil(TILE) as usize, rows_of)
@@ -73,14 +73,15 @@ fn tile_row(visible: &[ScreenGaussian], candidates: &[u32], top_px: u32, camera:
     let bottom_px = (top_px + TILE).min(camera.height_px) - 1;
     let columns_of = |index: u32| {
         let g = &visible[index as usize];
-        let first = f64::from(top_px) + 0.5 - g.mean_px.y;
-        let last = f64::from(bottom_px) + 0.5 - g.mean_px.y;
-        let (first, last) = (first.max(-g.extent_px.y), last.min(g.extent_px.y));
+        let (reach2, extent_px) = (f64::from(g.reach2), g.extent_px());
+        let first = (f64::from(top_px) + 0.5 - g.mean_px.y).max(-extent_px.y);
+        let last = (f64::from(bottom_px) + 0.5 - g.mean_px.y).min(extent_px.y);
         // x of the ellipse's edge is concave (right) or convex (left) in y: its extreme within the
-        // band lies at the extreme of the whole ellipse, clamped.
-        let y_right = g.y_of_rightmost_px().max(first).min(last);
-        let y_left = (-g.y_of_rightmost_px()).max(first).min(last);
-        let half = |y: f64| (g.reach2 - (y * g.inv_height).powi(2)).max(0.0).sqrt() / g.inv_width;
+        // band lies at the extreme of the whole ellipse, clamped. That is at y = cov_xy / cov_xx * ex.
+        let y_of_rightmost = g.slope * g.inv_height.powi(-2) * reach2 / extent_px.x;
+        let y_right = y_of_rightmost.max(first).min(last);
+        let y_left = (-y_of_rightmost).max(first).min(last);
+        let half = |y: f64| (reach2 - (y * g.inv_height).powi(2)).max(0.0).sqrt() / g.inv_width;
         let low = g.mean_px.x + g.slope * y_left - half(y_left);
         let high = g.mean_px.x + g.slope * y_right + half(y_right);
         ScreenGaussian::pixels_within(low, high, camera.width_px).map(|(a, b)| (a / TILE, b / TILE))

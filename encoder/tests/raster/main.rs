@@ -1,4 +1,6 @@
 //! The rasteriser and the scene check against recorded data and a brute-force oracle.
 
+mod check;
 mod fixtures;
 mod gsplat;
+mod oracle;

@@ -1,0 +1,185 @@
+//! The scene check on real drone photos: a trained scene, its 18 photos and their COLMAP poses.
+
+use std::path::Path;
+
+use glam::{DAffine3, DQuat, DVec3};
+use slag_common::{Distortion, Gaussians, Intrinsics};
+use slag_encoder::check::{CheckError, CheckOptions, CheckReport, CheckView, Mistake, check};
+use slag_encoder::raster::{CpuRasterizer, RasterView};
+
+use crate::fixtures::shared;
+
+/// PSNR over all photos that the trainer (gsplat) reports at 1000 x 562.
+const TRAINER_PSNR_DB: f64 = 25.02;
+
+/// Reads the scene's PLY: 17 floats a vertex, logits and logs as the original 3DGS writes them.
+fn read_scene(path: &Path) -> Gaussians {
+    let bytes = fs_err::read(path).unwrap();
+    let end = b"end_header\n";
+    let start = bytes.windows(end.len()).position(|w| w == end).unwrap() + end.len();
+    let mut scene = Gaussians::default();
+    for row in bytes[start..].chunks_exact(17 * 4) {
+        let f: Vec<f32> = row.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
+        scene.means_in_world.push(DVec3::new(f[0].into(), f[1].into(), f[2].into()));
+        scene.sh_dc.push([f[6], f[7], f[8]]);
+        scene.opacities.push(1.0 / (1.0 + (-f[9]).exp()));
+        scene.scales.push([f[10].exp(), f[11].exp(), f[12].exp()]);
+        let norm = f[13..17].iter().map(|c| c * c).sum::<f32>().sqrt();
+        scene.rotations_wxyz.push([f[13] / norm, f[14] / norm, f[15] / norm, f[16] / norm]);
+    }
+    assert_eq!(scene.len(), 149_097);
+    scene
+}
+
+/// Reads every `step`-th view of the model, by name.
+fn read_views(root: &Path, step: usize) -> Vec<CheckView> {
+    let intrinsics = Intrinsics {
+        width_px: 1574,
+        height_px: 884,
+        focal_x_px: 924.0,
+        focal_y_px: 924.0,
+        centre_x_px: 787.0,
+        centre_y_px: 442.0,
+        distortion: Distortion::None,
+    };
+    let text = fs_err::read_to_string(root.join("sparse/0/images.txt")).unwrap();
+    let mut lines: Vec<Vec<&str>> =
+        text.lines().filter(|line| line.ends_with(".jpg")).map(|line| line.split(' ').collect()).collect();
+    lines.sort_by_key(|fields| fields[9]);
+    assert_eq!(lines.len(), 18);
+    lines
+        .iter()
+        .step_by(step)
+        .map(|fields| {
+            let n: Vec<f64> = fields[1..8].iter().map(|v| v.parse().unwrap()).collect();
+            let rotation = DQuat::from_xyzw(n[1], n[2], n[3], n[0]).normalize();
+            let translation = DVec3::new(n[4], n[5], n[6]);
+            CheckView {
+                name: fields[9].to_owned(),
+                image: image::open(root.join("images").join(fields[9])).unwrap().into_rgb8(),
+                view: RasterView {
+                    camera_from_world: DAffine3::from_rotation_translation(rotation, translation),
+                    intrinsics,
+                },
+            }
+        })
+        .collect()
+}
+
+fn run(scene: &Gaussians, views: &[CheckView], options: &CheckOptions) -> CheckReport {
+    let report = check(scene, views, &CpuRasterizer, options).unwrap();
+    println!("mean {:.2} dB, {:?}", report.mean_psnr_db, report.diagnosis.as_ref().map(|d| &d.advice));
+    report
+}
+
+#[test]
+fn a_scene_that_fits_its_photos_passes() {
+    let Some(root) = shared("scenes/brighton") else { return };
+    let scene = read_scene(&root.join("point_cloud.ply"));
+    let pictures_dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join("check");
+    let options =
+        CheckOptions { width_px: 1000, pictures_dir: Some(pictures_dir.clone()), ..CheckOptions::default() };
+    let report = run(&scene, &read_views(&root, 5), &options);
+    assert_eq!(report.diagnosis, None);
+    assert_eq!((report.views.len(), report.unusable_gaussians), (4, 0));
+    assert!((report.mean_psnr_db - TRAINER_PSNR_DB).abs() < 1.5, "{}", report.mean_psnr_db);
+    assert!(report.mean_covered_share > 0.9);
+    let picture = image::open(pictures_dir.join("0001_DJI_0023.jpg.png")).unwrap();
+    assert_eq!((picture.width(), picture.height()), (2000, 562));
+}
+
+#[test]
+#[ignore = "18 photos at full training size: half a minute"]
+fn psnr_is_what_the_trainer_reports() {
+    let Some(root) = shared("scenes/brighton") else { return };
+    let scene = read_scene(&root.join("point_cloud.ply"));
+    let options = CheckOptions { width_px: 1000, ..CheckOptions::default() };
+    let report = run(&scene, &read_views(&root, 1), &options);
+    assert!((report.mean_psnr_db - TRAINER_PSNR_DB).abs() < 0.5, "{}", report.mean_psnr_db);
+}
+
+/// Plants each mistake by the inverse of its correction, written out independently of it.
+#[test]
+fn planted_mistakes_are_diagnosed() {
+    let Some(root) = shared("scenes/brighton") else { return };
+    let scene = read_scene(&root.join("point_cloud.ply"));
+    let views = read_views(&root, 5);
+    let options = CheckOptions { width_px: 160, ..CheckOptions::default() };
+    let diagnosed = |scene: &Gaussians, plant: &dyn Fn(&mut RasterView)| {
+        let mut views = views.clone();
+        views.iter_mut().for_each(|view| plant(&mut view.view));
+        let diagnosis = run(scene, &views, &options).diagnosis.expect("a diagnosis");
+        assert!(!diagnosis.advice.is_empty());
+        diagnosis.mistake
+    };
+
+    let negate_yz = |view: &mut RasterView| {
+        let pose = &mut view.camera_from_world;
+        for axis in [&mut pose.matrix3.x_axis, &mut pose.matrix3.y_axis, &mut pose.matrix3.z_axis] {
+            (axis.y, axis.z) = (-axis.y, -axis.z);
+        }
+        (pose.translation.y, pose.translation.z) = (-pose.translation.y, -pose.translation.z);
+    };
+    assert_eq!(diagnosed(&scene, &negate_yz), Some(Mistake::OpenGlAxes));
+
+    let invert = |view: &mut RasterView| {
+        let pose = &mut view.camera_from_world;
+        pose.matrix3 = pose.matrix3.transpose();
+        pose.translation = -(pose.matrix3 * pose.translation);
+    };
+    assert_eq!(diagnosed(&scene, &invert), Some(Mistake::WorldFromCamera));
+    let nerf = |view: &mut RasterView| {
+        negate_yz(view);
+        invert(view);
+    };
+    assert_eq!(diagnosed(&scene, &nerf), Some(Mistake::WorldFromOpenGlCamera));
+
+    let mut large = scene.clone();
+    large.means_in_world.iter_mut().for_each(|mean| *mean *= 10.0);
+    large.scales.iter_mut().for_each(|scales| *scales = scales.map(|s| s * 10.0));
+    assert_eq!(diagnosed(&large, &|_| {}), Some(Mistake::SceneScale(10.0)));
+
+    let double_focal = |view: &mut RasterView| {
+        view.intrinsics.focal_x_px *= 2.0;
+        view.intrinsics.focal_y_px *= 2.0;
+    };
+    assert_eq!(diagnosed(&scene, &double_focal), Some(Mistake::FocalScale(0.5)));
+
+    // (x, y, z) of a z-up world is (x, z, -y) of a y-up one: turned back by three quarters.
+    let y_up = |view: &mut RasterView| {
+        let m = &mut view.camera_from_world.matrix3;
+        (m.y_axis, m.z_axis) = (m.z_axis, -m.y_axis);
+    };
+    assert_eq!(diagnosed(&scene, &y_up), Some(Mistake::WorldQuarterTurns(3)));
+
+    let other_way = |view: &mut RasterView| {
+        let pose = &mut view.camera_from_world;
+        pose.translation += DVec3::new(0.0, 0.0, -500.0);
+    };
+    assert_eq!(diagnosed(&scene, &other_way), None);
+}
+
+#[test]
+fn contradictions_are_errors() {
+    let error = |views: &[CheckView]| {
+        check(&Gaussians::default(), views, &CpuRasterizer, &CheckOptions::default()).unwrap_err()
+    };
+    assert!(matches!(error(&[]), CheckError::NoViews));
+    let view = CheckView {
+        name: "a".to_owned(),
+        image: image::RgbImage::new(4, 3),
+        view: RasterView {
+            camera_from_world: DAffine3::IDENTITY,
+            intrinsics: Intrinsics {
+                width_px: 4,
+                height_px: 4,
+                focal_x_px: 4.0,
+                focal_y_px: 4.0,
+                centre_x_px: 2.0,
+                centre_y_px: 2.0,
+                distortion: Distortion::None,
+            },
+        },
+    };
+    assert!(matches!(error(&[view]), CheckError::ImageSize { image_px: [4, 3], camera_px: [4, 4], .. }));
+}
