@@ -213,9 +213,9 @@ fn ramp(x: f32, from: f32, to: f32) -> f32 {
 /// that name, shifted a little towards the middle of what the name covers.
 const HUES: [(f32, Colour); 8] = [
     (27.0, Colour::Red),
-    (68.0, Colour::Orange),
-    (107.0, Colour::Yellow),
-    (145.0, Colour::Green),
+    (62.0, Colour::Orange),
+    (103.0, Colour::Yellow),
+    (138.0, Colour::Green),
     (255.0, Colour::Blue),
     (315.0, Colour::Purple),
     (358.0, Colour::Pink),
@@ -226,11 +226,13 @@ const HUES: [(f32, Colour); 8] = [
 fn add_colours(pixel: &Pixel, highlight: f32, shares: &mut [f32]) {
     let mut add = |colour: Colour, share: f32| shares[colour as usize] += share;
     let Pixel { lightness, saturation, hue_deg } = *pixel;
-    let lit = ramp(lightness, 0.18, 0.28);
-    add(Colour::Black, 1.0 - lit);
-
     // Photographs tint white walls; a tint below 0.045 is still called white or grey.
     let chromatic = ramp(saturation, 0.045, 0.09);
+    // Navy is darker than what is called black without a hue.
+    let darkest = 0.26 - 0.16 * chromatic;
+    let lit = ramp(lightness, darkest, darkest + 0.08);
+    add(Colour::Black, 1.0 - lit);
+
     // A third of the way to the highlight: shade on white down to a quarter of the light stays white, while
     // a grey part of a white thing stays grey.
     let relit = lightness + 0.35 * (highlight - lightness).max(0.0);

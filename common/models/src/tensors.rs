@@ -33,7 +33,7 @@ pub enum TensorsError {
         found: Vec<String>,
     },
     /// The tensor is of another kind.
-    #[error("{}: tensor {name:?} is {dtype:?} {found:?}, expected F16 or F32 {expected}; correct the description", path.display())]
+    #[error("{}: tensor {name:?} is {dtype:?} {found:?}, expected F16 or F32 {expected}; correct the description, or fetch its files again", path.display())]
     Shape {
         /// The file.
         path: PathBuf,
