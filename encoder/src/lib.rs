@@ -1,6 +1,8 @@
 //! The cloud side of SLAG as a library: one module per stage of the pipeline.
 
+pub mod check;
 pub mod cli;
+pub mod demo;
 pub mod embed;
 pub mod encode;
 pub mod generate;
@@ -10,7 +12,6 @@ pub mod palette;
 pub mod progress;
 pub mod publish;
 pub mod query;
-pub mod check;
 pub mod raster;
 pub mod segment;
 pub mod shard;
