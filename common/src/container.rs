@@ -1,5 +1,5 @@
 //! The sectioned file that shards, fields and view sums are: little-endian, 64-byte aligned,
-//! checksummed, usable through mmap without parsing. The byte table is in `docs/FORMAT.md`.
+//! checksummed, usable through mmap without parsing. The byte table is in `FORMAT.md`.
 
 use std::io::{self, Write};
 use std::ops::Range;

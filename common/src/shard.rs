@@ -1,4 +1,4 @@
-//! A shard: one cell's data in one file. The byte table and its reasons are in `docs/FORMAT.md`.
+//! A shard: one cell's data in one file. The byte table and its reasons are in `FORMAT.md`.
 //!
 //! Gaussians are ordered by palette row, then along a Morton curve, so a row's members are one
 //! run `row_starts[r]..row_starts[r + 1]` and no code column exists; those without evidence follow

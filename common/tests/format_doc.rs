@@ -1,0 +1,61 @@
+//! FORMAT.md says what the code does: its tables are compared with the constants and layouts.
+
+use std::mem::offset_of;
+
+use slag_common::shard::{self, ShardHeader, section};
+use slag_common::{container, manifest};
+
+/// Returns the cells of every table row of the document.
+fn rows() -> Vec<Vec<String>> {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../FORMAT.md");
+    let text = fs_err::read_to_string(path).expect("FORMAT.md lies at the project's root");
+    text.lines()
+        .filter(|line| line.starts_with('|'))
+        .map(|line| line.trim_matches('|').split('|').map(|cell| cell.trim().to_owned()).collect())
+        .collect()
+}
+
+fn has(expected: &[&str]) -> bool {
+    rows().iter().any(|row| row.iter().zip(expected).all(|(a, b)| a == b) && row.len() >= expected.len())
+}
+
+#[test]
+fn header_offsets_are_those_of_the_struct() {
+    macro_rules! field {
+        ($name:ident, $size:expr, $kind:expr) => {
+            let offset = offset_of!(ShardHeader, $name).to_string();
+            assert!(has(&[&offset, &$size.to_string(), $kind, stringify!($name)]), "{}", stringify!($name));
+        };
+    }
+    field!(cell_id, 4, "u32");
+    field!(n_gaussians, 4, "u32");
+    field!(n_rows, 4, "u32");
+    field!(dim, 4, "u32");
+    field!(origin_in_world, 24, "f64 x 3");
+    field!(position_step, 24, "f64 x 3");
+    field!(box_min, 24, "f64 x 3");
+    field!(box_max, 24, "f64 x 3");
+    field!(encoder_id, 32, "bytes");
+    assert_eq!(size_of::<ShardHeader>(), 144, "a field is missing in FORMAT.md");
+}
+
+#[test]
+fn sections_and_versions_are_those_of_the_code() {
+    let sections = [
+        (section::HEADER, "header"),
+        (section::POSITIONS, "positions"),
+        (section::ROW_STARTS, "row_starts"),
+        (section::PALETTE, "palette"),
+        (section::RADII, "radii"),
+        (section::INPUT_INDICES, "input_indices"),
+        (section::EMBEDDINGS, "embeddings"),
+    ];
+    for (id, name) in sections {
+        assert!(has(&[&id.to_string(), name]), "section {id} {name}");
+    }
+    let magic = String::from_utf8(shard::MAGIC.to_vec()).expect("ASCII");
+    assert!(has(&["shard", &format!("`{magic}`"), &shard::VERSION.to_string()]));
+    assert!(has(&["manifest", "`slag-manifest`", &manifest::VERSION.to_string()]));
+    assert!(has(&["12", "4", "u32", "n_sections", &format!("0..={}", container::MAX_SECTIONS)]));
+    assert!(has(&[&container::PREAMBLE_BYTES.to_string(), &format!("{} n", container::SECTION_ROW_BYTES)]));
+}
