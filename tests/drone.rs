@@ -1,0 +1,68 @@
+//! The drone survey: real photos, metric, geo-referenced.
+
+use slag_tests::*;
+
+/// Photos and splat fit as well as the scene's own notes say (25.02 dB at 1000 px).
+#[test]
+fn check_confirms_the_poses() {
+    let Some(scene) = shared("scenes/brighton") else { return };
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let report = run_json(&mut encoder(&[
+        "check", "--scene", text(&scene.join("point_cloud.ply")), "--views", text(&scene.join("sparse/0")),
+        "--samples", "18", "--raster-width", "1000", "--out", text(dir.path()),
+    ]));
+    let psnr_db = report["mean_psnr_db"].as_f64().expect("a figure");
+    println!("mean PSNR of 18 photos: {psnr_db:.2} dB");
+    assert!((psnr_db - 25.02).abs() <= 0.5);
+    assert_eq!(fs_err::read_dir(dir.path()).expect("pictures").count(), 18);
+    assert!(report["diagnosis"].is_null());
+}
+
+/// From photos to a robot: automatic masks, shards around a place given in metres and in degrees.
+#[test]
+fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
+    let (Some(scene), Some(_)) = (shared("scenes/brighton"), shared("models/image_encoder")) else { return };
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let store = dir.path().join("brighton");
+    let models = root().join("tests/models/conse");
+    // Six photos show the road end to end; all eighteen only take longer.
+    let summary = run_json(&mut encoder(&[
+        "encode", "--scene", text(&scene.join("point_cloud.ply")), "--views", text(&scene.join("sparse/0")),
+        "--masks", "auto", "--models", text(&models), "--views-limit", "6", "--store", text(&store),
+    ]));
+    println!("{summary:#}");
+    let n_cells = summary["n_cells"].as_u64().expect("a count");
+    let server = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
+
+    // A point on the ground near the middle, and the same in degrees (oracle: another implementation's
+    // figures, from an ENU library for the origin of geo.json).
+    let origin = server.get("/v1/cells?x=0&y=0&z=2&radius=30");
+    let nearby = origin["cells"].as_array().expect("cells").len() as u64;
+    assert!(0 < nearby && nearby < n_cells, "{nearby} of {n_cells} cells");
+
+    let fetch = |at: &[&str], cache: &str| {
+        let cache = dir.path().join(cache);
+        let mut args = vec!["fetch", "--from", &server.url, "--radius", "30", "--cache", text(&cache)];
+        args.extend(at);
+        let report = run_json(&mut edge(&args));
+        println!("{report}");
+        let mut shards: Vec<String> = fs_err::read_dir(cache.join("shards"))
+            .expect("shards")
+            .map(|entry| entry.expect("an entry").file_name().into_string().expect("a hash"))
+            .collect();
+        shards.sort();
+        shards
+    };
+    let by_metres = fetch(&["--at", "0,0,2"], "metres");
+    let by_degrees = fetch(&["--at-geo", "46.842657,-91.994008,160.509"], "degrees");
+    assert_eq!(by_metres, by_degrees);
+    assert_eq!(by_metres.len() as u64, nearby);
+
+    let cache = dir.path().join("metres");
+    let models = text(&models);
+    for question in ["car", "tree", "picnic table"] {
+        let reply = run_json(&mut edge(&["query", question, "--cache", text(&cache), "--models", models, "--near", "0,0,2"]));
+        println!("{question}: {reply}");
+        assert!(reply["answers"].is_array());
+    }
+}

@@ -1,0 +1,125 @@
+//! The labelled house: agreement with a field that an independent pipeline computed.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use half::f16;
+use serde_json::Value;
+use slag_encoder::encode::{read_field, read_regions};
+use slag_encoder::store::StoreReader;
+use slag_tests::*;
+
+/// Encodes the house with its given masks and the ConSE encoder and compares total weights, embeddings, and
+/// per word AUC and IoU. The tolerances are the reference's own: crops, resizing and runtime versions
+/// differ a little.
+#[test]
+fn the_field_agrees_with_the_independent_reference() {
+    let (Some(house), Some(_)) = (shared("scenes/house_a"), shared("models/image_encoder")) else { return };
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let store = dir.path().join("house");
+    let models = root().join("tests/models/conse");
+    let (scene, views, masks) = (house.join("point_cloud.ply"), house.join("sparse/0"), house.join("gt/masks"));
+    let summary = run_json(&mut encoder(&[
+        "encode", "--scene", text(&scene), "--views", text(&views), "--masks", text(&masks), "--models", text(&models),
+        "--background", "white", "--min-mask-px", "200", "--metric", "--strict", "--store", text(&store),
+    ]));
+    println!("{summary:#}");
+    assert_eq!(summary["n_masks"], 1423, "the reference has as many masks");
+
+    check_embeddings(&house, &store);
+    check_words(&house, &store, &models, dir.path());
+}
+
+/// Cosine at least 0.99 for 95 % of the reference's Gaussians, total weights within 1 %.
+fn check_embeddings(house: &Path, store: &Path) {
+    let bytes = fs_err::read(house.join("gt/reference_embeddings.npz")).expect("reads");
+    let mut npz = npyz::npz::NpzArchive::new(std::io::Cursor::new(bytes)).expect("an npz");
+    let index: Vec<u32> = npz.by_name("index").expect("an npz").expect("index").into_vec().expect("u32");
+    let embedding: Vec<f16> = npz.by_name("embedding").expect("an npz").expect("embedding").into_vec().expect("f16");
+    let weight: Vec<f32> = npz.by_name("total_weight").expect("an npz").expect("weight").into_vec().expect("f32");
+    let dim = embedding.len() / index.len();
+
+    let reader = StoreReader::open(store).expect("a published store");
+    let table = read_regions(&reader).expect("regions");
+    let fields: Vec<_> =
+        reader.manifest().cells.iter().map(|c| read_field(&reader, c.cell_id, table.len()).expect("a field")).collect();
+    let place: BTreeMap<u32, (usize, usize)> = fields
+        .iter()
+        .enumerate()
+        .flat_map(|(cell, field)| field.input_indices.iter().enumerate().map(move |(k, i)| (*i, (cell, k))))
+        .collect();
+    let (mut cosines, mut weight_errors) = (Vec::new(), Vec::new());
+    let mut ours = vec![0.0f32; dim];
+    for ((index, expected), weight) in index.iter().zip(embedding.chunks(dim)).zip(&weight) {
+        let (cell, k) = place[index];
+        fields[cell].embedding(k, &table, &mut ours);
+        let cosine: f64 = ours.iter().zip(expected).map(|(a, b)| f64::from(*a) * b.to_f64()).sum();
+        let length = expected.iter().map(|b| b.to_f64() * b.to_f64()).sum::<f64>().sqrt();
+        cosines.push(cosine / length);
+        weight_errors.push(f64::from((fields[cell].total_weights[k] - weight).abs() / weight));
+    }
+    cosines.sort_by(f64::total_cmp);
+    weight_errors.sort_by(f64::total_cmp);
+    let n = cosines.len();
+    println!(
+        "{n} reference Gaussians: cosine min {:.4}, 5th percentile {:.4}, median {:.4}; weight error median {:.5}, 99th percentile {:.5}, max {:.5}",
+        cosines[0], cosines[n / 20], cosines[n / 2], weight_errors[n / 2], weight_errors[n * 99 / 100], weight_errors[n - 1]
+    );
+    assert!(cosines[n / 20] >= 0.99);
+    assert!(weight_errors[n * 95 / 100] <= 0.01);
+}
+
+/// Mean AUC within 0.01 of the reference's 0.795, mIoU within 0.02 of its 0.221; prints a table by word.
+fn check_words(house: &Path, store: &Path, models: &Path, dir: &Path) {
+    let read = |name: &str| -> Value {
+        serde_json::from_slice(&fs_err::read(house.join(name)).expect("reads")).expect("JSON")
+    };
+    let reference = read("gt/reference.json")["results"]["white"].clone();
+    let instances = read("gt/instances.json");
+    let category: BTreeMap<u64, String> = instances["instances"]
+        .as_array()
+        .expect("instances")
+        .iter()
+        .map(|i| (i["id"].as_u64().expect("an id"), i["category"].as_str().expect("a category").to_owned()))
+        .collect();
+    let truth: Vec<u16> = read_npy(&house.join("gt/gaussian_instance.npy"));
+    // Gaussians of background surfaces and unlabelled ones take no part.
+    let (objects, labels): (Vec<usize>, Vec<&String>) =
+        truth.iter().enumerate().filter_map(|(k, id)| category.get(&u64::from(*id)).map(|c| (k, c))).unzip();
+
+    let words: Vec<String> = reference["auc"].as_object().expect("words").keys().cloned().collect();
+    let mut scores = Vec::new();
+    for word in &words {
+        let path = dir.join("scores.npy");
+        run(&mut encoder(&["query", "--store", text(store), "--models", text(models), word, "--scores", text(&path)]));
+        let all: Vec<f32> = read_npy(&path);
+        assert_eq!(all.len(), truth.len());
+        // What was never seen scores below everything.
+        scores.push(objects.iter().map(|k| if all[*k].is_nan() { -2.0 } else { all[*k] }).collect::<Vec<f32>>());
+    }
+    // The multi-class answer is the best word, over Gaussians of the words' categories.
+    let of_words: Vec<usize> = (0..objects.len()).filter(|i| words.contains(labels[*i])).collect();
+    let best: Vec<usize> = of_words
+        .iter()
+        .map(|i| (0..words.len()).max_by(|a, b| scores[*a][*i].total_cmp(&scores[*b][*i])).expect("words"))
+        .collect();
+    println!("{:<18} {:>7} {:>9} {:>7} {:>9}", "word", "AUC", "reference", "IoU", "reference");
+    let (mut aucs, mut ious) = (Vec::new(), Vec::new());
+    for (w, word) in words.iter().enumerate() {
+        let positive: Vec<bool> = labels.iter().map(|label| *label == word).collect();
+        let auc = roc_auc(&scores[w], &positive);
+        let count = |test: &dyn Fn(bool, bool) -> bool| {
+            of_words.iter().zip(&best).filter(|(i, b)| test(labels[**i] == word, **b == w)).count() as f64
+        };
+        let iou = count(&|is, said| is && said) / count(&|is, said| is || said).max(1.0);
+        let [auc_then, iou_then] = ["auc", "iou"].map(|m| reference[m][word].as_f64().expect("a figure"));
+        println!("{word:<18} {auc:>7.4} {auc_then:>9.4} {iou:>7.4} {iou_then:>9.4}");
+        aucs.push(auc);
+        ious.push(iou);
+    }
+    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+    let (auc, iou) = (mean(&aucs), mean(&ious));
+    println!("{:<18} {auc:>7.4} {:>9} {iou:>7.4} {:>9}", "mean", reference["auc_mean"], reference["miou"]);
+    assert!((auc - reference["auc_mean"].as_f64().expect("a figure")).abs() <= 0.01);
+    assert!((iou - reference["miou"].as_f64().expect("a figure")).abs() <= 0.02);
+}
