@@ -14,6 +14,7 @@ pub mod publish;
 pub mod query;
 pub mod raster;
 pub mod embed;
+pub mod publish;
 pub mod segment;
 pub mod shard;
 pub mod store;

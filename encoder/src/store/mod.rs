@@ -22,7 +22,7 @@ mod error;
 mod files;
 mod reader;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Write};

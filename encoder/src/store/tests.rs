@@ -7,31 +7,43 @@ use slag_common::shard::Profile;
 
 use super::*;
 
-/// A manifest whose cells list the given objects, one a cell.
-fn manifest(generation: u64, objects: &[(Hash32, u64)]) -> Manifest {
-    let cell = |(cell_id, (hash, len_bytes)): (usize, &(Hash32, u64))| {
-        let min = DVec3::splat(cell_id as f64);
-        let (hash, len_bytes) = (*hash, *len_bytes);
-        let record = ShardRecord { hash, len_bytes, n_rows: 1, score_error_bound: 0.0, position_error: 0.0 };
-        let bounds = Aabb { min, max: min + DVec3::ONE };
-        let shards = BTreeMap::from([(Profile::Compact, record)]);
-        CellRecord { cell_id: cell_id as u32, bounds, n_gaussians: 1, shards }
+/// A manifest of cells without shards.
+pub(crate) fn manifest_of_boxes(boxes: &[Aabb]) -> Manifest {
+    let cell = |(cell_id, bounds): (usize, &Aabb)| CellRecord {
+        cell_id: cell_id as u32,
+        bounds: *bounds,
+        n_gaussians: 1 + cell_id as u32,
+        shards: BTreeMap::new(),
     };
-    let encoder = EncoderRecord { name: "e".into(), id: Hash32([1; 32]), dim: 4, default_threshold: 0.5 };
     Manifest {
         version: VERSION,
         scene: "yard".into(),
-        generation,
+        generation: 1,
         created_unix_secs: 1,
         expires_unix_secs: None,
         metric: true,
         geo_reference: None,
-        encoder,
-        n_gaussians: objects.len() as u64,
+        encoder: EncoderRecord { name: "e".into(), id: Hash32([1; 32]), dim: 4, default_threshold: 0.5 },
+        n_gaussians: boxes.len() as u64,
         n_without_evidence: 0,
         n_rejected: 0,
-        cells: objects.iter().enumerate().map(cell).collect(),
+        cells: boxes.iter().enumerate().map(cell).collect(),
     }
+}
+
+/// A manifest whose cells list the given objects, one a cell, in a row along x.
+pub(crate) fn manifest(generation: u64, objects: &[(Hash32, u64)]) -> Manifest {
+    let unit_box = |i: usize| {
+        let min = DVec3::X * (10 * i) as f64;
+        Aabb { min, max: min + DVec3::ONE }
+    };
+    let boxes: Vec<Aabb> = (0..objects.len()).map(unit_box).collect();
+    let mut manifest = Manifest { generation, ..manifest_of_boxes(&boxes) };
+    for (cell, &(hash, len_bytes)) in manifest.cells.iter_mut().zip(objects) {
+        let record = ShardRecord { hash, len_bytes, n_rows: 1, score_error_bound: 0.0, position_error: 0.0 };
+        cell.shards.insert(Profile::Compact, record);
+    }
+    manifest
 }
 
 fn put_many(store: &Store, texts: &[impl AsRef<[u8]>]) -> Vec<(Hash32, u64)> {

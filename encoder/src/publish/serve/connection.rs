@@ -1,0 +1,116 @@
+//! Accepting connections: a bounded number, and none that stalls for ever.
+
+use std::io;
+use std::net::SocketAddr;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use axum::serve::Listener;
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::time::{Instant, Sleep, sleep_until};
+
+/// A listener with a bounded number of connections; further ones wait in the system's queue.
+pub(super) struct BoundedListener {
+    pub(super) tcp: TcpListener,
+    pub(super) slots: Arc<Semaphore>,
+    pub(super) stall_timeout: Duration,
+}
+
+impl Listener for BoundedListener {
+    type Io = Connection<TcpStream>;
+    type Addr = SocketAddr;
+
+    async fn accept(&mut self) -> (Self::Io, SocketAddr) {
+        let slot = Arc::clone(&self.slots).acquire_owned().await.expect("the semaphore is never closed");
+        // tokio's own listener retries after errors such as too many open files.
+        let (stream, address) = Listener::accept(&mut self.tcp).await;
+        (Connection::new(stream, Some(slot), self.stall_timeout), address)
+    }
+
+    fn local_addr(&self) -> io::Result<SocketAddr> {
+        self.tcp.local_addr()
+    }
+}
+
+/// A connection that fails once nothing could be sent for `stall_timeout`.
+///
+/// Requests have no bodies, so time without a byte sent is time a client idles, drips its headers or
+/// does not read its answer: one deadline bounds all three.
+pub(super) struct Connection<S> {
+    stream: S,
+    stall_timeout: Duration,
+    deadline: Pin<Box<Sleep>>,
+    _slot: Option<OwnedSemaphorePermit>,
+}
+
+impl<S> Connection<S> {
+    pub(super) fn new(stream: S, slot: Option<OwnedSemaphorePermit>, stall_timeout: Duration) -> Self {
+        let deadline = Box::pin(sleep_until(Instant::now() + stall_timeout));
+        Self { stream, stall_timeout, deadline, _slot: slot }
+    }
+
+    /// Turns "not yet" into an error after the deadline; progress in sending moves the deadline.
+    fn bounded<T>(
+        &mut self,
+        polled: Poll<io::Result<T>>,
+        sending: bool,
+        context: &mut Context<'_>,
+    ) -> Poll<io::Result<T>> {
+        if polled.is_pending() {
+            return self.deadline.as_mut().poll(context).map(|()| Err(io::ErrorKind::TimedOut.into()));
+        }
+        if sending {
+            self.deadline.as_mut().reset(Instant::now() + self.stall_timeout);
+        }
+        polled
+    }
+}
+
+impl<S: AsyncRead + Unpin> AsyncRead for Connection<S> {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        let polled = Pin::new(&mut self.stream).poll_read(context, buffer);
+        self.bounded(polled, false, context)
+    }
+}
+
+impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
+    fn poll_write(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        bytes: &[u8],
+    ) -> Poll<io::Result<usize>> {
+        let polled = Pin::new(&mut self.stream).poll_write(context, bytes);
+        self.bounded(polled, true, context)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        slices: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        let polled = Pin::new(&mut self.stream).poll_write_vectored(context, slices);
+        self.bounded(polled, true, context)
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        self.stream.is_write_vectored()
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        let polled = Pin::new(&mut self.stream).poll_flush(context);
+        self.bounded(polled, false, context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        let polled = Pin::new(&mut self.stream).poll_shutdown(context);
+        self.bounded(polled, false, context)
+    }
+}

@@ -1,0 +1,153 @@
+//! Byte ranges and entity tags of HTTP (RFC 9110, sections 8.8, 13 and 14).
+
+use std::ops::RangeInclusive;
+
+/// What a `Range` header asks of a representation.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Selection {
+    /// All of it: no range, or one that may be ignored (another unit, malformed, several ranges).
+    Whole,
+    /// These bytes; never empty.
+    Part(RangeInclusive<u64>),
+    /// Nothing that is there: 416.
+    Unsatisfiable,
+}
+
+/// Reads a `Range` header's value against a representation of `len_bytes`.
+pub(super) fn select(value: &str, len_bytes: u64) -> Selection {
+    let Some((unit, set)) = value.split_once('=') else { return Selection::Whole };
+    if !unit.eq_ignore_ascii_case("bytes") {
+        return Selection::Whole;
+    }
+    // List elements may be empty and have blanks around commas, but not at the ends (5.6.1.2).
+    let optional_blanks = [' ', '\t'];
+    if set.starts_with(optional_blanks) || set.ends_with(optional_blanks) {
+        return Selection::Whole;
+    }
+    let mut specs = set.split(',').map(|spec| spec.trim_matches(optional_blanks)).filter(|s| !s.is_empty());
+    let (Some(spec), None) = (specs.next(), specs.next()) else { return Selection::Whole };
+    let Some((first, last)) = spec.split_once('-') else { return Selection::Whole };
+    let (Some(first), Some(last)) = (position(first), position(last)) else { return Selection::Whole };
+    match (first, last) {
+        (None, None) => Selection::Whole,
+        (Some(first), Some(last)) if last < first => Selection::Whole,
+        (Some(first), _) if first >= len_bytes => Selection::Unsatisfiable,
+        (Some(first), last) => Selection::Part(first..=last.unwrap_or(u64::MAX).min(len_bytes - 1)),
+        (None, Some(0)) => Selection::Unsatisfiable,
+        // A suffix of nothing is satisfiable, but no `Content-Range` can say it.
+        (None, Some(_)) if len_bytes == 0 => Selection::Whole,
+        (None, Some(suffix)) => Selection::Part(len_bytes.saturating_sub(suffix)..=len_bytes - 1),
+    }
+}
+
+/// Reads digits; `Some(None)` without any, `None` if there is something else. Numbers beyond u64 are
+/// beyond any file too.
+fn position(digits: &str) -> Option<Option<u64>> {
+    match digits {
+        "" => Some(None),
+        _ if !digits.bytes().all(|b| b.is_ascii_digit()) => None,
+        _ => Some(Some(digits.parse().unwrap_or(u64::MAX))),
+    }
+}
+
+/// Returns whether an `If-None-Match` value names a tag (weak comparison, 13.1.2).
+pub(super) fn names_tag(value: &str, tag: &str) -> bool {
+    let tags = || value.split(',').map(|one| one.trim_matches([' ', '\t']));
+    value.trim() == "*" || tags().any(|one| one.strip_prefix("W/").unwrap_or(one) == tag)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: the examples and rules of RFC 9110, 14.1.1 and 14.1.2, by hand.
+    #[test]
+    fn ranges_of_rfc_9110() {
+        use Selection::{Part, Unsatisfiable, Whole};
+        let table = [
+            // 14.1.2: examples for a representation of 10000 bytes.
+            ("bytes=0-499", 10_000, Part(0..=499)),
+            ("bytes=500-999", 10_000, Part(500..=999)),
+            ("bytes=-500", 10_000, Part(9500..=9999)),
+            ("bytes=9500-", 10_000, Part(9500..=9999)),
+            ("bytes=0-0", 10_000, Part(0..=0)),
+            ("bytes=-1", 10_000, Part(9999..=9999)),
+            ("bytes=0-0,-1", 10_000, Whole),
+            ("bytes= 0-999, 4500-5499, -1000", 10_000, Whole),
+            ("bytes=500-600,601-999", 10_000, Whole),
+            // "if the last-pos value is absent, or greater than or equal to the current length, the
+            // byte range is interpreted as the remainder".
+            ("bytes=0-", 10, Part(0..=9)),
+            ("bytes=0-10", 10, Part(0..=9)),
+            ("bytes=9-99999999999999999999999", 10, Part(9..=9)),
+            // "If the selected representation is shorter than the suffix-length, the entire".
+            ("bytes=-11", 10, Part(0..=9)),
+            ("bytes=-99999999999999999999999", 10, Part(0..=9)),
+            // Satisfiable: "a first-pos less than the current length" or "a non-zero suffix-length".
+            ("bytes=10-", 10, Unsatisfiable),
+            ("bytes=10-20", 10, Unsatisfiable),
+            ("bytes=99999999999999999999999-", 10, Unsatisfiable),
+            ("bytes=-0", 10, Unsatisfiable),
+            ("bytes=0-", 0, Unsatisfiable),
+            ("bytes=-5", 0, Whole),
+            // "An int-range is invalid if the last-pos value is present and less than first-pos."
+            ("bytes=5-4", 10, Whole),
+            ("bytes=20-10", 10, Whole),
+            // Malformed, or another unit: ignored.
+            ("", 10, Whole),
+            ("bytes", 10, Whole),
+            ("bytes=", 10, Whole),
+            ("bytes=-", 10, Whole),
+            ("bytes=1", 10, Whole),
+            ("bytes=a-b", 10, Whole),
+            ("bytes=+1-2", 10, Whole),
+            ("bytes=1-+2", 10, Whole),
+            ("bytes=1--2", 10, Whole),
+            ("bytes=1 -2", 10, Whole),
+            ("bytes=0x1-2", 10, Whole),
+            ("bytes=\u{662}-\u{663}", 10, Whole),
+            ("bytes =1-2", 10, Whole),
+            ("bytes: 1-2", 10, Whole),
+            ("seconds=1-2", 10, Whole),
+            // 14.1: "Range units are case-insensitive"; 5.6.1.2: empty list elements.
+            ("BYTES=1-2", 10, Part(1..=2)),
+            ("bytes=,1-2", 10, Part(1..=2)),
+            ("bytes=1-2 ,\t,", 10, Part(1..=2)),
+            ("bytes=0-0", 1, Part(0..=0)),
+            ("bytes=0-0", u64::MAX, Part(0..=0)),
+        ];
+        for (value, len_bytes, expected) in table {
+            assert_eq!(select(value, len_bytes), expected, "{value:?} of {len_bytes}");
+        }
+    }
+
+    /// Whatever is asked, the part lies within the representation.
+    #[test]
+    fn parts_lie_within() {
+        let pieces = ["", "0", "1", "9", "10", "18446744073709551615", "18446744073709551616", "x"];
+        for (first, last) in pieces.iter().flat_map(|a| pieces.iter().map(move |b| (a, b))) {
+            for len_bytes in [0, 1, 2, 10, 11, u64::MAX] {
+                if let Selection::Part(part) = select(&format!("bytes={first}-{last}"), len_bytes) {
+                    assert!(part.start() <= part.end() && *part.end() < len_bytes, "{part:?} of {len_bytes}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn tags_in_lists() {
+        for (value, expected) in [
+            ("\"a\"", true),
+            ("W/\"a\"", true),
+            ("\"b\", \"a\"", true),
+            ("\"b\" ,W/\"a\"", true),
+            ("*", true),
+            ("\"b\"", false),
+            ("a", false),
+            ("\"aa\"", false),
+            ("", false),
+        ] {
+            assert_eq!(names_tag(value, "\"a\""), expected, "{value}");
+        }
+    }
+}

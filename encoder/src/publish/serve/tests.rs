@@ -1,0 +1,463 @@
+use std::path::Path;
+
+use axum::body::to_bytes;
+use axum::http::Request;
+use serde_json::Value;
+use slag_common::frames::{GeoReference, Geographic};
+use slag_common::manifest::TrustedKeys;
+use tokio::io::AsyncWriteExt;
+use tower::ServiceExt;
+
+use super::*;
+use crate::store::tests::{manifest, manifest_of_boxes};
+use crate::store::{Extras, Store};
+
+/// A store with generations 1 (shards 0 and 1) and 2 (shards 1 and 2), and the shards' bytes.
+struct Fixture {
+    dir: tempfile::TempDir,
+    store: Store,
+    shards: Vec<(Hash32, Vec<u8>)>,
+    extra: Hash32,
+}
+
+fn fixture() -> Fixture {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    let content =
+        |seed: u32| (0..200_000u32).map(|i| (i.wrapping_mul(2_654_435_761 + seed) >> 24) as u8).collect();
+    let shards: Vec<(Hash32, Vec<u8>)> = (0..3)
+        .map(|seed| {
+            let bytes: Vec<u8> = content(seed);
+            (store.put_bytes(&bytes).expect("room").0, bytes)
+        })
+        .collect();
+    let extra = store.put_bytes(b"not for robots").expect("room").0;
+    let extras = Extras::from([("field".to_owned(), extra)]);
+    let fixture = Fixture { dir, store, shards, extra };
+    for generation in [1, 2] {
+        let listed = fixture.listed(generation - 1..generation + 1);
+        fixture.store.publish(&manifest(generation as u64, &listed), &extras).expect("publishes");
+    }
+    fixture
+}
+
+impl Fixture {
+    fn listed(&self, range: std::ops::Range<usize>) -> Vec<(Hash32, u64)> {
+        self.shards[range].iter().map(|(hash, bytes)| (*hash, bytes.len() as u64)).collect()
+    }
+
+    fn router(&self) -> Router {
+        router(self.dir.path(), Limits::default()).expect("published")
+    }
+}
+
+struct Answer {
+    status: StatusCode,
+    headers: HeaderMap,
+    body: Bytes,
+}
+
+impl Answer {
+    fn header(&self, name: HeaderName) -> &str {
+        self.headers.get(name).map_or("", |value| value.to_str().expect("ASCII"))
+    }
+
+    fn json(&self) -> Value {
+        serde_json::from_slice(&self.body).expect("JSON")
+    }
+
+    /// Checks that this is a problem of RFC 9457 and returns its detail.
+    fn problem(&self, status: StatusCode) -> String {
+        assert_eq!(self.status, status);
+        assert_eq!(self.header(header::CONTENT_TYPE), "application/problem+json");
+        let problem = self.json();
+        assert_eq!(problem["type"], "about:blank");
+        assert_eq!(problem["status"], status.as_u16());
+        assert_eq!(problem["title"], status.canonical_reason().expect("known"));
+        assert!(problem["instance"].as_str().expect("text").contains("#request-"));
+        problem["detail"].as_str().expect("text").to_owned()
+    }
+}
+
+async fn ask(router: &Router, request: Request<Body>) -> Answer {
+    let response = router.clone().oneshot(request).await.expect("infallible");
+    let (parts, body) = response.into_parts();
+    let body = to_bytes(body, usize::MAX).await.expect("whole");
+    Answer { status: parts.status, headers: parts.headers, body }
+}
+
+fn request(path: &str, headers: &[(&str, &str)]) -> Request<Body> {
+    let mut request = Request::get(path);
+    for (name, value) in headers {
+        request = request.header(*name, *value);
+    }
+    request.body(Body::empty()).expect("a request")
+}
+
+async fn get_with(router: &Router, path: &str, headers: &[(&str, &str)]) -> Answer {
+    ask(router, request(path, headers)).await
+}
+
+#[tokio::test]
+async fn manifest_is_tagged_and_verifies() {
+    let fixture = fixture();
+    let router = fixture.router();
+    let answer = get_with(&router, "/v1/manifest", &[]).await;
+    assert_eq!(answer.status, StatusCode::OK);
+    let key = Hash32(fixture.store.signing_key().verifying_key().to_bytes());
+    let (verified, _) = Manifest::verify(&answer.body, &TrustedKeys::Only(vec![key])).expect("signed");
+    assert_eq!(verified.generation, 2);
+    let tag = answer.header(header::ETAG).to_owned();
+    assert_eq!(tag, format!("\"{}\"", Hash32::of(&answer.body)));
+    for (condition, status) in [
+        (tag.clone(), StatusCode::NOT_MODIFIED),
+        (format!("\"other\", W/{tag}"), StatusCode::NOT_MODIFIED),
+        ("\"other\"".to_owned(), StatusCode::OK),
+    ] {
+        let answer = get_with(&router, "/v1/manifest", &[("if-none-match", &condition)]).await;
+        assert_eq!((answer.status, answer.header(header::ETAG)), (status, tag.as_str()), "{condition}");
+        assert_eq!(answer.body.is_empty(), status == StatusCode::NOT_MODIFIED);
+    }
+}
+
+#[tokio::test]
+async fn objects_in_whole_and_in_part() {
+    let fixture = fixture();
+    let router = fixture.router();
+    // Shard 0 is listed by the manifest before the current one alone.
+    for (hash, bytes) in &fixture.shards {
+        let answer = get_with(&router, &format!("/v1/objects/{hash}"), &[]).await;
+        assert_eq!((answer.status, &answer.body[..]), (StatusCode::OK, &bytes[..]));
+        assert_eq!(answer.header(header::ETAG), format!("\"{hash}\""));
+        assert_eq!(answer.header(header::CACHE_CONTROL), "public, max-age=31536000, immutable");
+        assert_eq!(answer.header(header::ACCEPT_RANGES), "bytes");
+        assert_eq!(answer.header(header::CONTENT_LENGTH), bytes.len().to_string());
+    }
+    let (hash, bytes) = &fixture.shards[2];
+    let (path, tag, n) = (format!("/v1/objects/{hash}"), format!("\"{hash}\""), bytes.len());
+    let weak = format!("W/{tag}");
+    for (range, condition, part) in [
+        ("bytes=0-0", None, Some(0..1)),
+        ("bytes=65535-65537", None, Some(65_535..65_538)),
+        ("bytes=199999-", Some(tag.as_str()), Some(n - 1..n)),
+        ("bytes=-70000", Some(tag.as_str()), Some(n - 70_000..n)),
+        ("bytes=5-1000000", None, Some(5..n)),
+        ("bytes=5-9", Some("\"another\""), None),
+        ("bytes=5-9", Some(weak.as_str()), None),
+        ("bytes=5-9", Some("Wed, 21 Oct 2015 07:28:00 GMT"), None),
+        ("bytes=0-1,4-5", None, None),
+        ("lines=1-2", None, None),
+    ] {
+        let mut headers = vec![("range", range)];
+        headers.extend(condition.map(|tag| ("if-range", tag)));
+        let answer = get_with(&router, &path, &headers).await;
+        let what = format!("{range} {condition:?}");
+        match part {
+            Some(part) => {
+                assert_eq!(answer.status, StatusCode::PARTIAL_CONTENT, "{what}");
+                let expected = format!("bytes {}-{}/{n}", part.start, part.end - 1);
+                assert_eq!(answer.header(header::CONTENT_RANGE), expected, "{what}");
+                assert_eq!(answer.header(header::CONTENT_LENGTH), part.len().to_string(), "{what}");
+                assert_eq!(&answer.body[..], &bytes[part], "{what}");
+            }
+            None => assert_eq!((answer.status, answer.body.len()), (StatusCode::OK, n), "{what}"),
+        }
+    }
+    let answer = get_with(&router, &path, &[("range", "bytes=200000-")]).await;
+    assert!(answer.problem(StatusCode::RANGE_NOT_SATISFIABLE).contains("200000 bytes"));
+    assert_eq!(answer.header(header::CONTENT_RANGE), "bytes */200000");
+
+    let answer = get_with(&router, &path, &[("if-none-match", &tag), ("range", "bytes=0-1")]).await;
+    assert_eq!((answer.status, answer.body.len()), (StatusCode::NOT_MODIFIED, 0));
+    let head = Request::head(&path).header("range", "bytes=0-1").body(Body::empty()).expect("a request");
+    let answer = ask(&router, head).await;
+    assert_eq!((answer.status, answer.body.len()), (StatusCode::OK, 0));
+    assert_eq!(answer.header(header::CONTENT_LENGTH), "200000");
+}
+
+#[tokio::test]
+async fn only_what_is_listed_is_served() {
+    let fixture = fixture();
+    let router = fixture.router();
+    for path in [
+        format!("/v1/objects/{}", fixture.extra),
+        format!("/v1/objects/{}", Hash32::of(b"unknown")),
+        "/v1/objects".to_owned(),
+        "/v1/objects/".to_owned(),
+        "/keys/ed25519".to_owned(),
+        "/".to_owned(),
+    ] {
+        get_with(&router, &path, &[]).await.problem(StatusCode::NOT_FOUND);
+    }
+    let upper = fixture.shards[2].0.to_string().to_uppercase();
+    for name in [upper.as_str(), "..%2F..%2Fkeys%2Fed25519", "00", "%FF"] {
+        get_with(&router, &format!("/v1/objects/{name}"), &[]).await.problem(StatusCode::BAD_REQUEST);
+    }
+    let (hash, _) = fixture.shards[2];
+    fs_err::write(StoreReader::open(fixture.dir.path()).expect("published").object_path(hash), b"cut")
+        .expect("writable");
+    let answer = get_with(&router, &format!("/v1/objects/{hash}"), &[]).await;
+    let detail = answer.problem(StatusCode::INTERNAL_SERVER_ERROR);
+    assert!(!detail.contains("objects") && !detail.contains("bytes"), "no path in {detail}");
+}
+
+#[tokio::test]
+async fn only_reading_without_bodies() {
+    let router = fixture().router();
+    let post = Request::post("/v1/manifest").body(Body::empty()).expect("a request");
+    let answer = ask(&router, post).await;
+    answer.problem(StatusCode::METHOD_NOT_ALLOWED);
+    assert_eq!(answer.header(header::ALLOW), "GET,HEAD");
+    let long = Request::get("/v1/manifest").header("content-length", "1000000");
+    let answer = ask(&router, long.body(Body::from(vec![0; 1_000_000])).expect("a request")).await;
+    answer.problem(StatusCode::PAYLOAD_TOO_LARGE);
+}
+
+#[tokio::test]
+async fn cells_near_a_point() {
+    let fixture = fixture();
+    let origin = Geographic { latitude_deg: 46.842657, longitude_deg: -91.994008, height_m: 158.5 };
+    let reference = GeoReference { origin };
+    // A spiral of boxes.
+    let boxes: Vec<Aabb> = (0..60)
+        .map(|i| {
+            let (angle, i) = (f64::from(i) * 0.7, f64::from(i));
+            let min = DVec3::new(i * angle.cos(), i * angle.sin(), i / 3.0);
+            Aabb { min, max: min + DVec3::new(1.0, 2.0, i / 9.0) }
+        })
+        .collect();
+    let unplaced = Manifest { generation: 3, ..manifest_of_boxes(&boxes) };
+    fixture.store.publish(&unplaced, &Extras::new()).expect("publishes");
+    let router = fixture.router();
+    let at = "lat=46.8427&lon=-91.9940&radius=20";
+    let detail = get_with(&router, &format!("/v1/cells?{at}"), &[]).await.problem(StatusCode::BAD_REQUEST);
+    assert!(detail.contains("not geo-referenced"), "{detail}");
+    let placed = Manifest { generation: 4, geo_reference: Some(reference), ..unplaced };
+    fixture.store.publish(&placed, &Extras::new()).expect("publishes");
+
+    let place = Geographic { latitude_deg: 46.8427, longitude_deg: -91.9940, ..origin };
+    let centres = [
+        ("x=3&y=-4.5&z=1e0&radius=20".to_owned(), DVec3::new(3.0, -4.5, 1.0)),
+        (at.to_owned(), reference.world_from_geographic(place)),
+        (
+            format!("{at}&height=178.5"),
+            reference.world_from_geographic(Geographic { height_m: 178.5, ..place }),
+        ),
+    ];
+    for (query, centre) in centres {
+        let answer = get_with(&router, &format!("/v1/cells?{query}"), &[]).await;
+        assert_eq!(answer.status, StatusCode::OK, "{query}");
+        let answer = answer.json();
+        assert_eq!((&answer["generation"], &answer["encoder_id"]), (&4.into(), &"01".repeat(32).into()));
+        // Oracle: brute force over the boxes, the distance by clamping.
+        let distance = |b: &Aabb| centre.clamp(b.min, b.max).distance(centre);
+        let near = boxes.iter().enumerate().filter(|(_, b)| distance(b) <= 20.0);
+        let expected: Vec<(u64, f64)> = near.map(|(i, b)| (i as u64, distance(b))).collect();
+        assert!(expected.len() > 5 && expected.len() < boxes.len(), "{query}: a test that says something");
+        let cells = answer["cells"].as_array().expect("a list");
+        assert_eq!(cells.len(), expected.len(), "{query}");
+        for (cell, (cell_id, distance)) in cells.iter().zip(expected) {
+            assert_eq!(cell["cell_id"], cell_id);
+            assert!((cell["distance"].as_f64().expect("a number") - distance).abs() < 1e-12);
+            assert_eq!(cell["n_gaussians"], cell_id + 1);
+            let bounds: Aabb = serde_json::from_value(cell["bounds"].clone()).expect("a box");
+            assert_eq!(bounds, boxes[cell_id as usize]);
+            assert!(cell["shards"].is_object());
+        }
+    }
+    for query in [
+        "",
+        "radius=5",
+        "x=1&y=2&radius=5",
+        "x=1&y=2&z=3",
+        "x=1&y=2&z=3&radius=-1",
+        "x=1&y=2&z=3&radius=NaN",
+        "x=1&y=2&z=3&radius=inf",
+        "x=nan&y=2&z=3&radius=1",
+        "x=1&y=2&z=3&radius=x",
+        "x=1&y=2&z=3&radius=1&lat=1",
+        "x=1&y=2&z=3&radius=1&height=1",
+        "x=1&x=1&y=2&z=3&radius=1",
+        "lat=91&lon=0&radius=1",
+        "lat=0&lon=181&radius=1",
+        "lat=0&lon=0&height=inf&radius=1",
+        "lat=0&radius=1",
+        "x=1&y=2&z=3&radius=1&profile=exact",
+    ] {
+        let answer = get_with(&router, &format!("/v1/cells?{query}"), &[]).await;
+        assert!(!answer.problem(StatusCode::BAD_REQUEST).is_empty(), "{query}");
+    }
+}
+
+#[tokio::test]
+async fn coverage_needs_a_place_on_the_earth() {
+    let fixture = fixture();
+    let router = fixture.router();
+    let answer = get_with(&router, "/v1/coverage.geojson", &[]).await;
+    assert!(answer.problem(StatusCode::CONFLICT).contains("not geo-referenced"));
+    let origin = Geographic { latitude_deg: 46.842657, longitude_deg: -91.994008, height_m: 158.5 };
+    let geo_reference = Some(GeoReference { origin });
+    let placed = Manifest { geo_reference, ..manifest(3, &fixture.listed(0..3)) };
+    fixture.store.publish(&placed, &Extras::new()).expect("publishes");
+    let answer = get_with(&router, "/v1/coverage.geojson", &[]).await;
+    assert_eq!(
+        (answer.status, answer.header(header::CONTENT_TYPE)),
+        (StatusCode::OK, "application/geo+json")
+    );
+    let geojson: geojson::FeatureCollection =
+        std::str::from_utf8(&answer.body).expect("UTF-8").parse().expect("GeoJSON");
+    assert_eq!(geojson.features.len(), 3);
+}
+
+#[tokio::test]
+async fn new_manifest_is_noticed_and_a_damaged_one_is_not_served() {
+    let fixture = fixture();
+    let router = fixture.router();
+    let generation =
+        async |router: &Router| get_with(router, "/healthz", &[]).await.json()["generation"].clone();
+    assert_eq!(generation(&router).await, 2);
+    fixture.store.publish(&manifest(3, &fixture.listed(2..3)), &Extras::new()).expect("publishes");
+    assert_eq!(generation(&router).await, 3);
+    let old = format!("/v1/objects/{}", fixture.shards[0].0);
+    get_with(&router, &old, &[]).await.problem(StatusCode::NOT_FOUND);
+    let before = get_with(&router, "/v1/manifest", &[]).await.body;
+
+    fs_err::write(fixture.dir.path().join("manifest"), b"damaged").expect("writable");
+    assert_eq!(generation(&router).await, 3);
+    assert_eq!(get_with(&router, "/v1/manifest", &[]).await.body, before);
+    assert!(super::router(fixture.dir.path(), Limits::default()).is_err(), "but nothing starts from it");
+}
+
+#[tokio::test]
+async fn overload_timeout_and_panic_are_problems() {
+    let (entered, mut inside) = tokio::sync::mpsc::channel(1);
+    let release = Arc::new(tokio::sync::Notify::new());
+    let waiting = Arc::clone(&release);
+    let wait = move || async move {
+        entered.send(()).await.expect("the test listens");
+        waiting.notified().await;
+    };
+    let routes = || Router::new().route("/quick", get(async || "done"));
+    let limits = Limits { n_requests: 1, ..Limits::default() };
+    let router = bounded(routes().route("/wait", get(wait)), limits);
+    let held = tokio::spawn(router.clone().oneshot(request("/wait", &[])));
+    inside.recv().await.expect("the handler runs");
+    let turned_away = get_with(&router, "/quick", &[]).await;
+    turned_away.problem(StatusCode::SERVICE_UNAVAILABLE);
+    assert_eq!(turned_away.header(header::RETRY_AFTER), "2");
+    release.notify_one();
+    held.await.expect("ends").expect("infallible");
+    assert_eq!(get_with(&router, "/quick", &[]).await.status, StatusCode::OK);
+
+    let limits = Limits { answer_timeout: Duration::from_millis(20), ..Limits::default() };
+    let router = bounded(routes().route("/never", get(async || std::future::pending::<()>().await)), limits);
+    let late = get_with(&router, "/never", &[]).await;
+    assert!(late.problem(StatusCode::SERVICE_UNAVAILABLE).contains("too long"));
+    assert_eq!(late.header(header::RETRY_AFTER), "2");
+
+    async fn broken() {
+        panic!("secret of the house");
+    }
+    let router = bounded(routes().route("/broken", get(broken)), Limits::default());
+    let detail = get_with(&router, "/broken", &[]).await.problem(StatusCode::INTERNAL_SERVER_ERROR);
+    assert!(!detail.contains("secret"), "{detail}");
+}
+
+#[tokio::test]
+async fn downloads_are_counted_until_they_end() {
+    let fixture = fixture();
+    let limits = Limits { n_downloads: 1, ..Limits::default() };
+    let router = router(fixture.dir.path(), limits).expect("published");
+    let path = format!("/v1/objects/{}", fixture.shards[1].0);
+    let unread = router.clone().oneshot(request(&path, &[])).await.expect("infallible");
+    assert_eq!(unread.status(), StatusCode::OK);
+    get_with(&router, &path, &[]).await.problem(StatusCode::SERVICE_UNAVAILABLE);
+    assert_eq!(get_with(&router, "/v1/manifest", &[]).await.status, StatusCode::OK);
+    drop(unread);
+    assert_eq!(get_with(&router, &path, &[]).await.status, StatusCode::OK);
+}
+
+/// A running service: its address, what stops it, and its end.
+struct Running {
+    address: SocketAddr,
+    stop: tokio::sync::oneshot::Sender<()>,
+    ended: tokio::task::JoinHandle<Result<(), ServeError>>,
+}
+
+async fn start(dir: &Path, limits: Limits) -> Running {
+    let (stop, stopped) = tokio::sync::oneshot::channel();
+    let (told, listening) = tokio::sync::oneshot::channel();
+    let dir = dir.to_owned();
+    let ended = tokio::spawn(async move {
+        let any_port = "127.0.0.1:0".parse().expect("an address");
+        let shutdown = async move {
+            let _ = stopped.await;
+        };
+        serve(&dir, any_port, limits, |address| told.send(address).expect("awaited"), shutdown).await
+    });
+    Running { address: listening.await.expect("listens"), stop, ended }
+}
+
+async fn connect(address: SocketAddr, text: &str) -> tokio::net::TcpStream {
+    let mut stream = tokio::net::TcpStream::connect(address).await.expect("listens");
+    stream.write_all(text.as_bytes()).await.expect("sends");
+    stream
+}
+
+#[tokio::test]
+async fn over_tcp_a_download_outlives_the_stop() {
+    let fixture = fixture();
+    let big: Vec<u8> = (0..8_000_000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
+    let (hash, len_bytes) = fixture.store.put_bytes(&big).expect("room");
+    fixture.store.publish(&manifest(3, &[(hash, len_bytes)]), &Extras::new()).expect("publishes");
+    let running = start(fixture.dir.path(), Limits::default()).await;
+    let text = format!("GET /v1/objects/{hash} HTTP/1.1\r\nHost: x\r\nRange: bytes=5-\r\n\r\n");
+    let mut stream = connect(running.address, &text).await;
+    let mut received = vec![0; 1000];
+    stream.read_exact(&mut received).await.expect("begins");
+    running.stop.send(()).expect("runs");
+    stream.read_to_end(&mut received).await.expect("ends whole");
+    let head_end = received.windows(4).position(|w| w == b"\r\n\r\n").expect("a head") + 4;
+    let head = String::from_utf8_lossy(&received[..head_end]).to_lowercase();
+    assert!(head.starts_with("http/1.1 206 "), "{head}");
+    assert!(head.contains("content-range: bytes 5-7999999/8000000\r\n"), "{head}");
+    assert_eq!(received[head_end..], big[5..]);
+    running.ended.await.expect("ends").expect("in order");
+    assert!(tokio::net::TcpStream::connect(running.address).await.is_err(), "no longer listening");
+}
+
+#[tokio::test]
+async fn who_stalls_is_dropped_and_does_not_hold_up_the_stop() {
+    let fixture = fixture();
+    let quick = Duration::from_millis(60);
+    let running = start(fixture.dir.path(), Limits { stall_timeout: quick, ..Limits::default() }).await;
+    // Half a request, and an idle connection after a whole one.
+    let mut half = connect(running.address, "GET /v1/manifest HTTP/1.1\r\nHost:").await;
+    let mut idle = connect(running.address, "GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n").await;
+    let mut received = Vec::new();
+    let _ = half.read_to_end(&mut received).await;
+    assert_eq!(received, b"", "dropped without an answer");
+    let _ = idle.read_to_end(&mut received).await;
+    assert!(received.starts_with(b"HTTP/1.1 200 "));
+
+    // A reader that never reads: more than the sockets' buffers hold.
+    let (hash, len_bytes) = fixture.store.put_bytes(&vec![7; 40_000_000]).expect("room");
+    fixture.store.publish(&manifest(3, &[(hash, len_bytes)]), &Extras::new()).expect("publishes");
+    let patient = Limits { drain_timeout: quick, ..Limits::default() };
+    let other = start(fixture.dir.path(), patient).await;
+    let text = format!("GET /v1/objects/{hash} HTTP/1.1\r\nHost: x\r\n\r\n");
+    let mut unread = connect(other.address, &text).await;
+    unread.read_exact(&mut [0; 10]).await.expect("begins");
+    other.stop.send(()).expect("runs");
+    other.ended.await.expect("ends").expect("after the drain deadline");
+    running.stop.send(()).expect("runs");
+    running.ended.await.expect("ends").expect("in order");
+}
+
+#[tokio::test]
+async fn nothing_published_is_an_error_at_the_start() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let any_port = "127.0.0.1:0".parse().expect("an address");
+    let ended = serve(dir.path(), any_port, Limits::default(), |_| (), std::future::pending()).await;
+    assert!(matches!(ended, Err(ServeError::Store(StoreError::NotPublished { .. }))));
+}
