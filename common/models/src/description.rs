@@ -1,0 +1,353 @@
+//! `model.toml`: what a model directory holds and how its files are used.
+//!
+//! ```toml
+//! name = "clip-vit-b32"            # names the space; part of the encoder id
+//! about = "what it knows and what not"
+//! dim = 512                        # components of a vector
+//! licence = "MIT"
+//! files_root = "."                 # folder of the files below, relative to this file's folder
+//!
+//! [image]
+//! file = { path = "vision.onnx", sha256 = "..." }   # sha256 may be left out where the file is there
+//! input = "pixel_values"           # f32 [n,3,size_px,size_px], RGB
+//! output = "image_embeds"          # f32 [n,dim]
+//! size_px = 224
+//! resize = "shortest-edge"         # and centre crop, as CLIPImageProcessor; or "stretch"
+//! filter = "bicubic"
+//! mean = [0.48, 0.46, 0.41]        # pixel value = (level / 255 - mean) / std
+//! std = [0.27, 0.26, 0.28]
+//! normalise = true                 # false: the model's vectors are of unit length already
+//! batch = 16
+//!
+//! [text]
+//! kind = "onnx"
+//! file = { path = "text.onnx" }
+//! tokenizer = { path = "tokenizer.json" }
+//! input_ids = "input_ids"          # i64 [1,tokens]
+//! attention_mask = "attention_mask"  # left out where the model takes none
+//! output = "text_embeds"           # f32 [1,dim]
+//! max_tokens = 77
+//! end_token_id = 49407
+//! prompt = "a photo of a {}"
+//!
+//! # or, instead: vectors of fixed phrases
+//! # [text]
+//! # kind = "phrases"
+//! # file = { path = "phrases.txt" }            # one a line
+//! # vectors = { path = "vectors.safetensors" } # F16 or F32 [phrases,dim]
+//! # tensor = "vectors"
+//!
+//! [text_centre]                    # optional: a text's vector is normalize(normalize(t) - centre)
+//! file = { path = "vectors.safetensors" }
+//! tensor = "mean"                  # F16 or F32 [dim]
+//!
+//! [score]
+//! threshold = 0.25                 # cosine from which something counts as found
+//! ```
+//!
+//! Unknown fields are refused. A robot that has the text files only needs the image file's `sha256`
+//! recorded, because the encoder id states both.
+
+use std::path::{Component, Path, PathBuf};
+
+use serde::Deserialize;
+
+use crate::preprocess::{Filter, Preprocess, Resize};
+
+/// The name of the description within a model directory.
+pub const FILE_NAME: &str = "model.toml";
+
+/// Says why a description is refused.
+#[derive(Debug, thiserror::Error)]
+pub enum DescriptionError {
+    /// A file could not be read.
+    #[error("{source}; put the file there or correct the description")]
+    Read {
+        /// The operating system's answer, which names the path.
+        source: std::io::Error,
+    },
+    /// The description is not what is expected here.
+    #[error("{}: {source}; see the fields of {FILE_NAME} in its documentation", path.display())]
+    Format {
+        /// The description.
+        path: PathBuf,
+        /// Line, column and what is wrong.
+        source: Box<toml::de::Error>,
+    },
+    /// A field's value cannot be used.
+    #[error("{}: {field} is {found}, expected {expected}; correct it", path.display())]
+    Value {
+        /// The description.
+        path: PathBuf,
+        /// The field, with its table.
+        field: &'static str,
+        /// Its value.
+        found: String,
+        /// What is expected.
+        expected: &'static str,
+    },
+    /// A file is not the one described.
+    #[error("{}: SHA-256 is {found}, expected {expected}; fetch the file again or correct the description", path.display())]
+    Hash {
+        /// The file.
+        path: PathBuf,
+        /// The hash described.
+        expected: String,
+        /// The hash of the file.
+        found: String,
+    },
+    /// A file is absent and its hash is not recorded, so that the encoder id cannot be stated.
+    #[error("{}: absent, and {FILE_NAME} records no sha256 of it; record it or put the file there", path.display())]
+    NoHash {
+        /// The file.
+        path: PathBuf,
+    },
+}
+
+/// A file of the model.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FileRef {
+    /// Its path below `files_root`.
+    pub path: PathBuf,
+    /// Its SHA-256.
+    pub sha256: Option<Sha256>,
+}
+
+/// A SHA-256, as 64 hexadecimal digits in text.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(try_from = "String")]
+pub struct Sha256(pub [u8; 32]);
+
+impl TryFrom<String> for Sha256 {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        let mut bytes = [0; 32];
+        hex::decode_to_slice(&text, &mut bytes)
+            .map(|()| Self(bytes))
+            .map_err(|error| format!("{text:?} is no SHA-256 of 64 hexadecimal digits: {error}"))
+    }
+}
+
+/// A model directory's description.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Description {
+    /// The name of the space.
+    pub name: String,
+    /// What the model knows and what not.
+    #[serde(default)]
+    pub about: String,
+    /// Components of a vector.
+    pub dim: u32,
+    /// The licence of the weights.
+    pub licence: String,
+    /// Folder of the files, relative to the description's folder.
+    #[serde(default = "here")]
+    pub files_root: PathBuf,
+    /// The image side.
+    pub image: ImageDescription,
+    /// The text side.
+    pub text: TextDescription,
+    /// What is subtracted from text vectors.
+    pub text_centre: Option<CentreDescription>,
+    /// How scores are read.
+    pub score: ScoreDescription,
+}
+
+fn here() -> PathBuf {
+    ".".into()
+}
+
+/// The image side of a model.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ImageDescription {
+    /// The ONNX file.
+    pub file: FileRef,
+    /// Its input, f32 `[n, 3, size_px, size_px]`.
+    pub input: String,
+    /// Its output, f32 `[n, dim]`.
+    pub output: String,
+    /// Edge of the square that it takes, pixels.
+    pub size_px: u16,
+    /// How a crop becomes that square.
+    pub resize: Resize,
+    /// With which filter.
+    #[serde(default)]
+    pub filter: Filter,
+    /// Subtracted from level / 255, per channel.
+    pub mean: [f64; 3],
+    /// Divided by after that, per channel.
+    pub std: [f64; 3],
+    /// Whether the output is to be scaled to unit length.
+    pub normalise: bool,
+    /// Crops in a run.
+    pub batch: u16,
+}
+
+impl ImageDescription {
+    /// Returns the steps from a crop to pixel values.
+    pub fn preprocess(&self) -> Preprocess {
+        Preprocess::new(u32::from(self.size_px), self.resize, self.filter, self.mean, self.std)
+    }
+}
+
+/// The text side of a model.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(tag = "kind", rename_all = "kebab-case")]
+pub enum TextDescription {
+    /// A model for any text.
+    Onnx(OnnxText),
+    /// Vectors of fixed phrases.
+    Phrases(PhrasesText),
+}
+
+/// A text encoder in ONNX.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OnnxText {
+    /// The ONNX file.
+    pub file: FileRef,
+    /// The tokenizer, `tokenizer.json` of Hugging Face tokenizers.
+    pub tokenizer: FileRef,
+    /// The input for token ids, i64 `[1, tokens]`.
+    pub input_ids: String,
+    /// The input for the mask, i64 `[1, tokens]`, if there is one.
+    pub attention_mask: Option<String>,
+    /// The output, f32 `[1, dim]`.
+    pub output: String,
+    /// The longest text, tokens, with the begin and end tokens.
+    pub max_tokens: u16,
+    /// The token that ends a text.
+    pub end_token_id: u32,
+    /// What is encoded, `{}` standing for the text.
+    pub prompt: String,
+}
+
+/// A text encoder made of fixed phrases.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PhrasesText {
+    /// The phrases, UTF-8, one a line.
+    pub file: FileRef,
+    /// The safetensors file of their vectors.
+    pub vectors: FileRef,
+    /// The tensor in it, `[phrases][dim]`.
+    pub tensor: String,
+}
+
+/// What is subtracted from text vectors.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CentreDescription {
+    /// The safetensors file.
+    pub file: FileRef,
+    /// The tensor in it, `[dim]`.
+    pub tensor: String,
+}
+
+/// How scores are read.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ScoreDescription {
+    /// The cosine from which something counts as found, by default.
+    pub threshold: f32,
+}
+
+impl Description {
+    /// Reads and checks `path`.
+    /// # Errors
+    /// [`DescriptionError`] where it cannot be read or used.
+    pub fn read(path: &Path) -> Result<Self, DescriptionError> {
+        let text = fs_err::read_to_string(path).map_err(|source| DescriptionError::Read { source })?;
+        let description: Self = toml::from_str(&text)
+            .map_err(|source| DescriptionError::Format { path: path.to_owned(), source: Box::new(source) })?;
+        description.check(path)?;
+        Ok(description)
+    }
+
+    /// Returns the files with their roles, image first.
+    pub fn files(&self) -> Vec<(&'static str, &FileRef)> {
+        let mut files = vec![("image.model", &self.image.file)];
+        match &self.text {
+            TextDescription::Onnx(text) => {
+                files.extend([("text.model", &text.file), ("text.tokenizer", &text.tokenizer)]);
+            }
+            TextDescription::Phrases(text) => {
+                files.extend([("text.phrases", &text.file), ("text.vectors", &text.vectors)]);
+            }
+        }
+        files.extend(self.text_centre.iter().map(|centre| ("text.centre", &centre.file)));
+        files
+    }
+
+    fn check(&self, path: &Path) -> Result<(), DescriptionError> {
+        let require = |holds: bool, field, found: String, expected| {
+            if holds {
+                return Ok(());
+            }
+            Err(DescriptionError::Value { path: path.to_owned(), field, found, expected })
+        };
+        let plain_name = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+        require(
+            (1..=64).contains(&self.name.len()) && self.name.chars().all(plain_name),
+            "name",
+            format!("{:?}", self.name),
+            "1 to 64 of A-Z a-z 0-9 - _ .",
+        )?;
+        let image = &self.image;
+        require((1..=1 << 16).contains(&self.dim), "dim", self.dim.to_string(), "1 to 65536")?;
+        require(
+            (1..=2048).contains(&image.size_px),
+            "image.size_px",
+            image.size_px.to_string(),
+            "1 to 2048",
+        )?;
+        require((1..=1024).contains(&image.batch), "image.batch", image.batch.to_string(), "1 to 1024")?;
+        require(
+            image.mean.iter().all(|x| x.is_finite()),
+            "image.mean",
+            format!("{:?}", image.mean),
+            "three finite numbers",
+        )?;
+        require(
+            image.std.iter().all(|x| x.is_finite() && *x > 0.0),
+            "image.std",
+            format!("{:?}", image.std),
+            "three numbers above 0",
+        )?;
+        if let TextDescription::Onnx(text) = &self.text {
+            let max_tokens = text.max_tokens;
+            require(max_tokens >= 2, "text.max_tokens", max_tokens.to_string(), "2 or more")?;
+            let has_place = text.prompt.contains("{}");
+            require(has_place, "text.prompt", format!("{:?}", text.prompt), "a text with {} in it")?;
+        }
+        let threshold = self.score.threshold;
+        require(
+            (-1.0..=1.0).contains(&threshold),
+            "score.threshold",
+            threshold.to_string(),
+            "a cosine, -1 to 1",
+        )?;
+        require(
+            self.files_root
+                .components()
+                .all(|c| matches!(c, Component::Normal(_) | Component::CurDir | Component::ParentDir)),
+            "files_root",
+            self.files_root.display().to_string(),
+            "a relative path",
+        )?;
+        for (role, file) in self.files() {
+            let mut components = file.path.components().peekable();
+            require(
+                components.peek().is_some() && components.all(|c| matches!(c, Component::Normal(_))),
+                role,
+                file.path.display().to_string(),
+                "a relative path without ..",
+            )?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,165 @@
+use std::{
+    io::{self, Read},
+    path::{Path, PathBuf},
+};
+
+use sha2::{Digest, Sha256};
+
+use crate::{
+    EncoderId, ImageEncoder, ModelError, SessionOptions, TextEncoder, builtin,
+    description::{Description, DescriptionError, FILE_NAME, FileRef, TextDescription},
+    image::OnnxImageEncoder,
+    phrases::PhraseEncoder,
+    tensors,
+    text::OnnxTextEncoder,
+};
+
+/// A pair of image and text encoders: a directory with a description, or what is built in.
+#[derive(Clone, Debug)]
+pub struct ModelDir {
+    id: EncoderId,
+    source: Source,
+}
+
+#[derive(Clone, Debug)]
+enum Source {
+    Builtin,
+    Files { files_root: PathBuf, description: Box<Description> },
+}
+
+impl ModelDir {
+    /// Opens the directory `path`, which holds a [`description`](crate::description) in `model.toml`.
+    ///
+    /// Files whose hash is recorded are not read yet; each is checked when an encoder needs it.
+    /// # Errors
+    /// [`ModelError::Description`] where the description cannot be used, or a file without a recorded hash is absent.
+    pub fn open(path: &Path) -> Result<Self, ModelError> {
+        let description = Description::read(&path.join(FILE_NAME))?;
+        let files_root = path.join(&description.files_root);
+        let mut id = EncoderId {
+            name: description.name.clone(),
+            dim: description.dim,
+            sha256_of_file: Default::default(),
+        };
+        for (role, file) in description.files() {
+            let sha256 = match file.sha256 {
+                Some(sha256) => sha256.0,
+                None => hash_file(&files_root.join(&file.path)).map_err(|source| match source.kind() {
+                    io::ErrorKind::NotFound => DescriptionError::NoHash { path: files_root.join(&file.path) },
+                    _ => DescriptionError::Read { source },
+                })?,
+            };
+            id.sha256_of_file.insert(role.to_owned(), hex::encode(sha256));
+        }
+        Ok(Self { id, source: Source::Files { files_root, description: Box::new(description) } })
+    }
+
+    /// Returns the built-in stand-in, which needs no files and no ONNX Runtime.
+    pub fn builtin() -> Self {
+        let id = EncoderId {
+            name: builtin::NAME.to_owned(),
+            dim: builtin::DIM as u32,
+            sha256_of_file: Default::default(),
+        };
+        Self { id, source: Source::Builtin }
+    }
+
+    /// Returns the name of the space.
+    pub fn encoder_id(&self) -> &EncoderId {
+        &self.id
+    }
+
+    /// Returns the number of components of a vector.
+    pub fn dim(&self) -> usize {
+        self.id.dim as usize
+    }
+
+    /// Returns what the model knows and what not, for people.
+    pub fn about(&self) -> &str {
+        match &self.source {
+            Source::Builtin => builtin::ABOUT,
+            Source::Files { description, .. } => &description.about,
+        }
+    }
+
+    /// Returns the licence of the weights.
+    pub fn licence(&self) -> &str {
+        match &self.source {
+            Source::Builtin => env!("CARGO_PKG_LICENSE"),
+            Source::Files { description, .. } => &description.licence,
+        }
+    }
+
+    /// Returns the cosine from which something counts as found, by default.
+    pub fn threshold(&self) -> f32 {
+        match &self.source {
+            Source::Builtin => builtin::THRESHOLD,
+            Source::Files { description, .. } => description.score.threshold,
+        }
+    }
+
+    /// Opens the image encoder.
+    /// # Errors
+    /// [`ModelError`] where a file is absent or not as described, or ONNX Runtime does not load.
+    pub fn image_encoder(&self, options: &SessionOptions) -> Result<Box<dyn ImageEncoder>, ModelError> {
+        let Source::Files { files_root, description } = &self.source else {
+            return Ok(Box::new(builtin::ColourShape));
+        };
+        let image = &description.image;
+        let path = checked(files_root, &image.file)?;
+        Ok(Box::new(OnnxImageEncoder::open(&description.name, self.dim(), &path, image, options)?))
+    }
+
+    /// Opens the text encoder; ONNX Runtime is loaded only where the text side is ONNX.
+    /// # Errors
+    /// [`ModelError`] where a file is absent or not as described, or ONNX Runtime does not load.
+    pub fn text_encoder(&self, options: &SessionOptions) -> Result<Box<dyn TextEncoder>, ModelError> {
+        let Source::Files { files_root, description } = &self.source else {
+            return Ok(Box::new(builtin::ColourShape));
+        };
+        let (name, dim) = (&description.name, self.dim());
+        let centre = match &description.text_centre {
+            None => None,
+            Some(centre) => {
+                Some(tensors::read(&checked(files_root, &centre.file)?, &centre.tensor, None, dim)?)
+            }
+        };
+        Ok(match &description.text {
+            TextDescription::Onnx(text) => {
+                let (model, tokenizer) =
+                    (checked(files_root, &text.file)?, checked(files_root, &text.tokenizer)?);
+                Box::new(OnnxTextEncoder::open(name, dim, [&model, &tokenizer], text, centre, options)?)
+            }
+            TextDescription::Phrases(text) => {
+                let (phrases, vectors) =
+                    (checked(files_root, &text.file)?, checked(files_root, &text.vectors)?);
+                Box::new(PhraseEncoder::open(name, dim, &phrases, (&vectors, &text.tensor), centre)?)
+            }
+        })
+    }
+}
+
+/// Returns the path of `file` after comparing its hash with the recorded one, if any.
+fn checked(files_root: &Path, file: &FileRef) -> Result<PathBuf, DescriptionError> {
+    let path = files_root.join(&file.path);
+    if let Some(expected) = file.sha256 {
+        let found = hash_file(&path).map_err(|source| DescriptionError::Read { source })?;
+        if found != expected.0 {
+            let (expected, found) = (hex::encode(expected.0), hex::encode(found));
+            return Err(DescriptionError::Hash { path, expected, found });
+        }
+    }
+    Ok(path)
+}
+
+fn hash_file(path: &Path) -> io::Result<[u8; 32]> {
+    let mut file = fs_err::File::open(path)?;
+    let mut hasher = Sha256::new();
+    let mut buffer = vec![0; 1 << 20];
+    loop {
+        match file.read(&mut buffer)? {
+            0 => return Ok(hasher.finalize().into()),
+            n => hasher.update(&buffer[..n]),
+        }
+    }
+}

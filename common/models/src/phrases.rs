@@ -1,0 +1,172 @@
+//! A text encoder made of fixed phrases and their vectors: needs no model and no ONNX Runtime.
+
+use std::{
+    collections::HashMap,
+    path::{Path, PathBuf},
+};
+
+use crate::{EncodeError, ModelError, TextEncoder, tensors, text::centred};
+
+/// Says why a list of phrases is refused.
+#[derive(Debug, thiserror::Error)]
+pub enum PhrasesError {
+    /// The file could not be read.
+    #[error("{source}; put the file there or correct the description")]
+    Read {
+        /// The operating system's answer, which names the path.
+        source: std::io::Error,
+    },
+    /// A line has no phrase.
+    #[error("{}: line {line} is empty; the list needs one phrase a line", path.display())]
+    EmptyLine {
+        /// The file.
+        path: PathBuf,
+        /// The line, from 1.
+        line: usize,
+    },
+    /// A phrase's vector has no direction.
+    #[error("{}: line {line}: the vector of {phrase:?} is zero after centring; remove the phrase", path.display())]
+    NoDirection {
+        /// The file.
+        path: PathBuf,
+        /// The line, from 1.
+        line: usize,
+        /// The phrase.
+        phrase: String,
+    },
+}
+
+/// How many known phrases an unknown one is answered with.
+const N_NEAR: usize = 5;
+
+/// Texts of more letters are sentences, not phrases misspelt; comparing them would only take time.
+const LONGEST_COMPARED: usize = 100;
+
+/// A text encoder made of fixed phrases.
+#[derive(Debug)]
+pub struct PhraseEncoder {
+    name: String,
+    dim: usize,
+    phrases: Vec<String>,
+    index_of_key: HashMap<String, usize>,
+    /// `[phrases][dim]`, centred unit vectors.
+    vectors: Vec<f32>,
+}
+
+impl PhraseEncoder {
+    /// Reads the phrases, one a line, and their vectors, (file, tensor) `[phrases][dim]`; `centre`: `[dim]`.
+    ///
+    /// Where two lines are the same phrase, the first counts.
+    /// # Errors
+    /// [`ModelError::Phrases`] or [`ModelError::Tensors`] where a file is not as described.
+    pub fn open(
+        name: &str,
+        dim: usize,
+        phrases: &Path,
+        (vectors, tensor): (&Path, &str),
+        centre: Option<Vec<f32>>,
+    ) -> Result<Self, ModelError> {
+        let text = fs_err::read_to_string(phrases).map_err(|source| PhrasesError::Read { source })?;
+        let lines: Vec<String> = text.lines().map(str::to_owned).collect();
+        let mut index_of_key = HashMap::new();
+        for (index, phrase) in lines.iter().enumerate() {
+            let key = key(phrase);
+            if key.is_empty() {
+                return Err(PhrasesError::EmptyLine { path: phrases.to_owned(), line: index + 1 }.into());
+            }
+            index_of_key.entry(key).or_insert(index);
+        }
+        let mut vectors = tensors::read(vectors, tensor, Some(lines.len()), dim)?;
+        for (index, vector) in vectors.chunks_exact_mut(dim).enumerate() {
+            if !centred(vector, centre.as_deref()) {
+                let (path, phrase) = (phrases.to_owned(), lines[index].clone());
+                return Err(PhrasesError::NoDirection { path, line: index + 1, phrase }.into());
+            }
+        }
+        Ok(Self { name: name.to_owned(), dim, phrases: lines, index_of_key, vectors })
+    }
+
+    /// Returns known phrases that look like `key`: few letters apart, or a whole word in common.
+    fn near(&self, key: &str) -> Vec<String> {
+        let letters: Vec<char> = key.chars().collect();
+        if letters.len() > LONGEST_COMPARED {
+            return Vec::new();
+        }
+        let is_start = |a: &str, b: &str| a.len() >= 3 && b.starts_with(a);
+        let mut near: Vec<(usize, usize)> = self
+            .phrases
+            .iter()
+            .enumerate()
+            .filter_map(|(index, phrase)| {
+                let other: Vec<char> = phrase.to_lowercase().chars().collect();
+                // Fewer words in the answer are nearer to what was meant.
+                let shares_a_word = key
+                    .split(' ')
+                    .any(|w| phrase.split_whitespace().any(|p| p == w || is_start(w, p) || is_start(p, w)));
+                let allowed = letters.len() / 4 + 1;
+                let distance = (letters.len().abs_diff(other.len()) <= allowed)
+                    .then(|| edit_distance(&letters, &other))
+                    .filter(|&d| d <= allowed);
+                distance
+                    .or_else(|| shares_a_word.then(|| allowed + 1 + phrase.matches(' ').count()))
+                    .map(|d| (d, index))
+            })
+            .collect();
+        near.sort_unstable();
+        near.into_iter().take(N_NEAR).map(|(_, index)| self.phrases[index].clone()).collect()
+    }
+}
+
+impl TextEncoder for PhraseEncoder {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn dim(&self) -> usize {
+        self.dim
+    }
+
+    fn encode(&mut self, text: &str) -> Result<Vec<f32>, EncodeError> {
+        let key = key(text);
+        if key.is_empty() {
+            return Err(EncodeError::EmptyText);
+        }
+        match self.index_of_key.get(&key) {
+            Some(index) => Ok(self.vectors[index * self.dim..][..self.dim].to_vec()),
+            None => Err(EncodeError::UnknownPhrase {
+                n_known: self.phrases.len(),
+                near: self.near(&key),
+                text: key,
+            }),
+        }
+    }
+
+    fn vocabulary(&self) -> Option<&[String]> {
+        Some(&self.phrases)
+    }
+}
+
+/// Returns what a phrase is looked up by: lower case, single spaces, no leading article.
+fn key(text: &str) -> String {
+    let text = text.to_lowercase();
+    let mut words: Vec<&str> = text.split_whitespace().collect();
+    if words.len() > 1 && ["a", "an", "the"].contains(&words[0]) {
+        words.remove(0);
+    }
+    words.join(" ")
+}
+
+/// Returns the Levenshtein distance: insertions, deletions and replacements.
+fn edit_distance(a: &[char], b: &[char]) -> usize {
+    let mut row: Vec<usize> = (0..=b.len()).collect();
+    for (i, x) in a.iter().enumerate() {
+        let mut diagonal = i;
+        row[0] = i + 1;
+        for (j, y) in b.iter().enumerate() {
+            let replaced = diagonal + usize::from(x != y);
+            diagonal = row[j + 1];
+            row[j + 1] = replaced.min(diagonal + 1).min(row[j] + 1);
+        }
+    }
+    row[b.len()]
+}

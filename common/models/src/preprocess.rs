@@ -1,0 +1,195 @@
+//! From a crop to the pixel values that an image model expects: resize, centre crop, normalise.
+//!
+//! Resampling is the algorithm of Pillow's `Image.resize` (libImaging/Resample.c: two passes, 8-bit
+//! between them, 22-bit fixed-point weights), pixel for pixel, because the models were trained and
+//! their published figures measured behind it; integers also make it the same on every machine.
+
+use image::RgbImage;
+use serde::Deserialize;
+
+/// How a crop of any shape becomes the model's square.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Resize {
+    /// The shorter edge becomes `size_px`, the aspect ratio stays, the middle is kept (`CLIPImageProcessor`).
+    ShortestEdge,
+    /// Both edges become `size_px`: nothing is cut off, the aspect ratio is lost.
+    Stretch,
+}
+
+/// The resampling filter.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Filter {
+    /// Cubic convolution with a = -0.5 (Keys 1981), widened when shrinking; Pillow's `BICUBIC`.
+    #[default]
+    Bicubic,
+}
+
+impl Filter {
+    /// Reach to either side, in input pixels at scale 1.
+    fn support(self) -> f64 {
+        match self {
+            Self::Bicubic => 2.0,
+        }
+    }
+
+    fn weight(self, x: f64) -> f64 {
+        match self {
+            Self::Bicubic => match x.abs() {
+                x if x < 1.0 => (1.5 * x - 2.5) * x * x + 1.0,
+                x if x < 2.0 => (((x - 5.0) * x + 8.0) * x - 4.0) * -0.5,
+                _ => 0.0,
+            },
+        }
+    }
+}
+
+/// The part of a resized image that is wanted, pixels of the resized image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Window {
+    /// Left edge.
+    pub left_px: u64,
+    /// Top edge.
+    pub top_px: u64,
+    /// Width.
+    pub width_px: u32,
+    /// Height.
+    pub height_px: u32,
+}
+
+/// The steps from a crop to pixel values.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Preprocess {
+    size_px: u32,
+    resize: Resize,
+    filter: Filter,
+    /// (x / 255 - mean) / std of every level x, per channel.
+    values: [[f32; 256]; 3],
+}
+
+impl Preprocess {
+    /// Returns the steps for a square of `size_px`; `mean` and `std` apply to x / 255, per channel RGB.
+    pub fn new(size_px: u32, resize: Resize, filter: Filter, mean: [f64; 3], std: [f64; 3]) -> Self {
+        let value =
+            |channel: usize, level: usize| ((level as f64 / 255.0 - mean[channel]) / std[channel]) as f32;
+        let values = std::array::from_fn(|c| std::array::from_fn(|level| value(c, level)));
+        Self { size_px, resize, filter, values }
+    }
+
+    /// Returns the edge of the square, pixels.
+    pub fn size_px(&self) -> u32 {
+        self.size_px
+    }
+
+    /// Returns the size that an image of the given size is resized to, and the part of it that is kept.
+    ///
+    /// Neither edge may be 0.
+    pub fn plan(&self, width_px: u32, height_px: u32) -> ([u64; 2], Window) {
+        let size = u64::from(self.size_px);
+        let short = u64::from(width_px.min(height_px));
+        // The longer edge is cut to whole pixels, as in transformers' get_resize_output_image_size.
+        let resized = match self.resize {
+            Resize::Stretch => [size, size],
+            Resize::ShortestEdge => [width_px, height_px].map(|edge| size * u64::from(edge) / short),
+        };
+        let window = Window {
+            left_px: (resized[0] - size) / 2,
+            top_px: (resized[1] - size) / 2,
+            width_px: self.size_px,
+            height_px: self.size_px,
+        };
+        (resized, window)
+    }
+
+    /// Returns the model's square, resized and cropped. `image` must have pixels.
+    pub fn square(&self, image: &RgbImage) -> RgbImage {
+        let (resized, window) = self.plan(image.width(), image.height());
+        resample(image, self.filter, resized, window)
+    }
+
+    /// Appends the pixel values of `image`: `[3][size_px][size_px]`. `image` must have pixels.
+    pub fn append_pixel_values(&self, image: &RgbImage, values: &mut Vec<f32>) {
+        let square = self.square(image);
+        for (channel, value_of_level) in self.values.iter().enumerate() {
+            values.extend(
+                square.as_raw().iter().skip(channel).step_by(3).map(|&x| value_of_level[usize::from(x)]),
+            );
+        }
+    }
+}
+
+/// Bits after the point of a weight; with 8-bit levels and some overshoot, a sum fits 32 bits.
+const WEIGHT_BITS: u32 = 32 - 8 - 2;
+
+/// Which input pixels one output pixel is made of.
+struct Taps {
+    first: usize,
+    weights: Vec<i32>,
+}
+
+/// Returns the taps of the output pixels `range` where `n_in` pixels are resized to `n_out`.
+fn taps(filter: Filter, n_in: u32, n_out: u64, range: std::ops::Range<u64>) -> Vec<Taps> {
+    let scale = f64::from(n_in) / n_out as f64;
+    let filter_scale = scale.max(1.0);
+    let reach = filter.support() * filter_scale;
+    range
+        .map(|out| {
+            let centre = (out as f64 + 0.5) * scale;
+            let first = (centre - reach + 0.5).max(0.0) as usize;
+            let end = ((centre + reach + 0.5) as usize).min(n_in as usize);
+            let weights: Vec<f64> = (first..end)
+                .map(|x| filter.weight((x as f64 - centre + 0.5) * (1.0 / filter_scale)))
+                .collect();
+            let total: f64 = weights.iter().sum();
+            let fixed = |w: &f64| (w / total * f64::from(1 << WEIGHT_BITS)).round() as i32;
+            Taps { first, weights: weights.iter().map(fixed).collect() }
+        })
+        .collect()
+}
+
+fn to_level(sum: i32) -> u8 {
+    (sum >> WEIGHT_BITS).clamp(0, 255) as u8
+}
+
+/// Half a level, so that [`to_level`] rounds.
+const HALF: i32 = 1 << (WEIGHT_BITS - 1);
+
+/// Resizes `image` to `resized` (width, height) and returns `window` of the result, computing no more than that.
+///
+/// Neither `image` nor `resized` may be empty, and the window must lie within `resized`.
+pub fn resample(image: &RgbImage, filter: Filter, resized: [u64; 2], window: Window) -> RgbImage {
+    let columns = window.left_px..window.left_px + u64::from(window.width_px);
+    let rows = window.top_px..window.top_px + u64::from(window.height_px);
+    let columns = taps(filter, image.width(), resized[0], columns);
+    let rows = taps(filter, image.height(), resized[1], rows);
+    let first_row = rows.iter().map(|t| t.first).min().unwrap_or(0);
+    let end_row = rows.iter().map(|t| t.first + t.weights.len()).max().unwrap_or(0);
+
+    let stride_in = image.width() as usize * 3;
+    let mut narrowed = Vec::with_capacity((end_row - first_row) * columns.len() * 3);
+    for row in image.as_raw().chunks_exact(stride_in).take(end_row).skip(first_row) {
+        for tap in &columns {
+            let mut sums = [HALF; 3];
+            for (pixel, &weight) in row[tap.first * 3..].chunks_exact(3).zip(&tap.weights) {
+                for channel in 0..3 {
+                    sums[channel] += i32::from(pixel[channel]) * weight;
+                }
+            }
+            narrowed.extend(sums.map(to_level));
+        }
+    }
+
+    let stride = columns.len() * 3;
+    let mut result = RgbImage::new(window.width_px, window.height_px);
+    let mut sums = vec![0; stride];
+    for (tap, out) in rows.iter().zip(result.chunks_exact_mut(stride.max(1))) {
+        sums.fill(HALF);
+        let first = (tap.first - first_row) * stride;
+        for (row, &weight) in narrowed[first..].chunks_exact(stride).zip(&tap.weights) {
+            sums.iter_mut().zip(row).for_each(|(sum, &x)| *sum += i32::from(x) * weight);
+        }
+        out.iter_mut().zip(&sums).for_each(|(x, &sum)| *x = to_level(sum));
+    }
+    result
+}

@@ -1,0 +1,96 @@
+//! Matrices and vectors from safetensors files.
+
+use std::path::{Path, PathBuf};
+
+use half::f16;
+use safetensors::{Dtype, SafeTensors};
+
+/// Says why a tensor could not be read.
+#[derive(Debug, thiserror::Error)]
+pub enum TensorsError {
+    /// The file could not be read.
+    #[error("{source}; put the file there or correct the description")]
+    Read {
+        /// The operating system's answer, which names the path.
+        source: std::io::Error,
+    },
+    /// The file is not safetensors, or is cut.
+    #[error("{}: {source}; fetch the file again", path.display())]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: safetensors::SafeTensorError,
+    },
+    /// The tensor is not there.
+    #[error("{}: no tensor {name:?}, it has {}; correct the description", path.display(), found.join(", "))]
+    Missing {
+        /// The file.
+        path: PathBuf,
+        /// The tensor asked for.
+        name: String,
+        /// The tensors that are there.
+        found: Vec<String>,
+    },
+    /// The tensor is of another kind.
+    #[error("{}: tensor {name:?} is {dtype:?} {found:?}, expected F16 or F32 {expected}; correct the description, or fetch its files again", path.display())]
+    Shape {
+        /// The file.
+        path: PathBuf,
+        /// The tensor.
+        name: String,
+        /// Its element type.
+        dtype: Dtype,
+        /// Its shape.
+        found: Vec<usize>,
+        /// The shape asked for, in words.
+        expected: String,
+    },
+    /// A number is NaN or infinite.
+    #[error("{}: tensor {name:?}: element {index} is not finite; fetch the file again", path.display())]
+    NotFinite {
+        /// The file.
+        path: PathBuf,
+        /// The tensor.
+        name: String,
+        /// Index of the element, row-major.
+        index: usize,
+    },
+}
+
+/// Reads tensor `name` as f32, row-major; `n_rows`: `None` for a vector `[dim]`, else a matrix `[n_rows][dim]`.
+/// # Errors
+/// [`TensorsError`] where the file or the tensor is not as described.
+pub fn read(path: &Path, name: &str, n_rows: Option<usize>, dim: usize) -> Result<Vec<f32>, TensorsError> {
+    let bytes = fs_err::read(path).map_err(|source| TensorsError::Read { source })?;
+    let tensors = SafeTensors::deserialize(&bytes)
+        .map_err(|source| TensorsError::Format { path: path.to_owned(), source })?;
+    let tensor = tensors.tensor(name).map_err(|_| {
+        let mut found: Vec<_> = tensors.names().into_iter().map(str::to_owned).collect();
+        found.sort();
+        TensorsError::Missing { path: path.to_owned(), name: name.to_owned(), found }
+    })?;
+    let expected = match n_rows {
+        Some(n_rows) => vec![n_rows, dim],
+        None => vec![dim],
+    };
+    let is_f16 = tensor.dtype() == Dtype::F16;
+    if tensor.shape() != expected || !(is_f16 || tensor.dtype() == Dtype::F32) {
+        return Err(TensorsError::Shape {
+            path: path.to_owned(),
+            name: name.to_owned(),
+            dtype: tensor.dtype(),
+            found: tensor.shape().to_vec(),
+            expected: format!("{expected:?}"),
+        });
+    }
+    let values: Vec<f32> = if is_f16 {
+        tensor.data().as_chunks().0.iter().map(|&b| f16::from_le_bytes(b).to_f32()).collect()
+    } else {
+        tensor.data().as_chunks().0.iter().map(|&b| f32::from_le_bytes(b)).collect()
+    };
+    match values.iter().position(|x| !x.is_finite()) {
+        Some(index) => Err(TensorsError::NotFinite { path: path.to_owned(), name: name.to_owned(), index }),
+        None => Ok(values),
+    }
+}

@@ -1,0 +1,204 @@
+//! Text encoders in ONNX: tokens by `tokenizer.json`, then the model.
+
+use std::path::{Path, PathBuf};
+
+use ort::value::TensorElementType;
+use tokenizers::Tokenizer;
+
+use crate::{
+    EncodeError, ModelError, TextEncoder,
+    clean::clean,
+    description::OnnxText,
+    normalise,
+    session::{Model, Provider, SessionOptions},
+};
+
+/// Says why text could not be made into tokens.
+#[derive(Debug, thiserror::Error)]
+pub enum TokenizerError {
+    /// The file could not be read.
+    #[error("{source}; put the tokenizer there or correct the description")]
+    Read {
+        /// The operating system's answer, which names the path.
+        source: std::io::Error,
+    },
+    /// The file is not a tokenizer.
+    #[error("{}: {reason}; fetch tokenizer.json again", path.display())]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// The tokenizer is of another model.
+    #[error(
+        "{}: a text ends in token {found:?}, the model's end token is {expected}; use the model's own tokenizer",
+        path.display()
+    )]
+    OtherVocabulary {
+        /// The file.
+        path: PathBuf,
+        /// The end token of the description.
+        expected: u32,
+        /// The last token of a text, if any.
+        found: Option<u32>,
+    },
+    /// The tokenizer fails on a text.
+    #[error("{}: {reason}; use other words", path.display())]
+    Encode {
+        /// The file.
+        path: PathBuf,
+        /// What it says.
+        reason: String,
+    },
+}
+
+/// Makes text into the token ids of one model.
+#[derive(Debug)]
+pub struct Tokens {
+    path: PathBuf,
+    tokenizer: Tokenizer,
+    max_tokens: usize,
+    end_token_id: u32,
+}
+
+impl Tokens {
+    /// Reads `path` (`tokenizer.json`); a text becomes at most `max_tokens` ids, the last being `end_token_id`.
+    /// # Errors
+    /// [`TokenizerError`] where the file is no tokenizer, or ends texts in another token.
+    pub fn open(path: &Path, max_tokens: usize, end_token_id: u32) -> Result<Self, TokenizerError> {
+        let bytes = fs_err::read(path).map_err(|source| TokenizerError::Read { source })?;
+        let mut tokenizer = Tokenizer::from_bytes(bytes)
+            .map_err(|error| TokenizerError::Format { path: path.to_owned(), reason: error.to_string() })?;
+        // Both are done here, the same for every file.
+        tokenizer.with_padding(None);
+        tokenizer
+            .with_truncation(None)
+            .map_err(|error| TokenizerError::Format { path: path.to_owned(), reason: error.to_string() })?;
+        let tokens = Self { path: path.to_owned(), tokenizer, max_tokens, end_token_id };
+        let found = tokens.raw_ids("")?.last().copied();
+        if found != Some(end_token_id) {
+            return Err(TokenizerError::OtherVocabulary {
+                path: path.to_owned(),
+                expected: end_token_id,
+                found,
+            });
+        }
+        Ok(tokens)
+    }
+
+    fn raw_ids(&self, text: &str) -> Result<Vec<u32>, TokenizerError> {
+        let encoding = self
+            .tokenizer
+            .encode_fast(text, true)
+            .map_err(|error| TokenizerError::Encode { path: self.path.clone(), reason: error.to_string() })?;
+        Ok(encoding.get_ids().to_vec())
+    }
+
+    /// Returns the ids of `text` as it stands, up to and with the first end token.
+    ///
+    /// Too long a text loses its end, the end token stays. CLIP's attention is causal and its vector is read
+    /// at the first end token, so what would follow (padding) can change nothing.
+    /// # Errors
+    /// [`TokenizerError::Encode`] where the tokenizer fails.
+    pub fn ids(&self, text: &str) -> Result<Vec<u32>, TokenizerError> {
+        let mut ids = self.raw_ids(text)?;
+        ids.truncate(self.max_tokens);
+        match ids.iter().position(|&id| id == self.end_token_id) {
+            Some(end) => ids.truncate(end + 1),
+            None => {
+                ids.truncate(self.max_tokens - 1);
+                ids.push(self.end_token_id);
+            }
+        }
+        Ok(ids)
+    }
+}
+
+/// A text encoder that runs an ONNX file.
+#[derive(Debug)]
+pub struct OnnxTextEncoder {
+    name: String,
+    dim: usize,
+    model: Model,
+    tokens: Tokens,
+    description: OnnxText,
+    /// Subtracted from the unit vector, `[dim]`.
+    centre: Option<Vec<f32>>,
+}
+
+impl OnnxTextEncoder {
+    /// Opens `model` and `tokenizer` as `description` says; `dim`: components of a vector; `centre`: `[dim]`.
+    /// # Errors
+    /// [`ModelError`] where the runtime or a file is not as described.
+    pub fn open(
+        name: &str,
+        dim: usize,
+        [model, tokenizer]: [&Path; 2],
+        description: &OnnxText,
+        centre: Option<Vec<f32>>,
+        options: &SessionOptions,
+    ) -> Result<Self, ModelError> {
+        let tokens = Tokens::open(tokenizer, usize::from(description.max_tokens), description.end_token_id)?;
+        let model = Model::open(model, options)?;
+        model.expect_input(&description.input_ids, TensorElementType::Int64, &[-1, -1])?;
+        let mut names = vec![description.input_ids.as_str()];
+        if let Some(mask) = &description.attention_mask {
+            model.expect_input(mask, TensorElementType::Int64, &[-1, -1])?;
+            names.push(mask);
+        }
+        model.expect_no_input_but(&names)?;
+        model.expect_output(&description.output, TensorElementType::Float32, &[-1, dim as i64])?;
+        Ok(Self { name: name.to_owned(), dim, model, tokens, description: description.clone(), centre })
+    }
+
+    /// Returns what it runs on.
+    pub fn provider(&self) -> Provider {
+        self.model.provider()
+    }
+}
+
+impl TextEncoder for OnnxTextEncoder {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn dim(&self) -> usize {
+        self.dim
+    }
+
+    fn encode(&mut self, text: &str) -> Result<Vec<f32>, EncodeError> {
+        let text = clean(text);
+        if text.is_empty() {
+            return Err(EncodeError::EmptyText);
+        }
+        let ids = self.tokens.ids(&self.description.prompt.replace("{}", &text))?;
+        let ids: Vec<i64> = ids.into_iter().map(i64::from).collect();
+        let ones = vec![1i64; ids.len()];
+        let shape = vec![1, ids.len() as i64];
+        let mut inputs = vec![(self.description.input_ids.as_str(), self.model.tensor(shape.clone(), &ids)?)];
+        if let Some(mask) = &self.description.attention_mask {
+            inputs.push((mask, self.model.tensor(shape, &ones)?));
+        }
+        let mut vector = self.model.run(inputs, &self.description.output, &[1, self.dim as i64])?;
+        if centred(&mut vector, self.centre.as_deref()) {
+            Ok(vector)
+        } else {
+            Err(EncodeError::NoDirection { model: self.name.clone(), index: 0 })
+        }
+    }
+}
+
+/// Makes `vector` normalize(normalize(v) - centre), both `[dim]`; returns false where that has no direction.
+pub(crate) fn centred(vector: &mut [f32], centre: Option<&[f32]>) -> bool {
+    if !normalise(vector) {
+        return false;
+    }
+    match centre {
+        None => true,
+        Some(centre) => {
+            vector.iter_mut().zip(centre).for_each(|(x, mean)| *x -= mean);
+            normalise(vector)
+        }
+    }
+}

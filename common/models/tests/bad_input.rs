@@ -1,0 +1,208 @@
+//! Wrong descriptions and files: one clear message each, no panic.
+
+mod common;
+
+use std::path::{Path, PathBuf};
+
+use common::{model_dir, options, shared};
+use slag_models::{EncoderId, ModelDir, SessionOptions};
+use tempfile::TempDir;
+
+/// A copy of the description `name` with replacements, its files linked beside it as `models`.
+fn changed(name: &str, models: &Path, replacements: &[(&str, &str)]) -> TempDir {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut text = fs_err::read_to_string(model_dir(name).join("model.toml")).expect("it is readable");
+    for (from, to) in [("../../../../shared/models", "models")].iter().chain(replacements) {
+        assert!(text.contains(from), "{from:?} is not in the description");
+        text = text.replace(from, to);
+    }
+    fs_err::write(folder.path().join("model.toml"), text).expect("it is writable");
+    if models.is_dir() {
+        std::os::unix::fs::symlink(models.canonicalize().expect("it exists"), folder.path().join("models"))
+            .expect("a link");
+    }
+    folder
+}
+
+/// The message with which opening the description, or one of its encoders, fails.
+fn failure(folder: &Path, options: &SessionOptions) -> String {
+    let opened = ModelDir::open(folder).and_then(|model| {
+        model.image_encoder(options)?;
+        model.text_encoder(options)?;
+        Ok(())
+    });
+    opened.expect_err("it must be refused").to_string()
+}
+
+#[test]
+fn wrong_descriptions_are_named_by_field_or_line() {
+    let no_models = PathBuf::from("absent");
+    let no_runtime = SessionOptions::new("no-such-library.so".into());
+    let hash = "sha256 = \"7651536597622dcf6d1e2f9ab46450187797180727d08ccc1ee903e1eed44469\"";
+    for (from, to, expected) in [
+        ("dim = 512", "dim = 0", "dim is 0, expected 1 to 65536"),
+        ("dim = 512", "dim = -1", "line 4"),
+        ("dim = 512", "dimension = 512", "dimension"),
+        ("size_px = 224", "size_px = 5000", "image.size_px is 5000"),
+        ("batch = 16", "batch = 0", "image.batch is 0"),
+        ("batch = 16", "batch = 16\nbatches = 2", "batches"),
+        ("resize = \"stretch\"", "resize = \"pad\"", "pad"),
+        ("threshold = 0.35", "threshold = nan", "score.threshold is NaN"),
+        ("std = [0.5019607843137255", "std = [0.0", "image.std is [0.0"),
+        ("name = \"conse-mobilenetv2\"", "name = \"two words\"", "name is \"two words\""),
+        ("path = \"clip_text/phrases.txt\"", "path = \"../phrases.txt\"", "text.phrases is ../phrases.txt"),
+        ("path = \"clip_text/phrases.txt\"", "path = \"/phrases.txt\"", "text.phrases is /phrases.txt"),
+        ("kind = \"phrases\"", "kind = \"sentences\"", "sentences"),
+        ("tensor = \"vectors\"", "tensors = \"vectors\"", "tensors"),
+        (hash, "sha256 = \"7651\"", "64 hexadecimal digits"),
+        (&format!(", {hash}"), "", "records no sha256"),
+        ("[text]", "[text", "line"),
+    ] {
+        let folder = changed("conse", &no_models, &[(from, to)]);
+        let message = failure(folder.path(), &no_runtime);
+        assert!(message.contains(expected), "{to}: {message}");
+        assert!(message.contains("model.toml"), "{to}: {message}");
+    }
+    let message = failure(Path::new("no-such-folder"), &no_runtime);
+    assert!(message.contains("no-such-folder/model.toml"), "{message}");
+    // Files are opened when an encoder is.
+    let folder = changed("conse", &no_models, &[]);
+    let message = failure(folder.path(), &no_runtime);
+    assert!(message.contains("conse_mnv2_int8.onnx") && message.contains("put the file there"), "{message}");
+}
+
+#[test]
+fn files_that_do_not_fit_their_description_are_refused() {
+    let (Some(models), Some(options)) = (shared("models"), options()) else { return };
+    let vision = ", sha256 = \"e0bca5c7dd0e39ddb0137356acde890cf58930766dccd276ae8242a868f39ae4\"";
+    let text = ", sha256 = \"1965ec622a100a1beebea6db591985d88f12e057f9772fc83dc8c4c8cd6e5ef0\"";
+    for (replacements, expected) in [
+        (&[("e0bca5c7", "00000000")][..], "SHA-256 is e0bca5c7"),
+        (&[("input = \"pixel_values\"", "input = \"image\"")], "no input \"image\", it has pixel_values"),
+        (&[("output = \"image_embeds\"", "output = \"x\"")], "it has image_embeds, last_hidden_state"),
+        (
+            &[("output = \"image_embeds\"", "output = \"last_hidden_state\"")],
+            "expected f32 [-1, 512]; correct the description",
+        ),
+        (&[("size_px = 224", "size_px = 256")], "expected f32 [-1, 3, 256, 256]"),
+        (&[("dim = 512", "dim = 256")], "expected f32 [-1, 256]"),
+        (
+            &[(vision, ""), ("clip_tiny/vision_model.onnx", "clip_tiny/text_model.onnx")],
+            "no input \"pixel_values\", it has input_ids",
+        ),
+        (
+            &[(text, ""), ("clip_tiny/text_model.onnx", "clip_tiny/text_model_mask.onnx")],
+            "input \"attention_mask\" is required by the model",
+        ),
+        (&[(text, ""), ("clip_tiny/text_model.onnx", "clip_tiny/golden.npz")], "fetch the model file again"),
+        (&[("end_token_id = 49407", "end_token_id = 2")], "the model's end token is 2"),
+        (&[("clip_tiny/text_model.onnx", "clip_tiny/absent.onnx")], "absent.onnx"),
+    ] {
+        let folder = changed("clip_tiny", &models, replacements);
+        let message = failure(folder.path(), &options);
+        assert!(message.contains(expected), "{replacements:?}: {message}");
+    }
+    for (replacements, expected) in [
+        (&[("tensor = \"vectors\"", "tensor = \"v\"")][..], "no tensor \"v\", it has mean, vectors"),
+        (&[("tensor = \"vectors\"", "tensor = \"mean\"")], "is F32 [512], expected F16 or F32 [1612, 512]"),
+    ] {
+        let folder = changed("conse", &models, replacements);
+        let message = failure(folder.path(), &options);
+        assert!(message.contains(expected), "{replacements:?}: {message}");
+    }
+}
+
+#[test]
+fn a_tokenizer_of_another_vocabulary_is_refused() {
+    let (Some(models), Some(options)) = (shared("models"), options()) else { return };
+    let hash = ", sha256 = \"e77528f5a52e0f4b4f98e1b3b4c13453f7762f2e38ec23c9ed352278a65de0a4\"";
+    let folder = changed(
+        "clip_tiny",
+        Path::new("absent"),
+        &[(hash, ""), ("clip_tokenizer/tokenizer.json", "tokenizer.json")],
+    );
+    fs_err::create_dir(folder.path().join("models")).expect("it is writable");
+    std::os::unix::fs::symlink(
+        models.join("clip_tiny").canonicalize().expect("it exists"),
+        folder.path().join("models/clip_tiny"),
+    )
+    .expect("a link");
+    let path = folder.path().join("models/tokenizer.json");
+    for (tokenizer, expected) in [
+        (
+            r#"{"version":"1.0","model":{"type":"WordLevel","vocab":{"a":0,"chair":1,"[UNK]":2},"unk_token":"[UNK]"},
+            "added_tokens":[],"normalizer":null,"pre_tokenizer":{"type":"Whitespace"},"post_processor":null,"decoder":null}"#,
+            "a text ends in token None, the model's end token is 49407",
+        ),
+        ("{}", "fetch tokenizer.json again"),
+        ("", "fetch tokenizer.json again"),
+    ] {
+        fs_err::write(&path, tokenizer).expect("it is writable");
+        let message = failure(folder.path(), &options);
+        assert!(message.contains(expected) && message.contains("tokenizer.json"), "{message}");
+    }
+}
+
+#[test]
+fn cut_files_are_refused() {
+    let (Some(models), Some(options)) = (shared("models"), options()) else { return };
+    for (name, path, expected) in [
+        ("clip_tiny", "clip_tiny/vision_model.onnx", "fetch the model file again"),
+        ("conse", "clip_text/vectors.safetensors", "fetch the file again"),
+        (
+            "conse",
+            "clip_text/phrases.txt",
+            "expected F16 or F32 [865, 512]; correct the description, or fetch its files again",
+        ),
+    ] {
+        let bytes = fs_err::read(models.join(path)).expect("it is readable");
+        let text = fs_err::read_to_string(model_dir(name).join("model.toml")).expect("it is readable");
+        // The description without hashes, or every change would be found by its hash.
+        let mut unhashed = String::new();
+        for line in text.replace("../../../../shared/models", ".").lines() {
+            unhashed += line.split(", sha256").next().expect("one part at least");
+            unhashed += if line.contains(", sha256") { " }\n" } else { "\n" };
+        }
+        let folder = tempfile::tempdir().expect("a folder");
+        fs_err::write(folder.path().join("model.toml"), unhashed).expect("it is writable");
+        for sub in ["clip_tiny", "clip_text", "clip_tokenizer", "image_encoder"] {
+            fs_err::create_dir(folder.path().join(sub)).expect("it is writable");
+            for entry in fs_err::read_dir(models.join(sub)).expect("it is readable") {
+                let entry = entry.expect("it is readable");
+                let target = folder.path().join(sub).join(entry.file_name());
+                std::os::unix::fs::symlink(entry.path().canonicalize().expect("it exists"), target)
+                    .expect("a link");
+            }
+        }
+        let cut = folder.path().join(path);
+        for n_bytes in [0, 7, bytes.len() / 2] {
+            fs_err::remove_file(&cut).expect("it is there");
+            fs_err::write(&cut, &bytes[..n_bytes]).expect("it is writable");
+            let message = failure(folder.path(), &options);
+            assert!(n_bytes < bytes.len() / 2 || message.contains(expected), "{path}: {message}");
+        }
+    }
+}
+
+#[test]
+fn the_encoder_id_is_the_same_with_or_without_files_and_hashes() {
+    let full = ModelDir::open(&model_dir("conse")).expect("no file is needed");
+    let id = full.encoder_id();
+    assert_eq!((id.name.as_str(), id.dim), ("conse-mobilenetv2", 512));
+    let roles: Vec<_> = id.sha256_of_file.keys().map(String::as_str).collect();
+    assert_eq!(roles, ["image.model", "text.centre", "text.phrases", "text.vectors"]);
+    let json = serde_json::to_string(id).expect("it serialises");
+    assert_eq!(&serde_json::from_str::<EncoderId>(&json).expect("it parses"), id);
+    // SHA-256 of the canonical form, computed with coreutils.
+    assert_eq!(hex::encode(id.hash()), "9ca22870c912d3ee9eac360e30de672cd0e647a57a8b44dd9dba16167a70a65c");
+    assert!(id.to_string().starts_with("conse-mobilenetv2@"));
+    assert_ne!(id.hash(), ModelDir::builtin().encoder_id().hash());
+
+    let Some(models) = shared("models") else { return };
+    // The recorded hash left out, and so computed from the file.
+    let hash = ", sha256 = \"0799d6716c84b2a15511cf1b267a0fb6ee91c8ca5b2155680b1b46770b798952\"";
+    let folder = changed("conse", &models, &[(hash, "")]);
+    assert_eq!(ModelDir::open(folder.path()).expect("it opens").encoder_id(), id);
+    let folder = changed("conse", &models, &[("0799d6716c84", "0799d6716c85")]);
+    assert_ne!(ModelDir::open(folder.path()).expect("it opens").encoder_id().hash(), id.hash());
+}

@@ -1,0 +1,45 @@
+//! Finding and loading ONNX Runtime; a program of its own, because a process loads it once.
+
+mod common;
+
+use std::path::{Path, PathBuf};
+
+use common::{model_dir, options, shared};
+use slag_models::{ModelDir, SessionOptions, find_runtime};
+
+#[test]
+fn a_missing_or_wrong_library_says_what_to_do_and_leaves_room_for_the_right_one() {
+    let absent = PathBuf::from("no/such/libonnxruntime.so");
+    let message = find_runtime(Some(&absent), &[]).expect_err("it is absent").to_string();
+    assert!(message.contains("no/such/libonnxruntime.so") && message.contains("give the path"), "{message}");
+    let folder = tempfile::tempdir().expect("a folder");
+    let bare = find_runtime(None, &[folder.path().to_owned()]).expect("the system's loader is asked");
+    assert_eq!(bare, Path::new("libonnxruntime.so"));
+    let library = folder.path().join("libonnxruntime.so");
+    fs_err::write(&library, "not a library").expect("it is writable");
+    assert_eq!(
+        find_runtime(None, &["absent".into(), folder.path().to_owned()]).expect("it is found"),
+        library
+    );
+    assert_eq!(find_runtime(Some(&library), &[]).expect("it is found"), library);
+
+    if shared("models").is_none() {
+        return;
+    }
+    let model = ModelDir::open(&model_dir("conse")).expect("it opens");
+    let refusal = |runtime: &Path| {
+        let error = model.image_encoder(&SessionOptions::new(runtime.to_owned())).err();
+        error.expect("it is refused").to_string()
+    };
+    assert!(refusal(&library).contains("install version 1.17 or newer"), "{}", refusal(&library));
+    assert!(refusal(&absent).contains("give the path"), "{}", refusal(&absent));
+    assert!(
+        refusal(Path::new("libno-such-onnxruntime.so")).contains("put libonnxruntime.so beside the program")
+    );
+
+    let Some(options) = options() else { return };
+    model.image_encoder(&options).expect("the right library still loads");
+    fs_err::copy(&options.runtime, &library).expect("it is writable");
+    assert!(refusal(&library).contains("use one per process"), "{}", refusal(&library));
+    model.image_encoder(&options).expect("the loaded one stays in use");
+}
