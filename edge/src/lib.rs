@@ -1,3 +1,9 @@
 //! The robot's side of SLAG: keeps the shards around it and answers text queries offline.
 
+pub mod http;
+pub mod query;
+pub mod score;
 pub mod store;
+#[cfg(test)]
+mod testing;
+pub mod text;

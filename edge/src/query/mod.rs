@@ -1,0 +1,3 @@
+//! From a question to ranked answers.
+
+pub mod cluster;

@@ -1,0 +1,127 @@
+//! Small real shards for the tests of this crate, with the embeddings they were made from.
+
+use glam::DVec3;
+use half::f16;
+use slag_common::container::AlignedBytes;
+use slag_common::hash::Hash32;
+use slag_common::shard::{ShardHeader, ShardLayout, ShardParts, ShardView};
+
+/// A Gaussian of a test shard.
+#[derive(Clone, Debug)]
+pub struct Member {
+    pub steps: [u16; 3],
+    pub embedding: Vec<f32>,
+}
+
+/// What a test shard is built from.
+#[derive(Clone, Debug)]
+pub struct TestShard {
+    pub cell_id: u32,
+    pub origin: DVec3,
+    pub step: DVec3,
+    pub encoder_id: Hash32,
+    /// Members by row.
+    pub rows: Vec<Vec<Member>>,
+    /// Gaussians without a row, after the rows'.
+    pub without_evidence: Vec<[u16; 3]>,
+}
+
+/// A shard's bytes and the unrounded embeddings of its Gaussians.
+pub struct BuiltShard {
+    pub bytes: AlignedBytes,
+    pub layout: ShardLayout,
+    pub embeddings: Vec<Vec<f32>>,
+}
+
+impl BuiltShard {
+    pub fn view(&self) -> ShardView<'_> {
+        self.layout.view(&self.bytes)
+    }
+}
+
+impl TestShard {
+    pub fn new(rows: Vec<Vec<Member>>) -> Self {
+        let (origin, step) = (DVec3::ZERO, DVec3::splat(0.01));
+        Self { cell_id: 1, origin, step, encoder_id: Hash32([7; 32]), rows, without_evidence: Vec::new() }
+    }
+
+    /// Writes the shard and reads it back: rows are the members' means, radii the largest distance of
+    /// an unrounded embedding from the stored row.
+    pub fn build(&self, exact: bool) -> BuiltShard {
+        let members = || self.rows.iter().flatten();
+        let dim = members().next().map_or(2, |m| m.embedding.len());
+        let mut row_starts = vec![0u32];
+        let (mut palette, mut radii) = (Vec::new(), Vec::new());
+        for row in &self.rows {
+            row_starts.push(row_starts.last().expect("starts with 0") + row.len() as u32);
+            let mean = (0..dim)
+                .map(|c| row.iter().map(|m| f64::from(m.embedding[c])).sum::<f64>() / row.len() as f64)
+                .map(f16::from_f64);
+            let stored: Vec<f16> = mean.collect();
+            let distance = |m: &Member| {
+                let squares =
+                    m.embedding.iter().zip(&stored).map(|(e, p)| (f64::from(*e) - p.to_f64()).powi(2));
+                squares.sum::<f64>().sqrt()
+            };
+            radii.push(row.iter().map(distance).fold(0.0, f64::max) as f32 * (1.0 + f32::EPSILON));
+            palette.extend(stored);
+        }
+        let positions: Vec<[u16; 3]> =
+            members().map(|m| m.steps).chain(self.without_evidence.iter().copied()).collect();
+        let embeddings: Vec<f16> =
+            members().flat_map(|m| m.embedding.iter().map(|v| f16::from_f32(*v))).collect();
+        let input_indices: Vec<u32> = (0..positions.len() as u32).map(|i| i * 3 + 1).collect();
+        let header = ShardHeader {
+            cell_id: self.cell_id,
+            n_gaussians: positions.len() as u32,
+            n_rows: self.rows.len() as u32,
+            dim: dim as u32,
+            origin_in_world: self.origin.to_array(),
+            position_step: self.step.to_array(),
+            box_min: self.origin.to_array(),
+            box_max: (self.origin + self.step * 65535.0).to_array(),
+            encoder_id: self.encoder_id.0,
+        };
+        let mut bytes = Vec::new();
+        ShardParts {
+            header,
+            positions: &positions,
+            row_starts: &row_starts,
+            palette: &palette,
+            radii: &radii,
+            exact: exact.then_some((&input_indices, &embeddings)),
+        }
+        .write(&mut bytes)
+        .expect("writes to memory");
+        let bytes = AlignedBytes::copy_of(&bytes);
+        let layout = ShardLayout::check(&bytes).expect("a valid shard");
+        BuiltShard { bytes, layout, embeddings: members().map(|m| m.embedding.clone()).collect() }
+    }
+}
+
+/// Pseudo-random numbers for bulk data (splitmix64, Steele et al. 2014).
+pub struct Random(pub u64);
+
+impl Random {
+    pub fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+
+    /// Uniform in -1..1.
+    pub fn signed(&mut self) -> f32 {
+        (self.next() >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+    }
+
+    pub fn unit(&mut self, dim: usize) -> Vec<f32> {
+        normalised((0..dim).map(|_| self.signed()).collect())
+    }
+}
+
+pub fn normalised(vector: Vec<f32>) -> Vec<f32> {
+    let length = vector.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+    vector.into_iter().map(|v| (f64::from(v) / length) as f32).collect()
+}
