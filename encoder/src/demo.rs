@@ -16,7 +16,7 @@ use crate::encode::{self, EncodeSettings, EncodeSummary, Masks};
 use crate::generate::{self, TrueObject};
 use crate::palette::PaletteSettings;
 use crate::progress::Progress;
-use crate::publish::serve::Server;
+use crate::publish::serve::{self, Limits};
 use crate::raster::WeightKind;
 use crate::shard::cells::CellLimits;
 
@@ -183,13 +183,19 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     let summary =
         tokio::task::block_in_place(|| encode::encode(&settings, &models, &session, progress, cancel)).context("encode")?;
 
-    let server = Server::bind(&store, ([127, 0, 0, 1], 0).into()).await.context("serve")?;
-    let url = format!("http://{}", server.address());
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
-    let serving = tokio::spawn(server.run(async {
-        // An error means that the sender is gone: stop as well.
-        let _ = stopped.await;
-    }));
+    let (listens, listening) = tokio::sync::oneshot::channel();
+    let serving = tokio::spawn(async move {
+        // Errors of the channels mean that the other end is gone: the demo failed and says why itself.
+        let on_listening = |address| drop(listens.send(address));
+        let stopped = async { drop(stopped.await) };
+        serve::serve(&store, ([127, 0, 0, 1], 0).into(), Limits::default(), on_listening, stopped).await
+    });
+    let Ok(address) = listening.await else {
+        serving.await.context("serve")?.context("serve")?;
+        return Err(anyhow!("serve: ended before it listened"));
+    };
+    let url = format!("http://{address}");
     let at = format!("{},{},{}", ROBOT_IN_WORLD.x, ROBOT_IN_WORLD.y, ROBOT_IN_WORLD.z);
     let radius = RADIUS_M.to_string();
     let fetch = ["fetch", "--from", &url, "--at", &at, "--radius", &radius];

@@ -13,8 +13,6 @@ pub mod progress;
 pub mod publish;
 pub mod query;
 pub mod raster;
-pub mod embed;
-pub mod publish;
 pub mod segment;
 pub mod shard;
 pub mod store;

@@ -258,9 +258,13 @@ fn runtime() -> Result<tokio::runtime::Runtime> {
 
 fn run_serve(args: &ServeArgs) -> Result<Exit> {
     runtime()?.block_on(async {
-        let server = serve::Server::bind(&args.store, args.listen).await?;
-        tracing::info!("serving {} on http://{}", args.store.display(), server.address());
-        server.run(serve::termination()).await
+        let listening = |address| tracing::info!("serving {} on http://{address}", args.store.display());
+        let stop = async {
+            if let Err(error) = serve::stop_signal().await {
+                tracing::warn!("cannot listen for signals, stopping: {error}");
+            }
+        };
+        serve::serve(&args.store, args.listen, serve::Limits::default(), listening, stop).await
     })?;
     Ok(Exit::Done)
 }

@@ -22,6 +22,7 @@ use slag_common::splat::{self, SplatError};
 use slag_common::{Hash32, View};
 use slag_models::{ModelDir, ModelError, SessionOptions};
 
+use crate::embed::EmbedError;
 use crate::ingest::{self, GeoError, IngestError};
 use crate::lift::{CellBuckets, CellField, FieldError, RegionTable, SumsError, ViewSums};
 use crate::progress::Progress;
@@ -76,7 +77,7 @@ pub enum EncodeError {
         /// The view.
         view: String,
         /// Why.
-        source: slag_models::EncodeError,
+        source: EmbedError,
     },
     /// The store said no.
     #[error(transparent)]

@@ -49,7 +49,7 @@ impl ViewWorker<'_> {
                 none => none.insert(self.models.image_encoder(self.session)?),
             };
             let embedded = self.stopwatch.time("embed", || {
-                embed::embed_masks(&loaded.image, &masks, encoder.as_mut(), self.settings.background)
+                embed::embed_masks(&loaded.image, &masks, encoder.as_mut(), self.settings.background, None)
             });
             embedded.map_err(|source| EncodeError::Embed { view: view.name.clone(), source })?
         };

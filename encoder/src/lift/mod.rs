@@ -17,5 +17,5 @@ mod field;
 mod sums;
 
 pub use buckets::{CellBuckets, SumEntry};
-pub use field::{CellField, FieldError, RegionTable};
+pub use field::{CellField, FieldError, RegionTable, dot};
 pub use sums::{SumsError, ViewSums};

@@ -62,6 +62,15 @@ pub(super) fn replace(part: &Path, path: &Path, bytes: &[u8], access: Access) ->
     move_into_place(part, path)
 }
 
+/// Replaces a working file by `bytes`, written beside as `.part` first: whole or not at all after a crash.
+pub(crate) fn write_durably(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let part = path.with_extension("part");
+    if part.exists() {
+        fs_err::remove_file(&part)?;
+    }
+    replace(&part, path, bytes, Access::Shared)
+}
+
 /// Renames a synced file and makes its new name durable.
 pub(super) fn move_into_place(part: &Path, path: &Path) -> io::Result<()> {
     fs_err::rename(part, path)?;
