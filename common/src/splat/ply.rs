@@ -101,7 +101,7 @@ pub fn write(path: &Path, gaussians: &Gaussians) -> Result<(), SplatError> {
     Ok(writer.flush()?)
 }
 
-/// Writes as [`write`] does, to any writer (best a buffered one).
+/// Writes as [`write()`] does, to any writer (best a buffered one).
 ///
 /// # Errors
 /// Those of the writer.

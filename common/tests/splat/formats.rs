@@ -139,6 +139,17 @@ fn trained_scenes_row_by_row() {
 }
 
 #[test]
+fn a_dot_splat_of_broken_rows_is_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for (len, row) in [(0, 0), (63, 32), (65, 64)] {
+        let error = crate::read_bytes(folder.path(), "cut.splat", &vec![1; len]).expect_err("is refused");
+        let expected =
+            format!("cut.splat: byte {row}: expected rows of 32 bytes, found a file of {len} bytes");
+        assert!(error.to_string().contains(&expected), "{error}");
+    }
+}
+
+#[test]
 fn refusals_say_what_to_do() {
     let Some(folder) = shared("fixtures/formats") else { return };
     let error = read_all(&folder.join("minimal.ksplat")).expect_err("is refused");

@@ -155,32 +155,34 @@ fn counts_that_lie_are_refused_before_memory_is_taken() {
     assert!(error.contains("Gaussians in") && error.contains("4294967295"), "{error}");
 }
 
-/// A stream that unpacks to far more than the table of contents says: refused, and not kept.
+/// Streams that unpack to far more than the table of contents says: refused, and not kept.
 #[test]
 fn zstandard_bombs_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
-    let (mut out, columns) = spz_columns(4, 0, &[]);
-    out.extend(32_u32.to_le_bytes());
-    out.extend([0; 12]);
-    let mut streams: Vec<_> =
-        columns[..5].iter().map(|c| compress_to_vec(&c[..], CompressionLevel::Fastest)).collect();
-    // A frame with a window of 8 MiB and 2,000 blocks that repeat a byte 128 KiB times: 250 MiB.
-    let mut bomb = vec![0x28, 0xB5, 0x2F, 0xFD, 0x00, 13 << 3];
-    for block in 0..2000_u32 {
-        let header = (128 << 10) << 3 | 1 << 1 | u32::from(block == 1999);
-        bomb.extend(&header.to_le_bytes()[..3]);
-        bomb.push(0);
+    for (log_window, expected) in [(23, "more than the 1 bytes"), (30, "window_size")] {
+        let (mut out, columns) = spz_columns(4, 0, &[]);
+        out.extend(32_u32.to_le_bytes());
+        out.extend([0; 12]);
+        let compress = |column: &Vec<u8>| compress_to_vec(&column[..], CompressionLevel::Fastest);
+        let mut streams: Vec<_> = columns[..5].iter().map(compress).collect();
+        // 2,000 blocks that repeat a byte 128 KiB times: 250 MiB.
+        let mut bomb = vec![0x28, 0xB5, 0x2F, 0xFD, 0x00, (log_window - 10) << 3];
+        for block in 0..2000_u32 {
+            let header = (128 << 10) << 3 | 1 << 1 | u32::from(block == 1999);
+            bomb.extend(&header.to_le_bytes()[..3]);
+            bomb.push(0);
+        }
+        streams[1] = bomb;
+        for (column, stream) in columns.iter().zip(&streams) {
+            out.extend((stream.len() as u64).to_le_bytes());
+            out.extend((column.len() as u64).to_le_bytes());
+        }
+        out.extend(streams.concat());
+        let (result, peak_bytes) = crate::damage::peak_bytes(|| read_bytes(folder.path(), "bomb.spz", &out));
+        let error = result.expect_err("is refused").to_string();
+        assert!(error.contains("bomb.spz: byte ") && error.contains(expected), "{error}");
+        assert!(peak_bytes < 40 << 20, "{peak_bytes} bytes");
     }
-    streams[1] = bomb;
-    for (column, stream) in columns.iter().zip(&streams) {
-        out.extend((stream.len() as u64).to_le_bytes());
-        out.extend((column.len() as u64).to_le_bytes());
-    }
-    out.extend(streams.concat());
-    let (result, peak_bytes) = crate::damage::peak_bytes(|| read_bytes(folder.path(), "bomb.spz", &out));
-    let error = result.expect_err("is refused").to_string();
-    assert!(error.contains("bomb.spz: byte ") && error.contains("more than the 1 bytes"), "{error}");
-    assert!(peak_bytes < 40 << 20, "{peak_bytes} bytes");
 }
 
 fn write_webp(path: &Path, width: u32, pixels: &[[u8; 4]]) {
@@ -269,7 +271,44 @@ fn sog_parts_stay_in_their_folder() {
     write_sog_v1(&inner);
     std::fs::rename(inner.join("sh0.webp"), folder.path().join("sh0.webp")).expect("moves");
     let meta = std::fs::read_to_string(inner.join("meta.json")).expect("was written");
-    std::fs::write(inner.join("meta.json"), meta.replace("sh0.webp", "../sh0.webp")).expect("writes");
-    let error = read_all(&inner).expect_err("is refused").to_string();
-    assert!(error.contains("plain names of files") && error.contains("../sh0.webp"), "{error}");
+    for outside in ["../sh0.webp", "../inner/../sh0.webp", "sub/../../sh0.webp"] {
+        std::fs::create_dir_all(inner.join("sub")).expect("the temporary folder can be written");
+        std::fs::write(inner.join("meta.json"), meta.replace("sh0.webp", outside)).expect("writes");
+        let error = read_all(&inner).expect_err("is refused").to_string();
+        assert!(error.contains("plain names of files") && error.contains(outside), "{error}");
+    }
+}
+
+#[test]
+fn sog_labels_and_codebooks_out_of_range() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path();
+    write_sog_v1(path);
+    write_webp(&path.join("labels.webp"), 3, &[[127, 0, 0, 255]; 6]);
+    assert_eq!(read_all(path).unwrap_or_else(|e| panic!("{e}")).sh_degree, 1);
+    write_webp(&path.join("labels.webp"), 3, &[[128, 0, 0, 255]; 6]);
+    let error = read_all(path).expect_err("is refused").to_string();
+    assert!(error.contains("shN: expected labels below 128, found 128"), "{error}");
+
+    // Version 2 with a codebook null, 1, ... 255, where PlayCanvas takes 1 + (1 - 255) / 255 for the
+    // null; and a short one, 1 to 99.
+    let numbers = |n: usize| (1..n).map(|i| i.to_string()).collect::<Vec<_>>().join(",");
+    let meta = std::fs::read_to_string(path.join("meta.json")).expect("was written");
+    let start = meta.find("\"scales\"").expect("is there");
+    let means = meta[..start].replacen('{', "{\"version\": 2, \"count\": 6,", 1);
+    let v2 = format!(
+        "{means} \"scales\": {{\"codebook\": [{}], \"files\": [\"scales.webp\"]}},\
+         \"quats\": {{\"files\": [\"quats.webp\"]}},\
+         \"sh0\": {{\"codebook\": [null,{}], \"files\": [\"sh0.webp\"]}}}}",
+        numbers(100),
+        numbers(256),
+    );
+    std::fs::write(path.join("meta.json"), v2).expect("writes");
+    write_webp(&path.join("sh0.webp"), 3, &[[0, 1, 255, 51]; 6]);
+    write_webp(&path.join("scales.webp"), 3, &[[0, 98, 99, 255]; 6]);
+    let found = read_all(path).unwrap_or_else(|e| panic!("{e}"));
+    assert_near(found.sh_dc[5][0].into(), 1.0 - 254.0 / 255.0, 1e-7, "null");
+    assert_eq!((found.sh_dc[5][1], found.sh_dc[5][2], found.opacities[5]), (1.0, 255.0, 0.2));
+    assert_near(f64::from(found.scales[5][0]), 1_f64.exp(), 1e-7, "scale");
+    assert!(found.scales[5][2].is_nan() && !found.is_usable(5));
 }

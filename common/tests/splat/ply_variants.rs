@@ -74,10 +74,9 @@ fn encodings_types_and_orders_give_the_same_gaussians() {
         ("binary_little_endian", "float"),
         ("binary_little_endian", "double"),
         ("binary_big_endian", "float"),
-        ("binary_big_endian", "float64"),
+        ("binary_big_endian", "double"),
     ] {
-        let bytes = variant(encoding, kind.trim_end_matches("64"), &names, &rows);
-        let bytes = if kind == "float64" { variant(encoding, "double", &names, &rows) } else { bytes };
+        let bytes = variant(encoding, kind, &names, &rows);
         let found = read_bytes(folder.path(), "variant.ply", &bytes).unwrap_or_else(|e| panic!("{e}"));
         assert!(found == expected, "{encoding} {kind}");
     }
@@ -129,6 +128,66 @@ fn missing_properties_are_named() {
     let error = read_bytes(folder.path(), "cloud.ply", text.as_bytes()).expect_err("is refused").to_string();
     assert!(error.contains("cloud.ply: line 7: expected a header with property \"rot_0\""), "{error}");
     assert!(error.ends_with("pass the splat's PLY"), "{error}");
+}
+
+/// A compressed PLY of one chunk without colour ranges (as the first version was) and five Gaussians
+/// with harmonics of degree 1, `sh` bytes each the same; counts as told.
+fn compressed(n_chunks: usize, sh: &[u8]) -> Vec<u8> {
+    let axes = ["x", "y", "z", "scale_x", "scale_y", "scale_z"];
+    let ranges = axes.map(|axis| format!("property float min_{axis}\nproperty float max_{axis}\n")).concat();
+    let packed =
+        ["position", "rotation", "scale", "color"].map(|p| format!("property uint packed_{p}\n")).concat();
+    let rest: String = (0..9).map(|i| format!("property uchar f_rest_{i}\n")).collect();
+    let mut out = format!(
+        "ply\nformat binary_little_endian 1.0\nelement chunk {n_chunks}\n{ranges}\
+         element vertex 5\n{packed}element sh {}\n{rest}end_header\n",
+        sh.len()
+    )
+    .into_bytes();
+    for _ in 0..n_chunks {
+        (0..6).for_each(|axis| out.extend([-1.0, axis as f32].map(f32::to_le_bytes).concat()));
+    }
+    // Position: x at its maximum, y at its minimum, z at 1023/2047; colour 255, 0, 51; opacity 255.
+    let words: [u32; 4] = [0x7FF << 21 | 1023, 0b11 << 30 | 1023 << 20 | 512 << 10 | 511, 0, 0xFF00_33FF];
+    (0..5).for_each(|_| out.extend(words.map(u32::to_le_bytes).concat()));
+    sh.iter().for_each(|byte| out.extend([*byte; 9]));
+    out
+}
+
+/// Oracle: PlayCanvas' description of the format, worked out by hand.
+#[test]
+fn compressed_ply_by_hand() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let bytes = compressed(1, &[0, 1, 128, 254, 255]);
+    let found = read_bytes(folder.path(), "hand.ply", &bytes).unwrap_or_else(|e| panic!("{e}"));
+    assert_columns_agree(&found);
+    let mean = found.means_in_world[4];
+    assert_eq!((mean.x, mean.y), (0.0, -1.0));
+    assert_near(mean.z, -1.0 + 3.0 * 1023.0 / 2047.0, 1e-12, "z");
+    assert_near(found.scales[4][2].into(), (-1.0_f64).exp(), 1e-7, "scale");
+    for (found, expected) in found.rgb_dc(4).into_iter().zip([1.0, 0.0, 0.2]) {
+        assert_near(found.into(), expected, 1e-6, "colour");
+    }
+    assert_eq!(found.opacities[4], 1.0);
+    // w, x, y are 0.5 * sqrt(2) * (2 n / 1023 - 1) for n = 1023, 512, 511; z, the largest, is what is left.
+    let small = 0.5_f64.sqrt() / 1023.0;
+    for (found, expected) in
+        found.rotations_wxyz[4].into_iter().zip([0.5_f64.sqrt(), small, -small, 0.5_f64.sqrt()])
+    {
+        assert_near(found.into(), expected, 1e-6, "rotation");
+    }
+    for (i, expected) in [-4.0, -4.0 + 1.5 / 32.0, 0.5 / 32.0, 4.0 - 1.5 / 32.0, 4.0].into_iter().enumerate()
+    {
+        assert_eq!(found.sh_rest[9 * i..9 * (i + 1)], [expected; 9], "{i}");
+    }
+    for (bytes, expected) in [
+        (compressed(2, &[0; 5]), "expected 1 chunks for 5 Gaussians, found 2"),
+        (compressed(0, &[0; 5]), "expected 1 chunks for 5 Gaussians, found 0"),
+        (compressed(1, &[0; 4]), "expected 5 rows of element \"sh\", found 4"),
+    ] {
+        let error = read_bytes(folder.path(), "wrong.ply", &bytes).expect_err("is refused").to_string();
+        assert!(error.contains("wrong.ply: byte ") && error.contains(expected), "{error}");
+    }
 }
 
 /// Random Gaussians of a degree, with the ends of the ranges among them.
@@ -183,6 +242,7 @@ fn what_is_written_is_read_back() {
             let (channel, coefficient) = (j / per_channel, j % per_channel);
             assert_eq!(rows[5][9 + j], written.sh_rest[(5 * per_channel + coefficient) * 3 + channel]);
         }
+        assert!(rows.iter().flatten().all(|value| value.is_finite()), "logarithms of 0 and 1 as well");
         let opacity = f64::from(written.opacities[5]);
         let logit = (opacity / (1.0 - opacity)).ln();
         assert_near(rows[5][9 + 3 * per_channel].into(), logit, 1e-6, "logit");
