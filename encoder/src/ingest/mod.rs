@@ -1,0 +1,122 @@
+//! Stage 0: photos as the later stages want them, ideal pinhole images of a known size.
+
+mod geo;
+mod undistort;
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use image::metadata::Orientation;
+use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, RgbImage};
+use slag_common::{Distortion, Intrinsics, View};
+
+pub use geo::{GeoError, read_geo_reference};
+pub use undistort::Undistorter;
+
+/// Largest factor by which a folder of downscaled copies may differ from the intrinsics.
+const MAX_DOWNSCALE: u32 = 64;
+
+/// A photo, free of lens distortion.
+#[derive(Clone, Debug)]
+pub struct LoadedImage {
+    /// The view with the image's own size and an ideal pinhole.
+    pub view: View,
+    /// The pixels, black where the lens imaged nothing.
+    pub image: RgbImage,
+    /// How the image came about, where the lens distorted it.
+    pub undistorter: Option<Undistorter>,
+    /// Pixels that show something, row-major; `None` where all do.
+    pub valid: Option<Vec<bool>>,
+}
+
+/// Why a photo could not be loaded.
+#[derive(Debug, thiserror::Error)]
+pub enum IngestError {
+    /// A file could not be read; the message has its path.
+    #[error("{0}; check that the file exists and may be read")]
+    Io(#[from] io::Error),
+    /// A file is no image or damaged.
+    #[error("{}: {source}; give a JPEG, PNG or WebP that opens elsewhere", path.display())]
+    Decode {
+        /// The image.
+        path: PathBuf,
+        /// The decoder's reason.
+        #[source]
+        source: ImageError,
+    },
+    /// An image's size does not belong to its camera.
+    #[error(
+        "{}: the image is {} x {} px but its camera {} x {} px, and the one is no uniform scale of the other; \
+         give the images that the poses were computed from, or whole-factor reductions of them",
+        path.display(), found_px[0], found_px[1], expected_px[0], expected_px[1]
+    )]
+    Size {
+        /// The image.
+        path: PathBuf,
+        /// Width and height of the image.
+        found_px: [u32; 2],
+        /// Width and height according to the camera.
+        expected_px: [u32; 2],
+    },
+}
+
+/// Returns the views whose image file is absent, in the order given.
+pub fn missing_images(views: &[View]) -> Vec<&View> {
+    views.iter().filter(|view| !view.image_path.is_file()).collect()
+}
+
+/// Loads a view's photo and takes the lens distortion out of it.
+///
+/// An image that is a scaled copy of what the camera took brings a scaled camera with it. A pinhole's
+/// pixels are handed on untouched. An EXIF orientation is ignored, with a warning: poses are computed
+/// from the pixels as they are stored.
+///
+/// # Errors
+/// [`IngestError`] if the file cannot be read or decoded, or is of a size that is not the camera's.
+pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
+    let photo = decode(&view.image_path, &view.intrinsics)?;
+    let intrinsics = view.intrinsics.scaled_to(photo.width(), photo.height());
+    let view = View { intrinsics: intrinsics.without_distortion(), ..view.clone() };
+    if intrinsics.distortion == Distortion::None {
+        return Ok(LoadedImage { view, image: photo, undistorter: None, valid: None });
+    }
+    let undistorter = Undistorter::new(intrinsics);
+    let (image, valid) = undistorter.image(&photo);
+    Ok(LoadedImage { view, image, undistorter: Some(undistorter), valid: Some(valid) })
+}
+
+fn decode(path: &Path, camera: &Intrinsics) -> Result<RgbImage, IngestError> {
+    let failed = |source| IngestError::Decode { path: path.to_owned(), source };
+    let file = io::BufReader::new(fs_err::File::open(path)?);
+    let mut decoder = ImageReader::new(file).with_guessed_format()?.into_decoder().map_err(failed)?;
+    let (width_px, height_px) = decoder.dimensions();
+    // Before any pixel is allocated.
+    if !is_scale_of(camera, width_px, height_px) {
+        return Err(IngestError::Size {
+            path: path.to_owned(),
+            found_px: [width_px, height_px],
+            expected_px: [camera.width_px, camera.height_px],
+        });
+    }
+    match decoder.orientation() {
+        Ok(Orientation::NoTransforms) | Err(_) => {}
+        Ok(orientation) => tracing::warn!(
+            path = %path.display(), ?orientation,
+            "EXIF orientation ignored; if this view fits badly, were its poses computed from a rotated copy?"
+        ),
+    }
+    Ok(DynamicImage::from_decoder(decoder).map_err(failed)?.into_rgb8())
+}
+
+/// Whether a size is exactly proportional to the camera's, or its sides are the camera's divided by
+/// one whole number, each rounded up or down (as downscaled copies are made).
+fn is_scale_of(camera: &Intrinsics, width_px: u32, height_px: u32) -> bool {
+    let proportional = u64::from(width_px) * u64::from(camera.height_px)
+        == u64::from(height_px) * u64::from(camera.width_px);
+    let reduced = |side_px: u32, of_px: u32, n: u32| side_px == of_px / n || side_px == of_px.div_ceil(n);
+    width_px > 0
+        && height_px > 0
+        && (proportional
+            || (2..=MAX_DOWNSCALE)
+                .any(|n| reduced(width_px, camera.width_px, n) && reduced(height_px, camera.height_px, n)))
+}

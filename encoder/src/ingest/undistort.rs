@@ -1,0 +1,94 @@
+//! Lens distortion taken out: each pixel of an ideal pinhole looks up where the lens imaged it.
+
+use image::RgbImage;
+use slag_common::Intrinsics;
+
+/// Maps images of a distorted camera to the ideal pinhole of the same focal lengths, centre and size.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Undistorter {
+    /// The camera as it is, with distortion, at the image's size.
+    camera: Intrinsics,
+    /// Beyond this normalised radius the lens polynomial folds back.
+    max_radius: f64,
+}
+
+impl Undistorter {
+    /// Makes the map of a camera whose size is that of the images.
+    pub fn new(camera: Intrinsics) -> Self {
+        Self { camera, max_radius: camera.distortion.monotonic_radius() }
+    }
+
+    /// Returns where in the distorted image, pixels, the centre of an ideal pixel is seen; `None`
+    /// outside of the image or of the lens model's range.
+    fn source_px(&self, column: u32, row: u32) -> Option<[f64; 2]> {
+        let ideal = self.camera.distorted_from_pixel([f64::from(column) + 0.5, f64::from(row) + 0.5]);
+        if ideal[0].hypot(ideal[1]) > self.max_radius {
+            return None;
+        }
+        let [u, v] = self.camera.pixel_from_distorted(self.camera.distort(ideal));
+        let inside = (0.0..f64::from(self.camera.width_px)).contains(&u)
+            && (0.0..f64::from(self.camera.height_px)).contains(&v);
+        inside.then_some([u, v])
+    }
+
+    /// Returns the ideal image, sampled bilinearly, and which of its pixels show something (row-major);
+    /// the others are black.
+    ///
+    /// # Panics
+    /// If the image is not of the camera's size.
+    pub fn image(&self, photo: &RgbImage) -> (RgbImage, Vec<bool>) {
+        let (width_px, height_px) = (self.camera.width_px, self.camera.height_px);
+        assert_eq!(photo.dimensions(), (width_px, height_px), "the undistorter is of another size");
+        let mut valid = Vec::with_capacity(width_px as usize * height_px as usize);
+        let mut ideal = RgbImage::new(width_px, height_px);
+        for (column, row, pixel) in ideal.enumerate_pixels_mut() {
+            let source = self.source_px(column, row);
+            valid.push(source.is_some());
+            if let Some(source) = source {
+                pixel.0 = bilinear(photo, source);
+            }
+        }
+        (ideal, valid)
+    }
+
+    /// Returns labels (row-major) of the ideal image, each the nearest one of the distorted image,
+    /// and `outside` where that shows nothing.
+    ///
+    /// # Panics
+    /// If there are not as many labels as the camera has pixels.
+    pub fn labels(&self, labels: &[u32], outside: u32) -> Vec<u32> {
+        let (width_px, height_px) = (self.camera.width_px, self.camera.height_px);
+        assert_eq!(
+            labels.len(),
+            width_px as usize * height_px as usize,
+            "the undistorter is of another size"
+        );
+        let mut ideal = Vec::with_capacity(labels.len());
+        for row in 0..height_px {
+            ideal.extend((0..width_px).map(|column| match self.source_px(column, row) {
+                // Truncation is the pixel that holds the position: pixel i spans i..i + 1.
+                Some([u, v]) => labels[v as usize * width_px as usize + u as usize],
+                None => outside,
+            }));
+        }
+        ideal
+    }
+}
+
+/// Returns the colour at a position, pixels, between the four pixel centres around it; the outermost
+/// half pixel takes its edge's colour.
+fn bilinear(image: &RgbImage, [u, v]: [f64; 2]) -> [u8; 3] {
+    let axis = |position: f64, size_px: u32| {
+        let from_centre = (position - 0.5).clamp(0.0, f64::from(size_px - 1));
+        let low = from_centre as u32;
+        (low, (low + 1).min(size_px - 1), from_centre - f64::from(low))
+    };
+    let (x0, x1, fx) = axis(u, image.width());
+    let (y0, y1, fy) = axis(v, image.height());
+    let [a, b, c, d] = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)].map(|(x, y)| image.get_pixel(x, y).0);
+    [0, 1, 2].map(|channel| {
+        let [a, b, c, d] = [a, b, c, d].map(|colour| f64::from(colour[channel]));
+        let (top, bottom) = (a + (b - a) * fx, c + (d - c) * fx);
+        (top + (bottom - top) * fy).round() as u8
+    })
+}

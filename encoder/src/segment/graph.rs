@@ -1,0 +1,416 @@
+//! The built-in segmenter: graph-based image segmentation at several scales (Felzenszwalb and
+//! Huttenlocher, "Efficient Graph-Based Image Segmentation", IJCV 59(2), 2004), over differences of
+//! colour (CIE L*a*b*, where distances are about as large as they look) and jumps of depth.
+
+use std::collections::HashMap;
+
+use image::{RgbImage, imageops};
+
+use super::regions::nearest;
+use super::{BoxPx, Mask, NO_REGION, SegmentError, SegmentInput, Segmenter, masks_of_labels};
+
+/// Steps of an edge weight per unit of L*a*b* distance; 16 bits then reach beyond black to white.
+const WEIGHT_STEPS: f32 = 200.0;
+/// Neighbours that a pixel has an edge to; the other four have one to it.
+const NEIGHBOURS: [(i64, i64); 4] = [(1, 0), (-1, 1), (0, 1), (1, 1)];
+
+/// The parameters of [`GraphSegmenter`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct GraphSettings {
+    /// Longest side of the image that is worked on, pixels; masks are scaled up from it.
+    pub max_side_px: u32,
+    /// Standard deviation of the smoothing, pixels of that image.
+    pub smoothing_px: f32,
+    /// Scale of observation k of each level, coarsest first, in units of colour distance times pixels.
+    pub scales: Vec<f32>,
+    /// Smallest component kept, as a share of the image.
+    pub min_area_share: f32,
+    /// Weight of a jump to twice the depth, in units of colour distance.
+    pub depth_weight: f32,
+    /// Overlap (intersection over union) with a mask of a coarser level above which a mask repeats it.
+    pub max_overlap_iou: f32,
+    /// Most masks of an image; the largest are kept.
+    pub max_masks: usize,
+}
+
+impl Default for GraphSettings {
+    fn default() -> Self {
+        Self {
+            max_side_px: 640,
+            smoothing_px: 0.8,
+            scales: vec![1500.0, 500.0, 150.0],
+            min_area_share: 0.0005,
+            depth_weight: 100.0,
+            max_overlap_iou: 0.9,
+            max_masks: 400,
+        }
+    }
+}
+
+/// Finds masks without a model.
+#[derive(Clone, Debug)]
+pub struct GraphSegmenter {
+    settings: GraphSettings,
+    name: String,
+}
+
+impl GraphSegmenter {
+    /// Makes the segmenter; only the first 256 scales count.
+    pub fn new(mut settings: GraphSettings) -> Self {
+        settings.scales.truncate(256);
+        settings.max_side_px = settings.max_side_px.max(1);
+        let name = format!("graph 1, {settings:?}");
+        Self { settings, name }
+    }
+}
+
+impl Default for GraphSegmenter {
+    fn default() -> Self {
+        Self::new(GraphSettings::default())
+    }
+}
+
+impl Segmenter for GraphSegmenter {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn segment(&self, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError> {
+        let (width_px, height_px) = input.image.dimensions();
+        if width_px == 0 || height_px == 0 {
+            return Ok(Vec::new());
+        }
+        let raster = Raster::new(input, &self.settings);
+        let edges = raster.edges_by_weight(self.settings.depth_weight);
+        let n_pixels = raster.lab.len();
+        let min_area_px = ((n_pixels as f32 * self.settings.min_area_share) as u32).max(1);
+        let levels: Vec<Labels> = self
+            .settings
+            .scales
+            .iter()
+            .map(|scale| raster.components(&edges, scale * WEIGHT_STEPS, min_area_px))
+            .collect();
+
+        let mut masks = Vec::new();
+        for (level, labels) in levels.iter().enumerate() {
+            let repeats = labels.repeats_of(&levels[..level], self.settings.max_overlap_iou);
+            let all = masks_of_labels(&labels.of_pixel, raster.width_px, labels.area_px.len(), u64::MAX);
+            let kept = all
+                .unwrap_or_default()
+                .into_iter()
+                .filter(|(label, mask)| mask.area_px >= min_area_px && !repeats[*label as usize]);
+            masks.extend(kept.map(|(_, mask)| Mask { level: level as u8, ..mask }));
+        }
+        self.keep_largest(&mut masks);
+        let (columns, rows) = (nearest(raster.width_px, width_px), nearest(raster.height_px, height_px));
+        Ok(masks.iter().filter_map(|mask| scaled_up(mask, &columns, &rows)).collect())
+    }
+}
+
+impl GraphSegmenter {
+    fn keep_largest(&self, masks: &mut Vec<Mask>) {
+        if masks.len() <= self.settings.max_masks {
+            return;
+        }
+        let mut order: Vec<usize> = (0..masks.len()).collect();
+        order.sort_by_key(|index| (std::cmp::Reverse(masks[*index].area_px), *index));
+        let mut keep = vec![false; masks.len()];
+        order.iter().take(self.settings.max_masks).for_each(|index| keep[*index] = true);
+        let mut index = 0;
+        masks.retain(|_| {
+            index += 1;
+            keep[index - 1]
+        });
+    }
+}
+
+/// An edge of the grid: the pixel it belongs to times 4, plus the index of the neighbour.
+type Edge = u32;
+
+/// The image as it is worked on.
+struct Raster {
+    width_px: u32,
+    height_px: u32,
+    /// Smoothed colour, L* a* b*.
+    lab: Vec<[f32; 3]>,
+    /// One over the depth, NaN where unknown; empty where there is no depth at all.
+    inverse_depth: Vec<f32>,
+    /// Pixels that show something.
+    valid: Vec<bool>,
+}
+
+impl Raster {
+    fn new(input: &SegmentInput<'_>, settings: &GraphSettings) -> Self {
+        let (full_width, full_height) = input.image.dimensions();
+        let longest = full_width.max(full_height);
+        let scaled = |side: u32| {
+            let side = u64::from(side) * u64::from(settings.max_side_px.min(longest));
+            ((side + u64::from(longest) / 2) / u64::from(longest)).max(1) as u32
+        };
+        let (width_px, height_px) = (scaled(full_width), scaled(full_height));
+        let mut lab = if longest <= settings.max_side_px {
+            lab_of(input.image)
+        } else {
+            lab_of(&imageops::thumbnail(input.image, width_px, height_px))
+        };
+        smooth(&mut lab, width_px as usize, settings.smoothing_px);
+
+        let (columns, rows) = (nearest(full_width, width_px), nearest(full_height, height_px));
+        let inverse_depth = input.depth.map_or_else(Vec::new, |depth| {
+            let inverse = |z: &f32| if *z > 0.0 { 1.0 / z } else { f32::NAN };
+            sample(full_width, &columns, &rows, |at| depth.get(at).map_or(f32::NAN, inverse))
+        });
+        let valid = input.valid.map_or_else(
+            || vec![true; lab.len()],
+            |valid| sample(full_width, &columns, &rows, |at| valid.get(at) == Some(&true)),
+        );
+        Self { width_px, height_px, lab, inverse_depth, valid }
+    }
+
+    /// Returns the pixel at the other end of an edge; `None` beyond the border.
+    fn neighbour(&self, pixel: usize, (dx, dy): (i64, i64)) -> Option<usize> {
+        let (width, height) = (i64::from(self.width_px), i64::from(self.height_px));
+        let (x, y) = (pixel as i64 % width + dx, pixel as i64 / width + dy);
+        ((0..width).contains(&x) && (0..height).contains(&y)).then_some((y * width + x) as usize)
+    }
+
+    /// Returns the depth jump between neighbours relative to their depth, 0 if unknown.
+    ///
+    /// The inverse depth of a plane is linear in the image. So the jump is what remains after the
+    /// slope on either side of the edge has been carried on over it, whichever explains more: a
+    /// slanted floor and the fold between floor and wall have none.
+    fn depth_jump(&self, a: usize, b: usize, step: (i64, i64)) -> f32 {
+        let Some((at_a, at_b)) = self.inverse_depth.get(a).zip(self.inverse_depth.get(b)) else { return 0.0 };
+        let carried_on = |near: f32, far: f32, beyond: Option<usize>| {
+            let beyond = beyond.map_or(near, |pixel| self.inverse_depth[pixel]);
+            let slope = if beyond.is_nan() { 0.0 } else { near - beyond };
+            (far - near - slope).abs().min((far - near).abs())
+        };
+        let from_a = carried_on(*at_a, *at_b, self.neighbour(a, (-step.0, -step.1)));
+        let from_b = carried_on(*at_b, *at_a, self.neighbour(b, step));
+        let relative = from_a.min(from_b) / at_a.max(*at_b);
+        if relative.is_finite() { relative } else { 0.0 }
+    }
+
+    /// Returns the edges between valid pixels, ascending by weight and then by position, with weights.
+    fn edges_by_weight(&self, depth_weight: f32) -> Vec<(Edge, u16)> {
+        let mut edges = Vec::with_capacity(4 * self.lab.len());
+        for pixel in 0..self.lab.len() {
+            for (direction, step) in NEIGHBOURS.into_iter().enumerate() {
+                let Some(other) = self.neighbour(pixel, step) else { continue };
+                if !(self.valid[pixel] && self.valid[other]) {
+                    continue;
+                }
+                let colour = distance(self.lab[pixel], self.lab[other]);
+                // A jump of relative inverse depth 1/2 is one to twice the depth.
+                let depth = 2.0 * depth_weight * self.depth_jump(pixel, other, step);
+                let weight = ((colour + depth) * WEIGHT_STEPS) as u16;
+                edges.push((pixel as u32 * 4 + direction as u32, weight));
+            }
+        }
+        // Stable, so that ties keep the order of positions.
+        let mut ends = vec![0_u32; usize::from(u16::MAX) + 2];
+        edges.iter().for_each(|(_, weight)| ends[usize::from(*weight) + 1] += 1);
+        for weight in 1..ends.len() {
+            ends[weight] += ends[weight - 1];
+        }
+        let mut sorted = vec![(0, 0); edges.len()];
+        for edge in edges {
+            let slot = &mut ends[usize::from(edge.1)];
+            sorted[*slot as usize] = edge;
+            *slot += 1;
+        }
+        sorted
+    }
+
+    /// Joins pixels over ascending edges while the edge is no larger than both components' largest
+    /// inner weight plus `scale` over their size; then joins what is smaller than `min_area_px` to
+    /// its most similar neighbour.
+    fn components(&self, edges: &[(Edge, u16)], scale: f32, min_area_px: u32) -> Labels {
+        let mut forest = Forest::new(self.lab.len(), scale);
+        let ends = |edge: Edge| {
+            let pixel = edge as usize / 4;
+            let (dx, dy) = NEIGHBOURS[edge as usize % 4];
+            // Within the raster: the edge was made so.
+            (pixel, (pixel as i64 + dy * i64::from(self.width_px) + dx) as usize)
+        };
+        let mut open = Vec::new();
+        for (edge, weight) in edges {
+            let (a, b) = ends(*edge);
+            let (a, b) = (forest.root(a), forest.root(b));
+            if a == b {
+                continue;
+            }
+            let weight = f32::from(*weight);
+            if weight <= forest.threshold[a].min(forest.threshold[b]) {
+                forest.join(a, b, weight + scale / (forest.area_px[a] + forest.area_px[b]) as f32);
+            } else {
+                open.push(*edge);
+            }
+        }
+        for edge in open {
+            let (a, b) = ends(edge);
+            let (a, b) = (forest.root(a), forest.root(b));
+            if a != b && forest.area_px[a].min(forest.area_px[b]) < min_area_px {
+                forest.join(a, b, 0.0);
+            }
+        }
+        forest.labels(&self.valid)
+    }
+}
+
+/// Disjoint sets of pixels.
+struct Forest {
+    parent: Vec<u32>,
+    area_px: Vec<u32>,
+    /// Of a root: the weight up to which its component takes an edge.
+    threshold: Vec<f32>,
+}
+
+impl Forest {
+    fn new(n_pixels: usize, scale: f32) -> Self {
+        let parent = (0..n_pixels as u32).collect();
+        Self { parent, area_px: vec![1; n_pixels], threshold: vec![scale; n_pixels] }
+    }
+
+    fn root(&mut self, mut pixel: usize) -> usize {
+        while self.parent[pixel] as usize != pixel {
+            let grandparent = self.parent[self.parent[pixel] as usize];
+            self.parent[pixel] = grandparent;
+            pixel = grandparent as usize;
+        }
+        pixel
+    }
+
+    /// Joins two roots, the smaller below the larger.
+    fn join(&mut self, a: usize, b: usize, threshold: f32) {
+        let (root, child) = if self.area_px[a] >= self.area_px[b] { (a, b) } else { (b, a) };
+        self.parent[child] = root as u32;
+        self.area_px[root] += self.area_px[child];
+        self.threshold[root] = threshold;
+    }
+
+    /// Numbers the sets of valid pixels in the order of a row-major scan.
+    fn labels(mut self, valid: &[bool]) -> Labels {
+        let mut label_of_root = vec![NO_REGION; self.parent.len()];
+        let mut labels = Labels { of_pixel: Vec::with_capacity(valid.len()), area_px: Vec::new() };
+        for (pixel, valid) in valid.iter().enumerate() {
+            if !valid {
+                labels.of_pixel.push(NO_REGION);
+                continue;
+            }
+            let root = self.root(pixel);
+            if label_of_root[root] == NO_REGION {
+                label_of_root[root] = labels.area_px.len() as u32;
+                labels.area_px.push(self.area_px[root]);
+            }
+            labels.of_pixel.push(label_of_root[root]);
+        }
+        labels
+    }
+}
+
+/// One level's partition.
+struct Labels {
+    of_pixel: Vec<u32>,
+    area_px: Vec<u32>,
+}
+
+impl Labels {
+    /// Returns which components overlap one of a coarser level by more than `max_iou`.
+    fn repeats_of(&self, coarser: &[Self], max_iou: f32) -> Vec<bool> {
+        let mut repeats = vec![false; self.area_px.len()];
+        for other in coarser {
+            let mut unsorted_overlaps: HashMap<(u32, u32), u32> = HashMap::new();
+            for (a, b) in self.of_pixel.iter().zip(&other.of_pixel).filter(|(a, _)| **a != NO_REGION) {
+                *unsorted_overlaps.entry((*a, *b)).or_default() += 1;
+            }
+            for ((a, b), overlap_px) in unsorted_overlaps {
+                let union_px = self.area_px[a as usize] + other.area_px[b as usize] - overlap_px;
+                repeats[a as usize] |= overlap_px as f32 > max_iou * union_px as f32;
+            }
+        }
+        repeats
+    }
+}
+
+/// Reads, for each raster pixel, the value at the nearest pixel of an image `width_px` wide.
+fn sample<T>(width_px: u32, columns: &[u32], rows: &[u32], value_at: impl Fn(usize) -> T) -> Vec<T> {
+    let mut values = Vec::with_capacity(columns.len() * rows.len());
+    for y in rows {
+        let start = *y as usize * width_px as usize;
+        values.extend(columns.iter().map(|x| value_at(start + *x as usize)));
+    }
+    values
+}
+
+fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
+    let [l, m, n] = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+    (l * l + m * m + n * n).sqrt()
+}
+
+/// Converts sRGB (IEC 61966-2-1) to CIE L*a*b* of illuminant D65 (CIE 15).
+fn lab_of(image: &RgbImage) -> Vec<[f32; 3]> {
+    let linear: Vec<f32> = (0..=255_u8)
+        .map(|value| {
+            let v = f32::from(value) / 255.0;
+            if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
+        })
+        .collect();
+    let root = |t: f32| if t > 216.0 / 24389.0 { t.cbrt() } else { (24389.0 / 27.0 * t + 16.0) / 116.0 };
+    let lab = |pixel: &image::Rgb<u8>| {
+        let [r, g, b] = pixel.0.map(|value| linear[usize::from(value)]);
+        let x = root((0.4124564 * r + 0.3575761 * g + 0.1804375 * b) / 0.95047);
+        let y = root(0.2126729 * r + 0.7151522 * g + 0.072175 * b);
+        let z = root((0.0193339 * r + 0.119192 * g + 0.9503041 * b) / 1.08883);
+        [116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)]
+    };
+    image.pixels().map(lab).collect()
+}
+
+/// Smooths with a Gaussian cut off at four standard deviations; the border is repeated outwards.
+fn smooth(lab: &mut [[f32; 3]], width: usize, sigma_px: f32) {
+    let radius = (4.0 * sigma_px).ceil().clamp(0.0, 64.0) as usize;
+    if radius == 0 || width == 0 {
+        return;
+    }
+    let mut kernel: Vec<f32> =
+        (0..=2 * radius).map(|i| (-0.5 * ((i as f32 - radius as f32) / sigma_px).powi(2)).exp()).collect();
+    let sum: f32 = kernel.iter().sum();
+    kernel.iter_mut().for_each(|weight| *weight /= sum);
+
+    let height = lab.len() / width;
+    let mut line = Vec::new();
+    let mut along = |start: usize, stride: usize, len: usize| {
+        line.clear();
+        line.extend(
+            (0..len + 2 * radius).map(|i| lab[start + i.saturating_sub(radius).min(len - 1) * stride]),
+        );
+        for (i, window) in line.windows(kernel.len()).enumerate() {
+            let mut sum = [0.0; 3];
+            for (weight, colour) in kernel.iter().zip(window) {
+                (0..3).for_each(|c| sum[c] += weight * colour[c]);
+            }
+            lab[start + i * stride] = sum;
+        }
+    };
+    (0..height).for_each(|y| along(y * width, 1, width));
+    (0..width).for_each(|x| along(x, width, height));
+}
+
+/// Scales a mask up; `None` if it has no pixel in the target.
+fn scaled_up(mask: &Mask, columns: &[u32], rows: &[u32]) -> Option<Mask> {
+    let range = |axis: &[u32], low: u32, high: u32| {
+        (axis.partition_point(|p| *p < low) as u32, axis.partition_point(|p| *p < high) as u32)
+    };
+    let ((x0, x1), (y0, y1)) =
+        (range(columns, mask.box_px.x0, mask.box_px.x1), range(rows, mask.box_px.y0, mask.box_px.y1));
+    let mut inside = Vec::with_capacity((x1 - x0) as usize * (y1 - y0) as usize);
+    for row in &rows[y0 as usize..y1 as usize] {
+        let start = (row - mask.box_px.y0) as usize * mask.box_px.width_px() as usize;
+        let columns = &columns[x0 as usize..x1 as usize];
+        inside.extend(columns.iter().map(|column| mask.inside[start + (column - mask.box_px.x0) as usize]));
+    }
+    let area_px = inside.iter().filter(|inside| **inside).count() as u32;
+    (area_px > 0).then_some(Mask { box_px: BoxPx { x0, y0, x1, y1 }, inside, area_px, level: mask.level })
+}

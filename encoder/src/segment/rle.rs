@@ -1,0 +1,199 @@
+//! COCO's run-length masks: runs of outside and inside in turn, column by column, and their compact
+//! text (signed base-32 digits, little end first, from the third run on as differences to the run
+//! two before; format of the COCO API, `maskApi.c`, described by its authors as "similar to LEB128").
+
+use super::{BoxPx, Mask};
+
+/// Digits that a number of 32 bits and a sign may take, 5 bits each.
+const MAX_DIGITS: u32 = 7;
+
+/// A run-length encoded mask.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Rle {
+    width_px: u32,
+    height_px: u32,
+    /// Lengths of runs, outside first; they add up to the number of pixels.
+    counts: Vec<u32>,
+}
+
+/// Why a run-length encoding is refused.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum RleError {
+    /// The runs do not fill the image.
+    #[error("runs add up to {found} pixels, expected {expected}; encode the mask again")]
+    Sum {
+        /// Pixels of the image.
+        expected: u64,
+        /// Sum of the runs.
+        found: u64,
+    },
+    /// A side is longer than any image's may be.
+    #[error("size {width_px} x {height_px} px, the limit is 65535 each way; encode the mask again")]
+    Size {
+        /// Width of the image.
+        width_px: u32,
+        /// Height of the image.
+        height_px: u32,
+    },
+    /// A run is negative or too long.
+    #[error("run {index} is out of range; encode the mask again")]
+    Run {
+        /// Position of the run, counted from 0.
+        index: usize,
+    },
+    /// A character that is no digit, a number that is too long or does not end.
+    #[error("counts: byte {offset_bytes} is no valid digit; encode the mask again")]
+    Digit {
+        /// Offset within the text.
+        offset_bytes: usize,
+    },
+    /// The mask is a list of polygons.
+    #[error("{n_polygons} polygons instead of run lengths; convert them (pycocotools: annToRLE)")]
+    Polygons {
+        /// Length of the list.
+        n_polygons: usize,
+    },
+}
+
+impl Rle {
+    /// Makes a mask of runs in column-major order, outside first.
+    ///
+    /// # Errors
+    /// [`RleError::Size`] if pixels cannot be counted in 32 bits; [`RleError::Sum`] unless the runs fill
+    /// the image exactly.
+    pub fn from_counts(width_px: u32, height_px: u32, counts: Vec<u32>) -> Result<Self, RleError> {
+        if width_px.max(height_px) > u32::from(u16::MAX) {
+            return Err(RleError::Size { width_px, height_px });
+        }
+        let expected = u64::from(width_px) * u64::from(height_px);
+        // Fewer than 2^32 runs of 32 bits cannot overflow 64 bits.
+        let found = counts.iter().map(|count| u64::from(*count)).sum();
+        if found == expected {
+            Ok(Self { width_px, height_px, counts })
+        } else {
+            Err(RleError::Sum { expected, found })
+        }
+    }
+
+    /// Decodes COCO's compact text.
+    ///
+    /// # Errors
+    /// [`RleError`] if the text is no encoding or does not fill the image exactly.
+    pub fn from_text(width_px: u32, height_px: u32, text: &str) -> Result<Self, RleError> {
+        let mut counts: Vec<u32> = Vec::new();
+        let mut bytes = text.bytes().enumerate();
+        while let Some((start, first)) = bytes.next() {
+            let mut value = 0_i64;
+            let mut digit = (start, first);
+            for position in 0.. {
+                let (offset_bytes, byte) = digit;
+                if position == MAX_DIGITS || !(48..48 + 64).contains(&byte) {
+                    return Err(RleError::Digit { offset_bytes });
+                }
+                let bits = i64::from(byte - 48);
+                value |= (bits & 0x1F) << (5 * position);
+                if bits & 0x20 == 0 {
+                    if bits & 0x10 != 0 {
+                        value |= -1 << (5 * (position + 1));
+                    }
+                    break;
+                }
+                digit = bytes.next().ok_or(RleError::Digit { offset_bytes })?;
+            }
+            let index = counts.len();
+            let base = if index > 2 { i64::from(counts[index - 2]) } else { 0 };
+            counts.push(u32::try_from(base + value).map_err(|_| RleError::Run { index })?);
+        }
+        Self::from_counts(width_px, height_px, counts)
+    }
+
+    /// Encodes as COCO's compact text.
+    pub fn to_text(&self) -> String {
+        let mut text = String::new();
+        for (index, count) in self.counts.iter().enumerate() {
+            let base = if index > 2 { i64::from(self.counts[index - 2]) } else { 0 };
+            let mut value = i64::from(*count) - base;
+            loop {
+                let digit = (value & 0x1F) as u8;
+                value >>= 5;
+                let sign = if digit & 0x10 == 0 { 0 } else { -1 };
+                if value == sign {
+                    text.push(char::from(48 + digit));
+                    break;
+                }
+                text.push(char::from(48 + (digit | 0x20)));
+            }
+        }
+        text
+    }
+
+    /// Encodes a mask of an image of the given size; what its box holds outside is ignored.
+    pub fn from_mask(mask: &Mask, width_px: u32, height_px: u32) -> Self {
+        let mut counts = Vec::new();
+        let (mut run, mut inside) = (0_u32, false);
+        for x in 0..width_px {
+            for y in 0..height_px {
+                if mask.contains(x, y) != inside {
+                    counts.push(std::mem::take(&mut run));
+                    inside = !inside;
+                }
+                run += 1;
+            }
+        }
+        counts.push(run);
+        Self { width_px, height_px, counts }
+    }
+
+    /// Returns the image's width and height, pixels.
+    pub fn size_px(&self) -> [u32; 2] {
+        [self.width_px, self.height_px]
+    }
+
+    /// Returns the runs inside the mask: first pixel, column-major, and length.
+    fn runs_inside(&self) -> impl Iterator<Item = (u64, u64)> {
+        let mut position = 0;
+        self.counts.iter().enumerate().filter_map(move |(index, count)| {
+            let start = position;
+            position += u64::from(*count);
+            (index % 2 == 1 && *count > 0).then_some((start, u64::from(*count)))
+        })
+    }
+
+    /// Returns the tight box around the mask; `None` if no pixel is inside.
+    pub fn box_px(&self) -> Option<BoxPx> {
+        let height = u64::from(self.height_px);
+        let mut box_px = BoxPx { x0: u32::MAX, y0: u32::MAX, x1: 0, y1: 0 };
+        for (start, len) in self.runs_inside() {
+            let last = start + len - 1;
+            box_px.x0 = box_px.x0.min((start / height) as u32);
+            box_px.x1 = box_px.x1.max((last / height) as u32 + 1);
+            if start / height == last / height {
+                box_px.y0 = box_px.y0.min((start % height) as u32);
+                box_px.y1 = box_px.y1.max((last % height) as u32 + 1);
+            } else {
+                // A run over the foot of a column holds its last row and the next one's first.
+                (box_px.y0, box_px.y1) = (0, self.height_px);
+            }
+        }
+        (box_px.x1 > 0).then_some(box_px)
+    }
+
+    /// Decodes to a mask of level 0; `None` if no pixel is inside.
+    ///
+    /// The memory is that of the mask's box, which [`Rle::box_px`] tells beforehand.
+    pub fn to_mask(&self) -> Option<Mask> {
+        let box_px = self.box_px()?;
+        let width = box_px.width_px() as usize;
+        let mut inside = vec![false; width * box_px.height_px() as usize];
+        let mut area_px = 0;
+        for (start, len) in self.runs_inside() {
+            for pixel in start..start + len {
+                let x = (pixel / u64::from(self.height_px)) as u32 - box_px.x0;
+                let y = (pixel % u64::from(self.height_px)) as u32 - box_px.y0;
+                inside[y as usize * width + x as usize] = true;
+            }
+            area_px += len as u32;
+        }
+        Some(Mask { box_px, inside, area_px, level: 0 })
+    }
+}
