@@ -1,0 +1,253 @@
+//! Photos: sizes, undistortion, geo-reference.
+
+mod common;
+
+use std::path::Path;
+
+use common::shared;
+use glam::DAffine3;
+use image::{Rgb, RgbImage};
+use slag_common::{Distortion, Intrinsics, View, poses};
+use slag_encoder::ingest::{
+    GeoError, IngestError, Undistorter, load_image, missing_images, read_geo_reference,
+};
+
+fn camera(distortion: Distortion) -> Intrinsics {
+    Intrinsics {
+        width_px: 160,
+        height_px: 120,
+        focal_x_px: 100.0,
+        focal_y_px: 105.0,
+        centre_x_px: 82.0,
+        centre_y_px: 57.0,
+        distortion,
+    }
+}
+
+fn view(image_path: &Path, intrinsics: Intrinsics) -> View {
+    View {
+        name: "a.png".to_owned(),
+        image_path: image_path.to_owned(),
+        intrinsics,
+        camera_from_world: DAffine3::IDENTITY,
+    }
+}
+
+/// A smooth pattern of the ideal image, at a position in pixels.
+fn pattern([u, v]: [f64; 2]) -> [f64; 3] {
+    [128.0 + 100.0 * (u / 9.0).sin(), 128.0 + 100.0 * (v / 11.0).cos(), 128.0 + 0.5 * (u - v)]
+}
+
+/// Finds the ideal point of a distorted one by Newton's method with a numeric derivative: the
+/// oracle of the tests below, as the code itself only ever goes the other way.
+fn invert(distortion: Distortion, [x, y]: [f64; 2]) -> [f64; 2] {
+    let mut ideal = [x, y];
+    for _ in 0..50 {
+        let h = 1e-6;
+        let at = distortion.distort(ideal);
+        let [dx, dy] = [[h, 0.0], [0.0, h]].map(|[a, b]| {
+            let moved = distortion.distort([ideal[0] + a, ideal[1] + b]);
+            [(moved[0] - at[0]) / h, (moved[1] - at[1]) / h]
+        });
+        let (ex, ey) = (x - at[0], y - at[1]);
+        let determinant = dx[0] * dy[1] - dy[0] * dx[1];
+        ideal[0] += (ex * dy[1] - ey * dy[0]) / determinant;
+        ideal[1] += (ey * dx[0] - ex * dx[1]) / determinant;
+    }
+    ideal
+}
+
+/// Photographs the pattern through a lens.
+fn photograph(camera: &Intrinsics) -> RgbImage {
+    RgbImage::from_fn(camera.width_px, camera.height_px, |x, y| {
+        let distorted = camera.distorted_from_pixel([f64::from(x) + 0.5, f64::from(y) + 0.5]);
+        let ideal = invert(camera.distortion, distorted);
+        Rgb(pattern(camera.pixel_from_distorted(ideal)).map(|c| c.round().clamp(0.0, 255.0) as u8))
+    })
+}
+
+const LENSES: [Distortion; 3] = [
+    Distortion::Brown { k: [-0.12, 0.02, 0.0], p: [0.003, -0.002] },
+    Distortion::Brown { k: [0.15, 0.03, 0.01], p: [0.0, 0.0] },
+    Distortion::Fisheye { k: [0.02, -0.01, 0.003, 0.0] },
+];
+
+#[test]
+fn a_photo_through_a_lens_becomes_the_ideal_one() {
+    let dir = tempfile::tempdir().unwrap();
+    for distortion in LENSES {
+        let camera = camera(distortion);
+        let path = dir.path().join("a.png");
+        photograph(&camera).save(&path).unwrap();
+        let loaded = load_image(&view(&path, camera)).unwrap();
+        assert_eq!(loaded.view.intrinsics, camera.without_distortion());
+        let valid = loaded.valid.as_ref().unwrap();
+        let (mut n_valid, mut largest, mut displaced) = (0, 0.0_f64, 0.0_f64);
+        for (x, y, pixel) in loaded.image.enumerate_pixels() {
+            let ideal_px = [f64::from(x) + 0.5, f64::from(y) + 0.5];
+            let at = camera.pixel_from_distorted(camera.distort(camera.distorted_from_pixel(ideal_px)));
+            let inside = (0.0..160.0).contains(&at[0]) && (0.0..120.0).contains(&at[1]);
+            assert_eq!(valid[(y * 160 + x) as usize], inside, "{distortion:?} {x} {y}");
+            if !inside {
+                assert_eq!(pixel.0, [0; 3]);
+                continue;
+            }
+            displaced = displaced.max((at[0] - ideal_px[0]).hypot(at[1] - ideal_px[1]));
+            // The outermost half pixel repeats the edge.
+            if (0.5..159.5).contains(&at[0]) && (0.5..119.5).contains(&at[1]) {
+                n_valid += 1;
+                let expected = pattern(ideal_px);
+                (0..3).for_each(|c| largest = largest.max((expected[c] - f64::from(pixel.0[c])).abs()));
+            }
+        }
+        // Twice rounded to 8 bits, and a chord of the pattern's curvature 100 / 81 over a pixel that
+        // the lens may stretch (1.4 times at most here).
+        assert!(largest < 1.3, "{distortion:?}: off by {largest}");
+        assert!(
+            displaced > 3.0 && n_valid > 14_000,
+            "{distortion:?}: too little to see, {displaced} {n_valid}"
+        );
+    }
+}
+
+#[test]
+fn labels_are_those_of_the_nearest_pixel() {
+    for distortion in LENSES {
+        let camera = camera(distortion);
+        let labels: Vec<u32> = (0..160 * 120).collect();
+        let ideal = Undistorter::new(camera).labels(&labels, u32::MAX);
+        let (mut n, mut sum_px) = (0.0, [0.0; 2]);
+        for (label, at) in ideal.iter().zip(0_u32..).filter(|(label, _)| **label != u32::MAX) {
+            let found = [*label % 160, *label / 160].map(|v| f64::from(v) + 0.5);
+            let ideal_px =
+                camera.pixel_from_distorted(invert(distortion, camera.distorted_from_pixel(found)));
+            let expected_px = [at % 160, at / 160].map(|v| f64::from(v) + 0.5);
+            let off_px = [0, 1].map(|axis| ideal_px[axis] - expected_px[axis]);
+            // Half a pixel each way, which the fisheye's corners stretch to nearly twice.
+            assert!(off_px.iter().all(|off| off.abs() < 1.0), "{distortion:?} {at}: {off_px:?}");
+            n += 1.0;
+            sum_px = [sum_px[0] + off_px[0], sum_px[1] + off_px[1]];
+        }
+        assert!(
+            sum_px.iter().all(|sum| (sum / n).abs() < 0.02),
+            "{distortion:?}: on average {sum_px:?} / {n}"
+        );
+    }
+}
+
+/// Beyond the fold of a strong barrel lens there is nothing to see, though the formula leads back in.
+#[test]
+fn folded_pixels_are_not_valid() {
+    let camera = Intrinsics {
+        focal_x_px: 40.0,
+        focal_y_px: 40.0,
+        ..camera(Distortion::Brown { k: [-0.3, 0.0, 0.0], p: [0.0; 2] })
+    };
+    let (_, valid) = Undistorter::new(camera).image(&RgbImage::from_pixel(160, 120, Rgb([9; 3])));
+    let fold = (1.0_f64 / 0.9).sqrt();
+    let radius = |at: usize| {
+        let [x, y] = camera.distorted_from_pixel([(at % 160) as f64 + 0.5, (at / 160) as f64 + 0.5]);
+        x.hypot(y)
+    };
+    assert!(valid.iter().enumerate().all(|(at, valid)| !valid || radius(at) <= fold));
+    let folded_back_inside = (0..valid.len()).filter(|at| (fold..1.7).contains(&radius(*at))).count();
+    assert!(folded_back_inside > 1_000);
+}
+
+#[test]
+fn a_pinhole_passes_bit_for_bit() {
+    let Some(scene) = shared("scenes/house_a") else { return };
+    let set = poses::read(&scene, None).unwrap();
+    let loaded = load_image(&set.views[0]).unwrap();
+    assert_eq!(loaded.view, set.views[0]);
+    assert!(loaded.undistorter.is_none() && loaded.valid.is_none());
+    assert_eq!(loaded.image, image::open(&set.views[0].image_path).unwrap().into_rgb8());
+}
+
+#[test]
+fn sizes_that_are_a_scale_bring_the_camera_along() {
+    let dir = tempfile::tempdir().unwrap();
+    let odd = Intrinsics { width_px: 161, height_px: 121, ..camera(Distortion::None) };
+    let load = |width: u32, height: u32, ending: &str, camera: Intrinsics| {
+        let path = dir.path().join("a").with_extension(ending);
+        RgbImage::new(width, height).save(&path).unwrap();
+        load_image(&view(&path, camera))
+    };
+    for (width, height, ending) in [(80, 60, "png"), (40, 30, "webp"), (320, 240, "jpg"), (120, 90, "png")] {
+        let scaled = load(width, height, ending, camera(Distortion::None)).unwrap().view.intrinsics;
+        let scale = f64::from(width) / 160.0;
+        assert_eq!((scaled.width_px, scaled.height_px), (width, height));
+        assert_eq!([scaled.focal_x_px, scaled.focal_y_px], [100.0 * scale, 105.0 * scale]);
+        assert_eq!([scaled.centre_x_px, scaled.centre_y_px], [82.0 * scale, 57.0 * scale]);
+    }
+    assert!(load(80, 60, "png", odd).is_ok(), "halved and rounded down");
+    assert!(load(81, 61, "png", odd).is_ok(), "halved and rounded up");
+    for (width, height) in [(160, 121), (159, 120), (120, 160), (81, 60), (80, 59)] {
+        match load(width, height, "png", camera(Distortion::None)) {
+            Err(IngestError::Size { found_px, expected_px, .. }) => {
+                assert_eq!((found_px, expected_px), ([width, height], [160, 120]));
+            }
+            other => panic!("{width} x {height}: {:?}", other.map(|loaded| loaded.view)),
+        }
+    }
+}
+
+/// An EXIF orientation must not turn the pixels: COLMAP reads them as they are stored, too.
+#[test]
+fn exif_orientation_is_ignored() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.jpg");
+    RgbImage::from_fn(160, 120, |x, _| Rgb([x as u8; 3])).save(&path).unwrap();
+    let plain = load_image(&view(&path, camera(Distortion::None))).unwrap().image;
+    let jpeg = fs_err::read(&path).unwrap();
+    // APP1: big-endian TIFF with one entry, tag 0x0112 (orientation), a 16-bit 6 (rotated by 90 degrees).
+    let exif = b"\xFF\xE1\x00\x22Exif\0\0MM\0\x2A\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0";
+    fs_err::write(&path, [&jpeg[..2], exif, &jpeg[2..]].concat()).unwrap();
+    assert_eq!(load_image(&view(&path, camera(Distortion::None))).unwrap().image, plain);
+}
+
+#[test]
+fn absent_and_damaged_images_are_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.png");
+    let absent = view(&dir.path().join("b.png"), camera(Distortion::None));
+    let damaged = view(&path, camera(Distortion::None));
+    RgbImage::from_fn(160, 120, |x, y| Rgb([(x * y) as u8, x as u8, y as u8])).save(&path).unwrap();
+    let bytes = fs_err::read(&path).unwrap();
+    fs_err::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+    assert!(matches!(load_image(&absent), Err(IngestError::Io(e)) if e.to_string().contains("b.png")));
+    assert!(matches!(load_image(&damaged), Err(IngestError::Decode { path, .. }) if path.ends_with("a.png")));
+    let views = [damaged, absent.clone()];
+    assert_eq!(missing_images(&views), [&absent]);
+}
+
+#[test]
+fn geo_reference() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("geo.json");
+    let read = |json: &str| {
+        fs_err::write(&path, json).unwrap();
+        read_geo_reference(&path)
+    };
+    let origin =
+        read(r#"{"origin": {"lat": -90, "lon": 180, "alt": -3.5, "x": 1}, "more": []}"#).unwrap().origin;
+    assert_eq!((origin.latitude_deg, origin.longitude_deg, origin.height_m), (-90.0, 180.0, -3.5));
+    for (json, name) in [
+        (r#"{"origin": {"lat": 91, "lon": 0, "alt": 0}}"#, "lat"),
+        (r#"{"origin": {"lat": 0, "lon": -180.01, "alt": 0}}"#, "lon"),
+        (r#"{"origin": {"lat": 0, "lon": 0, "alt": 1e6}}"#, "alt"),
+    ] {
+        assert!(matches!(read(json), Err(GeoError::Range { field, .. }) if field == name), "{json}");
+    }
+    for json in
+        ["", "[]", r#"{"origin": {"lat": 0, "lon": 0}}"#, r#"{"origin": {"lat": NaN, "lon": 0, "alt": 0}}"#]
+    {
+        assert!(matches!(read(json), Err(GeoError::Json { .. })), "{json}");
+    }
+    let Some(brighton) = shared("scenes/brighton/geo.json") else { return };
+    let origin = read_geo_reference(&brighton).unwrap().origin;
+    assert_eq!(
+        (origin.latitude_deg, origin.longitude_deg, origin.height_m),
+        (46.842657, -91.994008, 158.509)
+    );
+}

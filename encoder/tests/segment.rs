@@ -1,0 +1,356 @@
+//! Masks: run lengths, files that users give, the partition into regions.
+
+mod common;
+
+use std::path::Path;
+
+use common::{Random, shared};
+use glam::DAffine3;
+use image::{GrayImage, ImageBuffer, Luma, RgbImage};
+use proptest::prelude::*;
+use slag_common::{Distortion, Intrinsics, View, poses};
+use slag_encoder::ingest::{Undistorter, load_image};
+use slag_encoder::segment::{
+    BoxPx, GivenMasks, Mask, NO_REGION, Rle, RleError, SegmentError, SegmentInput, Segmenter, partition,
+};
+
+/// Makes a mask of a membership function; `None` if no pixel is inside.
+fn mask(width: u32, height: u32, inside: impl Fn(u32, u32) -> bool) -> Option<Mask> {
+    let pixels: Vec<(u32, u32)> =
+        (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).filter(|(x, y)| inside(*x, *y)).collect();
+    let box_px = BoxPx {
+        x0: pixels.iter().map(|p| p.0).min()?,
+        y0: pixels.iter().map(|p| p.1).min()?,
+        x1: pixels.iter().map(|p| p.0).max()? + 1,
+        y1: pixels.iter().map(|p| p.1).max()? + 1,
+    };
+    let inside = (box_px.y0..box_px.y1).flat_map(|y| (box_px.x0..box_px.x1).map(move |x| (x, y)));
+    let inside = inside.map(|(x, y)| pixels.binary_search_by_key(&(y, x), |p| (p.1, p.0)).is_ok()).collect();
+    Some(Mask { box_px, inside, area_px: pixels.len() as u32, level: 0 })
+}
+
+/// Oracle: pycocotools 2.0 (`mask.encode` of the same arrays), recorded.
+#[test]
+fn run_lengths_are_cocos() {
+    let disc = mask(40, 30, |x, y| x.abs_diff(20).pow(2) + y.abs_diff(14).pow(2) <= 100);
+    let foot = mask(40, 30, |x, y| (x, y) == (3, 29) || (x, y) == (4, 0));
+    let full = mask(40, 30, |_, _| true);
+    let rects = mask(400, 300, |x, y| {
+        ((150..153).contains(&x) && y >= 6)
+            || ((300..304).contains(&x) && (100..290).contains(&y))
+            || (x == 399 && y < 2)
+    });
+    for (expected, size, text) in [
+        (disc, (40, 30), "j91i08J4M2N2O0O2O00000O20N1000001N101N2N3L6HT8"),
+        (full, (40, 30), "0`U1"),
+        (None, (40, 30), "`U1"),
+        (foot, (40, 30), "g32gQ1"),
+        (rects, (400, 300), "^n[1V96000RU[1hLVndN00000`gk0TJ\\^TO"),
+    ] {
+        let rle = Rle::from_text(size.0, size.1, text).unwrap();
+        assert_eq!(rle.to_text(), text);
+        assert_eq!(rle.to_mask(), expected, "{text}");
+        if let Some(mask) = expected {
+            assert_eq!(rle.box_px(), Some(mask.box_px));
+            assert_eq!(Rle::from_mask(&mask, size.0, size.1), rle);
+        }
+    }
+}
+
+#[test]
+fn bad_run_lengths_are_refused() {
+    assert_eq!(Rle::from_counts(4, 3, vec![6, 5]), Err(RleError::Sum { expected: 12, found: 11 }));
+    assert_eq!(Rle::from_text(40, 30, "`U1 "), Err(RleError::Digit { offset_bytes: 3 }));
+    assert_eq!(Rle::from_text(40, 30, "`"), Err(RleError::Digit { offset_bytes: 0 }));
+    assert_eq!(Rle::from_text(40, 30, "oooooooo0"), Err(RleError::Digit { offset_bytes: 7 }));
+    assert_eq!(Rle::from_text(40, 30, "O"), Err(RleError::Run { index: 0 }));
+    assert!(matches!(Rle::from_counts(65_536, 1, vec![65_536]), Err(RleError::Size { .. })));
+    assert!(Rle::from_counts(0, 0, vec![]).unwrap().to_mask().is_none());
+}
+
+fn view(name: &str, width_px: u32, height_px: u32) -> View {
+    let (focal_x_px, focal_y_px) = (50.0, 50.0);
+    let (centre_x_px, centre_y_px) = (f64::from(width_px) / 2.0, f64::from(height_px) / 2.0);
+    let distortion = Distortion::None;
+    let intrinsics =
+        Intrinsics { width_px, height_px, focal_x_px, focal_y_px, centre_x_px, centre_y_px, distortion };
+    View { name: name.into(), image_path: "none".into(), intrinsics, camera_from_world: DAffine3::IDENTITY }
+}
+
+/// Loads what a folder of masks gives for image `left/a.jpg` of 8 x 6 pixels.
+fn load(
+    dir: &Path,
+    ignore_ids: &[u32],
+    undistorter: Option<&Undistorter>,
+) -> Result<Option<Vec<Mask>>, SegmentError> {
+    let (view, image) = (view("left/a.jpg", 8, 6), RgbImage::new(8, 6));
+    let input = SegmentInput { view: &view, image: &image, valid: None, undistorter, depth: None };
+    let given = GivenMasks::open(dir, ignore_ids.to_vec()).unwrap();
+    let loaded = given.load(&input);
+    if let Ok(masks) = &loaded {
+        assert_eq!(given.covers(&view), masks.is_some());
+        assert_eq!(given.segment(&input).unwrap(), masks.clone().unwrap_or_default());
+    }
+    loaded
+}
+
+fn folder() -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    fs_err::create_dir(dir.path().join("left")).unwrap();
+    dir
+}
+
+fn write_png(path: &Path, color: png::ColorType, depth: png::BitDepth, rows: &[u8]) {
+    let mut encoder = png::Encoder::new(fs_err::File::create(path).unwrap(), 8, 6);
+    encoder.set_color(color);
+    encoder.set_depth(depth);
+    encoder.set_palette(vec![7; 3 * 16]);
+    encoder.write_header().unwrap().write_image_data(rows).unwrap();
+}
+
+/// The ids 0, 3 and 255 on an 8 x 6 image, in every kind of PNG that can hold them or their like.
+#[test]
+fn id_images_of_every_depth() {
+    let dir = folder();
+    let id_at = |x: u32, y: u32| if x == 7 { 15 } else { 3 * u32::from(x >= 2 && y >= 1 && x < 6) };
+    let expected = [mask(8, 6, |x, y| id_at(x, y) == 3).unwrap(), mask(8, 6, |x, _| x == 7).unwrap()];
+    let pixels = || (0..6).flat_map(|y| (0..8).map(move |x| (x, y)));
+    let eight: Vec<u8> = pixels().map(|(x, y)| id_at(x, y) as u8).collect();
+    let four: Vec<u8> = eight.chunks(2).map(|pair| pair[0] << 4 | pair[1]).collect();
+    let sixteen: Vec<u8> = pixels().flat_map(|(x, y)| (id_at(x, y) as u16 * 1_000).to_be_bytes()).collect();
+    let (gray, palette) = (png::ColorType::Grayscale, png::ColorType::Indexed);
+    for (name, color, depth, rows) in [
+        ("left/a.png", gray, png::BitDepth::Eight, &eight),
+        ("left/a.png", gray, png::BitDepth::Four, &four),
+        ("left/a.jpg.png", gray, png::BitDepth::Sixteen, &sixteen),
+        ("left/a.png", palette, png::BitDepth::Eight, &eight),
+        ("left/a.jpg.png", palette, png::BitDepth::Four, &four),
+    ] {
+        let path = dir.path().join(name);
+        write_png(&path, color, depth, rows);
+        assert_eq!(load(dir.path(), &[], None).unwrap().unwrap(), expected, "{color:?} {depth:?}");
+        let factor = if depth == png::BitDepth::Sixteen { 1_000 } else { 1 };
+        assert_eq!(load(dir.path(), &[15 * factor], None).unwrap().unwrap(), expected[..1]);
+        fs_err::remove_file(path).unwrap();
+    }
+    assert_eq!(load(dir.path(), &[], None).unwrap(), None);
+    // One bit: the only id is 1.
+    write_png(&dir.path().join("left/a.png"), gray, png::BitDepth::One, &[0b0011_1100; 6]);
+    let stripe = mask(8, 6, |x, _| (2..6).contains(&x)).unwrap();
+    assert_eq!(load(dir.path(), &[], None).unwrap().unwrap(), [stripe]);
+}
+
+#[test]
+fn id_images_of_the_wrong_kind_or_size_are_refused() {
+    let dir = folder();
+    let path = dir.path().join("left/a.png");
+    RgbImage::new(8, 6).save(&path).unwrap();
+    assert!(matches!(load(dir.path(), &[], None), Err(SegmentError::NotIds { found: "RGB", .. })));
+    GrayImage::new(6, 8).save(&path).unwrap();
+    let size = load(dir.path(), &[], None).unwrap_err();
+    assert!(matches!(size, SegmentError::Size { found_px: [6, 8], expected_px: [8, 6], .. }), "{size}");
+}
+
+#[test]
+fn run_length_files_of_every_form() {
+    let dir = folder();
+    let path = dir.path().join("left/a.json");
+    let [a, b] = [mask(8, 6, |x, _| x < 5).unwrap(), mask(8, 6, |x, y| x > 2 && y > 1).unwrap()];
+    let text = Rle::from_mask(&a, 8, 6).to_text();
+    // Columns of 6: three outside, then each two outside and four inside.
+    let runs = [vec![18 + 2], vec![4, 2, 4, 2, 4, 2, 4, 2, 4]].concat();
+    let annotations = serde_json::json!([
+        {"segmentation": {"size": [6, 8], "counts": text}, "area": 30, "predicted_iou": 0.9, "image_id": 9},
+        {"segmentation": {"counts": runs, "size": [6, 8]}, "bbox": [3, 2, 5, 4], "image_id": 9},
+        {"segmentation": {"size": [6, 8], "counts": [48]}, "image_id": 9},
+    ]);
+    fs_err::write(&path, annotations.to_string()).unwrap();
+    assert_eq!(load(dir.path(), &[], None).unwrap().unwrap(), [a.clone(), b.clone()]);
+    let object = serde_json::json!({"image": {"file_name": "x"}, "annotations": annotations});
+    fs_err::write(&path, object.to_string()).unwrap();
+    assert_eq!(load(dir.path(), &[], None).unwrap().unwrap(), [a.clone(), b.clone()]);
+
+    let data_set = serde_json::json!({"images": [{"id": 8, "file_name": "b.jpg"},
+        {"id": 9, "file_name": "left/a.jpg", "width": 8}], "annotations": annotations});
+    let whole = dir.path().join("coco.json");
+    fs_err::write(&whole, data_set.to_string()).unwrap();
+    assert_eq!(load(&whole, &[], None).unwrap().unwrap(), [a, b]);
+    let given = GivenMasks::open(&whole, Vec::new()).unwrap();
+    assert!(given.covers(&view("b.jpg", 8, 6)) && !given.covers(&view("c.jpg", 8, 6)));
+
+    for (json, expected) in [
+        (r#"[{"segmentation": [[1, 2, 3, 4, 5, 6]]}]"#, "polygons"),
+        (r#"[{"segmentation": {"size": [6, 8], "counts": [47]}}]"#, "mask 0: runs add up to 47"),
+        (r#"[{"segmentation": {"size": [8, 6], "counts": [48]}}]"#, "masks of 6 x 8 px"),
+        (r#"[{"segmentation": 3}]"#, "SAM's list"),
+        ("", "SAM's list"),
+    ] {
+        fs_err::write(&path, json).unwrap();
+        let error = load(dir.path(), &[], None).unwrap_err().to_string();
+        assert!(error.contains(expected) && error.contains("a.json"), "{error}");
+    }
+}
+
+/// Both kinds of mask file go through the lens exactly as a label image does, pixel by pixel.
+#[test]
+fn masks_are_undistorted_like_the_photo() {
+    let dir = folder();
+    let mut camera = view("a", 8, 6).intrinsics;
+    (camera.focal_x_px, camera.focal_y_px) = (5.0, 5.0);
+    camera.distortion = Distortion::Brown { k: [0.5, 0.0, 0.0], p: [0.02, 0.0] };
+    let undistorter = Undistorter::new(camera);
+    let masks: Vec<Mask> = (0..3).filter_map(|i| mask(8, 6, |x, y| (x + y * i) % 4 > i || y == 5)).collect();
+    let annotations: Vec<_> = masks
+        .iter()
+        .map(|m| serde_json::json!({"segmentation": {"size": [6, 8], "counts": Rle::from_mask(m, 8, 6).to_text()}}))
+        .collect();
+    fs_err::write(dir.path().join("left/a.json"), serde_json::json!(annotations).to_string()).unwrap();
+    let through_lens = |m: &Mask| {
+        let labels: Vec<u32> = (0..48).map(|at| u32::from(m.contains(at % 8, at / 8))).collect();
+        let ideal = undistorter.labels(&labels, 0);
+        mask(8, 6, |x, y| ideal[(y * 8 + x) as usize] == 1).unwrap()
+    };
+    let expected: Vec<Mask> = masks.iter().map(through_lens).collect();
+    assert_ne!(expected, masks, "the lens must move something");
+    assert_eq!(load(dir.path(), &[], Some(&undistorter)).unwrap().unwrap(), expected);
+
+    let ids: Vec<u8> = (0..48).map(|at| u8::from(masks[0].contains(at % 8, at / 8))).collect();
+    GrayImage::from_raw(8, 6, ids).unwrap().save(dir.path().join("left/a.png")).unwrap();
+    assert_eq!(load(dir.path(), &[], Some(&undistorter)).unwrap().unwrap(), expected[..1]);
+}
+
+/// Oracle: the number of pixels of each instance over all views, counted by the scene's generator.
+#[test]
+fn house_masks_have_the_pixels_that_the_scene_states() {
+    let Some(scene) = shared("scenes/house_a") else { return };
+    let stated: serde_json::Value =
+        serde_json::from_slice(&fs_err::read(scene.join("gt/instances.json")).unwrap()).unwrap();
+    let mut stated_px = std::collections::BTreeMap::new();
+    for group in ["background", "instances"] {
+        for instance in stated[group].as_array().unwrap() {
+            stated_px
+                .insert(instance["id"].as_u64().unwrap() as u32, instance["train_pixels"].as_u64().unwrap());
+        }
+    }
+    let given = GivenMasks::open(&scene.join("gt/masks"), vec![255]).unwrap();
+    let mut found_px = std::collections::BTreeMap::new();
+    let image = RgbImage::new(640, 480);
+    for view in &poses::read(&scene, None).unwrap().views {
+        let input = SegmentInput { view, image: &image, valid: None, undistorter: None, depth: None };
+        let png =
+            image::open(scene.join("gt/masks").join(&view.name).with_extension("png")).unwrap().into_luma8();
+        for mask in given.load(&input).unwrap().unwrap() {
+            // The id, which a mask does not carry, is that of any of its pixels.
+            let first = mask.inside.iter().position(|inside| *inside).unwrap() as u32;
+            let (x, y) = (first % mask.box_px.width_px(), first / mask.box_px.width_px());
+            let id = u32::from(png.get_pixel(mask.box_px.x0 + x, mask.box_px.y0 + y).0[0]);
+            *found_px.entry(id).or_insert(0) += u64::from(mask.area_px);
+        }
+    }
+    stated_px.retain(|_, pixels| *pixels > 0);
+    assert_eq!(found_px, stated_px);
+    assert_eq!(found_px.values().sum::<u64>(), 96 * 640 * 480);
+}
+
+/// The set of masks of every raster pixel, one by one.
+fn sets_of_pixels(
+    masks: &[Mask],
+    size: (u32, u32),
+    target: (u32, u32),
+    valid: Option<&[bool]>,
+) -> Vec<Vec<u32>> {
+    let nearest =
+        |i: u32, size: u32, target: u32| ((f64::from(i) + 0.5) * f64::from(size) / f64::from(target)) as u32;
+    let pixels = (0..target.1).flat_map(|y| (0..target.0).map(move |x| (x, y)));
+    pixels
+        .map(|(x, y)| (nearest(x, size.0, target.0), nearest(y, size.1, target.1)))
+        .map(|(x, y)| match valid {
+            Some(valid) if !valid[(y * size.0 + x) as usize] => Vec::new(),
+            _ => (0_u32..).zip(masks).filter(|(_, mask)| mask.contains(x, y)).map(|(i, _)| i).collect(),
+        })
+        .collect()
+}
+
+fn check_partition(masks: &[Mask], size: (u32, u32), target: (u32, u32), valid: Option<&[bool]>) {
+    let (map, masks_of_region) = partition(masks, size.0, size.1, target.0, target.1, valid);
+    assert_eq!((map.width_px, map.height_px), target);
+    assert_eq!(map.n_regions as usize, masks_of_region.len());
+    let mut next = 0;
+    let sets = sets_of_pixels(masks, size, target, valid);
+    assert_eq!(map.region_of_pixel.len(), sets.len());
+    for (region, set) in map.region_of_pixel.iter().zip(&sets) {
+        if *region == NO_REGION {
+            assert!(set.is_empty());
+            continue;
+        }
+        assert_eq!(&masks_of_region[*region as usize], set);
+        assert!(!set.is_empty() && *region <= next, "regions are numbered in scan order");
+        next = next.max(region + 1);
+    }
+    assert_eq!(next, map.n_regions);
+    // No two regions with one set: together with the above, regions are exactly the distinct sets.
+    let distinct: std::collections::BTreeSet<_> = masks_of_region.iter().collect();
+    assert_eq!(distinct.len(), masks_of_region.len());
+}
+
+fn random_mask(random: &mut Random, width: u32, height: u32) -> Mask {
+    let mut below = |n: u32| random.below(n as usize) as u32;
+    let (x, y, w, h, holes) =
+        (below(width), below(height), 1 + below(width), 1 + below(height), 1 + below(5));
+    mask(width, height, |px, py| {
+        let in_box = px >= x && py >= y && px < x + w && py < y + h;
+        (px, py) == (x, y) || in_box && (px * 3 + py * 5) % (holes + 1) != 0
+    })
+    .unwrap()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(60))]
+    #[test]
+    fn regions_are_the_distinct_sets_of_masks(
+        seed: u64, n in 0_usize..12, size in (1_u32..40, 1_u32..30), target in (1_u32..60, 1_u32..60), holes: bool,
+    ) {
+        let mut random = Random(seed);
+        let mut masks: Vec<Mask> = (0..n).map(|_| random_mask(&mut random, size.0, size.1)).collect();
+        // Identical masks, and one of a single pixel.
+        masks.extend(masks.first().cloned());
+        masks.extend(mask(size.0, size.1, |x, y| (x, y) == (size.0 / 2, size.1 / 2)).filter(|_| n > 0));
+        let valid: Vec<bool> = (0..size.0 * size.1).map(|_| random.below(5) > 0).collect();
+        check_partition(&masks, size, target, holes.then_some(&valid[..]));
+    }
+}
+
+#[test]
+fn three_hundred_overlapping_masks() {
+    let mut random = Random(3);
+    let masks: Vec<Mask> = (0..300).map(|_| random_mask(&mut random, 64, 48)).collect();
+    check_partition(&masks, (64, 48), (64, 48), None);
+    check_partition(&masks, (64, 48), (31, 100), None);
+    check_partition(&[], (64, 48), (64, 48), None);
+    assert_eq!(partition(&masks, 64, 48, 64, 48, Some(&[false; 64 * 48])).0.n_regions, 0);
+}
+
+/// Regions of a real photo's masks, written as 16-bit ids, are read back as the same masks.
+#[test]
+fn a_loaded_photo_makes_the_input() {
+    let Some(scene) = shared("scenes/house_a") else { return };
+    let loaded = load_image(&poses::read(&scene, None).unwrap().views[5]).unwrap();
+    let masks = GivenMasks::open(&scene.join("gt/masks"), Vec::new()).unwrap();
+    let masks = masks.segment(&SegmentInput::new(&loaded, None)).unwrap();
+    let (map, masks_of_region) = partition(&masks, 640, 480, 640, 480, None);
+    assert_eq!(map.n_regions as usize, masks.len(), "id images do not overlap");
+    assert!(masks_of_region.iter().all(|set| set.len() == 1));
+    let wide: ImageBuffer<Luma<u16>, Vec<u16>> = ImageBuffer::from_fn(640, 480, |x, y| {
+        Luma([map.region_of_pixel[(y * 640 + x) as usize] as u16 + 300])
+    });
+    let dir = tempfile::tempdir().unwrap();
+    wide.save(dir.path().join("0005.png")).unwrap();
+    let again =
+        GivenMasks::open(dir.path(), Vec::new()).unwrap().segment(&SegmentInput::new(&loaded, None)).unwrap();
+    let by_box = |masks: Vec<Mask>| {
+        let mut masks = masks;
+        masks.sort_by_key(|m| (m.box_px.y0, m.box_px.x0, m.area_px));
+        masks
+    };
+    assert_eq!(by_box(again), by_box(masks));
+}
