@@ -1,3 +1,4 @@
 //! The robot's side of SLAG: keeps the shards around it and answers text queries offline.
 
+pub mod fetch;
 pub mod store;
