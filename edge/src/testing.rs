@@ -1,10 +1,20 @@
-//! Small real shards for the tests of this crate, with the embeddings they were made from.
+//! Small real shards and caches for the tests of this crate, and a text encoder that is all axes.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Condvar, Mutex};
 
 use glam::DVec3;
 use half::f16;
 use slag_common::container::AlignedBytes;
 use slag_common::hash::Hash32;
-use slag_common::shard::{ShardHeader, ShardLayout, ShardParts, ShardView};
+use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
+use slag_common::shard::{Profile, ShardHeader, ShardLayout, ShardParts, ShardView};
+use slag_models::{EncodeError, TextEncoder};
+
+use crate::store::{Current, CurrentCell, EdgeCache};
+use crate::text::{EncoderInfo, TextService};
 
 /// A Gaussian of a test shard.
 #[derive(Clone, Debug)]
@@ -124,4 +134,136 @@ impl Random {
 pub fn normalised(vector: Vec<f32>) -> Vec<f32> {
     let length = vector.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
     vector.into_iter().map(|v| (f64::from(v) / length) as f32).collect()
+}
+
+/// Lets threads pass once it is open.
+pub type Gate = Arc<(Mutex<bool>, Condvar)>;
+
+pub fn open_gate(gate: &Gate) {
+    *gate.0.lock().expect("no panic inside") = true;
+    gate.1.notify_all();
+}
+
+/// A text encoder whose texts are numbers of axes; `wait` waits for the gate, `panic` panics.
+pub struct Axes {
+    dim: usize,
+    gate: Gate,
+    n_encoded: Arc<AtomicUsize>,
+}
+
+impl Axes {
+    pub fn new(dim: usize) -> Self {
+        Self { dim, gate: Gate::default(), n_encoded: Arc::default() }
+    }
+
+    pub fn info(dim: usize) -> EncoderInfo {
+        let id = TestShard::new(Vec::new()).encoder_id;
+        EncoderInfo { name: "axes".into(), id, dim: dim as u32, execution_provider: "none" }
+    }
+}
+
+impl TextEncoder for Axes {
+    fn name(&self) -> &str {
+        "axes"
+    }
+
+    fn dim(&self) -> usize {
+        self.dim
+    }
+
+    fn encode(&mut self, text: &str) -> Result<Vec<f32>, EncodeError> {
+        self.n_encoded.fetch_add(1, Ordering::SeqCst);
+        let axis = match text {
+            "panic" => panic!("asked to"),
+            "wait" => {
+                let open = self.gate.0.lock().expect("no panic inside");
+                drop(self.gate.1.wait_while(open, |open| !*open).expect("no panic inside"));
+                0
+            }
+            _ => text.parse().ok().filter(|axis| *axis < self.dim).ok_or_else(|| {
+                EncodeError::UnknownPhrase { text: text.into(), n_known: self.dim, near: vec!["0".into()] }
+            })?,
+        };
+        Ok((0..self.dim).map(|i| f32::from(i == axis)).collect())
+    }
+}
+
+/// Returns a service over [`Axes`] and the count of texts it really encoded.
+pub fn axes_service(dim: usize, gate: Gate) -> (TextService, Arc<AtomicUsize>) {
+    let n_encoded: Arc<AtomicUsize> = Arc::default();
+    let axes = Axes { dim, gate, n_encoded: Arc::clone(&n_encoded) };
+    (TextService::start(Axes::info(dim), Box::new(axes)).expect("a thread"), n_encoded)
+}
+
+/// Returns the manifest of some shards, as an encoder of [`Axes`]' space would list them.
+pub fn manifest_of(shards: &[BuiltShard], generation: u64) -> Manifest {
+    let cells = shards.iter().map(|shard| {
+        let view = shard.view();
+        let record = ShardRecord {
+            hash: Hash32::of(&shard.bytes),
+            len_bytes: shard.bytes.len() as u64,
+            n_rows: view.header.n_rows,
+            score_error_bound: view.radii.iter().fold(0.0, |a: f32, b| a.max(*b)),
+            position_error: 0.01,
+        };
+        CellRecord {
+            cell_id: view.header.cell_id,
+            bounds: view.bounds(),
+            n_gaussians: view.header.n_gaussians,
+            shards: BTreeMap::from([(Profile::Compact, record)]),
+        }
+    });
+    let header = shards[0].view().header;
+    Manifest {
+        version: manifest::VERSION,
+        scene: "yard".into(),
+        generation,
+        created_unix_secs: 1_700_000_000,
+        expires_unix_secs: None,
+        metric: true,
+        geo_reference: None,
+        encoder: EncoderRecord {
+            name: "axes".into(),
+            id: Hash32(header.encoder_id),
+            dim: header.dim,
+            default_threshold: 0.5,
+        },
+        n_gaussians: shards.iter().map(|s| u64::from(s.view().header.n_gaussians)).sum(),
+        n_without_evidence: 0,
+        n_rejected: 0,
+        cells: cells.collect(),
+    }
+}
+
+/// Writes a cache as a fetch leaves it, replacing `current` last.
+pub fn write_cache(dir: &Path, shards: &[BuiltShard], generation: u64) {
+    let manifest = manifest_of(shards, generation);
+    let key = manifest::generate_key();
+    let signed = manifest.sign(&key);
+    let current = Current {
+        manifest_hash: Hash32::of(&signed),
+        key: Hash32(key.verifying_key().to_bytes()),
+        profile: Profile::Compact,
+        centre_in_world: DVec3::ZERO,
+        radius: 50.0,
+        cells: manifest
+            .cells
+            .iter()
+            .map(|cell| {
+                let record = &cell.shards[&Profile::Compact];
+                CurrentCell { cell_id: cell.cell_id, hash: record.hash, len_bytes: record.len_bytes }
+            })
+            .collect(),
+    };
+    let cache = EdgeCache::open(dir);
+    for folder in ["shards", "manifests"] {
+        fs_err::create_dir_all(dir.join(folder)).expect("a folder");
+    }
+    for shard in shards {
+        fs_err::write(cache.shard_path(Hash32::of(&shard.bytes)), &*shard.bytes).expect("a file");
+    }
+    fs_err::write(cache.manifest_path(current.manifest_hash), &signed).expect("a file");
+    let staged = dir.join("current.new");
+    fs_err::write(&staged, serde_json::to_vec(&current).expect("JSON")).expect("a file");
+    fs_err::rename(staged, cache.current_path()).expect("a rename");
 }

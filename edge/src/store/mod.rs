@@ -86,6 +86,16 @@ pub enum StoreError {
         /// Why and where.
         source: ContainerError,
     },
+    /// `current` names a cell or a profile of it that the manifest does not list.
+    #[error("{path}: the manifest lists no {profile} shard of cell {cell_id}; fetch again", path = path.display())]
+    Unlisted {
+        /// The file.
+        path: PathBuf,
+        /// The cell.
+        cell_id: u32,
+        /// The profile.
+        profile: Profile,
+    },
     /// The shard is sound, but not the one that the manifest describes.
     #[error("{path}: {field} is {found}, the manifest says {expected}; delete it and fetch again", path = path.display())]
     Mismatch {
@@ -299,37 +309,26 @@ impl OpenShard {
         at: &CurrentCell,
     ) -> Result<Self, StoreError> {
         let path = cache.shard_path(at.hash);
-        let cell = manifest
-            .cells
-            .binary_search_by_key(&at.cell_id, |cell| cell.cell_id)
-            .map(|position| manifest.cells[position].clone());
-        let listed = cell.ok().filter(|cell| {
-            cell.shards.get(&profile).is_some_and(|s| s.hash == at.hash && s.len_bytes == at.len_bytes)
-        });
-        let Some(cell) = listed else {
-            let what = format!("cell {} with shard {} is not in the manifest", at.cell_id, at.hash);
-            return Err(StoreError::Current { path: cache.current_path(), what });
-        };
         let bytes = match cache.files.map(&path) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(StoreError::Missing { path }),
             other => other?,
         };
-        let layout = check_shard(&path, &bytes, &cell, at.len_bytes, manifest)?;
-        Ok(Self { cell, layout, bytes })
+        let (cell, layout) = check_shard(&path, &bytes, at, profile, manifest)?;
+        Ok(Self { cell: cell.clone(), layout, bytes })
     }
 }
 
-/// Checks that bytes are a sound shard, and the one that a manifest's cell describes.
+/// Checks that bytes are a sound shard, and the one that a manifest lists for a cell.
 ///
 /// # Errors
 /// [`StoreError::Shard`], [`StoreError::Mismatch`].
-pub fn check_shard(
+pub fn check_shard<'a>(
     path: &Path,
     bytes: &[u8],
-    cell: &CellRecord,
-    len_bytes: u64,
-    manifest: &Manifest,
-) -> Result<ShardLayout, StoreError> {
+    at: &CurrentCell,
+    profile: Profile,
+    manifest: &'a Manifest,
+) -> Result<(&'a CellRecord, ShardLayout), StoreError> {
     let same = |field, expected: &dyn ToString, found: &dyn ToString| {
         let (expected, found) = (expected.to_string(), found.to_string());
         match expected == found {
@@ -337,7 +336,14 @@ pub fn check_shard(
             false => Err(StoreError::Mismatch { path: path.to_owned(), field, expected, found }),
         }
     };
-    same("the length in bytes", &len_bytes, &bytes.len())?;
+    let position = manifest.cells.partition_point(|cell| cell.cell_id < at.cell_id);
+    let cell = manifest.cells.get(position).filter(|cell| cell.cell_id == at.cell_id);
+    let Some((cell, listed)) = cell.and_then(|cell| Some((cell, cell.shards.get(&profile)?))) else {
+        let (cell_id, path) = (at.cell_id, path.to_owned());
+        return Err(StoreError::Unlisted { path, cell_id, profile });
+    };
+    same("the name", &listed.hash, &at.hash)?;
+    same("the length in bytes", &listed.len_bytes, &bytes.len())?;
     let layout =
         ShardLayout::check(bytes).map_err(|source| StoreError::Shard { path: path.to_owned(), source })?;
     let header = layout.header;
@@ -345,5 +351,5 @@ pub fn check_shard(
     same("the number of Gaussians", &cell.n_gaussians, &header.n_gaussians)?;
     same("the embedding dimension", &manifest.encoder.dim, &header.dim)?;
     same("the encoder", &manifest.encoder.id, &Hash32(header.encoder_id))?;
-    Ok(layout)
+    Ok((cell, layout))
 }

@@ -1,0 +1,275 @@
+//! The command line: what can be asked for, and how a run ends.
+
+mod commands;
+mod fetch;
+mod output;
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::{Args, Parser, Subcommand};
+use glam::DVec3;
+use slag_common::Hash32;
+use slag_common::shard::Profile;
+use slag_edge::query::{DEFAULT_MIN_COUNT, Level, parse_point};
+
+/// Keeps the shards around a robot and answers text queries offline.
+#[derive(Debug, Parser)]
+#[command(name = "slag-edge", version)]
+pub struct Cli {
+    #[command(subcommand)]
+    command: Command,
+    /// Log more (twice: all).
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    verbose: u8,
+    /// Log errors only, show no progress.
+    #[arg(short, long, global = true, conflicts_with = "verbose")]
+    quiet: bool,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Brings the shards around a position on board.
+    Fetch(FetchArgs),
+    /// Answers questions over HTTP, from what is on board.
+    Serve(ServeArgs),
+    /// Answers one question from what is on board.
+    Query(QueryArgs),
+    /// Shows what is on board.
+    Status(StatusArgs),
+}
+
+#[derive(Debug, Args)]
+struct CacheArgs {
+    /// Folder of what is on board [default: $XDG_CACHE_HOME/slag, else ~/.cache/slag].
+    #[arg(long, value_name = "DIR")]
+    cache: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+struct ModelArgs {
+    /// Folder of the text model, with its model.toml [default: the built-in stand-in].
+    #[arg(long, value_name = "DIR")]
+    models: Option<PathBuf>,
+    /// ONNX Runtime library [default: beside this program, else where the system finds it].
+    #[arg(long, value_name = "PATH")]
+    runtime: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+struct FetchArgs {
+    /// Address of the store [default: that of the last fetch].
+    #[arg(long, value_name = "URL")]
+    from: Option<String>,
+    /// Where the robot is, world frame [default: where it was at the last fetch].
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
+    at: Option<DVec3>,
+    /// Where the robot is: WGS 84 degrees, and metres.
+    #[arg(long, value_name = "LAT,LON[,HEIGHT]", value_parser = parse_geographic, allow_hyphen_values = true, conflicts_with = "at")]
+    at_geo: Option<(f64, f64, Option<f64>)>,
+    /// How far around, world units (metres where the scene is metric).
+    #[arg(long, default_value_t = 50.0)]
+    radius: f64,
+    /// How much each shard carries: compact or exact.
+    #[arg(long, default_value_t = Profile::Compact)]
+    profile: Profile,
+    /// The only public key accepted [default: the one accepted before, or the first one met].
+    #[arg(long, value_name = "HEX")]
+    key: Option<Hash32>,
+    /// Bytes that shards may take [default: twice what the radius needs].
+    #[arg(long, value_name = "N")]
+    max_bytes: Option<u64>,
+    #[command(flatten)]
+    cache: CacheArgs,
+    /// Print the report as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Args)]
+struct ServeArgs {
+    /// Address to listen on.
+    #[arg(long, value_name = "IP:PORT", default_value = "127.0.0.1:7734")]
+    listen: SocketAddr,
+    #[command(flatten)]
+    cache: CacheArgs,
+    #[command(flatten)]
+    models: ModelArgs,
+}
+
+#[derive(Debug, Args)]
+struct QueryArgs {
+    /// What to look for.
+    text: String,
+    /// Where the asker is, world frame: answers carry their distance and nearer ones rank higher.
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
+    near: Option<DVec3>,
+    /// Only within this distance of --near, world units.
+    #[arg(long, requires = "near")]
+    radius: Option<f64>,
+    /// Most answers [default: 10].
+    #[arg(long)]
+    limit: Option<usize>,
+    /// Cosine from which a Gaussian matches [default: the scene's].
+    #[arg(long, allow_hyphen_values = true)]
+    threshold: Option<f32>,
+    /// What answers are made of: clusters or gaussians.
+    #[arg(long, default_value = "clusters")]
+    level: Level,
+    /// Edge of the voxels that join Gaussians to clusters, world units [default: 0.25 m, or the scene's].
+    #[arg(long)]
+    voxel: Option<f64>,
+    /// Clusters with fewer Gaussians are dropped, and counted.
+    #[arg(long, default_value_t = DEFAULT_MIN_COUNT)]
+    min_count: u64,
+    #[command(flatten)]
+    cache: CacheArgs,
+    #[command(flatten)]
+    models: ModelArgs,
+    /// Print the answers as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Args)]
+struct StatusArgs {
+    #[command(flatten)]
+    cache: CacheArgs,
+    /// Print the status as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// How a run ends.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Exit {
+    /// Done, even if nothing was found.
+    Done = 0,
+    /// Failed.
+    Failed = 1,
+    /// Asked for something that cannot be; clap exits with it too.
+    Usage = 2,
+    /// Interrupted by a signal (128 + SIGINT).
+    Interrupted = 130,
+}
+
+impl From<Exit> for ExitCode {
+    fn from(exit: Exit) -> Self {
+        Self::from(exit as u8)
+    }
+}
+
+impl Cli {
+    /// Returns what is logged unless `RUST_LOG` says otherwise.
+    pub fn log_filter(&self) -> &'static str {
+        match (self.quiet, self.verbose, &self.command) {
+            (true, ..) => "error",
+            (_, 0, Command::Serve(_)) | (_, 1, _) => "warn,slag_edge=info",
+            (_, 0, _) => "warn",
+            _ => "debug",
+        }
+    }
+
+    /// Runs the command and reports how it went.
+    pub fn run(self) -> Exit {
+        let (json, result) = match self.command {
+            Command::Fetch(args) => (args.json, fetch::fetch(args, self.quiet)),
+            Command::Serve(args) => (false, commands::serve(args)),
+            Command::Query(args) => (args.json, commands::query(args)),
+            Command::Status(args) => (args.json, commands::status(args)),
+        };
+        match result {
+            Ok(()) => Exit::Done,
+            Err(failure) => failure.report(json),
+        }
+    }
+}
+
+fn parse_geographic(text: &str) -> Result<(f64, f64, Option<f64>), String> {
+    let numbers: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
+    let in_range = |lat: f64, lon: f64| lat.abs() <= 90.0 && lon.abs() <= 180.0;
+    match numbers.as_deref() {
+        Some([lat, lon]) if in_range(*lat, *lon) => Ok((*lat, *lon, None)),
+        Some([lat, lon, height]) if in_range(*lat, *lon) && height.is_finite() => {
+            Ok((*lat, *lon, Some(*height)))
+        }
+        _ => Err("degrees LAT,LON within ±90 and ±180, optionally a height in metres".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(line: &str) -> Result<Cli, clap::Error> {
+        Cli::try_parse_from(line.split(' '))
+    }
+
+    #[test]
+    fn the_definition_is_sound() {
+        use clap::CommandFactory;
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn lines_parse() {
+        let Command::Fetch(fetch) =
+            parse("slag-edge fetch --from http://a:1 --at -1,2.5,-3e1 --radius 20 --profile exact --max-bytes 7 --cache c --json")
+                .expect("parses")
+                .command
+        else {
+            panic!("fetch")
+        };
+        assert_eq!(
+            (fetch.at, fetch.radius, fetch.profile),
+            (Some(DVec3::new(-1.0, 2.5, -30.0)), 20.0, Profile::Exact)
+        );
+        assert_eq!((fetch.max_bytes, fetch.cache.cache, fetch.json), (Some(7), Some("c".into()), true));
+        let Command::Fetch(fetch) = parse("slag-edge fetch --at-geo -46.8,-92").expect("parses").command
+        else {
+            panic!("fetch")
+        };
+        assert_eq!(
+            (fetch.at_geo, fetch.radius, fetch.profile),
+            (Some((-46.8, -92.0, None)), 50.0, Profile::Compact)
+        );
+        let Command::Serve(serve) = parse("slag-edge serve").expect("parses").command else {
+            panic!("serve")
+        };
+        assert_eq!(serve.listen, SocketAddr::from(([127, 0, 0, 1], 7734)));
+        let Command::Query(query) = parse(
+            "slag-edge query chair --near 1,2,-3 --radius 4 --limit 5 --threshold -0.5 --level gaussians",
+        )
+        .expect("parses")
+        .command
+        else {
+            panic!("query")
+        };
+        assert_eq!((query.text.as_str(), query.near), ("chair", Some(DVec3::new(1.0, 2.0, -3.0))));
+        assert_eq!((query.radius, query.limit, query.threshold), (Some(4.0), Some(5), Some(-0.5)));
+        assert_eq!(query.level, Level::Gaussians);
+        assert!(parse("slag-edge status --json --cache d").is_ok());
+    }
+
+    #[test]
+    fn wrong_lines_are_refused() {
+        for line in [
+            "slag-edge",
+            "slag-edge query",
+            "slag-edge query chair --radius 4",
+            "slag-edge query chair --near 1,2",
+            "slag-edge query chair --near NaN,0,0",
+            "slag-edge query chair --level points",
+            "slag-edge query chair --limit -1",
+            "slag-edge fetch --at 1,2,3 --at-geo 1,2",
+            "slag-edge fetch --at-geo 91,0",
+            "slag-edge fetch --key 12",
+            "slag-edge fetch --profile tiny",
+            "slag-edge serve --listen nowhere",
+            "slag-edge status --quiet --verbose",
+        ] {
+            assert_eq!(parse(line).expect_err(line).exit_code(), Exit::Usage as i32, "{line}");
+        }
+    }
+}

@@ -1,0 +1,413 @@
+//! HTTP: the manifest and shards come in whole or not at all, within the lengths that were announced.
+
+use std::io::Read;
+use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use slag_common::Hash32;
+use slag_common::manifest;
+use ureq::http::{Response, StatusCode, Uri, header};
+
+use super::{Environment, FetchError};
+use crate::store::files::Files;
+
+/// Patience with a server and with the way to it.
+#[derive(Clone, Debug)]
+pub struct NetworkLimits {
+    /// Failures in a row, without progress, after which a download is given up.
+    pub attempts: u32,
+    /// Wait after the first failure; doubled after each further one, and scaled by 0.5..1.5.
+    pub first_backoff: Duration,
+    /// Longest wait.
+    pub longest_backoff: Duration,
+    /// Time for name resolution and for connecting, each.
+    pub connect_timeout: Duration,
+    /// Time without a byte.
+    pub read_timeout: Duration,
+    /// A body that comes in slower than this on average is broken off (and resumed).
+    pub slowest_bytes_per_sec: u64,
+    /// Bytes received between two writes; a retry counts as progress after as many.
+    pub chunk_bytes: usize,
+}
+
+impl Default for NetworkLimits {
+    fn default() -> Self {
+        Self {
+            attempts: 6,
+            first_backoff: Duration::from_millis(500),
+            longest_backoff: Duration::from_secs(30),
+            connect_timeout: Duration::from_secs(10),
+            read_timeout: Duration::from_secs(20),
+            slowest_bytes_per_sec: 4096,
+            chunk_bytes: 256 << 10,
+        }
+    }
+}
+
+/// A manifest's expected length, for the time it may take.
+const USUAL_MANIFEST_BYTES: u64 = 1 << 20;
+/// How often a shard may come in with other content than its hash before it is given up: once for a
+/// part that a power cut damaged, twice for the way.
+const MAX_WRONG_HASHES: u32 = 3;
+/// Longest sleep before the cancel flag is looked at again.
+const NAP: Duration = Duration::from_millis(50);
+
+/// Why one attempt failed.
+#[derive(Debug, thiserror::Error)]
+pub enum Failure {
+    /// No connection, or it broke.
+    #[error("{0}")]
+    Transport(#[from] Box<ureq::Error>),
+    /// The body broke off.
+    #[error("the body ends at byte {found_bytes} of {expected_bytes}")]
+    Cut {
+        /// Length expected.
+        expected_bytes: u64,
+        /// Bytes there.
+        found_bytes: u64,
+    },
+    /// The server says no.
+    #[error("the server answers {status}")]
+    Status {
+        /// HTTP status.
+        status: u16,
+    },
+    /// The server sends to another address; shards and manifests are not followed elsewhere.
+    #[error("the server sends to {location:?}; if that is the store, give that address")]
+    Redirect {
+        /// Where (cut to 200 characters).
+        location: String,
+    },
+    /// The announced length is not the manifest's.
+    #[error("the server announces {found:?} for {expected}")]
+    Length {
+        /// What the request asked for.
+        expected: String,
+        /// Header found.
+        found: String,
+    },
+    /// The content is not what the hash names.
+    #[error("the content has hash {found}, expected {expected}")]
+    Hash {
+        /// Hash expected.
+        expected: Hash32,
+        /// Hash of the content.
+        found: Hash32,
+    },
+}
+
+impl Failure {
+    /// Whether another attempt may help.
+    fn is_passing(&self) -> bool {
+        match self {
+            Self::Redirect { .. } => false,
+            Self::Status { status } => *status >= 500 || matches!(status, 408 | 416 | 429),
+            Self::Transport(e) => !matches!(**e, ureq::Error::BadUri(_) | ureq::Error::Http(_)),
+            Self::Cut { .. } | Self::Length { .. } | Self::Hash { .. } => true,
+        }
+    }
+}
+
+/// How an attempt ended, if not well.
+enum Stop {
+    /// The other side or the way: maybe try again.
+    Failed(Failure),
+    /// The same, but more bytes are there than after any attempt before.
+    Interrupted(Failure),
+    /// This side: no.
+    Fatal(FetchError),
+}
+
+impl From<Failure> for Stop {
+    fn from(failure: Failure) -> Self {
+        Self::Failed(failure)
+    }
+}
+
+impl From<FetchError> for Stop {
+    fn from(e: FetchError) -> Self {
+        Self::Fatal(e)
+    }
+}
+
+impl From<std::io::Error> for Stop {
+    fn from(e: std::io::Error) -> Self {
+        Self::Fatal(e.into())
+    }
+}
+
+impl From<ureq::Error> for Stop {
+    fn from(e: ureq::Error) -> Self {
+        Self::Failed(Failure::Transport(Box::new(e)))
+    }
+}
+
+/// What the server says of the manifest.
+pub(super) enum ManifestAnswer {
+    /// It is the one that was named.
+    Unchanged,
+    /// Its bytes.
+    New(Vec<u8>),
+}
+
+/// A store's address, and what downloads from it share.
+pub(super) struct Client<'a> {
+    agent: ureq::Agent,
+    base: String,
+    environment: &'a Environment<'a>,
+    /// Bytes that earlier attempts had left.
+    pub resumed_bytes: AtomicU64,
+    /// Attempts beyond the first.
+    pub retries: AtomicU64,
+}
+
+impl<'a> Client<'a> {
+    /// Checks an address.
+    pub fn new(from: &str, environment: &'a Environment<'a>) -> Result<Self, FetchError> {
+        let bad = |what: &str| FetchError::Address { from: from.to_owned(), what: what.to_owned() };
+        let uri: Uri = from.parse().map_err(|_| bad("it is no URL"))?;
+        if !matches!(uri.scheme_str(), Some("http" | "https")) {
+            return Err(bad("it does not begin with http:// or https://"));
+        }
+        if uri.authority().is_none_or(|a| a.host().is_empty() || a.as_str().contains('@')) {
+            return Err(bad("it has no host, or names a user"));
+        }
+        if uri.query().is_some() || from.contains('#') {
+            return Err(bad("it has a query or a fragment"));
+        }
+        let limits = &environment.limits;
+        let agent = ureq::Agent::config_builder()
+            .http_status_as_error(false)
+            // Neither another host nor a proxy from the environment: what is asked is what was given.
+            .max_redirects(0)
+            .proxy(None)
+            .timeout_resolve(Some(limits.connect_timeout))
+            .timeout_connect(Some(limits.connect_timeout))
+            .timeout_recv_response(Some(limits.read_timeout))
+            .timeout_per_read(Some(limits.read_timeout))
+            .user_agent(concat!("slag-edge/", env!("CARGO_PKG_VERSION")))
+            .build()
+            .new_agent();
+        let base = from.trim_end_matches('/').to_owned();
+        Ok(Self { agent, base, environment, resumed_bytes: AtomicU64::new(0), retries: AtomicU64::new(0) })
+    }
+
+    /// Gets the manifest, unless it is still the one with a given hash.
+    pub fn manifest(&self, known: Option<Hash32>) -> Result<ManifestAnswer, FetchError> {
+        let url = format!("{}/v1/manifest", self.base);
+        self.retrying(&url, || self.try_manifest(&url, known))
+    }
+
+    fn try_manifest(&self, url: &str, known: Option<Hash32>) -> Result<ManifestAnswer, Stop> {
+        let etag = known.map(|hash| (header::IF_NONE_MATCH, format!("\"{hash}\"")));
+        let response = self.get(url, USUAL_MANIFEST_BYTES, etag)?;
+        match response.status() {
+            StatusCode::NOT_MODIFIED if known.is_some() => return Ok(ManifestAnswer::Unchanged),
+            StatusCode::OK => {}
+            _ => return Err(refusal(&response).into()),
+        }
+        let mut body = response.into_body().into_reader().take(manifest::MAX_BYTES + 1);
+        let mut bytes = Vec::new();
+        let mut chunk = vec![0; self.environment.limits.chunk_bytes.max(1)];
+        loop {
+            self.check_cancelled()?;
+            match body.read(&mut chunk).map_err(ureq::Error::from)? {
+                // A body that is too long is refused by the verification.
+                0 => return Ok(ManifestAnswer::New(bytes)),
+                n => bytes.extend_from_slice(&chunk[..n]),
+            }
+        }
+    }
+
+    /// Downloads an object into a staged file, going on where an earlier attempt ended, and makes it
+    /// durable. Its content has the hash then.
+    pub fn object(
+        &self,
+        files: &dyn Files,
+        hash: Hash32,
+        len_bytes: u64,
+        part: &Path,
+    ) -> Result<(), FetchError> {
+        let url = format!("{}/v1/objects/{hash}", self.base);
+        let staged_bytes = || Ok::<_, FetchError>(files.stat(part)?.map_or(0, |stat| stat.len_bytes));
+        if staged_bytes()? > len_bytes {
+            files.remove(part)?;
+        }
+        let mut furthest = staged_bytes()?;
+        self.resumed_bytes.fetch_add(furthest, Ordering::Relaxed);
+        let mut n_wrong_hashes = 0;
+        self.retrying(&url, || {
+            let offset = staged_bytes()?;
+            let received = self.receive(files, &url, hash, offset, len_bytes, part);
+            let reached = staged_bytes()?;
+            if let Err(Stop::Failed(failure)) = received {
+                let is_progress =
+                    reached - furthest.min(reached) >= self.environment.limits.chunk_bytes as u64;
+                furthest = furthest.max(reached);
+                return Err(if is_progress { Stop::Interrupted(failure) } else { Stop::Failed(failure) });
+            }
+            received?;
+            files.sync(part)?;
+            let found = Hash32::of(&files.map(part)?);
+            if found == hash {
+                return Ok(());
+            }
+            files.remove(part)?;
+            n_wrong_hashes += 1;
+            let failure = Failure::Hash { expected: hash, found };
+            match n_wrong_hashes < MAX_WRONG_HASHES {
+                true => Err(Stop::Failed(failure)),
+                false => {
+                    let url = url.clone();
+                    Err(Stop::Fatal(FetchError::Download { url, attempts: n_wrong_hashes, failure }))
+                }
+            }
+        })
+    }
+
+    /// Receives bytes `offset..len_bytes` of an object, or, if the server sends it whole, all of it.
+    fn receive(
+        &self,
+        files: &dyn Files,
+        url: &str,
+        hash: Hash32,
+        mut offset: u64,
+        len_bytes: u64,
+        part: &Path,
+    ) -> Result<(), Stop> {
+        if offset == len_bytes {
+            // An empty object has no part yet.
+            return if len_bytes == 0 { Ok(files.write_from(part, 0, &[])?) } else { Ok(()) };
+        }
+        let mut ranges = Vec::new();
+        if offset > 0 {
+            ranges.push((header::RANGE, format!("bytes={offset}-")));
+            ranges.push((header::IF_RANGE, format!("\"{hash}\"")));
+        }
+        let response = self.get(url, len_bytes, ranges)?;
+        match response.status() {
+            StatusCode::PARTIAL_CONTENT if offset > 0 => {
+                let found = header_text(&response, header::CONTENT_RANGE);
+                let expected = format!("bytes {offset}-{}/{len_bytes}", len_bytes - 1);
+                if found != expected {
+                    return Err(Failure::Length { expected, found }.into());
+                }
+            }
+            StatusCode::OK => offset = 0,
+            _ => {
+                if response.status() == StatusCode::RANGE_NOT_SATISFIABLE {
+                    files.remove(part)?;
+                }
+                return Err(refusal(&response).into());
+            }
+        }
+        let left_bytes = len_bytes - offset;
+        if let Some(stated) = response.body().content_length().filter(|stated| *stated != left_bytes) {
+            let (expected, found) = (format!("{left_bytes} bytes"), format!("{stated} bytes"));
+            return Err(Failure::Length { expected, found }.into());
+        }
+        // Never more than the manifest's length, however long the body goes on.
+        let mut body = response.into_body().into_reader().take(left_bytes);
+        let mut chunk = vec![0; (self.environment.limits.chunk_bytes as u64).clamp(1, left_bytes) as usize];
+        let mut n_filled = 0;
+        loop {
+            self.check_cancelled()?;
+            let read = body.read(&mut chunk[n_filled..]);
+            let n_read = *read.as_ref().unwrap_or(&0);
+            n_filled += n_read;
+            self.environment.progress.received(n_read as u64);
+            // Also what came in before a break: the next attempt goes on there.
+            if n_filled == chunk.len() || n_read == 0 || n_filled as u64 == len_bytes - offset {
+                files.write_from(part, offset, &chunk[..n_filled])?;
+                offset += n_filled as u64;
+                n_filled = 0;
+            }
+            read.map_err(ureq::Error::from)?;
+            if offset == len_bytes {
+                return Ok(());
+            }
+            if n_read == 0 {
+                return Err(Failure::Cut { expected_bytes: len_bytes, found_bytes: offset }.into());
+            }
+        }
+    }
+
+    fn get(
+        &self,
+        url: &str,
+        expected_bytes: u64,
+        headers: impl IntoIterator<Item = (header::HeaderName, String)>,
+    ) -> Result<Response<ureq::Body>, Stop> {
+        let limits = &self.environment.limits;
+        let body_secs = expected_bytes / limits.slowest_bytes_per_sec.max(1);
+        let body_timeout = limits.read_timeout.saturating_add(Duration::from_secs(body_secs));
+        // A length that no clock holds is as good as no limit.
+        let body_timeout = Instant::now().checked_add(body_timeout).is_some().then_some(body_timeout);
+        let mut request = self.agent.get(url);
+        for (name, value) in headers {
+            request = request.header(name, value);
+        }
+        Ok(request.config().timeout_recv_body(body_timeout).build().call()?)
+    }
+
+    /// Tries until it works, fails for good, or has failed too often in a row without progress.
+    fn retrying<T>(&self, url: &str, mut attempt: impl FnMut() -> Result<T, Stop>) -> Result<T, FetchError> {
+        let limits = &self.environment.limits;
+        let mut attempts = 0;
+        loop {
+            self.check_cancelled()?;
+            let failure = match attempt() {
+                Ok(value) => return Ok(value),
+                Err(Stop::Fatal(e)) => return Err(e),
+                Err(Stop::Failed(failure)) => {
+                    attempts += 1;
+                    failure
+                }
+                Err(Stop::Interrupted(failure)) => {
+                    attempts = 1;
+                    failure
+                }
+            };
+            if !failure.is_passing() || attempts >= limits.attempts {
+                return Err(FetchError::Download { url: url.to_owned(), attempts, failure });
+            }
+            self.retries.fetch_add(1, Ordering::Relaxed);
+            self.environment.progress.retried(url, &failure);
+            let doubled = limits.first_backoff.saturating_mul(1 << (attempts - 1).min(16));
+            let spread = 0.5 + (self.environment.random)().clamp(0.0, 1.0);
+            self.sleep(doubled.min(limits.longest_backoff).mul_f64(spread))?;
+        }
+    }
+
+    fn sleep(&self, mut left: Duration) -> Result<(), FetchError> {
+        while !left.is_zero() {
+            self.check_cancelled()?;
+            let nap = left.min(NAP);
+            std::thread::sleep(nap);
+            left -= nap;
+        }
+        Ok(())
+    }
+
+    fn check_cancelled(&self) -> Result<(), FetchError> {
+        match self.environment.cancel.load(Ordering::Relaxed) {
+            true => Err(FetchError::Cancelled),
+            false => Ok(()),
+        }
+    }
+}
+
+fn refusal(response: &Response<ureq::Body>) -> Failure {
+    if response.status().is_redirection() && response.status() != StatusCode::NOT_MODIFIED {
+        let location = header_text(response, header::LOCATION);
+        return Failure::Redirect { location };
+    }
+    Failure::Status { status: response.status().as_u16() }
+}
+
+/// Returns a header as text, cut to 200 characters; empty if it is not there or not text.
+fn header_text(response: &Response<ureq::Body>, name: header::HeaderName) -> String {
+    let value = response.headers().get(name).and_then(|value| value.to_str().ok());
+    value.unwrap_or_default().chars().take(200).collect()
+}

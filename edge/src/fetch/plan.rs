@@ -1,0 +1,424 @@
+//! What a fetch does: which cells, which shards to download, keep and free. Pure functions.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use glam::{DVec2, DVec3};
+use serde::{Deserialize, Serialize};
+use slag_common::Hash32;
+use slag_common::frames::{Aabb, Geographic};
+use slag_common::manifest::{CellIndex, Manifest};
+use slag_common::shard::Profile;
+
+use crate::store::CurrentCell;
+
+/// Where the robot is.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Position {
+    /// World frame.
+    World(DVec3),
+    /// On the earth; needs a geo-referenced scene.
+    Geographic {
+        /// Latitude, degrees, north positive (WGS 84).
+        latitude_deg: f64,
+        /// Longitude, degrees, east positive.
+        longitude_deg: f64,
+        /// Height in metres, in the datum of the scene's origin; absent: at the scene's own height
+        /// there (see [`Position::in_world`]).
+        height_m: Option<f64>,
+    },
+}
+
+/// Why there is no plan.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum PlanError {
+    /// A number that no place has.
+    #[error("{name} is {value}, it must be {expected}")]
+    Number {
+        /// What it is.
+        name: &'static str,
+        /// Value found.
+        value: f64,
+        /// Values possible.
+        expected: &'static str,
+    },
+    /// Latitude and longitude mean nothing in this scene.
+    #[error("scene {scene:?} has no geo-reference: give the position as x, y, z in its world frame")]
+    NoGeoReference {
+        /// The scene.
+        scene: String,
+    },
+    /// The place is elsewhere.
+    #[error(
+        "no cell of scene {scene:?} within {radius} of {centre_in_world}, the nearest is {nearest:.1} away; check the position or take a larger radius"
+    )]
+    NoCells {
+        /// The scene.
+        scene: String,
+        /// Where cells were looked for.
+        centre_in_world: DVec3,
+        /// How far.
+        radius: f64,
+        /// Distance of the nearest cell; infinite in a scene without cells.
+        nearest: f64,
+    },
+    /// The encoder did not write this profile.
+    #[error("cell {cell_id} has no {profile} shard; it has: {available}")]
+    NoProfile {
+        /// The cell.
+        cell_id: u32,
+        /// Profile asked for.
+        profile: Profile,
+        /// Profiles there, separated by commas.
+        available: String,
+    },
+    /// More than the robot may hold.
+    #[error(
+        "the {n_cells} cells take {needed_bytes} bytes, allowed are {max_bytes}; take a smaller radius or a smaller profile"
+    )]
+    TooLarge {
+        /// Cells within the radius.
+        n_cells: usize,
+        /// Bytes of their shards.
+        needed_bytes: u64,
+        /// Bytes allowed.
+        max_bytes: u64,
+    },
+    /// The manifest contradicts itself.
+    #[error(
+        "the manifest gives cell {cell_id} the shard of another cell, {hash}; have the scene published again"
+    )]
+    Conflict {
+        /// The second cell.
+        cell_id: u32,
+        /// The shard.
+        hash: Hash32,
+    },
+}
+
+impl Position {
+    /// Returns the position in the world frame.
+    ///
+    /// A geographic position without a height is put at the height of the centre of the box that is
+    /// horizontally nearest (then whose centre is, then of the lowest id), so that a robot that knows
+    /// only latitude and longitude gets the cells around it wherever the scene's zero height lies.
+    ///
+    /// # Errors
+    /// [`PlanError::Number`], [`PlanError::NoGeoReference`].
+    pub fn in_world(self, manifest: &Manifest) -> Result<DVec3, PlanError> {
+        let number = |name, value: f64, limit: f64, expected| match value.abs() <= limit {
+            true => Ok(()),
+            false => Err(PlanError::Number { name, value, expected }),
+        };
+        match self {
+            Self::World(position) => {
+                for (name, value) in [("x", position.x), ("y", position.y), ("z", position.z)] {
+                    number(name, value, f64::MAX, "finite")?;
+                }
+                Ok(position)
+            }
+            Self::Geographic { latitude_deg, longitude_deg, height_m } => {
+                number("latitude", latitude_deg, 90.0, "within -90..90 degrees")?;
+                number("longitude", longitude_deg, 180.0, "within -180..180 degrees")?;
+                number("height", height_m.unwrap_or(0.0), f64::MAX, "finite")?;
+                let geo = manifest
+                    .geo_reference
+                    .ok_or_else(|| PlanError::NoGeoReference { scene: manifest.scene.clone() })?;
+                let at = |height_m| {
+                    geo.world_from_geographic(Geographic { latitude_deg, longitude_deg, height_m })
+                };
+                let at_origin_height = at(geo.origin.height_m);
+                Ok(match height_m {
+                    Some(height_m) => at(height_m),
+                    None => at_origin_height.with_z(scene_height(manifest, at_origin_height)),
+                })
+            }
+        }
+    }
+}
+
+/// Returns the z of the centre of the cell that is horizontally nearest; that of the point where there
+/// is no cell.
+fn scene_height(manifest: &Manifest, point: DVec3) -> f64 {
+    let rank = |bounds: &Aabb| {
+        let flat = Aabb { min: bounds.min.with_z(0.0), max: bounds.max.with_z(0.0) };
+        let to_centre = DVec2::new(point.x, point.y).distance(flat.centre().truncate());
+        (flat.distance_to(point.with_z(0.0)), to_centre)
+    };
+    let nearest = manifest.cells.iter().map(|cell| &cell.bounds).min_by(|a, b| {
+        let ((a_box, a_centre), (b_box, b_centre)) = (rank(a), rank(b));
+        a_box.total_cmp(&b_box).then(a_centre.total_cmp(&b_centre))
+    });
+    nearest.map_or(point.z, |bounds| bounds.centre().z)
+}
+
+/// A shard on board.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Held {
+    /// Length of the file.
+    pub len_bytes: u64,
+    /// Number of the fetch that last needed it.
+    pub last_used: u64,
+}
+
+/// What is wanted on board.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Wanted {
+    /// Which shard of each cell.
+    pub profile: Profile,
+    /// Where the robot is.
+    pub centre_in_world: DVec3,
+    /// How far cells matter, world units.
+    pub radius: f64,
+    /// Bytes that shards may take; absent: twice what the cells within the radius take.
+    pub max_bytes: Option<u64>,
+}
+
+/// What to do with each shard.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Plan {
+    /// The cells within the radius, by id, ascending.
+    pub cells: Vec<CurrentCell>,
+    /// Those whose shard is not on board.
+    pub download: Vec<CurrentCell>,
+    /// Shards on board that are needed.
+    pub keep: BTreeSet<Hash32>,
+    /// Shards on board that are not needed but fit the budget, the most recently used.
+    pub spare: BTreeSet<Hash32>,
+    /// Shards on board that do not.
+    pub free: BTreeSet<Hash32>,
+}
+
+impl Plan {
+    /// Plans a fetch.
+    ///
+    /// # Errors
+    /// [`PlanError`].
+    pub fn new(
+        manifest: &Manifest,
+        wanted: &Wanted,
+        held: &BTreeMap<Hash32, Held>,
+    ) -> Result<Self, PlanError> {
+        let Wanted { profile, centre_in_world, radius, max_bytes } = *wanted;
+        if !(radius >= 0.0 && radius.is_finite()) {
+            let (name, expected) = ("radius", "zero or more, and finite");
+            return Err(PlanError::Number { name, value: radius, expected });
+        }
+        let positions = CellIndex::new(&manifest.cells).within(centre_in_world, radius);
+        if positions.is_empty() {
+            let distances = manifest.cells.iter().map(|cell| cell.bounds.distance_to(centre_in_world));
+            let nearest = distances.fold(f64::INFINITY, f64::min);
+            return Err(PlanError::NoCells {
+                scene: manifest.scene.clone(),
+                centre_in_world,
+                radius,
+                nearest,
+            });
+        }
+        let mut plan = Self::default();
+        let mut needed: BTreeMap<Hash32, u64> = BTreeMap::new();
+        for cell in positions.into_iter().map(|position| &manifest.cells[position]) {
+            let Some(shard) = cell.shards.get(&profile) else {
+                let names: Vec<&str> = cell.shards.keys().map(|profile| profile.name()).collect();
+                let (cell_id, available) = (cell.cell_id, names.join(", "));
+                return Err(PlanError::NoProfile { cell_id, profile, available });
+            };
+            let (hash, len_bytes) = (shard.hash, shard.len_bytes);
+            let at = CurrentCell { cell_id: cell.cell_id, hash, len_bytes };
+            plan.cells.push(at);
+            if needed.insert(hash, len_bytes).is_some() {
+                return Err(PlanError::Conflict { cell_id: cell.cell_id, hash });
+            }
+            match held.get(&hash) {
+                Some(held) if held.len_bytes == len_bytes => drop(plan.keep.insert(hash)),
+                _ => plan.download.push(at),
+            }
+        }
+        let needed_bytes = needed.values().fold(0u64, |sum, len| sum.saturating_add(*len));
+        let budget_bytes = max_bytes.unwrap_or(needed_bytes.saturating_mul(2));
+        if needed_bytes > budget_bytes {
+            let n_cells = plan.cells.len();
+            return Err(PlanError::TooLarge { n_cells, needed_bytes, max_bytes: budget_bytes });
+        }
+        let mut others: Vec<(&Hash32, &Held)> =
+            held.iter().filter(|(hash, _)| !needed.contains_key(hash)).collect();
+        others.sort_by_key(|(hash, held)| (std::cmp::Reverse(held.last_used), **hash));
+        let mut room_bytes = Some(budget_bytes - needed_bytes);
+        for (hash, held) in others {
+            // The first that does not fit ends it: what is less recent than a freed shard is freed too.
+            room_bytes = room_bytes.and_then(|room| room.checked_sub(held.len_bytes));
+            match room_bytes {
+                Some(_) => plan.spare.insert(*hash),
+                None => plan.free.insert(*hash),
+            };
+        }
+        Ok(plan)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use slag_common::frames::GeoReference;
+    use slag_common::manifest::{CellRecord, EncoderRecord, ShardRecord, VERSION};
+
+    use super::*;
+
+    fn manifest(boxes: &[(DVec3, DVec3, u64)]) -> Manifest {
+        let cells = (0u32..).zip(boxes).map(|(cell_id, (min, size, len_bytes))| CellRecord {
+            cell_id: cell_id * 3,
+            bounds: Aabb { min: *min, max: *min + *size },
+            n_gaussians: 1,
+            shards: BTreeMap::from([(
+                Profile::Compact,
+                ShardRecord {
+                    hash: hash(cell_id),
+                    len_bytes: *len_bytes,
+                    n_rows: 1,
+                    score_error_bound: 0.1,
+                    position_error: 0.1,
+                },
+            )]),
+        });
+        let origin = Geographic { latitude_deg: 46.8, longitude_deg: -91.9, height_m: 150.0 };
+        Manifest {
+            version: VERSION,
+            scene: "s".into(),
+            generation: 1,
+            created_unix_secs: 0,
+            expires_unix_secs: None,
+            metric: true,
+            geo_reference: Some(GeoReference { origin }),
+            encoder: EncoderRecord { name: "e".into(), id: Hash32([1; 32]), dim: 4, default_threshold: 0.1 },
+            n_gaussians: boxes.len() as u64,
+            n_without_evidence: 0,
+            n_rejected: 0,
+            cells: cells.collect(),
+        }
+    }
+
+    fn hash(number: u32) -> Hash32 {
+        Hash32::of(&number.to_le_bytes())
+    }
+
+    fn wanted(centre_in_world: DVec3, radius: f64, max_bytes: Option<u64>) -> Wanted {
+        Wanted { profile: Profile::Compact, centre_in_world, radius, max_bytes }
+    }
+
+    proptest! {
+        /// Oracles: distances by brute force; eviction one at a time, the least recent first.
+        #[test]
+        fn plan_equals_brute_force(
+            boxes in prop::collection::vec(
+                (prop::array::uniform3(-50.0..50.0f64), prop::array::uniform3(0.0..20.0f64), 1..100u64), 1..40),
+            held in prop::collection::btree_map(0..60u32, (1..100u64, 0..5u64, any::<bool>()), 0..40),
+            centre in prop::array::uniform3(-60.0..60.0f64), radius in 0.0..60.0f64,
+            max_bytes in prop::option::of(0..4000u64),
+        ) {
+            let boxes: Vec<_> = boxes.into_iter().map(|(min, size, len)| (min.into(), size.into(), len)).collect();
+            let manifest = manifest(&boxes);
+            let centre = DVec3::from(centre);
+            // Some of the held shards have the manifest's length, others are damaged.
+            let held: BTreeMap<Hash32, Held> = held.into_iter().map(|(number, (len, last_used, is_sound))| {
+                let listed = boxes.get(number as usize).map(|(_, _, len)| *len).filter(|_| is_sound);
+                (hash(number), Held { len_bytes: listed.unwrap_or(len), last_used })
+            }).collect();
+            let plan = Plan::new(&manifest, &wanted(centre, radius, max_bytes), &held);
+
+            let near: Vec<u32> = (0..boxes.len() as u32).filter(|i| {
+                let (min, size, _) = boxes[*i as usize];
+                centre.clamp(min, min + size).distance(centre) <= radius
+            }).collect();
+            let needed_bytes: u64 = near.iter().map(|i| boxes[*i as usize].2).sum();
+            let budget_bytes = max_bytes.unwrap_or(2 * needed_bytes);
+            if near.is_empty() {
+                prop_assert!(matches!(plan, Err(PlanError::NoCells { .. })), "{:?}", plan);
+                return Ok(());
+            }
+            if needed_bytes > budget_bytes {
+                prop_assert!(matches!(plan, Err(PlanError::TooLarge { .. })), "{:?}", plan);
+                return Ok(());
+            }
+            let plan = plan.expect("possible");
+            let ids: Vec<u32> = plan.cells.iter().map(|cell| cell.cell_id / 3).collect();
+            prop_assert_eq!(&ids, &near);
+            for i in near {
+                let is_held = held.get(&hash(i)).is_some_and(|held| held.len_bytes == boxes[i as usize].2);
+                prop_assert_eq!(plan.keep.contains(&hash(i)), is_held);
+                prop_assert_eq!(plan.download.iter().any(|cell| cell.hash == hash(i)), !is_held);
+            }
+            let mut others: Vec<(u64, std::cmp::Reverse<Hash32>, u64)> = held.iter()
+                .filter(|(hash, _)| plan.cells.iter().all(|cell| cell.hash != **hash))
+                .map(|(hash, held)| (held.last_used, std::cmp::Reverse(*hash), held.len_bytes)).collect();
+            let n_others = others.len();
+            while needed_bytes + others.iter().map(|(_, _, len)| len).sum::<u64>() > budget_bytes {
+                let oldest = *others.iter().min().expect("some are left");
+                others.retain(|other| *other != oldest);
+            }
+            let spare: BTreeSet<Hash32> = others.iter().map(|(_, hash, _)| hash.0).collect();
+            prop_assert_eq!(plan.free.len(), n_others - spare.len());
+            prop_assert!(plan.free.is_disjoint(&spare));
+            prop_assert_eq!(plan.spare, spare);
+        }
+
+        /// Oracle: the horizontal position that went in, and brute force over columns apart.
+        #[test]
+        fn latitude_and_longitude_give_the_same_cells(x in 0.0..200.0f64, y in 0.0..10.0f64, z in -5.0..5.0f64) {
+            let boxes: Vec<_> = (0..20).map(|i| {
+                let i = f64::from(i);
+                (DVec3::new(i * 10.0, 0.0, i * 7.0 - 100.0), DVec3::splat(10.0), 1)
+            }).collect();
+            let manifest = manifest(&boxes);
+            let column = (x / 10.0).floor();
+            let point = DVec3::new(x, y, column * 7.0 - 95.0 + z);
+            let geo = manifest.geo_reference.expect("given").geographic_from_world(point);
+            let at = |height_m| Position::Geographic {
+                latitude_deg: geo.latitude_deg, longitude_deg: geo.longitude_deg, height_m,
+            };
+            let with_height = at(Some(geo.height_m)).in_world(&manifest).expect("a place");
+            prop_assert!(with_height.distance(point) < 1e-6);
+            let without = at(None).in_world(&manifest).expect("a place");
+            prop_assert!((without - point).truncate().length() < 0.02, "{} {}", without, point);
+            // Near a border either neighbour may be the nearest.
+            if (0.1..9.9).contains(&(x - column * 10.0)) {
+                prop_assert_eq!(without.z, column * 7.0 - 95.0);
+            }
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_is_refused() {
+        let good = manifest(&[(DVec3::ZERO, DVec3::ONE, 5), (DVec3::ONE, DVec3::ONE, u64::MAX)]);
+        let at_zero =
+            |radius, max_bytes| Plan::new(&good, &wanted(DVec3::ZERO, radius, max_bytes), &BTreeMap::new());
+        for radius in [-1.0, f64::NAN, f64::INFINITY] {
+            assert!(
+                matches!(at_zero(radius, None), Err(PlanError::Number { name: "radius", .. })),
+                "{radius}"
+            );
+        }
+        assert!(at_zero(0.5, Some(5)).is_ok());
+        // 5 + u64::MAX does not wrap around.
+        let error = at_zero(9.0, Some(1000)).expect_err("too large");
+        assert_eq!(error, PlanError::TooLarge { n_cells: 2, needed_bytes: u64::MAX, max_bytes: 1000 });
+        let exact = Wanted { profile: Profile::Exact, ..wanted(DVec3::ZERO, 1.0, None) };
+        let error = Plan::new(&good, &exact, &BTreeMap::new()).expect_err("no exact shards");
+        assert!(error.to_string().contains("it has: compact"), "{error}");
+        let mut twice = good.clone();
+        twice.cells[1].shards = twice.cells[0].shards.clone();
+        let error =
+            Plan::new(&twice, &wanted(DVec3::ZERO, 9.0, None), &BTreeMap::new()).expect_err("conflict");
+        assert_eq!(error, PlanError::Conflict { cell_id: 3, hash: hash(0) });
+
+        let at = |latitude_deg, longitude_deg| Position::Geographic {
+            latitude_deg,
+            longitude_deg,
+            height_m: None,
+        };
+        for place in [at(90.1, 0.0), at(f64::NAN, 0.0), at(0.0, -180.5), Position::World(DVec3::NAN)] {
+            assert!(matches!(place.in_world(&good), Err(PlanError::Number { .. })), "{place:?}");
+        }
+        let nowhere = Manifest { geo_reference: None, ..good };
+        assert!(matches!(at(46.8, -91.9).in_world(&nowhere), Err(PlanError::NoGeoReference { .. })));
+    }
+}

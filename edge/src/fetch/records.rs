@@ -1,0 +1,162 @@
+//! The fetcher's small records, in sled. Its lock is the cache's: one fetch at a time.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use slag_common::Hash32;
+
+use super::plan::Position;
+
+/// Pages kept in memory: the records are a few kilobytes.
+const CACHE_BYTES: u64 = 1 << 20;
+
+/// Why the records cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordsError {
+    /// Another fetch has them open.
+    #[error("another fetch works on {path}: wait for it or end it", path = path.display())]
+    Busy {
+        /// The records' folder.
+        path: PathBuf,
+    },
+    /// The database's error.
+    #[error("{path}: {source}; check disk space and permissions, or delete the folder and fetch again naming the source", path = path.display())]
+    Database {
+        /// The records' folder.
+        path: PathBuf,
+        /// What went wrong.
+        source: sled::Error,
+    },
+    /// A record is not what fetch writes.
+    #[error("{path}: record {record:?} is damaged; delete the folder and fetch again naming the source", path = path.display())]
+    Damaged {
+        /// The records' folder.
+        path: PathBuf,
+        /// The record.
+        record: &'static str,
+    },
+}
+
+/// What the last fetch was asked for.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LastFetch {
+    /// The store's address.
+    pub from: String,
+    /// The place.
+    pub at: Position,
+}
+
+/// The open records.
+pub struct Records {
+    path: PathBuf,
+    db: sled::Db,
+    generations: sled::Tree,
+    used: sled::Tree,
+}
+
+impl Records {
+    /// Opens the records, or makes them; holds the lock until dropped.
+    ///
+    /// # Errors
+    /// [`RecordsError`]; so for every operation here.
+    pub fn open(path: &Path) -> Result<Self, RecordsError> {
+        let config = sled::Config::new().path(path).cache_capacity(CACHE_BYTES).flush_every_ms(None);
+        let opened = config.open().and_then(|db| {
+            let (generations, used) = (db.open_tree("generations")?, db.open_tree("used")?);
+            Ok((db, generations, used))
+        });
+        let path = path.to_owned();
+        match opened {
+            Ok((db, generations, used)) => Ok(Self { path, db, generations, used }),
+            // sled has no variant of its own for this.
+            Err(sled::Error::Io(e)) if e.to_string().contains("could not acquire lock") => {
+                Err(RecordsError::Busy { path })
+            }
+            Err(source) => Err(RecordsError::Database { path, source }),
+        }
+    }
+
+    /// Returns what the last fetch was asked for.
+    pub fn last(&self) -> Result<Option<LastFetch>, RecordsError> {
+        let bytes = self.db.get("last").map_err(|e| self.database(e))?;
+        bytes.map(|bytes| serde_json::from_slice(&bytes).map_err(|_| self.damaged("last"))).transpose()
+    }
+
+    /// Returns the accepted key.
+    pub fn key(&self) -> Result<Option<Hash32>, RecordsError> {
+        let bytes = self.db.get("key").map_err(|e| self.database(e))?;
+        bytes.map(|b| b.as_ref().try_into().map(Hash32).map_err(|_| self.damaged("key"))).transpose()
+    }
+
+    /// Returns the highest generation seen of a scene signed by a key.
+    pub fn highest_generation(&self, key: Hash32, scene: &str) -> Result<Option<u64>, RecordsError> {
+        self.number(&self.generations, &generation_name(key, scene), "generations")
+    }
+
+    /// Returns the number of the last fetch that needed a shard; 0 if none is known.
+    pub fn last_used(&self, shard: Hash32) -> Result<u64, RecordsError> {
+        Ok(self.number(&self.used, &shard.0, "used")?.unwrap_or(0))
+    }
+
+    /// Records durably that a manifest was accepted, and for which request.
+    pub fn accept(
+        &self,
+        last: &LastFetch,
+        key: Hash32,
+        scene: &str,
+        generation: u64,
+    ) -> Result<(), RecordsError> {
+        let last = serde_json::to_vec(last).map_err(|_| self.damaged("last"))?;
+        let write = || {
+            self.db.insert("last", last)?;
+            self.db.insert("key", &key.0)?;
+            self.generations.insert(generation_name(key, scene), &generation.to_le_bytes())?;
+            self.db.flush()
+        };
+        write().map(drop).map_err(|e| self.database(e))
+    }
+
+    /// Records which shards a fetch needed and which it freed.
+    pub fn finish(
+        &self,
+        needed: impl Iterator<Item = Hash32>,
+        freed: impl Iterator<Item = Hash32>,
+    ) -> Result<(), RecordsError> {
+        let count = self.number(&self.db, b"fetches", "fetches")?.unwrap_or(0).saturating_add(1);
+        let write = || {
+            self.db.insert("fetches", &count.to_le_bytes())?;
+            for hash in needed {
+                self.used.insert(hash.0, &count.to_le_bytes())?;
+            }
+            for hash in freed {
+                self.used.remove(hash.0)?;
+            }
+            self.db.flush()
+        };
+        write().map(drop).map_err(|e| self.database(e))
+    }
+
+    fn number(
+        &self,
+        tree: &sled::Tree,
+        name: &[u8],
+        record: &'static str,
+    ) -> Result<Option<u64>, RecordsError> {
+        let bytes = tree.get(name).map_err(|e| self.database(e))?;
+        bytes
+            .map(|b| b.as_ref().try_into().map(u64::from_le_bytes).map_err(|_| self.damaged(record)))
+            .transpose()
+    }
+
+    fn database(&self, source: sled::Error) -> RecordsError {
+        RecordsError::Database { path: self.path.clone(), source }
+    }
+
+    fn damaged(&self, record: &'static str) -> RecordsError {
+        RecordsError::Damaged { path: self.path.clone(), record }
+    }
+}
+
+fn generation_name(key: Hash32, scene: &str) -> Vec<u8> {
+    [&key.0, scene.as_bytes()].concat()
+}

@@ -1,0 +1,243 @@
+//! The robot's own HTTP service: questions, status, health and metrics.
+
+mod metrics;
+mod params;
+mod problem;
+mod serve;
+
+use std::any::Any;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use axum::extract::rejection::QueryRejection;
+use axum::extract::{Query, Request, State};
+use axum::http::{HeaderValue, Method, Uri, header};
+use axum::middleware::{Next, from_fn_with_state};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use axum::{Json, Router};
+use serde_json::json;
+use tokio::sync::{Semaphore, watch};
+use tower_http::catch_panic::CatchPanicLayer;
+
+pub use problem::Problem;
+pub use serve::serve;
+
+use crate::query::{Engine, RequestError, Status};
+use metrics::Metrics;
+
+const HELP: &str = "slag-edge answers where things are.
+
+GET /query?text=chair   clusters of Gaussians that match, best first
+    limit=10            most answers
+    threshold=0.1       cosine from which a Gaussian matches (default: the scene's)
+    near=x,y,z          rank by distance too
+    radius=r            only within r of near
+    level=clusters      or gaussians
+    voxel=v             edge of the voxels that join Gaussians to clusters
+    min_count=n         smaller clusters are dropped
+GET /status             scene, generation, encoder, shards
+GET /healthz            the process lives
+GET /readyz             a scene is loaded and fits the text model
+GET /metrics            Prometheus
+";
+
+/// The paths there are.
+const ROUTES: [&str; 6] = ["/", "/query", "/status", "/healthz", "/readyz", "/metrics"];
+
+/// What the service may use.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Queries at a time; more are turned away.
+    pub max_queries: usize,
+    /// Connections at a time; more wait to be accepted.
+    pub max_connections: usize,
+    /// An answer takes no longer.
+    pub query_timeout: Duration,
+    /// A request's head takes no longer to arrive; a connection idles no longer.
+    pub header_timeout: Duration,
+    /// After a stop signal, requests under way have so long.
+    pub drain: Duration,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            max_queries: 32,
+            max_connections: 256,
+            query_timeout: Duration::from_secs(10),
+            header_timeout: Duration::from_secs(30),
+            drain: Duration::from_secs(5),
+        }
+    }
+}
+
+/// The service's state.
+pub struct App {
+    engine: Engine,
+    settings: Settings,
+    permits: Arc<Semaphore>,
+    metrics: Metrics,
+    is_reloading: AtomicBool,
+    n_reload_attempts: watch::Sender<u64>,
+    n_requests: AtomicU64,
+}
+
+impl App {
+    /// Wraps an engine; what it has loaded is served, and what is fetched later replaces it.
+    pub fn new(engine: Engine, settings: Settings) -> Arc<Self> {
+        Arc::new(Self {
+            engine,
+            permits: Arc::new(Semaphore::new(settings.max_queries)),
+            settings,
+            metrics: Metrics::default(),
+            is_reloading: AtomicBool::new(false),
+            n_reload_attempts: watch::Sender::new(0),
+            n_requests: AtomicU64::new(0),
+        })
+    }
+
+    /// Returns a counter of finished attempts to load another generation.
+    pub fn reload_attempts(&self) -> watch::Receiver<u64> {
+        self.n_reload_attempts.subscribe()
+    }
+
+    /// Starts loading in the background if the cache changed and nobody does yet. One `stat` call.
+    fn reload_if_stale(self: &Arc<Self>) {
+        if !self.engine.is_stale() || self.is_reloading.swap(true, Ordering::AcqRel) {
+            return;
+        }
+        let app = Arc::clone(self);
+        tokio::task::spawn_blocking(move || {
+            let counter = match app.engine.reload() {
+                Ok(()) => &app.metrics.reloads,
+                Err(error) => {
+                    tracing::warn!("the newest generation does not open: {:#}", anyhow::Error::from(error));
+                    &app.metrics.reload_failures
+                }
+            };
+            counter.fetch_add(1, Ordering::Relaxed);
+            app.is_reloading.store(false, Ordering::Release);
+            app.n_reload_attempts.send_modify(|n| *n += 1);
+        });
+    }
+}
+
+/// Returns the service's routes.
+pub fn router(app: Arc<App>) -> Router {
+    Router::new()
+        .route("/", get(|| async { HELP }))
+        .route("/query", get(query))
+        .route("/status", get(status))
+        .route("/healthz", get(|| async { "alive\n" }))
+        .route("/readyz", get(ready))
+        .route("/metrics", get(metrics))
+        .fallback(|uri: Uri| async move { Problem::not_found(uri.path()) })
+        .method_not_allowed_fallback(
+            |method: Method| async move { Problem::method_not_allowed(method.as_str()) },
+        )
+        .layer(CatchPanicLayer::custom(|panic: Box<dyn Any + Send>| {
+            Problem::internal(&panic_text(&*panic)).into_response()
+        }))
+        .layer(from_fn_with_state(Arc::clone(&app), observe))
+        .with_state(app)
+}
+
+fn panic_text(panic: &(dyn Any + Send)) -> String {
+    let text = panic.downcast_ref::<&str>().copied().or(panic.downcast_ref::<String>().map(String::as_str));
+    format!("panic: {}", text.unwrap_or("of an unknown kind"))
+}
+
+/// Gives each request an id, logs it, and counts its response.
+async fn observe(State(app): State<Arc<App>>, request: Request, next: Next) -> Response {
+    let started = Instant::now();
+    let id = app.n_requests.fetch_add(1, Ordering::Relaxed) + 1;
+    // Only our own paths become labels: a scanner must not fill the metrics.
+    let route = ROUTES.into_iter().find(|route| *route == request.uri().path()).unwrap_or("other");
+    let mut response = next.run(request).await;
+    let status = response.status().as_u16();
+    app.metrics.count_response(route, status);
+    if route == "/query" {
+        app.metrics.observe_query(started.elapsed());
+    }
+    tracing::debug!(id, route, status, took = ?started.elapsed(), "request");
+    response.headers_mut().insert("x-request-id", HeaderValue::from(id));
+    response
+}
+
+/// Runs what blocks or computes off the async threads.
+async fn blocking<T: Send + 'static>(
+    app: &Arc<App>,
+    work: impl FnOnce(&Arc<App>) -> Result<T, Problem> + Send + 'static,
+) -> Result<T, Problem> {
+    let app = Arc::clone(app);
+    tokio::task::spawn_blocking(move || work(&app)).await.unwrap_or_else(|e| Err(Problem::internal(&e)))
+}
+
+async fn query(
+    State(app): State<Arc<App>>,
+    pairs: Result<Query<Vec<(String, String)>>, QueryRejection>,
+) -> Result<Response, Problem> {
+    let Query(pairs) =
+        pairs.map_err(|e| RequestError::new("query string", &e.body_text(), "name=value pairs"))?;
+    let request = params::parse(&pairs)?;
+    request.check()?;
+    let permit = Arc::clone(&app.permits)
+        .try_acquire_owned()
+        .map_err(|_| Problem::overloaded(app.settings.max_queries))?;
+    let answering = blocking(&app, move |app| {
+        // Held until the work is done, even if nobody waits for it any more.
+        let _permit = permit;
+        app.reload_if_stale();
+        let answers = app.engine.answer(&request)?;
+        app.metrics.empty_answers.fetch_add(u64::from(answers.answers.is_empty()), Ordering::Relaxed);
+        serde_json::to_vec(&answers).map_err(|e| Problem::internal(&e))
+    });
+    let limit = app.settings.query_timeout;
+    let body = tokio::time::timeout(limit, answering).await.map_err(|_| Problem::timeout(limit))??;
+    Ok(([(header::CONTENT_TYPE, HeaderValue::from_static("application/json"))], body).into_response())
+}
+
+async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Problem> {
+    blocking(&app, |app| {
+        app.reload_if_stale();
+        let snapshot = app.engine.snapshot()?;
+        app.engine.check_encoder(&snapshot)?;
+        if app.engine.text_is_alive() {
+            Ok("ready\n")
+        } else {
+            Err(Problem::internal(&"the text model has stopped"))
+        }
+    })
+    .await
+}
+
+async fn status(State(app): State<Arc<App>>) -> Result<Response, Problem> {
+    blocking(&app, |app| {
+        app.reload_if_stale();
+        let snapshot = app.engine.snapshot();
+        let trouble = snapshot.as_ref().map_or_else(
+            |e| Some(e.to_string()),
+            |snapshot| app.engine.check_encoder(snapshot).err().map(|e| e.to_string()),
+        );
+        let scene = snapshot.ok().map(|snapshot| Status::of(&snapshot));
+        let is_ready = trouble.is_none() && app.engine.text_is_alive();
+        let version = env!("CARGO_PKG_VERSION");
+        let text_model = app.engine.encoder();
+        Ok(Json(json!({
+            "version": version, "is_ready": is_ready, "trouble": trouble, "text_model": text_model, "scene": scene,
+        }))
+        .into_response())
+    })
+    .await
+}
+
+async fn metrics(State(app): State<Arc<App>>) -> Response {
+    let in_flight = app.settings.max_queries - app.permits.available_permits();
+    let text = app.metrics.render(in_flight, app.engine.snapshot().ok().as_deref());
+    ([(header::CONTENT_TYPE, HeaderValue::from_static("text/plain; version=0.0.4"))], text).into_response()
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,350 @@
+use axum::body::{Body, to_bytes};
+use axum::http::{HeaderMap, StatusCode};
+use glam::DVec3;
+use serde_json::Value;
+use tempfile::TempDir;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::oneshot;
+use tower::ServiceExt;
+
+use super::*;
+use crate::store::EdgeCache;
+use crate::testing::{BuiltShard, Gate, Member, TestShard, axes_service, open_gate, write_cache};
+use slag_common::Hash32;
+
+struct Service {
+    dir: TempDir,
+    app: Arc<App>,
+    gate: Gate,
+}
+
+/// 20 Gaussians of axis 0 at x = 3, in a space of 3 axes.
+fn chair(encoder_id: Option<Hash32>) -> [BuiltShard; 1] {
+    let member = |i: u16| Member { steps: [i, 0, 0], embedding: vec![1.0, 0.0, 0.0] };
+    let shard = TestShard::new(vec![(0..20).map(member).collect()]);
+    let encoder_id = encoder_id.unwrap_or(shard.encoder_id);
+    [TestShard { origin: DVec3::new(3.0, 0.0, 0.0), encoder_id, ..shard }.build(false)]
+}
+
+impl Service {
+    /// Serves a cache with generation 1, or an empty one.
+    fn new(shards: Option<&[BuiltShard]>, settings: Settings) -> Self {
+        let dir = tempfile::tempdir().expect("a folder");
+        if let Some(shards) = shards {
+            write_cache(dir.path(), shards, 1);
+        }
+        let gate = Gate::default();
+        let (text, _) = axes_service(3, Arc::clone(&gate));
+        let engine = Engine::new(EdgeCache::open(dir.path()), text);
+        assert_eq!(engine.reload().is_ok(), shards.is_some());
+        Self { dir, app: App::new(engine, settings), gate }
+    }
+
+    fn with_chair() -> Self {
+        Self::new(Some(&chair(None)), Settings::default())
+    }
+
+    fn send(&self, method: &str, uri: &str) -> impl Future<Output = Response> + use<> {
+        let request = Request::builder().method(method).uri(uri).body(Body::empty()).expect("a request");
+        let router = router(Arc::clone(&self.app));
+        async move { router.oneshot(request).await.expect("infallible") }
+    }
+
+    async fn get(&self, uri: &str) -> (StatusCode, HeaderMap, Value) {
+        read(self.send("GET", uri).await).await
+    }
+}
+
+async fn read(response: Response) -> (StatusCode, HeaderMap, Value) {
+    let (head, body) = response.into_parts();
+    let bytes = to_bytes(body, 1 << 20).await.expect("a body");
+    let text = String::from_utf8_lossy(&bytes).into_owned();
+    (head.status, head.headers, serde_json::from_slice(&bytes).unwrap_or(Value::String(text)))
+}
+
+/// Lets a request run until it waits for its answer.
+async fn start(response: &mut std::pin::Pin<Box<impl Future<Output = Response>>>) {
+    tokio::select! {
+        biased;
+        _ = response => panic!("must wait"),
+        () = std::future::ready(()) => {}
+    }
+}
+
+#[tokio::test]
+async fn answers_questions() {
+    let service = Service::with_chair();
+    let (status, headers, body) = service.get("/query?text=0&near=3,0,4&radius=20&limit=5").await;
+    assert_eq!(
+        (status, &headers["content-type"]),
+        (StatusCode::OK, &"application/json".parse().expect("a value"))
+    );
+    let chair = &body["answers"][0];
+    assert_eq!((&chair["rank"], &chair["id"], &chair["n_gaussians"]), (&1.into(), &"1-0".into(), &20.into()));
+    assert!((chair["position_in_world"][0].as_f64().expect("a number") - 3.095).abs() < 1e-9);
+    assert!((chair["distance"].as_f64().expect("a number") - 4.001).abs() < 1e-3);
+    assert_eq!(
+        (&body["scene"], &body["generation"], &body["unit"]),
+        (&"yard".into(), &1.into(), &"m".into())
+    );
+    let (_, _, gaussians) = service.get("/query?text=0&level=gaussians&limit=3").await;
+    assert_eq!(gaussians["answers"].as_array().map(Vec::len), Some(3));
+
+    let (status, _, empty) = service.get("/query?text=1").await;
+    assert_eq!((status, &empty["answers"]), (StatusCode::OK, &serde_json::json!([])));
+    assert_eq!(empty["reason"]["kind"], "below-threshold");
+    assert!(empty["reason"]["detail"].as_str().expect("text").contains("20 searched"));
+}
+
+#[tokio::test]
+async fn refusals_are_problem_details() {
+    let service = Service::with_chair();
+    let long = format!("/query?text={}", "x".repeat(10_000));
+    let cases = [
+        ("/query", 400, "text"),
+        ("/query?text=", 400, "text"),
+        ("/query?text=%20%09", 400, "text"),
+        ("/query?text=%00%01%1b", 400, "text"),
+        (&long, 400, "text"),
+        ("/query?text=0&threshold=NaN", 400, "threshold"),
+        ("/query?text=0&threshold=2", 400, "threshold"),
+        ("/query?text=0&threshold=", 400, "threshold"),
+        ("/query?text=0&near=inf,0,0", 400, "near"),
+        ("/query?text=0&near=0,0", 400, "near"),
+        ("/query?text=0&radius=3", 400, "near"),
+        ("/query?text=0&near=0,0,0&radius=-1", 400, "radius"),
+        ("/query?text=0&near=0,0,0&radius=1e999", 400, "radius"),
+        ("/query?text=0&limit=0", 400, "limit"),
+        ("/query?text=0&limit=-1", 400, "limit"),
+        ("/query?text=0&limit=99999999999999999999", 400, "limit"),
+        ("/query?text=0&level=points", 400, "level"),
+        ("/query?text=0&voxel=0", 400, "voxel"),
+        ("/query?text=0&min_count=0", 400, "min_count"),
+        ("/query?text=0&text=1", 400, "text"),
+        ("/query?text=0&colour=red", 400, "colour"),
+        ("/query?text=sofa", 422, "text"),
+    ];
+    for (uri, status, parameter) in cases {
+        let (found, headers, body) = service.get(uri).await;
+        let shown: String = uri.chars().take(60).collect();
+        assert_eq!(found.as_u16(), status, "{shown}: {body}");
+        assert_eq!(headers["content-type"], "application/problem+json", "{shown}");
+        assert_eq!(
+            (&body["parameter"], &body["status"]),
+            (&parameter.into(), &status.into()),
+            "{shown}: {body}"
+        );
+        for member in ["type", "title", "detail", "found", "expected"] {
+            assert!(
+                body[member].as_str().is_some_and(|text| !text.is_empty() && text.len() < 200),
+                "{shown}: {body}"
+            );
+        }
+    }
+    let (_, _, unknown) = service.get("/query?text=sofa").await;
+    assert_eq!(unknown["suggestions"], serde_json::json!(["0"]));
+    let (status, headers, body) = service.get("/v1/manifest").await;
+    assert_eq!((status.as_u16(), &body["type"]), (404, &"urn:slag:problem:not-found".into()));
+    assert!(headers.contains_key("x-request-id"));
+    let (status, headers, body) = read(service.send("POST", "/query?text=0").await).await;
+    assert_eq!(
+        (status.as_u16(), &headers["content-type"]),
+        (405, &"application/problem+json".parse().expect("a value"))
+    );
+    assert_eq!((&headers["allow"], &body["status"]), (&"GET,HEAD".parse().expect("a value"), &405.into()));
+}
+
+#[tokio::test]
+async fn without_a_scene_it_lives_but_is_not_ready() {
+    let service = Service::new(None, Settings::default());
+    assert_eq!(service.get("/healthz").await.0, StatusCode::OK);
+    assert_eq!(service.get("/").await.0, StatusCode::OK);
+    for uri in ["/readyz", "/query?text=0"] {
+        let (status, headers, body) = service.get(uri).await;
+        assert_eq!((status.as_u16(), &body["type"]), (503, &"urn:slag:problem:no-scene".into()));
+        assert!(headers.contains_key("retry-after"));
+    }
+    let (status, _, body) = service.get("/status").await;
+    assert_eq!((status, &body["is_ready"], &body["scene"]), (StatusCode::OK, &false.into(), &Value::Null));
+}
+
+#[tokio::test]
+async fn another_encoder_is_refused_by_name() {
+    let service = Service::new(Some(&chair(Some(Hash32([8; 32])))), Settings::default());
+    let (status, _, body) = service.get("/query?text=0").await;
+    assert_eq!((status.as_u16(), &body["type"]), (409, &"urn:slag:problem:encoder-mismatch".into()));
+    assert_eq!(body["scene"]["id"], "08".repeat(32));
+    assert!(body["detail"].as_str().expect("text").contains("--models"));
+    assert_eq!(service.get("/readyz").await.0.as_u16(), 409);
+    assert_eq!(service.get("/status").await.2["is_ready"], false);
+}
+
+#[tokio::test]
+async fn too_many_questions_are_turned_away() {
+    let service = Service::new(Some(&chair(None)), Settings { max_queries: 1, ..Settings::default() });
+    let mut waiting = Box::pin(service.send("GET", "/query?text=wait"));
+    start(&mut waiting).await;
+    let (status, headers, body) = service.get("/query?text=0").await;
+    assert_eq!((status.as_u16(), &body["type"]), (503, &"urn:slag:problem:overloaded".into()));
+    assert_eq!(headers["retry-after"], "1");
+    assert_eq!(service.get("/healthz").await.0, StatusCode::OK);
+    open_gate(&service.gate);
+    assert_eq!(waiting.await.status(), StatusCode::OK);
+    assert_eq!(service.get("/query?text=0").await.0, StatusCode::OK);
+}
+
+/// Who no longer waits still counts against the limit while the work goes on.
+#[tokio::test]
+async fn a_slow_answer_is_cut_off_and_keeps_its_place() {
+    let settings =
+        Settings { max_queries: 1, query_timeout: Duration::from_millis(1), ..Settings::default() };
+    let service = Service::new(Some(&chair(None)), settings);
+    let (status, headers, body) = service.get("/query?text=wait").await;
+    assert_eq!((status.as_u16(), &body["type"]), (503, &"urn:slag:problem:timeout".into()));
+    assert!(headers.contains_key("retry-after"));
+    assert_eq!(service.get("/query?text=0").await.2["type"], "urn:slag:problem:overloaded");
+    open_gate(&service.gate);
+    let _permit = service.app.permits.acquire().await.expect("never closed");
+}
+
+#[tokio::test]
+async fn our_own_faults_are_not_explained_to_clients() {
+    let service = Service::with_chair();
+    let (status, _, body) = service.get("/query?text=panic").await;
+    assert_eq!((status.as_u16(), &body["type"]), (500, &"urn:slag:problem:internal".into()));
+    assert!(!body.to_string().contains("text model"));
+    assert_eq!(service.get("/readyz").await.0.as_u16(), 500);
+}
+
+/// The request that notices a new generation loads it in the background; a broken one changes nothing.
+#[tokio::test]
+async fn generations_are_swapped_while_questions_are_answered() {
+    let service = Service::with_chair();
+    let mut attempts = service.app.reload_attempts();
+    assert_eq!(service.get("/query?text=0").await.2["generation"], 1);
+    write_cache(service.dir.path(), &chair(None), 2);
+    let (status, _, body) = service.get("/query?text=0").await;
+    assert!(status == StatusCode::OK && [1, 2].contains(&body["generation"].as_i64().expect("a number")));
+    attempts.changed().await.expect("the service lives");
+    assert_eq!(service.get("/query?text=0").await.2["generation"], 2);
+
+    fs_err::write(service.dir.path().join("current"), b"{").expect("a file");
+    assert_eq!(service.get("/status").await.2["scene"]["generation"], 2);
+    attempts.changed().await.expect("the service lives");
+    assert_eq!(service.get("/query?text=0").await.2["generation"], 2);
+    let (_, _, metrics) = service.get("/metrics").await;
+    let metrics = metrics.as_str().expect("text");
+    assert!(
+        metrics.contains("slag_edge_reloads_total 1\n")
+            && metrics.contains("slag_edge_reload_failures_total 1\n")
+    );
+}
+
+#[tokio::test]
+async fn tells_status_and_metrics() {
+    let service = Service::with_chair();
+    service.get("/query?text=0").await;
+    service.get("/query?text=1").await;
+    service.get("/query?text=0&limit=x").await;
+    service.get("/nowhere").await;
+    let (_, _, status) = service.get("/status").await;
+    assert_eq!((&status["is_ready"], &status["trouble"]), (&true.into(), &Value::Null));
+    assert_eq!(
+        (&status["text_model"]["name"], &status["text_model"]["execution_provider"]),
+        (&"axes".into(), &"none".into())
+    );
+    let scene = &status["scene"];
+    assert_eq!(
+        (&scene["n_gaussians"], &scene["encoder_name"], &scene["metric"]),
+        (&20.into(), &"axes".into(), &true.into())
+    );
+    assert_eq!((&scene["shards"][0]["cell_id"], &scene["radius"]), (&1.into(), &50.0.into()));
+    let (_, headers, metrics) = service.get("/metrics").await;
+    assert!(headers["content-type"].to_str().expect("text").starts_with("text/plain"));
+    let metrics = metrics.as_str().expect("text");
+    for line in [
+        "slag_edge_http_requests_total{route=\"/query\",status=\"200\"} 2",
+        "slag_edge_http_requests_total{route=\"/query\",status=\"400\"} 1",
+        "slag_edge_http_requests_total{route=\"other\",status=\"404\"} 1",
+        "slag_edge_query_duration_seconds_bucket{le=\"+Inf\"} 3",
+        "slag_edge_query_duration_seconds_count 3",
+        "slag_edge_empty_answers_total 1",
+        "slag_edge_generation 1",
+        "slag_edge_gaussians 20",
+    ] {
+        assert!(metrics.lines().any(|found| found == line), "{line} is not in\n{metrics}");
+    }
+}
+
+/// Serves on a real socket; returns the address, the stop signal, and the server's end.
+async fn serve_for_real(
+    service: &Service,
+) -> (std::net::SocketAddr, oneshot::Sender<()>, tokio::task::JoinHandle<std::io::Result<()>>) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let address = listener.local_addr().expect("an address");
+    let (stop, stopped) = oneshot::channel();
+    let stopped = async { drop(stopped.await) };
+    (address, stop, tokio::spawn(serve(Arc::clone(&service.app), listener, stopped)))
+}
+
+async fn talk(address: std::net::SocketAddr, request: &str) -> TcpStream {
+    let mut stream = TcpStream::connect(address).await.expect("a connection");
+    stream.write_all(request.as_bytes()).await.expect("sent");
+    stream
+}
+
+async fn rest(mut stream: TcpStream) -> String {
+    let mut text = String::new();
+    stream.read_to_string(&mut text).await.expect("an answer");
+    text
+}
+
+const ASK_AND_WAIT: &str = "GET /query?text=wait HTTP/1.1\r\nhost: x\r\n\r\n";
+
+/// Resolves once a query is being answered.
+async fn until_in_flight(service: &Service) {
+    while service.app.permits.available_permits() == service.app.settings.max_queries {
+        tokio::task::yield_now().await;
+    }
+}
+
+#[tokio::test]
+async fn stops_gracefully() {
+    let service = Service::with_chair();
+    let (address, stop, end) = serve_for_real(&service).await;
+    let waiting = talk(address, ASK_AND_WAIT).await;
+    until_in_flight(&service).await;
+    stop.send(()).expect("the server lives");
+    open_gate(&service.gate);
+    let answer = rest(waiting).await;
+    assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("\"rank\":1"), "{answer}");
+    end.await.expect("no panic").expect("a clean end");
+    assert!(TcpStream::connect(address).await.is_err());
+}
+
+#[tokio::test]
+async fn stopping_has_a_deadline() {
+    let service =
+        Service::new(Some(&chair(None)), Settings { drain: Duration::from_millis(1), ..Settings::default() });
+    let (address, stop, end) = serve_for_real(&service).await;
+    let _waiting = talk(address, ASK_AND_WAIT).await;
+    until_in_flight(&service).await;
+    stop.send(()).expect("the server lives");
+    assert_eq!(end.await.expect("no panic").expect_err("cut off").kind(), std::io::ErrorKind::TimedOut);
+    open_gate(&service.gate);
+}
+
+#[tokio::test]
+async fn heads_are_bounded_in_size_and_time() {
+    let service = Service::new(
+        Some(&chair(None)),
+        Settings { header_timeout: Duration::from_millis(20), ..Settings::default() },
+    );
+    let (address, _stop, _end) = serve_for_real(&service).await;
+    let long = format!("GET /query?text=0 HTTP/1.1\r\nhost: x\r\ncookie: {}\r\n\r\n", "x".repeat(30_000));
+    assert!(rest(talk(address, &long).await).await.starts_with("HTTP/1.1 431"));
+    let never_ending = talk(address, "GET /query?text=0 HTTP/1.1\r\nhost: ").await;
+    // The connection is closed, with or without an answer.
+    rest(never_ending).await;
+}

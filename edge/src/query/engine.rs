@@ -1,0 +1,261 @@
+//! A cache, a text model, and the questions to them: what the HTTP service and the command line share.
+
+use std::sync::{Arc, PoisonError, RwLock};
+use std::time::{Duration, Instant};
+
+use glam::DVec3;
+use serde::Serialize;
+use slag_common::Hash32;
+use slag_common::frames::GeoReference;
+use slag_common::shard::{Profile, ShardView};
+use slag_models::EncodeError;
+
+use super::{Answers, QueryRequest, RequestError, Scene, answer};
+use crate::score::ScoreError;
+use crate::store::files::Stat;
+use crate::store::{EdgeCache, OpenShard, Snapshot, StoreError};
+use crate::text::{EncoderInfo, TextError, TextService};
+
+/// A failed load is tried again after this, even if `current` stays the same: the disk may have been
+/// full, or files too many.
+const RETRY_AFTER: Duration = Duration::from_secs(5);
+
+/// Why a question has no answer at all.
+#[derive(Debug, thiserror::Error)]
+pub enum QueryError {
+    /// The question cannot be.
+    #[error(transparent)]
+    Request(#[from] RequestError),
+    /// The text has no vector.
+    #[error(transparent)]
+    Text(#[from] TextError),
+    /// No scene is loaded.
+    #[error("no scene is loaded; run `slag-edge fetch`, or see the log if one was fetched")]
+    NoScene,
+    /// Text and scene live in different spaces.
+    #[error(
+        "the text model is {models_name} ({models_id}), the scene was encoded with {scene_name} ({scene_id}); give --models the directory of {scene_name}, or fetch a scene encoded with {models_name}"
+    )]
+    EncoderMismatch {
+        /// Name of the text model's space.
+        models_name: String,
+        /// Its identity.
+        models_id: Hash32,
+        /// Name of the scene's space.
+        scene_name: String,
+        /// Its identity.
+        scene_id: Hash32,
+    },
+    /// The shards cannot be scored.
+    #[error(transparent)]
+    Score(#[from] ScoreError),
+}
+
+impl QueryError {
+    /// Returns a stable name of the kind of error, for programs.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Request(_) | Self::Text(TextError::Encode(EncodeError::EmptyText)) => "bad-parameter",
+            Self::Text(TextError::Busy) => "overloaded",
+            Self::Text(TextError::Encode(
+                EncodeError::UnknownPhrase { .. } | EncodeError::UnknownWords { .. },
+            )) => "unknown-words",
+            Self::Text(_) => "text-model",
+            Self::NoScene => "no-scene",
+            Self::EncoderMismatch { .. } => "encoder-mismatch",
+            Self::Score(_) => "score",
+        }
+    }
+}
+
+/// What is loaded, for people and monitors.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Status {
+    /// Name of the scene.
+    pub scene: String,
+    /// Generation of the scene.
+    pub generation: u64,
+    /// BLAKE3 of the signed manifest.
+    pub manifest_hash: Hash32,
+    /// Public key that signed it.
+    pub key: Hash32,
+    /// Name of the encoder that made the embeddings.
+    pub encoder_name: String,
+    /// Its identity.
+    pub encoder_id: Hash32,
+    /// Cosine from which a Gaussian matches by default.
+    pub default_threshold: f32,
+    /// How much the shards carry.
+    pub profile: Profile,
+    /// Whether a world unit is a metre.
+    pub metric: bool,
+    /// Where the world frame lies on the earth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub geo_reference: Option<GeoReference>,
+    /// Centre of what was fetched.
+    pub centre_in_world: DVec3,
+    /// Radius of what was fetched, world units.
+    pub radius: f64,
+    /// Cells of the scene, on board or not.
+    pub n_cells_in_scene: usize,
+    /// Gaussians on board.
+    pub n_gaussians: u64,
+    /// Bytes of the shards on board.
+    pub len_bytes: u64,
+    /// The shards on board.
+    pub shards: Vec<ShardStatus>,
+}
+
+/// A shard on board.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ShardStatus {
+    /// Its cell.
+    pub cell_id: u32,
+    /// Its Gaussians.
+    pub n_gaussians: u32,
+    /// Its palette rows.
+    pub n_rows: u32,
+    /// Its length.
+    pub len_bytes: u64,
+}
+
+impl Status {
+    /// Describes a snapshot.
+    pub fn of(snapshot: &Snapshot) -> Self {
+        let Snapshot { current, manifest, .. } = snapshot;
+        let shards: Vec<ShardStatus> = snapshot
+            .shards
+            .iter()
+            .map(|shard| {
+                let header = shard.view().header;
+                let (cell_id, len_bytes) = (header.cell_id, shard.len_bytes());
+                ShardStatus { cell_id, n_gaussians: header.n_gaussians, n_rows: header.n_rows, len_bytes }
+            })
+            .collect();
+        Self {
+            scene: manifest.scene.clone(),
+            generation: manifest.generation,
+            manifest_hash: current.manifest_hash,
+            key: current.key,
+            encoder_name: manifest.encoder.name.clone(),
+            encoder_id: manifest.encoder.id,
+            default_threshold: manifest.encoder.default_threshold,
+            profile: current.profile,
+            metric: manifest.metric,
+            geo_reference: manifest.geo_reference,
+            centre_in_world: current.centre_in_world,
+            radius: current.radius,
+            n_cells_in_scene: manifest.cells.len(),
+            n_gaussians: shards.iter().map(|shard| u64::from(shard.n_gaussians)).sum(),
+            len_bytes: shards.iter().map(|shard| shard.len_bytes).sum(),
+            shards,
+        }
+    }
+}
+
+#[derive(Default)]
+struct Loaded {
+    snapshot: Option<Arc<Snapshot>>,
+    /// State of `current` at the last attempt to load it.
+    tried: Option<Stat>,
+    failed_at: Option<Instant>,
+}
+
+/// Answers questions from the newest generation of a cache.
+pub struct Engine {
+    cache: EdgeCache,
+    text: TextService,
+    loaded: RwLock<Loaded>,
+}
+
+impl Engine {
+    /// Joins a cache and a text model; nothing is loaded yet.
+    pub fn new(cache: EdgeCache, text: TextService) -> Self {
+        Self { cache, text, loaded: RwLock::default() }
+    }
+
+    /// Returns which text encoder answers.
+    pub fn encoder(&self) -> &EncoderInfo {
+        self.text.info()
+    }
+
+    /// Whether the text model runs.
+    pub fn text_is_alive(&self) -> bool {
+        self.text.is_alive()
+    }
+
+    /// Whether the cache's `current` is another than the one loaded (one `stat` call), or loading it
+    /// failed a while ago.
+    pub fn is_stale(&self) -> bool {
+        let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
+        let retry = loaded.failed_at.is_some_and(|at| at.elapsed() >= RETRY_AFTER);
+        retry || self.cache.current_stat().is_ok_and(|stat| stat != loaded.tried)
+    }
+
+    /// Opens the cache's current generation and puts it in place; questions under way keep theirs.
+    /// If it does not open, the one before stays.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub fn reload(&self) -> Result<(), StoreError> {
+        let tried = self.cache.current_stat().ok().flatten();
+        let opened = Snapshot::open(&self.cache);
+        let mut loaded = self.loaded.write().unwrap_or_else(PoisonError::into_inner);
+        match opened {
+            Ok(snapshot) => {
+                let (tried, snapshot) = (snapshot.current_stat, Some(Arc::new(snapshot)));
+                let before = std::mem::replace(&mut *loaded, Loaded { snapshot, tried, failed_at: None });
+                // Unmapping many shards takes a while: not while others wait for the lock.
+                drop(loaded);
+                drop(before);
+                Ok(())
+            }
+            Err(error) => {
+                loaded.tried = tried;
+                // An empty cache is no fault that goes away by itself.
+                loaded.failed_at = (!matches!(error, StoreError::Empty { .. })).then(Instant::now);
+                Err(error)
+            }
+        }
+    }
+
+    /// Returns the generation that is loaded.
+    ///
+    /// # Errors
+    /// [`QueryError::NoScene`].
+    pub fn snapshot(&self) -> Result<Arc<Snapshot>, QueryError> {
+        let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
+        loaded.snapshot.clone().ok_or(QueryError::NoScene)
+    }
+
+    /// Whether text model and scene share a space.
+    ///
+    /// # Errors
+    /// [`QueryError::EncoderMismatch`].
+    pub fn check_encoder(&self, snapshot: &Snapshot) -> Result<(), QueryError> {
+        let (models, scene) = (self.encoder(), &snapshot.manifest.encoder);
+        if models.id == scene.id {
+            return Ok(());
+        }
+        Err(QueryError::EncoderMismatch {
+            models_name: models.name.clone(),
+            models_id: models.id,
+            scene_name: scene.name.clone(),
+            scene_id: scene.id,
+        })
+    }
+
+    /// Answers a question from the generation that is loaded. Blocks: milliseconds of computing.
+    ///
+    /// # Errors
+    /// [`QueryError`].
+    pub fn answer(&self, request: &QueryRequest) -> Result<Answers, QueryError> {
+        request.check()?;
+        let snapshot = self.snapshot()?;
+        self.check_encoder(&snapshot)?;
+        let query = self.text.encode(&request.text)?;
+        let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(OpenShard::view).collect();
+        let fetched = (snapshot.current.centre_in_world, snapshot.current.radius);
+        Ok(answer(&Scene { shards: &shards, manifest: &snapshot.manifest, fetched }, &query, request)?)
+    }
+}

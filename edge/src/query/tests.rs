@@ -1,0 +1,164 @@
+use slag_common::frames::GeoReference;
+
+use super::*;
+use crate::testing::{BuiltShard, Member, TestShard, manifest_of, normalised};
+
+/// A cell whose single row of `n` Gaussians sits at a place, 1 cm apart, at a cosine to axis 0.
+fn thing(cell_id: u32, at: DVec3, n: u16, cosine: f32) -> TestShard {
+    let embedding = normalised(vec![cosine, (1.0 - cosine * cosine).sqrt()]);
+    let members = (0..n).map(|i| Member { steps: [i, 0, 0], embedding: embedding.clone() }).collect();
+    TestShard { cell_id, origin: at, ..TestShard::new(vec![members]) }
+}
+
+fn ask(built: &[BuiltShard], edit: impl FnOnce(&mut QueryRequest, &mut Manifest)) -> Answers {
+    let (mut request, mut manifest) = (QueryRequest::new("thing"), manifest_of(built, 7));
+    edit(&mut request, &mut manifest);
+    request.check().expect("a sound request");
+    let shards: Vec<_> = built.iter().map(BuiltShard::view).collect();
+    let scene = Scene { shards: &shards, manifest: &manifest, fetched: (DVec3::ZERO, 50.0) };
+    answer(&scene, &[1.0, 0.0], &request).expect("answers")
+}
+
+fn clusters(answers: &Answers) -> &[ClusterAnswer] {
+    let Found::Clusters(clusters) = &answers.answers else { panic!("clusters") };
+    clusters
+}
+
+fn yard() -> Vec<BuiltShard> {
+    let things = [
+        thing(3, DVec3::new(20.0, 0.0, 0.0), 100, 0.9),
+        thing(4, DVec3::new(-5.0, 0.0, 0.0), 100, 0.9),
+        thing(5, DVec3::new(0.0, 30.0, 0.0), 20, 0.7),
+        thing(6, DVec3::new(0.0, 0.0, 9.0), 4, 0.95),
+        thing(7, DVec3::new(0.0, -20.0, 0.0), 500, 0.3),
+    ];
+    things.iter().map(|thing| thing.build(false)).collect()
+}
+
+/// Oracle: the places, counts and cosines that the yard was made from, and the documented formula.
+#[test]
+fn clusters_are_ranked_nearest_best() {
+    let yard = yard();
+    let answers = ask(&yard, |_, _| ());
+    assert_eq!((answers.n_searched, answers.n_matching, answers.unit), (724, 224, "m"));
+    assert_eq!((answers.reason.as_ref(), answers.area_fetched, answers.exact), (None, None, false));
+    let found = clusters(&answers);
+    // Equal things, no place to start from: by first Gaussian. The four Gaussians are too few.
+    assert_eq!(found.iter().map(|c| c.id.as_str()).collect::<Vec<_>>(), ["3-0", "4-0", "5-0"]);
+    let clustering = answers.clustering.as_ref().expect("clusters");
+    assert_eq!((clustering.n_small_clusters, clustering.n_gaussians_in_small_clusters), (1, 4));
+    let first = &found[0];
+    assert_eq!((first.rank, first.n_gaussians, first.distance), (1, 100, None));
+    assert!((first.score - 0.9).abs() < 1e-3 && first.best_score >= first.score);
+    // 100 in a row, 1 cm apart: 2 % off either end is one Gaussian each.
+    assert!((first.position_in_world - DVec3::new(20.495, 0.0, 0.0)).length() < 1e-9);
+    assert!((first.size - DVec3::new(0.97, 0.0, 0.0)).length() < 1e-9);
+
+    let near = DVec3::new(-4.505, 0.0, 0.0);
+    let answers = ask(&yard, |request, _| request.near = Some(near));
+    let found = clusters(&answers);
+    assert_eq!(found.iter().map(|c| c.id.as_str()).collect::<Vec<_>>(), ["4-0", "3-0", "5-0"]);
+    assert!(
+        found[0].distance.is_some_and(|d| d < 1e-9)
+            && found[1].distance.is_some_and(|d| (d - 25.0).abs() < 1e-9)
+    );
+    for cluster in found {
+        let distance = cluster.position_in_world.distance(near);
+        let n = cluster.n_gaussians as f64;
+        let expected = f64::from(cluster.score - 0.5) * (1.0 + n).ln() / (1.0 + distance / 10.0);
+        assert!((f64::from(cluster.relevance) - expected).abs() < 1e-6);
+    }
+}
+
+/// Near enough, a worse thing beats a better one far away.
+#[test]
+fn distance_and_margin_are_weighed() {
+    let yard = yard();
+    let first_from =
+        |near: DVec3| clusters(&ask(&yard, |request, _| request.near = Some(near)))[0].id.clone();
+    assert_eq!(first_from(DVec3::new(0.0, 30.0, 0.0)), "5-0");
+    assert_eq!(first_from(DVec3::new(0.0, 18.0, 0.0)), "4-0");
+    // Without any margin nothing but the distance is left.
+    let score = clusters(&ask(&yard, |_, _| ()))[0].score;
+    for (x, first) in [(30.0, "3-0"), (-30.0, "4-0")] {
+        let answers = ask(&yard, |request, _| {
+            (request.threshold, request.near) = (Some(score), Some(DVec3::new(x, 0.0, 0.0)));
+        });
+        assert_eq!((clusters(&answers)[0].id.as_str(), clusters(&answers)[0].relevance), (first, 0.0));
+    }
+}
+
+#[test]
+fn empty_answers_say_why() {
+    let yard = yard();
+    let high = ask(&yard, |request, _| request.threshold = Some(0.99)).reason.expect("nothing found");
+    assert_eq!(high.kind, ReasonKind::BelowThreshold);
+    assert!(
+        high.detail.contains("724") && high.detail.contains("0.99") && high.detail.contains("0.950"),
+        "{}",
+        high.detail
+    );
+    assert_eq!(high.best_position_in_world, Some(DVec3::new(0.0, 0.0, 9.0)));
+
+    let ball = |at: DVec3, radius: f64| {
+        move |request: &mut QueryRequest, _: &mut Manifest| {
+            (request.near, request.radius) = (Some(at), Some(radius));
+        }
+    };
+    let small = ask(&yard, ball(DVec3::new(0.0, 0.0, 9.0), 2.0));
+    assert_eq!(small.reason.as_ref().expect("too small").kind, ReasonKind::ClustersTooSmall);
+    assert_eq!((small.n_matching, small.area_fetched), (4, Some(true)));
+    let nothing = ask(&yard, ball(DVec3::new(49.0, 49.0, 0.0), 2.0));
+    let reason = nothing.reason.expect("nothing there");
+    assert_eq!((reason.kind, reason.best_score), (ReasonKind::NothingThere, None));
+    assert_eq!(nothing.area_fetched, Some(false));
+    let gaussians =
+        ask(&yard, |request, _| (request.level, request.threshold) = (Level::Gaussians, Some(1.0)));
+    assert_eq!(gaussians.reason.expect("nothing found").kind, ReasonKind::BelowThreshold);
+}
+
+#[test]
+fn gaussians_come_best_then_nearest_first() {
+    let near = DVec3::new(20.355, 0.0, 0.0);
+    let answers = ask(&yard(), |request, _| {
+        (request.level, request.limit, request.near) = (Level::Gaussians, Some(7), Some(near));
+    });
+    let Found::Gaussians(found) = &answers.answers else { panic!("gaussians") };
+    let names: Vec<(u32, u32)> = found.iter().map(|g| (g.cell_id, g.index)).collect();
+    // Cell 6 has the best score, its Gaussians in order of x; then the two things tie, the near one first.
+    assert_eq!(names, [(6, 3), (6, 2), (6, 1), (6, 0), (3, 35), (3, 36), (3, 34)]);
+    assert_eq!((answers.n_matching, found[0].input_index, answers.clustering.is_none()), (224, None, true));
+}
+
+#[test]
+fn exact_shards_answer_exactly() {
+    let exact = [thing(1, DVec3::ZERO, 30, 0.7).build(true)];
+    let clusters_of = ask(&exact, |_, _| ());
+    let gaussians = ask(&exact, |request, _| request.level = Level::Gaussians);
+    assert!(clusters_of.exact && gaussians.exact && gaussians.score_error_bound < 1e-5);
+    let Found::Gaussians(found) = &gaussians.answers else { panic!("gaussians") };
+    assert_eq!((found.len(), found[2].input_index), (DEFAULT_LIMIT, Some(7)));
+}
+
+#[test]
+fn answers_carry_the_place_on_earth() {
+    let origin = Geographic { latitude_deg: 46.8, longitude_deg: -92.0, height_m: 180.0 };
+    let answers = ask(&yard(), |_, manifest| manifest.geo_reference = Some(GeoReference { origin }));
+    let north = clusters(&answers)[2].geographic.expect("geo-referenced");
+    // 30 m north; a degree of latitude has 111.2 km there.
+    assert!((north.latitude_deg - 46.8 - 30.0 / 111_200.0).abs() < 1e-6, "{north:?}");
+}
+
+#[test]
+fn voxels_of_a_scene_without_metres_follow_its_cells() {
+    let yard = yard();
+    let mut manifest = manifest_of(&yard, 1);
+    assert_eq!(default_voxel(&manifest), 0.25);
+    manifest.metric = false;
+    for (at, cell) in manifest.cells.iter_mut().enumerate() {
+        cell.bounds.max = cell.bounds.min + DVec3::new(1e3, 64.0 * (at as f64 + 1.0), 0.1);
+    }
+    assert_eq!(default_voxel(&manifest), 3.0);
+    manifest.cells.clear();
+    assert_eq!(default_voxel(&manifest), 1.0);
+}

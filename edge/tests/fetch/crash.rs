@@ -1,0 +1,182 @@
+//! Power cuts after every step, and full disks: the old generation or the new one, whole.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use slag_common::shard::Profile;
+use slag_edge::fetch::{FetchError, FetchReport};
+use slag_edge::store::{Snapshot, StoreError};
+
+use super::scene::{Published, Random};
+use super::server::{Fault, Server};
+use super::sim::SimFiles;
+use super::{Robot, assert_holds, at};
+
+/// What becomes of the records, which have their own store, at a power cut.
+const N_RECORDS_FATES: u64 = 3;
+
+fn copy_dir(from: &Path, to: &Path) {
+    fs_err::create_dir_all(to).expect("made");
+    for entry in fs_err::read_dir(from).expect("there") {
+        let entry = entry.expect("readable");
+        let target = to.join(entry.file_name());
+        match entry.file_type().expect("known").is_dir() {
+            true => copy_dir(&entry.path(), &target),
+            false => drop(fs_err::copy(entry.path(), target).expect("copied")),
+        }
+    }
+}
+
+/// Two generations, the robot's two places, and the storage after the first fetch.
+struct Trial {
+    dir: tempfile::TempDir,
+    server: Server,
+    old: Published,
+    new: Published,
+    before: SimFiles,
+}
+
+impl Trial {
+    fn new() -> Self {
+        let dir = tempfile::tempdir().expect("temporary folder");
+        let (old, new) = (Published::new(1, &[0; 7], 150), Published::new(2, &[0, 0, 5, 0, 5, 0, 0], 150));
+        let server = Server::start(old.clone());
+        let files = Arc::new(SimFiles::default());
+        let robot = Robot::on_sim(dir.path(), files.clone(), &server.url());
+        robot.fetch().expect("works");
+        assert_holds(&robot.snapshot(), &old, 0..3);
+        server.publish(new.clone());
+        copy_dir(&dir.path().join("cache/db"), &dir.path().join("db-before"));
+        Self { dir, server, old, new, before: files.fork(None, 0) }
+    }
+
+    /// Puts the records back to what they were before the fetch, or loses them, or leaves them.
+    fn settle_records(&self, fate: u64) {
+        let db = self.dir.path().join("cache/db");
+        if fate > 0 && db.exists() {
+            fs_err::remove_dir_all(&db).expect("there");
+        }
+        if fate == 1 {
+            copy_dir(&self.dir.path().join("db-before"), &db);
+        }
+    }
+
+    /// Moves to cells 1..5 (and frees cell 0) under the new generation.
+    fn fetch(&self, files: &Arc<SimFiles>, parallel: usize) -> (Robot, Result<FetchReport, FetchError>) {
+        let mut robot = Robot::on_sim(self.dir.path(), files.clone(), &self.server.url());
+        robot.request.at = Some(at(30.0));
+        robot.request.radius = 15.0;
+        robot.request.max_bytes = Some(self.new.bytes(1..5));
+        robot.request.parallel = parallel;
+        robot.limits.attempts = 20;
+        let result = robot.fetch();
+        (robot, result)
+    }
+
+    /// Cuts the power at a step, and returns whether the new generation was visible afterwards.
+    fn cut(&self, step: u64, seed: u64, parallel: usize) -> bool {
+        let context = format!("step {step} seed {seed} parallel {parallel}");
+        self.settle_records(1);
+        let files = Arc::new(self.before.fork(Some(step), seed));
+        let (_, result) = self.fetch(&files, parallel);
+        assert!(result.is_err(), "{context}: the cut came too late");
+        self.settle_records(seed % N_RECORDS_FATES);
+
+        let files = Arc::new(files.after_power_cut(seed));
+        let robot = Robot::on_sim(self.dir.path(), files.clone(), &self.server.url());
+        let snapshot = Snapshot::open(&robot.cache).unwrap_or_else(|e| panic!("{context}: {e}: {:?}", e));
+        let is_new = snapshot.manifest.generation == 2;
+        match is_new {
+            true => assert_holds(&snapshot, &self.new, 1..5),
+            false => assert_holds(&snapshot, &self.old, 0..3),
+        }
+
+        let (robot, result) = self.fetch(&files, parallel);
+        result.unwrap_or_else(|e| panic!("{context}: the next fetch: {e}: {e:?}"));
+        assert_holds(&robot.snapshot(), &self.new, 1..5);
+        let mut expected: Vec<_> = (1..5).map(|id| self.new.hash(id, Profile::Compact)).collect();
+        expected.sort();
+        assert_eq!(robot.shards(), expected, "{context}: orphans");
+        assert!(robot.staged().is_empty(), "{context}: {:?}", robot.staged());
+        is_new
+    }
+}
+
+#[test]
+fn a_power_cut_at_any_step_leaves_a_whole_generation() {
+    let trial = Trial::new();
+    let files = Arc::new(trial.before.fork(None, 0));
+    trial.fetch(&files, 1).1.expect("works");
+    let n_steps = files.n_steps();
+    let mut n_new = 0;
+    for step in 1..=n_steps {
+        for seed in 0..6 {
+            n_new += u64::from(trial.cut(step, step * 100 + seed, 1));
+        }
+    }
+    assert!(n_new > 0 && n_new < n_steps * 6, "{n_new} of {n_steps} steps: both outcomes are seen");
+}
+
+/// Also with a server that breaks connections, and with several downloads at a time.
+#[test]
+fn random_power_cuts_under_faults() {
+    let trial = Trial::new();
+    for seed in 0..100 {
+        let mut random = Random(seed);
+        let mut faults = Random(seed);
+        trial.server.faults(move |_| match faults.below(6) {
+            0 => Fault::Cut(faults.below(1200) as usize),
+            1 => Fault::Status(503),
+            _ => Fault::None,
+        });
+        // Fewer than the steps of a fetch without faults, so the cut always comes.
+        trial.cut(1 + random.below(25), seed, 3);
+    }
+}
+
+/// The very first fetch: nothing, or the whole generation.
+#[test]
+fn a_power_cut_in_the_first_fetch() {
+    let scene = Published::new(1, &[0; 3], 100);
+    let server = Server::start(scene.clone());
+    for step in 1.. {
+        let dir = tempfile::tempdir().expect("temporary folder");
+        let files = Arc::new(SimFiles::default().fork(Some(step), step));
+        if Robot::on_sim(dir.path(), files.clone(), &server.url()).fetch().is_ok() {
+            assert!(step > 10);
+            break;
+        }
+        let robot = Robot::on_sim(dir.path(), Arc::new(files.after_power_cut(step)), &server.url());
+        match Snapshot::open(&robot.cache) {
+            Ok(snapshot) => assert_holds(&snapshot, &scene, 0..3),
+            Err(e) => assert!(matches!(e, StoreError::Empty { .. }), "step {step}: {e}"),
+        }
+        robot.fetch().unwrap_or_else(|e| panic!("step {step}: {e}"));
+        assert_holds(&robot.snapshot(), &scene, 0..3);
+    }
+}
+
+#[test]
+fn a_full_disk_leaves_the_old_generation() {
+    let trial = Trial::new();
+    let used_bytes = trial.before.used_bytes();
+    for room_bytes in (0..).step_by(700) {
+        trial.settle_records(1);
+        let files = Arc::new(trial.before.fork(None, 0));
+        files.limit(Some(used_bytes + room_bytes));
+        let (robot, result) = trial.fetch(&files, 2);
+        match result {
+            Ok(_) => {
+                assert!(room_bytes > 1000);
+                break;
+            }
+            Err(FetchError::DiskFull { .. }) => {
+                assert_holds(&robot.snapshot(), &trial.old, 0..3);
+                assert!(robot.staged().is_empty(), "the space is given back");
+            }
+            Err(e) => panic!("room for {room_bytes}: {e}"),
+        }
+        files.limit(None);
+        trial.fetch(&files, 2).1.expect("there is room again");
+    }
+}

@@ -1,0 +1,108 @@
+//! Fetch and store against a real HTTP server that misbehaves, and storage that loses power.
+
+mod crash;
+mod hostile;
+mod scene;
+mod server;
+mod sim;
+mod sync;
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
+
+use glam::DVec3;
+use slag_common::Hash32;
+use slag_edge::fetch::{
+    Environment, FetchError, FetchReport, FetchRequest, NetworkLimits, Position, Progress, fetch,
+};
+use slag_edge::store::{EdgeCache, Snapshot};
+
+use scene::{NOW, Published};
+use sim::SimFiles;
+
+/// Fetches with a small patience, as tests want it.
+struct Robot {
+    cache: EdgeCache,
+    request: FetchRequest,
+    now_unix_secs: u64,
+    limits: NetworkLimits,
+}
+
+impl Robot {
+    fn new(cache: EdgeCache, from: &str) -> Self {
+        let limits = NetworkLimits {
+            attempts: 3,
+            first_backoff: Duration::from_millis(1),
+            longest_backoff: Duration::from_millis(4),
+            read_timeout: Duration::from_secs(5),
+            chunk_bytes: 512,
+            ..NetworkLimits::default()
+        };
+        let request = FetchRequest {
+            from: Some(from.to_owned()),
+            at: Some(at(5.0)),
+            radius: 20.0,
+            parallel: 1,
+            ..FetchRequest::default()
+        };
+        Self { cache, request, now_unix_secs: NOW, limits }
+    }
+
+    fn on_disk(dir: &Path, from: &str) -> Self {
+        Self::new(EdgeCache::open(dir.join("cache")), from)
+    }
+
+    fn on_sim(dir: &Path, files: Arc<SimFiles>, from: &str) -> Self {
+        Self::new(EdgeCache::with_files(dir.join("cache"), files), from)
+    }
+
+    fn fetch(&self) -> Result<FetchReport, FetchError> {
+        self.fetch_watched(&(), &AtomicBool::new(false))
+    }
+
+    fn fetch_watched(&self, progress: &dyn Progress, cancel: &AtomicBool) -> Result<FetchReport, FetchError> {
+        let environment = Environment {
+            now_unix_secs: self.now_unix_secs,
+            cancel,
+            progress,
+            random: &|| 0.5,
+            limits: self.limits.clone(),
+        };
+        fetch(&self.cache, &self.request, &environment)
+    }
+
+    fn snapshot(&self) -> Snapshot {
+        Snapshot::open(&self.cache).expect("a whole generation")
+    }
+
+    /// Returns the names in `shards/`.
+    fn shards(&self) -> Vec<Hash32> {
+        let names = self.cache.files().list(&self.cache.dir().join("shards")).expect("there");
+        names.iter().map(|name| name.parse().expect("a hash")).collect()
+    }
+
+    fn staged(&self) -> Vec<String> {
+        self.cache.files().list(&self.cache.dir().join("staging")).expect("there")
+    }
+}
+
+fn at(x: f64) -> Position {
+    Position::World(DVec3::new(x, 0.0, 105.0))
+}
+
+/// Checks that a snapshot holds exactly these cells of a scene, byte for byte.
+fn assert_holds(snapshot: &Snapshot, published: &Published, cell_ids: std::ops::Range<u32>) {
+    let found: Vec<u32> = snapshot.shards.iter().map(|shard| shard.cell.cell_id).collect();
+    assert_eq!(found, cell_ids.collect::<Vec<_>>());
+    assert_eq!(snapshot.manifest, published.manifest);
+    for (shard, at) in snapshot.shards.iter().zip(&snapshot.current.cells) {
+        let expected = &published.objects[&published.hash(at.cell_id, snapshot.current.profile)];
+        assert_eq!(shard.len_bytes(), expected.len() as u64);
+        let aligned = slag_common::container::AlignedBytes::copy_of(expected);
+        let layout = slag_common::shard::ShardLayout::check(&aligned).expect("sound");
+        assert_eq!(shard.view().positions, layout.view(&aligned).positions);
+        assert_eq!(shard.view().header, layout.view(&aligned).header);
+    }
+}

@@ -1,0 +1,148 @@
+//! Small published scenes: a row of cells, 10 wide, along x.
+
+use std::collections::BTreeMap;
+
+use ed25519_dalek::SigningKey;
+use glam::DVec3;
+use half::f16;
+use slag_common::Hash32;
+use slag_common::frames::{Aabb, GeoReference};
+use slag_common::manifest::{CellRecord, EncoderRecord, Manifest, ShardRecord, VERSION};
+use slag_common::shard::{Profile, ShardHeader, ShardParts};
+
+pub const DIM: u32 = 4;
+pub const ENCODER: Hash32 = Hash32([9; 32]);
+pub const NOW: u64 = 1_800_000_000;
+
+/// SplitMix64 (Steele et al. 2014): enough to be irregular.
+pub struct Random(pub u64);
+
+impl Random {
+    pub fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+
+    pub fn below(&mut self, n: u64) -> u64 {
+        self.next() % n
+    }
+}
+
+pub fn key(seed: u8) -> SigningKey {
+    SigningKey::from_bytes(&[seed; 32])
+}
+
+pub fn public(key: &SigningKey) -> Hash32 {
+    Hash32(key.verifying_key().to_bytes())
+}
+
+/// A scene as a store has it.
+#[derive(Clone)]
+pub struct Published {
+    pub manifest: Manifest,
+    pub signed: Vec<u8>,
+    pub objects: BTreeMap<Hash32, Vec<u8>>,
+}
+
+/// What distinguishes one shard's content from another's.
+pub struct ShardSpec {
+    pub cell_id: u32,
+    pub content: u64,
+    pub n_gaussians: u32,
+    pub encoder: Hash32,
+    pub is_exact: bool,
+}
+
+pub fn bounds(cell_id: u32) -> Aabb {
+    let min = DVec3::new(f64::from(cell_id) * 10.0, -5.0, 100.0);
+    Aabb { min, max: min + DVec3::splat(10.0) }
+}
+
+pub fn shard(spec: &ShardSpec) -> Vec<u8> {
+    let mut random = Random(spec.content ^ u64::from(spec.cell_id) << 32);
+    let (n, box_) = (spec.n_gaussians, bounds(spec.cell_id));
+    let header = ShardHeader {
+        cell_id: spec.cell_id,
+        n_gaussians: n,
+        n_rows: 1,
+        dim: DIM,
+        origin_in_world: box_.min.into(),
+        position_step: [1e-4; 3],
+        box_min: box_.min.into(),
+        box_max: box_.max.into(),
+        encoder_id: spec.encoder.0,
+    };
+    let positions: Vec<[u16; 3]> = (0..n).map(|_| [(); 3].map(|()| random.next() as u16)).collect();
+    let indices: Vec<u32> = (0..n).collect();
+    let embeddings = vec![f16::from_f32(0.5); (n * DIM) as usize];
+    let mut out = Vec::new();
+    let parts = ShardParts {
+        header,
+        positions: &positions,
+        row_starts: &[0, n],
+        palette: &[f16::from_f32(0.5); DIM as usize],
+        radii: &[0.1],
+        exact: spec.is_exact.then_some((&indices, &embeddings)),
+    };
+    parts.write(&mut out).expect("writes to memory");
+    out
+}
+
+impl Published {
+    /// Publishes cells `0..contents.len()` in both profiles; equal content numbers give equal shards.
+    pub fn new(generation: u64, contents: &[u64], n_gaussians: u32) -> Self {
+        let mut objects = BTreeMap::new();
+        let cells = (0u32..).zip(contents).map(|(cell_id, content)| {
+            let shards = [Profile::Compact, Profile::Exact].map(|profile| {
+                let is_exact = profile == Profile::Exact;
+                let spec = ShardSpec { cell_id, content: *content, n_gaussians, encoder: ENCODER, is_exact };
+                let bytes = shard(&spec);
+                let (hash, len_bytes) = (Hash32::of(&bytes), bytes.len() as u64);
+                objects.insert(hash, bytes);
+                let record =
+                    ShardRecord { hash, len_bytes, n_rows: 1, score_error_bound: 0.1, position_error: 5e-5 };
+                (profile, record)
+            });
+            CellRecord { cell_id, bounds: bounds(cell_id), n_gaussians, shards: BTreeMap::from(shards) }
+        });
+        let manifest = Manifest {
+            version: VERSION,
+            scene: "yard".into(),
+            generation,
+            created_unix_secs: NOW - 1000,
+            expires_unix_secs: Some(NOW + 1000),
+            metric: true,
+            geo_reference: Some(GeoReference {
+                origin: slag_common::frames::Geographic {
+                    latitude_deg: 46.8,
+                    longitude_deg: -91.9,
+                    height_m: 150.0,
+                },
+            }),
+            encoder: EncoderRecord { name: "e".into(), id: ENCODER, dim: DIM, default_threshold: 0.1 },
+            n_gaussians: u64::from(n_gaussians) * contents.len() as u64,
+            n_without_evidence: 0,
+            n_rejected: 0,
+            cells: cells.collect(),
+        };
+        Self { signed: manifest.sign(&key(1)), manifest, objects }
+    }
+
+    /// Changes the manifest and signs it again.
+    pub fn edited(mut self, signer: &SigningKey, edit: impl FnOnce(&mut Manifest)) -> Self {
+        edit(&mut self.manifest);
+        self.signed = self.manifest.sign(signer);
+        self
+    }
+
+    pub fn hash(&self, cell_id: u32, profile: Profile) -> Hash32 {
+        self.manifest.cells[cell_id as usize].shards[&profile].hash
+    }
+
+    pub fn bytes(&self, cell_ids: std::ops::Range<u32>) -> u64 {
+        cell_ids.map(|id| self.objects[&self.hash(id, Profile::Compact)].len() as u64).sum()
+    }
+}

@@ -1,0 +1,220 @@
+//! A small HTTP/1.1 server that serves a published scene and misbehaves on demand.
+
+use std::io::{BufRead, BufReader, Write};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+
+use slag_common::Hash32;
+
+use super::scene::Published;
+
+/// What to do to one request instead of answering it.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Fault {
+    None,
+    /// Closes the connection after so many body bytes.
+    Cut(usize),
+    /// Flips the body's byte there.
+    Corrupt(usize),
+    /// Answers with the whole body.
+    IgnoreRange,
+    /// Answers with this status and no body.
+    Status(u16),
+    /// Sends elsewhere.
+    Redirect(String),
+    /// Sends the body and then goes on for ever, in chunks.
+    Endless,
+    /// Announces this many bytes more than there are.
+    Length(i64),
+    /// Answers the range that begins so many bytes later.
+    ShiftedRange(usize),
+    /// Sends other bytes.
+    Instead(Vec<u8>),
+    /// Sends nothing until the client goes away.
+    Stall,
+}
+
+/// One request as it was seen.
+#[derive(Clone, Debug)]
+pub struct Seen {
+    pub path: String,
+    pub range_start: Option<usize>,
+    pub status: u16,
+    pub body_bytes: usize,
+}
+
+type Chooser = dyn FnMut(&Seen) -> Fault + Send;
+
+struct Shared {
+    published: Mutex<Published>,
+    chooser: Mutex<Box<Chooser>>,
+    seen: Mutex<Vec<Seen>>,
+    is_over: AtomicBool,
+}
+
+pub struct Server {
+    shared: Arc<Shared>,
+    address: SocketAddr,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Server {
+    pub fn start(published: Published) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
+        let address = listener.local_addr().expect("bound");
+        let shared = Arc::new(Shared {
+            published: Mutex::new(published),
+            chooser: Mutex::new(Box::new(|_| Fault::None)),
+            seen: Mutex::default(),
+            is_over: AtomicBool::new(false),
+        });
+        let for_thread = shared.clone();
+        let thread = std::thread::spawn(move || {
+            for stream in listener.incoming() {
+                if for_thread.is_over.load(Ordering::Relaxed) {
+                    break;
+                }
+                let shared = for_thread.clone();
+                // A client that goes away mid-answer is part of the game.
+                std::thread::spawn(move || stream.map(|stream| answer(&shared, stream)));
+            }
+        });
+        Self { shared, address, thread: Some(thread) }
+    }
+
+    pub fn url(&self) -> String {
+        format!("http://{}", self.address)
+    }
+
+    pub fn publish(&self, published: Published) {
+        *self.shared.published.lock().expect("sound") = published;
+    }
+
+    /// Lets a function choose what happens to each request from now on.
+    pub fn faults(&self, chooser: impl FnMut(&Seen) -> Fault + Send + 'static) {
+        *self.shared.chooser.lock().expect("sound") = Box::new(chooser);
+    }
+
+    /// Returns the requests since the last call.
+    pub fn take_seen(&self) -> Vec<Seen> {
+        std::mem::take(&mut self.shared.seen.lock().expect("sound"))
+    }
+
+    /// Returns the requests for objects since the last call.
+    pub fn take_objects(&self) -> Vec<Seen> {
+        self.take_seen().into_iter().filter(|seen| seen.path.contains("objects")).collect()
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.shared.is_over.store(true, Ordering::Relaxed);
+        // Wakes the accept loop.
+        let woken = TcpStream::connect(self.address);
+        if let (Ok(_), Some(thread)) = (woken, self.thread.take()) {
+            thread.join().expect("the server does not panic");
+        }
+    }
+}
+
+fn answer(shared: &Shared, mut stream: TcpStream) -> std::io::Result<()> {
+    let mut reader = BufReader::new(stream.try_clone()?);
+    let mut request_line = String::new();
+    reader.read_line(&mut request_line)?;
+    let (mut range_start, mut if_range, mut if_none_match) = (None, None, None);
+    loop {
+        let mut line = String::new();
+        if reader.read_line(&mut line)? <= 2 {
+            break;
+        }
+        let Some((name, value)) = line.trim_end().split_once(": ") else { continue };
+        match name.to_ascii_lowercase().as_str() {
+            "range" => {
+                range_start =
+                    value.strip_prefix("bytes=").and_then(|v| v.strip_suffix('-')?.parse::<usize>().ok());
+            }
+            "if-range" => if_range = Some(value.to_owned()),
+            "if-none-match" => if_none_match = Some(value.to_owned()),
+            _ => {}
+        }
+    }
+    let path = request_line.split(' ').nth(1).unwrap_or_default().to_owned();
+    let content = {
+        let published = shared.published.lock().expect("sound");
+        match path.strip_prefix("/v1/objects/") {
+            Some(hash) => hash.parse().ok().and_then(|hash: Hash32| published.objects.get(&hash).cloned()),
+            None => (path == "/v1/manifest").then(|| published.signed.clone()),
+        }
+    };
+    let mut seen = Seen { path, range_start, status: 0, body_bytes: 0 };
+    let fault = shared.chooser.lock().expect("sound")(&seen);
+    let mut body = content.unwrap_or_default();
+    let etag = format!("\"{}\"", Hash32::of(&body));
+    let mut head = String::new();
+    seen.status = match (&fault, range_start) {
+        (Fault::Status(status), _) => {
+            body.clear();
+            *status
+        }
+        (Fault::Redirect(location), _) => {
+            head += &format!("Location: {location}\r\n");
+            302
+        }
+        _ if body.is_empty() => 404,
+        _ if if_none_match.as_ref() == Some(&etag) => {
+            body.clear();
+            304
+        }
+        (Fault::IgnoreRange, _) | (_, None) => 200,
+        (_, Some(_)) if if_range.as_ref() != Some(&etag) => 200,
+        (_, Some(start)) if start >= body.len() => {
+            body.clear();
+            416
+        }
+        (_, Some(start)) => {
+            let start = start + if let Fault::ShiftedRange(by) = fault { by } else { 0 };
+            head += &format!("Content-Range: bytes {start}-{}/{}\r\n", body.len() - 1, body.len());
+            body.drain(..start);
+            206
+        }
+    };
+    let mut stated = body.len() as i64;
+    let mut sent = body.len();
+    match &fault {
+        Fault::Cut(at) => sent = sent.min(*at),
+        Fault::Corrupt(at) if !body.is_empty() => {
+            let at = at % body.len();
+            body[at] ^= 0x40;
+        }
+        Fault::Length(by) => stated += by,
+        Fault::Instead(other) if seen.status == 200 => {
+            body = other.clone();
+            (stated, sent) = (body.len() as i64, body.len());
+        }
+        _ => {}
+    }
+    seen.body_bytes = sent;
+    let status = seen.status;
+    shared.seen.lock().expect("sound").push(seen);
+    if fault == Fault::Stall {
+        // Ends when the client closes.
+        return reader.read_line(&mut String::new()).map(drop);
+    }
+    let is_endless = fault == Fault::Endless && status < 300;
+    let framing = match is_endless {
+        true => "Transfer-Encoding: chunked".to_owned(),
+        false => format!("Content-Length: {stated}"),
+    };
+    write!(stream, "HTTP/1.1 {status} X\r\nConnection: close\r\nETag: {etag}\r\n{head}{framing}\r\n\r\n")?;
+    if !is_endless {
+        return stream.write_all(&body[..sent]);
+    }
+    write!(stream, "{:x}\r\n", body.len())?;
+    stream.write_all(&body)?;
+    loop {
+        stream.write_all(b"\r\n10000\r\n")?;
+        stream.write_all(&[b'x'; 0x10000])?;
+    }
+}

@@ -1,0 +1,291 @@
+//! Storage that can lose power: what was not synced is lost, torn or kept, at random.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+
+use slag_common::container::AlignedBytes;
+use slag_edge::store::files::{Files, Stat};
+use slag_edge::store::mmap::FileBytes;
+
+use super::scene::Random;
+
+/// Smallest piece of unsynced content that is lost or kept by itself.
+const SECTOR_BYTES: usize = 128;
+
+#[derive(Clone, Default)]
+struct Inode {
+    live: Vec<u8>,
+    durable: Vec<u8>,
+}
+
+/// A change of a folder that is not synced yet.
+#[derive(Clone)]
+enum Change {
+    Link {
+        path: PathBuf,
+        inode: usize,
+    },
+    /// `after`: the link of the same rename; a file is never lost by renaming it.
+    Unlink {
+        path: PathBuf,
+        after: Option<usize>,
+    },
+}
+
+impl Change {
+    fn dir(&self) -> Option<&Path> {
+        let (Self::Link { path, .. } | Self::Unlink { path, .. }) = self;
+        path.parent()
+    }
+}
+
+#[derive(Clone, Default)]
+struct State {
+    inodes: Vec<Inode>,
+    live: BTreeMap<PathBuf, usize>,
+    durable: BTreeMap<PathBuf, usize>,
+    /// By number; kept in order.
+    pending: BTreeMap<usize, Change>,
+    n_changes: usize,
+    n_steps: u64,
+    cut_at: Option<u64>,
+    is_cut: bool,
+    capacity_bytes: Option<u64>,
+    random: u64,
+}
+
+/// The simulated storage.
+#[derive(Default)]
+pub struct SimFiles(Mutex<State>);
+
+impl SimFiles {
+    /// Returns a copy that loses power at a step (counted from 1), which may or may not still happen.
+    pub fn fork(&self, cut_at: Option<u64>, seed: u64) -> Self {
+        let state = self.0.lock().expect("sound").clone();
+        Self(Mutex::new(State { n_steps: 0, cut_at, random: seed, ..state }))
+    }
+
+    pub fn n_steps(&self) -> u64 {
+        self.0.lock().expect("sound").n_steps
+    }
+
+    pub fn limit(&self, capacity_bytes: Option<u64>) {
+        self.0.lock().expect("sound").capacity_bytes = capacity_bytes;
+    }
+
+    /// Returns the bytes of all files.
+    pub fn used_bytes(&self) -> u64 {
+        self.0.lock().expect("sound").used_bytes()
+    }
+
+    /// Returns what is there after the power comes back.
+    pub fn after_power_cut(&self, seed: u64) -> Self {
+        let mut random = Random(seed);
+        let mut state = self.0.lock().expect("sound").clone();
+        let mut kept_changes = BTreeSet::new();
+        let pending = std::mem::take(&mut state.pending);
+        for (number, change) in &pending {
+            let is_possible = match change {
+                Change::Unlink { after: Some(link), .. } => {
+                    !pending.contains_key(link) || kept_changes.contains(link)
+                }
+                _ => true,
+            };
+            if is_possible && random.below(2) == 0 {
+                kept_changes.insert(*number);
+                state.apply(change);
+            }
+        }
+        for inode in &mut state.inodes {
+            if inode.live != inode.durable {
+                inode.durable = torn(inode, &mut random);
+            }
+            inode.live = inode.durable.clone();
+        }
+        state.live = state.durable.clone();
+        Self(Mutex::new(State { is_cut: false, cut_at: None, n_steps: 0, ..state }))
+    }
+}
+
+/// Returns one of the contents that an unsynced file may have.
+fn torn(inode: &Inode, random: &mut Random) -> Vec<u8> {
+    let len = match random.below(3) {
+        0 => inode.durable.len(),
+        1 => inode.live.len(),
+        _ => random.below(inode.live.len().max(inode.durable.len()) as u64 + 1) as usize,
+    };
+    let mut out = vec![0; len];
+    for start in (0..len).step_by(SECTOR_BYTES) {
+        let range = start..(start + SECTOR_BYTES).min(len);
+        let source = match random.below(3) {
+            0 => &inode.durable,
+            1 => &inode.live,
+            _ => continue,
+        };
+        for at in range {
+            out[at] = source.get(at).copied().unwrap_or(0);
+        }
+    }
+    out
+}
+
+impl State {
+    fn used_bytes(&self) -> u64 {
+        self.live.values().map(|inode| self.inodes[*inode].live.len() as u64).sum()
+    }
+
+    fn change(&mut self, change: Change) -> usize {
+        self.n_changes += 1;
+        self.pending.insert(self.n_changes, change);
+        self.n_changes
+    }
+
+    fn apply(&mut self, change: &Change) {
+        match change {
+            Change::Link { path, inode } => drop(self.durable.insert(path.clone(), *inode)),
+            Change::Unlink { path, .. } => drop(self.durable.remove(path)),
+        }
+    }
+
+    fn inode(&self, path: &Path) -> io::Result<usize> {
+        let missing = || io::Error::new(io::ErrorKind::NotFound, format!("{} is not there", path.display()));
+        self.live.get(path).copied().ok_or_else(missing)
+    }
+
+    fn check_power(&self) -> io::Result<()> {
+        if self.is_cut { Err(io::Error::other("the power is cut")) } else { Ok(()) }
+    }
+}
+
+impl SimFiles {
+    /// Takes one step, unless the power is cut; at the cut it happens or not.
+    fn step(&self, work: impl FnOnce(&mut State) -> io::Result<()>) -> io::Result<()> {
+        let mut state = self.0.lock().expect("sound");
+        state.check_power()?;
+        state.n_steps += 1;
+        if state.cut_at == Some(state.n_steps) {
+            if Random(state.random).below(2) == 0 {
+                work(&mut state)?;
+            }
+            state.is_cut = true;
+            return state.check_power();
+        }
+        work(&mut state)
+    }
+
+    fn look<T>(&self, work: impl FnOnce(&State) -> io::Result<T>) -> io::Result<T> {
+        let state = self.0.lock().expect("sound");
+        state.check_power()?;
+        work(&state)
+    }
+}
+
+impl Files for SimFiles {
+    /// Folders are always there.
+    fn create_dir(&self, _dir: &Path) -> io::Result<()> {
+        self.look(|_| Ok(()))
+    }
+
+    fn write_from(&self, path: &Path, offset_bytes: u64, bytes: &[u8]) -> io::Result<()> {
+        self.step(|state| {
+            let inode = match state.live.get(path) {
+                Some(inode) => *inode,
+                None => {
+                    state.inodes.push(Inode::default());
+                    let inode = state.inodes.len() - 1;
+                    state.live.insert(path.to_owned(), inode);
+                    state.change(Change::Link { path: path.to_owned(), inode });
+                    inode
+                }
+            };
+            state.inodes[inode].live.resize(offset_bytes as usize, 0);
+            let room =
+                state.capacity_bytes.map_or(u64::MAX, |capacity| capacity.saturating_sub(state.used_bytes()));
+            let n_fitting = bytes.len().min(room as usize);
+            state.inodes[inode].live.extend_from_slice(&bytes[..n_fitting]);
+            if n_fitting < bytes.len() {
+                return Err(io::Error::new(io::ErrorKind::StorageFull, "no space left"));
+            }
+            Ok(())
+        })
+    }
+
+    fn sync(&self, path: &Path) -> io::Result<()> {
+        self.step(|state| {
+            let inode = state.inode(path)?;
+            state.inodes[inode].durable = state.inodes[inode].live.clone();
+            Ok(())
+        })
+    }
+
+    fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        self.step(|state| {
+            let inode = state.inode(from)?;
+            state.live.remove(from);
+            state.live.insert(to.to_owned(), inode);
+            let link = state.change(Change::Link { path: to.to_owned(), inode });
+            state.change(Change::Unlink { path: from.to_owned(), after: Some(link) });
+            Ok(())
+        })
+    }
+
+    fn sync_dir(&self, dir: &Path) -> io::Result<()> {
+        self.step(|state| {
+            let here: Vec<(usize, Change)> = state
+                .pending
+                .iter()
+                .filter(|(_, change)| change.dir() == Some(dir))
+                .map(|(number, change)| (*number, change.clone()))
+                .collect();
+            for (number, change) in here {
+                let waits = matches!(change, Change::Unlink { after: Some(link), .. } if state.pending.contains_key(&link));
+                if !waits {
+                    state.apply(&change);
+                    state.pending.remove(&number);
+                }
+            }
+            Ok(())
+        })
+    }
+
+    fn remove(&self, path: &Path) -> io::Result<()> {
+        self.step(|state| {
+            if state.live.remove(path).is_some() {
+                state.change(Change::Unlink { path: path.to_owned(), after: None });
+            }
+            Ok(())
+        })
+    }
+
+    fn list(&self, dir: &Path) -> io::Result<Vec<String>> {
+        self.look(|state| {
+            let here = state.live.keys().filter(|path| path.parent() == Some(dir));
+            Ok(here.filter_map(|path| Some(path.file_name()?.to_str()?.to_owned())).collect())
+        })
+    }
+
+    fn read(&self, path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
+        self.look(|state| {
+            let bytes = &state.inodes[state.inode(path)?].live;
+            assert!(bytes.len() as u64 <= max_bytes, "{} is too long", path.display());
+            Ok(bytes.clone())
+        })
+    }
+
+    fn map(&self, path: &Path) -> io::Result<FileBytes> {
+        self.look(|state| Ok(FileBytes::Read(AlignedBytes::copy_of(&state.inodes[state.inode(path)?].live))))
+    }
+
+    fn stat(&self, path: &Path) -> io::Result<Option<Stat>> {
+        self.look(|state| {
+            let stat = |inode: &usize| Stat {
+                len_bytes: state.inodes[*inode].live.len() as u64,
+                modified: None,
+                inode: *inode as u64,
+            };
+            Ok(state.live.get(path).map(stat))
+        })
+    }
+}

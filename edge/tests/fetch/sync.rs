@@ -1,0 +1,363 @@
+//! What a fetch brings, keeps and frees when nothing goes wrong, or something passing does.
+
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+use slag_common::Hash32;
+use slag_common::shard::Profile;
+use slag_edge::fetch::{FetchError, FetchRequest, PlanError, Position, Progress, Records, RecordsError};
+use slag_edge::store::{EdgeCache, Snapshot, StoreError};
+
+use super::scene::{ENCODER, Published, Random, key, public};
+use super::server::{Fault, Server};
+use super::{Robot, assert_holds, at};
+
+#[test]
+fn the_second_fetch_brings_only_the_difference() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let first = Published::new(1, &[0; 8], 100);
+    let server = Server::start(first.clone());
+    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Empty { .. })));
+
+    // x = 5, radius 20: cells 0 (0..10), 1, 2 (20..30, 15 away).
+    let report = robot.fetch().expect("works");
+    assert_eq!((report.n_cells, report.downloaded.n_shards, report.kept.n_shards), (3, 3, 0));
+    assert_eq!(report.downloaded.bytes, first.bytes(0..3));
+    assert_eq!(
+        server.take_objects().iter().map(|seen| seen.body_bytes as u64).sum::<u64>(),
+        first.bytes(0..3)
+    );
+    assert!(report.is_first_contact && report.key == public(&key(1)) && report.generation == 1);
+    assert_holds(&robot.snapshot(), &first, 0..3);
+    let stat = robot.cache.current_stat().expect("readable");
+
+    // Nothing new: one conditional request, nothing written. Source and place are those of before.
+    robot.request = FetchRequest { from: None, at: None, ..robot.request };
+    let report = robot.fetch().expect("works");
+    assert_eq!((report.downloaded.n_shards, report.kept.n_shards, report.freed.n_shards), (0, 3, 0));
+    let seen = server.take_seen();
+    assert_eq!(seen.iter().map(|seen| seen.status).collect::<Vec<_>>(), [304]);
+    assert_eq!(robot.cache.current_stat().expect("readable"), stat);
+    assert!(!report.is_first_contact);
+
+    // A new generation changes cell 1, and the robot moves: cells 1..=4 (x = 25), cell 0 falls out.
+    let second = Published::new(2, &[0, 7, 0, 0, 0, 0, 0, 0], 100);
+    server.publish(second.clone());
+    robot.request.at = Some(at(25.0));
+    robot.request.radius = 14.0;
+    robot.request.max_bytes = Some(second.bytes(1..4));
+    let report = robot.fetch().expect("works");
+    let objects = server.take_objects();
+    let expected = [1, 3].map(|id| format!("/v1/objects/{}", second.hash(id, Profile::Compact)));
+    assert_eq!(objects.iter().map(|seen| seen.path.as_str()).collect::<Vec<_>>(), expected);
+    assert_eq!((report.kept.n_shards, report.freed.n_shards, report.spare.n_shards), (1, 2, 0));
+    assert_holds(&robot.snapshot(), &second, 1..4);
+    assert_eq!(robot.shards().len(), 3);
+    assert_ne!(robot.cache.current_stat().expect("readable"), stat);
+
+    // Back again without network: what was freed is missing; what is on board is enough further on.
+    robot.request.offline = true;
+    robot.request.at = Some(at(5.0));
+    assert!(matches!(robot.fetch(), Err(FetchError::Offline { n_shards: 1, .. })));
+    robot.request.at = Some(at(35.0));
+    robot.request.radius = 3.0;
+    assert_eq!(robot.fetch().expect("on board").n_cells, 1);
+    assert_eq!(server.take_seen().len(), 0);
+}
+
+#[test]
+fn the_least_recently_used_are_freed_first() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let scene = Published::new(1, &[0; 8], 100);
+    let server = Server::start(scene.clone());
+    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    robot.request.radius = 2.0;
+    robot.request.max_bytes = Some(scene.bytes(0..3));
+    // Visits cells 0, 1, 0, 2: the next one pushes out cell 1, not cell 0.
+    for x in [5.0, 15.0, 5.0, 25.0, 35.0] {
+        robot.request.at = Some(at(x));
+        robot.fetch().expect("works");
+    }
+    let mut expected = [0, 2, 3].map(|id| scene.hash(id, Profile::Compact));
+    expected.sort();
+    assert_eq!(robot.shards(), expected);
+    robot.request.max_bytes = Some(scene.bytes(0..1) - 1);
+    assert!(matches!(robot.fetch(), Err(FetchError::Plan(PlanError::TooLarge { n_cells: 1, .. }))));
+    robot.request.at = Some(at(500.0));
+    let error = robot.fetch().expect_err("far away").to_string();
+    assert!(error.contains("the nearest is 420.0 away"), "{error}");
+    assert_holds(&robot.snapshot(), &scene, 3..4);
+}
+
+/// Latitude and longitude of a point bring the same cells as its x, y, z.
+#[test]
+fn geographic_positions_bring_the_same_shards() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let scene = Published::new(1, &[0; 8], 10);
+    let server = Server::start(scene.clone());
+    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    robot.fetch().expect("works");
+    let Position::World(point) = at(5.0) else { unreachable!("a world position") };
+    let place = scene.manifest.geo_reference.expect("given").geographic_from_world(point);
+    for height_m in [Some(place.height_m), None] {
+        let (latitude_deg, longitude_deg) = (place.latitude_deg, place.longitude_deg);
+        robot.request.at = Some(Position::Geographic { latitude_deg, longitude_deg, height_m });
+        let report = robot.fetch().expect("works");
+        assert_eq!((report.n_cells, report.kept.n_shards), (3, 3), "{height_m:?}");
+    }
+    robot.request.profile = Profile::Exact;
+    robot.fetch().expect("works");
+    assert!(robot.snapshot().shards.iter().all(|shard| shard.view().exact.is_some()));
+}
+
+#[test]
+fn an_interrupted_download_goes_on_where_it_ended() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let scene = Published::new(1, &[0; 3], 2000);
+    let server = Server::start(scene.clone());
+    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    robot.request.radius = 2.0;
+    robot.limits.attempts = 1;
+    let len = scene.bytes(0..1) as usize;
+    let cut = len * 2 / 3;
+    server.faults(move |seen| if seen.path.contains("objects") { Fault::Cut(cut) } else { Fault::None });
+    assert!(matches!(robot.fetch(), Err(FetchError::Download { .. })));
+    assert_eq!(robot.staged().len(), 1);
+    server.take_seen();
+
+    server.faults(|_| Fault::None);
+    // The request was recorded with the accepted manifest: going on needs no repetition.
+    robot.request.from = None;
+    let report = robot.fetch().expect("works");
+    let objects = server.take_objects();
+    assert_eq!(objects.len(), 1);
+    assert_eq!(
+        (objects[0].status, objects[0].range_start, objects[0].body_bytes),
+        (206, Some(cut), len - cut)
+    );
+    assert_eq!(report.resumed_bytes, cut as u64);
+    assert_holds(&robot.snapshot(), &scene, 0..1);
+    assert!(robot.staged().is_empty());
+}
+
+/// One fault of each passing kind on every object, in one fetch: it ends well, and each retry goes on
+/// where the last one ended.
+#[test]
+fn passing_faults_are_overcome() {
+    let faults = [
+        (Fault::Cut(700), true),
+        (Fault::Status(503), true),
+        (Fault::Status(429), true),
+        (Fault::Corrupt(100), false),
+        (Fault::Length(-3), true),
+        (Fault::Length(9), true),
+        (Fault::Stall, true),
+    ];
+    for (fault, is_retry_cheap) in faults {
+        let dir = tempfile::tempdir().expect("temporary folder");
+        let scene = Published::new(1, &[0; 3], 300);
+        let server = Server::start(scene.clone());
+        let mut robot = Robot::on_disk(dir.path(), &server.url());
+        robot.limits.read_timeout = std::time::Duration::from_millis(400);
+        let (mut seen_paths, fault_given) = (std::collections::BTreeSet::new(), fault.clone());
+        server.faults(move |seen| {
+            match seen_paths.insert(seen.path.clone()) && seen.path.contains("objects") {
+                true => fault_given.clone(),
+                false => Fault::None,
+            }
+        });
+        let report = robot.fetch().unwrap_or_else(|e| panic!("{fault:?}: {e}"));
+        assert_eq!(report.retries, 3, "{fault:?}");
+        assert_holds(&robot.snapshot(), &scene, 0..3);
+        let second: usize = server.take_objects().iter().filter(|seen| seen.range_start.is_some()).count();
+        assert!(is_retry_cheap || second == 0, "{fault:?}: damaged bytes are not resumed");
+    }
+}
+
+/// The part on board is of another content, or the server knows no ranges, or answers a wrong one.
+#[test]
+fn resuming_never_mixes_contents() {
+    for fault in [Fault::None, Fault::IgnoreRange, Fault::ShiftedRange(1), Fault::Status(416)] {
+        let dir = tempfile::tempdir().expect("temporary folder");
+        let scene = Published::new(1, &[0; 3], 300);
+        let server = Server::start(scene.clone());
+        let mut robot = Robot::on_disk(dir.path(), &server.url());
+        robot.request.radius = 2.0;
+        let staging = robot.cache.dir().join("staging");
+        fs_err::create_dir_all(&staging).expect("made");
+        let part = staging.join(format!("{}.part", scene.hash(0, Profile::Compact)));
+        fs_err::write(part, [b'x'; 700]).expect("written");
+        fs_err::write(staging.join("orphan"), b"x").expect("written");
+        let mut is_first = true;
+        let given = fault.clone();
+        server.faults(move |seen| match seen.range_start {
+            Some(_) if std::mem::take(&mut is_first) => given.clone(),
+            _ => Fault::None,
+        });
+        robot.fetch().unwrap_or_else(|e| panic!("{fault:?}: {e}"));
+        assert_holds(&robot.snapshot(), &scene, 0..1);
+        assert!(robot.staged().is_empty());
+    }
+}
+
+/// Many shards, several at a time, every kind of passing fault at random: always the same outcome.
+#[test]
+fn parallel_downloads_under_random_faults_converge() {
+    let scene = Published::new(1, &[3; 24], 200);
+    for seed in 0..6 {
+        let dir = tempfile::tempdir().expect("temporary folder");
+        let server = Server::start(scene.clone());
+        let mut robot = Robot::on_disk(dir.path(), &server.url());
+        robot.request = FetchRequest { radius: 500.0, parallel: 1 + seed as usize, ..robot.request };
+        robot.limits.attempts = 40;
+        let mut random = Random(seed);
+        server.faults(move |_| match random.below(12) {
+            0 => Fault::Cut(random.below(1500) as usize),
+            1 => Fault::Status(500),
+            2 => Fault::IgnoreRange,
+            3 => Fault::ShiftedRange(3),
+            4 => Fault::Length(1),
+            _ => Fault::None,
+        });
+        let report = robot.fetch().unwrap_or_else(|e| panic!("seed {seed}: {e}"));
+        assert_eq!(report.downloaded.n_shards, 24);
+        assert_holds(&robot.snapshot(), &scene, 0..24);
+    }
+}
+
+struct CancelAt<'a> {
+    cancel: &'a AtomicBool,
+    bytes: u64,
+    received: AtomicU64,
+}
+
+impl Progress for CancelAt<'_> {
+    fn received(&self, bytes: u64) {
+        if self.received.fetch_add(bytes, Ordering::Relaxed) + bytes >= self.bytes {
+            self.cancel.store(true, Ordering::Relaxed);
+        }
+    }
+}
+
+#[test]
+fn cancelling_ends_soon_and_loses_nothing() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let scene = Published::new(1, &[0; 3], 5000);
+    let server = Server::start(scene.clone());
+    let robot = Robot::on_disk(dir.path(), &server.url());
+    let cancel = AtomicBool::new(false);
+    let progress = CancelAt { cancel: &cancel, bytes: 10_000, received: AtomicU64::new(0) };
+    assert!(matches!(robot.fetch_watched(&progress, &cancel), Err(FetchError::Cancelled)));
+    // One buffer at most comes in after the flag.
+    assert!(progress.received.load(Ordering::Relaxed) <= 10_000 + 512);
+    assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Empty { .. })));
+    let report = robot.fetch().expect("works");
+    assert!(report.resumed_bytes >= 9_000, "{report:?}");
+    assert_holds(&robot.snapshot(), &scene, 0..3);
+}
+
+#[test]
+fn one_fetch_at_a_time() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let server = Server::start(Published::new(1, &[0; 3], 10));
+    let robot = Robot::on_disk(dir.path(), &server.url());
+    robot.fetch().expect("works");
+    let records = Records::open(&robot.cache.dir().join("db")).expect("free");
+    assert!(matches!(robot.fetch(), Err(FetchError::Records(RecordsError::Busy { .. }))));
+    // Reading needs no lock.
+    robot.snapshot();
+    drop(records);
+    robot.fetch().expect("free again");
+}
+
+#[test]
+fn damage_on_board_is_found_and_healed() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let scene = Published::new(1, &[0; 3], 100);
+    let server = Server::start(scene.clone());
+    let robot = Robot::on_disk(dir.path(), &server.url());
+    robot.fetch().expect("works");
+    let victim = scene.hash(1, Profile::Compact);
+    let path = robot.cache.shard_path(victim);
+    let mut bytes = fs_err::read(&path).expect("there");
+    bytes[600] ^= 1;
+    fs_err::write(&path, &bytes).expect("written");
+    let error = Snapshot::open(&robot.cache).expect_err("damaged");
+    assert!(matches!(&error, StoreError::Shard { path: named, .. } if *named == path), "{error}");
+    server.take_seen();
+    assert_eq!(robot.fetch().expect("heals").downloaded.n_shards, 1);
+    assert_eq!(server.take_objects().len(), 1);
+    assert_holds(&robot.snapshot(), &scene, 0..3);
+
+    // A shard that is gone; a manifest that is; a pointer that is no JSON.
+    fs_err::remove_file(&path).expect("there");
+    assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Missing { .. })));
+    robot.fetch().expect("heals");
+    fs_err::write(robot.cache.manifest_path(Hash32::of(&scene.signed)), b"x").expect("written");
+    assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Hash { .. })));
+    fs_err::write(robot.cache.current_path(), b"{").expect("written");
+    assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Current { .. })));
+    robot.fetch().expect("heals");
+    assert_holds(&robot.snapshot(), &scene, 0..3);
+}
+
+/// A shard of another cell or encoder under the right name is refused when it is opened.
+#[test]
+fn a_shard_that_the_manifest_does_not_describe_is_refused() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let scene = Published::new(1, &[0; 3], 100);
+    let server = Server::start(scene.clone());
+    let robot = Robot::on_disk(dir.path(), &server.url());
+    robot.fetch().expect("works");
+    let path = robot.cache.shard_path(scene.hash(1, Profile::Compact));
+    fs_err::copy(robot.cache.shard_path(scene.hash(0, Profile::Compact)), &path).expect("copied");
+    let error = Snapshot::open(&robot.cache).expect_err("another cell").to_string();
+    assert!(error.contains("the cell is 0, the manifest says 1"), "{error}");
+    let spec = super::scene::ShardSpec {
+        cell_id: 1,
+        content: 0,
+        n_gaussians: 100,
+        encoder: Hash32([8; 32]),
+        is_exact: false,
+    };
+    fs_err::write(&path, super::scene::shard(&spec)).expect("written");
+    let error = Snapshot::open(&robot.cache).expect_err("another encoder").to_string();
+    assert!(error.contains("the encoder is 0808"), "{error}");
+    assert_eq!(robot.fetch().expect("heals").encoder_id, ENCODER);
+}
+
+/// Readers that open a snapshot again and again while fetches replace it always get a whole one.
+#[test]
+fn readers_get_a_whole_generation_during_fetches() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let scene = Published::new(1, &[0; 8], 50);
+    let server = Server::start(scene.clone());
+    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    robot.request.radius = 2.0;
+    robot.request.max_bytes = Some(scene.bytes(0..1));
+    robot.fetch().expect("works");
+    let (is_over, seen) = (AtomicBool::new(false), Mutex::new(std::collections::BTreeSet::new()));
+    let reader = EdgeCache::open(robot.cache.dir());
+    std::thread::scope(|scope| {
+        let readers: Vec<_> = (0..2)
+            .map(|_| {
+                scope.spawn(|| {
+                    while !is_over.load(Ordering::Relaxed) {
+                        let snapshot = Snapshot::open(&reader).expect("a whole generation");
+                        let cell_id = snapshot.shards[0].cell.cell_id;
+                        assert_holds(&snapshot, &scene, cell_id..cell_id + 1);
+                        seen.lock().expect("sound").insert(cell_id);
+                    }
+                })
+            })
+            .collect();
+        for step in 0..40 {
+            robot.request.at = Some(at(f64::from(step % 8) * 10.0 + 5.0));
+            robot.fetch().expect("works");
+        }
+        is_over.store(true, Ordering::Relaxed);
+        readers.into_iter().for_each(|reader| reader.join().expect("no reader failed"));
+    });
+    assert!(seen.lock().expect("sound").len() > 1);
+}
