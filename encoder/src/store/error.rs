@@ -11,7 +11,7 @@ use slag_common::manifest::ManifestError;
 pub enum StoreError {
     /// The file system refused; the text names the path.
     #[error("{0}; check permissions and free space")]
-    Io(#[from] io::Error),
+    Io(io::Error),
     /// A second writer.
     #[error("another slag-encoder is writing to {}; wait for it or stop it", store.display())]
     Locked {
@@ -20,14 +20,14 @@ pub enum StoreError {
     },
     /// The record database is damaged or cannot be written.
     #[error(
-        "{}: {source}; if it is damaged, remove this folder: published scenes stay, unfinished jobs start over",
+        "{}: {cause}; if it is damaged, remove this folder: published scenes stay, unfinished jobs start over",
         path.display()
     )]
     Records {
         /// The database's folder.
         path: PathBuf,
         /// What it says.
-        source: sled::Error,
+        cause: sled::Error,
     },
     /// Nothing was published yet.
     #[error("{} is missing: nothing was published here yet; run `slag-encoder encode` first", path.display())]
@@ -42,12 +42,12 @@ pub enum StoreError {
         path: PathBuf,
     },
     /// The stored manifest is refused.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {cause}", path.display())]
     Manifest {
         /// The manifest's file.
         path: PathBuf,
         /// Why.
-        source: ManifestError,
+        cause: ManifestError,
     },
     /// The record of what was published beside the shards is damaged.
     #[error("{}: {what}; encode again", path.display())]
@@ -89,4 +89,10 @@ pub enum StoreError {
         /// Highest generation published.
         current: u64,
     },
+}
+
+impl From<io::Error> for StoreError {
+    fn from(cause: io::Error) -> Self {
+        Self::Io(cause)
+    }
 }

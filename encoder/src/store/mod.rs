@@ -84,19 +84,19 @@ impl Store {
         files::sync_folder(&dir.join("objects"))?;
         let db_path = dir.join("db");
         let db = sled::Config::new().path(&db_path).cache_capacity(RECORD_CACHE_BYTES).open();
-        let db = db.map_err(|source| match source {
+        let db = db.map_err(|cause| match cause {
             // sled has no error kind of its own for this.
             sled::Error::Io(e) if e.to_string().contains("could not acquire lock") => {
                 StoreError::Locked { store: dir.to_owned() }
             }
-            source => StoreError::Records { path: db_path.clone(), source },
+            cause => StoreError::Records { path: db_path.clone(), cause },
         })?;
         // The lock is ours, so whatever lies in tmp/ is of a writer that died.
         for entry in fs_err::read_dir(dir.join("tmp"))? {
             fs_err::remove_file(entry?.path())?;
         }
         let published =
-            db.open_tree(PUBLISHED_TREE).map_err(|source| StoreError::Records { path: db_path, source })?;
+            db.open_tree(PUBLISHED_TREE).map_err(|cause| StoreError::Records { path: db_path, cause })?;
         let n_parts = AtomicU64::new(0);
         let key = load_or_make_key(dir)?;
         let store = Self { dir: dir.to_owned(), db, published, key, n_parts };
@@ -205,7 +205,7 @@ impl Store {
         }
         let signed = manifest.sign(&self.key);
         let path = self.dir.join(reader::MANIFEST);
-        let refuse = |source| StoreError::Manifest { path: path.clone(), source };
+        let refuse = |cause| StoreError::Manifest { path: path.clone(), cause };
         let own = manifest::TrustedKeys::Only(vec![Hash32(self.key.verifying_key().to_bytes())]);
         Manifest::verify(&signed, &own).map_err(refuse)?;
         let hash = Hash32::of(&signed);
@@ -269,12 +269,12 @@ impl Store {
         };
         let cells: Result<Vec<CellRecord>, sled::Error> =
             self.published.scan_prefix(CELL_PREFIX).values().map(|value| decode(value?)).collect();
-        cells.map_err(|source| self.records_error(source))
+        cells.map_err(|cause| self.records_error(cause))
     }
 
     /// Returns the highest generation published, from the records.
     fn generation(&self) -> Result<Option<u64>, StoreError> {
-        let value = self.published.get(GENERATION_KEY).map_err(|source| self.records_error(source))?;
+        let value = self.published.get(GENERATION_KEY).map_err(|cause| self.records_error(cause))?;
         Ok(value.and_then(|bytes| Some(u64::from_be_bytes(bytes.as_ref().try_into().ok()?))))
     }
 
@@ -299,7 +299,7 @@ impl Store {
             self.published.apply_batch(batch)?;
             self.published.flush().map(drop)
         };
-        write().map_err(|source| self.records_error(source))
+        write().map_err(|cause| self.records_error(cause))
     }
 
     /// Brings the records up to the manifest, which a crash may have left ahead of them.
@@ -334,8 +334,8 @@ impl Store {
         self.dir.join("tmp").join(format!("{part}.part"))
     }
 
-    fn records_error(&self, source: sled::Error) -> StoreError {
-        StoreError::Records { path: self.dir.join("db"), source }
+    fn records_error(&self, cause: sled::Error) -> StoreError {
+        StoreError::Records { path: self.dir.join("db"), cause }
     }
 }
 

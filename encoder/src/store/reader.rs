@@ -37,7 +37,7 @@ impl Published {
         let path = dir.join(name);
         let Some(signed) = read_signed(&path)? else { return Err(StoreError::NotPublished { path }) };
         let (manifest, _) =
-            Manifest::verify(&signed, own).map_err(|source| StoreError::Manifest { path, source })?;
+            Manifest::verify(&signed, own).map_err(|cause| StoreError::Manifest { path, cause })?;
         let hash = Hash32::of(&signed);
         let path = extras_path(dir, hash);
         let extras = fs_err::read(&path)?;
@@ -174,8 +174,8 @@ pub(super) fn read_signed(path: &Path) -> Result<Option<Vec<u8>>, StoreError> {
     let mut bytes = Vec::new();
     file.take(manifest::MAX_BYTES + 1).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > manifest::MAX_BYTES {
-        let source = ManifestError::TooLong { len_bytes: bytes.len() as u64 };
-        return Err(StoreError::Manifest { path: path.to_owned(), source });
+        let cause = ManifestError::TooLong { len_bytes: bytes.len() as u64 };
+        return Err(StoreError::Manifest { path: path.to_owned(), cause });
     }
     Ok(Some(bytes))
 }

@@ -99,16 +99,16 @@ pub enum ServeError {
     #[error(transparent)]
     Store(#[from] StoreError),
     /// The address cannot be listened on.
-    #[error("cannot listen on {address}: {source}; choose another address or port")]
+    #[error("cannot listen on {address}: {cause}; choose another address or port")]
     Listen {
         /// The address.
         address: SocketAddr,
         /// Why.
-        source: io::Error,
+        cause: io::Error,
     },
     /// Accepting connections failed for good.
     #[error("the service ended: {0}; start it again")]
-    Ended(#[source] io::Error),
+    Ended(io::Error),
 }
 
 /// Serves a store until `shutdown` completes, then lets answers under way finish for a while.
@@ -125,7 +125,7 @@ pub async fn serve(
     shutdown: impl Future<Output = ()> + Send + 'static,
 ) -> Result<(), ServeError> {
     let router = router(dir, limits)?;
-    let refused = |source| ServeError::Listen { address: listen, source };
+    let refused = |cause| ServeError::Listen { address: listen, cause };
     let tcp = tokio::net::TcpListener::bind(listen).await.map_err(refused)?;
     on_listening(tcp.local_addr().map_err(refused)?);
     let slots = Arc::new(Semaphore::new(limits.n_connections));

@@ -1,0 +1,365 @@
+mod server;
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use glam::DVec3;
+use half::f16;
+use qdrant_client::qdrant::{SearchPointsBuilder, point_id::PointIdOptions, value::Kind};
+use slag_common::frames::{Aabb, GeoReference, Geographic};
+use slag_common::manifest::ShardRecord;
+use slag_common::shard::{Profile, ShardHeader, ShardParts};
+
+use super::*;
+use crate::store::tests::manifest_of_boxes;
+use crate::store::{Extras, Store};
+use server::Server;
+
+const DIM: usize = 16;
+/// Gaussians of the cells, and how many of them have an embedding.
+const CELLS: [(u32, u32); 3] = [(60, 50), (7, 0), (45, 45)];
+const N_POINTS: u64 = 95;
+const BATCH: usize = 8;
+/// 50 points in batches of 8, then 45.
+const N_BATCHES: usize = 7 + 6;
+
+/// A store of three cells, and what it was made from: id -> (mean, embedding, cell).
+struct Fixture {
+    _dir: tempfile::TempDir,
+    store: Store,
+    truth: BTreeMap<u64, (DVec3, Vec<f16>, u32)>,
+}
+
+/// Pseudo-random numbers in -1..1 (Steele et al. 2014, SplitMix64).
+struct Numbers(u64);
+
+impl Numbers {
+    fn next(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 52) as f64 - 1.0
+    }
+
+    fn unit_vector(&mut self) -> Vec<f16> {
+        let vector: Vec<f64> = (0..DIM).map(|_| self.next()).collect();
+        let norm = vector.iter().map(|v| v * v).sum::<f64>().sqrt();
+        vector.iter().map(|v| f16::from_f64(v / norm)).collect()
+    }
+}
+
+fn fixture() -> Fixture {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    let mut fixture = Fixture { _dir: dir, store, truth: BTreeMap::new() };
+    fixture.publish(1, 0);
+    fixture
+}
+
+impl Fixture {
+    /// Publishes a generation whose splat indices begin at `first_id`.
+    fn publish(&mut self, generation: u64, first_id: u32) {
+        let mut numbers = Numbers(generation);
+        self.truth.clear();
+        let boxes: Vec<Aabb> = (0..CELLS.len())
+            .map(|i| Aabb {
+                min: DVec3::X * 100.0 * i as f64,
+                max: DVec3::new(100.0 * i as f64 + 90.0, 90.0, 9.0),
+            })
+            .collect();
+        let mut manifest = manifest_of_boxes(&boxes);
+        manifest.generation = generation;
+        manifest.encoder.dim = DIM as u32;
+        let origin = Geographic { latitude_deg: 46.842657, longitude_deg: -91.994008, height_m: 158.5 };
+        manifest.geo_reference = Some(GeoReference { origin });
+        let mut next_id = first_id;
+        for (cell, (n_gaussians, n_with_evidence)) in manifest.cells.iter_mut().zip(CELLS) {
+            let (n, n_with) = (n_gaussians as usize, n_with_evidence as usize);
+            // Interleaved ids, so that shard order is not id order.
+            let ids: Vec<u32> = (0..n_gaussians).map(|i| next_id + (i * 37) % n_gaussians).collect();
+            next_id += n_gaussians;
+            let positions: Vec<[u16; 3]> = (0..n as u16).map(|i| [i * 1000, 60_000 - i * 900, i]).collect();
+            let embeddings: Vec<f16> = (0..n_with).flat_map(|_| numbers.unit_vector()).collect();
+            let row_starts: &[u32] = if n_with == 0 { &[0] } else { &[0, n_with_evidence] };
+            let n_rows = row_starts.len() as u32 - 1;
+            let header = ShardHeader {
+                cell_id: cell.cell_id,
+                n_gaussians,
+                n_rows,
+                dim: DIM as u32,
+                origin_in_world: cell.bounds.min.to_array(),
+                position_step: [90.0 / 65535.0; 3],
+                box_min: cell.bounds.min.to_array(),
+                box_max: cell.bounds.max.to_array(),
+                encoder_id: manifest.encoder.id.0,
+            };
+            for i in 0..n_with {
+                let steps = DVec3::from(positions[i].map(f64::from));
+                let mean = cell.bounds.min + steps * (90.0 / 65535.0);
+                let embedding = embeddings[i * DIM..(i + 1) * DIM].to_vec();
+                self.truth.insert(u64::from(ids[i]), (mean, embedding, cell.cell_id));
+            }
+            let parts = ShardParts {
+                header,
+                positions: &positions,
+                row_starts,
+                palette: &vec![f16::ONE; n_rows as usize * DIM],
+                radii: &vec![1.0; n_rows as usize],
+                exact: Some((&ids, &embeddings)),
+            };
+            let (hash, len_bytes) = self.store.put_object(|out| parts.write(out)).expect("room");
+            let record =
+                ShardRecord { hash, len_bytes, n_rows, score_error_bound: 1.0, position_error: 1e-3 };
+            cell.n_gaussians = n_gaussians;
+            cell.shards.insert(Profile::Exact, record);
+        }
+        manifest.n_gaussians = CELLS.iter().map(|cell| u64::from(cell.0)).sum();
+        manifest.n_without_evidence = manifest.n_gaussians - N_POINTS;
+        self.store.publish(&manifest, &Extras::new()).expect("publishes");
+    }
+
+    async fn push_until(
+        &self,
+        options: &PushOptions,
+        cancel: impl Future<Output = ()> + Send,
+    ) -> Result<(PushReport, Vec<PushProgress>), PushError> {
+        let reader = self.store.reader().expect("published");
+        let source = Arc::new(ExactShards::new(reader.clone()));
+        let mut seen = Vec::new();
+        let report = push(&reader, source, self.store.db(), options, |p| seen.push(p), cancel).await?;
+        Ok((report, seen))
+    }
+
+    async fn push(&self, options: &PushOptions) -> Result<PushReport, PushError> {
+        self.push_until(options, std::future::pending()).await.map(|(report, _)| report)
+    }
+
+    /// Checks that the server holds exactly this generation, every value as it was made.
+    fn assert_arrived(&self, server: &Server, generation: i64) {
+        let points = server.with(|state| state.points.clone());
+        assert_eq!(points.keys().collect::<Vec<_>>(), self.truth.keys().collect::<Vec<_>>());
+        let reader = self.store.reader().expect("published");
+        let reference = reader.manifest().geo_reference.expect("geo-referenced");
+        for (id, (mean, embedding, cell_id)) in &self.truth {
+            let point = &points[id];
+            let expected: Vec<f32> = embedding.iter().map(|v| v.to_f32()).collect();
+            assert_eq!(point.vector, expected, "{id}");
+            let kind = |key: &str| point.payload[key].kind.clone().expect("a value");
+            for (key, value) in [("x", mean.x), ("y", mean.y), ("z", mean.z)] {
+                assert_eq!(kind(key), Kind::DoubleValue(value), "{id}: {key}");
+            }
+            assert_eq!(kind("cell_id"), Kind::IntegerValue(i64::from(*cell_id)));
+            assert_eq!(kind("generation"), Kind::IntegerValue(generation));
+            assert_eq!(kind("scene"), Kind::StringValue("yard".into()));
+            let Kind::StructValue(location) = kind("location") else { panic!("{id}: no location") };
+            let degrees = |key: &str| location.fields[key].as_double().expect("a number");
+            let place =
+                Geographic { latitude_deg: degrees("lat"), longitude_deg: degrees("lon"), height_m: 158.5 };
+            let back = reference.world_from_geographic(place);
+            assert!((back - *mean).truncate().length() < 1e-2, "{id}: {back} {mean}");
+        }
+    }
+}
+
+fn options(url: &str) -> PushOptions {
+    PushOptions {
+        n_points_per_batch: NonZeroUsize::new(BATCH).expect("not zero"),
+        retry_delay: Duration::from_millis(1),
+        ..PushOptions::new(url, "yard")
+    }
+}
+
+#[tokio::test]
+async fn every_point_arrives_and_search_equals_brute_force() {
+    let fixture = fixture();
+    let (server, url) = Server::start(Some("k3y")).await;
+    let options = PushOptions { api_key: Some("k3y".into()), ..options(&url) };
+    let (report, seen) = fixture.push_until(&options, std::future::pending()).await.expect("pushes");
+    let expected = PushReport {
+        n_points: N_POINTS,
+        n_sent: N_POINTS,
+        n_without_evidence: 17,
+        n_retries: 0,
+        created_collection: true,
+    };
+    assert_eq!(report, expected);
+    assert_eq!(seen.len(), N_BATCHES);
+    assert_eq!(seen.last(), Some(&PushProgress { n_points: N_POINTS, n_points_expected: N_POINTS }));
+    fixture.assert_arrived(&server, 1);
+    assert_eq!(server.with(|state| state.indexed.clone()), ["scene", "generation", "location"]);
+
+    let client = Qdrant::from_url(&url).api_key("k3y").skip_compatibility_check().build().expect("a client");
+    let mut numbers = Numbers(99);
+    for _ in 0..5 {
+        let query: Vec<f32> = (0..DIM).map(|_| numbers.next() as f32).collect();
+        let search = SearchPointsBuilder::new("yard", query.clone(), 12);
+        let found = client.search_points(search).await.expect("answers").result;
+        // Oracle: cosines in float64 of the embeddings that the shards were written from.
+        let norm = |v: &[f64]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
+        let query: Vec<f64> = query.iter().copied().map(f64::from).collect();
+        let mut scores: Vec<(f64, u64)> = Vec::new();
+        for (id, (_, embedding, _)) in &fixture.truth {
+            let embedding: Vec<f64> = embedding.iter().map(|v| v.to_f64()).collect();
+            let dot: f64 = embedding.iter().zip(&query).map(|(a, b)| a * b).sum();
+            scores.push((dot / (norm(&embedding) * norm(&query)), *id));
+        }
+        scores.sort_by(|a, b| b.0.total_cmp(&a.0));
+        assert_eq!(found.len(), 12);
+        for (point, (score, id)) in found.iter().zip(scores) {
+            let found_id = point.id.as_ref().and_then(|id| id.point_id_options.clone());
+            assert_eq!(found_id, Some(PointIdOptions::Num(id)));
+            assert!((f64::from(point.score) - score).abs() < 1e-6);
+        }
+    }
+}
+
+/// The client repeats a request once by itself, so three failures in a row need a repetition of ours.
+#[tokio::test]
+async fn batches_that_fail_are_repeated() {
+    let fixture = fixture();
+    let (server, url) = Server::start(None).await;
+    let ids: Vec<u64> = {
+        let reader = fixture.store.reader().expect("published");
+        let source = ExactShards::new(reader.clone());
+        let cells = reader.manifest().cells.iter().map(|cell| source.load(cell).expect("whole"));
+        cells
+            .flat_map(|cell| cell.input_indices.chunks(BATCH).map(|b| u64::from(b[0])).collect::<Vec<_>>())
+            .collect()
+    };
+    assert_eq!(ids.len(), N_BATCHES);
+    // Every third batch; every sixth is applied and only its acknowledgement is lost.
+    let failures = ids.iter().step_by(3).enumerate().map(|(i, id)| (*id, (3, i % 2 == 1))).collect();
+    server.with(|state| state.failures = failures);
+    let report = fixture.push(&options(&url)).await.expect("pushes");
+    assert_eq!((report.n_points, report.n_sent), (N_POINTS, N_POINTS));
+    assert_eq!(server.with(|state| state.n_failed), 3 * 5);
+    // Attempts 1 and 2 fail in one call, 3 in the next, whose repetition by the client succeeds.
+    assert_eq!(report.n_retries, 5);
+    assert_eq!(server.with(|state| state.acknowledged.clone()), ids);
+    fixture.assert_arrived(&server, 1);
+
+    let (server, url) = Server::start(None).await;
+    server.with(|state| state.failures = [(ids[4], (u32::MAX, false))].into());
+    let refused = fixture.push(&PushOptions { n_retries: 2, ..options(&url) }).await.expect_err("gives up");
+    assert!(matches!(refused, PushError::Database { action: "upsert points", .. }), "{refused}");
+    assert_eq!(server.with(|state| state.n_failed), 2 * 3);
+    server.with(|state| state.failures.clear());
+    let report = fixture.push(&options(&url)).await.expect("continues");
+    assert_eq!(report.n_sent, N_POINTS - 4 * BATCH as u64);
+    fixture.assert_arrived(&server, 1);
+}
+
+#[tokio::test]
+async fn a_push_that_is_cut_off_continues() {
+    // Stopped after its acknowledgement by the server, before it is noted; everywhere in turn.
+    for stop_after in [1, 5, 7, 8, 12, N_BATCHES] {
+        let fixture = fixture();
+        let (server, url) = Server::start(None).await;
+        let (stop, stopped) = tokio::sync::watch::channel(false);
+        *server.watcher.lock().expect("free") = Some(Arc::new(move |n_acknowledged| {
+            if n_acknowledged == stop_after {
+                let _ = stop.send(true);
+            }
+        }));
+        let mut stopped_too = stopped.clone();
+        let cancel = async move {
+            let _ = stopped_too.wait_for(|stop| *stop).await;
+        };
+        let ended = fixture.push_until(&options(&url), cancel).await;
+        assert!(matches!(ended, Err(PushError::Cancelled)), "{stop_after}: {ended:?}");
+        *server.watcher.lock().expect("free") = None;
+        let before = server.with(|state| state.acknowledged.clone());
+        assert!(before.len() >= stop_after && before.len() <= stop_after + 1, "{stop_after}: {before:?}");
+
+        let report = fixture.push(&options(&url)).await.expect("continues");
+        assert!(!report.created_collection);
+        assert_eq!((report.n_points, report.n_without_evidence), (N_POINTS, 17), "{stop_after}");
+        let all = server.with(|state| state.acknowledged.clone());
+        // At most the one batch that was acknowledged but not noted comes twice.
+        let distinct: BTreeSet<u64> = all.iter().copied().collect();
+        assert_eq!(distinct.len(), N_BATCHES, "{stop_after}");
+        assert!(all.len() <= N_BATCHES + 1, "{stop_after}: {} batches were sent", all.len());
+        fixture.assert_arrived(&server, 1);
+
+        let again = fixture.push(&options(&url)).await.expect("nothing to do");
+        assert_eq!((again.n_points, again.n_sent), (N_POINTS, 0));
+    }
+}
+
+#[tokio::test]
+async fn a_new_generation_starts_over_and_replaces() {
+    let mut fixture = fixture();
+    let (server, url) = Server::start(None).await;
+    fixture.push(&options(&url)).await.expect("pushes");
+    fixture.publish(2, 30);
+    let report = fixture.push(&options(&url)).await.expect("pushes");
+    assert_eq!((report.n_sent, report.created_collection), (N_POINTS, false));
+    fixture.assert_arrived(&server, 2);
+
+    // A collection that was deleted is filled again, whatever the record says.
+    server.with(|state| *state = server::State::default());
+    let report = fixture.push(&options(&url)).await.expect("pushes");
+    assert_eq!((report.n_sent, report.created_collection), (N_POINTS, true));
+    // One that lost points is noticed, and filled by the next push.
+    server.with(|state| state.points.pop_first());
+    let lost = fixture.push(&options(&url)).await.expect_err("a point is missing");
+    assert!(matches!(lost, PushError::Count { expected: N_POINTS, found: 94, .. }), "{lost}");
+    fixture.push(&options(&url)).await.expect("starts over");
+    fixture.assert_arrived(&server, 2);
+}
+
+#[tokio::test]
+async fn collections_that_do_not_fit_are_refused() {
+    let fixture = fixture();
+    let (server, url) = Server::start(None).await;
+    for (dim, distance) in [(DIM as u64 + 1, Distance::Cosine), (DIM as u64, Distance::Dot)] {
+        let params = VectorParamsBuilder::new(dim, distance).build();
+        server.with(|state| state.params = Some(params));
+        let refused = fixture.push(&options(&url)).await.expect_err("does not fit").to_string();
+        let expected = format!(
+            "collection \"yard\" has vectors of {dim} components, distance {}, this scene needs vectors of 16 components, distance Cosine; choose another collection, or delete this one",
+            distance.as_str_name()
+        );
+        assert_eq!(refused, expected);
+    }
+    server.with(|state| state.params = Some(VectorParamsBuilder::new(DIM as u64, Distance::Cosine).build()));
+    let foreign =
+        server::Stored { vector: vec![1.0; DIM], payload: [("scene".to_owned(), "attic".into())].into() };
+    server.with(|state| state.points.insert(7, foreign));
+    let refused = fixture.push(&options(&url)).await.expect_err("another scene");
+    assert!(matches!(refused, PushError::OtherScene { n_points: 1, .. }), "{refused}");
+    assert_eq!(server.with(|state| (state.points.len(), state.acknowledged.len())), (1, 0), "untouched");
+}
+
+#[tokio::test]
+async fn errors_that_do_not_pass_are_not_repeated_and_hide_the_key() {
+    let fixture = fixture();
+    let (_server, url) = Server::start(Some("right")).await;
+    let wrong = PushOptions { api_key: Some("wr0ng".into()), ..options(&url) };
+    assert!(!format!("{wrong:?}").contains("wr0ng"));
+    let refused = fixture.push(&wrong).await.expect_err("not admitted").to_string();
+    assert!(refused.contains("wrong or missing key") && !refused.contains("wr0ng"), "{refused}");
+
+    // Nothing listens: repeated, then given up.
+    let unreachable = PushOptions { n_retries: 2, ..options("http://127.0.0.1:1") };
+    let refused = fixture.push(&unreachable).await.expect_err("nobody there").to_string();
+    assert!(refused.contains("Failed to connect") && refused.contains("127.0.0.1:1"), "{refused}");
+    let refused = fixture.push(&options("no address")).await.expect_err("no URL").to_string();
+    assert!(refused.contains("no address"), "{refused}");
+}
+
+#[tokio::test]
+async fn scenes_without_exact_shards_are_refused() {
+    let fixture = fixture();
+    let (_server, url) = Server::start(None).await;
+    let reader = fixture.store.reader().expect("published");
+    let source = ExactShards::new(reader.clone());
+    let mut cell = reader.manifest().cells[0].clone();
+    cell.n_gaussians += 1;
+    assert!(matches!(source.load(&cell), Err(SourceError::Mismatch { what: "number of Gaussians", .. })));
+    cell.shards.clear();
+    assert!(matches!(source.load(&cell), Err(SourceError::NoShard { cell_id: 0, profile: Profile::Exact })));
+    let path = reader.object_path(reader.manifest().cells[2].shards[&Profile::Exact].hash);
+    fs_err::write(path, b"damaged").expect("writable");
+    let refused = fixture.push(&options(&url)).await.expect_err("damaged");
+    assert!(matches!(refused, PushError::Source(SourceError::Store(_))), "{refused}");
+}
