@@ -84,7 +84,7 @@ pub struct Question {
     /// The best answer.
     pub answer: Option<EdgeAnswer>,
     /// Why there is none.
-    pub reason: Option<String>,
+    pub reason: Option<serde_json::Value>,
     /// What truly is there: name, and the middle of its box.
     pub truth: Vec<(String, DVec3)>,
     /// Milliseconds, from the program's start to its end.
@@ -97,27 +97,32 @@ pub struct Question {
 #[derive(Debug, Deserialize)]
 struct EdgeReply {
     answers: Vec<EdgeAnswer>,
-    reason: Option<String>,
+    reason: Option<serde_json::Value>,
 }
 
 /// A cluster of matching Gaussians.
 #[derive(Clone, Debug, Deserialize, Serialize)]
 pub struct EdgeAnswer {
-    /// Its centre.
-    pub centre: DVec3,
+    /// Its place.
+    pub position_in_world: DVec3,
     /// Edge lengths of its box.
     pub size: DVec3,
     /// Its score.
     pub score: f32,
     /// Its Gaussians.
-    pub count: u64,
+    pub n_gaussians: u64,
     /// Distance from the robot.
     pub distance: Option<f64>,
 }
 
 #[derive(Deserialize)]
 struct FetchReply {
-    downloaded_bytes: u64,
+    downloaded: Tally,
+}
+
+#[derive(Deserialize)]
+struct Tally {
+    bytes: u64,
 }
 
 impl DemoReport {
@@ -215,7 +220,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
             None => truth.is_empty(),
             Some(answer) => truth.iter().any(|object| {
                 let (low, high) = (object.box_min - TOLERANCE_M, object.box_max + TOLERANCE_M);
-                answer.centre.cmpge(low).all() && answer.centre.cmple(high).all()
+                answer.position_in_world.cmpge(low).all() && answer.position_in_world.cmple(high).all()
             }),
         };
         let truth = truth.iter().map(|o| (o.name.to_owned(), (o.box_min + o.box_max) / 2.0)).collect();
@@ -223,7 +228,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     }
     let report = DemoReport {
         encode: summary,
-        downloaded_bytes: fetched.downloaded_bytes,
+        downloaded_bytes: fetched.downloaded.bytes,
         about_model: slag_models::builtin::ABOUT,
         questions,
     };
@@ -270,9 +275,9 @@ impl fmt::Display for DemoReport {
         writeln!(f, "{:<16} {:<44} {:<32} right", "question", "answer of the robot, offline", "truth")?;
         for q in &self.questions {
             let answer = match &q.answer {
-                Some(a) => format!(
+                Some(a @ EdgeAnswer { position_in_world: p, .. }) => format!(
                     "{:.1} m away at {:.2} {:.2} {:.2}, score {:.2}",
-                    a.distance.unwrap_or(f64::NAN), a.centre.x, a.centre.y, a.centre.z, a.score
+                    a.distance.unwrap_or(f64::NAN), p.x, p.y, p.z, a.score
                 ),
                 None => "nothing found".into(),
             };

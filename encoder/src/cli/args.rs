@@ -1,6 +1,7 @@
 //! The flags.
 
 use std::net::SocketAddr;
+use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -282,8 +283,8 @@ pub struct QdrantArgs {
     #[arg(long, value_name = "KEY", env = "QDRANT_API_KEY", hide_env_values = true)]
     pub api_key: Option<String>,
     /// Points a request.
-    #[arg(long, value_name = "N", default_value_t = 256, value_parser = clap::value_parser!(u32).range(1..=10_000))]
-    pub batch: u32,
+    #[arg(long, value_name = "N", default_value = "256")]
+    pub batch: NonZeroUsize,
 }
 
 /// `generate`.

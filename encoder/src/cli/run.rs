@@ -24,7 +24,7 @@ use crate::progress::{Progress, Silent};
 use crate::publish::{qdrant, serve};
 use crate::raster::{CpuRasterizer, RasterView};
 use crate::shard::cells::CellLimits;
-use crate::store::StoreReader;
+use crate::store::{Store, StoreReader};
 use crate::{generate, ingest, query};
 
 /// Runs the program and says how it ended.
@@ -44,7 +44,8 @@ pub fn run(cli: Cli) -> Exit {
         Ok(exit) => exit,
         Err(error) if is_broken_pipe(&error) => Exit::Done,
         Err(error) => {
-            let interrupted = matches!(error.downcast_ref(), Some(EncodeError::Interrupted { .. }));
+            let interrupted = matches!(error.downcast_ref(), Some(EncodeError::Interrupted { .. }))
+                || matches!(error.downcast_ref(), Some(qdrant::PushError::Cancelled));
             if json {
                 println!("{}", json!({"error": {"message": format!("{error:#}"), "interrupted": interrupted}}));
             } else {
@@ -271,14 +272,35 @@ fn run_serve(args: &ServeArgs) -> Result<Exit> {
 
 fn run_push(args: &QdrantArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
     let options = qdrant::PushOptions {
-        url: args.url.clone(),
-        collection: args.collection.clone(),
         api_key: args.api_key.clone(),
-        batch: args.batch as usize,
-        ..qdrant::PushOptions::default()
+        n_points_per_batch: args.batch,
+        ..qdrant::PushOptions::new(&args.url, &args.collection)
     };
-    let report = runtime()?.block_on(qdrant::push(&args.store, &options, progress, cancel_flag()?.as_ref()))?;
-    print(json, &report, format!("{report}\n"))?;
+    // The writer's lock: the state of the push is kept in the store.
+    let store = Store::create_or_open(&args.store)?;
+    let reader = store.reader()?;
+    let vectors = Arc::new(qdrant::ExactShards::new(reader.clone()));
+    let mut shown = None;
+    let on_batch = |at: qdrant::PushProgress| {
+        let before = shown.replace(at.n_points);
+        match before {
+            None => progress.begin("push", "point", at.n_points_expected, at.n_points),
+            Some(before) => progress.advance(at.n_points - before),
+        }
+    };
+    let stop = async {
+        if let Err(error) = serve::stop_signal().await {
+            tracing::warn!("cannot listen for signals, stopping: {error}");
+        }
+    };
+    let pushed = runtime()?.block_on(qdrant::push(&reader, vectors, store.db(), &options, on_batch, stop));
+    progress.end();
+    let report = pushed?;
+    let lines = format!(
+        "{} points in collection {}: {} sent now, {} Gaussians without evidence left out, {} attempts repeated\n",
+        report.n_points, args.collection, report.n_sent, report.n_without_evidence, report.n_retries
+    );
+    print(json, &report, lines)?;
     Ok(Exit::Done)
 }
 

@@ -94,7 +94,7 @@ pub struct PushProgress {
 }
 
 /// What a push did.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct PushReport {
     /// Points of this generation, all of which the database has.
     pub n_points: u64,
