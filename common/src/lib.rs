@@ -11,8 +11,8 @@ pub mod frames;
 pub mod gaussians;
 pub mod hash;
 pub mod manifest;
-pub mod shard;
 pub mod poses;
+pub mod shard;
 pub mod splat;
 
 pub use camera::{Distortion, Intrinsics, View};

@@ -13,7 +13,6 @@ pub mod progress;
 pub mod publish;
 pub mod query;
 pub mod raster;
-pub mod ingest;
 pub mod segment;
 pub mod shard;
 pub mod store;

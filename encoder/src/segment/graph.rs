@@ -80,6 +80,10 @@ impl Segmenter for GraphSegmenter {
         &self.name
     }
 
+    fn wants_depth(&self) -> bool {
+        true
+    }
+
     fn segment(&self, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError> {
         let (width_px, height_px) = input.image.dimensions();
         if width_px == 0 || height_px == 0 {

@@ -23,6 +23,11 @@ pub trait Segmenter: Sync {
     /// Returns what identifies the segmenter's results: its method and every parameter of it.
     fn name(&self) -> &str;
 
+    /// Returns whether it looks at [`SegmentInput::depth`], which takes a drawing of the scene.
+    fn wants_depth(&self) -> bool {
+        false
+    }
+
     /// Returns the masks of an image; they may overlap.
     ///
     /// # Errors
