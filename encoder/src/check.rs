@@ -182,7 +182,7 @@ impl Mistake {
             }
             Self::WorldQuarterTurns(quarters) => {
                 let angle_rad = f64::from(quarters) * std::f64::consts::FRAC_PI_2;
-                *pose = *pose * DAffine3::from_rotation_x(angle_rad);
+                *pose *= DAffine3::from_rotation_x(angle_rad);
             }
         }
         corrected

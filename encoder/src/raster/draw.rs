@@ -47,10 +47,9 @@ pub fn draw(
                 let rect = TileRect::new(column, row, width_px, height_px);
                 let mut sink = PixelSink::new(visible, colours);
                 let transmittance = walk_tile(visible, members, rect, WeightKind::Blend, &mut sink);
-                for y in 0..rect.height_px {
-                    for x in 0..rect.width_px {
+                for (y, light) in transmittance.iter().enumerate().take(rect.height_px) {
+                    for (x, &light) in light.iter().enumerate().take(rect.width_px) {
                         let pixel = y * width_px + rect.x_px + x;
-                        let light = transmittance[y][x];
                         for c in 0..3 {
                             rgb[pixel * 3 + c] = sink.rgb[c][y][x] + light * background[c];
                         }
