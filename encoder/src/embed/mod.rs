@@ -31,14 +31,14 @@ pub enum EmbedError {
         height_px: u32,
     },
     /// The encoder failed on a batch.
-    #[error("masks {first} to {last}: {source}")]
+    #[error("masks {first} to {last}: {cause}")]
     Encode {
         /// Index of the batch's first mask.
         first: usize,
         /// Index of the batch's last mask.
         last: usize,
         /// Why.
-        source: EncodeError,
+        cause: Box<EncodeError>,
     },
 }
 
@@ -136,10 +136,10 @@ pub fn embed_masks(
         n_pixels += mask.inside.len() as u64;
         crops.push(crop);
         if crops.len() >= batch || n_pixels >= MAX_BATCH_PIXELS || index + 1 == masks.len() {
-            let encoded = encoder.encode(&crops).map_err(|source| EmbedError::Encode {
+            let encoded = encoder.encode(&crops).map_err(|cause| EmbedError::Encode {
                 first: index + 1 - crops.len(),
                 last: index,
-                source,
+                cause: Box::new(cause),
             })?;
             vectors.extend(encoded);
             crops.clear();
