@@ -216,6 +216,38 @@ fn records_behind_the_manifest_are_repaired() {
     assert_eq!(fs_err::read_dir(dir.path().join("tmp")).expect("folder").count(), 0);
 }
 
+/// Each step but the last can fail, and the generation before it stays, whole: so a crash there is
+/// harmless too.
+#[test]
+fn publication_that_fails_on_its_way_changes_nothing() {
+    for obstacle in ["extras", "manifest.previous"] {
+        let dir = tempfile::tempdir().expect("temporary folder");
+        let store = Store::create_or_open(dir.path()).expect("opens");
+        let shards = put_many(&store, &["a", "b"]);
+        let hash = store.publish(&manifest(1, &shards[..1]), &Extras::new()).expect("publishes");
+        // A file cannot be written where its folder is none, nor renamed onto a folder that is not empty.
+        let (path, aside) = (dir.path().join(obstacle), dir.path().join("aside"));
+        match obstacle {
+            "extras" => {
+                fs_err::rename(&path, &aside).expect("renames");
+                fs_err::write(&path, b"").expect("writable");
+            }
+            _ => fs_err::create_dir_all(path.join("inside")).expect("room"),
+        }
+        let failed = store.publish(&manifest(2, &shards[1..]), &Extras::new());
+        assert!(matches!(failed, Err(StoreError::Io(_))), "{obstacle}: {failed:?}");
+        if obstacle == "extras" {
+            fs_err::remove_file(&path).expect("there");
+            fs_err::rename(&aside, &path).expect("renames");
+        } else {
+            fs_err::remove_dir_all(&path).expect("there");
+        }
+        assert_eq!(store.reader().expect("published").current().hash, hash, "{obstacle}");
+        assert_eq!(store.next_generation().expect("records"), 2, "{obstacle}");
+        store.publish(&manifest(2, &shards[1..]), &Extras::new()).expect("publishes, once it can");
+    }
+}
+
 /// Publishes without end; run in a process of its own by the test below, which kills it.
 #[test]
 #[ignore = "the process that the kill test starts"]

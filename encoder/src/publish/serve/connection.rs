@@ -114,3 +114,32 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
         self.bounded(polled, false, context)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+
+    use super::*;
+
+    #[tokio::test]
+    async fn sending_moves_the_deadline_and_receiving_does_not() {
+        let (ours, mut theirs) = tokio::io::duplex(64);
+        let mut connection = Connection::new(ours, None, Duration::from_millis(200));
+        for _ in 0..5 {
+            tokio::time::sleep(Duration::from_millis(60)).await;
+            connection.write_all(b"x").await.expect("room");
+            let polled = tokio::time::timeout(Duration::ZERO, connection.read_u8()).await;
+            assert!(polled.is_err(), "nothing to read yet, and no failure: {polled:?}");
+        }
+        let drip = tokio::spawn(async move {
+            while theirs.write_all(b"y").await.is_ok() {
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+        });
+        let mut received = Vec::new();
+        let ended = connection.read_to_end(&mut received).await.expect_err("never ends by itself");
+        assert_eq!(ended.kind(), io::ErrorKind::TimedOut);
+        drop(connection);
+        drip.await.expect("ends with the connection");
+    }
+}

@@ -455,6 +455,32 @@ async fn who_stalls_is_dropped_and_does_not_hold_up_the_stop() {
 }
 
 #[tokio::test]
+async fn connections_beyond_the_limit_wait() {
+    let fixture = fixture();
+    let running = start(fixture.dir.path(), Limits { n_connections: 1, ..Limits::default() }).await;
+    let mut first = connect(running.address, "GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n").await;
+    first.read_exact(&mut [0; 12]).await.expect("answered");
+    let mut second = connect(running.address, "GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n").await;
+    let mut received = [0; 12];
+    let early = tokio::time::timeout(Duration::from_millis(100), second.read_exact(&mut received)).await;
+    assert!(early.is_err(), "not while the first is open");
+    drop(first);
+    second.read_exact(&mut received).await.expect("answered then");
+    assert_eq!(&received, b"HTTP/1.1 200");
+}
+
+#[cfg(unix)]
+#[tokio::test]
+async fn sigterm_is_the_signal_to_stop() {
+    let mut signalled = std::pin::pin!(stop_signal());
+    // The first poll installs the handler; without it this process would die.
+    assert!(tokio::time::timeout(Duration::ZERO, &mut signalled).await.is_err());
+    let killed = std::process::Command::new("kill").args(["-TERM", &std::process::id().to_string()]).status();
+    assert!(killed.expect("runs").success());
+    signalled.await.expect("signals can be listened for");
+}
+
+#[tokio::test]
 async fn nothing_published_is_an_error_at_the_start() {
     let dir = tempfile::tempdir().expect("temporary folder");
     let any_port = "127.0.0.1:0".parse().expect("an address");
