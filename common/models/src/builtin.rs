@@ -79,9 +79,10 @@ const SYNONYMS: [(&str, &str); 24] = [
 ];
 
 /// Words that say nothing about colour or shape.
-const STOP_WORDS: [&str; 24] = [
+const STOP_WORDS: [&str; 32] = [
     "a", "an", "the", "and", "or", "of", "with", "in", "is", "are", "that", "this", "some", "any", "all",
     "thing", "things", "object", "objects", "item", "items", "coloured", "colored", "photo",
+    "something", "anything", "everything", "one", "ones", "find", "where", "there",
 ];
 
 /// The stand-in; both an image and a text encoder.

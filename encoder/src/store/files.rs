@@ -64,11 +64,13 @@ pub(super) fn replace(part: &Path, path: &Path, bytes: &[u8], access: Access) ->
 
 /// Replaces a working file by `bytes`, written beside as `.part` first: whole or not at all after a crash.
 pub(crate) fn write_durably(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let part = path.with_extension("part");
+    let mut part = path.as_os_str().to_owned();
+    part.push(".part");
+    let part = Path::new(&part);
     if part.exists() {
-        fs_err::remove_file(&part)?;
+        fs_err::remove_file(part)?;
     }
-    replace(&part, path, bytes, Access::Shared)
+    replace(part, path, bytes, Access::Shared)
 }
 
 /// Renames a synced file and makes its new name durable.
