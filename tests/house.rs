@@ -91,7 +91,8 @@ fn check_words(house: &Path, store: &Path, models: &Path, dir: &Path) {
     let mut scores = Vec::new();
     for word in &words {
         let path = dir.join("scores.npy");
-        run(&mut encoder(&["query", "--store", text(store), "--models", text(models), word, "--scores", text(&path)]));
+        let scores_to = ["--scores", text(&path), "--limit", "0"];
+        run(encoder(&["query", "--store", text(store), "--models", text(models), word]).args(scores_to));
         let all: Vec<f32> = read_npy(&path);
         assert_eq!(all.len(), truth.len());
         // What was never seen scores below everything.

@@ -104,6 +104,9 @@ pub fn best(reader: &StoreReader, scores: &Scores, n: usize) -> Result<Vec<Hit>,
     let mut order: Vec<u32> = (0..scores.cosines.len() as u32).filter(|i| !scores.cosines[*i as usize].is_nan()).collect();
     order.sort_by(|a, b| scores.cosines[*b as usize].total_cmp(&scores.cosines[*a as usize]).then(a.cmp(b)));
     order.truncate(n);
+    if order.is_empty() {
+        return Ok(Vec::new());
+    }
     let mut hits = Vec::with_capacity(order.len());
     for cell in &reader.manifest().cells {
         let Some(shard) = cell.shards.get(&Profile::Exact) else { continue };
