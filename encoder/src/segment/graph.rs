@@ -11,6 +11,11 @@ use super::{BoxPx, Mask, NO_REGION, SegmentError, SegmentInput, Segmenter, masks
 
 /// Steps of an edge weight per unit of L*a*b* distance; 16 bits then reach beyond black to white.
 const WEIGHT_STEPS: f32 = 200.0;
+/// One over the least share of a component's pixels that its own kind must surround: a strip 3 px
+/// wide has a third, a ring around an object hardly any.
+const MIN_SURROUNDED: u32 = 8;
+/// Smallest mask, pixels of the image that is worked on: a block of JPEG's, the size of its artefacts.
+const MIN_AREA_PX: u32 = 64;
 /// Neighbours that a pixel has an edge to; the other four have one to it.
 const NEIGHBOURS: [(i64, i64); 4] = [(1, 0), (-1, 1), (0, 1), (1, 1)];
 
@@ -37,9 +42,9 @@ impl Default for GraphSettings {
     fn default() -> Self {
         Self {
             max_side_px: 640,
-            smoothing_px: 0.8,
-            scales: vec![1500.0, 500.0, 150.0],
-            min_area_share: 0.0005,
+            smoothing_px: 0.6,
+            scales: vec![3000.0, 1200.0, 600.0, 300.0, 150.0],
+            min_area_share: 0.0008,
             depth_weight: 100.0,
             max_overlap_iou: 0.9,
             max_masks: 400,
@@ -83,7 +88,7 @@ impl Segmenter for GraphSegmenter {
         let raster = Raster::new(input, &self.settings);
         let edges = raster.edges_by_weight(self.settings.depth_weight);
         let n_pixels = raster.lab.len();
-        let min_area_px = ((n_pixels as f32 * self.settings.min_area_share) as u32).max(1);
+        let min_area_px = ((n_pixels as f32 * self.settings.min_area_share) as u32).max(MIN_AREA_PX);
         let levels: Vec<Labels> = self
             .settings
             .scales
@@ -248,14 +253,45 @@ impl Raster {
                 open.push(*edge);
             }
         }
-        for edge in open {
-            let (a, b) = ends(edge);
+        for edge in &open {
+            let (a, b) = ends(*edge);
             let (a, b) = (forest.root(a), forest.root(b));
             if a != b && forest.area_px[a].min(forest.area_px[b]) < min_area_px {
                 forest.join(a, b, 0.0);
             }
         }
+        let mut thick = self.thick(&mut forest);
+        for edge in &open {
+            let (a, b) = ends(*edge);
+            let (a, b) = (forest.root(a), forest.root(b));
+            if a != b && !(thick[a] && thick[b]) {
+                let either = thick[a] || thick[b];
+                forest.join(a, b, 0.0);
+                thick[forest.root(a)] = either;
+            }
+        }
         forest.labels(&self.valid)
+    }
+
+    /// Returns, at the roots, whether enough of a component is surrounded by itself.
+    ///
+    /// A smoothed outline is a ramp of colours. A component only as wide as that is a strip of it,
+    /// and belongs to no object.
+    fn thick(&self, forest: &mut Forest) -> Vec<bool> {
+        let roots: Vec<usize> = (0..self.lab.len()).map(|pixel| forest.root(pixel)).collect();
+        let (width, height) = (self.width_px as usize, self.height_px as usize);
+        if width < 3 || height < 3 {
+            return vec![true; roots.len()];
+        }
+        let mut surrounded_px = vec![0_u32; roots.len()];
+        for pixel in (1..height - 1).flat_map(|y| y * width + 1..(y + 1) * width - 1) {
+            let rows = [pixel - width, pixel, pixel + width];
+            let same =
+                |middle: &usize| roots[middle - 1..=middle + 1].iter().all(|root| *root == roots[pixel]);
+            surrounded_px[roots[pixel]] += u32::from(rows.iter().all(same));
+        }
+        let shares = surrounded_px.iter().zip(&forest.area_px);
+        shares.map(|(surrounded_px, area_px)| surrounded_px * MIN_SURROUNDED >= *area_px).collect()
     }
 }
 

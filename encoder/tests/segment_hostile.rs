@@ -1,0 +1,161 @@
+//! Damaged mask files: an error or a valid result, never a panic, and no allocation that the size
+//! of file and image does not justify.
+#![expect(unsafe_code, reason = "a global allocator that measures is unsafe to implement")]
+
+mod common;
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+
+use common::Random;
+use glam::DAffine3;
+use image::RgbImage;
+use slag_common::{Distortion, Intrinsics, View};
+use slag_encoder::segment::{GivenMasks, Mask, Rle, SegmentError, SegmentInput};
+
+thread_local! {
+    static LARGEST_BYTES: Cell<usize> = const { Cell::new(0) };
+}
+
+/// The system's allocator, noting the largest request of each thread.
+struct Measuring;
+
+// SAFETY: every call is passed on to the system's allocator unchanged.
+unsafe impl GlobalAlloc for Measuring {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        LARGEST_BYTES.with(|largest| largest.set(largest.get().max(layout.size())));
+        // SAFETY: the caller's promises are the system allocator's.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's promises are the system allocator's.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Measuring = Measuring;
+
+const WIDTH_PX: u32 = 64;
+const HEIGHT_PX: u32 = 48;
+
+/// A file with its end cut off, a few bits flipped or up to eight bytes overwritten.
+fn damaged(bytes: &[u8], random: &mut Random) -> Vec<u8> {
+    let mut bytes = bytes.to_vec();
+    match random.below(3) {
+        0 => bytes.truncate(random.below(bytes.len())),
+        1 => {
+            for _ in 0..=random.below(4) {
+                let at = random.below(bytes.len());
+                bytes[at] ^= 1 << random.below(8);
+            }
+        }
+        _ => {
+            let at = random.below(bytes.len());
+            let end = (at + 1 + random.below(8)).min(bytes.len());
+            let value = [0xFF, b'9', b'o', 0][random.below(4)];
+            bytes[at..end].fill(value);
+        }
+    }
+    bytes
+}
+
+fn check(masks: &[Mask]) {
+    for mask in masks {
+        assert!(mask.box_px.x0 < mask.box_px.x1 && mask.box_px.x1 <= WIDTH_PX);
+        assert!(mask.box_px.y0 < mask.box_px.y1 && mask.box_px.y1 <= HEIGHT_PX);
+        assert_eq!(mask.inside.len(), (mask.box_px.width_px() * mask.box_px.height_px()) as usize);
+        assert_eq!(mask.inside.iter().filter(|inside| **inside).count(), mask.area_px as usize);
+    }
+}
+
+/// Reads 1,000 damaged versions of a mask file; both outcomes must occur.
+fn survive(name: &str, bytes: &[u8], whole: bool) {
+    let dir = tempfile::tempdir().unwrap();
+    let intrinsics = Intrinsics {
+        width_px: WIDTH_PX,
+        height_px: HEIGHT_PX,
+        focal_x_px: 50.0,
+        focal_y_px: 50.0,
+        centre_x_px: 32.0,
+        centre_y_px: 24.0,
+        distortion: Distortion::None,
+    };
+    let view = View {
+        name: "a.jpg".into(),
+        image_path: "a.jpg".into(),
+        intrinsics,
+        camera_from_world: DAffine3::IDENTITY,
+    };
+    let image = RgbImage::new(WIDTH_PX, HEIGHT_PX);
+    let input = SegmentInput { view: &view, image: &image, valid: None, undistorter: None, depth: None };
+    let path = dir.path().join(name);
+    let load = |bytes: &[u8]| {
+        fs_err::write(&path, bytes).unwrap();
+        LARGEST_BYTES.set(0);
+        GivenMasks::open(if whole { &path } else { dir.path() }, Vec::new())?.load(&input)
+    };
+    assert!(load(bytes).unwrap().is_some_and(|masks| masks.len() > 1));
+    let mut random = Random(bytes.len() as u64);
+    let (mut n_read, mut n_errors) = (0, 0);
+    for round in 0..1_000 {
+        let bad = damaged(bytes, &mut random);
+        let result = load(&bad);
+        let largest_bytes = LARGEST_BYTES.get();
+        // The table of 16-bit ids is the largest fixed part; JSON is buffered value by value.
+        assert!(largest_bytes <= (3 << 19) + 64 * bad.len(), "{name} {round}: {largest_bytes} bytes");
+        match result {
+            Ok(masks) => {
+                n_read += 1;
+                check(&masks.unwrap_or_default());
+            }
+            Err(SegmentError::Io(error)) => panic!("{name} {round}: {error}"),
+            Err(error) => {
+                n_errors += 1;
+                assert!(error.to_string().contains(name), "{error}");
+            }
+        }
+    }
+    assert!(n_read > 5 && n_errors > 200, "{name}: {n_read} read, {n_errors} errors");
+}
+
+#[test]
+fn damaged_id_images() {
+    let id = |x: u32, y: u32| (x / 9 + y / 7) as u16;
+    let pixels = || (0..HEIGHT_PX).flat_map(|y| (0..WIDTH_PX).map(move |x| id(x, y)));
+    for depth in [png::BitDepth::Eight, png::BitDepth::Sixteen] {
+        let rows: Vec<u8> = match depth {
+            png::BitDepth::Eight => pixels().map(|id| id as u8).collect(),
+            _ => pixels().flat_map(|id| (id * 4_000).to_be_bytes()).collect(),
+        };
+        let mut file = Vec::new();
+        let mut encoder = png::Encoder::new(&mut file, WIDTH_PX, HEIGHT_PX);
+        encoder.set_color(png::ColorType::Grayscale);
+        encoder.set_depth(depth);
+        encoder.write_header().unwrap().write_image_data(&rows).unwrap();
+        survive("a.png", &file, false);
+    }
+}
+
+#[test]
+fn damaged_run_lengths() {
+    let masks: Vec<Mask> = (1..6)
+        .map(|i| {
+            let runs = (0..WIDTH_PX).flat_map(|_| [HEIGHT_PX - 7 * i, 7 * i]).collect();
+            Rle::from_counts(WIDTH_PX, HEIGHT_PX, runs).unwrap().to_mask().unwrap()
+        })
+        .collect();
+    let text = |mask| Rle::from_mask(mask, WIDTH_PX, HEIGHT_PX).to_text();
+    let mut annotations: Vec<_> = masks
+        .iter()
+        .map(|mask| serde_json::json!({"segmentation": {"size": [48, 64], "counts": text(mask)}, "image_id": 1}))
+        .collect();
+    annotations.push(
+        serde_json::json!({"segmentation": {"size": [48, 64], "counts": [1000, 72, 2000]}, "image_id": 1}),
+    );
+    survive("a.json", serde_json::json!(annotations).to_string().as_bytes(), false);
+    let data_set =
+        serde_json::json!({"images": [{"id": 1, "file_name": "a.jpg"}], "annotations": annotations});
+    survive("coco.json", data_set.to_string().as_bytes(), true);
+}
