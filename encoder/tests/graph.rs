@@ -164,13 +164,13 @@ fn the_name_tells_parameters_apart() {
 }
 
 /// Returns the mean over true instance masks of at least 200 pixels of the best overlap, and the
-/// number of masks found, over eight photos.
+/// number of masks found, over eight photos that the default settings were not chosen with.
 fn house_score(settings: &GraphSettings) -> Option<(f64, f64)> {
     let scene = shared("scenes/house_a")?;
     let truth = GivenMasks::open(&scene.join("gt/masks"), Vec::new()).unwrap();
     let segmenter = GraphSegmenter::new(settings.clone());
     let (mut sum, mut n, mut n_masks) = (0.0, 0, 0);
-    for view in poses::read(&scene, None).unwrap().views.iter().step_by(12) {
+    for view in poses::read(&scene, None).unwrap().views.iter().skip(5).step_by(12) {
         let loaded = load_image(view).unwrap();
         let input = SegmentInput::new(&loaded, None);
         let masks = segmenter.segment(&input).unwrap();
@@ -194,6 +194,6 @@ fn iou_of_masks(a: &Mask, b: &Mask) -> f64 {
 fn instances_of_real_photos() {
     let Some((mean_best_iou, n_masks)) = house_score(&GraphSettings::default()) else { return };
     println!("mean best IoU {mean_best_iou:.3}, {n_masks:.1} masks an image");
-    // Measured 0.636 and 136; without regard to what is seen, chance gives about 0.1.
-    assert!(mean_best_iou > 0.6 && n_masks < 160.0, "{mean_best_iou} {n_masks}");
+    // Measured: 0.670 and 169.9.
+    assert!(mean_best_iou > 0.63 && n_masks < 180.0, "{mean_best_iou} {n_masks}");
 }

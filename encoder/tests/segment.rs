@@ -305,7 +305,7 @@ fn random_mask(random: &mut Random, width: u32, height: u32) -> Mask {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(60))]
+    #![proptest_config(ProptestConfig { cases: 60, failure_persistence: None, ..ProptestConfig::default() })]
     #[test]
     fn regions_are_the_distinct_sets_of_masks(
         seed: u64, n in 0_usize..12, size in (1_u32..40, 1_u32..30), target in (1_u32..60, 1_u32..60), holes: bool,

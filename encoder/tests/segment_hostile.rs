@@ -70,9 +70,7 @@ fn check(masks: &[Mask]) {
     }
 }
 
-/// Reads 1,000 damaged versions of a mask file; both outcomes must occur.
-fn survive(name: &str, bytes: &[u8], whole: bool) {
-    let dir = tempfile::tempdir().unwrap();
+fn view() -> View {
     let intrinsics = Intrinsics {
         width_px: WIDTH_PX,
         height_px: HEIGHT_PX,
@@ -82,12 +80,18 @@ fn survive(name: &str, bytes: &[u8], whole: bool) {
         centre_y_px: 24.0,
         distortion: Distortion::None,
     };
-    let view = View {
+    View {
         name: "a.jpg".into(),
         image_path: "a.jpg".into(),
         intrinsics,
         camera_from_world: DAffine3::IDENTITY,
-    };
+    }
+}
+
+/// Reads 1,000 damaged versions of a mask file; both outcomes must occur.
+fn survive(name: &str, bytes: &[u8], whole: bool) {
+    let dir = tempfile::tempdir().unwrap();
+    let view = view();
     let image = RgbImage::new(WIDTH_PX, HEIGHT_PX);
     let input = SegmentInput { view: &view, image: &image, valid: None, undistorter: None, depth: None };
     let path = dir.path().join(name);
@@ -136,6 +140,20 @@ fn damaged_id_images() {
         encoder.write_header().unwrap().write_image_data(&rows).unwrap();
         survive("a.png", &file, false);
     }
+}
+
+/// A small file that unpacks to far more than the image has pixels is refused by its header.
+#[test]
+fn an_id_image_that_unpacks_to_much() {
+    let dir = tempfile::tempdir().unwrap();
+    image::GrayImage::new(6_000, 6_000).save(dir.path().join("a.png")).unwrap();
+    let (view, image) = (view(), RgbImage::new(WIDTH_PX, HEIGHT_PX));
+    let input = SegmentInput { view: &view, image: &image, valid: None, undistorter: None, depth: None };
+    let given = GivenMasks::open(dir.path(), Vec::new()).unwrap();
+    LARGEST_BYTES.set(0);
+    let error = given.load(&input).unwrap_err();
+    assert!(matches!(error, SegmentError::Size { found_px: [6_000, 6_000], .. }), "{error}");
+    assert!(LARGEST_BYTES.get() < 100_000, "{} bytes", LARGEST_BYTES.get());
 }
 
 #[test]
