@@ -81,7 +81,7 @@ pub fn serve(args: ServeArgs) -> Result<(), Failure> {
         Err(StoreError::Empty { path }) => {
             tracing::warn!("{} holds no scene yet; what is fetched there is served at once", path.display());
         }
-        Err(error) => tracing::warn!("no scene is loaded: {:#}", anyhow!(error)),
+        Err(error) => tracing::warn!("no scene is loaded: {}", slag_edge::error_line(&error)),
     }
     if let Ok(snapshot) = engine.snapshot()
         && let Err(error) = engine.check_encoder(&snapshot)

@@ -34,7 +34,7 @@ impl Failure {
             Self::Failed(kind, error) => (Exit::Failed, kind, error),
             Self::Interrupted(error) => (Exit::Interrupted, "interrupted", error),
         };
-        let detail = format!("{error:#}");
+        let detail = slag_edge::error_line(&*error);
         // Nothing is left to do if even this cannot be written.
         let _ = match json {
             true => writeln!(
@@ -203,6 +203,13 @@ mod tests {
         );
         assert_eq!(text, " a     long head\n12             é\n 3  long content\n");
         assert_eq!(visible("yard\u{1b}[2J\n"), "yard\\u{1b}[2J\\n");
+    }
+
+    #[test]
+    fn causes_are_told_once() {
+        let io = io::Error::new(io::ErrorKind::NotFound, "no such file");
+        let error = anyhow::Error::from(io).context("a: no such file; look").context("b");
+        assert_eq!(slag_edge::error_line(&*error), "b: a: no such file; look");
     }
 
     #[test]

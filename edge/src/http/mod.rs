@@ -113,7 +113,7 @@ impl App {
             let counter = match app.engine.reload() {
                 Ok(()) => &app.metrics.reloads,
                 Err(error) => {
-                    tracing::warn!("the newest generation does not open: {:#}", anyhow::Error::from(error));
+                    tracing::warn!("the newest generation does not open: {}", crate::error_line(&error));
                     &app.metrics.reload_failures
                 }
             };

@@ -52,8 +52,20 @@ impl Service {
     }
 
     async fn get(&self, uri: &str) -> (StatusCode, HeaderMap, Value) {
-        read(self.send("GET", uri).await).await
+        soon(async { read(self.send("GET", uri).await).await }).await
     }
+}
+
+/// A failed test must end, too: the runtime waits for whoever waits at the gate.
+impl Drop for Service {
+    fn drop(&mut self) {
+        open_gate(&self.gate);
+    }
+}
+
+/// Fails instead of hanging.
+async fn soon<T>(future: impl Future<Output = T>) -> T {
+    tokio::time::timeout(Duration::from_secs(20), future).await.expect("within 20 s")
 }
 
 async fn read(response: Response) -> (StatusCode, HeaderMap, Value) {
@@ -226,12 +238,12 @@ async fn generations_are_swapped_while_questions_are_answered() {
     write_cache(service.dir.path(), &chair(None), 2);
     let (status, _, body) = service.get("/query?text=0").await;
     assert!(status == StatusCode::OK && [1, 2].contains(&body["generation"].as_i64().expect("a number")));
-    attempts.changed().await.expect("the service lives");
+    soon(attempts.changed()).await.expect("the service lives");
     assert_eq!(service.get("/query?text=0").await.2["generation"], 2);
 
     fs_err::write(service.dir.path().join("current"), b"{").expect("a file");
     assert_eq!(service.get("/status").await.2["scene"]["generation"], 2);
-    attempts.changed().await.expect("the service lives");
+    soon(attempts.changed()).await.expect("the service lives");
     assert_eq!(service.get("/query?text=0").await.2["generation"], 2);
     let (_, _, metrics) = service.get("/metrics").await;
     let metrics = metrics.as_str().expect("text");
@@ -296,7 +308,7 @@ async fn talk(address: std::net::SocketAddr, request: &str) -> TcpStream {
 
 async fn rest(mut stream: TcpStream) -> String {
     let mut text = String::new();
-    stream.read_to_string(&mut text).await.expect("an answer");
+    soon(stream.read_to_string(&mut text)).await.expect("an answer");
     text
 }
 
@@ -319,7 +331,7 @@ async fn stops_gracefully() {
     open_gate(&service.gate);
     let answer = rest(waiting).await;
     assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("\"rank\":1"), "{answer}");
-    end.await.expect("no panic").expect("a clean end");
+    soon(end).await.expect("no panic").expect("a clean end");
     assert!(TcpStream::connect(address).await.is_err());
 }
 
@@ -331,7 +343,7 @@ async fn stopping_has_a_deadline() {
     let _waiting = talk(address, ASK_AND_WAIT).await;
     until_in_flight(&service).await;
     stop.send(()).expect("the server lives");
-    assert_eq!(end.await.expect("no panic").expect_err("cut off").kind(), std::io::ErrorKind::TimedOut);
+    assert_eq!(soon(end).await.expect("no panic").expect_err("cut off").kind(), std::io::ErrorKind::TimedOut);
     open_gate(&service.gate);
 }
 

@@ -112,6 +112,8 @@ fn empty_answers_say_why() {
     let reason = nothing.reason.expect("nothing there");
     assert_eq!((reason.kind, reason.best_score), (ReasonKind::NothingThere, None));
     assert_eq!(nothing.area_fetched, Some(false));
+    let sticking_out = ask(&yard, ball(DVec3::new(45.0, 0.0, 0.0), 10.0));
+    assert_eq!(sticking_out.area_fetched, Some(false));
     let gaussians =
         ask(&yard, |request, _| (request.level, request.threshold) = (Level::Gaussians, Some(1.0)));
     assert_eq!(gaussians.reason.expect("nothing found").kind, ReasonKind::BelowThreshold);

@@ -1,0 +1,210 @@
+//! The real program over a real socket: fetch, status, query, serve, and how it ends.
+
+use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpListener;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+
+use glam::DVec3;
+use half::f16;
+use serde_json::Value;
+use slag_common::Hash32;
+use slag_common::frames::Aabb;
+use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
+use slag_common::shard::{Profile, ShardHeader, ShardParts};
+use slag_edge::text::TextService;
+use slag_models::SessionOptions;
+
+/// Returns the signed manifest and the one shard of a scene with 40 red Gaussians around x = 2 and
+/// 60 blue ones around x = 8, in the space of the built-in model.
+fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
+    let text = TextService::open(None, &SessionOptions::new("not-needed".into())).expect("built in");
+    let mut positions: Vec<[u16; 3]> = (0..40).map(|i| [2000 + i, 0, 0]).collect();
+    positions.extend((0..60).map(|i| [8000 + i, 0, 0]));
+    let row =
+        |word: &str| text.encode(word).expect("known").iter().map(|v| f16::from_f32(*v)).collect::<Vec<_>>();
+    let palette = [row("red"), row("blue")].concat();
+    let bounds = Aabb { min: DVec3::ZERO, max: DVec3::splat(10.0) };
+    let header = ShardHeader {
+        cell_id: 0,
+        n_gaussians: 100,
+        n_rows: 2,
+        dim: text.info().dim,
+        origin_in_world: [0.0; 3],
+        position_step: [1e-3; 3],
+        box_min: bounds.min.into(),
+        box_max: bounds.max.into(),
+        encoder_id: text.info().id.0,
+    };
+    let mut shard = Vec::new();
+    ShardParts {
+        header,
+        positions: &positions,
+        row_starts: &[0, 40, 100],
+        palette: &palette,
+        radii: &[0.05; 2],
+        exact: None,
+    }
+    .write(&mut shard)
+    .expect("writes to memory");
+    let record = ShardRecord {
+        hash: Hash32::of(&shard),
+        len_bytes: shard.len() as u64,
+        n_rows: 2,
+        score_error_bound: 0.05,
+        position_error: 5e-4,
+    };
+    let shards = BTreeMap::from([(Profile::Compact, record)]);
+    let manifest = Manifest {
+        version: manifest::VERSION,
+        scene: "paint".into(),
+        generation: 3,
+        created_unix_secs: 1_700_000_000,
+        expires_unix_secs: None,
+        metric: true,
+        geo_reference: None,
+        encoder: EncoderRecord {
+            name: text.info().name.clone(),
+            id: text.info().id,
+            dim: header.dim,
+            default_threshold: 0.8,
+        },
+        n_gaussians: 100,
+        n_without_evidence: 0,
+        n_rejected: 0,
+        cells: vec![CellRecord { cell_id: 0, bounds, n_gaussians: 100, shards }],
+    };
+    (manifest.sign(&manifest::generate_key()), shard)
+}
+
+/// Serves the two files of a store from a thread for as long as the tests run; returns its address.
+fn store(signed: Vec<u8>, shard: Vec<u8>) -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let address = format!("http://{}", listener.local_addr().expect("an address"));
+    std::thread::spawn(move || {
+        for stream in listener.incoming() {
+            let mut stream = stream.expect("a connection");
+            let mut lines =
+                BufReader::new(stream.try_clone().expect("a handle")).lines().map_while(Result::ok);
+            let request = lines.next().unwrap_or_default();
+            lines.take_while(|line| !line.is_empty()).for_each(drop);
+            let body = if request.starts_with("GET /v1/manifest ") { &signed } else { &shard };
+            let head =
+                format!("HTTP/1.1 200 OK\r\ncontent-length: {}\r\nconnection: close\r\n\r\n", body.len());
+            // The client may have enough of it.
+            let _ = stream.write_all(&[head.as_bytes(), body].concat());
+        }
+    });
+    address
+}
+
+fn slag_edge(cache: &Path, args: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_slag-edge"));
+    command.args(args).arg("--cache").arg(cache).env_remove("RUST_LOG");
+    command
+}
+
+fn run(cache: &Path, args: &[&str]) -> (Option<i32>, String, String) {
+    let Output { status, stdout, stderr } = slag_edge(cache, args).output().expect("runs");
+    (
+        status.code(),
+        String::from_utf8_lossy(&stdout).into_owned(),
+        String::from_utf8_lossy(&stderr).into_owned(),
+    )
+}
+
+fn json(text: &str) -> Value {
+    serde_json::from_str(text).unwrap_or_else(|e| panic!("{e}: {text}"))
+}
+
+fn get(url: &str) -> (u16, Value) {
+    let agent: ureq::Agent = ureq::Agent::config_builder().http_status_as_error(false).build().into();
+    let mut response = agent.get(url).call().expect("an answer");
+    (response.status().as_u16(), json(&response.body_mut().read_to_string().expect("a body")))
+}
+
+#[test]
+fn a_robot_fetches_asks_and_serves() {
+    let (signed, shard) = red_and_blue();
+    let from = store(signed, shard);
+    let dir = tempfile::tempdir().expect("a folder");
+    let cache = dir.path().join("cache");
+
+    let (code, out, _) = run(&cache, &["query", "red", "--json"]);
+    assert_eq!((code, &json(&out)["error"]["kind"]), (Some(1), &"no-scene".into()));
+    let (code, out, err) =
+        run(&cache, &["fetch", "--from", &from, "--at", "0,0,0", "--radius", "20", "--json"]);
+    assert_eq!((code, err.as_str()), (Some(0), ""), "{out}");
+    assert_eq!(json(&out)["downloaded"]["n_shards"], 1);
+    let (code, out, _) = run(&cache, &["status", "--json"]);
+    assert_eq!(
+        (code, &json(&out)["n_gaussians"], &json(&out)["generation"]),
+        (Some(0), &100.into(), &3.into())
+    );
+
+    let (code, out, _) = run(&cache, &["query", "a red thing", "--near", "-1,0,0", "--json"]);
+    let answer = &json(&out)["answers"][0];
+    assert_eq!((code, &answer["n_gaussians"]), (Some(0), &40.into()));
+    assert!((answer["distance"].as_f64().expect("a number") - 3.0195).abs() < 1e-9);
+    let (code, out, err) = run(&cache, &["query", "blue"]);
+    assert!(
+        code == Some(0) && out.contains("8.03, 0.00, 0.00") && err.contains("60 Gaussians of 100"),
+        "{out}{err}"
+    );
+    let (code, out, err) = run(&cache, &["query", "yellow"]);
+    assert!(
+        code == Some(0) && out.is_empty() && err.contains("no Gaussian of the 100 searched"),
+        "{out}{err}"
+    );
+    let (code, out, _) = run(&cache, &["query", "sofa", "--json"]);
+    assert_eq!((code, &json(&out)["error"]["kind"]), (Some(1), &"unknown-words".into()));
+    assert_eq!(run(&cache, &["query", " "]).0, Some(2));
+    assert_eq!(run(&cache, &["query", "red", "--limit", "0"]).0, Some(2));
+
+    let mut serving = slag_edge(&cache, &["serve", "--listen", "127.0.0.1:0"]);
+    let mut serving = serving.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
+    let mut line = String::new();
+    BufReader::new(serving.stdout.take().expect("a pipe")).read_line(&mut line).expect("a line");
+    let url = line.trim().strip_prefix("listening on ").expect("an address");
+    let (code, answers) = get(&format!("{url}/query?text=blue"));
+    assert_eq!((code, &answers["answers"][0]["n_gaussians"]), (200, &60.into()));
+    assert_eq!(get(&format!("{url}/query?text=blue&radius=1")).0, 400);
+    assert_eq!(get(&format!("{url}/status")).1["is_ready"], true);
+    let killed = Command::new("kill").args(["-TERM", &serving.id().to_string()]).status().expect("runs");
+    assert!(killed.success());
+    assert_eq!(serving.wait().expect("ends").code(), Some(0));
+    let mut log = String::new();
+    serving.stderr.take().expect("a pipe").read_to_string(&mut log).expect("text");
+    assert!(log.contains("stopping"), "{log}");
+}
+
+/// A store that never answers: ctrl-c ends the fetch with the interrupted code.
+#[test]
+fn an_interrupted_fetch_says_so() {
+    let silent = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let from = format!("http://{}", silent.local_addr().expect("an address"));
+    let dir = tempfile::tempdir().expect("a folder");
+    let mut fetching = slag_edge(dir.path(), &["fetch", "--from", &from, "--at", "0,0,0"]);
+    let fetching = fetching.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
+    // Its handler is in place before it connects. Closing makes it try again, and look at the flag.
+    let (connection, _) = silent.accept().expect("a connection");
+    let interrupted = Command::new("kill").args(["-INT", &fetching.id().to_string()]).status().expect("runs");
+    assert!(interrupted.success());
+    drop(connection);
+    let output = fetching.wait_with_output().expect("ends");
+    assert_eq!(output.status.code(), Some(130), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+#[test]
+fn nobody_reads_and_nobody_complains() {
+    let (signed, shard) = red_and_blue();
+    let dir = tempfile::tempdir().expect("a folder");
+    let from = store(signed, shard);
+    assert_eq!(run(dir.path(), &["fetch", "--from", &from, "--at", "0,0,0"]).0, Some(0));
+    let mut child = slag_edge(dir.path(), &["query", "red", "--level", "gaussians", "--json"]);
+    let mut child = child.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
+    drop(child.stdout.take());
+    let output = child.wait_with_output().expect("ends");
+    assert_eq!((output.status.code(), output.stderr.len()), (Some(0), 0));
+}
