@@ -8,8 +8,17 @@ fn check_confirms_the_poses() {
     let Some(scene) = shared("scenes/brighton") else { return };
     let dir = tempfile::tempdir().expect("a temporary folder");
     let report = run_json(&mut encoder(&[
-        "check", "--scene", text(&scene.join("point_cloud.ply")), "--views", text(&scene.join("sparse/0")),
-        "--samples", "18", "--raster-width", "1000", "--out", text(dir.path()),
+        "check",
+        "--scene",
+        text(&scene.join("point_cloud.ply")),
+        "--views",
+        text(&scene.join("sparse/0")),
+        "--samples",
+        "18",
+        "--raster-width",
+        "1000",
+        "--out",
+        text(dir.path()),
     ]));
     let psnr_db = report["mean_psnr_db"].as_f64().expect("a figure");
     println!("mean PSNR of 18 photos: {psnr_db:.2} dB");
@@ -27,8 +36,19 @@ fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
     let models = root().join("tests/models/conse");
     // Six photos show the road end to end; all eighteen only take longer.
     let summary = run_json(&mut encoder(&[
-        "encode", "--scene", text(&scene.join("point_cloud.ply")), "--views", text(&scene.join("sparse/0")),
-        "--masks", "auto", "--models", text(&models), "--views-limit", "6", "--store", text(&store),
+        "encode",
+        "--scene",
+        text(&scene.join("point_cloud.ply")),
+        "--views",
+        text(&scene.join("sparse/0")),
+        "--masks",
+        "auto",
+        "--models",
+        text(&models),
+        "--views-limit",
+        "6",
+        "--store",
+        text(&store),
     ]));
     println!("{summary:#}");
     let n_cells = summary["n_cells"].as_u64().expect("a count");
@@ -61,7 +81,16 @@ fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
     let cache = dir.path().join("metres");
     let models = text(&models);
     for question in ["car", "tree", "boat"] {
-        let reply = run_json(&mut edge(&["query", question, "--cache", text(&cache), "--models", models, "--near", "0,0,2"]));
+        let reply = run_json(&mut edge(&[
+            "query",
+            question,
+            "--cache",
+            text(&cache),
+            "--models",
+            models,
+            "--near",
+            "0,0,2",
+        ]));
         println!("{question}: {reply}");
         assert!(reply["answers"].is_array());
     }

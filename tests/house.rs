@@ -18,10 +18,26 @@ fn the_field_agrees_with_the_independent_reference() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let store = dir.path().join("house");
     let models = root().join("tests/models/conse");
-    let (scene, views, masks) = (house.join("point_cloud.ply"), house.join("sparse/0"), house.join("gt/masks"));
+    let (scene, views, masks) =
+        (house.join("point_cloud.ply"), house.join("sparse/0"), house.join("gt/masks"));
     let summary = run_json(&mut encoder(&[
-        "encode", "--scene", text(&scene), "--views", text(&views), "--masks", text(&masks), "--models", text(&models),
-        "--background", "white", "--min-mask-px", "200", "--metric", "--strict", "--store", text(&store),
+        "encode",
+        "--scene",
+        text(&scene),
+        "--views",
+        text(&views),
+        "--masks",
+        text(&masks),
+        "--models",
+        text(&models),
+        "--background",
+        "white",
+        "--min-mask-px",
+        "200",
+        "--metric",
+        "--strict",
+        "--store",
+        text(&store),
     ]));
     println!("{summary:#}");
     assert_eq!(summary["n_masks"], 1423, "the reference has as many masks");
@@ -35,14 +51,20 @@ fn check_embeddings(house: &Path, store: &Path) {
     let bytes = fs_err::read(house.join("gt/reference_embeddings.npz")).expect("reads");
     let mut npz = npyz::npz::NpzArchive::new(std::io::Cursor::new(bytes)).expect("an npz");
     let index: Vec<u32> = npz.by_name("index").expect("an npz").expect("index").into_vec().expect("u32");
-    let embedding: Vec<f16> = npz.by_name("embedding").expect("an npz").expect("embedding").into_vec().expect("f16");
-    let weight: Vec<f32> = npz.by_name("total_weight").expect("an npz").expect("weight").into_vec().expect("f32");
+    let embedding: Vec<f16> =
+        npz.by_name("embedding").expect("an npz").expect("embedding").into_vec().expect("f16");
+    let weight: Vec<f32> =
+        npz.by_name("total_weight").expect("an npz").expect("weight").into_vec().expect("f32");
     let dim = embedding.len() / index.len();
 
     let reader = StoreReader::open(store).expect("a published store");
     let table = read_regions(&reader).expect("regions");
-    let fields: Vec<_> =
-        reader.manifest().cells.iter().map(|c| read_field(&reader, c.cell_id, table.len()).expect("a field")).collect();
+    let fields: Vec<_> = reader
+        .manifest()
+        .cells
+        .iter()
+        .map(|c| read_field(&reader, c.cell_id, table.len()).expect("a field"))
+        .collect();
     let place: BTreeMap<u32, (usize, usize)> = fields
         .iter()
         .enumerate()
@@ -63,7 +85,12 @@ fn check_embeddings(house: &Path, store: &Path) {
     let n = cosines.len();
     println!(
         "{n} reference Gaussians: cosine min {:.4}, 5th percentile {:.4}, median {:.4}; weight error median {:.5}, 99th percentile {:.5}, max {:.5}",
-        cosines[0], cosines[n / 20], cosines[n / 2], weight_errors[n / 2], weight_errors[n * 99 / 100], weight_errors[n - 1]
+        cosines[0],
+        cosines[n / 20],
+        cosines[n / 2],
+        weight_errors[n / 2],
+        weight_errors[n * 99 / 100],
+        weight_errors[n - 1]
     );
     assert!(cosines[n / 20] >= 0.99);
     assert!(weight_errors[n * 95 / 100] <= 0.01);
@@ -96,7 +123,9 @@ fn check_words(house: &Path, store: &Path, models: &Path, dir: &Path) {
         let all: Vec<f32> = read_npy(&path);
         assert_eq!(all.len(), truth.len());
         // What was never seen scores below everything.
-        scores.push(objects.iter().map(|k| if all[*k].is_nan() { -2.0 } else { all[*k] }).collect::<Vec<f32>>());
+        scores.push(
+            objects.iter().map(|k| if all[*k].is_nan() { -2.0 } else { all[*k] }).collect::<Vec<f32>>(),
+        );
     }
     // The multi-class answer is the best word, over Gaussians of the words' categories.
     let of_words: Vec<usize> = (0..objects.len()).filter(|i| words.contains(labels[*i])).collect();

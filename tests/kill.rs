@@ -38,8 +38,17 @@ fn run_or_kill(command: &mut Command, after: Duration) -> bool {
 fn encode(room: &Path, store: &Path) -> Command {
     let (scene, views) = (room.join("scene.ply"), room.join("transforms.json"));
     let mut command = encoder(&[
-        "encode", "--scene", text(&scene), "--views", text(&views), "--metric", "--cell-gaussians", "4096",
-        "--store", text(store), "--json",
+        "encode",
+        "--scene",
+        text(&scene),
+        "--views",
+        text(&views),
+        "--metric",
+        "--cell-gaussians",
+        "4096",
+        "--store",
+        text(store),
+        "--json",
     ]);
     command.env("SOURCE_DATE_EPOCH", "1700000000");
     command
@@ -49,19 +58,22 @@ fn encode(room: &Path, store: &Path) -> Command {
 fn killed_encodes_and_fetches_resume_and_show_nothing_half() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let room = dir.path().join("room");
-    run(&mut encoder(&["generate", "--out", text(&room), "--n-views", "16"]));
+    run(&mut encoder(&["generate", "--out", text(&room), "--n-views", "10"]));
     let whole = dir.path().join("whole");
     let start = Instant::now();
     run(&mut encode(&room, &whole));
     let encode_time = start.elapsed();
     let expected = content(&whole);
 
-    // Killed again and again; a store that got finished in between makes room for the next.
+    // Killed again and again, within the first half so that several kills hit each store; a store that got
+    // finished in between makes room for the next.
     let mut state = 7;
     let (mut n_kills, mut n_stores, mut n_resumed) = (0, 0, 0);
     while n_kills < N_KILLS || n_stores == 0 {
         let store = dir.path().join(format!("store{n_stores}"));
-        while n_kills < N_KILLS && run_or_kill(&mut encode(&room, &store), encode_time.mul_f64(random(&mut state))) {
+        while n_kills < N_KILLS
+            && run_or_kill(&mut encode(&room, &store), encode_time.mul_f64(0.5 * random(&mut state)))
+        {
             n_kills += 1;
             if store.join("manifest").exists() {
                 assert_eq!(content(&store), expected, "a visible manifest is a whole one");
@@ -76,13 +88,25 @@ fn killed_encodes_and_fetches_resume_and_show_nothing_half() {
 
     let server = Service::start(&mut encoder(&["serve", "--store", text(&whole)]));
     let fetch = |cache: &Path| {
-        edge(&["fetch", "--from", &server.url, "--at", "3.5,2.7,0", "--radius", "50", "--cache", text(cache), "--json"])
+        edge(&[
+            "fetch",
+            "--from",
+            &server.url,
+            "--at",
+            "3.5,2.7,0",
+            "--radius",
+            "50",
+            "--cache",
+            text(cache),
+            "--json",
+        ])
     };
     let reference = dir.path().join("cache");
     let start = Instant::now();
     run(&mut fetch(&reference));
     let fetch_time = start.elapsed();
-    let answer = |cache: &Path| run_json(&mut edge(&["query", "red", "--cache", text(cache)]))["answers"].clone();
+    let answer =
+        |cache: &Path| run_json(&mut edge(&["query", "red", "--cache", text(cache)]))["answers"].clone();
     let expected = answer(&reference);
     for kill in 0..N_KILLS {
         let cache = dir.path().join(format!("cache{kill}"));

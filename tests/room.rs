@@ -34,8 +34,19 @@ fn stores_are_equal_to_the_byte() {
     let encode = |name: &str, views: &Path, threads: &str, memory: &str| {
         let store = dir.path().join(name);
         run(&mut encoder(&[
-            "encode", "--scene", text(&scene), "--views", text(views), "--threads", threads, "--memory", memory,
-            "--cell-gaussians", "20000", "--store", text(&store),
+            "encode",
+            "--scene",
+            text(&scene),
+            "--views",
+            text(views),
+            "--threads",
+            threads,
+            "--memory",
+            memory,
+            "--cell-gaussians",
+            "20000",
+            "--store",
+            text(&store),
         ]));
         content(&store)
     };
@@ -58,7 +69,17 @@ fn mistakes_are_named() {
     };
     let absent = dir.path().join("absent");
     let encode = |views: &str, images: &str| {
-        fails(&["encode", "--scene", text(&scene), "--views", views, "--images", images, "--store", text(&store)])
+        fails(&[
+            "encode",
+            "--scene",
+            text(&scene),
+            "--views",
+            views,
+            "--images",
+            images,
+            "--store",
+            text(&store),
+        ])
     };
     assert!(encode(text(&views), text(&absent)).contains("--images"));
     assert!(encode(text(&absent), text(dir.path())).contains("absent"));
@@ -73,7 +94,16 @@ fn the_robots_service_answers() {
     let (scene, views) = generate(dir.path());
     let (store, cache) = (dir.path().join("store"), dir.path().join("cache"));
     let encode = || {
-        run(&mut encoder(&["encode", "--scene", text(&scene), "--views", text(&views), "--metric", "--store", text(&store)]));
+        run(&mut encoder(&[
+            "encode",
+            "--scene",
+            text(&scene),
+            "--views",
+            text(&views),
+            "--metric",
+            "--store",
+            text(&store),
+        ]));
     };
     encode();
     let server = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
@@ -82,7 +112,10 @@ fn the_robots_service_answers() {
     let reply = robot.get("/query?text=red&near=3.5,2.7,0");
     assert!(!reply["answers"].as_array().expect("answers").is_empty(), "{reply}");
     let reply = robot.get("/query?text=pink");
-    assert!(reply["answers"].as_array().expect("answers").is_empty() && reply["reason"].is_string(), "{reply}");
+    assert!(
+        reply["answers"].as_array().expect("answers").is_empty() && reply["reason"].is_string(),
+        "{reply}"
+    );
     assert_eq!(robot.get("/status")["generation"], 1);
 
     // Its source and place are remembered.

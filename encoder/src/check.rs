@@ -78,19 +78,30 @@ pub struct CheckReport {
 /// A table of the views, and what may be wrong.
 impl fmt::Display for CheckReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "{:<28} {:>8} {:>14} {:>9} {:>10}", "view", "PSNR dB", "plain colour", "covered", "Gaussians")?;
+        writeln!(
+            f,
+            "{:<28} {:>8} {:>14} {:>9} {:>10}",
+            "view", "PSNR dB", "plain colour", "covered", "Gaussians"
+        )?;
         for view in &self.views {
             let covered = format!("{:.0} %", view.covered_share * 100.0);
             let (psnr_db, flat_db, n) = (view.psnr_db, view.flat_psnr_db, view.visible_gaussians);
             writeln!(f, "{:<28} {psnr_db:>8.2} {flat_db:>14.2} {covered:>9} {n:>10}", view.name)?;
         }
         let covered = format!("{:.0} %", self.mean_covered_share * 100.0);
-        writeln!(f, "{:<28} {:>8.2} {:>14.2} {covered:>9}", "mean", self.mean_psnr_db, self.mean_flat_psnr_db)?;
+        writeln!(
+            f,
+            "{:<28} {:>8.2} {:>14.2} {covered:>9}",
+            "mean", self.mean_psnr_db, self.mean_flat_psnr_db
+        )?;
         match &self.diagnosis {
             None => writeln!(f, "the drawings explain the photos"),
             Some(Diagnosis { mistake: Some(mistake), tried, .. }) => {
                 let best_db = tried.first().map_or(f64::NAN, |trial| trial.psnr_db);
-                writeln!(f, "the drawings do not explain the photos; likely: {mistake} (then {best_db:.2} dB)")
+                writeln!(
+                    f,
+                    "the drawings do not explain the photos; likely: {mistake} (then {best_db:.2} dB)"
+                )
             }
             Some(_) => writeln!(
                 f,

@@ -150,14 +150,18 @@ impl Demo {
 /// Whatever step fails, with its name.
 pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &AtomicBool) -> Result<Demo> {
     if !options.edge.is_file() {
-        return Err(anyhow!("{} is not there; build it with: cargo build --release --bin slag-edge", options.edge.display()));
+        return Err(anyhow!(
+            "{} is not there; build it with: cargo build --release --bin slag-edge",
+            options.edge.display()
+        ));
     }
     clear(&options.out)?;
     let store = options.out.join("store");
     let cache = options.out.join("cache");
 
     let room = generate::room(options.seed, N_VIEWS);
-    let written = tokio::task::block_in_place(|| room.write(&options.out.join("room"), progress)).context("generate")?;
+    let written = tokio::task::block_in_place(|| room.write(&options.out.join("room"), progress))
+        .context("generate")?;
     let models = ModelDir::builtin();
     let settings = EncodeSettings {
         scene: written.scene,
@@ -186,14 +190,19 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     // The built-in models need no runtime library.
     let session = SessionOptions::new(PathBuf::new());
     let summary =
-        tokio::task::block_in_place(|| encode::encode(&settings, &models, &session, progress, cancel)).context("encode")?;
+        tokio::task::block_in_place(|| encode::encode(&settings, &models, &session, progress, cancel))
+            .context("encode")?;
 
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
     let (listens, listening) = tokio::sync::oneshot::channel();
     let serving = tokio::spawn(async move {
         // Errors of the channels mean that the other end is gone: the demo failed and says why itself.
-        let on_listening = |address| drop(listens.send(address));
-        let stopped = async { drop(stopped.await) };
+        let on_listening = |address| {
+            let _ = listens.send(address);
+        };
+        let stopped = async {
+            let _ = stopped.await;
+        };
         serve::serve(&store, ([127, 0, 0, 1], 0).into(), Limits::default(), on_listening, stopped).await
     });
     let Ok(address) = listening.await else {
@@ -224,7 +233,14 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
             }),
         };
         let truth = truth.iter().map(|o| (o.name.to_owned(), (o.box_min + o.box_max) / 2.0)).collect();
-        questions.push(Question { text: text.into(), answer, reason: reply.reason, truth, process_ms, right });
+        questions.push(Question {
+            text: text.into(),
+            answer,
+            reason: reply.reason,
+            truth,
+            process_ms,
+            right,
+        });
     }
     let report = DemoReport {
         encode: summary,
@@ -254,7 +270,13 @@ fn clear(out: &Path) -> Result<()> {
 /// Runs the robot's program on its cache and reads what it prints.
 fn edge<T: for<'a> Deserialize<'a>>(options: &DemoOptions, cache: &Path, args: &[&str]) -> Result<T> {
     let mut command = Command::new(&options.edge);
-    command.args(args).arg("--cache").arg(cache).args(["--json", "--quiet"]).stdin(Stdio::null()).stderr(Stdio::inherit());
+    command
+        .args(args)
+        .arg("--cache")
+        .arg(cache)
+        .args(["--json", "--quiet"])
+        .stdin(Stdio::null())
+        .stderr(Stdio::inherit());
     let output = tokio::task::block_in_place(|| command.output())
         .with_context(|| format!("cannot start {}", options.edge.display()))?;
     let text = String::from_utf8_lossy(&output.stdout);
@@ -270,14 +292,23 @@ impl fmt::Display for DemoReport {
         writeln!(
             f,
             "encoded {} Gaussians from {} photos ({} masks) in {:.1} s; the robot fetched {} kB in {} cells\n",
-            encode.n_gaussians, encode.n_views, encode.n_masks, encode.wall_secs, self.downloaded_bytes / 1000, encode.n_cells
+            encode.n_gaussians,
+            encode.n_views,
+            encode.n_masks,
+            encode.wall_secs,
+            self.downloaded_bytes / 1000,
+            encode.n_cells
         )?;
         writeln!(f, "{:<16} {:<44} {:<32} right", "question", "answer of the robot, offline", "truth")?;
         for q in &self.questions {
             let answer = match &q.answer {
                 Some(a @ EdgeAnswer { position_in_world: p, .. }) => format!(
                     "{:.1} m away at {:.2} {:.2} {:.2}, score {:.2}",
-                    a.distance.unwrap_or(f64::NAN), p.x, p.y, p.z, a.score
+                    a.distance.unwrap_or(f64::NAN),
+                    p.x,
+                    p.y,
+                    p.z,
+                    a.score
                 ),
                 None => "nothing found".into(),
             };

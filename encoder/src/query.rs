@@ -28,7 +28,9 @@ pub enum QueryError {
     #[error(transparent)]
     Store(#[from] StoreError),
     /// The query is a vector of another space.
-    #[error("the query has {found} components, the store's embeddings {expected}; use the models it was encoded with ({encoder})")]
+    #[error(
+        "the query has {found} components, the store's embeddings {expected}; use the models it was encoded with ({encoder})"
+    )]
     Dimension {
         /// Components of the store's embeddings.
         expected: usize,
@@ -101,7 +103,8 @@ pub struct Hit {
 /// # Errors
 /// [`QueryError`].
 pub fn best(reader: &StoreReader, scores: &Scores, n: usize) -> Result<Vec<Hit>, QueryError> {
-    let mut order: Vec<u32> = (0..scores.cosines.len() as u32).filter(|i| !scores.cosines[*i as usize].is_nan()).collect();
+    let mut order: Vec<u32> =
+        (0..scores.cosines.len() as u32).filter(|i| !scores.cosines[*i as usize].is_nan()).collect();
     order.sort_by(|a, b| scores.cosines[*b as usize].total_cmp(&scores.cosines[*a as usize]).then(a.cmp(b)));
     order.truncate(n);
     if order.is_empty() {
@@ -111,7 +114,8 @@ pub fn best(reader: &StoreReader, scores: &Scores, n: usize) -> Result<Vec<Hit>,
     for cell in &reader.manifest().cells {
         let Some(shard) = cell.shards.get(&Profile::Exact) else { continue };
         let bytes = reader.read_object(shard.hash)?;
-        let layout = ShardLayout::check(&bytes).map_err(|source| QueryError::Shard { cell_id: cell.cell_id, source })?;
+        let layout = ShardLayout::check(&bytes)
+            .map_err(|source| QueryError::Shard { cell_id: cell.cell_id, source })?;
         let view = layout.view(&bytes);
         let indices = view.exact.map_or(&[][..], |exact| exact.input_indices);
         for (at, index) in indices.iter().enumerate() {

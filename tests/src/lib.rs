@@ -88,11 +88,13 @@ pub struct Service {
 impl Service {
     /// Starts a service on a free port and waits until it listens.
     pub fn start(command: &mut Command) -> Self {
-        let mut child = command.args(["--listen", "127.0.0.1:0"]).stderr(Stdio::piped()).spawn().expect("starts");
+        let mut child =
+            command.args(["--listen", "127.0.0.1:0"]).stderr(Stdio::piped()).spawn().expect("starts");
         let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines();
         let mut seen = String::new();
         let url = loop {
-            let line = lines.next().unwrap_or_else(|| panic!("ended before it listened: {seen}")).expect("text");
+            let line =
+                lines.next().unwrap_or_else(|| panic!("ended before it listened: {seen}")).expect("text");
             if let Some(at) = line.find("http://") {
                 break line[at..].split_whitespace().next().expect("a URL").to_owned();
             }
@@ -105,7 +107,8 @@ impl Service {
 
     /// Returns a resource as JSON.
     pub fn get(&self, path: &str) -> Value {
-        let text = ureq::get(format!("{}{path}", self.url)).call().expect("answers").body_mut().read_to_string();
+        let text =
+            ureq::get(format!("{}{path}", self.url)).call().expect("answers").body_mut().read_to_string();
         serde_json::from_str(&text.expect("text")).expect("JSON")
     }
 }
@@ -175,7 +178,13 @@ mod tests {
             for j in 0..7 {
                 if positive[i] && !positive[j] {
                     pairs += 1.0;
-                    won += if scores[i] > scores[j] { 1.0 } else if scores[i] == scores[j] { 0.5 } else { 0.0 };
+                    won += if scores[i] > scores[j] {
+                        1.0
+                    } else if scores[i] == scores[j] {
+                        0.5
+                    } else {
+                        0.0
+                    };
                 }
             }
         }

@@ -340,9 +340,22 @@ mod tests {
     fn flags_are_consistent_and_checked() {
         Cli::command().debug_assert();
         let parse = |line: &str| Cli::try_parse_from(line.split(' '));
-        assert!(parse("slag-encoder encode --scene a.ply --views v --store s --memory 512MiB --masks auto").is_ok());
-        for wrong in ["--memory 1", "--memory 5TB", "--views-limit 0", "--threads 0", "--preset best", "--background red"] {
-            assert!(parse(&format!("slag-encoder encode --scene a.ply --views v --store s {wrong}")).is_err(), "{wrong}");
+        assert!(
+            parse("slag-encoder encode --scene a.ply --views v --store s --memory 512MiB --masks auto")
+                .is_ok()
+        );
+        for wrong in [
+            "--memory 1",
+            "--memory 5TB",
+            "--views-limit 0",
+            "--threads 0",
+            "--preset best",
+            "--background red",
+        ] {
+            assert!(
+                parse(&format!("slag-encoder encode --scene a.ply --views v --store s {wrong}")).is_err(),
+                "{wrong}"
+            );
         }
     }
 
@@ -350,6 +363,10 @@ mod tests {
     fn bytes_have_units() {
         assert_eq!(parse_bytes("2GiB"), Ok(2 << 30));
         assert_eq!(parse_bytes("67108864"), Ok(1 << 26));
-        assert!(parse_bytes("99999999999GiB").is_err() && parse_bytes("-1").is_err() && parse_bytes("GiB").is_err());
+        assert!(
+            parse_bytes("99999999999GiB").is_err()
+                && parse_bytes("-1").is_err()
+                && parse_bytes("GiB").is_err()
+        );
     }
 }

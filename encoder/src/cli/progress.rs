@@ -43,11 +43,15 @@ impl Progress for Shown {
     fn begin(&self, stage: &str, unit: &str, total: u64, done: u64) {
         let mut state = self.state();
         let now = Some(Instant::now());
-        *state = State { stage: stage.into(), total, done, first: done, started: now, last_line: now, bar: None };
+        *state =
+            State { stage: stage.into(), total, done, first: done, started: now, last_line: now, bar: None };
         if self.terminal {
-            let template = format!("{{prefix:>10}} [{{bar:32}}] {{pos}}/{{len}} {unit}s  {{per_sec}}  ETA {{eta}}");
-            let style = ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar());
-            let bar = ProgressBar::new(total).with_style(style.progress_chars("=> ")).with_prefix(stage.to_owned());
+            let template =
+                format!("{{prefix:>10}} [{{bar:32}}] {{pos}}/{{len}} {unit}s  {{per_sec}}  ETA {{eta}}");
+            let style =
+                ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar());
+            let bar =
+                ProgressBar::new(total).with_style(style.progress_chars("=> ")).with_prefix(stage.to_owned());
             bar.set_position(done);
             bar.reset_eta();
             bar.enable_steady_tick(Duration::from_millis(200));
@@ -66,7 +70,10 @@ impl Progress for Shown {
                 let seconds = state.started.map_or(0.0, |t| t.elapsed().as_secs_f64());
                 let rate = (state.done - state.first) as f64 / seconds.max(1e-9);
                 let eta_secs = state.total.saturating_sub(state.done) as f64 / rate.max(1e-9);
-                eprintln!("{}: {} of {}, {rate:.1}/s, ETA {eta_secs:.0} s", state.stage, state.done, state.total);
+                eprintln!(
+                    "{}: {} of {}, {rate:.1}/s, ETA {eta_secs:.0} s",
+                    state.stage, state.done, state.total
+                );
                 state.last_line = Some(Instant::now());
             }
             None => {}

@@ -30,7 +30,8 @@ use crate::{generate, ingest, query};
 /// Runs the program and says how it ended.
 pub fn run(cli: Cli) -> Exit {
     let json = cli.json;
-    let progress: Box<dyn Progress> = if cli.shows_progress() { Box::new(Shown::new()) } else { Box::new(Silent) };
+    let progress: Box<dyn Progress> =
+        if cli.shows_progress() { Box::new(Shown::new()) } else { Box::new(Silent) };
     let result = match cli.command {
         Command::Check(args) => run_check(&args, json),
         Command::Encode(args) => run_encode(&args, progress.as_ref(), json),
@@ -47,7 +48,10 @@ pub fn run(cli: Cli) -> Exit {
             let interrupted = matches!(error.downcast_ref(), Some(EncodeError::Interrupted { .. }))
                 || matches!(error.downcast_ref(), Some(qdrant::PushError::Cancelled));
             if json {
-                println!("{}", json!({"error": {"message": format!("{error:#}"), "interrupted": interrupted}}));
+                println!(
+                    "{}",
+                    json!({"error": {"message": format!("{error:#}"), "interrupted": interrupted}})
+                );
             } else {
                 eprintln!("{}: {error:#}", if interrupted { "interrupted" } else { "error" });
             }
@@ -58,7 +62,10 @@ pub fn run(cli: Cli) -> Exit {
 
 /// A reader that went away (`| head`) is no failure.
 fn is_broken_pipe(error: &anyhow::Error) -> bool {
-    error.chain().filter_map(|e| e.downcast_ref::<std::io::Error>()).any(|e| e.kind() == std::io::ErrorKind::BrokenPipe)
+    error
+        .chain()
+        .filter_map(|e| e.downcast_ref::<std::io::Error>())
+        .any(|e| e.kind() == std::io::ErrorKind::BrokenPipe)
 }
 
 /// Prints the result: as one JSON object, or as lines for people.
@@ -113,7 +120,12 @@ fn run_check(args: &CheckArgs, json: bool) -> Result<Exit> {
     let all = poses::read(&args.input.views, args.input.images.as_deref())?.views;
     let missing: Vec<_> = ingest::missing_images(&all).into_iter().map(|v| v.image_path.clone()).collect();
     if let Some(first) = missing.first() {
-        let message = format!("{} of {} photos are missing, the first is {}", missing.len(), all.len(), first.display());
+        let message = format!(
+            "{} of {} photos are missing, the first is {}",
+            missing.len(),
+            all.len(),
+            first.display()
+        );
         if args.input.strict || missing.len() == all.len() {
             return Err(anyhow!("{message}; give their folder with --images"));
         }
@@ -124,11 +136,17 @@ fn run_check(args: &CheckArgs, json: bool) -> Result<Exit> {
     let mut views = Vec::with_capacity(n);
     for i in 0..n {
         let loaded = ingest::load_image(&there[i * there.len() / n])?;
-        let view = RasterView { camera_from_world: loaded.view.camera_from_world, intrinsics: loaded.view.intrinsics };
+        let view = RasterView {
+            camera_from_world: loaded.view.camera_from_world,
+            intrinsics: loaded.view.intrinsics,
+        };
         views.push(CheckView { name: loaded.view.name, image: loaded.image, view });
     }
-    let options =
-        CheckOptions { width_px: args.raster_width, pictures_dir: args.out.clone(), ..CheckOptions::default() };
+    let options = CheckOptions {
+        width_px: args.raster_width,
+        pictures_dir: args.out.clone(),
+        ..CheckOptions::default()
+    };
     let report = check::check(&scene, &views, &CpuRasterizer, &options)?;
     print(json, &report, &report)?;
     Ok(if missing.is_empty() { Exit::Done } else { Exit::Partly })
@@ -181,13 +199,21 @@ fn available_threads() -> usize {
 
 fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
     let settings = encode_settings(args)?;
-    rayon::ThreadPoolBuilder::new().num_threads(settings.threads).build_global().context("cannot start threads")?;
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(settings.threads)
+        .build_global()
+        .context("cannot start threads")?;
     let (models, session) = open_models(&args.models)?;
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());
     let summary = encode::encode(&settings, &models, &session, progress, cancel_flag()?.as_ref())?;
-    let stages = summary.busy_secs.iter().map(|(stage, s)| format!("{stage} {s:.1}")).collect::<Vec<_>>().join(", ");
-    let sizes =
-        summary.shard_bytes.iter().map(|(p, b)| format!("{p} {:.1} MB", *b as f64 / 1e6)).collect::<Vec<_>>().join(", ");
+    let stages =
+        summary.busy_secs.iter().map(|(stage, s)| format!("{stage} {s:.1}")).collect::<Vec<_>>().join(", ");
+    let sizes = summary
+        .shard_bytes
+        .iter()
+        .map(|(p, b)| format!("{p} {:.1} MB", *b as f64 / 1e6))
+        .collect::<Vec<_>>()
+        .join(", ");
     let skipped = match summary.skipped_views.len() {
         0 => String::new(),
         n => format!("left out   {n} views, the first: {}\n", summary.skipped_views[0].reason),
@@ -227,7 +253,9 @@ fn run_query(args: &QueryArgs, json: bool) -> Result<Exit> {
     if id != manifest.encoder.id {
         return Err(anyhow!(
             "the store was encoded with {:?} ({}), the models at hand are {}; give the same with --models",
-            manifest.encoder.name, manifest.encoder.id, models.encoder_id()
+            manifest.encoder.name,
+            manifest.encoder.id,
+            models.encoder_id()
         ));
     }
     let vector = models.text_encoder(&session)?.encode(&args.text)?;
@@ -244,7 +272,8 @@ fn run_query(args: &QueryArgs, json: bool) -> Result<Exit> {
     let mut lines = format!("{n_matching} of {n_scored} Gaussians reach {threshold}\n");
     for hit in &hits {
         let p = hit.position_in_world;
-        lines += &format!("{:.4}  Gaussian {:>8}  at {:.2} {:.2} {:.2}\n", hit.cosine, hit.index, p.x, p.y, p.z);
+        lines +=
+            &format!("{:.4}  Gaussian {:>8}  at {:.2} {:.2} {:.2}\n", hit.cosine, hit.index, p.x, p.y, p.z);
     }
     let value = json!({
         "text": args.text, "threshold": threshold, "n_matching": n_matching, "n_scored": n_scored, "best": hits,
@@ -254,7 +283,10 @@ fn run_query(args: &QueryArgs, json: bool) -> Result<Exit> {
 }
 
 fn runtime() -> Result<tokio::runtime::Runtime> {
-    tokio::runtime::Builder::new_multi_thread().enable_all().build().context("cannot start the service's threads")
+    tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .context("cannot start the service's threads")
 }
 
 fn run_serve(args: &ServeArgs) -> Result<Exit> {
@@ -314,13 +346,22 @@ fn run_generate(args: &GenerateArgs, progress: &dyn Progress) -> Result<Exit> {
         room.views.len(),
         args.out.display()
     );
-    println!("next: slag-encoder encode --scene {} --views {} --metric --store STORE", written.scene.display(), written.views.display());
+    println!(
+        "next: slag-encoder encode --scene {} --views {} --metric --store STORE",
+        written.scene.display(),
+        written.views.display()
+    );
     Ok(Exit::Done)
 }
 
 fn run_demo(args: &DemoArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
     let edge = std::env::current_exe()?.with_file_name(format!("slag-edge{}", std::env::consts::EXE_SUFFIX));
-    let options = demo::DemoOptions { out: args.out.clone(), seed: args.seed, edge, created_unix_secs: now_unix_secs() };
+    let options = demo::DemoOptions {
+        out: args.out.clone(),
+        seed: args.seed,
+        edge,
+        created_unix_secs: now_unix_secs(),
+    };
     let demo = runtime()?.block_on(async { demo::run(&options, progress, cancel_flag()?.as_ref()).await })?;
     print(json, &demo.report, &demo.report)?;
     if args.keep {
@@ -328,4 +369,3 @@ fn run_demo(args: &DemoArgs, progress: &dyn Progress, json: bool) -> Result<Exit
     }
     Ok(if demo.report.all_right() { Exit::Done } else { Exit::Failed })
 }
-

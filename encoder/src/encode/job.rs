@@ -32,11 +32,16 @@ impl<'a> Job<'a> {
         let found = job.records.get(FINGERPRINT_KEY).map_err(|source| records_error(store, source))?;
         let same = found.as_deref() == Some(&fingerprint.0);
         if found.is_some() && !same && !restart {
-            return Err(EncodeError::OtherJob { path: store.dir().to_owned(), n_done: job.done_views()?.len() });
+            return Err(EncodeError::OtherJob {
+                path: store.dir().to_owned(),
+                n_done: job.done_views()?.len(),
+            });
         }
         if !same {
             job.clear()?;
-            job.records.insert(FINGERPRINT_KEY, &fingerprint.0).map_err(|source| records_error(store, source))?;
+            job.records
+                .insert(FINGERPRINT_KEY, &fingerprint.0)
+                .map_err(|source| records_error(store, source))?;
             job.flush()?;
         }
         fs_err::create_dir_all(job.folder.join("views"))?;

@@ -134,7 +134,9 @@ pub enum EncodeError {
         n_gaussians: usize,
     },
     /// The budget is too small for the region vectors.
-    #[error("the vectors of {n_regions} regions take {needed_bytes} bytes, half of --memory is {available_bytes}; raise --memory or lower --views-limit")]
+    #[error(
+        "the vectors of {n_regions} regions take {needed_bytes} bytes, half of --memory is {available_bytes}; raise --memory or lower --views-limit"
+    )]
     Memory {
         /// Regions in all views.
         n_regions: usize,
@@ -318,7 +320,12 @@ pub fn encode(
         }
         summary.n_rows += u64::from(built.n_rows);
         summary.n_without_evidence += built.n_without_evidence as u64;
-        records.push(CellRecord { cell_id, bounds: cell.bounds, n_gaussians: cell.gaussians.len() as u32, shards });
+        records.push(CellRecord {
+            cell_id,
+            bounds: cell.bounds,
+            n_gaussians: cell.gaussians.len() as u32,
+            shards,
+        });
         progress.advance(1);
     }
     progress.end();
@@ -345,8 +352,13 @@ pub fn encode(
     store.publish(&manifest, &extras)?;
     job.finish()?;
     store.prune()?;
-    summary.busy_secs =
-        stopwatch.0.into_inner().unwrap_or_else(|e| e.into_inner()).into_iter().map(|(k, v)| (k.to_owned(), v)).collect();
+    summary.busy_secs = stopwatch
+        .0
+        .into_inner()
+        .unwrap_or_else(|e| e.into_inner())
+        .into_iter()
+        .map(|(k, v)| (k.to_owned(), v))
+        .collect();
     summary.wall_secs = start.elapsed().as_secs_f64();
     Ok(summary)
 }
@@ -373,7 +385,8 @@ fn choose_views(settings: &EncodeSettings) -> Result<(Vec<View>, Vec<SkippedView
     // Evenly spread over the order of names, which mostly is the order in which they were taken.
     let n = there.len();
     let chosen: Vec<usize> = (0..limit).map(|i| i * n / limit).collect();
-    let views = there.into_iter().enumerate().filter(|(i, _)| chosen.binary_search(i).is_ok()).map(|(_, v)| v);
+    let views =
+        there.into_iter().enumerate().filter(|(i, _)| chosen.binary_search(i).is_ok()).map(|(_, v)| v);
     Ok((views.collect(), skipped))
 }
 
@@ -400,7 +413,9 @@ fn run_views(
                     progress.advance(1);
                 }
                 // One bad photo or mask file of a thousand must not end an encode.
-                Err(error @ (EncodeError::Ingest(_) | EncodeError::Segment(_))) if !worker.settings.strict => {
+                Err(error @ (EncodeError::Ingest(_) | EncodeError::Segment(_)))
+                    if !worker.settings.strict =>
+                {
                     tracing::warn!("view {} is left out: {error}", view.name);
                     skipped.push(SkippedView { view: view.name.clone(), reason: error.to_string() });
                 }
@@ -415,7 +430,10 @@ fn run_views(
     let n_workers = worker.settings.threads.clamp(1, open.len().max(1));
     let results: Vec<Result<Vec<SkippedView>, EncodeError>> = std::thread::scope(|scope| {
         let workers: Vec<_> = (0..n_workers).map(|_| scope.spawn(work)).collect();
-        workers.into_iter().map(|w| w.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))).collect()
+        workers
+            .into_iter()
+            .map(|w| w.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+            .collect()
     });
     let skipped: Vec<SkippedView> = results.into_iter().collect::<Result<Vec<_>, _>>()?.concat();
     if cancel.load(Ordering::Relaxed) {
@@ -482,14 +500,16 @@ pub fn read_field(
 /// As [`read_field`].
 pub fn read_regions(reader: &crate::store::StoreReader) -> Result<RegionTable, ReadFieldError> {
     let bytes = read_extra(reader, EXTRA_REGIONS)?;
-    RegionTable::from_bytes(&bytes).map_err(|source| ReadFieldError::Damaged { name: EXTRA_REGIONS.into(), source })
+    RegionTable::from_bytes(&bytes)
+        .map_err(|source| ReadFieldError::Damaged { name: EXTRA_REGIONS.into(), source })
 }
 
 fn read_extra(
     reader: &crate::store::StoreReader,
     name: &str,
 ) -> Result<slag_common::container::AlignedBytes, ReadFieldError> {
-    let hash = reader.current().extras.get(name).ok_or_else(|| ReadFieldError::Absent { name: name.to_owned() })?;
+    let hash =
+        reader.current().extras.get(name).ok_or_else(|| ReadFieldError::Absent { name: name.to_owned() })?;
     Ok(reader.read_object(*hash)?)
 }
 

@@ -77,6 +77,24 @@ pub struct EncodeSettings {
 pub const MAX_RASTER_WIDTH_PX: u32 = 1024;
 
 impl EncodeSettings {
+    /// Returns names and lengths of the files in the given masks' folder and its subfolders.
+    fn mask_files(&self) -> Result<Vec<(String, u64)>, EncodeError> {
+        let Masks::Given { dir, .. } = &self.masks else { return Ok(Vec::new()) };
+        let mut files = Vec::new();
+        let mut folders = if dir.is_dir() { vec![dir.clone()] } else { Vec::new() };
+        while let Some(folder) = folders.pop() {
+            for entry in fs_err::read_dir(folder)? {
+                let entry = entry?;
+                match entry.metadata()? {
+                    metadata if metadata.is_dir() => folders.push(entry.path()),
+                    metadata => files.push((entry.path().display().to_string(), metadata.len())),
+                }
+            }
+        }
+        files.sort();
+        Ok(files)
+    }
+
     /// Returns the hash of everything on which a view's sums depend.
     pub(super) fn fingerprint(
         &self,
@@ -91,6 +109,7 @@ impl EncodeSettings {
             encoder_id: Hash32,
             scene: Hash32,
             segmenter: &'a str,
+            mask_files: Vec<(String, u64)>,
             views: Vec<(&'a str, u64, String)>,
             raster_width_px: Option<u32>,
             background: String,
@@ -103,7 +122,8 @@ impl EncodeSettings {
             hasher.extend_from_slice(bytemuck::bytes_of(&mean.to_array()));
             hasher.extend_from_slice(bytemuck::bytes_of(rotation));
         }
-        let columns = [hasher.as_slice(), bytemuck::cast_slice(&scene.scales), bytemuck::cast_slice(&scene.opacities)];
+        let columns =
+            [hasher.as_slice(), bytemuck::cast_slice(&scene.scales), bytemuck::cast_slice(&scene.opacities)];
         let scene = columns.map(|column| Hash32::of(column).0).concat();
         let views = views
             .iter()
@@ -117,6 +137,7 @@ impl EncodeSettings {
             encoder_id: Hash32(models.encoder_id().hash()),
             scene: Hash32::of(&scene),
             segmenter,
+            mask_files: self.mask_files()?,
             views,
             raster_width_px: self.raster_width_px,
             background: format!("{:?}", self.background),

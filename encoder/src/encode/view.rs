@@ -65,7 +65,9 @@ impl ViewWorker<'_> {
         );
         let weights = self
             .stopwatch
-            .time("raster", || CpuRasterizer.weights(self.scene, &raster_view, &regions, self.settings.weights))
+            .time("raster", || {
+                CpuRasterizer.weights(self.scene, &raster_view, &regions, self.settings.weights)
+            })
             .map_err(|source| EncodeError::Raster { view: view.name.clone(), source })?;
         Ok(ViewSums::new(&weights.entries, masks_of_region, vectors, self.models.dim(), self.split))
     }

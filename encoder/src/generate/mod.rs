@@ -144,7 +144,8 @@ impl Room {
             let [x, y, z] = world_from_camera.matrix3.to_cols_array_2d().map(DVec3::from);
             let columns = [x, -y, -z, world_from_camera.translation];
             let row = |r: usize| columns.map(|c| c[r]);
-            frames.push(Frame { file_path, transform_matrix: [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]] });
+            frames
+                .push(Frame { file_path, transform_matrix: [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]] });
             progress.advance(1);
         }
         progress.end();

@@ -112,7 +112,9 @@ fn ellipsoid(centre: [f64; 3], half: [f64; 3], rgb: [f64; 3]) -> Part {
 /// Returns four legs under the corners of a top.
 fn legs(half_x: f64, half_y: f64, height_m: f64, rgb: [f64; 3]) -> impl Iterator<Item = Part> {
     let corners = [[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]];
-    corners.into_iter().map(move |[x, y]| cuboid([x * half_x, y * half_y, height_m / 2.0], [0.05, 0.05, height_m], rgb))
+    corners
+        .into_iter()
+        .map(move |[x, y]| cuboid([x * half_x, y * half_y, height_m / 2.0], [0.05, 0.05, height_m], rgb))
 }
 
 fn furniture() -> Vec<Furniture> {
@@ -192,7 +194,10 @@ mod tests {
             let (scene, objects) = build(seed);
             assert!((0..scene.len()).all(|i| scene.is_usable(i)));
             for (i, a) in objects.iter().enumerate() {
-                assert!(a.box_min.cmpge(DVec3::splat(-0.02)).all() && a.box_max.cmple(SIZE_M).all(), "{seed} {a:?}");
+                assert!(
+                    a.box_min.cmpge(DVec3::splat(-0.02)).all() && a.box_max.cmple(SIZE_M).all(),
+                    "{seed} {a:?}"
+                );
                 for b in &objects[..i] {
                     let apart = a.box_min.cmpgt(b.box_max).any() || b.box_min.cmpgt(a.box_max).any();
                     assert!(apart, "seed {seed}: {} and {} overlap", a.name, b.name);

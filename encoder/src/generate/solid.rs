@@ -73,7 +73,9 @@ impl Shape {
             Self::Box(half) => {
                 for (axis, side) in (0..3).flat_map(|axis| [(axis, 1.0), (axis, -1.0)]) {
                     let (u, v) = ((axis + 1) % 3, (axis + 2) % 3);
-                    for (a, b) in grid(half[u], spacing_m).flat_map(|a| grid(half[v], spacing_m).map(move |b| (a, b))) {
+                    for (a, b) in
+                        grid(half[u], spacing_m).flat_map(|a| grid(half[v], spacing_m).map(move |b| (a, b)))
+                    {
                         let mut position = DVec3::ZERO;
                         (position[axis], position[u], position[v]) = (half[axis] * side, a, b);
                         let mut normal = DVec3::ZERO;
@@ -84,11 +86,19 @@ impl Shape {
             }
             Self::Cylinder { radius_m, half_height_m } => {
                 for z in grid(half_height_m, spacing_m) {
-                    out.extend(ring(radius_m, spacing_m).map(|normal| Surfel { position: normal * radius_m + DVec3::Z * z, normal }));
+                    out.extend(
+                        ring(radius_m, spacing_m)
+                            .map(|normal| Surfel { position: normal * radius_m + DVec3::Z * z, normal }),
+                    );
                 }
-                for (r, side) in grid(radius_m / 2.0, spacing_m).flat_map(|r| [(r + radius_m / 2.0, 1.0), (r + radius_m / 2.0, -1.0)]) {
+                for (r, side) in grid(radius_m / 2.0, spacing_m)
+                    .flat_map(|r| [(r + radius_m / 2.0, 1.0), (r + radius_m / 2.0, -1.0)])
+                {
                     let normal = DVec3::Z * side;
-                    out.extend(ring(r, spacing_m).map(|u| Surfel { position: u * r + normal * half_height_m, normal }));
+                    out.extend(
+                        ring(r, spacing_m)
+                            .map(|u| Surfel { position: u * r + normal * half_height_m, normal }),
+                    );
                 }
             }
             Self::Ellipsoid(half) => {
@@ -123,7 +133,14 @@ fn ring(radius: f64, spacing: f64) -> impl Iterator<Item = DVec3> {
 }
 
 /// Covers a part with Gaussians. The object stands at `position`, turned by `yaw_rad` around z.
-pub fn cover(out: &mut Gaussians, part: &Part, position: DVec3, yaw_rad: f64, spacing_m: f64, random: &mut Random) {
+pub fn cover(
+    out: &mut Gaussians,
+    part: &Part,
+    position: DVec3,
+    yaw_rad: f64,
+    spacing_m: f64,
+    random: &mut Random,
+) {
     let world_from_object = DMat3::from_rotation_z(yaw_rad);
     // The light hangs above; faces that look up are brightest, and no two walls are alike.
     let light = DVec3::new(0.25, 0.45, 0.86).normalize();
@@ -151,7 +168,9 @@ mod tests {
         let spacing_m = 0.02;
         let area_of = |shape: Shape| shape.surfels(spacing_m).len() as f64 * spacing_m * spacing_m;
         for s in Shape::Ellipsoid(half).surfels(spacing_m) {
-            assert!(((s.position / half).length() - 1.0).abs() < 1e-9 && (s.normal.length() - 1.0).abs() < 1e-9);
+            assert!(
+                ((s.position / half).length() - 1.0).abs() < 1e-9 && (s.normal.length() - 1.0).abs() < 1e-9
+            );
         }
         for s in Shape::Box(half).surfels(spacing_m) {
             assert!(((s.position / half).abs().max_element() - 1.0).abs() < 1e-9);

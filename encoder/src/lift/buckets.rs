@@ -70,7 +70,8 @@ impl CellBuckets {
         for cell_id in 0..self.in_memory.len() {
             let entries = std::mem::take(&mut self.in_memory[cell_id]);
             if !entries.is_empty() {
-                let mut file = fs_err::OpenOptions::new().create(true).append(true).open(self.path(cell_id))?;
+                let mut file =
+                    fs_err::OpenOptions::new().create(true).append(true).open(self.path(cell_id))?;
                 file.write_all(bytemuck::cast_slice(&entries))?;
                 self.spilled_entries[cell_id] += entries.len() as u64;
             }
@@ -115,7 +116,8 @@ mod tests {
                 let entries: Vec<SumEntry> =
                     (0..i % 7).map(|j| SumEntry { local: j, region: j, weight: (i * j) as f32 }).collect();
                 buckets.put(i % 3, i, &entries).expect("puts");
-                expected[(i % 3) as usize].extend(entries.iter().map(|e| SumEntry { region: e.region + i, ..*e }));
+                expected[(i % 3) as usize]
+                    .extend(entries.iter().map(|e| SumEntry { region: e.region + i, ..*e }));
             }
             for cell_id in [2, 0, 1] {
                 assert_eq!(buckets.take(cell_id).expect("takes"), expected[cell_id as usize]);

@@ -129,8 +129,14 @@ impl CellField {
             weights[*at as usize] = entry.weight;
             *at += 1;
         }
-        let mut field =
-            Self { input_indices, starts, regions, weights, total_weights: Vec::new(), mean_lengths: Vec::new() };
+        let mut field = Self {
+            input_indices,
+            starts,
+            regions,
+            weights,
+            total_weights: Vec::new(),
+            mean_lengths: Vec::new(),
+        };
         (field.total_weights, field.mean_lengths) = (0..n)
             .into_par_iter()
             .map_init(|| vec![0.0; table.dim], |mean, k| field.mean(k, table, mean))
@@ -222,7 +228,9 @@ impl CellField {
         let (n, n_entries) = (n as usize, n_entries as usize);
         let field = Self {
             input_indices: bytemuck::pod_collect_to_vec(&bytes[layout.column::<u32>(2, "input indices", n)?]),
-            starts: bytemuck::pod_collect_to_vec(&bytes[layout.column::<u64>(3, "starts", n.saturating_add(1))?]),
+            starts: bytemuck::pod_collect_to_vec(
+                &bytes[layout.column::<u64>(3, "starts", n.saturating_add(1))?],
+            ),
             regions: bytemuck::pod_collect_to_vec(&bytes[layout.column::<u32>(4, "regions", n_entries)?]),
             weights: bytemuck::pod_collect_to_vec(&bytes[layout.column::<f32>(5, "weights", n_entries)?]),
             total_weights: bytemuck::pod_collect_to_vec(&bytes[layout.column::<f32>(6, "total weights", n)?]),
@@ -272,11 +280,13 @@ mod tests {
         let mut sum = vec![0.0f64; dim];
         let mut total = 0.0f64;
         for view in views {
-            for entry in view.entries_of_cell.iter().flat_map(|(_, entries)| entries).filter(|e| e.local == k) {
+            for entry in view.entries_of_cell.iter().flat_map(|(_, entries)| entries).filter(|e| e.local == k)
+            {
                 for mask in &view.masks_of_region[entry.region as usize] {
                     let w = f64::from(entry.weight);
                     total += w;
-                    (0..dim).for_each(|c| sum[c] += w * f64::from(view.mask_vectors[*mask as usize * dim + c]));
+                    (0..dim)
+                        .for_each(|c| sum[c] += w * f64::from(view.mask_vectors[*mask as usize * dim + c]));
                 }
             }
         }

@@ -147,12 +147,15 @@ impl ViewSums {
     fn parse(bytes: &[u8]) -> Result<Self, ContainerError> {
         let layout = Layout::check(bytes, MAGIC, VERSION)?;
         let header: Header = layout.value(bytes, section::HEADER, "header")?;
-        let (n_regions, n_masks, dim) = (header.n_regions as usize, header.n_masks as usize, header.dim as usize);
+        let (n_regions, n_masks, dim) =
+            (header.n_regions as usize, header.n_masks as usize, header.dim as usize);
         let n_entries = header.n_entries as usize;
-        let starts: Vec<u32> = column(bytes, &layout, section::REGION_STARTS, "region starts", n_regions + 1)?;
+        let starts: Vec<u32> =
+            column(bytes, &layout, section::REGION_STARTS, "region starts", n_regions + 1)?;
         let masks: Vec<u32> =
             column(bytes, &layout, section::REGION_MASKS, "region masks", header.n_region_masks as usize)?;
-        let mask_vectors = column(bytes, &layout, section::MASK_VECTORS, "mask vectors", n_masks.saturating_mul(dim))?;
+        let mask_vectors =
+            column(bytes, &layout, section::MASK_VECTORS, "mask vectors", n_masks.saturating_mul(dim))?;
         let cells: Vec<CellStart> = column(bytes, &layout, section::CELLS, "cells", header.n_cells as usize)?;
         let entries: Vec<SumEntry> = column(bytes, &layout, section::ENTRIES, "entries", n_entries)?;
         let consistent = dim > 0
@@ -170,8 +173,11 @@ impl ViewSums {
         let masks_of_region =
             starts.windows(2).map(|w| masks[w[0] as usize..w[1] as usize].to_vec()).collect();
         let ends = cells.iter().skip(1).map(|c| c.start as usize).chain([n_entries]);
-        let entries_of_cell =
-            cells.iter().zip(ends).map(|(c, end)| (c.cell_id, entries[c.start as usize..end].to_vec())).collect();
+        let entries_of_cell = cells
+            .iter()
+            .zip(ends)
+            .map(|(c, end)| (c.cell_id, entries[c.start as usize..end].to_vec()))
+            .collect();
         Ok(Self { dim, mask_vectors, masks_of_region, entries_of_cell })
     }
 }

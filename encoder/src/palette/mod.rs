@@ -147,7 +147,8 @@ impl Cluster {
         }
         let n = members.len().max(1) as f64;
         let centre: Vec<f32> = sum.iter().map(|s| (s / n) as f32).collect();
-        let squared_error = members.iter().map(|i| f64::from(squared_distance(projected.get(*i), &centre))).sum();
+        let squared_error =
+            members.iter().map(|i| f64::from(squared_distance(projected.get(*i), &centre))).sum();
         Self { members, centre, squared_error }
     }
 
@@ -186,10 +187,18 @@ fn split_clusters(projected: &Projected, settings: &PaletteSettings) -> Vec<Clus
 fn split_in_two(projected: &Projected, cluster: &Cluster) -> Option<[Cluster; 2]> {
     let farthest = |from: &[f32]| {
         let distance = |i: &u32| squared_distance(projected.get(*i), from);
-        let best = cluster.members.par_iter().map(|i| (distance(i), *i)).reduce_with(|a, b| match a.0.total_cmp(&b.0) {
-            std::cmp::Ordering::Less => b,
-            std::cmp::Ordering::Greater => a,
-            std::cmp::Ordering::Equal => if a.1 < b.1 { a } else { b },
+        let best = cluster.members.par_iter().map(|i| (distance(i), *i)).reduce_with(|a, b| {
+            match a.0.total_cmp(&b.0) {
+                std::cmp::Ordering::Less => b,
+                std::cmp::Ordering::Greater => a,
+                std::cmp::Ordering::Equal => {
+                    if a.1 < b.1 {
+                        a
+                    } else {
+                        b
+                    }
+                }
+            }
         });
         projected.get(best.expect("a cluster has members").1).to_vec()
     };
@@ -215,12 +224,15 @@ fn split_in_two(projected: &Projected, cluster: &Cluster) -> Option<[Cluster; 2]
 
 fn nearest_rows(projected: &Projected, clusters: &[Cluster]) -> Vec<u32> {
     // ||v - c||² = ||v||² - 2 v·c + ||c||²; the first term is the same for all rows.
-    let half_norms: Vec<f32> = clusters.iter().map(|c| crate::lift::dot(&c.centre, &c.centre) / 2.0).collect();
+    let half_norms: Vec<f32> =
+        clusters.iter().map(|c| crate::lift::dot(&c.centre, &c.centre) / 2.0).collect();
     projected
         .values
         .par_chunks_exact(projected.width)
         .map(|value| {
-            let score = |(row, cluster): (usize, &Cluster)| (crate::lift::dot(value, &cluster.centre) - half_norms[row], row as u32);
+            let score = |(row, cluster): (usize, &Cluster)| {
+                (crate::lift::dot(value, &cluster.centre) - half_norms[row], row as u32)
+            };
             let best = clusters.iter().enumerate().map(score).reduce(|a, b| if b.0 > a.0 { b } else { a });
             best.expect("there are clusters").1
         })

@@ -63,11 +63,14 @@ pub fn split(scene: &Gaussians, limits: CellLimits) -> CellSplit {
         let size = mean_bounds.size();
         let axis = (0..3).max_by(|a, b| size[*a].total_cmp(&size[*b])).unwrap_or(0);
         let coordinate = |i: &u32| scene.means_in_world[*i as usize][axis];
-        let too_wide = limits.max_width.is_some_and(|max| size[axis] > max) && part.len() > MIN_GAUSSIANS_TO_NARROW;
+        let too_wide =
+            limits.max_width.is_some_and(|max| size[axis] > max) && part.len() > MIN_GAUSSIANS_TO_NARROW;
         let cut = if part.len() > limits.max_gaussians.max(1) {
             let middle = part.len() / 2;
             // Ties by index make the order strict, so that the halves are the same sets every time.
-            part.select_nth_unstable_by(middle, |a, b| coordinate(a).total_cmp(&coordinate(b)).then(a.cmp(b)));
+            part.select_nth_unstable_by(middle, |a, b| {
+                coordinate(a).total_cmp(&coordinate(b)).then(a.cmp(b))
+            });
             middle
         } else if too_wide {
             let plane = mean_bounds.centre()[axis];

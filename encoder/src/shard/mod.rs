@@ -75,7 +75,9 @@ pub fn build(
         .map(|local| {
             let offset = scene.means_in_world[cell.gaussians[*local as usize] as usize] - origin;
             // A flat axis has step 0 and every offset 0.
-            std::array::from_fn(|a| if position_step[a] > 0.0 { (offset[a] / position_step[a]).round() as u16 } else { 0 })
+            std::array::from_fn(|a| {
+                if position_step[a] > 0.0 { (offset[a] / position_step[a]).round() as u16 } else { 0 }
+            })
         })
         .collect();
     let header = ShardHeader {

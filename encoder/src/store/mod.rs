@@ -33,8 +33,8 @@ use ed25519_dalek::SigningKey;
 use slag_common::Hash32;
 use slag_common::manifest::{self, CellRecord, Manifest};
 
-pub(crate) use files::write_durably;
 pub use error::StoreError;
+pub(crate) use files::write_durably;
 use files::{Access, HashingWriter};
 pub use reader::{Extras, Published, StoreReader};
 
