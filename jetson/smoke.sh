@@ -16,7 +16,7 @@ trap '[ -z "$server" ] || kill "$server" 2>/dev/null; rm -rf "$work"' EXIT
 $encoder --quiet generate --out "$work/room" --n-views 12 >/dev/null
 $encoder --quiet encode --scene "$work/room/scene.ply" --views "$work/room/transforms.json" --metric \
     --cell-gaussians 8192 --store "$work/store" >/dev/null
-$encoder serve --store "$work/store" --listen 127.0.0.1:0 2>"$work/log" &
+$encoder serve --store "$work/store" --listen 127.0.0.1:0 >"$work/log" &
 server=$!
 url=
 for _ in 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20; do

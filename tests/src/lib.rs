@@ -89,8 +89,8 @@ impl Service {
     /// Starts a service on a free port and waits until it listens.
     pub fn start(command: &mut Command) -> Self {
         let mut child =
-            command.args(["--listen", "127.0.0.1:0"]).stderr(Stdio::piped()).spawn().expect("starts");
-        let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines();
+            command.args(["--listen", "127.0.0.1:0"]).stdout(Stdio::piped()).spawn().expect("starts");
+        let mut lines = BufReader::new(child.stdout.take().expect("piped")).lines();
         let mut seen = String::new();
         let url = loop {
             let line =

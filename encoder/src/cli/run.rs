@@ -291,7 +291,8 @@ fn runtime() -> Result<tokio::runtime::Runtime> {
 
 fn run_serve(args: &ServeArgs) -> Result<Exit> {
     runtime()?.block_on(async {
-        let listening = |address| tracing::info!("serving {} on http://{address}", args.store.display());
+        // On stdout: with port 0 this is where a script learns the port.
+        let listening = |address| println!("listening on http://{address}");
         let stop = async {
             if let Err(error) = serve::stop_signal().await {
                 tracing::warn!("cannot listen for signals, stopping: {error}");
