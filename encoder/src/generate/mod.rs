@@ -170,7 +170,7 @@ impl Room {
 }
 
 /// Returns a drawing as 8-bit RGB.
-fn to_image(drawing: &Drawing, view: &RasterView) -> RgbImage {
+pub(crate) fn to_image(drawing: &Drawing, view: &RasterView) -> RgbImage {
     let bytes = drawing.rgb.iter().map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
     RgbImage::from_raw(view.intrinsics.width_px, view.intrinsics.height_px, bytes)
         .expect("a drawing has three values a pixel of its view")

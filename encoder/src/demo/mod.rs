@@ -1,5 +1,7 @@
 //! The whole system in one run: generate, encode, serve, fetch as a robot would, ask, compare with the truth.
 
+mod picture;
+
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -19,6 +21,7 @@ use crate::progress::Progress;
 use crate::publish::serve::{self, Limits};
 use crate::raster::WeightKind;
 use crate::shard::cells::CellLimits;
+use crate::{query, store::StoreReader};
 
 /// Photos of the room.
 const N_VIEWS: u32 = 36;
@@ -66,6 +69,8 @@ pub struct Demo {
 /// What came of a demo.
 #[derive(Debug, Serialize)]
 pub struct DemoReport {
+    /// The answers, drawn.
+    pub picture: PathBuf,
     /// What the encode did.
     pub encode: EncodeSummary,
     /// Bytes that the robot downloaded.
@@ -242,7 +247,10 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
             right,
         });
     }
+    let picture =
+        tokio::task::block_in_place(|| draw_answers(options, &room, &questions)).context("picture")?;
     let report = DemoReport {
+        picture,
         encode: summary,
         downloaded_bytes: fetched.downloaded.bytes,
         about_model: slag_models::builtin::ABOUT,
@@ -250,6 +258,23 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     };
     fs_err::write(options.out.join(MARKER), serde_json::to_vec_pretty(&report)?)?;
     Ok(Demo { report, edge: options.edge.clone(), cache })
+}
+
+/// Draws what was found, from the full-precision scores of the store.
+fn draw_answers(options: &DemoOptions, room: &generate::Room, questions: &[Question]) -> Result<PathBuf> {
+    let reader = StoreReader::open(&options.out.join("store"))?;
+    let mut text = ModelDir::builtin().text_encoder(&SessionOptions::new(PathBuf::new()))?;
+    let threshold = reader.manifest().encoder.default_threshold;
+    let mut panels = Vec::new();
+    for question in questions {
+        if let Some(answer) = &question.answer {
+            let cosines = query::scores(&reader, &text.encode(&question.text)?)?.cosines;
+            panels.push(picture::Panel { answer, cosines, threshold });
+        }
+    }
+    let path = options.out.join("answers.png");
+    picture::draw(&room.gaussians, &room.views, &panels)?.save(&path)?;
+    Ok(path)
 }
 
 /// Empties the folder of an earlier demo; refuses a folder that holds anything else.
@@ -316,6 +341,7 @@ impl fmt::Display for DemoReport {
             let truth = truth.reduce(|a, b| a + ", " + &b).unwrap_or_else(|| "none in the room".into());
             writeln!(f, "{:<16} {answer:<44} {truth:<32} {}", q.text, if q.right { "yes" } else { "NO" })?;
         }
-        writeln!(f, "\nmodel: {}", self.about_model)
+        writeln!(f, "\nmodel: {}", self.about_model)?;
+        writeln!(f, "picture: {}", self.picture.display())
     }
 }
