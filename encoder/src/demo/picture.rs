@@ -35,7 +35,8 @@ pub(super) fn draw(
     let Some(first) = views.first() else { return Ok(RgbImage::new(1, 1)) };
     let size = first.intrinsics.scaled_to_width(PANEL_WIDTH_PX);
     let n_rows = panels.len().div_ceil(COLUMNS).max(1) as u32;
-    let mut picture = RgbImage::new(size.width_px * COLUMNS as u32, size.height_px * n_rows);
+    let mut picture =
+        RgbImage::from_pixel(size.width_px * COLUMNS as u32, size.height_px * n_rows, image::Rgb([255; 3]));
     for (i, panel) in panels.iter().enumerate() {
         let mut coloured = scene.clone();
         for (sh, cosine) in coloured.sh_dc.iter_mut().zip(&panel.cosines) {
