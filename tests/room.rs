@@ -129,3 +129,95 @@ fn the_robots_service_answers() {
     }
     panic!("the service did not take up the new generation");
 }
+
+/// Views without masks, a mask of one pixel, a view that sees nothing and photos that are missing or damaged are
+/// all normal: counted, named, and left out where they must be.
+#[test]
+fn odd_views_are_counted_not_fatal() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let (scene, views) = generate(dir.path());
+    let images = views.with_file_name("images");
+    let mut poses: Value = serde_json::from_slice(&fs_err::read(&views).expect("reads")).expect("JSON");
+    let frames = poses["frames"].as_array_mut().expect("frames");
+    frames.truncate(5);
+    // A camera 1,000 m up that looks up: nothing is in view.
+    frames[4]["transform_matrix"] =
+        serde_json::json!([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1000], [0, 0, 0, 1]]);
+    fs_err::write(&views, poses.to_string()).expect("writes");
+    // 0000: two masks, one of them a single pixel; 0001: none; 0004: one, of a view that sees nothing.
+    let masks = dir.path().join("masks");
+    fs_err::create_dir(&masks).expect("makes");
+    let mut ids = image::GrayImage::new(640, 480);
+    image::imageops::replace(&mut ids, &image::GrayImage::from_pixel(200, 200, image::Luma([7])), 200, 150);
+    ids.save(masks.join("0004.png")).expect("writes");
+    ids.put_pixel(5, 5, image::Luma([9]));
+    ids.save(masks.join("0000.png")).expect("writes");
+    // 0002: a cut photo; 0003: no photo.
+    let photo = fs_err::read(images.join("0002.png")).expect("reads");
+    fs_err::write(images.join("0002.png"), &photo[..photo.len() / 2]).expect("writes");
+    fs_err::remove_file(images.join("0003.png")).expect("removes");
+
+    let store = dir.path().join("store");
+    let encode = |strict: &[&str]| {
+        let (scene, views) = (text(&scene), text(&views));
+        let inputs = ["encode", "--scene", scene, "--views", views, "--masks", text(&masks), "--json"];
+        encoder(&inputs)
+            .args(["--min-mask-px", "1", "--store", text(&store)])
+            .args(strict)
+            .output()
+            .expect("starts")
+    };
+    let output = encode(&["--strict"]);
+    assert_eq!(output.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&output.stdout).contains("0003.png"));
+
+    let output = encode(&["--restart"]);
+    assert_eq!(output.status.code(), Some(3), "done with some inputs left out");
+    let summary: Value = serde_json::from_slice(&output.stdout).expect("a summary");
+    assert_eq!(summary["n_views"], 3);
+    assert_eq!(summary["n_views_without_masks"], 1);
+    assert_eq!(summary["n_masks"], 3);
+    let skipped: Vec<&str> = summary["skipped_views"]
+        .as_array()
+        .expect("a list")
+        .iter()
+        .map(|s| s["view"].as_str().expect("a name"))
+        .collect();
+    assert_eq!(skipped, ["0002.png", "0003.png"]);
+    assert!(summary["n_without_evidence"].as_u64() < summary["n_gaussians"].as_u64());
+}
+
+/// Ctrl-C ends an encode with code 130 and a state that the next one resumes.
+#[cfg(unix)]
+#[test]
+fn an_interrupted_encode_resumes() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let (scene, views) = generate(dir.path());
+    let store = dir.path().join("store");
+    let args = [
+        "encode",
+        "--scene",
+        text(&scene),
+        "--views",
+        text(&views),
+        "--threads",
+        "1",
+        "--store",
+        text(&store),
+    ];
+    let mut child = encoder(&args).stderr(std::process::Stdio::null()).spawn().expect("starts");
+    // Once the first view's sums are there, the encode is in the middle of the others.
+    let sums = store.join("job/views");
+    while fs_err::read_dir(&sums).map_or(0, Iterator::count) == 0 {
+        assert!(child.try_wait().expect("waits").is_none(), "ended before it could be interrupted");
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    // A second encode into the same store is refused.
+    let second = encoder(&args).output().expect("starts");
+    assert!(String::from_utf8_lossy(&second.stderr).contains("another slag-encoder"));
+    let interrupt = std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status();
+    assert!(interrupt.expect("kill runs").success());
+    assert_eq!(child.wait().expect("waits").code(), Some(130));
+    let summary = run_json(&mut encoder(&args));
+    assert!(summary["n_views_resumed"].as_u64() > Some(0), "{summary}");
+}

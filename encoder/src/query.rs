@@ -6,7 +6,7 @@ use glam::DVec3;
 use serde::Serialize;
 use slag_common::shard::{Profile, ShardLayout};
 
-use crate::encode::{ReadFieldError, read_field, read_regions};
+use crate::lift::published::{ReadFieldError, read_field, read_regions};
 use crate::store::{StoreError, StoreReader};
 
 /// Cosines of every Gaussian of the input with a query.

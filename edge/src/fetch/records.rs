@@ -1,6 +1,7 @@
 //! The fetcher's small records, in sled. Its lock is the cache's: one fetch at a time.
 
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
@@ -9,6 +10,9 @@ use super::plan::Position;
 
 /// Pages kept in memory: the records are a few kilobytes.
 const CACHE_BYTES: u64 = 1 << 20;
+/// A fetch that has just ended may hold the lock for an instant more: sled lets go of it on a thread of its own.
+const LOCK_PATIENCE: Duration = Duration::from_secs(2);
+const LOCK_PAUSE: Duration = Duration::from_millis(20);
 
 /// Why the records cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -61,18 +65,24 @@ impl Records {
     /// [`RecordsError`]; so for every operation here.
     pub fn open(path: &Path) -> Result<Self, RecordsError> {
         let config = sled::Config::new().path(path).cache_capacity(CACHE_BYTES).flush_every_ms(None);
-        let opened = config.open().and_then(|db| {
-            let (generations, used) = (db.open_tree("generations")?, db.open_tree("used")?);
-            Ok((db, generations, used))
-        });
-        let path = path.to_owned();
-        match opened {
-            Ok((db, generations, used)) => Ok(Self { path, db, generations, used }),
-            // sled has no variant of its own for this.
-            Err(sled::Error::Io(e)) if e.to_string().contains("could not acquire lock") => {
-                Err(RecordsError::Busy { path })
+        let start = Instant::now();
+        loop {
+            let opened = config.open().and_then(|db| {
+                let (generations, used) = (db.open_tree("generations")?, db.open_tree("used")?);
+                Ok((db, generations, used))
+            });
+            let path = path.to_owned();
+            match opened {
+                Ok((db, generations, used)) => return Ok(Self { path, db, generations, used }),
+                // sled has no variant of its own for this.
+                Err(sled::Error::Io(e)) if e.to_string().contains("could not acquire lock") => {
+                    if start.elapsed() > LOCK_PATIENCE {
+                        return Err(RecordsError::Busy { path });
+                    }
+                    std::thread::sleep(LOCK_PAUSE);
+                }
+                Err(source) => return Err(RecordsError::Database { path, source }),
             }
-            Err(source) => Err(RecordsError::Database { path, source }),
         }
     }
 

@@ -57,7 +57,7 @@ impl Progress for Shown {
             bar.enable_steady_tick(Duration::from_millis(200));
             state.bar = Some(bar);
         } else {
-            eprintln!("{stage}: {done} of {total} {unit}s");
+            eprintln!("{stage}: {done} of {total}");
         }
     }
 

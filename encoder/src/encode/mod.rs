@@ -24,7 +24,8 @@ use slag_models::{ModelDir, ModelError, SessionOptions};
 
 use crate::embed::EmbedError;
 use crate::ingest::{self, GeoError, IngestError};
-use crate::lift::{CellBuckets, CellField, FieldError, RegionTable, SumsError, ViewSums};
+use crate::lift::published::{EXTRA_REGIONS, extra_field};
+use crate::lift::{CellBuckets, CellField, RegionTable, SumsError, ViewSums};
 use crate::progress::Progress;
 use crate::raster::RasterError;
 use crate::segment::{GivenMasks, GraphSegmenter, SegmentError, Segmenter};
@@ -33,14 +34,6 @@ use crate::store::{Extras, Store, StoreError};
 use job::Job;
 pub use settings::{EncodeSettings, Masks};
 use view::ViewWorker;
-
-/// Name of the region table among a generation's extras.
-pub const EXTRA_REGIONS: &str = "regions";
-
-/// Returns the name of a cell's field among a generation's extras.
-pub fn extra_field(cell_id: u32) -> String {
-    format!("field/{cell_id}")
-}
 
 /// Why an encode ended without a new generation.
 #[derive(Debug, thiserror::Error)]
@@ -478,59 +471,4 @@ fn merge(
         merged.n_views_without_masks += usize::from(n_masks == 0);
     }
     Ok(merged)
-}
-
-/// Reads the full-precision field of a published cell.
-///
-/// # Errors
-/// [`StoreError`], or [`FieldError`] as a string naming the object.
-pub fn read_field(
-    reader: &crate::store::StoreReader,
-    cell_id: u32,
-    n_regions: usize,
-) -> Result<CellField, ReadFieldError> {
-    let name = extra_field(cell_id);
-    let bytes = read_extra(reader, &name)?;
-    CellField::from_bytes(&bytes, n_regions).map_err(|source| ReadFieldError::Damaged { name, source })
-}
-
-/// Reads the region table of the published generation.
-///
-/// # Errors
-/// As [`read_field`].
-pub fn read_regions(reader: &crate::store::StoreReader) -> Result<RegionTable, ReadFieldError> {
-    let bytes = read_extra(reader, EXTRA_REGIONS)?;
-    RegionTable::from_bytes(&bytes)
-        .map_err(|source| ReadFieldError::Damaged { name: EXTRA_REGIONS.into(), source })
-}
-
-fn read_extra(
-    reader: &crate::store::StoreReader,
-    name: &str,
-) -> Result<slag_common::container::AlignedBytes, ReadFieldError> {
-    let hash =
-        reader.current().extras.get(name).ok_or_else(|| ReadFieldError::Absent { name: name.to_owned() })?;
-    Ok(reader.read_object(*hash)?)
-}
-
-/// Why a published field cannot be read.
-#[derive(Debug, thiserror::Error)]
-pub enum ReadFieldError {
-    /// The store said no.
-    #[error(transparent)]
-    Store(#[from] StoreError),
-    /// The generation has no such part.
-    #[error("the store has no {name}: it was published by another program; encode again")]
-    Absent {
-        /// The part.
-        name: String,
-    },
-    /// The part is damaged.
-    #[error("{name}: {source}")]
-    Damaged {
-        /// The part.
-        name: String,
-        /// What is wrong.
-        source: FieldError,
-    },
 }

@@ -117,13 +117,12 @@ impl EncodeSettings {
             weights: String,
             cells: String,
         }
-        let mut hasher = Vec::new();
-        for (mean, rotation) in scene.means_in_world.iter().zip(&scene.rotations_wxyz) {
-            hasher.extend_from_slice(bytemuck::bytes_of(&mean.to_array()));
-            hasher.extend_from_slice(bytemuck::bytes_of(rotation));
-        }
-        let columns =
-            [hasher.as_slice(), bytemuck::cast_slice(&scene.scales), bytemuck::cast_slice(&scene.opacities)];
+        let columns: [&[u8]; 4] = [
+            bytemuck::cast_slice(&scene.means_in_world),
+            bytemuck::cast_slice(&scene.rotations_wxyz),
+            bytemuck::cast_slice(&scene.scales),
+            bytemuck::cast_slice(&scene.opacities),
+        ];
         let scene = columns.map(|column| Hash32::of(column).0).concat();
         let views = views
             .iter()

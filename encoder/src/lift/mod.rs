@@ -14,6 +14,7 @@
 
 mod buckets;
 mod field;
+pub mod published;
 mod sums;
 
 pub use buckets::{CellBuckets, SumEntry};

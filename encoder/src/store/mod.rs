@@ -28,6 +28,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
 
 use ed25519_dalek::SigningKey;
 use slag_common::Hash32;
@@ -40,6 +41,9 @@ pub use reader::{Extras, Published, StoreReader};
 
 /// sled keeps whole pages in memory; the records are small.
 const RECORD_CACHE_BYTES: u64 = 16 << 20;
+/// A writer that has just ended may hold the lock for an instant more: sled lets go of it on a thread of its own.
+const LOCK_PATIENCE: Duration = Duration::from_secs(2);
+const LOCK_PAUSE: Duration = Duration::from_millis(20);
 /// Tree of the records that repeat the manifest.
 const PUBLISHED_TREE: &str = "published";
 const SCENE_KEY: &[u8] = b"scene";
@@ -83,14 +87,21 @@ impl Store {
         }
         files::sync_folder(&dir.join("objects"))?;
         let db_path = dir.join("db");
-        let db = sled::Config::new().path(&db_path).cache_capacity(RECORD_CACHE_BYTES).open();
-        let db = db.map_err(|cause| match cause {
-            // sled has no error kind of its own for this.
-            sled::Error::Io(e) if e.to_string().contains("could not acquire lock") => {
-                StoreError::Locked { store: dir.to_owned() }
+        let config = sled::Config::new().path(&db_path).cache_capacity(RECORD_CACHE_BYTES);
+        let start = Instant::now();
+        let db = loop {
+            match config.open() {
+                Ok(db) => break db,
+                // sled has no error kind of its own for this.
+                Err(sled::Error::Io(e)) if e.to_string().contains("could not acquire lock") => {
+                    if start.elapsed() > LOCK_PATIENCE {
+                        return Err(StoreError::Locked { store: dir.to_owned() });
+                    }
+                    std::thread::sleep(LOCK_PAUSE);
+                }
+                Err(cause) => return Err(StoreError::Records { path: db_path, cause }),
             }
-            cause => StoreError::Records { path: db_path.clone(), cause },
-        })?;
+        };
         // The lock is ours, so whatever lies in tmp/ is of a writer that died.
         for entry in fs_err::read_dir(dir.join("tmp"))? {
             fs_err::remove_file(entry?.path())?;

@@ -1,0 +1,62 @@
+//! The field of a published generation, read back in full precision.
+
+use slag_common::container::AlignedBytes;
+
+use super::field::{CellField, FieldError, RegionTable};
+use crate::store::{StoreError, StoreReader};
+
+/// Name of the region table among a generation's extras.
+pub const EXTRA_REGIONS: &str = "regions";
+
+/// Returns the name of a cell's field among a generation's extras.
+pub fn extra_field(cell_id: u32) -> String {
+    format!("field/{cell_id}")
+}
+
+/// Reads the full-precision field of a published cell.
+///
+/// # Errors
+/// [`ReadFieldError`].
+pub fn read_field(reader: &StoreReader, cell_id: u32, n_regions: usize) -> Result<CellField, ReadFieldError> {
+    let name = extra_field(cell_id);
+    let bytes = read_extra(reader, &name)?;
+    CellField::from_bytes(&bytes, n_regions).map_err(|source| ReadFieldError::Damaged { name, source })
+}
+
+/// Reads the region table of the published generation.
+///
+/// # Errors
+/// As [`read_field`].
+pub fn read_regions(reader: &StoreReader) -> Result<RegionTable, ReadFieldError> {
+    let bytes = read_extra(reader, EXTRA_REGIONS)?;
+    RegionTable::from_bytes(&bytes)
+        .map_err(|source| ReadFieldError::Damaged { name: EXTRA_REGIONS.into(), source })
+}
+
+fn read_extra(reader: &StoreReader, name: &str) -> Result<AlignedBytes, ReadFieldError> {
+    let hash =
+        reader.current().extras.get(name).ok_or_else(|| ReadFieldError::Absent { name: name.to_owned() })?;
+    Ok(reader.read_object(*hash)?)
+}
+
+/// Why a published field cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum ReadFieldError {
+    /// The store said no.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The generation has no such part.
+    #[error("the store has no {name}: it was published by another program; encode again")]
+    Absent {
+        /// The part.
+        name: String,
+    },
+    /// The part is damaged.
+    #[error("{name}: {source}")]
+    Damaged {
+        /// The part.
+        name: String,
+        /// What is wrong.
+        source: FieldError,
+    },
+}

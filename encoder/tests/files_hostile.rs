@@ -1,0 +1,88 @@
+//! The encoder's own files and the geo-reference, damaged in 1,000 ways each: refused with the reason, never a panic.
+
+use slag_common::container::AlignedBytes;
+use slag_encoder::ingest::read_geo_reference;
+use slag_encoder::lift::{CellField, RegionTable, SumEntry, ViewSums};
+
+const N_MUTATIONS: u64 = 1000;
+
+/// Returns a damaged copy: cut for every fourth seed, else with one to three flipped bits.
+fn damaged(bytes: &[u8], seed: u64) -> Vec<u8> {
+    let random = |salt: u64| {
+        let mut z = (seed * 31 + salt).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        (z ^ (z >> 31)) as usize
+    };
+    if seed.is_multiple_of(4) {
+        return bytes[..random(0) % bytes.len()].to_vec();
+    }
+    let mut damaged = bytes.to_vec();
+    for flip in 1..=1 + seed % 3 {
+        let at = random(flip) % bytes.len();
+        damaged[at] ^= 1 << (random(flip + 10) % 8);
+    }
+    damaged
+}
+
+fn sums() -> ViewSums {
+    let entry = |local, region| SumEntry { local, region, weight: 2.5 };
+    ViewSums {
+        dim: 4,
+        mask_vectors: vec![0.5; 8],
+        masks_of_region: vec![vec![0], vec![0, 1]],
+        entries_of_cell: vec![(0, vec![entry(0, 0), entry(1, 1)]), (3, vec![entry(0, 1)])],
+    }
+}
+
+/// What the sections hold lies under a checksum; only the zeros between them do not.
+#[test]
+fn sums_regions_and_fields_refuse_damage() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let path = dir.path().join("view.sums");
+    sums().write(&path).expect("writes");
+    let file = fs_err::read(&path).expect("reads");
+    let mut table = RegionTable::new(4);
+    table.append(&sums());
+    let entries: Vec<SumEntry> = sums().entries_of_cell.remove(0).1;
+    let field = CellField::new(vec![8, 9], &entries, &table);
+    let (table_file, field_file) = (table.to_bytes(), field.to_bytes());
+    let mut n_refused = 0;
+    for seed in 0..N_MUTATIONS {
+        fs_err::remove_file(&path).expect("removes");
+        fs_err::write(&path, damaged(&file, seed)).expect("writes");
+        match ViewSums::read(&path) {
+            Ok(read) => assert_eq!(read, sums(), "seed {seed}"),
+            Err(error) => {
+                assert!(error.to_string().contains("view.sums"), "{error}");
+                n_refused += 1;
+            }
+        }
+        match RegionTable::from_bytes(&AlignedBytes::copy_of(&damaged(&table_file, seed))) {
+            Ok(read) => assert_eq!(read, table, "seed {seed}"),
+            Err(error) => assert!(!error.to_string().is_empty()),
+        }
+        match CellField::from_bytes(&AlignedBytes::copy_of(&damaged(&field_file, seed)), table.len()) {
+            Ok(read) => assert_eq!(read, field, "seed {seed}"),
+            Err(error) => assert!(!error.to_string().is_empty()),
+        }
+    }
+    // The padding between the sections of so small a file is about half of it.
+    assert!(n_refused > N_MUTATIONS / 2, "{n_refused}");
+}
+
+#[test]
+fn geo_references_are_read_or_refused() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let path = dir.path().join("geo.json");
+    let text = br#"{"origin": {"lat": 46.842657, "lon": -91.994008, "alt": 158.509}, "crs_note": "ENU"}"#;
+    fs_err::write(&path, text).expect("writes");
+    read_geo_reference(&path).expect("valid");
+    for seed in 0..N_MUTATIONS {
+        fs_err::remove_file(&path).expect("removes");
+        fs_err::write(&path, damaged(text, seed)).expect("writes");
+        match read_geo_reference(&path) {
+            Ok(geo) => assert!(geo.origin.latitude_deg.abs() <= 90.0 && geo.origin.height_m.is_finite()),
+            Err(error) => assert!(error.to_string().contains("geo.json"), "{error}"),
+        }
+    }
+}
