@@ -113,7 +113,7 @@ fn the_robots_service_answers() {
     assert!(!reply["answers"].as_array().expect("answers").is_empty(), "{reply}");
     let reply = robot.get("/query?text=pink");
     assert!(
-        reply["answers"].as_array().expect("answers").is_empty() && reply["reason"].is_string(),
+        reply["answers"].as_array().expect("answers").is_empty() && reply["reason"]["detail"].is_string(),
         "{reply}"
     );
     assert_eq!(robot.get("/status")["generation"], 1);
