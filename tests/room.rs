@@ -116,13 +116,13 @@ fn the_robots_service_answers() {
         reply["answers"].as_array().expect("answers").is_empty() && reply["reason"]["detail"].is_string(),
         "{reply}"
     );
-    assert_eq!(robot.get("/status")["generation"], 1);
+    assert_eq!(robot.get("/status")["scene"]["generation"], 1);
 
     // Its source and place are remembered.
     encode();
     run(&mut edge(&["fetch", "--radius", "50", "--cache", text(&cache)]));
     for _ in 0..100 {
-        if robot.get("/status")["generation"] == 2 {
+        if robot.get("/status")["scene"]["generation"] == 2 {
             return;
         }
         std::thread::sleep(std::time::Duration::from_millis(50));
