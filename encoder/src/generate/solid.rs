@@ -175,6 +175,11 @@ mod tests {
         for s in Shape::Box(half).surfels(spacing_m) {
             assert!(((s.position / half).abs().max_element() - 1.0).abs() < 1e-9);
         }
+        for shape in [Shape::Box(half), Shape::Ellipsoid(half)] {
+            let surfels = shape.surfels(spacing_m);
+            let middle = surfels.iter().map(|s| s.position).sum::<DVec3>() / surfels.len() as f64;
+            assert!(middle.length() < 1e-9, "{shape:?} is lopsided: {middle}");
+        }
         let boxes = 8.0 * (half.x * half.y + half.y * half.z + half.z * half.x);
         assert!((area_of(Shape::Box(half)) / boxes - 1.0).abs() < 0.1);
         let cylinder = Shape::Cylinder { radius_m: 0.3, half_height_m: 0.4 };

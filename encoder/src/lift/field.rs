@@ -276,7 +276,7 @@ mod tests {
     use crate::lift::ViewSums;
 
     /// The paper's equation in float64, mask by mask: no regions, no sparse rows.
-    fn oracle(k: u32, views: &[ViewSums], dim: usize) -> Option<Vec<f64>> {
+    fn oracle(k: u32, views: &[ViewSums], dim: usize) -> (f64, Option<Vec<f64>>) {
         let mut sum = vec![0.0f64; dim];
         let mut total = 0.0f64;
         for view in views {
@@ -291,7 +291,8 @@ mod tests {
             }
         }
         let length = sum.iter().map(|c| c * c).sum::<f64>().sqrt();
-        (total > 0.0 && length / total > 2e-3).then(|| sum.iter().map(|c| c / length).collect())
+        let is_clear = total > 0.0 && length / total > 2e-3;
+        (total, is_clear.then(|| sum.iter().map(|c| c / length).collect()))
     }
 
     prop_compose! {
@@ -337,7 +338,9 @@ mod tests {
             let cosines = field.cosines(&table.scores(&query));
             let mut embedding = vec![0.0; 7];
             for k in 0..9u32 {
-                let Some(expected) = oracle(k, &views, 7) else { continue };
+                let (total, expected) = oracle(k, &views, 7);
+                prop_assert!((f64::from(field.total_weights[k as usize]) - total).abs() <= 1e-6 * total);
+                let Some(expected) = expected else { continue };
                 field.embedding(k as usize, &table, &mut embedding);
                 let cosine: f64 = expected.iter().zip(&query).map(|(e, q)| e * f64::from(*q)).sum();
                 prop_assert!(embedding.iter().zip(&expected).all(|(a, b)| (f64::from(*a) - b).abs() < 1e-3));
