@@ -73,15 +73,18 @@ impl Trial {
         (robot, result)
     }
 
-    /// Cuts the power at a step, and returns whether the new generation was visible afterwards.
+    /// Cuts the power at a step of a fetch, and returns whether the new generation was visible afterwards.
     fn cut(&self, step: u64, seed: u64, parallel: usize) -> bool {
-        let context = format!("step {step} seed {seed} parallel {parallel}");
         self.settle_records(1);
         let files = Arc::new(self.before.fork(Some(step), seed));
         let (_, result) = self.fetch(&files, parallel);
-        assert!(result.is_err(), "{context}: the cut came too late");
-        self.settle_records(seed % N_RECORDS_FATES);
+        assert!(result.is_err(), "step {step} seed {seed}: the cut came too late");
+        self.recover(&files, seed, &format!("step {step} seed {seed} parallel {parallel}"))
+    }
 
+    /// Restores the power, checks that a generation is there, and that the next fetch works.
+    fn recover(&self, files: &SimFiles, seed: u64, context: &str) -> bool {
+        self.settle_records(seed % N_RECORDS_FATES);
         let files = Arc::new(files.after_power_cut(seed));
         let robot = Robot::on_sim(self.dir.path(), files.clone(), &self.server.url());
         let snapshot = Snapshot::open(&robot.cache).unwrap_or_else(|e| panic!("{context}: {e}: {:?}", e));
@@ -91,7 +94,7 @@ impl Trial {
             false => assert_holds(&snapshot, &self.old, 0..3),
         }
 
-        let (robot, result) = self.fetch(&files, parallel);
+        let (robot, result) = self.fetch(&files, 2);
         result.unwrap_or_else(|e| panic!("{context}: the next fetch: {e}: {e:?}"));
         assert_holds(&robot.snapshot(), &self.new, 1..5);
         let mut expected: Vec<_> = (1..5).map(|id| self.new.hash(id, Profile::Compact)).collect();
@@ -115,6 +118,27 @@ fn a_power_cut_at_any_step_leaves_a_whole_generation() {
         }
     }
     assert!(n_new > 0 && n_new < n_steps * 6, "{n_new} of {n_steps} steps: both outcomes are seen");
+}
+
+/// A killed process leaves what the system has not synced yet: the next fetch must not build on it.
+#[test]
+fn a_power_cut_after_a_killed_fetch() {
+    let trial = Trial::new();
+    let files = Arc::new(trial.before.fork(None, 0));
+    trial.fetch(&files, 1).1.expect("works");
+    for kill_step in 1..=files.n_steps() {
+        for seed in kill_step * 100..kill_step * 100 + 8 {
+            trial.settle_records(1);
+            let killed = Arc::new(trial.before.fork(Some(kill_step), seed));
+            trial.fetch(&killed, 1).1.expect_err("killed");
+            // The step may lie behind the second fetch: then the power fails after it.
+            let cut_step = 1 + Random(seed).below(files.n_steps());
+            let second = Arc::new(killed.fork(Some(cut_step), seed));
+            let outcome = trial.fetch(&second, 1).1;
+            assert!(outcome.is_err() || second.n_steps() < cut_step, "seed {seed}");
+            trial.recover(&second, seed, &format!("killed at {kill_step}, cut at {cut_step}, seed {seed}"));
+        }
+    }
 }
 
 /// Also with a server that breaks connections, and with several downloads at a time.

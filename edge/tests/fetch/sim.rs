@@ -62,9 +62,10 @@ pub struct SimFiles(Mutex<State>);
 
 impl SimFiles {
     /// Returns a copy that loses power at a step (counted from 1), which may or may not still happen.
+    /// Of storage that is cut it is what a killed process leaves: all that happened, synced or not.
     pub fn fork(&self, cut_at: Option<u64>, seed: u64) -> Self {
         let state = self.0.lock().expect("sound").clone();
-        Self(Mutex::new(State { n_steps: 0, cut_at, random: seed, ..state }))
+        Self(Mutex::new(State { n_steps: 0, cut_at, is_cut: false, random: seed, ..state }))
     }
 
     pub fn n_steps(&self) -> u64 {
