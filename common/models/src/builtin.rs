@@ -1,8 +1,8 @@
 //! The built-in stand-in: knows colours and coarse shapes, no objects; needs no files and no ONNX Runtime.
 //!
-//! An image's vector is a soft histogram over the 11 basic colour terms (Berlin and Kay 1969), centred so
-//! that an absent colour scores below 0, followed by shape terms from the mask. A text's vector is the sum
-//! of the prototypes of its words.
+//! An image's vector is a soft histogram over the 11 basic colour terms (Berlin and Kay 1969), followed by
+//! shape terms from the mask. A text's vector is the sum of the prototypes of its words; those of colours
+//! are centred, so that an absent colour scores below 0.
 //!
 //! Pixels are judged in OKLab (Ottosson 2020). Shade multiplies linear light by k and with it all three of
 //! L, a, b by the cube root of k: hue and chroma / L stay, so these decide between hues, and lightness is
@@ -177,9 +177,7 @@ fn encode_crop(crop: &Crop) -> Option<[f32; DIM]> {
     for pixel in &pixels {
         add_colours(pixel, highlight, &mut vector[..N_COLOURS]);
     }
-    for x in &mut vector[..N_COLOURS] {
-        *x = *x / pixels.len() as f32 - 1.0 / N_COLOURS as f32;
-    }
+    vector[..N_COLOURS].iter_mut().for_each(|x| *x /= pixels.len() as f32);
     for (x, term) in vector[N_COLOURS..].iter_mut().zip(shape(&inside, crop.image().width() as usize)) {
         *x = SHAPE_WEIGHT * term;
     }
@@ -284,8 +282,7 @@ fn shape(inside: &[usize], width_px: usize) -> [f32; 3] {
     let elongation = 0.5 * (var_y / var_x).ln() / 2.5f64.ln();
     // Share of the circle around the mask that is filled: disc 1, square 0.64, ellipse 2:1 0.5. The
     // farthest fiftieth is left out, because masks have ragged edges.
-    radii2.sort_unstable_by(f64::total_cmp);
-    let radius2 = radii2[(radii2.len() - 1) * 49 / 50];
+    let (_, &mut radius2, _) = radii2.select_nth_unstable_by((inside.len() - 1) * 49 / 50, f64::total_cmp);
     let filled = n / (std::f64::consts::PI * (radius2.sqrt() + 0.5).powi(2) / 0.98);
     [elongation.clamp(0.0, 1.0) as f32, (-elongation).clamp(0.0, 1.0) as f32, ramp(filled as f32, 0.75, 0.9)]
 }

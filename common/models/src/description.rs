@@ -61,18 +61,18 @@ pub const FILE_NAME: &str = "model.toml";
 #[derive(Debug, thiserror::Error)]
 pub enum DescriptionError {
     /// A file could not be read.
-    #[error("{source}; put the file there or correct the description")]
+    #[error("{cause}; put the file there or correct the description")]
     Read {
         /// The operating system's answer, which names the path.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// The description is not what is expected here.
-    #[error("{}: {source}; see the fields of {FILE_NAME} in its documentation", path.display())]
+    #[error("{}: {cause}; see the fields of {FILE_NAME} in its documentation", path.display())]
     Format {
         /// The description.
         path: PathBuf,
         /// Line, column and what is wrong.
-        source: Box<toml::de::Error>,
+        cause: Box<toml::de::Error>,
     },
     /// A field's value cannot be used.
     #[error("{}: {field} is {found}, expected {expected}; correct it", path.display())]
@@ -261,9 +261,9 @@ impl Description {
     /// # Errors
     /// [`DescriptionError`] where it cannot be read or used.
     pub fn read(path: &Path) -> Result<Self, DescriptionError> {
-        let text = fs_err::read_to_string(path).map_err(|source| DescriptionError::Read { source })?;
+        let text = fs_err::read_to_string(path).map_err(|cause| DescriptionError::Read { cause })?;
         let description: Self = toml::from_str(&text)
-            .map_err(|source| DescriptionError::Format { path: path.to_owned(), source: Box::new(source) })?;
+            .map_err(|cause| DescriptionError::Format { path: path.to_owned(), cause: Box::new(cause) })?;
         description.check(path)?;
         Ok(description)
     }

@@ -44,9 +44,9 @@ impl ModelDir {
         for (role, file) in description.files() {
             let sha256 = match file.sha256 {
                 Some(sha256) => sha256.0,
-                None => hash_file(&files_root.join(&file.path)).map_err(|source| match source.kind() {
+                None => hash_file(&files_root.join(&file.path)).map_err(|cause| match cause.kind() {
                     io::ErrorKind::NotFound => DescriptionError::NoHash { path: files_root.join(&file.path) },
-                    _ => DescriptionError::Read { source },
+                    _ => DescriptionError::Read { cause },
                 })?,
             };
             id.sha256_of_file.insert(role.to_owned(), hex::encode(sha256));
@@ -143,7 +143,7 @@ impl ModelDir {
 fn checked(files_root: &Path, file: &FileRef) -> Result<PathBuf, DescriptionError> {
     let path = files_root.join(&file.path);
     if let Some(expected) = file.sha256 {
-        let found = hash_file(&path).map_err(|source| DescriptionError::Read { source })?;
+        let found = hash_file(&path).map_err(|cause| DescriptionError::Read { cause })?;
         if found != expected.0 {
             let (expected, found) = (hex::encode(expected.0), hex::encode(found));
             return Err(DescriptionError::Hash { path, expected, found });

@@ -11,10 +11,10 @@ use crate::{EncodeError, ModelError, TextEncoder, tensors, text::centred};
 #[derive(Debug, thiserror::Error)]
 pub enum PhrasesError {
     /// The file could not be read.
-    #[error("{source}; put the file there or correct the description")]
+    #[error("{cause}; put the file there or correct the description")]
     Read {
         /// The operating system's answer, which names the path.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// A line has no phrase.
     #[error("{}: line {line} is empty; the list needs one phrase a line", path.display())]
@@ -66,7 +66,7 @@ impl PhraseEncoder {
         (vectors, tensor): (&Path, &str),
         centre: Option<Vec<f32>>,
     ) -> Result<Self, ModelError> {
-        let text = fs_err::read_to_string(phrases).map_err(|source| PhrasesError::Read { source })?;
+        let text = fs_err::read_to_string(phrases).map_err(|cause| PhrasesError::Read { cause })?;
         let lines: Vec<String> = text.lines().map(str::to_owned).collect();
         let mut index_of_key = HashMap::new();
         for (index, phrase) in lines.iter().enumerate() {

@@ -28,11 +28,11 @@ pub enum SessionError {
     },
     /// The library does not load.
     #[error(
-        "ONNX Runtime: {source}; install version 1.17 or newer, put libonnxruntime.so beside the program, or give its path"
+        "ONNX Runtime: {cause}; install version 1.17 or newer, put libonnxruntime.so beside the program, or give its path"
     )]
     Runtime {
         /// What the loader says; it names the path.
-        source: Box<ort::LoadDynamicError>,
+        cause: Box<ort::LoadDynamicError>,
     },
     /// Another library was loaded before.
     #[error("ONNX Runtime is loaded from {}, {} was asked for; use one per process", loaded.display(), asked.display())]
@@ -43,32 +43,32 @@ pub enum SessionError {
         asked: PathBuf,
     },
     /// The library refuses to start.
-    #[error("ONNX Runtime does not start: {source}; check its version (1.17 or newer)")]
+    #[error("ONNX Runtime does not start: {cause}; check its version (1.17 or newer)")]
     Start {
         /// What it says.
-        source: ort::Error,
+        cause: ort::Error,
     },
     /// The accelerator asked for cannot be used.
-    #[error("ONNX Runtime cannot use {provider:?}: {source}; use a build with it, or the CPU")]
+    #[error("ONNX Runtime cannot use {provider:?}: {cause}; use a build with it, or the CPU")]
     Provider {
         /// The accelerator.
         provider: Provider,
         /// What the runtime says.
-        source: ort::Error,
+        cause: ort::Error,
     },
     /// The model file cannot be read.
-    #[error("{source}; put the model file there or correct the description")]
+    #[error("{cause}; put the model file there or correct the description")]
     Read {
         /// The operating system's answer, which names the path.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// The model file cannot be loaded: cut, not ONNX, or of an unknown version.
-    #[error("{}: {source}; fetch the model file again", path.display())]
+    #[error("{}: {cause}; fetch the model file again", path.display())]
     Load {
         /// The model file.
         path: PathBuf,
         /// What the runtime says.
-        source: ort::Error,
+        cause: ort::Error,
     },
     /// The model has no such input or output.
     #[error("{}: no {role} {name:?}, it has {}; correct the description", path.display(), found.join(", "))]
@@ -97,12 +97,12 @@ pub enum SessionError {
         expected: String,
     },
     /// Running the model failed.
-    #[error("{}: running the model: {source}; the file does not fit its description", path.display())]
+    #[error("{}: running the model: {cause}; the file does not fit its description", path.display())]
     Run {
         /// The model file.
         path: PathBuf,
         /// What the runtime says.
-        source: ort::Error,
+        cause: ort::Error,
     },
 }
 
@@ -170,12 +170,12 @@ fn environment(runtime: &Path) -> Result<Environment, SessionError> {
         None => {}
     }
     let environment = ort::init_from(&path)
-        .map_err(|source| SessionError::Runtime { source: Box::new(source) })?
+        .map_err(|cause| SessionError::Runtime { cause: Box::new(cause) })?
         .with_name("slag")
         .with_telemetry(false)
         .with_logger(Arc::new(forward_log))
         .build()
-        .map_err(|source| SessionError::Start { source })?;
+        .map_err(|cause| SessionError::Start { cause })?;
     environment.set_log_level(LogLevel::Warning);
     *loaded = Some((path, environment.clone()));
     Ok(environment)
@@ -201,16 +201,16 @@ pub(crate) struct Model {
 impl Model {
     pub(crate) fn open(path: &Path, options: &SessionOptions) -> Result<Self, SessionError> {
         // Before the library is asked for, so that a missing model is named as such.
-        fs_err::metadata(path).map_err(|source| SessionError::Read { source })?;
+        fs_err::metadata(path).map_err(|cause| SessionError::Read { cause })?;
         let environment = environment(&options.runtime)?;
-        let load = |source| SessionError::Load { path: path.to_owned(), source };
+        let load = |cause| SessionError::Load { path: path.to_owned(), cause };
         let mut builder = Session::builder(&environment)
             .and_then(|b| b.with_intra_threads(options.intra_op_threads).map_err(ort::Error::from))
             .and_then(|b| b.with_inter_threads(1).map_err(ort::Error::from))
             .map_err(load)?;
         if options.provider == Provider::Cuda {
             builder = with_cuda(builder)
-                .map_err(|source| SessionError::Provider { provider: options.provider, source })?;
+                .map_err(|cause| SessionError::Provider { provider: options.provider, cause })?;
         }
         let session = builder.commit_from_file(path).map_err(load)?;
         tracing::debug!(path = %path.display(), provider = ?options.provider, "model opened");
@@ -308,8 +308,8 @@ impl Model {
         name: &str,
         shape: &[i64],
     ) -> Result<Vec<f32>, SessionError> {
-        let run = |path: &Path, source| SessionError::Run { path: path.to_owned(), source };
-        let mut outputs = self.session.run(inputs).map_err(|source| run(&self.path, source))?;
+        let run = |path: &Path, cause| SessionError::Run { path: path.to_owned(), cause };
+        let mut outputs = self.session.run(inputs).map_err(|cause| run(&self.path, cause))?;
         let output = outputs.remove(name);
         drop(outputs);
         let extracted = output.as_ref().map(DynValue::try_extract_tensor::<f32>);
@@ -319,7 +319,7 @@ impl Model {
                 let found = format!("f32 {:?}", &found[..]);
                 Err(self.shape_error("output", name, found, TensorElementType::Float32, shape))
             }
-            Some(Err(source)) => Err(run(&self.path, source)),
+            Some(Err(cause)) => Err(run(&self.path, cause)),
             None => {
                 Err(self.shape_error("output", name, "absent".to_owned(), TensorElementType::Float32, shape))
             }
@@ -336,7 +336,7 @@ impl Model {
         T: PrimitiveTensorElementType + Clone + Debug + 'static,
     {
         let tensor = TensorRef::from_array_view((shape, values))
-            .map_err(|source| SessionError::Run { path: self.path.clone(), source })?;
+            .map_err(|cause| SessionError::Run { path: self.path.clone(), cause })?;
         Ok(tensor.into())
     }
 }

@@ -9,18 +9,18 @@ use safetensors::{Dtype, SafeTensors};
 #[derive(Debug, thiserror::Error)]
 pub enum TensorsError {
     /// The file could not be read.
-    #[error("{source}; put the file there or correct the description")]
+    #[error("{cause}; put the file there or correct the description")]
     Read {
         /// The operating system's answer, which names the path.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// The file is not safetensors, or is cut.
-    #[error("{}: {source}; fetch the file again", path.display())]
+    #[error("{}: {cause}; fetch the file again", path.display())]
     Format {
         /// The file.
         path: PathBuf,
         /// What is wrong.
-        source: safetensors::SafeTensorError,
+        cause: safetensors::SafeTensorError,
     },
     /// The tensor is not there.
     #[error("{}: no tensor {name:?}, it has {}; correct the description", path.display(), found.join(", "))]
@@ -62,9 +62,9 @@ pub enum TensorsError {
 /// # Errors
 /// [`TensorsError`] where the file or the tensor is not as described.
 pub fn read(path: &Path, name: &str, n_rows: Option<usize>, dim: usize) -> Result<Vec<f32>, TensorsError> {
-    let bytes = fs_err::read(path).map_err(|source| TensorsError::Read { source })?;
+    let bytes = fs_err::read(path).map_err(|cause| TensorsError::Read { cause })?;
     let tensors = SafeTensors::deserialize(&bytes)
-        .map_err(|source| TensorsError::Format { path: path.to_owned(), source })?;
+        .map_err(|cause| TensorsError::Format { path: path.to_owned(), cause })?;
     let tensor = tensors.tensor(name).map_err(|_| {
         let mut found: Vec<_> = tensors.names().into_iter().map(str::to_owned).collect();
         found.sort();

@@ -17,10 +17,10 @@ use crate::{
 #[derive(Debug, thiserror::Error)]
 pub enum TokenizerError {
     /// The file could not be read.
-    #[error("{source}; put the tokenizer there or correct the description")]
+    #[error("{cause}; put the tokenizer there or correct the description")]
     Read {
         /// The operating system's answer, which names the path.
-        source: std::io::Error,
+        cause: std::io::Error,
     },
     /// The file is not a tokenizer.
     #[error("{}: {reason}; fetch tokenizer.json again", path.display())]
@@ -67,7 +67,7 @@ impl Tokens {
     /// # Errors
     /// [`TokenizerError`] where the file is no tokenizer, or ends texts in another token.
     pub fn open(path: &Path, max_tokens: usize, end_token_id: u32) -> Result<Self, TokenizerError> {
-        let bytes = fs_err::read(path).map_err(|source| TokenizerError::Read { source })?;
+        let bytes = fs_err::read(path).map_err(|cause| TokenizerError::Read { cause })?;
         let mut tokenizer = Tokenizer::from_bytes(bytes)
             .map_err(|error| TokenizerError::Format { path: path.to_owned(), reason: error.to_string() })?;
         // Both are done here, the same for every file.

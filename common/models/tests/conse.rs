@@ -103,6 +103,8 @@ fn an_unknown_phrase_is_answered_with_near_ones() {
     };
     assert_eq!(near("refridgerator")[0], "refrigerator");
     assert_eq!(near("chiar")[0], "chair");
+    // "cup" comes first in the list, and is its beginning.
+    assert_eq!(near("cupcaks")[..2], ["cupcake", "cup"]);
     assert!(near("red sofa").contains(&"sofa".to_owned()));
     assert_eq!(near("zzzzzzzz"), Vec::<String>::new());
     assert_eq!(near(&"very long ".repeat(1000)), Vec::<String>::new());

@@ -1,0 +1,225 @@
+//! Crops against a plain recomputation on a labelled view, and vectors of a whole view.
+
+use std::{
+    num::NonZeroUsize,
+    path::{Path, PathBuf},
+    time::Instant,
+};
+
+use image::{Rgb, RgbImage};
+use slag_encoder::{
+    embed::{Background, EmbedError, crop, embed_masks},
+    segment::{BoxPx, Mask},
+};
+use slag_models::{Crop, EncodeError, ImageEncoder, ModelDir, SessionOptions};
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
+}
+
+fn present(path: PathBuf, message: &str) -> Option<PathBuf> {
+    let is_there = path.exists();
+    if !is_there {
+        assert!(std::env::var("CI").as_deref() != Ok("true"), "{message}");
+        println!("skipped: {message}");
+    }
+    is_there.then_some(path)
+}
+
+fn shared(path: &str) -> Option<PathBuf> {
+    let shared = std::env::var_os("SLAG_SHARED").map_or_else(|| root().join("../shared"), PathBuf::from);
+    present(shared, "../shared is absent").map(|shared| shared.join(path))
+}
+
+/// A labelled view.
+struct Labelled {
+    photo: RgbImage,
+    /// Instance of each pixel.
+    labels: Vec<u8>,
+    /// A mask per instance of 200 pixels or more.
+    masks: Vec<(u8, Mask)>,
+}
+
+fn view(name: &str) -> Option<Labelled> {
+    let scene = shared("scenes/house_a")?;
+    let photo = image::open(scene.join(format!("images/{name}.jpg"))).expect("it decodes").to_rgb8();
+    let labels = image::open(scene.join(format!("gt/masks/{name}.png"))).expect("it decodes").to_luma8();
+    assert_eq!(photo.dimensions(), labels.dimensions());
+    let width = photo.width() as usize;
+    let labels = labels.into_raw();
+    let masks = (0..=255u8).filter_map(|id| {
+        let pixels: Vec<_> = labels
+            .iter()
+            .enumerate()
+            .filter(|(_, l)| **l == id)
+            .map(|(i, _)| (i % width, i / width))
+            .collect();
+        if pixels.len() < 200 {
+            return None;
+        }
+        let range = |values: Vec<usize>| (*values.iter().min().unwrap(), *values.iter().max().unwrap() + 1);
+        let (x0, x1) = range(pixels.iter().map(|p| p.0).collect());
+        let (y0, y1) = range(pixels.iter().map(|p| p.1).collect());
+        let inside =
+            (y0..y1).flat_map(|y| labels[y * width + x0..y * width + x1].iter().map(|&l| l == id)).collect();
+        let box_px = BoxPx { x0: x0 as u32, y0: y0 as u32, x1: x1 as u32, y1: y1 as u32 };
+        Some((id, Mask { box_px, inside, area_px: pixels.len() as u32, level: 0 }))
+    });
+    let masks = masks.collect();
+    Some(Labelled { photo, labels, masks })
+}
+
+/// The level that a true Gaussian blur of the box gives, in f64; beyond the edge its pixels are repeated.
+fn blurred(photo: &RgbImage, b: BoxPx, x: u32, y: u32) -> [f64; 3] {
+    let sigma = 0.05 * f64::from(b.width_px().max(b.height_px()));
+    let reach = (4.0 * sigma).ceil() as i64;
+    let (mut sum, mut total) = ([0.0; 3], 0.0);
+    for dy in -reach..=reach {
+        for dx in -reach..=reach {
+            let weight = (-((dx * dx + dy * dy) as f64) / (2.0 * sigma * sigma)).exp();
+            let clamp = |v: i64, from: u32, end: u32| v.clamp(i64::from(from), i64::from(end) - 1) as u32;
+            let pixel =
+                photo.get_pixel(clamp(i64::from(x) + dx, b.x0, b.x1), clamp(i64::from(y) + dy, b.y0, b.y1));
+            (0..3).for_each(|c| sum[c] += weight * f64::from(pixel[c]));
+            total += weight;
+        }
+    }
+    sum.map(|s| s / total)
+}
+
+#[test]
+fn crops_equal_a_plain_recomputation() {
+    let Some(Labelled { photo, labels, masks }) = view("0000") else { return };
+    assert!(masks.len() > 5, "{}", masks.len());
+    let mut worst = 0.0f64;
+    let mut differences = Vec::new();
+    for (id, mask) in &masks {
+        let b = mask.box_px;
+        let fills = [(Background::White, Some(255)), (Background::Grey, Some(128)), (Background::Keep, None)];
+        for (background, fill) in fills {
+            let crop = crop(&photo, mask, background).expect("it fits");
+            assert_eq!(crop.image().dimensions(), (b.x1 - b.x0, b.y1 - b.y0));
+            for (x, y, found) in crop.image().enumerate_pixels() {
+                let in_photo = (x + b.x0, y + b.y0);
+                let is_inside = labels[(in_photo.1 * photo.width() + in_photo.0) as usize] == *id;
+                let expected = match fill {
+                    Some(level) if !is_inside => Rgb([level; 3]),
+                    _ => *photo.get_pixel(in_photo.0, in_photo.1),
+                };
+                assert_eq!(*found, expected, "instance {id}, {background:?}, {x} {y}");
+                assert_eq!(crop.inside()[(y * (b.x1 - b.x0) + x) as usize], is_inside);
+            }
+        }
+        let blurry = crop(&photo, mask, Background::Blur).expect("it fits");
+        for (i, (x, y, found)) in blurry.image().enumerate_pixels().enumerate() {
+            let (x, y) = (x + b.x0, y + b.y0);
+            if blurry.inside()[i] {
+                assert_eq!(found, photo.get_pixel(x, y));
+            } else if i % 997 == 0 {
+                let exact = blurred(&photo, b, x, y);
+                let sigma = 0.05 * f64::from(b.width_px().max(b.height_px()));
+                let to_edge = (x - b.x0).min(b.x1 - 1 - x).min((y - b.y0).min(b.y1 - 1 - y));
+                for channel in 0..3 {
+                    let difference = (f64::from(found[channel]) - exact[channel]).abs();
+                    differences.push(difference);
+                    if f64::from(to_edge) > 3.0 * sigma {
+                        worst = worst.max(difference);
+                    }
+                }
+            }
+        }
+    }
+    let mean = differences.iter().sum::<f64>() / differences.len() as f64;
+    println!(
+        "blur: {mean:.2} levels from a Gaussian on average, at most {worst:.1} away from the box's edge"
+    );
+    // At the edge a Gaussian says as much about how the photograph is continued as about the photograph.
+    assert!(mean < 1.0 && worst < 2.0 && differences.len() > 1000, "{mean} {worst} {}", differences.len());
+}
+
+#[test]
+fn vectors_of_a_view_are_the_crops_own_in_any_batch() {
+    let Some(Labelled { photo, masks, .. }) = view("0000") else { return };
+    let library = format!("target/onnxruntime/{}/libonnxruntime.so", std::env::consts::ARCH);
+    let Some(library) = present(root().join(library), "no ONNX Runtime: run scripts/get-onnxruntime.sh")
+    else {
+        return;
+    };
+    let model = ModelDir::open(&root().join("tests/models/conse")).expect("it opens");
+    let mut encoder = model.image_encoder(&SessionOptions::new(library)).expect("it loads");
+    let masks: Vec<Mask> = masks.into_iter().map(|(_, mask)| mask).collect();
+    let start = Instant::now();
+    let together = embed_masks(&photo, &masks, &mut *encoder, Background::White, None).expect("it embeds");
+    let seconds = start.elapsed().as_secs_f64();
+    println!("{} crops: {:.0} crops/s on one thread", masks.len(), masks.len() as f64 / seconds);
+    assert_eq!(together.len(), masks.len() * 512);
+    for (i, mask) in masks.iter().enumerate() {
+        let crop = crop(&photo, mask, Background::White).expect("it fits");
+        let alone = encoder.encode(&[crop]).expect("it encodes");
+        assert!(alone == together[i * 512..][..512], "mask {i}");
+    }
+    let threes = embed_masks(&photo, &masks, &mut *encoder, Background::White, NonZeroUsize::new(3));
+    assert!(threes.expect("it embeds") == together);
+    let none = embed_masks(&photo, &[], &mut *encoder, Background::White, None);
+    assert_eq!(none.expect("nothing to do"), Vec::<f32>::new());
+}
+
+/// Notes how many crops it is given at a time; a vector is the crop's width and height.
+struct Recorder {
+    batches: Vec<usize>,
+}
+
+impl ImageEncoder for Recorder {
+    fn dim(&self) -> usize {
+        2
+    }
+    fn preferred_batch(&self) -> usize {
+        4
+    }
+    fn encode(&mut self, crops: &[Crop]) -> Result<Vec<f32>, EncodeError> {
+        self.batches.push(crops.len());
+        Ok(crops.iter().flat_map(|c| [c.image().width() as f32, c.image().height() as f32]).collect())
+    }
+}
+
+fn rectangle(x0: u32, y0: u32, x1: u32, y1: u32) -> Mask {
+    let area_px = (x1 - x0) * (y1 - y0);
+    Mask { box_px: BoxPx { x0, y0, x1, y1 }, inside: vec![true; area_px as usize], area_px, level: 0 }
+}
+
+#[test]
+fn batches_are_bounded_by_count_and_by_pixels() {
+    let photo = RgbImage::new(3000, 3000);
+    let mut masks: Vec<Mask> = (1..=5).map(|i| rectangle(0, 0, i, 2)).collect();
+    masks.extend((0..3).map(|_| rectangle(0, 0, 3000, 3000)));
+    masks.push(rectangle(2999, 2999, 3000, 3000));
+    let mut recorder = Recorder { batches: Vec::new() };
+    let vectors = embed_masks(&photo, &masks, &mut recorder, Background::Keep, None).expect("it embeds");
+    // 4 by count; a small one and 2 of 9 million pixels; the rest.
+    assert_eq!(recorder.batches, [4, 3, 2]);
+    let expected: Vec<f32> =
+        masks.iter().flat_map(|m| [m.box_px.width_px() as f32, m.box_px.height_px() as f32]).collect();
+    assert_eq!(vectors, expected);
+}
+
+#[test]
+fn masks_that_do_not_fit_are_named() {
+    let photo = RgbImage::new(10, 8);
+    let beyond = rectangle(5, 5, 11, 8);
+    let mut short = rectangle(0, 0, 4, 4);
+    short.inside.pop();
+    let mut empty = rectangle(0, 0, 4, 4);
+    empty.inside.fill(false);
+    let mut reversed = rectangle(0, 0, 4, 4);
+    reversed.box_px = BoxPx { x0: 4, y0: 0, x1: 0, y1: 4 };
+    for bad in [beyond, short, empty, reversed] {
+        let masks = [rectangle(0, 0, 10, 8), bad];
+        let mut recorder = Recorder { batches: Vec::new() };
+        let error = embed_masks(&photo, &masks, &mut recorder, Background::Blur, None)
+            .expect_err("it must be refused");
+        assert!(matches!(error, EmbedError::Mask { index: 1, .. }), "{error}");
+        assert!(error.to_string().contains("10x8"), "{error}");
+    }
+    let one = crop(&photo, &rectangle(9, 7, 10, 8), Background::Blur).expect("it fits");
+    assert_eq!(one.image().dimensions(), (1, 1));
+}
