@@ -312,7 +312,7 @@ mod tests {
                 prop_assert_eq!(cluster.best_score as usize, *members.iter().max().expect("has members"));
                 let cut = members.len().saturating_sub(1) / 50;
                 let mut inside = members.clone();
-                for axis in 0..3 {
+                for axis in [0, 1, 2] {
                     let mut column: Vec<f64> = members.iter().map(|m| points[*m][axis]).collect();
                     column.sort_by(f64::total_cmp);
                     let (low, high) = (column[cut], column[column.len() - 1 - cut]);

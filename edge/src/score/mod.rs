@@ -131,7 +131,7 @@ impl<'a> Search<'a> {
     ) -> Result<Self, ScoreError> {
         let length = query.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt() as f32;
         // Text models normalise in f32, or from f16 tables.
-        if !((length - 1.0).abs() <= 1e-3) {
+        if !(0.999..=1.001).contains(&length) {
             return Err(ScoreError::NotUnit { found: length });
         }
         for shard in shards {
@@ -142,7 +142,7 @@ impl<'a> Search<'a> {
             }
             let reach = position_box(shard);
             let found = reach.min.abs().max(reach.max.abs()).max_element();
-            if !(found <= MAX_COORDINATE) {
+            if !(0.0..=MAX_COORDINATE).contains(&found) {
                 return Err(ScoreError::Extent { cell_id: header.cell_id, found });
             }
         }
