@@ -168,20 +168,20 @@ fn connect(voxels: &[&[Span]]) -> Vec<u32> {
         }
         at
     }
-    let key = |at: usize| voxels[at][0].voxel_key;
+    let keys: Vec<u64> = voxels.iter().map(|spans| spans[0].voxel_key).collect();
     let mut parents: Vec<u32> = (0..voxels.len() as u32).collect();
     for difference in forward_neighbours() {
         // Keys ascend, so the neighbours sought do too: one walk finds them all.
         let mut other = 0;
-        for at in 0..voxels.len() {
-            let wanted = key(at) + difference;
-            while other < voxels.len() && key(other) < wanted {
+        for at in 0..keys.len() {
+            let wanted = keys[at] + difference;
+            while other < keys.len() && keys[other] < wanted {
                 other += 1;
             }
-            if other == voxels.len() {
+            if other == keys.len() {
                 break;
             }
-            if key(other) == wanted {
+            if keys[other] == wanted {
                 let (a, b) = (root_of(&mut parents, at as u32), root_of(&mut parents, other as u32));
                 parents[a.max(b) as usize] = a.min(b);
             }
