@@ -289,16 +289,18 @@ fn runtime() -> Result<tokio::runtime::Runtime> {
         .context("cannot start the service's threads")
 }
 
+/// Completes when the user or the system asks the program to stop.
+async fn stopped() {
+    if let Err(error) = serve::stop_signal().await {
+        tracing::warn!("cannot listen for signals, stopping: {error}");
+    }
+}
+
 fn run_serve(args: &ServeArgs) -> Result<Exit> {
     runtime()?.block_on(async {
         // On stdout: with port 0 this is where a script learns the port.
         let listening = |address| println!("listening on http://{address}");
-        let stop = async {
-            if let Err(error) = serve::stop_signal().await {
-                tracing::warn!("cannot listen for signals, stopping: {error}");
-            }
-        };
-        serve::serve(&args.store, args.listen, serve::Limits::default(), listening, stop).await
+        serve::serve(&args.store, args.listen, serve::Limits::default(), listening, stopped()).await
     })?;
     Ok(Exit::Done)
 }
@@ -321,12 +323,8 @@ fn run_push(args: &QdrantArgs, progress: &dyn Progress, json: bool) -> Result<Ex
             Some(before) => progress.advance(at.n_points - before),
         }
     };
-    let stop = async {
-        if let Err(error) = serve::stop_signal().await {
-            tracing::warn!("cannot listen for signals, stopping: {error}");
-        }
-    };
-    let pushed = runtime()?.block_on(qdrant::push(&reader, vectors, store.db(), &options, on_batch, stop));
+    let pushed =
+        runtime()?.block_on(qdrant::push(&reader, vectors, store.db(), &options, on_batch, stopped()));
     progress.end();
     let report = pushed?;
     let lines = format!(
