@@ -205,7 +205,8 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
         .context("cannot start threads")?;
     let (models, session) = open_models(&args.models)?;
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());
-    let summary = encode::encode(&settings, &models, &session, progress, cancel_flag()?.as_ref())?;
+    let summary =
+        encode::encode(&settings, &models, &session, &CpuRasterizer, progress, cancel_flag()?.as_ref())?;
     let stages =
         summary.busy_secs.iter().map(|(stage, s)| format!("{stage} {s:.1}")).collect::<Vec<_>>().join(", ");
     let sizes = summary

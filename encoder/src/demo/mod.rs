@@ -19,7 +19,7 @@ use crate::generate::{self, TrueObject};
 use crate::palette::PaletteSettings;
 use crate::progress::Progress;
 use crate::publish::serve::{self, Limits};
-use crate::raster::WeightKind;
+use crate::raster::{CpuRasterizer, WeightKind};
 use crate::shard::cells::CellLimits;
 use crate::{query, store::StoreReader};
 
@@ -194,9 +194,10 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     };
     // The built-in models need no runtime library.
     let session = SessionOptions::new(PathBuf::new());
-    let summary =
-        tokio::task::block_in_place(|| encode::encode(&settings, &models, &session, progress, cancel))
-            .context("encode")?;
+    let summary = tokio::task::block_in_place(|| {
+        encode::encode(&settings, &models, &session, &CpuRasterizer, progress, cancel)
+    })
+    .context("encode")?;
 
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
     let (listens, listening) = tokio::sync::oneshot::channel();

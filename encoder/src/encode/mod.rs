@@ -27,7 +27,7 @@ use crate::ingest::{self, GeoError, IngestError};
 use crate::lift::published::{EXTRA_REGIONS, extra_field};
 use crate::lift::{CellBuckets, CellField, RegionTable, SumsError, ViewSums};
 use crate::progress::Progress;
-use crate::raster::RasterError;
+use crate::raster::{RasterError, Rasterizer};
 use crate::segment::{GivenMasks, GraphSegmenter, SegmentError, Segmenter};
 use crate::shard::{self, cells};
 use crate::store::{Extras, Store, StoreError};
@@ -53,6 +53,9 @@ pub enum EncodeError {
     /// Masks cannot be made or read.
     #[error(transparent)]
     Segment(#[from] SegmentError),
+    /// The scene cannot be rasterised.
+    #[error(transparent)]
+    Scene(#[from] RasterError),
     /// A view cannot be rasterised.
     #[error("view {view}: {source}")]
     Raster {
@@ -218,6 +221,7 @@ pub fn encode(
     settings: &EncodeSettings,
     models: &ModelDir,
     session: &SessionOptions,
+    rasterizer: &dyn Rasterizer,
     progress: &dyn Progress,
     cancel: &AtomicBool,
 ) -> Result<EncodeSummary, EncodeError> {
@@ -243,9 +247,10 @@ pub fn encode(
 
     let done = job.done_views()?;
     let n_resumed = views.iter().filter(|view| done.contains(&view.name)).count();
+    let loaded = stopwatch.time("raster", || rasterizer.load(&scene))?;
     let worker = ViewWorker {
         settings,
-        scene: &scene,
+        scene: loaded.as_ref(),
         split: &split,
         segmenter: segmenter.as_ref(),
         models,

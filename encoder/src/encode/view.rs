@@ -1,6 +1,6 @@
 //! One view through the stages segment, embed and raster.
 
-use slag_common::{Gaussians, View};
+use slag_common::View;
 use slag_models::{ImageEncoder, ModelDir, SessionOptions};
 
 use super::settings::MAX_RASTER_WIDTH_PX;
@@ -8,14 +8,14 @@ use super::{EncodeError, EncodeSettings, Stopwatch};
 use crate::embed;
 use crate::ingest::{self, LoadedImage};
 use crate::lift::ViewSums;
-use crate::raster::{CpuRasterizer, RasterView, Rasterizer};
+use crate::raster::{LoadedScene, RasterView};
 use crate::segment::{self, Mask, SegmentInput, Segmenter};
 use crate::shard::cells::CellSplit;
 
 /// What every view needs.
 pub(super) struct ViewWorker<'a> {
     pub(super) settings: &'a EncodeSettings,
-    pub(super) scene: &'a Gaussians,
+    pub(super) scene: &'a dyn LoadedScene,
     pub(super) split: &'a CellSplit,
     pub(super) segmenter: &'a dyn Segmenter,
     pub(super) models: &'a ModelDir,
@@ -65,9 +65,7 @@ impl ViewWorker<'_> {
         );
         let weights = self
             .stopwatch
-            .time("raster", || {
-                CpuRasterizer.weights(self.scene, &raster_view, &regions, self.settings.weights)
-            })
+            .time("raster", || self.scene.weights(&raster_view, &regions, self.settings.weights))
             .map_err(|source| EncodeError::Raster { view: view.name.clone(), source })?;
         Ok(ViewSums::new(&weights.entries, masks_of_region, vectors, self.models.dim(), self.split))
     }
@@ -76,7 +74,7 @@ impl ViewWorker<'_> {
         let depth = if self.segmenter.wants_depth() {
             let drawing = self
                 .stopwatch
-                .time("raster", || CpuRasterizer.draw(self.scene, raster_view, [0.0; 3]))
+                .time("raster", || self.scene.draw(raster_view, [0.0; 3]))
                 .map_err(|source| EncodeError::Raster { view: loaded.view.name.clone(), source })?;
             Some(enlarge(&drawing.depth, raster_view, loaded))
         } else {

@@ -156,37 +156,17 @@ pub enum RasterError {
 }
 
 /// A backend that rasterises scenes.
-pub trait Rasterizer: Sync {
-    /// Returns the sums of each Gaussian's weight over each region; pixels of [`NO_REGION`] take
-    /// light but record nothing. The same input gives the same bits for any number of threads.
+pub trait Rasterizer: Send + Sync {
+    /// Makes a scene ready: checks it and, on a device with memory of its own, uploads it.
     ///
     /// # Errors
-    /// [`RasterError`] for input that contradicts itself; single bad Gaussians are counted instead.
-    fn weights(
-        &self,
-        scene: &Gaussians,
-        view: &RasterView,
-        regions: &RegionMap,
-        kind: WeightKind,
-    ) -> Result<ViewWeights, RasterError>;
+    /// [`RasterError`] for a scene that contradicts itself; single bad Gaussians are counted instead.
+    fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError>;
 
-    /// Returns the picture of a scene over a background colour (linear in what was trained).
+    /// [`LoadedScene::weights`] of a scene that is needed once.
     ///
     /// # Errors
-    /// [`RasterError`] for input that contradicts itself.
-    fn draw(
-        &self,
-        scene: &Gaussians,
-        view: &RasterView,
-        background: [f32; 3],
-    ) -> Result<Drawing, RasterError>;
-}
-
-/// The reference backend; runs on the current rayon pool.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct CpuRasterizer;
-
-impl Rasterizer for CpuRasterizer {
+    /// [`RasterError`].
     fn weights(
         &self,
         scene: &Gaussians,
@@ -194,27 +174,79 @@ impl Rasterizer for CpuRasterizer {
         regions: &RegionMap,
         kind: WeightKind,
     ) -> Result<ViewWeights, RasterError> {
-        check_scene(scene)?;
-        check_view(view)?;
-        check_regions(regions, &view.intrinsics)?;
-        let projection = project::project(scene, view);
-        let tiles = bin::bin(&projection.visible, &view.intrinsics);
-        let entries = blend::region_sums(&projection.visible, &tiles, regions, kind);
-        Ok(ViewWeights { entries, counters: counters(&projection, &tiles) })
+        self.load(scene)?.weights(view, regions, kind)
     }
 
+    /// [`LoadedScene::draw`] of a scene that is needed once.
+    ///
+    /// # Errors
+    /// [`RasterError`].
     fn draw(
         &self,
         scene: &Gaussians,
         view: &RasterView,
         background: [f32; 3],
     ) -> Result<Drawing, RasterError> {
+        self.load(scene)?.draw(view, background)
+    }
+}
+
+/// A scene that a backend has made ready; views may be asked for from several threads.
+pub trait LoadedScene: Sync {
+    /// Returns the sums of each Gaussian's weight over each region; pixels of [`NO_REGION`] take
+    /// light but record nothing. The same input gives the same bits for any number of threads.
+    ///
+    /// # Errors
+    /// [`RasterError`] for input that contradicts itself.
+    fn weights(
+        &self,
+        view: &RasterView,
+        regions: &RegionMap,
+        kind: WeightKind,
+    ) -> Result<ViewWeights, RasterError>;
+
+    /// Returns the picture of the scene over a background colour (linear in what was trained).
+    ///
+    /// # Errors
+    /// [`RasterError`] for input that contradicts itself.
+    fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError>;
+}
+
+/// The reference backend; runs on the current rayon pool.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct CpuRasterizer;
+
+impl Rasterizer for CpuRasterizer {
+    fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
         check_scene(scene)?;
+        Ok(Box::new(CpuScene(scene)))
+    }
+}
+
+/// A scene whose columns fit each other.
+struct CpuScene<'s>(&'s Gaussians);
+
+impl LoadedScene for CpuScene<'_> {
+    fn weights(
+        &self,
+        view: &RasterView,
+        regions: &RegionMap,
+        kind: WeightKind,
+    ) -> Result<ViewWeights, RasterError> {
         check_view(view)?;
-        let projection = project::project(scene, view);
+        check_regions(regions, &view.intrinsics)?;
+        let projection = project::project(self.0, view);
+        let tiles = bin::bin(&projection.visible, &view.intrinsics);
+        let entries = blend::region_sums(&projection.visible, &tiles, regions, kind);
+        Ok(ViewWeights { entries, counters: counters(&projection, &tiles) })
+    }
+
+    fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {
+        check_view(view)?;
+        let projection = project::project(self.0, view);
         let tiles = bin::bin(&projection.visible, &view.intrinsics);
         let position_in_world = view.camera_from_world.inverse().translation;
-        let colours = sh::colours(scene, &projection.visible, position_in_world);
+        let colours = sh::colours(self.0, &projection.visible, position_in_world);
         let mut drawing = draw::draw(&projection.visible, &colours, &tiles, background);
         drawing.counters = counters(&projection, &tiles);
         Ok(drawing)
