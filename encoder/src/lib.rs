@@ -1,5 +1,6 @@
 //! The cloud side of SLAG as a library: one module per stage of the pipeline.
 
+pub mod bench;
 pub mod check;
 pub mod cli;
 pub mod demo;
