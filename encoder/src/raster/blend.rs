@@ -16,7 +16,19 @@ pub const LANES: usize = 8;
 const LIVENESS_INTERVAL: usize = 16;
 
 /// Powers up to here matter: `exp(-6)` is below 1/255, so that no alpha beyond counts.
-const MAX_POWER: f32 = 6.0;
+pub const MAX_POWER: f32 = 6.0;
+/// `exp(t - 3/4)` for `|t| <= 3/4`, interpolated at the Chebyshev nodes; its 4th power is within
+/// 1.6e-7 of the exact one.
+pub const EXP_OF_MINUS_C: [f32; 8] = [
+    0.472_366_54,
+    0.472_366_55,
+    0.236_183_8,
+    0.078_727_82,
+    0.019_677_254,
+    0.003_935_868_3,
+    0.000_669_358_36,
+    0.000_095_198_29,
+];
 
 /// One value for each pixel of a tile.
 pub type PerPixel<T> = [[T; TILE_SIZE_PX]; TILE_SIZE_PX];
@@ -203,20 +215,9 @@ impl InTile {
 /// Plain arithmetic instead of the platform's `exp`: fits SIMD, and has the same bits everywhere.
 #[inline(always)]
 fn exp_of_minus(power: Vec4) -> Vec4 {
-    /// `exp(t - 3/4)` for `|t| <= 3/4`, interpolated at the Chebyshev nodes; its 4th power is within
-    /// 1.6e-7 of the exact one.
-    const C: [f32; 8] = [
-        0.472_366_54,
-        0.472_366_55,
-        0.236_183_8,
-        0.078_727_82,
-        0.019_677_254,
-        0.003_935_868_3,
-        0.000_669_358_36,
-        0.000_095_198_29,
-    ];
     let t = Vec4::splat(MAX_POWER / 8.0) - power.min(Vec4::splat(MAX_POWER)) * 0.25;
-    let root = C[..7].iter().rev().fold(Vec4::splat(C[7]), |sum, &c| sum * t + c);
+    let [first @ .., last] = EXP_OF_MINUS_C;
+    let root = first.iter().rev().fold(Vec4::splat(last), |sum, &c| sum * t + c);
     let square = root * root;
     square * square
 }

@@ -15,6 +15,7 @@ pub mod bin;
 pub mod blend;
 pub mod constants;
 pub mod draw;
+pub mod gpu;
 pub mod project;
 pub mod sh;
 
@@ -142,6 +143,14 @@ pub enum RasterError {
         found_px: [u32; 2],
         /// Values that the map has.
         found_values: usize,
+    },
+    /// A GPU cannot do the work; another backend may.
+    #[error("{adapter}: {what}; --device cpu works without it")]
+    Device {
+        /// Name of the device.
+        adapter: String,
+        /// What went wrong.
+        what: String,
     },
     /// A pixel names a region that does not exist.
     #[error("pixel {pixel} is of region {found}, the map has {n_regions}; make the region map again")]

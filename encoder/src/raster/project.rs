@@ -97,6 +97,11 @@ pub fn project(scene: &Gaussians, view: &RasterView) -> Projection {
     }
 }
 
+/// Returns the squared Mahalanobis distance within which a Gaussian's alpha may reach 1/255.
+pub fn reach2(opacity: f32) -> f32 {
+    ((2.0 * (255.0 * f64::from(opacity)).ln()).max(0.0) + REACH2_MARGIN) as f32
+}
+
 /// The projected covariance is beyond the range of the pixels' arithmetic.
 struct Unrepresentable;
 
@@ -133,12 +138,11 @@ fn project_one(
     // |m_x|^2 |m_y|^2 - (m_x . m_y)^2 = |m_x x m_y|^2 (Lagrange): exact for needles, and above 0.
     let det = m_x.cross(m_y).length_squared() + COVARIANCE_BLUR_PX2 * (cov_xx + cov_yy)
         - COVARIANCE_BLUR_PX2 * COVARIANCE_BLUR_PX2;
-    let reach2 = (2.0 * (255.0 * f64::from(opacity)).ln()).max(0.0) + REACH2_MARGIN;
     let on_screen = ScreenGaussian {
         gaussian: index as u32,
         depth: mean.z as f32,
         opacity,
-        reach2: reach2 as f32,
+        reach2: reach2(opacity),
         mean_px,
         inv_width: (cov_yy / det).sqrt(),
         slope: cov_xy / cov_yy,

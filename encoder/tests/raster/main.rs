@@ -2,5 +2,6 @@
 
 mod check;
 mod fixtures;
+mod gpu;
 mod gsplat;
 mod oracle;

@@ -1,0 +1,253 @@
+// Twin of blend.rs: blends the Gaussians of a tile front to back, and sums their weights over regions.
+//
+// A workgroup is a tile, a thread a pixel. The pixels are dealt out in the order of their regions, so
+// that the pixels of a region lie one after another: the second half of each step then adds up runs,
+// 32 threads a Gaussian, whatever the number of regions.
+
+// A Gaussian relative to a tile.
+struct InTile {
+    u0: f32,
+    u_x: f32,
+    u_y: f32,
+    v0: f32,
+    v_y: f32,
+    opacity: f32,
+    reach2: f32,
+    member: u32,
+}
+
+fn in_tile(member: u32, x_px: u32, y_px: u32) -> InTile {
+    let g = screen[member];
+    let dx = real(x_px) + HALF - g.mean_x_px;
+    let dy = real(y_px) + HALF - g.mean_y_px;
+    return InTile(
+        f32(g.inv_width * (dx - g.slope * dy)),
+        f32(g.inv_width),
+        f32(-g.inv_width * g.slope),
+        f32(g.inv_height * dy),
+        f32(g.inv_height),
+        g.opacity,
+        g.reach2,
+        member,
+    );
+}
+
+struct Entry {
+    member: u32,
+    region: u32,
+    // In units of 2^-TILE_FRACTION_BITS.
+    sum: u32,
+}
+
+@group(0) @binding(0) var<storage, read> view: View;
+@group(0) @binding(1) var<storage, read_write> counters: array<atomic<u32>, N_COUNTERS>;
+@group(0) @binding(2) var<storage, read> screen: array<Screen>;
+@group(0) @binding(3) var<storage, read> members: array<u32>;
+@group(0) @binding(4) var<storage, read> ranges: array<Range>;
+// Row-major, of the band alone.
+@group(0) @binding(5) var<storage, read> region_of_pixel: array<u32>;
+@group(0) @binding(6) var<storage, read_write> entries: array<Entry>;
+
+// Gaussians whose weights are summed in one step.
+const STEP = 8u;
+// Gaussians loaded at once.
+const LOAD = 64u;
+// Consecutive pixels that a thread adds up.
+const RUN = 8u;
+// One word of padding a run keeps the threads of a Gaussian in different memory banks.
+const WEIGHTS_STRIDE = WORKGROUP_SIZE + WORKGROUP_SIZE / RUN;
+const N_SUMS = 2048u;
+const NO_SLOT = 0xffffu;
+const PIXEL_BITS = 8u;
+const NO_REGION_KEY = 0xffffffu;
+
+var<workgroup> pixel_keys: array<u32, WORKGROUP_SIZE>;
+var<workgroup> slots: array<u32, WORKGROUP_SIZE>;
+var<workgroup> region_of_slot: array<u32, WORKGROUP_SIZE>;
+var<workgroup> gaussians: array<InTile, LOAD>;
+var<workgroup> weights: array<f32, STEP * WEIGHTS_STRIDE>;
+var<workgroup> sums: array<atomic<u32>, N_SUMS>;
+var<workgroup> n_slots_shared: u32;
+var<workgroup> range_shared: vec2<u32>;
+var<workgroup> n_live: atomic<u32>;
+var<workgroup> n_live_shared: u32;
+var<workgroup> n_found: atomic<u32>;
+var<workgroup> first_entry: u32;
+
+// Sorts the tile's pixels by region (Batcher 1968).
+fn sort_pixels(thread: u32) {
+    for (var size = 2u; size <= WORKGROUP_SIZE; size *= 2u) {
+        for (var distance = size / 2u; distance > 0u; distance /= 2u) {
+            workgroupBarrier();
+            let partner = thread ^ distance;
+            let own = pixel_keys[thread];
+            let other = pixel_keys[partner];
+            let wants_lower = (thread < partner) == ((thread & size) == 0u);
+            workgroupBarrier();
+            pixel_keys[thread] = select(max(own, other), min(own, other), wants_lower);
+        }
+    }
+    workgroupBarrier();
+}
+
+@compute @workgroup_size(WORKGROUP_SIZE)
+fn sum_regions(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let x_px = group.x * TILE_SIZE_PX;
+    let y_px = (view.first_tile_row + group.y) * TILE_SIZE_PX;
+    {
+        let x = x_px + thread % TILE_SIZE_PX;
+        let y = y_px + thread / TILE_SIZE_PX;
+        var region = NO_REGION_KEY;
+        if x < view.width_px && y < view.height_px {
+            region = min(region_of_pixel[(y - view.first_tile_row * TILE_SIZE_PX) * view.width_px + x], NO_REGION_KEY);
+        }
+        pixel_keys[thread] = (region << PIXEL_BITS) | thread;
+    }
+    sort_pixels(thread);
+    let key = pixel_keys[thread];
+    let region = key >> PIXEL_BITS;
+    let pixel = key & (WORKGROUP_SIZE - 1u);
+    var is_head = 0u;
+    if thread == 0u || pixel_keys[max(thread, 1u) - 1u] >> PIXEL_BITS != region {
+        is_head = 1u;
+    }
+    let slot = block_scan(is_head, thread) + is_head - 1u;
+    // Pixels without a region come last.
+    let has_region = region != NO_REGION_KEY;
+    slots[thread] = select(NO_SLOT, slot, has_region);
+    if is_head == 1u {
+        region_of_slot[slot] = region;
+    }
+    if thread == WORKGROUP_SIZE - 1u {
+        n_slots_shared = slot + u32(has_region);
+        let range = ranges[group.y * view.tile_columns + group.x];
+        range_shared = vec2<u32>(range.start, min(range.end, view.capacity_pairs));
+        atomicStore(&n_live, 0u);
+        atomicStore(&n_found, 0u);
+    }
+    for (var i = thread; i < N_SUMS; i += WORKGROUP_SIZE) {
+        atomicStore(&sums[i], 0u);
+    }
+    let n_slots = workgroupUniformLoad(&n_slots_shared);
+    let range = workgroupUniformLoad(&range_shared);
+    if n_slots == 0u || range.x >= range.y {
+        return;
+    }
+
+    let local_x = pixel % TILE_SIZE_PX;
+    let local_y = pixel / TILE_SIZE_PX;
+    var is_live = x_px + local_x < view.width_px && y_px + local_y < view.height_px;
+    var transmittance = 1.0;
+    if is_live {
+        atomicAdd(&n_live, 1u);
+    }
+    let is_falloff = view.falloff != 0u;
+    // The run of pixels that this thread adds up, for one Gaussian of a step.
+    let of_step = thread / (WORKGROUP_SIZE / STEP);
+    let run = thread % (WORKGROUP_SIZE / STEP);
+    // Sums fit for so many Gaussians before they are written out.
+    let per_round = min(N_SUMS / n_slots / STEP * STEP, LOAD);
+
+    for (var start = range.x; start < range.y; start += per_round) {
+        if thread < per_round {
+            if start + thread < range.y {
+                gaussians[thread] = in_tile(members[start + thread], x_px, y_px);
+            } else {
+                gaussians[thread] = InTile(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0u);
+            }
+        }
+        if thread == 0u {
+            n_live_shared = atomicLoad(&n_live);
+        }
+        // A barrier, too: the Gaussians are there.
+        if workgroupUniformLoad(&n_live_shared) == 0u {
+            break;
+        }
+        let n_loaded = min(per_round, range.y - start);
+        for (var step = 0u; step < n_loaded; step += STEP) {
+            for (var i = 0u; i < STEP; i++) {
+                let g = gaussians[step + i];
+                var weight = 0.0;
+                if is_live {
+                    let u = g.u0 + g.u_y * f32(local_y) + g.u_x * f32(local_x);
+                    let v = g.v0 + g.v_y * f32(local_y);
+                    let falloff = exp_of_minus(0.5 * u * u + 0.5 * v * v);
+                    let alpha = min(g.opacity * falloff, MAX_ALPHA);
+                    if alpha >= MIN_ALPHA {
+                        if is_falloff {
+                            weight = falloff;
+                        } else {
+                            let next = transmittance * (1.0 - alpha);
+                            if next > MIN_TRANSMITTANCE {
+                                weight = alpha * transmittance;
+                                transmittance = next;
+                            } else {
+                                is_live = false;
+                                atomicSub(&n_live, 1u);
+                            }
+                        }
+                    }
+                }
+                weights[i * WEIGHTS_STRIDE + thread + thread / RUN] = weight;
+            }
+            workgroupBarrier();
+            let first_weight = of_step * WEIGHTS_STRIDE + run * (RUN + 1u);
+            let first_sum = (step + of_step) * n_slots;
+            var sum = 0.0;
+            var slot_of_run = slots[run * RUN];
+            for (var i = 0u; i < RUN; i++) {
+                let slot_of_pixel = slots[run * RUN + i];
+                if slot_of_pixel != slot_of_run {
+                    add(first_sum, slot_of_run, sum);
+                    sum = 0.0;
+                    slot_of_run = slot_of_pixel;
+                }
+                sum += weights[first_weight + i];
+            }
+            add(first_sum, slot_of_run, sum);
+            workgroupBarrier();
+        }
+        write_entries(n_loaded, n_slots, thread);
+    }
+}
+
+fn add(first_sum: u32, slot: u32, sum: f32) {
+    if slot != NO_SLOT && sum > 0.0 {
+        atomicAdd(&sums[first_sum + slot], u32(round(sum * TILE_SCALE)));
+    }
+}
+
+// Appends what was summed to the entries, and clears the sums. The order in which tiles append does not
+// matter: entries are sorted, and whole numbers added, before anything is read.
+fn write_entries(n_loaded: u32, n_slots: u32, thread: u32) {
+    var n_own = 0u;
+    for (var i = thread; i < n_loaded * n_slots; i += WORKGROUP_SIZE) {
+        n_own += u32(atomicLoad(&sums[i]) > 0u);
+    }
+    var at = 0u;
+    if n_own > 0u {
+        at = atomicAdd(&n_found, n_own);
+    }
+    workgroupBarrier();
+    if thread == 0u {
+        first_entry = atomicAdd(&counters[COUNTER_ENTRIES], atomicLoad(&n_found));
+        atomicStore(&n_found, 0u);
+    }
+    at += workgroupUniformLoad(&first_entry);
+    if n_own > 0u {
+        for (var i = thread; i < n_loaded * n_slots; i += WORKGROUP_SIZE) {
+            let sum = atomicLoad(&sums[i]);
+            if sum > 0u {
+                if at < view.capacity_entries {
+                    entries[at] = Entry(gaussians[i / n_slots].member, region_of_slot[i % n_slots], sum);
+                }
+                at += 1u;
+                atomicStore(&sums[i], 0u);
+            }
+        }
+    }
+    workgroupBarrier();
+}

@@ -1,0 +1,197 @@
+//! Adapters, and the one that was opened.
+
+use std::pin::pin;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::task::{Context, Poll, Waker};
+
+use serde::Serialize;
+
+use super::shader::{Kernels, Precision};
+use crate::raster::RasterError;
+
+/// What an adapter is.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct AdapterReport {
+    /// Name of the device.
+    pub name: String,
+    /// Driver and its version.
+    pub driver: String,
+    /// Interface: Vulkan, Metal, Dx12.
+    pub backend: String,
+    /// `discrete`, `integrated`, `virtual`, `software` or `other`.
+    pub kind: &'static str,
+    /// Precision of the projection.
+    pub precision: Precision,
+    /// Largest piece of memory that a shader can see, bytes.
+    pub max_binding_bytes: u64,
+}
+
+impl AdapterReport {
+    fn new(adapter: &wgpu::Adapter) -> Self {
+        let info = adapter.get_info();
+        let has_f64 = adapter.features().contains(wgpu::Features::SHADER_F64);
+        Self {
+            name: info.name,
+            driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
+            backend: format!("{:?}", info.backend),
+            kind: match info.device_type {
+                wgpu::DeviceType::DiscreteGpu => "discrete",
+                wgpu::DeviceType::IntegratedGpu => "integrated",
+                wgpu::DeviceType::VirtualGpu => "virtual",
+                wgpu::DeviceType::Cpu => "software",
+                wgpu::DeviceType::Other => "other",
+            },
+            precision: if has_f64 { Precision::F64 } else { Precision::F32 },
+            max_binding_bytes: adapter.limits().max_storage_buffer_binding_size,
+        }
+    }
+
+    /// Returns whether the processor does the work.
+    pub fn is_software(&self) -> bool {
+        self.kind == "software"
+    }
+}
+
+/// An adapter that can be opened.
+pub struct Adapter {
+    /// What it is.
+    pub report: AdapterReport,
+    adapter: wgpu::Adapter,
+}
+
+/// Returns all adapters, the best kind first.
+pub fn adapters() -> Vec<Adapter> {
+    let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
+    descriptor.backends = wgpu::Backends::PRIMARY;
+    // Dispatch sizes are our own shaders', and within limits: checking them again costs a pass each.
+    descriptor.flags = wgpu::InstanceFlags::empty();
+    let instance = wgpu::Instance::new(descriptor);
+    let mut adapters: Vec<Adapter> = ready(instance.enumerate_adapters(wgpu::Backends::PRIMARY))
+        .into_iter()
+        .map(|adapter| Adapter { report: AdapterReport::new(&adapter), adapter })
+        .collect();
+    let rank =
+        |kind| ["discrete", "integrated", "virtual", "other", "software"].iter().position(|k| *k == kind);
+    adapters.sort_by_key(|a| rank(a.report.kind));
+    adapters
+}
+
+/// An opened device with its compiled shaders.
+pub struct Device {
+    pub(super) device: wgpu::Device,
+    pub(super) queue: wgpu::Queue,
+    pub(super) kernels: Kernels,
+    /// What it is; the precision is the one that is used.
+    pub report: AdapterReport,
+    /// The first thing that went wrong; the device is not used after it.
+    failure: Arc<Mutex<Option<String>>>,
+}
+
+impl Adapter {
+    /// Opens the device and compiles the shaders. `precision` may be lower than what the device has.
+    ///
+    /// # Errors
+    /// [`RasterError::Device`] where the device lacks what the shaders need.
+    pub fn open(&self, precision: Precision) -> Result<Device, RasterError> {
+        let failed = |what: String| RasterError::Device { adapter: self.report.name.clone(), what };
+        let limits = self.adapter.limits();
+        // 256 threads and 24 KiB shared by them: what every desktop device has.
+        for (name, found, needed) in [
+            ("threads of a workgroup", limits.max_compute_invocations_per_workgroup, 256),
+            ("bytes of workgroup memory", limits.max_compute_workgroup_storage_size, 24 << 10),
+            ("storage buffers of a shader", limits.max_storage_buffers_per_shader_stage, 8),
+        ] {
+            if found < needed {
+                return Err(failed(format!("has {found} {name}, {needed} are needed")));
+            }
+        }
+        let mut features = wgpu::Features::empty();
+        if precision == Precision::F64 {
+            features |= wgpu::Features::SHADER_F64;
+        }
+        let (device, queue) = ready(self.adapter.request_device(&wgpu::DeviceDescriptor {
+            label: Some("slag"),
+            required_features: features,
+            required_limits: limits,
+            ..Default::default()
+        }))
+        .map_err(|e| failed(e.to_string()))?;
+        let failure = Arc::new(Mutex::new(None));
+        let note = |failure: &Arc<Mutex<Option<String>>>| {
+            let failure = Arc::clone(failure);
+            move |what: String| {
+                failure.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(what);
+            }
+        };
+        let (note_error, note_loss) = (note(&failure), note(&failure));
+        device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| note_error(error.to_string())));
+        device.set_device_lost_callback(move |reason, what| note_loss(format!("lost ({reason:?}): {what}")));
+        let kernels = Kernels::new(&device, precision);
+        let opened = Device {
+            device,
+            queue,
+            kernels,
+            report: AdapterReport { precision, ..self.report.clone() },
+            failure,
+        };
+        opened.check()?;
+        Ok(opened)
+    }
+}
+
+impl Device {
+    /// Returns an error if anything went wrong since the device was opened.
+    pub(super) fn check(&self) -> Result<(), RasterError> {
+        match &*self.failure.lock().unwrap_or_else(PoisonError::into_inner) {
+            None => Ok(()),
+            Some(what) => Err(self.error(what.clone())),
+        }
+    }
+
+    pub(super) fn error(&self, what: String) -> RasterError {
+        RasterError::Device { adapter: self.report.name.clone(), what }
+    }
+
+    /// Makes a buffer; `None` where the device's memory does not hold it.
+    pub(super) fn buffer(
+        &self,
+        label: &str,
+        size_bytes: u64,
+        usage: wgpu::BufferUsages,
+    ) -> Option<wgpu::Buffer> {
+        let scope = self.device.push_error_scope(wgpu::ErrorFilter::OutOfMemory);
+        let descriptor = wgpu::BufferDescriptor {
+            label: Some(label),
+            size: size_bytes.next_multiple_of(16).max(256),
+            usage,
+            mapped_at_creation: false,
+        };
+        let buffer = self.device.create_buffer(&descriptor);
+        ready(scope.pop()).is_none().then_some(buffer)
+    }
+
+    /// Waits until a submission is done.
+    pub(super) fn wait(&self, submission: wgpu::SubmissionIndex) -> Result<(), RasterError> {
+        let wait = wgpu::PollType::Wait { submission_index: Some(submission), timeout: None };
+        self.device.poll(wait).map_err(|e| self.error(e.to_string()))?;
+        self.check()
+    }
+
+    /// Makes the device fail as a lost one does.
+    #[doc(hidden)]
+    pub fn lose(&self) {
+        self.device.destroy();
+    }
+}
+
+/// Runs a future of wgpu, which on native platforms is ready at once.
+fn ready<T>(future: impl Future<Output = T>) -> T {
+    let mut future = pin!(future);
+    let mut context = Context::from_waker(Waker::noop());
+    loop {
+        if let Poll::Ready(value) = future.as_mut().poll(&mut context) {
+            return value;
+        }
+        std::thread::yield_now();
+    }
+}

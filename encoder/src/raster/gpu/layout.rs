@@ -1,0 +1,285 @@
+//! What host and shaders exchange. A test holds these structures against the shaders'.
+
+use bytemuck::{Pod, Zeroable};
+use glam::DVec3;
+use slag_common::Gaussians;
+
+use super::shader::Precision;
+use crate::raster::RasterView;
+use crate::raster::constants::{MIN_ALPHA, TILE_SIZE_PX};
+use crate::raster::project::reach2;
+
+/// A Gaussian in the device's memory.
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C)]
+pub struct SceneGaussian {
+    /// Mean relative to the scene's origin, rounded to `f32`.
+    pub mean_high: [f32; 3],
+    /// 0 where it cannot be drawn.
+    pub opacity: f32,
+    /// What the rounding left.
+    pub mean_low: [f32; 3],
+    /// As [`super::super::project::ScreenGaussian::reach2`].
+    pub reach2: f32,
+    /// Rotation.
+    pub rotation_wxyz: [f32; 4],
+    /// Standard deviations, world units.
+    pub scales: [f32; 3],
+    /// Unused.
+    pub padding: u32,
+}
+
+impl SceneGaussian {
+    /// Takes a Gaussian out of a scene.
+    pub fn new(scene: &Gaussians, index: usize, origin_in_world: DVec3) -> Self {
+        let opacity = scene.opacities[index];
+        if !scene.is_usable(index) || opacity < MIN_ALPHA {
+            return Self::zeroed();
+        }
+        let mean = scene.means_in_world[index] - origin_in_world;
+        let (mean_high, mean_low) = high_and_low(mean);
+        if !mean_high.iter().all(|c| c.is_finite()) {
+            return Self::zeroed();
+        }
+        Self {
+            mean_high,
+            opacity,
+            mean_low,
+            reach2: reach2(opacity),
+            rotation_wxyz: scene.rotations_wxyz[index],
+            scales: scene.scales[index],
+            padding: 0,
+        }
+    }
+}
+
+/// Splits a vector into what `f32` holds and what that leaves: 48 bits in all.
+fn high_and_low(value: DVec3) -> ([f32; 3], [f32; 3]) {
+    let high = value.as_vec3();
+    (high.to_array(), (value - high.as_dvec3()).as_vec3().to_array())
+}
+
+/// A part of the scene.
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C)]
+pub struct Chunk {
+    /// Index in the scene of its first Gaussian.
+    pub first_gaussian: u32,
+    /// How many it has.
+    pub n_gaussians: u32,
+}
+
+/// A prefix sum, as `scan.wgsl` explains.
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C)]
+pub struct ScanJob {
+    /// Counter with the number of items.
+    pub items: u32,
+    /// The number where no counter has it.
+    pub n_fixed: u32,
+    /// Items a block.
+    pub block: u32,
+    /// Values a block.
+    pub columns: u32,
+    /// Counter for the total.
+    pub total: u32,
+}
+
+/// A pass of a radix sort, as `sort.wgsl` explains.
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C)]
+pub struct SortPass {
+    /// Counter with the number of items.
+    pub items: u32,
+    /// Words from key to key.
+    pub stride: u32,
+    /// Word of the first key.
+    pub offset: u32,
+    /// Bits below the digit.
+    pub shift: u32,
+    /// 1 where the items are still in their own order.
+    pub is_first: u32,
+    /// Items that there is room for.
+    pub capacity: u32,
+}
+
+/// A sum over all tiles of a band, in units of `2^-TILE_FRACTION_BITS`.
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C)]
+pub struct RegionSum {
+    /// Index in the scene.
+    pub gaussian: u32,
+    /// Region of the view.
+    pub region: u32,
+    /// Lower word of the sum.
+    pub low: u32,
+    /// Upper word of the sum.
+    pub high: u32,
+}
+
+/// Room in a workspace.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Capacities {
+    /// Visible Gaussians.
+    pub visible: u32,
+    /// (Tile, Gaussian) pairs.
+    pub pairs: u32,
+    /// Sums per tile, Gaussian and region.
+    pub entries: u32,
+}
+
+/// The view's part of the shaders' input, for a band of tile rows.
+pub struct ViewBlock {
+    /// `rotation` (9), `position_high` (3), `position_low` (3), focal lengths, centre.
+    pub reals: [f64; 19],
+    /// From `width_px` to `capacity_entries`.
+    pub words: [u32; 10],
+}
+
+impl ViewBlock {
+    /// Prepares a view of a scene with an origin.
+    pub fn new(
+        view: &RasterView,
+        origin_in_world: DVec3,
+        tile_rows: [u32; 2],
+        is_falloff: bool,
+        n_regions: u32,
+        room: Capacities,
+    ) -> Self {
+        let camera = &view.intrinsics;
+        let rotation = view.camera_from_world.matrix3;
+        let position = view.camera_from_world.inverse().translation - origin_in_world;
+        let (high, _) = high_and_low(position);
+        let low = position - DVec3::from_array(high.map(f64::from));
+        let mut reals = [0.0; 19];
+        reals[..9].copy_from_slice(&rotation.transpose().to_cols_array());
+        reals[9..12].copy_from_slice(&high.map(f64::from));
+        reals[12..15].copy_from_slice(&low.to_array());
+        reals[15..].copy_from_slice(&[
+            camera.focal_x_px,
+            camera.focal_y_px,
+            camera.centre_x_px,
+            camera.centre_y_px,
+        ]);
+        let words = [
+            camera.width_px,
+            camera.height_px,
+            tile_rows[0],
+            tile_rows[1],
+            camera.width_px.div_ceil(TILE_SIZE_PX as u32),
+            u32::from(is_falloff),
+            n_regions,
+            room.visible,
+            room.pairs,
+            room.entries,
+        ];
+        Self { reals, words }
+    }
+
+    /// Returns the bytes that a device of a precision reads.
+    pub fn to_bytes(&self, precision: Precision) -> Vec<u8> {
+        let mut bytes: Vec<u8> = match precision {
+            Precision::F64 => self.reals.iter().flat_map(|r| r.to_le_bytes()).collect(),
+            Precision::F32 => self.reals.iter().flat_map(|r| (*r as f32).to_le_bytes()).collect(),
+        };
+        bytes.extend(self.words.iter().flat_map(|w| w.to_le_bytes()));
+        bytes
+    }
+}
+
+/// Returns the bytes of a Gaussian on the screen, and which of its words is the depth.
+pub fn screen_layout(precision: Precision) -> (u32, u32) {
+    match precision {
+        Precision::F64 => (56, 10),
+        Precision::F32 => (36, 5),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::mem::offset_of;
+
+    use super::super::shader::module_text;
+    use super::*;
+
+    /// Returns the members (name, offset, bytes) and the size of a shader's structure.
+    fn layout_of(stage: &str, name: &str, precision: Precision) -> (Vec<(String, usize, usize)>, usize) {
+        let module = naga::front::wgsl::parse_str(&module_text(stage, precision)).expect("parses");
+        let context = module.to_ctx();
+        let (_, found) = module.types.iter().find(|(_, t)| t.name.as_deref() == Some(name)).expect(name);
+        let naga::TypeInner::Struct { members, span } = &found.inner else { panic!("{name}: no structure") };
+        let columns = members
+            .iter()
+            .map(|m| {
+                let bytes = module.types[m.ty].inner.size(context) as usize;
+                (m.name.clone().unwrap_or_default(), m.offset as usize, bytes)
+            })
+            .collect();
+        (columns, *span as usize)
+    }
+
+    macro_rules! assert_layout {
+        ($stage:literal, $type:ident; $($field:ident),+ $(,)?) => {{
+            // Breaks the build where a field is left out.
+            let _ = |value: $type| { let $type { $($field: _),+ } = value; };
+            let sizes = |value: $type| [$(size_of_val(&value.$field)),+];
+            let sizes = sizes($type::zeroed());
+            let names = [$((stringify!($field), offset_of!($type, $field))),+];
+            let expected: Vec<(String, usize, usize)> =
+                names.iter().zip(sizes).map(|((n, o), s)| ((*n).to_owned(), *o, s)).collect();
+            for precision in [Precision::F64, Precision::F32] {
+                let (mut found, size_bytes) = layout_of($stage, stringify!($type), precision);
+                found.retain(|(name, ..)| !name.starts_with("padding") || names.iter().any(|n| n.0 == name));
+                assert_eq!(found, expected, "{} {precision:?}", stringify!($type));
+                assert!(size_bytes >= size_of::<$type>(), "{size_bytes}");
+            }
+        }};
+    }
+
+    #[test]
+    fn shaders_have_the_hosts_structures() {
+        assert_layout!("project", SceneGaussian; mean_high, opacity, mean_low, reach2, rotation_wxyz, scales, padding);
+        assert_eq!(layout_of("project", "SceneGaussian", Precision::F32).1, size_of::<SceneGaussian>());
+        assert_layout!("project", Chunk; first_gaussian, n_gaussians);
+        assert_layout!("scan", ScanJob; items, n_fixed, block, columns, total);
+        assert_layout!("sort", SortPass; items, stride, offset, shift, is_first, capacity);
+        assert_layout!("compact", RegionSum; gaussian, region, low, high);
+        assert_eq!(layout_of("compact", "RegionSum", Precision::F32).1, size_of::<RegionSum>());
+        for precision in [Precision::F64, Precision::F32] {
+            let (columns, size_bytes) = layout_of("project", "Screen", precision);
+            let depth = columns.iter().find(|c| c.0 == "depth").expect("depth").1;
+            assert_eq!(screen_layout(precision), (size_bytes as u32, depth as u32 / 4));
+
+            let (columns, size_bytes) = layout_of("project", "View", precision);
+            let names: Vec<&str> = columns.iter().map(|c| c.0.as_str()).collect();
+            assert_eq!(
+                names,
+                [
+                    "rotation",
+                    "position_high",
+                    "position_low",
+                    "focal_x_px",
+                    "focal_y_px",
+                    "centre_x_px",
+                    "centre_y_px",
+                    "width_px",
+                    "height_px",
+                    "first_tile_row",
+                    "end_tile_row",
+                    "tile_columns",
+                    "falloff",
+                    "n_regions",
+                    "capacity_visible",
+                    "capacity_pairs",
+                    "capacity_entries",
+                ]
+            );
+            let real_bytes = if precision == Precision::F64 { 8 } else { 4 };
+            assert!(columns.windows(2).all(|w| w[0].1 + w[0].2 == w[1].1), "no gaps: {columns:?}");
+            let width = columns.iter().find(|c| c.0 == "width_px").expect("width_px").1;
+            assert_eq!(width, 19 * real_bytes);
+            let block = ViewBlock { reals: [0.0; 19], words: [0; 10] };
+            assert_eq!(block.to_bytes(precision).len(), size_bytes);
+        }
+    }
+}

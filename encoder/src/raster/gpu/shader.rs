@@ -1,0 +1,208 @@
+//! The shaders: their text, with the constants and the precision put in front, and their pipelines.
+
+use std::borrow::Cow;
+use std::fmt::Write;
+
+use crate::raster::blend::{EXP_OF_MINUS_C, MAX_POWER};
+use crate::raster::constants::{
+    COVARIANCE_BLUR_PX2, FAR_Z, FOV_MARGIN, MAX_ALPHA, MAX_VARIANCE_PX2, MIN_ALPHA, MIN_TRANSMITTANCE,
+    NEAR_Z, TILE_SIZE_PX,
+};
+
+/// Threads of a workgroup, which also are the pixels of a tile.
+pub const WORKGROUP_SIZE: u32 = (TILE_SIZE_PX * TILE_SIZE_PX) as u32;
+/// Items that a workgroup sorts in one go.
+pub const SORT_BLOCK: u32 = 2048;
+/// Most workgroups of a dispatch, as every device has it.
+pub const MAX_DISPATCH: u32 = 65_535;
+/// Fraction bits of a sum over a tile: 256 weights of at most 1 fit 32 bits.
+pub const TILE_FRACTION_BITS: u32 = 23;
+/// No counter.
+pub const NONE: u32 = u32::MAX;
+
+/// Numbers that shaders count up; the host reads them after each view.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
+pub enum Counter {
+    /// Gaussians visible in the band.
+    Visible,
+    /// Those not visible in an earlier band.
+    FirstVisible,
+    /// Gaussians whose projection is out of range.
+    Unrepresentable,
+    /// (Tile, Gaussian) pairs of the band.
+    Pairs,
+    /// Sums per tile, Gaussian and region.
+    Entries,
+    /// Sums per Gaussian and region.
+    RegionSums,
+}
+
+impl Counter {
+    /// All of them, by value.
+    pub const ALL: [(Self, &'static str); 6] = [
+        (Self::Visible, "VISIBLE"),
+        (Self::FirstVisible, "FIRST_VISIBLE"),
+        (Self::Unrepresentable, "UNREPRESENTABLE"),
+        (Self::Pairs, "PAIRS"),
+        (Self::Entries, "ENTRIES"),
+        (Self::RegionSums, "REGION_SUMS"),
+    ];
+}
+
+/// Precision of the projection on a device.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    /// As the reference has it.
+    F64,
+    /// Where the device has no more: Gaussians far from the image's centre, and needles, lose digits.
+    F32,
+}
+
+/// The stages' own shaders, without what they share.
+pub const STAGES: [(&str, &str); 6] = [
+    ("project", include_str!("../project.wgsl")),
+    ("scan", include_str!("../scan.wgsl")),
+    ("sort", include_str!("../sort.wgsl")),
+    ("bin", include_str!("../bin.wgsl")),
+    ("blend", include_str!("../blend.wgsl")),
+    ("compact", include_str!("../compact.wgsl")),
+];
+const COMMON: &str = include_str!("../common.wgsl");
+
+/// Returns a stage's whole module.
+pub fn module_text(stage: &str, precision: Precision) -> String {
+    let mut text = String::new();
+    let real = match precision {
+        Precision::F64 => "f64",
+        Precision::F32 => "f32",
+    };
+    // Beyond these the squares of f32 arithmetic overflow.
+    let (max_variance, max_coordinate) = match precision {
+        Precision::F64 => (MAX_VARIANCE_PX2, f64::MAX),
+        Precision::F32 => (1e18, 1e18),
+    };
+    let _ = writeln!(text, "alias real = {real};");
+    for (name, value) in [("ZERO", 0.0), ("HALF", 0.5), ("ONE", 1.0), ("TWO", 2.0)] {
+        let _ = writeln!(text, "const {name}: real = real({value:?});");
+    }
+    for (name, value) in [
+        ("NEAR_Z", NEAR_Z),
+        ("FAR_Z", FAR_Z),
+        ("FOV_MARGIN", FOV_MARGIN),
+        ("COVARIANCE_BLUR_PX2", COVARIANCE_BLUR_PX2),
+        ("MAX_VARIANCE_PX2", max_variance),
+        ("MAX_COORDINATE_PX", max_coordinate),
+    ] {
+        let _ = writeln!(text, "const {name}: real = real({value:e});");
+    }
+    for (name, value) in [
+        ("MIN_ALPHA", MIN_ALPHA),
+        ("MAX_ALPHA", MAX_ALPHA),
+        ("MIN_TRANSMITTANCE", MIN_TRANSMITTANCE),
+        ("MAX_POWER", MAX_POWER),
+        ("TILE_SCALE", (1u32 << TILE_FRACTION_BITS) as f32),
+    ] {
+        let _ = writeln!(text, "const {name}: f32 = {value:e}f;");
+    }
+    for (name, value) in [
+        ("TILE_SIZE_PX", TILE_SIZE_PX as u32),
+        ("WORKGROUP_SIZE", WORKGROUP_SIZE),
+        ("SORT_BLOCK", SORT_BLOCK),
+        ("MAX_DISPATCH", MAX_DISPATCH),
+        ("N_COUNTERS", Counter::ALL.len() as u32),
+        ("NONE", NONE),
+    ] {
+        let _ = writeln!(text, "const {name}: u32 = {value}u;");
+    }
+    for (counter, name) in Counter::ALL {
+        let _ = writeln!(text, "const COUNTER_{name}: u32 = {}u;", counter as u32);
+    }
+    // Horner's scheme, written out: an array of constants would be indexed in memory.
+    let [first @ .., last] = EXP_OF_MINUS_C;
+    let _ = writeln!(text, "fn exp_of_minus(power: f32) -> f32 {{");
+    let _ = writeln!(text, "    let t = MAX_POWER / 8.0 - min(power, MAX_POWER) * 0.25;");
+    let _ = writeln!(text, "    var root = {last:e}f;");
+    for c in first.iter().rev() {
+        let _ = writeln!(text, "    root = root * t + {c:e}f;");
+    }
+    let _ = writeln!(text, "    let square = root * root;\n    return square * square;\n}}");
+    text.push_str(COMMON);
+    text.push_str(STAGES.iter().find(|s| s.0 == stage).map_or("", |s| s.1));
+    text
+}
+
+/// The compute pipelines of all stages.
+pub struct Kernels {
+    pub count_visible: wgpu::ComputePipeline,
+    pub write_visible: wgpu::ComputePipeline,
+    pub scan: wgpu::ComputePipeline,
+    pub count_digits: wgpu::ComputePipeline,
+    pub scatter: wgpu::ComputePipeline,
+    pub count_pairs: wgpu::ComputePipeline,
+    pub write_pairs: wgpu::ComputePipeline,
+    pub find_ranges: wgpu::ComputePipeline,
+    pub sum_regions: wgpu::ComputePipeline,
+    pub count_heads: wgpu::ComputePipeline,
+    pub add_up: wgpu::ComputePipeline,
+}
+
+impl Kernels {
+    /// Compiles all stages.
+    pub fn new(device: &wgpu::Device, precision: Precision) -> Self {
+        let kernel = |stage: &str, entry: &str| {
+            let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+                label: Some(stage),
+                source: wgpu::ShaderSource::Wgsl(Cow::Owned(module_text(stage, precision))),
+            });
+            device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+                label: Some(entry),
+                layout: None,
+                module: &module,
+                entry_point: Some(entry),
+                compilation_options: wgpu::PipelineCompilationOptions {
+                    // Every shader writes its workgroup memory before it reads it.
+                    zero_initialize_workgroup_memory: false,
+                    ..Default::default()
+                },
+                cache: None,
+            })
+        };
+        Self {
+            count_visible: kernel("project", "count_visible"),
+            write_visible: kernel("project", "write_visible"),
+            scan: kernel("scan", "scan"),
+            count_digits: kernel("sort", "count_digits"),
+            scatter: kernel("sort", "scatter"),
+            count_pairs: kernel("bin", "count_pairs"),
+            write_pairs: kernel("bin", "write_pairs"),
+            find_ranges: kernel("bin", "find_ranges"),
+            sum_regions: kernel("blend", "sum_regions"),
+            count_heads: kernel("compact", "count_heads"),
+            add_up: kernel("compact", "add_up"),
+        }
+    }
+}
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shaders_are_valid_in_both_precisions() {
+        for precision in [Precision::F64, Precision::F32] {
+            for (stage, _) in STAGES {
+                let text = module_text(stage, precision);
+                let module = naga::front::wgsl::parse_str(&text)
+                    .unwrap_or_else(|e| panic!("{stage}: {}", e.emit_to_string(&text)));
+                let mut validator = naga::valid::Validator::new(
+                    naga::valid::ValidationFlags::all(),
+                    naga::valid::Capabilities::FLOAT64,
+                );
+                if let Err(error) = validator.validate(&module) {
+                    panic!("{stage} {precision:?}: {}", error.emit_to_string(&text));
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,586 @@
+//! The buffers of one view in flight, and the commands that take it through all stages.
+
+use std::collections::HashMap;
+
+use bytemuck::Zeroable;
+use wgpu::BufferUsages as Usage;
+
+use super::device::Device;
+use super::layout::{
+    Capacities, Chunk, RegionSum, ScanJob, SceneGaussian, SortPass, ViewBlock, screen_layout,
+};
+use super::shader::{Counter, NONE, SORT_BLOCK, WORKGROUP_SIZE};
+use crate::raster::RasterError;
+use crate::raster::constants::TILE_SIZE_PX;
+
+/// Counts of a band's run.
+pub type Counts = [u32; Counter::ALL.len()];
+
+const JOB_STRIDE_BYTES: u64 = 256;
+/// Words of a record of dispatch sizes.
+const DISPATCH_BYTES: u64 = 16;
+const PAIR_WORDS: u32 = 2;
+const ENTRY_WORDS: u32 = 3;
+
+/// Scans that are the same for every view.
+#[derive(Clone, Copy)]
+enum Scan {
+    Digits(Counter),
+    Pairs,
+    /// No array: only the dispatch sizes.
+    Entries,
+    Heads,
+}
+
+/// What is sorted by what.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+enum SortKey {
+    Depth,
+    Tile,
+    Region,
+    Member,
+}
+
+const SORT_KEYS: [SortKey; 4] = [SortKey::Depth, SortKey::Tile, SortKey::Region, SortKey::Member];
+const DIGIT_BITS: u32 = 4;
+const MAX_PASSES: u32 = 8;
+
+impl SortKey {
+    fn counter(self) -> Counter {
+        match self {
+            Self::Depth => Counter::Visible,
+            Self::Tile => Counter::Pairs,
+            Self::Region | Self::Member => Counter::Entries,
+        }
+    }
+}
+
+/// A piece of the scene on the device.
+pub struct SceneChunk {
+    /// How many Gaussians it has.
+    pub n_gaussians: u32,
+    /// Its [`Chunk`] and the [`ScanJob`] of its blocks, [`JOB_STRIDE_BYTES`] apart.
+    jobs: wgpu::Buffer,
+    /// Its Gaussians; `None` where they are uploaded for each view.
+    pub gaussians: Option<wgpu::Buffer>,
+}
+
+impl SceneChunk {
+    /// Makes the small buffers of a piece; `None` where memory is short.
+    pub fn new(device: &Device, first_gaussian: u32, n_gaussians: u32) -> Option<Self> {
+        let jobs = device.buffer("chunk jobs", 2 * JOB_STRIDE_BYTES, Usage::STORAGE | Usage::COPY_DST)?;
+        let chunk = Chunk { first_gaussian, n_gaussians };
+        let scan = ScanJob {
+            items: NONE,
+            n_fixed: n_gaussians,
+            block: WORKGROUP_SIZE,
+            columns: 1,
+            total: Counter::Visible as u32,
+        };
+        device.queue.write_buffer(&jobs, 0, bytemuck::bytes_of(&chunk));
+        device.queue.write_buffer(&jobs, JOB_STRIDE_BYTES, bytemuck::bytes_of(&scan));
+        Some(Self { n_gaussians, jobs, gaussians: None })
+    }
+}
+
+/// The buffers of one view in flight.
+pub struct Workspace {
+    /// What there is room for.
+    pub room: Capacities,
+    n_tiles: u32,
+    n_px: u32,
+    view: wgpu::Buffer,
+    counters: wgpu::Buffer,
+    dispatches: wgpu::Buffer,
+    jobs: wgpu::Buffer,
+    block_counts: wgpu::Buffer,
+    histogram: wgpu::Buffer,
+    screen: wgpu::Buffer,
+    tile_counts: wgpu::Buffer,
+    visible_order: [wgpu::Buffer; 2],
+    pairs: wgpu::Buffer,
+    pair_order: [wgpu::Buffer; 2],
+    members: wgpu::Buffer,
+    ranges: wgpu::Buffer,
+    regions: wgpu::Buffer,
+    entries: wgpu::Buffer,
+    entry_order: [wgpu::Buffer; 2],
+    region_sums: wgpu::Buffer,
+    staging: wgpu::Buffer,
+    /// Region sums that are copied back with the counters.
+    n_copied: u32,
+    groups: HashMap<(&'static str, u32), wgpu::BindGroup>,
+}
+
+/// Sizes that a workspace is made for.
+#[derive(Clone, Copy)]
+pub struct Size {
+    /// Room for what the shaders produce.
+    pub room: Capacities,
+    /// Tiles of a band.
+    pub n_tiles: u32,
+    /// Pixels of a band.
+    pub n_px: u32,
+    /// Gaussians of the largest chunk.
+    pub n_chunk: u32,
+}
+
+const COUNTERS_BYTES: u64 = 64;
+
+impl Workspace {
+    /// Makes the buffers; `None` where the device's memory does not hold them.
+    pub fn new(device: &Device, size: Size) -> Option<Self> {
+        let Size { room, n_tiles, n_px, n_chunk } = size;
+        let storage = |label: &str, words: u64| {
+            device.buffer(label, words * 4, Usage::STORAGE | Usage::COPY_DST | Usage::COPY_SRC)
+        };
+        let (screen_bytes, depth_word) = screen_layout(device.report.precision);
+        let (visible, pairs, entries) =
+            (u64::from(room.visible), u64::from(room.pairs), u64::from(room.entries));
+        let largest = visible.max(pairs).max(entries);
+        let n_copied = (room.entries / 4).clamp(1, 1 << 16);
+        let workspace = Self {
+            room,
+            n_tiles,
+            n_px,
+            view: storage("view", 64)?,
+            counters: storage("counters", COUNTERS_BYTES / 4)?,
+            dispatches: device.buffer(
+                "dispatches",
+                2 * Counter::ALL.len() as u64 * DISPATCH_BYTES,
+                Usage::STORAGE | Usage::INDIRECT,
+            )?,
+            jobs: storage("jobs", (SCAN_JOBS + 4 * u64::from(MAX_PASSES)) * JOB_STRIDE_BYTES / 4)?,
+            block_counts: storage(
+                "block counts",
+                largest.max(n_chunk.into()).div_ceil(WORKGROUP_SIZE.into()),
+            )?,
+            histogram: storage("histogram", 16 * largest.div_ceil(SORT_BLOCK.into()))?,
+            screen: storage("screen", visible * u64::from(screen_bytes / 4))?,
+            tile_counts: storage("tile counts", visible)?,
+            visible_order: [storage("order of visible", visible)?, storage("order of visible", visible)?],
+            pairs: storage("pairs", pairs * u64::from(PAIR_WORDS))?,
+            pair_order: [storage("order of pairs", pairs)?, storage("order of pairs", pairs)?],
+            members: storage("members", pairs)?,
+            ranges: storage("ranges", 2 * u64::from(n_tiles))?,
+            regions: storage("regions", n_px.into())?,
+            entries: storage("entries", entries * u64::from(ENTRY_WORDS))?,
+            entry_order: [storage("order of entries", entries)?, storage("order of entries", entries)?],
+            region_sums: storage("region sums", entries * 4)?,
+            staging: Self::staging(device, n_copied)?,
+            n_copied,
+            groups: HashMap::new(),
+        };
+        workspace.write_jobs(device, screen_bytes / 4, depth_word);
+        Some(workspace)
+    }
+
+    fn staging(device: &Device, n_copied: u32) -> Option<wgpu::Buffer> {
+        let bytes = COUNTERS_BYTES + u64::from(n_copied) * size_of::<RegionSum>() as u64;
+        device.buffer("staging", bytes, Usage::MAP_READ | Usage::COPY_DST)
+    }
+
+    /// Returns whether a band fits.
+    pub fn holds(&self, n_tiles: u32, n_px: u32) -> bool {
+        n_tiles <= self.n_tiles && n_px <= self.n_px
+    }
+
+    fn write_jobs(&self, device: &Device, screen_words: u32, depth_word: u32) {
+        let write = |index: u64, bytes: &[u8]| {
+            device.queue.write_buffer(&self.jobs, index * JOB_STRIDE_BYTES, bytes);
+        };
+        let scan = |items, n_fixed, block, columns, total| ScanJob { items, n_fixed, block, columns, total };
+        for counter in [Counter::Visible, Counter::Pairs, Counter::Entries] {
+            let job = scan(counter as u32, 0, SORT_BLOCK, 16, NONE);
+            write(Scan::Digits(counter).index(), bytemuck::bytes_of(&job));
+        }
+        for (kind, job) in [
+            (Scan::Pairs, scan(Counter::Visible as u32, 0, WORKGROUP_SIZE, 1, Counter::Pairs as u32)),
+            (Scan::Entries, scan(NONE, 0, 1, 1, Counter::Entries as u32)),
+            (Scan::Heads, scan(Counter::Entries as u32, 0, WORKGROUP_SIZE, 1, Counter::RegionSums as u32)),
+        ] {
+            write(kind.index(), bytemuck::bytes_of(&job));
+        }
+        for key in SORT_KEYS {
+            let (stride, offset, capacity) = match key {
+                SortKey::Depth => (screen_words, depth_word, self.room.visible),
+                SortKey::Tile => (PAIR_WORDS, 0, self.room.pairs),
+                SortKey::Region => (ENTRY_WORDS, 1, self.room.entries),
+                SortKey::Member => (ENTRY_WORDS, 0, self.room.entries),
+            };
+            for pass in 0..MAX_PASSES {
+                let job = SortPass {
+                    items: key.counter() as u32,
+                    stride,
+                    offset,
+                    shift: pass * DIGIT_BITS,
+                    is_first: u32::from(pass == 0 && key != SortKey::Member),
+                    capacity,
+                };
+                write(sort_job(key, pass), bytemuck::bytes_of(&job));
+            }
+        }
+    }
+
+    /// Takes a band of a view through all stages and returns its counts, and the sums where they are
+    /// complete: where a count is beyond the room, they are not.
+    pub fn run(
+        &mut self,
+        device: &Device,
+        chunks: &[SceneChunk],
+        upload: &dyn Fn(usize) -> Result<wgpu::Buffer, RasterError>,
+        view: &ViewBlock,
+        regions: &[u32],
+    ) -> Result<(Counts, Vec<RegionSum>), RasterError> {
+        device.queue.write_buffer(&self.view, 0, &view.to_bytes(device.report.precision));
+        device.queue.write_buffer(&self.regions, 0, bytemuck::cast_slice(regions));
+        let mut encoder = device.device.create_command_encoder(&Default::default());
+        encoder.clear_buffer(&self.counters, 0, None);
+        encoder.clear_buffer(&self.ranges, 0, None);
+        for (index, chunk) in chunks.iter().enumerate() {
+            match &chunk.gaussians {
+                Some(gaussians) => self.project(device, &mut encoder, chunk, gaussians),
+                None => {
+                    let gaussians = upload(index)?;
+                    self.project(device, &mut encoder, chunk, &gaussians);
+                    // Before the next piece, so that no more than one lies on the device.
+                    let next = device.device.create_command_encoder(&Default::default());
+                    let full = std::mem::replace(&mut encoder, next);
+                    let submission = device.queue.submit([full.finish()]);
+                    device.wait(submission)?;
+                }
+            }
+        }
+        let [width_px, height_px, first_row, end_row, columns, _, n_regions, ..] = view.words;
+        let _ = (width_px, height_px);
+        let n_tiles = (end_row - first_row) * columns;
+        {
+            let mut pass = encoder.begin_compute_pass(&Default::default());
+            let depth_order = self.sort(device, &mut pass, &[(SortKey::Depth, 32)]);
+            self.pair(device, &mut pass, depth_order);
+            let pair_order = self.sort(device, &mut pass, &[(SortKey::Tile, bits_of(n_tiles))]);
+            self.find_ranges(device, &mut pass, pair_order);
+            self.blend(device, &mut pass, columns, end_row - first_row);
+            let keys = [(SortKey::Region, bits_of(n_regions)), (SortKey::Member, bits_of(self.room.visible))];
+            let entry_order = self.sort(device, &mut pass, &keys);
+            self.compact(device, &mut pass, entry_order);
+        }
+        let sum_bytes = u64::from(self.n_copied) * size_of::<RegionSum>() as u64;
+        encoder.copy_buffer_to_buffer(&self.counters, 0, &self.staging, 0, COUNTERS_BYTES);
+        encoder.copy_buffer_to_buffer(&self.region_sums, 0, &self.staging, COUNTERS_BYTES, sum_bytes);
+        let (counts, sums) = self.read_back(device, encoder)?;
+        let room = self.room;
+        let fits = counts[Counter::Visible as usize] <= room.visible
+            && counts[Counter::Pairs as usize] <= room.pairs
+            && counts[Counter::Entries as usize] <= room.entries;
+        let n_sums = counts[Counter::RegionSums as usize];
+        if !fits || n_sums <= self.n_copied {
+            return Ok((counts, sums));
+        }
+        // More than expected: the rest comes in a second copy, and the next view's in one.
+        self.n_copied = n_sums.saturating_add(n_sums / 4).min(room.entries);
+        self.staging = Self::staging(device, self.n_copied)
+            .ok_or_else(|| device.error("no memory for the copy back".into()))?;
+        let mut encoder = device.device.create_command_encoder(&Default::default());
+        let sum_bytes = u64::from(self.n_copied) * size_of::<RegionSum>() as u64;
+        encoder.copy_buffer_to_buffer(&self.counters, 0, &self.staging, 0, COUNTERS_BYTES);
+        encoder.copy_buffer_to_buffer(&self.region_sums, 0, &self.staging, COUNTERS_BYTES, sum_bytes);
+        self.read_back(device, encoder)
+    }
+
+    fn read_back(
+        &self,
+        device: &Device,
+        encoder: wgpu::CommandEncoder,
+    ) -> Result<(Counts, Vec<RegionSum>), RasterError> {
+        let submission = device.queue.submit([encoder.finish()]);
+        self.staging.map_async(wgpu::MapMode::Read, .., |_| {});
+        device.wait(submission)?;
+        let bytes = self.staging.get_mapped_range(..).map_err(|e| device.error(e.to_string()))?;
+        let mut counts: Counts = Zeroable::zeroed();
+        counts.copy_from_slice(
+            &bytemuck::cast_slice::<u8, u32>(&bytes[..COUNTERS_BYTES as usize])[..Counter::ALL.len()],
+        );
+        let n_sums = counts[Counter::RegionSums as usize].min(self.n_copied) as usize;
+        let sums =
+            bytemuck::cast_slice::<u8, RegionSum>(&bytes[COUNTERS_BYTES as usize..])[..n_sums].to_vec();
+        drop(bytes);
+        self.staging.unmap();
+        Ok((counts, sums))
+    }
+
+    fn project(
+        &mut self,
+        device: &Device,
+        encoder: &mut wgpu::CommandEncoder,
+        chunk: &SceneChunk,
+        gaussians: &wgpu::Buffer,
+    ) {
+        let mut pass = encoder.begin_compute_pass(&Default::default());
+        let kernels = &device.kernels;
+        let n_blocks = chunk.n_gaussians.div_ceil(WORKGROUP_SIZE);
+        let chunk_job = part(&chunk.jobs, 0);
+        let bound = [&self.view, &self.counters].map(whole).into_iter().chain([chunk_job, whole(gaussians)]);
+        let bound: Vec<_> = bound.chain([whole(&self.block_counts)]).collect();
+        let group = bind(device, &kernels.count_visible, &number(&bound));
+        dispatch(&mut pass, &kernels.count_visible, &group, [n_blocks, 1]);
+        let scan =
+            [part(&chunk.jobs, 1), whole(&self.counters), whole(&self.block_counts), whole(&self.dispatches)];
+        let group = bind(device, &kernels.scan, &number(&scan));
+        dispatch(&mut pass, &kernels.scan, &group, [1, 1]);
+        let bound = [
+            (0, whole(&self.view)),
+            (2, part(&chunk.jobs, 0)),
+            (3, whole(gaussians)),
+            (4, whole(&self.block_counts)),
+            (5, whole(&self.screen)),
+            (6, whole(&self.tile_counts)),
+        ];
+        let group = bind(device, &kernels.write_visible, &bound);
+        dispatch(&mut pass, &kernels.write_visible, &group, [n_blocks, 1]);
+    }
+
+    fn scan(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, scan: Scan) {
+        let values = match scan {
+            Scan::Digits(_) => &self.histogram,
+            Scan::Pairs | Scan::Entries | Scan::Heads => &self.block_counts,
+        };
+        let bound =
+            [part(&self.jobs, scan.index()), whole(&self.counters), whole(values), whole(&self.dispatches)];
+        let group = cached(&mut self.groups, ("scan", scan.index() as u32), || {
+            bind(device, &device.kernels.scan, &number(&bound))
+        });
+        dispatch(pass, &device.kernels.scan, group, [1, 1]);
+    }
+
+    /// Sorts by several keys, the least first, and returns which buffer holds the order.
+    fn sort(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, keys: &[(SortKey, u32)]) -> usize {
+        let mut current = 0;
+        for &(key, bits) in keys {
+            for digit in 0..bits.div_ceil(DIGIT_BITS).max(1) {
+                let (values, order) = match key {
+                    SortKey::Depth => (&self.screen, &self.visible_order),
+                    SortKey::Tile => (&self.pairs, &self.pair_order),
+                    SortKey::Region | SortKey::Member => (&self.entries, &self.entry_order),
+                };
+                let job = sort_job(key, digit);
+                let name = job as u32 * 2 + current as u32;
+                let bound =
+                    [part(&self.jobs, job), whole(&self.counters), whole(values), whole(&order[current])];
+                let bound: Vec<_> =
+                    bound.into_iter().chain([whole(&self.histogram), whole(&order[1 - current])]).collect();
+                let sizes = (&self.dispatches, dispatch_offset(key.counter(), true));
+                let group = cached(&mut self.groups, ("count_digits", name), || {
+                    bind(device, &device.kernels.count_digits, &number(&bound[..5]))
+                });
+                dispatch_indirect(pass, &device.kernels.count_digits, group, sizes);
+                self.scan(device, pass, Scan::Digits(key.counter()));
+                let bound = match key {
+                    SortKey::Depth => (&self.screen, &self.visible_order),
+                    SortKey::Tile => (&self.pairs, &self.pair_order),
+                    SortKey::Region | SortKey::Member => (&self.entries, &self.entry_order),
+                };
+                let bound = [
+                    part(&self.jobs, job),
+                    whole(&self.counters),
+                    whole(bound.0),
+                    whole(&bound.1[current]),
+                    whole(&self.histogram),
+                    whole(&bound.1[1 - current]),
+                ];
+                let sizes = (&self.dispatches, dispatch_offset(key.counter(), true));
+                let group = cached(&mut self.groups, ("scatter", name), || {
+                    bind(device, &device.kernels.scatter, &number(&bound))
+                });
+                dispatch_indirect(pass, &device.kernels.scatter, group, sizes);
+                current = 1 - current;
+            }
+        }
+        current
+    }
+
+    fn pair(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, depth_order: usize) {
+        let offset = dispatch_offset(Counter::Visible, false);
+        let order = &self.visible_order[depth_order];
+        let counted = [
+            (0, whole(&self.view)),
+            (1, whole(&self.counters)),
+            (3, whole(&self.tile_counts)),
+            (4, whole(order)),
+            (5, whole(&self.block_counts)),
+        ];
+        let written = [(2, whole(&self.screen)), (6, whole(&self.pairs))];
+        let written: Vec<_> = counted.iter().chain(&written).cloned().collect();
+        let kernels = &device.kernels;
+        let key = depth_order as u32;
+        let group =
+            cached(&mut self.groups, ("count_pairs", key), || bind(device, &kernels.count_pairs, &counted));
+        dispatch_indirect(pass, &kernels.count_pairs, group, (&self.dispatches, offset));
+        let group =
+            cached(&mut self.groups, ("write_pairs", key), || bind(device, &kernels.write_pairs, &written))
+                .clone();
+        self.scan(device, pass, Scan::Pairs);
+        dispatch_indirect(pass, &kernels.write_pairs, &group, (&self.dispatches, offset));
+    }
+
+    fn find_ranges(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, pair_order: usize) {
+        let bound = [
+            (0, whole(&self.view)),
+            (1, whole(&self.counters)),
+            (4, whole(&self.pair_order[pair_order])),
+            (7, whole(&self.pairs)),
+            (8, whole(&self.ranges)),
+            (9, whole(&self.members)),
+        ];
+        let kernel = &device.kernels.find_ranges;
+        let group =
+            cached(&mut self.groups, ("find_ranges", pair_order as u32), || bind(device, kernel, &bound));
+        dispatch_indirect(pass, kernel, group, (&self.dispatches, dispatch_offset(Counter::Pairs, false)));
+    }
+
+    fn blend(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, columns: u32, rows: u32) {
+        let bound = [
+            &self.view,
+            &self.counters,
+            &self.screen,
+            &self.members,
+            &self.ranges,
+            &self.regions,
+            &self.entries,
+        ]
+        .map(whole);
+        let kernel = &device.kernels.sum_regions;
+        let group = cached(&mut self.groups, ("sum_regions", 0), || bind(device, kernel, &number(&bound)));
+        dispatch(pass, kernel, group, [columns, rows]);
+        self.scan(device, pass, Scan::Entries);
+    }
+
+    fn compact(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, entry_order: usize) {
+        let order = &self.entry_order[entry_order];
+        let bound = [
+            (0, whole(&self.view)),
+            (1, whole(&self.counters)),
+            (2, whole(&self.screen)),
+            (3, whole(&self.entries)),
+            (4, whole(order)),
+            (5, whole(&self.block_counts)),
+            (6, whole(&self.region_sums)),
+        ];
+        let kernels = &device.kernels;
+        let offset = dispatch_offset(Counter::Entries, false);
+        let key = entry_order as u32;
+        let counted: Vec<_> = bound.iter().filter(|b| b.0 != 2).cloned().collect();
+        let add_up =
+            cached(&mut self.groups, ("add_up", key), || bind(device, &kernels.add_up, &bound)).clone();
+        let group =
+            cached(&mut self.groups, ("count_heads", key), || bind(device, &kernels.count_heads, &counted));
+        dispatch_indirect(pass, &kernels.count_heads, group, (&self.dispatches, offset));
+        self.scan(device, pass, Scan::Heads);
+        dispatch_indirect(pass, &kernels.add_up, &add_up, (&self.dispatches, offset));
+    }
+}
+
+const SCAN_JOBS: u64 = 6;
+
+impl Scan {
+    fn index(self) -> u64 {
+        match self {
+            Self::Digits(Counter::Visible) => 0,
+            Self::Digits(Counter::Pairs) => 1,
+            Self::Digits(_) => 2,
+            Self::Pairs => 3,
+            Self::Entries => 4,
+            Self::Heads => 5,
+        }
+    }
+}
+
+fn sort_job(key: SortKey, pass: u32) -> u64 {
+    SCAN_JOBS + key as u64 * u64::from(MAX_PASSES) + u64::from(pass)
+}
+
+/// Returns where the dispatch sizes for a counter's items lie: a thread an item, or a sort block each.
+fn dispatch_offset(counter: Counter, by_sort_block: bool) -> u64 {
+    (counter as u64 * 2 + u64::from(by_sort_block)) * DISPATCH_BYTES
+}
+
+/// Returns the bits of the numbers below `n`.
+fn bits_of(n: u32) -> u32 {
+    u32::BITS - n.saturating_sub(1).leading_zeros()
+}
+
+fn whole(buffer: &wgpu::Buffer) -> wgpu::BufferBinding<'_> {
+    buffer.as_entire_buffer_binding()
+}
+
+/// Returns one of the small records of a buffer.
+fn part(buffer: &wgpu::Buffer, index: u64) -> wgpu::BufferBinding<'_> {
+    wgpu::BufferBinding {
+        buffer,
+        offset: index * JOB_STRIDE_BYTES,
+        size: std::num::NonZeroU64::new(JOB_STRIDE_BYTES),
+    }
+}
+
+fn number<'a>(bindings: &[wgpu::BufferBinding<'a>]) -> Vec<(u32, wgpu::BufferBinding<'a>)> {
+    (0..).zip(bindings.iter().cloned()).collect()
+}
+
+fn bind(
+    device: &Device,
+    kernel: &wgpu::ComputePipeline,
+    bound: &[(u32, wgpu::BufferBinding<'_>)],
+) -> wgpu::BindGroup {
+    let entries: Vec<_> = bound
+        .iter()
+        .map(|(binding, buffer)| wgpu::BindGroupEntry {
+            binding: *binding,
+            resource: wgpu::BindingResource::Buffer(buffer.clone()),
+        })
+        .collect();
+    device.device.create_bind_group(&wgpu::BindGroupDescriptor {
+        label: None,
+        layout: &kernel.get_bind_group_layout(0),
+        entries: &entries,
+    })
+}
+
+fn cached<'g>(
+    groups: &'g mut HashMap<(&'static str, u32), wgpu::BindGroup>,
+    key: (&'static str, u32),
+    make: impl FnOnce() -> wgpu::BindGroup,
+) -> &'g wgpu::BindGroup {
+    groups.entry(key).or_insert_with(make)
+}
+
+fn dispatch(
+    pass: &mut wgpu::ComputePass<'_>,
+    kernel: &wgpu::ComputePipeline,
+    group: &wgpu::BindGroup,
+    n: [u32; 2],
+) {
+    pass.set_pipeline(kernel);
+    pass.set_bind_group(0, group, &[]);
+    pass.dispatch_workgroups(n[0], n[1], 1);
+}
+
+fn dispatch_indirect(
+    pass: &mut wgpu::ComputePass<'_>,
+    kernel: &wgpu::ComputePipeline,
+    group: &wgpu::BindGroup,
+    (sizes, offset): (&wgpu::Buffer, u64),
+) {
+    pass.set_pipeline(kernel);
+    pass.set_bind_group(0, group, &[]);
+    pass.dispatch_workgroups_indirect(sizes, offset);
+}
+
+/// Returns the tiles and pixels of a band.
+pub fn band_size(width_px: u32, height_px: u32, tile_rows: [u32; 2]) -> (u32, u32) {
+    let tile = TILE_SIZE_PX as u32;
+    let rows_px = (tile_rows[1] * tile).min(height_px) - tile_rows[0] * tile;
+    ((tile_rows[1] - tile_rows[0]) * width_px.div_ceil(tile), rows_px * width_px)
+}
+
+/// Bytes of a Gaussian in the device's memory.
+pub const SCENE_GAUSSIAN_BYTES: u64 = size_of::<SceneGaussian>() as u64;

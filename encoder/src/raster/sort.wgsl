@@ -1,0 +1,127 @@
+// Stable radix sort of indices by a 32-bit key, 4 bits a pass: count, scan, scatter.
+//
+// Every thread owns a run of consecutive items, so ranks follow the order of the input without
+// subgroups or atomics: the same on every device.
+
+struct SortPass {
+    // Counter with the number of items.
+    items: u32,
+    // The key of item i is `keys[i * stride + offset] >> shift`.
+    stride: u32,
+    offset: u32,
+    shift: u32,
+    // The first pass takes the items as they are: its input order is not read.
+    is_first: u32,
+    capacity: u32,
+}
+
+@group(0) @binding(0) var<storage, read> job: SortPass;
+@group(0) @binding(1) var<storage, read> counters: array<u32, N_COUNTERS>;
+@group(0) @binding(2) var<storage, read> keys: array<u32>;
+@group(0) @binding(3) var<storage, read> order_in: array<u32>;
+@group(0) @binding(4) var<storage, read_write> histogram: array<u32>;
+@group(0) @binding(5) var<storage, read_write> order_out: array<u32>;
+
+const PER_THREAD = SORT_BLOCK / WORKGROUP_SIZE;
+const RADIX = 16u;
+
+// Counts of each (digit, thread), then where that thread's items of that digit begin.
+var<workgroup> counts: array<u32, RADIX * WORKGROUP_SIZE>;
+
+fn n_items() -> u32 {
+    return min(counters[job.items], job.capacity);
+}
+
+fn item(at: u32) -> u32 {
+    if job.is_first != 0u {
+        return at;
+    }
+    return order_in[at];
+}
+
+fn digit(item: u32) -> u32 {
+    return (keys[item * job.stride + job.offset] >> job.shift) & (RADIX - 1u);
+}
+
+var<workgroup> block_histogram: array<atomic<u32>, RADIX>;
+
+@compute @workgroup_size(WORKGROUP_SIZE)
+fn count_digits(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let n = n_items();
+    let n_blocks = (n + SORT_BLOCK - 1u) / SORT_BLOCK;
+    for (var block = group.x; block < n_blocks; block += groups.x) {
+        if thread < RADIX {
+            atomicStore(&block_histogram[thread], 0u);
+        }
+        workgroupBarrier();
+        for (var i = 0u; i < PER_THREAD; i++) {
+            let at = block * SORT_BLOCK + i * WORKGROUP_SIZE + thread;
+            if at < n {
+                atomicAdd(&block_histogram[digit(item(at))], 1u);
+            }
+        }
+        workgroupBarrier();
+        if thread < RADIX {
+            histogram[thread * n_blocks + block] = atomicLoad(&block_histogram[thread]);
+        }
+        workgroupBarrier();
+    }
+}
+
+@compute @workgroup_size(WORKGROUP_SIZE)
+fn scatter(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let n = n_items();
+    let n_blocks = (n + SORT_BLOCK - 1u) / SORT_BLOCK;
+    for (var block = group.x; block < n_blocks; block += groups.x) {
+        for (var d = 0u; d < RADIX; d++) {
+            counts[d * WORKGROUP_SIZE + thread] = 0u;
+        }
+        var items: array<u32, PER_THREAD>;
+        var digits: array<u32, PER_THREAD>;
+        let first = block * SORT_BLOCK + thread * PER_THREAD;
+        for (var i = 0u; i < PER_THREAD; i++) {
+            digits[i] = RADIX;
+            if first + i < n {
+                items[i] = item(first + i);
+                digits[i] = digit(items[i]);
+                counts[digits[i] * WORKGROUP_SIZE + thread] += 1u;
+            }
+        }
+        workgroupBarrier();
+        // Thread t scans 16 counts that lie one after another: those of digit t / 16.
+        var sum = 0u;
+        var own: array<u32, RADIX>;
+        for (var i = 0u; i < RADIX; i++) {
+            own[i] = sum;
+            sum += counts[thread * RADIX + i];
+        }
+        let before = block_scan(sum, thread);
+        let in_digit = thread * RADIX / WORKGROUP_SIZE;
+        // Ranks are wanted from the digit's first item on.
+        if thread * RADIX % WORKGROUP_SIZE == 0u {
+            atomicStore(&block_histogram[in_digit], before);
+        }
+        workgroupBarrier();
+        let rank = before - atomicLoad(&block_histogram[in_digit]) + histogram[in_digit * n_blocks + block];
+        for (var i = 0u; i < RADIX; i++) {
+            counts[thread * RADIX + i] = rank + own[i];
+        }
+        workgroupBarrier();
+        for (var i = 0u; i < PER_THREAD; i++) {
+            if digits[i] < RADIX {
+                let slot = digits[i] * WORKGROUP_SIZE + thread;
+                order_out[counts[slot]] = items[i];
+                counts[slot] += 1u;
+            }
+        }
+        workgroupBarrier();
+    }
+}
