@@ -1,6 +1,10 @@
 //! Benchmarks as commands: each writes JSON that names the machine, and compares side by side in one
 //! run.
 
+pub mod arrays;
+pub mod raster;
+pub mod scene;
+
 use std::time::Instant;
 
 use serde::Serialize;

@@ -54,6 +54,9 @@ pub enum Command {
     Generate(GenerateArgs),
     /// Generates a room, encodes, serves, fetches and asks: the whole system in one command.
     Demo(DemoArgs),
+    /// Measures this machine.
+    #[command(subcommand)]
+    Bench(BenchCommand),
 }
 
 /// Where models come from.
@@ -313,6 +316,56 @@ pub struct DemoArgs {
     /// Leaves the robot's service running until ctrl-c, to try queries by hand.
     #[arg(long)]
     pub keep: bool,
+}
+
+/// `bench`.
+#[derive(Debug, Subcommand)]
+pub enum BenchCommand {
+    /// Weights of a view: each device on generated scenes, or on a recorded one.
+    Raster(RasterBenchArgs),
+}
+
+/// `bench raster`.
+#[derive(Debug, Args)]
+pub struct RasterBenchArgs {
+    /// Recorded scene: a NumPy archive of means, quats, scales, opacities, viewmats, Ks, width, height.
+    #[arg(long, value_name = "FILE")]
+    pub fixture: Option<PathBuf>,
+    /// Gaussians of the generated scenes; without a recorded scene 100000,1000000,2000000,8000000.
+    #[arg(long, value_name = "N", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..))]
+    pub gaussians: Vec<u32>,
+    /// Regions of a view; a recorded scene is also measured with a grid of 8 x 6.
+    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "8,64,512,4096",
+        value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub regions: Vec<u32>,
+    /// Devices to compare.
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "cpu")]
+    pub device: Vec<DeviceArg>,
+    /// Width of generated views, pixels.
+    #[arg(long, value_name = "PX", default_value_t = 648, value_parser = clap::value_parser!(u32).range(1..=16_384))]
+    pub width: u32,
+    /// Height of generated views, pixels.
+    #[arg(long, value_name = "PX", default_value_t = 484, value_parser = clap::value_parser!(u32).range(1..=16_384))]
+    pub height: u32,
+    /// Timed views a case.
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..))]
+    pub repeats: u32,
+    /// Views asked for at once where throughput is measured.
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub views: u32,
+    /// Threads; all cores if absent.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub threads: Option<u32>,
+    /// Writes the figures as JSON into this file.
+    #[arg(long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
+}
+
+/// What `bench raster` measures.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum DeviceArg {
+    /// The processor.
+    Cpu,
 }
 
 /// Reads a number of bytes with an optional unit.

@@ -16,6 +16,9 @@ use slag_models::{ModelDir, SessionOptions, find_runtime};
 use super::Exit;
 use super::args::*;
 use super::progress::Shown;
+use crate::bench::Machine;
+use crate::bench::raster::{Device, RasterBench, RasterReport};
+use crate::bench::scene::{BenchScene, cell_regions, grid_regions};
 use crate::check::{self, CheckOptions, CheckView};
 use crate::demo;
 use crate::encode::{self, EncodeError, EncodeSettings, Masks};
@@ -40,6 +43,7 @@ pub fn run(cli: Cli) -> Exit {
         Command::Push(PushCommand::Qdrant(args)) => run_push(&args, progress.as_ref(), json),
         Command::Generate(args) => run_generate(&args, progress.as_ref()),
         Command::Demo(args) => run_demo(&args, progress.as_ref(), json),
+        Command::Bench(BenchCommand::Raster(args)) => run_bench_raster(&args, progress.as_ref(), json),
     };
     match result {
         Ok(exit) => exit,
@@ -368,4 +372,46 @@ fn run_demo(args: &DemoArgs, progress: &dyn Progress, json: bool) -> Result<Exit
         demo.keep()?;
     }
     Ok(if demo.report.all_right() { Exit::Done } else { Exit::Failed })
+}
+
+fn run_bench_raster(args: &RasterBenchArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(args.threads.map_or_else(available_threads, |n| n as usize))
+        .build_global()
+        .context("cannot start threads")?;
+    let devices: Vec<Device> = args
+        .device
+        .iter()
+        .map(|device| match device {
+            DeviceArg::Cpu => Device { name: "cpu".into(), rasterizer: Box::new(CpuRasterizer) },
+        })
+        .collect();
+    let sizes = match (&args.fixture, args.gaussians.is_empty()) {
+        (None, true) => vec![100_000, 1_000_000, 2_000_000, 8_000_000],
+        _ => args.gaussians.clone(),
+    };
+    let n_cases = (sizes.len() + usize::from(args.fixture.is_some())) * args.regions.len();
+    progress.begin("bench", "case", (n_cases + usize::from(args.fixture.is_some())) as u64, 0);
+    let bench = RasterBench { n_repeats: args.repeats as usize, n_in_flight: args.views as usize };
+    let mut report = RasterReport { machine: Machine::here(), cases: Vec::new() };
+    let mut measure = |scene: &BenchScene, with_grid: bool| -> Result<()> {
+        let (width_px, height_px) = (scene.views[0].intrinsics.width_px, scene.views[0].intrinsics.height_px);
+        let grid = with_grid.then(|| grid_regions(width_px, height_px, 8, 6));
+        let cells = args.regions.iter().map(|&n| cell_regions(width_px, height_px, n));
+        let maps: Vec<_> = grid.into_iter().chain(cells).collect();
+        report.cases.extend(bench.run(scene, &maps, &devices, progress)?);
+        Ok(())
+    };
+    if let Some(path) = &args.fixture {
+        measure(&BenchScene::read(path)?, true)?;
+    }
+    for n in sizes {
+        measure(&BenchScene::generated(n as usize, args.width, args.height), false)?;
+    }
+    progress.end();
+    if let Some(path) = &args.out {
+        fs_err::write(path, serde_json::to_string_pretty(&report)?)?;
+    }
+    print(json, &report, &report)?;
+    Ok(Exit::Done)
 }

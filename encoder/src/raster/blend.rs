@@ -224,7 +224,7 @@ fn exp_of_minus(power: Vec4) -> Vec4 {
 
 /// A Gaussian's sum over the pixels of a region in one tile, or in all of them.
 #[derive(Clone, Copy)]
-struct Sum {
+pub struct Sum {
     /// Index into the visible Gaussians.
     member: u32,
     region: u32,
@@ -232,18 +232,8 @@ struct Sum {
     fixed: u64,
 }
 
-/// Returns the sums above zero over the regions of a view, ordered by (Gaussian, region).
-pub fn region_sums(
-    visible: &[ScreenGaussian],
-    tiles: &Tiles,
-    regions: &RegionMap,
-    kind: WeightKind,
-) -> Vec<RegionWeight> {
-    merge(visible, &tile_sums(visible, tiles, regions, kind))
-}
-
 /// Returns the sums of each tile that has a region.
-fn tile_sums(
+pub fn tile_sums(
     visible: &[ScreenGaussian],
     tiles: &Tiles,
     regions: &RegionMap,
@@ -264,8 +254,8 @@ fn tile_sums(
         .collect()
 }
 
-/// Adds up the sums of all tiles.
-fn merge(visible: &[ScreenGaussian], sums: &[Vec<Sum>]) -> Vec<RegionWeight> {
+/// Adds up the sums of all tiles; returns those above zero, ordered by (Gaussian, region).
+pub fn merge(visible: &[ScreenGaussian], sums: &[Vec<Sum>]) -> Vec<RegionWeight> {
     // A counting pass brings each Gaussian's few sums together; only those need sorting.
     let mut ends = vec![0_usize; visible.len()];
     for sum in sums.iter().flatten() {

@@ -19,6 +19,8 @@ pub mod gpu;
 pub mod project;
 pub mod sh;
 
+use std::time::Instant;
+
 use glam::{DAffine3, DMat3};
 use slag_common::{Distortion, Gaussians, Intrinsics};
 
@@ -74,6 +76,15 @@ pub struct ViewWeights {
     pub entries: Vec<RegionWeight>,
     /// What happened on the way.
     pub counters: ViewCounters,
+}
+
+/// How long a stage of a view took.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StageTime {
+    /// Name of the stage.
+    pub stage: &'static str,
+    /// Wall time, milliseconds.
+    pub ms: f64,
 }
 
 /// Why a view cannot be rasterised.
@@ -214,6 +225,20 @@ pub trait LoadedScene: Sync {
         kind: WeightKind,
     ) -> Result<ViewWeights, RasterError>;
 
+    /// [`Self::weights`] with the time of each stage in the order of the work; none where a backend
+    /// does not measure them.
+    ///
+    /// # Errors
+    /// Those of [`Self::weights`].
+    fn weights_timed(
+        &self,
+        view: &RasterView,
+        regions: &RegionMap,
+        kind: WeightKind,
+    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
+        Ok((self.weights(view, regions, kind)?, Vec::new()))
+    }
+
     /// Returns the picture of the scene over a background colour (linear in what was trained).
     ///
     /// # Errors
@@ -242,12 +267,24 @@ impl LoadedScene for CpuScene<'_> {
         regions: &RegionMap,
         kind: WeightKind,
     ) -> Result<ViewWeights, RasterError> {
+        Ok(self.weights_timed(view, regions, kind)?.0)
+    }
+
+    fn weights_timed(
+        &self,
+        view: &RasterView,
+        regions: &RegionMap,
+        kind: WeightKind,
+    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
         check_view(view)?;
         check_regions(regions, &view.intrinsics)?;
-        let projection = project::project(self.0, view);
-        let tiles = bin::bin(&projection.visible, &view.intrinsics);
-        let entries = blend::region_sums(&projection.visible, &tiles, regions, kind);
-        Ok(ViewWeights { entries, counters: counters(&projection, &tiles) })
+        let mut times = Vec::new();
+        let projection = timed("project", &mut times, || project::project(self.0, view));
+        let visible = &projection.visible;
+        let tiles = timed("bin", &mut times, || bin::bin(visible, &view.intrinsics));
+        let sums = timed("blend", &mut times, || blend::tile_sums(visible, &tiles, regions, kind));
+        let entries = timed("merge", &mut times, || blend::merge(visible, &sums));
+        Ok((ViewWeights { entries, counters: counters(&projection, &tiles) }, times))
     }
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {
@@ -260,6 +297,14 @@ impl LoadedScene for CpuScene<'_> {
         drawing.counters = counters(&projection, &tiles);
         Ok(drawing)
     }
+}
+
+/// Does a stage's work and records its time.
+fn timed<T>(stage: &'static str, times: &mut Vec<StageTime>, work: impl FnOnce() -> T) -> T {
+    let start = Instant::now();
+    let result = work();
+    times.push(StageTime { stage, ms: start.elapsed().as_secs_f64() * 1e3 });
+    result
 }
 
 fn counters(projection: &project::Projection, tiles: &bin::Tiles) -> ViewCounters {
