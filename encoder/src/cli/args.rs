@@ -8,6 +8,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use crate::embed::Background;
 use crate::raster::WeightKind;
+use crate::raster::devices::DeviceChoice;
 
 /// Makes 3D Gaussian splatting scenes searchable by words.
 #[derive(Debug, Parser)]
@@ -54,6 +55,8 @@ pub enum Command {
     Generate(GenerateArgs),
     /// Generates a room, encodes, serves, fetches and asks: the whole system in one command.
     Demo(DemoArgs),
+    /// Lists the GPUs that can rasterise.
+    Devices,
     /// Measures this machine.
     #[command(subcommand)]
     Bench(BenchCommand),
@@ -96,6 +99,9 @@ pub struct CheckArgs {
     /// Views to render, evenly spread.
     #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..))]
     pub samples: u32,
+    /// Where to render: auto, gpu, cpu, or an adapter's number.
+    #[arg(long, value_name = "DEVICE", default_value_t)]
+    pub device: DeviceChoice,
     /// Width to render at, pixels.
     #[arg(long, value_name = "PX", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(16..=8192))]
     pub raster_width: u32,
@@ -134,6 +140,9 @@ pub struct EncodeArgs {
     /// Views to use at most, evenly spread.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub views_limit: Option<u32>,
+    /// Where weights are rasterised: auto (GPUs, else the CPU), gpu, cpu, or an adapter's number.
+    #[arg(long, value_name = "DEVICE", default_value_t)]
+    pub device: DeviceChoice,
     /// Width at which weights are rasterised; the photo's own, at most 1024, if absent.
     #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
     pub raster_width: Option<u32>,
@@ -338,9 +347,9 @@ pub struct RasterBenchArgs {
     #[arg(long, value_name = "N", value_delimiter = ',', default_value = "8,64,512,4096",
         value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub regions: Vec<u32>,
-    /// Devices to compare.
-    #[arg(long, value_enum, value_delimiter = ',', default_value = "cpu")]
-    pub device: Vec<DeviceArg>,
+    /// Devices to compare: cpu, gpu, or an adapter's number.
+    #[arg(long, value_name = "DEVICE", value_delimiter = ',', default_value = "cpu")]
+    pub device: Vec<DeviceChoice>,
     /// Width of generated views, pixels.
     #[arg(long, value_name = "PX", default_value_t = 648, value_parser = clap::value_parser!(u32).range(1..=16_384))]
     pub width: u32,
@@ -359,13 +368,6 @@ pub struct RasterBenchArgs {
     /// Writes the figures as JSON into this file.
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
-}
-
-/// What `bench raster` measures.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum DeviceArg {
-    /// The processor.
-    Cpu,
 }
 
 /// Reads a number of bytes with an optional unit.

@@ -25,7 +25,9 @@ use crate::encode::{self, EncodeError, EncodeSettings, Masks};
 use crate::palette::PaletteSettings;
 use crate::progress::{Progress, Silent};
 use crate::publish::{qdrant, serve};
-use crate::raster::{CpuRasterizer, RasterView};
+use crate::raster::RasterView;
+use crate::raster::devices::Devices;
+use crate::raster::gpu::{AdapterReport, GpuOptions, adapters};
 use crate::shard::cells::CellLimits;
 use crate::store::{Store, StoreReader};
 use crate::{generate, ingest, query};
@@ -43,6 +45,7 @@ pub fn run(cli: Cli) -> Exit {
         Command::Push(PushCommand::Qdrant(args)) => run_push(&args, progress.as_ref(), json),
         Command::Generate(args) => run_generate(&args, progress.as_ref()),
         Command::Demo(args) => run_demo(&args, progress.as_ref(), json),
+        Command::Devices => run_devices(json),
         Command::Bench(BenchCommand::Raster(args)) => run_bench_raster(&args, progress.as_ref(), json),
     };
     match result {
@@ -151,7 +154,7 @@ fn run_check(args: &CheckArgs, json: bool) -> Result<Exit> {
         pictures_dir: args.out.clone(),
         ..CheckOptions::default()
     };
-    let report = check::check(&scene, &views, &CpuRasterizer, &options)?;
+    let report = check::check(&scene, &views, &Devices::open(args.device, GpuOptions::default())?, &options)?;
     print(json, &report, &report)?;
     Ok(if missing.is_empty() { Exit::Done } else { Exit::Partly })
 }
@@ -209,8 +212,8 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
         .context("cannot start threads")?;
     let (models, session) = open_models(&args.models)?;
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());
-    let summary =
-        encode::encode(&settings, &models, &session, &CpuRasterizer, progress, cancel_flag()?.as_ref())?;
+    let devices = Devices::open(args.device, GpuOptions::default())?;
+    let summary = encode::encode(&settings, &models, &session, &devices, progress, cancel_flag()?.as_ref())?;
     let stages =
         summary.busy_secs.iter().map(|(stage, s)| format!("{stage} {s:.1}")).collect::<Vec<_>>().join(", ");
     let sizes = summary
@@ -374,18 +377,36 @@ fn run_demo(args: &DemoArgs, progress: &dyn Progress, json: bool) -> Result<Exit
     Ok(if demo.report.all_right() { Exit::Done } else { Exit::Failed })
 }
 
+fn run_devices(json: bool) -> Result<Exit> {
+    let reports: Vec<_> = adapters().into_iter().map(|adapter| adapter.report).collect();
+    let mut lines = String::new();
+    for (number, report) in reports.iter().enumerate() {
+        let AdapterReport { name, driver, backend, kind, precision, max_binding_bytes } = report;
+        lines += &format!(
+            "{number}  {name} ({kind}, {backend}, {driver}); projection in {precision:?}, {} MiB a buffer\n",
+            max_binding_bytes >> 20
+        );
+    }
+    if reports.is_empty() {
+        lines += "no GPU; the CPU does the work\n";
+    }
+    print(json, &json!({ "adapters": reports }), lines)?;
+    Ok(Exit::Done)
+}
+
 fn run_bench_raster(args: &RasterBenchArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
     rayon::ThreadPoolBuilder::new()
         .num_threads(args.threads.map_or_else(available_threads, |n| n as usize))
         .build_global()
         .context("cannot start threads")?;
-    let devices: Vec<Device> = args
-        .device
-        .iter()
-        .map(|device| match device {
-            DeviceArg::Cpu => Device { name: "cpu".into(), rasterizer: Box::new(CpuRasterizer) },
-        })
-        .collect();
+    let mut devices = Vec::with_capacity(args.device.len());
+    for choice in &args.device {
+        let opened = Devices::open(
+            *choice,
+            GpuOptions { views_in_flight: args.views as usize, ..Default::default() },
+        )?;
+        devices.push(Device { name: opened.names().join(", "), rasterizer: Box::new(opened) });
+    }
     let sizes = match (&args.fixture, args.gaussians.is_empty()) {
         (None, true) => vec![100_000, 1_000_000, 2_000_000, 8_000_000],
         _ => args.gaussians.clone(),

@@ -14,6 +14,7 @@
 pub mod bin;
 pub mod blend;
 pub mod constants;
+pub mod devices;
 pub mod draw;
 pub mod gpu;
 pub mod project;
@@ -161,6 +162,14 @@ pub enum RasterError {
         /// Name of the device.
         adapter: String,
         /// What went wrong.
+        what: String,
+    },
+    /// A view is too much for a GPU; others may not be.
+    #[error("{adapter}: {what}; rasterise at a smaller width or use --device cpu")]
+    DeviceRoom {
+        /// Name of the device.
+        adapter: String,
+        /// What there is no room for.
         what: String,
     },
     /// A pixel names a region that does not exist.

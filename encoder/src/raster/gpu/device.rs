@@ -105,7 +105,9 @@ impl Adapter {
                 return Err(failed(format!("has {found} {name}, {needed} are needed")));
             }
         }
+        let has_timestamps = self.adapter.features().contains(wgpu::Features::TIMESTAMP_QUERY);
         let mut features = wgpu::Features::empty();
+        features.set(wgpu::Features::TIMESTAMP_QUERY, has_timestamps);
         if precision == Precision::F64 {
             features |= wgpu::Features::SHADER_F64;
         }
@@ -150,6 +152,10 @@ impl Device {
 
     pub(super) fn error(&self, what: String) -> RasterError {
         RasterError::Device { adapter: self.report.name.clone(), what }
+    }
+
+    pub(super) fn room_error(&self, what: String) -> RasterError {
+        RasterError::DeviceRoom { adapter: self.report.name.clone(), what }
     }
 
     /// Makes a buffer; `None` where the device's memory does not hold it.

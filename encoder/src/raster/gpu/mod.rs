@@ -19,8 +19,8 @@ use slag_common::Gaussians;
 
 use super::constants::TILE_SIZE_PX;
 use super::{
-    CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, RegionWeight, ViewWeights,
-    WeightKind, check_regions, check_scene, check_view,
+    CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, RegionWeight, StageTime,
+    ViewWeights, WeightKind, check_regions, check_scene, check_view,
 };
 use crate::segment::RegionMap;
 pub use device::{Adapter, AdapterReport, Device, adapters};
@@ -199,7 +199,7 @@ impl<'s> GpuScene<'s> {
     fn make_workspace(&self, room: Capacities, n_tiles: u32, n_px: u32) -> Result<Workspace, RasterError> {
         let n_chunk = self.chunks.iter().map(|c| c.n_gaussians).max().unwrap_or(0);
         Workspace::new(&self.device, Size { room, n_tiles, n_px, n_chunk })
-            .ok_or_else(|| self.device.error(format!("no memory for {room:?}")))
+            .ok_or_else(|| self.device.room_error(format!("no memory for {room:?}")))
     }
 
     /// Takes a view through the device, band by band.
@@ -209,6 +209,7 @@ impl<'s> GpuScene<'s> {
         view: &RasterView,
         regions: &RegionMap,
         kind: WeightKind,
+        times: &mut Vec<StageTime>,
     ) -> Result<ViewWeights, RasterError> {
         let camera = &view.intrinsics;
         let tile = TILE_SIZE_PX as u32;
@@ -258,7 +259,7 @@ impl<'s> GpuScene<'s> {
                 self.upload(first, self.chunks[index].n_gaussians as usize)
                     .ok_or_else(|| self.device.error("no memory for a part of the scene".into()))
             };
-            let (counts, found) = current.run(&self.device, &self.chunks, &upload, &block, of_band)?;
+            let (counts, found) = current.run(&self.device, &self.chunks, &upload, &block, of_band, times)?;
             let count = |counter: Counter| counts[counter as usize];
             let needed = Capacities {
                 visible: room.visible.max(count(Counter::Visible)),
@@ -292,7 +293,7 @@ impl<'s> GpuScene<'s> {
                 bands.extend([[middle, band[1]], [band[0], middle]]);
             } else {
                 let what = format!("a row of tiles needs {needed:?}, the device holds {max:?}");
-                return Err(self.device.error(what));
+                return Err(self.device.room_error(what));
             }
         }
         if n_bands > 1 {
@@ -322,19 +323,29 @@ impl LoadedScene for GpuScene<'_> {
         regions: &RegionMap,
         kind: WeightKind,
     ) -> Result<ViewWeights, RasterError> {
+        Ok(self.weights_timed(view, regions, kind)?.0)
+    }
+
+    fn weights_timed(
+        &self,
+        view: &RasterView,
+        regions: &RegionMap,
+        kind: WeightKind,
+    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
         check_view(view)?;
         check_regions(regions, &view.intrinsics)?;
         if regions.n_regions > MAX_REGIONS {
             let what = format!("{} regions in a view, {MAX_REGIONS} at most", regions.n_regions);
-            return Err(self.device.error(what));
+            return Err(self.device.room_error(what));
         }
         if self.chunks.is_empty() {
-            return Ok(ViewWeights::default());
+            return Ok(Default::default());
         }
+        let mut times = Vec::new();
         let mut workspace = self.take_workspace();
-        let result = self.run_view(&mut workspace, view, regions, kind);
+        let result = self.run_view(&mut workspace, view, regions, kind, &mut times);
         self.return_workspace(workspace);
-        result
+        Ok((result?, times))
     }
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {

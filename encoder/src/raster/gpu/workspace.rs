@@ -10,8 +10,8 @@ use super::layout::{
     Capacities, Chunk, RegionSum, ScanJob, SceneGaussian, SortPass, ViewBlock, screen_layout,
 };
 use super::shader::{Counter, NONE, SORT_BLOCK, WORKGROUP_SIZE};
-use crate::raster::RasterError;
 use crate::raster::constants::TILE_SIZE_PX;
+use crate::raster::{RasterError, StageTime};
 
 /// Counts of a band's run.
 pub type Counts = [u32; Counter::ALL.len()];
@@ -110,6 +110,7 @@ pub struct Workspace {
     /// Region sums that are copied back with the counters.
     n_copied: u32,
     groups: HashMap<(&'static str, u32), wgpu::BindGroup>,
+    stopwatch: Stopwatch,
 }
 
 /// Sizes that a workspace is made for.
@@ -126,6 +127,72 @@ pub struct Size {
 }
 
 const COUNTERS_BYTES: u64 = 64;
+/// What precedes the sums in the copy back: counters and timestamps.
+const HEAD_BYTES: u64 = COUNTERS_BYTES + 192;
+
+/// Stages that are timed.
+const STAGES: [&str; 5] = ["project", "sort", "bin", "blend", "compact"];
+
+/// The device's own clock at the ends of each stage, where it has one.
+struct Stopwatch {
+    queries: Option<(wgpu::QuerySet, wgpu::Buffer)>,
+    period_ns: f32,
+}
+
+impl Stopwatch {
+    fn new(device: &Device) -> Option<Self> {
+        let n = 2 * STAGES.len() as u32;
+        let queries = if device.device.features().contains(wgpu::Features::TIMESTAMP_QUERY) {
+            let descriptor =
+                wgpu::QuerySetDescriptor { label: None, ty: wgpu::QueryType::Timestamp, count: n };
+            let usage = Usage::QUERY_RESOLVE | Usage::COPY_SRC;
+            let resolved = device.buffer("timestamps", u64::from(n) * 8, usage)?;
+            Some((device.device.create_query_set(&descriptor), resolved))
+        } else {
+            None
+        };
+        Some(Self { queries, period_ns: device.queue.get_timestamp_period() })
+    }
+
+    /// Begins a pass of a stage; `ends` says whether it is the stage's first and last.
+    fn pass<'e>(
+        &self,
+        encoder: &'e mut wgpu::CommandEncoder,
+        stage: u32,
+        ends: (bool, bool),
+    ) -> wgpu::ComputePass<'e> {
+        let timestamp_writes = self.queries.as_ref().filter(|_| ends.0 || ends.1).map(|(query_set, _)| {
+            wgpu::ComputePassTimestampWrites {
+                query_set,
+                beginning_of_pass_write_index: ends.0.then_some(2 * stage),
+                end_of_pass_write_index: ends.1.then_some(2 * stage + 1),
+            }
+        });
+        encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
+            label: Some(STAGES[stage as usize]),
+            timestamp_writes,
+        })
+    }
+
+    fn resolve(&self, encoder: &mut wgpu::CommandEncoder, staging: &wgpu::Buffer) {
+        if let Some((queries, resolved)) = &self.queries {
+            let n = 2 * STAGES.len() as u32;
+            encoder.resolve_query_set(queries, 0..n, resolved, 0);
+            encoder.copy_buffer_to_buffer(resolved, 0, staging, COUNTERS_BYTES, u64::from(n) * 8);
+        }
+    }
+
+    fn read(&self, bytes: &[u8]) -> Vec<StageTime> {
+        if self.queries.is_none() {
+            return Vec::new();
+        }
+        let ticks = |i: usize| u64::from_le_bytes(bytes[8 * i..][..8].try_into().unwrap_or_default());
+        let ms = |stage: usize| {
+            ticks(2 * stage + 1).saturating_sub(ticks(2 * stage)) as f64 * f64::from(self.period_ns) * 1e-6
+        };
+        STAGES.iter().enumerate().map(|(i, stage)| StageTime { stage, ms: ms(i) }).collect()
+    }
+}
 
 impl Workspace {
     /// Makes the buffers; `None` where the device's memory does not hold them.
@@ -170,13 +237,14 @@ impl Workspace {
             staging: Self::staging(device, n_copied)?,
             n_copied,
             groups: HashMap::new(),
+            stopwatch: Stopwatch::new(device)?,
         };
         workspace.write_jobs(device, screen_bytes / 4, depth_word);
         Some(workspace)
     }
 
     fn staging(device: &Device, n_copied: u32) -> Option<wgpu::Buffer> {
-        let bytes = COUNTERS_BYTES + u64::from(n_copied) * size_of::<RegionSum>() as u64;
+        let bytes = HEAD_BYTES + u64::from(n_copied) * size_of::<RegionSum>() as u64;
         device.buffer("staging", bytes, Usage::MAP_READ | Usage::COPY_DST)
     }
 
@@ -231,6 +299,7 @@ impl Workspace {
         upload: &dyn Fn(usize) -> Result<wgpu::Buffer, RasterError>,
         view: &ViewBlock,
         regions: &[u32],
+        times: &mut Vec<StageTime>,
     ) -> Result<(Counts, Vec<RegionSum>), RasterError> {
         device.queue.write_buffer(&self.view, 0, &view.to_bytes(device.report.precision));
         device.queue.write_buffer(&self.regions, 0, bytemuck::cast_slice(regions));
@@ -238,11 +307,12 @@ impl Workspace {
         encoder.clear_buffer(&self.counters, 0, None);
         encoder.clear_buffer(&self.ranges, 0, None);
         for (index, chunk) in chunks.iter().enumerate() {
+            let ends = (index == 0, index + 1 == chunks.len());
             match &chunk.gaussians {
-                Some(gaussians) => self.project(device, &mut encoder, chunk, gaussians),
+                Some(gaussians) => self.project(device, &mut encoder, chunk, gaussians, ends),
                 None => {
                     let gaussians = upload(index)?;
-                    self.project(device, &mut encoder, chunk, &gaussians);
+                    self.project(device, &mut encoder, chunk, &gaussians, ends);
                     // Before the next piece, so that no more than one lies on the device.
                     let next = device.device.create_command_encoder(&Default::default());
                     let full = std::mem::replace(&mut encoder, next);
@@ -251,24 +321,29 @@ impl Workspace {
                 }
             }
         }
-        let [width_px, height_px, first_row, end_row, columns, _, n_regions, ..] = view.words;
-        let _ = (width_px, height_px);
+        let [_, _, first_row, end_row, columns, _, n_regions, ..] = view.words;
         let n_tiles = (end_row - first_row) * columns;
-        {
-            let mut pass = encoder.begin_compute_pass(&Default::default());
-            let depth_order = self.sort(device, &mut pass, &[(SortKey::Depth, 32)]);
-            self.pair(device, &mut pass, depth_order);
-            let pair_order = self.sort(device, &mut pass, &[(SortKey::Tile, bits_of(n_tiles))]);
-            self.find_ranges(device, &mut pass, pair_order);
-            self.blend(device, &mut pass, columns, end_row - first_row);
-            let keys = [(SortKey::Region, bits_of(n_regions)), (SortKey::Member, bits_of(self.room.visible))];
-            let entry_order = self.sort(device, &mut pass, &keys);
-            self.compact(device, &mut pass, entry_order);
-        }
+        let mut pass = self.stopwatch.pass(&mut encoder, 1, (true, true));
+        let depth_order = self.sort(device, &mut pass, &[(SortKey::Depth, 32)]);
+        drop(pass);
+        let mut pass = self.stopwatch.pass(&mut encoder, 2, (true, true));
+        self.pair(device, &mut pass, depth_order);
+        let pair_order = self.sort(device, &mut pass, &[(SortKey::Tile, bits_of(n_tiles))]);
+        self.find_ranges(device, &mut pass, pair_order);
+        drop(pass);
+        let mut pass = self.stopwatch.pass(&mut encoder, 3, (true, true));
+        self.blend(device, &mut pass, columns, end_row - first_row);
+        drop(pass);
+        let mut pass = self.stopwatch.pass(&mut encoder, 4, (true, true));
+        let keys = [(SortKey::Region, bits_of(n_regions)), (SortKey::Member, bits_of(self.room.visible))];
+        let entry_order = self.sort(device, &mut pass, &keys);
+        self.compact(device, &mut pass, entry_order);
+        drop(pass);
+        self.stopwatch.resolve(&mut encoder, &self.staging);
         let sum_bytes = u64::from(self.n_copied) * size_of::<RegionSum>() as u64;
         encoder.copy_buffer_to_buffer(&self.counters, 0, &self.staging, 0, COUNTERS_BYTES);
-        encoder.copy_buffer_to_buffer(&self.region_sums, 0, &self.staging, COUNTERS_BYTES, sum_bytes);
-        let (counts, sums) = self.read_back(device, encoder)?;
+        encoder.copy_buffer_to_buffer(&self.region_sums, 0, &self.staging, HEAD_BYTES, sum_bytes);
+        let (counts, sums) = self.read_back(device, encoder, times)?;
         let room = self.room;
         let fits = counts[Counter::Visible as usize] <= room.visible
             && counts[Counter::Pairs as usize] <= room.pairs
@@ -284,14 +359,15 @@ impl Workspace {
         let mut encoder = device.device.create_command_encoder(&Default::default());
         let sum_bytes = u64::from(self.n_copied) * size_of::<RegionSum>() as u64;
         encoder.copy_buffer_to_buffer(&self.counters, 0, &self.staging, 0, COUNTERS_BYTES);
-        encoder.copy_buffer_to_buffer(&self.region_sums, 0, &self.staging, COUNTERS_BYTES, sum_bytes);
-        self.read_back(device, encoder)
+        encoder.copy_buffer_to_buffer(&self.region_sums, 0, &self.staging, HEAD_BYTES, sum_bytes);
+        self.read_back(device, encoder, &mut Vec::new())
     }
 
     fn read_back(
         &self,
         device: &Device,
         encoder: wgpu::CommandEncoder,
+        times: &mut Vec<StageTime>,
     ) -> Result<(Counts, Vec<RegionSum>), RasterError> {
         let submission = device.queue.submit([encoder.finish()]);
         self.staging.map_async(wgpu::MapMode::Read, .., |_| {});
@@ -301,9 +377,9 @@ impl Workspace {
         counts.copy_from_slice(
             &bytemuck::cast_slice::<u8, u32>(&bytes[..COUNTERS_BYTES as usize])[..Counter::ALL.len()],
         );
+        times.extend(self.stopwatch.read(&bytes[COUNTERS_BYTES as usize..HEAD_BYTES as usize]));
         let n_sums = counts[Counter::RegionSums as usize].min(self.n_copied) as usize;
-        let sums =
-            bytemuck::cast_slice::<u8, RegionSum>(&bytes[COUNTERS_BYTES as usize..])[..n_sums].to_vec();
+        let sums = bytemuck::cast_slice::<u8, RegionSum>(&bytes[HEAD_BYTES as usize..])[..n_sums].to_vec();
         drop(bytes);
         self.staging.unmap();
         Ok((counts, sums))
@@ -315,8 +391,9 @@ impl Workspace {
         encoder: &mut wgpu::CommandEncoder,
         chunk: &SceneChunk,
         gaussians: &wgpu::Buffer,
+        ends: (bool, bool),
     ) {
-        let mut pass = encoder.begin_compute_pass(&Default::default());
+        let mut pass = self.stopwatch.pass(encoder, 0, ends);
         let kernels = &device.kernels;
         let n_blocks = chunk.n_gaussians.div_ceil(WORKGROUP_SIZE);
         let chunk_job = part(&chunk.jobs, 0);
