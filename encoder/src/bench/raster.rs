@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Barrier, OnceLock};
+use std::time::Instant;
 
 use serde::Serialize;
 
@@ -179,21 +181,28 @@ impl RasterBench {
     ) -> Result<f64, RasterError> {
         let n_views = self.n_repeats.max(self.n_in_flight);
         let next = AtomicUsize::new(0);
+        let warm = Barrier::new(self.n_in_flight);
+        let started = OnceLock::new();
         let ask = || {
+            let view = |turn: usize| &scene.views[turn % scene.views.len()];
+            // A device makes its buffers for so many views at the first.
+            let first = device.weights(view(0), regions, WeightKind::Blend);
+            warm.wait();
+            first?;
+            started.get_or_init(Instant::now);
             loop {
                 let turn = next.fetch_add(1, Ordering::Relaxed);
                 if turn >= n_views {
                     return Ok(());
                 }
-                device.weights(&scene.views[turn % scene.views.len()], regions, WeightKind::Blend)?;
+                device.weights(view(turn), regions, WeightKind::Blend)?;
             }
         };
-        let (outcome, ms) = timed_ms(|| {
-            std::thread::scope(|scope| {
-                let threads: Vec<_> = (0..self.n_in_flight).map(|_| scope.spawn(ask)).collect();
-                threads.into_iter().map(|thread| thread.join()).collect::<Vec<_>>()
-            })
+        let outcome = std::thread::scope(|scope| {
+            let threads: Vec<_> = (0..self.n_in_flight).map(|_| scope.spawn(ask)).collect();
+            threads.into_iter().map(|thread| thread.join()).collect::<Vec<_>>()
         });
+        let ms = started.get().map_or(f64::NAN, |start: &Instant| start.elapsed().as_secs_f64() * 1e3);
         for result in outcome {
             result.unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
         }

@@ -4,34 +4,6 @@
 // that the pixels of a region lie one after another: the second half of each step then adds up runs,
 // 32 threads a Gaussian, whatever the number of regions.
 
-// A Gaussian relative to a tile.
-struct InTile {
-    u0: f32,
-    u_x: f32,
-    u_y: f32,
-    v0: f32,
-    v_y: f32,
-    opacity: f32,
-    reach2: f32,
-    member: u32,
-}
-
-fn in_tile(member: u32, x_px: u32, y_px: u32) -> InTile {
-    let g = screen[member];
-    let dx = real(x_px) + HALF - g.mean_x_px;
-    let dy = real(y_px) + HALF - g.mean_y_px;
-    return InTile(
-        f32(g.inv_width * (dx - g.slope * dy)),
-        f32(g.inv_width),
-        f32(-g.inv_width * g.slope),
-        f32(g.inv_height * dy),
-        f32(g.inv_height),
-        g.opacity,
-        g.reach2,
-        member,
-    );
-}
-
 struct Entry {
     member: u32,
     region: u32,
@@ -154,7 +126,8 @@ fn sum_regions(
     for (var start = range.x; start < range.y; start += per_round) {
         if thread < per_round {
             if start + thread < range.y {
-                gaussians[thread] = in_tile(members[start + thread], x_px, y_px);
+                let member = members[start + thread];
+                gaussians[thread] = in_tile(screen[member], member, x_px, y_px);
             } else {
                 gaussians[thread] = InTile(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0u);
             }
@@ -174,20 +147,21 @@ fn sum_regions(
                 if is_live {
                     let u = g.u0 + g.u_y * f32(local_y) + g.u_x * f32(local_x);
                     let v = g.v0 + g.v_y * f32(local_y);
-                    let falloff = exp_of_minus(0.5 * u * u + 0.5 * v * v);
-                    let alpha = min(g.opacity * falloff, MAX_ALPHA);
-                    if alpha >= MIN_ALPHA {
-                        if is_falloff {
+                    // Beyond its reach no alpha counts; most Gaussians reach few pixels of a tile.
+                    if u * u + v * v <= g.reach2 {
+                        let falloff = exp_of_minus(0.5 * u * u + 0.5 * v * v);
+                        let alpha = min(g.opacity * falloff, MAX_ALPHA);
+                        let next = transmittance * (1.0 - alpha);
+                        if alpha < MIN_ALPHA {
+                            // Skipped.
+                        } else if is_falloff {
                             weight = falloff;
+                        } else if next > MIN_TRANSMITTANCE {
+                            weight = alpha * transmittance;
+                            transmittance = next;
                         } else {
-                            let next = transmittance * (1.0 - alpha);
-                            if next > MIN_TRANSMITTANCE {
-                                weight = alpha * transmittance;
-                                transmittance = next;
-                            } else {
-                                is_live = false;
-                                atomicSub(&n_live, 1u);
-                            }
+                            is_live = false;
+                            atomicSub(&n_live, 1u);
                         }
                     }
                 }

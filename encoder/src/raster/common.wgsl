@@ -87,6 +87,33 @@ fn tile_columns(g: Screen, extent: array<real, 2>, row: u32, width_px: u32, heig
     return PixelSpan(columns.first / TILE_SIZE_PX, columns.last / TILE_SIZE_PX, columns.is_some);
 }
 
+// A Gaussian relative to a tile.
+struct InTile {
+    u0: f32,
+    u_x: f32,
+    u_y: f32,
+    v0: f32,
+    v_y: f32,
+    opacity: f32,
+    reach2: f32,
+    member: u32,
+}
+
+fn in_tile(g: Screen, member: u32, x_px: u32, y_px: u32) -> InTile {
+    let dx = real(x_px) + HALF - g.mean_x_px;
+    let dy = real(y_px) + HALF - g.mean_y_px;
+    return InTile(
+        f32(g.inv_width * (dx - g.slope * dy)),
+        f32(g.inv_width),
+        f32(-g.inv_width * g.slope),
+        f32(g.inv_height * dy),
+        f32(g.inv_height),
+        g.opacity,
+        g.reach2,
+        member,
+    );
+}
+
 struct Pair {
     // Row-major in the band of tile rows.
     tile: u32,

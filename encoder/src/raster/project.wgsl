@@ -35,6 +35,14 @@ struct Projected {
     on_screen: Screen,
 }
 
+fn dot3(a: real3, b: real3) -> real {
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+fn is_coordinate(value: real) -> bool {
+    return abs(value) <= real(MAX_COORDINATE_PX);
+}
+
 fn limited(tangent: real, focal: real, centre: real, size: real) -> real {
     let margin = real(FOV_MARGIN) * HALF * size / focal;
     return min(max(tangent, -centre / focal - margin), (size - centre) / focal + margin);
@@ -49,63 +57,83 @@ fn project(index: u32) -> Projected {
     }
     // High parts first: their difference is exact where it matters, so a scene far from its origin
     // keeps its accuracy in f32 too.
-    var d: array<real, 3>;
-    for (var c = 0u; c < 3u; c++) {
-        d[c] = (real(g.mean_high[c]) - view.position_high[c]) + (real(g.mean_low[c]) - view.position_low[c]);
-    }
-    let r = view.rotation;
-    let x = r[0] * d[0] + r[1] * d[1] + r[2] * d[2];
-    let y = r[3] * d[0] + r[4] * d[1] + r[5] * d[2];
-    let z = r[6] * d[0] + r[7] * d[1] + r[8] * d[2];
+    let from_camera = real3(
+        (real(g.mean_high.x) - view.position_high[0]) + (real(g.mean_low.x) - view.position_low[0]),
+        (real(g.mean_high.y) - view.position_high[1]) + (real(g.mean_low.y) - view.position_low[1]),
+        (real(g.mean_high.z) - view.position_high[2]) + (real(g.mean_low.z) - view.position_low[2]),
+    );
+    let r_x = real3(view.rotation[0], view.rotation[1], view.rotation[2]);
+    let r_y = real3(view.rotation[3], view.rotation[4], view.rotation[5]);
+    let r_z = real3(view.rotation[6], view.rotation[7], view.rotation[8]);
+    let z = dot3(r_z, from_camera);
     if !(z >= real(NEAR_Z) && z <= real(FAR_Z)) {
         return result;
     }
-    let mean_x = view.focal_x_px * x / z + view.centre_x_px;
-    let mean_y = view.focal_y_px * y / z + view.centre_y_px;
-    let tan_x = limited(x / z, view.focal_x_px, view.centre_x_px, real(view.width_px));
-    let tan_y = limited(y / z, view.focal_y_px, view.centre_y_px, real(view.height_px));
+    let ratio_x = dot3(r_x, from_camera) / z;
+    let ratio_y = dot3(r_y, from_camera) / z;
+    let mean_x = view.focal_x_px * ratio_x + view.centre_x_px;
+    let mean_y = view.focal_y_px * ratio_y + view.centre_y_px;
+    let width = real(view.width_px);
+    let height = real(view.height_px);
+    let tan_x = limited(ratio_x, view.focal_x_px, view.centre_x_px, width);
+    let tan_y = limited(ratio_y, view.focal_y_px, view.centre_y_px, height);
     let scale_x = view.focal_x_px / z;
     let scale_y = view.focal_y_px / z;
-
-    // Columns of camera-from-Gaussian's axes, times scales; then the Jacobian's two rows on them.
-    var qw = real(g.rotation_wxyz[0]);
-    var qx = real(g.rotation_wxyz[1]);
-    var qy = real(g.rotation_wxyz[2]);
-    var qz = real(g.rotation_wxyz[3]);
-    let norm = sqrt(qw * qw + qx * qx + qy * qy + qz * qz);
-    qw /= norm;
-    qx /= norm;
-    qy /= norm;
-    qz /= norm;
-    let m = array<real, 9>(
-        ONE - TWO * (qy * qy + qz * qz), TWO * (qx * qy - qw * qz), TWO * (qx * qz + qw * qy),
-        TWO * (qx * qy + qw * qz), ONE - TWO * (qx * qx + qz * qz), TWO * (qy * qz - qw * qx),
-        TWO * (qx * qz - qw * qy), TWO * (qy * qz + qw * qx), ONE - TWO * (qx * qx + qy * qy),
-    );
-    var m_x: array<real, 3>;
-    var m_y: array<real, 3>;
-    for (var c = 0u; c < 3u; c++) {
-        let s = real(g.scales[c]);
-        let a_x = (r[0] * m[c] + r[1] * m[c + 3u] + r[2] * m[c + 6u]) * s;
-        let a_y = (r[3] * m[c] + r[4] * m[c + 3u] + r[5] * m[c + 6u]) * s;
-        let a_z = (r[6] * m[c] + r[7] * m[c + 3u] + r[8] * m[c + 6u]) * s;
-        m_x[c] = scale_x * (a_x - tan_x * a_z);
-        m_y[c] = scale_y * (a_y - tan_y * a_z);
-    }
     let blur = real(COVARIANCE_BLUR_PX2);
-    let cov_xx = m_x[0] * m_x[0] + m_x[1] * m_x[1] + m_x[2] * m_x[2] + blur;
-    let cov_yy = m_y[0] * m_y[0] + m_y[1] * m_y[1] + m_y[2] * m_y[2] + blur;
-    let cov_xy = m_x[0] * m_y[0] + m_x[1] * m_y[1] + m_x[2] * m_y[2];
+
+    // No standard deviation on the screen is above the largest axis times the Jacobian's row; a
+    // footprint outside the image by that needs no covariance. Wider by half: no rounding matters.
+    let size = real(max(max(g.scales.x, g.scales.y), g.scales.z));
+    let spread = real(g.reach2) * real(2.25);
+    let most_x = scale_x * scale_x * (ONE + tan_x * tan_x) * size * size + blur;
+    let most_y = scale_y * scale_y * (ONE + tan_y * tan_y) * size * size + blur;
+    let beyond_x = max(max(-mean_x, mean_x - width), ZERO);
+    let beyond_y = max(max(-mean_y, mean_y - height), ZERO);
+    let is_far_out = beyond_x * beyond_x > most_x * spread || beyond_y * beyond_y > most_y * spread;
     let limit = real(MAX_VARIANCE_PX2);
-    if !(cov_xx <= limit && cov_yy <= limit && abs(mean_x) <= real(MAX_COORDINATE_PX) && abs(mean_y) <= real(MAX_COORDINATE_PX)) {
+    // What cannot be represented is counted, in the image or not.
+    if is_far_out && most_x < limit && most_y < limit && is_coordinate(mean_x) && is_coordinate(mean_y) {
+        return result;
+    }
+
+    // Rows of camera-from-Gaussian's axes, times scales; then the Jacobian's two rows on them.
+    let q = real4(
+        real(g.rotation_wxyz.x),
+        real(g.rotation_wxyz.y),
+        real(g.rotation_wxyz.z),
+        real(g.rotation_wxyz.w),
+    );
+    let unit = TWO / (q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w);
+    let xx = q.y * q.y * unit;
+    let yy = q.z * q.z * unit;
+    let zz = q.w * q.w * unit;
+    let xy = q.y * q.z * unit;
+    let xz = q.y * q.w * unit;
+    let yz = q.z * q.w * unit;
+    let wx = q.x * q.y * unit;
+    let wy = q.x * q.z * unit;
+    let wz = q.x * q.w * unit;
+    let j_x = (r_x - r_z * tan_x) * scale_x;
+    let j_y = (r_y - r_z * tan_y) * scale_y;
+    let axis_0 = real3(ONE - yy - zz, xy + wz, xz - wy) * real(g.scales.x);
+    let axis_1 = real3(xy - wz, ONE - xx - zz, yz + wx) * real(g.scales.y);
+    let axis_2 = real3(xz + wy, yz - wx, ONE - xx - yy) * real(g.scales.z);
+    let m_x = real3(dot3(j_x, axis_0), dot3(j_x, axis_1), dot3(j_x, axis_2));
+    let m_y = real3(dot3(j_y, axis_0), dot3(j_y, axis_1), dot3(j_y, axis_2));
+    let cov_xx = dot3(m_x, m_x) + blur;
+    let cov_yy = dot3(m_y, m_y) + blur;
+    let cov_xy = dot3(m_x, m_y);
+    if !(cov_xx <= limit && cov_yy <= limit && is_coordinate(mean_x) && is_coordinate(mean_y)) {
         result.status = UNREPRESENTABLE;
         return result;
     }
     // Lagrange's identity: exact for needles, and above 0.
-    let c_x = m_x[1] * m_y[2] - m_x[2] * m_y[1];
-    let c_y = m_x[2] * m_y[0] - m_x[0] * m_y[2];
-    let c_z = m_x[0] * m_y[1] - m_x[1] * m_y[0];
-    let det = c_x * c_x + c_y * c_y + c_z * c_z + blur * (cov_xx + cov_yy) - blur * blur;
+    let c = real3(
+        m_x.y * m_y.z - m_x.z * m_y.y,
+        m_x.z * m_y.x - m_x.x * m_y.z,
+        m_x.x * m_y.y - m_x.y * m_y.x,
+    );
+    let det = dot3(c, c) + blur * (cov_xx + cov_yy) - blur * blur;
     var s: Screen;
     s.mean_x_px = mean_x;
     s.mean_y_px = mean_y;
@@ -131,21 +159,25 @@ fn project(index: u32) -> Projected {
 @compute @workgroup_size(WORKGROUP_SIZE)
 fn count_visible(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) thread: u32) {
     let index = group.x * WORKGROUP_SIZE + thread;
+    // Bands of tile rows work one after another: each Gaussian is counted in the first that it is in.
+    let is_first_band = view.first_tile_row == 0u;
     var is_visible = 0u;
+    var is_new = 0u;
     if index < chunk.n_gaussians {
         let p = project(index);
         is_visible = u32(p.status == VISIBLE);
-        // Bands of tile rows work one after another: each Gaussian is counted in the first that it is in.
-        if p.status == VISIBLE && (p.first_tile_row >= view.first_tile_row || view.first_tile_row == 0u) {
-            atomicAdd(&counters[COUNTER_FIRST_VISIBLE], 1u);
-        }
-        if p.status == UNREPRESENTABLE && view.first_tile_row == 0u {
+        is_new = u32(p.status == VISIBLE && (is_first_band || p.first_tile_row >= view.first_tile_row));
+        // Rare, so that every thread may count for itself.
+        if p.status == UNREPRESENTABLE && is_first_band {
             atomicAdd(&counters[COUNTER_UNREPRESENTABLE], 1u);
         }
     }
-    let before = block_scan(is_visible, thread);
+    // Two sums in one: each is at most the size of the workgroup.
+    let packed = is_visible | (is_new << 16u);
+    let sums = block_scan(packed, thread) + packed;
     if thread == WORKGROUP_SIZE - 1u {
-        block_counts[group.x] = before + is_visible;
+        block_counts[group.x] = sums & 0xffffu;
+        atomicAdd(&counters[COUNTER_FIRST_VISIBLE], sums >> 16u);
     }
 }
 

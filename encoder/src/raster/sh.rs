@@ -16,26 +16,28 @@ const SH_C3: [f32; 7] =
 /// Higher coefficients of degree 3.
 const MAX_REST: usize = 15;
 
-/// Returns the RGB colour of each visible Gaussian seen from a camera: `max(0, SH(direction) + 0.5)`.
+/// Returns the RGB colour of each visible Gaussian seen from a camera.
 pub fn colours(scene: &Gaussians, visible: &[ScreenGaussian], position_in_world: DVec3) -> Vec<[f32; 3]> {
-    let n_rest = Gaussians::sh_rest_per_channel(scene.sh_degree).min(MAX_REST);
     visible
         .par_iter()
-        .map(|on_screen| {
-            let index = on_screen.gaussian as usize;
-            let mut rgb = scene.sh_dc[index].map(|c| 0.5 + SH_C0 * c);
-            if n_rest > 0 {
-                let direction = (scene.means_in_world[index] - position_in_world).normalize_or_zero();
-                let basis = rest_basis(direction.as_vec3());
-                let coefficients = &scene.sh_rest[index * n_rest * 3..][..n_rest * 3];
-                for (value, coefficient) in basis.iter().zip(coefficients.chunks_exact(3)) {
-                    rgb = std::array::from_fn(|c| rgb[c] + value * coefficient[c]);
-                }
-            }
-            // One broken coefficient must not blot out the picture.
-            rgb.map(|c| if c.is_finite() { c.max(0.0) } else { 0.0 })
-        })
+        .map(|on_screen| colour(scene, on_screen.gaussian as usize, position_in_world))
         .collect()
+}
+
+/// Returns the RGB colour of a Gaussian seen from a camera: `max(0, SH(direction) + 0.5)`.
+pub fn colour(scene: &Gaussians, index: usize, position_in_world: DVec3) -> [f32; 3] {
+    let n_rest = Gaussians::sh_rest_per_channel(scene.sh_degree).min(MAX_REST);
+    let mut rgb = scene.sh_dc[index].map(|c| 0.5 + SH_C0 * c);
+    if n_rest > 0 {
+        let direction = (scene.means_in_world[index] - position_in_world).normalize_or_zero();
+        let basis = rest_basis(direction.as_vec3());
+        let coefficients = &scene.sh_rest[index * n_rest * 3..][..n_rest * 3];
+        for (value, coefficient) in basis.iter().zip(coefficients.chunks_exact(3)) {
+            rgb = std::array::from_fn(|c| rgb[c] + value * coefficient[c]);
+        }
+    }
+    // One broken coefficient must not blot out the picture.
+    rgb.map(|c| if c.is_finite() { c.max(0.0) } else { 0.0 })
 }
 
 /// Returns the basis functions of degree 1 to 3 for a unit direction.

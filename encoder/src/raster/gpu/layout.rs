@@ -4,10 +4,10 @@ use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 use slag_common::Gaussians;
 
-use super::shader::Precision;
-use crate::raster::RasterView;
+use super::shader::{Precision, TILE_FRACTION_BITS};
 use crate::raster::constants::{MIN_ALPHA, TILE_SIZE_PX};
 use crate::raster::project::reach2;
+use crate::raster::{RasterView, RegionWeight};
 
 /// A Gaussian in the device's memory.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
@@ -115,6 +115,29 @@ pub struct RegionSum {
     pub low: u32,
     /// Upper word of the sum.
     pub high: u32,
+}
+
+impl RegionSum {
+    /// Returns the sum, in units of `2^-TILE_FRACTION_BITS`.
+    pub fn fixed(&self) -> u64 {
+        u64::from(self.high) << 32 | u64::from(self.low)
+    }
+
+    /// Returns the weight of this Gaussian and region for a sum.
+    pub fn weight(&self, fixed: u64) -> RegionWeight {
+        let weight = (fixed as f64 / f64::from(1u32 << TILE_FRACTION_BITS)) as f32;
+        RegionWeight { gaussian: self.gaussian, region: self.region, weight }
+    }
+}
+
+/// What a picture is drawn over.
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[repr(C)]
+pub struct Background {
+    /// Colour.
+    pub rgb: [f32; 3],
+    /// Unused.
+    pub padding: u32,
 }
 
 /// Room in a workspace.
@@ -243,6 +266,7 @@ mod tests {
         assert_layout!("project", Chunk; first_gaussian, n_gaussians);
         assert_layout!("scan", ScanJob; items, n_fixed, block, columns, total);
         assert_layout!("sort", SortPass; items, stride, offset, shift, is_first, capacity);
+        assert_layout!("draw", Background; rgb, padding);
         assert_layout!("compact", RegionSum; gaussian, region, low, high);
         assert_eq!(layout_of("compact", "RegionSum", Precision::F32).1, size_of::<RegionSum>());
         for precision in [Precision::F64, Precision::F32] {

@@ -12,22 +12,25 @@ mod layout;
 mod shader;
 mod workspace;
 
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::ops::Range;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
 use glam::DVec3;
+use rayon::prelude::*;
 use slag_common::Gaussians;
 
 use super::constants::TILE_SIZE_PX;
+use super::sh;
 use super::{
     CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, RegionWeight, StageTime,
-    ViewWeights, WeightKind, check_regions, check_scene, check_view,
+    ViewCounters, ViewWeights, WeightKind, check_regions, check_scene, check_view,
 };
 use crate::segment::RegionMap;
 pub use device::{Adapter, AdapterReport, Device, adapters};
 use layout::{Capacities, RegionSum, SceneGaussian, ViewBlock, screen_layout};
 pub use shader::Precision;
-use shader::{Counter, MAX_DISPATCH, TILE_FRACTION_BITS, WORKGROUP_SIZE};
-use workspace::{SCENE_GAUSSIAN_BYTES, SceneChunk, Size, Workspace, band_size};
+use shader::{Counter, MAX_DISPATCH, WORKGROUP_SIZE};
+use workspace::{Band, Counts, PIXEL_BYTES, SCENE_GAUSSIAN_BYTES, SceneChunk, Size, Workspace, band_size};
 
 /// How a device is used.
 #[derive(Clone, Copy, Debug)]
@@ -92,10 +95,11 @@ struct GpuScene<'s> {
 }
 
 /// Workspaces that are not in use.
-#[derive(Default)]
 struct Pool {
     idle: Vec<Workspace>,
     n_made: usize,
+    /// Room that new ones are made with: what views have needed so far.
+    room: Capacities,
 }
 
 /// Room that a workspace starts with; grown when a view needs more.
@@ -121,8 +125,18 @@ impl<'s> GpuScene<'s> {
             max_binding_bytes,
             origin_in_world,
             chunks: Vec::new(),
-            workspaces: Mutex::default(),
+            workspaces: Mutex::new(Pool {
+                idle: Vec::new(),
+                n_made: 0,
+                room: Capacities { visible: 0, pairs: 0, entries: 0 },
+            }),
             returned: Condvar::new(),
+        };
+        let max = loaded.max_room();
+        loaded.pool().room = Capacities {
+            visible: FIRST_ROOM.min(scene.len().max(1) as u32).min(max.visible),
+            pairs: FIRST_ROOM.min(max.pairs),
+            entries: FIRST_ROOM.min(max.entries),
         };
         let mut resident_bytes = 0;
         let mut is_full = false;
@@ -173,8 +187,12 @@ impl<'s> GpuScene<'s> {
         }
     }
 
+    fn pool(&self) -> MutexGuard<'_, Pool> {
+        self.workspaces.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     fn take_workspace(&self) -> Option<Workspace> {
-        let mut pool = self.workspaces.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut pool = self.pool();
         loop {
             if let Some(workspace) = pool.idle.pop() {
                 return Some(workspace);
@@ -188,7 +206,7 @@ impl<'s> GpuScene<'s> {
     }
 
     fn return_workspace(&self, workspace: Option<Workspace>) {
-        let mut pool = self.workspaces.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut pool = self.pool();
         match workspace {
             Some(workspace) => pool.idle.push(workspace),
             None => pool.n_made -= 1,
@@ -202,80 +220,77 @@ impl<'s> GpuScene<'s> {
             .ok_or_else(|| self.device.room_error(format!("no memory for {room:?}")))
     }
 
-    /// Takes a view through the device, band by band.
-    fn run_view(
+    /// Takes a view through the device, band by band: `work` gets each band's workspace and input, its
+    /// rows of tiles and of pixels, and returns its counts. Where they are beyond the room, the band is
+    /// done again with more, or in two.
+    fn each_band(
+        &self,
+        view: &RasterView,
+        (kind, n_regions): (WeightKind, u32),
+        px_bytes: u64,
+        mut work: impl FnMut(&mut Workspace, &Band<'_>, Rows) -> Result<Counts, RasterError>,
+    ) -> Result<ViewCounters, RasterError> {
+        let mut workspace = self.take_workspace();
+        let result = self.bands_of(&mut workspace, view, (kind, n_regions), px_bytes, &mut work);
+        self.return_workspace(workspace);
+        result
+    }
+
+    fn bands_of(
         &self,
         workspace: &mut Option<Workspace>,
         view: &RasterView,
-        regions: &RegionMap,
-        kind: WeightKind,
-        times: &mut Vec<StageTime>,
-    ) -> Result<ViewWeights, RasterError> {
-        let camera = &view.intrinsics;
+        (kind, n_regions): (WeightKind, u32),
+        px_bytes: u64,
+        work: &mut dyn FnMut(&mut Workspace, &Band<'_>, Rows) -> Result<Counts, RasterError>,
+    ) -> Result<ViewCounters, RasterError> {
         let tile = TILE_SIZE_PX as u32;
-        let (width_px, height_px) = (camera.width_px, camera.height_px);
+        let (width_px, height_px) = (view.intrinsics.width_px, view.intrinsics.height_px);
         let max = self.max_room();
         // Bands by pixels first; by what turns out to be in them below.
-        let rows_of_band = (self.max_elements(4) / width_px / tile).clamp(1, MAX_DISPATCH);
+        let rows_of_band = (self.max_elements(px_bytes) / width_px / tile).clamp(1, MAX_DISPATCH);
         let n_rows = height_px.div_ceil(tile);
         let mut bands: Vec<[u32; 2]> = (0..n_rows.div_ceil(rows_of_band))
             .rev()
             .map(|i| [i * rows_of_band, ((i + 1) * rows_of_band).min(n_rows)])
             .collect();
-        let mut weights = ViewWeights::default();
-        weights.counters.unusable = self.n_unusable;
-        let mut sums: Vec<RegionSum> = Vec::new();
-        let mut n_bands = 0;
-        while let Some(band) = bands.pop() {
-            let (n_tiles, n_px) = band_size(width_px, height_px, band);
+        let mut counters = ViewCounters { unusable: self.n_unusable, ..ViewCounters::default() };
+        let upload = |index: usize| {
+            let first = self.chunks[..index].iter().map(|c| c.n_gaussians as usize).sum();
+            self.upload(first, self.chunks[index].n_gaussians as usize)
+                .ok_or_else(|| self.device.room_error("no memory for a part of the scene".into()))
+        };
+        while let Some([first, end]) = bands.pop() {
+            let (n_tiles, n_px) = band_size(width_px, height_px, [first, end]);
             let mut current = match workspace.take() {
                 Some(current) if current.holds(n_tiles, n_px) => current,
                 old => {
-                    let room = old.as_ref().map_or_else(
-                        || Capacities {
-                            visible: FIRST_ROOM.min(self.scene.len().max(1) as u32).min(max.visible),
-                            pairs: FIRST_ROOM.min(max.pairs),
-                            entries: FIRST_ROOM.min(max.entries),
-                        },
-                        |old| old.room,
-                    );
                     drop(old);
+                    let room = self.pool().room;
                     self.make_workspace(room, n_tiles, n_px)?
                 }
             };
             let room = current.room;
-            let block = ViewBlock::new(
-                view,
-                self.origin_in_world,
-                band,
-                kind == WeightKind::Falloff,
-                regions.n_regions,
-                room,
-            );
-            let first_px = (band[0] * tile * width_px) as usize;
-            let of_band = &regions.region_of_pixel[first_px..first_px + n_px as usize];
-            let upload = |index: usize| {
-                let first = self.chunks[..index].iter().map(|c| c.n_gaussians as usize).sum();
-                self.upload(first, self.chunks[index].n_gaussians as usize)
-                    .ok_or_else(|| self.device.error("no memory for a part of the scene".into()))
-            };
-            let (counts, found) = current.run(&self.device, &self.chunks, &upload, &block, of_band, times)?;
+            let is_falloff = kind == WeightKind::Falloff;
+            let block = ViewBlock::new(view, self.origin_in_world, [first, end], is_falloff, n_regions, room);
+            let band = Band { device: &self.device, chunks: &self.chunks, upload: &upload, view: &block };
+            let first_px = (first * tile * width_px) as usize;
+            let rows = Rows { px: first_px..first_px + n_px as usize, is_whole: end - first == n_rows };
+            let counts = work(&mut current, &band, rows)?;
             let count = |counter: Counter| counts[counter as usize];
-            let needed = Capacities {
-                visible: room.visible.max(count(Counter::Visible)),
-                pairs: room.pairs.max(count(Counter::Pairs)),
-                entries: room.entries.max(count(Counter::Entries)),
-            };
-            if needed == room {
+            if current.fits(&counts) {
                 *workspace = Some(current);
-                weights.counters.visible += count(Counter::FirstVisible) as usize;
-                weights.counters.pairs += count(Counter::Pairs) as usize;
-                weights.counters.unusable += count(Counter::Unrepresentable) as usize;
-                sums.extend(found);
-                n_bands += 1;
+                counters.visible += count(Counter::FirstVisible) as usize;
+                counters.pairs += count(Counter::Pairs) as usize;
+                counters.unusable += count(Counter::Unrepresentable) as usize;
                 continue;
             }
             drop(current);
+            let needed = Capacities {
+                visible: count(Counter::Visible),
+                pairs: count(Counter::Pairs),
+                entries: count(Counter::Entries),
+            };
             if needed.visible <= max.visible && needed.pairs <= max.pairs && needed.entries <= max.entries {
                 // What counts for later stages is cut off with the first: a quarter more, and again.
                 let grown = |needed: u32, now: u32, max: u32| {
@@ -286,31 +301,44 @@ impl<'s> GpuScene<'s> {
                     pairs: grown(needed.pairs, room.pairs, max.pairs),
                     entries: grown(needed.entries, room.entries, max.entries),
                 };
-                *workspace = Some(self.make_workspace(room, n_tiles, n_px)?);
-                bands.push(band);
-            } else if band[1] - band[0] > 1 {
-                let middle = band[0].midpoint(band[1]);
-                bands.extend([[middle, band[1]], [band[0], middle]]);
+                self.pool().room = room;
+                bands.push([first, end]);
+            } else if end - first > 1 {
+                let middle = first.midpoint(end);
+                bands.extend([[middle, end], [first, middle]]);
             } else {
                 let what = format!("a row of tiles needs {needed:?}, the device holds {max:?}");
                 return Err(self.device.room_error(what));
             }
         }
-        if n_bands > 1 {
-            sums.sort_unstable_by_key(|s| (s.gaussian, s.region));
-        }
-        let fixed = |s: &RegionSum| u64::from(s.high) << 32 | u64::from(s.low);
-        weights.entries = sums
-            .chunk_by(|a, b| (a.gaussian, a.region) == (b.gaussian, b.region))
-            .map(|same| RegionWeight {
-                gaussian: same[0].gaussian,
-                region: same[0].region,
-                weight: (same.iter().map(fixed).sum::<u64>() as f64 / f64::from(1u32 << TILE_FRACTION_BITS))
-                    as f32,
-            })
-            .collect();
-        Ok(weights)
+        Ok(counters)
     }
+
+    /// Returns the colours of all Gaussians as seen from a view, on the device.
+    fn colours(&self, view: &RasterView) -> Result<wgpu::Buffer, RasterError> {
+        let position_in_world = view.camera_from_world.inverse().translation;
+        let colours: Vec<[f32; 3]> = (0..self.scene.len())
+            .into_par_iter()
+            .map(|index| sh::colour(self.scene, index, position_in_world))
+            .collect();
+        let no_room = || self.device.room_error("no room for the colours of the scene".into());
+        let bytes: &[u8] = bytemuck::cast_slice(&colours);
+        if bytes.len() as u64 > self.max_binding_bytes {
+            return Err(no_room());
+        }
+        let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
+        let buffer = self.device.buffer("colours", bytes.len() as u64, usage).ok_or_else(no_room)?;
+        self.device.queue.write_buffer(&buffer, 0, bytes);
+        Ok(buffer)
+    }
+}
+
+/// What a band is of its image.
+struct Rows {
+    /// Its pixels.
+    px: Range<usize>,
+    /// Whether it is all of them.
+    is_whole: bool,
 }
 
 /// Regions of a view: a region and a pixel of its tile share a word.
@@ -342,13 +370,49 @@ impl LoadedScene for GpuScene<'_> {
             return Ok(Default::default());
         }
         let mut times = Vec::new();
-        let mut workspace = self.take_workspace();
-        let result = self.run_view(&mut workspace, view, regions, kind, &mut times);
-        self.return_workspace(workspace);
-        Ok((result?, times))
+        let mut entries: Vec<RegionWeight> = Vec::new();
+        let mut sums: Vec<RegionSum> = Vec::new();
+        let counters = self.each_band(view, (kind, regions.n_regions), 4, |workspace, band, rows| {
+            let mut take = |found: &[RegionSum]| match rows.is_whole {
+                true => entries.extend(found.iter().map(|sum| sum.weight(sum.fixed()))),
+                false => sums.extend(found),
+            };
+            workspace.sum(band, &regions.region_of_pixel[rows.px], &mut times, &mut take)
+        })?;
+        sums.sort_unstable_by_key(|sum| (sum.gaussian, sum.region));
+        entries.extend(
+            sums.chunk_by(|a, b| (a.gaussian, a.region) == (b.gaussian, b.region))
+                .map(|same| same[0].weight(same.iter().map(RegionSum::fixed).sum())),
+        );
+        Ok((ViewWeights { entries, counters }, times))
     }
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {
-        CpuRasterizer.load(self.scene)?.draw(view, background)
+        check_view(view)?;
+        if self.chunks.is_empty() {
+            return CpuRasterizer.load(self.scene)?.draw(view, background);
+        }
+        let colours = self.colours(view)?;
+        let (width_px, height_px) = (view.intrinsics.width_px, view.intrinsics.height_px);
+        let n_px = (width_px * height_px) as usize;
+        let mut drawing = Drawing {
+            width_px,
+            height_px,
+            rgb: vec![0.0; n_px * 3],
+            depth: vec![0.0; n_px],
+            coverage: vec![0.0; n_px],
+            ..Drawing::default()
+        };
+        drawing.counters =
+            self.each_band(view, (WeightKind::Blend, 0), PIXEL_BYTES, |workspace, band, rows| {
+                let (counts, pixels) = workspace.draw(band, background, &colours)?;
+                for (i, pixel) in rows.px.zip(pixels.chunks_exact(5)) {
+                    drawing.rgb[3 * i..][..3].copy_from_slice(&pixel[..3]);
+                    drawing.depth[i] = pixel[3];
+                    drawing.coverage[i] = pixel[4];
+                }
+                Ok(counts)
+            })?;
+        Ok(drawing)
     }
 }

@@ -61,13 +61,14 @@ pub enum Precision {
 }
 
 /// The stages' own shaders, without what they share.
-pub const STAGES: [(&str, &str); 6] = [
+pub const STAGES: [(&str, &str); 7] = [
     ("project", include_str!("../project.wgsl")),
     ("scan", include_str!("../scan.wgsl")),
     ("sort", include_str!("../sort.wgsl")),
     ("bin", include_str!("../bin.wgsl")),
     ("blend", include_str!("../blend.wgsl")),
     ("compact", include_str!("../compact.wgsl")),
+    ("draw", include_str!("../draw.wgsl")),
 ];
 const COMMON: &str = include_str!("../common.wgsl");
 
@@ -83,7 +84,7 @@ pub fn module_text(stage: &str, precision: Precision) -> String {
         Precision::F64 => (MAX_VARIANCE_PX2, f64::MAX),
         Precision::F32 => (1e18, 1e18),
     };
-    let _ = writeln!(text, "alias real = {real};");
+    let _ = writeln!(text, "alias real = {real};\nalias real3 = vec3<{real}>;\nalias real4 = vec4<{real}>;");
     for (name, value) in [("ZERO", 0.0), ("HALF", 0.5), ("ONE", 1.0), ("TWO", 2.0)] {
         let _ = writeln!(text, "const {name}: real = real({value:?});");
     }
@@ -146,6 +147,7 @@ pub struct Kernels {
     pub sum_regions: wgpu::ComputePipeline,
     pub count_heads: wgpu::ComputePipeline,
     pub add_up: wgpu::ComputePipeline,
+    pub draw: wgpu::ComputePipeline,
 }
 
 impl Kernels {
@@ -181,6 +183,7 @@ impl Kernels {
             sum_regions: kernel("blend", "sum_regions"),
             count_heads: kernel("compact", "count_heads"),
             add_up: kernel("compact", "add_up"),
+            draw: kernel("draw", "draw"),
         }
     }
 }

@@ -1,13 +1,14 @@
 //! The buffers of one view in flight, and the commands that take it through all stages.
 
 use std::collections::HashMap;
+use std::time::Instant;
 
 use bytemuck::Zeroable;
 use wgpu::BufferUsages as Usage;
 
 use super::device::Device;
 use super::layout::{
-    Capacities, Chunk, RegionSum, ScanJob, SceneGaussian, SortPass, ViewBlock, screen_layout,
+    Background, Capacities, Chunk, RegionSum, ScanJob, SceneGaussian, SortPass, ViewBlock, screen_layout,
 };
 use super::shader::{Counter, NONE, SORT_BLOCK, WORKGROUP_SIZE};
 use crate::raster::constants::TILE_SIZE_PX;
@@ -83,6 +84,26 @@ impl SceneChunk {
     }
 }
 
+/// A band of a view of a scene.
+pub struct Band<'a> {
+    /// Where it is worked on.
+    pub device: &'a Device,
+    /// The scene.
+    pub chunks: &'a [SceneChunk],
+    /// Uploads a chunk that is not on the device.
+    pub upload: &'a dyn Fn(usize) -> Result<wgpu::Buffer, RasterError>,
+    /// The view and its rows of tiles.
+    pub view: &'a ViewBlock,
+}
+
+impl Band<'_> {
+    /// Returns the columns and rows of tiles.
+    fn tiles(&self) -> [u32; 2] {
+        let [_, _, first_row, end_row, columns, ..] = self.view.words;
+        [columns, end_row - first_row]
+    }
+}
+
 /// The buffers of one view in flight.
 pub struct Workspace {
     /// What there is room for.
@@ -129,6 +150,9 @@ pub struct Size {
 const COUNTERS_BYTES: u64 = 64;
 /// What precedes the sums in the copy back: counters and timestamps.
 const HEAD_BYTES: u64 = COUNTERS_BYTES + 192;
+
+/// Bytes of a pixel of a picture.
+pub const PIXEL_BYTES: u64 = 20;
 
 /// Stages that are timed.
 const STAGES: [&str; 5] = ["project", "sort", "bin", "blend", "compact"];
@@ -290,19 +314,88 @@ impl Workspace {
         }
     }
 
-    /// Takes a band of a view through all stages and returns its counts, and the sums where they are
-    /// complete: where a count is beyond the room, they are not.
-    pub fn run(
+    /// Takes a band of a view through all stages and returns its counts. `take` gets the sums, once,
+    /// where they are complete: where a count is beyond the room, they are not.
+    pub fn sum(
         &mut self,
-        device: &Device,
-        chunks: &[SceneChunk],
-        upload: &dyn Fn(usize) -> Result<wgpu::Buffer, RasterError>,
-        view: &ViewBlock,
+        band: &Band<'_>,
         regions: &[u32],
         times: &mut Vec<StageTime>,
-    ) -> Result<(Counts, Vec<RegionSum>), RasterError> {
-        device.queue.write_buffer(&self.view, 0, &view.to_bytes(device.report.precision));
+        take: &mut dyn FnMut(&[RegionSum]),
+    ) -> Result<Counts, RasterError> {
+        let start = Instant::now();
+        let device = band.device;
         device.queue.write_buffer(&self.regions, 0, bytemuck::cast_slice(regions));
+        let mut encoder = self.bin(band)?;
+        let [columns, rows] = band.tiles();
+        let mut pass = self.stopwatch.pass(&mut encoder, 3, (true, true));
+        self.blend(device, &mut pass, columns, rows);
+        drop(pass);
+        let mut pass = self.stopwatch.pass(&mut encoder, 4, (true, true));
+        let n_regions = band.view.words[6];
+        let keys = [(SortKey::Region, bits_of(n_regions)), (SortKey::Member, bits_of(self.room.visible))];
+        let entry_order = self.sort(device, &mut pass, &keys);
+        self.compact(device, &mut pass, entry_order);
+        drop(pass);
+        self.stopwatch.resolve(&mut encoder, &self.staging);
+        self.copy_back(&mut encoder);
+        let submission = device.queue.submit([encoder.finish()]);
+        times.push(StageTime { stage: "submit", ms: start.elapsed().as_secs_f64() * 1e3 });
+        let counts = self.read_back(device, submission, times, take)?;
+        let n_sums = counts[Counter::RegionSums as usize];
+        if !self.fits(&counts) || n_sums <= self.n_copied {
+            return Ok(counts);
+        }
+        // More than expected: a second copy, but from now on one that is large enough.
+        self.n_copied = n_sums.saturating_add(n_sums / 4).min(self.room.entries);
+        self.staging = Self::staging(device, self.n_copied)
+            .ok_or_else(|| device.room_error("no memory for the copy back".into()))?;
+        let mut encoder = device.device.create_command_encoder(&Default::default());
+        self.copy_back(&mut encoder);
+        let submission = device.queue.submit([encoder.finish()]);
+        self.read_back(device, submission, &mut Vec::new(), take)
+    }
+
+    /// Draws a band and returns its counts and pixels: red, green, blue, depth, coverage.
+    pub fn draw(
+        &mut self,
+        band: &Band<'_>,
+        background: [f32; 3],
+        colours: &wgpu::Buffer,
+    ) -> Result<(Counts, Vec<f32>), RasterError> {
+        let device = band.device;
+        let mut encoder = self.bin(band)?;
+        let [columns, rows] = band.tiles();
+        let n_bytes = u64::from(self.n_px) * PIXEL_BYTES;
+        let no_room = || device.room_error("no memory for a picture".into());
+        let make = |label: &str, size, usage| device.buffer(label, size, usage).ok_or_else(no_room);
+        // Pictures are rare: their buffers do not stay.
+        let over = make("background", 16, Usage::STORAGE | Usage::COPY_DST)?;
+        let pixels = make("pixels", n_bytes, Usage::STORAGE | Usage::COPY_SRC)?;
+        let staging = make("staging", COUNTERS_BYTES + n_bytes, Usage::MAP_READ | Usage::COPY_DST)?;
+        let value = Background { rgb: background, padding: 0 };
+        device.queue.write_buffer(&over, 0, bytemuck::bytes_of(&value));
+        let bound =
+            [&self.view, &over, &self.screen, &self.members, &self.ranges, colours, &pixels].map(whole);
+        let kernel = &device.kernels.draw;
+        let group = bind(device, kernel, &number(&bound));
+        dispatch(&mut encoder.begin_compute_pass(&Default::default()), kernel, &group, [columns, rows]);
+        encoder.copy_buffer_to_buffer(&self.counters, 0, &staging, 0, COUNTERS_BYTES);
+        encoder.copy_buffer_to_buffer(&pixels, 0, &staging, COUNTERS_BYTES, n_bytes);
+        let submission = device.queue.submit([encoder.finish()]);
+        staging.map_async(wgpu::MapMode::Read, .., |_| {});
+        device.wait(submission)?;
+        let bytes = staging.get_mapped_range(..).map_err(|e| device.error(e.to_string()))?;
+        let (head, rest) = bytes.split_at(COUNTERS_BYTES as usize);
+        let mut counts: Counts = Zeroable::zeroed();
+        counts.copy_from_slice(&bytemuck::cast_slice::<u8, u32>(head)[..Counter::ALL.len()]);
+        Ok((counts, bytemuck::cast_slice(rest).to_vec()))
+    }
+
+    /// Records all stages up to the lists of each tile's Gaussians.
+    fn bin(&mut self, band: &Band<'_>) -> Result<wgpu::CommandEncoder, RasterError> {
+        let Band { device, chunks, upload, view } = *band;
+        device.queue.write_buffer(&self.view, 0, &view.to_bytes(device.report.precision));
         let mut encoder = device.device.create_command_encoder(&Default::default());
         encoder.clear_buffer(&self.counters, 0, None);
         encoder.clear_buffer(&self.ranges, 0, None);
@@ -321,68 +414,60 @@ impl Workspace {
                 }
             }
         }
-        let [_, _, first_row, end_row, columns, _, n_regions, ..] = view.words;
-        let n_tiles = (end_row - first_row) * columns;
+        let [columns, rows] = band.tiles();
         let mut pass = self.stopwatch.pass(&mut encoder, 1, (true, true));
         let depth_order = self.sort(device, &mut pass, &[(SortKey::Depth, 32)]);
         drop(pass);
         let mut pass = self.stopwatch.pass(&mut encoder, 2, (true, true));
         self.pair(device, &mut pass, depth_order);
-        let pair_order = self.sort(device, &mut pass, &[(SortKey::Tile, bits_of(n_tiles))]);
+        let pair_order = self.sort(device, &mut pass, &[(SortKey::Tile, bits_of(columns * rows))]);
         self.find_ranges(device, &mut pass, pair_order);
         drop(pass);
-        let mut pass = self.stopwatch.pass(&mut encoder, 3, (true, true));
-        self.blend(device, &mut pass, columns, end_row - first_row);
-        drop(pass);
-        let mut pass = self.stopwatch.pass(&mut encoder, 4, (true, true));
-        let keys = [(SortKey::Region, bits_of(n_regions)), (SortKey::Member, bits_of(self.room.visible))];
-        let entry_order = self.sort(device, &mut pass, &keys);
-        self.compact(device, &mut pass, entry_order);
-        drop(pass);
-        self.stopwatch.resolve(&mut encoder, &self.staging);
+        Ok(encoder)
+    }
+
+    /// Returns whether all that a band produces fits the room.
+    pub fn fits(&self, counts: &Counts) -> bool {
+        counts[Counter::Visible as usize] <= self.room.visible
+            && counts[Counter::Pairs as usize] <= self.room.pairs
+            && counts[Counter::Entries as usize] <= self.room.entries
+    }
+
+    fn copy_back(&self, encoder: &mut wgpu::CommandEncoder) {
         let sum_bytes = u64::from(self.n_copied) * size_of::<RegionSum>() as u64;
         encoder.copy_buffer_to_buffer(&self.counters, 0, &self.staging, 0, COUNTERS_BYTES);
         encoder.copy_buffer_to_buffer(&self.region_sums, 0, &self.staging, HEAD_BYTES, sum_bytes);
-        let (counts, sums) = self.read_back(device, encoder, times)?;
-        let room = self.room;
-        let fits = counts[Counter::Visible as usize] <= room.visible
-            && counts[Counter::Pairs as usize] <= room.pairs
-            && counts[Counter::Entries as usize] <= room.entries;
-        let n_sums = counts[Counter::RegionSums as usize];
-        if !fits || n_sums <= self.n_copied {
-            return Ok((counts, sums));
-        }
-        // More than expected: the rest comes in a second copy, and the next view's in one.
-        self.n_copied = n_sums.saturating_add(n_sums / 4).min(room.entries);
-        self.staging = Self::staging(device, self.n_copied)
-            .ok_or_else(|| device.error("no memory for the copy back".into()))?;
-        let mut encoder = device.device.create_command_encoder(&Default::default());
-        let sum_bytes = u64::from(self.n_copied) * size_of::<RegionSum>() as u64;
-        encoder.copy_buffer_to_buffer(&self.counters, 0, &self.staging, 0, COUNTERS_BYTES);
-        encoder.copy_buffer_to_buffer(&self.region_sums, 0, &self.staging, HEAD_BYTES, sum_bytes);
-        self.read_back(device, encoder, &mut Vec::new())
     }
 
     fn read_back(
         &self,
         device: &Device,
-        encoder: wgpu::CommandEncoder,
+        submission: wgpu::SubmissionIndex,
         times: &mut Vec<StageTime>,
-    ) -> Result<(Counts, Vec<RegionSum>), RasterError> {
-        let submission = device.queue.submit([encoder.finish()]);
+        take: &mut dyn FnMut(&[RegionSum]),
+    ) -> Result<Counts, RasterError> {
+        let start = Instant::now();
         self.staging.map_async(wgpu::MapMode::Read, .., |_| {});
         device.wait(submission)?;
+        let waited_ms = start.elapsed().as_secs_f64() * 1e3;
         let bytes = self.staging.get_mapped_range(..).map_err(|e| device.error(e.to_string()))?;
         let mut counts: Counts = Zeroable::zeroed();
         counts.copy_from_slice(
             &bytemuck::cast_slice::<u8, u32>(&bytes[..COUNTERS_BYTES as usize])[..Counter::ALL.len()],
         );
-        times.extend(self.stopwatch.read(&bytes[COUNTERS_BYTES as usize..HEAD_BYTES as usize]));
-        let n_sums = counts[Counter::RegionSums as usize].min(self.n_copied) as usize;
-        let sums = bytemuck::cast_slice::<u8, RegionSum>(&bytes[HEAD_BYTES as usize..])[..n_sums].to_vec();
+        let stages = self.stopwatch.read(&bytes[COUNTERS_BYTES as usize..HEAD_BYTES as usize]);
+        let on_device_ms: f64 = stages.iter().map(|stage| stage.ms).sum();
+        times.extend(stages);
+        times.push(StageTime { stage: "copy", ms: (waited_ms - on_device_ms).max(0.0) });
+        let n_sums = counts[Counter::RegionSums as usize];
+        if self.fits(&counts) && n_sums <= self.n_copied {
+            let start = Instant::now();
+            take(&bytemuck::cast_slice(&bytes[HEAD_BYTES as usize..])[..n_sums as usize]);
+            times.push(StageTime { stage: "read", ms: start.elapsed().as_secs_f64() * 1e3 });
+        }
         drop(bytes);
         self.staging.unmap();
-        Ok((counts, sums))
+        Ok(counts)
     }
 
     fn project(
