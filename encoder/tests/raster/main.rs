@@ -1,6 +1,10 @@
 //! The rasteriser and the scene check against recorded data and a brute-force oracle.
 
+mod backends;
+mod brute_force;
 mod check;
 mod fixtures;
 mod gsplat;
 mod oracle;
+mod scenes;
+mod table;
