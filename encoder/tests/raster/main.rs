@@ -3,8 +3,10 @@
 mod backends;
 mod brute_force;
 mod check;
+mod extremes;
 mod fixtures;
 mod gsplat;
 mod oracle;
+mod rejected;
 mod scenes;
 mod table;

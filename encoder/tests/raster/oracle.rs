@@ -79,6 +79,9 @@ pub struct Truth {
     pub low: f64,
     /// The most that is right.
     pub high: f64,
+    /// How far the value moves, per relative error of every alpha: its own, and in the light that
+    /// surfaces of opacity near 1 leave, the share `alpha / (1 - alpha)` of theirs.
+    pub sensitivity: f64,
 }
 
 impl Truth {
@@ -93,6 +96,7 @@ impl std::ops::AddAssign for Truth {
         self.value += other.value;
         self.low += other.low;
         self.high += other.high;
+        self.sensitivity += other.sensitivity;
     }
 }
 
@@ -110,9 +114,7 @@ pub fn each_weight(
     let width = view.intrinsics.width_px as usize;
     for pixel in 0..width * view.intrinsics.height_px as usize {
         let centre = DVec2::new((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5);
-        let mut light = Truth { value: 1.0, low: 1.0, high: 1.0 };
-        // Relative error of the transmittance that follows from those of the alphas so far.
-        let mut light_tolerance = 0.0;
+        let mut light = Truth { value: 1.0, low: 1.0, high: 1.0, sensitivity: 0.0 };
         for gaussian in &projected {
             let d = centre - gaussian.mean_px;
             let falloff = (-0.5 * gaussian.axes.iter().map(|a| a.dot(d).powi(2)).sum::<f64>()).exp();
@@ -125,21 +127,25 @@ pub fn each_weight(
             let gate = |counts: bool, value: f64| if counts { value } else { 0.0 };
             if kind == WeightKind::Falloff {
                 let (value, low) = (gate(counts, falloff), gate(counts_low, falloff));
-                f(gaussian, pixel, Truth { value, low, high: falloff });
+                f(gaussian, pixel, Truth { value, low, high: falloff, sensitivity: falloff });
                 continue;
             }
-            light_tolerance += cut_tolerance * alpha / (1.0 - alpha) + f64::from(f32::EPSILON);
-            let goes_on = |light: f64, slack: f64| light * (1.0 - alpha) * (1.0 + slack) > 1e-4;
-            let low_goes_on = goes_on(light.low, -light_tolerance);
-            let high_goes_on = goes_on(light.high, light_tolerance);
-            let value_goes_on = goes_on(light.value, 0.0);
+            let own_sensitivity = light.sensitivity + 1.0;
+            light.sensitivity += alpha / (1.0 - alpha);
+            let slack = cut_tolerance * light.sensitivity;
+            let goes_on = |light: f64, factor: f64| light * (1.0 - alpha) * factor > 1e-4;
+            let low_goes_on = goes_on(light.low, 1.0 - slack);
+            let value_goes_on = goes_on(light.value, 1.0);
+            let high_goes_on = goes_on(light.high, 1.0 + slack);
             if counts_low && !high_goes_on {
                 break;
             }
+            let high = gate(high_goes_on, alpha * light.high);
             let weight = Truth {
                 value: gate(counts && value_goes_on, alpha * light.value),
                 low: gate(counts_low && low_goes_on, alpha * light.low),
-                high: gate(high_goes_on, alpha * light.high),
+                high,
+                sensitivity: high * own_sensitivity,
             };
             f(gaussian, pixel, weight);
             // A pixel that may be finished has no light left at worst.

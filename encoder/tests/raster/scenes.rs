@@ -20,6 +20,19 @@ impl Random {
         low + (self.bits() >> 11) as f64 * 2.0_f64.powi(-53) * (high - low)
     }
 
+    /// Returns a number whose logarithm is evenly spread.
+    pub fn log_between(&mut self, low: f64, high: f64) -> f64 {
+        self.between(low.ln(), high.ln()).exp()
+    }
+
+    /// Returns a point of the image or of a border as wide as a quarter of it, and a depth.
+    pub fn in_view(&mut self, view: &RasterView, depths: [f64; 2]) -> DVec3 {
+        let (width, height) = (f64::from(view.intrinsics.width_px), f64::from(view.intrinsics.height_px));
+        let (x, y) = (self.between(-0.25, 1.25) * width, self.between(-0.25, 1.25) * height);
+        let depth = self.log_between(depths[0], depths[1]);
+        unproject(view, x, y, depth)
+    }
+
     pub fn below(&mut self, n: u32) -> u32 {
         (self.bits() % u64::from(n)) as u32
     }
@@ -81,4 +94,37 @@ pub fn random_regions(random: &mut Random, view: &RasterView, n_regions: u32) ->
     }
     region_of_pixel.truncate((width_px * height_px) as usize);
     RegionMap { width_px, height_px, region_of_pixel, n_regions }
+}
+
+/// Returns a camera somewhere near the origin, its principal point near the middle.
+pub fn posed(random: &mut Random, [width_px, height_px]: [u32; 2], focal_px: f64) -> RasterView {
+    let mut view = random_view(random, width_px, height_px);
+    view.intrinsics.focal_x_px = focal_px;
+    view.intrinsics.focal_y_px = focal_px * random.between(0.9, 1.1);
+    view
+}
+
+/// Returns the point at a depth that projects to a pixel position, camera frame.
+pub fn unproject(view: &RasterView, x_px: f64, y_px: f64, depth: f64) -> DVec3 {
+    let camera = &view.intrinsics;
+    let x = (x_px - camera.centre_x_px) / camera.focal_x_px;
+    let y = (y_px - camera.centre_y_px) / camera.focal_y_px;
+    DVec3::new(x, y, 1.0) * depth
+}
+
+/// Appends a Gaussian of random rotation.
+pub fn push(
+    scene: &mut Gaussians,
+    view: &RasterView,
+    random: &mut Random,
+    mean_in_camera: DVec3,
+    scales: [f64; 3],
+    opacity: f64,
+) {
+    let rotation = DQuat::from_axis_angle(random.direction(), random.between(0.0, 6.0));
+    scene.means_in_world.push(view.camera_from_world.inverse().transform_point3(mean_in_camera));
+    scene.rotations_wxyz.push([rotation.w, rotation.x, rotation.y, rotation.z].map(|c| c as f32));
+    scene.scales.push(scales.map(|s| s as f32));
+    scene.opacities.push(opacity as f32);
+    scene.sh_dc.push([0.0; 3]);
 }

@@ -33,8 +33,9 @@ impl Case {
 pub struct Row {
     pub name: &'static str,
     pub range: &'static str,
-    /// Largest error of a sum: relative, of sums below `unit_px` in units of that.
+    /// Largest error of a sum over its sensitivity, so of every alpha; see [`oracle::Truth`].
     pub claimed: f64,
+    /// Sums of less sensitivity are measured in this unit.
     pub unit_px: f64,
 }
 
@@ -75,7 +76,7 @@ impl Row {
     }
 }
 
-/// Returns the largest error over the pairs of both, relative above `unit_px`, and where it is.
+/// Returns the largest error over the pairs of both, and where it is; see [`Row::claimed`].
 pub fn largest_error(found: &ViewWeights, expected: &Sums, unit_px: f64) -> (f64, (u32, u32)) {
     let pairs = found.entries.iter().map(|e| (e.gaussian, e.region));
     assert!(pairs.is_sorted_by(|a, b| a < b), "ordered, each pair once");
@@ -86,7 +87,7 @@ pub fn largest_error(found: &ViewWeights, expected: &Sums, unit_px: f64) -> (f64
         let (found, truth) =
             (found.get(key).copied().unwrap_or(0.0), expected.get(key).copied().unwrap_or_default());
         assert!(found.is_finite());
-        truth.distance(found) / truth.high.max(unit_px)
+        truth.distance(found) / truth.sensitivity.max(unit_px)
     };
     keys.into_iter().map(|key| (error(key), *key)).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default()
 }
