@@ -5,6 +5,9 @@ use glam::DVec3;
 /// Zeroth spherical-harmonic basis function, 1 / (2 sqrt(pi)).
 pub const SH_C0: f32 = 0.282_094_79;
 
+/// Largest coordinate of a mean: sizes of boxes and squares of distances stay finite in f64.
+const MAX_COORDINATE: f64 = f32::MAX as f64;
+
 /// 3D Gaussians, one column a field; every column has [`Gaussians::len`] rows.
 ///
 /// Values are decoded: opacities are linear (not logits), scales are standard deviations (not
@@ -48,11 +51,12 @@ impl Gaussians {
         self.sh_dc[index].map(|c| 0.5 + SH_C0 * c)
     }
 
-    /// Returns whether a Gaussian can be drawn: every field finite and the rotation not degenerate.
+    /// Returns whether a Gaussian can be drawn: every field finite, the mean within f32's range, and the
+    /// rotation not degenerate.
     /// Readers keep unusable rows (indices stay those of the file); stages skip and count them.
     pub fn is_usable(&self, index: usize) -> bool {
         let norm2: f32 = self.rotations_wxyz[index].iter().map(|q| q * q).sum();
-        self.means_in_world[index].is_finite()
+        self.means_in_world[index].to_array().iter().all(|x| x.abs() <= MAX_COORDINATE)
             && (norm2 - 1.0).abs() < 1e-3
             && self.scales[index].iter().all(|s| s.is_finite() && *s >= 0.0)
             && (0.0..=1.0).contains(&self.opacities[index])

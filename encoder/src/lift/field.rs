@@ -173,7 +173,8 @@ impl CellField {
         let scale = (1.0 / total_weight) as f32;
         mean.iter_mut().for_each(|c| *c *= scale);
         let length = dot(mean, mean).sqrt();
-        (total_weight as f32, if length < MIN_MEAN_LENGTH { 0.0 } else { length })
+        // A length that is NaN or infinite is no evidence either.
+        (total_weight as f32, if (MIN_MEAN_LENGTH..f32::INFINITY).contains(&length) { length } else { 0.0 })
     }
 
     /// Returns whether a Gaussian has an embedding.
@@ -184,8 +185,11 @@ impl CellField {
     /// Writes the unit embedding of a Gaussian, or zeros where it has no evidence.
     pub fn embedding(&self, k: usize, table: &RegionTable, out: &mut [f32]) {
         let (_, length) = self.mean(k, table, out);
-        let scale = if length > 0.0 { 1.0 / length } else { 0.0 };
-        out.iter_mut().for_each(|c| *c *= scale);
+        if length > 0.0 {
+            out.iter_mut().for_each(|c| *c *= 1.0 / length);
+        } else {
+            out.fill(0.0);
+        }
     }
 
     /// Returns the cosine of every Gaussian's embedding with a unit query, from the query's score

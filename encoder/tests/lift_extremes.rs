@@ -1,0 +1,316 @@
+//! Embeddings at the extremes: rows of the table in NUMERICS.md, each against the paper's equation in
+//! float64 or a closed form.
+
+mod common;
+
+use common::Random;
+use glam::DVec3;
+use half::f16;
+use slag_common::container::AlignedBytes;
+use slag_common::shard::{Profile, ShardLayout};
+use slag_common::{Gaussians, Hash32};
+use slag_encoder::lift::{CellField, RegionTable, SumEntry, ViewSums};
+use slag_encoder::palette::PaletteSettings;
+use slag_encoder::shard::{self, cells};
+
+const DIM: usize = 512;
+
+/// Below this length of the mean vector a Gaussian has no evidence.
+const MIN_MEAN_LENGTH: f64 = 1e-3;
+
+fn uniform(random: &mut Random) -> f64 {
+    random.below(1 << 30) as f64 / f64::from(1 << 30)
+}
+
+fn length(vector: &[f64]) -> f64 {
+    vector.iter().map(|c| c * c).sum::<f64>().sqrt()
+}
+
+fn unit(vector: &[f64]) -> Vec<f64> {
+    let length = length(vector);
+    vector.iter().map(|c| c / length).collect()
+}
+
+fn direction(random: &mut Random) -> Vec<f64> {
+    unit(&(0..DIM).map(|_| uniform(random) - 0.5).collect::<Vec<_>>())
+}
+
+/// One Gaussian's weights over regions of one mask each.
+struct Seen {
+    vectors: Vec<Vec<f32>>,
+    weights: Vec<f32>,
+}
+
+impl Seen {
+    fn field(&self) -> (CellField, RegionTable) {
+        let view = ViewSums {
+            dim: DIM,
+            mask_vectors: self.vectors.concat(),
+            masks_of_region: (0..self.vectors.len() as u32).map(|mask| vec![mask]).collect(),
+            entries_of_cell: Vec::new(),
+        };
+        let mut table = RegionTable::new(DIM);
+        table.append(&view);
+        let entry =
+            |(region, weight): (usize, &f32)| SumEntry { local: 0, region: region as u32, weight: *weight };
+        let entries: Vec<SumEntry> = self.weights.iter().enumerate().map(entry).collect();
+        (CellField::new(vec![0], &entries, &table), table)
+    }
+
+    /// Returns the mean vector and the total weight, in float64.
+    fn truth(&self) -> (Vec<f64>, f64) {
+        let total: f64 = self.weights.iter().map(|w| f64::from(*w)).sum();
+        let component = |c: usize| {
+            let terms = self.vectors.iter().zip(&self.weights).map(|(v, w)| f64::from(*w) * f64::from(v[c]));
+            terms.sum::<f64>() / total
+        };
+        ((0..DIM).map(component).collect(), total)
+    }
+
+    /// Returns the errors of the total weight (relative), of the mean length, of the unit embedding and of
+    /// its cosine with a query, the last two times the mean length; `None` where there is no evidence.
+    fn errors(&self, query: &[f64]) -> Option<[f64; 4]> {
+        let (field, table) = self.field();
+        let (mean, total) = self.truth();
+        let query_f32: Vec<f32> = query.iter().map(|c| *c as f32).collect();
+        let cosine = field.cosines(&table.scores(&query_f32))[0];
+        let mut embedding = vec![f32::NAN; DIM];
+        field.embedding(0, &table, &mut embedding);
+        assert!(embedding.iter().all(|c| c.is_finite()));
+        assert!(field.mean_lengths[0].is_finite());
+        if !field.has_evidence(0) {
+            assert!(cosine.is_nan() && embedding.iter().all(|c| *c == 0.0));
+            return None;
+        }
+        let (true_length, expected) = (length(&mean), unit(&mean));
+        let difference: Vec<f64> = embedding.iter().zip(&expected).map(|(a, b)| f64::from(*a) - b).collect();
+        let true_cosine: f64 = expected.iter().zip(&query_f32).map(|(e, q)| e * f64::from(*q)).sum();
+        Some([
+            (f64::from(field.total_weights[0]) / total - 1.0).abs(),
+            (f64::from(field.mean_lengths[0]) - true_length).abs(),
+            length(&difference) * true_length,
+            (f64::from(cosine) - true_cosine).abs() * true_length,
+        ])
+    }
+}
+
+fn to_f32(vector: &[f64]) -> Vec<f32> {
+    vector.iter().map(|c| *c as f32).collect()
+}
+
+fn print(row: &str, range: &str, worst: [f64; 4], claimed: f64) {
+    let [total, mean, embedding, cosine] = worst;
+    println!(
+        "| {row} | {range} | total {total:.1e}, mean length {mean:.1e}, embedding x length {embedding:.1e}, \
+         cosine x length {cosine:.1e} | claimed {claimed:.0e} |"
+    );
+    assert!(worst.iter().all(|error| *error <= claimed), "{row}: {worst:?}");
+    assert!(total <= 1e-7, "{row}: a total is f64 rounded to f32, off by {total}");
+}
+
+fn worst_of(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
+    std::array::from_fn(|i| a[i].max(b[i]))
+}
+
+/// Two masks at an angle have a mean of length cos(angle / 2): what is left of antiparallel ones is noise.
+#[test]
+fn parallel_and_antiparallel_vectors() {
+    let random = &mut Random(1);
+    let (mut worst, mut n_flagged) = ([0.0; 4], 0);
+    let from_pi = [0.0, 1e-7, 1e-5, 1e-4, 1e-3, 1.9e-3, 2.1e-3, 1e-2, 0.1];
+    let angles =
+        [0.0, 1e-7, 1e-5, 1e-3, 0.1, 1.0, 2.0].into_iter().chain(from_pi.map(|d| std::f64::consts::PI - d));
+    for angle in angles {
+        for _ in 0..20 {
+            let a = direction(random);
+            let other = direction(random);
+            let along: f64 = a.iter().zip(&other).map(|(x, y)| x * y).sum();
+            let b = unit(&other.iter().zip(&a).map(|(y, x)| y - along * x).collect::<Vec<_>>());
+            let (sin, cos) = f64::sin_cos(angle);
+            let turned: Vec<f64> = a.iter().zip(&b).map(|(x, y)| cos * x + sin * y).collect();
+            let weight = (0.01 + 1e4 * uniform(random)) as f32;
+            let seen = Seen { vectors: vec![to_f32(&a), to_f32(&turned)], weights: vec![weight; 2] };
+            match seen.errors(&direction(random)) {
+                Some(errors) => worst = worst_of(worst, errors),
+                None => n_flagged += 1,
+            }
+            let is_clear = (angle / 2.0).cos() > MIN_MEAN_LENGTH;
+            assert_eq!(seen.field().0.has_evidence(0), is_clear, "angle {angle}");
+        }
+    }
+    assert_eq!(n_flagged, 6 * 20);
+    print("parallel to antiparallel", "angles 0 to pi", worst, 1e-6);
+}
+
+/// Pairs of opposite vectors in random order cancel exactly; a vector of known weight remains.
+#[test]
+fn masks_that_disagree() {
+    let random = &mut Random(2);
+    let mut worst = [0.0; 4];
+    // Shares of the whole that do not cancel, about the limit below which there is no evidence.
+    for (share, has_evidence) in [(0.0, false), (1e-6, false), (9e-4, false), (1.1e-3, true), (1e-2, true)] {
+        for n_pairs in [1, 30, 1000] {
+            let mut terms: Vec<(Vec<f32>, f32)> = Vec::new();
+            for _ in 0..n_pairs {
+                let vector = to_f32(&direction(random));
+                let weight = 10.0_f64.powf(uniform(random) * 6.0 - 1.0) as f32;
+                let opposite = vector.iter().map(|c| -c).collect();
+                terms.push((vector, weight));
+                terms.insert(random.below(terms.len()), (opposite, weight));
+            }
+            let total: f64 = terms.iter().map(|t| f64::from(t.1)).sum();
+            terms.push((to_f32(&direction(random)), (share * total) as f32));
+            let (vectors, weights) = terms.into_iter().unzip();
+            let errors = Seen { vectors, weights }.errors(&direction(random));
+            assert_eq!(errors.is_some(), has_evidence, "{share} of {n_pairs} pairs remain");
+            worst = worst_of(worst, errors.unwrap_or_default());
+        }
+    }
+    print("cancellation", "2 to 2,001 masks, weights to 1e5, 0 to 1e-2 remain", worst, 1e-6);
+}
+
+/// A Gaussian seen in 16,384 views at 65,536 pixels each: 2^30 pixels in all.
+#[test]
+fn a_billion_pixels_over_many_views() {
+    let random = &mut Random(3);
+    let masks: Vec<Vec<f32>> = (0..7).map(|_| to_f32(&direction(random))).collect();
+    let n_views = 1 << 14;
+    let vectors = (0..n_views).map(|_| masks[random.below(7)].clone()).collect();
+    let weights: Vec<f32> = (0..n_views).map(|_| (65536.0 * (0.5 + uniform(random))) as f32).collect();
+    let n_px: f64 = weights.iter().map(|w| f64::from(*w)).sum();
+    assert!(n_px > 1e9);
+    let errors = Seen { vectors, weights }.errors(&direction(random)).expect("evidence");
+    print("sums of views", "16,384 views, 1.07e9 pixels", errors, 1e-5);
+}
+
+/// What a model must not give and the models' crate refuses: no evidence, never a NaN in the field.
+#[test]
+fn vectors_that_are_no_numbers_are_no_evidence() {
+    for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX] {
+        let mut vector = vec![0.1; DIM];
+        vector[7] = bad;
+        let seen = Seen { vectors: vec![vector, vec![0.04; DIM]], weights: vec![3.0, 2.0] };
+        assert_eq!(seen.errors(&vec![0.04; DIM]), None, "{bad}");
+    }
+}
+
+/// Returns the exact shard of a scene of one cell, in which each Gaussian shows one mask.
+fn exact_shard(vectors: &[Vec<f32>], means_in_world: Vec<DVec3>) -> AlignedBytes {
+    let n = vectors.len();
+    let scene = Gaussians {
+        means_in_world,
+        rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n],
+        scales: vec![[0.1; 3]; n],
+        opacities: vec![0.5; n],
+        sh_dc: vec![[0.0; 3]; n],
+        ..Gaussians::default()
+    };
+    let split = cells::split(&scene, cells::CellLimits { max_gaussians: n, max_width: None });
+    let cell = &split.cells[0];
+    let view = ViewSums {
+        dim: DIM,
+        mask_vectors: vectors.concat(),
+        masks_of_region: (0..n as u32).map(|mask| vec![mask]).collect(),
+        entries_of_cell: Vec::new(),
+    };
+    let mut table = RegionTable::new(DIM);
+    table.append(&view);
+    let entry = |i: usize| SumEntry { local: split.local_of_gaussian[i], region: i as u32, weight: 2.0 };
+    let entries: Vec<SumEntry> = (0..n).map(entry).collect();
+    let field = CellField::new(cell.gaussians.clone(), &entries, &table);
+    let settings = PaletteSettings::default();
+    let built = shard::build(&scene, 0, cell, &field, &table, Hash32([0; 32]), &settings);
+    let exact = built.shards.iter().find(|(profile, _)| *profile == Profile::Exact);
+    AlignedBytes::copy_of(&exact.expect("there is one").1)
+}
+
+/// Components from 1 down to 1e-12 lie in the shard as f16: half a step of 2^-11, below 2^-14 half a
+/// step of 2^-24, and zero in the end.
+#[test]
+fn embeddings_stored_as_f16() {
+    let random = &mut Random(4);
+    let n = 300;
+    let vectors: Vec<Vec<f32>> = (0..n)
+        .map(|i| {
+            // Every tenth is a unit axis, so that 1 itself is met.
+            let raw = (0..DIM).map(|c| match (i % 10 == 0, c == i) {
+                (true, is_axis) => f64::from(u8::from(is_axis)),
+                _ => (1.0 - 2.0 * random.below(2) as f64) * 10.0_f64.powf(-12.0 * uniform(random)),
+            });
+            to_f32(&unit(&raw.collect::<Vec<_>>()))
+        })
+        .collect();
+    let means = (0..n).map(|i| DVec3::new(i as f64, 0.0, 1.0)).collect();
+    let bytes = exact_shard(&vectors, means);
+    let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
+    let exact = shard.exact.expect("exact");
+    assert_eq!(exact.input_indices.len(), n);
+    let (mut worst_step, mut worst_vector, mut n_zero, mut n_subnormal) = (0.0_f64, 0.0_f64, 0, 0);
+    for (stored, input) in exact.embeddings.chunks_exact(DIM).zip(exact.input_indices) {
+        let expected: Vec<f64> = vectors[*input as usize].iter().map(|c| f64::from(*c)).collect();
+        let difference: Vec<f64> =
+            stored.iter().zip(&expected).map(|(s, e)| f64::from(s.to_f64()) - e).collect();
+        assert!(stored.iter().all(|c| c.is_finite()));
+        for (difference, expected) in difference.iter().zip(&expected) {
+            let half_step = (expected.abs() * 2.0_f64.powi(-11)).max(2.0_f64.powi(-25));
+            // Beyond the half step is the f32 rounding of the mean and of its length.
+            worst_step = worst_step.max((difference.abs() - 4e-7 * expected.abs()) / half_step);
+        }
+        worst_vector = worst_vector.max(length(&difference));
+        n_zero += stored.iter().zip(&expected).filter(|(s, e)| **s == f16::ZERO && **e != 0.0).count();
+        n_subnormal += stored.iter().filter(|s| !s.is_normal() && **s != f16::ZERO).count();
+    }
+    assert!(n_zero > 1000 && n_subnormal > 1000, "underflow must be met");
+    println!(
+        "| f16 embeddings | components 1e-12 to 1 | {worst_step:.3} half steps, vector {worst_vector:.1e} | claimed 1, 5e-4 |"
+    );
+    assert!(worst_step <= 1.0 && worst_vector <= 5e-4, "{worst_step} {worst_vector}");
+}
+
+/// Rows stand for their members to the stated radius, positions are right to half a step.
+#[test]
+fn shards_keep_their_bounds() {
+    let random = &mut Random(5);
+    let centres: Vec<Vec<f64>> = (0..8).map(|_| direction(random)).collect();
+    let n = 3000;
+    let vectors: Vec<Vec<f32>> = (0..n)
+        .map(|i| {
+            let noise = direction(random);
+            to_f32(&unit(&centres[i % 8].iter().zip(&noise).map(|(c, n)| c + 0.3 * n).collect::<Vec<_>>()))
+        })
+        .collect();
+    // A cell of 25 m, 1,000 km from the origin.
+    let means: Vec<DVec3> =
+        (0..n).map(|_| DVec3::from_array(std::array::from_fn(|_| 1e6 + 25.0 * uniform(random)))).collect();
+    let bytes = exact_shard(&vectors, means.clone());
+    let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
+    let input = |i: usize| shard.exact.expect("exact").input_indices[i] as usize;
+    let half_step = DVec3::from(shard.header.position_step) / 2.0;
+    let offsets =
+        (0..n).map(|i| ((shard.position_in_world(i) - means[input(i)]) / half_step).abs().max_element());
+    let position = offsets.fold(0.0, f64::max);
+
+    let (mut nearest, mut farthest, mut score) = (f64::INFINITY, 0.0_f64, 0.0_f64);
+    let queries: Vec<Vec<f64>> = centres.iter().cloned().chain((0..20).map(|_| direction(random))).collect();
+    for row in 0..shard.radii.len() {
+        let stored: Vec<f64> = shard.palette[row * DIM..][..DIM].iter().map(|c| c.to_f64()).collect();
+        let radius = f64::from(shard.radii[row]);
+        let mut largest = 0.0_f64;
+        for member in shard.members(row) {
+            let difference: Vec<f64> =
+                vectors[input(member)].iter().zip(&stored).map(|(v, s)| f64::from(*v) - s).collect();
+            largest = largest.max(length(&difference));
+            for query in &queries {
+                let off: f64 = difference.iter().zip(query).map(|(d, q)| d * q).sum();
+                score = score.max(off.abs() / radius);
+            }
+        }
+        (nearest, farthest) = (nearest.min(radius / largest), farthest.max(radius / largest));
+    }
+    println!(
+        "| shards | 25 m cell 1e6 m away, {} rows | position {position:.6} half steps, radius over distance {nearest:.6} \
+         to {farthest:.6}, score {score:.3} radii |",
+        shard.radii.len()
+    );
+    assert!(position <= 1.0 + 1e-5 && nearest >= 1.0 && farthest <= 1.001 && score <= 1.0);
+}

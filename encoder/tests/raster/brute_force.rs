@@ -1,0 +1,231 @@
+//! Sums, drawings and their invariants on random scenes, against brute force and each other.
+
+use std::collections::BTreeMap;
+
+use glam::DVec3;
+use slag_common::{Distortion, Gaussians};
+use slag_encoder::raster::{Drawing, RasterError, RasterView, ViewWeights, WeightKind};
+use slag_encoder::segment::{NO_REGION, RegionMap};
+
+use crate::backends::{Backend, backends};
+use crate::oracle;
+use crate::scenes::{Random, random_regions, random_scene, random_view};
+use crate::table::{Case, KINDS, Row};
+
+const SIZES_PX: [(u32, u32); 7] = [(1, 1), (16, 16), (17, 15), (5, 40), (33, 31), (64, 48), (70, 3)];
+
+#[test]
+fn weights_are_those_of_brute_force() {
+    let cases = SIZES_PX.into_iter().enumerate().map(|(seed, (width, height))| {
+        let random = &mut Random(seed as u64);
+        let view = random_view(random, width, height);
+        let scene = random_scene(random, 400, &view, 0);
+        let regions = random_regions(random, &view, 9);
+        Case::new(scene, view, regions)
+    });
+    let row =
+        Row { name: "random scenes", range: "400 Gaussians, 1x1 to 70x3 px", claimed: 1e-5, unit_px: 1.0 };
+    row.check(&cases.collect::<Vec<_>>());
+}
+
+#[test]
+fn drawings_are_those_of_brute_force() {
+    for Backend { rasterizer, bound_factor, cut_tolerance, .. } in backends() {
+        for (seed, (width, height)) in SIZES_PX.into_iter().enumerate() {
+            let random = &mut Random(seed as u64);
+            let view = random_view(random, width, height);
+            let scene = random_scene(random, 300, &view, (seed % 4) as u8);
+            let background = [0.1, 0.7, 1.0];
+            let found = rasterizer.draw(&scene, &view, background).unwrap();
+            let n_px = (width * height) as usize;
+            let (mut rgb, mut alpha, mut depth) = (vec![DVec3::ZERO; n_px], vec![0.0; n_px], vec![0.0; n_px]);
+            let mut is_on_a_cut = vec![false; n_px];
+            oracle::each_weight(
+                &scene,
+                &view,
+                WeightKind::Blend,
+                *cut_tolerance,
+                |gaussian, pixel, weight| {
+                    rgb[pixel] += weight.value * oracle::colour(&scene, gaussian.index, &view);
+                    alpha[pixel] += weight.value;
+                    depth[pixel] += weight.value * gaussian.depth;
+                    is_on_a_cut[pixel] |= weight.high - weight.low > 1e-3 * weight.high;
+                },
+            );
+            assert!(is_on_a_cut.iter().filter(|is| **is).count() * 10 <= n_px, "{width}x{height}");
+            for pixel in (0..n_px).filter(|pixel| !is_on_a_cut[*pixel]) {
+                let expected = rgb[pixel] + (1.0 - alpha[pixel]) * DVec3::new(0.1, 0.7, 1.0);
+                for c in 0..3 {
+                    let difference = (f64::from(found.rgb[pixel * 3 + c]) - expected[c]).abs();
+                    assert!(difference < 3e-6 * bound_factor, "{width}x{height} pixel {pixel}: {difference}");
+                }
+                assert!((f64::from(found.coverage[pixel]) - alpha[pixel]).abs() < 1e-6 * bound_factor);
+                let expected = if alpha[pixel] > 0.0 { depth[pixel] / alpha[pixel] } else { 0.0 };
+                let difference = (f64::from(found.depth[pixel]) - expected).abs();
+                assert!(difference < 1e-5 * bound_factor, "{width}x{height} pixel {pixel}: {difference}");
+            }
+        }
+    }
+}
+
+#[test]
+fn the_number_of_threads_does_not_change_a_bit() {
+    for Backend { rasterizer, .. } in backends() {
+        let random = &mut Random(5);
+        let view = random_view(random, 150, 130);
+        let scene = random_scene(random, 20_000, &view, 1);
+        let regions = random_regions(random, &view, 300);
+        let with_threads = |n| -> (Vec<ViewWeights>, Drawing) {
+            rayon::ThreadPoolBuilder::new().num_threads(n).build().unwrap().install(|| {
+                (
+                    KINDS.map(|kind| rasterizer.weights(&scene, &view, &regions, kind).unwrap()).into(),
+                    rasterizer.draw(&scene, &view, [0.5; 3]).unwrap(),
+                )
+            })
+        };
+        let one = with_threads(1);
+        assert!(one.0[0].entries.len() > 1000);
+        assert_eq!(one, with_threads(2));
+        assert_eq!(one, with_threads(5));
+    }
+}
+
+/// Sums over a coarser partition are the sums of its parts: to the fixed point's 2^-33 a part and
+/// tile, and the final rounding to `f32`.
+#[test]
+fn sums_over_regions_add_up() {
+    for Backend { rasterizer, .. } in backends() {
+        let random = &mut Random(6);
+        let view = random_view(random, 100, 90);
+        let scene = random_scene(random, 3000, &view, 0);
+        let fine = random_regions(random, &view, 200);
+        let coarse_of = |region: u32| if region == NO_REGION { NO_REGION } else { region % 4 };
+        let coarse = RegionMap {
+            region_of_pixel: fine.region_of_pixel.iter().map(|&r| coarse_of(r)).collect(),
+            n_regions: 4,
+            ..fine
+        };
+        for kind in KINDS {
+            let mut sums = BTreeMap::<_, f64>::new();
+            let mut n_parts = BTreeMap::<_, usize>::new();
+            for entry in rasterizer.weights(&scene, &view, &fine, kind).unwrap().entries {
+                let key = (entry.gaussian, coarse_of(entry.region));
+                *sums.entry(key).or_default() += f64::from(entry.weight);
+                *n_parts.entry(key).or_default() += 1;
+            }
+            let found = rasterizer.weights(&scene, &view, &coarse, kind).unwrap().entries;
+            assert_eq!(found.len(), sums.len());
+            assert!(n_parts.values().any(|&n| n > 10));
+            for entry in found {
+                let key = (entry.gaussian, entry.region);
+                let weight = f64::from(entry.weight);
+                let allowed = weight * 2.0_f64.powi(-23) + 42.0 * 50.0 * 2.0_f64.powi(-33);
+                assert!((weight - sums[&key]).abs() <= allowed, "{key:?}: {weight} {}", sums[&key]);
+            }
+        }
+    }
+}
+
+#[test]
+fn nothing_to_see_is_no_error() {
+    for Backend { rasterizer, .. } in backends() {
+        let random = &mut Random(7);
+        let view = random_view(random, 20, 20);
+        let regions = random_regions(random, &view, 3);
+        let mut behind = random_scene(random, 50, &view, 0);
+        let world_from_camera = view.camera_from_world.inverse();
+        behind.means_in_world.fill(world_from_camera.transform_point3(DVec3::new(0.1, 0.0, -4.0)));
+        for scene in [Gaussians::default(), behind] {
+            for kind in KINDS {
+                assert_eq!(
+                    rasterizer.weights(&scene, &view, &regions, kind).unwrap(),
+                    ViewWeights::default()
+                );
+            }
+            let drawing = rasterizer.draw(&scene, &view, [0.25; 3]).unwrap();
+            assert!(drawing.rgb.iter().all(|&c| c == 0.25));
+            assert!(drawing.depth.iter().chain(&drawing.coverage).all(|&v| v == 0.0));
+        }
+    }
+}
+
+/// Broken rows are counted, and change nothing for the others.
+#[test]
+fn unusable_gaussians_are_skipped_and_counted() {
+    for Backend { rasterizer, .. } in backends() {
+        let random = &mut Random(8);
+        let view = random_view(random, 40, 40);
+        let mut scene = random_scene(random, 100, &view, 1);
+        let regions = random_regions(random, &view, 3);
+        let without = |scene: &Gaussians| {
+            let mut scene = scene.clone();
+            scene.opacities[..7].fill(0.0);
+            rasterizer.weights(&scene, &view, &regions, WeightKind::Blend).unwrap()
+        };
+        let expected = without(&scene);
+        scene.means_in_world[0].y = f64::NAN;
+        scene.means_in_world[1].x = f64::INFINITY;
+        scene.rotations_wxyz[2] = [0.0; 4];
+        scene.scales[3][1] = f32::NAN;
+        scene.opacities[4] = f32::NAN;
+        scene.sh_dc[5][0] = f32::INFINITY;
+        scene.scales[6] = [f32::MAX; 3];
+        scene.means_in_world[6] = view.camera_from_world.inverse().transform_point3(DVec3::Z);
+        scene.opacities[6] = 0.5;
+        // A broken higher coefficient costs the Gaussian its colour, no more.
+        scene.sh_rest[9 * 50] = f32::NAN;
+        let found = rasterizer.weights(&scene, &view, &regions, WeightKind::Blend).unwrap();
+        assert_eq!(found.counters.unusable, 7);
+        assert_eq!(found.entries, expected.entries);
+        let drawing = rasterizer.draw(&scene, &view, [0.0; 3]).unwrap();
+        assert!(drawing.rgb.iter().all(|c| c.is_finite()));
+    }
+}
+
+#[test]
+fn contradictions_are_errors() {
+    for Backend { rasterizer, .. } in backends() {
+        let random = &mut Random(9);
+        let view = random_view(random, 20, 10);
+        let scene = random_scene(random, 5, &view, 1);
+        let regions = random_regions(random, &view, 3);
+        let error = |scene: &Gaussians, view: &RasterView, regions: &RegionMap| {
+            rasterizer.weights(scene, view, regions, WeightKind::Blend).unwrap_err()
+        };
+        let short = Gaussians { sh_rest: vec![0.0; 44], ..scene.clone() };
+        assert_eq!(
+            error(&short, &view, &regions),
+            RasterError::ColumnLength { column: "sh_rest", expected: 45, found: 44 }
+        );
+        let of_degree_4 = Gaussians { sh_degree: 4, ..scene.clone() };
+        assert_eq!(error(&of_degree_4, &view, &regions), RasterError::ShDegree { found: 4 });
+
+        let with = |change: fn(&mut RasterView)| {
+            let mut view = view;
+            change(&mut view);
+            error(&scene, &view, &regions)
+        };
+        assert!(matches!(with(|v| v.intrinsics.width_px = 0), RasterError::ImageSize { .. }));
+        assert!(matches!(with(|v| v.intrinsics.height_px = u32::MAX), RasterError::ImageSize { .. }));
+        assert!(matches!(with(|v| v.intrinsics.focal_x_px = 0.0), RasterError::Camera { .. }));
+        assert!(matches!(with(|v| v.intrinsics.centre_y_px = f64::NAN), RasterError::Camera { .. }));
+        assert!(
+            matches!(with(|v| v.camera_from_world.matrix3 *= 2.0), RasterError::Pose { off } if off > 2.9)
+        );
+        assert!(
+            matches!(with(|v| v.camera_from_world.matrix3 *= -1.0), RasterError::Pose { off } if off.is_infinite())
+        );
+        assert!(
+            matches!(with(|v| v.camera_from_world.translation.x = f64::NAN), RasterError::Pose { off } if off.is_nan())
+        );
+        assert!(matches!(with(|v| v.intrinsics.width_px = 21), RasterError::RegionMapSize { .. }));
+        let fisheye = with(|v| v.intrinsics.distortion = Distortion::Fisheye { k: [0.0; 4] });
+        assert_eq!(fisheye, RasterError::Distorted);
+
+        let mut wrong = regions.clone();
+        wrong.region_of_pixel[33] = 3;
+        assert_eq!(error(&scene, &view, &wrong), RasterError::Region { pixel: 33, found: 3, n_regions: 3 });
+        wrong.region_of_pixel.pop();
+        assert!(matches!(error(&scene, &view, &wrong), RasterError::RegionMapSize { found_values: 199, .. }));
+    }
+}
