@@ -248,8 +248,7 @@ fn embeddings_stored_as_f16() {
     let (mut worst_step, mut worst_vector, mut n_zero, mut n_subnormal) = (0.0_f64, 0.0_f64, 0, 0);
     for (stored, input) in exact.embeddings.chunks_exact(DIM).zip(exact.input_indices) {
         let expected: Vec<f64> = vectors[*input as usize].iter().map(|c| f64::from(*c)).collect();
-        let difference: Vec<f64> =
-            stored.iter().zip(&expected).map(|(s, e)| f64::from(s.to_f64()) - e).collect();
+        let difference: Vec<f64> = stored.iter().zip(&expected).map(|(s, e)| s.to_f64() - e).collect();
         assert!(stored.iter().all(|c| c.is_finite()));
         for (difference, expected) in difference.iter().zip(&expected) {
             let half_step = (expected.abs() * 2.0_f64.powi(-11)).max(2.0_f64.powi(-25));

@@ -158,6 +158,42 @@ fn logits() {
     Row { name: "logits", range, claimed: 1e-5, unit_px: 1.0 }.check(&read);
 }
 
+/// Pixels on the very edge of both cuts, a few steps of f32 to either side; beside them a Gaussian in
+/// the middle of nothing, so that what lies on a cut is a small share.
+#[test]
+fn on_the_cuts() {
+    let steps = |value: f32, n: i32| f64::from(f32::from_bits(value.to_bits().wrapping_add_signed(n)));
+    let cases = cases(
+        8,
+        [48, 32],
+        |_| 50.0,
+        |scene, view, random| {
+            for i in 0..20 {
+                let (x, y) = (f64::from(4 * (i % 5)) + 2.5, f64::from(4 * (i / 5)) + 2.5);
+                let (dx, dy) = (random.between(0.0, 0.05), random.between(0.0, 0.05));
+                // Without an extent of its own a Gaussian has the variance of the blur.
+                let falloff = (-0.5 * (dx * dx + dy * dy) / 0.3).exp();
+                let mut layer = |depth: f64, alpha: f64| {
+                    let mean = unproject(view, x + dx, y + dy, depth);
+                    push(scene, view, random, mean, [1e-6; 3], alpha / falloff);
+                };
+                let n = i % 7 - 3;
+                if i % 2 == 0 {
+                    layer(1.0, steps(1.0 / 255.0, n));
+                } else {
+                    // 0.01 of the light goes through each; what is behind sees all or nothing of the rest.
+                    layer(1.0, f64::from(0.99_f32));
+                    layer(2.0, steps(0.99, n));
+                    layer(3.0, 0.5);
+                }
+            }
+            push(scene, view, random, unproject(view, 36.0, 20.0, 1.0), [0.2; 3], 0.9);
+        },
+    );
+    let range = "alpha within 3 steps of f32 of 1/255, transmittance of 1e-4";
+    Row { name: "on the cuts", range, claimed: 1e-5, unit_px: 1e-2 }.check(&cases);
+}
+
 /// Sums are compared relative to themselves: 2,300 layers of alpha 1/255 leave the last one 1e-4.
 #[test]
 fn pile() {
