@@ -4,11 +4,11 @@
 // that the pixels of a region lie one after another: the second half of each step then adds up runs,
 // 32 threads a Gaussian, whatever the number of regions.
 
-struct Entry {
-    member: u32,
-    region: u32,
-    // In units of 2^-TILE_FRACTION_BITS.
-    sum: u32,
+// Returns by how many bits the sums of a Gaussian in a tile are finer than 2^-TILE_FRACTION_BITS: none of
+// its weights is above `bound`, so as many leading bits of a sum stay 0.
+fn extra_bits(bound: f32) -> u32 {
+    let exponent = i32(bitcast<u32>(bound) >> 23u) - 127;
+    return u32(clamp(-(exponent + 1), 0, i32(MAX_EXTRA_BITS)));
 }
 
 @group(0) @binding(0) var<storage, read> view: View;
@@ -31,7 +31,7 @@ const WEIGHTS_STRIDE = WORKGROUP_SIZE + WORKGROUP_SIZE / RUN;
 const N_SUMS = 2048u;
 const NO_SLOT = 0xffffu;
 const PIXEL_BITS = 8u;
-const NO_REGION_KEY = 0xffffffu;
+const NO_REGION_KEY = (1u << REGION_BITS) - 1u;
 
 var<workgroup> pixel_keys: array<u32, WORKGROUP_SIZE>;
 var<workgroup> slots: array<u32, WORKGROUP_SIZE>;
@@ -43,6 +43,9 @@ var<workgroup> n_slots_shared: u32;
 var<workgroup> range_shared: vec2<u32>;
 var<workgroup> n_live: atomic<u32>;
 var<workgroup> n_live_shared: u32;
+// Bits of the largest transmittance of a live pixel; positive, so they order as it does.
+var<workgroup> most_light: atomic<u32>;
+var<workgroup> most_light_shared: f32;
 var<workgroup> n_found: atomic<u32>;
 var<workgroup> first_entry: u32;
 
@@ -99,6 +102,7 @@ fn sum_regions(
         range_shared = vec2<u32>(range.start, min(range.end, view.capacity_pairs));
         atomicStore(&n_live, 0u);
         atomicStore(&n_found, 0u);
+        atomicStore(&most_light, bitcast<u32>(1.0));
     }
     for (var i = thread; i < N_SUMS; i += WORKGROUP_SIZE) {
         atomicStore(&sums[i], 0u);
@@ -134,11 +138,13 @@ fn sum_regions(
         }
         if thread == 0u {
             n_live_shared = atomicLoad(&n_live);
+            most_light_shared = bitcast<f32>(atomicExchange(&most_light, 0u));
         }
         // A barrier, too: the Gaussians are there.
         if workgroupUniformLoad(&n_live_shared) == 0u {
             break;
         }
+        let light = select(most_light_shared, 1.0, is_falloff);
         let n_loaded = min(per_round, range.y - start);
         for (var step = 0u; step < n_loaded; step += STEP) {
             for (var i = 0u; i < STEP; i++) {
@@ -170,33 +176,39 @@ fn sum_regions(
             workgroupBarrier();
             let first_weight = of_step * WEIGHTS_STRIDE + run * (RUN + 1u);
             let first_sum = (step + of_step) * n_slots;
+            let bound = select(gaussians[step + of_step].opacity, 1.0, is_falloff) * light;
+            // 2 to that power.
+            let scale = bitcast<f32>((127u + TILE_FRACTION_BITS + extra_bits(bound)) << 23u);
             var sum = 0.0;
             var slot_of_run = slots[run * RUN];
             for (var i = 0u; i < RUN; i++) {
                 let slot_of_pixel = slots[run * RUN + i];
                 if slot_of_pixel != slot_of_run {
-                    add(first_sum, slot_of_run, sum);
+                    add(first_sum, slot_of_run, sum * scale);
                     sum = 0.0;
                     slot_of_run = slot_of_pixel;
                 }
                 sum += weights[first_weight + i];
             }
-            add(first_sum, slot_of_run, sum);
+            add(first_sum, slot_of_run, sum * scale);
             workgroupBarrier();
         }
-        write_entries(n_loaded, n_slots, thread);
+        if is_live {
+            atomicMax(&most_light, bitcast<u32>(transmittance));
+        }
+        write_entries(n_loaded, n_slots, select(light, -1.0, is_falloff), thread);
     }
 }
 
 fn add(first_sum: u32, slot: u32, sum: f32) {
     if slot != NO_SLOT && sum > 0.0 {
-        atomicAdd(&sums[first_sum + slot], u32(round(sum * TILE_SCALE)));
+        atomicAdd(&sums[first_sum + slot], u32(round(sum)));
     }
 }
 
 // Appends what was summed to the entries, and clears the sums. The order in which tiles append does not
 // matter: entries are sorted, and whole numbers added, before anything is read.
-fn write_entries(n_loaded: u32, n_slots: u32, thread: u32) {
+fn write_entries(n_loaded: u32, n_slots: u32, light: f32, thread: u32) {
     var n_own = 0u;
     for (var i = thread; i < n_loaded * n_slots; i += WORKGROUP_SIZE) {
         n_own += u32(atomicLoad(&sums[i]) > 0u);
@@ -216,7 +228,9 @@ fn write_entries(n_loaded: u32, n_slots: u32, thread: u32) {
             let sum = atomicLoad(&sums[i]);
             if sum > 0u {
                 if at < view.capacity_entries {
-                    entries[at] = Entry(gaussians[i / n_slots].member, region_of_slot[i % n_slots], sum);
+                    let g = gaussians[i / n_slots];
+                    let bits = extra_bits(select(g.opacity * light, 1.0, light < 0.0));
+                    entries[at] = Entry(g.member, region_of_slot[i % n_slots] | (bits << REGION_BITS), sum);
                 }
                 at += 1u;
                 atomicStore(&sums[i], 0u);

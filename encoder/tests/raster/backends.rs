@@ -2,6 +2,7 @@
 
 use std::sync::OnceLock;
 
+use slag_encoder::raster::gpu::{GpuOptions, GpuRasterizer, Precision, adapters};
 use slag_encoder::raster::{CpuRasterizer, Rasterizer};
 
 /// A rasteriser with what its arithmetic allows.
@@ -20,7 +21,7 @@ pub struct Backend {
 pub fn backends() -> &'static [Backend] {
     static BACKENDS: OnceLock<Vec<Backend>> = OnceLock::new();
     BACKENDS.get_or_init(|| {
-        vec![
+        let mut backends = vec![
             // `u` and `v` are below 32 at the start of a tile where they matter, so off by 6e-6 at most
             // after three roundings of f32, and alpha by 3.4 times that.
             Backend {
@@ -29,6 +30,30 @@ pub fn backends() -> &'static [Backend] {
                 bound_factor: 1.0,
                 cut_tolerance: 2e-5,
             },
-        ]
+        ];
+        let adapter = adapters().into_iter().next();
+        assert!(adapter.is_some() || !gpu_is_expected(), "no adapter: install mesa-vulkan-drivers");
+        match adapter {
+            None => println!("skipped on the GPU: there is none"),
+            Some(adapter) => {
+                for (name, precision, bound_factor, cut_tolerance) in
+                    [("gpu", Precision::F64, 1.0, 2e-5), ("gpu f32", Precision::F32, 1.0, 2e-5)]
+                {
+                    if precision == Precision::F64 && adapter.report.precision == Precision::F32 {
+                        println!("skipped on the GPU in f64: {} has none", adapter.report.name);
+                        continue;
+                    }
+                    let device = adapter.open(precision).expect("the adapter opens");
+                    let rasterizer = Box::new(GpuRasterizer::new(device, GpuOptions::default()));
+                    backends.push(Backend { name, rasterizer, bound_factor, cut_tolerance });
+                }
+            }
+        }
+        backends
     })
+}
+
+/// Returns whether an adapter must be there: the set-up installs one for CI.
+pub fn gpu_is_expected() -> bool {
+    std::env::var("CI").as_deref() == Ok("true")
 }

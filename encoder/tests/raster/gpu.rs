@@ -1,45 +1,169 @@
-//! The GPU against the CPU.
+//! What only a GPU does: cutting into chunks and bands, sharing views, failing.
 
-use std::collections::BTreeMap;
+use slag_encoder::raster::devices::{DeviceChoice, DeviceError, Devices};
+use slag_encoder::raster::gpu::{GpuOptions, GpuRasterizer, adapters};
+use slag_encoder::raster::{
+    CpuRasterizer, LoadedScene, RasterError, RasterView, Rasterizer, ViewWeights, WeightKind,
+};
+use slag_encoder::segment::RegionMap;
 
-use slag_encoder::raster::gpu::{GpuOptions, GpuRasterizer, Precision, adapters};
-use slag_encoder::raster::{CpuRasterizer, Rasterizer, WeightKind};
+use crate::backends::gpu_is_expected;
+use crate::scenes::{Random, random_regions, random_scene, random_view};
 
-use crate::fixtures::{Npz, points, view, widened};
+/// Opens the first adapter in its best precision.
+fn open(options: GpuOptions) -> Option<GpuRasterizer> {
+    let Some(adapter) = adapters().into_iter().next() else {
+        assert!(!gpu_is_expected(), "no adapter: install mesa-vulkan-drivers");
+        println!("skipped: no GPU");
+        return None;
+    };
+    Some(GpuRasterizer::new(adapter.open(adapter.report.precision).unwrap(), options))
+}
+
+fn weights(scene: &dyn LoadedScene, view: &RasterView, regions: &RegionMap) -> ViewWeights {
+    scene.weights(view, regions, WeightKind::Blend).unwrap()
+}
+
+/// The second view is as large as the buffers that the first left behind; later ones are larger.
+const SIZES_PX: [(u32, u32); 4] = [(70, 90), (70, 90), (131, 40), (33, 200)];
 
 #[test]
-fn garden() {
-    let Some(mut npz) = Npz::open("fixtures/gsplat_garden.npz") else { return };
-    let means = points(&npz.array("means"));
-    let scene = npz.scene(means);
-    let (poses, matrices) = (npz.array::<f32>("viewmats"), npz.array::<f32>("Ks"));
-    let adapters = adapters();
-    for a in &adapters {
-        println!("{:?}", a.report);
-    }
-    for precision in [Precision::F64, Precision::F32] {
-        let gpu = GpuRasterizer::new(adapters[0].open(precision).unwrap(), GpuOptions::default());
-        let loaded = gpu.load(&scene).unwrap();
-        for v in 0..3 {
-            let camera = npz.intrinsics(&matrices[v * 9..]);
-            let regions = npz.regions(&camera);
-            let view = view(&widened(&poses[v * 16..][..16]), camera);
-            let start = std::time::Instant::now();
-            let found = loaded.weights(&view, &regions, WeightKind::Blend).unwrap();
-            println!("{precision:?} {:?} {:?}", start.elapsed(), found.counters);
-            let expected = CpuRasterizer.weights(&scene, &view, &regions, WeightKind::Blend).unwrap();
-            println!("cpu {:?} {} {}", expected.counters, found.entries.len(), expected.entries.len());
-            let mut d = BTreeMap::<(u32, u32), f64>::new();
-            for e in &found.entries {
-                *d.entry((e.gaussian, e.region)).or_default() += f64::from(e.weight);
-            }
-            for e in &expected.entries {
-                *d.entry((e.gaussian, e.region)).or_default() -= f64::from(e.weight);
-            }
-            let total: f64 = expected.entries.iter().map(|e| f64::from(e.weight)).sum();
-            let l1: f64 = d.values().map(|v| v.abs()).sum();
-            let max = d.values().fold(0.0_f64, |m, v| m.max(v.abs()));
-            println!("L1 {:e} max {max:e}", l1 / total);
+fn chunks_and_bands_change_no_bit() {
+    let Some(whole) = open(GpuOptions::default()) else { return };
+    let random = &mut Random(20);
+    let view = random_view(random, 70, 90);
+    let scene = random_scene(random, 3000, &view, 0);
+    // 56 bytes a visible Gaussian, 64 a Gaussian: 875 a chunk, and 1,000 visible a band. Of the second,
+    // part of the scene stays on the device, of the third none.
+    let mut n_with_bands = 0;
+    for (max_binding_bytes, max_resident_bytes) in [(56_000, u64::MAX), (90_000, 100_000), (56_000, 0)] {
+        let cut =
+            open(GpuOptions { max_binding_bytes, max_resident_bytes, ..GpuOptions::default() }).unwrap();
+        let (whole, cut) = (whole.load(&scene).unwrap(), cut.load(&scene).unwrap());
+        for (width, height) in SIZES_PX {
+            let mut view = view;
+            (view.intrinsics.width_px, view.intrinsics.height_px) = (width, height);
+            let regions = random_regions(random, &view, 40);
+            let expected = weights(whole.as_ref(), &view, &regions);
+            let has_bands = expected.counters.visible > 1000;
+            println!("{max_binding_bytes} {width}x{height}: bands {has_bands}, {:?}", expected.counters);
+            n_with_bands += usize::from(has_bands);
+            let found = weights(cut.as_ref(), &view, &regions);
+            assert_eq!(found.counters, expected.counters, "{max_binding_bytes}");
+            assert!(found == expected, "{max_binding_bytes} {max_resident_bytes} {width}x{height}");
         }
+        let drawn = |scene: &dyn LoadedScene| scene.draw(&view, [0.1, 0.2, 0.3]).unwrap();
+        assert!(drawn(cut.as_ref()) == drawn(whole.as_ref()));
+    }
+    assert!(n_with_bands > 3);
+}
+
+/// One row of tiles is the least that a device must hold.
+#[test]
+fn too_much_for_a_device_is_an_error_and_falls_to_the_cpu() {
+    let options = GpuOptions { max_binding_bytes: 2000, ..GpuOptions::default() };
+    let Some(tiny) = open(options) else { return };
+    let random = &mut Random(21);
+    let view = random_view(random, 60, 16);
+    let scene = random_scene(random, 2000, &view, 0);
+    let regions = random_regions(random, &view, 3);
+    let error = tiny.weights(&scene, &view, &regions, WeightKind::Blend).unwrap_err();
+    assert!(matches!(error, RasterError::DeviceRoom { .. }), "{error}");
+    let devices = Devices::of(vec![tiny], 2);
+    let found = devices.weights(&scene, &view, &regions, WeightKind::Blend).unwrap();
+    assert_eq!(found, CpuRasterizer.weights(&scene, &view, &regions, WeightKind::Blend).unwrap());
+}
+
+#[test]
+fn the_same_bits_each_time_from_every_thread() {
+    let Some(gpu) = open(GpuOptions { views_in_flight: 2, ..GpuOptions::default() }) else { return };
+    let random = &mut Random(22);
+    let view = random_view(random, 90, 70);
+    let scene = random_scene(random, 4000, &view, 0);
+    let regions = random_regions(random, &view, 100);
+    let loaded = gpu.load(&scene).unwrap();
+    let expected = weights(loaded.as_ref(), &view, &regions);
+    assert!(expected.entries.len() > 1000);
+    std::thread::scope(|scope| {
+        for _ in 0..4 {
+            scope.spawn(|| {
+                for _ in 0..3 {
+                    assert!(weights(loaded.as_ref(), &view, &regions) == expected);
+                }
+            });
+        }
+    });
+}
+
+/// Two devices share; one is lost with views asked for from four threads, then the other.
+#[test]
+fn a_lost_device_loses_no_view() {
+    let (Some(a), Some(b)) = (open(GpuOptions::default()), open(GpuOptions::default())) else { return };
+    let random = &mut Random(23);
+    let views: Vec<RasterView> = (0..6).map(|_| random_view(random, 50, 40)).collect();
+    let scene = random_scene(random, 1500, &views[0], 0);
+    let regions = random_regions(random, &views[0], 12);
+    let expected: Vec<ViewWeights> = views
+        .iter()
+        .map(|view| CpuRasterizer.weights(&scene, view, &regions, WeightKind::Blend).unwrap())
+        .collect();
+    let devices = Devices::of(vec![a, b], 1);
+    let loaded = devices.load(&scene).unwrap();
+    let all = || {
+        std::thread::scope(|scope| {
+            let threads: Vec<_> = (0..4)
+                .map(|_| {
+                    scope.spawn(|| {
+                        views.iter().map(|view| weights(loaded.as_ref(), view, &regions)).collect::<Vec<_>>()
+                    })
+                })
+                .collect();
+            threads.into_iter().flat_map(|thread| thread.join().unwrap()).collect::<Vec<_>>()
+        })
+    };
+    let near = |found: &[ViewWeights]| {
+        for (found, expected) in found.iter().zip(expected.iter().cycle()) {
+            assert_eq!(found.counters, expected.counters);
+            for (a, b) in found.entries.iter().zip(&expected.entries) {
+                assert_eq!((a.gaussian, a.region), (b.gaussian, b.region));
+                assert!((a.weight - b.weight).abs() < 1e-4 * b.weight.max(1.0), "{a:?} {b:?}");
+            }
+        }
+    };
+    let found = all();
+    assert_eq!(found.len(), 24);
+    near(&found);
+    devices.gpus()[0].lose();
+    near(&all());
+    devices.gpus()[1].lose();
+    let found = all();
+    assert!(found.chunks(views.len()).all(|views| views == expected), "the CPU's own bits");
+    // A scene that comes after the loss goes to the CPU, too.
+    assert!(matches!(devices.gpus()[0].load(&scene), Err(RasterError::Device { .. })));
+    assert_eq!(weights(devices.load(&scene).unwrap().as_ref(), &views[0], &regions), expected[0]);
+}
+
+#[test]
+fn choices() {
+    for (text, choice) in [
+        ("auto", DeviceChoice::Auto),
+        ("gpu", DeviceChoice::Gpu),
+        ("cpu", DeviceChoice::Cpu),
+        ("3", DeviceChoice::Adapter(3)),
+    ] {
+        assert_eq!(text.parse(), Ok(choice));
+        assert_eq!(choice.to_string(), text);
+    }
+    assert!("fast".parse::<DeviceChoice>().unwrap_err().contains("\"fast\""));
+    let open = |choice| Devices::open(choice, GpuOptions::default());
+    assert!(open(DeviceChoice::Cpu).unwrap().gpus().is_empty());
+    let error = open(DeviceChoice::Adapter(999)).err().unwrap();
+    assert!(matches!(error, DeviceError::NoSuchAdapter { number: 999, .. }), "{error}");
+    // Imitated GPUs are slower than the CPU itself.
+    let auto = open(DeviceChoice::Auto).unwrap();
+    assert!(auto.gpus().iter().all(|gpu| !gpu.report().is_software()));
+    match open(DeviceChoice::Gpu) {
+        Ok(devices) => assert!(!devices.gpus().is_empty()),
+        Err(error) => assert!(matches!(error, DeviceError::NoAdapter) && !gpu_is_expected(), "{error}"),
     }
 }

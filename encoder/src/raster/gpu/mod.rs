@@ -29,7 +29,7 @@ use crate::segment::RegionMap;
 pub use device::{Adapter, AdapterReport, Device, adapters};
 use layout::{Capacities, RegionSum, SceneGaussian, ViewBlock, screen_layout};
 pub use shader::Precision;
-use shader::{Counter, MAX_DISPATCH, WORKGROUP_SIZE};
+use shader::{Counter, MAX_DISPATCH, REGION_BITS, WORKGROUP_SIZE};
 use workspace::{Band, Counts, PIXEL_BYTES, SCENE_GAUSSIAN_BYTES, SceneChunk, Size, Workspace, band_size};
 
 /// How a device is used.
@@ -109,11 +109,7 @@ impl<'s> GpuScene<'s> {
     fn new(device: Arc<Device>, options: GpuOptions, scene: &'s Gaussians) -> Result<Self, RasterError> {
         device.check()?;
         let usable: Vec<bool> = (0..scene.len()).map(|i| scene.is_usable(i)).collect();
-        let (mut low, mut high) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
-        for (mean, _) in scene.means_in_world.iter().zip(&usable).filter(|(_, usable)| **usable) {
-            (low, high) = (low.min(*mean), high.max(*mean));
-        }
-        let origin_in_world = if low.x <= high.x { low.midpoint(high) } else { DVec3::ZERO };
+        let origin_in_world = middle(scene, &usable);
         let max_binding_bytes = options.max_binding_bytes.min(device.report.max_binding_bytes);
         let per_chunk = (max_binding_bytes / SCENE_GAUSSIAN_BYTES)
             .clamp(1, u64::from(MAX_DISPATCH) * u64::from(WORKGROUP_SIZE)) as usize;
@@ -333,6 +329,24 @@ impl<'s> GpuScene<'s> {
     }
 }
 
+/// Returns a point in the midst of a scene: the median along each axis of a sample, which no outlier moves.
+fn middle(scene: &Gaussians, usable: &[bool]) -> DVec3 {
+    const N_SAMPLES: usize = 4096;
+    let sample: Vec<DVec3> = (0..scene.len())
+        .step_by(scene.len() / N_SAMPLES + 1)
+        .filter(|i| usable[*i])
+        .map(|i| scene.means_in_world[i])
+        .collect();
+    if sample.is_empty() {
+        return DVec3::ZERO;
+    }
+    DVec3::from_array(std::array::from_fn(|axis| {
+        let mut values: Vec<f64> = sample.iter().map(|mean| mean[axis]).collect();
+        values.sort_unstable_by(f64::total_cmp);
+        values[values.len() / 2]
+    }))
+}
+
 /// What a band is of its image.
 struct Rows {
     /// Its pixels.
@@ -341,8 +355,8 @@ struct Rows {
     is_whole: bool,
 }
 
-/// Regions of a view: a region and a pixel of its tile share a word.
-const MAX_REGIONS: u32 = (1 << 24) - 1;
+/// Regions of a view; the number above stands for no region.
+const MAX_REGIONS: u32 = (1 << REGION_BITS) - 1;
 
 impl LoadedScene for GpuScene<'_> {
     fn weights(

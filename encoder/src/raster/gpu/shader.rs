@@ -17,6 +17,11 @@ pub const SORT_BLOCK: u32 = 2048;
 pub const MAX_DISPATCH: u32 = 65_535;
 /// Fraction bits of a sum over a tile: 256 weights of at most 1 fit 32 bits.
 pub const TILE_FRACTION_BITS: u32 = 23;
+/// Bits that the sums of faint Gaussians are finer by, at most. With [`TILE_FRACTION_BITS`] and the
+/// 2^28 pixels of the largest image, 63 bits.
+pub const MAX_EXTRA_BITS: u32 = 12;
+/// Bits of a region's number; a region and a pixel of its tile share a word.
+pub const REGION_BITS: u32 = 24;
 /// No counter.
 pub const NONE: u32 = u32::MAX;
 
@@ -85,6 +90,7 @@ pub fn module_text(stage: &str, precision: Precision) -> String {
         Precision::F32 => (1e18, 1e18),
     };
     let _ = writeln!(text, "alias real = {real};\nalias real3 = vec3<{real}>;\nalias real4 = vec4<{real}>;");
+    let _ = writeln!(text, "const HAS_F64 = {};", precision == Precision::F64);
     for (name, value) in [("ZERO", 0.0), ("HALF", 0.5), ("ONE", 1.0), ("TWO", 2.0)] {
         let _ = writeln!(text, "const {name}: real = real({value:?});");
     }
@@ -103,7 +109,6 @@ pub fn module_text(stage: &str, precision: Precision) -> String {
         ("MAX_ALPHA", MAX_ALPHA),
         ("MIN_TRANSMITTANCE", MIN_TRANSMITTANCE),
         ("MAX_POWER", MAX_POWER),
-        ("TILE_SCALE", (1u32 << TILE_FRACTION_BITS) as f32),
     ] {
         let _ = writeln!(text, "const {name}: f32 = {value:e}f;");
     }
@@ -114,6 +119,9 @@ pub fn module_text(stage: &str, precision: Precision) -> String {
         ("MAX_DISPATCH", MAX_DISPATCH),
         ("N_COUNTERS", Counter::ALL.len() as u32),
         ("NONE", NONE),
+        ("TILE_FRACTION_BITS", TILE_FRACTION_BITS),
+        ("MAX_EXTRA_BITS", MAX_EXTRA_BITS),
+        ("REGION_BITS", REGION_BITS),
     ] {
         let _ = writeln!(text, "const {name}: u32 = {value}u;");
     }
