@@ -366,6 +366,8 @@ pub struct RasterBenchArgs {
 pub enum DeviceArg {
     /// The processor.
     Cpu,
+    /// The processor, with each of the instruction sets that it has.
+    CpuEach,
 }
 
 /// Reads a number of bytes with an optional unit.

@@ -25,7 +25,8 @@ use crate::encode::{self, EncodeError, EncodeSettings, Masks};
 use crate::palette::PaletteSettings;
 use crate::progress::{Progress, Silent};
 use crate::publish::{qdrant, serve};
-use crate::raster::{CpuRasterizer, RasterView};
+use crate::raster::simd::Level;
+use crate::raster::{CpuLevel, CpuRasterizer, RasterView};
 use crate::shard::cells::CellLimits;
 use crate::store::{Store, StoreReader};
 use crate::{generate, ingest, query};
@@ -382,8 +383,14 @@ fn run_bench_raster(args: &RasterBenchArgs, progress: &dyn Progress, json: bool)
     let devices: Vec<Device> = args
         .device
         .iter()
-        .map(|device| match device {
-            DeviceArg::Cpu => Device { name: "cpu".into(), rasterizer: Box::new(CpuRasterizer) },
+        .flat_map(|device| -> Vec<Device> {
+            match device {
+                DeviceArg::Cpu => vec![Device { name: "cpu".into(), rasterizer: Box::new(CpuRasterizer) }],
+                DeviceArg::CpuEach => Level::available()
+                    .into_iter()
+                    .map(|level| Device { name: level.name().into(), rasterizer: Box::new(CpuLevel(level)) })
+                    .collect(),
+            }
         })
         .collect();
     let sizes = match (&args.fixture, args.gaussians.is_empty()) {

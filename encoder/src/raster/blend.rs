@@ -8,9 +8,9 @@ use super::constants::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE_SIZE_PX};
 use super::project::ScreenGaussian;
 use super::simd::{Lanes, Level, Work};
 
-/// Gaussians that are made ready at once: their scattered reads overlap. In between is looked which
-/// rows of the tile are finished.
-const BATCH: usize = 16;
+/// Gaussians that are fetched and made ready at once. In between is looked which rows of the tile are
+/// finished.
+const BATCH: usize = 32;
 
 /// Powers up to here matter: `exp(-6)` is below 1/255, so that no alpha beyond counts.
 const MAX_POWER: f32 = 6.0;
@@ -87,6 +87,7 @@ impl<K: WeightSink, const BLEND: bool> Work for Walk<'_, K, BLEND> {
         for row in &mut transmittance[..rect.height_px] {
             row[..rect.width_px].fill(1.0);
         }
+        let mut fetched = [ScreenGaussian::default(); BATCH];
         let mut ready = [InTile::default(); BATCH];
         for batch in members.chunks(BATCH) {
             let mut live = [false; TILE_SIZE_PX];
@@ -98,8 +99,12 @@ impl<K: WeightSink, const BLEND: bool> Work for Walk<'_, K, BLEND> {
             if live == [false; TILE_SIZE_PX] {
                 break;
             }
-            for (ready, &member) in ready.iter_mut().zip(batch) {
-                *ready = InTile::new(&visible[member as usize], rect);
+            // Copies first: reads that wait for nothing but memory, so that they wait together.
+            for (fetched, &member) in fetched.iter_mut().zip(batch) {
+                *fetched = visible[member as usize];
+            }
+            for (ready, fetched) in ready.iter_mut().zip(&fetched[..batch.len()]) {
+                *ready = InTile::new(fetched, rect);
             }
             for (local, &member) in ready.iter().zip(batch) {
                 for y in local.first_row..local.end_row {

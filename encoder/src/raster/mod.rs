@@ -7,7 +7,8 @@
 //! |---|---|
 //! | [`project`] | Gaussian to screen ellipse, in `f64` relative to the camera |
 //! | [`bin`] | depth order, and the Gaussians of each 16x16 tile in that order |
-//! | [`blend`] | alpha and transmittance per pixel, sums per (Gaussian, region) |
+//! | [`blend`] | alpha and transmittance per pixel, in [`simd`] vectors |
+//! | [`sums`] | sums per (Gaussian, region) |
 //! | [`draw`] | colour, depth and coverage per pixel |
 //! | [`sh`] | colour of a Gaussian as seen from the camera |
 
@@ -240,14 +241,24 @@ pub trait LoadedScene: Sync {
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError>;
 }
 
-/// The reference backend; runs on the current rayon pool.
+/// The reference backend; runs on the current rayon pool, with the widest instructions there are.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct CpuRasterizer;
 
 impl Rasterizer for CpuRasterizer {
     fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
+        CpuLevel(simd::Level::widest()).load(scene)
+    }
+}
+
+/// The reference backend with a chosen instruction set; the results are the same bits.
+#[derive(Clone, Copy, Debug)]
+pub struct CpuLevel(pub simd::Level);
+
+impl Rasterizer for CpuLevel {
+    fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
         check_scene(scene)?;
-        Ok(Box::new(CpuScene { prepared: project::Prepared::new(scene), level: simd::Level::widest() }))
+        Ok(Box::new(CpuScene { prepared: project::Prepared::new(scene), level: self.0 }))
     }
 }
 

@@ -17,7 +17,7 @@ use super::constants::{
 /// d.y`, the power is `(u^2 + v^2) / 2`: the Cholesky factor of the inverse covariance. A sum of
 /// squares loses no digits where needles cancel in `a dx^2 + 2 b dx dy + c dy^2`.
 /// 56 bytes: tiles read these at random, and a cache line is 64.
-#[derive(Clone, Copy, Debug, PartialEq, Zeroable)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Zeroable)]
 pub struct ScreenGaussian {
     /// Index in the scene.
     pub gaussian: u32,
@@ -54,9 +54,15 @@ impl ScreenGaussian {
     /// Returns the pixels `first..=last` along one axis whose centres lie in `[low, high]` and in the
     /// image; `None` if there is none.
     pub fn pixels_within(low: f64, high: f64, size_px: u32) -> Option<(u32, u32)> {
-        let first = (low - 0.5).ceil().max(0.0);
-        let last = (high - 0.5).floor().min(f64::from(size_px) - 1.0);
-        (first <= last).then_some((first as u32, last as u32))
+        let first = (low - 0.5).max(0.0);
+        let last = (high - 0.5).min(f64::from(size_px) - 1.0);
+        if first > last {
+            return None;
+        }
+        // Truncation is an instruction where `ceil` and `floor` may be calls.
+        let (below, last) = (first as u32, last as u32);
+        let first = below + u32::from(f64::from(below) < first);
+        (first <= last).then_some((first, last))
     }
 }
 
