@@ -3,6 +3,7 @@
 use std::net::SocketAddr;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
+use std::str::FromStr;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
@@ -347,9 +348,9 @@ pub struct RasterBenchArgs {
     #[arg(long, value_name = "N", value_delimiter = ',', default_value = "8,64,512,4096",
         value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     pub regions: Vec<u32>,
-    /// Devices to compare: cpu, gpu, or an adapter's number.
+    /// Devices to compare: cpu, cpu-each (once per instruction set), gpu, or an adapter's number.
     #[arg(long, value_name = "DEVICE", value_delimiter = ',', default_value = "cpu")]
-    pub device: Vec<DeviceChoice>,
+    pub device: Vec<BenchDevice>,
     /// Width of generated views, pixels.
     #[arg(long, value_name = "PX", default_value_t = 648, value_parser = clap::value_parser!(u32).range(1..=16_384))]
     pub width: u32,
@@ -368,6 +369,23 @@ pub struct RasterBenchArgs {
     /// Writes the figures as JSON into this file.
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
+}
+
+/// What `bench raster` measures.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BenchDevice {
+    /// What a choice opens.
+    Chosen(DeviceChoice),
+    /// The processor, with each of the instruction sets that it has.
+    CpuEach,
+}
+
+impl FromStr for BenchDevice {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text == "cpu-each" { Ok(Self::CpuEach) } else { text.parse().map(Self::Chosen) }
+    }
 }
 
 /// Reads a number of bytes with an optional unit.

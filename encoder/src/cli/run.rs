@@ -25,9 +25,10 @@ use crate::encode::{self, EncodeError, EncodeSettings, Masks};
 use crate::palette::PaletteSettings;
 use crate::progress::{Progress, Silent};
 use crate::publish::{qdrant, serve};
-use crate::raster::RasterView;
 use crate::raster::devices::Devices;
 use crate::raster::gpu::{AdapterReport, GpuOptions, adapters};
+use crate::raster::simd::Level;
+use crate::raster::{CpuLevel, RasterView};
 use crate::shard::cells::CellLimits;
 use crate::store::{Store, StoreReader};
 use crate::{generate, ingest, query};
@@ -400,12 +401,19 @@ fn run_bench_raster(args: &RasterBenchArgs, progress: &dyn Progress, json: bool)
         .build_global()
         .context("cannot start threads")?;
     let mut devices = Vec::with_capacity(args.device.len());
-    for choice in &args.device {
-        let opened = Devices::open(
-            *choice,
-            GpuOptions { views_in_flight: args.views as usize, ..Default::default() },
-        )?;
-        devices.push(Device { name: opened.names().join(", "), rasterizer: Box::new(opened) });
+    for device in &args.device {
+        match device {
+            BenchDevice::Chosen(choice) => {
+                let options = GpuOptions { views_in_flight: args.views as usize, ..GpuOptions::default() };
+                let opened = Devices::open(*choice, options)?;
+                devices.push(Device { name: opened.names().join(", "), rasterizer: Box::new(opened) });
+            }
+            BenchDevice::CpuEach => devices.extend(
+                Level::available()
+                    .into_iter()
+                    .map(|level| Device { name: level.name().into(), rasterizer: Box::new(CpuLevel(level)) }),
+            ),
+        }
     }
     let sizes = match (&args.fixture, args.gaussians.is_empty()) {
         (None, true) => vec![100_000, 1_000_000, 2_000_000, 8_000_000],

@@ -1,11 +1,13 @@
 //! Draws colour, depth and coverage.
 
+use bytemuck::cast_slice_mut;
 use rayon::prelude::*;
 
 use super::bin::Tiles;
-use super::blend::{LANES, PerPixel, TileRect, WeightSink, walk_tile};
+use super::blend::{PerPixel, TileRect, WeightSink, walk_tile};
 use super::constants::TILE_SIZE_PX;
 use super::project::ScreenGaussian;
+use super::simd::{Lanes, Level};
 use super::{ViewCounters, WeightKind};
 
 /// The picture of a scene in one view; every column is row-major.
@@ -27,6 +29,7 @@ pub struct Drawing {
 
 /// Draws the Gaussians of every tile; `colours` has one RGB a visible Gaussian.
 pub fn draw(
+    level: Level,
     visible: &[ScreenGaussian],
     colours: &[[f32; 3]],
     tiles: &Tiles,
@@ -43,10 +46,10 @@ pub fn draw(
         .zip(&tiles.rows)
         .enumerate()
         .for_each(|(row, ((rgb, depth, coverage), tile_row))| {
-            for (column, members) in tile_row.tiles().enumerate() {
+            for (column, members) in tile_row.iter().enumerate() {
                 let rect = TileRect::new(column, row, width_px, height_px);
                 let mut sink = PixelSink::new(visible, colours);
-                let transmittance = walk_tile(visible, members, rect, WeightKind::Blend, &mut sink);
+                let transmittance = walk_tile(level, visible, members, rect, WeightKind::Blend, &mut sink);
                 for (y, light) in transmittance.iter().enumerate().take(rect.height_px) {
                     for (x, &light) in light.iter().enumerate().take(rect.width_px) {
                         let pixel = y * width_px + rect.x_px + x;
@@ -89,24 +92,19 @@ impl<'a> PixelSink<'a> {
 
 impl WeightSink for PixelSink<'_> {
     #[inline(always)]
-    fn lanes(&mut self, member: u32, x: usize, y: usize, weights: &[f32; LANES]) {
+    fn add<S: Lanes>(&mut self, simd: S, member: u32, y: usize, v: usize, weights: S::f32s) {
         let member = member as usize;
-        add_scaled(&mut self.weight[y], x, weights, 1.0);
-        add_scaled(&mut self.depth[y], x, weights, self.visible[member].depth);
+        let add_scaled = |row: &mut [f32; TILE_SIZE_PX], factor| {
+            let sum = &mut cast_slice_mut::<f32, S::f32s>(row)[v];
+            *sum = simd.add_f32s(*sum, simd.mul_f32s(weights, simd.splat_f32s(factor)));
+        };
+        add_scaled(&mut self.weight[y], 1.0);
+        add_scaled(&mut self.depth[y], self.visible[member].depth);
         for (plane, &value) in self.rgb.iter_mut().zip(&self.colours[member]) {
-            add_scaled(&mut plane[y], x, weights, value);
+            add_scaled(&mut plane[y], value);
         }
     }
 
-    fn end(&mut self, _: u32) {}
-}
-
-/// Adds `factor * weights` to the pixels of a row from `x` on.
-#[inline(always)]
-fn add_scaled(row: &mut [f32; TILE_SIZE_PX], x: usize, weights: &[f32; LANES], factor: f32) {
-    if let Some(lanes) = row[x..].first_chunk_mut::<LANES>() {
-        for (sum, weight) in lanes.iter_mut().zip(weights) {
-            *sum += weight * factor;
-        }
-    }
+    #[inline(always)]
+    fn end<S: Lanes>(&mut self, _: S, _: u32) {}
 }

@@ -7,18 +7,22 @@
 //! |---|---|
 //! | [`project`] | Gaussian to screen ellipse, in `f64` relative to the camera |
 //! | [`bin`] | depth order, and the Gaussians of each 16x16 tile in that order |
-//! | [`blend`] | alpha and transmittance per pixel, sums per (Gaussian, region) |
+//! | [`blend`] | alpha and transmittance per pixel, in [`simd`] vectors |
+//! | [`sums`] | sums per (Gaussian, region) |
 //! | [`draw`] | colour, depth and coverage per pixel |
 //! | [`sh`] | colour of a Gaussian as seen from the camera |
 
 pub mod bin;
 pub mod blend;
+pub mod buckets;
 pub mod constants;
 pub mod devices;
 pub mod draw;
 pub mod gpu;
 pub mod project;
 pub mod sh;
+pub mod simd;
+pub mod sums;
 
 use std::time::Instant;
 
@@ -49,7 +53,7 @@ pub enum WeightKind {
 }
 
 /// The weight of a Gaussian summed over the pixels of a region.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Zeroable)]
 pub struct RegionWeight {
     /// Index of the Gaussian in the scene.
     pub gaussian: u32,
@@ -255,19 +259,32 @@ pub trait LoadedScene: Sync {
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError>;
 }
 
-/// The reference backend; runs on the current rayon pool.
+/// The reference backend; runs on the current rayon pool, with the widest instructions there are.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct CpuRasterizer;
 
 impl Rasterizer for CpuRasterizer {
     fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
-        check_scene(scene)?;
-        Ok(Box::new(CpuScene(scene)))
+        CpuLevel(simd::Level::widest()).load(scene)
     }
 }
 
-/// A scene whose columns fit each other.
-struct CpuScene<'s>(&'s Gaussians);
+/// The reference backend with a chosen instruction set; the results are the same bits.
+#[derive(Clone, Copy, Debug)]
+pub struct CpuLevel(pub simd::Level);
+
+impl Rasterizer for CpuLevel {
+    fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
+        check_scene(scene)?;
+        Ok(Box::new(CpuScene { prepared: project::Prepared::new(scene), level: self.0 }))
+    }
+}
+
+/// A scene whose columns fit each other, and what its pixels are worked on with.
+struct CpuScene<'s> {
+    prepared: project::Prepared<'s>,
+    level: simd::Level,
+}
 
 impl LoadedScene for CpuScene<'_> {
     fn weights(
@@ -288,21 +305,21 @@ impl LoadedScene for CpuScene<'_> {
         check_view(view)?;
         check_regions(regions, &view.intrinsics)?;
         let mut times = Vec::new();
-        let projection = timed("project", &mut times, || project::project(self.0, view));
+        let projection = timed("project", &mut times, || self.prepared.project(view));
         let visible = &projection.visible;
         let tiles = timed("bin", &mut times, || bin::bin(visible, &view.intrinsics));
-        let sums = timed("blend", &mut times, || blend::tile_sums(visible, &tiles, regions, kind));
-        let entries = timed("merge", &mut times, || blend::merge(visible, &sums));
+        let sums = timed("blend", &mut times, || sums::tile_sums(visible, &tiles, regions, kind, self.level));
+        let entries = timed("merge", &mut times, || sums::merge(visible, &sums));
         Ok((ViewWeights { entries, counters: counters(&projection, &tiles) }, times))
     }
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {
         check_view(view)?;
-        let projection = project::project(self.0, view);
+        let projection = self.prepared.project(view);
         let tiles = bin::bin(&projection.visible, &view.intrinsics);
         let position_in_world = view.camera_from_world.inverse().translation;
-        let colours = sh::colours(self.0, &projection.visible, position_in_world);
-        let mut drawing = draw::draw(&projection.visible, &colours, &tiles, background);
+        let colours = sh::colours(self.prepared.scene, &projection.visible, position_in_world);
+        let mut drawing = draw::draw(self.level, &projection.visible, &colours, &tiles, background);
         drawing.counters = counters(&projection, &tiles);
         Ok(drawing)
     }
@@ -319,7 +336,7 @@ fn timed<T>(stage: &'static str, times: &mut Vec<StageTime>, work: impl FnOnce()
 fn counters(projection: &project::Projection, tiles: &bin::Tiles) -> ViewCounters {
     ViewCounters {
         visible: projection.visible.len(),
-        pairs: tiles.rows.iter().map(|row| row.members.len()).sum(),
+        pairs: tiles.rows.iter().map(|row| row.n_items()).sum(),
         unusable: projection.unusable,
     }
 }

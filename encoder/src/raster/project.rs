@@ -1,10 +1,12 @@
 //! Projects Gaussians to ellipses on the screen.
 
+use bytemuck::Zeroable;
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 use slag_common::{Gaussians, Intrinsics};
 
 use super::RasterView;
+use super::buckets::concat;
 use super::constants::{
     COVARIANCE_BLUR_PX2, FAR_Z, FOV_MARGIN, MAX_VARIANCE_PX2, MIN_ALPHA, NEAR_Z, REACH2_MARGIN,
 };
@@ -15,7 +17,7 @@ use super::constants::{
 /// d.y`, the power is `(u^2 + v^2) / 2`: the Cholesky factor of the inverse covariance. A sum of
 /// squares loses no digits where needles cancel in `a dx^2 + 2 b dx dy + c dy^2`.
 /// 56 bytes: tiles read these at random, and a cache line is 64.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Zeroable)]
 pub struct ScreenGaussian {
     /// Index in the scene.
     pub gaussian: u32,
@@ -52,9 +54,15 @@ impl ScreenGaussian {
     /// Returns the pixels `first..=last` along one axis whose centres lie in `[low, high]` and in the
     /// image; `None` if there is none.
     pub fn pixels_within(low: f64, high: f64, size_px: u32) -> Option<(u32, u32)> {
-        let first = (low - 0.5).ceil().max(0.0);
-        let last = (high - 0.5).floor().min(f64::from(size_px) - 1.0);
-        (first <= last).then_some((first as u32, last as u32))
+        let first = (low - 0.5).max(0.0);
+        let last = (high - 0.5).min(f64::from(size_px) - 1.0);
+        if first > last {
+            return None;
+        }
+        // Truncation is an instruction where `ceil` and `floor` may be calls.
+        let (below, last) = (first as u32, last as u32);
+        let first = below + u32::from(f64::from(below) < first);
+        (first <= last).then_some((first, last))
     }
 }
 
@@ -71,29 +79,124 @@ pub struct Projection {
 /// Gaussians a task of the thread pool; enough to hide its cost.
 const CHUNK: usize = 4096;
 
-/// Projects a scene whose columns fit each other.
-pub fn project(scene: &Gaussians, view: &RasterView) -> Projection {
-    let parts: Vec<Projection> = (0..scene.len().div_ceil(CHUNK))
-        .into_par_iter()
-        .map(|chunk| {
-            let mut part = Projection::default();
-            for index in chunk * CHUNK..((chunk + 1) * CHUNK).min(scene.len()) {
-                if !scene.is_usable(index) {
-                    part.unusable += 1;
-                    continue;
+/// A scene with what decides quickly that a Gaussian is not seen.
+pub struct Prepared<'s> {
+    /// The scene; its columns fit each other.
+    pub scene: &'s Gaussians,
+    sizes: Vec<Size>,
+    unusable: usize,
+}
+
+/// How far a Gaussian can reach.
+#[derive(Clone, Copy, Zeroable)]
+struct Size {
+    /// Largest standard deviation, world units.
+    max_scale: f32,
+    /// `u^2 + v^2` within which alpha may count; negative where the Gaussian is never drawn.
+    reach2: f32,
+}
+
+impl<'s> Prepared<'s> {
+    /// Looks at each Gaussian of a scene whose columns fit each other.
+    pub fn new(scene: &'s Gaussians) -> Self {
+        let mut sizes: Vec<Size> = bytemuck::zeroed_vec(scene.len());
+        let unusable = sizes
+            .par_chunks_mut(CHUNK)
+            .enumerate()
+            .map(|(chunk, sizes)| {
+                let mut unusable = 0;
+                for (size, index) in sizes.iter_mut().zip(chunk * CHUNK..) {
+                    let usable = scene.is_usable(index);
+                    unusable += usize::from(!usable);
+                    let opacity = scene.opacities[index];
+                    let drawn = usable && opacity >= MIN_ALPHA;
+                    size.max_scale = scene.scales[index].into_iter().fold(0.0, f32::max);
+                    size.reach2 = if drawn { reach2(opacity) } else { -1.0 };
                 }
-                match project_one(scene, index, view) {
-                    Ok(Some(on_screen)) => part.visible.push(on_screen),
-                    Ok(None) => {}
-                    Err(Unrepresentable) => part.unusable += 1,
+                unusable
+            })
+            .sum();
+        Self { scene, sizes, unusable }
+    }
+
+    /// Projects what a view can see.
+    pub fn project(&self, view: &RasterView) -> Projection {
+        let bounds = Bounds::new(view);
+        let parts: Vec<(Vec<ScreenGaussian>, usize)> = self
+            .sizes
+            .par_chunks(CHUNK)
+            .enumerate()
+            .map(|(chunk, sizes)| {
+                let (mut visible, mut unusable) = (Vec::new(), 0);
+                for (&size, index) in sizes.iter().zip(chunk * CHUNK..) {
+                    if size.reach2 < 0.0 {
+                        continue;
+                    }
+                    let mean = view.camera_from_world.transform_point3(self.scene.means_in_world[index]);
+                    if bounds.exclude(mean, size) {
+                        continue;
+                    }
+                    match project_one(self.scene, index, size, mean, view) {
+                        Ok(Some(on_screen)) => visible.push(on_screen),
+                        Ok(None) => {}
+                        Err(Unrepresentable) => unusable += 1,
+                    }
                 }
-            }
-            part
-        })
-        .collect();
-    Projection {
-        unusable: parts.iter().map(|p| p.unusable).sum(),
-        visible: parts.into_iter().flat_map(|p| p.visible).collect(),
+                (visible, unusable)
+            })
+            .collect();
+        let (visible, unusable): (Vec<_>, Vec<usize>) = parts.into_iter().unzip();
+        let unusable = self.unusable + unusable.iter().sum::<usize>();
+        Projection { visible: concat(&visible), unusable }
+    }
+}
+
+/// The frustum of a view, for a test that costs little and errs on the side of keeping.
+struct Bounds {
+    /// Focal lengths, pixels.
+    focal_px: DVec2,
+    /// From the centre of the first pixel to the principal point, pixels.
+    before_px: DVec2,
+    /// From the principal point to the centre of the last pixel, pixels.
+    after_px: DVec2,
+    /// Pixels on the screen a world unit at z = 1, at most.
+    stretch_px: DVec2,
+}
+
+impl Bounds {
+    /// Taken on top of the extent: rotations are orthonormal only to 1e-3, sums are rounded.
+    const SLACK: f64 = 1.002;
+    /// Extents up to here are certain to have a covariance within [`MAX_VARIANCE_PX2`].
+    const MAX_EXTENT_PX: f64 = 1e9;
+
+    fn new(view: &RasterView) -> Self {
+        let camera = &view.intrinsics;
+        let [tan_x, tan_y] = tangent_limits(camera).map(|[low, high]| high.max(-low));
+        let focal_px = DVec2::new(camera.focal_x_px, camera.focal_y_px);
+        let before_px = DVec2::new(camera.centre_x_px, camera.centre_y_px) - 0.5;
+        Self {
+            focal_px,
+            before_px,
+            after_px: DVec2::new(camera.width_px.into(), camera.height_px.into()) - 1.0 - before_px,
+            stretch_px: focal_px * DVec2::new(tan_x.hypot(1.0), tan_y.hypot(1.0)),
+        }
+    }
+
+    /// Returns whether no pixel centre can be in the footprint of a Gaussian with this mean, camera
+    /// frame. All lengths are times z: no division.
+    fn exclude(&self, mean: DVec3, size: Size) -> bool {
+        if !(NEAR_Z..=FAR_Z).contains(&mean.z) {
+            return true;
+        }
+        let reach = f64::from(size.reach2).sqrt() * Self::SLACK;
+        // The root of a sum is at most the sum of the roots.
+        let extent =
+            (self.stretch_px * f64::from(size.max_scale) + COVARIANCE_BLUR_PX2.sqrt() * mean.z) * reach;
+        let offset = self.focal_px * mean.truncate();
+        let beyond = (offset + self.before_px * mean.z + extent).cmplt(DVec2::ZERO)
+            | (offset - self.after_px * mean.z - extent).cmpgt(DVec2::ZERO);
+        let certain = extent.max_element() < Self::MAX_EXTENT_PX * mean.z && offset.is_finite();
+        beyond.any() && certain
     }
 }
 
@@ -105,17 +208,14 @@ pub fn reach2(opacity: f32) -> f32 {
 /// The projected covariance is beyond the range of the pixels' arithmetic.
 struct Unrepresentable;
 
-/// Projects one usable Gaussian; `None` where it is culled.
+/// Projects one usable Gaussian whose mean is given in the camera's frame; `None` where it is culled.
 fn project_one(
     scene: &Gaussians,
     index: usize,
+    size: Size,
+    mean: DVec3,
     view: &RasterView,
 ) -> Result<Option<ScreenGaussian>, Unrepresentable> {
-    let opacity = scene.opacities[index];
-    let mean = view.camera_from_world.transform_point3(scene.means_in_world[index]);
-    if opacity < MIN_ALPHA || !(NEAR_Z..=FAR_Z).contains(&mean.z) {
-        return Ok(None);
-    }
     let camera = &view.intrinsics;
     let mean_px = DVec2::new(
         camera.focal_x_px * mean.x / mean.z + camera.centre_x_px,
@@ -141,8 +241,8 @@ fn project_one(
     let on_screen = ScreenGaussian {
         gaussian: index as u32,
         depth: mean.z as f32,
-        opacity,
-        reach2: reach2(opacity),
+        opacity: scene.opacities[index],
+        reach2: size.reach2,
         mean_px,
         inv_width: (cov_yy / det).sqrt(),
         slope: cov_xy / cov_yy,
@@ -158,15 +258,23 @@ fn project_one(
 /// Returns the rows of the Jacobian of the pinhole projection (Zwicker et al., EWA splatting, 2001),
 /// px per world unit, taken inside a slightly widened field of view.
 fn jacobian_rows(mean: DVec3, camera: &Intrinsics) -> [DVec3; 2] {
-    let (width, height) = (f64::from(camera.width_px), f64::from(camera.height_px));
-    let limited = |tangent: f64, focal: f64, centre: f64, size: f64| {
-        let margin = FOV_MARGIN * 0.5 * size / focal;
-        tangent.max(-centre / focal - margin).min((size - centre) / focal + margin)
-    };
-    let tan_x = limited(mean.x / mean.z, camera.focal_x_px, camera.centre_x_px, width);
-    let tan_y = limited(mean.y / mean.z, camera.focal_y_px, camera.centre_y_px, height);
+    let [limit_x, limit_y] = tangent_limits(camera);
+    let tan_x = (mean.x / mean.z).max(limit_x[0]).min(limit_x[1]);
+    let tan_y = (mean.y / mean.z).max(limit_y[0]).min(limit_y[1]);
     [
         DVec3::new(1.0, 0.0, -tan_x) * (camera.focal_x_px / mean.z),
         DVec3::new(0.0, 1.0, -tan_y) * (camera.focal_y_px / mean.z),
+    ]
+}
+
+/// Returns the lowest and highest tangent in x and y at which the Jacobian is taken.
+fn tangent_limits(camera: &Intrinsics) -> [[f64; 2]; 2] {
+    let limits = |focal: f64, centre: f64, size: u32| {
+        let margin = FOV_MARGIN * 0.5 * f64::from(size) / focal;
+        [-centre / focal - margin, (f64::from(size) - centre) / focal + margin]
+    };
+    [
+        limits(camera.focal_x_px, camera.centre_x_px, camera.width_px),
+        limits(camera.focal_y_px, camera.centre_y_px, camera.height_px),
     ]
 }

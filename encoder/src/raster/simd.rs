@@ -1,0 +1,135 @@
+//! Instruction sets that the pixels are worked on with.
+
+#[cfg(target_arch = "aarch64")]
+use pulp::aarch64::Neon;
+use pulp::{NullaryFnOnce, Scalar128b, Simd, f32x4, f64x2};
+#[cfg(target_arch = "x86_64")]
+use pulp::{
+    f32x8, f32x16, f64x4, f64x8,
+    x86::{V3, V4},
+};
+
+/// Vectors of an instruction set, with what [`Simd`] lacks.
+pub trait Lanes: Simd {
+    /// Returns the values as `f64`: the first half of the lanes, then the second.
+    fn widen(self, values: Self::f32s) -> [Self::f64s; 2];
+}
+
+impl Lanes for Scalar128b {
+    #[inline(always)]
+    fn widen(self, f32x4(a, b, c, d): f32x4) -> [f64x2; 2] {
+        [f64x2(a.into(), b.into()), f64x2(c.into(), d.into())]
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+impl Lanes for V3 {
+    #[inline(always)]
+    fn widen(self, values: f32x8) -> [f64x4; 2] {
+        let [low, high]: [f32x4; 2] = bytemuck::cast(values);
+        [self.convert_f32x4_to_f64x4(low), self.convert_f32x4_to_f64x4(high)]
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+impl Lanes for V4 {
+    #[inline(always)]
+    fn widen(self, values: f32x16) -> [f64x8; 2] {
+        let [low, high]: [f32x8; 2] = bytemuck::cast(values);
+        [self.convert_f32x8_to_f64x8(low), self.convert_f32x8_to_f64x8(high)]
+    }
+}
+
+#[cfg(target_arch = "aarch64")]
+impl Lanes for Neon {
+    #[inline(always)]
+    fn widen(self, values: f32x4) -> [f64x2; 2] {
+        let values: std::arch::aarch64::float32x4_t = bytemuck::cast(values);
+        let low = self.neon.vcvt_f64_f32(self.neon.vget_low_f32(values));
+        [bytemuck::cast(low), bytemuck::cast(self.neon.vcvt_high_f64_f32(values))]
+    }
+}
+
+/// Work that is written once for all instruction sets; its `run` and all that it calls must be
+/// `inline(always)`, or it is compiled for the plain processor.
+pub trait Work {
+    /// What it gives.
+    type Output;
+    /// Does the work.
+    fn run<S: Lanes>(self, simd: S) -> Self::Output;
+}
+
+/// Work on vectors that are known.
+struct On<S, W>(S, W);
+
+impl<S: Lanes, W: Work> NullaryFnOnce for On<S, W> {
+    type Output = W::Output;
+
+    #[inline(always)]
+    fn call(self) -> W::Output {
+        self.1.run(self.0)
+    }
+}
+
+/// An instruction set that this processor has. All give the same bits: nothing is contracted, and
+/// what is summed in another order is summed exactly.
+#[derive(Clone, Copy, Debug)]
+pub enum Level {
+    /// Plain code in groups of four values, for any processor.
+    Portable,
+    /// AVX2, eight `f32` at once.
+    #[cfg(target_arch = "x86_64")]
+    Avx2(V3),
+    /// AVX-512, sixteen `f32` at once.
+    #[cfg(target_arch = "x86_64")]
+    Avx512(V4),
+    /// NEON, four `f32` at once.
+    #[cfg(target_arch = "aarch64")]
+    Neon(Neon),
+}
+
+impl Level {
+    /// Returns those that this processor has, narrowest first.
+    pub fn available() -> Vec<Self> {
+        let mut levels = vec![Self::Portable];
+        #[cfg(target_arch = "x86_64")]
+        {
+            levels.extend(V3::try_new().map(Self::Avx2));
+            levels.extend(V4::try_new().map(Self::Avx512));
+        }
+        #[cfg(target_arch = "aarch64")]
+        levels.extend(Neon::try_new().map(Self::Neon));
+        levels
+    }
+
+    /// Returns the widest that this processor has.
+    pub fn widest() -> Self {
+        Self::available().pop().unwrap_or(Self::Portable)
+    }
+
+    /// Returns the name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Portable => "portable",
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2(_) => "avx2",
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512(_) => "avx512",
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon(_) => "neon",
+        }
+    }
+
+    /// Does work compiled for this instruction set.
+    pub fn dispatch<W: Work>(self, work: W) -> W::Output {
+        match self {
+            Self::Portable => work.run(Scalar128b),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2(simd) => simd.vectorize(On(simd, work)),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512(simd) => simd.vectorize(On(simd, work)),
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon(simd) => simd.vectorize(On(simd, work)),
+        }
+    }
+}
