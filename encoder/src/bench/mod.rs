@@ -1,6 +1,8 @@
 //! Benchmarks as commands: each writes JSON that names the machine, and compares side by side in one
 //! run.
 
+pub mod lift;
+
 use std::time::Instant;
 
 use serde::Serialize;
