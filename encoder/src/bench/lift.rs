@@ -87,10 +87,10 @@ pub struct Plan {
     pub cell_bytes: u64,
     /// Bytes that `--memory` leaves for sums at a time.
     pub group_bytes: u64,
-    /// Seconds to open, read and regroup.
-    pub aggregation_secs: f64,
-    /// Seconds to compute the embeddings.
-    pub embeddings_secs: f64,
+    /// Seconds of one processor to open, read and regroup.
+    pub aggregation_cpu_secs: f64,
+    /// Seconds of one processor to compute the embeddings.
+    pub embeddings_cpu_secs: f64,
 }
 
 /// What was measured.
@@ -122,7 +122,7 @@ pub struct LiftReport {
     pub aggregation: Spread,
     /// That, and each Gaussian's embedding and its length.
     pub with_embeddings: Spread,
-    /// Nanoseconds for an entry's 512th of an embedding times its components, and for a Gaussian.
+    /// What the embeddings' processor time is made of.
     pub embedding_model: EmbeddingModel,
     /// Most memory that the process held during the aggregation.
     pub peak_rss_bytes: Option<u64>,
@@ -132,7 +132,7 @@ pub struct LiftReport {
     pub plan: Plan,
 }
 
-/// Time of the embeddings: so much an entry, so much a Gaussian.
+/// Processor time of the embeddings: so much an entry, so much a Gaussian.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct EmbeddingModel {
     /// Nanoseconds an entry.
@@ -347,7 +347,7 @@ impl Report<'_> {
         let model = self.embedding_model();
         let embeddings_ns =
             model.ns_per_entry * n_entries as f64 + model.ns_per_gaussian * n_gaussians as f64;
-        let aggregation = self.spread(Pass::aggregation_ms);
+        let aggregation_ms = self.spread(|p| p.open.cpu_ms + p.read.cpu_ms + p.regroup.cpu_ms).median_ms;
         Plan {
             n_gaussians,
             n_views,
@@ -356,8 +356,8 @@ impl Report<'_> {
             index_bytes,
             cell_bytes,
             group_bytes: self.options.memory_bytes.saturating_sub(index_bytes + cell_bytes),
-            aggregation_secs: aggregation.median_ms * more_views / 1e3,
-            embeddings_secs: embeddings_ns / 1e9,
+            aggregation_cpu_secs: aggregation_ms * more_views / 1e3,
+            embeddings_cpu_secs: embeddings_ns / 1e9,
         }
     }
 }
@@ -546,13 +546,13 @@ impl fmt::Display for LiftReport {
         writeln!(
             f,
             "estimate for {} Gaussians, {} views: {} entries, {:.1} GB on disk read once, none written; \
-             aggregation {:.1} s, embeddings {:.1} s; memory {:.2} GB for the index, {:.2} GB for a cell",
+             aggregation {:.1} s and embeddings {:.1} s of one processor; memory {:.2} GB for the index, {:.2} GB for a cell",
             plan.n_gaussians,
             plan.n_views,
             plan.n_entries,
             gb(plan.disk_bytes),
-            plan.aggregation_secs,
-            plan.embeddings_secs,
+            plan.aggregation_cpu_secs,
+            plan.embeddings_cpu_secs,
             gb(plan.index_bytes),
             gb(plan.cell_bytes)
         )

@@ -110,6 +110,9 @@ prop_compose! {
 }
 
 proptest! {
+    // Each case writes files and waits for the disk.
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
     /// Oracle: entries picked from the views one by one.
     #[test]
     fn sums_by_gaussian_are_those_of_the_views_for_any_budget(
