@@ -63,7 +63,7 @@ fn check_embeddings(house: &Path, store: &Path) {
         .manifest()
         .cells
         .iter()
-        .map(|c| read_field(&reader, c.cell_id, table.len()).expect("a field"))
+        .map(|c| read_field(&reader, c.cell_id, c.n_gaussians, table.len()).expect("a field"))
         .collect();
     let place: BTreeMap<u32, (usize, usize)> = fields
         .iter()

@@ -66,15 +66,15 @@ pub enum QueryError {
 pub fn scores(reader: &StoreReader, query: &[f32]) -> Result<Scores, QueryError> {
     let manifest = reader.manifest();
     let table = read_regions(reader)?;
-    if query.len() != table.dim {
+    if query.len() != table.dim() {
         let encoder = manifest.encoder.name.clone();
-        return Err(QueryError::Dimension { expected: table.dim, found: query.len(), encoder });
+        return Err(QueryError::Dimension { expected: table.dim(), found: query.len(), encoder });
     }
     let region_scores = table.scores(query);
     let n = (manifest.n_gaussians + manifest.n_rejected) as usize;
     let mut scores = Scores { cosines: vec![f32::NAN; n], total_weights: vec![0.0; n] };
     for cell in &manifest.cells {
-        let field = read_field(reader, cell.cell_id, table.len())?;
+        let field = read_field(reader, cell.cell_id, cell.n_gaussians, table.len())?;
         let cosines = field.cosines(&region_scores);
         for (k, index) in field.input_indices.iter().enumerate() {
             if *index as usize >= n {

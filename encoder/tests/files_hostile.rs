@@ -1,8 +1,10 @@
 //! The encoder's own files and the geo-reference, damaged in 1,000 ways each: refused with the reason, never a panic.
 
+use std::path::Path;
+
 use slag_common::container::AlignedBytes;
 use slag_encoder::ingest::read_geo_reference;
-use slag_encoder::lift::{CellField, RegionTable, SumEntry, ViewSums};
+use slag_encoder::lift::{CellField, PartSums, RegionTable, SumEntry, SumsError, SumsIndex, ViewSums};
 
 const N_MUTATIONS: u64 = 1000;
 
@@ -34,6 +36,14 @@ fn sums() -> ViewSums {
     }
 }
 
+/// Opens, reads and regroups a file of sums as an encode does.
+fn read_sums(path: &Path) -> Result<(RegionTable, Vec<PartSums>), SumsError> {
+    let (index, table) = SumsIndex::open(&[path.to_owned()], 4, &[2, 2, 2, 2])?;
+    let raw = index.read(0..index.parts().len())?;
+    let sums = index.regroup(&raw, &table)?;
+    Ok((table, sums))
+}
+
 /// What the sections hold lies under a checksum; only the zeros between them do not.
 #[test]
 fn sums_regions_and_fields_refuse_damage() {
@@ -41,17 +51,17 @@ fn sums_regions_and_fields_refuse_damage() {
     let path = dir.path().join("view.sums");
     sums().write(&path).expect("writes");
     let file = fs_err::read(&path).expect("reads");
-    let mut table = RegionTable::new(4);
-    table.append(&sums());
-    let entries: Vec<SumEntry> = sums().entries_of_cell.remove(0).1;
-    let field = CellField::new(vec![8, 9], &entries, &table);
-    let (table_file, field_file) = (table.to_bytes(), field.to_bytes());
+    let (table, parts) = read_sums(&path).expect("valid");
+    let field = CellField::new(vec![8, 9], parts[0].clone(), &table, &mut [0.0; 8]);
+    let (mut table_file, mut field_file) = (Vec::new(), Vec::new());
+    table.write(&mut table_file).expect("writes to memory");
+    field.write(&mut field_file).expect("writes to memory");
     let mut n_refused = 0;
     for seed in 0..N_MUTATIONS {
         fs_err::remove_file(&path).expect("removes");
         fs_err::write(&path, damaged(&file, seed)).expect("writes");
-        match ViewSums::read(&path) {
-            Ok(read) => assert_eq!(read, sums(), "seed {seed}"),
+        match read_sums(&path) {
+            Ok(read) => assert_eq!(read, (table.clone(), parts.clone()), "seed {seed}"),
             Err(error) => {
                 assert!(error.to_string().contains("view.sums"), "{error}");
                 n_refused += 1;

@@ -9,9 +9,9 @@ use half::f16;
 use slag_common::container::AlignedBytes;
 use slag_common::shard::{Profile, ShardLayout};
 use slag_common::{Gaussians, Hash32};
-use slag_encoder::lift::{CellField, RegionTable, SumEntry, ViewSums};
+use slag_encoder::lift::{CellField, RegionTable, SumEntry, SumsIndex, ViewSums};
 use slag_encoder::palette::PaletteSettings;
-use slag_encoder::shard::{self, cells};
+use slag_encoder::shard::{self, CellEmbeddings, cells};
 
 const DIM: usize = 512;
 
@@ -35,6 +35,30 @@ fn direction(random: &mut Random) -> Vec<f64> {
     unit(&(0..DIM).map(|_| uniform(random) - 0.5).collect::<Vec<_>>())
 }
 
+/// Takes a view of one cell, with a region a mask, through its file; returns the embeddings too.
+fn one_cell(
+    vectors: &[Vec<f32>],
+    entries: Vec<SumEntry>,
+    input_indices: Vec<u32>,
+) -> (CellField, RegionTable, Vec<f32>) {
+    let view = ViewSums {
+        dim: DIM,
+        mask_vectors: vectors.concat(),
+        masks_of_region: (0..vectors.len() as u32).map(|mask| vec![mask]).collect(),
+        entries_of_cell: vec![(0, entries)],
+    };
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let path = dir.path().join("view.sums");
+    view.write(&path).expect("writes");
+    let (index, table) = SumsIndex::open(&[path], DIM, &[input_indices.len()]).expect("opens");
+    assert_eq!(index.parts().len(), 1);
+    let raw = index.read(0..1).expect("reads");
+    let sums = index.regroup(&raw, &table).expect("regroups").remove(0);
+    let mut embeddings = vec![f32::NAN; input_indices.len() * DIM];
+    let field = CellField::new(input_indices, sums, &table, &mut embeddings);
+    (field, table, embeddings)
+}
+
 /// One Gaussian's weights over regions of one mask each.
 struct Seen {
     vectors: Vec<Vec<f32>>,
@@ -43,18 +67,11 @@ struct Seen {
 
 impl Seen {
     fn field(&self) -> (CellField, RegionTable) {
-        let view = ViewSums {
-            dim: DIM,
-            mask_vectors: self.vectors.concat(),
-            masks_of_region: (0..self.vectors.len() as u32).map(|mask| vec![mask]).collect(),
-            entries_of_cell: Vec::new(),
-        };
-        let mut table = RegionTable::new(DIM);
-        table.append(&view);
         let entry =
             |(region, weight): (usize, &f32)| SumEntry { local: 0, region: region as u32, weight: *weight };
-        let entries: Vec<SumEntry> = self.weights.iter().enumerate().map(entry).collect();
-        (CellField::new(vec![0], &entries, &table), table)
+        let entries = self.weights.iter().enumerate().map(entry).collect();
+        let (field, table, _) = one_cell(&self.vectors, entries, vec![0]);
+        (field, table)
     }
 
     /// Returns the mean vector and the total weight, in float64.
@@ -207,19 +224,13 @@ fn exact_shard(vectors: &[Vec<f32>], means_in_world: Vec<DVec3>) -> AlignedBytes
     };
     let split = cells::split(&scene, cells::CellLimits { max_gaussians: n, max_width: None });
     let cell = &split.cells[0];
-    let view = ViewSums {
-        dim: DIM,
-        mask_vectors: vectors.concat(),
-        masks_of_region: (0..n as u32).map(|mask| vec![mask]).collect(),
-        entries_of_cell: Vec::new(),
-    };
-    let mut table = RegionTable::new(DIM);
-    table.append(&view);
     let entry = |i: usize| SumEntry { local: split.local_of_gaussian[i], region: i as u32, weight: 2.0 };
-    let entries: Vec<SumEntry> = (0..n).map(entry).collect();
-    let field = CellField::new(cell.gaussians.clone(), &entries, &table);
-    let settings = PaletteSettings::default();
-    let built = shard::build(&scene, 0, cell, &field, &table, Hash32([0; 32]), &settings);
+    let mut entries: Vec<SumEntry> = (0..n).map(entry).collect();
+    entries.sort_by_key(|entry| entry.local);
+    let (field, _, vectors) = one_cell(vectors, entries, cell.gaussians.clone());
+    let has_evidence = (0..n).map(|k| field.has_evidence(k)).collect();
+    let embeddings = CellEmbeddings { dim: DIM, vectors, has_evidence };
+    let built = shard::build(&scene, 0, cell, &embeddings, Hash32([0; 32]), &PaletteSettings::default());
     let exact = built.shards.iter().find(|(profile, _)| *profile == Profile::Exact);
     AlignedBytes::copy_of(&exact.expect("there is one").1)
 }

@@ -2,6 +2,7 @@
 //! run.
 
 pub mod arrays;
+pub mod lift;
 pub mod raster;
 pub mod scene;
 

@@ -333,6 +333,8 @@ pub struct DemoArgs {
 pub enum BenchCommand {
     /// Weights of a view: each device on generated scenes, or on a recorded one.
     Raster(RasterBenchArgs),
+    /// From the sparse sums of all views to every Gaussian's embedding, on a made-up scene.
+    Lift(LiftBenchArgs),
 }
 
 /// `bench raster`.
@@ -371,6 +373,53 @@ pub struct RasterBenchArgs {
     pub out: Option<PathBuf>,
 }
 
+/// `bench lift`.
+#[derive(Debug, Args)]
+pub struct LiftBenchArgs {
+    /// Gaussians.
+    #[arg(long, value_name = "N", default_value_t = 2_000_000, value_parser = clap::value_parser!(u32).range(1..))]
+    pub gaussians: u32,
+    /// Views.
+    #[arg(long, value_name = "N", default_value_t = 252, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    pub views: u32,
+    /// Masks a view.
+    #[arg(long, value_name = "N", default_value_t = 60, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    pub masks: u32,
+    /// Gaussians with a sum, a view.
+    #[arg(long, value_name = "N", default_value_t = 400_000, value_parser = clap::value_parser!(u32).range(1..))]
+    pub visible: u32,
+    /// Sums of each of these: a Gaussian lies in several regions near their borders.
+    #[arg(long, value_name = "X", default_value_t = 1.4, value_parser = parse_ratio)]
+    pub entries_per_visible: f64,
+    /// Components of an embedding.
+    #[arg(long, value_name = "N", default_value_t = 512, value_parser = clap::value_parser!(u32).range(1..=8192))]
+    pub dim: u32,
+    /// Gaussians a cell at most.
+    #[arg(long, value_name = "N", default_value_t = 65_536, value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    pub cell_gaussians: u32,
+    /// Working memory, as of `encode`.
+    #[arg(long, value_name = "BYTES", default_value = "2GiB", value_parser = parse_bytes)]
+    pub memory: u64,
+    /// Threads; all cores if absent.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub threads: Option<u32>,
+    /// Times that everything is done.
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..))]
+    pub repeats: u32,
+    /// Folder for the files of sums, removed afterwards; in the system's temporary folder if absent.
+    #[arg(long, value_name = "DIR")]
+    pub work: Option<PathBuf>,
+    /// Gaussians of the scene that a plan is made for.
+    #[arg(long, value_name = "N", default_value_t = 38_000_000, value_parser = clap::value_parser!(u32).range(1..))]
+    pub plan_gaussians: u32,
+    /// Views of that scene.
+    #[arg(long, value_name = "N", default_value_t = 1657, value_parser = clap::value_parser!(u32).range(1..))]
+    pub plan_views: u32,
+    /// Writes the figures as JSON into this file.
+    #[arg(long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
+}
+
 /// What `bench raster` measures.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BenchDevice {
@@ -386,6 +435,12 @@ impl FromStr for BenchDevice {
     fn from_str(text: &str) -> Result<Self, String> {
         if text == "cpu-each" { Ok(Self::CpuEach) } else { text.parse().map(Self::Chosen) }
     }
+}
+
+/// Reads a number of sums a Gaussian.
+fn parse_ratio(text: &str) -> Result<f64, String> {
+    let ratio: f64 = text.parse().map_err(|_| format!("{text:?} is no number"))?;
+    if (1.0..=4.0).contains(&ratio) { Ok(ratio) } else { Err(format!("{text:?} is not within 1 to 4")) }
 }
 
 /// Reads a number of bytes with an optional unit.

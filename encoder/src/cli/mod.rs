@@ -1,6 +1,7 @@
 //! The command line: flags in, exit code out. Data goes to stdout, everything else to stderr.
 
 mod args;
+mod bench;
 mod progress;
 mod run;
 

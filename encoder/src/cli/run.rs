@@ -48,6 +48,7 @@ pub fn run(cli: Cli) -> Exit {
         Command::Demo(args) => run_demo(&args, progress.as_ref(), json),
         Command::Devices => run_devices(json),
         Command::Bench(BenchCommand::Raster(args)) => run_bench_raster(&args, progress.as_ref(), json),
+        Command::Bench(BenchCommand::Lift(args)) => super::bench::run_lift(&args, json),
     };
     match result {
         Ok(exit) => exit,
@@ -77,7 +78,7 @@ fn is_broken_pipe(error: &anyhow::Error) -> bool {
 }
 
 /// Prints the result: as one JSON object, or as lines for people.
-fn print(json: bool, value: &impl Serialize, lines: impl Display) -> Result<()> {
+pub(super) fn print(json: bool, value: &impl Serialize, lines: impl Display) -> Result<()> {
     let mut out = std::io::stdout().lock();
     match json {
         true => writeln!(out, "{}", serde_json::to_string(value)?)?,
@@ -201,7 +202,7 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
     })
 }
 
-fn available_threads() -> usize {
+pub(super) fn available_threads() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 

@@ -1,7 +1,7 @@
 //! The state of an unfinished encode: which views are done, and their files of sums.
 
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use slag_common::Hash32;
 
@@ -46,11 +46,6 @@ impl<'a> Job<'a> {
         }
         fs_err::create_dir_all(job.folder.join("views"))?;
         Ok(job)
-    }
-
-    /// Returns the folder for working files.
-    pub(super) fn folder(&self) -> &Path {
-        &self.folder
     }
 
     /// Returns the views whose sums are on disk.

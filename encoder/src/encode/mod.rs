@@ -5,6 +5,7 @@
 //! the views' names, so the store's bytes do not depend on threads, on the order of views or on where
 //! a run was interrupted.
 
+mod cells;
 mod job;
 mod settings;
 mod view;
@@ -16,7 +17,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Instant;
 
 use serde::Serialize;
-use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
+use slag_common::manifest::{self, EncoderRecord, Manifest};
 use slag_common::poses::{self, PoseError};
 use slag_common::splat::{self, SplatError};
 use slag_common::{Hash32, View};
@@ -24,13 +25,13 @@ use slag_models::{ModelDir, ModelError, SessionOptions};
 
 use crate::embed::EmbedError;
 use crate::ingest::{self, GeoError, IngestError};
-use crate::lift::published::{EXTRA_REGIONS, extra_field};
-use crate::lift::{CellBuckets, CellField, RegionTable, SumsError, ViewSums};
+use crate::lift::SumsError;
 use crate::progress::Progress;
 use crate::raster::{RasterError, Rasterizer};
 use crate::segment::{GivenMasks, GraphSegmenter, SegmentError, Segmenter};
-use crate::shard::{self, cells};
-use crate::store::{Extras, Store, StoreError};
+use crate::shard;
+use crate::store::{Store, StoreError};
+use cells::CellBuilder;
 use job::Job;
 pub use settings::{EncodeSettings, Masks};
 use view::ViewWorker;
@@ -129,17 +130,20 @@ pub enum EncodeError {
         /// Gaussians in it.
         n_gaussians: usize,
     },
-    /// The budget is too small for the region vectors.
+    /// The budget is too small.
     #[error(
-        "the vectors of {n_regions} regions take {needed_bytes} bytes, half of --memory is {available_bytes}; raise --memory or lower --views-limit"
+        "--memory is {available_bytes} bytes, {needed_bytes} are needed: {cell_bytes} for the largest cell, \
+         {index_bytes} for the masks and sums of all views; raise --memory or lower --cell-gaussians"
     )]
     Memory {
-        /// Regions in all views.
-        n_regions: usize,
-        /// Bytes they take.
-        needed_bytes: u64,
-        /// Bytes there are for them.
+        /// Bytes there are.
         available_bytes: u64,
+        /// Bytes needed at least.
+        needed_bytes: u64,
+        /// Of these, to build the largest cell.
+        cell_bytes: u64,
+        /// Of these, for mask vectors and where sums lie.
+        index_bytes: u64,
     },
     /// Stopped by the user; a rerun resumes.
     #[error("interrupted after {n_done} of {n_views} views; run the same command again to resume")]
@@ -233,11 +237,13 @@ pub fn encode(
     let read_options = splat::ReadOptions { with_sh_rest: false };
     let scene = stopwatch.time("read", || splat::read(&settings.scene, &read_options))?;
     let (views, mut skipped) = choose_views(settings)?;
-    let split = stopwatch.time("cells", || cells::split(&scene, settings.cells));
+    let split = stopwatch.time("cells", || shard::cells::split(&scene, settings.cells));
     if split.cells.is_empty() {
         let n_gaussians = scene.len();
         return Err(EncodeError::NoGaussians { path: settings.scene.clone(), n_gaussians });
     }
+    // Before hours of work: the part of the budget that is known now.
+    cells::check_memory(settings.memory_bytes, cells::largest_cell_bytes(&split, models.dim()), 0, 0)?;
     let segmenter: Box<dyn Segmenter> = match &settings.masks {
         Masks::Auto => Box::new(GraphSegmenter::default()),
         Masks::Given { dir, ignore_ids } => Box::new(GivenMasks::open(dir, ignore_ids.clone())?),
@@ -266,11 +272,8 @@ pub fn encode(
         return Err(EncodeError::NoViews { n_views: skipped.len(), reason: first.reason.clone() });
     }
 
-    let merged = stopwatch.time("merge", || merge(settings, &job, &used, split.cells.len(), models.dim()))?;
-    let Merged { table, mut buckets, n_masks, n_entries, n_views_without_masks } = merged;
-    let encoder_id = Hash32(models.encoder_id().hash());
-    let mut extras = Extras::new();
-    extras.insert(EXTRA_REGIONS.into(), store.put_bytes(&table.to_bytes())?.0);
+    let sums_paths: Vec<PathBuf> = used.iter().map(|view| job.sums_path(&view.name)).collect();
+    let builder = CellBuilder::open(settings, &store, &scene, &split, &sums_paths, models, &stopwatch)?;
     let mut summary = EncodeSummary {
         generation: store.next_generation()?,
         n_gaussians: (scene.len() - split.n_rejected) as u64,
@@ -278,11 +281,11 @@ pub fn encode(
         n_rejected: split.n_rejected as u64,
         n_views: used.len(),
         n_views_resumed: n_resumed,
-        n_views_without_masks,
+        n_views_without_masks: builder.n_views_without_masks(),
         skipped_views: skipped,
-        n_masks,
-        n_regions: table.len(),
-        n_entries,
+        n_masks: builder.n_masks(),
+        n_regions: builder.n_regions(),
+        n_entries: builder.n_entries(),
         n_cells: split.cells.len(),
         n_rows: 0,
         shard_bytes: BTreeMap::new(),
@@ -290,43 +293,18 @@ pub fn encode(
         wall_secs: 0.0,
         encoder: models.encoder_id().to_string(),
     };
-    let mut records = Vec::with_capacity(split.cells.len());
     progress.begin("cells", "cell", split.cells.len() as u64, 0);
-    for (cell_id, cell) in (0u32..).zip(&split.cells) {
-        if cancel.load(Ordering::Relaxed) {
-            return Err(EncodeError::Interrupted { n_done: used.len(), n_views: used.len() });
-        }
-        let entries = buckets.take(cell_id)?;
-        let field = stopwatch.time("lift", || CellField::new(cell.gaussians.clone(), &entries, &table));
-        drop(entries);
-        let built = stopwatch.time("palette", || {
-            shard::build(&scene, cell_id, cell, &field, &table, encoder_id, &settings.palette)
-        });
-        extras.insert(extra_field(cell_id), store.put_bytes(&field.to_bytes())?.0);
-        let mut shards = BTreeMap::new();
-        for (profile, bytes) in &built.shards {
-            let (hash, len_bytes) = stopwatch.time("write", || store.put_bytes(bytes))?;
-            *summary.shard_bytes.entry(profile.to_string()).or_default() += len_bytes;
-            let record = ShardRecord {
-                hash,
-                len_bytes,
-                n_rows: built.n_rows,
-                score_error_bound: built.score_error_bound,
-                position_error: built.position_error,
-            };
-            shards.insert(*profile, record);
-        }
-        summary.n_rows += u64::from(built.n_rows);
-        summary.n_without_evidence += built.n_without_evidence as u64;
-        records.push(CellRecord {
-            cell_id,
-            bounds: cell.bounds,
-            n_gaussians: cell.gaussians.len() as u32,
-            shards,
-        });
-        progress.advance(1);
-    }
+    let Some(built) = builder.build(progress, cancel)? else {
+        return Err(EncodeError::Interrupted { n_done: used.len(), n_views: used.len() });
+    };
     progress.end();
+    for record in &built.records {
+        for (profile, shard) in &record.shards {
+            *summary.shard_bytes.entry(profile.to_string()).or_default() += shard.len_bytes;
+        }
+        summary.n_rows += record.shards.values().map(|s| u64::from(s.n_rows)).max().unwrap_or(0);
+    }
+    summary.n_without_evidence = built.n_without_evidence;
 
     let manifest = Manifest {
         version: manifest::VERSION,
@@ -338,16 +316,16 @@ pub fn encode(
         geo_reference,
         encoder: EncoderRecord {
             name: models.encoder_id().name.clone(),
-            id: encoder_id,
+            id: Hash32(models.encoder_id().hash()),
             dim: models.dim() as u32,
             default_threshold: models.threshold(),
         },
         n_gaussians: summary.n_gaussians,
         n_without_evidence: summary.n_without_evidence,
         n_rejected: summary.n_rejected,
-        cells: records,
+        cells: built.records,
     };
-    store.publish(&manifest, &extras)?;
+    store.publish(&manifest, &built.extras)?;
     job.finish()?;
     store.prune()?;
     summary.busy_secs = stopwatch
@@ -438,42 +416,4 @@ fn run_views(
         return Err(EncodeError::Interrupted { n_done: job.done_views()?.len(), n_views: views.len() });
     }
     Ok(skipped)
-}
-
-struct Merged {
-    table: RegionTable,
-    buckets: CellBuckets,
-    n_masks: usize,
-    n_entries: u64,
-    n_views_without_masks: usize,
-}
-
-/// Brings the sums of all views together, in the order of their names.
-fn merge(
-    settings: &EncodeSettings,
-    job: &Job<'_>,
-    used: &[&View],
-    n_cells: usize,
-    dim: usize,
-) -> Result<Merged, EncodeError> {
-    let buckets = CellBuckets::new(job.folder().join("cells"), n_cells, settings.memory_bytes / 4)?;
-    let table = RegionTable::new(dim);
-    let mut merged = Merged { table, buckets, n_masks: 0, n_entries: 0, n_views_without_masks: 0 };
-    for view in used {
-        let sums = ViewSums::read(&job.sums_path(&view.name))?;
-        let first_region = merged.table.append(&sums);
-        let needed_bytes = (merged.table.vectors.len() * size_of::<f32>()) as u64;
-        if needed_bytes > settings.memory_bytes / 2 {
-            let available_bytes = settings.memory_bytes / 2;
-            return Err(EncodeError::Memory { n_regions: merged.table.len(), needed_bytes, available_bytes });
-        }
-        for (cell_id, entries) in &sums.entries_of_cell {
-            merged.buckets.put(*cell_id, first_region, entries)?;
-            merged.n_entries += entries.len() as u64;
-        }
-        let n_masks = sums.mask_vectors.len() / dim;
-        merged.n_masks += n_masks;
-        merged.n_views_without_masks += usize::from(n_masks == 0);
-    }
-    Ok(merged)
 }

@@ -11,12 +11,29 @@
 //! so the field stays factorised: a sparse matrix of sums times a small matrix of region vectors.
 //! Sums are taken in one canonical order (views by name, then regions), whatever order, thread or
 //! process made them: the result is the same bit for bit.
+//!
+//! | step | job |
+//! |---|---|
+//! | [`sums`] | a view's sums in a file, ordered by cell |
+//! | [`regroup`] | the sums of all views by Gaussian, a few cells at a time |
+//! | [`embeddings`] | each Gaussian's embedding, computed once |
+//! | [`field`] | what is kept of it: sums, total weight, length |
 
-mod buckets;
+mod embeddings;
 mod field;
 pub mod published;
+mod regroup;
 mod sums;
+mod table;
+#[cfg(test)]
+mod tests;
 
-pub use buckets::{CellBuckets, SumEntry};
-pub use field::{CellField, FieldError, RegionTable, dot};
-pub use sums::{SumsError, ViewSums};
+pub use field::{CellField, dot};
+pub use regroup::{Part, PartSums, RawGroup, SumsIndex};
+pub use sums::{GAUSSIANS_PER_SLICE, MAX_REGIONS, SumEntry, SumsError, SumsFile, ViewRegions, ViewSums};
+pub use table::RegionTable;
+
+/// Returns whether values are ascending from 0 to `end`, as the starts of `starts.len() - 1` rows are.
+fn are_starts(starts: &[u64], end: usize) -> bool {
+    starts.first() == Some(&0) && starts.is_sorted() && starts.last() == Some(&(end as u64))
+}

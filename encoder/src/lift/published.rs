@@ -1,26 +1,42 @@
 //! The field of a published generation, read back in full precision.
 
-use slag_common::container::AlignedBytes;
+use slag_common::container::{AlignedBytes, ContainerError};
 
-use super::field::{CellField, FieldError, RegionTable};
+use super::field::CellField;
+use super::table::RegionTable;
 use crate::store::{StoreError, StoreReader};
 
 /// Name of the region table among a generation's extras.
 pub const EXTRA_REGIONS: &str = "regions";
 
-/// Returns the name of a cell's field among a generation's extras.
-pub fn extra_field(cell_id: u32) -> String {
-    format!("field/{cell_id}")
+/// Returns the name of a part of a cell's field among a generation's extras.
+pub fn extra_field(cell_id: u32, part: u32) -> String {
+    format!("field/{cell_id}/{part}")
 }
 
-/// Reads the full-precision field of a published cell.
+/// Reads the full-precision field of a published cell of `n_gaussians`.
 ///
 /// # Errors
 /// [`ReadFieldError`].
-pub fn read_field(reader: &StoreReader, cell_id: u32, n_regions: usize) -> Result<CellField, ReadFieldError> {
-    let name = extra_field(cell_id);
-    let bytes = read_extra(reader, &name)?;
-    CellField::from_bytes(&bytes, n_regions).map_err(|source| ReadFieldError::Damaged { name, source })
+pub fn read_field(
+    reader: &StoreReader,
+    cell_id: u32,
+    n_gaussians: u32,
+    n_regions: usize,
+) -> Result<CellField, ReadFieldError> {
+    let read_part = |part| {
+        let name = extra_field(cell_id, part);
+        let bytes = read_extra(reader, &name)?;
+        CellField::from_bytes(&bytes, n_regions).map_err(|source| ReadFieldError::Damaged { name, source })
+    };
+    let mut field = read_part(0)?;
+    for part in 1.. {
+        if field.len() >= n_gaussians as usize {
+            break;
+        }
+        field.append(read_part(part)?);
+    }
+    Ok(field)
 }
 
 /// Reads the region table of the published generation.
@@ -57,6 +73,6 @@ pub enum ReadFieldError {
         /// The part.
         name: String,
         /// What is wrong.
-        source: FieldError,
+        source: ContainerError,
     },
 }

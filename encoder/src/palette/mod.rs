@@ -4,7 +4,7 @@
 //! Clusters are found in a random projection (Johnson and Lindenstrauss 1984: distances survive), by
 //! splitting the worst cluster in two until every cluster keeps the error budget or K reaches its
 //! limit, so K follows the cell's content. Row vectors and hard radii are then taken from the full
-//! embeddings, which are recomputed from the sparse sums in chunks: N x dim is never held.
+//! embeddings.
 
 use half::f16;
 use rayon::prelude::*;
@@ -16,8 +16,11 @@ const PROJECTED_DIM: usize = 64;
 const SPLIT_ROUNDS: usize = 3;
 /// Rounds of k-means over all rows at the end.
 const REFINE_ROUNDS: usize = 2;
-/// Embeddings recomputed at a time by one thread.
+/// Embeddings projected at a time by one thread.
 const CHUNK: usize = 256;
+
+/// Bytes that building a palette takes for each embedding, at most: projection, members and codes.
+pub const WORKING_BYTES_PER_EMBEDDING: usize = (PROJECTED_DIM + 8) * size_of::<f32>();
 
 /// How fine a palette is.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -47,7 +50,7 @@ pub struct Palette {
     pub codes: Vec<u32>,
 }
 
-/// Embeddings that can be computed again at any time.
+/// Embeddings that can be read several times.
 pub trait EmbeddingSource: Sync {
     /// Returns the number of embeddings.
     fn len(&self) -> usize;

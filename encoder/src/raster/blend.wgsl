@@ -4,13 +4,6 @@
 // that the pixels of a region lie one after another: the second half of each step then adds up runs,
 // 32 threads a Gaussian, whatever the number of regions.
 
-// Returns by how many bits the sums of a Gaussian in a tile are finer than 2^-TILE_FRACTION_BITS: none of
-// its weights is above `bound`, so as many leading bits of a sum stay 0.
-fn extra_bits(bound: f32) -> u32 {
-    let exponent = i32(bitcast<u32>(bound) >> 23u) - 127;
-    return u32(clamp(-(exponent + 1), 0, i32(MAX_EXTRA_BITS)));
-}
-
 @group(0) @binding(0) var<storage, read> view: View;
 @group(0) @binding(1) var<storage, read_write> counters: array<atomic<u32>, N_COUNTERS>;
 @group(0) @binding(2) var<storage, read> screen: array<Screen>;
@@ -39,13 +32,11 @@ var<workgroup> region_of_slot: array<u32, WORKGROUP_SIZE>;
 var<workgroup> gaussians: array<InTile, LOAD>;
 var<workgroup> weights: array<f32, STEP * WEIGHTS_STRIDE>;
 var<workgroup> sums: array<atomic<u32>, N_SUMS>;
+var<workgroup> upper_sums: array<atomic<u32>, N_SUMS>;
 var<workgroup> n_slots_shared: u32;
 var<workgroup> range_shared: vec2<u32>;
 var<workgroup> n_live: atomic<u32>;
 var<workgroup> n_live_shared: u32;
-// Bits of the largest transmittance of a live pixel; positive, so they order as it does.
-var<workgroup> most_light: atomic<u32>;
-var<workgroup> most_light_shared: f32;
 var<workgroup> n_found: atomic<u32>;
 var<workgroup> first_entry: u32;
 
@@ -102,10 +93,10 @@ fn sum_regions(
         range_shared = vec2<u32>(range.start, min(range.end, view.capacity_pairs));
         atomicStore(&n_live, 0u);
         atomicStore(&n_found, 0u);
-        atomicStore(&most_light, bitcast<u32>(1.0));
     }
     for (var i = thread; i < N_SUMS; i += WORKGROUP_SIZE) {
         atomicStore(&sums[i], 0u);
+        atomicStore(&upper_sums[i], 0u);
     }
     let n_slots = workgroupUniformLoad(&n_slots_shared);
     let range = workgroupUniformLoad(&range_shared);
@@ -138,13 +129,11 @@ fn sum_regions(
         }
         if thread == 0u {
             n_live_shared = atomicLoad(&n_live);
-            most_light_shared = bitcast<f32>(atomicExchange(&most_light, 0u));
         }
         // A barrier, too: the Gaussians are there.
         if workgroupUniformLoad(&n_live_shared) == 0u {
             break;
         }
-        let light = select(most_light_shared, 1.0, is_falloff);
         let n_loaded = min(per_round, range.y - start);
         for (var step = 0u; step < n_loaded; step += STEP) {
             for (var i = 0u; i < STEP; i++) {
@@ -176,42 +165,45 @@ fn sum_regions(
             workgroupBarrier();
             let first_weight = of_step * WEIGHTS_STRIDE + run * (RUN + 1u);
             let first_sum = (step + of_step) * n_slots;
-            let bound = select(gaussians[step + of_step].opacity, 1.0, is_falloff) * light;
-            // 2 to that power.
-            let scale = bitcast<f32>((127u + TILE_FRACTION_BITS + extra_bits(bound)) << 23u);
             var sum = 0.0;
             var slot_of_run = slots[run * RUN];
             for (var i = 0u; i < RUN; i++) {
                 let slot_of_pixel = slots[run * RUN + i];
                 if slot_of_pixel != slot_of_run {
-                    add(first_sum, slot_of_run, sum * scale);
+                    add(first_sum, slot_of_run, sum);
                     sum = 0.0;
                     slot_of_run = slot_of_pixel;
                 }
                 sum += weights[first_weight + i];
             }
-            add(first_sum, slot_of_run, sum * scale);
+            add(first_sum, slot_of_run, sum);
             workgroupBarrier();
         }
-        if is_live {
-            atomicMax(&most_light, bitcast<u32>(transmittance));
-        }
-        write_entries(n_loaded, n_slots, select(light, -1.0, is_falloff), thread);
+        write_entries(n_loaded, n_slots, thread);
     }
 }
 
+// Adds the sum of a run, at most 8, as a whole number of 2^-SUM_FRACTION_BITS. Its upper word counts
+// 2^(32 - SUM_FRACTION_BITS); both parts of the split are exact.
 fn add(first_sum: u32, slot: u32, sum: f32) {
     if slot != NO_SLOT && sum > 0.0 {
-        atomicAdd(&sums[first_sum + slot], u32(round(sum)));
+        var high = u32(sum * UPPER_SCALE);
+        let low = u32((sum - f32(high) / UPPER_SCALE) * UPPER_SCALE * 4294967296.0);
+        let at = first_sum + slot;
+        let before = atomicAdd(&sums[at], low);
+        high += u32(before + low < before);
+        if high > 0u {
+            atomicAdd(&upper_sums[at], high);
+        }
     }
 }
 
 // Appends what was summed to the entries, and clears the sums. The order in which tiles append does not
 // matter: entries are sorted, and whole numbers added, before anything is read.
-fn write_entries(n_loaded: u32, n_slots: u32, light: f32, thread: u32) {
+fn write_entries(n_loaded: u32, n_slots: u32, thread: u32) {
     var n_own = 0u;
     for (var i = thread; i < n_loaded * n_slots; i += WORKGROUP_SIZE) {
-        n_own += u32(atomicLoad(&sums[i]) > 0u);
+        n_own += u32((atomicLoad(&sums[i]) | atomicLoad(&upper_sums[i])) > 0u);
     }
     var at = 0u;
     if n_own > 0u {
@@ -225,15 +217,13 @@ fn write_entries(n_loaded: u32, n_slots: u32, light: f32, thread: u32) {
     at += workgroupUniformLoad(&first_entry);
     if n_own > 0u {
         for (var i = thread; i < n_loaded * n_slots; i += WORKGROUP_SIZE) {
-            let sum = atomicLoad(&sums[i]);
-            if sum > 0u {
+            let low = atomicExchange(&sums[i], 0u);
+            let high = atomicExchange(&upper_sums[i], 0u);
+            if (low | high) > 0u {
                 if at < view.capacity_entries {
-                    let g = gaussians[i / n_slots];
-                    let bits = extra_bits(select(g.opacity * light, 1.0, light < 0.0));
-                    entries[at] = Entry(g.member, region_of_slot[i % n_slots] | (bits << REGION_BITS), sum);
+                    entries[at] = Entry(gaussians[i / n_slots].member, region_of_slot[i % n_slots], low, high);
                 }
                 at += 1u;
-                atomicStore(&sums[i], 0u);
             }
         }
     }

@@ -10,8 +10,6 @@ struct View {
     focal_y_px: real,
     centre_x_px: real,
     centre_y_px: real,
-    // What f32 leaves of the rotation's last row.
-    forward_low: array<real, 3>,
     width_px: u32,
     height_px: u32,
     // Rows of tiles that are worked on: `first_tile_row..end_tile_row`.
@@ -128,17 +126,12 @@ struct Range {
     end: u32,
 }
 
-// A Gaussian's sum over a region in one tile.
+// A Gaussian's sum over a region in one tile, in units of 2^-SUM_FRACTION_BITS.
 struct Entry {
     member: u32,
-    // The region in the lower REGION_BITS, above it how many bits the sum is finer than usual.
-    region_and_bits: u32,
-    // In units of 2^-(TILE_FRACTION_BITS + those bits).
-    sum: u32,
-}
-
-fn region_of(entry: Entry) -> u32 {
-    return entry.region_and_bits & ((1u << REGION_BITS) - 1u);
+    region: u32,
+    low: u32,
+    high: u32,
 }
 
 // Sum over a workgroup: what every stage places its output by.

@@ -1,6 +1,6 @@
 // Adds up the sorted entries of each (Gaussian, region): whole numbers, so the order does not show.
 
-// A sum over all tiles, in units of 2^-(TILE_FRACTION_BITS + MAX_EXTRA_BITS).
+// A sum over all tiles, in units of 2^-SUM_FRACTION_BITS.
 struct RegionSum {
     gaussian: u32,
     region: u32,
@@ -30,7 +30,7 @@ fn is_head(at: u32, n: u32) -> u32 {
     }
     let own = entries[order[at]];
     let before = entries[order[at - 1u]];
-    return u32(own.member != before.member || region_of(own) != region_of(before));
+    return u32(own.member != before.member || own.region != before.region);
 }
 
 @compute @workgroup_size(WORKGROUP_SIZE)
@@ -72,15 +72,11 @@ fn add_up(
             let entry = entries[order[position]];
             if head == 1u {
                 region_sums[index].gaussian = screen[entry.member].gaussian;
-                region_sums[index].region = region_of(entry);
+                region_sums[index].region = entry.region;
             }
-            let shift = MAX_EXTRA_BITS - (entry.region_and_bits >> REGION_BITS);
-            let low = entry.sum << shift;
-            // Two shifts: one by 32 is none.
-            let high = (entry.sum >> 1u) >> (31u - shift);
             // The lower word wraps at most once an addition.
-            let before = atomicAdd(&region_sums[index].low, low);
-            let carried = high + u32(before + low < before);
+            let before = atomicAdd(&region_sums[index].low, entry.low);
+            let carried = entry.high + u32(before + entry.low < before);
             if carried > 0u {
                 atomicAdd(&region_sums[index].high, carried);
             }

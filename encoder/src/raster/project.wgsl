@@ -39,43 +39,6 @@ fn dot3(a: real3, b: real3) -> real {
     return a.x * b.x + a.y * b.y + a.z * b.z;
 }
 
-// Returns a + b as rounded sum and rounding error (Knuth 1969).
-fn two_sum(a: f32, b: f32) -> vec2<f32> {
-    let sum = a + b;
-    let of_b = sum - a;
-    return vec2<f32>(sum, (a - (sum - of_b)) + (b - of_b));
-}
-
-// Returns a * b as rounded product and rounding error (Dekker 1971).
-fn two_product(a: f32, b: f32) -> vec2<f32> {
-    let product = a * b;
-    let a_split = 4097.0 * a;
-    let b_split = 4097.0 * b;
-    let a_high = a_split - (a_split - a);
-    let b_high = b_split - (b_split - b);
-    let a_low = a - a_high;
-    let b_low = b - b_high;
-    let error = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low;
-    return vec2<f32>(product, error);
-}
-
-// Returns the camera z correctly rounded, or nearly so: plain f32 would swap near neighbours in depth,
-// and their weights with them.
-fn exact_depth(g: SceneGaussian) -> f32 {
-    var sum = 0.0;
-    var error = 0.0;
-    for (var i = 0u; i < 3u; i++) {
-        let offset = two_sum(g.mean_high[i], -f32(view.position_high[i]));
-        let rest = offset.y + (g.mean_low[i] - f32(view.position_low[i]));
-        let forward = f32(view.rotation[6u + i]);
-        let product = two_product(forward, offset.x);
-        let total = two_sum(sum, product.x);
-        sum = total.x;
-        error += total.y + (product.y + (forward * rest + f32(view.forward_low[i]) * offset.x));
-    }
-    return sum + error;
-}
-
 fn is_coordinate(value: real) -> bool {
     return abs(value) <= real(MAX_COORDINATE_PX);
 }
@@ -178,9 +141,6 @@ fn project(index: u32) -> Projected {
     s.slope = cov_xy / cov_yy;
     s.inv_height = ONE / sqrt(cov_yy);
     s.depth = bitcast<u32>(f32(z));
-    if !HAS_F64 {
-        s.depth = bitcast<u32>(exact_depth(g));
-    }
     s.opacity = g.opacity;
     s.reach2 = g.reach2;
     s.gaussian = chunk.first_gaussian + index;

@@ -8,7 +8,6 @@ use slag_common::Gaussians;
 use slag_common::hash::Hash32;
 use slag_common::shard::{Profile, ShardHeader, ShardParts};
 
-use crate::lift::{CellField, RegionTable};
 use crate::palette::{self, EmbeddingSource, PaletteSettings};
 use cells::Cell;
 
@@ -26,9 +25,31 @@ pub struct BuiltCell {
     pub n_without_evidence: usize,
 }
 
+/// The embeddings of a cell's Gaussians.
+pub struct CellEmbeddings {
+    /// Components of an embedding.
+    pub dim: usize,
+    /// `[N][dim]`: unit, or zeros where there is no evidence.
+    pub vectors: Vec<f32>,
+    /// `[N]`: whether there is.
+    pub has_evidence: Vec<bool>,
+}
+
+impl CellEmbeddings {
+    fn get(&self, local: u32) -> &[f32] {
+        &self.vectors[local as usize * self.dim..][..self.dim]
+    }
+}
+
+/// Returns the bytes that a cell of `n_gaussians` takes while its shards are built: embeddings in f32,
+/// in f16 and in the shard, their projection for the palette, and the palette's lists.
+pub fn working_bytes(n_gaussians: usize, dim: usize) -> u64 {
+    let per_component = size_of::<f32>() + 2 * size_of::<f16>();
+    (n_gaussians * (dim * per_component + palette::WORKING_BYTES_PER_EMBEDDING)) as u64
+}
+
 struct WithEvidence<'a> {
-    field: &'a CellField,
-    table: &'a RegionTable,
+    embeddings: &'a CellEmbeddings,
     /// Locals of the Gaussians that have an embedding.
     locals: &'a [u32],
 }
@@ -38,10 +59,10 @@ impl EmbeddingSource for WithEvidence<'_> {
         self.locals.len()
     }
     fn dim(&self) -> usize {
-        self.table.dim
+        self.embeddings.dim
     }
     fn embedding(&self, index: usize, out: &mut [f32]) {
-        self.field.embedding(self.locals[index] as usize, self.table, out);
+        out.copy_from_slice(self.embeddings.get(self.locals[index]));
     }
 }
 
@@ -50,14 +71,13 @@ pub fn build(
     scene: &Gaussians,
     cell_id: u32,
     cell: &Cell,
-    field: &CellField,
-    table: &RegionTable,
+    embeddings: &CellEmbeddings,
     encoder_id: Hash32,
     settings: &PaletteSettings,
 ) -> BuiltCell {
     let (mut locals, without): (Vec<u32>, Vec<u32>) =
-        (0..field.len() as u32).partition(|k| field.has_evidence(*k as usize));
-    let palette = palette::build(&WithEvidence { field, table, locals: &locals }, settings);
+        (0..cell.gaussians.len() as u32).partition(|local| embeddings.has_evidence[*local as usize]);
+    let palette = palette::build(&WithEvidence { embeddings, locals: &locals }, settings);
     let n_rows = palette.radii.len();
 
     // Shard order: by row, then along the Morton curve, which is the order of locals.
@@ -84,23 +104,20 @@ pub fn build(
         cell_id,
         n_gaussians: locals.len() as u32,
         n_rows: n_rows as u32,
-        dim: table.dim as u32,
+        dim: embeddings.dim as u32,
         origin_in_world: origin.to_array(),
         position_step,
         box_min: cell.bounds.min.to_array(),
         box_max: cell.bounds.max.to_array(),
         encoder_id: encoder_id.0,
     };
-    let input_indices: Vec<u32> = locals.iter().map(|local| field.input_indices[*local as usize]).collect();
+    let input_indices: Vec<u32> = locals.iter().map(|local| cell.gaussians[*local as usize]).collect();
     let n_with = locals.len() - without.len();
-    let mut embeddings = vec![f16::ZERO; n_with * table.dim];
-    embeddings.par_chunks_exact_mut(table.dim).zip(&locals[..n_with]).for_each_init(
-        || vec![0.0; table.dim],
-        |embedding, (out, local)| {
-            field.embedding(*local as usize, table, embedding);
-            out.iter_mut().zip(embedding.iter()).for_each(|(o, v)| *o = f16::from_f32(*v));
-        },
-    );
+    let dim = embeddings.dim;
+    let mut exact = vec![f16::ZERO; n_with * dim];
+    exact.par_chunks_exact_mut(dim).zip(&locals[..n_with]).for_each(|(out, local)| {
+        out.iter_mut().zip(embeddings.get(*local)).for_each(|(o, v)| *o = f16::from_f32(*v));
+    });
     let shards = Profile::ALL
         .into_iter()
         .map(|profile| {
@@ -110,7 +127,7 @@ pub fn build(
                 row_starts: &row_starts,
                 palette: &palette.rows,
                 radii: &palette.radii,
-                exact: (profile == Profile::Exact).then_some((&input_indices, &embeddings)),
+                exact: (profile == Profile::Exact).then_some((&input_indices, &exact)),
             };
             let mut bytes = Vec::new();
             parts.write(&mut bytes).expect("writing to memory cannot fail");

@@ -95,10 +95,10 @@ impl Adapter {
     pub fn open(&self, precision: Precision) -> Result<Device, RasterError> {
         let failed = |what: String| RasterError::Device { adapter: self.report.name.clone(), what };
         let limits = self.adapter.limits();
-        // 256 threads and 24 KiB shared by them: what every desktop device has.
+        // 256 threads and 32 KiB shared by them: what every desktop device has.
         for (name, found, needed) in [
             ("threads of a workgroup", limits.max_compute_invocations_per_workgroup, 256),
-            ("bytes of workgroup memory", limits.max_compute_workgroup_storage_size, 24 << 10),
+            ("bytes of workgroup memory", limits.max_compute_workgroup_storage_size, 32 << 10),
             ("storage buffers of a shader", limits.max_storage_buffers_per_shader_stage, 8),
         ] {
             if found < needed {

@@ -4,7 +4,7 @@ use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 use slag_common::Gaussians;
 
-use super::shader::{MAX_EXTRA_BITS, Precision, TILE_FRACTION_BITS};
+use super::shader::{Precision, SUM_FRACTION_BITS};
 use crate::raster::constants::{MIN_ALPHA, TILE_SIZE_PX};
 use crate::raster::project::reach2;
 use crate::raster::{RasterView, RegionWeight};
@@ -103,7 +103,7 @@ pub struct SortPass {
     pub capacity: u32,
 }
 
-/// A sum over all tiles of a band, in units of `2^-(TILE_FRACTION_BITS + MAX_EXTRA_BITS)`.
+/// A sum over all tiles of a band, in units of `2^-SUM_FRACTION_BITS`.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub struct RegionSum {
@@ -125,7 +125,7 @@ impl RegionSum {
 
     /// Returns the weight of this Gaussian and region for a sum.
     pub fn weight(&self, fixed: u64) -> RegionWeight {
-        let weight = (fixed as f64 / (1u64 << (TILE_FRACTION_BITS + MAX_EXTRA_BITS)) as f64) as f32;
+        let weight = (fixed as f64 / (1u64 << SUM_FRACTION_BITS) as f64) as f32;
         RegionWeight { gaussian: self.gaussian, region: self.region, weight }
     }
 }
@@ -153,8 +153,8 @@ pub struct Capacities {
 
 /// The view's part of the shaders' input, for a band of tile rows.
 pub struct ViewBlock {
-    /// `rotation` (9), `position_high` (3), `position_low` (3), focal lengths, centre, `forward_low` (3).
-    pub reals: [f64; 22],
+    /// `rotation` (9), `position_high` (3), `position_low` (3), focal lengths, centre.
+    pub reals: [f64; 19],
     /// From `width_px` to `capacity_entries`.
     pub words: [u32; 10],
 }
@@ -174,18 +174,16 @@ impl ViewBlock {
         let position = view.camera_from_world.inverse().translation - origin_in_world;
         let (high, _) = high_and_low(position);
         let low = position - DVec3::from_array(high.map(f64::from));
-        let mut reals = [0.0; 22];
+        let mut reals = [0.0; 19];
         reals[..9].copy_from_slice(&rotation.transpose().to_cols_array());
         reals[9..12].copy_from_slice(&high.map(f64::from));
         reals[12..15].copy_from_slice(&low.to_array());
-        reals[15..19].copy_from_slice(&[
+        reals[15..].copy_from_slice(&[
             camera.focal_x_px,
             camera.focal_y_px,
             camera.centre_x_px,
             camera.centre_y_px,
         ]);
-        let forward = rotation.row(2);
-        reals[19..].copy_from_slice(&(forward - forward.as_vec3().as_dvec3()).to_array());
         let words = [
             camera.width_px,
             camera.height_px,
@@ -288,7 +286,6 @@ mod tests {
                     "focal_y_px",
                     "centre_x_px",
                     "centre_y_px",
-                    "forward_low",
                     "width_px",
                     "height_px",
                     "first_tile_row",
@@ -304,8 +301,8 @@ mod tests {
             let real_bytes = if precision == Precision::F64 { 8 } else { 4 };
             assert!(columns.windows(2).all(|w| w[0].1 + w[0].2 == w[1].1), "no gaps: {columns:?}");
             let width = columns.iter().find(|c| c.0 == "width_px").expect("width_px").1;
-            assert_eq!(width, 22 * real_bytes);
-            let block = ViewBlock { reals: [0.0; 22], words: [0; 10] };
+            assert_eq!(width, 19 * real_bytes);
+            let block = ViewBlock { reals: [0.0; 19], words: [0; 10] };
             assert_eq!(block.to_bytes(precision).len(), size_bytes);
         }
     }

@@ -329,7 +329,8 @@ impl<'s> GpuScene<'s> {
     }
 }
 
-/// Returns a point in the midst of a scene: the median along each axis of a sample, which no outlier moves.
+/// Returns a point near the middle of a scene that no outlier moves: the median along each axis of a
+/// sample, rounded to the scale of the scene, so that differences to it mostly are exact.
 fn middle(scene: &Gaussians, usable: &[bool]) -> DVec3 {
     const N_SAMPLES: usize = 4096;
     let sample: Vec<DVec3> = (0..scene.len())
@@ -343,7 +344,9 @@ fn middle(scene: &Gaussians, usable: &[bool]) -> DVec3 {
     DVec3::from_array(std::array::from_fn(|axis| {
         let mut values: Vec<f64> = sample.iter().map(|mean| mean[axis]).collect();
         values.sort_unstable_by(f64::total_cmp);
-        values[values.len() / 2]
+        let at = |share: usize| values[(values.len() - 1) * share / 10];
+        let scale = (at(9) - at(1)).max(1e-6).log2().ceil().exp2();
+        (at(5) / scale).round() * scale
     }))
 }
 

@@ -15,11 +15,8 @@ pub const WORKGROUP_SIZE: u32 = (TILE_SIZE_PX * TILE_SIZE_PX) as u32;
 pub const SORT_BLOCK: u32 = 2048;
 /// Most workgroups of a dispatch, as every device has it.
 pub const MAX_DISPATCH: u32 = 65_535;
-/// Fraction bits of a sum over a tile: 256 weights of at most 1 fit 32 bits.
-pub const TILE_FRACTION_BITS: u32 = 23;
-/// Bits that the sums of faint Gaussians are finer by, at most. With [`TILE_FRACTION_BITS`] and the
-/// 2^28 pixels of the largest image, 63 bits.
-pub const MAX_EXTRA_BITS: u32 = 12;
+/// Fraction bits of the sums: with the 2^28 pixels of the largest image, 63 bits.
+pub const SUM_FRACTION_BITS: u32 = 35;
 /// Bits of a region's number; a region and a pixel of its tile share a word.
 pub const REGION_BITS: u32 = 24;
 /// No counter.
@@ -90,7 +87,6 @@ pub fn module_text(stage: &str, precision: Precision) -> String {
         Precision::F32 => (1e18, 1e18),
     };
     let _ = writeln!(text, "alias real = {real};\nalias real3 = vec3<{real}>;\nalias real4 = vec4<{real}>;");
-    let _ = writeln!(text, "const HAS_F64 = {};", precision == Precision::F64);
     for (name, value) in [("ZERO", 0.0), ("HALF", 0.5), ("ONE", 1.0), ("TWO", 2.0)] {
         let _ = writeln!(text, "const {name}: real = real({value:?});");
     }
@@ -109,6 +105,7 @@ pub fn module_text(stage: &str, precision: Precision) -> String {
         ("MAX_ALPHA", MAX_ALPHA),
         ("MIN_TRANSMITTANCE", MIN_TRANSMITTANCE),
         ("MAX_POWER", MAX_POWER),
+        ("UPPER_SCALE", (1u32 << (SUM_FRACTION_BITS - 32)) as f32),
     ] {
         let _ = writeln!(text, "const {name}: f32 = {value:e}f;");
     }
@@ -119,8 +116,6 @@ pub fn module_text(stage: &str, precision: Precision) -> String {
         ("MAX_DISPATCH", MAX_DISPATCH),
         ("N_COUNTERS", Counter::ALL.len() as u32),
         ("NONE", NONE),
-        ("TILE_FRACTION_BITS", TILE_FRACTION_BITS),
-        ("MAX_EXTRA_BITS", MAX_EXTRA_BITS),
         ("REGION_BITS", REGION_BITS),
     ] {
         let _ = writeln!(text, "const {name}: u32 = {value}u;");

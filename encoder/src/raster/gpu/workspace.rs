@@ -21,7 +21,7 @@ const JOB_STRIDE_BYTES: u64 = 256;
 /// Words of a record of dispatch sizes.
 const DISPATCH_BYTES: u64 = 16;
 const PAIR_WORDS: u32 = 2;
-const ENTRY_WORDS: u32 = 3;
+const ENTRY_WORDS: u32 = 4;
 
 /// Scans that are the same for every view.
 #[derive(Clone, Copy)]

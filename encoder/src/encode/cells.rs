@@ -1,0 +1,212 @@
+//! From the sums of all views to the objects of every cell, within the budget.
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use slag_common::manifest::{CellRecord, ShardRecord};
+use slag_common::{Gaussians, Hash32};
+use slag_models::ModelDir;
+
+use super::{EncodeError, EncodeSettings, Stopwatch};
+use crate::lift::published::{EXTRA_REGIONS, extra_field};
+use crate::lift::{CellField, PartSums, RegionTable, SumsIndex};
+use crate::progress::Progress;
+use crate::shard::cells::CellSplit;
+use crate::shard::{self, CellEmbeddings};
+use crate::store::{Extras, Store};
+
+/// Returns the bytes that the largest cell takes while it is built.
+pub(super) fn largest_cell_bytes(split: &CellSplit, dim: usize) -> u64 {
+    let largest = split.cells.iter().map(|cell| cell.gaussians.len()).max().unwrap_or(0);
+    shard::working_bytes(largest, dim)
+}
+
+/// Returns what cell and index leave of `available_bytes` for sums, which need at least `sums_bytes`.
+pub(super) fn check_memory(
+    available_bytes: u64,
+    cell_bytes: u64,
+    index_bytes: u64,
+    sums_bytes: u64,
+) -> Result<u64, EncodeError> {
+    let needed_bytes = cell_bytes + index_bytes + sums_bytes;
+    if needed_bytes > available_bytes {
+        return Err(EncodeError::Memory { available_bytes, needed_bytes, cell_bytes, index_bytes });
+    }
+    Ok(available_bytes - cell_bytes - index_bytes)
+}
+
+/// Builds the cells of a scene whose views are all done.
+pub(super) struct CellBuilder<'a> {
+    settings: &'a EncodeSettings,
+    store: &'a Store,
+    scene: &'a Gaussians,
+    split: &'a CellSplit,
+    encoder_id: Hash32,
+    stopwatch: &'a Stopwatch,
+    index: SumsIndex,
+    table: RegionTable,
+    /// Bytes there are for the sums of a group of cells.
+    group_bytes: u64,
+}
+
+/// What was built.
+pub(super) struct BuiltCells {
+    pub(super) records: Vec<CellRecord>,
+    pub(super) extras: Extras,
+    pub(super) n_without_evidence: u64,
+}
+
+impl<'a> CellBuilder<'a> {
+    /// Opens the files of sums, in the order of the views' names.
+    ///
+    /// # Errors
+    /// [`EncodeError::Sums`], [`EncodeError::Memory`].
+    pub(super) fn open(
+        settings: &'a EncodeSettings,
+        store: &'a Store,
+        scene: &'a Gaussians,
+        split: &'a CellSplit,
+        sums_paths: &[PathBuf],
+        models: &ModelDir,
+        stopwatch: &'a Stopwatch,
+    ) -> Result<Self, EncodeError> {
+        let n_gaussians: Vec<usize> = split.cells.iter().map(|cell| cell.gaussians.len()).collect();
+        let (index, table) =
+            stopwatch.time("merge", || SumsIndex::open(sums_paths, models.dim(), &n_gaussians))?;
+        let group_bytes = check_memory(
+            settings.memory_bytes,
+            largest_cell_bytes(split, models.dim()),
+            table.len_bytes() + index.len_bytes(),
+            index.largest_part_bytes(),
+        )?;
+        let encoder_id = Hash32(models.encoder_id().hash());
+        Ok(Self { settings, store, scene, split, encoder_id, stopwatch, index, table, group_bytes })
+    }
+
+    pub(super) fn n_views_without_masks(&self) -> usize {
+        self.index.n_views_without_masks()
+    }
+
+    pub(super) fn n_masks(&self) -> usize {
+        self.table.n_masks()
+    }
+
+    pub(super) fn n_regions(&self) -> usize {
+        self.table.len()
+    }
+
+    pub(super) fn n_entries(&self) -> u64 {
+        self.index.n_entries()
+    }
+
+    /// Builds all cells and puts their objects into the store; `None` if cancelled.
+    ///
+    /// # Errors
+    /// [`EncodeError`].
+    pub(super) fn build(
+        &self,
+        progress: &dyn Progress,
+        cancel: &AtomicBool,
+    ) -> Result<Option<BuiltCells>, EncodeError> {
+        let mut built = BuiltCells { records: Vec::new(), extras: Extras::new(), n_without_evidence: 0 };
+        let regions = self.store.put_object(|out| self.table.write(out))?.0;
+        built.extras.insert(EXTRA_REGIONS.into(), regions);
+        let dim = self.table.dim();
+        let mut cell = CellEmbeddings { dim, vectors: Vec::new(), has_evidence: Vec::new() };
+        for group in self.index.groups(self.group_bytes) {
+            let sums = self.stopwatch.time("merge", || {
+                let raw = self.index.read(group)?;
+                self.index.regroup(&raw, &self.table)
+            })?;
+            for sums in sums {
+                if cancel.load(Ordering::Relaxed) {
+                    return Ok(None);
+                }
+                let cell_id = sums.part.cell_id;
+                self.add_part(sums, &mut cell, &mut built)?;
+                if cell.has_evidence.len() == self.split.cells[cell_id as usize].gaussians.len() {
+                    self.finish_cell(cell_id, &cell, &mut built)?;
+                    cell.has_evidence.clear();
+                    progress.advance(1);
+                }
+            }
+        }
+        Ok(Some(built))
+    }
+
+    /// Adds the next part's embeddings to its cell's, and publishes its field.
+    fn add_part(
+        &self,
+        sums: PartSums,
+        cell: &mut CellEmbeddings,
+        built: &mut BuiltCells,
+    ) -> Result<(), EncodeError> {
+        let part = sums.part.clone();
+        let gaussians = &self.split.cells[part.cell_id as usize].gaussians;
+        // Nothing is copied or cleared: the largest cell's vectors are taken once.
+        let len = cell.vectors.len().max(gaussians.len() * cell.dim);
+        cell.vectors.reserve_exact(len - cell.vectors.len());
+        cell.vectors.resize(len, 0.0);
+        let vectors = &mut cell.vectors[part.locals.start * cell.dim..part.locals.end * cell.dim];
+        let field = self.stopwatch.time("lift", || {
+            CellField::new(gaussians[part.locals.clone()].to_vec(), sums, &self.table, vectors)
+        });
+        cell.has_evidence.extend((0..field.len()).map(|k| field.has_evidence(k)));
+        let (hash, _) = self.stopwatch.time("write", || self.store.put_object(|out| field.write(out)))?;
+        built.extras.insert(extra_field(part.cell_id, part.number), hash);
+        Ok(())
+    }
+
+    /// Makes a cell's palette and shards of its embeddings.
+    fn finish_cell(
+        &self,
+        cell_id: u32,
+        embeddings: &CellEmbeddings,
+        built: &mut BuiltCells,
+    ) -> Result<(), EncodeError> {
+        let cell = &self.split.cells[cell_id as usize];
+        let (scene, palette) = (self.scene, &self.settings.palette);
+        let made = self
+            .stopwatch
+            .time("palette", || shard::build(scene, cell_id, cell, embeddings, self.encoder_id, palette));
+        let put = |bytes: &[u8]| self.stopwatch.time("write", || self.store.put_bytes(bytes));
+        let record = |bytes: &[u8]| -> Result<ShardRecord, EncodeError> {
+            let (hash, len_bytes) = put(bytes)?;
+            Ok(ShardRecord {
+                hash,
+                len_bytes,
+                n_rows: made.n_rows,
+                score_error_bound: made.score_error_bound,
+                position_error: made.position_error,
+            })
+        };
+        let shards = made
+            .shards
+            .iter()
+            .map(|(profile, bytes)| Ok((*profile, record(bytes)?)))
+            .collect::<Result<_, EncodeError>>()?;
+        built.n_without_evidence += made.n_without_evidence as u64;
+        built.records.push(CellRecord {
+            cell_id,
+            bounds: cell.bounds,
+            n_gaussians: cell.gaussians.len() as u32,
+            shards,
+        });
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_budget_that_is_too_small_is_refused_with_what_is_needed() {
+        assert_eq!(check_memory(100, 50, 20, 30).expect("enough"), 30);
+        let message = check_memory(99, 50, 20, 30).expect_err("too small").to_string();
+        assert!(
+            message.contains("99 bytes, 100 are needed: 50") && message.contains("raise --memory"),
+            "{message}"
+        );
+    }
+}

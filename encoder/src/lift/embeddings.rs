@@ -1,0 +1,194 @@
+//! The embeddings of many Gaussians at once, from their sums.
+//!
+//! A component of an embedding is a sum over hundreds of region vectors, far more than fit a cache.
+//! So a few neighbouring Gaussians, which share most of their regions, are taken together, and of
+//! their regions a few components at a time. Every component is summed in the entries' order, with
+//! products rounded before they are added: the same bits on any machine.
+
+use std::ops::Range;
+
+use pulp::{Arch, Simd, WithSimd};
+use rayon::prelude::*;
+
+use super::field::{MIN_MEAN_LENGTH, dot};
+use super::regroup::PartSums;
+use super::table::RegionTable;
+
+/// Gaussians taken together: their embeddings stay in a core's cache until they are scaled.
+const CHUNK: usize = 512;
+/// Components of the region vectors that are at hand at a time.
+const BLOCK: usize = 128;
+/// Registers that hold sums: enough to hide an addition's latency; BLOCK fills them at any width.
+const REGISTERS: usize = 8;
+const UNSEEN: u32 = u32::MAX;
+
+/// Working memory of one thread.
+struct Scratch {
+    /// `[n_regions]`: place of each region among the chunk's, or [`UNSEEN`].
+    place_of_region: Vec<u32>,
+    regions: Vec<u32>,
+    /// Place of the region of each entry.
+    places: Vec<u32>,
+    /// A block of components of each of the chunk's region vectors.
+    vectors: Vec<[f32; BLOCK]>,
+}
+
+/// Writes the unit embedding of each Gaussian of a part to `out` (`[N][dim]`), zeros where there is no
+/// evidence, and returns the lengths of their mean vectors, 0 where there is none.
+pub(super) fn write_embeddings(sums: &PartSums, table: &RegionTable, out: &mut [f32]) -> Vec<f32> {
+    write_embeddings_on(Arch::new(), sums, table, out)
+}
+
+fn write_embeddings_on(arch: Arch, sums: &PartSums, table: &RegionTable, out: &mut [f32]) -> Vec<f32> {
+    let dim = table.dim();
+    let mut lengths = vec![0.0; sums.total_weights.len()];
+    out.par_chunks_mut(CHUNK * dim).zip(lengths.par_chunks_mut(CHUNK)).enumerate().for_each_init(
+        || Scratch {
+            place_of_region: vec![UNSEEN; table.len()],
+            regions: Vec::new(),
+            places: Vec::new(),
+            vectors: Vec::new(),
+        },
+        |scratch, (chunk, (out, lengths))| {
+            let first = chunk * CHUNK;
+            scratch.number_regions(sums, first..first + lengths.len());
+            lengths.copy_from_slice(&arch.dispatch(Chunk { sums, table, first, scratch, out }));
+            scratch.forget_regions();
+        },
+    );
+    lengths
+}
+
+/// Scales a sum of region vectors to unit length and returns the mean vector's length, or zeros it and
+/// returns 0 where there is no evidence.
+#[inline(always)]
+pub(super) fn make_unit(sum: &mut [f32], total_weight: f32) -> f32 {
+    let scale = if total_weight > 0.0 { total_weight.recip() } else { 0.0 };
+    sum.iter_mut().for_each(|c| *c *= scale);
+    let length = dot(sum, sum).sqrt();
+    if !(MIN_MEAN_LENGTH..=f32::MAX).contains(&length) {
+        sum.fill(0.0);
+        return 0.0;
+    }
+    let scale = length.recip();
+    sum.iter_mut().for_each(|c| *c *= scale);
+    length
+}
+
+impl Scratch {
+    /// Numbers the regions of some Gaussians in the order in which they come up.
+    fn number_regions(&mut self, sums: &PartSums, gaussians: Range<usize>) {
+        let entries = sums.starts[gaussians.start] as usize..sums.starts[gaussians.end] as usize;
+        self.places.clear();
+        for region in &sums.regions[entries] {
+            let place = &mut self.place_of_region[*region as usize];
+            if *place == UNSEEN {
+                *place = self.regions.len() as u32;
+                self.regions.push(*region);
+            }
+            self.places.push(*place);
+        }
+    }
+
+    fn forget_regions(&mut self) {
+        self.regions.drain(..).for_each(|region| self.place_of_region[region as usize] = UNSEEN);
+    }
+}
+
+/// The sums of region vectors of some consecutive Gaussians.
+struct Chunk<'a> {
+    sums: &'a PartSums,
+    table: &'a RegionTable,
+    first: usize,
+    scratch: &'a mut Scratch,
+    /// `[n][dim]`.
+    out: &'a mut [f32],
+}
+
+impl WithSimd for Chunk<'_> {
+    type Output = Vec<f32>;
+
+    /// Returns the lengths of the mean vectors.
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) -> Vec<f32> {
+        let Self { sums, table, first, scratch, out } = self;
+        let Scratch { regions, places, vectors, .. } = scratch;
+        let dim = table.dim();
+        let first_entry = sums.starts[first] as usize;
+        for from in (0..dim).step_by(BLOCK) {
+            let width = BLOCK.min(dim - from);
+            vectors.resize(vectors.len().max(regions.len()), [0.0; BLOCK]);
+            for (vector, region) in vectors.iter_mut().zip(&*regions) {
+                table.components(*region as usize, from, &mut vector[..width]);
+            }
+            for (embedding, at) in out.chunks_exact_mut(dim).zip(sums.starts[first..].windows(2)) {
+                let entries = at[0] as usize..at[1] as usize;
+                let places = &places[entries.start - first_entry..entries.end - first_entry];
+                let mut sum = [0.0; BLOCK];
+                add_vectors(simd, vectors, places, &sums.weights[entries], &mut sum);
+                embedding[from..from + width].copy_from_slice(&sum[..width]);
+            }
+        }
+        let make_unit = |(sum, total): (&mut [f32], &f32)| make_unit(sum, *total);
+        out.chunks_exact_mut(dim).zip(&sums.total_weights[first..]).map(make_unit).collect()
+    }
+}
+
+/// Writes the sum of `weight * vector` over some entries: a few registers' worth of components at a
+/// time, which stay in them until all entries are added.
+#[inline(always)]
+fn add_vectors<S: Simd>(
+    simd: S,
+    vectors: &[[f32; BLOCK]],
+    places: &[u32],
+    weights: &[f32],
+    out: &mut [f32; BLOCK],
+) {
+    for (step, out) in S::as_mut_simd_f32s(out).0.chunks_exact_mut(REGISTERS).enumerate() {
+        let mut sum = [simd.splat_f32s(0.0); REGISTERS];
+        for (place, weight) in places.iter().zip(weights) {
+            let weight = simd.splat_f32s(*weight);
+            let vector = S::as_simd_f32s(&vectors[*place as usize]).0;
+            let vector = &vector[step * REGISTERS..][..REGISTERS];
+            for i in 0..REGISTERS {
+                // Not fused: other machines could not, and would differ.
+                sum[i] = simd.add_f32s(sum[i], simd.mul_f32s(weight, vector[i]));
+            }
+        }
+        out.copy_from_slice(&sum);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lift::tests::{Scene, scene_of};
+
+    /// Whatever vectors the machine has, the bits are those of single numbers.
+    #[test]
+    fn every_width_of_vectors_gives_the_same_bits() {
+        let mut widths = vec![Arch::Scalar];
+        #[cfg(target_arch = "x86_64")]
+        {
+            widths.extend(pulp::x86::V3::try_new().map(Arch::V3));
+            widths.extend(pulp::x86::V4::try_new().map(Arch::V4));
+        }
+        #[cfg(target_arch = "aarch64")]
+        widths.extend(pulp::aarch64::Neon::try_new().map(Arch::Neon));
+        for dim in [1, 7, 64, 130, 512] {
+            let scene = scene_of(dim, 600, 11);
+            let Scene { index, table, .. } = &scene;
+            let raw = index.read(0..index.parts().len()).expect("reads");
+            for sums in index.regroup(&raw, table).expect("regroups") {
+                let results: Vec<(Vec<f32>, Vec<f32>)> = widths
+                    .iter()
+                    .map(|arch| {
+                        let mut out = vec![f32::NAN; sums.total_weights.len() * dim];
+                        (write_embeddings_on(*arch, &sums, table, &mut out), out)
+                    })
+                    .collect();
+                assert!(results.iter().all(|r| *r == results[0]), "dim {dim}");
+            }
+        }
+    }
+}
