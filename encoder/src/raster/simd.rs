@@ -1,8 +1,6 @@
 //! Instruction sets that the pixels are worked on with.
 
 use bytemuck::{cast, cast_slice_mut};
-#[cfg(target_arch = "aarch64")]
-use pulp::aarch64::Neon;
 use pulp::{NullaryFnOnce, Scalar, Simd};
 #[cfg(target_arch = "aarch64")]
 use pulp::{aarch64::Neon, f32x4, f64x2};
