@@ -113,8 +113,8 @@ impl<K: WeightSink, const BLEND: bool> Work for Walk<'_, K, BLEND> {
                     }
                     let Some((first, end)) = local.vectors::<S>(y) else { continue };
                     let row: &mut [S::f32s] = cast_slice_mut(&mut transmittance[y]);
-                    for v in first..end {
-                        let weights = local.blend::<S, BLEND>(simd, y, v, &mut row[v]);
+                    for (light, v) in row[first..end].iter_mut().zip(first..) {
+                        let weights = local.blend::<S, BLEND>(simd, y, v, light);
                         sink.add(simd, member, y, v, weights);
                     }
                 }
