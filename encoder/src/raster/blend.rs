@@ -1,6 +1,6 @@
 //! Blends the Gaussians of a tile front to back.
 
-use bytemuck::{cast_slice, cast_slice_mut};
+use bytemuck::{cast, cast_slice, cast_slice_mut};
 use pulp::Simd;
 
 use super::WeightKind;
@@ -125,8 +125,8 @@ impl<K: WeightSink, const BLEND: bool> Work for Walk<'_, K, BLEND> {
                     }
                     let Some((first, end)) = local.vectors::<S>(y) else { continue };
                     let row: &mut [S::f32s] = cast_slice_mut(&mut transmittance[y]);
-                    for v in first..end {
-                        let weights = local.blend::<S, BLEND>(simd, y, v, &mut row[v]);
+                    for (light, v) in row[first..end].iter_mut().zip(first..) {
+                        let weights = local.blend::<S, BLEND>(simd, y, v, light);
                         sink.add(simd, member, y, v, weights);
                     }
                 }
@@ -229,15 +229,21 @@ impl InTile {
         let light = *transmittance;
         if !BLEND {
             let weighs = simd.and_m32s(counts, simd.greater_than_f32s(light, splat(0.0)));
-            return simd.select_f32s(weighs, falloff, splat(0.0));
+            return select(simd, weighs, falloff, splat(0.0));
         }
         let next = simd.mul_f32s(light, simd.sub_f32s(splat(1.0), alpha));
         let blends = simd.and_m32s(counts, simd.greater_than_f32s(next, splat(MIN_TRANSMITTANCE)));
-        let finished =
-            simd.select_f32s(counts, simd.min_f32s(light, simd.sub_f32s(splat(0.0), light)), light);
-        *transmittance = simd.select_f32s(blends, next, finished);
-        simd.select_f32s(blends, simd.mul_f32s(alpha, light), splat(0.0))
+        let finished = select(simd, counts, simd.min_f32s(light, simd.sub_f32s(splat(0.0), light)), light);
+        *transmittance = select(simd, blends, next, finished);
+        select(simd, blends, simd.mul_f32s(alpha, light), splat(0.0))
     }
+}
+
+/// Returns, lane by lane, one value where the mask is set and another where not. `select_f32s` is not
+/// always inlined, which costs AVX2 a call with its masks in memory.
+#[inline(always)]
+fn select<S: Simd>(simd: S, mask: S::m32s, set: S::f32s, unset: S::f32s) -> S::f32s {
+    cast(simd.select_u32s(mask, cast(set), cast(unset)))
 }
 
 /// Returns `exp(-power)` for `power >= 0`, within 1e-6 of the result; beyond [`MAX_POWER`] stays there.

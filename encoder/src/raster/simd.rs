@@ -1,52 +1,60 @@
 //! Instruction sets that the pixels are worked on with.
 
+use bytemuck::{cast, cast_slice_mut};
+use pulp::{NullaryFnOnce, Scalar, Simd};
 #[cfg(target_arch = "aarch64")]
-use pulp::aarch64::Neon;
-use pulp::{NullaryFnOnce, Scalar128b, Simd, f32x4, f64x2};
+use pulp::{aarch64::Neon, f32x4, f64x2};
 #[cfg(target_arch = "x86_64")]
 use pulp::{
-    f32x8, f32x16, f64x4, f64x8,
+    f32x4, f32x8, f32x16, f64x4, f64x8,
     x86::{V3, V4},
 };
 
 /// Vectors of an instruction set, with what [`Simd`] lacks.
 pub trait Lanes: Simd {
-    /// Returns the values as `f64`: the first half of the lanes, then the second.
-    fn widen(self, values: Self::f32s) -> [Self::f64s; 2];
+    /// Adds the values to as many sums.
+    fn add_to_f64(self, values: Self::f32s, sums: &mut [f64]);
 }
 
-impl Lanes for Scalar128b {
+impl Lanes for Scalar {
     #[inline(always)]
-    fn widen(self, f32x4(a, b, c, d): f32x4) -> [f64x2; 2] {
-        [f64x2(a.into(), b.into()), f64x2(c.into(), d.into())]
+    fn add_to_f64(self, value: f32, sums: &mut [f64]) {
+        sums[0] += f64::from(value);
     }
 }
 
 #[cfg(target_arch = "x86_64")]
 impl Lanes for V3 {
     #[inline(always)]
-    fn widen(self, values: f32x8) -> [f64x4; 2] {
-        let [low, high]: [f32x4; 2] = bytemuck::cast(values);
-        [self.convert_f32x4_to_f64x4(low), self.convert_f32x4_to_f64x4(high)]
+    fn add_to_f64(self, values: f32x8, sums: &mut [f64]) {
+        let [low, high]: [f32x4; 2] = cast(values);
+        let sums = cast_slice_mut::<f64, f64x4>(sums);
+        sums[0] = self.add_f64x4(sums[0], self.convert_f32x4_to_f64x4(low));
+        sums[1] = self.add_f64x4(sums[1], self.convert_f32x4_to_f64x4(high));
     }
 }
 
 #[cfg(target_arch = "x86_64")]
 impl Lanes for V4 {
     #[inline(always)]
-    fn widen(self, values: f32x16) -> [f64x8; 2] {
-        let [low, high]: [f32x8; 2] = bytemuck::cast(values);
-        [self.convert_f32x8_to_f64x8(low), self.convert_f32x8_to_f64x8(high)]
+    fn add_to_f64(self, values: f32x16, sums: &mut [f64]) {
+        let [low, high]: [f32x8; 2] = cast(values);
+        let sums = cast_slice_mut::<f64, f64x8>(sums);
+        sums[0] = self.add_f64x8(sums[0], self.convert_f32x8_to_f64x8(low));
+        sums[1] = self.add_f64x8(sums[1], self.convert_f32x8_to_f64x8(high));
     }
 }
 
 #[cfg(target_arch = "aarch64")]
 impl Lanes for Neon {
     #[inline(always)]
-    fn widen(self, values: f32x4) -> [f64x2; 2] {
-        let values: std::arch::aarch64::float32x4_t = bytemuck::cast(values);
-        let low = self.neon.vcvt_f64_f32(self.neon.vget_low_f32(values));
-        [bytemuck::cast(low), bytemuck::cast(self.neon.vcvt_high_f64_f32(values))]
+    fn add_to_f64(self, values: f32x4, sums: &mut [f64]) {
+        let values: std::arch::aarch64::float32x4_t = cast(values);
+        let low = cast(self.neon.vcvt_f64_f32(self.neon.vget_low_f32(values)));
+        let high = cast(self.neon.vcvt_high_f64_f32(values));
+        let sums = cast_slice_mut::<f64, f64x2>(sums);
+        sums[0] = self.add_f64s(sums[0], low);
+        sums[1] = self.add_f64s(sums[1], high);
     }
 }
 
@@ -75,7 +83,7 @@ impl<S: Lanes, W: Work> NullaryFnOnce for On<S, W> {
 /// what is summed in another order is summed exactly.
 #[derive(Clone, Copy, Debug)]
 pub enum Level {
-    /// Plain code in groups of four values, for any processor.
+    /// Plain code, for any processor.
     Portable,
     /// AVX2, eight `f32` at once.
     #[cfg(target_arch = "x86_64")]
@@ -123,7 +131,7 @@ impl Level {
     /// Does work compiled for this instruction set.
     pub fn dispatch<W: Work>(self, work: W) -> W::Output {
         match self {
-            Self::Portable => work.run(Scalar128b),
+            Self::Portable => work.run(Scalar),
             #[cfg(target_arch = "x86_64")]
             Self::Avx2(simd) => simd.vectorize(On(simd, work)),
             #[cfg(target_arch = "x86_64")]

@@ -178,10 +178,8 @@ impl WeightSink for RegionSink {
         let bits: S::u32s = cast(weights);
         for part in &self.parts[self.first_part[y]..self.first_part[y + 1]] {
             let mask = cast_slice::<u32, S::u32s>(&part.mask)[v];
-            let [low, high] = simd.widen(cast(simd.and_u32s(bits, mask)));
-            let sums = cast_slice_mut::<f64, S::f64s>(&mut self.weights[part.slot]);
-            sums[2 * v] = simd.add_f64s(sums[2 * v], low);
-            sums[2 * v + 1] = simd.add_f64s(sums[2 * v + 1], high);
+            let sums = &mut self.weights[part.slot][v * S::F32_LANES..][..S::F32_LANES];
+            simd.add_to_f64(cast(simd.and_u32s(bits, mask)), sums);
             self.touched[part.slot / 64] |= 1 << (part.slot % 64);
         }
     }
