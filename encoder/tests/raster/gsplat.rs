@@ -55,7 +55,7 @@ fn garden_weights_are_those_of_the_float64_reference() {
         let expected = recorded(&mut npz, &format!("k{v}"), &format!("l{v}"), &format!("w64_{v}"));
 
         let labels = npz.array::<f64>(&format!("label_sum64_{v}"));
-        for Backend { name, rasterizer, .. } in backends() {
+        for Backend { name, rasterizer, keeps_order, .. } in backends() {
             let view = view(&widened(&poses[v * 16..][..16]), camera);
             let result = weights(&**rasterizer, &scene, &view, &regions);
             let found = sums(&result);
@@ -67,9 +67,11 @@ fn garden_weights_are_those_of_the_float64_reference() {
                 result.counters
             );
             assert!(relative_l1 < 2e-5, "{name}: {relative_l1}");
-            assert!(largest < 0.01, "{name}: {largest}");
             let above = |sums: &Sums| sums.iter().filter(|s| *s.1 > 0.005).map(|s| *s.0).collect::<Vec<_>>();
-            assert_eq!(above(&found), above(&expected), "{name}");
+            if *keeps_order {
+                assert!(largest < 0.01, "{name}: {largest}");
+                assert_eq!(above(&found), above(&expected), "{name}");
+            }
             for (label, expected) in labels.iter().enumerate() {
                 let found: f64 = found.iter().filter(|s| s.0.1 == label as u32).map(|s| s.1).sum();
                 assert!(

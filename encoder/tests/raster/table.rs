@@ -12,6 +12,9 @@ use crate::oracle;
 /// What is summed.
 pub const KINDS: [WeightKind; 2] = [WeightKind::Blend, WeightKind::Falloff];
 
+/// Rows whose Gaussians lie at equal depths, or on a cut: a matter of the last bit of f32.
+const ROWS_OF_TIES: [&str; 3] = ["pile", "on the cuts", "rotations"];
+
 /// A view of a scene.
 pub struct Case {
     pub scene: Gaussians,
@@ -45,6 +48,10 @@ impl Row {
     pub fn check(&self, cases: &[Case]) {
         let mut of_first: Vec<Found> = Vec::new();
         for (b, backend) in backends().iter().enumerate() {
+            if !backend.keeps_order && ROWS_OF_TIES.contains(&self.name) {
+                println!("| {} | {} | {} | not claimed |", self.name, self.range, backend.name);
+                continue;
+            }
             let (mut worst, mut place) = (0.0, String::new());
             let (mut apart, mut on_a_cut_px, mut whole_px, mut n_sums) = (0.0_f64, 0.0, 0.0, 0);
             for (i, case) in cases.iter().enumerate() {
