@@ -46,6 +46,53 @@ fn the_field_agrees_with_the_independent_reference() {
     check_words(&house, &store, &models, dir.path());
 }
 
+/// The GPU's field is the CPU's within the bound of NUMERICS.md: the same sums but for pixels across a cut,
+/// and those together less than a 50,000th. Where the machine has no GPU, a software one does the work.
+#[test]
+fn a_gpu_gives_the_field_of_the_cpu() {
+    let Some(house) = shared("scenes/house_a") else { return };
+    let found = run_json(&mut encoder(&["devices"]));
+    if found["adapters"].as_array().expect("a list").is_empty() {
+        assert!(std::env::var("CI").as_deref() != Ok("true"), "no GPU: install mesa-vulkan-drivers");
+        println!("skipped: no GPU");
+        return;
+    }
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let encode = |device: &str| {
+        let store = dir.path().join(device);
+        let (scene, views, masks) =
+            (house.join("point_cloud.ply"), house.join("sparse/0"), house.join("gt/masks"));
+        let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views)]);
+        command.args(["--masks", text(&masks), "--store", text(&store), "--device", device]);
+        run_json(command.args(["--views-limit", "6", "--raster-width", "320", "--metric"]));
+        let reader = StoreReader::open(&store).expect("a published store");
+        let n_regions = read_regions(&reader).expect("regions").len();
+        let mut sums = BTreeMap::new();
+        for cell in &reader.manifest().cells {
+            let field = read_field(&reader, cell.cell_id, cell.n_gaussians, n_regions).expect("a field");
+            for (k, gaussian) in field.input_indices.iter().enumerate() {
+                for entry in field.starts[k] as usize..field.starts[k + 1] as usize {
+                    sums.insert((*gaussian, field.regions[entry]), f64::from(field.weights[entry]));
+                }
+            }
+        }
+        sums
+    };
+    let (cpu, gpu) = (encode("cpu"), encode("gpu"));
+    let total: f64 = cpu.values().sum();
+    let mut differences: BTreeMap<_, f64> = cpu.clone();
+    gpu.iter().for_each(|(key, weight)| *differences.entry(*key).or_default() -= weight);
+    let largest = differences.values().fold(0.0_f64, |most, d| most.max(d.abs()));
+    let relative_l1 = differences.values().map(|d| d.abs()).sum::<f64>() / total;
+    let n_cpu = cpu.len();
+    println!(
+        "{n_cpu} sums on the CPU, {} on the GPU: relative L1 {relative_l1:.1e}, largest {largest:.1e}",
+        gpu.len()
+    );
+    assert!(n_cpu > 50_000);
+    assert!(relative_l1 < 2e-5 && largest < 0.01, "{relative_l1:e} {largest:e}");
+}
+
 /// Cosine at least 0.99 for 95 % of the reference's Gaussians, total weights within 1 %.
 fn check_embeddings(house: &Path, store: &Path) {
     let bytes = fs_err::read(house.join("gt/reference_embeddings.npz")).expect("reads");

@@ -33,6 +33,21 @@ fn count_pairs(
     }
 }
 
+// Writes the pairs of a row of tiles from `start` on.
+fn write_row(member: u32, row: u32, columns: PixelSpan, start: u32) {
+    let first = (row - view.first_tile_row) * view.tile_columns;
+    for (var column = columns.first; column <= columns.last; column++) {
+        let at = start + column - columns.first;
+        if at < view.capacity_pairs {
+            pairs[at] = Pair(first + column, member);
+        }
+    }
+}
+
+fn width_of(columns: PixelSpan) -> u32 {
+    return select(0u, columns.last - columns.first + 1u, columns.is_some);
+}
+
 // Writes the pairs of a visible Gaussian from `start` on.
 fn write_tiles(member: u32, start: u32) {
     var at = start;
@@ -43,16 +58,27 @@ fn write_tiles(member: u32, start: u32) {
     for (var row = max(rows.first, view.first_tile_row); row < end; row++) {
         let columns = tile_columns(g, extent, row, view.width_px, view.height_px);
         if columns.is_some {
-            let first = (row - view.first_tile_row) * view.tile_columns;
-            for (var column = columns.first; column <= columns.last; column++) {
-                if at < view.capacity_pairs {
-                    pairs[at] = Pair(first + column, member);
-                }
-                at += 1u;
-            }
+            write_row(member, row, columns, at);
         }
+        at += width_of(columns);
     }
 }
+
+// A Gaussian of more tiles is written by all threads of its block, a row each.
+const MAX_OWN_TILES = 64u;
+
+struct Wide {
+    member: u32,
+    start: u32,
+    first_row: u32,
+    end_row: u32,
+}
+
+var<workgroup> n_wide: atomic<u32>;
+var<workgroup> n_wide_shared: u32;
+var<workgroup> wide: array<Wide, WORKGROUP_SIZE>;
+var<workgroup> wide_shared: Wide;
+var<workgroup> n_of_rows: u32;
 
 @compute @workgroup_size(WORKGROUP_SIZE)
 fn write_pairs(
@@ -63,11 +89,48 @@ fn write_pairs(
     let n = min(counters[COUNTER_VISIBLE], view.capacity_visible);
     let n_blocks = (n + WORKGROUP_SIZE - 1u) / WORKGROUP_SIZE;
     for (var block = group.x; block < n_blocks; block += groups.x) {
+        if thread == 0u {
+            atomicStore(&n_wide, 0u);
+        }
         let position = block * WORKGROUP_SIZE + thread;
         let n_tiles = tiles_of(position, n);
         let at = block_counts[block] + block_scan(n_tiles, thread);
-        if n_tiles > 0u {
+        if n_tiles > MAX_OWN_TILES {
+            let rows = tile_rows(screen[order[position]], view.height_px);
+            let first = max(rows.first, view.first_tile_row);
+            let end = min(rows.last + 1u, view.end_tile_row);
+            wide[atomicAdd(&n_wide, 1u)] = Wide(order[position], at, first, end);
+        } else if n_tiles > 0u {
             write_tiles(order[position], at);
+        }
+        workgroupBarrier();
+        if thread == 0u {
+            n_wide_shared = atomicLoad(&n_wide);
+        }
+        let n_found = workgroupUniformLoad(&n_wide_shared);
+        for (var i = 0u; i < n_found; i++) {
+            if thread == 0u {
+                wide_shared = wide[i];
+            }
+            let found = workgroupUniformLoad(&wide_shared);
+            let g = screen[found.member];
+            let extent = extent_px(g);
+            var start = found.start;
+            for (var first = found.first_row; first < found.end_row; first += WORKGROUP_SIZE) {
+                let row = first + thread;
+                var columns = PixelSpan(0u, 0u, false);
+                if row < found.end_row {
+                    columns = tile_columns(g, extent, row, view.width_px, view.height_px);
+                }
+                let before = block_scan(width_of(columns), thread);
+                if columns.is_some {
+                    write_row(found.member, row, columns, start + before);
+                }
+                if thread == WORKGROUP_SIZE - 1u {
+                    n_of_rows = before + width_of(columns);
+                }
+                start += workgroupUniformLoad(&n_of_rows);
+            }
         }
     }
 }

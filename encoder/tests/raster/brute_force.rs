@@ -30,7 +30,7 @@ fn weights_are_those_of_brute_force() {
 
 #[test]
 fn drawings_are_those_of_brute_force() {
-    for Backend { rasterizer, bound_factor, cut_tolerance, .. } in backends() {
+    for Backend { rasterizer, bound_factor, cut_tolerance, keeps_order, .. } in backends() {
         for (seed, (width, height)) in SIZES_PX.into_iter().enumerate() {
             let random = &mut Random(seed as u64);
             let view = random_view(random, width, height);
@@ -52,7 +52,8 @@ fn drawings_are_those_of_brute_force() {
                     is_on_a_cut[pixel] |= weight.high - weight.low > 1e-3 * weight.high;
                 },
             );
-            assert!(is_on_a_cut.iter().filter(|is| **is).count() * 10 <= n_px, "{width}x{height}");
+            let n_on_a_cut = is_on_a_cut.iter().filter(|is| **is).count();
+            assert!(!keeps_order || n_on_a_cut * 10 <= n_px, "{width}x{height}");
             for pixel in (0..n_px).filter(|pixel| !is_on_a_cut[*pixel]) {
                 let expected = rgb[pixel] + (1.0 - alpha[pixel]) * DVec3::new(0.1, 0.7, 1.0);
                 for c in 0..3 {

@@ -320,8 +320,14 @@ fn sums_over_many_pixels() {
     let regions = RegionMap { width_px, height_px, n_regions: 1, region_of_pixel: vec![0; n_px] };
     let cap = 0.999;
     let weights = [0.7, 0.3 * cap, 0.3 * (1.0 - cap) * 0.01].map(|weight| weight * n_px as f64);
-    for Backend { name, rasterizer, bound_factor, .. } in backends() {
+    for Backend { name, rasterizer, bound_factor, keeps_order, .. } in backends() {
         let found = rasterizer.weights(&scene, &view, &regions, WeightKind::Blend).unwrap();
+        if !keeps_order {
+            // Wider than the squares that f32 holds.
+            assert_eq!((found.counters.unusable, found.entries.len()), (3, 0));
+            println!("| sums | {n_px} px of one region | {name} | rejected, counted |");
+            continue;
+        }
         assert_eq!(found.entries.len(), 3);
         let error =
             |(entry, expected): (&RegionWeight, f64)| (f64::from(entry.weight) / expected - 1.0).abs();
