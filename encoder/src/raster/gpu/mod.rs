@@ -8,8 +8,10 @@
 //! tile rows. Neither changes a sum, since tiles are independent and whole numbers add up exactly.
 
 mod device;
+mod jobs;
 mod layout;
 mod shader;
+mod stopwatch;
 mod workspace;
 
 use std::ops::Range;

@@ -7,54 +7,20 @@ use bytemuck::Zeroable;
 use wgpu::BufferUsages as Usage;
 
 use super::device::Device;
+use super::jobs::{
+    DIGIT_BITS, DISPATCH_BYTES, ENTRY_WORDS, JOB_STRIDE_BYTES, MAX_PASSES, PAIR_WORDS, SCAN_JOBS, Scan,
+    SortKey, bits_of, dispatch_offset, part, sort_job, write_jobs,
+};
 use super::layout::{
-    Background, Capacities, Chunk, RegionSum, ScanJob, SceneGaussian, SortPass, ViewBlock, screen_layout,
+    Background, Capacities, Chunk, RegionSum, ScanJob, SceneGaussian, ViewBlock, screen_layout,
 };
 use super::shader::{Counter, NONE, SORT_BLOCK, WORKGROUP_SIZE};
+use super::stopwatch::{Stopwatch, TIMESTAMPS_BYTES};
 use crate::raster::constants::TILE_SIZE_PX;
 use crate::raster::{RasterError, StageTime};
 
 /// Counts of a band's run.
 pub type Counts = [u32; Counter::ALL.len()];
-
-const JOB_STRIDE_BYTES: u64 = 256;
-/// Words of a record of dispatch sizes.
-const DISPATCH_BYTES: u64 = 16;
-const PAIR_WORDS: u32 = 2;
-const ENTRY_WORDS: u32 = 4;
-
-/// Scans that are the same for every view.
-#[derive(Clone, Copy)]
-enum Scan {
-    Digits(Counter),
-    Pairs,
-    /// No array: only the dispatch sizes.
-    Entries,
-    Heads,
-}
-
-/// What is sorted by what.
-#[derive(Clone, Copy, PartialEq, Eq, Hash)]
-enum SortKey {
-    Depth,
-    Tile,
-    Region,
-    Member,
-}
-
-const SORT_KEYS: [SortKey; 4] = [SortKey::Depth, SortKey::Tile, SortKey::Region, SortKey::Member];
-const DIGIT_BITS: u32 = 4;
-const MAX_PASSES: u32 = 8;
-
-impl SortKey {
-    fn counter(self) -> Counter {
-        match self {
-            Self::Depth => Counter::Visible,
-            Self::Tile => Counter::Pairs,
-            Self::Region | Self::Member => Counter::Entries,
-        }
-    }
-}
 
 /// A piece of the scene on the device.
 pub struct SceneChunk {
@@ -149,74 +115,10 @@ pub struct Size {
 
 const COUNTERS_BYTES: u64 = 64;
 /// What precedes the sums in the copy back: counters and timestamps.
-const HEAD_BYTES: u64 = COUNTERS_BYTES + 192;
+const HEAD_BYTES: u64 = (COUNTERS_BYTES + TIMESTAMPS_BYTES).next_multiple_of(256);
 
 /// Bytes of a pixel of a picture.
 pub const PIXEL_BYTES: u64 = 20;
-
-/// Stages that are timed.
-const STAGES: [&str; 5] = ["project", "sort", "bin", "blend", "compact"];
-
-/// The device's own clock at the ends of each stage, where it has one.
-struct Stopwatch {
-    queries: Option<(wgpu::QuerySet, wgpu::Buffer)>,
-    period_ns: f32,
-}
-
-impl Stopwatch {
-    fn new(device: &Device) -> Option<Self> {
-        let n = 2 * STAGES.len() as u32;
-        let queries = if device.device.features().contains(wgpu::Features::TIMESTAMP_QUERY) {
-            let descriptor =
-                wgpu::QuerySetDescriptor { label: None, ty: wgpu::QueryType::Timestamp, count: n };
-            let usage = Usage::QUERY_RESOLVE | Usage::COPY_SRC;
-            let resolved = device.buffer("timestamps", u64::from(n) * 8, usage)?;
-            Some((device.device.create_query_set(&descriptor), resolved))
-        } else {
-            None
-        };
-        Some(Self { queries, period_ns: device.queue.get_timestamp_period() })
-    }
-
-    /// Begins a pass of a stage; `ends` says whether it is the stage's first and last.
-    fn pass<'e>(
-        &self,
-        encoder: &'e mut wgpu::CommandEncoder,
-        stage: u32,
-        ends: (bool, bool),
-    ) -> wgpu::ComputePass<'e> {
-        let timestamp_writes = self.queries.as_ref().filter(|_| ends.0 || ends.1).map(|(query_set, _)| {
-            wgpu::ComputePassTimestampWrites {
-                query_set,
-                beginning_of_pass_write_index: ends.0.then_some(2 * stage),
-                end_of_pass_write_index: ends.1.then_some(2 * stage + 1),
-            }
-        });
-        encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
-            label: Some(STAGES[stage as usize]),
-            timestamp_writes,
-        })
-    }
-
-    fn resolve(&self, encoder: &mut wgpu::CommandEncoder, staging: &wgpu::Buffer) {
-        if let Some((queries, resolved)) = &self.queries {
-            let n = 2 * STAGES.len() as u32;
-            encoder.resolve_query_set(queries, 0..n, resolved, 0);
-            encoder.copy_buffer_to_buffer(resolved, 0, staging, COUNTERS_BYTES, u64::from(n) * 8);
-        }
-    }
-
-    fn read(&self, bytes: &[u8]) -> Vec<StageTime> {
-        if self.queries.is_none() {
-            return Vec::new();
-        }
-        let ticks = |i: usize| u64::from_le_bytes(bytes[8 * i..][..8].try_into().unwrap_or_default());
-        let ms = |stage: usize| {
-            ticks(2 * stage + 1).saturating_sub(ticks(2 * stage)) as f64 * f64::from(self.period_ns) * 1e-6
-        };
-        STAGES.iter().enumerate().map(|(i, stage)| StageTime { stage, ms: ms(i) }).collect()
-    }
-}
 
 impl Workspace {
     /// Makes the buffers; `None` where the device's memory does not hold them.
@@ -225,7 +127,7 @@ impl Workspace {
         let storage = |label: &str, words: u64| {
             device.buffer(label, words * 4, Usage::STORAGE | Usage::COPY_DST | Usage::COPY_SRC)
         };
-        let (screen_bytes, depth_word) = screen_layout(device.report.precision);
+        let (screen_bytes, _) = screen_layout(device.report.precision);
         let (visible, pairs, entries) =
             (u64::from(room.visible), u64::from(room.pairs), u64::from(room.entries));
         let largest = visible.max(pairs).max(entries);
@@ -263,7 +165,7 @@ impl Workspace {
             groups: HashMap::new(),
             stopwatch: Stopwatch::new(device)?,
         };
-        workspace.write_jobs(device, screen_bytes / 4, depth_word);
+        write_jobs(device, &workspace.jobs, room);
         Some(workspace)
     }
 
@@ -275,43 +177,6 @@ impl Workspace {
     /// Returns whether a band fits.
     pub fn holds(&self, n_tiles: u32, n_px: u32) -> bool {
         n_tiles <= self.n_tiles && n_px <= self.n_px
-    }
-
-    fn write_jobs(&self, device: &Device, screen_words: u32, depth_word: u32) {
-        let write = |index: u64, bytes: &[u8]| {
-            device.queue.write_buffer(&self.jobs, index * JOB_STRIDE_BYTES, bytes);
-        };
-        let scan = |items, n_fixed, block, columns, total| ScanJob { items, n_fixed, block, columns, total };
-        for counter in [Counter::Visible, Counter::Pairs, Counter::Entries] {
-            let job = scan(counter as u32, 0, SORT_BLOCK, 16, NONE);
-            write(Scan::Digits(counter).index(), bytemuck::bytes_of(&job));
-        }
-        for (kind, job) in [
-            (Scan::Pairs, scan(Counter::Visible as u32, 0, WORKGROUP_SIZE, 1, Counter::Pairs as u32)),
-            (Scan::Entries, scan(NONE, 0, 1, 1, Counter::Entries as u32)),
-            (Scan::Heads, scan(Counter::Entries as u32, 0, WORKGROUP_SIZE, 1, Counter::RegionSums as u32)),
-        ] {
-            write(kind.index(), bytemuck::bytes_of(&job));
-        }
-        for key in SORT_KEYS {
-            let (stride, offset, capacity) = match key {
-                SortKey::Depth => (screen_words, depth_word, self.room.visible),
-                SortKey::Tile => (PAIR_WORDS, 0, self.room.pairs),
-                SortKey::Region => (ENTRY_WORDS, 1, self.room.entries),
-                SortKey::Member => (ENTRY_WORDS, 0, self.room.entries),
-            };
-            for pass in 0..MAX_PASSES {
-                let job = SortPass {
-                    items: key.counter() as u32,
-                    stride,
-                    offset,
-                    shift: pass * DIGIT_BITS,
-                    is_first: u32::from(pass == 0 && key != SortKey::Member),
-                    capacity,
-                };
-                write(sort_job(key, pass), bytemuck::bytes_of(&job));
-            }
-        }
     }
 
     /// Takes a band of a view through all stages and returns its counts. `take` gets the sums, once,
@@ -337,7 +202,7 @@ impl Workspace {
         let entry_order = self.sort(device, &mut pass, &keys);
         self.compact(device, &mut pass, entry_order);
         drop(pass);
-        self.stopwatch.resolve(&mut encoder, &self.staging);
+        self.stopwatch.resolve(&mut encoder, &self.staging, COUNTERS_BYTES);
         self.copy_back(&mut encoder);
         let submission = device.queue.submit([encoder.finish()]);
         times.push(StageTime { stage: "submit", ms: start.elapsed().as_secs_f64() * 1e3 });
@@ -526,35 +391,27 @@ impl Workspace {
                     SortKey::Region | SortKey::Member => (&self.entries, &self.entry_order),
                 };
                 let job = sort_job(key, digit);
-                let name = job as u32 * 2 + current as u32;
-                let bound =
-                    [part(&self.jobs, job), whole(&self.counters), whole(values), whole(&order[current])];
-                let bound: Vec<_> =
-                    bound.into_iter().chain([whole(&self.histogram), whole(&order[1 - current])]).collect();
-                let sizes = (&self.dispatches, dispatch_offset(key.counter(), true));
-                let group = cached(&mut self.groups, ("count_digits", name), || {
-                    bind(device, &device.kernels.count_digits, &number(&bound[..5]))
-                });
-                dispatch_indirect(pass, &device.kernels.count_digits, group, sizes);
-                self.scan(device, pass, Scan::Digits(key.counter()));
-                let bound = match key {
-                    SortKey::Depth => (&self.screen, &self.visible_order),
-                    SortKey::Tile => (&self.pairs, &self.pair_order),
-                    SortKey::Region | SortKey::Member => (&self.entries, &self.entry_order),
-                };
-                let bound = [
+                let bound = number(&[
                     part(&self.jobs, job),
                     whole(&self.counters),
-                    whole(bound.0),
-                    whole(&bound.1[current]),
+                    whole(values),
+                    whole(&order[current]),
                     whole(&self.histogram),
-                    whole(&bound.1[1 - current]),
-                ];
-                let sizes = (&self.dispatches, dispatch_offset(key.counter(), true));
-                let group = cached(&mut self.groups, ("scatter", name), || {
-                    bind(device, &device.kernels.scatter, &number(&bound))
-                });
-                dispatch_indirect(pass, &device.kernels.scatter, group, sizes);
+                    whole(&order[1 - current]),
+                ]);
+                let name = job as u32 * 2 + current as u32;
+                let kernels = &device.kernels;
+                let count = cached(&mut self.groups, ("count_digits", name), || {
+                    bind(device, &kernels.count_digits, &bound[..5])
+                })
+                .clone();
+                let scatter =
+                    cached(&mut self.groups, ("scatter", name), || bind(device, &kernels.scatter, &bound))
+                        .clone();
+                let offset = dispatch_offset(key.counter(), true);
+                dispatch_indirect(pass, &kernels.count_digits, &count, (&self.dispatches, offset));
+                self.scan(device, pass, Scan::Digits(key.counter()));
+                dispatch_indirect(pass, &kernels.scatter, &scatter, (&self.dispatches, offset));
                 current = 1 - current;
             }
         }
@@ -642,46 +499,8 @@ impl Workspace {
     }
 }
 
-const SCAN_JOBS: u64 = 6;
-
-impl Scan {
-    fn index(self) -> u64 {
-        match self {
-            Self::Digits(Counter::Visible) => 0,
-            Self::Digits(Counter::Pairs) => 1,
-            Self::Digits(_) => 2,
-            Self::Pairs => 3,
-            Self::Entries => 4,
-            Self::Heads => 5,
-        }
-    }
-}
-
-fn sort_job(key: SortKey, pass: u32) -> u64 {
-    SCAN_JOBS + key as u64 * u64::from(MAX_PASSES) + u64::from(pass)
-}
-
-/// Returns where the dispatch sizes for a counter's items lie: a thread an item, or a sort block each.
-fn dispatch_offset(counter: Counter, by_sort_block: bool) -> u64 {
-    (counter as u64 * 2 + u64::from(by_sort_block)) * DISPATCH_BYTES
-}
-
-/// Returns the bits of the numbers below `n`.
-fn bits_of(n: u32) -> u32 {
-    u32::BITS - n.saturating_sub(1).leading_zeros()
-}
-
 fn whole(buffer: &wgpu::Buffer) -> wgpu::BufferBinding<'_> {
     buffer.as_entire_buffer_binding()
-}
-
-/// Returns one of the small records of a buffer.
-fn part(buffer: &wgpu::Buffer, index: u64) -> wgpu::BufferBinding<'_> {
-    wgpu::BufferBinding {
-        buffer,
-        offset: index * JOB_STRIDE_BYTES,
-        size: std::num::NonZeroU64::new(JOB_STRIDE_BYTES),
-    }
 }
 
 fn number<'a>(bindings: &[wgpu::BufferBinding<'a>]) -> Vec<(u32, wgpu::BufferBinding<'a>)> {
@@ -746,3 +565,50 @@ pub fn band_size(width_px: u32, height_px: u32, tile_rows: [u32; 2]) -> (u32, u3
 
 /// Bytes of a Gaussian in the device's memory.
 pub const SCENE_GAUSSIAN_BYTES: u64 = size_of::<SceneGaussian>() as u64;
+
+#[cfg(test)]
+mod tests {
+    use super::super::device::adapters;
+    use super::*;
+
+    /// Sorts entries by (member, region) on the device and on the host, at sizes about a workgroup and a
+    /// block. Half of the keys repeat, so that an unstable sort shows.
+    #[test]
+    fn the_sort_is_stable_at_every_size() {
+        let Some(adapter) = adapters().into_iter().next() else {
+            println!("skipped: no GPU");
+            return;
+        };
+        let device = adapter.open(adapter.report.precision).expect("opens");
+        let room = Capacities { visible: 1, pairs: 1, entries: 70_000 };
+        let size = Size { room, n_tiles: 1, n_px: 1, n_chunk: 1 };
+        let mut workspace = Workspace::new(&device, size).expect("there is memory");
+        for n in [0, 1, 2, 255, 256, 257, 2047, 2048, 2049, 4096, 70_000] {
+            let key = |i: u32, salt: u32| (i ^ salt).wrapping_mul(0x9e37_79b9) >> 8;
+            let entries: Vec<[u32; 4]> =
+                (0..n).map(|i| [key(i / 2, 1) % 5000, key(i / 3, 2) % 300, i, 0]).collect();
+            let mut counts: Counts = Zeroable::zeroed();
+            counts[Counter::Entries as usize] = n;
+            device.queue.write_buffer(&workspace.counters, 0, bytemuck::bytes_of(&counts));
+            device.queue.write_buffer(&workspace.entries, 0, bytemuck::cast_slice(&entries));
+            let mut encoder = device.device.create_command_encoder(&Default::default());
+            let mut pass = encoder.begin_compute_pass(&Default::default());
+            workspace.scan(&device, &mut pass, Scan::Entries);
+            let keys = [(SortKey::Region, bits_of(300)), (SortKey::Member, 32)];
+            let last = workspace.sort(&device, &mut pass, &keys);
+            drop(pass);
+            let staging = device
+                .buffer("staging", u64::from(n) * 4, Usage::MAP_READ | Usage::COPY_DST)
+                .expect("there is memory");
+            encoder.copy_buffer_to_buffer(&workspace.entry_order[last], 0, &staging, 0, u64::from(n) * 4);
+            let submission = device.queue.submit([encoder.finish()]);
+            staging.map_async(wgpu::MapMode::Read, .., |_| {});
+            device.wait(submission).expect("no error");
+            let bytes = staging.get_mapped_range(..).expect("mapped");
+            let found = bytemuck::cast_slice::<u8, u32>(&bytes)[..n as usize].to_vec();
+            let mut expected: Vec<u32> = (0..n).collect();
+            expected.sort_by_key(|i| (entries[*i as usize][0], entries[*i as usize][1]));
+            assert!(found == expected, "{n} items");
+        }
+    }
+}
