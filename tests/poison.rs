@@ -118,10 +118,15 @@ fn a_poisoned_scene_leaves_no_nan_in_the_store() {
     assert_eq!((manifest.n_rejected, manifest.n_gaussians), (n_rejected, ply.len() as u64 - n_rejected));
 
     let table = read_regions(&reader).expect("regions");
-    assert!(table.vectors.iter().chain(&table.n_masks).all(|v| v.is_finite()));
+    // Every component of every region's vector, one at a time.
+    for component in 0..table.dim() {
+        let mut query = vec![0.0; table.dim()];
+        query[component] = 1.0;
+        assert!(table.scores(&query).iter().all(|v| v.is_finite()));
+    }
     let (mut stored, mut n_with_evidence) = (BTreeSet::new(), 0);
     for cell in &manifest.cells {
-        let field = read_field(&reader, cell.cell_id, table.len()).expect("a field");
+        let field = read_field(&reader, cell.cell_id, cell.n_gaussians, table.len()).expect("a field");
         let columns = [&field.weights, &field.total_weights, &field.mean_lengths];
         assert!(columns.into_iter().flatten().all(|v| v.is_finite() && *v >= 0.0));
         for (profile, shard) in &cell.shards {
