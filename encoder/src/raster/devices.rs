@@ -179,14 +179,14 @@ impl Rasterizer for Devices {
             }
             return Ok(cpu);
         }
-        let free = (0..self.views_in_flight).flat_map(|_| 0..gpus.len()).collect();
-        let lanes = Lanes { free, is_usable: vec![true; gpus.len()] };
+        let lanes =
+            Lanes { n_free: vec![self.views_in_flight; gpus.len()], is_usable: vec![true; gpus.len()] };
         Ok(Box::new(SharedScene { gpus, cpu, lanes: Mutex::new(lanes), freed: Condvar::new() }))
     }
 }
 
 /// A scene on several GPUs. Each has as many lanes as it works on views at once; whoever asks for a
-/// view gets the lane that has been free longest, so a GPU waits for nothing but a view.
+/// view gets the GPU with the most free lanes, so a slow view holds up none but its own lane.
 struct SharedScene<'s> {
     gpus: Vec<Box<dyn LoadedScene + 's>>,
     cpu: Box<dyn LoadedScene + 's>,
@@ -195,21 +195,21 @@ struct SharedScene<'s> {
 }
 
 struct Lanes {
-    /// GPUs with a free lane, the longest free first.
-    free: std::collections::VecDeque<usize>,
+    /// Free lanes of each GPU.
+    n_free: Vec<usize>,
     is_usable: Vec<bool>,
 }
 
 impl SharedScene<'_> {
-    /// Returns the next free GPU, or `None` if none is usable any more.
+    /// Returns the GPU with the most free lanes, or `None` if none is usable any more.
     fn take(&self) -> Option<usize> {
         let mut lanes = self.lanes.lock().unwrap_or_else(PoisonError::into_inner);
         while lanes.is_usable.contains(&true) {
-            if let Some(gpu) = lanes.free.pop_front() {
-                if lanes.is_usable[gpu] {
-                    return Some(gpu);
-                }
-                continue;
+            let usable = (0..self.gpus.len()).filter(|gpu| lanes.is_usable[*gpu] && lanes.n_free[*gpu] > 0);
+            // The first of those with as many.
+            if let Some(gpu) = usable.rev().max_by_key(|gpu| lanes.n_free[*gpu]) {
+                lanes.n_free[gpu] -= 1;
+                return Some(gpu);
             }
             lanes = self.freed.wait(lanes).unwrap_or_else(PoisonError::into_inner);
         }
@@ -231,7 +231,7 @@ impl SharedScene<'_> {
                 // Whoever waits for a lane must see that there may be none.
                 self.freed.notify_all();
             } else if !failed {
-                lanes.free.push_back(gpu);
+                lanes.n_free[gpu] += 1;
                 self.freed.notify_one();
             }
             drop(lanes);
