@@ -230,13 +230,15 @@ pub trait LoadedScene: Sync {
     /// light but record nothing. The same input gives the same bits for any number of threads.
     ///
     /// # Errors
-    /// [`RasterError`] for input that contradicts itself.
+    /// [`RasterError`] for input that contradicts itself, or where a device fails.
     fn weights(
         &self,
         view: &RasterView,
         regions: &RegionMap,
         kind: WeightKind,
-    ) -> Result<ViewWeights, RasterError>;
+    ) -> Result<ViewWeights, RasterError> {
+        Ok(self.weights_timed(view, regions, kind)?.0)
+    }
 
     /// [`Self::weights`] with the time of each stage in the order of the work; none where a backend
     /// does not measure them.
@@ -248,9 +250,7 @@ pub trait LoadedScene: Sync {
         view: &RasterView,
         regions: &RegionMap,
         kind: WeightKind,
-    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
-        Ok((self.weights(view, regions, kind)?, Vec::new()))
-    }
+    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError>;
 
     /// Returns the picture of the scene over a background colour (linear in what was trained).
     ///
@@ -287,15 +287,6 @@ struct CpuScene<'s> {
 }
 
 impl LoadedScene for CpuScene<'_> {
-    fn weights(
-        &self,
-        view: &RasterView,
-        regions: &RegionMap,
-        kind: WeightKind,
-    ) -> Result<ViewWeights, RasterError> {
-        Ok(self.weights_timed(view, regions, kind)?.0)
-    }
-
     fn weights_timed(
         &self,
         view: &RasterView,

@@ -364,15 +364,6 @@ struct Rows {
 const MAX_REGIONS: u32 = (1 << REGION_BITS) - 1;
 
 impl LoadedScene for GpuScene<'_> {
-    fn weights(
-        &self,
-        view: &RasterView,
-        regions: &RegionMap,
-        kind: WeightKind,
-    ) -> Result<ViewWeights, RasterError> {
-        Ok(self.weights_timed(view, regions, kind)?.0)
-    }
-
     fn weights_timed(
         &self,
         view: &RasterView,
