@@ -17,7 +17,7 @@ use super::table::RegionTable;
 /// published, and a store must not depend on the memory of the machine that made it.
 const PART_ENTRIES: u64 = 1 << 22;
 /// Entries of a group where the budget would allow more: larger ones only leave the caches.
-const GROUP_ENTRIES: u64 = 1 << 24;
+const GROUP_ENTRIES: u64 = 1 << 22;
 /// Bytes that an entry takes while it is regrouped: as read, and as region and weight.
 const BYTES_PER_ENTRY: u64 = (size_of::<PackedEntry>() + size_of::<(u32, f32)>()) as u64;
 /// Bytes that a Gaussian takes: start, total weight, mean length, index.
