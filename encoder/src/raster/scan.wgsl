@@ -1,9 +1,9 @@
 // Sums over an array: what every stage places its output by.
 
 struct ScanJob {
-    // The array holds `ceil(n / block) * columns` values; n is counters[items], or n_fixed.
+    // The array holds `ceil(n / block) * columns` values; n is counters[items], at most n_most.
     items: u32,
-    n_fixed: u32,
+    n_most: u32,
     block: u32,
     columns: u32,
     // Counter that the scan starts from and adds its sum to, where the array has a total.
@@ -22,9 +22,10 @@ var<workgroup> length: u32;
 @compute @workgroup_size(WORKGROUP_SIZE)
 fn scan(@builtin(local_invocation_index) thread: u32) {
     if thread == 0u {
-        var n = job.n_fixed;
+        // A counter goes on beyond the room; what lies there was never written.
+        var n = job.n_most;
         if job.items != NONE {
-            n = counters[job.items];
+            n = min(n, counters[job.items]);
         }
         length = min((n + job.block - 1u) / job.block * job.columns, arrayLength(&values));
     }

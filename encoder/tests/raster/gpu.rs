@@ -36,9 +36,16 @@ fn chunks_and_bands_change_no_bit() {
     // 56 bytes a visible Gaussian, 64 a Gaussian, 16 a sum of a tile: 937 a chunk, 1,071 visible and 3,750
     // sums a band. Of the second, part of the scene stays on the device, of the third none.
     let mut n_with_bands = 0;
-    for (max_binding_bytes, max_resident_bytes) in [(60_000, u64::MAX), (90_000, 100_000), (60_000, 0)] {
+    // The last has next to no room at first, which must grow to the whole image in one band.
+    for (max_binding_bytes, max_resident_bytes, first_room) in [
+        (60_000, u64::MAX, 1 << 19),
+        (90_000, 100_000, 1 << 19),
+        (60_000, 0, 1 << 19),
+        (1 << 27, u64::MAX, 100),
+    ] {
         let cut =
-            open(GpuOptions { max_binding_bytes, max_resident_bytes, ..GpuOptions::default() }).unwrap();
+            open(GpuOptions { max_binding_bytes, max_resident_bytes, first_room, ..GpuOptions::default() })
+                .unwrap();
         let (whole, cut) = (whole.load(&scene).unwrap(), cut.load(&scene).unwrap());
         for (width, height) in SIZES_PX {
             let mut view = view;

@@ -179,8 +179,10 @@ impl Device {
     /// Waits until a submission is done.
     pub(super) fn wait(&self, submission: wgpu::SubmissionIndex) -> Result<(), RasterError> {
         let wait = wgpu::PollType::Wait { submission_index: Some(submission), timeout: None };
-        self.device.poll(wait).map_err(|e| self.error(e.to_string()))?;
-        self.check()
+        let polled = self.device.poll(wait);
+        // Why a submission failed says more than that it did.
+        self.check()?;
+        polled.map_err(|e| self.error(e.to_string())).map(drop)
     }
 
     /// Makes the device fail as a lost one does.

@@ -96,15 +96,20 @@ pub fn write_jobs(device: &Device, jobs: &wgpu::Buffer, room: Capacities) {
     let write = |index: u64, bytes: &[u8]| {
         device.queue.write_buffer(jobs, index * JOB_STRIDE_BYTES, bytes);
     };
-    let scan = |items, n_fixed, block, columns, total| ScanJob { items, n_fixed, block, columns, total };
-    for counter in [Counter::Visible, Counter::Pairs, Counter::Entries] {
-        let job = scan(counter as u32, 0, SORT_BLOCK, 16, NONE);
+    let scan = |items, n_most, block, columns, total| ScanJob { items, n_most, block, columns, total };
+    for (counter, most) in
+        [(Counter::Visible, room.visible), (Counter::Pairs, room.pairs), (Counter::Entries, room.entries)]
+    {
+        let job = scan(counter as u32, most, SORT_BLOCK, 16, NONE);
         write(Scan::Digits(counter).index(), bytemuck::bytes_of(&job));
     }
     for (kind, job) in [
-        (Scan::Pairs, scan(Counter::Visible as u32, 0, WORKGROUP_SIZE, 1, Counter::Pairs as u32)),
+        (Scan::Pairs, scan(Counter::Visible as u32, room.visible, WORKGROUP_SIZE, 1, Counter::Pairs as u32)),
         (Scan::Entries, scan(NONE, 0, 1, 1, Counter::Entries as u32)),
-        (Scan::Heads, scan(Counter::Entries as u32, 0, WORKGROUP_SIZE, 1, Counter::RegionSums as u32)),
+        (
+            Scan::Heads,
+            scan(Counter::Entries as u32, room.entries, WORKGROUP_SIZE, 1, Counter::RegionSums as u32),
+        ),
     ] {
         write(kind.index(), bytemuck::bytes_of(&job));
     }

@@ -75,8 +75,8 @@ pub struct Chunk {
 pub struct ScanJob {
     /// Counter with the number of items.
     pub items: u32,
-    /// The number where no counter has it.
-    pub n_fixed: u32,
+    /// Most items there can be; their number where no counter has it.
+    pub n_most: u32,
     /// Items a block.
     pub block: u32,
     /// Values a block.
@@ -264,7 +264,7 @@ mod tests {
         assert_layout!("project", SceneGaussian; mean_high, opacity, mean_low, reach2, rotation_wxyz, scales, padding);
         assert_eq!(layout_of("project", "SceneGaussian", Precision::F32).1, size_of::<SceneGaussian>());
         assert_layout!("project", Chunk; first_gaussian, n_gaussians);
-        assert_layout!("scan", ScanJob; items, n_fixed, block, columns, total);
+        assert_layout!("scan", ScanJob; items, n_most, block, columns, total);
         assert_layout!("sort", SortPass; items, stride, offset, shift, is_first, capacity);
         assert_layout!("draw", Background; rgb, padding);
         assert_layout!("compact", RegionSum; gaussian, region, low, high);

@@ -41,13 +41,20 @@ pub struct GpuOptions {
     pub max_binding_bytes: u64,
     /// Bytes of the scene that stay on the device; the rest is uploaded for each view.
     pub max_resident_bytes: u64,
+    /// Visible Gaussians, pairs and sums that there is room for at first; grown when a view needs more.
+    pub first_room: u32,
     /// Views worked on at once: while one is copied back, others compute.
     pub views_in_flight: usize,
 }
 
 impl Default for GpuOptions {
     fn default() -> Self {
-        Self { max_binding_bytes: u64::MAX, max_resident_bytes: u64::MAX, views_in_flight: 3 }
+        Self {
+            max_binding_bytes: u64::MAX,
+            max_resident_bytes: u64::MAX,
+            first_room: 1 << 19,
+            views_in_flight: 3,
+        }
     }
 }
 
@@ -104,15 +111,13 @@ struct Pool {
     room: Capacities,
 }
 
-/// Room that a workspace starts with; grown when a view needs more.
-const FIRST_ROOM: u32 = 1 << 19;
-
 impl<'s> GpuScene<'s> {
     fn new(device: Arc<Device>, options: GpuOptions, scene: &'s Gaussians) -> Result<Self, RasterError> {
         device.check()?;
         let usable: Vec<bool> = (0..scene.len()).map(|i| scene.is_usable(i)).collect();
         let origin_in_world = middle(scene, &usable);
-        let max_binding_bytes = options.max_binding_bytes.min(device.report.max_binding_bytes);
+        // Buffers are rounded up to 16 bytes.
+        let max_binding_bytes = options.max_binding_bytes.min(device.report.max_binding_bytes) & !15;
         let per_chunk = (max_binding_bytes / SCENE_GAUSSIAN_BYTES)
             .clamp(1, u64::from(MAX_DISPATCH) * u64::from(WORKGROUP_SIZE)) as usize;
         let mut loaded = Self {
@@ -132,9 +137,9 @@ impl<'s> GpuScene<'s> {
         };
         let max = loaded.max_room();
         loaded.pool().room = Capacities {
-            visible: FIRST_ROOM.min(scene.len().max(1) as u32).min(max.visible),
-            pairs: FIRST_ROOM.min(max.pairs),
-            entries: FIRST_ROOM.min(max.entries),
+            visible: options.first_room.min(scene.len().max(1) as u32).min(max.visible),
+            pairs: options.first_room.min(max.pairs),
+            entries: options.first_room.min(max.entries),
         };
         let mut resident_bytes = 0;
         let mut is_full = false;
@@ -158,14 +163,17 @@ impl<'s> GpuScene<'s> {
     fn upload(&self, first: usize, n: usize) -> Option<wgpu::Buffer> {
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
         let buffer = self.device.buffer("Gaussians", n as u64 * SCENE_GAUSSIAN_BYTES, usage)?;
-        // In pieces, so that the host holds little of the scene twice.
-        const PIECE: usize = 1 << 16;
+        // In pieces, each sent off before the next: the host holds little of the scene twice, and the window
+        // through which it writes may be no larger than 256 MiB.
+        const PIECE: usize = 1 << 18;
         for start in (0..n).step_by(PIECE) {
             let rows: Vec<SceneGaussian> = (start..(start + PIECE).min(n))
                 .map(|i| SceneGaussian::new(self.scene, first + i, self.origin_in_world))
                 .collect();
             let offset = start as u64 * SCENE_GAUSSIAN_BYTES;
             self.device.queue.write_buffer(&buffer, offset, bytemuck::cast_slice(&rows));
+            let submission = self.device.queue.submit([]);
+            self.device.wait(submission).ok()?;
         }
         Some(buffer)
     }

@@ -39,7 +39,7 @@ impl SceneChunk {
         let chunk = Chunk { first_gaussian, n_gaussians };
         let scan = ScanJob {
             items: NONE,
-            n_fixed: n_gaussians,
+            n_most: n_gaussians,
             block: WORKGROUP_SIZE,
             columns: 1,
             total: Counter::Visible as u32,
