@@ -15,7 +15,7 @@ pub use request::{
     DEFAULT_LIMIT, DEFAULT_MIN_COUNT, Level, MAX_LIMIT, QueryRequest, RequestError, parse_point,
 };
 
-use crate::score::{ScoreError, Search, rounding_bound};
+use crate::score::{Precision, Question, Region, ScoreError, Search, rounding_bound};
 use cluster::{Cluster, cluster};
 
 /// Edge of the voxels in a metric scene, metres: parts of one piece of furniture are nearer to each
@@ -196,7 +196,9 @@ pub fn answer(scene: &Scene<'_>, query: &[f32], request: &QueryRequest) -> Resul
     let manifest = scene.manifest;
     let threshold = request.threshold.unwrap_or(manifest.encoder.default_threshold);
     let limit = request.limit.unwrap_or(DEFAULT_LIMIT);
-    let search = Search::new(scene.shards, query, request.ball())?;
+    let question = Question::new(query);
+    let region = Region { ball: request.ball(), bounds: None };
+    let search = Search::new(scene.shards, &question, region, Precision::Exact)?;
     let matches = search.matching(threshold);
     let exact = search.is_exact();
     let mut clustering = None;
@@ -313,14 +315,15 @@ fn gaussians(
     let hits = search.best(limit, threshold, near).into_iter().enumerate();
     let answers = hits.map(|(at, hit)| {
         let shard = &scene.shards[hit.shard as usize];
+        let position_in_world = shard.position_in_world(hit.index as usize);
         GaussianAnswer {
             rank: at + 1,
             cell_id: shard.header.cell_id,
             index: hit.index,
             input_index: shard.exact.map(|exact| exact.input_indices[hit.index as usize]),
-            position_in_world: hit.position_in_world,
+            position_in_world,
             score: hit.score,
-            distance: near.map(|_| hit.distance),
+            distance: near.map(|near| near.distance(position_in_world)),
         }
     });
     answers.collect()
@@ -331,7 +334,10 @@ fn reason(search: &Search<'_>, request: &QueryRequest, threshold: f32, n_matchin
         Some(ball) => format!(" within {} of {}", ball.radius, ball.centre_in_world),
         None => String::new(),
     };
-    let best = search.best(1, f32::NEG_INFINITY, request.near).first().copied();
+    let best = search
+        .best(1, f32::NEG_INFINITY, request.near)
+        .first()
+        .map(|hit| (hit.score, search.shards()[hit.shard as usize].position_in_world(hit.index as usize)));
     let (kind, detail) = match best {
         None => (
             ReasonKind::NothingThere,
@@ -346,7 +352,7 @@ fn reason(search: &Search<'_>, request: &QueryRequest, threshold: f32, n_matchin
         ),
         Some(best) => {
             let n: usize = search.searched().map(ShardView::n_with_evidence).sum();
-            let (score, at) = (best.score, best.position_in_world);
+            let (score, at) = best;
             (
                 ReasonKind::BelowThreshold,
                 format!(
@@ -358,8 +364,8 @@ fn reason(search: &Search<'_>, request: &QueryRequest, threshold: f32, n_matchin
     Reason {
         kind,
         detail,
-        best_score: best.map(|hit| hit.score),
-        best_position_in_world: best.map(|hit| hit.position_in_world),
+        best_score: best.map(|(score, _)| score),
+        best_position_in_world: best.map(|(_, at)| at),
     }
 }
 

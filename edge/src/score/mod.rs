@@ -1,13 +1,16 @@
-//! Scores a query vector against shards, palette row by palette row.
+//! Scores questions against shards, palette row by palette row.
 //!
-//! A row's radius `r` bounds `||E_k - P[row]||` over its members, so a unit query's score of a member
-//! is within `r` of the row's score. Where a shard carries exact embeddings, rows that stay at or
-//! above the threshold by more than `r` are in as a whole, rows below it by more than `r` are out, and
-//! only members of the rows between are scored one by one. Where it does not, a row is in when its own
-//! score reaches the threshold, and the answer carries the bound.
+//! A row's radius `r` bounds `||E_k - P[row]||` over its members, so a score of a member is within
+//! `r * steepness` of the row's, where the steepness is 1 for a plain cosine and `max_j ||q - n_j||` with
+//! negatives. Where a shard carries exact embeddings (and they are asked for), rows that stay at or above
+//! the threshold by more than that are in as a whole, rows below it by more are out, and only members of
+//! the rows between are scored one by one. Where it does not, a row is in when its own score reaches the
+//! threshold, and the answer carries the bound.
 
-mod best;
 mod dot;
+mod question;
+mod region;
+mod select;
 
 use std::ops::Range;
 
@@ -16,15 +19,17 @@ use rayon::prelude::*;
 use slag_common::frames::Aabb;
 use slag_common::shard::ShardView;
 
-pub use best::Hit;
 pub use dot::{dot, rounding_bound};
+pub use question::{Question, RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
+pub use region::{Ball, Region};
+pub use select::Hit;
 
 /// Positions beyond this many world units are no scene (a hundred times the earth's diameter) and
 /// would overflow what is computed from them.
 pub const MAX_COORDINATE: f64 = 1e9;
-/// Half a step of f16 at 1: how far a stored unit embedding may lie from the one its row's radius
-/// was measured to.
-const F16_ROUNDING: f32 = 1.0 / 2048.0;
+/// How far a unit embedding stored as f16 may lie from the one its row's radius was measured to: half a
+/// step of f16 at 1 (2^-11), and the steps of components too small for f16's exponents.
+const F16_ROUNDING: f32 = 5e-4;
 
 /// Why shards cannot be scored.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -47,6 +52,16 @@ pub enum ScoreError {
         /// Its length.
         found: f32,
     },
+    /// A negative is of another space than the question.
+    #[error(
+        "a negative has {found} components, the query vector {expected}; take both from the same text model"
+    )]
+    Negative {
+        /// Components of the query.
+        expected: usize,
+        /// Components of the negative.
+        found: usize,
+    },
     /// A shard's positions lie where no scene is.
     #[error(
         "cell {cell_id}: positions reach {found:e}, the limit is {MAX_COORDINATE:e} world units; encode the scene again around a nearer origin"
@@ -59,26 +74,14 @@ pub enum ScoreError {
     },
 }
 
-/// The part of space that a query asks for: Gaussians whose mean lies within.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Ball {
-    /// Its centre.
-    pub centre_in_world: DVec3,
-    /// Its radius, world units.
-    pub radius: f64,
-}
-
-impl Ball {
-    fn contains(&self, point: DVec3) -> bool {
-        point.distance_squared(self.centre_in_world) <= self.radius * self.radius
-    }
-
-    /// Whether every point of a box is inside.
-    fn covers(&self, bounds: &Aabb) -> bool {
-        let farthest =
-            (bounds.min - self.centre_in_world).abs().max((bounds.max - self.centre_in_world).abs());
-        farthest.length() <= self.radius
-    }
+/// Which data scores come from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Precision {
+    /// Palette rows alone: fastest, every score within the bound stated.
+    Rows,
+    /// Rows, and exact embeddings for what rows cannot decide, of shards that carry them.
+    #[default]
+    Exact,
 }
 
 /// Matching Gaussians of one shard that lie next to each other and share a score.
@@ -109,59 +112,67 @@ pub struct Matches {
     pub n_shards_below: usize,
 }
 
-/// One query's row scores over some shards; answers several questions without scoring twice.
+/// One question's row scores over some shards; gives several kinds of answers without scoring twice.
 pub struct Search<'a> {
     shards: &'a [ShardView<'a>],
-    query: &'a [f32],
-    ball: Option<Ball>,
-    /// Per shard, the score of each row; `None` where the shard's box is outside the ball.
+    question: &'a Question,
+    region: Region,
+    precision: Precision,
+    /// Per shard, the score of each row; `None` where the shard lies outside the region.
     row_scores: Vec<Option<Vec<f32>>>,
 }
 
 impl<'a> Search<'a> {
-    /// Scores the rows of the shards that come within the ball.
+    /// Scores the rows of the shards that reach into the region. As [`Search::batch`], for one question.
     ///
-    /// `query`: `[dim]`, unit length. Costs one product per row and component, in parallel by shard.
     /// # Errors
     /// [`ScoreError`].
     pub fn new(
         shards: &'a [ShardView<'a>],
-        query: &'a [f32],
-        ball: Option<Ball>,
+        question: &'a Question,
+        region: Region,
+        precision: Precision,
     ) -> Result<Self, ScoreError> {
-        let length = query.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt() as f32;
-        // Text models normalise in f32, or from f16 tables.
-        if length.is_nan() || (length - 1.0).abs() > 1e-3 {
-            return Err(ScoreError::NotUnit { found: length });
-        }
-        for shard in shards {
-            let header = &shard.header;
-            if header.dim as usize != query.len() {
-                let (expected, found) = (header.dim as usize, query.len());
-                return Err(ScoreError::Dimension { cell_id: header.cell_id, expected, found });
-            }
-            let reach = position_box(shard);
-            let found = reach.min.abs().max(reach.max.abs()).max_element();
-            if found.is_nan() || found > MAX_COORDINATE {
-                return Err(ScoreError::Extent { cell_id: header.cell_id, found });
-            }
-        }
-        let row_scores = shards
-            .par_iter()
-            .map(|shard| {
-                let within =
-                    |ball: Ball| position_box(shard).distance_to(ball.centre_in_world) <= ball.radius;
-                ball.is_none_or(within)
-                    .then(|| shard.palette.chunks_exact(query.len()).map(|row| dot(row, query)).collect())
-            })
+        check(shards, question)?;
+        let scored = score_rows(shards, std::slice::from_ref(question), region);
+        let row_scores = scored.into_iter().map(|of_shard| of_shard?.pop()).collect();
+        Ok(Self { shards, question, region, precision, row_scores })
+    }
+
+    /// Scores the rows for several questions in one pass; returns a search for each, in their order.
+    ///
+    /// Costs one product per row, component and distinct vector (negatives that questions share are
+    /// multiplied once), in parallel by shard.
+    /// # Errors
+    /// [`ScoreError`].
+    pub fn batch(
+        shards: &'a [ShardView<'a>],
+        questions: &'a [Question],
+        region: Region,
+        precision: Precision,
+    ) -> Result<Vec<Self>, ScoreError> {
+        questions.iter().try_for_each(|question| check(shards, question))?;
+        let mut searches: Vec<Self> = questions
+            .iter()
+            .map(|question| Self { shards, question, region, precision, row_scores: Vec::new() })
             .collect();
-        Ok(Self { shards, query, ball, row_scores })
+        for of_shard in score_rows(shards, questions, region) {
+            let mut of_questions = of_shard.into_iter().flatten();
+            searches.iter_mut().for_each(|search| search.row_scores.push(of_questions.next()));
+        }
+        Ok(searches)
     }
 
     /// Returns the Gaussians whose score reaches a threshold, as far as the shards' data tell.
     pub fn matching(&self, threshold: f32) -> Matches {
-        let per_shard: Vec<Matches> =
-            (0..self.shards.len()).into_par_iter().map(|shard| self.matching_in(shard, threshold)).collect();
+        self.collect(threshold, false)
+    }
+
+    /// Gathers what reaches a threshold over all shards. `each`: members of shards with exact embeddings
+    /// get scores of their own even where their row alone decides.
+    fn collect(&self, threshold: f32, each: bool) -> Matches {
+        let shards = (0..self.shards.len()).into_par_iter();
+        let per_shard: Vec<Matches> = shards.map(|shard| self.collect_in(shard, threshold, each)).collect();
         let mut all = Matches::default();
         for mut found in per_shard {
             all.runs.append(&mut found.runs);
@@ -173,56 +184,73 @@ impl<'a> Search<'a> {
         all
     }
 
-    fn matching_in(&self, shard_at: usize, threshold: f32) -> Matches {
+    fn collect_in(&self, shard_at: usize, threshold: f32, each: bool) -> Matches {
         let mut found = Matches::default();
         let Some(scores) = &self.row_scores[shard_at] else { return found };
         let shard = &self.shards[shard_at];
-        let rounding = rounding_bound(self.query.len());
-        let filter = self.filter(shard);
+        let exact = shard.exact.filter(|_| self.precision == Precision::Exact);
+        let (filter, slack) = (self.filter(shard), self.slack(shard));
         let mut reachable = false;
         for (row, score) in scores.iter().copied().enumerate() {
-            let slack = shard.radii[row] + rounding + F16_ROUNDING;
-            reachable |= score + slack >= threshold;
-            let whole = |found: &mut Matches| {
-                for run in runs_inside(shard, filter, shard.members(row)) {
-                    found.n_gaussians += run.len() as u64;
-                    let (start, end) = (run.start as u32, run.end as u32);
-                    found.runs.push(Run { shard: shard_at as u32, start, end, score });
-                }
-            };
-            match &shard.exact {
-                None if score >= threshold => whole(&mut found),
-                Some(_) if score - slack >= threshold => whole(&mut found),
-                Some(exact) if score + slack >= threshold => {
-                    found.n_rows_undecided += 1;
-                    for index in runs_inside(shard, filter, shard.members(row)).flatten() {
-                        found.n_rescored += 1;
-                        let score = self.exact_score(exact.embeddings, index);
-                        if score >= threshold {
-                            let start = index as u32;
-                            found.n_gaussians += 1;
-                            found.runs.push(Run { shard: shard_at as u32, start, end: start + 1, score });
-                        }
+            let slack = slack(row);
+            if score + slack < threshold {
+                continue;
+            }
+            reachable = true;
+            let is_undecided = score - slack < threshold;
+            for inside in runs_inside(shard, filter, shard.members(row)) {
+                let run = |range: Range<usize>, score: f32| {
+                    let (start, end) = (range.start as u32, range.end as u32);
+                    Run { shard: shard_at as u32, start, end, score }
+                };
+                match exact {
+                    Some(exact) if is_undecided || each => {
+                        found.n_rescored += inside.len() as u64;
+                        let scored = inside.map(|at| (at, self.exact_score(exact.embeddings, at)));
+                        let reaching = scored.filter(|(_, score)| *score >= threshold);
+                        let before = found.runs.len();
+                        found.runs.extend(reaching.map(|(at, score)| run(at..at + 1, score)));
+                        found.n_gaussians += (found.runs.len() - before) as u64;
+                    }
+                    _ => {
+                        found.n_gaussians += inside.len() as u64;
+                        found.runs.push(run(inside, score));
                     }
                 }
-                _ => {}
             }
+            found.n_rows_undecided += u64::from(exact.is_some() && is_undecided);
         }
         found.n_shards_below = usize::from(!reachable);
         found
     }
 
+    /// Returns by how much a member's score may differ from its row's, by row; 0 where the row's counts
+    /// for all its members.
+    fn slack<'b>(&self, shard: &'b ShardView<'_>) -> impl Fn(usize) -> f32 + use<'b> {
+        let (steepness, rounding) = (self.question.steepness(), self.question.rounding_bound());
+        let is_exact = shard.exact.is_some() && self.precision == Precision::Exact;
+        // Both the row's score and the member's own are rounded.
+        let slack = move |row: usize| steepness * (shard.radii[row] + F16_ROUNDING) + 2.0 * rounding;
+        move |row| if is_exact { slack(row) } else { 0.0 }
+    }
+
     fn exact_score(&self, embeddings: &[half::f16], index: usize) -> f32 {
-        let dim = self.query.len();
-        dot(&embeddings[index * dim..][..dim], self.query)
+        let dim = self.question.vector.len();
+        let embedding = &embeddings[index * dim..][..dim];
+        combine(self.question.vectors().map(|vector| dot(embedding, vector)))
     }
 
-    /// Returns the ball where the shard sticks out of it.
-    fn filter(&self, shard: &ShardView<'_>) -> Option<Ball> {
-        self.ball.filter(|ball| !ball.covers(&position_box(shard)))
+    /// Returns the region where the shard sticks out of it.
+    fn filter(&self, shard: &ShardView<'_>) -> Option<Region> {
+        (!self.region.covers(&position_box(shard))).then_some(self.region)
     }
 
-    /// Returns the shards that were searched (the others lie outside the ball).
+    /// Returns all shards, which runs and hits refer to by place.
+    pub fn shards(&self) -> &'a [ShardView<'a>] {
+        self.shards
+    }
+
+    /// Returns the shards that were searched (the others lie outside the region).
     pub fn searched(&self) -> impl Iterator<Item = &'a ShardView<'a>> {
         self.shards
             .iter()
@@ -231,17 +259,72 @@ impl<'a> Search<'a> {
             .map(|(shard, _)| shard)
     }
 
-    /// Returns the bound on the error of scores: for every Gaussian searched,
-    /// `|row score - q·E_k|` is at most this.
+    /// Returns the bound on the error of scores: for every Gaussian searched, its row's score is off by at
+    /// most this.
     pub fn score_error_bound(&self) -> f32 {
         let largest = self.searched().flat_map(|shard| shard.radii).fold(0.0, |a: f32, b| a.max(*b));
-        largest + rounding_bound(self.query.len())
+        self.question.steepness() * largest + self.question.rounding_bound()
     }
 
-    /// Whether membership is exact: every shard searched carries exact embeddings.
+    /// Whether membership is exact: exact embeddings were asked for and every shard searched carries them.
     pub fn is_exact(&self) -> bool {
-        self.searched().all(|shard| shard.exact.is_some())
+        self.precision == Precision::Exact && self.searched().all(|shard| shard.exact.is_some())
     }
+}
+
+fn check(shards: &[ShardView<'_>], question: &Question) -> Result<(), ScoreError> {
+    question.check()?;
+    for shard in shards {
+        let header = &shard.header;
+        let (expected, found) = (header.dim as usize, question.vector.len());
+        if expected != found {
+            return Err(ScoreError::Dimension { cell_id: header.cell_id, expected, found });
+        }
+        let reach = position_box(shard);
+        let found = reach.min.abs().max(reach.max.abs()).max_element();
+        if found.is_nan() || found > MAX_COORDINATE {
+            return Err(ScoreError::Extent { cell_id: header.cell_id, found });
+        }
+    }
+    Ok(())
+}
+
+/// Returns the score made of the product with the question's vector and, after it, those with negatives;
+/// never -0, which would sort after 0 though it is equal.
+fn combine(mut products: impl Iterator<Item = f32>) -> f32 {
+    let own = products.next().unwrap_or(0.0);
+    products.reduce(f32::max).map_or(own, |worst| own - worst) + 0.0
+}
+
+/// Returns, per shard that reaches into the region, the scores `[questions][rows]`.
+fn score_rows(
+    shards: &[ShardView<'_>],
+    questions: &[Question],
+    region: Region,
+) -> Vec<Option<Vec<Vec<f32>>>> {
+    let mut vectors: Vec<&[f32]> = Vec::new();
+    let mut place = |vector| {
+        vectors.iter().position(|known| *known == vector).unwrap_or_else(|| {
+            vectors.push(vector);
+            vectors.len() - 1
+        })
+    };
+    let places: Vec<Vec<usize>> =
+        questions.iter().map(|question| question.vectors().map(&mut place).collect()).collect();
+    let score_shard = |shard: &ShardView<'_>| {
+        let n_rows = shard.header.n_rows as usize;
+        let mut scores: Vec<Vec<f32>> = questions.iter().map(|_| Vec::with_capacity(n_rows)).collect();
+        let mut products = vec![0.0; vectors.len()];
+        for row in shard.palette.chunks_exact(shard.header.dim as usize) {
+            products.iter_mut().zip(&vectors).for_each(|(product, vector)| *product = dot(row, vector));
+            for (scores, places) in scores.iter_mut().zip(&places) {
+                scores.push(combine(places.iter().map(|place| products[*place])));
+            }
+        }
+        scores
+    };
+    let in_region = |shard: &ShardView<'_>| region.touches(&position_box(shard)).then(|| score_shard(shard));
+    shards.par_iter().map(in_region).collect()
 }
 
 /// Returns the box that a shard's decoded positions can reach.
@@ -253,17 +336,17 @@ pub fn position_box(shard: &ShardView<'_>) -> Aabb {
 /// Returns the parts of a range of Gaussians that lie inside the filter.
 fn runs_inside(
     shard: &ShardView<'_>,
-    filter: Option<Ball>,
+    filter: Option<Region>,
     members: Range<usize>,
 ) -> impl Iterator<Item = Range<usize>> {
     let mut at = members.start;
     std::iter::from_fn(move || {
-        let Some(ball) = filter else {
+        let Some(region) = filter else {
             let rest = at..members.end;
             at = members.end;
             return (!rest.is_empty()).then_some(rest);
         };
-        let inside = |index: &usize| ball.contains(shard.position_in_world(*index));
+        let inside = |index: &usize| region.contains(shard.position_in_world(*index));
         let start = (at..members.end).find(inside)?;
         at = (start..members.end).find(|index| !inside(index)).unwrap_or(members.end);
         Some(start..at)

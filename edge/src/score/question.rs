@@ -1,0 +1,127 @@
+//! What is asked: a vector, and what it is compared with.
+
+use std::sync::Arc;
+
+use super::{ScoreError, dot::rounding_bound};
+
+/// Steepness of [`relevancy`], as LERF has it.
+pub const RELEVANCY_STEEPNESS: f32 = 10.0;
+
+/// A question in vectors. A Gaussian's score is `q · E_k`, or `q · E_k - max_j n_j · E_k` with negatives:
+/// how much more it is the thing asked for than the likest of what it is not (LERF, Kerr et al. 2023,
+/// section 3.3; [`relevancy`] maps it to 0..1).
+#[derive(Clone, Debug, PartialEq)]
+pub struct Question {
+    /// `[dim]`, unit length.
+    pub vector: Arc<[f32]>,
+    /// `[dim]` each, unit length; none: the score is the cosine.
+    pub negatives: Vec<Arc<[f32]>>,
+}
+
+impl Question {
+    /// Makes a question without negatives.
+    pub fn new(vector: impl Into<Arc<[f32]>>) -> Self {
+        Self { vector: vector.into(), negatives: Vec::new() }
+    }
+
+    /// Returns all vectors, the question's own first.
+    pub(super) fn vectors(&self) -> impl Iterator<Item = &[f32]> {
+        std::iter::once(&*self.vector).chain(self.negatives.iter().map(|negative| &**negative))
+    }
+
+    /// Checks that every vector has `dim` components and unit length.
+    pub(super) fn check(&self) -> Result<(), ScoreError> {
+        let dim = self.vector.len();
+        for vector in self.vectors() {
+            if vector.len() != dim {
+                return Err(ScoreError::Negative { expected: dim, found: vector.len() });
+            }
+            let found = length(vector.iter().copied()) as f32;
+            // Text models normalise in f32, or from f16 tables.
+            if found.is_nan() || (found - 1.0).abs() > 1e-3 {
+                return Err(ScoreError::NotUnit { found });
+            }
+        }
+        Ok(())
+    }
+
+    /// Returns by how much a score moves at most when an embedding moves by 1: the length of `q`, or the
+    /// largest of `q - n_j`, since the score is the least of all `(q - n_j) · E`, each as steep as that.
+    pub fn steepness(&self) -> f32 {
+        let own = length(self.vector.iter().copied());
+        let apart = |n: &Arc<[f32]>| length(self.vector.iter().zip(&**n).map(|(q, n)| q - n));
+        let largest = self.negatives.iter().map(apart).reduce(f64::max).unwrap_or(own);
+        (largest * (1.0 + f64::from(f32::EPSILON))) as f32
+    }
+
+    /// Returns a bound on what rounding in f32 changes a score by.
+    pub fn rounding_bound(&self) -> f32 {
+        let of_dot = rounding_bound(self.vector.len());
+        // The difference of two products of at most 1 each is rounded once more.
+        if self.negatives.is_empty() { of_dot } else { 2.0 * of_dot + f32::EPSILON }
+    }
+}
+
+fn length(components: impl Iterator<Item = f32>) -> f64 {
+    components.map(|v| f64::from(v).powi(2)).sum::<f64>().sqrt()
+}
+
+/// Returns LERF's relevancy of a score with negatives, `1 / (1 + exp(-t s))` with
+/// [t = 10](RELEVANCY_STEEPNESS): 0.5 where the thing asked for and the likest negative are equally near.
+pub fn relevancy(score: f32) -> f32 {
+    let t = f64::from(RELEVANCY_STEEPNESS);
+    (1.0 / (1.0 + (-t * f64::from(score)).exp())) as f32
+}
+
+/// Returns the score that has a relevancy, the inverse of [`relevancy`]; infinite for 0 and 1.
+pub fn score_of_relevancy(relevancy: f32) -> f32 {
+    let p = f64::from(relevancy);
+    ((p / (1.0 - p)).ln() / f64::from(RELEVANCY_STEEPNESS)) as f32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: LERF's own formula, the least of pairwise softmaxes of 10 times the cosines.
+    #[test]
+    fn relevancy_is_the_least_pairwise_softmax() {
+        for (positive, negatives) in
+            [(0.3f64, [0.1f64, 0.25, -0.2]), (0.1, [0.4, 0.0, 0.3]), (0.2, [0.2, 0.1, 0.0])]
+        {
+            let softmax = |n: &f64| (10.0 * positive).exp() / ((10.0 * positive).exp() + (10.0 * n).exp());
+            let expected = negatives.iter().map(softmax).fold(1.0, f64::min);
+            let score = (positive - negatives.iter().fold(-1.0, |a: f64, b| a.max(*b))) as f32;
+            assert!((f64::from(relevancy(score)) - expected).abs() < 1e-6);
+            assert!((score_of_relevancy(relevancy(score)) - score).abs() < 1e-6);
+        }
+        assert_eq!((relevancy(0.0), score_of_relevancy(0.5)), (0.5, 0.0));
+    }
+
+    /// Oracle: the scores of random embeddings and of others nearby, in f64.
+    #[test]
+    fn no_score_is_steeper_than_stated() {
+        let mut random = crate::testing::Random(3);
+        let (mut steepest, dim) = (0.0f64, 6);
+        for n_negatives in [0, 1, 4] {
+            for _ in 0..2000 {
+                let mut unit = || Arc::from(random.unit(dim));
+                let (vector, negatives) = (unit(), (0..n_negatives).map(|_| unit()).collect());
+                let question = Question { vector, negatives };
+                let score = |e: &[f32]| {
+                    let dot =
+                        |v: &[f32]| v.iter().zip(e).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
+                    let worst = question.negatives.iter().map(|n| dot(n)).reduce(f64::max).unwrap_or(0.0);
+                    dot(&question.vector) - worst
+                };
+                let (at, step) = (random.unit(dim), random.unit(dim));
+                let moved: Vec<f32> = at.iter().zip(&step).map(|(a, s)| a + 0.25 * s).collect();
+                let distance = length(at.iter().zip(&moved).map(|(a, b)| a - b));
+                let share = (score(&at) - score(&moved)).abs() / (distance * f64::from(question.steepness()));
+                assert!(share <= 1.0 + 1e-6, "{share}");
+                steepest = steepest.max(share);
+            }
+        }
+        assert!(steepest > 0.9, "the bound was hardly tested: {steepest}");
+    }
+}
