@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::frames::{Aabb, GeoReference};
 use crate::hash::Hash32;
-use crate::shard::Profile;
+use crate::shard::{Profile, ScoreErrors};
 
 /// Version of the manifest format that is written and read.
 pub const VERSION: u32 = 1;
@@ -88,8 +88,10 @@ pub struct ShardRecord {
     pub len_bytes: u64,
     /// Palette rows.
     pub n_rows: u32,
-    /// Largest distance of an embedding from its row: no score is off by more.
+    /// Largest distance of an embedding from what the profile decodes: no score is off by more.
     pub score_error_bound: f32,
+    /// Errors of scores, measured over a bank of texts.
+    pub score_errors: ScoreErrors,
     /// Largest error of a position, world units.
     pub position_error: f64,
 }
@@ -324,6 +326,7 @@ mod tests {
                         len_bytes: 9,
                         n_rows: 2,
                         score_error_bound: 0.1,
+                        score_errors: ScoreErrors::default(),
                         position_error: 1e-3,
                     };
                     let shards = BTreeMap::from([(Profile::Compact, record)]);

@@ -3,6 +3,11 @@
 //! Gaussians are ordered by palette row, then along a Morton curve, so a row's members are one
 //! run `row_starts[r]..row_starts[r + 1]` and no code column exists; those without evidence follow
 //! the last run and have no row.
+//!
+//! Rows are 8-bit components in a basis of the cell's own, for a cell's embeddings fill few dimensions:
+//! `P[r] = mean + row_step * sum over c of rows[r][c] * basis_steps[c] * basis[c]`. A residual code adds
+//! `scale[r] * word` to groups of components, a word of 16 for each group:
+//! `E ~ P[r] + scale[r] * sum over g of sum over c in group g of words[g][code][c] * basis_steps[c] * basis[c]`.
 
 use std::io;
 use std::ops::Range;
@@ -19,24 +24,48 @@ use crate::hash::Hash32;
 /// First bytes of a shard.
 pub const MAGIC: [u8; 8] = *b"SLAGSHRD";
 /// Version of the shard format that is written and read.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
+/// Gaussians whose residual codes lie together, one byte column after the other.
+pub const BLOCK: usize = 32;
+/// Words of a group of components: a code is half a byte.
+pub const WORDS: usize = 16;
+/// Most groups of a residual code.
+pub const MAX_GROUPS: usize = 128;
+/// Larger than any text-image model's embedding; a larger stated `dim` is damage.
+pub const MAX_DIM: usize = 8192;
 
 /// Ids of a shard's sections.
 pub mod section {
     /// [`super::ShardHeader`].
     pub const HEADER: u32 = 1;
-    /// `[N][3]` u16, steps of `position_step` from `origin_in_world`.
+    /// `[N]` u32 or `[N][3]` u16, see [`super::Positions`].
     pub const POSITIONS: u32 = 2;
     /// `[K + 1]` u32.
     pub const ROW_STARTS: u32 = 3;
-    /// `[K][dim]` f16.
-    pub const PALETTE: u32 = 4;
+    /// `[K][m]` i8.
+    pub const ROWS: u32 = 4;
     /// `[K]` f32.
     pub const RADII: u32 = 5;
     /// `[N]` u32, index in the input splat file.
     pub const INPUT_INDICES: u32 = 6;
     /// `[row_starts[K]][dim]` f16, unit embeddings.
     pub const EMBEDDINGS: u32 = 7;
+    /// `[dim]` f16; absent: zero.
+    pub const MEAN: u32 = 8;
+    /// `[m][dim]` i8; absent: the components are the embedding's own, m = dim.
+    pub const BASIS: u32 = 9;
+    /// `[m]` f32, with the basis.
+    pub const BASIS_STEPS: u32 = 10;
+    /// `[G + 1]` u32: group g has the components from `starts[g]` to `starts[g + 1]`.
+    pub const GROUP_STARTS: u32 = 11;
+    /// Group by group `[16][components of the group]` f16.
+    pub const WORDS: u32 = 12;
+    /// `[K]` f32: what a row's words are multiplied by.
+    pub const ROW_SCALES: u32 = 13;
+    /// `[K]` f32: length of the largest residual of a row's members as decoded, in components.
+    pub const REACHES: u32 = 14;
+    /// `[ceil(row_starts[K] / 32)][G / 2][32]` u8: two codes a byte, the even group's in the low half.
+    pub const CODES: u32 = 15;
 }
 
 /// How much a shard carries.
@@ -45,18 +74,21 @@ pub mod section {
 pub enum Profile {
     /// Palette rows and positions.
     Compact,
-    /// Also every embedding, as f16.
+    /// Also a residual code of each embedding.
+    Balanced,
+    /// Palette rows, positions and every embedding as f16.
     Exact,
 }
 
 impl Profile {
     /// Every profile, smallest first.
-    pub const ALL: [Self; 2] = [Self::Compact, Self::Exact];
+    pub const ALL: [Self; 3] = [Self::Compact, Self::Balanced, Self::Exact];
 
     /// Returns the name used in manifests, URLs and flags.
     pub fn name(self) -> &'static str {
         match self {
             Self::Compact => "compact",
+            Self::Balanced => "balanced",
             Self::Exact => "exact",
         }
     }
@@ -80,6 +112,23 @@ impl std::str::FromStr for Profile {
     }
 }
 
+/// Errors of a profile's scores over a bank of text vectors, measured when it was made: absolute, of
+/// cosines; on a sample of the Gaussians.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[repr(C)]
+pub struct ScoreErrors {
+    /// Mean over texts and Gaussians.
+    pub mean: f32,
+    /// 99.9th percentile.
+    pub p999: f32,
+    /// Largest.
+    pub max: f32,
+    /// Standard deviation over the Gaussians of a text's scores, mean over the texts: what an error is
+    /// to be compared with.
+    pub spread: f32,
+}
+
 /// The fixed part of a shard.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
@@ -92,6 +141,14 @@ pub struct ShardHeader {
     pub n_rows: u32,
     /// Components of an embedding.
     pub dim: u32,
+    /// Components of a row, m.
+    pub n_components: u32,
+    /// Groups of components of the residual code, G; even; 0 without one.
+    pub n_groups: u32,
+    /// Bits of a position's x, y and z, 32 in all at most; 16 each where they are kept as u16.
+    pub position_bits: [u8; 4],
+    /// What a row's 8-bit components are multiplied by.
+    pub row_step: f32,
     /// Where the shard frame's origin lies in the world frame.
     pub origin_in_world: [f64; 3],
     /// World units per step of a quantised position, per axis; the error is at most half a step.
@@ -100,158 +157,74 @@ pub struct ShardHeader {
     pub box_min: [f64; 3],
     /// Largest corner.
     pub box_max: [f64; 3],
+    /// Measured errors of this profile.
+    pub errors: ScoreErrors,
     /// The encoder whose space the rows live in.
     pub encoder_id: [u8; 32],
 }
 
-/// What a shard is written from. All columns are in shard order.
-pub struct ShardParts<'a> {
-    /// The fixed part.
-    pub header: ShardHeader,
-    /// `[N][3]`.
-    pub positions: &'a [[u16; 3]],
-    /// `[K + 1]`, ascending.
-    pub row_starts: &'a [u32],
-    /// `[K][dim]`.
-    pub palette: &'a [f16],
-    /// `[K]`: at least the largest `||E_k - P[row]||` of the row's members.
-    pub radii: &'a [f32],
-    /// `[N]` index in the input file and `[row_starts[K]][dim]` embeddings: the exact profile.
-    pub exact: Option<(&'a [u32], &'a [f16])>,
+/// Quantised means, steps of `position_step` from `origin_in_world`.
+#[derive(Clone, Copy, Debug)]
+pub enum Positions<'a> {
+    /// x, y and z from the lowest bit up, `position_bits` wide.
+    Packed(&'a [u32]),
+    /// x, y, z.
+    Wide(&'a [[u16; 3]]),
 }
 
-impl ShardParts<'_> {
-    /// Writes the shard.
-    ///
-    /// # Errors
-    /// Whatever the writer gives.
-    pub fn write(&self, out: impl io::Write) -> io::Result<()> {
-        let mut sections = vec![
-            (section::HEADER, bytemuck::bytes_of(&self.header)),
-            (section::POSITIONS, container::bytes_of(self.positions)),
-            (section::ROW_STARTS, container::bytes_of(self.row_starts)),
-            (section::PALETTE, container::bytes_of(self.palette)),
-            (section::RADII, container::bytes_of(self.radii)),
-        ];
-        if let Some((input_indices, embeddings)) = self.exact {
-            sections.push((section::INPUT_INDICES, container::bytes_of(input_indices)));
-            sections.push((section::EMBEDDINGS, container::bytes_of(embeddings)));
+impl Positions<'_> {
+    fn bytes(&self) -> &[u8] {
+        match self {
+            Self::Packed(words) => container::bytes_of(words),
+            Self::Wide(steps) => container::bytes_of(steps),
         }
-        container::write(out, MAGIC, VERSION, &sections)
     }
-}
 
-/// A checked shard's header and where its columns lie; pair it with the bytes by [`ShardLayout::view`].
-#[derive(Clone, Debug)]
-pub struct ShardLayout {
-    /// The fixed part.
-    pub header: ShardHeader,
-    positions: Range<usize>,
-    row_starts: Range<usize>,
-    palette: Range<usize>,
-    radii: Range<usize>,
-    exact: Option<(Range<usize>, Range<usize>)>,
-}
-
-impl ShardLayout {
-    /// Checks a whole shard: container, sizes, row order, finite and sane numbers.
-    ///
-    /// # Errors
-    /// [`ContainerError`], naming the byte.
-    pub fn check(bytes: &[u8]) -> Result<Self, ContainerError> {
-        let layout = Layout::check(bytes, MAGIC, VERSION)?;
-        let at_header = layout.find(section::HEADER).map_or(0, |range| range.start as u64);
-        let header: ShardHeader = layout.value(bytes, section::HEADER, "header")?;
-        let damaged = |what: String| ContainerError::Damaged { offset_bytes: at_header, what };
-        let floats = [header.origin_in_world, header.position_step, header.box_min, header.box_max];
-        if floats.as_flattened().iter().any(|v| !v.is_finite())
-            || header.position_step.iter().any(|s| *s < 0.0)
-        {
-            return Err(damaged("a coordinate of the header is not finite, or a step is negative".into()));
-        }
-        if (0..3).any(|axis| header.box_min[axis] > header.box_max[axis]) {
-            return Err(damaged(format!("box {:?}..{:?} is empty", header.box_min, header.box_max)));
-        }
-        let (n, k, dim) = (header.n_gaussians as usize, header.n_rows as usize, header.dim as usize);
-        if k > n || dim == 0 || dim > MAX_DIM {
-            return Err(damaged(format!("{k} rows of {dim} components for {n} Gaussians")));
-        }
-        let row_starts = layout.column::<u32>(section::ROW_STARTS, "row starts", k + 1)?;
-        let starts: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[row_starts.clone()]);
-        // A row has members: an empty one would only cost time, and K <= N bounds memory.
-        if starts[0] != 0 || starts.windows(2).any(|w| w[0] >= w[1]) || starts[k] as usize > n {
-            let offset_bytes = row_starts.start as u64;
-            let what = format!("row starts do not ascend from 0 to at most {n}");
-            return Err(ContainerError::Damaged { offset_bytes, what });
-        }
-        let exact = match layout.find(section::EMBEDDINGS) {
-            None => None,
-            Some(_) => Some((
-                layout.column::<u32>(section::INPUT_INDICES, "input indices", n)?,
-                layout.column::<f16>(section::EMBEDDINGS, "embeddings", starts[k] as usize * dim)?,
-            )),
-        };
-        let palette = layout.column::<f16>(section::PALETTE, "palette", k * dim)?;
-        let radii = layout.column::<f32>(section::RADII, "radii", k)?;
-        let half_columns = [Some(palette.clone()), exact.as_ref().map(|(_, embeddings)| embeddings.clone())];
-        for range in half_columns.into_iter().flatten() {
-            if !all_finite_f16(&bytes[range.clone()]) {
-                let what = "an embedding component is not finite".into();
-                return Err(ContainerError::Damaged { offset_bytes: range.start as u64, what });
+    fn steps(&self, index: usize, bits: [u8; 4]) -> [u32; 3] {
+        match self {
+            Self::Wide(steps) => steps[index].map(u32::from),
+            Self::Packed(words) => {
+                let word = u64::from(words[index]);
+                let part = |shift: u8, bits: u8| (word >> shift & ((1 << bits) - 1)) as u32;
+                [part(0, bits[0]), part(bits[0], bits[1]), part(bits[0] + bits[1], bits[2])]
             }
         }
-        let radius_values: Vec<f32> = bytemuck::pod_collect_to_vec(&bytes[radii.clone()]);
-        if radius_values.iter().any(|r| !(0.0..=4.0).contains(r)) {
-            let what = "a radius is outside 0..=4".into();
-            return Err(ContainerError::Damaged { offset_bytes: radii.start as u64, what });
-        }
-        let positions = layout.column::<[u16; 3]>(section::POSITIONS, "positions", n)?;
-        Ok(Self { header, positions, row_starts, palette, radii, exact })
-    }
-
-    /// Returns the columns of the bytes that were checked.
-    ///
-    /// # Panics
-    /// If `bytes` are other than those checked (shorter), or do not start at a 4-byte aligned address
-    /// (mapped files and [`container::AlignedBytes`] do).
-    pub fn view<'a>(&self, bytes: &'a [u8]) -> ShardView<'a> {
-        ShardView {
-            header: self.header,
-            positions: bytemuck::cast_slice(&bytes[self.positions.clone()]),
-            row_starts: bytemuck::cast_slice(&bytes[self.row_starts.clone()]),
-            palette: bytemuck::cast_slice(&bytes[self.palette.clone()]),
-            radii: bytemuck::cast_slice(&bytes[self.radii.clone()]),
-            exact: self.exact.as_ref().map(|(indices, embeddings)| ExactColumns {
-                input_indices: bytemuck::cast_slice(&bytes[indices.clone()]),
-                embeddings: bytemuck::cast_slice(&bytes[embeddings.clone()]),
-            }),
-        }
     }
 }
 
-/// Larger than any text-image model's embedding; a larger stated `dim` is damage.
-pub const MAX_DIM: usize = 8192;
-
-fn all_finite_f16(bytes: &[u8]) -> bool {
-    // Exponent bits all set is infinity or NaN (IEEE 754 binary16).
-    bytes.chunks_exact(2).all(|b| u16::from_le_bytes([b[0], b[1]]) & 0x7c00 != 0x7c00)
-}
-
-/// A shard's columns, borrowed from its bytes.
+/// The basis of a cell's rows.
 #[derive(Clone, Copy, Debug)]
-pub struct ShardView<'a> {
-    /// The fixed part.
-    pub header: ShardHeader,
-    /// `[N][3]`, quantised; decode with [`ShardView::position_in_world`].
-    pub positions: &'a [[u16; 3]],
-    /// `[K + 1]`.
-    pub row_starts: &'a [u32],
-    /// `[K][dim]`.
-    pub palette: &'a [f16],
+pub struct Basis<'a> {
+    /// `[dim]`.
+    pub mean: &'a [f16],
+    /// `[m][dim]`.
+    pub vectors: &'a [i8],
+    /// `[m]`.
+    pub steps: &'a [f32],
+}
+
+/// The residual code.
+#[derive(Clone, Copy, Debug)]
+pub struct Residuals<'a> {
+    /// `[G + 1]`, strictly ascending, at most m.
+    pub group_starts: &'a [u32],
+    /// Group by group `[16][components of the group]`.
+    pub words: &'a [f16],
     /// `[K]`.
-    pub radii: &'a [f32],
-    /// What only the exact profile has.
-    pub exact: Option<ExactColumns<'a>>,
+    pub row_scales: &'a [f32],
+    /// `[K]`: no member's decoded residual is longer, as a vector of components.
+    pub reaches: &'a [f32],
+    /// `[ceil(row_starts[K] / 32)][G / 2][32]`.
+    pub codes: &'a [u8],
+}
+
+impl Residuals<'_> {
+    /// Returns the word that a Gaussian's code names in a group.
+    pub fn code(&self, index: usize, group: usize) -> usize {
+        let n_bytes = (self.group_starts.len() - 1) / 2;
+        let byte = self.codes[(index / BLOCK * n_bytes + group / 2) * BLOCK + index % BLOCK];
+        usize::from(if group.is_multiple_of(2) { byte & 15 } else { byte >> 4 })
+    }
 }
 
 /// The exact profile's columns.
@@ -263,16 +236,82 @@ pub struct ExactColumns<'a> {
     pub embeddings: &'a [f16],
 }
 
+/// A shard's columns, borrowed from its bytes, or from what it is to be written from.
+#[derive(Clone, Copy, Debug)]
+pub struct ShardView<'a> {
+    /// The fixed part.
+    pub header: ShardHeader,
+    /// `[N]`; decode with [`ShardView::position_in_world`].
+    pub positions: Positions<'a>,
+    /// `[K + 1]`, ascending.
+    pub row_starts: &'a [u32],
+    /// `[K][m]`.
+    pub rows: &'a [i8],
+    /// `[K]`: at least the largest `||E_k - E'_k||` of the row's members, E' as this profile decodes it
+    /// (the row, or row and residual); beside exact embeddings, of the row.
+    pub radii: &'a [f32],
+    /// What the rows' components mean; absent: they are the embedding's own.
+    pub basis: Option<Basis<'a>>,
+    /// What only the balanced profile has.
+    pub residuals: Option<Residuals<'a>>,
+    /// What only the exact profile has.
+    pub exact: Option<ExactColumns<'a>>,
+}
+
 impl ShardView<'_> {
+    /// Writes the shard.
+    ///
+    /// # Errors
+    /// Whatever the writer gives.
+    pub fn write(&self, out: impl io::Write) -> io::Result<()> {
+        let mut sections = vec![
+            (section::HEADER, bytemuck::bytes_of(&self.header)),
+            (section::POSITIONS, self.positions.bytes()),
+            (section::ROW_STARTS, container::bytes_of(self.row_starts)),
+            (section::ROWS, container::bytes_of(self.rows)),
+            (section::RADII, container::bytes_of(self.radii)),
+        ];
+        if let Some(basis) = &self.basis {
+            sections.push((section::MEAN, container::bytes_of(basis.mean)));
+            sections.push((section::BASIS, container::bytes_of(basis.vectors)));
+            sections.push((section::BASIS_STEPS, container::bytes_of(basis.steps)));
+        }
+        if let Some(residuals) = &self.residuals {
+            sections.push((section::GROUP_STARTS, container::bytes_of(residuals.group_starts)));
+            sections.push((section::WORDS, container::bytes_of(residuals.words)));
+            sections.push((section::ROW_SCALES, container::bytes_of(residuals.row_scales)));
+            sections.push((section::REACHES, container::bytes_of(residuals.reaches)));
+            sections.push((section::CODES, residuals.codes));
+        }
+        if let Some(exact) = &self.exact {
+            sections.push((section::INPUT_INDICES, container::bytes_of(exact.input_indices)));
+            sections.push((section::EMBEDDINGS, container::bytes_of(exact.embeddings)));
+        }
+        container::write(out, MAGIC, VERSION, &sections)
+    }
+
     /// Returns the mean of a Gaussian, exact to half a step per axis.
     pub fn position_in_world(&self, index: usize) -> DVec3 {
-        let steps = self.positions[index].map(f64::from);
+        let steps = self.positions.steps(index, self.header.position_bits).map(f64::from);
         DVec3::from(self.header.origin_in_world) + DVec3::from(steps) * DVec3::from(self.header.position_step)
+    }
+
+    /// Returns the box that positions can reach.
+    pub fn position_box(&self) -> Aabb {
+        let steps = self.header.position_bits.map(|bits| ((1u64 << bits) - 1) as f64);
+        let min = DVec3::from(self.header.origin_in_world);
+        let size = DVec3::new(steps[0], steps[1], steps[2]) * DVec3::from(self.header.position_step);
+        Aabb { min, max: min + size }
     }
 
     /// Returns the members of a row.
     pub fn members(&self, row: usize) -> Range<usize> {
         self.row_starts[row] as usize..self.row_starts[row + 1] as usize
+    }
+
+    /// Returns the row of a Gaussian that has evidence.
+    pub fn row_of(&self, index: usize) -> usize {
+        self.row_starts.partition_point(|start| *start as usize <= index) - 1
     }
 
     /// Returns the number of Gaussians that have an embedding.
@@ -289,6 +328,257 @@ impl ShardView<'_> {
     pub fn encoder_id(&self) -> Hash32 {
         Hash32(self.header.encoder_id)
     }
+
+    /// Writes a row's vector to `out` (`[dim]`): the formula of the module, in float64.
+    pub fn decode_row(&self, row: usize, out: &mut [f64]) {
+        let m = self.header.n_components as usize;
+        let step = f64::from(self.header.row_step);
+        let components: Vec<f64> = self.rows[row * m..][..m].iter().map(|c| f64::from(*c) * step).collect();
+        self.combine(&components, out);
+    }
+
+    /// Writes the embedding of a Gaussian with evidence, as well as this profile knows it, to `out`
+    /// (`[dim]`), in float64.
+    pub fn decode(&self, index: usize, out: &mut [f64]) {
+        let (m, dim) = (self.header.n_components as usize, self.header.dim as usize);
+        if let Some(exact) = &self.exact {
+            let stored = &exact.embeddings[index * dim..][..dim];
+            out.iter_mut().zip(stored).for_each(|(o, v)| *o = v.to_f64());
+            return;
+        }
+        let row = self.row_of(index);
+        let step = f64::from(self.header.row_step);
+        let mut components: Vec<f64> =
+            self.rows[row * m..][..m].iter().map(|c| f64::from(*c) * step).collect();
+        if let Some(residuals) = &self.residuals {
+            let scale = f64::from(residuals.row_scales[row]);
+            for group in 0..residuals.group_starts.len() - 1 {
+                let of_group =
+                    residuals.group_starts[group] as usize..residuals.group_starts[group + 1] as usize;
+                let word = residuals.code(index, group) * of_group.len();
+                let word = &residuals.words[WORDS * of_group.start + word..][..of_group.len()];
+                components[of_group].iter_mut().zip(word).for_each(|(c, w)| *c += scale * w.to_f64());
+            }
+        }
+        self.combine(&components, out);
+    }
+
+    fn combine(&self, components: &[f64], out: &mut [f64]) {
+        let Some(basis) = &self.basis else {
+            out.copy_from_slice(components);
+            return;
+        };
+        out.iter_mut().zip(basis.mean).for_each(|(o, v)| *o = v.to_f64());
+        for ((component, vector), step) in
+            components.iter().zip(basis.vectors.chunks_exact(out.len())).zip(basis.steps)
+        {
+            let scale = component * f64::from(*step);
+            out.iter_mut().zip(vector).for_each(|(o, v)| *o += scale * f64::from(*v));
+        }
+    }
+}
+
+/// Rounds values to 8 bits with a common step, which is returned with them.
+pub fn quantise(values: &[f32]) -> (Vec<i8>, f32) {
+    let largest = values.iter().fold(0.0f32, |most, v| most.max(v.abs()));
+    let step = largest / 127.0;
+    let round = |v: &f32| if step > 0.0 { (v / step).round() as i8 } else { 0 };
+    (values.iter().map(round).collect(), step)
+}
+
+/// A checked shard's header and where its columns lie; pair it with the bytes by [`ShardLayout::view`].
+#[derive(Clone, Debug)]
+pub struct ShardLayout {
+    /// The fixed part.
+    pub header: ShardHeader,
+    positions: Range<usize>,
+    row_starts: Range<usize>,
+    rows: Range<usize>,
+    radii: Range<usize>,
+    basis: Option<[Range<usize>; 3]>,
+    residuals: Option<[Range<usize>; 5]>,
+    exact: Option<[Range<usize>; 2]>,
+}
+
+impl ShardLayout {
+    /// Checks a whole shard: container, sizes, row order, finite and sane numbers.
+    ///
+    /// # Errors
+    /// [`ContainerError`], naming the byte.
+    pub fn check(bytes: &[u8]) -> Result<Self, ContainerError> {
+        let layout = Layout::check(bytes, MAGIC, VERSION)?;
+        let header: ShardHeader = layout.value(bytes, section::HEADER, "header")?;
+        let at_header = layout.find(section::HEADER).map_or(0, |range| range.start);
+        check_header(&header).map_err(|what| damaged(at_header, what))?;
+        let (n, k, dim) = (header.n_gaussians as usize, header.n_rows as usize, header.dim as usize);
+        let (m, n_groups) = (header.n_components as usize, header.n_groups as usize);
+        let row_starts = layout.column::<u32>(section::ROW_STARTS, "row starts", k + 1)?;
+        let starts: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[row_starts.clone()]);
+        // A row has members: an empty one would only cost time, and K <= N bounds memory.
+        if starts[0] != 0 || starts.windows(2).any(|w| w[0] >= w[1]) || starts[k] as usize > n {
+            let what = format!("row starts do not ascend from 0 to at most {n}");
+            return Err(damaged(row_starts.start, what));
+        }
+        let n_with_evidence = starts[k] as usize;
+        let rows = layout.column::<i8>(section::ROWS, "rows", k * m)?;
+        let radii = lengths(&layout, bytes, section::RADII, "radii", k)?;
+        let basis = match layout.find(section::BASIS) {
+            None if m != dim => {
+                return Err(damaged(at_header, format!("{m} components of {dim} without a basis")));
+            }
+            None => None,
+            Some(_) => {
+                let mean = halves(&layout, bytes, section::MEAN, "mean", dim)?;
+                let vectors = layout.column::<i8>(section::BASIS, "basis", m * dim)?;
+                Some([mean, vectors, lengths(&layout, bytes, section::BASIS_STEPS, "basis steps", m)?])
+            }
+        };
+        let residuals = match n_groups {
+            0 => None,
+            _ => {
+                let group_starts =
+                    layout.column::<u32>(section::GROUP_STARTS, "group starts", n_groups + 1)?;
+                let of_groups: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[group_starts.clone()]);
+                let end = of_groups[n_groups] as usize;
+                if of_groups[0] != 0 || of_groups.windows(2).any(|w| w[0] >= w[1]) || end > m {
+                    let what = format!("group starts do not ascend from 0 to at most {m}");
+                    return Err(damaged(group_starts.start, what));
+                }
+                let words = halves(&layout, bytes, section::WORDS, "words", WORDS * end)?;
+                let row_scales = lengths(&layout, bytes, section::ROW_SCALES, "row scales", k)?;
+                let reaches = lengths(&layout, bytes, section::REACHES, "reaches", k)?;
+                let n_codes = n_with_evidence.div_ceil(BLOCK) * BLOCK * n_groups / 2;
+                let codes = layout.column::<u8>(section::CODES, "codes", n_codes)?;
+                Some([group_starts, words, row_scales, reaches, codes])
+            }
+        };
+        let exact = match layout.find(section::EMBEDDINGS) {
+            None => None,
+            Some(_) => {
+                let indices = layout.column::<u32>(section::INPUT_INDICES, "input indices", n)?;
+                Some([
+                    indices,
+                    halves(&layout, bytes, section::EMBEDDINGS, "embeddings", n_with_evidence * dim)?,
+                ])
+            }
+        };
+        let positions = match is_packed(&header) {
+            true => layout.column::<u32>(section::POSITIONS, "positions", n)?,
+            false => layout.column::<[u16; 3]>(section::POSITIONS, "positions", n)?,
+        };
+        Ok(Self { header, positions, row_starts, rows, radii, basis, residuals, exact })
+    }
+
+    /// Returns the columns of the bytes that were checked.
+    ///
+    /// # Panics
+    /// If `bytes` are other than those checked (shorter), or do not start at a 4-byte aligned address
+    /// (mapped files and [`container::AlignedBytes`] do).
+    pub fn view<'a>(&self, bytes: &'a [u8]) -> ShardView<'a> {
+        fn cast<'a, T: Pod>(bytes: &'a [u8], range: &Range<usize>) -> &'a [T] {
+            bytemuck::cast_slice(&bytes[range.clone()])
+        }
+        ShardView {
+            header: self.header,
+            positions: match is_packed(&self.header) {
+                true => Positions::Packed(cast(bytes, &self.positions)),
+                false => Positions::Wide(cast(bytes, &self.positions)),
+            },
+            row_starts: cast(bytes, &self.row_starts),
+            rows: cast(bytes, &self.rows),
+            radii: cast(bytes, &self.radii),
+            basis: self.basis.as_ref().map(|[mean, vectors, steps]| Basis {
+                mean: cast(bytes, mean),
+                vectors: cast(bytes, vectors),
+                steps: cast(bytes, steps),
+            }),
+            residuals: self.residuals.as_ref().map(|[group_starts, words, row_scales, reaches, codes]| {
+                Residuals {
+                    group_starts: cast(bytes, group_starts),
+                    words: cast(bytes, words),
+                    row_scales: cast(bytes, row_scales),
+                    reaches: cast(bytes, reaches),
+                    codes: &bytes[codes.clone()],
+                }
+            }),
+            exact: self.exact.as_ref().map(|[indices, embeddings]| ExactColumns {
+                input_indices: cast(bytes, indices),
+                embeddings: cast(bytes, embeddings),
+            }),
+        }
+    }
+}
+
+/// No vector here is longer: embeddings are of unit length, rows and residuals shorter than a few.
+const MAX_LENGTH: f32 = 64.0;
+
+fn damaged(offset: usize, what: String) -> ContainerError {
+    ContainerError::Damaged { offset_bytes: offset as u64, what }
+}
+
+fn is_packed(header: &ShardHeader) -> bool {
+    header.position_bits[..3] != [16; 3]
+}
+
+fn check_header(header: &ShardHeader) -> Result<(), String> {
+    let floats = [header.origin_in_world, header.position_step, header.box_min, header.box_max];
+    if floats.as_flattened().iter().any(|v| !v.is_finite()) || header.position_step.iter().any(|s| *s < 0.0) {
+        return Err("a coordinate of the header is not finite, or a step is negative".into());
+    }
+    if (0..3).any(|axis| header.box_min[axis] > header.box_max[axis]) {
+        return Err(format!("box {:?}..{:?} is empty", header.box_min, header.box_max));
+    }
+    let (n, k, dim, m) =
+        (header.n_gaussians, header.n_rows, header.dim as usize, header.n_components as usize);
+    if k > n || dim == 0 || dim > MAX_DIM || m > dim {
+        return Err(format!("{k} rows of {m} components of {dim} for {n} Gaussians"));
+    }
+    if header.n_groups as usize > MAX_GROUPS.min(m) || !header.n_groups.is_multiple_of(2) {
+        return Err(format!("{} groups of {m} components", header.n_groups));
+    }
+    let bits = header.position_bits;
+    if bits[3] != 0 || is_packed(header) && bits.iter().map(|b| u32::from(*b)).sum::<u32>() > 32 {
+        return Err(format!("positions of {bits:?} bits"));
+    }
+    let ScoreErrors { mean, p999, max, spread } = header.errors;
+    if [header.row_step, mean, p999, max, spread].iter().any(|v| !(0.0..=MAX_LENGTH).contains(v)) {
+        return Err("the rows' step or an error is not within 0..=64".into());
+    }
+    Ok(())
+}
+
+/// Returns where a column of lengths lies, which are finite and not negative.
+fn lengths(
+    layout: &Layout,
+    bytes: &[u8],
+    id: u32,
+    name: &'static str,
+    len: usize,
+) -> Result<Range<usize>, ContainerError> {
+    let range = layout.column::<f32>(id, name, len)?;
+    let values = bytes[range.clone()].chunks_exact(4);
+    let mut values = values.map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
+    if values.any(|v| !(0.0..=MAX_LENGTH).contains(&v)) {
+        return Err(damaged(range.start, format!("one of the {name} is not within 0..={MAX_LENGTH}")));
+    }
+    Ok(range)
+}
+
+/// Returns where a column of half floats lies, which are finite.
+fn halves(
+    layout: &Layout,
+    bytes: &[u8],
+    id: u32,
+    name: &'static str,
+    len: usize,
+) -> Result<Range<usize>, ContainerError> {
+    let range = layout.column::<f16>(id, name, len)?;
+    // Exponent bits all set is infinity or NaN (IEEE 754 binary16).
+    let is_finite = |b: &[u8]| u16::from_le_bytes([b[0], b[1]]) & 0x7c00 != 0x7c00;
+    if !bytes[range.clone()].chunks_exact(2).all(is_finite) {
+        return Err(damaged(range.start, format!("a number of the {name} is not finite")));
+    }
+    Ok(range)
 }
 
 #[cfg(test)]
@@ -296,30 +586,65 @@ mod tests {
     use super::*;
     use container::AlignedBytes;
 
-    fn parts_bytes(edit: impl FnOnce(&mut ShardHeader, &mut Vec<u32>, &mut Vec<f16>)) -> Vec<u8> {
-        let mut header = ShardHeader {
-            cell_id: 5,
-            n_gaussians: 6,
-            n_rows: 2,
-            dim: 3,
-            origin_in_world: [1e6, -2.0, 3.0],
-            position_step: [0.001, 0.002, 0.0],
-            box_min: [1e6 - 1.0, -3.0, 2.0],
-            box_max: [1e6 + 66.0, 130.0, 4.0],
-            encoder_id: [9; 32],
+    /// What a test edits before the shard is written.
+    struct Parts {
+        header: ShardHeader,
+        row_starts: Vec<u32>,
+        radii: Vec<f32>,
+        group_starts: Vec<u32>,
+        words: Vec<f16>,
+        mean: Vec<f16>,
+    }
+
+    /// Six Gaussians, five of them with evidence, in two rows; four dimensions, three components, two groups.
+    fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
+        let mut parts = Parts {
+            header: ShardHeader {
+                cell_id: 5,
+                n_gaussians: 6,
+                n_rows: 2,
+                dim: 4,
+                n_components: 3,
+                n_groups: 2,
+                position_bits: [11, 12, 9, 0],
+                row_step: 0.01,
+                origin_in_world: [1e6, -2.0, 3.0],
+                position_step: [0.001, 0.002, 0.0],
+                box_min: [1e6 - 1.0, -3.0, 2.0],
+                box_max: [1e6 + 66.0, 130.0, 4.0],
+                errors: ScoreErrors { mean: 0.01, p999: 0.1, max: 0.2, spread: 0.07 },
+                encoder_id: [9; 32],
+            },
+            row_starts: vec![0, 2, 5],
+            radii: vec![0.1, 0.2],
+            group_starts: vec![0, 1, 3],
+            words: (0..48).map(|i| f16::from_f32(i as f32 / 64.0)).collect(),
+            mean: [0.5, 0.25, 0.0, -0.5].map(f16::from_f32).to_vec(),
         };
-        let mut row_starts = vec![0, 2, 5];
-        let mut palette: Vec<f16> = [1.0, 0.0, 0.0, 0.0, 0.6, 0.8].map(f16::from_f32).to_vec();
-        edit(&mut header, &mut row_starts, &mut palette);
-        let embeddings: Vec<f16> = (0..15).map(|i| f16::from_f32(i as f32 / 16.0)).collect();
+        edit(&mut parts);
+        let mut codes = vec![0u8; BLOCK];
+        (0..5).for_each(|i| codes[i] = (i as u8 + 1) << 4 | (15 - i as u8));
+        let packed = [0, 1 | 2 << 11 | 3 << 23, u32::MAX, 4, 5, 6];
         let mut out = Vec::new();
-        ShardParts {
-            header,
-            positions: &[[0, 0, 0], [1, 2, 3], [65535, 65535, 65535], [4, 4, 4], [5, 5, 5], [6, 6, 6]],
-            row_starts: &row_starts,
-            palette: &palette,
-            radii: &[0.1, 0.2],
-            exact: Some((&[10, 11, 12, 13, 14, 15], &embeddings)),
+        ShardView {
+            header: parts.header,
+            positions: Positions::Packed(&packed),
+            row_starts: &parts.row_starts,
+            rows: &[1, 2, 3, -4, 5, -128],
+            radii: &parts.radii,
+            basis: Some(Basis {
+                mean: &parts.mean,
+                vectors: &[127, 0, 0, 0, 0, 127, 0, 0, 0, 64, -64, 0],
+                steps: &[0.01, 0.02, 0.03],
+            }),
+            residuals: Some(Residuals {
+                group_starts: &parts.group_starts,
+                words: &parts.words,
+                row_scales: &[0.5, 2.0],
+                reaches: &[1.0, 3.0],
+                codes: &codes,
+            }),
+            exact: None,
         }
         .write(&mut out)
         .expect("writes to memory");
@@ -328,29 +653,53 @@ mod tests {
 
     #[test]
     fn round_trip() {
-        let bytes = AlignedBytes::copy_of(&parts_bytes(|_, _, _| {}));
+        let bytes = AlignedBytes::copy_of(&written(|_| {}));
         let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
-        assert_eq!(shard.members(1), 2..5);
+        assert_eq!((shard.members(1), shard.row_of(1), shard.row_of(2), shard.row_of(4)), (2..5, 0, 1, 1));
         assert_eq!(shard.n_with_evidence(), 5);
         let p = shard.position_in_world(2);
-        assert!((p - DVec3::new(1e6 + 65.535, 129.07, 3.0)).length() < 1e-9, "{p}");
-        assert_eq!(shard.exact.expect("exact").input_indices[3], 13);
+        assert!((p - DVec3::new(1e6 + 2.047, -2.0 + 4095.0 * 0.002, 3.0)).length() < 1e-9, "{p}");
+        assert_eq!(shard.position_in_world(1), DVec3::new(1e6 + 0.001, -2.0 + 0.004, 3.0));
+        assert_eq!(shard.position_box().max, p);
+        // Worked out by hand: components of row 1, then code 13 of group 0 (word 13/64), code 3 of group 1
+        // (words (16 + 6)/64 and 23/64), doubled.
+        let mut decoded = [0.0; 4];
+        shard.decode(2, &mut decoded);
+        let c = [-0.04 + 2.0 * 13.0 / 64.0, 0.05 + 2.0 * 22.0 / 64.0, -1.28 + 2.0 * 23.0 / 64.0];
+        let expected =
+            [0.5 + c[0] * 1.27, 0.25 + c[1] * 2.54 + c[2] * 64.0 * 0.03, c[2] * -64.0 * 0.03, -0.5];
+        for (found, expected) in decoded.iter().zip(expected) {
+            assert!((found - expected).abs() < 1e-6, "{decoded:?} {expected:?}");
+        }
     }
 
     /// A hostile writer computes right checksums over wrong contents: each lie is refused.
     #[test]
     fn lies_are_refused() {
-        let refused = |edit: fn(&mut ShardHeader, &mut Vec<u32>, &mut Vec<f16>)| {
-            ShardLayout::check(&parts_bytes(edit)).expect_err("must be refused").to_string()
+        let refused = |edit: fn(&mut Parts)| {
+            ShardLayout::check(&written(edit)).expect_err("must be refused").to_string()
         };
-        assert!(refused(|h, _, _| h.n_gaussians = u32::MAX).contains("bytes"));
-        assert!(refused(|h, _, _| h.n_rows = 7).contains("rows"));
-        assert!(refused(|h, _, _| h.dim = 0).contains("components"));
-        assert!(refused(|h, _, _| h.dim = u32::MAX).contains("components"));
-        assert!(refused(|h, _, _| h.origin_in_world[1] = f64::NAN).contains("finite"));
-        assert!(refused(|h, _, _| h.box_max[0] = -1.0).contains("empty"));
-        assert!(refused(|_, starts, _| starts[1] = 9).contains("ascend"));
-        assert!(refused(|_, starts, _| starts[2] = 7).contains("ascend"));
-        assert!(refused(|_, _, palette| palette[4] = f16::INFINITY).contains("finite"));
+        assert!(refused(|p| p.header.n_gaussians = u32::MAX).contains("bytes"));
+        assert!(refused(|p| p.header.n_rows = 7).contains("rows"));
+        assert!(refused(|p| p.header.dim = 0).contains("components"));
+        assert!(refused(|p| p.header.dim = u32::MAX).contains("components"));
+        assert!(refused(|p| p.header.n_components = 5).contains("components"));
+        assert!(refused(|p| p.header.n_components = 2).contains("bytes"));
+        assert!(refused(|p| p.header.n_groups = 1).contains("groups"));
+        assert!(refused(|p| p.header.n_groups = u32::MAX).contains("groups"));
+        assert!(refused(|p| p.header.position_bits = [16; 4]).contains("positions"));
+        assert!(refused(|p| p.header.position_bits = [16, 16, 17, 0]).contains("positions"));
+        assert!(refused(|p| p.header.position_bits = [16, 16, 16, 0]).contains("positions"));
+        assert!(refused(|p| p.header.origin_in_world[1] = f64::NAN).contains("finite"));
+        assert!(refused(|p| p.header.box_max[0] = -1.0).contains("empty"));
+        assert!(refused(|p| p.header.row_step = f32::NAN).contains("step"));
+        assert!(refused(|p| p.header.errors.max = -1.0).contains("error"));
+        assert!(refused(|p| p.row_starts[1] = 9).contains("ascend"));
+        assert!(refused(|p| p.row_starts[2] = 7).contains("ascend"));
+        assert!(refused(|p| p.radii[1] = f32::INFINITY).contains("radii"));
+        assert!(refused(|p| p.group_starts[2] = 4).contains("ascend"));
+        assert!(refused(|p| p.group_starts[1] = 3).contains("ascend"));
+        assert!(refused(|p| p.words[4] = f16::INFINITY).contains("finite"));
+        assert!(refused(|p| p.mean[0] = f16::NAN).contains("finite"));
     }
 }

@@ -31,12 +31,17 @@ fn header_offsets_are_those_of_the_struct() {
     field!(n_gaussians, 4, "u32");
     field!(n_rows, 4, "u32");
     field!(dim, 4, "u32");
+    field!(n_components, 4, "u32");
+    field!(n_groups, 4, "u32");
+    field!(position_bits, 4, "u8 x 4");
+    field!(row_step, 4, "f32");
     field!(origin_in_world, 24, "f64 x 3");
     field!(position_step, 24, "f64 x 3");
     field!(box_min, 24, "f64 x 3");
     field!(box_max, 24, "f64 x 3");
+    field!(errors, 16, "f32 x 4");
     field!(encoder_id, 32, "bytes");
-    assert_eq!(size_of::<ShardHeader>(), 144, "a field is missing in FORMAT.md");
+    assert_eq!(size_of::<ShardHeader>(), 176, "a field is missing in FORMAT.md");
 }
 
 #[test]
@@ -45,10 +50,18 @@ fn sections_and_versions_are_those_of_the_code() {
         (section::HEADER, "header"),
         (section::POSITIONS, "positions"),
         (section::ROW_STARTS, "row_starts"),
-        (section::PALETTE, "palette"),
+        (section::ROWS, "rows"),
         (section::RADII, "radii"),
         (section::INPUT_INDICES, "input_indices"),
         (section::EMBEDDINGS, "embeddings"),
+        (section::MEAN, "mean"),
+        (section::BASIS, "basis"),
+        (section::BASIS_STEPS, "basis_steps"),
+        (section::GROUP_STARTS, "group_starts"),
+        (section::WORDS, "words"),
+        (section::ROW_SCALES, "row_scales"),
+        (section::REACHES, "reaches"),
+        (section::CODES, "codes"),
     ];
     for (id, name) in sections {
         assert!(has(&[&id.to_string(), name]), "section {id} {name}");
