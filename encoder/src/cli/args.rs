@@ -7,7 +7,10 @@ use std::str::FromStr;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
+use slag_common::shard::Profile;
+
 use crate::embed::Background;
+use crate::palette::PaletteSettings;
 use crate::raster::WeightKind;
 use crate::raster::devices::DeviceChoice;
 
@@ -171,12 +174,19 @@ pub struct EncodeArgs {
     /// Width of a cell at most, metres, in metric scenes.
     #[arg(long, value_name = "M", default_value_t = 25.0)]
     pub cell_width_m: f64,
-    /// Palette rows a cell at most.
-    #[arg(long, value_name = "N", default_value_t = 1024, value_parser = clap::value_parser!(u32).range(1..=65_536))]
-    pub palette_rows: u32,
-    /// Root-mean-square distance of embeddings from their palette row that is good enough.
-    #[arg(long, value_name = "R", default_value_t = 0.1)]
-    pub palette_rms: f32,
+    /// Which shards to make.
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', num_args = 1.., default_values_t = Profile::ALL)]
+    pub profiles: Vec<Profile>,
+    /// Error of scores that the compact profile may have: mean, relative to the spread of scores.
+    #[arg(long, value_name = "E", default_value_t = PaletteSettings::default().compact_error, value_parser = parse_error)]
+    pub compact_error: f32,
+    /// The same for the balanced profile.
+    #[arg(long, value_name = "E", default_value_t = PaletteSettings::default().balanced_error, value_parser = parse_error)]
+    pub balanced_error: f32,
+    /// Error of positions, world units [default: 0.01 in metric scenes, else a quarter of the size of a
+    /// cell's small Gaussians].
+    #[arg(long, value_name = "E")]
+    pub position_error: Option<f64>,
     /// Days after which robots refuse the manifest; never if absent.
     #[arg(long, value_name = "DAYS")]
     pub expires_days: Option<u32>,
@@ -496,5 +506,12 @@ mod tests {
                 && parse_bytes("-1").is_err()
                 && parse_bytes("GiB").is_err()
         );
+    }
+}
+
+fn parse_error(text: &str) -> Result<f32, String> {
+    match text.parse::<f32>() {
+        Ok(error) if error >= 0.0 && error.is_finite() => Ok(error),
+        _ => Err("a share of the spread of scores, such as 0.1".into()),
     }
 }

@@ -29,7 +29,9 @@ use crate::raster::devices::Devices;
 use crate::raster::gpu::{AdapterReport, GpuOptions, adapters};
 use crate::raster::simd::Level;
 use crate::raster::{CpuLevel, RasterView};
+use crate::shard::ShardSettings;
 use crate::shard::cells::CellLimits;
+use crate::shard::positions::PositionError;
 use crate::store::{Store, StoreReader};
 use crate::{generate, ingest, query};
 
@@ -196,7 +198,17 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             max_gaussians: args.cell_gaussians as usize,
             max_width: metric.then_some(args.cell_width_m),
         },
-        palette: PaletteSettings { max_rows: args.palette_rows as usize, max_rms: args.palette_rms },
+        shards: ShardSettings {
+            profiles: args.profiles.clone(),
+            palette: PaletteSettings {
+                compact_error: args.compact_error,
+                balanced_error: args.balanced_error,
+                ..PaletteSettings::default()
+            },
+            position_error: args
+                .position_error
+                .map_or_else(|| PositionError::default_for(metric), PositionError::Within),
+        },
         created_unix_secs,
         expires_unix_secs: args.expires_days.map(|days| created_unix_secs + u64::from(days) * 86_400),
     })

@@ -16,11 +16,15 @@ use slag_models::{ModelDir, SessionOptions};
 use crate::embed::Background;
 use crate::encode::{self, EncodeSettings, EncodeSummary, Masks};
 use crate::generate::{self, TrueObject};
+use slag_common::shard::Profile;
+
 use crate::palette::PaletteSettings;
 use crate::progress::Progress;
 use crate::publish::serve::{self, Limits};
 use crate::raster::{CpuRasterizer, WeightKind};
+use crate::shard::ShardSettings;
 use crate::shard::cells::CellLimits;
+use crate::shard::positions::PositionError;
 use crate::{query, store::StoreReader};
 
 /// Photos of the room.
@@ -188,7 +192,11 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         restart: false,
         // Small cells, so that the demo has several.
         cells: CellLimits { max_gaussians: 16_384, max_width: Some(25.0) },
-        palette: PaletteSettings::default(),
+        shards: ShardSettings {
+            profiles: Profile::ALL.to_vec(),
+            palette: PaletteSettings::default(),
+            position_error: PositionError::default_for(true),
+        },
         created_unix_secs: options.created_unix_secs,
         expires_unix_secs: None,
     };

@@ -4,15 +4,17 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use slag_common::manifest::{CellRecord, ShardRecord};
+use slag_common::shard::Profile;
 use slag_common::{Gaussians, Hash32};
 use slag_models::ModelDir;
 
 use super::{EncodeError, EncodeSettings, Stopwatch};
 use crate::lift::published::{EXTRA_REGIONS, extra_field};
 use crate::lift::{CellField, PartSums, RegionTable, SumsIndex};
+use crate::palette::{ScoreMetric, TextBank, Yardstick};
 use crate::progress::Progress;
 use crate::shard::cells::CellSplit;
-use crate::shard::{self, CellEmbeddings};
+use crate::shard::{self, BuiltShard, CellEmbeddings};
 use crate::store::{Extras, Store};
 
 /// Returns the bytes that the largest cell takes while it is built.
@@ -45,6 +47,8 @@ pub(super) struct CellBuilder<'a> {
     stopwatch: &'a Stopwatch,
     index: SumsIndex,
     table: RegionTable,
+    /// What errors of scores are measured by.
+    yardstick: Yardstick,
     /// Bytes there are for the sums of a group of cells.
     group_bytes: u64,
 }
@@ -68,6 +72,7 @@ impl<'a> CellBuilder<'a> {
         split: &'a CellSplit,
         sums_paths: &[PathBuf],
         models: &ModelDir,
+        bank: TextBank,
         stopwatch: &'a Stopwatch,
     ) -> Result<Self, EncodeError> {
         let n_gaussians: Vec<usize> = split.cells.iter().map(|cell| cell.gaussians.len()).collect();
@@ -80,7 +85,23 @@ impl<'a> CellBuilder<'a> {
             index.largest_part_bytes(),
         )?;
         let encoder_id = Hash32(models.encoder_id().hash());
-        Ok(Self { settings, store, scene, split, encoder_id, stopwatch, index, table, group_bytes })
+        let yardstick = stopwatch.time("texts", || {
+            let metric = ScoreMetric::new(models.dim(), &bank);
+            let spread = metric.spread(table.mask_vectors());
+            Yardstick { metric, bank, spread }
+        });
+        Ok(Self {
+            settings,
+            store,
+            scene,
+            split,
+            encoder_id,
+            stopwatch,
+            index,
+            table,
+            yardstick,
+            group_bytes,
+        })
     }
 
     pub(super) fn n_views_without_masks(&self) -> usize {
@@ -165,26 +186,23 @@ impl<'a> CellBuilder<'a> {
         built: &mut BuiltCells,
     ) -> Result<(), EncodeError> {
         let cell = &self.split.cells[cell_id as usize];
-        let (scene, palette) = (self.scene, &self.settings.palette);
-        let made = self
-            .stopwatch
-            .time("palette", || shard::build(scene, cell_id, cell, embeddings, self.encoder_id, palette));
-        let put = |bytes: &[u8]| self.stopwatch.time("write", || self.store.put_bytes(bytes));
-        let record = |bytes: &[u8]| -> Result<ShardRecord, EncodeError> {
-            let (hash, len_bytes) = put(bytes)?;
-            Ok(ShardRecord {
+        let (scene, encoder_id, settings) = (self.scene, self.encoder_id, &self.settings.shards);
+        let made = self.stopwatch.time("palette", || {
+            shard::build(scene, cell_id, cell, embeddings, encoder_id, &self.yardstick, settings)
+        });
+        let record = |shard: &BuiltShard| -> Result<(Profile, ShardRecord), EncodeError> {
+            let (hash, len_bytes) = self.stopwatch.time("write", || self.store.put_bytes(&shard.bytes))?;
+            let record = ShardRecord {
                 hash,
                 len_bytes,
                 n_rows: made.n_rows,
-                score_error_bound: made.score_error_bound,
+                score_error_bound: shard.score_error_bound,
+                score_errors: shard.score_errors,
                 position_error: made.position_error,
-            })
+            };
+            Ok((shard.profile, record))
         };
-        let shards = made
-            .shards
-            .iter()
-            .map(|(profile, bytes)| Ok((*profile, record(bytes)?)))
-            .collect::<Result<_, EncodeError>>()?;
+        let shards = made.shards.iter().map(record).collect::<Result<_, EncodeError>>()?;
         built.n_without_evidence += made.n_without_evidence as u64;
         built.records.push(CellRecord {
             cell_id,

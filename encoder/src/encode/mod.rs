@@ -26,6 +26,7 @@ use slag_models::{ModelDir, ModelError, SessionOptions};
 use crate::embed::EmbedError;
 use crate::ingest::{self, GeoError, IngestError};
 use crate::lift::SumsError;
+use crate::palette::TextBank;
 use crate::progress::Progress;
 use crate::raster::{RasterError, Rasterizer};
 use crate::segment::{GivenMasks, GraphSegmenter, SegmentError, Segmenter};
@@ -273,7 +274,14 @@ pub fn encode(
     }
 
     let sums_paths: Vec<PathBuf> = used.iter().map(|view| job.sums_path(&view.name)).collect();
-    let builder = CellBuilder::open(settings, &store, &scene, &split, &sums_paths, models, &stopwatch)?;
+    let bank = stopwatch.time("texts", || match models.text_encoder(session) {
+        Ok(mut encoder) => TextBank::of_model(&mut *encoder),
+        Err(e) => {
+            tracing::warn!("{e}; palettes take texts in all directions alike");
+            TextBank::directions(models.dim())
+        }
+    });
+    let builder = CellBuilder::open(settings, &store, &scene, &split, &sums_paths, models, bank, &stopwatch)?;
     let mut summary = EncodeSummary {
         generation: store.next_generation()?,
         n_gaussians: (scene.len() - split.n_rejected) as u64,

@@ -8,8 +8,8 @@ use slag_models::ModelDir;
 
 use super::EncodeError;
 use crate::embed::Background;
-use crate::palette::PaletteSettings;
 use crate::raster::WeightKind;
+use crate::shard::ShardSettings;
 use crate::shard::cells::CellLimits;
 
 /// Where masks come from.
@@ -65,8 +65,8 @@ pub struct EncodeSettings {
     pub restart: bool,
     /// How large a cell may become.
     pub cells: CellLimits,
-    /// How fine a palette is.
-    pub palette: PaletteSettings,
+    /// How fine shards are.
+    pub shards: ShardSettings,
     /// Creation time to sign, seconds since 1970.
     pub created_unix_secs: u64,
     /// Expiry to sign.

@@ -6,6 +6,7 @@
 use std::io::{self, Write};
 use std::ops::Range;
 
+use crate::palette::matrix::Rows;
 use rayon::prelude::*;
 use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
 
@@ -71,6 +72,11 @@ impl RegionTable {
             self.starts.push(self.masks.len() as u64);
         }
         first
+    }
+
+    /// Returns the masks' vectors, one a row.
+    pub fn mask_vectors(&self) -> Rows<'_> {
+        Rows::all(&self.mask_vectors, self.dim)
     }
 
     /// Returns the masks of a region.

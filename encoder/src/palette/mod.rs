@@ -1,289 +1,378 @@
-//! Stage 5: an error-bounded palette per cell.
+//! Stage 5: an error-bounded palette per cell, and a residual code where one row is not enough.
 //!
-//! Embeddings cluster strongly, so a cell stores K rows and each Gaussian the row it belongs to.
-//! Clusters are found in a random projection (Johnson and Lindenstrauss 1984: distances survive), by
-//! splitting the worst cluster in two until every cluster keeps the error budget or K reaches its
-//! limit, so K follows the cell's content. Row vectors and hard radii are then taken from the full
-//! embeddings.
+//! Embeddings cluster strongly, so a cell stores K rows and each Gaussian belongs to one. Rows, and what
+//! they leave, are kept in coordinates of the cell's own ([`frame`]), in which equal distances are equal
+//! errors of scores; K and the code's length follow from the errors asked for ([`cluster`], [`residual`]).
+//! Hard radii are taken from the full embeddings, and scores' errors measured over a bank of texts
+//! ([`measure`]).
+
+pub mod cluster;
+pub mod frame;
+pub mod matrix;
+pub mod measure;
+pub mod residual;
 
 use half::f16;
 use rayon::prelude::*;
+use slag_common::shard::{self, ScoreErrors};
 
-/// Components of the projection in which clusters are sought: the relative error of a distance is
-/// about sqrt(2 / 64) = 18 %, far below the factor between clusters worth separating.
-const PROJECTED_DIM: usize = 64;
-/// Rounds of 2-means when a cluster is split; the halves hardly move after the third.
-const SPLIT_ROUNDS: usize = 3;
-/// Rounds of k-means over all rows at the end.
-const REFINE_ROUNDS: usize = 2;
-/// Embeddings projected at a time by one thread.
-const CHUNK: usize = 256;
+use frame::Frame;
+pub use frame::{ScoreMetric, TextBank};
+use matrix::{Panels, Rows};
+use residual::ResidualCode;
 
-/// Bytes that building a palette takes for each embedding, at most: projection, members and codes.
-pub const WORKING_BYTES_PER_EMBEDDING: usize = (PROJECTED_DIM + 8) * size_of::<f32>();
+/// What a root mean square is to a mean of absolute errors, for a distribution with heavy tails: measured
+/// on the labelled house, 1.3 to 1.4; normally distributed errors have 1.25.
+const RMS_OF_MEAN: f32 = 1.35;
+/// Share of the residual code's error budget that the dimensions without a component may take.
+const TAIL_SHARE: f32 = 0.3;
+/// Embeddings whose decoded form is at hand at a time.
+const CHUNK: usize = 1024;
 
-/// How fine a palette is.
+/// Bytes that building a palette takes for each embedding, at most: components, residuals, codes.
+pub fn working_bytes_per_embedding(dim: usize) -> usize {
+    4 * dim.min(128) * size_of::<f32>() + 64
+}
+
+/// How fine a palette is. Errors are means of `|score error|`, relative to the spread of scores (their
+/// standard deviation over the scene).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PaletteSettings {
-    /// Rows at most.
-    pub max_rows: usize,
-    /// Root-mean-square distance of members from their row that is good enough.
-    pub max_rms: f32,
+    /// Error of the compact profile that is good enough.
+    pub compact_error: f32,
+    /// Error of the balanced profile that is good enough.
+    pub balanced_error: f32,
+    /// A row has so many Gaussians on average, or more.
+    pub min_gaussians_per_row: usize,
+    /// Half bytes of a residual code, at most.
+    pub max_groups: usize,
 }
 
 impl Default for PaletteSettings {
-    /// 1,024 rows kept the exact field's task accuracy on a labelled house of 105,000 Gaussians; a
-    /// residual of 0.1 moves a score by about 0.1 / sqrt(dim) times a few, below what masks disagree by.
+    /// On the labelled house, 0.1 keeps the exact field's task accuracy, and 0.03 its ranking (NUMERICS.md).
     fn default() -> Self {
-        Self { max_rows: 1024, max_rms: 0.1 }
+        Self { compact_error: 0.1, balanced_error: 0.025, min_gaussians_per_row: 40, max_groups: 32 }
     }
 }
 
-/// Rows of a cell and who belongs to them.
-#[derive(Clone, Debug, PartialEq)]
+/// What errors are measured by.
+pub struct Yardstick {
+    /// How far scores move.
+    pub metric: ScoreMetric,
+    /// Texts whose scores are compared.
+    pub bank: TextBank,
+    /// Spread of a text's scores over the scene, as far as it is known before.
+    pub spread: f32,
+}
+
+/// A cell's rows, and who belongs to them. Gaussians are in the order of the rows.
 pub struct Palette {
-    /// `[K][dim]`.
-    pub rows: Vec<f16>,
-    /// `[K]`: at least the largest distance of a member's embedding from the row as stored.
+    /// `[n]`: the given embeddings in the order of the rows, then as given.
+    pub order: Vec<u32>,
+    /// `[K + 1]`.
+    pub row_starts: Vec<u32>,
+    /// Components of a row, m.
+    pub n_components: usize,
+    /// `[dim]`.
+    pub mean: Vec<f16>,
+    /// `[m][dim]`.
+    pub basis: Vec<i8>,
+    /// `[m]`.
+    pub basis_steps: Vec<f32>,
+    /// `[K][m]`.
+    pub rows: Vec<i8>,
+    /// What the rows' components are multiplied by.
+    pub row_step: f32,
+    /// `[K]`: no member is farther from its row.
     pub radii: Vec<f32>,
-    /// `[n]`: row of each embedding.
-    pub codes: Vec<u32>,
+    /// Errors of the rows' scores.
+    pub errors: ScoreErrors,
+    /// What the rows leave; absent where they are enough.
+    pub residuals: Option<PaletteResiduals>,
 }
 
-/// Embeddings that can be read several times.
-pub trait EmbeddingSource: Sync {
-    /// Returns the number of embeddings.
-    fn len(&self) -> usize;
-    /// Returns whether there are none.
-    fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-    /// Returns the components of an embedding.
-    fn dim(&self) -> usize;
-    /// Writes embedding `index`, a unit vector, to `out` (`[dim]`).
-    fn embedding(&self, index: usize, out: &mut [f32]);
+/// The residual code of a palette.
+pub struct PaletteResiduals {
+    /// Groups and words.
+    pub code: ResidualCode,
+    /// `[K]`.
+    pub row_scales: Vec<f32>,
+    /// `[K]`.
+    pub reaches: Vec<f32>,
+    /// `[ceil(n / 32)][G / 2][32]`.
+    pub codes: Vec<u8>,
+    /// `[K]`: no member is farther from its decoded form.
+    pub radii: Vec<f32>,
+    /// Errors of the decoded scores.
+    pub errors: ScoreErrors,
 }
 
-/// Builds the palette of some embeddings. The result depends on them alone, not on threads.
-pub fn build(source: &impl EmbeddingSource, settings: &PaletteSettings) -> Palette {
-    let n = source.len();
-    if n == 0 {
-        return Palette { rows: Vec::new(), radii: Vec::new(), codes: Vec::new() };
-    }
-    let projected = Projected::new(source);
-    let mut clusters = split_clusters(&projected, settings);
-    let mut codes = vec![0u32; n];
-    for (row, cluster) in clusters.iter().enumerate() {
-        cluster.members.iter().for_each(|i| codes[*i as usize] = row as u32);
-    }
-    if clusters.len() > 1 {
-        for _ in 0..REFINE_ROUNDS {
-            codes = nearest_rows(&projected, &clusters);
-            clusters = regroup(&projected, &codes, clusters.len());
-        }
-        let mut used: Vec<u32> = vec![u32::MAX; clusters.len()];
-        let mut n_rows = 0;
-        for (row, cluster) in clusters.iter().enumerate() {
-            if !cluster.members.is_empty() {
-                used[row] = n_rows;
-                n_rows += 1;
-            }
-        }
-        codes.iter_mut().for_each(|code| *code = used[*code as usize]);
-        clusters.retain(|cluster| !cluster.members.is_empty());
-    }
-    let (rows, radii): (Vec<Vec<f16>>, Vec<f32>) =
-        clusters.par_iter().map(|cluster| row_and_radius(source, &cluster.members)).unzip();
-    Palette { rows: rows.concat(), radii, codes }
-}
+/// Builds the palette of some unit embeddings. The result depends on them and the yardstick alone, not on
+/// threads.
+pub fn build(embeddings: Rows<'_>, yardstick: &Yardstick, settings: &PaletteSettings) -> Palette {
+    let dim = embeddings.width;
+    let rms = |error: f32| error * RMS_OF_MEAN * yardstick.spread;
+    let mut frame = Frame::fit(embeddings, &yardstick.metric, TAIL_SHARE * rms(settings.balanced_error));
+    let m = frame.n_components;
+    let points = frame.components(embeddings);
+    let max_rows = (embeddings.len() / settings.min_gaussians_per_row.max(1)).max(1);
+    let found = cluster::clusters(Rows::all(&points, m), rms(settings.compact_error), max_rows);
+    let (order, row_starts) = sorted(&found.codes, found.centres.len() / m);
 
-/// Embeddings in the projection, `[n][width]`.
-struct Projected {
-    width: usize,
-    values: Vec<f32>,
-}
-
-impl Projected {
-    fn new(source: &impl EmbeddingSource) -> Self {
-        let dim = source.dim();
-        let width = dim.min(PROJECTED_DIM);
-        // Random signs (Achlioptas 2003), component-major so that the inner loop is contiguous.
-        let signs: Vec<f32> = (0..(dim * width) as u64)
-            .map(|i| if splitmix64(i) & 1 == 0 { 1.0 } else { -1.0 } / (width as f32).sqrt())
-            .collect();
-        let mut values = vec![0.0; source.len() * width];
-        values.par_chunks_mut(CHUNK * width).enumerate().for_each(|(chunk, out)| {
-            let mut embedding = vec![0.0; dim];
-            for (offset, target) in out.chunks_exact_mut(width).enumerate() {
-                source.embedding(chunk * CHUNK + offset, &mut embedding);
-                if width == dim {
-                    target.copy_from_slice(&embedding);
-                    continue;
-                }
-                for (component, value) in embedding.iter().enumerate() {
-                    let row = &signs[component * width..][..width];
-                    target.iter_mut().zip(row).for_each(|(t, s)| *t += value * s);
-                }
-            }
-        });
-        Self { width, values }
-    }
-
-    fn get(&self, index: u32) -> &[f32] {
-        &self.values[index as usize * self.width..][..self.width]
-    }
-}
-
-struct Cluster {
-    /// Ascending.
-    members: Vec<u32>,
-    centre: Vec<f32>,
-    /// Sum of squared distances of the members from the centre.
-    squared_error: f64,
-}
-
-impl Cluster {
-    fn new(projected: &Projected, members: Vec<u32>) -> Self {
-        let mut sum = vec![0.0f64; projected.width];
-        for i in &members {
-            sum.iter_mut().zip(projected.get(*i)).for_each(|(s, v)| *s += f64::from(*v));
-        }
-        let n = members.len().max(1) as f64;
-        let centre: Vec<f32> = sum.iter().map(|s| (s / n) as f32).collect();
-        let squared_error =
-            members.iter().map(|i| f64::from(squared_distance(projected.get(*i), &centre))).sum();
-        Self { members, centre, squared_error }
-    }
-
-    fn keeps(&self, max_rms: f32) -> bool {
-        self.members.len() < 2
-            || self.squared_error <= f64::from(max_rms) * f64::from(max_rms) * self.members.len() as f64
-    }
-}
-
-/// Splits the cluster with the largest squared error until all keep the budget or K is reached.
-fn split_clusters(projected: &Projected, settings: &PaletteSettings) -> Vec<Cluster> {
-    let n = projected.values.len() / projected.width;
-    let mut done = Vec::new();
-    let mut open = vec![Cluster::new(projected, (0..n as u32).collect())];
-    while !open.is_empty() && done.len() + open.len() < settings.max_rows {
-        // Ties by position: the order of `open` depends on the data alone.
-        let worst = (0..open.len())
-            .max_by(|a, b| open[*a].squared_error.total_cmp(&open[*b].squared_error))
-            .expect("open is not empty");
-        let cluster = open.swap_remove(worst);
-        if cluster.keeps(settings.max_rms) {
-            done.push(cluster);
-            continue;
-        }
-        match split_in_two(projected, &cluster) {
-            Some(halves) => open.extend(halves),
-            None => done.push(cluster),
-        }
-    }
-    done.extend(open);
-    done
-}
-
-/// 2-means, started from the member farthest from the centre and the one farthest from that;
-/// `None` where all members coincide.
-fn split_in_two(projected: &Projected, cluster: &Cluster) -> Option<[Cluster; 2]> {
-    let farthest = |from: &[f32]| {
-        let distance = |i: &u32| squared_distance(projected.get(*i), from);
-        let best = cluster.members.par_iter().map(|i| (distance(i), *i)).reduce_with(|a, b| {
-            match a.0.total_cmp(&b.0) {
-                std::cmp::Ordering::Less => b,
-                std::cmp::Ordering::Greater => a,
-                std::cmp::Ordering::Equal => {
-                    if a.1 < b.1 {
-                        a
-                    } else {
-                        b
-                    }
-                }
-            }
-        });
-        projected.get(best.expect("a cluster has members").1).to_vec()
+    // Turned so that components are the residuals' eigenvectors, each residual measured by its row's.
+    let mut residuals = points;
+    residuals.par_chunks_exact_mut(m).zip(&found.codes).for_each(|(point, row)| {
+        let centre = &found.centres[*row as usize * m..][..m];
+        point.iter_mut().zip(centre).for_each(|(p, c)| *p -= c);
+    });
+    let scales = row_scales(Rows { values: &residuals, width: m, index: Some(&order) }, &row_starts);
+    residuals.par_chunks_exact_mut(m).zip(&found.codes).for_each(|(residual, row)| {
+        let scale = scales[*row as usize].recip();
+        residual.iter_mut().for_each(|v| *v *= scale);
+    });
+    let (turn, variances) = residual::rotation(Rows::all(&residuals, m));
+    let turned =
+        |vectors: &[f32]| Panels::new(m, m, |old, new| turn[new * m + old]).product(Rows::all(vectors, m));
+    let residuals = turned(&residuals);
+    let scale_of: Vec<f32> = found.codes.iter().map(|row| scales[*row as usize]).collect();
+    let planned = residual::plan(
+        Rows::all(&residuals, m),
+        &scale_of,
+        &variances,
+        rms(settings.balanced_error),
+        settings.max_groups,
+    );
+    drop(residuals);
+    let components_in_order: Vec<usize> = match &planned {
+        Some((order, _)) => order.clone(),
+        None => (0..m).collect(),
     };
-    let first = farthest(&cluster.centre);
-    let second = farthest(&first);
-    let mut centres = [first, second];
-    let mut halves = None;
-    for _ in 0..SPLIT_ROUNDS {
-        let nearer_to_first = |i: &u32| {
-            let value = projected.get(*i);
-            squared_distance(value, &centres[0]) <= squared_distance(value, &centres[1])
-        };
-        let (a, b): (Vec<u32>, Vec<u32>) = cluster.members.iter().partition(|i| nearer_to_first(i));
-        if a.is_empty() || b.is_empty() {
-            break;
-        }
-        let pair = [Cluster::new(projected, a), Cluster::new(projected, b)];
-        centres = [pair[0].centre.clone(), pair[1].centre.clone()];
-        halves = Some(pair);
+    let turn: Vec<f32> = components_in_order.iter().flat_map(|c| &turn[c * m..][..m]).copied().collect();
+    frame.rotate(&turn);
+
+    // Rows in 8 bits: each component has a range of its own, which its basis vector takes on.
+    let centres = Panels::new(m, m, |old, new| turn[new * m + old]).product(Rows::all(&found.centres, m));
+    let ranges = ranges(&centres, m);
+    let row_step = 1.0 / 127.0;
+    let rows: Vec<i8> =
+        centres.iter().enumerate().map(|(at, v)| (v / ranges[at % m] * 127.0).round() as i8).collect();
+    let (mut basis, mut basis_steps) = (Vec::with_capacity(m * dim), Vec::with_capacity(m));
+    for (vector, range) in frame.basis.chunks_exact(dim).zip(&ranges) {
+        let scaled: Vec<f32> = vector.iter().map(|v| v * range).collect();
+        let (values, step) = shard::quantise(&scaled);
+        basis.extend(values);
+        basis_steps.push(step);
     }
-    halves
+    let decoder = Decoder { dim, m, mean: &frame.mean, basis: &basis, steps: &basis_steps };
+    let decoded_rows =
+        decoder.decode(&rows.iter().map(|v| f32::from(*v) * row_step).collect::<Vec<_>>(), true);
+
+    let measured = measure::Sample::new(embeddings, &order, &yardstick.bank);
+    let (radii, errors) = compare(embeddings, &order, &row_starts, &decoded_rows, None, &measured);
+    let residuals = planned.map(|(_, code)| {
+        let coded = coded(embeddings, &frame, &order, &row_starts, &decoded_rows, &scales);
+        let (codes, mut decoded) = code.encode(Rows::all(&coded, m));
+        let covered = code.n_components();
+        // In the rows' units, multiplied by the rows' scales: what a reader decodes.
+        let mut reaches = vec![0.0f32; scales.len()];
+        let mut words = code.words.clone();
+        for starts in code.group_starts.windows(2) {
+            let (from, to) = (starts[0] as usize, starts[1] as usize);
+            for (at, word) in words[shard::WORDS * from..shard::WORDS * to].iter_mut().enumerate() {
+                *word = f16::from_f32(word.to_f32() / ranges[from + at % (to - from)]);
+            }
+        }
+        for row in 0..scales.len() {
+            for at in row_starts[row] as usize..row_starts[row + 1] as usize {
+                let decoded = &mut decoded[at * covered..][..covered];
+                decoded.iter_mut().zip(&ranges).for_each(|(v, range)| {
+                    *v = f16::from_f32(*v / range).to_f32() * scales[row];
+                });
+                let length = decoded.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+                reaches[row] = reaches[row].max((length as f32).next_up());
+            }
+        }
+        let part =
+            Decoder { m: covered, basis: &basis[..covered * dim], steps: &basis_steps[..covered], ..decoder };
+        let (radii, errors) =
+            compare(embeddings, &order, &row_starts, &decoded_rows, Some((&part, &decoded)), &measured);
+        let code = ResidualCode { words, ..code };
+        PaletteResiduals { code, row_scales: scales, reaches, codes, radii, errors }
+    });
+    let Frame { mean, .. } = frame;
+    Palette {
+        order,
+        row_starts,
+        n_components: m,
+        mean,
+        basis,
+        basis_steps,
+        rows,
+        row_step,
+        radii,
+        errors,
+        residuals,
+    }
 }
 
-fn nearest_rows(projected: &Projected, clusters: &[Cluster]) -> Vec<u32> {
-    // ||v - c||² = ||v||² - 2 v·c + ||c||²; the first term is the same for all rows.
-    let half_norms: Vec<f32> =
-        clusters.iter().map(|c| crate::lift::dot(&c.centre, &c.centre) / 2.0).collect();
-    projected
-        .values
-        .par_chunks_exact(projected.width)
-        .map(|value| {
-            let score = |(row, cluster): (usize, &Cluster)| {
-                (crate::lift::dot(value, &cluster.centre) - half_norms[row], row as u32)
-            };
-            let best = clusters.iter().enumerate().map(score).reduce(|a, b| if b.0 > a.0 { b } else { a });
-            best.expect("there are clusters").1
+/// Returns the points ordered by row, and where the rows start.
+fn sorted(codes: &[u32], n_rows: usize) -> (Vec<u32>, Vec<u32>) {
+    let mut starts = vec![0u32; n_rows + 1];
+    codes.iter().for_each(|row| starts[*row as usize + 1] += 1);
+    (0..n_rows).for_each(|row| starts[row + 1] += starts[row]);
+    let mut next = starts.clone();
+    let mut order = vec![0; codes.len()];
+    for (point, row) in codes.iter().enumerate() {
+        order[next[*row as usize] as usize] = point as u32;
+        next[*row as usize] += 1;
+    }
+    (order, starts)
+}
+
+/// Returns the root mean square of each row's residuals.
+fn row_scales(residuals: Rows<'_>, row_starts: &[u32]) -> Vec<f32> {
+    row_starts
+        .par_windows(2)
+        .map(|members| {
+            let squares = |at: usize| residuals.get(at).iter().map(|v| f64::from(v * v)).sum::<f64>();
+            let members = members[0] as usize..members[1] as usize;
+            let n = members.len() as f64;
+            // Where all members coincide there is nothing to code; a division by zero is avoided.
+            ((members.map(squares).sum::<f64>() / n).sqrt() as f32).max(1e-6)
         })
         .collect()
 }
 
-fn regroup(projected: &Projected, codes: &[u32], n_rows: usize) -> Vec<Cluster> {
-    let mut members = vec![Vec::new(); n_rows];
-    codes.iter().enumerate().for_each(|(i, code)| members[*code as usize].push(i as u32));
-    members.into_par_iter().map(|members| Cluster::new(projected, members)).collect()
+/// Returns the largest absolute value of each component, or 1 where it is nothing.
+fn ranges(centres: &[f32], m: usize) -> Vec<f32> {
+    let mut ranges = vec![0.0f32; m];
+    for centre in centres.chunks_exact(m) {
+        ranges.iter_mut().zip(centre).for_each(|(range, v)| *range = range.max(v.abs()));
+    }
+    let largest = ranges.iter().copied().fold(0.0, f32::max);
+    // A component that no row has is still one of residuals: it keeps a range that eight bits can hold.
+    let least = if largest > 0.0 { largest / 256.0 } else { 1.0 };
+    ranges.into_iter().map(|range| range.max(least)).collect()
 }
 
-/// Returns the mean of the members' embeddings as stored, and their largest distance from it.
-fn row_and_radius(source: &impl EmbeddingSource, members: &[u32]) -> (Vec<f16>, f32) {
-    let mut sum = vec![0.0f64; source.dim()];
-    let mut embedding = vec![0.0; source.dim()];
-    for i in members {
-        source.embedding(*i as usize, &mut embedding);
-        sum.iter_mut().zip(&embedding).for_each(|(s, v)| *s += f64::from(*v));
-    }
-    let row: Vec<f16> = sum.iter().map(|s| f16::from_f64(s / members.len() as f64)).collect();
-    let decoded: Vec<f32> = row.iter().map(|c| c.to_f32()).collect();
-    let mut largest = 0.0f32;
-    for i in members {
-        source.embedding(*i as usize, &mut embedding);
-        largest = largest.max(squared_distance(&embedding, &decoded));
-    }
-    // Rounding of the sum over dim components stays below dim * 2^-24 of it; the bound must hold.
-    let slack = 1.0 + source.dim() as f32 * f32::EPSILON;
-    (row, (largest.sqrt() * slack).next_up())
+/// Turns components into vectors, as readers do.
+#[derive(Clone, Copy)]
+struct Decoder<'a> {
+    dim: usize,
+    m: usize,
+    mean: &'a [f16],
+    basis: &'a [i8],
+    steps: &'a [f32],
 }
 
-fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
-    let mut lanes = [0.0f32; 16];
-    let (a_blocks, a_rest) = a.as_chunks::<16>();
-    let (b_blocks, b_rest) = b.as_chunks::<16>();
-    for (x, y) in a_blocks.iter().zip(b_blocks) {
-        for lane in 0..16 {
-            let d = x[lane] - y[lane];
-            lanes[lane] += d * d;
+impl Decoder<'_> {
+    /// Returns `[n][dim]` of components `[n][m]`.
+    fn decode(&self, components: &[f32], with_mean: bool) -> Vec<f32> {
+        let mut out = self.panels().product(Rows::all(components, self.m));
+        if with_mean {
+            for vector in out.chunks_exact_mut(self.dim) {
+                vector.iter_mut().zip(self.mean).for_each(|(v, mean)| *v += mean.to_f32());
+            }
+        }
+        out
+    }
+
+    fn panels(&self) -> Panels {
+        Panels::new(self.m, self.dim, |c, i| f32::from(self.basis[c * self.dim + i]) * self.steps[c])
+    }
+
+    /// Returns the length of each basis vector.
+    fn lengths(&self) -> Vec<f32> {
+        let length = |(vector, step): (&[i8], &f32)| {
+            vector.iter().map(|v| f32::from(*v).powi(2)).sum::<f32>().sqrt() * step
+        };
+        self.basis.chunks_exact(self.dim).zip(self.steps).map(length).collect()
+    }
+}
+
+/// Returns what the rows as stored leave of each embedding, in shard order, divided by the rows' scales.
+fn coded(
+    embeddings: Rows<'_>,
+    frame: &Frame,
+    order: &[u32],
+    row_starts: &[u32],
+    decoded_rows: &[f32],
+    scales: &[f32],
+) -> Vec<f32> {
+    let (m, dim) = (frame.n_components, embeddings.width);
+    let in_order: Vec<u32> =
+        order.iter().map(|at| embeddings.index.map_or(*at, |index| index[*at as usize])).collect();
+    let mut points = frame.components(Rows { index: Some(&in_order), ..embeddings });
+    let rows = frame.components(Rows::all(decoded_rows, dim));
+    for (row, members) in row_starts.windows(2).enumerate() {
+        let scale = scales[row].recip();
+        for point in points[members[0] as usize * m..members[1] as usize * m].chunks_exact_mut(m) {
+            point.iter_mut().zip(&rows[row * m..]).for_each(|(p, r)| *p = (*p - r) * scale);
         }
     }
-    let rest: f32 = a_rest.iter().zip(b_rest).map(|(x, y)| (x - y) * (x - y)).sum();
-    lanes.iter().sum::<f32>() + rest
+    points
+}
+
+/// Returns for each row the largest distance of a member from its decoded form, and the errors of the decoded
+/// scores. `residuals`: components, in shard order, to add to the rows.
+fn compare(
+    embeddings: Rows<'_>,
+    order: &[u32],
+    row_starts: &[u32],
+    decoded_rows: &[f32],
+    residuals: Option<(&Decoder<'_>, &[f32])>,
+    sample: &measure::Sample<'_>,
+) -> (Vec<f32>, ScoreErrors) {
+    let dim = embeddings.width;
+    let added =
+        residuals.map(|(decoder, components)| (decoder.panels(), decoder.lengths(), decoder.m, components));
+    let chunks: Vec<(Vec<f32>, Vec<f32>)> = (0..order.len().div_ceil(CHUNK))
+        .into_par_iter()
+        .map(|chunk| {
+            let places = chunk * CHUNK..order.len().min((chunk + 1) * CHUNK);
+            let mut decoded = match &added {
+                Some((panels, _, m, components)) => {
+                    panels.product(Rows::all(&components[places.start * m..places.end * m], *m))
+                }
+                None => vec![0.0; places.len() * dim],
+            };
+            let mut row = row_starts.partition_point(|start| *start as usize <= places.start) - 1;
+            let mut distances = Vec::with_capacity(places.len());
+            let mut missed = Vec::new();
+            for (place, decoded) in places.zip(decoded.chunks_exact_mut(dim)) {
+                while row_starts[row + 1] as usize <= place {
+                    row += 1;
+                }
+                let embedding = embeddings.get(order[place] as usize);
+                let of_row = &decoded_rows[row * dim..][..dim];
+                for ((d, r), e) in decoded.iter_mut().zip(of_row).zip(embedding) {
+                    *d = e - (r + *d);
+                }
+                // What the products' rounding may have added: their terms' sizes times the steps of a sum.
+                let rounding = added.as_ref().map_or(0.0, |(_, lengths, m, components)| {
+                    let terms = components[place * m..][..*m].iter().zip(lengths).map(|(c, l)| c.abs() * l);
+                    terms.sum::<f32>() * (*m as f32 + 4.0) * f32::EPSILON
+                });
+                let slack = 1.0 + dim as f32 * f32::EPSILON;
+                let length = crate::lift::dot(decoded, decoded).sqrt();
+                distances.push((length * slack + rounding + 2.0 * f32::EPSILON).next_up());
+                if sample.has(place) {
+                    missed.extend_from_slice(decoded);
+                }
+            }
+            (distances, missed)
+        })
+        .collect();
+    let distances: Vec<f32> = chunks.iter().flat_map(|(distances, _)| distances).copied().collect();
+    let missed: Vec<f32> = chunks.into_iter().flat_map(|(_, missed)| missed).collect();
+    let radius = |members: &[u32]| {
+        distances[members[0] as usize..members[1] as usize].iter().copied().fold(0.0, f32::max)
+    };
+    (row_starts.windows(2).map(radius).collect(), sample.errors(&missed))
 }
 
 /// A well-mixed 64-bit value of an index (Steele, Lea and Flood 2014).
-fn splitmix64(index: u64) -> u64 {
+pub(crate) fn splitmix64(index: u64) -> u64 {
     let mut z = index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
     z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
@@ -291,87 +380,4 @@ fn splitmix64(index: u64) -> u64 {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    struct Rows {
-        dim: usize,
-        values: Vec<f32>,
-    }
-
-    impl EmbeddingSource for Rows {
-        fn len(&self) -> usize {
-            self.values.len() / self.dim
-        }
-        fn dim(&self) -> usize {
-            self.dim
-        }
-        fn embedding(&self, index: usize, out: &mut [f32]) {
-            out.copy_from_slice(&self.values[index * self.dim..][..self.dim]);
-        }
-    }
-
-    /// `n` unit vectors around `n_centres` random directions.
-    fn clustered(n: usize, n_centres: usize, dim: usize, spread: f32) -> Rows {
-        let uniform = |i: u64| (splitmix64(i) >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
-        let mut values = Vec::new();
-        for i in 0..n {
-            let centre = (splitmix64(i as u64 + 7) % n_centres as u64) * 1_000_003;
-            let raw: Vec<f32> = (0..dim as u64)
-                .map(|c| uniform(centre + c) + spread * uniform(1 << 40 | (i as u64) << 16 | c))
-                .collect();
-            let length = crate::lift::dot(&raw, &raw).sqrt();
-            values.extend(raw.iter().map(|v| v / length));
-        }
-        Rows { dim, values }
-    }
-
-    /// Oracle: distances in float64. The radius bounds every member, and is not much larger.
-    #[test]
-    fn radii_bound_every_member() {
-        for (dim, n) in [(512, 700), (16, 500), (3, 1)] {
-            let source = clustered(n, 20, dim, 0.3);
-            let palette = build(&source, &PaletteSettings { max_rows: 40, max_rms: 0.05 });
-            let mut largest = vec![0.0f64; palette.radii.len()];
-            for i in 0..n {
-                let row = palette.codes[i] as usize;
-                let d2: f64 = (0..dim)
-                    .map(|c| f64::from(source.values[i * dim + c]) - palette.rows[row * dim + c].to_f64())
-                    .map(|d| d * d)
-                    .sum();
-                largest[row] = largest[row].max(d2.sqrt());
-            }
-            for (radius, largest) in palette.radii.iter().zip(&largest) {
-                assert!(f64::from(*radius) >= *largest, "{radius} < {largest}");
-                assert!(f64::from(*radius) <= largest * 1.001 + 1e-6, "{radius} far above {largest}");
-            }
-        }
-    }
-
-    #[test]
-    fn rows_follow_the_content_not_the_count() {
-        let few = build(&clustered(5000, 4, 128, 0.02), &PaletteSettings::default());
-        let many = build(&clustered(5000, 300, 128, 0.02), &PaletteSettings::default());
-        assert_eq!(few.radii.len(), 4);
-        // A split may cut through a cluster, which the budget then does not undo.
-        assert!((300..=330).contains(&many.radii.len()), "{} rows for 300 clusters", many.radii.len());
-    }
-
-    #[test]
-    fn same_bytes_for_any_number_of_threads() {
-        let source = clustered(3000, 50, 64, 0.5);
-        let with = |threads| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("starts");
-            pool.install(|| build(&source, &PaletteSettings { max_rows: 64, max_rms: 0.01 }))
-        };
-        assert_eq!(with(1), with(3));
-    }
-
-    #[test]
-    fn equal_embeddings_make_one_row_and_none_makes_none() {
-        let same = Rows { dim: 4, values: [0.5f32; 400].to_vec() };
-        assert_eq!(build(&same, &PaletteSettings { max_rows: 9, max_rms: 0.0 }).radii.len(), 1);
-        let none = Rows { dim: 4, values: Vec::new() };
-        assert!(build(&none, &PaletteSettings::default()).radii.is_empty());
-    }
-}
+mod tests;

@@ -1,28 +1,54 @@
 //! Stage 6: a cell's field becomes its shards.
 
 pub mod cells;
+pub mod positions;
 
 use half::f16;
 use rayon::prelude::*;
 use slag_common::Gaussians;
 use slag_common::hash::Hash32;
-use slag_common::shard::{Profile, ShardHeader, ShardParts};
+use slag_common::shard::{Basis, ExactColumns, Profile, Residuals, ScoreErrors, ShardHeader, ShardView};
 
-use crate::palette::{self, EmbeddingSource, PaletteSettings};
+use crate::palette::matrix::Rows;
+use crate::palette::{self, PaletteSettings, Yardstick};
 use cells::Cell;
+use positions::{PositionError, QuantisedPositions};
 
-/// A cell's shards as bytes, with what the manifest says of them.
+/// A cell's shard as bytes, with what the manifest says of it.
+pub struct BuiltShard {
+    /// How much it carries.
+    pub profile: Profile,
+    /// The file.
+    pub bytes: Vec<u8>,
+    /// No score is off by more.
+    pub score_error_bound: f32,
+    /// Errors of scores, measured.
+    pub score_errors: ScoreErrors,
+}
+
+/// A cell's shards.
 pub struct BuiltCell {
-    /// The bytes of each profile.
-    pub shards: Vec<(Profile, Vec<u8>)>,
+    /// One a profile.
+    pub shards: Vec<BuiltShard>,
     /// Palette rows.
     pub n_rows: u32,
-    /// Largest row radius.
-    pub score_error_bound: f32,
+    /// Half bytes of the residual code.
+    pub n_groups: u32,
     /// Largest error of a position, world units.
     pub position_error: f64,
     /// Gaussians without an embedding.
     pub n_without_evidence: usize,
+}
+
+/// Which shards are made, and how fine they are.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ShardSettings {
+    /// Which.
+    pub profiles: Vec<Profile>,
+    /// Of embeddings.
+    pub palette: PaletteSettings,
+    /// Of positions.
+    pub position_error: PositionError,
 }
 
 /// The embeddings of a cell's Gaussians.
@@ -35,35 +61,11 @@ pub struct CellEmbeddings {
     pub has_evidence: Vec<bool>,
 }
 
-impl CellEmbeddings {
-    fn get(&self, local: u32) -> &[f32] {
-        &self.vectors[local as usize * self.dim..][..self.dim]
-    }
-}
-
-/// Returns the bytes that a cell of `n_gaussians` takes while its shards are built: embeddings in f32,
-/// in f16 and in the shard, their projection for the palette, and the palette's lists.
+/// Returns the bytes that a cell of `n_gaussians` takes while its shards are built: embeddings in f32, in f16
+/// and in the shard, and what the palette needs.
 pub fn working_bytes(n_gaussians: usize, dim: usize) -> u64 {
     let per_component = size_of::<f32>() + 2 * size_of::<f16>();
-    (n_gaussians * (dim * per_component + palette::WORKING_BYTES_PER_EMBEDDING)) as u64
-}
-
-struct WithEvidence<'a> {
-    embeddings: &'a CellEmbeddings,
-    /// Locals of the Gaussians that have an embedding.
-    locals: &'a [u32],
-}
-
-impl EmbeddingSource for WithEvidence<'_> {
-    fn len(&self) -> usize {
-        self.locals.len()
-    }
-    fn dim(&self) -> usize {
-        self.embeddings.dim
-    }
-    fn embedding(&self, index: usize, out: &mut [f32]) {
-        out.copy_from_slice(self.embeddings.get(self.locals[index]));
-    }
+    (n_gaussians * (dim * per_component + palette::working_bytes_per_embedding(dim))) as u64
 }
 
 /// Builds a cell's shards.
@@ -73,72 +75,94 @@ pub fn build(
     cell: &Cell,
     embeddings: &CellEmbeddings,
     encoder_id: Hash32,
-    settings: &PaletteSettings,
+    yardstick: &Yardstick,
+    settings: &ShardSettings,
 ) -> BuiltCell {
-    let (mut locals, without): (Vec<u32>, Vec<u32>) =
+    let dim = embeddings.dim;
+    let (with, without): (Vec<u32>, Vec<u32>) =
         (0..cell.gaussians.len() as u32).partition(|local| embeddings.has_evidence[*local as usize]);
-    let palette = palette::build(&WithEvidence { embeddings, locals: &locals }, settings);
-    let n_rows = palette.radii.len();
-
+    let rows = Rows { values: &embeddings.vectors, width: dim, index: Some(&with) };
+    let palette = palette::build(rows, yardstick, &settings.palette);
+    let n_with = with.len();
     // Shard order: by row, then along the Morton curve, which is the order of locals.
-    let mut row_starts = vec![0u32; n_rows + 1];
-    palette.codes.iter().for_each(|row| row_starts[*row as usize + 1] += 1);
-    (0..n_rows).for_each(|row| row_starts[row + 1] += row_starts[row]);
-    let mut keyed: Vec<(u32, u32)> = palette.codes.iter().copied().zip(locals.iter().copied()).collect();
-    keyed.sort_unstable();
-    locals = keyed.into_iter().map(|(_, local)| local).chain(without.iter().copied()).collect();
+    let in_order = palette.order.iter().map(|at| with[*at as usize]);
+    let locals: Vec<u32> = in_order.chain(without.iter().copied()).collect();
 
-    let origin = cell.mean_bounds.min;
-    let position_step = (cell.mean_bounds.size() / f64::from(u16::MAX)).to_array();
-    let positions: Vec<[u16; 3]> = locals
-        .iter()
-        .map(|local| {
-            let offset = scene.means_in_world[cell.gaussians[*local as usize] as usize] - origin;
-            // A flat axis has step 0 and every offset 0.
-            std::array::from_fn(|a| {
-                if position_step[a] > 0.0 { (offset[a] / position_step[a]).round() as u16 } else { 0 }
-            })
-        })
-        .collect();
+    let positions = QuantisedPositions::new(scene, cell, &locals, settings.position_error);
     let header = ShardHeader {
         cell_id,
         n_gaussians: locals.len() as u32,
-        n_rows: n_rows as u32,
-        dim: embeddings.dim as u32,
-        origin_in_world: origin.to_array(),
-        position_step,
+        n_rows: palette.radii.len() as u32,
+        dim: dim as u32,
+        n_components: palette.n_components as u32,
+        n_groups: 0,
+        position_bits: positions.bits,
+        row_step: palette.row_step,
+        origin_in_world: cell.mean_bounds.min.to_array(),
+        position_step: positions.step,
         box_min: cell.bounds.min.to_array(),
         box_max: cell.bounds.max.to_array(),
+        errors: palette.errors,
         encoder_id: encoder_id.0,
     };
-    let input_indices: Vec<u32> = locals.iter().map(|local| cell.gaussians[*local as usize]).collect();
-    let n_with = locals.len() - without.len();
-    let dim = embeddings.dim;
-    let mut exact = vec![f16::ZERO; n_with * dim];
-    exact.par_chunks_exact_mut(dim).zip(&locals[..n_with]).for_each(|(out, local)| {
-        out.iter_mut().zip(embeddings.get(*local)).for_each(|(o, v)| *o = f16::from_f32(*v));
+    let compact = ShardView {
+        header,
+        positions: positions.view(),
+        row_starts: &palette.row_starts,
+        rows: &palette.rows,
+        radii: &palette.radii,
+        basis: Some(Basis { mean: &palette.mean, vectors: &palette.basis, steps: &palette.basis_steps }),
+        residuals: None,
+        exact: None,
+    };
+    let balanced = palette.residuals.as_ref().map_or(compact, |residuals| ShardView {
+        header: ShardHeader {
+            n_groups: residuals.code.n_groups() as u32,
+            errors: residuals.errors,
+            ..header
+        },
+        radii: &residuals.radii,
+        residuals: Some(Residuals {
+            group_starts: &residuals.code.group_starts,
+            words: &residuals.code.words,
+            row_scales: &residuals.row_scales,
+            reaches: &residuals.reaches,
+            codes: &residuals.codes,
+        }),
+        ..compact
     });
-    let shards = Profile::ALL
-        .into_iter()
-        .map(|profile| {
-            let parts = ShardParts {
-                header,
-                positions: &positions,
-                row_starts: &row_starts,
-                palette: &palette.rows,
-                radii: &palette.radii,
-                exact: (profile == Profile::Exact).then_some((&input_indices, &exact)),
-            };
-            let mut bytes = Vec::new();
-            parts.write(&mut bytes).expect("writing to memory cannot fail");
-            (profile, bytes)
-        })
-        .collect();
+    let largest = |radii: &[f32]| radii.iter().copied().fold(0.0, f32::max);
+    let built = |profile, view: &ShardView<'_>| {
+        let mut bytes = Vec::new();
+        view.write(&mut bytes).expect("writing to memory cannot fail");
+        let score_error_bound = if profile == Profile::Exact { F16_ROUNDING } else { largest(view.radii) };
+        BuiltShard { profile, bytes, score_error_bound, score_errors: view.header.errors }
+    };
+    let shards = Profile::ALL.into_iter().filter(|profile| settings.profiles.contains(profile));
+    let shards = shards.map(|profile| match profile {
+        Profile::Compact => built(profile, &compact),
+        Profile::Balanced => built(profile, &balanced),
+        Profile::Exact => {
+            let input_indices: Vec<u32> =
+                locals.iter().map(|local| cell.gaussians[*local as usize]).collect();
+            let mut halves = vec![f16::ZERO; n_with * dim];
+            halves.par_chunks_exact_mut(dim).zip(&locals[..n_with]).for_each(|(out, local)| {
+                let embedding = &embeddings.vectors[*local as usize * dim..][..dim];
+                out.iter_mut().zip(embedding).for_each(|(o, v)| *o = f16::from_f32(*v));
+            });
+            let errors = ScoreErrors { spread: palette.errors.spread, ..ScoreErrors::default() };
+            let exact = Some(ExactColumns { input_indices: &input_indices, embeddings: &halves });
+            built(profile, &ShardView { header: ShardHeader { errors, ..header }, exact, ..compact })
+        }
+    });
     BuiltCell {
-        shards,
-        n_rows: n_rows as u32,
-        score_error_bound: palette.radii.iter().copied().fold(0.0, f32::max),
-        position_error: position_step.into_iter().fold(0.0, f64::max) / 2.0,
+        shards: shards.collect(),
+        n_rows: header.n_rows,
+        n_groups: balanced.header.n_groups,
+        position_error: positions.step.into_iter().fold(0.0, f64::max) / 2.0,
         n_without_evidence: without.len(),
     }
 }
+
+/// Half a step of f16 at 1: how far an embedding may lie from its f16 form.
+const F16_ROUNDING: f32 = 1.0 / 2048.0;

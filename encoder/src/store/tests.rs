@@ -40,7 +40,14 @@ pub(crate) fn manifest(generation: u64, objects: &[(Hash32, u64)]) -> Manifest {
     let boxes: Vec<Aabb> = (0..objects.len()).map(unit_box).collect();
     let mut manifest = Manifest { generation, ..manifest_of_boxes(&boxes) };
     for (cell, &(hash, len_bytes)) in manifest.cells.iter_mut().zip(objects) {
-        let record = ShardRecord { hash, len_bytes, n_rows: 1, score_error_bound: 0.0, position_error: 0.0 };
+        let record = ShardRecord {
+            hash,
+            len_bytes,
+            n_rows: 1,
+            score_error_bound: 0.0,
+            score_errors: Default::default(),
+            position_error: 0.0,
+        };
         cell.shards.insert(Profile::Compact, record);
     }
     manifest

@@ -7,7 +7,7 @@ use half::f16;
 use qdrant_client::qdrant::{SearchPointsBuilder, point_id::PointIdOptions, value::Kind};
 use slag_common::frames::{Aabb, GeoReference, Geographic};
 use slag_common::manifest::ShardRecord;
-use slag_common::shard::{Profile, ShardHeader, ShardParts};
+use slag_common::shard::{ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardView};
 
 use super::*;
 use crate::store::tests::manifest_of_boxes;
@@ -86,6 +86,11 @@ impl Fixture {
                 n_gaussians,
                 n_rows,
                 dim: DIM as u32,
+                n_components: DIM as u32,
+                n_groups: 0,
+                position_bits: [16, 16, 16, 0],
+                row_step: 1.0 / 127.0,
+                errors: ScoreErrors::default(),
                 origin_in_world: cell.bounds.min.to_array(),
                 position_step: [90.0 / 65535.0; 3],
                 box_min: cell.bounds.min.to_array(),
@@ -98,17 +103,25 @@ impl Fixture {
                 let embedding = embeddings[i * DIM..(i + 1) * DIM].to_vec();
                 self.truth.insert(u64::from(ids[i]), (mean, embedding, cell.cell_id));
             }
-            let parts = ShardParts {
+            let parts = ShardView {
                 header,
-                positions: &positions,
+                positions: Positions::Wide(&positions),
                 row_starts,
-                palette: &vec![f16::ONE; n_rows as usize * DIM],
+                rows: &vec![127; n_rows as usize * DIM],
                 radii: &vec![1.0; n_rows as usize],
-                exact: Some((&ids, &embeddings)),
+                basis: None,
+                residuals: None,
+                exact: Some(ExactColumns { input_indices: &ids, embeddings: &embeddings }),
             };
             let (hash, len_bytes) = self.store.put_object(|out| parts.write(out)).expect("room");
-            let record =
-                ShardRecord { hash, len_bytes, n_rows, score_error_bound: 1.0, position_error: 1e-3 };
+            let record = ShardRecord {
+                hash,
+                len_bytes,
+                n_rows,
+                score_error_bound: 1.0,
+                score_errors: ScoreErrors::default(),
+                position_error: 1e-3,
+            };
             cell.n_gaussians = n_gaussians;
             cell.shards.insert(Profile::Exact, record);
         }

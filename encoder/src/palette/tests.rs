@@ -1,0 +1,195 @@
+use slag_common::container::AlignedBytes;
+use slag_common::shard::{Basis, Positions, Residuals, ShardHeader, ShardLayout, ShardView};
+
+use super::*;
+
+/// `n` unit vectors around `n_centres` random directions of few dimensions.
+fn clustered(n: usize, n_centres: usize, dim: usize, spread: f32) -> Vec<f32> {
+    let uniform = |i: u64| (splitmix64(i) >> 40) as f32 / (1u64 << 23) as f32 - 1.0;
+    let mut values = Vec::new();
+    for i in 0..n {
+        let centre = (splitmix64(i as u64 + 7) % n_centres as u64) * 1_000_003;
+        let raw: Vec<f32> = (0..dim as u64)
+            .map(|c| uniform(centre + c) + spread * uniform(1 << 40 | (i as u64) << 16 | c))
+            .collect();
+        let length = crate::lift::dot(&raw, &raw).sqrt();
+        values.extend(raw.iter().map(|v| v / length));
+    }
+    values
+}
+
+fn yardstick(dim: usize, vectors: &[f32]) -> Yardstick {
+    let bank = TextBank::directions(dim);
+    let metric = ScoreMetric::new(dim, &bank);
+    let spread = metric.spread(Rows::all(vectors, dim));
+    Yardstick { metric, bank, spread }
+}
+
+/// Writes a palette as a shard of one profile and reads it back.
+fn shard_of(palette: &Palette, dim: usize, balanced: bool) -> AlignedBytes {
+    let n = palette.order.len() as u32;
+    let residuals = palette.residuals.as_ref().filter(|_| balanced);
+    let header = ShardHeader {
+        cell_id: 0,
+        n_gaussians: n,
+        n_rows: palette.radii.len() as u32,
+        dim: dim as u32,
+        n_components: palette.n_components as u32,
+        n_groups: residuals.map_or(0, |r| r.code.n_groups() as u32),
+        position_bits: [10, 10, 10, 0],
+        row_step: palette.row_step,
+        origin_in_world: [0.0; 3],
+        position_step: [0.0; 3],
+        box_min: [0.0; 3],
+        box_max: [0.0; 3],
+        errors: palette.errors,
+        encoder_id: [0; 32],
+    };
+    let mut out = Vec::new();
+    ShardView {
+        header,
+        positions: Positions::Packed(&vec![0; n as usize]),
+        row_starts: &palette.row_starts,
+        rows: &palette.rows,
+        radii: residuals.map_or(&palette.radii, |r| &r.radii),
+        basis: Some(Basis { mean: &palette.mean, vectors: &palette.basis, steps: &palette.basis_steps }),
+        residuals: residuals.map(|r| Residuals {
+            group_starts: &r.code.group_starts,
+            words: &r.code.words,
+            row_scales: &r.row_scales,
+            reaches: &r.reaches,
+            codes: &r.codes,
+        }),
+        exact: None,
+    }
+    .write(&mut out)
+    .expect("writes to memory");
+    AlignedBytes::copy_of(&out)
+}
+
+/// Oracle: the naive decoder of the format, in float64. Radii bound every member and are not much larger;
+/// the measured errors are those of the decoded scores; the residual code makes them smaller.
+#[test]
+fn bounds_and_errors_are_those_of_what_readers_decode() {
+    for (dim, n, centres) in [(512, 1400, 20), (64, 900, 300), (16, 500, 5), (3, 40, 2), (5, 1, 1)] {
+        let vectors = clustered(n, centres, dim, 0.3);
+        let yardstick = yardstick(dim, &vectors);
+        let settings = PaletteSettings { min_gaussians_per_row: 20, ..PaletteSettings::default() };
+        let palette = build(Rows::all(&vectors, dim), &yardstick, &settings);
+        let mut means = Vec::new();
+        for balanced in [false, true] {
+            let bytes = shard_of(&palette, dim, balanced);
+            let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
+            let (mut largest, mut reached) =
+                (vec![0.0f64; palette.radii.len()], vec![0.0f64; palette.radii.len()]);
+            let (mut error_sum, mut error_max, mut n_errors) = (0.0, 0.0f64, 0);
+            let (mut decoded, mut of_row) = (vec![0.0; dim], vec![0.0; dim]);
+            for (place, at) in palette.order.iter().enumerate() {
+                let truth = &vectors[*at as usize * dim..][..dim];
+                shard.decode(place, &mut decoded);
+                let row = shard.row_of(place);
+                shard.decode_row(row, &mut of_row);
+                let missed: Vec<f64> = truth.iter().zip(&decoded).map(|(t, d)| f64::from(*t) - d).collect();
+                let length = missed.iter().map(|v| v * v).sum::<f64>().sqrt();
+                largest[row] = largest[row].max(length);
+                reached[row] = reached[row]
+                    .max(decoded.iter().zip(&of_row).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt());
+                if n <= 1024 {
+                    for text in yardstick.bank.vectors.chunks_exact(dim) {
+                        let error: f64 = text.iter().zip(&missed).map(|(t, m)| f64::from(*t) * m).sum();
+                        error_sum += error.abs();
+                        error_max = error_max.max(error.abs());
+                        n_errors += 1;
+                    }
+                }
+            }
+            for (radius, largest) in shard.radii.iter().zip(&largest) {
+                assert!(f64::from(*radius) >= *largest, "{dim}: {radius} < {largest}");
+                assert!(f64::from(*radius) <= largest * 1.01 + 1e-5, "{dim}: {radius} far above {largest}");
+            }
+            let errors = match &palette.residuals {
+                Some(residuals) if balanced => residuals.errors,
+                _ => palette.errors,
+            };
+            if n_errors > 0 {
+                let mean = error_sum / n_errors as f64;
+                assert!(
+                    (f64::from(errors.mean) - mean).abs() < 1e-3 * mean + 1e-6,
+                    "{dim}: {errors:?} {mean}"
+                );
+                assert!((f64::from(errors.max) - error_max).abs() < 1e-3 * error_max + 1e-6);
+            }
+            means.push(errors.mean);
+        }
+        let residuals = palette.residuals.as_ref();
+        println!(
+            "{dim} x {n}: {} rows of {} components, {} groups, errors {means:?}, spread {}",
+            palette.radii.len(),
+            palette.n_components,
+            residuals.map_or(0, |r| r.code.n_groups()),
+            yardstick.spread
+        );
+        assert!(residuals.is_none() || means[1] < 0.8 * means[0], "{dim}: {means:?}");
+    }
+}
+
+/// The longest decoded residual of a row's members, as a vector of components.
+#[test]
+fn reaches_bound_decoded_residuals() {
+    let (dim, n) = (64, 600);
+    let vectors = clustered(n, 200, dim, 0.4);
+    let palette = build(Rows::all(&vectors, dim), &yardstick(dim, &vectors), &PaletteSettings::default());
+    let residuals = palette.residuals.as_ref().expect("one row a 40 is not enough here");
+    let bytes = shard_of(&palette, dim, true);
+    let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
+    let columns = shard.residuals.expect("balanced");
+    for place in 0..n {
+        let row = shard.row_of(place);
+        let mut squares = 0.0;
+        for (group, starts) in columns.group_starts.windows(2).enumerate() {
+            let len = (starts[1] - starts[0]) as usize;
+            let at = shard::WORDS * starts[0] as usize + columns.code(place, group) * len;
+            squares += columns.words[at..at + len].iter().map(|w| w.to_f64().powi(2)).sum::<f64>();
+        }
+        let length = squares.sqrt() * f64::from(columns.row_scales[row]);
+        assert!(
+            length <= f64::from(residuals.reaches[row]) * (1.0 + 1e-6),
+            "{length} {}",
+            residuals.reaches[row]
+        );
+    }
+}
+
+#[test]
+fn rows_follow_the_content_not_the_count() {
+    let build = |n_centres| {
+        let vectors = clustered(5000, n_centres, 128, 0.02);
+        let settings = PaletteSettings { min_gaussians_per_row: 1, ..PaletteSettings::default() };
+        build(Rows::all(&vectors, 128), &yardstick(128, &vectors), &settings).radii.len()
+    };
+    assert_eq!(build(4), 4);
+    let many = build(300);
+    assert!((250..=360).contains(&many), "{many} rows for 300 clusters");
+}
+
+#[test]
+fn same_result_for_any_number_of_threads() {
+    let vectors = clustered(3000, 50, 64, 0.5);
+    let yardstick = yardstick(64, &vectors);
+    let with = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("starts");
+        let palette =
+            pool.install(|| build(Rows::all(&vectors, 64), &yardstick, &PaletteSettings::default()));
+        (shard_of(&palette, 64, false).to_vec(), shard_of(&palette, 64, true).to_vec())
+    };
+    assert!(with(1) == with(3));
+}
+
+#[test]
+fn equal_embeddings_make_one_row_and_none_makes_none() {
+    let same = [0.5f32; 400];
+    let palette = build(Rows::all(&same, 4), &yardstick(4, &same), &PaletteSettings::default());
+    assert_eq!((palette.radii.len(), palette.residuals.is_none()), (1, true));
+    let none = build(Rows::all(&[], 4), &yardstick(4, &same), &PaletteSettings::default());
+    assert_eq!((none.radii.len(), none.row_starts), (0, vec![0]));
+}
