@@ -2,7 +2,10 @@
 //! run.
 
 pub mod arrays;
+pub mod codec;
+pub mod field;
 pub mod lift;
+pub mod plot;
 pub mod raster;
 pub mod scene;
 

@@ -341,6 +341,10 @@ pub struct DemoArgs {
 /// `bench`.
 #[derive(Debug, Subcommand)]
 pub enum BenchCommand {
+    /// Bytes against errors of the shards' codes, beside plain 8 bits and product quantisation.
+    Codec(CodecBenchArgs),
+    /// Publishes a store of a generated field, for `slag-edge bench query`.
+    Field(FieldBenchArgs),
     /// Weights of a view: each device on generated scenes, or on a recorded one.
     Raster(RasterBenchArgs),
     /// From the sparse sums of all views to every Gaussian's embedding, on a made-up scene.
@@ -507,6 +511,54 @@ mod tests {
                 && parse_bytes("GiB").is_err()
         );
     }
+}
+
+/// `bench codec`.
+#[derive(Debug, Args)]
+pub struct CodecBenchArgs {
+    /// Store with exact shards; a generated field if absent.
+    #[arg(long, value_name = "DIR")]
+    pub store: Option<PathBuf>,
+    /// Gaussians of the generated field.
+    #[arg(long, value_name = "N", default_value_t = 125_000, value_parser = clap::value_parser!(u32).range(1000..=10_000_000))]
+    pub gaussians: u32,
+    /// Components of the generated field.
+    #[arg(long, value_name = "N", default_value_t = 512, value_parser = clap::value_parser!(u32).range(2..=4096))]
+    pub dim: u32,
+    /// Title of the plot [default: the store's folder].
+    #[arg(long)]
+    pub title: Option<String>,
+    /// Write the plot.
+    #[arg(long, value_name = "FILE")]
+    pub svg: Option<PathBuf>,
+    /// Write the report as JSON.
+    #[arg(long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
+    #[command(flatten)]
+    pub models: ModelArgs,
+}
+
+/// `bench field`.
+#[derive(Debug, Args)]
+pub struct FieldBenchArgs {
+    /// Store to publish into.
+    #[arg(long, value_name = "DIR")]
+    pub store: PathBuf,
+    /// Gaussians, rounded down to whole cells of 62,500.
+    #[arg(long, value_name = "N", default_value_t = 1_000_000, value_parser = clap::value_parser!(u32).range(1000..=100_000_000))]
+    pub gaussians: u32,
+    /// Components.
+    #[arg(long, value_name = "N", default_value_t = 512, value_parser = clap::value_parser!(u32).range(2..=4096))]
+    pub dim: u32,
+    /// Which shards to make.
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', default_values_t = [Profile::Compact, Profile::Balanced])]
+    pub profiles: Vec<Profile>,
+    /// Error of the balanced profile, relative to the spread of scores.
+    #[arg(long, value_name = "E", default_value_t = PaletteSettings::default().balanced_error, value_parser = parse_error)]
+    pub balanced_error: f32,
+    /// Write the report as JSON.
+    #[arg(long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
 }
 
 fn parse_error(text: &str) -> Result<f32, String> {

@@ -51,6 +51,8 @@ pub fn run(cli: Cli) -> Exit {
         Command::Devices => run_devices(json),
         Command::Bench(BenchCommand::Raster(args)) => run_bench_raster(&args, progress.as_ref(), json),
         Command::Bench(BenchCommand::Lift(args)) => super::bench::run_lift(&args, json),
+        Command::Bench(BenchCommand::Codec(args)) => super::bench::run_codec(&args, json),
+        Command::Bench(BenchCommand::Field(args)) => super::bench::run_field(&args, progress.as_ref()),
     };
     match result {
         Ok(exit) => exit,
@@ -110,7 +112,7 @@ fn now_unix_secs() -> u64 {
 }
 
 /// Opens the models and says how they are run.
-fn open_models(args: &ModelArgs) -> Result<(ModelDir, SessionOptions)> {
+pub(super) fn open_models(args: &ModelArgs) -> Result<(ModelDir, SessionOptions)> {
     let models = match &args.models {
         Some(dir) => ModelDir::open(dir)?,
         None => ModelDir::builtin(),

@@ -3,6 +3,7 @@
 //! Every surface is covered with flat Gaussians; the photos are drawn from them by the project's own
 //! rasteriser, along a walk through the room. What stands where is the truth to check answers by.
 
+pub mod field;
 mod room;
 mod solid;
 

@@ -99,7 +99,7 @@ impl ResidualCode {
                 let (from, to) = (group[0] as usize, group[1] as usize);
                 let points: Vec<f32> =
                     sample.iter().flat_map(|row| &residuals.get(*row)[from..to]).copied().collect();
-                let mut words = trained(Rows::all(&points, to - from));
+                let mut words = trained(Rows::all(&points, to - from), WORDS);
                 // Fewer distinct residuals than words: the rest is never named.
                 words.resize(WORDS * (to - from), 0.0);
                 words.into_iter().map(f16::from_f32).collect()
@@ -158,11 +158,11 @@ fn nearest_word(residual: &[f32], words: &[f32]) -> usize {
     best.1
 }
 
-/// K-means with 16 means at most.
-fn trained(points: Rows<'_>) -> Vec<f32> {
+/// Returns the means of k-means, `n_words` at most.
+pub fn trained(points: Rows<'_>, n_words: usize) -> Vec<f32> {
     /// Rounds after those of the clusters: the gain of more is below a hundredth.
     const ROUNDS: usize = 6;
-    let mut words = clusters(points, 0.0, WORDS).centres;
+    let mut words = clusters(points, 0.0, n_words).centres;
     for _ in 0..ROUNDS {
         let codes = nearest(points, &words);
         let mut sums = vec![0.0f64; words.len()];

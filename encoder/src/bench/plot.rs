@@ -1,0 +1,138 @@
+//! A small line plot as SVG, both axes logarithmic.
+
+use std::fmt::Write;
+
+const SIZE: (f64, f64) = (760.0, 480.0);
+const MARGIN: (f64, f64) = (72.0, 48.0);
+const COLOURS: [&str; 6] = ["#1b6ca8", "#c8553d", "#588157", "#7b2d8b", "#b08900", "#444444"];
+
+/// What the axes are.
+pub struct Plot {
+    /// Above the plot.
+    pub title: String,
+    /// Horizontal axis.
+    pub across: &'static str,
+    /// Vertical axis.
+    pub up: &'static str,
+}
+
+/// Points that belong together, positive, in the order of the line through them.
+pub struct Series {
+    /// In the legend.
+    pub name: &'static str,
+    /// (across, up).
+    pub points: Vec<(f64, f64)>,
+}
+
+impl Plot {
+    /// Draws the series.
+    pub fn svg(&self, series: &[Series]) -> String {
+        let all = || series.iter().flat_map(|s| &s.points).filter(|p| p.0 > 0.0 && p.1 > 0.0);
+        let x = Axis::of(all().map(|p| p.0), MARGIN.0, SIZE.0 - 16.0);
+        let y = Axis::of(all().map(|p| p.1), SIZE.1 - MARGIN.1, 40.0);
+        let (w, h) = SIZE;
+        let mut out = format!(
+            "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {w} {h}\" font-family=\"sans-serif\" font-size=\"12\">\n\
+             <rect width=\"{w}\" height=\"{h}\" fill=\"white\"/>\n\
+             <text x=\"{}\" y=\"22\" font-size=\"15\">{}</text>\n",
+            MARGIN.0, self.title
+        );
+        let (left, right, bottom, top) = (x.from, x.to, y.from, y.to);
+        let mut line = |x1: f64, y1: f64, x2: f64, y2: f64| {
+            writeln!(
+                out,
+                "<line x1=\"{x1:.1}\" y1=\"{y1:.1}\" x2=\"{x2:.1}\" y2=\"{y2:.1}\" stroke=\"#ddd\"/>"
+            )
+        };
+        for tick in x.ticks() {
+            let _ = line(x.at(tick), bottom, x.at(tick), top);
+        }
+        for tick in y.ticks() {
+            let _ = line(left, y.at(tick), right, y.at(tick));
+        }
+        for tick in x.ticks() {
+            let at = x.at(tick);
+            let _ = writeln!(
+                out,
+                "<text x=\"{at:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{tick}</text>",
+                bottom + 16.0
+            );
+        }
+        for tick in y.ticks() {
+            let at = y.at(tick) + 4.0;
+            let _ = writeln!(
+                out,
+                "<text x=\"{:.1}\" y=\"{at:.1}\" text-anchor=\"end\">{tick}</text>",
+                left - 6.0
+            );
+        }
+        let _ = writeln!(
+            out,
+            "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{}</text>\n\
+             <text transform=\"translate(16 {:.1}) rotate(-90)\" text-anchor=\"middle\">{}</text>",
+            (left + right) / 2.0,
+            h - 10.0,
+            self.across,
+            (bottom + top) / 2.0,
+            self.up
+        );
+        for (number, series) in series.iter().enumerate() {
+            let colour = COLOURS[number % COLOURS.len()];
+            let points: Vec<String> =
+                series.points.iter().map(|p| format!("{:.1},{:.1}", x.at(p.0), y.at(p.1))).collect();
+            let _ = writeln!(
+                out,
+                "<polyline points=\"{}\" fill=\"none\" stroke=\"{colour}\" stroke-width=\"2\"/>",
+                points.join(" ")
+            );
+            for p in &series.points {
+                let _ = writeln!(
+                    out,
+                    "<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"3.5\" fill=\"{colour}\"/>",
+                    x.at(p.0),
+                    y.at(p.1)
+                );
+            }
+            let at = 52.0 + 18.0 * number as f64;
+            let _ = writeln!(
+                out,
+                "<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"4\" fill=\"{colour}\"/><text x=\"{:.1}\" y=\"{:.1}\">{}</text>",
+                right - 110.0,
+                at,
+                right - 100.0,
+                at + 4.0,
+                series.name
+            );
+        }
+        out.push_str("</svg>\n");
+        out
+    }
+}
+
+/// A logarithmic axis.
+struct Axis {
+    low: f64,
+    high: f64,
+    from: f64,
+    to: f64,
+}
+
+impl Axis {
+    fn of(values: impl Iterator<Item = f64>, from: f64, to: f64) -> Self {
+        let (low, high) = values.fold((f64::MAX, f64::MIN), |(low, high), v| (low.min(v), high.max(v)));
+        let (low, high) = if low > high { (1.0, 10.0) } else { (low, high) };
+        Self { low: low / 1.15, high: high * 1.15, from, to }
+    }
+
+    fn at(&self, value: f64) -> f64 {
+        self.from + (self.to - self.from) * (value / self.low).ln() / (self.high / self.low).ln()
+    }
+
+    /// 1, 2 and 5 times powers of ten.
+    fn ticks(&self) -> impl Iterator<Item = f64> + use<> {
+        let (low, high) = (self.low, self.high);
+        (-9..9)
+            .flat_map(|e| [1.0, 2.0, 5.0].map(|m| format!("{m}e{e}").parse::<f64>().unwrap_or(1.0)))
+            .filter(move |v| (low..=high).contains(v))
+    }
+}
