@@ -10,7 +10,9 @@ use half::f16;
 use slag_common::container::AlignedBytes;
 use slag_common::hash::Hash32;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
-use slag_common::shard::{Profile, ShardHeader, ShardLayout, ShardParts, ShardView};
+use slag_common::shard::{
+    ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardLayout, ShardView, quantise,
+};
 use slag_models::{EncodeError, TextEncoder};
 
 use crate::store::{Current, CurrentCell, EdgeCache};
@@ -30,6 +32,8 @@ pub struct TestShard {
     pub origin: DVec3,
     pub step: DVec3,
     pub encoder_id: Hash32,
+    /// Whether rows are rounded with a step that is a power of two: what is exact in f32 stays exact.
+    pub has_exact_rows: bool,
     /// Members by row.
     pub rows: Vec<Vec<Member>>,
     /// Gaussians without a row, after the rows'.
@@ -52,7 +56,8 @@ impl BuiltShard {
 impl TestShard {
     pub fn new(rows: Vec<Vec<Member>>) -> Self {
         let (origin, step) = (DVec3::ZERO, DVec3::splat(0.01));
-        Self { cell_id: 1, origin, step, encoder_id: Hash32([7; 32]), rows, without_evidence: Vec::new() }
+        let (encoder_id, without_evidence) = (Hash32([7; 32]), Vec::new());
+        Self { cell_id: 1, origin, step, encoder_id, has_exact_rows: false, rows, without_evidence }
     }
 
     /// Writes the shard and reads it back: rows are the members' means, radii the largest distance of
@@ -61,21 +66,21 @@ impl TestShard {
         let members = || self.rows.iter().flatten();
         let dim = members().next().map_or(2, |m| m.embedding.len());
         let mut row_starts = vec![0u32];
-        let (mut palette, mut radii) = (Vec::new(), Vec::new());
+        let mut means = Vec::new();
         for row in &self.rows {
             row_starts.push(row_starts.last().expect("starts with 0") + row.len() as u32);
-            let mean = (0..dim)
-                .map(|c| row.iter().map(|m| f64::from(m.embedding[c])).sum::<f64>() / row.len() as f64)
-                .map(f16::from_f64);
-            let stored: Vec<f16> = mean.collect();
-            let distance = |m: &Member| {
-                let squares =
-                    m.embedding.iter().zip(&stored).map(|(e, p)| (f64::from(*e) - p.to_f64()).powi(2));
-                squares.sum::<f64>().sqrt()
-            };
-            radii.push(row.iter().map(distance).fold(0.0, f64::max) as f32 * (1.0 + f32::EPSILON));
-            palette.extend(stored);
+            let sum = |c: usize| row.iter().map(|m| f64::from(m.embedding[c])).sum::<f64>();
+            means.extend((0..dim).map(|c| (sum(c) / row.len() as f64) as f32));
         }
+        let (rows, row_step) = if self.has_exact_rows { quantise_exactly(&means) } else { quantise(&means) };
+        let radius = |(row, stored): (&Vec<Member>, &[i8])| {
+            let stored = || stored.iter().map(|v| f64::from(*v) * f64::from(row_step));
+            let squares = |m: &Member| -> f64 {
+                m.embedding.iter().zip(stored()).map(|(e, p)| (f64::from(*e) - p).powi(2)).sum()
+            };
+            row.iter().map(squares).fold(0.0, f64::max).sqrt() as f32 * (1.0 + f32::EPSILON)
+        };
+        let radii: Vec<f32> = self.rows.iter().zip(rows.chunks(dim)).map(radius).collect();
         let positions: Vec<[u16; 3]> =
             members().map(|m| m.steps).chain(self.without_evidence.iter().copied()).collect();
         let embeddings: Vec<f16> =
@@ -86,20 +91,28 @@ impl TestShard {
             n_gaussians: positions.len() as u32,
             n_rows: self.rows.len() as u32,
             dim: dim as u32,
+            n_components: dim as u32,
+            n_groups: 0,
+            position_bits: [16, 16, 16, 0],
+            row_step,
             origin_in_world: self.origin.to_array(),
             position_step: self.step.to_array(),
             box_min: self.origin.to_array(),
             box_max: (self.origin + self.step * 65535.0).to_array(),
+            errors: ScoreErrors::default(),
             encoder_id: self.encoder_id.0,
         };
+        let exact = exact.then_some(ExactColumns { input_indices: &input_indices, embeddings: &embeddings });
         let mut bytes = Vec::new();
-        ShardParts {
+        ShardView {
             header,
-            positions: &positions,
+            positions: Positions::Wide(&positions),
             row_starts: &row_starts,
-            palette: &palette,
+            rows: &rows,
             radii: &radii,
-            exact: exact.then_some((&input_indices, &embeddings)),
+            basis: None,
+            residuals: None,
+            exact,
         }
         .write(&mut bytes)
         .expect("writes to memory");
@@ -107,6 +120,13 @@ impl TestShard {
         let layout = ShardLayout::check(&bytes).expect("a valid shard");
         BuiltShard { bytes, layout, embeddings: members().map(|m| m.embedding.clone()).collect() }
     }
+}
+
+/// Rounds to 8 bits with a step that is a power of two.
+fn quantise_exactly(values: &[f32]) -> (Vec<i8>, f32) {
+    let largest = values.iter().fold(f32::MIN_POSITIVE, |most, v| most.max(v.abs()));
+    let step = (largest / 127.0).log2().ceil().exp2();
+    (values.iter().map(|v| (v / step).round() as i8).collect(), step)
 }
 
 /// Pseudo-random numbers for bulk data (splitmix64, Steele et al. 2014).
@@ -204,6 +224,7 @@ pub fn manifest_of(shards: &[BuiltShard], generation: u64) -> Manifest {
             len_bytes: shard.bytes.len() as u64,
             n_rows: view.header.n_rows,
             score_error_bound: view.radii.iter().fold(0.0, |a: f32, b| a.max(*b)),
+            score_errors: view.header.errors,
             position_error: 0.01,
         };
         CellRecord {

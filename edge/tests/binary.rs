@@ -7,12 +7,11 @@ use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
 use glam::DVec3;
-use half::f16;
 use serde_json::Value;
 use slag_common::Hash32;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
-use slag_common::shard::{Profile, ShardHeader, ShardParts};
+use slag_common::shard::{Positions, Profile, ScoreErrors, ShardHeader, ShardView, quantise};
 use slag_edge::text::TextService;
 use slag_models::SessionOptions;
 
@@ -22,28 +21,34 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
     let text = TextService::open(None, &SessionOptions::new("not-needed".into())).expect("built in");
     let mut positions: Vec<[u16; 3]> = (0..40).map(|i| [2000 + i, 0, 0]).collect();
     positions.extend((0..60).map(|i| [8000 + i, 0, 0]));
-    let row =
-        |word: &str| text.encode(word).expect("known").iter().map(|v| f16::from_f32(*v)).collect::<Vec<_>>();
-    let palette = [row("red"), row("blue")].concat();
+    let row = |word: &str| text.encode(word).expect("known").to_vec();
+    let (rows, row_step) = quantise(&[row("red"), row("blue")].concat());
     let bounds = Aabb { min: DVec3::ZERO, max: DVec3::splat(10.0) };
     let header = ShardHeader {
         cell_id: 0,
         n_gaussians: 100,
         n_rows: 2,
         dim: text.info().dim,
+        n_components: text.info().dim,
+        n_groups: 0,
+        position_bits: [16, 16, 16, 0],
+        row_step,
         origin_in_world: [0.0; 3],
         position_step: [1e-3; 3],
         box_min: bounds.min.into(),
         box_max: bounds.max.into(),
+        errors: ScoreErrors::default(),
         encoder_id: text.info().id.0,
     };
     let mut shard = Vec::new();
-    ShardParts {
+    ShardView {
         header,
-        positions: &positions,
+        positions: Positions::Wide(&positions),
         row_starts: &[0, 40, 100],
-        palette: &palette,
+        rows: &rows,
         radii: &[0.05; 2],
+        basis: None,
+        residuals: None,
         exact: None,
     }
     .write(&mut shard)
@@ -53,6 +58,7 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
         len_bytes: shard.len() as u64,
         n_rows: 2,
         score_error_bound: 0.05,
+        score_errors: ScoreErrors::default(),
         position_error: 5e-4,
     };
     let shards = BTreeMap::from([(Profile::Compact, record)]);

@@ -276,6 +276,7 @@ mod tests {
                     len_bytes: *len_bytes,
                     n_rows: 1,
                     score_error_bound: 0.1,
+                    score_errors: Default::default(),
                     position_error: 0.1,
                 },
             )]),

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use slag_common::frames::Aabb;
 use slag_common::shard::ShardView;
 
-use crate::score::{Run, position_box};
+use crate::score::Run;
 
 /// Bits of a voxel's coordinate in its key, three of which fill a `u64`.
 const AXIS_BITS: u32 = 21;
@@ -100,7 +100,7 @@ pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], voxel: f64, min_count: u6
     let mut result = Clusters { clusters: Vec::new(), n_small: 0, n_gaussians_in_small: 0, voxel };
     let mut reach = Aabb::EMPTY;
     for runs_of_shard in runs.chunk_by(|a, b| a.shard == b.shard) {
-        let of_shard = position_box(&shards[runs_of_shard[0].shard as usize]);
+        let of_shard = shards[runs_of_shard[0].shard as usize].position_box();
         reach = Aabb { min: reach.min.min(of_shard.min), max: reach.max.max(of_shard.max) };
     }
     if runs.is_empty() {

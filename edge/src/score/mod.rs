@@ -14,9 +14,7 @@ mod select;
 
 use std::ops::Range;
 
-use glam::DVec3;
 use rayon::prelude::*;
-use slag_common::frames::Aabb;
 use slag_common::shard::ShardView;
 
 pub use dot::{dot, rounding_bound};
@@ -242,7 +240,7 @@ impl<'a> Search<'a> {
 
     /// Returns the region where the shard sticks out of it.
     fn filter(&self, shard: &ShardView<'_>) -> Option<Region> {
-        (!self.region.covers(&position_box(shard))).then_some(self.region)
+        (!self.region.covers(&shard.position_box())).then_some(self.region)
     }
 
     /// Returns all shards, which runs and hits refer to by place.
@@ -280,7 +278,7 @@ fn check(shards: &[ShardView<'_>], question: &Question) -> Result<(), ScoreError
         if expected != found {
             return Err(ScoreError::Dimension { cell_id: header.cell_id, expected, found });
         }
-        let reach = position_box(shard);
+        let reach = shard.position_box();
         let found = reach.min.abs().max(reach.max.abs()).max_element();
         if found.is_nan() || found > MAX_COORDINATE {
             return Err(ScoreError::Extent { cell_id: header.cell_id, found });
@@ -315,22 +313,20 @@ fn score_rows(
         let n_rows = shard.header.n_rows as usize;
         let mut scores: Vec<Vec<f32>> = questions.iter().map(|_| Vec::with_capacity(n_rows)).collect();
         let mut products = vec![0.0; vectors.len()];
-        for row in shard.palette.chunks_exact(shard.header.dim as usize) {
-            products.iter_mut().zip(&vectors).for_each(|(product, vector)| *product = dot(row, vector));
+        let mut row = vec![0.0; shard.header.dim as usize];
+        for at in 0..n_rows {
+            shard.decode_row(at, &mut row);
+            products.iter_mut().zip(&vectors).for_each(|(product, vector)| {
+                *product = row.iter().zip(*vector).map(|(a, b)| a * f64::from(*b)).sum::<f64>() as f32
+            });
             for (scores, places) in scores.iter_mut().zip(&places) {
                 scores.push(combine(places.iter().map(|place| products[*place])));
             }
         }
         scores
     };
-    let in_region = |shard: &ShardView<'_>| region.touches(&position_box(shard)).then(|| score_shard(shard));
+    let in_region = |shard: &ShardView<'_>| region.touches(&shard.position_box()).then(|| score_shard(shard));
     shards.par_iter().map(in_region).collect()
-}
-
-/// Returns the box that a shard's decoded positions can reach.
-pub fn position_box(shard: &ShardView<'_>) -> Aabb {
-    let min = DVec3::from(shard.header.origin_in_world);
-    Aabb { min, max: min + f64::from(u16::MAX) * DVec3::from(shard.header.position_step) }
 }
 
 /// Returns the parts of a range of Gaussians that lie inside the filter.

@@ -1,7 +1,9 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use glam::DVec3;
 use proptest::prelude::*;
+use slag_common::frames::Aabb;
 use slag_common::shard::ShardView;
 
 use super::*;
@@ -25,7 +27,15 @@ fn exact_shards() -> impl Strategy<Value = Vec<TestShard>> {
         let build = |(at, (rows, without_evidence, origin)): (usize, (Vec<Vec<Member>>, _, [i32; 3]))| {
             let origin = DVec3::from(origin.map(|v| f64::from(v) * 8.0));
             let step = DVec3::new(1.0, 0.5, 0.25) / STEPS_PER_UNIT;
-            TestShard { cell_id: at as u32 + 10, origin, step, without_evidence, ..TestShard::new(rows) }
+            let cell_id = at as u32 + 10;
+            TestShard {
+                cell_id,
+                origin,
+                step,
+                without_evidence,
+                has_exact_rows: true,
+                ..TestShard::new(rows)
+            }
         };
         shards.into_iter().enumerate().map(build).filter(|s| !s.rows.is_empty()).collect()
     })
@@ -73,12 +83,12 @@ fn brute_force(
         let view = shard.view();
         for row in 0..view.header.n_rows as usize {
             for index in view.members(row) {
-                let dim = question.vector.len();
-                let vector = match (&view.exact, precision) {
-                    (Some(columns), Precision::Exact) => &columns.embeddings[index * dim..][..dim],
-                    _ => &view.palette[row * dim..][..dim],
-                };
-                let score = score_in_f64(question, vector.iter().map(|e| e.to_f64()));
+                let mut vector = vec![0.0; question.vector.len()];
+                match precision {
+                    Precision::Exact => view.decode(index, &mut vector),
+                    Precision::Rows => view.decode_row(row, &mut vector),
+                }
+                let score = score_in_f64(question, vector.iter().copied());
                 let p = view.position_in_world(index);
                 let in_ball = region.ball.is_none_or(|b| p.distance(b.centre_in_world) <= b.radius);
                 let in_box = |b: Aabb| (0..3).all(|axis| b.min[axis] <= p[axis] && p[axis] <= b.max[axis]);
@@ -116,7 +126,7 @@ proptest! {
         let batch = Search::batch(&views, &questions, region, precision).expect("valid");
         prop_assert_eq!(batch.len(), questions.len());
         for (search, question) in batch.iter().zip(&questions) {
-            // The palette of a compact shard is rounded to f16, after which sums are still exact.
+            // Rows are rounded with a step of a power of two, after which sums are still exact.
             let mut expected = brute_force(&built, question, region, precision);
             expected.retain(|(_, _, score, _)| *score >= f64::from(threshold));
             let matches = search.matching(threshold);

@@ -8,7 +8,7 @@ use half::f16;
 use slag_common::Hash32;
 use slag_common::frames::{Aabb, GeoReference};
 use slag_common::manifest::{CellRecord, EncoderRecord, Manifest, ShardRecord, VERSION};
-use slag_common::shard::{Profile, ShardHeader, ShardParts};
+use slag_common::shard::{ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardView, quantise};
 
 pub const DIM: u32 = 4;
 pub const ENCODER: Hash32 = Hash32([9; 32]);
@@ -64,28 +64,37 @@ pub fn bounds(cell_id: u32) -> Aabb {
 pub fn shard(spec: &ShardSpec) -> Vec<u8> {
     let mut random = Random(spec.content ^ u64::from(spec.cell_id) << 32);
     let (n, box_) = (spec.n_gaussians, bounds(spec.cell_id));
+    let (rows, row_step) = quantise(&[0.5; DIM as usize]);
     let header = ShardHeader {
         cell_id: spec.cell_id,
         n_gaussians: n,
         n_rows: 1,
         dim: DIM,
+        n_components: DIM,
+        n_groups: 0,
+        position_bits: [16, 16, 16, 0],
+        row_step,
         origin_in_world: box_.min.into(),
         position_step: [1e-4; 3],
         box_min: box_.min.into(),
         box_max: box_.max.into(),
+        errors: ScoreErrors::default(),
         encoder_id: spec.encoder.0,
     };
     let positions: Vec<[u16; 3]> = (0..n).map(|_| [(); 3].map(|()| random.next() as u16)).collect();
     let indices: Vec<u32> = (0..n).collect();
     let embeddings = vec![f16::from_f32(0.5); (n * DIM) as usize];
     let mut out = Vec::new();
-    let parts = ShardParts {
+    let exact = ExactColumns { input_indices: &indices, embeddings: &embeddings };
+    let parts = ShardView {
         header,
-        positions: &positions,
+        positions: Positions::Wide(&positions),
         row_starts: &[0, n],
-        palette: &[f16::from_f32(0.5); DIM as usize],
+        rows: &rows,
         radii: &[0.1],
-        exact: spec.is_exact.then_some((&indices, &embeddings)),
+        basis: None,
+        residuals: None,
+        exact: spec.is_exact.then_some(exact),
     };
     parts.write(&mut out).expect("writes to memory");
     out
@@ -102,8 +111,14 @@ impl Published {
                 let bytes = shard(&spec);
                 let (hash, len_bytes) = (Hash32::of(&bytes), bytes.len() as u64);
                 objects.insert(hash, bytes);
-                let record =
-                    ShardRecord { hash, len_bytes, n_rows: 1, score_error_bound: 0.1, position_error: 5e-5 };
+                let record = ShardRecord {
+                    hash,
+                    len_bytes,
+                    n_rows: 1,
+                    score_error_bound: 0.1,
+                    score_errors: ScoreErrors::default(),
+                    position_error: 5e-5,
+                };
                 (profile, record)
             });
             CellRecord { cell_id, bounds: bounds(cell_id), n_gaussians, shards: BTreeMap::from(shards) }
