@@ -158,8 +158,7 @@ async fn formats_are_negotiated() {
 /// the client has does not look whole.
 #[tokio::test]
 async fn answers_that_nobody_reads_are_given_up() {
-    let settings =
-        Settings { max_queries: 1, stream_timeout: Duration::from_millis(30), ..Settings::default() };
+    let settings = Settings { max_queries: 1, stream_timeout: Duration::from_secs(1), ..Settings::default() };
     let service = Service::new(Some(&many()), settings);
     let uri = "/query?text=0&level=gaussians&limit=60000&threshold=0.5";
     let response = service.send("GET", uri).await;
