@@ -158,7 +158,7 @@ impl Scale {
         match self.0 {
             ScoreKind::Cosine => of_score,
             // A sigmoid is nowhere steeper than a quarter of its steepness at 0.
-            ScoreKind::Relevancy => of_score * RELEVANCY_STEEPNESS / 4.0 + f32::EPSILON,
+            ScoreKind::Relevancy => (of_score * RELEVANCY_STEEPNESS / 4.0 + f32::EPSILON).min(1.0),
         }
     }
 }

@@ -208,21 +208,28 @@ fn negatives_make_relevancies() {
 /// bound, nearly.
 #[test]
 fn relevancies_keep_within_their_bound_and_use_it() {
-    let angles = [-0.02f64, 0.02].map(|turn| turn + std::f64::consts::FRAC_PI_4);
+    let angles = |turn: f64| [-turn, turn].map(|turn| turn + std::f64::consts::FRAC_PI_4);
     let member = |angle: &f64| Member {
         steps: [0; 3],
         embedding: [angle.cos(), angle.sin()].map(|v| v as f32).to_vec(),
     };
-    let row = [TestShard::new(vec![angles.iter().map(member).collect()]).build(false)];
+    let row = |turn| [TestShard::new(vec![angles(turn).iter().map(member).collect()]).build(false)];
     let question = Question { negatives: vec![[0.0, 1.0].into()], ..Question::new([1.0, 0.0]) };
-    let answers = ask_about(&row, &[question], |request, _| {
-        request.negatives = Negatives::Phrases(vec!["other".into()]);
-        (request.level, request.threshold) = (Level::Gaussians, Some(0.0));
-    });
-    for (angle, found) in angles.iter().zip(described(&row, &answers[0], None)) {
+    let ask = |row: &[BuiltShard]| {
+        let mut answers = ask_about(row, std::slice::from_ref(&question), |request, _| {
+            request.negatives = Negatives::Phrases(vec!["other".into()]);
+            (request.level, request.threshold) = (Level::Gaussians, Some(0.0));
+        });
+        answers.remove(0)
+    };
+    // No relevancy is off by more than all there is.
+    assert_eq!(ask(&row(0.7)).score_error_bound, 1.0);
+    let row = row(0.02);
+    let answers = ask(&row);
+    for (angle, found) in angles(0.02).iter().zip(described(&row, &answers, None)) {
         let truth = 1.0 / (1.0 + (-10.0 * (angle.cos() - angle.sin())).exp());
-        let share = (f64::from(found.score) - truth).abs() / f64::from(answers[0].score_error_bound);
-        assert!((0.9..=1.0).contains(&share), "{share} of {}", answers[0].score_error_bound);
+        let share = (f64::from(found.score) - truth).abs() / f64::from(answers.score_error_bound);
+        assert!((0.9..=1.0).contains(&share), "{share} of {}", answers.score_error_bound);
     }
 }
 
