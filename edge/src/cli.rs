@@ -11,8 +11,9 @@ use std::process::ExitCode;
 use clap::{Args, Parser, Subcommand};
 use glam::DVec3;
 use slag_common::Hash32;
+use slag_common::frames::Aabb;
 use slag_common::shard::Profile;
-use slag_edge::query::{DEFAULT_MIN_COUNT, Level, parse_point};
+use slag_edge::query::{DEFAULT_MIN_COUNT, Level, Negatives, parse_box, parse_point};
 
 /// Keeps the shards around a robot and answers text queries offline.
 #[derive(Debug, Parser)]
@@ -102,16 +103,22 @@ struct ServeArgs {
 struct QueryArgs {
     /// What to look for.
     text: String,
+    /// What it is told from: none, canonical (object, things, stuff, texture), or phrases A,B,C.
+    #[arg(long, default_value = "none")]
+    negatives: Negatives,
     /// Where the asker is, world frame: answers carry their distance and nearer ones rank higher.
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
     near: Option<DVec3>,
     /// Only within this distance of --near, world units.
     #[arg(long, requires = "near")]
     radius: Option<f64>,
+    /// Only between two corners of a box, world frame.
+    #[arg(long = "box", value_name = "X,Y,Z,X,Y,Z", value_parser = parse_box, allow_hyphen_values = true)]
+    bounds: Option<Aabb>,
     /// Most answers [default: 10].
     #[arg(long)]
     limit: Option<usize>,
-    /// Cosine from which a Gaussian matches [default: the scene's].
+    /// Cosine, or relevancy with negatives, from which a Gaussian matches [default: the scene's; 0.5].
     #[arg(long, allow_hyphen_values = true)]
     threshold: Option<f32>,
     /// What answers are made of: clusters or gaussians.
@@ -123,6 +130,9 @@ struct QueryArgs {
     /// Clusters with fewer Gaussians are dropped, and counted.
     #[arg(long, default_value_t = DEFAULT_MIN_COUNT)]
     min_count: u64,
+    /// Use palette rows alone, even where exact embeddings are on board: faster.
+    #[arg(long)]
+    rows_only: bool,
     #[command(flatten)]
     cache: CacheArgs,
     #[command(flatten)]
@@ -249,6 +259,16 @@ mod tests {
         assert_eq!((query.text.as_str(), query.near), ("chair", Some(DVec3::new(1.0, 2.0, -3.0))));
         assert_eq!((query.radius, query.limit, query.threshold), (Some(4.0), Some(5), Some(-0.5)));
         assert_eq!(query.level, Level::Gaussians);
+        let Command::Query(query) =
+            parse("slag-edge query chair --box -1,2,3,4,-5,6 --negatives wall,floor --rows-only")
+                .expect("parses")
+                .command
+        else {
+            panic!("query")
+        };
+        let bounds = Aabb { min: DVec3::new(-1.0, -5.0, 3.0), max: DVec3::new(4.0, 2.0, 6.0) };
+        assert_eq!((query.bounds, query.rows_only), (Some(bounds), true));
+        assert_eq!(query.negatives, Negatives::Phrases(vec!["wall".into(), "floor".into()]));
         assert!(parse("slag-edge status --json --cache d").is_ok());
     }
 
@@ -262,6 +282,8 @@ mod tests {
             "slag-edge query chair --near NaN,0,0",
             "slag-edge query chair --level points",
             "slag-edge query chair --limit -1",
+            "slag-edge query chair --box 1,2,3",
+            "slag-edge query chair --negatives ,",
             "slag-edge fetch --at 1,2,3 --at-geo 1,2",
             "slag-edge fetch --at-geo 91,0",
             "slag-edge fetch --key 12",

@@ -11,7 +11,7 @@ use slag_edge::text::TextService;
 use slag_models::{SessionOptions, find_runtime};
 use tokio::net::TcpListener;
 
-use super::output::{Failure, print_answers, print_json, print_status};
+use super::output::{Failure, print_json, print_reply, print_status, write_json};
 use super::{CacheArgs, ModelArgs, QueryArgs, ServeArgs, StatusArgs};
 
 /// Async threads: they only pass requests on.
@@ -52,20 +52,23 @@ fn store_failure(error: StoreError) -> Failure {
 
 pub fn query(args: QueryArgs) -> Result<(), Failure> {
     let request = QueryRequest {
-        text: args.text,
+        texts: vec![args.text],
+        negatives: args.negatives,
         limit: args.limit,
         threshold: args.threshold,
         near: args.near,
         radius: args.radius,
+        bounds: args.bounds,
         level: args.level,
         voxel: args.voxel,
         min_count: args.min_count,
+        exact: !args.rows_only,
     };
     request.check().map_err(|e| Failure::Usage(e.into()))?;
     let engine = engine(args.cache, &args.models)?;
     engine.reload().map_err(store_failure)?;
-    let answers = engine.answer(&request)?;
-    if args.json { print_json(&answers) } else { print_answers(&answers) }
+    let reply = engine.answer(&request)?;
+    if args.json { write_json(reply) } else { print_reply(&reply) }
 }
 
 pub fn status(args: StatusArgs) -> Result<(), Failure> {

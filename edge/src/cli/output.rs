@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use glam::DVec3;
 use serde::Serialize;
-use slag_edge::query::{Answers, Found, QueryError, Status};
+use slag_edge::query::{Answers, Format, Found, QueryError, Reply, Status, ThresholdSource};
 
 use super::Exit;
 
@@ -82,18 +82,38 @@ pub fn print_pairs(pairs: &[(&str, String)]) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Prints answers as a table, and what is to be known about them on stderr.
-pub fn print_answers(answers: &Answers) -> Result<(), Failure> {
+/// Prints a reply as one JSON object, piece by piece.
+pub fn write_json(reply: Reply) -> Result<(), Failure> {
+    let mut out = io::stdout().lock();
+    for piece in reply.pieces(Format::Json) {
+        out.write_all(&piece?)?;
+    }
+    Ok(writeln!(out)?)
+}
+
+/// Prints a reply's answers as tables, and what is to be known about them on stderr.
+pub fn print_reply(reply: &Reply) -> Result<(), Failure> {
+    reply.answers.iter().try_for_each(|answers| print_answers(reply, answers))
+}
+
+fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
     if let Some(reason) = &answers.reason {
         writeln!(io::stderr(), "{}", reason.detail)?;
         return Ok(());
     }
-    let exactness = match answers.exact {
+    let exactness = match answers.is_exact {
         true => "exactly".to_owned(),
         false => format!("scores within ±{:.3}", answers.score_error_bound),
     };
     let (n, threshold) = (answers.n_matching, answers.threshold);
-    writeln!(io::stderr(), "{n} Gaussians of {} reach {threshold} ({exactness})", answers.n_searched)?;
+    let source = match answers.threshold_source {
+        ThresholdSource::Request => "as asked",
+        ThresholdSource::Scene => "calibrated on the scene",
+        ThresholdSource::Encoder => "the encoder's default",
+        ThresholdSource::Relevancy => "nearer than any negative",
+    };
+    let searched = answers.n_searched;
+    writeln!(io::stderr(), "{n} Gaussians of {searched} reach {threshold}, {source} ({exactness})")?;
     if answers.area_fetched == Some(false) {
         writeln!(io::stderr(), "part of that area is not on board: fetch it for a full answer")?;
     }
@@ -114,8 +134,9 @@ pub fn print_answers(answers: &Answers) -> Result<(), Failure> {
                 ]
             })
             .collect(),
-        Found::Gaussians(gaussians) => gaussians
-            .iter()
+        Found::Gaussians(_) => reply
+            .gaussians(answers)
+            .into_iter()
             .map(|g| {
                 let (score, id) = (format!("{:.3}", g.score), format!("{}-{}", g.cell_id, g.index));
                 vec![

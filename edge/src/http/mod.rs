@@ -3,6 +3,7 @@
 mod metrics;
 mod params;
 mod problem;
+mod query;
 mod serve;
 
 use std::any::Any;
@@ -10,9 +11,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use axum::extract::rejection::QueryRejection;
-use axum::extract::{Query, Request, State};
-use axum::http::{HeaderValue, Method, Uri, header};
+use axum::extract::{Request, State};
+use axum::http::{HeaderName, HeaderValue, Method, Uri, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
@@ -24,27 +24,37 @@ use tower_http::catch_panic::CatchPanicLayer;
 pub use problem::Problem;
 pub use serve::serve;
 
-use crate::query::{Engine, RequestError, Status};
+use crate::query::{Engine, Status};
 use metrics::Metrics;
 
 const HELP: &str = "slag-edge answers where things are.
 
 GET /query?text=chair   clusters of Gaussians that match, best first
-    limit=10            most answers
-    threshold=0.1       cosine from which a Gaussian matches (default: the scene's)
+    text=table          again: both are answered, in one pass
+    negatives=canonical or a,b,c: scores are LERF's relevancy against these (default: none)
+    limit=10            most answers to a text
+    threshold=0.1       cosine or relevancy from which a Gaussian matches (default: the scene's)
     near=x,y,z          rank by distance too
     radius=r            only within r of near
+    box=x,y,z,x,y,z     only between two corners
     level=clusters      or gaussians
     voxel=v             edge of the voxels that join Gaussians to clusters
     min_count=n         smaller clusters are dropped
+    exact=true          false: by palette rows alone, faster
+    format=json         or arrow: columns, of gaussians
 GET /status             scene, generation, encoder, shards
 GET /healthz            the process lives
 GET /readyz             a scene is loaded and fits the text model
 GET /metrics            Prometheus
+GET /openapi.json       all of this for programs
 ";
 
+/// The description for programs; a test compares it with the routes, parameters and answers there are.
+const OPENAPI: &str = include_str!("openapi.json");
+const JSON: (HeaderName, HeaderValue) = (header::CONTENT_TYPE, HeaderValue::from_static("application/json"));
+
 /// The paths there are.
-const ROUTES: [&str; 6] = ["/", "/query", "/status", "/healthz", "/readyz", "/metrics"];
+const ROUTES: [&str; 7] = ["/", "/query", "/status", "/healthz", "/readyz", "/metrics", "/openapi.json"];
 
 /// What the service may use.
 #[derive(Clone, Debug)]
@@ -55,6 +65,8 @@ pub struct Settings {
     pub max_connections: usize,
     /// An answer takes no longer.
     pub query_timeout: Duration,
+    /// Sending a long answer takes no longer.
+    pub stream_timeout: Duration,
     /// A request's head takes no longer to arrive; a connection idles no longer.
     pub header_timeout: Duration,
     /// After a stop signal, requests under way have so long.
@@ -67,6 +79,7 @@ impl Default for Settings {
             max_queries: 32,
             max_connections: 256,
             query_timeout: Duration::from_secs(10),
+            stream_timeout: Duration::from_secs(60),
             header_timeout: Duration::from_secs(30),
             drain: Duration::from_secs(5),
         }
@@ -128,7 +141,8 @@ impl App {
 pub fn router(app: Arc<App>) -> Router {
     Router::new()
         .route("/", get(|| async { HELP }))
-        .route("/query", get(query))
+        .route("/query", get(query::query))
+        .route("/openapi.json", get(|| async { ([JSON], OPENAPI) }))
         .route("/status", get(status))
         .route("/healthz", get(|| async { "alive\n" }))
         .route("/readyz", get(ready))
@@ -173,30 +187,6 @@ async fn blocking<T: Send + 'static>(
 ) -> Result<T, Problem> {
     let app = Arc::clone(app);
     tokio::task::spawn_blocking(move || work(&app)).await.unwrap_or_else(|e| Err(Problem::internal(&e)))
-}
-
-async fn query(
-    State(app): State<Arc<App>>,
-    pairs: Result<Query<Vec<(String, String)>>, QueryRejection>,
-) -> Result<Response, Problem> {
-    let Query(pairs) =
-        pairs.map_err(|e| RequestError::new("query string", &e.body_text(), "name=value pairs"))?;
-    let request = params::parse(&pairs)?;
-    request.check()?;
-    let permit = Arc::clone(&app.permits)
-        .try_acquire_owned()
-        .map_err(|_| Problem::overloaded(app.settings.max_queries))?;
-    let answering = blocking(&app, move |app| {
-        // Held until the work is done, even if nobody waits for it any more.
-        let _permit = permit;
-        app.reload_if_stale();
-        let answers = app.engine.answer(&request)?;
-        app.metrics.empty_answers.fetch_add(u64::from(answers.answers.is_empty()), Ordering::Relaxed);
-        serde_json::to_vec(&answers).map_err(|e| Problem::internal(&e))
-    });
-    let limit = app.settings.query_timeout;
-    let body = tokio::time::timeout(limit, answering).await.map_err(|_| Problem::timeout(limit))??;
-    Ok(([(header::CONTENT_TYPE, HeaderValue::from_static("application/json"))], body).into_response())
 }
 
 async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Problem> {

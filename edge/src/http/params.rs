@@ -2,50 +2,86 @@
 
 use std::str::FromStr;
 
-use crate::query::{QueryRequest, RequestError, parse_point};
+use axum::http::{HeaderMap, header};
+
+use crate::query::{Format, Level, QueryRequest, RequestError, parse_box, parse_point};
 
 /// The parameters there are.
-const NAMES: &str = "text, limit, threshold, near, radius, level, voxel, min_count";
+pub const NAMES: [&str; 12] = [
+    "text",
+    "negatives",
+    "limit",
+    "threshold",
+    "near",
+    "radius",
+    "box",
+    "level",
+    "voxel",
+    "min_count",
+    "exact",
+    "format",
+];
 
-/// Reads a question from decoded `name=value` pairs; values are checked by [`QueryRequest::check`].
+/// Reads a question and the format of its answer from decoded `name=value` pairs; values are checked by
+/// [`QueryRequest::check`].
 ///
 /// # Errors
-/// The first parameter that is unknown, given twice or does not parse, or `text` when it is missing.
-pub fn parse(pairs: &[(String, String)]) -> Result<QueryRequest, RequestError> {
-    let mut request = QueryRequest::new("");
+/// The first parameter that is unknown, given twice (but for `text`) or does not parse, or `text` when it is
+/// missing.
+pub fn parse(
+    pairs: &[(String, String)],
+    headers: &HeaderMap,
+) -> Result<(QueryRequest, Format), RequestError> {
+    let mut request = QueryRequest { texts: Vec::new(), ..QueryRequest::new("") };
+    let mut format = accepted(headers);
     for (at, (name, value)) in pairs.iter().enumerate() {
-        if pairs[..at].iter().any(|(before, _)| before == name) {
+        if name != "text" && pairs[..at].iter().any(|(before, _)| before == name) {
             return Err(RequestError::new(name, value, "one value"));
         }
+        let refused = |expected: String| RequestError::new(name, value, expected);
         match name.as_str() {
-            "text" => request.text.clone_from(value),
+            "text" => request.texts.push(value.clone()),
+            "negatives" => request.negatives = value.parse().map_err(refused)?,
             "limit" => request.limit = Some(number(name, value, "a whole number")?),
-            "threshold" => request.threshold = Some(number(name, value, "a cosine, -1 to 1")?),
-            "near" => {
-                request.near =
-                    Some(parse_point(value).map_err(|expected| RequestError::new(name, value, expected))?);
-            }
+            "threshold" => request.threshold = Some(number(name, value, "a number")?),
+            "near" => request.near = Some(parse_point(value).map_err(refused)?),
             "radius" => request.radius = Some(number(name, value, "a number")?),
-            "level" => {
-                request.level =
-                    value.parse().map_err(|expected: String| RequestError::new(name, value, expected))?
-            }
+            "box" => request.bounds = Some(parse_box(value).map_err(refused)?),
+            "level" => request.level = value.parse().map_err(refused)?,
             "voxel" => request.voxel = Some(number(name, value, "a number")?),
             "min_count" => request.min_count = number(name, value, "a whole number")?,
+            "exact" => request.exact = number(name, value, "true or false")?,
+            "format" => format = value.parse().map_err(refused)?,
             _ => {
                 let name: String = name.chars().take(40).collect();
-                return Err(RequestError::new(
-                    &name.escape_debug().to_string(),
-                    value,
-                    format!("one of {NAMES}"),
-                ));
+                let expected = format!("one of {}", NAMES.join(", "));
+                return Err(RequestError::new(&name.escape_debug().to_string(), value, expected));
             }
         }
     }
-    if pairs.iter().all(|(name, _)| name != "text") {
+    if request.texts.is_empty() {
         return Err(RequestError::new("text", "nothing", "words to look for"));
     }
-    Ok(request)
+    if format == Format::Arrow && request.level != Level::Gaussians {
+        return Err(RequestError::new(
+            "level",
+            &request.level.to_string(),
+            "gaussians, since format is arrow",
+        ));
+    }
+    Ok((request, format))
+}
+
+/// Returns the format that `Accept` names: columns if it lists them, JSON otherwise.
+fn accepted(headers: &HeaderMap) -> Format {
+    let arrow = Format::Arrow.media_type();
+    let mut values = headers.get_all(header::ACCEPT).iter().filter_map(|value| value.to_str().ok());
+    let names_arrow = |value: &str| {
+        value
+            .split(',')
+            .any(|range| range.split(';').next().is_some_and(|r| r.trim().eq_ignore_ascii_case(arrow)))
+    };
+    if values.any(names_arrow) { Format::Arrow } else { Format::Json }
 }
 
 fn number<T: FromStr>(name: &str, value: &str, expected: &str) -> Result<T, RequestError> {

@@ -93,9 +93,10 @@ impl From<QueryError> for Problem {
         let (kind, detail) = (error.kind(), error.to_string());
         let unavailable =
             |title| Self::new(StatusCode::SERVICE_UNAVAILABLE, kind, title, detail.clone()).retry();
+        let parameter = if matches!(error, QueryError::Negatives(_)) { "negatives" } else { "text" };
         let unknown_words = |found: String, expected: String, suggestions: Vec<String>| {
             Self::new(StatusCode::UNPROCESSABLE_ENTITY, kind, "Unknown words", detail.clone())
-                .with("parameter", "text")
+                .with("parameter", parameter)
                 .with("found", found)
                 .with("expected", expected)
                 .with("suggestions", suggestions)
@@ -103,25 +104,31 @@ impl From<QueryError> for Problem {
         match error {
             QueryError::Request(error) => error.into(),
             QueryError::NoScene => unavailable("No scene"),
-            QueryError::Text(TextError::Busy) => unavailable("Overloaded"),
+            QueryError::Text(TextError::Busy) | QueryError::Negatives(TextError::Busy) => {
+                unavailable("Overloaded")
+            }
             QueryError::EncoderMismatch { models_name, models_id, scene_name, scene_id } => {
                 Self::new(StatusCode::CONFLICT, kind, "Text model and scene do not fit", detail)
                     .with("models", json!({ "name": models_name, "id": models_id }))
                     .with("scene", json!({ "name": scene_name, "id": scene_id }))
             }
-            QueryError::Text(TextError::Encode(error)) => match error {
-                EncodeError::EmptyText => {
-                    RequestError::new("text", "nothing to look for", "words to look for").into()
+            QueryError::Text(TextError::Encode(error)) | QueryError::Negatives(TextError::Encode(error)) => {
+                match error {
+                    EncodeError::EmptyText => {
+                        RequestError::new(parameter, "nothing to look for", "words to look for").into()
+                    }
+                    EncodeError::UnknownPhrase { text, n_known, near } => {
+                        unknown_words(text, format!("one of {n_known} phrases"), near)
+                    }
+                    EncodeError::UnknownWords { unknown, known } => {
+                        unknown_words(unknown.join(", "), "words that the model knows".into(), known)
+                    }
+                    _ => Self::internal(&detail),
                 }
-                EncodeError::UnknownPhrase { text, n_known, near } => {
-                    unknown_words(text, format!("one of {n_known} phrases"), near)
-                }
-                EncodeError::UnknownWords { unknown, known } => {
-                    unknown_words(unknown.join(", "), "words that the model knows".into(), known)
-                }
-                _ => Self::internal(&detail),
-            },
-            QueryError::Text(TextError::Stopped) | QueryError::Score(_) => Self::internal(&detail),
+            }
+            QueryError::Text(TextError::Stopped)
+            | QueryError::Negatives(TextError::Stopped)
+            | QueryError::Score(_) => Self::internal(&detail),
         }
     }
 }

@@ -13,6 +13,9 @@ use crate::store::EdgeCache;
 use crate::testing::{BuiltShard, Gate, Member, TestShard, axes_service, open_gate, write_cache};
 use slag_common::Hash32;
 
+mod answers;
+mod openapi;
+
 struct Service {
     dir: TempDir,
     app: Arc<App>,
@@ -133,7 +136,20 @@ async fn refusals_are_problem_details() {
         ("/query?text=0&level=points", 400, "level"),
         ("/query?text=0&voxel=0", 400, "voxel"),
         ("/query?text=0&min_count=0", 400, "min_count"),
-        ("/query?text=0&text=1", 400, "text"),
+        ("/query?text=0&text=", 400, "text"),
+        ("/query?text=0&limit=1&limit=2", 400, "limit"),
+        ("/query?text=0&limit=10001", 400, "limit"),
+        ("/query?text=0&level=gaussians&limit=1000001", 400, "limit"),
+        ("/query?text=0&level=gaussians&text=1&limit=500001", 400, "limit"),
+        ("/query?text=0&box=1,2,3", 400, "box"),
+        ("/query?text=0&box=0,0,0,1,1,NaN", 400, "box"),
+        ("/query?text=0&exact=maybe", 400, "exact"),
+        ("/query?text=0&format=xml", 400, "format"),
+        ("/query?text=0&format=arrow", 400, "level"),
+        ("/query?text=0&negatives=1,,2", 400, "negatives"),
+        ("/query?text=0&negatives=%07", 400, "negatives"),
+        ("/query?text=0&negatives=1&threshold=-0.1", 400, "threshold"),
+        ("/query?text=0&negatives=canonical", 422, "negatives"),
         ("/query?text=0&colour=red", 400, "colour"),
         ("/query?text=sofa", 422, "text"),
     ];

@@ -1,11 +1,18 @@
 //! Groups matching Gaussians into objects: Gaussians in the same or in touching voxels (26
-//! neighbours) of a world-aligned grid belong together.
+//! neighbours) of a world-aligned grid belong together, unless only a thin bridge joins them.
+//!
+//! A voxel's mass is the number of its Gaussians, each weighted by how far its score passes the threshold.
+//! Voxels join from the heaviest to the lightest, each to its heaviest neighbour; where one touches two
+//! groups it joins these too, if its own mass is at least a twentieth of the lesser group's peak (clustering
+//! by prominence: Chazal et al. 2013, "Persistence-based clustering in Riemannian manifolds"). So a string
+//! of floaters does not make one thing of two, however dense or sparse the things are.
 
 use glam::{DVec3, I64Vec3};
 use rayon::prelude::*;
 use slag_common::frames::Aabb;
 use slag_common::shard::ShardView;
 
+use super::oriented::{Alignment, OrientedBox, trimmed_range};
 use crate::score::Run;
 
 /// Bits of a voxel's coordinate in its key, three of which fill a `u64`.
@@ -13,6 +20,25 @@ const AXIS_BITS: u32 = 21;
 /// The part of a cluster's members, from either end along each axis, that its box leaves out: a few
 /// floaters must not blow it up.
 const TRIMMED: f64 = 0.02;
+/// The least mass of a voxel that joins two groups, as a share of the lesser group's heaviest voxel. A thing
+/// fills its voxels with tens of Gaussians, floaters with one or two.
+const BRIDGE_SHARE: f64 = 0.05;
+/// What a Gaussian that just reaches the threshold weighs, beside the best one's 1.
+const LEAST_WEIGHT: f64 = 0.1;
+
+/// How to group.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Grouping {
+    /// Edge of the voxels, world units, positive; it is taken as is, except that it is doubled until the
+    /// matches' extent fits the grid.
+    pub voxel: f64,
+    /// Clusters with fewer members are dropped.
+    pub min_count: u64,
+    /// Score from which Gaussians match.
+    pub threshold: f32,
+    /// How boxes may be turned.
+    pub alignment: Alignment,
+}
 
 /// Gaussians that belong together.
 #[derive(Clone, Debug, PartialEq)]
@@ -30,6 +56,8 @@ pub struct Cluster {
     /// From the 2nd to the 98th percentile of the members' means along each axis (all of them where
     /// they are fewer than 51).
     pub box_in_world: Aabb,
+    /// The same along axes of its own: those of the members inside `box_in_world`.
+    pub oriented_box: OrientedBox,
 }
 
 /// All clusters of some matches.
@@ -93,10 +121,9 @@ fn forward_neighbours() -> impl Iterator<Item = u64> {
     all.map(|(x, y, z)| (x << (2 * AXIS_BITS)) + (y << AXIS_BITS) + z).filter(|d| *d > 0).map(|d| d as u64)
 }
 
-/// Groups the members of runs. `voxel`: edge length, world units, positive; it is taken as is, except
-/// that it is doubled until the matches' extent fits the grid.
-pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], voxel: f64, min_count: u64) -> Clusters {
-    let mut voxel = voxel;
+/// Groups the members of runs, which do not overlap.
+pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], grouping: &Grouping) -> Clusters {
+    let Grouping { mut voxel, min_count, threshold, alignment } = *grouping;
     let mut result = Clusters { clusters: Vec::new(), n_small: 0, n_gaussians_in_small: 0, voxel };
     let mut reach = Aabb::EMPTY;
     for runs_of_shard in runs.chunk_by(|a, b| a.shard == b.shard) {
@@ -116,7 +143,11 @@ pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], voxel: f64, min_count: u6
         .collect();
     spans.par_sort_unstable();
     let voxels: Vec<&[Span]> = spans.chunk_by(|a, b| a.voxel_key == b.voxel_key).collect();
-    let roots = connect(&voxels);
+    let weight = weight_of_score(runs, threshold);
+    let mass = |spans: &&[Span]| -> f64 {
+        spans.iter().map(|s| weight(runs[s.run as usize].score) * f64::from(s.end - s.start)).sum()
+    };
+    let roots = connect(&voxels, &voxels.iter().map(mass).collect::<Vec<_>>());
     let mut by_root: Vec<u32> = (0..voxels.len() as u32).collect();
     by_root.sort_by_key(|voxel| roots[*voxel as usize]);
     let groups: Vec<&[u32]> = by_root.chunk_by(|a, b| roots[*a as usize] == roots[*b as usize]).collect();
@@ -136,7 +167,7 @@ pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], voxel: f64, min_count: u6
                 group.iter().flat_map(|voxel| voxels[*voxel as usize]).copied().collect();
             // Members in storage order, so that sums do not depend on how the world is voxelised.
             spans.sort_unstable_by_key(|span| (span.run, span.start));
-            summarise(shards, runs, &spans)
+            summarise(shards, runs, &spans, alignment)
         })
         .collect();
     result.clusters.sort_unstable_by_key(|cluster| cluster.first);
@@ -159,8 +190,18 @@ fn spans_of(shards: &[ShardView<'_>], runs: &[Run], first_run: usize, grid: &Gri
     spans
 }
 
-/// Returns for each voxel (by key, ascending) the first voxel of its connected component.
-fn connect(voxels: &[&[Span]]) -> Vec<u32> {
+/// Returns what a Gaussian of a score weighs: from a tenth at the threshold to 1 at the best score.
+fn weight_of_score(runs: &[Run], threshold: f32) -> impl Fn(f32) -> f64 {
+    let best = runs.iter().fold(threshold, |best, run| best.max(run.score));
+    let range = f64::from(best) - f64::from(threshold);
+    move |score| match range > 0.0 {
+        true => ((f64::from(score) - f64::from(threshold)) / range).clamp(LEAST_WEIGHT, 1.0),
+        false => 1.0,
+    }
+}
+
+/// Returns for each voxel (by key, ascending) a number that those of its group share. `masses`: `[voxels]`.
+fn connect(voxels: &[&[Span]], masses: &[f64]) -> Vec<u32> {
     fn root_of(parents: &mut [u32], mut at: u32) -> u32 {
         while parents[at as usize] != at {
             parents[at as usize] = parents[parents[at as usize] as usize];
@@ -168,8 +209,16 @@ fn connect(voxels: &[&[Span]]) -> Vec<u32> {
         }
         at
     }
+    // From here on voxels are named by their rank, from the heaviest; a group's root is its heaviest.
+    let mut by_rank: Vec<u32> = (0..voxels.len() as u32).collect();
+    let mass = |voxel: u32| masses[voxel as usize];
+    by_rank.par_sort_unstable_by(|a, b| mass(*b).total_cmp(&mass(*a)).then(a.cmp(b)));
+    let mut rank_of = vec![0u32; voxels.len()];
+    by_rank.iter().zip(0..).for_each(|(voxel, rank)| rank_of[*voxel as usize] = rank);
+
+    // The lighter end decides when a joint comes into play, then the heavier one.
+    let mut joints: Vec<(u32, u32)> = Vec::new();
     let keys: Vec<u64> = voxels.iter().map(|spans| spans[0].voxel_key).collect();
-    let mut parents: Vec<u32> = (0..voxels.len() as u32).collect();
     for difference in forward_neighbours() {
         // Keys ascend, so the neighbours sought do too: one walk finds them all.
         let mut other = 0;
@@ -182,15 +231,25 @@ fn connect(voxels: &[&[Span]]) -> Vec<u32> {
                 break;
             }
             if keys[other] == wanted {
-                let (a, b) = (root_of(&mut parents, at as u32), root_of(&mut parents, other as u32));
-                parents[a.max(b) as usize] = a.min(b);
+                let (a, b) = (rank_of[at], rank_of[other]);
+                joints.push((a.max(b), a.min(b)));
             }
         }
     }
-    (0..voxels.len() as u32).map(|at| root_of(&mut parents, at)).collect()
+    joints.par_sort_unstable();
+    let mut parents: Vec<u32> = (0..voxels.len() as u32).collect();
+    let mass = |rank: u32| masses[by_rank[rank as usize] as usize];
+    for (lighter, heavier) in joints {
+        let (a, b) = (root_of(&mut parents, lighter), root_of(&mut parents, heavier));
+        let lesser = a.max(b);
+        if mass(lighter) >= BRIDGE_SHARE * mass(lesser) {
+            parents[lesser as usize] = a.min(b);
+        }
+    }
+    rank_of.into_iter().map(|rank| root_of(&mut parents, rank)).collect()
 }
 
-fn summarise(shards: &[ShardView<'_>], runs: &[Run], spans: &[Span]) -> Cluster {
+fn summarise(shards: &[ShardView<'_>], runs: &[Run], spans: &[Span], alignment: Alignment) -> Cluster {
     let mut points: Vec<DVec3> = Vec::new();
     let (mut score_sum, mut best_score, mut first) = (0.0, f32::NEG_INFINITY, (u32::MAX, u32::MAX));
     for span in spans {
@@ -202,9 +261,11 @@ fn summarise(shards: &[ShardView<'_>], runs: &[Run], spans: &[Span]) -> Cluster 
         first = first.min((shard.header.cell_id, span.start));
     }
     let box_in_world = trimmed_box(&points);
-    let inside = |p: &&DVec3| p.cmpge(box_in_world.min).all() && p.cmple(box_in_world.max).all();
-    let (sum, n_inside) =
-        points.iter().filter(inside).fold((DVec3::ZERO, 0u64), |(sum, n), point| (sum + *point, n + 1));
+    let inside = |p: &DVec3| p.cmpge(box_in_world.min).all() && p.cmple(box_in_world.max).all();
+    let (sum, n_inside) = points
+        .iter()
+        .filter(|p| inside(p))
+        .fold((DVec3::ZERO, 0u64), |(sum, n), point| (sum + *point, n + 1));
     Cluster {
         first,
         n_gaussians: points.len() as u64,
@@ -213,132 +274,21 @@ fn summarise(shards: &[ShardView<'_>], runs: &[Run], spans: &[Span]) -> Cluster 
         // Trimming leaves out at most 4 % per axis, so some member is inside along all three.
         position_in_world: sum / n_inside as f64,
         box_in_world,
+        oriented_box: OrientedBox::around(&points, inside, alignment, TRIMMED),
     }
 }
 
 /// Returns the box between the `TRIMMED` and `1 - TRIMMED` quantiles along each axis.
 fn trimmed_box(points: &[DVec3]) -> Aabb {
-    let cut = (TRIMMED * (points.len() - 1) as f64) as usize;
     let (mut min, mut max) = (DVec3::ZERO, DVec3::ZERO);
     let mut values = Vec::with_capacity(points.len());
     for axis in 0..3 {
         values.clear();
         values.extend(points.iter().map(|point| point[axis]));
-        let (_, low, above) = values.select_nth_unstable_by(cut, f64::total_cmp);
-        min[axis] = *low;
-        // The upper quantile's place among what lies above the lower one.
-        max[axis] = match above.len().checked_sub(1 + cut) {
-            Some(place) => *above.select_nth_unstable_by(place, f64::total_cmp).1,
-            None => min[axis],
-        };
+        (min[axis], max[axis]) = trimmed_range(&mut values, TRIMMED);
     }
     Aabb { min, max }
 }
 
 #[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-
-    use super::*;
-    use crate::testing::{Member, TestShard};
-
-    /// Connected components the slow way: all pairs, voxels at most one apart along each axis.
-    fn brute_force(points: &[DVec3], voxel: f64) -> Vec<Vec<usize>> {
-        let voxel_of = |p: DVec3| (p / voxel).floor();
-        let mut component: Vec<Option<usize>> = vec![None; points.len()];
-        let mut components = Vec::new();
-        for seed in 0..points.len() {
-            if component[seed].is_some() {
-                continue;
-            }
-            let mut members = Vec::new();
-            let mut open = vec![seed];
-            component[seed] = Some(components.len());
-            while let Some(at) = open.pop() {
-                members.push(at);
-                for other in 0..points.len() {
-                    let apart = (voxel_of(points[at]) - voxel_of(points[other])).abs().max_element();
-                    if component[other].is_none() && apart <= 1.0 {
-                        component[other] = Some(components.len());
-                        open.push(other);
-                    }
-                }
-            }
-            members.sort_unstable();
-            components.push(members);
-        }
-        components
-    }
-
-    proptest! {
-        /// Oracle: all-pairs connected components, and sorted columns for the boxes.
-        #[test]
-        fn equals_brute_force_components(
-            steps in prop::collection::vec(prop::array::uniform3(0u16..24), 1..150), split in 0usize..150,
-            min_count in 1u64..6, x_shift in -3i32..3,
-        ) {
-            let split = split.min(steps.len());
-            // A power of two, so that the oracle's division and the grid's product agree on borders.
-            let (voxel, step) = (2.0, 0.75);
-            let origin = DVec3::new(f64::from(x_shift) * 7.3, -20.1, 3.0);
-            let shard = |cell_id: u32, steps: &[[u16; 3]]| {
-                let members = steps.iter().map(|at| Member { steps: *at, embedding: vec![1.0, 0.0] }).collect();
-                TestShard { cell_id, origin, step: DVec3::splat(step), ..TestShard::new(vec![members]) }.build(false)
-            };
-            let built: Vec<_> = [(9, &steps[..split]), (4, &steps[split..])]
-                .into_iter().filter(|(_, steps)| !steps.is_empty()).map(|(id, steps)| shard(id, steps)).collect();
-            let views: Vec<_> = built.iter().map(|b| b.view()).collect();
-            let mut points = Vec::new();
-            let mut names = Vec::new();
-            let mut runs = Vec::new();
-            for (at, view) in views.iter().enumerate() {
-                let n = view.header.n_gaussians;
-                runs.extend((0..n).map(|i| Run { shard: at as u32, start: i, end: i + 1, score: (points.len() + i as usize) as f32 }));
-                points.extend((0..n as usize).map(|i| view.position_in_world(i)));
-                names.extend((0..n).map(|i| (view.header.cell_id, i)));
-            }
-            let found = cluster(&views, &runs, voxel, min_count);
-            let (large, small): (Vec<_>, Vec<_>) =
-                brute_force(&points, voxel).into_iter().partition(|m| m.len() as u64 >= min_count);
-            prop_assert_eq!(found.n_small as usize, small.len());
-            prop_assert_eq!(found.n_gaussians_in_small as usize, small.iter().map(Vec::len).sum::<usize>());
-            prop_assert_eq!(found.clusters.len(), large.len());
-            for members in large {
-                let first = members.iter().map(|m| names[*m]).min().expect("has members");
-                let cluster = found.clusters.iter().find(|c| c.first == first).expect("same first member");
-                prop_assert_eq!(cluster.n_gaussians as usize, members.len());
-                let mean = members.iter().map(|m| *m as f64).sum::<f64>() / members.len() as f64;
-                prop_assert!((f64::from(cluster.score) - mean).abs() < 1e-4 * (1.0 + mean));
-                prop_assert_eq!(cluster.best_score as usize, *members.iter().max().expect("has members"));
-                let cut = members.len().saturating_sub(1) / 50;
-                let mut inside = members.clone();
-                for axis in [0, 1, 2] {
-                    let mut column: Vec<f64> = members.iter().map(|m| points[*m][axis]).collect();
-                    column.sort_by(f64::total_cmp);
-                    let (low, high) = (column[cut], column[column.len() - 1 - cut]);
-                    prop_assert_eq!((cluster.box_in_world.min[axis], cluster.box_in_world.max[axis]), (low, high));
-                    inside.retain(|m| (low..=high).contains(&points[*m][axis]));
-                }
-                let mean = inside.iter().map(|m| points[*m]).sum::<DVec3>() / inside.len() as f64;
-                prop_assert!((cluster.position_in_world - mean).length() < 1e-9);
-            }
-        }
-    }
-
-    /// A voxel far too small for the extent is doubled, and nothing overflows on the way.
-    #[test]
-    fn hopeless_voxels_grow() {
-        let members = vec![
-            Member { steps: [0; 3], embedding: vec![1.0, 0.0] },
-            Member { steps: [65535; 3], embedding: vec![1.0, 0.0] },
-        ];
-        let shard = TestShard { step: DVec3::splat(1e4), ..TestShard::new(vec![members]) }.build(false);
-        let runs = [Run { shard: 0, start: 0, end: 2, score: 0.5 }];
-        for voxel in [f64::MIN_POSITIVE, 1e-9, 0.25] {
-            let found = cluster(&[shard.view()], &runs, voxel, 1);
-            assert_eq!(found.clusters.len(), 2);
-            assert!(found.voxel >= 65535e4 / f64::from(1 << AXIS_BITS), "{}", found.voxel);
-        }
-        assert_eq!(cluster(&[shard.view()], &runs, 1e300, 1).clusters.len(), 1);
-    }
-}
+mod tests;

@@ -10,8 +10,8 @@ use slag_common::frames::GeoReference;
 use slag_common::shard::{Profile, ShardView};
 use slag_models::EncodeError;
 
-use super::{Answers, QueryRequest, RequestError, Scene, answer};
-use crate::score::ScoreError;
+use super::{QueryRequest, Reply, RequestError, Scene, answer};
+use crate::score::{Question, ScoreError};
 use crate::store::files::Stat;
 use crate::store::{EdgeCache, OpenShard, Snapshot, StoreError};
 use crate::text::{EncoderInfo, TextError, TextService};
@@ -29,6 +29,9 @@ pub enum QueryError {
     /// The text has no vector.
     #[error(transparent)]
     Text(#[from] TextError),
+    /// A negative has no vector.
+    #[error("negatives: {0}")]
+    Negatives(#[source] TextError),
     /// No scene is loaded.
     #[error("no scene is loaded; run `slag-edge fetch`, or see the log if one was fetched")]
     NoScene,
@@ -55,12 +58,15 @@ impl QueryError {
     /// Returns a stable name of the kind of error, for programs.
     pub fn kind(&self) -> &'static str {
         match self {
-            Self::Request(_) | Self::Text(TextError::Encode(EncodeError::EmptyText)) => "bad-parameter",
-            Self::Text(TextError::Busy) => "overloaded",
-            Self::Text(TextError::Encode(
-                EncodeError::UnknownPhrase { .. } | EncodeError::UnknownWords { .. },
-            )) => "unknown-words",
-            Self::Text(_) => "text-model",
+            Self::Request(_) => "bad-parameter",
+            Self::Text(error) | Self::Negatives(error) => match error {
+                TextError::Encode(EncodeError::EmptyText) => "bad-parameter",
+                TextError::Busy => "overloaded",
+                TextError::Encode(EncodeError::UnknownPhrase { .. } | EncodeError::UnknownWords { .. }) => {
+                    "unknown-words"
+                }
+                _ => "text-model",
+            },
             Self::NoScene => "no-scene",
             Self::EncoderMismatch { .. } => "encoder-mismatch",
             Self::Score(_) => "score",
@@ -245,17 +251,23 @@ impl Engine {
         })
     }
 
-    /// Answers a question from the generation that is loaded. Blocks: milliseconds of computing.
+    /// Answers a request from the generation that is loaded. Blocks: milliseconds of computing.
     ///
     /// # Errors
     /// [`QueryError`].
-    pub fn answer(&self, request: &QueryRequest) -> Result<Answers, QueryError> {
+    pub fn answer(&self, request: &QueryRequest) -> Result<Reply, QueryError> {
         request.check()?;
         let snapshot = self.snapshot()?;
         self.check_encoder(&snapshot)?;
-        let query = self.text.encode(&request.text)?;
+        let negatives = request.negatives.phrases().into_iter().map(|phrase| self.text.encode(phrase));
+        let negatives: Vec<_> = negatives.collect::<Result<_, _>>().map_err(QueryError::Negatives)?;
+        let question =
+            |text: &String| Ok(Question { vector: self.text.encode(text)?, negatives: negatives.clone() });
+        let questions = request.texts.iter().map(question).collect::<Result<Vec<_>, TextError>>()?;
         let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(OpenShard::view).collect();
         let fetched = (snapshot.current.centre_in_world, snapshot.current.radius);
-        Ok(answer(&Scene { shards: &shards, manifest: &snapshot.manifest, fetched }, &query, request)?)
+        let scene = Scene { shards: &shards, manifest: &snapshot.manifest, fetched };
+        let answers = answer(&scene, &questions, request)?;
+        Ok(Reply { snapshot, near: request.near, answers })
     }
 }

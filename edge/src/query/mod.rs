@@ -1,22 +1,30 @@
 //! From a question to ranked answers.
 
+mod answers;
+mod arrow;
 pub mod cluster;
 mod engine;
+mod oriented;
+mod reply;
 mod request;
+mod threshold;
 
 use glam::DVec3;
-use serde::Serialize;
-use slag_common::frames::Geographic;
 use slag_common::manifest::Manifest;
 use slag_common::shard::ShardView;
 
+pub use answers::{Answers, ClusterAnswer, Clustering, Found, GaussianAnswer, Reason, ReasonKind, ScoreKind};
 pub use engine::{Engine, QueryError, ShardStatus, Status};
+pub use oriented::{Alignment, OrientedBox};
+pub use reply::{Format, Reply};
 pub use request::{
-    DEFAULT_LIMIT, DEFAULT_MIN_COUNT, Level, MAX_LIMIT, QueryRequest, RequestError, parse_point,
+    CANONICAL_NEGATIVES, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, Level, MAX_CLUSTERS, MAX_GAUSSIANS, MAX_NEGATIVES,
+    MAX_TEXTS, Negatives, QueryRequest, RequestError, parse_box, parse_point,
 };
+pub use threshold::{Calibration, RELEVANCY_THRESHOLD, ThresholdSource, calibrated_threshold};
 
-use crate::score::{Precision, Question, Region, ScoreError, Search, rounding_bound};
-use cluster::{Cluster, cluster};
+use crate::score::{Question, RELEVANCY_STEEPNESS, ScoreError, Search, relevancy, score_of_relevancy};
+use cluster::{Cluster, Grouping, cluster};
 
 /// Edge of the voxels in a metric scene, metres: parts of one piece of furniture are nearer to each
 /// other than two such edges, two pieces of furniture mostly are not.
@@ -36,176 +44,43 @@ pub struct Scene<'a> {
     pub fetched: (DVec3, f64),
 }
 
-/// Answers to one question.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Answers {
-    /// The question.
-    pub text: String,
-    /// What the answers are made of.
-    pub level: Level,
-    /// Name of the scene.
-    pub scene: String,
-    /// Generation of the scene.
-    pub generation: u64,
-    /// Unit of every position and length: `m`, or `world` where the model is not metric.
-    pub unit: &'static str,
-    /// Cosine from which a Gaussian matches.
-    pub threshold: f32,
-    /// Gaussians with an embedding in the shards that were searched.
-    pub n_searched: u64,
-    /// Gaussians that match.
-    pub n_matching: u64,
-    /// Whether exactly the Gaussians that reach the threshold match; else a Gaussian whose score lies
-    /// within `score_error_bound` of the threshold may be on the wrong side.
-    pub exact: bool,
-    /// No score is off by more.
-    pub score_error_bound: f32,
-    /// Whether all of the ball asked for was fetched; absent without `radius`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub area_fetched: Option<bool>,
-    /// How matches were grouped; absent at level `gaussians`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub clustering: Option<Clustering>,
-    /// The answers, best first.
-    pub answers: Found,
-    /// Why there is none; absent if there is one.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub reason: Option<Reason>,
-}
-
-/// Answers of either level.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-#[serde(untagged)]
-pub enum Found {
-    /// Clusters.
-    Clusters(Vec<ClusterAnswer>),
-    /// Gaussians.
-    Gaussians(Vec<GaussianAnswer>),
-}
-
-impl Found {
-    /// Whether there is no answer.
-    pub fn is_empty(&self) -> bool {
-        match self {
-            Self::Clusters(answers) => answers.is_empty(),
-            Self::Gaussians(answers) => answers.is_empty(),
-        }
-    }
-}
-
-/// How matches were grouped.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Clustering {
-    /// Edge of the voxels.
-    pub voxel: f64,
-    /// Members that a cluster needs.
-    pub min_count: u64,
-    /// Clusters with enough members; those past the limit included.
-    pub n_clusters: u64,
-    /// Clusters with too few.
-    pub n_small_clusters: u64,
-    /// Gaussians in those.
-    pub n_gaussians_in_small_clusters: u64,
-}
-
-/// A group of matching Gaussians: an object, or what touches it.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct ClusterAnswer {
-    /// Place in the list, from 1.
-    pub rank: usize,
-    /// Cell and index of its first Gaussian; keeps its meaning within a generation.
-    pub id: String,
-    /// Mean of its Gaussians inside the box.
-    pub position_in_world: DVec3,
-    /// The same on the earth, where the scene is geo-referenced.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub geographic: Option<Geographic>,
-    /// Smallest corner of its box: 2nd percentile along each axis, so that floaters do not count.
-    pub box_min_in_world: DVec3,
-    /// Largest corner: 98th percentile.
-    pub box_max_in_world: DVec3,
-    /// Edges of the box.
-    pub size: DVec3,
-    /// Mean score of its Gaussians.
-    pub score: f32,
-    /// Best score of its Gaussians.
-    pub best_score: f32,
-    /// Its Gaussians.
-    pub n_gaussians: u64,
-    /// What the list is ranked by, see [`relevance`].
-    pub relevance: f32,
-    /// Distance of the position from `near`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub distance: Option<f64>,
-}
-
-/// A matching Gaussian.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct GaussianAnswer {
-    /// Place in the list, from 1.
-    pub rank: usize,
-    /// Its cell.
-    pub cell_id: u32,
-    /// Its index in the cell's shard.
-    pub index: u32,
-    /// Its index in the input splat file, where the profile keeps it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub input_index: Option<u32>,
-    /// Its mean.
-    pub position_in_world: DVec3,
-    /// Its score.
-    pub score: f32,
-    /// Distance from `near`.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub distance: Option<f64>,
-}
-
-/// Why there is no answer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum ReasonKind {
-    /// No Gaussian reaches the threshold.
-    BelowThreshold,
-    /// Gaussians match, but no cluster has enough of them.
-    ClustersTooSmall,
-    /// No Gaussian with an embedding lies in the part of space asked for.
-    NothingThere,
-}
-
-/// Why there is no answer, and what came nearest.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Reason {
-    /// Kind.
-    pub kind: ReasonKind,
-    /// For people.
-    pub detail: String,
-    /// Best score of a Gaussian.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub best_score: Option<f32>,
-    /// Where that Gaussian lies.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub best_position_in_world: Option<DVec3>,
-}
-
-/// Answers a checked request about a scene. `query`: the text's vector, `[dim]`, unit length.
+/// Answers a checked request about a scene: one answer to each question, in their order. `questions`: the
+/// vectors of the request's texts, each with those of its negatives.
 ///
-/// Same scene, vector and request: same answers, for any number of threads.
+/// Same scene, vectors and request: same answers, for any number of threads, asked alone or together.
 /// # Errors
 /// [`ScoreError`].
-pub fn answer(scene: &Scene<'_>, query: &[f32], request: &QueryRequest) -> Result<Answers, ScoreError> {
+pub fn answer(
+    scene: &Scene<'_>,
+    questions: &[Question],
+    request: &QueryRequest,
+) -> Result<Vec<Answers>, ScoreError> {
+    let searches = Search::batch(scene.shards, questions, request.region(), request.precision())?;
+    let asked = request.texts.iter().zip(questions).zip(&searches);
+    Ok(asked.map(|((text, question), search)| answer_one(scene, text, question, search, request)).collect())
+}
+
+fn answer_one(
+    scene: &Scene<'_>,
+    text: &str,
+    question: &Question,
+    search: &Search<'_>,
+    request: &QueryRequest,
+) -> Answers {
     let manifest = scene.manifest;
-    let threshold = request.threshold.unwrap_or(manifest.encoder.default_threshold);
+    let scale = Scale::of(question);
+    let (threshold, threshold_source) = scale.threshold(request, manifest);
+    let score_threshold = scale.to_score(threshold);
     let limit = request.limit.unwrap_or(DEFAULT_LIMIT);
-    let question = Question::new(query);
-    let region = Region { ball: request.ball(), bounds: None };
-    let search = Search::new(scene.shards, &question, region, Precision::Exact)?;
-    let matches = search.matching(threshold);
-    let exact = search.is_exact();
+    let mut matches = search.matching(score_threshold);
+    matches.runs.iter_mut().for_each(|run| run.score = scale.shown(run.score));
     let mut clustering = None;
     let found = match request.level {
         Level::Clusters => {
             let voxel = request.voxel.unwrap_or_else(|| default_voxel(manifest));
-            let grouped = cluster(scene.shards, &matches.runs, voxel, request.min_count);
+            let grouping =
+                Grouping { voxel, min_count: request.min_count, threshold, alignment: alignment(manifest) };
+            let grouped = cluster(scene.shards, &matches.runs, &grouping);
             clustering = Some(Clustering {
                 voxel: grouped.voxel,
                 min_count: request.min_count,
@@ -215,33 +90,92 @@ pub fn answer(scene: &Scene<'_>, query: &[f32], request: &QueryRequest) -> Resul
             });
             Found::Clusters(rank(grouped.clusters, threshold, voxel, limit, request.near, manifest))
         }
-        Level::Gaussians => Found::Gaussians(gaussians(scene, &search, limit, threshold, request.near)),
+        Level::Gaussians => {
+            let mut hits = search.best(limit, score_threshold, request.near);
+            hits.iter_mut().for_each(|hit| hit.score = scale.shown(hit.score));
+            Found::Gaussians(hits)
+        }
     };
-    let reason = found.is_empty().then(|| reason(&search, request, threshold, matches.n_gaussians));
+    let reason = found.is_empty().then(|| reason(search, scale, request, threshold, matches.n_gaussians));
     // Gaussians of exact shards are listed with their own scores, clusters with their rows'.
-    let score_error_bound = match (exact, request.level) {
-        (true, Level::Gaussians) => rounding_bound(query.len()),
+    let score_error_bound = scale.error_bound(match (search.is_exact(), request.level) {
+        (true, Level::Gaussians) => question.rounding_bound(),
         _ => search.score_error_bound(),
-    };
-    let (centre, radius) = scene.fetched;
-    Ok(Answers {
-        text: request.text.clone(),
+    });
+    Answers {
+        text: text.to_owned(),
+        negatives: request.negatives.phrases().into_iter().map(str::to_owned).collect(),
         level: request.level,
         scene: manifest.scene.clone(),
         generation: manifest.generation,
         unit: if manifest.metric { "m" } else { "world" },
+        score_kind: scale.0,
         threshold,
+        threshold_source,
         n_searched: search.searched().map(|shard| shard.n_with_evidence() as u64).sum(),
         n_matching: matches.n_gaussians,
-        exact,
+        is_exact: search.is_exact(),
         score_error_bound,
-        area_fetched: request
-            .ball()
-            .map(|ball| ball.centre_in_world.distance(centre) + ball.radius <= radius),
+        area_fetched: area_fetched(scene.fetched, request),
         clustering,
-        answers: found,
         reason,
-    })
+        answers: found,
+    }
+}
+
+/// How scores are shown: as they are, or as relevancies.
+#[derive(Clone, Copy)]
+struct Scale(ScoreKind);
+
+impl Scale {
+    fn of(question: &Question) -> Self {
+        Self(if question.negatives.is_empty() { ScoreKind::Cosine } else { ScoreKind::Relevancy })
+    }
+
+    fn threshold(self, request: &QueryRequest, manifest: &Manifest) -> (f32, ThresholdSource) {
+        match (request.threshold, self.0) {
+            (Some(threshold), _) => (threshold, ThresholdSource::Request),
+            (None, ScoreKind::Relevancy) => (RELEVANCY_THRESHOLD, ThresholdSource::Relevancy),
+            (None, ScoreKind::Cosine) => calibrated_threshold(manifest.encoder.default_threshold, None),
+        }
+    }
+
+    fn shown(self, score: f32) -> f32 {
+        match self.0 {
+            ScoreKind::Cosine => score,
+            ScoreKind::Relevancy => relevancy(score),
+        }
+    }
+
+    fn to_score(self, shown: f32) -> f32 {
+        match self.0 {
+            ScoreKind::Cosine => shown,
+            ScoreKind::Relevancy => score_of_relevancy(shown),
+        }
+    }
+
+    fn error_bound(self, of_score: f32) -> f32 {
+        match self.0 {
+            ScoreKind::Cosine => of_score,
+            // A sigmoid is nowhere steeper than a quarter of its steepness at 0.
+            ScoreKind::Relevancy => (of_score * RELEVANCY_STEEPNESS / 4.0 + f32::EPSILON).min(1.0),
+        }
+    }
+}
+
+/// Returns whether the region asked for was fetched: surely where the ball or the box was, since only
+/// what lies in both was asked for.
+fn area_fetched((centre, radius): (DVec3, f64), request: &QueryRequest) -> Option<bool> {
+    let region = request.region();
+    let ball = region.ball.map(|ball| ball.centre_in_world.distance(centre) + ball.radius <= radius);
+    let bounds = region.bounds.map(|b| (b.min - centre).abs().max((b.max - centre).abs()).length() <= radius);
+    ball.into_iter().chain(bounds).reduce(|a, b| a || b)
+}
+
+/// Returns how boxes may be turned: a metric or geo-referenced world has z up (`frames.rs`).
+fn alignment(manifest: &Manifest) -> Alignment {
+    let z_is_up = manifest.metric || manifest.geo_reference.is_some();
+    if z_is_up { Alignment::Gravity } else { Alignment::Principal }
 }
 
 /// Returns the edge of the voxels where a request states none: 0.25 m in a metric scene, else a 64th
@@ -296,6 +230,7 @@ fn rank(
         box_min_in_world: cluster.box_in_world.min,
         box_max_in_world: cluster.box_in_world.max,
         size: cluster.box_in_world.size(),
+        oriented_box: cluster.oriented_box,
         score: cluster.score,
         best_score: cluster.best_score,
         n_gaussians: cluster.n_gaussians,
@@ -305,39 +240,17 @@ fn rank(
     answers.collect()
 }
 
-fn gaussians(
-    scene: &Scene<'_>,
+fn reason(
     search: &Search<'_>,
-    limit: usize,
+    scale: Scale,
+    request: &QueryRequest,
     threshold: f32,
-    near: Option<DVec3>,
-) -> Vec<GaussianAnswer> {
-    let hits = search.best(limit, threshold, near).into_iter().enumerate();
-    let answers = hits.map(|(at, hit)| {
-        let shard = &scene.shards[hit.shard as usize];
-        let position_in_world = shard.position_in_world(hit.index as usize);
-        GaussianAnswer {
-            rank: at + 1,
-            cell_id: shard.header.cell_id,
-            index: hit.index,
-            input_index: shard.exact.map(|exact| exact.input_indices[hit.index as usize]),
-            position_in_world,
-            score: hit.score,
-            distance: near.map(|near| near.distance(position_in_world)),
-        }
+    n_matching: u64,
+) -> Reason {
+    let place = request.region();
+    let best = search.best(1, f32::NEG_INFINITY, request.near).first().map(|hit| {
+        (scale.shown(hit.score), search.shards()[hit.shard as usize].position_in_world(hit.index as usize))
     });
-    answers.collect()
-}
-
-fn reason(search: &Search<'_>, request: &QueryRequest, threshold: f32, n_matching: u64) -> Reason {
-    let place = match request.ball() {
-        Some(ball) => format!(" within {} of {}", ball.radius, ball.centre_in_world),
-        None => String::new(),
-    };
-    let best = search
-        .best(1, f32::NEG_INFINITY, request.near)
-        .first()
-        .map(|hit| (hit.score, search.shards()[hit.shard as usize].position_in_world(hit.index as usize)));
     let (kind, detail) = match best {
         None => (
             ReasonKind::NothingThere,
@@ -350,9 +263,8 @@ fn reason(search: &Search<'_>, request: &QueryRequest, threshold: f32, n_matchin
                 request.min_count
             ),
         ),
-        Some(best) => {
+        Some((score, at)) => {
             let n: usize = search.searched().map(ShardView::n_with_evidence).sum();
-            let (score, at) = best;
             (
                 ReasonKind::BelowThreshold,
                 format!(

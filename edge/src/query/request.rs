@@ -1,15 +1,25 @@
 //! What can be asked, and its limits.
 
+use std::fmt;
 use std::str::FromStr;
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
+use slag_common::frames::Aabb;
 
-use crate::score::{Ball, MAX_COORDINATE};
+use crate::score::{Ball, MAX_COORDINATE, Precision, Region};
 use crate::text::MAX_TEXT_BYTES;
 
-/// More answers than this are refused: a client that wants them all reads the shards.
-pub const MAX_LIMIT: usize = 10_000;
+/// More clusters than this, over all texts of a request, are refused.
+pub const MAX_CLUSTERS: usize = 10_000;
+/// More Gaussians than this, over all texts of a request, are refused: 12 MB while they are sent.
+pub const MAX_GAUSSIANS: usize = 1_000_000;
+/// Texts of one request.
+pub const MAX_TEXTS: usize = 32;
+/// Negatives of one request.
+pub const MAX_NEGATIVES: usize = 16;
+/// What LERF compares every text with (Kerr et al. 2023, section 3.3).
+pub const CANONICAL_NEGATIVES: [&str; 4] = ["object", "things", "stuff", "texture"];
 /// Answers without a limit in the request.
 pub const DEFAULT_LIMIT: usize = 10;
 /// Smaller clusters are dropped, unless the request says otherwise.
@@ -48,6 +58,15 @@ pub enum Level {
     Gaussians,
 }
 
+impl fmt::Display for Level {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Clusters => "clusters",
+            Self::Gaussians => "gaussians",
+        })
+    }
+}
+
 impl FromStr for Level {
     type Err = String;
 
@@ -57,6 +76,60 @@ impl FromStr for Level {
             "gaussians" => Ok(Self::Gaussians),
             _ => Err("clusters or gaussians".into()),
         }
+    }
+}
+
+/// What a question's thing is told from.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum Negatives {
+    /// Nothing: scores are cosines.
+    #[default]
+    None,
+    /// [`CANONICAL_NEGATIVES`].
+    Canonical,
+    /// These phrases.
+    Phrases(Vec<String>),
+}
+
+impl Negatives {
+    /// Returns the phrases.
+    pub fn phrases(&self) -> Vec<&str> {
+        match self {
+            Self::None => Vec::new(),
+            Self::Canonical => CANONICAL_NEGATIVES.to_vec(),
+            Self::Phrases(phrases) => phrases.iter().map(String::as_str).collect(),
+        }
+    }
+}
+
+impl FromStr for Negatives {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let phrases: Vec<String> = text.split(',').map(|phrase| phrase.trim().to_owned()).collect();
+        match text.trim() {
+            "none" => Ok(Self::None),
+            "canonical" => Ok(Self::Canonical),
+            _ if phrases.iter().any(String::is_empty) || phrases.len() > MAX_NEGATIVES => {
+                Err(format!("none, canonical, or 1 to {MAX_NEGATIVES} phrases A,B,C"))
+            }
+            _ => Ok(Self::Phrases(phrases)),
+        }
+    }
+}
+
+/// Parses `X0,Y0,Z0,X1,Y1,Z1`: two opposite corners of a box.
+///
+/// # Errors
+/// What was expected.
+pub fn parse_box(text: &str) -> Result<Aabb, String> {
+    let numbers: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
+    match numbers.as_deref() {
+        Some([a, b, c, d, e, f]) if [a, b, c, d, e, f].iter().all(|v| v.abs() <= MAX_COORDINATE) => {
+            let (one, other) = (DVec3::new(*a, *b, *c), DVec3::new(*d, *e, *f));
+            Ok(Aabb { min: one.min(other), max: one.max(other) })
+        }
+        _ => Err(format!("six numbers X0,Y0,Z0,X1,Y1,Z1 within ±{MAX_COORDINATE:e}")),
     }
 }
 
@@ -72,39 +145,48 @@ pub fn parse_point(text: &str) -> Result<DVec3, String> {
     }
 }
 
-/// A question.
+/// One or several questions of the same kind.
 #[derive(Clone, Debug, PartialEq)]
 pub struct QueryRequest {
-    /// What to look for.
-    pub text: String,
-    /// Most answers; [`DEFAULT_LIMIT`] if absent.
+    /// What to look for: each is answered by itself.
+    pub texts: Vec<String>,
+    /// What the things looked for are told from.
+    pub negatives: Negatives,
+    /// Most answers to each; [`DEFAULT_LIMIT`] if absent.
     pub limit: Option<usize>,
-    /// Cosine from which a Gaussian matches; the scene's own if absent.
+    /// Cosine, or relevancy with negatives, from which a Gaussian matches; the scene's own if absent.
     pub threshold: Option<f32>,
     /// Where the asker is: answers carry their distance from it and nearer ones rank higher.
     pub near: Option<DVec3>,
     /// Only Gaussians within this distance of `near` count, world units.
     pub radius: Option<f64>,
+    /// Only Gaussians within this box count.
+    pub bounds: Option<Aabb>,
     /// What answers are made of.
     pub level: Level,
     /// Edge of the voxels that clusters are joined by, world units; the scene's own if absent.
     pub voxel: Option<f64>,
     /// Clusters with fewer Gaussians are dropped, and counted.
     pub min_count: u64,
+    /// Whether exact embeddings are used, of shards that carry them.
+    pub exact: bool,
 }
 
 impl QueryRequest {
     /// Returns the question for a text, all else as by default.
     pub fn new(text: impl Into<String>) -> Self {
         Self {
-            text: text.into(),
+            texts: vec![text.into()],
+            negatives: Negatives::None,
             limit: None,
             threshold: None,
             near: None,
             radius: None,
+            bounds: None,
             level: Level::default(),
             voxel: None,
             min_count: DEFAULT_MIN_COUNT,
+            exact: true,
         }
     }
 
@@ -117,21 +199,54 @@ impl QueryRequest {
         let refuse = |parameter: &str, found: &dyn ToString, expected: String| {
             Err(RequestError::new(parameter, &found.to_string(), expected))
         };
-        if self.text.len() > MAX_TEXT_BYTES {
-            let found = format!("{} bytes", self.text.len());
-            return refuse("text", &found, format!("at most {MAX_TEXT_BYTES} bytes"));
+        if !(1..=MAX_TEXTS).contains(&self.texts.len()) {
+            return refuse(
+                "text",
+                &format!("{} of them", self.texts.len()),
+                format!("1 to {MAX_TEXTS} texts"),
+            );
         }
-        if self.text.trim().is_empty() {
-            return refuse("text", &self.text, "words to look for".into());
+        let negatives = self.negatives.phrases();
+        if negatives.len() > MAX_NEGATIVES {
+            let found = format!("{} of them", negatives.len());
+            return refuse("negatives", &found, format!("at most {MAX_NEGATIVES} phrases"));
         }
-        if self.text.chars().any(|c| c.is_control() && !c.is_whitespace()) {
-            return refuse("text", &self.text, "no control characters".into());
+        let texts = self.texts.iter().map(|text| ("text", text.as_str()));
+        for (parameter, text) in texts.chain(negatives.iter().map(|text| ("negatives", *text))) {
+            if text.len() > MAX_TEXT_BYTES {
+                let found = format!("{} bytes", text.len());
+                return refuse(parameter, &found, format!("at most {MAX_TEXT_BYTES} bytes"));
+            }
+            if text.trim().is_empty() {
+                return refuse(parameter, &text, "words to look for".into());
+            }
+            if text.chars().any(|c| c.is_control() && !c.is_whitespace()) {
+                return refuse(parameter, &text, "no control characters".into());
+            }
         }
-        if self.limit.is_some_and(|limit| !(1..=MAX_LIMIT).contains(&limit)) {
-            return refuse("limit", &self.limit.unwrap_or(0), format!("1 to {MAX_LIMIT}"));
+        let most = match self.level {
+            Level::Clusters => MAX_CLUSTERS,
+            Level::Gaussians => MAX_GAUSSIANS,
+        } / self.texts.len();
+        if let Some(limit) = self.limit.filter(|limit| !(1..=most).contains(limit)) {
+            return refuse("limit", &limit, format!("1 to {most} {} a text", self.level));
         }
-        if let Some(threshold) = self.threshold.filter(|t| !(-1.0..=1.0).contains(t)) {
-            return refuse("threshold", &threshold, "a cosine, -1 to 1".into());
+        let (thresholds, expected) = match self.negatives {
+            Negatives::None => (-1.0..=1.0, "a cosine, -1 to 1"),
+            _ => (0.0..=1.0, "a relevancy, 0 to 1, since there are negatives"),
+        };
+        if let Some(threshold) = self.threshold.filter(|t| !thresholds.contains(t)) {
+            return refuse("threshold", &threshold, expected.into());
+        }
+        if let Some(bounds) = self.bounds.filter(|b| {
+            !(b.min.cmple(b.max).all() && b.min.abs().max(b.max.abs()).max_element() <= MAX_COORDINATE)
+        }) {
+            let found = format!("{} to {}", bounds.min, bounds.max);
+            return refuse(
+                "box",
+                &found,
+                format!("two corners, the lower first, within ±{MAX_COORDINATE:e}"),
+            );
         }
         if let Some(near) =
             self.near.filter(|near| !(near.abs().max_element() <= MAX_COORDINATE && near.is_finite()))
@@ -153,10 +268,16 @@ impl QueryRequest {
         Ok(())
     }
 
-    /// Returns the part of space asked for, if it is bounded.
-    pub fn ball(&self) -> Option<Ball> {
-        let (centre_in_world, radius) = self.near.zip(self.radius)?;
-        Some(Ball { centre_in_world, radius })
+    /// Returns the part of space asked for.
+    pub fn region(&self) -> Region {
+        let ball = self.near.zip(self.radius);
+        let ball = ball.map(|(centre_in_world, radius)| Ball { centre_in_world, radius });
+        Region { ball, bounds: self.bounds }
+    }
+
+    /// Returns which data scores come from.
+    pub fn precision(&self) -> Precision {
+        if self.exact { Precision::Exact } else { Precision::Rows }
     }
 }
 
@@ -172,9 +293,32 @@ mod tests {
             edit(&mut request);
             request.check().expect_err("must be refused").parameter
         };
-        assert_eq!(refused(|r| r.text = " \t ".into()), "text");
-        assert_eq!(refused(|r| r.text = "x".repeat(513)), "text");
-        assert_eq!(refused(|r| r.text = "a\u{1b}[2Jb".into()), "text");
+        assert_eq!(refused(|r| r.texts = vec![" \t ".into()]), "text");
+        assert_eq!(refused(|r| r.texts.push("x".repeat(513))), "text");
+        assert_eq!(refused(|r| r.texts.push("a\u{1b}[2Jb".into())), "text");
+        assert_eq!(refused(|r| r.texts.clear()), "text");
+        assert_eq!(refused(|r| r.texts = vec!["a".into(); MAX_TEXTS + 1]), "text");
+        assert_eq!(refused(|r| r.negatives = Negatives::Phrases(vec!["\0".into()])), "negatives");
+        assert_eq!(
+            refused(|r| r.negatives = Negatives::Phrases(vec!["a".into(); MAX_NEGATIVES + 1])),
+            "negatives"
+        );
+        assert_eq!(refused(|r| (r.negatives, r.threshold) = (Negatives::Canonical, Some(-0.1))), "threshold");
+        assert_eq!(refused(|r| r.limit = Some(MAX_CLUSTERS + 1)), "limit");
+        assert_eq!(refused(|r| (r.level, r.limit) = (Level::Gaussians, Some(MAX_GAUSSIANS + 1))), "limit");
+        assert_eq!(
+            refused(|r| {
+                (r.level, r.limit) = (Level::Gaussians, Some(MAX_GAUSSIANS / 2 + 1));
+                r.texts.push("table".into());
+            }),
+            "limit"
+        );
+        let bounds = |min: f64, max: f64| Some(Aabb { min: DVec3::splat(min), max: DVec3::splat(max) });
+        let boxes = [bounds(1.0, 0.0), bounds(f64::NAN, 0.0), bounds(0.0, f64::INFINITY), bounds(-1e10, 0.0)];
+        for bounds in boxes {
+            let request = QueryRequest { bounds, ..QueryRequest::new("chair") };
+            assert_eq!(request.check().expect_err("must be refused").parameter, "box");
+        }
         assert_eq!(refused(|r| r.limit = Some(0)), "limit");
         assert_eq!(refused(|r| r.limit = Some(usize::MAX)), "limit");
         assert_eq!(refused(|r| r.threshold = Some(f32::NAN)), "threshold");
@@ -193,6 +337,22 @@ mod tests {
         assert_eq!(parse_point("1, -2.5,3e2"), Ok(DVec3::new(1.0, -2.5, 300.0)));
         for bad in ["", "1,2", "1,2,3,4", "1,2,x", "NaN,0,0", "inf,0,0", "0,0,1e10"] {
             assert!(parse_point(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn negatives_and_boxes_parse_or_say_what_they_should_be() {
+        assert_eq!("none".parse(), Ok(Negatives::None));
+        assert_eq!(" canonical".parse(), Ok(Negatives::Canonical));
+        let phrases = Negatives::Phrases(vec!["white wall".into(), "floor".into()]);
+        assert_eq!("white wall, floor".parse(), Ok(phrases));
+        for bad in ["", ",", "wall,,floor", &["x"; MAX_NEGATIVES + 1].join(",")] {
+            assert!(bad.parse::<Negatives>().is_err(), "{bad}");
+        }
+        let bounds = Aabb { min: DVec3::new(-1.0, 0.0, 2.0), max: DVec3::new(4.0, 5.0, 3.0) };
+        assert_eq!(parse_box("4,0, 3,-1,5,2"), Ok(bounds));
+        for bad in ["", "1,2,3", "1,2,3,4,5", "1,2,3,4,5,6,7", "0,0,0,1,1,NaN", "0,0,0,1,1,1e10"] {
+            assert!(parse_box(bad).is_err(), "{bad}");
         }
     }
 }

@@ -1,4 +1,4 @@
-use slag_common::frames::GeoReference;
+use slag_common::frames::{Aabb, GeoReference, Geographic};
 
 use super::*;
 use crate::testing::{BuiltShard, Member, TestShard, manifest_of, normalised};
@@ -11,12 +11,28 @@ fn thing(cell_id: u32, at: DVec3, n: u16, cosine: f32) -> TestShard {
 }
 
 fn ask(built: &[BuiltShard], edit: impl FnOnce(&mut QueryRequest, &mut Manifest)) -> Answers {
+    ask_about(built, &[Question::new([1.0, 0.0])], edit).remove(0)
+}
+
+fn ask_about(
+    built: &[BuiltShard],
+    questions: &[Question],
+    edit: impl FnOnce(&mut QueryRequest, &mut Manifest),
+) -> Vec<Answers> {
     let (mut request, mut manifest) = (QueryRequest::new("thing"), manifest_of(built, 7));
     edit(&mut request, &mut manifest);
     request.check().expect("a sound request");
     let shards: Vec<_> = built.iter().map(BuiltShard::view).collect();
     let scene = Scene { shards: &shards, manifest: &manifest, fetched: (DVec3::ZERO, 50.0) };
-    answer(&scene, &[1.0, 0.0], &request).expect("answers")
+    answer(&scene, questions, &request).expect("answers")
+}
+
+fn described(built: &[BuiltShard], answers: &Answers, near: Option<DVec3>) -> Vec<GaussianAnswer> {
+    let Found::Gaussians(hits) = &answers.answers else { panic!("gaussians") };
+    let describe = |(at, hit): (usize, &crate::score::Hit)| {
+        GaussianAnswer::new(at, hit, &built[hit.shard as usize].view(), near)
+    };
+    hits.iter().enumerate().map(describe).collect()
 }
 
 fn clusters(answers: &Answers) -> &[ClusterAnswer] {
@@ -41,7 +57,7 @@ fn clusters_are_ranked_nearest_best() {
     let yard = yard();
     let answers = ask(&yard, |_, _| ());
     assert_eq!((answers.n_searched, answers.n_matching, answers.unit), (724, 224, "m"));
-    assert_eq!((answers.reason.as_ref(), answers.area_fetched, answers.exact), (None, None, false));
+    assert_eq!((answers.reason.as_ref(), answers.area_fetched, answers.is_exact), (None, None, false));
     let found = clusters(&answers);
     // Equal things, no place to start from: by first Gaussian. The four Gaussians are too few.
     assert_eq!(found.iter().map(|c| c.id.as_str()).collect::<Vec<_>>(), ["3-0", "4-0", "5-0"]);
@@ -122,10 +138,11 @@ fn empty_answers_say_why() {
 #[test]
 fn gaussians_come_best_then_nearest_first() {
     let near = DVec3::new(20.355, 0.0, 0.0);
-    let answers = ask(&yard(), |request, _| {
+    let yard = yard();
+    let answers = ask(&yard, |request, _| {
         (request.level, request.limit, request.near) = (Level::Gaussians, Some(7), Some(near));
     });
-    let Found::Gaussians(found) = &answers.answers else { panic!("gaussians") };
+    let found = described(&yard, &answers, Some(near));
     let names: Vec<(u32, u32)> = found.iter().map(|g| (g.cell_id, g.index)).collect();
     // Cell 6 has the best score, its Gaussians in order of x; then the two things tie, the near one first.
     assert_eq!(names, [(6, 3), (6, 2), (6, 1), (6, 0), (3, 35), (3, 36), (3, 34)]);
@@ -137,9 +154,150 @@ fn exact_shards_answer_exactly() {
     let exact = [thing(1, DVec3::ZERO, 30, 0.7).build(true)];
     let clusters_of = ask(&exact, |_, _| ());
     let gaussians = ask(&exact, |request, _| request.level = Level::Gaussians);
-    assert!(clusters_of.exact && gaussians.exact && gaussians.score_error_bound < 1e-5);
-    let Found::Gaussians(found) = &gaussians.answers else { panic!("gaussians") };
+    assert!(clusters_of.is_exact && gaussians.is_exact && gaussians.score_error_bound < 1e-5);
+    let found = described(&exact, &gaussians, None);
     assert_eq!((found.len(), found[2].input_index), (DEFAULT_LIMIT, Some(7)));
+}
+
+/// By rows alone, the same shards answer as compact ones do, and say so.
+#[test]
+fn exactness_is_a_choice() {
+    let exact = [thing(1, DVec3::ZERO, 30, 0.7).build(true)];
+    let rows = ask(&exact, |request, _| (request.level, request.exact) = (Level::Gaussians, false));
+    let compact = [thing(1, DVec3::ZERO, 30, 0.7).build(false)];
+    assert_eq!(rows, ask(&compact, |request, _| request.level = Level::Gaussians));
+    assert!(!rows.is_exact && rows.score_error_bound > 1e-5, "{}", rows.score_error_bound);
+}
+
+/// Oracle: cosines to both axes, and LERF's formula.
+#[test]
+fn negatives_make_relevancies() {
+    let yard = yard();
+    let question = Question { negatives: vec![[0.0, 1.0].into()], ..Question::new([1.0, 0.0]) };
+    let ask = |edit: fn(&mut QueryRequest)| {
+        let mut answers = ask_about(&yard, std::slice::from_ref(&question), |request, _| {
+            request.negatives = Negatives::Phrases(vec!["other".into()]);
+            edit(request);
+        });
+        answers.remove(0)
+    };
+    let expected = |cosine: f64| {
+        let other = (1.0 - cosine * cosine).sqrt();
+        1.0 / (1.0 + (-10.0 * (cosine - other)).exp())
+    };
+    let answers = ask(|_| ());
+    assert_eq!((answers.score_kind, answers.threshold), (ScoreKind::Relevancy, 0.5));
+    assert_eq!((answers.threshold_source, &answers.negatives[0][..]), (ThresholdSource::Relevancy, "other"));
+    // 0.7 is nearer to the other axis.
+    assert_eq!(answers.n_matching, 204);
+    let found = clusters(&answers);
+    assert_eq!(found.iter().map(|c| c.id.as_str()).collect::<Vec<_>>(), ["3-0", "4-0"]);
+    let bound = f64::from(answers.score_error_bound);
+    assert!((f64::from(found[0].score) - expected(0.9)).abs() <= bound && bound < 0.01, "{bound}");
+    let answers = ask(|request| request.threshold = Some(0.4));
+    assert_eq!((answers.n_matching, answers.threshold_source), (224, ThresholdSource::Request));
+    let all = ask(|request| (request.threshold, request.level) = (Some(0.0), Level::Gaussians));
+    assert_eq!(all.n_matching, 724);
+    let best = &described(&yard, &all, None)[0];
+    assert!((f64::from(best.score) - expected(0.95)).abs() <= bound, "{best:?}");
+    let none = ask(|request| request.threshold = Some(1.0)).reason.expect("nothing is certain");
+    assert!((f64::from(none.best_score.expect("the best")) - expected(0.95)).abs() <= bound);
+}
+
+/// Half way between question and negative relevancies are steepest: a row's members differ from it by the
+/// bound, nearly.
+#[test]
+fn relevancies_keep_within_their_bound_and_use_it() {
+    let angles = |turn: f64| [-turn, turn].map(|turn| turn + std::f64::consts::FRAC_PI_4);
+    let member = |angle: &f64| Member {
+        steps: [0; 3],
+        embedding: [angle.cos(), angle.sin()].map(|v| v as f32).to_vec(),
+    };
+    let row = |turn| [TestShard::new(vec![angles(turn).iter().map(member).collect()]).build(false)];
+    let question = Question { negatives: vec![[0.0, 1.0].into()], ..Question::new([1.0, 0.0]) };
+    let ask = |row: &[BuiltShard]| {
+        let mut answers = ask_about(row, std::slice::from_ref(&question), |request, _| {
+            request.negatives = Negatives::Phrases(vec!["other".into()]);
+            (request.level, request.threshold) = (Level::Gaussians, Some(0.0));
+        });
+        answers.remove(0)
+    };
+    // No relevancy is off by more than all there is.
+    assert_eq!(ask(&row(0.7)).score_error_bound, 1.0);
+    let row = row(0.02);
+    let answers = ask(&row);
+    for (angle, found) in angles(0.02).iter().zip(described(&row, &answers, None)) {
+        let truth = 1.0 / (1.0 + (-10.0 * (angle.cos() - angle.sin())).exp());
+        let share = (f64::from(found.score) - truth).abs() / f64::from(answers.score_error_bound);
+        assert!((0.9..=1.0).contains(&share), "{share} of {}", answers.score_error_bound);
+    }
+}
+
+/// Several questions at once are answered as each alone.
+#[test]
+fn batches_answer_as_single_questions_do() {
+    let yard = yard();
+    let questions = [Question::new([1.0, 0.0]), Question::new([0.0, 1.0]), Question::new([0.6, 0.8])];
+    for level in [Level::Clusters, Level::Gaussians] {
+        let texts = ["thing", "other", "third"].map(str::to_owned);
+        let together = ask_about(&yard, &questions, |request, _| {
+            (request.texts, request.level, request.limit) = (texts.to_vec(), level, Some(120));
+        });
+        assert_eq!(together.len(), 3);
+        for ((answers, question), text) in together.iter().zip(&questions).zip(&texts) {
+            let alone = ask_about(&yard, std::slice::from_ref(question), |request, _| {
+                (request.texts, request.level, request.limit) = (vec![text.clone()], level, Some(120));
+            });
+            assert_eq!(&alone[0], answers);
+            assert!(!answers.answers.is_empty());
+        }
+    }
+}
+
+#[test]
+fn boxes_bound_what_is_searched() {
+    let yard = yard();
+    let bounds = |min: [f64; 3], max: [f64; 3]| Some(Aabb { min: min.into(), max: max.into() });
+    let answers = ask(&yard, |request, _| request.bounds = bounds([-6.0, -1.0, -1.0], [-4.501, 1.0, 1.0]));
+    // Points at -5, -4.99, ..: 50 of them lie below -4.501.
+    assert_eq!((answers.n_matching, answers.area_fetched), (50, Some(true)));
+    let far = ask(&yard, |request, _| request.bounds = bounds([0.0; 3], [40.0, 40.0, 0.0]));
+    assert_eq!(far.area_fetched, Some(false));
+    // What lies in box and ball was fetched if either was.
+    let both = ask(&yard, |request, _| {
+        request.bounds = bounds([0.0; 3], [40.0, 40.0, 0.0]);
+        (request.near, request.radius) = (Some(DVec3::new(20.0, 0.0, 0.0)), Some(0.105));
+    });
+    assert_eq!((both.area_fetched, both.n_matching), (Some(true), 11));
+    let nothing = ask(&yard, |request, _| request.bounds = bounds([60.0; 3], [61.0; 3])).reason;
+    assert!(nothing.expect("nothing there").detail.contains("in the box [60, 60, 60] to [61, 61, 61]"));
+}
+
+/// A metric world has an up; of another only the principal axes are known.
+#[test]
+fn boxes_are_upright_where_up_is_known() {
+    // A ramp of 100 Gaussians, 1 cm apart along x and rising half as fast.
+    let embedding = vec![1.0, 0.0];
+    let members = (0..100).map(|i| Member { steps: [i * 2, 0, i], embedding: embedding.clone() }).collect();
+    let ramp = [TestShard { step: DVec3::splat(0.005), ..TestShard::new(vec![members]) }.build(false)];
+    let oriented = |metric: bool| {
+        clusters(&ask(&ramp, |request, manifest| (manifest.metric, request.voxel) = (metric, Some(0.25))))[0]
+            .oriented_box
+    };
+    let (upright, free) = (oriented(true), oriented(false));
+    assert_eq!((upright.alignment, free.alignment), (Alignment::Gravity, Alignment::Principal));
+    assert!((upright.size - DVec3::new(0.97, 0.0, 0.485)).length() < 1e-9, "{upright:?}");
+    assert!((free.size - DVec3::new(0.97 * 1.25f64.sqrt(), 0.0, 0.0)).length() < 1e-9, "{free:?}");
+    assert!((free.rotation_world_from_box * DVec3::X).dot(DVec3::new(2.0, 0.0, 1.0).normalize()) > 0.999_999);
+}
+
+#[test]
+fn thresholds_say_where_they_come_from() {
+    let answers = ask(&yard(), |request, _| request.threshold = Some(0.2));
+    assert_eq!((answers.threshold, answers.threshold_source), (0.2, ThresholdSource::Request));
+    let answers = ask(&yard(), |_, manifest| manifest.encoder.default_threshold = 0.8);
+    assert_eq!((answers.threshold, answers.threshold_source), (0.8, ThresholdSource::Encoder));
+    assert_eq!((answers.n_matching, answers.score_kind), (204, ScoreKind::Cosine));
 }
 
 #[test]

@@ -12,8 +12,8 @@ use clap::{Parser, ValueEnum};
 use qdrant_edge::{
     Distance, EdgeConfig, EdgeConfigBuilder, EdgeShard, EdgeVectorParamsBuilder, HnswIndexConfig, NamedQuery,
     PointId, PointInsertOperations, PointOperations, PointStruct, QuantizationConfig,
-    QuantizationSearchParams, QueryEnum, ScalarQuantization, ScalarQuantizationConfig, ScalarType,
-    SearchParams, SearchRequest, UpdateOperation, VectorInternal,
+    QuantizationSearchParams, QueryEnum, ScalarQuantizationConfig, ScalarType, SearchParams, SearchRequest,
+    UpdateOperation, VectorInternal,
 };
 use serde::{Deserialize, Serialize};
 
@@ -120,10 +120,19 @@ impl Dump {
         let floats = |name: &str, n: usize| -> Result<Vec<f32>> {
             let bytes = read(name)?;
             let expected = n.checked_mul(meta.dim).and_then(|n| n.checked_mul(4));
-            ensure!(Some(bytes.len()) == expected, "{name} has {} bytes, meta.json says [{n}][{}]", bytes.len(), meta.dim);
+            ensure!(
+                Some(bytes.len()) == expected,
+                "{name} has {} bytes, meta.json says [{n}][{}]",
+                bytes.len(),
+                meta.dim
+            );
             Ok(bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect())
         };
-        Ok(Self { meta, vectors: floats("vectors.f32", meta.n)?, queries: floats("queries.f32", meta.n_queries)? })
+        Ok(Self {
+            meta,
+            vectors: floats("vectors.f32", meta.n)?,
+            queries: floats("queries.f32", meta.n_queries)?,
+        })
     }
 
     fn query(&self, query: usize) -> &[f32] {
@@ -140,7 +149,11 @@ impl Dump {
 
 fn main() -> Result<()> {
     let args = Args::parse();
-    ensure!(args.runs >= 10, "--runs is {}, at least 10 are needed for a 99th percentile to mean anything", args.runs);
+    ensure!(
+        args.runs >= 10,
+        "--runs is {}, at least 10 are needed for a 99th percentile to mean anything",
+        args.runs
+    );
     let dump = Dump::read(&args.dump)?;
     if let Some(dir) = &args.ids {
         std::fs::create_dir_all(dir)?;
@@ -173,13 +186,18 @@ fn config(dim: usize, mode: Mode) -> EdgeConfig {
         payload_m: Some(0),
         inline_storage: None,
     };
-    let int8 = ScalarQuantizationConfig { r#type: ScalarType::Int8, quantile: Some(0.99), always_ram: Some(true) };
+    let int8 =
+        ScalarQuantizationConfig { r#type: ScalarType::Int8, quantile: Some(0.99), always_ram: Some(true) };
     // Unit vectors: the dot product is the cosine, and nothing is normalised a second time.
-    let mut vector = EdgeVectorParamsBuilder::new(dim, Distance::Dot).hnsw_config(no_graph.clone()).on_disk(false);
+    let mut vector =
+        EdgeVectorParamsBuilder::new(dim, Distance::Dot).hnsw_config(no_graph.clone()).on_disk(false);
     if mode == Mode::Int8 {
-        vector = vector.quantization_config(QuantizationConfig::Scalar(ScalarQuantization { scalar: int8 }));
+        vector = vector.quantization_config(QuantizationConfig::from(int8));
     }
-    EdgeConfigBuilder::new().vector(qdrant_edge::DEFAULT_VECTOR_NAME, vector.build()).hnsw_config(no_graph).build()
+    EdgeConfigBuilder::new()
+        .vector(qdrant_edge::DEFAULT_VECTOR_NAME, vector.build())
+        .hnsw_config(no_graph)
+        .build()
 }
 
 fn build(dump: &Dump, work: &Path, mode: Mode) -> Result<EdgeShard> {
@@ -199,7 +217,8 @@ fn build(dump: &Dump, work: &Path, mode: Mode) -> Result<EdgeShard> {
 }
 
 fn search(shard: &EdgeShard, query: &[f32], limit: usize, mode: Mode) -> Result<Vec<u32>> {
-    let quantization = QuantizationSearchParams { ignore: mode == Mode::Exact, rescore: Some(false), oversampling: None };
+    let quantization =
+        QuantizationSearchParams { ignore: mode == Mode::Exact, rescore: Some(false), oversampling: None };
     let found = shard.search(SearchRequest {
         query: QueryEnum::Nearest(NamedQuery { query: VectorInternal::Dense(query.to_vec()), using: None }),
         filter: None,
@@ -223,7 +242,8 @@ fn search(shard: &EdgeShard, query: &[f32], limit: usize, mode: Mode) -> Result<
 
 fn time(args: &Args, dump: &Dump, truth: &[Vec<f64>], mode: Mode) -> Result<ModeReport> {
     let work = args.work.clone().unwrap_or_else(|| args.dump.join(format!("qdrant-{}", mode.name())));
-    std::fs::create_dir(&work).with_context(|| format!("{}: the database needs a new folder", work.display()))?;
+    std::fs::create_dir(&work)
+        .with_context(|| format!("{}: the database needs a new folder", work.display()))?;
     let started = Instant::now();
     let shard = build(dump, &work, mode)?;
     let build_secs = started.elapsed().as_secs_f64();
@@ -274,7 +294,8 @@ fn recall(found: &[u32], scores: &[f64], limit: usize) -> f64 {
     let mut sorted = scores.to_vec();
     let (_, last, _) = sorted.select_nth_unstable_by(limit - 1, |a, b| b.total_cmp(a));
     let reached = *last - 1e-6;
-    let n = found.iter().filter(|id| scores.get(**id as usize).is_some_and(|score| *score >= reached)).count();
+    let n =
+        found.iter().filter(|id| scores.get(**id as usize).is_some_and(|score| *score >= reached)).count();
     n.min(limit) as f64 / limit as f64
 }
 

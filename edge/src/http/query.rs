@@ -1,0 +1,133 @@
+//! `GET /query`: short answers whole, long ones piece by piece.
+
+use std::io;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::task::{Context, Poll, ready};
+use std::time::Duration;
+
+use axum::body::{Body, Bytes};
+use axum::extract::rejection::QueryRejection;
+use axum::extract::{Query, State};
+use axum::http::{HeaderMap, HeaderValue, header};
+use axum::response::{IntoResponse, Response};
+use hyper::body::Frame;
+use tokio::sync::mpsc::{Receiver, Sender, channel};
+
+use super::{App, Problem, blocking, params};
+use crate::query::RequestError;
+
+/// Pieces made ahead of the client.
+const PIECES_AHEAD: usize = 2;
+
+/// Answers `/query`.
+pub async fn query(
+    State(app): State<Arc<App>>,
+    headers: HeaderMap,
+    pairs: Result<Query<Vec<(String, String)>>, QueryRejection>,
+) -> Result<Response, Problem> {
+    let Query(pairs) =
+        pairs.map_err(|e| RequestError::new("query string", &e.body_text(), "name=value pairs"))?;
+    let (request, format) = params::parse(&pairs, &headers)?;
+    request.check()?;
+    let permit = Arc::clone(&app.permits)
+        .try_acquire_owned()
+        .map_err(|_| Problem::overloaded(app.settings.max_queries))?;
+    let answering = blocking(&app, move |app| {
+        app.reload_if_stale();
+        let reply = app.engine.answer(&request)?;
+        let n_empty = reply.answers.iter().filter(|answers| answers.answers.is_empty()).count();
+        app.metrics.empty_answers.fetch_add(n_empty as u64, Ordering::Relaxed);
+        let mut pieces = reply.pieces(format).peekable();
+        let first = pieces.next().transpose().map_err(|e| Problem::internal(&e))?.unwrap_or_default();
+        let is_whole = pieces.peek().is_none();
+        // The permit is held until the work is done, even if nobody waits for it any more.
+        Ok((first, (!is_whole).then_some((pieces, permit))))
+    });
+    let limit = app.settings.query_timeout;
+    let (first, rest) =
+        tokio::time::timeout(limit, answering).await.map_err(|_| Problem::timeout(limit))??;
+    let body = match rest {
+        None => Body::from(first),
+        Some((pieces, permit)) => {
+            let (sender, receiver) = channel(PIECES_AHEAD);
+            let deadline = app.settings.stream_timeout;
+            tokio::spawn(async move {
+                let _permit = permit;
+                send_all(first, pieces, sender, deadline).await;
+            });
+            Body::new(Pieces { receiver, is_complete: false })
+        }
+    };
+    Ok(([(header::CONTENT_TYPE, HeaderValue::from_static(format.media_type()))], body).into_response())
+}
+
+/// What travels to the body.
+enum Message {
+    Piece(Bytes),
+    End,
+}
+
+/// Sends the pieces, each made off the async threads once the client took those before; gives up at the
+/// deadline, so that a client that reads slowly or not at all holds neither a permit nor the answers.
+async fn send_all(
+    first: Vec<u8>,
+    pieces: impl Iterator<Item = io::Result<Vec<u8>>> + Send + 'static,
+    to: Sender<Message>,
+    deadline: Duration,
+) {
+    let sending = async {
+        let (mut piece, mut pieces) = (Some(Ok(first)), pieces);
+        while let Some(Ok(bytes)) = piece {
+            if to.send(Message::Piece(bytes.into())).await.is_err() {
+                tracing::debug!("a client left before its answer ended");
+                return;
+            }
+            let next = tokio::task::spawn_blocking(move || (pieces.next(), pieces)).await;
+            (piece, pieces) = match next {
+                Ok(next) => next,
+                Err(error) => return tracing::error!("an answer broke off: {error}"),
+            };
+        }
+        match piece {
+            Some(Err(error)) => tracing::error!("an answer broke off: {error}"),
+            // Nothing is lost if the client is gone by now.
+            _ => drop(to.send(Message::End).await),
+        }
+    };
+    if tokio::time::timeout(deadline, sending).await.is_err() {
+        tracing::warn!("an answer was cut off: its client took more than {} s", deadline.as_secs_f64());
+    }
+}
+
+/// A body whose end is either reached or an error: what was cut off must not look complete.
+struct Pieces {
+    receiver: Receiver<Message>,
+    is_complete: bool,
+}
+
+impl hyper::body::Body for Pieces {
+    type Data = Bytes;
+    type Error = io::Error;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, io::Error>>> {
+        if self.is_complete {
+            return Poll::Ready(None);
+        }
+        Poll::Ready(match ready!(self.receiver.poll_recv(context)) {
+            Some(Message::Piece(bytes)) => Some(Ok(Frame::data(bytes))),
+            Some(Message::End) => {
+                self.is_complete = true;
+                None
+            }
+            None => {
+                self.is_complete = true;
+                Some(Err(io::Error::new(io::ErrorKind::TimedOut, "the answer was cut off")))
+            }
+        })
+    }
+}

@@ -1,0 +1,126 @@
+//! The description for programs is that of this program.
+
+use std::collections::BTreeSet;
+
+use super::*;
+
+fn description() -> Value {
+    serde_json::from_str(OPENAPI).expect("JSON")
+}
+
+fn names<'a>(names: impl IntoIterator<Item = &'a str>) -> BTreeSet<&'a str> {
+    names.into_iter().collect()
+}
+
+/// Checks a value against a schema: types, names (none undescribed, none of the required missing), enums.
+fn check(schema: &Value, value: &Value, at: &str) -> Result<(), String> {
+    if let Some(name) = schema["$ref"].as_str() {
+        let schema = description().pointer(name.trim_start_matches('#')).cloned();
+        return check(&schema.ok_or(format!("{at}: no {name}"))?, value, at);
+    }
+    if let Some(kinds) = schema["oneOf"].as_array() {
+        let errors: Vec<String> = kinds.iter().filter_map(|kind| check(kind, value, at).err()).collect();
+        let fits = kinds.len() - errors.len();
+        return if fits == 1 { Ok(()) } else { Err(format!("{at}: fits {fits} kinds: {errors:?}")) };
+    }
+    let is = |kind: &Value| match kind.as_str() {
+        Some("integer") => value.as_u64().is_some(),
+        Some("number") => value.is_number(),
+        Some("string") => value.is_string(),
+        Some("boolean") => value.is_boolean(),
+        Some("null") => value.is_null(),
+        Some("array") => value.is_array(),
+        Some("object") => value.is_object(),
+        _ => false,
+    };
+    let kinds = schema["type"].as_array().cloned().unwrap_or_else(|| vec![schema["type"].clone()]);
+    if !kinds.iter().any(is) {
+        return Err(format!("{at}: {value} is not of {}", schema["type"]));
+    }
+    if schema["enum"].as_array().is_some_and(|known| !known.contains(value)) {
+        return Err(format!("{at}: {value} is not in {}", schema["enum"]));
+    }
+    for (i, item) in value.as_array().into_iter().flatten().enumerate() {
+        check(&schema["items"], item, &format!("{at}[{i}]"))?;
+    }
+    if let (Some(members), Some(described)) = (value.as_object(), schema["properties"].as_object()) {
+        let required = schema["required"].as_array().into_iter().flatten().filter_map(Value::as_str);
+        if let Some(missing) = required.into_iter().find(|name| !members.contains_key(*name)) {
+            return Err(format!("{at}: {missing} is missing"));
+        }
+        for (name, member) in members {
+            let schema = described.get(name).ok_or(format!("{at}: {name} is not described"))?;
+            check(schema, member, &format!("{at}.{name}"))?;
+        }
+    }
+    Ok(())
+}
+
+#[tokio::test]
+async fn every_route_and_parameter_is_described() {
+    let service = Service::with_chair();
+    let (status, headers, served) = service.get("/openapi.json").await;
+    assert_eq!(
+        (status, &headers["content-type"]),
+        (StatusCode::OK, &"application/json".parse().expect("a value"))
+    );
+    let api = description();
+    assert_eq!(served, api);
+    assert_eq!(api["info"]["version"], env!("CARGO_PKG_VERSION"));
+    let paths = api["paths"].as_object().expect("paths");
+    assert_eq!(names(paths.keys().map(String::as_str)), names(ROUTES));
+    for path in ROUTES {
+        assert_ne!(service.get(path).await.0, StatusCode::NOT_FOUND, "{path} is described, not served");
+    }
+    let parameters = api["paths"]["/query"]["get"]["parameters"].as_array().expect("parameters");
+    assert_eq!(names(parameters.iter().filter_map(|p| p["name"].as_str())), names(params::NAMES));
+    // The parser knows each: it finds a wrong value, or nothing wrong.
+    for parameter in params::NAMES {
+        let (_, _, body) = service.get(&format!("/query?text=0&{parameter}=,&{parameter}=,")).await;
+        let is_text = parameter == "text";
+        assert_eq!(body["parameter"], parameter, "{body}");
+        assert!(is_text || !body["expected"].as_str().expect("text").starts_with("one of"), "{body}");
+    }
+    // People find them too.
+    let help = service.get("/").await.2;
+    let help = help.as_str().expect("text");
+    assert!(params::NAMES.iter().all(|name| help.contains(&format!("{name}="))), "{help}");
+    assert!(ROUTES.iter().all(|route| help.contains(&format!("GET {route}")) || *route == "/"));
+}
+
+#[tokio::test]
+async fn every_answer_is_as_described() {
+    let exact = {
+        let member = |i: u16| Member { steps: [i, 0, 0], embedding: vec![1.0, 0.0, 0.0] };
+        [TestShard::new(vec![(0..20).map(member).collect()]).build(true)]
+    };
+    let service = Service::new(Some(&exact), Settings::default());
+    let response_schema = |path: &str, status: StatusCode, kind: &str| {
+        let api = description();
+        let response = api["paths"][path]["get"]["responses"][status.as_str()].clone();
+        assert!(response.is_object(), "{path}: {status} is not described");
+        response["content"][kind]["schema"].clone()
+    };
+    let cases = [
+        ("/query", "text=0&near=0,0,0&radius=9"),
+        ("/query", "text=0&level=gaussians&near=0,0,0"),
+        ("/query", "text=0&level=gaussians&exact=false"),
+        ("/query", "text=0&text=1&negatives=2,1"),
+        ("/query", "text=1"),
+        ("/query", "text=0&min_count=21"),
+        ("/query", "text=0&box=900,900,900,901,901,901"),
+        ("/query", "text=0&limit=0"),
+        ("/query", "text=sofa"),
+        ("/query", "text=0&negatives=sofa"),
+        ("/status", ""),
+    ];
+    for (path, query) in cases {
+        let (status, headers, body) = service.get(&format!("{path}?{query}")).await;
+        let kind = headers["content-type"].to_str().expect("text");
+        let found = check(&response_schema(path, status, kind), &body, "");
+        assert_eq!(found, Ok(()), "{path}?{query}: {body:#}");
+    }
+    let empty = Service::new(None, Settings::default());
+    let (_, _, body) = empty.get("/status").await;
+    assert_eq!(check(&response_schema("/status", StatusCode::OK, "application/json"), &body, ""), Ok(()));
+}
