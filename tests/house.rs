@@ -5,6 +5,7 @@ use std::path::Path;
 
 use half::f16;
 use serde_json::Value;
+use slag_common::shard::Profile;
 use slag_encoder::lift::published::{read_field, read_regions};
 use slag_encoder::store::StoreReader;
 use slag_tests::*;
@@ -143,12 +144,63 @@ fn check_embeddings(house: &Path, store: &Path) {
     assert!(weight_errors[n * 95 / 100] <= 0.01);
 }
 
-/// Mean AUC within 0.01 of the reference's 0.795, mIoU within 0.02 of its 0.221; prints a table by word.
+/// A word's figures: area under the ROC curve, IoU of the multi-class answer.
+struct Words {
+    words: Vec<String>,
+    aucs: Vec<f64>,
+    ious: Vec<f64>,
+}
+
+impl Words {
+    fn means(&self) -> (f64, f64) {
+        let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+        (mean(&self.aucs), mean(&self.ious))
+    }
+}
+
+/// Compares the words' figures with the reference's, and those of each profile with the field's.
 fn check_words(house: &Path, store: &Path, models: &Path, dir: &Path) {
+    let bytes = fs_err::read(house.join("gt/reference.json")).expect("reads");
+    let reference: Value = serde_json::from_slice(&bytes).expect("JSON");
+    let reference = &reference["results"]["white"];
+    let words: Vec<String> = reference["auc"].as_object().expect("words").keys().cloned().collect();
+    let field = judge(house, store, models, dir, &words, None);
+    println!("{:<18} {:>7} {:>9} {:>7} {:>9}", "word", "AUC", "reference", "IoU", "reference");
+    for (w, word) in field.words.iter().enumerate() {
+        let [auc, iou] = ["auc", "iou"].map(|m| reference[m][word].as_f64().expect("a figure"));
+        println!("{word:<18} {:>7.4} {auc:>9.4} {:>7.4} {iou:>9.4}", field.aucs[w], field.ious[w]);
+    }
+    let (auc, iou) = field.means();
+    println!("{:<18} {auc:>7.4} {:>9} {iou:>7.4} {:>9}", "mean", reference["auc_mean"], reference["miou"]);
+    assert!((auc - reference["auc_mean"].as_f64().expect("a figure")).abs() <= 0.01);
+    assert!((iou - reference["miou"].as_f64().expect("a figure")).abs() <= 0.02);
+
+    let manifest = StoreReader::open(store).expect("a published store").manifest().clone();
+    for (profile, most_bytes) in
+        [(Profile::Compact, 10.0), (Profile::Balanced, 24.0), (Profile::Exact, 1100.0)]
+    {
+        let of_profile = judge(house, store, models, dir, &words, Some(profile)).means();
+        let bytes: u64 = manifest.cells.iter().map(|cell| cell.shards[&profile].len_bytes).sum();
+        let bytes = bytes as f64 / manifest.n_gaussians as f64;
+        println!("{profile}: {bytes:.2} bytes a Gaussian, AUC {:.4}, mIoU {:.4}", of_profile.0, of_profile.1);
+        assert!(bytes <= most_bytes);
+        // Half a point, as the profile promises; the others are closer.
+        assert!((of_profile.0 - auc).abs() <= 0.005 && of_profile.1 - iou >= -0.005, "{profile}");
+    }
+}
+
+/// Scores the words, by the field in full precision or as a profile decodes it, against the labels.
+fn judge(
+    house: &Path,
+    store: &Path,
+    models: &Path,
+    dir: &Path,
+    words: &[String],
+    profile: Option<Profile>,
+) -> Words {
     let read = |name: &str| -> Value {
         serde_json::from_slice(&fs_err::read(house.join(name)).expect("reads")).expect("JSON")
     };
-    let reference = read("gt/reference.json")["results"]["white"].clone();
     let instances = read("gt/instances.json");
     let category: BTreeMap<u64, String> = instances["instances"]
         .as_array()
@@ -161,12 +213,15 @@ fn check_words(house: &Path, store: &Path, models: &Path, dir: &Path) {
     let (objects, labels): (Vec<usize>, Vec<&String>) =
         truth.iter().enumerate().filter_map(|(k, id)| category.get(&u64::from(*id)).map(|c| (k, c))).unzip();
 
-    let words: Vec<String> = reference["auc"].as_object().expect("words").keys().cloned().collect();
     let mut scores = Vec::new();
-    for word in &words {
+    for word in words {
         let path = dir.join("scores.npy");
         let scores_to = ["--scores", text(&path), "--limit", "0"];
-        run(encoder(&["query", "--store", text(store), "--models", text(models), word]).args(scores_to));
+        let mut command = encoder(&["query", "--store", text(store), "--models", text(models), word]);
+        if let Some(profile) = profile {
+            command.args(["--profile", profile.name()]);
+        }
+        run(command.args(scores_to));
         let all: Vec<f32> = read_npy(&path);
         assert_eq!(all.len(), truth.len());
         // What was never seen scores below everything.
@@ -180,23 +235,14 @@ fn check_words(house: &Path, store: &Path, models: &Path, dir: &Path) {
         .iter()
         .map(|i| (0..words.len()).max_by(|a, b| scores[*a][*i].total_cmp(&scores[*b][*i])).expect("words"))
         .collect();
-    println!("{:<18} {:>7} {:>9} {:>7} {:>9}", "word", "AUC", "reference", "IoU", "reference");
     let (mut aucs, mut ious) = (Vec::new(), Vec::new());
     for (w, word) in words.iter().enumerate() {
         let positive: Vec<bool> = labels.iter().map(|label| *label == word).collect();
-        let auc = roc_auc(&scores[w], &positive);
+        aucs.push(roc_auc(&scores[w], &positive));
         let count = |test: &dyn Fn(bool, bool) -> bool| {
             of_words.iter().zip(&best).filter(|(i, b)| test(labels[**i] == word, **b == w)).count() as f64
         };
-        let iou = count(&|is, said| is && said) / count(&|is, said| is || said).max(1.0);
-        let [auc_then, iou_then] = ["auc", "iou"].map(|m| reference[m][word].as_f64().expect("a figure"));
-        println!("{word:<18} {auc:>7.4} {auc_then:>9.4} {iou:>7.4} {iou_then:>9.4}");
-        aucs.push(auc);
-        ious.push(iou);
+        ious.push(count(&|is, said| is && said) / count(&|is, said| is || said).max(1.0));
     }
-    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
-    let (auc, iou) = (mean(&aucs), mean(&ious));
-    println!("{:<18} {auc:>7.4} {:>9} {iou:>7.4} {:>9}", "mean", reference["auc_mean"], reference["miou"]);
-    assert!((auc - reference["auc_mean"].as_f64().expect("a figure")).abs() <= 0.01);
-    assert!((iou - reference["miou"].as_f64().expect("a figure")).abs() <= 0.02);
+    Words { words: words.to_vec(), aucs, ious }
 }

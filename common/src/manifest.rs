@@ -60,8 +60,22 @@ pub struct EncoderRecord {
     pub id: Hash32,
     /// Components of an embedding.
     pub dim: u32,
-    /// Cosine at or above which a Gaussian matches, unless the query says otherwise.
+    /// Cosine at or above which a Gaussian matches, unless the query or the calibration says otherwise.
     pub default_threshold: f32,
+    /// How texts score in this scene; there where the model states no threshold.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub calibration: Option<Calibration>,
+}
+
+/// How a bank of texts scores in a scene: nearly all pairs of text and Gaussian do not belong together, so
+/// this is what no match looks like in this scene, with this encoder.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Calibration {
+    /// Mean of the scores of all pairs.
+    pub score_mean: f32,
+    /// Their standard deviation, over all pairs (not within a text).
+    pub score_spread: f32,
 }
 
 /// A cell: a piece of space and its shards.
@@ -314,6 +328,7 @@ mod tests {
                 id: Hash32([7; 32]),
                 dim: 512,
                 default_threshold: 0.1,
+                calibration: None,
             },
             n_gaussians: 10,
             n_without_evidence: 1,

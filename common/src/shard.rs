@@ -340,12 +340,49 @@ impl ShardView<'_> {
     /// Writes the embedding of a Gaussian with evidence, as well as this profile knows it, to `out`
     /// (`[dim]`), in float64.
     pub fn decode(&self, index: usize, out: &mut [f64]) {
-        let (m, dim) = (self.header.n_components as usize, self.header.dim as usize);
+        let dim = self.header.dim as usize;
         if let Some(exact) = &self.exact {
             let stored = &exact.embeddings[index * dim..][..dim];
             out.iter_mut().zip(stored).for_each(|(o, v)| *o = v.to_f64());
             return;
         }
+        self.combine(&self.components(index), out);
+    }
+
+    /// Returns the scores of a query (`[dim]`) and every Gaussian with evidence, as this profile decodes them,
+    /// in float64.
+    pub fn scores(&self, query: &[f32]) -> Vec<f64> {
+        let dim = self.header.dim as usize;
+        let product = |vector: &mut dyn Iterator<Item = f64>| -> f64 {
+            vector.zip(query).map(|(v, q)| v * f64::from(*q)).sum()
+        };
+        if let Some(exact) = &self.exact {
+            return exact
+                .embeddings
+                .chunks_exact(dim)
+                .map(|e| product(&mut e.iter().map(|v| v.to_f64())))
+                .collect();
+        }
+        let (offset, of_components) = match &self.basis {
+            None => (0.0, query.iter().map(|q| f64::from(*q)).collect::<Vec<_>>()),
+            Some(basis) => {
+                let vectors = basis.vectors.chunks_exact(dim).zip(basis.steps);
+                let of_component = |(v, step): (&[i8], &f32)| {
+                    product(&mut v.iter().map(|v| f64::from(*v))) * f64::from(*step)
+                };
+                (product(&mut basis.mean.iter().map(|v| v.to_f64())), vectors.map(of_component).collect())
+            }
+        };
+        let score = |index| {
+            let components = self.components(index);
+            offset + components.iter().zip(&of_components).map(|(c, q)| c * q).sum::<f64>()
+        };
+        (0..self.n_with_evidence()).map(score).collect()
+    }
+
+    /// Returns the components of a Gaussian with evidence: its row's and its residual's.
+    fn components(&self, index: usize) -> Vec<f64> {
+        let m = self.header.n_components as usize;
         let row = self.row_of(index);
         let step = f64::from(self.header.row_step);
         let mut components: Vec<f64> =
@@ -360,7 +397,7 @@ impl ShardView<'_> {
                 components[of_group].iter_mut().zip(word).for_each(|(c, w)| *c += scale * w.to_f64());
             }
         }
-        self.combine(&components, out);
+        components
     }
 
     fn combine(&self, components: &[f64], out: &mut [f64]) {
@@ -671,6 +708,9 @@ mod tests {
         for (found, expected) in decoded.iter().zip(expected) {
             assert!((found - expected).abs() < 1e-6, "{decoded:?} {expected:?}");
         }
+        let query = [0.1f32, -0.2, 0.3, 0.4];
+        let score: f64 = decoded.iter().zip(query).map(|(d, q)| d * f64::from(q)).sum();
+        assert!((shard.scores(&query)[2] - score).abs() < 1e-12);
     }
 
     /// A hostile writer computes right checksums over wrong contents: each lie is refused.

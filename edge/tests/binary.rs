@@ -75,6 +75,7 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
             id: text.info().id,
             dim: header.dim,
             default_threshold: 0.8,
+            calibration: None,
         },
         n_gaussians: 100,
         n_without_evidence: 0,

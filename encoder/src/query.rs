@@ -4,6 +4,7 @@ use std::io::{self, Write};
 
 use glam::DVec3;
 use serde::Serialize;
+use slag_common::container::AlignedBytes;
 use slag_common::shard::{Profile, ShardLayout};
 
 use crate::lift::published::{ReadFieldError, read_field, read_regions};
@@ -49,6 +50,14 @@ pub enum QueryError {
         /// Gaussians in the scene.
         n: usize,
     },
+    /// A cell has no shard of a profile.
+    #[error("cell {cell_id} has no {profile} shard; encode with --profiles {profile},exact")]
+    NoShard {
+        /// The cell.
+        cell_id: u32,
+        /// The profile.
+        profile: Profile,
+    },
     /// A shard is damaged.
     #[error("cell {cell_id}: {source}")]
     Shard {
@@ -82,6 +91,43 @@ pub fn scores(reader: &StoreReader, query: &[f32]) -> Result<Scores, QueryError>
             }
             scores.cosines[*index as usize] = cosines[k];
             scores.total_weights[*index as usize] = field.total_weights[k];
+        }
+    }
+    Ok(scores)
+}
+
+/// Scores every Gaussian as a profile's shards decode it: what a robot that holds them knows.
+///
+/// Total weights are left at zero: shards do not keep them.
+/// # Errors
+/// [`QueryError`].
+pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -> Result<Scores, QueryError> {
+    let manifest = reader.manifest();
+    let dim = manifest.encoder.dim as usize;
+    if query.len() != dim {
+        let encoder = manifest.encoder.name.clone();
+        return Err(QueryError::Dimension { expected: dim, found: query.len(), encoder });
+    }
+    let n = (manifest.n_gaussians + manifest.n_rejected) as usize;
+    let mut scores = Scores { cosines: vec![f32::NAN; n], total_weights: vec![0.0; n] };
+    for cell in &manifest.cells {
+        let cell_id = cell.cell_id;
+        let read = |profile: Profile| -> Result<(AlignedBytes, ShardLayout), QueryError> {
+            let missing = QueryError::NoShard { cell_id, profile };
+            let bytes = reader.read_object(cell.shards.get(&profile).ok_or(missing)?.hash)?;
+            let layout =
+                ShardLayout::check(&bytes).map_err(|source| QueryError::Shard { cell_id, source })?;
+            Ok((bytes, layout))
+        };
+        let (bytes, layout) = read(profile)?;
+        let shard = layout.view(&bytes);
+        // All profiles have the same order; only the exact one says whose it is.
+        let (bytes, layout) = read(Profile::Exact)?;
+        let exact =
+            layout.view(&bytes).exact.ok_or(QueryError::NoShard { cell_id, profile: Profile::Exact })?;
+        for (cosine, index) in shard.scores(query).into_iter().zip(exact.input_indices) {
+            let found = scores.cosines.get_mut(*index as usize);
+            *found.ok_or(QueryError::Index { cell_id, index: *index, n })? = cosine as f32;
         }
     }
     Ok(scores)

@@ -42,7 +42,8 @@
 //! tensor = "mean"                  # F16 or F32 [dim]
 //!
 //! [score]
-//! threshold = 0.25                 # cosine from which something counts as found
+//! threshold = 0.25                 # cosine from which something counts as found; without [score],
+//!                                  # every scene is calibrated by its own scores
 //! ```
 //!
 //! Unknown fields are refused. A robot that has the text files only needs the image file's `sha256`
@@ -153,7 +154,8 @@ pub struct Description {
     /// What is subtracted from text vectors.
     pub text_centre: Option<CentreDescription>,
     /// How scores are read.
-    pub score: ScoreDescription,
+    #[serde(default)]
+    pub score: Option<ScoreDescription>,
 }
 
 fn here() -> PathBuf {
@@ -324,13 +326,10 @@ impl Description {
             let has_place = text.prompt.contains("{}");
             require(has_place, "text.prompt", format!("{:?}", text.prompt), "a text with {} in it")?;
         }
-        let threshold = self.score.threshold;
-        require(
-            (-1.0..=1.0).contains(&threshold),
-            "score.threshold",
-            threshold.to_string(),
-            "a cosine, -1 to 1",
-        )?;
+        if let Some(ScoreDescription { threshold }) = self.score {
+            let is_cosine = (-1.0..=1.0).contains(&threshold);
+            require(is_cosine, "score.threshold", threshold.to_string(), "a cosine, -1 to 1")?;
+        }
         require(
             self.files_root
                 .components()

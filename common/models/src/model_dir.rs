@@ -90,11 +90,11 @@ impl ModelDir {
         }
     }
 
-    /// Returns the cosine from which something counts as found, by default.
-    pub fn threshold(&self) -> f32 {
+    /// Returns the cosine from which something counts as found, where the model states one.
+    pub fn threshold(&self) -> Option<f32> {
         match &self.source {
-            Source::Builtin => builtin::THRESHOLD,
-            Source::Files { description, .. } => description.score.threshold,
+            Source::Builtin => Some(builtin::THRESHOLD),
+            Source::Files { description, .. } => description.score.as_ref().map(|score| score.threshold),
         }
     }
 

@@ -21,7 +21,7 @@ pub use request::{
     CANONICAL_NEGATIVES, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, Level, MAX_CLUSTERS, MAX_GAUSSIANS, MAX_NEGATIVES,
     MAX_TEXTS, Negatives, QueryRequest, RequestError, parse_box, parse_point,
 };
-pub use threshold::{Calibration, RELEVANCY_THRESHOLD, ThresholdSource, calibrated_threshold};
+pub use threshold::{RELEVANCY_THRESHOLD, ThresholdSource, calibrated_threshold};
 
 use crate::score::{Question, RELEVANCY_STEEPNESS, ScoreError, Search, relevancy, score_of_relevancy};
 use cluster::{Cluster, Grouping, cluster};
@@ -136,7 +136,9 @@ impl Scale {
         match (request.threshold, self.0) {
             (Some(threshold), _) => (threshold, ThresholdSource::Request),
             (None, ScoreKind::Relevancy) => (RELEVANCY_THRESHOLD, ThresholdSource::Relevancy),
-            (None, ScoreKind::Cosine) => calibrated_threshold(manifest.encoder.default_threshold, None),
+            (None, ScoreKind::Cosine) => {
+                calibrated_threshold(manifest.encoder.default_threshold, manifest.encoder.calibration)
+            }
         }
     }
 

@@ -1,6 +1,7 @@
 //! From which score on something counts as found, and why from there.
 
 use serde::Serialize;
+use slag_common::manifest::Calibration;
 
 /// Spreads above the mean at which a scene's own threshold lies. On the labelled house with ConSE vectors
 /// (1,500 Gaussians, 1,612 texts: mean 0.002, spread 0.118) the mean F1 over its words is best at 3 spreads,
@@ -12,16 +13,6 @@ const MIN_SPREAD: f32 = 1e-3;
 /// The relevancy from which a Gaussian matches where a question has negatives: it is nearer to the thing
 /// asked for than to any of them (LERF's own choice).
 pub const RELEVANCY_THRESHOLD: f32 = 0.5;
-
-/// How a bank of texts scores in a scene: nearly all pairs of text and Gaussian do not belong together, so
-/// this is what no match looks like in this scene, with this encoder.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Calibration {
-    /// Mean of the scores of all pairs.
-    pub score_mean: f32,
-    /// Their standard deviation, over all pairs (not within a text).
-    pub score_spread: f32,
-}
 
 /// Where a threshold comes from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]

@@ -136,6 +136,7 @@ pub fn publish(
                 id: encoder_id,
                 dim: dim as u32,
                 default_threshold: 0.5,
+                calibration: None,
             },
             n_gaussians: report.n_gaussians,
             n_without_evidence: 0,

@@ -267,6 +267,9 @@ pub struct QueryArgs {
     /// Gaussians to print, best first.
     #[arg(long, default_value_t = 10)]
     pub limit: u32,
+    /// Score as a robot with shards of this profile does [default: the field in full precision].
+    #[arg(long, value_name = "NAME")]
+    pub profile: Option<Profile>,
     /// Writes every Gaussian's score, in the input's order, as a NumPy array (NaN: no evidence).
     #[arg(long, value_name = "FILE")]
     pub scores: Option<PathBuf>,

@@ -283,7 +283,10 @@ fn run_query(args: &QueryArgs, json: bool) -> Result<Exit> {
         ));
     }
     let vector = models.text_encoder(&session)?.encode(&args.text)?;
-    let scores = query::scores(&reader, &vector)?;
+    let scores = match args.profile {
+        Some(profile) => query::scores_of_shards(&reader, &vector, profile)?,
+        None => query::scores(&reader, &vector)?,
+    };
     if let Some(path) = &args.scores {
         let mut file = std::io::BufWriter::new(fs_err::File::create(path)?);
         query::write_npy(&mut file, &scores.cosines)?;

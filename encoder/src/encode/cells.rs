@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use slag_common::manifest::{CellRecord, ShardRecord};
+use slag_common::manifest::{Calibration, CellRecord, ShardRecord};
 use slag_common::shard::Profile;
 use slag_common::{Gaussians, Hash32};
 use slag_models::ModelDir;
@@ -58,6 +58,18 @@ pub(super) struct BuiltCells {
     pub(super) records: Vec<CellRecord>,
     pub(super) extras: Extras,
     pub(super) n_without_evidence: u64,
+    /// Sums over the Gaussians with evidence of mean score and mean squared score, and how many they are.
+    score_sums: [f64; 3],
+}
+
+impl BuiltCells {
+    /// Returns how the bank of texts scores in all cells.
+    pub(super) fn calibration(&self) -> Calibration {
+        let [sum, squares, n] = self.score_sums;
+        let mean = sum / n.max(1.0);
+        let variance = (squares / n.max(1.0) - mean * mean).max(0.0);
+        Calibration { score_mean: mean as f32, score_spread: variance.sqrt() as f32 }
+    }
 }
 
 impl<'a> CellBuilder<'a> {
@@ -129,7 +141,12 @@ impl<'a> CellBuilder<'a> {
         progress: &dyn Progress,
         cancel: &AtomicBool,
     ) -> Result<Option<BuiltCells>, EncodeError> {
-        let mut built = BuiltCells { records: Vec::new(), extras: Extras::new(), n_without_evidence: 0 };
+        let mut built = BuiltCells {
+            records: Vec::new(),
+            extras: Extras::new(),
+            n_without_evidence: 0,
+            score_sums: [0.0; 3],
+        };
         let regions = self.store.put_object(|out| self.table.write(out))?.0;
         built.extras.insert(EXTRA_REGIONS.into(), regions);
         let dim = self.table.dim();
@@ -204,6 +221,9 @@ impl<'a> CellBuilder<'a> {
         };
         let shards = made.shards.iter().map(record).collect::<Result<_, EncodeError>>()?;
         built.n_without_evidence += made.n_without_evidence as u64;
+        let n_with = (cell.gaussians.len() - made.n_without_evidence) as f64;
+        let sums = [made.moments.mean * n_with, made.moments.mean_square * n_with, n_with];
+        built.score_sums.iter_mut().zip(sums).for_each(|(all, of_cell)| *all += of_cell);
         built.records.push(CellRecord {
             cell_id,
             bounds: cell.bounds,

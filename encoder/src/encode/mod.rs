@@ -17,7 +17,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Instant;
 
 use serde::Serialize;
-use slag_common::manifest::{self, EncoderRecord, Manifest};
+use slag_common::manifest::{self, Calibration, EncoderRecord, Manifest};
 use slag_common::poses::{self, PoseError};
 use slag_common::splat::{self, SplatError};
 use slag_common::{Hash32, View};
@@ -326,7 +326,12 @@ pub fn encode(
             name: models.encoder_id().name.clone(),
             id: Hash32(models.encoder_id().hash()),
             dim: models.dim() as u32,
-            default_threshold: models.threshold(),
+            // Three spreads above the mean, as robots reckon it.
+            default_threshold: models.threshold().unwrap_or_else(|| {
+                let Calibration { score_mean, score_spread } = built.calibration();
+                (score_mean + 3.0 * score_spread).clamp(-1.0, 1.0)
+            }),
+            calibration: models.threshold().is_none().then(|| built.calibration()),
         },
         n_gaussians: summary.n_gaussians,
         n_without_evidence: summary.n_without_evidence,

@@ -16,6 +16,25 @@ pub struct Sample<'a> {
     stride: usize,
     /// Standard deviation over the sample of a text's scores, mean over the texts.
     spread: f32,
+    /// Of all scores.
+    pub moments: ScoreMoments,
+}
+
+/// Sums over pairs of a text and a Gaussian.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ScoreMoments {
+    /// Mean of the scores.
+    pub mean: f64,
+    /// Mean of their squares.
+    pub mean_square: f64,
+}
+
+impl ScoreMoments {
+    fn of(scores: &[f32]) -> Self {
+        let n = scores.len().max(1) as f64;
+        let mean = |power: i32| scores.iter().map(|s| f64::from(*s).powi(power)).sum::<f64>() / n;
+        Self { mean: mean(1), mean_square: mean(2) }
+    }
 }
 
 impl<'a> Sample<'a> {
@@ -26,8 +45,9 @@ impl<'a> Sample<'a> {
         let texts = Panels::new(dim, bank.len(), |c, text| bank.vectors[text * dim + c]);
         let chosen: Vec<f32> =
             order.iter().step_by(stride).flat_map(|at| embeddings.get(*at as usize)).copied().collect();
-        let spread = spread(&texts.product(Rows::all(&chosen, dim)), bank.len());
-        Self { bank, texts, stride, spread }
+        let scores = texts.product(Rows::all(&chosen, dim));
+        let (spread, moments) = (spread(&scores, bank.len()), ScoreMoments::of(&scores));
+        Self { bank, texts, stride, spread, moments }
     }
 
     /// Whether the Gaussian at a place of the order belongs to the sample.

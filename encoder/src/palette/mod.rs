@@ -19,6 +19,7 @@ use slag_common::shard::{self, ScoreErrors};
 use frame::Frame;
 pub use frame::{ScoreMetric, TextBank};
 use matrix::{Panels, Rows};
+use measure::ScoreMoments;
 use residual::ResidualCode;
 
 /// What a root mean square is to a mean of absolute errors, for a distribution with heavy tails: measured
@@ -87,6 +88,8 @@ pub struct Palette {
     pub radii: Vec<f32>,
     /// Errors of the rows' scores.
     pub errors: ScoreErrors,
+    /// Of all texts' scores.
+    pub moments: ScoreMoments,
     /// What the rows leave; absent where they are enough.
     pub residuals: Option<PaletteResiduals>,
 }
@@ -211,6 +214,7 @@ pub fn build(embeddings: Rows<'_>, yardstick: &Yardstick, settings: &PaletteSett
         row_step,
         radii,
         errors,
+        moments: measured.moments,
         residuals,
     }
 }

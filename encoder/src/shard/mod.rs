@@ -10,6 +10,7 @@ use slag_common::hash::Hash32;
 use slag_common::shard::{Basis, ExactColumns, Profile, Residuals, ScoreErrors, ShardHeader, ShardView};
 
 use crate::palette::matrix::Rows;
+use crate::palette::measure::ScoreMoments;
 use crate::palette::{self, PaletteSettings, Yardstick};
 use cells::Cell;
 use positions::{PositionError, QuantisedPositions};
@@ -36,6 +37,8 @@ pub struct BuiltCell {
     pub n_groups: u32,
     /// Largest error of a position, world units.
     pub position_error: f64,
+    /// Of the scores of all texts.
+    pub moments: ScoreMoments,
     /// Gaussians without an embedding.
     pub n_without_evidence: usize,
 }
@@ -160,6 +163,7 @@ pub fn build(
         n_rows: header.n_rows,
         n_groups: balanced.header.n_groups,
         position_error: positions.step.into_iter().fold(0.0, f64::max) / 2.0,
+        moments: palette.moments,
         n_without_evidence: without.len(),
     }
 }
