@@ -10,8 +10,10 @@ use slag_common::container::AlignedBytes;
 use slag_common::shard::{Profile, ShardLayout};
 use slag_common::{Gaussians, Hash32};
 use slag_encoder::lift::{CellField, RegionTable, SumEntry, SumsIndex, ViewSums};
-use slag_encoder::palette::PaletteSettings;
-use slag_encoder::shard::{self, CellEmbeddings, cells};
+use slag_encoder::palette::matrix::Rows;
+use slag_encoder::palette::{PaletteSettings, ScoreMetric, TextBank, Yardstick};
+use slag_encoder::shard::positions::PositionError;
+use slag_encoder::shard::{self, CellEmbeddings, ShardSettings, cells};
 
 const DIM: usize = 512;
 
@@ -230,9 +232,17 @@ fn exact_shard(vectors: &[Vec<f32>], means_in_world: Vec<DVec3>) -> AlignedBytes
     let (field, _, vectors) = one_cell(vectors, entries, cell.gaussians.clone());
     let has_evidence = (0..n).map(|k| field.has_evidence(k)).collect();
     let embeddings = CellEmbeddings { dim: DIM, vectors, has_evidence };
-    let built = shard::build(&scene, 0, cell, &embeddings, Hash32([0; 32]), &PaletteSettings::default());
-    let exact = built.shards.iter().find(|(profile, _)| *profile == Profile::Exact);
-    AlignedBytes::copy_of(&exact.expect("there is one").1)
+    let bank = TextBank::directions(DIM);
+    let metric = ScoreMetric::new(DIM, &bank);
+    let spread = metric.spread(Rows::all(&embeddings.vectors, DIM));
+    let settings = ShardSettings {
+        profiles: vec![Profile::Exact],
+        palette: PaletteSettings::default(),
+        position_error: PositionError::Within(0.01),
+    };
+    let yardstick = Yardstick { metric, bank, spread };
+    let built = shard::build(&scene, 0, cell, &embeddings, Hash32([0; 32]), &yardstick, &settings);
+    AlignedBytes::copy_of(&built.shards[0].bytes)
 }
 
 /// Components from 1 down to 1e-12 lie in the shard as f16: half a step of 2^-11, below 2^-14 half a
@@ -303,7 +313,8 @@ fn shards_keep_their_bounds() {
     let (mut nearest, mut farthest, mut score) = (f64::INFINITY, 0.0_f64, 0.0_f64);
     let queries: Vec<Vec<f64>> = centres.iter().cloned().chain((0..20).map(|_| direction(random))).collect();
     for row in 0..shard.radii.len() {
-        let stored: Vec<f64> = shard.palette[row * DIM..][..DIM].iter().map(|c| c.to_f64()).collect();
+        let mut stored = vec![0.0; DIM];
+        shard.decode_row(row, &mut stored);
         let radius = f64::from(shard.radii[row]);
         let mut largest = 0.0_f64;
         for member in shard.members(row) {
@@ -322,5 +333,6 @@ fn shards_keep_their_bounds() {
          to {farthest:.6}, score {score:.3} radii |",
         shard.radii.len()
     );
+    assert!(half_step.max_element() <= 0.01, "{half_step}");
     assert!(position <= 1.0 + 1e-5 && nearest >= 1.0 && farthest <= 1.001 && score <= 1.0);
 }
