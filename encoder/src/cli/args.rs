@@ -7,6 +7,7 @@ use std::str::FromStr;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
+use super::keys::KeysCommand;
 use crate::embed::Background;
 use crate::raster::WeightKind;
 use crate::raster::devices::DeviceChoice;
@@ -49,6 +50,9 @@ pub enum Command {
     Query(QueryArgs),
     /// Serves a store's manifest and shards over HTTP.
     Serve(ServeArgs),
+    /// Shows, makes and changes the key that a store signs with.
+    #[command(subcommand)]
+    Keys(KeysCommand),
     /// Pushes a store elsewhere.
     #[command(subcommand)]
     Push(PushCommand),
