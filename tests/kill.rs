@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 use serde_json::Value;
 use slag_tests::*;
 
-const N_KILLS: usize = 20;
+const N_ENCODE_KILLS: usize = 20;
+const N_FETCH_KILLS: usize = 100;
 
 /// A pseudo-random sequence in 0..1 (SplitMix64).
 fn random(state: &mut u64) -> f64 {
@@ -35,33 +36,14 @@ fn run_or_kill(command: &mut Command, after: Duration) -> Option<Vec<u8>> {
     None
 }
 
-fn encode(room: &Path, store: &Path) -> Command {
-    let (scene, views) = (room.join("scene.ply"), room.join("transforms.json"));
-    let mut command = encoder(&[
-        "encode",
-        "--scene",
-        text(&scene),
-        "--views",
-        text(&views),
-        "--metric",
-        "--cell-gaussians",
-        "4096",
-        "--store",
-        text(store),
-        "--json",
-    ]);
-    command.env("SOURCE_DATE_EPOCH", "1700000000");
-    command
-}
-
 #[test]
-fn killed_encodes_and_fetches_resume_and_show_nothing_half() {
+fn killed_encodes_resume_and_show_nothing_half() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let room = dir.path().join("room");
     run(&mut encoder(&["generate", "--out", text(&room), "--n-views", "10"]));
     let whole = dir.path().join("whole");
     let start = Instant::now();
-    run(&mut encode(&room, &whole));
+    run(&mut encode_room(&room, &whole));
     let encode_time = start.elapsed();
     let expected = content(&whole);
 
@@ -69,12 +51,12 @@ fn killed_encodes_and_fetches_resume_and_show_nothing_half() {
     // finished in between makes room for the next.
     let mut state = 7;
     let (mut n_kills, mut n_stores, mut n_resumed) = (0, 0, 0);
-    while n_kills < N_KILLS {
+    while n_kills < N_ENCODE_KILLS {
         let store = dir.path().join(format!("store{n_stores}"));
         let printed = loop {
-            let enough = n_kills == N_KILLS;
+            let enough = n_kills == N_ENCODE_KILLS;
             let after = if enough { Duration::MAX } else { encode_time.mul_f64(0.5 * random(&mut state)) };
-            match run_or_kill(&mut encode(&room, &store), after) {
+            match run_or_kill(&mut encode_room(&room, &store), after) {
                 Some(printed) => break printed,
                 None => n_kills += 1,
             }
@@ -89,37 +71,61 @@ fn killed_encodes_and_fetches_resume_and_show_nothing_half() {
     }
     assert!(n_resumed > 0, "no killed encode was resumed");
     println!("encode: {n_kills} kills, {n_stores} stores, {n_resumed} views not done twice");
+}
 
-    let server = Service::start(&mut encoder(&["serve", "--store", text(&whole)]));
-    let fetch = |cache: &Path| {
-        edge(&[
-            "fetch",
-            "--from",
-            &server.url,
-            "--at",
-            "3.5,2.7,0",
-            "--radius",
-            "50",
-            "--cache",
-            text(cache),
-            "--json",
-        ])
+/// A robot with generation 1 on board is killed while it fetches generation 2, in which all shards differ.
+#[test]
+fn killed_fetches_leave_the_old_or_the_new_generation() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let room = dir.path().join("room");
+    run(&mut encoder(&["generate", "--out", text(&room), "--n-views", "10"]));
+    let (first, second) = (dir.path().join("first"), dir.path().join("second"));
+    run(&mut encode_room(&room, &first));
+    // The same key and scene, one generation on.
+    copy_dir(&first, &second);
+    run(encode_room(&room, &second).args(["--name", "first", "--palette-rows", "48"]));
+    let stores =
+        [&first, &second].map(|store| Service::start(&mut encoder(&["serve", "--store", text(store)])));
+    let fetch = |from: &Service, cache: &Path| {
+        let mut command = edge(&["fetch", "--from", &from.url, "--at", "3.5,2.7,0", "--radius", "50"]);
+        command.args(["--cache", text(cache)]);
+        command
     };
-    let reference = dir.path().join("cache");
+    let ask = |cache: &Path| {
+        let answers = run_json(&mut edge(&["query", "blue", "--cache", text(cache)]));
+        (answers["generation"].as_u64().expect("a number"), answers["answers"].clone())
+    };
+    let (old, new) = (dir.path().join("old"), dir.path().join("new"));
+    run(&mut fetch(&stores[0], &old));
+    copy_dir(&old, &new);
     let start = Instant::now();
-    run(&mut fetch(&reference));
+    run(&mut fetch(&stores[1], &new));
     let fetch_time = start.elapsed();
-    let answer =
-        |cache: &Path| run_json(&mut edge(&["query", "blue", "--cache", text(cache)]))["answers"].clone();
-    let expected = answer(&reference);
-    assert!(!expected.as_array().expect("answers").is_empty());
-    for kill in 0..N_KILLS {
-        let cache = dir.path().join(format!("cache{kill}"));
-        run_or_kill(&mut fetch(&cache), fetch_time.mul_f64(random(&mut state)));
-        if cache.join("current").exists() {
-            assert_eq!(answer(&cache), expected, "what is visible is whole");
+    let expected = [ask(&old), ask(&new)];
+    assert_eq!(expected.each_ref().map(|(generation, _)| *generation), [1, 2]);
+    assert!(expected.iter().all(|(_, answers)| !answers.as_array().expect("answers").is_empty()));
+
+    let mut state = 11;
+    let (mut n_kills, mut n_runs, mut n_new) = (0, 0, 0);
+    while n_kills < N_FETCH_KILLS {
+        let cache = dir.path().join(format!("cache{n_runs}"));
+        copy_dir(&old, &cache);
+        let is_killed =
+            run_or_kill(&mut fetch(&stores[1], &cache), fetch_time.mul_f64(random(&mut state))).is_none();
+        let found = ask(&cache);
+        assert!(expected.contains(&found), "run {n_runs}: generation {} answers otherwise", found.0);
+        assert!(is_killed || found.0 == 2, "run {n_runs}: a fetch that ended well is there");
+        n_kills += usize::from(is_killed);
+        n_new += u64::from(is_killed && found.0 == 2);
+        // Often enough to see that what a kill leaves does not stand in the way.
+        if n_runs % 10 == 0 {
+            run(&mut fetch(&stores[1], &cache));
+            assert_eq!(ask(&cache), expected[1], "run {n_runs}: the next fetch");
         }
-        run(&mut fetch(&cache));
-        assert_eq!(answer(&cache), expected);
+        fs_err::remove_dir_all(&cache).expect("there");
+        n_runs += 1;
     }
+    println!(
+        "fetch: {n_kills} kills in {n_runs} runs, {n_new} of them after the new generation was in place"
+    );
 }

@@ -33,6 +33,10 @@ pub struct Manifest {
     /// Seconds since 1970 after which robots refuse it; absent: never.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub expires_unix_secs: Option<u64>,
+    /// The public key that signs later generations: who accepts this manifest's key accepts that one
+    /// too, and, once it has signed a manifest, only that one; absent: no change of keys is under way.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub next_key: Option<Hash32>,
     /// Whether a world unit is a metre.
     pub metric: bool,
     /// Where the world frame lies on the earth, if known.
@@ -221,6 +225,9 @@ impl Manifest {
         let manifest: Self =
             serde_json::from_slice(json).map_err(|e| ManifestError::Content { what: e.to_string() })?;
         manifest.check_content()?;
+        if manifest.next_key == Some(public) {
+            return Err(ManifestError::Content { what: "the next key is the one that signs".into() });
+        }
         Ok((manifest, public))
     }
 
@@ -321,6 +328,7 @@ mod tests {
             generation: 3,
             created_unix_secs: 1_700_000_000,
             expires_unix_secs: Some(1_800_000_000),
+            next_key: Some(Hash32([5; 32])),
             metric: true,
             geo_reference: None,
             encoder: EncoderRecord {
@@ -373,6 +381,11 @@ mod tests {
         let unordered = Manifest { cells: manifest(4).cells.into_iter().rev().collect(), ..manifest(0) };
         assert!(matches!(
             Manifest::verify(&unordered.sign(&key), &TrustedKeys::FirstContact),
+            Err(ManifestError::Content { .. })
+        ));
+        let own_successor = Manifest { next_key: Some(public), ..manifest(1) };
+        assert!(matches!(
+            Manifest::verify(&own_successor.sign(&key), &TrustedKeys::FirstContact),
             Err(ManifestError::Content { .. })
         ));
     }

@@ -546,8 +546,8 @@ impl ShardLayout {
     }
 }
 
-/// No vector here is longer: embeddings are of unit length, rows and residuals shorter than a few.
-const MAX_LENGTH: f32 = 64.0;
+/// No length here is larger: embeddings are of unit length, and components scaled to about that.
+const MAX_LENGTH: f32 = 4096.0;
 
 fn damaged(offset: usize, what: String) -> ContainerError {
     ContainerError::Damaged { offset_bytes: offset as u64, what }
@@ -579,7 +579,7 @@ fn check_header(header: &ShardHeader) -> Result<(), String> {
     }
     let ScoreErrors { mean, p999, max, spread } = header.errors;
     if [header.row_step, mean, p999, max, spread].iter().any(|v| !(0.0..=MAX_LENGTH).contains(v)) {
-        return Err("the rows' step or an error is not within 0..=64".into());
+        return Err("the rows' step or an error is not within 0..=4096".into());
     }
     Ok(())
 }

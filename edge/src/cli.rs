@@ -1,5 +1,6 @@
 //! The command line: what can be asked for, and how a run ends.
 
+mod bench;
 mod commands;
 mod fetch;
 mod output;
@@ -39,6 +40,55 @@ enum Command {
     Query(QueryArgs),
     /// Shows what is on board.
     Status(StatusArgs),
+    /// Measures a service and this machine; prints JSON.
+    #[command(subcommand)]
+    Bench(BenchCommand),
+}
+
+#[derive(Debug, Subcommand)]
+enum BenchCommand {
+    /// The longest time a query waits while fetches replace the generation.
+    Pause(PauseArgs),
+    /// How a service stands more queries than it can answer.
+    Load(LoadArgs),
+}
+
+#[derive(Debug, Args)]
+struct PauseArgs {
+    /// Gaussians of the generated scene.
+    #[arg(long, value_name = "N", default_value_t = 1_000_000, value_parser = clap::value_parser!(u32).range(1000..=16_000_000))]
+    gaussians: u32,
+    /// Components of an embedding.
+    #[arg(long, value_name = "N", default_value_t = 512, value_parser = clap::value_parser!(u32).range(2..=8192))]
+    dim: u32,
+    /// Generations that are fetched, one after the other.
+    #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    fetches: u32,
+    /// Folder to work in [default: a new one among the system's temporary files].
+    #[arg(long, value_name = "DIR")]
+    work: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+struct LoadArgs {
+    /// The service, as `slag-edge serve` prints it.
+    #[arg(long, value_name = "URL")]
+    url: String,
+    /// What is asked for.
+    #[arg(long, default_value = "red")]
+    text: String,
+    /// Questions a second, as a multiple of what the service answers.
+    #[arg(long, value_name = "X", default_value_t = 10.0)]
+    overload: f64,
+    /// Questions at a time, at most.
+    #[arg(long, value_name = "N", default_value_t = 320, value_parser = clap::value_parser!(u32).range(1..=4096))]
+    clients: u32,
+    /// How long.
+    #[arg(long, value_name = "S", default_value_t = 600)]
+    seconds: u64,
+    /// Process whose memory is watched (Linux).
+    #[arg(long, value_name = "PID")]
+    pid: Option<u32>,
 }
 
 #[derive(Debug, Args)]
@@ -75,17 +125,39 @@ struct FetchArgs {
     /// How much each shard carries: compact or exact.
     #[arg(long, default_value_t = Profile::Compact)]
     profile: Profile,
-    /// The only public key accepted [default: the one accepted before, or the first one met].
+    /// The only public key accepted, or the one that took its place; given again: its successor, for a
+    /// robot that missed the change [default: the one accepted before, or the first one met].
     #[arg(long, value_name = "HEX")]
-    key: Option<Hash32>,
+    key: Vec<Hash32>,
     /// Bytes that shards may take [default: twice what the radius needs].
     #[arg(long, value_name = "N")]
     max_bytes: Option<u64>,
+    /// Follow the robot: read positions from stdin, one a line, `x y z` or `lat,lon[,height]`, or as
+    /// JSON, and fetch whenever it needs more.
+    #[arg(long)]
+    watch: bool,
+    #[command(flatten)]
+    follow: FollowArgs,
     #[command(flatten)]
     cache: CacheArgs,
-    /// Print the report as JSON.
+    /// Print the report as JSON (with --watch: one a line).
     #[arg(long)]
     json: bool,
+}
+
+/// How a robot is followed.
+#[derive(Debug, Args)]
+struct FollowArgs {
+    /// When following: how much farther than the radius is fetched, world units [default: a quarter of
+    /// the radius].
+    #[arg(long, value_name = "D")]
+    margin: Option<f64>,
+    /// When following: seconds between fetches, at least.
+    #[arg(long, value_name = "S", default_value_t = 2)]
+    min_interval_secs: u64,
+    /// When following: seconds after which a robot that stays looks for a new generation; 0: never.
+    #[arg(long, value_name = "S", default_value_t = 300)]
+    refresh_secs: u64,
 }
 
 #[derive(Debug, Args)]
@@ -93,6 +165,23 @@ struct ServeArgs {
     /// Address to listen on.
     #[arg(long, value_name = "IP:PORT", default_value = "127.0.0.1:7734")]
     listen: SocketAddr,
+    /// Follow the robot: fetch from this store around the positions that POST /position says.
+    #[arg(long, value_name = "URL")]
+    follow: Option<String>,
+    /// When following: how far around the robot cells are kept, world units.
+    #[arg(long, default_value_t = 50.0)]
+    radius: f64,
+    /// When following: how much each shard carries: compact or exact.
+    #[arg(long, default_value_t = Profile::Compact)]
+    profile: Profile,
+    /// When following: the only public keys accepted, at most two.
+    #[arg(long, value_name = "HEX")]
+    key: Vec<Hash32>,
+    /// When following: bytes that shards may take [default: twice what the radius needs].
+    #[arg(long, value_name = "N")]
+    max_bytes: Option<u64>,
+    #[command(flatten)]
+    following: FollowArgs,
     #[command(flatten)]
     cache: CacheArgs,
     #[command(flatten)]
@@ -188,6 +277,7 @@ impl Cli {
             Command::Serve(args) => (false, commands::serve(args)),
             Command::Query(args) => (args.json, commands::query(args)),
             Command::Status(args) => (args.json, commands::status(args)),
+            Command::Bench(command) => (true, bench::run(command)),
         };
         match result {
             Ok(()) => Exit::Done,
@@ -225,7 +315,7 @@ mod tests {
     #[test]
     fn lines_parse() {
         let Command::Fetch(fetch) =
-            parse("slag-edge fetch --from http://a:1 --at -1,2.5,-3e1 --radius 20 --profile exact --max-bytes 7 --cache c --json")
+            parse("slag-edge fetch --from http://a:1 --at -1,2.5,-3e1 --watch --margin 4 --radius 20 --profile exact --max-bytes 7 --cache c --json")
                 .expect("parses")
                 .command
         else {
@@ -244,6 +334,8 @@ mod tests {
             (fetch.at_geo, fetch.radius, fetch.profile),
             (Some((-46.8, -92.0, None)), 50.0, Profile::Compact)
         );
+        assert!(parse("slag-edge bench pause --gaussians 5000").is_ok());
+        assert!(parse("slag-edge bench load --url http://a:1 --clients 8 --seconds 2").is_ok());
         let Command::Serve(serve) = parse("slag-edge serve").expect("parses").command else {
             panic!("serve")
         };
@@ -287,6 +379,9 @@ mod tests {
             "slag-edge fetch --at 1,2,3 --at-geo 1,2",
             "slag-edge fetch --at-geo 91,0",
             "slag-edge fetch --key 12",
+            "slag-edge fetch --margin",
+            "slag-edge bench",
+            "slag-edge bench pause --gaussians 1",
             "slag-edge fetch --profile tiny",
             "slag-edge serve --listen nowhere",
             "slag-edge status --quiet --verbose",

@@ -1,5 +1,6 @@
 //! The robot's side of SLAG: keeps the shards around it and answers text queries offline.
 
+pub mod bench;
 pub mod fetch;
 pub mod http;
 pub mod query;
@@ -21,4 +22,10 @@ pub fn error_line(error: &dyn std::error::Error) -> String {
         cause = error.source();
     }
     line
+}
+
+/// Returns the system's clock, seconds since 1970; 0 where it stands before that.
+pub fn now_unix_secs() -> u64 {
+    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+    since.map_or(0, |since| since.as_secs())
 }

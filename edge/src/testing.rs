@@ -241,6 +241,7 @@ pub fn manifest_of(shards: &[BuiltShard], generation: u64) -> Manifest {
         generation,
         created_unix_secs: 1_700_000_000,
         expires_unix_secs: None,
+        next_key: None,
         metric: true,
         geo_reference: None,
         encoder: EncoderRecord {
@@ -259,7 +260,11 @@ pub fn manifest_of(shards: &[BuiltShard], generation: u64) -> Manifest {
 
 /// Writes a cache as a fetch leaves it, replacing `current` last.
 pub fn write_cache(dir: &Path, shards: &[BuiltShard], generation: u64) {
-    let manifest = manifest_of(shards, generation);
+    write_manifest(dir, shards, manifest_of(shards, generation));
+}
+
+/// As [`write_cache`], with a manifest that may say more.
+pub fn write_manifest(dir: &Path, shards: &[BuiltShard], manifest: Manifest) {
     let key = manifest::generate_key();
     let signed = manifest.sign(&key);
     let current = Current {

@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpListener;
 use std::path::Path;
-use std::process::{Command, Output, Stdio};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
 
 use glam::DVec3;
 use serde_json::Value;
@@ -68,6 +69,7 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
         generation: 3,
         created_unix_secs: 1_700_000_000,
         expires_unix_secs: None,
+        next_key: None,
         metric: true,
         geo_reference: None,
         encoder: EncoderRecord {
@@ -104,6 +106,26 @@ fn store(signed: Vec<u8>, shard: Vec<u8>) -> String {
         }
     });
     address
+}
+
+/// Starts a service; returns its process and its address.
+fn serve(cache: &Path, args: &[&str]) -> (Child, String) {
+    let mut serving = slag_edge(cache, &[&["serve", "--listen", "127.0.0.1:0"], args].concat());
+    let mut serving = serving.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
+    let mut line = String::new();
+    BufReader::new(serving.stdout.take().expect("a pipe")).read_line(&mut line).expect("a line");
+    let url = line.trim().strip_prefix("listening on ").expect("an address").to_owned();
+    (serving, url)
+}
+
+/// Ends a service and returns its log.
+fn stop(mut serving: Child) -> String {
+    let killed = Command::new("kill").args(["-TERM", &serving.id().to_string()]).status().expect("runs");
+    assert!(killed.success());
+    assert_eq!(serving.wait().expect("ends").code(), Some(0));
+    let mut log = String::new();
+    serving.stderr.take().expect("a pipe").read_to_string(&mut log).expect("text");
+    log
 }
 
 fn slag_edge(cache: &Path, args: &[&str]) -> Command {
@@ -169,20 +191,12 @@ fn a_robot_fetches_asks_and_serves() {
     assert_eq!(run(&cache, &["query", " "]).0, Some(2));
     assert_eq!(run(&cache, &["query", "red", "--limit", "0"]).0, Some(2));
 
-    let mut serving = slag_edge(&cache, &["serve", "--listen", "127.0.0.1:0"]);
-    let mut serving = serving.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
-    let mut line = String::new();
-    BufReader::new(serving.stdout.take().expect("a pipe")).read_line(&mut line).expect("a line");
-    let url = line.trim().strip_prefix("listening on ").expect("an address");
+    let (serving, url) = serve(&cache, &[]);
     let (code, answers) = get(&format!("{url}/query?text=blue"));
     assert_eq!((code, &answers["answers"][0]["n_gaussians"]), (200, &60.into()));
     assert_eq!(get(&format!("{url}/query?text=blue&radius=1")).0, 400);
     assert_eq!(get(&format!("{url}/status")).1["is_ready"], true);
-    let killed = Command::new("kill").args(["-TERM", &serving.id().to_string()]).status().expect("runs");
-    assert!(killed.success());
-    assert_eq!(serving.wait().expect("ends").code(), Some(0));
-    let mut log = String::new();
-    serving.stderr.take().expect("a pipe").read_to_string(&mut log).expect("text");
+    let log = stop(serving);
     assert!(log.contains("stopping"), "{log}");
 }
 
@@ -214,4 +228,99 @@ fn nobody_reads_and_nobody_complains() {
     drop(child.stdout.take());
     let output = child.wait_with_output().expect("ends");
     assert_eq!((output.status.code(), output.stderr.len()), (Some(0), 0));
+}
+
+/// Positions on stdin: a fetch for the first, none for those near it, bad lines are told and passed over.
+#[test]
+fn a_robot_is_followed_along_stdin() {
+    let (signed, shard) = red_and_blue();
+    let dir = tempfile::tempdir().expect("a folder");
+    let from = store(signed, shard);
+    let watch = |text: &str| {
+        let args = [
+            "fetch",
+            "--watch",
+            "--from",
+            &from,
+            "--radius",
+            "20",
+            "--margin",
+            "4",
+            "--min-interval-secs",
+            "0",
+        ];
+        let mut child = slag_edge(dir.path(), &[&args[..], &["--json"]].concat());
+        child.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut child = child.spawn().expect("runs");
+        child.stdin.take().expect("a pipe").write_all(text.as_bytes()).expect("written");
+        let Output { status, stdout, stderr } = child.wait_with_output().expect("ends");
+        let reports: Vec<Value> = String::from_utf8_lossy(&stdout).lines().map(json).collect();
+        (status.code(), reports, String::from_utf8_lossy(&stderr).into_owned())
+    };
+    // Which of the positions are seen one by one is a matter of time; the last one always is.
+    let (code, reports, log) = watch("1 2 3\nnonsense\n\n1 2 4\n{\"x\":1,\"y\":2,\"z\":3}\n");
+    assert_eq!((code, reports.len()), (Some(0), 1), "{log}");
+    assert_eq!((&reports[0]["n_cells"], &reports[0]["radius"]), (&1.into(), &24.0.into()));
+    assert!(log.contains("line 2: \"nonsense\" is no position"), "{log}");
+    // A place on the earth means nothing in this scene: the last fetch failed, and what is on board stays.
+    let (code, reports, log) = watch("46.8,-92\n");
+    assert_eq!((code, &reports[0]["error"]["kind"]), (Some(1), &"fetch".into()), "{log}");
+    assert!(reports[0]["error"]["detail"].as_str().is_some_and(|text| text.contains("geo-reference")));
+    assert_eq!(run(dir.path(), &["query", "red", "--json"]).0, Some(0));
+    assert_eq!(watch("").0, Some(0));
+}
+
+/// The service fetches around the positions it is told, and answers from what came in.
+#[test]
+fn a_robot_is_followed_by_its_service() {
+    let (signed, shard) = red_and_blue();
+    let dir = tempfile::tempdir().expect("a folder");
+    let from = store(signed, shard);
+    let (serving, url) = serve(dir.path(), &["--follow", &from, "--radius", "20"]);
+    assert_eq!(get(&format!("{url}/query?text=blue")).0, 503);
+    let posted = ureq::post(format!("{url}/position")).send(r#"{"x":1,"y":2,"z":3}"#).expect("an answer");
+    assert_eq!(posted.status().as_u16(), 202);
+    let give_up = Instant::now() + Duration::from_secs(60);
+    loop {
+        let ((code, answers), (_, status)) =
+            (get(&format!("{url}/query?text=blue")), get(&format!("{url}/status")));
+        if code == 200 && status["following"]["n_fetches"] == 1 {
+            assert_eq!(
+                (&answers["answers"][0]["n_gaussians"], &status["is_expired"]),
+                (&60.into(), &false.into())
+            );
+            break;
+        }
+        assert!(Instant::now() < give_up, "the scene does not come in: {status}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    assert!(stop(serving).contains("1 shards of generation 3 came in"));
+}
+
+/// Ten times more questions than can be answered: some are, quickly enough, the others are turned away.
+#[test]
+fn overload_is_turned_away_and_memory_stays() {
+    let (signed, shard) = red_and_blue();
+    let dir = tempfile::tempdir().expect("a folder");
+    let from = store(signed, shard);
+    assert_eq!(run(dir.path(), &["fetch", "--from", &from, "--at", "0,0,0"]).0, Some(0));
+    let (serving, url) = serve(dir.path(), &[]);
+    let mut load = Command::new(env!("CARGO_BIN_EXE_slag-edge"));
+    load.args(["bench", "load", "--url", &url, "--text", "blue", "--seconds", "10", "--clients", "320"]);
+    let output = load.args(["--pid", &serving.id().to_string()]).output().expect("runs");
+    let report = json(&String::from_utf8_lossy(&output.stdout));
+    stop(serving);
+    println!("{report}");
+    assert!(output.status.success(), "{report}");
+    let number = |path: &str| report.pointer(path).and_then(Value::as_f64).expect("a number");
+    assert!(number("/accepted/n") > 100.0, "{report}");
+    for none in ["/n_without_retry_after", "/n_other_status", "/n_broken"] {
+        assert_eq!(number(none), 0.0, "{report}");
+    }
+    // A bound, not a measurement: a queue without end would grow for as long as the load lasts.
+    assert!(number("/accepted/p99_ms") < 2000.0, "{report}");
+    if cfg!(target_os = "linux") {
+        let grown = number("/memory/late_max_bytes") - number("/memory/early_max_bytes");
+        assert!(number("/memory/n") > 40.0 && grown < 8e6, "{report}");
+    }
 }

@@ -78,6 +78,28 @@ pub fn run_json(command: &mut Command) -> Value {
     serde_json::from_slice(&output.stdout).expect("one JSON object on stdout")
 }
 
+/// Returns the command that encodes a generated room into a store, in cells small enough that there are several.
+pub fn encode_room(room: &Path, store: &Path) -> Command {
+    let (scene, views) = (room.join("scene.ply"), room.join("transforms.json"));
+    let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views), "--metric"]);
+    command.args(["--cell-gaussians", "4096", "--store", text(store), "--json"]);
+    command.env("SOURCE_DATE_EPOCH", "1700000000");
+    command
+}
+
+/// Copies a folder with all that is in it.
+pub fn copy_dir(from: &Path, to: &Path) {
+    fs_err::create_dir_all(to).expect("made");
+    for entry in fs_err::read_dir(from).expect("there") {
+        let entry = entry.expect("readable");
+        let target = to.join(entry.file_name());
+        match entry.file_type().expect("known").is_dir() {
+            true => copy_dir(&entry.path(), &target),
+            false => drop(fs_err::copy(entry.path(), target).expect("copied")),
+        }
+    }
+}
+
 /// A service of the project, stopped when dropped.
 pub struct Service {
     child: Child,

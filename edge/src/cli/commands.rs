@@ -2,8 +2,12 @@
 
 use std::io::{self, Write};
 use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
 
 use anyhow::{Context, anyhow};
+use serde::Serialize;
+use slag_edge::fetch::follow::Following;
 use slag_edge::http::{self, App, Settings};
 use slag_edge::query::{Engine, QueryRequest, Status};
 use slag_edge::store::{EdgeCache, Snapshot, StoreError};
@@ -11,7 +15,8 @@ use slag_edge::text::TextService;
 use slag_models::{SessionOptions, find_runtime};
 use tokio::net::TcpListener;
 
-use super::output::{Failure, print_json, print_reply, print_status, write_json};
+use super::fetch::follow_in_background;
+use super::output::{Failure, print_json, print_pairs, print_reply, print_status, write_json};
 use super::{CacheArgs, ModelArgs, QueryArgs, ServeArgs, StatusArgs};
 
 /// Async threads: they only pass requests on.
@@ -35,14 +40,14 @@ fn default_cache_dir() -> Option<PathBuf> {
     Some(base.join("slag"))
 }
 
-fn engine(cache: CacheArgs, models: &ModelArgs) -> Result<Engine, Failure> {
+fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
     let failed = Failure::of("models");
     let beside = std::env::current_exe().ok().and_then(|exe| Some(exe.parent()?.to_owned()));
     let beside: Vec<PathBuf> = beside.into_iter().collect();
     let runtime = find_runtime(models.runtime.as_deref(), &beside).map_err(|e| failed(e.into()))?;
     let options = SessionOptions::new(runtime);
     let text = TextService::open(models.models.as_deref(), &options).map_err(|e| failed(e.into()))?;
-    Ok(Engine::new(cache.open()?, text))
+    Ok(Engine::new(cache, text))
 }
 
 fn store_failure(error: StoreError) -> Failure {
@@ -65,7 +70,7 @@ pub fn query(args: QueryArgs) -> Result<(), Failure> {
         exact: !args.rows_only,
     };
     request.check().map_err(|e| Failure::Usage(e.into()))?;
-    let engine = engine(args.cache, &args.models)?;
+    let engine = engine(args.cache.open()?, &args.models)?;
     engine.reload().map_err(store_failure)?;
     let reply = engine.answer(&request)?;
     if args.json { write_json(reply) } else { print_reply(&reply) }
@@ -74,11 +79,29 @@ pub fn query(args: QueryArgs) -> Result<(), Failure> {
 pub fn status(args: StatusArgs) -> Result<(), Failure> {
     let snapshot = Snapshot::open(&args.cache.open()?).map_err(store_failure)?;
     let status = Status::of(&snapshot);
-    if args.json { print_json(&status) } else { print_status(&status) }
+    let expires_unix_secs = snapshot.manifest.expires_unix_secs;
+    let is_expired = snapshot.manifest.check_expiry(slag_edge::now_unix_secs()).is_err();
+    if args.json {
+        return print_json(&OnBoard { status: &status, expires_unix_secs, is_expired });
+    }
+    print_status(&status)?;
+    match is_expired {
+        true => print_pairs(&[("expired", "yes: it still answers, but fetch refuses it".into())]),
+        false => Ok(()),
+    }
 }
 
-pub fn serve(args: ServeArgs) -> Result<(), Failure> {
-    let engine = engine(args.cache, &args.models)?;
+#[derive(Serialize)]
+struct OnBoard<'a> {
+    #[serde(flatten)]
+    status: &'a Status,
+    expires_unix_secs: Option<u64>,
+    is_expired: bool,
+}
+
+pub fn serve(mut args: ServeArgs) -> Result<(), Failure> {
+    let cache = std::mem::replace(&mut args.cache, CacheArgs { cache: None }).open()?;
+    let engine = engine(cache.clone(), &args.models)?;
     match engine.reload() {
         Ok(()) => {}
         Err(StoreError::Empty { path }) => {
@@ -106,7 +129,16 @@ pub fn serve(args: ServeArgs) -> Result<(), Failure> {
         let listener = listener.map_err(Failure::of("listen"))?;
         // For scripts that let the system choose a port.
         writeln!(io::stdout(), "listening on http://{}", listener.local_addr()?)?;
-        Ok(http::serve(App::new(engine, settings), listener, stop).await?)
+        let following = args.follow.is_some().then(Arc::<Following>::default);
+        let app = App::following(engine, settings, following.clone());
+        let follower = match following {
+            Some(following) => Some(follow_in_background(&args, cache, following, Arc::clone(&app))?),
+            None => None,
+        };
+        let served = http::serve(app, listener, stop).await;
+        // A fetch under way need not be waited for: the next one goes on where it is cut off.
+        follower.inspect(|cancel| cancel.store(true, Ordering::Relaxed));
+        Ok(served?)
     });
     // A query that does not end must not keep the process.
     runtime.shutdown_timeout(drain);

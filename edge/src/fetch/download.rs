@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use slag_common::Hash32;
-use slag_common::manifest;
+use slag_common::manifest::{self, ManifestError};
 use ureq::http::{Response, StatusCode, Uri, header};
 
 use super::{Environment, FetchError};
@@ -21,6 +21,8 @@ pub struct NetworkLimits {
     pub first_backoff: Duration,
     /// Longest wait.
     pub longest_backoff: Duration,
+    /// The longest wait that a server may ask for (`Retry-After`); it is waited beside the backoff.
+    pub longest_retry_after: Duration,
     /// Time for name resolution and for connecting, each.
     pub connect_timeout: Duration,
     /// Time without a byte.
@@ -37,6 +39,7 @@ impl Default for NetworkLimits {
             attempts: 6,
             first_backoff: Duration::from_millis(500),
             longest_backoff: Duration::from_secs(30),
+            longest_retry_after: Duration::from_secs(120),
             connect_timeout: Duration::from_secs(10),
             read_timeout: Duration::from_secs(20),
             slowest_bytes_per_sec: 4096,
@@ -72,6 +75,8 @@ pub enum Failure {
     Status {
         /// HTTP status.
         status: u16,
+        /// When it asks to be asked again (429 and 503, `Retry-After` in seconds).
+        retry_after: Option<Duration>,
     },
     /// The server sends to another address; shards and manifests are not followed elsewhere.
     #[error("the server sends to {location:?}; if that is the store, give that address")]
@@ -102,7 +107,7 @@ impl Failure {
     fn is_passing(&self) -> bool {
         match self {
             Self::Redirect { .. } => false,
-            Self::Status { status } => *status >= 500 || matches!(status, 408 | 416 | 429),
+            Self::Status { status, .. } => *status >= 500 || matches!(status, 408 | 416 | 429),
             Self::Transport(e) => !matches!(**e, ureq::Error::BadUri(_) | ureq::Error::Http(_)),
             Self::Cut { .. } | Self::Length { .. } | Self::Hash { .. } => true,
         }
@@ -206,6 +211,9 @@ impl<'a> Client<'a> {
             StatusCode::NOT_MODIFIED if known.is_some() => return Ok(ManifestAnswer::Unchanged),
             StatusCode::OK => {}
             _ => return Err(refusal(&response).into()),
+        }
+        if let Some(len_bytes) = response.body().content_length().filter(|len| *len > manifest::MAX_BYTES) {
+            return Err(FetchError::from(ManifestError::TooLong { len_bytes }).into());
         }
         let mut body = response.into_body().into_reader().take(manifest::MAX_BYTES + 1);
         let mut bytes = Vec::new();
@@ -376,7 +384,12 @@ impl<'a> Client<'a> {
             self.environment.progress.retried(url, &failure);
             let doubled = limits.first_backoff.saturating_mul(1 << (attempts - 1).min(16));
             let spread = 0.5 + (self.environment.random)().clamp(0.0, 1.0);
-            self.sleep(doubled.min(limits.longest_backoff).mul_f64(spread))?;
+            let asked = match &failure {
+                Failure::Status { retry_after: Some(asked), .. } => (*asked).min(limits.longest_retry_after),
+                _ => Duration::ZERO,
+            };
+            // Beside the backoff, so that a fleet that was told the same does not come back in step.
+            self.sleep(asked.saturating_add(doubled.min(limits.longest_backoff).mul_f64(spread)))?;
         }
     }
 
@@ -403,7 +416,14 @@ fn refusal(response: &Response<ureq::Body>) -> Failure {
         let location = header_text(response, header::LOCATION);
         return Failure::Redirect { location };
     }
-    Failure::Status { status: response.status().as_u16() }
+    let status = response.status();
+    let retry_after = match status {
+        StatusCode::TOO_MANY_REQUESTS | StatusCode::SERVICE_UNAVAILABLE => {
+            header_text(response, header::RETRY_AFTER).trim().parse().ok().map(Duration::from_secs)
+        }
+        _ => None,
+    };
+    Failure::Status { status: status.as_u16(), retry_after }
 }
 
 /// Returns a header as text, cut to 200 characters; empty if it is not there or not text.

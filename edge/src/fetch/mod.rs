@@ -13,7 +13,10 @@
 
 mod download;
 mod error;
+pub mod follow;
+mod offer;
 mod plan;
+mod position;
 mod records;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -26,16 +29,18 @@ use glam::DVec3;
 use rayon::prelude::*;
 use serde::Serialize;
 use slag_common::Hash32;
-use slag_common::manifest::{self, Manifest, TrustedKeys};
+use slag_common::manifest::Manifest;
 use slag_common::shard::Profile;
 
 pub use download::{Failure, NetworkLimits};
 pub use error::FetchError;
-pub use plan::{Held, Plan, PlanError, Position, Wanted};
+pub use plan::{Held, Object, Plan, PlanError, Wanted};
+pub use position::{NotAPosition, Position};
 pub use records::{LastFetch, Records, RecordsError};
 
 use crate::store::{self, Current, CurrentCell, EdgeCache, StoreError};
-use download::{Client, ManifestAnswer};
+use download::Client;
+use offer::{Offer, Trust};
 
 /// Radius unless one is given, world units.
 pub const DEFAULT_RADIUS: f64 = 50.0;
@@ -55,8 +60,9 @@ pub struct FetchRequest {
     pub radius: f64,
     /// How much each shard carries.
     pub profile: Profile,
-    /// The only key accepted; absent: the one accepted before, or, at the first contact, the server's.
-    pub key: Option<Hash32>,
+    /// The only keys accepted, or those that have taken their places since; empty: the one accepted
+    /// before, or, at the first contact, the server's. A key's named successor is accepted with it.
+    pub keys: Vec<Hash32>,
     /// The only encoder accepted; absent: any.
     pub expected_encoder: Option<Hash32>,
     /// Bytes that shards may take; absent: twice what the cells within the radius take.
@@ -74,7 +80,7 @@ impl Default for FetchRequest {
             at: None,
             radius: DEFAULT_RADIUS,
             profile: Profile::Compact,
-            key: None,
+            keys: Vec::new(),
             expected_encoder: None,
             max_bytes: None,
             parallel: DEFAULT_PARALLEL,
@@ -138,6 +144,10 @@ pub struct FetchReport {
     pub manifest_hash: Hash32,
     /// The public key that signed it.
     pub key: Hash32,
+    /// The key that it names as its successor; accepted from now on, too.
+    pub next_key: Option<Hash32>,
+    /// The key whose place this one took: no longer accepted from now on.
+    pub replaced_key: Option<Hash32>,
     /// Whether the key was accepted just because it was the first.
     pub is_first_contact: bool,
     /// The encoder whose text model answers queries.
@@ -200,26 +210,30 @@ pub fn fetch(
         other => other?,
     };
     let client = Client::new(&from, environment)?;
-    let accepted = request.key.or(records.key()?).or(old.as_ref().map(|old| old.key));
     let on_board = old.as_ref().and_then(|old| Offer::on_board(cache, old));
-    let offer = Offer::get(&client, request.offline, on_board.as_ref(), accepted)?;
-    offer.check(&records, on_board.as_ref(), request, environment.now_unix_secs)?;
+    let trust = Trust::new(&request.keys, &records, old.as_ref(), on_board.as_ref())?;
+    let offer = Offer::get(&client, request.offline, on_board.as_ref(), &trust)?;
+    offer.check(&records, on_board.as_ref(), &trust, request, environment.now_unix_secs)?;
+    let replaced_key = trust.replaced_by(offer.key);
 
     let centre_in_world = at.in_world(&offer.manifest)?;
     let mut held = held_shards(cache, &records)?;
     let FetchRequest { profile, radius, max_bytes, .. } = *request;
     let wanted = Wanted { profile, centre_in_world, radius, max_bytes };
     let mut plan = Plan::new(&offer.manifest, &wanted, &held)?;
-    let unfit = unfit_shards(cache, &offer.manifest, profile, &plan);
+    let unfit = unfit_objects(cache, &Check::new(&offer.manifest, profile, &plan.cells), &plan.keep);
     if !unfit.is_empty() {
         held.retain(|hash, _| !unfit.contains(hash));
         plan = Plan::new(&offer.manifest, &wanted, &held)?;
     }
-    let downloaded = Tally::of(plan.download.iter().map(|cell| cell.len_bytes));
+    let downloaded = Tally::of(plan.download.iter().map(|object| object.len_bytes));
     if request.offline && downloaded.n_shards > 0 {
         return Err(FetchError::Offline { n_shards: downloaded.n_shards, bytes: downloaded.bytes });
     }
-    records.accept(&LastFetch { from, at }, offer.key, &offer.manifest.scene, offer.manifest.generation)?;
+    records.accept(&LastFetch { from, at }, &offer.manifest, offer.key, replaced_key.as_slice())?;
+    if let Some(old) = replaced_key {
+        tracing::info!("key {old} is no longer accepted: {} took its place", offer.key);
+    }
 
     let in_use: BTreeSet<Hash32> = old.iter().flat_map(|old| &old.cells).map(|cell| cell.hash).collect();
     for hash in plan.free.difference(&in_use) {
@@ -228,7 +242,8 @@ pub fn fetch(
     clear_staging(cache, &plan.download)?;
     environment.progress.planned(downloaded.n_shards, downloaded.bytes);
     let work = || {
-        download_all(cache, &client, &offer.manifest, profile, &plan.download, request.parallel)?;
+        let check = Check::new(&offer.manifest, profile, &plan.cells);
+        download_all(cache, &client, &check, &plan.download, request.parallel)?;
         let Offer { manifest_hash, key, .. } = offer;
         let current =
             Current { manifest_hash, key, profile, centre_in_world, radius, cells: plan.cells.clone() };
@@ -262,7 +277,9 @@ pub fn fetch(
         generation: offer.manifest.generation,
         manifest_hash: offer.manifest_hash,
         key: offer.key,
-        is_first_contact: accepted.is_none(),
+        next_key: offer.manifest.next_key,
+        replaced_key,
+        is_first_contact: trust.is_first_contact(),
         encoder_id: offer.manifest.encoder.id,
         encoder_name: offer.manifest.encoder.name,
         profile,
@@ -277,69 +294,6 @@ pub fn fetch(
         retries: client.retries.into_inner(),
         seconds: started.elapsed().as_secs_f64(),
     })
-}
-
-/// A manifest with a good signature.
-struct Offer {
-    bytes: Vec<u8>,
-    manifest_hash: Hash32,
-    manifest: Manifest,
-    key: Hash32,
-}
-
-impl Offer {
-    /// Reads the manifest that `current` names; `None` if it is not what it should be.
-    fn on_board(cache: &EdgeCache, old: &Current) -> Option<Self> {
-        let manifest_hash = old.manifest_hash;
-        let bytes = cache.files().read(&cache.manifest_path(manifest_hash), manifest::MAX_BYTES).ok()?;
-        let (manifest, key) = Manifest::verify(&bytes, &TrustedKeys::Only(vec![old.key])).ok()?;
-        (Hash32::of(&bytes) == manifest_hash).then_some(Self { bytes, manifest_hash, manifest, key })
-    }
-
-    /// Gets the store's manifest, or, offline, that on board.
-    fn get(
-        client: &Client<'_>,
-        offline: bool,
-        on_board: Option<&Self>,
-        accepted: Option<Hash32>,
-    ) -> Result<Self, FetchError> {
-        let answer = match offline {
-            true => ManifestAnswer::Unchanged,
-            false => client.manifest(on_board.map(|offer| offer.manifest_hash))?,
-        };
-        let bytes = match (answer, on_board) {
-            (ManifestAnswer::New(bytes), _) => bytes,
-            (ManifestAnswer::Unchanged, Some(offer)) => offer.bytes.clone(),
-            (ManifestAnswer::Unchanged, None) => return Err(FetchError::NotGiven { what: "manifest" }),
-        };
-        let trusted = accepted.map_or(TrustedKeys::FirstContact, |key| TrustedKeys::Only(vec![key]));
-        let (manifest, key) = Manifest::verify(&bytes, &trusted)?;
-        Ok(Self { manifest_hash: Hash32::of(&bytes), bytes, manifest, key })
-    }
-
-    /// Refuses what is expired, older than what was accepted before, or of another encoder.
-    fn check(
-        &self,
-        records: &Records,
-        on_board: Option<&Self>,
-        request: &FetchRequest,
-        now_unix_secs: u64,
-    ) -> Result<(), FetchError> {
-        self.manifest.check_expiry(now_unix_secs)?;
-        let (scene, offered) = (&self.manifest.scene, self.manifest.generation);
-        // The records may have been lost; the manifest on board says it too.
-        let on_board = on_board.filter(|old| old.key == self.key && old.manifest.scene == *scene);
-        let seen =
-            records.highest_generation(self.key, scene)?.max(on_board.map(|old| old.manifest.generation));
-        if let Some(seen) = seen.filter(|seen| *seen > offered) {
-            return Err(FetchError::Rollback { scene: scene.clone(), seen, offered });
-        }
-        let found = self.manifest.encoder.id;
-        match request.expected_encoder {
-            Some(expected) if expected != found => Err(FetchError::Encoder { expected, found }),
-            _ => Ok(()),
-        }
-    }
 }
 
 fn staging(cache: &EdgeCache) -> PathBuf {
@@ -367,35 +321,49 @@ fn held_shards(cache: &EdgeCache, records: &Records) -> Result<BTreeMap<Hash32, 
     Ok(held)
 }
 
-/// Returns the shards a plan keeps that are damaged, or not what the manifest says: they must not get
+/// What an object must be, beyond having its hash.
+struct Check<'a> {
+    manifest: &'a Manifest,
+    profile: Profile,
+    cells: BTreeMap<Hash32, &'a CurrentCell>,
+}
+
+impl<'a> Check<'a> {
+    fn new(manifest: &'a Manifest, profile: Profile, cells: &'a [CurrentCell]) -> Self {
+        Self { manifest, profile, cells: cells.iter().map(|cell| (cell.hash, cell)).collect() }
+    }
+
+    /// Checks that bytes are what the manifest says of the object: the shard of its cell.
+    fn object(&self, path: &Path, hash: Hash32, bytes: &[u8]) -> Result<(), StoreError> {
+        match self.cells.get(&hash) {
+            Some(cell) => store::check_shard(path, bytes, cell, self.profile, self.manifest).map(drop),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Returns the objects a plan keeps that are damaged, or not what the manifest says: they must not get
 /// behind `current`, and are downloaded again.
-fn unfit_shards(cache: &EdgeCache, manifest: &Manifest, profile: Profile, plan: &Plan) -> BTreeSet<Hash32> {
-    let check = |cell: &CurrentCell| {
-        let path = cache.shard_path(cell.hash);
-        let checked = cache.files().map(&path).map_err(StoreError::Io);
-        let checked =
-            checked.and_then(|bytes| store::check_shard(&path, &bytes, cell, profile, manifest).map(drop));
-        checked.err().map(|e| (cell.hash, e))
+fn unfit_objects(cache: &EdgeCache, check: &Check<'_>, kept: &BTreeSet<Hash32>) -> BTreeSet<Hash32> {
+    let is_unfit = |hash: &Hash32| {
+        let path = cache.shard_path(*hash);
+        let mapped = cache.files().map(&path).map_err(StoreError::Io);
+        mapped.and_then(|bytes| check.object(&path, *hash, &bytes)).err().map(|e| (*hash, e))
     };
-    let kept: Vec<&CurrentCell> = plan.cells.iter().filter(|cell| plan.keep.contains(&cell.hash)).collect();
-    let unfit: Vec<(Hash32, StoreError)> = kept.into_par_iter().filter_map(check).collect();
+    let unfit: Vec<(Hash32, StoreError)> =
+        store::beside_queries(|| kept.par_iter().filter_map(is_unfit).collect());
     unfit
         .into_iter()
         .map(|(hash, e)| {
-            tracing::warn!("a shard on board is downloaded again: {}", chain(&e));
+            tracing::warn!("a shard on board is downloaded again: {}", crate::error_line(&e));
             hash
         })
         .collect()
 }
 
-/// Returns an error's text with those of its causes.
-fn chain(e: &dyn std::error::Error) -> String {
-    std::iter::successors(Some(e), |e| e.source()).map(ToString::to_string).collect::<Vec<_>>().join(": ")
-}
-
 /// Removes what lies in `staging/`, but for parts that are still wanted.
-fn clear_staging(cache: &EdgeCache, wanted: &[CurrentCell]) -> Result<(), FetchError> {
-    let wanted: BTreeSet<PathBuf> = wanted.iter().map(|cell| part_path(cache, cell.hash)).collect();
+fn clear_staging(cache: &EdgeCache, wanted: &[Object]) -> Result<(), FetchError> {
+    let wanted: BTreeSet<PathBuf> = wanted.iter().map(|object| part_path(cache, object.hash)).collect();
     for name in cache.files().list(&staging(cache))? {
         let path = staging(cache).join(name);
         if !wanted.contains(&path) {
@@ -429,14 +397,13 @@ fn is_disk_full(e: &io::Error) -> bool {
     matches!(e.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
 }
 
-/// Downloads shards, several at a time, and puts them in place, durably. Of several failures the one of
-/// the first shard in order is returned.
+/// Downloads objects, several at a time, and puts them in place, durably. Of several failures the one of
+/// the first object in order is returned.
 fn download_all(
     cache: &EdgeCache,
     client: &Client<'_>,
-    manifest: &Manifest,
-    profile: Profile,
-    shards: &[CurrentCell],
+    check: &Check<'_>,
+    objects: &[Object],
     parallel: usize,
 ) -> Result<(), FetchError> {
     let next = AtomicUsize::new(0);
@@ -445,15 +412,15 @@ fn download_all(
         let mut first_failure = None;
         while !failed.load(Ordering::Relaxed) {
             let index = next.fetch_add(1, Ordering::Relaxed);
-            let Some(shard) = shards.get(index) else { break };
-            if let Err(e) = download_one(cache, client, manifest, profile, shard) {
+            let Some(object) = objects.get(index) else { break };
+            if let Err(e) = download_one(cache, client, check, *object) {
                 failed.store(true, Ordering::Relaxed);
                 first_failure = Some((index, e));
             }
         }
         first_failure
     };
-    let n_workers = parallel.clamp(1, MAX_PARALLEL).min(shards.len());
+    let n_workers = parallel.clamp(1, MAX_PARALLEL).min(objects.len());
     let failures = std::thread::scope(|scope| {
         let workers: Vec<_> = (0..n_workers).map(|_| scope.spawn(worker)).collect();
         let joined = workers.into_iter().map(|worker| match worker.join() {
@@ -464,7 +431,7 @@ fn download_all(
     });
     match failures.into_iter().flatten().min_by_key(|(index, _)| *index) {
         Some((_, e)) => Err(e),
-        None if shards.is_empty() => Ok(()),
+        None if objects.is_empty() => Ok(()),
         None => Ok(cache.files().sync_dir(&cache.dir().join("shards"))?),
     }
 }
@@ -472,15 +439,13 @@ fn download_all(
 fn download_one(
     cache: &EdgeCache,
     client: &Client<'_>,
-    manifest: &Manifest,
-    profile: Profile,
-    shard: &CurrentCell,
+    check: &Check<'_>,
+    Object { hash, len_bytes }: Object,
 ) -> Result<(), FetchError> {
-    let CurrentCell { hash, len_bytes, .. } = *shard;
     let part = part_path(cache, hash);
     client.object(cache.files(), hash, len_bytes, &part)?;
     let bytes = cache.files().map(&part)?;
-    if let Err(source) = store::check_shard(&part, &bytes, shard, profile, manifest) {
+    if let Err(source) = check.object(&part, hash, &bytes) {
         return Err(FetchError::Published { hash, source: Box::new(source) });
     }
     Ok(cache.files().rename(&part, &cache.shard_path(hash))?)

@@ -2,32 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use glam::{DVec2, DVec3};
-use serde::{Deserialize, Serialize};
+use glam::DVec3;
 use slag_common::Hash32;
-use slag_common::frames::{Aabb, Geographic};
 use slag_common::manifest::{CellIndex, Manifest};
 use slag_common::shard::Profile;
 
 use crate::store::CurrentCell;
-
-/// Where the robot is.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Position {
-    /// World frame.
-    World(DVec3),
-    /// On the earth; needs a geo-referenced scene.
-    Geographic {
-        /// Latitude, degrees, north positive (WGS 84).
-        latitude_deg: f64,
-        /// Longitude, degrees, east positive.
-        longitude_deg: f64,
-        /// Height in metres, in the datum of the scene's origin; absent: at the scene's own height
-        /// there (see [`Position::in_world`]).
-        height_m: Option<f64>,
-    },
-}
 
 /// Why there is no plan.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -96,62 +76,6 @@ pub enum PlanError {
     },
 }
 
-impl Position {
-    /// Returns the position in the world frame.
-    ///
-    /// A geographic position without a height is put at the height of the centre of the box that is
-    /// horizontally nearest (then whose centre is, then of the lowest id), so that a robot that knows
-    /// only latitude and longitude gets the cells around it wherever the scene's zero height lies.
-    ///
-    /// # Errors
-    /// [`PlanError::Number`], [`PlanError::NoGeoReference`].
-    pub fn in_world(self, manifest: &Manifest) -> Result<DVec3, PlanError> {
-        let number = |name, value: f64, limit: f64, expected| match value.abs() <= limit {
-            true => Ok(()),
-            false => Err(PlanError::Number { name, value, expected }),
-        };
-        match self {
-            Self::World(position) => {
-                for (name, value) in [("x", position.x), ("y", position.y), ("z", position.z)] {
-                    number(name, value, f64::MAX, "finite")?;
-                }
-                Ok(position)
-            }
-            Self::Geographic { latitude_deg, longitude_deg, height_m } => {
-                number("latitude", latitude_deg, 90.0, "within -90..90 degrees")?;
-                number("longitude", longitude_deg, 180.0, "within -180..180 degrees")?;
-                number("height", height_m.unwrap_or(0.0), f64::MAX, "finite")?;
-                let geo = manifest
-                    .geo_reference
-                    .ok_or_else(|| PlanError::NoGeoReference { scene: manifest.scene.clone() })?;
-                let at = |height_m| {
-                    geo.world_from_geographic(Geographic { latitude_deg, longitude_deg, height_m })
-                };
-                let at_origin_height = at(geo.origin.height_m);
-                Ok(match height_m {
-                    Some(height_m) => at(height_m),
-                    None => at_origin_height.with_z(scene_height(manifest, at_origin_height)),
-                })
-            }
-        }
-    }
-}
-
-/// Returns the z of the centre of the cell that is horizontally nearest; that of the point where there
-/// is no cell.
-fn scene_height(manifest: &Manifest, point: DVec3) -> f64 {
-    let rank = |bounds: &Aabb| {
-        let flat = Aabb { min: bounds.min.with_z(0.0), max: bounds.max.with_z(0.0) };
-        let to_centre = DVec2::new(point.x, point.y).distance(flat.centre().truncate());
-        (flat.distance_to(point.with_z(0.0)), to_centre)
-    };
-    let nearest = manifest.cells.iter().map(|cell| &cell.bounds).min_by(|a, b| {
-        let ((a_box, a_centre), (b_box, b_centre)) = (rank(a), rank(b));
-        a_box.total_cmp(&b_box).then(a_centre.total_cmp(&b_centre))
-    });
-    nearest.map_or(point.z, |bounds| bounds.centre().z)
-}
-
 /// A shard on board.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Held {
@@ -174,18 +98,27 @@ pub struct Wanted {
     pub max_bytes: Option<u64>,
 }
 
-/// What to do with each shard.
+/// A file that a generation needs: content named by its hash.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Object {
+    /// BLAKE3 of the content.
+    pub hash: Hash32,
+    /// Its length.
+    pub len_bytes: u64,
+}
+
+/// What to do with each object.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Plan {
     /// The cells within the radius, by id, ascending.
     pub cells: Vec<CurrentCell>,
-    /// Those whose shard is not on board.
-    pub download: Vec<CurrentCell>,
-    /// Shards on board that are needed.
+    /// What they need and is not on board.
+    pub download: Vec<Object>,
+    /// Objects on board that are needed.
     pub keep: BTreeSet<Hash32>,
-    /// Shards on board that are not needed but fit the budget, the most recently used.
+    /// Objects on board that are not needed but fit the budget, the most recently used.
     pub spare: BTreeSet<Hash32>,
-    /// Shards on board that do not.
+    /// Objects on board that do not.
     pub free: BTreeSet<Hash32>,
 }
 
@@ -215,33 +148,24 @@ impl Plan {
                 nearest,
             });
         }
-        let mut plan = Self::default();
-        let mut needed: BTreeMap<Hash32, u64> = BTreeMap::new();
-        for cell in positions.into_iter().map(|position| &manifest.cells[position]) {
-            let Some(shard) = cell.shards.get(&profile) else {
-                let names: Vec<&str> = cell.shards.keys().map(|profile| profile.name()).collect();
-                let (cell_id, available) = (cell.cell_id, names.join(", "));
-                return Err(PlanError::NoProfile { cell_id, profile, available });
-            };
-            let (hash, len_bytes) = (shard.hash, shard.len_bytes);
-            let at = CurrentCell { cell_id: cell.cell_id, hash, len_bytes };
-            plan.cells.push(at);
-            if needed.insert(hash, len_bytes).is_some() {
-                return Err(PlanError::Conflict { cell_id: cell.cell_id, hash });
-            }
-            match held.get(&hash) {
-                Some(held) if held.len_bytes == len_bytes => drop(plan.keep.insert(hash)),
-                _ => plan.download.push(at),
-            }
-        }
-        let needed_bytes = needed.values().fold(0u64, |sum, len| sum.saturating_add(*len));
+        let cells = cells_at(manifest, profile, &positions)?;
+        let needs = objects(&cells)?;
+        let needed: BTreeSet<Hash32> = needs.iter().map(|object| object.hash).collect();
+        let needed_bytes = needs.iter().fold(0u64, |sum, object| sum.saturating_add(object.len_bytes));
         let budget_bytes = max_bytes.unwrap_or(needed_bytes.saturating_mul(2));
         if needed_bytes > budget_bytes {
-            let n_cells = plan.cells.len();
+            let n_cells = cells.len();
             return Err(PlanError::TooLarge { n_cells, needed_bytes, max_bytes: budget_bytes });
         }
+        let mut plan = Self { cells, ..Self::default() };
+        for object in needs {
+            match held.get(&object.hash) {
+                Some(held) if held.len_bytes == object.len_bytes => drop(plan.keep.insert(object.hash)),
+                _ => plan.download.push(object),
+            }
+        }
         let mut others: Vec<(&Hash32, &Held)> =
-            held.iter().filter(|(hash, _)| !needed.contains_key(hash)).collect();
+            held.iter().filter(|(hash, _)| !needed.contains(hash)).collect();
         others.sort_by_key(|(hash, held)| (std::cmp::Reverse(held.last_used), **hash));
         let mut room_bytes = Some(budget_bytes - needed_bytes);
         for (hash, held) in others {
@@ -256,12 +180,44 @@ impl Plan {
     }
 }
 
+/// Returns the cells at some positions of a manifest with their shards of a profile.
+fn cells_at(
+    manifest: &Manifest,
+    profile: Profile,
+    positions: &[usize],
+) -> Result<Vec<CurrentCell>, PlanError> {
+    let listed = positions.iter().map(|position| {
+        let cell = &manifest.cells[*position];
+        match cell.shards.get(&profile) {
+            Some(shard) => {
+                Ok(CurrentCell { cell_id: cell.cell_id, hash: shard.hash, len_bytes: shard.len_bytes })
+            }
+            None => {
+                let names: Vec<&str> = cell.shards.keys().map(|profile| profile.name()).collect();
+                Err(PlanError::NoProfile { cell_id: cell.cell_id, profile, available: names.join(", ") })
+            }
+        }
+    });
+    listed.collect()
+}
+
+/// Returns everything that must be on board before a generation of these cells is made current.
+fn objects(cells: &[CurrentCell]) -> Result<Vec<Object>, PlanError> {
+    let mut seen = BTreeSet::new();
+    let object = |cell: &CurrentCell| match seen.insert(cell.hash) {
+        true => Ok(Object { hash: cell.hash, len_bytes: cell.len_bytes }),
+        false => Err(PlanError::Conflict { cell_id: cell.cell_id, hash: cell.hash }),
+    };
+    cells.iter().map(object).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
-    use slag_common::frames::GeoReference;
+    use slag_common::frames::{Aabb, GeoReference, Geographic};
     use slag_common::manifest::{CellRecord, EncoderRecord, ShardRecord, VERSION};
 
+    use super::super::position::Position;
     use super::*;
 
     fn manifest(boxes: &[(DVec3, DVec3, u64)]) -> Manifest {
@@ -288,6 +244,7 @@ mod tests {
             generation: 1,
             created_unix_secs: 0,
             expires_unix_secs: None,
+            next_key: None,
             metric: true,
             geo_reference: Some(GeoReference { origin }),
             encoder: EncoderRecord {

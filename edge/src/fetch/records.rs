@@ -5,8 +5,9 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
+use slag_common::manifest::Manifest;
 
-use super::plan::Position;
+use super::position::Position;
 
 /// Pages kept in memory: the records are a few kilobytes.
 const CACHE_BYTES: u64 = 1 << 20;
@@ -56,7 +57,12 @@ pub struct Records {
     db: sled::Db,
     generations: sled::Tree,
     used: sled::Tree,
+    /// Keys that are no longer accepted, and which one took their place.
+    successors: sled::Tree,
 }
+
+/// A key change takes effect when its chain is this short; a longer one is damage.
+const MAX_SUCCESSORS: usize = 1000;
 
 impl Records {
     /// Opens the records, or makes them; holds the lock until dropped.
@@ -68,12 +74,14 @@ impl Records {
         let start = Instant::now();
         loop {
             let opened = config.open().and_then(|db| {
-                let (generations, used) = (db.open_tree("generations")?, db.open_tree("used")?);
-                Ok((db, generations, used))
+                let open = |name| db.open_tree(name);
+                let (generations, used, successors) =
+                    (open("generations")?, open("used")?, open("successors")?);
+                Ok(Self { path: path.to_owned(), db, generations, used, successors })
             });
             let path = path.to_owned();
             match opened {
-                Ok((db, generations, used)) => return Ok(Self { path, db, generations, used }),
+                Ok(records) => return Ok(records),
                 // sled has no variant of its own for this.
                 Err(sled::Error::Io(e)) if e.to_string().contains("could not acquire lock") => {
                     if start.elapsed() > LOCK_PATIENCE {
@@ -92,10 +100,21 @@ impl Records {
         bytes.map(|bytes| serde_json::from_slice(&bytes).map_err(|_| self.damaged("last"))).transpose()
     }
 
-    /// Returns the accepted key.
-    pub fn key(&self) -> Result<Option<Hash32>, RecordsError> {
-        let bytes = self.db.get("key").map_err(|e| self.database(e))?;
-        bytes.map(|b| b.as_ref().try_into().map(Hash32).map_err(|_| self.damaged("key"))).transpose()
+    /// Returns the accepted key, and the one that it named as its successor.
+    pub fn keys(&self) -> Result<Option<(Hash32, Option<Hash32>)>, RecordsError> {
+        let Some(key) = self.hash(&self.db, b"key", "key")? else { return Ok(None) };
+        Ok(Some((key, self.hash(&self.db, b"next_key", "next_key")?)))
+    }
+
+    /// Returns the key that stands in a key's place now: itself, unless it was changed for another.
+    pub fn successor(&self, mut key: Hash32) -> Result<Hash32, RecordsError> {
+        for _ in 0..MAX_SUCCESSORS {
+            match self.hash(&self.successors, &key.0, "successors")? {
+                Some(successor) => key = successor,
+                None => return Ok(key),
+            }
+        }
+        Err(self.damaged("successors"))
     }
 
     /// Returns the highest generation seen of a scene signed by a key.
@@ -108,19 +127,33 @@ impl Records {
         Ok(self.number(&self.used, &shard.0, "used")?.unwrap_or(0))
     }
 
-    /// Records durably that a manifest was accepted, and for which request.
+    /// Records durably that a manifest was accepted, and for which request. Where its key takes the
+    /// place of others, they are no longer accepted.
     pub fn accept(
         &self,
         last: &LastFetch,
+        manifest: &Manifest,
         key: Hash32,
-        scene: &str,
-        generation: u64,
+        replaced: &[Hash32],
     ) -> Result<(), RecordsError> {
         let last = serde_json::to_vec(last).map_err(|_| self.damaged("last"))?;
+        // Whatever part of this a power cut leaves, in this order: the old key is never accepted again
+        // once the new one is, and never for less than was seen.
         let write = || {
-            self.db.insert("last", last)?;
-            self.db.insert("key", &key.0)?;
-            self.generations.insert(generation_name(key, scene), &generation.to_le_bytes())?;
+            let generation = manifest.generation.to_le_bytes();
+            self.generations.insert(generation_name(key, &manifest.scene), &generation)?;
+            for old in replaced {
+                self.successors.insert(old.0, &key.0)?;
+            }
+            self.successors.remove(key.0)?;
+            let mut batch = sled::Batch::default();
+            batch.insert("last", last);
+            batch.insert("key", &key.0);
+            match manifest.next_key {
+                Some(next) => batch.insert("next_key", &next.0),
+                None => batch.remove("next_key"),
+            }
+            self.db.apply_batch(batch)?;
             self.db.flush()
         };
         write().map(drop).map_err(|e| self.database(e))
@@ -144,6 +177,16 @@ impl Records {
             self.db.flush()
         };
         write().map(drop).map_err(|e| self.database(e))
+    }
+
+    fn hash(
+        &self,
+        tree: &sled::Tree,
+        name: &[u8],
+        record: &'static str,
+    ) -> Result<Option<Hash32>, RecordsError> {
+        let bytes = tree.get(name).map_err(|e| self.database(e))?;
+        bytes.map(|b| b.as_ref().try_into().map(Hash32).map_err(|_| self.damaged(record))).transpose()
     }
 
     fn number(

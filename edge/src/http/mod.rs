@@ -2,6 +2,7 @@
 
 mod metrics;
 mod params;
+mod position;
 mod problem;
 mod query;
 mod serve;
@@ -11,19 +12,21 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use axum::extract::{Request, State};
+use axum::extract::{DefaultBodyLimit, Request, State};
 use axum::http::{HeaderName, HeaderValue, Method, Uri, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
-use axum::routing::get;
+use axum::routing::{get, post};
 use axum::{Json, Router};
 use serde_json::json;
 use tokio::sync::{Semaphore, watch};
 use tower_http::catch_panic::CatchPanicLayer;
 
 pub use problem::Problem;
+pub use query::parse_query;
 pub use serve::serve;
 
+use crate::fetch::follow::Following;
 use crate::query::{Engine, Status};
 use metrics::Metrics;
 
@@ -42,7 +45,8 @@ GET /query?text=chair   clusters of Gaussians that match, best first
     min_count=n         smaller clusters are dropped
     exact=true          false: by palette rows alone, faster
     format=json         or arrow: columns, of gaussians
-GET /status             scene, generation, encoder, shards
+GET /status             scene, generation, encoder, shards, and whether the scene is past its expiry
+POST /position          where the robot is, if it is followed; JSON: x, y, z, or lat, lon, height
 GET /healthz            the process lives
 GET /readyz             a scene is loaded and fits the text model
 GET /metrics            Prometheus
@@ -54,7 +58,8 @@ const OPENAPI: &str = include_str!("openapi.json");
 const JSON: (HeaderName, HeaderValue) = (header::CONTENT_TYPE, HeaderValue::from_static("application/json"));
 
 /// The paths there are.
-const ROUTES: [&str; 7] = ["/", "/query", "/status", "/healthz", "/readyz", "/metrics", "/openapi.json"];
+const ROUTES: [&str; 8] =
+    ["/", "/query", "/status", "/position", "/healthz", "/readyz", "/metrics", "/openapi.json"];
 
 /// What the service may use.
 #[derive(Clone, Debug)]
@@ -77,7 +82,7 @@ impl Default for Settings {
     fn default() -> Self {
         Self {
             max_queries: 32,
-            max_connections: 256,
+            max_connections: 512,
             query_timeout: Duration::from_secs(10),
             stream_timeout: Duration::from_secs(60),
             header_timeout: Duration::from_secs(30),
@@ -95,11 +100,17 @@ pub struct App {
     is_reloading: AtomicBool,
     n_reload_attempts: watch::Sender<u64>,
     n_requests: AtomicU64,
+    following: Option<Arc<Following>>,
 }
 
 impl App {
     /// Wraps an engine; what it has loaded is served, and what is fetched later replaces it.
     pub fn new(engine: Engine, settings: Settings) -> Arc<Self> {
+        Self::following(engine, settings, None)
+    }
+
+    /// As [`App::new`], and `POST /position` is handed on.
+    pub fn following(engine: Engine, settings: Settings, following: Option<Arc<Following>>) -> Arc<Self> {
         Arc::new(Self {
             engine,
             permits: Arc::new(Semaphore::new(settings.max_queries)),
@@ -108,6 +119,7 @@ impl App {
             is_reloading: AtomicBool::new(false),
             n_reload_attempts: watch::Sender::new(0),
             n_requests: AtomicU64::new(0),
+            following,
         })
     }
 
@@ -122,18 +134,27 @@ impl App {
             return;
         }
         let app = Arc::clone(self);
-        tokio::task::spawn_blocking(move || {
-            let counter = match app.engine.reload() {
-                Ok(()) => &app.metrics.reloads,
-                Err(error) => {
-                    tracing::warn!("the newest generation does not open: {}", crate::error_line(&error));
-                    &app.metrics.reload_failures
-                }
-            };
-            counter.fetch_add(1, Ordering::Relaxed);
-            app.is_reloading.store(false, Ordering::Release);
-            app.n_reload_attempts.send_modify(|n| *n += 1);
-        });
+        tokio::task::spawn_blocking(move || app.reload());
+    }
+
+    /// Loads what a fetch has just brought, unless someone does already. Blocks; questions do not wait.
+    pub fn reload_now(&self) {
+        if !self.is_reloading.swap(true, Ordering::AcqRel) {
+            self.reload();
+        }
+    }
+
+    fn reload(&self) {
+        let counter = match self.engine.reload() {
+            Ok(()) => &self.metrics.reloads,
+            Err(error) => {
+                tracing::warn!("the newest generation does not open: {}", crate::error_line(&error));
+                &self.metrics.reload_failures
+            }
+        };
+        counter.fetch_add(1, Ordering::Relaxed);
+        self.is_reloading.store(false, Ordering::Release);
+        self.n_reload_attempts.send_modify(|n| *n += 1);
     }
 }
 
@@ -144,6 +165,7 @@ pub fn router(app: Arc<App>) -> Router {
         .route("/query", get(query::query))
         .route("/openapi.json", get(|| async { ([JSON], OPENAPI) }))
         .route("/status", get(status))
+        .route("/position", post(position::position).layer(DefaultBodyLimit::max(position::MAX_BODY_BYTES)))
         .route("/healthz", get(|| async { "alive\n" }))
         .route("/readyz", get(ready))
         .route("/metrics", get(metrics))
@@ -211,12 +233,18 @@ async fn status(State(app): State<Arc<App>>) -> Result<Response, Problem> {
             |e| Some(e.to_string()),
             |snapshot| app.engine.check_encoder(snapshot).err().map(|e| e.to_string()),
         );
-        let scene = snapshot.ok().map(|snapshot| Status::of(&snapshot));
+        let manifest = snapshot.as_ref().ok().map(|snapshot| &snapshot.manifest);
+        let expires_unix_secs = manifest.and_then(|manifest| manifest.expires_unix_secs);
+        // It goes on answering: an old map is better than none, as long as this is said.
+        let is_expired = manifest.is_some_and(|m| m.check_expiry(crate::now_unix_secs()).is_err());
+        let following = app.following.as_ref().map(|following| following.status());
+        let scene = snapshot.as_ref().ok().map(|snapshot| Status::of(snapshot));
         let is_ready = trouble.is_none() && app.engine.text_is_alive();
         let version = env!("CARGO_PKG_VERSION");
         let text_model = app.engine.encoder();
         Ok(Json(json!({
             "version": version, "is_ready": is_ready, "trouble": trouble, "text_model": text_model, "scene": scene,
+            "expires_unix_secs": expires_unix_secs, "is_expired": is_expired, "following": following,
         }))
         .into_response())
     })

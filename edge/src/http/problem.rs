@@ -58,10 +58,10 @@ impl Problem {
         Self::new(StatusCode::NOT_FOUND, "not-found", "Not found", detail)
     }
 
-    /// Another method than GET.
+    /// Another method than the path's.
     pub fn method_not_allowed(method: &str) -> Self {
         let method: String = method.chars().take(20).collect();
-        let detail = format!("found {method:?}, expected \"GET\"");
+        let detail = format!("found {method:?}, expected \"GET\", or \"POST\" at /position");
         Self::new(StatusCode::METHOD_NOT_ALLOWED, "method-not-allowed", "Method not allowed", detail)
     }
 

@@ -10,16 +10,28 @@ use std::time::Duration;
 use axum::body::{Body, Bytes};
 use axum::extract::rejection::QueryRejection;
 use axum::extract::{Query, State};
-use axum::http::{HeaderMap, HeaderValue, header};
+use axum::http::{HeaderMap, HeaderValue, Uri, header};
 use axum::response::{IntoResponse, Response};
 use hyper::body::Frame;
 use tokio::sync::mpsc::{Receiver, Sender, channel};
 
 use super::{App, Problem, blocking, params};
-use crate::query::RequestError;
+use crate::query::{QueryRequest, RequestError};
 
 /// Pieces made ahead of the client.
 const PIECES_AHEAD: usize = 2;
+
+/// Reads the query string of `/query`; values are checked by [`QueryRequest::check`].
+///
+/// # Errors
+/// The first parameter that is wrong, or the string if it is none.
+pub fn parse_query(query_string: &str) -> Result<QueryRequest, RequestError> {
+    let wrong = |e: &dyn ToString| RequestError::new("query string", &e.to_string(), "name=value pairs");
+    let uri: Uri = format!("/query?{query_string}").parse().map_err(|e| wrong(&e))?;
+    let pairs: Query<Vec<(String, String)>> =
+        Query::try_from_uri(&uri).map_err(|e: QueryRejection| wrong(&e.body_text()))?;
+    Ok(params::parse(&pairs, &HeaderMap::new())?.0)
+}
 
 /// Answers `/query`.
 pub async fn query(

@@ -9,9 +9,13 @@ use tokio::sync::oneshot;
 use tower::ServiceExt;
 
 use super::*;
+use crate::fetch::Position;
 use crate::store::EdgeCache;
-use crate::testing::{BuiltShard, Gate, Member, TestShard, axes_service, open_gate, write_cache};
+use crate::testing::{
+    BuiltShard, Gate, Member, TestShard, axes_service, manifest_of, open_gate, write_cache, write_manifest,
+};
 use slag_common::Hash32;
+use slag_common::manifest::Manifest;
 
 mod answers;
 mod openapi;
@@ -303,6 +307,56 @@ async fn tells_status_and_metrics() {
     ] {
         assert!(metrics.lines().any(|found| found == line), "{line} is not in\n{metrics}");
     }
+}
+
+#[tokio::test]
+async fn an_expired_scene_answers_and_the_status_says_so() {
+    for (expires_unix_secs, is_expired) in [(None, false), (Some(1), true), (Some(u64::MAX), false)] {
+        let service = Service::with_chair();
+        let mut attempts = service.app.reload_attempts();
+        let manifest = Manifest { expires_unix_secs, ..manifest_of(&chair(None), 2) };
+        write_manifest(service.dir.path(), &chair(None), manifest);
+        service.get("/query?text=0").await;
+        soon(attempts.changed()).await.expect("the service lives");
+        let (_, _, body) = service.get("/status").await;
+        assert_eq!((&body["scene"]["generation"], &body["is_ready"]), (&2.into(), &true.into()));
+        assert_eq!(
+            (&body["is_expired"], body["expires_unix_secs"].as_u64()),
+            (&is_expired.into(), expires_unix_secs)
+        );
+        let (status, _, body) = service.get("/query?text=0").await;
+        assert_eq!((status, &body["answers"][0]["n_gaussians"]), (StatusCode::OK, &20.into()));
+    }
+}
+
+#[tokio::test]
+async fn positions_are_handed_on_or_refused() {
+    let service = Service::with_chair();
+    let say = |app: &Arc<App>, body: &str| {
+        let request = Request::post("/position").body(Body::from(body.to_owned())).expect("a request");
+        let router = router(Arc::clone(app));
+        soon(async { read(router.oneshot(request).await.expect("infallible")).await })
+    };
+    let (status, _, body) = say(&service.app, "1 2 3").await;
+    assert_eq!((status.as_u16(), &body["type"]), (409, &"urn:slag:problem:not-following".into()));
+    assert_eq!(service.get("/status").await.2["following"], Value::Null);
+
+    let following = Arc::<Following>::default();
+    let (text, _) = axes_service(3, Gate::default());
+    let engine = Engine::new(EdgeCache::open(service.dir.path()), text);
+    let app = App::following(engine, Settings::default(), Some(Arc::clone(&following)));
+    assert_eq!(say(&app, r#"{"x":1,"y":-2,"z":3.5}"#).await.0, StatusCode::ACCEPTED);
+    assert_eq!(following.status().position, Some(Position::World(DVec3::new(1.0, -2.0, 3.5))));
+    assert_eq!(say(&app, r#"{"lat":46.8,"lon":-92}"#).await.0, StatusCode::ACCEPTED);
+    let at = Position::Geographic { latitude_deg: 46.8, longitude_deg: -92.0, height_m: None };
+    assert_eq!(following.status().position, Some(at));
+    for bad in
+        ["", "{}", r#"{"x":1}"#, r#"{"lat":91,"lon":0}"#, "\u{1b}[2J", &"1".repeat(900), &"1".repeat(100_000)]
+    {
+        let (status, _, body) = say(&app, bad).await;
+        assert_eq!((status.as_u16(), &body["parameter"]), (400, &"body".into()), "{bad}");
+    }
+    assert_eq!(following.status().position, Some(at), "what is refused changes nothing");
 }
 
 /// Serves on a real socket; returns the address, the stop signal, and the server's end.

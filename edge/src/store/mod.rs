@@ -16,7 +16,7 @@ pub mod mmap;
 
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -272,13 +272,28 @@ impl Snapshot {
         current_stat: Option<Stat>,
     ) -> Result<Self, StoreError> {
         let manifest = cache.read_manifest(current.manifest_hash, current.key)?;
-        let opened: Vec<Result<OpenShard, StoreError>> = current
-            .cells
-            .par_iter()
-            .map(|cell| OpenShard::open(cache, &manifest, current.profile, cell))
-            .collect();
+        let open = |cell| OpenShard::open(cache, &manifest, current.profile, cell);
+        let opened: Vec<Result<OpenShard, StoreError>> =
+            beside_queries(|| current.cells.par_iter().map(open).collect());
         let shards = opened.into_iter().collect::<Result<_, _>>()?;
         Ok(Self { current, current_stat, manifest, shards })
+    }
+}
+
+/// Runs work in parallel on threads of its own, half as many as there are cores.
+///
+/// Queries are split over the common threads; behind the checks of many shards there, a query would wait
+/// for all of them.
+pub(crate) fn beside_queries<T: Send>(work: impl FnOnce() -> T + Send) -> T {
+    static POOL: OnceLock<Option<rayon::ThreadPool>> = OnceLock::new();
+    let pool = POOL.get_or_init(|| {
+        let n_threads = std::thread::available_parallelism().map_or(1, usize::from).div_ceil(2);
+        rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().ok()
+    });
+    match pool {
+        Some(pool) => pool.install(work),
+        // Without memory for threads it takes longer.
+        None => work(),
     }
 }
 

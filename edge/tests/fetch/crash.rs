@@ -15,7 +15,7 @@ use super::{Robot, assert_holds, at};
 /// What becomes of the records, which have their own store, at a power cut.
 const N_RECORDS_FATES: u64 = 3;
 
-fn copy_dir(from: &Path, to: &Path) {
+pub fn copy_dir(from: &Path, to: &Path) {
     fs_err::create_dir_all(to).expect("made");
     for entry in fs_err::read_dir(from).expect("there") {
         let entry = entry.expect("readable");

@@ -75,10 +75,10 @@ fn refused_manifests_leave_the_old_generation() {
 
     // The key is changed only when that is said; then the old one is no longer accepted.
     server.publish(foreign.clone());
-    robot.request.key = Some(public(&key(2)));
+    robot.request.keys = vec![public(&key(2))];
     assert_eq!(robot.fetch().expect("accepted").key, public(&key(2)));
     assert_holds(&robot.snapshot(), &foreign, 0..3);
-    robot.request.key = None;
+    robot.request.keys.clear();
     server.publish(Published::new(9, &[0; 4], 50));
     assert!(matches!(robot.fetch(), Err(FetchError::Manifest(ManifestError::UnknownKey { .. }))));
 }
@@ -149,8 +149,8 @@ fn lasting_faults_are_given_up_and_told() {
     let len = scene.bytes(0..1);
     type Check = fn(&Failure) -> bool;
     let cases: [(Fault, u32, Check); 6] = [
-        (Fault::Status(404), 1, |f| matches!(f, Failure::Status { status: 404 })),
-        (Fault::Status(500), 3, |f| matches!(f, Failure::Status { status: 500 })),
+        (Fault::Status(404), 1, |f| matches!(f, Failure::Status { status: 404, .. })),
+        (Fault::Status(500), 3, |f| matches!(f, Failure::Status { status: 500, .. })),
         (Fault::Length(1), 3, |f| matches!(f, Failure::Length { .. })),
         (Fault::Corrupt(900), 3, |f| matches!(f, Failure::Hash { .. })),
         (Fault::Cut(0), 3, |f| matches!(f, Failure::Transport(_) | Failure::Cut { .. })),
@@ -253,4 +253,132 @@ fn addresses_that_are_none_are_refused() {
     let mut robot = Robot::on_disk(dir.path(), "http://a");
     robot.request.from = None;
     assert!(matches!(robot.fetch(), Err(FetchError::NotGiven { what: "store's address" })));
+}
+
+/// Announced lengths are believed when they are too long, not when they are short enough.
+#[test]
+fn a_manifest_of_a_gigabyte_is_refused_unread() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let scene = Published::new(1, &[0; 1], 50);
+    let server = Server::start(scene.clone());
+    let robot = Robot::on_disk(dir.path(), &server.url());
+    robot.fetch().expect("works");
+    server.publish(Published::new(2, &[1; 1], 50));
+    server.take_seen();
+    server.faults(|_| Fault::Length(1 << 30));
+    let error = robot.fetch().expect_err("refused");
+    assert!(
+        matches!(error, FetchError::Manifest(ManifestError::TooLong { len_bytes }) if len_bytes > 1 << 30),
+        "{error}"
+    );
+    assert_eq!(server.take_seen().len(), 1, "no second attempt");
+    assert_holds(&robot.snapshot(), &scene, 0..1);
+}
+
+/// Names become paths: only 64 hex digits do.
+#[test]
+fn names_that_are_paths_are_refused() {
+    let scene = Published::new(1, &[0; 1], 50);
+    let end = scene.signed.iter().position(|b| *b == b'\n').expect("a first line") + 1;
+    let json = String::from_utf8(scene.signed[end..].to_vec()).expect("JSON");
+    let name = scene.hash(0, Profile::Compact).to_string();
+    let upper = name.to_uppercase();
+    for path in ["../../../etc/passwd", "/etc/passwd", "", ".", "..\\\\x", "a/b", &name[1..], &upper] {
+        let dir = tempfile::tempdir().expect("temporary folder");
+        let mut hostile = scene.clone();
+        hostile.signed = signed_text(&json.replace(&name, path));
+        let server = Server::start(hostile);
+        let robot = Robot::on_disk(dir.path(), &server.url());
+        let error = robot.fetch().expect_err("refused");
+        assert!(matches!(error, FetchError::Manifest(ManifestError::Content { .. })), "{path}: {error}");
+
+        // The same in what lies on board.
+        server.publish(scene.clone());
+        robot.fetch().expect("works");
+        let current = fs_err::read_to_string(robot.cache.current_path()).expect("there");
+        fs_err::write(robot.cache.current_path(), current.replace(&name, path)).expect("written");
+        let error = Snapshot::open(&robot.cache).expect_err("refused");
+        assert!(matches!(error, StoreError::Current { .. }), "{path}: {error}");
+    }
+}
+
+/// Signs any text as a manifest.
+fn signed_text(json: &str) -> Vec<u8> {
+    use ed25519_dalek::Signer;
+    let key = key(1);
+    let signature = key.sign(json.as_bytes()).to_bytes();
+    let hex = |bytes: &[u8]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
+    format!("slag-manifest 1 ed25519 {} {}\n{json}", public(&key), hex(&signature)).into_bytes()
+}
+
+/// Shards with lies under right checksums, hashes and signatures: sizes, sections, counts, offsets.
+#[test]
+fn shards_that_lie_are_refused() {
+    let scene = Published::new(1, &[0; 1], 50);
+    let sound = scene.objects[&scene.hash(0, Profile::Compact)].clone();
+    // FORMAT.md: the section table begins at 32, a row is id, 0, offset, length, checksum in 32 bytes; the
+    // header section comes first. The checksum is the hash's beginning.
+    let row = |n: usize| 32 + 32 * n;
+    let set =
+        |bytes: &mut Vec<u8>, at: usize, value: u64| bytes[at..at + 8].copy_from_slice(&value.to_le_bytes());
+    let get = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().expect("8 bytes"));
+    let header = get(&sound, row(0) + 8) as usize;
+    type Lie<'a> = (&'a str, Box<dyn Fn(&mut Vec<u8>) + 'a>);
+    let lies: Vec<Lie<'_>> = vec![
+        (
+            "overlap",
+            Box::new(|b| {
+                let at = get(b, row(0) + 8);
+                set(b, row(1) + 8, at)
+            }),
+        ),
+        ("offset that wraps", Box::new(|b| set(b, row(1) + 8, u64::MAX - 63))),
+        ("length that wraps", Box::new(|b| set(b, row(1) + 16, u64::MAX))),
+        (
+            "length beyond the end",
+            Box::new(|b| {
+                let len = get(b, row(1) + 16);
+                set(b, row(1) + 16, len + (1 << 40))
+            }),
+        ),
+        ("length that is short", Box::new(|b| set(b, row(1) + 16, 6))),
+        ("two sections of one id", Box::new(|b| b[row(1)] = b[row(0)])),
+        ("file length", Box::new(|b| set(b, 16, 1 << 50))),
+        ("number of sections", Box::new(|b| b[12..16].copy_from_slice(&u32::MAX.to_le_bytes()))),
+        ("n_gaussians", Box::new(|b| b[header + 4..header + 8].copy_from_slice(&u32::MAX.to_le_bytes()))),
+        ("huge K", Box::new(|b| b[header + 8..header + 12].copy_from_slice(&u32::MAX.to_le_bytes()))),
+        ("huge dim", Box::new(|b| b[header + 12..header + 16].copy_from_slice(&u32::MAX.to_le_bytes()))),
+        ("K and N together", Box::new(|b| b[header + 4..header + 12].copy_from_slice(&[0xff; 8]))),
+    ];
+    for (name, lie) in &lies {
+        let mut bytes = sound.clone();
+        lie(&mut bytes);
+        let n_sections = u32::from_le_bytes(sound[12..16].try_into().expect("4 bytes")) as usize;
+        for n in 0..n_sections {
+            let (at, len) = (get(&bytes, row(n) + 8) as usize, get(&bytes, row(n) + 16) as usize);
+            if let Some(section) = at.checked_add(len).and_then(|end| bytes.get(at..end)) {
+                let checksum = Hash32::of(section).0;
+                bytes[row(n) + 24..row(n) + 32].copy_from_slice(&checksum[..8]);
+            }
+        }
+        let head = [&bytes[..24], &bytes[32..row(n_sections)]].concat();
+        bytes[24..32].copy_from_slice(&Hash32::of(&head).0[..8]);
+
+        let dir = tempfile::tempdir().expect("temporary folder");
+        let mut hostile = scene.clone();
+        let (hash, len_bytes) = (Hash32::of(&bytes), bytes.len() as u64);
+        hostile.objects.insert(hash, bytes);
+        let hostile = hostile.edited(&key(1), |manifest| {
+            let record = manifest.cells[0].shards.get_mut(&Profile::Compact).expect("there");
+            (record.hash, record.len_bytes) = (hash, len_bytes);
+        });
+        let server = Server::start(hostile);
+        let robot = Robot::on_disk(dir.path(), &server.url());
+        let error = robot.fetch().expect_err(name);
+        let FetchError::Published { source, .. } = &error else { panic!("{name}: {error}") };
+        let StoreError::Shard { source, .. } = &**source else { panic!("{name}: {source}") };
+        let is_about_checksum = source.to_string().contains("checksum");
+        assert!(!is_about_checksum, "{name}: the lie is told with right checksums: {source}");
+        assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Empty { .. })), "{name}");
+    }
 }

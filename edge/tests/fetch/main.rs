@@ -1,7 +1,10 @@
 //! Fetch and store against a real HTTP server that misbehaves, and storage that loses power.
 
 mod crash;
+mod faults;
+mod follow;
 mod hostile;
+mod keys;
 mod scene;
 mod server;
 mod sim;
@@ -23,6 +26,7 @@ use scene::{NOW, Published};
 use sim::SimFiles;
 
 /// Fetches with a small patience, as tests want it.
+#[derive(Clone)]
 struct Robot {
     cache: EdgeCache,
     request: FetchRequest,

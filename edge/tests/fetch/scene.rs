@@ -129,6 +129,7 @@ impl Published {
             generation,
             created_unix_secs: NOW - 1000,
             expires_unix_secs: Some(NOW + 1000),
+            next_key: None,
             metric: true,
             geo_reference: Some(GeoReference {
                 origin: slag_common::frames::Geographic {

@@ -5,6 +5,7 @@ use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 use slag_common::Hash32;
 
@@ -22,6 +23,10 @@ pub enum Fault {
     IgnoreRange,
     /// Answers with this status and no body.
     Status(u16),
+    /// Answers with this status, no body, and when to come back, in seconds.
+    RetryAfter(u16, u64),
+    /// Answers later.
+    Delay(Duration),
     /// Sends elsewhere.
     Redirect(String),
     /// Sends the body and then goes on for ever, in chunks.
@@ -158,6 +163,11 @@ fn answer(shared: &Shared, mut stream: TcpStream) -> std::io::Result<()> {
             body.clear();
             *status
         }
+        (Fault::RetryAfter(status, seconds), _) => {
+            body.clear();
+            head += &format!("Retry-After: {seconds}\r\n");
+            *status
+        }
         (Fault::Redirect(location), _) => {
             head += &format!("Location: {location}\r\n");
             302
@@ -198,6 +208,9 @@ fn answer(shared: &Shared, mut stream: TcpStream) -> std::io::Result<()> {
     seen.body_bytes = sent;
     let status = seen.status;
     shared.seen.lock().expect("sound").push(seen);
+    if let Fault::Delay(by) = fault {
+        std::thread::sleep(by);
+    }
     if fault == Fault::Stall {
         // Ends when the client closes.
         return reader.read_line(&mut String::new()).map(drop);

@@ -51,6 +51,7 @@ struct State {
     n_changes: usize,
     n_steps: u64,
     cut_at: Option<u64>,
+    fail_at: Option<u64>,
     is_cut: bool,
     capacity_bytes: Option<u64>,
     random: u64,
@@ -66,6 +67,11 @@ impl SimFiles {
     pub fn fork(&self, cut_at: Option<u64>, seed: u64) -> Self {
         let state = self.0.lock().expect("sound").clone();
         Self(Mutex::new(State { n_steps: 0, cut_at, is_cut: false, random: seed, ..state }))
+    }
+
+    /// Lets one step from now on fail, once, with an error of the medium; it happens or not.
+    pub fn fail_at(&self, step: Option<u64>) {
+        self.0.lock().expect("sound").fail_at = step;
     }
 
     pub fn n_steps(&self) -> u64 {
@@ -106,7 +112,7 @@ impl SimFiles {
             inode.live = inode.durable.clone();
         }
         state.live = state.durable.clone();
-        Self(Mutex::new(State { is_cut: false, cut_at: None, n_steps: 0, ..state }))
+        Self(Mutex::new(State { is_cut: false, cut_at: None, fail_at: None, n_steps: 0, ..state }))
     }
 }
 
@@ -172,6 +178,12 @@ impl SimFiles {
             }
             state.is_cut = true;
             return state.check_power();
+        }
+        if state.fail_at == Some(state.n_steps) {
+            if Random(state.random ^ 1).below(2) == 0 {
+                work(&mut state)?;
+            }
+            return Err(io::Error::other("the medium fails"));
         }
         work(&mut state)
     }

@@ -361,3 +361,27 @@ fn readers_get_a_whole_generation_during_fetches() {
     });
     assert!(seen.lock().expect("sound").len() > 1);
 }
+
+/// A server's `Retry-After` is waited for, up to a limit, and beside the backoff.
+#[test]
+fn retry_after_is_honoured_within_bounds() {
+    let scene = Published::new(1, &[0; 1], 10);
+    // Asked for in seconds, allowed in milliseconds: expected is what was slept at least and the most.
+    for (fault, allowed_ms, expected_ms) in [
+        (Fault::RetryAfter(503, 3600), 120, 120..60_000),
+        (Fault::RetryAfter(429, 3600), 120, 120..60_000),
+        (Fault::RetryAfter(503, 1), 60_000, 1000..60_000),
+        (Fault::RetryAfter(500, 3600), 3_600_000, 0..60_000),
+        (Fault::RetryAfter(503, u64::MAX), 1, 1..60_000),
+    ] {
+        let dir = tempfile::tempdir().expect("temporary folder");
+        let server = Server::start(scene.clone());
+        let mut robot = Robot::on_disk(dir.path(), &server.url());
+        robot.limits.longest_retry_after = std::time::Duration::from_millis(allowed_ms);
+        let (mut is_first, given) = (true, fault.clone());
+        server.faults(move |_| if std::mem::take(&mut is_first) { given.clone() } else { Fault::None });
+        let start = std::time::Instant::now();
+        assert_eq!(robot.fetch().expect("works").retries, 1, "{fault:?}");
+        assert!(expected_ms.contains(&start.elapsed().as_millis()), "{fault:?}: {:?}", start.elapsed());
+    }
+}

@@ -129,6 +129,7 @@ pub fn publish(
             generation: store.next_generation()?,
             created_unix_secs: 0,
             expires_unix_secs: None,
+            next_key: None,
             metric: true,
             geo_reference: None,
             encoder: EncoderRecord {

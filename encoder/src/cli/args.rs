@@ -9,6 +9,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use slag_common::shard::Profile;
 
+use super::keys::KeysCommand;
 use crate::embed::Background;
 use crate::palette::PaletteSettings;
 use crate::raster::WeightKind;
@@ -52,6 +53,9 @@ pub enum Command {
     Query(QueryArgs),
     /// Serves a store's manifest and shards over HTTP.
     Serve(ServeArgs),
+    /// Shows, makes and changes the key that a store signs with.
+    #[command(subcommand)]
+    Keys(KeysCommand),
     /// Pushes a store elsewhere.
     #[command(subcommand)]
     Push(PushCommand),

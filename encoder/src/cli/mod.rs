@@ -2,6 +2,7 @@
 
 mod args;
 mod bench;
+mod keys;
 mod progress;
 mod run;
 

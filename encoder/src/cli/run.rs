@@ -45,6 +45,7 @@ pub fn run(cli: Cli) -> Exit {
         Command::Encode(args) => run_encode(&args, progress.as_ref(), json),
         Command::Query(args) => run_query(&args, json),
         Command::Serve(args) => run_serve(&args),
+        Command::Keys(command) => super::keys::run(&command, json),
         Command::Push(PushCommand::Qdrant(args)) => run_push(&args, progress.as_ref(), json),
         Command::Generate(args) => run_generate(&args, progress.as_ref()),
         Command::Demo(args) => run_demo(&args, progress.as_ref(), json),
@@ -105,7 +106,7 @@ fn cancel_flag() -> Result<Arc<AtomicBool>> {
     Ok(flag)
 }
 
-fn now_unix_secs() -> u64 {
+pub(super) fn now_unix_secs() -> u64 {
     // Reproducible builds of a store: the convention of reproducible-builds.org.
     let given = std::env::var("SOURCE_DATE_EPOCH").ok().and_then(|text| text.parse().ok());
     given.unwrap_or_else(|| SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs()))

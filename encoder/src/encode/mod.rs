@@ -320,6 +320,8 @@ pub fn encode(
         generation: summary.generation,
         created_unix_secs: settings.created_unix_secs,
         expires_unix_secs: settings.expires_unix_secs,
+        // The store says it.
+        next_key: None,
         metric: settings.metric || geo_reference.is_some(),
         geo_reference,
         encoder: EncoderRecord {

@@ -155,7 +155,7 @@ pub fn build(embeddings: Rows<'_>, yardstick: &Yardstick, settings: &PaletteSett
 
     // Rows in 8 bits: each component has a range of its own, which its basis vector takes on.
     let centres = Panels::new(m, m, |old, new| turn[new * m + old]).product(Rows::all(&found.centres, m));
-    let ranges = ranges(&centres, m);
+    let ranges = ranges(&centres, m, &scales);
     let row_step = 1.0 / 127.0;
     let rows: Vec<i8> =
         centres.iter().enumerate().map(|(at, v)| (v / ranges[at % m] * 127.0).round() as i8).collect();
@@ -247,16 +247,15 @@ fn row_scales(residuals: Rows<'_>, row_starts: &[u32]) -> Vec<f32> {
         .collect()
 }
 
-/// Returns the largest absolute value of each component, or 1 where it is nothing.
-fn ranges(centres: &[f32], m: usize) -> Vec<f32> {
-    let mut ranges = vec![0.0f32; m];
+/// Returns the largest absolute value of each component, but no less than what keeps residuals, which have all
+/// components, within what half floats and readers take.
+fn ranges(centres: &[f32], m: usize, scales: &[f32]) -> Vec<f32> {
+    let largest_scale = scales.iter().copied().fold(0.0, f32::max);
+    let mut ranges = vec![(largest_scale / 8.0).max(1e-3); m];
     for centre in centres.chunks_exact(m) {
         ranges.iter_mut().zip(centre).for_each(|(range, v)| *range = range.max(v.abs()));
     }
-    let largest = ranges.iter().copied().fold(0.0, f32::max);
-    // A component that no row has is still one of residuals: it keeps a range that eight bits can hold.
-    let least = if largest > 0.0 { largest / 256.0 } else { 1.0 };
-    ranges.into_iter().map(|range| range.max(least)).collect()
+    ranges
 }
 
 /// Turns components into vectors, as readers do.

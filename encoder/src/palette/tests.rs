@@ -185,6 +185,24 @@ fn same_result_for_any_number_of_threads() {
     assert!(with(1) == with(3));
 }
 
+/// Cells of a handful of Gaussians: one row, which is their mean, and residuals as large as any.
+#[test]
+fn a_few_embeddings_are_finite() {
+    for n in 1..=6 {
+        let vectors = clustered(n, n, 64, 0.3);
+        let mut yardstick = yardstick(64, &clustered(500, 50, 64, 0.3));
+        for spread in [yardstick.spread, 1e-6] {
+            yardstick.spread = spread;
+            let palette = build(Rows::all(&vectors, 64), &yardstick, &PaletteSettings::default());
+            for balanced in [false, true] {
+                let bytes = shard_of(&palette, 64, balanced);
+                let shard = ShardLayout::check(&bytes).expect("finite").view(&bytes);
+                assert!(shard.radii.iter().all(|r| *r < 1.5), "{n}: {:?}", shard.radii);
+            }
+        }
+    }
+}
+
 #[test]
 fn equal_embeddings_make_one_row_and_none_makes_none() {
     let same = [0.5f32; 400];

@@ -81,6 +81,20 @@ pub enum StoreError {
         /// Hash of the content.
         found: Hash32,
     },
+    /// A change of keys out of order.
+    #[error("{}: {what}; run `slag-encoder keys rotate` first, and finish once every robot has fetched", store.display())]
+    Rotation {
+        /// The store.
+        store: PathBuf,
+        /// What is missing.
+        what: &'static str,
+    },
+    /// The first key is there already.
+    #[error("{} has a key already; to change it, run `slag-encoder keys rotate`", store.display())]
+    HasKey {
+        /// The store.
+        store: PathBuf,
+    },
     /// A generation that would take robots back.
     #[error("generation {found} cannot follow {current}; take the number from `next_generation`")]
     Generation {

@@ -6,7 +6,7 @@
 //! | `manifest` | the current signed manifest |
 //! | `manifest.previous` | the one before it, which fetches under way may still need |
 //! | `extras/MANIFEST_HASH` | JSON name -> object hash: objects that belong to that manifest but not to robots |
-//! | `keys/ed25519`, `keys/ed25519.pub` | signing key (mode 0600) and its public half, hex |
+//! | `keys/` | signing keys (mode 0600) and their public halves, hex: see [`keys`] |
 //! | `db/` | sled: scene, generation, cells, state of jobs and pushes; opened by writers alone |
 //! | `job/` | working files of an unfinished encode |
 //! | `tmp/` | files being written |
@@ -20,6 +20,7 @@
 
 mod error;
 mod files;
+pub mod keys;
 mod reader;
 #[cfg(test)]
 pub(crate) mod tests;
@@ -32,11 +33,12 @@ use std::time::{Duration, Instant};
 
 use ed25519_dalek::SigningKey;
 use slag_common::Hash32;
-use slag_common::manifest::{self, CellRecord, Manifest};
+use slag_common::manifest::{CellRecord, Manifest, TrustedKeys};
 
 pub use error::StoreError;
 pub(crate) use files::write_durably;
 use files::{Access, HashingWriter};
+use keys::Keys;
 pub use reader::{Extras, Published, StoreReader};
 
 /// sled keeps whole pages in memory; the records are small.
@@ -67,7 +69,7 @@ pub struct Store {
     dir: PathBuf,
     db: sled::Db,
     published: sled::Tree,
-    key: SigningKey,
+    keys: Keys,
     n_parts: AtomicU64,
 }
 
@@ -109,8 +111,8 @@ impl Store {
         let published =
             db.open_tree(PUBLISHED_TREE).map_err(|cause| StoreError::Records { path: db_path, cause })?;
         let n_parts = AtomicU64::new(0);
-        let key = load_or_make_key(dir)?;
-        let store = Self { dir: dir.to_owned(), db, published, key, n_parts };
+        let keys = Keys::load_or_make(dir)?;
+        let store = Self { dir: dir.to_owned(), db, published, keys, n_parts };
         store.repair_records()?;
         Ok(store)
     }
@@ -137,7 +139,7 @@ impl Store {
 
     /// Returns the key that signs this store's manifests.
     pub fn signing_key(&self) -> &SigningKey {
-        &self.key
+        &self.keys.present
     }
 
     /// Returns a reader of what is published.
@@ -201,12 +203,23 @@ impl Store {
     /// Signs a manifest and makes it, with the objects it lists, the current one; returns its hash.
     ///
     /// `extras`: objects by name that this generation needs but robots do not fetch (readers find them
-    /// in [`Published::extras`]). Publishing the current manifest once more changes nothing.
+    /// in [`Published::extras`]). Publishing the current manifest once more changes nothing. The next
+    /// key that it names is the store's, whatever `manifest` says.
     ///
     /// # Errors
     /// [`StoreError::MissingObject`] if an object listed is not there in full,
     /// [`StoreError::Generation`] unless the generation is above the current one.
     pub fn publish(&self, manifest: &Manifest, extras: &Extras) -> Result<Hash32, StoreError> {
+        let next_key = self.keys.next.as_ref().map(keys::public);
+        self.publish_as(&self.keys.present, &Manifest { next_key, ..manifest.clone() }, extras)
+    }
+
+    fn publish_as(
+        &self,
+        signer: &SigningKey,
+        manifest: &Manifest,
+        extras: &Extras,
+    ) -> Result<Hash32, StoreError> {
         let shards = manifest.cells.iter().flat_map(|cell| cell.shards.values());
         for shard in shards {
             self.check_object(shard.hash, Some(shard.len_bytes))?;
@@ -214,10 +227,10 @@ impl Store {
         for hash in extras.values() {
             self.check_object(*hash, None)?;
         }
-        let signed = manifest.sign(&self.key);
+        let signed = manifest.sign(signer);
         let path = self.dir.join(reader::MANIFEST);
         let refuse = |cause| StoreError::Manifest { path: path.clone(), cause };
-        let own = manifest::TrustedKeys::Only(vec![Hash32(self.key.verifying_key().to_bytes())]);
+        let own = TrustedKeys::Only(vec![keys::public(signer)]);
         Manifest::verify(&signed, &own).map_err(refuse)?;
         let hash = Hash32::of(&signed);
         let current = reader::read_signed(&path)?;
@@ -363,26 +376,4 @@ fn files_in(folder: &Path) -> io::Result<BTreeMap<PathBuf, u64>> {
             Ok((entry.path(), entry.metadata()?.len()))
         })
         .collect()
-}
-
-/// Reads the signing key, or makes it; the public half beside it is what readers need.
-fn load_or_make_key(dir: &Path) -> Result<SigningKey, StoreError> {
-    let path = dir.join(reader::SECRET_KEY);
-    let part = dir.join("tmp").join("key.part");
-    let key = match reader::read_hex_key(&path) {
-        Ok(secret) => SigningKey::from_bytes(&secret.0),
-        Err(StoreError::Io(e)) if e.kind() == io::ErrorKind::NotFound => {
-            let key = manifest::generate_key();
-            let text = format!("{}\n", hex::encode(key.to_bytes()));
-            files::replace(&part, &path, text.as_bytes(), Access::Private)?;
-            key
-        }
-        Err(e) => return Err(e),
-    };
-    let public = format!("{}\n", hex::encode(key.verifying_key().to_bytes()));
-    let public_path = dir.join(reader::PUBLIC_KEY);
-    if fs_err::read(&public_path).ok().as_deref() != Some(public.as_bytes()) {
-        files::replace(&part, &public_path, public.as_bytes(), Access::Shared)?;
-    }
-    Ok(key)
 }

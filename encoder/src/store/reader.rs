@@ -10,11 +10,10 @@ use slag_common::container::AlignedBytes;
 use slag_common::manifest::{self, Manifest, ManifestError, TrustedKeys};
 
 use super::StoreError;
+use super::keys::PublicKeys;
 
 pub(super) const MANIFEST: &str = "manifest";
 pub(super) const MANIFEST_PREVIOUS: &str = "manifest.previous";
-pub(super) const SECRET_KEY: &str = "keys/ed25519";
-pub(super) const PUBLIC_KEY: &str = "keys/ed25519.pub";
 
 /// Objects by name that belong to a generation but are not for robots.
 pub type Extras = BTreeMap<String, Hash32>;
@@ -87,7 +86,7 @@ pub struct StoreReader {
 }
 
 impl StoreReader {
-    /// Reads the manifest and verifies that this store's key signed it.
+    /// Reads the manifest and verifies that a key of this store signed it.
     ///
     /// # Errors
     /// [`StoreError::NotPublished`] before the first publication, [`StoreError`] otherwise.
@@ -98,7 +97,7 @@ impl StoreReader {
             io::ErrorKind::NotFound => StoreError::NotPublished { path },
             _ => e.into(),
         })?;
-        let own = TrustedKeys::Only(vec![read_hex_key(&dir.join(PUBLIC_KEY))?]);
+        let own = PublicKeys::read(dir)?.trusted();
         let current = Published::read(dir, MANIFEST, &own)?;
         let previous = match Published::read(dir, MANIFEST_PREVIOUS, &own) {
             Ok(previous) => Some(previous),

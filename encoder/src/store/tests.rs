@@ -21,6 +21,7 @@ pub(crate) fn manifest_of_boxes(boxes: &[Aabb]) -> Manifest {
         generation: 1,
         created_unix_secs: 1,
         expires_unix_secs: None,
+        next_key: None,
         metric: true,
         geo_reference: None,
         encoder: EncoderRecord {
@@ -311,5 +312,83 @@ fn killed_writer_leaves_a_whole_generation() {
         let store = Store::create_or_open(dir.path()).expect("opens after the kill");
         assert_eq!(store.next_generation().expect("records"), generation + 1);
         last_generation = generation;
+    }
+}
+
+fn public(store: &Store) -> Hash32 {
+    Hash32(store.signing_key().verifying_key().to_bytes())
+}
+
+/// Oracle: `common`'s verification of the bytes that robots get, against the keys noted on the way.
+#[test]
+fn keys_change_in_two_steps() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let mut store = Store::create_or_open(dir.path()).expect("opens");
+    assert!(matches!(store.finish_rotation(9), Err(StoreError::Rotation { .. })));
+    let shards = put_many(&store, &["a"]);
+    let extras = Extras::from([("field".to_owned(), shards[0].0)]);
+    store.publish(&manifest(1, &shards), &extras).expect("publishes");
+    let first = public(&store);
+    let signed_by = |key: Hash32| {
+        let signed = fs_err::read(dir.path().join("manifest")).expect("there");
+        Manifest::verify(&signed, &TrustedKeys::Only(vec![key])).map(|(manifest, _)| manifest)
+    };
+
+    let keys = store.begin_rotation(7).expect("begins");
+    let second = keys.next.expect("made");
+    assert_eq!((keys.present, keys.previous), (first, None));
+    let named = signed_by(first).expect("by the present key");
+    assert_eq!((named.next_key, named.generation, named.created_unix_secs), (Some(second), 2, 7));
+    assert_eq!(named.cells, manifest(1, &shards).cells);
+    // Done again: nothing new. An encode in between names it as well.
+    assert_eq!(store.begin_rotation(8).expect("again"), keys);
+    assert_eq!(store.next_generation().expect("records"), 3);
+    store.publish(&manifest(3, &shards), &extras).expect("publishes");
+    assert_eq!(signed_by(first).expect("by the present key").next_key, Some(second));
+
+    let keys = store.finish_rotation(9).expect("finishes");
+    assert_eq!((keys.present, keys.next, keys.previous), (second, None, Some(first)));
+    let moved = signed_by(second).expect("by the next key");
+    assert_eq!((moved.next_key, moved.generation), (None, 4));
+    assert!(signed_by(first).is_err());
+    let reader = store.reader().expect("published");
+    assert_eq!(
+        (reader.previous().map(|p| p.manifest.generation), &reader.current().extras),
+        (Some(3), &extras)
+    );
+    drop(store);
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    store.publish(&manifest(5, &shards), &extras).expect("publishes");
+    assert_eq!(signed_by(second).expect("by the new key").generation, 5);
+}
+
+/// A crash between the commit and the moving of the files, at each of their steps.
+#[test]
+fn a_change_of_keys_that_was_cut_off_is_finished() {
+    for n_moved in 0..4 {
+        let dir = tempfile::tempdir().expect("temporary folder");
+        let keys = dir.path().join("keys");
+        let mut store = Store::create_or_open(dir.path()).expect("opens");
+        let shards = put_many(&store, &["a"]);
+        store.publish(&manifest(1, &shards), &Extras::new()).expect("publishes");
+        let next = store.begin_rotation(7).expect("begins").next.expect("made");
+        let before = ["ed25519", "ed25519.pub", "ed25519.next", "ed25519.next.pub"]
+            .map(|name| (name, fs_err::read(keys.join(name)).expect("there")));
+        store.finish_rotation(8).expect("finishes");
+        drop(store);
+        // Undoes all but the first moves: predecessor noted, key renamed, public half written.
+        let undone: &[usize] = [&[0, 1, 2, 3][..], &[0, 1, 2, 3], &[1, 3], &[3]][n_moved];
+        if n_moved == 0 {
+            fs_err::remove_file(keys.join("ed25519.previous.pub")).expect("there");
+        }
+        for (name, content) in undone.iter().map(|i| &before[*i]) {
+            fs_err::write(keys.join(name), content).expect("written");
+        }
+        StoreReader::open(dir.path()).unwrap_or_else(|e| panic!("{n_moved}: readers go on: {e}"));
+        let store = Store::create_or_open(dir.path()).expect("opens");
+        assert_eq!(public(&store), next, "{n_moved}");
+        assert!(!keys.join("ed25519.next").exists() && !keys.join("ed25519.next.pub").exists(), "{n_moved}");
+        store.publish(&manifest(4, &shards), &Extras::new()).expect("publishes");
+        StoreReader::open(dir.path()).expect("reads");
     }
 }

@@ -1,0 +1,232 @@
+//! How long a query waits while fetches replace the generation, through the real service and sockets.
+
+use std::io;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use glam::DVec3;
+use serde::Serialize;
+use slag_common::manifest::generate_key;
+use tokio::net::TcpListener;
+
+use super::scene::{Generator, Shelf, store, text_service};
+use super::{Machine, Percentiles, Times};
+use crate::fetch::{Environment, FetchError, FetchRequest, NetworkLimits, Position, fetch};
+use crate::http::{self, App, Settings};
+use crate::query::Engine;
+use crate::store::{EdgeCache, StoreError};
+
+/// What is measured.
+#[derive(Clone, Debug)]
+pub struct PauseOptions {
+    /// Gaussians of the generated scene.
+    pub n_gaussians: u32,
+    /// Components of an embedding.
+    pub dim: u32,
+    /// Fetches, each of a generation of which half the cells are new.
+    pub n_fetches: u32,
+    /// Time of queries without fetches, before.
+    pub idle: Duration,
+    /// Folder to work in; made, and emptied of the cache afterwards.
+    pub work_dir: PathBuf,
+}
+
+/// What was measured.
+#[derive(Clone, Debug, Serialize)]
+pub struct PauseReport {
+    /// Where.
+    pub machine: Machine,
+    /// Gaussians on board.
+    pub n_gaussians: u32,
+    /// Components of an embedding.
+    pub dim: u32,
+    /// Fetches.
+    pub n_fetches: u32,
+    /// Bytes that came in, a fetch.
+    pub bytes_per_fetch: u64,
+    /// Median time of a fetch and the loading of what it brought.
+    pub fetch_median_ms: f64,
+    /// Queries while nothing is fetched.
+    pub idle: Percentiles,
+    /// Queries that ran while a fetch or the loading of a generation did.
+    pub fetching: Percentiles,
+    /// The longest time between a question and its answer while fetching: no pause is longer.
+    pub longest_pause_ms: f64,
+    /// Generations that answered.
+    pub n_generations_seen: usize,
+}
+
+/// Why there is no report.
+#[derive(Debug, thiserror::Error)]
+pub enum PauseError {
+    /// A socket or file.
+    #[error("{0}; check the work folder and that the loopback network is up")]
+    Io(#[from] io::Error),
+    /// A fetch failed.
+    #[error(transparent)]
+    Fetch(#[from] FetchError),
+    /// The generation does not open.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// A query got no answer.
+    #[error("a query was not answered: {what}; the service's log says why")]
+    Query {
+        /// What came instead.
+        what: String,
+    },
+}
+
+/// One answered query.
+struct Asked {
+    began: Instant,
+    ended: Instant,
+    generation: u64,
+}
+
+/// Measures.
+///
+/// # Errors
+/// [`PauseError`].
+pub fn run(options: &PauseOptions) -> Result<PauseReport, PauseError> {
+    let PauseOptions { n_gaussians, dim, n_fetches, idle, .. } = *options;
+    let generator = Generator { n_gaussians, dim, key: generate_key() };
+    let shelf = Shelf::default();
+    let put = |generation| -> io::Result<()> {
+        let published = generator.generation(generation)?;
+        *shelf.write().unwrap_or_else(PoisonError::into_inner) = published;
+        Ok(())
+    };
+    put(1)?;
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+    let cache = EdgeCache::open(options.work_dir.join("cache"));
+    let app = App::new(Engine::new(cache.clone(), text_service(dim)?), Settings::default());
+    let (from, service) = runtime.block_on(async {
+        let (cloud, robot) =
+            (TcpListener::bind("127.0.0.1:0").await?, TcpListener::bind("127.0.0.1:0").await?);
+        let urls = (format!("http://{}", cloud.local_addr()?), format!("http://{}", robot.local_addr()?));
+        tokio::spawn(axum::serve(cloud, store(Arc::clone(&shelf))).into_future());
+        tokio::spawn(http::serve(Arc::clone(&app), robot, std::future::pending()));
+        Ok::<_, io::Error>(urls)
+    })?;
+    let request = FetchRequest {
+        from: Some(from),
+        at: Some(Position::World(DVec3::ZERO)),
+        radius: 1e6,
+        ..FetchRequest::default()
+    };
+    let cancel = AtomicBool::new(false);
+    let environment = Environment {
+        now_unix_secs: crate::now_unix_secs(),
+        cancel: &cancel,
+        progress: &(),
+        random: &|| 0.5,
+        limits: NetworkLimits::default(),
+    };
+    fetch(&cache, &request, &environment)?;
+    app.reload_now();
+
+    let (is_over, asked) = (AtomicBool::new(false), Mutex::new(Vec::<Asked>::new()));
+    let (mut fetches, mut publishings) = (Vec::new(), Vec::new());
+    let mut bytes = 0;
+    let mut work = || -> Result<(), PauseError> {
+        std::thread::sleep(idle);
+        for generation in 2..u64::from(n_fetches) + 2 {
+            let publishing = Instant::now();
+            put(generation)?;
+            let began = Instant::now();
+            publishings.push((publishing, began));
+            bytes += fetch(&cache, &request, &environment)?.downloaded.bytes;
+            app.reload_now();
+            fetches.push((began, Instant::now()));
+        }
+        Ok(())
+    };
+    let (worked, queried) = std::thread::scope(|scope| {
+        let client = scope.spawn(|| ask_until(&is_over, &service, &asked));
+        let worked = work();
+        is_over.store(true, Ordering::Relaxed);
+        (worked, client.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+    });
+    runtime.shutdown_background();
+    worked?;
+    queried?;
+    // What was made for the measurement is of no use afterwards.
+    fs_err::remove_dir_all(cache.dir())?;
+
+    let asked = asked.into_inner().unwrap_or_else(PoisonError::into_inner);
+    let (mut quiet, mut busy) = (Times::default(), Times::default());
+    for query in &asked {
+        let during = |(began, ended): &(Instant, Instant)| query.began < *ended && query.ended > *began;
+        if fetches.iter().any(during) {
+            busy.add(query.ended - query.began);
+        } else if !publishings.iter().any(during) {
+            // Publishing is the cloud's work, not the robot's: what is asked meanwhile counts for nothing.
+            quiet.add(query.ended - query.began);
+        }
+    }
+    let mut fetch_ms: Vec<f64> =
+        fetches.iter().map(|(began, ended)| (*ended - *began).as_secs_f64() * 1e3).collect();
+    fetch_ms.sort_by(f64::total_cmp);
+    let generations: std::collections::BTreeSet<u64> = asked.iter().map(|query| query.generation).collect();
+    let fetching = busy.percentiles();
+    Ok(PauseReport {
+        machine: Machine::here(),
+        n_gaussians,
+        dim,
+        n_fetches,
+        bytes_per_fetch: bytes / u64::from(n_fetches.max(1)),
+        fetch_median_ms: fetch_ms.get(fetch_ms.len() / 2).copied().unwrap_or(0.0),
+        idle: quiet.percentiles(),
+        fetching,
+        longest_pause_ms: fetching.max_ms,
+        n_generations_seen: generations.len(),
+    })
+}
+
+/// Asks for one thing after the other, without a pause.
+fn ask_until(is_over: &AtomicBool, service: &str, asked: &Mutex<Vec<Asked>>) -> Result<(), PauseError> {
+    let agent: ureq::Agent = ureq::Agent::config_builder().proxy(None).build().into();
+    let fail = |e: &dyn ToString| PauseError::Query { what: e.to_string() };
+    for number in 0u64.. {
+        if is_over.load(Ordering::Relaxed) {
+            break;
+        }
+        let url = format!("{service}/query?text={}", number % 8);
+        let began = Instant::now();
+        let body = agent.get(&url).call().and_then(|mut answer| answer.body_mut().read_to_string());
+        let body: serde_json::Value =
+            serde_json::from_str(&body.map_err(|e| fail(&e))?).map_err(|e| fail(&e))?;
+        let generation = body["generation"].as_u64().ok_or_else(|| fail(&"no generation"))?;
+        if body["n_matching"].as_u64().is_none_or(|n| n == 0) {
+            return Err(fail(&"nothing was found"));
+        }
+        let query = Asked { began, ended: Instant::now(), generation };
+        asked.lock().unwrap_or_else(PoisonError::into_inner).push(query);
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Every query is answered, by each generation in turn. (The times are the command's business.)
+    #[test]
+    fn queries_go_on_during_fetches() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let options = PauseOptions {
+            n_gaussians: 140_000,
+            dim: 32,
+            n_fetches: 3,
+            idle: Duration::from_millis(50),
+            work_dir: dir.path().into(),
+        };
+        let report = run(&options).expect("measures");
+        assert!(report.fetching.n > 0 && report.idle.n > 0 && report.longest_pause_ms > 0.0, "{report:?}");
+        assert!(report.n_generations_seen >= 3, "{report:?}");
+        // Three cells: one or two of them change.
+        assert!(report.bytes_per_fetch > 6 * 65_536, "{report:?}");
+    }
+}

@@ -1,0 +1,223 @@
+//! A generated scene, its store, and a text model of its space.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::sync::{Arc, PoisonError, RwLock};
+
+use axum::Router;
+use axum::extract::{Path, State};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use glam::DVec3;
+use slag_common::Hash32;
+use slag_common::frames::Aabb;
+use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
+use slag_common::shard::{self, Positions, Profile, ScoreErrors, ShardHeader, ShardView};
+use slag_models::{EncodeError, TextEncoder};
+
+use crate::text::{EncoderInfo, TextService};
+
+const CELL_GAUSSIANS: u32 = 65_536;
+const ROWS_PER_CELL: u32 = 256;
+/// Things there are; a query asks for one of them.
+const N_CONCEPTS: u64 = 64;
+const CELL_WIDTH_M: f64 = 25.0;
+/// Between a thing's rows (0.9 and more) and those of others (0.2 and less at 512 components).
+const THRESHOLD: f32 = 0.6;
+
+/// Pseudo-random numbers (splitmix64, Steele et al. 2014).
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+
+    fn signed(&mut self) -> f32 {
+        (self.next() >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+    }
+}
+
+fn unit(mut vector: Vec<f32>) -> Vec<f32> {
+    let length = vector.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt() as f32;
+    vector.iter_mut().for_each(|v| *v /= length);
+    vector
+}
+
+fn concept(number: u64, dim: u32) -> Vec<f32> {
+    let mut random = Random(number % N_CONCEPTS + 1);
+    unit((0..dim).map(|_| random.signed()).collect())
+}
+
+fn encoder_id() -> Hash32 {
+    Hash32::of(b"slag-edge bench")
+}
+
+/// Encodes a number as the thing of that number.
+struct Concepts(u32);
+
+impl TextEncoder for Concepts {
+    fn name(&self) -> &str {
+        "concepts"
+    }
+
+    fn dim(&self) -> usize {
+        self.0 as usize
+    }
+
+    fn encode(&mut self, text: &str) -> Result<Vec<f32>, EncodeError> {
+        Ok(concept(text.trim().parse().unwrap_or(0), self.0))
+    }
+}
+
+/// Starts the scene's text model.
+pub(super) fn text_service(dim: u32) -> io::Result<TextService> {
+    let info = EncoderInfo { name: "concepts".into(), id: encoder_id(), dim, execution_provider: "none" };
+    TextService::start(info, Box::new(Concepts(dim)))
+}
+
+/// One generation, as a store serves it.
+#[derive(Default)]
+pub(super) struct Published {
+    signed: Vec<u8>,
+    objects: BTreeMap<Hash32, Vec<u8>>,
+}
+
+/// Generates generation after generation of a scene; from one to the next half of the cells change.
+pub(super) struct Generator {
+    pub n_gaussians: u32,
+    pub dim: u32,
+    pub key: ed25519_dalek::SigningKey,
+}
+
+impl Generator {
+    pub fn generation(&self, generation: u64) -> io::Result<Published> {
+        let mut published = Published::default();
+        let mut cells = Vec::new();
+        for cell_id in 0..self.n_gaussians.div_ceil(CELL_GAUSSIANS) {
+            let n = CELL_GAUSSIANS.min(self.n_gaussians - cell_id * CELL_GAUSSIANS);
+            let content = (generation + u64::from(cell_id)) / 2;
+            let shard = self.shard(cell_id, n, content)?;
+            let (hash, len_bytes, bounds) = (Hash32::of(&shard), shard.len() as u64, bounds(cell_id));
+            published.objects.insert(hash, shard);
+            let n_rows = ROWS_PER_CELL.min(n);
+            let record = ShardRecord {
+                hash,
+                len_bytes,
+                n_rows,
+                score_error_bound: 0.1,
+                score_errors: ScoreErrors::default(),
+                position_error: 2e-4,
+            };
+            let shards = BTreeMap::from([(Profile::Compact, record)]);
+            cells.push(CellRecord { cell_id, bounds, n_gaussians: n, shards });
+        }
+        let manifest = Manifest {
+            version: manifest::VERSION,
+            scene: "generated".into(),
+            generation,
+            created_unix_secs: 1,
+            expires_unix_secs: None,
+            next_key: None,
+            metric: true,
+            geo_reference: None,
+            encoder: EncoderRecord {
+                name: "concepts".into(),
+                id: encoder_id(),
+                dim: self.dim,
+                default_threshold: THRESHOLD,
+                calibration: None,
+            },
+            n_gaussians: u64::from(self.n_gaussians),
+            n_without_evidence: 0,
+            n_rejected: 0,
+            cells,
+        };
+        published.signed = manifest.sign(&self.key);
+        Ok(published)
+    }
+
+    fn shard(&self, cell_id: u32, n: u32, content: u64) -> io::Result<Vec<u8>> {
+        let mut random = Random((u64::from(cell_id) << 32) ^ content);
+        let n_rows = ROWS_PER_CELL.min(n);
+        let row_starts: Vec<u32> =
+            (0..=n_rows).map(|row| (u64::from(row) * u64::from(n) / u64::from(n_rows)) as u32).collect();
+        let mut palette: Vec<f32> = Vec::new();
+        // Members of a row stand together, as in real scenes.
+        let mut positions: Vec<[u16; 3]> = Vec::new();
+        for row in 0..n_rows {
+            let spread = 0.4 / (self.dim as f32 / 3.0).sqrt();
+            let around = concept(random.next(), self.dim);
+            let vector = unit(around.into_iter().map(|v| v + spread * random.signed()).collect());
+            palette.extend(vector);
+            let centre = [(); 3].map(|()| random.next() % 60_000);
+            for _ in row_starts[row as usize]..row_starts[row as usize + 1] {
+                positions.push(centre.map(|c| (c + random.next() % 5000) as u16));
+            }
+        }
+        let (rows, row_step) = shard::quantise(&palette);
+        let box_ = bounds(cell_id);
+        let header = ShardHeader {
+            cell_id,
+            n_gaussians: n,
+            n_rows,
+            dim: self.dim,
+            n_components: self.dim,
+            n_groups: 0,
+            position_bits: [16, 16, 16, 0],
+            row_step,
+            origin_in_world: box_.min.into(),
+            position_step: [CELL_WIDTH_M / 65535.0; 3],
+            box_min: box_.min.into(),
+            box_max: box_.max.into(),
+            errors: ScoreErrors::default(),
+            encoder_id: encoder_id().0,
+        };
+        let radii = vec![0.1; n_rows as usize];
+        let mut out = Vec::new();
+        let parts = ShardView {
+            header,
+            positions: Positions::Wide(&positions),
+            row_starts: &row_starts,
+            rows: &rows,
+            radii: &radii,
+            basis: None,
+            residuals: None,
+            exact: None,
+        };
+        parts.write(&mut out)?;
+        Ok(out)
+    }
+}
+
+/// Cells lie in a row along x.
+fn bounds(cell_id: u32) -> Aabb {
+    let min = DVec3::X * (f64::from(cell_id) * CELL_WIDTH_M);
+    Aabb { min, max: min + DVec3::splat(CELL_WIDTH_M) }
+}
+
+/// What a store serves at the moment.
+pub(super) type Shelf = Arc<RwLock<Published>>;
+
+/// Returns the routes of a store that robots fetch from.
+pub(super) fn store(shelf: Shelf) -> Router {
+    async fn manifest(State(shelf): State<Shelf>) -> Vec<u8> {
+        shelf.read().unwrap_or_else(PoisonError::into_inner).signed.clone()
+    }
+    async fn object(State(shelf): State<Shelf>, Path(hash): Path<String>) -> Response {
+        let shelf = shelf.read().unwrap_or_else(PoisonError::into_inner);
+        match hash.parse().ok().and_then(|hash: Hash32| shelf.objects.get(&hash)) {
+            Some(bytes) => bytes.clone().into_response(),
+            None => StatusCode::NOT_FOUND.into_response(),
+        }
+    }
+    Router::new()
+        .route("/v1/manifest", get(manifest))
+        .route("/v1/objects/{hash}", get(object))
+        .with_state(shelf)
+}

@@ -1,0 +1,189 @@
+//! Where the robot is, and how people and programs say it.
+
+use std::str::FromStr;
+
+use glam::{DVec2, DVec3};
+use serde::{Deserialize, Serialize};
+use slag_common::frames::{Aabb, Geographic};
+use slag_common::manifest::Manifest;
+
+use super::plan::PlanError;
+
+/// Longest text that can be a position.
+pub const MAX_TEXT_BYTES: usize = 256;
+
+/// Where the robot is.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Position {
+    /// World frame.
+    World(DVec3),
+    /// On the earth; needs a geo-referenced scene.
+    Geographic {
+        /// Latitude, degrees, north positive (WGS 84).
+        latitude_deg: f64,
+        /// Longitude, degrees, east positive.
+        longitude_deg: f64,
+        /// Height in metres, in the datum of the scene's origin; absent: at the scene's own height
+        /// there (see [`Position::in_world`]).
+        height_m: Option<f64>,
+    },
+}
+
+/// A text that is no position.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "{found:?} is no position; expected `x y z`, `lat,lon[,height]`, {{\"x\":..,\"y\":..,\"z\":..}} or {{\"lat\":..,\"lon\":..,\"height\":..}}"
+)]
+pub struct NotAPosition {
+    /// The text, cut to 80 characters.
+    pub found: String,
+}
+
+/// A position as JSON.
+#[derive(Deserialize)]
+#[serde(untagged, deny_unknown_fields)]
+enum Spoken {
+    World { x: f64, y: f64, z: f64 },
+    Geographic { lat: f64, lon: f64, height: Option<f64> },
+}
+
+impl FromStr for Position {
+    type Err = NotAPosition;
+
+    /// Reads `x y z` (world frame), `lat,lon[,height]` (degrees, metres), or either as a JSON object.
+    /// Degrees are checked, numbers are finite.
+    fn from_str(text: &str) -> Result<Self, NotAPosition> {
+        let refuse = || NotAPosition { found: text.trim().chars().take(80).collect() };
+        if text.len() > MAX_TEXT_BYTES {
+            return Err(refuse());
+        }
+        let text = text.trim();
+        let spoken = if text.starts_with('{') {
+            serde_json::from_str(text).map_err(|_| refuse())?
+        } else {
+            let is_geographic = text.contains(',');
+            let parts: Vec<&str> = match is_geographic {
+                true => text.split(',').collect(),
+                false => text.split_whitespace().collect(),
+            };
+            let numbers: Option<Vec<f64>> = parts.iter().map(|part| part.trim().parse().ok()).collect();
+            match (is_geographic, numbers.as_deref()) {
+                (false, Some([x, y, z])) => Spoken::World { x: *x, y: *y, z: *z },
+                (true, Some([lat, lon])) => Spoken::Geographic { lat: *lat, lon: *lon, height: None },
+                (true, Some([lat, lon, height])) => {
+                    Spoken::Geographic { lat: *lat, lon: *lon, height: Some(*height) }
+                }
+                _ => return Err(refuse()),
+            }
+        };
+        match spoken {
+            Spoken::World { x, y, z } if [x, y, z].iter().all(|v| v.is_finite()) => {
+                Ok(Self::World(DVec3::new(x, y, z)))
+            }
+            Spoken::Geographic { lat, lon, height }
+                if lat.abs() <= 90.0 && lon.abs() <= 180.0 && height.is_none_or(f64::is_finite) =>
+            {
+                Ok(Self::Geographic { latitude_deg: lat, longitude_deg: lon, height_m: height })
+            }
+            _ => Err(refuse()),
+        }
+    }
+}
+
+impl Position {
+    /// Returns the position in the world frame.
+    ///
+    /// A geographic position without a height is put at the height of the centre of the box that is
+    /// horizontally nearest (then whose centre is, then of the lowest id), so that a robot that knows
+    /// only latitude and longitude gets the cells around it wherever the scene's zero height lies.
+    ///
+    /// # Errors
+    /// [`PlanError::Number`], [`PlanError::NoGeoReference`].
+    pub fn in_world(self, manifest: &Manifest) -> Result<DVec3, PlanError> {
+        let number = |name, value: f64, limit: f64, expected| match value.abs() <= limit {
+            true => Ok(()),
+            false => Err(PlanError::Number { name, value, expected }),
+        };
+        match self {
+            Self::World(position) => {
+                for (name, value) in [("x", position.x), ("y", position.y), ("z", position.z)] {
+                    number(name, value, f64::MAX, "finite")?;
+                }
+                Ok(position)
+            }
+            Self::Geographic { latitude_deg, longitude_deg, height_m } => {
+                number("latitude", latitude_deg, 90.0, "within -90..90 degrees")?;
+                number("longitude", longitude_deg, 180.0, "within -180..180 degrees")?;
+                number("height", height_m.unwrap_or(0.0), f64::MAX, "finite")?;
+                let geo = manifest
+                    .geo_reference
+                    .ok_or_else(|| PlanError::NoGeoReference { scene: manifest.scene.clone() })?;
+                let at = |height_m| {
+                    geo.world_from_geographic(Geographic { latitude_deg, longitude_deg, height_m })
+                };
+                let at_origin_height = at(geo.origin.height_m);
+                Ok(match height_m {
+                    Some(height_m) => at(height_m),
+                    None => at_origin_height.with_z(scene_height(manifest, at_origin_height)),
+                })
+            }
+        }
+    }
+}
+
+/// Returns the z of the centre of the cell that is horizontally nearest; that of the point where there
+/// is no cell.
+fn scene_height(manifest: &Manifest, point: DVec3) -> f64 {
+    let rank = |bounds: &Aabb| {
+        let flat = Aabb { min: bounds.min.with_z(0.0), max: bounds.max.with_z(0.0) };
+        let to_centre = DVec2::new(point.x, point.y).distance(flat.centre().truncate());
+        (flat.distance_to(point.with_z(0.0)), to_centre)
+    };
+    let nearest = manifest.cells.iter().map(|cell| &cell.bounds).min_by(|a, b| {
+        let ((a_box, a_centre), (b_box, b_centre)) = (rank(a), rank(b));
+        a_box.total_cmp(&b_box).then(a_centre.total_cmp(&b_centre))
+    });
+    nearest.map_or(point.z, |bounds| bounds.centre().z)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn positions_are_read_in_every_form_or_refused() {
+        let world = Position::World(DVec3::new(1.0, -2.5, 30.0));
+        for text in ["1 -2.5 3e1", "  1\t-2.5 30\n", r#"{"x":1,"y":-2.5,"z":30}"#] {
+            assert_eq!(text.parse(), Ok(world), "{text}");
+        }
+        let earth = |height_m| Position::Geographic { latitude_deg: 46.8, longitude_deg: -92.0, height_m };
+        assert_eq!("46.8,-92".parse(), Ok(earth(None)));
+        assert_eq!("46.8, -92, 150".parse(), Ok(earth(Some(150.0))));
+        assert_eq!(r#"{"lat":46.8,"lon":-92.0}"#.parse(), Ok(earth(None)));
+        assert_eq!(r#"{"lat":46.8,"lon":-92,"height":150}"#.parse(), Ok(earth(Some(150.0))));
+        let long = format!("{} 1 1", "1".repeat(300));
+        for bad in [
+            "",
+            "1 2",
+            "1 2 3 4",
+            "1 2 x",
+            "NaN 0 0",
+            "inf 0 0",
+            "91,0",
+            "0,181",
+            "0,0,NaN",
+            "1,2,3,4",
+            ",",
+            "{}",
+            r#"{"x":1,"y":2}"#,
+            r#"{"x":1,"y":2,"z":3,"w":4}"#,
+            r#"{"lat":91,"lon":0}"#,
+            "{\"x\":",
+            &long,
+        ] {
+            assert!(bad.parse::<Position>().is_err(), "{bad}");
+        }
+        assert!(long.parse::<Position>().expect_err("too long").found.len() <= 80);
+    }
+}

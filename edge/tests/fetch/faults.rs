@@ -1,0 +1,247 @@
+//! Storage and network that fail together, a thousand times over: after each trial the old or the new
+//! generation answers a real query, whole.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use slag_common::container::AlignedBytes;
+use slag_common::manifest::ManifestError;
+use slag_common::shard::{Profile, ShardLayout};
+use slag_edge::fetch::FetchError;
+use slag_edge::query::{Engine, Level, QueryRequest};
+use slag_edge::store::EdgeCache;
+use slag_edge::text::{EncoderInfo, TextService};
+use slag_models::{EncodeError, TextEncoder};
+
+use super::crash::copy_dir;
+use super::scene::{DIM, ENCODER, Published, Random, key, public};
+use super::server::{Fault, Seen, Server};
+use super::sim::SimFiles;
+use super::{Robot, at};
+
+const N_TRIALS: u64 = 1000;
+const N_THREADS: u64 = 4;
+/// Gaussians of a cell: its shard comes in in several pieces.
+const N: u32 = 60;
+
+/// Every text is the first axis; every row of these scenes has a cosine of 0.5 with it.
+struct FirstAxis;
+
+impl TextEncoder for FirstAxis {
+    fn name(&self) -> &str {
+        "e"
+    }
+
+    fn dim(&self) -> usize {
+        DIM as usize
+    }
+
+    fn encode(&mut self, _: &str) -> Result<Vec<f32>, EncodeError> {
+        Ok((0..DIM).map(|axis| if axis == 0 { 1.0 } else { 0.0 }).collect())
+    }
+}
+
+/// Micrometres.
+type Place = [i64; 3];
+
+fn place(position: [f64; 3]) -> Place {
+    position.map(|v| (v * 1e6).round() as i64)
+}
+
+/// Asks for everything; returns the generation that answered, and where.
+fn ask(cache: EdgeCache) -> Result<(u64, BTreeSet<Place>), String> {
+    let info = EncoderInfo { name: "e".into(), id: ENCODER, dim: DIM, execution_provider: "none" };
+    let text = TextService::start(info, Box::new(FirstAxis)).expect("a thread");
+    let engine = Engine::new(cache, text);
+    engine.reload().map_err(|e| slag_edge::error_line(&e))?;
+    let request = QueryRequest { level: Level::Gaussians, limit: Some(10_000), ..QueryRequest::new("x") };
+    let reply = engine.answer(&request).map_err(|e| slag_edge::error_line(&e))?;
+    let answers = &reply.answers[0];
+    let found = reply.gaussians(answers).iter().map(|g| place(g.position_in_world.into())).collect();
+    Ok((answers.generation, found))
+}
+
+/// Oracle: the positions as they were published.
+fn expected(published: &Published, cell_ids: std::ops::Range<u32>) -> BTreeSet<Place> {
+    let of_cell = |cell_id| {
+        let bytes = AlignedBytes::copy_of(&published.objects[&published.hash(cell_id, Profile::Compact)]);
+        let layout = ShardLayout::check(&bytes).expect("sound");
+        let view = layout.view(&bytes);
+        (0..N as usize).map(|i| place(view.position_in_world(i).into())).collect::<Vec<_>>()
+    };
+    cell_ids.flat_map(of_cell).collect()
+}
+
+/// What all trials of a thread start from: generation 2 on board, generation 3 offered, 1 for replays.
+struct Stage {
+    dir: tempfile::TempDir,
+    server: Server,
+    stale: Published,
+    new: Published,
+    before: SimFiles,
+    expected: [BTreeSet<Place>; 2],
+    is_key_change: bool,
+}
+
+/// What came out of the trials: a harness that never fails a fetch, or always does, tests nothing.
+#[derive(Debug, Default)]
+struct Outcomes {
+    worked: AtomicU64,
+    kept_old: AtomicU64,
+    failed_with_new: AtomicU64,
+}
+
+impl Stage {
+    fn new(is_key_change: bool) -> Self {
+        // In memory where there is such a folder: the records there are not what is tested.
+        let shm = Path::new("/dev/shm");
+        let dir = if shm.is_dir() { tempfile::tempdir_in(shm) } else { tempfile::tempdir() };
+        let dir = dir.expect("temporary folder");
+        let (present, next) = (key(1), if is_key_change { key(2) } else { key(1) });
+        let stale = Published::new(1, &[9; 7], N);
+        let named = is_key_change.then(|| public(&next));
+        let old = Published::new(2, &[0; 7], N).edited(&present, |manifest| manifest.next_key = named);
+        let new = Published::new(3, &[0, 0, 5, 0, 5, 0, 0], N).edited(&next, |_| {});
+        let server = Server::start(old.clone());
+        let files = Arc::new(SimFiles::default());
+        Robot::on_sim(dir.path(), files.clone(), &server.url()).fetch().expect("works");
+        server.publish(new.clone());
+        copy_dir(&dir.path().join("cache/db"), &dir.path().join("db-before"));
+        let expected = [expected(&old, 0..3), expected(&new, 1..5)];
+        Self { dir, server, stale, new, before: files.fork(None, 0), expected, is_key_change }
+    }
+
+    /// The robot goes from cells 0..3 to cells 1..5, and cell 0 must go.
+    fn robot(&self, files: &Arc<SimFiles>) -> Robot {
+        let mut robot = Robot::on_sim(self.dir.path(), files.clone(), &self.server.url());
+        robot.request.at = Some(at(30.0));
+        robot.request.radius = 15.0;
+        robot.request.max_bytes = Some(self.new.bytes(1..5));
+        robot
+    }
+
+    /// Puts the records back to those of before the trial (1), loses them (2), or leaves them.
+    fn settle_records(&self, fate: u64) {
+        let db = self.dir.path().join("cache/db");
+        if fate > 0 && db.exists() {
+            fs_err::remove_dir_all(&db).expect("there");
+        }
+        if fate == 1 {
+            copy_dir(&self.dir.path().join("db-before"), &db);
+        }
+    }
+
+    /// Chooses what happens to each request.
+    fn network(&self, seed: u64) -> impl FnMut(&Seen) -> Fault + Send + 'static {
+        let mut random = Random(seed ^ 0x6e65_7477);
+        // Calm, breezy, stormy.
+        let one_in = [u64::MAX, 6, 3][random.below(3) as usize];
+        let (stale, replay) = (self.stale.clone(), self.stale.signed.clone());
+        let pairs: Vec<(String, Vec<u8>)> = (0..7)
+            .map(|id| {
+                let name = format!("/v1/objects/{}", self.new.hash(id, Profile::Compact));
+                (name, stale.objects[&stale.hash(id, Profile::Compact)].clone())
+            })
+            .collect();
+        move |seen| {
+            if random.below(one_in) != 0 {
+                return Fault::None;
+            }
+            match random.below(12) {
+                0 | 1 => Fault::Cut(random.below(1500) as usize),
+                // Truncated, and the announced length agrees.
+                2 => Fault::Length(-(1 + random.below(200) as i64)),
+                3 => Fault::Length(1 + random.below(200) as i64),
+                4 => Fault::Delay(Duration::from_millis(1 + random.below(4))),
+                5 => Fault::Corrupt(random.below(4000) as usize),
+                6 => Fault::Status([500, 502, 503, 404, 416][random.below(5) as usize]),
+                7 => Fault::IgnoreRange,
+                8 => Fault::ShiftedRange(random.below(100) as usize),
+                9 => Fault::RetryAfter(503, 1),
+                // An old manifest again; a sound shard of the same cell and length, under another hash.
+                _ if seen.path == "/v1/manifest" => Fault::Instead(replay.clone()),
+                _ => match pairs.iter().find(|(name, _)| *name == seen.path) {
+                    Some((_, other)) => Fault::Instead(other.clone()),
+                    None => Fault::None,
+                },
+            }
+        }
+    }
+
+    fn trial(&self, seed: u64, outcomes: &Outcomes) {
+        let mut random = Random(seed);
+        self.settle_records(1);
+        self.server.faults(self.network(seed));
+        // A fetch without faults takes some 40 steps.
+        let (storage, step) = (random.below(4), 1 + random.below(45));
+        let files = Arc::new(self.before.fork((storage == 1).then_some(step), seed));
+        files.fail_at((storage == 2).then_some(step));
+        files.limit((storage == 3).then(|| self.before.used_bytes() + random.below(8000)));
+        let mut robot = self.robot(&files);
+        robot.request.parallel = 1 + random.below(3) as usize;
+        robot.limits.attempts = 4;
+        robot.limits.longest_retry_after = Duration::from_millis(2);
+        let result = robot.fetch();
+
+        // The power fails now, if it has not before: what was not synced may be lost, torn, or out of order.
+        let context = format!("seed {seed}, storage {storage} at step {step}: {result:?}");
+        self.settle_records(random.below(3));
+        let files = match random.below(3) {
+            0 if storage != 1 => Arc::new(files.fork(None, seed)),
+            _ => Arc::new(files.after_power_cut(seed)),
+        };
+        files.limit(None);
+        files.fail_at(None);
+        let robot = self.robot(&files);
+        let (generation, found) = ask(robot.cache.clone()).unwrap_or_else(|e| panic!("{context}: {e}"));
+        let which = generation.checked_sub(2).and_then(|which| self.expected.get(which as usize));
+        assert!(
+            which == Some(&found),
+            "{context}: generation {generation} answers with {} places",
+            found.len()
+        );
+        match (&result, generation) {
+            (Ok(_), generation) => {
+                assert_eq!(generation, 3, "{context}: what a fetch has said is there must be there");
+                outcomes.worked.fetch_add(1, Ordering::Relaxed);
+            }
+            (Err(_), 3) => drop(outcomes.failed_with_new.fetch_add(1, Ordering::Relaxed)),
+            (Err(_), _) => drop(outcomes.kept_old.fetch_add(1, Ordering::Relaxed)),
+        }
+
+        self.server.faults(|_| Fault::None);
+        robot.fetch().unwrap_or_else(|e| panic!("{context}: the next fetch: {}", slag_edge::error_line(&e)));
+        assert_eq!(ask(robot.cache.clone()), Ok((3, self.expected[1].clone())), "{context}");
+        assert!(robot.staged().is_empty(), "{context}");
+        if self.is_key_change && seed.is_multiple_of(4) {
+            let later = Published::new(9, &[0; 7], N);
+            self.server.publish(later);
+            let error = robot.fetch().expect_err("the old key is out");
+            let is_refused = matches!(error, FetchError::Manifest(ManifestError::UnknownKey { .. }));
+            assert!(is_refused, "{context}: {error}");
+            self.server.publish(self.new.clone());
+        }
+    }
+}
+
+#[test]
+fn a_thousand_faults_leave_a_whole_generation() {
+    let outcomes = Outcomes::default();
+    std::thread::scope(|scope| {
+        for thread in 0..N_THREADS {
+            let outcomes = &outcomes;
+            scope.spawn(move || {
+                // In every other thread the new generation is signed by the next key.
+                let stage = Stage::new(thread % 2 == 1);
+                (thread..N_TRIALS).step_by(N_THREADS as usize).for_each(|seed| stage.trial(seed, outcomes));
+            });
+        }
+    });
+    println!("{outcomes:?}");
+    let Outcomes { worked, kept_old, failed_with_new } = outcomes;
+    let seen = [worked, kept_old, failed_with_new].map(AtomicU64::into_inner);
+    assert!(seen.iter().all(|n| *n >= N_TRIALS / 100), "all outcomes are seen: {seen:?}");
+}

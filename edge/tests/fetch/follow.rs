@@ -1,0 +1,208 @@
+//! A robot that moves: what is on board around it, and what it costs.
+
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
+
+use glam::DVec3;
+use slag_common::shard::Profile;
+use slag_edge::fetch::follow::{Decision, FollowEnvironment, FollowSettings, Follower, Following, follow};
+use slag_edge::fetch::{FetchError, Position};
+
+use super::scene::{Published, bounds};
+use super::server::{Fault, Server};
+use super::{Robot, assert_holds};
+
+const N_CELLS: usize = 30;
+
+/// Follows positions, one a second from a start, and returns the seconds at which a fetch was made.
+fn drive(robot: &mut Robot, follower: &mut Follower, start: u64, xs: impl Iterator<Item = f64>) -> Vec<u64> {
+    let mut fetched_at = Vec::new();
+    for (second, x) in (start..).zip(xs) {
+        let (now, at) = (Duration::from_secs(second), DVec3::new(x, 0.0, 105.0));
+        if follower.decide(now, Some(at)) != Decision::Fetch {
+            continue;
+        }
+        robot.request.at = Some(Position::World(at));
+        robot.request.radius = follower.fetch_radius();
+        let report = robot.fetch().expect("works");
+        follower.fetched(now, report.centre_in_world);
+        fetched_at.push(second);
+    }
+    fetched_at
+}
+
+fn settings() -> FollowSettings {
+    let min_interval = Duration::from_secs(1);
+    FollowSettings { radius: 12.0, margin: 6.0, min_interval, refresh: None, ..FollowSettings::default() }
+}
+
+#[test]
+fn going_to_and_fro_over_an_edge_costs_one_fetch() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let server = Server::start(Published::new(1, &[0; N_CELLS], 20));
+    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    // Cells end at multiples of ten. The edge that matters for the first fetch lies at 100 + 18 = 118
+    // too: there the set of cells in reach changes with every step.
+    for edge in [100.0, 102.0] {
+        let mut follower = Follower::new(settings());
+        let to_and_fro = (0..200).map(|i| edge + if i % 2 == 0 { -2.5 } else { 0.4 });
+        server.take_seen();
+        let fetched_at = drive(&mut robot, &mut follower, 0, to_and_fro);
+        assert_eq!(fetched_at, [0], "edge at {edge}");
+        let seen = server.take_seen();
+        let n_manifests = seen.iter().filter(|seen| seen.path.contains("manifest")).count();
+        assert_eq!(n_manifests, 1, "{seen:?}");
+    }
+}
+
+/// Oracle: the boxes of the cells, by brute force, at every position.
+#[test]
+fn a_drive_always_has_what_is_around() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let scene = Published::new(1, &[0; N_CELLS], 20);
+    let server = Server::start(scene.clone());
+    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    // Room for six cells: 12 + 6 to either side reach five or six at most.
+    let budget_bytes = scene.bytes(0..6);
+    robot.request.max_bytes = Some(budget_bytes);
+    let mut follower = Follower::new(settings());
+    let mut n_fetches = 0;
+    for step in 0..500 {
+        let x = 5.0 + f64::from(step) * 0.5;
+        let at = DVec3::new(x, 0.0, 105.0);
+        let now = Duration::from_secs(step as u64);
+        if follower.decide(now, Some(at)) == Decision::Fetch {
+            robot.request.at = Some(Position::World(at));
+            robot.request.radius = follower.fetch_radius();
+            let report = robot.fetch().expect("works");
+            follower.fetched(now, report.centre_in_world);
+            n_fetches += 1;
+            let on_board: u64 = robot.shards().iter().map(|hash| scene.objects[hash].len() as u64).sum();
+            assert!(on_board <= budget_bytes, "{on_board}");
+        }
+        let on_board: Vec<u32> = robot.snapshot().shards.iter().map(|shard| shard.cell.cell_id).collect();
+        for cell_id in 0..N_CELLS as u32 {
+            if bounds(cell_id).distance_to(at) <= 12.0 {
+                assert!(on_board.contains(&cell_id), "cell {cell_id} at {x}");
+            }
+        }
+    }
+    // 250 m, and a new centre after more than 3: 3.5 at this pace.
+    assert_eq!(n_fetches, 72);
+    let objects = server.take_objects();
+    assert_eq!(objects.len(), (0..N_CELLS as u32).filter(|id| bounds(*id).min.x <= 254.5 + 18.0).count());
+}
+
+/// Within the budget the least recently used go first, so the way back costs only what was freed.
+#[test]
+fn the_way_back_uses_what_is_still_on_board() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let scene = Published::new(1, &[0; N_CELLS], 20);
+    let server = Server::start(scene.clone());
+    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    robot.request.max_bytes = Some(scene.bytes(0..12));
+    let mut follower = Follower::new(settings());
+    drive(&mut robot, &mut follower, 0, (0..40).map(|i| 105.0 + f64::from(i)));
+    server.take_seen();
+    let back = drive(&mut robot, &mut follower, 40, (0..40).map(|i| 140.0 - f64::from(i)));
+    assert!(back.len() > 5, "{back:?}");
+    assert_eq!(server.take_objects().len(), 0, "twelve cells hold the whole way");
+}
+
+/// The loop over real sockets: bad weather, no network, a new generation, and the end.
+#[test]
+fn following_survives_the_loss_of_the_network() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let scene = Published::new(1, &[0; N_CELLS], 20);
+    let server = Server::start(scene.clone());
+    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    robot.limits.attempts = 1;
+    let settings = FollowSettings {
+        radius: 4.0,
+        margin: 4.0,
+        min_interval: Duration::from_millis(1),
+        first_backoff: Duration::from_millis(5),
+        longest_backoff: Duration::from_millis(20),
+        refresh: None,
+    };
+    let place = |x: f64| Position::World(DVec3::new(x, 0.0, 105.0));
+    let earth = |x: f64| {
+        let point = DVec3::new(x, 0.0, 105.0);
+        let geo = scene.manifest.geo_reference.expect("given").geographic_from_world(point);
+        let (latitude_deg, longitude_deg) = (geo.latitude_deg, geo.longitude_deg);
+        Position::Geographic { latitude_deg, longitude_deg, height_m: None }
+    };
+    let (following, cancel) = (Following::default(), AtomicBool::new(false));
+    following.post(place(5.0));
+    let mut outcomes = Vec::new();
+    let mut step = 0;
+    let result = follow(
+        &robot.cache,
+        &robot.request,
+        settings,
+        &following,
+        FollowEnvironment {
+            fetch: &mut |request| {
+                let robot = Robot { request: request.clone(), cache: robot.cache.clone(), ..robot.clone() };
+                robot.fetch()
+            },
+            tell: &mut |outcome| {
+                outcomes.push(outcome.as_ref().map(|report| report.n_cells).map_err(|e| e.to_string()));
+                step += 1;
+                match step {
+                    // On board; the robot moves on, and the network is gone.
+                    1 => {
+                        assert_holds(&robot.snapshot(), &scene, 0..2);
+                        server.faults(|_| Fault::Cut(0));
+                        following.post(place(35.0));
+                    }
+                    // Three failures: the last generation stays. Then it is back.
+                    2 | 3 => assert_holds(&robot.snapshot(), &scene, 0..2),
+                    4 => server.faults(|_| Fault::None),
+                    // The same place, said otherwise, costs nothing; one far off on the earth does.
+                    5 => {
+                        following.post(earth(35.5));
+                        following.post(earth(75.0));
+                    }
+                    _ => following.close(),
+                }
+            },
+            random: &|| 0.5,
+            cancel: &cancel,
+        },
+    );
+    result.expect("the last position is served");
+    assert!(outcomes[1..4].iter().all(Result::is_err), "{outcomes:?}");
+    assert_eq!((outcomes.len(), &outcomes[4], &outcomes[5]), (6, &Ok(3), &Ok(3)), "{outcomes:?}");
+    assert_holds(&robot.snapshot(), &scene, 6..9);
+    let status = following.status();
+    assert_eq!((status.n_fetches, status.n_failures, status.last_error), (3, 3, None));
+    assert_eq!(robot.snapshot().shards.len(), 3);
+    assert_eq!(scene.hash(6, Profile::Compact), robot.snapshot().current.cells[0].hash);
+}
+
+/// Positions that end while a fetch is due and fails: the error is told.
+#[test]
+fn the_end_tells_whether_the_last_position_was_served() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let server = Server::start(Published::new(1, &[0; 3], 20));
+    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    robot.limits.attempts = 1;
+    server.faults(|_| Fault::Status(404));
+    let (following, cancel) = (Following::default(), AtomicBool::new(false));
+    let run = |following: &Following, cancel: &AtomicBool| {
+        follow(
+            &robot.cache,
+            &robot.request,
+            FollowSettings::default(),
+            following,
+            FollowEnvironment { fetch: &mut |_| robot.fetch(), tell: &mut |_| {}, random: &|| 0.5, cancel },
+        )
+    };
+    following.close();
+    run(&following, &cancel).expect("no position, no fetch");
+    following.post(Position::World(DVec3::ZERO));
+    assert!(matches!(run(&following, &cancel), Err(FetchError::Download { .. })));
+    cancel.store(true, std::sync::atomic::Ordering::Relaxed);
+    assert!(matches!(run(&following, &cancel), Err(FetchError::Cancelled)));
+}

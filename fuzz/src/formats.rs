@@ -1,0 +1,279 @@
+//! The targets.
+
+use std::cell::RefCell;
+use std::path::Path;
+
+use ed25519_dalek::{Signer, SigningKey};
+use glam::DVec3;
+use slag_common::container::{AlignedBytes, Layout, PREAMBLE_BYTES, SECTION_ROW_BYTES};
+use slag_common::manifest::{CellIndex, Manifest, TrustedKeys};
+use slag_common::shard::{self, ShardLayout};
+use slag_common::splat::{self, ReadOptions};
+use slag_common::{Hash32, poses};
+use slag_edge::store::EdgeCache;
+use slag_encoder::bench::scene::BenchScene;
+use slag_encoder::ingest::read_geo_reference;
+use slag_encoder::lift::{CellField, RegionTable, SumsFile};
+use slag_encoder::segment::{GivenMasks, Rle};
+use slag_models::description::Description;
+
+/// Splits inputs of several files.
+const SEPARATOR: &[u8] = b"\n====\n";
+
+/// Gives each thread a folder; in memory, where there is such a place.
+fn in_folder(work: impl FnOnce(&Path) -> bool) -> bool {
+    thread_local! {
+        static FOLDER: RefCell<Option<tempfile::TempDir>> = const { RefCell::new(None) };
+    }
+    FOLDER.with_borrow_mut(|folder| {
+        let folder = folder.get_or_insert_with(|| {
+            let memory = Path::new("/dev/shm");
+            let made = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
+            made.expect("a temporary folder")
+        });
+        work(folder.path())
+    })
+}
+
+fn in_file(name: &str, data: &[u8], work: impl FnOnce(&Path) -> bool) -> bool {
+    in_folder(|folder| {
+        let path = folder.join(name);
+        fs_err::write(&path, data).expect("room for a file");
+        work(&path)
+    })
+}
+
+/// Returns the bytes with the checksums of a container's sections and head made right, as a hostile
+/// writer would.
+fn with_checksums(data: &[u8]) -> Vec<u8> {
+    let mut bytes = data.to_vec();
+    let Some(n) = bytes.get(12..16).map(|n| u32::from_le_bytes([n[0], n[1], n[2], n[3]]) as usize) else {
+        return bytes;
+    };
+    let table_end = PREAMBLE_BYTES + n.min(64) * SECTION_ROW_BYTES;
+    if bytes.len() < table_end {
+        return bytes;
+    }
+    for row in (PREAMBLE_BYTES..table_end).step_by(SECTION_ROW_BYTES) {
+        let number = |at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().expect("eight bytes"));
+        let (offset, len) = (number(row + 8), number(row + 16));
+        let section = offset.checked_add(len).and_then(|end| bytes.get(offset as usize..end as usize));
+        if let Some(checksum) = section.map(|section| Hash32::of(section).0) {
+            bytes[row + 24..row + 32].copy_from_slice(&checksum[..8]);
+        }
+    }
+    let head = [&bytes[..24], &bytes[PREAMBLE_BYTES..table_end]].concat();
+    bytes[24..32].copy_from_slice(&Hash32::of(&head).0[..8]);
+    bytes
+}
+
+pub fn container(data: &[u8]) -> bool {
+    let is_accepted = |bytes: &[u8]| match Layout::check(bytes, shard::MAGIC, shard::VERSION) {
+        Ok(layout) => {
+            std::hint::black_box((0..64).filter_map(|id| layout.find(id)).count());
+            true
+        }
+        Err(_) => false,
+    };
+    is_accepted(data) | is_accepted(&with_checksums(data))
+}
+
+pub fn shard(data: &[u8]) -> bool {
+    let bytes = AlignedBytes::copy_of(&with_checksums(data));
+    let Ok(layout) = ShardLayout::check(&bytes) else { return false };
+    let view = layout.view(&bytes);
+    for row in 0..view.header.n_rows as usize {
+        assert!(view.members(row).end <= view.n_with_evidence());
+    }
+    for index in 0..view.header.n_gaussians as usize {
+        std::hint::black_box(view.position_in_world(index));
+    }
+    std::hint::black_box(view.scores(&vec![1.0; view.header.dim as usize]));
+    std::hint::black_box((view.bounds(), view.encoder_id()));
+    true
+}
+
+/// The bytes as they come, and the same as text that an accepted key has signed.
+pub fn manifest(data: &[u8]) -> bool {
+    let key = SigningKey::from_bytes(&[7; 32]);
+    let public = key.verifying_key().to_bytes();
+    let hex = |bytes: &[u8]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
+    let _ = Manifest::verify(data, &TrustedKeys::FirstContact);
+    let json = data.iter().position(|b| *b == b'\n').map_or(data, |end| &data[end + 1..]);
+    let line = format!("slag-manifest 1 ed25519 {} {}\n", hex(&public), hex(&key.sign(json).to_bytes()));
+    let signed = [line.as_bytes(), json].concat();
+    let Ok((manifest, _)) = Manifest::verify(&signed, &TrustedKeys::Only(vec![Hash32(public)])) else {
+        return false;
+    };
+    let again = manifest.sign(&key);
+    let read = Manifest::verify(&again, &TrustedKeys::FirstContact).expect("what is written is read");
+    assert_eq!(read.0, manifest);
+    CellIndex::new(&manifest.cells).within(DVec3::ZERO, 1e9);
+    let wanted = slag_edge::fetch::Wanted {
+        profile: shard::Profile::Compact,
+        centre_in_world: DVec3::ZERO,
+        radius: 1e9,
+        max_bytes: None,
+    };
+    let _ = slag_edge::fetch::Plan::new(&manifest, &wanted, &Default::default());
+    let at: Result<slag_edge::fetch::Position, _> = "46.8,-91.9".parse();
+    let _ = at.expect("a position").in_world(&manifest);
+    true
+}
+
+pub fn current(data: &[u8]) -> bool {
+    in_folder(|folder| {
+        let cache = EdgeCache::open(folder);
+        fs_err::write(cache.current_path(), data).expect("room for a file");
+        cache.current().is_ok()
+    })
+}
+
+fn read_splat(name: &str, data: &[u8]) -> bool {
+    in_file(name, data, |path| match splat::read(path, &ReadOptions { with_sh_rest: true }) {
+        Ok(gaussians) => {
+            assert_eq!(gaussians.means_in_world.len(), gaussians.opacities.len());
+            true
+        }
+        Err(_) => false,
+    })
+}
+
+/// Plain and compressed PLY.
+pub fn ply(data: &[u8]) -> bool {
+    read_splat("x.ply", data)
+}
+
+pub fn splat(data: &[u8]) -> bool {
+    read_splat("x.splat", data)
+}
+
+/// The bytes as they come, and packed by gzip, as versions 1 to 3 are.
+pub fn spz(data: &[u8]) -> bool {
+    use std::io::Write;
+    let is_accepted = read_splat("x.spz", data);
+    let mut packed = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    packed.write_all(data).expect("writes to memory");
+    read_splat("x.spz", &packed.finish().expect("writes to memory")) | is_accepted
+}
+
+pub fn sog(data: &[u8]) -> bool {
+    read_splat("x.sog", data)
+}
+
+/// The description of a folder whose pictures are not there: it is sound when they are missed.
+pub fn sog_meta(data: &[u8]) -> bool {
+    in_file("meta.json", data, |path| {
+        let read = splat::read(path, &ReadOptions { with_sh_rest: true });
+        read.is_err_and(|e| matches!(e, splat::SplatError::Io { .. }))
+    })
+}
+
+fn two_parts(data: &[u8]) -> (&[u8], &[u8]) {
+    let at = data.windows(SEPARATOR.len()).position(|window| window == SEPARATOR);
+    at.map_or((data, &[]), |at| (&data[..at], &data[at + SEPARATOR.len()..]))
+}
+
+fn colmap(data: &[u8], extension: &str) -> bool {
+    let (cameras, images) = two_parts(data);
+    in_folder(|folder| {
+        let path = |stem: &str| folder.join(stem).with_extension(extension);
+        fs_err::write(path("cameras"), cameras).expect("room for a file");
+        fs_err::write(path("images"), images).expect("room for a file");
+        poses::read(&path("cameras"), Some(folder)).is_ok()
+    })
+}
+
+pub fn colmap_text(data: &[u8]) -> bool {
+    colmap(data, "txt")
+}
+
+pub fn colmap_bin(data: &[u8]) -> bool {
+    colmap(data, "bin")
+}
+
+pub fn transforms(data: &[u8]) -> bool {
+    in_file("transforms.json", data, |path| poses::read(path, None).is_ok())
+}
+
+/// Two bytes of width, two of height, and the text.
+pub fn rle(data: &[u8]) -> bool {
+    let Some((size, text)) = data.split_at_checked(4) else { return false };
+    let side = |at: usize| u32::from(u16::from_le_bytes([size[at], size[at + 1]]));
+    let is_accepted = Rle::from_text(side(0), side(2), &String::from_utf8_lossy(text)).is_ok();
+    let counts = text.as_chunks().0.iter().map(|b| u32::from_le_bytes(*b)).collect();
+    Rle::from_counts(side(0), side(2), counts).is_ok() | is_accepted
+}
+
+pub fn coco(data: &[u8]) -> bool {
+    in_file("masks.json", data, |path| GivenMasks::open(path, Vec::new()).is_ok())
+}
+
+pub fn model_toml(data: &[u8]) -> bool {
+    in_file("model.toml", data, |path| Description::read(path).is_ok())
+}
+
+pub fn tensors(data: &[u8]) -> bool {
+    in_file("x.safetensors", data, |path| {
+        let read = |n_rows| slag_models::tensors::read(path, "vectors", n_rows, 3).is_ok();
+        read(Some(2)) | read(None)
+    })
+}
+
+/// Phrases, and their vectors.
+pub fn phrases(data: &[u8]) -> bool {
+    let (phrases, vectors) = two_parts(data);
+    in_folder(|folder| {
+        let (text, tensors) = (folder.join("phrases.txt"), folder.join("x.safetensors"));
+        fs_err::write(&text, phrases).expect("room for a file");
+        fs_err::write(&tensors, vectors).expect("room for a file");
+        slag_models::phrases::PhraseEncoder::open("x", 3, &text, (&tensors, "vectors"), None).is_ok()
+    })
+}
+
+pub fn sums(data: &[u8]) -> bool {
+    // The entries lie behind the container.
+    let stated = data.get(16..24).map(|b| u64::from_le_bytes(b.try_into().expect("eight bytes")));
+    let at = stated.map_or(data.len(), |at| (at as usize).min(data.len()));
+    let bytes = [with_checksums(&data[..at]).as_slice(), &data[at..]].concat();
+    in_file("x.sums", &bytes, |path| {
+        let Ok((file, regions)) = SumsFile::open(path) else { return false };
+        std::hint::black_box(regions.masks_of_region().map(<[u32]>::len).sum::<usize>());
+        for run in 0..file.runs().len() {
+            std::hint::black_box(file.entries_of_run(run));
+        }
+        true
+    })
+}
+
+pub fn region_table(data: &[u8]) -> bool {
+    RegionTable::from_bytes(&AlignedBytes::copy_of(&with_checksums(data))).is_ok()
+}
+
+pub fn cell_field(data: &[u8]) -> bool {
+    CellField::from_bytes(&AlignedBytes::copy_of(&with_checksums(data)), 4).is_ok()
+}
+
+pub fn npz(data: &[u8]) -> bool {
+    in_file("x.npz", data, |path| BenchScene::read(path).is_ok())
+}
+
+pub fn geo(data: &[u8]) -> bool {
+    in_file("geo.json", data, |path| read_geo_reference(path).is_ok())
+}
+
+/// The query string of a robot's `/query`.
+pub fn query(data: &[u8]) -> bool {
+    let Ok(text) = std::str::from_utf8(data) else { return false };
+    slag_edge::http::parse_query(text).is_ok_and(|request| request.check().is_ok())
+}
+
+/// Lines that say where the robot is.
+pub fn position(data: &[u8]) -> bool {
+    let mut n_accepted = 0;
+    let read = slag_edge::fetch::follow::read_positions(data, |_, position| {
+        n_accepted += u32::from(position.is_ok());
+    });
+    read.expect("memory can be read");
+    n_accepted > 0
+}

@@ -1,0 +1,308 @@
+//! Sound inputs to start from.
+
+use std::collections::BTreeMap;
+use std::io::Write;
+use std::path::Path;
+
+use ed25519_dalek::SigningKey;
+use glam::DVec3;
+use half::f16;
+use slag_common::frames::Aabb;
+use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
+use slag_common::shard::{
+    Basis, ExactColumns, Positions, Profile, Residuals, ScoreErrors, ShardHeader, ShardView,
+};
+use slag_common::{Hash32, container};
+
+/// Longer files of the data beside the project are not used: mutations would hit nothing that matters.
+const MAX_SHARED_BYTES: usize = 100_000;
+
+/// Returns the seeds of a target; `shared`: the data beside the project, where it is there.
+pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
+    let text = |text: &str| vec![text.as_bytes().to_vec()];
+    let mut seeds = match target {
+        "container" | "shard" => vec![shard(false), shard(true)],
+        "manifest" => vec![manifest()],
+        "current" => text(&format!(
+            r#"{{"manifest_hash":"{0}","key":"{0}","profile":"compact","centre_in_world":[0.0,1.0,2.5],"radius":50.0,"cells":[{{"cell_id":1,"hash":"{0}","len_bytes":7}}]}}"#,
+            "ab".repeat(32)
+        )),
+        "ply" => text(PLY),
+        "splat" => vec![vec![0x40; 96]],
+        "spz" => vec![spz()],
+        "sog_meta" => text(
+            r#"{"version":2,"count":4,"antialias":false,"means":{"mins":[0,0,0],"maxs":[1,1,1],"files":["means_l.webp","means_u.webp"]},"scales":{"codebook":[0.5],"files":["scales.webp"]},"quats":{"files":["quats.webp"]},"sh0":{"codebook":[0.1],"files":["sh0.webp"]}}"#,
+        ),
+        "colmap_text" => text(
+            "# cameras\n1 PINHOLE 640 480 500.0 500.0 320.0 240.0\n2 SIMPLE_RADIAL 64 48 50 32 24 0.01\n====\n1 1 0 0 0 0.5 0.25 2 1 a.jpg\n10 10 -1\n2 0 1 0 0 1 2 3 2 b.jpg\n\n",
+        ),
+        "colmap_bin" => vec![colmap_bin()],
+        "transforms" => text(
+            r#"{"camera_model":"OPENCV","fl_x":500.0,"fl_y":500.0,"cx":320.0,"cy":240.0,"w":640,"h":480,"k1":0.01,"frames":[{"file_path":"images/a.jpg","transform_matrix":[[1,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]]}]}"#,
+        ),
+        "rle" => vec![b"\x04\x00\x03\x00453".to_vec(), b"\x0a\x00\x0a\x00\x64\x00\x00\x00".to_vec()],
+        "coco" => text(
+            r#"{"images":[{"id":1,"file_name":"a.jpg","width":4,"height":3}],"annotations":[{"id":1,"image_id":1,"segmentation":{"size":[3,4],"counts":"453"}},{"id":2,"image_id":1,"segmentation":{"size":[3,4],"counts":[4,5,3]}}]}"#,
+        ),
+        "model_toml" => vec![
+            include_bytes!("../../tests/models/clip_tiny/model.toml").to_vec(),
+            include_bytes!("../../tests/models/conse/model.toml").to_vec(),
+        ],
+        "tensors" => vec![safetensors()],
+        "phrases" => vec![[b"chair\na red sofa\n====\n".as_slice(), &safetensors()].concat()],
+        "sums" => vec![sums()],
+        "region_table" => vec![region_table()],
+        "cell_field" => vec![cell_field()],
+        "npz" => vec![npz()],
+        "geo" => text(r#"{"origin":{"lat":46.8,"lon":-91.9,"alt":150.0}}"#),
+        "query" => text(
+            "text=a+red%20chair&limit=10&threshold=0.1&near=1,2,3&radius=4&level=gaussians&voxel=0.2&min_count=3",
+        ),
+        "position" => text("1 2 3\n46.8,-91.9,150\n{\"x\":1,\"y\":2,\"z\":3}\n{\"lat\":1,\"lon\":2}\n"),
+        _ => Vec::new(),
+    };
+    for path in shared_files(target) {
+        let read = shared.and_then(|shared| fs_err::read(shared.join(path)).ok());
+        seeds.extend(read.filter(|bytes| bytes.len() <= MAX_SHARED_BYTES));
+    }
+    seeds
+}
+
+fn shared_files(target: &str) -> &'static [&'static str] {
+    match target {
+        "ply" => &[
+            "fixtures/formats/gsplatrs_minimal_ascii.ply",
+            "fixtures/formats/gsplatrs_minimal_binary.ply",
+            "fixtures/formats/playbot_lod6.compressed.ply",
+        ],
+        "splat" => &["fixtures/formats/minimal.splat"],
+        "spz" => &[
+            "fixtures/formats/minimal-v2.spz",
+            "fixtures/formats/minimal-v3.spz",
+            "fixtures/formats/minimal-v4.spz",
+            "fixtures/formats/gsplatrs_minimal_v4_degree0.spz",
+        ],
+        "sog" => &["fixtures/formats/playbot_lod6.sog"],
+        "sog_meta" => &["fixtures/formats/playbot_lod3_sog/meta.json"],
+        _ => &[],
+    }
+}
+
+const PLY: &str = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nproperty float f_dc_0\nproperty float f_dc_1\nproperty float f_dc_2\nproperty float opacity\nproperty float scale_0\nproperty float scale_1\nproperty float scale_2\nproperty float rot_0\nproperty float rot_1\nproperty float rot_2\nproperty float rot_3\nend_header\n1 2 3 0.1 0.2 0.3 1 -2 -2 -2 1 0 0 0\n";
+
+fn shard(is_exact: bool) -> Vec<u8> {
+    let header = ShardHeader {
+        cell_id: 5,
+        n_gaussians: 6,
+        n_rows: 2,
+        dim: 3,
+        n_components: 2,
+        n_groups: if is_exact { 0 } else { 2 },
+        position_bits: [16, 16, 16, 0],
+        row_step: 0.01,
+        origin_in_world: [1.0, -2.0, 3.0],
+        position_step: [0.001, 0.002, 0.0],
+        box_min: [0.0, -3.0, 2.0],
+        box_max: [66.0, 130.0, 4.0],
+        errors: ScoreErrors::default(),
+        encoder_id: [9; 32],
+    };
+    let embeddings = [f16::from_f32(0.5); 15];
+    let mut out = Vec::new();
+    let (mean, words) = ([f16::from_f32(0.1); 3], [f16::from_f32(0.25); 32]);
+    let positions = [[0, 0, 0], [1, 2, 3], [65535, 65535, 65535], [4, 4, 4], [5, 5, 5], [6, 6, 6]];
+    let view = ShardView {
+        header,
+        positions: Positions::Wide(&positions),
+        row_starts: &[0, 2, 5],
+        rows: &[60, -10, 20, 127],
+        radii: &[0.1, 0.2],
+        basis: Some(Basis { mean: &mean, vectors: &[127, 0, 5, -3, 127, 0], steps: &[0.01, 0.01] }),
+        residuals: (!is_exact).then_some(Residuals {
+            group_starts: &[0, 1, 2],
+            words: &words,
+            row_scales: &[0.1, 0.2],
+            reaches: &[0.3, 0.4],
+            codes: &[0x5a; 32],
+        }),
+        exact: is_exact
+            .then_some(ExactColumns { input_indices: &[10, 11, 12, 13, 14, 15], embeddings: &embeddings }),
+    };
+    view.write(&mut out).expect("writes to memory");
+    out
+}
+
+fn manifest() -> Vec<u8> {
+    let cell = |cell_id: u32| {
+        let record = ShardRecord {
+            hash: Hash32([cell_id as u8; 32]),
+            len_bytes: 100,
+            n_rows: 2,
+            score_error_bound: 0.1,
+            score_errors: ScoreErrors::default(),
+            position_error: 1e-3,
+        };
+        CellRecord {
+            cell_id,
+            bounds: Aabb { min: DVec3::ZERO, max: DVec3::ONE },
+            n_gaussians: 5,
+            shards: BTreeMap::from([(Profile::Compact, record)]),
+        }
+    };
+    let manifest = Manifest {
+        version: manifest::VERSION,
+        scene: "yard".into(),
+        generation: 3,
+        created_unix_secs: 1_700_000_000,
+        expires_unix_secs: Some(1_900_000_000),
+        next_key: Some(Hash32([3; 32])),
+        metric: true,
+        geo_reference: None,
+        encoder: EncoderRecord {
+            name: "e".into(),
+            id: Hash32([7; 32]),
+            dim: 4,
+            default_threshold: 0.1,
+            calibration: None,
+        },
+        n_gaussians: 10,
+        n_without_evidence: 1,
+        n_rejected: 0,
+        cells: vec![cell(1), cell(2)],
+    };
+    manifest.sign(&SigningKey::from_bytes(&[7; 32]))
+}
+
+/// A header of version 2 and one Gaussian of zeros, unpacked: the target packs it.
+fn spz() -> Vec<u8> {
+    let mut bytes = b"NGSP".to_vec();
+    bytes.extend([2, 0, 0, 0, 1, 0, 0, 0, 0, 12, 0, 0]);
+    bytes.extend([0; 19]);
+    bytes
+}
+
+fn colmap_bin() -> Vec<u8> {
+    let mut bytes = 1u64.to_le_bytes().to_vec();
+    // Camera 1, PINHOLE, 640 x 480.
+    bytes.extend([1u32.to_le_bytes(), 1u32.to_le_bytes()].concat());
+    bytes.extend([640u64.to_le_bytes(), 480u64.to_le_bytes()].concat());
+    [500.0f64, 500.0, 320.0, 240.0].iter().for_each(|v| bytes.extend(v.to_le_bytes()));
+    bytes.extend(b"\n====\n");
+    bytes.extend(1u64.to_le_bytes());
+    bytes.extend(1u32.to_le_bytes());
+    [1.0f64, 0.0, 0.0, 0.0, 0.5, 0.25, 2.0].iter().for_each(|v| bytes.extend(v.to_le_bytes()));
+    bytes.extend(1u32.to_le_bytes());
+    bytes.extend(b"a.jpg\0");
+    bytes.extend(0u64.to_le_bytes());
+    bytes
+}
+
+fn safetensors() -> Vec<u8> {
+    let head = br#"{"vectors":{"dtype":"F32","shape":[2,3],"data_offsets":[0,24]}}"#;
+    let mut bytes = (head.len() as u64).to_le_bytes().to_vec();
+    bytes.extend(head);
+    [1.0f32, 0.0, 0.0, 0.0, 1.0, 0.0].iter().for_each(|v| bytes.extend(v.to_le_bytes()));
+    bytes
+}
+
+fn u64s(values: &[u64]) -> Vec<u8> {
+    values.iter().flat_map(|v| v.to_le_bytes()).collect()
+}
+
+fn u32s(values: &[u32]) -> Vec<u8> {
+    values.iter().flat_map(|v| v.to_le_bytes()).collect()
+}
+
+fn f32s(values: &[f32]) -> Vec<u8> {
+    values.iter().flat_map(|v| v.to_le_bytes()).collect()
+}
+
+fn sections(magic: &[u8; 8], version: u32, columns: &[Vec<u8>]) -> Vec<u8> {
+    let sections: Vec<(u32, &[u8])> = (1..).zip(columns.iter().map(Vec::as_slice)).collect();
+    let mut out = Vec::new();
+    container::write(&mut out, *magic, version, &sections).expect("writes to memory");
+    out
+}
+
+/// FORMAT.md: two regions of two masks, one run of one entry.
+fn sums() -> Vec<u8> {
+    let entry = [u32s(&[1]), f32s(&[0.5])].concat();
+    let checksum = u64::from(crc32(&entry));
+    let header = [u32s(&[2, 2, 2, 1]), u64s(&[3, 1])].concat();
+    let run = [u32s(&[0, 0]), u64s(&[0, checksum])].concat();
+    let columns = [header, u32s(&[0, 1, 3]), u32s(&[0, 0, 1]), f32s(&[1.0, 0.0, 0.0, 1.0]), run];
+    [sections(b"SLAGSUMS", 2, &columns), entry].concat()
+}
+
+/// CRC-32 (IEEE 802.3), bit by bit.
+fn crc32(bytes: &[u8]) -> u32 {
+    let fold = |crc: u32, byte: &u8| {
+        (0..8).fold(crc ^ u32::from(*byte), |crc, _| (crc >> 1) ^ (0xedb8_8320 & (crc & 1).wrapping_neg()))
+    };
+    !bytes.iter().fold(!0, fold)
+}
+
+fn region_table() -> Vec<u8> {
+    let columns = [u64s(&[2, 2, 2, 3]), f32s(&[1.0, 0.0, 0.0, 1.0]), u64s(&[0, 1, 3]), u32s(&[0, 0, 1])];
+    sections(b"SLAGREGN", 2, &columns)
+}
+
+fn cell_field() -> Vec<u8> {
+    let columns = [
+        u64s(&[2, 3]),
+        u32s(&[4, 9]),
+        u64s(&[0, 1, 3]),
+        u32s(&[0, 1, 3]),
+        f32s(&[1.0, 0.5, 0.25]),
+        f32s(&[1.0, 0.75]),
+        f32s(&[0.9, 0.8]),
+    ];
+    sections(b"SLAGFELD", 1, &columns)
+}
+
+/// A stored (not deflated) archive of one Gaussian and one camera.
+fn npz() -> Vec<u8> {
+    let array = |descr: &str, shape: &str, data: Vec<u8>| {
+        let head = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}");
+        let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+        let len = (10 + head.len() + 1).next_multiple_of(64) - 10;
+        bytes.extend((len as u16).to_le_bytes());
+        writeln!(bytes, "{head:<width$}", width = len - 1).expect("writes to memory");
+        bytes.extend(data);
+        bytes
+    };
+    let floats = |shape: &str, values: &[f32]| array("<f4", shape, f32s(values));
+    let mut pose = [0.0; 16];
+    [0, 5, 10, 15].iter().for_each(|i| pose[*i] = 1.0);
+    let files = [
+        ("means", floats("(1, 3)", &[0.0, 0.0, 2.0])),
+        ("quats", floats("(1, 4)", &[1.0, 0.0, 0.0, 0.0])),
+        ("scales", floats("(1, 3)", &[0.1; 3])),
+        ("opacities", floats("(1,)", &[0.5])),
+        ("viewmats", floats("(1, 4, 4)", &pose)),
+        ("Ks", floats("(1, 3, 3)", &[50.0, 0.0, 16.0, 0.0, 50.0, 12.0, 0.0, 0.0, 1.0])),
+        ("width", array("<i8", "()", 32u64.to_le_bytes().to_vec())),
+        ("height", array("<i8", "()", 24u64.to_le_bytes().to_vec())),
+    ];
+    let (mut out, mut directory) = (Vec::new(), Vec::new());
+    for (name, data) in &files {
+        let name = format!("{name}.npy");
+        let offset = out.len() as u32;
+        let common = [
+            u16s(&[20, 0, 0, 0, 0]),
+            u32s(&[crc32(data), data.len() as u32, data.len() as u32]),
+            u16s(&[name.len() as u16, 0]),
+        ]
+        .concat();
+        out.extend([b"PK\x03\x04".as_slice(), &common, name.as_bytes(), data].concat());
+        let tail = [u16s(&[0, 0, 0]), u32s(&[0, offset])].concat();
+        directory.extend([b"PK\x01\x02".as_slice(), &u16s(&[20]), &common, &tail, name.as_bytes()].concat());
+    }
+    let n = files.len() as u16;
+    let end = [u16s(&[0, 0, n, n]), u32s(&[directory.len() as u32, out.len() as u32]), u16s(&[0])].concat();
+    [out.as_slice(), &directory, b"PK\x05\x06", &end].concat()
+}
+
+fn u16s(values: &[u16]) -> Vec<u8> {
+    values.iter().flat_map(|v| v.to_le_bytes()).collect()
+}

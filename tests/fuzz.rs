@@ -1,0 +1,172 @@
+//! A smoke of every fuzz target on a stable compiler: seeds, and thousands of seeded mutations of them.
+//!
+//! `SLAG_FUZZ_SECS`: seconds a target, instead of a fixed number of mutations.
+
+#![expect(unsafe_code, reason = "an allocator that counts")]
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::time::{Duration, Instant};
+
+#[path = "../fuzz/src/lib.rs"]
+mod targets;
+
+use slag_tests::shared;
+
+/// Memory that a decoder may take beyond the multiple of its input: buffers, and small pictures.
+const FREE_BYTES: usize = 64 << 20;
+const MAX_EXPANSION: usize = 256;
+/// Mutations of each target; those that write files and decode pictures take the longest.
+const N_MUTATIONS: u64 = 3000;
+/// Bytes and numbers at which decoders turn.
+const INTERESTING: [u64; 12] =
+    [0, 1, 2, 0x7f, 0x80, 0xff, 0xffff, 0x7fff_ffff, 0x8000_0000, 0xffff_ffff, u64::MAX >> 1, u64::MAX];
+
+/// Counts what the current thread has allocated, now and at most.
+struct Counting;
+
+thread_local! {
+    static LIVE_BYTES: Cell<isize> = const { Cell::new(0) };
+    static PEAK_BYTES: Cell<isize> = const { Cell::new(0) };
+}
+
+fn count(change: isize) {
+    let live = LIVE_BYTES.get() + change;
+    LIVE_BYTES.set(live);
+    PEAK_BYTES.set(PEAK_BYTES.get().max(live));
+}
+
+// SAFETY: every call goes to the system's allocator unchanged.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count(layout.size() as isize);
+        // SAFETY: as required of our caller.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
+        count(layout.size() as isize);
+        // SAFETY: as required of our caller.
+        unsafe { System.alloc_zeroed(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        count(-(layout.size() as isize));
+        // SAFETY: as required of our caller.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// Returns what `work` returns and the most bytes it had allocated at a time.
+fn peak_bytes<T>(work: impl FnOnce() -> T) -> (T, usize) {
+    let before = LIVE_BYTES.get();
+    PEAK_BYTES.set(before);
+    let result = work();
+    (result, (PEAK_BYTES.get() - before) as usize)
+}
+
+/// SplitMix64 (Steele et al. 2014).
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+
+    fn below(&mut self, n: usize) -> usize {
+        (self.next() % n.max(1) as u64) as usize
+    }
+}
+
+/// Changes some bytes, as fuzzers do: bits, numbers, digits, cuts, copies, and pieces of another seed.
+fn mutated(seeds: &[Vec<u8>], random: &mut Random) -> Vec<u8> {
+    let mut bytes = seeds[random.below(seeds.len())].clone();
+    for _ in 0..1 + random.below(4) {
+        let at = random.below(bytes.len());
+        match random.below(9) {
+            0 | 1 if !bytes.is_empty() => bytes[at] ^= 1 << random.below(8),
+            2 if !bytes.is_empty() => bytes[at] = random.next() as u8,
+            3 | 4 => {
+                let width = [1, 2, 4, 8][random.below(4)];
+                let value = INTERESTING[random.below(INTERESTING.len())].to_le_bytes();
+                // Numbers are mostly aligned.
+                let at = if random.below(2) == 0 { at } else { at / width * width };
+                let end = (at + width).min(bytes.len());
+                bytes[at..end].copy_from_slice(&value[..end - at]);
+            }
+            5 => {
+                // Text: a digit, a sign, or a long number in place of what stands there.
+                let piece: &[u8] =
+                    [b"-".as_slice(), b"9", b"1e999", b"NaN", b"99999999999999999999", b"\"", b"{"]
+                        [random.below(7)];
+                let end = (at + random.below(3)).min(bytes.len());
+                bytes.splice(at..end, piece.iter().copied());
+            }
+            6 => bytes.truncate(at),
+            7 => {
+                let end = (at + random.below(64)).min(bytes.len());
+                let piece = bytes[at..end].to_vec();
+                let to = random.below(bytes.len() + 1);
+                bytes.splice(to..to, piece);
+            }
+            _ => {
+                let other = &seeds[random.below(seeds.len())];
+                let from = random.below(other.len());
+                let piece = &other[from..(from + random.below(64)).min(other.len())];
+                let end = (at + piece.len()).min(bytes.len());
+                bytes.splice(at..end, piece.iter().copied());
+            }
+        }
+    }
+    bytes
+}
+
+#[test]
+fn no_decoder_panics() {
+    let folder = shared("fixtures").and_then(|path| Some(path.parent()?.to_owned()));
+    let budget = std::env::var("SLAG_FUZZ_SECS")
+        .ok()
+        .map(|secs| Duration::from_secs(secs.parse().expect("SLAG_FUZZ_SECS is a number of seconds")));
+    let mut without_sound_seed = Vec::new();
+    for target in targets::TARGETS {
+        let seeds = targets::seeds::of(target.name, folder.as_deref());
+        assert!(!seeds.is_empty() || folder.is_none(), "{} has no seeds", target.name);
+        if seeds.is_empty() {
+            continue;
+        }
+        let start = Instant::now();
+        let mut random = Random(7);
+        let (mut n, mut largest_bytes) = (0, 0);
+        let mut n_accepted = seeds.iter().filter(|seed| (target.run)(seed)).count();
+        if n_accepted == 0 {
+            without_sound_seed.push(target.name);
+        }
+        while budget.map_or(n < N_MUTATIONS, |budget| start.elapsed() < budget) {
+            let input = mutated(&seeds, &mut random);
+            let run = || catch_unwind(AssertUnwindSafe(|| targets::run(target.name, &input)));
+            let (ended, peak_bytes) = peak_bytes(run);
+            let told = || format!("{} at mutation {n}; the input: {}", target.name, input.escape_ascii());
+            n_accepted += usize::from(ended.unwrap_or_else(|_| panic!("{}", told())));
+            largest_bytes = largest_bytes.max(peak_bytes);
+            let limit_bytes = FREE_BYTES + input.len() * MAX_EXPANSION;
+            assert!(peak_bytes <= limit_bytes, "{peak_bytes} bytes of memory: {}", told());
+            n += 1;
+        }
+        println!(
+            "{}: {n} mutations of {} seeds, {n_accepted} of them sound, at most {largest_bytes} bytes, in {:.1?}",
+            target.name,
+            seeds.len(),
+            start.elapsed()
+        );
+    }
+    // Mutations of what is refused at once test nothing.
+    assert!(without_sound_seed.is_empty(), "no seed is sound: {without_sound_seed:?}");
+}
