@@ -1,10 +1,12 @@
 //! The command line: what can be asked for, and how a run ends.
 
+mod bench;
 mod commands;
 mod fetch;
 mod output;
 
 use std::net::SocketAddr;
+use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -38,6 +40,9 @@ enum Command {
     Query(QueryArgs),
     /// Shows what is on board.
     Status(StatusArgs),
+    /// Measures.
+    #[command(subcommand)]
+    Bench(bench::BenchCommand),
 }
 
 #[derive(Debug, Args)]
@@ -45,6 +50,13 @@ struct CacheArgs {
     /// Folder of what is on board [default: $XDG_CACHE_HOME/slag, else ~/.cache/slag].
     #[arg(long, value_name = "DIR")]
     cache: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+struct ThreadArgs {
+    /// Threads that questions are worked on with [default: as many as there are cores].
+    #[arg(long, value_name = "N")]
+    threads: Option<NonZeroUsize>,
 }
 
 #[derive(Debug, Args)]
@@ -93,6 +105,8 @@ struct ServeArgs {
     #[arg(long, value_name = "IP:PORT", default_value = "127.0.0.1:7734")]
     listen: SocketAddr,
     #[command(flatten)]
+    threads: ThreadArgs,
+    #[command(flatten)]
     cache: CacheArgs,
     #[command(flatten)]
     models: ModelArgs,
@@ -123,6 +137,8 @@ struct QueryArgs {
     /// Clusters with fewer Gaussians are dropped, and counted.
     #[arg(long, default_value_t = DEFAULT_MIN_COUNT)]
     min_count: u64,
+    #[command(flatten)]
+    threads: ThreadArgs,
     #[command(flatten)]
     cache: CacheArgs,
     #[command(flatten)]
@@ -178,6 +194,7 @@ impl Cli {
             Command::Serve(args) => (false, commands::serve(args)),
             Command::Query(args) => (args.json, commands::query(args)),
             Command::Status(args) => (args.json, commands::status(args)),
+            Command::Bench(bench::BenchCommand::Query(args)) => (true, bench::query(args)),
         };
         match result {
             Ok(()) => Exit::Done,
@@ -250,6 +267,7 @@ mod tests {
         assert_eq!((query.radius, query.limit, query.threshold), (Some(4.0), Some(5), Some(-0.5)));
         assert_eq!(query.level, Level::Gaussians);
         assert!(parse("slag-edge status --json --cache d").is_ok());
+        assert!(parse("slag-edge bench query --cache d --limits 10,20 --runs 3 --threads 1").is_ok());
     }
 
     #[test]
@@ -268,6 +286,8 @@ mod tests {
             "slag-edge fetch --profile tiny",
             "slag-edge serve --listen nowhere",
             "slag-edge status --quiet --verbose",
+            "slag-edge serve --threads 0",
+            "slag-edge bench query --runs 0",
         ] {
             assert_eq!(parse(line).expect_err(line).exit_code(), Exit::Usage as i32, "{line}");
         }

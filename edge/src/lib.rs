@@ -1,5 +1,6 @@
 //! The robot's side of SLAG: keeps the shards around it and answers text queries offline.
 
+pub mod bench;
 pub mod fetch;
 pub mod http;
 pub mod query;

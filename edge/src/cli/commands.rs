@@ -12,7 +12,7 @@ use slag_models::{SessionOptions, find_runtime};
 use tokio::net::TcpListener;
 
 use super::output::{Failure, print_answers, print_json, print_status};
-use super::{CacheArgs, ModelArgs, QueryArgs, ServeArgs, StatusArgs};
+use super::{CacheArgs, ModelArgs, QueryArgs, ServeArgs, StatusArgs, ThreadArgs};
 
 /// Async threads: they only pass requests on.
 const ASYNC_THREADS: usize = 2;
@@ -25,6 +25,15 @@ impl CacheArgs {
         let dir = self.cache.or_else(default_cache_dir);
         let advice = || Failure::Usage(anyhow!("neither XDG_CACHE_HOME nor HOME is set; give --cache DIR"));
         Ok(EdgeCache::open(dir.ok_or_else(advice)?))
+    }
+}
+
+impl ThreadArgs {
+    /// Bounds the threads that questions are worked on with; once in a process.
+    pub fn apply(&self) -> Result<(), Failure> {
+        let Some(n) = self.threads else { return Ok(()) };
+        let built = rayon::ThreadPoolBuilder::new().num_threads(n.get()).build_global();
+        built.map_err(|e| Failure::Failed("threads", e.into()))
     }
 }
 
@@ -45,7 +54,8 @@ fn engine(cache: CacheArgs, models: &ModelArgs) -> Result<Engine, Failure> {
     Ok(Engine::new(cache.open()?, text))
 }
 
-fn store_failure(error: StoreError) -> Failure {
+/// Tells apart that nothing is on board yet.
+pub fn store_failure(error: StoreError) -> Failure {
     let kind = if matches!(error, StoreError::Empty { .. }) { "no-scene" } else { "store" };
     Failure::Failed(kind, error.into())
 }
@@ -62,6 +72,7 @@ pub fn query(args: QueryArgs) -> Result<(), Failure> {
         min_count: args.min_count,
     };
     request.check().map_err(|e| Failure::Usage(e.into()))?;
+    args.threads.apply()?;
     let engine = engine(args.cache, &args.models)?;
     engine.reload().map_err(store_failure)?;
     let answers = engine.answer(&request)?;
@@ -75,6 +86,7 @@ pub fn status(args: StatusArgs) -> Result<(), Failure> {
 }
 
 pub fn serve(args: ServeArgs) -> Result<(), Failure> {
+    args.threads.apply()?;
     let engine = engine(args.cache, &args.models)?;
     match engine.reload() {
         Ok(()) => {}

@@ -1,11 +1,10 @@
 //! The best-scoring Gaussians, without scoring them all.
 
-use std::cmp::Ordering;
-
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::{Run, Search, runs_inside};
+use super::collect::{Cell, Gather, runs_inside};
+use super::{Effort, Run, Search};
 
 /// One Gaussian and its score.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -14,74 +13,190 @@ pub struct Hit {
     pub shard: u32,
     /// Index in the shard.
     pub index: u32,
-    /// Exact where the shard carries exact embeddings and they were asked for, else that of its row.
+    /// Its own where the shard knows more of it than its row and that was asked for, else that of its row.
     pub score: f32,
+}
+
+/// Into how many parts the range of scores is cut to find a rank in it.
+const BINS: usize = 4096;
+/// Fewer keys than this are sorted on one thread.
+const SORTED_ALONE: usize = 1 << 14;
+
+/// Memory for ranking.
+#[derive(Default)]
+pub(super) struct Order {
+    parts: Vec<Part>,
+    runs: Vec<Run>,
+    keys: Vec<u64>,
+    tied: Vec<(f64, Hit)>,
+}
+
+/// What one thread counts.
+#[derive(Default)]
+struct Part {
+    bins: Vec<u64>,
+    scores: Vec<(f32, u64)>,
+    range: Option<(f32, f32)>,
 }
 
 impl Search<'_> {
     /// Returns the `limit` best Gaussians that reach a threshold, best first: by score, then by distance
     /// from `near`, then by cell and index. The selection is exact with respect to the scores returned.
     pub fn best(&self, limit: usize, threshold: f32, near: Option<DVec3>) -> Vec<Hit> {
+        let mut hits = Vec::new();
+        self.best_into(limit, threshold, near, &mut hits);
+        hits
+    }
+
+    /// As [`Search::best`], into a list that is cleared before. Returns what it took.
+    pub fn best_into(
+        &self,
+        limit: usize,
+        threshold: f32,
+        near: Option<DVec3>,
+        hits: &mut Vec<Hit>,
+    ) -> Effort {
+        hits.clear();
         if limit == 0 {
-            return Vec::new();
+            return Effort::default();
         }
-        let cut = self.score_surely_reached(limit, threshold);
-        let mut runs = self.collect(cut, true).runs;
-        runs.par_sort_unstable_by(|a, b| b.score.total_cmp(&a.score).then(self.by_name(a.shard, a.start, b)));
-        let mut best = Vec::new();
-        for ties in runs.chunk_by(|a, b| a.score == b.score) {
-            let first = best.len();
-            let hits = ties.iter().flat_map(|run| {
-                (run.start..run.end).map(|index| Hit { shard: run.shard, index, score: run.score })
+        let mut gather = self.take_gather();
+        let mut effort = Effort::default();
+        let has_detail = (0..self.shards.len()).any(|at| self.cell(at).is_some_and(|cell| cell.has_detail()));
+        let cut = if has_detail {
+            // Half as many again by their rows' scores: the worst of these members by their own scores are
+            // not among the best.
+            let enough = limit.saturating_add(limit / 2).saturating_add(1);
+            let floor = self.row_score_at(&mut gather.order, enough, f32::NEG_INFINITY);
+            self.collect(&mut gather, threshold, true, floor.unwrap_or(f32::NEG_INFINITY));
+            effort += gather.effort();
+            let Gather { shards, order } = &mut gather;
+            order.score_at(limit, shards.len(), |at, put| {
+                let runs = shards[at].found.runs.iter();
+                runs.for_each(|run| put(run.score, u64::from(run.end - run.start)));
+            })
+        } else {
+            self.row_score_at(&mut gather.order, limit, threshold)
+        };
+        self.collect(&mut gather, cut.unwrap_or(threshold), true, f32::NEG_INFINITY);
+        effort += gather.effort();
+        self.rank(&mut gather, limit, near, hits);
+        self.put_back(gather);
+        effort
+    }
+
+    /// Returns the least of the scores of the rows whose members, with those of better rows, are `limit`
+    /// or more; none if there are fewer with a row that reaches the threshold.
+    fn row_score_at(&self, order: &mut Order, limit: usize, threshold: f32) -> Option<f32> {
+        order.score_at(limit, self.shards.len(), |at, put| {
+            let Some(cell) = self.cell(at) else { return };
+            for (row, score) in cell.rows.iter().enumerate().filter(|(_, score)| **score >= threshold) {
+                put(*score, self.n_inside(at, &cell, row));
+            }
+        })
+    }
+
+    fn n_inside(&self, at: usize, cell: &Cell<'_>, row: usize) -> u64 {
+        let members = self.shards[at].members(row);
+        match cell.filter {
+            None => members.len() as u64,
+            filter => runs_inside(&self.shards[at], filter, members).map(|inside| inside.len() as u64).sum(),
+        }
+    }
+
+    /// Sorts what was gathered.
+    fn rank(&self, gather: &mut Gather, limit: usize, near: Option<DVec3>, hits: &mut Vec<Hit>) {
+        let Gather { shards, order: Order { runs, keys, tied, .. } } = gather;
+        let mut by_cell: Vec<usize> = (0..self.shards.len()).collect();
+        by_cell.sort_by_key(|at| self.shards[*at].header.cell_id);
+        runs.clear();
+        by_cell.iter().for_each(|at| runs.extend_from_slice(&shards[*at].found.runs));
+        keys.clear();
+        // Places, in the order of cells and indices, decide between equal scores.
+        keys.extend(runs.iter().zip(0u64..).map(|(run, place)| u64::from(!rising(run.score)) << 32 | place));
+        match keys.len() < SORTED_ALONE {
+            true => keys.sort_unstable(),
+            false => keys.par_sort_unstable(),
+        }
+        hits.reserve(limit.min(runs.iter().map(|run| (run.end - run.start) as usize).sum()));
+        for ties in keys.chunk_by(|a, b| a >> 32 == b >> 32) {
+            let left = limit - hits.len();
+            let of_ties = ties.iter().flat_map(|key| {
+                let run = runs[*key as u32 as usize];
+                (run.start..run.end).map(move |index| Hit { shard: run.shard, index, score: run.score })
             });
             match near {
-                // Ties are in the order of their names already.
-                None => best.extend(hits.take(limit - first)),
+                None => hits.extend(of_ties.take(left)),
                 Some(near) => {
-                    let mut tied: Vec<(f64, Hit)> =
-                        hits.map(|hit| (self.distance(near, &hit), hit)).collect();
+                    tied.clear();
+                    tied.extend(of_ties.map(|hit| (self.distance(near, &hit), hit)));
                     // Stable: those as near stay in the order of their names.
                     tied.sort_by(|a, b| a.0.total_cmp(&b.0));
-                    best.extend(tied.into_iter().map(|(_, hit)| hit).take(limit - first));
+                    hits.extend(tied.iter().map(|(_, hit)| *hit).take(left));
                 }
             }
-            if best.len() == limit {
+            if hits.len() == limit {
                 break;
             }
         }
-        best
     }
 
     fn distance(&self, from: DVec3, hit: &Hit) -> f64 {
         from.distance(self.shards[hit.shard as usize].position_in_world(hit.index as usize))
     }
+}
 
-    fn by_name(&self, shard: u32, start: u32, other: &Run) -> Ordering {
-        let cell = |shard: u32| self.shards[shard as usize].header.cell_id;
-        (cell(shard), start).cmp(&(cell(other.shard), other.start))
+impl Order {
+    /// Returns the score of the Gaussian at a rank, counted from 1 at the best; none if there are fewer.
+    ///
+    /// `of_place` gives scores and how many Gaussians have them, for each of `n_places`.
+    /// Counts by parts of the range of scores find the part in question, and only that is sorted.
+    fn score_at<F>(&mut self, rank: usize, n_places: usize, of_place: F) -> Option<f32>
+    where
+        F: Fn(usize, &mut dyn FnMut(f32, u64)) + Sync,
+    {
+        let n_parts = rayon::current_num_threads().min(n_places).max(1);
+        self.parts.resize_with(n_parts, Part::default);
+        let places = |part: usize| n_places * part / n_parts..n_places * (part + 1) / n_parts;
+        self.parts.par_iter_mut().enumerate().for_each(|(part, counts)| {
+            counts.scores.clear();
+            let Part { scores, range, .. } = counts;
+            places(part).for_each(|at| of_place(at, &mut |score, count| scores.push((score, count))));
+            let ends = scores.iter().map(|(score, _)| (*score, *score));
+            *range = ends.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)));
+        });
+        let ranges = self.parts.iter().filter_map(|part| part.range);
+        let (least, most) = ranges.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))?;
+        // Never falls as the score rises; all that counts here.
+        let per_score = (BINS - 1) as f32 / (most - least).max(f32::MIN_POSITIVE);
+        let bin_of = |score: f32| (((score - least) * per_score) as usize).min(BINS - 1);
+        self.parts.par_iter_mut().for_each(|Part { bins, scores, .. }| {
+            bins.clear();
+            bins.resize(BINS, 0);
+            scores.iter().for_each(|(score, count)| bins[bin_of(*score)] += count);
+        });
+        let mut n_better = 0;
+        let bin = (0..BINS).rev().find(|bin| {
+            let n: u64 = self.parts.iter().map(|part| part.bins[*bin]).sum();
+            let is_here = n_better + n >= rank as u64;
+            n_better += if is_here { 0 } else { n };
+            is_here
+        })?;
+        self.parts.par_iter_mut().for_each(|part| part.scores.retain(|(score, _)| bin_of(*score) == bin));
+        let (first, others) = self.parts.split_first_mut()?;
+        let of_bin = &mut first.scores;
+        others.iter().for_each(|part| of_bin.extend_from_slice(&part.scores));
+        of_bin.sort_unstable_by(|a, b| b.0.total_cmp(&a.0));
+        let reached = of_bin.iter().find(|(_, count)| {
+            n_better += count;
+            n_better >= rank as u64
+        });
+        reached.map(|(score, _)| *score)
     }
+}
 
-    /// Returns a score, at least the threshold, that `limit` Gaussians surely reach; the threshold where
-    /// there are no more that surely reach it.
-    fn score_surely_reached(&self, limit: usize, threshold: f32) -> f32 {
-        let per_shard = (0..self.shards.len()).into_par_iter().map(|at| {
-            let (shard, Some(scores)) = (&self.shards[at], &self.row_scores[at]) else { return Vec::new() };
-            let (filter, slack) = (self.filter(shard), self.slack(shard));
-            let lower = scores.iter().enumerate().map(|(row, score)| (score - slack(row), row));
-            lower
-                .filter(|(lower, _)| *lower >= threshold)
-                .map(|(lower, row)| {
-                    (lower, runs_inside(shard, filter, shard.members(row)).map(|r| r.len()).sum())
-                })
-                .collect::<Vec<(f32, usize)>>()
-        });
-        let mut rows: Vec<(f32, usize)> = per_shard.flatten_iter().collect();
-        rows.par_sort_unstable_by(|a, b| b.0.total_cmp(&a.0));
-        let mut n = 0;
-        let reached = rows.into_iter().find(|(_, n_members)| {
-            n += n_members;
-            n >= limit
-        });
-        reached.map_or(threshold, |(lower, _)| lower)
-    }
+/// Returns a number that rises with a score.
+fn rising(score: f32) -> u32 {
+    let bits = score.to_bits();
+    if bits >> 31 == 0 { bits | 1 << 31 } else { !bits }
 }
