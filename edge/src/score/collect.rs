@@ -241,7 +241,8 @@ impl Cell<'_> {
             is_reachable = true;
             let is_undecided = lower < threshold;
             let is_scanned = is_undecided || each;
-            for inside in runs_inside(self.shard, self.filter, self.shard.members(row)) {
+            let members = self.shard.row_starts[row] as usize..self.shard.row_starts[row + 1] as usize;
+            for inside in runs_inside(self.shard, self.filter, members) {
                 match self.detail {
                     Detail::Residuals(residuals) if is_scanned => {
                         self.scan(gather, &residuals, row, inside, threshold);

@@ -1,7 +1,7 @@
 //! Large answers as columns.
 
 use rayon::prelude::*;
-use slag_common::shard::ShardView;
+use slag_common::shard::{Positions, ShardView};
 
 use super::{Hit, Run};
 
@@ -36,11 +36,30 @@ struct Part<'a> {
 }
 
 impl Part<'_> {
+    #[inline]
     fn set(&mut self, at: usize, shards: &[ShardView<'_>], hit: Hit) {
-        let position = shards[hit.shard as usize].position_in_world(hit.index as usize);
         (self.shard[at], self.index[at], self.score[at]) = (hit.shard, hit.index, hit.score);
-        (self.x[at], self.y[at], self.z[at]) = position.into();
+        [self.x[at], self.y[at], self.z[at]] =
+            position_in_world(&shards[hit.shard as usize], hit.index as usize);
     }
+}
+
+/// As [`ShardView::position_in_world`], the same bits, but compiled into the loop over many.
+#[inline]
+fn position_in_world(shard: &ShardView<'_>, index: usize) -> [f64; 3] {
+    let header = &shard.header;
+    let steps = match shard.positions {
+        Positions::Wide(steps) => steps[index].map(u32::from),
+        Positions::Packed(words) => {
+            let [x, y, z, _] = header.position_bits.map(u32::from);
+            let word = u64::from(words[index]);
+            let low = |word: u64, bits: u32| (word & ((1 << bits) - 1)) as u32;
+            [low(word, x), low(word >> x, y), low(word >> (x + y), z)]
+        }
+    };
+    std::array::from_fn(|axis| {
+        header.origin_in_world[axis] + f64::from(steps[axis]) * header.position_step[axis]
+    })
 }
 
 impl Columns {

@@ -35,8 +35,7 @@ pub(super) struct Order {
 #[derive(Default)]
 struct Part {
     bins: Vec<u64>,
-    scores: Vec<(f32, u64)>,
-    range: Option<(f32, f32)>,
+    in_bin: Vec<(f32, u64)>,
 }
 
 impl Search<'_> {
@@ -71,10 +70,9 @@ impl Search<'_> {
             self.collect(&mut gather, threshold, true, floor.unwrap_or(f32::NEG_INFINITY));
             effort += gather.effort();
             let Gather { shards, order } = &mut gather;
-            order.score_at(limit, shards.len(), |at, put| {
-                let runs = shards[at].found.runs.iter();
-                runs.for_each(|run| put(run.score, u64::from(run.end - run.start)));
-            })
+            let runs = |at: usize| &shards[at].found.runs;
+            let count = |at: usize, run: usize| u64::from(runs(at)[run].end - runs(at)[run].start);
+            order.score_at(limit, shards.len(), |at| runs(at).iter().map(|run| run.score).zip(0..), count)
         } else {
             self.row_score_at(&mut gather.order, limit, threshold)
         };
@@ -88,20 +86,20 @@ impl Search<'_> {
     /// Returns the least of the scores of the rows whose members, with those of better rows, are `limit`
     /// or more; none if there are fewer with a row that reaches the threshold.
     fn row_score_at(&self, order: &mut Order, limit: usize, threshold: f32) -> Option<f32> {
-        order.score_at(limit, self.shards.len(), |at, put| {
-            let Some(cell) = self.cell(at) else { return };
-            for (row, score) in cell.rows.iter().enumerate().filter(|(_, score)| **score >= threshold) {
-                put(*score, self.n_inside(at, &cell, row));
+        let cells: Vec<Option<Cell<'_>>> = (0..self.shards.len()).map(|at| self.cell(at)).collect();
+        let scores = |at: usize| {
+            let rows = cells[at].as_ref().map_or(&[][..], |cell| cell.rows);
+            rows.iter().copied().zip(0..).filter(move |(score, _)| *score >= threshold)
+        };
+        let count = |at: usize, row: usize| {
+            let shard = &self.shards[at];
+            let members = shard.row_starts[row] as usize..shard.row_starts[row + 1] as usize;
+            match cells[at].as_ref().and_then(|cell| cell.filter) {
+                None => members.len() as u64,
+                filter => runs_inside(shard, filter, members).map(|inside| inside.len() as u64).sum(),
             }
-        })
-    }
-
-    fn n_inside(&self, at: usize, cell: &Cell<'_>, row: usize) -> u64 {
-        let members = self.shards[at].members(row);
-        match cell.filter {
-            None => members.len() as u64,
-            filter => runs_inside(&self.shards[at], filter, members).map(|inside| inside.len() as u64).sum(),
-        }
+        };
+        order.score_at(limit, self.shards.len(), scores, count)
     }
 
     /// Sorts what was gathered.
@@ -149,31 +147,24 @@ impl Search<'_> {
 impl Order {
     /// Returns the score of the Gaussian at a rank, counted from 1 at the best; none if there are fewer.
     ///
-    /// `of_place` gives scores and how many Gaussians have them, for each of `n_places`.
-    /// Counts by parts of the range of scores find the part in question, and only that is sorted.
-    fn score_at<F>(&mut self, rank: usize, n_places: usize, of_place: F) -> Option<f32>
-    where
-        F: Fn(usize, &mut dyn FnMut(f32, u64)) + Sync,
-    {
+    /// `scores`: scores at each of `n_places` and what `count` tells by how many Gaussians have them. Counts by
+    /// parts of the range of scores find the part in question, and only that is sorted.
+    fn score_at<I: Iterator<Item = (f32, usize)>>(
+        &mut self,
+        rank: usize,
+        n_places: usize,
+        scores: impl Fn(usize) -> I + Sync,
+        count: impl Fn(usize, usize) -> u64 + Sync,
+    ) -> Option<f32> {
         let n_parts = rayon::current_num_threads().min(n_places).max(1);
         self.parts.resize_with(n_parts, Part::default);
         let places = |part: usize| n_places * part / n_parts..n_places * (part + 1) / n_parts;
-        self.parts.par_iter_mut().enumerate().for_each(|(part, counts)| {
-            counts.scores.clear();
-            let Part { scores, range, .. } = counts;
-            places(part).for_each(|at| of_place(at, &mut |score, count| scores.push((score, count))));
-            let ends = scores.iter().map(|(score, _)| (*score, *score));
-            *range = ends.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)));
-        });
-        let ranges = self.parts.iter().filter_map(|part| part.range);
-        let (least, most) = ranges.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))?;
-        // Never falls as the score rises; all that counts here.
-        let per_score = (BINS - 1) as f32 / (most - least).max(f32::MIN_POSITIVE);
-        let bin_of = |score: f32| (((score - least) * per_score) as usize).min(BINS - 1);
-        self.parts.par_iter_mut().for_each(|Part { bins, scores, .. }| {
+        self.parts.par_iter_mut().enumerate().for_each(|(part, Part { bins, .. })| {
             bins.clear();
             bins.resize(BINS, 0);
-            scores.iter().for_each(|(score, count)| bins[bin_of(*score)] += count);
+            for place in places(part) {
+                scores(place).for_each(|(score, at)| bins[bin_of(score)] += count(place, at));
+            }
         });
         let mut n_better = 0;
         let bin = (0..BINS).rev().find(|bin| {
@@ -182,17 +173,28 @@ impl Order {
             n_better += if is_here { 0 } else { n };
             is_here
         })?;
-        self.parts.par_iter_mut().for_each(|part| part.scores.retain(|(score, _)| bin_of(*score) == bin));
+        self.parts.par_iter_mut().enumerate().for_each(|(part, Part { in_bin, .. })| {
+            in_bin.clear();
+            for place in places(part) {
+                let of_bin = scores(place).filter(|(score, _)| bin_of(*score) == bin);
+                in_bin.extend(of_bin.map(|(score, at)| (score, count(place, at))));
+            }
+        });
         let (first, others) = self.parts.split_first_mut()?;
-        let of_bin = &mut first.scores;
-        others.iter().for_each(|part| of_bin.extend_from_slice(&part.scores));
-        of_bin.sort_unstable_by(|a, b| b.0.total_cmp(&a.0));
-        let reached = of_bin.iter().find(|(_, count)| {
+        others.iter().for_each(|part| first.in_bin.extend_from_slice(&part.in_bin));
+        first.in_bin.sort_unstable_by(|a, b| b.0.total_cmp(&a.0));
+        let reached = first.in_bin.iter().find(|(_, count)| {
             n_better += count;
             n_better >= rank as u64
         });
         reached.map(|(score, _)| *score)
     }
+}
+
+/// Returns the part of the range of scores that a score lies in; never falls as the score rises.
+fn bin_of(score: f32) -> usize {
+    // Few scores lie outside of -1..1, and those share the first and the last part.
+    ((score + 1.0) * (BINS as f32 / 2.0)).clamp(0.0, (BINS - 1) as f32) as usize
 }
 
 /// Returns a number that rises with a score.

@@ -164,22 +164,21 @@ impl<F: FnMut(usize, i32)> Work for MatrixTimesVector<'_, F> {
     fn run<K: Kernels>(self, kernels: K) {
         let Self { rows, n_components, vector, mut put } = self;
         let n_rows = rows.len() / n_components;
-        let mut at = 0;
-        while at < n_rows {
-            // What a row is read beyond its end is multiplied with the padding's zeros.
-            let padded = |row: usize| rows.get(row * n_components..row * n_components + vector.len());
-            if let (Some(a), Some(b), Some(c), Some(d)) =
-                (padded(at), padded(at + 1), padded(at + 2), padded(at + 3))
-            {
-                let dots = kernels.dots([a, b, c, d], vector);
-                for (row, dot) in (at..).zip(dots) {
-                    put(row, dot);
-                }
-                at += ROWS;
-            } else {
-                put(at, dot(&rows[at * n_components..][..n_components], vector));
-                at += 1;
+        // What a row is read beyond its end is multiplied with the padding's zeros; the last rows cannot be.
+        let n_padded = (rows.len() + n_components).saturating_sub(vector.len()) / n_components;
+        let n_together = n_padded.min(n_rows) / ROWS * ROWS;
+        for at in (0..n_together).step_by(ROWS) {
+            let start = at * n_components;
+            let four = &rows[start..start + (ROWS - 1) * n_components + vector.len()];
+            let (a, b) = (&four[..vector.len()], &four[n_components..][..vector.len()]);
+            let (c, d) = (&four[2 * n_components..][..vector.len()], &four[3 * n_components..]);
+            let dots = kernels.dots([a, b, c, d], vector);
+            for (row, dot) in (at..).zip(dots) {
+                put(row, dot);
             }
+        }
+        for row in n_together..n_rows {
+            put(row, dot(&rows[row * n_components..][..n_components], vector));
         }
     }
 }

@@ -57,7 +57,9 @@ impl Random {
 /// Writes a cache as a fetch leaves it.
 pub fn write_cache(dir: &Path, spec: &SceneSpec) {
     let cache = EdgeCache::open(dir);
-    ["shards", "manifests"].map(|folder| std::fs::create_dir_all(dir.join(folder)).expect("a folder"));
+    for folder in ["shards", "manifests"] {
+        std::fs::create_dir_all(dir.join(folder)).expect("a folder");
+    }
     let profile = if spec.is_balanced { Profile::Balanced } else { Profile::Compact };
     let mut cells = Vec::new();
     for start in (0..spec.n_gaussians).step_by(CELL) {

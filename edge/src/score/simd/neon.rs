@@ -1,4 +1,4 @@
-//! NEON.
+//! NEON. Closures would be compiled for the plain processor: loops only.
 
 use std::arch::aarch64::{int8x16_t, int16x8_t, uint8x16_t};
 
@@ -12,7 +12,9 @@ impl Kernels for Neon {
     #[inline(always)]
     fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
         let neon = self.neon;
-        let [a, b, c, d] = rows.map(|row| row.as_chunks::<16>().0);
+        let [a, b, c, d] = rows;
+        let (a, b) = (a.as_chunks::<16>().0, b.as_chunks::<16>().0);
+        let (c, d) = (c.as_chunks::<16>().0, d.as_chunks::<16>().0);
         let vector = vector.as_chunks::<16>().0;
         let mut sums = [neon.vdupq_n_s32(0); ROWS];
         for ((((a, b), c), d), vector) in a.iter().zip(b).zip(c).zip(d).zip(vector) {

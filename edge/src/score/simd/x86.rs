@@ -1,4 +1,4 @@
-//! AVX2 and AVX-512.
+//! AVX2 and AVX-512. Closures would be compiled for the plain processor: loops only.
 
 use std::arch::x86_64::{__m128i, __m256i, __m512i};
 
@@ -12,7 +12,9 @@ impl Kernels for V3 {
     #[inline(always)]
     fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
         let (avx, avx2) = (self.avx, self.avx2);
-        let [a, b, c, d] = rows.map(|row| row.as_chunks::<16>().0);
+        let [a, b, c, d] = rows;
+        let (a, b) = (a.as_chunks::<16>().0, b.as_chunks::<16>().0);
+        let (c, d) = (c.as_chunks::<16>().0, d.as_chunks::<16>().0);
         let vector = vector.as_chunks::<16>().0;
         let mut sums = [avx._mm256_setzero_si256(); ROWS];
         for ((((a, b), c), d), vector) in a.iter().zip(b).zip(c).zip(d).zip(vector) {
@@ -39,7 +41,9 @@ impl Kernels for V4 {
     #[inline(always)]
     fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
         let (avx512f, avx512bw) = (self.avx512f, self.avx512bw);
-        let [a, b, c, d] = rows.map(|row| row.as_chunks::<32>().0);
+        let [a, b, c, d] = rows;
+        let (a, b) = (a.as_chunks::<32>().0, b.as_chunks::<32>().0);
+        let (c, d) = (c.as_chunks::<32>().0, d.as_chunks::<32>().0);
         let vector = vector.as_chunks::<32>().0;
         let mut sums = [avx512f._mm512_setzero_si512(); ROWS];
         for ((((a, b), c), d), vector) in a.iter().zip(b).zip(c).zip(d).zip(vector) {
@@ -49,7 +53,14 @@ impl Kernels for V4 {
                 *sum = avx512f._mm512_add_epi32(*sum, products);
             }
         }
-        fold(*self, sums.map(|sum| self.avx2._mm256_add_epi32(halves(self, sum)[0], halves(self, sum)[1])))
+        let [a, b, c, d] = sums;
+        let sums = [
+            halves_added_32(self, a),
+            halves_added_32(self, b),
+            halves_added_32(self, c),
+            halves_added_32(self, d),
+        ];
+        fold(*self, sums)
     }
 
     /// Two columns at once, one in either half of a register.
@@ -70,7 +81,7 @@ impl Kernels for V4 {
                 wide[1] = avx512bw._mm512_add_epi16(wide[1], avx512bw._mm512_srli_epi16::<8>(values));
             }
         }
-        let mut sums = wide.map(|sum| self.avx2._mm256_add_epi16(halves(self, sum)[0], halves(self, sum)[1]));
+        let mut sums = [halves_added_16(self, wide[0]), halves_added_16(self, wide[1])];
         let rest = columns.len() - single.len();
         for ((codes, low), high) in single.iter().zip(&low[rest..]).zip(&high[rest..]) {
             add_column(*self, &mut sums, codes, low, high);
@@ -80,8 +91,15 @@ impl Kernels for V4 {
 }
 
 #[inline(always)]
-fn halves(simd: V4, value: __m512i) -> [__m256i; 2] {
-    [simd.avx512f._mm512_castsi512_si256(value), simd.avx512f._mm512_extracti64x4_epi64::<1>(value)]
+fn halves_added_32(simd: V4, value: __m512i) -> __m256i {
+    let high = simd.avx512f._mm512_extracti64x4_epi64::<1>(value);
+    simd.avx2._mm256_add_epi32(simd.avx512f._mm512_castsi512_si256(value), high)
+}
+
+#[inline(always)]
+fn halves_added_16(simd: V4, value: __m512i) -> __m256i {
+    let high = simd.avx512f._mm512_extracti64x4_epi64::<1>(value);
+    simd.avx2._mm256_add_epi16(simd.avx512f._mm512_castsi512_si256(value), high)
 }
 
 /// Returns the sum of each register's eight lanes.
