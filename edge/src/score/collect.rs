@@ -8,7 +8,8 @@ use slag_common::shard::{BLOCK, Residuals, ShardView};
 
 use super::project::Projection;
 use super::rows::{ShardScores, combine};
-use super::simd::{BlockSums, Level};
+use super::select::{BINS, bin_of};
+use super::simd::{AtLeast, BlockSums, Level};
 use super::{Effort, F16_ROUNDING, Matches, Precision, Region, Run, Search, dot};
 
 /// Runs on their way to an answer, and what finding them takes; kept from one answer to the next.
@@ -39,6 +40,10 @@ pub(super) struct ShardGather {
     sums: Vec<[u16; BLOCK]>,
     /// The block that these are of.
     block: Option<usize>,
+    /// Whether matches are only to be counted.
+    is_counting: bool,
+    /// How many have a score in each part of the range of scores; empty where there is none.
+    pub bins: Vec<u32>,
 }
 
 /// What members are scored by, beyond their row.
@@ -65,6 +70,8 @@ pub(super) struct Cell<'a> {
     component_steepness: f32,
     /// Rounding in tables for a row scale of 1.
     table_error: f32,
+    /// Sum over vectors of the largest that tables name, for a row scale of 1.
+    table_reach: f32,
 }
 
 impl<'a> Search<'a> {
@@ -96,6 +103,7 @@ impl<'a> Search<'a> {
             level: Level::widest(),
             component_steepness: 0.0,
             table_error: 0.0,
+            table_reach: 0.0,
         };
         if let Some(residuals) = &shard.residuals {
             cell.measure(residuals);
@@ -103,14 +111,28 @@ impl<'a> Search<'a> {
         Some(cell)
     }
 
-    /// Gathers what reaches a threshold, of rows whose own score reaches `floor`. `each`: members of shards
-    /// that know more of them than their row get scores of their own even where the row alone decides.
-    pub(super) fn collect(&self, gather: &mut Gather, threshold: f32, each: bool, floor: f32) {
+    /// Gathers what reaches a threshold. `each`: members of shards that know more of them than their row get
+    /// scores of their own even where the row alone decides.
+    pub(super) fn collect(&self, gather: &mut Gather, threshold: f32, each: bool) {
         gather.shards.resize_with(self.shards.len(), ShardGather::default);
         gather.shards.par_iter_mut().enumerate().for_each(|(at, gather)| {
             gather.found.clear();
+            gather.is_counting = false;
             if let Some(cell) = self.cell(at) {
-                cell.collect(gather, threshold, each, floor);
+                cell.collect(gather, threshold, each, f32::NEG_INFINITY);
+            }
+        });
+    }
+
+    /// Counts what reaches a threshold, each by its own score, of rows whose own score reaches `floor`.
+    pub(super) fn count(&self, gather: &mut Gather, threshold: f32, floor: f32) {
+        gather.shards.resize_with(self.shards.len(), ShardGather::default);
+        gather.shards.par_iter_mut().enumerate().for_each(|(at, gather)| {
+            gather.found.clear();
+            gather.is_counting = true;
+            gather.bins.clear();
+            if let Some(cell) = self.cell(at) {
+                cell.collect(gather, threshold, true, floor);
             }
         });
     }
@@ -142,7 +164,10 @@ impl Cell<'_> {
             errors.map(|(_, projection)| projection.tables.error).fold(0.0, f32::max)
         };
         let table_error = error(false) + error(true);
-        (self.component_steepness, self.table_error) = (steepness, table_error);
+        let reach = |p: &Projection| p.tables.offset.abs() + p.tables.step * f32::from(p.tables.most);
+        let table_reach = self.projections().map(reach).sum();
+        (self.component_steepness, self.table_error, self.table_reach) =
+            (steepness, table_error, table_reach);
     }
 
     /// Returns a member's score by one vector for a sum of codes of 0, and what each step of the sum adds.
@@ -161,13 +186,8 @@ impl Cell<'_> {
 
     /// Returns a bound on what the rounding in f32 of a member's score comes to.
     fn rounding(&self, row: usize, residuals: &Residuals<'_>) -> f32 {
-        let of_vector = |place: &usize| {
-            let tables = &self.scores.projections[*place].tables;
-            let scale = residuals.row_scales[row];
-            let largest = tables.offset.abs() + tables.step * f32::from(tables.most);
-            self.scores.rows[*place][row].abs() + scale * largest
-        };
-        2.0 * f32::EPSILON * self.search.places.iter().map(of_vector).sum::<f32>()
+        let of_rows: f32 = self.search.places.iter().map(|place| self.scores.rows[*place][row].abs()).sum();
+        2.0 * f32::EPSILON * (of_rows + residuals.row_scales[row] * self.table_reach)
     }
 
     /// Returns two scores that a row's members lie between.
@@ -181,6 +201,11 @@ impl Cell<'_> {
             }
             Detail::Residuals(residuals) => {
                 let apart = self.residual_bound(row, residuals);
+                if let [place] = self.search.places[..] {
+                    let (least, step) = self.line(place, row, residuals);
+                    let most = least + step * f32::from(self.scores.projections[place].tables.most);
+                    return (least.max(score - apart), most.min(score + apart));
+                }
                 let ends = |place: &usize| {
                     let (least, step) = self.line(*place, row, residuals);
                     let most = self.scores.projections[*place].tables.most;
@@ -234,8 +259,11 @@ impl Cell<'_> {
         gather.block = None;
         let mut is_reachable = false;
         for row in 0..self.rows.len() {
+            if self.rows[row] < floor {
+                continue;
+            }
             let (lower, upper) = self.bounds(row);
-            if upper < threshold || self.rows[row] < floor {
+            if upper < threshold {
                 continue;
             }
             is_reachable = true;
@@ -248,9 +276,9 @@ impl Cell<'_> {
                         self.scan(gather, &residuals, row, inside, threshold);
                     }
                     Detail::Embeddings(embeddings) if is_scanned => {
-                        self.rescore(&mut gather.found, embeddings, inside, threshold);
+                        self.rescore(gather, embeddings, inside, threshold);
                     }
-                    _ => self.push(&mut gather.found, inside, self.rows[row]),
+                    _ => self.push(gather, inside, self.rows[row]),
                 }
             }
             gather.found.n_rows_undecided += u64::from(is_undecided);
@@ -258,20 +286,26 @@ impl Cell<'_> {
         gather.found.n_shards_below = usize::from(!is_reachable);
     }
 
-    fn push(&self, found: &mut Matches, members: Range<usize>, score: f32) {
-        found.n_gaussians += members.len() as u64;
-        found.runs.push(Run { shard: self.at, start: members.start as u32, end: members.end as u32, score });
+    fn push(&self, gather: &mut ShardGather, members: Range<usize>, score: f32) {
+        if gather.is_counting {
+            gather.bins.resize(BINS, 0);
+            gather.bins[bin_of(score)] += members.len() as u32;
+            return;
+        }
+        gather.found.n_gaussians += members.len() as u64;
+        let (start, end) = (members.start as u32, members.end as u32);
+        gather.found.runs.push(Run { shard: self.at, start, end, score });
     }
 
-    fn rescore(&self, found: &mut Matches, embeddings: &[f16], members: Range<usize>, threshold: f32) {
-        found.n_rescored += members.len() as u64;
+    fn rescore(&self, gather: &mut ShardGather, embeddings: &[f16], members: Range<usize>, threshold: f32) {
+        gather.found.n_rescored += members.len() as u64;
         let dim = self.shard.header.dim as usize;
         for at in members {
             let embedding = &embeddings[at * dim..][..dim];
             let mut products = self.search.question.vectors().map(|vector| dot(embedding, vector));
             let score = combine(products.next().unwrap_or(0.0), products);
             if score >= threshold {
-                self.push(found, at..at + 1, score);
+                self.push(gather, at..at + 1, score);
             }
         }
     }
@@ -297,28 +331,30 @@ impl Cell<'_> {
                 self.sum_block(gather, residuals, block);
             }
             let first = block * BLOCK;
-            let within = members.start.saturating_sub(first)..(members.end - first).min(BLOCK);
-            let ShardGather { found, sums, .. } = gather;
-            for at in within {
-                if sums[0][at] < least {
-                    continue;
-                }
-                let product = |(place, sums): (&usize, &[u16; BLOCK])| {
-                    let (least, step) = self.line(*place, row, residuals);
-                    least + step * f32::from(sums[at])
-                };
+            let (start, end) = (members.start.saturating_sub(first), (members.end - first).min(BLOCK));
+            let of_row = (u32::MAX << start) & (u32::MAX >> (BLOCK - end));
+            let mut reaching = of_row & self.level.dispatch(AtLeast { sums: &gather.sums[0], least });
+            while reaching != 0 {
+                let at = reaching.trailing_zeros() as usize;
+                reaching &= reaching - 1;
                 let score = match places.len() {
-                    1 => own + step * f32::from(sums[0][at]) + 0.0,
-                    _ => {
-                        let mut products = places.iter().zip(&*sums).map(product);
-                        combine(products.next().unwrap_or(0.0), products)
-                    }
+                    1 => own + step * f32::from(gather.sums[0][at]) + 0.0,
+                    _ => self.score_of_sums(&gather.sums, at, row, residuals),
                 };
                 if score >= threshold {
-                    self.push(found, first + at..first + at + 1, score);
+                    self.push(gather, first + at..first + at + 1, score);
                 }
             }
         }
+    }
+
+    /// Returns the score of the member of a block, made of one sum for each vector.
+    fn score_of_sums(&self, sums: &[[u16; BLOCK]], at: usize, row: usize, residuals: &Residuals<'_>) -> f32 {
+        let mut products = self.search.places.iter().zip(sums).map(|(place, sums)| {
+            let (least, step) = self.line(*place, row, residuals);
+            least + step * f32::from(sums[at])
+        });
+        combine(products.next().unwrap_or(0.0), products)
     }
 
     fn sum_block(&self, gather: &mut ShardGather, residuals: &Residuals<'_>, block: usize) {

@@ -230,7 +230,7 @@ impl<'a> Search<'a> {
     /// As [`Search::matching`], into a list that is cleared before.
     pub fn matching_into(&self, threshold: f32, all: &mut Matches) {
         let mut gather = self.take_gather();
-        self.collect(&mut gather, threshold, false, f32::NEG_INFINITY);
+        self.collect(&mut gather, threshold, false);
         all.clear();
         all.runs.reserve(gather.shards.iter().map(|of_shard| of_shard.found.runs.len()).sum());
         for ShardGather { found, .. } in &gather.shards {

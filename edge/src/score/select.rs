@@ -18,9 +18,9 @@ pub struct Hit {
 }
 
 /// Into how many parts the range of scores is cut to find a rank in it.
-const BINS: usize = 4096;
-/// Fewer keys than this are sorted on one thread.
-const SORTED_ALONE: usize = 1 << 14;
+pub(super) const BINS: usize = 4096;
+/// Bits that keys are sorted by at a time: counts of their values stay in the first-level cache.
+const DIGIT_BITS: u32 = 11;
 
 /// Memory for ranking.
 #[derive(Default)]
@@ -28,6 +28,7 @@ pub(super) struct Order {
     parts: Vec<Part>,
     runs: Vec<Run>,
     keys: Vec<u64>,
+    swapped: Vec<u64>,
     tied: Vec<(f64, Hit)>,
 }
 
@@ -67,16 +68,13 @@ impl Search<'_> {
             // not among the best.
             let enough = limit.saturating_add(limit / 2).saturating_add(1);
             let floor = self.row_score_at(&mut gather.order, enough, f32::NEG_INFINITY);
-            self.collect(&mut gather, threshold, true, floor.unwrap_or(f32::NEG_INFINITY));
+            self.count(&mut gather, threshold, floor.unwrap_or(f32::NEG_INFINITY));
             effort += gather.effort();
-            let Gather { shards, order } = &mut gather;
-            let runs = |at: usize| &shards[at].found.runs;
-            let count = |at: usize, run: usize| u64::from(runs(at)[run].end - runs(at)[run].start);
-            order.score_at(limit, shards.len(), |at| runs(at).iter().map(|run| run.score).zip(0..), count)
+            score_reached(&gather, limit).map(|score| score.max(threshold))
         } else {
             self.row_score_at(&mut gather.order, limit, threshold)
         };
-        self.collect(&mut gather, cut.unwrap_or(threshold), true, f32::NEG_INFINITY);
+        self.collect(&mut gather, cut.unwrap_or(threshold), true);
         effort += gather.effort();
         self.rank(&mut gather, limit, near, hits);
         self.put_back(gather);
@@ -104,7 +102,7 @@ impl Search<'_> {
 
     /// Sorts what was gathered.
     fn rank(&self, gather: &mut Gather, limit: usize, near: Option<DVec3>, hits: &mut Vec<Hit>) {
-        let Gather { shards, order: Order { runs, keys, tied, .. } } = gather;
+        let Gather { shards, order: Order { runs, keys, swapped, tied, .. } } = gather;
         let mut by_cell: Vec<usize> = (0..self.shards.len()).collect();
         by_cell.sort_by_key(|at| self.shards[*at].header.cell_id);
         runs.clear();
@@ -112,26 +110,23 @@ impl Search<'_> {
         keys.clear();
         // Places, in the order of cells and indices, decide between equal scores.
         keys.extend(runs.iter().zip(0u64..).map(|(run, place)| u64::from(!rising(run.score)) << 32 | place));
-        match keys.len() < SORTED_ALONE {
-            true => keys.sort_unstable(),
-            false => keys.par_sort_unstable(),
-        }
+        sort_by_high_half(keys, swapped);
         hits.reserve(limit.min(runs.iter().map(|run| (run.end - run.start) as usize).sum()));
         for ties in keys.chunk_by(|a, b| a >> 32 == b >> 32) {
-            let left = limit - hits.len();
-            let of_ties = ties.iter().flat_map(|key| {
-                let run = runs[*key as u32 as usize];
-                (run.start..run.end).map(move |index| Hit { shard: run.shard, index, score: run.score })
-            });
-            match near {
-                None => hits.extend(of_ties.take(left)),
-                Some(near) => {
-                    tied.clear();
-                    tied.extend(of_ties.map(|hit| (self.distance(near, &hit), hit)));
-                    // Stable: those as near stay in the order of their names.
-                    tied.sort_by(|a, b| a.0.total_cmp(&b.0));
-                    hits.extend(tied.iter().map(|(_, hit)| *hit).take(left));
-                }
+            let first = hits.len();
+            for key in ties {
+                let Run { shard, start, end, score } = runs[*key as u32 as usize];
+                // All of them where their distance decides.
+                let room = if near.is_some() { usize::MAX } else { limit - hits.len() };
+                let end = end.min(start.saturating_add(u32::try_from(room).unwrap_or(u32::MAX)));
+                hits.extend((start..end).map(|index| Hit { shard, index, score }));
+            }
+            if let Some(near) = near {
+                tied.clear();
+                tied.extend(hits.drain(first..).map(|hit| (self.distance(near, &hit), hit)));
+                // Stable: those as near stay in the order of their names.
+                tied.sort_by(|a, b| a.0.total_cmp(&b.0));
+                hits.extend(tied.iter().map(|(_, hit)| *hit).take(limit - first));
             }
             if hits.len() == limit {
                 break;
@@ -191,14 +186,90 @@ impl Order {
     }
 }
 
+/// Returns a score that so many of the Gaussians counted reach; none if there are fewer.
+fn score_reached(gather: &Gather, limit: usize) -> Option<f32> {
+    let bins: Vec<&[u32]> = gather.shards.iter().map(|of_shard| &of_shard.bins[..]).collect();
+    let mut n = 0;
+    let bin = (0..BINS).rev().find(|bin| {
+        n += bins.iter().filter_map(|bins| bins.get(*bin)).map(|n| u64::from(*n)).sum::<u64>();
+        n >= limit as u64
+    })?;
+    // The first part has all that is lower. Else a little below its edge: parts are found with rounding.
+    let edge = bin as f32 / (BINS as f32 / 2.0) - 1.0;
+    Some(if bin == 0 { f32::NEG_INFINITY } else { edge - 4.0 * f32::EPSILON })
+}
+
 /// Returns the part of the range of scores that a score lies in; never falls as the score rises.
-fn bin_of(score: f32) -> usize {
+pub(super) fn bin_of(score: f32) -> usize {
     // Few scores lie outside of -1..1, and those share the first and the last part.
     ((score + 1.0) * (BINS as f32 / 2.0)).clamp(0.0, (BINS - 1) as f32) as usize
+}
+
+/// Sorts by the upper 32 bits; equal ones stay in their order. `swapped` is memory.
+fn sort_by_high_half(keys: &mut Vec<u64>, swapped: &mut Vec<u64>) {
+    let all_high = || keys.iter().map(|key| (key >> 32) as u32);
+    let (least, most) = (all_high().min().unwrap_or(0), all_high().max().unwrap_or(0));
+    let n_bits = u32::BITS - (most - least).leading_zeros();
+    swapped.clear();
+    swapped.resize(keys.len(), 0);
+    for shift in (0..n_bits).step_by(DIGIT_BITS as usize) {
+        let digit = |key: u64| (((key >> 32) as u32 - least) >> shift) as usize & ((1 << DIGIT_BITS) - 1);
+        let mut places = [0usize; 1 << DIGIT_BITS];
+        keys.iter().for_each(|key| places[digit(*key)] += 1);
+        let mut n_before = 0;
+        for place in &mut places {
+            n_before += std::mem::replace(place, n_before);
+        }
+        for key in &*keys {
+            let place = &mut places[digit(*key)];
+            swapped[*place] = *key;
+            *place += 1;
+        }
+        std::mem::swap(keys, swapped);
+    }
 }
 
 /// Returns a number that rises with a score.
 fn rising(score: f32) -> u32 {
     let bits = score.to_bits();
     if bits >> 31 == 0 { bits | 1 << 31 } else { !bits }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::Random;
+
+    /// Oracle: the standard library's stable sort.
+    #[test]
+    fn keys_are_sorted_by_score_and_place() {
+        let mut random = Random(31);
+        let mut swapped = Vec::new();
+        for n in [0, 1, 2, 3000] {
+            for n_bits in [0, 1, 11, 12, 23, 32] {
+                let mut key = |place: u64| {
+                    let high = if n_bits == 0 { 7 } else { random.next() >> (64 - n_bits) };
+                    high << 32 | place
+                };
+                let mut keys: Vec<u64> = (0..n).map(&mut key).collect();
+                let mut expected = keys.clone();
+                expected.sort();
+                sort_by_high_half(&mut keys, &mut swapped);
+                assert_eq!(keys, expected, "{n} {n_bits}");
+            }
+        }
+    }
+
+    /// Oracle: the order that the standard library gives floats.
+    #[test]
+    fn keys_and_parts_rise_with_scores() {
+        let mut scores = vec![-1e30, -3.0, -1.0, -0.5, -1e-20, 0.0, 1e-20, 0.25, 0.9995, 1.0, 2.0, 1e30];
+        let mut random = Random(32);
+        scores.extend((0..3000).map(|_| random.signed()));
+        scores.sort_by(f32::total_cmp);
+        for pair in scores.windows(2) {
+            assert!(rising(pair[0]) < rising(pair[1]) || pair[0] == pair[1]);
+            assert!(bin_of(pair[0]) <= bin_of(pair[1]) && bin_of(pair[1]) < BINS);
+        }
+    }
 }

@@ -32,6 +32,9 @@ pub trait Kernels: Copy {
     /// each byte column the 16 values of the group in the low and in the high half, twice over.
     /// There are at most 64 columns, so that no sum exceeds 16 bits.
     fn block_sums(self, columns: &[Column], low: &[Column], high: &[Column]) -> [u16; BLOCK];
+
+    /// Returns a bit for each of a block's sums, from the lowest bit up: whether it is at least `least`.
+    fn at_least(self, sums: &[u16; BLOCK], least: u16) -> u32;
 }
 
 /// Plain code, for any processor.
@@ -53,6 +56,12 @@ impl Kernels for Portable {
             }
         }
         sums
+    }
+
+    #[inline(always)]
+    fn at_least(self, sums: &[u16; BLOCK], least: u16) -> u32 {
+        let bits = sums.iter().zip(0..).map(|(sum, at)| u32::from(*sum >= least) << at);
+        bits.fold(0, |mask, bit| mask | bit)
     }
 }
 
@@ -202,6 +211,23 @@ impl Work for BlockSums<'_> {
     }
 }
 
+/// Compares a block's sums, see [`Kernels::at_least`].
+pub struct AtLeast<'a> {
+    /// Sums.
+    pub sums: &'a [u16; BLOCK],
+    /// What they are compared with.
+    pub least: u16,
+}
+
+impl Work for AtLeast<'_> {
+    type Output = u32;
+
+    #[inline(always)]
+    fn run<K: Kernels>(self, kernels: K) -> u32 {
+        kernels.at_least(self.sums, self.least)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -271,6 +297,26 @@ mod tests {
                 for level in Level::available() {
                     let found = level.dispatch(BlockSums { columns, low, high });
                     assert_eq!(found.map(u64::from).to_vec(), expected, "{} {n_columns}", level.name());
+                }
+            }
+        }
+    }
+
+    /// Oracle: one comparison for each, at both ends of 16 bits and around the sign.
+    #[test]
+    fn sums_are_compared_at_every_level() {
+        let mut random = Random(13);
+        let ends = [0, 1, 0x7fff, 0x8000, 0x8001, u16::MAX];
+        for _ in 0..200 {
+            let mut sums = [0; BLOCK];
+            sums.iter_mut().for_each(|sum| *sum = random.next() as u16);
+            sums[7..13].copy_from_slice(&ends);
+            for least in ends.into_iter().chain([sums[3], sums[31], random.next() as u16]) {
+                for level in Level::available() {
+                    let mask = level.dispatch(AtLeast { sums: &sums, least });
+                    for (at, sum) in sums.iter().enumerate() {
+                        assert_eq!(mask >> at & 1 == 1, *sum >= least, "{} {sum} {least}", level.name());
+                    }
                 }
             }
         }
