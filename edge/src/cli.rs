@@ -6,6 +6,7 @@ mod fetch;
 mod output;
 
 use std::net::SocketAddr;
+use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -47,6 +48,8 @@ enum Command {
 
 #[derive(Debug, Subcommand)]
 enum BenchCommand {
+    /// Times questions to what is on board, without text model and HTTP.
+    Query(bench::BenchQueryArgs),
     /// The longest time a query waits while fetches replace the generation.
     Pause(PauseArgs),
     /// How a service stands more queries than it can answer.
@@ -96,6 +99,13 @@ struct CacheArgs {
     /// Folder of what is on board [default: $XDG_CACHE_HOME/slag, else ~/.cache/slag].
     #[arg(long, value_name = "DIR")]
     cache: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+struct ThreadArgs {
+    /// Threads that questions are worked on with [default: as many as there are cores].
+    #[arg(long, value_name = "N")]
+    threads: Option<NonZeroUsize>,
 }
 
 #[derive(Debug, Args)]
@@ -183,6 +193,8 @@ struct ServeArgs {
     #[command(flatten)]
     following: FollowArgs,
     #[command(flatten)]
+    threads: ThreadArgs,
+    #[command(flatten)]
     cache: CacheArgs,
     #[command(flatten)]
     models: ModelArgs,
@@ -222,6 +234,8 @@ struct QueryArgs {
     /// Use palette rows alone, even where exact embeddings are on board: faster.
     #[arg(long)]
     rows_only: bool,
+    #[command(flatten)]
+    threads: ThreadArgs,
     #[command(flatten)]
     cache: CacheArgs,
     #[command(flatten)]
@@ -362,6 +376,7 @@ mod tests {
         assert_eq!((query.bounds, query.rows_only), (Some(bounds), true));
         assert_eq!(query.negatives, Negatives::Phrases(vec!["wall".into(), "floor".into()]));
         assert!(parse("slag-edge status --json --cache d").is_ok());
+        assert!(parse("slag-edge bench query --cache d --limits 10,20 --runs 3 --threads 1").is_ok());
     }
 
     #[test]
@@ -385,6 +400,8 @@ mod tests {
             "slag-edge fetch --profile tiny",
             "slag-edge serve --listen nowhere",
             "slag-edge status --quiet --verbose",
+            "slag-edge serve --threads 0",
+            "slag-edge bench query --runs 0",
         ] {
             assert_eq!(parse(line).expect_err(line).exit_code(), Exit::Usage as i32, "{line}");
         }

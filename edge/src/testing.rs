@@ -1,5 +1,7 @@
 //! Small real shards and caches for the tests of this crate, and a text encoder that is all axes.
 
+pub mod coded;
+
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};

@@ -1,37 +1,15 @@
 //! Measurements as commands: each returns a report that names the machine.
 
+mod dump;
 pub mod load;
+mod machine;
 pub mod pause;
+pub mod query;
 mod scene;
 
 use serde::Serialize;
 
-/// Where figures were measured.
-#[derive(Clone, Debug, Serialize)]
-pub struct Machine {
-    /// Processor, as the system names it.
-    pub cpu: String,
-    /// Threads that may run at a time.
-    pub n_threads: usize,
-    /// Operating system and architecture.
-    pub platform: String,
-    /// Version of this program.
-    pub version: &'static str,
-}
-
-impl Machine {
-    /// Looks at the machine this runs on.
-    pub fn here() -> Self {
-        let info = fs_err::read_to_string("/proc/cpuinfo").unwrap_or_default();
-        let name = info.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
-        Self {
-            cpu: name.map_or_else(|| "unknown".into(), |(_, name)| name.to_owned()),
-            n_threads: std::thread::available_parallelism().map_or(1, usize::from),
-            platform: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
-            version: env!("CARGO_PKG_VERSION"),
-        }
-    }
-}
+pub use machine::Machine;
 
 /// Times of many requests, in buckets 2% wide, so that a long run takes no more memory than a short one.
 #[derive(Clone, Debug)]

@@ -17,7 +17,7 @@ use tokio::net::TcpListener;
 
 use super::fetch::follow_in_background;
 use super::output::{Failure, print_json, print_pairs, print_reply, print_status, write_json};
-use super::{CacheArgs, ModelArgs, QueryArgs, ServeArgs, StatusArgs};
+use super::{CacheArgs, ModelArgs, QueryArgs, ServeArgs, StatusArgs, ThreadArgs};
 
 /// Async threads: they only pass requests on.
 const ASYNC_THREADS: usize = 2;
@@ -30,6 +30,15 @@ impl CacheArgs {
         let dir = self.cache.or_else(default_cache_dir);
         let advice = || Failure::Usage(anyhow!("neither XDG_CACHE_HOME nor HOME is set; give --cache DIR"));
         Ok(EdgeCache::open(dir.ok_or_else(advice)?))
+    }
+}
+
+impl ThreadArgs {
+    /// Bounds the threads that questions are worked on with; once in a process.
+    pub fn apply(&self) -> Result<(), Failure> {
+        let Some(n) = self.threads else { return Ok(()) };
+        let built = rayon::ThreadPoolBuilder::new().num_threads(n.get()).build_global();
+        built.map_err(|e| Failure::Failed("threads", e.into()))
     }
 }
 
@@ -50,7 +59,8 @@ fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
     Ok(Engine::new(cache, text))
 }
 
-fn store_failure(error: StoreError) -> Failure {
+/// Tells apart that nothing is on board yet.
+pub fn store_failure(error: StoreError) -> Failure {
     let kind = if matches!(error, StoreError::Empty { .. }) { "no-scene" } else { "store" };
     Failure::Failed(kind, error.into())
 }
@@ -70,6 +80,7 @@ pub fn query(args: QueryArgs) -> Result<(), Failure> {
         exact: !args.rows_only,
     };
     request.check().map_err(|e| Failure::Usage(e.into()))?;
+    args.threads.apply()?;
     let engine = engine(args.cache.open()?, &args.models)?;
     engine.reload().map_err(store_failure)?;
     let reply = engine.answer(&request)?;
@@ -100,6 +111,7 @@ struct OnBoard<'a> {
 }
 
 pub fn serve(mut args: ServeArgs) -> Result<(), Failure> {
+    args.threads.apply()?;
     let cache = std::mem::replace(&mut args.cache, CacheArgs { cache: None }).open()?;
     let engine = engine(cache.clone(), &args.models)?;
     match engine.reload() {

@@ -10,7 +10,7 @@ const BLOCK: usize = 512;
 /// Returns a finite f16 as f32, exactly, in operations that every vector unit has: the bits are moved
 /// into place, and the exponents' biases differ by 127 - 15 = 112. (Conversion instructions would have
 /// to be called through a runtime check, every few components.)
-fn widen(value: f16) -> f32 {
+pub(super) fn widen(value: f16) -> f32 {
     const BIAS: f32 = f32::from_bits((127 + 112) << 23);
     let bits = u32::from(value.to_bits());
     f32::from_bits((bits & 0x8000) << 16 | (bits & 0x7fff) << 13) * BIAS

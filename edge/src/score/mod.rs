@@ -2,25 +2,39 @@
 //!
 //! A row's radius `r` bounds `||E_k - P[row]||` over its members, so a score of a member is within
 //! `r * steepness` of the row's, where the steepness is 1 for a plain cosine and `max_j ||q - n_j||` with
-//! negatives. Where a shard carries exact embeddings (and they are asked for), rows that stay at or above
-//! the threshold by more than that are in as a whole, rows below it by more are out, and only members of
-//! the rows between are scored one by one. Where it does not, a row is in when its own score reaches the
-//! threshold, and the answer carries the bound.
+//! negatives; what rounding adds is in [`project`]. Where a shard knows more of a Gaussian than its row, a
+//! residual code or the exact embedding (and that is asked for), rows that stay at or above the threshold
+//! by more than that are in as a whole, rows below it by more are out, and only members of the rows
+//! between are scored one by one. Where it does not, a row is in when its own score reaches the threshold,
+//! and the answer carries the bound.
+//!
+//! Scores of rows and codes are sums of integers, scaled once: the same bits on every processor.
 
+mod collect;
+mod columns;
 mod dot;
+mod project;
 mod question;
 mod region;
+mod rows;
 mod select;
+mod simd;
 
-use std::ops::Range;
+use std::sync::{Arc, PoisonError};
 
 use rayon::prelude::*;
 use slag_common::shard::ShardView;
 
+use collect::{Cell, Gather, ShardGather};
+use rows::Scored;
+
+pub use columns::Columns;
 pub use dot::{dot, rounding_bound};
 pub use question::{Question, RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
 pub use region::{Ball, Region};
+pub use rows::Scratch;
 pub use select::Hit;
+pub use simd::Level;
 
 /// Positions beyond this many world units are no scene (a hundred times the earth's diameter) and
 /// would overflow what is computed from them.
@@ -77,7 +91,8 @@ pub enum ScoreError {
 pub enum Precision {
     /// Palette rows alone: fastest, every score within the bound stated.
     Rows,
-    /// Rows, and exact embeddings for what rows cannot decide, of shards that carry them.
+    /// Rows, and for what they cannot decide the residual codes or exact embeddings of shards that carry
+    /// them.
     #[default]
     Exact,
 }
@@ -106,8 +121,35 @@ pub struct Matches {
     pub n_rows_undecided: u64,
     /// Gaussians that were scored by themselves.
     pub n_rescored: u64,
+    /// Blocks of residual codes that were read.
+    pub n_blocks_read: u64,
     /// Shards none of whose rows can reach the threshold.
     pub n_shards_below: usize,
+}
+
+impl Matches {
+    /// Empties the list; its memory stays.
+    pub fn clear(&mut self) {
+        let mut runs = std::mem::take(&mut self.runs);
+        runs.clear();
+        *self = Self { runs, ..Self::default() };
+    }
+}
+
+/// What finding an answer took, beyond the rows.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Effort {
+    /// Gaussians that were scored by themselves.
+    pub n_rescored: u64,
+    /// Blocks of residual codes that were read.
+    pub n_blocks_read: u64,
+}
+
+impl std::ops::AddAssign for Effort {
+    fn add_assign(&mut self, other: Self) {
+        self.n_rescored += other.n_rescored;
+        self.n_blocks_read += other.n_blocks_read;
+    }
 }
 
 /// One question's row scores over some shards; gives several kinds of answers without scoring twice.
@@ -116,8 +158,12 @@ pub struct Search<'a> {
     question: &'a Question,
     region: Region,
     precision: Precision,
-    /// Per shard, the score of each row; `None` where the shard lies outside the region.
-    row_scores: Vec<Option<Vec<f32>>>,
+    scored: Arc<Scored>,
+    /// Which of the vectors scored are the question's own and its negatives.
+    places: Vec<usize>,
+    /// Which of the questions scored it is.
+    asked: usize,
+    steepness: f32,
 }
 
 impl<'a> Search<'a> {
@@ -131,10 +177,25 @@ impl<'a> Search<'a> {
         region: Region,
         precision: Precision,
     ) -> Result<Self, ScoreError> {
+        Self::reusing(&mut Scratch::default(), shards, question, region, precision)
+    }
+
+    /// As [`Search::new`], in the memory of an earlier search that is over (else in new memory).
+    ///
+    /// # Errors
+    /// [`ScoreError`].
+    pub fn reusing(
+        scratch: &mut Scratch,
+        shards: &'a [ShardView<'a>],
+        question: &'a Question,
+        region: Region,
+        precision: Precision,
+    ) -> Result<Self, ScoreError> {
         check(shards, question)?;
-        let scored = score_rows(shards, std::slice::from_ref(question), region);
-        let row_scores = scored.into_iter().map(|of_shard| of_shard?.pop()).collect();
-        Ok(Self { shards, question, region, precision, row_scores })
+        let places = scratch.take().score(shards, std::slice::from_ref(question), region, precision);
+        let places = places.into_iter().next().unwrap_or_default();
+        let (scored, steepness) = (scratch.share(), question.steepness());
+        Ok(Self { shards, question, region, precision, scored, places, asked: 0, steepness })
     }
 
     /// Scores the rows for several questions in one pass; returns a search for each, in their order.
@@ -150,97 +211,47 @@ impl<'a> Search<'a> {
         precision: Precision,
     ) -> Result<Vec<Self>, ScoreError> {
         questions.iter().try_for_each(|question| check(shards, question))?;
-        let mut searches: Vec<Self> = questions
-            .iter()
-            .map(|question| Self { shards, question, region, precision, row_scores: Vec::new() })
-            .collect();
-        for of_shard in score_rows(shards, questions, region) {
-            let mut of_questions = of_shard.into_iter().flatten();
-            searches.iter_mut().for_each(|search| search.row_scores.push(of_questions.next()));
-        }
-        Ok(searches)
+        let mut scratch = Scratch::default();
+        let places = scratch.take().score(shards, questions, region, precision);
+        let searches = questions.iter().zip(places).enumerate().map(|(asked, (question, places))| {
+            let (scored, steepness) = (scratch.share(), question.steepness());
+            Self { shards, question, region, precision, scored, places, asked, steepness }
+        });
+        Ok(searches.collect())
     }
 
     /// Returns the Gaussians whose score reaches a threshold, as far as the shards' data tell.
     pub fn matching(&self, threshold: f32) -> Matches {
-        self.collect(threshold, false)
+        let mut matches = Matches::default();
+        self.matching_into(threshold, &mut matches);
+        matches
     }
 
-    /// Gathers what reaches a threshold over all shards. `each`: members of shards with exact embeddings
-    /// get scores of their own even where their row alone decides.
-    fn collect(&self, threshold: f32, each: bool) -> Matches {
-        let shards = (0..self.shards.len()).into_par_iter();
-        let per_shard: Vec<Matches> = shards.map(|shard| self.collect_in(shard, threshold, each)).collect();
-        let mut all = Matches::default();
-        for mut found in per_shard {
-            all.runs.append(&mut found.runs);
+    /// As [`Search::matching`], into a list that is cleared before.
+    pub fn matching_into(&self, threshold: f32, all: &mut Matches) {
+        let mut gather = self.take_gather();
+        self.collect(&mut gather, threshold, false);
+        all.clear();
+        all.runs.reserve(gather.shards.iter().map(|of_shard| of_shard.found.runs.len()).sum());
+        for ShardGather { found, .. } in &gather.shards {
+            all.runs.extend_from_slice(&found.runs);
             all.n_gaussians += found.n_gaussians;
             all.n_rows_undecided += found.n_rows_undecided;
             all.n_rescored += found.n_rescored;
+            all.n_blocks_read += found.n_blocks_read;
             all.n_shards_below += found.n_shards_below;
         }
-        all
+        self.put_back(gather);
     }
 
-    fn collect_in(&self, shard_at: usize, threshold: f32, each: bool) -> Matches {
-        let mut found = Matches::default();
-        let Some(scores) = &self.row_scores[shard_at] else { return found };
-        let shard = &self.shards[shard_at];
-        let exact = shard.exact.filter(|_| self.precision == Precision::Exact);
-        let (filter, slack) = (self.filter(shard), self.slack(shard));
-        let mut reachable = false;
-        for (row, score) in scores.iter().copied().enumerate() {
-            let slack = slack(row);
-            if score + slack < threshold {
-                continue;
-            }
-            reachable = true;
-            let is_undecided = score - slack < threshold;
-            for inside in runs_inside(shard, filter, shard.members(row)) {
-                let run = |range: Range<usize>, score: f32| {
-                    let (start, end) = (range.start as u32, range.end as u32);
-                    Run { shard: shard_at as u32, start, end, score }
-                };
-                match exact {
-                    Some(exact) if is_undecided || each => {
-                        found.n_rescored += inside.len() as u64;
-                        let scored = inside.map(|at| (at, self.exact_score(exact.embeddings, at)));
-                        let reaching = scored.filter(|(_, score)| *score >= threshold);
-                        let before = found.runs.len();
-                        found.runs.extend(reaching.map(|(at, score)| run(at..at + 1, score)));
-                        found.n_gaussians += (found.runs.len() - before) as u64;
-                    }
-                    _ => {
-                        found.n_gaussians += inside.len() as u64;
-                        found.runs.push(run(inside, score));
-                    }
-                }
-            }
-            found.n_rows_undecided += u64::from(exact.is_some() && is_undecided);
-        }
-        found.n_shards_below = usize::from(!reachable);
-        found
+    /// Returns the memory that answers are gathered in; new memory where another search of the batch has it.
+    /// (A lock held over parallel work would block the thread that the other search is given to.)
+    fn take_gather(&self) -> Gather {
+        std::mem::take(&mut *self.scored.gather.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// Returns by how much a member's score may differ from its row's, by row; 0 where the row's counts
-    /// for all its members.
-    fn slack<'b>(&self, shard: &'b ShardView<'_>) -> impl Fn(usize) -> f32 + use<'b> {
-        let (steepness, rounding) = (self.question.steepness(), self.question.rounding_bound());
-        let is_exact = shard.exact.is_some() && self.precision == Precision::Exact;
-        // Both the row's score and the member's own are rounded.
-        let slack = move |row: usize| steepness * (shard.radii[row] + F16_ROUNDING) + 2.0 * rounding;
-        move |row| if is_exact { slack(row) } else { 0.0 }
-    }
-
-    fn exact_score(&self, embeddings: &[half::f16], index: usize) -> f32 {
-        let dim = self.question.vector.len();
-        let embedding = &embeddings[index * dim..][..dim];
-        combine(self.question.vectors().map(|vector| dot(embedding, vector)))
-    }
-
-    /// Returns the region where the shard sticks out of it.
-    fn filter(&self, shard: &ShardView<'_>) -> Option<Region> {
-        (!self.region.covers(&shard.position_box())).then_some(self.region)
+    fn put_back(&self, gather: Gather) {
+        *self.scored.gather.lock().unwrap_or_else(PoisonError::into_inner) = gather;
     }
 
     /// Returns all shards, which runs and hits refer to by place.
@@ -250,18 +261,17 @@ impl<'a> Search<'a> {
 
     /// Returns the shards that were searched (the others lie outside the region).
     pub fn searched(&self) -> impl Iterator<Item = &'a ShardView<'a>> {
-        self.shards
-            .iter()
-            .zip(&self.row_scores)
-            .filter(|(_, scores)| scores.is_some())
-            .map(|(shard, _)| shard)
+        let searched = self.shards.iter().zip(&self.scored.shards).filter(|(_, scores)| scores.is_searched);
+        searched.map(|(shard, _)| shard)
     }
 
-    /// Returns the bound on the error of scores: for every Gaussian searched, its row's score is off by at
-    /// most this.
+    /// Returns the bound on the error of scores: none given here, of a row or a Gaussian, is off from
+    /// that of any embedding it stands for by more.
     pub fn score_error_bound(&self) -> f32 {
-        let largest = self.searched().flat_map(|shard| shard.radii).fold(0.0, |a: f32, b| a.max(*b));
-        self.question.steepness() * largest + self.question.rounding_bound()
+        let cells = (0..self.shards.len()).into_par_iter().filter_map(|at| self.cell(at));
+        let of_cell =
+            |cell: Cell<'_>| (0..cell.rows.len()).map(|row| cell.score_error(row)).fold(0.0, f32::max);
+        cells.map(of_cell).reduce(|| 0.0, f32::max)
     }
 
     /// Whether membership is exact: exact embeddings were asked for and every shard searched carries them.
@@ -287,67 +297,7 @@ fn check(shards: &[ShardView<'_>], question: &Question) -> Result<(), ScoreError
     Ok(())
 }
 
-/// Returns the score made of the product with the question's vector and, after it, those with negatives;
-/// never -0, which would sort after 0 though it is equal.
-fn combine(mut products: impl Iterator<Item = f32>) -> f32 {
-    let own = products.next().unwrap_or(0.0);
-    products.reduce(f32::max).map_or(own, |worst| own - worst) + 0.0
-}
-
-/// Returns, per shard that reaches into the region, the scores `[questions][rows]`.
-fn score_rows(
-    shards: &[ShardView<'_>],
-    questions: &[Question],
-    region: Region,
-) -> Vec<Option<Vec<Vec<f32>>>> {
-    let mut vectors: Vec<&[f32]> = Vec::new();
-    let mut place = |vector| {
-        vectors.iter().position(|known| *known == vector).unwrap_or_else(|| {
-            vectors.push(vector);
-            vectors.len() - 1
-        })
-    };
-    let places: Vec<Vec<usize>> =
-        questions.iter().map(|question| question.vectors().map(&mut place).collect()).collect();
-    let score_shard = |shard: &ShardView<'_>| {
-        let n_rows = shard.header.n_rows as usize;
-        let mut scores: Vec<Vec<f32>> = questions.iter().map(|_| Vec::with_capacity(n_rows)).collect();
-        let mut products = vec![0.0; vectors.len()];
-        let mut row = vec![0.0; shard.header.dim as usize];
-        for at in 0..n_rows {
-            shard.decode_row(at, &mut row);
-            products.iter_mut().zip(&vectors).for_each(|(product, vector)| {
-                *product = row.iter().zip(*vector).map(|(a, b)| a * f64::from(*b)).sum::<f64>() as f32
-            });
-            for (scores, places) in scores.iter_mut().zip(&places) {
-                scores.push(combine(places.iter().map(|place| products[*place])));
-            }
-        }
-        scores
-    };
-    let in_region = |shard: &ShardView<'_>| region.touches(&shard.position_box()).then(|| score_shard(shard));
-    shards.par_iter().map(in_region).collect()
-}
-
-/// Returns the parts of a range of Gaussians that lie inside the filter.
-fn runs_inside(
-    shard: &ShardView<'_>,
-    filter: Option<Region>,
-    members: Range<usize>,
-) -> impl Iterator<Item = Range<usize>> {
-    let mut at = members.start;
-    std::iter::from_fn(move || {
-        let Some(region) = filter else {
-            let rest = at..members.end;
-            at = members.end;
-            return (!rest.is_empty()).then_some(rest);
-        };
-        let inside = |index: &usize| region.contains(shard.position_in_world(*index));
-        let start = (at..members.end).find(inside)?;
-        at = (start..members.end).find(|index| !inside(index)).unwrap_or(members.end);
-        Some(start..at)
-    })
-}
-
+#[cfg(test)]
+mod coded_tests;
 #[cfg(test)]
 mod tests;

@@ -1,11 +1,10 @@
 //! The best-scoring Gaussians, without scoring them all.
 
-use std::cmp::Ordering;
-
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::{Run, Search, runs_inside};
+use super::collect::{Cell, Gather, runs_inside};
+use super::{Effort, Run, Search};
 
 /// One Gaussian and its score.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -14,74 +13,263 @@ pub struct Hit {
     pub shard: u32,
     /// Index in the shard.
     pub index: u32,
-    /// Exact where the shard carries exact embeddings and they were asked for, else that of its row.
+    /// Its own where the shard knows more of it than its row and that was asked for, else that of its row.
     pub score: f32,
+}
+
+/// Into how many parts the range of scores is cut to find a rank in it.
+pub(super) const BINS: usize = 4096;
+/// Bits that keys are sorted by at a time: counts of their values stay in the first-level cache.
+const DIGIT_BITS: u32 = 11;
+
+/// Memory for ranking.
+#[derive(Default)]
+pub(super) struct Order {
+    parts: Vec<Part>,
+    runs: Vec<Run>,
+    keys: Vec<u64>,
+    swapped: Vec<u64>,
+    tied: Vec<(f64, Hit)>,
+}
+
+/// What one thread counts.
+#[derive(Default)]
+struct Part {
+    bins: Vec<u64>,
+    in_bin: Vec<(f32, u64)>,
 }
 
 impl Search<'_> {
     /// Returns the `limit` best Gaussians that reach a threshold, best first: by score, then by distance
     /// from `near`, then by cell and index. The selection is exact with respect to the scores returned.
     pub fn best(&self, limit: usize, threshold: f32, near: Option<DVec3>) -> Vec<Hit> {
+        let mut hits = Vec::new();
+        self.best_into(limit, threshold, near, &mut hits);
+        hits
+    }
+
+    /// As [`Search::best`], into a list that is cleared before. Returns what it took.
+    pub fn best_into(
+        &self,
+        limit: usize,
+        threshold: f32,
+        near: Option<DVec3>,
+        hits: &mut Vec<Hit>,
+    ) -> Effort {
+        hits.clear();
         if limit == 0 {
-            return Vec::new();
+            return Effort::default();
         }
-        let cut = self.score_surely_reached(limit, threshold);
-        let mut runs = self.collect(cut, true).runs;
-        runs.par_sort_unstable_by(|a, b| b.score.total_cmp(&a.score).then(self.by_name(a.shard, a.start, b)));
-        let mut best = Vec::new();
-        for ties in runs.chunk_by(|a, b| a.score == b.score) {
-            let first = best.len();
-            let hits = ties.iter().flat_map(|run| {
-                (run.start..run.end).map(|index| Hit { shard: run.shard, index, score: run.score })
-            });
-            match near {
-                // Ties are in the order of their names already.
-                None => best.extend(hits.take(limit - first)),
-                Some(near) => {
-                    let mut tied: Vec<(f64, Hit)> =
-                        hits.map(|hit| (self.distance(near, &hit), hit)).collect();
-                    // Stable: those as near stay in the order of their names.
-                    tied.sort_by(|a, b| a.0.total_cmp(&b.0));
-                    best.extend(tied.into_iter().map(|(_, hit)| hit).take(limit - first));
-                }
+        let mut gather = self.take_gather();
+        let mut effort = Effort::default();
+        let has_detail = (0..self.shards.len()).any(|at| self.cell(at).is_some_and(|cell| cell.has_detail()));
+        let cut = if has_detail {
+            // Half as many again by their rows' scores: the worst of these members by their own scores are
+            // not among the best.
+            let enough = limit.saturating_add(limit / 2).saturating_add(1);
+            let floor = self.row_score_at(&mut gather.order, enough, f32::NEG_INFINITY);
+            self.count(&mut gather, threshold, floor.unwrap_or(f32::NEG_INFINITY));
+            effort += gather.effort();
+            score_reached(&gather, limit).map(|score| score.max(threshold))
+        } else {
+            self.row_score_at(&mut gather.order, limit, threshold)
+        };
+        self.collect(&mut gather, cut.unwrap_or(threshold), true);
+        effort += gather.effort();
+        self.rank(&mut gather, limit, near, hits);
+        self.put_back(gather);
+        effort
+    }
+
+    /// Returns the least of the scores of the rows whose members, with those of better rows, are `limit`
+    /// or more; none if there are fewer with a row that reaches the threshold.
+    fn row_score_at(&self, order: &mut Order, limit: usize, threshold: f32) -> Option<f32> {
+        let cells: Vec<Option<Cell<'_>>> = (0..self.shards.len()).map(|at| self.cell(at)).collect();
+        let scores = |at: usize| {
+            let rows = cells[at].as_ref().map_or(&[][..], |cell| cell.rows);
+            rows.iter().copied().zip(0..).filter(move |(score, _)| *score >= threshold)
+        };
+        let count = |at: usize, row: usize| {
+            let shard = &self.shards[at];
+            let members = shard.row_starts[row] as usize..shard.row_starts[row + 1] as usize;
+            match cells[at].as_ref().and_then(|cell| cell.filter) {
+                None => members.len() as u64,
+                filter => runs_inside(shard, filter, members).map(|inside| inside.len() as u64).sum(),
             }
-            if best.len() == limit {
+        };
+        order.score_at(limit, self.shards.len(), scores, count)
+    }
+
+    /// Sorts what was gathered.
+    fn rank(&self, gather: &mut Gather, limit: usize, near: Option<DVec3>, hits: &mut Vec<Hit>) {
+        let Gather { shards, order: Order { runs, keys, swapped, tied, .. } } = gather;
+        let mut by_cell: Vec<usize> = (0..self.shards.len()).collect();
+        by_cell.sort_by_key(|at| self.shards[*at].header.cell_id);
+        runs.clear();
+        by_cell.iter().for_each(|at| runs.extend_from_slice(&shards[*at].found.runs));
+        keys.clear();
+        // Places, in the order of cells and indices, decide between equal scores.
+        keys.extend(runs.iter().zip(0u64..).map(|(run, place)| u64::from(!rising(run.score)) << 32 | place));
+        sort_by_high_half(keys, swapped);
+        hits.reserve(limit.min(runs.iter().map(|run| (run.end - run.start) as usize).sum()));
+        for ties in keys.chunk_by(|a, b| a >> 32 == b >> 32) {
+            let first = hits.len();
+            for key in ties {
+                let Run { shard, start, end, score } = runs[*key as u32 as usize];
+                // All of them where their distance decides.
+                let room = if near.is_some() { usize::MAX } else { limit - hits.len() };
+                let end = end.min(start.saturating_add(u32::try_from(room).unwrap_or(u32::MAX)));
+                hits.extend((start..end).map(|index| Hit { shard, index, score }));
+            }
+            if let Some(near) = near {
+                tied.clear();
+                tied.extend(hits.drain(first..).map(|hit| (self.distance(near, &hit), hit)));
+                // Stable: those as near stay in the order of their names.
+                tied.sort_by(|a, b| a.0.total_cmp(&b.0));
+                hits.extend(tied.iter().map(|(_, hit)| *hit).take(limit - first));
+            }
+            if hits.len() == limit {
                 break;
             }
         }
-        best
     }
 
     fn distance(&self, from: DVec3, hit: &Hit) -> f64 {
         from.distance(self.shards[hit.shard as usize].position_in_world(hit.index as usize))
     }
+}
 
-    fn by_name(&self, shard: u32, start: u32, other: &Run) -> Ordering {
-        let cell = |shard: u32| self.shards[shard as usize].header.cell_id;
-        (cell(shard), start).cmp(&(cell(other.shard), other.start))
+impl Order {
+    /// Returns the score of the Gaussian at a rank, counted from 1 at the best; none if there are fewer.
+    ///
+    /// `scores`: scores at each of `n_places` and what `count` tells by how many Gaussians have them. Counts by
+    /// parts of the range of scores find the part in question, and only that is sorted.
+    fn score_at<I: Iterator<Item = (f32, usize)>>(
+        &mut self,
+        rank: usize,
+        n_places: usize,
+        scores: impl Fn(usize) -> I + Sync,
+        count: impl Fn(usize, usize) -> u64 + Sync,
+    ) -> Option<f32> {
+        let n_parts = rayon::current_num_threads().min(n_places).max(1);
+        self.parts.resize_with(n_parts, Part::default);
+        let places = |part: usize| n_places * part / n_parts..n_places * (part + 1) / n_parts;
+        self.parts.par_iter_mut().enumerate().for_each(|(part, Part { bins, .. })| {
+            bins.clear();
+            bins.resize(BINS, 0);
+            for place in places(part) {
+                scores(place).for_each(|(score, at)| bins[bin_of(score)] += count(place, at));
+            }
+        });
+        let mut n_better = 0;
+        let bin = (0..BINS).rev().find(|bin| {
+            let n: u64 = self.parts.iter().map(|part| part.bins[*bin]).sum();
+            let is_here = n_better + n >= rank as u64;
+            n_better += if is_here { 0 } else { n };
+            is_here
+        })?;
+        self.parts.par_iter_mut().enumerate().for_each(|(part, Part { in_bin, .. })| {
+            in_bin.clear();
+            for place in places(part) {
+                let of_bin = scores(place).filter(|(score, _)| bin_of(*score) == bin);
+                in_bin.extend(of_bin.map(|(score, at)| (score, count(place, at))));
+            }
+        });
+        let (first, others) = self.parts.split_first_mut()?;
+        others.iter().for_each(|part| first.in_bin.extend_from_slice(&part.in_bin));
+        first.in_bin.sort_unstable_by(|a, b| b.0.total_cmp(&a.0));
+        let reached = first.in_bin.iter().find(|(_, count)| {
+            n_better += count;
+            n_better >= rank as u64
+        });
+        reached.map(|(score, _)| *score)
+    }
+}
+
+/// Returns a score that so many of the Gaussians counted reach; none if there are fewer.
+fn score_reached(gather: &Gather, limit: usize) -> Option<f32> {
+    let bins: Vec<&[u32]> = gather.shards.iter().map(|of_shard| &of_shard.bins[..]).collect();
+    let mut n = 0;
+    let bin = (0..BINS).rev().find(|bin| {
+        n += bins.iter().filter_map(|bins| bins.get(*bin)).map(|n| u64::from(*n)).sum::<u64>();
+        n >= limit as u64
+    })?;
+    // The first part has all that is lower. Else a little below its edge: parts are found with rounding.
+    let edge = bin as f32 / (BINS as f32 / 2.0) - 1.0;
+    Some(if bin == 0 { f32::NEG_INFINITY } else { edge - 4.0 * f32::EPSILON })
+}
+
+/// Returns the part of the range of scores that a score lies in; never falls as the score rises.
+pub(super) fn bin_of(score: f32) -> usize {
+    // Few scores lie outside of -1..1, and those share the first and the last part.
+    ((score + 1.0) * (BINS as f32 / 2.0)).clamp(0.0, (BINS - 1) as f32) as usize
+}
+
+/// Sorts by the upper 32 bits; equal ones stay in their order. `swapped` is memory.
+fn sort_by_high_half(keys: &mut Vec<u64>, swapped: &mut Vec<u64>) {
+    let all_high = || keys.iter().map(|key| (key >> 32) as u32);
+    let (least, most) = (all_high().min().unwrap_or(0), all_high().max().unwrap_or(0));
+    let n_bits = u32::BITS - (most - least).leading_zeros();
+    swapped.clear();
+    swapped.resize(keys.len(), 0);
+    for shift in (0..n_bits).step_by(DIGIT_BITS as usize) {
+        let digit = |key: u64| (((key >> 32) as u32 - least) >> shift) as usize & ((1 << DIGIT_BITS) - 1);
+        let mut places = [0usize; 1 << DIGIT_BITS];
+        keys.iter().for_each(|key| places[digit(*key)] += 1);
+        let mut n_before = 0;
+        for place in &mut places {
+            n_before += std::mem::replace(place, n_before);
+        }
+        for key in &*keys {
+            let place = &mut places[digit(*key)];
+            swapped[*place] = *key;
+            *place += 1;
+        }
+        std::mem::swap(keys, swapped);
+    }
+}
+
+/// Returns a number that rises with a score.
+fn rising(score: f32) -> u32 {
+    let bits = score.to_bits();
+    if bits >> 31 == 0 { bits | 1 << 31 } else { !bits }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::Random;
+
+    /// Oracle: the standard library's stable sort.
+    #[test]
+    fn keys_are_sorted_by_score_and_place() {
+        let mut random = Random(31);
+        let mut swapped = Vec::new();
+        for n in [0, 1, 2, 3000] {
+            for n_bits in [0, 1, 11, 12, 23, 32] {
+                let mut key = |place: u64| {
+                    let high = if n_bits == 0 { 7 } else { random.next() >> (64 - n_bits) };
+                    high << 32 | place
+                };
+                let mut keys: Vec<u64> = (0..n).map(&mut key).collect();
+                let mut expected = keys.clone();
+                expected.sort();
+                sort_by_high_half(&mut keys, &mut swapped);
+                assert_eq!(keys, expected, "{n} {n_bits}");
+            }
+        }
     }
 
-    /// Returns a score, at least the threshold, that `limit` Gaussians surely reach; the threshold where
-    /// there are no more that surely reach it.
-    fn score_surely_reached(&self, limit: usize, threshold: f32) -> f32 {
-        let per_shard = (0..self.shards.len()).into_par_iter().map(|at| {
-            let (shard, Some(scores)) = (&self.shards[at], &self.row_scores[at]) else { return Vec::new() };
-            let (filter, slack) = (self.filter(shard), self.slack(shard));
-            let lower = scores.iter().enumerate().map(|(row, score)| (score - slack(row), row));
-            lower
-                .filter(|(lower, _)| *lower >= threshold)
-                .map(|(lower, row)| {
-                    (lower, runs_inside(shard, filter, shard.members(row)).map(|r| r.len()).sum())
-                })
-                .collect::<Vec<(f32, usize)>>()
-        });
-        let mut rows: Vec<(f32, usize)> = per_shard.flatten_iter().collect();
-        rows.par_sort_unstable_by(|a, b| b.0.total_cmp(&a.0));
-        let mut n = 0;
-        let reached = rows.into_iter().find(|(_, n_members)| {
-            n += n_members;
-            n >= limit
-        });
-        reached.map_or(threshold, |(lower, _)| lower)
+    /// Oracle: the order that the standard library gives floats.
+    #[test]
+    fn keys_and_parts_rise_with_scores() {
+        let mut scores = vec![-1e30, -3.0, -1.0, -0.5, -1e-20, 0.0, 1e-20, 0.25, 0.9995, 1.0, 2.0, 1e30];
+        let mut random = Random(32);
+        scores.extend((0..3000).map(|_| random.signed()));
+        scores.sort_by(f32::total_cmp);
+        for pair in scores.windows(2) {
+            assert!(rising(pair[0]) < rising(pair[1]) || pair[0] == pair[1]);
+            assert!(bin_of(pair[0]) <= bin_of(pair[1]) && bin_of(pair[1]) < BINS);
+        }
     }
 }

@@ -1,0 +1,245 @@
+//! Shards with bases and residual codes.
+
+use slag_common::container::AlignedBytes;
+use slag_common::shard::{MAX_GROUPS, ShardLayout};
+
+use super::tests::{random_question, score_in_f64, views};
+use super::*;
+use crate::testing::coded::CodedShard;
+use crate::testing::{BuiltShard, Random};
+use glam::DVec3;
+use half::f16;
+
+/// Dimension, components, whether there is a basis, groups.
+const SHAPES: [(usize, usize, bool, usize); 9] = [
+    (1, 1, false, 0),
+    (37, 37, false, 0),
+    (64, 64, false, 32),
+    (40, 7, true, 0),
+    (40, 7, true, 2),
+    (33, 33, true, 14),
+    (512, 96, true, 32),
+    (130, 130, true, MAX_GROUPS),
+    (515, 3, true, 2),
+];
+
+fn shards(
+    random: &mut Random,
+    (dim, n_components, has_basis, n_groups): (usize, usize, bool, usize),
+) -> Vec<BuiltShard> {
+    // Rows that end in blocks, at their ends, and fill several.
+    let lens = [&[1, 31, 32, 33, 70, 64, 5][..], &[1], &[3; 40]];
+    let mut build = |(at, lens): (usize, &[usize])| {
+        let cell_id = 9 - at as u32;
+        let origin = DVec3::new(12.0 * at as f64, 0.0, 0.0);
+        CodedShard { cell_id, dim, n_components, has_basis, n_groups, row_lens: lens.to_vec(), origin }
+            .build(random)
+    };
+    lens.into_iter().enumerate().map(&mut build).collect()
+}
+
+/// The score of a Gaussian as the format and the module define it, from the rounded parts, one by one.
+fn defined_score(search: &Search<'_>, shard_at: usize, index: usize) -> f32 {
+    let shard = &search.shards[shard_at];
+    let (row, scores) = (shard.row_of(index), &search.scored.shards[shard_at]);
+    let product = |place: &usize| {
+        let own = scores.rows[*place][row];
+        let Some(residuals) = shard.residuals.filter(|_| search.precision == Precision::Exact) else {
+            return own;
+        };
+        let (tables, scale) = (&scores.projections[*place].tables, residuals.row_scales[row]);
+        let value = |group: usize| {
+            let half = if group % 2 == 0 { &tables.low } else { &tables.high };
+            u32::from(half[group / 2][residuals.code(index, group)])
+        };
+        let sum: u32 = (0..shard.header.n_groups as usize).map(value).sum();
+        (own + scale * tables.offset) + scale * tables.step * sum as f32
+    };
+    let products: Vec<f32> = search.places.iter().map(product).collect();
+    let worst = products[1..].iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    if products.len() > 1 { products[0] - worst } else { products[0] }
+}
+
+/// Oracle: float64 decoding, and the embeddings that the shards were made from.
+#[test]
+fn scores_are_within_the_stated_error() {
+    let mut random = Random(21);
+    let mut largest_share = 0.0f64;
+    for shape in SHAPES {
+        let built = shards(&mut random, shape);
+        let views = views(&built);
+        for n_negatives in [0, 3] {
+            let question = random_question(&mut random, shape.0, n_negatives);
+            for precision in [Precision::Exact, Precision::Rows] {
+                let search = Search::new(&views, &question, Region::default(), precision).expect("valid");
+                for (at, (shard, built)) in views.iter().zip(&built).enumerate() {
+                    let cell = search.cell(at).expect("searched");
+                    for (index, embedding) in built.embeddings.iter().enumerate() {
+                        let row = shard.row_of(index);
+                        let found = f64::from(defined_score(&search, at, index));
+                        let mut decoded = vec![0.0; shape.0];
+                        match precision {
+                            Precision::Exact => shard.decode(index, &mut decoded),
+                            Precision::Rows => shard.decode_row(row, &mut decoded),
+                        }
+                        let rounding = (found - score_in_f64(&question, decoded.iter().copied())).abs();
+                        let truth = score_in_f64(&question, embedding.iter().map(|e| f64::from(*e)));
+                        let bound = cell.score_error(row);
+                        let of_rounding = match (&shard.residuals, precision) {
+                            (Some(_), Precision::Rows) => cell.row_error(row),
+                            _ => bound - search.steepness * shard.radii[row],
+                        };
+                        let share = rounding / f64::from(of_rounding);
+                        assert!(
+                            (found - truth).abs() <= f64::from(bound),
+                            "{shape:?} {found} {truth} {bound}"
+                        );
+                        assert!(share <= 1.0, "{shape:?} {precision:?} {rounding} {of_rounding}");
+                        largest_share = largest_share.max(share);
+                        let (lower, upper) = cell.bounds(row);
+                        let (lower, upper) = (f64::from(lower), f64::from(upper));
+                        assert!(lower <= found && found <= upper, "{shape:?} {lower} {found} {upper}");
+                    }
+                }
+            }
+        }
+    }
+    println!("largest rounding: {largest_share:.2} of its bound");
+    assert!(largest_share > 0.05, "the bound says nothing: {largest_share}");
+}
+
+/// Oracle: every Gaussian's score as defined, compared and sorted.
+#[test]
+fn answers_are_those_of_brute_force() {
+    let mut random = Random(22);
+    let (mut n_scanned, mut n_all) = (0, 0);
+    for shape in SHAPES {
+        let built = shards(&mut random, shape);
+        let views = views(&built);
+        let mut scratch = Scratch::default();
+        for (n_negatives, precision, is_near) in [
+            (0, Precision::Exact, false),
+            (0, Precision::Rows, false),
+            (2, Precision::Exact, false),
+            (0, Precision::Exact, true),
+            (2, Precision::Rows, true),
+        ] {
+            let question = random_question(&mut random, shape.0, n_negatives);
+            let ball = Ball { centre_in_world: DVec3::new(11.0, 5.0, 5.0), radius: 6.0 };
+            let region = Region { ball: is_near.then_some(ball), bounds: None };
+            let search = Search::reusing(&mut scratch, &views, &question, region, precision).expect("valid");
+            let mut all: Vec<Hit> = Vec::new();
+            for (at, view) in views.iter().enumerate().filter(|(at, _)| search.cell(*at).is_some()) {
+                let inside = |index: &usize| region.contains(view.position_in_world(*index));
+                let hit = |index: usize| {
+                    let score = defined_score(&search, at, index);
+                    Hit { shard: at as u32, index: index as u32, score }
+                };
+                all.extend((0..view.n_with_evidence()).filter(inside).map(hit));
+            }
+            let mut scores: Vec<f32> = all.iter().map(|hit| hit.score).collect();
+            scores.sort_by(f32::total_cmp);
+            let thresholds =
+                [0.0, 0.3, 0.6, 0.9, 0.99].map(|p| scores[(p * (scores.len() - 1) as f64) as usize]);
+            for threshold in thresholds.into_iter().chain([-9.0, 9.0]) {
+                let matches = search.matching(threshold);
+                let members = |run: &Run| {
+                    let Run { shard, start, end, score } = *run;
+                    (start..end).map(move |index| (Hit { shard, index, score }, end - start == 1))
+                };
+                let found: Vec<(Hit, bool)> = matches.runs.iter().flat_map(members).collect();
+                let expected: Vec<&Hit> = all.iter().filter(|hit| hit.score >= threshold).collect();
+                assert_eq!(found.len(), expected.len(), "{shape:?} {precision:?} {threshold}");
+                for ((found, _), expected) in found.iter().zip(&expected) {
+                    assert_eq!((found.shard, found.index), (expected.shard, expected.index));
+                    // Of a row that is in as a whole, its own score is given.
+                    let row = views[found.shard as usize].row_of(found.index as usize);
+                    let cell = search.cell(found.shard as usize).expect("searched");
+                    assert!(found.score == expected.score || found.score == cell.rows[row]);
+                }
+                let mut columns = Columns::default();
+                columns.set_runs(&views, &matches.runs);
+                assert_eq!(columns.index, found.iter().map(|(hit, _)| hit.index).collect::<Vec<_>>());
+                n_scanned += matches.n_rescored;
+                n_all += all.len() as u64;
+                let mut ranked: Vec<Hit> = expected.into_iter().copied().collect();
+                let cell = |hit: &Hit| views[hit.shard as usize].header.cell_id;
+                ranked.sort_by(|a, b| {
+                    b.score.total_cmp(&a.score).then((cell(a), a.index).cmp(&(cell(b), b.index)))
+                });
+                for limit in [1, 7, 100, 180, usize::MAX] {
+                    let best = search.best(limit, threshold, None);
+                    assert_eq!(best, ranked[..limit.min(ranked.len())], "{shape:?} {precision:?} {limit}");
+                    columns.set_hits(&views, &best);
+                    assert_eq!(columns.len(), best.len());
+                    for (at, hit) in best.iter().enumerate() {
+                        let position = views[hit.shard as usize].position_in_world(hit.index as usize);
+                        let given = DVec3::new(columns.x[at], columns.y[at], columns.z[at]);
+                        assert_eq!(
+                            (columns.shard[at], columns.index[at], given),
+                            (hit.shard, hit.index, position)
+                        );
+                        assert_eq!(columns.score[at], hit.score);
+                    }
+                }
+            }
+        }
+    }
+    assert!(n_scanned * 2 < n_all, "the rows served for nothing: {n_scanned} of {n_all}");
+    assert!(n_scanned * 20 > n_all, "hardly any code was read: {n_scanned} of {n_all}");
+}
+
+/// A shard may state anything that the format allows, at its largest.
+#[test]
+fn the_largest_numbers_do_no_harm() {
+    let mut random = Random(23);
+    for (at, shape) in SHAPES.into_iter().enumerate() {
+        let built = shards(&mut random, shape);
+        let view = built[0].view();
+        let mut header = view.header;
+        header.row_step = 64.0;
+        let rows = vec![-128i8; view.rows.len()];
+        let (mean, vectors) = (vec![f16::MAX; shape.0], vec![-128i8; shape.0 * shape.1]);
+        let steps = vec![64.0; shape.1];
+        let basis =
+            view.basis.map(|_| slag_common::shard::Basis { mean: &mean, vectors: &vectors, steps: &steps });
+        let n = view.header.n_rows as usize;
+        let words: Vec<f16> = match view.residuals {
+            Some(residuals) => {
+                (0..residuals.words.len()).map(|i| if i % 3 == 0 { f16::MAX } else { f16::MIN }).collect()
+            }
+            None => Vec::new(),
+        };
+        let (scales, reaches, radii) =
+            (vec![64.0; n], vec![if at % 2 == 0 { 0.0 } else { 64.0 }; n], vec![64.0; n]);
+        let residuals = view.residuals.map(|old| slag_common::shard::Residuals {
+            words: &words,
+            row_scales: &scales,
+            reaches: &reaches,
+            ..old
+        });
+        let mut bytes = Vec::new();
+        let hostile =
+            slag_common::shard::ShardView { header, rows: &rows, basis, residuals, radii: &radii, ..view };
+        hostile.write(&mut bytes).expect("writes to memory");
+        let bytes = AlignedBytes::copy_of(&bytes);
+        let layout = ShardLayout::check(&bytes).expect("allowed");
+        let views = [layout.view(&bytes)];
+        let mut axis = vec![0.0; shape.0];
+        axis[shape.0 - 1] = -1.0;
+        let questions = [
+            Question::new(axis),
+            random_question(&mut random, shape.0, 2),
+            Question::new(vec![1.0 / (shape.0 as f32).sqrt(); shape.0]),
+        ];
+        for question in &questions {
+            let search = Search::new(&views, question, Region::default(), Precision::Exact).expect("valid");
+            assert!(search.score_error_bound().is_finite());
+            for threshold in [f32::NEG_INFINITY, -1.0, 0.0, 1.0, f32::INFINITY] {
+                let matches = search.matching(threshold);
+                assert!(matches.runs.iter().all(|run| run.score.is_finite()));
+                assert!(search.best(100, threshold, None).iter().all(|hit| hit.score >= threshold));
+            }
+        }
+    }
+}

@@ -1,0 +1,415 @@
+//! Gathers what reaches a threshold: rows as a whole where their bounds decide, members where not.
+
+use std::ops::Range;
+
+use half::f16;
+use rayon::prelude::*;
+use slag_common::shard::{BLOCK, Residuals, ShardView};
+
+use super::project::Projection;
+use super::rows::{ShardScores, combine};
+use super::select::{BINS, bin_of};
+use super::simd::{AtLeast, BlockSums, Level};
+use super::{Effort, F16_ROUNDING, Matches, Precision, Region, Run, Search, dot};
+
+/// Runs on their way to an answer, and what finding them takes; kept from one answer to the next.
+#[derive(Default)]
+pub(super) struct Gather {
+    /// By place in the slice of shards.
+    pub shards: Vec<ShardGather>,
+    /// For [`Search::best`].
+    pub order: super::select::Order,
+}
+
+impl Gather {
+    /// Returns what the gathering took.
+    pub fn effort(&self) -> Effort {
+        let mut effort = Effort::default();
+        for ShardGather { found, .. } in &self.shards {
+            effort += Effort { n_rescored: found.n_rescored, n_blocks_read: found.n_blocks_read };
+        }
+        effort
+    }
+}
+
+/// What one shard contributes.
+#[derive(Default)]
+pub(super) struct ShardGather {
+    pub found: Matches,
+    /// Sums of codes of one block, by vector of the question.
+    sums: Vec<[u16; BLOCK]>,
+    /// The block that these are of.
+    block: Option<usize>,
+    /// Whether matches are only to be counted.
+    is_counting: bool,
+    /// How many have a score in each part of the range of scores; empty where there is none.
+    pub bins: Vec<u32>,
+}
+
+/// What members are scored by, beyond their row.
+#[derive(Clone, Copy)]
+enum Detail<'a> {
+    Nothing,
+    Residuals(Residuals<'a>),
+    Embeddings(&'a [f16]),
+}
+
+/// One question's view of a shard.
+pub(super) struct Cell<'a> {
+    at: u32,
+    shard: &'a ShardView<'a>,
+    search: &'a Search<'a>,
+    scores: &'a ShardScores,
+    /// The question's score of each row.
+    pub rows: &'a [f32],
+    detail: Detail<'a>,
+    /// The region, where the shard sticks out of it.
+    pub filter: Option<Region>,
+    level: Level,
+    /// How much a score moves at most with a residual of length 1, in components.
+    component_steepness: f32,
+    /// Rounding in tables for a row scale of 1.
+    table_error: f32,
+    /// Sum over vectors of the largest that tables name, for a row scale of 1.
+    table_reach: f32,
+}
+
+impl<'a> Search<'a> {
+    /// Returns the question's view of a shard that was searched.
+    pub(super) fn cell(&'a self, at: usize) -> Option<Cell<'a>> {
+        let (shard, scores) = (&self.shards[at], &self.scored.shards[at]);
+        if !scores.is_searched {
+            return None;
+        }
+        let rows = match self.places.len() {
+            1 => &scores.rows[self.places[0]],
+            _ => &scores.combined[self.asked],
+        };
+        let detail = match (&shard.exact, &shard.residuals) {
+            _ if self.precision == Precision::Rows => Detail::Nothing,
+            (Some(exact), _) => Detail::Embeddings(exact.embeddings),
+            (None, Some(residuals)) => Detail::Residuals(*residuals),
+            (None, None) => Detail::Nothing,
+        };
+        let filter = (!self.region.covers(&shard.position_box())).then_some(self.region);
+        let mut cell = Cell {
+            at: at as u32,
+            shard,
+            search: self,
+            scores,
+            rows,
+            detail,
+            filter,
+            level: Level::widest(),
+            component_steepness: 0.0,
+            table_error: 0.0,
+            table_reach: 0.0,
+        };
+        if let Some(residuals) = &shard.residuals {
+            cell.measure(residuals);
+        }
+        Some(cell)
+    }
+
+    /// Gathers what reaches a threshold. `each`: members of shards that know more of them than their row get
+    /// scores of their own even where the row alone decides.
+    pub(super) fn collect(&self, gather: &mut Gather, threshold: f32, each: bool) {
+        gather.shards.resize_with(self.shards.len(), ShardGather::default);
+        gather.shards.par_iter_mut().enumerate().for_each(|(at, gather)| {
+            gather.found.clear();
+            gather.is_counting = false;
+            if let Some(cell) = self.cell(at) {
+                cell.collect(gather, threshold, each, f32::NEG_INFINITY);
+            }
+        });
+    }
+
+    /// Counts what reaches a threshold, each by its own score, of rows whose own score reaches `floor`.
+    pub(super) fn count(&self, gather: &mut Gather, threshold: f32, floor: f32) {
+        gather.shards.resize_with(self.shards.len(), ShardGather::default);
+        gather.shards.par_iter_mut().enumerate().for_each(|(at, gather)| {
+            gather.found.clear();
+            gather.is_counting = true;
+            gather.bins.clear();
+            if let Some(cell) = self.cell(at) {
+                cell.collect(gather, threshold, true, floor);
+            }
+        });
+    }
+}
+
+impl Cell<'_> {
+    /// Whether a member's score may differ from its row's.
+    pub fn has_detail(&self) -> bool {
+        !matches!(self.detail, Detail::Nothing)
+    }
+
+    fn projections(&self) -> impl Iterator<Item = &Projection> {
+        self.search.places.iter().map(|place| &self.scores.projections[*place])
+    }
+
+    /// Sets what depends on the question and the residual code alone.
+    fn measure(&mut self, residuals: &Residuals<'_>) {
+        // Components that no group has do not take part.
+        let n_coded = residuals.group_starts.last().map_or(0, |end| *end as usize);
+        let mut projections = self.projections();
+        let own = projections.next().map_or(&[][..], |own| &own.components[..n_coded]);
+        let length = |squares: f64| (squares.sqrt() * (1.0 + f64::from(f32::EPSILON))) as f32;
+        let apart =
+            |other: &Projection| own.iter().zip(&other.components).map(|(a, b)| (a - b).powi(2)).sum();
+        let largest = projections.map(apart).reduce(f64::max);
+        let steepness = length(largest.unwrap_or_else(|| own.iter().map(|v| v * v).sum()));
+        let error = |negative: bool| {
+            let errors = self.projections().enumerate().filter(|(at, _)| (*at > 0) == negative);
+            errors.map(|(_, projection)| projection.tables.error).fold(0.0, f32::max)
+        };
+        let table_error = error(false) + error(true);
+        let reach = |p: &Projection| p.tables.offset.abs() + p.tables.step * f32::from(p.tables.most);
+        let table_reach = self.projections().map(reach).sum();
+        (self.component_steepness, self.table_error, self.table_reach) =
+            (steepness, table_error, table_reach);
+    }
+
+    /// Returns a member's score by one vector for a sum of codes of 0, and what each step of the sum adds.
+    fn line(&self, place: usize, row: usize, residuals: &Residuals<'_>) -> (f32, f32) {
+        let (tables, scale) = (&self.scores.projections[place].tables, residuals.row_scales[row]);
+        (self.scores.rows[place][row] + scale * tables.offset, scale * tables.step)
+    }
+
+    /// Returns by how much members' scores differ at most from their row's through the residual code.
+    fn residual_bound(&self, row: usize, residuals: &Residuals<'_>) -> f32 {
+        let scale = residuals.row_scales[row];
+        let apart = residuals.reaches[row] * self.component_steepness + scale * self.table_error;
+        // Three roundings in each line, and those of the bound itself.
+        apart * (1.0 + 4.0 * f32::EPSILON) + self.rounding(row, residuals)
+    }
+
+    /// Returns a bound on what the rounding in f32 of a member's score comes to.
+    fn rounding(&self, row: usize, residuals: &Residuals<'_>) -> f32 {
+        let of_rows: f32 = self.search.places.iter().map(|place| self.scores.rows[*place][row].abs()).sum();
+        2.0 * f32::EPSILON * (of_rows + residuals.row_scales[row] * self.table_reach)
+    }
+
+    /// Returns two scores that a row's members lie between.
+    pub fn bounds(&self, row: usize) -> (f32, f32) {
+        let score = self.rows[row];
+        match &self.detail {
+            Detail::Nothing => (score, score),
+            Detail::Embeddings(_) => {
+                let slack = self.embedding_bound(row);
+                (score - slack, score + slack)
+            }
+            Detail::Residuals(residuals) => {
+                let apart = self.residual_bound(row, residuals);
+                if let [place] = self.search.places[..] {
+                    let (least, step) = self.line(place, row, residuals);
+                    let most = least + step * f32::from(self.scores.projections[place].tables.most);
+                    return (least.max(score - apart), most.min(score + apart));
+                }
+                let ends = |place: &usize| {
+                    let (least, step) = self.line(*place, row, residuals);
+                    let most = self.scores.projections[*place].tables.most;
+                    (least, least + step * f32::from(most))
+                };
+                let mut all = self.search.places.iter().map(ends);
+                let (mut lower, mut upper) = all.next().unwrap_or_default();
+                if let Some((least, most)) = all.reduce(|a, b| (a.0.max(b.0), a.1.max(b.1))) {
+                    (lower, upper) = (lower - most, upper - least);
+                }
+                (lower.max(score - apart), upper.min(score + apart))
+            }
+        }
+    }
+
+    /// Returns by how much a stored embedding's score may differ from its row's.
+    fn embedding_bound(&self, row: usize) -> f32 {
+        let question = self.search.question;
+        let distance = self.shard.radii[row] + F16_ROUNDING;
+        self.search.steepness * distance + 2.0 * question.rounding_bound() + self.row_error(row)
+    }
+
+    /// Returns a bound on what rounding changes a row's score by.
+    pub fn row_error(&self, row: usize) -> f32 {
+        let error = |projection: &Projection| {
+            // Members are of unit length, so that the row is no longer than 1 and their distance from it.
+            let length = 1.0 + self.shard.radii[row] + projection.mean_length;
+            projection.error_per_length * length + projection.error + f32::EPSILON * (1.0 + length)
+        };
+        let mut errors = self.projections().map(error);
+        errors.next().unwrap_or(0.0) + errors.fold(0.0, f32::max)
+    }
+
+    /// Returns a bound on the error of the row's score, or of its members' own where they are scored by
+    /// a residual code.
+    pub fn score_error(&self, row: usize) -> f32 {
+        let of_rows = self.search.steepness * self.shard.radii[row] + self.row_error(row);
+        match (&self.detail, &self.shard.residuals) {
+            (Detail::Residuals(residuals), _) => {
+                of_rows + residuals.row_scales[row] * self.table_error + self.rounding(row, residuals)
+            }
+            // Radii are measured to what row and code decode to.
+            (_, Some(residuals)) if self.shard.exact.is_none() => {
+                of_rows + residuals.reaches[row] * self.component_steepness
+            }
+            _ => of_rows,
+        }
+    }
+
+    fn collect(&self, gather: &mut ShardGather, threshold: f32, each: bool, floor: f32) {
+        gather.block = None;
+        let mut is_reachable = false;
+        for row in 0..self.rows.len() {
+            if self.rows[row] < floor {
+                continue;
+            }
+            let (lower, upper) = self.bounds(row);
+            if upper < threshold {
+                continue;
+            }
+            is_reachable = true;
+            let is_undecided = lower < threshold;
+            let is_scanned = is_undecided || each;
+            let members = self.shard.row_starts[row] as usize..self.shard.row_starts[row + 1] as usize;
+            for inside in runs_inside(self.shard, self.filter, members) {
+                match self.detail {
+                    Detail::Residuals(residuals) if is_scanned => {
+                        self.scan(gather, &residuals, row, inside, threshold);
+                    }
+                    Detail::Embeddings(embeddings) if is_scanned => {
+                        self.rescore(gather, embeddings, inside, threshold);
+                    }
+                    _ => self.push(gather, inside, self.rows[row]),
+                }
+            }
+            gather.found.n_rows_undecided += u64::from(is_undecided);
+        }
+        gather.found.n_shards_below = usize::from(!is_reachable);
+    }
+
+    fn push(&self, gather: &mut ShardGather, members: Range<usize>, score: f32) {
+        if gather.is_counting {
+            gather.bins.resize(BINS, 0);
+            gather.bins[bin_of(score)] += members.len() as u32;
+            return;
+        }
+        gather.found.n_gaussians += members.len() as u64;
+        let (start, end) = (members.start as u32, members.end as u32);
+        gather.found.runs.push(Run { shard: self.at, start, end, score });
+    }
+
+    fn rescore(&self, gather: &mut ShardGather, embeddings: &[f16], members: Range<usize>, threshold: f32) {
+        gather.found.n_rescored += members.len() as u64;
+        let dim = self.shard.header.dim as usize;
+        for at in members {
+            let embedding = &embeddings[at * dim..][..dim];
+            let mut products = self.search.question.vectors().map(|vector| dot(embedding, vector));
+            let score = combine(products.next().unwrap_or(0.0), products);
+            if score >= threshold {
+                self.push(gather, at..at + 1, score);
+            }
+        }
+    }
+
+    /// Scores members of a row by their codes.
+    fn scan(
+        &self,
+        gather: &mut ShardGather,
+        residuals: &Residuals<'_>,
+        row: usize,
+        members: Range<usize>,
+        threshold: f32,
+    ) {
+        gather.found.n_rescored += members.len() as u64;
+        let places = &self.search.places;
+        let (own, step) = self.line(places[0], row, residuals);
+        let most = self.scores.projections[places[0]].tables.most;
+        // The score grows with the sum, so that sums are compared and only what matches is scored.
+        let least = if places.len() == 1 { least_sum(own, step, most, threshold) } else { Some(0) };
+        let Some(least) = least else { return };
+        for block in members.start / BLOCK..members.end.div_ceil(BLOCK) {
+            if gather.block != Some(block) {
+                self.sum_block(gather, residuals, block);
+            }
+            let first = block * BLOCK;
+            let (start, end) = (members.start.saturating_sub(first), (members.end - first).min(BLOCK));
+            let of_row = (u32::MAX << start) & (u32::MAX >> (BLOCK - end));
+            let mut reaching = of_row & self.level.dispatch(AtLeast { sums: &gather.sums[0], least });
+            while reaching != 0 {
+                let at = reaching.trailing_zeros() as usize;
+                reaching &= reaching - 1;
+                let score = match places.len() {
+                    1 => own + step * f32::from(gather.sums[0][at]) + 0.0,
+                    _ => self.score_of_sums(&gather.sums, at, row, residuals),
+                };
+                if score >= threshold {
+                    self.push(gather, first + at..first + at + 1, score);
+                }
+            }
+        }
+    }
+
+    /// Returns the score of the member of a block, made of one sum for each vector.
+    fn score_of_sums(&self, sums: &[[u16; BLOCK]], at: usize, row: usize, residuals: &Residuals<'_>) -> f32 {
+        let mut products = self.search.places.iter().zip(sums).map(|(place, sums)| {
+            let (least, step) = self.line(*place, row, residuals);
+            least + step * f32::from(sums[at])
+        });
+        combine(products.next().unwrap_or(0.0), products)
+    }
+
+    fn sum_block(&self, gather: &mut ShardGather, residuals: &Residuals<'_>, block: usize) {
+        let n_columns = (residuals.group_starts.len() - 1) / 2;
+        let columns = &residuals.codes.as_chunks::<BLOCK>().0[block * n_columns..][..n_columns];
+        gather.sums.clear();
+        for place in &self.search.places {
+            let tables = &self.scores.projections[*place].tables;
+            let work = BlockSums { columns, low: &tables.low, high: &tables.high };
+            gather.sums.push(self.level.dispatch(work));
+        }
+        gather.block = Some(block);
+        gather.found.n_blocks_read += 1;
+    }
+}
+
+/// Returns the least sum whose score `own + step * sum` reaches a threshold; none up to `most` may.
+fn least_sum(own: f32, step: f32, most: u16, threshold: f32) -> Option<u16> {
+    let reaches = |sum: u16| own + step * f32::from(sum) >= threshold;
+    if !reaches(most) {
+        return None;
+    }
+    // Off by rounding only; a flat line would make it a long way from there.
+    let guess = (((threshold - own) / step).ceil() as u16).min(most);
+    let near = guess.saturating_sub(2)..guess.saturating_add(2).min(most);
+    let (mut low, mut high) = (0, most);
+    if near.start == 0 || !reaches(near.start - 1) {
+        low = near.start;
+    }
+    if reaches(near.end) {
+        high = near.end;
+    }
+    while low < high {
+        let middle = low + (high - low) / 2;
+        if reaches(middle) { high = middle } else { low = middle + 1 }
+    }
+    Some(low)
+}
+
+/// Returns the parts of a range of Gaussians that lie inside the filter.
+pub(super) fn runs_inside(
+    shard: &ShardView<'_>,
+    filter: Option<Region>,
+    members: Range<usize>,
+) -> impl Iterator<Item = Range<usize>> {
+    let mut at = members.start;
+    std::iter::from_fn(move || {
+        let Some(region) = filter else {
+            let rest = at..members.end;
+            at = members.end;
+            return (!rest.is_empty()).then_some(rest);
+        };
+        let inside = |index: &usize| region.contains(shard.position_in_world(*index));
+        let start = (at..members.end).find(inside)?;
+        at = (start..members.end).find(|index| !inside(index)).unwrap_or(members.end);
+        Some(start..at)
+    })
+}

@@ -1,0 +1,248 @@
+//! A question's vector as a cell sees it: rounded to 16 bits, in the cell's basis, and looked up by code.
+//!
+//! With `q^` the vector of the question `q` rounded to 16 bits and `y[c] = basis_steps[c] * basis[c] . q^`,
+//! a row scores `mean . q + row_step * rows[r] . y^`, where `y^` is `y` rounded to 16 bits; without a basis
+//! `y^` is `q^`. Both products are of integers. That is off from `q . P[r]` by at most
+//! `|q - q^| |P[r] - mean| + row_step |y - y^| |rows[r]|` (Cauchy-Schwarz).
+//!
+//! A residual code adds `row_scale * (offset + step * sum over groups of table[g][code])`, where
+//! `offset + step * table` is `words . y` rounded to 8 bits. That is off from the decoded residual's product
+//! by at most `|q - q^| |residual| + row_scale * sum over groups of the largest rounding in each`.
+
+use slag_common::shard::{BLOCK, Residuals, ShardView, WORDS};
+
+use super::dot::widen;
+use super::simd::{Column, Level, MatrixTimesVector, PAD};
+
+/// A larger sum of absolute values, times the 128 of a row's largest component, would not fit 32 bits.
+const MOST_IN_SUM: u64 = (1 << 24) - 1;
+
+/// A vector in steps of 16 bits.
+#[derive(Clone, Debug, Default)]
+pub struct Rounded {
+    /// What a step is worth: a power of two, so that it scales exactly.
+    pub step: f64,
+    /// Steps, padded with zeros to a multiple of [`PAD`].
+    pub steps: Vec<i16>,
+    /// Length of what rounding took away.
+    pub error: f64,
+}
+
+impl Rounded {
+    /// Rounds finite values with the smallest step that keeps every product with 8-bit rows in 32 bits.
+    pub fn set(&mut self, values: &[f64]) {
+        let largest = values.iter().fold(0.0f64, |most, v| most.max(v.abs()));
+        let sum: f64 = values.iter().map(|v| v.abs()).sum();
+        // Rounding adds at most half a step to each.
+        let room = MOST_IN_SUM as f64 - 0.5 * values.len() as f64;
+        let least = (largest / f64::from(i16::MAX)).max(sum / room).max(f64::MIN_POSITIVE);
+        self.step = power_of_two_from(least);
+        let mut squares = 0.0;
+        self.steps.clear();
+        self.steps.extend(values.iter().map(|value| {
+            let steps = nearest(value / self.step);
+            squares += (value - f64::from(steps) * self.step).powi(2);
+            steps as i16
+        }));
+        self.steps.resize(values.len().next_multiple_of(PAD), 0);
+        self.error = squares.sqrt();
+    }
+}
+
+/// A vector of a question, rounded once for all cells.
+#[derive(Clone, Debug, Default)]
+pub struct Vector {
+    /// `[dim]`.
+    pub exact: Vec<f64>,
+    /// The same in 16 bits.
+    pub rounded: Rounded,
+    /// Its length.
+    pub length: f64,
+}
+
+impl Vector {
+    /// Takes over a question's vector.
+    pub fn set(&mut self, values: &[f32]) {
+        self.exact.clear();
+        self.exact.extend(values.iter().map(|v| f64::from(*v)));
+        self.rounded.set(&self.exact);
+        self.length = length(&self.exact);
+    }
+}
+
+/// Values of a residual code's words, in 8 bits.
+#[derive(Clone, Debug, Default)]
+pub struct Tables {
+    /// `[G / 2]`: values of the even groups' words, twice over.
+    pub low: Vec<Column>,
+    /// `[G / 2]`: of the odd groups'.
+    pub high: Vec<Column>,
+    /// What a step is worth.
+    pub step: f32,
+    /// Sum of the groups' smallest values.
+    pub offset: f32,
+    /// Largest sum that codes can name.
+    pub most: u16,
+    /// Sum of the groups' largest roundings.
+    pub error: f32,
+}
+
+/// A vector in a cell's components.
+#[derive(Clone, Debug, Default)]
+pub struct Projection {
+    /// Product with the cell's mean.
+    pub base: f64,
+    /// `[m]`: products with the basis' vectors, or the vector's own components.
+    pub components: Vec<f64>,
+    /// The same in 16 bits.
+    rounded: Rounded,
+    /// Rounding's part in a row's score, for each unit of the row's distance from the mean.
+    pub error_per_length: f32,
+    /// Rounding's part in a row's score beside that.
+    pub error: f32,
+    /// Length of the mean.
+    pub mean_length: f32,
+    /// What residual codes are worth, of a cell that has them.
+    pub tables: Tables,
+}
+
+impl Projection {
+    /// Brings a vector into a cell's components.
+    pub fn set(&mut self, level: Level, shard: &ShardView<'_>, vector: &Vector) {
+        self.components.clear();
+        let m = shard.header.n_components as usize;
+        let step = f64::from(shard.header.row_step);
+        let Some(basis) = &shard.basis else {
+            self.components.extend_from_slice(&vector.exact);
+            self.rounded.clone_from(&vector.rounded);
+            (self.base, self.mean_length) = (0.0, 0.0);
+            (self.error_per_length, self.error) = (up(vector.rounded.error), 0.0);
+            return;
+        };
+        self.components.resize(m, 0.0);
+        let components = &mut self.components;
+        level.dispatch(MatrixTimesVector {
+            rows: basis.vectors,
+            n_components: vector.exact.len(),
+            vector: &vector.rounded.steps,
+            put: |at: usize, dot: i32| {
+                components[at] = f64::from(basis.steps[at]) * (vector.rounded.step * f64::from(dot));
+            },
+        });
+        let mean = || basis.mean.iter().map(|v| f64::from(widen(*v)));
+        self.base = mean().zip(&vector.exact).map(|(a, b)| a * b).sum();
+        self.mean_length = up(mean().map(|v| v * v).sum::<f64>().sqrt());
+        self.rounded.set(&self.components);
+        self.error_per_length = up(vector.rounded.error);
+        self.error = up(self.rounded.error * step * 128.0 * (m as f64).sqrt());
+    }
+
+    /// Scores a cell's rows. `scores`: `[K]`.
+    pub fn score_rows(&self, level: Level, shard: &ShardView<'_>, scores: &mut Vec<f32>) {
+        scores.clear();
+        scores.resize(shard.header.n_rows as usize, 0.0);
+        let step = f64::from(shard.header.row_step) * self.rounded.step;
+        level.dispatch(MatrixTimesVector {
+            rows: shard.rows,
+            n_components: shard.header.n_components as usize,
+            vector: &self.rounded.steps,
+            // Never -0, which would sort after 0 though it is equal.
+            put: |row: usize, dot: i32| scores[row] = (self.base + step * f64::from(dot)) as f32 + 0.0,
+        });
+    }
+
+    /// Makes the tables of a residual code.
+    pub fn set_tables(&mut self, residuals: &Residuals<'_>) {
+        let n_groups = residuals.group_starts.len() - 1;
+        let tables = &mut self.tables;
+        let mut values = [[0.0f64; WORDS]; slag_common::shard::MAX_GROUPS];
+        let values = &mut values[..n_groups];
+        let (mut offset, mut widest) = (0.0, 0.0f64);
+        for (values, starts) in values.iter_mut().zip(residuals.group_starts.windows(2)) {
+            let (start, end) = (starts[0] as usize, starts[1] as usize);
+            let words = residuals.words[WORDS * start..WORDS * end].chunks_exact(end - start);
+            for (value, word) in values.iter_mut().zip(words) {
+                let terms = word.iter().zip(&self.components[start..end]);
+                *value = terms.map(|(w, y)| f64::from(widen(*w)) * y).sum();
+            }
+            let least = values.iter().copied().fold(f64::INFINITY, f64::min);
+            values.iter_mut().for_each(|value| *value -= least);
+            offset += least;
+            widest = values.iter().copied().fold(widest, f64::max);
+        }
+        (tables.step, tables.offset) = ((widest / 255.0) as f32, offset as f32);
+        let step = f64::from(tables.step);
+        (tables.most, tables.error) = (0, 0.0);
+        let mut error = 0.0;
+        tables.low.clear();
+        tables.high.clear();
+        for (group, values) in values.iter().enumerate() {
+            let mut column = [0; BLOCK];
+            let (mut most, mut largest_rounding) = (0, 0.0f64);
+            for (word, value) in values.iter().enumerate() {
+                let steps = if step > 0.0 { nearest(value / step).min(255) } else { 0 };
+                largest_rounding = largest_rounding.max((value - f64::from(steps) * step).abs());
+                column[word] = steps as u8;
+                column[word + WORDS] = column[word];
+                most = most.max(column[word]);
+            }
+            tables.most += u16::from(most);
+            error += largest_rounding;
+            let half = if group.is_multiple_of(2) { &mut tables.low } else { &mut tables.high };
+            half.push(column);
+        }
+        tables.error = up(error + (offset - f64::from(tables.offset)).abs());
+    }
+}
+
+/// Returns the least power of two that is not below a positive number.
+fn power_of_two_from(value: f64) -> f64 {
+    const MANTISSA: u64 = (1 << 52) - 1;
+    f64::from_bits((value.to_bits() + MANTISSA) & !MANTISSA)
+}
+
+/// Rounds to the nearest integer. (Without SSE 4.1 the standard rounding is a call.)
+fn nearest(value: f64) -> i32 {
+    (value + 0.5f64.copysign(value)) as i32
+}
+
+/// Returns the length of a vector.
+pub fn length(vector: &[f64]) -> f64 {
+    vector.iter().map(|v| v * v).sum::<f64>().sqrt()
+}
+
+/// Returns a bound in f32, not below what it was.
+fn up(bound: f64) -> f32 {
+    (bound * (1.0 + f64::from(f32::EPSILON))) as f32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::Random;
+
+    /// Oracle: the definition, in wide integers and float64.
+    #[test]
+    fn rounded_vectors_fit_and_are_as_near_as_stated() {
+        let mut random = Random(13);
+        let mut rounded = Rounded::default();
+        for n in (1..40usize).chain([512, 8191, 8192]) {
+            for (scale, is_flat) in [(1.0, false), (1.0, true), (1e-30, false), (1e6, true), (0.0, false)] {
+                let mut value = |_| if is_flat { scale } else { f64::from(random.signed()) * scale };
+                let values: Vec<f64> = (0..n).map(&mut value).collect();
+                rounded.set(&values);
+                assert_eq!(rounded.steps.len(), n.next_multiple_of(PAD));
+                let sum: i64 = rounded.steps.iter().map(|v| i64::from(*v).abs()).sum();
+                assert!(sum * 128 < 1 << 31, "{n} {scale} {sum}");
+                assert_eq!(rounded.step.to_bits() & ((1 << 52) - 1), 0, "a power of two: {}", rounded.step);
+                let off = values.iter().zip(&rounded.steps).map(|(v, s)| v - f64::from(*s) * rounded.step);
+                let squares: f64 = off.clone().map(|v| v * v).sum();
+                assert!((squares.sqrt() - rounded.error).abs() <= 1e-9 * rounded.error);
+                assert!(off.clone().all(|off| off.abs() <= rounded.step * 0.5));
+                // No step is twice as large as it need be.
+                let largest = rounded.steps.iter().map(|s| s.unsigned_abs()).max();
+                assert!(scale == 0.0 || largest >= Some(1 << 14) || sum * 128 > 1 << 29, "{n} {scale} {sum}");
+            }
+        }
+    }
+}

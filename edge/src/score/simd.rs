@@ -1,0 +1,324 @@
+//! The two integer loops that queries spend their time in, for every instruction set there is.
+//!
+//! All sums are of integers and none can overflow, so that every level gives the same bits.
+
+#[cfg(target_arch = "aarch64")]
+mod neon;
+#[cfg(target_arch = "x86_64")]
+mod x86;
+
+use pulp::NullaryFnOnce;
+#[cfg(target_arch = "aarch64")]
+use pulp::aarch64::Neon;
+#[cfg(target_arch = "x86_64")]
+use pulp::x86::{V3, V4};
+use slag_common::shard::BLOCK;
+
+/// Vectors are padded with zeros to a multiple of this many components: what the widest level multiplies
+/// at once.
+pub const PAD: usize = 32;
+/// Rows that are multiplied together, so that their sums are folded together.
+pub const ROWS: usize = 4;
+
+/// One byte column of a block of Gaussians, or the words of a group for each half of a byte shuffle.
+pub type Column = [u8; BLOCK];
+
+/// What an instruction set does.
+pub trait Kernels: Copy {
+    /// Returns the products of rows with a vector. All have the same length, a multiple of [`PAD`].
+    fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS];
+
+    /// Returns for each Gaussian of a block the sum of the values that its codes name. `low`, `high`: for
+    /// each byte column the 16 values of the group in the low and in the high half, twice over.
+    /// There are at most 64 columns, so that no sum exceeds 16 bits.
+    fn block_sums(self, columns: &[Column], low: &[Column], high: &[Column]) -> [u16; BLOCK];
+
+    /// Returns a bit for each of a block's sums, from the lowest bit up: whether it is at least `least`.
+    fn at_least(self, sums: &[u16; BLOCK], least: u16) -> u32;
+}
+
+/// Plain code, for any processor.
+#[derive(Clone, Copy, Debug)]
+pub struct Portable;
+
+impl Kernels for Portable {
+    #[inline(always)]
+    fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
+        rows.map(|row| dot(row, vector))
+    }
+
+    #[inline(always)]
+    fn block_sums(self, columns: &[Column], low: &[Column], high: &[Column]) -> [u16; BLOCK] {
+        let mut sums = [0; BLOCK];
+        for ((codes, low), high) in columns.iter().zip(low).zip(high) {
+            for (sum, code) in sums.iter_mut().zip(codes) {
+                *sum += u16::from(low[usize::from(code & 15)]) + u16::from(high[usize::from(code >> 4)]);
+            }
+        }
+        sums
+    }
+
+    #[inline(always)]
+    fn at_least(self, sums: &[u16; BLOCK], least: u16) -> u32 {
+        let bits = sums.iter().zip(0..).map(|(sum, at)| u32::from(*sum >= least) << at);
+        bits.fold(0, |mask, bit| mask | bit)
+    }
+}
+
+/// Returns the product of a row and a vector, which may be longer.
+#[inline(always)]
+fn dot(row: &[i8], vector: &[i16]) -> i32 {
+    row.iter().zip(vector).map(|(a, b)| i32::from(*a) * i32::from(*b)).sum()
+}
+
+/// Work that is written once for all instruction sets; its `run` and all that it calls must be
+/// `inline(always)`, or it is compiled for the plain processor.
+pub trait Work {
+    /// What it gives.
+    type Output;
+    /// Does the work.
+    fn run<K: Kernels>(self, kernels: K) -> Self::Output;
+}
+
+/// Work on an instruction set that is known.
+struct On<K, W>(K, W);
+
+impl<K: Kernels, W: Work> NullaryFnOnce for On<K, W> {
+    type Output = W::Output;
+
+    #[inline(always)]
+    fn call(self) -> W::Output {
+        self.1.run(self.0)
+    }
+}
+
+/// An instruction set that this processor has.
+#[derive(Clone, Copy, Debug)]
+pub enum Level {
+    /// Plain code.
+    Portable,
+    /// AVX2.
+    #[cfg(target_arch = "x86_64")]
+    Avx2(V3),
+    /// AVX-512, with bytes and words.
+    #[cfg(target_arch = "x86_64")]
+    Avx512(V4),
+    /// NEON.
+    #[cfg(target_arch = "aarch64")]
+    Neon(Neon),
+}
+
+impl Level {
+    /// Returns those that this processor has, narrowest first.
+    pub fn available() -> Vec<Self> {
+        let mut levels = vec![Self::Portable];
+        #[cfg(target_arch = "x86_64")]
+        {
+            levels.extend(V3::try_new().map(Self::Avx2));
+            levels.extend(V4::try_new().map(Self::Avx512));
+        }
+        #[cfg(target_arch = "aarch64")]
+        levels.extend(Neon::try_new().map(Self::Neon));
+        levels
+    }
+
+    /// Returns the widest that this processor has.
+    pub fn widest() -> Self {
+        Self::available().pop().unwrap_or(Self::Portable)
+    }
+
+    /// Returns the name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Portable => "portable",
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2(_) => "avx2",
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512(_) => "avx512",
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon(_) => "neon",
+        }
+    }
+
+    /// Does work compiled for this instruction set.
+    pub fn dispatch<W: Work>(self, work: W) -> W::Output {
+        match self {
+            Self::Portable => work.run(Portable),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2(simd) => pulp::Simd::vectorize(simd, On(simd, work)),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512(simd) => pulp::Simd::vectorize(simd, On(simd, work)),
+            #[cfg(target_arch = "aarch64")]
+            Self::Neon(simd) => pulp::Simd::vectorize(simd, On(simd, work)),
+        }
+    }
+}
+
+/// Multiplies every row of a matrix with a vector; gives products in the order of the rows.
+pub struct MatrixTimesVector<'a, F> {
+    /// `[n][n_components]`.
+    pub rows: &'a [i8],
+    /// Components of a row.
+    pub n_components: usize,
+    /// The vector, padded with zeros to the next multiple of [`PAD`].
+    pub vector: &'a [i16],
+    /// Called with the place of a row and its product.
+    pub put: F,
+}
+
+impl<F: FnMut(usize, i32)> Work for MatrixTimesVector<'_, F> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<K: Kernels>(self, kernels: K) {
+        let Self { rows, n_components, vector, mut put } = self;
+        let n_rows = rows.len() / n_components;
+        // What a row is read beyond its end is multiplied with the padding's zeros; the last rows cannot be.
+        let n_padded = (rows.len() + n_components).saturating_sub(vector.len()) / n_components;
+        let n_together = n_padded.min(n_rows) / ROWS * ROWS;
+        for at in (0..n_together).step_by(ROWS) {
+            let start = at * n_components;
+            let four = &rows[start..start + (ROWS - 1) * n_components + vector.len()];
+            let (a, b) = (&four[..vector.len()], &four[n_components..][..vector.len()]);
+            let (c, d) = (&four[2 * n_components..][..vector.len()], &four[3 * n_components..]);
+            let dots = kernels.dots([a, b, c, d], vector);
+            for (row, dot) in (at..).zip(dots) {
+                put(row, dot);
+            }
+        }
+        for row in n_together..n_rows {
+            put(row, dot(&rows[row * n_components..][..n_components], vector));
+        }
+    }
+}
+
+/// Sums the values of a block's codes, see [`Kernels::block_sums`].
+pub struct BlockSums<'a> {
+    /// Byte columns of the block.
+    pub columns: &'a [Column],
+    /// Values of the groups in the low halves.
+    pub low: &'a [Column],
+    /// Values of the groups in the high halves.
+    pub high: &'a [Column],
+}
+
+impl Work for BlockSums<'_> {
+    type Output = [u16; BLOCK];
+
+    #[inline(always)]
+    fn run<K: Kernels>(self, kernels: K) -> [u16; BLOCK] {
+        kernels.block_sums(self.columns, self.low, self.high)
+    }
+}
+
+/// Compares a block's sums, see [`Kernels::at_least`].
+pub struct AtLeast<'a> {
+    /// Sums.
+    pub sums: &'a [u16; BLOCK],
+    /// What they are compared with.
+    pub least: u16,
+}
+
+impl Work for AtLeast<'_> {
+    type Output = u32;
+
+    #[inline(always)]
+    fn run<K: Kernels>(self, kernels: K) -> u32 {
+        kernels.at_least(self.sums, self.least)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::Random;
+
+    /// Oracle: plain 64-bit sums. Lengths around every width, values at both ends, and the last rows, which
+    /// cannot be read past their end.
+    #[test]
+    fn products_are_the_sums_at_every_level() {
+        let mut random = Random(11);
+        for n_components in (1..70usize).chain([96, 100, 511, 512, 513, 8192]) {
+            for n_rows in [0, 1, 3, 4, 5, 37] {
+                let is_extreme = n_rows == 5;
+                let rows: Vec<i8> = (0..n_rows * n_components)
+                    .map(|_| if is_extreme { -128 } else { random.next() as i8 })
+                    .collect();
+                // The largest that the sum of absolute values allows, see `rounded`.
+                let most = ((1 << 24) / n_components as i64 - 1).clamp(1, 32767);
+                let mut vector: Vec<i16> = (0..n_components)
+                    .map(|_| if is_extreme { -most } else { random.next() as i64 % (most + 1) } as i16)
+                    .collect();
+                vector.resize(n_components.next_multiple_of(PAD), 0);
+                let exact = |row: &[i8]| -> i64 {
+                    row.iter().zip(&vector).map(|(a, b)| i64::from(*a) * i64::from(*b)).sum()
+                };
+                let expected: Vec<i64> = rows.chunks_exact(n_components).map(exact).collect();
+                for level in Level::available() {
+                    let mut found = Vec::new();
+                    let put = |row: usize, dot: i32| {
+                        assert_eq!(row, found.len());
+                        found.push(i64::from(dot));
+                    };
+                    level.dispatch(MatrixTimesVector { rows: &rows, n_components, vector: &vector, put });
+                    assert_eq!(found, expected, "{} {n_components} {n_rows}", level.name());
+                }
+            }
+        }
+    }
+
+    /// Oracle: each code looked up by itself. Up to 64 columns of 255, the most that 16 bits must hold.
+    #[test]
+    fn sums_of_a_block_are_the_looked_up_values_at_every_level() {
+        let mut random = Random(12);
+        for n_columns in (0..20).chain([63, 64]) {
+            for highest in [1, 255] {
+                let mut bytes = |most: u64| -> Vec<u8> {
+                    let byte = |_| if most == 1 { 255 } else { (random.next() % (most + 1)) as u8 };
+                    (0..n_columns * BLOCK).map(byte).collect()
+                };
+                let columns = bytes(255);
+                let [low, high] = [0; 2].map(|_| {
+                    let words = bytes(highest);
+                    let twice = |words: &[u8]| [&words[..16], &words[..16]].concat();
+                    words.chunks_exact(BLOCK).flat_map(twice).collect::<Vec<u8>>()
+                });
+                let expected: Vec<u64> = (0..BLOCK)
+                    .map(|at| {
+                        let value = |column: usize| {
+                            let code = columns[column * BLOCK + at];
+                            let (l, h) = (usize::from(code % 16), usize::from(code / 16));
+                            u64::from(low[column * BLOCK + l]) + u64::from(high[column * BLOCK + h])
+                        };
+                        (0..n_columns).map(value).sum()
+                    })
+                    .collect();
+                let [columns, low, high] = [&columns, &low, &high].map(|c| c.as_chunks::<BLOCK>().0);
+                for level in Level::available() {
+                    let found = level.dispatch(BlockSums { columns, low, high });
+                    assert_eq!(found.map(u64::from).to_vec(), expected, "{} {n_columns}", level.name());
+                }
+            }
+        }
+    }
+
+    /// Oracle: one comparison for each, at both ends of 16 bits and around the sign.
+    #[test]
+    fn sums_are_compared_at_every_level() {
+        let mut random = Random(13);
+        let ends = [0, 1, 0x7fff, 0x8000, 0x8001, u16::MAX];
+        for _ in 0..200 {
+            let mut sums = [0; BLOCK];
+            sums.iter_mut().for_each(|sum| *sum = random.next() as u16);
+            sums[7..13].copy_from_slice(&ends);
+            for least in ends.into_iter().chain([sums[3], sums[31], random.next() as u16]) {
+                for level in Level::available() {
+                    let mask = level.dispatch(AtLeast { sums: &sums, least });
+                    for (at, sum) in sums.iter().enumerate() {
+                        assert_eq!(mask >> at & 1 == 1, *sum >= least, "{} {sum} {least}", level.name());
+                    }
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,110 @@
+//! Random shards with bases and residual codes, whose radii and reaches are measured in float64.
+
+use glam::DVec3;
+use half::f16;
+use slag_common::container::AlignedBytes;
+use slag_common::shard::{
+    BLOCK, Basis, Positions, Residuals, ScoreErrors, ShardHeader, ShardLayout, ShardView, WORDS, quantise,
+};
+
+use super::{BuiltShard, Random, normalised};
+
+/// What a random shard is to have.
+#[derive(Clone, Debug)]
+pub struct CodedShard {
+    pub cell_id: u32,
+    pub dim: usize,
+    pub n_components: usize,
+    pub has_basis: bool,
+    /// 0: no residual code.
+    pub n_groups: usize,
+    /// Members of each row.
+    pub row_lens: Vec<usize>,
+    pub origin: DVec3,
+}
+
+impl CodedShard {
+    /// Writes the shard and reads it back. Embeddings are what it decodes to, off by a little, of unit length.
+    pub fn build(&self, random: &mut Random) -> BuiltShard {
+        let (dim, m) = (self.dim, self.n_components);
+        let (k, n) = (self.row_lens.len(), self.row_lens.iter().sum::<usize>());
+        let mut row_starts = vec![0u32];
+        self.row_lens.iter().for_each(|len| row_starts.push(row_starts[row_starts.len() - 1] + *len as u32));
+        let mut floats =
+            |n: usize, scale: f32| -> Vec<f32> { (0..n).map(|_| random.signed() * scale).collect() };
+        let (rows, row_step) = quantise(&floats(k * m, 1.5 / (m as f32).sqrt()));
+        let (vectors, basis_step) = quantise(&floats(m * dim, 1.2 / (dim as f32).sqrt()));
+        let steps: Vec<f32> = floats(m, 0.5).iter().map(|v| basis_step * (1.0 + v)).collect();
+        let mean: Vec<f16> = floats(dim, 0.5 / (dim as f32).sqrt()).into_iter().map(f16::from_f32).collect();
+        // The last component is left without a word where there is room.
+        let n_coded = if m > self.n_groups { m - 1 } else { m };
+        let group_starts: Vec<u32> =
+            (0..=self.n_groups).map(|g| (n_coded * g / self.n_groups.max(1)) as u32).collect();
+        let n_words = WORDS * if self.n_groups == 0 { 0 } else { n_coded };
+        let words: Vec<f16> =
+            floats(n_words, 0.5 / (m as f32).sqrt()).into_iter().map(f16::from_f32).collect();
+        let row_scales: Vec<f32> = floats(k, 1.0).into_iter().map(|v| v.abs()).collect();
+        let codes: Vec<u8> =
+            (0..n.div_ceil(BLOCK) * BLOCK * self.n_groups / 2).map(|_| random.next() as u8).collect();
+        let positions: Vec<[u16; 3]> = (0..n).map(|_| [(); 3].map(|()| random.next() as u16)).collect();
+        let step = 10.0 / 65536.0;
+        let header = ShardHeader {
+            cell_id: self.cell_id,
+            n_gaussians: n as u32,
+            n_rows: k as u32,
+            dim: dim as u32,
+            n_components: m as u32,
+            n_groups: self.n_groups as u32,
+            position_bits: [16, 16, 16, 0],
+            row_step,
+            origin_in_world: self.origin.to_array(),
+            position_step: [step; 3],
+            box_min: self.origin.to_array(),
+            box_max: (self.origin + 10.0).to_array(),
+            errors: ScoreErrors::default(),
+            encoder_id: [7; 32],
+        };
+        let (mut radii, mut reaches) = (vec![0.0; k], vec![0.0; k]);
+        let view = |radii, reaches| ShardView {
+            header,
+            positions: Positions::Wide(&positions),
+            row_starts: &row_starts,
+            rows: &rows,
+            radii,
+            basis: self.has_basis.then_some(Basis { mean: &mean, vectors: &vectors, steps: &steps }),
+            residuals: (self.n_groups > 0).then_some(Residuals {
+                group_starts: &group_starts,
+                words: &words,
+                row_scales: &row_scales,
+                reaches,
+                codes: &codes,
+            }),
+            exact: None,
+        };
+        let measured = view(&[], &[]);
+        let mut embeddings = Vec::new();
+        for (row, (radius, reach)) in radii.iter_mut().zip(&mut reaches).enumerate() {
+            for index in measured.members(row) {
+                let mut decoded = vec![0.0; dim];
+                measured.decode(index, &mut decoded);
+                let embedding =
+                    normalised(decoded.iter().map(|v| *v as f32 + random.signed() * 0.02).collect());
+                let squares = embedding.iter().zip(&decoded).map(|(e, d)| (f64::from(*e) - d).powi(2));
+                *radius = f32::max(*radius, squares.sum::<f64>().sqrt() as f32 * (1.0 + f32::EPSILON));
+                embeddings.push(embedding);
+                let Some(residuals) = &measured.residuals else { continue };
+                let words = group_starts.windows(2).enumerate().flat_map(|(group, starts)| {
+                    let (start, len) = (starts[0] as usize, (starts[1] - starts[0]) as usize);
+                    &words[WORDS * start + residuals.code(index, group) * len..][..len]
+                });
+                let length = words.map(|w| w.to_f64().powi(2)).sum::<f64>().sqrt() as f32;
+                *reach = f32::max(*reach, length * row_scales[row] * (1.0 + 2.0 * f32::EPSILON));
+            }
+        }
+        let mut bytes = Vec::new();
+        view(&radii, &reaches).write(&mut bytes).expect("writes to memory");
+        let bytes = AlignedBytes::copy_of(&bytes);
+        let layout = ShardLayout::check(&bytes).expect("a valid shard");
+        BuiltShard { bytes, layout, embeddings }
+    }
+}

@@ -1,0 +1,213 @@
+//! Caches of random rows and codes in the proportions of real ones: sizes and skipping are, contents are not.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use glam::DVec3;
+use half::f16;
+use slag_common::Hash32;
+use slag_common::frames::Aabb;
+use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
+use slag_common::shard::{
+    BLOCK, Basis, Positions, Profile, Residuals, ScoreErrors, ShardHeader, ShardView, WORDS, quantise,
+};
+use slag_edge::store::{Current, CurrentCell, EdgeCache};
+
+/// Gaussians of a cell.
+const CELL: usize = 65_536;
+/// Gaussians of a row, mean.
+const ROW: usize = 50;
+/// Kinds of things in a cell.
+const KINDS: usize = 24;
+
+pub struct SceneSpec {
+    pub n_gaussians: usize,
+    pub dim: usize,
+    pub n_components: usize,
+    pub n_groups: usize,
+    pub is_balanced: bool,
+}
+
+/// SplitMix64 (Steele et al. 2014).
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+
+    fn below(&mut self, n: usize) -> usize {
+        (self.next() % n as u64) as usize
+    }
+
+    /// Of variance 1, about normal.
+    fn normal(&mut self) -> f32 {
+        (0..3).map(|_| (self.next() >> 40) as f32 / (1u64 << 23) as f32 - 1.0).sum()
+    }
+
+    fn normals(&mut self, n: usize, scale: f32) -> Vec<f32> {
+        (0..n).map(|_| self.normal() * scale).collect()
+    }
+}
+
+/// Writes a cache as a fetch leaves it.
+pub fn write_cache(dir: &Path, spec: &SceneSpec) {
+    let cache = EdgeCache::open(dir);
+    for folder in ["shards", "manifests"] {
+        std::fs::create_dir_all(dir.join(folder)).expect("a folder");
+    }
+    let profile = if spec.is_balanced { Profile::Balanced } else { Profile::Compact };
+    let mut cells = Vec::new();
+    for start in (0..spec.n_gaussians).step_by(CELL) {
+        let n = CELL.min(spec.n_gaussians - start);
+        let cell_id = (start / CELL) as u32;
+        let (bytes, bounds, n_rows) = shard(cell_id, n, spec);
+        let hash = Hash32::of(&bytes);
+        let record = ShardRecord {
+            hash,
+            len_bytes: bytes.len() as u64,
+            n_rows,
+            score_error_bound: 0.5,
+            score_errors: ScoreErrors::default(),
+            position_error: 0.01,
+        };
+        std::fs::write(cache.shard_path(hash), bytes).expect("a file");
+        let shards = BTreeMap::from([(profile, record)]);
+        cells.push(CellRecord { cell_id, bounds, n_gaussians: n as u32, shards });
+    }
+    let manifest = Manifest {
+        version: manifest::VERSION,
+        scene: "generated".into(),
+        generation: 1,
+        created_unix_secs: 1_700_000_000,
+        expires_unix_secs: None,
+        next_key: None,
+        metric: true,
+        geo_reference: None,
+        encoder: EncoderRecord {
+            name: "random".into(),
+            id: Hash32([3; 32]),
+            dim: spec.dim as u32,
+            default_threshold: 0.2,
+            calibration: None,
+        },
+        n_gaussians: spec.n_gaussians as u64,
+        n_without_evidence: 0,
+        n_rejected: 0,
+        cells,
+    };
+    let key = manifest::generate_key();
+    let signed = manifest.sign(&key);
+    let current = Current {
+        manifest_hash: Hash32::of(&signed),
+        key: Hash32(key.verifying_key().to_bytes()),
+        profile,
+        centre_in_world: DVec3::ZERO,
+        radius: 1e6,
+        cells: manifest
+            .cells
+            .iter()
+            .map(|cell| {
+                let record = &cell.shards[&profile];
+                CurrentCell { cell_id: cell.cell_id, hash: record.hash, len_bytes: record.len_bytes }
+            })
+            .collect(),
+    };
+    std::fs::write(cache.manifest_path(current.manifest_hash), &signed).expect("a file");
+    std::fs::write(cache.current_path(), serde_json::to_vec(&current).expect("JSON")).expect("a file");
+}
+
+fn shard(cell_id: u32, n: usize, spec: &SceneSpec) -> (Vec<u8>, Aabb, u32) {
+    let mut random = Random(u64::from(cell_id) << 32 | 5);
+    let (dim, m) = (spec.dim, spec.n_components);
+    // One in a hundred was never seen.
+    let n_with_evidence = n - n / 100;
+    let mut row_starts = vec![0u32];
+    let mut at = 0;
+    while at < n_with_evidence {
+        // From 1 to several hundred members: half the rows are short.
+        let len = match random.below(2) {
+            0 => 1 + random.below(ROW),
+            _ => 1 + random.below(3 * ROW),
+        };
+        at = n_with_evidence.min(at + len);
+        row_starts.push(at as u32);
+    }
+    let k = row_starts.len() - 1;
+    // Components fall off as those of a principal component analysis do; rows of a kind are alike.
+    let fall: Vec<f32> = (0..m).map(|c| 1.0 / (1.0 + c as f32 / 6.0)).collect();
+    let squares: f32 = fall.iter().map(|f| f * f).sum();
+    let fall: Vec<f32> = fall.iter().map(|f| f / squares.sqrt()).collect();
+    let kinds = random.normals(KINDS * m, 0.7);
+    let mut rows = Vec::with_capacity(k * m);
+    let mut kind = 0;
+    for row in 0..k {
+        if row % 16 == 0 {
+            kind = random.below(KINDS);
+        }
+        rows.extend((0..m).map(|c| (kinds[kind * m + c] + 0.35 * random.normal()) * fall[c]));
+    }
+    let (rows, row_step) = quantise(&rows);
+    let (vectors, step) = quantise(&random.normals(m * dim, 1.0 / (dim as f32).sqrt()));
+    let steps = vec![step; m];
+    let mean: Vec<f16> =
+        random.normals(dim, 0.6 / (dim as f32).sqrt()).into_iter().map(f16::from_f32).collect();
+    let group_starts: Vec<u32> = (0..=spec.n_groups).map(|g| (m * g / spec.n_groups) as u32).collect();
+    let words = random.normals(WORDS * m, 0.2);
+    let words: Vec<f16> = group_starts
+        .windows(2)
+        .flat_map(|starts| (0..WORDS).flat_map(move |_| starts[0]..starts[1]))
+        .zip(&words)
+        .map(|(c, w)| f16::from_f32(w * fall[c as usize]))
+        .collect();
+    let row_scales: Vec<f32> = (0..k).map(|_| 0.4 + random.below(100) as f32 / 80.0).collect();
+    let reaches: Vec<f32> = row_scales.iter().map(|scale| scale * 0.45).collect();
+    let codes: Vec<u8> = (0..n_with_evidence.div_ceil(BLOCK) * BLOCK * spec.n_groups / 16)
+        .flat_map(|_| random.next().to_le_bytes())
+        .collect();
+    let positions: Vec<u32> = (0..n).map(|_| random.next() as u32).collect();
+    let radii = vec![0.1; k];
+    let (x, y) = (f64::from(cell_id % 16) * 20.0, f64::from(cell_id / 16) * 20.0);
+    let bounds = Aabb { min: DVec3::new(x, y, 0.0), max: DVec3::new(x + 20.48, y + 20.48, 10.24) };
+    let header = ShardHeader {
+        cell_id,
+        n_gaussians: n as u32,
+        n_rows: k as u32,
+        dim: dim as u32,
+        n_components: m as u32,
+        n_groups: if spec.is_balanced { spec.n_groups as u32 } else { 0 },
+        position_bits: [11, 11, 10, 0],
+        row_step,
+        origin_in_world: bounds.min.to_array(),
+        position_step: [0.01; 3],
+        box_min: bounds.min.to_array(),
+        box_max: bounds.max.to_array(),
+        errors: ScoreErrors::default(),
+        encoder_id: [3; 32],
+    };
+    let residuals = Residuals {
+        group_starts: &group_starts,
+        words: &words,
+        row_scales: &row_scales,
+        reaches: &reaches,
+        codes: &codes,
+    };
+    let mut bytes = Vec::new();
+    ShardView {
+        header,
+        positions: Positions::Packed(&positions),
+        row_starts: &row_starts,
+        rows: &rows,
+        radii: &radii,
+        basis: Some(Basis { mean: &mean, vectors: &vectors, steps: &steps }),
+        residuals: spec.is_balanced.then_some(residuals),
+        exact: None,
+    }
+    .write(&mut bytes)
+    .expect("writes to memory");
+    (bytes, bounds, k as u32)
+}
