@@ -85,7 +85,10 @@ async fn every_route_and_parameter_is_described() {
     let help = service.get("/").await.2;
     let help = help.as_str().expect("text");
     assert!(params::NAMES.iter().all(|name| help.contains(&format!("{name}="))), "{help}");
-    assert!(ROUTES.iter().all(|route| help.contains(&format!("GET {route}")) || *route == "/"));
+    assert!(ROUTES.iter().all(|route| {
+        [format!("GET {route}"), format!("POST {route}")].iter().any(|line| help.contains(line))
+            || *route == "/"
+    }));
 }
 
 #[tokio::test]
