@@ -49,7 +49,7 @@ fn defined_score(search: &Search<'_>, shard_at: usize, index: usize) -> f32 {
         };
         let (tables, scale) = (&scores.projections[*place].tables, residuals.row_scales[row]);
         let value = |group: usize| {
-            let half = if group % 2 == 0 { &tables.low } else { &tables.high };
+            let half = if group.is_multiple_of(2) { &tables.low } else { &tables.high };
             u32::from(half[group / 2][residuals.code(index, group)])
         };
         let sum: u32 = (0..shard.header.n_groups as usize).map(value).sum();
@@ -113,10 +113,11 @@ fn scores_are_within_the_stated_error() {
 fn answers_are_those_of_brute_force() {
     let mut random = Random(22);
     let (mut n_scanned, mut n_all) = (0, 0);
+    // Memory of other scenes, precisions and questions must not show.
+    let mut scratch = Scratch::default();
     for shape in SHAPES {
         let built = shards(&mut random, shape);
         let views = views(&built);
-        let mut scratch = Scratch::default();
         for (n_negatives, precision, is_near) in [
             (0, Precision::Exact, false),
             (0, Precision::Rows, false),

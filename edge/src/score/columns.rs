@@ -5,8 +5,8 @@ use slag_common::shard::{Positions, ShardView};
 
 use super::{Hit, Run};
 
-/// Gaussians that one thread fills in at a time.
-const CHUNK: usize = 4096;
+/// Gaussians that one thread fills in at a time; few where tests are to need several.
+const CHUNK: usize = if cfg!(test) { 64 } else { 4096 };
 
 /// Gaussians of an answer, a value of each in every column.
 #[derive(Clone, Debug, Default, PartialEq)]
