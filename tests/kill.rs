@@ -83,7 +83,7 @@ fn killed_fetches_leave_the_old_or_the_new_generation() {
     run(&mut encode_room(&room, &first));
     // The same key and scene, one generation on.
     copy_dir(&first, &second);
-    run(encode_room(&room, &second).args(["--name", "first", "--palette-rows", "48"]));
+    run(encode_room(&room, &second).args(["--name", "first", "--compact-error", "0.4"]));
     let stores =
         [&first, &second].map(|store| Service::start(&mut encoder(&["serve", "--store", text(store)])));
     let fetch = |from: &Service, cache: &Path| {

@@ -11,7 +11,8 @@ use glam::DVec3;
 use half::f16;
 
 /// Dimension, components, whether there is a basis, groups.
-const SHAPES: [(usize, usize, bool, usize); 9] = [
+const SHAPES: [(usize, usize, bool, usize); 10] = [
+    (16, 0, true, 0),
     (1, 1, false, 0),
     (37, 37, false, 0),
     (64, 64, false, 32),

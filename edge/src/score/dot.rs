@@ -1,4 +1,4 @@
-//! The one inner loop: an f16 row times an f32 vector.
+//! The loop over exact embeddings: an f16 vector times an f32 vector.
 
 use half::f16;
 

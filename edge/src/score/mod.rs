@@ -2,7 +2,7 @@
 //!
 //! A row's radius `r` bounds `||E_k - P[row]||` over its members, so a score of a member is within
 //! `r * steepness` of the row's, where the steepness is 1 for a plain cosine and `max_j ||q - n_j||` with
-//! negatives; what rounding adds is in [`project`]. Where a shard knows more of a Gaussian than its row, a
+//! negatives; what rounding adds is in `project.rs`. Where a shard knows more of a Gaussian than its row, a
 //! residual code or the exact embedding (and that is asked for), rows that stay at or above the threshold
 //! by more than that are in as a whole, rows below it by more are out, and only members of the rows
 //! between are scored one by one. Where it does not, a row is in when its own score reaches the threshold,

@@ -140,7 +140,8 @@ impl Projection {
     /// Scores a cell's rows. `scores`: `[K]`.
     pub fn score_rows(&self, level: Level, shard: &ShardView<'_>, scores: &mut Vec<f32>) {
         scores.clear();
-        scores.resize(shard.header.n_rows as usize, 0.0);
+        // Rows of no components are the mean.
+        scores.resize(shard.header.n_rows as usize, self.base as f32 + 0.0);
         let step = f64::from(shard.header.row_step) * self.rounded.step;
         level.dispatch(MatrixTimesVector {
             rows: shard.rows,

@@ -10,7 +10,7 @@ use super::project::{Projection, Vector};
 use super::simd::Level;
 use super::{Precision, Question, Region};
 
-/// Memory of a search, which the next one takes over: then a search allocates nothing but its answers.
+/// Memory of a search, which the next one takes over: then a search allocates little but its answers.
 #[derive(Default)]
 pub struct Scratch {
     /// Shared with the searches that were made with it.

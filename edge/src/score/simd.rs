@@ -172,7 +172,8 @@ impl<F: FnMut(usize, i32)> Work for MatrixTimesVector<'_, F> {
     #[inline(always)]
     fn run<K: Kernels>(self, kernels: K) {
         let Self { rows, n_components, vector, mut put } = self;
-        let n_rows = rows.len() / n_components;
+        // Rows of nothing have no products, and nothing tells how many there are.
+        let Some(n_rows) = rows.len().checked_div(n_components) else { return };
         // What a row is read beyond its end is multiplied with the padding's zeros; the last rows cannot be.
         let n_padded = (rows.len() + n_components).saturating_sub(vector.len()) / n_components;
         let n_together = n_padded.min(n_rows) / ROWS * ROWS;

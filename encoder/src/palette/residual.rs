@@ -11,11 +11,11 @@ use super::cluster::{clusters, nearest, squared_distance};
 use super::matrix::{Rows, eigen_symmetric};
 
 /// Residuals that words are trained on.
-const TRAINING_SAMPLE: usize = 8192;
+const TRAINING_SAMPLE: usize = 6144;
 /// Most components of a group: with more, 16 words say little of each.
 const MAX_GROUP: usize = 8;
-/// Groups are added so many at a time.
-const GROUPS_STEP: usize = 8;
+/// Numbers of groups are multiples of this.
+const GROUPS_STEP: usize = 4;
 
 /// A residual code.
 pub struct ResidualCode {
@@ -59,11 +59,7 @@ pub fn rotation(residuals: Rows<'_>) -> (Vec<f32>, Vec<f64>) {
 /// Puts components into groups so that all together lose least, and returns the components in the order of
 /// their groups (those in none last) and where the groups start.
 pub fn groups(variances: &[f64], n_groups: usize) -> (Vec<usize>, Vec<u32>) {
-    // What four bits leave of d components (rate-distortion of Gaussian ones at equal loss).
-    let loss = |d: usize, log_product: f64| {
-        d as f64 * ((log_product - 8.0 * std::f64::consts::LN_2) / d as f64).exp()
-    };
-    let log = |c: usize| variances[c].max(1e-30).ln();
+    let log = |c: usize| log_variance(variances[c]);
     let mut members: Vec<Vec<usize>> = (0..n_groups).map(|c| vec![c]).collect();
     let mut log_products: Vec<f64> = (0..n_groups).map(log).collect();
     let mut outside = Vec::new();
@@ -161,7 +157,7 @@ fn nearest_word(residual: &[f32], words: &[f32]) -> usize {
 /// Returns the means of k-means, `n_words` at most.
 pub fn trained(points: Rows<'_>, n_words: usize) -> Vec<f32> {
     /// Rounds after those of the clusters: the gain of more is below a hundredth.
-    const ROUNDS: usize = 6;
+    const ROUNDS: usize = 4;
     let mut words = clusters(points, 0.0, n_words).centres;
     for _ in 0..ROUNDS {
         let codes = nearest(points, &words);
@@ -206,8 +202,7 @@ pub fn plan(
         return None;
     }
     let max_groups = max_groups.min(m) / 2 * 2;
-    let mut n_groups = GROUPS_STEP.min(max_groups);
-    loop {
+    let train = |n_groups: usize| {
         let (order, starts) = groups(variances, n_groups);
         let points: Vec<f32> =
             sample.iter().flat_map(|row| order.iter().map(|c| residuals.get(*row)[*c])).collect();
@@ -220,9 +215,39 @@ pub fn plan(
             let inside = squared_distance(inside, &decoded[at * covered..][..covered]);
             f64::from(inside) + outside.iter().map(|v| f64::from(v * v)).sum::<f64>()
         });
-        if error <= target || n_groups == max_groups {
-            return Some((order, code));
-        }
-        n_groups = (n_groups + GROUPS_STEP).min(max_groups);
+        (order, code, error)
+    };
+    // A short code tells how far the residuals are from what the estimate takes them for; the length that is
+    // needed follows from it, and only that one is trained.
+    let few = (2 * GROUPS_STEP).min(max_groups);
+    let (order, code, error) = train(few);
+    if error <= target || few == max_groups {
+        return Some((order, code));
     }
+    let factor = error / estimated_loss(variances, few);
+    let steps = (few..max_groups).step_by(GROUPS_STEP).skip(1);
+    let enough = steps.into_iter().find(|n| factor * estimated_loss(variances, *n) <= target);
+    let (order, code, _) = train(enough.unwrap_or(max_groups));
+    Some((order, code))
+}
+
+/// Returns what a code of so many groups leaves of the residuals, as mean square, if they were Gaussian.
+fn estimated_loss(variances: &[f64], n_groups: usize) -> f64 {
+    let (order, starts) = groups(variances, n_groups);
+    let of_group = |group: &[u32]| {
+        let members = &order[group[0] as usize..group[1] as usize];
+        loss(members.len(), members.iter().map(|c| log_variance(variances[*c])).sum())
+    };
+    let outside = &order[starts[n_groups] as usize..];
+    starts.windows(2).map(of_group).sum::<f64>() + outside.iter().map(|c| variances[*c]).sum::<f64>()
+}
+
+/// What four bits leave of `d` components, given the sum of the logarithms of their variances (rate and
+/// distortion of Gaussian ones at equal loss).
+fn loss(d: usize, log_product: f64) -> f64 {
+    d as f64 * ((log_product - 8.0 * std::f64::consts::LN_2) / d as f64).exp()
+}
+
+fn log_variance(variance: f64) -> f64 {
+    variance.max(1e-30).ln()
 }
