@@ -289,7 +289,7 @@ fn ours(
     for n in &embeddings.cells {
         // Where the Gaussians lie says nothing here: a 20 m cube, in the order given.
         let scene = Gaussians {
-            means_in_world: (0..*n as u64).map(|k| crate::generate::field::place_in_cube(k)).collect(),
+            means_in_world: (0..*n as u64).map(crate::generate::field::place_in_cube).collect(),
             scales: vec![[0.01; 3]; *n],
             rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; *n],
             opacities: vec![1.0; *n],

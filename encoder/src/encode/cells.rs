@@ -83,8 +83,7 @@ impl<'a> CellBuilder<'a> {
         scene: &'a Gaussians,
         split: &'a CellSplit,
         sums_paths: &[PathBuf],
-        models: &ModelDir,
-        bank: TextBank,
+        (models, bank): (&ModelDir, TextBank),
         stopwatch: &'a Stopwatch,
     ) -> Result<Self, EncodeError> {
         let n_gaussians: Vec<usize> = split.cells.iter().map(|cell| cell.gaussians.len()).collect();

@@ -281,7 +281,8 @@ pub fn encode(
             TextBank::directions(models.dim())
         }
     });
-    let builder = CellBuilder::open(settings, &store, &scene, &split, &sums_paths, models, bank, &stopwatch)?;
+    let builder =
+        CellBuilder::open(settings, &store, &scene, &split, &sums_paths, (models, bank), &stopwatch)?;
     let mut summary = EncodeSummary {
         generation: store.next_generation()?,
         n_gaussians: (scene.len() - split.n_rejected) as u64,

@@ -62,7 +62,7 @@ impl TextBank {
 
     /// Returns the number of texts.
     pub fn len(&self) -> usize {
-        if self.dim == 0 { 0 } else { self.vectors.len() / self.dim }
+        self.vectors.len().checked_div(self.dim).unwrap_or(0)
     }
 
     /// Returns whether there is none.

@@ -33,6 +33,11 @@ impl<'a> Rows<'a> {
         self.index.map_or(self.values.len() / self.width, <[u32]>::len)
     }
 
+    /// Returns whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
     /// Returns a row.
     pub fn get(&self, row: usize) -> &'a [f32] {
         let row = self.index.map_or(row, |index| index[row] as usize);

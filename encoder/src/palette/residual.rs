@@ -63,7 +63,7 @@ pub fn groups(variances: &[f64], n_groups: usize) -> (Vec<usize>, Vec<u32>) {
     let mut members: Vec<Vec<usize>> = (0..n_groups).map(|c| vec![c]).collect();
     let mut log_products: Vec<f64> = (0..n_groups).map(log).collect();
     let mut outside = Vec::new();
-    for c in n_groups..variances.len() {
+    for (c, variance) in variances.iter().enumerate().skip(n_groups) {
         let rise = |g: usize| {
             let d = members[g].len();
             loss(d + 1, log_products[g] + log(c)) - loss(d, log_products[g])
@@ -71,7 +71,7 @@ pub fn groups(variances: &[f64], n_groups: usize) -> (Vec<usize>, Vec<u32>) {
         let best = (0..n_groups)
             .filter(|g| members[*g].len() < MAX_GROUP)
             .min_by(|a, b| rise(*a).total_cmp(&rise(*b)));
-        match best.filter(|g| rise(*g) < variances[c]) {
+        match best.filter(|g| rise(*g) < *variance) {
             Some(g) => {
                 log_products[g] += log(c);
                 members[g].push(c);
