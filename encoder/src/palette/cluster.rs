@@ -8,6 +8,8 @@ use super::matrix::{Panels, Rows};
 const SPLIT_ROUNDS: usize = 3;
 /// Rounds of k-means over all rows at the end.
 const REFINE_ROUNDS: usize = 1;
+/// So few clusters are all split: each is far from good enough.
+const FEW_CLUSTERS: usize = 16;
 /// Share of the clusters that are split at a time: the worst, so that the order is almost that of
 /// splitting one by one, and threads have work.
 const SPLIT_SHARE: usize = 8;
@@ -102,7 +104,8 @@ fn split(points: Rows<'_>, max_rms: f32, max_clusters: usize) -> Vec<Cluster> {
             break;
         }
         open.sort_by(|a, b| b.squared_error.total_cmp(&a.squared_error).then(a.members.cmp(&b.members)));
-        let n_split = (open.len() / SPLIT_SHARE).clamp(1, max_clusters - n_clusters);
+        let share = if open.len() < FEW_CLUSTERS { 1 } else { SPLIT_SHARE };
+        let n_split = (open.len() / share).clamp(1, max_clusters - n_clusters);
         let rest = open.split_off(n_split);
         let halves: Vec<Result<[Cluster; 2], Cluster>> =
             open.into_par_iter().map(|cluster| split_in_two(points, cluster)).collect();

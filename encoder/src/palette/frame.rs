@@ -5,7 +5,7 @@ use half::f16;
 
 use slag_models::TextEncoder;
 
-use super::matrix::{Panels, Rows, eigen_symmetric, orthonormalise};
+use super::matrix::{Panels, Rows, dot, eigen_symmetric, orthonormalise};
 use super::splitmix64;
 
 /// Share of the texts' covariance that is replaced by that of texts in all directions alike, so that a
@@ -16,9 +16,9 @@ const COVARIANCE_SAMPLE: usize = 4096;
 /// Most components.
 const MAX_COMPONENTS: usize = 128;
 /// Vectors iterated beside those wanted, and iterations: the last wanted eigenvalue is then off by less
-/// than (ratio of the eigenvalues)^(2 * 6) (Halko, Martinsson and Tropp 2011, 4.5).
+/// than (ratio of the eigenvalues)^(2 * 4) (Halko, Martinsson and Tropp 2011, 4.5).
 const EXTRA_VECTORS: usize = 12;
-const ITERATIONS: usize = 6;
+const ITERATIONS: usize = 4;
 
 /// Most texts of a bank, and fewest that say where queries point.
 const MAX_TEXTS: usize = 2048;
@@ -180,7 +180,7 @@ impl Frame {
             }
             for i in 0..dim {
                 let row = &metric.factor[i * dim..][..=i];
-                forms[c * dim + i] = row.iter().zip(direction).map(|(f, u)| f * u).sum::<f64>() as f32;
+                forms[c * dim + i] = dot(row, &direction[..=i]) as f32;
                 basis[c * dim + i] = solved[i] as f32;
             }
         }
@@ -258,8 +258,7 @@ fn leading_eigenvectors(matrix: &[f32], dim: usize, n: usize) -> (Vec<f64>, Vec<
     let mut small = vec![0.0; n * n];
     for i in 0..n {
         for j in 0..=i {
-            let products = block[i * dim..][..dim].iter().zip(&applied[j * dim..][..dim]);
-            let value: f64 = products.map(|(a, b)| a * b).sum();
+            let value = dot(&block[i * dim..][..dim], &applied[j * dim..][..dim]);
             (small[i * n + j], small[j * n + i]) = (value, value);
         }
     }

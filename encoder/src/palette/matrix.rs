@@ -209,13 +209,13 @@ pub fn eigen_symmetric(mut a: Vec<f64>, n: usize) -> (Vec<f64>, Vec<f64>) {
     for _ in 0..24 {
         let off: f64 =
             (0..n).flat_map(|i| (0..i).map(move |j| (i, j))).map(|(i, j)| a[i * n + j].powi(2)).sum();
-        if off <= 1e-22 * total {
+        if off <= 1e-18 * total {
             break;
         }
         for p in 0..n {
             for q in p + 1..n {
                 let off = a[p * n + q];
-                if off == 0.0 {
+                if off * off <= 1e-20 * total / (n * n) as f64 {
                     continue;
                 }
                 let theta = (a[q * n + q] - a[p * n + p]) / (2.0 * off);
@@ -245,6 +245,16 @@ fn rotate_rows(a: &mut [f64], n: usize, p: usize, q: usize, c: f64, s: f64) {
     }
 }
 
+/// Returns the scalar product, summed in eight fixed lanes.
+pub fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let mut lanes = [0.0; 8];
+    let ((a_blocks, a_rest), (b_blocks, b_rest)) = (a.as_chunks::<8>(), b.as_chunks::<8>());
+    for (x, y) in a_blocks.iter().zip(b_blocks) {
+        (0..8).for_each(|lane| lanes[lane] += x[lane] * y[lane]);
+    }
+    lanes.iter().sum::<f64>() + a_rest.iter().zip(b_rest).map(|(x, y)| x * y).sum::<f64>()
+}
+
 /// Makes rows `[n][width]` orthonormal, in order (modified Gram-Schmidt, twice); rows that depend on those
 /// before become zero.
 pub fn orthonormalise(rows: &mut [f64], width: usize) {
@@ -254,7 +264,7 @@ pub fn orthonormalise(rows: &mut [f64], width: usize) {
         let length_before = row.iter().map(|v| v * v).sum::<f64>().sqrt();
         for _ in 0..2 {
             for other in before.chunks_exact(width) {
-                let product: f64 = row.iter().zip(other).map(|(a, b)| a * b).sum();
+                let product = dot(row, other);
                 row.iter_mut().zip(other).for_each(|(a, b)| *a -= product * b);
             }
         }
