@@ -50,9 +50,9 @@ pub struct PaletteSettings {
 }
 
 impl Default for PaletteSettings {
-    /// On the labelled house, 0.1 keeps the exact field's task accuracy, and 0.03 its ranking (NUMERICS.md).
+    /// On the labelled house, 0.1 keeps the exact field's task accuracy, and 0.02 its ranking (README.md).
     fn default() -> Self {
-        Self { compact_error: 0.1, balanced_error: 0.025, min_gaussians_per_row: 45, max_groups: 32 }
+        Self { compact_error: 0.1, balanced_error: 0.02, min_gaussians_per_row: 45, max_groups: 32 }
     }
 }
 
