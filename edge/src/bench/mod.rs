@@ -11,6 +11,32 @@ use serde::Serialize;
 
 pub use machine::Machine;
 
+/// Numbers that need only look random (SplitMix64: Steele et al. 2014).
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+
+    fn below(&mut self, n: usize) -> usize {
+        (self.next() % n.max(1) as u64) as usize
+    }
+
+    fn signed(&mut self) -> f32 {
+        (self.next() >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+    }
+
+    /// Normal to a fourth moment: a sum of uniform numbers.
+    fn normal(&mut self) -> f64 {
+        (0..4).map(|_| (self.next() >> 11) as f64 / (1u64 << 53) as f64 - 0.5).sum()
+    }
+}
+
 /// Times of many requests, in buckets 2% wide, so that a long run takes no more memory than a short one.
 #[derive(Clone, Debug)]
 struct Times {

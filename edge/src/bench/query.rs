@@ -7,6 +7,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 use slag_common::shard::{BLOCK, Positions, Profile, ShardView};
 
+use super::Random;
 pub use super::dump::{DumpError, dump_ids, dump_vectors};
 pub use super::machine::{Machine, Memory, read_bandwidth};
 use crate::score::{Columns, Effort, Hit, Matches, Precision, Question, Region, ScoreError, Scratch, Search};
@@ -101,7 +102,7 @@ pub struct Timing {
 /// Makes query vectors: every other one in a random direction, the rest as like an embedding of the scene
 /// as a text's vector is to what it names. Same seed, same vectors.
 pub fn make_queries(shards: &[ShardView<'_>], n: usize, seed: u64) -> Vec<Vec<f32>> {
-    let mut random = SplitMix(seed);
+    let mut random = Random(seed);
     let mut queries = Vec::with_capacity(n.min(1 << 16));
     let dim = shards.first().map_or(0, |shard| shard.header.dim as usize);
     let known: Vec<&ShardView<'_>> = shards.iter().filter(|shard| shard.n_with_evidence() > 0).collect();
@@ -126,28 +127,6 @@ pub(super) fn normalise(vector: &mut [f64]) {
     let length = vector.iter().map(|v| v * v).sum::<f64>().sqrt();
     if length > 0.0 {
         vector.iter_mut().for_each(|v| *v /= length);
-    }
-}
-
-/// Numbers that need only look random (Steele et al. 2014).
-struct SplitMix(u64);
-
-impl SplitMix {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    fn below(&mut self, n: usize) -> usize {
-        (self.next() % n.max(1) as u64) as usize
-    }
-
-    /// Normal to a fourth moment: a sum of uniform numbers.
-    fn normal(&mut self) -> f64 {
-        (0..4).map(|_| (self.next() >> 11) as f64 / (1u64 << 53) as f64 - 0.5).sum()
     }
 }
 

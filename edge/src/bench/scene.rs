@@ -16,6 +16,8 @@ use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardReco
 use slag_common::shard::{self, Positions, Profile, ScoreErrors, ShardHeader, ShardView};
 use slag_models::{EncodeError, TextEncoder};
 
+use super::Random;
+
 use crate::text::{EncoderInfo, TextService};
 
 const CELL_GAUSSIANS: u32 = 65_536;
@@ -25,23 +27,6 @@ const N_CONCEPTS: u64 = 64;
 const CELL_WIDTH_M: f64 = 25.0;
 /// Between a thing's rows (0.9 and more) and those of others (0.2 and less at 512 components).
 const THRESHOLD: f32 = 0.6;
-
-/// Pseudo-random numbers (splitmix64, Steele et al. 2014).
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    fn signed(&mut self) -> f32 {
-        (self.next() >> 40) as f32 / (1u64 << 23) as f32 - 1.0
-    }
-}
 
 fn unit(mut vector: Vec<f32>) -> Vec<f32> {
     let length = vector.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt() as f32;
