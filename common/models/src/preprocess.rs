@@ -15,6 +15,8 @@ pub enum Resize {
     ShortestEdge,
     /// Both edges become `size_px`: nothing is cut off, the aspect ratio is lost.
     Stretch,
+    /// The longer edge becomes `size_px`, the aspect ratio stays, white fills the square.
+    Pad,
 }
 
 /// The resampling filter.
@@ -82,7 +84,8 @@ impl Preprocess {
         self.size_px
     }
 
-    /// Returns the size that an image of the given size is resized to, and the part of it that is kept.
+    /// Returns the size that an image of the given size is resized to, and the part of it that is kept;
+    /// smaller than the square only where it is filled up.
     ///
     /// Neither edge may be 0.
     pub fn plan(&self, width_px: u32, height_px: u32) -> ([u64; 2], Window) {
@@ -92,12 +95,17 @@ impl Preprocess {
         let resized = match self.resize {
             Resize::Stretch => [size, size],
             Resize::ShortestEdge => [width_px, height_px].map(|edge| size * u64::from(edge) / short),
+            Resize::Pad => {
+                let long = u64::from(width_px.max(height_px));
+                [width_px, height_px].map(|edge| ((2 * size * u64::from(edge) + long) / (2 * long)).max(1))
+            }
         };
+        let [width, height] = resized.map(|edge| edge.min(size));
         let window = Window {
-            left_px: (resized[0] - size) / 2,
-            top_px: (resized[1] - size) / 2,
-            width_px: self.size_px,
-            height_px: self.size_px,
+            left_px: (resized[0] - width) / 2,
+            top_px: (resized[1] - height) / 2,
+            width_px: width as u32,
+            height_px: height as u32,
         };
         (resized, window)
     }
@@ -105,7 +113,15 @@ impl Preprocess {
     /// Returns the model's square, resized and cropped. `image` must have pixels.
     pub fn square(&self, image: &RgbImage) -> RgbImage {
         let (resized, window) = self.plan(image.width(), image.height());
-        resample(image, self.filter, resized, window)
+        let resized = resample(image, self.filter, resized, window);
+        let (width, height) = resized.dimensions();
+        if width == self.size_px && height == self.size_px {
+            return resized;
+        }
+        let mut square = RgbImage::from_pixel(self.size_px, self.size_px, image::Rgb([255; 3]));
+        let [left, top] = [width, height].map(|edge| i64::from((self.size_px - edge) / 2));
+        image::imageops::replace(&mut square, &resized, left, top);
+        square
     }
 
     /// Appends the pixel values of `image`: `[3][size_px][size_px]`. `image` must have pixels.
@@ -192,4 +208,31 @@ pub fn resample(image: &RgbImage, filter: Filter, resized: [u64; 2], window: Win
         out.iter_mut().zip(&sums).for_each(|(x, &sum)| *x = to_level(sum));
     }
     result
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Oracle: one plain resize to the size that keeps the proportions, put into the middle by hand.
+    #[test]
+    fn padding_keeps_proportions_and_fills_with_white() {
+        for (width, height, inner) in
+            [(40, 20, [16, 8]), (10, 31, [5, 16]), (7, 7, [16, 16]), (500, 1, [16, 1])]
+        {
+            let image = RgbImage::from_fn(width, height, |x, y| {
+                image::Rgb([(x * 37 % 200) as u8, (y * 53 % 200) as u8, ((x + y) * 11 % 200) as u8])
+            });
+            let square = Preprocess::new(16, Resize::Pad, Filter::Bicubic, [0.0; 3], [1.0; 3]).square(&image);
+            let whole = Window { left_px: 0, top_px: 0, width_px: inner[0], height_px: inner[1] };
+            let plain = resample(&image, Filter::Bicubic, inner.map(u64::from), whole);
+            let [left, top] = inner.map(|edge| (16 - edge) / 2);
+            for (x, y, pixel) in square.enumerate_pixels() {
+                let (u, v) = (x.wrapping_sub(left), y.wrapping_sub(top));
+                let expected =
+                    if u < inner[0] && v < inner[1] { *plain.get_pixel(u, v) } else { image::Rgb([255; 3]) };
+                assert_eq!(*pixel, expected, "{width}x{height} at {x},{y}");
+            }
+        }
+    }
 }
