@@ -17,7 +17,7 @@ fn the_demo_answers_rightly() {
 
 fn generate(dir: &Path) -> (std::path::PathBuf, std::path::PathBuf) {
     let room = dir.join("room");
-    run(&mut encoder(&["generate", "--out", text(&room), "--n-views", "16"]));
+    run(&mut encoder(&["generate", "scene", "--out", text(&room), "--n-views", "16"]));
     (room.join("scene.ply"), room.join("transforms.json"))
 }
 

@@ -6,6 +6,7 @@ pub mod cli;
 pub mod demo;
 pub mod embed;
 pub mod encode;
+pub mod eval;
 pub mod generate;
 pub mod ingest;
 pub mod lift;

@@ -11,6 +11,8 @@ use slag_common::shard::Profile;
 
 use super::keys::KeysCommand;
 use crate::embed::Background;
+use crate::generate::crops::Split;
+use crate::generate::grammar::SceneKind;
 use crate::palette::PaletteSettings;
 use crate::raster::WeightKind;
 use crate::raster::devices::DeviceChoice;
@@ -60,7 +62,12 @@ pub enum Command {
     #[command(subcommand)]
     Push(PushCommand),
     /// Writes a furnished room as splat, photos, poses and truth.
-    Generate(GenerateArgs),
+    /// Measures answers against labels.
+    #[command(subcommand)]
+    Eval(EvalCommand),
+    /// Makes scenes and crops whose contents are known.
+    #[command(subcommand)]
+    Generate(GenerateCommand),
     /// Generates a room, encodes, serves, fetches and asks: the whole system in one command.
     Demo(DemoArgs),
     /// Lists the GPUs that can rasterise.
@@ -279,6 +286,39 @@ pub struct QueryArgs {
     pub scores: Option<PathBuf>,
 }
 
+/// `eval`.
+#[derive(Debug, Subcommand)]
+pub enum EvalCommand {
+    /// Against a scene whose every Gaussian has a label (`generate scene` makes such).
+    Labelled(EvalLabelledArgs),
+}
+
+/// `eval labelled`.
+#[derive(Debug, Args)]
+pub struct EvalLabelledArgs {
+    /// Store.
+    #[arg(long, value_name = "DIR")]
+    pub store: PathBuf,
+    /// The splat that was encoded.
+    #[arg(long, value_name = "FILE")]
+    pub scene: PathBuf,
+    /// Folder of the labels: gt/instances.json, gt/gaussian_instance.npy; test/ and gt/test_masks/ if there are.
+    #[arg(long, value_name = "DIR")]
+    pub truth: PathBuf,
+    /// Models; the same that the store was encoded with.
+    #[command(flatten)]
+    pub models: ModelArgs,
+    /// Categories to ask for [default: all].
+    #[arg(long, value_name = "A,B", value_delimiter = ',')]
+    pub words: Vec<String>,
+    /// Score as a robot with shards of this profile does [default: the field in full precision].
+    #[arg(long, value_name = "NAME")]
+    pub profile: Option<Profile>,
+    /// Score from which something counts as found [default: the store's].
+    #[arg(long, value_name = "COSINE", allow_negative_numbers = true)]
+    pub threshold: Option<f32>,
+}
+
 /// `serve`.
 #[derive(Debug, Args)]
 pub struct ServeArgs {
@@ -318,17 +358,55 @@ pub struct QdrantArgs {
 }
 
 /// `generate`.
+#[derive(Debug, Subcommand)]
+pub enum GenerateCommand {
+    /// A scene: Gaussians, photos, poses, and in `gt/` what is true about it.
+    Scene(GenerateSceneArgs),
+    /// Crops of things with the words that are true of them, to train an encoder.
+    Crops(GenerateCropsArgs),
+}
+
+/// `generate scene`.
 #[derive(Debug, Args)]
-pub struct GenerateArgs {
+pub struct GenerateSceneArgs {
     /// Folder to write into; made if absent.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Chooses where things stand and how they are lit.
+    /// What kind of scene; several, separated by commas, are put side by side.
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "room")]
+    pub kind: Vec<SceneKind>,
+    /// Chooses what stands where and how it looks.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
     /// Photos.
     #[arg(long, value_name = "N", default_value_t = 36, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub n_views: u32,
+    /// Folder of object files (`NOUN.txt`) instead of those shipped.
+    #[arg(long, value_name = "DIR")]
+    pub objects: Option<PathBuf>,
+}
+
+/// `generate crops`.
+#[derive(Debug, Args)]
+pub struct GenerateCropsArgs {
+    /// Folder to write into; made if absent.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// To learn from, or to test with.
+    #[arg(long, value_enum, default_value = "train")]
+    pub split: Split,
+    /// Scenes to take crops from.
+    #[arg(long, value_name = "N", default_value_t = 100)]
+    pub n_scenes: u64,
+    /// Seed of the first scene; the next ones count up.
+    #[arg(long, default_value_t = 1_000_000)]
+    pub seed: u64,
+    /// Edge of the crops, pixels.
+    #[arg(long, value_name = "PX", default_value_t = 64, value_parser = clap::value_parser!(u32).range(8..=512))]
+    pub edge: u32,
+    /// Folder of object files (`NOUN.txt`) instead of those shipped.
+    #[arg(long, value_name = "DIR")]
+    pub objects: Option<PathBuf>,
 }
 
 /// `demo`.

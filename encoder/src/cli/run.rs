@@ -11,7 +11,7 @@ use anyhow::{Context, Result, anyhow};
 use serde::Serialize;
 use serde_json::json;
 use slag_common::{poses, splat};
-use slag_models::{ModelDir, SessionOptions, find_runtime};
+use slag_models::{ModelDir, SessionOptions, TextEncoder, find_runtime};
 
 use super::Exit;
 use super::args::*;
@@ -22,13 +22,15 @@ use crate::bench::scene::{BenchScene, cell_regions, grid_regions};
 use crate::check::{self, CheckOptions, CheckView};
 use crate::demo;
 use crate::encode::{self, EncodeError, EncodeSettings, Masks};
+use crate::eval::{self, EvalSettings, Truth};
+use crate::generate::{crops, grammar};
 use crate::palette::PaletteSettings;
 use crate::progress::{Progress, Silent};
 use crate::publish::{qdrant, serve};
 use crate::raster::devices::Devices;
 use crate::raster::gpu::{AdapterReport, GpuOptions, adapters};
 use crate::raster::simd::Level;
-use crate::raster::{CpuLevel, RasterView};
+use crate::raster::{CpuLevel, CpuRasterizer, RasterView};
 use crate::shard::ShardSettings;
 use crate::shard::cells::CellLimits;
 use crate::shard::positions::PositionError;
@@ -47,7 +49,8 @@ pub fn run(cli: Cli) -> Exit {
         Command::Serve(args) => run_serve(&args),
         Command::Keys(command) => super::keys::run(&command, json),
         Command::Push(PushCommand::Qdrant(args)) => run_push(&args, progress.as_ref(), json),
-        Command::Generate(args) => run_generate(&args, progress.as_ref()),
+        Command::Eval(EvalCommand::Labelled(args)) => run_eval_labelled(&args, json),
+        Command::Generate(command) => run_generate(&command, progress.as_ref()),
         Command::Demo(args) => run_demo(&args, progress.as_ref(), json),
         Command::Devices => run_devices(json),
         Command::Bench(BenchCommand::Raster(args)) => run_bench_raster(&args, progress.as_ref(), json),
@@ -273,17 +276,8 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
 fn run_query(args: &QueryArgs, json: bool) -> Result<Exit> {
     let reader = StoreReader::open(&args.store)?;
     let manifest = reader.manifest();
-    let (models, session) = open_models(&args.models)?;
-    let id = slag_common::Hash32(models.encoder_id().hash());
-    if id != manifest.encoder.id {
-        return Err(anyhow!(
-            "the store was encoded with {:?} ({}), the models at hand are {}; give the same with --models",
-            manifest.encoder.name,
-            manifest.encoder.id,
-            models.encoder_id()
-        ));
-    }
-    let vector = models.text_encoder(&session)?.encode(&args.text)?;
+    let mut encoder = text_encoder_of(&reader, &args.models)?;
+    let vector = encoder.encode(&args.text)?;
     let scores = match args.profile {
         Some(profile) => query::scores_of_shards(&reader, &vector, profile)?,
         None => query::scores(&reader, &vector)?,
@@ -307,6 +301,33 @@ fn run_query(args: &QueryArgs, json: bool) -> Result<Exit> {
         "text": args.text, "threshold": threshold, "n_matching": n_matching, "n_scored": n_scored, "best": hits,
     });
     print(json, &value, lines)?;
+    Ok(Exit::Done)
+}
+
+/// Opens the text encoder that a store was encoded with.
+fn text_encoder_of(reader: &StoreReader, args: &ModelArgs) -> Result<Box<dyn TextEncoder>> {
+    let expected = &reader.manifest().encoder;
+    let (models, session) = open_models(args)?;
+    if slag_common::Hash32(models.encoder_id().hash()) != expected.id {
+        return Err(anyhow!(
+            "the store was encoded with {:?} ({}), the models at hand are {}; give the same with --models",
+            expected.name,
+            expected.id,
+            models.encoder_id()
+        ));
+    }
+    Ok(models.text_encoder(&session)?)
+}
+
+fn run_eval_labelled(args: &EvalLabelledArgs, json: bool) -> Result<Exit> {
+    let reader = StoreReader::open(&args.store)?;
+    let mut encoder = text_encoder_of(&reader, &args.models)?;
+    let scene = splat::read(&args.scene, &splat::ReadOptions { with_sh_rest: false })?;
+    let truth = Truth::read(&args.truth, scene.len())?;
+    let settings =
+        EvalSettings { words: args.words.clone(), profile: args.profile, threshold: args.threshold };
+    let report = eval::labelled(&reader, &truth, &scene, &mut *encoder, &CpuRasterizer, &settings)?;
+    print(json, &report, &report)?;
     Ok(Exit::Done)
 }
 
@@ -363,21 +384,32 @@ fn run_push(args: &QdrantArgs, progress: &dyn Progress, json: bool) -> Result<Ex
     Ok(Exit::Done)
 }
 
-fn run_generate(args: &GenerateArgs, progress: &dyn Progress) -> Result<Exit> {
-    let room = generate::room(args.seed, args.n_views);
-    let written = room.write(&args.out, progress)?;
-    println!(
-        "{} Gaussians, {} objects, {} photos in {}",
-        room.gaussians.len(),
-        room.objects.len(),
-        room.views.len(),
-        args.out.display()
-    );
-    println!(
-        "next: slag-encoder encode --scene {} --views {} --metric --store STORE",
-        written.scene.display(),
-        written.views.display()
-    );
+fn run_generate(command: &GenerateCommand, progress: &dyn Progress) -> Result<Exit> {
+    match command {
+        GenerateCommand::Scene(args) => {
+            let nouns = grammar::nouns(args.objects.as_deref())?;
+            let mut scene = generate::Scene::new(&args.kind, args.seed, args.n_views, &nouns);
+            let written = scene.write(&args.out, progress)?;
+            println!(
+                "{} Gaussians, {} things, {} photos in {}",
+                scene.gaussians.len(),
+                scene.objects.iter().filter(|object| !object.background).count(),
+                scene.views.len(),
+                args.out.display()
+            );
+            println!(
+                "next: slag-encoder encode --scene {} --views {} --metric --store STORE",
+                written.scene.display(),
+                written.views.display()
+            );
+        }
+        GenerateCommand::Crops(args) => {
+            let nouns = grammar::nouns(args.objects.as_deref())?;
+            let seeds = args.seed..args.seed + args.n_scenes;
+            let n_crops = crops::write(&args.out, args.split, &nouns, seeds, args.edge, progress)?;
+            println!("{n_crops} crops of {} nouns in {}", nouns.len(), args.out.display());
+        }
+    }
     Ok(Exit::Done)
 }
 

@@ -15,7 +15,8 @@ use slag_models::{ModelDir, SessionOptions};
 
 use crate::embed::Background;
 use crate::encode::{self, EncodeSettings, EncodeSummary, Masks};
-use crate::generate::{self, TrueObject};
+use crate::generate::grammar::{self, SceneKind};
+use crate::generate::{Scene, TrueObject};
 use slag_common::shard::Profile;
 
 use crate::palette::PaletteSettings;
@@ -168,8 +169,9 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     let store = options.out.join("store");
     let cache = options.out.join("cache");
 
-    let room = generate::room(options.seed, N_VIEWS);
-    let written = tokio::task::block_in_place(|| room.write(&options.out.join("room"), progress))
+    let nouns = grammar::nouns(None).context("generate")?;
+    let mut scene = Scene::new(&[SceneKind::Room], options.seed, N_VIEWS, &nouns);
+    let written = tokio::task::block_in_place(|| scene.write(&options.out.join("scene"), progress))
         .context("generate")?;
     let models = ModelDir::builtin();
     let settings = EncodeSettings {
@@ -237,16 +239,16 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         let start = Instant::now();
         let reply: EdgeReply = edge(options, &cache, &["query", text, "--near", &at]).context("query")?;
         let process_ms = start.elapsed().as_secs_f64() * 1e3;
-        let truth: Vec<&TrueObject> = room.objects.iter().filter(|o| o.colour == colour).collect();
+        let truth: Vec<&TrueObject> = scene.objects.iter().filter(|o| o.colour == colour).collect();
         let answer = reply.answers.into_iter().next();
         let right = match &answer {
             None => truth.is_empty(),
             Some(answer) => truth.iter().any(|object| {
-                let (low, high) = (object.box_min - TOLERANCE_M, object.box_max + TOLERANCE_M);
+                let (low, high) = (object.aabb_min - TOLERANCE_M, object.aabb_max + TOLERANCE_M);
                 answer.position_in_world.cmpge(low).all() && answer.position_in_world.cmple(high).all()
             }),
         };
-        let truth = truth.iter().map(|o| (o.name.to_owned(), (o.box_min + o.box_max) / 2.0)).collect();
+        let truth = truth.iter().map(|o| (o.category.clone(), (o.aabb_min + o.aabb_max) / 2.0)).collect();
         questions.push(Question {
             text: text.into(),
             answer,
@@ -257,7 +259,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         });
     }
     let picture =
-        tokio::task::block_in_place(|| draw_answers(options, &room, &questions)).context("picture")?;
+        tokio::task::block_in_place(|| draw_answers(options, &scene, &questions)).context("picture")?;
     let report = DemoReport {
         picture,
         encode: summary,
@@ -270,7 +272,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
 }
 
 /// Draws what was found, from the full-precision scores of the store.
-fn draw_answers(options: &DemoOptions, room: &generate::Room, questions: &[Question]) -> Result<PathBuf> {
+fn draw_answers(options: &DemoOptions, scene: &Scene, questions: &[Question]) -> Result<PathBuf> {
     let reader = StoreReader::open(&options.out.join("store"))?;
     let mut text = ModelDir::builtin().text_encoder(&SessionOptions::new(PathBuf::new()))?;
     let threshold = reader.manifest().encoder.default_threshold;
@@ -282,7 +284,7 @@ fn draw_answers(options: &DemoOptions, room: &generate::Room, questions: &[Quest
         }
     }
     let path = options.out.join("answers.png");
-    picture::draw(&room.gaussians, &room.views, &panels)?.save(&path)?;
+    picture::draw(&scene.gaussians, &scene.views, &panels)?.save(&path)?;
     Ok(path)
 }
 

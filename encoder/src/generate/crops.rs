@@ -1,0 +1,240 @@
+//! Crops of generated things with the words that are true of them: what the embedded encoder learns from.
+
+use std::io::Write as _;
+use std::path::Path;
+
+use glam::DVec3;
+use image::RgbImage;
+use rayon::prelude::*;
+use serde::Serialize;
+use slag_models::preprocess::{Filter, Preprocess, Resize};
+
+use super::compose::{Layout, looking, pinhole};
+use super::grammar::{Noun, SceneKind};
+use super::paint::{Colour, Material};
+use super::render::{Photo, Solids};
+use super::solid::Random;
+use super::{GenerateError, write_npy};
+use crate::embed::{self, Background};
+use crate::progress::Progress;
+use crate::raster::RasterView;
+use crate::segment::{BoxPx, Mask};
+
+/// Photos that crops are taken from: their edge.
+const PHOTO_PX: u32 = 208;
+/// Photos of a scene.
+const N_PHOTOS: usize = 14;
+/// Masks with fewer pixels are no crops, as with `encode`.
+const MIN_MASK_PX: u32 = 200;
+/// A crop shows at least this part of what it would show if nothing stood before it.
+const MIN_SHOWN: f64 = 0.3;
+/// Of the pairs of noun and colour, one in so many is kept for the test.
+const HELD_OUT_OF: u64 = 7;
+
+/// Which crops to make.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Split {
+    /// To learn from.
+    Train,
+    /// Things of other seeds, in all pairs of noun and colour: those to learn from, and those never seen.
+    Test,
+}
+
+/// What is true of a crop.
+#[derive(Clone, Debug, Serialize)]
+pub struct Label {
+    /// Index of its noun.
+    pub noun: usize,
+    /// Main colour.
+    pub colour: Colour,
+    /// Main material.
+    pub material: Material,
+    /// Whether noun and colour are a pair that is not learnt from.
+    pub held_out: bool,
+    /// Height divided by the larger horizontal edge.
+    pub slenderness: f64,
+    /// Pixels of the mask.
+    pub area_px: u32,
+    /// The part of it that is not hidden.
+    pub shown: f64,
+    /// Whether the mask is a piece of the true one.
+    pub cut: bool,
+}
+
+/// Returns whether a pair of noun and colour is kept for the test; by its words, so that new nouns change nothing.
+pub fn is_held_out(noun: &Noun, colour: Colour) -> bool {
+    // FNV-1a (Fowler, Noll, Vo).
+    let words = noun.name.bytes().chain(colour.word().bytes());
+    let hash =
+        words.fold(0xcbf2_9ce4_8422_2325, |h: u64, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3));
+    // What has one or two colours only cannot spare any.
+    noun.colours().len() > 3 && (hash >> 32) % HELD_OUT_OF == 0
+}
+
+/// Writes crops of `n_scenes` scenes: `crops.npy` (u8 `[n][edge][edge][3]`, as the encoder takes them, white
+/// outside the mask), `labels.json` (a [`Label`] each) and `nouns.json` (the words).
+///
+/// # Errors
+/// [`GenerateError`].
+pub fn write(
+    folder: &Path,
+    split: Split,
+    nouns: &[Noun],
+    seeds: std::ops::Range<u64>,
+    edge_px: u32,
+    progress: &dyn Progress,
+) -> Result<usize, GenerateError> {
+    fs_err::create_dir_all(folder)?;
+    let preprocess = Preprocess::new(edge_px, Resize::Pad, Filter::Bicubic, [0.0; 3], [1.0; 3]);
+    progress.begin("scenes", "scene", seeds.end - seeds.start, 0);
+    let of_seed = |seed: u64| {
+        let crops: Vec<(RgbImage, Label)> = crops(split, nouns, seed)
+            .into_iter()
+            .map(|(image, label)| (preprocess.square(&image), label))
+            .collect();
+        progress.advance(1);
+        crops
+    };
+    let crops: Vec<(RgbImage, Label)> = seeds.into_par_iter().flat_map_iter(of_seed).collect();
+    progress.end();
+    let pixels: Vec<u8> = crops.iter().flat_map(|(image, _)| image.as_raw().iter().copied()).collect();
+    let edge = u64::from(edge_px);
+    write_npy(&folder.join("crops.npy"), &[crops.len() as u64, edge, edge, 3], &pixels)?;
+    let labels: Vec<&Label> = crops.iter().map(|(_, label)| label).collect();
+    fs_err::write(folder.join("labels.json"), serde_json::to_vec(&labels).map_err(std::io::Error::from)?)?;
+    let mut out = fs_err::File::create(folder.join("nouns.json"))?;
+    let words: Vec<_> = nouns
+        .iter()
+        .map(|noun| {
+            serde_json::json!({
+                "name": noun.name, "words": noun.words, "kinds": noun.kinds,
+                "colours": noun.colours(), "materials": noun.materials(),
+            })
+        })
+        .collect();
+    out.write_all(&serde_json::to_vec_pretty(&words).map_err(std::io::Error::from)?)?;
+    Ok(crops.len())
+}
+
+fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(RgbImage, Label)> {
+    let allowed = |noun: &Noun, colour| split == Split::Test || !is_held_out(noun, colour);
+    let kinds = [SceneKind::Room, SceneKind::Yard, SceneKind::Street];
+    let layout = Layout::new(&[kinds[(seed % 3) as usize]], seed, nouns, &allowed);
+    let solids = layout.solids();
+    let mut random = Random::new(seed ^ 0xc405);
+    let mut out = Vec::new();
+    for _ in 0..N_PHOTOS {
+        let Some(view) = look_at_something(&layout, &solids, &mut random) else { continue };
+        let photo = solids.photo(&view);
+        for (thing, placed) in layout.placed.iter().enumerate() {
+            let Some(mask) = mask_of(&photo, thing as u16) else { continue };
+            let shown = f64::from(mask.area_px) / f64::from(photo.unhidden_px[thing].max(1));
+            if mask.area_px < MIN_MASK_PX || (shown < MIN_SHOWN && !placed.shell) {
+                continue;
+            }
+            // Floors and walls are on every photo.
+            if placed.shell && random.below(4) != 0 {
+                continue;
+            }
+            let cut = random.below(4) == 0;
+            let mask = if cut { spoilt(&mask, &mut random) } else { mask };
+            let Some(crop) = embed::crop(&photo.image, &mask, Background::White) else { continue };
+            let size = placed.bounds.size();
+            let label = Label {
+                noun: placed.noun,
+                colour: placed.object.colour,
+                material: placed.object.paint.material,
+                held_out: is_held_out(&nouns[placed.noun], placed.object.colour),
+                slenderness: size.z / size.x.max(size.y),
+                area_px: mask.area_px,
+                shown,
+                cut,
+            };
+            out.push((crop.image().clone(), label));
+        }
+    }
+    out
+}
+
+/// Returns a view of a thing from somewhere around it.
+fn look_at_something(layout: &Layout, solids: &Solids, random: &mut Random) -> Option<RasterView> {
+    let things: Vec<usize> = (0..layout.placed.len()).filter(|i| !layout.placed[*i].shell).collect();
+    if things.is_empty() {
+        return None;
+    }
+    for _ in 0..20 {
+        let thing = &solids.things()[*random.pick(&things)];
+        let field_of_view_rad = random.between(40.0, 75.0).to_radians();
+        // Fills between a third of the picture's width and all of it.
+        let fills = random.between(0.35, 1.1);
+        let distance_m = thing.radius_m() / (field_of_view_rad / 2.0 * fills).sin();
+        let azimuth = random.between(0.0, std::f64::consts::TAU);
+        let elevation = random.between(-5.0, 50.0).to_radians();
+        let away =
+            DVec3::new(azimuth.cos() * elevation.cos(), azimuth.sin() * elevation.cos(), elevation.sin());
+        let position = thing.centre() + away * distance_m;
+        if position.z > 0.15 && layout.is_walkable(position) {
+            let aside = DVec3::from([0; 3].map(|_| random.signed())) * 0.25 * thing.radius_m();
+            let camera_from_world = looking(position, thing.centre() + aside - position);
+            return Some(RasterView {
+                camera_from_world,
+                intrinsics: pinhole([PHOTO_PX; 2], field_of_view_rad),
+            });
+        }
+    }
+    None
+}
+
+/// Returns the mask of a thing on a photo.
+fn mask_of(photo: &Photo, thing: u16) -> Option<Mask> {
+    let width = photo.image.width();
+    let places = || {
+        let inside = photo.thing_of_pixel.iter().zip(0u32..).filter(move |(t, _)| **t == thing);
+        inside.map(move |(_, i)| (i % width, i / width))
+    };
+    let mut box_px = BoxPx { x0: u32::MAX, y0: u32::MAX, x1: 0, y1: 0 };
+    for (x, y) in places() {
+        box_px = BoxPx {
+            x0: box_px.x0.min(x),
+            y0: box_px.y0.min(y),
+            x1: box_px.x1.max(x + 1),
+            y1: box_px.y1.max(y + 1),
+        };
+    }
+    (box_px.x1 > 0).then(|| {
+        let mut inside = vec![false; (box_px.width_px() * box_px.height_px()) as usize];
+        let mut area_px = 0;
+        for (x, y) in places() {
+            inside[((y - box_px.y0) * box_px.width_px() + x - box_px.x0) as usize] = true;
+            area_px += 1;
+        }
+        Mask { box_px, inside, area_px, level: 0 }
+    })
+}
+
+/// Returns the mask as a segmenter may give it: a side of it is missing.
+fn spoilt(mask: &Mask, random: &mut Random) -> Mask {
+    let (width, height) = (mask.box_px.width_px(), mask.box_px.height_px());
+    let angle = random.between(0.0, std::f64::consts::TAU);
+    let (nx, ny) = (angle.cos(), angle.sin());
+    let along = |x: u32, y: u32| {
+        (f64::from(x) / f64::from(width) - 0.5) * nx + (f64::from(y) / f64::from(height) - 0.5) * ny
+    };
+    let limit = random.between(0.0, 0.35);
+    let kept = |x: u32, y: u32| mask.inside[(y * width + x) as usize] && along(x, y) < limit;
+    let places = || (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).filter(|(x, y)| kept(*x, *y));
+    let area_px = places().count() as u32;
+    if area_px < MIN_MASK_PX {
+        return mask.clone();
+    }
+    let [x0, x1] = [places().map(|p| p.0).min(), places().map(|p| p.0).max()].map(Option::unwrap_or_default);
+    let [y0, y1] = [places().map(|p| p.1).min(), places().map(|p| p.1).max()].map(Option::unwrap_or_default);
+    let box_px = BoxPx {
+        x0: mask.box_px.x0 + x0,
+        y0: mask.box_px.y0 + y0,
+        x1: mask.box_px.x0 + x1 + 1,
+        y1: mask.box_px.y0 + y1 + 1,
+    };
+    let inside = (y0..=y1).flat_map(|y| (x0..=x1).map(move |x| kept(x, y))).collect();
+    Mask { box_px, inside, area_px, level: mask.level }
+}
