@@ -239,7 +239,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         let start = Instant::now();
         let reply: EdgeReply = edge(options, &cache, &["query", text, "--near", &at]).context("query")?;
         let process_ms = start.elapsed().as_secs_f64() * 1e3;
-        let truth: Vec<&TrueObject> = scene.objects.iter().filter(|o| o.colour == colour).collect();
+        let truth: Vec<&TrueObject> = scene.objects.iter().filter(|o| o.colours.contains(&colour)).collect();
         let answer = reply.answers.into_iter().next();
         let right = match &answer {
             None => truth.is_empty(),

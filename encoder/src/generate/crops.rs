@@ -142,9 +142,9 @@ fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(RgbImage, Label)> {
             let size = placed.bounds.size();
             let label = Label {
                 noun: placed.noun,
-                colour: placed.object.colour,
+                colour: placed.object.colours[0],
                 material: placed.object.paint.material,
-                held_out: is_held_out(&nouns[placed.noun], placed.object.colour),
+                held_out: is_held_out(&nouns[placed.noun], placed.object.colours[0]),
                 slenderness: size.z / size.x.max(size.y),
                 area_px: mask.area_px,
                 shown,

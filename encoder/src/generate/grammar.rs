@@ -146,8 +146,8 @@ struct PartRule {
 pub struct Object {
     /// What it is made of; its own frame, z up, on the ground at 0, its front along +y.
     pub parts: Vec<Part>,
-    /// Its main colour.
-    pub colour: Colour,
+    /// Its colours, the main one first.
+    pub colours: Vec<Colour>,
     /// Its main paint.
     pub paint: Paint,
     /// Where things may stand on it.
@@ -385,8 +385,13 @@ impl Noun {
             let [z_m, w, d] = [0, 1, 2].map(|i| top[i].value(&variables, random));
             Top { z_m, size_m: [w, d] }
         });
-        let (paint, colour) = paints[0];
-        Object { parts, colour, paint, top }
+        let mut colours: Vec<Colour> = Vec::new();
+        for (_, colour) in &paints {
+            if !colours.contains(colour) {
+                colours.push(*colour);
+            }
+        }
+        Object { parts, colours, paint: paints[0].0, top }
     }
 }
 
@@ -472,7 +477,7 @@ mod tests {
         assert_eq!((noun.name.as_str(), noun.words.len(), noun.kinds.len()), ("small stool", 2, 2));
         assert_eq!(noun.found, [(SceneKind::Room, Place::Floor), (SceneKind::Yard, Place::Wall)]);
         let object = noun.make(&mut Random::new(3), |colour| colour == Colour::Blue);
-        assert_eq!(object.colour, Colour::Blue);
+        assert_eq!(object.colours, [Colour::Blue]);
         assert_eq!(object.top, Some(Top { z_m: 0.55, size_m: [0.4, 0.4] }));
         let centres: Vec<[f64; 3]> =
             object.parts.iter().map(|part| part.object_from_part.translation.to_array()).collect();

@@ -71,8 +71,8 @@ pub struct TrueObject {
     pub words: Vec<String>,
     /// Kinds of thing that it is.
     pub kinds: Vec<String>,
-    /// Its main colour.
-    pub colour: &'static str,
+    /// Its colours, the main one first.
+    pub colours: Vec<&'static str>,
     /// Its main material.
     pub material: &'static str,
     /// Whether it is floor, wall or the like.
@@ -156,7 +156,7 @@ impl Scene {
                 category: noun.name.clone(),
                 words: noun.words.clone(),
                 kinds: noun.kinds.clone(),
-                colour: placed.object.colour.word(),
+                colours: placed.object.colours.iter().map(|colour| colour.word()).collect(),
                 material: placed.object.paint.material.word(),
                 background: placed.shell,
                 centre: placed.bounds.centre(),
