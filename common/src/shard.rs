@@ -66,6 +66,14 @@ pub mod section {
     pub const REACHES: u32 = 14;
     /// `[ceil(row_starts[K] / 32)][G / 2][32]` u8: two codes a byte, the even group's in the low half.
     pub const CODES: u32 = 15;
+    /// [`super::ScoreErrors`] of the fine residuals.
+    pub const FINE_ERRORS: u32 = 16;
+    /// `[m]` f32: what a fine residual's components are multiplied by.
+    pub const FINE_STEPS: u32 = 17;
+    /// `[K]` f32: what those of a row's members are multiplied by.
+    pub const FINE_SCALES: u32 = 18;
+    /// `[row_starts[K]][m]` i8.
+    pub const FINE: u32 = 19;
 }
 
 /// How much a shard carries.
@@ -157,7 +165,7 @@ pub struct ShardHeader {
     pub box_min: [f64; 3],
     /// Largest corner.
     pub box_max: [f64; 3],
-    /// Measured errors of this profile.
+    /// Measured errors of this profile; beside exact embeddings, of the residual code.
     pub errors: ScoreErrors,
     /// The encoder whose space the rows live in.
     pub encoder_id: [u8; 32],
@@ -234,6 +242,21 @@ pub struct ExactColumns<'a> {
     pub input_indices: &'a [u32],
     /// `[row_starts[K]][dim]` unit embeddings.
     pub embeddings: &'a [f16],
+    /// What lies between codes and embeddings; absent where there is no code.
+    pub fine: Option<Fine<'a>>,
+}
+
+/// Residuals in 8 bits a component: a Gaussian's lie together, an eighth of its embedding's bytes.
+#[derive(Clone, Copy, Debug)]
+pub struct Fine<'a> {
+    /// Measured errors of their scores.
+    pub errors: ScoreErrors,
+    /// `[m]`.
+    pub steps: &'a [f32],
+    /// `[K]`.
+    pub scales: &'a [f32],
+    /// `[row_starts[K]][m]`.
+    pub values: &'a [i8],
 }
 
 /// A shard's columns, borrowed from its bytes, or from what it is to be written from.
@@ -286,6 +309,12 @@ impl ShardView<'_> {
         if let Some(exact) = &self.exact {
             sections.push((section::INPUT_INDICES, container::bytes_of(exact.input_indices)));
             sections.push((section::EMBEDDINGS, container::bytes_of(exact.embeddings)));
+            if let Some(fine) = &exact.fine {
+                sections.push((section::FINE_ERRORS, bytemuck::bytes_of(&fine.errors)));
+                sections.push((section::FINE_STEPS, container::bytes_of(fine.steps)));
+                sections.push((section::FINE_SCALES, container::bytes_of(fine.scales)));
+                sections.push((section::FINE, container::bytes_of(fine.values)));
+            }
         }
         container::write(out, MAGIC, VERSION, &sections)
     }
@@ -347,6 +376,18 @@ impl ShardView<'_> {
             return;
         }
         self.combine(&self.components(index), out);
+    }
+
+    /// Writes the embedding of a Gaussian with evidence as its fine residual has it to `out` (`[dim]`), in
+    /// float64; of shards that have those.
+    pub fn decode_fine(&self, index: usize, fine: &Fine<'_>, out: &mut [f64]) {
+        let m = self.header.n_components as usize;
+        let row = self.row_of(index);
+        let (step, scale) = (f64::from(self.header.row_step), f64::from(fine.scales[row]));
+        let of_row = self.rows[row * m..][..m].iter().map(|c| f64::from(*c) * step);
+        let residual = fine.values[index * m..][..m].iter().zip(fine.steps);
+        let residual = residual.map(|(v, step)| f64::from(*v) * f64::from(*step) * scale);
+        self.combine(&of_row.zip(residual).map(|(a, b)| a + b).collect::<Vec<_>>(), out);
     }
 
     /// Returns the scores of a query (`[dim]`) and every Gaussian with evidence, as this profile decodes them,
@@ -435,6 +476,7 @@ pub struct ShardLayout {
     basis: Option<[Range<usize>; 3]>,
     residuals: Option<[Range<usize>; 5]>,
     exact: Option<[Range<usize>; 2]>,
+    fine: Option<(ScoreErrors, [Range<usize>; 3])>,
 }
 
 impl ShardLayout {
@@ -499,11 +541,23 @@ impl ShardLayout {
                 ])
             }
         };
+        let fine = match layout.find(section::FINE) {
+            None => None,
+            Some(_) => {
+                let errors: ScoreErrors =
+                    layout.value(bytes, section::FINE_ERRORS, "errors of fine residuals")?;
+                check_errors(&errors).map_err(|what| damaged(at_header, what))?;
+                let steps = lengths(&layout, bytes, section::FINE_STEPS, "fine steps", m)?;
+                let scales = lengths(&layout, bytes, section::FINE_SCALES, "fine scales", k)?;
+                let values = layout.column::<i8>(section::FINE, "fine residuals", n_with_evidence * m)?;
+                Some((errors, [steps, scales, values]))
+            }
+        };
         let positions = match is_packed(&header) {
             true => layout.column::<u32>(section::POSITIONS, "positions", n)?,
             false => layout.column::<[u16; 3]>(section::POSITIONS, "positions", n)?,
         };
-        Ok(Self { header, positions, row_starts, rows, radii, basis, residuals, exact })
+        Ok(Self { header, positions, row_starts, rows, radii, basis, residuals, exact, fine })
     }
 
     /// Returns the columns of the bytes that were checked.
@@ -541,6 +595,12 @@ impl ShardLayout {
             exact: self.exact.as_ref().map(|[indices, embeddings]| ExactColumns {
                 input_indices: cast(bytes, indices),
                 embeddings: cast(bytes, embeddings),
+                fine: self.fine.as_ref().map(|(errors, [steps, scales, values])| Fine {
+                    errors: *errors,
+                    steps: cast(bytes, steps),
+                    scales: cast(bytes, scales),
+                    values: cast(bytes, values),
+                }),
             }),
         }
     }
@@ -577,9 +637,16 @@ fn check_header(header: &ShardHeader) -> Result<(), String> {
     if bits[3] != 0 || is_packed(header) && bits.iter().map(|b| u32::from(*b)).sum::<u32>() > 32 {
         return Err(format!("positions of {bits:?} bits"));
     }
-    let ScoreErrors { mean, p999, max, spread } = header.errors;
-    if [header.row_step, mean, p999, max, spread].iter().any(|v| !(0.0..=MAX_LENGTH).contains(v)) {
-        return Err("the rows' step or an error is not within 0..=4096".into());
+    if !(0.0..=MAX_LENGTH).contains(&header.row_step) {
+        return Err(format!("the rows' step is not within 0..={MAX_LENGTH}"));
+    }
+    check_errors(&header.errors)
+}
+
+fn check_errors(errors: &ScoreErrors) -> Result<(), String> {
+    let ScoreErrors { mean, p999, max, spread } = *errors;
+    if [mean, p999, max, spread].iter().any(|v| !(0.0..=MAX_LENGTH).contains(v)) {
+        return Err(format!("a score's error is not within 0..={MAX_LENGTH}"));
     }
     Ok(())
 }

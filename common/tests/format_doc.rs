@@ -62,6 +62,10 @@ fn sections_and_versions_are_those_of_the_code() {
         (section::ROW_SCALES, "row_scales"),
         (section::REACHES, "reaches"),
         (section::CODES, "codes"),
+        (section::FINE_ERRORS, "fine_errors"),
+        (section::FINE_STEPS, "fine_steps"),
+        (section::FINE_SCALES, "fine_scales"),
+        (section::FINE, "fine"),
     ];
     for (id, name) in sections {
         assert!(has(&[&id.to_string(), name]), "section {id} {name}");

@@ -16,6 +16,7 @@ use slag_common::Hash32;
 use slag_common::frames::Aabb;
 use slag_common::shard::Profile;
 use slag_edge::query::{DEFAULT_MIN_COUNT, Level, Negatives, parse_box, parse_point};
+use slag_edge::score::Precision;
 
 /// Keeps the shards around a robot and answers text queries offline.
 #[derive(Debug, Parser)]
@@ -231,9 +232,10 @@ struct QueryArgs {
     /// Clusters with fewer Gaussians are dropped, and counted.
     #[arg(long, default_value_t = DEFAULT_MIN_COUNT)]
     min_count: u64,
-    /// Use palette rows alone, even where exact embeddings are on board: faster.
-    #[arg(long)]
-    rows_only: bool,
+    /// Which data scores come from: rows, measured (embeddings only where the measured errors of their codes do
+    /// not decide) or exact.
+    #[arg(long, value_name = "NAME", default_value_t = Precision::Exact)]
+    precision: Precision,
     #[command(flatten)]
     threads: ThreadArgs,
     #[command(flatten)]
@@ -366,14 +368,14 @@ mod tests {
         assert_eq!((query.radius, query.limit, query.threshold), (Some(4.0), Some(5), Some(-0.5)));
         assert_eq!(query.level, Level::Gaussians);
         let Command::Query(query) =
-            parse("slag-edge query chair --box -1,2,3,4,-5,6 --negatives wall,floor --rows-only")
+            parse("slag-edge query chair --box -1,2,3,4,-5,6 --negatives wall,floor --precision rows")
                 .expect("parses")
                 .command
         else {
             panic!("query")
         };
         let bounds = Aabb { min: DVec3::new(-1.0, -5.0, 3.0), max: DVec3::new(4.0, 2.0, 6.0) };
-        assert_eq!((query.bounds, query.rows_only), (Some(bounds), true));
+        assert_eq!((query.bounds, query.precision), (Some(bounds), Precision::Rows));
         assert_eq!(query.negatives, Negatives::Phrases(vec!["wall".into(), "floor".into()]));
         assert!(parse("slag-edge status --json --cache d").is_ok());
         assert!(parse("slag-edge bench query --cache d --limits 10,20 --runs 3 --threads 1").is_ok());

@@ -104,7 +104,11 @@ impl TestShard {
             errors: ScoreErrors::default(),
             encoder_id: self.encoder_id.0,
         };
-        let exact = exact.then_some(ExactColumns { input_indices: &input_indices, embeddings: &embeddings });
+        let exact = exact.then_some(ExactColumns {
+            input_indices: &input_indices,
+            embeddings: &embeddings,
+            fine: None,
+        });
         let mut bytes = Vec::new();
         ShardView {
             header,

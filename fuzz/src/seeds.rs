@@ -10,7 +10,7 @@ use half::f16;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use slag_common::shard::{
-    Basis, ExactColumns, Positions, Profile, Residuals, ScoreErrors, ShardHeader, ShardView,
+    Basis, ExactColumns, Fine, Positions, Profile, Residuals, ScoreErrors, ShardHeader, ShardView,
 };
 use slag_common::{Hash32, container};
 
@@ -125,8 +125,16 @@ fn shard(is_exact: bool) -> Vec<u8> {
             reaches: &[0.3, 0.4],
             codes: &[0x5a; 32],
         }),
-        exact: is_exact
-            .then_some(ExactColumns { input_indices: &[10, 11, 12, 13, 14, 15], embeddings: &embeddings }),
+        exact: is_exact.then_some(ExactColumns {
+            input_indices: &[10, 11, 12, 13, 14, 15],
+            embeddings: &embeddings,
+            fine: Some(Fine {
+                errors: ScoreErrors::default(),
+                steps: &[0.5, 0.25],
+                scales: &[0.01, 0.02],
+                values: &[1, -2, 127, -128, 5, 0, 3, 4, -5, 6],
+            }),
+        }),
     };
     view.write(&mut out).expect("writes to memory");
     out

@@ -67,6 +67,7 @@ pub fn dump_ids(
     shards: &[ShardView<'_>],
     queries: &[Vec<f32>],
     limits: &[usize],
+    precision: Precision,
 ) -> Result<(), DumpError> {
     fs_err::create_dir_all(dir)?;
     let mut first = vec![0u32];
@@ -75,7 +76,7 @@ pub fn dump_ids(
     }
     for (at, query) in queries.iter().enumerate() {
         let question = Question::new(&query[..]);
-        let search = Search::new(shards, &question, Region::default(), Precision::Exact)?;
+        let search = Search::new(shards, &question, Region::default(), precision)?;
         for limit in limits {
             let hits = search.best(*limit, f32::NEG_INFINITY, None);
             let ids = hits.iter().flat_map(|hit| (first[hit.shard as usize] + hit.index).to_le_bytes());

@@ -1,6 +1,7 @@
 //! Measurements as commands: each returns a report that names the machine.
 
 mod dump;
+pub mod http;
 pub mod load;
 mod machine;
 pub mod pause;

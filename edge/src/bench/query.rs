@@ -9,6 +9,7 @@ use slag_common::shard::{BLOCK, Positions, Profile, ShardView};
 
 use super::Random;
 pub use super::dump::{DumpError, dump_ids, dump_vectors};
+pub use super::http::{HttpTiming, time_http};
 pub use super::machine::{Machine, Memory, read_bandwidth};
 use crate::score::{Columns, Effort, Hit, Matches, Precision, Question, Region, ScoreError, Scratch, Search};
 use crate::store::{OpenShard, Snapshot};
@@ -16,12 +17,16 @@ use crate::store::{OpenShard, Snapshot};
 /// How much of a query like those of a bank of texts is an embedding of the scene: text and image vectors
 /// of one thing have cosines around this (CLIP).
 const LIKENESS: f32 = 0.3;
+/// Queries that recall is taken from: exact answers take their time.
+const N_RECALL: usize = 16;
 
 /// What is measured.
 #[derive(Clone, Debug)]
 pub struct Settings {
     /// Result sizes.
     pub limits: Vec<usize>,
+    /// Which data scores come from.
+    pub precision: Precision,
     /// Timed questions for each size and kind of answer; queries take turns.
     pub n_runs: usize,
     /// Untimed questions before them.
@@ -35,6 +40,8 @@ pub struct Report {
     pub machine: Machine,
     /// What was asked about.
     pub scene: SceneSize,
+    /// Which data scores come from.
+    pub precision: Precision,
     /// Distinct query vectors.
     pub n_queries: usize,
     /// Memory of the process after all questions.
@@ -43,6 +50,8 @@ pub struct Report {
     pub read_bytes_per_s: f64,
     /// Times in process: from the query's vector to columns of Gaussians, scores and positions.
     pub in_process: Vec<Timing>,
+    /// Times of the best through the service on loopback, as Arrow columns.
+    pub http: Vec<HttpTiming>,
 }
 
 /// What was asked about.
@@ -91,6 +100,10 @@ pub struct Timing {
     pub p99_ms: f64,
     /// The shortest.
     pub min_ms: f64,
+    /// Share of the exact answer that is found, mean over queries; absent where answers are exact, or the shards
+    /// have no exact embeddings to tell.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub recall: Option<f64>,
     /// Bytes of the shards that a question reads, median.
     pub bytes_touched: u64,
     /// What reading those takes in a plain loop.
@@ -145,12 +158,15 @@ pub fn bench_query(
     for limit in &settings.limits {
         for kind in [Kind::Best, Kind::Threshold] {
             let runs = answer.time(&shards, queries, kind, *limit, settings)?;
-            timed.push((kind, *limit, runs));
+            let recall = recall(&shards, queries, kind, *limit, settings.precision)?;
+            timed.push((kind, *limit, runs, recall));
         }
     }
     let memory = Memory::now();
     let read_bytes_per_s = read_bandwidth();
-    let in_process = timed.into_iter().map(|(kind, limit, runs)| timing(kind, limit, runs, read_bytes_per_s));
+    let in_process = timed
+        .into_iter()
+        .map(|(kind, limit, runs, recall)| Timing { recall, ..timing(kind, limit, runs, read_bytes_per_s) });
     Ok(Report {
         machine: Machine::here(),
         scene: SceneSize {
@@ -162,10 +178,12 @@ pub fn bench_query(
             dim: shards.first().map_or(0, |shard| shard.header.dim as usize),
             shard_bytes: snapshot.shards.iter().map(OpenShard::len_bytes).sum(),
         },
+        precision: settings.precision,
         n_queries: queries.len(),
         memory,
         read_bytes_per_s,
         in_process: in_process.collect(),
+        http: Vec::new(),
     })
 }
 
@@ -201,12 +219,12 @@ impl Answer {
             let threshold = match kind {
                 Kind::Best => f32::NEG_INFINITY,
                 Kind::Threshold => {
-                    let search = self.search(shards, question)?;
+                    let search = self.search(shards, question, settings.precision)?;
                     search.best(limit, f32::NEG_INFINITY, None).last().map_or(1.0, |hit| hit.score)
                 }
             };
             let start = Instant::now();
-            let search = self.search(shards, question)?;
+            let search = self.search(shards, question, settings.precision)?;
             let effort = match kind {
                 Kind::Best => {
                     let effort = search.best_into(limit, threshold, None, &mut self.hits);
@@ -216,8 +234,7 @@ impl Answer {
                 Kind::Threshold => {
                     search.matching_into(threshold, &mut self.matches);
                     self.columns.set_runs(shards, &self.matches.runs);
-                    let Matches { n_rescored, n_blocks_read, .. } = self.matches;
-                    Effort { n_rescored, n_blocks_read }
+                    self.matches.effort
                 }
             };
             let took = start.elapsed();
@@ -233,9 +250,40 @@ impl Answer {
         &mut self,
         shards: &'a [ShardView<'a>],
         question: &'a Question,
+        precision: Precision,
     ) -> Result<Search<'a>, ScoreError> {
-        Search::reusing(&mut self.scratch, shards, question, Region::default(), Precision::Exact)
+        Search::reusing(&mut self.scratch, shards, question, Region::default(), precision)
     }
+}
+
+/// Returns the share of the exact answers that is found, over some of the queries.
+fn recall(
+    shards: &[ShardView<'_>],
+    queries: &[Vec<f32>],
+    kind: Kind,
+    limit: usize,
+    precision: Precision,
+) -> Result<Option<f64>, ScoreError> {
+    let has_truth = shards.iter().all(|shard| shard.exact.is_some());
+    if kind == Kind::Threshold || precision == Precision::Exact || !has_truth {
+        return Ok(None);
+    }
+    let queries = &queries[..queries.len().min(N_RECALL)];
+    let mut sum = 0.0;
+    for query in queries {
+        let question = Question::new(&query[..]);
+        let best = |precision| -> Result<Vec<(u32, u32)>, ScoreError> {
+            let search = Search::new(shards, &question, Region::default(), precision)?;
+            let hits = search.best(limit, f32::NEG_INFINITY, None);
+            let mut names: Vec<(u32, u32)> = hits.iter().map(|hit| (hit.shard, hit.index)).collect();
+            names.sort_unstable();
+            Ok(names)
+        };
+        let (truth, found) = (best(Precision::Exact)?, best(precision)?);
+        let n = found.iter().filter(|name| truth.binary_search(name).is_ok()).count();
+        sum += n as f64 / truth.len().max(1) as f64;
+    }
+    Ok(Some(sum / queries.len() as f64))
 }
 
 fn timing(kind: Kind, limit: usize, runs: Vec<Run>, read_bytes_per_s: f64) -> Timing {
@@ -254,6 +302,7 @@ fn timing(kind: Kind, limit: usize, runs: Vec<Run>, read_bytes_per_s: f64) -> Ti
         n_found: [found().min().unwrap_or(0), found().max().unwrap_or(0)],
         median_ms,
         p99_ms: millis[at(0.99)],
+        recall: None,
         min_ms: millis[0],
         bytes_touched,
         plain_read_ms,
@@ -272,13 +321,14 @@ fn bytes_touched(shards: &[ShardView<'_>], effort: Effort, found: &Columns) -> u
     };
     let first = shards.first();
     let block = first.map_or(0, |shard| BLOCK as u64 * u64::from(shard.header.n_groups) / 2);
-    let dim = first.filter(|shard| shard.exact.is_some()).map_or(0, |shard| u64::from(shard.header.dim));
+    let (dim, m) = first.map_or((0, 0), |shard| (shard.header.dim, shard.header.n_components));
     let position = first.map_or(0, |shard| match shard.positions {
         Positions::Packed(_) => 4,
         Positions::Wide(_) => 6,
     });
     shards.par_iter().map(of_shard).sum::<u64>()
         + effort.n_blocks_read * block
-        + effort.n_rescored * dim * size_of::<f16>() as u64
+        + effort.n_fine_read * u64::from(m)
+        + effort.n_embeddings_read * u64::from(dim) * size_of::<f16>() as u64
         + found.len() as u64 * position
 }

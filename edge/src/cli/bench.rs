@@ -8,7 +8,8 @@ use clap::Args;
 use slag_common::shard::ShardView;
 use slag_edge::bench::load::{self, LoadOptions};
 use slag_edge::bench::pause::{self, PauseOptions};
-use slag_edge::bench::query::{Settings, bench_query, dump_ids, dump_vectors, make_queries};
+use slag_edge::bench::query::{Settings, bench_query, dump_ids, dump_vectors, make_queries, time_http};
+use slag_edge::score::Precision;
 use slag_edge::store::{OpenShard, Snapshot};
 
 use super::commands::store_failure;
@@ -24,6 +25,9 @@ pub struct BenchQueryArgs {
     /// Sizes of answers.
     #[arg(long, value_name = "N,...", value_delimiter = ',', default_values_t = [1_000, 10_000, 50_000, 100_000])]
     limits: Vec<usize>,
+    /// Which data scores come from.
+    #[arg(long, value_name = "rows|measured|exact", default_value_t = Precision::Exact)]
+    precision: Precision,
     /// Timed questions for each size and kind of answer.
     #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     runs: u32,
@@ -62,7 +66,8 @@ pub fn run(command: BenchCommand) -> Result<(), Failure> {
 
 fn bench_query_command(args: BenchQueryArgs) -> Result<(), Failure> {
     args.threads.apply()?;
-    let snapshot = Snapshot::open(&args.cache.open()?).map_err(store_failure)?;
+    let cache = args.cache.open()?;
+    let snapshot = Snapshot::open(&cache).map_err(store_failure)?;
     let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(OpenShard::view).collect();
     let queries = match &args.queries {
         None => make_queries(&shards, N_QUERIES, args.seed),
@@ -86,10 +91,17 @@ fn bench_query_command(args: BenchQueryArgs) -> Result<(), Failure> {
     }
     if let Some(dir) = &args.ids {
         let name = snapshot.current.profile.name();
-        dump_ids(dir, name, &shards, &queries, &args.limits).map_err(|e| failed(e.into()))?;
+        dump_ids(dir, name, &shards, &queries, &args.limits, args.precision).map_err(|e| failed(e.into()))?;
     }
-    let settings = Settings { limits: args.limits, n_runs: args.runs as usize, n_warm_up: N_WARM_UP };
-    let report = bench_query(&snapshot, &queries, &settings).map_err(|e| failed(e.into()))?;
+    let settings = Settings {
+        limits: args.limits,
+        precision: args.precision,
+        n_runs: args.runs as usize,
+        n_warm_up: N_WARM_UP,
+    };
+    let mut report = bench_query(&snapshot, &queries, &settings).map_err(|e| failed(e.into()))?;
+    report.http = time_http(&cache, &snapshot, queries, &settings, &report.in_process)
+        .map_err(|e| failed(anyhow::Error::new(e).context("timing the service on loopback")))?;
     print_json(&report)
 }
 

@@ -77,7 +77,7 @@ pub fn query(args: QueryArgs) -> Result<(), Failure> {
         level: args.level,
         voxel: args.voxel,
         min_count: args.min_count,
-        exact: !args.rows_only,
+        precision: args.precision,
     };
     request.check().map_err(|e| Failure::Usage(e.into()))?;
     args.threads.apply()?;

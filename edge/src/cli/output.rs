@@ -103,7 +103,12 @@ fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
     }
     let exactness = match answers.is_exact {
         true => "exactly".to_owned(),
-        false => format!("scores within ±{:.3}", answers.score_error_bound),
+        false => match answers.score_error_p999 {
+            Some(p999) => {
+                format!("999 of 1,000 scores within ±{p999:.3}, all within ±{:.3}", answers.score_error_bound)
+            }
+            None => format!("scores within ±{:.3}", answers.score_error_bound),
+        },
     };
     let (n, threshold) = (answers.n_matching, answers.threshold);
     let source = match answers.threshold_source {

@@ -18,7 +18,7 @@ pub const NAMES: [&str; 12] = [
     "level",
     "voxel",
     "min_count",
-    "exact",
+    "precision",
     "format",
 ];
 
@@ -50,7 +50,7 @@ pub fn parse(
             "level" => request.level = value.parse().map_err(refused)?,
             "voxel" => request.voxel = Some(number(name, value, "a number")?),
             "min_count" => request.min_count = number(name, value, "a whole number")?,
-            "exact" => request.exact = number(name, value, "true or false")?,
+            "precision" => request.precision = value.parse().map_err(refused)?,
             "format" => format = value.parse().map_err(refused)?,
             _ => {
                 let name: String = name.chars().take(40).collect();

@@ -147,7 +147,7 @@ async fn refusals_are_problem_details() {
         ("/query?text=0&level=gaussians&text=1&limit=500001", 400, "limit"),
         ("/query?text=0&box=1,2,3", 400, "box"),
         ("/query?text=0&box=0,0,0,1,1,NaN", 400, "box"),
-        ("/query?text=0&exact=maybe", 400, "exact"),
+        ("/query?text=0&precision=maybe", 400, "precision"),
         ("/query?text=0&format=xml", 400, "format"),
         ("/query?text=0&format=arrow", 400, "level"),
         ("/query?text=0&negatives=1,,2", 400, "negatives"),

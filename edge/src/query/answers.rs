@@ -52,6 +52,10 @@ pub struct Answers {
     pub is_exact: bool,
     /// No score is off by more.
     pub score_error_bound: f32,
+    /// Measured over a bank of texts, 999 of 1,000 scores are off by less; absent where answers are exact, and
+    /// where it was not measured.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub score_error_p999: Option<f32>,
     /// Whether all of the region asked for was fetched; absent without `radius` and `box`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub area_fetched: Option<bool>,

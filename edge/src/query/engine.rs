@@ -1,6 +1,6 @@
 //! A cache, a text model, and the questions to them: what the HTTP service and the command line share.
 
-use std::sync::{Arc, PoisonError, RwLock};
+use std::sync::{Arc, Mutex, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
@@ -11,7 +11,7 @@ use slag_common::shard::{Profile, ShardView};
 use slag_models::EncodeError;
 
 use super::{QueryRequest, Reply, RequestError, Scene, answer};
-use crate::score::{Question, ScoreError};
+use crate::score::{Question, ScoreError, Scratch};
 use crate::store::files::Stat;
 use crate::store::{EdgeCache, OpenShard, Snapshot, StoreError};
 use crate::text::{EncoderInfo, TextError, TextService};
@@ -172,12 +172,14 @@ pub struct Engine {
     cache: EdgeCache,
     text: TextService,
     loaded: RwLock<Loaded>,
+    /// Memory of answers that are over, one for each that was made at a time.
+    idle: Mutex<Vec<Scratch>>,
 }
 
 impl Engine {
     /// Joins a cache and a text model; nothing is loaded yet.
     pub fn new(cache: EdgeCache, text: TextService) -> Self {
-        Self { cache, text, loaded: RwLock::default() }
+        Self { cache, text, loaded: RwLock::default(), idle: Mutex::default() }
     }
 
     /// Returns which text encoder answers.
@@ -267,7 +269,11 @@ impl Engine {
         let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(OpenShard::view).collect();
         let fetched = (snapshot.current.centre_in_world, snapshot.current.radius);
         let scene = Scene { shards: &shards, manifest: &snapshot.manifest, fetched };
-        let answers = answer(&scene, &questions, request)?;
+        let idle = || self.idle.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut scratch = idle().pop().unwrap_or_default();
+        let answers = answer(&mut scratch, &scene, &questions, request);
+        idle().push(scratch);
+        let answers = answers?;
         Ok(Reply { snapshot, near: request.near, answers })
     }
 }

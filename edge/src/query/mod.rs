@@ -23,7 +23,9 @@ pub use request::{
 };
 pub use threshold::{RELEVANCY_THRESHOLD, ThresholdSource, calibrated_threshold};
 
-use crate::score::{Question, RELEVANCY_STEEPNESS, ScoreError, Search, relevancy, score_of_relevancy};
+use crate::score::{
+    Question, RELEVANCY_STEEPNESS, ScoreError, Scratch, Search, relevancy, score_of_relevancy,
+};
 use cluster::{Cluster, Grouping, cluster};
 
 /// Edge of the voxels in a metric scene, metres: parts of one piece of furniture are nearer to each
@@ -47,15 +49,17 @@ pub struct Scene<'a> {
 /// Answers a checked request about a scene: one answer to each question, in their order. `questions`: the
 /// vectors of the request's texts, each with those of its negatives.
 ///
-/// Same scene, vectors and request: same answers, for any number of threads, asked alone or together.
+/// Same scene, vectors and request: same answers, for any number of threads, asked alone or together. `scratch`:
+/// memory that earlier answers used, or new.
 /// # Errors
 /// [`ScoreError`].
 pub fn answer(
+    scratch: &mut Scratch,
     scene: &Scene<'_>,
     questions: &[Question],
     request: &QueryRequest,
 ) -> Result<Vec<Answers>, ScoreError> {
-    let searches = Search::batch(scene.shards, questions, request.region(), request.precision())?;
+    let searches = Search::batch(scratch, scene.shards, questions, request.region(), request.precision)?;
     let asked = request.texts.iter().zip(questions).zip(&searches);
     Ok(asked.map(|((text, question), search)| answer_one(scene, text, question, search, request)).collect())
 }
@@ -72,11 +76,13 @@ fn answer_one(
     let (threshold, threshold_source) = scale.threshold(request, manifest);
     let score_threshold = scale.to_score(threshold);
     let limit = request.limit.unwrap_or(DEFAULT_LIMIT);
-    let mut matches = search.matching(score_threshold);
-    matches.runs.iter_mut().for_each(|run| run.score = scale.shown(run.score));
     let mut clustering = None;
+    let n_matching;
     let found = match request.level {
         Level::Clusters => {
+            let mut matches = search.matching(score_threshold);
+            matches.runs.iter_mut().for_each(|run| run.score = scale.shown(run.score));
+            n_matching = matches.n_gaussians;
             let voxel = request.voxel.unwrap_or_else(|| default_voxel(manifest));
             let grouping =
                 Grouping { voxel, min_count: request.min_count, threshold, alignment: alignment(manifest) };
@@ -92,11 +98,15 @@ fn answer_one(
         }
         Level::Gaussians => {
             let mut hits = search.best(limit, score_threshold, request.near);
+            // Where all are listed, nobody need count them again.
+            let is_whole = hits.len() < limit;
+            n_matching =
+                if is_whole { hits.len() as u64 } else { search.matching(score_threshold).n_gaussians };
             hits.iter_mut().for_each(|hit| hit.score = scale.shown(hit.score));
             Found::Gaussians(hits)
         }
     };
-    let reason = found.is_empty().then(|| reason(search, scale, request, threshold, matches.n_gaussians));
+    let reason = found.is_empty().then(|| reason(search, scale, request, threshold, n_matching));
     // Gaussians of exact shards are listed with their own scores, clusters with their rows'.
     let score_error_bound = scale.error_bound(match (search.is_exact(), request.level) {
         (true, Level::Gaussians) => question.rounding_bound(),
@@ -113,9 +123,14 @@ fn answer_one(
         threshold,
         threshold_source,
         n_searched: search.searched().map(|shard| shard.n_with_evidence() as u64).sum(),
-        n_matching: matches.n_gaussians,
+        n_matching,
         is_exact: search.is_exact(),
         score_error_bound,
+        score_error_p999: search.measured_errors().map(|errors| {
+            // With negatives a score is the difference of two.
+            let n_products = if question.negatives.is_empty() { 1.0 } else { 2.0 };
+            scale.error_bound(n_products * errors.p999)
+        }),
         area_fetched: area_fetched(scene.fetched, request),
         clustering,
         reason,

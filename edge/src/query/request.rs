@@ -168,8 +168,8 @@ pub struct QueryRequest {
     pub voxel: Option<f64>,
     /// Clusters with fewer Gaussians are dropped, and counted.
     pub min_count: u64,
-    /// Whether exact embeddings are used, of shards that carry them.
-    pub exact: bool,
+    /// Which data scores come from.
+    pub precision: Precision,
 }
 
 impl QueryRequest {
@@ -186,7 +186,7 @@ impl QueryRequest {
             level: Level::default(),
             voxel: None,
             min_count: DEFAULT_MIN_COUNT,
-            exact: true,
+            precision: Precision::default(),
         }
     }
 
@@ -273,11 +273,6 @@ impl QueryRequest {
         let ball = self.near.zip(self.radius);
         let ball = ball.map(|(centre_in_world, radius)| Ball { centre_in_world, radius });
         Region { ball, bounds: self.bounds }
-    }
-
-    /// Returns which data scores come from.
-    pub fn precision(&self) -> Precision {
-        if self.exact { Precision::Exact } else { Precision::Rows }
     }
 }
 

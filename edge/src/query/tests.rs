@@ -1,6 +1,7 @@
 use slag_common::frames::{Aabb, GeoReference, Geographic};
 
 use super::*;
+use crate::score::{Precision, Scratch};
 use crate::testing::{BuiltShard, Member, TestShard, manifest_of, normalised};
 
 /// A cell whose single row of `n` Gaussians sits at a place, 1 cm apart, at a cosine to axis 0.
@@ -24,7 +25,7 @@ fn ask_about(
     request.check().expect("a sound request");
     let shards: Vec<_> = built.iter().map(BuiltShard::view).collect();
     let scene = Scene { shards: &shards, manifest: &manifest, fetched: (DVec3::ZERO, 50.0) };
-    answer(&scene, questions, &request).expect("answers")
+    answer(&mut Scratch::default(), &scene, questions, &request).expect("answers")
 }
 
 fn described(built: &[BuiltShard], answers: &Answers, near: Option<DVec3>) -> Vec<GaussianAnswer> {
@@ -163,7 +164,8 @@ fn exact_shards_answer_exactly() {
 #[test]
 fn exactness_is_a_choice() {
     let exact = [thing(1, DVec3::ZERO, 30, 0.7).build(true)];
-    let rows = ask(&exact, |request, _| (request.level, request.exact) = (Level::Gaussians, false));
+    let rows =
+        ask(&exact, |request, _| (request.level, request.precision) = (Level::Gaussians, Precision::Rows));
     let compact = [thing(1, DVec3::ZERO, 30, 0.7).build(false)];
     assert_eq!(rows, ask(&compact, |request, _| request.level = Level::Gaussians));
     assert!(!rows.is_exact && rows.score_error_bound > 1e-5, "{}", rows.score_error_bound);

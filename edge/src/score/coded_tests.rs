@@ -5,7 +5,7 @@ use slag_common::shard::{MAX_GROUPS, ShardLayout};
 
 use super::tests::{random_question, score_in_f64, views};
 use super::*;
-use crate::testing::coded::CodedShard;
+use crate::testing::coded::{CODE_ERROR, CodedShard, FINE_ERROR};
 use crate::testing::{BuiltShard, Random};
 use glam::DVec3;
 use half::f16;
@@ -24,16 +24,22 @@ const SHAPES: [(usize, usize, bool, usize); 10] = [
     (515, 3, true, 2),
 ];
 
-fn shards(
+fn shards(random: &mut Random, shape: (usize, usize, bool, usize)) -> Vec<BuiltShard> {
+    shards_of(random, shape, false)
+}
+
+fn shards_of(
     random: &mut Random,
     (dim, n_components, has_basis, n_groups): (usize, usize, bool, usize),
+    is_exact: bool,
 ) -> Vec<BuiltShard> {
     // Rows that end in blocks, at their ends, and fill several.
     let lens = [&[1, 31, 32, 33, 70, 64, 5][..], &[1], &[3; 40]];
     let mut build = |(at, lens): (usize, &[usize])| {
         let cell_id = 9 - at as u32;
         let origin = DVec3::new(12.0 * at as f64, 0.0, 0.0);
-        CodedShard { cell_id, dim, n_components, has_basis, n_groups, row_lens: lens.to_vec(), origin }
+        let row_lens = lens.to_vec();
+        CodedShard { cell_id, dim, n_components, has_basis, n_groups, is_exact, row_lens, origin }
             .build(random)
     };
     lens.into_iter().enumerate().map(&mut build).collect()
@@ -45,7 +51,7 @@ fn defined_score(search: &Search<'_>, shard_at: usize, index: usize) -> f32 {
     let (row, scores) = (shard.row_of(index), &search.scored.shards[shard_at]);
     let product = |place: &usize| {
         let own = scores.rows[*place][row];
-        let Some(residuals) = shard.residuals.filter(|_| search.precision == Precision::Exact) else {
+        let Some(residuals) = shard.residuals.filter(|_| search.precision != Precision::Rows) else {
             return own;
         };
         let (tables, scale) = (&scores.projections[*place].tables, residuals.row_scales[row]);
@@ -80,7 +86,7 @@ fn scores_are_within_the_stated_error() {
                         let found = f64::from(defined_score(&search, at, index));
                         let mut decoded = vec![0.0; shape.0];
                         match precision {
-                            Precision::Exact => shard.decode(index, &mut decoded),
+                            Precision::Exact | Precision::Measured => shard.decode(index, &mut decoded),
                             Precision::Rows => shard.decode_row(row, &mut decoded),
                         }
                         let rounding = (found - score_in_f64(&question, decoded.iter().copied())).abs();
@@ -162,7 +168,7 @@ fn answers_are_those_of_brute_force() {
                 let mut columns = Columns::default();
                 columns.set_runs(&views, &matches.runs);
                 assert_eq!(columns.index, found.iter().map(|(hit, _)| hit.index).collect::<Vec<_>>());
-                n_scanned += matches.n_rescored;
+                n_scanned += matches.effort.n_rescored;
                 n_all += all.len() as u64;
                 let mut ranked: Vec<Hit> = expected.into_iter().copied().collect();
                 let cell = |hit: &Hit| views[hit.shard as usize].header.cell_id;
@@ -189,6 +195,93 @@ fn answers_are_those_of_brute_force() {
     }
     assert!(n_scanned * 2 < n_all, "the rows served for nothing: {n_scanned} of {n_all}");
     assert!(n_scanned * 20 > n_all, "hardly any code was read: {n_scanned} of {n_all}");
+}
+
+/// Oracle: each Gaussian's scores by code, fine residual and embedding, as the format and the module define them,
+/// and what is in by those.
+#[test]
+fn measured_errors_decide_as_defined() {
+    let mut random = Random(24);
+    let (mut n_fine, mut n_embeddings, mut n_all) = (0, 0, 0);
+    for shape in SHAPES.into_iter().filter(|shape| shape.3 > 0) {
+        let built = shards_of(&mut random, shape, true);
+        let views = views(&built);
+        for n_negatives in [0, 2] {
+            let question = random_question(&mut random, shape.0, n_negatives);
+            let measured = Precision::Measured;
+            let search = Search::new(&views, &question, Region::default(), measured).expect("valid");
+            assert!(!search.is_exact());
+            let n_products = if n_negatives == 0 { 1.0 } else { 2.0 };
+            let (code_margin, fine_margin) = (3.0 * n_products * CODE_ERROR, 3.0 * n_products * FINE_ERROR);
+            // By code, fine residual, embedding.
+            let scores = |at: usize, index: usize| -> [f32; 3] {
+                let (shard, mut decoded) = (&views[at], vec![0.0; shape.0]);
+                let exact = shard.exact.expect("exact");
+                shard.decode_fine(index, &exact.fine.expect("fine"), &mut decoded);
+                let cell = search.cell(at).expect("searched");
+                let (row, fine) = (shard.row_of(index), score_in_f64(&question, decoded.iter().copied()));
+                let (of_row, bound) = (f64::from(cell.rows[row]), f64::from(cell.embedding_bound(row)));
+                let fine = fine.clamp(of_row - bound, of_row + bound);
+                let embedding = &exact.embeddings[index * shape.0..][..shape.0];
+                let exact = score_in_f64(&question, embedding.iter().map(|v| v.to_f64()));
+                [defined_score(&search, at, index), fine as f32, exact as f32]
+            };
+            let mut all: Vec<(u32, u32, [f32; 3])> = Vec::new();
+            for (at, view) in views.iter().enumerate() {
+                let of_shard = (0..view.n_with_evidence()).map(|i| (at as u32, i as u32, scores(at, i)));
+                all.extend(of_shard);
+            }
+            // Products are rounded to 16 bits, and that decides in a few cases.
+            let rounding = 1e-3 * n_products;
+            let mut codes: Vec<f32> = all.iter().map(|(_, _, scores)| scores[0]).collect();
+            codes.sort_by(|a, b| b.total_cmp(a));
+            for rank in [0, 5, 50, 200, codes.len() - 1] {
+                let threshold = codes[rank];
+                let matches = search.matching(threshold);
+                n_fine += matches.effort.n_fine_read;
+                n_embeddings += matches.effort.n_embeddings_read;
+                n_all += all.len() as u64;
+                let members =
+                    |run: &Run| (run.start..run.end).map(|index| (run.shard, index)).collect::<Vec<_>>();
+                let found: Vec<(u32, u32)> = matches.runs.iter().flat_map(members).collect();
+                assert!(found.is_sorted(), "{shape:?}");
+                for (at, index, [code, fine, exact]) in &all {
+                    let is_near = |score: f32, border: f32| (score - border).abs() <= rounding;
+                    let is_in = if (code - threshold).abs() >= code_margin {
+                        *code >= threshold
+                    } else if (fine - threshold).abs() > fine_margin {
+                        *fine >= threshold
+                    } else {
+                        *exact >= threshold
+                    };
+                    let is_close = is_near(*code, threshold + code_margin)
+                        || is_near(*code, threshold - code_margin)
+                        || [threshold - fine_margin, threshold + fine_margin]
+                            .iter()
+                            .any(|b| is_near(*fine, *b))
+                        || is_near(*exact, threshold);
+                    let is_found = found.binary_search(&(*at, *index)).is_ok();
+                    assert!(is_close || is_found == is_in, "{shape:?} {code} {fine} {exact} {threshold}");
+                }
+                let limit = rank + 1;
+                let best = search.best(limit, f32::NEG_INFINITY, None);
+                assert_eq!(best.len(), limit, "{shape:?}");
+                assert!(best.is_sorted_by(|a, b| a.score >= b.score));
+                // Ranks are counted in steps of 1/2048.
+                let (border, slack) = (threshold, 1.0 / 2048.0 + rounding);
+                for hit in &best {
+                    let at = all.iter().find(|(at, index, _)| (*at, *index) == (hit.shard, hit.index));
+                    let [code, fine, exact] = at.expect("known").2;
+                    assert!(code >= border - code_margin - slack, "{code} {border}");
+                    let is_one =
+                        [code, fine, exact].iter().any(|score| (score - hit.score).abs() <= rounding);
+                    assert!(is_one, "{shape:?} {} of {code} {fine} {exact}", hit.score);
+                }
+            }
+        }
+    }
+    assert!(n_fine * 2 < n_all && n_embeddings * 2 < n_fine, "{n_all} {n_fine} {n_embeddings}");
+    assert!(n_fine * 50 > n_all && n_embeddings > 0, "{n_all} {n_fine} {n_embeddings}");
 }
 
 /// A shard may state anything that the format allows, at its largest.

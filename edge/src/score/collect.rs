@@ -4,13 +4,18 @@ use std::ops::Range;
 
 use half::f16;
 use rayon::prelude::*;
-use slag_common::shard::{BLOCK, Residuals, ShardView};
+use slag_common::shard::{BLOCK, ExactColumns, Residuals, ShardView};
 
+use super::dot::EmbeddingTimesVector;
 use super::project::Projection;
 use super::rows::{ShardScores, combine};
 use super::select::{BINS, bin_of};
-use super::simd::{AtLeast, BlockSums, Level};
-use super::{Effort, F16_ROUNDING, Matches, Precision, Region, Run, Search, dot};
+use super::simd::{BlockSums, FindSums, LastBlock, Level, SomeRowsTimesVector};
+use super::{Effort, F16_ROUNDING, Matches, Precision, Region, Run, Search};
+
+/// With measured errors, what codes or fine residuals leave within so many mean errors of the border is
+/// looked at more closely. Of a generated field's best 1,000 to 100,000, 0.99 and more are then found.
+const UNDECIDED: f32 = 3.0;
 
 /// Runs on their way to an answer, and what finding them takes; kept from one answer to the next.
 #[derive(Default)]
@@ -25,11 +30,18 @@ impl Gather {
     /// Returns what the gathering took.
     pub fn effort(&self) -> Effort {
         let mut effort = Effort::default();
-        for ShardGather { found, .. } in &self.shards {
-            effort += Effort { n_rescored: found.n_rescored, n_blocks_read: found.n_blocks_read };
-        }
+        self.shards.iter().for_each(|of_shard| effort += of_shard.found.effort);
         effort
     }
+}
+
+/// Which scores are in.
+#[derive(Clone, Copy)]
+pub(super) struct Cut {
+    /// The score of the last that are.
+    pub score: f32,
+    /// None below is in, though that score is an estimate.
+    pub least: f32,
 }
 
 /// What one shard contributes.
@@ -37,13 +49,27 @@ impl Gather {
 pub(super) struct ShardGather {
     pub found: Matches,
     /// Sums of codes of one block, by vector of the question.
-    sums: Vec<[u16; BLOCK]>,
-    /// The block that these are of.
-    block: Option<usize>,
+    last: Vec<LastBlock>,
+    /// Members of one row that reach a sum.
+    sums: Vec<(u32, u16)>,
+    refine: Refine,
     /// Whether matches are only to be counted.
     is_counting: bool,
     /// How many have a score in each part of the range of scores; empty where there is none.
     pub bins: Vec<u32>,
+}
+
+/// Memory for members of one row that are looked at more closely.
+#[derive(Default)]
+struct Refine {
+    /// Members with the scores of their codes, then better ones.
+    members: Vec<(u32, f32)>,
+    /// Places in `members` and members whose codes do not decide.
+    undecided: Vec<(usize, f32)>,
+    which: Vec<u32>,
+    products: Vec<i32>,
+    /// `[vectors][undecided]`.
+    scores: Vec<f32>,
 }
 
 /// What members are scored by, beyond their row.
@@ -52,6 +78,34 @@ enum Detail<'a> {
     Nothing,
     Residuals(Residuals<'a>),
     Embeddings(&'a [f16]),
+    Measured(Measured<'a>),
+}
+
+/// Codes, fine residuals and embeddings, and how far from the border the errors of each matter.
+#[derive(Clone, Copy)]
+struct Measured<'a> {
+    residuals: Residuals<'a>,
+    exact: ExactColumns<'a>,
+    code_margin: f32,
+    fine_margin: f32,
+}
+
+impl<'a> Measured<'a> {
+    /// `n_products`: of which a score is the difference.
+    fn new(
+        shard: &ShardView<'a>,
+        residuals: Residuals<'a>,
+        exact: ExactColumns<'a>,
+        n_products: f32,
+    ) -> Self {
+        let margin = |mean: f32| UNDECIDED * n_products * mean;
+        Self {
+            residuals,
+            exact,
+            code_margin: margin(shard.header.errors.mean),
+            fine_margin: margin(exact.fine.map_or(0.0, |fine| fine.errors.mean)),
+        }
+    }
 }
 
 /// One question's view of a shard.
@@ -87,6 +141,13 @@ impl<'a> Search<'a> {
         };
         let detail = match (&shard.exact, &shard.residuals) {
             _ if self.precision == Precision::Rows => Detail::Nothing,
+            // Codes whose errors were not measured say nothing.
+            (Some(exact), Some(residuals))
+                if self.precision == Precision::Measured && shard.header.errors.mean > 0.0 =>
+            {
+                let n_products = if self.places.len() == 1 { 1.0 } else { 2.0 };
+                Detail::Measured(Measured::new(shard, *residuals, *exact, n_products))
+            }
             (Some(exact), _) => Detail::Embeddings(exact.embeddings),
             (None, Some(residuals)) => Detail::Residuals(*residuals),
             (None, None) => Detail::Nothing,
@@ -113,13 +174,13 @@ impl<'a> Search<'a> {
 
     /// Gathers what reaches a threshold. `each`: members of shards that know more of them than their row get
     /// scores of their own even where the row alone decides.
-    pub(super) fn collect(&self, gather: &mut Gather, threshold: f32, each: bool) {
+    pub(super) fn collect(&self, gather: &mut Gather, cut: Cut, each: bool) {
         gather.shards.resize_with(self.shards.len(), ShardGather::default);
         gather.shards.par_iter_mut().enumerate().for_each(|(at, gather)| {
             gather.found.clear();
             gather.is_counting = false;
             if let Some(cell) = self.cell(at) {
-                cell.collect(gather, threshold, each, f32::NEG_INFINITY);
+                cell.collect(gather, cut, each, f32::NEG_INFINITY);
             }
         });
     }
@@ -132,7 +193,7 @@ impl<'a> Search<'a> {
             gather.is_counting = true;
             gather.bins.clear();
             if let Some(cell) = self.cell(at) {
-                cell.collect(gather, threshold, true, floor);
+                cell.collect(gather, Cut { score: threshold, least: threshold }, true, floor);
             }
         });
     }
@@ -199,7 +260,7 @@ impl Cell<'_> {
                 let slack = self.embedding_bound(row);
                 (score - slack, score + slack)
             }
-            Detail::Residuals(residuals) => {
+            Detail::Residuals(residuals) | Detail::Measured(Measured { residuals, .. }) => {
                 let apart = self.residual_bound(row, residuals);
                 if let [place] = self.search.places[..] {
                     let (least, step) = self.line(place, row, residuals);
@@ -222,7 +283,7 @@ impl Cell<'_> {
     }
 
     /// Returns by how much a stored embedding's score may differ from its row's.
-    fn embedding_bound(&self, row: usize) -> f32 {
+    pub fn embedding_bound(&self, row: usize) -> f32 {
         let question = self.search.question;
         let distance = self.shard.radii[row] + F16_ROUNDING;
         self.search.steepness * distance + 2.0 * question.rounding_bound() + self.row_error(row)
@@ -243,9 +304,16 @@ impl Cell<'_> {
     /// a residual code.
     pub fn score_error(&self, row: usize) -> f32 {
         let of_rows = self.search.steepness * self.shard.radii[row] + self.row_error(row);
+        let of_codes = |residuals: &Residuals<'_>| {
+            of_rows + residuals.row_scales[row] * self.table_error + self.rounding(row, residuals)
+        };
         match (&self.detail, &self.shard.residuals) {
-            (Detail::Residuals(residuals), _) => {
-                of_rows + residuals.row_scales[row] * self.table_error + self.rounding(row, residuals)
+            (Detail::Residuals(residuals), _) => of_codes(residuals),
+            // Beside exact embeddings, radii are measured to the row.
+            (Detail::Measured(Measured { residuals, .. }), _) => {
+                let by_code = of_codes(residuals) + residuals.reaches[row] * self.component_steepness;
+                // Score and truth lie within that bound of the row's score.
+                by_code.max(2.0 * self.embedding_bound(row))
             }
             // Radii are measured to what row and code decode to.
             (_, Some(residuals)) if self.shard.exact.is_none() => {
@@ -255,28 +323,41 @@ impl Cell<'_> {
         }
     }
 
-    fn collect(&self, gather: &mut ShardGather, threshold: f32, each: bool, floor: f32) {
-        gather.block = None;
+    fn collect(&self, gather: &mut ShardGather, cut: Cut, each: bool, floor: f32) {
+        gather.last.clear();
+        gather.last.resize_with(self.search.places.len(), LastBlock::default);
+        let margin = match self.detail {
+            Detail::Measured(Measured { code_margin, .. }) if !gather.is_counting => code_margin,
+            _ => 0.0,
+        };
         let mut is_reachable = false;
         for row in 0..self.rows.len() {
             if self.rows[row] < floor {
                 continue;
             }
             let (lower, upper) = self.bounds(row);
-            if upper < threshold {
+            if upper + margin < cut.score {
                 continue;
             }
             is_reachable = true;
-            let is_undecided = lower < threshold;
+            let is_undecided = lower - margin < cut.score;
             let is_scanned = is_undecided || each;
             let members = self.shard.row_starts[row] as usize..self.shard.row_starts[row + 1] as usize;
             for inside in runs_inside(self.shard, self.filter, members) {
                 match self.detail {
                     Detail::Residuals(residuals) if is_scanned => {
-                        self.scan(gather, &residuals, row, inside, threshold);
+                        self.scan(gather, &residuals, row, inside, cut.score);
+                        self.push_scanned(gather);
+                    }
+                    Detail::Measured(measured) if is_scanned => {
+                        self.scan(gather, &measured.residuals, row, inside, cut.score - margin);
+                        if margin > 0.0 {
+                            self.refine(gather, &measured, row, cut);
+                        }
+                        self.push_scanned(gather);
                     }
                     Detail::Embeddings(embeddings) if is_scanned => {
-                        self.rescore(gather, embeddings, inside, threshold);
+                        self.rescore(gather, embeddings, inside, cut.score);
                     }
                     _ => self.push(gather, inside, self.rows[row]),
                 }
@@ -298,19 +379,25 @@ impl Cell<'_> {
     }
 
     fn rescore(&self, gather: &mut ShardGather, embeddings: &[f16], members: Range<usize>, threshold: f32) {
-        gather.found.n_rescored += members.len() as u64;
-        let dim = self.shard.header.dim as usize;
+        gather.found.effort.n_rescored += members.len() as u64;
+        gather.found.effort.n_embeddings_read += members.len() as u64;
         for at in members {
-            let embedding = &embeddings[at * dim..][..dim];
-            let mut products = self.search.question.vectors().map(|vector| dot(embedding, vector));
-            let score = combine(products.next().unwrap_or(0.0), products);
+            let score = self.exact_score(embeddings, at);
             if score >= threshold {
                 self.push(gather, at..at + 1, score);
             }
         }
     }
 
-    /// Scores members of a row by their codes.
+    fn exact_score(&self, embeddings: &[f16], at: usize) -> f32 {
+        let dim = self.shard.header.dim as usize;
+        let embedding = &embeddings[at * dim..][..dim];
+        let product = |vector| self.level.dispatch(EmbeddingTimesVector(embedding, vector));
+        let mut products = self.search.question.vectors().map(product);
+        combine(products.next().unwrap_or(0.0), products)
+    }
+
+    /// Scores members of a row by their codes; those that reach the threshold are kept in `gather.refine`.
     fn scan(
         &self,
         gather: &mut ShardGather,
@@ -319,55 +406,111 @@ impl Cell<'_> {
         members: Range<usize>,
         threshold: f32,
     ) {
-        gather.found.n_rescored += members.len() as u64;
+        gather.found.effort.n_rescored += members.len() as u64;
+        gather.refine.members.clear();
+        let ShardGather { last, sums, refine, found, .. } = gather;
+        let [first, others @ ..] = &mut last[..] else { return };
         let places = &self.search.places;
+        let tables = &self.scores.projections[places[0]].tables;
         let (own, step) = self.line(places[0], row, residuals);
-        let most = self.scores.projections[places[0]].tables.most;
         // The score grows with the sum, so that sums are compared and only what matches is scored.
-        let least = if places.len() == 1 { least_sum(own, step, most, threshold) } else { Some(0) };
+        let is_single = places.len() == 1;
+        let least = if is_single { least_sum(own, step, tables.most, threshold) } else { Some(0) };
         let Some(least) = least else { return };
-        for block in members.start / BLOCK..members.end.div_ceil(BLOCK) {
-            if gather.block != Some(block) {
-                self.sum_block(gather, residuals, block);
-            }
-            let first = block * BLOCK;
-            let (start, end) = (members.start.saturating_sub(first), (members.end - first).min(BLOCK));
-            let of_row = (u32::MAX << start) & (u32::MAX >> (BLOCK - end));
-            let mut reaching = of_row & self.level.dispatch(AtLeast { sums: &gather.sums[0], least });
-            while reaching != 0 {
-                let at = reaching.trailing_zeros() as usize;
-                reaching &= reaching - 1;
-                let score = match places.len() {
-                    1 => own + step * f32::from(gather.sums[0][at]) + 0.0,
-                    _ => self.score_of_sums(&gather.sums, at, row, residuals),
-                };
-                if score >= threshold {
-                    self.push(gather, first + at..first + at + 1, score);
-                }
-            }
-        }
-    }
-
-    /// Returns the score of the member of a block, made of one sum for each vector.
-    fn score_of_sums(&self, sums: &[[u16; BLOCK]], at: usize, row: usize, residuals: &Residuals<'_>) -> f32 {
-        let mut products = self.search.places.iter().zip(sums).map(|(place, sums)| {
-            let (least, step) = self.line(*place, row, residuals);
-            least + step * f32::from(sums[at])
+        sums.clear();
+        found.effort.n_blocks_read += self.level.dispatch(FindSums {
+            columns: residuals.codes.as_chunks::<BLOCK>().0,
+            low: &tables.low,
+            high: &tables.high,
+            members,
+            least,
+            last: first,
+            found: sums,
         });
-        combine(products.next().unwrap_or(0.0), products)
+        if is_single {
+            let score = |(at, sum): &(u32, u16)| (*at, own + step * f32::from(*sum) + 0.0);
+            refine.members.extend(sums.iter().map(score));
+            return;
+        }
+        for (at, sum) in sums.iter() {
+            let (block, within) = (*at as usize / BLOCK, *at as usize % BLOCK);
+            let negatives = others.iter_mut().zip(&places[1..]).map(|(last, place)| {
+                if last.block != Some(block) {
+                    *last = self.sum_block(residuals, *place, block);
+                }
+                let (least, step) = self.line(*place, row, residuals);
+                least + step * f32::from(last.sums[within])
+            });
+            let score = combine(own + step * f32::from(*sum), negatives);
+            if score >= threshold {
+                refine.members.push((*at, score));
+            }
+        }
     }
 
-    fn sum_block(&self, gather: &mut ShardGather, residuals: &Residuals<'_>, block: usize) {
-        let n_columns = (residuals.group_starts.len() - 1) / 2;
-        let columns = &residuals.codes.as_chunks::<BLOCK>().0[block * n_columns..][..n_columns];
-        gather.sums.clear();
-        for place in &self.search.places {
-            let tables = &self.scores.projections[*place].tables;
-            let work = BlockSums { columns, low: &tables.low, high: &tables.high };
-            gather.sums.push(self.level.dispatch(work));
+    fn sum_block(&self, residuals: &Residuals<'_>, place: usize, block: usize) -> LastBlock {
+        let tables = &self.scores.projections[place].tables;
+        let columns = &residuals.codes.as_chunks::<BLOCK>().0[block * tables.low.len()..][..tables.low.len()];
+        let work = BlockSums { columns, low: &tables.low, high: &tables.high };
+        LastBlock { block: Some(block), sums: self.level.dispatch(work) }
+    }
+
+    fn push_scanned(&self, gather: &mut ShardGather) {
+        let ShardGather { refine, found, bins, is_counting, .. } = gather;
+        if *is_counting {
+            bins.resize(BINS, 0);
+            refine.members.iter().for_each(|(_, score)| bins[bin_of(*score)] += 1);
+            return;
         }
-        gather.block = Some(block);
-        gather.found.n_blocks_read += 1;
+        found.n_gaussians += refine.members.len() as u64;
+        let run = |(at, score): &(u32, f32)| Run { shard: self.at, start: *at, end: at + 1, score: *score };
+        found.runs.extend(refine.members.iter().map(run));
+    }
+
+    /// Scores members near the border by what is known better of them, and drops those that are out.
+    fn refine(&self, gather: &mut ShardGather, measured: &Measured<'_>, row: usize, cut: Cut) {
+        let ShardGather { refine, found, .. } = gather;
+        let Refine { members, undecided, which, products, scores } = refine;
+        undecided.clear();
+        which.clear();
+        for (place, (at, score)) in members.iter().enumerate() {
+            if *score < cut.score + measured.code_margin {
+                undecided.push((place, *score));
+                which.push(*at);
+            }
+        }
+        if let Some(fine) = &measured.exact.fine {
+            found.effort.n_fine_read += which.len() as u64;
+            scores.clear();
+            for place in &self.search.places {
+                let rounded = &self.scores.projections[*place].fine;
+                let n_components = self.shard.header.n_components as usize;
+                let (rows, vector) = (fine.values, &rounded.steps[..]);
+                self.level.dispatch(SomeRowsTimesVector { rows, n_components, vector, which, products });
+                let (own, step) = (self.scores.rows[*place][row], f64::from(fine.scales[row]) * rounded.step);
+                scores.extend(products.iter().map(|product| own + (step * f64::from(*product)) as f32));
+            }
+            for (number, (place, _)) in undecided.iter().enumerate() {
+                let mut products = scores[number..].iter().step_by(which.len()).copied();
+                let score = combine(products.next().unwrap_or(0.0), products);
+                // Where the embedding's own score is, whatever the residual says.
+                let (of_row, bound) = (self.rows[row], self.embedding_bound(row));
+                members[*place].1 = score.max(of_row - bound).min(of_row + bound);
+            }
+        }
+        for (place, of_code) in undecided.iter() {
+            let (at, score) = &mut members[*place];
+            if measured.exact.fine.is_none() || (*score - cut.score).abs() <= measured.fine_margin {
+                found.effort.n_embeddings_read += 1;
+                *score = self.exact_score(measured.exact.embeddings, *at as usize);
+            }
+            // What was in by its code stays unless it is below the least: as many are found as were sought.
+            let is_out = *of_code < cut.score && *score < cut.score - measured.fine_margin;
+            if is_out || *score < cut.least {
+                *score = f32::NEG_INFINITY;
+            }
+        }
+        members.retain(|(_, score)| *score > f32::NEG_INFINITY);
     }
 }
 

@@ -2,6 +2,8 @@
 
 use half::f16;
 
+use super::simd::{Kernels, Work};
+
 /// Sums that are kept apart until the end: one AVX register, two of SSE or NEON.
 const LANES: usize = 8;
 /// Components multiplied at a time; the products stay in the first-level cache.
@@ -10,6 +12,7 @@ const BLOCK: usize = 512;
 /// Returns a finite f16 as f32, exactly, in operations that every vector unit has: the bits are moved
 /// into place, and the exponents' biases differ by 127 - 15 = 112. (Conversion instructions would have
 /// to be called through a runtime check, every few components.)
+#[inline(always)]
 pub(super) fn widen(value: f16) -> f32 {
     const BIAS: f32 = f32::from_bits((127 + 112) << 23);
     let bits = u32::from(value.to_bits());
@@ -19,6 +22,7 @@ pub(super) fn widen(value: f16) -> f32 {
 /// Returns `row · vector`, summed in f32 in a fixed order: the same bits on every machine and for
 /// any number of threads. Components past the shorter one's end are ignored; the row must be finite
 /// (a checked shard's is).
+#[inline(always)]
 pub fn dot(row: &[f16], vector: &[f32]) -> f32 {
     let mut lanes = [0.0f32; LANES];
     let mut products = [0.0f32; BLOCK];
@@ -34,12 +38,28 @@ pub fn dot(row: &[f16], vector: &[f32]) -> f32 {
         while width > LANES {
             width /= 2;
             let (low, high) = products.split_at_mut(width);
-            low.iter_mut().zip(&*high).for_each(|(a, b)| *a += b);
+            for (a, b) in low.iter_mut().zip(&*high) {
+                *a += b;
+            }
         }
-        lanes.iter_mut().zip(&products).for_each(|(lane, product)| *lane += product);
+        for (lane, product) in lanes.iter_mut().zip(&products) {
+            *lane += product;
+        }
     }
     let [a, b, c, d, e, f, g, h] = lanes;
     ((a + e) + (c + g)) + ((b + f) + (d + h))
+}
+
+/// [`dot`] for an instruction set: wider vectors, the same sums.
+pub(super) struct EmbeddingTimesVector<'a>(pub &'a [f16], pub &'a [f32]);
+
+impl Work for EmbeddingTimesVector<'_> {
+    type Output = f32;
+
+    #[inline(always)]
+    fn run<K: Kernels>(self, _: K) -> f32 {
+        dot(self.0, self.1)
+    }
 }
 
 /// Returns a bound on the error of [`dot`] for unit vectors: each product passes at most 1 + 6
@@ -54,6 +74,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::score::simd::Level;
 
     /// Oracle: the half crate's conversion, over every finite f16.
     #[test]
@@ -74,6 +95,10 @@ mod tests {
             let absolute: f64 = terms().map(f64::abs).sum();
             let bound = f64::from(rounding_bound(pairs.len())) * absolute + 1e-30;
             prop_assert!((f64::from(dot(&row, &vector)) - expected).abs() <= bound);
+            for level in Level::available() {
+                let found = level.dispatch(EmbeddingTimesVector(&row, &vector));
+                prop_assert_eq!(found.to_bits(), dot(&row, &vector).to_bits(), "{}", level.name());
+            }
         }
     }
 }

@@ -8,6 +8,10 @@
 //! between are scored one by one. Where it does not, a row is in when its own score reaches the threshold,
 //! and the answer carries the bound.
 //!
+//! Hard bounds of codes are tens of times their usual errors, so that exact answers read most embeddings near the
+//! border. With [`Precision::Measured`], codes decide all but what lies within a few of their measured errors
+//! from it, fine residuals all of that but what lies within a few of theirs, and embeddings the rest.
+//!
 //! Scores of rows and codes are sums of integers, scaled once: the same bits on every processor.
 
 mod collect;
@@ -23,9 +27,10 @@ mod simd;
 use std::sync::{Arc, PoisonError};
 
 use rayon::prelude::*;
-use slag_common::shard::ShardView;
+use serde::Serialize;
+use slag_common::shard::{ScoreErrors, ShardView};
 
-use collect::{Cell, Gather, ShardGather};
+use collect::{Cell, Cut, Gather, ShardGather};
 use rows::Scored;
 
 pub use columns::Columns;
@@ -87,14 +92,49 @@ pub enum ScoreError {
 }
 
 /// Which data scores come from.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Precision {
     /// Palette rows alone: fastest, every score within the bound stated.
     Rows,
+    /// As `Exact`, but of shards with exact embeddings only those are read that the measured errors of codes,
+    /// and of fine residuals, leave near the border of the answer. Nearly all of the exact answer, tens of times
+    /// sooner; [`Search::measured_errors`] says how near its scores are.
+    Measured,
     /// Rows, and for what they cannot decide the residual codes or exact embeddings of shards that carry
     /// them.
     #[default]
     Exact,
+}
+
+impl Precision {
+    /// Every precision, fastest first.
+    pub const ALL: [Self; 3] = [Self::Rows, Self::Measured, Self::Exact];
+
+    /// Returns the name used in URLs and flags.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Rows => "rows",
+            Self::Measured => "measured",
+            Self::Exact => "exact",
+        }
+    }
+}
+
+impl std::fmt::Display for Precision {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+impl std::str::FromStr for Precision {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let names = || Self::ALL.map(Self::name).join(", ");
+        let found = Self::ALL.into_iter().find(|precision| precision.name() == text);
+        found.ok_or_else(|| format!("{text:?} is no precision; there are: {}", names()))
+    }
 }
 
 /// Matching Gaussians of one shard that lie next to each other and share a score.
@@ -119,10 +159,8 @@ pub struct Matches {
     pub n_gaussians: u64,
     /// Rows that could only be decided member by member.
     pub n_rows_undecided: u64,
-    /// Gaussians that were scored by themselves.
-    pub n_rescored: u64,
-    /// Blocks of residual codes that were read.
-    pub n_blocks_read: u64,
+    /// What finding them took.
+    pub effort: Effort,
     /// Shards none of whose rows can reach the threshold.
     pub n_shards_below: usize,
 }
@@ -143,12 +181,18 @@ pub struct Effort {
     pub n_rescored: u64,
     /// Blocks of residual codes that were read.
     pub n_blocks_read: u64,
+    /// Fine residuals that were read.
+    pub n_fine_read: u64,
+    /// Exact embeddings that were read.
+    pub n_embeddings_read: u64,
 }
 
 impl std::ops::AddAssign for Effort {
     fn add_assign(&mut self, other: Self) {
         self.n_rescored += other.n_rescored;
         self.n_blocks_read += other.n_blocks_read;
+        self.n_fine_read += other.n_fine_read;
+        self.n_embeddings_read += other.n_embeddings_read;
     }
 }
 
@@ -202,16 +246,17 @@ impl<'a> Search<'a> {
     ///
     /// Costs one product per row, component and distinct vector (negatives that questions share are
     /// multiplied once), in parallel by shard.
+    /// In the memory of earlier searches that are over (else in new memory).
     /// # Errors
     /// [`ScoreError`].
     pub fn batch(
+        scratch: &mut Scratch,
         shards: &'a [ShardView<'a>],
         questions: &'a [Question],
         region: Region,
         precision: Precision,
     ) -> Result<Vec<Self>, ScoreError> {
         questions.iter().try_for_each(|question| check(shards, question))?;
-        let mut scratch = Scratch::default();
         let places = scratch.take().score(shards, questions, region, precision);
         let searches = questions.iter().zip(places).enumerate().map(|(asked, (question, places))| {
             let (scored, steepness) = (scratch.share(), question.steepness());
@@ -230,15 +275,14 @@ impl<'a> Search<'a> {
     /// As [`Search::matching`], into a list that is cleared before.
     pub fn matching_into(&self, threshold: f32, all: &mut Matches) {
         let mut gather = self.take_gather();
-        self.collect(&mut gather, threshold, false);
+        self.collect(&mut gather, Cut { score: threshold, least: threshold }, false);
         all.clear();
         all.runs.reserve(gather.shards.iter().map(|of_shard| of_shard.found.runs.len()).sum());
         for ShardGather { found, .. } in &gather.shards {
             all.runs.extend_from_slice(&found.runs);
             all.n_gaussians += found.n_gaussians;
             all.n_rows_undecided += found.n_rows_undecided;
-            all.n_rescored += found.n_rescored;
-            all.n_blocks_read += found.n_blocks_read;
+            all.effort += found.effort;
             all.n_shards_below += found.n_shards_below;
         }
         self.put_back(gather);
@@ -272,6 +316,31 @@ impl<'a> Search<'a> {
         let of_cell =
             |cell: Cell<'_>| (0..cell.rows.len()).map(|row| cell.score_error(row)).fold(0.0, f32::max);
         cells.map(of_cell).reduce(|| 0.0, f32::max)
+    }
+
+    /// Returns the errors of scores that were measured over a bank of texts, each the largest of the shards
+    /// searched; none where answers are exact, or a shard's were not measured for what is read of it.
+    pub fn measured_errors(&self) -> Option<ScoreErrors> {
+        let mut largest: Option<ScoreErrors> = None;
+        for shard in self.searched() {
+            let of_codes = match self.precision {
+                Precision::Rows => shard.residuals.is_none() && shard.exact.is_none(),
+                Precision::Measured => true,
+                Precision::Exact => shard.exact.is_none(),
+            };
+            let errors = shard.header.errors;
+            if !of_codes || errors.p999 == 0.0 {
+                return None;
+            }
+            let of = largest.unwrap_or(errors);
+            largest = Some(ScoreErrors {
+                mean: of.mean.max(errors.mean),
+                p999: of.p999.max(errors.p999),
+                max: of.max.max(errors.max),
+                spread: of.spread.max(errors.spread),
+            });
+        }
+        largest
     }
 
     /// Whether membership is exact: exact embeddings were asked for and every shard searched carries them.

@@ -9,7 +9,7 @@
 //! `offset + step * table` is `words . y` rounded to 8 bits. That is off from the decoded residual's product
 //! by at most `|q - q^| |residual| + row_scale * sum over groups of the largest rounding in each`.
 
-use slag_common::shard::{BLOCK, Residuals, ShardView, WORDS};
+use slag_common::shard::{BLOCK, Fine, Residuals, ShardView, WORDS};
 
 use super::dot::widen;
 use super::simd::{Column, Level, MatrixTimesVector, PAD};
@@ -104,6 +104,10 @@ pub struct Projection {
     pub mean_length: f32,
     /// What residual codes are worth, of a cell that has them.
     pub tables: Tables,
+    /// What components of fine residuals are worth, of a cell that has them.
+    pub fine: Rounded,
+    /// In float64.
+    fine_components: Vec<f64>,
 }
 
 impl Projection {
@@ -150,6 +154,14 @@ impl Projection {
             // Never -0, which would sort after 0 though it is equal.
             put: |row: usize, dot: i32| scores[row] = (self.base + step * f64::from(dot)) as f32 + 0.0,
         });
+    }
+
+    /// Makes the vector that fine residuals are multiplied with.
+    pub fn set_fine(&mut self, fine: &Fine<'_>) {
+        self.fine_components.clear();
+        self.fine_components
+            .extend(self.components.iter().zip(fine.steps).map(|(y, step)| y * f64::from(*step)));
+        self.fine.set(&self.fine_components);
     }
 
     /// Makes the tables of a residual code.

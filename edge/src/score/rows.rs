@@ -104,8 +104,16 @@ impl ShardScores {
         for ((projection, rows), vector) in self.projections.iter_mut().zip(&mut self.rows).zip(vectors) {
             projection.set(level, shard, vector);
             projection.score_rows(level, shard, rows);
-            if let (Some(residuals), Precision::Exact) = (&shard.residuals, precision) {
+            let are_codes_read = match precision {
+                Precision::Rows => false,
+                Precision::Measured => true,
+                Precision::Exact => shard.exact.is_none(),
+            };
+            if let Some(residuals) = shard.residuals.as_ref().filter(|_| are_codes_read) {
                 projection.set_tables(residuals);
+            }
+            if let (Some(fine), true) = (shard.exact.and_then(|exact| exact.fine), are_codes_read) {
+                projection.set_fine(&fine);
             }
         }
         self.combined.resize_with(places.len(), Vec::new);

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::collect::{Cell, Gather, runs_inside};
+use super::collect::{Cell, Cut, Gather, runs_inside};
 use super::{Effort, Run, Search};
 
 /// One Gaussian and its score.
@@ -21,6 +21,8 @@ pub struct Hit {
 pub(super) const BINS: usize = 4096;
 /// Bits that keys are sorted by at a time: counts of their values stay in the first-level cache.
 const DIGIT_BITS: u32 = 11;
+/// Fewer runs are not worth a second thread.
+const MIN_RUNS_PER_THREAD: usize = if cfg!(test) { 16 } else { 8192 };
 
 /// Memory for ranking.
 #[derive(Default)]
@@ -28,8 +30,16 @@ pub(super) struct Order {
     parts: Vec<Part>,
     runs: Vec<Run>,
     keys: Vec<u64>,
+    ranked: Vec<Ranked>,
+}
+
+/// What one thread ranks.
+#[derive(Default)]
+struct Ranked {
+    keys: Vec<u64>,
     swapped: Vec<u64>,
     tied: Vec<(f64, Hit)>,
+    hits: Vec<Hit>,
 }
 
 /// What one thread counts.
@@ -74,7 +84,7 @@ impl Search<'_> {
         } else {
             self.row_score_at(&mut gather.order, limit, threshold)
         };
-        self.collect(&mut gather, cut.unwrap_or(threshold), true);
+        self.collect(&mut gather, Cut { score: cut.unwrap_or(threshold), least: threshold }, true);
         effort += gather.effort();
         self.rank(&mut gather, limit, near, hits);
         self.put_back(gather);
@@ -102,7 +112,7 @@ impl Search<'_> {
 
     /// Sorts what was gathered.
     fn rank(&self, gather: &mut Gather, limit: usize, near: Option<DVec3>, hits: &mut Vec<Hit>) {
-        let Gather { shards, order: Order { runs, keys, swapped, tied, .. } } = gather;
+        let Gather { shards, order: Order { runs, keys, ranked, .. } } = gather;
         let mut by_cell: Vec<usize> = (0..self.shards.len()).collect();
         by_cell.sort_by_key(|at| self.shards[*at].header.cell_id);
         runs.clear();
@@ -110,8 +120,21 @@ impl Search<'_> {
         keys.clear();
         // Places, in the order of cells and indices, decide between equal scores.
         keys.extend(runs.iter().zip(0u64..).map(|(run, place)| u64::from(!rising(run.score)) << 32 | place));
+        let n_parts = rayon::current_num_threads().min(keys.len() / MIN_RUNS_PER_THREAD).max(1);
+        ranked.resize_with(n_parts, Ranked::default);
+        share_by_high_half(keys, ranked);
+        ranked.par_iter_mut().for_each(|part| self.rank_part(part, runs, limit, near));
+        for part in ranked {
+            let n = part.hits.len().min(limit - hits.len());
+            hits.extend_from_slice(&part.hits[..n]);
+        }
+    }
+
+    /// Turns keys into hits, in their order, `limit` at most.
+    fn rank_part(&self, part: &mut Ranked, runs: &[Run], limit: usize, near: Option<DVec3>) {
+        let Ranked { keys, swapped, tied, hits } = part;
         sort_by_high_half(keys, swapped);
-        hits.reserve(limit.min(runs.iter().map(|run| (run.end - run.start) as usize).sum()));
+        hits.clear();
         for ties in keys.chunk_by(|a, b| a >> 32 == b >> 32) {
             let first = hits.len();
             for key in ties {
@@ -205,6 +228,28 @@ pub(super) fn bin_of(score: f32) -> usize {
     ((score + 1.0) * (BINS as f32 / 2.0)).clamp(0.0, (BINS - 1) as f32) as usize
 }
 
+/// Deals keys out to parts of about the same size, all with a lower upper half to an earlier part; those of a
+/// part stay in their order.
+fn share_by_high_half(keys: &mut Vec<u64>, parts: &mut [Ranked]) {
+    parts.iter_mut().for_each(|part| part.keys.clear());
+    if let [all] = parts {
+        std::mem::swap(keys, &mut all.keys);
+        return;
+    }
+    let all_high = || keys.iter().map(|key| (key >> 32) as u32);
+    let (least, most) = (all_high().min().unwrap_or(0), all_high().max().unwrap_or(0));
+    let shift = (u32::BITS - (most - least).leading_zeros()).saturating_sub(DIGIT_BITS);
+    let digit = |key: u64| (((key >> 32) as u32 - least) >> shift) as usize;
+    let mut part_of = [0usize; 1 << DIGIT_BITS];
+    keys.iter().for_each(|key| part_of[digit(*key)] += 1);
+    let mut n_before = 0;
+    for count in &mut part_of {
+        let part = n_before * parts.len() / keys.len();
+        n_before += std::mem::replace(count, part);
+    }
+    keys.iter().for_each(|key| parts[part_of[digit(*key)]].keys.push(*key));
+}
+
 /// Sorts by the upper 32 bits; equal ones stay in their order. `swapped` is memory.
 fn sort_by_high_half(keys: &mut Vec<u64>, swapped: &mut Vec<u64>) {
     let all_high = || keys.iter().map(|key| (key >> 32) as u32);
@@ -256,6 +301,31 @@ mod tests {
                 expected.sort();
                 sort_by_high_half(&mut keys, &mut swapped);
                 assert_eq!(keys, expected, "{n} {n_bits}");
+            }
+        }
+    }
+
+    /// Oracle: the standard library's stable sort, of all parts one after the other.
+    #[test]
+    fn keys_are_shared_in_order() {
+        let mut random = Random(33);
+        for n in [1, 2, 3000] {
+            for n_bits in [1, 5, 11, 12, 32] {
+                for n_parts in [1, 2, 3, 7] {
+                    let mut keys: Vec<u64> =
+                        (0..n).map(|place| random.next() >> (64 - n_bits) << 32 | place).collect();
+                    let mut expected = keys.clone();
+                    expected.sort();
+                    let mut parts = Vec::new();
+                    parts.resize_with(n_parts, Ranked::default);
+                    share_by_high_half(&mut keys, &mut parts);
+                    let mut found = Vec::new();
+                    for part in &mut parts {
+                        sort_by_high_half(&mut part.keys, &mut part.swapped);
+                        found.extend_from_slice(&part.keys);
+                    }
+                    assert_eq!(found, expected, "{n} {n_bits} {n_parts}");
+                }
             }
         }
     }

@@ -212,20 +212,97 @@ impl Work for BlockSums<'_> {
     }
 }
 
-/// Compares a block's sums, see [`Kernels::at_least`].
-pub struct AtLeast<'a> {
-    /// Sums.
-    pub sums: &'a [u16; BLOCK],
-    /// What they are compared with.
-    pub least: u16,
+/// The sums of the block that was read last.
+#[derive(Clone, Debug, Default)]
+pub struct LastBlock {
+    /// Which it was.
+    pub block: Option<usize>,
+    /// Its sums.
+    pub sums: [u16; BLOCK],
 }
 
-impl Work for AtLeast<'_> {
-    type Output = u32;
+/// Finds the Gaussians of a range whose codes' sums reach a value; returns the number of blocks read.
+pub struct FindSums<'a> {
+    /// Byte columns of all blocks, see [`Kernels::block_sums`].
+    pub columns: &'a [Column],
+    /// Values of the groups in the low halves.
+    pub low: &'a [Column],
+    /// Values of the groups in the high halves.
+    pub high: &'a [Column],
+    /// Which Gaussians.
+    pub members: std::ops::Range<usize>,
+    /// What sums are compared with.
+    pub least: u16,
+    /// Where an earlier range may have ended.
+    pub last: &'a mut LastBlock,
+    /// Gets Gaussians and their sums, ascending.
+    pub found: &'a mut Vec<(u32, u16)>,
+}
+
+impl Work for FindSums<'_> {
+    type Output = u64;
 
     #[inline(always)]
-    fn run<K: Kernels>(self, kernels: K) -> u32 {
-        kernels.at_least(self.sums, self.least)
+    fn run<K: Kernels>(self, kernels: K) -> u64 {
+        let Self { columns, low, high, members, least, last, found } = self;
+        let mut n_read = 0;
+        for block in members.start / BLOCK..members.end.div_ceil(BLOCK) {
+            if last.block != Some(block) {
+                let columns = &columns[block * low.len()..][..low.len()];
+                last.sums = kernels.block_sums(columns, low, high);
+                last.block = Some(block);
+                n_read += 1;
+            }
+            let first = block * BLOCK;
+            let (start, end) = (members.start.saturating_sub(first), (members.end - first).min(BLOCK));
+            let of_range = (u32::MAX << start) & (u32::MAX >> (BLOCK - end));
+            let mut reaching = of_range & kernels.at_least(&last.sums, least);
+            while reaching != 0 {
+                let at = reaching.trailing_zeros() as usize;
+                reaching &= reaching - 1;
+                found.push(((first + at) as u32, last.sums[at]));
+            }
+        }
+        n_read
+    }
+}
+
+/// Multiplies some rows of a matrix with a vector.
+pub struct SomeRowsTimesVector<'a> {
+    /// `[n][n_components]`.
+    pub rows: &'a [i8],
+    /// Components of a row, not 0.
+    pub n_components: usize,
+    /// The vector, padded with zeros to the next multiple of [`PAD`].
+    pub vector: &'a [i16],
+    /// Which rows, ascending.
+    pub which: &'a [u32],
+    /// Gets their products.
+    pub products: &'a mut Vec<i32>,
+}
+
+impl Work for SomeRowsTimesVector<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<K: Kernels>(self, kernels: K) {
+        let Self { rows, n_components, vector, which, products } = self;
+        products.clear();
+        for which in which.chunks(ROWS) {
+            let last = which[which.len() - 1] as usize;
+            // As for all rows: what is read beyond a row's end is multiplied with zeros.
+            if last * n_components + vector.len() <= rows.len() {
+                let mut four = [&rows[last * n_components..][..vector.len()]; ROWS];
+                for (row, at) in four.iter_mut().zip(which) {
+                    *row = &rows[*at as usize * n_components..][..vector.len()];
+                }
+                products.extend_from_slice(&kernels.dots(four, vector)[..which.len()]);
+            } else {
+                for at in which {
+                    products.push(dot(&rows[*at as usize * n_components..][..n_components], vector));
+                }
+            }
+        }
     }
 }
 
@@ -303,21 +380,70 @@ mod tests {
         }
     }
 
-    /// Oracle: one comparison for each, at both ends of 16 bits and around the sign.
+    /// Oracle: one comparison for each sum, at both ends of 16 bits and around the sign. The words of code 1 make
+    /// a sum of what its columns say.
     #[test]
-    fn sums_are_compared_at_every_level() {
+    fn sums_that_reach_a_value_are_found_at_every_level() {
         let mut random = Random(13);
-        let ends = [0, 1, 0x7fff, 0x8000, 0x8001, u16::MAX];
-        for _ in 0..200 {
-            let mut sums = [0; BLOCK];
-            sums.iter_mut().for_each(|sum| *sum = random.next() as u16);
-            sums[7..13].copy_from_slice(&ends);
-            for least in ends.into_iter().chain([sums[3], sums[31], random.next() as u16]) {
+        const N_COLUMNS: usize = 64;
+        let n_blocks = 5;
+        let columns: Vec<Column> =
+            (0..n_blocks * N_COLUMNS).map(|_| [(); BLOCK].map(|()| random.next() as u8)).collect();
+        for highest in [3u64, 256] {
+            let mut table = || -> Vec<Column> {
+                let words = |_| {
+                    let words: [u8; 16] = [(); 16].map(|()| (random.next() % highest) as u8);
+                    std::array::from_fn(|at| words[at % 16])
+                };
+                (0..N_COLUMNS).map(words).collect()
+            };
+            let (low, high) = (table(), table());
+            let sums: Vec<u16> = columns
+                .chunks_exact(N_COLUMNS)
+                .flat_map(|block| Portable.block_sums(block, &low, &high))
+                .collect();
+            let (least_sum, most) = (sums.iter().min().copied(), sums.iter().max().copied());
+            for least in [Some(0), Some(u16::MAX), Some(0x8000), least_sum, most, Some(sums[40])] {
+                let least = least.expect("there are sums");
                 for level in Level::available() {
-                    let mask = level.dispatch(AtLeast { sums: &sums, least });
-                    for (at, sum) in sums.iter().enumerate() {
-                        assert_eq!(mask >> at & 1 == 1, *sum >= least, "{} {sum} {least}", level.name());
+                    let (mut last, mut found, mut n_read) = (LastBlock::default(), Vec::new(), 0);
+                    let ends = [0, 1, 31, 32, 33, 96, 97, 98, 160];
+                    for ends in ends.windows(2) {
+                        let (columns, members) = (&columns[..], ends[0]..ends[1]);
+                        let (last, found, low, high) = (&mut last, &mut found, &low[..], &high[..]);
+                        n_read +=
+                            level.dispatch(FindSums { columns, low, high, members, least, last, found });
                     }
+                    let expected: Vec<(u32, u16)> =
+                        (0..).zip(sums.iter().copied()).filter(|(_, sum)| *sum >= least).collect();
+                    assert_eq!(found, expected, "{} {least}", level.name());
+                    assert_eq!(n_read, n_blocks as u64);
+                }
+            }
+        }
+    }
+
+    /// Oracle: plain sums; the last rows cannot be read past their end.
+    #[test]
+    fn products_of_some_rows_are_the_sums_at_every_level() {
+        let mut random = Random(14);
+        for n_components in [1usize, 2, 31, 32, 33, 96, 126, 512] {
+            let rows: Vec<i8> = (0..40 * n_components).map(|_| random.next() as i8).collect();
+            let mut vector: Vec<i16> =
+                (0..n_components).map(|_| (random.next() % 999) as i16 - 500).collect();
+            vector.resize(n_components.next_multiple_of(PAD), 0);
+            for which in [vec![], vec![39], vec![0, 3, 4, 17, 38], (0..40).collect::<Vec<u32>>()] {
+                let expected: Vec<i32> = which
+                    .iter()
+                    .map(|at| dot(&rows[*at as usize * n_components..][..n_components], &vector))
+                    .collect();
+                for level in Level::available() {
+                    let mut products = vec![7];
+                    let (rows, vector, which) = (&rows[..], &vector[..], &which[..]);
+                    let products_of =
+                        SomeRowsTimesVector { rows, n_components, vector, which, products: &mut products };
+                    level.dispatch(products_of);
+                    assert_eq!(products, expected, "{} {n_components}", level.name());
                 }
             }
         }

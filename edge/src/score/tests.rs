@@ -85,7 +85,7 @@ fn brute_force(
             for index in view.members(row) {
                 let mut vector = vec![0.0; question.vector.len()];
                 match precision {
-                    Precision::Exact => view.decode(index, &mut vector),
+                    Precision::Exact | Precision::Measured => view.decode(index, &mut vector),
                     Precision::Rows => view.decode_row(row, &mut vector),
                 }
                 let score = score_in_f64(question, vector.iter().copied());
@@ -123,7 +123,7 @@ proptest! {
         let views = views(&built);
         let threshold = threshold as f32 / 8.0;
         let precision = if rows_only { Precision::Rows } else { Precision::Exact };
-        let batch = Search::batch(&views, &questions, region, precision).expect("valid");
+        let batch = Search::batch(&mut Scratch::default(), &views, &questions, region, precision).expect("valid");
         prop_assert_eq!(batch.len(), questions.len());
         for (search, question) in batch.iter().zip(&questions) {
             // Rows are rounded with a step of a power of two, after which sums are still exact.
@@ -224,7 +224,7 @@ fn answers_keep_within_the_stated_bound() {
             }
             assert!(expected_in.next().is_none());
             assert!(exact_search.is_exact() && !rows.is_exact());
-            n_saved += n - exact_matches.n_rescored;
+            n_saved += n - exact_matches.effort.n_rescored;
         }
     }
     println!("largest error of a row's score: {largest_share:.2} of the bound");
@@ -274,8 +274,14 @@ fn does_not_depend_on_threads() {
     let answers = [1, 2, 7].map(|threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("a pool");
         pool.install(|| {
-            let batch =
-                Search::batch(&views, &questions, Region::default(), Precision::Exact).expect("valid");
+            let batch = Search::batch(
+                &mut Scratch::default(),
+                &views,
+                &questions,
+                Region::default(),
+                Precision::Exact,
+            )
+            .expect("valid");
             let answer =
                 |search: &Search<'_>| (search.matching(-0.05), search.best(40, -1.0, Some(DVec3::ONE)));
             batch.iter().map(answer).collect::<Vec<_>>()
@@ -302,7 +308,7 @@ fn skips_by_box_and_by_bound() {
     assert_eq!(search.searched().count(), 2);
     let matches = search.matching(0.5);
     assert_eq!(members_of(&matches), [(0, 0)]);
-    assert_eq!((matches.n_shards_below, matches.n_rescored, matches.n_rows_undecided), (1, 0, 0));
+    assert_eq!((matches.n_shards_below, matches.effort.n_rescored, matches.n_rows_undecided), (1, 0, 0));
 }
 
 #[test]
@@ -315,7 +321,8 @@ fn refuses_what_cannot_be_scored() {
         let negatives = negatives.iter().map(|n| Arc::from(*n)).collect();
         let questions = [Question::new([1.0, 0.0]), Question { vector: query.into(), negatives }];
         let shards = [shard.view()];
-        let batch = Search::batch(&shards, &questions, Region::default(), Precision::Exact);
+        let batch =
+            Search::batch(&mut Scratch::default(), &shards, &questions, Region::default(), Precision::Exact);
         let batch = batch.map(|_| ()).err();
         let alone = Search::new(&shards, &questions[1], Region::default(), Precision::Exact);
         assert_eq!(format!("{:?}", alone.map(|_| ()).err()), format!("{batch:?}"));

@@ -4,7 +4,8 @@ use glam::DVec3;
 use half::f16;
 use slag_common::container::AlignedBytes;
 use slag_common::shard::{
-    BLOCK, Basis, Positions, Residuals, ScoreErrors, ShardHeader, ShardLayout, ShardView, WORDS, quantise,
+    BLOCK, Basis, ExactColumns, Fine, Positions, Residuals, ScoreErrors, ShardHeader, ShardLayout, ShardView,
+    WORDS, quantise,
 };
 
 use super::{BuiltShard, Random, normalised};
@@ -18,10 +19,18 @@ pub struct CodedShard {
     pub has_basis: bool,
     /// 0: no residual code.
     pub n_groups: usize,
+    /// Whether exact embeddings are beside the code, and fine residuals: any, for nothing is decided by what is not
+    /// measured, and these errors are stated: [`CODE_ERROR`] and [`FINE_ERROR`].
+    pub is_exact: bool,
     /// Members of each row.
     pub row_lens: Vec<usize>,
     pub origin: DVec3,
 }
+
+/// Stated mean error of an exact shard's codes.
+pub const CODE_ERROR: f32 = 0.01;
+/// Stated mean error of its fine residuals.
+pub const FINE_ERROR: f32 = 0.003;
 
 impl CodedShard {
     /// Writes the shard and reads it back. Embeddings are what it decodes to, off by a little, of unit length.
@@ -61,9 +70,14 @@ impl CodedShard {
             position_step: [step; 3],
             box_min: self.origin.to_array(),
             box_max: (self.origin + 10.0).to_array(),
-            errors: ScoreErrors::default(),
+            errors: ScoreErrors { mean: CODE_ERROR, ..ScoreErrors::default() },
             encoder_id: [7; 32],
         };
+        let fine_steps: Vec<f32> = (0..m).map(|_| 1.0 + 0.5 * random.signed()).collect();
+        let fine_scales: Vec<f32> = (0..k).map(|_| 2e-4 * (1.5 + random.signed())).collect();
+        let fine_values: Vec<i8> = (0..n * m).map(|_| random.next() as i8).collect();
+        let fine_errors = ScoreErrors { mean: FINE_ERROR, ..ScoreErrors::default() };
+        let input_indices: Vec<u32> = (0..n as u32).collect();
         let (mut radii, mut reaches) = (vec![0.0; k], vec![0.0; k]);
         let view = |radii, reaches| ShardView {
             header,
@@ -87,9 +101,12 @@ impl CodedShard {
             for index in measured.members(row) {
                 let mut decoded = vec![0.0; dim];
                 measured.decode(index, &mut decoded);
+                let mut stored = vec![0.0; dim];
+                measured.decode_row(row, &mut stored);
                 let embedding =
                     normalised(decoded.iter().map(|v| *v as f32 + random.signed() * 0.02).collect());
-                let squares = embedding.iter().zip(&decoded).map(|(e, d)| (f64::from(*e) - d).powi(2));
+                let from = if self.is_exact { &stored } else { &decoded };
+                let squares = embedding.iter().zip(from).map(|(e, d)| (f64::from(*e) - d).powi(2));
                 *radius = f32::max(*radius, squares.sum::<f64>().sqrt() as f32 * (1.0 + f32::EPSILON));
                 embeddings.push(embedding);
                 let Some(residuals) = &measured.residuals else { continue };
@@ -102,7 +119,12 @@ impl CodedShard {
             }
         }
         let mut bytes = Vec::new();
-        view(&radii, &reaches).write(&mut bytes).expect("writes to memory");
+        let halves: Vec<f16> = embeddings.iter().flatten().map(|v| f16::from_f32(*v)).collect();
+        let fine =
+            Fine { errors: fine_errors, steps: &fine_steps, scales: &fine_scales, values: &fine_values };
+        let exact = ExactColumns { input_indices: &input_indices, embeddings: &halves, fine: Some(fine) };
+        let exact = self.is_exact.then_some(exact);
+        ShardView { exact, ..view(&radii, &reaches) }.write(&mut bytes).expect("writes to memory");
         let bytes = AlignedBytes::copy_of(&bytes);
         let layout = ShardLayout::check(&bytes).expect("a valid shard");
         BuiltShard { bytes, layout, embeddings }

@@ -85,7 +85,7 @@ pub fn shard(spec: &ShardSpec) -> Vec<u8> {
     let indices: Vec<u32> = (0..n).collect();
     let embeddings = vec![f16::from_f32(0.5); (n * DIM) as usize];
     let mut out = Vec::new();
-    let exact = ExactColumns { input_indices: &indices, embeddings: &embeddings };
+    let exact = ExactColumns { input_indices: &indices, embeddings: &embeddings, fine: None };
     let parts = ShardView {
         header,
         positions: Positions::Wide(&positions),

@@ -135,6 +135,7 @@ pub fn run(source: &Source, bank: TextBank, title: &str) -> Result<CodecReport, 
         balanced_error: balanced,
         max_groups: if profile == Profile::Compact { 2 } else { 64 },
         min_gaussians_per_row: 16,
+        has_fine: false,
     };
     for error in COMPACT_ERRORS {
         points.push(ours(

@@ -47,12 +47,20 @@ pub struct PaletteSettings {
     pub min_gaussians_per_row: usize,
     /// Half bytes of a residual code, at most.
     pub max_groups: usize,
+    /// Whether residuals are also kept in 8 bits a component, as exact shards have them.
+    pub has_fine: bool,
 }
 
 impl Default for PaletteSettings {
     /// On the labelled house, 0.1 keeps the exact field's task accuracy, and 0.02 its ranking (README.md).
     fn default() -> Self {
-        Self { compact_error: 0.1, balanced_error: 0.02, min_gaussians_per_row: 45, max_groups: 32 }
+        Self {
+            compact_error: 0.1,
+            balanced_error: 0.02,
+            min_gaussians_per_row: 45,
+            max_groups: 32,
+            has_fine: false,
+        }
     }
 }
 
@@ -106,6 +114,20 @@ pub struct PaletteResiduals {
     pub codes: Vec<u8>,
     /// `[K]`: no member is farther from its decoded form.
     pub radii: Vec<f32>,
+    /// Errors of the decoded scores.
+    pub errors: ScoreErrors,
+    /// Where they were asked for.
+    pub fine: Option<FineResiduals>,
+}
+
+/// Residuals in 8 bits a component.
+pub struct FineResiduals {
+    /// `[m]`.
+    pub steps: Vec<f32>,
+    /// `[K]`.
+    pub scales: Vec<f32>,
+    /// `[n][m]`.
+    pub values: Vec<i8>,
     /// Errors of the decoded scores.
     pub errors: ScoreErrors,
 }
@@ -174,6 +196,18 @@ pub fn build(embeddings: Rows<'_>, yardstick: &Yardstick, settings: &PaletteSett
     let (radii, errors) = compare(embeddings, &order, &row_starts, &decoded_rows, None, &measured);
     let residuals = planned.map(|(_, code)| {
         let coded = coded(embeddings, &frame, &order, &row_starts, &decoded_rows, &scales);
+        let fine = settings.has_fine.then(|| {
+            let (fine, decoded) = fine(&coded, m, &row_starts, &scales, &ranges);
+            let (_, errors) = compare(
+                embeddings,
+                &order,
+                &row_starts,
+                &decoded_rows,
+                Some((&decoder, &decoded)),
+                &measured,
+            );
+            FineResiduals { errors, ..fine }
+        });
         let (codes, mut decoded) = code.encode(Rows::all(&coded, m));
         let covered = code.n_components();
         // In the rows' units, multiplied by the rows' scales: what a reader decodes.
@@ -200,7 +234,7 @@ pub fn build(embeddings: Rows<'_>, yardstick: &Yardstick, settings: &PaletteSett
         let (radii, errors) =
             compare(embeddings, &order, &row_starts, &decoded_rows, Some((&part, &decoded)), &measured);
         let code = ResidualCode { words, ..code };
-        PaletteResiduals { code, row_scales: scales, reaches, codes, radii, errors }
+        PaletteResiduals { code, row_scales: scales, reaches, codes, radii, errors, fine }
     });
     let Frame { mean, .. } = frame;
     Palette {
@@ -314,6 +348,45 @@ fn coded(
         }
     }
     points
+}
+
+/// Rounds residuals (`[n][m]`, divided by their rows' scales) to 8 bits; returns them with what they decode to,
+/// in readers' components. Steps follow the components' sizes, scales the largest of a row's members.
+fn fine(
+    residuals: &[f32],
+    m: usize,
+    row_starts: &[u32],
+    row_scales: &[f32],
+    ranges: &[f32],
+) -> (FineResiduals, Vec<f32>) {
+    const MOST: f32 = 127.0;
+    let of_row = |row: usize| row_starts[row] as usize * m..row_starts[row + 1] as usize * m;
+    let mut squares = vec![0.0f64; m];
+    for (row, scale) in row_scales.iter().enumerate() {
+        for (at, v) in residuals[of_row(row)].iter().enumerate() {
+            squares[at % m] += f64::from(v * scale).powi(2);
+        }
+    }
+    let n = (residuals.len() / m).max(1) as f64;
+    // A component that no residual has needs no step, but is divided by one.
+    let sizes: Vec<f32> = squares.iter().map(|s| ((s / n).sqrt() as f32).max(1e-9)).collect();
+    let steps: Vec<f32> = sizes.iter().zip(ranges).map(|(size, range)| size / range).collect();
+    let (mut scales, mut values) =
+        (Vec::with_capacity(row_scales.len()), Vec::with_capacity(residuals.len()));
+    let mut decoded = Vec::with_capacity(residuals.len());
+    for (row, row_scale) in row_scales.iter().enumerate() {
+        let in_sizes = |(at, v): (usize, &f32)| v * row_scale / sizes[at % m];
+        let members = || residuals[of_row(row)].iter().enumerate();
+        let scale = members().map(in_sizes).fold(0.0f32, |most, v| most.max(v.abs())) / MOST;
+        let factor = if scale > 0.0 { scale.recip() } else { 0.0 };
+        for (at, v) in members() {
+            let value = (in_sizes((at, v)) * factor).round().clamp(-MOST, MOST);
+            values.push(value as i8);
+            decoded.push(value * steps[at % m] * scale);
+        }
+        scales.push(scale);
+    }
+    (FineResiduals { steps, scales, values, errors: ScoreErrors::default() }, decoded)
 }
 
 /// Returns for each row the largest distance of a member from its decoded form, and the errors of the decoded

@@ -1,5 +1,7 @@
 use slag_common::container::AlignedBytes;
-use slag_common::shard::{Basis, Positions, Residuals, ShardHeader, ShardLayout, ShardView};
+use slag_common::shard::{
+    Basis, ExactColumns, Fine, Positions, Residuals, ShardHeader, ShardLayout, ShardView,
+};
 
 use super::*;
 
@@ -158,6 +160,46 @@ fn reaches_bound_decoded_residuals() {
             residuals.reaches[row]
         );
     }
+}
+
+/// Oracle: the naive decoder of the format, in float64. Fine residuals are many times nearer than codes, and their
+/// errors are those that were measured.
+#[test]
+fn fine_residuals_decode_to_what_was_measured() {
+    let (dim, n) = (64, 900);
+    let vectors = clustered(n, 300, dim, 0.3);
+    let yardstick = yardstick(dim, &vectors);
+    let settings = PaletteSettings { has_fine: true, max_groups: 8, ..PaletteSettings::default() };
+    let palette = build(Rows::all(&vectors, dim), &yardstick, &settings);
+    let residuals = palette.residuals.as_ref().expect("rows are not enough here");
+    let fine = residuals.fine.as_ref().expect("asked for");
+    let stored = shard_of(&palette, dim, true);
+    let view = ShardLayout::check(&stored).expect("valid").view(&stored);
+    let columns =
+        Fine { errors: fine.errors, steps: &fine.steps, scales: &fine.scales, values: &fine.values };
+    let in_order = palette.order.iter().flat_map(|at| &vectors[*at as usize * dim..][..dim]);
+    let embeddings: Vec<f16> = in_order.map(|v| f16::from_f32(*v)).collect();
+    let exact = ExactColumns { input_indices: &palette.order, embeddings: &embeddings, fine: Some(columns) };
+    let mut bytes = Vec::new();
+    ShardView { exact: Some(exact), ..view }.write(&mut bytes).expect("writes to memory");
+    let bytes = AlignedBytes::copy_of(&bytes);
+    let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
+    let read = shard.exact.and_then(|exact| exact.fine).expect("written");
+    let (mut sum, mut max, mut decoded) = (0.0, 0.0f64, vec![0.0; dim]);
+    for (place, at) in palette.order.iter().enumerate() {
+        shard.decode_fine(place, &read, &mut decoded);
+        let truth = &vectors[*at as usize * dim..][..dim];
+        for text in yardstick.bank.vectors.chunks_exact(dim) {
+            let terms = text.iter().zip(truth).zip(&decoded);
+            let error: f64 = terms.map(|((t, v), d)| f64::from(*t) * (f64::from(*v) - d)).sum();
+            sum += error.abs();
+            max = max.max(error.abs());
+        }
+    }
+    let mean = sum / (n * yardstick.bank.len()) as f64;
+    assert!((f64::from(fine.errors.mean) - mean).abs() < 1e-3 * mean + 1e-6, "{:?} {mean}", fine.errors);
+    assert!((f64::from(fine.errors.max) - max).abs() < 1e-3 * max + 1e-6, "{:?} {max}", fine.errors);
+    assert!(fine.errors.mean * 4.0 < residuals.errors.mean, "{:?} {:?}", fine.errors, residuals.errors);
 }
 
 #[test]

@@ -7,7 +7,9 @@ use half::f16;
 use rayon::prelude::*;
 use slag_common::Gaussians;
 use slag_common::hash::Hash32;
-use slag_common::shard::{Basis, ExactColumns, Profile, Residuals, ScoreErrors, ShardHeader, ShardView};
+use slag_common::shard::{
+    Basis, ExactColumns, Fine, Profile, Residuals, ScoreErrors, ShardHeader, ShardView,
+};
 
 use crate::palette::matrix::Rows;
 use crate::palette::measure::ScoreMoments;
@@ -85,7 +87,8 @@ pub fn build(
     let (with, without): (Vec<u32>, Vec<u32>) =
         (0..cell.gaussians.len() as u32).partition(|local| embeddings.has_evidence[*local as usize]);
     let rows = Rows { values: &embeddings.vectors, width: dim, index: Some(&with) };
-    let palette = palette::build(rows, yardstick, &settings.palette);
+    let has_fine = settings.profiles.contains(&Profile::Exact);
+    let palette = palette::build(rows, yardstick, &PaletteSettings { has_fine, ..settings.palette });
     let n_with = with.len();
     // Shard order: by row, then along the Morton curve, which is the order of locals.
     let in_order = palette.order.iter().map(|at| with[*at as usize]);
@@ -135,11 +138,15 @@ pub fn build(
         ..compact
     });
     let largest = |radii: &[f32]| radii.iter().copied().fold(0.0, f32::max);
+    let spread = palette.errors.spread;
     let built = |profile, view: &ShardView<'_>| {
         let mut bytes = Vec::new();
         view.write(&mut bytes).expect("writing to memory cannot fail");
-        let score_error_bound = if profile == Profile::Exact { F16_ROUNDING } else { largest(view.radii) };
-        BuiltShard { profile, bytes, score_error_bound, score_errors: view.header.errors }
+        let (score_error_bound, score_errors) = match profile {
+            Profile::Exact => (F16_ROUNDING, ScoreErrors { spread, ..ScoreErrors::default() }),
+            _ => (largest(view.radii), view.header.errors),
+        };
+        BuiltShard { profile, bytes, score_error_bound, score_errors }
     };
     let shards = Profile::ALL.into_iter().filter(|profile| settings.profiles.contains(profile));
     let shards = shards.map(|profile| match profile {
@@ -153,9 +160,16 @@ pub fn build(
                 let embedding = &embeddings.vectors[*local as usize * dim..][..dim];
                 out.iter_mut().zip(embedding).for_each(|(o, v)| *o = f16::from_f32(*v));
             });
-            let errors = ScoreErrors { spread: palette.errors.spread, ..ScoreErrors::default() };
-            let exact = Some(ExactColumns { input_indices: &input_indices, embeddings: &halves });
-            built(profile, &ShardView { header: ShardHeader { errors, ..header }, exact, ..compact })
+            // Codes and fine residuals tell which embeddings are worth reading.
+            let fine = palette.residuals.as_ref().and_then(|residuals| residuals.fine.as_ref());
+            let fine = fine.map(|fine| Fine {
+                errors: fine.errors,
+                steps: &fine.steps,
+                scales: &fine.scales,
+                values: &fine.values,
+            });
+            let exact = Some(ExactColumns { input_indices: &input_indices, embeddings: &halves, fine });
+            built(profile, &ShardView { radii: compact.radii, exact, ..balanced })
         }
     });
     BuiltCell {

@@ -107,7 +107,7 @@ async fn every_answer_is_as_described() {
     let cases = [
         ("/query", "text=0&near=0,0,0&radius=9"),
         ("/query", "text=0&level=gaussians&near=0,0,0"),
-        ("/query", "text=0&level=gaussians&exact=false"),
+        ("/query", "text=0&level=gaussians&precision=rows"),
         ("/query", "text=0&text=1&negatives=2,1"),
         ("/query", "text=1"),
         ("/query", "text=0&min_count=21"),

@@ -111,7 +111,7 @@ impl Fixture {
                 radii: &vec![1.0; n_rows as usize],
                 basis: None,
                 residuals: None,
-                exact: Some(ExactColumns { input_indices: &ids, embeddings: &embeddings }),
+                exact: Some(ExactColumns { input_indices: &ids, embeddings: &embeddings, fine: None }),
             };
             let (hash, len_bytes) = self.store.put_object(|out| parts.write(out)).expect("room");
             let record = ShardRecord {

@@ -1,0 +1,92 @@
+//! Fine residuals of exact shards: written and read, decoded as FORMAT.md says, and refused where they lie.
+
+use half::f16;
+use slag_common::container::{AlignedBytes, ContainerError};
+use slag_common::shard::{
+    Basis, ExactColumns, Fine, Positions, ScoreErrors, ShardHeader, ShardLayout, ShardView,
+};
+
+/// What a test edits before the shard is written.
+struct Parts {
+    errors: ScoreErrors,
+    steps: Vec<f32>,
+    scales: Vec<f32>,
+    values: Vec<i8>,
+}
+
+/// Three Gaussians with evidence in two rows and one without; three dimensions, two components.
+fn written(edit: impl FnOnce(&mut Parts)) -> AlignedBytes {
+    let mut parts = Parts {
+        errors: ScoreErrors { mean: 0.001, p999: 0.005, max: 0.01, spread: 0.07 },
+        steps: vec![0.5, 0.25],
+        scales: vec![0.01, 0.02],
+        values: vec![1, -2, 127, -128, 5, 0],
+    };
+    edit(&mut parts);
+    let Parts { errors, steps, scales, values } = &parts;
+    let fine = Fine { errors: *errors, steps, scales, values };
+    let mean = [0.5, 0.25, -0.5].map(f16::from_f32);
+    let mut out = Vec::new();
+    ShardView {
+        header: ShardHeader {
+            cell_id: 1,
+            n_gaussians: 4,
+            n_rows: 2,
+            dim: 3,
+            n_components: 2,
+            n_groups: 0,
+            position_bits: [16, 16, 16, 0],
+            row_step: 0.125,
+            origin_in_world: [0.0; 3],
+            position_step: [0.1; 3],
+            box_min: [0.0; 3],
+            box_max: [1.0; 3],
+            errors: ScoreErrors::default(),
+            encoder_id: [9; 32],
+        },
+        positions: Positions::Wide(&[[0; 3]; 4]),
+        row_starts: &[0, 1, 3],
+        rows: &[4, -8, 16, 2],
+        radii: &[0.1, 0.2],
+        basis: Some(Basis { mean: &mean, vectors: &[100, 0, 50, 0, -20, 10], steps: &[0.01, 0.02] }),
+        residuals: None,
+        exact: Some(ExactColumns {
+            input_indices: &[3, 2, 1, 0],
+            embeddings: &[f16::from_f32(0.5); 9],
+            fine: Some(fine),
+        }),
+    }
+    .write(&mut out)
+    .expect("writes to memory");
+    AlignedBytes::copy_of(&out)
+}
+
+#[test]
+fn fine_residuals_are_read_and_decoded() {
+    let bytes = written(|_| {});
+    let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
+    let fine = shard.exact.and_then(|exact| exact.fine).expect("written");
+    assert_eq!((fine.errors.p999, fine.steps, fine.scales), (0.005, &[0.5, 0.25][..], &[0.01, 0.02][..]));
+    // By hand: Gaussian 1 is of row 1, whose components are 2 and 0.25; its residual adds 127 * 0.5 * 0.02 and
+    // -128 * 0.25 * 0.02.
+    let c = [2.0 + 1.27, 0.25 - 0.64];
+    let expected = [0.5 + c[0], 0.25 + c[1] * -0.4, -0.5 + c[0] * 0.5 + c[1] * 0.2];
+    let mut decoded = [0.0; 3];
+    shard.decode_fine(1, &fine, &mut decoded);
+    for (found, expected) in decoded.iter().zip(expected) {
+        assert!((found - expected).abs() < 1e-6, "{decoded:?} {expected:?}");
+    }
+}
+
+#[test]
+fn lies_are_refused() {
+    let refused = |edit: fn(&mut Parts)| -> String {
+        let error: ContainerError = ShardLayout::check(&written(edit)).expect_err("must be refused");
+        error.to_string()
+    };
+    assert!(refused(|p| p.errors.mean = f32::NAN).contains("error"));
+    assert!(refused(|p| p.steps[1] = -1.0).contains("fine steps"));
+    assert!(refused(|p| p.steps.truncate(1)).contains("bytes"));
+    assert!(refused(|p| p.scales[0] = f32::INFINITY).contains("fine scales"));
+    assert!(refused(|p| p.values.truncate(5)).contains("bytes"));
+}

@@ -1,0 +1,105 @@
+//! What the service adds to an answer: whole requests over loopback, as Arrow columns.
+
+use std::io;
+use std::time::Instant;
+
+use serde::Serialize;
+use slag_models::{EncodeError, TextEncoder};
+use tokio::net::TcpListener;
+
+use super::query::{Kind, Settings, Timing};
+use crate::http::{self, App};
+use crate::query::{Engine, MAX_GAUSSIANS};
+use crate::store::{EdgeCache, Snapshot};
+use crate::text::{EncoderInfo, TextService};
+
+/// Times of requests at one size.
+#[derive(Clone, Debug, Serialize)]
+pub struct HttpTiming {
+    /// Size asked for.
+    pub limit: usize,
+    /// Timed requests.
+    pub n_runs: usize,
+    /// Bytes of the largest body.
+    pub body_bytes: usize,
+    /// Half of the requests took no longer, from the request to the body's last byte.
+    pub median_ms: f64,
+    /// 99 of 100 took no longer.
+    pub p99_ms: f64,
+    /// The median less that of the same answer in process.
+    pub added_ms: f64,
+}
+
+/// A text model whose texts are the places of given vectors.
+struct Given(Vec<Vec<f32>>);
+
+impl TextEncoder for Given {
+    fn name(&self) -> &str {
+        "given vectors"
+    }
+
+    fn dim(&self) -> usize {
+        self.0.first().map_or(0, Vec::len)
+    }
+
+    fn encode(&mut self, text: &str) -> Result<Vec<f32>, EncodeError> {
+        let known = text.parse().ok().and_then(|at: usize| self.0.get(at)).cloned();
+        known.ok_or(EncodeError::EmptyText)
+    }
+}
+
+/// Times the best Gaussians of a cache through the service. `queries`: of unit length, at least one.
+/// `in_process`: the same answers' times without it. Sizes that the service refuses are left out.
+///
+/// # Errors
+/// When a socket fails, or a request is not answered.
+pub fn time_http(
+    cache: &EdgeCache,
+    snapshot: &Snapshot,
+    queries: Vec<Vec<f32>>,
+    settings: &Settings,
+    in_process: &[Timing],
+) -> io::Result<Vec<HttpTiming>> {
+    let encoder = &snapshot.manifest.encoder;
+    let (name, id) = (encoder.name.clone(), encoder.id);
+    let info = EncoderInfo { name, id, dim: encoder.dim, execution_provider: "none" };
+    let n_queries = queries.len();
+    let text = TextService::start(info, Box::new(Given(queries)))?;
+    let app = App::new(Engine::new(cache.clone(), text), http::Settings::default());
+    app.reload_now();
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+    let service = runtime.block_on(async {
+        let listener = TcpListener::bind("127.0.0.1:0").await?;
+        let service = format!("http://{}", listener.local_addr()?);
+        tokio::spawn(http::serve(app, listener, std::future::pending()));
+        io::Result::Ok(service)
+    })?;
+    let agent: ureq::Agent = ureq::Agent::config_builder().proxy(None).build().into();
+    let mut timings = Vec::new();
+    for limit in settings.limits.iter().copied().filter(|limit| *limit <= MAX_GAUSSIANS) {
+        let (mut times_ms, mut body_bytes) = (Vec::new(), 0);
+        for at in 0..settings.n_warm_up + settings.n_runs {
+            let (text, precision) = (at % n_queries, settings.precision);
+            let url = format!(
+                "{service}/query?text={text}&limit={limit}&precision={precision}&threshold=-1&level=gaussians&format=arrow"
+            );
+            let start = Instant::now();
+            let answer = agent.get(&url).call();
+            let body = answer.and_then(|mut a| a.body_mut().with_config().limit(u64::MAX).read_to_vec());
+            let body = body.map_err(io::Error::other)?;
+            if at >= settings.n_warm_up {
+                times_ms.push(start.elapsed().as_secs_f64() * 1e3);
+                body_bytes = body_bytes.max(body.len());
+            }
+        }
+        times_ms.sort_by(f64::total_cmp);
+        let n_runs = times_ms.len();
+        let at = |share: f64| times_ms[((n_runs as f64 * share).ceil() as usize).clamp(1, n_runs) - 1];
+        let same = in_process.iter().find(|timing| timing.limit == limit && timing.kind == Kind::Best);
+        let (median_ms, p99_ms) = (at(0.5), at(0.99));
+        let added_ms = median_ms - same.map_or(0.0, |timing| timing.median_ms);
+        timings.push(HttpTiming { limit, n_runs, body_bytes, median_ms, p99_ms, added_ms });
+    }
+    runtime.shutdown_background();
+    Ok(timings)
+}
