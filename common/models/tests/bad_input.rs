@@ -47,7 +47,7 @@ fn wrong_descriptions_are_named_by_field_or_line() {
         ("batch = 16", "batch = 0", "image.batch is 0"),
         ("batch = 16", "batch = 16\nbatches = 2", "batches"),
         ("resize = \"stretch\"", "resize = \"pad\"", "pad"),
-        ("threshold = 0.35", "threshold = nan", "score.threshold is NaN"),
+        ("threshold = 0.35", "threshold = nan", "score is { threshold = NaN }"),
         ("std = [0.5019607843137255", "std = [0.0", "image.std is [0.0"),
         ("name = \"conse-mobilenetv2\"", "name = \"two words\"", "name is \"two words\""),
         ("path = \"clip_text/phrases.txt\"", "path = \"../phrases.txt\"", "text.phrases is ../phrases.txt"),
