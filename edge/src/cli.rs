@@ -16,6 +16,7 @@ use slag_common::Hash32;
 use slag_common::frames::Aabb;
 use slag_common::shard::Profile;
 use slag_edge::query::{DEFAULT_MIN_COUNT, Level, Negatives, parse_box, parse_point};
+use slag_models::commands::{ModelsCommand, RunArgs};
 
 /// Keeps the shards around a robot and answers text queries offline.
 #[derive(Debug, Parser)]
@@ -41,6 +42,8 @@ enum Command {
     Query(QueryArgs),
     /// Shows what is on board.
     Status(StatusArgs),
+    /// Public text models: what is known, pulling, checking, showing.
+    Models(ModelsArgs),
     /// Measures a service and this machine; prints JSON.
     #[command(subcommand)]
     Bench(BenchCommand),
@@ -110,12 +113,12 @@ struct ThreadArgs {
 
 #[derive(Debug, Args)]
 struct ModelArgs {
-    /// Folder of the text model, with its model.toml [default: the built-in stand-in].
-    #[arg(long, value_name = "DIR")]
+    /// Folder of the text model, with its model.toml, or name of a pulled model (`models list`) [default: the
+    /// built-in stand-in].
+    #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR")]
     models: Option<PathBuf>,
-    /// ONNX Runtime library [default: beside this program, else where the system finds it].
-    #[arg(long, value_name = "PATH")]
-    runtime: Option<PathBuf>,
+    #[command(flatten)]
+    how: RunArgs,
 }
 
 #[derive(Debug, Args)]
@@ -254,6 +257,15 @@ struct StatusArgs {
     json: bool,
 }
 
+#[derive(Debug, Args)]
+struct ModelsArgs {
+    #[command(subcommand)]
+    command: ModelsCommand,
+    /// Print the result as JSON.
+    #[arg(long, global = true)]
+    json: bool,
+}
+
 /// How a run ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Exit {
@@ -279,6 +291,7 @@ impl Cli {
         match (self.quiet, self.verbose, &self.command) {
             (true, ..) => "error",
             (_, 0, Command::Serve(_)) | (_, 1, _) => "warn,slag_edge=info",
+            (_, 0, Command::Models(_)) => "warn,slag_models=info",
             (_, 0, _) => "warn",
             _ => "debug",
         }
@@ -291,6 +304,7 @@ impl Cli {
             Command::Serve(args) => (false, commands::serve(args)),
             Command::Query(args) => (args.json, commands::query(args)),
             Command::Status(args) => (args.json, commands::status(args)),
+            Command::Models(args) => (args.json, commands::models(args)),
             Command::Bench(command) => (true, bench::run(command)),
         };
         match result {

@@ -6,14 +6,18 @@
 //! with what is built in ([`builtin`]). [`EncoderId`] names the space, so that a robot can refuse
 //! to compare vectors of two spaces.
 //!
-//! Nothing here prints, reads the environment or starts threads of its own.
+//! [`hub`] brings public models here, and [`commands`] is the face that both programs give it.
+//!
+//! Nothing here prints, reads the environment or starts threads of its own, save the question of [`commands::ask`].
 
 pub mod builtin;
 pub mod clean;
+pub mod commands;
 mod crop;
 pub mod description;
 pub mod encoder_id;
 mod error;
+pub mod hub;
 pub mod image;
 mod model_dir;
 pub mod phrases;

@@ -157,7 +157,8 @@ fn checked(files_root: &Path, file: &FileRef) -> Result<PathBuf, DescriptionErro
     Ok(path)
 }
 
-fn hash_file(path: &Path) -> io::Result<[u8; 32]> {
+/// Returns the SHA-256 of a file.
+pub(crate) fn hash_file(path: &Path) -> io::Result<[u8; 32]> {
     let mut file = fs_err::File::open(path)?;
     let mut hasher = Sha256::new();
     let mut buffer = vec![0; 1 << 20];

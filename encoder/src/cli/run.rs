@@ -11,7 +11,9 @@ use anyhow::{Context, Result, anyhow};
 use serde::Serialize;
 use serde_json::json;
 use slag_common::{poses, splat};
-use slag_models::{ModelDir, SessionOptions, TextEncoder, find_runtime};
+use slag_models::commands::{self, ModelsCommand, RunArgs};
+use slag_models::hub::Side;
+use slag_models::{ModelDir, ModelError, SessionOptions, TextEncoder, find_runtime};
 
 use super::Exit;
 use super::args::*;
@@ -48,6 +50,7 @@ pub fn run(cli: Cli) -> Exit {
         Command::Query(args) => run_query(&args, json),
         Command::Serve(args) => run_serve(&args),
         Command::Keys(command) => super::keys::run(&command, json),
+        Command::Models(command) => run_models(&command, json),
         Command::Push(PushCommand::Qdrant(args)) => run_push(&args, progress.as_ref(), json),
         Command::Eval(EvalCommand::Labelled(args)) => run_eval_labelled(&args, json),
         Command::Generate(command) => run_generate(&command, progress.as_ref()),
@@ -118,11 +121,28 @@ pub(super) fn now_unix_secs() -> u64 {
 /// Opens the models and says how they are run.
 pub(super) fn open_models(args: &ModelArgs) -> Result<(ModelDir, SessionOptions)> {
     let models = match &args.models {
-        Some(dir) => ModelDir::open(dir)?,
+        Some(model) => ModelDir::open(&commands::resolve(model, &|name| std::env::var_os(name))?)?,
         None => ModelDir::builtin(),
     };
-    let runtime = find_runtime(args.runtime.as_deref(), &runtime_folders())?;
-    Ok((models, SessionOptions::new(runtime)))
+    Ok((models, session_options(&args.how)?))
+}
+
+/// Returns how models are run.
+fn session_options(how: &RunArgs) -> Result<SessionOptions, ModelError> {
+    let runtime = find_runtime(how.runtime.as_deref(), &runtime_folders())?;
+    Ok(SessionOptions { providers: how.provider.clone(), ..SessionOptions::new(runtime) })
+}
+
+fn run_models(command: &ModelsCommand, json: bool) -> Result<Exit> {
+    let context = commands::Context {
+        variable: &|name| std::env::var_os(name),
+        side: Side::Both,
+        ask: &|question| !json && commands::ask(question),
+        session: &session_options,
+    };
+    let report = commands::run(command, &context)?;
+    print(json, &report, &report)?;
+    Ok(Exit::Done)
 }
 
 /// Returns where the set-up puts ONNX Runtime: beside the program, or in the build folder above it.
