@@ -57,6 +57,8 @@ enum BenchCommand {
     Pause(PauseArgs),
     /// How a service stands more queries than it can answer.
     Load(LoadArgs),
+    /// Times the text model.
+    Text(bench::BenchTextArgs),
 }
 
 #[derive(Debug, Args)]
@@ -390,6 +392,11 @@ mod tests {
         assert_eq!((query.bounds, query.rows_only), (Some(bounds), true));
         assert_eq!(query.negatives, Negatives::Phrases(vec!["wall".into(), "floor".into()]));
         assert!(parse("slag-edge status --json --cache d").is_ok());
+        assert!(parse("slag-edge models pull clip --accept-licence --json").is_ok());
+        assert!(
+            parse("slag-edge bench text --encoder clip --provider tensorrt,cuda,cpu --model-threads 2")
+                .is_ok()
+        );
         assert!(parse("slag-edge bench query --cache d --limits 10,20 --runs 3 --threads 1").is_ok());
     }
 
@@ -416,6 +423,9 @@ mod tests {
             "slag-edge status --quiet --verbose",
             "slag-edge serve --threads 0",
             "slag-edge bench query --runs 0",
+            "slag-edge query chair --provider gpu",
+            "slag-edge models",
+            "slag-edge models pull",
         ] {
             assert_eq!(parse(line).expect_err(line).exit_code(), Exit::Usage as i32, "{line}");
         }

@@ -2,6 +2,7 @@
 
 use std::fmt;
 use std::io::{self, BufRead, IsTerminal, Write};
+use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
@@ -11,7 +12,8 @@ use crate::description::{Description, FILE_NAME};
 use crate::hub::{
     Entry, Here, Hub, HubError, HubOptions, PulledFile, Side, Source, cache_folder, models_folder,
 };
-use crate::{ModelDir, ModelError, Provider, SessionOptions};
+use crate::session::SessionError;
+use crate::{ModelDir, ModelError, Provider, SessionOptions, find_runtime};
 
 /// What can be done with models.
 #[derive(Debug, Subcommand)]
@@ -66,6 +68,26 @@ pub struct RunArgs {
     /// list, it is an error if none of them can be used.
     #[arg(long, value_name = "NAME,...", value_delimiter = ',', default_value = "cpu")]
     pub provider: Vec<Provider>,
+    /// Threads of one run of a model [default: 1 where views are encoded side by side, else all cores, at most 4].
+    #[arg(long, value_name = "N")]
+    pub model_threads: Option<NonZeroUsize>,
+}
+
+impl RunArgs {
+    /// Returns how models are run, with `default_threads` unless the user says otherwise; `beside`: folders in
+    /// which the runtime is looked for.
+    /// # Errors
+    /// [`SessionError::NoRuntime`] where the library that the user gives is not there.
+    pub fn session_options(
+        &self,
+        beside: &[PathBuf],
+        default_threads: usize,
+    ) -> Result<SessionOptions, SessionError> {
+        let intra_op_threads = self.model_threads.map_or(default_threads, NonZeroUsize::get);
+        let runtime = find_runtime(self.runtime.as_deref(), beside)?;
+        let providers = self.provider.clone();
+        Ok(SessionOptions { intra_op_threads, providers, ..SessionOptions::new(runtime) })
+    }
 }
 
 /// What the program that is run knows.
@@ -77,7 +99,7 @@ pub struct Context<'a> {
     /// Asks the user a question.
     pub ask: &'a dyn Fn(&str) -> bool,
     /// Returns how models run.
-    pub session: &'a dyn Fn(&RunArgs) -> Result<SessionOptions, ModelError>,
+    pub session: &'a dyn Fn(&RunArgs) -> Result<SessionOptions, SessionError>,
 }
 
 /// Returns how the hub is reached in this environment.
@@ -184,7 +206,7 @@ fn info(folder: &Path, args: &InfoArgs, context: &Context<'_>) -> Result<Info, H
         batch: None,
     };
     if args.run {
-        let session = (context.session)(&args.how)?;
+        let session = (context.session)(&args.how).map_err(ModelError::from)?;
         let runs_on = |placement: Option<&crate::Placement>| Some(placement?.to_string());
         info.text_runs_on = runs_on(model.text_encoder(&session)?.placement());
         if context.side == Side::Both {

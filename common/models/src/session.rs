@@ -3,6 +3,7 @@
 //! The library is loaded at run time, once a process, so that a program without models needs none.
 
 use std::{
+    collections::BTreeSet,
     env::consts::{DLL_PREFIX, DLL_SUFFIX},
     fmt::Debug,
     path::{Path, PathBuf},
@@ -230,6 +231,16 @@ pub(crate) fn forward_log(level: LogLevel, category: &str, _id: &str, _location:
     }
 }
 
+/// Warns unless the same was said before: every thread opens models of its own.
+fn warn_once(message: String) {
+    static SAID: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
+    let mut said = SAID.lock().unwrap_or_else(PoisonError::into_inner);
+    if !said.contains(&message) {
+        tracing::warn!("{message}");
+        said.insert(message);
+    }
+}
+
 /// An opened model file.
 #[derive(Debug)]
 pub(crate) struct Model {
@@ -267,7 +278,7 @@ impl Model {
                     if wanted.is_empty() && !may_be_cpu {
                         return Err(error);
                     }
-                    tracing::warn!("{error}");
+                    warn_once(error.to_string());
                 }
                 committed => break committed?,
             }
@@ -277,7 +288,8 @@ impl Model {
             if !may_be_cpu {
                 return Err(SessionError::NotPlaced { path: path.to_owned(), asked, placement });
             }
-            tracing::warn!("{} runs on the processor; asked for was {}", path.display(), names(&asked));
+            let asked = names(&asked);
+            warn_once(format!("{} runs on the processor; asked for was {asked}", path.display()));
         }
         tracing::debug!("{} runs on {placement}", path.display());
         Ok(Self { path: path.to_owned(), session, placement })

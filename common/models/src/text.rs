@@ -101,9 +101,9 @@ impl Tokens {
         Ok(tokens)
     }
 
-    /// Returns the largest id that a text can have.
+    /// Returns the largest id that a text can have; what is added beside the vocabulary need not occur.
     fn largest_id(&self) -> u32 {
-        self.tokenizer.get_vocab(true).into_values().max().unwrap_or(0)
+        self.tokenizer.get_vocab(false).into_values().max().unwrap_or(0)
     }
 
     fn raw_ids(&self, text: &str) -> Result<Vec<u32>, TokenizerError> {

@@ -246,3 +246,51 @@ fn models_that_do_not_fit_say_so_when_opened() {
         assert!(message.contains("text.onnx") && message.contains("fetch the model file again"), "{message}");
     }
 }
+
+/// The indented lines of README.md that follow a line with `start`.
+fn readme_block(start: &str) -> Vec<String> {
+    let readme = fs_err::read_to_string(common::root().join("README.md")).expect("it is readable");
+    let after = readme.lines().skip_while(|line| !line.contains(start));
+    let indented = after.skip_while(|line| !line.starts_with("    "));
+    indented.map_while(|line| Some(line.strip_prefix("    ")?.to_owned())).collect()
+}
+
+#[test]
+fn the_descriptions_in_the_readme_are_valid() {
+    let clip = readme_block("A model of your own is a folder");
+    let siglip = readme_block("For SigLIP these differ");
+    // The second example is the first with some lines instead of others, section by section.
+    let mut merged: Vec<(String, String)> = Vec::new();
+    let mut section = String::new();
+    for line in clip.iter().chain(&siglip) {
+        if line.starts_with('[') {
+            line.split(' ').next().expect("a word").clone_into(&mut section);
+            continue;
+        }
+        let key = |line: &str| line.split(" = ").next().expect("a key").to_owned();
+        merged.retain(|(other, before)| (other, key(before)) != (&section, key(line)));
+        merged.push((section.clone(), line.clone()));
+    }
+    let mut sections: Vec<&String> = merged.iter().map(|(section, _)| section).collect();
+    sections.sort();
+    sections.dedup();
+    let mut text = String::new();
+    for section in sections {
+        text += &format!("{section}\n");
+        merged
+            .iter()
+            .filter(|(other, _)| other == section)
+            .for_each(|(_, line)| text += &format!("{line}\n"));
+    }
+    let no_runtime = SessionOptions::new("no-such-library.so".into());
+    for (description, threshold) in [(clip.join("\n"), None), (text, Some(0.077_052_4))] {
+        let folder = made(&description, TextKind::default(), (Element::F32, -1, false));
+        fs_err::rename(folder.path().join("text.onnx"), folder.path().join("text_model.onnx"))
+            .expect("renamed");
+        fs_err::rename(folder.path().join("vision.onnx"), folder.path().join("vision_model.onnx"))
+            .expect("renamed");
+        let model = ModelDir::open(folder.path()).unwrap_or_else(|e| panic!("{e}\n{description}"));
+        assert_eq!(model.threshold().map(|t| (t * 1e5).round()), threshold.map(|t: f32| (t * 1e5).round()));
+        assert!(model.text_encoder(&no_runtime).is_err());
+    }
+}

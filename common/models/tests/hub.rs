@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use common::made::{TextKind, VOCABULARY, image_graph, text_graph, tokenizer};
+use common::made::{DESCRIPTION, TextKind, VOCABULARY, image_graph, text_graph, tokenizer};
 use common::onnx::{Element, model};
 use common::options;
 use sha2::{Digest, Sha256};
@@ -20,27 +20,7 @@ use tempfile::TempDir;
 const COMMIT: &str = "0123456789abcdef0123456789abcdef01234567";
 
 /// The made model at the hub: its tokenizer is small, so that the hub states no hash of it.
-const TABLE: &str = r#"
-hub = "http://127.0.0.1:1"
-[layout.made]
-description = '''
-[image]
-file = { path = "IMAGE" }
-input = "pixel_values"
-size_px = 8
-resize = "stretch"
-mean = [0.5, 0.5, 0.5]
-std = [0.5, 0.5, 0.5]
-normalise = true
-[text]
-kind = "onnx"
-file = { path = "TEXT" }
-tokenizer = { path = "TOKENIZER" }
-input_ids = "input_ids"
-max_tokens = 8
-end_token_id = 1
-prompt = "{}"
-'''
+const MODEL: &str = r#"
 [[model]]
 name = "made"
 about = "A made model."
@@ -54,6 +34,15 @@ image = "onnx/vision.onnx"
 text = "onnx/text.onnx"
 tokenizer = "tokenizer.json"
 "#;
+
+/// The table of that model alone.
+fn table() -> String {
+    let (_, layout) = DESCRIPTION.split_once("licence = \"none\"\n").expect("a head");
+    let layout = [("vision.onnx", "IMAGE"), ("text.onnx", "TEXT"), ("tokenizer.json", "TOKENIZER")]
+        .into_iter()
+        .fold(layout.to_owned(), |layout, (file, placeholder)| layout.replace(file, placeholder));
+    format!("hub = \"http://127.0.0.1:1\"\n[layout.made]\ndescription = '''{layout}'''\n{MODEL}")
+}
 
 fn sha256(bytes: &[u8]) -> String {
     hex::encode(Sha256::digest(bytes))
@@ -233,7 +222,7 @@ fn hub_of(table: &str, url: &str, root: &Path) -> Hub {
 
 fn setting() -> (Server, TempDir, Hub) {
     let (server, root) = (Server::start(), tempfile::tempdir().expect("a folder"));
-    let hub = hub_of(TABLE, &server.url, root.path());
+    let hub = hub_of(&table(), &server.url, root.path());
     (server, root, hub)
 }
 
@@ -241,7 +230,7 @@ fn setting() -> (Server, TempDir, Hub) {
 fn pinned(server: &Server) -> String {
     let text = server.bytes("onnx/text.onnx");
     let known = "[model.known.\"onnx/text.onnx\"]";
-    format!("{TABLE}{known}\nlen_bytes = {}\nsha256 = \"{}\"\n", text.len(), sha256(&text))
+    format!("{}{known}\nlen_bytes = {}\nsha256 = \"{}\"\n", table(), text.len(), sha256(&text))
 }
 
 fn lock_of(root: &Path) -> serde_json::Value {
@@ -332,7 +321,7 @@ fn a_robot_pulls_the_text_side_and_still_knows_the_space() {
     assert_eq!(hub.here(hub.entry("made").expect("known")), Here::Text);
     assert_eq!(Hub::verify(&root.path().join("made")).expect("as recorded").len(), 2);
     let robot = ModelDir::open(&root.path().join("made")).expect("it opens");
-    hub_of(TABLE, &server.url, both.path()).pull("made", Side::Both, true).expect("it is pulled");
+    hub_of(&table(), &server.url, both.path()).pull("made", Side::Both, true).expect("it is pulled");
     let cloud = ModelDir::open(&both.path().join("made")).expect("it opens");
     assert_eq!(robot.encoder_id(), cloud.encoder_id());
     // Without the hub's word there is no name.
@@ -340,7 +329,8 @@ fn a_robot_pulls_the_text_side_and_still_knows_the_space() {
     server.change(|files| {
         files.stated.insert("onnx/vision.onnx".into(), "no hash".into());
     });
-    let error = hub_of(TABLE, &server.url, bare.path()).pull("made", Side::Text, true).expect_err("no name");
+    let error =
+        hub_of(&table(), &server.url, bare.path()).pull("made", Side::Text, true).expect_err("no name");
     assert!(matches!(error, HubError::NoImageHash { .. }), "{error}");
 }
 
@@ -363,7 +353,7 @@ fn a_cut_pull_goes_on_where_it_ended() {
 
     // The same over two runs of the program: the first one left a part.
     let root = tempfile::tempdir().expect("a folder");
-    let hub = hub_of(TABLE, &server.url, root.path());
+    let hub = hub_of(&table(), &server.url, root.path());
     fs_err::create_dir_all(root.path().join("made/onnx")).expect("it is writable");
     let vision = server.bytes("onnx/vision.onnx");
     let part = root.path().join("made/onnx/vision.onnx.part");
@@ -525,7 +515,7 @@ fn nothing_is_asked_for_before_the_licence_is_accepted() {
     assert!(server.asked().is_empty() && files_below(root.path()).is_empty());
     hub.pull("made", Side::Both, true).expect("accepted");
     // Another licence is asked for again.
-    let relicensed = hub_of(&TABLE.replace("Example-1.0", "Example-2.0"), &server.url, root.path());
+    let relicensed = hub_of(&table().replace("Example-1.0", "Example-2.0"), &server.url, root.path());
     assert!(matches!(relicensed.pull("made", Side::Both, false), Err(HubError::Licence { .. })));
 }
 
@@ -546,7 +536,7 @@ fn only_names_of_the_table_lead_into_the_cache() {
     assert!(error.contains("models pull made"), "{error}");
     assert!(files_below(root.path()).is_empty());
     // Descriptions do not lead out of it either.
-    let escaping = TABLE.replace("onnx/text.onnx", "../../text.onnx");
+    let escaping = table().replace("onnx/text.onnx", "../../text.onnx");
     let server = Server::start();
     server.change(|files| {
         let bytes = files.bytes["onnx/text.onnx"].clone();

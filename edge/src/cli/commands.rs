@@ -13,9 +13,10 @@ use slag_edge::http::{self, App, Settings};
 use slag_edge::query::{Engine, QueryRequest, Status};
 use slag_edge::store::{EdgeCache, Snapshot, StoreError};
 use slag_edge::text::TextService;
+use slag_models::SessionOptions;
 use slag_models::commands::{self as model_commands, RunArgs};
 use slag_models::hub::{Side, cache_folder};
-use slag_models::{ModelError, SessionOptions, find_runtime};
+use slag_models::session::SessionError;
 use tokio::net::TcpListener;
 
 use super::fetch::follow_in_background;
@@ -24,6 +25,8 @@ use super::{CacheArgs, ModelArgs, ModelsArgs, QueryArgs, ServeArgs, StatusArgs, 
 
 /// Async threads: they only pass requests on.
 const ASYNC_THREADS: usize = 2;
+/// Threads of a text model: more gain little for short texts.
+const MAX_MODEL_THREADS: usize = 4;
 /// Threads beside those of queries, for status and for loading a generation.
 const SPARE_BLOCKING_THREADS: usize = 8;
 
@@ -46,23 +49,24 @@ impl ThreadArgs {
 }
 
 fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
-    Ok(Engine::new(cache, open_text(models)?))
+    let (folder, options) = text_model(models)?;
+    let text = TextService::open(folder.as_deref(), &options);
+    Ok(Engine::new(cache, text.map_err(|e| Failure::Failed("models", e.into()))?))
 }
 
-/// Opens the text model.
-pub fn open_text(models: &ModelArgs) -> Result<TextService, Failure> {
+/// Returns the folder of the text model, none for the built-in one, and how it is run.
+pub fn text_model(models: &ModelArgs) -> Result<(Option<PathBuf>, SessionOptions), Failure> {
     let failed = Failure::of("models");
     let folder = models.models.as_deref().map(|model| model_commands::resolve(model, &variable)).transpose();
-    let folder = folder.map_err(|e| failed(e.into()))?;
     let options = session_options(&models.how).map_err(|e| failed(e.into()))?;
-    TextService::open(folder.as_deref(), &options).map_err(|e| failed(e.into()))
+    Ok((folder.map_err(|e| failed(e.into()))?, options))
 }
 
-fn session_options(how: &RunArgs) -> Result<SessionOptions, ModelError> {
+/// Returns how models are run: one text at a time, with a few threads.
+fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
     let beside = std::env::current_exe().ok().and_then(|exe| Some(exe.parent()?.to_owned()));
-    let beside: Vec<PathBuf> = beside.into_iter().collect();
-    let runtime = find_runtime(how.runtime.as_deref(), &beside)?;
-    Ok(SessionOptions { providers: how.provider.clone(), ..SessionOptions::new(runtime) })
+    let n_cores = std::thread::available_parallelism().map_or(1, usize::from);
+    how.session_options(&Vec::from_iter(beside), n_cores.min(MAX_MODEL_THREADS))
 }
 
 fn variable(name: &str) -> Option<OsString> {

@@ -13,7 +13,8 @@ use serde_json::json;
 use slag_common::{poses, splat};
 use slag_models::commands::{self, ModelsCommand, RunArgs};
 use slag_models::hub::Side;
-use slag_models::{ModelDir, ModelError, SessionOptions, TextEncoder, find_runtime};
+use slag_models::session::SessionError;
+use slag_models::{ModelDir, SessionOptions, TextEncoder};
 
 use super::Exit;
 use super::args::*;
@@ -127,10 +128,9 @@ pub(super) fn open_models(args: &ModelArgs) -> Result<(ModelDir, SessionOptions)
     Ok((models, session_options(&args.how)?))
 }
 
-/// Returns how models are run.
-fn session_options(how: &RunArgs) -> Result<SessionOptions, ModelError> {
-    let runtime = find_runtime(how.runtime.as_deref(), &runtime_folders())?;
-    Ok(SessionOptions { providers: how.provider.clone(), ..SessionOptions::new(runtime) })
+/// Returns how models are run: with one thread, because views are encoded side by side.
+fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
+    how.session_options(&runtime_folders(), 1)
 }
 
 fn run_models(command: &ModelsCommand, json: bool) -> Result<Exit> {
@@ -266,10 +266,11 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
         0 => String::new(),
         n => format!("left out   {n} views, the first: {}\n", summary.skipped_views[0].reason),
     };
+    let images_on = summary.images_on.as_ref().map_or(String::new(), |on| format!("images on  {on}\n"));
     let lines = format!(
         "published  generation {} in {}\n\
          Gaussians  {} ({} without evidence, {} unusable)\n\
-         views      {} ({} resumed, {} without masks)\n{skipped}\
+         views      {} ({} resumed, {} without masks)\n{skipped}{images_on}\
          masks      {} in {} regions, {} sums\n\
          cells      {} with {} palette rows\n\
          shards     {sizes}\n\

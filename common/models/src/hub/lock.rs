@@ -38,6 +38,13 @@ pub struct LockedFile {
     pub on_the_word_of: Source,
 }
 
+impl LockedFile {
+    /// Says that a file is not this one.
+    pub(super) fn refusal(self, path: PathBuf, found: Sha256, advice: &'static str) -> HubError {
+        HubError::Hash { path, found, expected: self.sha256, by: self.on_the_word_of, advice }
+    }
+}
+
 /// Whose word a hash is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]

@@ -39,7 +39,7 @@ pub enum HubError {
     /// The licence has not been accepted.
     #[error(
         "{name} is under {licence} ({url}){}; pull it with --accept-licence if you accept that",
-        if note.is_empty() { String::new() } else { format!("; {note}") }
+        if note.is_empty() { String::new() } else { format!("; note: {}", note.trim_end_matches('.')) }
     )]
     Licence {
         /// The model.
@@ -70,6 +70,9 @@ pub enum HubError {
     /// There is no folder for models.
     #[error("neither XDG_CACHE_HOME nor HOME is an absolute path, so models have no place; set one")]
     NoFolder,
+    /// The proxy cannot be used.
+    #[error("the proxy that HTTPS_PROXY names: {0}; correct or unset it")]
+    Proxy(#[from] Failure),
     /// A file is not the expected one.
     #[error("{}: SHA-256 is {found}, expected {expected} ({}); {advice}", path.display(), source_of(*by))]
     Hash {
@@ -309,29 +312,12 @@ impl Hub {
         // Another pull may have ended meanwhile.
         lock = Lock::read(root)?;
         lock.entry(name).licence.clone_from(&entry.licence);
-        let client = Client::new(&self.options)
-            .map_err(|failure| self.unreachable(entry, side, &lock, "the proxy", failure))?;
-        let mut pulled = Vec::new();
-        for path in entry.paths(side == Side::Text) {
-            pulled.push(self.pull_file(entry, side, path, &client, &mut lock)?);
-            lock.write(root)?;
-        }
-        if side == Side::Text {
-            // The image model is not needed here, but names the space.
-            let path = entry.paths(false)[0];
-            if self.expected(entry, path, &lock).is_none() {
-                let url = self.url(entry, path, &lock);
-                let advertised =
-                    client.ask(&url).map_err(|e| self.unreachable(entry, side, &lock, &url, e))?;
-                self.check_revision(entry, &url, &advertised, &mut lock)?;
-                let sha256 = advertised.sha256.ok_or(HubError::NoImageHash { url })?;
-                lock.entry(name)
-                    .files
-                    .insert(path.to_owned(), LockedFile { sha256, on_the_word_of: Source::Hub });
-                lock.write(root)?;
-            }
-        }
-        let hash_of = |path: &str| Some(self.expected(entry, path, &lock)?.sha256);
+        let client = Client::new(&self.options)?;
+        let mut pull = Pull { hub: self, entry, side, client, lock };
+        let paths = entry.paths(side == Side::Text);
+        let pulled = paths.into_iter().map(|path| pull.file(path)).collect::<Result<Vec<_>, _>>()?;
+        pull.name_image()?;
+        let hash_of = |path: &str| Some(pull.expected(path)?.sha256);
         let description = self.table.description(entry, &hash_of);
         write_atomically(&self.folder(entry).join(description::FILE_NAME), description.as_bytes())?;
         Ok(pulled)
@@ -379,120 +365,123 @@ impl Hub {
             _ => Ok(name.to_owned()),
         }
     }
+}
 
-    fn url(&self, entry: &Entry, path: &str, lock: &Lock) -> String {
-        let hub = self.options.hub.as_deref().unwrap_or(&self.table.hub).trim_end_matches('/');
-        let locked = lock.get(&entry.name).and_then(|accepted| accepted.revision.as_deref());
-        let revision = entry.revision.as_deref().or(locked).unwrap_or("main");
-        format!("{hub}/{}/resolve/{revision}/{path}", entry.repository)
+/// A pull under way.
+struct Pull<'a> {
+    hub: &'a Hub,
+    entry: &'a Entry,
+    side: Side,
+    client: Client,
+    lock: Lock,
+}
+
+impl Pull<'_> {
+    fn url(&self, path: &str) -> String {
+        let hub = self.hub.options.hub.as_deref().unwrap_or(&self.hub.table.hub).trim_end_matches('/');
+        let locked = self.lock.get(&self.entry.name).and_then(|accepted| accepted.revision.as_deref());
+        let revision = self.entry.revision.as_deref().or(locked).unwrap_or("main");
+        format!("{hub}/{}/resolve/{revision}/{path}", self.entry.repository)
     }
 
     /// Returns the hash that a file must have, where somebody has said one.
-    fn expected(&self, entry: &Entry, path: &str, lock: &Lock) -> Option<LockedFile> {
-        let known = entry.known.get(path);
+    fn expected(&self, path: &str) -> Option<LockedFile> {
+        let known = self.entry.known.get(path);
         let known = known.map(|known| LockedFile { sha256: known.sha256, on_the_word_of: Source::Table });
-        known.or_else(|| lock.get(&entry.name)?.files.get(path).cloned())
+        known.or_else(|| self.lock.get(&self.entry.name)?.files.get(path).cloned())
     }
 
-    fn unreachable(&self, entry: &Entry, side: Side, lock: &Lock, url: &str, failure: Failure) -> HubError {
+    /// Writes down what a file was accepted as.
+    fn accept(&mut self, path: &str, file: LockedFile) -> Result<(), HubError> {
+        self.lock.entry(&self.entry.name).files.insert(path.to_owned(), file);
+        self.lock.write(&self.hub.options.root)
+    }
+
+    fn unreachable(&self, url: &str, failure: Failure) -> HubError {
         if let Failure::Io(error) = failure {
             return HubError::Io(error);
         }
-        let folder = self.folder(entry);
-        let wanted = entry.paths(side == Side::Text).into_iter().filter(|path| !folder.join(path).is_file());
-        let wanted = wanted.map(|path| Wanted {
-            url: self.url(entry, path, lock),
+        let folder = self.hub.folder(self.entry);
+        let paths = self.entry.paths(self.side == Side::Text).into_iter();
+        let wanted = paths.filter(|path| !folder.join(path).is_file()).map(|path| Wanted {
+            url: self.url(path),
             path: folder.join(path),
-            sha256: self.expected(entry, path, lock).map(|expected| expected.sha256),
+            sha256: self.expected(path).map(|expected| expected.sha256),
         });
         HubError::Unreachable { url: url.to_owned(), failure: Box::new(failure), wanted: wanted.collect() }
     }
 
-    fn check_revision(
-        &self,
-        entry: &Entry,
-        url: &str,
-        advertised: &Advertised,
-        lock: &mut Lock,
-    ) -> Result<(), HubError> {
-        let Some(found) = advertised.revision.clone() else { return Ok(()) };
-        let accepted = lock.entry(&entry.name);
-        match entry.revision.clone().or(accepted.revision.clone()) {
-            Some(expected) if expected != found => {
-                Err(HubError::Revision { url: url.to_owned(), found, expected })
-            }
-            _ => {
-                accepted.revision = Some(found);
-                Ok(())
+    /// Asks what the hub says of a file, which must be of the commit that is pulled.
+    fn ask(&mut self, url: &str) -> Result<Advertised, HubError> {
+        let advertised = self.client.ask(url).map_err(|failure| self.unreachable(url, failure))?;
+        if let Some(found) = advertised.revision.clone() {
+            let accepted = self.lock.entry(&self.entry.name);
+            match self.entry.revision.clone().or(accepted.revision.clone()) {
+                Some(expected) if expected != found => {
+                    return Err(HubError::Revision { url: url.to_owned(), found, expected });
+                }
+                _ => accepted.revision = Some(found),
             }
         }
+        Ok(advertised)
+    }
+
+    /// Has the image model's hash known even where the file is not needed: it names the space.
+    fn name_image(&mut self) -> Result<(), HubError> {
+        let path = self.entry.paths(false)[0];
+        if self.expected(path).is_some() {
+            return Ok(());
+        }
+        let url = self.url(path);
+        let sha256 = self.ask(&url)?.sha256.ok_or(HubError::NoImageHash { url })?;
+        self.accept(path, LockedFile { sha256, on_the_word_of: Source::Hub })
     }
 
     /// Brings one file here and into the lock.
-    fn pull_file(
-        &self,
-        entry: &Entry,
-        side: Side,
-        path: &str,
-        client: &Client,
-        lock: &mut Lock,
-    ) -> Result<PulledFile, HubError> {
-        let target = self.folder(entry).join(path);
-        let url = self.url(entry, path, lock);
-        let mut expected = self.expected(entry, path, lock);
+    fn file(&mut self, path: &str) -> Result<PulledFile, HubError> {
+        let target = self.hub.folder(self.entry).join(path);
         let was_here = target.is_file();
         if !was_here {
-            expected = Some(self.download(entry, side, path, client, lock, expected, &target, &url)?);
+            let accepted = self.download(path, &target)?;
+            self.accept(path, accepted)?;
         }
         let found = Sha256(hash_file(&target)?);
-        let expected = match expected {
+        let expected = match self.expected(path) {
             Some(expected) => expected,
             // Placed by hand, and nobody has said yet what it should be.
-            None => match client.ask(&url).ok().and_then(|advertised| advertised.sha256) {
+            None => match self.client.ask(&self.url(path)).ok().and_then(|advertised| advertised.sha256) {
                 Some(sha256) => LockedFile { sha256, on_the_word_of: Source::Hub },
                 None => LockedFile { sha256: found, on_the_word_of: Source::PlacedByHand },
             },
         };
         if found != expected.sha256 {
-            let (expected, by) = (expected.sha256, expected.on_the_word_of);
-            let advice = "remove the file and pull again";
-            return Err(HubError::Hash { path: target, found, expected, by, advice });
+            return Err(expected.refusal(target, found, "remove the file and pull again"));
         }
-        lock.entry(&entry.name).files.insert(path.to_owned(), expected.clone());
+        self.accept(path, expected.clone())?;
         let LockedFile { sha256, on_the_word_of } = expected;
         Ok(PulledFile { path: path.to_owned(), sha256, on_the_word_of, was_here })
     }
 
     /// Downloads a file to `target`; returns what it was found to be, and on whose word.
-    #[expect(clippy::too_many_arguments, reason = "all of one pull")]
-    fn download(
-        &self,
-        entry: &Entry,
-        side: Side,
-        path: &str,
-        client: &Client,
-        lock: &mut Lock,
-        expected: Option<LockedFile>,
-        target: &Path,
-        url: &str,
-    ) -> Result<LockedFile, HubError> {
-        let fails = |lock: &Lock, failure| self.unreachable(entry, side, lock, url, failure);
-        let advertised = client.ask(url).map_err(|failure| fails(lock, failure))?;
-        self.check_revision(entry, url, &advertised, lock)?;
+    fn download(&mut self, path: &str, target: &Path) -> Result<LockedFile, HubError> {
+        let url = self.url(path);
+        let expected = self.expected(path);
+        let advertised = self.ask(&url)?;
         if let (Some(expected), Some(advertised)) = (&expected, advertised.sha256)
             && expected.sha256 != advertised
         {
             let (expected, by) = (expected.sha256, expected.on_the_word_of);
-            return Err(HubError::Advertised { url: url.to_owned(), advertised, expected, by });
+            return Err(HubError::Advertised { url, advertised, expected, by });
         }
         let hub = advertised.sha256.map(|sha256| LockedFile { sha256, on_the_word_of: Source::Hub });
         let stated = expected.or(hub);
         let part = target.with_added_extension("part");
-        fs_err::create_dir_all(target.parent().unwrap_or(&self.options.root))?;
-        let len_bytes = entry.known.get(path).map(|known| known.len_bytes).or(advertised.len_bytes);
+        fs_err::create_dir_all(target.parent().unwrap_or(&self.hub.options.root))?;
+        let len_bytes = self.entry.known.get(path).map(|known| known.len_bytes).or(advertised.len_bytes);
         tracing::info!("pulling {url}");
         loop {
-            let was_begun = client.receive(url, &part, len_bytes).map_err(|failure| fails(lock, failure))?;
+            let received = self.client.receive(&url, &part, len_bytes);
+            let was_begun = received.map_err(|failure| self.unreachable(&url, failure))?;
             let found = Sha256(hash_file(&part)?);
             let first = LockedFile { sha256: found, on_the_word_of: Source::FirstPull };
             let expected = stated.clone().unwrap_or(first);
@@ -505,9 +494,8 @@ impl Hub {
             discard(&part)?;
             // Perhaps the part that was here already was another file's.
             if !was_begun {
-                let (expected, by) = (expected.sha256, expected.on_the_word_of);
                 let advice = "what came was thrown away: pull again, or give another --hub";
-                return Err(HubError::Hash { path: target.to_owned(), found, expected, by, advice });
+                return Err(expected.refusal(target.to_owned(), found, advice));
             }
         }
     }

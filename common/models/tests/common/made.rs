@@ -43,14 +43,14 @@ pub fn text_graph(kind: TextKind) -> Graph {
     let table: Vec<f32> = (0..N_TOKENS as u32).flat_map(row).collect();
     let shape = [N_TOKENS as i64, DIM as i64];
     let mut nodes = vec![
-        node("Cast", &["input_ids"], "ids", &[("to", &[Element::I64 as i64])]),
+        node("Cast", &["input_ids"], "ids", &[("to", &[Element::I64.code()])]),
         node("Gather", &["table", "ids"], "rows", &[("axis", &[0])]),
     ];
     let mut inputs = vec![value("input_ids", kind.ids, &[1, kind.n_tokens])];
     if kind.has_mask {
         inputs.push(value("attention_mask", kind.ids, &[1, kind.n_tokens]));
         nodes.extend([
-            node("Cast", &["attention_mask"], "weights", &[("to", &[kind.floats as i64])]),
+            node("Cast", &["attention_mask"], "weights", &[("to", &[kind.floats.code()])]),
             node("Unsqueeze", &["weights"], "line", &[("axes", &[1])]),
             node("MatMul", &["line", "rows"], "sums", &[]),
             node("Squeeze", &["sums"], "text_embeds", &[("axes", &[1])]),

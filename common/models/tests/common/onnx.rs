@@ -1,12 +1,19 @@
 //! Writes small ONNX files, so that tests can have a model of any kind and know its answers without running it.
 
-/// Element types, as in `TensorProto.DataType` of onnx.proto.
+/// An element type, by its number in `TensorProto.DataType` of onnx.proto.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Element {
-    F32 = 1,
-    I32 = 6,
-    I64 = 7,
-    F16 = 10,
+pub struct Element(i64);
+
+impl Element {
+    pub const F32: Self = Self(1);
+    pub const I32: Self = Self(6);
+    pub const I64: Self = Self(7);
+    pub const F16: Self = Self(10);
+
+    /// Its number.
+    pub fn code(self) -> i64 {
+        self.0
+    }
 }
 
 /// A message of protocol buffers.
@@ -44,7 +51,7 @@ pub fn value(name: &str, element: Element, shape: &[i64]) -> Vec<u8> {
         -1 => Message::default().bytes(2, "n").0,
         n => Message::default().number(1, n).0,
     });
-    let tensor = Message::default().number(1, element as i64).bytes(2, Message::default().each(1, dims).0);
+    let tensor = Message::default().number(1, element.code()).bytes(2, Message::default().each(1, dims).0);
     Message::default().bytes(1, name).bytes(2, Message::default().bytes(1, tensor.0).0).0
 }
 
@@ -55,7 +62,7 @@ pub fn constant(name: &str, element: Element, shape: &[i64], values: &[f32]) -> 
         _ => values.iter().flat_map(|x| x.to_le_bytes()).collect(),
     };
     let message = shape.iter().fold(Message::default(), |message, &n| message.number(1, n));
-    message.number(2, element as i64).bytes(8, name).bytes(9, raw).0
+    message.number(2, element.code()).bytes(8, name).bytes(9, raw).0
 }
 
 /// A node; attributes are integers, or lists of them.
