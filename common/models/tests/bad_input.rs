@@ -46,7 +46,7 @@ fn wrong_descriptions_are_named_by_field_or_line() {
         ("size_px = 224", "size_px = 5000", "image.size_px is 5000"),
         ("batch = 16", "batch = 0", "image.batch is 0"),
         ("batch = 16", "batch = 16\nbatches = 2", "batches"),
-        ("resize = \"stretch\"", "resize = \"pad\"", "pad"),
+        ("resize = \"stretch\"", "resize = \"tile\"", "tile"),
         ("threshold = 0.35", "threshold = nan", "score is { threshold = NaN }"),
         ("std = [0.5019607843137255", "std = [0.0", "image.std is [0.0"),
         ("name = \"conse-mobilenetv2\"", "name = \"two words\"", "name is \"two words\""),
