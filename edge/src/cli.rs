@@ -17,6 +17,7 @@ use slag_common::frames::Aabb;
 use slag_common::shard::Profile;
 use slag_edge::query::{DEFAULT_MIN_COUNT, Level, Negatives, parse_box, parse_point};
 use slag_edge::score::Precision;
+use slag_models::commands::{ModelsCommand, RunArgs};
 
 /// Keeps the shards around a robot and answers text queries offline.
 #[derive(Debug, Parser)]
@@ -42,6 +43,8 @@ enum Command {
     Query(QueryArgs),
     /// Shows what is on board.
     Status(StatusArgs),
+    /// Public text models: what is known, pulling, checking, showing.
+    Models(ModelsArgs),
     /// Measures a service and this machine; prints JSON.
     #[command(subcommand)]
     Bench(BenchCommand),
@@ -55,6 +58,8 @@ enum BenchCommand {
     Pause(PauseArgs),
     /// How a service stands more queries than it can answer.
     Load(LoadArgs),
+    /// Times the text model.
+    Text(bench::BenchTextArgs),
 }
 
 #[derive(Debug, Args)]
@@ -111,12 +116,12 @@ struct ThreadArgs {
 
 #[derive(Debug, Args)]
 struct ModelArgs {
-    /// Folder of the text model, with its model.toml [default: the built-in stand-in].
-    #[arg(long, value_name = "DIR")]
+    /// Folder of the text model, with its model.toml, or name of a pulled model (`models list`) [default: the
+    /// built-in stand-in].
+    #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR")]
     models: Option<PathBuf>,
-    /// ONNX Runtime library [default: beside this program, else where the system finds it].
-    #[arg(long, value_name = "PATH")]
-    runtime: Option<PathBuf>,
+    #[command(flatten)]
+    how: RunArgs,
 }
 
 #[derive(Debug, Args)]
@@ -256,6 +261,15 @@ struct StatusArgs {
     json: bool,
 }
 
+#[derive(Debug, Args)]
+struct ModelsArgs {
+    #[command(subcommand)]
+    command: ModelsCommand,
+    /// Print the result as JSON.
+    #[arg(long, global = true)]
+    json: bool,
+}
+
 /// How a run ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Exit {
@@ -281,6 +295,7 @@ impl Cli {
         match (self.quiet, self.verbose, &self.command) {
             (true, ..) => "error",
             (_, 0, Command::Serve(_)) | (_, 1, _) => "warn,slag_edge=info",
+            (_, 0, Command::Models(_)) => "warn,slag_models=info",
             (_, 0, _) => "warn",
             _ => "debug",
         }
@@ -293,6 +308,7 @@ impl Cli {
             Command::Serve(args) => (false, commands::serve(args)),
             Command::Query(args) => (args.json, commands::query(args)),
             Command::Status(args) => (args.json, commands::status(args)),
+            Command::Models(args) => (args.json, commands::models(args)),
             Command::Bench(command) => (true, bench::run(command)),
         };
         match result {
@@ -378,6 +394,11 @@ mod tests {
         assert_eq!((query.bounds, query.precision), (Some(bounds), Precision::Rows));
         assert_eq!(query.negatives, Negatives::Phrases(vec!["wall".into(), "floor".into()]));
         assert!(parse("slag-edge status --json --cache d").is_ok());
+        assert!(parse("slag-edge models pull clip --accept-licence --json").is_ok());
+        assert!(
+            parse("slag-edge bench text --encoder clip --provider tensorrt,cuda,cpu --model-threads 2")
+                .is_ok()
+        );
         assert!(parse("slag-edge bench query --cache d --limits 10,20 --runs 3 --threads 1").is_ok());
     }
 
@@ -404,6 +425,9 @@ mod tests {
             "slag-edge status --quiet --verbose",
             "slag-edge serve --threads 0",
             "slag-edge bench query --runs 0",
+            "slag-edge query chair --provider gpu",
+            "slag-edge models",
+            "slag-edge models pull",
         ] {
             assert_eq!(parse(line).expect_err(line).exit_code(), Exit::Usage as i32, "{line}");
         }

@@ -182,6 +182,11 @@ impl Axes {
         Self { dim, gate: Gate::default(), n_encoded: Arc::default() }
     }
 
+    /// Returns the count of texts that it encodes.
+    pub fn n_encoded(&self) -> Arc<AtomicUsize> {
+        Arc::clone(&self.n_encoded)
+    }
+
     pub fn info(dim: usize) -> EncoderInfo {
         let id = TestShard::new(Vec::new()).encoder_id;
         EncoderInfo { name: "axes".into(), id, dim: dim as u32, execution_provider: "none" }
@@ -216,8 +221,8 @@ impl TextEncoder for Axes {
 
 /// Returns a service over [`Axes`] and the count of texts it really encoded.
 pub fn axes_service(dim: usize, gate: Gate) -> (TextService, Arc<AtomicUsize>) {
-    let n_encoded: Arc<AtomicUsize> = Arc::default();
-    let axes = Axes { dim, gate, n_encoded: Arc::clone(&n_encoded) };
+    let axes = Axes { gate, ..Axes::new(dim) };
+    let n_encoded = axes.n_encoded();
     (TextService::start(Axes::info(dim), Box::new(axes)).expect("a thread"), n_encoded)
 }
 

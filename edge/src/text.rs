@@ -10,7 +10,7 @@ use std::thread::JoinHandle;
 
 use serde::Serialize;
 use slag_common::Hash32;
-use slag_models::{EncodeError, ModelDir, ModelError, Provider, SessionOptions, TextEncoder};
+use slag_models::{EncodeError, ModelDir, ModelError, SessionOptions, TextEncoder};
 
 /// Longer query texts are refused: every text model here cuts far below.
 pub const MAX_TEXT_BYTES: usize = 512;
@@ -53,7 +53,7 @@ pub struct EncoderInfo {
     pub id: Hash32,
     /// Components of a vector.
     pub dim: u32,
-    /// What the text model runs on: `cpu`, `cuda`, or `none` where texts are looked up.
+    /// What the text model runs on, as it turned out: `cpu`, `cuda` ..., or `none` where no runtime is needed.
     pub execution_provider: &'static str,
 }
 
@@ -79,11 +79,7 @@ impl TextService {
     pub fn open(models: Option<&Path>, options: &SessionOptions) -> Result<Self, TextOpenError> {
         let models = models.map_or_else(|| Ok(ModelDir::builtin()), ModelDir::open)?;
         let encoder = models.text_encoder(options)?;
-        let execution_provider = match (encoder.vocabulary(), options.provider) {
-            (Some(_), _) => "none",
-            (None, Provider::Cpu) => "cpu",
-            (None, Provider::Cuda) => "cuda",
-        };
+        let execution_provider = encoder.placement().map_or("none", |placement| placement.provider().name());
         let id = models.encoder_id();
         let info =
             EncoderInfo { name: id.name.clone(), id: Hash32(id.hash()), dim: id.dim, execution_provider };

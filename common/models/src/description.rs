@@ -9,25 +9,27 @@
 //!
 //! [image]
 //! file = { path = "vision.onnx", sha256 = "..." }   # sha256 may be left out where the file is there
-//! input = "pixel_values"           # f32 [n,3,size_px,size_px], RGB
-//! output = "image_embeds"          # f32 [n,dim]
+//! input = "pixel_values"           # f32 or f16 [n,3,size_px,size_px], RGB; n may be fixed to 1
+//! output = "image_embeds"          # f32 or f16 [n,dim]; left out: the only output of that shape
 //! size_px = 224
 //! resize = "shortest-edge"         # and centre crop, as CLIPImageProcessor; or "stretch"
 //! filter = "bicubic"
 //! mean = [0.48, 0.46, 0.41]        # pixel value = (level / 255 - mean) / std
 //! std = [0.27, 0.26, 0.28]
 //! normalise = true                 # false: the model's vectors are of unit length already
-//! batch = 16
+//! batch = 16                       # crops in a run; left out: measured (see `OnnxImageEncoder`)
 //!
 //! [text]
 //! kind = "onnx"
 //! file = { path = "text.onnx" }
 //! tokenizer = { path = "tokenizer.json" }
-//! input_ids = "input_ids"          # i64 [1,tokens]
+//! input_ids = "input_ids"          # i64 or i32 [1,tokens]
 //! attention_mask = "attention_mask"  # left out where the model takes none
-//! output = "text_embeds"           # f32 [1,dim]
+//! output = "text_embeds"           # f32 or f16 [1,dim]; left out: the only output of that shape
 //! max_tokens = 77
 //! end_token_id = 49407
+//! padding = { n_tokens = 64, token_id = 1 }  # only where the model was trained on padded texts (SigLIP), or
+//!                                  # takes so many tokens and no others; CLIP is quicker without
 //! prompt = "a photo of a {}"
 //!
 //! # or, instead: vectors of fixed phrases
@@ -44,14 +46,21 @@
 //! [score]
 //! threshold = 0.25                 # cosine from which something counts as found; without [score],
 //!                                  # every scene is calibrated by its own scores
+//!
+//! # or, for models trained with a sigmoid: probability = 1 / (1 + exp(-(logit_scale * cosine + logit_bias)))
+//! # [score]
+//! # logit_scale = 117.33           # the factor itself, not its logarithm
+//! # logit_bias = -12.93
+//! # probability = 0.5              # from which something counts as found; 0.5 where left out
 //! ```
 //!
 //! Unknown fields are refused. A robot that has the text files only needs the image file's `sha256`
 //! recorded, because the encoder id states both.
 
+use std::fmt;
 use std::path::{Component, Path, PathBuf};
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 use crate::preprocess::{Filter, Preprocess, Resize};
 
@@ -116,9 +125,21 @@ pub struct FileRef {
 }
 
 /// A SHA-256, as 64 hexadecimal digits in text.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
-#[serde(try_from = "String")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
 pub struct Sha256(pub [u8; 32]);
+
+impl fmt::Display for Sha256 {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&hex::encode(self.0))
+    }
+}
+
+impl From<Sha256> for String {
+    fn from(sha256: Sha256) -> Self {
+        sha256.to_string()
+    }
+}
 
 impl TryFrom<String> for Sha256 {
     type Error = String;
@@ -168,10 +189,10 @@ fn here() -> PathBuf {
 pub struct ImageDescription {
     /// The ONNX file.
     pub file: FileRef,
-    /// Its input, f32 `[n, 3, size_px, size_px]`.
+    /// Its input, f32 or f16 `[n, 3, size_px, size_px]`.
     pub input: String,
-    /// Its output, f32 `[n, dim]`.
-    pub output: String,
+    /// Its output, f32 or f16 `[n, dim]`; the only one of that shape if absent.
+    pub output: Option<String>,
     /// Edge of the square that it takes, pixels.
     pub size_px: u16,
     /// How a crop becomes that square.
@@ -185,8 +206,8 @@ pub struct ImageDescription {
     pub std: [f64; 3],
     /// Whether the output is to be scaled to unit length.
     pub normalise: bool,
-    /// Crops in a run.
-    pub batch: u16,
+    /// Crops in a run; measured if absent.
+    pub batch: Option<u16>,
 }
 
 impl ImageDescription {
@@ -214,18 +235,30 @@ pub struct OnnxText {
     pub file: FileRef,
     /// The tokenizer, `tokenizer.json` of Hugging Face tokenizers.
     pub tokenizer: FileRef,
-    /// The input for token ids, i64 `[1, tokens]`.
+    /// The input for token ids, i64 or i32 `[1, tokens]`.
     pub input_ids: String,
-    /// The input for the mask, i64 `[1, tokens]`, if there is one.
+    /// The input for the mask, i64 or i32 `[1, tokens]`, if there is one.
     pub attention_mask: Option<String>,
-    /// The output, f32 `[1, dim]`.
-    pub output: String,
+    /// The output, f32 or f16 `[1, dim]`; the only one of that shape if absent.
+    pub output: Option<String>,
     /// The longest text, tokens, with the begin and end tokens.
     pub max_tokens: u16,
     /// The token that ends a text.
     pub end_token_id: u32,
+    /// What follows the end token, if anything.
+    pub padding: Option<Padding>,
     /// What is encoded, `{}` standing for the text.
     pub prompt: String,
+}
+
+/// How texts are made as long as the model wants them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Padding {
+    /// Tokens of every text, with the begin and end tokens.
+    pub n_tokens: u16,
+    /// The token that fills up.
+    pub token_id: u32,
 }
 
 /// A text encoder made of fixed phrases.
@@ -250,12 +283,53 @@ pub struct CentreDescription {
     pub tensor: String,
 }
 
-/// How scores are read.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+/// How scores are read: a cosine, or the sigmoid of a scaled one.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ScoreDescription {
     /// The cosine from which something counts as found, by default.
-    pub threshold: f32,
+    threshold: Option<f32>,
+    /// What the cosine is multiplied by to become a logit.
+    logit_scale: Option<f64>,
+    /// What is added after that.
+    logit_bias: Option<f64>,
+    /// The probability from which something counts as found, by default.
+    probability: Option<f64>,
+}
+
+/// Shows the fields that are given.
+impl fmt::Display for ScoreDescription {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { threshold, logit_scale, logit_bias, probability } = *self;
+        let given = [
+            ("threshold", threshold.map(f64::from)),
+            ("logit_scale", logit_scale),
+            ("logit_bias", logit_bias),
+            ("probability", probability),
+        ];
+        let given = given.into_iter().filter_map(|(name, value)| Some(format!("{name} = {}", value?)));
+        f.write_str(&given.collect::<Vec<_>>().join(", "))
+    }
+}
+
+impl ScoreDescription {
+    /// Returns the cosine from which something counts as found: as stated, or where
+    /// 1 / (1 + exp(-(scale * cosine + bias))) is the probability stated (Zhai et al. 2023, equation 1).
+    ///
+    /// `None` where the fields are not exactly those of one way, or give no cosine.
+    pub fn threshold(&self) -> Option<f32> {
+        let threshold = match *self {
+            Self { threshold, logit_scale: None, logit_bias: None, probability: None } => {
+                f64::from(threshold?)
+            }
+            Self { threshold: None, logit_scale, logit_bias, probability } => {
+                let probability = probability.unwrap_or(0.5);
+                ((probability / (1.0 - probability)).ln() - logit_bias?) / logit_scale.filter(|s| *s > 0.0)?
+            }
+            _ => return None,
+        };
+        (-1.0..=1.0).contains(&threshold).then_some(threshold as f32)
+    }
 }
 
 impl Description {
@@ -307,7 +381,8 @@ impl Description {
             image.size_px.to_string(),
             "1 to 2048",
         )?;
-        require((1..=1024).contains(&image.batch), "image.batch", image.batch.to_string(), "1 to 1024")?;
+        let batch = image.batch.unwrap_or(1);
+        require((1..=1024).contains(&batch), "image.batch", batch.to_string(), "1 to 1024")?;
         require(
             image.mean.iter().all(|x| x.is_finite()),
             "image.mean",
@@ -325,10 +400,18 @@ impl Description {
             require(max_tokens >= 2, "text.max_tokens", max_tokens.to_string(), "2 or more")?;
             let has_place = text.prompt.contains("{}");
             require(has_place, "text.prompt", format!("{:?}", text.prompt), "a text with {} in it")?;
+            let n_padded = text.padding.map_or(max_tokens, |padding| padding.n_tokens);
+            let expected = "text.max_tokens or more";
+            require(n_padded >= max_tokens, "text.padding.n_tokens", n_padded.to_string(), expected)?;
         }
-        if let Some(ScoreDescription { threshold }) = self.score {
-            let is_cosine = (-1.0..=1.0).contains(&threshold);
-            require(is_cosine, "score.threshold", threshold.to_string(), "a cosine, -1 to 1")?;
+        if let Some(score) = &self.score {
+            require(
+                score.threshold().is_some(),
+                "score",
+                format!("{{ {score} }}"),
+                "a threshold alone, a cosine from -1 to 1, or logit_scale above 0 and logit_bias, with a probability \
+                 between 0 and 1 that some cosine reaches",
+            )?;
         }
         require(
             self.files_root

@@ -6,18 +6,23 @@
 //! with what is built in ([`builtin`]). [`EncoderId`] names the space, so that a robot can refuse
 //! to compare vectors of two spaces.
 //!
-//! Nothing here prints, reads the environment or starts threads of its own.
+//! [`hub`] brings public models here, and [`commands`] is the face that both programs give it.
+//!
+//! Nothing here prints, reads the environment or starts threads of its own, save the question of [`commands::ask`].
 
 pub mod builtin;
 pub mod clean;
+pub mod commands;
 mod crop;
 pub mod description;
 pub mod encoder_id;
 mod error;
+pub mod hub;
 pub mod image;
 mod model_dir;
 pub mod phrases;
 pub mod preprocess;
+mod provider;
 pub mod session;
 pub mod tensors;
 pub mod text;
@@ -26,7 +31,8 @@ pub use crop::Crop;
 pub use encoder_id::EncoderId;
 pub use error::{EncodeError, ModelError};
 pub use model_dir::ModelDir;
-pub use session::{Provider, SessionOptions, find_runtime};
+pub use provider::{NoProvider, Placement, Provider};
+pub use session::{SessionOptions, find_runtime};
 
 /// Turns crops of photographs into unit vectors.
 pub trait ImageEncoder: Send {
@@ -42,6 +48,11 @@ pub trait ImageEncoder: Send {
     /// # Errors
     /// [`EncodeError`] where a crop is empty or the model fails.
     fn encode(&mut self, crops: &[Crop]) -> Result<Vec<f32>, EncodeError>;
+
+    /// Returns what ONNX Runtime really runs it on; `None` where it does without.
+    fn placement(&self) -> Option<&Placement> {
+        None
+    }
 }
 
 /// Turns words into unit vectors of the image encoder's space.
@@ -59,6 +70,11 @@ pub trait TextEncoder: Send {
 
     /// Returns all that it knows, where that is a list; `None` where it takes any text.
     fn vocabulary(&self) -> Option<&[String]> {
+        None
+    }
+
+    /// Returns what ONNX Runtime really runs it on; `None` where it does without.
+    fn placement(&self) -> Option<&Placement> {
         None
     }
 }

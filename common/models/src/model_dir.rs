@@ -1,6 +1,7 @@
 use std::{
     io::{self, Read},
     path::{Path, PathBuf},
+    sync::{Arc, Mutex, PoisonError},
 };
 
 use sha2::{Digest, Sha256};
@@ -24,7 +25,7 @@ pub struct ModelDir {
 #[derive(Clone, Debug)]
 enum Source {
     Builtin,
-    Files { files_root: PathBuf, description: Box<Description> },
+    Files { files_root: PathBuf, description: Box<Description>, batch: Arc<Mutex<Option<usize>>> },
 }
 
 impl ModelDir {
@@ -51,7 +52,8 @@ impl ModelDir {
             };
             id.sha256_of_file.insert(role.to_owned(), hex::encode(sha256));
         }
-        Ok(Self { id, source: Source::Files { files_root, description: Box::new(description) } })
+        let source = Source::Files { files_root, description: Box::new(description), batch: Arc::default() };
+        Ok(Self { id, source })
     }
 
     /// Returns the built-in stand-in, which needs no files and no ONNX Runtime.
@@ -94,7 +96,7 @@ impl ModelDir {
     pub fn threshold(&self) -> Option<f32> {
         match &self.source {
             Source::Builtin => Some(builtin::THRESHOLD),
-            Source::Files { description, .. } => description.score.as_ref().map(|score| score.threshold),
+            Source::Files { description, .. } => description.score.as_ref()?.threshold(),
         }
     }
 
@@ -102,19 +104,22 @@ impl ModelDir {
     /// # Errors
     /// [`ModelError`] where a file is absent or not as described, or ONNX Runtime does not load.
     pub fn image_encoder(&self, options: &SessionOptions) -> Result<Box<dyn ImageEncoder>, ModelError> {
-        let Source::Files { files_root, description } = &self.source else {
+        let Source::Files { files_root, description, batch } = &self.source else {
             return Ok(Box::new(builtin::ColourShape));
         };
         let image = &description.image;
         let path = checked(files_root, &image.file)?;
-        Ok(Box::new(OnnxImageEncoder::open(&description.name, self.dim(), &path, image, options)?))
+        let mut encoder = OnnxImageEncoder::open(&description.name, self.dim(), &path, image, options)?;
+        // One measures, the others wait, or they would disturb it.
+        encoder.settle_batch(&mut batch.lock().unwrap_or_else(PoisonError::into_inner))?;
+        Ok(Box::new(encoder))
     }
 
     /// Opens the text encoder; ONNX Runtime is loaded only where the text side is ONNX.
     /// # Errors
     /// [`ModelError`] where a file is absent or not as described, or ONNX Runtime does not load.
     pub fn text_encoder(&self, options: &SessionOptions) -> Result<Box<dyn TextEncoder>, ModelError> {
-        let Source::Files { files_root, description } = &self.source else {
+        let Source::Files { files_root, description, .. } = &self.source else {
             return Ok(Box::new(builtin::ColourShape));
         };
         let (name, dim) = (&description.name, self.dim());
@@ -152,7 +157,8 @@ fn checked(files_root: &Path, file: &FileRef) -> Result<PathBuf, DescriptionErro
     Ok(path)
 }
 
-fn hash_file(path: &Path) -> io::Result<[u8; 32]> {
+/// Returns the SHA-256 of a file.
+pub(crate) fn hash_file(path: &Path) -> io::Result<[u8; 32]> {
     let mut file = fs_err::File::open(path)?;
     let mut hasher = Sha256::new();
     let mut buffer = vec![0; 1 << 20];

@@ -3,19 +3,23 @@
 //! The library is loaded at run time, once a process, so that a program without models needs none.
 
 use std::{
+    collections::BTreeSet,
     env::consts::{DLL_PREFIX, DLL_SUFFIX},
     fmt::Debug,
     path::{Path, PathBuf},
     sync::{Arc, Mutex, PoisonError},
 };
 
+use half::f16;
 use ort::{
+    ErrorCode,
     environment::Environment,
-    ep,
     logging::LogLevel,
-    session::{Session, SessionInputValue, builder::SessionBuilder},
-    value::{DynValue, Outlet, PrimitiveTensorElementType, TensorElementType, TensorRef, ValueType},
+    session::{Session, SessionInputValue},
+    value::{Outlet, PrimitiveTensorElementType, Tensor, TensorElementType, TensorRef, ValueType},
 };
+
+use crate::provider::{Listener, Placement, Provider};
 
 /// Says why a model could not be opened or run.
 #[derive(Debug, thiserror::Error)]
@@ -49,12 +53,28 @@ pub enum SessionError {
         cause: ort::Error,
     },
     /// The accelerator asked for cannot be used.
-    #[error("ONNX Runtime cannot use {provider:?}: {cause}; use a build with it, or the CPU")]
+    #[error(
+        "ONNX Runtime cannot use {provider}: {cause}; give a libonnxruntime that is built with it, with its drivers \
+         (onnxruntime-gpu for cuda and tensorrt), or let the processor stand in: {provider},cpu"
+    )]
     Provider {
         /// The accelerator.
         provider: Provider,
         /// What the runtime says.
         cause: ort::Error,
+    },
+    /// The accelerators asked for take no part of the model.
+    #[error(
+        "{}: runs on {placement} alone, {} was asked for; use another export of the model, or let the processor \
+         stand in by adding cpu", path.display(), names(asked)
+    )]
+    NotPlaced {
+        /// The model file.
+        path: PathBuf,
+        /// What was asked for.
+        asked: Vec<Provider>,
+        /// What runs it.
+        placement: Placement,
     },
     /// The model file cannot be read.
     #[error("{cause}; put the model file there or correct the description")]
@@ -65,6 +85,17 @@ pub enum SessionError {
     /// The model file cannot be loaded: cut, not ONNX, or of an unknown version.
     #[error("{}: {cause}; fetch the model file again", path.display())]
     Load {
+        /// The model file.
+        path: PathBuf,
+        /// What the runtime says.
+        cause: ort::Error,
+    },
+    /// The model file is of a version that the library does not know.
+    #[error(
+        "{}: {cause}; give a newer libonnxruntime, or export the model for an older opset (17 is known to all)",
+        path.display()
+    )]
+    Version {
         /// The model file.
         path: PathBuf,
         /// What the runtime says.
@@ -81,6 +112,21 @@ pub enum SessionError {
         name: String,
         /// The names that it has.
         found: Vec<String>,
+    },
+    /// Which input or output is meant is not clear.
+    #[error(
+        "{}: the {role} is not named, and of {} not one alone is {expected}; name it in the description",
+        path.display(), found.join(", ")
+    )]
+    Unnamed {
+        /// The model file.
+        path: PathBuf,
+        /// "input" or "output".
+        role: &'static str,
+        /// All that it has, with types and shapes.
+        found: Vec<String>,
+        /// Type and shape looked for; -1 is any size.
+        expected: String,
     },
     /// An input or output is of another type or shape.
     #[error("{}: {role} {name:?} is {found}, expected {expected}; correct the description", path.display())]
@@ -106,14 +152,8 @@ pub enum SessionError {
     },
 }
 
-/// What a model is run on.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Provider {
-    /// The processor.
-    #[default]
-    Cpu,
-    /// An NVIDIA GPU; needs a CUDA build of ONNX Runtime.
-    Cuda,
+fn names(providers: &[Provider]) -> String {
+    providers.iter().map(|provider| provider.name()).collect::<Vec<_>>().join(", ")
 }
 
 /// How models are run.
@@ -123,14 +163,15 @@ pub struct SessionOptions {
     pub runtime: PathBuf,
     /// Threads within one run; small models are fastest with 1, several sessions then run side by side.
     pub intra_op_threads: usize,
-    /// What the model runs on.
-    pub provider: Provider,
+    /// What the model is to run on, the most wanted first. Without the processor in the list, nothing else
+    /// than what is listed will do.
+    pub providers: Vec<Provider>,
 }
 
 impl SessionOptions {
     /// Returns the options for one thread on the processor.
     pub fn new(runtime: PathBuf) -> Self {
-        Self { runtime, intra_op_threads: 1, provider: Provider::Cpu }
+        Self { runtime, intra_op_threads: 1, providers: vec![Provider::Cpu] }
     }
 }
 
@@ -182,11 +223,21 @@ fn environment(runtime: &Path) -> Result<Environment, SessionError> {
 }
 
 /// Hands the runtime's messages on, which it would print otherwise.
-fn forward_log(level: LogLevel, category: &str, _id: &str, _location: &str, message: &str) {
+pub(crate) fn forward_log(level: LogLevel, category: &str, _id: &str, _location: &str, message: &str) {
     match level {
         LogLevel::Error | LogLevel::Fatal => tracing::error!(category, "ONNX Runtime: {message}"),
         LogLevel::Warning => tracing::warn!(category, "ONNX Runtime: {message}"),
         LogLevel::Info | LogLevel::Verbose => tracing::debug!(category, "ONNX Runtime: {message}"),
+    }
+}
+
+/// Warns unless the same was said before: every thread opens models of its own.
+fn warn_once(message: String) {
+    static SAID: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
+    let mut said = SAID.lock().unwrap_or_else(PoisonError::into_inner);
+    if !said.contains(&message) {
+        tracing::warn!("{message}");
+        said.insert(message);
     }
 }
 
@@ -195,7 +246,17 @@ fn forward_log(level: LogLevel, category: &str, _id: &str, _location: &str, mess
 pub(crate) struct Model {
     path: PathBuf,
     session: Session,
-    provider: Provider,
+    placement: Placement,
+}
+
+/// An input or output of a model.
+pub(crate) struct Slot {
+    /// Its name.
+    pub name: String,
+    /// What its elements are.
+    pub element: TensorElementType,
+    /// Its shape; -1 is any size.
+    pub shape: Vec<i64>,
 }
 
 impl Model {
@@ -203,42 +264,107 @@ impl Model {
         // Before the library is asked for, so that a missing model is named as such.
         fs_err::metadata(path).map_err(|cause| SessionError::Read { cause })?;
         let environment = environment(&options.runtime)?;
-        let load = |cause| SessionError::Load { path: path.to_owned(), cause };
-        let mut builder = Session::builder(&environment)
+        let mut wanted = options.providers.clone();
+        // What comes after the processor is never needed: the processor can run everything.
+        let end = wanted.iter().position(|&p| p == Provider::Cpu);
+        let may_be_cpu = end.is_some() || wanted.is_empty();
+        wanted.truncate(end.unwrap_or(wanted.len()));
+        let asked = wanted.clone();
+        let (session, placement) = loop {
+            match Self::commit(path, options, &environment, &wanted, !asked.is_empty()) {
+                Err(SessionError::Provider { provider, cause }) => {
+                    wanted.retain(|&p| p != provider);
+                    let error = SessionError::Provider { provider, cause };
+                    if wanted.is_empty() && !may_be_cpu {
+                        return Err(error);
+                    }
+                    warn_once(error.to_string());
+                }
+                committed => break committed?,
+            }
+        };
+        let placement = placement.of_asked(&asked);
+        if placement.provider() == Provider::Cpu && !asked.is_empty() {
+            if !may_be_cpu {
+                return Err(SessionError::NotPlaced { path: path.to_owned(), asked, placement });
+            }
+            let asked = names(&asked);
+            warn_once(format!("{} runs on the processor; asked for was {asked}", path.display()));
+        }
+        tracing::debug!("{} runs on {placement}", path.display());
+        Ok(Self { path: path.to_owned(), session, placement })
+    }
+
+    /// Opens the model with its nodes offered to `providers`, and says who took them where that is asked.
+    fn commit(
+        path: &Path,
+        options: &SessionOptions,
+        environment: &Environment,
+        providers: &[Provider],
+        listens: bool,
+    ) -> Result<(Session, Placement), SessionError> {
+        let load = |cause: ort::Error| {
+            let says = cause.message();
+            let path = path.to_owned();
+            match says.contains("opset") || says.contains("IR version") {
+                true => SessionError::Version { path, cause },
+                false => SessionError::Load { path, cause },
+            }
+        };
+        let mut builder = Session::builder(environment)
             .and_then(|b| b.with_intra_threads(options.intra_op_threads).map_err(ort::Error::from))
             .and_then(|b| b.with_inter_threads(1).map_err(ort::Error::from))
             .map_err(load)?;
-        if options.provider == Provider::Cuda {
-            builder = with_cuda(builder)
-                .map_err(|cause| SessionError::Provider { provider: options.provider, cause })?;
+        let listener = Listener::default();
+        if listens {
+            builder = listener.attach(builder).map_err(load)?;
         }
-        let session = builder.commit_from_file(path).map_err(load)?;
-        tracing::debug!(path = %path.display(), provider = ?options.provider, "model opened");
-        Ok(Self { path: path.to_owned(), session, provider: options.provider })
+        for &provider in providers {
+            builder =
+                provider.register(builder).map_err(|cause| SessionError::Provider { provider, cause })?;
+        }
+        let session =
+            builder.commit_from_file(path).map_err(|cause| match (providers.first(), cause.code()) {
+                (None, _)
+                | (_, ErrorCode::InvalidProtobuf | ErrorCode::InvalidGraph | ErrorCode::NoModel) => {
+                    load(cause)
+                }
+                // Devices and drivers are looked for only now.
+                (Some(&provider), _) => SessionError::Provider { provider, cause },
+            })?;
+        Ok((session, listener.placement()))
     }
 
-    pub(crate) fn provider(&self) -> Provider {
-        self.provider
+    pub(crate) fn placement(&self) -> &Placement {
+        &self.placement
     }
 
-    /// Checks that input `name` takes `element` tensors of `shape`, where -1 is any size.
-    pub(crate) fn expect_input(
+    /// Returns what the elements of input `name` are, if it is there and a tensor.
+    pub(crate) fn input_element(&self, name: &str) -> Option<TensorElementType> {
+        let input = self.session.inputs().iter().find(|input| input.name() == name)?;
+        input.dtype().tensor_type()
+    }
+
+    /// Returns input `name`, or without a name the only one that fits, if it takes `elements` (f32 stands for
+    /// f16 too) of `shape`, where -1 is any size.
+    pub(crate) fn expect_input<'a>(
         &self,
-        name: &str,
+        name: impl Into<Option<&'a str>>,
         element: TensorElementType,
         shape: &[i64],
-    ) -> Result<(), SessionError> {
-        self.expect("input", self.session.inputs(), name, element, shape)
+    ) -> Result<Slot, SessionError> {
+        self.expect("input", self.session.inputs(), name.into(), element, shape)
     }
 
-    /// Checks that output `name` gives `element` tensors of `shape`, where -1 is any size.
-    pub(crate) fn expect_output(
+    /// Returns output `name`, or without a name the only one that fits, if it gives `elements` (f32 stands for
+    /// f16 too) of `shape`, where -1 is any size.
+    pub(crate) fn expect_output<'a>(
         &self,
-        name: &str,
+        name: impl Into<Option<&'a str>>,
         element: TensorElementType,
         shape: &[i64],
-    ) -> Result<(), SessionError> {
-        self.expect("output", self.session.outputs(), name, element, shape)
+    ) -> Result<Slot, SessionError> {
+        self.expect("output", self.session.outputs(), name.into(), element, shape)
     }
 
     /// Checks that the model has no input beside `names`.
@@ -259,29 +385,50 @@ impl Model {
         &self,
         role: &'static str,
         outlets: &[Outlet],
-        name: &str,
+        name: Option<&str>,
         element: TensorElementType,
         expected: &[i64],
-    ) -> Result<(), SessionError> {
-        let outlet =
-            outlets.iter().find(|outlet| outlet.name() == name).ok_or_else(|| SessionError::NoTensor {
-                path: self.path.clone(),
-                role,
-                name: name.to_owned(),
-                found: outlets.iter().map(|outlet| outlet.name().to_owned()).collect(),
-            })?;
-        let fits = match outlet.dtype() {
-            ValueType::Tensor { ty, shape, .. } => *ty == element && shapes_fit(shape, expected),
-            _ => false,
+    ) -> Result<Slot, SessionError> {
+        let slot_of = |outlet: &Outlet| match outlet.dtype() {
+            ValueType::Tensor { ty, shape, .. }
+                if is_element(*ty, element) && shapes_fit(shape, expected) =>
+            {
+                Some(Slot { name: outlet.name().to_owned(), element: *ty, shape: shape.to_vec() })
+            }
+            _ => None,
         };
-        if fits {
-            return Ok(());
+        let path = self.path.clone();
+        let Some(name) = name else {
+            let mut fitting = outlets.iter().filter_map(slot_of);
+            return match (fitting.next(), fitting.next()) {
+                (Some(slot), None) => Ok(slot),
+                _ => Err(SessionError::Unnamed {
+                    path,
+                    role,
+                    found: outlets.iter().map(|o| format!("{} {}", o.name(), type_of(o))).collect(),
+                    expected: format!("{element} {expected:?}"),
+                }),
+            };
+        };
+        let Some(outlet) = outlets.iter().find(|outlet| outlet.name() == name) else {
+            let found = outlets.iter().map(|outlet| outlet.name().to_owned()).collect();
+            return Err(SessionError::NoTensor { path, role, name: name.to_owned(), found });
+        };
+        slot_of(outlet).ok_or_else(|| self.shape_error(role, name, type_of(outlet), element, expected))
+    }
+
+    /// Says that the model takes texts of one length only.
+    pub(crate) fn fixed_tokens(&self, slot: &Slot) -> SessionError {
+        let n = slot.shape[1];
+        SessionError::Shape {
+            path: self.path.clone(),
+            role: "input",
+            name: slot.name.clone(),
+            found: format!("{} {:?}", slot.element, slot.shape),
+            expected: format!(
+                "text.padding = {{ n_tokens = {n}, token_id = the model's }} or tokens of any number"
+            ),
         }
-        let found = match outlet.dtype() {
-            ValueType::Tensor { ty, shape, .. } => format!("{ty} {:?}", &shape[..]),
-            other => other.to_string(),
-        };
-        Err(self.shape_error(role, name, found, element, expected))
     }
 
     fn shape_error(
@@ -312,18 +459,21 @@ impl Model {
         let mut outputs = self.session.run(inputs).map_err(|cause| run(&self.path, cause))?;
         let output = outputs.remove(name);
         drop(outputs);
-        let extracted = output.as_ref().map(DynValue::try_extract_tensor::<f32>);
-        match extracted {
-            Some(Ok((found, values))) if found[..] == *shape => Ok(values.to_vec()),
-            Some(Ok((found, _))) => {
-                let found = format!("f32 {:?}", &found[..]);
-                Err(self.shape_error("output", name, found, TensorElementType::Float32, shape))
-            }
-            Some(Err(cause)) => Err(run(&self.path, cause)),
-            None => {
-                Err(self.shape_error("output", name, "absent".to_owned(), TensorElementType::Float32, shape))
-            }
+        let absent =
+            || self.shape_error("output", name, "absent".to_owned(), TensorElementType::Float32, shape);
+        let output = output.ok_or_else(absent)?;
+        let extracted = match output.dtype().tensor_type() {
+            Some(TensorElementType::Float16) => output
+                .try_extract_tensor::<f16>()
+                .map(|(found, values)| (found, values.iter().map(|x| x.to_f32()).collect())),
+            _ => output.try_extract_tensor::<f32>().map(|(found, values)| (found, values.to_vec())),
+        };
+        let (found, values): (_, Vec<f32>) = extracted.map_err(|cause| run(&self.path, cause))?;
+        if found[..] != *shape {
+            let found = format!("{} {:?}", TensorElementType::Float32, &found[..]);
+            return Err(self.shape_error("output", name, found, TensorElementType::Float32, shape));
         }
+        Ok(values)
     }
 
     /// Returns `values` as an input of `shape`.
@@ -339,12 +489,32 @@ impl Model {
             .map_err(|cause| SessionError::Run { path: self.path.clone(), cause })?;
         Ok(tensor.into())
     }
+
+    /// Returns `values` as an input of `shape`, i32 or i64.
+    pub(crate) fn integers(
+        &self,
+        shape: Vec<i64>,
+        values: impl Iterator<Item = u32>,
+        is_i32: bool,
+    ) -> Result<SessionInputValue<'static>, SessionError> {
+        let tensor: ort::Result<SessionInputValue<'static>> = match is_i32 {
+            true => Tensor::from_array((shape, values.map(|v| v as i32).collect::<Vec<_>>())).map(Into::into),
+            false => Tensor::from_array((shape, values.map(i64::from).collect::<Vec<_>>())).map(Into::into),
+        };
+        tensor.map_err(|cause| SessionError::Run { path: self.path.clone(), cause })
+    }
 }
 
-fn with_cuda(builder: SessionBuilder) -> ort::Result<SessionBuilder> {
-    builder
-        .with_execution_providers([ep::CUDA::default().build().error_on_failure()])
-        .map_err(ort::Error::from)
+fn type_of(outlet: &Outlet) -> String {
+    match outlet.dtype() {
+        ValueType::Tensor { ty, shape, .. } => format!("{ty} {:?}", &shape[..]),
+        other => other.to_string(),
+    }
+}
+
+/// Tells whether elements are as expected; halves of f32 are converted.
+fn is_element(found: TensorElementType, expected: TensorElementType) -> bool {
+    found == expected || (expected, found) == (TensorElementType::Float32, TensorElementType::Float16)
 }
 
 /// Tells whether a declared shape admits `expected`; -1 on either side is any size.

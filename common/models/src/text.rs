@@ -10,7 +10,8 @@ use crate::{
     clean::clean,
     description::OnnxText,
     normalise,
-    session::{Model, Provider, SessionOptions},
+    provider::Placement,
+    session::{Model, SessionError, SessionOptions},
 };
 
 /// Says why text could not be made into tokens.
@@ -42,6 +43,19 @@ pub enum TokenizerError {
         expected: u32,
         /// The last token of a text, if any.
         found: Option<u32>,
+    },
+    /// The tokenizer has more tokens than the model knows.
+    #[error(
+        "{}: has token ids up to {largest}, the model does not take them ({cause}); use the model's own tokenizer",
+        path.display()
+    )]
+    MoreTokens {
+        /// The file.
+        path: PathBuf,
+        /// Its largest id.
+        largest: u32,
+        /// What the model says to a text of it.
+        cause: Box<SessionError>,
     },
     /// The tokenizer fails on a text.
     #[error("{}: {reason}; use other words", path.display())]
@@ -87,6 +101,11 @@ impl Tokens {
         Ok(tokens)
     }
 
+    /// Returns the largest id that a text can have; what is added beside the vocabulary need not occur.
+    fn largest_id(&self) -> u32 {
+        self.tokenizer.get_vocab(false).into_values().max().unwrap_or(0)
+    }
+
     fn raw_ids(&self, text: &str) -> Result<Vec<u32>, TokenizerError> {
         let encoding = self
             .tokenizer
@@ -123,12 +142,17 @@ pub struct OnnxTextEncoder {
     model: Model,
     tokens: Tokens,
     description: OnnxText,
+    output: String,
+    /// Whether ids and mask are i32, not i64.
+    is_i32: bool,
     /// Subtracted from the unit vector, `[dim]`.
     centre: Option<Vec<f32>>,
 }
 
 impl OnnxTextEncoder {
     /// Opens `model` and `tokenizer` as `description` says; `dim`: components of a vector; `centre`: `[dim]`.
+    ///
+    /// A text of the tokenizer's largest id is run, so that a model that does not fit is found now.
     /// # Errors
     /// [`ModelError`] where the runtime or a file is not as described.
     pub fn open(
@@ -141,20 +165,52 @@ impl OnnxTextEncoder {
     ) -> Result<Self, ModelError> {
         let tokens = Tokens::open(tokenizer, usize::from(description.max_tokens), description.end_token_id)?;
         let model = Model::open(model, options)?;
-        model.expect_input(&description.input_ids, TensorElementType::Int64, &[-1, -1])?;
-        let mut names = vec![description.input_ids.as_str()];
-        if let Some(mask) = &description.attention_mask {
-            model.expect_input(mask, TensorElementType::Int64, &[-1, -1])?;
-            names.push(mask);
+        let is_i32 = model.input_element(&description.input_ids) == Some(TensorElementType::Int32);
+        let id = if is_i32 { TensorElementType::Int32 } else { TensorElementType::Int64 };
+        let n_tokens = description.padding.map_or(-1, |padding| i64::from(padding.n_tokens));
+        let names: Vec<&str> = [Some(&description.input_ids), description.attention_mask.as_ref()]
+            .into_iter()
+            .flatten()
+            .map(|name| &**name)
+            .collect();
+        for name in &names {
+            let slot = model.expect_input(*name, id, &[1, n_tokens])?;
+            if description.padding.is_none() && slot.shape[1] != -1 {
+                return Err(model.fixed_tokens(&slot).into());
+            }
         }
         model.expect_no_input_but(&names)?;
-        model.expect_output(&description.output, TensorElementType::Float32, &[-1, dim as i64])?;
-        Ok(Self { name: name.to_owned(), dim, model, tokens, description: description.clone(), centre })
+        let output = model
+            .expect_output(description.output.as_deref(), TensorElementType::Float32, &[1, dim as i64])?
+            .name;
+        let (name, description) = (name.to_owned(), description.clone());
+        let mut encoder = Self { name, dim, model, tokens, description, output, is_i32, centre };
+        let largest = encoder.tokens.largest_id();
+        let end = encoder.description.end_token_id;
+        match encoder.run(&[largest, end]) {
+            Ok(_) => Ok(encoder),
+            Err(cause) if encoder.run(&[end, end]).is_ok() => {
+                let (path, cause) = (tokenizer.to_owned(), Box::new(cause));
+                Err(TokenizerError::MoreTokens { path, largest, cause }.into())
+            }
+            Err(cause) => Err(cause.into()),
+        }
     }
 
-    /// Returns what it runs on.
-    pub fn provider(&self) -> Provider {
-        self.model.provider()
+    /// Returns the model's vector of token ids, `[dim]`.
+    fn run(&mut self, ids: &[u32]) -> Result<Vec<f32>, SessionError> {
+        let (n_real, padding) = (ids.len(), self.description.padding);
+        let n_tokens = padding.map_or(n_real, |padding| usize::from(padding.n_tokens));
+        let filler = padding.map_or(0, |padding| padding.token_id);
+        let ids = ids.iter().copied().chain(std::iter::repeat(filler)).take(n_tokens);
+        let mask = (0..n_tokens).map(|i| u32::from(i < n_real));
+        let shape = vec![1, n_tokens as i64];
+        let ids = self.model.integers(shape.clone(), ids, self.is_i32)?;
+        let mut inputs = vec![(self.description.input_ids.as_str(), ids)];
+        if let Some(name) = &self.description.attention_mask {
+            inputs.push((name, self.model.integers(shape, mask, self.is_i32)?));
+        }
+        self.model.run(inputs, &self.output, &[1, self.dim as i64])
     }
 }
 
@@ -173,19 +229,16 @@ impl TextEncoder for OnnxTextEncoder {
             return Err(EncodeError::EmptyText);
         }
         let ids = self.tokens.ids(&self.description.prompt.replace("{}", &text))?;
-        let ids: Vec<i64> = ids.into_iter().map(i64::from).collect();
-        let ones = vec![1i64; ids.len()];
-        let shape = vec![1, ids.len() as i64];
-        let mut inputs = vec![(self.description.input_ids.as_str(), self.model.tensor(shape.clone(), &ids)?)];
-        if let Some(mask) = &self.description.attention_mask {
-            inputs.push((mask, self.model.tensor(shape, &ones)?));
-        }
-        let mut vector = self.model.run(inputs, &self.description.output, &[1, self.dim as i64])?;
+        let mut vector = self.run(&ids)?;
         if centred(&mut vector, self.centre.as_deref()) {
             Ok(vector)
         } else {
             Err(EncodeError::NoDirection { model: self.name.clone(), index: 0 })
         }
+    }
+
+    fn placement(&self) -> Option<&Placement> {
+        Some(self.model.placement())
     }
 }
 

@@ -3,6 +3,7 @@
 mod common;
 
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
 use common::{model_dir, options, shared};
 use slag_models::{ModelDir, SessionOptions, find_runtime};
@@ -36,6 +37,19 @@ fn a_missing_or_wrong_library_says_what_to_do_and_leaves_room_for_the_right_one(
     assert!(
         refusal(Path::new("libno-such-onnxruntime.so")).contains("put libonnxruntime.so beside the program")
     );
+
+    // An old ONNX Runtime: all that is asked of it before it is refused is its version.
+    let source = folder.path().join("old.c");
+    let old = folder.path().join("libold.so");
+    let code = "static const char* version(void) { return \"1.9.0\"; }\n\
+        static struct { void* get_api; const char* (*version)(void); } base = { 0, version };\n\
+        void* OrtGetApiBase(void) { return &base; }\n";
+    fs_err::write(&source, code).expect("it is writable");
+    let built = Command::new("cc").args(["-shared", "-fPIC", "-o"]).args([&old, &source]).status();
+    assert!(built.expect("the linker's compiler is there").success());
+    for part in ["libold.so", "1.9.0", "1.17", "install version 1.17 or newer"] {
+        assert!(refusal(&old).contains(part), "{}", refusal(&old));
+    }
 
     let Some(options) = options() else { return };
     model.image_encoder(&options).expect("the right library still loads");

@@ -7,6 +7,7 @@ mod machine;
 pub mod pause;
 pub mod query;
 mod scene;
+pub mod text;
 
 use serde::Serialize;
 

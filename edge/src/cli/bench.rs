@@ -9,12 +9,14 @@ use slag_common::shard::ShardView;
 use slag_edge::bench::load::{self, LoadOptions};
 use slag_edge::bench::pause::{self, PauseOptions};
 use slag_edge::bench::query::{Settings, bench_query, dump_ids, dump_vectors, make_queries, time_http};
+use slag_edge::bench::text::{self, TextSettings};
 use slag_edge::score::Precision;
 use slag_edge::store::{OpenShard, Snapshot};
+use slag_models::ModelDir;
 
-use super::commands::store_failure;
+use super::commands::{store_failure, text_model};
 use super::output::{Failure, print_json};
-use super::{BenchCommand, CacheArgs, LoadArgs, PauseArgs, ThreadArgs};
+use super::{BenchCommand, CacheArgs, LoadArgs, ModelArgs, PauseArgs, ThreadArgs};
 
 #[derive(Debug, Args)]
 pub struct BenchQueryArgs {
@@ -46,6 +48,20 @@ pub struct BenchQueryArgs {
     ids: Option<PathBuf>,
 }
 
+#[derive(Debug, Args)]
+pub struct BenchTextArgs {
+    #[command(flatten)]
+    models: ModelArgs,
+    /// A text to time; may be given again.
+    #[arg(long, default_values = ["chair", "a red fire extinguisher on the wall beside the door"])]
+    text: Vec<String>,
+    /// Timed runs of each text.
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    runs: u32,
+}
+
+/// Untimed runs of a text before the timed ones.
+const N_TEXT_WARM_UP: usize = 10;
 /// Made queries.
 const N_QUERIES: usize = 32;
 /// Untimed questions before the timed ones.
@@ -61,6 +77,7 @@ pub fn run(command: BenchCommand) -> Result<(), Failure> {
         BenchCommand::Query(args) => bench_query_command(args),
         BenchCommand::Pause(args) => bench_pause(args),
         BenchCommand::Load(args) => bench_load(args),
+        BenchCommand::Text(args) => bench_text(args),
     }
 }
 
@@ -103,6 +120,21 @@ fn bench_query_command(args: BenchQueryArgs) -> Result<(), Failure> {
     report.http = time_http(&cache, &snapshot, queries, &settings, &report.in_process)
         .map_err(|e| failed(anyhow::Error::new(e).context("timing the service on loopback")))?;
     print_json(&report)
+}
+
+fn bench_text(args: BenchTextArgs) -> Result<(), Failure> {
+    let failed = Failure::of("models");
+    let (folder, options) = text_model(&args.models)?;
+    let models = folder.map_or_else(|| Ok(ModelDir::builtin()), |folder| ModelDir::open(&folder));
+    let encoder = models.and_then(|models| models.text_encoder(&options));
+    let settings = TextSettings {
+        texts: args.text,
+        n_runs: args.runs as usize,
+        n_warm_up: N_TEXT_WARM_UP,
+        model_threads: options.intra_op_threads,
+    };
+    let report = text::run(&mut *encoder.map_err(|e| failed(e.into()))?, &settings);
+    print_json(&report.map_err(|e| failed(e.into()))?)
 }
 
 fn bench_pause(args: PauseArgs) -> Result<(), Failure> {

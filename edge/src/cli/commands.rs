@@ -1,5 +1,6 @@
 //! `serve`, `query` and `status`.
 
+use std::ffi::OsString;
 use std::io::{self, Write};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -12,22 +13,27 @@ use slag_edge::http::{self, App, Settings};
 use slag_edge::query::{Engine, QueryRequest, Status};
 use slag_edge::store::{EdgeCache, Snapshot, StoreError};
 use slag_edge::text::TextService;
-use slag_models::{SessionOptions, find_runtime};
+use slag_models::SessionOptions;
+use slag_models::commands::{self as model_commands, RunArgs};
+use slag_models::hub::{Side, cache_folder};
+use slag_models::session::SessionError;
 use tokio::net::TcpListener;
 
 use super::fetch::follow_in_background;
 use super::output::{Failure, print_json, print_pairs, print_reply, print_status, write_json};
-use super::{CacheArgs, ModelArgs, QueryArgs, ServeArgs, StatusArgs, ThreadArgs};
+use super::{CacheArgs, ModelArgs, ModelsArgs, QueryArgs, ServeArgs, StatusArgs, ThreadArgs};
 
 /// Async threads: they only pass requests on.
 const ASYNC_THREADS: usize = 2;
+/// Threads of a text model: more gain little for short texts.
+const MAX_MODEL_THREADS: usize = 4;
 /// Threads beside those of queries, for status and for loading a generation.
 const SPARE_BLOCKING_THREADS: usize = 8;
 
 impl CacheArgs {
     /// Returns the cache named, or the user's own.
     pub fn open(self) -> Result<EdgeCache, Failure> {
-        let dir = self.cache.or_else(default_cache_dir);
+        let dir = self.cache.or_else(|| cache_folder(variable));
         let advice = || Failure::Usage(anyhow!("neither XDG_CACHE_HOME nor HOME is set; give --cache DIR"));
         Ok(EdgeCache::open(dir.ok_or_else(advice)?))
     }
@@ -42,21 +48,44 @@ impl ThreadArgs {
     }
 }
 
-fn default_cache_dir() -> Option<PathBuf> {
-    // The base directory specification has relative paths ignored.
-    let absolute = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
-    let base = absolute("XDG_CACHE_HOME").or_else(|| Some(absolute("HOME")?.join(".cache")))?;
-    Some(base.join("slag"))
+fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
+    let (folder, options) = text_model(models)?;
+    let text = TextService::open(folder.as_deref(), &options);
+    Ok(Engine::new(cache, text.map_err(|e| Failure::Failed("models", e.into()))?))
 }
 
-fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
+/// Returns the folder of the text model, none for the built-in one, and how it is run.
+pub fn text_model(models: &ModelArgs) -> Result<(Option<PathBuf>, SessionOptions), Failure> {
     let failed = Failure::of("models");
+    let folder = models.models.as_deref().map(|model| model_commands::resolve(model, &variable)).transpose();
+    let options = session_options(&models.how).map_err(|e| failed(e.into()))?;
+    Ok((folder.map_err(|e| failed(e.into()))?, options))
+}
+
+/// Returns how models are run: one text at a time, with a few threads.
+fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
     let beside = std::env::current_exe().ok().and_then(|exe| Some(exe.parent()?.to_owned()));
-    let beside: Vec<PathBuf> = beside.into_iter().collect();
-    let runtime = find_runtime(models.runtime.as_deref(), &beside).map_err(|e| failed(e.into()))?;
-    let options = SessionOptions::new(runtime);
-    let text = TextService::open(models.models.as_deref(), &options).map_err(|e| failed(e.into()))?;
-    Ok(Engine::new(cache, text))
+    let n_cores = std::thread::available_parallelism().map_or(1, usize::from);
+    how.session_options(&Vec::from_iter(beside), n_cores.min(MAX_MODEL_THREADS))
+}
+
+fn variable(name: &str) -> Option<OsString> {
+    std::env::var_os(name)
+}
+
+pub fn models(args: ModelsArgs) -> Result<(), Failure> {
+    let context = model_commands::Context {
+        variable: &variable,
+        side: Side::Text,
+        ask: &|question| !args.json && model_commands::ask(question),
+        session: &session_options,
+    };
+    let report = model_commands::run(&args.command, &context);
+    let report = report.map_err(|e| Failure::Failed("models", e.into()))?;
+    match args.json {
+        true => print_json(&report),
+        false => Ok(write!(io::stdout(), "{report}")?),
+    }
 }
 
 /// Tells apart that nothing is on board yet.

@@ -8,6 +8,7 @@ use std::str::FromStr;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use slag_common::shard::Profile;
+use slag_models::commands::{ModelsCommand, RunArgs};
 
 use super::keys::KeysCommand;
 use crate::embed::Background;
@@ -58,6 +59,9 @@ pub enum Command {
     /// Shows, makes and changes the key that a store signs with.
     #[command(subcommand)]
     Keys(KeysCommand),
+    /// Public models: what is known, pulling, checking, showing.
+    #[command(subcommand)]
+    Models(ModelsCommand),
     /// Pushes a store elsewhere.
     #[command(subcommand)]
     Push(PushCommand),
@@ -80,12 +84,12 @@ pub enum Command {
 /// Where models come from.
 #[derive(Clone, Debug, Args)]
 pub struct ModelArgs {
-    /// Model directory (with model.toml); the built-in stand-in if absent.
-    #[arg(long, value_name = "DIR")]
+    /// Folder with model.toml, or name of a pulled model (`models list`); the built-in stand-in if absent.
+    #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR")]
     pub models: Option<PathBuf>,
-    /// ONNX Runtime library; searched beside the program and by the system if absent.
-    #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
-    pub runtime: Option<PathBuf>,
+    /// How they run.
+    #[command(flatten)]
+    pub how: RunArgs,
 }
 
 /// Scene, poses, photos.

@@ -11,7 +11,10 @@ use anyhow::{Context, Result, anyhow};
 use serde::Serialize;
 use serde_json::json;
 use slag_common::{poses, splat};
-use slag_models::{ModelDir, SessionOptions, TextEncoder, find_runtime};
+use slag_models::commands::{self, ModelsCommand, RunArgs};
+use slag_models::hub::Side;
+use slag_models::session::SessionError;
+use slag_models::{ModelDir, SessionOptions, TextEncoder};
 
 use super::Exit;
 use super::args::*;
@@ -48,6 +51,7 @@ pub fn run(cli: Cli) -> Exit {
         Command::Query(args) => run_query(&args, json),
         Command::Serve(args) => run_serve(&args),
         Command::Keys(command) => super::keys::run(&command, json),
+        Command::Models(command) => run_models(&command, json),
         Command::Push(PushCommand::Qdrant(args)) => run_push(&args, progress.as_ref(), json),
         Command::Eval(EvalCommand::Labelled(args)) => run_eval_labelled(&args, json),
         Command::Generate(command) => run_generate(&command, progress.as_ref()),
@@ -118,11 +122,27 @@ pub(super) fn now_unix_secs() -> u64 {
 /// Opens the models and says how they are run.
 pub(super) fn open_models(args: &ModelArgs) -> Result<(ModelDir, SessionOptions)> {
     let models = match &args.models {
-        Some(dir) => ModelDir::open(dir)?,
+        Some(model) => ModelDir::open(&commands::resolve(model, &|name| std::env::var_os(name))?)?,
         None => ModelDir::builtin(),
     };
-    let runtime = find_runtime(args.runtime.as_deref(), &runtime_folders())?;
-    Ok((models, SessionOptions::new(runtime)))
+    Ok((models, session_options(&args.how)?))
+}
+
+/// Returns how models are run: with one thread, because views are encoded side by side.
+fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
+    how.session_options(&runtime_folders(), 1)
+}
+
+fn run_models(command: &ModelsCommand, json: bool) -> Result<Exit> {
+    let context = commands::Context {
+        variable: &|name| std::env::var_os(name),
+        side: Side::Both,
+        ask: &|question| !json && commands::ask(question),
+        session: &session_options,
+    };
+    let report = commands::run(command, &context)?;
+    print(json, &report, &report)?;
+    Ok(Exit::Done)
 }
 
 /// Returns where the set-up puts ONNX Runtime: beside the program, or in the build folder above it.
@@ -246,10 +266,11 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
         0 => String::new(),
         n => format!("left out   {n} views, the first: {}\n", summary.skipped_views[0].reason),
     };
+    let images_on = summary.images_on.as_ref().map_or(String::new(), |on| format!("images on  {on}\n"));
     let lines = format!(
         "published  generation {} in {}\n\
          Gaussians  {} ({} without evidence, {} unusable)\n\
-         views      {} ({} resumed, {} without masks)\n{skipped}\
+         views      {} ({} resumed, {} without masks)\n{skipped}{images_on}\
          masks      {} in {} regions, {} sums\n\
          cells      {} with {} palette rows\n\
          shards     {sizes}\n\

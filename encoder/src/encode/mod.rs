@@ -13,6 +13,7 @@ mod view;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Mutex;
+use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Instant;
 
@@ -200,6 +201,8 @@ pub struct EncodeSummary {
     pub busy_secs: BTreeMap<String, f64>,
     /// Seconds from start to end.
     pub wall_secs: f64,
+    /// What the image model really ran on; absent where no view was left to do, or no runtime is needed.
+    pub images_on: Option<String>,
     /// The encoder's name.
     pub encoder: String,
 }
@@ -263,6 +266,7 @@ pub fn encode(
         models,
         session,
         stopwatch: &stopwatch,
+        images_on: OnceLock::new(),
     };
     progress.begin("views", "view", views.len() as u64, n_resumed as u64);
     skipped.extend(run_views(&worker, &views, &job, progress, cancel)?);
@@ -301,6 +305,7 @@ pub fn encode(
         busy_secs: BTreeMap::new(),
         wall_secs: 0.0,
         encoder: models.encoder_id().to_string(),
+        images_on: worker.images_on.get().cloned().flatten(),
     };
     progress.begin("cells", "cell", split.cells.len() as u64, 0);
     let Some(built) = builder.build(progress, cancel)? else {

@@ -1,5 +1,7 @@
 //! One view through the stages segment, embed and raster.
 
+use std::sync::OnceLock;
+
 use slag_common::View;
 use slag_models::{ImageEncoder, ModelDir, SessionOptions};
 
@@ -21,6 +23,8 @@ pub(super) struct ViewWorker<'a> {
     pub(super) models: &'a ModelDir,
     pub(super) session: &'a SessionOptions,
     pub(super) stopwatch: &'a Stopwatch,
+    /// What the image model really runs on, once it is open.
+    pub(super) images_on: OnceLock<Option<String>>,
 }
 
 impl ViewWorker<'_> {
@@ -48,6 +52,7 @@ impl ViewWorker<'_> {
                 Some(encoder) => encoder,
                 none => none.insert(self.models.image_encoder(self.session)?),
             };
+            self.images_on.get_or_init(|| encoder.placement().map(ToString::to_string));
             let embedded = self.stopwatch.time("embed", || {
                 embed::embed_masks(&loaded.image, &masks, encoder.as_mut(), self.settings.background, None)
             });

@@ -1,6 +1,9 @@
 //! Where the tests' data lies.
 #![allow(dead_code, reason = "each test program uses a part")]
 
+pub mod made;
+pub mod onnx;
+
 use std::path::{Path, PathBuf};
 
 use npyz::npz::NpzArchive;

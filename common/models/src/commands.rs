@@ -1,0 +1,344 @@
+//! `models list|pull|verify|info`, the same in both programs.
+
+use std::fmt;
+use std::io::{self, BufRead, IsTerminal, Write};
+use std::num::NonZeroUsize;
+use std::path::{Path, PathBuf};
+
+use clap::{Args, Subcommand};
+use serde::Serialize;
+
+use crate::description::{Description, FILE_NAME};
+use crate::hub::{
+    Entry, Here, Hub, HubError, HubOptions, PulledFile, Side, Source, cache_folder, models_folder,
+};
+use crate::session::SessionError;
+use crate::{ModelDir, ModelError, Provider, SessionOptions, find_runtime};
+
+/// What can be done with models.
+#[derive(Debug, Subcommand)]
+pub enum ModelsCommand {
+    /// Lists the public models that are known, and what of them is here.
+    List,
+    /// Pulls public models into the user's cache; goes on where it was cut off.
+    Pull(PullArgs),
+    /// Compares every file of models with its recorded hash.
+    Verify {
+        /// Names of pulled models, or folders [default: all that are pulled].
+        models: Vec<PathBuf>,
+    },
+    /// Shows what a model is, and, with --run, what it really runs on.
+    Info(InfoArgs),
+}
+
+/// `models pull`.
+#[derive(Debug, Args)]
+pub struct PullArgs {
+    /// Names, as `models list` has them.
+    #[arg(required = true)]
+    names: Vec<String>,
+    /// Accepts the models' licences without a question.
+    #[arg(long, visible_alias = "accept-license")]
+    accept_licence: bool,
+    /// A mirror of the hub.
+    #[arg(long, value_name = "URL")]
+    hub: Option<String>,
+}
+
+/// `models info`.
+#[derive(Debug, Args)]
+pub struct InfoArgs {
+    /// Name of a pulled model, or a folder.
+    model: PathBuf,
+    /// Opens the encoders and says what they run on.
+    #[arg(long)]
+    run: bool,
+    /// How they run.
+    #[command(flatten)]
+    how: RunArgs,
+}
+
+/// How models are run.
+#[derive(Clone, Debug, Args)]
+pub struct RunArgs {
+    /// ONNX Runtime library [default: beside this program, else where the system finds it].
+    #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
+    pub runtime: Option<PathBuf>,
+    /// What models run on, the most wanted first: cpu, cuda, tensorrt, coreml, directml. Without cpu in the
+    /// list, it is an error if none of them can be used.
+    #[arg(long, value_name = "NAME,...", value_delimiter = ',', default_value = "cpu")]
+    pub provider: Vec<Provider>,
+    /// Threads of one run of a model [default: 1 where views are encoded side by side, else all cores, at most 4].
+    #[arg(long, value_name = "N")]
+    pub model_threads: Option<NonZeroUsize>,
+}
+
+impl RunArgs {
+    /// Returns how models are run, with `default_threads` unless the user says otherwise; `beside`: folders in
+    /// which the runtime is looked for.
+    /// # Errors
+    /// [`SessionError::NoRuntime`] where the library that the user gives is not there.
+    pub fn session_options(
+        &self,
+        beside: &[PathBuf],
+        default_threads: usize,
+    ) -> Result<SessionOptions, SessionError> {
+        let intra_op_threads = self.model_threads.map_or(default_threads, NonZeroUsize::get);
+        let runtime = find_runtime(self.runtime.as_deref(), beside)?;
+        let providers = self.provider.clone();
+        Ok(SessionOptions { intra_op_threads, providers, ..SessionOptions::new(runtime) })
+    }
+}
+
+/// What the program that is run knows.
+pub struct Context<'a> {
+    /// Looks the environment up.
+    pub variable: &'a dyn Fn(&str) -> Option<std::ffi::OsString>,
+    /// Which files the program has use for.
+    pub side: Side,
+    /// Asks the user a question.
+    pub ask: &'a dyn Fn(&str) -> bool,
+    /// Returns how models run.
+    pub session: &'a dyn Fn(&RunArgs) -> Result<SessionOptions, SessionError>,
+}
+
+/// Returns how the hub is reached in this environment.
+fn options(variable: &dyn Fn(&str) -> Option<std::ffi::OsString>) -> Option<HubOptions> {
+    let proxy = ["HTTPS_PROXY", "https_proxy"].into_iter().find_map(variable);
+    let root = models_folder(&cache_folder(variable)?);
+    let proxy = proxy.and_then(|proxy| proxy.into_string().ok()).filter(|proxy| !proxy.is_empty());
+    Some(HubOptions { proxy, ..HubOptions::new(root) })
+}
+
+/// Returns the folder that the name of a pulled model, or a folder, stands for.
+/// # Errors
+/// [`HubError::NotPulled`] where it is a known model that is not here.
+pub fn resolve(
+    model: &Path,
+    variable: &dyn Fn(&str) -> Option<std::ffi::OsString>,
+) -> Result<PathBuf, HubError> {
+    match options(variable) {
+        Some(options) => Hub::new(options)?.resolve(model),
+        None => Ok(model.to_owned()),
+    }
+}
+
+/// Asks a question on the terminal; no, where there is none to ask.
+pub fn ask(question: &str) -> bool {
+    if !io::stdin().is_terminal() || !io::stderr().is_terminal() {
+        return false;
+    }
+    let mut answer = String::new();
+    let asked =
+        write!(io::stderr(), "{question} [y/N] ").and_then(|()| io::stdin().lock().read_line(&mut answer));
+    asked.is_ok() && matches!(answer.trim(), "y" | "Y" | "yes")
+}
+
+/// Does what `command` says.
+/// # Errors
+/// [`HubError`].
+pub fn run(command: &ModelsCommand, context: &Context<'_>) -> Result<Report, HubError> {
+    let mut options = options(context.variable).ok_or(HubError::NoFolder)?;
+    if let ModelsCommand::Pull(PullArgs { hub, .. }) = command {
+        options.hub.clone_from(hub);
+    }
+    let hub = Hub::new(options)?;
+    match command {
+        ModelsCommand::List => {
+            Ok(Report::Models(hub.table().models.iter().map(|entry| Listed::new(&hub, entry)).collect()))
+        }
+        ModelsCommand::Pull(args) => {
+            let pulled = args.names.iter().map(|name| pull(&hub, name, args.accept_licence, context));
+            Ok(Report::Pulled(pulled.collect::<Result<_, _>>()?))
+        }
+        ModelsCommand::Verify { models } => {
+            let here = hub.table().models.iter().filter(|entry| hub.here(entry) != Here::No);
+            let folders = match models.is_empty() {
+                true => here.map(|entry| hub.folder(entry)).collect(),
+                false => models.iter().map(|model| hub.resolve(model)).collect::<Result<Vec<_>, _>>()?,
+            };
+            let verified = folders.into_iter().map(|folder| {
+                let files = Hub::verify(&folder)?;
+                Ok(Verified { folder, files })
+            });
+            Ok(Report::Verified(verified.collect::<Result<_, HubError>>()?))
+        }
+        ModelsCommand::Info(args) => {
+            Ok(Report::Info(Box::new(info(&hub.resolve(&args.model)?, args, context)?)))
+        }
+    }
+}
+
+fn pull(hub: &Hub, name: &str, accepts: bool, context: &Context<'_>) -> Result<Pulled, HubError> {
+    let files = match hub.pull(name, context.side, accepts) {
+        Err(HubError::Licence { name, licence, url, note }) => {
+            let question = format!("{name} is under {licence} ({url}). {note} Accept that?");
+            if !(context.ask)(&question) {
+                return Err(HubError::Licence { name, licence, url, note });
+            }
+            hub.pull(&name, context.side, true)?
+        }
+        pulled => pulled?,
+    };
+    Ok(Pulled { name: name.to_owned(), folder: hub.folder(hub.entry(name)?), files })
+}
+
+fn info(folder: &Path, args: &InfoArgs, context: &Context<'_>) -> Result<Info, HubError> {
+    let model = ModelDir::open(folder)?;
+    let description = Description::read(&folder.join(FILE_NAME))?;
+    let root = folder.join(&description.files_root);
+    let files = description.files().into_iter().map(|(role, file)| DescribedFile {
+        role,
+        path: file.path.clone(),
+        is_here: root.join(&file.path).is_file(),
+    });
+    let mut info = Info {
+        name: description.name.clone(),
+        about: model.about().to_owned(),
+        licence: model.licence().to_owned(),
+        folder: folder.to_owned(),
+        dim: description.dim,
+        encoder_id: hex::encode(model.encoder_id().hash()),
+        threshold: model.threshold(),
+        files: files.collect(),
+        text_runs_on: None,
+        image_runs_on: None,
+        batch: None,
+    };
+    if args.run {
+        let session = (context.session)(&args.how).map_err(ModelError::from)?;
+        let runs_on = |placement: Option<&crate::Placement>| Some(placement?.to_string());
+        info.text_runs_on = runs_on(model.text_encoder(&session)?.placement());
+        if context.side == Side::Both {
+            let image = model.image_encoder(&session)?;
+            info.image_runs_on = runs_on(image.placement());
+            info.batch = Some(image.preferred_batch());
+        }
+    }
+    Ok(info)
+}
+
+/// What a command found or did.
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Report {
+    /// Of `list`.
+    Models(Vec<Listed>),
+    /// Of `pull`.
+    Pulled(Vec<Pulled>),
+    /// Of `verify`.
+    Verified(Vec<Verified>),
+    /// Of `info`.
+    Info(Box<Info>),
+}
+
+/// A model of the table.
+#[derive(Debug, Serialize)]
+pub struct Listed {
+    name: String,
+    about: String,
+    licence: String,
+    here: Here,
+}
+
+impl Listed {
+    fn new(hub: &Hub, entry: &Entry) -> Self {
+        let Entry { name, about, licence, .. } = entry.clone();
+        Self { name, about, licence, here: hub.here(entry) }
+    }
+}
+
+/// A model that was pulled.
+#[derive(Debug, Serialize)]
+pub struct Pulled {
+    name: String,
+    folder: PathBuf,
+    files: Vec<PulledFile>,
+}
+
+/// A model whose files are as recorded.
+#[derive(Debug, Serialize)]
+pub struct Verified {
+    folder: PathBuf,
+    files: Vec<String>,
+}
+
+/// What a model is.
+#[derive(Debug, Serialize)]
+pub struct Info {
+    name: String,
+    about: String,
+    licence: String,
+    folder: PathBuf,
+    dim: u32,
+    encoder_id: String,
+    /// Cosine from which something counts as found; absent: calibrated by each scene.
+    threshold: Option<f32>,
+    files: Vec<DescribedFile>,
+    text_runs_on: Option<String>,
+    image_runs_on: Option<String>,
+    /// Crops in a run.
+    batch: Option<usize>,
+}
+
+/// A file that a description names.
+#[derive(Debug, Serialize)]
+pub struct DescribedFile {
+    role: &'static str,
+    path: PathBuf,
+    is_here: bool,
+}
+
+/// Shows a report to people.
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Models(models) => models.iter().try_for_each(|model| {
+                let here = match model.here {
+                    Here::No => "-",
+                    Here::Text => "text",
+                    Here::All => "here",
+                };
+                writeln!(f, "{:28} {here:5} {:11} {}", model.name, model.licence, model.about)
+            }),
+            Self::Pulled(models) => models.iter().try_for_each(|model| {
+                writeln!(f, "{} in {}", model.name, model.folder.display())?;
+                model.files.iter().try_for_each(|file| {
+                    let word = match file.on_the_word_of {
+                        Source::Table => "as known",
+                        Source::Hub => "as the hub advertised",
+                        Source::FirstPull => "nobody states a hash; this one is kept in models.lock",
+                        Source::PlacedByHand => "placed by hand; this hash is kept in models.lock",
+                    };
+                    let was_here = if file.was_here { ", was here" } else { "" };
+                    writeln!(f, "  {}  {} ({word}{was_here})", file.sha256, file.path)
+                })
+            }),
+            Self::Verified(models) if models.is_empty() => writeln!(f, "no model is pulled"),
+            Self::Verified(models) => models.iter().try_for_each(|model| {
+                writeln!(f, "{}: {} are as recorded", model.folder.display(), model.files.join(", "))
+            }),
+            Self::Info(info) => info.fmt(f),
+        }
+    }
+}
+
+impl fmt::Display for Info {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "name        {}\nabout       {}", self.name, self.about)?;
+        writeln!(f, "licence     {}\nfolder      {}", self.licence, self.folder.display())?;
+        writeln!(f, "components  {}\nencoder id  {}", self.dim, self.encoder_id)?;
+        match self.threshold {
+            Some(cosine) => writeln!(f, "found from  cosine {cosine}")?,
+            None => writeln!(f, "found from  what each scene's scores say")?,
+        }
+        for file in &self.files {
+            let here = if file.is_here { "" } else { " (not here)" };
+            writeln!(f, "{:11} {}{here}", file.role.trim_start_matches("text."), file.path.display())?;
+        }
+        for (what, runs_on) in [("text on", &self.text_runs_on), ("images on", &self.image_runs_on)] {
+            runs_on.iter().try_for_each(|runs_on| writeln!(f, "{what:11} {runs_on}"))?;
+        }
+        self.batch.iter().try_for_each(|batch| writeln!(f, "batch       {batch} crops"))
+    }
+}

@@ -1,0 +1,548 @@
+//! Pulling models from a hub on this machine that answers as the real one does, or worse.
+
+mod common;
+
+use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use common::made::{DESCRIPTION, TextKind, VOCABULARY, image_graph, text_graph, tokenizer};
+use common::onnx::{Element, model};
+use common::options;
+use sha2::{Digest, Sha256};
+use slag_models::hub::{Here, Hub, HubError, HubOptions, Lock, Side, Source, Table};
+use slag_models::{ModelDir, SessionOptions};
+use tempfile::TempDir;
+
+const COMMIT: &str = "0123456789abcdef0123456789abcdef01234567";
+
+/// The made model at the hub: its tokenizer is small, so that the hub states no hash of it.
+const MODEL: &str = r#"
+[[model]]
+name = "made"
+about = "A made model."
+layout = "made"
+dim = 4
+licence = "Example-1.0"
+licence_note = "Not a real one."
+licence_url = "https://licence.example/"
+repository = "owner/made"
+image = "onnx/vision.onnx"
+text = "onnx/text.onnx"
+tokenizer = "tokenizer.json"
+"#;
+
+/// The table of that model alone.
+fn table() -> String {
+    let (_, layout) = DESCRIPTION.split_once("licence = \"none\"\n").expect("a head");
+    let layout = [("vision.onnx", "IMAGE"), ("text.onnx", "TEXT"), ("tokenizer.json", "TOKENIZER")]
+        .into_iter()
+        .fold(layout.to_owned(), |layout, (file, placeholder)| layout.replace(file, placeholder));
+    format!("hub = \"http://127.0.0.1:1\"\n[layout.made]\ndescription = '''{layout}'''\n{MODEL}")
+}
+
+fn sha256(bytes: &[u8]) -> String {
+    hex::encode(Sha256::digest(bytes))
+}
+
+#[derive(Clone, Debug)]
+struct Asked {
+    method: String,
+    path: String,
+    headers: BTreeMap<String, String>,
+}
+
+struct Answer {
+    status: u16,
+    headers: Vec<(&'static str, String)>,
+    body: Vec<u8>,
+    /// How much of the body is sent before the connection breaks.
+    sent_bytes: usize,
+}
+
+impl Answer {
+    fn status(status: u16) -> Self {
+        Self { status, headers: Vec::new(), body: Vec::new(), sent_bytes: usize::MAX }
+    }
+}
+
+/// A hub whose answers can be changed while it runs.
+struct Server {
+    url: String,
+    asked: Arc<Mutex<Vec<Asked>>>,
+    files: Arc<Mutex<Files>>,
+}
+
+/// What the hub has, and how it misbehaves.
+struct Files {
+    bytes: BTreeMap<String, Vec<u8>>,
+    commit: &'static str,
+    /// Hashes that the hub states against the truth.
+    stated: BTreeMap<String, String>,
+    status: Option<u16>,
+    /// Bytes after which every body breaks.
+    cut_bytes: usize,
+    /// Whether the store has no validators of its files, and ignores ranges.
+    is_plain: bool,
+    /// Added to every length announced.
+    extra_bytes: usize,
+}
+
+impl Files {
+    fn answer(&self, asked: &Asked) -> Answer {
+        if let Some(status) = self.status {
+            return Answer::status(status);
+        }
+        if let Some(name) = asked.path.strip_prefix("/store/") {
+            return self.stored(asked, &self.bytes[name], name);
+        }
+        let rest = asked.path.strip_prefix("/owner/made/resolve/").unwrap_or_default();
+        let Some((_, name)) = rest.split_once('/') else { return Answer::status(404) };
+        let Some(bytes) = self.bytes.get(name) else { return Answer::status(404) };
+        let commit = ("X-Repo-Commit", self.commit.to_owned());
+        if name == "tokenizer.json" {
+            let mut answer = self.stored(asked, bytes, name);
+            answer.headers.push(commit);
+            return answer;
+        }
+        let stated = self.stated.get(name).cloned().unwrap_or_else(|| sha256(bytes));
+        let headers = vec![
+            commit,
+            ("X-Linked-ETag", format!("\"{stated}\"")),
+            ("X-Linked-Size", bytes.len().to_string()),
+            ("Location", format!("/store/{name}")),
+        ];
+        Answer { headers, ..Answer::status(302) }
+    }
+
+    fn stored(&self, asked: &Asked, bytes: &[u8], name: &str) -> Answer {
+        let etag = format!("\"{}-{}\"", name.len(), &sha256(bytes)[..8]);
+        let mut answer = Answer { body: bytes.to_vec(), sent_bytes: self.cut_bytes, ..Answer::status(200) };
+        if self.is_plain {
+            return answer;
+        }
+        if asked.headers.get("if-range") == Some(&etag)
+            && let Some(range) = asked.headers.get("range").and_then(|range| range.strip_prefix("bytes="))
+        {
+            let first: usize = range.trim_end_matches('-').parse().expect("a range to the end");
+            answer.status = 206;
+            answer.body.drain(..first);
+            let last = bytes.len() - 1;
+            answer.headers.push(("Content-Range", format!("bytes {first}-{last}/{}", bytes.len())));
+        }
+        answer.headers.push(("ETag", etag));
+        answer
+    }
+}
+
+fn serve_one(stream: TcpStream, files: &Mutex<Files>, seen: &Mutex<Vec<Asked>>) -> std::io::Result<()> {
+    let mut reader = BufReader::new(&stream);
+    let mut line = String::new();
+    reader.read_line(&mut line)?;
+    let mut words = line.split(' ').map(str::to_owned);
+    let (Some(method), Some(path)) = (words.next(), words.next()) else { return Ok(()) };
+    let mut asked = Asked { method, path, headers: BTreeMap::new() };
+    loop {
+        let mut line = String::new();
+        reader.read_line(&mut line)?;
+        let Some((name, value)) = line.split_once(": ") else { break };
+        asked.headers.insert(name.to_lowercase(), value.trim().to_owned());
+    }
+    let files = files.lock().expect("no panic");
+    let answer = files.answer(&asked);
+    seen.lock().expect("no panic").push(asked.clone());
+    let mut head = format!("HTTP/1.1 {} X\r\nConnection: close\r\n", answer.status);
+    head += &format!("Content-Length: {}\r\n", answer.body.len() + files.extra_bytes);
+    for (name, value) in answer.headers {
+        head += &format!("{name}: {value}\r\n");
+    }
+    (&stream).write_all((head + "\r\n").as_bytes())?;
+    if asked.method == "GET" {
+        (&stream).write_all(&answer.body[..answer.sent_bytes.min(answer.body.len())])?;
+    }
+    // What the client still has to say is read, or its kernel drops what it has not read.
+    stream.shutdown(std::net::Shutdown::Write)?;
+    stream.set_read_timeout(Some(Duration::from_secs(5)))?;
+    std::io::copy(&mut reader.take(1 << 16), &mut std::io::sink())?;
+    Ok(())
+}
+
+impl Server {
+    fn start() -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+        let url = format!("http://{}", listener.local_addr().expect("an address"));
+        let bytes = [
+            ("onnx/vision.onnx", model(&image_graph(Element::F32, -1, false))),
+            ("onnx/text.onnx", model(&text_graph(TextKind::default()))),
+            ("tokenizer.json", tokenizer(&VOCABULARY).into_bytes()),
+        ];
+        let files = Files {
+            bytes: bytes.into_iter().map(|(name, bytes)| (name.to_owned(), bytes)).collect(),
+            commit: COMMIT,
+            stated: BTreeMap::new(),
+            status: None,
+            cut_bytes: usize::MAX,
+            is_plain: false,
+            extra_bytes: 0,
+        };
+        let server = Self { url, asked: Arc::default(), files: Arc::new(Mutex::new(files)) };
+        let (asked, files) = (Arc::clone(&server.asked), Arc::clone(&server.files));
+        std::thread::spawn(move || {
+            for stream in listener.incoming().flatten() {
+                // A client that goes away is part of the game.
+                drop(serve_one(stream, &files, &asked));
+            }
+        });
+        server
+    }
+
+    fn change(&self, change: impl FnOnce(&mut Files)) {
+        change(&mut self.files.lock().expect("no panic"));
+    }
+
+    fn bytes(&self, name: &str) -> Vec<u8> {
+        self.files.lock().expect("no panic").bytes[name].clone()
+    }
+
+    /// What was asked since the last time.
+    fn asked(&self) -> Vec<Asked> {
+        std::mem::take(&mut self.asked.lock().expect("no panic"))
+    }
+}
+
+fn hub_of(table: &str, url: &str, root: &Path) -> Hub {
+    let (hub, first_backoff) = (Some(url.to_owned()), Duration::from_millis(1));
+    let timeout = Duration::from_secs(5);
+    let options = HubOptions { hub, first_backoff, timeout, ..HubOptions::new(root.to_owned()) };
+    Hub::with_table(toml::from_str::<Table>(table).expect("a table"), options)
+}
+
+fn setting() -> (Server, TempDir, Hub) {
+    let (server, root) = (Server::start(), tempfile::tempdir().expect("a folder"));
+    let hub = hub_of(&table(), &server.url, root.path());
+    (server, root, hub)
+}
+
+/// The table with the hash of the text model known.
+fn pinned(server: &Server) -> String {
+    let text = server.bytes("onnx/text.onnx");
+    let known = "[model.known.\"onnx/text.onnx\"]";
+    format!("{}{known}\nlen_bytes = {}\nsha256 = \"{}\"\n", table(), text.len(), sha256(&text))
+}
+
+fn lock_of(root: &Path) -> serde_json::Value {
+    serde_json::to_value(Lock::read(root).expect("a lock")).expect("it serialises")
+}
+
+/// All files below a folder, but for the lock and the pulls' own.
+fn files_below(root: &Path) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    let mut folders = vec![root.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for entry in fs_err::read_dir(folder).expect("it is readable") {
+            let path = entry.expect("it is readable").path();
+            match path.is_dir() {
+                true => folders.push(path),
+                false => found.push(path.strip_prefix(root).expect("below").to_owned()),
+            }
+        }
+    }
+    found.retain(|path| !["models.lock", ".pull"].contains(&path.to_str().expect("UTF-8")));
+    found.sort();
+    found
+}
+
+#[test]
+fn a_pulled_model_is_checked_described_and_pulled_once() {
+    let (server, root, _) = setting();
+    let hub = hub_of(&pinned(&server), &server.url, root.path());
+    let pulled = hub.pull("made", Side::Both, true).expect("it is pulled");
+    let words: Vec<_> =
+        pulled.iter().map(|file| (file.path.as_str(), file.on_the_word_of, file.was_here)).collect();
+    let expected = [
+        ("onnx/vision.onnx", Source::Hub, false),
+        ("onnx/text.onnx", Source::Table, false),
+        ("tokenizer.json", Source::FirstPull, false),
+    ];
+    assert_eq!(words, expected);
+    for file in &pulled {
+        let found = fs_err::read(root.path().join("made").join(&file.path)).expect("it is there");
+        assert_eq!((found == server.bytes(&file.path), file.sha256.to_string()), (true, sha256(&found)));
+    }
+    let names = ["made/model.toml", "made/onnx/text.onnx", "made/onnx/vision.onnx", "made/tokenizer.json"];
+    assert_eq!(files_below(root.path()), names.map(PathBuf::from));
+    let lock = lock_of(root.path());
+    assert_eq!(
+        (&lock["made"]["licence"], &lock["made"]["revision"]),
+        (&"Example-1.0".into(), &COMMIT.into())
+    );
+    assert_eq!(lock["made"]["files"]["tokenizer.json"]["on_the_word_of"], "first-pull");
+    assert_eq!(hub.here(hub.entry("made").expect("known")), Here::All);
+
+    // A second time nothing is asked for, and no licence.
+    server.asked();
+    let again = hub.pull("made", Side::Both, false).expect("it is there");
+    assert!(again.iter().all(|file| file.was_here) && server.asked().is_empty());
+
+    let folder = hub.resolve(Path::new("made")).expect("it is here");
+    let model = ModelDir::open(&folder).expect("it opens");
+    assert_eq!(Hub::verify(&folder).expect("as recorded").len(), 3);
+    if let Some(options) = options() {
+        assert!(model.text_encoder(&options).expect("it loads").encode("red chair").is_ok());
+        assert!(model.image_encoder(&options).is_ok());
+    }
+    // A changed file is found by both who read it.
+    let text = folder.join("onnx/text.onnx");
+    let mut bytes = fs_err::read(&text).expect("it is readable");
+    bytes[40] ^= 1;
+    fs_err::write(&text, bytes).expect("it is writable");
+    for error in [
+        Hub::verify(&folder).expect_err("changed").to_string(),
+        hub.pull("made", Side::Both, false).expect_err("changed").to_string(),
+        model.text_encoder(&SessionOptions::new("none".into())).err().expect("changed").to_string(),
+    ] {
+        assert!(error.contains("onnx/text.onnx: SHA-256 is") && error.contains("again"), "{error}");
+    }
+}
+
+#[test]
+fn a_robot_pulls_the_text_side_and_still_knows_the_space() {
+    let (server, root, hub) = setting();
+    let both = tempfile::tempdir().expect("a folder");
+    let pulled = hub.pull("made", Side::Text, true).expect("it is pulled");
+    assert_eq!(
+        pulled.iter().map(|file| file.path.as_str()).collect::<Vec<_>>(),
+        ["onnx/text.onnx", "tokenizer.json"]
+    );
+    assert!(server.asked().iter().all(|asked| asked.method == "HEAD" || !asked.path.contains("vision")));
+    assert_eq!(hub.here(hub.entry("made").expect("known")), Here::Text);
+    assert_eq!(Hub::verify(&root.path().join("made")).expect("as recorded").len(), 2);
+    let robot = ModelDir::open(&root.path().join("made")).expect("it opens");
+    hub_of(&table(), &server.url, both.path()).pull("made", Side::Both, true).expect("it is pulled");
+    let cloud = ModelDir::open(&both.path().join("made")).expect("it opens");
+    assert_eq!(robot.encoder_id(), cloud.encoder_id());
+    // Without the hub's word there is no name.
+    let bare = tempfile::tempdir().expect("a folder");
+    server.change(|files| {
+        files.stated.insert("onnx/vision.onnx".into(), "no hash".into());
+    });
+    let error =
+        hub_of(&table(), &server.url, bare.path()).pull("made", Side::Text, true).expect_err("no name");
+    assert!(matches!(error, HubError::NoImageHash { .. }), "{error}");
+}
+
+#[test]
+fn a_cut_pull_goes_on_where_it_ended() {
+    let (server, root, hub) = setting();
+    // Every body breaks after 100 bytes: there is progress each time, so it is tried on.
+    server.change(|files| files.cut_bytes = 100);
+    hub.pull("made", Side::Both, true).expect("piece by piece");
+    let asked = server.asked();
+    let text = server.bytes("onnx/text.onnx");
+    let ranges: Vec<_> = asked
+        .iter()
+        .filter(|a| a.path == "/store/onnx/text.onnx")
+        .filter_map(|a| a.headers.get("range"))
+        .collect();
+    let expected: Vec<String> = (100..text.len()).step_by(100).map(|at| format!("bytes={at}-")).collect();
+    assert_eq!(ranges, expected.iter().collect::<Vec<_>>());
+    assert_eq!(fs_err::read(root.path().join("made/onnx/text.onnx")).expect("it is there"), text);
+
+    // The same over two runs of the program: the first one left a part.
+    let root = tempfile::tempdir().expect("a folder");
+    let hub = hub_of(&table(), &server.url, root.path());
+    fs_err::create_dir_all(root.path().join("made/onnx")).expect("it is writable");
+    let vision = server.bytes("onnx/vision.onnx");
+    let part = root.path().join("made/onnx/vision.onnx.part");
+    fs_err::write(&part, &vision[..120]).expect("it is writable");
+    let etag = format!("\"{}-{}\"", "onnx/vision.onnx".len(), &sha256(&vision)[..8]);
+    fs_err::write(part.with_extension("etag"), etag).expect("it is writable");
+    server.change(|files| files.cut_bytes = usize::MAX);
+    server.asked();
+    hub.pull("made", Side::Both, true).expect("the rest");
+    let stored: Vec<Asked> = server.asked().into_iter().filter(|a| a.path.starts_with("/store/")).collect();
+    let ranges: Vec<_> = stored.iter().filter_map(|a| a.headers.get("range")).collect();
+    assert_eq!(ranges, ["bytes=120-"]);
+    assert_eq!(files_below(root.path()).len(), 4, "no part is left: {:?}", files_below(root.path()));
+}
+
+#[test]
+fn parts_of_other_files_and_plain_servers_do_no_harm() {
+    let (server, root, hub) = setting();
+    let vision = server.bytes("onnx/vision.onnx");
+    let part = root.path().join("made/onnx/vision.onnx.part");
+    let right = format!("\"{}-{}\"", "onnx/vision.onnx".len(), &sha256(&vision)[..8]);
+    fs_err::create_dir_all(root.path().join("made/onnx")).expect("it is writable");
+    // Another version's part; one without a validator; one that claims to be of this version, but is not.
+    for (etag, n_bytes) in
+        [(Some("\"other\"".to_owned()), 50), (None, 50), (Some(right), 50), (None, 100_000)]
+    {
+        fs_err::write(&part, vec![9; n_bytes]).expect("it is writable");
+        etag.iter()
+            .for_each(|etag| fs_err::write(part.with_extension("etag"), etag).expect("it is writable"));
+        hub.pull("made", Side::Both, true).unwrap_or_else(|e| panic!("{etag:?}: {e}"));
+        assert_eq!(files_below(root.path()).len(), 4, "{etag:?}");
+        fs_err::remove_file(root.path().join("made/onnx/vision.onnx")).expect("it is there");
+    }
+    // A server without validators or ranges: from the start each time, and given up where it always breaks.
+    server.change(|files| (files.is_plain, files.cut_bytes) = (true, 100));
+    let error = hub.pull("made", Side::Both, true).expect_err("it never ends").to_string();
+    assert!(error.contains("disconnected"), "{error}");
+    server.change(|files| files.cut_bytes = usize::MAX);
+    hub.pull("made", Side::Both, true).expect("whole");
+}
+
+#[test]
+fn what_is_not_what_was_promised_is_thrown_away() {
+    let (server, root, hub) = setting();
+    // The hub's word against the store's bytes.
+    server.change(|files| {
+        files.stated.insert("onnx/vision.onnx".into(), sha256(b"something else"));
+    });
+    let error = hub.pull("made", Side::Both, true).expect_err("wrong").to_string();
+    let vision = server.bytes("onnx/vision.onnx");
+    for part in
+        ["vision.onnx: SHA-256 is", &sha256(&vision), &sha256(b"something else"), "advertised by the hub"]
+    {
+        assert!(error.contains(part), "{error}");
+    }
+    assert_eq!(files_below(root.path()), Vec::<PathBuf>::new());
+
+    // The program's word against the hub's: nothing is downloaded.
+    server.change(|files| files.stated.clear());
+    let table = pinned(&server);
+    server.change(|files| files.bytes.get_mut("onnx/text.onnx").expect("it is there").push(0));
+    server.asked();
+    let error = hub_of(&table, &server.url, root.path()).pull("made", Side::Text, true).expect_err("wrong");
+    assert!(matches!(error, HubError::Advertised { by: Source::Table, .. }), "{error}");
+    assert!(server.asked().iter().all(|asked| asked.method == "HEAD"));
+
+    // Lengths: more than the program knows; a body that goes on.
+    let longer = table.replace("len_bytes = ", "len_bytes = 1");
+    server.change(|files| {
+        files.bytes.get_mut("onnx/text.onnx").expect("it is there").pop();
+    });
+    let error = hub_of(&longer, &server.url, root.path()).pull("made", Side::Text, true).expect_err("wrong");
+    assert!(error.to_string().contains("bytes, expected 1"), "{error}");
+    server.change(|files| files.extra_bytes = 7);
+    let error = hub_of(&table, &server.url, root.path()).pull("made", Side::Text, true).expect_err("wrong");
+    assert!(error.to_string().contains("bytes, expected"), "{error}");
+}
+
+#[test]
+fn the_lock_keeps_what_was_accepted_first() {
+    let (server, root, hub) = setting();
+    hub.pull("made", Side::Both, true).expect("it is pulled");
+    let asked = server.asked();
+    assert!(asked.iter().any(|asked| asked.path == "/owner/made/resolve/main/onnx/vision.onnx"));
+    let remove = |name: &str| fs_err::remove_file(root.path().join("made").join(name)).expect("it is there");
+
+    // Asked for again, it is the commit that was met first.
+    remove("tokenizer.json");
+    hub.pull("made", Side::Both, false).expect("the same again");
+    let path = format!("/owner/made/resolve/{COMMIT}/tokenizer.json");
+    assert!(server.asked().iter().all(|asked| asked.path == path));
+    // Another tokenizer under the same commit.
+    remove("tokenizer.json");
+    server.change(|files| files.bytes.get_mut("tokenizer.json").expect("it is there").push(b' '));
+    let error = hub.pull("made", Side::Both, false).expect_err("changed");
+    assert!(matches!(error, HubError::Hash { by: Source::FirstPull, .. }), "{error}");
+    // Another model, which the hub admits.
+    remove("onnx/text.onnx");
+    server.change(|files| files.bytes.get_mut("onnx/text.onnx").expect("it is there").push(0));
+    let error = hub.pull("made", Side::Both, false).expect_err("changed");
+    assert!(matches!(error, HubError::Advertised { by: Source::Hub, .. }), "{error}");
+    assert!(error.to_string().contains("take the model out of models.lock"), "{error}");
+    // Another commit.
+    server.change(|files| files.commit = "ffffffffffffffffffffffffffffffffffffffff");
+    let error = hub.pull("made", Side::Both, false).expect_err("changed");
+    assert!(matches!(error, HubError::Revision { .. }), "{error}");
+
+    fs_err::write(root.path().join("models.lock"), "{").expect("it is writable");
+    let error = hub.pull("made", Side::Both, false).expect_err("damaged").to_string();
+    assert!(error.contains("models.lock") && error.contains("pull again"), "{error}");
+}
+
+#[test]
+fn without_the_hub_it_is_said_what_to_put_where() {
+    let (server, root, _) = setting();
+    let table = pinned(&server);
+    for (url, status, part) in [
+        (server.url.as_str(), Some(404), "the server answers 404"),
+        (server.url.as_str(), Some(503), "the server answers 503"),
+        // Nothing listens on port 1.
+        ("http://127.0.0.1:1", None, "refused"),
+    ] {
+        server.change(|files| files.status = status);
+        server.asked();
+        let error = hub_of(&table, url, root.path()).pull("made", Side::Both, true).expect_err("unreachable");
+        // Only what may pass is tried again.
+        assert_eq!(
+            server.asked().len(),
+            [0, 1, 5][usize::from(status.is_some()) + usize::from(status == Some(503))]
+        );
+        let text = root.path().join("made/onnx/text.onnx");
+        let wanted = format!("{} (SHA-256 {})", text.display(), sha256(&server.bytes("onnx/text.onnx")));
+        let unknown = format!("{} (SHA-256 unknown)", root.path().join("made/tokenizer.json").display());
+        let error = error.to_string();
+        for part in [part, &wanted, &unknown, &format!("{url}/owner/made/resolve/main/onnx/text.onnx as ")] {
+            assert!(error.contains(part), "{error}");
+        }
+    }
+    // Put there by hand, it is a pulled model without the hub, and the lock says so.
+    for name in ["onnx/vision.onnx", "onnx/text.onnx", "tokenizer.json"] {
+        let path = root.path().join("made").join(name);
+        fs_err::create_dir_all(path.parent().expect("a folder")).expect("it is writable");
+        fs_err::write(path, server.bytes(name)).expect("it is writable");
+    }
+    let hub = hub_of(&table, "http://127.0.0.1:1", root.path());
+    let pulled = hub.pull("made", Side::Both, true).expect("all is there");
+    let words: Vec<_> = pulled.iter().map(|file| file.on_the_word_of).collect();
+    assert_eq!(words, [Source::PlacedByHand, Source::Table, Source::PlacedByHand]);
+    assert!(ModelDir::open(&hub.resolve(Path::new("made")).expect("here")).is_ok());
+}
+
+#[test]
+fn nothing_is_asked_for_before_the_licence_is_accepted() {
+    let (server, root, hub) = setting();
+    let error = hub.pull("made", Side::Both, false).expect_err("not accepted").to_string();
+    for part in ["Example-1.0", "https://licence.example/", "Not a real one.", "--accept-licence"] {
+        assert!(error.contains(part), "{error}");
+    }
+    assert!(server.asked().is_empty() && files_below(root.path()).is_empty());
+    hub.pull("made", Side::Both, true).expect("accepted");
+    // Another licence is asked for again.
+    let relicensed = hub_of(&table().replace("Example-1.0", "Example-2.0"), &server.url, root.path());
+    assert!(matches!(relicensed.pull("made", Side::Both, false), Err(HubError::Licence { .. })));
+}
+
+#[test]
+fn only_names_of_the_table_lead_into_the_cache() {
+    let (_server, root, hub) = setting();
+    for name in ["../made", "made/", "./made", "/made", "", ".", "MADE", "made\0"] {
+        let error = hub.pull(name, Side::Both, true).expect_err("no name").to_string();
+        assert!(error.contains("there are made"), "{error}");
+        let path = PathBuf::from(name);
+        assert_eq!(
+            hub.resolve(&path).map(PathBuf::into_os_string).ok(),
+            Some(path.into_os_string()),
+            "{name:?}"
+        );
+    }
+    let error = hub.resolve(Path::new("made")).expect_err("not yet").to_string();
+    assert!(error.contains("models pull made"), "{error}");
+    assert!(files_below(root.path()).is_empty());
+    // Descriptions do not lead out of it either.
+    let escaping = table().replace("onnx/text.onnx", "../../text.onnx");
+    let server = Server::start();
+    server.change(|files| {
+        let bytes = files.bytes["onnx/text.onnx"].clone();
+        files.bytes.insert("../../text.onnx".into(), bytes);
+    });
+    let hub = hub_of(&escaping, &server.url, root.path());
+    drop(hub.pull("made", Side::Text, true));
+    assert!(hub.resolve(Path::new("made")).is_err() || ModelDir::open(&root.path().join("made")).is_err());
+}
