@@ -96,6 +96,16 @@ pub enum SessionError {
         /// What is expected; -1 is any size.
         expected: String,
     },
+    /// The model is of another layout.
+    #[error("{}: {found}; expected {expected}; give the files of one export in their places", path.display())]
+    Layout {
+        /// The model file.
+        path: PathBuf,
+        /// What it has.
+        found: String,
+        /// What is expected.
+        expected: String,
+    },
     /// Running the model failed.
     #[error("{}: running the model: {cause}; the file does not fit its description", path.display())]
     Run {
@@ -190,6 +200,37 @@ fn forward_log(level: LogLevel, category: &str, _id: &str, _location: &str, mess
     }
 }
 
+/// A tensor of f32, row-major.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Tensor {
+    pub(crate) shape: Vec<i64>,
+    pub(crate) values: Vec<f32>,
+}
+
+/// Name, and for tensors element type and shape, where -1 is any size, of an input or output.
+pub(crate) type Declared = (String, Option<(TensorElementType, Vec<i64>)>);
+
+fn declared(outlets: &[Outlet]) -> Vec<Declared> {
+    let tensor = |outlet: &Outlet| match outlet.dtype() {
+        ValueType::Tensor { ty, shape, .. } => Some((*ty, shape.to_vec())),
+        _ => None,
+    };
+    outlets.iter().map(|outlet| (outlet.name().to_owned(), tensor(outlet))).collect()
+}
+
+fn listed(outlets: &[Outlet]) -> String {
+    let listed = outlets.iter().map(|outlet| format!("{} {}", outlet.name(), found(outlet)));
+    listed.collect::<Vec<_>>().join(", ")
+}
+
+/// Returns an input's or output's type and shape for people.
+fn found(outlet: &Outlet) -> String {
+    match outlet.dtype() {
+        ValueType::Tensor { ty, shape, .. } => format!("{ty} {:?}", &shape[..]),
+        other => other.to_string(),
+    }
+}
+
 /// An opened model file.
 #[derive(Debug)]
 pub(crate) struct Model {
@@ -207,6 +248,8 @@ impl Model {
         let mut builder = Session::builder(&environment)
             .and_then(|b| b.with_intra_threads(options.intra_op_threads).map_err(ort::Error::from))
             .and_then(|b| b.with_inter_threads(1).map_err(ort::Error::from))
+            // A thread that waits must not take a core from the other stages.
+            .and_then(|b| b.with_intra_op_spinning(false).map_err(ort::Error::from))
             .map_err(load)?;
         if options.provider == Provider::Cuda {
             builder = with_cuda(builder)
@@ -277,11 +320,7 @@ impl Model {
         if fits {
             return Ok(());
         }
-        let found = match outlet.dtype() {
-            ValueType::Tensor { ty, shape, .. } => format!("{ty} {:?}", &shape[..]),
-            other => other.to_string(),
-        };
-        Err(self.shape_error(role, name, found, element, expected))
+        Err(self.shape_error(role, name, found(outlet), element, expected))
     }
 
     fn shape_error(
@@ -301,6 +340,26 @@ impl Model {
         }
     }
 
+    pub(crate) fn inputs(&self) -> Vec<Declared> {
+        declared(self.session.inputs())
+    }
+
+    pub(crate) fn outputs(&self) -> Vec<Declared> {
+        declared(self.session.outputs())
+    }
+
+    pub(crate) fn listed_inputs(&self) -> String {
+        listed(self.session.inputs())
+    }
+
+    pub(crate) fn listed_outputs(&self) -> String {
+        listed(self.session.outputs())
+    }
+
+    pub(crate) fn layout_error(&self, found: String, expected: String) -> SessionError {
+        SessionError::Layout { path: self.path.clone(), found, expected }
+    }
+
     /// Runs the model on `inputs` and returns the f32 output `name`, which must have exactly `shape`.
     pub(crate) fn run(
         &mut self,
@@ -308,22 +367,31 @@ impl Model {
         name: &str,
         shape: &[i64],
     ) -> Result<Vec<f32>, SessionError> {
+        Ok(self.run_all(inputs, &[(name, shape)])?.swap_remove(0).values)
+    }
+
+    /// Runs the model on `inputs` and returns the f32 outputs named, in this order; -1 in a shape is any size.
+    pub(crate) fn run_all(
+        &mut self,
+        inputs: Vec<(&str, SessionInputValue<'_>)>,
+        outputs: &[(&str, &[i64])],
+    ) -> Result<Vec<Tensor>, SessionError> {
         let run = |path: &Path, cause| SessionError::Run { path: path.to_owned(), cause };
-        let mut outputs = self.session.run(inputs).map_err(|cause| run(&self.path, cause))?;
-        let output = outputs.remove(name);
-        drop(outputs);
-        let extracted = output.as_ref().map(DynValue::try_extract_tensor::<f32>);
-        match extracted {
-            Some(Ok((found, values))) if found[..] == *shape => Ok(values.to_vec()),
-            Some(Ok((found, _))) => {
-                let found = format!("f32 {:?}", &found[..]);
-                Err(self.shape_error("output", name, found, TensorElementType::Float32, shape))
-            }
-            Some(Err(cause)) => Err(run(&self.path, cause)),
-            None => {
-                Err(self.shape_error("output", name, "absent".to_owned(), TensorElementType::Float32, shape))
-            }
-        }
+        let mut found = self.session.run(inputs).map_err(|cause| run(&self.path, cause))?;
+        let values: Vec<_> = outputs.iter().map(|(name, _)| found.remove(name)).collect();
+        drop(found);
+        let take = |(value, &(name, shape)): (&Option<DynValue>, &(&str, &[i64]))| {
+            let found = match value.as_ref().map(DynValue::try_extract_tensor::<f32>) {
+                Some(Ok((found, values))) if shapes_fit(found, shape) => {
+                    return Ok(Tensor { shape: found.to_vec(), values: values.to_vec() });
+                }
+                Some(Ok((found, _))) => format!("f32 {:?}", &found[..]),
+                Some(Err(cause)) => return Err(run(&self.path, cause)),
+                None => "absent".to_owned(),
+            };
+            Err(self.shape_error("output", name, found, TensorElementType::Float32, shape))
+        };
+        values.iter().zip(outputs).map(take).collect()
     }
 
     /// Returns `values` as an input of `shape`.
@@ -348,7 +416,7 @@ fn with_cuda(builder: SessionBuilder) -> ort::Result<SessionBuilder> {
 }
 
 /// Tells whether a declared shape admits `expected`; -1 on either side is any size.
-fn shapes_fit(declared: &[i64], expected: &[i64]) -> bool {
+pub(crate) fn shapes_fit(declared: &[i64], expected: &[i64]) -> bool {
     declared.len() == expected.len()
         && declared.iter().zip(expected).all(|(&d, &e)| d == e || d == -1 || e == -1)
 }
