@@ -178,9 +178,12 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
     let metric = args.metric || geo.is_some();
     let folder_name = args.store.file_name().map(|name| name.to_string_lossy().into_owned());
     let created_unix_secs = now_unix_secs();
-    let masks = match args.masks.as_str() {
-        "auto" => Masks::Auto,
-        dir => Masks::Given { dir: dir.into(), ignore_ids: args.ignore_mask_ids.clone() },
+    let masks = match (args.masks.as_str(), args.sam.masks()) {
+        ("auto", masks) => masks.unwrap_or(Masks::Auto),
+        (dir, Some(_)) => {
+            return Err(anyhow!("--masks {dir} gives masks, --segmenter finds some; choose one"));
+        }
+        (dir, None) => Masks::Given { dir: dir.into(), ignore_ids: args.ignore_mask_ids.clone() },
     };
     Ok(EncodeSettings {
         scene: args.input.scene.clone(),

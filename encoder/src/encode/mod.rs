@@ -29,7 +29,7 @@ use crate::lift::SumsError;
 use crate::palette::TextBank;
 use crate::progress::Progress;
 use crate::raster::{RasterError, Rasterizer};
-use crate::segment::{GivenMasks, GraphSegmenter, SegmentError, Segmenter};
+use crate::segment::{GivenMasks, GraphSegmenter, SamSegmenter, SegmentError, Segmenter};
 use crate::shard;
 use crate::store::{Store, StoreError};
 use cells::CellBuilder;
@@ -248,6 +248,10 @@ pub fn encode(
     let segmenter: Box<dyn Segmenter> = match &settings.masks {
         Masks::Auto => Box::new(GraphSegmenter::default()),
         Masks::Given { dir, ignore_ids } => Box::new(GivenMasks::open(dir, ignore_ids.clone())?),
+        Masks::Sam { dir, settings, n_model_threads } => {
+            let session = SessionOptions { intra_op_threads: *n_model_threads, ..session.clone() };
+            Box::new(SamSegmenter::open(dir, settings.clone(), &session)?)
+        }
     };
     let fingerprint = settings.fingerprint(models, segmenter.name(), &scene, &views)?;
     let job = Job::open(&store, fingerprint, settings.restart)?;
