@@ -10,6 +10,7 @@ use crate::{
     description::{Description, DescriptionError, FILE_NAME, FileRef, TextDescription},
     image::OnnxImageEncoder,
     phrases::PhraseEncoder,
+    preprocess::Preprocess,
     tensors,
     text::OnnxTextEncoder,
 };
@@ -89,6 +90,16 @@ impl ModelDir {
         match &self.source {
             Source::Builtin => Some(builtin::THRESHOLD),
             Source::Files { description, .. } => description.score.as_ref().map(|score| score.threshold),
+        }
+    }
+
+    /// Returns how crops become the squares that the image encoder takes; `None` where it takes any size.
+    ///
+    /// A square that was made so is encoded as its crop is.
+    pub fn preprocess(&self) -> Option<Preprocess> {
+        match &self.source {
+            Source::Builtin => None,
+            Source::Files { description, .. } => Some(description.image.preprocess()),
         }
     }
 

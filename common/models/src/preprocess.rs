@@ -182,6 +182,10 @@ const HALF: i32 = 1 << (WEIGHT_BITS - 1);
 ///
 /// Neither `image` nor `resized` may be empty, and the window must lie within `resized`.
 pub fn resample(image: &RgbImage, filter: Filter, resized: [u64; 2], window: Window) -> RgbImage {
+    let whole = Window { left_px: 0, top_px: 0, width_px: image.width(), height_px: image.height() };
+    if window == whole && resized == [image.width(), image.height()].map(u64::from) {
+        return image.clone();
+    }
     let columns = window.left_px..window.left_px + u64::from(window.width_px);
     let rows = window.top_px..window.top_px + u64::from(window.height_px);
     let columns = taps(filter, image.width(), resized[0], columns);

@@ -132,12 +132,21 @@ pub struct Sam {
 #[derive(Debug)]
 struct Names {
     pixels: String,
-    /// Outputs of the encoder and the decoder's inputs that take them.
-    embeddings: Vec<(String, String)>,
+    /// What the encoder gives the decoder.
+    embeddings: Vec<Handed>,
     points: String,
     labels: String,
     scores: String,
     masks: String,
+}
+
+/// A tensor that goes from the encoder to the decoder.
+#[derive(Debug)]
+struct Handed {
+    output: String,
+    /// Of the output as declared; -1 is any size.
+    shape: Vec<i64>,
+    input: String,
 }
 
 /// What the encoder makes of an image.
@@ -258,10 +267,10 @@ impl Sam {
         let (size, pixels) = (i64::from(self.size_px), self.pixel_values(image));
         let mut encoder = self.encoder.lock().unwrap_or_else(PoisonError::into_inner);
         let input = encoder.tensor(vec![1, 3, size, size], &pixels)?;
-        let outputs: Vec<_> =
-            self.names.embeddings.iter().map(|(output, _)| (output.as_str(), &[1, -1, -1, -1][..])).collect();
+        let handed = &self.names.embeddings;
+        let outputs: Vec<_> = handed.iter().map(|h| (h.output.as_str(), &h.shape[..])).collect();
         let found = encoder.run_all(vec![(self.names.pixels.as_str(), input)], &outputs)?;
-        let inputs = self.names.embeddings.iter().map(|(_, input)| input.clone());
+        let inputs = handed.iter().map(|h| h.input.clone());
         Ok(Embedding { tensors: inputs.zip(found).collect(), frame: self.frame_of(image) })
     }
 
@@ -326,18 +335,22 @@ impl Names {
         let (mut points, mut labels) = (Vec::new(), Vec::new());
         let (mut embeddings, mut others) = (Vec::new(), Vec::new());
         for (name, tensor) in decoder.inputs() {
-            let given = offered.iter().any(|(output, _)| *output == name);
-            match tensor {
-                Some((Float32, _)) if given => embeddings.push((name.clone(), name)),
-                Some((Float32, shape)) if matches!(shape[..], [_, _, _, 2]) => points.push(name),
-                Some((Int64, shape)) if shape.len() == 3 => labels.push(name),
+            let given = offered.iter().find(|(output, _)| *output == name);
+            match (given, tensor) {
+                (Some((output, Some((Float32, shape)))), Some((Float32, _))) => {
+                    embeddings.push(Handed { output: output.clone(), shape: shape.clone(), input: name });
+                }
+                (_, Some((Float32, shape))) if matches!(shape[..], [_, _, _, 2]) => points.push(name),
+                (_, Some((Int64, shape))) if shape.len() == 3 => labels.push(name),
                 _ => others.push(name),
             }
         }
         // Exports that give a single embedding do not always call it the same on both sides.
-        if let ([other], [(output, _)], true) = (&others[..], &offered[..], embeddings.is_empty()) {
-            embeddings.push((output.clone(), other.clone()));
-            others.clear();
+        if let ([_], [(output, Some((Float32, shape)))], true) =
+            (&others[..], &offered[..], embeddings.is_empty())
+        {
+            let input = others.swap_remove(0);
+            embeddings.push(Handed { output: output.clone(), shape: shape.clone(), input });
         }
         let listed = || format!("its inputs are {}", decoder.listed_inputs());
         let ([points], [labels], [_, ..], []) = (&points[..], &labels[..], &embeddings[..], &others[..])
@@ -345,7 +358,7 @@ impl Names {
             let names: Vec<&str> = offered.iter().map(|(name, _)| name.as_str()).collect();
             let expected = format!(
                 "points f32 [-1, -1, -1, 2], their labels i64 [-1, -1, -1], the image encoder's {}, and no more \
-                 (no boxes, no earlier masks, no features of inner layers)",
+                 (no boxes, no earlier masks)",
                 names.join(", ")
             );
             return Err(decoder.layout_error(listed(), expected));

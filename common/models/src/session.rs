@@ -142,6 +142,11 @@ impl SessionOptions {
     pub fn new(runtime: PathBuf) -> Self {
         Self { runtime, intra_op_threads: 1, provider: Provider::Cpu }
     }
+
+    /// Returns whether models are to run on the processor alone.
+    pub fn is_on_cpu(&self) -> bool {
+        self.provider == Provider::Cpu
+    }
 }
 
 /// Returns the library's path: `explicit`, else the first of the folders `beside` that has it, else its bare

@@ -34,6 +34,11 @@ pub trait Segmenter: Sync {
         false
     }
 
+    /// Returns how many images a model or device of its own works on at once; `None` on the processor.
+    fn n_lanes(&self) -> Option<usize> {
+        None
+    }
+
     /// Returns the masks of an image; they may overlap.
     ///
     /// # Errors

@@ -144,6 +144,11 @@ impl Segmenter for SamSegmenter {
         &self.name
     }
 
+    /// One image is embedded while another's points are decoded; the model has threads of its own.
+    fn n_lanes(&self) -> Option<usize> {
+        Some(2)
+    }
+
     fn segment(&self, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError> {
         let (width_px, height_px) = input.image.dimensions();
         let filters = Filters { settings: &self.settings, image_px: [width_px, height_px] };

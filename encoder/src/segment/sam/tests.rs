@@ -6,9 +6,10 @@ use slag_models::sam::{Decoded, Frame};
 use slag_models::{SessionOptions, find_runtime};
 
 use super::filter::Filters;
+use super::runs::{Run, RunMask};
 use super::upsample::Upsampler;
 use super::{SamSegmenter, SamSettings, points};
-use crate::segment::{BoxPx, Mask};
+use crate::segment::{BoxPx, Mask, Segmenter};
 
 /// Edge of the square and of the logits, pixels: the proportion is SAM's.
 const SIZE_PX: u32 = 256;
@@ -349,6 +350,70 @@ fn the_filters_equal_a_plain_recomputation() {
     }
     // Regions are healed even where every island is small.
     assert_eq!(n(&SamSettings { min_region_px: 1_000_000, crop_nms_iou: 1.0, ..all.clone() }), n_all);
+}
+
+/// Soft things too, whose fringe reaches far beyond their mask.
+#[test]
+fn stability_equals_a_plain_recomputation() {
+    let frame = Frame::new(SIZE_PX, [210, 150]);
+    let upsampler = Upsampler::new(&frame, [LOGITS_PX; 2]);
+    let mut n_soft = 0;
+    for (k, blob) in blobs(10, 11, frame.resized_px.map(f64::from)).into_iter().enumerate() {
+        let blob = Blob { slope: 0.01 * 1.2_f64.powi(k as i32), ..blob };
+        let dense = enlarged(&logits(&blob), &frame, [LOGITS_PX; 2]);
+        let n_above = |limit: f64| dense.iter().filter(|logit| **logit > limit).count() as f64;
+        let expected = n_above(1.0) / n_above(-1.0);
+        let found = upsampler.cut(&logits(&blob), 1.0, [0, 0]).map_or(0.0, |cut| cut.stability);
+        assert_eq!(found, expected, "slope {}", blob.slope);
+        n_soft += u32::from(expected < 0.5);
+    }
+    assert!((5..25).contains(&n_soft), "{n_soft}");
+}
+
+/// What an unfinished encode is recognised by: another file or setting is another segmenter.
+#[test]
+fn the_name_tells_model_and_settings() {
+    let Some(segmenter) = tiny(SamSettings::default()) else { return };
+    let other = tiny(SamSettings { crop_points_divisor: 2, ..SamSettings::default() }).expect("as before");
+    assert_ne!(segmenter.name(), other.name());
+    for part in ["38dc63289500", "68f6ab0a5d54", "1024 px", "predicted_iou: 0.88", "1 threads"] {
+        assert!(segmenter.name().contains(part), "{part}: {}", segmenter.name());
+    }
+}
+
+/// Noise holds every way in which pixels touch, corners too.
+#[test]
+fn healing_of_noise_equals_a_plain_recomputation() {
+    let mut state = 5_u64;
+    let mut random = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 33) as f64 / (1_u64 << 31) as f64
+    };
+    for round in 0..300 {
+        let [width, height] = [1 + round % 19, 1 + round % 13];
+        let density = 0.2 + 0.6 * random();
+        let inside: Vec<bool> = (0..width * height).map(|_| random() < density).collect();
+        let min_region_px = (random() * 12.0) as u32;
+        let mut runs = Vec::new();
+        for (y, row) in inside.chunks_exact(width).enumerate() {
+            // Runs must be apart: each begins where the pixel before is outside.
+            for x0 in (0..width).filter(|&x| row[x] && (x == 0 || !row[x - 1])) {
+                let x1 = (x0..width).find(|&x| !row[x]).unwrap_or(width);
+                runs.push(Run { y: y as u32, x0: x0 as u32, x1: x1 as u32 });
+            }
+        }
+        let Some(mask) = RunMask::new(runs) else { continue };
+        let settings = SamSettings { min_region_px, ..SamSettings::default() };
+        let oracle = Oracle { settings, image_px: [width, height] };
+        let mut expected = Dense { inside, predicted_iou: 0.0, level: 0, crop: [0; 4], healed: false };
+        oracle.heal(&mut expected);
+        let healed = mask.without_small_regions(width as u32, height as u32, min_region_px);
+        assert_eq!(healed.is_some(), expected.healed, "round {round}");
+        let found = healed.unwrap_or(mask).to_mask(0);
+        for (at, inside) in expected.inside.iter().enumerate() {
+            assert_eq!(found.contains((at % width) as u32, (at / width) as u32), *inside, "round {round}");
+        }
+    }
 }
 
 #[test]
