@@ -67,28 +67,25 @@ impl RunMask {
     }
 
     /// Fills holes, then drops islands, of fewer than `min_px` pixels in an image of the given size; the largest
-    /// island stays. Pixels that touch at a corner belong together. Returns `None` where nothing changes.
+    /// island stays. Pixels that touch at a corner belong together. Returns `None` where no region is small.
     pub(super) fn without_small_regions(&self, width_px: u32, height_px: u32, min_px: u32) -> Option<Self> {
+        let is_small = |size_px: &u64| *size_px < u64::from(min_px);
         let outside = complement(&self.runs, width_px, height_px);
         let hole_of = components(&outside);
-        let is_hole: Vec<bool> =
-            hole_of.sizes_px.iter().map(|&size_px| size_px < u64::from(min_px)).collect();
-        let left = outside.iter().zip(&hole_of.of_run).filter(|(_, component)| !is_hole[**component]);
+        let left = outside.iter().zip(&hole_of.of_run);
+        let left = left.filter(|(_, component)| !is_small(&hole_of.sizes_px[**component]));
         let left: Vec<Run> = left.map(|(run, _)| *run).collect();
         let filled = complement(&left, width_px, height_px);
 
         let island_of = components(&filled);
-        let most_px = island_of.sizes_px.iter().copied().max().unwrap_or(0);
-        let largest = island_of.sizes_px.iter().position(|&size_px| size_px == most_px);
-        let stays: Vec<bool> = (island_of.sizes_px.iter().enumerate())
-            .map(|(component, &size_px)| {
-                size_px >= u64::from(min_px) || (most_px < u64::from(min_px) && Some(component) == largest)
-            })
-            .collect();
-        if !is_hole.contains(&true) && !stays.contains(&false) {
+        if !hole_of.sizes_px.iter().any(is_small) && !island_of.sizes_px.iter().any(is_small) {
             return None;
         }
-        let kept = filled.iter().zip(&island_of.of_run).filter(|(_, component)| stays[**component]);
+        // Where all are small, the first of the largest.
+        let most_px = island_of.sizes_px.iter().copied().max().filter(is_small);
+        let spared = island_of.sizes_px.iter().position(|size_px| Some(*size_px) == most_px);
+        let stays = |component: usize| Some(component) == spared || !is_small(&island_of.sizes_px[component]);
+        let kept = filled.iter().zip(&island_of.of_run).filter(|(_, component)| stays(**component));
         Self::new(kept.map(|(run, _)| *run).collect())
     }
 }
