@@ -179,7 +179,7 @@ pub struct Description {
     pub score: Option<ScoreDescription>,
 }
 
-fn here() -> PathBuf {
+pub(crate) fn here() -> PathBuf {
     ".".into()
 }
 
@@ -337,9 +337,7 @@ impl Description {
     /// # Errors
     /// [`DescriptionError`] where it cannot be read or used.
     pub fn read(path: &Path) -> Result<Self, DescriptionError> {
-        let text = fs_err::read_to_string(path).map_err(|cause| DescriptionError::Read { cause })?;
-        let description: Self = toml::from_str(&text)
-            .map_err(|cause| DescriptionError::Format { path: path.to_owned(), cause: Box::new(cause) })?;
+        let description: Self = read_toml(path)?;
         description.check(path)?;
         Ok(description)
     }
@@ -360,19 +358,8 @@ impl Description {
     }
 
     fn check(&self, path: &Path) -> Result<(), DescriptionError> {
-        let require = |holds: bool, field, found: String, expected| {
-            if holds {
-                return Ok(());
-            }
-            Err(DescriptionError::Value { path: path.to_owned(), field, found, expected })
-        };
-        let plain_name = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
-        require(
-            (1..=64).contains(&self.name.len()) && self.name.chars().all(plain_name),
-            "name",
-            format!("{:?}", self.name),
-            "1 to 64 of A-Z a-z 0-9 - _ .",
-        )?;
+        check_common(path, &self.name, &self.files_root, &self.files())?;
+        let require = |holds, field, found, expected| require(path, holds, field, found, expected);
         let image = &self.image;
         require((1..=1 << 16).contains(&self.dim), "dim", self.dim.to_string(), "1 to 65536")?;
         require(
@@ -413,23 +400,49 @@ impl Description {
                  between 0 and 1 that some cosine reaches",
             )?;
         }
-        require(
-            self.files_root
-                .components()
-                .all(|c| matches!(c, Component::Normal(_) | Component::CurDir | Component::ParentDir)),
-            "files_root",
-            self.files_root.display().to_string(),
-            "a relative path",
-        )?;
-        for (role, file) in self.files() {
-            let mut components = file.path.components().peekable();
-            require(
-                components.peek().is_some() && components.all(|c| matches!(c, Component::Normal(_))),
-                role,
-                file.path.display().to_string(),
-                "a relative path without ..",
-            )?;
-        }
         Ok(())
     }
+}
+
+/// Reads TOML.
+pub(crate) fn read_toml<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, DescriptionError> {
+    let text = fs_err::read_to_string(path).map_err(|cause| DescriptionError::Read { cause })?;
+    toml::from_str(&text)
+        .map_err(|cause| DescriptionError::Format { path: path.to_owned(), cause: Box::new(cause) })
+}
+
+/// Refuses the value `found` of a field unless it `holds` what is expected.
+pub(crate) fn require(
+    path: &Path,
+    holds: bool,
+    field: &'static str,
+    found: String,
+    expected: &'static str,
+) -> Result<(), DescriptionError> {
+    if holds {
+        return Ok(());
+    }
+    Err(DescriptionError::Value { path: path.to_owned(), field, found, expected })
+}
+
+/// Checks what every description has: a name, and files below a root.
+pub(crate) fn check_common(
+    path: &Path,
+    name: &str,
+    files_root: &Path,
+    files: &[(&'static str, &FileRef)],
+) -> Result<(), DescriptionError> {
+    let plain_name = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
+    let is_plain = (1..=64).contains(&name.len()) && name.chars().all(plain_name);
+    require(path, is_plain, "name", format!("{name:?}"), "1 to 64 of A-Z a-z 0-9 - _ .")?;
+    let is_relative = files_root
+        .components()
+        .all(|c| matches!(c, Component::Normal(_) | Component::CurDir | Component::ParentDir));
+    require(path, is_relative, "files_root", files_root.display().to_string(), "a relative path")?;
+    for (role, file) in files {
+        let mut components = file.path.components().peekable();
+        let is_below = components.peek().is_some() && components.all(|c| matches!(c, Component::Normal(_)));
+        require(path, is_below, role, file.path.display().to_string(), "a relative path without ..")?;
+    }
+    Ok(())
 }

@@ -3,7 +3,7 @@
 //! A [`ModelDir`] is described by one TOML file ([`description`]). Its image side turns crops into
 //! vectors ([`ImageEncoder`]), its text side turns queries into vectors of the same space
 //! ([`TextEncoder`]): through ONNX Runtime ([`session`]), from a list of phrases ([`phrases`]), or
-//! with what is built in ([`builtin`]). [`EncoderId`] names the space, so that a robot can refuse
+//! with what is built in ([`builtin`]). [`sam`] finds masks. [`EncoderId`] names the space, so that a robot can refuse
 //! to compare vectors of two spaces.
 //!
 //! [`hub`] brings public models here, and [`commands`] is the face that both programs give it.
@@ -23,6 +23,7 @@ mod model_dir;
 pub mod phrases;
 pub mod preprocess;
 mod provider;
+pub mod sam;
 pub mod session;
 pub mod tensors;
 pub mod text;

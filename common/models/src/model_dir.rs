@@ -11,6 +11,7 @@ use crate::{
     description::{Description, DescriptionError, FILE_NAME, FileRef, TextDescription},
     image::OnnxImageEncoder,
     phrases::PhraseEncoder,
+    preprocess::Preprocess,
     tensors,
     text::OnnxTextEncoder,
 };
@@ -43,13 +44,7 @@ impl ModelDir {
             sha256_of_file: Default::default(),
         };
         for (role, file) in description.files() {
-            let sha256 = match file.sha256 {
-                Some(sha256) => sha256.0,
-                None => hash_file(&files_root.join(&file.path)).map_err(|cause| match cause.kind() {
-                    io::ErrorKind::NotFound => DescriptionError::NoHash { path: files_root.join(&file.path) },
-                    _ => DescriptionError::Read { cause },
-                })?,
-            };
+            let sha256 = sha256_of(&files_root, file)?;
             id.sha256_of_file.insert(role.to_owned(), hex::encode(sha256));
         }
         let source = Source::Files { files_root, description: Box::new(description), batch: Arc::default() };
@@ -100,6 +95,16 @@ impl ModelDir {
         }
     }
 
+    /// Returns how crops become the squares that the image encoder takes; `None` where it takes any size.
+    ///
+    /// A square that was made so is encoded as its crop is.
+    pub fn preprocess(&self) -> Option<Preprocess> {
+        match &self.source {
+            Source::Builtin => None,
+            Source::Files { description, .. } => Some(description.image.preprocess()),
+        }
+    }
+
     /// Opens the image encoder.
     /// # Errors
     /// [`ModelError`] where a file is absent or not as described, or ONNX Runtime does not load.
@@ -144,8 +149,20 @@ impl ModelDir {
     }
 }
 
+/// Returns the recorded hash of `file`, else that of what is there.
+pub(crate) fn sha256_of(files_root: &Path, file: &FileRef) -> Result<[u8; 32], DescriptionError> {
+    let path = files_root.join(&file.path);
+    match file.sha256 {
+        Some(sha256) => Ok(sha256.0),
+        None => hash_file(&path).map_err(|cause| match cause.kind() {
+            io::ErrorKind::NotFound => DescriptionError::NoHash { path },
+            _ => DescriptionError::Read { cause },
+        }),
+    }
+}
+
 /// Returns the path of `file` after comparing its hash with the recorded one, if any.
-fn checked(files_root: &Path, file: &FileRef) -> Result<PathBuf, DescriptionError> {
+pub(crate) fn checked(files_root: &Path, file: &FileRef) -> Result<PathBuf, DescriptionError> {
     let path = files_root.join(&file.path);
     if let Some(expected) = file.sha256 {
         let found = hash_file(&path).map_err(|cause| DescriptionError::Read { cause })?;

@@ -26,6 +26,8 @@ pub enum Filter {
     /// Cubic convolution with a = -0.5 (Keys 1981), widened when shrinking; Pillow's `BICUBIC`.
     #[default]
     Bicubic,
+    /// A triangle, widened when shrinking; Pillow's `BILINEAR`.
+    Bilinear,
 }
 
 impl Filter {
@@ -33,6 +35,7 @@ impl Filter {
     fn support(self) -> f64 {
         match self {
             Self::Bicubic => 2.0,
+            Self::Bilinear => 1.0,
         }
     }
 
@@ -43,6 +46,7 @@ impl Filter {
                 x if x < 2.0 => (((x - 5.0) * x + 8.0) * x - 4.0) * -0.5,
                 _ => 0.0,
             },
+            Self::Bilinear => (1.0 - x.abs()).max(0.0),
         }
     }
 }
@@ -60,6 +64,12 @@ pub struct Window {
     pub height_px: u32,
 }
 
+/// Returns (x / 255 - mean) / std of every level x, per channel.
+pub(crate) fn values_of_levels(mean: [f64; 3], std: [f64; 3]) -> [[f32; 256]; 3] {
+    let value = |channel: usize, level: usize| ((level as f64 / 255.0 - mean[channel]) / std[channel]) as f32;
+    std::array::from_fn(|c| std::array::from_fn(|level| value(c, level)))
+}
+
 /// The steps from a crop to pixel values.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Preprocess {
@@ -73,10 +83,7 @@ pub struct Preprocess {
 impl Preprocess {
     /// Returns the steps for a square of `size_px`; `mean` and `std` apply to x / 255, per channel RGB.
     pub fn new(size_px: u32, resize: Resize, filter: Filter, mean: [f64; 3], std: [f64; 3]) -> Self {
-        let value =
-            |channel: usize, level: usize| ((level as f64 / 255.0 - mean[channel]) / std[channel]) as f32;
-        let values = std::array::from_fn(|c| std::array::from_fn(|level| value(c, level)));
-        Self { size_px, resize, filter, values }
+        Self { size_px, resize, filter, values: values_of_levels(mean, std) }
     }
 
     /// Returns the edge of the square, pixels.
@@ -175,6 +182,10 @@ const HALF: i32 = 1 << (WEIGHT_BITS - 1);
 ///
 /// Neither `image` nor `resized` may be empty, and the window must lie within `resized`.
 pub fn resample(image: &RgbImage, filter: Filter, resized: [u64; 2], window: Window) -> RgbImage {
+    let whole = Window { left_px: 0, top_px: 0, width_px: image.width(), height_px: image.height() };
+    if window == whole && resized == [image.width(), image.height()].map(u64::from) {
+        return image.clone();
+    }
     let columns = window.left_px..window.left_px + u64::from(window.width_px);
     let rows = window.top_px..window.top_px + u64::from(window.height_px);
     let columns = taps(filter, image.width(), resized[0], columns);

@@ -16,7 +16,10 @@ use ort::{
     environment::Environment,
     logging::LogLevel,
     session::{Session, SessionInputValue},
-    value::{Outlet, PrimitiveTensorElementType, Tensor, TensorElementType, TensorRef, ValueType},
+    value::{
+        DynValue, Outlet, PrimitiveTensorElementType, Tensor as OwnedTensor, TensorElementType, TensorRef,
+        ValueType,
+    },
 };
 
 use crate::provider::{Listener, Placement, Provider};
@@ -142,6 +145,16 @@ pub enum SessionError {
         /// What is expected; -1 is any size.
         expected: String,
     },
+    /// The model is of another layout.
+    #[error("{}: {found}; expected {expected}; give the files of one export in their places", path.display())]
+    Layout {
+        /// The model file.
+        path: PathBuf,
+        /// What it has.
+        found: String,
+        /// What is expected.
+        expected: String,
+    },
     /// Running the model failed.
     #[error("{}: running the model: {cause}; the file does not fit its description", path.display())]
     Run {
@@ -172,6 +185,11 @@ impl SessionOptions {
     /// Returns the options for one thread on the processor.
     pub fn new(runtime: PathBuf) -> Self {
         Self { runtime, intra_op_threads: 1, providers: vec![Provider::Cpu] }
+    }
+
+    /// Returns whether models are to run on the processor alone.
+    pub fn is_on_cpu(&self) -> bool {
+        self.providers.first().is_none_or(|first| *first == Provider::Cpu)
     }
 }
 
@@ -239,6 +257,29 @@ fn warn_once(message: String) {
         tracing::warn!("{message}");
         said.insert(message);
     }
+}
+
+/// A tensor of f32, row-major.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Tensor {
+    pub(crate) shape: Vec<i64>,
+    pub(crate) values: Vec<f32>,
+}
+
+/// Name, and for tensors element type and shape, where -1 is any size, of an input or output.
+pub(crate) type Declared = (String, Option<(TensorElementType, Vec<i64>)>);
+
+fn declared(outlets: &[Outlet]) -> Vec<Declared> {
+    let tensor = |outlet: &Outlet| match outlet.dtype() {
+        ValueType::Tensor { ty, shape, .. } => Some((*ty, shape.to_vec())),
+        _ => None,
+    };
+    outlets.iter().map(|outlet| (outlet.name().to_owned(), tensor(outlet))).collect()
+}
+
+fn listed(outlets: &[Outlet]) -> String {
+    let listed = outlets.iter().map(|outlet| format!("{} {}", outlet.name(), type_of(outlet)));
+    listed.collect::<Vec<_>>().join(", ")
 }
 
 /// An opened model file.
@@ -314,6 +355,8 @@ impl Model {
         let mut builder = Session::builder(environment)
             .and_then(|b| b.with_intra_threads(options.intra_op_threads).map_err(ort::Error::from))
             .and_then(|b| b.with_inter_threads(1).map_err(ort::Error::from))
+            // A thread that waits must not take a core from the other stages.
+            .and_then(|b| b.with_intra_op_spinning(false).map_err(ort::Error::from))
             .map_err(load)?;
         let listener = Listener::default();
         if listens {
@@ -448,6 +491,26 @@ impl Model {
         }
     }
 
+    pub(crate) fn inputs(&self) -> Vec<Declared> {
+        declared(self.session.inputs())
+    }
+
+    pub(crate) fn outputs(&self) -> Vec<Declared> {
+        declared(self.session.outputs())
+    }
+
+    pub(crate) fn listed_inputs(&self) -> String {
+        listed(self.session.inputs())
+    }
+
+    pub(crate) fn listed_outputs(&self) -> String {
+        listed(self.session.outputs())
+    }
+
+    pub(crate) fn layout_error(&self, found: String, expected: String) -> SessionError {
+        SessionError::Layout { path: self.path.clone(), found, expected }
+    }
+
     /// Runs the model on `inputs` and returns the f32 output `name`, which must have exactly `shape`.
     pub(crate) fn run(
         &mut self,
@@ -455,25 +518,35 @@ impl Model {
         name: &str,
         shape: &[i64],
     ) -> Result<Vec<f32>, SessionError> {
+        Ok(self.run_all(inputs, &[(name, shape)])?.swap_remove(0).values)
+    }
+
+    /// Runs the model on `inputs` and returns the f32 outputs named, in this order; -1 in a shape is any size.
+    pub(crate) fn run_all(
+        &mut self,
+        inputs: Vec<(&str, SessionInputValue<'_>)>,
+        outputs: &[(&str, &[i64])],
+    ) -> Result<Vec<Tensor>, SessionError> {
         let run = |path: &Path, cause| SessionError::Run { path: path.to_owned(), cause };
-        let mut outputs = self.session.run(inputs).map_err(|cause| run(&self.path, cause))?;
-        let output = outputs.remove(name);
-        drop(outputs);
-        let absent =
-            || self.shape_error("output", name, "absent".to_owned(), TensorElementType::Float32, shape);
-        let output = output.ok_or_else(absent)?;
-        let extracted = match output.dtype().tensor_type() {
-            Some(TensorElementType::Float16) => output
-                .try_extract_tensor::<f16>()
-                .map(|(found, values)| (found, values.iter().map(|x| x.to_f32()).collect())),
-            _ => output.try_extract_tensor::<f32>().map(|(found, values)| (found, values.to_vec())),
+        let mut found = self.session.run(inputs).map_err(|cause| run(&self.path, cause))?;
+        let values: Vec<_> = outputs.iter().map(|(name, _)| found.remove(name)).collect();
+        drop(found);
+        let take = |(value, &(name, shape)): (&Option<DynValue>, &(&str, &[i64]))| {
+            let wrong = |found| self.shape_error("output", name, found, TensorElementType::Float32, shape);
+            let value = value.as_ref().ok_or_else(|| wrong("absent".to_owned()))?;
+            let extracted = match value.dtype().tensor_type() {
+                Some(TensorElementType::Float16) => value
+                    .try_extract_tensor::<f16>()
+                    .map(|(found, values)| (found, values.iter().map(|x| x.to_f32()).collect())),
+                _ => value.try_extract_tensor::<f32>().map(|(found, values)| (found, values.to_vec())),
+            };
+            let (found, values) = extracted.map_err(|cause| run(&self.path, cause))?;
+            match shapes_fit(found, shape) {
+                true => Ok(Tensor { shape: found.to_vec(), values }),
+                false => Err(wrong(format!("{} {:?}", TensorElementType::Float32, &found[..]))),
+            }
         };
-        let (found, values): (_, Vec<f32>) = extracted.map_err(|cause| run(&self.path, cause))?;
-        if found[..] != *shape {
-            let found = format!("{} {:?}", TensorElementType::Float32, &found[..]);
-            return Err(self.shape_error("output", name, found, TensorElementType::Float32, shape));
-        }
-        Ok(values)
+        values.iter().zip(outputs).map(take).collect()
     }
 
     /// Returns `values` as an input of `shape`.
@@ -497,10 +570,13 @@ impl Model {
         values: impl Iterator<Item = u32>,
         is_i32: bool,
     ) -> Result<SessionInputValue<'static>, SessionError> {
-        let tensor: ort::Result<SessionInputValue<'static>> = match is_i32 {
-            true => Tensor::from_array((shape, values.map(|v| v as i32).collect::<Vec<_>>())).map(Into::into),
-            false => Tensor::from_array((shape, values.map(i64::from).collect::<Vec<_>>())).map(Into::into),
-        };
+        let tensor: ort::Result<SessionInputValue<'static>> =
+            match is_i32 {
+                true => OwnedTensor::from_array((shape, values.map(|v| v as i32).collect::<Vec<_>>()))
+                    .map(Into::into),
+                false => OwnedTensor::from_array((shape, values.map(i64::from).collect::<Vec<_>>()))
+                    .map(Into::into),
+            };
         tensor.map_err(|cause| SessionError::Run { path: self.path.clone(), cause })
     }
 }
@@ -518,7 +594,7 @@ fn is_element(found: TensorElementType, expected: TensorElementType) -> bool {
 }
 
 /// Tells whether a declared shape admits `expected`; -1 on either side is any size.
-fn shapes_fit(declared: &[i64], expected: &[i64]) -> bool {
+pub(crate) fn shapes_fit(declared: &[i64], expected: &[i64]) -> bool {
     declared.len() == expected.len()
         && declared.iter().zip(expected).all(|(&d, &e)| d == e || d == -1 || e == -1)
 }

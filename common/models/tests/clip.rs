@@ -41,6 +41,18 @@ fn every_step_of_preprocessing_equals_pillow() {
     assert!(max_difference(&values, &expected) < 1e-6, "{}", max_difference(&values, &expected));
 }
 
+/// Squares that were made ahead are encoded as their crops are: nothing is resized twice.
+#[test]
+fn a_square_stays_as_it_is() {
+    let photo =
+        image::RgbImage::from_fn(61, 97, |x, y| image::Rgb([(x * y) as u8, (3 * x) as u8, (y ^ x) as u8]));
+    for resize in [Resize::ShortestEdge, Resize::Stretch, Resize::Pad] {
+        let steps = Preprocess::new(48, resize, Filter::Bicubic, [0.5; 3], [0.5; 3]);
+        let square = steps.square(&photo);
+        assert!(steps.square(&square) == square, "{resize:?}");
+    }
+}
+
 #[test]
 fn image_vectors_equal_the_recorded_ones() {
     let (Some(golden), Some(options)) = (shared("models/clip_tiny/golden.npz"), options()) else { return };

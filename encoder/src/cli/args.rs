@@ -11,6 +11,7 @@ use slag_common::shard::Profile;
 use slag_models::commands::{ModelsCommand, RunArgs};
 
 use super::keys::KeysCommand;
+use super::sam::SamArgs;
 use crate::embed::Background;
 use crate::generate::crops::Split;
 use crate::generate::grammar::SceneKind;
@@ -141,9 +142,12 @@ pub struct EncodeArgs {
     /// Store to publish into; made if absent.
     #[arg(long, value_name = "DIR")]
     pub store: PathBuf,
-    /// `auto` for the built-in segmenter, or a folder of masks: id PNGs or COCO RLE JSON.
+    /// `auto` for a segmenter, or a folder of masks: id PNGs or COCO RLE JSON.
     #[arg(long, value_name = "auto|DIR", default_value = "auto")]
     pub masks: String,
+    /// The segmenter, where it is not the built-in one.
+    #[command(flatten)]
+    pub sam: SamArgs,
     /// Ids of mask PNGs that are no mask, beside 0.
     #[arg(long, value_name = "ID", value_delimiter = ',')]
     pub ignore_mask_ids: Vec<u32>,

@@ -5,6 +5,7 @@ mod bench;
 mod keys;
 mod progress;
 mod run;
+mod sam;
 
 use std::process::ExitCode;
 

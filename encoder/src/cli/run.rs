@@ -24,7 +24,7 @@ use crate::bench::raster::{Device, RasterBench, RasterReport};
 use crate::bench::scene::{BenchScene, cell_regions, grid_regions};
 use crate::check::{self, CheckOptions, CheckView};
 use crate::demo;
-use crate::encode::{self, EncodeError, EncodeSettings, Masks};
+use crate::encode::{self, EncodeError, EncodeSettings, Masks, StageReport};
 use crate::eval::{self, EvalSettings, Truth};
 use crate::generate::{crops, grammar};
 use crate::palette::PaletteSettings;
@@ -198,9 +198,12 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
     let metric = args.metric || geo.is_some();
     let folder_name = args.store.file_name().map(|name| name.to_string_lossy().into_owned());
     let created_unix_secs = now_unix_secs();
-    let masks = match args.masks.as_str() {
-        "auto" => Masks::Auto,
-        dir => Masks::Given { dir: dir.into(), ignore_ids: args.ignore_mask_ids.clone() },
+    let masks = match (args.masks.as_str(), args.sam.masks()) {
+        ("auto", masks) => masks.unwrap_or(Masks::Auto),
+        (dir, Some(_)) => {
+            return Err(anyhow!("--masks {dir} gives masks, --segmenter finds some; choose one"));
+        }
+        (dir, None) => Masks::Given { dir: dir.into(), ignore_ids: args.ignore_mask_ids.clone() },
     };
     Ok(EncodeSettings {
         scene: args.input.scene.clone(),
@@ -254,8 +257,14 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());
     let devices = Devices::open(args.device, GpuOptions::default())?;
     let summary = encode::encode(&settings, &models, &session, &devices, progress, cancel_flag()?.as_ref())?;
-    let stages =
+    let busy =
         summary.busy_secs.iter().map(|(stage, s)| format!("{stage} {s:.1}")).collect::<Vec<_>>().join(", ");
+    let of_views: String = (summary.view_stages.iter())
+        .map(|stage| {
+            let StageReport { stage, n_slots, busy_secs, busy_share } = stage;
+            format!("  {stage:<9}{n_slots:>8}{busy_secs:>10.1}{:>7.0} %\n", 100.0 * busy_share)
+        })
+        .collect();
     let sizes = summary
         .shard_bytes
         .iter()
@@ -274,7 +283,8 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
          masks      {} in {} regions, {} sums\n\
          cells      {} with {} palette rows\n\
          shards     {sizes}\n\
-         seconds    {:.1}; by stage, all threads: {stages}\n",
+         seconds    {:.1}; by stage, all threads: {busy}\n\
+         views took {:.1} s\n  stage    at once   seconds    busy\n{of_views}",
         summary.generation,
         settings.store.display(),
         summary.n_gaussians,
@@ -289,6 +299,7 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
         summary.n_cells,
         summary.n_rows,
         summary.wall_secs,
+        summary.views_secs,
     );
     print(json, &summary, lines)?;
     Ok(if summary.skipped_views.is_empty() { Exit::Done } else { Exit::Partly })

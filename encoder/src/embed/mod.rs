@@ -5,7 +5,7 @@ use std::num::NonZeroUsize;
 use image::{Rgb, RgbImage, imageops};
 use slag_models::{
     Crop, EncodeError, ImageEncoder,
-    preprocess::{Filter, Window, resample},
+    preprocess::{Filter, Preprocess, Window, resample},
 };
 
 use crate::segment::{BoxPx, Mask};
@@ -107,6 +107,49 @@ fn resized(image: &RgbImage, width_px: u32, height_px: u32) -> RgbImage {
     resample(image, Filter::Bicubic, [width_px, height_px].map(u64::from), whole)
 }
 
+/// Returns the crop of mask `index`, or says why there is none.
+fn crop_of(
+    image: &RgbImage,
+    (index, mask): (usize, &Mask),
+    background: Background,
+) -> Result<Crop, EmbedError> {
+    crop(image, mask, background).ok_or_else(|| EmbedError::Mask {
+        index,
+        box_px: mask.box_px,
+        n_inside: mask.inside.iter().filter(|&&inside| inside).count(),
+        width_px: image.width(),
+        height_px: image.height(),
+    })
+}
+
+/// Returns each mask's crop as the square that the image encoder takes: small, whatever the photo's size.
+/// # Errors
+/// [`EmbedError::Mask`] where a mask does not fit the image.
+pub fn squares(
+    image: &RgbImage,
+    masks: &[Mask],
+    background: Background,
+    preprocess: &Preprocess,
+) -> Result<Vec<Crop>, EmbedError> {
+    let square = |mask| Ok(Crop::whole(preprocess.square(crop_of(image, mask, background)?.image())));
+    masks.iter().enumerate().map(square).collect()
+}
+
+/// Returns a unit vector per crop, `[crops][dim]`; the first crop is that of mask `first`.
+/// # Errors
+/// [`EmbedError::Encode`] where the encoder fails.
+pub fn embed_crops(
+    crops: &[Crop],
+    first: usize,
+    encoder: &mut dyn ImageEncoder,
+) -> Result<Vec<f32>, EmbedError> {
+    encoder.encode(crops).map_err(|cause| EmbedError::Encode {
+        first,
+        last: (first + crops.len()).saturating_sub(1),
+        cause: Box::new(cause),
+    })
+}
+
 /// Returns a unit vector per mask, `[masks][dim]`.
 ///
 /// `batch`: crops given to the encoder at once, its own preference if `None`. Batches depend on the masks
@@ -126,22 +169,11 @@ pub fn embed_masks(
     let mut crops = Vec::new();
     let mut n_pixels = 0;
     for (index, mask) in masks.iter().enumerate() {
-        let crop = crop(image, mask, background).ok_or_else(|| EmbedError::Mask {
-            index,
-            box_px: mask.box_px,
-            n_inside: mask.inside.iter().filter(|&&inside| inside).count(),
-            width_px: image.width(),
-            height_px: image.height(),
-        })?;
+        let crop = crop_of(image, (index, mask), background)?;
         n_pixels += mask.inside.len() as u64;
         crops.push(crop);
         if crops.len() >= batch || n_pixels >= MAX_BATCH_PIXELS || index + 1 == masks.len() {
-            let encoded = encoder.encode(&crops).map_err(|cause| EmbedError::Encode {
-                first: index + 1 - crops.len(),
-                last: index,
-                cause: Box::new(cause),
-            })?;
-            vectors.extend(encoded);
+            vectors.extend(embed_crops(&crops, index + 1 - crops.len(), encoder)?);
             crops.clear();
             n_pixels = 0;
         }

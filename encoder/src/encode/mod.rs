@@ -7,14 +7,15 @@
 
 mod cells;
 mod job;
+mod pipeline;
 mod settings;
 mod view;
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Mutex;
-use std::sync::OnceLock;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{OnceLock, PoisonError};
 use std::time::Instant;
 
 use serde::Serialize;
@@ -30,13 +31,14 @@ use crate::lift::SumsError;
 use crate::palette::TextBank;
 use crate::progress::Progress;
 use crate::raster::{RasterError, Rasterizer};
-use crate::segment::{GivenMasks, GraphSegmenter, SegmentError, Segmenter};
+use crate::segment::{GivenMasks, GraphSegmenter, SamSegmenter, SegmentError, Segmenter};
 use crate::shard;
 use crate::store::{Store, StoreError};
 use cells::CellBuilder;
 use job::Job;
+pub use pipeline::StageReport;
 pub use settings::{EncodeSettings, Masks};
-use view::ViewWorker;
+use view::{ViewStages, Work};
 
 /// Why an encode ended without a new generation.
 #[derive(Debug, thiserror::Error)]
@@ -157,6 +159,17 @@ pub enum EncodeError {
     },
 }
 
+impl EncodeError {
+    /// Returns whether an input of one view is at fault, so that the others may go on.
+    fn is_of_one_view(&self) -> bool {
+        match self {
+            Self::Ingest(_) => true,
+            Self::Segment(error) => !matches!(error, SegmentError::Model(_)),
+            _ => false,
+        }
+    }
+}
+
 /// A view that was left out.
 #[derive(Clone, Debug, Serialize)]
 pub struct SkippedView {
@@ -199,6 +212,10 @@ pub struct EncodeSummary {
     pub shard_bytes: BTreeMap<String, u64>,
     /// Seconds spent in each stage, added over threads.
     pub busy_secs: BTreeMap<String, f64>,
+    /// How busy the stages of the views were, in their order.
+    pub view_stages: Vec<StageReport>,
+    /// Seconds from the first view to the last.
+    pub views_secs: f64,
     /// Seconds from start to end.
     pub wall_secs: f64,
     /// What the image model really ran on; absent where no view was left to do, or no runtime is needed.
@@ -251,6 +268,10 @@ pub fn encode(
     let segmenter: Box<dyn Segmenter> = match &settings.masks {
         Masks::Auto => Box::new(GraphSegmenter::default()),
         Masks::Given { dir, ignore_ids } => Box::new(GivenMasks::open(dir, ignore_ids.clone())?),
+        Masks::Sam { dir, settings, n_model_threads } => {
+            let session = SessionOptions { intra_op_threads: *n_model_threads, ..session.clone() };
+            Box::new(SamSegmenter::open(dir, settings.clone(), &session)?)
+        }
     };
     let fingerprint = settings.fingerprint(models, segmenter.name(), &scene, &views)?;
     let job = Job::open(&store, fingerprint, settings.restart)?;
@@ -258,18 +279,24 @@ pub fn encode(
     let done = job.done_views()?;
     let n_resumed = views.iter().filter(|view| done.contains(&view.name)).count();
     let loaded = stopwatch.time("raster", || rasterizer.load(&scene))?;
-    let worker = ViewWorker {
+    let stages = ViewStages {
         settings,
         scene: loaded.as_ref(),
         split: &split,
         segmenter: segmenter.as_ref(),
         models,
         session,
-        stopwatch: &stopwatch,
         images_on: OnceLock::new(),
+        job: &job,
+        progress,
+        preprocess: models.preprocess(),
+        encoders: Mutex::default(),
     };
     progress.begin("views", "view", views.len() as u64, n_resumed as u64);
-    skipped.extend(run_views(&worker, &views, &job, progress, cancel)?);
+    let views_start = Instant::now();
+    let (view_stages, left_out) = run_views(&stages, &views, cancel)?;
+    let views_secs = views_start.elapsed().as_secs_f64();
+    skipped.extend(left_out);
     progress.end();
     skipped.sort_by(|a, b| a.view.cmp(&b.view));
     let used: Vec<&View> = views.iter().filter(|v| !skipped.iter().any(|s| s.view == v.name)).collect();
@@ -303,9 +330,11 @@ pub fn encode(
         n_rows: 0,
         shard_bytes: BTreeMap::new(),
         busy_secs: BTreeMap::new(),
+        view_stages,
+        views_secs,
         wall_secs: 0.0,
         encoder: models.encoder_id().to_string(),
-        images_on: worker.images_on.get().cloned().flatten(),
+        images_on: stages.images_on.get().cloned().flatten(),
     };
     progress.begin("cells", "cell", split.cells.len() as u64, 0);
     let Some(built) = builder.build(progress, cancel)? else {
@@ -352,10 +381,13 @@ pub fn encode(
     summary.busy_secs = stopwatch
         .0
         .into_inner()
-        .unwrap_or_else(|e| e.into_inner())
+        .unwrap_or_else(PoisonError::into_inner)
         .into_iter()
         .map(|(k, v)| (k.to_owned(), v))
         .collect();
+    for stage in &summary.view_stages {
+        *summary.busy_secs.entry(stage.stage.clone()).or_default() += stage.busy_secs;
+    }
     summary.wall_secs = start.elapsed().as_secs_f64();
     Ok(summary)
 }
@@ -387,54 +419,34 @@ fn choose_views(settings: &EncodeSettings) -> Result<(Vec<View>, Vec<SkippedView
     Ok((views.collect(), skipped))
 }
 
-/// Works off the views that are not done yet, on as many threads as the settings say.
+/// Works off the views that are not done yet. Returns how busy the stages were, and the views that were left out.
 fn run_views(
-    worker: &ViewWorker<'_>,
+    stages: &ViewStages<'_>,
     views: &[View],
-    job: &Job<'_>,
-    progress: &dyn Progress,
     cancel: &AtomicBool,
-) -> Result<Vec<SkippedView>, EncodeError> {
-    let done = job.done_views()?;
-    let open: Vec<&View> = views.iter().filter(|view| !done.contains(&view.name)).collect();
-    let next = AtomicUsize::new(0);
-    let failed = AtomicBool::new(false);
-    let work = || -> Result<Vec<SkippedView>, EncodeError> {
-        let mut skipped = Vec::new();
-        let mut encoder = None;
-        while !cancel.load(Ordering::Relaxed) && !failed.load(Ordering::Relaxed) {
-            let Some(view) = open.get(next.fetch_add(1, Ordering::Relaxed)) else { break };
-            match worker.run(view, &mut encoder) {
-                Ok(sums) => {
-                    worker.stopwatch.time("write", || job.keep(&view.name, &sums))?;
-                    progress.advance(1);
-                }
-                // One bad photo or mask file of a thousand must not end an encode.
-                Err(error @ (EncodeError::Ingest(_) | EncodeError::Segment(_)))
-                    if !worker.settings.strict =>
-                {
-                    tracing::warn!("view {} is left out: {error}", view.name);
-                    skipped.push(SkippedView { view: view.name.clone(), reason: error.to_string() });
-                }
-                Err(error) => {
-                    failed.store(true, Ordering::Relaxed);
-                    return Err(error);
-                }
+) -> Result<(Vec<StageReport>, Vec<SkippedView>), EncodeError> {
+    let done = stages.job.done_views()?;
+    let open = views.iter().filter(|view| !done.contains(&view.name));
+    // No view is begun once the user has said stop; those at hand are finished.
+    let source = open.take_while(|_| !cancel.load(Ordering::Relaxed)).map(Work::begin);
+    let skipped = Mutex::new(Vec::new());
+    let reports = pipeline::run(&stages.stages(), stages.settings.threads.max(1), source, |_, work| {
+        let view = work.view();
+        match stages.step(work) {
+            // One bad photo or mask file of a thousand must not end an encode; a model that fails on one view is
+            // no model for the others.
+            Err(error) if !stages.settings.strict && error.is_of_one_view() => {
+                tracing::warn!("view {} is left out: {error}", view.name);
+                let skip = SkippedView { view: view.name.clone(), reason: error.to_string() };
+                skipped.lock().unwrap_or_else(PoisonError::into_inner).push(skip);
+                Ok(None)
             }
+            result => result,
         }
-        Ok(skipped)
-    };
-    let n_workers = worker.settings.threads.clamp(1, open.len().max(1));
-    let results: Vec<Result<Vec<SkippedView>, EncodeError>> = std::thread::scope(|scope| {
-        let workers: Vec<_> = (0..n_workers).map(|_| scope.spawn(work)).collect();
-        workers
-            .into_iter()
-            .map(|w| w.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
-            .collect()
-    });
-    let skipped: Vec<SkippedView> = results.into_iter().collect::<Result<Vec<_>, _>>()?.concat();
+    })?;
     if cancel.load(Ordering::Relaxed) {
-        return Err(EncodeError::Interrupted { n_done: job.done_views()?.len(), n_views: views.len() });
+        let n_done = stages.job.done_views()?.len();
+        return Err(EncodeError::Interrupted { n_done, n_views: views.len() });
     }
-    Ok(skipped)
+    Ok((reports, skipped.into_inner().unwrap_or_else(PoisonError::into_inner)))
 }

@@ -9,11 +9,12 @@ use slag_models::ModelDir;
 use super::EncodeError;
 use crate::embed::Background;
 use crate::raster::WeightKind;
+use crate::segment::SamSettings;
 use crate::shard::ShardSettings;
 use crate::shard::cells::CellLimits;
 
 /// Where masks come from.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub enum Masks {
     /// From the built-in segmenter.
     Auto,
@@ -23,6 +24,15 @@ pub enum Masks {
         dir: PathBuf,
         /// Ids of label images that are no masks (a "nothing" value such as 255).
         ignore_ids: Vec<u32>,
+    },
+    /// From Segment Anything.
+    Sam {
+        /// The model directory.
+        dir: PathBuf,
+        /// How many masks.
+        settings: SamSettings,
+        /// Threads within a run of the model. Another number may change masks in the last bits of their logits.
+        n_model_threads: usize,
     },
 }
 

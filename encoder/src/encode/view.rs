@@ -1,95 +1,203 @@
-//! One view through the stages segment, embed and raster.
+//! One view through the stages.
 
-use std::sync::OnceLock;
+use std::sync::{Mutex, OnceLock, PoisonError};
 
 use slag_common::View;
-use slag_models::{ImageEncoder, ModelDir, SessionOptions};
+use slag_models::preprocess::Preprocess;
+use slag_models::{Crop, ImageEncoder, ModelDir, SessionOptions};
 
+use super::job::Job;
+use super::pipeline::Stage;
 use super::settings::MAX_RASTER_WIDTH_PX;
-use super::{EncodeError, EncodeSettings, Stopwatch};
+use super::{EncodeError, EncodeSettings};
 use crate::embed;
 use crate::ingest::{self, LoadedImage};
 use crate::lift::ViewSums;
-use crate::raster::{LoadedScene, RasterView};
-use crate::segment::{self, Mask, SegmentInput, Segmenter};
+use crate::progress::Progress;
+use crate::raster::{LoadedScene, RasterError, RasterView};
+use crate::segment::{self, Mask, RegionMap, SegmentInput, Segmenter};
 use crate::shard::cells::CellSplit;
 
+/// Views at once in a GPU's image encoder: one is computed while others' pixel values are made and copied.
+const GPU_EMBED_SLOTS: usize = 3;
+
 /// What every view needs.
-pub(super) struct ViewWorker<'a> {
+pub(super) struct ViewStages<'a> {
     pub(super) settings: &'a EncodeSettings,
     pub(super) scene: &'a dyn LoadedScene,
     pub(super) split: &'a CellSplit,
     pub(super) segmenter: &'a dyn Segmenter,
     pub(super) models: &'a ModelDir,
     pub(super) session: &'a SessionOptions,
-    pub(super) stopwatch: &'a Stopwatch,
     /// What the image model really runs on, once it is open.
     pub(super) images_on: OnceLock<Option<String>>,
+    pub(super) job: &'a Job<'a>,
+    pub(super) progress: &'a dyn Progress,
+    /// How crops become the image encoder's squares, where it takes any.
+    pub(super) preprocess: Option<Preprocess>,
+    /// Image encoders that are not at work; opened as they are needed.
+    pub(super) encoders: Mutex<Vec<Box<dyn ImageEncoder>>>,
 }
 
-impl ViewWorker<'_> {
-    /// Takes a view through all stages. `encoder` is the calling thread's, opened at the first need.
-    pub(super) fn run(
-        &self,
-        view: &View,
-        encoder: &mut Option<Box<dyn ImageEncoder>>,
-    ) -> Result<ViewSums, EncodeError> {
-        let loaded = self.stopwatch.time("decode", || ingest::load_image(view))?;
+/// A view between two stages, with what the next one needs.
+pub(super) struct Work<'v> {
+    view: &'v View,
+    next: Next,
+}
+
+enum Next {
+    Decode,
+    Depth(LoadedImage),
+    Segment(LoadedImage, Option<Vec<f32>>),
+    Crop(LoadedImage, Vec<Mask>),
+    Embed(Crops, Partition),
+    Raster(Vec<f32>, Partition),
+    Write(ViewSums),
+}
+
+/// What is to be embedded.
+enum Crops {
+    /// Squares of the model's size.
+    Squares(Vec<Crop>),
+    /// Of a model that takes crops of any size: they are cut a batch at a time.
+    Uncut(LoadedImage, Vec<Mask>),
+}
+
+/// The regions of a view, and the masks of each.
+struct Partition {
+    raster_view: RasterView,
+    regions: RegionMap,
+    masks_of_region: Vec<Vec<u32>>,
+}
+
+impl<'v> Work<'v> {
+    pub(super) fn begin(view: &'v View) -> Self {
+        Self { view, next: Next::Decode }
+    }
+
+    pub(super) fn view(&self) -> &'v View {
+        self.view
+    }
+}
+
+impl ViewStages<'_> {
+    /// Returns the stages, in the order in which [`Self::step`] goes through them.
+    pub(super) fn stages(&self) -> Vec<Stage> {
+        let n_cores = self.settings.threads.max(1);
+        let on_cpu = |name| Stage { name, n_slots: n_cores, on_cpu: true };
+        let on_device = |name, n_slots: Option<usize>| match n_slots {
+            Some(n_slots) => Stage { name, n_slots, on_cpu: false },
+            None => on_cpu(name),
+        };
+        let embed_slots = (!self.session.is_on_cpu()).then_some(GPU_EMBED_SLOTS);
+        let mut stages = vec![on_cpu("decode")];
+        if self.segmenter.wants_depth() {
+            stages.push(on_device("depth", self.scene.n_lanes()));
+        }
+        stages.extend([
+            on_device("segment", self.segmenter.n_lanes()),
+            on_cpu("crop"),
+            on_device("embed", embed_slots),
+            on_device("raster", self.scene.n_lanes()),
+            on_device("write", Some(1)),
+        ]);
+        stages
+    }
+
+    /// Does the next stage's work.
+    pub(super) fn step<'v>(&self, work: Work<'v>) -> Result<Option<Work<'v>>, EncodeError> {
+        let view = work.view;
+        let raster_failed = |source: RasterError| EncodeError::Raster { view: view.name.clone(), source };
+        let next = match work.next {
+            Next::Decode => match ingest::load_image(view)? {
+                loaded if self.segmenter.wants_depth() => Next::Depth(loaded),
+                loaded => Next::Segment(loaded, None),
+            },
+            Next::Depth(loaded) => {
+                let raster_view = self.raster_view(&loaded);
+                let drawing = self.scene.draw(&raster_view, [0.0; 3]).map_err(raster_failed)?;
+                let depth = enlarge(&drawing.depth, &raster_view, &loaded);
+                Next::Segment(loaded, Some(depth))
+            }
+            Next::Segment(loaded, depth) => {
+                let mut masks = self.segmenter.segment(&SegmentInput::new(&loaded, depth.as_deref()))?;
+                masks.retain(|mask| mask.area_px >= self.settings.min_mask_px);
+                Next::Crop(loaded, masks)
+            }
+            Next::Crop(loaded, masks) => {
+                let partition = self.partition(&loaded, &masks);
+                let crops = match &self.preprocess {
+                    Some(preprocess) => Crops::Squares(
+                        embed::squares(&loaded.image, &masks, self.settings.background, preprocess)
+                            .map_err(|source| EncodeError::Embed { view: view.name.clone(), source })?,
+                    ),
+                    None => Crops::Uncut(loaded, masks),
+                };
+                Next::Embed(crops, partition)
+            }
+            Next::Embed(crops, partition) => Next::Raster(self.embed(view, &crops)?, partition),
+            Next::Raster(vectors, Partition { raster_view, regions, masks_of_region }) => {
+                let weights = self
+                    .scene
+                    .weights(&raster_view, &regions, self.settings.weights)
+                    .map_err(raster_failed)?;
+                let dim = self.models.dim();
+                Next::Write(ViewSums::new(&weights.entries, masks_of_region, vectors, dim, self.split))
+            }
+            Next::Write(sums) => {
+                self.job.keep(&view.name, &sums)?;
+                self.progress.advance(1);
+                return Ok(None);
+            }
+        };
+        Ok(Some(Work { view, next }))
+    }
+
+    fn raster_view(&self, loaded: &LoadedImage) -> RasterView {
         let intrinsics = loaded.view.intrinsics;
-        let raster_width_px =
-            self.settings.raster_width_px.unwrap_or(intrinsics.width_px.min(MAX_RASTER_WIDTH_PX));
-        let raster_view = RasterView {
-            camera_from_world: view.camera_from_world,
-            intrinsics: intrinsics.scaled_to_width(raster_width_px),
-        };
-        let mut masks = self.segment(&loaded, &raster_view)?;
-        masks.retain(|mask| mask.area_px >= self.settings.min_mask_px);
+        let width_px = self.settings.raster_width_px.unwrap_or(intrinsics.width_px.min(MAX_RASTER_WIDTH_PX));
+        RasterView {
+            camera_from_world: loaded.view.camera_from_world,
+            intrinsics: intrinsics.scaled_to_width(width_px),
+        }
+    }
 
-        let vectors = if masks.is_empty() {
-            Vec::new()
-        } else {
-            let encoder = match encoder {
-                Some(encoder) => encoder,
-                none => none.insert(self.models.image_encoder(self.session)?),
-            };
-            self.images_on.get_or_init(|| encoder.placement().map(ToString::to_string));
-            let embedded = self.stopwatch.time("embed", || {
-                embed::embed_masks(&loaded.image, &masks, encoder.as_mut(), self.settings.background, None)
-            });
-            embedded.map_err(|source| EncodeError::Embed { view: view.name.clone(), source })?
-        };
-
-        let size = raster_view.intrinsics;
+    fn partition(&self, loaded: &LoadedImage, masks: &[Mask]) -> Partition {
+        let raster_view = self.raster_view(loaded);
         let (regions, masks_of_region) = segment::partition(
-            &masks,
+            masks,
             loaded.image.width(),
             loaded.image.height(),
-            size.width_px,
-            size.height_px,
+            raster_view.intrinsics.width_px,
+            raster_view.intrinsics.height_px,
             loaded.valid.as_deref(),
         );
-        let weights = self
-            .stopwatch
-            .time("raster", || self.scene.weights(&raster_view, &regions, self.settings.weights))
-            .map_err(|source| EncodeError::Raster { view: view.name.clone(), source })?;
-        Ok(ViewSums::new(&weights.entries, masks_of_region, vectors, self.models.dim(), self.split))
+        Partition { raster_view, regions, masks_of_region }
     }
 
-    fn segment(&self, loaded: &LoadedImage, raster_view: &RasterView) -> Result<Vec<Mask>, EncodeError> {
-        let depth = if self.segmenter.wants_depth() {
-            let drawing = self
-                .stopwatch
-                .time("raster", || self.scene.draw(raster_view, [0.0; 3]))
-                .map_err(|source| EncodeError::Raster { view: loaded.view.name.clone(), source })?;
-            Some(enlarge(&drawing.depth, raster_view, loaded))
-        } else {
-            None
+    /// Returns a vector per mask, with an encoder that is free or a new one.
+    fn embed(&self, view: &View, crops: &Crops) -> Result<Vec<f32>, EncodeError> {
+        if matches!(crops, Crops::Squares(crops) if crops.is_empty()) {
+            return Ok(Vec::new());
+        }
+        let encoders = || self.encoders.lock().unwrap_or_else(PoisonError::into_inner);
+        let free = encoders().pop();
+        let mut encoder = match free {
+            Some(encoder) => encoder,
+            None => self.models.image_encoder(self.session)?,
         };
-        let input = SegmentInput::new(loaded, depth.as_deref());
-        Ok(self.stopwatch.time("segment", || self.segmenter.segment(&input))?)
+        self.images_on.get_or_init(|| encoder.placement().map(ToString::to_string));
+        let vectors = match crops {
+            Crops::Squares(crops) => embed::embed_crops(crops, 0, encoder.as_mut()),
+            Crops::Uncut(loaded, masks) => {
+                let background = self.settings.background;
+                embed::embed_masks(&loaded.image, masks, encoder.as_mut(), background, None)
+            }
+        };
+        encoders().push(encoder);
+        vectors.map_err(|source| EncodeError::Embed { view: view.name.clone(), source })
     }
 }
-
 /// Returns a raster's values at the photo's size, nearest.
 fn enlarge(values: &[f32], raster_view: &RasterView, loaded: &LoadedImage) -> Vec<f32> {
     let (width, height) = (u64::from(loaded.image.width()), u64::from(loaded.image.height()));

@@ -1,13 +1,14 @@
 //! Stage 0: photos as the later stages want them, ideal pinhole images of a known size.
 
 mod geo;
+mod jpeg;
 mod undistort;
 
 use std::io;
 use std::path::{Path, PathBuf};
 
 use image::metadata::Orientation;
-use image::{DynamicImage, ImageDecoder, ImageError, ImageReader, RgbImage};
+use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, RgbImage};
 use slag_common::{Distortion, Intrinsics, View};
 
 pub use geo::{GeoError, read_geo_reference};
@@ -43,6 +44,12 @@ pub enum IngestError {
         /// The decoder's reason.
         #[source]
         source: ImageError,
+    },
+    /// A JPEG is cut short.
+    #[error("{}: the file ends before its image does; copy the photo again", path.display())]
+    Cut {
+        /// The image.
+        path: PathBuf,
     },
     /// An image's size does not belong to its camera.
     #[error(
@@ -87,8 +94,12 @@ pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
 
 fn decode(path: &Path, camera: &Intrinsics) -> Result<RgbImage, IngestError> {
     let failed = |source| IngestError::Decode { path: path.to_owned(), source };
-    let file = io::BufReader::new(fs_err::File::open(path)?);
-    let mut decoder = ImageReader::new(file).with_guessed_format()?.into_decoder().map_err(failed)?;
+    let open = || Ok::<_, IngestError>(io::BufReader::new(fs_err::File::open(path)?));
+    let reader = ImageReader::new(open()?).with_guessed_format()?;
+    if reader.format() == Some(ImageFormat::Jpeg) && !jpeg::is_whole(open()?)? {
+        return Err(IngestError::Cut { path: path.to_owned() });
+    }
+    let mut decoder = reader.into_decoder().map_err(failed)?;
     let (width_px, height_px) = decoder.dimensions();
     // Before any pixel is allocated.
     if !is_scale_of(camera, width_px, height_px) {

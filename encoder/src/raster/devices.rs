@@ -181,7 +181,13 @@ impl Rasterizer for Devices {
         }
         let lanes =
             Lanes { n_free: vec![self.views_in_flight; gpus.len()], is_usable: vec![true; gpus.len()] };
-        Ok(Box::new(SharedScene { gpus, cpu, lanes: Mutex::new(lanes), freed: Condvar::new() }))
+        Ok(Box::new(SharedScene {
+            gpus,
+            views_in_flight: self.views_in_flight,
+            cpu,
+            lanes: Mutex::new(lanes),
+            freed: Condvar::new(),
+        }))
     }
 }
 
@@ -189,6 +195,7 @@ impl Rasterizer for Devices {
 /// view gets the GPU with the most free lanes, so a slow view holds up none but its own lane.
 struct SharedScene<'s> {
     gpus: Vec<Box<dyn LoadedScene + 's>>,
+    views_in_flight: usize,
     cpu: Box<dyn LoadedScene + 's>,
     lanes: Mutex<Lanes>,
     freed: Condvar,
@@ -260,5 +267,9 @@ impl LoadedScene for SharedScene<'_> {
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {
         self.run(|scene| scene.draw(view, background))
+    }
+
+    fn n_lanes(&self) -> Option<usize> {
+        Some(self.gpus.len() * self.views_in_flight)
     }
 }

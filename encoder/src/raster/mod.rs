@@ -257,6 +257,11 @@ pub trait LoadedScene: Sync {
     /// # Errors
     /// [`RasterError`] for input that contradicts itself.
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError>;
+
+    /// Returns how many views devices of their own work on at once; `None` on the processor.
+    fn n_lanes(&self) -> Option<usize> {
+        None
+    }
 }
 
 /// The reference backend; runs on the current rayon pool, with the widest instructions there are.

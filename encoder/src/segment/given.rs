@@ -8,12 +8,11 @@ use serde::Deserialize;
 use slag_common::View;
 
 use super::{
-    BoxPx, Mask, NO_REGION, Rle, RleError, SegmentError, SegmentInput, Segmenter, masks_of_labels, partition,
+    BoxPx, MAX_MASK_BYTES, Mask, NO_REGION, Rle, RleError, SegmentError, SegmentInput, Segmenter,
+    masks_of_labels, partition,
 };
 use crate::ingest::Undistorter;
 
-/// Most pixels that the boxes of a view's masks may have in all; a byte each.
-const MAX_MASK_BYTES: u64 = 1 << 30;
 /// What a PNG decoder may allocate beyond the pixels themselves.
 const PNG_OVERHEAD_BYTES: usize = 1 << 20;
 

@@ -4,12 +4,14 @@ mod given;
 mod graph;
 mod regions;
 mod rle;
+mod sam;
 
 use std::io;
 use std::path::PathBuf;
 
 use image::RgbImage;
 use slag_common::View;
+use slag_models::session::SessionError;
 
 use crate::ingest::{LoadedImage, Undistorter};
 
@@ -17,6 +19,10 @@ pub use given::GivenMasks;
 pub use graph::{GraphSegmenter, GraphSettings};
 pub use regions::partition;
 pub use rle::{Rle, RleError};
+pub use sam::{SamSegmenter, SamSettings};
+
+/// Most pixels that the boxes of a view's masks may have in all; a byte each.
+const MAX_MASK_BYTES: u64 = 1 << 30;
 
 /// Finds the masks of an image.
 pub trait Segmenter: Sync {
@@ -26,6 +32,11 @@ pub trait Segmenter: Sync {
     /// Returns whether it looks at [`SegmentInput::depth`], which takes a drawing of the scene.
     fn wants_depth(&self) -> bool {
         false
+    }
+
+    /// Returns how many images a model or device of its own works on at once; `None` on the processor.
+    fn n_lanes(&self) -> Option<usize> {
+        None
     }
 
     /// Returns the masks of an image; they may overlap.
@@ -133,6 +144,19 @@ pub enum SegmentError {
         /// The file.
         path: PathBuf,
         /// The limit: the sum over the masks of their boxes' areas.
+        limit_bytes: u64,
+    },
+    /// A segmentation model failed: no fault of the image.
+    #[error(transparent)]
+    Model(#[from] SessionError),
+    /// A model finds more masks than is allowed.
+    #[error(
+        "view {view:?}: the masks found take more than {limit_bytes} bytes; ask for fewer points, or be stricter          with --sam-predicted-iou and --sam-stability"
+    )]
+    TooManyMasks {
+        /// The view.
+        view: String,
+        /// The limit.
         limit_bytes: u64,
     },
 }

@@ -1,0 +1,97 @@
+//! The flags of Segment Anything.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::run::available_threads;
+use crate::encode::Masks;
+use crate::segment::SamSettings;
+
+/// Masks from Segment Anything; without `--segmenter` the others say nothing.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Segment Anything")]
+pub struct SamArgs {
+    /// Model directory (with model.toml) of SAM, MobileSAM or another of its kind, which finds the masks.
+    #[arg(long, value_name = "DIR")]
+    segmenter: Option<PathBuf>,
+    /// Points along each side of the grid that masks are asked for at: 8, 16, 32, 64.
+    #[arg(long, value_name = "N", default_value_t = SamSettings::default().points_per_side,
+        value_parser = clap::value_parser!(u32).range(1..=256))]
+    points_per_side: u32,
+    /// Points that the model takes at once: more are faster on GPUs and take more memory.
+    #[arg(long, value_name = "N", default_value_t = SamSettings::default().points_per_batch,
+        value_parser = clap::value_parser!(u32).range(1..=1024))]
+    sam_points_per_batch: u32,
+    /// IoU that the model must predict for a mask, 0 to 1.
+    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().predicted_iou, value_parser = parse_f32_ratio)]
+    sam_predicted_iou: f32,
+    /// IoU that a mask must have with itself under higher and lower thresholds, 0 to 1.
+    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().stability, value_parser = parse_ratio)]
+    sam_stability: f64,
+    /// How far those thresholds lie from 0, logits.
+    #[arg(long, value_name = "LOGITS", default_value_t = SamSettings::default().stability_offset, value_parser = parse_offset)]
+    sam_stability_offset: f32,
+    /// IoU of boxes from which two masks are the same.
+    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().box_nms_iou, value_parser = parse_ratio)]
+    sam_box_nms: f64,
+    /// IoU of pixels from which two masks are the same; 1 compares boxes only.
+    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().mask_nms_iou, value_parser = parse_ratio)]
+    sam_mask_nms: f64,
+    /// Layers of crops, which find small things: layer i segments 4^i crops of the image beside the whole.
+    #[arg(long, value_name = "N", default_value_t = SamSettings::default().crop_layers,
+        value_parser = clap::value_parser!(u32).range(0..=4))]
+    sam_crop_layers: u32,
+    /// IoU of boxes from which masks of two crops are the same.
+    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().crop_nms_iou, value_parser = parse_ratio)]
+    sam_crop_nms: f64,
+    /// Overlap of neighbouring crops, relative to the image's shorter edge.
+    #[arg(long, value_name = "RATIO", default_value_t = SamSettings::default().crop_overlap, value_parser = parse_ratio)]
+    sam_crop_overlap: f64,
+    /// Divides the points along a side from layer to layer of crops.
+    #[arg(long, value_name = "N", default_value_t = SamSettings::default().crop_points_divisor,
+        value_parser = clap::value_parser!(u32).range(1..=16))]
+    sam_crop_points_divisor: u32,
+    /// Holes and islands of masks with fewer pixels are healed.
+    #[arg(long, value_name = "PX", default_value_t = SamSettings::default().min_region_px)]
+    sam_min_region_px: u32,
+    /// Threads within the model [default: all cores]. Masks may depend on it in the last bits.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    sam_threads: Option<u32>,
+}
+
+impl SamArgs {
+    /// Returns where masks come from, if it is Segment Anything.
+    pub(super) fn masks(&self) -> Option<Masks> {
+        let settings = SamSettings {
+            points_per_side: self.points_per_side,
+            points_per_batch: self.sam_points_per_batch,
+            predicted_iou: self.sam_predicted_iou,
+            stability: self.sam_stability,
+            stability_offset: self.sam_stability_offset,
+            box_nms_iou: self.sam_box_nms,
+            mask_nms_iou: self.sam_mask_nms,
+            crop_layers: self.sam_crop_layers,
+            crop_nms_iou: self.sam_crop_nms,
+            crop_overlap: self.sam_crop_overlap,
+            crop_points_divisor: self.sam_crop_points_divisor,
+            min_region_px: self.sam_min_region_px,
+        };
+        let n_model_threads = self.sam_threads.map_or_else(available_threads, |n| n as usize);
+        Some(Masks::Sam { dir: self.segmenter.clone()?, settings, n_model_threads })
+    }
+}
+
+fn parse_ratio(text: &str) -> Result<f64, String> {
+    let ratio: f64 = text.parse().map_err(|error| format!("{error}"))?;
+    (0.0..=1.0).contains(&ratio).then_some(ratio).ok_or_else(|| "expected 0 to 1".into())
+}
+
+fn parse_f32_ratio(text: &str) -> Result<f32, String> {
+    parse_ratio(text).map(|ratio| ratio as f32)
+}
+
+fn parse_offset(text: &str) -> Result<f32, String> {
+    let offset: f32 = text.parse().map_err(|error| format!("{error}"))?;
+    (0.0..=100.0).contains(&offset).then_some(offset).ok_or_else(|| "expected 0 to 100".into())
+}

@@ -1,0 +1,274 @@
+//! Views on their way through stages that overlap: while a device has one view, the cores prepare the next.
+//!
+//! Each stage has as many slots as views may be in it at once, and a queue as long. A free thread takes the view that
+//! is furthest, so that views leave before others come in and the memory is that of few. Stages of the processor
+//! share its cores; one that waits for a GPU or the disk takes none from them. On a processor alone this is a thread
+//! a core, each with a view.
+
+use std::any::Any;
+use std::collections::VecDeque;
+use std::panic::{self, AssertUnwindSafe};
+use std::sync::{Condvar, Mutex, PoisonError};
+use std::time::Instant;
+
+use serde::Serialize;
+
+/// A stage of the pipeline.
+#[derive(Clone, Debug)]
+pub(super) struct Stage {
+    pub(super) name: &'static str,
+    /// Views that may be in it at once, at least 1.
+    pub(super) n_slots: usize,
+    /// Whether it keeps a core busy, rather than a GPU or a disk.
+    pub(super) on_cpu: bool,
+}
+
+/// How busy a stage was.
+#[derive(Clone, Debug, Serialize)]
+pub struct StageReport {
+    /// The stage.
+    pub stage: String,
+    /// Views that it could take at once.
+    pub n_slots: usize,
+    /// Seconds of work, added over the slots.
+    pub busy_secs: f64,
+    /// Share of the time that its slots were busy on average, 0 to 1.
+    pub busy_share: f64,
+}
+
+struct State<S, T, E> {
+    source: S,
+    /// Waiting before each stage.
+    waiting: Vec<VecDeque<T>>,
+    n_running: Vec<usize>,
+    busy_secs: Vec<f64>,
+    failure: Option<Failure<E>>,
+}
+
+enum Failure<E> {
+    Error(E),
+    Panic(Box<dyn Any + Send>),
+}
+
+/// Takes what `source` yields through the stages, `n_cores` at a time on the processor.
+///
+/// `step` does the work of a stage (its index) and returns what the next one takes; `None` ends an item's way.
+///
+/// # Errors
+/// The first that `step` returned; what is under way is then given up.
+pub(super) fn run<T: Send, E: Send>(
+    stages: &[Stage],
+    n_cores: usize,
+    source: impl Iterator<Item = T> + Send,
+    step: impl Fn(usize, T) -> Result<Option<T>, E> + Sync,
+) -> Result<Vec<StageReport>, E> {
+    let start = Instant::now();
+    let state = Mutex::new(State {
+        source: source.fuse(),
+        waiting: stages.iter().map(|_| VecDeque::new()).collect(),
+        n_running: vec![0; stages.len()],
+        busy_secs: vec![0.0; stages.len()],
+        failure: None,
+    });
+    let changed = Condvar::new();
+    let work = || {
+        let lock = || state.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut state = lock();
+        while state.failure.is_none() {
+            let Some((stage, item)) = state.take(stages, n_cores) else {
+                // Where nothing is under way and nothing can be begun, nothing waits.
+                if state.n_running.iter().all(|n| *n == 0) {
+                    break;
+                }
+                state = changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+                continue;
+            };
+            drop(state);
+            let begun = Instant::now();
+            // A panic must not leave the others waiting.
+            let result = panic::catch_unwind(AssertUnwindSafe(|| step(stage, item)));
+            state = lock();
+            state.busy_secs[stage] += begun.elapsed().as_secs_f64();
+            state.n_running[stage] -= 1;
+            match result {
+                Ok(Ok(Some(item))) if stage + 1 < stages.len() => state.waiting[stage + 1].push_back(item),
+                Ok(Ok(_)) => {}
+                Ok(Err(error)) => drop(state.failure.get_or_insert(Failure::Error(error))),
+                Err(panic) => state.failure = Some(Failure::Panic(panic)),
+            }
+            changed.notify_all();
+        }
+    };
+    let n_elsewhere: usize = stages.iter().filter(|stage| !stage.on_cpu).map(|stage| stage.n_slots).sum();
+    std::thread::scope(|scope| {
+        for _ in 0..n_cores + n_elsewhere {
+            scope.spawn(work);
+        }
+    });
+    let State { busy_secs, failure, .. } = state.into_inner().unwrap_or_else(PoisonError::into_inner);
+    match failure {
+        Some(Failure::Error(error)) => return Err(error),
+        Some(Failure::Panic(panic)) => panic::resume_unwind(panic),
+        None => {}
+    }
+    let wall_secs = start.elapsed().as_secs_f64();
+    let report = |(stage, busy_secs): (&Stage, f64)| StageReport {
+        stage: stage.name.to_owned(),
+        n_slots: stage.n_slots,
+        busy_secs,
+        busy_share: busy_secs / (wall_secs * stage.n_slots as f64),
+    };
+    Ok(stages.iter().zip(busy_secs).map(report).collect())
+}
+
+impl<S: Iterator<Item = T>, T, E> State<S, T, E> {
+    /// Takes the item that is furthest of those that can go on, and says into which stage.
+    fn take(&mut self, stages: &[Stage], n_cores: usize) -> Option<(usize, T)> {
+        let on_cpu = stages.iter().zip(&self.n_running).filter(|(stage, _)| stage.on_cpu);
+        let has_core = on_cpu.map(|(_, n)| n).sum::<usize>() < n_cores;
+        for (at, stage) in stages.iter().enumerate().rev() {
+            // What is in the stage has its place in the next one's queue, which holds enough for either's slots.
+            let has_room = stages.get(at + 1).is_none_or(|next| {
+                self.waiting[at + 1].len() + self.n_running[at] < stage.n_slots.max(next.n_slots)
+            });
+            if self.n_running[at] < stage.n_slots && has_room && (has_core || !stage.on_cpu) {
+                let item = if at == 0 { self.source.next() } else { self.waiting[at].pop_front() };
+                if let Some(item) = item {
+                    self.n_running[at] += 1;
+                    return Some((at, item));
+                }
+            }
+        }
+        None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+    use std::sync::{Arc, mpsc};
+    use std::time::Duration;
+
+    use super::*;
+
+    fn stage(name: &'static str, n_slots: usize, on_cpu: bool) -> Stage {
+        Stage { name, n_slots, on_cpu }
+    }
+
+    /// Every item passes every stage in order; slots, cores and queues are never exceeded; nothing is lost.
+    #[test]
+    fn slots_cores_and_queues_are_kept() {
+        let stages = [
+            stage("a", 3, true),
+            stage("b", 1, false),
+            stage("c", 3, true),
+            stage("d", 2, false),
+            stage("e", 3, true),
+        ];
+        let n_cores = 3;
+        let running: [AtomicUsize; 5] = Default::default();
+        let (on_cpu, begun, ended) = (AtomicUsize::new(0), AtomicUsize::new(0), AtomicUsize::new(0));
+        let most_under_way = AtomicUsize::new(0);
+        let done = Mutex::new(BTreeSet::new());
+        let reports = run::<_, ()>(&stages, n_cores, (0..200).map(|id| (id, 0)), |at, (id, passed)| {
+            assert_eq!(at, passed, "item {id}");
+            if at == 0 {
+                begun.fetch_add(1, Ordering::SeqCst);
+            }
+            let under_way = begun.load(Ordering::SeqCst).saturating_sub(ended.load(Ordering::SeqCst));
+            most_under_way.fetch_max(under_way, Ordering::SeqCst);
+            assert!(running[at].fetch_add(1, Ordering::SeqCst) < stages[at].n_slots, "slots of {at}");
+            if stages[at].on_cpu {
+                assert!(on_cpu.fetch_add(1, Ordering::SeqCst) < n_cores, "cores");
+            }
+            std::thread::sleep(Duration::from_micros(id * 7 % 50 * (at as u64 + 1)));
+            if stages[at].on_cpu {
+                on_cpu.fetch_sub(1, Ordering::SeqCst);
+            }
+            running[at].fetch_sub(1, Ordering::SeqCst);
+            if at == 4 {
+                ended.fetch_add(1, Ordering::SeqCst);
+                done.lock().expect("not poisoned").insert(id);
+            }
+            Ok(Some((id, passed + 1)))
+        })
+        .expect("no error");
+        assert_eq!(done.into_inner().expect("not poisoned").len(), 200);
+        // A queue before each of four stages, of 3, 3, 3 and 3 with what comes into it, and 3 in the last one.
+        let most = most_under_way.into_inner();
+        assert!((4..=15).contains(&most), "{most}");
+        assert_eq!(reports.len(), 5);
+        for report in &reports {
+            assert!(
+                report.busy_secs > 0.0 && report.busy_share > 0.0 && report.busy_share <= 1.0,
+                "{report:?}"
+            );
+        }
+    }
+
+    /// While a device has the first item, the only core prepares the second: the device returns only then.
+    #[test]
+    fn a_device_does_not_stop_the_cores() {
+        let stages = [stage("prepare", 1, true), stage("device", 1, false)];
+        let (prepared, seen) = mpsc::channel();
+        let seen = Mutex::new(seen);
+        run::<_, ()>(&stages, 1, 0..2, |at, item| {
+            if at == 0 && item == 1 {
+                prepared.send(()).expect("someone listens");
+            }
+            if at == 1 && item == 0 {
+                let waited = seen.lock().expect("not poisoned").recv_timeout(Duration::from_secs(20));
+                waited.expect("the second item was not prepared meanwhile");
+            }
+            Ok(Some(item))
+        })
+        .expect("no error");
+    }
+
+    /// The furthest item goes first, so that few are under way.
+    #[test]
+    fn what_is_furthest_goes_first() {
+        let stages = [stage("a", 1, true), stage("b", 1, true), stage("c", 1, true)];
+        let order = Mutex::new(Vec::new());
+        run::<_, ()>(&stages, 1, 0..2, |at, item| {
+            order.lock().expect("not poisoned").push((item, at));
+            Ok(Some(item))
+        })
+        .expect("no error");
+        let order = order.into_inner().expect("not poisoned");
+        assert_eq!(order, [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)]);
+    }
+
+    #[test]
+    fn items_end_where_nothing_is_returned_and_errors_end_all() {
+        let stages = [stage("a", 2, true), stage("b", 2, true)];
+        let n_second = AtomicUsize::new(0);
+        let step = |at: usize, item: u32| {
+            n_second.fetch_add(at, Ordering::SeqCst);
+            Ok::<_, ()>((item % 2 == 0).then_some(item))
+        };
+        run(&stages, 2, 0..10, step).expect("no error");
+        assert_eq!(n_second.into_inner(), 5);
+
+        let n_begun = Arc::new(AtomicUsize::new(0));
+        let counted = Arc::clone(&n_begun);
+        let source = (0..1_000_000).inspect(move |_| {
+            counted.fetch_add(1, Ordering::SeqCst);
+        });
+        let failed =
+            run(&stages, 2, source, |_, item: u32| if item == 7 { Err(item) } else { Ok(Some(item)) });
+        assert_eq!(failed.expect_err("it failed"), 7);
+        assert!(n_begun.load(Ordering::SeqCst) < 100);
+    }
+
+    #[test]
+    #[should_panic(expected = "a broken stage")]
+    fn a_panic_is_passed_on() {
+        let stages = [stage("a", 2, true), stage("b", 2, false)];
+        let _ = run::<_, ()>(&stages, 2, 0..10, |at, item| {
+            assert!(at == 0 || item != 3, "a broken stage");
+            Ok(Some(item))
+        });
+    }
+}

@@ -1,0 +1,131 @@
+//! Which of SAM's proposals become masks: the filters of Segment Anything's automatic mask generation, in its order.
+
+use rayon::prelude::*;
+use slag_models::sam::{Decoded, MASKS_PER_PROMPT};
+
+use super::SamSettings;
+use super::runs::RunMask;
+use super::upsample::Upsampler;
+use crate::segment::BoxPx;
+
+/// Distance at which a box counts as touching an edge; of the reference implementation.
+const EDGE_TOLERANCE_PX: u32 = 20;
+
+/// A mask that may be kept.
+#[derive(Clone, Debug)]
+pub(super) struct Candidate {
+    pub(super) mask: RunMask,
+    /// The model's own guess of how good it is.
+    pub(super) predicted_iou: f32,
+    /// 0 whole, 1 part, 2 subpart.
+    pub(super) level: u8,
+    /// The crop of the image that it was found in.
+    pub(super) crop: BoxPx,
+}
+
+/// The filters for the masks of one image.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Filters<'a> {
+    pub(super) settings: &'a SamSettings,
+    /// Width and height of the image.
+    pub(super) image_px: [u32; 2],
+}
+
+impl Filters<'_> {
+    /// Returns the proposals that the model trusts, that are stable, and that no edge of the crop cuts; in their order.
+    pub(super) fn candidates(&self, decoded: &Decoded, upsampler: &Upsampler, crop: BoxPx) -> Vec<Candidate> {
+        let SamSettings { predicted_iou: least_iou, stability, stability_offset, .. } = *self.settings;
+        let n_logits = (decoded.logits_px[0] * decoded.logits_px[1]) as usize;
+        let proposals = decoded.logits.par_chunks_exact(n_logits).zip(&decoded.predicted_ious).enumerate();
+        proposals
+            .filter(|&(_, (_, &predicted_iou))| predicted_iou > least_iou || least_iou == 0.0)
+            .filter_map(|(at, (logits, predicted_iou))| {
+                let cut = upsampler.cut(logits, stability_offset, [crop.x0, crop.y0])?;
+                let keeps = cut.stability >= stability && !self.is_cut_by(crop, cut.mask.box_px());
+                // Three proposals a prompt, the smallest thing first.
+                let level = (MASKS_PER_PROMPT - 1 - at % MASKS_PER_PROMPT) as u8;
+                keeps.then_some(Candidate { mask: cut.mask, predicted_iou: *predicted_iou, level, crop })
+            })
+            .collect()
+    }
+
+    /// Returns whether a box touches an edge of the crop that is not one of the image.
+    fn is_cut_by(&self, crop: BoxPx, found: BoxPx) -> bool {
+        // The last column and row, as the reference implementation counts them.
+        let edges = |b: BoxPx| [b.x0, b.y0, b.x1, b.y1];
+        let found = [found.x0, found.y0, found.x1 - 1, found.y1 - 1];
+        let image = [0, 0, self.image_px[0], self.image_px[1]];
+        let is_near = |a: u32, b: u32| a.abs_diff(b) <= EDGE_TOLERANCE_PX;
+        found
+            .into_iter()
+            .zip(edges(crop))
+            .zip(image)
+            .any(|((found, crop), image)| is_near(found, crop) && !is_near(found, image))
+    }
+
+    /// Drops duplicates among the candidates of one crop, the better first.
+    pub(super) fn unique_in_crop(&self, candidates: Vec<Candidate>) -> Vec<Candidate> {
+        let scores = candidates.iter().map(|candidate| f64::from(candidate.predicted_iou)).collect();
+        by_boxes(candidates, scores, self.settings.box_nms_iou)
+    }
+
+    /// Drops duplicates among the candidates of all crops, heals holes and islands, and drops the duplicates that
+    /// this made and those that the pixels show.
+    pub(super) fn unique_in_image(&self, mut candidates: Vec<Candidate>, n_crops: usize) -> Vec<Candidate> {
+        let SamSettings { box_nms_iou, crop_nms_iou, mask_nms_iou, min_region_px, .. } = *self.settings;
+        if n_crops > 1 {
+            // Small crops show more.
+            let area = |b: BoxPx| f64::from(b.width_px()) * f64::from(b.height_px());
+            let scores = candidates.iter().map(|candidate| 1.0 / area(candidate.crop)).collect();
+            candidates = by_boxes(candidates, scores, crop_nms_iou);
+        }
+        if min_region_px > 0 {
+            let [width_px, height_px] = self.image_px;
+            let heal = |candidate: &mut Candidate| {
+                let healed = candidate.mask.without_small_regions(width_px, height_px, min_region_px);
+                // Masks that were good as they are come first.
+                let score = f64::from(u8::from(healed.is_none()));
+                candidate.mask = healed.unwrap_or_else(|| candidate.mask.clone());
+                score
+            };
+            let scores = candidates.par_iter_mut().map(heal).collect();
+            candidates = by_boxes(candidates, scores, box_nms_iou.max(crop_nms_iou));
+        }
+        if mask_nms_iou < 1.0 {
+            let scores = candidates.iter().map(|candidate| f64::from(candidate.predicted_iou)).collect();
+            candidates = suppress(candidates, scores, |a, b| a.mask.iou(&b.mask) > mask_nms_iou);
+        }
+        candidates
+    }
+}
+
+fn by_boxes(candidates: Vec<Candidate>, scores: Vec<f64>, most_iou: f64) -> Vec<Candidate> {
+    suppress(candidates, scores, |a, b| box_iou(a.mask.box_px(), b.mask.box_px()) > most_iou)
+}
+
+/// Greedy non-maximum suppression: from the highest score down (the first of equal ones before), keeps what is no
+/// duplicate of anything kept.
+fn suppress(
+    candidates: Vec<Candidate>,
+    scores: Vec<f64>,
+    is_duplicate: impl Fn(&Candidate, &Candidate) -> bool + Sync,
+) -> Vec<Candidate> {
+    let mut ranked: Vec<(f64, Candidate)> = scores.into_iter().zip(candidates).collect();
+    ranked.sort_by(|(a, _), (b, _)| b.total_cmp(a));
+    let mut kept: Vec<Candidate> = Vec::new();
+    for (_, candidate) in ranked {
+        if !kept.par_iter().any(|better| is_duplicate(better, &candidate)) {
+            kept.push(candidate);
+        }
+    }
+    kept
+}
+
+/// Returns the IoU of two boxes from first to last pixel: as the reference implementation reckons, whose areas
+/// are a pixel less each way; NaN for two lines.
+fn box_iou(a: BoxPx, b: BoxPx) -> f64 {
+    let area = |b: BoxPx| f64::from(b.width_px() - 1) * f64::from(b.height_px() - 1);
+    let overlap = |low: u32, high: u32| f64::from(high.saturating_sub(low + 1));
+    let both = overlap(a.x0.max(b.x0), a.x1.min(b.x1)) * overlap(a.y0.max(b.y0), a.y1.min(b.y1));
+    both / (area(a) + area(b) - both)
+}

@@ -1,0 +1,155 @@
+//! A mask as runs of pixels: small while thousands of candidates wait for the filters.
+
+use crate::segment::{BoxPx, Mask};
+
+/// Pixels `x0 <= x < x1` of row `y`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Run {
+    pub(super) y: u32,
+    pub(super) x0: u32,
+    pub(super) x1: u32,
+}
+
+/// A set of pixels: runs in row-major order, apart from each other.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct RunMask {
+    runs: Vec<Run>,
+    box_px: BoxPx,
+    area_px: u32,
+}
+
+impl RunMask {
+    /// Returns the set of these runs; `None` if there is none.
+    pub(super) fn new(runs: Vec<Run>) -> Option<Self> {
+        let (first, last) = (runs.first()?, runs.last()?);
+        let x0 = runs.iter().map(|run| run.x0).min()?;
+        let x1 = runs.iter().map(|run| run.x1).max()?;
+        let box_px = BoxPx { x0, y0: first.y, x1, y1: last.y + 1 };
+        let area_px = runs.iter().map(|run| run.x1 - run.x0).sum();
+        Some(Self { runs, box_px, area_px })
+    }
+
+    pub(super) fn box_px(&self) -> BoxPx {
+        self.box_px
+    }
+
+    pub(super) fn len_bytes(&self) -> u64 {
+        size_of_val(&self.runs[..]) as u64
+    }
+
+    pub(super) fn to_mask(&self, level: u8) -> Mask {
+        let BoxPx { x0, y0, .. } = self.box_px;
+        let width = self.box_px.width_px() as usize;
+        let mut inside = vec![false; width * self.box_px.height_px() as usize];
+        for run in &self.runs {
+            let start = (run.y - y0) as usize * width;
+            inside[start + (run.x0 - x0) as usize..start + (run.x1 - x0) as usize].fill(true);
+        }
+        Mask { box_px: self.box_px, inside, area_px: self.area_px, level }
+    }
+
+    /// Returns the intersection over the union of two sets.
+    pub(super) fn iou(&self, other: &Self) -> f64 {
+        let (mut a, mut b) = (self.runs.iter().peekable(), other.runs.iter().peekable());
+        let mut both_px = 0_u64;
+        while let (Some(p), Some(q)) = (a.peek(), b.peek()) {
+            if p.y == q.y {
+                both_px += u64::from(p.x1.min(q.x1).saturating_sub(p.x0.max(q.x0)));
+            }
+            if (p.y, p.x1) <= (q.y, q.x1) {
+                a.next()
+            } else {
+                b.next()
+            };
+        }
+        let areas_px = u64::from(self.area_px) + u64::from(other.area_px);
+        both_px as f64 / (areas_px - both_px) as f64
+    }
+
+    /// Fills holes, then drops islands, of fewer than `min_px` pixels in an image of the given size; the largest
+    /// island stays. Pixels that touch at a corner belong together. Returns `None` where no region is small.
+    pub(super) fn without_small_regions(&self, width_px: u32, height_px: u32, min_px: u32) -> Option<Self> {
+        let is_small = |size_px: &u64| *size_px < u64::from(min_px);
+        let outside = complement(&self.runs, width_px, height_px);
+        let hole_of = components(&outside);
+        let left = outside.iter().zip(&hole_of.of_run);
+        let left = left.filter(|(_, component)| !is_small(&hole_of.sizes_px[**component]));
+        let left: Vec<Run> = left.map(|(run, _)| *run).collect();
+        let filled = complement(&left, width_px, height_px);
+
+        let island_of = components(&filled);
+        if !hole_of.sizes_px.iter().any(is_small) && !island_of.sizes_px.iter().any(is_small) {
+            return None;
+        }
+        // Where all are small, the first of the largest.
+        let most_px = island_of.sizes_px.iter().copied().max().filter(is_small);
+        let spared = island_of.sizes_px.iter().position(|size_px| Some(*size_px) == most_px);
+        let stays = |component: usize| Some(component) == spared || !is_small(&island_of.sizes_px[component]);
+        let kept = filled.iter().zip(&island_of.of_run).filter(|(_, component)| stays(**component));
+        Self::new(kept.map(|(run, _)| *run).collect())
+    }
+}
+
+/// Returns the pixels of an image that no run covers.
+fn complement(runs: &[Run], width_px: u32, height_px: u32) -> Vec<Run> {
+    let mut gaps = Vec::new();
+    let mut runs = runs.iter().peekable();
+    for y in 0..height_px {
+        let mut x0 = 0;
+        while let Some(run) = runs.next_if(|run| run.y == y) {
+            if x0 < run.x0 {
+                gaps.push(Run { y, x0, x1: run.x0 });
+            }
+            x0 = run.x1;
+        }
+        if x0 < width_px {
+            gaps.push(Run { y, x0, x1: width_px });
+        }
+    }
+    gaps
+}
+
+/// Connected components of runs.
+struct Components {
+    /// Of each run, numbered in the order in which a row-major scan meets them.
+    of_run: Vec<usize>,
+    sizes_px: Vec<u64>,
+}
+
+/// Finds the components of runs in row-major order; runs of neighbouring rows that overlap or touch at a corner
+/// are connected.
+fn components(runs: &[Run]) -> Components {
+    let mut parents: Vec<usize> = (0..runs.len()).collect();
+    fn root(parents: &mut [usize], mut run: usize) -> usize {
+        while parents[run] != run {
+            parents[run] = parents[parents[run]];
+            run = parents[run];
+        }
+        run
+    }
+    let mut above = 0;
+    for (at, run) in runs.iter().enumerate() {
+        while (runs[above].y + 1 < run.y) || (runs[above].y + 1 == run.y && runs[above].x1 < run.x0) {
+            above += 1;
+        }
+        let touching = runs[above..at].iter().enumerate();
+        for (k, _) in touching.take_while(|(_, other)| other.y + 1 == run.y && other.x0 <= run.x1) {
+            let (a, b) = (root(&mut parents, above + k), root(&mut parents, at));
+            parents[a.max(b)] = a.min(b);
+        }
+    }
+    let mut number_of_root = vec![usize::MAX; runs.len()];
+    let mut sizes_px = Vec::new();
+    let of_run = (0..runs.len())
+        .map(|at| {
+            let root = root(&mut parents, at);
+            if number_of_root[root] == usize::MAX {
+                number_of_root[root] = sizes_px.len();
+                sizes_px.push(0);
+            }
+            sizes_px[number_of_root[root]] += u64::from(runs[at].x1 - runs[at].x0);
+            number_of_root[root]
+        })
+        .collect();
+    Components { of_run, sizes_px }
+}

@@ -1,0 +1,126 @@
+//! From the decoder's coarse logits to the pixels of an image.
+//!
+//! SAM enlarges the logits to its square, cuts off the padding, and scales what is left to the image, bilinearly
+//! each time with pixel centres aligned. Both steps are linear in each axis, so they are one step with at most
+//! three taps an axis here, and the square is never made.
+
+use slag_models::sam::Frame;
+
+use super::runs::{Run, RunMask};
+
+/// The logits that each pixel of an axis is made of.
+struct Axis {
+    /// The first of three logits in a row.
+    first: Vec<usize>,
+    weights: Vec<[f32; 3]>,
+}
+
+/// Returns the two neighbours of output pixel `at` and the weight of the second one, where `n_in` pixels are resized
+/// to `n_out`: the source coordinate is (at + 1/2) n_in / n_out - 1/2, clamped to the input.
+fn neighbours(at: u32, n_in: u32, n_out: u32) -> ([u32; 2], f64) {
+    let source = ((f64::from(at) + 0.5) * f64::from(n_in) / f64::from(n_out) - 0.5).max(0.0);
+    let low = (source as u32).min(n_in - 1);
+    ([low, (low + 1).min(n_in - 1)], source - f64::from(low))
+}
+
+impl Axis {
+    fn new(n_logits: u32, size_px: u32, resized_px: u32, image_px: u32) -> Self {
+        let mut axis = Self { first: Vec::new(), weights: Vec::new() };
+        for at in 0..image_px {
+            let (in_square, second) = neighbours(at, resized_px, image_px);
+            let mut first = None;
+            let mut weights = [0.0_f64; 3];
+            for (pixel, weight) in in_square.into_iter().zip([1.0 - second, second]) {
+                let (logits, second) = neighbours(pixel, n_logits, size_px);
+                // Logits are no finer than the square, so neighbours in it need three of them at most.
+                let first = *first.get_or_insert((logits[0] as usize).min(n_logits as usize - 3));
+                weights[logits[0] as usize - first] += weight * (1.0 - second);
+                weights[logits[1] as usize - first] += weight * second;
+            }
+            axis.first.push(first.unwrap_or(0));
+            axis.weights.push(weights.map(|weight| weight as f32));
+        }
+        axis
+    }
+
+    /// Returns the pixels that logits `first..=last` have a part in.
+    fn pixels(&self, first: usize, last: usize) -> std::ops::Range<usize> {
+        let start = self.first.partition_point(|&tap| tap + 2 < first);
+        start..self.first.partition_point(|&tap| tap <= last).max(start)
+    }
+}
+
+/// The way from logits to the pixels of one image.
+pub(super) struct Upsampler {
+    n_columns: usize,
+    x: Axis,
+    y: Axis,
+}
+
+/// A mask that was cut out of logits.
+pub(super) struct Cut {
+    /// The pixels whose logit is above 0.
+    pub(super) mask: RunMask,
+    /// IoU of the masks above `+offset` and above `-offset`.
+    pub(super) stability: f64,
+}
+
+impl Upsampler {
+    /// `logits_px`: columns and rows of the logits, 3 or more and no more than the square has.
+    pub(super) fn new(frame: &Frame, logits_px: [u32; 2]) -> Self {
+        let axis = |k: usize| Axis::new(logits_px[k], frame.size_px, frame.resized_px[k], frame.image_px[k]);
+        Self { n_columns: logits_px[0] as usize, x: axis(0), y: axis(1) }
+    }
+
+    /// Enlarges `logits`, `[rows][columns]`, and cuts at 0; `None` if no pixel is inside. `origin_px` is added to the
+    /// pixels' coordinates.
+    pub(super) fn cut(&self, logits: &[f32], offset: f32, origin_px: [u32; 2]) -> Option<Cut> {
+        // Means of logits below -offset are below it: nothing else need be enlarged.
+        let (mut rows, mut columns) = ((usize::MAX, 0), (usize::MAX, 0));
+        for (y, row) in logits.chunks_exact(self.n_columns).enumerate() {
+            let mut above = row.iter().enumerate().filter(|(_, logit)| **logit > -offset).map(|(x, _)| x);
+            if let Some(first) = above.next() {
+                rows = (rows.0.min(y), y);
+                columns = (columns.0.min(first), columns.1.max(above.next_back().unwrap_or(first)));
+            }
+        }
+        if rows.0 == usize::MAX {
+            return None;
+        }
+        let (ys, xs) = (self.y.pixels(rows.0, rows.1), self.x.pixels(columns.0, columns.1));
+        let first_row = self.y.first[ys.clone()].iter().copied().min()?;
+        let end_row = self.y.first[ys.clone()].iter().copied().max()? + 3;
+        let width = xs.len();
+        let mut widened = Vec::with_capacity((end_row - first_row) * width);
+        for row in logits.chunks_exact(self.n_columns).take(end_row).skip(first_row) {
+            for x in xs.clone() {
+                let (taps, weights) = (&row[self.x.first[x]..self.x.first[x] + 3], self.x.weights[x]);
+                widened.push(taps[0] * weights[0] + taps[1] * weights[1] + taps[2] * weights[2]);
+            }
+        }
+        let is_inside = |logit: &f32| *logit > 0.0;
+        let mut runs = Vec::new();
+        let (mut n_high, mut n_low) = (0_u64, 0_u64);
+        let mut line = vec![0.0_f32; width];
+        for y in ys {
+            let weights = self.y.weights[y];
+            let at = (self.y.first[y] - first_row) * width;
+            let [a, b, c] = [0, 1, 2].map(|tap| &widened[at + tap * width..at + (tap + 1) * width]);
+            for (k, logit) in line.iter_mut().enumerate() {
+                *logit = a[k] * weights[0] + b[k] * weights[1] + c[k] * weights[2];
+            }
+            n_high += line.iter().filter(|logit| **logit > offset).count() as u64;
+            n_low += line.iter().filter(|logit| **logit > -offset).count() as u64;
+            let mut from = 0;
+            while let Some(start) = line[from..].iter().position(is_inside).map(|k| from + k) {
+                let end =
+                    line[start..].iter().position(|logit| !is_inside(logit)).map_or(width, |k| start + k);
+                let at = |k: usize| origin_px[0] + (xs.start + k) as u32;
+                runs.push(Run { y: origin_px[1] + y as u32, x0: at(start), x1: at(end) });
+                from = end;
+            }
+        }
+        let stability = n_high as f64 / n_low as f64;
+        RunMask::new(runs).map(|mask| Cut { mask, stability })
+    }
+}
