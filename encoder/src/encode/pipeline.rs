@@ -246,7 +246,7 @@ mod tests {
         let n_second = AtomicUsize::new(0);
         let step = |at: usize, item: u32| {
             n_second.fetch_add(at, Ordering::SeqCst);
-            Ok::<_, ()>((item % 2 == 0).then_some(item))
+            Ok::<_, ()>(item.is_multiple_of(2).then_some(item))
         };
         run(&stages, 2, 0..10, step).expect("no error");
         assert_eq!(n_second.into_inner(), 5);

@@ -45,6 +45,7 @@ pub(super) struct Work<'v> {
     next: Next,
 }
 
+#[expect(clippy::large_enum_variant, reason = "a handful at a time, moved a few times a view")]
 enum Next {
     Decode,
     Depth(LoadedImage),
@@ -56,6 +57,7 @@ enum Next {
 }
 
 /// What is to be embedded.
+#[expect(clippy::large_enum_variant, reason = "a handful at a time, moved a few times a view")]
 enum Crops {
     /// Squares of the model's size.
     Squares(Vec<Crop>),

@@ -148,7 +148,7 @@ pub enum SegmentError {
     },
     /// A segmentation model failed: no fault of the image.
     #[error(transparent)]
-    Model(#[from] SessionError),
+    Model(Box<SessionError>),
     /// A model finds more masks than is allowed.
     #[error(
         "view {view:?}: the masks found take more than {limit_bytes} bytes; ask for fewer points, or be stricter          with --sam-predicted-iou and --sam-stability"
@@ -159,6 +159,12 @@ pub enum SegmentError {
         /// The limit.
         limit_bytes: u64,
     },
+}
+
+impl From<SessionError> for SegmentError {
+    fn from(error: SessionError) -> Self {
+        Self::Model(Box::new(error))
+    }
 }
 
 /// A box in pixels: `x0 <= x < x1`, `y0 <= y < y1`.
