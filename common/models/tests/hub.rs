@@ -509,7 +509,7 @@ fn without_the_hub_it_is_said_what_to_put_where() {
 fn nothing_is_asked_for_before_the_licence_is_accepted() {
     let (server, root, hub) = setting();
     let error = hub.pull("made", Side::Both, false).expect_err("not accepted").to_string();
-    for part in ["Example-1.0", "https://licence.example/", "Not a real one.", "--accept-licence"] {
+    for part in ["Example-1.0", "https://licence.example/", "Not a real one;", "--accept-licence"] {
         assert!(error.contains(part), "{error}");
     }
     assert!(server.asked().is_empty() && files_below(root.path()).is_empty());
