@@ -3,6 +3,7 @@
 use slag_common::container::AlignedBytes;
 use slag_common::shard::{MAX_GROUPS, ShardLayout};
 
+use super::collect::UNDECIDED;
 use super::tests::{random_question, score_in_f64, views};
 use super::*;
 use crate::testing::coded::{CODE_ERROR, CodedShard, FINE_ERROR};
@@ -212,7 +213,8 @@ fn measured_errors_decide_as_defined() {
             let search = Search::new(&views, &question, Region::default(), measured).expect("valid");
             assert!(!search.is_exact());
             let n_products = if n_negatives == 0 { 1.0 } else { 2.0 };
-            let (code_margin, fine_margin) = (3.0 * n_products * CODE_ERROR, 3.0 * n_products * FINE_ERROR);
+            let (code_margin, fine_margin) =
+                (UNDECIDED * n_products * CODE_ERROR, UNDECIDED * n_products * FINE_ERROR);
             // By code, fine residual, embedding.
             let scores = |at: usize, index: usize| -> [f32; 3] {
                 let (shard, mut decoded) = (&views[at], vec![0.0; shape.0]);

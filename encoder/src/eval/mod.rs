@@ -78,7 +78,7 @@ pub enum EvalError {
         /// The first.
         first: String,
         /// Why not.
-        source: EncodeError,
+        source: Box<EncodeError>,
     },
     /// The scene has no thing of these words.
     #[error("no word is a category of the labels; there are: {there}")]
@@ -225,7 +225,9 @@ pub fn labelled(
     }
     if classes.is_empty() {
         return Err(match first_error {
-            Some((first, source)) => EvalError::NoWords { n: unknown_words.len(), first, source },
+            Some((first, source)) => {
+                EvalError::NoWords { n: unknown_words.len(), first, source: Box::new(source) }
+            }
             None => EvalError::NoCategories { there: there() },
         });
     }
