@@ -28,9 +28,9 @@ pub struct CodedShard {
 }
 
 /// Stated mean error of an exact shard's codes.
-pub const CODE_ERROR: f32 = 0.01;
+pub const CODE_ERROR: f32 = 0.0033;
 /// Stated mean error of its fine residuals.
-pub const FINE_ERROR: f32 = 0.003;
+pub const FINE_ERROR: f32 = 0.001;
 
 impl CodedShard {
     /// Writes the shard and reads it back. Embeddings are what it decodes to, off by a little, of unit length.
