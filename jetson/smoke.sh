@@ -13,7 +13,7 @@ arm() {
 work=$(mktemp -d)
 server=
 trap '[ -z "$server" ] || kill "$server" 2>/dev/null; rm -rf "$work"' EXIT
-$encoder --quiet generate --out "$work/room" --n-views 12 >/dev/null
+$encoder --quiet generate scene --out "$work/room" --n-views 12 >/dev/null
 $encoder --quiet encode --scene "$work/room/scene.ply" --views "$work/room/transforms.json" --metric \
     --cell-gaussians 8192 --store "$work/store" >/dev/null
 $encoder serve --store "$work/store" --listen 127.0.0.1:0 >"$work/log" &
