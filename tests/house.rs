@@ -175,6 +175,25 @@ fn check_words(house: &Path, store: &Path, models: &Path, dir: &Path) {
     assert!((auc - reference["auc_mean"].as_f64().expect("a figure")).abs() <= 0.01);
     assert!((iou - reference["miou"].as_f64().expect("a figure")).abs() <= 0.02);
 
+    // The program's own evaluation, which shares no code with the judge above.
+    let (scene, truth) = (house.join("point_cloud.ply"), house);
+    let report = run_json(&mut encoder(&[
+        "eval",
+        "labelled",
+        "--store",
+        text(store),
+        "--scene",
+        text(&scene),
+        "--truth",
+        text(truth),
+        "--models",
+        text(models),
+    ]));
+    let figure = |value: &Value| value.as_f64().expect("a figure");
+    assert!((figure(&report["mean_area_under_roc"]) - auc).abs() < 1e-4);
+    assert!((figure(&report["multi_class"][0]["miou"]) - iou).abs() < 1e-4);
+    assert_eq!(report["words"].as_array().expect("words").len(), words.len());
+
     let manifest = StoreReader::open(store).expect("a published store").manifest().clone();
     for (profile, most_bytes) in
         [(Profile::Compact, 10.0), (Profile::Balanced, 24.0), (Profile::Exact, 1200.0)]

@@ -310,6 +310,20 @@ mod tests {
         }
     }
 
+    #[test]
+    fn the_same_seed_makes_the_same_scene() {
+        let nouns = grammar::nouns(None).expect("parse");
+        let scene = |seed| Scene::new(&KINDS, seed, 3, &nouns);
+        let (a, b, other) = (scene(5), scene(5), scene(6));
+        assert!(a.gaussians == b.gaussians && a.objects == b.objects && a.id_of_gaussian == b.id_of_gaussian);
+        assert!(a.objects != other.objects);
+        let ids: Vec<u16> = a.objects.iter().map(|object| object.id).collect();
+        for (object, id) in a.objects.iter().zip(&ids) {
+            let n = a.id_of_gaussian.iter().filter(|of| *of == id).count();
+            assert_eq!((n, ids.iter().filter(|other| *other == id).count()), (object.n_gaussians, 1));
+        }
+    }
+
     /// The Gaussians show what the photos show: two ways of drawing the same scene.
     #[test]
     fn gaussians_look_like_the_photos() {
