@@ -7,6 +7,7 @@ use glam::{DAffine3, DMat3, DQuat, DVec2, DVec3};
 use slag_common::{Distortion, Gaussians, Intrinsics};
 
 use super::arrays::{Arrays, FixtureError};
+use crate::generate::compose::{looking, pinhole};
 use crate::raster::RasterView;
 use crate::segment::RegionMap;
 
@@ -47,16 +48,7 @@ impl BenchScene {
         maker.backdrop(n_backdrop);
         maker.floating(n_floating);
         maker.objects(n_gaussians - n_ground - n_backdrop - n_floating);
-        let focal_px = f64::from(width_px) / 2.0 / (FIELD_OF_VIEW_RAD / 2.0).tan();
-        let intrinsics = Intrinsics {
-            width_px,
-            height_px,
-            focal_x_px: focal_px,
-            focal_y_px: focal_px,
-            centre_x_px: f64::from(width_px) / 2.0,
-            centre_y_px: f64::from(height_px) / 2.0,
-            distortion: Distortion::None,
-        };
+        let intrinsics = pinhole([width_px, height_px], FIELD_OF_VIEW_RAD);
         let views = (0..N_VIEWS)
             .map(|i| {
                 let angle = TAU * i as f64 / N_VIEWS as f64;
@@ -151,14 +143,6 @@ pub fn cell_regions(width_px: u32, height_px: u32, n_regions: u32) -> RegionMap 
     };
     let region_of_pixel = (0..height_px).flat_map(|y| (0..width_px).map(move |x| region(x, y))).collect();
     RegionMap { width_px, height_px, region_of_pixel, n_regions }
-}
-
-/// Returns the pose of a camera at `position` that looks along `heading`, upright in a z-up world.
-fn looking(position: DVec3, heading: DVec3) -> DAffine3 {
-    let forward = heading.normalize();
-    let right = forward.cross(DVec3::Z).normalize();
-    let rotation = DMat3::from_cols(right, forward.cross(right), forward).transpose();
-    DAffine3::from_mat3_translation(rotation, -(rotation * position))
 }
 
 /// SplitMix64 (Steele et al. 2014).

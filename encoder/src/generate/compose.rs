@@ -234,10 +234,7 @@ impl Layout {
                 && at.z < area.height_m - 0.1
         });
         inside
-            && self.placed.iter().filter(|p| !p.shell).all(|p| {
-                let near = at.clamp(p.bounds.min, p.bounds.max);
-                near.distance(at) > CAMERA_CLEARANCE_M
-            })
+            && self.placed.iter().filter(|p| !p.shell).all(|p| p.bounds.distance_to(at) > CAMERA_CLEARANCE_M)
     }
 
     /// Returns cameras on an oval walk through each area, looking outwards and across in turn; `start`: where
@@ -314,7 +311,7 @@ impl Area {
 
 /// Returns the box around parts.
 fn bounds(parts: &[Part], world_from_object: DAffine3) -> Aabb {
-    let mut bounds = Aabb { min: DVec3::INFINITY, max: DVec3::NEG_INFINITY };
+    let mut bounds = Aabb::EMPTY;
     for part in parts {
         let pose = world_from_object * part.object_from_part;
         let m = pose.matrix3;

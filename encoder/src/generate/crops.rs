@@ -12,13 +12,13 @@ use slag_models::preprocess::{Filter, Preprocess, Resize};
 use super::compose::{Layout, looking, pinhole};
 use super::grammar::{Noun, SceneKind};
 use super::paint::{Colour, Material};
-use super::render::{Photo, Solids};
+use super::render::{NOTHING, Photo, Solids};
 use super::solid::Random;
 use super::{GenerateError, write_npy};
 use crate::embed::{self, Background};
 use crate::progress::Progress;
 use crate::raster::RasterView;
-use crate::segment::{BoxPx, Mask};
+use crate::segment::{BoxPx, Mask, NO_REGION, masks_of_labels};
 
 /// Photos that crops are taken from: their edge.
 const PHOTO_PX: u32 = 208;
@@ -126,8 +126,8 @@ fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(RgbImage, Label)> {
     for _ in 0..N_PHOTOS {
         let Some(view) = look_at_something(&layout, &solids, &mut random) else { continue };
         let photo = solids.photo(&view);
-        for (thing, placed) in layout.placed.iter().enumerate() {
-            let Some(mask) = mask_of(&photo, thing as u16) else { continue };
+        for (thing, mask) in masks_of(&photo) {
+            let (thing, placed) = (thing as usize, &layout.placed[thing as usize]);
             let shown = f64::from(mask.area_px) / f64::from(photo.unhidden_px[thing].max(1));
             if mask.area_px < MIN_MASK_PX || (shown < MIN_SHOWN && !placed.shell) {
                 continue;
@@ -185,31 +185,11 @@ fn look_at_something(layout: &Layout, solids: &Solids, random: &mut Random) -> O
     None
 }
 
-/// Returns the mask of a thing on a photo.
-fn mask_of(photo: &Photo, thing: u16) -> Option<Mask> {
-    let width = photo.image.width();
-    let places = || {
-        let inside = photo.thing_of_pixel.iter().zip(0u32..).filter(move |(t, _)| **t == thing);
-        inside.map(move |(_, i)| (i % width, i / width))
-    };
-    let mut box_px = BoxPx { x0: u32::MAX, y0: u32::MAX, x1: 0, y1: 0 };
-    for (x, y) in places() {
-        box_px = BoxPx {
-            x0: box_px.x0.min(x),
-            y0: box_px.y0.min(y),
-            x1: box_px.x1.max(x + 1),
-            y1: box_px.y1.max(y + 1),
-        };
-    }
-    (box_px.x1 > 0).then(|| {
-        let mut inside = vec![false; (box_px.width_px() * box_px.height_px()) as usize];
-        let mut area_px = 0;
-        for (x, y) in places() {
-            inside[((y - box_px.y0) * box_px.width_px() + x - box_px.x0) as usize] = true;
-            area_px += 1;
-        }
-        Mask { box_px, inside, area_px, level: 0 }
-    })
+/// Returns the things on a photo with their masks.
+fn masks_of(photo: &Photo) -> Vec<(u32, Mask)> {
+    let label = |thing: &u16| if *thing == NOTHING { NO_REGION } else { u32::from(*thing) };
+    let labels: Vec<u32> = photo.thing_of_pixel.iter().map(label).collect();
+    masks_of_labels(&labels, photo.image.width(), photo.unhidden_px.len(), u64::MAX).unwrap_or_default()
 }
 
 /// Returns the mask as a segmenter may give it: a side of it is missing.
@@ -222,19 +202,14 @@ fn spoilt(mask: &Mask, random: &mut Random) -> Mask {
     };
     let limit = random.between(0.0, 0.35);
     let kept = |x: u32, y: u32| mask.inside[(y * width + x) as usize] && along(x, y) < limit;
-    let places = || (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).filter(|(x, y)| kept(*x, *y));
-    let area_px = places().count() as u32;
-    if area_px < MIN_MASK_PX {
+    let places = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+    let labels: Vec<u32> = places.map(|(x, y)| if kept(x, y) { 0 } else { NO_REGION }).collect();
+    let piece = masks_of_labels(&labels, width, 1, u64::MAX).and_then(|mut masks| masks.pop());
+    let Some((_, piece)) = piece.filter(|(_, piece)| piece.area_px >= MIN_MASK_PX) else {
         return mask.clone();
-    }
-    let [x0, x1] = [places().map(|p| p.0).min(), places().map(|p| p.0).max()].map(Option::unwrap_or_default);
-    let [y0, y1] = [places().map(|p| p.1).min(), places().map(|p| p.1).max()].map(Option::unwrap_or_default);
-    let box_px = BoxPx {
-        x0: mask.box_px.x0 + x0,
-        y0: mask.box_px.y0 + y0,
-        x1: mask.box_px.x0 + x1 + 1,
-        y1: mask.box_px.y0 + y1 + 1,
     };
-    let inside = (y0..=y1).flat_map(|y| (x0..=x1).map(move |x| kept(x, y))).collect();
-    Mask { box_px, inside, area_px, level: mask.level }
+    let (left, top) = (mask.box_px.x0, mask.box_px.y0);
+    let BoxPx { x0, y0, x1, y1 } = piece.box_px;
+    let box_px = BoxPx { x0: left + x0, y0: top + y0, x1: left + x1, y1: top + y1 };
+    Mask { box_px, level: mask.level, ..piece }
 }

@@ -219,7 +219,7 @@ impl Mask {
 /// boxes of all masks together exceed `limit_bytes`.
 ///
 /// `labels`: row-major, `width_px` a row, each less than `n_labels` or [`NO_REGION`].
-fn masks_of_labels(
+pub(crate) fn masks_of_labels(
     labels: &[u32],
     width_px: u32,
     n_labels: usize,
