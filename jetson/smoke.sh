@@ -15,7 +15,7 @@ server=
 trap '[ -z "$server" ] || kill "$server" 2>/dev/null; rm -rf "$work"' EXIT
 $encoder --quiet generate scene --out "$work/room" --n-views 12 >/dev/null
 $encoder --quiet encode --scene "$work/room/scene.ply" --views "$work/room/transforms.json" --metric \
-    --cell-gaussians 8192 --store "$work/store" >/dev/null
+    --models colours --cell-gaussians 8192 --store "$work/store" >/dev/null
 $encoder serve --store "$work/store" --listen 127.0.0.1:0 >"$work/log" &
 server=$!
 url=
@@ -29,8 +29,8 @@ done
 $native fetch --from "$url" --at 3.5,2.7,0 --radius 3 --cache "$work/native" --json >/dev/null
 arm fetch --from "$url" --at 3.5,2.7,0 --radius 3 --cache "$work/arm" --json
 for question in red blue pink; do
-    $native query "$question" --cache "$work/native" --near 3.5,2.7,0 --json >"$work/native.json" || true
-    arm query "$question" --cache "$work/arm" --near 3.5,2.7,0 --json >"$work/arm.json" || true
+    $native query "$question" --models colours --cache "$work/native" --near 3.5,2.7,0 --json >"$work/native.json" || true
+    arm query "$question" --models colours --cache "$work/arm" --near 3.5,2.7,0 --json >"$work/arm.json" || true
     # Times differ; answers must not.
     sed 's/"[a-z_]*_\(ms\|secs\|us\)":[0-9.e-]*,\{0,1\}//g' "$work/native.json" >"$work/native.answers"
     sed 's/"[a-z_]*_\(ms\|secs\|us\)":[0-9.e-]*,\{0,1\}//g' "$work/arm.json" >"$work/arm.answers"

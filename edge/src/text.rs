@@ -2,7 +2,6 @@
 
 use std::collections::HashMap;
 use std::io;
-use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -72,12 +71,11 @@ pub struct TextService {
 }
 
 impl TextService {
-    /// Opens the text encoder of a model directory, or the built-in stand-in without one.
+    /// Opens the text encoder of a pair.
     ///
     /// # Errors
     /// [`TextOpenError`].
-    pub fn open(models: Option<&Path>, options: &SessionOptions) -> Result<Self, TextOpenError> {
-        let models = models.map_or_else(|| Ok(ModelDir::builtin()), ModelDir::open)?;
+    pub fn open(models: &ModelDir, options: &SessionOptions) -> Result<Self, TextOpenError> {
         let encoder = models.text_encoder(options)?;
         let execution_provider = encoder.placement().map_or("none", |placement| placement.provider().name());
         let id = models.encoder_id();
@@ -187,6 +185,8 @@ impl Cache {
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
     use crate::testing::{Axes, Gate, axes_service, open_gate};
 
@@ -234,18 +234,17 @@ mod tests {
     #[test]
     fn built_in_and_described_models_open() {
         let options = SessionOptions::new("no-runtime-needed".into());
-        let built_in = TextService::open(None, &options).expect("built in");
+        let built_in = TextService::open(&ModelDir::colours(), &options).expect("built in");
         assert_eq!(built_in.encode("a red thing").expect("known").len(), built_in.info().dim as usize);
         assert!(matches!(built_in.encode("sofa"), Err(TextError::Encode(EncodeError::UnknownWords { .. }))));
-        assert!(TextService::open(Some(Path::new("no-such-models")), &options).is_err());
-
         let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/models/conse");
         if !models.join("../../../../shared").exists() {
             assert!(std::env::var("CI").is_err(), "../shared is absent");
             println!("skipped: ../shared is absent");
             return;
         }
-        let phrases = TextService::open(Some(&models), &options).expect("described");
+        let phrases =
+            TextService::open(&ModelDir::open(&models).expect("described"), &options).expect("described");
         let (chair, stool, tree) =
             (phrases.encode("a chair"), phrases.encode("stool"), phrases.encode("tree"));
         let (chair, stool, tree) = (chair.expect("known"), stool.expect("known"), tree.expect("known"));

@@ -8,7 +8,7 @@ proportion it names is known exactly. So the loss is a sigmoid per pair of crop 
 threshold from which something counts as found.
 """
 
-import argparse, json, math, pathlib, random, time
+import argparse, copy, json, math, pathlib, random, time
 
 import numpy as np
 import torch
@@ -145,7 +145,7 @@ class Residual(nn.Module):
 class ImageEncoder(nn.Module):
     """[n, 3, 64, 64], (level / 255 - 0.5) / 0.5 -> [n, 128], unit length."""
 
-    def __init__(self, widths=(24, 48, 96, 192), depths=(0, 1, 2, 1)):
+    def __init__(self, widths=(24, 48, 96, 192), depths=(1, 2, 3, 1)):
         super().__init__()
         layers, before = [], 3
         for width, depth in zip(widths, depths):
@@ -199,12 +199,12 @@ class Data:
         self.nouns = json.loads((pathlib.Path(folders[0]) / "nouns.json").read_text())
         self.pixels = [np.load(pathlib.Path(f) / "crops.npy", mmap_mode="r") for f in folders]
         labels = [label for f in folders for label in json.loads((pathlib.Path(f) / "labels.json").read_text())]
-        self.place = [(f, i) for f, pixels in enumerate(self.pixels) for i in range(len(pixels))]
         self.noun = np.array([label["noun"] for label in labels])
         self.colour = np.array([COLOURS.index(label["colour"]) for label in labels])
         self.material = np.array([MATERIALS.index(label["material"]) for label in labels])
         self.held_out = np.array([label["held_out"] for label in labels])
-        self.whole = np.array([not label["cut"] and label["shown"] > 0.6 for label in labels])
+        self.segmented = np.array([label["segmented"] for label in labels])
+        self.whole = np.array([not label["cut"] and not label["segmented"] and label["shown"] > 0.6 for label in labels])
         slender = np.array([label["slenderness"] for label in labels])
         if tall_of is None:
             tall_of = {}
@@ -218,68 +218,139 @@ class Data:
         limits = np.array([tall_of.get(noun, (-1.0, math.inf)) for noun in range(len(self.nouns))])
         self.tall = np.where(slender > limits[self.noun, 1], 1, np.where(slender < limits[self.noun, 0], 0, -1))
 
-    def images(self, index):
-        return torch.from_numpy(np.stack([self.pixels[f][i] for f, i in (self.place[k] for k in index)])).permute(0, 3, 1, 2)
+    def to(self, device):
+        """Puts crops and labels on the device, where batches are made."""
+        self.crops = torch.cat([torch.from_numpy(np.ascontiguousarray(p)).permute(0, 3, 1, 2).contiguous().to(device) for p in self.pixels])
+        self.labels = {name: torch.from_numpy(getattr(self, name)).long().to(device) for name in ("noun", "colour", "material", "tall")}
+        self.colourful = torch.tensor([len(noun["colours"]) > 3 for noun in self.nouns], device=device)
+        return self
 
 
 def augment(images):
-    """Light, colour cast, sharpness and noise as photos differ in them; mirrored."""
-    n = len(images)
-    white = (images.amin(1, keepdim=True) == 255)
+    """Light, colour cast, sharpness and noise as photos differ in them; a shift and another size; mirrored."""
+    n, device = len(images), images.device
+    uniform = lambda *shape: 2 * torch.rand(*shape, device=device) - 1
     x = images.float() / 255
-    gain = 1 + 0.15 * (2 * torch.rand(n, 1, 1, 1) - 1) + 0.05 * (2 * torch.rand(n, 3, 1, 1) - 1)
-    x = (x * gain + 0.06 * (2 * torch.rand(n, 1, 1, 1) - 1) + 0.02 * torch.randn_like(x)).clamp(0, 1)
-    soft = torch.rand(n) < 0.35
-    if soft.any():
-        size = random.choice([24, 32, 44])
-        x[soft] = F.interpolate(F.interpolate(x[soft], size=size, mode="area"), size=EDGE, mode="bilinear")
-    x = torch.where(white, torch.ones(()), x)
-    flip = torch.rand(n) < 0.5
-    x[flip] = x[flip].flip(-1)
+    white = (images.amin(1, keepdim=True) == 255).float()
+    gain = 1 + 0.15 * uniform(n, 1, 1, 1) + 0.05 * uniform(n, 3, 1, 1)
+    x = (x * gain + 0.06 * uniform(n, 1, 1, 1) + 0.02 * torch.randn_like(x)).clamp(0, 1)
+    soft = torch.rand(n, device=device) < 0.35
+    size = random.choice([24, 32, 44])
+    blurred = F.interpolate(F.interpolate(x, size=size, mode="area"), size=EDGE, mode="bilinear")
+    x = torch.where(soft[:, None, None, None], blurred, x)
+    x = torch.lerp(x, torch.ones_like(x), white)
+    # A mirrored, stretched, shifted and slightly turned picture; white beyond its border.
+    flip = (torch.rand(n, device=device) < 0.5).float() * -2 + 1
+    wide, high, turn = 1 + 0.1 * uniform(n), 1 + 0.1 * uniform(n), 0.08 * uniform(n)
+    affine = torch.stack([torch.stack([flip * wide, -turn, 0.08 * uniform(n)], 1), torch.stack([turn, high, 0.08 * uniform(n)], 1)], 1)
+    x = F.grid_sample(x - 1, F.affine_grid(affine, list(x.shape), align_corners=False), align_corners=False) + 1
     return (x - 0.5) / 0.5
 
 
-def encode_texts(model, tokenizer, texts, device):
-    ids = [tokenizer.encode(text).ids for text in texts]
+def recolour(images, chosen):
+    """Gives the chosen crops other colours: turned hues, or shades of one colour. Shapes must suffice to tell nouns
+    in colours that were never seen; what colour and material they have is unknown then."""
+    n, device = len(images), images.device
+    x = images.float() / 255
+    white = (images.amin(1, keepdim=True) == 255)
+    luma = (x * torch.tensor([0.299, 0.587, 0.114], device=device)[:, None, None]).sum(1, keepdim=True)
+    # Turned around the axis of grey (Rodrigues' formula) by any angle.
+    angle = 2 * math.pi * torch.rand(n, 1, 1, 1, device=device)
+    turned = x * angle.cos() + torch.cat([x[:, 2:] - x[:, 1:2], x[:, :1] - x[:, 2:], x[:, 1:2] - x[:, :1]], 1) * (angle.sin() / math.sqrt(3))
+    turned = turned + x.mean(1, keepdim=True) * (1 - angle.cos())
+    # Shades: as bright, relative to the mean, as before.
+    shown = (~white).float()
+    mean = (luma * shown).sum((2, 3), keepdim=True) / shown.sum((2, 3), keepdim=True).clamp(min=1)
+    shades = (luma / mean.clamp(min=0.05)) * (0.08 + 0.84 * torch.rand(n, 3, 1, 1, device=device))
+    other = torch.where((torch.rand(n, device=device) < 0.5)[:, None, None, None], turned, shades).clamp(0, 1)
+    other = torch.where(white, torch.ones((), device=device), other)
+    return torch.where(chosen[:, None, None, None], other * 255, x * 255).to(torch.uint8)
+
+
+class Batches(torch.utils.data.IterableDataset):
+    """Batches of crops' numbers with texts about them, made by worker processes."""
+
+    def __init__(self, data, words, tokenizer, args):
+        self.words, self.tokenizer, self.args = words, tokenizer, args
+        self.labels = data.noun, data.colour, data.material, data.tall
+        # Seldom nouns more often than they come, but not as often as the frequent.
+        self.chance = 1 / np.sqrt(np.bincount(data.noun, minlength=len(data.nouns))[data.noun])
+        self.chance = np.cumsum(self.chance / self.chance.sum())
+
+    def __iter__(self):
+        worker = torch.utils.data.get_worker_info()
+        seed = self.args.seed * 1000 + (worker.id if worker else 0)
+        random.seed(seed); np.random.seed(seed)
+        noun, colour, material, tall = self.labels
+        words, args = self.words, self.args
+        while True:
+            index = np.minimum(np.searchsorted(self.chance, np.random.random(args.batch)), len(self.chance) - 1)
+            texts, said = [], []
+            for k in np.random.choice(index, args.texts):
+                other = random.random() < 0.25
+                text, true = words.sample(int(noun[k]), random.choice(COLOURS) if other else COLOURS[colour[k]],
+                                          MATERIALS[material[k]], {1: True, 0: False, -1: None}[int(tall[k])])
+                if random.random() < 0.08:
+                    text, true = words.absent()
+                texts.append(text); said.append(true)
+            # The softmax terms: one text of each noun, colour and material.
+            noun_words = [random.choice(of) for of in words.words_of]
+            texts += [random.choice(PROMPTS).format(word) for word in noun_words]
+            texts += [random.choice(["{}", "something {}", "{} thing"]).format(c) for c in COLOURS]
+            texts += [random.choice(["something {}", "{} thing", "{}"]).format(random.choice(MATERIAL_WORDS.get(m, [m]))) for m in MATERIALS]
+            of = np.ones((args.texts, len(words.nouns)), bool)
+            for row, (nouns, *_) in zip(of, said):
+                if nouns is not None:
+                    row[:] = False
+                    row[list(nouns)] = True
+            number = lambda all, value: -1 if value is None else all.index(value)
+            asked = [[number(COLOURS, c), number(MATERIALS, m), -1 if high is None else int(high)] for _, c, m, high in said]
+            also = [[n in words.of_word[w] for w in noun_words] for n in range(len(words.nouns))]
+            yield (torch.from_numpy(index), *tokens_of(self.tokenizer, texts), torch.from_numpy(of), torch.tensor(asked), torch.tensor(also))
+
+
+def tokens_of(tokenizer, texts):
+    """Returns ids, padded, and their numbers."""
+    ids = [encoding.ids for encoding in tokenizer.encode_batch(texts)]
     ids = [i if len(i) <= TOKENS else i[:TOKENS - 1] + [0] for i in ids]
-    lengths = torch.tensor([len(i) for i in ids], device=device)
-    padded = torch.zeros(len(ids), int(lengths.max()), dtype=torch.long)
+    lengths = torch.tensor([len(i) for i in ids])
+    padded = torch.zeros(len(ids), TOKENS, dtype=torch.long)
     for row, i in zip(padded, ids):
         row[:len(i)] = torch.tensor(i)
-    return model(padded.to(device), lengths)
+    return padded, lengths
 
 
-def truth_of(said, data, index, words):
-    """Returns [crops, texts]: 1 true, 0 false, -1 unknown."""
-    truth = np.ones((len(index), len(said)), np.int8)
-    noun, colour, material, tall = (a[index] for a in (data.noun, data.colour, data.material, data.tall))
-    for t, (of, c, m, high) in enumerate(said):
-        true = np.ones(len(index), bool)
-        if of is not None:
-            true &= np.isin(noun, list(of))
-        if c is not None:
-            true &= colour == COLOURS.index(c)
-        if m is not None:
-            true &= material == MATERIALS.index(m)
-        truth[:, t] = true
-        if high is not None:
-            truth[true & (tall != int(high)), t] = 0
-            truth[true & (tall == -1), t] = -1
-    return truth
+def encode_texts(model, tokenizer, texts, device):
+    ids, lengths = tokens_of(tokenizer, texts)
+    return model(ids[:, :int(lengths.max())].to(device), lengths.to(device))
+
+
+def truth_of(labels, of, asked):
+    """Returns [crops, texts]: 1 true, 0 false, -1 unknown. `labels` are [crops], `of` [texts, nouns], `asked`
+    [texts, 3]: colour, material and whether tall, -1 where nothing is said."""
+    true = of[:, labels["noun"]].T
+    known = torch.ones_like(true)
+    for column, name in enumerate(("colour", "material", "tall")):
+        said, of_crop = asked[:, column], labels[name][:, None]
+        known &= ~((said != -1) & (of_crop == -1))
+        true = true & ((said == -1) | (of_crop == said) | (of_crop == -1))
+    # What is false for another reason is false, whatever is unknown.
+    return torch.where(known | ~true, true.long(), -1)
 
 
 def train(args, data, words, tokenizer):
     device = args.device
     torch.manual_seed(args.seed); random.seed(args.seed); np.random.seed(args.seed)
-    image, text = ImageEncoder().to(device), TextEncoder().to(device)
-    if device == "cpu":
-        image = image.to(memory_format=torch.channels_last)
-    scale, bias = nn.Parameter(torch.tensor(math.log(12.0), device=device)), nn.Parameter(torch.tensor(-7.0, device=device))
+    image, text, log_scale, bias = load(args.resume) if args.resume else (ImageEncoder(), TextEncoder(), math.log(12.0), -7.0)
+    image, text = image.train().to(device).to(memory_format=torch.channels_last), text.train().to(device)
+    scale, bias = (nn.Parameter(torch.tensor(value, device=device)) for value in (log_scale, bias))
+    # What is kept is the mean over the last steps of training.
+    kept = copy.deepcopy([image, text])
     groups = [{"params": [*image.parameters(), *text.parameters()], "weight_decay": 0.02}, {"params": [scale, bias], "weight_decay": 0.0}]
     optimiser = torch.optim.AdamW(groups, lr=args.rate, betas=(0.9, 0.98))
-    counts = np.bincount(data.noun, minlength=len(data.nouns))
-    chance = 1 / np.sqrt(counts[data.noun])
-    chance /= chance.sum()
+    data.to(device)
+    batches = iter(torch.utils.data.DataLoader(Batches(data, words, tokenizer, args), batch_size=None, num_workers=args.workers))
+    n_nouns = len(data.nouns)
     began = time.time()
     step, mean = 0, None
     while True:
@@ -288,60 +359,66 @@ def train(args, data, words, tokenizer):
         if done >= 1:
             break
         for group in optimiser.param_groups:
-            group["lr"] = args.rate * min(1, (step + 1) / 200) * (0.5 + 0.5 * math.cos(math.pi * done))
-        index = np.random.choice(len(chance), args.batch, p=chance)
-        pixels = augment(data.images(index)).to(device)
-        if device == "cpu":
-            pixels = pixels.contiguous(memory_format=torch.channels_last)
-        said, texts = [], []
-        for k in np.random.choice(index, args.texts):
-            tall = {1: True, 0: False, -1: None}[int(data.tall[k])]
-            other = random.random() < 0.25
-            chosen = words.sample(int(data.noun[k]), random.choice(COLOURS) if other else COLOURS[data.colour[k]],
-                                  MATERIALS[data.material[k]], tall)
-            if random.random() < 0.08:
-                chosen = words.absent()
-            texts.append(chosen[0]); said.append(chosen[1])
-        # The softmax terms: one text of each noun, colour and material.
-        noun_words = [random.choice(of) for of in words.words_of]
-        noun_texts = [random.choice(PROMPTS).format(word) for word in noun_words]
-        colour_texts = [random.choice(["{}", "something {}", "{} thing"]).format(c) for c in COLOURS]
-        material_texts = [random.choice(["something {}", "{} thing", "{}"]).format(random.choice(MATERIAL_WORDS.get(m, [m]))) for m in MATERIALS]
-        truth = torch.from_numpy(truth_of(said, data, index, words)).to(device)
+            group["lr"] = args.rate * min(1, (step + 1) / 500) * (0.5 + 0.5 * math.cos(math.pi * done))
+        index, ids, lengths, of, asked, also = (t.to(device, non_blocking=True) for t in next(batches))
+        labels = {name: of_all[index] for name, of_all in data.labels.items()}
+        # Not what has few colours: those tell what it is.
+        recoloured = (torch.rand(len(index), device=device) < args.recoloured) & data.colourful[labels["noun"]]
+        for name in ("colour", "material"):
+            labels[name] = torch.where(recoloured, -1, labels[name])
+        pixels = augment(recolour(data.crops[index], recoloured)).contiguous(memory_format=torch.channels_last)
         with torch.autocast(device, dtype=torch.bfloat16):
-            x = image(pixels)
-            y = encode_texts(text, tokenizer, texts + noun_texts + colour_texts + material_texts, device)
+            x, y = image(pixels), text(ids, lengths)
         cosines = x.float() @ y.float().T
-        pairs = cosines[:, :len(texts)] * scale.exp() + bias
-        known = truth >= 0
-        loss = F.binary_cross_entropy_with_logits(pairs[known], truth[known].float(), reduction="sum") / args.batch
-        logits = cosines[:, len(texts):] * 16
-        nouns, colours, materials = logits.split([len(noun_texts), len(COLOURS), len(MATERIALS)], dim=1)
-        noun = torch.from_numpy(data.noun[index]).to(device)
-        also = torch.from_numpy(np.stack([[n in words.of_word[w] for w in noun_words] for n in data.noun[index]])).to(device)
-        also[torch.arange(len(noun)), noun] = False
-        softmax = F.cross_entropy(nouns.masked_fill(also, -1e4), noun)
-        softmax = softmax + 0.4 * F.cross_entropy(colours, torch.from_numpy(data.colour[index]).to(device))
-        softmax = softmax + 0.4 * F.cross_entropy(materials, torch.from_numpy(data.material[index]).to(device))
-        total = 0.25 * loss + softmax
+        pairs = cosines[:, :args.texts] * scale.exp() + bias
+        truth = truth_of(labels, of, asked)
+        loss = F.binary_cross_entropy_with_logits(pairs, truth.float().clamp(min=0), reduction="none")
+        loss = (loss * (truth >= 0)).sum() / args.batch * (256 / args.texts)
+        nouns, colours, materials = (cosines[:, args.texts:] * 16).split([n_nouns, len(COLOURS), len(MATERIALS)], dim=1)
+        noun = labels["noun"]
+        others = also[noun] & (torch.arange(n_nouns, device=device) != noun[:, None])
+        softmax = F.cross_entropy(nouns.masked_fill(others, -1e4), noun)
+        softmax = softmax + 0.4 * F.cross_entropy(colours, labels["colour"], ignore_index=-1)
+        softmax = softmax + 0.4 * F.cross_entropy(materials, labels["material"], ignore_index=-1)
         optimiser.zero_grad(set_to_none=True)
-        total.backward()
+        (0.25 * loss + softmax).backward()
         torch.nn.utils.clip_grad_norm_([*image.parameters(), *text.parameters()], 1.0)
         optimiser.step()
         step += 1
-        now = np.array([loss.item(), softmax.item(), (nouns.argmax(1) == noun).float().mean().item()])
-        mean = now if mean is None else 0.98 * mean + 0.02 * now
-        if step % 100 == 0:
+        keep(kept, [image, text], 1 - 1 / min(2000, 10 + step // 10))
+        if step % 50 == 0:
+            now = np.array([loss.item(), softmax.item(), (nouns.argmax(1) == noun).float().mean().item()])
+            mean = now if mean is None else 0.8 * mean + 0.2 * now
+        if step % 500 == 0:
             print(f"{step} {time.time() - began:.0f} s  pairs {mean[0]:.3f}  softmax {mean[1]:.3f}  noun {mean[2]:.3f}", flush=True)
-            if args.checkpoint:
-                torch.save([image.state_dict(), text.state_dict(), scale, bias], args.checkpoint)
-    return image.eval(), text.eval(), float(scale.exp()), float(bias), step
+            save(args.out, kept, scale, bias)
+    return kept[0].eval(), kept[1].eval(), float(scale.exp()), float(bias), step
+
+
+def save(out, models, log_scale, bias):
+    torch.save([models[0].state_dict(), models[1].state_dict(), log_scale, bias], out / "check.pt")
+
+
+def load(folder):
+    states = torch.load(folder / "check.pt", map_location="cpu")
+    image, text = ImageEncoder(), TextEncoder()
+    image.load_state_dict(states[0]); text.load_state_dict(states[1])
+    return image, text, float(states[2]), float(states[3])
+
+
+@torch.no_grad()
+def keep(kept, now, share):
+    """Moves the kept models' parameters towards those of now; statistics of batches are taken over."""
+    for old, new in zip(kept, now):
+        torch._foreach_lerp_(list(old.parameters()), list(new.parameters()), 1 - share)
+        for a, b in zip(old.buffers(), new.buffers()):
+            a.copy_(b)
 
 
 @torch.no_grad()
 def evaluate(image, text, tokenizer, data, words, scale, bias, device):
-    x = torch.cat([image(((data.images(range(i, min(i + 512, len(data.place)))).float() / 255 - 0.5) / 0.5).to(device)).cpu()
-                   for i in range(0, len(data.place), 512)])
+    data.to(device)
+    x = torch.cat([image((block.float() / 255 - 0.5) / 0.5).cpu() for block in data.crops.split(512)])
     encode = lambda texts: encode_texts(text, tokenizer, texts, device).cpu()
     nouns = x @ encode([f"a {n['name']}" for n in data.nouns]).T
     colours = x @ encode([f"something {c}" for c in COLOURS]).T
@@ -354,7 +431,8 @@ def evaluate(image, text, tokenizer, data, words, scale, bias, device):
     colour = colours.argmax(1).numpy() == data.colour
     material = materials.argmax(1).numpy() == data.material
     shells = np.isin(data.noun, [i for i, n in enumerate(data.nouns) if n["name"] in ("floor", "wall", "ceiling", "grass", "road", "pavement")])
-    groups = {"all": np.ones(len(top1), bool), "whole": data.whole, "cut or hidden": ~data.whole,
+    groups = {"all": np.ones(len(top1), bool), "whole": data.whole, "cut or hidden": ~data.whole & ~data.segmented,
+              "segments": data.segmented, 
               "held-out pairs": data.held_out, "held-out pairs, whole": data.held_out & data.whole, "without floors and walls, whole": data.whole & ~shells}
     report = {"crops": len(top1), "threshold": -bias / scale, "groups": {}, "nouns": {}}
     for name, mask in groups.items():
@@ -391,32 +469,33 @@ def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("out", type=pathlib.Path)
     parser.add_argument("test")
-    parser.add_argument("train", nargs="*")
+    parser.add_argument("train", nargs="*", help="none: only evaluates and exports what --resume names")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--steps", type=int, default=20000)
+    parser.add_argument("--steps", type=int, default=30000)
     parser.add_argument("--seconds", type=float, default=0, help="stop after this time instead")
-    parser.add_argument("--batch", type=int, default=192)
-    parser.add_argument("--texts", type=int, default=256)
+    parser.add_argument("--batch", type=int, default=1024)
+    parser.add_argument("--texts", type=int, default=512)
     parser.add_argument("--rate", type=float, default=2e-3)
+    parser.add_argument("--workers", type=int, default=12, help="processes that write texts; other batches with another number")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--checkpoint", help="kept while training; evaluated and exported instead, where no folder to train with is given")
+    parser.add_argument("--recoloured", type=float, default=0.35, help="part of the crops that get other colours")
+    parser.add_argument("--resume", type=pathlib.Path, help="folder of an earlier run's tokenizer.json and check.pt, to go on from")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     tall_of = None
+    tokenizer = Tokenizer.from_file(str(args.resume / "tokenizer.json")) if args.resume else None
     if args.train:
         data = Data(args.train)
         words, tall_of = Words(data.nouns), data.tall_of
-        tokenizer = train_tokenizer(words, args.seed)
-        print(f"{len(data.place)} crops, {len(data.nouns)} nouns, {tokenizer.get_vocab_size()} tokens, on {args.device}", flush=True)
+        tokenizer = tokenizer or train_tokenizer(words, args.seed)
+        tokenizer.save(str(args.out / "tokenizer.json"), pretty=False)
+        print(f"{len(data.noun)} crops, {len(data.nouns)} nouns, {tokenizer.get_vocab_size()} tokens, on {args.device}", flush=True)
         image, text, scale, bias, steps = train(args, data, words, tokenizer)
+        save(args.out, [image, text], torch.tensor(math.log(scale)), torch.tensor(bias))
     else:
-        image, text = ImageEncoder(), TextEncoder()
-        states = torch.load(args.checkpoint, map_location="cpu")
-        image.load_state_dict(states[0]); text.load_state_dict(states[1])
-        image.eval(); text.eval()
-        scale, bias, steps, args.device = float(states[2].exp()), float(states[3]), 0, "cpu"
+        image, text, scale, bias = load(args.resume)
+        image, text, scale, steps, args.device = image.eval(), text.eval(), math.exp(scale), 0, "cpu"
         words = Words(Data([args.test]).nouns)
-        tokenizer = train_tokenizer(words, args.seed)
     test = Data([args.test], tall_of)
     report, confusion = evaluate(image, text, tokenizer, test, words, scale, bias, args.device)
     report |= {"scale": scale, "bias": bias, "steps": steps, "batch": args.batch, "seed": args.seed, "device": args.device, "torch": torch.__version__}

@@ -123,6 +123,27 @@ pub fn resolve(
     }
 }
 
+/// Opens what a user asks for: the embedded encoders if nothing, [`ModelDir::colours`] by that name, else a folder or
+/// a pulled model.
+/// # Errors
+/// As [`resolve`] and [`ModelDir::open`].
+pub fn open(
+    asked: Option<&Path>,
+    variable: &dyn Fn(&str) -> Option<std::ffi::OsString>,
+) -> Result<ModelDir, HubError> {
+    Ok(match asked {
+        None => ModelDir::embedded()?,
+        Some(name) if name == Path::new("colours") => ModelDir::colours(),
+        Some(model) => ModelDir::open(&resolve(model, variable)?)?,
+    })
+}
+
+/// Returns where the set-up puts ONNX Runtime: beside the program `exe`, or in the build folder above it.
+pub fn runtime_folders(exe: &Path) -> Vec<PathBuf> {
+    let arch = Path::new("onnxruntime").join(std::env::consts::ARCH);
+    exe.ancestors().skip(1).take(3).flat_map(|folder| [folder.to_owned(), folder.join(&arch)]).collect()
+}
+
 /// Asks a question on the terminal; no, where there is none to ask.
 pub fn ask(question: &str) -> bool {
     if !io::stdin().is_terminal() || !io::stderr().is_terminal() {

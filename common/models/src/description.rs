@@ -337,7 +337,15 @@ impl Description {
     /// # Errors
     /// [`DescriptionError`] where it cannot be read or used.
     pub fn read(path: &Path) -> Result<Self, DescriptionError> {
-        let description: Self = read_toml(path)?;
+        let text = fs_err::read_to_string(path).map_err(|cause| DescriptionError::Read { cause })?;
+        Self::parse(path, &text)
+    }
+
+    /// Reads and checks a description's text; `path` is for messages.
+    /// # Errors
+    /// [`DescriptionError`] where it cannot be used.
+    pub(crate) fn parse(path: &Path, text: &str) -> Result<Self, DescriptionError> {
+        let description: Self = parse_toml(path, text)?;
         description.check(path)?;
         Ok(description)
     }
@@ -407,7 +415,11 @@ impl Description {
 /// Reads TOML.
 pub(crate) fn read_toml<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, DescriptionError> {
     let text = fs_err::read_to_string(path).map_err(|cause| DescriptionError::Read { cause })?;
-    toml::from_str(&text)
+    parse_toml(path, &text)
+}
+
+fn parse_toml<T: serde::de::DeserializeOwned>(path: &Path, text: &str) -> Result<T, DescriptionError> {
+    toml::from_str(text)
         .map_err(|cause| DescriptionError::Format { path: path.to_owned(), cause: Box::new(cause) })
 }
 

@@ -6,7 +6,7 @@ use half::f16;
 use ort::value::TensorElementType;
 
 use crate::{
-    Crop, EncodeError, ImageEncoder, ModelError,
+    Crop, EncodeError, ImageEncoder, ModelError, ModelFile,
     description::ImageDescription,
     normalise,
     preprocess::Preprocess,
@@ -42,17 +42,17 @@ pub struct OnnxImageEncoder {
 }
 
 impl OnnxImageEncoder {
-    /// Opens `path` as `description` says; `dim`: components of a vector.
+    /// Opens `file` as `description` says; `dim`: components of a vector.
     /// # Errors
     /// [`ModelError::Session`] where the runtime or the file is not as described.
     pub fn open(
         name: &str,
         dim: usize,
-        path: &std::path::Path,
+        file: &ModelFile,
         description: &ImageDescription,
         options: &SessionOptions,
     ) -> Result<Self, ModelError> {
-        let model = Model::open(path, options)?;
+        let model = Model::open(file, options)?;
         let preprocess = description.preprocess();
         let size = i64::from(preprocess.size_px());
         let (f32, input) = (TensorElementType::Float32, description.input.as_str());

@@ -3,15 +3,15 @@
 //! A [`ModelDir`] is described by one TOML file ([`description`]). Its image side turns crops into
 //! vectors ([`ImageEncoder`]), its text side turns queries into vectors of the same space
 //! ([`TextEncoder`]): through ONNX Runtime ([`session`]), from a list of phrases ([`phrases`]), or
-//! with what is built in ([`builtin`]). [`sam`] finds masks. [`EncoderId`] names the space, so that a robot can refuse
+//! without a model at all ([`colours`]). Encoders of our own are part of the program ([`ModelDir::embedded`]). [`sam`] finds masks. [`EncoderId`] names the space, so that a robot can refuse
 //! to compare vectors of two spaces.
 //!
 //! [`hub`] brings public models here, and [`commands`] is the face that both programs give it.
 //!
 //! Nothing here prints, reads the environment or starts threads of its own, save the question of [`commands::ask`].
 
-pub mod builtin;
 pub mod clean;
+pub mod colours;
 pub mod commands;
 mod crop;
 pub mod description;
@@ -20,6 +20,7 @@ mod error;
 pub mod hub;
 pub mod image;
 mod model_dir;
+mod model_file;
 pub mod phrases;
 pub mod preprocess;
 mod provider;
@@ -32,6 +33,7 @@ pub use crop::Crop;
 pub use encoder_id::EncoderId;
 pub use error::{EncodeError, ModelError};
 pub use model_dir::ModelDir;
+pub use model_file::ModelFile;
 pub use provider::{NoProvider, Placement, Provider};
 pub use session::{SessionOptions, find_runtime};
 

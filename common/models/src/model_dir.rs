@@ -6,8 +6,17 @@ use std::{
 
 use sha2::{Digest, Sha256};
 
+/// What is part of the program, in `embedded/`. Each is named where it is used alone, so that a robot's program,
+/// which encodes no images, leaves the largest out.
+mod embedded {
+    pub const DESCRIPTION: &str = include_str!("../embedded/model.toml");
+    pub const IMAGE: &[u8] = include_bytes!("../embedded/image.onnx");
+    pub const TEXT: &[u8] = include_bytes!("../embedded/text.onnx");
+    pub const TOKENIZER: &[u8] = include_bytes!("../embedded/tokenizer.json");
+}
+
 use crate::{
-    EncoderId, ImageEncoder, ModelError, SessionOptions, TextEncoder, builtin,
+    EncoderId, ImageEncoder, ModelError, ModelFile, SessionOptions, TextEncoder, colours,
     description::{Description, DescriptionError, FILE_NAME, FileRef, TextDescription},
     image::OnnxImageEncoder,
     phrases::PhraseEncoder,
@@ -25,8 +34,33 @@ pub struct ModelDir {
 
 #[derive(Clone, Debug)]
 enum Source {
-    Builtin,
-    Files { files_root: PathBuf, description: Box<Description>, batch: Arc<Mutex<Option<usize>>> },
+    Colours,
+    Files { files: Files, description: Box<Description>, batch: Arc<Mutex<Option<usize>>> },
+}
+
+/// Where the files of a description are.
+#[derive(Clone, Debug)]
+enum Files {
+    Embedded,
+    Folder(PathBuf),
+}
+
+impl Files {
+    /// Returns a file after comparing its hash with the recorded one, if any; `embedded` is what the program has of it.
+    fn open(&self, file: &FileRef, embedded: &'static [u8]) -> Result<ModelFile, DescriptionError> {
+        match self {
+            Self::Embedded => Ok(ModelFile::embedded(&file.path, embedded)),
+            Self::Folder(root) => Ok(checked(root, file)?.into()),
+        }
+    }
+
+    /// Returns the path of a file that embedded models do not have.
+    fn on_disk(&self, file: &FileRef) -> Result<PathBuf, DescriptionError> {
+        match self {
+            Self::Embedded => Ok(file.path.clone()),
+            Self::Folder(root) => checked(root, file),
+        }
+    }
 }
 
 impl ModelDir {
@@ -38,27 +72,45 @@ impl ModelDir {
     pub fn open(path: &Path) -> Result<Self, ModelError> {
         let description = Description::read(&path.join(FILE_NAME))?;
         let files_root = path.join(&description.files_root);
+        Self::with(description, Files::Folder(files_root))
+    }
+
+    /// Returns the encoders that are part of the program: trained on generated things, poor on real photos
+    /// (`embedded/CARD.md`). They need ONNX Runtime as others do.
+    /// # Errors
+    /// [`ModelError::Description`]: never, with the files that the program is built from.
+    pub fn embedded() -> Result<Self, ModelError> {
+        let description = Description::parse(Path::new("(embedded)/model.toml"), embedded::DESCRIPTION)?;
+        Self::with(description, Files::Embedded)
+    }
+
+    fn with(description: Description, files: Files) -> Result<Self, ModelError> {
         let mut id = EncoderId {
             name: description.name.clone(),
             dim: description.dim,
             sha256_of_file: Default::default(),
         };
         for (role, file) in description.files() {
-            let sha256 = sha256_of(&files_root, file)?;
+            let root = match &files {
+                Files::Folder(root) => root,
+                // Every hash is recorded.
+                Files::Embedded => Path::new(""),
+            };
+            let sha256 = sha256_of(root, file)?;
             id.sha256_of_file.insert(role.to_owned(), hex::encode(sha256));
         }
-        let source = Source::Files { files_root, description: Box::new(description), batch: Arc::default() };
+        let source = Source::Files { files, description: Box::new(description), batch: Arc::default() };
         Ok(Self { id, source })
     }
 
-    /// Returns the built-in stand-in, which needs no files and no ONNX Runtime.
-    pub fn builtin() -> Self {
+    /// Returns the stand-in that knows colours and shapes, and needs no files and no ONNX Runtime.
+    pub fn colours() -> Self {
         let id = EncoderId {
-            name: builtin::NAME.to_owned(),
-            dim: builtin::DIM as u32,
+            name: colours::NAME.to_owned(),
+            dim: colours::DIM as u32,
             sha256_of_file: Default::default(),
         };
-        Self { id, source: Source::Builtin }
+        Self { id, source: Source::Colours }
     }
 
     /// Returns the name of the space.
@@ -74,7 +126,7 @@ impl ModelDir {
     /// Returns what the model knows and what not, for people.
     pub fn about(&self) -> &str {
         match &self.source {
-            Source::Builtin => builtin::ABOUT,
+            Source::Colours => colours::ABOUT,
             Source::Files { description, .. } => &description.about,
         }
     }
@@ -82,7 +134,7 @@ impl ModelDir {
     /// Returns the licence of the weights.
     pub fn licence(&self) -> &str {
         match &self.source {
-            Source::Builtin => env!("CARGO_PKG_LICENSE"),
+            Source::Colours => env!("CARGO_PKG_LICENSE"),
             Source::Files { description, .. } => &description.licence,
         }
     }
@@ -90,7 +142,7 @@ impl ModelDir {
     /// Returns the cosine from which something counts as found, where the model states one.
     pub fn threshold(&self) -> Option<f32> {
         match &self.source {
-            Source::Builtin => Some(builtin::THRESHOLD),
+            Source::Colours => Some(colours::THRESHOLD),
             Source::Files { description, .. } => description.score.as_ref()?.threshold(),
         }
     }
@@ -100,7 +152,7 @@ impl ModelDir {
     /// A square that was made so is encoded as its crop is.
     pub fn preprocess(&self) -> Option<Preprocess> {
         match &self.source {
-            Source::Builtin => None,
+            Source::Colours => None,
             Source::Files { description, .. } => Some(description.image.preprocess()),
         }
     }
@@ -109,12 +161,12 @@ impl ModelDir {
     /// # Errors
     /// [`ModelError`] where a file is absent or not as described, or ONNX Runtime does not load.
     pub fn image_encoder(&self, options: &SessionOptions) -> Result<Box<dyn ImageEncoder>, ModelError> {
-        let Source::Files { files_root, description, batch } = &self.source else {
-            return Ok(Box::new(builtin::ColourShape));
+        let Source::Files { files, description, batch } = &self.source else {
+            return Ok(Box::new(colours::ColourShape));
         };
         let image = &description.image;
-        let path = checked(files_root, &image.file)?;
-        let mut encoder = OnnxImageEncoder::open(&description.name, self.dim(), &path, image, options)?;
+        let file = files.open(&image.file, embedded::IMAGE)?;
+        let mut encoder = OnnxImageEncoder::open(&description.name, self.dim(), &file, image, options)?;
         // One measures, the others wait, or they would disturb it.
         encoder.settle_batch(&mut batch.lock().unwrap_or_else(PoisonError::into_inner))?;
         Ok(Box::new(encoder))
@@ -124,25 +176,22 @@ impl ModelDir {
     /// # Errors
     /// [`ModelError`] where a file is absent or not as described, or ONNX Runtime does not load.
     pub fn text_encoder(&self, options: &SessionOptions) -> Result<Box<dyn TextEncoder>, ModelError> {
-        let Source::Files { files_root, description, .. } = &self.source else {
-            return Ok(Box::new(builtin::ColourShape));
+        let Source::Files { files, description, .. } = &self.source else {
+            return Ok(Box::new(colours::ColourShape));
         };
         let (name, dim) = (&description.name, self.dim());
         let centre = match &description.text_centre {
             None => None,
-            Some(centre) => {
-                Some(tensors::read(&checked(files_root, &centre.file)?, &centre.tensor, None, dim)?)
-            }
+            Some(centre) => Some(tensors::read(&files.on_disk(&centre.file)?, &centre.tensor, None, dim)?),
         };
         Ok(match &description.text {
             TextDescription::Onnx(text) => {
-                let (model, tokenizer) =
-                    (checked(files_root, &text.file)?, checked(files_root, &text.tokenizer)?);
+                let model = files.open(&text.file, embedded::TEXT)?;
+                let tokenizer = files.open(&text.tokenizer, embedded::TOKENIZER)?;
                 Box::new(OnnxTextEncoder::open(name, dim, [&model, &tokenizer], text, centre, options)?)
             }
             TextDescription::Phrases(text) => {
-                let (phrases, vectors) =
-                    (checked(files_root, &text.file)?, checked(files_root, &text.vectors)?);
+                let (phrases, vectors) = (files.on_disk(&text.file)?, files.on_disk(&text.vectors)?);
                 Box::new(PhraseEncoder::open(name, dim, &phrases, (&vectors, &text.tensor), centre)?)
             }
         })

@@ -217,8 +217,8 @@ impl Sam {
             id = format!("{id} {}", hex::encode(sha256_of(&files_root, file)?));
         }
         let SegmentDescription::Sam(sam) = &description.segment;
-        let encoder = Model::open(&checked(&files_root, &sam.image_encoder)?, options)?;
-        let decoder = Model::open(&checked(&files_root, &sam.mask_decoder)?, options)?;
+        let encoder = Model::open(&checked(&files_root, &sam.image_encoder)?.into(), options)?;
+        let decoder = Model::open(&checked(&files_root, &sam.mask_decoder)?.into(), options)?;
         let size_px = u32::from(sam.size_px);
         let names = Names::discover(&encoder, &decoder, i64::from(size_px))?;
         Ok(Self {

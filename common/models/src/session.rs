@@ -22,6 +22,7 @@ use ort::{
     },
 };
 
+use crate::ModelFile;
 use crate::provider::{Listener, Placement, Provider};
 
 /// Says why a model could not be opened or run.
@@ -301,9 +302,12 @@ pub(crate) struct Slot {
 }
 
 impl Model {
-    pub(crate) fn open(path: &Path, options: &SessionOptions) -> Result<Self, SessionError> {
+    pub(crate) fn open(file: &ModelFile, options: &SessionOptions) -> Result<Self, SessionError> {
+        let path = &*file.path;
         // Before the library is asked for, so that a missing model is named as such.
-        fs_err::metadata(path).map_err(|cause| SessionError::Read { cause })?;
+        if file.embedded_bytes().is_none() {
+            fs_err::metadata(path).map_err(|cause| SessionError::Read { cause })?;
+        }
         let environment = environment(&options.runtime)?;
         let mut wanted = options.providers.clone();
         // What comes after the processor is never needed: the processor can run everything.
@@ -312,7 +316,7 @@ impl Model {
         wanted.truncate(end.unwrap_or(wanted.len()));
         let asked = wanted.clone();
         let (session, placement) = loop {
-            match Self::commit(path, options, &environment, &wanted, !asked.is_empty()) {
+            match Self::commit(file, options, &environment, &wanted, !asked.is_empty()) {
                 Err(SessionError::Provider { provider, cause }) => {
                     wanted.retain(|&p| p != provider);
                     let error = SessionError::Provider { provider, cause };
@@ -338,7 +342,7 @@ impl Model {
 
     /// Opens the model with its nodes offered to `providers`, and says who took them where that is asked.
     fn commit(
-        path: &Path,
+        file: &ModelFile,
         options: &SessionOptions,
         environment: &Environment,
         providers: &[Provider],
@@ -346,7 +350,7 @@ impl Model {
     ) -> Result<(Session, Placement), SessionError> {
         let load = |cause: ort::Error| {
             let says = cause.message();
-            let path = path.to_owned();
+            let path = file.path.clone();
             match says.contains("opset") || says.contains("IR version") {
                 true => SessionError::Version { path, cause },
                 false => SessionError::Load { path, cause },
@@ -366,15 +370,17 @@ impl Model {
             builder =
                 provider.register(builder).map_err(|cause| SessionError::Provider { provider, cause })?;
         }
-        let session =
-            builder.commit_from_file(path).map_err(|cause| match (providers.first(), cause.code()) {
-                (None, _)
-                | (_, ErrorCode::InvalidProtobuf | ErrorCode::InvalidGraph | ErrorCode::NoModel) => {
-                    load(cause)
-                }
-                // Devices and drivers are looked for only now.
-                (Some(&provider), _) => SessionError::Provider { provider, cause },
-            })?;
+        let committed = match file.embedded_bytes() {
+            Some(bytes) => builder.commit_from_memory(bytes),
+            None => builder.commit_from_file(&file.path),
+        };
+        let session = committed.map_err(|cause| match (providers.first(), cause.code()) {
+            (None, _) | (_, ErrorCode::InvalidProtobuf | ErrorCode::InvalidGraph | ErrorCode::NoModel) => {
+                load(cause)
+            }
+            // Devices and drivers are looked for only now.
+            (Some(&provider), _) => SessionError::Provider { provider, cause },
+        })?;
         Ok((session, listener.placement()))
     }
 

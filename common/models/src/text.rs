@@ -1,12 +1,12 @@
 //! Text encoders in ONNX: tokens by `tokenizer.json`, then the model.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use ort::value::TensorElementType;
 use tokenizers::Tokenizer;
 
 use crate::{
-    EncodeError, ModelError, TextEncoder,
+    EncodeError, ModelError, ModelFile, TextEncoder,
     clean::clean,
     description::OnnxText,
     normalise,
@@ -77,11 +77,12 @@ pub struct Tokens {
 }
 
 impl Tokens {
-    /// Reads `path` (`tokenizer.json`); a text becomes at most `max_tokens` ids, the last being `end_token_id`.
+    /// Reads `file` (`tokenizer.json`); a text becomes at most `max_tokens` ids, the last being `end_token_id`.
     /// # Errors
     /// [`TokenizerError`] where the file is no tokenizer, or ends texts in another token.
-    pub fn open(path: &Path, max_tokens: usize, end_token_id: u32) -> Result<Self, TokenizerError> {
-        let bytes = fs_err::read(path).map_err(|cause| TokenizerError::Read { cause })?;
+    pub fn open(file: &ModelFile, max_tokens: usize, end_token_id: u32) -> Result<Self, TokenizerError> {
+        let path = &*file.path;
+        let bytes = file.read().map_err(|cause| TokenizerError::Read { cause })?;
         let mut tokenizer = Tokenizer::from_bytes(bytes)
             .map_err(|error| TokenizerError::Format { path: path.to_owned(), reason: error.to_string() })?;
         // Both are done here, the same for every file.
@@ -158,7 +159,7 @@ impl OnnxTextEncoder {
     pub fn open(
         name: &str,
         dim: usize,
-        [model, tokenizer]: [&Path; 2],
+        [model, tokenizer]: [&ModelFile; 2],
         description: &OnnxText,
         centre: Option<Vec<f32>>,
         options: &SessionOptions,
@@ -190,7 +191,7 @@ impl OnnxTextEncoder {
         match encoder.run(&[largest, end]) {
             Ok(_) => Ok(encoder),
             Err(cause) if encoder.run(&[end, end]).is_ok() => {
-                let (path, cause) = (tokenizer.to_owned(), Box::new(cause));
+                let (path, cause) = (tokenizer.path.clone(), Box::new(cause));
                 Err(TokenizerError::MoreTokens { path, largest, cause }.into())
             }
             Err(cause) => Err(cause.into()),

@@ -78,7 +78,7 @@ fn token_ids_equal_those_of_openai() {
     };
     let golden: serde_json::Value =
         serde_json::from_slice(&fs_err::read(golden).expect("it is readable")).expect("it is JSON");
-    let tokens = Tokens::open(&tokenizer, 77, 49407).expect("it opens");
+    let tokens = Tokens::open(&(&tokenizer).into(), 77, 49407).expect("it opens");
     let ids = |value: &serde_json::Value| -> Vec<u32> {
         let ids: Vec<u32> =
             value.as_array().expect("a list").iter().map(|id| id.as_u64().expect("an id") as u32).collect();

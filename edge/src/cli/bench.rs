@@ -12,7 +12,6 @@ use slag_edge::bench::query::{Settings, bench_query, dump_ids, dump_vectors, mak
 use slag_edge::bench::text::{self, TextSettings};
 use slag_edge::score::Precision;
 use slag_edge::store::{OpenShard, Snapshot};
-use slag_models::ModelDir;
 
 use super::commands::{store_failure, text_model};
 use super::output::{Failure, print_json};
@@ -124,9 +123,8 @@ fn bench_query_command(args: BenchQueryArgs) -> Result<(), Failure> {
 
 fn bench_text(args: BenchTextArgs) -> Result<(), Failure> {
     let failed = Failure::of("models");
-    let (folder, options) = text_model(&args.models)?;
-    let models = folder.map_or_else(|| Ok(ModelDir::builtin()), |folder| ModelDir::open(&folder));
-    let encoder = models.and_then(|models| models.text_encoder(&options));
+    let (models, options) = text_model(&args.models)?;
+    let encoder = models.text_encoder(&options);
     let settings = TextSettings {
         texts: args.text,
         n_runs: args.runs as usize,

@@ -2,7 +2,6 @@
 
 use std::ffi::OsString;
 use std::io::{self, Write};
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
@@ -13,6 +12,7 @@ use slag_edge::http::{self, App, Settings};
 use slag_edge::query::{Engine, QueryRequest, Status};
 use slag_edge::store::{EdgeCache, Snapshot, StoreError};
 use slag_edge::text::TextService;
+use slag_models::ModelDir;
 use slag_models::SessionOptions;
 use slag_models::commands::{self as model_commands, RunArgs};
 use slag_models::hub::{Side, cache_folder};
@@ -49,24 +49,24 @@ impl ThreadArgs {
 }
 
 fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
-    let (folder, options) = text_model(models)?;
-    let text = TextService::open(folder.as_deref(), &options);
+    let (models, options) = text_model(models)?;
+    let text = TextService::open(&models, &options);
     Ok(Engine::new(cache, text.map_err(|e| Failure::Failed("models", e.into()))?))
 }
 
-/// Returns the folder of the text model, none for the built-in one, and how it is run.
-pub fn text_model(models: &ModelArgs) -> Result<(Option<PathBuf>, SessionOptions), Failure> {
+/// Returns the models that the text model is of, and how it is run.
+pub fn text_model(args: &ModelArgs) -> Result<(ModelDir, SessionOptions), Failure> {
     let failed = Failure::of("models");
-    let folder = models.models.as_deref().map(|model| model_commands::resolve(model, &variable)).transpose();
-    let options = session_options(&models.how).map_err(|e| failed(e.into()))?;
-    Ok((folder.map_err(|e| failed(e.into()))?, options))
+    let models = model_commands::open(args.models.as_deref(), &variable);
+    let options = session_options(&args.how).map_err(|e| failed(e.into()))?;
+    Ok((models.map_err(|e| failed(e.into()))?, options))
 }
 
 /// Returns how models are run: one text at a time, with a few threads.
 fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
-    let beside = std::env::current_exe().ok().and_then(|exe| Some(exe.parent()?.to_owned()));
+    let exe = std::env::current_exe().unwrap_or_default();
     let n_cores = std::thread::available_parallelism().map_or(1, usize::from);
-    how.session_options(&Vec::from_iter(beside), n_cores.min(MAX_MODEL_THREADS))
+    how.session_options(&model_commands::runtime_folders(&exe), n_cores.min(MAX_MODEL_THREADS))
 }
 
 fn variable(name: &str) -> Option<OsString> {

@@ -73,7 +73,7 @@ pub enum Command {
     /// Makes scenes and crops whose contents are known.
     #[command(subcommand)]
     Generate(GenerateCommand),
-    /// Generates a room, encodes, serves, fetches and asks: the whole system in one command.
+    /// Generates a house and yard, encodes, serves, fetches and asks: the whole system in one command.
     Demo(DemoArgs),
     /// Lists the GPUs that can rasterise.
     Devices,
@@ -85,7 +85,8 @@ pub enum Command {
 /// Where models come from.
 #[derive(Clone, Debug, Args)]
 pub struct ModelArgs {
-    /// Folder with model.toml, or name of a pulled model (`models list`); the built-in stand-in if absent.
+    /// Folder with model.toml, or name of a pulled model (`models list`); the embedded encoders if absent; `colours`
+    /// knows colours only, and needs no ONNX Runtime.
     #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR")]
     pub models: Option<PathBuf>,
     /// How they run.
@@ -372,6 +373,8 @@ pub enum GenerateCommand {
     Scene(GenerateSceneArgs),
     /// Crops of things with the words that are true of them, to train an encoder.
     Crops(GenerateCropsArgs),
+    /// Photos with the thing at each pixel, to train a segmenter.
+    Photos(GeneratePhotosArgs),
 }
 
 /// `generate scene`.
@@ -417,16 +420,36 @@ pub struct GenerateCropsArgs {
     pub objects: Option<PathBuf>,
 }
 
+/// `generate photos`.
+#[derive(Debug, Args)]
+pub struct GeneratePhotosArgs {
+    /// Folder to write into; made if absent.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Scenes to photograph.
+    #[arg(long, value_name = "N", default_value_t = 100)]
+    pub n_scenes: u64,
+    /// Seed of the first scene; the next ones count up.
+    #[arg(long, default_value_t = 2_000_000)]
+    pub seed: u64,
+    /// Folder of object files (`NOUN.txt`) instead of those shipped.
+    #[arg(long, value_name = "DIR")]
+    pub objects: Option<PathBuf>,
+}
+
 /// `demo`.
 #[derive(Debug, Args)]
 pub struct DemoArgs {
     /// Folder to work in; emptied of an earlier demo.
     #[arg(long, value_name = "DIR", default_value = "target/demo")]
     pub out: PathBuf,
-    /// Chooses the room.
+    /// Chooses house and yard.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Leaves the robot's service running until ctrl-c, to try queries by hand.
+    /// How models are run.
+    #[command(flatten)]
+    pub how: RunArgs,
+    /// Leaves the services running until ctrl-c, to try queries by hand.
     #[arg(long)]
     pub keep: bool,
 }

@@ -2,7 +2,6 @@
 
 use std::fmt::Display;
 use std::io::Write;
-use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -26,7 +25,7 @@ use crate::check::{self, CheckOptions, CheckView};
 use crate::demo;
 use crate::encode::{self, EncodeError, EncodeSettings, Masks, StageReport};
 use crate::eval::{self, EvalSettings, Truth};
-use crate::generate::{crops, grammar};
+use crate::generate::{crops, grammar, photos};
 use crate::palette::PaletteSettings;
 use crate::progress::{Progress, Silent};
 use crate::publish::{qdrant, serve};
@@ -121,16 +120,13 @@ pub(super) fn now_unix_secs() -> u64 {
 
 /// Opens the models and says how they are run.
 pub(super) fn open_models(args: &ModelArgs) -> Result<(ModelDir, SessionOptions)> {
-    let models = match &args.models {
-        Some(model) => ModelDir::open(&commands::resolve(model, &|name| std::env::var_os(name))?)?,
-        None => ModelDir::builtin(),
-    };
+    let models = commands::open(args.models.as_deref(), &|name| std::env::var_os(name))?;
     Ok((models, session_options(&args.how)?))
 }
 
 /// Returns how models are run: with one thread, because views are encoded side by side.
 fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
-    how.session_options(&runtime_folders(), 1)
+    how.session_options(&commands::runtime_folders(&std::env::current_exe().unwrap_or_default()), 1)
 }
 
 fn run_models(command: &ModelsCommand, json: bool) -> Result<Exit> {
@@ -143,13 +139,6 @@ fn run_models(command: &ModelsCommand, json: bool) -> Result<Exit> {
     let report = commands::run(command, &context)?;
     print(json, &report, &report)?;
     Ok(Exit::Done)
-}
-
-/// Returns where the set-up puts ONNX Runtime: beside the program, or in the build folder above it.
-fn runtime_folders() -> Vec<PathBuf> {
-    let exe = std::env::current_exe().unwrap_or_default();
-    let arch = Path::new("onnxruntime").join(std::env::consts::ARCH);
-    exe.ancestors().skip(1).take(3).flat_map(|folder| [folder.to_owned(), folder.join(&arch)]).collect()
 }
 
 fn run_check(args: &CheckArgs, json: bool) -> Result<Exit> {
@@ -441,6 +430,12 @@ fn run_generate(command: &GenerateCommand, progress: &dyn Progress) -> Result<Ex
             let n_crops = crops::write(&args.out, args.split, &nouns, seeds, args.edge, progress)?;
             println!("{n_crops} crops of {} nouns in {}", nouns.len(), args.out.display());
         }
+        GenerateCommand::Photos(args) => {
+            let nouns = grammar::nouns(args.objects.as_deref())?;
+            let seeds = args.seed..args.seed + args.n_scenes;
+            let n_photos = photos::write(&args.out, &nouns, seeds, progress)?;
+            println!("{n_photos} photos in {}", args.out.display());
+        }
     }
     Ok(Exit::Done)
 }
@@ -450,6 +445,7 @@ fn run_demo(args: &DemoArgs, progress: &dyn Progress, json: bool) -> Result<Exit
     let options = demo::DemoOptions {
         out: args.out.clone(),
         seed: args.seed,
+        session: session_options(&args.how)?,
         edge,
         created_unix_secs: now_unix_secs(),
     };

@@ -1,6 +1,7 @@
 //! The whole system in one run: generate, encode, serve, fetch as a robot would, ask, compare with the truth.
 
 mod picture;
+mod questions;
 
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -11,12 +12,12 @@ use std::time::Instant;
 use anyhow::{Context, Result, anyhow};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
-use slag_models::{ModelDir, SessionOptions};
+use slag_models::{ModelDir, SessionOptions, TextEncoder};
 
 use crate::embed::Background;
 use crate::encode::{self, EncodeSettings, EncodeSummary, Masks};
+use crate::generate::Scene;
 use crate::generate::grammar::{self, SceneKind};
-use crate::generate::{Scene, TrueObject};
 use slag_common::shard::Profile;
 
 use crate::palette::PaletteSettings;
@@ -28,35 +29,27 @@ use crate::shard::cells::CellLimits;
 use crate::shard::positions::PositionError;
 use crate::{query, store::StoreReader};
 
-/// Photos of the room.
-const N_VIEWS: u32 = 36;
-/// Where the robot stands: the middle of the room.
-const ROBOT_IN_WORLD: DVec3 = DVec3::new(3.5, 2.75, 0.0);
-/// What the robot fetches around it.
-const RADIUS_M: f64 = 50.0;
+/// A house and a yard beside it.
+const KINDS: [SceneKind; 2] = [SceneKind::Room, SceneKind::Yard];
+/// Photos of both.
+const N_VIEWS: u32 = 72;
+/// The robot stands in the yard, where this photo was taken.
+const ROBOT_VIEW: usize = 1;
+/// What the robot fetches around it: not all of the scene.
+const RADIUS_M: f64 = 9.0;
 /// How far an answer's centre may lie outside the true box: a mask's edge takes in some of what is behind.
 const TOLERANCE_M: f64 = 0.25;
 /// Marks a folder as a demo's, which may be emptied.
 const MARKER: &str = "demo.json";
 
-/// What is asked, and the colour that the answer truly has. Nothing in the room is pink.
-const QUESTIONS: [(&str, &str); 8] = [
-    ("something red", "red"),
-    ("blue", "blue"),
-    ("the yellow one", "yellow"),
-    ("green", "green"),
-    ("a purple thing", "purple"),
-    ("black", "black"),
-    ("orange", "orange"),
-    ("pink", "pink"),
-];
-
 /// How to run the demo.
 pub struct DemoOptions {
     /// Folder to work in.
     pub out: PathBuf,
-    /// Chooses the room.
+    /// Chooses house and yard.
     pub seed: u64,
+    /// How models are run.
+    pub session: SessionOptions,
     /// The robot's program.
     pub edge: PathBuf,
     /// Creation time to sign.
@@ -74,14 +67,14 @@ pub struct Demo {
 /// What came of a demo.
 #[derive(Debug, Serialize)]
 pub struct DemoReport {
-    /// The answers, drawn.
-    pub picture: PathBuf,
+    /// The answers, drawn; and a map of the scene from above, with its cells and what the robot fetched.
+    pub pictures: [PathBuf; 2],
     /// What the encode did.
     pub encode: EncodeSummary,
     /// Bytes that the robot downloaded.
     pub downloaded_bytes: u64,
     /// The model's own words about itself.
-    pub about_model: &'static str,
+    pub about_model: String,
     /// The questions in turn.
     pub questions: Vec<Question>,
 }
@@ -143,12 +136,20 @@ impl DemoReport {
 }
 
 impl Demo {
-    /// Serves the robot's queries until it is stopped.
+    /// Serves the shards and the robot's queries until it is stopped.
     ///
     /// # Errors
-    /// If the program cannot be started.
+    /// If a program cannot be started.
     pub fn keep(&self) -> Result<()> {
+        let store = self.cache.with_file_name("store");
+        let mut shards = Command::new(std::env::current_exe()?);
+        let mut shards =
+            shards.arg("serve").arg("--store").arg(store).spawn().context("cannot serve the store")?;
+        println!("try: curl 'http://127.0.0.1:7734/query?text=chair'");
         let status = Command::new(&self.edge).arg("serve").arg("--cache").arg(&self.cache).status();
+        // It may have ended already, as ctrl-c reaches all.
+        let _ = shards.kill();
+        let _ = shards.wait();
         status.with_context(|| format!("cannot start {}", self.edge.display()))?;
         Ok(())
     }
@@ -170,17 +171,19 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     let cache = options.out.join("cache");
 
     let nouns = grammar::nouns(None).context("generate")?;
-    let mut scene = Scene::new(&[SceneKind::Room], options.seed, N_VIEWS, &nouns);
+    let mut scene = Scene::new(&KINDS, options.seed, N_VIEWS, &nouns);
     let written = tokio::task::block_in_place(|| scene.write(&options.out.join("scene"), progress))
         .context("generate")?;
-    let models = ModelDir::builtin();
+    let camera_in_world = scene.views[ROBOT_VIEW].camera_from_world.inverse().translation;
+    let robot_in_world = DVec3::new(camera_in_world.x, camera_in_world.y, 0.0);
+    let models = ModelDir::embedded()?;
     let settings = EncodeSettings {
         scene: written.scene,
         views: written.views,
         images: None,
         masks: Masks::Auto,
         store: store.clone(),
-        scene_name: "demo room".into(),
+        scene_name: "demo house and yard".into(),
         metric: true,
         geo: None,
         views_limit: None,
@@ -202,10 +205,8 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         created_unix_secs: options.created_unix_secs,
         expires_unix_secs: None,
     };
-    // The built-in models need no runtime library.
-    let session = SessionOptions::new(PathBuf::new());
     let summary = tokio::task::block_in_place(|| {
-        encode::encode(&settings, &models, &session, &CpuRasterizer, progress, cancel)
+        encode::encode(&settings, &models, &options.session, &CpuRasterizer, progress, cancel)
     })
     .context("encode")?;
 
@@ -226,7 +227,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         return Err(anyhow!("serve: ended before it listened"));
     };
     let url = format!("http://{address}");
-    let at = format!("{},{},{}", ROBOT_IN_WORLD.x, ROBOT_IN_WORLD.y, ROBOT_IN_WORLD.z);
+    let at = format!("{:.3},{:.3},{:.3}", robot_in_world.x, robot_in_world.y, robot_in_world.z);
     let radius = RADIUS_M.to_string();
     let fetch = ["fetch", "--from", &url, "--at", &at, "--radius", &radius];
     let fetched: FetchReply = edge(options, &cache, &fetch).context("fetch")?;
@@ -235,46 +236,46 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     serving.await.context("serve")?.context("serve")?;
 
     let mut questions = Vec::new();
-    for (text, colour) in QUESTIONS {
+    for asked in questions::questions(&scene.objects, robot_in_world, RADIUS_M) {
         let start = Instant::now();
-        let reply: EdgeReply = edge(options, &cache, &["query", text, "--near", &at]).context("query")?;
+        let reply: EdgeReply =
+            edge(options, &cache, &["query", &asked.text, "--near", &at]).context("query")?;
         let process_ms = start.elapsed().as_secs_f64() * 1e3;
-        let truth: Vec<&TrueObject> = scene.objects.iter().filter(|o| o.colours.contains(&colour)).collect();
         let answer = reply.answers.into_iter().next();
         let right = match &answer {
-            None => truth.is_empty(),
-            Some(answer) => truth.iter().any(|object| {
+            None => asked.truth.is_empty(),
+            Some(answer) => asked.truth.iter().any(|object| {
                 let (low, high) = (object.aabb_min - TOLERANCE_M, object.aabb_max + TOLERANCE_M);
                 answer.position_in_world.cmpge(low).all() && answer.position_in_world.cmple(high).all()
             }),
         };
-        let truth = truth.iter().map(|o| (o.category.clone(), (o.aabb_min + o.aabb_max) / 2.0)).collect();
-        questions.push(Question {
-            text: text.into(),
-            answer,
-            reason: reply.reason,
-            truth,
-            process_ms,
-            right,
-        });
+        let truth = asked.truth.iter().map(|o| (o.category.clone(), o.centre)).collect();
+        questions.push(Question { text: asked.text, answer, reason: reply.reason, truth, process_ms, right });
     }
-    let picture =
-        tokio::task::block_in_place(|| draw_answers(options, &scene, &questions)).context("picture")?;
+    let mut encoder = models.text_encoder(&options.session)?;
+    let pictures =
+        tokio::task::block_in_place(|| draw(options, &scene, &questions, &mut *encoder, robot_in_world))
+            .context("pictures")?;
     let report = DemoReport {
-        picture,
+        pictures,
         encode: summary,
         downloaded_bytes: fetched.downloaded.bytes,
-        about_model: slag_models::builtin::ABOUT,
+        about_model: models.about().to_owned(),
         questions,
     };
     fs_err::write(options.out.join(MARKER), serde_json::to_vec_pretty(&report)?)?;
     Ok(Demo { report, edge: options.edge.clone(), cache })
 }
 
-/// Draws what was found, from the full-precision scores of the store.
-fn draw_answers(options: &DemoOptions, scene: &Scene, questions: &[Question]) -> Result<PathBuf> {
+/// Draws what was found, from the full-precision scores of the store, and where it is.
+fn draw(
+    options: &DemoOptions,
+    scene: &Scene,
+    questions: &[Question],
+    text: &mut dyn TextEncoder,
+    robot_in_world: DVec3,
+) -> Result<[PathBuf; 2]> {
     let reader = StoreReader::open(&options.out.join("store"))?;
-    let mut text = ModelDir::builtin().text_encoder(&SessionOptions::new(PathBuf::new()))?;
     let threshold = reader.manifest().encoder.default_threshold;
     let mut panels = Vec::new();
     for question in questions {
@@ -283,9 +284,12 @@ fn draw_answers(options: &DemoOptions, scene: &Scene, questions: &[Question]) ->
             panels.push(picture::Panel { answer, cosines, threshold });
         }
     }
-    let path = options.out.join("answers.png");
-    picture::draw(&scene.gaussians, &scene.views, &panels)?.save(&path)?;
-    Ok(path)
+    let paths = ["answers.png", "map.png"].map(|name| options.out.join(name));
+    picture::answers(&scene.gaussians, &scene.views, &panels)?.save(&paths[0])?;
+    let answers: Vec<DVec3> = panels.iter().map(|panel| panel.answer.position_in_world).collect();
+    let cells: Vec<_> = reader.manifest().cells.iter().map(|cell| cell.bounds).collect();
+    picture::map(&scene.gaussians, &cells, &answers, robot_in_world, RADIUS_M).save(&paths[1])?;
+    Ok(paths)
 }
 
 /// Empties the folder of an earlier demo; refuses a folder that holds anything else.
@@ -335,7 +339,11 @@ impl fmt::Display for DemoReport {
             self.downloaded_bytes / 1000,
             encode.n_cells
         )?;
-        writeln!(f, "{:<16} {:<44} {:<32} right", "question", "answer of the robot, offline", "truth")?;
+        writeln!(
+            f,
+            "{:<24} {:<46} {:>7}  {:<7} truth",
+            "question", "answer of the robot, offline", "ms", "right"
+        )?;
         for q in &self.questions {
             let answer = match &q.answer {
                 Some(a @ EdgeAnswer { position_in_world: p, .. }) => format!(
@@ -349,10 +357,11 @@ impl fmt::Display for DemoReport {
                 None => "nothing found".into(),
             };
             let truth = q.truth.iter().map(|(name, p)| format!("{name} at {:.2} {:.2} {:.2}", p.x, p.y, p.z));
-            let truth = truth.reduce(|a, b| a + ", " + &b).unwrap_or_else(|| "none in the room".into());
-            writeln!(f, "{:<16} {answer:<44} {truth:<32} {}", q.text, if q.right { "yes" } else { "NO" })?;
+            let truth = truth.reduce(|a, b| a + ", " + &b).unwrap_or_else(|| "there is none".into());
+            let right = if q.right { "yes" } else { "NO" };
+            writeln!(f, "{:<24} {answer:<46} {:>7.0}  {right:<7} {truth}", q.text, q.process_ms)?;
         }
         writeln!(f, "\nmodel: {}", self.about_model)?;
-        writeln!(f, "picture: {}", self.picture.display())
+        writeln!(f, "pictures: {}, {}", self.pictures[0].display(), self.pictures[1].display())
     }
 }

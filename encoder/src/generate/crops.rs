@@ -1,12 +1,14 @@
 //! Crops of generated things with the words that are true of them: what the embedded encoder learns from.
 
 use std::io::Write as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use glam::DVec3;
 use image::RgbImage;
 use rayon::prelude::*;
 use serde::Serialize;
+use slag_common::View;
+use slag_models::Crop;
 use slag_models::preprocess::{Filter, Preprocess, Resize};
 
 use super::compose::{Layout, looking, pinhole};
@@ -18,7 +20,7 @@ use super::{GenerateError, write_npy};
 use crate::embed::{self, Background};
 use crate::progress::Progress;
 use crate::raster::RasterView;
-use crate::segment::{BoxPx, Mask, NO_REGION, masks_of_labels};
+use crate::segment::{BoxPx, GraphSegmenter, Mask, NO_REGION, SegmentInput, Segmenter, masks_of_labels};
 
 /// Photos that crops are taken from: their edge.
 const PHOTO_PX: u32 = 208;
@@ -28,6 +30,10 @@ const N_PHOTOS: usize = 14;
 const MIN_MASK_PX: u32 = 200;
 /// A crop shows at least this part of what it would show if nothing stood before it.
 const MIN_SHOWN: f64 = 0.3;
+/// Of a segment's pixels, at least this part shows the thing that it is labelled with,
+const MIN_PURITY: f64 = 0.8;
+/// and of the pixels that show the thing, at least this part is in the segment.
+const MIN_COVERED: f64 = 0.2;
 /// Of the pairs of noun and colour, one in so many is kept for the test.
 const HELD_OUT_OF: u64 = 7;
 
@@ -59,6 +65,8 @@ pub struct Label {
     pub shown: f64,
     /// Whether the mask is a piece of the true one.
     pub cut: bool,
+    /// Whether the mask is of the segmenter, not the true one.
+    pub segmented: bool,
 }
 
 /// Returns whether a pair of noun and colour is kept for the test; by its words, so that new nouns change nothing.
@@ -90,7 +98,7 @@ pub fn write(
     let of_seed = |seed: u64| {
         let crops: Vec<(RgbImage, Label)> = crops(split, nouns, seed)
             .into_iter()
-            .map(|(image, label)| (preprocess.square(&image), label))
+            .map(|(crop, label)| (preprocess.square(crop.image()), label))
             .collect();
         progress.advance(1);
         crops
@@ -116,7 +124,8 @@ pub fn write(
     Ok(crops.len())
 }
 
-fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(RgbImage, Label)> {
+/// Returns the crops of a scene.
+pub(crate) fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(Crop, Label)> {
     let allowed = |noun: &Noun, colour| split == Split::Test || !is_held_out(noun, colour);
     let kinds = [SceneKind::Room, SceneKind::Yard, SceneKind::Street];
     let layout = Layout::new(&[kinds[(seed % 3) as usize]], seed, nouns, &allowed);
@@ -126,17 +135,21 @@ fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(RgbImage, Label)> {
     for _ in 0..N_PHOTOS {
         let Some(view) = look_at_something(&layout, &solids, &mut random) else { continue };
         let photo = solids.photo(&view);
-        for (thing, mask) in masks_of(&photo) {
+        let things = masks_of(&photo);
+        // A third of the photos is cut up as a newcomer's are: by the segmenter that needs no model.
+        let segmented = random.below(3) == 0;
+        let masks = if segmented { segments_of(&photo, &view, &things) } else { things.clone() };
+        for (thing, mask) in masks {
             let (thing, placed) = (thing as usize, &layout.placed[thing as usize]);
             let shown = f64::from(mask.area_px) / f64::from(photo.unhidden_px[thing].max(1));
-            if mask.area_px < MIN_MASK_PX || (shown < MIN_SHOWN && !placed.shell) {
+            if mask.area_px < MIN_MASK_PX || (shown < MIN_SHOWN && !placed.shell && !segmented) {
                 continue;
             }
             // Floors and walls are on every photo.
             if placed.shell && random.below(4) != 0 {
                 continue;
             }
-            let cut = random.below(4) == 0;
+            let cut = !segmented && random.below(4) == 0;
             let mask = if cut { spoilt(&mask, &mut random) } else { mask };
             let Some(crop) = embed::crop(&photo.image, &mask, Background::White) else { continue };
             let size = placed.bounds.size();
@@ -149,8 +162,9 @@ fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(RgbImage, Label)> {
                 area_px: mask.area_px,
                 shown,
                 cut,
+                segmented,
             };
-            out.push((crop.image().clone(), label));
+            out.push((crop, label));
         }
     }
     out
@@ -190,6 +204,34 @@ fn masks_of(photo: &Photo) -> Vec<(u32, Mask)> {
     let label = |thing: &u16| if *thing == NOTHING { NO_REGION } else { u32::from(*thing) };
     let labels: Vec<u32> = photo.thing_of_pixel.iter().map(label).collect();
     masks_of_labels(&labels, photo.image.width(), photo.unhidden_px.len(), u64::MAX).unwrap_or_default()
+}
+
+/// Returns the segments of a photo that show mostly one thing, with the thing.
+fn segments_of(photo: &Photo, raster_view: &RasterView, things: &[(u32, Mask)]) -> Vec<(u32, Mask)> {
+    let view = View {
+        name: String::new(),
+        image_path: PathBuf::new(),
+        intrinsics: raster_view.intrinsics,
+        camera_from_world: raster_view.camera_from_world,
+    };
+    let input =
+        SegmentInput { view: &view, image: &photo.image, valid: None, undistorter: None, depth: None };
+    let segments = GraphSegmenter::default().segment(&input).unwrap_or_default();
+    let width = photo.image.width();
+    let thing_of = |mask: &Mask| {
+        let mut n_px = vec![0_u32; photo.unhidden_px.len()];
+        for (row, y) in mask.inside.chunks(mask.box_px.width_px() as usize).zip(mask.box_px.y0..) {
+            for (_, x) in row.iter().zip(mask.box_px.x0..).filter(|(inside, _)| **inside) {
+                let thing = photo.thing_of_pixel[(y * width + x) as usize];
+                n_px.get_mut(usize::from(thing)).into_iter().for_each(|n| *n += 1);
+            }
+        }
+        let (n, thing) = things.iter().map(|(thing, _)| (n_px[*thing as usize], *thing)).max()?;
+        let whole = things.iter().find(|(of, _)| *of == thing)?.1.area_px;
+        let pure = f64::from(n) >= MIN_PURITY * f64::from(mask.area_px);
+        (pure && f64::from(n) >= MIN_COVERED * f64::from(whole)).then_some(thing)
+    };
+    segments.into_iter().filter_map(|mask| Some((thing_of(&mask)?, mask))).collect()
 }
 
 /// Returns the mask as a segmenter may give it: a side of it is missing.

@@ -9,6 +9,7 @@ mod expression;
 pub mod field;
 pub mod grammar;
 pub mod paint;
+pub mod photos;
 pub mod render;
 mod solid;
 

@@ -4,7 +4,7 @@ use image::{Rgb, RgbImage};
 use slag_models::{Crop, EncodeError, ImageEncoder, ModelDir, SessionOptions, TextEncoder};
 
 fn encoders() -> (Box<dyn ImageEncoder>, Box<dyn TextEncoder>) {
-    let (model, options) = (ModelDir::builtin(), SessionOptions::new("no-such-library.so".into()));
+    let (model, options) = (ModelDir::colours(), SessionOptions::new("no-such-library.so".into()));
     (
         model.image_encoder(&options).expect("it is built in"),
         model.text_encoder(&options).expect("it is built in"),
@@ -82,7 +82,7 @@ const COLOURS: [&str; 11] =
 #[test]
 fn a_shaded_thing_scores_high_for_its_colour_and_low_for_all_others() {
     let (mut images, mut texts) = encoders();
-    let threshold = ModelDir::builtin().threshold().expect("stated");
+    let threshold = ModelDir::colours().threshold().expect("stated");
     let mut wrong = Vec::new();
     for (name, colour) in THINGS {
         let vector = images.encode(&[thing(colour, 60, 60, |_, _| true)]).expect("it encodes");
@@ -100,7 +100,7 @@ fn a_shaded_thing_scores_high_for_its_colour_and_low_for_all_others() {
 #[test]
 fn an_absent_colour_scores_below_zero_and_a_present_one_passes() {
     let (mut images, mut texts) = encoders();
-    let threshold = ModelDir::builtin().threshold().expect("stated");
+    let threshold = ModelDir::colours().threshold().expect("stated");
     let red = [220, 20, 30];
     let vector = images.encode(&[thing(red, 50, 50, |_, _| true)]).expect("it encodes");
     for absent in ["green", "blue", "white", "purple"] {
@@ -118,7 +118,7 @@ fn an_absent_colour_scores_below_zero_and_a_present_one_passes() {
 #[test]
 fn shapes_come_from_the_mask() {
     let (mut images, mut texts) = encoders();
-    let threshold = ModelDir::builtin().threshold().expect("stated");
+    let threshold = ModelDir::colours().threshold().expect("stated");
     let disc =
         |x: u32, y: u32| (f64::from(x) - 39.5).powi(2) + (f64::from(y) - 39.5).powi(2) < 39.0f64.powi(2);
     let crops = [

@@ -1,0 +1,90 @@
+//! What the demo asks: texts about what truly stands in the scene, and one about what does not.
+
+use glam::DVec3;
+
+use crate::generate::TrueObject;
+
+/// Things are asked for if so many pixels of the photos show them.
+const MIN_PIXELS: u64 = 12_000;
+/// Nowhere in any scene.
+const ABSENT: &str = "an elephant";
+
+/// A text, and what would be a right answer.
+pub(super) struct Asked<'a> {
+    /// The text.
+    pub(super) text: String,
+    /// The things of which it is true; none if the right answer is that there is nothing.
+    pub(super) truth: Vec<&'a TrueObject>,
+}
+
+/// A way of asking.
+struct Form {
+    /// Returns the text that asks for a thing so; `None` where the form does not fit it.
+    text: fn(&TrueObject) -> Option<String>,
+    /// Whether what asks for the first thing is true of the second.
+    is_true: fn(&TrueObject, &TrueObject) -> bool,
+}
+
+const FORMS: [Form; 7] = [
+    Form { text: |o| Some(o.category.clone()), is_true: same_noun },
+    Form {
+        text: |o| Some(format!("{} {}", o.colours.first()?, o.category)),
+        is_true: |a, b| same_noun(a, b) && a.colours.first() == b.colours.first(),
+    },
+    // Another word for it.
+    Form {
+        text: |o| o.words.iter().find(|word| **word != o.category).map(|word| format!("the {word}")),
+        is_true: same_noun,
+    },
+    Form {
+        text: |o| use_of(o).cloned(),
+        is_true: |a, b| use_of(a).is_some_and(|kind| b.kinds.contains(kind)),
+    },
+    Form {
+        text: |o| Some(format!("{} {}", adjective(o.material)?, o.category)),
+        is_true: |a, b| same_noun(a, b) && a.material == b.material,
+    },
+    Form { text: |o| Some(format!("where is the {}", o.category)), is_true: same_noun },
+    Form { text: |o| plural(&o.category).map(|noun| format!("find {noun}")), is_true: same_noun },
+];
+
+fn same_noun(a: &TrueObject, b: &TrueObject) -> bool {
+    a.category == b.category
+}
+
+/// What it is for.
+fn use_of(object: &TrueObject) -> Option<&String> {
+    object.kinds.iter().find(|kind| kind.starts_with("something to"))
+}
+
+fn adjective(material: &str) -> Option<&str> {
+    match material {
+        "wood" => Some("wooden"),
+        "metal" | "plastic" | "leather" => Some(material),
+        _ => None,
+    }
+}
+
+/// Returns the plural where it is regular.
+fn plural(noun: &str) -> Option<String> {
+    (!noun.ends_with(['s', 'x', 'h', 'y', 'f'])).then(|| format!("{noun}s"))
+}
+
+/// Returns the questions about the things within `radius_m` of the robot: each form once, for the thing shown best
+/// of those that it fits and that were not asked for yet; then one without an answer.
+pub(super) fn questions(objects: &[TrueObject], robot_in_world: DVec3, radius_m: f64) -> Vec<Asked<'_>> {
+    let mut left: Vec<&TrueObject> = objects
+        .iter()
+        .filter(|o| !o.background && o.train_pixels >= MIN_PIXELS)
+        .filter(|o| o.centre.distance(robot_in_world) < radius_m)
+        .collect();
+    left.sort_by_key(|o| (std::cmp::Reverse(o.train_pixels), o.id));
+    let mut asked = Vec::new();
+    for Form { text, is_true } in FORMS {
+        let Some((object, text)) = left.iter().find_map(|o| Some((*o, text(o)?))) else { continue };
+        left.retain(|other| !same_noun(object, other));
+        asked.push(Asked { text, truth: objects.iter().filter(|other| is_true(object, other)).collect() });
+    }
+    asked.push(Asked { text: ABSENT.into(), truth: Vec::new() });
+    asked
+}
