@@ -6,6 +6,8 @@ mod keys;
 mod progress;
 mod run;
 mod sam;
+mod tradeoff;
+mod views;
 
 use std::process::ExitCode;
 

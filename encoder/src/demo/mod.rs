@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 use slag_models::{ModelDir, SessionOptions};
 
 use crate::embed::Background;
-use crate::encode::{self, EncodeSettings, EncodeSummary, Masks};
+use crate::encode::{self, EncodeSettings, EncodeSummary, Masks, ViewOrder};
 use crate::generate::grammar::{self, SceneKind};
 use crate::generate::{Scene, TrueObject};
 use slag_common::shard::Profile;
@@ -184,6 +184,8 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         metric: true,
         geo: None,
         views_limit: None,
+        view_order: ViewOrder::Names,
+        time_budget: None,
         raster_width_px: None,
         background: Background::White,
         min_mask_px: 200,
@@ -192,6 +194,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         memory_bytes: 1 << 30,
         strict: true,
         restart: false,
+        keep_sums: false,
         // Small cells, so that the demo has several.
         cells: CellLimits { max_gaussians: 16_384, max_width: Some(25.0) },
         shards: ShardSettings {
