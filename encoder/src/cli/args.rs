@@ -10,6 +10,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use slag_common::shard::Profile;
 use slag_models::commands::{ModelsCommand, RunArgs};
 
+use super::eval::{EvalLerfArgs, EvalScannetArgs};
 use super::keys::KeysCommand;
 use super::sam::SamArgs;
 use super::tradeoff::TradeoffArgs;
@@ -304,6 +305,10 @@ pub struct QueryArgs {
 pub enum EvalCommand {
     /// Against a scene whose every Gaussian has a label (`generate scene` makes such).
     Labelled(EvalLabelledArgs),
+    /// Against LangSplat's labels of LERF scenes (LERF-OVS).
+    Lerf(EvalLerfArgs),
+    /// Against ScanNet's labelled meshes, with OpenGaussian's protocol.
+    Scannet(EvalScannetArgs),
 }
 
 /// `eval labelled`.

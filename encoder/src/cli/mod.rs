@@ -2,6 +2,7 @@
 
 mod args;
 mod bench;
+mod eval;
 mod keys;
 mod progress;
 mod run;

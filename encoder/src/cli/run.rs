@@ -55,6 +55,8 @@ pub fn run(cli: Cli) -> Exit {
         Command::Models(command) => run_models(&command, json),
         Command::Push(PushCommand::Qdrant(args)) => run_push(&args, progress.as_ref(), json),
         Command::Eval(EvalCommand::Labelled(args)) => run_eval_labelled(&args, json),
+        Command::Eval(EvalCommand::Lerf(args)) => super::eval::run_lerf(&args, json),
+        Command::Eval(EvalCommand::Scannet(args)) => super::eval::run_scannet(&args, json),
         Command::Generate(command) => run_generate(&command, progress.as_ref()),
         Command::Demo(args) => run_demo(&args, progress.as_ref(), json),
         Command::Devices => run_devices(json),
@@ -347,7 +349,7 @@ fn run_query(args: &QueryArgs, json: bool) -> Result<Exit> {
 }
 
 /// Opens the text encoder that a store was encoded with.
-fn text_encoder_of(reader: &StoreReader, args: &ModelArgs) -> Result<Box<dyn TextEncoder>> {
+pub(super) fn text_encoder_of(reader: &StoreReader, args: &ModelArgs) -> Result<Box<dyn TextEncoder>> {
     let expected = &reader.manifest().encoder;
     let (models, session) = open_models(args)?;
     if slag_common::Hash32(models.encoder_id().hash()) != expected.id {

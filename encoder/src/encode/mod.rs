@@ -20,7 +20,7 @@ use std::sync::{OnceLock, PoisonError};
 use std::time::Instant;
 
 use serde::Serialize;
-use slag_common::manifest::{self, Calibration, EncoderRecord, Manifest};
+use slag_common::manifest::{self, Calibration, CellRecord, EncoderRecord, Manifest};
 use slag_common::poses::{self, PoseError};
 use slag_common::splat::{self, SplatError};
 use slag_common::{Hash32, View};
@@ -181,6 +181,19 @@ pub struct SkippedView {
     pub reason: String,
 }
 
+/// What a cell was given: rows go by its content, bytes by rows and Gaussians.
+#[derive(Clone, Debug, Serialize)]
+pub struct CellReport {
+    /// The cell.
+    pub cell_id: u32,
+    /// Gaussians.
+    pub n_gaussians: u32,
+    /// Palette rows.
+    pub n_rows: u32,
+    /// Bytes of its shards by profile.
+    pub shard_bytes: BTreeMap<String, u64>,
+}
+
 /// What an encode did.
 #[derive(Clone, Debug, Serialize)]
 pub struct EncodeSummary {
@@ -220,6 +233,8 @@ pub struct EncodeSummary {
     pub n_rows: u64,
     /// Bytes of all shards by profile.
     pub shard_bytes: BTreeMap<String, u64>,
+    /// What was spent on each cell.
+    pub cells: Vec<CellReport>,
     /// Seconds spent in each stage, added over threads.
     pub busy_secs: BTreeMap<String, f64>,
     /// How busy the stages of the views were, in their order.
@@ -324,11 +339,13 @@ pub fn encode(
     let done = job.done_views()?;
     let mut used: Vec<usize> = chosen.into_iter().filter(|view| done.contains(&views[*view].name)).collect();
     used.sort_unstable();
+    let coverage = coverage.map(|coverage| coverage.report(used.iter().copied()));
+    let used: Vec<&View> = used.into_iter().map(|view| &views[view]).collect();
     if let (true, Some(first)) = (used.is_empty(), skipped.first()) {
         return Err(EncodeError::NoViews { n_views: skipped.len(), reason: first.reason.clone() });
     }
 
-    let sums_paths: Vec<PathBuf> = used.iter().map(|view| job.sums_path(&views[*view].name)).collect();
+    let sums_paths: Vec<PathBuf> = used.iter().map(|view| job.sums_path(&view.name)).collect();
     let bank = stopwatch.time("texts", || match models.text_encoder(session) {
         Ok(mut encoder) => TextBank::of_model(&mut *encoder),
         Err(e) => {
@@ -346,7 +363,7 @@ pub fn encode(
         n_views: used.len(),
         n_views_there: views.len(),
         view_order: settings.view_order,
-        coverage: coverage.map(|coverage| coverage.report(used.iter().copied())),
+        coverage,
         coverage_secs,
         n_views_resumed: n_resumed,
         n_views_without_masks: builder.n_views_without_masks(),
@@ -357,6 +374,7 @@ pub fn encode(
         n_cells: split.cells.len(),
         n_rows: 0,
         shard_bytes: BTreeMap::new(),
+        cells: Vec::new(),
         busy_secs: BTreeMap::new(),
         view_stages,
         views_secs,
@@ -370,10 +388,15 @@ pub fn encode(
     };
     progress.end();
     for record in &built.records {
-        for (profile, shard) in &record.shards {
-            *summary.shard_bytes.entry(profile.to_string()).or_default() += shard.len_bytes;
+        let shard_bytes = record.shards.iter().map(|(profile, shard)| (profile.to_string(), shard.len_bytes));
+        let shard_bytes: BTreeMap<String, u64> = shard_bytes.collect();
+        for (profile, len_bytes) in &shard_bytes {
+            *summary.shard_bytes.entry(profile.clone()).or_default() += len_bytes;
         }
-        summary.n_rows += record.shards.values().map(|s| u64::from(s.n_rows)).max().unwrap_or(0);
+        let n_rows = record.shards.values().map(|shard| shard.n_rows).max().unwrap_or(0);
+        summary.n_rows += u64::from(n_rows);
+        let CellRecord { cell_id, n_gaussians, .. } = *record;
+        summary.cells.push(CellReport { cell_id, n_gaussians, n_rows, shard_bytes });
     }
     summary.n_without_evidence = built.n_without_evidence;
 

@@ -235,10 +235,10 @@ fn measure_group<'p>(
             encoded = run.encode(&store, &views, &lift)?;
             views_seconds = None;
         }
-        let own_views = number(&encoded, "views_secs");
+        let own_views = run.figure(&encoded, "views_secs")?;
         let of_views = *views_seconds.get_or_insert(own_views);
         let judged = run.evaluate(&store, point.profile, &eval)?;
-        let n_gaussians = number(&encoded, "n_gaussians").max(1.0);
+        let n_gaussians = run.figure(&encoded, "n_gaussians")?.max(1.0);
         let best = |name: &str| judged[name].as_f64();
         let all = &judged["multi_class"][0];
         let figures = Figures {
@@ -248,17 +248,17 @@ fn measure_group<'p>(
             n_views: integer(&encoded, "n_views"),
             n_masks: integer(&encoded, "n_masks"),
             coverage: encoded["coverage"]["coverage"].as_f64(),
-            miou: number(all, "miou"),
-            macc: number(all, "macc"),
+            miou: run.figure(all, "miou")?,
+            macc: run.figure(all, "macc")?,
             map: best("mean_average_precision"),
             auc: best("mean_area_under_roc"),
             localised: best("mean_localised"),
             iou_on_views: best("mean_iou_on_views"),
             n_unknown_words: judged["unknown_words"].as_object().map_or(0, |words| words.len() as u64),
-            seconds: number(&encoded, "wall_secs") - own_views + of_views,
+            seconds: run.figure(&encoded, "wall_secs")? - own_views + of_views,
             views_seconds: of_views,
-            coverage_seconds: number(&encoded, "coverage_secs"),
-            bytes_per_gaussian: number(&encoded["shard_bytes"], point.profile.name()) / n_gaussians,
+            coverage_seconds: run.figure(&encoded, "coverage_secs")?,
+            bytes_per_gaussian: run.figure(&encoded["shard_bytes"], point.profile.name())? / n_gaussians,
             query_ms: run.query_ms(&store, out, point.profile)?,
         };
         // The file last and at once: a point is measured as a whole or not.
@@ -281,10 +281,6 @@ fn file_name(scene: &LabelledScene, point: &Point, programs: &Programs) -> Strin
 
 fn remove(store: &Path) -> std::io::Result<()> {
     if store.exists() { fs_err::remove_dir_all(store) } else { Ok(()) }
-}
-
-fn number(value: &Value, name: &str) -> f64 {
-    value[name].as_f64().unwrap_or(f64::NAN)
 }
 
 fn integer(value: &Value, name: &str) -> u64 {

@@ -122,14 +122,24 @@ impl Runs<'_> {
         }
     }
 
+    /// Returns a figure that a program printed.
+    pub(super) fn figure(&self, printed: &Value, name: &str) -> Result<f64, TradeoffError> {
+        let missing =
+            || self.error("its answer".into(), format!("no {name}: the flags leave nothing to measure"));
+        printed[name].as_f64().ok_or_else(missing)
+    }
+
     fn failed(&self, command: &Command, message: String) -> TradeoffError {
         let words = std::iter::once(command.get_program()).chain(command.get_args());
-        let words: Vec<_> = words.map(OsStr::to_string_lossy).collect();
+        self.error(words.map(OsStr::to_string_lossy).collect::<Vec<_>>().join(" "), message)
+    }
+
+    fn error(&self, command: String, message: String) -> TradeoffError {
         TradeoffError::Program {
             scene: self.scene.name.clone(),
             axis: self.point.axis.clone(),
             name: self.point.name.clone(),
-            command: words.join(" "),
+            command,
             message,
         }
     }
