@@ -65,7 +65,15 @@ fn a_gpu_gives_the_field_of_the_cpu() {
             (house.join("point_cloud.ply"), house.join("sparse/0"), house.join("gt/masks"));
         let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views)]);
         command.args(["--masks", text(&masks), "--store", text(&store), "--device", device]);
-        run_json(command.args(["--views-limit", "6", "--raster-width", "320", "--metric"]));
+        run_json(command.args([
+            "--views-limit",
+            "6",
+            "--view-order",
+            "nth",
+            "--raster-width",
+            "320",
+            "--metric",
+        ]));
         let reader = StoreReader::open(&store).expect("a published store");
         let n_regions = read_regions(&reader).expect("regions").len();
         let mut sums = BTreeMap::new();

@@ -30,6 +30,8 @@ fn sam_finds_masks_the_same_for_any_number_of_threads() {
             text(&root().join("tests/models/conse")),
             "--views-limit",
             "3",
+            "--view-order",
+            "nth",
             "--metric",
         ]);
         // What random weights find is weak.

@@ -90,6 +90,30 @@ pub(super) fn sh_rest_properties(ply: &Ply, element: usize) -> Result<(u8, Vec<u
     }
 }
 
+/// Reads properties of a mesh's or point cloud's vertices: one row a vertex, in the order of `names`.
+///
+/// # Errors
+/// [`SplatError`] for a file that is no PLY, is cut, or lacks one of them.
+pub fn read_vertices<const N: usize>(path: &Path, names: [&str; N]) -> Result<Vec<[f64; N]>, SplatError> {
+    const NO_VERTICES: &str = "pass a PLY whose vertices have it";
+    let mut ply = Ply::open(Input::open(path)?)?;
+    let Some(vertex) = ply.element("vertex") else {
+        return Err(SplatError::Malformed {
+            path: path.into(),
+            place: ply.input.place(),
+            expected: "a header with an element \"vertex\"".into(),
+            found: "none".into(),
+            advice: NO_VERTICES,
+        });
+    };
+    let wanted = names.map(|name| ply.property(vertex, name, NO_VERTICES));
+    let wanted = wanted.into_iter().collect::<Result<Vec<_>, _>>()?;
+    ply.seek_element(vertex)?;
+    let mut rows = Vec::with_capacity(ply.checked_count(vertex)?);
+    ply.rows(&wanted, |row| rows.push(std::array::from_fn(|i| row[i])))?;
+    Ok(rows)
+}
+
 /// Writes Gaussians as the original 3DGS does: binary little-endian, normals of zero, logarithmic
 /// scales, logits of opacities.
 ///

@@ -11,7 +11,7 @@ use slag_common::container::AlignedBytes;
 use slag_common::shard::{Profile, ShardLayout};
 use slag_common::{Gaussians, Hash32};
 
-use super::plot::{Plot, Series};
+use super::plot::{Plot, Scale, Series};
 use super::{Machine, timed_ms};
 use crate::generate::field::Field;
 use crate::palette::matrix::{Panels, Rows};
@@ -436,12 +436,13 @@ impl CodecReport {
             let of_name = self.points.iter().filter(|p| p.codec == name);
             let mut points: Vec<(f64, f64)> = of_name.map(|p| (p.bytes, p.mean_error)).collect();
             points.sort_by(|a, b| a.0.total_cmp(&b.0));
-            Series { name, points }
+            Series { name: name.into(), points }
         });
         let plot = Plot {
             title: format!("{}: {} Gaussians, {} texts", self.title, self.n_gaussians, self.n_texts),
             across: "bytes a Gaussian, position included",
             up: "mean |score error| / spread of scores",
+            up_scale: Scale::Logarithmic,
         };
         plot.svg(&series)
     }

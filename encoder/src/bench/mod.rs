@@ -8,6 +8,7 @@ pub mod lift;
 pub mod plot;
 pub mod raster;
 pub mod scene;
+pub mod tradeoff;
 
 use std::time::Instant;
 

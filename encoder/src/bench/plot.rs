@@ -1,4 +1,4 @@
-//! A small line plot as SVG, both axes logarithmic.
+//! A small line plot as SVG, the horizontal axis logarithmic.
 
 use std::fmt::Write;
 
@@ -14,12 +14,23 @@ pub struct Plot {
     pub across: &'static str,
     /// Vertical axis.
     pub up: &'static str,
+    /// How its values are laid out.
+    pub up_scale: Scale,
+}
+
+/// How an axis lays out values.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scale {
+    /// Equal factors are equally long.
+    Logarithmic,
+    /// Equal differences are.
+    Linear,
 }
 
 /// Points that belong together, positive, in the order of the line through them.
 pub struct Series {
     /// In the legend.
-    pub name: &'static str,
+    pub name: String,
     /// (across, up).
     pub points: Vec<(f64, f64)>,
 }
@@ -28,8 +39,8 @@ impl Plot {
     /// Draws the series.
     pub fn svg(&self, series: &[Series]) -> String {
         let all = || series.iter().flat_map(|s| &s.points).filter(|p| p.0 > 0.0 && p.1 > 0.0);
-        let x = Axis::of(all().map(|p| p.0), MARGIN.0, SIZE.0 - 16.0);
-        let y = Axis::of(all().map(|p| p.1), SIZE.1 - MARGIN.1, 40.0);
+        let x = Axis::of(all().map(|p| p.0), MARGIN.0, SIZE.0 - 16.0, Scale::Logarithmic);
+        let y = Axis::of(all().map(|p| p.1), SIZE.1 - MARGIN.1, 40.0, self.up_scale);
         let (w, h) = SIZE;
         let mut out = format!(
             "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {w} {h}\" font-family=\"sans-serif\" font-size=\"12\">\n\
@@ -97,9 +108,9 @@ impl Plot {
             let _ = writeln!(
                 out,
                 "<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"4\" fill=\"{colour}\"/><text x=\"{:.1}\" y=\"{:.1}\">{}</text>",
-                right - 110.0,
+                right - 150.0,
                 at,
-                right - 100.0,
+                right - 140.0,
                 at + 4.0,
                 series.name
             );
@@ -109,8 +120,8 @@ impl Plot {
     }
 }
 
-/// A logarithmic axis.
 struct Axis {
+    scale: Scale,
     low: f64,
     high: f64,
     from: f64,
@@ -118,21 +129,59 @@ struct Axis {
 }
 
 impl Axis {
-    fn of(values: impl Iterator<Item = f64>, from: f64, to: f64) -> Self {
+    fn of(values: impl Iterator<Item = f64>, from: f64, to: f64, scale: Scale) -> Self {
         let (low, high) = values.fold((f64::MAX, f64::MIN), |(low, high), v| (low.min(v), high.max(v)));
         let (low, high) = if low > high { (1.0, 10.0) } else { (low, high) };
-        Self { low: low / 1.15, high: high * 1.15, from, to }
+        let (low, high) = match scale {
+            Scale::Logarithmic => (low / 1.15, high * 1.15),
+            Scale::Linear => {
+                let margin = (0.08 * (high - low)).max(0.01 * high.abs());
+                (low - margin, high + margin)
+            }
+        };
+        Self { scale, low, high, from, to }
     }
 
     fn at(&self, value: f64) -> f64 {
-        self.from + (self.to - self.from) * (value / self.low).ln() / (self.high / self.low).ln()
+        let share = match self.scale {
+            Scale::Logarithmic => (value / self.low).ln() / (self.high / self.low).ln(),
+            Scale::Linear => (value - self.low) / (self.high - self.low),
+        };
+        self.from + (self.to - self.from) * share
     }
 
-    /// 1, 2 and 5 times powers of ten.
-    fn ticks(&self) -> impl Iterator<Item = f64> + use<> {
-        let (low, high) = (self.low, self.high);
-        (-9..9)
-            .flat_map(|e| [1.0, 2.0, 5.0].map(|m| format!("{m}e{e}").parse::<f64>().unwrap_or(1.0)))
-            .filter(move |v| (low..=high).contains(v))
+    /// 1, 2 and 5 times powers of ten; of a linear axis multiples of one of these, four to ten of them.
+    fn ticks(&self) -> Vec<f64> {
+        let round = || {
+            let factors = |e: i32| [1.0, 2.0, 5.0].map(|m| format!("{m}e{e}").parse::<f64>().unwrap_or(1.0));
+            (-9..9).flat_map(factors)
+        };
+        let inside = |v: &f64| (self.low..=self.high).contains(v);
+        match self.scale {
+            Scale::Logarithmic => round().filter(inside).collect(),
+            Scale::Linear => {
+                let step = round().find(|step| (self.high - self.low) / step <= 10.0).unwrap_or(1.0);
+                let multiples = (self.low / step).ceil() as i64..=(self.high / step).floor() as i64;
+                // Digits that the step does not have are of the product's rounding.
+                let digits = (-step.log10().floor()).max(0.0) as usize;
+                multiples.map(|n| format!("{:.digits$}", n as f64 * step).parse().unwrap_or(0.0)).collect()
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ticks_are_round_and_inside() {
+        let of = |values: [f64; 2], scale| Axis::of(values.into_iter(), 0.0, 1.0, scale).ticks();
+        assert_eq!(of([0.9, 60.0], Scale::Logarithmic), [1.0, 2.0, 5.0, 10.0, 20.0, 50.0]);
+        assert_eq!(of([0.163, 0.219], Scale::Linear), [0.16, 0.17, 0.18, 0.19, 0.2, 0.21, 0.22]);
+        let axis = Axis::of([2.0, 4.0].into_iter(), 100.0, 0.0, Scale::Linear);
+        assert!((axis.at(3.0) - 50.0).abs() < 1e-9 && axis.at(4.0) < axis.at(2.0));
+        // One value alone still is an axis.
+        assert!(Axis::of([0.5].into_iter(), 0.0, 1.0, Scale::Linear).at(0.5).is_finite());
     }
 }

@@ -10,8 +10,11 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use slag_common::shard::Profile;
 use slag_models::commands::{ModelsCommand, RunArgs};
 
+use super::eval::{EvalLerfArgs, EvalScannetArgs};
 use super::keys::KeysCommand;
 use super::sam::SamArgs;
+use super::tradeoff::TradeoffArgs;
+use super::views::ViewsArgs;
 use crate::embed::Background;
 use crate::generate::crops::Split;
 use crate::generate::grammar::SceneKind;
@@ -161,9 +164,12 @@ pub struct EncodeArgs {
     /// Weight that is summed; the preset's if absent. `falloff` is the paper's formula as printed.
     #[arg(long, value_enum)]
     pub weights: Option<WeightsArg>,
-    /// Views to use at most, evenly spread.
+    /// Views to use at most: the first ones of --view-order.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub views_limit: Option<u32>,
+    /// Which views come first, and how long to go on.
+    #[command(flatten)]
+    pub views: ViewsArgs,
     /// Where weights are rasterised: auto (GPUs, else the CPU), gpu, cpu, or an adapter's number.
     #[arg(long, value_name = "DEVICE", default_value_t)]
     pub device: DeviceChoice,
@@ -300,6 +306,10 @@ pub struct QueryArgs {
 pub enum EvalCommand {
     /// Against a scene whose every Gaussian has a label (`generate scene` makes such).
     Labelled(EvalLabelledArgs),
+    /// Against LangSplat's labels of LERF scenes (LERF-OVS).
+    Lerf(EvalLerfArgs),
+    /// Against ScanNet's labelled meshes, with OpenGaussian's protocol.
+    Scannet(EvalScannetArgs),
 }
 
 /// `eval labelled`.
@@ -465,6 +475,8 @@ pub enum BenchCommand {
     Raster(RasterBenchArgs),
     /// From the sparse sums of all views to every Gaussian's embedding, on a made-up scene.
     Lift(LiftBenchArgs),
+    /// What each choice of `encode` costs and gives, on labelled scenes: table, front and plots.
+    Tradeoff(TradeoffArgs),
 }
 
 /// `bench raster`.
@@ -606,6 +618,10 @@ mod tests {
             "--memory 1",
             "--memory 5TB",
             "--views-limit 0",
+            "--view-order best",
+            "--mask-levels 0",
+            "--time-budget 0",
+            "--time-budget inf",
             "--threads 0",
             "--preset best",
             "--background red",

@@ -2,10 +2,13 @@
 
 mod args;
 mod bench;
+mod eval;
 mod keys;
 mod progress;
 mod run;
 mod sam;
+mod tradeoff;
+mod views;
 
 use std::process::ExitCode;
 

@@ -23,6 +23,7 @@ use crate::bench::raster::{Device, RasterBench, RasterReport};
 use crate::bench::scene::{BenchScene, cell_regions, grid_regions};
 use crate::check::{self, CheckOptions, CheckView};
 use crate::demo;
+use crate::encode::coverage::CoverageReport;
 use crate::encode::{self, EncodeError, EncodeSettings, Masks, StageReport};
 use crate::eval::{self, EvalSettings, Truth};
 use crate::generate::{crops, grammar, photos};
@@ -53,6 +54,8 @@ pub fn run(cli: Cli) -> Exit {
         Command::Models(command) => run_models(&command, json),
         Command::Push(PushCommand::Qdrant(args)) => run_push(&args, progress.as_ref(), json),
         Command::Eval(EvalCommand::Labelled(args)) => run_eval_labelled(&args, json),
+        Command::Eval(EvalCommand::Lerf(args)) => super::eval::run_lerf(&args, json),
+        Command::Eval(EvalCommand::Scannet(args)) => super::eval::run_scannet(&args, json),
         Command::Generate(command) => run_generate(&command, progress.as_ref()),
         Command::Demo(args) => run_demo(&args, progress.as_ref(), json),
         Command::Devices => run_devices(json),
@@ -60,6 +63,7 @@ pub fn run(cli: Cli) -> Exit {
         Command::Bench(BenchCommand::Lift(args)) => super::bench::run_lift(&args, json),
         Command::Bench(BenchCommand::Codec(args)) => super::bench::run_codec(&args, json),
         Command::Bench(BenchCommand::Field(args)) => super::bench::run_field(&args, progress.as_ref()),
+        Command::Bench(BenchCommand::Tradeoff(args)) => super::tradeoff::run(&args, progress.as_ref(), json),
     };
     match result {
         Ok(exit) => exit,
@@ -188,7 +192,7 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
     let folder_name = args.store.file_name().map(|name| name.to_string_lossy().into_owned());
     let created_unix_secs = now_unix_secs();
     let masks = match (args.masks.as_str(), args.sam.masks()) {
-        ("auto", masks) => masks.unwrap_or(Masks::Auto),
+        ("auto", masks) => masks.or(args.views.mask_levels.map(Masks::Levels)).unwrap_or(Masks::Auto),
         (dir, Some(_)) => {
             return Err(anyhow!("--masks {dir} gives masks, --segmenter finds some; choose one"));
         }
@@ -204,6 +208,8 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
         metric,
         geo,
         views_limit: args.views_limit.map(|n| n as usize),
+        view_order: args.views.order(args.views_limit),
+        time_budget: args.views.time_budget,
         raster_width_px: args.raster_width,
         background: args.background.map_or(preset_background, Into::into),
         min_mask_px: args.min_mask_px,
@@ -212,6 +218,7 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
         memory_bytes: args.memory,
         strict: args.input.strict,
         restart: args.restart,
+        keep_sums: args.views.keep_sums,
         cells: CellLimits {
             max_gaussians: args.cell_gaussians as usize,
             max_width: metric.then_some(args.cell_width_m),
@@ -264,11 +271,15 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
         0 => String::new(),
         n => format!("left out   {n} views, the first: {}\n", summary.skipped_views[0].reason),
     };
+    let coverage = summary.coverage.map_or(String::new(), |CoverageReport { coverage, seen }| {
+        let (coverage, seen, secs) = (100.0 * coverage, 100.0 * seen, summary.coverage_secs);
+        format!("coverage   {coverage:.1} % of all views, {seen:.1} % of the Gaussians seen; found in {secs:.1} s\n")
+    });
     let images_on = summary.images_on.as_ref().map_or(String::new(), |on| format!("images on  {on}\n"));
     let lines = format!(
         "published  generation {} in {}\n\
          Gaussians  {} ({} without evidence, {} unusable)\n\
-         views      {} ({} resumed, {} without masks)\n{skipped}{images_on}\
+         views      {} of {} ({} resumed, {} without masks)\n{coverage}{skipped}{images_on}\
          masks      {} in {} regions, {} sums\n\
          cells      {} with {} palette rows\n\
          shards     {sizes}\n\
@@ -280,6 +291,7 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
         summary.n_without_evidence,
         summary.n_rejected,
         summary.n_views,
+        summary.n_views_there,
         summary.n_views_resumed,
         summary.n_views_without_masks,
         summary.n_masks,
@@ -326,7 +338,7 @@ fn run_query(args: &QueryArgs, json: bool) -> Result<Exit> {
 }
 
 /// Opens the text encoder that a store was encoded with.
-fn text_encoder_of(reader: &StoreReader, args: &ModelArgs) -> Result<Box<dyn TextEncoder>> {
+pub(super) fn text_encoder_of(reader: &StoreReader, args: &ModelArgs) -> Result<Box<dyn TextEncoder>> {
     let expected = &reader.manifest().encoder;
     let (models, session) = open_models(args)?;
     if slag_common::Hash32(models.encoder_id().hash()) != expected.id {

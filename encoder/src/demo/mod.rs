@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use slag_models::{ModelDir, SessionOptions, TextEncoder};
 
 use crate::embed::Background;
-use crate::encode::{self, EncodeSettings, EncodeSummary, Masks};
+use crate::encode::{self, EncodeSettings, EncodeSummary, Masks, ViewOrder};
 use crate::generate::Scene;
 use crate::generate::grammar::{self, SceneKind};
 use slag_common::shard::Profile;
@@ -187,6 +187,8 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         metric: true,
         geo: None,
         views_limit: None,
+        view_order: ViewOrder::Names,
+        time_budget: None,
         raster_width_px: None,
         background: Background::White,
         min_mask_px: 200,
@@ -195,6 +197,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         memory_bytes: 1 << 30,
         strict: true,
         restart: false,
+        keep_sums: false,
         // Small cells, so that the demo has several.
         cells: CellLimits { max_gaussians: 16_384, max_width: Some(25.0) },
         shards: ShardSettings {

@@ -69,11 +69,7 @@ pub(super) fn answers(
 }
 
 /// Returns the view that shows most of what was found, of those that have the answer nearest to their middle.
-fn best_view(
-    scene: &Gaussians,
-    views: &[RasterView],
-    panel: &Panel<'_>,
-) -> Result<RasterView, RasterError> {
+fn best_view(scene: &Gaussians, views: &[RasterView], panel: &Panel<'_>) -> Result<RasterView, RasterError> {
     let off_axis = |view: &RasterView| {
         let in_camera = view.camera_from_world.transform_point3(panel.answer.position_in_world);
         // Nearer than this an object does not fit the picture.

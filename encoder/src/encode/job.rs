@@ -11,6 +11,8 @@ use crate::store::Store;
 
 const TREE: &str = "job";
 const FINGERPRINT_KEY: &[u8] = b"fingerprint";
+/// There once the views that are done were published, with others left to do.
+const PUBLISHED_KEY: &[u8] = b"published";
 const VIEW_PREFIX: &str = "view/";
 
 /// An encode under way in a store.
@@ -31,13 +33,16 @@ impl<'a> Job<'a> {
         let job = Self { store, records, folder };
         let found = job.records.get(FINGERPRINT_KEY).map_err(|source| records_error(store, source))?;
         let same = found.as_deref() == Some(&fingerprint.0);
-        if found.is_some() && !same && !restart {
+        let published =
+            job.records.contains_key(PUBLISHED_KEY).map_err(|source| records_error(store, source))?;
+        // What is published is not lost with its sums.
+        if found.is_some() && !same && !restart && !published {
             return Err(EncodeError::OtherJob {
                 path: store.dir().to_owned(),
                 n_done: job.done_views()?.len(),
             });
         }
-        if !same {
+        if !same || restart && published {
             job.clear()?;
             job.records
                 .insert(FINGERPRINT_KEY, &fingerprint.0)
@@ -69,6 +74,12 @@ impl<'a> Job<'a> {
         sums.write(&self.sums_path(view))?;
         let key = format!("{VIEW_PREFIX}{view}");
         self.records.insert(key, &[]).map_err(|source| records_error(self.store, source))?;
+        self.flush()
+    }
+
+    /// Keeps the sums of views that were published, for an encode that goes on with others.
+    pub(super) fn keep_published(self) -> Result<(), EncodeError> {
+        self.records.insert(PUBLISHED_KEY, &[]).map_err(|source| records_error(self.store, source))?;
         self.flush()
     }
 

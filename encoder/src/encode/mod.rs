@@ -6,6 +6,7 @@
 //! a run was interrupted.
 
 mod cells;
+pub mod coverage;
 mod job;
 mod pipeline;
 mod settings;
@@ -19,7 +20,7 @@ use std::sync::{OnceLock, PoisonError};
 use std::time::Instant;
 
 use serde::Serialize;
-use slag_common::manifest::{self, Calibration, EncoderRecord, Manifest};
+use slag_common::manifest::{self, Calibration, CellRecord, EncoderRecord, Manifest};
 use slag_common::poses::{self, PoseError};
 use slag_common::splat::{self, SplatError};
 use slag_common::{Hash32, View};
@@ -30,14 +31,15 @@ use crate::ingest::{self, GeoError, IngestError};
 use crate::lift::SumsError;
 use crate::palette::TextBank;
 use crate::progress::Progress;
-use crate::raster::{RasterError, Rasterizer};
-use crate::segment::{GivenMasks, GraphSegmenter, SamSegmenter, SegmentError, Segmenter};
+use crate::raster::{LoadedScene, RasterError, RasterView, Rasterizer};
+use crate::segment::{GivenMasks, GraphSegmenter, GraphSettings, SamSegmenter, SegmentError, Segmenter};
 use crate::shard;
 use crate::store::{Store, StoreError};
 use cells::CellBuilder;
+use coverage::{Coverage, CoverageReport};
 use job::Job;
 pub use pipeline::StageReport;
-pub use settings::{EncodeSettings, Masks};
+pub use settings::{EncodeSettings, Masks, ViewOrder};
 use view::{ViewStages, Work};
 
 /// Why an encode ended without a new generation.
@@ -179,6 +181,19 @@ pub struct SkippedView {
     pub reason: String,
 }
 
+/// What a cell was given: rows go by its content, bytes by rows and Gaussians.
+#[derive(Clone, Debug, Serialize)]
+pub struct CellReport {
+    /// The cell.
+    pub cell_id: u32,
+    /// Gaussians.
+    pub n_gaussians: u32,
+    /// Palette rows.
+    pub n_rows: u32,
+    /// Bytes of its shards by profile.
+    pub shard_bytes: BTreeMap<String, u64>,
+}
+
 /// What an encode did.
 #[derive(Clone, Debug, Serialize)]
 pub struct EncodeSummary {
@@ -192,6 +207,14 @@ pub struct EncodeSummary {
     pub n_rejected: u64,
     /// Views that were used.
     pub n_views: usize,
+    /// Views that there are photos of.
+    pub n_views_there: usize,
+    /// The order in which they were taken.
+    pub view_order: ViewOrder,
+    /// What the used views show of what all show, where views were taken by it.
+    pub coverage: Option<CoverageReport>,
+    /// Seconds of the raster of all views that it took.
+    pub coverage_secs: f64,
     /// Of these, finished by an earlier, interrupted run.
     pub n_views_resumed: usize,
     /// Views without any mask: no mask file, or none large enough.
@@ -210,6 +233,8 @@ pub struct EncodeSummary {
     pub n_rows: u64,
     /// Bytes of all shards by profile.
     pub shard_bytes: BTreeMap<String, u64>,
+    /// What was spent on each cell.
+    pub cells: Vec<CellReport>,
     /// Seconds spent in each stage, added over threads.
     pub busy_secs: BTreeMap<String, f64>,
     /// How busy the stages of the views were, in their order.
@@ -257,7 +282,7 @@ pub fn encode(
     let geo_reference = settings.geo.as_deref().map(ingest::read_geo_reference).transpose()?;
     let read_options = splat::ReadOptions { with_sh_rest: false };
     let scene = stopwatch.time("read", || splat::read(&settings.scene, &read_options))?;
-    let (views, mut skipped) = choose_views(settings)?;
+    let (views, mut skipped) = find_views(settings)?;
     let split = stopwatch.time("cells", || shard::cells::split(&scene, settings.cells));
     if split.cells.is_empty() {
         let n_gaussians = scene.len();
@@ -267,6 +292,11 @@ pub fn encode(
     cells::check_memory(settings.memory_bytes, cells::largest_cell_bytes(&split, models.dim()), 0, 0)?;
     let segmenter: Box<dyn Segmenter> = match &settings.masks {
         Masks::Auto => Box::new(GraphSegmenter::default()),
+        Masks::Levels(n) => {
+            let mut settings = GraphSettings::default();
+            settings.scales.truncate(*n);
+            Box::new(GraphSegmenter::new(settings))
+        }
         Masks::Given { dir, ignore_ids } => Box::new(GivenMasks::open(dir, ignore_ids.clone())?),
         Masks::Sam { dir, settings, n_model_threads } => {
             let session = SessionOptions { intra_op_threads: *n_model_threads, ..session.clone() };
@@ -277,8 +307,11 @@ pub fn encode(
     let job = Job::open(&store, fingerprint, settings.restart)?;
 
     let done = job.done_views()?;
-    let n_resumed = views.iter().filter(|view| done.contains(&view.name)).count();
     let loaded = stopwatch.time("raster", || rasterizer.load(&scene))?;
+    let coverage_start = Instant::now();
+    let (chosen, coverage) = choose_views(settings, loaded.as_ref(), scene.len(), &views, cancel)?;
+    let coverage_secs = coverage.as_ref().map_or(0.0, |_| coverage_start.elapsed().as_secs_f64());
+    let n_resumed = chosen.iter().filter(|view| done.contains(&views[**view].name)).count();
     let stages = ViewStages {
         settings,
         scene: loaded.as_ref(),
@@ -292,14 +325,22 @@ pub fn encode(
         preprocess: models.preprocess(),
         encoders: Mutex::default(),
     };
-    progress.begin("views", "view", views.len() as u64, n_resumed as u64);
+    progress.begin("views", "view", chosen.len() as u64, n_resumed as u64);
     let views_start = Instant::now();
-    let (view_stages, left_out) = run_views(&stages, &views, cancel)?;
+    let deadline = settings.time_budget.and_then(|budget| start.checked_add(budget));
+    let in_order: Vec<&View> = chosen.iter().map(|view| &views[*view]).collect();
+    let (view_stages, left_out) = run_views(&stages, &in_order, deadline, cancel)?;
     let views_secs = views_start.elapsed().as_secs_f64();
+    let n_failed = left_out.len();
     skipped.extend(left_out);
     progress.end();
     skipped.sort_by(|a, b| a.view.cmp(&b.view));
-    let used: Vec<&View> = views.iter().filter(|v| !skipped.iter().any(|s| s.view == v.name)).collect();
+    // In the order of names, whatever the order of the work.
+    let done = job.done_views()?;
+    let mut used: Vec<usize> = chosen.into_iter().filter(|view| done.contains(&views[*view].name)).collect();
+    used.sort_unstable();
+    let coverage = coverage.map(|coverage| coverage.report(used.iter().copied()));
+    let used: Vec<&View> = used.into_iter().map(|view| &views[view]).collect();
     if let (true, Some(first)) = (used.is_empty(), skipped.first()) {
         return Err(EncodeError::NoViews { n_views: skipped.len(), reason: first.reason.clone() });
     }
@@ -320,6 +361,10 @@ pub fn encode(
         n_without_evidence: 0,
         n_rejected: split.n_rejected as u64,
         n_views: used.len(),
+        n_views_there: views.len(),
+        view_order: settings.view_order,
+        coverage,
+        coverage_secs,
         n_views_resumed: n_resumed,
         n_views_without_masks: builder.n_views_without_masks(),
         skipped_views: skipped,
@@ -329,6 +374,7 @@ pub fn encode(
         n_cells: split.cells.len(),
         n_rows: 0,
         shard_bytes: BTreeMap::new(),
+        cells: Vec::new(),
         busy_secs: BTreeMap::new(),
         view_stages,
         views_secs,
@@ -342,10 +388,15 @@ pub fn encode(
     };
     progress.end();
     for record in &built.records {
-        for (profile, shard) in &record.shards {
-            *summary.shard_bytes.entry(profile.to_string()).or_default() += shard.len_bytes;
+        let shard_bytes = record.shards.iter().map(|(profile, shard)| (profile.to_string(), shard.len_bytes));
+        let shard_bytes: BTreeMap<String, u64> = shard_bytes.collect();
+        for (profile, len_bytes) in &shard_bytes {
+            *summary.shard_bytes.entry(profile.clone()).or_default() += len_bytes;
         }
-        summary.n_rows += record.shards.values().map(|s| u64::from(s.n_rows)).max().unwrap_or(0);
+        let n_rows = record.shards.values().map(|shard| shard.n_rows).max().unwrap_or(0);
+        summary.n_rows += u64::from(n_rows);
+        let CellRecord { cell_id, n_gaussians, .. } = *record;
+        summary.cells.push(CellReport { cell_id, n_gaussians, n_rows, shard_bytes });
     }
     summary.n_without_evidence = built.n_without_evidence;
 
@@ -376,7 +427,11 @@ pub fn encode(
         cells: built.records,
     };
     store.publish(&manifest, &built.extras)?;
-    job.finish()?;
+    // With views left to do the sums stay: the next encode goes on from them.
+    match settings.keep_sums || done.len() + n_failed < views.len() {
+        true => job.keep_published()?,
+        false => job.finish()?,
+    }
     store.prune()?;
     summary.busy_secs = stopwatch
         .0
@@ -392,8 +447,8 @@ pub fn encode(
     Ok(summary)
 }
 
-/// Reads the poses, leaves out views without a photo, and applies the limit.
-fn choose_views(settings: &EncodeSettings) -> Result<(Vec<View>, Vec<SkippedView>), EncodeError> {
+/// Reads the poses and leaves out views without a photo. Both lists are in the order of names.
+fn find_views(settings: &EncodeSettings) -> Result<(Vec<View>, Vec<SkippedView>), EncodeError> {
     let views = poses::read(&settings.views, settings.images.as_deref())?.views;
     let missing: Vec<String> = ingest::missing_images(&views).into_iter().map(|v| v.name.clone()).collect();
     if let (true, Some(first)) = (settings.strict, ingest::missing_images(&views).first()) {
@@ -410,25 +465,60 @@ fn choose_views(settings: &EncodeSettings) -> Result<(Vec<View>, Vec<SkippedView
         let reason = skipped.first().map_or("there are none".into(), |s| s.reason.clone());
         return Err(EncodeError::NoViews { n_views, reason });
     }
-    let limit = settings.views_limit.unwrap_or(usize::MAX).clamp(1, there.len());
-    // Evenly spread over the order of names, which mostly is the order in which they were taken.
-    let n = there.len();
-    let chosen: Vec<usize> = (0..limit).map(|i| i * n / limit).collect();
-    let views =
-        there.into_iter().enumerate().filter(|(i, _)| chosen.binary_search(i).is_ok()).map(|(_, v)| v);
-    Ok((views.collect(), skipped))
+    Ok((there, skipped))
 }
 
-/// Works off the views that are not done yet. Returns how busy the stages were, and the views that were left out.
+/// Returns the views to use, as numbers in the order in which they are to be taken.
+fn choose_views(
+    settings: &EncodeSettings,
+    scene: &dyn LoadedScene,
+    n_gaussians: usize,
+    views: &[View],
+    cancel: &AtomicBool,
+) -> Result<(Vec<usize>, Option<Coverage>), EncodeError> {
+    let n = views.len();
+    let limit = settings.views_limit.unwrap_or(n).clamp(1, n);
+    let spread = |limit: usize| (0..limit).map(|i| i * n / limit).collect::<Vec<_>>();
+    Ok(match settings.view_order {
+        ViewOrder::Names => ((0..limit).collect(), None),
+        // With a budget every beginning must be spread, with a limit the whole.
+        ViewOrder::Nth if settings.time_budget.is_some() => {
+            let chosen = spread(limit);
+            (coverage::spread_order(limit).into_iter().map(|i| chosen[i]).collect(), None)
+        }
+        ViewOrder::Nth => (spread(limit), None),
+        ViewOrder::Coverage => {
+            let raster_view =
+                |v: &View| RasterView { camera_from_world: v.camera_from_world, intrinsics: v.intrinsics };
+            let raster_views: Vec<RasterView> = views.iter().map(raster_view).collect();
+            let measured = Coverage::measure(scene, n_gaussians, &raster_views, cancel);
+            let coverage = measured
+                .map_err(|(view, source)| EncodeError::Raster { view: views[view].name.clone(), source })?
+                .ok_or(EncodeError::Interrupted { n_done: 0, n_views: limit })?;
+            let mut order = coverage.order();
+            order.truncate(limit);
+            (order, Some(coverage))
+        }
+    })
+}
+
+/// Works off the views that are not done yet, none begun after `deadline` but a first one. Returns how busy the
+/// stages were, and the views that were left out.
 fn run_views(
     stages: &ViewStages<'_>,
-    views: &[View],
+    views: &[&View],
+    deadline: Option<Instant>,
     cancel: &AtomicBool,
 ) -> Result<(Vec<StageReport>, Vec<SkippedView>), EncodeError> {
     let done = stages.job.done_views()?;
-    let open = views.iter().filter(|view| !done.contains(&view.name));
-    // No view is begun once the user has said stop; those at hand are finished.
-    let source = open.take_while(|_| !cancel.load(Ordering::Relaxed)).map(Work::begin);
+    let mut has_some = views.iter().any(|view| done.contains(&view.name));
+    let open = views.iter().copied().filter(|view| !done.contains(&view.name));
+    // No view is begun once the user has said stop or the time is over; those at hand are finished.
+    let may_begin = move |_: &&View| {
+        let in_time = deadline.is_none_or(|deadline| Instant::now() < deadline);
+        !cancel.load(Ordering::Relaxed) && (in_time || !std::mem::replace(&mut has_some, true))
+    };
+    let source = open.take_while(may_begin).map(Work::begin);
     let skipped = Mutex::new(Vec::new());
     let reports = pipeline::run(&stages.stages(), stages.settings.threads.max(1), source, |_, work| {
         let view = work.view();

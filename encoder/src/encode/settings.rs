@@ -1,6 +1,7 @@
 //! What an encode is told, and the fingerprint by which an interrupted one is recognised.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use serde::Serialize;
 use slag_common::{Gaussians, Hash32, View};
@@ -18,6 +19,8 @@ use crate::shard::cells::CellLimits;
 pub enum Masks {
     /// From the built-in segmenter.
     Auto,
+    /// From the built-in segmenter with the coarsest of its scales only.
+    Levels(usize),
     /// From files that the user gives.
     Given {
         /// Their folder.
@@ -34,6 +37,18 @@ pub enum Masks {
         /// Threads within a run of the model. Another number may change masks in the last bits of their logits.
         n_model_threads: usize,
     },
+}
+
+/// The order in which views are taken; it matters where not all of them are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ViewOrder {
+    /// By their names.
+    Names,
+    /// Evenly spread over the names, which mostly is the order in which they were taken.
+    Nth,
+    /// Those first that together show most of the scene; see [`super::coverage`].
+    Coverage,
 }
 
 /// What to encode and how.
@@ -55,8 +70,12 @@ pub struct EncodeSettings {
     pub metric: bool,
     /// A geo-reference file.
     pub geo: Option<PathBuf>,
-    /// Views to use at most, evenly spread.
+    /// Views to use at most: the first ones of the order.
     pub views_limit: Option<usize>,
+    /// The order in which views are taken. What is made of a given set of views does not depend on it.
+    pub view_order: ViewOrder,
+    /// Time after which no view is begun, from the start; at least one view is used.
+    pub time_budget: Option<Duration>,
     /// Width at which weights are rasterised; the photo's own, at most [`MAX_RASTER_WIDTH_PX`], if absent.
     pub raster_width_px: Option<u32>,
     /// What fills a crop outside its mask.
@@ -73,6 +92,8 @@ pub struct EncodeSettings {
     pub strict: bool,
     /// Whether an unfinished encode of other settings is dropped.
     pub restart: bool,
+    /// Whether the views' sums stay once all are published, for another encode that makes something else of them.
+    pub keep_sums: bool,
     /// How large a cell may become.
     pub cells: CellLimits,
     /// How fine shards are.

@@ -6,7 +6,11 @@
 //! al. 2023): the scores are rendered, the best pixel must lie on the thing (localisation), and the pixels
 //! above the threshold are compared with its mask.
 
+pub mod lerf;
 pub mod metrics;
+#[cfg(test)]
+mod public_tests;
+pub mod scannet;
 mod truth;
 
 use std::collections::BTreeMap;
@@ -58,12 +62,26 @@ const ABSENT: [&str; 24] = [
     "traffic light",
 ];
 
+/// Said beside figures of public data sets.
+const NO_PAPER_ROWS: &str = "published rows: this project's files have none to quote";
+
 /// Why an evaluation ended without figures.
 #[derive(Debug, thiserror::Error)]
 pub enum EvalError {
     /// The labels cannot be used.
     #[error(transparent)]
     Truth(#[from] TruthError),
+    /// The splat is another one than was encoded.
+    #[error("the store has {n_store} Gaussians, the splat {n_scene}; give the splat that was encoded")]
+    Scene {
+        /// Gaussians of the store.
+        n_store: usize,
+        /// Gaussians of the splat.
+        n_scene: usize,
+    },
+    /// The scan cannot be used.
+    #[error(transparent)]
+    Scan(#[from] scannet::ScanError),
     /// The store cannot be scored.
     #[error(transparent)]
     Query(#[from] QueryError),
@@ -180,6 +198,7 @@ pub fn labelled(
     rasterizer: &dyn Rasterizer,
     settings: &EvalSettings,
 ) -> Result<EvalReport, EvalError> {
+    check_scene(reader, scene)?;
     let all = truth.categories();
     let mut unknown_words = BTreeMap::new();
     let mut first_error = None;
@@ -309,6 +328,13 @@ pub fn labelled(
         n_without_evidence,
         n_unlabelled,
     })
+}
+
+/// Refuses a splat that is not the one that was encoded.
+fn check_scene(reader: &StoreReader, scene: &Gaussians) -> Result<(), EvalError> {
+    let manifest = reader.manifest();
+    let n_store = (manifest.n_gaussians + manifest.n_rejected) as usize;
+    if n_store != scene.len() { Err(EvalError::Scene { n_store, n_scene: scene.len() }) } else { Ok(()) }
 }
 
 /// Renders a word's scores on the views that show its things; whether the best pixel lies on one (1 or 0), and

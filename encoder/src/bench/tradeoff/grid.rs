@@ -1,0 +1,213 @@
+//! The grid as data: which flags are tried. A file of one's own is as good as those that are built in.
+//!
+//! ```json
+//! {"points": [{
+//!   "axis": "views by coverage", "name": "1/4",
+//!   "views": "--view-order coverage --views-limit {views/4}",
+//!   "lift": "--compact-error 0.1",
+//!   "eval": "", "profile": "compact"
+//! }]}
+//! ```
+//!
+//! `axis` is the curve of the plots that a point belongs to; `views` are flags of `encode` on which the views' sums
+//! depend, `lift` those that only change what is made of the sums; `eval` are flags of `eval labelled`; the shards of
+//! `profile` are judged, weighed and asked.
+//!
+//! `{masks}` is the scene's folder of true masks; `{views/N}` an N-th of its views, at least one. Points of the same
+//! scene with the same `views` share one store, and their sums are computed once.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use slag_common::poses;
+use slag_common::shard::Profile;
+
+use super::TradeoffError;
+
+const QUICK: &str = include_str!("quick.json");
+const FULL: &str = include_str!("full.json");
+
+/// Points to measure.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Grid {
+    /// The points; those that share sums need not be neighbours.
+    pub points: Vec<Point>,
+}
+
+/// One way of encoding a scene.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+pub struct Point {
+    /// What is varied.
+    pub axis: String,
+    /// How.
+    pub name: String,
+    /// Flags of `encode` on which sums depend.
+    #[serde(default)]
+    pub views: String,
+    /// Other flags of `encode`.
+    #[serde(default)]
+    pub lift: String,
+    /// Flags of `eval labelled`.
+    #[serde(default)]
+    pub eval: String,
+    /// Which shards count.
+    #[serde(default = "compact")]
+    pub profile: Profile,
+}
+
+fn compact() -> Profile {
+    Profile::Compact
+}
+
+impl Grid {
+    /// Returns the grid for a first look: ten minutes on two cores for a scene of a hundred thousand Gaussians and
+    /// a hundred views with given masks.
+    ///
+    /// # Errors
+    /// None; a test reads it.
+    pub fn quick() -> Result<Self, TradeoffError> {
+        Self::parse(QUICK, Path::new("quick.json"))
+    }
+
+    /// Returns the grid that the docs' figures are from.
+    ///
+    /// # Errors
+    /// None; a test reads it.
+    pub fn full() -> Result<Self, TradeoffError> {
+        Self::parse(FULL, Path::new("full.json"))
+    }
+
+    /// Reads a grid.
+    ///
+    /// # Errors
+    /// [`TradeoffError::Grid`].
+    pub fn read(path: &Path) -> Result<Self, TradeoffError> {
+        Self::parse(&fs_err::read_to_string(path)?, path)
+    }
+
+    fn parse(text: &str, path: &Path) -> Result<Self, TradeoffError> {
+        let wrong = |what: String| TradeoffError::Grid { path: path.to_owned(), what };
+        let grid: Self = serde_json::from_str(text).map_err(|error| wrong(error.to_string()))?;
+        for (number, point) in grid.points.iter().enumerate() {
+            let twice = grid.points[..number].iter().any(|p| p.axis == point.axis && p.name == point.name);
+            if twice {
+                return Err(wrong(format!("{} / {} occurs twice", point.axis, point.name)));
+            }
+        }
+        Ok(grid)
+    }
+}
+
+/// A labelled scene: splat and poses beside `gt/` and `test/`, as `generate scene` and the labelled house have them.
+#[derive(Clone, Debug)]
+pub struct LabelledScene {
+    /// Its folder's name.
+    pub name: String,
+    /// Its folder.
+    pub dir: PathBuf,
+    /// The splat.
+    pub splat: PathBuf,
+    /// The poses.
+    pub poses: PathBuf,
+    /// Views of them.
+    pub n_views: usize,
+}
+
+impl LabelledScene {
+    /// Looks what a folder holds.
+    ///
+    /// # Errors
+    /// [`TradeoffError::Scene`], [`TradeoffError::Poses`].
+    pub fn find(dir: &Path) -> Result<Self, TradeoffError> {
+        let first = |names: &[&str], what: &'static str| {
+            let found = names.iter().map(|name| dir.join(name)).find(|path| path.exists());
+            found.ok_or_else(|| TradeoffError::Scene {
+                dir: dir.to_owned(),
+                what: format!("no {what} ({})", names.join(", ")),
+            })
+        };
+        let splat = first(&["scene.ply", "point_cloud.ply", "point_cloud.spz"], "splat")?;
+        let poses = first(&["sparse/0", "transforms.json"], "poses")?;
+        first(&["gt/gaussian_instance.npy"], "labels")?;
+        let n_views = poses::read(&poses, None)?.views.len();
+        let name = dir.canonicalize()?.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        Ok(Self { name, dir: dir.to_owned(), splat, poses, n_views })
+    }
+
+    /// Returns the folder of true masks, where there is one.
+    pub fn masks(&self) -> Option<PathBuf> {
+        Some(self.dir.join("gt/masks")).filter(|path| path.is_dir())
+    }
+
+    /// Puts the scene's own values into flags; `None` where it lacks them.
+    ///
+    /// # Errors
+    /// [`TradeoffError::Flags`] for a placeholder that nobody knows.
+    pub fn expand(&self, flags: &str) -> Result<Option<Vec<String>>, TradeoffError> {
+        let unknown = |word: &str| TradeoffError::Flags { flags: flags.to_owned(), word: word.to_owned() };
+        let mut words = Vec::new();
+        for word in flags.split_whitespace() {
+            let inner = word.strip_prefix('{').and_then(|word| word.strip_suffix('}'));
+            words.push(match inner {
+                None if word.contains(['{', '}']) => return Err(unknown(word)),
+                None => word.to_owned(),
+                Some("masks") => match self.masks() {
+                    Some(path) => path.display().to_string(),
+                    None => return Ok(None),
+                },
+                Some(inner) => {
+                    let share = inner.strip_prefix("views/").and_then(|n| n.parse().ok());
+                    let n: usize = share.filter(|n| *n > 0).ok_or_else(|| unknown(word))?;
+                    (self.n_views / n).max(1).to_string()
+                }
+            });
+        }
+        Ok(Some(words))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn scene(dir: &Path) -> LabelledScene {
+        let path = dir.to_owned();
+        LabelledScene { name: "a".into(), dir: path.clone(), splat: path.clone(), poses: path, n_views: 96 }
+    }
+
+    #[test]
+    fn built_in_grids_are_sound() {
+        let dir = tempfile::tempdir().expect("a folder");
+        fs_err::create_dir_all(dir.path().join("gt/masks")).expect("makes");
+        for grid in [Grid::quick(), Grid::full()] {
+            let grid = grid.expect("a grid");
+            assert!(grid.points.len() > 5);
+            for point in &grid.points {
+                for flags in [&point.views, &point.lift, &point.eval] {
+                    assert!(scene(dir.path()).expand(flags).expect("known words").is_some(), "{flags}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn placeholders_are_the_scenes() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let scene = scene(dir.path());
+        let words = scene.expand("--views-limit {views/4} --x").expect("known").expect("there");
+        assert_eq!(words, ["--views-limit", "24", "--x"]);
+        assert_eq!(scene.expand("--masks {masks}").expect("known"), None, "the scene has none");
+        for wrong in ["{views/0}", "{view}", "{views/x}", "a{masks}"] {
+            let message = scene.expand(wrong).expect_err("unknown").to_string();
+            assert!(message.contains(wrong), "{message}");
+        }
+        let wrong = r#"{"points": [{"axis": "a", "name": "b"}, {"axis": "a", "name": "b"}]}"#;
+        let message = Grid::parse(wrong, Path::new("g.json")).expect_err("twice").to_string();
+        assert!(message.contains("g.json") && message.contains("a / b occurs twice"), "{message}");
+        let message =
+            Grid::parse(r#"{"points": [{"name": "b"}]}"#, Path::new("g.json")).expect_err("no axis");
+        assert!(message.to_string().contains("axis"), "{message}");
+    }
+}

@@ -1,0 +1,220 @@
+//! Tables and plots of what was measured.
+
+use std::fmt;
+use std::path::Path;
+
+use serde::Serialize;
+
+use super::{Figures, TradeoffError};
+use crate::bench::Machine;
+use crate::bench::plot::{Plot, Scale, Series};
+
+/// What was measured.
+#[derive(Clone, Debug, Serialize)]
+pub struct TradeoffReport {
+    /// Where.
+    pub machine: Machine,
+    /// Seconds of the paper's Table, on its machine and scenes.
+    pub paper_seconds: [f64; 4],
+    /// All points, in the order of scenes and grid.
+    pub figures: Vec<Figures>,
+    /// Points that a scene has no data for.
+    pub left_out: Vec<String>,
+}
+
+/// What accuracy is weighed against.
+struct Cost {
+    /// Name of the plots' files.
+    file: &'static str,
+    axis: &'static str,
+    of: fn(&Figures) -> Option<f64>,
+}
+
+const COSTS: [Cost; 3] = [
+    Cost { file: "seconds", axis: "seconds of the encode", of: |f| Some(f.seconds) },
+    Cost { file: "bytes", axis: "bytes a Gaussian", of: |f| Some(f.bytes_per_gaussian) },
+    Cost { file: "query", axis: "milliseconds of a query", of: |f| f.query_ms },
+];
+
+/// Returns which of (cost, accuracy) no other beats: none cheaper or as cheap is better, none as good is cheaper.
+pub fn pareto(points: &[(f64, f64)]) -> Vec<bool> {
+    let beats = |a: &(f64, f64), b: &(f64, f64)| a.0 <= b.0 && a.1 >= b.1 && a != b;
+    points.iter().map(|point| !points.iter().any(|other| beats(other, point))).collect()
+}
+
+impl TradeoffReport {
+    /// Writes `tradeoff.csv`, `tradeoff.json`, `tradeoff.txt` and the plots.
+    pub(super) fn write(&self, out: &Path) -> Result<(), TradeoffError> {
+        fs_err::write(out.join("tradeoff.csv"), self.csv())?;
+        fs_err::write(
+            out.join("tradeoff.json"),
+            serde_json::to_vec_pretty(self).map_err(std::io::Error::from)?,
+        )?;
+        fs_err::write(out.join("tradeoff.txt"), self.to_string())?;
+        for scene in self.scenes() {
+            for cost in &COSTS {
+                if let Some(svg) = self.svg(scene, cost) {
+                    fs_err::write(out.join(format!("{scene}-{}.svg", cost.file)), svg)?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn scenes(&self) -> Vec<&str> {
+        let mut scenes: Vec<&str> = self.figures.iter().map(|f| f.scene.as_str()).collect();
+        scenes.dedup();
+        scenes
+    }
+
+    fn of(&self, scene: &str) -> Vec<&Figures> {
+        self.figures.iter().filter(|f| f.scene == scene).collect()
+    }
+
+    /// Returns for each cost which points of a scene nobody beats.
+    fn fronts(&self, scene: &str) -> Vec<Vec<bool>> {
+        let of_cost = |cost: &Cost| {
+            // What has no cost is never in front.
+            let value = |f: &&Figures| (cost.of)(f).map_or((f64::MAX, f64::MIN), |value| (value, f.miou));
+            let points: Vec<(f64, f64)> = self.of(scene).iter().map(value).collect();
+            pareto(&points)
+                .into_iter()
+                .zip(&points)
+                .map(|(front, point)| front && point.0 < f64::MAX)
+                .collect()
+        };
+        COSTS.iter().map(of_cost).collect()
+    }
+
+    fn csv(&self) -> String {
+        let quote = |text: &str| format!("\"{}\"", text.replace('"', "\"\""));
+        let show = |value: Option<f64>| value.map_or(String::new(), |v| v.to_string());
+        let mut out = String::from(
+            "scene,axis,name,views flags,lift flags,eval flags,profile,views,masks,coverage,miou,macc,map,auc,\
+             localised,iou on views,unknown words,seconds,seconds of views,seconds of coverage,bytes a Gaussian,\
+             query ms\n",
+        );
+        for f in &self.figures {
+            let p = &f.point;
+            let texts =
+                [&f.scene, &p.axis, &p.name, &p.views, &p.lift, &p.eval].map(|text| quote(text)).join(",");
+            let figures = [
+                p.profile.name().to_owned(),
+                f.n_views.to_string(),
+                f.n_masks.to_string(),
+                show(f.coverage),
+                f.miou.to_string(),
+                f.macc.to_string(),
+                show(f.map),
+                show(f.auc),
+                show(f.localised),
+                show(f.iou_on_views),
+                f.n_unknown_words.to_string(),
+                f.seconds.to_string(),
+                f.views_seconds.to_string(),
+                f.coverage_seconds.to_string(),
+                f.bytes_per_gaussian.to_string(),
+                show(f.query_ms),
+            ];
+            out += &format!("{texts},{}\n", figures.join(","));
+        }
+        out
+    }
+
+    /// Draws accuracy against a cost: a line an axis of the grid, and one along the front.
+    fn svg(&self, scene: &str, cost: &Cost) -> Option<String> {
+        let of_scene = self.of(scene);
+        let at = |f: &Figures| (cost.of)(f).map(|value| (value, f.miou));
+        let sorted = |mut points: Vec<(f64, f64)>| {
+            points.sort_by(|a, b| a.0.total_cmp(&b.0));
+            points
+        };
+        let mut series: Vec<Series> = Vec::new();
+        for f in &of_scene {
+            let Some(point) = at(f) else { continue };
+            match series.iter_mut().find(|series| series.name == f.point.axis) {
+                Some(series) => series.points.push(point),
+                None => series.push(Series { name: f.point.axis.clone(), points: vec![point] }),
+            }
+        }
+        series.iter_mut().for_each(|series| series.points = sorted(std::mem::take(&mut series.points)));
+        let all: Vec<(f64, f64)> = of_scene.iter().filter_map(|f| at(f)).collect();
+        if all.is_empty() {
+            return None;
+        }
+        let front = all.iter().zip(pareto(&all)).filter(|(_, front)| *front).map(|(point, _)| *point);
+        series.push(Series { name: "nothing better".into(), points: sorted(front.collect()) });
+        let plot = Plot {
+            title: format!("{scene}: accuracy against {}", cost.axis),
+            across: cost.axis,
+            up: "multi-class mIoU",
+            up_scale: Scale::Linear,
+        };
+        Some(plot.svg(&series))
+    }
+}
+
+impl fmt::Display for TradeoffReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let show = |value: Option<f64>, n: usize| value.map_or("-".into(), |v| format!("{v:.n$}"));
+        for scene in self.scenes() {
+            let fronts = self.fronts(scene);
+            writeln!(
+                f,
+                "{scene}: marks say that no point is better and no more of seconds (s), bytes (b), query time (q)"
+            )?;
+            writeln!(
+                f,
+                "{:<3} {:<20} {:<16} {:>8} {:>6} {:>7} {:>6} {:>6} {:>6} {:>8} {:>8} {:>8}",
+                "",
+                "axis",
+                "point",
+                "seconds",
+                "views",
+                "masks",
+                "mIoU",
+                "mAcc",
+                "AUC",
+                "IoU 2D",
+                "bytes/G",
+                "query ms"
+            )?;
+            for (number, p) in self.of(scene).into_iter().enumerate() {
+                let marks: String = ["s", "b", "q"]
+                    .iter()
+                    .zip(&fronts)
+                    .filter(|(_, front)| front[number])
+                    .map(|(m, _)| *m)
+                    .collect();
+                writeln!(
+                    f,
+                    "{marks:<3} {:<20} {:<16} {:>8.1} {:>6} {:>7} {:>6.3} {:>6.3} {:>6} {:>8} {:>8.2} {:>8}",
+                    p.point.axis,
+                    p.point.name,
+                    p.seconds,
+                    p.n_views,
+                    p.n_masks,
+                    p.miou,
+                    p.macc,
+                    show(p.auc, 3),
+                    show(p.iou_on_views, 3),
+                    p.bytes_per_gaussian,
+                    show(p.query_ms, 3)
+                )?;
+            }
+        }
+        for point in &self.left_out {
+            writeln!(f, "left out: {point}")?;
+        }
+        let unknown = self.figures.iter().map(|f| f.n_unknown_words).max().unwrap_or(0);
+        if unknown > 0 {
+            writeln!(f, "{unknown} categories are in no mean: the encoder does not know their words")?;
+        }
+        let paper = self.paper_seconds.map(|s| s.to_string()).join(", ");
+        writeln!(
+            f,
+            "the paper's Table (Szilagyi et al. 2025), other scenes on another machine: {paper} s; its mIoU beside them \
+             is not in this project's files and is not quoted"
+        )
+    }
+}

@@ -1,0 +1,53 @@
+//! The flags that choose among views, and how many masks they get.
+
+use std::time::Duration;
+
+use clap::{Args, ValueEnum};
+
+use crate::encode::ViewOrder;
+
+/// Which views come first, and how long to go on. Sums of views are kept until all are used, so an encode with a
+/// higher limit or more time goes on from there.
+#[derive(Debug, Args)]
+pub struct ViewsArgs {
+    /// Order in which views are taken [default: coverage with a limit or a budget, else names].
+    #[arg(long, value_enum, value_name = "ORDER")]
+    view_order: Option<ViewOrderArg>,
+    /// Seconds after which no further view is begun; what is there then is published.
+    #[arg(long, value_name = "SECS", value_parser = parse_secs)]
+    pub time_budget: Option<Duration>,
+    /// Scales at which the built-in segmenter looks, coarsest first, 1 to 5 [default: 5].
+    #[arg(long, value_name = "N", value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=5))]
+    pub mask_levels: Option<usize>,
+    /// Keeps the sums of all views, so that another encode of the same views, with another palette say, is quick.
+    #[arg(long)]
+    pub keep_sums: bool,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum ViewOrderArg {
+    /// Those first that together show most of the scene, found by a small raster of all views.
+    Coverage,
+    /// By their names.
+    Names,
+    /// Evenly spread over the names.
+    Nth,
+}
+
+impl ViewsArgs {
+    /// Returns the order that the flags stand for.
+    pub(super) fn order(&self, views_limit: Option<u32>) -> ViewOrder {
+        match self.view_order {
+            Some(ViewOrderArg::Coverage) => ViewOrder::Coverage,
+            Some(ViewOrderArg::Names) => ViewOrder::Names,
+            Some(ViewOrderArg::Nth) => ViewOrder::Nth,
+            None if views_limit.is_some() || self.time_budget.is_some() => ViewOrder::Coverage,
+            None => ViewOrder::Names,
+        }
+    }
+}
+
+fn parse_secs(text: &str) -> Result<Duration, String> {
+    let secs = text.parse().ok().filter(|secs: &f64| *secs > 0.0);
+    secs.and_then(|secs| Duration::try_from_secs_f64(secs).ok()).ok_or_else(|| "seconds above 0".into())
+}
