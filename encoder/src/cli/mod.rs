@@ -3,7 +3,9 @@
 mod args;
 mod bench;
 mod keys;
+mod noise;
 mod progress;
+mod refine;
 mod run;
 mod sam;
 

@@ -31,7 +31,7 @@ use crate::lift::SumsError;
 use crate::palette::TextBank;
 use crate::progress::Progress;
 use crate::raster::{RasterError, Rasterizer};
-use crate::segment::{GivenMasks, GraphSegmenter, SamSegmenter, SegmentError, Segmenter};
+use crate::segment::{GivenMasks, GraphSegmenter, NoisyMasks, SamSegmenter, SegmentError, Segmenter};
 use crate::shard;
 use crate::store::{Store, StoreError};
 use cells::CellBuilder;
@@ -273,6 +273,10 @@ pub fn encode(
             Box::new(SamSegmenter::open(dir, settings.clone(), &session)?)
         }
     };
+    let segmenter = match settings.mask_noise {
+        Some(noise) => Box::new(NoisyMasks::new(segmenter, noise)),
+        None => segmenter,
+    };
     let fingerprint = settings.fingerprint(models, segmenter.name(), &scene, &views)?;
     let job = Job::open(&store, fingerprint, settings.restart)?;
 
@@ -312,7 +316,7 @@ pub fn encode(
             TextBank::directions(models.dim())
         }
     });
-    let builder =
+    let mut builder =
         CellBuilder::open(settings, &store, &scene, &split, &sums_paths, (models, bank), &stopwatch)?;
     let mut summary = EncodeSummary {
         generation: store.next_generation()?,
@@ -376,7 +380,9 @@ pub fn encode(
         cells: built.records,
     };
     store.publish(&manifest, &built.extras)?;
-    job.finish()?;
+    if !settings.keep_views {
+        job.finish()?;
+    }
     store.prune()?;
     summary.busy_secs = stopwatch
         .0
