@@ -20,6 +20,7 @@ use crate::generate::Scene;
 use crate::generate::grammar::{self, SceneKind};
 use slag_common::shard::Profile;
 
+use crate::lift::Aggregation;
 use crate::palette::PaletteSettings;
 use crate::progress::Progress;
 use crate::publish::serve::{self, Limits};
@@ -193,6 +194,8 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         background: Background::White,
         min_mask_px: 200,
         weights: WeightKind::Blend,
+        aggregation: Aggregation::REFINED,
+        mask_noise: None,
         threads: rayon::current_num_threads(),
         memory_bytes: 1 << 30,
         strict: true,

@@ -9,8 +9,9 @@ use slag_models::ModelDir;
 
 use super::EncodeError;
 use crate::embed::Background;
+use crate::lift::Aggregation;
 use crate::raster::WeightKind;
-use crate::segment::SamSettings;
+use crate::segment::{MaskNoise, SamSettings};
 use crate::shard::ShardSettings;
 use crate::shard::cells::CellLimits;
 
@@ -84,6 +85,10 @@ pub struct EncodeSettings {
     pub min_mask_px: u32,
     /// Which weight is summed.
     pub weights: WeightKind,
+    /// How sums become embeddings. No part of what a view leaves behind: views that are done stay so.
+    pub aggregation: Aggregation,
+    /// Errors to lay over the masks, for experiments.
+    pub mask_noise: Option<MaskNoise>,
     /// Views worked on at a time.
     pub threads: usize,
     /// Working memory for sums and region vectors.

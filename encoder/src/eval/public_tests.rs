@@ -111,7 +111,7 @@ impl Wall {
         };
         let session = SessionOptions::new(PathBuf::new());
         let cancel = AtomicBool::new(false);
-        encode::encode(&settings, &ModelDir::builtin(), &session, &CpuRasterizer, &Silent, &cancel)
+        encode::encode(&settings, &ModelDir::colours(), &session, &CpuRasterizer, &Silent, &cancel)
             .expect("encodes");
         Self { dir, gaussians, views }
     }
@@ -158,7 +158,7 @@ impl TextEncoder for Renamed {
 
 fn renamed(words: &[(&'static str, &'static str)]) -> Renamed {
     let session = SessionOptions::new(PathBuf::new());
-    let encoder = ModelDir::builtin().text_encoder(&session).expect("needs no runtime");
+    let encoder = ModelDir::colours().text_encoder(&session).expect("needs no runtime");
     Renamed(encoder, words.iter().copied().collect())
 }
 
