@@ -206,6 +206,9 @@ pub struct EncodeArgs {
     /// cell's small Gaussians].
     #[arg(long, value_name = "E")]
     pub position_error: Option<f64>,
+    /// Objects.
+    #[command(flatten)]
+    pub objects: super::objects::ObjectArgs,
     /// Days after which robots refuse the manifest; never if absent.
     #[arg(long, value_name = "DAYS")]
     pub expires_days: Option<u32>,
@@ -325,6 +328,9 @@ pub struct EvalLabelledArgs {
     /// Score from which something counts as found [default: the store's].
     #[arg(long, value_name = "COSINE", allow_negative_numbers = true)]
     pub threshold: Option<f32>,
+    /// Whether objects are scored.
+    #[command(flatten)]
+    pub level: super::objects::EvalLevelArgs,
 }
 
 /// `serve`.

@@ -3,6 +3,7 @@
 mod args;
 mod bench;
 mod keys;
+mod objects;
 mod progress;
 mod run;
 mod sam;

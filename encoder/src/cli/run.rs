@@ -238,6 +238,7 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
                 .position_error
                 .map_or_else(|| PositionError::default_for(metric), PositionError::Within),
         },
+        objects: !args.objects.no_objects,
         created_unix_secs,
         expires_unix_secs: args.expires_days.map(|days| created_unix_secs + u64::from(days) * 86_400),
     })
@@ -275,6 +276,10 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
         0 => String::new(),
         n => format!("left out   {n} views, the first: {}\n", summary.skipped_views[0].reason),
     };
+    let objects = summary.objects.as_ref().map_or(String::new(), |found| {
+        let (n, of_masks, aside) = (found.n_objects, found.n_masks_of_objects, found.n_masks_set_aside);
+        format!("objects    {n} of {of_masks} masks, {} Gaussians; {aside} masks set aside\n", found.n_gaussians)
+    });
     let images_on = summary.images_on.as_ref().map_or(String::new(), |on| format!("images on  {on}\n"));
     let lines = format!(
         "published  generation {} in {}\n\
@@ -282,7 +287,7 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
          views      {} ({} resumed, {} without masks)\n{skipped}{images_on}\
          masks      {} in {} regions, {} sums\n\
          cells      {} with {} palette rows\n\
-         shards     {sizes}\n\
+         {objects}shards     {sizes}\n\
          seconds    {:.1}; by stage, all threads: {busy}\n\
          views took {:.1} s\n  stage    at once   seconds    busy\n{of_views}",
         summary.generation,
@@ -356,8 +361,12 @@ fn run_eval_labelled(args: &EvalLabelledArgs, json: bool) -> Result<Exit> {
     let mut encoder = text_encoder_of(&reader, &args.models)?;
     let scene = splat::read(&args.scene, &splat::ReadOptions { with_sh_rest: false })?;
     let truth = Truth::read(&args.truth, scene.len())?;
-    let settings =
-        EvalSettings { words: args.words.clone(), profile: args.profile, threshold: args.threshold };
+    let settings = EvalSettings {
+        words: args.words.clone(),
+        profile: args.profile,
+        threshold: args.threshold,
+        level: args.level.level.into(),
+    };
     let report = eval::labelled(&reader, &truth, &scene, &mut *encoder, &CpuRasterizer, &settings)?;
     print(json, &report, &report)?;
     Ok(Exit::Done)

@@ -27,7 +27,9 @@ use slag_models::{ModelDir, ModelError, SessionOptions};
 
 use crate::embed::EmbedError;
 use crate::ingest::{self, GeoError, IngestError};
-use crate::lift::SumsError;
+use crate::lift::{SumsError, SumsFile};
+use crate::objects::ObjectsReport;
+use crate::objects::photos::{self, Photo};
 use crate::palette::TextBank;
 use crate::progress::Progress;
 use crate::raster::{RasterError, Rasterizer};
@@ -208,6 +210,8 @@ pub struct EncodeSummary {
     pub n_cells: usize,
     /// Palette rows in all cells.
     pub n_rows: u64,
+    /// Objects, where they were looked for.
+    pub objects: Option<ObjectsReport>,
     /// Bytes of all shards by profile.
     pub shard_bytes: BTreeMap<String, u64>,
     /// Seconds spent in each stage, added over threads.
@@ -305,6 +309,7 @@ pub fn encode(
     }
 
     let sums_paths: Vec<PathBuf> = used.iter().map(|view| job.sums_path(&view.name)).collect();
+    let photos = settings.objects.then(|| photos_of(&job, &used, models.dim())).transpose()?;
     let bank = stopwatch.time("texts", || match models.text_encoder(session) {
         Ok(mut encoder) => TextBank::of_model(&mut *encoder),
         Err(e) => {
@@ -313,7 +318,10 @@ pub fn encode(
         }
     });
     let builder =
-        CellBuilder::open(settings, &store, &scene, &split, &sums_paths, (models, bank), &stopwatch)?;
+        {
+        let files = (&sums_paths[..], photos);
+        CellBuilder::open(settings, &store, &scene, &split, files, (models, bank), &stopwatch)?
+    };
     let mut summary = EncodeSummary {
         generation: store.next_generation()?,
         n_gaussians: (scene.len() - split.n_rejected) as u64,
@@ -328,6 +336,7 @@ pub fn encode(
         n_entries: builder.n_entries(),
         n_cells: split.cells.len(),
         n_rows: 0,
+        objects: None,
         shard_bytes: BTreeMap::new(),
         busy_secs: BTreeMap::new(),
         view_stages,
@@ -348,6 +357,7 @@ pub fn encode(
         summary.n_rows += record.shards.values().map(|s| u64::from(s.n_rows)).max().unwrap_or(0);
     }
     summary.n_without_evidence = built.n_without_evidence;
+    summary.objects = built.objects.clone();
 
     let manifest = Manifest {
         version: manifest::VERSION,
@@ -417,6 +427,17 @@ fn choose_views(settings: &EncodeSettings) -> Result<(Vec<View>, Vec<SkippedView
     let views =
         there.into_iter().enumerate().filter(|(i, _)| chosen.binary_search(i).is_ok()).map(|(_, v)| v);
     Ok((views.collect(), skipped))
+}
+
+/// Reads where the masks of each view lie in its photo.
+fn photos_of(job: &Job<'_>, views: &[&View], dim: usize) -> Result<Vec<Photo>, EncodeError> {
+    let photo = |view: &&View| {
+        let (_, regions) = SumsFile::open(&job.sums_path(&view.name))?;
+        let n_masks = regions.mask_vectors.len() / dim;
+        let boxes_px = photos::read_boxes(&job.boxes_path(&view.name), n_masks)?;
+        Ok(Photo { name: view.name.clone(), boxes_px })
+    };
+    views.iter().map(photo).collect()
 }
 
 /// Works off the views that are not done yet. Returns how busy the stages were, and the views that were left out.

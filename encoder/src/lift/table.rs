@@ -80,7 +80,7 @@ impl RegionTable {
     }
 
     /// Returns the masks of a region.
-    fn masks_of(&self, region: usize) -> &[u32] {
+    pub(crate) fn masks_of(&self, region: usize) -> &[u32] {
         &self.masks[self.starts[region] as usize..self.starts[region + 1] as usize]
     }
 
