@@ -147,7 +147,9 @@ impl<'a> Objects<'a> {
             .vectors
             .chunks_exact(query.len())
             .zip(self.steps)
-            .map(|(vector, step)| step * vector.iter().zip(query).map(|(v, q)| f32::from(*v) * q).sum::<f32>())
+            .map(|(vector, step)| {
+                step * vector.iter().zip(query).map(|(v, q)| f32::from(*v) * q).sum::<f32>()
+            })
             .collect();
         products.chunks_exact(n_vectors).map(object_score).collect()
     }
@@ -197,12 +199,15 @@ impl ObjectsLayout {
         dim: usize,
     ) -> Result<Option<Self>, ContainerError> {
         let Some(at_header) = layout.find(section::HEADER) else { return Ok(None) };
-        let damaged = |offset: usize, what: String| ContainerError::Damaged { offset_bytes: offset as u64, what };
+        let damaged =
+            |offset: usize, what: String| ContainerError::Damaged { offset_bytes: offset as u64, what };
         let header: ObjectsHeader = layout.value(bytes, section::HEADER, "objects' header")?;
         let (n, n_vectors, n_runs) =
             (header.n_objects as usize, header.n_vectors as usize, header.n_runs as usize);
         if n >= usize::from(NO_OBJECT) || !(1..=MAX_VECTORS).contains(&header.n_vectors) {
-            let what = format!("{n} objects of {n_vectors} vectors, expected fewer than {NO_OBJECT} of 1 to {MAX_VECTORS}");
+            let what = format!(
+                "{n} objects of {n_vectors} vectors, expected fewer than {NO_OBJECT} of 1 to {MAX_VECTORS}"
+            );
             return Err(damaged(at_header.start, what));
         }
         let is_score = |score: f32| (-1.0..=1.0).contains(&score);
@@ -270,10 +275,13 @@ fn wrong(record: &ObjectRecord, n_here: u32, photos: &str) -> Option<&'static st
     let bounds = record.bounds();
     let is_finite = [record.position(), bounds.min, bounds.max].iter().all(|v| v.is_finite());
     let [x0, y0, x1, y1] = record.photo_box_px;
-    let name = record.photo_start as usize..(record.photo_start as usize).saturating_add(record.photo_bytes as usize);
+    let name = record.photo_start as usize
+        ..(record.photo_start as usize).saturating_add(record.photo_bytes as usize);
     match () {
         () if !is_finite || !bounds.min.cmple(bounds.max).all() => Some("its box is empty or not finite"),
-        () if n_here == 0 || record.n_gaussians_here != n_here => Some("its Gaussians are not those of the runs"),
+        () if n_here == 0 || record.n_gaussians_here != n_here => {
+            Some("its Gaussians are not those of the runs")
+        }
         () if record.n_gaussians < n_here => Some("it has fewer Gaussians than the cell has of it"),
         () if x0 > x1 || y0 > y1 => Some("its box in the photo is turned over"),
         () if name.len() > MAX_PHOTO_BYTES || photos.get(name).is_none() => Some("its photo has no name"),

@@ -193,7 +193,8 @@ impl PublishedObjects {
         }
         let header = header.ok_or(QueryError::NoObjects)?;
         let ids: Vec<u64> = vectors_of_id.keys().copied().collect();
-        let number = |id: Option<u64>| id.and_then(|id| ids.binary_search(&id).ok()).map_or(NONE, |at| at as u32);
+        let number =
+            |id: Option<u64>| id.and_then(|id| ids.binary_search(&id).ok()).map_or(NONE, |at| at as u32);
         let object_of = id_of.into_iter().map(number).collect();
         let (vectors, steps): (Vec<_>, Vec<_>) = vectors_of_id.into_values().unzip();
         Ok(Self {
@@ -209,7 +210,8 @@ impl PublishedObjects {
     /// Returns the score of each object with a unit query, see [`slag_common::objects::object_score`].
     pub fn scores(&self, query: &[f32]) -> Vec<f32> {
         let (header, vectors, steps) = (self.header, &self.vectors[..], &self.steps[..]);
-        Objects { header, vectors, steps, records: &[], run_ends: &[], run_objects: &[], photos: "" }.scores(query)
+        Objects { header, vectors, steps, records: &[], run_ends: &[], run_objects: &[], photos: "" }
+            .scores(query)
     }
 
     /// Gives every Gaussian that belongs to an object the object's score.

@@ -126,9 +126,8 @@ fn round_trip() {
 /// A hostile writer computes right checksums over wrong contents: each lie is refused.
 #[test]
 fn lies_are_refused() {
-    let refused = |edit: fn(&mut Parts)| {
-        ShardLayout::check(&written(edit)).expect_err("must be refused").to_string()
-    };
+    let refused =
+        |edit: fn(&mut Parts)| ShardLayout::check(&written(edit)).expect_err("must be refused").to_string();
     assert!(refused(|p| p.header.n_objects = u32::MAX).contains("objects of"));
     assert!(refused(|p| p.header.n_objects = 65_534).contains("bytes"));
     assert!(refused(|p| p.header.n_objects = 1).contains("bytes"));
@@ -176,7 +175,8 @@ fn rounded_vectors_keep_scores() {
     assert_eq!((rounded.len(), steps.len()), (5 * dim, 5));
     for _ in 0..50 {
         let query = unit();
-        let product = |v: &mut dyn Iterator<Item = f64>| -> f64 { v.zip(&query).map(|(v, q)| v * f64::from(*q)).sum() };
+        let product =
+            |v: &mut dyn Iterator<Item = f64>| -> f64 { v.zip(&query).map(|(v, q)| v * f64::from(*q)).sum() };
         let exact: Vec<f32> =
             vectors.chunks(dim).map(|v| product(&mut v.iter().map(|v| f64::from(*v))) as f32).collect();
         let kept: Vec<f32> = rounded

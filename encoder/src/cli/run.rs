@@ -278,7 +278,10 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
     };
     let objects = summary.objects.as_ref().map_or(String::new(), |found| {
         let (n, of_masks, aside) = (found.n_objects, found.n_masks_of_objects, found.n_masks_set_aside);
-        format!("objects    {n} of {of_masks} masks, {} Gaussians; {aside} masks set aside\n", found.n_gaussians)
+        format!(
+            "objects    {n} of {of_masks} masks, {} Gaussians; {aside} masks set aside\n",
+            found.n_gaussians
+        )
     });
     let images_on = summary.images_on.as_ref().map_or(String::new(), |on| format!("images on  {on}\n"));
     let lines = format!(

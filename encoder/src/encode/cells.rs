@@ -231,7 +231,14 @@ impl<'a> CellBuilder<'a> {
         let (scene, encoder_id, settings) = (self.scene, self.encoder_id, &self.settings.shards);
         let made = self.stopwatch.time("palette", || {
             shard::build_with(
-                scene, cell_id, cell, embeddings, encoder_id, &self.yardstick, settings, objects,
+                scene,
+                cell_id,
+                cell,
+                embeddings,
+                encoder_id,
+                &self.yardstick,
+                settings,
+                objects,
             )
         });
         let record = |shard: &BuiltShard| -> Result<(Profile, ShardRecord), EncodeError> {

@@ -317,8 +317,7 @@ pub fn encode(
             TextBank::directions(models.dim())
         }
     });
-    let builder =
-        {
+    let builder = {
         let files = (&sums_paths[..], photos);
         CellBuilder::open(settings, &store, &scene, &split, files, (models, bank), &stopwatch)?
     };

@@ -67,7 +67,8 @@ pub(super) fn report(
         }
     }
     let best_iou = |thing: u16, counts: &dyn Fn(u32) -> bool| {
-        let of_thing = n_of_both.range((thing, 0)..=(thing, u32::MAX)).filter(|((_, object), _)| counts(*object));
+        let of_thing =
+            n_of_both.range((thing, 0)..=(thing, u32::MAX)).filter(|((_, object), _)| counts(*object));
         let iou = |((_, object), both): (&(u16, u32), &u64)| {
             *both as f64 / (n_of_object[*object as usize] + n_of_thing[&thing] - both) as f64
         };
@@ -118,7 +119,10 @@ mod tests {
         let found = |chair: Vec<f32>| report(&truth, &object_of, 3, &classes, &[chair, vec![0.9; 3]], 0.5);
         let recall = |n, n_at_25, n_at_50| Recall { n, n_at_25, n_at_50 };
         let report = found(vec![0.9, 0.6, 0.1]);
-        assert_eq!((report.any, report.of_words, report.best_of_words), (recall(2, 2, 1), recall(2, 2, 1), recall(2, 2, 1)));
+        assert_eq!(
+            (report.any, report.of_words, report.best_of_words),
+            (recall(2, 2, 1), recall(2, 2, 1), recall(2, 2, 1))
+        );
         let report = found(vec![0.4, 0.1, 0.8]);
         assert_eq!((report.of_words, report.best_of_words), (recall(2, 1, 0), recall(2, 2, 1)));
         let report = found(vec![0.1, 0.45, 0.48]);

@@ -306,9 +306,9 @@ pub fn labelled(
     let n_without_evidence =
         of_things.iter().filter(|i| class_of(**i).is_some() && scores[0][**i].is_nan()).count();
 
-    let instances = objects
-        .as_ref()
-        .map(|objects| instances::report(truth, &objects.object_of, objects.ids.len(), &classes, &of_objects, threshold));
+    let instances = objects.as_ref().map(|objects| {
+        instances::report(truth, &objects.object_of, objects.ids.len(), &classes, &of_objects, threshold)
+    });
     let mut words = Vec::new();
     for (c, (word, ids)) in classes.iter().enumerate() {
         let positive: Vec<bool> = of_things.iter().map(|i| class_of(*i) == Some(c)).collect();
@@ -425,7 +425,10 @@ impl fmt::Display for EvalReport {
         if let Some(found) = &self.instances {
             let InstanceReport { n_objects, any, of_words, best_of_words } = found;
             writeln!(f, "{n_objects} objects; things found at IoU 0.25 and 0.5, by any object: {any}")?;
-            writeln!(f, "  by one of its word's above the threshold: {of_words}; by its word's best: {best_of_words}")?;
+            writeln!(
+                f,
+                "  by one of its word's above the threshold: {of_words}; by its word's best: {best_of_words}"
+            )?;
         }
         if !self.unknown_words.is_empty() {
             let words: Vec<&str> = self.unknown_words.keys().map(String::as_str).collect();

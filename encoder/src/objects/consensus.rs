@@ -194,8 +194,7 @@ impl<'a> Consensus<'a> {
 
     /// Judges a mask by all views.
     fn judge(&self, mask: usize, counts: &mut Counts) -> Judged {
-        let (mask, mut judged) =
-            (mask as u32, Judged { agreement: 0.0, consensus: 0.0, same: Vec::new() });
+        let (mask, mut judged) = (mask as u32, Judged { agreement: 0.0, consensus: 0.0, same: Vec::new() });
         if !self.is_large_enough(mask) {
             return judged;
         }
@@ -329,7 +328,8 @@ impl Shape {
         samples.retain(|sample| {
             let sightings = consensus.sightings.of(*sample).filter(|(view, _)| self.has_member[*view]);
             let (inside, n) = sightings.fold((0, 0), |(inside, n), (_, region)| {
-                let is_inside = (consensus.masks.of_region)(region).iter().any(|m| self.is_member[*m as usize]);
+                let is_inside =
+                    (consensus.masks.of_region)(region).iter().any(|m| self.is_member[*m as usize]);
                 (inside + usize::from(is_inside), n + 1)
             });
             2 * inside >= n

@@ -74,7 +74,9 @@ impl Members {
                     .into_par_iter()
                     .map_init(
                         || (vec![0.0f32; clusters.consensus.len()], Vec::new()),
-                        |(weights, touched), k| best_cluster(&sums, k, &of_region, clusters, weights, touched),
+                        |(weights, touched), k| {
+                            best_cluster(&sums, k, &of_region, clusters, weights, touched)
+                        },
                     )
                     .collect();
                 members.add_weights(&sums, &found, scene.table, clusters);

@@ -82,7 +82,8 @@ impl CellObjects {
             }
             cell.run_ends.last_mut().into_iter().for_each(|end| *end = index as u32 + 1);
         }
-        (cell.header.n_runs, cell.header.photos_bytes) = (cell.run_ends.len() as u32, cell.photos.len() as u32);
+        (cell.header.n_runs, cell.header.photos_bytes) =
+            (cell.run_ends.len() as u32, cell.photos.len() as u32);
         cell
     }
 
@@ -102,7 +103,8 @@ impl CellObjects {
 
 /// Returns a name that terminals and readers take: no control characters, not too long.
 fn plain(name: &str) -> String {
-    let mut plain: String = name.chars().map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c }).collect();
+    let mut plain: String =
+        name.chars().map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c }).collect();
     let end = (0..=MAX_PHOTO_BYTES.min(plain.len())).rev().find(|end| plain.is_char_boundary(*end));
     plain.truncate(end.unwrap_or(0));
     plain

@@ -40,7 +40,9 @@ pub fn choose(masks: &[u32], weights: &[f64], table: &RegionTable) -> Vec<f32> {
     for _ in 0..MAX_MEDOIDS.min(n) {
         let gain = |candidate: usize| -> f64 {
             let of_candidate = cosines[candidate * n..][..n].iter().zip(&nearest).zip(&masks);
-            of_candidate.map(|((cosine, nearest), mask)| weight(*mask) * f64::from(cosine.max(*nearest))).sum()
+            of_candidate
+                .map(|((cosine, nearest), mask)| weight(*mask) * f64::from(cosine.max(*nearest)))
+                .sum()
         };
         let gains = (0..n).filter(|i| !taken[*i]).map(|i| (i, gain(i)));
         let Some((best, _)) = gains.reduce(|a, b| if b.1 > a.1 { b } else { a }) else { break };
