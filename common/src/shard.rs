@@ -20,6 +20,7 @@ use serde::{Deserialize, Serialize};
 use crate::container::{self, ContainerError, Layout};
 use crate::frames::Aabb;
 use crate::hash::Hash32;
+use crate::objects::{Objects, ObjectsLayout};
 
 /// First bytes of a shard.
 pub const MAGIC: [u8; 8] = *b"SLAGSHRD";
@@ -287,6 +288,14 @@ impl ShardView<'_> {
     /// # Errors
     /// Whatever the writer gives.
     pub fn write(&self, out: impl io::Write) -> io::Result<()> {
+        self.write_with(out, None)
+    }
+
+    /// Writes the shard and the objects that its Gaussians belong to.
+    ///
+    /// # Errors
+    /// Whatever the writer gives.
+    pub fn write_with(&self, out: impl io::Write, objects: Option<&Objects<'_>>) -> io::Result<()> {
         let mut sections = vec![
             (section::HEADER, bytemuck::bytes_of(&self.header)),
             (section::POSITIONS, self.positions.bytes()),
@@ -316,6 +325,7 @@ impl ShardView<'_> {
                 sections.push((section::FINE, container::bytes_of(fine.values)));
             }
         }
+        sections.extend(objects.iter().flat_map(|objects| objects.sections()));
         container::write(out, MAGIC, VERSION, &sections)
     }
 
@@ -477,6 +487,7 @@ pub struct ShardLayout {
     residuals: Option<[Range<usize>; 5]>,
     exact: Option<[Range<usize>; 2]>,
     fine: Option<(ScoreErrors, [Range<usize>; 3])>,
+    objects: Option<ObjectsLayout>,
 }
 
 impl ShardLayout {
@@ -557,7 +568,16 @@ impl ShardLayout {
             true => layout.column::<u32>(section::POSITIONS, "positions", n)?,
             false => layout.column::<[u16; 3]>(section::POSITIONS, "positions", n)?,
         };
-        Ok(Self { header, positions, row_starts, rows, radii, basis, residuals, exact, fine })
+        let objects = ObjectsLayout::check(bytes, &layout, header.n_gaussians, dim)?;
+        Ok(Self { header, positions, row_starts, rows, radii, basis, residuals, exact, fine, objects })
+    }
+
+    /// Returns the objects of the bytes that were checked, where the shard has them.
+    ///
+    /// # Panics
+    /// As [`ShardLayout::view`]; the address must be 8-byte aligned.
+    pub fn objects<'a>(&self, bytes: &'a [u8]) -> Option<Objects<'a>> {
+        self.objects.as_ref().map(|objects| objects.view(bytes))
     }
 
     /// Returns the columns of the bytes that were checked.

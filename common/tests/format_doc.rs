@@ -2,6 +2,7 @@
 
 use std::mem::offset_of;
 
+use slag_common::objects::{self, ObjectRecord, ObjectsHeader};
 use slag_common::shard::{self, ShardHeader, section};
 use slag_common::{container, manifest};
 
@@ -45,6 +46,32 @@ fn header_offsets_are_those_of_the_struct() {
 }
 
 #[test]
+fn objects_are_those_of_the_structs() {
+    macro_rules! field {
+        ($of:ident, $name:ident, $size:expr, $kind:expr) => {
+            let offset = offset_of!($of, $name).to_string();
+            assert!(has(&[&offset, &$size.to_string(), $kind, stringify!($name)]), "{}", stringify!($name));
+        };
+    }
+    field!(ObjectsHeader, n_objects, 4, "u32");
+    field!(ObjectsHeader, n_vectors, 4, "u32");
+    field!(ObjectsHeader, n_runs, 4, "u32");
+    field!(ObjectsHeader, photos_bytes, 4, "u32");
+    field!(ObjectsHeader, score_mean, 4, "f32");
+    field!(ObjectsHeader, score_spread, 4, "f32");
+    field!(ObjectRecord, id, 8, "u64");
+    field!(ObjectRecord, position_in_world, 24, "f64 x 3");
+    field!(ObjectRecord, box_min, 24, "f64 x 3");
+    field!(ObjectRecord, box_max, 24, "f64 x 3");
+    field!(ObjectRecord, n_gaussians, 4, "u32");
+    field!(ObjectRecord, n_gaussians_here, 4, "u32");
+    field!(ObjectRecord, photo_box_px, 16, "u32 x 4");
+    field!(ObjectRecord, photo_start, 4, "u32");
+    field!(ObjectRecord, photo_bytes, 4, "u32");
+    assert_eq!([size_of::<ObjectsHeader>(), size_of::<ObjectRecord>()], [24, 112], "a field is missing");
+}
+
+#[test]
 fn sections_and_versions_are_those_of_the_code() {
     let sections = [
         (section::HEADER, "header"),
@@ -66,6 +93,13 @@ fn sections_and_versions_are_those_of_the_code() {
         (section::FINE_STEPS, "fine_steps"),
         (section::FINE_SCALES, "fine_scales"),
         (section::FINE, "fine"),
+        (objects::section::HEADER, "objects_header"),
+        (objects::section::RECORDS, "objects"),
+        (objects::section::VECTORS, "object_vectors"),
+        (objects::section::STEPS, "object_steps"),
+        (objects::section::RUN_ENDS, "run_ends"),
+        (objects::section::RUN_OBJECTS, "run_objects"),
+        (objects::section::PHOTOS, "photos"),
     ];
     for (id, name) in sections {
         assert!(has(&[&id.to_string(), name]), "section {id} {name}");

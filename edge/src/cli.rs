@@ -228,9 +228,10 @@ struct QueryArgs {
     /// Cosine, or relevancy with negatives, from which a Gaussian matches [default: the scene's; 0.5].
     #[arg(long, allow_hyphen_values = true)]
     threshold: Option<f32>,
-    /// What answers are made of: clusters or gaussians.
-    #[arg(long, default_value = "clusters")]
-    level: Level,
+    /// What answers are made of: objects, clusters or gaussians [default: objects where the scene has them, else
+    /// clusters].
+    #[arg(long)]
+    level: Option<Level>,
     /// Edge of the voxels that join Gaussians to clusters, world units [default: 0.25 m, or the scene's].
     #[arg(long)]
     voxel: Option<f64>,
@@ -382,7 +383,7 @@ mod tests {
         };
         assert_eq!((query.text.as_str(), query.near), ("chair", Some(DVec3::new(1.0, 2.0, -3.0))));
         assert_eq!((query.radius, query.limit, query.threshold), (Some(4.0), Some(5), Some(-0.5)));
-        assert_eq!(query.level, Level::Gaussians);
+        assert_eq!(query.level, Some(Level::Gaussians));
         let Command::Query(query) =
             parse("slag-edge query chair --box -1,2,3,4,-5,6 --negatives wall,floor --precision rows")
                 .expect("parses")

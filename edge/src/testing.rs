@@ -11,7 +11,8 @@ use glam::DVec3;
 use half::f16;
 use slag_common::container::AlignedBytes;
 use slag_common::hash::Hash32;
-use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
+use slag_common::manifest::{self, Calibration, CellRecord, EncoderRecord, Manifest, ShardRecord};
+use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, quantise_vectors};
 use slag_common::shard::{
     ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardLayout, ShardView, quantise,
 };
@@ -49,7 +50,68 @@ pub struct BuiltShard {
     pub embeddings: Vec<Vec<f32>>,
 }
 
+/// An object of a test shard: id, vectors, runs of Gaussians in the shard, and how many it has in all.
+pub struct TestObject {
+    pub id: u64,
+    pub vectors: Vec<f32>,
+    pub runs: Vec<std::ops::Range<u32>>,
+    pub n_gaussians: u32,
+}
+
 impl BuiltShard {
+    /// Writes the shard again, with objects: boxes around the origin, photos named by their ids.
+    pub fn with_objects(&self, objects: &[TestObject], calibration: Calibration) -> Self {
+        let shard = self.view();
+        let dim = shard.header.dim as usize;
+        let mut object_of = vec![NO_OBJECT; shard.header.n_gaussians as usize];
+        let (mut records, mut vectors, mut steps, mut photos) = (vec![], vec![], vec![], String::new());
+        for (number, object) in (0u16..).zip(objects) {
+            object.runs.iter().for_each(|run| object_of[run.start as usize..run.end as usize].fill(number));
+            let photo = format!("{}.jpg", object.id);
+            records.push(ObjectRecord {
+                id: object.id,
+                position_in_world: [object.id as f64, 0.0, 0.0],
+                box_min: [object.id as f64 - 1.0, -1.0, -1.0],
+                box_max: [object.id as f64 + 1.0, 1.0, 1.0],
+                n_gaussians: object.n_gaussians,
+                n_gaussians_here: object.runs.iter().map(|run| run.len() as u32).sum(),
+                photo_box_px: [1, 2, 30, 40],
+                photo_start: photos.len() as u32,
+                photo_bytes: photo.len() as u32,
+            });
+            photos += &photo;
+            let (components, of_vectors) = quantise_vectors(&object.vectors, dim, 3);
+            vectors.extend(components);
+            steps.extend(of_vectors);
+        }
+        let runs: Vec<&[u16]> = object_of.chunk_by(|a, b| a == b).collect();
+        let ends = runs.iter().scan(0, |end, run| {
+            *end += run.len() as u32;
+            Some(*end)
+        });
+        let objects = Objects {
+            header: ObjectsHeader {
+                n_objects: records.len() as u32,
+                n_vectors: 3,
+                n_runs: runs.len() as u32,
+                photos_bytes: photos.len() as u32,
+                score_mean: calibration.score_mean,
+                score_spread: calibration.score_spread,
+            },
+            records: &records,
+            vectors: &vectors,
+            steps: &steps,
+            run_ends: &ends.collect::<Vec<u32>>(),
+            run_objects: &runs.iter().map(|run| run[0]).collect::<Vec<u16>>(),
+            photos: &photos,
+        };
+        let mut bytes = Vec::new();
+        shard.write_with(&mut bytes, Some(&objects)).expect("writes to memory");
+        let bytes = AlignedBytes::copy_of(&bytes);
+        let layout = ShardLayout::check(&bytes).expect("a valid shard");
+        Self { bytes, layout, embeddings: self.embeddings.clone() }
+    }
+
     pub fn view(&self) -> ShardView<'_> {
         self.layout.view(&self.bytes)
     }

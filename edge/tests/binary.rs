@@ -14,12 +14,13 @@ use slag_common::frames::Aabb;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use slag_common::shard::{Positions, Profile, ScoreErrors, ShardHeader, ShardView, quantise};
 use slag_edge::text::TextService;
-use slag_models::SessionOptions;
+use slag_models::{ModelDir, SessionOptions};
 
 /// Returns the signed manifest and the one shard of a scene with 40 red Gaussians around x = 2 and
 /// 60 blue ones around x = 8, in the space of the built-in model.
 fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
-    let text = TextService::open(None, &SessionOptions::new("not-needed".into())).expect("built in");
+    let text =
+        TextService::open(&ModelDir::colours(), &SessionOptions::new("not-needed".into())).expect("built in");
     let mut positions: Vec<[u16; 3]> = (0..40).map(|i| [2000 + i, 0, 0]).collect();
     positions.extend((0..60).map(|i| [8000 + i, 0, 0]));
     let row = |word: &str| text.encode(word).expect("known").to_vec();
@@ -131,6 +132,9 @@ fn stop(mut serving: Child) -> String {
 fn slag_edge(cache: &Path, args: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_slag-edge"));
     command.args(args).arg("--cache").arg(cache).env_remove("RUST_LOG");
+    if ["query", "serve"].contains(&args[0]) {
+        command.args(["--models", "colours"]);
+    }
     command
 }
 

@@ -10,6 +10,7 @@ pub mod eval;
 pub mod generate;
 pub mod ingest;
 pub mod lift;
+pub mod objects;
 pub mod palette;
 pub mod progress;
 pub mod publish;

@@ -1,13 +1,17 @@
 //! Full-precision scores of a published field, for evaluation and trust.
 
+use std::collections::BTreeMap;
 use std::io::{self, Write};
 
 use glam::DVec3;
 use serde::Serialize;
 use slag_common::container::AlignedBytes;
+use slag_common::manifest::Calibration;
+use slag_common::objects::{Objects, ObjectsHeader};
 use slag_common::shard::{Profile, ShardLayout};
 
 use crate::lift::published::{ReadFieldError, read_field, read_regions};
+use crate::objects::NONE;
 use crate::store::{StoreError, StoreReader};
 
 /// Cosines of every Gaussian of the input with a query.
@@ -58,6 +62,9 @@ pub enum QueryError {
         /// The profile.
         profile: Profile,
     },
+    /// The store was published without objects.
+    #[error("the store has no objects; encode again, without --no-objects")]
+    NoObjects,
     /// A shard is damaged.
     #[error("cell {cell_id}: {source}")]
     Shard {
@@ -131,6 +138,87 @@ pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -
         }
     }
     Ok(scores)
+}
+
+/// The objects of a published scene, as robots get them.
+#[derive(Clone, Debug)]
+pub struct PublishedObjects {
+    /// `[N]` in the order of the input file: each Gaussian's object, or [`NONE`].
+    pub object_of: Vec<u32>,
+    /// Of each object, ascending.
+    pub ids: Vec<u64>,
+    /// How a bank of texts scores over them.
+    pub calibration: Calibration,
+    /// `[n][n_vectors][dim]`, and a step for each vector.
+    vectors: Vec<i8>,
+    steps: Vec<f32>,
+    header: ObjectsHeader,
+}
+
+impl PublishedObjects {
+    /// Reads the objects from the exact shards.
+    ///
+    /// # Errors
+    /// [`QueryError`].
+    pub fn read(reader: &StoreReader) -> Result<Self, QueryError> {
+        let manifest = reader.manifest();
+        let dim = manifest.encoder.dim as usize;
+        let n = (manifest.n_gaussians + manifest.n_rejected) as usize;
+        let mut id_of = vec![None; n];
+        let mut vectors_of_id: BTreeMap<u64, (Vec<i8>, Vec<f32>)> = BTreeMap::new();
+        let mut header = None;
+        for cell in &manifest.cells {
+            let cell_id = cell.cell_id;
+            let missing = QueryError::NoShard { cell_id, profile: Profile::Exact };
+            let bytes = reader.read_object(cell.shards.get(&Profile::Exact).ok_or(missing)?.hash)?;
+            let layout =
+                ShardLayout::check(&bytes).map_err(|source| QueryError::Shard { cell_id, source })?;
+            let objects = layout.objects(&bytes).ok_or(QueryError::NoObjects)?;
+            let indices = layout.view(&bytes).exact.map_or(&[][..], |exact| exact.input_indices);
+            for (run, object) in objects.runs() {
+                let id = object.map(|object| objects.records[object].id);
+                for index in indices.get(run.start as usize..run.end as usize).unwrap_or_default() {
+                    let found = id_of.get_mut(*index as usize);
+                    *found.ok_or(QueryError::Index { cell_id, index: *index, n })? = id;
+                }
+            }
+            let n_vectors = objects.header.n_vectors as usize;
+            let of_objects = objects.vectors.chunks_exact(n_vectors * dim);
+            for ((record, vectors), steps) in
+                objects.records.iter().zip(of_objects).zip(objects.steps.chunks_exact(n_vectors))
+            {
+                vectors_of_id.entry(record.id).or_insert_with(|| (vectors.to_vec(), steps.to_vec()));
+            }
+            header.get_or_insert(objects.header);
+        }
+        let header = header.ok_or(QueryError::NoObjects)?;
+        let ids: Vec<u64> = vectors_of_id.keys().copied().collect();
+        let number =
+            |id: Option<u64>| id.and_then(|id| ids.binary_search(&id).ok()).map_or(NONE, |at| at as u32);
+        let object_of = id_of.into_iter().map(number).collect();
+        let (vectors, steps): (Vec<_>, Vec<_>) = vectors_of_id.into_values().unzip();
+        Ok(Self {
+            object_of,
+            ids,
+            calibration: Calibration { score_mean: header.score_mean, score_spread: header.score_spread },
+            vectors: vectors.concat(),
+            steps: steps.concat(),
+            header,
+        })
+    }
+
+    /// Returns the score of each object with a unit query, see [`slag_common::objects::object_score`].
+    pub fn scores(&self, query: &[f32]) -> Vec<f32> {
+        let (header, vectors, steps) = (self.header, &self.vectors[..], &self.steps[..]);
+        Objects { header, vectors, steps, records: &[], run_ends: &[], run_objects: &[], photos: "" }
+            .scores(query)
+    }
+
+    /// Gives every Gaussian that belongs to an object the object's score.
+    pub fn overlay(&self, of_objects: &[f32], cosines: &mut [f32]) {
+        let of_gaussians = cosines.iter_mut().zip(&self.object_of).filter(|(_, object)| **object != NONE);
+        of_gaussians.for_each(|(cosine, object)| *cosine = of_objects[*object as usize]);
+    }
 }
 
 /// A Gaussian that answers a query.

@@ -9,6 +9,7 @@ use glam::DVec3;
 use half::f16;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
+use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader};
 use slag_common::shard::{
     Basis, ExactColumns, Fine, Positions, Profile, Residuals, ScoreErrors, ShardHeader, ShardView,
 };
@@ -136,7 +137,34 @@ fn shard(is_exact: bool) -> Vec<u8> {
             }),
         }),
     };
-    view.write(&mut out).expect("writes to memory");
+    let record = |id: u64, n_gaussians_here: u32| ObjectRecord {
+        id,
+        position_in_world: [1.0, 2.0, 3.0],
+        box_min: [0.5, 1.5, 2.5],
+        box_max: [1.5, 2.5, 4.5],
+        n_gaussians: 40,
+        n_gaussians_here,
+        photo_box_px: [10, 20, 110, 70],
+        photo_start: 0,
+        photo_bytes: 5,
+    };
+    let objects = Objects {
+        header: ObjectsHeader {
+            n_objects: 2,
+            n_vectors: 2,
+            n_runs: 4,
+            photos_bytes: 5,
+            score_mean: 0.02,
+            score_spread: 0.1,
+        },
+        records: &[record(1, 2), record(7, 3)],
+        vectors: &[100, 0, 0, 0, 50, 0, 0, 0, 120, 1, 2, 3],
+        steps: &[0.01, 0.02, 0.005, 0.0],
+        run_ends: &[2, 3, 5, 6],
+        run_objects: &[1, NO_OBJECT, 0, 1],
+        photos: "a.jpg",
+    };
+    view.write_with(&mut out, is_exact.then_some(&objects)).expect("writes to memory");
     out
 }
 

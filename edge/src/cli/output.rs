@@ -135,7 +135,10 @@ fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
                     size,
                     score,
                     n,
-                    c.id.clone(),
+                    match &c.evidence {
+                        Some(evidence) => format!("{} in {}", c.id, visible(&evidence.photo)),
+                        None => c.id.clone(),
+                    },
                 ]
             })
             .collect(),

@@ -1,7 +1,7 @@
 use axum::body::{Body, to_bytes};
 use axum::http::{HeaderMap, StatusCode};
 use glam::DVec3;
-use serde_json::Value;
+use serde_json::{Value, json};
 use tempfile::TempDir;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};

@@ -59,7 +59,7 @@ pub struct Answers {
     /// Whether all of the region asked for was fetched; absent without `radius` and `box`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub area_fetched: Option<bool>,
-    /// How matches were grouped; absent at level `gaussians`.
+    /// How matches were grouped; only at level `clusters`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub clustering: Option<Clustering>,
     /// Why there is no answer; absent if there is one.
@@ -113,12 +113,13 @@ pub struct Clustering {
     pub n_gaussians_in_small_clusters: u64,
 }
 
-/// A group of matching Gaussians: an object, or what touches it.
+/// A group of matching Gaussians, or an object.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ClusterAnswer {
     /// Place in the list, from 1.
     pub rank: usize,
-    /// Cell and index of its first Gaussian; keeps its meaning within a generation.
+    /// Cell and index of its first Gaussian, which keeps its meaning within a generation; of an object `o` and 16 hex
+    /// digits, which keep theirs as long as its Gaussians stay the same.
     pub id: String,
     /// Mean of its Gaussians inside the box.
     pub position_in_world: DVec3,
@@ -133,17 +134,32 @@ pub struct ClusterAnswer {
     pub size: DVec3,
     /// Its box along axes of its own, upright where the world has a known up.
     pub oriented_box: OrientedBox,
-    /// Mean score of its Gaussians.
+    /// Mean score of its Gaussians; of an object that of its masks.
     pub score: f32,
-    /// Best score of its Gaussians.
+    /// Best score of its Gaussians; of an object its score.
     pub best_score: f32,
-    /// Its Gaussians.
+    /// Its Gaussians; of an object those on board, in the region asked for.
     pub n_gaussians: u64,
+    /// Of an object: its Gaussians in the whole scene.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub n_gaussians_in_scene: Option<u64>,
+    /// Of an object: where to see it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub evidence: Option<Evidence>,
     /// What the list is ranked by, see [`super::relevance`].
     pub relevance: f32,
     /// Distance of the position from `near`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub distance: Option<f64>,
+}
+
+/// The photo that shows an object best.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Evidence {
+    /// Name of its view.
+    pub photo: String,
+    /// Where the object lies in it, free of distortion: x0, y0, x1, y1, the latter exclusive.
+    pub box_px: [u32; 4],
 }
 
 /// A matching Gaussian.

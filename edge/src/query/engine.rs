@@ -7,6 +7,7 @@ use glam::DVec3;
 use serde::Serialize;
 use slag_common::Hash32;
 use slag_common::frames::GeoReference;
+use slag_common::objects::Objects;
 use slag_common::shard::{Profile, ShardView};
 use slag_models::EncodeError;
 
@@ -268,7 +269,8 @@ impl Engine {
         let questions = request.texts.iter().map(question).collect::<Result<Vec<_>, TextError>>()?;
         let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(OpenShard::view).collect();
         let fetched = (snapshot.current.centre_in_world, snapshot.current.radius);
-        let scene = Scene { shards: &shards, manifest: &snapshot.manifest, fetched };
+        let objects: Vec<Option<Objects<'_>>> = snapshot.shards.iter().map(OpenShard::objects).collect();
+        let scene = Scene { shards: &shards, objects: &objects, manifest: &snapshot.manifest, fetched };
         let idle = || self.idle.lock().unwrap_or_else(PoisonError::into_inner);
         let mut scratch = idle().pop().unwrap_or_default();
         let answers = answer(&mut scratch, &scene, &questions, request);

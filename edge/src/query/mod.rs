@@ -4,16 +4,20 @@ mod answers;
 mod arrow;
 pub mod cluster;
 mod engine;
+mod objects;
 mod oriented;
 mod reply;
 mod request;
 mod threshold;
 
 use glam::DVec3;
-use slag_common::manifest::Manifest;
+use slag_common::manifest::{Calibration, Manifest};
+use slag_common::objects::Objects;
 use slag_common::shard::ShardView;
 
-pub use answers::{Answers, ClusterAnswer, Clustering, Found, GaussianAnswer, Reason, ReasonKind, ScoreKind};
+pub use answers::{
+    Answers, ClusterAnswer, Clustering, Evidence, Found, GaussianAnswer, Reason, ReasonKind, ScoreKind,
+};
 pub use engine::{Engine, QueryError, ShardStatus, Status};
 pub use oriented::{Alignment, OrientedBox};
 pub use reply::{Format, Reply};
@@ -27,6 +31,7 @@ use crate::score::{
     Question, RELEVANCY_STEEPNESS, ScoreError, Scratch, Search, relevancy, score_of_relevancy,
 };
 use cluster::{Cluster, Grouping, cluster};
+use objects::{FoundObject, Members};
 
 /// Edge of the voxels in a metric scene, metres: parts of one piece of furniture are nearer to each
 /// other than two such edges, two pieces of furniture mostly are not.
@@ -40,6 +45,8 @@ const VOXELS_TO_HALF_RELEVANCE: f64 = 40.0;
 pub struct Scene<'a> {
     /// The shards on board.
     pub shards: &'a [ShardView<'a>],
+    /// The objects of each, where it has them.
+    pub objects: &'a [Option<Objects<'a>>],
     /// Their manifest.
     pub manifest: &'a Manifest,
     /// The part of space that was fetched: centre and radius.
@@ -73,12 +80,35 @@ fn answer_one(
 ) -> Answers {
     let manifest = scene.manifest;
     let scale = Scale::of(question);
-    let (threshold, threshold_source) = scale.threshold(request, manifest);
+    let level = request.level.unwrap_or(match objects::are_there(scene.objects) {
+        true => Level::Objects,
+        false => Level::Clusters,
+    });
+    let (threshold, threshold_source) = match level {
+        Level::Objects => scale.threshold(request, manifest, objects::calibration(scene.objects)),
+        _ => scale.threshold(request, manifest, manifest.encoder.calibration),
+    };
     let score_threshold = scale.to_score(threshold);
     let limit = request.limit.unwrap_or(DEFAULT_LIMIT);
     let mut clustering = None;
+    let mut best_object = None;
     let n_matching;
-    let found = match request.level {
+    let found = match level {
+        Level::Objects => {
+            let all = objects::scored(scene.objects, question);
+            best_object = all.first().map(|best| (scale.shown(best.score), best.record.position()));
+            let matching = all.iter().take_while(|object| object.score >= score_threshold);
+            let described = matching.filter_map(|object| {
+                let members =
+                    object.members(scene.shards, scene.objects, &request.region(), alignment(manifest))?;
+                (members.n_gaussians >= request.min_count)
+                    .then(|| object_answer(object, members, scale, manifest))
+            });
+            let described: Vec<ClusterAnswer> = described.collect();
+            n_matching = described.iter().map(|object| object.n_gaussians).sum();
+            let voxel = request.voxel.unwrap_or_else(|| default_voxel(manifest));
+            Found::Clusters(rank(described, threshold, voxel, limit, request.near))
+        }
         Level::Clusters => {
             let mut matches = search.matching(score_threshold);
             matches.runs.iter_mut().for_each(|run| run.score = scale.shown(run.score));
@@ -94,7 +124,8 @@ fn answer_one(
                 n_small_clusters: grouped.n_small,
                 n_gaussians_in_small_clusters: grouped.n_gaussians_in_small,
             });
-            Found::Clusters(rank(grouped.clusters, threshold, voxel, limit, request.near, manifest))
+            let described = grouped.clusters.into_iter().map(|cluster| cluster_answer(cluster, manifest));
+            Found::Clusters(rank(described.collect(), threshold, voxel, limit, request.near))
         }
         Level::Gaussians => {
             let mut hits = search.best(limit, score_threshold, request.near);
@@ -106,16 +137,23 @@ fn answer_one(
             Found::Gaussians(hits)
         }
     };
-    let reason = found.is_empty().then(|| reason(search, scale, request, threshold, n_matching));
+    let reason = found.is_empty().then(|| match level {
+        Level::Objects => reason_of_objects(request, threshold, best_object),
+        _ => reason(search, scale, request, threshold, n_matching),
+    });
     // Gaussians of exact shards are listed with their own scores, clusters with their rows'.
-    let score_error_bound = scale.error_bound(match (search.is_exact(), request.level) {
+    // With negatives a score is the difference of two.
+    let n_products = if question.negatives.is_empty() { 1.0 } else { 2.0 };
+    let score_error_bound = scale.error_bound(match (search.is_exact(), level) {
+        (_, Level::Objects) => n_products * objects::rounding_bound(scene.objects),
         (true, Level::Gaussians) => question.rounding_bound(),
         _ => search.score_error_bound(),
     });
+    let measured = search.measured_errors().filter(|_| level != Level::Objects);
     Answers {
         text: text.to_owned(),
         negatives: request.negatives.phrases().into_iter().map(str::to_owned).collect(),
-        level: request.level,
+        level,
         scene: manifest.scene.clone(),
         generation: manifest.generation,
         unit: if manifest.metric { "m" } else { "world" },
@@ -124,13 +162,9 @@ fn answer_one(
         threshold_source,
         n_searched: search.searched().map(|shard| shard.n_with_evidence() as u64).sum(),
         n_matching,
-        is_exact: search.is_exact(),
+        is_exact: search.is_exact() && level != Level::Objects,
         score_error_bound,
-        score_error_p999: search.measured_errors().map(|errors| {
-            // With negatives a score is the difference of two.
-            let n_products = if question.negatives.is_empty() { 1.0 } else { 2.0 };
-            scale.error_bound(n_products * errors.p999)
-        }),
+        score_error_p999: measured.map(|errors| scale.error_bound(n_products * errors.p999)),
         area_fetched: area_fetched(scene.fetched, request),
         clustering,
         reason,
@@ -147,12 +181,20 @@ impl Scale {
         Self(if question.negatives.is_empty() { ScoreKind::Cosine } else { ScoreKind::Relevancy })
     }
 
-    fn threshold(self, request: &QueryRequest, manifest: &Manifest) -> (f32, ThresholdSource) {
+    /// Returns the threshold, and where it comes from. `of_level`: how texts score over what is scored.
+    fn threshold(
+        self,
+        request: &QueryRequest,
+        manifest: &Manifest,
+        of_level: Option<Calibration>,
+    ) -> (f32, ThresholdSource) {
         match (request.threshold, self.0) {
             (Some(threshold), _) => (threshold, ThresholdSource::Request),
             (None, ScoreKind::Relevancy) => (RELEVANCY_THRESHOLD, ThresholdSource::Relevancy),
             (None, ScoreKind::Cosine) => {
-                calibrated_threshold(manifest.encoder.default_threshold, manifest.encoder.calibration)
+                // A model that states its threshold is taken at its word: a cosine is a cosine.
+                let scene = manifest.encoder.calibration.and(of_level);
+                calibrated_threshold(manifest.encoder.default_threshold, scene)
             }
         }
     }
@@ -218,29 +260,10 @@ pub fn relevance(score: f32, threshold: f32, n_gaussians: u64, distance: Option<
     (margin * (1.0 + n_gaussians as f64).ln() / (1.0 + distance.unwrap_or(0.0) / half)) as f32
 }
 
-fn rank(
-    clusters: Vec<Cluster>,
-    threshold: f32,
-    voxel: f64,
-    limit: usize,
-    near: Option<DVec3>,
-    manifest: &Manifest,
-) -> Vec<ClusterAnswer> {
-    let half = VOXELS_TO_HALF_RELEVANCE * voxel;
-    let mut ranked: Vec<(f32, Option<f64>, Cluster)> = clusters
-        .into_iter()
-        .map(|cluster| {
-            let distance = near.map(|near| near.distance(cluster.position_in_world));
-            (relevance(cluster.score, threshold, cluster.n_gaussians, distance, half), distance, cluster)
-        })
-        .collect();
-    ranked.sort_by(|(a_relevance, a_distance, a), (b_relevance, b_distance, b)| {
-        let nearer = a_distance.unwrap_or(0.0).total_cmp(&b_distance.unwrap_or(0.0));
-        b_relevance.total_cmp(a_relevance).then(nearer).then(a.first.cmp(&b.first))
-    });
-    ranked.truncate(limit);
-    let answers = ranked.into_iter().enumerate().map(|(at, (relevance, distance, cluster))| ClusterAnswer {
-        rank: at + 1,
+/// Describes a cluster; rank, relevance and distance are still open.
+fn cluster_answer(cluster: Cluster, manifest: &Manifest) -> ClusterAnswer {
+    ClusterAnswer {
+        rank: 0,
         id: format!("{}-{}", cluster.first.0, cluster.first.1),
         position_in_world: cluster.position_in_world,
         geographic: manifest.geo_reference.map(|geo| geo.geographic_from_world(cluster.position_in_world)),
@@ -251,10 +274,89 @@ fn rank(
         score: cluster.score,
         best_score: cluster.best_score,
         n_gaussians: cluster.n_gaussians,
-        relevance,
-        distance,
+        n_gaussians_in_scene: None,
+        evidence: None,
+        relevance: 0.0,
+        distance: None,
+    }
+}
+
+/// Describes an object likewise.
+fn object_answer(
+    object: &FoundObject<'_>,
+    members: Members,
+    scale: Scale,
+    manifest: &Manifest,
+) -> ClusterAnswer {
+    let (record, position) = (object.record, object.record.position());
+    let (bounds, score) = (record.bounds(), scale.shown(object.score));
+    ClusterAnswer {
+        rank: 0,
+        id: format!("o{:016x}", record.id),
+        position_in_world: position,
+        geographic: manifest.geo_reference.map(|geo| geo.geographic_from_world(position)),
+        box_min_in_world: bounds.min,
+        box_max_in_world: bounds.max,
+        size: bounds.size(),
+        oriented_box: members.oriented_box,
+        score,
+        best_score: score,
+        n_gaussians: members.n_gaussians,
+        n_gaussians_in_scene: Some(u64::from(record.n_gaussians)),
+        evidence: Some(Evidence { photo: object.photo.to_owned(), box_px: record.photo_box_px }),
+        relevance: 0.0,
+        distance: None,
+    }
+}
+
+/// Ranks what was described in a fixed order, in which equals stay.
+fn rank(
+    mut described: Vec<ClusterAnswer>,
+    threshold: f32,
+    voxel: f64,
+    limit: usize,
+    near: Option<DVec3>,
+) -> Vec<ClusterAnswer> {
+    let half = VOXELS_TO_HALF_RELEVANCE * voxel;
+    for answer in &mut described {
+        answer.distance = near.map(|near| near.distance(answer.position_in_world));
+        answer.relevance = relevance(answer.score, threshold, answer.n_gaussians, answer.distance, half);
+    }
+    described.sort_by(|a, b| {
+        let nearer = a.distance.unwrap_or(0.0).total_cmp(&b.distance.unwrap_or(0.0));
+        b.relevance.total_cmp(&a.relevance).then(nearer)
     });
-    answers.collect()
+    described.truncate(limit);
+    described.iter_mut().enumerate().for_each(|(at, answer)| answer.rank = at + 1);
+    described
+}
+
+/// `best`: score and place of the best object on board.
+fn reason_of_objects(request: &QueryRequest, threshold: f32, best: Option<(f32, DVec3)>) -> Reason {
+    let place = request.region();
+    let (kind, detail) = match best {
+        None => (
+            ReasonKind::NothingThere,
+            "the shards on board have no objects; ask with level=clusters, or encode with objects".to_owned(),
+        ),
+        Some((score, at)) if score < threshold => (
+            ReasonKind::BelowThreshold,
+            format!("no object reaches {threshold}; the best has {score:.3}, at {at:.2}"),
+        ),
+        Some(_) => (
+            ReasonKind::NothingThere,
+            format!(
+                "no object that reaches {threshold} has {} Gaussians{place}; fetch that area, or ask elsewhere",
+                request.min_count
+            ),
+        ),
+    };
+    Reason {
+        kind,
+        detail,
+        best_score: best.map(|(score, _)| score),
+        best_position_in_world: best.map(|(_, at)| at),
+    }
 }
 
 fn reason(

@@ -51,8 +51,10 @@ impl RequestError {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Level {
-    /// Groups of neighbouring matches: objects.
+    /// What the masks of several views agree on, scored as a whole.
     #[default]
+    Objects,
+    /// Groups of neighbouring matches.
     Clusters,
     /// The matches themselves.
     Gaussians,
@@ -61,6 +63,7 @@ pub enum Level {
 impl fmt::Display for Level {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
+            Self::Objects => "objects",
             Self::Clusters => "clusters",
             Self::Gaussians => "gaussians",
         })
@@ -72,9 +75,10 @@ impl FromStr for Level {
 
     fn from_str(text: &str) -> Result<Self, String> {
         match text {
+            "objects" => Ok(Self::Objects),
             "clusters" => Ok(Self::Clusters),
             "gaussians" => Ok(Self::Gaussians),
-            _ => Err("clusters or gaussians".into()),
+            _ => Err("objects, clusters or gaussians".into()),
         }
     }
 }
@@ -162,8 +166,8 @@ pub struct QueryRequest {
     pub radius: Option<f64>,
     /// Only Gaussians within this box count.
     pub bounds: Option<Aabb>,
-    /// What answers are made of.
-    pub level: Level,
+    /// What answers are made of; objects if absent, where the scene has them, else clusters.
+    pub level: Option<Level>,
     /// Edge of the voxels that clusters are joined by, world units; the scene's own if absent.
     pub voxel: Option<f64>,
     /// Clusters with fewer Gaussians are dropped, and counted.
@@ -183,7 +187,7 @@ impl QueryRequest {
             near: None,
             radius: None,
             bounds: None,
-            level: Level::default(),
+            level: None,
             voxel: None,
             min_count: DEFAULT_MIN_COUNT,
             precision: Precision::default(),
@@ -225,11 +229,12 @@ impl QueryRequest {
             }
         }
         let most = match self.level {
-            Level::Clusters => MAX_CLUSTERS,
-            Level::Gaussians => MAX_GAUSSIANS,
+            Some(Level::Gaussians) => MAX_GAUSSIANS,
+            _ => MAX_CLUSTERS,
         } / self.texts.len();
         if let Some(limit) = self.limit.filter(|limit| !(1..=most).contains(limit)) {
-            return refuse("limit", &limit, format!("1 to {most} {} a text", self.level));
+            let answers = self.level.map_or("answers".to_owned(), |level| level.to_string());
+            return refuse("limit", &limit, format!("1 to {most} {answers} a text"));
         }
         let (thresholds, expected) = match self.negatives {
             Negatives::None => (-1.0..=1.0, "a cosine, -1 to 1"),
@@ -300,10 +305,13 @@ mod tests {
         );
         assert_eq!(refused(|r| (r.negatives, r.threshold) = (Negatives::Canonical, Some(-0.1))), "threshold");
         assert_eq!(refused(|r| r.limit = Some(MAX_CLUSTERS + 1)), "limit");
-        assert_eq!(refused(|r| (r.level, r.limit) = (Level::Gaussians, Some(MAX_GAUSSIANS + 1))), "limit");
+        assert_eq!(
+            refused(|r| (r.level, r.limit) = (Some(Level::Gaussians), Some(MAX_GAUSSIANS + 1))),
+            "limit"
+        );
         assert_eq!(
             refused(|r| {
-                (r.level, r.limit) = (Level::Gaussians, Some(MAX_GAUSSIANS / 2 + 1));
+                (r.level, r.limit) = (Some(Level::Gaussians), Some(MAX_GAUSSIANS / 2 + 1));
                 r.texts.push("table".into());
             }),
             "limit"

@@ -1,8 +1,9 @@
 use slag_common::frames::{Aabb, GeoReference, Geographic};
+use slag_common::manifest::Calibration;
 
 use super::*;
 use crate::score::{Precision, Scratch};
-use crate::testing::{BuiltShard, Member, TestShard, manifest_of, normalised};
+use crate::testing::{BuiltShard, Member, TestObject, TestShard, manifest_of, normalised};
 
 /// A cell whose single row of `n` Gaussians sits at a place, 1 cm apart, at a cosine to axis 0.
 fn thing(cell_id: u32, at: DVec3, n: u16, cosine: f32) -> TestShard {
@@ -24,7 +25,9 @@ fn ask_about(
     edit(&mut request, &mut manifest);
     request.check().expect("a sound request");
     let shards: Vec<_> = built.iter().map(BuiltShard::view).collect();
-    let scene = Scene { shards: &shards, manifest: &manifest, fetched: (DVec3::ZERO, 50.0) };
+    let objects: Vec<_> = built.iter().map(|shard| shard.layout.objects(&shard.bytes)).collect();
+    let scene =
+        Scene { shards: &shards, objects: &objects, manifest: &manifest, fetched: (DVec3::ZERO, 50.0) };
     answer(&mut Scratch::default(), &scene, questions, &request).expect("answers")
 }
 
@@ -132,7 +135,7 @@ fn empty_answers_say_why() {
     let sticking_out = ask(&yard, ball(DVec3::new(45.0, 0.0, 0.0), 10.0));
     assert_eq!(sticking_out.area_fetched, Some(false));
     let gaussians =
-        ask(&yard, |request, _| (request.level, request.threshold) = (Level::Gaussians, Some(1.0)));
+        ask(&yard, |request, _| (request.level, request.threshold) = (Some(Level::Gaussians), Some(1.0)));
     assert_eq!(gaussians.reason.expect("nothing found").kind, ReasonKind::BelowThreshold);
 }
 
@@ -141,7 +144,7 @@ fn gaussians_come_best_then_nearest_first() {
     let near = DVec3::new(20.355, 0.0, 0.0);
     let yard = yard();
     let answers = ask(&yard, |request, _| {
-        (request.level, request.limit, request.near) = (Level::Gaussians, Some(7), Some(near));
+        (request.level, request.limit, request.near) = (Some(Level::Gaussians), Some(7), Some(near));
     });
     let found = described(&yard, &answers, Some(near));
     let names: Vec<(u32, u32)> = found.iter().map(|g| (g.cell_id, g.index)).collect();
@@ -154,7 +157,7 @@ fn gaussians_come_best_then_nearest_first() {
 fn exact_shards_answer_exactly() {
     let exact = [thing(1, DVec3::ZERO, 30, 0.7).build(true)];
     let clusters_of = ask(&exact, |_, _| ());
-    let gaussians = ask(&exact, |request, _| request.level = Level::Gaussians);
+    let gaussians = ask(&exact, |request, _| request.level = Some(Level::Gaussians));
     assert!(clusters_of.is_exact && gaussians.is_exact && gaussians.score_error_bound < 1e-5);
     let found = described(&exact, &gaussians, None);
     assert_eq!((found.len(), found[2].input_index), (DEFAULT_LIMIT, Some(7)));
@@ -164,10 +167,11 @@ fn exact_shards_answer_exactly() {
 #[test]
 fn exactness_is_a_choice() {
     let exact = [thing(1, DVec3::ZERO, 30, 0.7).build(true)];
-    let rows =
-        ask(&exact, |request, _| (request.level, request.precision) = (Level::Gaussians, Precision::Rows));
+    let rows = ask(&exact, |request, _| {
+        (request.level, request.precision) = (Some(Level::Gaussians), Precision::Rows)
+    });
     let compact = [thing(1, DVec3::ZERO, 30, 0.7).build(false)];
-    assert_eq!(rows, ask(&compact, |request, _| request.level = Level::Gaussians));
+    assert_eq!(rows, ask(&compact, |request, _| request.level = Some(Level::Gaussians)));
     assert!(!rows.is_exact && rows.score_error_bound > 1e-5, "{}", rows.score_error_bound);
 }
 
@@ -198,7 +202,7 @@ fn negatives_make_relevancies() {
     assert!((f64::from(found[0].score) - expected(0.9)).abs() <= bound && bound < 0.02, "{bound}");
     let answers = ask(|request| request.threshold = Some(0.4));
     assert_eq!((answers.n_matching, answers.threshold_source), (224, ThresholdSource::Request));
-    let all = ask(|request| (request.threshold, request.level) = (Some(0.0), Level::Gaussians));
+    let all = ask(|request| (request.threshold, request.level) = (Some(0.0), Some(Level::Gaussians)));
     assert_eq!(all.n_matching, 724);
     let best = &described(&yard, &all, None)[0];
     assert!((f64::from(best.score) - expected(0.95)).abs() <= bound, "{best:?}");
@@ -220,7 +224,7 @@ fn relevancies_keep_within_their_bound_and_use_it() {
     let ask = |row: &[BuiltShard]| {
         let mut answers = ask_about(row, std::slice::from_ref(&question), |request, _| {
             request.negatives = Negatives::Phrases(vec!["other".into()]);
-            (request.level, request.threshold) = (Level::Gaussians, Some(0.0));
+            (request.level, request.threshold) = (Some(Level::Gaussians), Some(0.0));
         });
         answers.remove(0)
     };
@@ -240,7 +244,7 @@ fn relevancies_keep_within_their_bound_and_use_it() {
 fn batches_answer_as_single_questions_do() {
     let yard = yard();
     let questions = [Question::new([1.0, 0.0]), Question::new([0.0, 1.0]), Question::new([0.6, 0.8])];
-    for level in [Level::Clusters, Level::Gaussians] {
+    for level in [Some(Level::Clusters), Some(Level::Gaussians)] {
         let texts = ["thing", "other", "third"].map(str::to_owned);
         let together = ask_about(&yard, &questions, |request, _| {
             (request.texts, request.level, request.limit) = (texts.to_vec(), level, Some(120));
@@ -323,4 +327,103 @@ fn voxels_of_a_scene_without_metres_follow_its_cells() {
     assert_eq!(default_voxel(&manifest), 3.0);
     manifest.cells.clear();
     assert_eq!(default_voxel(&manifest), 1.0);
+}
+
+/// Cells 3 and 4 share object 21 (30 Gaussians and 12 of 50 in all); cell 4 has object 22 too.
+fn scene_of_objects() -> Vec<BuiltShard> {
+    let [a, b, c] = [[1.0f32, 0.0], [0.6, 0.8], [0.0, 1.0]];
+    let object = |id: u64, vectors: [[f32; 2]; 3], runs: &[std::ops::Range<u32>], n_gaussians| TestObject {
+        id,
+        vectors: vectors.concat(),
+        runs: runs.to_vec(),
+        n_gaussians,
+    };
+    let shared = |runs: &[std::ops::Range<u32>]| object(21, [b, a, c], runs, 50);
+    let calibration = Calibration { score_mean: 0.1, score_spread: 0.1 };
+    let built =
+        [thing(3, DVec3::new(20.0, 0.0, 0.0), 100, 0.9), thing(4, DVec3::new(22.0, 0.0, 0.0), 60, 0.9)];
+    let built = built.map(|thing| thing.build(false));
+    vec![
+        built[0].with_objects(&[shared(&[10..40])], calibration),
+        built[1].with_objects(&[shared(&[0..5, 10..17]), object(22, [c, c, c], &[20..50], 30)], calibration),
+    ]
+}
+
+/// Oracle: scores by hand. The mean's cosine is 0.6, the best side's 1.
+#[test]
+fn objects_answer_first_and_once() {
+    let scene = scene_of_objects();
+    let answers = ask(&scene, |request, manifest| {
+        request.near = Some(DVec3::ZERO);
+        manifest.encoder.calibration = Some(Calibration { score_mean: 0.5, score_spread: 0.2 });
+    });
+    assert_eq!((answers.level, answers.threshold_source), (Level::Objects, ThresholdSource::Scene));
+    // Of the objects, not of the Gaussians.
+    assert!((answers.threshold - 0.4).abs() < 1e-6, "{}", answers.threshold);
+    let found = clusters(&answers);
+    assert_eq!(found.len(), 1, "{found:?}");
+    let object = &found[0];
+    assert!((object.score - 0.8).abs() <= answers.score_error_bound && answers.score_error_bound < 0.01);
+    assert_eq!((object.id.as_str(), object.rank), ("o0000000000000015", 1));
+    assert_eq!((object.n_gaussians, object.n_gaussians_in_scene, answers.n_matching), (42, Some(50), 42));
+    let evidence = Evidence { photo: "21.jpg".into(), box_px: [1, 2, 30, 40] };
+    assert_eq!(object.evidence.as_ref(), Some(&evidence));
+    assert_eq!((object.position_in_world, object.distance), (DVec3::new(21.0, 0.0, 0.0), Some(21.0)));
+    assert_eq!(object.size, DVec3::splat(2.0));
+    // From 20.10 to 22.16, without 2 % at either end.
+    assert!((object.oriented_box.size.x - 2.06).abs() < 0.05, "{:?}", object.oriented_box);
+    assert!(!answers.is_exact && answers.clustering.is_none() && answers.reason.is_none());
+
+    // Without a calibrated scene the encoder's own threshold holds; the other levels are as ever.
+    let answers = ask(&scene, |request, _| request.level = Some(Level::Objects));
+    assert_eq!(answers.threshold_source, ThresholdSource::Encoder);
+    let clusters_of = |built: &[BuiltShard]| {
+        ask(built, |request, _| (request.level, request.threshold) = (Some(Level::Clusters), Some(0.5)))
+            .answers
+    };
+    let without =
+        [thing(3, DVec3::new(20.0, 0.0, 0.0), 100, 0.9), thing(4, DVec3::new(22.0, 0.0, 0.0), 60, 0.9)];
+    assert_eq!(clusters_of(&scene), clusters_of(&without.map(|thing| thing.build(false))));
+}
+
+#[test]
+fn objects_abstain_and_keep_to_the_region() {
+    let scene = scene_of_objects();
+    let ask_objects = |edit: &dyn Fn(&mut QueryRequest)| ask(&scene, |request, _| edit(request));
+    // Below the threshold: the best and its place are named.
+    let answers = ask_objects(&|request| request.threshold = Some(0.9));
+    let reason = answers.reason.as_ref().expect("no answer");
+    assert_eq!(
+        (answers.level, reason.kind, answers.answers.len()),
+        (Level::Objects, ReasonKind::BelowThreshold, 0)
+    );
+    assert!(
+        reason.best_score.is_some_and(|s| (s - 0.8).abs() < 0.01) && reason.detail.contains("0.8"),
+        "{reason:?}"
+    );
+    assert_eq!(reason.best_position_in_world, Some(DVec3::new(21.0, 0.0, 0.0)));
+    // Only what lies in the region counts: 20 Gaussians of cell 3 from 20.20 on, to 20.39.
+    let within =
+        |min: f64, max: f64| Aabb { min: DVec3::new(min, -1.0, -1.0), max: DVec3::new(max, 1.0, 1.0) };
+    let answers = ask_objects(&|request| {
+        (request.threshold, request.bounds) = (Some(0.5), Some(within(20.195, 20.9)));
+    });
+    assert_eq!(clusters(&answers)[0].n_gaussians, 20);
+    let answers = ask_objects(&|request| {
+        (request.threshold, request.bounds) = (Some(0.5), Some(within(50.0, 60.0)));
+    });
+    assert_eq!(answers.reason.map(|r| r.kind), Some(ReasonKind::NothingThere));
+    // With a negative the score is the difference of the object's scores: 0.8 - 0.9 for 21, 0 - 1 for 22.
+    let question =
+        Question { negatives: vec![std::sync::Arc::from([0.0f32, 1.0])], ..Question::new([1.0, 0.0]) };
+    let answers = ask_about(&scene, &[question], |request, _| {
+        (request.negatives, request.threshold) = (Negatives::Phrases(vec!["other".into()]), Some(0.2));
+    });
+    let found = clusters(&answers[0]);
+    let expected = crate::score::relevancy(0.8 - 0.9);
+    assert!(found.len() == 1 && (found[0].score - expected).abs() < 0.01, "{found:?}");
+    // A scene without objects says so.
+    let answers = ask(&yard(), |request, _| request.level = Some(Level::Objects));
+    assert!(answers.reason.is_some_and(|r| r.detail.contains("level=clusters")));
+    assert_eq!(ask(&yard(), |_, _| ()).level, Level::Clusters);
 }

@@ -24,6 +24,7 @@ use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
 use slag_common::container::ContainerError;
 use slag_common::manifest::{self, CellRecord, Manifest, ManifestError, TrustedKeys};
+use slag_common::objects::Objects;
 use slag_common::shard::{Profile, ShardLayout, ShardView};
 
 use files::{DiskFiles, Files, Stat};
@@ -310,6 +311,11 @@ impl OpenShard {
     /// Returns its columns.
     pub fn view(&self) -> ShardView<'_> {
         self.layout.view(&self.bytes)
+    }
+
+    /// Returns the objects of its Gaussians, where the shard has them.
+    pub fn objects(&self) -> Option<Objects<'_>> {
+        self.layout.objects(&self.bytes)
     }
 
     /// Returns its length.

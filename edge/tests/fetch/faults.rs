@@ -57,7 +57,8 @@ fn ask(cache: EdgeCache) -> Result<(u64, BTreeSet<Place>), String> {
     let text = TextService::start(info, Box::new(FirstAxis)).expect("a thread");
     let engine = Engine::new(cache, text);
     engine.reload().map_err(|e| slag_edge::error_line(&e))?;
-    let request = QueryRequest { level: Level::Gaussians, limit: Some(10_000), ..QueryRequest::new("x") };
+    let request =
+        QueryRequest { level: Some(Level::Gaussians), limit: Some(10_000), ..QueryRequest::new("x") };
     let reply = engine.answer(&request).map_err(|e| slag_edge::error_line(&e))?;
     let answers = &reply.answers[0];
     let found = reply.gaussians(answers).iter().map(|g| place(g.position_in_world.into())).collect();

@@ -220,6 +220,9 @@ pub struct EncodeArgs {
     /// cell's small Gaussians].
     #[arg(long, value_name = "E")]
     pub position_error: Option<f64>,
+    /// Objects.
+    #[command(flatten)]
+    pub objects: super::objects::ObjectArgs,
     /// Days after which robots refuse the manifest; never if absent.
     #[arg(long, value_name = "DAYS")]
     pub expires_days: Option<u32>,
@@ -351,6 +354,9 @@ pub struct EvalLabelledArgs {
     /// Lets the Gaussians of a superpoint answer together, as the paper does.
     #[arg(long, value_enum)]
     pub superpoints: Option<Filter>,
+    /// Whether objects are scored.
+    #[command(flatten)]
+    pub level: super::objects::EvalLevelArgs,
 }
 
 /// `serve`.

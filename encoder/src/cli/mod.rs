@@ -5,6 +5,7 @@ mod bench;
 mod eval;
 mod keys;
 mod noise;
+mod objects;
 mod progress;
 mod refine;
 mod run;

@@ -9,7 +9,7 @@ use super::Exit;
 use super::args::{BackgroundArg, ModelArgs};
 use super::run::{available_threads, cancel_flag, open_models, print};
 use crate::embed::Background;
-use crate::encode::{EncodeSettings, Masks};
+use crate::encode::{EncodeSettings, Masks, ViewOrder};
 use crate::eval::noise::{self, NoiseRow, NoiseSettings};
 use crate::lift::Aggregation;
 use crate::palette::PaletteSettings;
@@ -91,6 +91,9 @@ pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> 
             metric: true,
             geo: None,
             views_limit: args.views_limit.map(|n| n as usize),
+            view_order: ViewOrder::Nth,
+            time_budget: None,
+            objects: false,
             raster_width_px: None,
             background: Background::from(args.background),
             min_mask_px: 200,

@@ -237,6 +237,7 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
                 .position_error
                 .map_or_else(|| PositionError::default_for(metric), PositionError::Within),
         },
+        objects: !args.objects.no_objects,
         created_unix_secs,
         expires_unix_secs: args.expires_days.map(|days| created_unix_secs + u64::from(days) * 86_400),
     })
@@ -278,6 +279,13 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
         let (coverage, seen, secs) = (100.0 * coverage, 100.0 * seen, summary.coverage_secs);
         format!("coverage   {coverage:.1} % of all views, {seen:.1} % of the Gaussians seen; found in {secs:.1} s\n")
     });
+    let objects = summary.objects.as_ref().map_or(String::new(), |found| {
+        let (n, of_masks, aside) = (found.n_objects, found.n_masks_of_objects, found.n_masks_set_aside);
+        format!(
+            "objects    {n} of {of_masks} masks, {} Gaussians; {aside} masks set aside\n",
+            found.n_gaussians
+        )
+    });
     let images_on = summary.images_on.as_ref().map_or(String::new(), |on| format!("images on  {on}\n"));
     let lines = format!(
         "published  generation {} in {}\n\
@@ -285,7 +293,7 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
          views      {} of {} ({} resumed, {} without masks)\n{coverage}{skipped}{images_on}\
          masks      {} in {} regions, {} sums\n\
          cells      {} with {} palette rows\n\
-         shards     {sizes}\n\
+         {objects}shards     {sizes}\n\
          seconds    {:.1}; by stage, all threads: {busy}\n\
          views took {:.1} s\n  stage    at once   seconds    busy\n{of_views}",
         summary.generation,
@@ -365,6 +373,7 @@ fn run_eval_labelled(args: &EvalLabelledArgs, json: bool) -> Result<Exit> {
         profile: args.profile,
         threshold: args.threshold,
         filter: args.superpoints,
+        level: args.level.level.into(),
     };
     let report = eval::labelled(&reader, &truth, &scene, &mut *encoder, &CpuRasterizer, &settings)?;
     print(json, &report, &report)?;

@@ -208,6 +208,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
             palette: PaletteSettings::default(),
             position_error: PositionError::default_for(true),
         },
+        objects: true,
         created_unix_secs: options.created_unix_secs,
         expires_unix_secs: None,
     };

@@ -12,6 +12,8 @@ use super::{EncodeError, EncodeSettings, Stopwatch};
 use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS, extra_field};
 use crate::lift::refine::Refinement;
 use crate::lift::{Aggregation, CellField, PartSums, RegionTable, SumsIndex};
+use crate::objects::photos::Photo;
+use crate::objects::{self, ObjectsReport, SceneObjects};
 use crate::palette::{ScoreMetric, TextBank, Yardstick};
 use crate::progress::Progress;
 use crate::shard::cells::CellSplit;
@@ -52,6 +54,8 @@ pub(super) struct CellBuilder<'a> {
     yardstick: Yardstick,
     /// Bytes there are for the sums of a group of cells.
     group_bytes: u64,
+    /// Each view's masks in its photo, where objects are to be found.
+    photos: Option<Vec<Photo>>,
 }
 
 /// What was built.
@@ -61,6 +65,8 @@ pub(super) struct BuiltCells {
     pub(super) n_without_evidence: u64,
     /// Sums over the Gaussians with evidence of mean score and mean squared score, and how many they are.
     score_sums: [f64; 3],
+    /// What was found, where objects were looked for.
+    pub(super) objects: Option<ObjectsReport>,
 }
 
 impl BuiltCells {
@@ -83,7 +89,7 @@ impl<'a> CellBuilder<'a> {
         store: &'a Store,
         scene: &'a Gaussians,
         split: &'a CellSplit,
-        sums_paths: &[PathBuf],
+        (sums_paths, photos): (&[PathBuf], Option<Vec<Photo>>),
         (models, bank): (&ModelDir, TextBank),
         stopwatch: &'a Stopwatch,
     ) -> Result<Self, EncodeError> {
@@ -115,7 +121,23 @@ impl<'a> CellBuilder<'a> {
             table,
             yardstick,
             group_bytes,
+            photos,
         })
+    }
+
+    /// Finds the objects of the scene, where they are asked for.
+    fn objects(&self) -> Result<Option<SceneObjects>, EncodeError> {
+        let Some(photos) = &self.photos else { return Ok(None) };
+        let scene = objects::Scene {
+            index: &self.index,
+            table: &self.table,
+            gaussians: self.scene,
+            split: self.split,
+            photos,
+            yardstick: &self.yardstick,
+            group_bytes: self.group_bytes,
+        };
+        Ok(Some(self.stopwatch.time("objects", || objects::find(&scene))?))
     }
 
     pub(super) fn n_views_without_masks(&self) -> usize {
@@ -148,7 +170,10 @@ impl<'a> CellBuilder<'a> {
             extras: Extras::new(),
             n_without_evidence: 0,
             score_sums: [0.0; 3],
+            objects: None,
         };
+        // Of the masks as they are, before any counts less.
+        let objects = self.objects()?;
         let aggregation = self.settings.aggregation;
         let refinement = self.stopwatch.time("refine", || {
             let sums = (&self.index, &mut self.table);
@@ -177,12 +202,13 @@ impl<'a> CellBuilder<'a> {
                 let cell_id = sums.part.cell_id;
                 self.add_part(sums, refinement.as_ref(), &mut cell, &mut built)?;
                 if cell.has_evidence.len() == self.split.cells[cell_id as usize].gaussians.len() {
-                    self.finish_cell(cell_id, &cell, &mut built)?;
+                    self.finish_cell(cell_id, &cell, objects.as_ref(), &mut built)?;
                     cell.has_evidence.clear();
                     progress.advance(1);
                 }
             }
         }
+        built.objects = objects.map(|objects| objects.report);
         Ok(Some(built))
     }
 
@@ -218,12 +244,22 @@ impl<'a> CellBuilder<'a> {
         &self,
         cell_id: u32,
         embeddings: &CellEmbeddings,
+        objects: Option<&SceneObjects>,
         built: &mut BuiltCells,
     ) -> Result<(), EncodeError> {
         let cell = &self.split.cells[cell_id as usize];
         let (scene, encoder_id, settings) = (self.scene, self.encoder_id, &self.settings.shards);
         let made = self.stopwatch.time("palette", || {
-            shard::build(scene, cell_id, cell, embeddings, encoder_id, &self.yardstick, settings)
+            shard::build_with(
+                scene,
+                cell_id,
+                cell,
+                embeddings,
+                encoder_id,
+                &self.yardstick,
+                settings,
+                objects,
+            )
         });
         let record = |shard: &BuiltShard| -> Result<(Profile, ShardRecord), EncodeError> {
             let (hash, len_bytes) = self.stopwatch.time("write", || self.store.put_bytes(&shard.bytes))?;

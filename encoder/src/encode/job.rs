@@ -7,6 +7,7 @@ use slag_common::Hash32;
 
 use super::EncodeError;
 use crate::lift::ViewSums;
+use crate::objects::photos;
 use crate::store::Store;
 
 const TREE: &str = "job";
@@ -69,8 +70,14 @@ impl<'a> Job<'a> {
         self.folder.join("views").join(format!("{}.sums", Hash32::of(view.as_bytes())))
     }
 
-    /// Keeps a view's sums: the file first, then the record that counts it as done.
-    pub(super) fn keep(&self, view: &str, sums: &ViewSums) -> Result<(), EncodeError> {
+    /// Returns where the boxes of a view's masks lie.
+    pub(super) fn boxes_path(&self, view: &str) -> PathBuf {
+        self.sums_path(view).with_extension("boxes")
+    }
+
+    /// Keeps a view's sums and its masks' boxes: the files first, then the record that counts it as done.
+    pub(super) fn keep(&self, view: &str, sums: &ViewSums, boxes_px: &[[u32; 4]]) -> Result<(), EncodeError> {
+        photos::write_boxes(&self.boxes_path(view), boxes_px)?;
         sums.write(&self.sums_path(view))?;
         let key = format!("{VIEW_PREFIX}{view}");
         self.records.insert(key, &[]).map_err(|source| records_error(self.store, source))?;

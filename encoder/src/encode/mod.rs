@@ -28,7 +28,9 @@ use slag_models::{ModelDir, ModelError, SessionOptions};
 
 use crate::embed::EmbedError;
 use crate::ingest::{self, GeoError, IngestError};
-use crate::lift::SumsError;
+use crate::lift::{SumsError, SumsFile};
+use crate::objects::ObjectsReport;
+use crate::objects::photos::{self, Photo};
 use crate::palette::TextBank;
 use crate::progress::Progress;
 use crate::raster::{LoadedScene, RasterError, RasterView, Rasterizer};
@@ -233,6 +235,8 @@ pub struct EncodeSummary {
     pub n_cells: usize,
     /// Palette rows in all cells.
     pub n_rows: u64,
+    /// Objects, where they were looked for.
+    pub objects: Option<ObjectsReport>,
     /// Bytes of all shards by profile.
     pub shard_bytes: BTreeMap<String, u64>,
     /// What was spent on each cell.
@@ -352,6 +356,7 @@ pub fn encode(
     }
 
     let sums_paths: Vec<PathBuf> = used.iter().map(|view| job.sums_path(&view.name)).collect();
+    let photos = settings.objects.then(|| photos_of(&job, &used, models.dim())).transpose()?;
     let bank = stopwatch.time("texts", || match models.text_encoder(session) {
         Ok(mut encoder) => TextBank::of_model(&mut *encoder),
         Err(e) => {
@@ -359,8 +364,10 @@ pub fn encode(
             TextBank::directions(models.dim())
         }
     });
-    let mut builder =
-        CellBuilder::open(settings, &store, &scene, &split, &sums_paths, (models, bank), &stopwatch)?;
+    let mut builder = {
+        let files = (&sums_paths[..], photos);
+        CellBuilder::open(settings, &store, &scene, &split, files, (models, bank), &stopwatch)?
+    };
     let mut summary = EncodeSummary {
         generation: store.next_generation()?,
         n_gaussians: (scene.len() - split.n_rejected) as u64,
@@ -379,6 +386,7 @@ pub fn encode(
         n_entries: builder.n_entries(),
         n_cells: split.cells.len(),
         n_rows: 0,
+        objects: None,
         shard_bytes: BTreeMap::new(),
         cells: Vec::new(),
         busy_secs: BTreeMap::new(),
@@ -405,6 +413,7 @@ pub fn encode(
         summary.cells.push(CellReport { cell_id, n_gaussians, n_rows, shard_bytes });
     }
     summary.n_without_evidence = built.n_without_evidence;
+    summary.objects = built.objects.clone();
 
     let manifest = Manifest {
         version: manifest::VERSION,
@@ -506,6 +515,17 @@ fn choose_views(
             (order, Some(coverage))
         }
     })
+}
+
+/// Reads where the masks of each view lie in its photo.
+fn photos_of(job: &Job<'_>, views: &[&View], dim: usize) -> Result<Vec<Photo>, EncodeError> {
+    let photo = |view: &&View| {
+        let (_, regions) = SumsFile::open(&job.sums_path(&view.name))?;
+        let n_masks = regions.mask_vectors.len() / dim;
+        let boxes_px = photos::read_boxes(&job.boxes_path(&view.name), n_masks)?;
+        Ok(Photo { name: view.name.clone(), boxes_px })
+    };
+    views.iter().map(photo).collect()
 }
 
 /// Works off the views that are not done yet, none begun after `deadline` but a first one. Returns how busy the

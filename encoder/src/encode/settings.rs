@@ -103,6 +103,8 @@ pub struct EncodeSettings {
     pub cells: CellLimits,
     /// How fine shards are.
     pub shards: ShardSettings,
+    /// Whether masks that views agree on become objects.
+    pub objects: bool,
     /// Creation time to sign, seconds since 1970.
     pub created_unix_secs: u64,
     /// Expiry to sign.

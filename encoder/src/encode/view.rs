@@ -13,6 +13,7 @@ use super::{EncodeError, EncodeSettings};
 use crate::embed;
 use crate::ingest::{self, LoadedImage};
 use crate::lift::ViewSums;
+use crate::objects::photos::boxes_of;
 use crate::progress::Progress;
 use crate::raster::{LoadedScene, RasterError, RasterView};
 use crate::segment::{self, Mask, RegionMap, SegmentInput, Segmenter};
@@ -53,7 +54,7 @@ enum Next {
     Crop(LoadedImage, Vec<Mask>),
     Embed(Crops, Partition),
     Raster(Vec<f32>, Partition),
-    Write(ViewSums),
+    Write(ViewSums, Vec<[u32; 4]>),
 }
 
 /// What is to be embedded.
@@ -70,6 +71,8 @@ struct Partition {
     raster_view: RasterView,
     regions: RegionMap,
     masks_of_region: Vec<Vec<u32>>,
+    /// Of each mask, in pixels of the photo.
+    boxes_px: Vec<[u32; 4]>,
 }
 
 impl<'v> Work<'v> {
@@ -144,16 +147,17 @@ impl ViewStages<'_> {
                 }
                 Next::Raster(vectors, partition)
             }
-            Next::Raster(vectors, Partition { raster_view, regions, masks_of_region }) => {
+            Next::Raster(vectors, Partition { raster_view, regions, masks_of_region, boxes_px }) => {
                 let weights = self
                     .scene
                     .weights(&raster_view, &regions, self.settings.weights)
                     .map_err(raster_failed)?;
                 let dim = self.models.dim();
-                Next::Write(ViewSums::new(&weights.entries, masks_of_region, vectors, dim, self.split))
+                let sums = ViewSums::new(&weights.entries, masks_of_region, vectors, dim, self.split);
+                Next::Write(sums, boxes_px)
             }
-            Next::Write(sums) => {
-                self.job.keep(&view.name, &sums)?;
+            Next::Write(sums, boxes_px) => {
+                self.job.keep(&view.name, &sums, &boxes_px)?;
                 self.progress.advance(1);
                 return Ok(None);
             }
@@ -180,7 +184,7 @@ impl ViewStages<'_> {
             raster_view.intrinsics.height_px,
             loaded.valid.as_deref(),
         );
-        Partition { raster_view, regions, masks_of_region }
+        Partition { raster_view, regions, masks_of_region, boxes_px: boxes_of(masks) }
     }
 
     /// Returns a vector per mask, with an encoder that is free or a new one.

@@ -7,6 +7,7 @@
 //! above the threshold are compared with its mask.
 
 mod filter;
+mod instances;
 pub mod lerf;
 pub mod metrics;
 pub mod noise;
@@ -23,11 +24,12 @@ use slag_common::Gaussians;
 use slag_common::gaussians::SH_C0;
 use slag_models::{EncodeError, TextEncoder};
 
-use crate::query::{self, QueryError};
+use crate::query::{self, PublishedObjects, QueryError};
 use crate::raster::{RasterError, RasterView, Rasterizer};
 use crate::store::StoreReader;
 use crate::superpoint::{SuperpointSettings, Superpoints};
 pub use filter::Filter;
+pub use instances::{InstanceReport, Recall};
 use metrics::{Confusion, area_under_roc, average_precision, iou_of_sets, mean};
 use slag_common::shard::Profile;
 pub use truth::{LabelledView, Thing, Truth, TruthError};
@@ -156,6 +158,10 @@ pub struct EvalReport {
     /// How superpoints answered together; absent where each Gaussian answered for itself.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub filter: Option<Filter>,
+    /// What was scored.
+    pub level: EvalLevel,
+    /// How many of the things objects find; only where objects were scored.
+    pub instances: Option<InstanceReport>,
     /// Score from which something counts as found.
     pub threshold: f32,
     /// Each word.
@@ -182,6 +188,17 @@ pub struct EvalReport {
     pub n_unlabelled: usize,
 }
 
+/// What is scored.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum EvalLevel {
+    /// Each Gaussian by itself.
+    #[default]
+    Gaussians,
+    /// As its object, those without by themselves.
+    Objects,
+}
+
 /// What to evaluate.
 #[derive(Clone, Debug, Default)]
 pub struct EvalSettings {
@@ -193,6 +210,8 @@ pub struct EvalSettings {
     pub threshold: Option<f32>,
     /// Lets superpoints of colour and shape answer together.
     pub filter: Option<Filter>,
+    /// What is scored.
+    pub level: EvalLevel,
 }
 
 /// Evaluates a store against labels. `scene`: the splat that was encoded, for the test views.
@@ -213,7 +232,12 @@ pub fn labelled(
     let mut first_error = None;
     let mut classes: Vec<(String, Vec<u16>)> = Vec::new();
     let mut scores: Vec<Vec<f32>> = Vec::new();
-    let mut score = |text: &str| -> Result<Option<Vec<f32>>, EvalError> {
+    let objects = match settings.level {
+        EvalLevel::Gaussians => None,
+        EvalLevel::Objects => Some(PublishedObjects::read(reader)?),
+    };
+    let mut of_objects: Vec<Vec<f32>> = Vec::new();
+    let mut score = |text: &str| -> Result<Option<(Vec<f32>, Vec<f32>)>, EvalError> {
         let vector = match encoder.encode(text) {
             Ok(vector) => vector,
             Err(error) => {
@@ -222,30 +246,40 @@ pub fn labelled(
                 return Ok(None);
             }
         };
-        let scores = match settings.profile {
+        let mut scores = match settings.profile {
             Some(profile) => query::scores_of_shards(reader, &vector, profile)?,
             None => query::scores(reader, &vector)?,
         };
-        Ok(Some(scores.cosines))
+        let of_objects = objects.as_ref().map(|objects| objects.scores(&vector)).unwrap_or_default();
+        objects.iter().for_each(|objects| objects.overlay(&of_objects, &mut scores.cosines));
+        Ok(Some((scores.cosines, of_objects)))
     };
     let there = || all.iter().map(|(word, _)| word.as_str()).collect::<Vec<_>>().join(", ");
     for (word, ids) in &all {
         if !settings.words.is_empty() && !settings.words.contains(word) {
             continue;
         }
-        if let Some(cosines) = score(word)? {
+        if let Some((cosines, of_word)) = score(word)? {
             classes.push((word.clone(), ids.clone()));
             scores.push(cosines);
+            of_objects.push(of_word);
         }
     }
-    let threshold = settings.threshold.unwrap_or(reader.manifest().encoder.default_threshold);
+    let encoder_record = &reader.manifest().encoder;
+    let threshold = settings.threshold.unwrap_or_else(|| match &objects {
+        // A scene's own threshold is three spreads above the mean: of what is scored.
+        Some(PublishedObjects { calibration: c, .. }) if encoder_record.calibration.is_some() => {
+            (c.score_mean + 3.0 * c.score_spread).clamp(-1.0, 1.0)
+        }
+        _ => encoder_record.default_threshold,
+    });
     let is_there = |word: &str| {
         let things = truth.things.iter().chain(&truth.background);
         things.into_iter().any(|t| t.category.contains(word) || t.words.iter().any(|w| w.contains(word)))
     };
     let mut abstained = [0, 0];
     for word in ABSENT.into_iter().filter(|word| !is_there(word)) {
-        if let Some(cosines) = score(word)? {
+        if let Some((cosines, _)) = score(word)? {
             let n = cosines.iter().filter(|c| **c >= threshold).count();
             abstained[0] += usize::from(n < MIN_ANSWER);
             abstained[1] += 1;
@@ -311,6 +345,9 @@ pub fn labelled(
     let n_without_evidence =
         of_things.iter().filter(|i| class_of(**i).is_some() && scores[0][**i].is_nan()).count();
 
+    let instances = objects.as_ref().map(|objects| {
+        instances::report(truth, &objects.object_of, objects.ids.len(), &classes, &of_objects, threshold)
+    });
     let mut words = Vec::new();
     for (c, (word, ids)) in classes.iter().enumerate() {
         let positive: Vec<bool> = of_things.iter().map(|i| class_of(*i) == Some(c)).collect();
@@ -336,6 +373,8 @@ pub fn labelled(
         encoder: reader.manifest().encoder.name.clone(),
         profile: settings.profile,
         filter: settings.filter,
+        level: settings.level,
+        instances,
         threshold,
         multi_class,
         mean_iou_at_threshold: mean(words.iter().map(|w| w.iou_at_threshold)),
@@ -430,6 +469,14 @@ impl fmt::Display for EvalReport {
             show(self.mean_iou_on_views)
         )?;
         writeln!(f, "words that are nowhere: {} of {} found nothing", self.abstained[0], self.abstained[1])?;
+        if let Some(found) = &self.instances {
+            let InstanceReport { n_objects, any, of_words, best_of_words } = found;
+            writeln!(f, "{n_objects} objects; things found at IoU 0.25 and 0.5, by any object: {any}")?;
+            writeln!(
+                f,
+                "  by one of its word's above the threshold: {of_words}; by its word's best: {best_of_words}"
+            )?;
+        }
         if !self.unknown_words.is_empty() {
             let words: Vec<&str> = self.unknown_words.keys().map(String::as_str).collect();
             writeln!(f, "unknown to the encoder, in no mean: {}", words.join(", "))?;

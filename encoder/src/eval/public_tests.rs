@@ -16,6 +16,7 @@ use super::scannet::{Matching, Scan, ScannetReport, scannet};
 use super::*;
 use crate::embed::Background;
 use crate::encode::{self, EncodeSettings, Masks, ViewOrder};
+use crate::lift::Aggregation;
 use crate::palette::PaletteSettings;
 use crate::progress::Silent;
 use crate::raster::{CpuRasterizer, WeightKind};
@@ -100,6 +101,9 @@ impl Wall {
             strict: true,
             restart: false,
             keep_sums: false,
+            aggregation: Aggregation::PAPER,
+            mask_noise: None,
+            objects: false,
             cells: CellLimits { max_gaussians: 4096, max_width: None },
             shards: ShardSettings {
                 profiles: vec![Profile::Compact],

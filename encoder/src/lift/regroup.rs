@@ -59,6 +59,7 @@ struct IndexedView {
     /// Slice of each run, ascending.
     slices: Vec<u32>,
     first_region: u32,
+    n_masks: usize,
 }
 
 /// The files of all views, in the order of the views' names.
@@ -143,7 +144,8 @@ impl SumsIndex {
             }
             n_views_without_masks += usize::from(regions.mask_vectors.is_empty());
             let first_region = table.append(&regions.mask_vectors, regions.masks_of_region());
-            views.push(IndexedView { file, slices, first_region });
+            let n_masks = regions.mask_vectors.len() / dim;
+            views.push(IndexedView { file, slices, first_region, n_masks });
         }
         let parts = first_slice_of_cell
             .windows(2)
@@ -173,6 +175,16 @@ impl SumsIndex {
     /// Returns the number of views without any mask.
     pub fn n_views_without_masks(&self) -> usize {
         self.n_views_without_masks
+    }
+
+    /// Returns the number of masks of each view.
+    pub fn n_masks_of_view(&self) -> impl Iterator<Item = usize> + '_ {
+        self.views.iter().map(|view| view.n_masks)
+    }
+
+    /// Returns the number of regions of each view.
+    pub fn n_regions_of_view(&self) -> impl Iterator<Item = usize> + '_ {
+        self.views.iter().map(|view| view.file.n_regions())
     }
 
     /// Returns the bytes that the index takes in memory.

@@ -107,6 +107,11 @@ impl RegionTable {
         self.starts[region] as usize..self.starts[region + 1] as usize
     }
 
+    /// Returns the masks of a region, however much they count.
+    pub(crate) fn all_masks_of(&self, region: usize) -> &[u32] {
+        &self.masks[self.listed(region)]
+    }
+
     /// Returns the masks of a region, and how much each counts.
     #[inline(always)]
     pub fn masks_of(&self, region: usize) -> impl Iterator<Item = (u32, f32)> + '_ {

@@ -11,6 +11,8 @@ use slag_common::shard::{
     Basis, ExactColumns, Fine, Profile, Residuals, ScoreErrors, ShardHeader, ShardView,
 };
 
+use crate::objects::SceneObjects;
+use crate::objects::shards::CellObjects;
 use crate::palette::matrix::Rows;
 use crate::palette::measure::ScoreMoments;
 use crate::palette::{self, PaletteSettings, Yardstick};
@@ -73,7 +75,7 @@ pub fn working_bytes(n_gaussians: usize, dim: usize) -> u64 {
     (n_gaussians * (dim * per_component + palette::working_bytes_per_embedding(dim))) as u64
 }
 
-/// Builds a cell's shards.
+/// Builds a cell's shards, without objects.
 pub fn build(
     scene: &Gaussians,
     cell_id: u32,
@@ -82,6 +84,21 @@ pub fn build(
     encoder_id: Hash32,
     yardstick: &Yardstick,
     settings: &ShardSettings,
+) -> BuiltCell {
+    build_with(scene, cell_id, cell, embeddings, encoder_id, yardstick, settings, None)
+}
+
+/// Builds a cell's shards, with the objects of the scene.
+#[expect(clippy::too_many_arguments, reason = "what a cell is made of")]
+pub fn build_with(
+    scene: &Gaussians,
+    cell_id: u32,
+    cell: &Cell,
+    embeddings: &CellEmbeddings,
+    encoder_id: Hash32,
+    yardstick: &Yardstick,
+    settings: &ShardSettings,
+    objects: Option<&SceneObjects>,
 ) -> BuiltCell {
     let dim = embeddings.dim;
     let (with, without): (Vec<u32>, Vec<u32>) =
@@ -137,11 +154,13 @@ pub fn build(
         }),
         ..compact
     });
+    let objects = objects.map(|objects| CellObjects::new(objects, cell_id, &locals, dim));
+    let objects = objects.as_ref().map(CellObjects::view);
     let largest = |radii: &[f32]| radii.iter().copied().fold(0.0, f32::max);
     let spread = palette.errors.spread;
     let built = |profile, view: &ShardView<'_>| {
         let mut bytes = Vec::new();
-        view.write(&mut bytes).expect("writing to memory cannot fail");
+        view.write_with(&mut bytes, objects.as_ref()).expect("writing to memory cannot fail");
         let (score_error_bound, score_errors) = match profile {
             Profile::Exact => (F16_ROUNDING, ScoreErrors { spread, ..ScoreErrors::default() }),
             _ => (largest(view.radii), view.header.errors),

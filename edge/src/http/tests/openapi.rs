@@ -2,7 +2,10 @@
 
 use std::collections::BTreeSet;
 
+use slag_common::manifest::Calibration;
+
 use super::*;
+use crate::testing::TestObject;
 
 fn description() -> Value {
     serde_json::from_str(OPENAPI).expect("JSON")
@@ -122,6 +125,22 @@ async fn every_answer_is_as_described() {
         let kind = headers["content-type"].to_str().expect("text");
         let found = check(&response_schema(path, status, kind), &body, "");
         assert_eq!(found, Ok(()), "{path}?{query}: {body:#}");
+    }
+    // Objects come first where there are any.
+    let object = TestObject { id: 5, vectors: vec![1.0, 0.0, 0.0], runs: vec![2..14], n_gaussians: 40 };
+    let calibration = Calibration { score_mean: 0.0, score_spread: 0.1 };
+    let service = Service::new(Some(&[exact[0].with_objects(&[object], calibration)]), Settings::default());
+    for (query, level, n) in
+        [("text=0", "objects", 1), ("text=1", "objects", 0), ("text=0&level=clusters", "clusters", 1)]
+    {
+        let (_, _, body) = service.get(&format!("/query?{query}&near=0,0,0")).await;
+        let schema = response_schema("/query", StatusCode::OK, "application/json");
+        assert_eq!(check(&schema, &body, ""), Ok(()), "{query}: {body:#}");
+        assert_eq!(
+            (&body["level"], body["answers"].as_array().map(Vec::len)),
+            (&json!(level), Some(n)),
+            "{body:#}"
+        );
     }
     let empty = Service::new(None, Settings::default());
     let (_, _, body) = empty.get("/status").await;

@@ -1,0 +1,193 @@
+use super::*;
+use crate::container::AlignedBytes;
+use crate::shard::{Positions, ScoreErrors, ShardHeader, ShardLayout, ShardView};
+
+/// What a test edits before the shard is written.
+struct Parts {
+    header: ObjectsHeader,
+    records: Vec<ObjectRecord>,
+    steps: Vec<f32>,
+    run_ends: Vec<u32>,
+    run_objects: Vec<u16>,
+    photos: Vec<u8>,
+}
+
+fn record(id: u64, n_here: u32, photo: std::ops::Range<u32>) -> ObjectRecord {
+    ObjectRecord {
+        id,
+        position_in_world: [1.0, 2.0, 3.0],
+        box_min: [0.5, 1.5, 2.5],
+        box_max: [1.5, 2.5, 4.5],
+        n_gaussians: 40,
+        n_gaussians_here: n_here,
+        photo_box_px: [10, 20, 110, 70],
+        photo_start: photo.start,
+        photo_bytes: photo.len() as u32,
+    }
+}
+
+/// Six Gaussians of three dimensions in one row: 0, 1 of object 1, 2 of none, 3, 4 of object 0, 5 of object 1.
+fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
+    let mut parts = Parts {
+        header: ObjectsHeader {
+            n_objects: 2,
+            n_vectors: 2,
+            n_runs: 4,
+            photos_bytes: 10,
+            score_mean: 0.02,
+            score_spread: 0.1,
+        },
+        records: vec![record(0xdead_beef_0000_0001, 2, 0..5), record(7, 3, 5..10)],
+        steps: vec![0.01, 0.02, 0.005, 0.0],
+        run_ends: vec![2, 3, 5, 6],
+        run_objects: vec![1, NO_OBJECT, 0, 1],
+        photos: "a.jpgü.png".bytes().take(10).collect(),
+    };
+    // The umlaut has two bytes: "a.jpg" and "ü.pn".
+    edit(&mut parts);
+    let header = ShardHeader {
+        cell_id: 5,
+        n_gaussians: 6,
+        n_rows: 1,
+        dim: 3,
+        n_components: 3,
+        n_groups: 0,
+        position_bits: [16, 16, 16, 0],
+        row_step: 0.01,
+        origin_in_world: [0.0; 3],
+        position_step: [0.001; 3],
+        box_min: [0.0; 3],
+        box_max: [66.0; 3],
+        errors: ScoreErrors::default(),
+        encoder_id: [9; 32],
+    };
+    let shard = ShardView {
+        header,
+        positions: Positions::Wide(&[[1, 2, 3]; 6]),
+        row_starts: &[0, 5],
+        rows: &[100, 0, 0],
+        radii: &[0.5],
+        basis: None,
+        residuals: None,
+        exact: None,
+    };
+    let objects = Objects {
+        header: parts.header,
+        records: &parts.records,
+        vectors: &[100, 0, 0, 0, 50, 0, 0, 0, 120, 1, 2, 3],
+        steps: &parts.steps,
+        run_ends: &parts.run_ends,
+        run_objects: &parts.run_objects,
+        // A hostile writer need not keep to UTF-8; a str must.
+        photos: "",
+    };
+    let mut out = Vec::new();
+    let sections: Vec<(u32, Vec<u8>)> = {
+        shard.write(&mut out).expect("writes to memory");
+        let own = Layout::check(&out, crate::shard::MAGIC, crate::shard::VERSION).expect("valid");
+        let ids = (1..=19).filter_map(|id| own.find(id).map(|range| (id, out[range].to_vec())));
+        let of_objects = objects.sections().map(|(id, bytes)| match id {
+            section::PHOTOS => (id, parts.photos.clone()),
+            _ => (id, bytes.to_vec()),
+        });
+        ids.chain(of_objects).collect()
+    };
+    let sections: Vec<(u32, &[u8])> = sections.iter().map(|(id, bytes)| (*id, &bytes[..])).collect();
+    let mut out = Vec::new();
+    container::write(&mut out, crate::shard::MAGIC, crate::shard::VERSION, &sections).expect("writes");
+    out
+}
+
+#[test]
+fn round_trip() {
+    let bytes = AlignedBytes::copy_of(&written(|_| {}));
+    let layout = ShardLayout::check(&bytes).expect("valid");
+    let objects = layout.objects(&bytes).expect("has objects");
+    assert_eq!(objects.records, [record(0xdead_beef_0000_0001, 2, 0..5), record(7, 3, 5..10)]);
+    assert_eq!(objects.records.iter().map(|r| objects.photo(r)).collect::<Vec<_>>(), ["a.jpg", "ü.pn"]);
+    let runs: Vec<_> = objects.runs().collect();
+    assert_eq!(runs, [(0..2, Some(1)), (2..3, None), (3..5, Some(0)), (5..6, Some(1))]);
+    // By hand: object 0 has mean (1, 0, 0) and side (0, 1, 0); object 1 has mean (0, 0, 0.6) and side 0.
+    let scores = objects.scores(&[0.5, 0.25, -1.0]);
+    for (found, expected) in scores.iter().zip([0.5 * (0.5 + 0.25), 0.5 * -0.6]) {
+        assert!((found - expected).abs() < 1e-6, "{scores:?}");
+    }
+    // A shard that is written in one go is the same, and one without objects has none.
+    let again = objects;
+    let mut out = Vec::new();
+    layout.view(&bytes).write_with(&mut out, Some(&again)).expect("writes to memory");
+    assert_eq!(out, &bytes[..]);
+    out.clear();
+    layout.view(&bytes).write(&mut out).expect("writes to memory");
+    let bytes = AlignedBytes::copy_of(&out);
+    assert!(ShardLayout::check(&bytes).expect("valid").objects(&bytes).is_none());
+}
+
+/// A hostile writer computes right checksums over wrong contents: each lie is refused.
+#[test]
+fn lies_are_refused() {
+    let refused =
+        |edit: fn(&mut Parts)| ShardLayout::check(&written(edit)).expect_err("must be refused").to_string();
+    assert!(refused(|p| p.header.n_objects = u32::MAX).contains("objects of"));
+    assert!(refused(|p| p.header.n_objects = 65_534).contains("bytes"));
+    assert!(refused(|p| p.header.n_objects = 1).contains("bytes"));
+    assert!(refused(|p| p.header.n_vectors = 0).contains("vectors"));
+    assert!(refused(|p| p.header.n_vectors = u32::MAX).contains("vectors"));
+    assert!(refused(|p| p.header.n_runs = u32::MAX).contains("bytes"));
+    assert!(refused(|p| p.header.photos_bytes = u32::MAX).contains("bytes"));
+    assert!(refused(|p| p.header.score_mean = f32::NAN).contains("cosines"));
+    assert!(refused(|p| p.header.score_spread = -0.1).contains("cosines"));
+    assert!(refused(|p| p.steps[1] = f32::NAN).contains("steps"));
+    assert!(refused(|p| p.steps[1] = -0.5).contains("steps"));
+    assert!(refused(|p| p.run_ends[1] = 2).contains("ascend"));
+    assert!(refused(|p| p.run_ends[0] = 0).contains("ascend"));
+    assert!(refused(|p| p.run_ends[3] = 7).contains("ascend"));
+    assert!(refused(|p| p.run_objects[0] = 2).contains("object 2 of 2"));
+    assert!(refused(|p| p.run_objects[0] = 0).contains("not those of the runs"));
+    assert!(refused(|p| p.records[0].n_gaussians = 1).contains("fewer Gaussians"));
+    assert!(refused(|p| p.records[1].box_max[2] = f64::INFINITY).contains("not finite"));
+    assert!(refused(|p| p.records[1].box_min[0] = 2.0).contains("empty"));
+    assert!(refused(|p| p.records[1].position_in_world[0] = f64::NAN).contains("not finite"));
+    assert!(refused(|p| p.records[0].photo_box_px[2] = 9).contains("turned over"));
+    assert!(refused(|p| p.records[0].photo_start = u32::MAX).contains("name"));
+    assert!(refused(|p| p.records[0].photo_bytes = u32::MAX).contains("name"));
+    assert!(refused(|p| p.records[0].photo_bytes = 6).contains("name"), "cuts a character");
+    assert!(refused(|p| p.photos[0] = 0xff).contains("UTF-8"));
+    assert!(refused(|p| p.photos[0] = 0x1b).contains("UTF-8"), "an escape");
+}
+
+/// Oracle: products in float64. The stated bound holds, and repeats change no score.
+#[test]
+fn rounded_vectors_keep_scores() {
+    let dim = 64;
+    let mut state = 5u64;
+    let mut random = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+        (state >> 40) as f32 / (1 << 23) as f32 - 1.0
+    };
+    let mut unit = || {
+        let v: Vec<f32> = (0..dim).map(|_| random()).collect();
+        let length = v.iter().map(|c| c * c).sum::<f32>().sqrt();
+        v.into_iter().map(|c| c / length).collect::<Vec<f32>>()
+    };
+    let vectors: Vec<f32> = (0..3).flat_map(|_| unit()).collect();
+    let (rounded, steps) = quantise_vectors(&vectors, dim, 5);
+    assert_eq!((rounded.len(), steps.len()), (5 * dim, 5));
+    for _ in 0..50 {
+        let query = unit();
+        let product =
+            |v: &mut dyn Iterator<Item = f64>| -> f64 { v.zip(&query).map(|(v, q)| v * f64::from(*q)).sum() };
+        let exact: Vec<f32> =
+            vectors.chunks(dim).map(|v| product(&mut v.iter().map(|v| f64::from(*v))) as f32).collect();
+        let kept: Vec<f32> = rounded
+            .chunks(dim)
+            .zip(&steps)
+            .map(|(v, s)| product(&mut v.iter().map(|v| f64::from(*v) * f64::from(*s))) as f32)
+            .collect();
+        let bound = steps.iter().fold(0.0f32, |most, s| most.max(*s)) / 2.0 * (dim as f32).sqrt();
+        let error = (object_score(&kept) - object_score(&exact)).abs();
+        assert!(error <= bound && bound < 0.02, "{error} {bound}");
+    }
+    assert!(object_score(&[]).is_nan());
+    assert_eq!(object_score(&[0.5]), 0.5);
+}

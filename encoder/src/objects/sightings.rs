@@ -1,0 +1,71 @@
+//! What a sample of the Gaussians shows in each view.
+
+use rayon::prelude::*;
+
+use super::consensus::Sightings;
+use crate::lift::{RegionTable, SumsError, SumsIndex};
+
+/// Gaussians looked at, about: consensus takes time as their number, and masks of [`super::consensus`] need a few each.
+const MAX_SAMPLES: usize = 32_768;
+/// A view sees a Gaussian if it weighs at least this share of what it does in the view where it weighs most: what
+/// is left of it behind others says nothing.
+const MIN_WEIGHT_SHARE: f32 = 0.1;
+
+/// Returns which Gaussians of a cell are looked at: every n-th along its Morton curve, so that they are spread evenly.
+pub fn sample_step(n_gaussians: usize) -> usize {
+    n_gaussians.div_ceil(MAX_SAMPLES).max(1)
+}
+
+/// Gathers the sightings of every `step`-th Gaussian of each cell.
+///
+/// # Errors
+/// [`SumsError`].
+pub fn gather(
+    index: &SumsIndex,
+    table: &RegionTable,
+    step: usize,
+    group_bytes: u64,
+) -> Result<Sightings, SumsError> {
+    let view_of_region = super::repeat_each(index.n_regions_of_view());
+    let mut all = Sightings { starts: vec![0], views: Vec::new(), regions: Vec::new() };
+    for group in index.groups(group_bytes) {
+        let raw = index.read(group)?;
+        for sums in index.regroup(&raw, table)? {
+            let sampled: Vec<usize> = sums.part.locals.clone().filter(|local| local % step == 0).collect();
+            let sighted: Vec<Vec<(u32, u32)>> = sampled
+                .par_iter()
+                .map(|local| {
+                    let k = local - sums.part.locals.start;
+                    let entries = sums.starts[k] as usize..sums.starts[k + 1] as usize;
+                    of_gaussian(&sums.regions[entries.clone()], &sums.weights[entries], &view_of_region)
+                })
+                .collect();
+            for of_gaussian in sighted {
+                all.views.extend(of_gaussian.iter().map(|(view, _)| view));
+                all.regions.extend(of_gaussian.iter().map(|(_, region)| region));
+                all.starts.push(all.views.len());
+            }
+        }
+    }
+    Ok(all)
+}
+
+/// Returns (view, region) of each view that sees a Gaussian. Entries are by view, then region.
+fn of_gaussian(regions: &[u32], weights: &[f32], view_of_region: &[u32]) -> Vec<(u32, u32)> {
+    let mut views: Vec<(u32, f32, u32, f32)> = Vec::new();
+    for (region, weight) in regions.iter().zip(weights) {
+        let view = view_of_region[*region as usize];
+        match views.last_mut() {
+            Some((last, total, best, most)) if *last == view => {
+                *total += weight;
+                if weight > most {
+                    (*best, *most) = (*region, *weight);
+                }
+            }
+            _ => views.push((view, *weight, *region, *weight)),
+        }
+    }
+    let most = views.iter().map(|(_, total, ..)| *total).fold(0.0, f32::max);
+    let is_seen = |(_, total, ..): &&(u32, f32, u32, f32)| *total > 0.0 && *total >= MIN_WEIGHT_SHARE * most;
+    views.iter().filter(is_seen).map(|(view, _, region, _)| (*view, *region)).collect()
+}

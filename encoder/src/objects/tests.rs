@@ -1,0 +1,393 @@
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
+
+use slag_common::container::AlignedBytes;
+use slag_common::objects::object_score;
+
+use super::consensus::{MaskClusters, Sightings, cluster_masks};
+use super::photos::{read_boxes, write_boxes};
+use super::shards::CellObjects;
+use super::*;
+use crate::lift::{SumEntry, ViewSums};
+use crate::palette::{ScoreMetric, TextBank};
+use crate::shard::cells::{CellLimits, split};
+
+/// Pseudo-random numbers (splitmix64, Steele et al. 2014).
+struct Random(u64);
+
+impl Random {
+    fn below(&mut self, n: u64) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        (z ^ (z >> 31)) % n
+    }
+}
+
+/// What views show: of each view, the masks of each Gaussian that it sees; masks numbered within the view.
+type Shown = Vec<BTreeMap<u32, BTreeSet<u32>>>;
+
+/// The same as regions, sightings and views of masks.
+struct Made {
+    sightings: Sightings,
+    masks_of_region: Vec<Vec<u32>>,
+    view_of_mask: Vec<u32>,
+}
+
+fn make(shown: &Shown, n_gaussians: u32) -> Made {
+    let mut made = Made {
+        sightings: Sightings { starts: vec![0], views: Vec::new(), regions: Vec::new() },
+        masks_of_region: Vec::new(),
+        view_of_mask: Vec::new(),
+    };
+    let mut region_of = HashMap::new();
+    for (view, of_view) in shown.iter().enumerate() {
+        let first = made.view_of_mask.len() as u32;
+        for masks in of_view.values() {
+            region_of.entry((view, masks.clone())).or_insert_with(|| {
+                made.masks_of_region.push(masks.iter().map(|mask| mask + first).collect());
+                made.masks_of_region.len() as u32 - 1
+            });
+        }
+        let n = of_view.values().flatten().max().map_or(0, |most| most + 1);
+        made.view_of_mask.extend(std::iter::repeat_n(view as u32, n as usize));
+    }
+    for gaussian in 0..n_gaussians {
+        for (view, of_view) in shown.iter().enumerate() {
+            if let Some(masks) = of_view.get(&gaussian) {
+                made.sightings.views.push(view as u32);
+                made.sightings.regions.push(region_of[&(view, masks.clone())]);
+            }
+        }
+        made.sightings.starts.push(made.sightings.views.len());
+    }
+    made
+}
+
+impl Made {
+    fn clusters(&self) -> MaskClusters {
+        let of_region = |region: u32| &self.masks_of_region[region as usize][..];
+        let n_views = self.view_of_mask.last().map_or(0, |view| *view as usize + 1);
+        cluster_masks(
+            &self.sightings,
+            &Masks { of_region: &of_region, view_of_mask: &self.view_of_mask, n_views },
+        )
+    }
+}
+
+/// The definition, set by set: no counts, no shares of integers.
+fn oracle(shown: &Shown) -> (Vec<Option<usize>>, Vec<f64>, usize) {
+    type Set = HashSet<u32>;
+    let (mut masks, mut seen): (Vec<(usize, Set)>, Vec<Set>) = (Vec::new(), Vec::new());
+    for (view, of_view) in shown.iter().enumerate() {
+        let n = of_view.values().flatten().max().map_or(0, |most| most + 1);
+        let of_mask =
+            |mask: u32| of_view.iter().filter(|(_, m)| m.contains(&mask)).map(|(g, _)| *g).collect();
+        masks.extend((0..n).map(|mask| (view, of_mask(mask))));
+        seen.push(of_view.keys().copied().collect());
+    }
+    let is_large = |mask: usize| masks[mask].1.len() >= 3;
+    let iou = |a: &Set, b: &Set| a.intersection(b).count() as f64 / a.union(b).count().max(1) as f64;
+    let within = |a: &Set, b: &Set| -> Set { a.intersection(b).copied().collect() };
+    let both = |a: usize, b: usize| {
+        let common = within(&seen[masks[a].0], &seen[masks[b].0]);
+        (within(&masks[a].1, &common), within(&masks[b].1, &common))
+    };
+    let mut judged = Vec::new();
+    for a in 0..masks.len() {
+        let (mut agreement, mut judges) = (0.0, 0);
+        for (view, seen) in seen.iter().enumerate() {
+            let visible = within(&masks[a].1, seen).len();
+            if is_large(a) && visible > 0 && visible as f64 >= 0.3 * masks[a].1.len() as f64 - 1e-9 {
+                let of_view = (0..masks.len()).filter(|b| masks[*b].0 == view);
+                let ious = of_view
+                    .map(|b| both(a, b))
+                    .map(|(x, y)| if x.is_disjoint(&y) { 0.0 } else { iou(&x, &y) });
+                agreement += ious.fold(0.0, f64::max);
+                judges += 1;
+            }
+        }
+        let consensus = if judges > 1 { (agreement - 1.0) / f64::from(judges - 1) } else { 0.0 };
+        judged.push((agreement, consensus));
+    }
+    let mut seeds: Vec<usize> = (0..masks.len()).filter(|m| judged[*m].1 >= 0.5).collect();
+    seeds.sort_by(|a, b| judged[*b].0.total_cmp(&judged[*a].0).then(a.cmp(b)));
+    let n_aside = (0..masks.len()).filter(|m| is_large(*m) && judged[*m].1 < 0.5).count();
+    let mut cluster_of = vec![None; masks.len()];
+    let (mut gathered, mut consensuses) = (HashSet::new(), Vec::new());
+    for seed in seeds {
+        if !gathered.insert(seed) {
+            continue;
+        }
+        let same = (0..masks.len()).filter(|m| is_large(*m)).filter(|m| {
+            let (x, y) = both(seed, *m);
+            !x.is_disjoint(&y) && iou(&x, &y) >= 0.5
+        });
+        let same: Vec<usize> = same.collect();
+        let views: BTreeSet<usize> = same.iter().map(|m| masks[*m].0).collect();
+        let all: Set = same.iter().flat_map(|m| masks[*m].1.iter().copied()).collect();
+        let shape: Set = all
+            .into_iter()
+            .filter(|g| {
+                let seers = views.iter().filter(|v| seen[**v].contains(g));
+                let inside =
+                    |v: &&&usize| same.iter().any(|m| masks[*m].0 == ***v && masks[*m].1.contains(g));
+                2 * seers.clone().filter(inside).count() >= seers.count()
+            })
+            .collect();
+        let shape_iou = |m: usize| {
+            let visible = within(&shape, &seen[masks[m].0]);
+            if visible.is_disjoint(&masks[m].1) { 0.0 } else { iou(&visible, &masks[m].1) }
+        };
+        let members: Vec<usize> = (0..masks.len()).filter(|m| is_large(*m) && shape_iou(*m) >= 0.5).collect();
+        if members.iter().map(|m| masks[*m].0).collect::<HashSet<_>>().len() < 2 {
+            continue;
+        }
+        let judges = (0..seen.len()).filter(|v| {
+            let n = within(&shape, &seen[*v]).len();
+            n > 0 && 10 * n >= shape.len()
+        });
+        let best =
+            |v: usize| (0..masks.len()).filter(|m| masks[*m].0 == v).map(shape_iou).fold(0.0, f64::max);
+        let agreements: Vec<f64> = judges.map(best).collect();
+        gathered.extend(members.iter().copied());
+        let free: Vec<usize> = members.iter().copied().filter(|m| cluster_of[*m].is_none()).collect();
+        if 2 * free.len() >= members.len() {
+            free.iter().for_each(|m| cluster_of[*m] = Some(consensuses.len()));
+            consensuses.push(agreements.iter().sum::<f64>() / agreements.len() as f64);
+        }
+    }
+    (cluster_of, consensuses, n_aside)
+}
+
+/// Eight views of three things of 40 Gaussians: seven in ten are seen. View 2 has one mask for things 0 and 1, view 5
+/// two for thing 2; every view has one for everything.
+fn three_things(random: &mut Random) -> Shown {
+    let view = |view: u32| {
+        let mut of_view = BTreeMap::new();
+        for gaussian in (0..120).filter(|_| random.below(10) < 7) {
+            let thing = gaussian / 40;
+            let own = match (view, thing) {
+                (2, 0 | 1) => 0,
+                (5, 2) => 2 + (gaussian % 2),
+                _ => thing,
+            };
+            // Ragged: one in twenty shows something else's mask.
+            let own = if random.below(20) == 0 { random.below(3) as u32 } else { own };
+            of_view.insert(gaussian, BTreeSet::from([own, 4]));
+        }
+        of_view
+    };
+    (0..8).map(view).collect()
+}
+
+#[test]
+fn masks_of_one_thing_meet_and_those_of_several_are_set_aside() {
+    let made = make(&three_things(&mut Random(1)), 120);
+    let found = made.clusters();
+    let of = |view: usize, mask: usize| found.cluster_of_mask[5 * view + mask];
+    for thing in 0..3 {
+        let clusters: BTreeSet<u32> = [0, 1, 3, 4, 6, 7].into_iter().map(|view| of(view, thing)).collect();
+        assert!(clusters.len() == 1 && !clusters.contains(&NONE), "thing {thing}: {found:?}");
+    }
+    let things: BTreeSet<u32> = (0..3).map(|thing| of(0, thing)).collect();
+    assert_eq!(things.len(), 3, "{found:?}");
+    // What covers two things has the consensus of nobody; half a thing neither.
+    assert!([of(2, 0), of(5, 2), of(5, 3)].iter().all(|c| !things.contains(c)), "{found:?}");
+    assert!(found.n_set_aside >= 1, "{found:?}");
+    // The mask of everything is an object of its own: it is not chained to what it contains.
+    assert!(!things.contains(&of(0, 4)));
+}
+
+/// Oracle: sets and float64.
+#[test]
+fn clusters_are_those_of_the_definition() {
+    let check = |shown: &Shown, n_gaussians: u32, what: &str| {
+        let found = make(shown, n_gaussians).clusters();
+        let (expected, consensus, n_aside) = oracle(shown);
+        let found_of: Vec<Option<usize>> =
+            found.cluster_of_mask.iter().map(|c| (*c != NONE).then_some(*c as usize)).collect();
+        assert_eq!(found_of, expected, "{what}");
+        assert_eq!(found.n_set_aside, n_aside, "{what}");
+        for (found, expected) in found.consensus.iter().zip(&consensus) {
+            assert!((found - expected).abs() < 1e-12, "{what}: {found} {expected}");
+        }
+        found.consensus.len()
+    };
+    let mut n_clusters = 0;
+    for seed in 0..40 {
+        let mut random = Random(seed);
+        n_clusters += check(&three_things(&mut random), 120, &format!("things {seed}"));
+        // Anything: few views, masks without sense, Gaussians that nobody sees.
+        let n_views = 1 + random.below(5);
+        let shown: Shown = (0..n_views)
+            .map(|_| {
+                let n_masks = 1 + random.below(4);
+                let seen = (0..24).filter(|_| random.below(3) > 0).collect::<Vec<u32>>();
+                let masks = |g: u32, random: &mut Random| {
+                    let of_block = u64::from(g / 6) % n_masks;
+                    let other = if random.below(4) == 0 { random.below(n_masks) } else { of_block };
+                    BTreeSet::from([of_block as u32, other as u32])
+                };
+                seen.into_iter().map(|g| (g, masks(g, &mut random))).collect()
+            })
+            .collect();
+        n_clusters += check(&shown, 24, &format!("anything {seed}"));
+    }
+    assert!(n_clusters > 150, "{n_clusters}");
+    assert_eq!(check(&Vec::new(), 5, "no view"), 0);
+}
+
+/// Things in a row of cells, in files of sums; thing i's masks have the vector of axis i.
+struct World {
+    gaussians: Gaussians,
+    split: CellSplit,
+    index: SumsIndex,
+    table: RegionTable,
+    photos: Vec<Photo>,
+    yardstick: Yardstick,
+    _dir: tempfile::TempDir,
+}
+
+const DIM: usize = 8;
+const PER_THING: u32 = 60;
+
+fn world() -> World {
+    let n = 3 * PER_THING;
+    let means =
+        (0..n).map(|i| DVec3::new(f64::from(i / PER_THING) * 10.0, f64::from(i % PER_THING) * 0.1, 0.0));
+    let gaussians = Gaussians {
+        means_in_world: means.collect(),
+        rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n as usize],
+        scales: vec![[0.1; 3]; n as usize],
+        opacities: vec![0.5; n as usize],
+        sh_dc: vec![[0.0; 3]; n as usize],
+        ..Gaussians::default()
+    };
+    // Cells of at most 70: the things are cut.
+    let split = split(&gaussians, CellLimits { max_gaussians: 70, max_width: None });
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let mut random = Random(3);
+    let (mut paths, mut photos) = (Vec::new(), Vec::new());
+    for view in 0..6u32 {
+        let mut entries: BTreeMap<u32, Vec<SumEntry>> = BTreeMap::new();
+        for i in (0..n).filter(|_| random.below(10) < 8) {
+            let (cell, local) = (split.cell_of_gaussian[i as usize], split.local_of_gaussian[i as usize]);
+            let thing = i / PER_THING;
+            // A little of each lies under a neighbour's mask too: the last view sees thing 2 whole and large.
+            let weight = if view == 5 && thing == 2 { 9.0 } else { 1.0 + random.below(8) as f32 / 8.0 };
+            let spilt = SumEntry { local, region: (thing + 1) % 3, weight: 0.25 };
+            let mut of_gaussian = vec![SumEntry { local, region: thing, weight }, spilt];
+            of_gaussian.sort_by_key(|entry| entry.region);
+            entries.entry(cell).or_default().extend(of_gaussian);
+        }
+        entries.values_mut().for_each(|entries| entries.sort_by_key(|entry| (entry.local, entry.region)));
+        let axis = |thing: usize| (0..DIM).map(move |c| f32::from(u8::from(c == thing)));
+        let sums = ViewSums {
+            dim: DIM,
+            mask_vectors: (0..3).flat_map(axis).collect(),
+            masks_of_region: vec![vec![0], vec![1], vec![2]],
+            entries_of_cell: entries.into_iter().collect(),
+        };
+        let path = dir.path().join(format!("{view}.sums"));
+        sums.write(&path).expect("writes");
+        paths.push(path);
+        let boxes_px = (0..3).map(|mask| [view, mask, view + 10, mask + 10]).collect();
+        photos.push(Photo { name: format!("{view}.jpg"), boxes_px });
+    }
+    let n_of_cell: Vec<usize> = split.cells.iter().map(|cell| cell.gaussians.len()).collect();
+    let (index, table) = SumsIndex::open(&paths, DIM, &n_of_cell).expect("opens");
+    let bank = TextBank::directions(DIM);
+    let metric = ScoreMetric::new(DIM, &bank);
+    let spread = metric.spread(table.mask_vectors());
+    World { gaussians, split, index, table, photos, yardstick: Yardstick { metric, bank, spread }, _dir: dir }
+}
+
+impl World {
+    fn objects(&self, group_bytes: u64) -> SceneObjects {
+        let Self { gaussians, split, index, table, photos, yardstick, .. } = self;
+        find(&Scene { index, table, gaussians, split, photos, yardstick, group_bytes }).expect("finds")
+    }
+}
+
+/// Oracle: the things that the world was made of.
+#[test]
+fn objects_are_the_things_for_any_threads_and_memory() {
+    let world = world();
+    let found = world.objects(u64::MAX);
+    assert_eq!(found.objects.len(), 3, "{:?}", found.report);
+    assert!(world.split.cells.len() > 2);
+    let mut thing_of_object = BTreeMap::new();
+    for (cell, of_cell) in world.split.cells.iter().zip(&found.object_of) {
+        for (gaussian, object) in cell.gaussians.iter().zip(of_cell).filter(|(_, object)| **object != NONE) {
+            let thing = gaussian / PER_THING;
+            assert_eq!(*thing_of_object.entry(*object).or_insert(thing), thing, "Gaussian {gaussian}");
+        }
+    }
+    for (object, thing) in thing_of_object {
+        let object = &found.objects[object as usize];
+        // All but those that no view saw.
+        assert!((58..=PER_THING).contains(&object.n_gaussians) && object.n_masks == 6, "{object:?}");
+        assert!((object.position_in_world.x - f64::from(thing) * 10.0).abs() < 1e-9, "{object:?}");
+        let y = [object.box_in_world.min.y, object.box_in_world.max.y];
+        assert!((y[0] - 0.1).abs() < 0.15 && (y[1] - 5.8).abs() < 0.15, "{object:?}");
+        let cosines: Vec<f32> = object.vectors.chunks(DIM).map(|v| v[thing as usize]).collect();
+        assert!((object_score(&cosines) - 1.0).abs() < 1e-6, "{cosines:?}");
+        if thing == 2 {
+            assert_eq!((object.photo.as_str(), object.photo_box_px), ("5.jpg", [5, 2, 15, 12]));
+        }
+    }
+    for n_threads in [1, 3] {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().expect("threads");
+        for group_bytes in [0, 4_000, u64::MAX] {
+            assert_eq!(pool.install(|| world.objects(group_bytes)), found, "{n_threads} {group_bytes}");
+        }
+    }
+}
+
+/// What shards say is what was found, in any order of the Gaussians.
+#[test]
+fn shards_carry_the_objects_of_their_cell() {
+    let world = world();
+    let found = world.objects(u64::MAX);
+    for (cell_id, of_cell) in found.object_of.iter().enumerate() {
+        let mut locals: Vec<u32> = (0..of_cell.len() as u32).collect();
+        locals.sort_by_key(|local| local.wrapping_mul(0x9e37_79b9));
+        let cell = CellObjects::new(&found, cell_id as u32, &locals, DIM);
+        let objects = cell.view();
+        let mut n = 0;
+        for (run, object) in objects.runs() {
+            for index in run {
+                let id = object.map(|object| objects.records[object].id);
+                let expected = of_cell[locals[index as usize] as usize];
+                let expected = (expected != NONE).then(|| found.objects[expected as usize].id);
+                assert_eq!((id, index), (expected, n));
+                n += 1;
+            }
+        }
+        assert_eq!(n as usize, locals.len());
+        let mut query = [0.0; DIM];
+        query[1] = 1.0;
+        for (record, score) in objects.records.iter().zip(objects.scores(&query)) {
+            let object = found.objects.iter().find(|object| object.id == record.id).expect("known");
+            let exact: Vec<f32> = object.vectors.chunks(DIM).map(|v| v[1]).collect();
+            assert!((score - object_score(&exact)).abs() < 0.01);
+            assert_eq!(objects.photo(record), object.photo);
+        }
+    }
+}
+
+#[test]
+fn boxes_are_kept_and_damage_is_named() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let path = dir.path().join("a.boxes");
+    let boxes = [[1, 2, 3, 4], [5, 6, 7, 8]];
+    write_boxes(&path, &boxes).expect("writes");
+    assert_eq!(read_boxes(&path, 2).expect("reads"), boxes);
+    let message = read_boxes(&path, 3).expect_err("too few").to_string();
+    assert!(message.contains("a.boxes") && message.contains("the view has 3"), "{message}");
+    let mut bytes = AlignedBytes::read(&path).expect("reads").to_vec();
+    let last = bytes.len() - 70;
+    bytes[last] ^= 1;
+    fs_err::write(&path, &bytes).expect("writes");
+    read_boxes(&path, 2).expect_err("damaged");
+}

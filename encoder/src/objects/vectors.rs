@@ -1,0 +1,69 @@
+//! The few vectors that stand for an object's masks.
+
+use slag_common::manifest::Calibration;
+use slag_common::objects::object_score;
+
+use super::Object;
+use crate::lift::{RegionTable, dot};
+use crate::palette::Yardstick;
+
+/// Masks that stand for an object's others, beside their mean: the sides that a thing has.
+pub const MAX_MEDOIDS: usize = 4;
+/// Masks that are looked at, most weight first: the medoids of more are hardly others, and time grows as the square.
+const MAX_MASKS: usize = 256;
+
+/// Returns `[n][dim]`: the direction of the mean of some masks' vectors by weight, then medoids: those that, chosen one
+/// after the other, raise the weighted mean of the others' cosines with the nearest chosen most.
+pub fn choose(masks: &[u32], weights: &[f64], table: &RegionTable) -> Vec<f32> {
+    let dim = table.dim();
+    let vector = |mask: u32| table.mask_vectors().get(mask as usize);
+    let mut masks = masks.to_vec();
+    let weight = |mask: u32| weights[mask as usize];
+    masks.sort_by(|a, b| weight(*b).total_cmp(&weight(*a)).then(a.cmp(b)));
+    masks.truncate(MAX_MASKS);
+    let mut mean = vec![0.0f64; dim];
+    for mask in &masks {
+        let scale = weight(*mask);
+        mean.iter_mut().zip(vector(*mask)).for_each(|(m, v)| *m += scale * f64::from(*v));
+    }
+    let length = mean.iter().map(|m| m * m).sum::<f64>().sqrt();
+    let mut chosen: Vec<f32> = match length > 0.0 {
+        true => mean.iter().map(|m| (m / length) as f32).collect(),
+        // Vectors that cancel have no mean: the heaviest stands for it.
+        false => vector(masks[0]).to_vec(),
+    };
+    let n = masks.len();
+    let cosines: Vec<f32> =
+        masks.iter().flat_map(|a| masks.iter().map(|b| dot(vector(*a), vector(*b)))).collect();
+    let mut nearest = vec![-1.0f32; n];
+    let mut taken = vec![false; n];
+    for _ in 0..MAX_MEDOIDS.min(n) {
+        let gain = |candidate: usize| -> f64 {
+            let of_candidate = cosines[candidate * n..][..n].iter().zip(&nearest).zip(&masks);
+            of_candidate
+                .map(|((cosine, nearest), mask)| weight(*mask) * f64::from(cosine.max(*nearest)))
+                .sum()
+        };
+        let gains = (0..n).filter(|i| !taken[*i]).map(|i| (i, gain(i)));
+        let Some((best, _)) = gains.reduce(|a, b| if b.1 > a.1 { b } else { a }) else { break };
+        taken[best] = true;
+        nearest.iter_mut().zip(&cosines[best * n..]).for_each(|(nearest, c)| *nearest = nearest.max(*c));
+        chosen.extend(vector(masks[best]));
+    }
+    chosen
+}
+
+/// Returns how a bank of texts scores over objects: mean and spread of all scores, as cells have them of Gaussians.
+pub fn calibrate(objects: &[Object], yardstick: &Yardstick, dim: usize) -> Calibration {
+    let (mut sum, mut squares, mut n) = (0.0, 0.0, 0.0f64);
+    for object in objects {
+        for text in yardstick.bank.vectors.chunks_exact(dim) {
+            let cosines: Vec<f32> = object.vectors.chunks_exact(dim).map(|v| dot(v, text)).collect();
+            let score = f64::from(object_score(&cosines));
+            (sum, squares, n) = (sum + score, squares + score * score, n + 1.0);
+        }
+    }
+    let mean = sum / n.max(1.0);
+    let variance = (squares / n.max(1.0) - mean * mean).max(0.0);
+    Calibration { score_mean: mean as f32, score_spread: variance.sqrt() as f32 }
+}
