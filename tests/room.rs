@@ -15,6 +15,22 @@ fn the_demo_answers_rightly() {
     }
 }
 
+/// The embedded encoders on shapes, and pairs of noun and colour, that they never saw; the whole figures are in their
+/// card, by the same command.
+#[test]
+fn the_embedded_encoders_tell_things() {
+    let report = run_json(&mut encoder(&["eval", "encoder", "--n-scenes", "30"]));
+    println!("{}", report["tallies"]);
+    let tally = |i: usize, what: &str| {
+        let tally = &report["tallies"][i][1];
+        tally[what].as_f64().expect("a number") / tally["n_crops"].as_f64().expect("a number")
+    };
+    // Whole things; the same in pairs that were kept from learning.
+    assert!(tally(0, "noun") > 0.85 && tally(0, "colour") > 0.85 && tally(0, "material") > 0.7);
+    assert!(tally(1, "noun") > 0.65 && tally(1, "colour") > 0.65);
+    assert!(report["found"].as_f64() > Some(0.7) && report["found_absent"].as_f64() < Some(0.01));
+}
+
 fn generate(dir: &Path) -> (std::path::PathBuf, std::path::PathBuf) {
     let room = dir.join("room");
     run(&mut encoder(&["generate", "scene", "--out", text(&room), "--n-views", "16"]));

@@ -10,7 +10,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use slag_common::shard::Profile;
 use slag_models::commands::{ModelsCommand, RunArgs};
 
-use super::eval::{EvalLerfArgs, EvalScannetArgs};
+use super::eval::{EvalEncoderArgs, EvalLerfArgs, EvalScannetArgs};
 use super::keys::KeysCommand;
 use super::noise::EvalNoiseArgs;
 use super::refine::RefineArgs;
@@ -323,6 +323,8 @@ pub enum EvalCommand {
     Lerf(EvalLerfArgs),
     /// Against ScanNet's labelled meshes, with OpenGaussian's protocol.
     Scannet(EvalScannetArgs),
+    /// On crops of generated things: which noun, colour and material they show.
+    Encoder(EvalEncoderArgs),
     /// How each way to aggregate falls with errors laid over true masks.
     Noise(EvalNoiseArgs),
 }

@@ -1,4 +1,4 @@
-//! `eval lerf` and `eval scannet`.
+//! `eval encoder`, `eval lerf` and `eval scannet`.
 
 use std::path::PathBuf;
 
@@ -9,12 +9,31 @@ use slag_common::{poses, splat};
 
 use super::Exit;
 use super::args::ModelArgs;
-use super::run::{print, text_encoder_of};
-use crate::eval::EvalSettings;
+use super::run::{open_models, print, text_encoder_of};
 use crate::eval::lerf::{self, LerfLabels};
 use crate::eval::scannet::{self, Matching, Scan, ScannetReport};
+use crate::eval::{EvalSettings, encoder};
+use crate::generate::grammar;
+use crate::progress::Progress;
 use crate::raster::CpuRasterizer;
 use crate::store::StoreReader;
+
+/// `eval encoder`.
+#[derive(Debug, Args)]
+pub struct EvalEncoderArgs {
+    /// The encoder.
+    #[command(flatten)]
+    models: ModelArgs,
+    /// Scenes to take crops from.
+    #[arg(long, value_name = "N", default_value_t = 300)]
+    n_scenes: u64,
+    /// Seed of the first scene; the next ones count up. The embedded encoders learnt from 1000000 to 1012799.
+    #[arg(long, default_value_t = 9_000_000)]
+    seed: u64,
+    /// Picture of what is taken for what, to write.
+    #[arg(long, value_name = "PNG")]
+    confusion: Option<PathBuf>,
+}
 
 /// `eval lerf`.
 #[derive(Debug, Args)]
@@ -69,6 +88,15 @@ pub struct EvalScannetArgs {
     /// Score as a robot with shards of this profile does [default: the field in full precision].
     #[arg(long, value_name = "NAME")]
     profile: Option<Profile>,
+}
+
+pub(super) fn run_encoder(args: &EvalEncoderArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    let (models, session) = open_models(&args.models)?;
+    let nouns = grammar::nouns(None)?;
+    let seeds = args.seed..args.seed + args.n_scenes;
+    let report = encoder::evaluate(&models, &session, &nouns, seeds, args.confusion.as_deref(), progress)?;
+    print(json, &report, &report)?;
+    Ok(Exit::Done)
 }
 
 pub(super) fn run_lerf(args: &EvalLerfArgs, json: bool) -> Result<Exit> {

@@ -54,6 +54,7 @@ pub fn run(cli: Cli) -> Exit {
         Command::Models(command) => run_models(&command, json),
         Command::Push(PushCommand::Qdrant(args)) => run_push(&args, progress.as_ref(), json),
         Command::Eval(EvalCommand::Labelled(args)) => run_eval_labelled(&args, json),
+        Command::Eval(EvalCommand::Encoder(args)) => super::eval::run_encoder(&args, progress.as_ref(), json),
         Command::Eval(EvalCommand::Lerf(args)) => super::eval::run_lerf(&args, json),
         Command::Eval(EvalCommand::Scannet(args)) => super::eval::run_scannet(&args, json),
         Command::Eval(EvalCommand::Noise(args)) => super::noise::run(&args, progress.as_ref(), json),

@@ -6,6 +6,7 @@
 //! al. 2023): the scores are rendered, the best pixel must lie on the thing (localisation), and the pixels
 //! above the threshold are compared with its mask.
 
+pub mod encoder;
 mod filter;
 mod instances;
 pub mod lerf;

@@ -255,3 +255,44 @@ fn spoilt(mask: &Mask, random: &mut Random) -> Mask {
     let box_px = BoxPx { x0: left + x0, y0: top + y0, x1: left + x1, y1: top + y1 };
     Mask { box_px, level: mask.level, ..piece }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::grammar;
+    use super::*;
+
+    #[test]
+    fn what_is_kept_for_the_test_is_never_learnt_from() {
+        let nouns = grammar::nouns(None).expect("parse");
+        let held_out = |split| {
+            let of_seed = |seed| crops(split, &nouns, seed);
+            let labels = (0..9).flat_map(of_seed).map(|(_, label)| label);
+            labels.filter(|label| is_held_out(&nouns[label.noun], label.colour)).count()
+        };
+        assert_eq!(held_out(Split::Train), 0);
+        assert!(held_out(Split::Test) > 20);
+    }
+
+    /// A crop of a true mask shows as many pixels as the photo has of the thing, on white.
+    #[test]
+    fn crops_are_what_their_labels_say() {
+        let nouns = grammar::nouns(None).expect("parse");
+        let of_seed = |seed| crops(Split::Test, &nouns, seed);
+        let made: Vec<(Crop, Label)> = (0..6).flat_map(of_seed).collect();
+        let n_segmented = made.iter().filter(|(_, label)| label.segmented).count();
+        assert!(n_segmented > 20 && made.len() - n_segmented > 20, "{n_segmented} of {}", made.len());
+        for (crop, label) in &made {
+            let n_inside = crop.inside().iter().filter(|inside| **inside).count();
+            assert_eq!(n_inside, label.area_px as usize);
+            let outside = crop.image().pixels().zip(crop.inside()).filter(|(_, inside)| !**inside);
+            assert!(outside.into_iter().all(|(pixel, _)| pixel.0 == [255; 3]));
+            assert!(
+                label.shown > 0.0
+                    && label.shown <= 1.0
+                    && nouns[label.noun].colours().contains(&label.colour)
+            );
+        }
+        let again: Vec<(Crop, Label)> = (0..6).flat_map(of_seed).collect();
+        assert!(made.iter().zip(&again).all(|(a, b)| a.0 == b.0));
+    }
+}
