@@ -398,7 +398,7 @@ fn objects_abstain_and_keep_to_the_region() {
         (Level::Objects, ReasonKind::BelowThreshold, 0)
     );
     assert!(
-        reason.best_score.is_some_and(|s| (s - 0.8).abs() < 0.01) && reason.detail.contains("0.8"),
+        reason.best_score.is_some_and(|s| (s - 0.8).abs() < 0.01) && reason.detail.contains("reaches 0.9"),
         "{reason:?}"
     );
     assert_eq!(reason.best_position_in_world, Some(DVec3::new(21.0, 0.0, 0.0)));
