@@ -455,6 +455,28 @@ def evaluate(image, text, tokenizer, data, words, scale, bias, device):
     return report, confusion
 
 
+def halve(path):
+    """Stores the weights of a model in 16 bits; the runtime widens them when it opens the file."""
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    model = onnx.load(path)
+    kept, casts = [], []
+    for tensor in model.graph.initializer:
+        if tensor.data_type != TensorProto.FLOAT or int(np.prod(tensor.dims)) < 64:
+            kept.append(tensor)
+            continue
+        name = tensor.name + "_16"
+        kept.append(numpy_helper.from_array(numpy_helper.to_array(tensor).astype(np.float16), name))
+        casts.append(helper.make_node("Cast", [name], [tensor.name], to=TensorProto.FLOAT))
+    del model.graph.initializer[:]
+    model.graph.initializer.extend(kept)
+    nodes = casts + list(model.graph.node)
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
+    onnx.save(model, path)
+
+
 def export(out, image, text, tokenizer):
     out.mkdir(parents=True, exist_ok=True)
     image, text = image.cpu().to(memory_format=torch.contiguous_format), text.cpu()
@@ -462,6 +484,8 @@ def export(out, image, text, tokenizer):
                       dynamic_axes={"pixel_values": {0: "n"}, "image_embeds": {0: "n"}}, opset_version=17, dynamo=False)
     torch.onnx.export(text, (torch.zeros(2, 5, dtype=torch.long),), out / "text.onnx", input_names=["input_ids"], output_names=["text_embeds"],
                       dynamic_axes={"input_ids": {0: "n", 1: "tokens"}, "text_embeds": {0: "n"}}, opset_version=17, dynamo=False)
+    for name in ("image.onnx", "text.onnx"):
+        halve(out / name)
     tokenizer.save(str(out / "tokenizer.json"), pretty=False)
 
 

@@ -3,13 +3,14 @@
 //! A [`ModelDir`] is described by one TOML file ([`description`]). Its image side turns crops into
 //! vectors ([`ImageEncoder`]), its text side turns queries into vectors of the same space
 //! ([`TextEncoder`]): through ONNX Runtime ([`session`]), from a list of phrases ([`phrases`]), or
-//! without a model at all ([`colours`]). Encoders of our own are part of the program ([`ModelDir::embedded`]). [`sam`] finds masks. [`EncoderId`] names the space, so that a robot can refuse
+//! without a model at all ([`colours`]). [`boundaries`] finds where things end. Encoders of our own are part of the program ([`ModelDir::embedded`]). [`sam`] finds masks. [`EncoderId`] names the space, so that a robot can refuse
 //! to compare vectors of two spaces.
 //!
 //! [`hub`] brings public models here, and [`commands`] is the face that both programs give it.
 //!
 //! Nothing here prints, reads the environment or starts threads of its own, save the question of [`commands::ask`].
 
+pub mod boundaries;
 pub mod clean;
 pub mod colours;
 pub mod commands;

@@ -150,8 +150,9 @@ pub struct EncodeArgs {
     /// Store to publish into; made if absent.
     #[arg(long, value_name = "DIR")]
     pub store: PathBuf,
-    /// `auto` for a segmenter, or a folder of masks: id PNGs or COCO RLE JSON.
-    #[arg(long, value_name = "auto|DIR", default_value = "auto")]
+    /// `auto` for a segmenter (the embedded one, or --segmenter), `graph` for the one that needs no ONNX Runtime, or a
+    /// folder of masks: id PNGs or COCO RLE JSON.
+    #[arg(long, value_name = "auto|graph|DIR", default_value = "auto")]
     pub masks: String,
     /// The segmenter, where it is not the built-in one.
     #[command(flatten)]

@@ -194,6 +194,7 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
     let folder_name = args.store.file_name().map(|name| name.to_string_lossy().into_owned());
     let created_unix_secs = now_unix_secs();
     let masks = match (args.masks.as_str(), args.sam.masks()) {
+        ("graph", None) => Masks::Graph,
         ("auto", masks) => masks.or(args.views.mask_levels.map(Masks::Levels)).unwrap_or(Masks::Auto),
         (dir, Some(_)) => {
             return Err(anyhow!("--masks {dir} gives masks, --segmenter finds some; choose one"));

@@ -297,12 +297,15 @@ pub fn encode(
     // Before hours of work: the part of the budget that is known now.
     cells::check_memory(settings.memory_bytes, cells::largest_cell_bytes(&split, models.dim()), 0, 0)?;
     let segmenter: Box<dyn Segmenter> = match &settings.masks {
-        Masks::Auto => Box::new(GraphSegmenter::default()),
-        Masks::Levels(n) => {
-            let mut settings = GraphSettings::default();
-            settings.scales.truncate(*n);
-            Box::new(GraphSegmenter::new(settings))
+        Masks::Auto => {
+            Box::new(GraphSegmenter::learnt(GraphSettings::learnt(), session).map_err(SegmentError::from)?)
         }
+        Masks::Levels(n) => {
+            let mut settings = GraphSettings::learnt();
+            settings.scales.truncate(*n);
+            Box::new(GraphSegmenter::learnt(settings, session).map_err(SegmentError::from)?)
+        }
+        Masks::Graph => Box::new(GraphSegmenter::default()),
         Masks::Given { dir, ignore_ids } => Box::new(GivenMasks::open(dir, ignore_ids.clone())?),
         Masks::Sam { dir, settings, n_model_threads } => {
             let session = SessionOptions { intra_op_threads: *n_model_threads, ..session.clone() };

@@ -18,8 +18,10 @@ use crate::shard::cells::CellLimits;
 /// Where masks come from.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Masks {
-    /// From the built-in segmenter.
+    /// From the built-in segmenter with the embedded model.
     Auto,
+    /// From the built-in segmenter without a model.
+    Graph,
     /// From the built-in segmenter with the coarsest of its scales only.
     Levels(usize),
     /// From files that the user gives.

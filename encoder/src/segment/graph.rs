@@ -1,8 +1,15 @@
 //! The built-in segmenter: graph-based image segmentation at several scales (Felzenszwalb and
-//! Huttenlocher, "Efficient Graph-Based Image Segmentation", IJCV 59(2), 2004), over differences of
-//! colour (CIE L*a*b*, where distances are about as large as they look) and jumps of depth.
+//! Huttenlocher, "Efficient Graph-Based Image Segmentation", IJCV 59(2), 2004), over what a small model takes for
+//! boundaries between things, over differences of colour (CIE L*a*b*, where distances are about as large as they
+//! look) and jumps of depth.
 
+use std::borrow::Cow;
 use std::collections::HashMap;
+use std::sync::{Mutex, PoisonError};
+
+use slag_models::SessionOptions;
+use slag_models::boundaries::Boundaries;
+use slag_models::session::SessionError;
 
 use image::{RgbImage, imageops};
 
@@ -30,6 +37,10 @@ pub struct GraphSettings {
     pub scales: Vec<f32>,
     /// Smallest component kept, as a share of the image.
     pub min_area_share: f32,
+    /// Weight of the difference of colour itself.
+    pub colour_weight: f32,
+    /// Weight of a sure boundary between things, in units of colour distance; 0 asks no model.
+    pub boundary_weight: f32,
     /// Weight of a jump to twice the depth, in units of colour distance.
     pub depth_weight: f32,
     /// Overlap (intersection over union) with a mask of a coarser level above which a mask repeats it.
@@ -45,6 +56,8 @@ impl Default for GraphSettings {
             smoothing_px: 0.6,
             scales: vec![3000.0, 1200.0, 600.0, 300.0, 150.0],
             min_area_share: 0.0008,
+            colour_weight: 1.0,
+            boundary_weight: 0.0,
             depth_weight: 100.0,
             max_overlap_iou: 0.9,
             max_masks: 400,
@@ -52,11 +65,43 @@ impl Default for GraphSettings {
     }
 }
 
-/// Finds masks without a model.
-#[derive(Clone, Debug)]
+impl GraphSettings {
+    /// The settings with a model that says where things end.
+    pub fn learnt() -> Self {
+        Self {
+            scales: vec![1500.0, 800.0, 400.0, 200.0],
+            colour_weight: 0.3,
+            boundary_weight: 40.0,
+            depth_weight: 0.0,
+            ..Self::default()
+        }
+    }
+}
+
+/// Finds masks, without a model or with the embedded one.
+#[derive(Debug)]
 pub struct GraphSegmenter {
     settings: GraphSettings,
     name: String,
+    model: Option<ModelPool>,
+}
+
+/// The model, opened as often as images are segmented at a time.
+#[derive(Debug)]
+struct ModelPool {
+    options: SessionOptions,
+    idle: Mutex<Vec<Boundaries>>,
+}
+
+impl ModelPool {
+    fn boundaries(&self, image: &RgbImage) -> Result<Vec<f32>, SessionError> {
+        let idle = || self.idle.lock().unwrap_or_else(PoisonError::into_inner);
+        let taken = idle().pop();
+        let mut model = taken.map_or_else(|| Boundaries::open(&self.options), Ok)?;
+        let boundaries = model.of(image);
+        idle().push(model);
+        boundaries
+    }
 }
 
 impl GraphSegmenter {
@@ -64,8 +109,18 @@ impl GraphSegmenter {
     pub fn new(mut settings: GraphSettings) -> Self {
         settings.scales.truncate(256);
         settings.max_side_px = settings.max_side_px.max(1);
-        let name = format!("graph 1, {settings:?}");
-        Self { settings, name }
+        let name = format!("graph 2, {settings:?}");
+        Self { settings, name, model: None }
+    }
+
+    /// Makes the segmenter that asks the embedded model; it runs on one thread an image.
+    ///
+    /// # Errors
+    /// [`SessionError`] where ONNX Runtime does not load.
+    pub fn learnt(settings: GraphSettings, session: &SessionOptions) -> Result<Self, SessionError> {
+        let options = SessionOptions { intra_op_threads: 1, ..session.clone() };
+        let idle = Mutex::new(vec![Boundaries::open(&options)?]);
+        Ok(Self { model: Some(ModelPool { options, idle }), ..Self::new(settings) })
     }
 }
 
@@ -81,7 +136,7 @@ impl Segmenter for GraphSegmenter {
     }
 
     fn wants_depth(&self) -> bool {
-        true
+        self.settings.depth_weight > 0.0
     }
 
     fn segment(&self, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError> {
@@ -89,8 +144,9 @@ impl Segmenter for GraphSegmenter {
         if width_px == 0 || height_px == 0 {
             return Ok(Vec::new());
         }
-        let raster = Raster::new(input, &self.settings);
-        let edges = raster.edges_by_weight(self.settings.depth_weight);
+        let (image, raster) = Raster::new(input, &self.settings);
+        let boundaries = self.model.as_ref().map(|model| model.boundaries(&image)).transpose()?;
+        let edges = raster.edges_by_weight(&self.settings, boundaries.as_deref());
         let n_pixels = raster.lab.len();
         let min_area_px = ((n_pixels as f32 * self.settings.min_area_share) as u32).max(MIN_AREA_PX);
         let levels: Vec<Labels> = self
@@ -149,7 +205,8 @@ struct Raster {
 }
 
 impl Raster {
-    fn new(input: &SegmentInput<'_>, settings: &GraphSettings) -> Self {
+    /// Returns the image that is worked on, and what it is made into.
+    fn new<'a>(input: &SegmentInput<'a>, settings: &GraphSettings) -> (Cow<'a, RgbImage>, Self) {
         let (full_width, full_height) = input.image.dimensions();
         let longest = full_width.max(full_height);
         let scaled = |side: u32| {
@@ -157,11 +214,12 @@ impl Raster {
             ((side + u64::from(longest) / 2) / u64::from(longest)).max(1) as u32
         };
         let (width_px, height_px) = (scaled(full_width), scaled(full_height));
-        let mut lab = if longest <= settings.max_side_px {
-            lab_of(input.image)
+        let image = if longest <= settings.max_side_px {
+            Cow::Borrowed(input.image)
         } else {
-            lab_of(&imageops::thumbnail(input.image, width_px, height_px))
+            Cow::Owned(imageops::thumbnail(input.image, width_px, height_px))
         };
+        let mut lab = lab_of(&image);
         smooth(&mut lab, width_px as usize, settings.smoothing_px);
 
         let (columns, rows) = (nearest(full_width, width_px), nearest(full_height, height_px));
@@ -173,7 +231,7 @@ impl Raster {
             || vec![true; lab.len()],
             |valid| sample(full_width, &columns, &rows, |at| valid.get(at) == Some(&true)),
         );
-        Self { width_px, height_px, lab, inverse_depth, valid }
+        (image, Self { width_px, height_px, lab, inverse_depth, valid })
     }
 
     /// Returns the pixel at the other end of an edge; `None` beyond the border.
@@ -202,7 +260,9 @@ impl Raster {
     }
 
     /// Returns the edges between valid pixels, ascending by weight and then by position, with weights.
-    fn edges_by_weight(&self, depth_weight: f32) -> Vec<(Edge, u16)> {
+    ///
+    /// `boundaries`: `[neighbour][pixel]`, 0 to 1.
+    fn edges_by_weight(&self, settings: &GraphSettings, boundaries: Option<&[f32]>) -> Vec<(Edge, u16)> {
         let mut edges = Vec::with_capacity(4 * self.lab.len());
         for pixel in 0..self.lab.len() {
             for (direction, step) in NEIGHBOURS.into_iter().enumerate() {
@@ -210,10 +270,12 @@ impl Raster {
                 if !(self.valid[pixel] && self.valid[other]) {
                     continue;
                 }
-                let colour = distance(self.lab[pixel], self.lab[other]);
+                let colour = settings.colour_weight * distance(self.lab[pixel], self.lab[other]);
                 // A jump of relative inverse depth 1/2 is one to twice the depth.
-                let depth = 2.0 * depth_weight * self.depth_jump(pixel, other, step);
-                let weight = ((colour + depth) * WEIGHT_STEPS) as u16;
+                let depth = 2.0 * settings.depth_weight * self.depth_jump(pixel, other, step);
+                let boundary = boundaries.map_or(0.0, |of| of[direction * self.lab.len() + pixel]);
+                let weight = colour + depth + settings.boundary_weight * boundary;
+                let weight = (weight * WEIGHT_STEPS) as u16;
                 edges.push((pixel as u32 * 4 + direction as u32, weight));
             }
         }
