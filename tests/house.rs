@@ -31,6 +31,8 @@ fn the_field_agrees_with_the_independent_reference() {
         text(&masks),
         "--models",
         text(&models),
+        "--preset",
+        "paper",
         "--background",
         "white",
         "--min-mask-px",
@@ -64,6 +66,7 @@ fn a_gpu_gives_the_field_of_the_cpu() {
         let (scene, views, masks) =
             (house.join("point_cloud.ply"), house.join("sparse/0"), house.join("gt/masks"));
         let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views)]);
+        command.args(["--preset", "paper"]);
         command.args(["--masks", text(&masks), "--store", text(&store), "--device", device]);
         run_json(command.args([
             "--views-limit",

@@ -160,7 +160,7 @@ pub struct EncodeArgs {
     /// Ids of mask PNGs that are no mask, beside 0.
     #[arg(long, value_name = "ID", value_delimiter = ',')]
     pub ignore_mask_ids: Vec<u32>,
-    /// Bundle of the method's choices. `paper`: blend weights, white background, plain average.
+    /// Bundle of the method's choices. `paper`: the plain average; `balanced`: refined.
     #[arg(long, value_enum, default_value = "balanced")]
     pub preset: Preset,
     /// How sums become embeddings, where not as the preset says.

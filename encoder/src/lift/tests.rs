@@ -14,7 +14,7 @@ pub(super) struct Scene {
 }
 
 /// Writes views to files in the order given and opens them, with parts of at most `part_entries`.
-fn open(views: &[ViewSums], dim: usize, n_of_cell: &[usize], part_entries: u64) -> Scene {
+pub(super) fn open(views: &[ViewSums], dim: usize, n_of_cell: &[usize], part_entries: u64) -> Scene {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let path = |(i, view): (usize, &ViewSums)| {
         let path = dir.path().join(format!("{i}.sums"));

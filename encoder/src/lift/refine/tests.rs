@@ -1,1 +1,351 @@
+use std::sync::atomic::AtomicBool;
 
+use glam::DVec3;
+use slag_common::container::AlignedBytes;
+use slag_common::frames::Aabb;
+
+use super::*;
+use crate::lift::tests::{Scene, open};
+use crate::lift::{CellField, SumEntry, ViewSums};
+use crate::shard::cells::Cell;
+
+const DIM: usize = 12;
+const N: usize = 90;
+/// Gaussians that no view sees.
+const UNSEEN: [usize; 2] = [7, 50];
+
+fn random(seed: u64) -> f64 {
+    let z = seed.wrapping_add(5).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    ((z ^ (z >> 29)).wrapping_mul(0xbf58_476d_1ce4_e5b9) >> 20) as f64 / (1u64 << 44) as f64
+}
+
+/// Three patches of 30 Gaussians, far apart and each of a colour.
+fn gaussians() -> Gaussians {
+    let mut scene = Gaussians::default();
+    for i in 0..N {
+        let at = DVec3::new((i / 30 * 10) as f64 + (i % 6) as f64 * 0.1, (i % 30 / 6) as f64 * 0.1, 0.0);
+        scene.means_in_world.push(at);
+        scene.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+        scene.scales.push([0.1, 0.1, 0.01]);
+        scene.opacities.push(0.9);
+        scene.sh_dc.push([(i / 30) as f32; 3]);
+    }
+    scene
+}
+
+fn split() -> CellSplit {
+    let bounds = Aabb::EMPTY;
+    let cell = Cell { gaussians: (0..N as u32).collect(), mean_bounds: bounds, bounds };
+    let local_of_gaussian = (0..N as u32).collect();
+    CellSplit { cells: vec![cell], cell_of_gaussian: vec![0; N], local_of_gaussian, n_rejected: 0 }
+}
+
+/// Views of two masks a patch, which overlap; the masks of view 3 have the others' vectors turned round.
+fn views() -> Vec<ViewSums> {
+    let view = |v: u64| {
+        let vector = |mask: u64| {
+            let patch = if v == 3 { (mask / 2 + 1) % 3 } else { mask / 2 };
+            let raw: Vec<f32> = (0..DIM as u64)
+                .map(|c| {
+                    (f64::from(u8::from(c == patch * 3)) + 0.3 * (random(v << 20 ^ mask << 8 ^ c) - 0.5))
+                        as f32
+                })
+                .collect();
+            let length = dot(&raw, &raw).sqrt();
+            raw.into_iter().map(move |x| x / length)
+        };
+        let entry = |k: u64, step: u64| SumEntry {
+            local: k as u32,
+            region: (k / 30 * 3 + step) as u32,
+            weight: (0.05 + random(v << 30 ^ k << 10 ^ step << 2) * [9.0, 3.0, 0.4][step as usize]) as f32,
+        };
+        let seen =
+            (0..N as u64).filter(|k| !UNSEEN.contains(&(*k as usize)) && random(v ^ k << 5 ^ 99) > 0.2);
+        let entries = seen.flat_map(|k| (0..3).map(move |step| entry(k, step))).collect();
+        ViewSums {
+            dim: DIM,
+            mask_vectors: (0..6).flat_map(vector).collect(),
+            masks_of_region: (0..9)
+                .map(|r| {
+                    [vec![r / 3 * 2], vec![r / 3 * 2, r / 3 * 2 + 1], vec![r / 3 * 2 + 1]][r as usize % 3]
+                        .clone()
+                })
+                .collect(),
+            entries_of_cell: vec![(0, entries)],
+        }
+    };
+    (0..7).map(view).collect()
+}
+
+/// A field with its table and embeddings.
+struct Lifted {
+    field: CellField,
+    table: RegionTable,
+    embeddings: Vec<f32>,
+}
+
+fn lifted(settings: Aggregation, group_bytes: u64) -> Lifted {
+    let mut opened = open(&views(), DIM, &[N], u64::MAX);
+    let Scene { index, table, .. } = &mut opened;
+    let (scene, split) = (gaussians(), split());
+    let refinement =
+        Refinement::prepare(settings, (index, table), (&scene, &split), group_bytes, &AtomicBool::new(false))
+            .expect("reads");
+    let raw = index.read(0..1).expect("reads");
+    let mut sums = index.regroup(&raw, table).expect("regroups").remove(0);
+    if let Some(refinement) = refinement {
+        refinement.apply(&mut sums, &split.cells[0].gaussians);
+    }
+    let mut embeddings = vec![f32::NAN; N * DIM];
+    let field = CellField::new(split.cells[0].gaussians.clone(), sums, table, &mut embeddings);
+    Lifted { field, table: table.clone(), embeddings }
+}
+
+/// Entries of a Gaussian in float64, view by view: `(masks of the view, region, weight)`.
+fn row(views: &[ViewSums], k: usize) -> Vec<Vec<(usize, f64)>> {
+    let of_view = |view: &ViewSums| {
+        let entries = view.entries_of_cell[0].1.iter().filter(|e| e.local as usize == k);
+        entries.map(|e| (e.region as usize, f64::from(e.weight))).collect()
+    };
+    views.iter().map(of_view).collect()
+}
+
+fn pruned(rows: Vec<Vec<(usize, f64)>>, settings: &Aggregation) -> Vec<Vec<(usize, f64)>> {
+    let weight = |view: &Vec<(usize, f64)>| view.iter().map(|e| e.1).sum::<f64>();
+    let best = rows.iter().map(weight).fold(0.0, f64::max);
+    let kept = |view: Vec<(usize, f64)>| {
+        if weight(&view) < f64::from(settings.min_view_share) * best {
+            return Vec::new();
+        }
+        let largest = view.iter().map(|e| e.1).fold(0.0, f64::max);
+        view.into_iter().filter(|e| e.1 >= f64::from(settings.min_region_share) * largest).collect()
+    };
+    rows.into_iter().map(kept).collect()
+}
+
+/// `Σ weight * how often the mask counts * its vector` over a view's entries.
+fn contribution(view: &ViewSums, entries: &[(usize, f64)], counts: &[f64]) -> Vec<f64> {
+    let mut sum = vec![0.0; DIM];
+    for (region, weight) in entries {
+        for mask in &view.masks_of_region[*region] {
+            let mask = *mask as usize;
+            (0..DIM)
+                .for_each(|c| sum[c] += weight * counts[mask] * f64::from(view.mask_vectors[mask * DIM + c]));
+        }
+    }
+    sum
+}
+
+fn norm(v: &[f64]) -> f64 {
+    v.iter().map(|x| x * x).sum::<f64>().sqrt()
+}
+
+/// What masks count, by the definition, with everything in float64 and no axes.
+fn oracle_counts(views: &[ViewSums], settings: &Aggregation) -> Vec<Vec<f64>> {
+    let once = vec![1.0; 6];
+    let mut votes = vec![vec![(0.0, 0.0); 6]; views.len()];
+    for k in 0..N {
+        let rows = pruned(row(views, k), settings);
+        let parts: Vec<Vec<f64>> =
+            rows.iter().zip(views).map(|(entries, view)| contribution(view, entries, &once)).collect();
+        for (v, entries) in rows.iter().enumerate() {
+            let rest: Vec<f64> = (0..DIM)
+                .map(|c| parts.iter().enumerate().filter(|(u, _)| *u != v).map(|(_, p)| p[c]).sum())
+                .collect();
+            if norm(&rest) < 1e-9 {
+                continue;
+            }
+            for (region, weight) in entries {
+                for mask in &views[v].masks_of_region[*region] {
+                    let mask = *mask as usize;
+                    let vector = &views[v].mask_vectors[mask * DIM..][..DIM];
+                    let cosine: f64 =
+                        rest.iter().zip(vector).map(|(r, m)| r * f64::from(*m)).sum::<f64>() / norm(&rest);
+                    votes[v][mask].0 += weight * cosine;
+                    votes[v][mask].1 += weight;
+                }
+            }
+        }
+    }
+    let count = |(sum, weight): &(f64, f64)| (sum / weight).max(0.01).powf(f64::from(settings.agreement));
+    votes.iter().map(|of_view| of_view.iter().map(count).collect()).collect()
+}
+
+fn assert_near(found: &[f32], expected: &[f64], what: &str) {
+    let length = norm(expected);
+    for (a, b) in found.iter().zip(expected) {
+        assert!((f64::from(*a) - b / length).abs() < 2e-4, "{what}: {found:?} {expected:?}");
+    }
+}
+
+#[test]
+fn the_plain_average_is_left_alone_and_its_file_is_what_it_was() {
+    let mut opened = open(&views(), DIM, &[N], u64::MAX);
+    let Scene { index, table, .. } = &mut opened;
+    let before = table.clone();
+    let (scene, split) = (gaussians(), split());
+    let none = Refinement::prepare(
+        Aggregation::PAPER,
+        (index, table),
+        (&scene, &split),
+        u64::MAX,
+        &AtomicBool::new(false),
+    );
+    assert!(none.expect("reads").is_none());
+    assert_eq!(*table, before);
+    assert_eq!(Aggregation::default(), Aggregation::PAPER);
+}
+
+/// Oracle: float64 by definition, Gaussian by Gaussian.
+#[test]
+fn pruning_and_agreement_are_those_of_the_definition() {
+    let views = views();
+    for (agreement, shares) in [(0.0, (0.5, 0.3)), (1.0, (0.0, 0.0)), (2.0, (0.5, 0.3))] {
+        let settings = Aggregation {
+            agreement,
+            min_region_share: shares.0,
+            min_view_share: shares.1,
+            ..Aggregation::PAPER
+        };
+        let Lifted { field, table, embeddings } = lifted(settings, u64::MAX);
+        let counts = match agreement {
+            0.0 => vec![vec![1.0; 6]; views.len()],
+            _ => oracle_counts(&views, &settings),
+        };
+        for k in (0..N).filter(|k| !UNSEEN.contains(k)) {
+            let rows = pruned(row(&views, k), &settings);
+            let mut expected = vec![0.0; DIM];
+            for ((view, entries), counts) in views.iter().zip(&rows).zip(&counts) {
+                let part = contribution(view, entries, counts);
+                (0..DIM).for_each(|c| expected[c] += part[c]);
+            }
+            assert_near(&embeddings[k * DIM..][..DIM], &expected, &format!("{agreement} {k}"));
+            // Scores are those of the embeddings, by the published numbers alone.
+            let query: Vec<f32> = (0..DIM).map(|c| random(c as u64) as f32).collect();
+            let cosine = field.cosines(&table.scores(&query))[k];
+            assert!((cosine - dot(&embeddings[k * DIM..][..DIM], &query)).abs() < 1e-4);
+        }
+        if agreement > 0.0 {
+            let [good, bad] = [0, 3].map(|v| table.masks_of(v * 9).next().expect("a mask").1);
+            assert!(bad < 0.5 * good, "the view that contradicts: {bad}, another: {good}");
+        }
+    }
+}
+
+/// Oracle: the superpoints are the patches; half of a row is the patch's sum, by length.
+#[test]
+fn a_superpoint_gives_its_part_and_fills_what_no_view_sees() {
+    let views = views();
+    let settings = Aggregation { superpoint: 1.0, fill: true, ..Aggregation::PAPER };
+    let Lifted { field, embeddings, table } = lifted(settings, u64::MAX);
+    let once = vec![1.0; 6];
+    let sum_of = |k: usize| -> Vec<f64> {
+        let mut sum = vec![0.0; DIM];
+        for (view, entries) in views.iter().zip(row(&views, k)) {
+            contribution(view, &entries, &once).iter().enumerate().for_each(|(c, x)| sum[c] += x);
+        }
+        sum
+    };
+    for k in 0..N {
+        let mut patch = vec![0.0; DIM];
+        (k / 30 * 30..k / 30 * 30 + 30).for_each(|other| {
+            sum_of(other).iter().enumerate().for_each(|(c, x)| patch[c] += x);
+        });
+        let own = sum_of(k);
+        let own_length = norm(&own).max(1e-12);
+        let expected: Vec<f64> = (0..DIM).map(|c| own[c] / own_length + patch[c] / norm(&patch)).collect();
+        assert_near(&embeddings[k * DIM..][..DIM], &expected, &format!("{k}"));
+        assert!(field.has_evidence(k));
+        assert_eq!(UNSEEN.contains(&k), field.total_weights[k] < 0.01);
+    }
+    assert_eq!(table.len(), 7 * 9 + 3);
+    let mut bytes = Vec::new();
+    table.write(&mut bytes).expect("writes to memory");
+    assert_eq!(RegionTable::from_bytes(&AlignedBytes::copy_of(&bytes)).expect("valid"), table);
+
+    let unfilled = lifted(Aggregation { superpoint: 1.0, ..Aggregation::PAPER }, u64::MAX);
+    assert!(UNSEEN.iter().all(|k| !unfilled.field.has_evidence(*k)));
+    let only_filled = lifted(Aggregation { fill: true, ..Aggregation::PAPER }, u64::MAX);
+    let paper = lifted(Aggregation::PAPER, u64::MAX);
+    for k in 0..N {
+        let same = only_filled.embeddings[k * DIM..][..DIM] == paper.embeddings[k * DIM..][..DIM];
+        assert_eq!(same, !UNSEEN.contains(&k), "{k}");
+    }
+}
+
+/// Oracle: what Weiszfeld's steps lead to has the smallest sum of distances; the mean has a larger one.
+#[test]
+fn the_median_leaves_the_view_that_contradicts() {
+    let views = views();
+    let cost = |of: &Lifted| -> f64 {
+        let mut cost = 0.0;
+        for k in (0..N).filter(|k| !UNSEEN.contains(k)) {
+            for (view, entries) in views.iter().zip(row(&views, k)) {
+                let part = contribution(view, &entries, &[1.0; 6]);
+                let weight = norm(&part);
+                if weight > 0.0 {
+                    let offset = (0..DIM).map(|c| part[c] / weight - f64::from(of.embeddings[k * DIM + c]));
+                    cost += weight * norm(&offset.collect::<Vec<_>>());
+                }
+            }
+        }
+        cost
+    };
+    let mean = cost(&lifted(Aggregation::PAPER, u64::MAX));
+    let costs = [1, 3, 20]
+        .map(|median_steps| cost(&lifted(Aggregation { median_steps, ..Aggregation::PAPER }, u64::MAX)));
+    println!("{mean} {costs:?}");
+    assert!(costs[0] < 0.97 * mean && costs[1] < costs[0] && costs[2] <= costs[1]);
+}
+
+#[test]
+fn the_gate_takes_the_evidence_of_what_hardly_shows() {
+    let settings = Aggregation { min_weight_px: 30.0, ..Aggregation::PAPER };
+    let Lifted { field, .. } = lifted(settings, u64::MAX);
+    let views = views();
+    let mut n_gated = 0;
+    for k in 0..N {
+        let weight: f64 = row(&views, k).iter().flatten().map(|e| e.1).sum();
+        assert_eq!(field.has_evidence(k), weight >= 30.0, "{k}: {weight}");
+        n_gated += usize::from(weight < 30.0);
+    }
+    assert!((10..80).contains(&n_gated), "{n_gated}");
+}
+
+#[test]
+fn threads_and_budget_do_not_show() {
+    let settings = Aggregation { median_steps: 2, ..Aggregation::REFINED };
+    let run = |threads: usize, group_bytes: u64| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+        let Lifted { field, table, embeddings } = pool.install(|| lifted(settings, group_bytes));
+        (field, table, embeddings)
+    };
+    let expected = run(1, u64::MAX);
+    assert!(expected.2.iter().all(|x| x.is_finite()));
+    assert!(run(3, 1) == expected);
+}
+
+/// One mask and one view say nothing against each other.
+#[test]
+fn a_single_view_keeps_its_evidence() {
+    let view = ViewSums {
+        dim: 64,
+        mask_vectors: (0..64).map(|c| f32::from(u8::from(c == 3))).collect(),
+        masks_of_region: vec![vec![0]],
+        entries_of_cell: vec![(0, vec![SumEntry { local: 2, region: 0, weight: 1.0 }])],
+    };
+    let mut opened = open(&[view], 64, &[N], u64::MAX);
+    let Scene { index, table, .. } = &mut opened;
+    let (scene, split) = (gaussians(), split());
+    let (sums, cancel) = ((&*index, &mut *table), AtomicBool::new(false));
+    let refinement = Refinement::prepare(Aggregation::REFINED, sums, (&scene, &split), u64::MAX, &cancel);
+    let refinement = refinement.expect("reads").expect("refines");
+    let raw = index.read(0..1).expect("reads");
+    let mut sums = index.regroup(&raw, table).expect("regroups").remove(0);
+    refinement.apply(&mut sums, &split.cells[0].gaussians);
+    let mut embeddings = vec![0.0; N * 64];
+    let field = CellField::new((0..N as u32).collect(), sums, table, &mut embeddings);
+    // Its patch is filled, the others know nothing.
+    assert!((0..N).all(|k| field.has_evidence(k) == (k < 30)));
+    assert!((0..30).all(|k| (embeddings[k * 64 + 3] - 1.0).abs() < 1e-6));
+}
