@@ -8,7 +8,8 @@ use slag_tests::*;
 fn encode(room: &Path, store: &Path, more: &[&str]) -> Value {
     let (scene, views) = (room.join("scene.ply"), room.join("transforms.json"));
     let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views), "--metric"]);
-    run_json(command.args(["--store", text(store), "--raster-width", "320"]).args(more))
+    command.args(["--masks", text(&room.join("gt/masks")), "--store", text(store), "--raster-width", "320"]);
+    run_json(command.args(more))
 }
 
 #[test]
