@@ -54,7 +54,7 @@ fn an_encode_of_some_views_goes_on_with_more() {
 
     // Kept sums: another palette of the same views, without the views.
     let kept = dir.path().join("kept");
-    assert_eq!(counts(&encode(&room, &kept, &["--keep-sums", "--compact-error", "0.3"])), [10, 0]);
+    assert_eq!(counts(&encode(&room, &kept, &["--keep-views", "--compact-error", "0.3"])), [10, 0]);
     assert_eq!(counts(&encode(&room, &kept, &[])), [10, 10]);
     assert_eq!(content(&kept), expected);
 }

@@ -18,3 +18,4 @@ pub mod raster;
 pub mod segment;
 pub mod shard;
 pub mod store;
+pub mod superpoint;

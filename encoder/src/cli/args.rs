@@ -12,12 +12,16 @@ use slag_models::commands::{ModelsCommand, RunArgs};
 
 use super::eval::{EvalLerfArgs, EvalScannetArgs};
 use super::keys::KeysCommand;
+use super::noise::EvalNoiseArgs;
+use super::refine::RefineArgs;
 use super::sam::SamArgs;
 use super::tradeoff::TradeoffArgs;
 use super::views::ViewsArgs;
 use crate::embed::Background;
+use crate::eval::Filter;
 use crate::generate::crops::Split;
 use crate::generate::grammar::SceneKind;
+use crate::lift::Aggregation;
 use crate::palette::PaletteSettings;
 use crate::raster::WeightKind;
 use crate::raster::devices::DeviceChoice;
@@ -155,8 +159,11 @@ pub struct EncodeArgs {
     #[arg(long, value_name = "ID", value_delimiter = ',')]
     pub ignore_mask_ids: Vec<u32>,
     /// Bundle of the method's choices. `paper`: blend weights, white background, plain average.
-    #[arg(long, value_enum, default_value = "paper")]
+    #[arg(long, value_enum, default_value = "balanced")]
     pub preset: Preset,
+    /// How sums become embeddings, where not as the preset says.
+    #[command(flatten)]
+    pub refine: RefineArgs,
     /// What fills a crop outside its mask; the preset's if absent.
     #[arg(long, value_enum)]
     pub background: Option<BackgroundArg>,
@@ -223,15 +230,18 @@ pub struct EncodeArgs {
 /// Bundles of choices.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Preset {
-    /// The paper's method.
+    /// The paper's method: white behind the masks, the plain average.
     Paper,
+    /// White behind the masks, refined.
+    Balanced,
 }
 
 impl Preset {
-    /// Returns the background and the weight that the preset stands for.
-    pub fn choices(self) -> (Background, WeightKind) {
+    /// Returns the background, the weight and the aggregation that the preset stands for.
+    pub fn choices(self) -> (Background, WeightKind, Aggregation) {
         match self {
-            Self::Paper => (Background::White, WeightKind::Blend),
+            Self::Paper => (Background::White, WeightKind::Blend, Aggregation::PAPER),
+            Self::Balanced => (Background::White, WeightKind::Blend, Aggregation::REFINED),
         }
     }
 }
@@ -309,6 +319,8 @@ pub enum EvalCommand {
     Lerf(EvalLerfArgs),
     /// Against ScanNet's labelled meshes, with OpenGaussian's protocol.
     Scannet(EvalScannetArgs),
+    /// How each way to aggregate falls with errors laid over true masks.
+    Noise(EvalNoiseArgs),
 }
 
 /// `eval labelled`.
@@ -335,6 +347,9 @@ pub struct EvalLabelledArgs {
     /// Score from which something counts as found [default: the store's].
     #[arg(long, value_name = "COSINE", allow_negative_numbers = true)]
     pub threshold: Option<f32>,
+    /// Lets the Gaussians of a superpoint answer together, as the paper does.
+    #[arg(long, value_enum)]
+    pub superpoints: Option<Filter>,
 }
 
 /// `serve`.

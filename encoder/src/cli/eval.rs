@@ -76,8 +76,12 @@ pub(super) fn run_lerf(args: &EvalLerfArgs, json: bool) -> Result<Exit> {
     let mut encoder = text_encoder_of(&reader, &args.models)?;
     let scene = splat::read(&args.scene, &splat::ReadOptions { with_sh_rest: false })?;
     let labels = LerfLabels::read(&args.labels, &poses::read(&args.views, None)?.views)?;
-    let settings =
-        EvalSettings { words: args.words.clone(), profile: args.profile, threshold: args.threshold };
+    let settings = EvalSettings {
+        words: args.words.clone(),
+        profile: args.profile,
+        threshold: args.threshold,
+        ..EvalSettings::default()
+    };
     let report = lerf::lerf(&reader, &labels, &scene, &mut *encoder, &CpuRasterizer, &settings)?;
     print(json, &report, &report)?;
     let is_whole = report.unknown_words.is_empty() && report.frames_without_view.is_empty();

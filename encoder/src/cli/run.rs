@@ -57,6 +57,7 @@ pub fn run(cli: Cli) -> Exit {
         Command::Eval(EvalCommand::Labelled(args)) => run_eval_labelled(&args, json),
         Command::Eval(EvalCommand::Lerf(args)) => super::eval::run_lerf(&args, json),
         Command::Eval(EvalCommand::Scannet(args)) => super::eval::run_scannet(&args, json),
+        Command::Eval(EvalCommand::Noise(args)) => super::noise::run(&args, progress.as_ref(), json),
         Command::Generate(command) => run_generate(&command, progress.as_ref()),
         Command::Demo(args) => run_demo(&args, progress.as_ref(), json),
         Command::Devices => run_devices(json),
@@ -104,7 +105,7 @@ pub(super) fn print(json: bool, value: &impl Serialize, lines: impl Display) -> 
 }
 
 /// Returns a flag that ctrl-c or SIGTERM sets; a second one ends the program at once.
-fn cancel_flag() -> Result<Arc<AtomicBool>> {
+pub(super) fn cancel_flag() -> Result<Arc<AtomicBool>> {
     let flag = Arc::new(AtomicBool::new(false));
     let seen = Arc::clone(&flag);
     ctrlc::set_handler(move || {
@@ -195,7 +196,7 @@ fn run_check(args: &CheckArgs, json: bool) -> Result<Exit> {
 
 /// Returns the settings that the flags stand for.
 fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
-    let (preset_background, preset_weights) = args.preset.choices();
+    let (preset_background, preset_weights, preset_aggregation) = args.preset.choices();
     // A geo-reference that lies beside the scene belongs to it.
     let beside = args.input.scene.with_file_name("geo.json");
     let geo = args.geo.clone().or_else(|| beside.is_file().then_some(beside));
@@ -225,11 +226,13 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
         background: args.background.map_or(preset_background, Into::into),
         min_mask_px: args.min_mask_px,
         weights: args.weights.map_or(preset_weights, Into::into),
+        aggregation: args.refine.aggregation(preset_aggregation),
+        mask_noise: args.refine.mask_noise(),
+        keep_views: args.refine.keep_views,
         threads: args.threads.map_or_else(available_threads, |n| n as usize),
         memory_bytes: args.memory,
         strict: args.input.strict,
         restart: args.restart,
-        keep_sums: args.views.keep_sums,
         cells: CellLimits {
             max_gaussians: args.cell_gaussians as usize,
             max_width: metric.then_some(args.cell_width_m),
@@ -368,8 +371,12 @@ fn run_eval_labelled(args: &EvalLabelledArgs, json: bool) -> Result<Exit> {
     let mut encoder = text_encoder_of(&reader, &args.models)?;
     let scene = splat::read(&args.scene, &splat::ReadOptions { with_sh_rest: false })?;
     let truth = Truth::read(&args.truth, scene.len())?;
-    let settings =
-        EvalSettings { words: args.words.clone(), profile: args.profile, threshold: args.threshold };
+    let settings = EvalSettings {
+        words: args.words.clone(),
+        profile: args.profile,
+        threshold: args.threshold,
+        filter: args.superpoints,
+    };
     let report = eval::labelled(&reader, &truth, &scene, &mut *encoder, &CpuRasterizer, &settings)?;
     print(json, &report, &report)?;
     Ok(Exit::Done)

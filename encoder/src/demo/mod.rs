@@ -19,6 +19,7 @@ use crate::generate::grammar::{self, SceneKind};
 use crate::generate::{Scene, TrueObject};
 use slag_common::shard::Profile;
 
+use crate::lift::Aggregation;
 use crate::palette::PaletteSettings;
 use crate::progress::Progress;
 use crate::publish::serve::{self, Limits};
@@ -190,11 +191,13 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         background: Background::White,
         min_mask_px: 200,
         weights: WeightKind::Blend,
+        aggregation: Aggregation::REFINED,
+        mask_noise: None,
+        keep_views: false,
         threads: rayon::current_num_threads(),
         memory_bytes: 1 << 30,
         strict: true,
         restart: false,
-        keep_sums: false,
         // Small cells, so that the demo has several.
         cells: CellLimits { max_gaussians: 16_384, max_width: Some(25.0) },
         shards: ShardSettings {

@@ -9,8 +9,9 @@ use slag_common::{Gaussians, Hash32};
 use slag_models::ModelDir;
 
 use super::{EncodeError, EncodeSettings, Stopwatch};
-use crate::lift::published::{EXTRA_REGIONS, extra_field};
-use crate::lift::{CellField, PartSums, RegionTable, SumsIndex};
+use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS, extra_field};
+use crate::lift::refine::Refinement;
+use crate::lift::{Aggregation, CellField, PartSums, RegionTable, SumsIndex};
 use crate::palette::{ScoreMetric, TextBank, Yardstick};
 use crate::progress::Progress;
 use crate::shard::cells::CellSplit;
@@ -92,7 +93,9 @@ impl<'a> CellBuilder<'a> {
         let group_bytes = check_memory(
             settings.memory_bytes,
             largest_cell_bytes(split, models.dim()),
-            table.len_bytes() + index.len_bytes(),
+            table.len_bytes()
+                + index.len_bytes()
+                + Refinement::len_bytes(&settings.aggregation, scene.len(), table.len()),
             index.largest_part_bytes(),
         )?;
         let encoder_id = Hash32(models.encoder_id().hash());
@@ -136,7 +139,7 @@ impl<'a> CellBuilder<'a> {
     /// # Errors
     /// [`EncodeError`].
     pub(super) fn build(
-        &self,
+        &mut self,
         progress: &dyn Progress,
         cancel: &AtomicBool,
     ) -> Result<Option<BuiltCells>, EncodeError> {
@@ -146,6 +149,18 @@ impl<'a> CellBuilder<'a> {
             n_without_evidence: 0,
             score_sums: [0.0; 3],
         };
+        let aggregation = self.settings.aggregation;
+        let refinement = self.stopwatch.time("refine", || {
+            let sums = (&self.index, &mut self.table);
+            Refinement::prepare(aggregation, sums, (self.scene, self.split), self.group_bytes, cancel)
+        })?;
+        if cancel.load(Ordering::Relaxed) {
+            return Ok(None);
+        }
+        if aggregation != Aggregation::PAPER {
+            let record = serde_json::to_vec(&aggregation).map_err(std::io::Error::from)?;
+            built.extras.insert(EXTRA_AGGREGATION.into(), self.store.put_bytes(&record)?.0);
+        }
         let regions = self.store.put_object(|out| self.table.write(out))?.0;
         built.extras.insert(EXTRA_REGIONS.into(), regions);
         let dim = self.table.dim();
@@ -160,7 +175,7 @@ impl<'a> CellBuilder<'a> {
                     return Ok(None);
                 }
                 let cell_id = sums.part.cell_id;
-                self.add_part(sums, &mut cell, &mut built)?;
+                self.add_part(sums, refinement.as_ref(), &mut cell, &mut built)?;
                 if cell.has_evidence.len() == self.split.cells[cell_id as usize].gaussians.len() {
                     self.finish_cell(cell_id, &cell, &mut built)?;
                     cell.has_evidence.clear();
@@ -174,7 +189,8 @@ impl<'a> CellBuilder<'a> {
     /// Adds the next part's embeddings to its cell's, and publishes its field.
     fn add_part(
         &self,
-        sums: PartSums,
+        mut sums: PartSums,
+        refinement: Option<&Refinement>,
         cell: &mut CellEmbeddings,
         built: &mut BuiltCells,
     ) -> Result<(), EncodeError> {
@@ -186,6 +202,9 @@ impl<'a> CellBuilder<'a> {
         cell.vectors.resize(len, 0.0);
         let vectors = &mut cell.vectors[part.locals.start * cell.dim..part.locals.end * cell.dim];
         let field = self.stopwatch.time("lift", || {
+            if let Some(refinement) = refinement {
+                refinement.apply(&mut sums, &gaussians[part.locals.clone()]);
+            }
             CellField::new(gaussians[part.locals.clone()].to_vec(), sums, &self.table, vectors)
         });
         cell.has_evidence.extend((0..field.len()).map(|k| field.has_evidence(k)));

@@ -32,7 +32,9 @@ use crate::lift::SumsError;
 use crate::palette::TextBank;
 use crate::progress::Progress;
 use crate::raster::{LoadedScene, RasterError, RasterView, Rasterizer};
-use crate::segment::{GivenMasks, GraphSegmenter, GraphSettings, SamSegmenter, SegmentError, Segmenter};
+use crate::segment::{
+    GivenMasks, GraphSegmenter, GraphSettings, NoisyMasks, SamSegmenter, SegmentError, Segmenter,
+};
 use crate::shard;
 use crate::store::{Store, StoreError};
 use cells::CellBuilder;
@@ -303,6 +305,10 @@ pub fn encode(
             Box::new(SamSegmenter::open(dir, settings.clone(), &session)?)
         }
     };
+    let segmenter = match settings.mask_noise {
+        Some(noise) => Box::new(NoisyMasks::new(segmenter, noise)),
+        None => segmenter,
+    };
     let fingerprint = settings.fingerprint(models, segmenter.name(), &scene, &views)?;
     let job = Job::open(&store, fingerprint, settings.restart)?;
 
@@ -353,7 +359,7 @@ pub fn encode(
             TextBank::directions(models.dim())
         }
     });
-    let builder =
+    let mut builder =
         CellBuilder::open(settings, &store, &scene, &split, &sums_paths, (models, bank), &stopwatch)?;
     let mut summary = EncodeSummary {
         generation: store.next_generation()?,
@@ -428,7 +434,7 @@ pub fn encode(
     };
     store.publish(&manifest, &built.extras)?;
     // With views left to do the sums stay: the next encode goes on from them.
-    match settings.keep_sums || done.len() + n_failed < views.len() {
+    match settings.keep_views || done.len() + n_failed < views.len() {
         true => job.keep_published()?,
         false => job.finish()?,
     }

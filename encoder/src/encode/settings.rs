@@ -9,8 +9,9 @@ use slag_models::ModelDir;
 
 use super::EncodeError;
 use crate::embed::Background;
+use crate::lift::Aggregation;
 use crate::raster::WeightKind;
-use crate::segment::SamSettings;
+use crate::segment::{MaskNoise, SamSettings};
 use crate::shard::ShardSettings;
 use crate::shard::cells::CellLimits;
 
@@ -84,6 +85,12 @@ pub struct EncodeSettings {
     pub min_mask_px: u32,
     /// Which weight is summed.
     pub weights: WeightKind,
+    /// How sums become embeddings. No part of what a view leaves behind: views that are done stay so.
+    pub aggregation: Aggregation,
+    /// Errors to lay over the masks, for experiments.
+    pub mask_noise: Option<MaskNoise>,
+    /// Whether what the views left behind is kept, for another encode of the same with another aggregation.
+    pub keep_views: bool,
     /// Views worked on at a time.
     pub threads: usize,
     /// Working memory for sums and region vectors.
@@ -92,8 +99,6 @@ pub struct EncodeSettings {
     pub strict: bool,
     /// Whether an unfinished encode of other settings is dropped.
     pub restart: bool,
-    /// Whether the views' sums stay once all are published, for another encode that makes something else of them.
-    pub keep_sums: bool,
     /// How large a cell may become.
     pub cells: CellLimits,
     /// How fine shards are.

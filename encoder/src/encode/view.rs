@@ -137,7 +137,13 @@ impl ViewStages<'_> {
                 };
                 Next::Embed(crops, partition)
             }
-            Next::Embed(crops, partition) => Next::Raster(self.embed(view, &crops)?, partition),
+            Next::Embed(crops, partition) => {
+                let mut vectors = self.embed(view, &crops)?;
+                if let Some(noise) = &self.settings.mask_noise {
+                    noise.turn_vectors(&view.name, &mut vectors, self.models.dim());
+                }
+                Next::Raster(vectors, partition)
+            }
             Next::Raster(vectors, Partition { raster_view, regions, masks_of_region }) => {
                 let weights = self
                     .scene

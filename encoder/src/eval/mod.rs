@@ -6,8 +6,10 @@
 //! al. 2023): the scores are rendered, the best pixel must lie on the thing (localisation), and the pixels
 //! above the threshold are compared with its mask.
 
+mod filter;
 pub mod lerf;
 pub mod metrics;
+pub mod noise;
 #[cfg(test)]
 mod public_tests;
 pub mod scannet;
@@ -24,6 +26,8 @@ use slag_models::{EncodeError, TextEncoder};
 use crate::query::{self, QueryError};
 use crate::raster::{RasterError, RasterView, Rasterizer};
 use crate::store::StoreReader;
+use crate::superpoint::{SuperpointSettings, Superpoints};
+pub use filter::Filter;
 use metrics::{Confusion, area_under_roc, average_precision, iou_of_sets, mean};
 use slag_common::shard::Profile;
 pub use truth::{LabelledView, Thing, Truth, TruthError};
@@ -149,6 +153,9 @@ pub struct EvalReport {
     pub encoder: String,
     /// Scores of this profile's shards; the full field if absent.
     pub profile: Option<Profile>,
+    /// How superpoints answered together; absent where each Gaussian answered for itself.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub filter: Option<Filter>,
     /// Score from which something counts as found.
     pub threshold: f32,
     /// Each word.
@@ -184,6 +191,8 @@ pub struct EvalSettings {
     pub profile: Option<Profile>,
     /// Score from which something counts as found; the store's own if absent.
     pub threshold: Option<f32>,
+    /// Lets superpoints of colour and shape answer together.
+    pub filter: Option<Filter>,
 }
 
 /// Evaluates a store against labels. `scene`: the splat that was encoded, for the test views.
@@ -251,6 +260,11 @@ pub fn labelled(
         });
     }
 
+    let superpoints = settings.filter.map(|_| Superpoints::new(scene, None, &SuperpointSettings::of_looks()));
+    if let (Some(Filter::Mean), Some(superpoints)) = (settings.filter, &superpoints) {
+        scores.iter_mut().for_each(|scores| filter::average(scores, superpoints));
+    }
+
     // Gaussians of things: what retrieval is judged on. Those of the words' classes: what argmax is judged on.
     let class_of_id: BTreeMap<u16, usize> =
         classes.iter().enumerate().flat_map(|(c, (_, ids))| ids.iter().map(move |id| (*id, c))).collect();
@@ -265,12 +279,18 @@ pub fn labelled(
     let class_of = |gaussian: usize| class_of_id.get(&truth.id_of_gaussian[gaussian]).copied();
     let confusion = |n_classes: usize| {
         let mut confusion = Confusion::new(n_classes);
+        let best = |gaussian: usize| {
+            (0..n_classes)
+                .filter(|c| !scores[*c][gaussian].is_nan())
+                .max_by(|a, b| scores[*a][gaussian].total_cmp(&scores[*b][gaussian]).then(b.cmp(a)))
+        };
+        let mut answers: Vec<Option<usize>> = (0..truth.id_of_gaussian.len()).map(best).collect();
+        if let (Some(Filter::Majority), Some(superpoints)) = (settings.filter, &superpoints) {
+            filter::vote(&mut answers, superpoints);
+        }
         for (gaussian, class) in of_things.iter().filter_map(|i| Some((*i, class_of(*i)?))) {
             if class < n_classes {
-                let best = (0..n_classes)
-                    .filter(|c| !scores[*c][gaussian].is_nan())
-                    .max_by(|a, b| scores[*a][gaussian].total_cmp(&scores[*b][gaussian]).then(b.cmp(a)));
-                confusion.count(class, best);
+                confusion.count(class, answers[gaussian]);
             }
         }
         confusion
@@ -315,6 +335,7 @@ pub fn labelled(
     Ok(EvalReport {
         encoder: reader.manifest().encoder.name.clone(),
         profile: settings.profile,
+        filter: settings.filter,
         threshold,
         multi_class,
         mean_iou_at_threshold: mean(words.iter().map(|w| w.iou_at_threshold)),

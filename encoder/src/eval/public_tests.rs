@@ -16,6 +16,7 @@ use super::scannet::{Matching, Scan, ScannetReport, scannet};
 use super::*;
 use crate::embed::Background;
 use crate::encode::{self, EncodeSettings, Masks, ViewOrder};
+use crate::lift::Aggregation;
 use crate::palette::PaletteSettings;
 use crate::progress::Silent;
 use crate::raster::{CpuRasterizer, WeightKind};
@@ -99,7 +100,9 @@ impl Wall {
             memory_bytes: 1 << 28,
             strict: true,
             restart: false,
-            keep_sums: false,
+            keep_views: false,
+            aggregation: Aggregation::PAPER,
+            mask_noise: None,
             cells: CellLimits { max_gaussians: 4096, max_width: None },
             shards: ShardSettings {
                 profiles: vec![Profile::Compact],

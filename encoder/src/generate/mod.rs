@@ -26,7 +26,7 @@ use crate::raster::{Drawing, RasterView};
 use compose::{Layout, pinhole};
 use grammar::{GrammarError, Noun, SceneKind};
 use render::NOTHING;
-use solid::Random;
+pub(crate) use solid::Random;
 
 /// Size of the photos.
 const PHOTO_PX: [u32; 2] = [640, 480];

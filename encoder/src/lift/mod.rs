@@ -16,12 +16,14 @@
 //! |---|---|
 //! | [`sums`] | a view's sums in a file, ordered by cell |
 //! | [`regroup`] | the sums of all views by Gaussian, a few cells at a time |
+//! | [`refine`] | what masks count, and what neighbours add, where more than the plain average is asked for |
 //! | [`embeddings`] | each Gaussian's embedding, computed once |
 //! | [`field`] | what is kept of it: sums, total weight, length |
 
 mod embeddings;
 mod field;
 pub mod published;
+pub mod refine;
 mod regroup;
 mod sums;
 mod table;
@@ -29,6 +31,7 @@ mod table;
 mod tests;
 
 pub use field::{CellField, dot};
+pub use refine::Aggregation;
 pub use regroup::{Part, PartSums, RawGroup, SumsIndex};
 pub use sums::{GAUSSIANS_PER_SLICE, MAX_REGIONS, SumEntry, SumsError, SumsFile, ViewRegions, ViewSums};
 pub use table::RegionTable;

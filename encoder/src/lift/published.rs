@@ -9,6 +9,9 @@ use crate::store::{StoreError, StoreReader};
 /// Name of the region table among a generation's extras.
 pub const EXTRA_REGIONS: &str = "regions";
 
+/// Name of the record ([`super::Aggregation`], JSON) of how embeddings were made; absent of the plain average.
+pub const EXTRA_AGGREGATION: &str = "aggregation";
+
 /// Returns the name of a part of a cell's field among a generation's extras.
 pub fn extra_field(cell_id: u32, part: u32) -> String {
     format!("field/{cell_id}/{part}")

@@ -165,6 +165,11 @@ impl SumsIndex {
         self.parts.iter().map(|part| part.n_entries).sum()
     }
 
+    /// Returns the first region of each view, in the order of their names.
+    pub fn first_regions(&self) -> Vec<u32> {
+        self.views.iter().map(|view| view.first_region).collect()
+    }
+
     /// Returns the number of views without any mask.
     pub fn n_views_without_masks(&self) -> usize {
         self.n_views_without_masks

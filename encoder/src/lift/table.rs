@@ -2,6 +2,10 @@
 //!
 //! `V_r`, the sum of a region's mask vectors, is never kept: there are several regions a mask, and a
 //! few additions bring it back, so a scene's table is as large as its mask vectors.
+//!
+//! In a plain average every mask counts once. [`RegionTable::set_mask_weights`] lets a mask count for more or
+//! less, `V_r = Σ_j m_j e_j` and `n_r = Σ_j m_j`, and [`RegionTable::append_mixture`] adds regions that no view
+//! has: any mixture of masks, of which a Gaussian's row takes a part as of any region.
 
 use std::io::{self, Write};
 use std::ops::Range;
@@ -23,12 +27,14 @@ pub struct RegionTable {
     starts: Vec<u64>,
     /// Masks of each region, numbered over the whole scene.
     masks: Vec<u32>,
+    /// How much each of these counts; empty where all count 1.
+    shares: Vec<f32>,
 }
 
 impl RegionTable {
     /// A table without regions, for vectors of `dim` components.
     pub fn new(dim: usize) -> Self {
-        Self { dim, mask_vectors: Vec::new(), starts: vec![0], masks: Vec::new() }
+        Self { dim, mask_vectors: Vec::new(), starts: vec![0], masks: Vec::new(), shares: Vec::new() }
     }
 
     /// Returns the components of a vector.
@@ -53,7 +59,8 @@ impl RegionTable {
 
     /// Returns the bytes that the table takes in memory.
     pub fn len_bytes(&self) -> u64 {
-        (size_of_val(&*self.mask_vectors) + size_of_val(&*self.starts) + size_of_val(&*self.masks)) as u64
+        let numbers = size_of_val(&*self.starts) + size_of_val(&*self.masks) + size_of_val(&*self.shares);
+        (size_of_val(&*self.mask_vectors) + numbers) as u64
     }
 
     /// Appends a view's regions and returns the number of the first; `mask_vectors` is `[n][dim]`,
@@ -71,7 +78,24 @@ impl RegionTable {
             self.masks.extend(masks.iter().map(|mask| mask + first_mask));
             self.starts.push(self.masks.len() as u64);
         }
+        if !self.shares.is_empty() {
+            self.shares.resize(self.masks.len(), 1.0);
+        }
         first
+    }
+
+    /// Lets each mask count `weights[mask]` times (finite, not negative; `[n_masks]`) wherever it lies.
+    pub fn set_mask_weights(&mut self, weights: &[f32]) {
+        self.shares = self.masks.iter().map(|mask| weights[*mask as usize]).collect();
+    }
+
+    /// Appends a region that is a mixture of masks, `(mask, how much it counts)`, and returns its number.
+    pub fn append_mixture(&mut self, mixture: &[(u32, f32)]) -> u32 {
+        self.shares.resize(self.masks.len(), 1.0);
+        self.masks.extend(mixture.iter().map(|(mask, _)| mask));
+        self.shares.extend(mixture.iter().map(|(_, share)| share));
+        self.starts.push(self.masks.len() as u64);
+        self.len() as u32 - 1
     }
 
     /// Returns the masks' vectors, one a row.
@@ -79,23 +103,32 @@ impl RegionTable {
         Rows::all(&self.mask_vectors, self.dim)
     }
 
-    /// Returns the masks of a region.
-    fn masks_of(&self, region: usize) -> &[u32] {
-        &self.masks[self.starts[region] as usize..self.starts[region + 1] as usize]
+    fn listed(&self, region: usize) -> Range<usize> {
+        self.starts[region] as usize..self.starts[region + 1] as usize
     }
 
-    /// Returns how many masks cover each region of a view.
+    /// Returns the masks of a region, and how much each counts.
+    #[inline(always)]
+    pub fn masks_of(&self, region: usize) -> impl Iterator<Item = (u32, f32)> + '_ {
+        let listed = self.listed(region);
+        let shares = self.shares.get(listed.clone()).unwrap_or(&[]);
+        let share = move |i: usize| shares.get(i).copied().unwrap_or(1.0);
+        self.masks[listed].iter().enumerate().map(move |(i, mask)| (*mask, share(i)))
+    }
+
+    /// Returns how often masks count in each region of a view: how many cover it, if all count once.
     pub(super) fn mask_counts(&self, regions: Range<usize>) -> Vec<f32> {
-        regions.map(|region| self.masks_of(region).len() as f32).collect()
+        regions.map(|region| self.masks_of(region).map(|(_, share)| share).sum()).collect()
     }
 
     /// Writes components `from..from + out.len()` of `V_r`; inlined to be compiled for its caller's vectors.
     #[inline(always)]
     pub(super) fn components(&self, region: usize, from: usize, out: &mut [f32]) {
         out.fill(0.0);
-        for mask in self.masks_of(region) {
-            let vector = &self.mask_vectors[*mask as usize * self.dim + from..][..out.len()];
-            out.iter_mut().zip(vector).for_each(|(sum, v)| *sum += v);
+        let vector = |mask: u32| &self.mask_vectors[mask as usize * self.dim + from..];
+        for (mask, share) in self.masks_of(region) {
+            // Products are rounded before they are added, and 1 times a number is the number.
+            out.iter_mut().zip(vector(mask)).for_each(|(sum, v)| *sum += share * v);
         }
     }
 
@@ -103,7 +136,7 @@ impl RegionTable {
     pub fn scores(&self, query: &[f32]) -> Vec<f32> {
         let of_masks: Vec<f32> =
             self.mask_vectors.par_chunks_exact(self.dim).map(|vector| super::dot(vector, query)).collect();
-        let score = |region| self.masks_of(region).iter().map(|mask| of_masks[*mask as usize]).sum();
+        let score = |region| self.masks_of(region).map(|(mask, share)| share * of_masks[mask as usize]).sum();
         (0..self.len()).into_par_iter().map(score).collect()
     }
 
@@ -113,12 +146,15 @@ impl RegionTable {
     /// Whatever the writer gives.
     pub fn write(&self, out: impl Write) -> io::Result<()> {
         let header = [self.dim, self.len(), self.n_masks(), self.masks.len()].map(|n| n as u64);
-        let sections = [
+        let mut sections = vec![
             (1, container::bytes_of(&header)),
             (2, container::bytes_of(&self.mask_vectors)),
             (3, container::bytes_of(&self.starts)),
             (4, container::bytes_of(&self.masks)),
         ];
+        if !self.shares.is_empty() {
+            sections.push((5, container::bytes_of(&self.shares)));
+        }
         container::write(out, MAGIC, VERSION, &sections)
     }
 
@@ -138,14 +174,20 @@ impl RegionTable {
             mask_vectors: bytemuck::pod_collect_to_vec(&bytes[vectors]),
             starts: bytemuck::pod_collect_to_vec(&bytes[starts]),
             masks: bytemuck::pod_collect_to_vec(&bytes[masks]),
+            shares: match layout.find(5) {
+                Some(_) => bytemuck::pod_collect_to_vec(&bytes[layout.column::<f32>(5, "shares", n_listed)?]),
+                None => Vec::new(),
+            },
         };
         let consistent = dim > 0
             && super::are_starts(&table.starts, n_listed)
-            && table.masks.iter().all(|mask| (*mask as usize) < n_masks);
+            && table.masks.iter().all(|mask| (*mask as usize) < n_masks)
+            && table.shares.iter().all(|share| share.is_finite() && *share >= 0.0);
         if consistent {
             return Ok(table);
         }
-        let what = "regions refer to masks that are not there".into();
+        let what =
+            "regions refer to masks that are not there, or masks count no finite number of times".into();
         Err(ContainerError::Damaged { offset_bytes: 0, what })
     }
 }

@@ -212,6 +212,18 @@ impl Frame {
     }
 }
 
+/// Returns the coordinates `[vectors][n]` of vectors along their `n` principal axes through the origin: their
+/// scalar products are those of the vectors, less what lies across the axes (zeros, where there are fewer).
+pub fn principal_coordinates(vectors: Rows<'_>, n: usize) -> Vec<f32> {
+    let dim = vectors.width;
+    let (mean, mut moments) = moments_of(vectors);
+    for (i, row) in moments.chunks_exact_mut(dim).enumerate() {
+        row.iter_mut().zip(&mean).for_each(|(m, v)| *m += (mean[i].to_f64() * v.to_f64()) as f32);
+    }
+    let (_, axes) = leading_eigenvectors(&moments, dim, (n + EXTRA_VECTORS).min(dim));
+    Panels::new(dim, n, |i, c| if c < dim { axes[c * dim + i] as f32 } else { 0.0 }).product(vectors)
+}
+
 /// Returns mean (rounded as stored) and covariance `[dim][dim]` of an even sample of vectors.
 fn moments_of(vectors: Rows<'_>) -> (Vec<f16>, Vec<f32>) {
     let (n, dim) = (vectors.len(), vectors.width);

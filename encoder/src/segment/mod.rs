@@ -2,6 +2,7 @@
 
 mod given;
 mod graph;
+mod noise;
 mod regions;
 mod rle;
 mod sam;
@@ -17,6 +18,7 @@ use crate::ingest::{LoadedImage, Undistorter};
 
 pub use given::GivenMasks;
 pub use graph::{GraphSegmenter, GraphSettings};
+pub use noise::{MaskNoise, NoisyMasks};
 pub use regions::partition;
 pub use rle::{Rle, RleError};
 pub use sam::{SamSegmenter, SamSettings};

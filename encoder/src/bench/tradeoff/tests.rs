@@ -137,7 +137,7 @@ esac
     let called = fs_err::read_to_string(&calls).expect("was called");
     assert_eq!(called.lines().count(), 4, "{called}");
     assert!(called.lines().all(|line| line.contains("--models m")), "{called}");
-    assert!(called.contains("--keep-sums") && called.contains("--compact-error 0.3"), "{called}");
+    assert!(called.contains("--keep-views") && called.contains("--compact-error 0.3"), "{called}");
     let again = run(&settings, &programs, &Silent).expect("runs");
     assert_eq!(again.figures, report.figures);
     assert_eq!(fs_err::read_to_string(&calls).expect("was called"), called, "nothing is measured twice");

@@ -1,0 +1,70 @@
+//! Flags of how sums become embeddings.
+
+use clap::Args;
+
+use crate::lift::Aggregation;
+use crate::segment::MaskNoise;
+
+/// What is done beyond the preset's way to aggregate.
+#[derive(Clone, Debug, Default, Args)]
+pub struct RefineArgs {
+    /// Leaves out sums below this part of a Gaussian's largest in the same view; the preset's if absent.
+    #[arg(long, value_name = "SHARE", value_parser = share)]
+    min_region_share: Option<f32>,
+    /// Leaves out views in which a Gaussian has less than this part of its weight in the best.
+    #[arg(long, value_name = "SHARE", value_parser = share)]
+    min_view_share: Option<f32>,
+    /// Gaussians with less weight over all views, pixels, have no evidence.
+    #[arg(long, value_name = "PX", value_parser = amount)]
+    min_weight: Option<f32>,
+    /// A mask counts its agreement with other views to this power; 0: all count alike.
+    #[arg(long, value_name = "POWER", value_parser = amount)]
+    agreement: Option<f32>,
+    /// Steps from the mean of a Gaussian's views to their median.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=100))]
+    median_steps: Option<u32>,
+    /// What a superpoint's mean counts beside a Gaussian's own, which counts 1.
+    #[arg(long, value_name = "TIMES", value_parser = amount)]
+    superpoint: Option<f32>,
+    /// Whether Gaussians without evidence take their superpoint's.
+    #[arg(long, value_name = "BOOL")]
+    fill: Option<bool>,
+    /// Lays errors over the masks, for experiments: 0 (none) to 3.
+    #[arg(long, value_name = "LEVEL", hide = true, value_parser = clap::value_parser!(u8).range(0..=3))]
+    mask_noise: Option<u8>,
+    /// Which errors.
+    #[arg(long, value_name = "N", hide = true, default_value_t = 1)]
+    noise_seed: u64,
+    /// Keeps what the views left behind, so that another encode of the same, with another palette say, is quick.
+    #[arg(long)]
+    pub keep_views: bool,
+}
+
+impl RefineArgs {
+    /// Returns the preset's way with these flags' changes.
+    pub fn aggregation(&self, preset: Aggregation) -> Aggregation {
+        Aggregation {
+            min_region_share: self.min_region_share.unwrap_or(preset.min_region_share),
+            min_view_share: self.min_view_share.unwrap_or(preset.min_view_share),
+            min_weight_px: self.min_weight.unwrap_or(preset.min_weight_px),
+            agreement: self.agreement.unwrap_or(preset.agreement),
+            median_steps: self.median_steps.unwrap_or(preset.median_steps),
+            superpoint: self.superpoint.unwrap_or(preset.superpoint),
+            fill: self.fill.unwrap_or(preset.fill),
+        }
+    }
+
+    /// Returns the errors to lay over masks.
+    pub fn mask_noise(&self) -> Option<MaskNoise> {
+        self.mask_noise.map(|level| MaskNoise { level, seed: self.noise_seed })
+    }
+}
+
+fn share(text: &str) -> Result<f32, String> {
+    amount(text).and_then(|x| if x <= 1.0 { Ok(x) } else { Err(format!("{x} is not in 0..=1")) })
+}
+
+fn amount(text: &str) -> Result<f32, String> {
+    let value: f32 = text.parse().map_err(|_| format!("{text:?} is no number"))?;
+    if (0.0..=1000.0).contains(&value) { Ok(value) } else { Err(format!("{value} is not in 0..=1000")) }
+}

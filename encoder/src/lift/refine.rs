@@ -1,0 +1,578 @@
+//! What may be done better than the paper's plain average; each part on its own, nothing by default.
+//!
+//! | field of [`Aggregation`] | what it changes |
+//! |---|---|
+//! | `min_region_share`, `min_view_share` | sums of a region at whose edge a Gaussian lies, of views that hardly see it, are left out |
+//! | `min_weight_px` | a Gaussian that hardly shows anywhere has no evidence |
+//! | `agreement` | a mask counts as far as it agrees with what other views say of its Gaussians |
+//! | `median_steps` | views that disagree count less: steps towards the geometric median |
+//! | `superpoint` | a Gaussian's row takes a part of its superpoint's |
+//! | `fill` | a Gaussian without evidence takes its superpoint's row |
+//!
+//! The result is again sparse sums over regions: masks that count for less are in the [`RegionTable`], and a
+//! superpoint is one more region of it, a mixture of masks. So scores, shards and what is published agree, and a
+//! row has one entry more at most.
+//!
+//! Everything here is decided among the vectors' coordinates along a few principal axes, and in one order: the
+//! results do not depend on threads or on the memory budget.
+
+use std::ops::Range;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use slag_common::Gaussians;
+
+use super::field::{MIN_MEAN_LENGTH, dot};
+use super::regroup::{PartSums, SumsIndex};
+use super::sums::SumsError;
+use super::table::RegionTable;
+use crate::palette::frame::principal_coordinates;
+use crate::shard::cells::CellSplit;
+use crate::superpoint::{NO_SUPERPOINT, Sketches, SuperpointSettings, Superpoints};
+
+/// Principal axes: nine tenths of the squares of mask vectors of 512 components (measured).
+const AXES: usize = 48;
+/// Gaussians worked on at a time by a thread; a constant, because sums are taken chunk by chunk.
+const CHUNK: usize = 4096;
+/// What a mask with which no other view agrees still counts: its Gaussians keep their evidence.
+const LEAST_MASK_WEIGHT: f32 = 0.01;
+/// Distance on the unit sphere below which the median's steps no longer tell views apart.
+const MEDIAN_RESOLUTION: f32 = 0.1;
+/// Masks of a superpoint's mixture at most, the heaviest: some hundred views of a few masks each.
+const MIXTURE_MASKS: usize = 256;
+/// Evidence that a filled Gaussian states, pixels: next to nothing.
+const FILLED_WEIGHT_PX: f32 = 1e-3;
+/// What is left of a Gaussian's sum without a view must be this part of it to say anything of the view.
+const LEAST_REST: f32 = 1e-3;
+
+/// How the sums of all views become embeddings. The default is the paper's plain average.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Aggregation {
+    /// Sums below this part of the Gaussian's largest in the same view are left out, 0..=1.
+    pub min_region_share: f32,
+    /// Views in which a Gaussian has less than this part of the weight that it has in its best are left out, 0..=1.
+    pub min_view_share: f32,
+    /// Gaussians with less weight over all views have no evidence, pixels.
+    pub min_weight_px: f32,
+    /// A mask counts its mean cosine with its Gaussians' embeddings from other views to this power; 0: once.
+    pub agreement: f32,
+    /// Steps (Weiszfeld 1937) from the mean of a Gaussian's views to their geometric median.
+    pub median_steps: u32,
+    /// What a superpoint's mean counts beside the Gaussian's own, which counts 1.
+    pub superpoint: f32,
+    /// Whether Gaussians without evidence take their superpoint's mean.
+    pub fill: bool,
+}
+
+impl Aggregation {
+    /// The paper's plain average.
+    pub const PAPER: Self = Self {
+        min_region_share: 0.0,
+        min_view_share: 0.0,
+        min_weight_px: 0.0,
+        agreement: 0.0,
+        median_steps: 0,
+        superpoint: 0.0,
+        fill: false,
+    };
+    /// Everything that was measured to help.
+    pub const REFINED: Self = Self {
+        min_region_share: 0.5,
+        min_view_share: 0.1,
+        agreement: 1.0,
+        superpoint: 3.0,
+        fill: true,
+        ..Self::PAPER
+    };
+
+    /// Returns the plain average, each option alone, and those that are used together: what tables compare.
+    pub fn methods() -> Vec<(&'static str, Self)> {
+        let (paper, refined) = (Self::PAPER, Self::REFINED);
+        vec![
+            ("paper", paper),
+            (
+                "pruning",
+                Self {
+                    min_region_share: refined.min_region_share,
+                    min_view_share: refined.min_view_share,
+                    ..paper
+                },
+            ),
+            ("gate", Self { min_weight_px: 1.0, ..paper }),
+            ("agreement", Self { agreement: refined.agreement, ..paper }),
+            ("median", Self { median_steps: 3, ..paper }),
+            ("superpoints", Self { superpoint: refined.superpoint, ..paper }),
+            ("fill", Self { fill: true, ..paper }),
+            ("refined", refined),
+        ]
+    }
+
+    fn needs_superpoints(&self) -> bool {
+        self.superpoint > 0.0 || self.fill
+    }
+}
+
+/// A vector's coordinates along the principal axes.
+type Point = [f32; AXES];
+
+/// A scene's superpoints as regions.
+struct Mixtures {
+    of_gaussian: Vec<u32>,
+    /// Of each superpoint: its region, and the length of its vector; absent without evidence.
+    regions: Vec<Option<(u32, f32)>>,
+}
+
+/// What the views of a scene decide together, and how a part's sums are changed by it.
+pub struct Refinement {
+    settings: Aggregation,
+    /// First region of each view.
+    first_regions: Vec<u32>,
+    /// `[n_regions]`: how often masks count in each.
+    mask_counts: Vec<f32>,
+    /// `[n_regions]`: each region's vector; empty where none is needed.
+    points: Vec<Point>,
+    mixtures: Option<Mixtures>,
+}
+
+/// A Gaussian's entries of one view, and their weight.
+struct ViewEntries {
+    entries: Range<usize>,
+    weight: f32,
+}
+
+impl Refinement {
+    /// Reads all sums as often as is needed and decides what masks count and what superpoints say; adds both to
+    /// the table. `None` if cancelled, and where the plain average is asked for.
+    ///
+    /// # Errors
+    /// [`SumsError`].
+    pub fn prepare(
+        settings: Aggregation,
+        (index, table): (&SumsIndex, &mut RegionTable),
+        (scene, split): (&Gaussians, &CellSplit),
+        group_bytes: u64,
+        cancel: &AtomicBool,
+    ) -> Result<Option<Self>, SumsError> {
+        if settings == Aggregation::PAPER {
+            return Ok(None);
+        }
+        let first_regions = index.first_regions();
+        let mut refinement =
+            Self { settings, first_regions, mask_counts: Vec::new(), points: Vec::new(), mixtures: None };
+        refinement.mask_counts = table.mask_counts(0..table.len());
+        let is_plain =
+            settings.agreement == 0.0 && settings.median_steps == 0 && !settings.needs_superpoints();
+        if is_plain || table.is_empty() {
+            return Ok(Some(refinement));
+        }
+        let mask_points = principal_coordinates(table.mask_vectors(), AXES);
+        let mask_points: &[Point] = mask_points.as_chunks().0;
+        refinement.points = region_points(table, mask_points);
+        let each_part = |table: &RegionTable, visit: &mut dyn FnMut(PartSums)| -> Result<bool, SumsError> {
+            for group in index.groups(group_bytes) {
+                let sums = index.regroup(&index.read(group)?, table)?;
+                if cancel.load(Ordering::Relaxed) {
+                    return Ok(false);
+                }
+                sums.into_iter().for_each(&mut *visit);
+            }
+            Ok(true)
+        };
+        if settings.agreement > 0.0 {
+            let mut votes = vec![Vote::default(); table.len()];
+            let done = each_part(table, &mut |mut sums| {
+                refinement.prune(&mut sums);
+                refinement.add_votes(&sums, &mut votes);
+            })?;
+            if !done {
+                return Ok(None);
+            }
+            table.set_mask_weights(&mask_weights(table, mask_points, &votes, settings.agreement));
+            refinement.mask_counts = table.mask_counts(0..table.len());
+            refinement.points = region_points(table, mask_points);
+        }
+        if settings.needs_superpoints() {
+            let mut sketches = vec![0; scene.len() * AXES];
+            let done = each_part(table, &mut |mut sums| {
+                refinement.change_rows(&mut sums);
+                let gaussians = &split.cells[sums.part.cell_id as usize].gaussians[sums.part.locals.clone()];
+                refinement.sketch(&sums, gaussians, &mut sketches);
+            })?;
+            if !done {
+                return Ok(None);
+            }
+            let sketches = Sketches { width: AXES, values: &sketches };
+            let superpoints = Superpoints::new(scene, Some(sketches), &SuperpointSettings::default());
+            let mut regions_of = vec![Vec::new(); superpoints.n];
+            let done = each_part(table, &mut |mut sums| {
+                refinement.change_rows(&mut sums);
+                let gaussians = &split.cells[sums.part.cell_id as usize].gaussians[sums.part.locals.clone()];
+                add_rows(&sums, gaussians, &superpoints, &mut regions_of);
+            })?;
+            if !done {
+                return Ok(None);
+            }
+            refinement.mixtures = Some(Mixtures::new(superpoints, regions_of, table, mask_points));
+        }
+        Ok(Some(refinement))
+    }
+
+    /// Returns the bytes that are taken beside the table and the sums, at most, of `n_gaussians` and `n_regions`.
+    pub fn len_bytes(settings: &Aggregation, n_gaussians: usize, n_regions: usize) -> u64 {
+        if *settings == Aggregation::PAPER {
+            return 0;
+        }
+        let of_regions = n_regions * (size_of::<Point>() + size_of::<Vote>());
+        let of_superpoints = match settings.needs_superpoints() {
+            false => 0,
+            true => {
+                let working = Superpoints::working_bytes(n_gaussians, &SuperpointSettings::default());
+                (n_gaussians * AXES) as u64 + working
+            }
+        };
+        of_regions as u64 + of_superpoints
+    }
+
+    /// Changes a part's sums; `gaussians`: the scene's numbers of its Gaussians.
+    pub fn apply(&self, sums: &mut PartSums, gaussians: &[u32]) {
+        self.change_rows(sums);
+        if let Some(mixtures) = &self.mixtures {
+            self.mix(sums, gaussians, mixtures);
+        }
+    }
+
+    /// All but the superpoints.
+    fn change_rows(&self, sums: &mut PartSums) {
+        self.prune(sums);
+        if self.settings.median_steps > 0 {
+            self.move_to_median(sums);
+        }
+    }
+
+    /// Cuts a row of entries, ascending by region, into its views.
+    fn views_of(&self, sums: &PartSums, row: Range<usize>) -> Vec<ViewEntries> {
+        let mut views: Vec<ViewEntries> = Vec::new();
+        let mut end_region = 0;
+        for entry in row {
+            let region = sums.regions[entry];
+            if views.is_empty() || region >= end_region {
+                let next = self.first_regions.partition_point(|first| *first <= region);
+                end_region = self.first_regions.get(next).copied().unwrap_or(u32::MAX);
+                views.push(ViewEntries { entries: entry..entry, weight: 0.0 });
+            }
+            if let Some(view) = views.last_mut() {
+                view.entries.end = entry + 1;
+                view.weight += sums.weights[entry];
+            }
+        }
+        views
+    }
+
+    /// Drops entries that say little of their Gaussian.
+    fn prune(&self, sums: &mut PartSums) {
+        let Aggregation { min_region_share, min_view_share, min_weight_px, .. } = self.settings;
+        if min_region_share <= 0.0 && min_view_share <= 0.0 && min_weight_px <= 0.0 {
+            return;
+        }
+        let n = sums.total_weights.len();
+        let kept_of_chunk = |first: usize| -> Vec<Vec<u32>> {
+            let weights = &sums.weights;
+            let kept_of = |k: usize| {
+                let row = sums.starts[k] as usize..sums.starts[k + 1] as usize;
+                let views = self.views_of(sums, row);
+                let best = views.iter().map(|view| view.weight).fold(0.0, f32::max);
+                if views.iter().map(|view| view.weight).sum::<f32>() < min_weight_px {
+                    return Vec::new();
+                }
+                let seen = views.into_iter().filter(|view| view.weight >= min_view_share * best);
+                seen.flat_map(|view| {
+                    let largest = weights[view.entries.clone()].iter().copied().fold(0.0, f32::max);
+                    let large = move |entry: &usize| weights[*entry] >= min_region_share * largest;
+                    view.entries.filter(large).map(|entry| entry as u32)
+                })
+                .collect()
+            };
+            (first..(first + CHUNK).min(n)).map(kept_of).collect()
+        };
+        let firsts: Vec<usize> = (0..n).step_by(CHUNK).collect();
+        let kept: Vec<Vec<u32>> = firsts.into_par_iter().flat_map_iter(kept_of_chunk).collect();
+        let mut at = 0;
+        for (k, kept) in kept.into_iter().enumerate() {
+            let mut total = 0.0;
+            for entry in kept {
+                let entry = entry as usize;
+                (sums.regions[at], sums.weights[at]) = (sums.regions[entry], sums.weights[entry]);
+                total += f64::from(sums.weights[at]) * f64::from(self.mask_counts[sums.regions[at] as usize]);
+                at += 1;
+            }
+            sums.starts[k + 1] = at as u64;
+            sums.total_weights[k] = total as f32;
+        }
+        sums.regions.truncate(at);
+        sums.weights.truncate(at);
+    }
+
+    fn sum_of(&self, sums: &PartSums, entries: Range<usize>) -> Point {
+        let mut sum = [0.0; AXES];
+        for (region, weight) in sums.regions[entries.clone()].iter().zip(&sums.weights[entries]) {
+            add(&mut sum, *weight, &self.points[*region as usize]);
+        }
+        sum
+    }
+
+    /// Adds, to each region, the directions in which other views see its Gaussians.
+    fn add_votes(&self, sums: &PartSums, votes: &mut [Vote]) {
+        let n = sums.total_weights.len();
+        let of_chunk = |first: usize| -> Vec<(u32, Vote)> {
+            let gaussians = first..(first + CHUNK).min(n);
+            let entries = sums.starts[gaussians.start] as usize..sums.starts[gaussians.end] as usize;
+            let mut regions: Vec<u32> = sums.regions[entries].to_vec();
+            regions.sort_unstable();
+            regions.dedup();
+            let mut votes = vec![Vote::default(); regions.len()];
+            for k in gaussians {
+                let row = sums.starts[k] as usize..sums.starts[k + 1] as usize;
+                let whole = self.sum_of(sums, row.clone());
+                let least = LEAST_REST * length(&whole);
+                for view in self.views_of(sums, row) {
+                    let mut rest = whole;
+                    add(&mut rest, -1.0, &self.sum_of(sums, view.entries.clone()));
+                    let of_rest = length(&rest);
+                    if of_rest.is_nan() || of_rest <= least {
+                        continue;
+                    }
+                    for entry in view.entries {
+                        let weight = sums.weights[entry];
+                        if let Ok(at) = regions.binary_search(&sums.regions[entry]) {
+                            add(&mut votes[at].direction, weight / of_rest, &rest);
+                            votes[at].weight += weight;
+                        }
+                    }
+                }
+            }
+            regions.into_iter().zip(votes).collect()
+        };
+        let firsts: Vec<usize> = (0..n).step_by(CHUNK).collect();
+        let of_chunks: Vec<Vec<(u32, Vote)>> = firsts.into_par_iter().map(of_chunk).collect();
+        for (region, vote) in of_chunks.into_iter().flatten() {
+            let sum = &mut votes[region as usize];
+            add(&mut sum.direction, 1.0, &vote.direction);
+            sum.weight += vote.weight;
+        }
+    }
+
+    /// Scales the entries of views by what Weiszfeld's steps give them; the evidence stays what it was.
+    fn move_to_median(&self, sums: &mut PartSums) {
+        let n = sums.total_weights.len();
+        let factors_of = |k: usize| -> Vec<(Range<usize>, f32)> {
+            let row = sums.starts[k] as usize..sums.starts[k + 1] as usize;
+            let views = self.views_of(sums, row);
+            let mut of_views: Vec<Point> =
+                views.iter().map(|view| self.sum_of(sums, view.entries.clone())).collect();
+            let weights: Vec<f32> = of_views.iter().map(length).collect();
+            of_views.iter_mut().for_each(make_unit);
+            let mut factors = vec![1.0; views.len()];
+            for _ in 0..self.settings.median_steps {
+                let mut median = [0.0; AXES];
+                for ((point, weight), factor) in of_views.iter().zip(&weights).zip(&factors) {
+                    add(&mut median, weight * factor, point);
+                }
+                make_unit(&mut median);
+                for (factor, point) in factors.iter_mut().zip(&of_views) {
+                    let distance = (2.0 - 2.0 * dot(point, &median)).max(0.0).sqrt();
+                    *factor = MEDIAN_RESOLUTION / distance.max(MEDIAN_RESOLUTION);
+                }
+            }
+            views.into_iter().map(|view| view.entries).zip(factors).collect()
+        };
+        let factors: Vec<Vec<(Range<usize>, f32)>> = (0..n).into_par_iter().map(factors_of).collect();
+        for (entries, factor) in factors.into_iter().flatten() {
+            sums.weights[entries].iter_mut().for_each(|weight| *weight *= factor);
+        }
+    }
+
+    /// Writes each Gaussian's direction, rounded; zeros where there is no evidence.
+    fn sketch(&self, sums: &PartSums, gaussians: &[u32], sketches: &mut [i8]) {
+        let sketch_of = |k: usize| -> [i8; AXES] {
+            let mut sum = self.sum_of(sums, sums.starts[k] as usize..sums.starts[k + 1] as usize);
+            make_unit(&mut sum);
+            sum.map(|c| (127.0 * c).round() as i8)
+        };
+        let of_part: Vec<[i8; AXES]> = (0..gaussians.len()).into_par_iter().map(sketch_of).collect();
+        for (gaussian, sketch) in gaussians.iter().zip(of_part) {
+            sketches[*gaussian as usize * AXES..][..AXES].copy_from_slice(&sketch);
+        }
+    }
+
+    /// Adds each Gaussian's superpoint to its row.
+    fn mix(&self, sums: &mut PartSums, gaussians: &[u32], mixtures: &Mixtures) {
+        let share = self.settings.superpoint / (1.0 + self.settings.superpoint);
+        let entry_of = |k: usize| -> Option<(u32, f32)> {
+            let superpoint = mixtures.of_gaussian[gaussians[k] as usize];
+            let (region, of_mixture) = (*mixtures.regions.get(superpoint as usize)?)?;
+            let own = length(&self.sum_of(sums, sums.starts[k] as usize..sums.starts[k + 1] as usize));
+            if sums.total_weights[k] > 0.0 && own > MIN_MEAN_LENGTH * sums.total_weights[k] {
+                (share > 0.0).then_some((region, share * own / of_mixture))
+            } else {
+                self.settings.fill.then_some((region, FILLED_WEIGHT_PX))
+            }
+        };
+        let added: Vec<Option<(u32, f32)>> = (0..gaussians.len()).into_par_iter().map(entry_of).collect();
+        let n_entries = sums.regions.len() + added.iter().flatten().count();
+        let (mut regions, mut weights) = (Vec::with_capacity(n_entries), Vec::with_capacity(n_entries));
+        let mut start = 0;
+        for (k, added) in added.into_iter().enumerate() {
+            let row = start..sums.starts[k + 1] as usize;
+            start = row.end;
+            match added {
+                Some((region, weight)) if weight == FILLED_WEIGHT_PX => {
+                    regions.push(region);
+                    weights.push(weight);
+                    sums.total_weights[k] = weight;
+                }
+                added => {
+                    let kept = if added.is_some() { 1.0 - share } else { 1.0 };
+                    regions.extend(&sums.regions[row.clone()]);
+                    weights.extend(sums.weights[row].iter().map(|weight| weight * kept));
+                    if let Some((region, weight)) = added {
+                        regions.push(region);
+                        weights.push(weight);
+                    }
+                }
+            }
+            sums.starts[k + 1] = regions.len() as u64;
+        }
+        (sums.regions, sums.weights) = (regions, weights);
+    }
+}
+
+/// What other views say of a region's Gaussians.
+#[derive(Clone, Copy)]
+struct Vote {
+    /// Sum of directions, by weight.
+    direction: Point,
+    weight: f32,
+}
+
+impl Default for Vote {
+    fn default() -> Self {
+        Self { direction: [0.0; AXES], weight: 0.0 }
+    }
+}
+
+/// Returns the mean cosine of each mask with what other views say of its Gaussians, to a power; the median where
+/// no other view says anything.
+fn mask_weights(table: &RegionTable, mask_points: &[Point], votes: &[Vote], power: f32) -> Vec<f32> {
+    let mut of_masks = vec![Vote::default(); mask_points.len()];
+    for (region, vote) in votes.iter().enumerate() {
+        for (mask, _) in table.masks_of(region) {
+            let sum = &mut of_masks[mask as usize];
+            add(&mut sum.direction, 1.0, &vote.direction);
+            sum.weight += vote.weight;
+        }
+    }
+    let cosine = |(vote, point): (&Vote, &Point)| {
+        (vote.weight > 0.0).then(|| dot(&vote.direction, point) / vote.weight)
+    };
+    let cosines: Vec<Option<f32>> = of_masks.iter().zip(mask_points).map(cosine).collect();
+    let mut known: Vec<f32> = cosines.iter().flatten().copied().collect();
+    known.sort_by(f32::total_cmp);
+    let median = known.get(known.len() / 2).copied().unwrap_or(1.0);
+    let weight = |cosine: &Option<f32>| cosine.unwrap_or(median).max(LEAST_MASK_WEIGHT).powf(power);
+    cosines.iter().map(weight).collect()
+}
+
+fn region_points(table: &RegionTable, mask_points: &[Point]) -> Vec<Point> {
+    let point = |region: usize| {
+        let mut sum = [0.0; AXES];
+        table.masks_of(region).for_each(|(mask, share)| add(&mut sum, share, &mask_points[mask as usize]));
+        sum
+    };
+    (0..table.len()).into_par_iter().map(point).collect()
+}
+
+/// Adds the rows of a part's Gaussians to their superpoints' `(region, weight)`.
+fn add_rows(
+    sums: &PartSums,
+    gaussians: &[u32],
+    superpoints: &Superpoints,
+    regions_of: &mut [Vec<(u32, f32)>],
+) {
+    let superpoint_of = |k: u32| superpoints.of_gaussian[gaussians[k as usize] as usize];
+    let mut members: Vec<u32> =
+        (0..gaussians.len() as u32).filter(|k| superpoint_of(*k) != NO_SUPERPOINT).collect();
+    members.sort_by_key(|k| superpoint_of(*k));
+    let of_superpoint = |members: &[u32]| -> (usize, Vec<(u32, f32)>) {
+        let mut entries = Vec::new();
+        for k in members {
+            let row = sums.starts[*k as usize] as usize..sums.starts[*k as usize + 1] as usize;
+            entries.extend(sums.regions[row.clone()].iter().copied().zip(sums.weights[row].iter().copied()));
+        }
+        (superpoint_of(members[0]) as usize, added_up(entries))
+    };
+    let runs: Vec<&[u32]> = members.chunk_by(|a, b| superpoint_of(*a) == superpoint_of(*b)).collect();
+    let of_part: Vec<(usize, Vec<(u32, f32)>)> = runs.into_par_iter().map(of_superpoint).collect();
+    of_part.into_iter().for_each(|(superpoint, entries)| regions_of[superpoint].extend(entries));
+}
+
+/// Returns the sum of the values of each key, ascending by key.
+fn added_up(mut entries: Vec<(u32, f32)>) -> Vec<(u32, f32)> {
+    // Stable: values are added in the order in which they came.
+    entries.sort_by_key(|(key, _)| *key);
+    let sum = |run: &[(u32, f32)]| (run[0].0, run.iter().map(|(_, v)| f64::from(*v)).sum::<f64>() as f32);
+    entries.chunk_by(|a, b| a.0 == b.0).map(sum).collect()
+}
+
+impl Mixtures {
+    /// Makes a region of each superpoint with evidence.
+    fn new(
+        superpoints: Superpoints,
+        regions_of: Vec<Vec<(u32, f32)>>,
+        table: &mut RegionTable,
+        mask_points: &[Point],
+    ) -> Self {
+        let of_table = &*table;
+        let mixture = |entries: Vec<(u32, f32)>| -> Vec<(u32, f32)> {
+            let spread = |(region, weight): (u32, f32)| {
+                of_table.masks_of(region as usize).map(move |(mask, share)| (mask, weight * share))
+            };
+            let mut masks = added_up(added_up(entries).into_iter().flat_map(spread).collect());
+            masks.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+            masks.truncate(MIXTURE_MASKS);
+            masks.sort_by_key(|(mask, _)| *mask);
+            let total: f32 = masks.iter().map(|(_, share)| share).sum();
+            masks.iter_mut().for_each(|(_, share)| *share /= total);
+            masks
+        };
+        let mixtures: Vec<Vec<(u32, f32)>> = regions_of.into_par_iter().map(mixture).collect();
+        let mut region = |mixture: &Vec<(u32, f32)>| {
+            let mut sum = [0.0; AXES];
+            mixture.iter().for_each(|(mask, share)| add(&mut sum, *share, &mask_points[*mask as usize]));
+            let of_mixture = length(&sum);
+            (of_mixture > MIN_MEAN_LENGTH).then(|| (table.append_mixture(mixture), of_mixture))
+        };
+        let regions = mixtures.iter().map(&mut region).collect();
+        Self { of_gaussian: superpoints.of_gaussian, regions }
+    }
+}
+
+#[inline(always)]
+fn add(sum: &mut Point, weight: f32, point: &Point) {
+    sum.iter_mut().zip(point).for_each(|(s, p)| *s += weight * p);
+}
+
+fn length(point: &Point) -> f32 {
+    dot(point, point).sqrt()
+}
+
+fn make_unit(point: &mut Point) {
+    let length = length(point);
+    if length > 0.0 {
+        point.iter_mut().for_each(|c| *c /= length);
+    }
+}
+
+#[cfg(test)]
+mod tests;
