@@ -8,7 +8,8 @@ use slag_tests::*;
 fn encode(room: &Path, store: &Path, more: &[&str]) -> Value {
     let (scene, views) = (room.join("scene.ply"), room.join("transforms.json"));
     let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views), "--metric"]);
-    run_json(command.args(["--store", text(store), "--raster-width", "320"]).args(more))
+    command.args(["--masks", text(&room.join("gt/masks")), "--store", text(store), "--raster-width", "320"]);
+    run_json(command.args(more))
 }
 
 #[test]
@@ -53,7 +54,7 @@ fn an_encode_of_some_views_goes_on_with_more() {
 
     // Kept sums: another palette of the same views, without the views.
     let kept = dir.path().join("kept");
-    assert_eq!(counts(&encode(&room, &kept, &["--keep-sums", "--compact-error", "0.3"])), [10, 0]);
+    assert_eq!(counts(&encode(&room, &kept, &["--keep-views", "--compact-error", "0.3"])), [10, 0]);
     assert_eq!(counts(&encode(&room, &kept, &[])), [10, 10]);
     assert_eq!(content(&kept), expected);
 }

@@ -100,7 +100,7 @@ pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> 
             weights: WeightKind::Blend,
             aggregation: Aggregation::PAPER,
             mask_noise: None,
-            keep_sums: true,
+            keep_views: true,
             threads,
             memory_bytes: 2 << 30,
             strict: true,

@@ -35,6 +35,9 @@ pub struct RefineArgs {
     /// Which errors.
     #[arg(long, value_name = "N", hide = true, default_value_t = 1)]
     noise_seed: u64,
+    /// Keeps what the views left behind, so that another encode of the same, with another palette say, is quick.
+    #[arg(long)]
+    pub keep_views: bool,
 }
 
 impl RefineArgs {

@@ -219,11 +219,11 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
         weights: args.weights.map_or(preset_weights, Into::into),
         aggregation: args.refine.aggregation(preset_aggregation),
         mask_noise: args.refine.mask_noise(),
+        keep_views: args.refine.keep_views,
         threads: args.threads.map_or_else(available_threads, |n| n as usize),
         memory_bytes: args.memory,
         strict: args.input.strict,
         restart: args.restart,
-        keep_sums: args.views.keep_sums,
         cells: CellLimits {
             max_gaussians: args.cell_gaussians as usize,
             max_width: metric.then_some(args.cell_width_m),

@@ -19,9 +19,6 @@ pub struct ViewsArgs {
     /// Scales at which the built-in segmenter looks, coarsest first, 1 to 5 [default: 5].
     #[arg(long, value_name = "N", value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=5))]
     pub mask_levels: Option<usize>,
-    /// Keeps the sums of all views, so that another encode of the same views, with another palette say, is quick.
-    #[arg(long)]
-    pub keep_sums: bool,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]

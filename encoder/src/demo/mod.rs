@@ -196,11 +196,11 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
         weights: WeightKind::Blend,
         aggregation: Aggregation::REFINED,
         mask_noise: None,
+        keep_views: false,
         threads: rayon::current_num_threads(),
         memory_bytes: 1 << 30,
         strict: true,
         restart: false,
-        keep_sums: false,
         // Small cells, so that the demo has several.
         cells: CellLimits { max_gaussians: 16_384, max_width: Some(25.0) },
         shards: ShardSettings {

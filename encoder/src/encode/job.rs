@@ -43,7 +43,7 @@ impl<'a> Job<'a> {
                 n_done: job.done_views()?.len(),
             });
         }
-        if !same || restart && published {
+        if !same {
             job.clear()?;
             job.records
                 .insert(FINGERPRINT_KEY, &fingerprint.0)

@@ -446,7 +446,7 @@ pub fn encode(
     };
     store.publish(&manifest, &built.extras)?;
     // With views left to do the sums stay: the next encode goes on from them.
-    match settings.keep_sums || done.len() + n_failed < views.len() {
+    match settings.keep_views || done.len() + n_failed < views.len() {
         true => job.keep_published()?,
         false => job.finish()?,
     }

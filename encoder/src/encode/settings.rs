@@ -91,6 +91,8 @@ pub struct EncodeSettings {
     pub aggregation: Aggregation,
     /// Errors to lay over the masks, for experiments.
     pub mask_noise: Option<MaskNoise>,
+    /// Whether what the views left behind is kept, for another encode of the same with another aggregation.
+    pub keep_views: bool,
     /// Views worked on at a time.
     pub threads: usize,
     /// Working memory for sums and region vectors.
@@ -99,8 +101,6 @@ pub struct EncodeSettings {
     pub strict: bool,
     /// Whether an unfinished encode of other settings is dropped.
     pub restart: bool,
-    /// Whether the views' sums stay once all are published, for another encode that makes something else of them.
-    pub keep_sums: bool,
     /// How large a cell may become.
     pub cells: CellLimits,
     /// How fine shards are.

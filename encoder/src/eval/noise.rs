@@ -148,7 +148,7 @@ pub fn run(
                     store: store.clone(),
                     aggregation: *aggregation,
                     mask_noise: level.map(|level| MaskNoise { level, seed: settings.seed }),
-                    keep_sums: true,
+                    keep_views: true,
                     ..settings.encode.clone()
                 };
                 let summary = encode::encode(&encode, models, session, rasterizer, &Silent, cancel)

@@ -100,7 +100,7 @@ impl Wall {
             memory_bytes: 1 << 28,
             strict: true,
             restart: false,
-            keep_sums: false,
+            keep_views: false,
             aggregation: Aggregation::PAPER,
             mask_noise: None,
             objects: false,

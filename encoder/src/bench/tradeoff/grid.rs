@@ -11,7 +11,7 @@
 //!
 //! `axis` is the curve of the plots that a point belongs to; `views` are flags of `encode` on which the views' sums
 //! depend, `lift` those that only change what is made of the sums; `eval` are flags of `eval labelled`; the shards of
-//! `profile` are judged, weighed and asked.
+//! `profile` are judged, weighed and asked. All profiles are made, because the exact one says which Gaussian is which.
 //!
 //! `{masks}` is the scene's folder of true masks; `{views/N}` an N-th of its views, at least one. Points of the same
 //! scene with the same `views` share one store, and their sums are computed once.

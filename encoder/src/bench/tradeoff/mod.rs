@@ -116,7 +116,7 @@ pub struct Figures {
     pub localised: Option<f64>,
     /// Intersection over union on test views.
     pub iou_on_views: Option<f64>,
-    /// Categories that no mean counts, because the encoder does not know their words.
+    /// Words that no mean counts, because the encoder does not know them.
     pub n_unknown_words: u64,
     /// Seconds of the encode.
     pub seconds: f64,

@@ -51,7 +51,7 @@ impl Runs<'_> {
         lift: &[String],
     ) -> Result<Value, TradeoffError> {
         let mut command = Command::new(&self.programs.encoder);
-        command.args(["--json", "encode", "--metric", "--keep-sums", "--scene"]).arg(&self.scene.splat);
+        command.args(["--json", "encode", "--metric", "--keep-views", "--scene"]).arg(&self.scene.splat);
         command.arg("--views").arg(&self.scene.poses).arg("--store").arg(store);
         self.run(command.args(&self.programs.models).args(views).args(lift))
     }

@@ -208,7 +208,7 @@ impl fmt::Display for TradeoffReport {
         }
         let unknown = self.figures.iter().map(|f| f.n_unknown_words).max().unwrap_or(0);
         if unknown > 0 {
-            writeln!(f, "{unknown} categories are in no mean: the encoder does not know their words")?;
+            writeln!(f, "{unknown} words are in no mean: the encoder does not know them")?;
         }
         let paper = self.paper_seconds.map(|s| s.to_string()).join(", ");
         writeln!(
