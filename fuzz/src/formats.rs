@@ -96,7 +96,7 @@ pub fn shard(data: &[u8]) -> bool {
         assert!(
             objects.records.iter().all(|record| objects.photo(record).len() == record.photo_bytes as usize)
         );
-        std::hint::black_box(objects.scores(&vec![1.0; view.header.dim as usize]));
+        std::hint::black_box(objects.scores(&view, &vec![1.0; view.header.dim as usize]));
     }
     true
 }
