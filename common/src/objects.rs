@@ -11,7 +11,7 @@ use glam::DVec3;
 
 use crate::container::{self, ContainerError, Layout};
 use crate::frames::Aabb;
-use crate::shard::quantise;
+use crate::shard::{ShardView, quantise};
 
 /// Marks a run of Gaussians that belong to no object.
 pub const NO_OBJECT: u16 = u16::MAX;
@@ -19,8 +19,10 @@ pub const NO_OBJECT: u16 = u16::MAX;
 pub const MAX_VECTORS: u32 = 16;
 /// Longest name of a photo, bytes.
 pub const MAX_PHOTO_BYTES: usize = 1024;
-/// No vector's step is larger: components are of unit vectors.
-const MAX_STEP: f32 = 1.0;
+/// No vector's step is larger: components are scaled to about unit length.
+const MAX_STEP: f32 = 4096.0;
+/// No score is off by more: the longest difference of vectors of about unit length.
+const MAX_ERROR: f32 = 4.0;
 
 /// Ids of the sections.
 pub mod section {
@@ -28,7 +30,7 @@ pub mod section {
     pub const HEADER: u32 = 20;
     /// `[n]` [`super::ObjectRecord`].
     pub const RECORDS: u32 = 21;
-    /// `[n][n_vectors][dim]` i8.
+    /// `[n][n_vectors][m]` i8, in the basis of the shard's rows.
     pub const VECTORS: u32 = 22;
     /// `[n][n_vectors]` f32: what a vector's components are multiplied by.
     pub const STEPS: u32 = 23;
@@ -56,6 +58,8 @@ pub struct ObjectsHeader {
     pub score_mean: f32,
     /// Their standard deviation.
     pub score_spread: f32,
+    /// No score of an object is off by more: the largest distance of a vector from what is kept of it.
+    pub score_error_bound: f32,
 }
 
 /// An object, as every shard that holds some of it says.
@@ -101,7 +105,7 @@ pub struct Objects<'a> {
     pub header: ObjectsHeader,
     /// `[n]`.
     pub records: &'a [ObjectRecord],
-    /// `[n][n_vectors][dim]`.
+    /// `[n][n_vectors][m]`: components as a row has them.
     pub vectors: &'a [i8],
     /// `[n][n_vectors]`.
     pub steps: &'a [f32],
@@ -140,18 +144,29 @@ impl<'a> Objects<'a> {
         starts.zip(self.run_ends).zip(self.run_objects).map(move |((s, e), o)| (*s..*e, object(*o)))
     }
 
-    /// Returns the score of each object with a query (`[dim]`), see [`object_score`].
-    pub fn scores(&self, query: &[f32]) -> Vec<f32> {
-        let n_vectors = self.header.n_vectors as usize;
-        let products: Vec<f32> = self
-            .vectors
-            .chunks_exact(query.len())
-            .zip(self.steps)
-            .map(|(vector, step)| {
-                step * vector.iter().zip(query).map(|(v, q)| f32::from(*v) * q).sum::<f32>()
-            })
-            .collect();
-        products.chunks_exact(n_vectors).map(object_score).collect()
+    /// Returns the score of each object with a query (`[dim]`), see [`object_score`]. `shard`: the one that they are of.
+    pub fn scores(&self, shard: &ShardView<'_>, query: &[f32]) -> Vec<f32> {
+        let (offset, of_components) = shard.components_of_query(query);
+        let product = |(vector, step): (&[i8], &f32)| {
+            let sum: f64 = vector.iter().zip(&of_components).map(|(v, q)| f64::from(*v) * q).sum();
+            (offset + f64::from(*step) * sum) as f32
+        };
+        let products: Vec<f32> =
+            self.vectors.chunks_exact(of_components.len().max(1)).zip(self.steps).map(product).collect();
+        products.chunks_exact(self.header.n_vectors as usize).map(object_score).collect()
+    }
+
+    /// Returns the vectors of all objects, `[n][n_vectors][dim]`. `shard`: the one that they are of.
+    pub fn decode(&self, shard: &ShardView<'_>) -> Vec<f64> {
+        let (m, dim) = (shard.header.n_components as usize, shard.header.dim as usize);
+        let mut vectors = vec![0.0; self.steps.len() * dim];
+        for ((out, vector), step) in
+            vectors.chunks_exact_mut(dim).zip(self.vectors.chunks_exact(m.max(1))).zip(self.steps)
+        {
+            let components: Vec<f64> = vector.iter().map(|v| f64::from(*v) * f64::from(*step)).collect();
+            shard.combine(&components, out);
+        }
+        vectors
     }
 }
 
@@ -166,17 +181,13 @@ pub fn object_score(cosines: &[f32]) -> f32 {
     }
 }
 
-/// Rounds the vectors of an object (`[n][dim]`) to 8 bits a component and repeats the last up to `n_vectors`, which
-/// changes no score. Returns components and steps.
-///
-/// A step is 1/127 of the largest component, so that a cosine is off by `step / 2 * sqrt(dim)` at most (0.01 at 512
-/// components of which none is above 0.11), and by a twentieth of that as errors are independent.
-pub fn quantise_vectors(vectors: &[f32], dim: usize, n_vectors: usize) -> (Vec<i8>, Vec<f32>) {
+/// Rounds the vectors of an object (`[n][m]`, components) to 8 bits and repeats the last up to `n_vectors`, which changes
+/// no score. Returns components and steps, of which one is 1/127 of a vector's largest component.
+pub fn quantise_vectors(vectors: &[f32], m: usize, n_vectors: usize) -> (Vec<i8>, Vec<f32>) {
     let (mut components, mut steps) = (Vec::new(), Vec::new());
-    let last = vectors.len() / dim.max(1);
+    let last = (vectors.len() / m.max(1)).saturating_sub(1);
     for vector in 0..n_vectors {
-        let at = vector.min(last.saturating_sub(1)) * dim;
-        let (rounded, step) = quantise(&vectors[at..at + dim]);
+        let (rounded, step) = quantise(&vectors[vector.min(last) * m..][..m]);
         components.extend(rounded);
         steps.push(step);
     }
@@ -191,12 +202,12 @@ pub(crate) struct ObjectsLayout {
 }
 
 impl ObjectsLayout {
-    /// Checks the sections of a shard of `n_gaussians` Gaussians and embeddings of `dim` components; `None` without.
+    /// Checks the sections of a shard of `n_gaussians` Gaussians and rows of `m` components; `None` without.
     pub(crate) fn check(
         bytes: &[u8],
         layout: &Layout,
         n_gaussians: u32,
-        dim: usize,
+        m: usize,
     ) -> Result<Option<Self>, ContainerError> {
         let Some(at_header) = layout.find(section::HEADER) else { return Ok(None) };
         let damaged =
@@ -211,12 +222,16 @@ impl ObjectsLayout {
             return Err(damaged(at_header.start, what));
         }
         let is_score = |score: f32| (-1.0..=1.0).contains(&score);
-        if !is_score(header.score_mean) || !is_score(header.score_spread) || header.score_spread < 0.0 {
-            return Err(damaged(at_header.start, "scores of objects are no cosines".into()));
+        if !is_score(header.score_mean)
+            || !is_score(header.score_spread)
+            || header.score_spread < 0.0
+            || !(0.0..=MAX_ERROR).contains(&header.score_error_bound)
+        {
+            return Err(damaged(at_header.start, "scores of objects, or their error, are no cosines".into()));
         }
         let columns = [
             layout.column::<ObjectRecord>(section::RECORDS, "objects", n)?,
-            layout.column::<i8>(section::VECTORS, "objects' vectors", n * n_vectors * dim)?,
+            layout.column::<i8>(section::VECTORS, "objects' vectors", n * n_vectors * m)?,
             layout.column::<f32>(section::STEPS, "objects' steps", n * n_vectors)?,
             layout.column::<u32>(section::RUN_ENDS, "ends of objects' runs", n_runs)?,
             layout.column::<u16>(section::RUN_OBJECTS, "objects of runs", n_runs)?,

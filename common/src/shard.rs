@@ -414,7 +414,21 @@ impl ShardView<'_> {
                 .map(|e| product(&mut e.iter().map(|v| v.to_f64())))
                 .collect();
         }
-        let (offset, of_components) = match &self.basis {
+        let (offset, of_components) = self.components_of_query(query);
+        let score = |index| {
+            let components = self.components(index);
+            offset + components.iter().zip(&of_components).map(|(c, q)| c * q).sum::<f64>()
+        };
+        (0..self.n_with_evidence()).map(score).collect()
+    }
+
+    /// Returns what a query (`[dim]`) gives any vector, and what it gives each component (`[m]`), in float64.
+    pub fn components_of_query(&self, query: &[f32]) -> (f64, Vec<f64>) {
+        let dim = self.header.dim as usize;
+        let product = |vector: &mut dyn Iterator<Item = f64>| -> f64 {
+            vector.zip(query).map(|(v, q)| v * f64::from(*q)).sum()
+        };
+        match &self.basis {
             None => (0.0, query.iter().map(|q| f64::from(*q)).collect::<Vec<_>>()),
             Some(basis) => {
                 let vectors = basis.vectors.chunks_exact(dim).zip(basis.steps);
@@ -423,12 +437,7 @@ impl ShardView<'_> {
                 };
                 (product(&mut basis.mean.iter().map(|v| v.to_f64())), vectors.map(of_component).collect())
             }
-        };
-        let score = |index| {
-            let components = self.components(index);
-            offset + components.iter().zip(&of_components).map(|(c, q)| c * q).sum::<f64>()
-        };
-        (0..self.n_with_evidence()).map(score).collect()
+        }
     }
 
     /// Returns the components of a Gaussian with evidence: its row's and its residual's.
@@ -451,7 +460,7 @@ impl ShardView<'_> {
         components
     }
 
-    fn combine(&self, components: &[f64], out: &mut [f64]) {
+    pub(crate) fn combine(&self, components: &[f64], out: &mut [f64]) {
         let Some(basis) = &self.basis else {
             out.copy_from_slice(components);
             return;
@@ -568,7 +577,7 @@ impl ShardLayout {
             true => layout.column::<u32>(section::POSITIONS, "positions", n)?,
             false => layout.column::<[u16; 3]>(section::POSITIONS, "positions", n)?,
         };
-        let objects = ObjectsLayout::check(bytes, &layout, header.n_gaussians, dim)?;
+        let objects = ObjectsLayout::check(bytes, &layout, header.n_gaussians, m)?;
         Ok(Self { header, positions, row_starts, rows, radii, basis, residuals, exact, fine, objects })
     }
 

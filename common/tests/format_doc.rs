@@ -59,6 +59,7 @@ fn objects_are_those_of_the_structs() {
     field!(ObjectsHeader, photos_bytes, 4, "u32");
     field!(ObjectsHeader, score_mean, 4, "f32");
     field!(ObjectsHeader, score_spread, 4, "f32");
+    field!(ObjectsHeader, score_error_bound, 4, "f32");
     field!(ObjectRecord, id, 8, "u64");
     field!(ObjectRecord, position_in_world, 24, "f64 x 3");
     field!(ObjectRecord, box_min, 24, "f64 x 3");
@@ -68,7 +69,7 @@ fn objects_are_those_of_the_structs() {
     field!(ObjectRecord, photo_box_px, 16, "u32 x 4");
     field!(ObjectRecord, photo_start, 4, "u32");
     field!(ObjectRecord, photo_bytes, 4, "u32");
-    assert_eq!([size_of::<ObjectsHeader>(), size_of::<ObjectRecord>()], [24, 112], "a field is missing");
+    assert_eq!([size_of::<ObjectsHeader>(), size_of::<ObjectRecord>()], [28, 112], "a field is missing");
 }
 
 #[test]

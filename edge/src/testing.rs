@@ -97,6 +97,7 @@ impl BuiltShard {
                 photos_bytes: photos.len() as u32,
                 score_mean: calibration.score_mean,
                 score_spread: calibration.score_spread,
+                score_error_bound: 0.005,
             },
             records: &records,
             vectors: &vectors,

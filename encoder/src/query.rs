@@ -7,9 +7,10 @@ use glam::DVec3;
 use serde::Serialize;
 use slag_common::container::AlignedBytes;
 use slag_common::manifest::Calibration;
-use slag_common::objects::{Objects, ObjectsHeader};
+use slag_common::objects::object_score;
 use slag_common::shard::{Profile, ShardLayout};
 
+use crate::lift::dot;
 use crate::lift::published::{ReadFieldError, read_field, read_regions};
 use crate::objects::NONE;
 use crate::store::{StoreError, StoreReader};
@@ -149,10 +150,10 @@ pub struct PublishedObjects {
     pub ids: Vec<u64>,
     /// How a bank of texts scores over them.
     pub calibration: Calibration,
-    /// `[n][n_vectors][dim]`, and a step for each vector.
-    vectors: Vec<i8>,
-    steps: Vec<f32>,
-    header: ObjectsHeader,
+    /// `[n][n_vectors][dim]`.
+    vectors: Vec<f32>,
+    n_vectors: usize,
+    dim: usize,
 }
 
 impl PublishedObjects {
@@ -165,7 +166,7 @@ impl PublishedObjects {
         let dim = manifest.encoder.dim as usize;
         let n = (manifest.n_gaussians + manifest.n_rejected) as usize;
         let mut id_of = vec![None; n];
-        let mut vectors_of_id: BTreeMap<u64, (Vec<i8>, Vec<f32>)> = BTreeMap::new();
+        let mut vectors_of_id: BTreeMap<u64, Vec<f32>> = BTreeMap::new();
         let mut header = None;
         for cell in &manifest.cells {
             let cell_id = cell.cell_id;
@@ -174,7 +175,8 @@ impl PublishedObjects {
             let layout =
                 ShardLayout::check(&bytes).map_err(|source| QueryError::Shard { cell_id, source })?;
             let objects = layout.objects(&bytes).ok_or(QueryError::NoObjects)?;
-            let indices = layout.view(&bytes).exact.map_or(&[][..], |exact| exact.input_indices);
+            let shard = layout.view(&bytes);
+            let indices = shard.exact.map_or(&[][..], |exact| exact.input_indices);
             for (run, object) in objects.runs() {
                 let id = object.map(|object| objects.records[object].id);
                 for index in indices.get(run.start as usize..run.end as usize).unwrap_or_default() {
@@ -183,11 +185,10 @@ impl PublishedObjects {
                 }
             }
             let n_vectors = objects.header.n_vectors as usize;
-            let of_objects = objects.vectors.chunks_exact(n_vectors * dim);
-            for ((record, vectors), steps) in
-                objects.records.iter().zip(of_objects).zip(objects.steps.chunks_exact(n_vectors))
-            {
-                vectors_of_id.entry(record.id).or_insert_with(|| (vectors.to_vec(), steps.to_vec()));
+            let decoded = objects.decode(&shard);
+            for (record, vectors) in objects.records.iter().zip(decoded.chunks_exact(n_vectors * dim)) {
+                let vectors = || vectors.iter().map(|v| *v as f32).collect();
+                vectors_of_id.entry(record.id).or_insert_with(vectors);
             }
             header.get_or_insert(objects.header);
         }
@@ -196,22 +197,20 @@ impl PublishedObjects {
         let number =
             |id: Option<u64>| id.and_then(|id| ids.binary_search(&id).ok()).map_or(NONE, |at| at as u32);
         let object_of = id_of.into_iter().map(number).collect();
-        let (vectors, steps): (Vec<_>, Vec<_>) = vectors_of_id.into_values().unzip();
         Ok(Self {
             object_of,
             ids,
             calibration: Calibration { score_mean: header.score_mean, score_spread: header.score_spread },
-            vectors: vectors.concat(),
-            steps: steps.concat(),
-            header,
+            vectors: vectors_of_id.into_values().flatten().collect(),
+            n_vectors: header.n_vectors as usize,
+            dim,
         })
     }
 
     /// Returns the score of each object with a unit query, see [`slag_common::objects::object_score`].
     pub fn scores(&self, query: &[f32]) -> Vec<f32> {
-        let (header, vectors, steps) = (self.header, &self.vectors[..], &self.steps[..]);
-        Objects { header, vectors, steps, records: &[], run_ends: &[], run_objects: &[], photos: "" }
-            .scores(query)
+        let cosines: Vec<f32> = self.vectors.chunks_exact(self.dim).map(|v| dot(v, query)).collect();
+        cosines.chunks_exact(self.n_vectors).map(object_score).collect()
     }
 
     /// Gives every Gaussian that belongs to an object the object's score.

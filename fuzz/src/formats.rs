@@ -92,11 +92,11 @@ pub fn shard(data: &[u8]) -> bool {
     std::hint::black_box((view.bounds(), view.encoder_id()));
     if let Some(objects) = layout.objects(&bytes) {
         let n: u32 = objects.runs().map(|(run, object)| object.map_or(0, |_| run.len() as u32)).sum();
-        assert_eq!(n, objects.records.iter().map(|record| record.n_gaussians_here).sum());
+        assert_eq!(n, objects.records.iter().map(|record| record.n_gaussians_here).sum::<u32>());
         assert!(
             objects.records.iter().all(|record| objects.photo(record).len() == record.photo_bytes as usize)
         );
-        std::hint::black_box(objects.scores(&vec![1.0; view.header.dim as usize]));
+        std::hint::black_box(objects.scores(&view, &vec![1.0; view.header.dim as usize]));
     }
     true
 }

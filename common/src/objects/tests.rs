@@ -36,6 +36,7 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
             photos_bytes: 10,
             score_mean: 0.02,
             score_spread: 0.1,
+            score_error_bound: 0.02,
         },
         records: vec![record(0xdead_beef_0000_0001, 2, 0..5), record(7, 3, 5..10)],
         steps: vec![0.01, 0.02, 0.005, 0.0],
@@ -108,7 +109,7 @@ fn round_trip() {
     let runs: Vec<_> = objects.runs().collect();
     assert_eq!(runs, [(0..2, Some(1)), (2..3, None), (3..5, Some(0)), (5..6, Some(1))]);
     // By hand: object 0 has mean (1, 0, 0) and side (0, 1, 0); object 1 has mean (0, 0, 0.6) and side 0.
-    let scores = objects.scores(&[0.5, 0.25, -1.0]);
+    let scores = objects.scores(&layout.view(&bytes), &[0.5, 0.25, -1.0]);
     for (found, expected) in scores.iter().zip([0.5 * (0.5 + 0.25), 0.5 * -0.6]) {
         assert!((found - expected).abs() < 1e-6, "{scores:?}");
     }
@@ -137,6 +138,7 @@ fn lies_are_refused() {
     assert!(refused(|p| p.header.photos_bytes = u32::MAX).contains("bytes"));
     assert!(refused(|p| p.header.score_mean = f32::NAN).contains("cosines"));
     assert!(refused(|p| p.header.score_spread = -0.1).contains("cosines"));
+    assert!(refused(|p| p.header.score_error_bound = f32::INFINITY).contains("cosines"));
     assert!(refused(|p| p.steps[1] = f32::NAN).contains("steps"));
     assert!(refused(|p| p.steps[1] = -0.5).contains("steps"));
     assert!(refused(|p| p.run_ends[1] = 2).contains("ascend"));

@@ -95,7 +95,7 @@ fn answer_one(
     let n_matching;
     let found = match level {
         Level::Objects => {
-            let all = objects::scored(scene.objects, question);
+            let all = objects::scored(scene.shards, scene.objects, question);
             best_object = all.first().map(|best| (scale.shown(best.score), best.record.position()));
             let matching = all.iter().take_while(|object| object.score >= score_threshold);
             let described = matching.filter_map(|object| {
@@ -145,7 +145,7 @@ fn answer_one(
     // With negatives a score is the difference of two.
     let n_products = if question.negatives.is_empty() { 1.0 } else { 2.0 };
     let score_error_bound = scale.error_bound(match (search.is_exact(), level) {
-        (_, Level::Objects) => n_products * objects::rounding_bound(scene.objects),
+        (_, Level::Objects) => n_products * objects::score_error_bound(scene.objects),
         (true, Level::Gaussians) => question.rounding_bound(),
         _ => search.score_error_bound(),
     });

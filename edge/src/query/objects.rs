@@ -49,11 +49,15 @@ pub fn calibration(objects: &[Option<Objects<'_>>]) -> Option<Calibration> {
 
 /// Returns the objects on board, best first. A score is `s(q)`, or `s(q) - max_j s(n_j)` with negatives, s being
 /// [`slag_common::objects::object_score`].
-pub fn scored<'a>(objects: &[Option<Objects<'a>>], question: &Question) -> Vec<FoundObject<'a>> {
+pub fn scored<'a>(
+    shards: &[ShardView<'_>],
+    objects: &[Option<Objects<'a>>],
+    question: &Question,
+) -> Vec<FoundObject<'a>> {
     let mut found: BTreeMap<u64, FoundObject<'a>> = BTreeMap::new();
     for (shard, objects) in objects.iter().enumerate().filter_map(|(i, o)| Some((i, o.as_ref()?))) {
-        let mut scores = objects.scores(&question.vector);
-        let negatives = question.negatives.iter().map(|negative| objects.scores(negative));
+        let mut scores = objects.scores(&shards[shard], &question.vector);
+        let negatives = question.negatives.iter().map(|negative| objects.scores(&shards[shard], negative));
         let likest = negatives.reduce(|a, b| a.iter().zip(b).map(|(a, b)| a.max(b)).collect());
         scores.iter_mut().zip(likest.into_iter().flatten()).for_each(|(score, likest)| *score -= likest);
         for (number, (record, score)) in objects.records.iter().zip(scores).enumerate() {
@@ -66,12 +70,9 @@ pub fn scored<'a>(objects: &[Option<Objects<'a>>], question: &Question) -> Vec<F
     found
 }
 
-/// Returns a bound on the error that rounding vectors to 8 bits makes of a score, of one vector.
-pub fn rounding_bound(objects: &[Option<Objects<'_>>]) -> f32 {
-    let largest = objects.iter().flatten().flat_map(|o| o.steps).fold(0.0f32, |most, step| most.max(*step));
-    let of_dim = |o: &Objects<'_>| o.vectors.len() / o.steps.len().max(1);
-    let dim = objects.iter().flatten().map(of_dim).max().unwrap_or(0);
-    0.5 * largest * (dim as f32).sqrt()
+/// Returns the bound on the error of an object's score with one vector.
+pub fn score_error_bound(objects: &[Option<Objects<'_>>]) -> f32 {
+    objects.iter().flatten().map(|objects| objects.header.score_error_bound).fold(0.0, f32::max)
 }
 
 impl FoundObject<'_> {

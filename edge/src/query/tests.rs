@@ -344,8 +344,11 @@ fn scene_of_objects() -> Vec<BuiltShard> {
         [thing(3, DVec3::new(20.0, 0.0, 0.0), 100, 0.9), thing(4, DVec3::new(22.0, 0.0, 0.0), 60, 0.9)];
     let built = built.map(|thing| thing.build(false));
     vec![
-        built[0].with_objects(&[shared(&[10..40])], calibration),
-        built[1].with_objects(&[shared(&[0..5, 10..17]), object(22, [c, c, c], &[20..50], 30)], calibration),
+        built[0].with_objects(&[shared(&[10..25, 25..40])], calibration),
+        built[1].with_objects(
+            &[shared(&[0..5, 10..17]), object(22, [c, c, c], &[20..30, 30..50], 30)],
+            calibration,
+        ),
     ]
 }
 

@@ -215,6 +215,9 @@ pub struct EvalSettings {
     pub level: EvalLevel,
 }
 
+/// A word's scores: of Gaussians, and of objects where those are scored.
+type WordScores = (Vec<f32>, Vec<f32>);
+
 /// Evaluates a store against labels. `scene`: the splat that was encoded, for the test views.
 ///
 /// # Errors
@@ -238,7 +241,7 @@ pub fn labelled(
         EvalLevel::Objects => Some(PublishedObjects::read(reader)?),
     };
     let mut of_objects: Vec<Vec<f32>> = Vec::new();
-    let mut score = |text: &str| -> Result<Option<(Vec<f32>, Vec<f32>)>, EvalError> {
+    let mut score = |text: &str| -> Result<Option<WordScores>, EvalError> {
         let vector = match encoder.encode(text) {
             Ok(vector) => vector,
             Err(error) => {

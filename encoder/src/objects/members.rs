@@ -116,11 +116,8 @@ impl Members {
         let mut n_of = vec![0usize; self.masks.len()];
         self.object_of.iter().flatten().filter(|o| **o != NONE).for_each(|o| n_of[*o as usize] += 1);
         let mut number_of = vec![NONE; self.masks.len()];
-        let mut n = 0;
-        for (number, _) in number_of.iter_mut().zip(&n_of).filter(|(_, n)| **n >= min_gaussians.max(1)) {
-            *number = n;
-            n += 1;
-        }
+        let kept = (0..n_of.len()).filter(|object| n_of[*object] >= min_gaussians.max(1));
+        (0u32..).zip(kept).for_each(|(number, object)| number_of[object] = number);
         for object in self.object_of.iter_mut().flatten().filter(|object| **object != NONE) {
             *object = number_of[*object as usize];
         }

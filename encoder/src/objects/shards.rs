@@ -1,14 +1,123 @@
 //! The objects of a cell, as its shards carry them.
 
+use half::f16;
 use slag_common::objects::{
     MAX_PHOTO_BYTES, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, quantise_vectors,
 };
+use slag_common::shard::Basis;
 
 use super::vectors::MAX_MEDOIDS;
 use super::{NONE, SceneObjects};
 
 /// Vectors of an object: the mean of its masks' and the medoids.
 const N_VECTORS: usize = 1 + MAX_MEDOIDS;
+
+/// What the components of a cell's rows mean, and how vectors become such.
+pub struct RowFrame<'a> {
+    dim: usize,
+    /// Mean and `[m][dim]`; absent: components are the vector's own.
+    basis: Option<(&'a [f16], Vec<f64>)>,
+    /// `[m][m]`: lower triangle of the Cholesky factor of the basis vectors' products.
+    factor: Vec<f64>,
+}
+
+impl<'a> RowFrame<'a> {
+    /// Prepares the basis of a shard's rows.
+    pub fn new(dim: usize, basis: Option<Basis<'a>>) -> Self {
+        let basis = basis.map(|basis| {
+            let of_vector = |(v, step): (&[i8], &f32)| {
+                let step = f64::from(*step);
+                v.iter().map(move |v| f64::from(*v) * step).collect::<Vec<f64>>()
+            };
+            (
+                basis.mean,
+                basis.vectors.chunks_exact(dim).zip(basis.steps).flat_map(of_vector).collect::<Vec<f64>>(),
+            )
+        });
+        let mut frame = Self { dim, basis, factor: Vec::new() };
+        let Some((_, vectors)) = &frame.basis else { return frame };
+        // Row by row (Golub and Van Loan, 4.2). A vector that the others make up gets no component.
+        let m = frame.m();
+        let row = |i: usize| &vectors[i * dim..][..dim];
+        let mut factor = vec![0.0; m * m];
+        for i in 0..m {
+            for j in 0..=i {
+                let product: f64 = row(i).iter().zip(row(j)).map(|(a, b)| a * b).sum();
+                let known: f64 = (0..j).map(|c| factor[i * m + c] * factor[j * m + c]).sum();
+                let rest = product - known;
+                factor[i * m + j] = match (i == j, factor[j * m + j]) {
+                    (true, _) => {
+                        if rest > 1e-9 * product {
+                            rest.sqrt()
+                        } else {
+                            0.0
+                        }
+                    }
+                    (false, pivot) => {
+                        if pivot > 0.0 {
+                            rest / pivot
+                        } else {
+                            0.0
+                        }
+                    }
+                };
+            }
+        }
+        frame.factor = factor;
+        frame
+    }
+
+    /// Returns the number of components.
+    pub fn m(&self) -> usize {
+        self.basis.as_ref().map_or(self.dim, |(_, vectors)| vectors.len() / self.dim)
+    }
+
+    /// Returns the components (`[n][m]`) of the nearest vectors that the basis can make, by least squares.
+    pub fn components(&self, vectors: &[f32]) -> Vec<f32> {
+        let Some((mean, basis)) = &self.basis else { return vectors.to_vec() };
+        let m = self.m();
+        let solve = |vector: &[f32]| {
+            let apart: Vec<f64> =
+                vector.iter().zip(*mean).map(|(v, mean)| f64::from(*v) - mean.to_f64()).collect();
+            let mut x: Vec<f64> = basis
+                .chunks_exact(self.dim)
+                .map(|b| b.iter().zip(&apart).map(|(b, a)| b * a).sum())
+                .collect();
+            let divided = |rest: f64, pivot: f64| if pivot > 0.0 { rest / pivot } else { 0.0 };
+            for i in 0..m {
+                let known: f64 = (0..i).map(|j| self.factor[i * m + j] * x[j]).sum();
+                x[i] = divided(x[i] - known, self.factor[i * m + i]);
+            }
+            for i in (0..m).rev() {
+                let known: f64 = (i + 1..m).map(|j| self.factor[j * m + i] * x[j]).sum();
+                x[i] = divided(x[i] - known, self.factor[i * m + i]);
+            }
+            x.into_iter().map(|x| x as f32).collect::<Vec<f32>>()
+        };
+        vectors.chunks_exact(self.dim).flat_map(solve).collect()
+    }
+
+    /// Returns the largest distance of vectors (`[n][dim]`) from what their rounded components make.
+    fn largest_error(&self, vectors: &[f32], components: &[i8], steps: &[f32]) -> f32 {
+        let m = self.m();
+        let of_vector = |((vector, components), step): ((&[f32], &[i8]), &f32)| {
+            let mut made: Vec<f64> = match &self.basis {
+                None => components.iter().map(|c| f64::from(*c) * f64::from(*step)).collect(),
+                Some((mean, _)) => mean.iter().map(|mean| mean.to_f64()).collect(),
+            };
+            for (component, basis) in
+                components.iter().zip(self.basis.iter().flat_map(|(_, basis)| basis.chunks_exact(self.dim)))
+            {
+                let scale = f64::from(*component) * f64::from(*step);
+                made.iter_mut().zip(basis).for_each(|(made, b)| *made += scale * b);
+            }
+            made.iter().zip(vector).map(|(made, v)| (made - f64::from(*v)).powi(2)).sum::<f64>().sqrt()
+        };
+        let all = vectors.chunks_exact(self.dim).zip(components.chunks_exact(m.max(1))).zip(steps);
+        // Rounded up, so that it stays a bound in f32.
+        all.map(of_vector).fold(0.0, f64::max) as f32 * (1.0 + 2.0 * f32::EPSILON)
+    }
+}
 
 /// The columns of a cell's objects.
 pub struct CellObjects {
@@ -22,9 +131,8 @@ pub struct CellObjects {
 }
 
 impl CellObjects {
-    /// Collects the objects of a cell. `locals`: its Gaussians in the order of the shard; `dim`: components of an
-    /// embedding.
-    pub fn new(scene: &SceneObjects, cell_id: u32, locals: &[u32], dim: usize) -> Self {
+    /// Collects the objects of a cell. `locals`: its Gaussians in the order of the shard; `frame`: of its rows.
+    pub fn new(scene: &SceneObjects, cell_id: u32, locals: &[u32], frame: &RowFrame<'_>) -> Self {
         let object_of = &scene.object_of[cell_id as usize];
         let mut n_here = vec![0u32; scene.objects.len()];
         object_of.iter().filter(|object| **object != NONE).for_each(|object| n_here[*object as usize] += 1);
@@ -39,6 +147,7 @@ impl CellObjects {
                 photos_bytes: 0,
                 score_mean: scene.calibration.score_mean,
                 score_spread: scene.calibration.score_spread,
+                score_error_bound: 0.0,
             },
             records: Vec::new(),
             vectors: Vec::new(),
@@ -69,7 +178,10 @@ impl CellObjects {
                 photo_start: photo_start as u32,
                 photo_bytes: name.len() as u32,
             });
-            let (components, steps) = quantise_vectors(&object.vectors, dim, N_VECTORS);
+            let (components, steps) =
+                quantise_vectors(&frame.components(&object.vectors), frame.m(), N_VECTORS);
+            let error = frame.largest_error(&object.vectors, &components, &steps);
+            cell.header.score_error_bound = cell.header.score_error_bound.max(error);
             cell.vectors.extend(components);
             cell.steps.extend(steps);
         }

@@ -69,3 +69,21 @@ fn of_gaussian(regions: &[u32], weights: &[f32], view_of_region: &[u32]) -> Vec<
     let is_seen = |(_, total, ..): &&(u32, f32, u32, f32)| *total > 0.0 && *total >= MIN_WEIGHT_SHARE * most;
     views.iter().filter(is_seen).map(|(view, _, region, _)| (*view, *region)).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// By hand: view 0 shows regions 0 and 1, view 1 regions 2 to 4, view 2 a rest of less than a tenth, view 3 nothing.
+    #[test]
+    fn a_gaussian_shows_the_region_of_most_weight_where_it_is_seen() {
+        let view_of_region = [0, 0, 1, 1, 1, 2, 3];
+        let (regions, weights) = ([0, 1, 2, 3, 4, 5, 6], [1.0, 3.0, 4.0, 4.0, 2.0, 0.9, 0.0]);
+        assert_eq!(of_gaussian(&regions, &weights, &view_of_region), [(0, 1), (1, 2)]);
+        // A tenth of the best is enough.
+        assert_eq!(of_gaussian(&regions, &[1.0, 3.0, 4.0, 4.0, 2.0, 1.0, 0.0], &view_of_region).len(), 3);
+        assert_eq!(of_gaussian(&[], &[], &view_of_region), []);
+        assert_eq!(sample_step(1), 1);
+        assert_eq!((sample_step(32_768), sample_step(32_769), sample_step(104_878)), (1, 2, 4));
+    }
+}

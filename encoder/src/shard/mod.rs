@@ -12,7 +12,7 @@ use slag_common::shard::{
 };
 
 use crate::objects::SceneObjects;
-use crate::objects::shards::CellObjects;
+use crate::objects::shards::{CellObjects, RowFrame};
 use crate::palette::matrix::Rows;
 use crate::palette::measure::ScoreMoments;
 use crate::palette::{self, PaletteSettings, Yardstick};
@@ -154,7 +154,8 @@ pub fn build_with(
         }),
         ..compact
     });
-    let objects = objects.map(|objects| CellObjects::new(objects, cell_id, &locals, dim));
+    let objects = objects
+        .map(|objects| CellObjects::new(objects, cell_id, &locals, &RowFrame::new(dim, compact.basis)));
     let objects = objects.as_ref().map(CellObjects::view);
     let largest = |radii: &[f32]| radii.iter().copied().fold(0.0, f32::max);
     let spread = palette.errors.spread;

@@ -127,7 +127,7 @@ async fn every_answer_is_as_described() {
         assert_eq!(found, Ok(()), "{path}?{query}: {body:#}");
     }
     // Objects come first where there are any.
-    let object = TestObject { id: 5, vectors: vec![1.0, 0.0, 0.0], runs: vec![2..14], n_gaussians: 40 };
+    let object = TestObject { id: 5, vectors: vec![1.0, 0.0, 0.0], runs: vec![2..8, 8..14], n_gaussians: 40 };
     let calibration = Calibration { score_mean: 0.0, score_spread: 0.1 };
     let service = Service::new(Some(&[exact[0].with_objects(&[object], calibration)]), Settings::default());
     for (query, level, n) in
