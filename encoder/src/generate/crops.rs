@@ -286,11 +286,9 @@ mod tests {
             assert_eq!(n_inside, label.area_px as usize);
             let outside = crop.image().pixels().zip(crop.inside()).filter(|(_, inside)| !**inside);
             assert!(outside.into_iter().all(|(pixel, _)| pixel.0 == [255; 3]));
-            assert!(
-                label.shown > 0.0
-                    && label.shown <= 1.0
-                    && nouns[label.noun].colours().contains(&label.colour)
-            );
+            // A segment may hold some of what is beside the thing.
+            assert!(label.shown > 0.0 && (label.shown <= 1.0 || label.segmented));
+            assert!(nouns[label.noun].colours().contains(&label.colour));
         }
         let again: Vec<(Crop, Label)> = (0..6).flat_map(of_seed).collect();
         assert!(made.iter().zip(&again).all(|(a, b)| a.0 == b.0));
