@@ -69,7 +69,7 @@ fn stores_are_equal_to_the_byte() {
     let one = encode("one", &views, "1", "2GiB");
     assert!(one.len() > 4, "several cells and profiles");
     assert_eq!(encode("two", &views, "2", "2GiB"), one);
-    assert_eq!(encode("shuffled", &shuffled, "4", "64MiB"), one);
+    assert_eq!(encode("shuffled", &shuffled, "4", "96MiB"), one);
 }
 
 /// What a user does wrong is answered with what to do.
