@@ -124,7 +124,7 @@ pub fn evaluate(
     let ms_per_text = timed(|i| text.encode(&nouns[i % nouns.len()].name).map(|_| ()))?;
 
     let mut image = models.image_encoder(options)?;
-    let mut seen: Vec<(Label, usize, usize, usize)> = Vec::new();
+    let mut seen: Vec<Seen> = Vec::new();
     let mut found = [0_u64; 3];
     let mut timing = Vec::new();
     let threshold = models.threshold();
@@ -177,7 +177,10 @@ pub fn evaluate(
     Ok(report)
 }
 
+/// A crop's label, and the noun, colour and material that score best.
 type Seen = (Label, usize, usize, usize);
+/// Whether a crop is one of those that are counted together.
+type Group = fn(&Label) -> bool;
 
 fn is_whole(label: &Label) -> bool {
     !label.cut && !label.segmented && label.shown > WHOLE
@@ -188,7 +191,7 @@ fn argmax(scores: impl Iterator<Item = f32>) -> usize {
 }
 
 fn tallies(seen: &[Seen]) -> Vec<(String, Tally)> {
-    let groups: [(&str, fn(&Label) -> bool); 6] = [
+    let groups: [(&str, Group); 6] = [
         ("whole things", is_whole),
         ("whole things, in pairs of noun and colour kept from learning", |l| is_whole(l) && l.held_out),
         ("cut or half hidden", |l| !l.segmented && !is_whole(l)),
@@ -196,7 +199,7 @@ fn tallies(seen: &[Seen]) -> Vec<(String, Tally)> {
         ("all, in pairs kept from learning", |l| l.held_out),
         ("all", |_| true),
     ];
-    let tally = |is_in: fn(&Label) -> bool| {
+    let tally = |is_in: Group| {
         let mut tally = Tally::default();
         for (label, noun, colour, material) in seen.iter().filter(|s| is_in(&s.0)) {
             tally.n_crops += 1;
