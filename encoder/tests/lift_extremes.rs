@@ -241,7 +241,7 @@ fn exact_shard(vectors: &[Vec<f32>], means_in_world: Vec<DVec3>) -> AlignedBytes
         position_error: PositionError::Within(0.01),
     };
     let yardstick = Yardstick { metric, bank, spread };
-    let built = shard::build(&scene, 0, cell, &embeddings, Hash32([0; 32]), &yardstick, &settings);
+    let built = shard::build(&scene, 0, cell, &embeddings, Hash32([0; 32]), &yardstick, &settings, None);
     AlignedBytes::copy_of(&built.shards[0].bytes)
 }
 

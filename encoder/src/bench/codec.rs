@@ -306,7 +306,7 @@ fn ours(
             .collect();
         let cell = CellEmbeddings { dim, vectors: in_order, has_evidence: vec![true; *n] };
         let (built, took) = timed_ms(|| {
-            shard::build(&scene, 0, &cells.cells[0], &cell, Hash32([0; 32]), yardstick, &settings)
+            shard::build(&scene, 0, &cells.cells[0], &cell, Hash32([0; 32]), yardstick, &settings, None)
         });
         ms += took;
         n_rows += built.n_rows;

@@ -91,7 +91,7 @@ pub fn publish(
             cell.gaussians.iter().flat_map(|k| &vectors[*k as usize * dim..][..dim]).copied().collect();
         let embeddings = CellEmbeddings { dim, vectors, has_evidence: vec![true; n] };
         let (built, took) = timed_ms(|| {
-            shard::build(&scene, cell_id as u32, cell, &embeddings, encoder_id, &yardstick, settings)
+            shard::build(&scene, cell_id as u32, cell, &embeddings, encoder_id, &yardstick, settings, None)
         });
         ms += took;
         report.n_rows += u64::from(built.n_rows);

@@ -9,16 +9,14 @@ use super::Exit;
 use super::args::{BackgroundArg, ModelArgs};
 use super::run::{available_threads, cancel_flag, open_models, print};
 use crate::embed::Background;
-use crate::encode::{EncodeSettings, Masks, ViewOrder};
+use crate::encode::{EncodeSettings, ViewOrder};
 use crate::eval::noise::{self, NoiseRow, NoiseSettings};
 use crate::lift::Aggregation;
 use crate::palette::PaletteSettings;
 use crate::progress::Progress;
-use crate::raster::WeightKind;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
 use crate::shard::ShardSettings;
-use crate::shard::cells::CellLimits;
 use crate::shard::positions::PositionError;
 use slag_common::shard::Profile;
 
@@ -82,37 +80,22 @@ pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> 
         methods,
         out: args.out.clone(),
         encode: EncodeSettings {
-            scene: PathBuf::new(),
-            views: PathBuf::new(),
-            images: None,
-            masks: Masks::Auto,
-            store: PathBuf::new(),
             scene_name: "noise".into(),
-            metric: true,
-            geo: None,
             views_limit: args.views_limit.map(|n| n as usize),
             view_order: ViewOrder::Nth,
-            time_budget: None,
-            objects: false,
-            raster_width_px: None,
             background: Background::from(args.background),
-            min_mask_px: 200,
-            weights: WeightKind::Blend,
             aggregation: Aggregation::PAPER,
-            mask_noise: None,
             keep_views: true,
             threads,
-            memory_bytes: 2 << 30,
             strict: true,
             restart: true,
-            cells: CellLimits { max_gaussians: 65_536, max_width: Some(25.0) },
             shards: ShardSettings {
                 profiles: vec![Profile::Compact],
                 palette: PaletteSettings::default(),
                 position_error: PositionError::default_for(true),
             },
-            created_unix_secs: 0,
-            expires_unix_secs: None,
+            objects: false,
+            ..EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true)
         },
     };
     progress.begin("noise", "row", n_rows as u64, 0);

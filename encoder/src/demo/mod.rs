@@ -14,20 +14,13 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use slag_models::{ModelDir, SessionOptions, TextEncoder};
 
-use crate::embed::Background;
-use crate::encode::{self, EncodeSettings, EncodeSummary, Masks, ViewOrder};
+use crate::encode::{self, EncodeSettings, EncodeSummary};
 use crate::generate::Scene;
 use crate::generate::grammar::{self, SceneKind};
-use slag_common::shard::Profile;
-
-use crate::lift::Aggregation;
-use crate::palette::PaletteSettings;
 use crate::progress::Progress;
 use crate::publish::serve::{self, Limits};
-use crate::raster::{CpuRasterizer, WeightKind};
-use crate::shard::ShardSettings;
+use crate::raster::CpuRasterizer;
 use crate::shard::cells::CellLimits;
-use crate::shard::positions::PositionError;
 use crate::{query, store::StoreReader};
 
 /// A house and a yard beside it.
@@ -179,38 +172,13 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     let robot_in_world = DVec3::new(camera_in_world.x, camera_in_world.y, 0.0);
     let models = ModelDir::embedded()?;
     let settings = EncodeSettings {
-        scene: written.scene,
-        views: written.views,
-        images: None,
-        masks: Masks::Auto,
-        store: store.clone(),
         scene_name: "demo house and yard".into(),
-        metric: true,
-        geo: None,
-        views_limit: None,
-        view_order: ViewOrder::Names,
-        time_budget: None,
-        raster_width_px: None,
-        background: Background::White,
-        min_mask_px: 200,
-        weights: WeightKind::Blend,
-        aggregation: Aggregation::REFINED,
-        mask_noise: None,
-        keep_views: false,
-        threads: rayon::current_num_threads(),
         memory_bytes: 1 << 30,
         strict: true,
-        restart: false,
         // Small cells, so that the demo has several.
         cells: CellLimits { max_gaussians: 16_384, max_width: Some(25.0) },
-        shards: ShardSettings {
-            profiles: Profile::ALL.to_vec(),
-            palette: PaletteSettings::default(),
-            position_error: PositionError::default_for(true),
-        },
-        objects: true,
         created_unix_secs: options.created_unix_secs,
-        expires_unix_secs: None,
+        ..EncodeSettings::new(written.scene, written.views, store.clone(), true)
     };
     let summary = tokio::task::block_in_place(|| {
         encode::encode(&settings, &models, &options.session, &CpuRasterizer, progress, cancel)

@@ -250,16 +250,7 @@ impl<'a> CellBuilder<'a> {
         let cell = &self.split.cells[cell_id as usize];
         let (scene, encoder_id, settings) = (self.scene, self.encoder_id, &self.settings.shards);
         let made = self.stopwatch.time("palette", || {
-            shard::build_with(
-                scene,
-                cell_id,
-                cell,
-                embeddings,
-                encoder_id,
-                &self.yardstick,
-                settings,
-                objects,
-            )
+            shard::build(scene, cell_id, cell, embeddings, encoder_id, &self.yardstick, settings, objects)
         });
         let record = |shard: &BuiltShard| -> Result<(Profile, ShardRecord), EncodeError> {
             let (hash, len_bytes) = self.stopwatch.time("write", || self.store.put_bytes(&shard.bytes))?;

@@ -4,16 +4,19 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::Serialize;
+use slag_common::shard::Profile;
 use slag_common::{Gaussians, Hash32, View};
 use slag_models::ModelDir;
 
 use super::EncodeError;
 use crate::embed::Background;
 use crate::lift::Aggregation;
+use crate::palette::PaletteSettings;
 use crate::raster::WeightKind;
 use crate::segment::{MaskNoise, SamSettings};
 use crate::shard::ShardSettings;
 use crate::shard::cells::CellLimits;
+use crate::shard::positions::PositionError;
 
 /// Where masks come from.
 #[derive(Clone, Debug, PartialEq)]
@@ -117,6 +120,43 @@ pub struct EncodeSettings {
 pub const MAX_RASTER_WIDTH_PX: u32 = 1024;
 
 impl EncodeSettings {
+    /// Returns the settings to encode a splat and its photos into a store, as the program has them without flags.
+    pub fn new(scene: PathBuf, views: PathBuf, store: PathBuf, metric: bool) -> Self {
+        Self {
+            scene,
+            views,
+            images: None,
+            masks: Masks::Auto,
+            store,
+            scene_name: "scene".into(),
+            metric,
+            geo: None,
+            views_limit: None,
+            view_order: ViewOrder::Names,
+            time_budget: None,
+            raster_width_px: None,
+            background: Background::White,
+            min_mask_px: 200,
+            weights: WeightKind::Blend,
+            aggregation: Aggregation::REFINED,
+            mask_noise: None,
+            keep_views: false,
+            threads: rayon::current_num_threads(),
+            memory_bytes: 2 << 30,
+            strict: false,
+            restart: false,
+            cells: CellLimits { max_gaussians: 65_536, max_width: metric.then_some(25.0) },
+            shards: ShardSettings {
+                profiles: Profile::ALL.to_vec(),
+                palette: PaletteSettings::default(),
+                position_error: PositionError::default_for(metric),
+            },
+            objects: true,
+            created_unix_secs: 0,
+            expires_unix_secs: None,
+        }
+    }
+
     /// Returns names and lengths of the files in the given masks' folder and its subfolders.
     fn mask_files(&self) -> Result<Vec<(String, u64)>, EncodeError> {
         let Masks::Given { dir, .. } = &self.masks else { return Ok(Vec::new()) };

@@ -14,12 +14,11 @@ use slag_models::{EncodeError, ModelDir, SessionOptions, TextEncoder};
 use super::lerf::{LerfLabels, lerf};
 use super::scannet::{Matching, Scan, ScannetReport, scannet};
 use super::*;
-use crate::embed::Background;
-use crate::encode::{self, EncodeSettings, Masks, ViewOrder};
+use crate::encode::{self, EncodeSettings, Masks};
 use crate::lift::Aggregation;
 use crate::palette::PaletteSettings;
 use crate::progress::Silent;
-use crate::raster::{CpuRasterizer, WeightKind};
+use crate::raster::CpuRasterizer;
 use crate::shard::ShardSettings;
 use crate::shard::cells::CellLimits;
 use crate::shard::positions::PositionError;
@@ -81,28 +80,12 @@ impl Wall {
             "cx": centre_x_px, "cy": centre_y_px, "frames": frames});
         fs_err::write(&views, poses.to_string()).expect("writes");
         let settings = EncodeSettings {
-            scene,
-            views: views.clone(),
-            images: None,
             masks: Masks::Given { dir: dir.path().join("masks"), ignore_ids: Vec::new() },
-            store: dir.path().join("store"),
-            scene_name: "wall".into(),
-            metric: true,
-            geo: None,
-            views_limit: None,
-            view_order: ViewOrder::Names,
-            time_budget: None,
-            raster_width_px: None,
-            background: Background::White,
             min_mask_px: 10,
-            weights: WeightKind::Blend,
             threads: 1,
             memory_bytes: 1 << 28,
             strict: true,
-            restart: false,
-            keep_views: false,
             aggregation: Aggregation::PAPER,
-            mask_noise: None,
             objects: false,
             cells: CellLimits { max_gaussians: 4096, max_width: None },
             shards: ShardSettings {
@@ -110,8 +93,7 @@ impl Wall {
                 palette: PaletteSettings::default(),
                 position_error: PositionError::Within(0.01),
             },
-            created_unix_secs: 1,
-            expires_unix_secs: None,
+            ..EncodeSettings::new(scene, views.clone(), dir.path().join("store"), true)
         };
         let session = SessionOptions::new(PathBuf::new());
         let cancel = AtomicBool::new(false);

@@ -75,22 +75,9 @@ pub fn working_bytes(n_gaussians: usize, dim: usize) -> u64 {
     (n_gaussians * (dim * per_component + palette::working_bytes_per_embedding(dim))) as u64
 }
 
-/// Builds a cell's shards, without objects.
-pub fn build(
-    scene: &Gaussians,
-    cell_id: u32,
-    cell: &Cell,
-    embeddings: &CellEmbeddings,
-    encoder_id: Hash32,
-    yardstick: &Yardstick,
-    settings: &ShardSettings,
-) -> BuiltCell {
-    build_with(scene, cell_id, cell, embeddings, encoder_id, yardstick, settings, None)
-}
-
-/// Builds a cell's shards, with the objects of the scene.
+/// Builds a cell's shards, with the objects of the scene if it has any.
 #[expect(clippy::too_many_arguments, reason = "what a cell is made of")]
-pub fn build_with(
+pub fn build(
     scene: &Gaussians,
     cell_id: u32,
     cell: &Cell,
