@@ -6,8 +6,7 @@ use std::{
 
 use sha2::{Digest, Sha256};
 
-/// What is part of the program, in `embedded/`. Each is named where it is used alone, so that a robot's program,
-/// which encodes no images, leaves the largest out.
+/// What is part of the program, in `embedded/`.
 mod embedded {
     pub const DESCRIPTION: &str = include_str!("../embedded/model.toml");
     pub const IMAGE: &[u8] = include_bytes!("../embedded/image.onnx");
