@@ -195,7 +195,7 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
     let created_unix_secs = now_unix_secs();
     let masks = match (args.masks.as_str(), args.sam.masks()) {
         ("graph", None) => Masks::Graph,
-        ("auto", masks) => masks.or(args.views.mask_levels.map(Masks::Levels)).unwrap_or(Masks::Auto),
+        ("auto", masks) => masks.unwrap_or(Masks::Auto { n_levels: args.views.mask_levels }),
         (dir, Some(_)) => {
             return Err(anyhow!("--masks {dir} gives masks, --segmenter finds some; choose one"));
         }

@@ -16,7 +16,7 @@ pub struct ViewsArgs {
     /// Seconds after which no further view is begun; what is there then is published.
     #[arg(long, value_name = "SECS", value_parser = parse_secs)]
     pub time_budget: Option<Duration>,
-    /// Scales at which the built-in segmenter looks, coarsest first, 1 to 5 [default: 5].
+    /// Scales at which the built-in segmenter looks, coarsest first [default: all].
     #[arg(long, value_name = "N", value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=5))]
     pub mask_levels: Option<usize>,
 }

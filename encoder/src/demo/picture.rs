@@ -1,11 +1,10 @@
 //! What the robot found, drawn: each answer's Gaussians in colour, the rest in grey; and all from above.
 
+use glam::{DVec2, DVec3};
 use image::{RgbImage, imageops};
 use slag_common::Gaussians;
-use slag_common::gaussians::SH_C0;
-
-use glam::{DVec2, DVec3};
 use slag_common::frames::Aabb;
+use slag_common::gaussians::SH_C0;
 
 use super::EdgeAnswer;
 use crate::generate::to_image;
@@ -49,9 +48,8 @@ pub(super) fn answers(
             if *cosine >= panel.threshold {
                 continue;
             }
-            let rgb = sh.map(|c| 0.5 + SH_C0 * c);
-            // Luma (BT.601), lightened so that dark furniture still shows its shape.
-            let grey = 0.35 + 0.5 * (0.299 * rgb[0] + 0.587 * rgb[1] + 0.114 * rgb[2]);
+            // Lightened so that dark furniture still shows its shape.
+            let grey = 0.35 + 0.5 * luma(rgb_of(*sh));
             *sh = [(grey - 0.5) / SH_C0; 3];
         }
         let view = best_view(scene, views, panel)?;
@@ -66,6 +64,15 @@ pub(super) fn answers(
         );
     }
     Ok(picture)
+}
+
+fn rgb_of(sh_dc: [f32; 3]) -> [f32; 3] {
+    sh_dc.map(|c| 0.5 + SH_C0 * c)
+}
+
+/// BT.601.
+fn luma([r, g, b]: [f32; 3]) -> f32 {
+    0.299 * r + 0.587 * g + 0.114 * b
 }
 
 /// Returns the view that shows most of what was found, of those that have the answer nearest to their middle.
@@ -138,9 +145,9 @@ pub(super) fn map(
     order.sort_by(|a, b| scene.means_in_world[*a].z.total_cmp(&scene.means_in_world[*b].z));
     for i in order {
         let mean = scene.means_in_world[i];
-        let rgb = scene.sh_dc[i].map(|c| 0.5 + SH_C0 * c);
+        let rgb = rgb_of(scene.sh_dc[i]);
         let on_board = fetched.iter().any(|bounds| bounds.distance_to(mean) == 0.0);
-        let grey = 0.6 + 0.3 * (0.299 * rgb[0] + 0.587 * rgb[1] + 0.114 * rgb[2]);
+        let grey = 0.6 + 0.3 * luma(rgb);
         let rgb = if on_board { rgb } else { [grey; 3] }.map(|c| (c.clamp(0.0, 1.0) * 255.0) as u8);
         let (x, y) = place(mean.truncate());
         let reach = (f64::from(scene.scales[i][0]) * MAP_PX_PER_M).ceil() as i64;

@@ -297,12 +297,9 @@ pub fn encode(
     // Before hours of work: the part of the budget that is known now.
     cells::check_memory(settings.memory_bytes, cells::largest_cell_bytes(&split, models.dim()), 0, 0)?;
     let segmenter: Box<dyn Segmenter> = match &settings.masks {
-        Masks::Auto => {
-            Box::new(GraphSegmenter::learnt(GraphSettings::learnt(), session).map_err(SegmentError::from)?)
-        }
-        Masks::Levels(n) => {
+        Masks::Auto { n_levels } => {
             let mut settings = GraphSettings::learnt();
-            settings.scales.truncate(*n);
+            settings.scales.truncate(n_levels.unwrap_or(usize::MAX));
             Box::new(GraphSegmenter::learnt(settings, session).map_err(SegmentError::from)?)
         }
         Masks::Graph => Box::new(GraphSegmenter::default()),

@@ -22,11 +22,12 @@ use crate::shard::positions::PositionError;
 #[derive(Clone, Debug, PartialEq)]
 pub enum Masks {
     /// From the built-in segmenter with the embedded model.
-    Auto,
+    Auto {
+        /// Scales at which it looks, coarsest first; all if absent.
+        n_levels: Option<usize>,
+    },
     /// From the built-in segmenter without a model.
     Graph,
-    /// From the built-in segmenter with the coarsest of its scales only.
-    Levels(usize),
     /// From files that the user gives.
     Given {
         /// Their folder.
@@ -126,7 +127,7 @@ impl EncodeSettings {
             scene,
             views,
             images: None,
-            masks: Masks::Auto,
+            masks: Masks::Auto { n_levels: None },
             store,
             scene_name: "scene".into(),
             metric,

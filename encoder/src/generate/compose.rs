@@ -103,6 +103,12 @@ impl Layout {
         layout
     }
 
+    /// Furnishes a scene to learn from: its kind is the seed's too, each as often.
+    pub fn of_any_kind(seed: u64, nouns: &[Noun], colours: Colours<'_>) -> Self {
+        let kinds = [SceneKind::Room, SceneKind::Yard, SceneKind::Street];
+        Self::new(&[kinds[(seed % 3) as usize]], seed, nouns, colours)
+    }
+
     /// Returns the solids to cast rays at, in the order of [`Layout::placed`].
     pub fn solids(&self) -> Solids {
         let things = self.placed.iter().map(|p| Thing::new(&p.object.parts, p.world_from_object)).collect();

@@ -12,7 +12,7 @@ use slag_models::Crop;
 use slag_models::preprocess::{Filter, Preprocess, Resize};
 
 use super::compose::{Layout, looking, pinhole};
-use super::grammar::{Noun, SceneKind};
+use super::grammar::Noun;
 use super::paint::{Colour, Material};
 use super::render::{NOTHING, Photo, Solids};
 use super::solid::Random;
@@ -127,8 +127,7 @@ pub fn write(
 /// Returns the crops of a scene.
 pub(crate) fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(Crop, Label)> {
     let allowed = |noun: &Noun, colour| split == Split::Test || !is_held_out(noun, colour);
-    let kinds = [SceneKind::Room, SceneKind::Yard, SceneKind::Street];
-    let layout = Layout::new(&[kinds[(seed % 3) as usize]], seed, nouns, &allowed);
+    let layout = Layout::of_any_kind(seed, nouns, &allowed);
     let solids = layout.solids();
     let mut random = Random::new(seed ^ 0xc405);
     let mut out = Vec::new();

@@ -5,7 +5,7 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use super::compose::{Layout, pinhole};
-use super::grammar::{Noun, SceneKind};
+use super::grammar::Noun;
 use super::render::{NOTHING, Photo};
 use super::solid::Random;
 use super::{FIELD_OF_VIEW_RAD, GenerateError, PHOTO_PX, write_npy};
@@ -28,8 +28,7 @@ pub fn write(
     fs_err::create_dir_all(folder)?;
     progress.begin("scenes", "scene", seeds.end - seeds.start, 0);
     let of_seed = |seed: u64| {
-        let kinds = [SceneKind::Room, SceneKind::Yard, SceneKind::Street];
-        let layout = Layout::new(&[kinds[(seed % 3) as usize]], seed, nouns, &|_, _| true);
+        let layout = Layout::of_any_kind(seed, nouns, &|_, _| true);
         let solids = layout.solids();
         let start = Random::new(seed ^ 0xf070).between(0.0, 1.0);
         let views = layout.walk(N_PHOTOS, start, pinhole(PHOTO_PX, FIELD_OF_VIEW_RAD));
