@@ -7,7 +7,7 @@ use serde::Serialize;
 use slag_models::{EncodeError, TextEncoder};
 use tokio::net::TcpListener;
 
-use super::query::{Kind, Settings, Timing};
+use super::query::{Kind, Settings, Timing, quantile};
 use crate::http::{self, App};
 use crate::query::{Engine, MAX_GAUSSIANS};
 use crate::store::{EdgeCache, Snapshot};
@@ -48,6 +48,14 @@ impl TextEncoder for Given {
     }
 }
 
+/// Starts a text model of a scene's space whose texts are the places of given vectors.
+pub(super) fn given(snapshot: &Snapshot, queries: Vec<Vec<f32>>) -> io::Result<TextService> {
+    let encoder = &snapshot.manifest.encoder;
+    let (name, id) = (encoder.name.clone(), encoder.id);
+    let info = EncoderInfo { name, id, dim: encoder.dim, execution_provider: "none" };
+    TextService::start(info, Box::new(Given(queries)))
+}
+
 /// Times the best Gaussians of a cache through the service. `queries`: of unit length, at least one.
 /// `in_process`: the same answers' times without it. Sizes that the service refuses are left out.
 ///
@@ -60,11 +68,8 @@ pub fn time_http(
     settings: &Settings,
     in_process: &[Timing],
 ) -> io::Result<Vec<HttpTiming>> {
-    let encoder = &snapshot.manifest.encoder;
-    let (name, id) = (encoder.name.clone(), encoder.id);
-    let info = EncoderInfo { name, id, dim: encoder.dim, execution_provider: "none" };
     let n_queries = queries.len();
-    let text = TextService::start(info, Box::new(Given(queries)))?;
+    let text = given(snapshot, queries)?;
     let app = App::new(Engine::new(cache.clone(), text), http::Settings::default());
     app.reload_now();
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
@@ -94,9 +99,8 @@ pub fn time_http(
         }
         times_ms.sort_by(f64::total_cmp);
         let n_runs = times_ms.len();
-        let at = |share: f64| times_ms[((n_runs as f64 * share).ceil() as usize).clamp(1, n_runs) - 1];
         let same = in_process.iter().find(|timing| timing.limit == limit && timing.kind == Kind::Best);
-        let (median_ms, p99_ms) = (at(0.5), at(0.99));
+        let (median_ms, p99_ms) = (quantile(&times_ms, 0.5), quantile(&times_ms, 0.99));
         let added_ms = median_ms - same.map_or(0.0, |timing| timing.median_ms);
         timings.push(HttpTiming { limit, n_runs, body_bytes, median_ms, p99_ms, added_ms });
     }

@@ -4,6 +4,7 @@ mod dump;
 pub mod http;
 pub mod load;
 mod machine;
+pub mod objects;
 pub mod pause;
 pub mod query;
 mod scene;

@@ -11,6 +11,7 @@ use super::Random;
 pub use super::dump::{DumpError, dump_ids, dump_vectors};
 pub use super::http::{HttpTiming, time_http};
 pub use super::machine::{Machine, Memory, read_bandwidth};
+pub use super::objects::{ObjectsTiming, time_objects};
 use crate::score::{Columns, Effort, Hit, Matches, Precision, Question, Region, ScoreError, Scratch, Search};
 use crate::store::{OpenShard, Snapshot};
 
@@ -50,6 +51,9 @@ pub struct Report {
     pub read_bytes_per_s: f64,
     /// Times in process: from the query's vector to columns of Gaussians, scores and positions.
     pub in_process: Vec<Timing>,
+    /// Times of answers of objects in process; absent where the scene has none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub objects: Option<ObjectsTiming>,
     /// Times of the best through the service on loopback, as Arrow columns.
     pub http: Vec<HttpTiming>,
 }
@@ -183,6 +187,7 @@ pub fn bench_query(
         memory,
         read_bytes_per_s,
         in_process: in_process.collect(),
+        objects: None,
         http: Vec::new(),
     })
 }
@@ -286,13 +291,17 @@ fn recall(
     Ok(Some(sum / queries.len() as f64))
 }
 
+/// Returns the least of some sorted values, at least one, that so large a share of them does not exceed.
+pub(super) fn quantile<T: Copy>(sorted: &[T], share: f64) -> T {
+    sorted[((sorted.len() as f64 * share).ceil() as usize).clamp(1, sorted.len()) - 1]
+}
+
 fn timing(kind: Kind, limit: usize, runs: Vec<Run>, read_bytes_per_s: f64) -> Timing {
     let mut millis: Vec<f64> = runs.iter().map(|run| run.took.as_secs_f64() * 1e3).collect();
     millis.sort_by(f64::total_cmp);
     let mut bytes: Vec<u64> = runs.iter().map(|run| run.bytes).collect();
     bytes.sort_unstable();
-    let at = |share: f64| ((millis.len() as f64 * share).ceil() as usize).clamp(1, millis.len()) - 1;
-    let (median_ms, bytes_touched) = (millis[at(0.5)], bytes[at(0.5)]);
+    let (median_ms, bytes_touched) = (quantile(&millis, 0.5), quantile(&bytes, 0.5));
     let plain_read_ms = bytes_touched as f64 / read_bytes_per_s * 1e3;
     let found = || runs.iter().map(|run| run.n_found);
     Timing {
@@ -301,7 +310,7 @@ fn timing(kind: Kind, limit: usize, runs: Vec<Run>, read_bytes_per_s: f64) -> Ti
         n_runs: runs.len(),
         n_found: [found().min().unwrap_or(0), found().max().unwrap_or(0)],
         median_ms,
-        p99_ms: millis[at(0.99)],
+        p99_ms: quantile(&millis, 0.99),
         recall: None,
         min_ms: millis[0],
         bytes_touched,

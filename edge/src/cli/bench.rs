@@ -8,7 +8,9 @@ use clap::Args;
 use slag_common::shard::ShardView;
 use slag_edge::bench::load::{self, LoadOptions};
 use slag_edge::bench::pause::{self, PauseOptions};
-use slag_edge::bench::query::{Settings, bench_query, dump_ids, dump_vectors, make_queries, time_http};
+use slag_edge::bench::query::{
+    Settings, bench_query, dump_ids, dump_vectors, make_queries, time_http, time_objects,
+};
 use slag_edge::bench::text::{self, TextSettings};
 use slag_edge::score::Precision;
 use slag_edge::store::{OpenShard, Snapshot};
@@ -116,6 +118,8 @@ fn bench_query_command(args: BenchQueryArgs) -> Result<(), Failure> {
         n_warm_up: N_WARM_UP,
     };
     let mut report = bench_query(&snapshot, &queries, &settings).map_err(|e| failed(e.into()))?;
+    report.objects = time_objects(&cache, &snapshot, queries.clone(), &settings)
+        .map_err(|e| failed(anyhow::Error::new(e).context("timing answers of objects")))?;
     report.http = time_http(&cache, &snapshot, queries, &settings, &report.in_process)
         .map_err(|e| failed(anyhow::Error::new(e).context("timing the service on loopback")))?;
     print_json(&report)

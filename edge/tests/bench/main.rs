@@ -30,7 +30,14 @@ fn what_is_timed_is_what_is_sought() {
         let cache = dir.path().join(format!("cache-{n_blocks}"));
         scene::write_cache(
             &cache,
-            &SceneSpec { n_gaussians: 9_000, dim: 64, n_components: 24, n_groups: 8, is_balanced },
+            &SceneSpec {
+                n_gaussians: 9_000,
+                dim: 64,
+                n_components: 24,
+                n_groups: 8,
+                is_balanced,
+                n_objects: if is_balanced { 40 } else { 0 },
+            },
         );
         let dump = dir.path().join("dump");
         let name = dump.to_str().expect("UTF-8");
@@ -52,6 +59,10 @@ fn what_is_timed_is_what_is_sought() {
             assert!(found[0].as_u64() >= limit, "{timing}");
             assert!(timing["kind"] != "best" || found[1].as_u64() == limit, "{timing}");
         }
+        let objects = &report["objects"];
+        assert_eq!(objects["n_objects"].as_u64(), is_balanced.then_some(40));
+        assert!(objects["min_ms"].as_f64() <= objects["median_ms"].as_f64());
+        assert!(objects["median_ms"].as_f64() <= objects["p99_ms"].as_f64());
         let meta: Value =
             serde_json::from_slice(&std::fs::read(dump.join("meta.json")).expect("written")).expect("JSON");
         let (n, dim) = (meta["n"].as_u64().expect("n") as usize, 64);
@@ -89,14 +100,14 @@ fn what_is_timed_is_what_is_sought() {
     }
 }
 
-/// `SLAG_GENERATE="DIR N compact|balanced" cargo test ... -- --ignored` leaves a cache to time.
+/// `SLAG_GENERATE="DIR N compact|balanced N_OBJECTS" cargo test ... -- --ignored` leaves a cache to time.
 #[test]
 #[ignore = "writes a large cache where SLAG_GENERATE says"]
 fn generate() {
-    let spec = std::env::var("SLAG_GENERATE").expect("DIR N PROFILE");
-    let [dir, n, profile] = spec.split(' ').collect::<Vec<_>>()[..] else { panic!("DIR N PROFILE: {spec}") };
-    let n_gaussians = n.parse().expect("a number");
+    let spec = std::env::var("SLAG_GENERATE").expect("DIR N PROFILE N_OBJECTS");
+    let [dir, n, profile, objects] = spec.split(' ').collect::<Vec<_>>()[..] else { panic!("{spec}") };
+    let [n_gaussians, n_objects] = [n, objects].map(|n| n.parse().expect("a number"));
     let is_balanced = profile == "balanced";
-    let spec = SceneSpec { n_gaussians, dim: 512, n_components: 96, n_groups: 32, is_balanced };
+    let spec = SceneSpec { n_gaussians, dim: 512, n_components: 96, n_groups: 32, is_balanced, n_objects };
     scene::write_cache(Path::new(dir), &spec);
 }

@@ -8,6 +8,7 @@ use half::f16;
 use slag_common::Hash32;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
+use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, quantise_vectors};
 use slag_common::shard::{
     BLOCK, Basis, Positions, Profile, Residuals, ScoreErrors, ShardHeader, ShardView, WORDS, quantise,
 };
@@ -19,6 +20,10 @@ const CELL: usize = 65_536;
 const ROW: usize = 50;
 /// Kinds of things in a cell.
 const KINDS: usize = 24;
+/// Vectors of an object.
+const N_VECTORS: usize = 5;
+/// One in so many objects of a cell reaches into the next.
+const REACHING: usize = 10;
 
 pub struct SceneSpec {
     pub n_gaussians: usize,
@@ -26,6 +31,8 @@ pub struct SceneSpec {
     pub n_components: usize,
     pub n_groups: usize,
     pub is_balanced: bool,
+    /// Things in all cells, shared out evenly.
+    pub n_objects: usize,
 }
 
 /// SplitMix64 (Steele et al. 2014).
@@ -189,6 +196,13 @@ fn shard(cell_id: u32, n: usize, spec: &SceneSpec) -> (Vec<u8>, Aabb, u32) {
         errors: ScoreErrors::default(),
         encoder_id: [3; 32],
     };
+    let here = objects_of(cell_id, spec);
+    let of_objects = (!here.is_empty()).then(|| {
+        CellObjects::new(&here, n, m, bounds, |random| {
+            let kind = random.below(KINDS);
+            (0..m).map(|c| (kinds[kind * m + c] + 0.35 * random.normal()) * fall[c]).collect()
+        })
+    });
     let residuals = Residuals {
         group_starts: &group_starts,
         words: &words,
@@ -207,7 +221,89 @@ fn shard(cell_id: u32, n: usize, spec: &SceneSpec) -> (Vec<u8>, Aabb, u32) {
         residuals: spec.is_balanced.then_some(residuals),
         exact: None,
     }
-    .write(&mut bytes)
+    .write_with(&mut bytes, of_objects.as_ref().map(CellObjects::view).as_ref())
     .expect("writes to memory");
     (bytes, bounds, k as u32)
+}
+
+/// Returns the objects that have Gaussians in a cell: its own, and those that reach into it from the one before.
+fn objects_of(cell_id: u32, spec: &SceneSpec) -> Vec<u64> {
+    let n_cells = spec.n_gaussians.div_ceil(CELL);
+    let own = |cell: usize| spec.n_objects * cell / n_cells..spec.n_objects * (cell + 1) / n_cells;
+    let cell = cell_id as usize;
+    let before = cell.checked_sub(1).map(own).into_iter().flatten().filter(|object| object % REACHING == 0);
+    before.chain(own(cell)).map(|object| object as u64).collect()
+}
+
+/// The columns of a cell's objects.
+struct CellObjects {
+    header: ObjectsHeader,
+    records: Vec<ObjectRecord>,
+    vectors: Vec<i8>,
+    steps: Vec<f32>,
+    run_ends: Vec<u32>,
+    run_objects: Vec<u16>,
+    photos: String,
+}
+
+impl CellObjects {
+    /// Makes them: in turn, each takes a run of Gaussians three times, and a tenth is left to none.
+    fn new(ids: &[u64], n: usize, m: usize, bounds: Aabb, vector: impl Fn(&mut Random) -> Vec<f32>) -> Self {
+        let n_runs = 3 * ids.len() + 1;
+        let (end, numbers) = (|run: usize| (n - n / 10) * run / (n_runs - 1), 0..3 * ids.len());
+        let n_here = |number: usize| -> usize {
+            (0..3).map(|turn| number + turn * ids.len()).map(|run| end(run + 1) - end(run)).sum()
+        };
+        let mut random = Random(ids[0] + 77);
+        let (mut vectors, mut steps) = (Vec::new(), Vec::new());
+        for _ in ids {
+            let sides: Vec<f32> = (0..N_VECTORS).flat_map(|_| vector(&mut random)).collect();
+            let (components, of_vectors) = quantise_vectors(&sides, m, N_VECTORS);
+            vectors.extend(components);
+            steps.extend(of_vectors);
+        }
+        let record = |(number, id): (usize, &u64)| ObjectRecord {
+            id: *id,
+            position_in_world: ((bounds.min + bounds.max) * 0.5).to_array(),
+            box_min: bounds.min.to_array(),
+            box_max: bounds.max.to_array(),
+            n_gaussians: 2 * n as u32,
+            n_gaussians_here: n_here(number) as u32,
+            photo_box_px: [1, 2, 30, 40],
+            photo_start: 0,
+            photo_bytes: 12,
+        };
+        let photos: String = (0..ids.len().min(300)).map(|photo| format!("frame{photo:03}.jpg")).collect();
+        let ends = numbers.clone().map(|run| end(run + 1) as u32).chain([n as u32]);
+        let objects = numbers.map(|run| (run % ids.len()) as u16).chain([NO_OBJECT]);
+        Self {
+            header: ObjectsHeader {
+                n_objects: ids.len() as u32,
+                n_vectors: N_VECTORS as u32,
+                n_runs: n_runs as u32,
+                photos_bytes: photos.len() as u32,
+                score_mean: 0.0,
+                score_spread: 0.06,
+                score_error_bound: 0.05,
+            },
+            records: ids.iter().enumerate().map(record).collect(),
+            vectors,
+            steps,
+            run_ends: ends.collect(),
+            run_objects: objects.collect(),
+            photos,
+        }
+    }
+
+    fn view(&self) -> Objects<'_> {
+        Objects {
+            header: self.header,
+            records: &self.records,
+            vectors: &self.vectors,
+            steps: &self.steps,
+            run_ends: &self.run_ends,
+            run_objects: &self.run_objects,
+            photos: &self.photos,
+        }
+    }
 }
