@@ -113,8 +113,8 @@ pub struct Objects<'a> {
     pub run_ends: &'a [u32],
     /// `[n_runs]`.
     pub run_objects: &'a [u16],
-    /// Names of photos.
-    pub photos: &'a str,
+    /// Names of photos, UTF-8.
+    pub photos: &'a [u8],
 }
 
 impl<'a> Objects<'a> {
@@ -127,14 +127,20 @@ impl<'a> Objects<'a> {
             (section::STEPS, container::bytes_of(self.steps)),
             (section::RUN_ENDS, container::bytes_of(self.run_ends)),
             (section::RUN_OBJECTS, container::bytes_of(self.run_objects)),
-            (section::PHOTOS, self.photos.as_bytes()),
+            (section::PHOTOS, self.photos),
         ]
     }
 
     /// Returns the name of the photo that shows an object best.
     pub fn photo(&self, record: &ObjectRecord) -> &'a str {
         let start = record.photo_start as usize;
-        self.photos.get(start..start + record.photo_bytes as usize).unwrap_or_default()
+        let name = self.photos.get(start..start + record.photo_bytes as usize);
+        name.and_then(|name| std::str::from_utf8(name).ok()).unwrap_or_default()
+    }
+
+    /// Returns the indices of a run's Gaussians in the shard.
+    pub fn run(&self, run: usize) -> Range<u32> {
+        run.checked_sub(1).map_or(0, |before| self.run_ends[before])..self.run_ends[run]
     }
 
     /// Returns the runs of Gaussians: their indices in the shard, and their object's.
@@ -144,15 +150,17 @@ impl<'a> Objects<'a> {
         starts.zip(self.run_ends).zip(self.run_objects).map(move |((s, e), o)| (*s..*e, object(*o)))
     }
 
-    /// Returns the score of each object with a query (`[dim]`), see [`object_score`]. `shard`: the one that they are of.
+    /// Returns the score of each object with a query (`[dim]`), see [`object_score`], in float64. `shard`: the one that
+    /// they are of.
     pub fn scores(&self, shard: &ShardView<'_>, query: &[f32]) -> Vec<f32> {
         let (offset, of_components) = shard.components_of_query(query);
-        let product = |(vector, step): (&[i8], &f32)| {
-            let sum: f64 = vector.iter().zip(&of_components).map(|(v, q)| f64::from(*v) * q).sum();
+        let m = of_components.len();
+        let product = |(at, step): (usize, &f32)| {
+            let vector = self.vectors[at * m..][..m].iter();
+            let sum: f64 = vector.zip(&of_components).map(|(v, q)| f64::from(*v) * q).sum();
             (offset + f64::from(*step) * sum) as f32
         };
-        let products: Vec<f32> =
-            self.vectors.chunks_exact(of_components.len().max(1)).zip(self.steps).map(product).collect();
+        let products: Vec<f32> = self.steps.iter().enumerate().map(product).collect();
         products.chunks_exact(self.header.n_vectors as usize).map(object_score).collect()
     }
 
@@ -160,10 +168,9 @@ impl<'a> Objects<'a> {
     pub fn decode(&self, shard: &ShardView<'_>) -> Vec<f64> {
         let (m, dim) = (shard.header.n_components as usize, shard.header.dim as usize);
         let mut vectors = vec![0.0; self.steps.len() * dim];
-        for ((out, vector), step) in
-            vectors.chunks_exact_mut(dim).zip(self.vectors.chunks_exact(m.max(1))).zip(self.steps)
-        {
-            let components: Vec<f64> = vector.iter().map(|v| f64::from(*v) * f64::from(*step)).collect();
+        for (at, (out, step)) in vectors.chunks_exact_mut(dim).zip(self.steps).enumerate() {
+            let vector = self.vectors[at * m..][..m].iter();
+            let components: Vec<f64> = vector.map(|v| f64::from(*v) * f64::from(*step)).collect();
             shard.combine(&components, out);
         }
         vectors
@@ -280,7 +287,7 @@ impl ObjectsLayout {
             steps: bytemuck::cast_slice(steps),
             run_ends: bytemuck::cast_slice(run_ends),
             run_objects: bytemuck::cast_slice(run_objects),
-            photos: std::str::from_utf8(photos).unwrap_or_default(),
+            photos,
         }
     }
 }

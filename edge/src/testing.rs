@@ -53,6 +53,7 @@ pub struct BuiltShard {
 /// An object of a test shard: id, vectors, runs of Gaussians in the shard, and how many it has in all.
 pub struct TestObject {
     pub id: u64,
+    /// In components of the shard's rows.
     pub vectors: Vec<f32>,
     pub runs: Vec<std::ops::Range<u32>>,
     pub n_gaussians: u32,
@@ -62,7 +63,7 @@ impl BuiltShard {
     /// Writes the shard again, with objects: boxes around the origin, photos named by their ids.
     pub fn with_objects(&self, objects: &[TestObject], calibration: Calibration) -> Self {
         let shard = self.view();
-        let dim = shard.header.dim as usize;
+        let m = shard.header.n_components as usize;
         let mut object_of = vec![NO_OBJECT; shard.header.n_gaussians as usize];
         let (mut records, mut vectors, mut steps, mut photos) = (vec![], vec![], vec![], String::new());
         for (number, object) in (0u16..).zip(objects) {
@@ -80,7 +81,7 @@ impl BuiltShard {
                 photo_bytes: photo.len() as u32,
             });
             photos += &photo;
-            let (components, of_vectors) = quantise_vectors(&object.vectors, dim, 3);
+            let (components, of_vectors) = quantise_vectors(&object.vectors, m, 3);
             vectors.extend(components);
             steps.extend(of_vectors);
         }
@@ -104,7 +105,7 @@ impl BuiltShard {
             steps: &steps,
             run_ends: &ends.collect::<Vec<u32>>(),
             run_objects: &runs.iter().map(|run| run[0]).collect::<Vec<u16>>(),
-            photos: &photos,
+            photos: photos.as_bytes(),
         };
         let mut bytes = Vec::new();
         shard.write_with(&mut bytes, Some(&objects)).expect("writes to memory");

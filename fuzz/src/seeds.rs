@@ -163,7 +163,7 @@ fn shard(is_exact: bool) -> Vec<u8> {
         steps: &[0.01, 0.02, 0.005, 0.0],
         run_ends: &[2, 3, 5, 6],
         run_objects: &[1, NO_OBJECT, 0, 1],
-        photos: "a.jpg",
+        photos: b"a.jpg",
     };
     view.write_with(&mut out, is_exact.then_some(&objects)).expect("writes to memory");
     out

@@ -79,18 +79,14 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
         steps: &parts.steps,
         run_ends: &parts.run_ends,
         run_objects: &parts.run_objects,
-        // A hostile writer need not keep to UTF-8; a str must.
-        photos: "",
+        photos: &parts.photos,
     };
     let mut out = Vec::new();
     let sections: Vec<(u32, Vec<u8>)> = {
         shard.write(&mut out).expect("writes to memory");
         let own = Layout::check(&out, crate::shard::MAGIC, crate::shard::VERSION).expect("valid");
         let ids = (1..=19).filter_map(|id| own.find(id).map(|range| (id, out[range].to_vec())));
-        let of_objects = objects.sections().map(|(id, bytes)| match id {
-            section::PHOTOS => (id, parts.photos.clone()),
-            _ => (id, bytes.to_vec()),
-        });
+        let of_objects = objects.sections().map(|(id, bytes)| (id, bytes.to_vec()));
         ids.chain(of_objects).collect()
     };
     let sections: Vec<(u32, &[u8])> = sections.iter().map(|(id, bytes)| (*id, &bytes[..])).collect();
@@ -107,6 +103,7 @@ fn round_trip() {
     assert_eq!(objects.records, [record(0xdead_beef_0000_0001, 2, 0..5), record(7, 3, 5..10)]);
     assert_eq!(objects.records.iter().map(|r| objects.photo(r)).collect::<Vec<_>>(), ["a.jpg", "ü.pn"]);
     let runs: Vec<_> = objects.runs().collect();
+    assert!(runs.iter().enumerate().all(|(at, (run, _))| objects.run(at) == *run));
     assert_eq!(runs, [(0..2, Some(1)), (2..3, None), (3..5, Some(0)), (5..6, Some(1))]);
     // By hand: object 0 has mean (1, 0, 0) and side (0, 1, 0); object 1 has mean (0, 0, 0.6) and side 0.
     let scores = objects.scores(&layout.view(&bytes), &[0.5, 0.25, -1.0]);

@@ -270,7 +270,8 @@ impl Engine {
         let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(OpenShard::view).collect();
         let fetched = (snapshot.current.centre_in_world, snapshot.current.radius);
         let objects: Vec<Option<Objects<'_>>> = snapshot.shards.iter().map(OpenShard::objects).collect();
-        let scene = Scene { shards: &shards, objects: &objects, manifest: &snapshot.manifest, fetched };
+        let (index, manifest) = (&snapshot.objects, &snapshot.manifest);
+        let scene = Scene { shards: &shards, objects: &objects, index, manifest, fetched };
         let idle = || self.idle.lock().unwrap_or_else(PoisonError::into_inner);
         let mut scratch = idle().pop().unwrap_or_default();
         let answers = answer(&mut scratch, &scene, &questions, request);

@@ -11,6 +11,7 @@ mod request;
 mod threshold;
 
 use glam::DVec3;
+use rayon::prelude::*;
 use slag_common::manifest::{Calibration, Manifest};
 use slag_common::objects::Objects;
 use slag_common::shard::ShardView;
@@ -28,10 +29,12 @@ pub use request::{
 pub use threshold::{RELEVANCY_THRESHOLD, ThresholdSource, calibrated_threshold};
 
 use crate::score::{
-    Question, RELEVANCY_STEEPNESS, ScoreError, Scratch, Search, relevancy, score_of_relevancy,
+    ObjectScores, Question, RELEVANCY_STEEPNESS, Region, ScoreError, Scratch, Search, relevancy,
+    score_objects, score_of_relevancy,
 };
+use crate::store::objects::ObjectIndex;
 use cluster::{Cluster, Grouping, cluster};
-use objects::{FoundObject, Members};
+use objects::FoundObject;
 
 /// Edge of the voxels in a metric scene, metres: parts of one piece of furniture are nearer to each
 /// other than two such edges, two pieces of furniture mostly are not.
@@ -47,6 +50,8 @@ pub struct Scene<'a> {
     pub shards: &'a [ShardView<'a>],
     /// The objects of each, where it has them.
     pub objects: &'a [Option<Objects<'a>>],
+    /// Which of those are the same.
+    pub index: &'a ObjectIndex,
     /// Their manifest.
     pub manifest: &'a Manifest,
     /// The part of space that was fetched: centre and radius.
@@ -66,90 +71,123 @@ pub fn answer(
     questions: &[Question],
     request: &QueryRequest,
 ) -> Result<Vec<Answers>, ScoreError> {
+    let asked = request.texts.iter().map(String::as_str).zip(questions);
+    let level =
+        request.level.unwrap_or(if scene.index.is_empty() { Level::Clusters } else { Level::Objects });
+    if level == Level::Objects {
+        let scored = score_objects(scene.shards, scene.objects, scene.index, questions)?;
+        let answer = |((text, question), scored)| answer_objects(scene, text, question, scored, request);
+        return Ok(asked.zip(&scored).map(answer).collect());
+    }
     let searches = Search::batch(scratch, scene.shards, questions, request.region(), request.precision)?;
-    let asked = request.texts.iter().zip(questions).zip(&searches);
-    Ok(asked.map(|((text, question), search)| answer_one(scene, text, question, search, request)).collect())
+    let answer =
+        |((text, question), search)| answer_gaussians(scene, (text, level), question, search, request);
+    Ok(asked.zip(&searches).map(answer).collect())
 }
 
-fn answer_one(
+/// Answers a question by the objects that match; no row of Gaussians is scored.
+fn answer_objects(
     scene: &Scene<'_>,
     text: &str,
+    question: &Question,
+    scored: &ObjectScores,
+    request: &QueryRequest,
+) -> Answers {
+    let (manifest, scale, region) = (scene.manifest, Scale::of(question), request.region());
+    let said = scale.threshold(request, manifest, objects::calibration(scene.objects));
+    let of_score = scale.to_score(said.0);
+    let found = objects::matching(scene, &scored.scores, of_score, &region, request.min_count);
+    let n_matching = found.iter().map(|object| object.n_gaussians).sum();
+    let standing =
+        |object: &FoundObject<'_>| (scale.shown(object.score), object.n_gaussians, object.record.position());
+    let ranked = rank(found, said.0, manifest, request, standing);
+    // Of those that are told alone.
+    let described = ranked.into_par_iter().map(|ranked| object_answer(scene, ranked, scale, &region));
+    let found = Found::Clusters(described.collect());
+    let best = objects::best(&scored.scores);
+    let best = best.map(|best| (scale.shown(scored.scores[best]), objects::record(scene, best).position()));
+    let searched = scene.shards.iter().filter(|shard| region.touches(&shard.position_box()));
+    Answers {
+        n_searched: searched.map(|shard| shard.n_with_evidence() as u64).sum(),
+        n_matching,
+        score_error_bound: scale.error_bound(scored.error_bound),
+        reason: found.is_empty().then(|| reason_of_objects(request, said.0, best)),
+        answers: found,
+        ..nothing(scene, (text, Level::Objects), scale, said, request)
+    }
+}
+
+/// Answers a question by the Gaussians that match, or by clusters of them.
+fn answer_gaussians(
+    scene: &Scene<'_>,
+    (text, level): (&str, Level),
     question: &Question,
     search: &Search<'_>,
     request: &QueryRequest,
 ) -> Answers {
     let manifest = scene.manifest;
     let scale = Scale::of(question);
-    let level = request.level.unwrap_or(match objects::are_there(scene.objects) {
-        true => Level::Objects,
-        false => Level::Clusters,
-    });
-    let (threshold, threshold_source) = match level {
-        Level::Objects => scale.threshold(request, manifest, objects::calibration(scene.objects)),
-        _ => scale.threshold(request, manifest, manifest.encoder.calibration),
-    };
+    let (threshold, threshold_source) = scale.threshold(request, manifest, manifest.encoder.calibration);
     let score_threshold = scale.to_score(threshold);
-    let limit = request.limit.unwrap_or(DEFAULT_LIMIT);
     let mut clustering = None;
-    let mut best_object = None;
     let n_matching;
-    let found = match level {
-        Level::Objects => {
-            let all = objects::scored(scene.shards, scene.objects, question);
-            best_object = all.first().map(|best| (scale.shown(best.score), best.record.position()));
-            let matching = all.iter().take_while(|object| object.score >= score_threshold);
-            let described = matching.filter_map(|object| {
-                let members =
-                    object.members(scene.shards, scene.objects, &request.region(), alignment(manifest))?;
-                (members.n_gaussians >= request.min_count)
-                    .then(|| object_answer(object, members, scale, manifest))
-            });
-            let described: Vec<ClusterAnswer> = described.collect();
-            n_matching = described.iter().map(|object| object.n_gaussians).sum();
-            let voxel = request.voxel.unwrap_or_else(|| default_voxel(manifest));
-            Found::Clusters(rank(described, threshold, voxel, limit, request.near))
-        }
-        Level::Clusters => {
-            let mut matches = search.matching(score_threshold);
-            matches.runs.iter_mut().for_each(|run| run.score = scale.shown(run.score));
-            n_matching = matches.n_gaussians;
-            let voxel = request.voxel.unwrap_or_else(|| default_voxel(manifest));
-            let grouping =
-                Grouping { voxel, min_count: request.min_count, threshold, alignment: alignment(manifest) };
-            let grouped = cluster(scene.shards, &matches.runs, &grouping);
-            clustering = Some(Clustering {
-                voxel: grouped.voxel,
-                min_count: request.min_count,
-                n_clusters: grouped.clusters.len() as u64,
-                n_small_clusters: grouped.n_small,
-                n_gaussians_in_small_clusters: grouped.n_gaussians_in_small,
-            });
-            let described = grouped.clusters.into_iter().map(|cluster| cluster_answer(cluster, manifest));
-            Found::Clusters(rank(described.collect(), threshold, voxel, limit, request.near))
-        }
-        Level::Gaussians => {
-            let mut hits = search.best(limit, score_threshold, request.near);
-            // Where all are listed, nobody need count them again.
-            let is_whole = hits.len() < limit;
-            n_matching =
-                if is_whole { hits.len() as u64 } else { search.matching(score_threshold).n_gaussians };
-            hits.iter_mut().for_each(|hit| hit.score = scale.shown(hit.score));
-            Found::Gaussians(hits)
-        }
+    let found = if level == Level::Gaussians {
+        let limit = request.limit.unwrap_or(DEFAULT_LIMIT);
+        let mut hits = search.best(limit, score_threshold, request.near);
+        // Where all are listed, nobody need count them again.
+        let is_whole = hits.len() < limit;
+        n_matching = if is_whole { hits.len() as u64 } else { search.matching(score_threshold).n_gaussians };
+        hits.iter_mut().for_each(|hit| hit.score = scale.shown(hit.score));
+        Found::Gaussians(hits)
+    } else {
+        let mut matches = search.matching(score_threshold);
+        matches.runs.iter_mut().for_each(|run| run.score = scale.shown(run.score));
+        n_matching = matches.n_gaussians;
+        let voxel = request.voxel.unwrap_or_else(|| default_voxel(manifest));
+        let (min_count, alignment) = (request.min_count, alignment(manifest));
+        let grouped =
+            cluster(scene.shards, &matches.runs, &Grouping { voxel, min_count, threshold, alignment });
+        clustering = Some(Clustering {
+            voxel: grouped.voxel,
+            min_count,
+            n_clusters: grouped.clusters.len() as u64,
+            n_small_clusters: grouped.n_small,
+            n_gaussians_in_small_clusters: grouped.n_gaussians_in_small,
+        });
+        let standing = |of: &Cluster| (of.score, of.n_gaussians, of.position_in_world);
+        let ranked = rank(grouped.clusters, threshold, manifest, request, standing);
+        Found::Clusters(ranked.into_iter().map(|ranked| cluster_answer(ranked, manifest)).collect())
     };
-    let reason = found.is_empty().then(|| match level {
-        Level::Objects => reason_of_objects(request, threshold, best_object),
-        _ => reason(search, scale, request, threshold, n_matching),
-    });
     // Gaussians of exact shards are listed with their own scores, clusters with their rows'.
-    // With negatives a score is the difference of two.
-    let n_products = if question.negatives.is_empty() { 1.0 } else { 2.0 };
     let score_error_bound = scale.error_bound(match (search.is_exact(), level) {
-        (_, Level::Objects) => n_products * objects::score_error_bound(scene.objects),
         (true, Level::Gaussians) => question.rounding_bound(),
         _ => search.score_error_bound(),
     });
-    let measured = search.measured_errors().filter(|_| level != Level::Objects);
+    // With negatives a score is the difference of two.
+    let n_products = if question.negatives.is_empty() { 1.0 } else { 2.0 };
+    let measured = search.measured_errors();
+    Answers {
+        n_searched: search.searched().map(|shard| shard.n_with_evidence() as u64).sum(),
+        n_matching,
+        is_exact: search.is_exact(),
+        score_error_bound,
+        score_error_p999: measured.map(|errors| scale.error_bound(n_products * errors.p999)),
+        clustering,
+        reason: found.is_empty().then(|| reason(search, scale, request, threshold, n_matching)),
+        answers: found,
+        ..nothing(scene, (text, level), scale, (threshold, threshold_source), request)
+    }
+}
+
+/// Returns an answer of nothing, with what an answer says of its question and its scene.
+fn nothing(
+    scene: &Scene<'_>,
+    (text, level): (&str, Level),
+    scale: Scale,
+    (threshold, threshold_source): (f32, ThresholdSource),
+    request: &QueryRequest,
+) -> Answers {
+    let manifest = scene.manifest;
     Answers {
         text: text.to_owned(),
         negatives: request.negatives.phrases().into_iter().map(str::to_owned).collect(),
@@ -160,15 +198,15 @@ fn answer_one(
         score_kind: scale.0,
         threshold,
         threshold_source,
-        n_searched: search.searched().map(|shard| shard.n_with_evidence() as u64).sum(),
-        n_matching,
-        is_exact: search.is_exact() && level != Level::Objects,
-        score_error_bound,
-        score_error_p999: measured.map(|errors| scale.error_bound(n_products * errors.p999)),
+        n_searched: 0,
+        n_matching: 0,
+        is_exact: false,
+        score_error_bound: 0.0,
+        score_error_p999: None,
         area_fetched: area_fetched(scene.fetched, request),
-        clustering,
-        reason,
-        answers: found,
+        clustering: None,
+        reason: None,
+        answers: Found::Clusters(Vec::new()),
     }
 }
 
@@ -260,10 +298,45 @@ pub fn relevance(score: f32, threshold: f32, n_gaussians: u64, distance: Option<
     (margin * (1.0 + n_gaussians as f64).ln() / (1.0 + distance.unwrap_or(0.0) / half)) as f32
 }
 
-/// Describes a cluster; rank, relevance and distance are still open.
-fn cluster_answer(cluster: Cluster, manifest: &Manifest) -> ClusterAnswer {
+/// What was found, and where it stands among the answers.
+struct Ranked<T> {
+    found: T,
+    rank: usize,
+    relevance: f32,
+    distance: Option<f64>,
+}
+
+/// Ranks what was found in a fixed order, in which equals stay, and keeps as many as are asked for. `standing`: score as it is
+/// shown, Gaussians, and place.
+fn rank<T>(
+    found: Vec<T>,
+    threshold: f32,
+    manifest: &Manifest,
+    request: &QueryRequest,
+    standing: impl Fn(&T) -> (f32, u64, DVec3),
+) -> Vec<Ranked<T>> {
+    let half = VOXELS_TO_HALF_RELEVANCE * request.voxel.unwrap_or_else(|| default_voxel(manifest));
+    let weighed = found.into_iter().map(|found| {
+        let (score, n_gaussians, at) = standing(&found);
+        let distance = request.near.map(|near| near.distance(at));
+        let relevance = relevance(score, threshold, n_gaussians, distance, half);
+        Ranked { found, rank: 0, relevance, distance }
+    });
+    let mut ranked: Vec<Ranked<T>> = weighed.collect();
+    ranked.sort_by(|a, b| {
+        let nearer = a.distance.unwrap_or(0.0).total_cmp(&b.distance.unwrap_or(0.0));
+        b.relevance.total_cmp(&a.relevance).then(nearer)
+    });
+    ranked.truncate(request.limit.unwrap_or(DEFAULT_LIMIT));
+    ranked.iter_mut().zip(1..).for_each(|(ranked, rank)| ranked.rank = rank);
+    ranked
+}
+
+/// Describes a cluster.
+fn cluster_answer(ranked: Ranked<Cluster>, manifest: &Manifest) -> ClusterAnswer {
+    let Ranked { found: cluster, rank, relevance, distance } = ranked;
     ClusterAnswer {
-        rank: 0,
+        rank,
         id: format!("{}-{}", cluster.first.0, cluster.first.1),
         position_in_world: cluster.position_in_world,
         geographic: manifest.geo_reference.map(|geo| geo.geographic_from_world(cluster.position_in_world)),
@@ -276,59 +349,42 @@ fn cluster_answer(cluster: Cluster, manifest: &Manifest) -> ClusterAnswer {
         n_gaussians: cluster.n_gaussians,
         n_gaussians_in_scene: None,
         evidence: None,
-        relevance: 0.0,
-        distance: None,
+        relevance,
+        distance,
     }
 }
 
 /// Describes an object likewise.
 fn object_answer(
-    object: &FoundObject<'_>,
-    members: Members,
+    scene: &Scene<'_>,
+    ranked: Ranked<FoundObject<'_>>,
     scale: Scale,
-    manifest: &Manifest,
+    region: &Region,
 ) -> ClusterAnswer {
-    let (record, position) = (object.record, object.record.position());
-    let (bounds, score) = (record.bounds(), scale.shown(object.score));
+    let Ranked { found: FoundObject { object, record, score, n_gaussians }, rank, relevance, distance } =
+        ranked;
+    let (manifest, position) = (scene.manifest, record.position());
+    let (bounds, score) = (record.bounds(), scale.shown(score));
     ClusterAnswer {
-        rank: 0,
+        rank,
         id: format!("o{:016x}", record.id),
         position_in_world: position,
         geographic: manifest.geo_reference.map(|geo| geo.geographic_from_world(position)),
         box_min_in_world: bounds.min,
         box_max_in_world: bounds.max,
         size: bounds.size(),
-        oriented_box: members.oriented_box,
+        oriented_box: objects::oriented_box(scene, object, region, alignment(manifest)),
         score,
         best_score: score,
-        n_gaussians: members.n_gaussians,
+        n_gaussians,
         n_gaussians_in_scene: Some(u64::from(record.n_gaussians)),
-        evidence: Some(Evidence { photo: object.photo.to_owned(), box_px: record.photo_box_px }),
-        relevance: 0.0,
-        distance: None,
+        evidence: Some(Evidence {
+            photo: objects::photo(scene, object).to_owned(),
+            box_px: record.photo_box_px,
+        }),
+        relevance,
+        distance,
     }
-}
-
-/// Ranks what was described in a fixed order, in which equals stay.
-fn rank(
-    mut described: Vec<ClusterAnswer>,
-    threshold: f32,
-    voxel: f64,
-    limit: usize,
-    near: Option<DVec3>,
-) -> Vec<ClusterAnswer> {
-    let half = VOXELS_TO_HALF_RELEVANCE * voxel;
-    for answer in &mut described {
-        answer.distance = near.map(|near| near.distance(answer.position_in_world));
-        answer.relevance = relevance(answer.score, threshold, answer.n_gaussians, answer.distance, half);
-    }
-    described.sort_by(|a, b| {
-        let nearer = a.distance.unwrap_or(0.0).total_cmp(&b.distance.unwrap_or(0.0));
-        b.relevance.total_cmp(&a.relevance).then(nearer)
-    });
-    described.truncate(limit);
-    described.iter_mut().enumerate().for_each(|(at, answer)| answer.rank = at + 1);
-    described
 }
 
 /// `best`: score and place of the best object on board.

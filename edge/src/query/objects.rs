@@ -3,42 +3,28 @@
 //! An object that reaches into several cells is in the shards of all: it is scored once, and its Gaussians are those
 //! on board that lie in the region asked for.
 
-use std::collections::BTreeMap;
-
 use glam::DVec3;
 use slag_common::manifest::Calibration;
 use slag_common::objects::{ObjectRecord, Objects};
-use slag_common::shard::ShardView;
 
+use super::Scene;
 use super::oriented::{Alignment, OrientedBox};
-use crate::score::{Question, Region};
+use crate::score::Region;
+use crate::store::objects::Part;
 
 /// As [`super::cluster`] trims its boxes.
 const TRIMMED: f64 = 0.02;
 
-/// An object, some of it on board.
+/// An object that matches.
 pub struct FoundObject<'a> {
+    /// Its place in the index.
+    pub object: usize,
     /// What its shards say of it.
     pub record: &'a ObjectRecord,
-    /// The photo that shows it best.
-    pub photo: &'a str,
     /// Its score with the question.
     pub score: f32,
-    /// Where it is on board: shards, and its number in each.
-    parts: Vec<(usize, usize)>,
-}
-
-/// An object's Gaussians on board, in the region asked for.
-pub struct Members {
-    /// How many.
+    /// Its Gaussians on board, in the region asked for.
     pub n_gaussians: u64,
-    /// A box around them.
-    pub oriented_box: OrientedBox,
-}
-
-/// Returns whether there is any object on board.
-pub fn are_there(objects: &[Option<Objects<'_>>]) -> bool {
-    objects.iter().flatten().any(|objects| !objects.records.is_empty())
 }
 
 /// Returns how a bank of texts scores over the objects of the scene.
@@ -47,57 +33,79 @@ pub fn calibration(objects: &[Option<Objects<'_>>]) -> Option<Calibration> {
     Some(Calibration { score_mean: header.score_mean, score_spread: header.score_spread })
 }
 
-/// Returns the objects on board, best first. A score is `s(q)`, or `s(q) - max_j s(n_j)` with negatives, s being
-/// [`slag_common::objects::object_score`].
-pub fn scored<'a>(
-    shards: &[ShardView<'_>],
-    objects: &[Option<Objects<'a>>],
-    question: &Question,
+/// Returns the object with the best score, the first of equals.
+pub fn best(scores: &[f32]) -> Option<usize> {
+    (0..scores.len()).reduce(|best, object| if scores[object] > scores[best] { object } else { best })
+}
+
+/// Returns the objects whose scores reach a threshold and that have at least so many Gaussians, and one, in a region; best
+/// first, equals by id.
+pub fn matching<'a>(
+    scene: &Scene<'a>,
+    scores: &[f32],
+    threshold: f32,
+    region: &Region,
+    min_count: u64,
 ) -> Vec<FoundObject<'a>> {
-    let mut found: BTreeMap<u64, FoundObject<'a>> = BTreeMap::new();
-    for (shard, objects) in objects.iter().enumerate().filter_map(|(i, o)| Some((i, o.as_ref()?))) {
-        let mut scores = objects.scores(&shards[shard], &question.vector);
-        let negatives = question.negatives.iter().map(|negative| objects.scores(&shards[shard], negative));
-        let likest = negatives.reduce(|a, b| a.iter().zip(b).map(|(a, b)| a.max(b)).collect());
-        scores.iter_mut().zip(likest.into_iter().flatten()).for_each(|(score, likest)| *score -= likest);
-        for (number, (record, score)) in objects.records.iter().zip(scores).enumerate() {
-            let new = || FoundObject { record, photo: objects.photo(record), score, parts: Vec::new() };
-            found.entry(record.id).or_insert_with(new).parts.push((shard, number));
-        }
-    }
-    let mut found: Vec<_> = found.into_values().collect();
-    found.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.record.id.cmp(&b.record.id)));
+    let reaching = (0..scores.len()).filter(|object| scores[*object] >= threshold);
+    let found = reaching.filter_map(|object| {
+        let n_gaussians = scene.index.parts(object).iter().map(|part| count(scene, *part, region)).sum();
+        let is_found = n_gaussians >= min_count.max(1);
+        is_found.then(|| FoundObject {
+            object,
+            record: record(scene, object),
+            score: scores[object],
+            n_gaussians,
+        })
+    });
+    let mut found: Vec<_> = found.collect();
+    found.sort_by(|a, b| b.score.total_cmp(&a.score));
     found
 }
 
-/// Returns the bound on the error of an object's score with one vector.
-pub fn score_error_bound(objects: &[Option<Objects<'_>>]) -> f32 {
-    objects.iter().flatten().map(|objects| objects.header.score_error_bound).fold(0.0, f32::max)
+/// Returns what the shards say of an object.
+pub fn record<'a>(scene: &Scene<'a>, object: usize) -> &'a ObjectRecord {
+    let first = scene.index.parts(object)[0];
+    &of_part(scene, first).records[first.number as usize]
 }
 
-impl FoundObject<'_> {
-    /// Returns its Gaussians; `None` if none on board lies in the region.
-    pub fn members(
-        &self,
-        shards: &[ShardView<'_>],
-        objects: &[Option<Objects<'_>>],
-        region: &Region,
-        alignment: Alignment,
-    ) -> Option<Members> {
-        let mut points: Vec<DVec3> = Vec::new();
-        for (shard, number) in &self.parts {
-            let runs = objects[*shard].iter().flat_map(Objects::runs);
-            let of_object = runs.filter(|(_, object)| *object == Some(*number));
-            let places =
-                of_object.flat_map(|(run, _)| run.map(|i| shards[*shard].position_in_world(i as usize)));
-            points.extend(places.filter(|point| region.contains(*point)));
-        }
-        let bounds = self.record.bounds();
-        let in_box = |p: &DVec3| p.cmpge(bounds.min).all() && p.cmple(bounds.max).all();
-        let n_gaussians = points.len() as u64;
-        (n_gaussians > 0).then(|| Members {
-            n_gaussians,
-            oriented_box: OrientedBox::around(&points, in_box, alignment, TRIMMED),
-        })
+/// Returns the photo that shows an object best.
+pub fn photo<'a>(scene: &Scene<'a>, object: usize) -> &'a str {
+    of_part(scene, scene.index.parts(object)[0]).photo(record(scene, object))
+}
+
+/// Returns a box around an object's Gaussians in a region.
+pub fn oriented_box(scene: &Scene<'_>, object: usize, region: &Region, alignment: Alignment) -> OrientedBox {
+    let parts = scene.index.parts(object).iter();
+    let points: Vec<DVec3> = parts.flat_map(|part| points(scene, *part, region)).collect();
+    let bounds = record(scene, object).bounds();
+    let in_box = |p: &DVec3| p.cmpge(bounds.min).all() && p.cmple(bounds.max).all();
+    OrientedBox::around(&points, in_box, alignment, TRIMMED)
+}
+
+/// Returns how many Gaussians of a part lie in a region; looks at them only where its border crosses the shard.
+fn count(scene: &Scene<'_>, part: Part, region: &Region) -> u64 {
+    let reach = scene.shards[part.shard as usize].position_box();
+    if !region.touches(&reach) {
+        return 0;
+    }
+    if region.covers(&reach) {
+        return u64::from(of_part(scene, part).records[part.number as usize].n_gaussians_here);
+    }
+    points(scene, part, region).count() as u64
+}
+
+/// Returns where the Gaussians of a part that lie in a region are.
+fn points<'a>(scene: &'a Scene<'_>, part: Part, region: &'a Region) -> impl Iterator<Item = DVec3> + 'a {
+    let shard = &scene.shards[part.shard as usize];
+    let members = scene.index.runs(part, of_part(scene, part)).flatten();
+    members.map(|i| shard.position_in_world(i as usize)).filter(|point| region.contains(*point))
+}
+
+/// Returns the objects of a part's shard.
+fn of_part<'a>(scene: &Scene<'a>, part: Part) -> &'a Objects<'a> {
+    match &scene.objects[part.shard as usize] {
+        Some(objects) => objects,
+        None => unreachable!("only shards with objects have parts"),
     }
 }

@@ -16,6 +16,7 @@ fn ask(built: &[BuiltShard], edit: impl FnOnce(&mut QueryRequest, &mut Manifest)
     ask_about(built, &[Question::new([1.0, 0.0])], edit).remove(0)
 }
 
+/// Checks on the way that rows are scored for the levels that need them, and for no other.
 fn ask_about(
     built: &[BuiltShard],
     questions: &[Question],
@@ -26,9 +27,12 @@ fn ask_about(
     request.check().expect("a sound request");
     let shards: Vec<_> = built.iter().map(BuiltShard::view).collect();
     let objects: Vec<_> = built.iter().map(|shard| shard.layout.objects(&shard.bytes)).collect();
-    let scene =
-        Scene { shards: &shards, objects: &objects, manifest: &manifest, fetched: (DVec3::ZERO, 50.0) };
-    answer(&mut Scratch::default(), &scene, questions, &request).expect("answers")
+    let (index, fetched) = (ObjectIndex::new(&objects), (DVec3::ZERO, 50.0));
+    let scene = Scene { shards: &shards, objects: &objects, index: &index, manifest: &manifest, fetched };
+    let mut scratch = Scratch::default();
+    let answers = answer(&mut scratch, &scene, questions, &request).expect("answers");
+    assert!(answers.iter().all(|answers| (answers.level == Level::Objects) == scratch.is_untouched()));
+    answers
 }
 
 fn described(built: &[BuiltShard], answers: &Answers, near: Option<DVec3>) -> Vec<GaussianAnswer> {
@@ -242,16 +246,19 @@ fn relevancies_keep_within_their_bound_and_use_it() {
 /// Several questions at once are answered as each alone.
 #[test]
 fn batches_answer_as_single_questions_do() {
-    let yard = yard();
     let questions = [Question::new([1.0, 0.0]), Question::new([0.0, 1.0]), Question::new([0.6, 0.8])];
-    for level in [Some(Level::Clusters), Some(Level::Gaussians)] {
+    for (scene, level) in [
+        (yard(), Some(Level::Clusters)),
+        (yard(), Some(Level::Gaussians)),
+        (scene_of_objects(), Some(Level::Objects)),
+    ] {
         let texts = ["thing", "other", "third"].map(str::to_owned);
-        let together = ask_about(&yard, &questions, |request, _| {
+        let together = ask_about(&scene, &questions, |request, _| {
             (request.texts, request.level, request.limit) = (texts.to_vec(), level, Some(120));
         });
         assert_eq!(together.len(), 3);
         for ((answers, question), text) in together.iter().zip(&questions).zip(&texts) {
-            let alone = ask_about(&yard, std::slice::from_ref(question), |request, _| {
+            let alone = ask_about(&scene, std::slice::from_ref(question), |request, _| {
                 (request.texts, request.level, request.limit) = (vec![text.clone()], level, Some(120));
             });
             assert_eq!(&alone[0], answers);
@@ -412,6 +419,19 @@ fn objects_abstain_and_keep_to_the_region() {
         (request.threshold, request.bounds) = (Some(0.5), Some(within(20.195, 20.9)));
     });
     assert_eq!(clusters(&answers)[0].n_gaussians, 20);
+    // The box holds all of cell 4 and none of the object's Gaussians in cell 3, though its border crosses that cell.
+    let answers = ask_objects(&|request| {
+        let bounds = Aabb { min: DVec3::new(21.9, -1.0, -1.0), max: DVec3::splat(1e3) };
+        (request.threshold, request.bounds) = (Some(0.5), Some(bounds));
+    });
+    assert_eq!((clusters(&answers)[0].n_gaussians, answers.n_searched), (12, 160));
+    // From 22.00 to 22.16: those of cell 3 are not in the box either.
+    assert!((clusters(&answers)[0].oriented_box.size.x - 0.16).abs() < 0.011);
+    // All that match count, as many as asked for are told.
+    let answers = ask_about(&scene, &[Question::new([0.6, 0.8])], |request, _| request.limit = Some(1));
+    let found = clusters(&answers[0]);
+    assert_eq!((found.len(), found[0].rank, found[0].n_gaussians), (1, 1, 42));
+    assert_eq!((answers[0].n_matching, found[0].id.as_str()), (72, "o0000000000000015"));
     let answers = ask_objects(&|request| {
         (request.threshold, request.bounds) = (Some(0.5), Some(within(50.0, 60.0)));
     });

@@ -17,6 +17,7 @@
 mod collect;
 mod columns;
 mod dot;
+mod objects;
 mod project;
 mod question;
 mod region;
@@ -35,6 +36,7 @@ use rows::Scored;
 
 pub use columns::Columns;
 pub use dot::{dot, rounding_bound};
+pub use objects::{ObjectScores, score_objects};
 pub use question::{Question, RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
 pub use region::{Ball, Region};
 pub use rows::Scratch;
@@ -235,7 +237,7 @@ impl<'a> Search<'a> {
         region: Region,
         precision: Precision,
     ) -> Result<Self, ScoreError> {
-        check(shards, question)?;
+        check(shards, std::slice::from_ref(question))?;
         let places = scratch.take().score(shards, std::slice::from_ref(question), region, precision);
         let places = places.into_iter().next().unwrap_or_default();
         let (scored, steepness) = (scratch.share(), question.steepness());
@@ -256,7 +258,7 @@ impl<'a> Search<'a> {
         region: Region,
         precision: Precision,
     ) -> Result<Vec<Self>, ScoreError> {
-        questions.iter().try_for_each(|question| check(shards, question))?;
+        check(shards, questions)?;
         let places = scratch.take().score(shards, questions, region, precision);
         let searches = questions.iter().zip(places).enumerate().map(|(asked, (question, places))| {
             let (scored, steepness) = (scratch.share(), question.steepness());
@@ -349,18 +351,20 @@ impl<'a> Search<'a> {
     }
 }
 
-fn check(shards: &[ShardView<'_>], question: &Question) -> Result<(), ScoreError> {
-    question.check()?;
-    for shard in shards {
-        let header = &shard.header;
-        let (expected, found) = (header.dim as usize, question.vector.len());
-        if expected != found {
-            return Err(ScoreError::Dimension { cell_id: header.cell_id, expected, found });
-        }
-        let reach = shard.position_box();
-        let found = reach.min.abs().max(reach.max.abs()).max_element();
-        if found.is_nan() || found > MAX_COORDINATE {
-            return Err(ScoreError::Extent { cell_id: header.cell_id, found });
+fn check(shards: &[ShardView<'_>], questions: &[Question]) -> Result<(), ScoreError> {
+    for question in questions {
+        question.check()?;
+        for shard in shards {
+            let header = &shard.header;
+            let (expected, found) = (header.dim as usize, question.vector.len());
+            if expected != found {
+                return Err(ScoreError::Dimension { cell_id: header.cell_id, expected, found });
+            }
+            let reach = shard.position_box();
+            let found = reach.min.abs().max(reach.max.abs()).max_element();
+            if found.is_nan() || found > MAX_COORDINATE {
+                return Err(ScoreError::Extent { cell_id: header.cell_id, found });
+            }
         }
     }
     Ok(())

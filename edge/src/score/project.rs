@@ -95,7 +95,7 @@ pub struct Projection {
     /// `[m]`: products with the basis' vectors, or the vector's own components.
     pub components: Vec<f64>,
     /// The same in 16 bits.
-    rounded: Rounded,
+    pub rounded: Rounded,
     /// Rounding's part in a row's score, for each unit of the row's distance from the mean.
     pub error_per_length: f32,
     /// Rounding's part in a row's score beside that.
@@ -225,7 +225,7 @@ pub fn length(vector: &[f64]) -> f64 {
 }
 
 /// Returns a bound in f32, not below what it was.
-fn up(bound: f64) -> f32 {
+pub fn up(bound: f64) -> f32 {
     (bound * (1.0 + f64::from(f32::EPSILON))) as f32
 }
 

@@ -27,6 +27,12 @@ impl Scratch {
         Arc::get_mut(&mut self.scored).unwrap_or_else(|| unreachable!("the only owner"))
     }
 
+    /// Whether no rows were ever scored in it.
+    #[cfg(test)]
+    pub fn is_untouched(&self) -> bool {
+        self.scored.shards.is_empty()
+    }
+
     /// Shares the memory with a search.
     pub(super) fn share(&self) -> Arc<Scored> {
         Arc::clone(&self.scored)
@@ -67,15 +73,7 @@ impl Scored {
         region: Region,
         precision: Precision,
     ) -> Vec<Vec<usize>> {
-        let mut distinct: Vec<&[f32]> = Vec::new();
-        let mut place = |vector| {
-            distinct.iter().position(|known| *known == vector).unwrap_or_else(|| {
-                distinct.push(vector);
-                distinct.len() - 1
-            })
-        };
-        let places: Vec<Vec<usize>> =
-            questions.iter().map(|question| question.vectors().map(&mut place).collect()).collect();
+        let (distinct, places) = distinct(questions);
         self.vectors.resize_with(distinct.len(), Vector::default);
         self.vectors.iter_mut().zip(distinct).for_each(|(vector, values)| vector.set(values));
         self.shards.resize_with(shards.len(), ShardScores::default);
@@ -88,6 +86,19 @@ impl Scored {
         });
         places
     }
+}
+
+/// Returns the distinct vectors of some questions, and the places of each question's among them, its own first.
+pub(super) fn distinct(questions: &[Question]) -> (Vec<&[f32]>, Vec<Vec<usize>>) {
+    let mut distinct: Vec<&[f32]> = Vec::new();
+    let mut place = |vector| {
+        distinct.iter().position(|known| *known == vector).unwrap_or_else(|| {
+            distinct.push(vector);
+            distinct.len() - 1
+        })
+    };
+    let places = questions.iter().map(|question| question.vectors().map(&mut place).collect()).collect();
+    (distinct, places)
 }
 
 impl ShardScores {

@@ -13,6 +13,7 @@
 
 pub mod files;
 pub mod mmap;
+pub mod objects;
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -29,6 +30,7 @@ use slag_common::shard::{Profile, ShardLayout, ShardView};
 
 use files::{DiskFiles, Files, Stat};
 use mmap::FileBytes;
+use objects::ObjectIndex;
 
 /// A longer `current` is damage (a cell takes about 110 bytes there).
 const MAX_CURRENT_BYTES: u64 = 32 << 20;
@@ -242,6 +244,8 @@ pub struct Snapshot {
     pub manifest: Manifest,
     /// The shards, by cell id, ascending.
     pub shards: Vec<OpenShard>,
+    /// Their objects.
+    pub objects: ObjectIndex,
 }
 
 impl Snapshot {
@@ -276,8 +280,10 @@ impl Snapshot {
         let open = |cell| OpenShard::open(cache, &manifest, current.profile, cell);
         let opened: Vec<Result<OpenShard, StoreError>> =
             beside_queries(|| current.cells.par_iter().map(open).collect());
-        let shards = opened.into_iter().collect::<Result<_, _>>()?;
-        Ok(Self { current, current_stat, manifest, shards })
+        let shards: Vec<OpenShard> = opened.into_iter().collect::<Result<_, _>>()?;
+        let objects = shards.iter().map(OpenShard::objects).collect::<Vec<_>>();
+        let objects = ObjectIndex::new(&objects);
+        Ok(Self { current, current_stat, manifest, shards, objects })
     }
 }
 

@@ -303,7 +303,7 @@ impl CellObjects {
             steps: &self.steps,
             run_ends: &self.run_ends,
             run_objects: &self.run_objects,
-            photos: &self.photos,
+            photos: self.photos.as_bytes(),
         }
     }
 }
