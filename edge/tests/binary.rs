@@ -328,3 +328,17 @@ fn overload_is_turned_away_and_memory_stays() {
         assert!(number("/memory/n") > 40.0 && grown < 8e6, "{report}");
     }
 }
+
+/// The robot's program asks in words: it carries the embedded text model, and not the image model, which is larger than the
+/// rest of the models together.
+#[test]
+fn the_image_model_stays_with_the_encoder() {
+    let program = std::fs::read(env!("CARGO_BIN_EXE_slag-edge")).expect("the program");
+    let carries = |model: &str| {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../common/models/embedded").join(model);
+        let model = std::fs::read(path).expect("embedded");
+        let middle = &model[model.len() / 2..][..256];
+        program.windows(middle.len()).any(|bytes| bytes == middle)
+    };
+    assert_eq!((carries("text.onnx"), carries("image.onnx")), (true, false));
+}

@@ -13,7 +13,7 @@ use crate::hub::{
     Entry, Here, Hub, HubError, HubOptions, PulledFile, Side, Source, cache_folder, models_folder,
 };
 use crate::session::SessionError;
-use crate::{ModelDir, ModelError, Provider, SessionOptions, find_runtime};
+use crate::{ImageEncoder, ModelDir, ModelError, Provider, SessionOptions, find_runtime};
 
 /// What can be done with models.
 #[derive(Debug, Subcommand)]
@@ -90,12 +90,16 @@ impl RunArgs {
     }
 }
 
+/// How an image encoder is opened: [`ModelDir::image_encoder`].
+pub type OpenImage = dyn Fn(&ModelDir, &SessionOptions) -> Result<Box<dyn ImageEncoder>, ModelError>;
+
 /// What the program that is run knows.
 pub struct Context<'a> {
     /// Looks the environment up.
     pub variable: &'a dyn Fn(&str) -> Option<std::ffi::OsString>,
-    /// Which files the program has use for.
-    pub side: Side,
+    /// Opens a model's image side, where the program has one. A robot has none: a program that does not name
+    /// [`ModelDir::image_encoder`] does not carry the embedded image model.
+    pub image: Option<&'a OpenImage>,
     /// Asks the user a question.
     pub ask: &'a dyn Fn(&str) -> bool,
     /// Returns how models run.
@@ -191,13 +195,14 @@ pub fn run(command: &ModelsCommand, context: &Context<'_>) -> Result<Report, Hub
 }
 
 fn pull(hub: &Hub, name: &str, accepts: bool, context: &Context<'_>) -> Result<Pulled, HubError> {
-    let files = match hub.pull(name, context.side, accepts) {
+    let side = if context.image.is_some() { Side::Both } else { Side::Text };
+    let files = match hub.pull(name, side, accepts) {
         Err(HubError::Licence { name, licence, url, note }) => {
             let question = format!("{name} is under {licence} ({url}). {note} Accept that?");
             if !(context.ask)(&question) {
                 return Err(HubError::Licence { name, licence, url, note });
             }
-            hub.pull(&name, context.side, true)?
+            hub.pull(&name, side, true)?
         }
         pulled => pulled?,
     };
@@ -230,8 +235,8 @@ fn info(folder: &Path, args: &InfoArgs, context: &Context<'_>) -> Result<Info, H
         let session = (context.session)(&args.how).map_err(ModelError::from)?;
         let runs_on = |placement: Option<&crate::Placement>| Some(placement?.to_string());
         info.text_runs_on = runs_on(model.text_encoder(&session)?.placement());
-        if context.side == Side::Both {
-            let image = model.image_encoder(&session)?;
+        if let Some(open) = context.image {
+            let image = open(&model, &session)?;
             info.image_runs_on = runs_on(image.placement());
             info.batch = Some(image.preferred_batch());
         }
@@ -297,6 +302,7 @@ pub struct Info {
     threshold: Option<f32>,
     files: Vec<DescribedFile>,
     text_runs_on: Option<String>,
+    /// Absent where this program has no image side.
     image_runs_on: Option<String>,
     /// Crops in a run.
     batch: Option<usize>,
@@ -357,8 +363,11 @@ impl fmt::Display for Info {
             let here = if file.is_here { "" } else { " (not here)" };
             writeln!(f, "{:11} {}{here}", file.role.trim_start_matches("text."), file.path.display())?;
         }
-        for (what, runs_on) in [("text on", &self.text_runs_on), ("images on", &self.image_runs_on)] {
-            runs_on.iter().try_for_each(|runs_on| writeln!(f, "{what:11} {runs_on}"))?;
+        if let Some(text) = &self.text_runs_on {
+            let elsewhere =
+                "not here: this program asks; `slag-encoder models info --run` runs the image side";
+            let images = self.image_runs_on.as_deref().unwrap_or(elsewhere);
+            writeln!(f, "text on     {text}\nimages on   {images}")?;
         }
         self.batch.iter().try_for_each(|batch| writeln!(f, "batch       {batch} crops"))
     }

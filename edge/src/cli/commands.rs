@@ -15,7 +15,7 @@ use slag_edge::text::TextService;
 use slag_models::ModelDir;
 use slag_models::SessionOptions;
 use slag_models::commands::{self as model_commands, RunArgs};
-use slag_models::hub::{Side, cache_folder};
+use slag_models::hub::cache_folder;
 use slag_models::session::SessionError;
 use tokio::net::TcpListener;
 
@@ -76,7 +76,7 @@ fn variable(name: &str) -> Option<OsString> {
 pub fn models(args: ModelsArgs) -> Result<(), Failure> {
     let context = model_commands::Context {
         variable: &variable,
-        side: Side::Text,
+        image: None,
         ask: &|question| !args.json && model_commands::ask(question),
         session: &session_options,
     };

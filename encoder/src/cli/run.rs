@@ -11,7 +11,6 @@ use serde::Serialize;
 use serde_json::json;
 use slag_common::{poses, splat};
 use slag_models::commands::{self, ModelsCommand, RunArgs};
-use slag_models::hub::Side;
 use slag_models::session::SessionError;
 use slag_models::{ModelDir, SessionOptions, TextEncoder};
 
@@ -138,7 +137,7 @@ fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
 fn run_models(command: &ModelsCommand, json: bool) -> Result<Exit> {
     let context = commands::Context {
         variable: &|name| std::env::var_os(name),
-        side: Side::Both,
+        image: Some(&ModelDir::image_encoder),
         ask: &|question| !json && commands::ask(question),
         session: &session_options,
     };
