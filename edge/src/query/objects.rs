@@ -38,8 +38,7 @@ pub fn best(scores: &[f32]) -> Option<usize> {
     (0..scores.len()).reduce(|best, object| if scores[object] > scores[best] { object } else { best })
 }
 
-/// Returns the objects whose scores reach a threshold and that have at least so many Gaussians, and one, in a region; best
-/// first, equals by id.
+/// Returns the objects whose scores reach a threshold and that have at least so many Gaussians, and one, in a region; by id.
 pub fn matching<'a>(
     scene: &Scene<'a>,
     scores: &[f32],
@@ -48,7 +47,7 @@ pub fn matching<'a>(
     min_count: u64,
 ) -> Vec<FoundObject<'a>> {
     let reaching = (0..scores.len()).filter(|object| scores[*object] >= threshold);
-    let found = reaching.filter_map(|object| {
+    let found = |object| {
         let n_gaussians = scene.index.parts(object).iter().map(|part| count(scene, *part, region)).sum();
         let is_found = n_gaussians >= min_count.max(1);
         is_found.then(|| FoundObject {
@@ -57,10 +56,8 @@ pub fn matching<'a>(
             score: scores[object],
             n_gaussians,
         })
-    });
-    let mut found: Vec<_> = found.collect();
-    found.sort_by(|a, b| b.score.total_cmp(&a.score));
-    found
+    };
+    reaching.filter_map(found).collect()
 }
 
 /// Returns what the shards say of an object.

@@ -198,7 +198,7 @@ mod tests {
                 }
                 assert_eq!((found.scores.len(), index.len()), (80, expected.len()), "{shape:?}");
                 let n_products = if question.negatives.is_empty() { 1.0 } else { 2.0 };
-                let bound = found.error_bound - n_products * KEPT * 0.999;
+                let bound = found.error_bound - n_products * KEPT * (1.0 - 1e-5);
                 assert!(bound > 0.0 && bound < 2e-3, "{shape:?} {bound}");
                 for (found, expected) in found.scores.iter().zip(expected.values()) {
                     let share = (found - expected).abs() / bound;
