@@ -16,8 +16,9 @@ use super::noise::EvalNoiseArgs;
 use super::refine::RefineArgs;
 use super::sam::SamArgs;
 use super::tradeoff::TradeoffArgs;
-use super::views::ViewsArgs;
+use super::views::{ViewsArgs, parse_views_limit};
 use crate::embed::Background;
+use crate::encode::{DEFAULT_MASK_LEVELS, ViewsLimit};
 use crate::eval::Filter;
 use crate::generate::crops::Split;
 use crate::generate::grammar::SceneKind;
@@ -160,7 +161,7 @@ pub struct EncodeArgs {
     /// Ids of mask PNGs that are no mask, beside 0.
     #[arg(long, value_name = "ID", value_delimiter = ',')]
     pub ignore_mask_ids: Vec<u32>,
-    /// Bundle of the method's choices. `paper`: the plain average; `balanced`: refined.
+    /// Bundle of the method's choices; flags change single ones.
     #[arg(long, value_enum, default_value = "balanced")]
     pub preset: Preset,
     /// How sums become embeddings, where not as the preset says.
@@ -172,21 +173,21 @@ pub struct EncodeArgs {
     /// Weight that is summed; the preset's if absent. `falloff` is the paper's formula as printed.
     #[arg(long, value_enum)]
     pub weights: Option<WeightsArg>,
-    /// Views to use at most: the first ones of --view-order.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
-    pub views_limit: Option<u32>,
+    /// Views to use at most, or which part of them: the first ones of --view-order [default: the preset's].
+    #[arg(long, value_name = "N|P%", value_parser = parse_views_limit)]
+    pub views_limit: Option<ViewsLimit>,
     /// Which views come first, and how long to go on.
     #[command(flatten)]
     pub views: ViewsArgs,
     /// Where weights are rasterised: auto (GPUs, else the CPU), gpu, cpu, or an adapter's number.
     #[arg(long, value_name = "DEVICE", default_value_t)]
     pub device: DeviceChoice,
-    /// Width at which weights are rasterised; the photo's own, at most 1024, if absent.
+    /// Width at which weights are rasterised [default: the preset's, or the photo's own, at most 1024].
     #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
     pub raster_width: Option<u32>,
-    /// Masks with fewer pixels are left out.
-    #[arg(long, value_name = "PX", default_value_t = 200)]
-    pub min_mask_px: u32,
+    /// Masks with fewer pixels are left out [default: the preset's].
+    #[arg(long, value_name = "PX")]
+    pub min_mask_px: Option<u32>,
     /// Threads; all cores if absent.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
@@ -235,18 +236,60 @@ pub struct EncodeArgs {
 /// Bundles of choices.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Preset {
-    /// The paper's method: white behind the masks, the plain average.
+    /// The paper's method: white behind the masks, the plain average, no objects.
     Paper,
-    /// White behind the masks, refined.
+    /// Half of the views, by coverage, two scales of masks, coarse rasters; refined.
+    Fast,
+    /// All views; refined.
     Balanced,
+    /// All views, all scales of masks, small ones too; refined.
+    Accurate,
+}
+
+/// What a preset stands for.
+#[derive(Clone, Copy, Debug)]
+pub struct Choices {
+    /// What fills a crop outside its mask.
+    pub background: Background,
+    /// Which weight is summed.
+    pub weights: WeightKind,
+    /// How sums become embeddings.
+    pub aggregation: Aggregation,
+    /// Whether there are objects.
+    pub objects: bool,
+    /// Scales at which the built-in segmenter looks.
+    pub mask_levels: usize,
+    /// Masks with fewer pixels are left out.
+    pub min_mask_px: u32,
+    /// Views to use at most.
+    pub views_limit: ViewsLimit,
+    /// Width at which weights are rasterised.
+    pub raster_width_px: Option<u32>,
 }
 
 impl Preset {
-    /// Returns the background, the weight and the aggregation that the preset stands for.
-    pub fn choices(self) -> (Background, WeightKind, Aggregation) {
+    /// Returns what the preset stands for.
+    pub fn choices(self) -> Choices {
+        let balanced = Choices {
+            background: Background::White,
+            weights: WeightKind::Blend,
+            aggregation: Aggregation::REFINED,
+            objects: true,
+            mask_levels: DEFAULT_MASK_LEVELS,
+            min_mask_px: 200,
+            views_limit: ViewsLimit::All,
+            raster_width_px: None,
+        };
         match self {
-            Self::Paper => (Background::White, WeightKind::Blend, Aggregation::PAPER),
-            Self::Balanced => (Background::White, WeightKind::Blend, Aggregation::REFINED),
+            Self::Balanced => balanced,
+            Self::Paper => Choices { aggregation: Aggregation::PAPER, objects: false, ..balanced },
+            Self::Fast => Choices {
+                mask_levels: 2,
+                views_limit: ViewsLimit::Share(0.5),
+                raster_width_px: Some(320),
+                ..balanced
+            },
+            Self::Accurate => Choices { mask_levels: 4, min_mask_px: 100, ..balanced },
         }
     }
 }

@@ -9,7 +9,7 @@ use super::Exit;
 use super::args::{BackgroundArg, ModelArgs};
 use super::run::{available_threads, cancel_flag, open_models, print};
 use crate::embed::Background;
-use crate::encode::{EncodeSettings, ViewOrder};
+use crate::encode::{EncodeSettings, ViewOrder, ViewsLimit};
 use crate::eval::noise::{self, NoiseRow, NoiseSettings};
 use crate::lift::Aggregation;
 use crate::palette::PaletteSettings;
@@ -81,7 +81,7 @@ pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> 
         out: args.out.clone(),
         encode: EncodeSettings {
             scene_name: "noise".into(),
-            views_limit: args.views_limit.map(|n| n as usize),
+            views_limit: args.views_limit.map_or(ViewsLimit::All, |n| ViewsLimit::Count(n as usize)),
             view_order: ViewOrder::Nth,
             background: Background::from(args.background),
             aggregation: Aggregation::PAPER,

@@ -12,21 +12,20 @@ pub struct ObjectArgs {
     pub no_objects: bool,
 }
 
-/// `eval labelled`: what is scored.
+/// `eval labelled` and `query`: what is scored.
 #[derive(Debug, Args)]
 pub struct EvalLevelArgs {
-    /// What is scored: each Gaussian by itself, or as the object that it belongs to.
-    #[arg(long, value_enum, default_value_t)]
-    pub level: LevelArg,
+    /// What is scored [default: objects, where the scene has them].
+    #[arg(long, value_enum)]
+    pub level: Option<LevelArg>,
 }
 
 /// `--level`.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum LevelArg {
     /// Each Gaussian by itself.
-    #[default]
     Gaussians,
-    /// As its object, those without by themselves.
+    /// Objects, and the Gaussians within them; those without by themselves.
     Objects,
 }
 

@@ -185,7 +185,8 @@ fn run_check(args: &CheckArgs, json: bool) -> Result<Exit> {
 
 /// Returns the settings that the flags stand for.
 fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
-    let (preset_background, preset_weights, preset_aggregation) = args.preset.choices();
+    let preset = args.preset.choices();
+    let views_limit = args.views_limit.unwrap_or(preset.views_limit);
     // A geo-reference that lies beside the scene belongs to it.
     let beside = args.input.scene.with_file_name("geo.json");
     let geo = args.geo.clone().or_else(|| beside.is_file().then_some(beside));
@@ -194,7 +195,7 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
     let created_unix_secs = now_unix_secs();
     let masks = match (args.masks.as_str(), args.sam.masks()) {
         ("graph", None) => Masks::Graph,
-        ("auto", masks) => masks.unwrap_or(Masks::Auto { n_levels: args.views.mask_levels }),
+        ("auto", masks) => masks.unwrap_or(Masks::Auto { n_levels: args.views.mask_levels.unwrap_or(preset.mask_levels) }),
         (dir, Some(_)) => {
             return Err(anyhow!("--masks {dir} gives masks, --segmenter finds some; choose one"));
         }
@@ -209,14 +210,14 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
         scene_name: args.name.clone().or(folder_name).unwrap_or_else(|| "scene".into()),
         metric,
         geo,
-        views_limit: args.views_limit.map(|n| n as usize),
-        view_order: args.views.order(args.views_limit),
+        views_limit,
+        view_order: args.views.order(views_limit),
         time_budget: args.views.time_budget,
-        raster_width_px: args.raster_width,
-        background: args.background.map_or(preset_background, Into::into),
-        min_mask_px: args.min_mask_px,
-        weights: args.weights.map_or(preset_weights, Into::into),
-        aggregation: args.refine.aggregation(preset_aggregation),
+        raster_width_px: args.raster_width.or(preset.raster_width_px),
+        background: args.background.map_or(preset.background, Into::into),
+        min_mask_px: args.min_mask_px.unwrap_or(preset.min_mask_px),
+        weights: args.weights.map_or(preset.weights, Into::into),
+        aggregation: args.refine.aggregation(preset.aggregation),
         mask_noise: args.refine.mask_noise(),
         keep_views: args.refine.keep_views,
         threads: args.threads.map_or_else(available_threads, |n| n as usize),
@@ -238,7 +239,7 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
                 .position_error
                 .map_or_else(|| PositionError::default_for(metric), PositionError::Within),
         },
-        objects: !args.objects.no_objects,
+        objects: preset.objects && !args.objects.no_objects,
         created_unix_secs,
         expires_unix_secs: args.expires_days.map(|days| created_unix_secs + u64::from(days) * 86_400),
     })
@@ -374,7 +375,7 @@ fn run_eval_labelled(args: &EvalLabelledArgs, json: bool) -> Result<Exit> {
         profile: args.profile,
         threshold: args.threshold,
         filter: args.superpoints,
-        level: args.level.level.into(),
+        level: args.level.level.map(Into::into),
     };
     let report = eval::labelled(&reader, &truth, &scene, &mut *encoder, &CpuRasterizer, &settings)?;
     print(json, &report, &report)?;

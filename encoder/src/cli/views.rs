@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 
-use crate::encode::ViewOrder;
+use crate::encode::{ViewOrder, ViewsLimit};
 
 /// Which views come first, and how long to go on. Sums of views are kept until all are used, so an encode with a
 /// higher limit or more time goes on from there.
@@ -16,8 +16,8 @@ pub struct ViewsArgs {
     /// Seconds after which no further view is begun; what is there then is published.
     #[arg(long, value_name = "SECS", value_parser = parse_secs)]
     pub time_budget: Option<Duration>,
-    /// Scales at which the built-in segmenter looks, coarsest first [default: all].
-    #[arg(long, value_name = "N", value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=5))]
+    /// Scales at which the built-in segmenter looks, coarsest first [default: the preset's].
+    #[arg(long, value_name = "N", value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=4))]
     pub mask_levels: Option<usize>,
 }
 
@@ -33,15 +33,29 @@ enum ViewOrderArg {
 
 impl ViewsArgs {
     /// Returns the order that the flags stand for.
-    pub(super) fn order(&self, views_limit: Option<u32>) -> ViewOrder {
+    pub(super) fn order(&self, views_limit: ViewsLimit) -> ViewOrder {
         match self.view_order {
             Some(ViewOrderArg::Coverage) => ViewOrder::Coverage,
             Some(ViewOrderArg::Names) => ViewOrder::Names,
             Some(ViewOrderArg::Nth) => ViewOrder::Nth,
-            None if views_limit.is_some() || self.time_budget.is_some() => ViewOrder::Coverage,
+            None if views_limit != ViewsLimit::All || self.time_budget.is_some() => ViewOrder::Coverage,
             None => ViewOrder::Names,
         }
     }
+}
+
+/// Parses a number of views, or a part of them in per cent.
+pub(super) fn parse_views_limit(text: &str) -> Result<ViewsLimit, String> {
+    let limit = match text.strip_suffix('%') {
+        Some(percent) => percent.parse().ok().map(|p: f64| ViewsLimit::Share(p / 100.0)),
+        None => text.parse().ok().map(ViewsLimit::Count),
+    };
+    let is_some = |limit: &ViewsLimit| match limit {
+        ViewsLimit::All => true,
+        ViewsLimit::Count(n) => *n > 0,
+        ViewsLimit::Share(share) => *share > 0.0 && *share <= 1.0,
+    };
+    limit.filter(is_some).ok_or_else(|| format!("{text:?} is neither a number of views nor a part, 1% to 100%"))
 }
 
 fn parse_secs(text: &str) -> Result<Duration, String> {

@@ -43,7 +43,7 @@ use cells::CellBuilder;
 use coverage::{Coverage, CoverageReport};
 use job::Job;
 pub use pipeline::StageReport;
-pub use settings::{EncodeSettings, Masks, ViewOrder};
+pub use settings::{DEFAULT_MASK_LEVELS, EncodeSettings, Masks, ViewOrder, ViewsLimit};
 use view::{ViewStages, Work};
 
 /// Why an encode ended without a new generation.
@@ -298,8 +298,7 @@ pub fn encode(
     cells::check_memory(settings.memory_bytes, cells::largest_cell_bytes(&split, models.dim()), 0, 0)?;
     let segmenter: Box<dyn Segmenter> = match &settings.masks {
         Masks::Auto { n_levels } => {
-            let mut settings = GraphSettings::learnt();
-            settings.scales.truncate(n_levels.unwrap_or(usize::MAX));
+            let settings = GraphSettings::learnt(*n_levels);
             Box::new(GraphSegmenter::learnt(settings, session).map_err(SegmentError::from)?)
         }
         Masks::Graph => Box::new(GraphSegmenter::default()),
@@ -492,7 +491,7 @@ fn choose_views(
     cancel: &AtomicBool,
 ) -> Result<(Vec<usize>, Option<Coverage>), EncodeError> {
     let n = views.len();
-    let limit = settings.views_limit.unwrap_or(n).clamp(1, n);
+    let limit = settings.views_limit.of(n);
     let spread = |limit: usize| (0..limit).map(|i| i * n / limit).collect::<Vec<_>>();
     Ok(match settings.view_order {
         ViewOrder::Names => ((0..limit).collect(), None),

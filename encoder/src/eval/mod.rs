@@ -32,6 +32,7 @@ use crate::superpoint::{SuperpointSettings, Superpoints};
 pub use filter::Filter;
 pub use instances::{InstanceReport, Recall};
 use metrics::{Confusion, area_under_roc, average_precision, iou_of_sets, mean};
+use slag_common::manifest::Calibration;
 use slag_common::shard::Profile;
 pub use truth::{LabelledView, Thing, Truth, TruthError};
 
@@ -190,13 +191,12 @@ pub struct EvalReport {
 }
 
 /// What is scored.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum EvalLevel {
     /// Each Gaussian by itself.
-    #[default]
     Gaussians,
-    /// As its object, those without by themselves.
+    /// Objects, and the Gaussians within them ([`PublishedObjects::overlay`]); those without by themselves.
     Objects,
 }
 
@@ -211,8 +211,8 @@ pub struct EvalSettings {
     pub threshold: Option<f32>,
     /// Lets superpoints of colour and shape answer together.
     pub filter: Option<Filter>,
-    /// What is scored.
-    pub level: EvalLevel,
+    /// What is scored; objects if the scene has them, if absent.
+    pub level: Option<EvalLevel>,
 }
 
 /// A word's scores: of Gaussians, and of objects where those are scored.
@@ -237,8 +237,9 @@ pub fn labelled(
     let mut classes: Vec<(String, Vec<u16>)> = Vec::new();
     let mut scores: Vec<Vec<f32>> = Vec::new();
     let objects = match settings.level {
-        EvalLevel::Gaussians => None,
-        EvalLevel::Objects => Some(PublishedObjects::read(reader)?),
+        Some(EvalLevel::Gaussians) => None,
+        Some(EvalLevel::Objects) => Some(PublishedObjects::read(reader)?),
+        None => PublishedObjects::find(reader)?,
     };
     let mut of_objects: Vec<Vec<f32>> = Vec::new();
     let mut score = |text: &str| -> Result<Option<WordScores>, EvalError> {
@@ -270,13 +271,18 @@ pub fn labelled(
         }
     }
     let encoder_record = &reader.manifest().encoder;
-    let threshold = settings.threshold.unwrap_or_else(|| match &objects {
+    let of_scene = encoder_record.default_threshold;
+    let of_object = |objects: &PublishedObjects| match encoder_record.calibration {
         // A scene's own threshold is three spreads above the mean: of what is scored.
-        Some(PublishedObjects { calibration: c, .. }) if encoder_record.calibration.is_some() => {
-            (c.score_mean + 3.0 * c.score_spread).clamp(-1.0, 1.0)
+        Some(_) => {
+            let Calibration { score_mean, score_spread } = objects.calibration;
+            (score_mean + 3.0 * score_spread).clamp(-1.0, 1.0)
         }
-        _ => encoder_record.default_threshold,
-    });
+        None => of_scene,
+    };
+    let threshold = settings
+        .threshold
+        .unwrap_or_else(|| objects.as_ref().map_or(of_scene, |o| query::mixed(of_scene, of_object(o))));
     let is_there = |word: &str| {
         let things = truth.things.iter().chain(&truth.background);
         things.into_iter().any(|t| t.category.contains(word) || t.words.iter().any(|w| w.contains(word)))
@@ -350,6 +356,7 @@ pub fn labelled(
         of_things.iter().filter(|i| class_of(**i).is_some() && scores[0][**i].is_nan()).count();
 
     let instances = objects.as_ref().map(|objects| {
+        let threshold = settings.threshold.unwrap_or_else(|| of_object(objects));
         instances::report(truth, &objects.object_of, objects.ids.len(), &classes, &of_objects, threshold)
     });
     let mut words = Vec::new();
@@ -377,7 +384,7 @@ pub fn labelled(
         encoder: reader.manifest().encoder.name.clone(),
         profile: settings.profile,
         filter: settings.filter,
-        level: settings.level,
+        level: if objects.is_some() { EvalLevel::Objects } else { EvalLevel::Gaussians },
         instances,
         threshold,
         multi_class,

@@ -80,7 +80,7 @@ impl Aggregation {
     /// What was measured to help on a trained splat and on generated ones alike. Pruning by region helps the
     /// first, whose Gaussians lie across outlines, and costs the others more.
     pub const REFINED: Self =
-        Self { min_view_share: 0.1, agreement: 1.0, superpoint: 3.0, fill: true, ..Self::PAPER };
+        Self { min_view_share: 0.1, agreement: 0.5, superpoint: 3.0, fill: true, ..Self::PAPER };
 
     /// Returns the plain average, each option alone, and those that are used together: what tables compare.
     pub fn methods() -> Vec<(&'static str, Self)> {

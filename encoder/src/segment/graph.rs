@@ -66,10 +66,10 @@ impl Default for GraphSettings {
 }
 
 impl GraphSettings {
-    /// The settings with a model that says where things end.
-    pub fn learnt() -> Self {
+    /// The settings with a model that says where things end, coarsest scales first.
+    pub fn learnt(n_scales: usize) -> Self {
         Self {
-            scales: vec![1500.0, 800.0, 400.0, 200.0],
+            scales: [1500.0, 800.0, 400.0, 200.0].into_iter().take(n_scales).collect(),
             colour_weight: 0.3,
             boundary_weight: 40.0,
             depth_weight: 0.0,
