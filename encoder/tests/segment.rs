@@ -377,32 +377,6 @@ fn slivers_go_to_their_neighbours() {
     assert_eq!(map, before, "without a neighbour it stays");
 }
 
-/// Absorbing changes few pixels, never what is covered, and leaves regions in the order of the scan.
-#[test]
-fn slivers_are_few_pixels() {
-    let mut random = Random(5);
-    let masks: Vec<Mask> = (0..40).map(|_| random_mask(&mut random, 320, 240)).collect();
-    let (map, sets) = partition(&masks, 320, 240, 320, 240, None);
-    let (mut after, mut sets_after) = (map.clone(), sets.clone());
-    absorb_slivers(&mut after, &mut sets_after);
-    assert!(after.n_regions < map.n_regions && after.n_regions as usize == sets_after.len());
-    let mut next = 0;
-    let mut changed = vec![0; sets.len()];
-    for (a, b) in map.region_of_pixel.iter().zip(&after.region_of_pixel) {
-        assert_eq!(*a == NO_REGION, *b == NO_REGION);
-        if *a != NO_REGION {
-            assert!(*b <= next, "in scan order");
-            next = next.max(b + 1);
-            changed[*a as usize] += usize::from(sets[*a as usize] != sets_after[*b as usize]);
-        }
-    }
-    assert_eq!(next, after.n_regions);
-    assert!(changed.iter().all(|n| *n < 320 * 240 / 10_000), "{changed:?}");
-    let (again, sets_again) = (after.clone(), sets_after.clone());
-    absorb_slivers(&mut after, &mut sets_after);
-    assert_eq!((after, sets_after), (again, sets_again), "once is enough");
-}
-
 #[test]
 fn borders_over_area() {
     let square = mask(10, 10, |x, y| (3..7).contains(&x) && (3..7).contains(&y)).unwrap();
