@@ -37,6 +37,9 @@ fn the_field_agrees_with_the_independent_reference() {
         "white",
         "--min-mask-px",
         "200",
+        // The reference's.
+        "--raster-width",
+        "640",
         "--metric",
         "--strict",
         "--store",

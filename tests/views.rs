@@ -3,6 +3,9 @@
 use std::path::Path;
 
 use serde_json::Value;
+use slag_common::manifest::CellRecord;
+use slag_encoder::lift::published::{read_field, read_regions};
+use slag_encoder::store::StoreReader;
 use slag_tests::*;
 
 fn encode(room: &Path, store: &Path, more: &[&str]) -> Value {
@@ -57,4 +60,59 @@ fn an_encode_of_some_views_goes_on_with_more() {
     assert_eq!(counts(&encode(&room, &kept, &["--keep-views", "--compact-error", "0.3"])), [10, 0]);
     assert_eq!(counts(&encode(&room, &kept, &[])), [10, 10]);
     assert_eq!(content(&kept), expected);
+}
+
+/// Without --raster-width each view has its own by its content, weighs no more for a finer one, and the summary says
+/// what was spent on views and cells; threads and resuming do not show.
+#[test]
+fn what_was_spent_goes_by_content_and_is_reported() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let room = dir.path().join("room");
+    run(&mut encoder(&["generate", "scene", "--out", text(&room), "--n-views", "10", "--seed", "31"]));
+    let encode = |name: &str, more: &[&str]| {
+        let (scene, views, store) =
+            (room.join("scene.ply"), room.join("transforms.json"), dir.path().join(name));
+        let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views), "--metric"]);
+        // Few enough masks that some views have long borders and others have not.
+        command.args(["--store", text(&store), "--preset", "paper", "--mask-levels", "2"]);
+        run_json(command.args(more))
+    };
+    let column = |summary: &Value, name: &str| {
+        let column = summary["views"][name].as_array().expect("a column").iter();
+        column.map(|v| v.as_f64().expect("a number")).collect::<Vec<_>>()
+    };
+    let first = encode("first", &["--threads", "1", "--keep-views"]);
+    let widths = column(&first, "raster_width_px");
+    assert!(widths.iter().all(|width| [640.0, 1280.0].contains(width)), "{widths:?}");
+    assert!(widths.contains(&640.0) && widths.contains(&1280.0), "{widths:?}");
+    for total in ["n_masks", "n_regions", "n_entries"] {
+        assert_eq!(column(&first, total).iter().sum::<f64>(), first[total].as_f64().expect("a count"));
+    }
+    assert!(column(&first, "secs").iter().all(|secs| *secs > 0.0));
+    let cells = first["cells"].as_array().expect("cells");
+    let of_cells = cells.iter().map(|cell| cell["n_entries"].as_u64().expect("a count")).sum::<u64>();
+    assert_eq!(Some(of_cells), first["n_entries"].as_u64());
+    for cell in cells {
+        let error = |profile: &str| cell["score_error"][profile].as_f64().expect("an error");
+        assert!(error("compact") < 0.2 && error("compact") > error("balanced"), "{cell}");
+        assert_eq!((error("exact"), cell["n_groups"].as_u64() > Some(0)), (0.0, true));
+    }
+    let resumed = encode("first", &["--keep-views"]);
+    assert_eq!((&resumed["n_views_resumed"], &resumed["views"]), (&10.into(), &first["views"]));
+    encode("second", &["--threads", "2"]);
+    assert_eq!(content(&dir.path().join("second")), content(&dir.path().join("first")));
+
+    let fixed = encode("fixed", &["--raster-width", "640"]);
+    assert_eq!(column(&fixed, "raster_width_px"), [640.0; 10]);
+    let weight = |name: &str| {
+        let reader = StoreReader::open(&dir.path().join(name)).expect("a published store");
+        let n_regions = read_regions(&reader).expect("regions").len();
+        let cells = reader.manifest().cells.iter();
+        let field = |cell: &CellRecord| {
+            read_field(&reader, cell.cell_id, cell.n_gaussians, n_regions).expect("a field").total_weights
+        };
+        cells.flat_map(field).map(f64::from).sum::<f64>()
+    };
+    let ratio = weight("first") / weight("fixed");
+    assert!((ratio - 1.0).abs() < 0.01, "{ratio}");
 }

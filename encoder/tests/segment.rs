@@ -11,7 +11,8 @@ use proptest::prelude::*;
 use slag_common::{Distortion, Intrinsics, View, poses};
 use slag_encoder::ingest::{Undistorter, load_image};
 use slag_encoder::segment::{
-    BoxPx, GivenMasks, Mask, NO_REGION, Rle, RleError, SegmentError, SegmentInput, Segmenter, partition,
+    BoxPx, GivenMasks, Mask, NO_REGION, RegionMap, Rle, RleError, SegmentError, SegmentInput, Segmenter,
+    absorb_slivers, border_share, partition,
 };
 
 /// Makes a mask of a membership function; `None` if no pixel is inside.
@@ -328,6 +329,62 @@ fn three_hundred_overlapping_masks() {
     check_partition(&masks, (64, 48), (31, 100), None);
     check_partition(&[], (64, 48), (64, 48), None);
     assert_eq!(partition(&masks, 64, 48, 64, 48, Some(&[false; 64 * 48])).0.n_regions, 0);
+}
+
+/// Slivers go to the neighbour with the longest border; what is all that a mask has, and what has no neighbour, stays.
+#[test]
+fn slivers_go_to_their_neighbours() {
+    let inside =
+        |x: u32, y: u32, (x0, y0, x1, y1): (u32, u32, u32, u32)| x >= x0 && x < x1 && y >= y0 && y < y1;
+    // 11 pixels are the largest sliver of this raster. Left and right overlap in a column of 11 that ends at the
+    // lower edge of both, and in an island of 4; the nail is on the left one.
+    let (island, nail, size) = ((380, 280, 382, 282), (20, 20, 24, 22), (400, 300));
+    let left = |x, y| inside(x, y, (10, 10, 101, 50)) && (x < 100 || y >= 39) || inside(x, y, island);
+    let right = |x, y| inside(x, y, (100, 10, 150, 50)) || inside(x, y, island);
+    let masks = [
+        mask(size.0, size.1, left).unwrap(),
+        mask(size.0, size.1, right).unwrap(),
+        mask(size.0, size.1, |x, y| inside(x, y, nail)).unwrap(),
+    ];
+    let (mut map, mut masks_of_region) = partition(&masks, size.0, size.1, size.0, size.1, None);
+    let at = |map: &RegionMap, x: u32, y: u32| map.region_of_pixel[(y * size.0 + x) as usize];
+    let set = |map: &RegionMap, sets: &[Vec<u32>], x, y| sets[at(map, x, y) as usize].clone();
+    assert_eq!(set(&map, &masks_of_region, 100, 45), [0, 1], "the island's region, too large for its masks");
+    assert_eq!(at(&map, 100, 45), at(&map, 380, 280));
+    let before = map.clone();
+    absorb_slivers(&mut map, &mut masks_of_region);
+    assert_eq!(map, before, "15 pixels are no sliver");
+
+    // Without the island: 11 pixels, 11 + 0 along the left, 11 + 1 along the right.
+    let left = mask(size.0, size.1, |x, y| left(x, y) && !inside(x, y, island)).unwrap();
+    let masks = [left, masks[1].clone(), masks[2].clone()];
+    let (mut map, mut masks_of_region) = partition(&masks, size.0, size.1, size.0, size.1, None);
+    assert_eq!(map.n_regions, 4);
+    absorb_slivers(&mut map, &mut masks_of_region);
+    assert_eq!((map.n_regions, masks_of_region.len()), (3, 3));
+    for (x, y, expected) in [(100, 45, 1), (100, 38, 1), (99, 45, 0), (380, 280, 1)] {
+        assert_eq!(set(&map, &masks_of_region, x, y), [expected], "{x} {y}");
+    }
+    assert_eq!(set(&map, &masks_of_region, 22, 21), [0, 2], "8 pixels, but all that the nail has");
+    assert_eq!(at(&map, 300, 200), NO_REGION);
+
+    // Two masks whose only common pixels lie apart from the rest of both.
+    let far = |box_px| move |x, y| inside(x, y, box_px) || inside(x, y, island);
+    let masks = [(0, 0, 60, 60), (200, 0, 260, 60)].map(|b| mask(size.0, size.1, far(b)).unwrap());
+    let (mut map, mut masks_of_region) = partition(&masks, size.0, size.1, size.0, size.1, None);
+    let before = map.clone();
+    absorb_slivers(&mut map, &mut masks_of_region);
+    assert_eq!(map, before, "without a neighbour it stays");
+}
+
+#[test]
+fn borders_over_area() {
+    let square = mask(10, 10, |x, y| (3..7).contains(&x) && (3..7).contains(&y)).unwrap();
+    let halves = [mask(10, 10, |x, _| x < 5).unwrap(), mask(10, 10, |x, _| x >= 5).unwrap()];
+    let share = |masks: &[Mask], width| border_share(&partition(masks, 10, 10, width, width, None).0);
+    assert_eq!((share(&halves, 10), share(&halves, 20)), (0.1, 0.05));
+    assert_eq!(share(std::slice::from_ref(&square), 10), 1.0);
+    assert_eq!(share(&[], 10), 0.0);
 }
 
 /// Regions of a real photo's masks, written as 16-bit ids, are read back as the same masks.

@@ -182,7 +182,8 @@ pub struct EncodeArgs {
     /// Where weights are rasterised: auto (GPUs, else the CPU), gpu, cpu, or an adapter's number.
     #[arg(long, value_name = "DEVICE", default_value_t)]
     pub device: DeviceChoice,
-    /// Width at which weights are rasterised [default: the preset's, or the photo's own, at most 1024].
+    /// Width at which weights are rasterised [default: the preset's, or the photo's own, at most 1024, and twice as much
+    /// in views whose masks have long borders].
     #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
     pub raster_width: Option<u32>,
     /// Masks with fewer pixels are left out [default: the preset's].

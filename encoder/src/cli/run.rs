@@ -23,7 +23,9 @@ use crate::bench::scene::{BenchScene, cell_regions, grid_regions};
 use crate::check::{self, CheckOptions, CheckView};
 use crate::demo;
 use crate::encode::coverage::CoverageReport;
-use crate::encode::{self, EncodeError, EncodeSettings, Masks, StageReport};
+use crate::encode::{
+    self, CellReport, EncodeError, EncodeSettings, EncodeSummary, Masks, StageReport, ViewsReport,
+};
 use crate::eval::{self, EvalSettings, Truth};
 use crate::generate::{crops, grammar, photos};
 use crate::palette::PaletteSettings;
@@ -288,6 +290,7 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
             found.n_gaussians
         )
     });
+    let most = most_spent(&summary);
     let images_on = summary.images_on.as_ref().map_or(String::new(), |on| format!("images on  {on}\n"));
     let lines = format!(
         "published  generation {} in {}\n\
@@ -295,7 +298,7 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
          views      {} of {} ({} resumed, {} without masks)\n{coverage}{skipped}{images_on}\
          masks      {} in {} regions, {} sums\n\
          cells      {} with {} palette rows\n\
-         {objects}shards     {sizes}\n\
+         {objects}shards     {sizes}\n{most}\
          seconds    {:.1}; by stage, all threads: {busy}\n\
          views took {:.1} s\n  stage    at once   seconds    busy\n{of_views}",
         summary.generation,
@@ -317,6 +320,22 @@ fn run_encode(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<
     );
     print(json, &summary, lines)?;
     Ok(if summary.skipped_views.is_empty() { Exit::Done } else { Exit::Partly })
+}
+
+/// Returns the line that names the view and the cell on which most was spent.
+fn most_spent(summary: &EncodeSummary) -> String {
+    let (views, cells) = (&summary.views, &summary.cells);
+    let most = (0..views.view.len()).max_by(|a, b| views.secs[*a].total_cmp(&views.secs[*b]));
+    let (Some(at), Some(cell)) = (most, cells.iter().max_by_key(|cell| cell.n_rows)) else {
+        return String::new();
+    };
+    let ViewsReport { view, raster_width_px, n_masks, n_regions, n_entries, secs } = views;
+    let CellReport { cell_id, n_gaussians, n_rows, .. } = cell;
+    format!(
+        "most on    view {}, {:.1} s ({} masks, {} regions, {} sums, {} px wide); cell {cell_id}, {n_rows} rows \
+         ({n_gaussians} Gaussians)\n",
+        view[at], secs[at], n_masks[at], n_regions[at], n_entries[at], raster_width_px[at]
+    )
 }
 
 fn run_query(args: &QueryArgs, json: bool) -> Result<Exit> {

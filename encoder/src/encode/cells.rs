@@ -61,6 +61,8 @@ pub(super) struct CellBuilder<'a> {
 /// What was built.
 pub(super) struct BuiltCells {
     pub(super) records: Vec<CellRecord>,
+    /// Half bytes a Gaussian of each cell's residual code.
+    pub(super) n_groups: Vec<u32>,
     pub(super) extras: Extras,
     pub(super) n_without_evidence: u64,
     /// Sums over the Gaussians with evidence of mean score and mean squared score, and how many they are.
@@ -140,6 +142,10 @@ impl<'a> CellBuilder<'a> {
         Ok(Some(self.stopwatch.time("objects", || objects::find(&scene))?))
     }
 
+    pub(super) fn index(&self) -> &SumsIndex {
+        &self.index
+    }
+
     pub(super) fn n_views_without_masks(&self) -> usize {
         self.index.n_views_without_masks()
     }
@@ -167,6 +173,7 @@ impl<'a> CellBuilder<'a> {
     ) -> Result<Option<BuiltCells>, EncodeError> {
         let mut built = BuiltCells {
             records: Vec::new(),
+            n_groups: Vec::new(),
             extras: Extras::new(),
             n_without_evidence: 0,
             score_sums: [0.0; 3],
@@ -265,6 +272,7 @@ impl<'a> CellBuilder<'a> {
             Ok((shard.profile, record))
         };
         let shards = made.shards.iter().map(record).collect::<Result<_, EncodeError>>()?;
+        built.n_groups.push(made.n_groups);
         built.n_without_evidence += made.n_without_evidence as u64;
         let n_with = (cell.gaussians.len() - made.n_without_evidence) as f64;
         let sums = [made.moments.mean * n_with, made.moments.mean_square * n_with, n_with];

@@ -1,8 +1,9 @@
 //! The state of an unfinished encode: which views are done, and their files of sums.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
+use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
 
 use super::EncodeError;
@@ -15,6 +16,15 @@ const FINGERPRINT_KEY: &[u8] = b"fingerprint";
 /// There once the views that are done were published, with others left to do.
 const PUBLISHED_KEY: &[u8] = b"published";
 const VIEW_PREFIX: &str = "view/";
+
+/// What the record that counts a view as done says of it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(super) struct ViewRecord {
+    /// Width at which its weights were rasterised.
+    pub(super) raster_width_px: u32,
+    /// Seconds of its stages before this record.
+    pub(super) secs: f32,
+}
 
 /// An encode under way in a store.
 pub(super) struct Job<'a> {
@@ -55,13 +65,16 @@ impl<'a> Job<'a> {
     }
 
     /// Returns the views whose sums are on disk.
-    pub(super) fn done_views(&self) -> Result<BTreeSet<String>, EncodeError> {
-        let keys = self.records.scan_prefix(VIEW_PREFIX).keys();
-        keys.map(|key| {
-            let key = key.map_err(|source| records_error(self.store, source))?;
-            Ok(String::from_utf8_lossy(&key[VIEW_PREFIX.len()..]).into_owned())
-        })
-        .collect()
+    pub(super) fn done_views(&self) -> Result<BTreeMap<String, ViewRecord>, EncodeError> {
+        let records = self.records.scan_prefix(VIEW_PREFIX);
+        records
+            .map(|record| {
+                let (key, value) = record.map_err(|source| records_error(self.store, source))?;
+                let name = String::from_utf8_lossy(&key[VIEW_PREFIX.len()..]).into_owned();
+                // Only for the report; an older program's says nothing.
+                Ok((name, serde_json::from_slice(&value).unwrap_or_default()))
+            })
+            .collect()
     }
 
     /// Returns where a view's sums lie.
@@ -76,11 +89,18 @@ impl<'a> Job<'a> {
     }
 
     /// Keeps a view's sums and its masks' boxes: the files first, then the record that counts it as done.
-    pub(super) fn keep(&self, view: &str, sums: &ViewSums, boxes_px: &[[u32; 4]]) -> Result<(), EncodeError> {
+    pub(super) fn keep(
+        &self,
+        view: &str,
+        sums: &ViewSums,
+        boxes_px: &[[u32; 4]],
+        record: ViewRecord,
+    ) -> Result<(), EncodeError> {
         photos::write_boxes(&self.boxes_path(view), boxes_px)?;
         sums.write(&self.sums_path(view))?;
         let key = format!("{VIEW_PREFIX}{view}");
-        self.records.insert(key, &[]).map_err(|source| records_error(self.store, source))?;
+        let record = serde_json::to_vec(&record).map_err(std::io::Error::from)?;
+        self.records.insert(key, record).map_err(|source| records_error(self.store, source))?;
         self.flush()
     }
 

@@ -22,13 +22,14 @@ use std::time::Instant;
 use serde::Serialize;
 use slag_common::manifest::{self, Calibration, CellRecord, EncoderRecord, Manifest};
 use slag_common::poses::{self, PoseError};
+use slag_common::shard::ScoreErrors;
 use slag_common::splat::{self, SplatError};
 use slag_common::{Hash32, View};
 use slag_models::{ModelDir, ModelError, SessionOptions};
 
 use crate::embed::EmbedError;
 use crate::ingest::{self, GeoError, IngestError};
-use crate::lift::{SumsError, SumsFile};
+use crate::lift::{SumsError, SumsFile, SumsIndex};
 use crate::objects::ObjectsReport;
 use crate::objects::photos::{self, Photo};
 use crate::palette::TextBank;
@@ -41,7 +42,7 @@ use crate::shard;
 use crate::store::{Store, StoreError};
 use cells::CellBuilder;
 use coverage::{Coverage, CoverageReport};
-use job::Job;
+use job::{Job, ViewRecord};
 pub use pipeline::StageReport;
 pub use settings::{DEFAULT_MASK_LEVELS, EncodeSettings, Masks, ViewOrder, ViewsLimit};
 use view::{ViewStages, Work};
@@ -192,10 +193,33 @@ pub struct CellReport {
     pub cell_id: u32,
     /// Gaussians.
     pub n_gaussians: u32,
+    /// Sums per (Gaussian, region).
+    pub n_entries: u64,
     /// Palette rows.
     pub n_rows: u32,
+    /// Half bytes a Gaussian of the residual code; 0 where rows are enough for every profile.
+    pub n_groups: u32,
     /// Bytes of its shards by profile.
     pub shard_bytes: BTreeMap<String, u64>,
+    /// Mean error of their scores, relative to the spread of scores.
+    pub score_error: BTreeMap<String, f32>,
+}
+
+/// What each view was given, a column a figure, in the order of the names.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct ViewsReport {
+    /// Names.
+    pub view: Vec<String>,
+    /// Width at which weights were rasterised.
+    pub raster_width_px: Vec<u32>,
+    /// Masks.
+    pub n_masks: Vec<usize>,
+    /// Regions.
+    pub n_regions: Vec<usize>,
+    /// Sums per (Gaussian, region).
+    pub n_entries: Vec<u64>,
+    /// Seconds of all stages but the last, to the millisecond.
+    pub secs: Vec<f64>,
 }
 
 /// What an encode did.
@@ -241,6 +265,8 @@ pub struct EncodeSummary {
     pub shard_bytes: BTreeMap<String, u64>,
     /// What was spent on each cell.
     pub cells: Vec<CellReport>,
+    /// What was spent on each view.
+    pub views: ViewsReport,
     /// Seconds spent in each stage, added over threads.
     pub busy_secs: BTreeMap<String, f64>,
     /// How busy the stages of the views were, in their order.
@@ -320,7 +346,7 @@ pub fn encode(
     let coverage_start = Instant::now();
     let (chosen, coverage) = choose_views(settings, loaded.as_ref(), scene.len(), &views, cancel)?;
     let coverage_secs = coverage.as_ref().map_or(0.0, |_| coverage_start.elapsed().as_secs_f64());
-    let n_resumed = chosen.iter().filter(|view| done.contains(&views[**view].name)).count();
+    let n_resumed = chosen.iter().filter(|view| done.contains_key(&views[**view].name)).count();
     let stages = ViewStages {
         settings,
         scene: loaded.as_ref(),
@@ -346,7 +372,8 @@ pub fn encode(
     skipped.sort_by(|a, b| a.view.cmp(&b.view));
     // In the order of names, whatever the order of the work.
     let done = job.done_views()?;
-    let mut used: Vec<usize> = chosen.into_iter().filter(|view| done.contains(&views[*view].name)).collect();
+    let mut used: Vec<usize> =
+        chosen.into_iter().filter(|view| done.contains_key(&views[*view].name)).collect();
     used.sort_unstable();
     let coverage = coverage.map(|coverage| coverage.report(used.iter().copied()));
     let used: Vec<&View> = used.into_iter().map(|view| &views[view]).collect();
@@ -388,6 +415,7 @@ pub fn encode(
         objects: None,
         shard_bytes: BTreeMap::new(),
         cells: Vec::new(),
+        views: views_report(&used, &done, builder.index()),
         busy_secs: BTreeMap::new(),
         view_stages,
         views_secs,
@@ -409,7 +437,19 @@ pub fn encode(
         let n_rows = record.shards.values().map(|shard| shard.n_rows).max().unwrap_or(0);
         summary.n_rows += u64::from(n_rows);
         let CellRecord { cell_id, n_gaussians, .. } = *record;
-        summary.cells.push(CellReport { cell_id, n_gaussians, n_rows, shard_bytes });
+        let parts = builder.index().parts().iter().filter(|part| part.cell_id == cell_id);
+        let relative = |errors: &ScoreErrors| errors.mean / errors.spread.max(f32::MIN_POSITIVE);
+        summary.cells.push(CellReport {
+            cell_id,
+            n_gaussians,
+            n_entries: parts.map(|part| part.n_entries).sum(),
+            n_rows,
+            n_groups: built.n_groups[cell_id as usize],
+            shard_bytes,
+            score_error: (record.shards.iter())
+                .map(|(profile, shard)| (profile.to_string(), relative(&shard.score_errors)))
+                .collect(),
+        });
     }
     summary.n_without_evidence = built.n_without_evidence;
     summary.objects = built.objects.clone();
@@ -527,6 +567,19 @@ fn photos_of(job: &Job<'_>, views: &[&View], dim: usize) -> Result<Vec<Photo>, E
     views.iter().map(photo).collect()
 }
 
+/// Returns what was spent on the views that are used.
+fn views_report(used: &[&View], done: &BTreeMap<String, ViewRecord>, index: &SumsIndex) -> ViewsReport {
+    let record = |view: &&View| done.get(&view.name).copied().unwrap_or_default();
+    ViewsReport {
+        view: used.iter().map(|view| view.name.clone()).collect(),
+        raster_width_px: used.iter().map(|view| record(view).raster_width_px).collect(),
+        n_masks: index.n_masks_of_view().collect(),
+        n_regions: index.n_regions_of_view().collect(),
+        n_entries: index.n_entries_of_view().collect(),
+        secs: used.iter().map(|view| (f64::from(record(view).secs) * 1e3).round() / 1e3).collect(),
+    }
+}
+
 /// Works off the views that are not done yet, none begun after `deadline` but a first one. Returns how busy the
 /// stages were, and the views that were left out.
 fn run_views(
@@ -536,8 +589,8 @@ fn run_views(
     cancel: &AtomicBool,
 ) -> Result<(Vec<StageReport>, Vec<SkippedView>), EncodeError> {
     let done = stages.job.done_views()?;
-    let mut has_some = views.iter().any(|view| done.contains(&view.name));
-    let open = views.iter().copied().filter(|view| !done.contains(&view.name));
+    let mut has_some = views.iter().any(|view| done.contains_key(&view.name));
+    let open = views.iter().copied().filter(|view| !done.contains_key(&view.name));
     // No view is begun once the user has said stop or the time is over; those at hand are finished.
     let may_begin = move |_: &&View| {
         let in_time = deadline.is_none_or(|deadline| Instant::now() < deadline);

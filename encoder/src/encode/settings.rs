@@ -109,7 +109,8 @@ pub struct EncodeSettings {
     pub view_order: ViewOrder,
     /// Time after which no view is begun, from the start; at least one view is used.
     pub time_budget: Option<Duration>,
-    /// Width at which weights are rasterised; the photo's own, at most [`MAX_RASTER_WIDTH_PX`], if absent.
+    /// Width at which weights are rasterised; if absent the photo's own, at most [`MAX_RASTER_WIDTH_PX`], and twice as
+    /// much where regions have [`LONG_BORDERS`].
     pub raster_width_px: Option<u32>,
     /// What fills a crop outside its mask.
     pub background: Background,
@@ -143,8 +144,15 @@ pub struct EncodeSettings {
     pub expires_unix_secs: Option<u64>,
 }
 
-/// Widest raster unless asked for: masks are coarser than this, and time grows with the square.
+/// Widest raster where regions do not ask for more: masks are coarser than this, and time grows with the square.
 pub const MAX_RASTER_WIDTH_PX: u32 = 1024;
+/// Length of the borders of a view's regions over their area, in pixels of the raster, above which it has twice the
+/// width. The raster blurs Gaussians by half a pixel, and what they lose to the regions beside their own goes with
+/// this. Measured on generated scenes: mIoU 0.01 to 0.03 higher for a sixth more time. Half the width where borders
+/// are short was no faster on the labelled house, and a little worse.
+pub const LONG_BORDERS: f64 = 0.04;
+/// How masks become regions; another number is another encode.
+const REGIONS_VERSION: u32 = 2;
 
 impl EncodeSettings {
     /// Returns the settings to encode a splat and its photos into a store, as the program has them without flags.
@@ -219,6 +227,7 @@ impl EncodeSettings {
             mask_files: Vec<(String, u64)>,
             views: Vec<(&'a str, u64, String)>,
             raster_width_px: Option<u32>,
+            regions: (u32, f64),
             background: String,
             min_mask_px: u32,
             weights: String,
@@ -246,6 +255,7 @@ impl EncodeSettings {
             mask_files: self.mask_files()?,
             views,
             raster_width_px: self.raster_width_px,
+            regions: (REGIONS_VERSION, LONG_BORDERS),
             background: format!("{:?}", self.background),
             min_mask_px: self.min_mask_px,
             weights: format!("{:?}", self.weights),

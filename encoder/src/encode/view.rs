@@ -1,14 +1,15 @@
 //! One view through the stages.
 
 use std::sync::{Mutex, OnceLock, PoisonError};
+use std::time::Instant;
 
-use slag_common::View;
+use slag_common::{Intrinsics, View};
 use slag_models::preprocess::Preprocess;
 use slag_models::{Crop, ImageEncoder, ModelDir, SessionOptions};
 
-use super::job::Job;
+use super::job::{Job, ViewRecord};
 use super::pipeline::Stage;
-use super::settings::MAX_RASTER_WIDTH_PX;
+use super::settings::{LONG_BORDERS, MAX_RASTER_WIDTH_PX};
 use super::{EncodeError, EncodeSettings};
 use crate::embed;
 use crate::ingest::{self, LoadedImage};
@@ -44,6 +45,8 @@ pub(super) struct ViewStages<'a> {
 pub(super) struct Work<'v> {
     view: &'v View,
     next: Next,
+    /// Seconds of the stages so far.
+    secs: f32,
 }
 
 #[expect(clippy::large_enum_variant, reason = "a handful at a time, moved a few times a view")]
@@ -54,7 +57,7 @@ enum Next {
     Crop(LoadedImage, Vec<Mask>),
     Embed(Crops, Partition),
     Raster(Vec<f32>, Partition),
-    Write(ViewSums, Vec<[u32; 4]>),
+    Write(ViewSums, Vec<[u32; 4]>, u32),
 }
 
 /// What is to be embedded.
@@ -73,11 +76,13 @@ struct Partition {
     masks_of_region: Vec<Vec<u32>>,
     /// Of each mask, in pixels of the photo.
     boxes_px: Vec<[u32; 4]>,
+    /// Pixels of the base width in one of the raster: a view does not count more for being finer.
+    weight_scale: f32,
 }
 
 impl<'v> Work<'v> {
     pub(super) fn begin(view: &'v View) -> Self {
-        Self { view, next: Next::Decode }
+        Self { view, next: Next::Decode, secs: 0.0 }
     }
 
     pub(super) fn view(&self) -> &'v View {
@@ -111,6 +116,7 @@ impl ViewStages<'_> {
 
     /// Does the next stage's work.
     pub(super) fn step<'v>(&self, work: Work<'v>) -> Result<Option<Work<'v>>, EncodeError> {
+        let start = Instant::now();
         let view = work.view;
         let raster_failed = |source: RasterError| EncodeError::Raster { view: view.name.clone(), source };
         let next = match work.next {
@@ -119,7 +125,7 @@ impl ViewStages<'_> {
                 loaded => Next::Segment(loaded, None),
             },
             Next::Depth(loaded) => {
-                let raster_view = self.raster_view(&loaded);
+                let raster_view = raster_view(&loaded, self.base_width_px(&loaded));
                 let drawing = self.scene.draw(&raster_view, [0.0; 3]).map_err(raster_failed)?;
                 let depth = enlarge(&drawing.depth, &raster_view, &loaded);
                 Next::Segment(loaded, Some(depth))
@@ -147,44 +153,55 @@ impl ViewStages<'_> {
                 }
                 Next::Raster(vectors, partition)
             }
-            Next::Raster(vectors, Partition { raster_view, regions, masks_of_region, boxes_px }) => {
-                let weights = self
+            Next::Raster(vectors, partition) => {
+                let Partition { raster_view, regions, masks_of_region, boxes_px, weight_scale } = partition;
+                let mut weights = self
                     .scene
                     .weights(&raster_view, &regions, self.settings.weights)
                     .map_err(raster_failed)?;
+                weights.entries.iter_mut().for_each(|entry| entry.weight *= weight_scale);
                 let dim = self.models.dim();
                 let sums = ViewSums::new(&weights.entries, masks_of_region, vectors, dim, self.split);
-                Next::Write(sums, boxes_px)
+                Next::Write(sums, boxes_px, raster_view.intrinsics.width_px)
             }
-            Next::Write(sums, boxes_px) => {
-                self.job.keep(&view.name, &sums, &boxes_px)?;
+            Next::Write(sums, boxes_px, raster_width_px) => {
+                let record = ViewRecord { raster_width_px, secs: work.secs };
+                self.job.keep(&view.name, &sums, &boxes_px, record)?;
                 self.progress.advance(1);
                 return Ok(None);
             }
         };
-        Ok(Some(Work { view, next }))
+        Ok(Some(Work { view, next, secs: work.secs + start.elapsed().as_secs_f32() }))
     }
 
-    fn raster_view(&self, loaded: &LoadedImage) -> RasterView {
-        let intrinsics = loaded.view.intrinsics;
-        let width_px = self.settings.raster_width_px.unwrap_or(intrinsics.width_px.min(MAX_RASTER_WIDTH_PX));
-        RasterView {
-            camera_from_world: loaded.view.camera_from_world,
-            intrinsics: intrinsics.scaled_to_width(width_px),
-        }
+    /// Returns the width of the raster where nothing of the view's content is known.
+    fn base_width_px(&self, loaded: &LoadedImage) -> u32 {
+        self.settings.raster_width_px.unwrap_or(loaded.view.intrinsics.width_px.min(MAX_RASTER_WIDTH_PX))
     }
 
+    /// Makes the regions of a view's masks, finer where their borders are long and no width is asked for.
     fn partition(&self, loaded: &LoadedImage, masks: &[Mask]) -> Partition {
-        let raster_view = self.raster_view(loaded);
-        let (regions, masks_of_region) = segment::partition(
-            masks,
-            loaded.image.width(),
-            loaded.image.height(),
-            raster_view.intrinsics.width_px,
-            raster_view.intrinsics.height_px,
-            loaded.valid.as_deref(),
-        );
-        Partition { raster_view, regions, masks_of_region, boxes_px: boxes_of(masks) }
+        let regions_at = |width_px| {
+            let raster_view = raster_view(loaded, width_px);
+            let Intrinsics { width_px, height_px, .. } = raster_view.intrinsics;
+            let (image, valid) = (&loaded.image, loaded.valid.as_deref());
+            let (mut regions, mut masks_of_region) =
+                segment::partition(masks, image.width(), image.height(), width_px, height_px, valid);
+            segment::absorb_slivers(&mut regions, &mut masks_of_region);
+            (raster_view, regions, masks_of_region)
+        };
+        let base_px = self.base_width_px(loaded);
+        let mut made = regions_at(base_px);
+        let is_asked_for = self.settings.raster_width_px.is_some();
+        let mut width_px = base_px;
+        // Twice: pixels stay in step with those of the photo, whose masks then are just as they are.
+        if !is_asked_for && segment::border_share(&made.1) > LONG_BORDERS {
+            width_px = 2 * base_px;
+            made = regions_at(width_px);
+        }
+        let (raster_view, regions, masks_of_region) = made;
+        let weight_scale = (f64::from(base_px) / f64::from(width_px)).powi(2) as f32;
+        Partition { raster_view, regions, masks_of_region, boxes_px: boxes_of(masks), weight_scale }
     }
 
     /// Returns a vector per mask, with an encoder that is free or a new one.
@@ -210,6 +227,15 @@ impl ViewStages<'_> {
         vectors.map_err(|source| EncodeError::Embed { view: view.name.clone(), source })
     }
 }
+
+/// Returns the view as a raster of a width.
+fn raster_view(loaded: &LoadedImage, width_px: u32) -> RasterView {
+    RasterView {
+        camera_from_world: loaded.view.camera_from_world,
+        intrinsics: loaded.view.intrinsics.scaled_to_width(width_px),
+    }
+}
+
 /// Returns a raster's values at the photo's size, nearest.
 fn enlarge(values: &[f32], raster_view: &RasterView, loaded: &LoadedImage) -> Vec<f32> {
     let (width, height) = (u64::from(loaded.image.width()), u64::from(loaded.image.height()));

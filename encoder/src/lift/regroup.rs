@@ -187,6 +187,11 @@ impl SumsIndex {
         self.views.iter().map(|view| view.file.n_regions())
     }
 
+    /// Returns the number of entries of each view.
+    pub fn n_entries_of_view(&self) -> impl Iterator<Item = u64> + '_ {
+        self.views.iter().map(|view| view.file.n_entries())
+    }
+
     /// Returns the bytes that the index takes in memory.
     pub fn len_bytes(&self) -> u64 {
         let per_run = size_of::<super::sums::Run>() + size_of::<u32>();

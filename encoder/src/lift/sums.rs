@@ -303,6 +303,11 @@ impl SumsFile {
         self.n_regions
     }
 
+    /// Returns the number of sums of the view.
+    pub fn n_entries(&self) -> u64 {
+        self.n_entries
+    }
+
     /// Returns where the entries of a run lie.
     pub fn entries_of_run(&self, run: usize) -> Range<u64> {
         self.runs[run].start..self.runs.get(run + 1).map_or(self.n_entries, |next| next.start)

@@ -19,7 +19,7 @@ use crate::ingest::{LoadedImage, Undistorter};
 pub use given::GivenMasks;
 pub use graph::{GraphSegmenter, GraphSettings};
 pub use noise::{MaskNoise, NoisyMasks};
-pub use regions::partition;
+pub use regions::{absorb_slivers, border_share, partition};
 pub use rle::{Rle, RleError};
 pub use sam::{SamSegmenter, SamSettings};
 

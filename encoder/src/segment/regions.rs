@@ -7,6 +7,11 @@ const INVALID: u32 = u32::MAX;
 /// The class of pixels that no mask has covered so far.
 const UNCOVERED: u32 = 0;
 
+/// One over the share of a raster below which a region may be a sliver: 30 pixels of 640 x 480.
+const SLIVERS_A_RASTER: usize = 10_000;
+/// One over the share of every mask that covers it below which it is one.
+const SLIVERS_A_MASK: u32 = 8;
+
 /// Cuts a raster into regions of pixels that lie in the same set of masks.
 ///
 /// The masks are those of an image of `width_px` x `height_px`. Each pixel centre of the raster of
@@ -78,6 +83,72 @@ pub fn partition(
         }
     }
     number_regions(class_of_pixel, size_of_class.len(), masks, &columns, &rows)
+}
+
+/// Returns the length of a partition's borders over its area, both in pixels: pairs of neighbouring pixels of which
+/// just one lies in a region or each in another, over the pixels that lie in any. It falls with the raster's width.
+pub fn border_share(map: &RegionMap) -> f64 {
+    let (pixels, width) = (&map.region_of_pixel, (map.width_px as usize).max(1));
+    let in_rows = pixels.chunks(width).map(|row| row.windows(2).filter(|pair| pair[0] != pair[1]).count());
+    let in_columns = pixels.iter().zip(pixels.iter().skip(width)).filter(|(a, b)| a != b).count();
+    let n_covered = pixels.iter().filter(|region| **region != NO_REGION).count();
+    (in_rows.sum::<usize>() + in_columns) as f64 / n_covered.max(1) as f64
+}
+
+/// Gives slivers, which ragged edges of masks leave where they overlap, to their neighbours. A sliver has less than a
+/// 10,000th of the raster and less than an eighth of every mask that covers it, so that no mask loses its place. It
+/// goes to the region, no sliver itself, with which it has the longest border; where there is none it stays.
+pub fn absorb_slivers(map: &mut RegionMap, masks_of_region: &mut Vec<Vec<u32>>) {
+    let mut size_of_region = vec![0_u32; map.n_regions as usize];
+    let covered = map.region_of_pixel.iter().filter(|region| **region != NO_REGION);
+    covered.for_each(|region| size_of_region[*region as usize] += 1);
+    let n_masks = masks_of_region.iter().flatten().max().map_or(0, |mask| *mask as usize + 1);
+    let mut size_of_mask = vec![0_u32; n_masks];
+    for (masks, size) in masks_of_region.iter().zip(&size_of_region) {
+        masks.iter().for_each(|mask| size_of_mask[*mask as usize] += size);
+    }
+    let max_px = map.region_of_pixel.len() / SLIVERS_A_RASTER;
+    let is_sliver: Vec<bool> = (masks_of_region.iter().zip(&size_of_region))
+        .map(|(masks, size)| {
+            let is_small = |mask: &u32| SLIVERS_A_MASK * size < size_of_mask[*mask as usize];
+            (*size as usize) < max_px && masks.iter().all(is_small)
+        })
+        .collect();
+    let is = |region: u32| region != NO_REGION && is_sliver[region as usize];
+    // (sliver, neighbour), once for each pair of pixels along their border.
+    let mut borders = Vec::new();
+    let width = (map.width_px as usize).max(1);
+    for (at, a) in map.region_of_pixel.iter().enumerate() {
+        let right = map.region_of_pixel.get(at + 1).filter(|_| (at + 1) % width > 0);
+        for b in right.into_iter().chain(map.region_of_pixel.get(at + width)) {
+            match (is(*a), is(*b)) {
+                (true, false) if *b != NO_REGION => borders.push((*a, *b)),
+                (false, true) if *a != NO_REGION => borders.push((*b, *a)),
+                _ => {}
+            }
+        }
+    }
+    borders.sort_unstable();
+    let mut longest: Vec<(usize, u32)> = (0..map.n_regions).map(|region| (0, region)).collect();
+    for run in borders.chunk_by(|x, y| x == y) {
+        let (sliver, neighbour) = run[0];
+        if run.len() > longest[sliver as usize].0 {
+            longest[sliver as usize] = (run.len(), neighbour);
+        }
+    }
+    // Numbered anew in the order of the scan.
+    let mut number_of_region = vec![NO_REGION; map.n_regions as usize];
+    let mut masks_of_number = Vec::new();
+    for region in map.region_of_pixel.iter_mut().filter(|region| **region != NO_REGION) {
+        let kept = longest[*region as usize].1 as usize;
+        if number_of_region[kept] == NO_REGION {
+            number_of_region[kept] = masks_of_number.len() as u32;
+            masks_of_number.push(std::mem::take(&mut masks_of_region[kept]));
+        }
+        *region = number_of_region[kept];
+    }
+    map.n_regions = masks_of_number.len() as u32;
+    *masks_of_region = masks_of_number;
 }
 
 /// Numbers the classes in the order of a row-major scan, and finds the masks of each at its first pixel.
