@@ -40,6 +40,11 @@ impl Default for SuperpointSettings {
 }
 
 impl SuperpointSettings {
+    /// Larger superpoints of the same edges: about a thing's sides, where the default's are patches of them.
+    pub fn coarse() -> Self {
+        Self { scale: 20.0, min_gaussians: 60, ..Self::default() }
+    }
+
     /// Superpoints of colour and shape alone, where nothing else is known.
     pub fn of_looks() -> Self {
         Self { colour: 1.0, ..Self::default() }
@@ -81,8 +86,18 @@ impl Sketches<'_> {
 /// An edge; ascending by length, then by ends.
 type Edge = (u32, u32, u32);
 
-impl Superpoints {
-    /// Partitions a scene. The same input gives the same partition, for any number of threads.
+/// A scene's nearest-neighbour graph.
+#[derive(Debug)]
+pub struct Graph {
+    n_gaussians: usize,
+    /// Gaussians that can be drawn.
+    usable: Vec<u32>,
+    /// Ascending.
+    edges: Vec<Edge>,
+}
+
+impl Graph {
+    /// Finds and measures the edges of a scene. `settings`: neighbours, and what differences count.
     pub fn new(scene: &Gaussians, sketches: Option<Sketches<'_>>, settings: &SuperpointSettings) -> Self {
         let usable: Vec<u32> = (0..scene.len() as u32).filter(|i| scene.is_usable(*i as usize)).collect();
         let point = |i: &u32| GeomWithData::new(scene.means_in_world[*i as usize].to_array(), *i);
@@ -103,33 +118,45 @@ impl Superpoints {
         let mut edges: Vec<Edge> = usable.par_iter().flat_map_iter(edges_of).collect();
         edges.par_sort_unstable();
         edges.dedup();
-        let mut forest = Forest::new(scene.len(), settings.scale);
-        for (length, a, b) in &edges {
+        Self { n_gaussians: scene.len(), usable, edges }
+    }
+
+    /// Partitions the scene. `settings`: scale and least size.
+    pub fn superpoints(&self, settings: &SuperpointSettings) -> Superpoints {
+        let mut forest = Forest::new(self.n_gaussians, settings.scale);
+        for (length, a, b) in &self.edges {
             let length = f32::from_bits(*length);
             let (a, b) = (forest.root(*a), forest.root(*b));
             if a != b && length <= forest.threshold[a as usize].min(forest.threshold[b as usize]) {
                 forest.join(a, b, length, settings.scale);
             }
         }
-        for (_, a, b) in &edges {
+        for (_, a, b) in &self.edges {
             let (a, b) = (forest.root(*a), forest.root(*b));
             let smaller = forest.size[a as usize].min(forest.size[b as usize]);
             if a != b && smaller < settings.min_gaussians {
                 forest.join(a, b, 0.0, 0.0);
             }
         }
-        let mut number_of_root = vec![NO_SUPERPOINT; scene.len()];
-        let mut of_gaussian = vec![NO_SUPERPOINT; scene.len()];
+        let mut number_of_root = vec![NO_SUPERPOINT; self.n_gaussians];
+        let mut of_gaussian = vec![NO_SUPERPOINT; self.n_gaussians];
         let mut n = 0;
-        for i in usable {
-            let number = &mut number_of_root[forest.root(i) as usize];
+        for i in &self.usable {
+            let number = &mut number_of_root[forest.root(*i) as usize];
             if *number == NO_SUPERPOINT {
                 *number = n;
                 n += 1;
             }
-            of_gaussian[i as usize] = *number;
+            of_gaussian[*i as usize] = *number;
         }
-        Self { of_gaussian, n: n as usize }
+        Superpoints { of_gaussian, n: n as usize }
+    }
+}
+
+impl Superpoints {
+    /// Partitions a scene. The same input gives the same partition, for any number of threads.
+    pub fn new(scene: &Gaussians, sketches: Option<Sketches<'_>>, settings: &SuperpointSettings) -> Self {
+        Graph::new(scene, sketches, settings).superpoints(settings)
     }
 
     /// Returns the bytes that the work on `n_gaussians` takes: tree and edges.

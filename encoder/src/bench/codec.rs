@@ -439,6 +439,7 @@ impl CodecReport {
             Series { name: name.into(), points }
         });
         let plot = Plot {
+            note: String::new(),
             title: format!("{}: {} Gaussians, {} texts", self.title, self.n_gaussians, self.n_texts),
             across: "bytes a Gaussian, position included",
             up: "mean |score error| / spread of scores",

@@ -10,6 +10,8 @@ const COLOURS: [&str; 6] = ["#1b6ca8", "#c8553d", "#588157", "#7b2d8b", "#b08900
 pub struct Plot {
     /// Above the plot.
     pub title: String,
+    /// Below it, small: what the figures are to be read beside; nothing if empty.
+    pub note: String,
     /// Horizontal axis.
     pub across: &'static str,
     /// Vertical axis.
@@ -45,8 +47,9 @@ impl Plot {
         let mut out = format!(
             "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {w} {h}\" font-family=\"sans-serif\" font-size=\"12\">\n\
              <rect width=\"{w}\" height=\"{h}\" fill=\"white\"/>\n\
-             <text x=\"{}\" y=\"22\" font-size=\"15\">{}</text>\n",
-            MARGIN.0, self.title
+             <text x=\"{}\" y=\"20\" font-size=\"15\">{}</text>\n\
+             <text x=\"{}\" y=\"35\" font-size=\"10\" fill=\"#555\">{}</text>\n",
+            MARGIN.0, self.title, MARGIN.0, self.note
         );
         let (left, right, bottom, top) = (x.from, x.to, y.from, y.to);
         let mut line = |x1: f64, y1: f64, x2: f64, y2: f64| {

@@ -16,9 +16,9 @@ use super::noise::EvalNoiseArgs;
 use super::refine::RefineArgs;
 use super::sam::SamArgs;
 use super::tradeoff::TradeoffArgs;
-use super::views::{ViewsArgs, parse_views_limit};
+use super::views::{ViewsArgs, parse_raster_width, parse_views_limit};
 use crate::embed::Background;
-use crate::encode::{DEFAULT_MASK_LEVELS, ViewsLimit};
+use crate::encode::{DEFAULT_MASK_LEVELS, RasterWidth, ViewsLimit};
 use crate::eval::Filter;
 use crate::generate::crops::Split;
 use crate::generate::grammar::SceneKind;
@@ -182,10 +182,10 @@ pub struct EncodeArgs {
     /// Where weights are rasterised: auto (GPUs, else the CPU), gpu, cpu, or an adapter's number.
     #[arg(long, value_name = "DEVICE", default_value_t)]
     pub device: DeviceChoice,
-    /// Width at which weights are rasterised [default: the preset's, or the photo's own, at most 1024, and twice as much
-    /// in views whose masks have long borders].
-    #[arg(long, value_name = "PX", value_parser = clap::value_parser!(u32).range(16..=8192))]
-    pub raster_width: Option<u32>,
+    /// Width at which weights are rasterised: pixels; `photo` for the photo's own, at most 1024; `auto` for twice as much
+    /// in views whose masks have long borders [default: the preset's].
+    #[arg(long, value_name = "auto|photo|PX", value_parser = parse_raster_width)]
+    pub raster_width: Option<RasterWidth>,
     /// Masks with fewer pixels are left out [default: the preset's].
     #[arg(long, value_name = "PX")]
     pub min_mask_px: Option<u32>,
@@ -237,7 +237,7 @@ pub struct EncodeArgs {
 /// Bundles of choices.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Preset {
-    /// The paper's method: white behind the masks, the plain average, no objects.
+    /// The paper's method: white behind the masks, rasters as wide as photos, the plain average, no objects.
     Paper,
     /// Half of the views, by coverage, two scales of masks, coarse rasters; refined.
     Fast,
@@ -265,7 +265,7 @@ pub struct Choices {
     /// Views to use at most.
     pub views_limit: ViewsLimit,
     /// Width at which weights are rasterised.
-    pub raster_width_px: Option<u32>,
+    pub raster_width: RasterWidth,
 }
 
 impl Preset {
@@ -279,15 +279,20 @@ impl Preset {
             mask_levels: DEFAULT_MASK_LEVELS,
             min_mask_px: 200,
             views_limit: ViewsLimit::All,
-            raster_width_px: None,
+            raster_width: RasterWidth::ByContent,
         };
         match self {
             Self::Balanced => balanced,
-            Self::Paper => Choices { aggregation: Aggregation::PAPER, objects: false, ..balanced },
+            Self::Paper => Choices {
+                aggregation: Aggregation::PAPER,
+                objects: false,
+                raster_width: RasterWidth::Photo,
+                ..balanced
+            },
             Self::Fast => Choices {
                 mask_levels: 2,
                 views_limit: ViewsLimit::Share(0.5),
-                raster_width_px: Some(320),
+                raster_width: RasterWidth::Px(320),
                 ..balanced
             },
             Self::Accurate => Choices { mask_levels: 4, min_mask_px: 100, ..balanced },

@@ -26,6 +26,9 @@ pub struct RefineArgs {
     /// What a superpoint's mean counts beside a Gaussian's own, which counts 1.
     #[arg(long, value_name = "TIMES", value_parser = amount)]
     superpoint: Option<f32>,
+    /// What the mean of a larger superpoint counts beside what came of that.
+    #[arg(long, value_name = "TIMES", value_parser = amount)]
+    coarse: Option<f32>,
     /// Whether Gaussians without evidence take their superpoint's.
     #[arg(long, value_name = "BOOL")]
     fill: Option<bool>,
@@ -50,6 +53,7 @@ impl RefineArgs {
             agreement: self.agreement.unwrap_or(preset.agreement),
             median_steps: self.median_steps.unwrap_or(preset.median_steps),
             superpoint: self.superpoint.unwrap_or(preset.superpoint),
+            coarse: self.coarse.unwrap_or(preset.coarse),
             fill: self.fill.unwrap_or(preset.fill),
         }
     }

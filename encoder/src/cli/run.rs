@@ -197,7 +197,9 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
     let created_unix_secs = now_unix_secs();
     let masks = match (args.masks.as_str(), args.sam.masks()) {
         ("graph", None) => Masks::Graph,
-        ("auto", masks) => masks.unwrap_or(Masks::Auto { n_levels: args.views.mask_levels.unwrap_or(preset.mask_levels) }),
+        ("auto", masks) => {
+            masks.unwrap_or(Masks::Auto { n_levels: args.views.mask_levels.unwrap_or(preset.mask_levels) })
+        }
         (dir, Some(_)) => {
             return Err(anyhow!("--masks {dir} gives masks, --segmenter finds some; choose one"));
         }
@@ -215,7 +217,7 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
         views_limit,
         view_order: args.views.order(views_limit),
         time_budget: args.views.time_budget,
-        raster_width_px: args.raster_width.or(preset.raster_width_px),
+        raster_width: args.raster_width.unwrap_or(preset.raster_width),
         background: args.background.map_or(preset.background, Into::into),
         min_mask_px: args.min_mask_px.unwrap_or(preset.min_mask_px),
         weights: args.weights.map_or(preset.weights, Into::into),

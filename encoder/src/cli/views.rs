@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 
-use crate::encode::{ViewOrder, ViewsLimit};
+use crate::encode::{RasterWidth, ViewOrder, ViewsLimit};
 
 /// Which views come first, and how long to go on. Sums of views are kept until all are used, so an encode with a
 /// higher limit or more time goes on from there.
@@ -44,6 +44,20 @@ impl ViewsArgs {
     }
 }
 
+/// Parses how wide rasters are.
+pub(super) fn parse_raster_width(text: &str) -> Result<RasterWidth, String> {
+    match text {
+        "auto" => Ok(RasterWidth::ByContent),
+        "photo" => Ok(RasterWidth::Photo),
+        _ => {
+            let width_px = text.parse().ok().filter(|px| (16..=8192).contains(px));
+            width_px
+                .map(RasterWidth::Px)
+                .ok_or_else(|| format!("{text:?} is none of auto, photo, and 16 to 8192 pixels"))
+        }
+    }
+}
+
 /// Parses a number of views, or a part of them in per cent.
 pub(super) fn parse_views_limit(text: &str) -> Result<ViewsLimit, String> {
     let limit = match text.strip_suffix('%') {
@@ -55,7 +69,9 @@ pub(super) fn parse_views_limit(text: &str) -> Result<ViewsLimit, String> {
         ViewsLimit::Count(n) => *n > 0,
         ViewsLimit::Share(share) => *share > 0.0 && *share <= 1.0,
     };
-    limit.filter(is_some).ok_or_else(|| format!("{text:?} is neither a number of views nor a part, 1% to 100%"))
+    limit
+        .filter(is_some)
+        .ok_or_else(|| format!("{text:?} is neither a number of views nor a part, 1% to 100%"))
 }
 
 fn parse_secs(text: &str) -> Result<Duration, String> {

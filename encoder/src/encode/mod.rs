@@ -44,7 +44,7 @@ use cells::CellBuilder;
 use coverage::{Coverage, CoverageReport};
 use job::{Job, ViewRecord};
 pub use pipeline::StageReport;
-pub use settings::{DEFAULT_MASK_LEVELS, EncodeSettings, Masks, ViewOrder, ViewsLimit};
+pub use settings::{DEFAULT_MASK_LEVELS, EncodeSettings, Masks, RasterWidth, ViewOrder, ViewsLimit};
 use view::{ViewStages, Work};
 
 /// Why an encode ended without a new generation.

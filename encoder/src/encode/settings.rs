@@ -109,9 +109,8 @@ pub struct EncodeSettings {
     pub view_order: ViewOrder,
     /// Time after which no view is begun, from the start; at least one view is used.
     pub time_budget: Option<Duration>,
-    /// Width at which weights are rasterised; if absent the photo's own, at most [`MAX_RASTER_WIDTH_PX`], and twice as
-    /// much where regions have [`LONG_BORDERS`].
-    pub raster_width_px: Option<u32>,
+    /// Width at which weights are rasterised.
+    pub raster_width: RasterWidth,
     /// What fills a crop outside its mask.
     pub background: Background,
     /// Masks with fewer pixels are left out.
@@ -144,6 +143,18 @@ pub struct EncodeSettings {
     pub expires_unix_secs: Option<u64>,
 }
 
+/// Width of the rasters of views.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum RasterWidth {
+    /// As [`Self::Photo`], and twice as much in views whose regions have [`LONG_BORDERS`].
+    ByContent,
+    /// The photo's own, at most [`MAX_RASTER_WIDTH_PX`].
+    Photo,
+    /// This many pixels.
+    Px(u32),
+}
+
 /// Widest raster where regions do not ask for more: masks are coarser than this, and time grows with the square.
 pub const MAX_RASTER_WIDTH_PX: u32 = 1024;
 /// Length of the borders of a view's regions over their area, in pixels of the raster, above which it has twice the
@@ -169,7 +180,7 @@ impl EncodeSettings {
             views_limit: ViewsLimit::All,
             view_order: ViewOrder::Names,
             time_budget: None,
-            raster_width_px: None,
+            raster_width: RasterWidth::ByContent,
             background: Background::White,
             min_mask_px: 200,
             weights: WeightKind::Blend,
@@ -226,7 +237,7 @@ impl EncodeSettings {
             segmenter: &'a str,
             mask_files: Vec<(String, u64)>,
             views: Vec<(&'a str, u64, String)>,
-            raster_width_px: Option<u32>,
+            raster_width: RasterWidth,
             regions: (u32, f64),
             background: String,
             min_mask_px: u32,
@@ -254,7 +265,7 @@ impl EncodeSettings {
             segmenter,
             mask_files: self.mask_files()?,
             views,
-            raster_width_px: self.raster_width_px,
+            raster_width: self.raster_width,
             regions: (REGIONS_VERSION, LONG_BORDERS),
             background: format!("{:?}", self.background),
             min_mask_px: self.min_mask_px,

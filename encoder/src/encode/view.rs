@@ -9,7 +9,7 @@ use slag_models::{Crop, ImageEncoder, ModelDir, SessionOptions};
 
 use super::job::{Job, ViewRecord};
 use super::pipeline::Stage;
-use super::settings::{LONG_BORDERS, MAX_RASTER_WIDTH_PX};
+use super::settings::{LONG_BORDERS, MAX_RASTER_WIDTH_PX, RasterWidth};
 use super::{EncodeError, EncodeSettings};
 use crate::embed;
 use crate::ingest::{self, LoadedImage};
@@ -176,10 +176,15 @@ impl ViewStages<'_> {
 
     /// Returns the width of the raster where nothing of the view's content is known.
     fn base_width_px(&self, loaded: &LoadedImage) -> u32 {
-        self.settings.raster_width_px.unwrap_or(loaded.view.intrinsics.width_px.min(MAX_RASTER_WIDTH_PX))
+        match self.settings.raster_width {
+            RasterWidth::Px(width_px) => width_px,
+            RasterWidth::ByContent | RasterWidth::Photo => {
+                loaded.view.intrinsics.width_px.min(MAX_RASTER_WIDTH_PX)
+            }
+        }
     }
 
-    /// Makes the regions of a view's masks, finer where their borders are long and no width is asked for.
+    /// Makes the regions of a view's masks, finer where their borders are long, if that is asked for.
     fn partition(&self, loaded: &LoadedImage, masks: &[Mask]) -> Partition {
         let regions_at = |width_px| {
             let raster_view = raster_view(loaded, width_px);
@@ -192,10 +197,11 @@ impl ViewStages<'_> {
         };
         let base_px = self.base_width_px(loaded);
         let mut made = regions_at(base_px);
-        let is_asked_for = self.settings.raster_width_px.is_some();
         let mut width_px = base_px;
         // Twice: pixels stay in step with those of the photo, whose masks then are just as they are.
-        if !is_asked_for && segment::border_share(&made.1) > LONG_BORDERS {
+        if self.settings.raster_width == RasterWidth::ByContent
+            && segment::border_share(&made.1) > LONG_BORDERS
+        {
             width_px = 2 * base_px;
             made = regions_at(width_px);
         }

@@ -7,11 +7,12 @@
 //! | `agreement` | a mask counts as far as it agrees with what other views say of its Gaussians |
 //! | `median_steps` | views that disagree count less: steps towards the geometric median |
 //! | `superpoint` | a Gaussian's row takes a part of its superpoint's |
+//! | `coarse` | then a part of a larger superpoint's |
 //! | `fill` | a Gaussian without evidence takes its superpoint's row |
 //!
 //! The result is again sparse sums over regions: masks that count for less are in the [`RegionTable`], and a
 //! superpoint is one more region of it, a mixture of masks. So scores, shards and what is published agree, and a
-//! row has one entry more at most.
+//! row has two entries more at most.
 //!
 //! Everything here is decided among the vectors' coordinates along a few principal axes, and in one order: the
 //! results do not depend on threads or on the memory budget.
@@ -29,7 +30,7 @@ use super::sums::SumsError;
 use super::table::RegionTable;
 use crate::palette::frame::principal_coordinates;
 use crate::shard::cells::CellSplit;
-use crate::superpoint::{NO_SUPERPOINT, Sketches, SuperpointSettings, Superpoints};
+use crate::superpoint::{Graph, NO_SUPERPOINT, Sketches, SuperpointSettings, Superpoints};
 
 /// Principal axes: nine tenths of the squares of mask vectors of 512 components (measured).
 const AXES: usize = 48;
@@ -62,6 +63,8 @@ pub struct Aggregation {
     pub median_steps: u32,
     /// What a superpoint's mean counts beside the Gaussian's own, which counts 1.
     pub superpoint: f32,
+    /// What the mean of a larger superpoint counts beside what came of that, which counts 1.
+    pub coarse: f32,
     /// Whether Gaussians without evidence take their superpoint's mean.
     pub fill: bool,
 }
@@ -75,12 +78,13 @@ impl Aggregation {
         agreement: 0.0,
         median_steps: 0,
         superpoint: 0.0,
+        coarse: 0.0,
         fill: false,
     };
     /// What was measured to help on a trained splat and on generated ones alike. Pruning by region helps the
     /// first, whose Gaussians lie across outlines, and costs the others more.
     pub const REFINED: Self =
-        Self { min_view_share: 0.1, agreement: 0.5, superpoint: 3.0, fill: true, ..Self::PAPER };
+        Self { min_view_share: 0.1, agreement: 0.5, superpoint: 3.0, coarse: 0.7, fill: true, ..Self::PAPER };
 
     /// Returns the plain average, each option alone, and those that are used together: what tables compare.
     pub fn methods() -> Vec<(&'static str, Self)> {
@@ -93,13 +97,14 @@ impl Aggregation {
             ("agreement", Self { agreement: refined.agreement, ..paper }),
             ("median", Self { median_steps: 3, ..paper }),
             ("superpoints", Self { superpoint: refined.superpoint, ..paper }),
+            ("coarse", Self { coarse: refined.coarse, ..paper }),
             ("fill", Self { fill: true, ..paper }),
             ("refined", refined),
         ]
     }
 
     fn needs_superpoints(&self) -> bool {
-        self.superpoint > 0.0 || self.fill
+        self.superpoint > 0.0 || self.coarse > 0.0 || self.fill
     }
 }
 
@@ -122,7 +127,8 @@ pub struct Refinement {
     mask_counts: Vec<f32>,
     /// `[n_regions]`: each region's vector; empty where none is needed.
     points: Vec<Point>,
-    mixtures: Option<Mixtures>,
+    /// Finer superpoints first, and what each counts.
+    mixtures: Vec<(f32, Mixtures)>,
 }
 
 /// A Gaussian's entries of one view, and their weight.
@@ -148,8 +154,13 @@ impl Refinement {
             return Ok(None);
         }
         let first_regions = index.first_regions();
-        let mut refinement =
-            Self { settings, first_regions, mask_counts: Vec::new(), points: Vec::new(), mixtures: None };
+        let mut refinement = Self {
+            settings,
+            first_regions,
+            mask_counts: Vec::new(),
+            points: Vec::new(),
+            mixtures: Vec::new(),
+        };
         refinement.mask_counts = table.mask_counts(0..table.len());
         let is_plain =
             settings.agreement == 0.0 && settings.median_steps == 0 && !settings.needs_superpoints();
@@ -193,17 +204,33 @@ impl Refinement {
                 return Ok(None);
             }
             let sketches = Sketches { width: AXES, values: &sketches };
-            let superpoints = Superpoints::new(scene, Some(sketches), &SuperpointSettings::default());
-            let mut regions_of = vec![Vec::new(); superpoints.n];
+            let graph = Graph::new(scene, Some(sketches), &SuperpointSettings::default());
+            let mut levels = Vec::new();
+            if settings.superpoint > 0.0 || settings.fill {
+                levels.push((settings.superpoint, graph.superpoints(&SuperpointSettings::default())));
+            }
+            if settings.coarse > 0.0 {
+                levels.push((settings.coarse, graph.superpoints(&SuperpointSettings::coarse())));
+            }
+            drop(graph);
+            let mut regions_of: Vec<Vec<Vec<(u32, f32)>>> =
+                levels.iter().map(|(_, superpoints)| vec![Vec::new(); superpoints.n]).collect();
             let done = each_part(table, &mut |mut sums| {
                 refinement.change_rows(&mut sums);
                 let gaussians = &split.cells[sums.part.cell_id as usize].gaussians[sums.part.locals.clone()];
-                add_rows(&sums, gaussians, &superpoints, &mut regions_of);
+                for ((_, superpoints), regions_of) in levels.iter().zip(&mut regions_of) {
+                    add_rows(&sums, gaussians, superpoints, regions_of);
+                }
             })?;
             if !done {
                 return Ok(None);
             }
-            refinement.mixtures = Some(Mixtures::new(superpoints, regions_of, table, mask_points));
+            for ((count, superpoints), regions_of) in levels.into_iter().zip(regions_of) {
+                let mixtures = Mixtures::new(superpoints, regions_of, table, mask_points);
+                refinement.mixtures.push((count, mixtures));
+            }
+            // With those of the mixtures, which the next one is mixed with.
+            refinement.points = region_points(table, mask_points);
         }
         Ok(Some(refinement))
     }
@@ -227,8 +254,8 @@ impl Refinement {
     /// Changes a part's sums; `gaussians`: the scene's numbers of its Gaussians.
     pub fn apply(&self, sums: &mut PartSums, gaussians: &[u32]) {
         self.change_rows(sums);
-        if let Some(mixtures) = &self.mixtures {
-            self.mix(sums, gaussians, mixtures);
+        for (count, mixtures) in &self.mixtures {
+            self.mix(sums, gaussians, mixtures, *count);
         }
     }
 
@@ -395,9 +422,9 @@ impl Refinement {
         }
     }
 
-    /// Adds each Gaussian's superpoint to its row.
-    fn mix(&self, sums: &mut PartSums, gaussians: &[u32], mixtures: &Mixtures) {
-        let share = self.settings.superpoint / (1.0 + self.settings.superpoint);
+    /// Adds each Gaussian's superpoint to its row, `count` times as much as the row itself.
+    fn mix(&self, sums: &mut PartSums, gaussians: &[u32], mixtures: &Mixtures, count: f32) {
+        let share = count / (1.0 + count);
         // Region and weight of the entry that is added, and what the row keeps.
         let entry_of = |k: usize| -> Option<(u32, f32, f32)> {
             let superpoint = mixtures.of_gaussian[gaussians[k] as usize];

@@ -3,7 +3,7 @@
 //! ```json
 //! {"points": [{
 //!   "axis": "views by coverage", "name": "1/4",
-//!   "views": "--view-order coverage --views-limit {views/4}",
+//!   "views": "--view-order coverage --views-limit 25%",
 //!   "lift": "--compact-error 0.1",
 //!   "eval": "", "profile": "compact"
 //! }]}
@@ -13,13 +13,12 @@
 //! depend, `lift` those that only change what is made of the sums; `eval` are flags of `eval labelled`; the shards of
 //! `profile` are judged, weighed and asked. All profiles are made, because the exact one says which Gaussian is which.
 //!
-//! `{masks}` is the scene's folder of true masks; `{views/N}` an N-th of its views, at least one. Points of the same
-//! scene with the same `views` share one store, and their sums are computed once.
+//! `{masks}` is the scene's folder of true masks. Points of the same scene with the same `views` share one store, and
+//! their sums are computed once.
 
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use slag_common::poses;
 use slag_common::shard::Profile;
 
 use super::TradeoffError;
@@ -111,15 +110,13 @@ pub struct LabelledScene {
     pub splat: PathBuf,
     /// The poses.
     pub poses: PathBuf,
-    /// Views of them.
-    pub n_views: usize,
 }
 
 impl LabelledScene {
     /// Looks what a folder holds.
     ///
     /// # Errors
-    /// [`TradeoffError::Scene`], [`TradeoffError::Poses`].
+    /// [`TradeoffError::Scene`].
     pub fn find(dir: &Path) -> Result<Self, TradeoffError> {
         let first = |names: &[&str], what: &'static str| {
             let found = names.iter().map(|name| dir.join(name)).find(|path| path.exists());
@@ -131,9 +128,8 @@ impl LabelledScene {
         let splat = first(&["scene.ply", "point_cloud.ply", "point_cloud.spz"], "splat")?;
         let poses = first(&["sparse/0", "transforms.json"], "poses")?;
         first(&["gt/gaussian_instance.npy"], "labels")?;
-        let n_views = poses::read(&poses, None)?.views.len();
         let name = dir.canonicalize()?.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        Ok(Self { name, dir: dir.to_owned(), splat, poses, n_views })
+        Ok(Self { name, dir: dir.to_owned(), splat, poses })
     }
 
     /// Returns the folder of true masks, where there is one.
@@ -157,11 +153,7 @@ impl LabelledScene {
                     Some(path) => path.display().to_string(),
                     None => return Ok(None),
                 },
-                Some(inner) => {
-                    let share = inner.strip_prefix("views/").and_then(|n| n.parse().ok());
-                    let n: usize = share.filter(|n| *n > 0).ok_or_else(|| unknown(word))?;
-                    (self.n_views / n).max(1).to_string()
-                }
+                Some(_) => return Err(unknown(word)),
             });
         }
         Ok(Some(words))
@@ -174,7 +166,7 @@ mod tests {
 
     fn scene(dir: &Path) -> LabelledScene {
         let path = dir.to_owned();
-        LabelledScene { name: "a".into(), dir: path.clone(), splat: path.clone(), poses: path, n_views: 96 }
+        LabelledScene { name: "a".into(), dir: path.clone(), splat: path.clone(), poses: path }
     }
 
     #[test]
@@ -196,10 +188,10 @@ mod tests {
     fn placeholders_are_the_scenes() {
         let dir = tempfile::tempdir().expect("a folder");
         let scene = scene(dir.path());
-        let words = scene.expand("--views-limit {views/4} --x").expect("known").expect("there");
-        assert_eq!(words, ["--views-limit", "24", "--x"]);
+        let words = scene.expand("--views-limit 25% --x").expect("known").expect("there");
+        assert_eq!(words, ["--views-limit", "25%", "--x"]);
         assert_eq!(scene.expand("--masks {masks}").expect("known"), None, "the scene has none");
-        for wrong in ["{views/0}", "{view}", "{views/x}", "a{masks}"] {
+        for wrong in ["{view}", "{masks", "a{masks}"] {
             let message = scene.expand(wrong).expect_err("unknown").to_string();
             assert!(message.contains(wrong), "{message}");
         }

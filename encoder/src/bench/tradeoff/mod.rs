@@ -31,9 +31,6 @@ pub enum TradeoffError {
     /// A file could not be read or written.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// Poses cannot be read.
-    #[error(transparent)]
-    Poses(#[from] slag_common::poses::PoseError),
     /// The grid is not as expected.
     #[error("{}: {what}; expected {{\"points\": [..]}}, each with axis and name, and views, lift, eval, profile if need be", path.display())]
     Grid {
@@ -43,7 +40,7 @@ pub enum TradeoffError {
         what: String,
     },
     /// Flags with a placeholder that is none.
-    #[error("{flags:?}: {word} is not known; there are {{masks}} and {{views/N}}")]
+    #[error("{flags:?}: {word} is not known; there is {{masks}}")]
     Flags {
         /// The flags.
         flags: String,

@@ -106,7 +106,6 @@ esac
         dir: scene_dir.clone(),
         splat: scene_dir.join("scene.ply"),
         poses: scene_dir.join("transforms.json"),
-        n_views: 5,
     };
     let point = |name: &str, views: &str, lift: &str| Point {
         axis: "a".into(),

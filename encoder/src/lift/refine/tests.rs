@@ -236,8 +236,6 @@ fn pruning_and_agreement_are_those_of_the_definition() {
 #[test]
 fn a_superpoint_gives_its_part_and_fills_what_no_view_sees() {
     let views = views();
-    let settings = Aggregation { superpoint: 1.0, fill: true, ..Aggregation::PAPER };
-    let Lifted { field, embeddings, table } = lifted(settings, u64::MAX);
     let once = vec![1.0; 6];
     let sum_of = |k: usize| -> Vec<f64> {
         let mut sum = vec![0.0; DIM];
@@ -246,22 +244,31 @@ fn a_superpoint_gives_its_part_and_fills_what_no_view_sees() {
         }
         sum
     };
-    for k in 0..N {
-        let mut patch = vec![0.0; DIM];
-        (k / 30 * 30..k / 30 * 30 + 30).for_each(|other| {
-            sum_of(other).iter().enumerate().for_each(|(c, x)| patch[c] += x);
-        });
-        let own = sum_of(k);
-        let own_length = norm(&own).max(1e-12);
-        let expected: Vec<f64> = (0..DIM).map(|c| own[c] / own_length + patch[c] / norm(&patch)).collect();
-        assert_near(&embeddings[k * DIM..][..DIM], &expected, &format!("{k}"));
-        assert!(field.has_evidence(k));
-        assert_eq!(UNSEEN.contains(&k), field.total_weights[k] < 0.01);
+    // Larger superpoints are the same patches here. Both: a half of what came of the first is the second's.
+    let parts = |superpoint, coarse| Aggregation { superpoint, coarse, fill: true, ..Aggregation::PAPER };
+    for (settings, n_levels) in [(parts(1.0, 0.0), 1), (parts(0.0, 1.0), 2), (parts(1.0, 1.0), 2)] {
+        let Lifted { field, embeddings, table } = lifted(settings, u64::MAX);
+        for k in 0..N {
+            let mut patch = vec![0.0; DIM];
+            (k / 30 * 30..k / 30 * 30 + 30).for_each(|other| {
+                sum_of(other).iter().enumerate().for_each(|(c, x)| patch[c] += x);
+            });
+            let unit = |v: &[f64]| -> Vec<f64> { v.iter().map(|x| x / norm(v).max(1e-12)).collect() };
+            let mut expected = unit(&sum_of(k));
+            for count in [settings.superpoint, settings.coarse] {
+                let own = if norm(&expected) > 0.0 { unit(&expected) } else { unit(&patch) };
+                let of_patch = unit(&patch);
+                expected = (0..DIM).map(|c| own[c] + f64::from(count) * of_patch[c]).collect();
+            }
+            assert_near(&embeddings[k * DIM..][..DIM], &expected, &format!("{settings:?} {k}"));
+            assert!(field.has_evidence(k));
+            assert_eq!(UNSEEN.contains(&k), field.total_weights[k] < 0.01);
+        }
+        assert_eq!(table.len(), 7 * 9 + 3 * n_levels);
+        let mut bytes = Vec::new();
+        table.write(&mut bytes).expect("writes to memory");
+        assert_eq!(RegionTable::from_bytes(&AlignedBytes::copy_of(&bytes)).expect("valid"), table);
     }
-    assert_eq!(table.len(), 7 * 9 + 3);
-    let mut bytes = Vec::new();
-    table.write(&mut bytes).expect("writes to memory");
-    assert_eq!(RegionTable::from_bytes(&AlignedBytes::copy_of(&bytes)).expect("valid"), table);
 
     let unfilled = lifted(Aggregation { superpoint: 1.0, ..Aggregation::PAPER }, u64::MAX);
     assert!(UNSEEN.iter().all(|k| !unfilled.field.has_evidence(*k)));
