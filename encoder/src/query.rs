@@ -306,6 +306,24 @@ pub fn write_npy(mut out: impl Write, values: &[f32]) -> io::Result<()> {
 mod tests {
     use super::*;
 
+    /// By hand: a Gaussian with an object, one without, and one that only its object says something of.
+    #[test]
+    fn gaussians_take_a_part_of_their_objects_score() {
+        let objects = PublishedObjects {
+            object_of: vec![1, NONE, 0],
+            ids: vec![7, 9],
+            calibration: Calibration { score_mean: 0.0, score_spread: 0.1 },
+            vectors: vec![1.0, 0.0, 0.0, 1.0],
+            n_vectors: 1,
+            dim: 2,
+        };
+        let of_objects = objects.scores(&[0.6, 0.8]);
+        assert_eq!(of_objects, [0.6, 0.8]);
+        let mut cosines = [0.2, 0.3, f32::NAN];
+        objects.overlay(&of_objects, &mut cosines);
+        assert_eq!(cosines, [0.7 * 0.2 + 0.3 * 0.8, 0.3, 0.6]);
+    }
+
     /// Oracle: another reader of the format.
     #[test]
     fn npy_is_read_by_another_reader() {

@@ -436,7 +436,7 @@ impl CodecReport {
             let of_name = self.points.iter().filter(|p| p.codec == name);
             let mut points: Vec<(f64, f64)> = of_name.map(|p| (p.bytes, p.mean_error)).collect();
             points.sort_by(|a, b| a.0.total_cmp(&b.0));
-            Series { name: name.into(), points }
+            Series { name: name.into(), points, labels: Vec::new() }
         });
         let plot = Plot {
             note: String::new(),

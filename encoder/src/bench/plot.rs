@@ -2,9 +2,14 @@
 
 use std::fmt::Write;
 
-const SIZE: (f64, f64) = (760.0, 480.0);
+const SIZE: (f64, f64) = (920.0, 480.0);
+/// Where the plot ends and the legend begins.
+const RIGHT: f64 = 760.0;
 const MARGIN: (f64, f64) = (72.0, 48.0);
-const COLOURS: [&str; 6] = ["#1b6ca8", "#c8553d", "#588157", "#7b2d8b", "#b08900", "#444444"];
+const COLOURS: [&str; 12] = [
+    "#1b6ca8", "#c8553d", "#588157", "#7b2d8b", "#b08900", "#444444", "#00a0a0", "#e75480", "#8a5a00",
+    "#6a9fd8", "#9acd32", "#b0b0b0",
+];
 
 /// What the axes are.
 pub struct Plot {
@@ -35,13 +40,15 @@ pub struct Series {
     pub name: String,
     /// (across, up).
     pub points: Vec<(f64, f64)>,
+    /// Written beside the points; none if empty.
+    pub labels: Vec<String>,
 }
 
 impl Plot {
     /// Draws the series.
     pub fn svg(&self, series: &[Series]) -> String {
         let all = || series.iter().flat_map(|s| &s.points).filter(|p| p.0 > 0.0 && p.1 > 0.0);
-        let x = Axis::of(all().map(|p| p.0), MARGIN.0, SIZE.0 - 16.0, Scale::Logarithmic);
+        let x = Axis::of(all().map(|p| p.0), MARGIN.0, RIGHT, Scale::Logarithmic);
         let y = Axis::of(all().map(|p| p.1), SIZE.1 - MARGIN.1, 40.0, self.up_scale);
         let (w, h) = SIZE;
         let mut out = format!(
@@ -107,13 +114,21 @@ impl Plot {
                     y.at(p.1)
                 );
             }
+            for (p, label) in series.points.iter().zip(&series.labels) {
+                let _ = writeln!(
+                    out,
+                    "<text x=\"{:.1}\" y=\"{:.1}\" font-size=\"11\" fill=\"{colour}\">{label}</text>",
+                    x.at(p.0) + 6.0,
+                    y.at(p.1) - 5.0
+                );
+            }
             let at = 52.0 + 18.0 * number as f64;
             let _ = writeln!(
                 out,
                 "<circle cx=\"{:.1}\" cy=\"{:.1}\" r=\"4\" fill=\"{colour}\"/><text x=\"{:.1}\" y=\"{:.1}\">{}</text>",
-                right - 150.0,
+                right + 16.0,
                 at,
-                right - 140.0,
+                right + 26.0,
                 at + 4.0,
                 series.name
             );

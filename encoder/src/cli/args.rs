@@ -13,16 +13,16 @@ use slag_models::commands::{ModelsCommand, RunArgs};
 use super::eval::{EvalEncoderArgs, EvalLerfArgs, EvalScannetArgs};
 use super::keys::KeysCommand;
 use super::noise::EvalNoiseArgs;
+use super::preset::Preset;
 use super::refine::RefineArgs;
 use super::sam::SamArgs;
 use super::tradeoff::TradeoffArgs;
 use super::views::{ViewsArgs, parse_raster_width, parse_views_limit};
 use crate::embed::Background;
-use crate::encode::{DEFAULT_MASK_LEVELS, RasterWidth, ViewsLimit};
+use crate::encode::{RasterWidth, ViewsLimit};
 use crate::eval::Filter;
 use crate::generate::crops::Split;
 use crate::generate::grammar::SceneKind;
-use crate::lift::Aggregation;
 use crate::palette::PaletteSettings;
 use crate::raster::WeightKind;
 use crate::raster::devices::DeviceChoice;
@@ -213,12 +213,12 @@ pub struct EncodeArgs {
     /// Which shards to make.
     #[arg(long, value_name = "NAMES", value_delimiter = ',', num_args = 1.., default_values_t = Profile::ALL)]
     pub profiles: Vec<Profile>,
-    /// Error of scores that the compact profile may have: mean, relative to the spread of scores.
-    #[arg(long, value_name = "E", default_value_t = PaletteSettings::default().compact_error, value_parser = parse_error)]
-    pub compact_error: f32,
+    /// Error of scores that the compact profile may have: mean, relative to the spread of scores [default: the preset's].
+    #[arg(long, value_name = "E", value_parser = parse_error)]
+    pub compact_error: Option<f32>,
     /// The same for the balanced profile.
-    #[arg(long, value_name = "E", default_value_t = PaletteSettings::default().balanced_error, value_parser = parse_error)]
-    pub balanced_error: f32,
+    #[arg(long, value_name = "E", value_parser = parse_error)]
+    pub balanced_error: Option<f32>,
     /// Error of positions, world units [default: 0.01 in metric scenes, else a quarter of the size of a
     /// cell's small Gaussians].
     #[arg(long, value_name = "E")]
@@ -232,72 +232,6 @@ pub struct EncodeArgs {
     /// Drops an unfinished encode of other inputs or settings.
     #[arg(long)]
     pub restart: bool,
-}
-
-/// Bundles of choices.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum Preset {
-    /// The paper's method: white behind the masks, rasters as wide as photos, the plain average, no objects.
-    Paper,
-    /// Half of the views, by coverage, two scales of masks, coarse rasters; refined.
-    Fast,
-    /// All views; refined.
-    Balanced,
-    /// All views, all scales of masks, small ones too; refined.
-    Accurate,
-}
-
-/// What a preset stands for.
-#[derive(Clone, Copy, Debug)]
-pub struct Choices {
-    /// What fills a crop outside its mask.
-    pub background: Background,
-    /// Which weight is summed.
-    pub weights: WeightKind,
-    /// How sums become embeddings.
-    pub aggregation: Aggregation,
-    /// Whether there are objects.
-    pub objects: bool,
-    /// Scales at which the built-in segmenter looks.
-    pub mask_levels: usize,
-    /// Masks with fewer pixels are left out.
-    pub min_mask_px: u32,
-    /// Views to use at most.
-    pub views_limit: ViewsLimit,
-    /// Width at which weights are rasterised.
-    pub raster_width: RasterWidth,
-}
-
-impl Preset {
-    /// Returns what the preset stands for.
-    pub fn choices(self) -> Choices {
-        let balanced = Choices {
-            background: Background::White,
-            weights: WeightKind::Blend,
-            aggregation: Aggregation::REFINED,
-            objects: true,
-            mask_levels: DEFAULT_MASK_LEVELS,
-            min_mask_px: 200,
-            views_limit: ViewsLimit::All,
-            raster_width: RasterWidth::ByContent,
-        };
-        match self {
-            Self::Balanced => balanced,
-            Self::Paper => Choices {
-                aggregation: Aggregation::PAPER,
-                objects: false,
-                raster_width: RasterWidth::Photo,
-                ..balanced
-            },
-            Self::Fast => Choices {
-                mask_levels: 2,
-                views_limit: ViewsLimit::Share(0.5),
-                raster_width: RasterWidth::Px(320),
-                ..balanced
-            },
-            Self::Accurate => Choices { mask_levels: 4, min_mask_px: 100, ..balanced },
-        }
-    }
 }
 
 /// `--background`.
@@ -691,6 +625,11 @@ mod tests {
             "--memory 1",
             "--memory 5TB",
             "--views-limit 0",
+            "--views-limit 0%",
+            "--views-limit 101%",
+            "--views-limit NaN%",
+            "--raster-width 15",
+            "--raster-width wide",
             "--view-order best",
             "--mask-levels 0",
             "--time-budget 0",

@@ -6,6 +6,7 @@ mod eval;
 mod keys;
 mod noise;
 mod objects;
+mod preset;
 mod progress;
 mod refine;
 mod run;

@@ -235,9 +235,9 @@ fn encode_settings(args: &EncodeArgs) -> Result<EncodeSettings> {
         shards: ShardSettings {
             profiles: args.profiles.clone(),
             palette: PaletteSettings {
-                compact_error: args.compact_error,
-                balanced_error: args.balanced_error,
-                ..PaletteSettings::default()
+                compact_error: args.compact_error.unwrap_or(preset.palette.compact_error),
+                balanced_error: args.balanced_error.unwrap_or(preset.palette.balanced_error),
+                ..preset.palette
             },
             position_error: args
                 .position_error

@@ -36,6 +36,9 @@ const COSTS: [Cost; 3] = [
     Cost { file: "query", axis: "milliseconds of a query", of: |f| f.query_ms },
 ];
 
+/// Axis whose points are named in the plots.
+const PRESETS: &str = "preset";
+
 /// Returns which of (cost, accuracy) no other beats: none cheaper or as cheap is better, none as good is cheaper.
 pub fn pareto(points: &[(f64, f64)]) -> Vec<bool> {
     let beats = |a: &(f64, f64), b: &(f64, f64)| a.0 <= b.0 && a.1 >= b.1 && a != b;
@@ -134,25 +137,30 @@ impl TradeoffReport {
     fn svg(&self, scene: &str, cost: &Cost) -> Option<String> {
         let of_scene = self.of(scene);
         let at = |f: &Figures| (cost.of)(f).map(|value| (value, f.miou));
-        let sorted = |mut points: Vec<(f64, f64)>| {
-            points.sort_by(|a, b| a.0.total_cmp(&b.0));
-            points
-        };
-        let mut series: Vec<Series> = Vec::new();
+        let mut series: Vec<(String, Vec<((f64, f64), String)>)> = Vec::new();
         for f in &of_scene {
             let Some(point) = at(f) else { continue };
-            match series.iter_mut().find(|series| series.name == f.point.axis) {
-                Some(series) => series.points.push(point),
-                None => series.push(Series { name: f.point.axis.clone(), points: vec![point] }),
+            // What users choose by name is named.
+            let label = if f.point.axis == PRESETS { f.point.name.clone() } else { String::new() };
+            match series.iter_mut().find(|(name, _)| *name == f.point.axis) {
+                Some((_, points)) => points.push((point, label)),
+                None => series.push((f.point.axis.clone(), vec![(point, label)])),
             }
         }
-        series.iter_mut().for_each(|series| series.points = sorted(std::mem::take(&mut series.points)));
         let all: Vec<(f64, f64)> = of_scene.iter().filter_map(|f| at(f)).collect();
         if all.is_empty() {
             return None;
         }
-        let front = all.iter().zip(pareto(&all)).filter(|(_, front)| *front).map(|(point, _)| *point);
-        series.push(Series { name: "nothing better".into(), points: sorted(front.collect()) });
+        let front = all.iter().zip(pareto(&all)).filter(|(_, front)| *front);
+        series.push(("nothing better".into(), front.map(|(point, _)| (*point, String::new())).collect()));
+        let series: Vec<Series> = series
+            .into_iter()
+            .map(|(name, mut points)| {
+                points.sort_by(|a, b| a.0.0.total_cmp(&b.0.0));
+                let (points, labels) = points.into_iter().unzip();
+                Series { name, points, labels }
+            })
+            .collect();
         let plot = Plot {
             title: format!("{scene}: accuracy against {}", cost.axis),
             note: format!("{} threads. {}", self.machine.n_threads, self.paper()),
