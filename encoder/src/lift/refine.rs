@@ -245,7 +245,7 @@ impl Refinement {
             false => 0,
             true => {
                 let working = Superpoints::working_bytes(n_gaussians, &SuperpointSettings::default());
-                (n_gaussians * AXES) as u64 + working
+                (n_gaussians * (AXES + size_of::<u32>())) as u64 + working
             }
         };
         of_regions as u64 + of_superpoints
