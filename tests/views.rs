@@ -62,7 +62,7 @@ fn an_encode_of_some_views_goes_on_with_more() {
     assert_eq!(content(&kept), expected);
 }
 
-/// Without --raster-width each view has its own by its content, weighs no more for a finer one, and the summary says
+/// With --raster-width auto each view has its own by its content, weighs no more for a finer one, and the summary says
 /// what was spent on views and cells; threads and resuming do not show.
 #[test]
 fn what_was_spent_goes_by_content_and_is_reported() {
@@ -81,7 +81,8 @@ fn what_was_spent_goes_by_content_and_is_reported() {
         let column = summary["views"][name].as_array().expect("a column").iter();
         column.map(|v| v.as_f64().expect("a number")).collect::<Vec<_>>()
     };
-    let first = encode("first", &["--threads", "1", "--keep-views"]);
+    let auto = ["--raster-width", "auto"];
+    let first = encode("first", &[&["--threads", "1", "--keep-views"][..], &auto].concat());
     let widths = column(&first, "raster_width_px");
     assert!(widths.iter().all(|width| [640.0, 1280.0].contains(width)), "{widths:?}");
     assert!(widths.contains(&640.0) && widths.contains(&1280.0), "{widths:?}");
@@ -97,9 +98,9 @@ fn what_was_spent_goes_by_content_and_is_reported() {
         assert!(error("compact") < 0.2 && error("compact") > error("balanced"), "{cell}");
         assert_eq!((error("exact"), cell["n_groups"].as_u64() > Some(0)), (0.0, true));
     }
-    let resumed = encode("first", &["--keep-views"]);
+    let resumed = encode("first", &[&["--keep-views"][..], &auto].concat());
     assert_eq!((&resumed["n_views_resumed"], &resumed["views"]), (&10.into(), &first["views"]));
-    encode("second", &["--threads", "2"]);
+    encode("second", &[&["--threads", "2"][..], &auto].concat());
     assert_eq!(content(&dir.path().join("second")), content(&dir.path().join("first")));
 
     let fixed = encode("fixed", &["--raster-width", "640"]);

@@ -244,9 +244,9 @@ fn a_superpoint_gives_its_part_and_fills_what_no_view_sees() {
         }
         sum
     };
-    // Larger superpoints are the same patches here. Both: a half of what came of the first is the second's.
+    // Larger superpoints are the same patches here.
     let parts = |superpoint, coarse| Aggregation { superpoint, coarse, fill: true, ..Aggregation::PAPER };
-    for (settings, n_levels) in [(parts(1.0, 0.0), 1), (parts(0.0, 1.0), 2), (parts(1.0, 1.0), 2)] {
+    for (settings, n_levels) in [(parts(1.0, 0.0), 1), (parts(0.0, 0.5), 2), (parts(2.0, 0.5), 2)] {
         let Lifted { field, embeddings, table } = lifted(settings, u64::MAX);
         for k in 0..N {
             let mut patch = vec![0.0; DIM];
