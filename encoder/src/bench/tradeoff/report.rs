@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::{Figures, TradeoffError};
+use super::{Figures, Point, TradeoffError};
 use crate::bench::Machine;
 use crate::bench::plot::{Plot, Scale, Series};
 
@@ -136,31 +136,30 @@ impl TradeoffReport {
     /// Draws accuracy against a cost: a line an axis of the grid, and one along the front.
     fn svg(&self, scene: &str, cost: &Cost) -> Option<String> {
         let of_scene = self.of(scene);
-        let at = |f: &Figures| (cost.of)(f).map(|value| (value, f.miou));
-        let mut series: Vec<(String, Vec<((f64, f64), String)>)> = Vec::new();
-        for f in &of_scene {
-            let Some(point) = at(f) else { continue };
-            // What users choose by name is named.
-            let label = if f.point.axis == PRESETS { f.point.name.clone() } else { String::new() };
-            match series.iter_mut().find(|(name, _)| *name == f.point.axis) {
-                Some((_, points)) => points.push((point, label)),
-                None => series.push((f.point.axis.clone(), vec![(point, label)])),
-            }
-        }
-        let all: Vec<(f64, f64)> = of_scene.iter().filter_map(|f| at(f)).collect();
+        let at = |f: &&Figures| (cost.of)(f).map(|value| (value, f.miou));
+        let mut points: Vec<((f64, f64), &Point)> =
+            of_scene.iter().filter_map(|f| Some((at(f)?, &f.point))).collect();
+        points.sort_by(|a, b| a.0.0.total_cmp(&b.0.0));
+        let all: Vec<(f64, f64)> = points.iter().map(|(at, _)| *at).collect();
         if all.is_empty() {
             return None;
         }
-        let front = all.iter().zip(pareto(&all)).filter(|(_, front)| *front);
-        series.push(("nothing better".into(), front.map(|(point, _)| (*point, String::new())).collect()));
-        let series: Vec<Series> = series
-            .into_iter()
-            .map(|(name, mut points)| {
-                points.sort_by(|a, b| a.0.0.total_cmp(&b.0.0));
-                let (points, labels) = points.into_iter().unzip();
-                Series { name, points, labels }
-            })
-            .collect();
+        // In the order of the grid.
+        let mut series: Vec<Series> = Vec::new();
+        for f in &of_scene {
+            if !series.iter().any(|series| series.name == f.point.axis) {
+                let mut of_axis =
+                    Series { name: f.point.axis.clone(), points: Vec::new(), labels: Vec::new() };
+                for (at, point) in points.iter().filter(|(_, point)| point.axis == f.point.axis) {
+                    of_axis.points.push(*at);
+                    // What users choose by name is named.
+                    of_axis.labels.extend((point.axis == PRESETS).then(|| point.name.clone()));
+                }
+                series.push(of_axis);
+            }
+        }
+        let front = all.iter().zip(pareto(&all)).filter(|(_, front)| *front).map(|(point, _)| *point);
+        series.push(Series { name: "nothing better".into(), points: front.collect(), labels: Vec::new() });
         let plot = Plot {
             title: format!("{scene}: accuracy against {}", cost.axis),
             note: format!("{} threads. {}", self.machine.n_threads, self.paper()),
