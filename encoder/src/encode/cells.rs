@@ -9,10 +9,10 @@ use slag_common::{Gaussians, Hash32};
 use slag_models::ModelDir;
 
 use super::{EncodeError, EncodeSettings, Stopwatch};
+use crate::lift::photos::Photo;
 use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS, extra_field};
 use crate::lift::refine::Refinement;
 use crate::lift::{Aggregation, CellField, PartSums, RegionTable, SumsIndex};
-use crate::objects::photos::Photo;
 use crate::objects::{self, ObjectsReport, SceneObjects};
 use crate::palette::{ScoreMetric, TextBank, Yardstick};
 use crate::progress::Progress;
@@ -54,8 +54,8 @@ pub(super) struct CellBuilder<'a> {
     yardstick: Yardstick,
     /// Bytes there are for the sums of a group of cells.
     group_bytes: u64,
-    /// Each view's masks in its photo, where objects are to be found.
-    photos: Option<Vec<Photo>>,
+    /// Each view's masks in its photo.
+    photos: Vec<Photo>,
 }
 
 /// What was built.
@@ -91,7 +91,7 @@ impl<'a> CellBuilder<'a> {
         store: &'a Store,
         scene: &'a Gaussians,
         split: &'a CellSplit,
-        (sums_paths, photos): (&[PathBuf], Option<Vec<Photo>>),
+        (sums_paths, photos): (&[PathBuf], Vec<Photo>),
         (models, bank): (&ModelDir, TextBank),
         stopwatch: &'a Stopwatch,
     ) -> Result<Self, EncodeError> {
@@ -129,13 +129,15 @@ impl<'a> CellBuilder<'a> {
 
     /// Finds the objects of the scene, where they are asked for.
     fn objects(&self) -> Result<Option<SceneObjects>, EncodeError> {
-        let Some(photos) = &self.photos else { return Ok(None) };
+        if !self.settings.objects {
+            return Ok(None);
+        }
         let scene = objects::Scene {
             index: &self.index,
             table: &self.table,
             gaussians: self.scene,
             split: self.split,
-            photos,
+            photos: &self.photos,
             yardstick: &self.yardstick,
             group_bytes: self.group_bytes,
         };
@@ -184,7 +186,8 @@ impl<'a> CellBuilder<'a> {
         let aggregation = self.settings.aggregation;
         let refinement = self.stopwatch.time("refine", || {
             let sums = (&self.index, &mut self.table);
-            Refinement::prepare(aggregation, sums, (self.scene, self.split), self.group_bytes, cancel)
+            let scene = (self.scene, self.split);
+            Refinement::prepare(aggregation, sums, scene, &self.photos, self.group_bytes, cancel)
         })?;
         if cancel.load(Ordering::Relaxed) {
             return Ok(None);

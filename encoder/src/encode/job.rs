@@ -8,7 +8,7 @@ use slag_common::Hash32;
 
 use super::EncodeError;
 use crate::lift::ViewSums;
-use crate::objects::photos;
+use crate::lift::photos::{self, Outline};
 use crate::store::Store;
 
 const TREE: &str = "job";
@@ -83,20 +83,20 @@ impl<'a> Job<'a> {
         self.folder.join("views").join(format!("{}.sums", Hash32::of(view.as_bytes())))
     }
 
-    /// Returns where the boxes of a view's masks lie.
-    pub(super) fn boxes_path(&self, view: &str) -> PathBuf {
-        self.sums_path(view).with_extension("boxes")
+    /// Returns where the outlines of a view's masks lie.
+    pub(super) fn outlines_path(&self, view: &str) -> PathBuf {
+        self.sums_path(view).with_extension("outlines")
     }
 
-    /// Keeps a view's sums and its masks' boxes: the files first, then the record that counts it as done.
+    /// Keeps a view's sums and its masks' outlines: the files first, then the record that counts it as done.
     pub(super) fn keep(
         &self,
         view: &str,
         sums: &ViewSums,
-        boxes_px: &[[u32; 4]],
+        outlines: &[Outline],
         record: ViewRecord,
     ) -> Result<(), EncodeError> {
-        photos::write_boxes(&self.boxes_path(view), boxes_px)?;
+        photos::write_outlines(&self.outlines_path(view), outlines)?;
         sums.write(&self.sums_path(view))?;
         let key = format!("{VIEW_PREFIX}{view}");
         let record = serde_json::to_vec(&record).map_err(std::io::Error::from)?;

@@ -29,9 +29,9 @@ use slag_models::{ModelDir, ModelError, SessionOptions};
 
 use crate::embed::EmbedError;
 use crate::ingest::{self, GeoError, IngestError};
+use crate::lift::photos::{self, Photo};
 use crate::lift::{SumsError, SumsFile, SumsIndex};
 use crate::objects::ObjectsReport;
-use crate::objects::photos::{self, Photo};
 use crate::palette::TextBank;
 use crate::progress::Progress;
 use crate::raster::{LoadedScene, RasterError, RasterView, Rasterizer};
@@ -382,7 +382,7 @@ pub fn encode(
     }
 
     let sums_paths: Vec<PathBuf> = used.iter().map(|view| job.sums_path(&view.name)).collect();
-    let photos = settings.objects.then(|| photos_of(&job, &used, models.dim())).transpose()?;
+    let photos = photos_of(&job, &used, models.dim())?;
     let bank = stopwatch.time("texts", || match models.text_encoder(session) {
         Ok(mut encoder) => TextBank::of_model(&mut *encoder),
         Err(e) => {
@@ -556,13 +556,13 @@ fn choose_views(
     })
 }
 
-/// Reads where the masks of each view lie in its photo.
+/// Reads how the masks of each view lie in its photo.
 fn photos_of(job: &Job<'_>, views: &[&View], dim: usize) -> Result<Vec<Photo>, EncodeError> {
     let photo = |view: &&View| {
         let (_, regions) = SumsFile::open(&job.sums_path(&view.name))?;
         let n_masks = regions.mask_vectors.len() / dim;
-        let boxes_px = photos::read_boxes(&job.boxes_path(&view.name), n_masks)?;
-        Ok(Photo { name: view.name.clone(), boxes_px })
+        let outlines = photos::read_outlines(&job.outlines_path(&view.name), n_masks)?;
+        Ok(Photo { name: view.name.clone(), outlines })
     };
     views.iter().map(photo).collect()
 }

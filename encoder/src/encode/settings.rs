@@ -162,8 +162,8 @@ pub const MAX_RASTER_WIDTH_PX: u32 = 1024;
 /// this. Measured on generated scenes: mIoU 0.01 to 0.03 higher for a sixth more time. Half the width where borders
 /// are short was no faster on the labelled house, and a little worse.
 pub const LONG_BORDERS: f64 = 0.04;
-/// How masks become regions; another number is another encode.
-const REGIONS_VERSION: u32 = 2;
+/// How masks become regions, and what is kept of them; another number is another encode.
+const REGIONS_VERSION: u32 = 3;
 
 impl EncodeSettings {
     /// Returns the settings to encode a splat and its photos into a store, as the program has them without flags.

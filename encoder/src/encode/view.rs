@@ -14,7 +14,7 @@ use super::{EncodeError, EncodeSettings};
 use crate::embed;
 use crate::ingest::{self, LoadedImage};
 use crate::lift::ViewSums;
-use crate::objects::photos::boxes_of;
+use crate::lift::photos::Outline;
 use crate::progress::Progress;
 use crate::raster::{LoadedScene, RasterError, RasterView};
 use crate::segment::{self, Mask, RegionMap, SegmentInput, Segmenter};
@@ -57,7 +57,7 @@ enum Next {
     Crop(LoadedImage, Vec<Mask>),
     Embed(Crops, Partition),
     Raster(Vec<f32>, Partition),
-    Write(ViewSums, Vec<[u32; 4]>, u32),
+    Write(ViewSums, Vec<Outline>, u32),
 }
 
 /// What is to be embedded.
@@ -74,8 +74,8 @@ struct Partition {
     raster_view: RasterView,
     regions: RegionMap,
     masks_of_region: Vec<Vec<u32>>,
-    /// Of each mask, in pixels of the photo.
-    boxes_px: Vec<[u32; 4]>,
+    /// Of each mask.
+    outlines: Vec<Outline>,
     /// Pixels of the base width in one of the raster: a view does not count more for being finer.
     weight_scale: f32,
 }
@@ -154,7 +154,7 @@ impl ViewStages<'_> {
                 Next::Raster(vectors, partition)
             }
             Next::Raster(vectors, partition) => {
-                let Partition { raster_view, regions, masks_of_region, boxes_px, weight_scale } = partition;
+                let Partition { raster_view, regions, masks_of_region, outlines, weight_scale } = partition;
                 let mut weights = self
                     .scene
                     .weights(&raster_view, &regions, self.settings.weights)
@@ -162,11 +162,11 @@ impl ViewStages<'_> {
                 weights.entries.iter_mut().for_each(|entry| entry.weight *= weight_scale);
                 let dim = self.models.dim();
                 let sums = ViewSums::new(&weights.entries, masks_of_region, vectors, dim, self.split);
-                Next::Write(sums, boxes_px, raster_view.intrinsics.width_px)
+                Next::Write(sums, outlines, raster_view.intrinsics.width_px)
             }
-            Next::Write(sums, boxes_px, raster_width_px) => {
+            Next::Write(sums, outlines, raster_width_px) => {
                 let record = ViewRecord { raster_width_px, secs: work.secs };
-                self.job.keep(&view.name, &sums, &boxes_px, record)?;
+                self.job.keep(&view.name, &sums, &outlines, record)?;
                 self.progress.advance(1);
                 return Ok(None);
             }
@@ -207,7 +207,10 @@ impl ViewStages<'_> {
         }
         let (raster_view, regions, masks_of_region) = made;
         let weight_scale = (f64::from(base_px) / f64::from(width_px)).powi(2) as f32;
-        Partition { raster_view, regions, masks_of_region, boxes_px: boxes_of(masks), weight_scale }
+        let (width_px, height_px) = loaded.image.dimensions();
+        let outline = |mask| Outline::of(mask, width_px, height_px, loaded.valid.as_deref());
+        let outlines = masks.iter().map(outline).collect();
+        Partition { raster_view, regions, masks_of_region, outlines, weight_scale }
     }
 
     /// Returns a vector per mask, with an encoder that is free or a new one.

@@ -22,6 +22,7 @@
 
 mod embeddings;
 mod field;
+pub mod photos;
 pub mod published;
 pub mod refine;
 mod regroup;

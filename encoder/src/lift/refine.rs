@@ -4,6 +4,8 @@
 //! |---|---|
 //! | `min_region_share`, `min_view_share` | sums of a region at whose edge a Gaussian lies, of views that hardly see it, are left out |
 //! | `min_weight_px` | a Gaussian that hardly shows anywhere has no evidence |
+//! | `wholeness` | a mask counts less that the photo's edge cuts off |
+//! | `evenness` | views count less by how near, and how little aslant, they see a Gaussian |
 //! | `agreement` | a mask counts as far as it agrees with what other views say of its Gaussians |
 //! | `median_steps` | views that disagree count less: steps towards the geometric median |
 //! | `superpoint` | a Gaussian's row takes a part of its superpoint's |
@@ -25,6 +27,7 @@ use serde::{Deserialize, Serialize};
 use slag_common::Gaussians;
 
 use super::field::{MIN_MEAN_LENGTH, dot};
+use super::photos::{self, LEAST_MASK_WEIGHT, Photo};
 use super::regroup::{PartSums, SumsIndex};
 use super::sums::SumsError;
 use super::table::RegionTable;
@@ -36,8 +39,6 @@ use crate::superpoint::{Graph, NO_SUPERPOINT, Sketches, SuperpointSettings, Supe
 const AXES: usize = 48;
 /// Gaussians worked on at a time by a thread; a constant, because sums are taken chunk by chunk.
 const CHUNK: usize = 4096;
-/// What a mask with which no other view agrees still counts: its Gaussians keep their evidence.
-const LEAST_MASK_WEIGHT: f32 = 0.01;
 /// Distance on the unit sphere below which the median's steps no longer tell views apart.
 const MEDIAN_RESOLUTION: f32 = 0.1;
 /// Masks of a superpoint's mixture at most, the heaviest: some hundred views of a few masks each.
@@ -57,6 +58,11 @@ pub struct Aggregation {
     pub min_view_share: f32,
     /// Gaussians with less weight over all views have no evidence, pixels.
     pub min_weight_px: f32,
+    /// A mask counts the part of its outline that the photo's edge does not cut off, to this power; 0: once.
+    pub wholeness: f32,
+    /// A view counts its weight for a Gaussian, the solid angle that it sees of it, to the power of 1 less this: 1
+    /// lets all views count alike.
+    pub evenness: f32,
     /// A mask counts its mean cosine with its Gaussians' embeddings from other views to this power; 0: once.
     pub agreement: f32,
     /// Steps (Weiszfeld 1937) from the mean of a Gaussian's views to their geometric median.
@@ -75,6 +81,8 @@ impl Aggregation {
         min_region_share: 0.0,
         min_view_share: 0.0,
         min_weight_px: 0.0,
+        wholeness: 0.0,
+        evenness: 0.0,
         agreement: 0.0,
         median_steps: 0,
         superpoint: 0.0,
@@ -84,7 +92,7 @@ impl Aggregation {
     /// What was measured to help on a trained splat and on generated ones alike. Pruning by region helps the
     /// first, whose Gaussians lie across outlines, and costs the others more.
     pub const REFINED: Self =
-        Self { min_view_share: 0.1, agreement: 0.5, superpoint: 3.0, coarse: 0.7, fill: true, ..Self::PAPER };
+        Self { min_view_share: 0.1, wholeness: 2.0, agreement: 0.5, superpoint: 3.0, coarse: 0.7, fill: true, ..Self::PAPER };
 
     /// Returns the plain average, each option alone, and those that are used together: what tables compare.
     pub fn methods() -> Vec<(&'static str, Self)> {
@@ -94,6 +102,8 @@ impl Aggregation {
             ("regions", Self { min_region_share: 0.5, ..paper }),
             ("views", Self { min_view_share: refined.min_view_share, ..paper }),
             ("gate", Self { min_weight_px: 1.0, ..paper }),
+            ("wholeness", Self { wholeness: refined.wholeness, ..paper }),
+            ("evenness", Self { evenness: 0.5, ..paper }),
             ("agreement", Self { agreement: refined.agreement, ..paper }),
             ("median", Self { median_steps: 3, ..paper }),
             ("superpoints", Self { superpoint: refined.superpoint, ..paper }),
@@ -147,6 +157,7 @@ impl Refinement {
         settings: Aggregation,
         (index, table): (&SumsIndex, &mut RegionTable),
         (scene, split): (&Gaussians, &CellSplit),
+        photos: &[Photo],
         group_bytes: u64,
         cancel: &AtomicBool,
     ) -> Result<Option<Self>, SumsError> {
@@ -161,6 +172,10 @@ impl Refinement {
             points: Vec::new(),
             mixtures: Vec::new(),
         };
+        let mut mask_weights = photos::mask_weights(photos, settings.wholeness);
+        if settings.wholeness > 0.0 {
+            table.set_mask_weights(&mask_weights);
+        }
         refinement.mask_counts = table.mask_counts(0..table.len());
         let is_plain =
             settings.agreement == 0.0 && settings.median_steps == 0 && !settings.needs_superpoints();
@@ -189,7 +204,9 @@ impl Refinement {
             if !done {
                 return Ok(None);
             }
-            table.set_mask_weights(&mask_weights(table, mask_points, &votes, settings.agreement));
+            let agreements = agreements(table, mask_points, &votes, settings.agreement);
+            mask_weights.iter_mut().zip(agreements).for_each(|(weight, agreement)| *weight *= agreement);
+            table.set_mask_weights(&mask_weights);
             refinement.mask_counts = table.mask_counts(0..table.len());
             refinement.points = region_points(table, mask_points);
         }
@@ -262,8 +279,11 @@ impl Refinement {
     /// All but the superpoints.
     fn change_rows(&self, sums: &mut PartSums) {
         self.prune(sums);
+        if self.settings.evenness > 0.0 {
+            self.scale_views(sums, |_, views| self.evened(views));
+        }
         if self.settings.median_steps > 0 {
-            self.move_to_median(sums);
+            self.scale_views(sums, |sums, views| self.towards_median(sums, views));
         }
     }
 
@@ -379,34 +399,51 @@ impl Refinement {
         }
     }
 
-    /// Scales the entries of views by what Weiszfeld's steps give them; the evidence stays what it was.
-    fn move_to_median(&self, sums: &mut PartSums) {
+    /// Scales the entries of each Gaussian's views by factors; the evidence stays what it was.
+    fn scale_views(
+        &self,
+        sums: &mut PartSums,
+        factors: impl Fn(&PartSums, &[ViewEntries]) -> Vec<f32> + Sync,
+    ) {
         let n = sums.total_weights.len();
         let factors_of = |k: usize| -> Vec<(Range<usize>, f32)> {
-            let row = sums.starts[k] as usize..sums.starts[k + 1] as usize;
-            let views = self.views_of(sums, row);
-            let mut of_views: Vec<Point> =
-                views.iter().map(|view| self.sum_of(sums, view.entries.clone())).collect();
-            let weights: Vec<f32> = of_views.iter().map(length).collect();
-            of_views.iter_mut().for_each(make_unit);
-            let mut factors = vec![1.0; views.len()];
-            for _ in 0..self.settings.median_steps {
-                let mut median = [0.0; AXES];
-                for ((point, weight), factor) in of_views.iter().zip(&weights).zip(&factors) {
-                    add(&mut median, weight * factor, point);
-                }
-                make_unit(&mut median);
-                for (factor, point) in factors.iter_mut().zip(&of_views) {
-                    let distance = (2.0 - 2.0 * dot(point, &median)).max(0.0).sqrt();
-                    *factor = MEDIAN_RESOLUTION / distance.max(MEDIAN_RESOLUTION);
-                }
-            }
+            let views = self.views_of(sums, sums.starts[k] as usize..sums.starts[k + 1] as usize);
+            let factors = factors(sums, &views);
             views.into_iter().map(|view| view.entries).zip(factors).collect()
         };
         let factors: Vec<Vec<(Range<usize>, f32)>> = (0..n).into_par_iter().map(factors_of).collect();
         for (entries, factor) in factors.into_iter().flatten() {
             sums.weights[entries].iter_mut().for_each(|weight| *weight *= factor);
         }
+    }
+
+    /// Returns the factors by which a Gaussian's views count more alike, at the same weight together.
+    fn evened(&self, views: &[ViewEntries]) -> Vec<f32> {
+        let factors: Vec<f32> = views.iter().map(|view| view.weight.powf(-self.settings.evenness)).collect();
+        let total: f32 = views.iter().map(|view| view.weight).sum();
+        let evened: f32 = views.iter().zip(&factors).map(|(view, factor)| view.weight * factor).sum();
+        factors.into_iter().map(|factor| factor * total / evened).collect()
+    }
+
+    /// Returns the factors that Weiszfeld's steps give a Gaussian's views.
+    fn towards_median(&self, sums: &PartSums, views: &[ViewEntries]) -> Vec<f32> {
+        let mut of_views: Vec<Point> =
+            views.iter().map(|view| self.sum_of(sums, view.entries.clone())).collect();
+        let weights: Vec<f32> = of_views.iter().map(length).collect();
+        of_views.iter_mut().for_each(make_unit);
+        let mut factors = vec![1.0; views.len()];
+        for _ in 0..self.settings.median_steps {
+            let mut median = [0.0; AXES];
+            for ((point, weight), factor) in of_views.iter().zip(&weights).zip(&factors) {
+                add(&mut median, weight * factor, point);
+            }
+            make_unit(&mut median);
+            for (factor, point) in factors.iter_mut().zip(&of_views) {
+                let distance = (2.0 - 2.0 * dot(point, &median)).max(0.0).sqrt();
+                *factor = MEDIAN_RESOLUTION / distance.max(MEDIAN_RESOLUTION);
+            }
+        }
+        factors
     }
 
     /// Writes each Gaussian's direction, rounded; zeros where there is no evidence.
@@ -477,7 +514,7 @@ impl Default for Vote {
 
 /// Returns the mean cosine of each mask with what other views say of its Gaussians, to a power; the median where
 /// no other view says anything.
-fn mask_weights(table: &RegionTable, mask_points: &[Point], votes: &[Vote], power: f32) -> Vec<f32> {
+fn agreements(table: &RegionTable, mask_points: &[Point], votes: &[Vote], power: f32) -> Vec<f32> {
     let mut of_masks = vec![Vote::default(); mask_points.len()];
     for (region, vote) in votes.iter().enumerate() {
         for (mask, _) in table.masks_of(region) {

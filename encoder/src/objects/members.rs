@@ -125,12 +125,12 @@ impl Members {
         self.masks.retain(|_| number.next().is_some_and(|number| *number != NONE));
     }
 
-    /// Returns the mask that shows most of an object, and little else: the weight of the object's Gaussians, times
-    /// their share of the mask's.
-    pub fn best_mask(&self, masks: &[u32]) -> u32 {
+    /// Returns the mask that shows most of an object, little else, and whole: the weight of the object's Gaussians,
+    /// times their share of the mask's, times the mask's wholeness.
+    pub fn best_mask(&self, masks: &[u32], wholeness: &[f32]) -> u32 {
         let merit = |mask: u32| {
             let (own, all) = (self.own_weights[mask as usize], self.mask_weights[mask as usize]);
-            if all > 0.0 { own * own / all } else { 0.0 }
+            if all > 0.0 { own * own / all * f64::from(wholeness[mask as usize]) } else { 0.0 }
         };
         let better = |a: u32, b: u32| if merit(b) > merit(a) { b } else { a };
         masks.iter().copied().reduce(better).unwrap_or(NONE)

@@ -14,7 +14,6 @@
 
 pub mod consensus;
 pub mod members;
-pub mod photos;
 pub mod shards;
 pub mod sightings;
 pub mod vectors;
@@ -26,12 +25,12 @@ use slag_common::Gaussians;
 use slag_common::frames::Aabb;
 use slag_common::manifest::Calibration;
 
+use crate::lift::photos::{Outline, Photo};
 use crate::lift::{RegionTable, SumsError, SumsIndex};
 use crate::palette::Yardstick;
 use crate::shard::cells::CellSplit;
 use consensus::Masks;
 use members::Members;
-use photos::Photo;
 
 /// No cluster, no object.
 pub const NONE: u32 = u32::MAX;
@@ -157,6 +156,8 @@ fn describe(scene: &Scene<'_>, members: &Members, view_of_mask: &[u32]) -> Vec<O
             gaussians[*object as usize].push(*gaussian);
         }
     }
+    let wholeness: Vec<f32> =
+        scene.photos.iter().flat_map(|photo| &photo.outlines).map(Outline::wholeness).collect();
     let mut first_mask_of_view = Vec::with_capacity(scene.photos.len());
     let mut n_masks = 0;
     for n in scene.index.n_masks_of_view() {
@@ -172,7 +173,7 @@ fn describe(scene: &Scene<'_>, members: &Members, view_of_mask: &[u32]) -> Vec<O
             let means: Vec<DVec3> =
                 gaussians.iter().map(|i| scene.gaussians.means_in_world[*i as usize]).collect();
             let (position_in_world, box_in_world) = trimmed_box(&means);
-            let best = members.best_mask(masks);
+            let best = members.best_mask(masks, &wholeness);
             let view = view_of_mask[best as usize] as usize;
             let photo = &scene.photos[view];
             Object {
@@ -183,7 +184,7 @@ fn describe(scene: &Scene<'_>, members: &Members, view_of_mask: &[u32]) -> Vec<O
                 box_in_world,
                 vectors: vectors::choose(masks, &members.mask_weights, scene.table),
                 photo: photo.name.clone(),
-                photo_box_px: photo.boxes_px[(best - first_mask_of_view[view]) as usize],
+                photo_box_px: photo.outlines[(best - first_mask_of_view[view]) as usize].box_px,
             }
         })
         .collect()

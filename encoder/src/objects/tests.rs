@@ -5,7 +5,6 @@ use slag_common::objects::object_score;
 use slag_common::shard::Basis;
 
 use super::consensus::{MaskClusters, Sightings, cluster_masks};
-use super::photos::{read_boxes, write_boxes};
 use super::shards::{CellObjects, RowFrame};
 use super::*;
 use crate::lift::{SumEntry, ViewSums};
@@ -303,8 +302,9 @@ fn world() -> World {
         let path = dir.path().join(format!("{view}.sums"));
         sums.write(&path).expect("writes");
         paths.push(path);
-        let boxes_px = (0..3).map(|mask| [view, mask, view + 10, mask + 10]).collect();
-        photos.push(Photo { name: format!("{view}.jpg"), boxes_px });
+        let outline = |mask| Outline { box_px: [view, mask, view + 10, mask + 10], ..Outline::default() };
+        let outlines = (0..3).map(outline).collect();
+        photos.push(Photo { name: format!("{view}.jpg"), outlines });
     }
     let n_of_cell: Vec<usize> = split.cells.iter().map(|cell| cell.gaussians.len()).collect();
     let (index, table) = SumsIndex::open(&paths, DIM, &n_of_cell).expect("opens");
@@ -422,20 +422,4 @@ fn vectors_are_kept_in_the_basis_of_rows() {
             row(c).zip(made.iter().zip(&outside)).map(|(b, (made, v))| b * (made - f64::from(*v))).sum();
         assert!(product.abs() < 1e-4, "{c}: {product}");
     }
-}
-
-#[test]
-fn boxes_are_kept_and_damage_is_named() {
-    let dir = tempfile::tempdir().expect("a temporary folder");
-    let path = dir.path().join("a.boxes");
-    let boxes = [[1, 2, 3, 4], [5, 6, 7, 8]];
-    write_boxes(&path, &boxes).expect("writes");
-    assert_eq!(read_boxes(&path, 2).expect("reads"), boxes);
-    let message = read_boxes(&path, 3).expect_err("too few").to_string();
-    assert!(message.contains("a.boxes") && message.contains("the view has 3"), "{message}");
-    let mut bytes = AlignedBytes::read(&path).expect("reads").to_vec();
-    // In the second section: the first is padded.
-    bytes[200] ^= 1;
-    fs_err::write(&path, &bytes).expect("writes");
-    read_boxes(&path, 2).expect_err("damaged");
 }

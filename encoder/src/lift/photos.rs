@@ -1,0 +1,101 @@
+//! How a view's masks lie in its photo, kept beside its sums: what the photo's edge cuts off, and where the object is
+//! that it shows.
+
+use std::path::Path;
+
+use bytemuck::{Pod, Zeroable};
+use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
+
+use super::sums::SumsError;
+use crate::segment::{BoxPx, Mask};
+
+const MAGIC: [u8; 8] = *b"SLAGMBOX";
+const VERSION: u32 = 2;
+
+/// A view's name and its masks' outlines.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Photo {
+    /// Name of the view.
+    pub name: String,
+    /// Of each mask.
+    pub outlines: Vec<Outline>,
+}
+
+/// How a mask lies in its photo.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+pub struct Outline {
+    /// Box, pixels of the photo free of distortion: x0, y0, x1, y1, the latter exclusive.
+    pub box_px: [u32; 4],
+    /// Length along which the photo's edge cuts the mask off, pixels.
+    pub cut_px: u32,
+    /// Coarseness, as of [`Mask::level`].
+    pub level: u32,
+}
+
+impl Outline {
+    /// Returns the outline of a mask of a photo of `width_px` x `height_px`. `valid`: pixels that show something, `None`
+    /// where all do.
+    pub fn of(mask: &Mask, width_px: u32, height_px: u32, valid: Option<&[bool]>) -> Self {
+        let BoxPx { x0, y0, x1, y1 } = mask.box_px;
+        let is_there = |x: u32, y: u32| {
+            x < width_px && y < height_px && valid.is_none_or(|valid| valid[(y * width_px + x) as usize])
+        };
+        // Beyond 0 is a number larger than any photo's width.
+        let n_cut = |x: u32, y: u32| {
+            let beside = [(x.wrapping_sub(1), y), (x + 1, y), (x, y.wrapping_sub(1)), (x, y + 1)];
+            beside.into_iter().filter(|(x, y)| !is_there(*x, *y)).count()
+        };
+        let may_be_cut =
+            valid.is_some() || x0 == 0 || y0 == 0 || x1 >= width_px || y1 >= height_px;
+        let rows = if may_be_cut { y0..y1 } else { 0..0 };
+        let pixels = rows.flat_map(|y| (x0..x1).map(move |x| (x, y))).zip(&mask.inside);
+        let cut_px = pixels.filter(|(_, inside)| **inside).map(|((x, y), _)| n_cut(x, y) as u32).sum();
+        Self { box_px: [x0, y0, x1, y1], cut_px, level: mask.level.into() }
+    }
+
+    /// Returns the part of the outline that is the thing's own, 0 to 1: what the photo's edge does not cut off, of the
+    /// box's outline, which is no longer for being ragged.
+    pub fn wholeness(&self) -> f32 {
+        let [x0, y0, x1, y1] = self.box_px.map(f64::from);
+        (1.0 - f64::from(self.cut_px) / (2.0 * (x1 - x0 + y1 - y0))).max(0.0) as f32
+    }
+}
+
+/// What a mask counts at least: its Gaussians keep their evidence.
+pub const LEAST_MASK_WEIGHT: f32 = 0.01;
+
+/// Returns what each mask of some photos counts: its wholeness to a power.
+pub fn mask_weights(photos: &[Photo], power: f32) -> Vec<f32> {
+    let weight = |outline: &Outline| outline.wholeness().max(LEAST_MASK_WEIGHT).powf(power);
+    photos.iter().flat_map(|photo| &photo.outlines).map(weight).collect()
+}
+
+/// Writes the outlines of a view's masks durably.
+///
+/// # Errors
+/// [`SumsError::Io`].
+pub fn write_outlines(path: &Path, outlines: &[Outline]) -> Result<(), SumsError> {
+    let mut bytes = Vec::new();
+    let n = outlines.len() as u64;
+    let sections = [(1, bytemuck::bytes_of(&n)), (2, container::bytes_of(outlines))];
+    container::write(&mut bytes, MAGIC, VERSION, &sections)?;
+    Ok(crate::store::write_durably(path, &bytes)?)
+}
+
+/// Reads the outlines of a view of `n_masks` masks.
+///
+/// # Errors
+/// [`SumsError`], naming the file.
+pub fn read_outlines(path: &Path, n_masks: usize) -> Result<Vec<Outline>, SumsError> {
+    let damaged = |source| SumsError::Damaged { path: path.to_owned(), source };
+    let bytes = AlignedBytes::read(path)?;
+    let layout = Layout::check(&bytes, MAGIC, VERSION).map_err(damaged)?;
+    let n: u64 = layout.value(&bytes, 1, "number of masks").map_err(damaged)?;
+    if n != n_masks as u64 {
+        let what = format!("outlines of {n} masks, the view has {n_masks}");
+        return Err(damaged(ContainerError::Damaged { offset_bytes: 0, what }));
+    }
+    let outlines = layout.column::<Outline>(2, "outlines", n_masks).map_err(damaged)?;
+    Ok(bytemuck::pod_collect_to_vec(&bytes[outlines]))
+}
