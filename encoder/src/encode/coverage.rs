@@ -1,12 +1,13 @@
 //! Which views to take first: those that together show the most of the scene, known before any mask is paid for.
 //!
-//! A raster of low resolution gives the blending weight `a(k, v) = Σ_p alpha T` of each Gaussian `k` over a whole
-//! view `v`: the solid angle that is seen of it, which falls with the square of the distance, with the cosine of
-//! the angle, and with what stands in front. It counts twice, each time against the best view of the same Gaussian:
-//! the lift weighs a view by it, and the crops that the view gives are as much finer. A set of views `S` is worth
+//! A raster of low resolution gives the blending weight `a(k, v) = Σ_p alpha T` of each Gaussian `k` over a view `v`
+//! without its margin, at which the photo's edge cuts things off: the solid angle that is seen of it, which falls
+//! with the square of the distance, with the cosine of the angle, and with what stands in front. It counts twice,
+//! each time against the best view of the same Gaussian: the lift weighs a view by it, and the crops that the view
+//! gives are as much finer. A set of views `S` is worth
 //!
 //! ```text
-//! f(S) = Σ_k g(Σ_{v in S} q(k, v))     q(k, v) = (a(k, v) / max_v a(k, v))^2     g(x) = ln(1 + x)
+//! f(S) = Σ_k g(Σ_{v in S} q(k, v))     q(k, v) = (a(k, v) / max_v a(k, v))^2     g(x) = ln(1 + s x)
 //! ```
 //!
 //! `f` is monotone and submodular, because `g` is growing and concave: so the first `n` views of the greedy order
@@ -22,10 +23,12 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::raster::{LoadedScene, RasterError, RasterView, WeightKind};
-use crate::segment::RegionMap;
+use crate::segment::{NO_REGION, RegionMap};
 
 /// Width of the raster, pixels: a Gaussian that is smaller than a pixel there is smaller than any mask.
 const WIDTH_PX: u32 = 192;
+/// Width of the margin, in parts of the view's width and height.
+const MARGIN: f64 = 0.05;
 /// Most pairs of a Gaussian and a view that are kept, 8 bytes each; of larger scenes every n-th Gaussian counts.
 const MAX_PAIRS: usize = 1 << 26;
 /// Most Gaussians that count.
@@ -34,6 +37,8 @@ const MAX_GAUSSIANS: usize = 1 << 17;
 const QUALITY_STEPS: f32 = 255.0;
 /// Sums of qualities above this, 257 best views, gain nothing more.
 const MAX_SUM: usize = u16::MAX as usize;
+/// `s` of `g`: how soon another view of the same gains little.
+const STEEPNESS: f64 = 2.0;
 /// Steps of `g` = 1; at [`MAX_SUM`] a step of quality still is 2^8 of them.
 const GAIN_STEPS: f64 = (1 << 24) as f64;
 
@@ -95,7 +100,7 @@ impl Coverage {
         let mut gain_of_sum = vec![0u32];
         let mut step = u32::MAX;
         for sum in 1..=MAX_SUM {
-            let exact = GAIN_STEPS * (sum as f64 / f64::from(QUALITY_STEPS)).ln_1p();
+            let exact = GAIN_STEPS * (STEEPNESS * sum as f64 / f64::from(QUALITY_STEPS)).ln_1p();
             // Rounding must not make a step larger than the one before: the guarantee needs g concave.
             step = step.min(exact.round() as u32 - gain_of_sum[sum - 1]);
             gain_of_sum.push(gain_of_sum[sum - 1] + step);
@@ -155,20 +160,26 @@ impl Coverage {
     }
 }
 
-/// Returns every `stride`-th Gaussian that a view shows, numbered in strides, with its weight over the whole view.
+/// Returns every `stride`-th Gaussian that a view shows, numbered in strides, with its weight within the margin.
 fn weights(scene: &dyn LoadedScene, view: &RasterView, stride: u32) -> Result<Vec<(u32, f32)>, RasterError> {
     let intrinsics = view.intrinsics.without_distortion();
     let intrinsics = intrinsics.scaled_to_width(WIDTH_PX.min(intrinsics.width_px));
     let view = RasterView { camera_from_world: view.camera_from_world, intrinsics };
-    let whole = RegionMap {
-        width_px: intrinsics.width_px,
-        height_px: intrinsics.height_px,
-        n_regions: 1,
-        region_of_pixel: vec![0; intrinsics.width_px as usize * intrinsics.height_px as usize],
-    };
-    let weights = scene.weights(&view, &whole, WeightKind::Blend)?.entries;
+    let inner = inner(intrinsics.width_px, intrinsics.height_px);
+    let weights = scene.weights(&view, &inner, WeightKind::Blend)?.entries;
     let counted = weights.into_iter().filter(|entry| entry.gaussian.is_multiple_of(stride));
     Ok(counted.map(|entry| (entry.gaussian / stride, entry.weight)).collect())
+}
+
+/// Returns a raster whose pixels, but for the margin, are one region.
+fn inner(width_px: u32, height_px: u32) -> RegionMap {
+    let is_inner = |at: u32, n: u32| {
+        let margin = (MARGIN * f64::from(n)) as u32;
+        (margin..n - margin).contains(&at)
+    };
+    let region = |x, y| if is_inner(x, width_px) && is_inner(y, height_px) { 0 } else { NO_REGION };
+    let region_of_pixel = (0..height_px).flat_map(|y| (0..width_px).map(move |x| region(x, y))).collect();
+    RegionMap { width_px, height_px, n_regions: 1, region_of_pixel }
 }
 
 /// Returns the numbers below `n` so that those before any place are about evenly spread: by their reversed bits
@@ -211,7 +222,7 @@ mod tests {
         for (k, a) in chosen.iter().flat_map(|view| &weights[*view]) {
             sums[*k as usize] += (f64::from(*a) / best[*k as usize]).powi(2);
         }
-        sums.iter().map(|sum: &f64| sum.ln_1p()).sum()
+        sums.iter().map(|sum: &f64| (STEEPNESS * sum).ln_1p()).sum()
     }
 
     /// Oracle: every set of n views, and the definition in f64; the bound of Nemhauser, Wolsey and Fisher holds for
@@ -280,7 +291,7 @@ mod tests {
         let at =
             |x: f64| f64::from(coverage.gain_of_sum[(x * f64::from(QUALITY_STEPS)) as usize]) / GAIN_STEPS;
         for x in [0.2, 1.0, 2.0, 40.0, 257.0] {
-            assert!((at(x) - x.ln_1p()).abs() < 1e-3, "{x}: {}", at(x));
+            assert!((at(x) - (STEEPNESS * x).ln_1p()).abs() < 1e-3, "{x}: {}", at(x));
         }
     }
 
