@@ -1,5 +1,7 @@
 //! Full-precision scores of a published field, for evaluation and trust.
 
+mod by_level;
+
 use std::collections::BTreeMap;
 use std::io::{self, Write};
 
@@ -10,10 +12,11 @@ use slag_common::manifest::Calibration;
 use slag_common::objects::object_score;
 use slag_common::shard::{Profile, ShardLayout};
 
-use crate::lift::dot;
 use crate::lift::published::{ReadFieldError, read_field, read_regions};
+use crate::lift::{CellField, RegionTable, dot};
 use crate::objects::NONE;
 use crate::store::{StoreError, StoreReader};
+pub use by_level::ByLevel;
 
 /// Cosines of every Gaussian of the input with a query.
 #[derive(Clone, Debug)]
@@ -81,18 +84,34 @@ pub enum QueryError {
 /// # Errors
 /// [`QueryError`].
 pub fn scores(reader: &StoreReader, query: &[f32]) -> Result<Scores, QueryError> {
-    let manifest = reader.manifest();
     let table = read_regions(reader)?;
-    if query.len() != table.dim() {
-        let encoder = manifest.encoder.name.clone();
-        return Err(QueryError::Dimension { expected: table.dim(), found: query.len(), encoder });
-    }
+    check_dim(reader, &table, query)?;
     let region_scores = table.scores(query);
+    scores_of_cells(reader, table.len(), |_, field| field.cosines(&region_scores))
+}
+
+fn check_dim(reader: &StoreReader, table: &RegionTable, query: &[f32]) -> Result<(), QueryError> {
+    let (expected, found) = (table.dim(), query.len());
+    let encoder = || reader.manifest().encoder.name.clone();
+    (found == expected).then_some(()).ok_or_else(|| QueryError::Dimension {
+        expected,
+        found,
+        encoder: encoder(),
+    })
+}
+
+/// Scores the Gaussians of all cells, in the order of the input. `cosines`: of a field, and which cell it is.
+fn scores_of_cells(
+    reader: &StoreReader,
+    n_regions: usize,
+    cosines: impl Fn(usize, &CellField) -> Vec<f32>,
+) -> Result<Scores, QueryError> {
+    let manifest = reader.manifest();
     let n = (manifest.n_gaussians + manifest.n_rejected) as usize;
     let mut scores = Scores { cosines: vec![f32::NAN; n], total_weights: vec![0.0; n] };
-    for cell in &manifest.cells {
-        let field = read_field(reader, cell.cell_id, cell.n_gaussians, table.len())?;
-        let cosines = field.cosines(&region_scores);
+    for (at, cell) in manifest.cells.iter().enumerate() {
+        let field = read_field(reader, cell.cell_id, cell.n_gaussians, n_regions)?;
+        let cosines = cosines(at, &field);
         for (k, index) in field.input_indices.iter().enumerate() {
             if *index as usize >= n {
                 return Err(QueryError::Index { cell_id: cell.cell_id, index: *index, n });

@@ -293,6 +293,9 @@ pub struct QueryArgs {
     /// Score as a robot with shards of this profile does [default: the field in full precision].
     #[arg(long, value_name = "NAME")]
     pub profile: Option<Profile>,
+    /// Scores coarse and fine masks apart and takes the best, instead of their mean.
+    #[arg(long, conflicts_with = "profile")]
+    pub by_mask_level: bool,
     /// Writes every Gaussian's score, in the input's order, as a NumPy array (NaN: no evidence).
     #[arg(long, value_name = "FILE")]
     pub scores: Option<PathBuf>,
@@ -334,6 +337,9 @@ pub struct EvalLabelledArgs {
     /// Score as a robot with shards of this profile does [default: the field in full precision].
     #[arg(long, value_name = "NAME")]
     pub profile: Option<Profile>,
+    /// Scores coarse and fine masks apart and takes the best, instead of their mean.
+    #[arg(long, conflicts_with = "profile")]
+    pub by_mask_level: bool,
     /// Score from which something counts as found [default: the store's].
     #[arg(long, value_name = "COSINE", allow_negative_numbers = true)]
     pub threshold: Option<f32>,

@@ -31,6 +31,7 @@ use crate::generate::{crops, grammar, photos};
 use crate::palette::PaletteSettings;
 use crate::progress::{Progress, Silent};
 use crate::publish::{qdrant, serve};
+use crate::query::{self, ByLevel};
 use crate::raster::devices::Devices;
 use crate::raster::gpu::{AdapterReport, GpuOptions, adapters};
 use crate::raster::simd::Level;
@@ -39,7 +40,7 @@ use crate::shard::ShardSettings;
 use crate::shard::cells::CellLimits;
 use crate::shard::positions::PositionError;
 use crate::store::{Store, StoreReader};
-use crate::{generate, ingest, query};
+use crate::{generate, ingest};
 
 /// Runs the program and says how it ended.
 pub fn run(cli: Cli) -> Exit {
@@ -347,6 +348,7 @@ fn run_query(args: &QueryArgs, json: bool) -> Result<Exit> {
     let vector = encoder.encode(&args.text)?;
     let scores = match args.profile {
         Some(profile) => query::scores_of_shards(&reader, &vector, profile)?,
+        None if args.by_mask_level => ByLevel::read(&reader)?.scores(&vector)?,
         None => query::scores(&reader, &vector)?,
     };
     if let Some(path) = &args.scores {
@@ -397,6 +399,7 @@ fn run_eval_labelled(args: &EvalLabelledArgs, json: bool) -> Result<Exit> {
         threshold: args.threshold,
         filter: args.superpoints,
         level: args.level.level.map(Into::into),
+        by_mask_level: args.by_mask_level,
     };
     let report = eval::labelled(&reader, &truth, &scene, &mut *encoder, &CpuRasterizer, &settings)?;
     print(json, &report, &report)?;

@@ -96,8 +96,10 @@ impl<'a> CellBuilder<'a> {
         stopwatch: &'a Stopwatch,
     ) -> Result<Self, EncodeError> {
         let n_gaussians: Vec<usize> = split.cells.iter().map(|cell| cell.gaussians.len()).collect();
-        let (index, table) =
+        let (index, mut table) =
             stopwatch.time("merge", || SumsIndex::open(sums_paths, models.dim(), &n_gaussians))?;
+        let levels = photos.iter().flat_map(|photo| &photo.outlines).map(|outline| outline.level as u8);
+        table.set_levels(levels.collect());
         let group_bytes = check_memory(
             settings.memory_bytes,
             largest_cell_bytes(split, models.dim()),

@@ -346,6 +346,17 @@ mod tests {
         assert!(cancelled.expect("no error").is_none());
     }
 
+    /// By hand: a twentieth of 100 and of 40 pixels on either side.
+    #[test]
+    fn the_margin_is_left_out() {
+        let map = inner(100, 40);
+        let is_inner = |x: usize, y: usize| map.region_of_pixel[y * 100 + x] == 0;
+        assert_eq!(map.region_of_pixel.iter().filter(|region| **region == 0).count(), 90 * 36);
+        assert!(is_inner(5, 2) && is_inner(94, 37));
+        assert!(!is_inner(4, 20) && !is_inner(95, 20) && !is_inner(50, 1) && !is_inner(50, 38));
+        assert!(inner(1, 1).region_of_pixel == [0]);
+    }
+
     #[test]
     fn spread_orders_are_spread() {
         assert_eq!(spread_order(0), [0; 0]);

@@ -428,6 +428,12 @@ pub fn encode(
         return Err(EncodeError::Interrupted { n_done: used.len(), n_views: used.len() });
     };
     progress.end();
+    let mut n_entries_of_cell = vec![0; split.cells.len()];
+    builder
+        .index()
+        .parts()
+        .iter()
+        .for_each(|part| n_entries_of_cell[part.cell_id as usize] += part.n_entries);
     for record in &built.records {
         let shard_bytes = record.shards.iter().map(|(profile, shard)| (profile.to_string(), shard.len_bytes));
         let shard_bytes: BTreeMap<String, u64> = shard_bytes.collect();
@@ -437,12 +443,11 @@ pub fn encode(
         let n_rows = record.shards.values().map(|shard| shard.n_rows).max().unwrap_or(0);
         summary.n_rows += u64::from(n_rows);
         let CellRecord { cell_id, n_gaussians, .. } = *record;
-        let parts = builder.index().parts().iter().filter(|part| part.cell_id == cell_id);
         let relative = |errors: &ScoreErrors| errors.mean / errors.spread.max(f32::MIN_POSITIVE);
         summary.cells.push(CellReport {
             cell_id,
             n_gaussians,
-            n_entries: parts.map(|part| part.n_entries).sum(),
+            n_entries: n_entries_of_cell[cell_id as usize],
             n_rows,
             n_groups: built.n_groups[cell_id as usize],
             shard_bytes,

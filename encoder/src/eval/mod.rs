@@ -25,7 +25,7 @@ use slag_common::Gaussians;
 use slag_common::gaussians::SH_C0;
 use slag_models::{EncodeError, TextEncoder};
 
-use crate::query::{self, PublishedObjects, QueryError};
+use crate::query::{self, ByLevel, PublishedObjects, QueryError};
 use crate::raster::{RasterError, RasterView, Rasterizer};
 use crate::store::StoreReader;
 use crate::superpoint::{SuperpointSettings, Superpoints};
@@ -162,6 +162,8 @@ pub struct EvalReport {
     pub filter: Option<Filter>,
     /// What was scored.
     pub level: EvalLevel,
+    /// Whether levels of masks were scored apart.
+    pub by_mask_level: bool,
     /// How many of the things objects find; only where objects were scored.
     pub instances: Option<InstanceReport>,
     /// Score from which something counts as found.
@@ -213,6 +215,8 @@ pub struct EvalSettings {
     pub filter: Option<Filter>,
     /// What is scored; objects if the scene has them, if absent.
     pub level: Option<EvalLevel>,
+    /// Scores levels of masks apart and takes the best ([`ByLevel`]); of the full field only.
+    pub by_mask_level: bool,
 }
 
 /// A word's scores: of Gaussians, and of objects where those are scored.
@@ -241,6 +245,7 @@ pub fn labelled(
         Some(EvalLevel::Objects) => Some(PublishedObjects::read(reader)?),
         None => PublishedObjects::find(reader)?,
     };
+    let by_level = settings.by_mask_level.then(|| ByLevel::read(reader)).transpose()?;
     let mut of_objects: Vec<Vec<f32>> = Vec::new();
     let mut score = |text: &str| -> Result<Option<WordScores>, EvalError> {
         let vector = match encoder.encode(text) {
@@ -253,7 +258,10 @@ pub fn labelled(
         };
         let mut scores = match settings.profile {
             Some(profile) => query::scores_of_shards(reader, &vector, profile)?,
-            None => query::scores(reader, &vector)?,
+            None => match &by_level {
+                Some(by_level) => by_level.scores(&vector)?,
+                None => query::scores(reader, &vector)?,
+            },
         };
         let of_objects = objects.as_ref().map(|objects| objects.scores(&vector)).unwrap_or_default();
         objects.iter().for_each(|objects| objects.overlay(&of_objects, &mut scores.cosines));
@@ -384,6 +392,7 @@ pub fn labelled(
         encoder: reader.manifest().encoder.name.clone(),
         profile: settings.profile,
         filter: settings.filter,
+        by_mask_level: settings.by_mask_level,
         level: if objects.is_some() { EvalLevel::Objects } else { EvalLevel::Gaussians },
         instances,
         threshold,

@@ -46,8 +46,7 @@ impl Outline {
             let beside = [(x.wrapping_sub(1), y), (x + 1, y), (x, y.wrapping_sub(1)), (x, y + 1)];
             beside.into_iter().filter(|(x, y)| !is_there(*x, *y)).count()
         };
-        let may_be_cut =
-            valid.is_some() || x0 == 0 || y0 == 0 || x1 >= width_px || y1 >= height_px;
+        let may_be_cut = valid.is_some() || x0 == 0 || y0 == 0 || x1 >= width_px || y1 >= height_px;
         let rows = if may_be_cut { y0..y1 } else { 0..0 };
         let pixels = rows.flat_map(|y| (x0..x1).map(move |x| (x, y))).zip(&mask.inside);
         let cut_px = pixels.filter(|(_, inside)| **inside).map(|((x, y), _)| n_cut(x, y) as u32).sum();
@@ -98,4 +97,55 @@ pub fn read_outlines(path: &Path, n_masks: usize) -> Result<Vec<Outline>, SumsEr
     }
     let outlines = layout.column::<Outline>(2, "outlines", n_masks).map_err(damaged)?;
     Ok(bytemuck::pod_collect_to_vec(&bytes[outlines]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A mask of a box, without the pixels that `hole` names.
+    fn mask(box_px: [u32; 4], hole: impl Fn(u32, u32) -> bool) -> Mask {
+        let [x0, y0, x1, y1] = box_px;
+        let inside: Vec<bool> =
+            (y0..y1).flat_map(|y| (x0..x1).map(move |x| (x, y))).map(|(x, y)| !hole(x, y)).collect();
+        let area_px = inside.iter().filter(|inside| **inside).count() as u32;
+        Mask { box_px: BoxPx { x0, y0, x1, y1 }, inside, area_px, level: 2 }
+    }
+
+    /// By hand: what lies along the photo's edge, and along what undistorting left empty.
+    #[test]
+    fn the_photos_edge_cuts_off_what_touches_it() {
+        let of = |mask: &Mask, valid| Outline::of(mask, 20, 10, valid);
+        let inner = of(&mask([3, 2, 9, 8], |_, _| false), None);
+        assert_eq!(inner, Outline { box_px: [3, 2, 9, 8], cut_px: 0, level: 2 });
+        assert_eq!(inner.wholeness(), 1.0);
+        // 4 of the left, 5 of the lower edge.
+        let corner = of(&mask([0, 6, 5, 10], |_, _| false), None);
+        assert_eq!((corner.cut_px, corner.wholeness()), (9, 0.5));
+        // It touches the right edge with two pixels of its five rows.
+        let tip = of(&mask([14, 2, 20, 7], |x, y| x == 19 && !(3..5).contains(&y)), None);
+        assert_eq!((tip.cut_px, tip.wholeness()), (2, 10.0_f32 / 11.0));
+        let whole_photo = of(&mask([0, 0, 20, 10], |_, _| false), None);
+        assert_eq!((whole_photo.cut_px, whole_photo.wholeness()), (60, 0.0));
+        // Columns 0 to 2 show nothing: the mask beside them is cut along its 6 rows.
+        let valid: Vec<bool> = (0..200).map(|at| at % 20 > 2).collect();
+        assert_eq!(of(&mask([3, 2, 9, 8], |_, _| false), Some(&valid)).cut_px, 6);
+        assert_eq!(of(&mask([4, 2, 9, 8], |_, _| false), Some(&valid)).cut_px, 0);
+    }
+
+    #[test]
+    fn outlines_are_kept_and_damage_is_named() {
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        let path = dir.path().join("a.outlines");
+        let outlines = [[1, 2, 3, 4], [5, 6, 7, 8]].map(|box_px| Outline { box_px, cut_px: 3, level: 1 });
+        write_outlines(&path, &outlines).expect("writes");
+        assert_eq!(read_outlines(&path, 2).expect("reads"), outlines);
+        let message = read_outlines(&path, 3).expect_err("too few").to_string();
+        assert!(message.contains("a.outlines") && message.contains("the view has 3"), "{message}");
+        let mut bytes = AlignedBytes::read(&path).expect("reads").to_vec();
+        // In the second section: the first is padded.
+        bytes[200] ^= 1;
+        fs_err::write(&path, &bytes).expect("writes");
+        read_outlines(&path, 2).expect_err("damaged");
+    }
 }

@@ -91,8 +91,15 @@ impl Aggregation {
     };
     /// What was measured to help on a trained splat and on generated ones alike. Pruning by region helps the
     /// first, whose Gaussians lie across outlines, and costs the others more.
-    pub const REFINED: Self =
-        Self { min_view_share: 0.1, wholeness: 2.0, agreement: 0.5, superpoint: 3.0, coarse: 0.7, fill: true, ..Self::PAPER };
+    pub const REFINED: Self = Self {
+        min_view_share: 0.1,
+        wholeness: 2.0,
+        agreement: 0.5,
+        superpoint: 3.0,
+        coarse: 0.7,
+        fill: true,
+        ..Self::PAPER
+    };
 
     /// Returns the plain average, each option alone, and those that are used together: what tables compare.
     pub fn methods() -> Vec<(&'static str, Self)> {
@@ -184,7 +191,7 @@ impl Refinement {
         }
         let mask_points = principal_coordinates(table.mask_vectors(), AXES);
         let mask_points: &[Point] = mask_points.as_chunks().0;
-        refinement.points = region_points(table, mask_points);
+        refinement.points = region_points(table, mask_points, 0..table.len());
         let each_part = |table: &RegionTable, visit: &mut dyn FnMut(PartSums)| -> Result<bool, SumsError> {
             for group in index.groups(group_bytes) {
                 let sums = index.regroup(&index.read(group)?, table)?;
@@ -208,7 +215,7 @@ impl Refinement {
             mask_weights.iter_mut().zip(agreements).for_each(|(weight, agreement)| *weight *= agreement);
             table.set_mask_weights(&mask_weights);
             refinement.mask_counts = table.mask_counts(0..table.len());
-            refinement.points = region_points(table, mask_points);
+            refinement.points = region_points(table, mask_points, 0..table.len());
         }
         if settings.needs_superpoints() {
             let mut sketches = vec![0; scene.len() * AXES];
@@ -246,8 +253,9 @@ impl Refinement {
                 let mixtures = Mixtures::new(superpoints, regions_of, table, mask_points);
                 refinement.mixtures.push((count, mixtures));
             }
-            // With those of the mixtures, which the next one is mixed with.
-            refinement.points = region_points(table, mask_points);
+            // Those of the mixtures, which the next one is mixed with.
+            let mixtures = region_points(table, mask_points, refinement.points.len()..table.len());
+            refinement.points.extend(mixtures);
         }
         Ok(Some(refinement))
     }
@@ -419,7 +427,10 @@ impl Refinement {
 
     /// Returns the factors by which a Gaussian's views count more alike, at the same weight together.
     fn evened(&self, views: &[ViewEntries]) -> Vec<f32> {
-        let factors: Vec<f32> = views.iter().map(|view| view.weight.powf(-self.settings.evenness)).collect();
+        let factors: Vec<f32> = views
+            .iter()
+            .map(|view| view.weight.max(f32::MIN_POSITIVE).powf(-self.settings.evenness))
+            .collect();
         let total: f32 = views.iter().map(|view| view.weight).sum();
         let evened: f32 = views.iter().zip(&factors).map(|(view, factor)| view.weight * factor).sum();
         factors.into_iter().map(|factor| factor * total / evened).collect()
@@ -534,13 +545,13 @@ fn agreements(table: &RegionTable, mask_points: &[Point], votes: &[Vote], power:
     cosines.iter().map(weight).collect()
 }
 
-fn region_points(table: &RegionTable, mask_points: &[Point]) -> Vec<Point> {
+fn region_points(table: &RegionTable, mask_points: &[Point], regions: Range<usize>) -> Vec<Point> {
     let point = |region: usize| {
         let mut sum = [0.0; AXES];
         table.masks_of(region).for_each(|(mask, share)| add(&mut sum, share, &mask_points[mask as usize]));
         sum
     };
-    (0..table.len()).into_par_iter().map(point).collect()
+    regions.into_par_iter().map(point).collect()
 }
 
 /// Adds the rows of a part's Gaussians to their superpoints' `(region, weight)`.

@@ -29,12 +29,21 @@ pub struct RegionTable {
     masks: Vec<u32>,
     /// How much each of these counts; empty where all count 1.
     shares: Vec<f32>,
+    /// `[n_masks]`: coarseness of each mask, 0 the coarsest; empty where all are alike.
+    levels: Vec<u8>,
 }
 
 impl RegionTable {
     /// A table without regions, for vectors of `dim` components.
     pub fn new(dim: usize) -> Self {
-        Self { dim, mask_vectors: Vec::new(), starts: vec![0], masks: Vec::new(), shares: Vec::new() }
+        Self {
+            dim,
+            mask_vectors: Vec::new(),
+            starts: vec![0],
+            masks: Vec::new(),
+            shares: Vec::new(),
+            levels: Vec::new(),
+        }
     }
 
     /// Returns the components of a vector.
@@ -60,7 +69,7 @@ impl RegionTable {
     /// Returns the bytes that the table takes in memory.
     pub fn len_bytes(&self) -> u64 {
         let numbers = size_of_val(&*self.starts) + size_of_val(&*self.masks) + size_of_val(&*self.shares);
-        (size_of_val(&*self.mask_vectors) + numbers) as u64
+        (size_of_val(&*self.mask_vectors) + numbers + self.levels.len()) as u64
     }
 
     /// Appends a view's regions and returns the number of the first; `mask_vectors` is `[n][dim]`,
@@ -87,6 +96,21 @@ impl RegionTable {
     /// Lets each mask count `weights[mask]` times (finite, not negative; `[n_masks]`) wherever it lies.
     pub fn set_mask_weights(&mut self, weights: &[f32]) {
         self.shares = self.masks.iter().map(|mask| weights[*mask as usize]).collect();
+    }
+
+    /// Says how coarse each mask is, `[n_masks]`, 0 the coarsest.
+    pub fn set_levels(&mut self, levels: Vec<u8>) {
+        self.levels = if levels.iter().all(|level| *level == 0) { Vec::new() } else { levels };
+    }
+
+    /// Returns how coarse a mask is.
+    pub fn level_of(&self, mask: u32) -> usize {
+        self.levels.get(mask as usize).copied().unwrap_or(0).into()
+    }
+
+    /// Returns the number of levels of masks.
+    pub fn n_levels(&self) -> usize {
+        usize::from(self.levels.iter().copied().max().unwrap_or(0)) + 1
     }
 
     /// Appends a region that is a mixture of masks, `(mask, how much it counts)`, and returns its number.
@@ -145,6 +169,19 @@ impl RegionTable {
         (0..self.len()).into_par_iter().map(score).collect()
     }
 
+    /// Returns `q · V_r` of the masks of each level apart, `[n][n_levels]`.
+    pub fn scores_by_level(&self, query: &[f32]) -> Vec<f32> {
+        let of_masks: Vec<f32> =
+            self.mask_vectors.par_chunks_exact(self.dim).map(|vector| super::dot(vector, query)).collect();
+        let mut scores = vec![0.0; self.len() * self.n_levels()];
+        scores.par_chunks_exact_mut(self.n_levels()).enumerate().for_each(|(region, scores)| {
+            for (mask, share) in self.masks_of(region) {
+                scores[self.level_of(mask)] += share * of_masks[mask as usize];
+            }
+        });
+        scores
+    }
+
     /// Writes the file form.
     ///
     /// # Errors
@@ -159,6 +196,9 @@ impl RegionTable {
         ];
         if !self.shares.is_empty() {
             sections.push((5, container::bytes_of(&self.shares)));
+        }
+        if !self.levels.is_empty() {
+            sections.push((6, &self.levels));
         }
         container::write(out, MAGIC, VERSION, &sections)
     }
@@ -181,6 +221,10 @@ impl RegionTable {
             masks: bytemuck::pod_collect_to_vec(&bytes[masks]),
             shares: match layout.find(5) {
                 Some(_) => bytemuck::pod_collect_to_vec(&bytes[layout.column::<f32>(5, "shares", n_listed)?]),
+                None => Vec::new(),
+            },
+            levels: match layout.find(6) {
+                Some(_) => bytes[layout.column::<u8>(6, "levels", n_masks)?].to_vec(),
                 None => Vec::new(),
             },
         };

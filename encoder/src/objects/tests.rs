@@ -1,6 +1,5 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
-use slag_common::container::AlignedBytes;
 use slag_common::objects::object_score;
 use slag_common::shard::Basis;
 

@@ -5,6 +5,7 @@ use slag_common::container::AlignedBytes;
 use slag_common::frames::Aabb;
 
 use super::*;
+use crate::lift::photos::Outline;
 use crate::lift::tests::{Scene, open};
 use crate::lift::{CellField, SumEntry, ViewSums};
 use crate::shard::cells::Cell;
@@ -77,6 +78,15 @@ fn views() -> Vec<ViewSums> {
     (0..7).map(view).collect()
 }
 
+/// The same box for all masks, of which the photos' edges cut off between nothing and all.
+fn photos() -> Vec<Photo> {
+    let outline =
+        |v: u32, mask: u32| Outline { box_px: [4, 4, 14, 14], cut_px: (v * 6 + mask) % 41, level: 0 };
+    let photo =
+        |v: u32| Photo { name: v.to_string(), outlines: (0..6).map(|mask| outline(v, mask)).collect() };
+    (0..7).map(photo).collect()
+}
+
 /// A field with its table and embeddings.
 struct Lifted {
     field: CellField,
@@ -88,9 +98,15 @@ fn lifted(settings: Aggregation, group_bytes: u64) -> Lifted {
     let mut opened = open(&views(), DIM, &[N], u64::MAX);
     let Scene { index, table, .. } = &mut opened;
     let (scene, split) = (gaussians(), split());
-    let refinement =
-        Refinement::prepare(settings, (index, table), (&scene, &split), group_bytes, &AtomicBool::new(false))
-            .expect("reads");
+    let refinement = Refinement::prepare(
+        settings,
+        (index, table),
+        (&scene, &split),
+        &photos(),
+        group_bytes,
+        &AtomicBool::new(false),
+    )
+    .expect("reads");
     let raw = index.read(0..1).expect("reads");
     let mut sums = index.regroup(&raw, table).expect("regroups").remove(0);
     if let Some(refinement) = refinement {
@@ -123,6 +139,17 @@ fn pruned(rows: Vec<Vec<(usize, f64)>>, settings: &Aggregation) -> Vec<Vec<(usiz
     rows.into_iter().map(kept).collect()
 }
 
+/// Views' weights to the power of 1 less the evenness, and the same weight in all.
+fn evened(rows: Vec<Vec<(usize, f64)>>, evenness: f64) -> Vec<Vec<(usize, f64)>> {
+    let weights: Vec<f64> = rows.iter().map(|view| view.iter().map(|e| e.1).sum()).collect();
+    let total: f64 = weights.iter().sum();
+    let even: f64 = weights.iter().filter(|w| **w > 0.0).map(|w| w.powf(1.0 - evenness)).sum();
+    let scaled = |(view, w): (Vec<(usize, f64)>, &f64)| {
+        view.into_iter().map(|(region, a)| (region, a * w.powf(-evenness) * total / even)).collect()
+    };
+    rows.into_iter().zip(&weights).map(scaled).collect()
+}
+
 /// `Σ weight * how often the mask counts * its vector` over a view's entries.
 fn contribution(view: &ViewSums, entries: &[(usize, f64)], counts: &[f64]) -> Vec<f64> {
     let mut sum = vec![0.0; DIM];
@@ -142,12 +169,23 @@ fn norm(v: &[f64]) -> f64 {
 
 /// What masks count, by the definition, with everything in float64 and no axes.
 fn oracle_counts(views: &[ViewSums], settings: &Aggregation) -> Vec<Vec<f64>> {
-    let once = vec![1.0; 6];
+    let whole = |v: usize, mask: usize| {
+        (1.0 - ((v * 6 + mask) % 41) as f64 / 40.0).max(0.01).powf(settings.wholeness.into())
+    };
+    let whole: Vec<Vec<f64>> =
+        (0..views.len()).map(|v| (0..6).map(|mask| whole(v, mask)).collect()).collect();
+    if settings.agreement == 0.0 {
+        return whole;
+    }
     let mut votes = vec![vec![(0.0, 0.0); 6]; views.len()];
     for k in 0..N {
         let rows = pruned(row(views, k), settings);
-        let parts: Vec<Vec<f64>> =
-            rows.iter().zip(views).map(|(entries, view)| contribution(view, entries, &once)).collect();
+        let parts: Vec<Vec<f64>> = rows
+            .iter()
+            .zip(views)
+            .zip(&whole)
+            .map(|((e, view), whole)| contribution(view, e, whole))
+            .collect();
         for (v, entries) in rows.iter().enumerate() {
             let rest: Vec<f64> = (0..DIM)
                 .map(|c| parts.iter().enumerate().filter(|(u, _)| *u != v).map(|(_, p)| p[c]).sum())
@@ -168,7 +206,10 @@ fn oracle_counts(views: &[ViewSums], settings: &Aggregation) -> Vec<Vec<f64>> {
         }
     }
     let count = |(sum, weight): &(f64, f64)| (sum / weight).max(0.01).powf(f64::from(settings.agreement));
-    votes.iter().map(|of_view| of_view.iter().map(count).collect()).collect()
+    let counts = |(of_view, whole): (&Vec<(f64, f64)>, &Vec<f64>)| {
+        of_view.iter().zip(whole).map(|(vote, whole)| count(vote) * whole).collect()
+    };
+    votes.iter().zip(&whole).map(counts).collect()
 }
 
 fn assert_near(found: &[f32], expected: &[f64], what: &str) {
@@ -188,6 +229,7 @@ fn the_plain_average_is_left_alone_and_its_file_is_what_it_was() {
         Aggregation::PAPER,
         (index, table),
         (&scene, &split),
+        &photos(),
         u64::MAX,
         &AtomicBool::new(false),
     );
@@ -198,34 +240,41 @@ fn the_plain_average_is_left_alone_and_its_file_is_what_it_was() {
 
 /// Oracle: float64 by definition, Gaussian by Gaussian.
 #[test]
-fn pruning_and_agreement_are_those_of_the_definition() {
+fn what_masks_and_views_count_is_that_of_the_definition() {
     let views = views();
-    for (agreement, shares) in [(0.0, (0.5, 0.3)), (1.0, (0.0, 0.0)), (2.0, (0.5, 0.3))] {
+    let cases = [
+        (0.0, (0.5, 0.3), 0.0, 0.0),
+        (1.0, (0.0, 0.0), 0.0, 0.0),
+        (2.0, (0.5, 0.3), 0.0, 0.0),
+        (0.0, (0.0, 0.0), 2.0, 0.0),
+        (0.0, (0.0, 0.0), 0.0, 0.5),
+        (0.5, (0.0, 0.3), 2.0, 1.0),
+    ];
+    for (agreement, shares, wholeness, evenness) in cases {
         let settings = Aggregation {
             agreement,
+            wholeness,
+            evenness,
             min_region_share: shares.0,
             min_view_share: shares.1,
             ..Aggregation::PAPER
         };
         let Lifted { field, table, embeddings } = lifted(settings, u64::MAX);
-        let counts = match agreement {
-            0.0 => vec![vec![1.0; 6]; views.len()],
-            _ => oracle_counts(&views, &settings),
-        };
+        let counts = oracle_counts(&views, &settings);
         for k in (0..N).filter(|k| !UNSEEN.contains(k)) {
-            let rows = pruned(row(&views, k), &settings);
+            let rows = evened(pruned(row(&views, k), &settings), evenness.into());
             let mut expected = vec![0.0; DIM];
             for ((view, entries), counts) in views.iter().zip(&rows).zip(&counts) {
                 let part = contribution(view, entries, counts);
                 (0..DIM).for_each(|c| expected[c] += part[c]);
             }
-            assert_near(&embeddings[k * DIM..][..DIM], &expected, &format!("{agreement} {k}"));
+            assert_near(&embeddings[k * DIM..][..DIM], &expected, &format!("{settings:?} {k}"));
             // Scores are those of the embeddings, by the published numbers alone.
             let query: Vec<f32> = (0..DIM).map(|c| random(c as u64) as f32).collect();
             let cosine = field.cosines(&table.scores(&query))[k];
             assert!((cosine - dot(&embeddings[k * DIM..][..DIM], &query)).abs() < 1e-4);
         }
-        if agreement > 0.0 {
+        if agreement >= 1.0 {
             let [good, bad] = [0, 3].map(|v| table.masks_of(v * 9).next().expect("a mask").1);
             assert!(bad < 0.5 * good, "the view that contradicts: {bad}, another: {good}");
         }
@@ -345,7 +394,10 @@ fn a_single_view_keeps_its_evidence() {
     let Scene { index, table, .. } = &mut opened;
     let (scene, split) = (gaussians(), split());
     let (sums, cancel) = ((&*index, &mut *table), AtomicBool::new(false));
-    let refinement = Refinement::prepare(Aggregation::REFINED, sums, (&scene, &split), u64::MAX, &cancel);
+    let photos =
+        [Photo { name: "0".into(), outlines: vec![Outline { box_px: [0, 0, 8, 8], ..Outline::default() }] }];
+    let refinement =
+        Refinement::prepare(Aggregation::REFINED, sums, (&scene, &split), &photos, u64::MAX, &cancel);
     let refinement = refinement.expect("reads").expect("refines");
     let raw = index.read(0..1).expect("reads");
     let mut sums = index.regroup(&raw, table).expect("regroups").remove(0);
