@@ -201,6 +201,20 @@ pub fn quantise_vectors(vectors: &[f32], m: usize, n_vectors: usize) -> (Vec<i8>
     (components, steps)
 }
 
+/// Collects the runs of neighbours of the same object. `objects`: of each Gaussian of a shard, [`NO_OBJECT`] for none.
+/// Returns where each run ends, and its object.
+pub fn collect_runs(objects: impl IntoIterator<Item = u16>) -> (Vec<u32>, Vec<u16>) {
+    let (mut run_ends, mut run_objects) = (Vec::new(), Vec::new());
+    for (index, object) in (0u32..).zip(objects) {
+        if run_objects.last() != Some(&object) {
+            run_objects.push(object);
+            run_ends.push(index);
+        }
+        run_ends.last_mut().into_iter().for_each(|end| *end = index + 1);
+    }
+    (run_ends, run_objects)
+}
+
 /// Where the checked objects of a shard lie.
 #[derive(Clone, Debug)]
 pub(crate) struct ObjectsLayout {

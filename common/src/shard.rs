@@ -9,6 +9,8 @@
 //! `scale[r] * word` to groups of components, a word of 16 for each group:
 //! `E ~ P[r] + scale[r] * sum over g of sum over c in group g of words[g][code][c] * basis_steps[c] * basis[c]`.
 
+mod check;
+
 use std::io;
 use std::ops::Range;
 
@@ -17,7 +19,7 @@ use glam::DVec3;
 use half::f16;
 use serde::{Deserialize, Serialize};
 
-use crate::container::{self, ContainerError, Layout};
+use crate::container;
 use crate::frames::Aabb;
 use crate::hash::Hash32;
 use crate::objects::{Objects, ObjectsLayout};
@@ -500,87 +502,6 @@ pub struct ShardLayout {
 }
 
 impl ShardLayout {
-    /// Checks a whole shard: container, sizes, row order, finite and sane numbers.
-    ///
-    /// # Errors
-    /// [`ContainerError`], naming the byte.
-    pub fn check(bytes: &[u8]) -> Result<Self, ContainerError> {
-        let layout = Layout::check(bytes, MAGIC, VERSION)?;
-        let header: ShardHeader = layout.value(bytes, section::HEADER, "header")?;
-        let at_header = layout.find(section::HEADER).map_or(0, |range| range.start);
-        check_header(&header).map_err(|what| damaged(at_header, what))?;
-        let (n, k, dim) = (header.n_gaussians as usize, header.n_rows as usize, header.dim as usize);
-        let (m, n_groups) = (header.n_components as usize, header.n_groups as usize);
-        let row_starts = layout.column::<u32>(section::ROW_STARTS, "row starts", k + 1)?;
-        let starts: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[row_starts.clone()]);
-        // A row has members: an empty one would only cost time, and K <= N bounds memory.
-        if starts[0] != 0 || starts.windows(2).any(|w| w[0] >= w[1]) || starts[k] as usize > n {
-            let what = format!("row starts do not ascend from 0 to at most {n}");
-            return Err(damaged(row_starts.start, what));
-        }
-        let n_with_evidence = starts[k] as usize;
-        let rows = layout.column::<i8>(section::ROWS, "rows", k * m)?;
-        let radii = lengths(&layout, bytes, section::RADII, "radii", k)?;
-        let basis = match layout.find(section::BASIS) {
-            None if m != dim => {
-                return Err(damaged(at_header, format!("{m} components of {dim} without a basis")));
-            }
-            None => None,
-            Some(_) => {
-                let mean = halves(&layout, bytes, section::MEAN, "mean", dim)?;
-                let vectors = layout.column::<i8>(section::BASIS, "basis", m * dim)?;
-                Some([mean, vectors, lengths(&layout, bytes, section::BASIS_STEPS, "basis steps", m)?])
-            }
-        };
-        let residuals = match n_groups {
-            0 => None,
-            _ => {
-                let group_starts =
-                    layout.column::<u32>(section::GROUP_STARTS, "group starts", n_groups + 1)?;
-                let of_groups: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[group_starts.clone()]);
-                let end = of_groups[n_groups] as usize;
-                if of_groups[0] != 0 || of_groups.windows(2).any(|w| w[0] >= w[1]) || end > m {
-                    let what = format!("group starts do not ascend from 0 to at most {m}");
-                    return Err(damaged(group_starts.start, what));
-                }
-                let words = halves(&layout, bytes, section::WORDS, "words", WORDS * end)?;
-                let row_scales = lengths(&layout, bytes, section::ROW_SCALES, "row scales", k)?;
-                let reaches = lengths(&layout, bytes, section::REACHES, "reaches", k)?;
-                let n_codes = n_with_evidence.div_ceil(BLOCK) * BLOCK * n_groups / 2;
-                let codes = layout.column::<u8>(section::CODES, "codes", n_codes)?;
-                Some([group_starts, words, row_scales, reaches, codes])
-            }
-        };
-        let exact = match layout.find(section::EMBEDDINGS) {
-            None => None,
-            Some(_) => {
-                let indices = layout.column::<u32>(section::INPUT_INDICES, "input indices", n)?;
-                Some([
-                    indices,
-                    halves(&layout, bytes, section::EMBEDDINGS, "embeddings", n_with_evidence * dim)?,
-                ])
-            }
-        };
-        let fine = match layout.find(section::FINE) {
-            None => None,
-            Some(_) => {
-                let errors: ScoreErrors =
-                    layout.value(bytes, section::FINE_ERRORS, "errors of fine residuals")?;
-                check_errors(&errors).map_err(|what| damaged(at_header, what))?;
-                let steps = lengths(&layout, bytes, section::FINE_STEPS, "fine steps", m)?;
-                let scales = lengths(&layout, bytes, section::FINE_SCALES, "fine scales", k)?;
-                let values = layout.column::<i8>(section::FINE, "fine residuals", n_with_evidence * m)?;
-                Some((errors, [steps, scales, values]))
-            }
-        };
-        let positions = match is_packed(&header) {
-            true => layout.column::<u32>(section::POSITIONS, "positions", n)?,
-            false => layout.column::<[u16; 3]>(section::POSITIONS, "positions", n)?,
-        };
-        let objects = ObjectsLayout::check(bytes, &layout, header.n_gaussians, m)?;
-        Ok(Self { header, positions, row_starts, rows, radii, basis, residuals, exact, fine, objects })
-    }
-
     /// Returns the objects of the bytes that were checked, where the shard has them.
     ///
     /// # Panics
@@ -635,207 +556,9 @@ impl ShardLayout {
     }
 }
 
-/// No length here is larger: embeddings are of unit length, and components scaled to about that.
-const MAX_LENGTH: f32 = 4096.0;
-
-fn damaged(offset: usize, what: String) -> ContainerError {
-    ContainerError::Damaged { offset_bytes: offset as u64, what }
-}
-
 fn is_packed(header: &ShardHeader) -> bool {
     header.position_bits[..3] != [16; 3]
 }
 
-fn check_header(header: &ShardHeader) -> Result<(), String> {
-    let floats = [header.origin_in_world, header.position_step, header.box_min, header.box_max];
-    if floats.as_flattened().iter().any(|v| !v.is_finite()) || header.position_step.iter().any(|s| *s < 0.0) {
-        return Err("a coordinate of the header is not finite, or a step is negative".into());
-    }
-    if (0..3).any(|axis| header.box_min[axis] > header.box_max[axis]) {
-        return Err(format!("box {:?}..{:?} is empty", header.box_min, header.box_max));
-    }
-    let (n, k, dim, m) =
-        (header.n_gaussians, header.n_rows, header.dim as usize, header.n_components as usize);
-    if k > n || dim == 0 || dim > MAX_DIM || m > dim {
-        return Err(format!("{k} rows of {m} components of {dim} for {n} Gaussians"));
-    }
-    if header.n_groups as usize > MAX_GROUPS.min(m) || !header.n_groups.is_multiple_of(2) {
-        return Err(format!("{} groups of {m} components", header.n_groups));
-    }
-    let bits = header.position_bits;
-    if bits[3] != 0 || is_packed(header) && bits.iter().map(|b| u32::from(*b)).sum::<u32>() > 32 {
-        return Err(format!("positions of {bits:?} bits"));
-    }
-    if !(0.0..=MAX_LENGTH).contains(&header.row_step) {
-        return Err(format!("the rows' step is not within 0..={MAX_LENGTH}"));
-    }
-    check_errors(&header.errors)
-}
-
-fn check_errors(errors: &ScoreErrors) -> Result<(), String> {
-    let ScoreErrors { mean, p999, max, spread } = *errors;
-    if [mean, p999, max, spread].iter().any(|v| !(0.0..=MAX_LENGTH).contains(v)) {
-        return Err(format!("a score's error is not within 0..={MAX_LENGTH}"));
-    }
-    Ok(())
-}
-
-/// Returns where a column of lengths lies, which are finite and not negative.
-fn lengths(
-    layout: &Layout,
-    bytes: &[u8],
-    id: u32,
-    name: &'static str,
-    len: usize,
-) -> Result<Range<usize>, ContainerError> {
-    let range = layout.column::<f32>(id, name, len)?;
-    let values = bytes[range.clone()].chunks_exact(4);
-    let mut values = values.map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
-    if values.any(|v| !(0.0..=MAX_LENGTH).contains(&v)) {
-        return Err(damaged(range.start, format!("one of the {name} is not within 0..={MAX_LENGTH}")));
-    }
-    Ok(range)
-}
-
-/// Returns where a column of half floats lies, which are finite.
-fn halves(
-    layout: &Layout,
-    bytes: &[u8],
-    id: u32,
-    name: &'static str,
-    len: usize,
-) -> Result<Range<usize>, ContainerError> {
-    let range = layout.column::<f16>(id, name, len)?;
-    // Exponent bits all set is infinity or NaN (IEEE 754 binary16).
-    let is_finite = |b: &[u8]| u16::from_le_bytes([b[0], b[1]]) & 0x7c00 != 0x7c00;
-    if !bytes[range.clone()].chunks_exact(2).all(is_finite) {
-        return Err(damaged(range.start, format!("a number of the {name} is not finite")));
-    }
-    Ok(range)
-}
-
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use container::AlignedBytes;
-
-    /// What a test edits before the shard is written.
-    struct Parts {
-        header: ShardHeader,
-        row_starts: Vec<u32>,
-        radii: Vec<f32>,
-        group_starts: Vec<u32>,
-        words: Vec<f16>,
-        mean: Vec<f16>,
-    }
-
-    /// Six Gaussians, five of them with evidence, in two rows; four dimensions, three components, two groups.
-    fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
-        let mut parts = Parts {
-            header: ShardHeader {
-                cell_id: 5,
-                n_gaussians: 6,
-                n_rows: 2,
-                dim: 4,
-                n_components: 3,
-                n_groups: 2,
-                position_bits: [11, 12, 9, 0],
-                row_step: 0.01,
-                origin_in_world: [1e6, -2.0, 3.0],
-                position_step: [0.001, 0.002, 0.0],
-                box_min: [1e6 - 1.0, -3.0, 2.0],
-                box_max: [1e6 + 66.0, 130.0, 4.0],
-                errors: ScoreErrors { mean: 0.01, p999: 0.1, max: 0.2, spread: 0.07 },
-                encoder_id: [9; 32],
-            },
-            row_starts: vec![0, 2, 5],
-            radii: vec![0.1, 0.2],
-            group_starts: vec![0, 1, 3],
-            words: (0..48).map(|i| f16::from_f32(i as f32 / 64.0)).collect(),
-            mean: [0.5, 0.25, 0.0, -0.5].map(f16::from_f32).to_vec(),
-        };
-        edit(&mut parts);
-        let mut codes = vec![0u8; BLOCK];
-        (0..5).for_each(|i| codes[i] = (i as u8 + 1) << 4 | (15 - i as u8));
-        let packed = [0, 1 | 2 << 11 | 3 << 23, u32::MAX, 4, 5, 6];
-        let mut out = Vec::new();
-        ShardView {
-            header: parts.header,
-            positions: Positions::Packed(&packed),
-            row_starts: &parts.row_starts,
-            rows: &[1, 2, 3, -4, 5, -128],
-            radii: &parts.radii,
-            basis: Some(Basis {
-                mean: &parts.mean,
-                vectors: &[127, 0, 0, 0, 0, 127, 0, 0, 0, 64, -64, 0],
-                steps: &[0.01, 0.02, 0.03],
-            }),
-            residuals: Some(Residuals {
-                group_starts: &parts.group_starts,
-                words: &parts.words,
-                row_scales: &[0.5, 2.0],
-                reaches: &[1.0, 3.0],
-                codes: &codes,
-            }),
-            exact: None,
-        }
-        .write(&mut out)
-        .expect("writes to memory");
-        out
-    }
-
-    #[test]
-    fn round_trip() {
-        let bytes = AlignedBytes::copy_of(&written(|_| {}));
-        let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
-        assert_eq!((shard.members(1), shard.row_of(1), shard.row_of(2), shard.row_of(4)), (2..5, 0, 1, 1));
-        assert_eq!(shard.n_with_evidence(), 5);
-        let p = shard.position_in_world(2);
-        assert!((p - DVec3::new(1e6 + 2.047, -2.0 + 4095.0 * 0.002, 3.0)).length() < 1e-9, "{p}");
-        assert_eq!(shard.position_in_world(1), DVec3::new(1e6 + 0.001, -2.0 + 0.004, 3.0));
-        assert_eq!(shard.position_box().max, p);
-        // Worked out by hand: components of row 1, then code 13 of group 0 (word 13/64), code 3 of group 1
-        // (words (16 + 6)/64 and 23/64), doubled.
-        let mut decoded = [0.0; 4];
-        shard.decode(2, &mut decoded);
-        let c = [-0.04 + 2.0 * 13.0 / 64.0, 0.05 + 2.0 * 22.0 / 64.0, -1.28 + 2.0 * 23.0 / 64.0];
-        let expected =
-            [0.5 + c[0] * 1.27, 0.25 + c[1] * 2.54 + c[2] * 64.0 * 0.03, c[2] * -64.0 * 0.03, -0.5];
-        for (found, expected) in decoded.iter().zip(expected) {
-            assert!((found - expected).abs() < 1e-6, "{decoded:?} {expected:?}");
-        }
-        let query = [0.1f32, -0.2, 0.3, 0.4];
-        let score: f64 = decoded.iter().zip(query).map(|(d, q)| d * f64::from(q)).sum();
-        assert!((shard.scores(&query)[2] - score).abs() < 1e-12);
-    }
-
-    /// A hostile writer computes right checksums over wrong contents: each lie is refused.
-    #[test]
-    fn lies_are_refused() {
-        let refused = |edit: fn(&mut Parts)| {
-            ShardLayout::check(&written(edit)).expect_err("must be refused").to_string()
-        };
-        assert!(refused(|p| p.header.n_gaussians = u32::MAX).contains("bytes"));
-        assert!(refused(|p| p.header.n_rows = 7).contains("rows"));
-        assert!(refused(|p| p.header.dim = 0).contains("components"));
-        assert!(refused(|p| p.header.dim = u32::MAX).contains("components"));
-        assert!(refused(|p| p.header.n_components = 5).contains("components"));
-        assert!(refused(|p| p.header.n_components = 2).contains("bytes"));
-        assert!(refused(|p| p.header.n_groups = 1).contains("groups"));
-        assert!(refused(|p| p.header.n_groups = u32::MAX).contains("groups"));
-        assert!(refused(|p| p.header.position_bits = [16; 4]).contains("positions"));
-        assert!(refused(|p| p.header.position_bits = [16, 16, 17, 0]).contains("positions"));
-        assert!(refused(|p| p.header.position_bits = [16, 16, 16, 0]).contains("positions"));
-        assert!(refused(|p| p.header.origin_in_world[1] = f64::NAN).contains("finite"));
-        assert!(refused(|p| p.header.box_max[0] = -1.0).contains("empty"));
-        assert!(refused(|p| p.header.row_step = f32::NAN).contains("step"));
-        assert!(refused(|p| p.header.errors.max = -1.0).contains("error"));
-        assert!(refused(|p| p.row_starts[1] = 9).contains("ascend"));
-        assert!(refused(|p| p.row_starts[2] = 7).contains("ascend"));
-        assert!(refused(|p| p.radii[1] = f32::INFINITY).contains("radii"));
-        assert!(refused(|p| p.group_starts[2] = 4).contains("ascend"));
-        assert!(refused(|p| p.group_starts[1] = 3).contains("ascend"));
-        assert!(refused(|p| p.words[4] = f16::INFINITY).contains("finite"));
-        assert!(refused(|p| p.mean[0] = f16::NAN).contains("finite"));
-    }
-}
+mod tests;

@@ -12,7 +12,7 @@ use half::f16;
 use slag_common::container::AlignedBytes;
 use slag_common::hash::Hash32;
 use slag_common::manifest::{self, Calibration, CellRecord, EncoderRecord, Manifest, ShardRecord};
-use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, quantise_vectors};
+use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, quantise_vectors};
 use slag_common::shard::{
     ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardLayout, ShardView, quantise,
 };
@@ -85,16 +85,12 @@ impl BuiltShard {
             vectors.extend(components);
             steps.extend(of_vectors);
         }
-        let runs: Vec<&[u16]> = object_of.chunk_by(|a, b| a == b).collect();
-        let ends = runs.iter().scan(0, |end, run| {
-            *end += run.len() as u32;
-            Some(*end)
-        });
+        let (run_ends, run_objects) = collect_runs(object_of);
         let objects = Objects {
             header: ObjectsHeader {
                 n_objects: records.len() as u32,
                 n_vectors: 3,
-                n_runs: runs.len() as u32,
+                n_runs: run_ends.len() as u32,
                 photos_bytes: photos.len() as u32,
                 score_mean: calibration.score_mean,
                 score_spread: calibration.score_spread,
@@ -103,8 +99,8 @@ impl BuiltShard {
             records: &records,
             vectors: &vectors,
             steps: &steps,
-            run_ends: &ends.collect::<Vec<u32>>(),
-            run_objects: &runs.iter().map(|run| run[0]).collect::<Vec<u16>>(),
+            run_ends: &run_ends,
+            run_objects: &run_objects,
             photos: photos.as_bytes(),
         };
         let mut bytes = Vec::new();

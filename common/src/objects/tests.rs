@@ -155,6 +155,15 @@ fn lies_are_refused() {
     assert!(refused(|p| p.photos[0] = 0x1b).contains("UTF-8"), "an escape");
 }
 
+/// The Gaussians of [`written`]: what is read from runs is what they were collected from.
+#[test]
+fn neighbours_of_an_object_are_a_run() {
+    let of_gaussians = [1, 1, NO_OBJECT, 0, 0, 1];
+    assert_eq!(collect_runs(of_gaussians), (vec![2, 3, 5, 6], vec![1, NO_OBJECT, 0, 1]));
+    assert_eq!(collect_runs([NO_OBJECT; 3]), (vec![3], vec![NO_OBJECT]));
+    assert_eq!(collect_runs([]), (vec![], vec![]));
+}
+
 /// Oracle: products in float64. The stated bound holds, and repeats change no score.
 #[test]
 fn rounded_vectors_keep_scores() {

@@ -8,7 +8,7 @@ use half::f16;
 use slag_common::Hash32;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
-use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, quantise_vectors};
+use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, quantise_vectors};
 use slag_common::shard::{
     BLOCK, Basis, Positions, Profile, Residuals, ScoreErrors, ShardHeader, ShardView, WORDS, quantise,
 };
@@ -249,11 +249,16 @@ struct CellObjects {
 impl CellObjects {
     /// Makes them: in turn, each takes a run of Gaussians three times, and a tenth is left to none.
     fn new(ids: &[u64], n: usize, m: usize, bounds: Aabb, vector: impl Fn(&mut Random) -> Vec<f32>) -> Self {
-        let n_runs = 3 * ids.len() + 1;
-        let (end, numbers) = (|run: usize| (n - n / 10) * run / (n_runs - 1), 0..3 * ids.len());
-        let n_here = |number: usize| -> usize {
-            (0..3).map(|turn| number + turn * ids.len()).map(|run| end(run + 1) - end(run)).sum()
-        };
+        let n_turns = 3 * ids.len();
+        let start = |turn: usize| (n - n / 10) * turn / n_turns;
+        let mut object_of = vec![NO_OBJECT; n];
+        let mut n_here = vec![0; ids.len()];
+        for turn in 0..n_turns {
+            let (run, number) = (start(turn)..start(turn + 1), turn % ids.len());
+            n_here[number] += run.len() as u32;
+            object_of[run].fill(number as u16);
+        }
+        let (run_ends, run_objects) = collect_runs(object_of);
         let mut random = Random(ids[0] + 77);
         let (mut vectors, mut steps) = (Vec::new(), Vec::new());
         for _ in ids {
@@ -268,19 +273,17 @@ impl CellObjects {
             box_min: bounds.min.to_array(),
             box_max: bounds.max.to_array(),
             n_gaussians: 2 * n as u32,
-            n_gaussians_here: n_here(number) as u32,
+            n_gaussians_here: n_here[number],
             photo_box_px: [1, 2, 30, 40],
             photo_start: 0,
             photo_bytes: 12,
         };
         let photos: String = (0..ids.len().min(300)).map(|photo| format!("frame{photo:03}.jpg")).collect();
-        let ends = numbers.clone().map(|run| end(run + 1) as u32).chain([n as u32]);
-        let objects = numbers.map(|run| (run % ids.len()) as u16).chain([NO_OBJECT]);
         Self {
             header: ObjectsHeader {
                 n_objects: ids.len() as u32,
                 n_vectors: N_VECTORS as u32,
-                n_runs: n_runs as u32,
+                n_runs: run_ends.len() as u32,
                 photos_bytes: photos.len() as u32,
                 score_mean: 0.0,
                 score_spread: 0.06,
@@ -289,8 +292,8 @@ impl CellObjects {
             records: ids.iter().enumerate().map(record).collect(),
             vectors,
             steps,
-            run_ends: ends.collect(),
-            run_objects: objects.collect(),
+            run_ends,
+            run_objects,
             photos,
         }
     }

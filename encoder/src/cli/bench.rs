@@ -1,17 +1,129 @@
 //! `bench`.
 
+use std::path::PathBuf;
+use std::str::FromStr;
+
 use anyhow::{Context, Result};
+use clap::Args;
 
 use super::Exit;
-use super::args::{CodecBenchArgs, FieldBenchArgs, LiftBenchArgs};
+use super::args::{ModelArgs, parse_bytes, parse_error};
 use super::run::{available_threads, open_models, print};
 use crate::bench::codec::{self, Source};
 use crate::bench::field;
 use crate::bench::lift::{self, LiftOptions};
 use crate::palette::{PaletteSettings, TextBank};
 use crate::progress::Progress;
+use crate::raster::devices::DeviceChoice;
 use crate::shard::ShardSettings;
 use crate::shard::positions::PositionError;
+use slag_common::shard::Profile;
+
+/// `bench raster`.
+#[derive(Debug, Args)]
+pub struct RasterBenchArgs {
+    /// Recorded scene: a NumPy archive of means, quats, scales, opacities, viewmats, Ks, width, height.
+    #[arg(long, value_name = "FILE")]
+    pub fixture: Option<PathBuf>,
+    /// Gaussians of the generated scenes; without a recorded scene 100000,1000000,2000000,8000000.
+    #[arg(long, value_name = "N", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..))]
+    pub gaussians: Vec<u32>,
+    /// Regions of a view; a recorded scene is also measured with a grid of 8 x 6.
+    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "8,64,512,4096",
+        value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    pub regions: Vec<u32>,
+    /// Devices to compare: cpu, cpu-each (once per instruction set), gpu, or an adapter's number.
+    #[arg(long, value_name = "DEVICE", value_delimiter = ',', default_value = "cpu")]
+    pub device: Vec<BenchDevice>,
+    /// Width of generated views, pixels.
+    #[arg(long, value_name = "PX", default_value_t = 648, value_parser = clap::value_parser!(u32).range(1..=16_384))]
+    pub width: u32,
+    /// Height of generated views, pixels.
+    #[arg(long, value_name = "PX", default_value_t = 484, value_parser = clap::value_parser!(u32).range(1..=16_384))]
+    pub height: u32,
+    /// Timed views a case.
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..))]
+    pub repeats: u32,
+    /// Views asked for at once where throughput is measured.
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub views: u32,
+    /// Threads; all cores if absent.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub threads: Option<u32>,
+    /// Writes the figures as JSON into this file.
+    #[arg(long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
+}
+
+/// What `bench raster` measures.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BenchDevice {
+    /// What a choice opens.
+    Chosen(DeviceChoice),
+    /// The processor, with each of the instruction sets that it has.
+    CpuEach,
+}
+
+impl FromStr for BenchDevice {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text == "cpu-each" { Ok(Self::CpuEach) } else { text.parse().map(Self::Chosen) }
+    }
+}
+
+/// `bench lift`.
+#[derive(Debug, Args)]
+pub struct LiftBenchArgs {
+    /// Gaussians.
+    #[arg(long, value_name = "N", default_value_t = 2_000_000, value_parser = clap::value_parser!(u32).range(1..))]
+    gaussians: u32,
+    /// Views.
+    #[arg(long, value_name = "N", default_value_t = 252, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    views: u32,
+    /// Masks a view.
+    #[arg(long, value_name = "N", default_value_t = 60, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    masks: u32,
+    /// Gaussians with a sum, a view.
+    #[arg(long, value_name = "N", default_value_t = 400_000, value_parser = clap::value_parser!(u32).range(1..))]
+    visible: u32,
+    /// Sums of each of these: a Gaussian lies in several regions near their borders.
+    #[arg(long, value_name = "X", default_value_t = 1.4, value_parser = parse_ratio)]
+    entries_per_visible: f64,
+    /// Components of an embedding.
+    #[arg(long, value_name = "N", default_value_t = 512, value_parser = clap::value_parser!(u32).range(1..=8192))]
+    dim: u32,
+    /// Gaussians a cell at most.
+    #[arg(long, value_name = "N", default_value_t = 65_536, value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    cell_gaussians: u32,
+    /// Working memory, as of `encode`.
+    #[arg(long, value_name = "BYTES", default_value = "2GiB", value_parser = parse_bytes)]
+    memory: u64,
+    /// Threads; all cores if absent.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    threads: Option<u32>,
+    /// Times that everything is done.
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..))]
+    repeats: u32,
+    /// Folder for the files of sums, removed afterwards; in the system's temporary folder if absent.
+    #[arg(long, value_name = "DIR")]
+    work: Option<PathBuf>,
+    /// Gaussians of the scene that a plan is made for.
+    #[arg(long, value_name = "N", default_value_t = 38_000_000, value_parser = clap::value_parser!(u32).range(1..))]
+    plan_gaussians: u32,
+    /// Views of that scene.
+    #[arg(long, value_name = "N", default_value_t = 1657, value_parser = clap::value_parser!(u32).range(1..))]
+    plan_views: u32,
+    /// Writes the figures as JSON into this file.
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+}
+
+/// Reads a number of sums a Gaussian.
+fn parse_ratio(text: &str) -> Result<f64, String> {
+    let ratio: f64 = text.parse().map_err(|_| format!("{text:?} is no number"))?;
+    if (1.0..=4.0).contains(&ratio) { Ok(ratio) } else { Err(format!("{text:?} is not within 1 to 4")) }
+}
 
 pub(super) fn run_lift(args: &LiftBenchArgs, json: bool) -> Result<Exit> {
     rayon::ThreadPoolBuilder::new()
@@ -42,6 +154,31 @@ pub(super) fn run_lift(args: &LiftBenchArgs, json: bool) -> Result<Exit> {
     Ok(Exit::Done)
 }
 
+/// `bench codec`.
+#[derive(Debug, Args)]
+pub struct CodecBenchArgs {
+    /// Store with exact shards; a generated field if absent.
+    #[arg(long, value_name = "DIR")]
+    store: Option<PathBuf>,
+    /// Gaussians of the generated field.
+    #[arg(long, value_name = "N", default_value_t = 125_000, value_parser = clap::value_parser!(u32).range(1000..=10_000_000))]
+    gaussians: u32,
+    /// Components of the generated field.
+    #[arg(long, value_name = "N", default_value_t = 512, value_parser = clap::value_parser!(u32).range(2..=4096))]
+    dim: u32,
+    /// Title of the plot [default: the store's folder].
+    #[arg(long)]
+    title: Option<String>,
+    /// Write the plot.
+    #[arg(long, value_name = "FILE")]
+    svg: Option<PathBuf>,
+    /// Write the report as JSON.
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    #[command(flatten)]
+    models: ModelArgs,
+}
+
 pub(super) fn run_codec(args: &CodecBenchArgs, json: bool) -> Result<Exit> {
     let generated = || Source::Generated(args.gaussians as usize, args.dim as usize);
     let source = args.store.clone().map_or_else(generated, Source::Store);
@@ -62,6 +199,29 @@ pub(super) fn run_codec(args: &CodecBenchArgs, json: bool) -> Result<Exit> {
     }
     print(json, &report, &report)?;
     Ok(Exit::Done)
+}
+
+/// `bench field`.
+#[derive(Debug, Args)]
+pub struct FieldBenchArgs {
+    /// Store to publish into.
+    #[arg(long, value_name = "DIR")]
+    store: PathBuf,
+    /// Gaussians, rounded down to whole cells of 62,500.
+    #[arg(long, value_name = "N", default_value_t = 1_000_000, value_parser = clap::value_parser!(u32).range(1000..=100_000_000))]
+    gaussians: u32,
+    /// Components.
+    #[arg(long, value_name = "N", default_value_t = 512, value_parser = clap::value_parser!(u32).range(2..=4096))]
+    dim: u32,
+    /// Which shards to make.
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', default_values_t = [Profile::Compact, Profile::Balanced])]
+    profiles: Vec<Profile>,
+    /// Error of the balanced profile, relative to the spread of scores.
+    #[arg(long, value_name = "E", default_value_t = PaletteSettings::default().balanced_error, value_parser = parse_error)]
+    balanced_error: f32,
+    /// Write the report as JSON.
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
 }
 
 pub(super) fn run_field(args: &FieldBenchArgs, progress: &dyn Progress) -> Result<Exit> {

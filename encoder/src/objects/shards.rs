@@ -2,7 +2,7 @@
 
 use half::f16;
 use slag_common::objects::{
-    MAX_PHOTO_BYTES, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, quantise_vectors,
+    MAX_PHOTO_BYTES, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, quantise_vectors,
 };
 use slag_common::shard::Basis;
 
@@ -185,15 +185,11 @@ impl CellObjects {
             cell.vectors.extend(components);
             cell.steps.extend(steps);
         }
-        for (index, local) in locals.iter().enumerate() {
-            let object = object_of[*local as usize];
-            let number = if object == NONE { NO_OBJECT } else { number_of[object as usize] };
-            if cell.run_objects.last() != Some(&number) {
-                cell.run_objects.push(number);
-                cell.run_ends.push(0);
-            }
-            cell.run_ends.last_mut().into_iter().for_each(|end| *end = index as u32 + 1);
-        }
+        (cell.run_ends, cell.run_objects) =
+            collect_runs(locals.iter().map(|local| match object_of[*local as usize] {
+                NONE => NO_OBJECT,
+                object => number_of[object as usize],
+            }));
         (cell.header.n_runs, cell.header.photos_bytes) =
             (cell.run_ends.len() as u32, cell.photos.len() as u32);
         cell

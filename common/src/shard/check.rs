@@ -1,0 +1,170 @@
+//! What is checked of a shard's bytes before they are read.
+
+use std::ops::Range;
+
+use half::f16;
+
+use super::{
+    BLOCK, MAGIC, MAX_DIM, MAX_GROUPS, ScoreErrors, ShardHeader, ShardLayout, VERSION, WORDS, is_packed,
+    section,
+};
+use crate::container::{ContainerError, Layout};
+use crate::objects::ObjectsLayout;
+
+/// No length here is larger: embeddings are of unit length, and components scaled to about that.
+const MAX_LENGTH: f32 = 4096.0;
+
+impl ShardLayout {
+    /// Checks a whole shard: container, sizes, row order, finite and sane numbers.
+    ///
+    /// # Errors
+    /// [`ContainerError`], naming the byte.
+    pub fn check(bytes: &[u8]) -> Result<Self, ContainerError> {
+        let layout = Layout::check(bytes, MAGIC, VERSION)?;
+        let header: ShardHeader = layout.value(bytes, section::HEADER, "header")?;
+        let at_header = layout.find(section::HEADER).map_or(0, |range| range.start);
+        check_header(&header).map_err(|what| damaged(at_header, what))?;
+        let (n, k, dim) = (header.n_gaussians as usize, header.n_rows as usize, header.dim as usize);
+        let (m, n_groups) = (header.n_components as usize, header.n_groups as usize);
+        let row_starts = layout.column::<u32>(section::ROW_STARTS, "row starts", k + 1)?;
+        let starts: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[row_starts.clone()]);
+        // A row has members: an empty one would only cost time, and K <= N bounds memory.
+        if starts[0] != 0 || starts.windows(2).any(|w| w[0] >= w[1]) || starts[k] as usize > n {
+            let what = format!("row starts do not ascend from 0 to at most {n}");
+            return Err(damaged(row_starts.start, what));
+        }
+        let n_with_evidence = starts[k] as usize;
+        let rows = layout.column::<i8>(section::ROWS, "rows", k * m)?;
+        let radii = lengths(&layout, bytes, section::RADII, "radii", k)?;
+        let basis = match layout.find(section::BASIS) {
+            None if m != dim => {
+                return Err(damaged(at_header, format!("{m} components of {dim} without a basis")));
+            }
+            None => None,
+            Some(_) => {
+                let mean = halves(&layout, bytes, section::MEAN, "mean", dim)?;
+                let vectors = layout.column::<i8>(section::BASIS, "basis", m * dim)?;
+                Some([mean, vectors, lengths(&layout, bytes, section::BASIS_STEPS, "basis steps", m)?])
+            }
+        };
+        let residuals = match n_groups {
+            0 => None,
+            _ => {
+                let group_starts =
+                    layout.column::<u32>(section::GROUP_STARTS, "group starts", n_groups + 1)?;
+                let of_groups: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[group_starts.clone()]);
+                let end = of_groups[n_groups] as usize;
+                if of_groups[0] != 0 || of_groups.windows(2).any(|w| w[0] >= w[1]) || end > m {
+                    let what = format!("group starts do not ascend from 0 to at most {m}");
+                    return Err(damaged(group_starts.start, what));
+                }
+                let words = halves(&layout, bytes, section::WORDS, "words", WORDS * end)?;
+                let row_scales = lengths(&layout, bytes, section::ROW_SCALES, "row scales", k)?;
+                let reaches = lengths(&layout, bytes, section::REACHES, "reaches", k)?;
+                let n_codes = n_with_evidence.div_ceil(BLOCK) * BLOCK * n_groups / 2;
+                let codes = layout.column::<u8>(section::CODES, "codes", n_codes)?;
+                Some([group_starts, words, row_scales, reaches, codes])
+            }
+        };
+        let exact = match layout.find(section::EMBEDDINGS) {
+            None => None,
+            Some(_) => {
+                let indices = layout.column::<u32>(section::INPUT_INDICES, "input indices", n)?;
+                Some([
+                    indices,
+                    halves(&layout, bytes, section::EMBEDDINGS, "embeddings", n_with_evidence * dim)?,
+                ])
+            }
+        };
+        let fine = match layout.find(section::FINE) {
+            None => None,
+            Some(_) => {
+                let errors: ScoreErrors =
+                    layout.value(bytes, section::FINE_ERRORS, "errors of fine residuals")?;
+                check_errors(&errors).map_err(|what| damaged(at_header, what))?;
+                let steps = lengths(&layout, bytes, section::FINE_STEPS, "fine steps", m)?;
+                let scales = lengths(&layout, bytes, section::FINE_SCALES, "fine scales", k)?;
+                let values = layout.column::<i8>(section::FINE, "fine residuals", n_with_evidence * m)?;
+                Some((errors, [steps, scales, values]))
+            }
+        };
+        let positions = match is_packed(&header) {
+            true => layout.column::<u32>(section::POSITIONS, "positions", n)?,
+            false => layout.column::<[u16; 3]>(section::POSITIONS, "positions", n)?,
+        };
+        let objects = ObjectsLayout::check(bytes, &layout, header.n_gaussians, m)?;
+        Ok(Self { header, positions, row_starts, rows, radii, basis, residuals, exact, fine, objects })
+    }
+}
+
+fn damaged(offset: usize, what: String) -> ContainerError {
+    ContainerError::Damaged { offset_bytes: offset as u64, what }
+}
+
+fn check_header(header: &ShardHeader) -> Result<(), String> {
+    let floats = [header.origin_in_world, header.position_step, header.box_min, header.box_max];
+    if floats.as_flattened().iter().any(|v| !v.is_finite()) || header.position_step.iter().any(|s| *s < 0.0) {
+        return Err("a coordinate of the header is not finite, or a step is negative".into());
+    }
+    if (0..3).any(|axis| header.box_min[axis] > header.box_max[axis]) {
+        return Err(format!("box {:?}..{:?} is empty", header.box_min, header.box_max));
+    }
+    let (n, k, dim, m) =
+        (header.n_gaussians, header.n_rows, header.dim as usize, header.n_components as usize);
+    if k > n || dim == 0 || dim > MAX_DIM || m > dim {
+        return Err(format!("{k} rows of {m} components of {dim} for {n} Gaussians"));
+    }
+    if header.n_groups as usize > MAX_GROUPS.min(m) || !header.n_groups.is_multiple_of(2) {
+        return Err(format!("{} groups of {m} components", header.n_groups));
+    }
+    let bits = header.position_bits;
+    if bits[3] != 0 || is_packed(header) && bits.iter().map(|b| u32::from(*b)).sum::<u32>() > 32 {
+        return Err(format!("positions of {bits:?} bits"));
+    }
+    if !(0.0..=MAX_LENGTH).contains(&header.row_step) {
+        return Err(format!("the rows' step is not within 0..={MAX_LENGTH}"));
+    }
+    check_errors(&header.errors)
+}
+
+fn check_errors(errors: &ScoreErrors) -> Result<(), String> {
+    let ScoreErrors { mean, p999, max, spread } = *errors;
+    if [mean, p999, max, spread].iter().any(|v| !(0.0..=MAX_LENGTH).contains(v)) {
+        return Err(format!("a score's error is not within 0..={MAX_LENGTH}"));
+    }
+    Ok(())
+}
+
+/// Returns where a column of lengths lies, which are finite and not negative.
+fn lengths(
+    layout: &Layout,
+    bytes: &[u8],
+    id: u32,
+    name: &'static str,
+    len: usize,
+) -> Result<Range<usize>, ContainerError> {
+    let range = layout.column::<f32>(id, name, len)?;
+    let values = bytes[range.clone()].chunks_exact(4);
+    let mut values = values.map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
+    if values.any(|v| !(0.0..=MAX_LENGTH).contains(&v)) {
+        return Err(damaged(range.start, format!("one of the {name} is not within 0..={MAX_LENGTH}")));
+    }
+    Ok(range)
+}
+
+/// Returns where a column of half floats lies, which are finite.
+fn halves(
+    layout: &Layout,
+    bytes: &[u8],
+    id: u32,
+    name: &'static str,
+    len: usize,
+) -> Result<Range<usize>, ContainerError> {
+    let range = layout.column::<f16>(id, name, len)?;
+    // Exponent bits all set is infinity or NaN (IEEE 754 binary16).
+    let is_finite = |b: &[u8]| u16::from_le_bytes([b[0], b[1]]) & 0x7c00 != 0x7c00;
+    if !bytes[range.clone()].chunks_exact(2).all(is_finite) {
+        return Err(damaged(range.start, format!("a number of the {name} is not finite")));
+    }
+    Ok(range)
+}
