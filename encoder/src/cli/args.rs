@@ -10,7 +10,6 @@ use slag_common::shard::Profile;
 use slag_models::commands::{ModelsCommand, RunArgs};
 
 // `bench raster` is in `run.rs`, which has its flags from here.
-pub(super) use super::bench::{BenchDevice, RasterBenchArgs};
 use super::bench::{CodecBenchArgs, FieldBenchArgs, LiftBenchArgs};
 use super::eval::{EvalEncoderArgs, EvalLerfArgs, EvalScannetArgs};
 use super::keys::KeysCommand;
@@ -75,7 +74,6 @@ pub enum Command {
     /// Pushes a store elsewhere.
     #[command(subcommand)]
     Push(PushCommand),
-    /// Writes a furnished room as splat, photos, poses and truth.
     /// Measures answers against labels.
     #[command(subcommand)]
     Eval(EvalCommand),
@@ -486,7 +484,7 @@ pub enum BenchCommand {
     /// Publishes a store of a generated field, for `slag-edge bench query`.
     Field(FieldBenchArgs),
     /// Weights of a view: each device on generated scenes, or on a recorded one.
-    Raster(RasterBenchArgs),
+    Raster(super::bench::RasterBenchArgs),
     /// From the sparse sums of all views to every Gaussian's embedding, on a made-up scene.
     Lift(LiftBenchArgs),
     /// What each choice of `encode` costs and gives, on labelled scenes: table, front and plots.

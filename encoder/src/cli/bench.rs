@@ -9,12 +9,18 @@ use clap::Args;
 use super::Exit;
 use super::args::{ModelArgs, parse_bytes, parse_error};
 use super::run::{available_threads, open_models, print};
+use crate::bench::Machine;
 use crate::bench::codec::{self, Source};
 use crate::bench::field;
 use crate::bench::lift::{self, LiftOptions};
+use crate::bench::raster::{Device, RasterBench, RasterReport};
+use crate::bench::scene::{BenchScene, cell_regions, grid_regions};
 use crate::palette::{PaletteSettings, TextBank};
 use crate::progress::Progress;
-use crate::raster::devices::DeviceChoice;
+use crate::raster::CpuLevel;
+use crate::raster::devices::{DeviceChoice, Devices};
+use crate::raster::gpu::GpuOptions;
+use crate::raster::simd::Level;
 use crate::shard::ShardSettings;
 use crate::shard::positions::PositionError;
 use slag_common::shard::Profile;
@@ -237,5 +243,55 @@ pub(super) fn run_field(args: &FieldBenchArgs, progress: &dyn Progress) -> Resul
         fs_err::write(path, &text)?;
     }
     println!("{text}");
+    Ok(Exit::Done)
+}
+
+pub(super) fn run_raster(args: &RasterBenchArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(args.threads.map_or_else(available_threads, |n| n as usize))
+        .build_global()
+        .context("cannot start threads")?;
+    let mut devices = Vec::with_capacity(args.device.len());
+    for device in &args.device {
+        match device {
+            BenchDevice::Chosen(choice) => {
+                let options = GpuOptions { views_in_flight: args.views as usize, ..GpuOptions::default() };
+                let opened = Devices::open(*choice, options)?;
+                devices.push(Device { name: opened.names().join(", "), rasterizer: Box::new(opened) });
+            }
+            BenchDevice::CpuEach => devices.extend(
+                Level::available()
+                    .into_iter()
+                    .map(|level| Device { name: level.name().into(), rasterizer: Box::new(CpuLevel(level)) }),
+            ),
+        }
+    }
+    let sizes = match (&args.fixture, args.gaussians.is_empty()) {
+        (None, true) => vec![100_000, 1_000_000, 2_000_000, 8_000_000],
+        _ => args.gaussians.clone(),
+    };
+    let n_cases = (sizes.len() + usize::from(args.fixture.is_some())) * args.regions.len();
+    progress.begin("bench", "case", (n_cases + usize::from(args.fixture.is_some())) as u64, 0);
+    let bench = RasterBench { n_repeats: args.repeats as usize, n_in_flight: args.views as usize };
+    let mut report = RasterReport { machine: Machine::here(), cases: Vec::new() };
+    let mut measure = |scene: &BenchScene, with_grid: bool| -> Result<()> {
+        let (width_px, height_px) = (scene.views[0].intrinsics.width_px, scene.views[0].intrinsics.height_px);
+        let grid = with_grid.then(|| grid_regions(width_px, height_px, 8, 6));
+        let cells = args.regions.iter().map(|&n| cell_regions(width_px, height_px, n));
+        let maps: Vec<_> = grid.into_iter().chain(cells).collect();
+        report.cases.extend(bench.run(scene, &maps, &devices, progress)?);
+        Ok(())
+    };
+    if let Some(path) = &args.fixture {
+        measure(&BenchScene::read(path)?, true)?;
+    }
+    for n in sizes {
+        measure(&BenchScene::generated(n as usize, args.width, args.height), false)?;
+    }
+    progress.end();
+    if let Some(path) = &args.out {
+        fs_err::write(path, serde_json::to_string_pretty(&report)?)?;
+    }
+    print(json, &report, &report)?;
     Ok(Exit::Done)
 }

@@ -79,3 +79,44 @@ impl Preset {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use super::*;
+    use crate::encode::EncodeSettings;
+
+    /// The program without flags does what the library does without settings.
+    #[test]
+    fn balanced_is_what_the_library_has_as_its_own() {
+        let library = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
+        let balanced = Preset::Balanced.choices();
+        assert_eq!(balanced.aggregation, library.aggregation);
+        assert_eq!(balanced.objects, library.objects);
+        assert_eq!(balanced.views_limit, library.views_limit);
+        assert_eq!(balanced.raster_width, library.raster_width);
+        assert_eq!(balanced.min_mask_px, library.min_mask_px);
+        assert_eq!(balanced.background, library.background);
+        assert_eq!(balanced.weights, library.weights);
+        assert_eq!(balanced.palette, library.shards.palette);
+        let levels = balanced.mask_levels;
+        assert_eq!(library.masks, crate::encode::Masks::Auto { n_levels: levels });
+    }
+
+    /// The others differ in what their descriptions say.
+    #[test]
+    fn presets_are_what_they_are_called() {
+        let [paper, fast, balanced, accurate] =
+            [Preset::Paper, Preset::Fast, Preset::Balanced, Preset::Accurate].map(Preset::choices);
+        // The same masks, so that only what is made of them differs.
+        assert_eq!((paper.aggregation, paper.objects), (Aggregation::default(), false));
+        assert_eq!((paper.mask_levels, paper.views_limit), (balanced.mask_levels, ViewsLimit::All));
+        assert_eq!(fast.views_limit.of(96), 48);
+        assert_eq!((fast.mask_levels, fast.raster_width), (2, RasterWidth::Px(320)));
+        assert_eq!(fast.aggregation, balanced.aggregation);
+        assert_eq!(accurate.aggregation, balanced.aggregation);
+        assert_eq!(accurate.palette.compact_error, 0.5 * balanced.palette.compact_error);
+        assert_eq!(accurate.palette.balanced_error, 0.5 * balanced.palette.balanced_error);
+    }
+}

@@ -17,9 +17,6 @@ use slag_models::{ModelDir, SessionOptions, TextEncoder};
 use super::Exit;
 use super::args::*;
 use super::progress::Shown;
-use crate::bench::Machine;
-use crate::bench::raster::{Device, RasterBench, RasterReport};
-use crate::bench::scene::{BenchScene, cell_regions, grid_regions};
 use crate::check::{self, CheckOptions, CheckView};
 use crate::demo;
 use crate::encode::coverage::CoverageReport;
@@ -34,8 +31,7 @@ use crate::publish::{qdrant, serve};
 use crate::query::{self, ByLevel};
 use crate::raster::devices::Devices;
 use crate::raster::gpu::{AdapterReport, GpuOptions, adapters};
-use crate::raster::simd::Level;
-use crate::raster::{CpuLevel, CpuRasterizer, RasterView};
+use crate::raster::{CpuRasterizer, RasterView};
 use crate::shard::ShardSettings;
 use crate::shard::cells::CellLimits;
 use crate::shard::positions::PositionError;
@@ -63,7 +59,9 @@ pub fn run(cli: Cli) -> Exit {
         Command::Generate(command) => run_generate(&command, progress.as_ref()),
         Command::Demo(args) => run_demo(&args, progress.as_ref(), json),
         Command::Devices => run_devices(json),
-        Command::Bench(BenchCommand::Raster(args)) => run_bench_raster(&args, progress.as_ref(), json),
+        Command::Bench(BenchCommand::Raster(args)) => {
+            super::bench::run_raster(&args, progress.as_ref(), json)
+        }
         Command::Bench(BenchCommand::Lift(args)) => super::bench::run_lift(&args, json),
         Command::Bench(BenchCommand::Codec(args)) => super::bench::run_codec(&args, json),
         Command::Bench(BenchCommand::Field(args)) => super::bench::run_field(&args, progress.as_ref()),
@@ -525,55 +523,5 @@ fn run_devices(json: bool) -> Result<Exit> {
         lines += "no GPU; the CPU does the work\n";
     }
     print(json, &json!({ "adapters": reports }), lines)?;
-    Ok(Exit::Done)
-}
-
-fn run_bench_raster(args: &RasterBenchArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    rayon::ThreadPoolBuilder::new()
-        .num_threads(args.threads.map_or_else(available_threads, |n| n as usize))
-        .build_global()
-        .context("cannot start threads")?;
-    let mut devices = Vec::with_capacity(args.device.len());
-    for device in &args.device {
-        match device {
-            BenchDevice::Chosen(choice) => {
-                let options = GpuOptions { views_in_flight: args.views as usize, ..GpuOptions::default() };
-                let opened = Devices::open(*choice, options)?;
-                devices.push(Device { name: opened.names().join(", "), rasterizer: Box::new(opened) });
-            }
-            BenchDevice::CpuEach => devices.extend(
-                Level::available()
-                    .into_iter()
-                    .map(|level| Device { name: level.name().into(), rasterizer: Box::new(CpuLevel(level)) }),
-            ),
-        }
-    }
-    let sizes = match (&args.fixture, args.gaussians.is_empty()) {
-        (None, true) => vec![100_000, 1_000_000, 2_000_000, 8_000_000],
-        _ => args.gaussians.clone(),
-    };
-    let n_cases = (sizes.len() + usize::from(args.fixture.is_some())) * args.regions.len();
-    progress.begin("bench", "case", (n_cases + usize::from(args.fixture.is_some())) as u64, 0);
-    let bench = RasterBench { n_repeats: args.repeats as usize, n_in_flight: args.views as usize };
-    let mut report = RasterReport { machine: Machine::here(), cases: Vec::new() };
-    let mut measure = |scene: &BenchScene, with_grid: bool| -> Result<()> {
-        let (width_px, height_px) = (scene.views[0].intrinsics.width_px, scene.views[0].intrinsics.height_px);
-        let grid = with_grid.then(|| grid_regions(width_px, height_px, 8, 6));
-        let cells = args.regions.iter().map(|&n| cell_regions(width_px, height_px, n));
-        let maps: Vec<_> = grid.into_iter().chain(cells).collect();
-        report.cases.extend(bench.run(scene, &maps, &devices, progress)?);
-        Ok(())
-    };
-    if let Some(path) = &args.fixture {
-        measure(&BenchScene::read(path)?, true)?;
-    }
-    for n in sizes {
-        measure(&BenchScene::generated(n as usize, args.width, args.height), false)?;
-    }
-    progress.end();
-    if let Some(path) = &args.out {
-        fs_err::write(path, serde_json::to_string_pretty(&report)?)?;
-    }
-    print(json, &report, &report)?;
     Ok(Exit::Done)
 }

@@ -2,7 +2,7 @@
 //!
 //! ```json
 //! {"points": [{
-//!   "axis": "views by coverage", "name": "1/4",
+//!   "axis": "views by coverage", "name": "25 %",
 //!   "views": "--view-order coverage --views-limit 25%",
 //!   "lift": "--compact-error 0.1",
 //!   "eval": "", "profile": "compact"
