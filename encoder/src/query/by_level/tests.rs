@@ -44,7 +44,7 @@ fn the_best_of_the_levels_is_that_of_the_definition() {
     let lengths = lengths(&field, &table);
     for query in [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.5, 0.5, 0.5, 0.5], [0.0, -0.6, -0.8, 0.0]] {
         let found = best_of_levels(&field, &table.scores_by_level(&query), &lengths, 3);
-        for k in 0..2 {
+        for (k, found) in found.iter().enumerate().take(2) {
             let mut sums = [[0.0f64; 4]; 3];
             for (region, weight) in field.entries(k) {
                 for (mask, share) in table.masks_of(region) {
@@ -60,7 +60,7 @@ fn the_best_of_the_levels_is_that_of_the_definition() {
             let cosine =
                 |s: &[f64; 4]| s.iter().zip(query).map(|(c, q)| c * f64::from(q)).sum::<f64>() / length(s);
             let expected = known.map(cosine).fold(f64::MIN, f64::max);
-            assert!((f64::from(found[k]) - expected).abs() < 1e-6, "{k}: {} {expected}", found[k]);
+            assert!((f64::from(*found) - expected).abs() < 1e-6, "{k}: {found} {expected}");
         }
         assert!(found[2].is_nan(), "no sums, no score");
     }
