@@ -347,6 +347,12 @@ fn objects_are_the_things_for_any_threads_and_memory() {
             assert_eq!((object.photo.as_str(), object.photo_box_px), ("5.jpg", [5, 2, 15, 12]));
         }
     }
+    // Where that photo's edge cuts most of the thing off, another one shows it better.
+    let mut cut = world();
+    cut.photos[5].outlines[2].cut_px = 38;
+    let of_thing = |objects: &[Object]| objects.iter().position(|object| object.photo_box_px[1] == 2);
+    let whole = of_thing(&found.objects).expect("it is there");
+    assert_ne!(cut.objects(u64::MAX).objects[whole].photo, "5.jpg");
     for n_threads in [1, 3] {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().expect("threads");
         for group_bytes in [0, 4_000, u64::MAX] {
