@@ -348,7 +348,7 @@ fn objects_are_the_things_for_any_threads_and_memory() {
         }
     }
     // Where that photo's edge cuts most of the thing off, another one shows it better.
-    let mut cut = world();
+    let mut cut = self::world();
     cut.photos[5].outlines[2].cut_px = 38;
     let of_thing = |objects: &[Object]| objects.iter().position(|object| object.photo_box_px[1] == 2);
     let whole = of_thing(&found.objects).expect("it is there");
