@@ -161,18 +161,20 @@ impl RegionTable {
         }
     }
 
+    fn mask_scores(&self, query: &[f32]) -> Vec<f32> {
+        self.mask_vectors.par_chunks_exact(self.dim).map(|vector| super::dot(vector, query)).collect()
+    }
+
     /// Returns `q · V_r` for every region.
     pub fn scores(&self, query: &[f32]) -> Vec<f32> {
-        let of_masks: Vec<f32> =
-            self.mask_vectors.par_chunks_exact(self.dim).map(|vector| super::dot(vector, query)).collect();
+        let of_masks = self.mask_scores(query);
         let score = |region| self.masks_of(region).map(|(mask, share)| share * of_masks[mask as usize]).sum();
         (0..self.len()).into_par_iter().map(score).collect()
     }
 
     /// Returns `q · V_r` of the masks of each level apart, `[n][n_levels]`.
     pub fn scores_by_level(&self, query: &[f32]) -> Vec<f32> {
-        let of_masks: Vec<f32> =
-            self.mask_vectors.par_chunks_exact(self.dim).map(|vector| super::dot(vector, query)).collect();
+        let of_masks = self.mask_scores(query);
         let mut scores = vec![0.0; self.len() * self.n_levels()];
         scores.par_chunks_exact_mut(self.n_levels()).enumerate().for_each(|(region, scores)| {
             for (mask, share) in self.masks_of(region) {

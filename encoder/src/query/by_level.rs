@@ -11,10 +11,11 @@
 //! The sums are those of the plain field: nothing more is published for it but each mask's level.
 
 use rayon::prelude::*;
+use slag_common::manifest::CellRecord;
 
 use super::{QueryError, Scores, check_dim, scores_of_cells};
 use crate::lift::published::{read_field, read_regions};
-use crate::lift::{CellField, RegionTable};
+use crate::lift::{CellField, RegionTable, dot};
 use crate::store::StoreReader;
 
 /// A level with less than this part of the longest level's sum says nothing of a Gaussian.
@@ -35,7 +36,7 @@ impl<'a> ByLevel<'a> {
     /// [`QueryError::Field`].
     pub fn read(reader: &'a StoreReader) -> Result<Self, QueryError> {
         let table = read_regions(reader)?;
-        let lengths = |cell: &slag_common::manifest::CellRecord| {
+        let lengths = |cell: &CellRecord| {
             let field = read_field(reader, cell.cell_id, cell.n_gaussians, table.len())?;
             Ok(lengths(&field, &table))
         };
@@ -80,7 +81,7 @@ fn lengths(field: &CellField, table: &RegionTable) -> Vec<f32> {
                 sum.iter_mut().zip(vector).for_each(|(s, v)| *s += count * v);
             }
             for (length, sum) in lengths.iter_mut().zip(sums.chunks_exact(dim)) {
-                *length = crate::lift::dot(sum, sum).sqrt();
+                *length = dot(sum, sum).sqrt();
             }
         },
     );

@@ -29,7 +29,7 @@ fn field(table: &RegionTable) -> CellField {
             total += count;
             sum.iter_mut().zip(table.mask_vectors().get(mask as usize)).for_each(|(s, v)| *s += count * v);
         }
-        let length = crate::lift::dot(&sum, &sum).sqrt();
+        let length = dot(&sum, &sum).sqrt();
         field.total_weights.push(total);
         field.mean_lengths.push(if total > 0.0 { length / total } else { 0.0 });
     }
