@@ -9,8 +9,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 use slag_common::shard::Profile;
 use slag_models::commands::{ModelsCommand, RunArgs};
 
-// `bench raster` is in `run.rs`, which has its flags from here.
-use super::bench::{CodecBenchArgs, FieldBenchArgs, LiftBenchArgs};
+use super::bench::{CodecBenchArgs, FieldBenchArgs, LiftBenchArgs, RasterBenchArgs};
 use super::eval::{EvalEncoderArgs, EvalLerfArgs, EvalScannetArgs};
 use super::keys::KeysCommand;
 use super::noise::EvalNoiseArgs;
@@ -484,7 +483,7 @@ pub enum BenchCommand {
     /// Publishes a store of a generated field, for `slag-edge bench query`.
     Field(FieldBenchArgs),
     /// Weights of a view: each device on generated scenes, or on a recorded one.
-    Raster(super::bench::RasterBenchArgs),
+    Raster(RasterBenchArgs),
     /// From the sparse sums of all views to every Gaussian's embedding, on a made-up scene.
     Lift(LiftBenchArgs),
     /// What each choice of `encode` costs and gives, on labelled scenes: table, front and plots.

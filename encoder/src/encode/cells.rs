@@ -5,14 +5,15 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use slag_common::manifest::{Calibration, CellRecord, ShardRecord};
 use slag_common::shard::Profile;
-use slag_common::{Gaussians, Hash32};
+use slag_common::{Gaussians, Hash32, View};
 use slag_models::ModelDir;
 
+use super::job::Job;
 use super::{EncodeError, EncodeSettings, Stopwatch};
-use crate::lift::photos::Photo;
+use crate::lift::photos::{self, Photo};
 use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS, extra_field};
 use crate::lift::refine::Refinement;
-use crate::lift::{Aggregation, CellField, PartSums, RegionTable, SumsIndex};
+use crate::lift::{Aggregation, CellField, PartSums, RegionTable, SumsError, SumsIndex};
 use crate::objects::{self, ObjectsReport, SceneObjects};
 use crate::palette::{ScoreMetric, TextBank, Yardstick};
 use crate::progress::Progress;
@@ -82,7 +83,7 @@ impl BuiltCells {
 }
 
 impl<'a> CellBuilder<'a> {
-    /// Opens the files of sums, in the order of the views' names.
+    /// Opens what the job keeps of some views, in the order of their names.
     ///
     /// # Errors
     /// [`EncodeError::Sums`], [`EncodeError::Memory`].
@@ -91,13 +92,20 @@ impl<'a> CellBuilder<'a> {
         store: &'a Store,
         scene: &'a Gaussians,
         split: &'a CellSplit,
-        (sums_paths, photos): (&[PathBuf], Vec<Photo>),
+        (job, views): (&Job<'_>, &[&View]),
         (models, bank): (&ModelDir, TextBank),
         stopwatch: &'a Stopwatch,
     ) -> Result<Self, EncodeError> {
         let n_gaussians: Vec<usize> = split.cells.iter().map(|cell| cell.gaussians.len()).collect();
+        let sums_paths: Vec<PathBuf> = views.iter().map(|view| job.sums_path(&view.name)).collect();
         let (index, mut table) =
-            stopwatch.time("merge", || SumsIndex::open(sums_paths, models.dim(), &n_gaussians))?;
+            stopwatch.time("merge", || SumsIndex::open(&sums_paths, models.dim(), &n_gaussians))?;
+        let photo = |(view, n_masks): (&&View, usize)| -> Result<Photo, SumsError> {
+            let outlines = photos::read_outlines(&job.outlines_path(&view.name), n_masks)?;
+            Ok(Photo { name: view.name.clone(), outlines })
+        };
+        let photos: Vec<Photo> =
+            views.iter().zip(index.n_masks_of_view()).map(photo).collect::<Result<_, _>>()?;
         let levels = photos.iter().flat_map(|photo| &photo.outlines).map(|outline| outline.level as u8);
         table.set_levels(levels.collect());
         let group_bytes = check_memory(

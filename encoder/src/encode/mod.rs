@@ -29,8 +29,7 @@ use slag_models::{ModelDir, ModelError, SessionOptions};
 
 use crate::embed::EmbedError;
 use crate::ingest::{self, GeoError, IngestError};
-use crate::lift::photos::{self, Photo};
-use crate::lift::{SumsError, SumsFile, SumsIndex};
+use crate::lift::{SumsError, SumsIndex};
 use crate::objects::ObjectsReport;
 use crate::palette::TextBank;
 use crate::progress::Progress;
@@ -381,8 +380,6 @@ pub fn encode(
         return Err(EncodeError::NoViews { n_views: skipped.len(), reason: first.reason.clone() });
     }
 
-    let sums_paths: Vec<PathBuf> = used.iter().map(|view| job.sums_path(&view.name)).collect();
-    let photos = photos_of(&job, &used, models.dim())?;
     let bank = stopwatch.time("texts", || match models.text_encoder(session) {
         Ok(mut encoder) => TextBank::of_model(&mut *encoder),
         Err(e) => {
@@ -391,8 +388,8 @@ pub fn encode(
         }
     });
     let mut builder = {
-        let files = (&sums_paths[..], photos);
-        CellBuilder::open(settings, &store, &scene, &split, files, (models, bank), &stopwatch)?
+        let views = (&job, &used[..]);
+        CellBuilder::open(settings, &store, &scene, &split, views, (models, bank), &stopwatch)?
     };
     let mut summary = EncodeSummary {
         generation: store.next_generation()?,
@@ -559,17 +556,6 @@ fn choose_views(
             (order, Some(coverage))
         }
     })
-}
-
-/// Reads how the masks of each view lie in its photo.
-fn photos_of(job: &Job<'_>, views: &[&View], dim: usize) -> Result<Vec<Photo>, EncodeError> {
-    let photo = |view: &&View| {
-        let (_, regions) = SumsFile::open(&job.sums_path(&view.name))?;
-        let n_masks = regions.mask_vectors.len() / dim;
-        let outlines = photos::read_outlines(&job.outlines_path(&view.name), n_masks)?;
-        Ok(Photo { name: view.name.clone(), outlines })
-    };
-    views.iter().map(photo).collect()
 }
 
 /// Returns what was spent on the views that are used.

@@ -256,12 +256,10 @@ pub fn labelled(
                 return Ok(None);
             }
         };
-        let mut scores = match settings.profile {
-            Some(profile) => query::scores_of_shards(reader, &vector, profile)?,
-            None => match &by_level {
-                Some(by_level) => by_level.scores(&vector)?,
-                None => query::scores(reader, &vector)?,
-            },
+        let mut scores = match (settings.profile, &by_level) {
+            (Some(profile), _) => query::scores_of_shards(reader, &vector, profile)?,
+            (None, Some(by_level)) => by_level.scores(&vector)?,
+            (None, None) => query::scores(reader, &vector)?,
         };
         let of_objects = objects.as_ref().map(|objects| objects.scores(&vector)).unwrap_or_default();
         objects.iter().for_each(|objects| objects.overlay(&of_objects, &mut scores.cosines));

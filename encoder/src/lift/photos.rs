@@ -11,6 +11,8 @@ use crate::segment::{BoxPx, Mask};
 
 const MAGIC: [u8; 8] = *b"SLAGMBOX";
 const VERSION: u32 = 2;
+/// What a mask counts at least: its Gaussians keep their evidence.
+pub const LEAST_MASK_WEIGHT: f32 = 0.01;
 
 /// A view's name and its masks' outlines.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -60,9 +62,6 @@ impl Outline {
         (1.0 - f64::from(self.cut_px) / (2.0 * (x1 - x0 + y1 - y0))).max(0.0) as f32
     }
 }
-
-/// What a mask counts at least: its Gaussians keep their evidence.
-pub const LEAST_MASK_WEIGHT: f32 = 0.01;
 
 /// Returns what each mask of some photos counts: its wholeness to a power.
 pub fn mask_weights(photos: &[Photo], power: f32) -> Vec<f32> {
