@@ -1,8 +1,8 @@
 #!/bin/sh
 # Sets everything up, builds, and shows the whole system at work on a room that it generates itself.
-# usage: demo.sh [flags of `slag-encoder demo`]
+# usage: demo.sh [flags of `slag-lab demo`]
 set -eu
 cd "$(dirname "$0")"
 sh scripts/setup.sh
-cargo build --release --locked --bin slag-encoder --bin slag-edge
-exec target/release/slag-encoder demo "$@"
+cargo build --release --locked --bin slag-encoder --bin slag-lab --bin slag-edge
+exec target/release/slag-lab demo "$@"

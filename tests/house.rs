@@ -191,7 +191,7 @@ fn check_words(house: &Path, store: &Path, models: &Path, dir: &Path) {
 
     // The program's own evaluation, which shares no code with the judge above.
     let (scene, truth) = (house.join("point_cloud.ply"), house);
-    let report = run_json(&mut encoder(&[
+    let report = run_json(&mut lab(&[
         "eval",
         "labelled",
         "--store",

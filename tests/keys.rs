@@ -20,7 +20,7 @@ fn robots_follow_a_change_of_keys() {
     );
     assert!(!nowhere.exists(), "a typing error makes no store");
 
-    run(&mut encoder(&["generate", "scene", "--out", text(&room), "--n-views", "3"]));
+    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "3"]));
     run(&mut encode_room(&room, &store));
     let service = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
     let fetch = |cache: &Path, keys: &[&str]| {

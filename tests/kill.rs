@@ -40,7 +40,7 @@ fn run_or_kill(command: &mut Command, after: Duration) -> Option<Vec<u8>> {
 fn killed_encodes_resume_and_show_nothing_half() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let room = dir.path().join("room");
-    run(&mut encoder(&["generate", "scene", "--out", text(&room), "--n-views", "10"]));
+    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "10"]));
     let whole = dir.path().join("whole");
     let start = Instant::now();
     run(&mut encode_room(&room, &whole));
@@ -78,7 +78,7 @@ fn killed_encodes_resume_and_show_nothing_half() {
 fn killed_fetches_leave_the_old_or_the_new_generation() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let room = dir.path().join("room");
-    run(&mut encoder(&["generate", "scene", "--out", text(&room), "--n-views", "10"]));
+    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "10"]));
     let (first, second) = (dir.path().join("first"), dir.path().join("second"));
     run(&mut encode_room(&room, &first));
     // The same key and scene, one generation on.

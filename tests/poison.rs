@@ -80,7 +80,7 @@ fn poisons() -> Vec<(Vec<(&'static str, f64)>, bool)> {
 fn a_poisoned_scene_leaves_no_nan_in_the_store() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let room = dir.path().join("room");
-    run(&mut encoder(&["generate", "scene", "--out", text(&room), "--n-views", "6"]));
+    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "6"]));
     let (clean, scene) = (room.join("scene.ply"), room.join("poisoned.ply"));
     let mut ply = Ply::read(&clean);
     let poisons = poisons();

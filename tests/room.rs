@@ -8,7 +8,7 @@ use slag_tests::*;
 #[test]
 fn the_demo_answers_rightly() {
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let report = run_json(&mut encoder(&["demo", "--out", text(&dir.path().join("demo"))]));
+    let report = run_json(&mut lab(&["demo", "--out", text(&dir.path().join("demo"))]));
     for question in report["questions"].as_array().expect("questions") {
         println!("{question}");
         assert_eq!(question["right"], true);
@@ -19,7 +19,7 @@ fn the_demo_answers_rightly() {
 /// card, by the same command.
 #[test]
 fn the_embedded_encoders_tell_things() {
-    let report = run_json(&mut encoder(&["eval", "encoder", "--n-scenes", "30"]));
+    let report = run_json(&mut lab(&["eval", "encoder", "--n-scenes", "30"]));
     println!("{}", report["tallies"]);
     let tally = |i: usize, what: &str| {
         let tally = &report["tallies"][i][1];
@@ -33,7 +33,7 @@ fn the_embedded_encoders_tell_things() {
 
 fn generate(dir: &Path) -> (std::path::PathBuf, std::path::PathBuf) {
     let room = dir.join("room");
-    run(&mut encoder(&["generate", "scene", "--out", text(&room), "--n-views", "16"]));
+    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "16"]));
     (room.join("scene.ply"), room.join("transforms.json"))
 }
 

@@ -19,7 +19,7 @@ fn encode(room: &Path, store: &Path, more: &[&str]) -> Value {
 fn an_encode_of_some_views_goes_on_with_more() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let room = dir.path().join("room");
-    run(&mut encoder(&["generate", "scene", "--out", text(&room), "--n-views", "10", "--seed", "31"]));
+    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "10", "--seed", "31"]));
     let (whole, store) = (dir.path().join("whole"), dir.path().join("store"));
     let summary = encode(&room, &whole, &[]);
     assert_eq!((&summary["view_order"], &summary["coverage"]), (&"names".into(), &Value::Null));
@@ -55,7 +55,7 @@ fn an_encode_of_some_views_goes_on_with_more() {
     let one = encode(&room, &dir.path().join("one"), &["--time-budget", "0.000001", "--threads", "1"]);
     assert_eq!(counts(&one), [1, 0]);
 
-    // Kept sums: another palette of the same views, without the views.
+    // Kept sums: another codebook of the same views, without the views.
     let kept = dir.path().join("kept");
     assert_eq!(counts(&encode(&room, &kept, &["--keep-views", "--compact-error", "0.3"])), [10, 0]);
     assert_eq!(counts(&encode(&room, &kept, &[])), [10, 10]);
@@ -68,7 +68,7 @@ fn an_encode_of_some_views_goes_on_with_more() {
 fn what_was_spent_goes_by_content_and_is_reported() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let room = dir.path().join("room");
-    run(&mut encoder(&["generate", "scene", "--out", text(&room), "--n-views", "10", "--seed", "31"]));
+    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "10", "--seed", "31"]));
     let encode = |name: &str, more: &[&str]| {
         let (scene, views, store) =
             (room.join("scene.ply"), room.join("transforms.json"), dir.path().join(name));
@@ -96,7 +96,7 @@ fn what_was_spent_goes_by_content_and_is_reported() {
     for cell in cells {
         let error = |profile: &str| cell["score_error"][profile].as_f64().expect("an error");
         assert!(error("compact") < 0.2 && error("compact") > error("balanced"), "{cell}");
-        assert_eq!((error("exact"), cell["n_groups"].as_u64() > Some(0)), (0.0, true));
+        assert_eq!((error("exact"), cell["n_subspaces"].as_u64() > Some(0)), (0.0, true));
     }
     let resumed = encode("first", &[&["--keep-views"][..], &auto].concat());
     assert_eq!((&resumed["n_views_resumed"], &resumed["views"]), (&10.into(), &first["views"]));

@@ -7,6 +7,7 @@
 
 pub mod camera;
 pub mod container;
+pub mod durable;
 pub mod frames;
 pub mod gaussians;
 pub mod hash;

@@ -104,8 +104,8 @@ pub struct ShardRecord {
     pub hash: Hash32,
     /// Length of the file.
     pub len_bytes: u64,
-    /// Palette rows.
-    pub n_rows: u32,
+    /// Codebook rows.
+    pub n_centroids: u32,
     /// Largest distance of an embedding from what the profile decodes: no score is off by more.
     pub score_error_bound: f32,
     /// Errors of scores, measured over a bank of texts.
@@ -347,7 +347,7 @@ mod tests {
                     let record = ShardRecord {
                         hash: Hash32::of(b"x"),
                         len_bytes: 9,
-                        n_rows: 2,
+                        n_centroids: 2,
                         score_error_bound: 0.1,
                         score_errors: ScoreErrors::default(),
                         position_error: 1e-3,

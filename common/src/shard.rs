@@ -1,13 +1,13 @@
 //! A shard: one cell's data in one file. The byte table and its reasons are in `FORMAT.md`.
 //!
-//! Gaussians are ordered by palette row, then along a Morton curve, so a row's members are one
-//! run `row_starts[r]..row_starts[r + 1]` and no code column exists; those without evidence follow
-//! the last run and have no row.
+//! Gaussians are ordered by codebook centroid, then along a Morton curve, so a centroid's members are one
+//! run `centroid_starts[r]..centroid_starts[r + 1]` and no code column exists; those without evidence follow
+//! the last run and have no centroid.
 //!
 //! Rows are 8-bit components in a basis of the cell's own, for a cell's embeddings fill few dimensions:
-//! `P[r] = mean + row_step * sum over c of rows[r][c] * basis_steps[c] * basis[c]`. A residual code adds
-//! `scale[r] * word` to groups of components, a word of 16 for each group:
-//! `E ~ P[r] + scale[r] * sum over g of sum over c in group g of words[g][code][c] * basis_steps[c] * basis[c]`.
+//! `P[r] = mean + centroid_step * sum over c of centroids[r][c] * basis_steps[c] * basis[c]`. A residual code adds
+//! `scale[r] * codeword` to subspaces of components, a codeword of 16 for each subspace:
+//! `E ~ P[r] + scale[r] * sum over g of sum over c in subspace g of codewords[g][code][c] * basis_steps[c] * basis[c]`.
 
 mod check;
 
@@ -30,10 +30,10 @@ pub const MAGIC: [u8; 8] = *b"SLAGSHRD";
 pub const VERSION: u32 = 2;
 /// Gaussians whose residual codes lie together, one byte column after the other.
 pub const BLOCK: usize = 32;
-/// Words of a group of components: a code is half a byte.
-pub const WORDS: usize = 16;
-/// Most groups of a residual code.
-pub const MAX_GROUPS: usize = 128;
+/// Words of a subspace of components: a code is half a byte.
+pub const CODEWORDS: usize = 16;
+/// Most subspaces of a residual code.
+pub const MAX_SUBSPACES: usize = 128;
 /// Larger than any text-image model's embedding; a larger stated `dim` is damage.
 pub const MAX_DIM: usize = 8192;
 
@@ -44,14 +44,14 @@ pub mod section {
     /// `[N]` u32 or `[N][3]` u16, see [`super::Positions`].
     pub const POSITIONS: u32 = 2;
     /// `[K + 1]` u32.
-    pub const ROW_STARTS: u32 = 3;
+    pub const CENTROID_STARTS: u32 = 3;
     /// `[K][m]` i8.
-    pub const ROWS: u32 = 4;
+    pub const CENTROIDS: u32 = 4;
     /// `[K]` f32.
     pub const RADII: u32 = 5;
     /// `[N]` u32, index in the input splat file.
     pub const INPUT_INDICES: u32 = 6;
-    /// `[row_starts[K]][dim]` f16, unit embeddings.
+    /// `[centroid_starts[K]][dim]` f16, unit embeddings.
     pub const EMBEDDINGS: u32 = 7;
     /// `[dim]` f16; absent: zero.
     pub const MEAN: u32 = 8;
@@ -59,23 +59,23 @@ pub mod section {
     pub const BASIS: u32 = 9;
     /// `[m]` f32, with the basis.
     pub const BASIS_STEPS: u32 = 10;
-    /// `[G + 1]` u32: group g has the components from `starts[g]` to `starts[g + 1]`.
-    pub const GROUP_STARTS: u32 = 11;
-    /// Group by group `[16][components of the group]` f16.
-    pub const WORDS: u32 = 12;
-    /// `[K]` f32: what a row's words are multiplied by.
-    pub const ROW_SCALES: u32 = 13;
-    /// `[K]` f32: length of the largest residual of a row's members as decoded, in components.
-    pub const REACHES: u32 = 14;
-    /// `[ceil(row_starts[K] / 32)][G / 2][32]` u8: two codes a byte, the even group's in the low half.
+    /// `[G + 1]` u32: subspace g has the components from `starts[g]` to `starts[g + 1]`.
+    pub const SUBSPACE_STARTS: u32 = 11;
+    /// Group by subspace `[16][components of the subspace]` f16.
+    pub const CODEWORDS: u32 = 12;
+    /// `[K]` f32: what a centroid's codewords are multiplied by.
+    pub const RESIDUAL_SCALES: u32 = 13;
+    /// `[K]` f32: length of the largest residual of a centroid's members as decoded, in components.
+    pub const RESIDUAL_NORMS: u32 = 14;
+    /// `[ceil(centroid_starts[K] / 32)][G / 2][32]` u8: two codes a byte, the even subspace's in the low half.
     pub const CODES: u32 = 15;
     /// [`super::ScoreErrors`] of the fine residuals.
     pub const FINE_ERRORS: u32 = 16;
     /// `[m]` f32: what a fine residual's components are multiplied by.
     pub const FINE_STEPS: u32 = 17;
-    /// `[K]` f32: what those of a row's members are multiplied by.
+    /// `[K]` f32: what those of a centroid's members are multiplied by.
     pub const FINE_SCALES: u32 = 18;
-    /// `[row_starts[K]][m]` i8.
+    /// `[centroid_starts[K]][m]` i8.
     pub const FINE: u32 = 19;
 }
 
@@ -83,11 +83,11 @@ pub mod section {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Profile {
-    /// Palette rows and positions.
+    /// Codebook centroids and positions.
     Compact,
     /// Also a residual code of each embedding.
     Balanced,
-    /// Palette rows, positions and every embedding as f16.
+    /// Codebook centroids, positions and every embedding as f16.
     Exact,
 }
 
@@ -148,18 +148,18 @@ pub struct ShardHeader {
     pub cell_id: u32,
     /// Gaussians, N.
     pub n_gaussians: u32,
-    /// Palette rows, K.
-    pub n_rows: u32,
+    /// Codebook centroids, K.
+    pub n_centroids: u32,
     /// Components of an embedding.
     pub dim: u32,
-    /// Components of a row, m.
+    /// Components of a centroid, m.
     pub n_components: u32,
     /// Groups of components of the residual code, G; even; 0 without one.
-    pub n_groups: u32,
+    pub n_subspaces: u32,
     /// Bits of a position's x, y and z, 32 in all at most; 16 each where they are kept as u16.
     pub position_bits: [u8; 4],
-    /// What a row's 8-bit components are multiplied by.
-    pub row_step: f32,
+    /// What a centroid's 8-bit components are multiplied by.
+    pub centroid_step: f32,
     /// Where the shard frame's origin lies in the world frame.
     pub origin_in_world: [f64; 3],
     /// World units per step of a quantised position, per axis; the error is at most half a step.
@@ -170,7 +170,7 @@ pub struct ShardHeader {
     pub box_max: [f64; 3],
     /// Measured errors of this profile; beside exact embeddings, of the residual code.
     pub errors: ScoreErrors,
-    /// The encoder whose space the rows live in.
+    /// The encoder whose space the centroids live in.
     pub encoder_id: [u8; 32],
 }
 
@@ -186,7 +186,7 @@ pub enum Positions<'a> {
 impl Positions<'_> {
     fn bytes(&self) -> &[u8] {
         match self {
-            Self::Packed(words) => container::bytes_of(words),
+            Self::Packed(codewords) => container::bytes_of(codewords),
             Self::Wide(steps) => container::bytes_of(steps),
         }
     }
@@ -194,16 +194,16 @@ impl Positions<'_> {
     fn steps(&self, index: usize, bits: [u8; 4]) -> [u32; 3] {
         match self {
             Self::Wide(steps) => steps[index].map(u32::from),
-            Self::Packed(words) => {
-                let word = u64::from(words[index]);
-                let part = |shift: u8, bits: u8| (word >> shift & ((1 << bits) - 1)) as u32;
+            Self::Packed(codewords) => {
+                let codeword = u64::from(codewords[index]);
+                let part = |shift: u8, bits: u8| (codeword >> shift & ((1 << bits) - 1)) as u32;
                 [part(0, bits[0]), part(bits[0], bits[1]), part(bits[0] + bits[1], bits[2])]
             }
         }
     }
 }
 
-/// The basis of a cell's rows.
+/// The basis of a cell's centroids.
 #[derive(Clone, Copy, Debug)]
 pub struct Basis<'a> {
     /// `[dim]`.
@@ -218,23 +218,23 @@ pub struct Basis<'a> {
 #[derive(Clone, Copy, Debug)]
 pub struct Residuals<'a> {
     /// `[G + 1]`, strictly ascending, at most m.
-    pub group_starts: &'a [u32],
-    /// Group by group `[16][components of the group]`.
-    pub words: &'a [f16],
+    pub subspace_starts: &'a [u32],
+    /// Group by subspace `[16][components of the subspace]`.
+    pub codewords: &'a [f16],
     /// `[K]`.
-    pub row_scales: &'a [f32],
+    pub residual_scales: &'a [f32],
     /// `[K]`: no member's decoded residual is longer, as a vector of components.
-    pub reaches: &'a [f32],
-    /// `[ceil(row_starts[K] / 32)][G / 2][32]`.
+    pub residual_norms: &'a [f32],
+    /// `[ceil(centroid_starts[K] / 32)][G / 2][32]`.
     pub codes: &'a [u8],
 }
 
 impl Residuals<'_> {
-    /// Returns the word that a Gaussian's code names in a group.
-    pub fn code(&self, index: usize, group: usize) -> usize {
-        let n_bytes = (self.group_starts.len() - 1) / 2;
-        let byte = self.codes[(index / BLOCK * n_bytes + group / 2) * BLOCK + index % BLOCK];
-        usize::from(if group.is_multiple_of(2) { byte & 15 } else { byte >> 4 })
+    /// Returns the codeword that a Gaussian's code names in a subspace.
+    pub fn code(&self, index: usize, subspace: usize) -> usize {
+        let n_bytes = (self.subspace_starts.len() - 1) / 2;
+        let byte = self.codes[(index / BLOCK * n_bytes + subspace / 2) * BLOCK + index % BLOCK];
+        usize::from(if subspace.is_multiple_of(2) { byte & 15 } else { byte >> 4 })
     }
 }
 
@@ -243,7 +243,7 @@ impl Residuals<'_> {
 pub struct ExactColumns<'a> {
     /// `[N]` index in the input splat file.
     pub input_indices: &'a [u32],
-    /// `[row_starts[K]][dim]` unit embeddings.
+    /// `[centroid_starts[K]][dim]` unit embeddings.
     pub embeddings: &'a [f16],
     /// What lies between codes and embeddings; absent where there is no code.
     pub fine: Option<Fine<'a>>,
@@ -258,7 +258,7 @@ pub struct Fine<'a> {
     pub steps: &'a [f32],
     /// `[K]`.
     pub scales: &'a [f32],
-    /// `[row_starts[K]][m]`.
+    /// `[centroid_starts[K]][m]`.
     pub values: &'a [i8],
 }
 
@@ -270,13 +270,13 @@ pub struct ShardView<'a> {
     /// `[N]`; decode with [`ShardView::position_in_world`].
     pub positions: Positions<'a>,
     /// `[K + 1]`, ascending.
-    pub row_starts: &'a [u32],
+    pub centroid_starts: &'a [u32],
     /// `[K][m]`.
-    pub rows: &'a [i8],
-    /// `[K]`: at least the largest `||E_k - E'_k||` of the row's members, E' as this profile decodes it
-    /// (the row, or row and residual); beside exact embeddings, of the row.
+    pub centroids: &'a [i8],
+    /// `[K]`: at least the largest `||E_k - E'_k||` of the centroid's members, E' as this profile decodes it
+    /// (the centroid, or centroid and residual); beside exact embeddings, of the centroid.
     pub radii: &'a [f32],
-    /// What the rows' components mean; absent: they are the embedding's own.
+    /// What the centroids' components mean; absent: they are the embedding's own.
     pub basis: Option<Basis<'a>>,
     /// What only the balanced profile has.
     pub residuals: Option<Residuals<'a>>,
@@ -301,8 +301,8 @@ impl ShardView<'_> {
         let mut sections = vec![
             (section::HEADER, bytemuck::bytes_of(&self.header)),
             (section::POSITIONS, self.positions.bytes()),
-            (section::ROW_STARTS, container::bytes_of(self.row_starts)),
-            (section::ROWS, container::bytes_of(self.rows)),
+            (section::CENTROID_STARTS, container::bytes_of(self.centroid_starts)),
+            (section::CENTROIDS, container::bytes_of(self.centroids)),
             (section::RADII, container::bytes_of(self.radii)),
         ];
         if let Some(basis) = &self.basis {
@@ -311,10 +311,10 @@ impl ShardView<'_> {
             sections.push((section::BASIS_STEPS, container::bytes_of(basis.steps)));
         }
         if let Some(residuals) = &self.residuals {
-            sections.push((section::GROUP_STARTS, container::bytes_of(residuals.group_starts)));
-            sections.push((section::WORDS, container::bytes_of(residuals.words)));
-            sections.push((section::ROW_SCALES, container::bytes_of(residuals.row_scales)));
-            sections.push((section::REACHES, container::bytes_of(residuals.reaches)));
+            sections.push((section::SUBSPACE_STARTS, container::bytes_of(residuals.subspace_starts)));
+            sections.push((section::CODEWORDS, container::bytes_of(residuals.codewords)));
+            sections.push((section::RESIDUAL_SCALES, container::bytes_of(residuals.residual_scales)));
+            sections.push((section::RESIDUAL_NORMS, container::bytes_of(residuals.residual_norms)));
             sections.push((section::CODES, residuals.codes));
         }
         if let Some(exact) = &self.exact {
@@ -345,19 +345,19 @@ impl ShardView<'_> {
         Aabb { min, max: min + size }
     }
 
-    /// Returns the members of a row.
-    pub fn members(&self, row: usize) -> Range<usize> {
-        self.row_starts[row] as usize..self.row_starts[row + 1] as usize
+    /// Returns the members of a centroid.
+    pub fn members(&self, centroid: usize) -> Range<usize> {
+        self.centroid_starts[centroid] as usize..self.centroid_starts[centroid + 1] as usize
     }
 
-    /// Returns the row of a Gaussian that has evidence.
+    /// Returns the centroid of a Gaussian that has evidence.
     pub fn row_of(&self, index: usize) -> usize {
-        self.row_starts.partition_point(|start| *start as usize <= index) - 1
+        self.centroid_starts.partition_point(|start| *start as usize <= index) - 1
     }
 
     /// Returns the number of Gaussians that have an embedding.
     pub fn n_with_evidence(&self) -> usize {
-        self.row_starts[self.header.n_rows as usize] as usize
+        self.centroid_starts[self.header.n_centroids as usize] as usize
     }
 
     /// Returns the box around the Gaussians' extents.
@@ -365,16 +365,17 @@ impl ShardView<'_> {
         Aabb { min: self.header.box_min.into(), max: self.header.box_max.into() }
     }
 
-    /// Returns the encoder whose space the rows live in.
+    /// Returns the encoder whose space the centroids live in.
     pub fn encoder_id(&self) -> Hash32 {
         Hash32(self.header.encoder_id)
     }
 
-    /// Writes a row's vector to `out` (`[dim]`): the formula of the module, in float64.
-    pub fn decode_row(&self, row: usize, out: &mut [f64]) {
+    /// Writes a centroid's vector to `out` (`[dim]`): the formula of the module, in float64.
+    pub fn decode_centroid(&self, centroid: usize, out: &mut [f64]) {
         let m = self.header.n_components as usize;
-        let step = f64::from(self.header.row_step);
-        let components: Vec<f64> = self.rows[row * m..][..m].iter().map(|c| f64::from(*c) * step).collect();
+        let step = f64::from(self.header.centroid_step);
+        let components: Vec<f64> =
+            self.centroids[centroid * m..][..m].iter().map(|c| f64::from(*c) * step).collect();
         self.combine(&components, out);
     }
 
@@ -394,12 +395,12 @@ impl ShardView<'_> {
     /// float64; of shards that have those.
     pub fn decode_fine(&self, index: usize, fine: &Fine<'_>, out: &mut [f64]) {
         let m = self.header.n_components as usize;
-        let row = self.row_of(index);
-        let (step, scale) = (f64::from(self.header.row_step), f64::from(fine.scales[row]));
-        let of_row = self.rows[row * m..][..m].iter().map(|c| f64::from(*c) * step);
+        let centroid = self.row_of(index);
+        let (step, scale) = (f64::from(self.header.centroid_step), f64::from(fine.scales[centroid]));
+        let of_centroid = self.centroids[centroid * m..][..m].iter().map(|c| f64::from(*c) * step);
         let residual = fine.values[index * m..][..m].iter().zip(fine.steps);
         let residual = residual.map(|(v, step)| f64::from(*v) * f64::from(*step) * scale);
-        self.combine(&of_row.zip(residual).map(|(a, b)| a + b).collect::<Vec<_>>(), out);
+        self.combine(&of_centroid.zip(residual).map(|(a, b)| a + b).collect::<Vec<_>>(), out);
     }
 
     /// Returns the scores of a query (`[dim]`) and every Gaussian with evidence, as this profile decodes them,
@@ -442,21 +443,22 @@ impl ShardView<'_> {
         }
     }
 
-    /// Returns the components of a Gaussian with evidence: its row's and its residual's.
+    /// Returns the components of a Gaussian with evidence: its centroid's and its residual's.
     fn components(&self, index: usize) -> Vec<f64> {
         let m = self.header.n_components as usize;
-        let row = self.row_of(index);
-        let step = f64::from(self.header.row_step);
+        let centroid = self.row_of(index);
+        let step = f64::from(self.header.centroid_step);
         let mut components: Vec<f64> =
-            self.rows[row * m..][..m].iter().map(|c| f64::from(*c) * step).collect();
+            self.centroids[centroid * m..][..m].iter().map(|c| f64::from(*c) * step).collect();
         if let Some(residuals) = &self.residuals {
-            let scale = f64::from(residuals.row_scales[row]);
-            for group in 0..residuals.group_starts.len() - 1 {
-                let of_group =
-                    residuals.group_starts[group] as usize..residuals.group_starts[group + 1] as usize;
-                let word = residuals.code(index, group) * of_group.len();
-                let word = &residuals.words[WORDS * of_group.start + word..][..of_group.len()];
-                components[of_group].iter_mut().zip(word).for_each(|(c, w)| *c += scale * w.to_f64());
+            let scale = f64::from(residuals.residual_scales[centroid]);
+            for subspace in 0..residuals.subspace_starts.len() - 1 {
+                let of_subspace = residuals.subspace_starts[subspace] as usize
+                    ..residuals.subspace_starts[subspace + 1] as usize;
+                let codeword = residuals.code(index, subspace) * of_subspace.len();
+                let codeword =
+                    &residuals.codewords[CODEWORDS * of_subspace.start + codeword..][..of_subspace.len()];
+                components[of_subspace].iter_mut().zip(codeword).for_each(|(c, w)| *c += scale * w.to_f64());
             }
         }
         components
@@ -491,8 +493,8 @@ pub struct ShardLayout {
     /// The fixed part.
     pub header: ShardHeader,
     positions: Range<usize>,
-    row_starts: Range<usize>,
-    rows: Range<usize>,
+    centroid_starts: Range<usize>,
+    centroids: Range<usize>,
     radii: Range<usize>,
     basis: Option<[Range<usize>; 3]>,
     residuals: Option<[Range<usize>; 5]>,
@@ -525,23 +527,23 @@ impl ShardLayout {
                 true => Positions::Packed(cast(bytes, &self.positions)),
                 false => Positions::Wide(cast(bytes, &self.positions)),
             },
-            row_starts: cast(bytes, &self.row_starts),
-            rows: cast(bytes, &self.rows),
+            centroid_starts: cast(bytes, &self.centroid_starts),
+            centroids: cast(bytes, &self.centroids),
             radii: cast(bytes, &self.radii),
             basis: self.basis.as_ref().map(|[mean, vectors, steps]| Basis {
                 mean: cast(bytes, mean),
                 vectors: cast(bytes, vectors),
                 steps: cast(bytes, steps),
             }),
-            residuals: self.residuals.as_ref().map(|[group_starts, words, row_scales, reaches, codes]| {
-                Residuals {
-                    group_starts: cast(bytes, group_starts),
-                    words: cast(bytes, words),
-                    row_scales: cast(bytes, row_scales),
-                    reaches: cast(bytes, reaches),
+            residuals: self.residuals.as_ref().map(
+                |[subspace_starts, codewords, residual_scales, residual_norms, codes]| Residuals {
+                    subspace_starts: cast(bytes, subspace_starts),
+                    codewords: cast(bytes, codewords),
+                    residual_scales: cast(bytes, residual_scales),
+                    residual_norms: cast(bytes, residual_norms),
                     codes: &bytes[codes.clone()],
-                }
-            }),
+                },
+            ),
             exact: self.exact.as_ref().map(|[indices, embeddings]| ExactColumns {
                 input_indices: cast(bytes, indices),
                 embeddings: cast(bytes, embeddings),

@@ -14,7 +14,7 @@ struct Parts {
     values: Vec<i8>,
 }
 
-/// Three Gaussians with evidence in two rows and one without; three dimensions, two components.
+/// Three Gaussians with evidence in two centroids and one without; three dimensions, two components.
 fn written(edit: impl FnOnce(&mut Parts)) -> AlignedBytes {
     let mut parts = Parts {
         errors: ScoreErrors { mean: 0.001, p999: 0.005, max: 0.01, spread: 0.07 },
@@ -31,12 +31,12 @@ fn written(edit: impl FnOnce(&mut Parts)) -> AlignedBytes {
         header: ShardHeader {
             cell_id: 1,
             n_gaussians: 4,
-            n_rows: 2,
+            n_centroids: 2,
             dim: 3,
             n_components: 2,
-            n_groups: 0,
+            n_subspaces: 0,
             position_bits: [16, 16, 16, 0],
-            row_step: 0.125,
+            centroid_step: 0.125,
             origin_in_world: [0.0; 3],
             position_step: [0.1; 3],
             box_min: [0.0; 3],
@@ -45,8 +45,8 @@ fn written(edit: impl FnOnce(&mut Parts)) -> AlignedBytes {
             encoder_id: [9; 32],
         },
         positions: Positions::Wide(&[[0; 3]; 4]),
-        row_starts: &[0, 1, 3],
-        rows: &[4, -8, 16, 2],
+        centroid_starts: &[0, 1, 3],
+        centroids: &[4, -8, 16, 2],
         radii: &[0.1, 0.2],
         basis: Some(Basis { mean: &mean, vectors: &[100, 0, 50, 0, -20, 10], steps: &[0.01, 0.02] }),
         residuals: None,
@@ -67,7 +67,7 @@ fn fine_residuals_are_read_and_decoded() {
     let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
     let fine = shard.exact.and_then(|exact| exact.fine).expect("written");
     assert_eq!((fine.errors.p999, fine.steps, fine.scales), (0.005, &[0.5, 0.25][..], &[0.01, 0.02][..]));
-    // By hand: Gaussian 1 is of row 1, whose components are 2 and 0.25; its residual adds 127 * 0.5 * 0.02 and
+    // By hand: Gaussian 1 is of centroid 1, whose components are 2 and 0.25; its residual adds 127 * 0.5 * 0.02 and
     // -128 * 0.25 * 0.02.
     let c = [2.0 + 1.27, 0.25 - 0.64];
     let expected = [0.5 + c[0], 0.25 + c[1] * -0.4, -0.5 + c[0] * 0.5 + c[1] * 0.2];

@@ -30,12 +30,12 @@ fn header_offsets_are_those_of_the_struct() {
     }
     field!(cell_id, 4, "u32");
     field!(n_gaussians, 4, "u32");
-    field!(n_rows, 4, "u32");
+    field!(n_centroids, 4, "u32");
     field!(dim, 4, "u32");
     field!(n_components, 4, "u32");
-    field!(n_groups, 4, "u32");
+    field!(n_subspaces, 4, "u32");
     field!(position_bits, 4, "u8 x 4");
-    field!(row_step, 4, "f32");
+    field!(centroid_step, 4, "f32");
     field!(origin_in_world, 24, "f64 x 3");
     field!(position_step, 24, "f64 x 3");
     field!(box_min, 24, "f64 x 3");
@@ -77,18 +77,18 @@ fn sections_and_versions_are_those_of_the_code() {
     let sections = [
         (section::HEADER, "header"),
         (section::POSITIONS, "positions"),
-        (section::ROW_STARTS, "row_starts"),
-        (section::ROWS, "rows"),
+        (section::CENTROID_STARTS, "centroid_starts"),
+        (section::CENTROIDS, "centroids"),
         (section::RADII, "radii"),
         (section::INPUT_INDICES, "input_indices"),
         (section::EMBEDDINGS, "embeddings"),
         (section::MEAN, "mean"),
         (section::BASIS, "basis"),
         (section::BASIS_STEPS, "basis_steps"),
-        (section::GROUP_STARTS, "group_starts"),
-        (section::WORDS, "words"),
-        (section::ROW_SCALES, "row_scales"),
-        (section::REACHES, "reaches"),
+        (section::SUBSPACE_STARTS, "subspace_starts"),
+        (section::CODEWORDS, "codewords"),
+        (section::RESIDUAL_SCALES, "residual_scales"),
+        (section::RESIDUAL_NORMS, "residual_norms"),
         (section::CODES, "codes"),
         (section::FINE_ERRORS, "fine_errors"),
         (section::FINE_STEPS, "fine_steps"),

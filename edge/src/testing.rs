@@ -35,11 +35,11 @@ pub struct TestShard {
     pub origin: DVec3,
     pub step: DVec3,
     pub encoder_id: Hash32,
-    /// Whether rows are rounded with a step that is a power of two: what is exact in f32 stays exact.
-    pub has_exact_rows: bool,
-    /// Members by row.
-    pub rows: Vec<Vec<Member>>,
-    /// Gaussians without a row, after the rows'.
+    /// Whether centroids are rounded with a step that is a power of two: what is exact in f32 stays exact.
+    pub has_exact_centroids: bool,
+    /// Members by centroid.
+    pub centroids: Vec<Vec<Member>>,
+    /// Gaussians without a centroid, after the centroids'.
     pub without_evidence: Vec<[u16; 3]>,
 }
 
@@ -53,7 +53,7 @@ pub struct BuiltShard {
 /// An object of a test shard: id, vectors, runs of Gaussians in the shard, and how many it has in all.
 pub struct TestObject {
     pub id: u64,
-    /// In components of the shard's rows.
+    /// In components of the shard's centroids.
     pub vectors: Vec<f32>,
     pub runs: Vec<std::ops::Range<u32>>,
     pub n_gaussians: u32,
@@ -116,33 +116,34 @@ impl BuiltShard {
 }
 
 impl TestShard {
-    pub fn new(rows: Vec<Vec<Member>>) -> Self {
+    pub fn new(centroids: Vec<Vec<Member>>) -> Self {
         let (origin, step) = (DVec3::ZERO, DVec3::splat(0.01));
         let (encoder_id, without_evidence) = (Hash32([7; 32]), Vec::new());
-        Self { cell_id: 1, origin, step, encoder_id, has_exact_rows: false, rows, without_evidence }
+        Self { cell_id: 1, origin, step, encoder_id, has_exact_centroids: false, centroids, without_evidence }
     }
 
-    /// Writes the shard and reads it back: rows are the members' means, radii the largest distance of
-    /// an unrounded embedding from the stored row.
+    /// Writes the shard and reads it back: centroids are the members' means, radii the largest distance of
+    /// an unrounded embedding from the stored centroid.
     pub fn build(&self, exact: bool) -> BuiltShard {
-        let members = || self.rows.iter().flatten();
+        let members = || self.centroids.iter().flatten();
         let dim = members().next().map_or(2, |m| m.embedding.len());
-        let mut row_starts = vec![0u32];
+        let mut centroid_starts = vec![0u32];
         let mut means = Vec::new();
-        for row in &self.rows {
-            row_starts.push(row_starts.last().expect("starts with 0") + row.len() as u32);
-            let sum = |c: usize| row.iter().map(|m| f64::from(m.embedding[c])).sum::<f64>();
-            means.extend((0..dim).map(|c| (sum(c) / row.len() as f64) as f32));
+        for centroid in &self.centroids {
+            centroid_starts.push(centroid_starts.last().expect("starts with 0") + centroid.len() as u32);
+            let sum = |c: usize| centroid.iter().map(|m| f64::from(m.embedding[c])).sum::<f64>();
+            means.extend((0..dim).map(|c| (sum(c) / centroid.len() as f64) as f32));
         }
-        let (rows, row_step) = if self.has_exact_rows { quantise_exactly(&means) } else { quantise(&means) };
-        let radius = |(row, stored): (&Vec<Member>, &[i8])| {
-            let stored = || stored.iter().map(|v| f64::from(*v) * f64::from(row_step));
+        let (centroids, centroid_step) =
+            if self.has_exact_centroids { quantise_exactly(&means) } else { quantise(&means) };
+        let radius = |(centroid, stored): (&Vec<Member>, &[i8])| {
+            let stored = || stored.iter().map(|v| f64::from(*v) * f64::from(centroid_step));
             let squares = |m: &Member| -> f64 {
                 m.embedding.iter().zip(stored()).map(|(e, p)| (f64::from(*e) - p).powi(2)).sum()
             };
-            row.iter().map(squares).fold(0.0, f64::max).sqrt() as f32 * (1.0 + f32::EPSILON)
+            centroid.iter().map(squares).fold(0.0, f64::max).sqrt() as f32 * (1.0 + f32::EPSILON)
         };
-        let radii: Vec<f32> = self.rows.iter().zip(rows.chunks(dim)).map(radius).collect();
+        let radii: Vec<f32> = self.centroids.iter().zip(centroids.chunks(dim)).map(radius).collect();
         let positions: Vec<[u16; 3]> =
             members().map(|m| m.steps).chain(self.without_evidence.iter().copied()).collect();
         let embeddings: Vec<f16> =
@@ -151,12 +152,12 @@ impl TestShard {
         let header = ShardHeader {
             cell_id: self.cell_id,
             n_gaussians: positions.len() as u32,
-            n_rows: self.rows.len() as u32,
+            n_centroids: self.centroids.len() as u32,
             dim: dim as u32,
             n_components: dim as u32,
-            n_groups: 0,
+            n_subspaces: 0,
             position_bits: [16, 16, 16, 0],
-            row_step,
+            centroid_step,
             origin_in_world: self.origin.to_array(),
             position_step: self.step.to_array(),
             box_min: self.origin.to_array(),
@@ -173,8 +174,8 @@ impl TestShard {
         ShardView {
             header,
             positions: Positions::Wide(&positions),
-            row_starts: &row_starts,
-            rows: &rows,
+            centroid_starts: &centroid_starts,
+            centroids: &centroids,
             radii: &radii,
             basis: None,
             residuals: None,
@@ -293,7 +294,7 @@ pub fn manifest_of(shards: &[BuiltShard], generation: u64) -> Manifest {
         let record = ShardRecord {
             hash: Hash32::of(&shard.bytes),
             len_bytes: shard.bytes.len() as u64,
-            n_rows: view.header.n_rows,
+            n_centroids: view.header.n_centroids,
             score_error_bound: view.radii.iter().fold(0.0, |a: f32, b| a.max(*b)),
             score_errors: view.header.errors,
             position_error: 0.01,

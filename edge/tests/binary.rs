@@ -24,17 +24,17 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
     let mut positions: Vec<[u16; 3]> = (0..40).map(|i| [2000 + i, 0, 0]).collect();
     positions.extend((0..60).map(|i| [8000 + i, 0, 0]));
     let row = |word: &str| text.encode(word).expect("known").to_vec();
-    let (rows, row_step) = quantise(&[row("red"), row("blue")].concat());
+    let (centroids, centroid_step) = quantise(&[row("red"), row("blue")].concat());
     let bounds = Aabb { min: DVec3::ZERO, max: DVec3::splat(10.0) };
     let header = ShardHeader {
         cell_id: 0,
         n_gaussians: 100,
-        n_rows: 2,
+        n_centroids: 2,
         dim: text.info().dim,
         n_components: text.info().dim,
-        n_groups: 0,
+        n_subspaces: 0,
         position_bits: [16, 16, 16, 0],
-        row_step,
+        centroid_step,
         origin_in_world: [0.0; 3],
         position_step: [1e-3; 3],
         box_min: bounds.min.into(),
@@ -46,8 +46,8 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
     ShardView {
         header,
         positions: Positions::Wide(&positions),
-        row_starts: &[0, 40, 100],
-        rows: &rows,
+        centroid_starts: &[0, 40, 100],
+        centroids: &centroids,
         radii: &[0.05; 2],
         basis: None,
         residuals: None,
@@ -58,7 +58,7 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
     let record = ShardRecord {
         hash: Hash32::of(&shard),
         len_bytes: shard.len() as u64,
-        n_rows: 2,
+        n_centroids: 2,
         score_error_bound: 0.05,
         score_errors: ScoreErrors::default(),
         position_error: 5e-4,

@@ -413,7 +413,7 @@ fn draw(scene: &Gaussians, view: &CheckView, rasterizer: &dyn Rasterizer) -> Res
 }
 
 /// Returns the PSNR of a picture against a photo, dB; 100 where they are equal.
-pub(crate) fn psnr_db(photo: &RgbImage, value: impl Fn(usize, usize) -> f32) -> f64 {
+pub fn psnr_db(photo: &RgbImage, value: impl Fn(usize, usize) -> f32) -> f64 {
     let squares = photo.pixels().enumerate().flat_map(|(pixel, photo)| {
         let value = &value;
         (0..3).map(move |c| {

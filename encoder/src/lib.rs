@@ -1,17 +1,15 @@
 //! The cloud side of SLAG as a library: one module per stage of the pipeline.
 
-pub mod bench;
+pub mod cells;
 pub mod check;
 pub mod cli;
-pub mod demo;
+pub mod codebook;
 pub mod embed;
 pub mod encode;
-pub mod eval;
-pub mod generate;
 pub mod ingest;
 pub mod lift;
+pub mod masks;
 pub mod objects;
-pub mod palette;
 pub mod progress;
 pub mod publish;
 pub mod query;
@@ -19,4 +17,3 @@ pub mod raster;
 pub mod segment;
 pub mod shard;
 pub mod store;
-pub mod superpoint;

@@ -13,10 +13,11 @@ use slag_common::objects::object_score;
 use slag_common::shard::{Profile, ShardLayout};
 
 use crate::lift::published::{ReadFieldError, read_field, read_regions};
-use crate::lift::{CellField, RegionTable, dot};
+use crate::lift::{CellField, RegionTable};
 use crate::objects::NONE;
 use crate::store::{StoreError, StoreReader};
 pub use by_level::ByLevel;
+use slag_math::dot;
 
 /// Cosines of every Gaussian of the input with a query.
 #[derive(Clone, Debug)]

@@ -9,7 +9,7 @@ use std::{
 use image::{Rgb, RgbImage};
 use slag_encoder::{
     embed::{Background, EmbedError, crop, embed_masks},
-    segment::{BoxPx, Mask},
+    masks::{BoxPx, Mask},
 };
 use slag_models::{Crop, EncodeError, ImageEncoder, ModelDir, SessionOptions};
 

@@ -4,7 +4,10 @@ use std::path::Path;
 
 use slag_common::container::AlignedBytes;
 use slag_encoder::ingest::read_geo_reference;
-use slag_encoder::lift::{CellField, PartSums, RegionTable, SumEntry, SumsError, SumsIndex, ViewSums};
+use slag_encoder::lift::{
+    CellField, Contribution, ContributionError, ContributionIndex, PartContributions, RegionTable,
+    ViewContributions,
+};
 
 const N_MUTATIONS: u64 = 1000;
 
@@ -26,9 +29,9 @@ fn damaged(bytes: &[u8], seed: u64) -> Vec<u8> {
     damaged
 }
 
-fn sums() -> ViewSums {
-    let entry = |local, region| SumEntry { local, region, weight: 2.5 };
-    ViewSums {
+fn contributions() -> ViewContributions {
+    let entry = |local, region| Contribution { local, region, weight: 2.5 };
+    ViewContributions {
         dim: 4,
         mask_vectors: vec![0.5; 8],
         masks_of_region: vec![vec![0], vec![0, 1]],
@@ -36,20 +39,20 @@ fn sums() -> ViewSums {
     }
 }
 
-/// Opens, reads and regroups a file of sums as an encode does.
-fn read_sums(path: &Path) -> Result<(RegionTable, Vec<PartSums>), SumsError> {
-    let (index, table) = SumsIndex::open(&[path.to_owned()], 4, &[2, 2, 2, 2])?;
+/// Opens, reads and transposes a file of contributions as an encode does.
+fn read_sums(path: &Path) -> Result<(RegionTable, Vec<PartContributions>), ContributionError> {
+    let (index, table) = ContributionIndex::open(&[path.to_owned()], 4, &[2, 2, 2, 2])?;
     let raw = index.read(0..index.parts().len())?;
-    let sums = index.regroup(&raw, &table)?;
-    Ok((table, sums))
+    let contributions = index.transpose(&raw, &table)?;
+    Ok((table, contributions))
 }
 
 /// What the sections hold lies under a checksum; only the zeros between them do not.
 #[test]
 fn sums_regions_and_fields_refuse_damage() {
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let path = dir.path().join("view.sums");
-    sums().write(&path).expect("writes");
+    let path = dir.path().join("view.contributions");
+    contributions().write(&path).expect("writes");
     let file = fs_err::read(&path).expect("reads");
     let (table, parts) = read_sums(&path).expect("valid");
     let field = CellField::new(vec![8, 9], parts[0].clone(), &table, &mut [0.0; 8]);
@@ -63,7 +66,7 @@ fn sums_regions_and_fields_refuse_damage() {
         match read_sums(&path) {
             Ok(read) => assert_eq!(read, (table.clone(), parts.clone()), "seed {seed}"),
             Err(error) => {
-                assert!(error.to_string().contains("view.sums"), "{error}");
+                assert!(error.to_string().contains("view.contributions"), "{error}");
                 n_refused += 1;
             }
         }

@@ -7,7 +7,8 @@ use glam::DAffine3;
 use image::{Rgb, RgbImage};
 use slag_common::{Distortion, Intrinsics, View, poses};
 use slag_encoder::ingest::load_image;
-use slag_encoder::segment::{GivenMasks, GraphSegmenter, GraphSettings, Mask, SegmentInput, Segmenter};
+use slag_encoder::masks::Mask;
+use slag_encoder::segment::{GivenMasks, GraphSegmenter, GraphSettings, SegmentInput, Segmenter};
 
 fn segment(image: &RgbImage, depth: Option<&[f32]>, valid: Option<&[bool]>) -> Vec<Mask> {
     let (width_px, height_px) = image.dimensions();

@@ -9,11 +9,12 @@ use half::f16;
 use slag_common::container::AlignedBytes;
 use slag_common::shard::{Profile, ShardLayout};
 use slag_common::{Gaussians, Hash32};
-use slag_encoder::lift::{CellField, RegionTable, SumEntry, SumsIndex, ViewSums};
-use slag_encoder::palette::matrix::Rows;
-use slag_encoder::palette::{PaletteSettings, ScoreMetric, TextBank, Yardstick};
+use slag_encoder::cells;
+use slag_encoder::codebook::{CodebookSettings, ScoreMetric, ScoreMetricContext, TextBank};
+use slag_encoder::lift::{CellField, Contribution, ContributionIndex, RegionTable, ViewContributions};
 use slag_encoder::shard::positions::PositionError;
-use slag_encoder::shard::{self, CellEmbeddings, ShardSettings, cells};
+use slag_encoder::shard::{self, CellEmbeddings, ShardSettings};
+use slag_math::matrix::Rows;
 
 const DIM: usize = 512;
 
@@ -40,24 +41,24 @@ fn direction(random: &mut Random) -> Vec<f64> {
 /// Takes a view of one cell, with a region a mask, through its file; returns the embeddings too.
 fn one_cell(
     vectors: &[Vec<f32>],
-    entries: Vec<SumEntry>,
+    entries: Vec<Contribution>,
     input_indices: Vec<u32>,
 ) -> (CellField, RegionTable, Vec<f32>) {
-    let view = ViewSums {
+    let view = ViewContributions {
         dim: DIM,
         mask_vectors: vectors.concat(),
         masks_of_region: (0..vectors.len() as u32).map(|mask| vec![mask]).collect(),
         entries_of_cell: vec![(0, entries)],
     };
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let path = dir.path().join("view.sums");
+    let path = dir.path().join("view.contributions");
     view.write(&path).expect("writes");
-    let (index, table) = SumsIndex::open(&[path], DIM, &[input_indices.len()]).expect("opens");
+    let (index, table) = ContributionIndex::open(&[path], DIM, &[input_indices.len()]).expect("opens");
     assert_eq!(index.parts().len(), 1);
     let raw = index.read(0..1).expect("reads");
-    let sums = index.regroup(&raw, &table).expect("regroups").remove(0);
+    let contributions = index.transpose(&raw, &table).expect("transposes").remove(0);
     let mut embeddings = vec![f32::NAN; input_indices.len() * DIM];
-    let field = CellField::new(input_indices, sums, &table, &mut embeddings);
+    let field = CellField::new(input_indices, contributions, &table, &mut embeddings);
     (field, table, embeddings)
 }
 
@@ -69,8 +70,11 @@ struct Seen {
 
 impl Seen {
     fn field(&self) -> (CellField, RegionTable) {
-        let entry =
-            |(region, weight): (usize, &f32)| SumEntry { local: 0, region: region as u32, weight: *weight };
+        let entry = |(region, weight): (usize, &f32)| Contribution {
+            local: 0,
+            region: region as u32,
+            weight: *weight,
+        };
         let entries = self.weights.iter().enumerate().map(entry).collect();
         let (field, table, _) = one_cell(&self.vectors, entries, vec![0]);
         (field, table)
@@ -199,7 +203,7 @@ fn a_billion_pixels_over_many_views() {
     let n_px: f64 = weights.iter().map(|w| f64::from(*w)).sum();
     assert!(n_px > 1e9);
     let errors = Seen { vectors, weights }.errors(&direction(random)).expect("evidence");
-    print("sums of views", "16,384 views, 1.07e9 pixels", errors, 1e-5);
+    print("contributions of views", "16,384 views, 1.07e9 pixels", errors, 1e-5);
 }
 
 /// What a model must not give and the models' crate refuses: no evidence, never a NaN in the field.
@@ -226,8 +230,8 @@ fn exact_shard(vectors: &[Vec<f32>], means_in_world: Vec<DVec3>) -> AlignedBytes
     };
     let split = cells::split(&scene, cells::CellLimits { max_gaussians: n, max_width: None });
     let cell = &split.cells[0];
-    let entry = |i: usize| SumEntry { local: split.local_of_gaussian[i], region: i as u32, weight: 2.0 };
-    let mut entries: Vec<SumEntry> = (0..n).map(entry).collect();
+    let entry = |i: usize| Contribution { local: split.local_of_gaussian[i], region: i as u32, weight: 2.0 };
+    let mut entries: Vec<Contribution> = (0..n).map(entry).collect();
     entries.sort_by_key(|entry| entry.local);
     let (field, _, vectors) = one_cell(vectors, entries, cell.gaussians.clone());
     let has_evidence = (0..n).map(|k| field.has_evidence(k)).collect();
@@ -237,11 +241,11 @@ fn exact_shard(vectors: &[Vec<f32>], means_in_world: Vec<DVec3>) -> AlignedBytes
     let spread = metric.spread(Rows::all(&embeddings.vectors, DIM));
     let settings = ShardSettings {
         profiles: vec![Profile::Exact],
-        palette: PaletteSettings::default(),
+        codebook: CodebookSettings::default(),
         position_error: PositionError::Within(0.01),
     };
-    let yardstick = Yardstick { metric, bank, spread };
-    let built = shard::build(&scene, 0, cell, &embeddings, Hash32([0; 32]), &yardstick, &settings, None);
+    let score_context = ScoreMetricContext { metric, bank, spread };
+    let built = shard::build(&scene, 0, cell, &embeddings, Hash32([0; 32]), &score_context, &settings, None);
     AlignedBytes::copy_of(&built.shards[0].bytes)
 }
 
@@ -314,7 +318,7 @@ fn shards_keep_their_bounds() {
     let queries: Vec<Vec<f64>> = centres.iter().cloned().chain((0..20).map(|_| direction(random))).collect();
     for row in 0..shard.radii.len() {
         let mut stored = vec![0.0; DIM];
-        shard.decode_row(row, &mut stored);
+        shard.decode_centroid(row, &mut stored);
         let radius = f64::from(shard.radii[row]);
         let mut largest = 0.0_f64;
         for member in shard.members(row) {

@@ -10,10 +10,10 @@ use image::{GrayImage, ImageBuffer, Luma, RgbImage};
 use proptest::prelude::*;
 use slag_common::{Distortion, Intrinsics, View, poses};
 use slag_encoder::ingest::{Undistorter, load_image};
-use slag_encoder::segment::{
-    BoxPx, GivenMasks, Mask, NO_REGION, RegionMap, Rle, RleError, SegmentError, SegmentInput, Segmenter,
-    absorb_slivers, border_share, partition,
-};
+use slag_encoder::masks::regions::{absorb_slivers, border_share, partition};
+use slag_encoder::masks::rle::{Rle, RleError};
+use slag_encoder::masks::{BoxPx, Mask, NO_REGION, RegionMap};
+use slag_encoder::segment::{GivenMasks, SegmentError, SegmentInput, Segmenter};
 
 /// Makes a mask of a membership function; `None` if no pixel is inside.
 fn mask(width: u32, height: u32, inside: impl Fn(u32, u32) -> bool) -> Option<Mask> {
@@ -119,13 +119,13 @@ fn id_images_of_every_depth() {
     let eight: Vec<u8> = pixels().map(|(x, y)| id_at(x, y) as u8).collect();
     let four: Vec<u8> = eight.chunks(2).map(|pair| pair[0] << 4 | pair[1]).collect();
     let sixteen: Vec<u8> = pixels().flat_map(|(x, y)| (id_at(x, y) as u16 * 1_000).to_be_bytes()).collect();
-    let (gray, palette) = (png::ColorType::Grayscale, png::ColorType::Indexed);
+    let (gray, codebook) = (png::ColorType::Grayscale, png::ColorType::Indexed);
     for (name, color, depth, rows) in [
         ("left/a.png", gray, png::BitDepth::Eight, &eight),
         ("left/a.png", gray, png::BitDepth::Four, &four),
         ("left/a.jpg.png", gray, png::BitDepth::Sixteen, &sixteen),
-        ("left/a.png", palette, png::BitDepth::Eight, &eight),
-        ("left/a.jpg.png", palette, png::BitDepth::Four, &four),
+        ("left/a.png", codebook, png::BitDepth::Eight, &eight),
+        ("left/a.jpg.png", codebook, png::BitDepth::Four, &four),
     ] {
         let path = dir.path().join(name);
         write_png(&path, color, depth, rows);

@@ -11,7 +11,9 @@ use common::Random;
 use glam::DAffine3;
 use image::RgbImage;
 use slag_common::{Distortion, Intrinsics, View};
-use slag_encoder::segment::{GivenMasks, Mask, Rle, SegmentError, SegmentInput};
+use slag_encoder::masks::Mask;
+use slag_encoder::masks::rle::Rle;
+use slag_encoder::segment::{GivenMasks, SegmentError, SegmentInput};
 
 thread_local! {
     static LARGEST_BYTES: Cell<usize> = const { Cell::new(0) };

@@ -11,10 +11,11 @@ use slag_common::shard::{self, ShardLayout};
 use slag_common::splat::{self, ReadOptions};
 use slag_common::{Hash32, poses};
 use slag_edge::store::EdgeCache;
-use slag_encoder::bench::scene::BenchScene;
 use slag_encoder::ingest::read_geo_reference;
-use slag_encoder::lift::{CellField, RegionTable, SumsFile};
-use slag_encoder::segment::{GivenMasks, Rle};
+use slag_encoder::lift::{CellField, ContributionFile, RegionTable};
+use slag_encoder::masks::rle::Rle;
+use slag_encoder::segment::GivenMasks;
+use slag_lab::bench::scene::BenchScene;
 use slag_models::description::Description;
 
 /// Splits inputs of several files.
@@ -82,7 +83,7 @@ pub fn shard(data: &[u8]) -> bool {
     let bytes = AlignedBytes::copy_of(&with_checksums(data));
     let Ok(layout) = ShardLayout::check(&bytes) else { return false };
     let view = layout.view(&bytes);
-    for row in 0..view.header.n_rows as usize {
+    for row in 0..view.header.n_centroids as usize {
         assert!(view.members(row).end <= view.n_with_evidence());
     }
     for index in 0..view.header.n_gaussians as usize {
@@ -223,7 +224,7 @@ pub fn model_toml(data: &[u8]) -> bool {
 
 pub fn tensors(data: &[u8]) -> bool {
     in_file("x.safetensors", data, |path| {
-        let read = |n_rows| slag_models::tensors::read(path, "vectors", n_rows, 3).is_ok();
+        let read = |n_centroids| slag_models::tensors::read(path, "vectors", n_centroids, 3).is_ok();
         read(Some(2)) | read(None)
     })
 }
@@ -245,7 +246,7 @@ pub fn sums(data: &[u8]) -> bool {
     let at = stated.map_or(data.len(), |at| (at as usize).min(data.len()));
     let bytes = [with_checksums(&data[..at]).as_slice(), &data[at..]].concat();
     in_file("x.sums", &bytes, |path| {
-        let Ok((file, regions)) = SumsFile::open(path) else { return false };
+        let Ok((file, regions)) = ContributionFile::open(path) else { return false };
         std::hint::black_box(regions.masks_of_region().map(<[u32]>::len).sum::<usize>());
         for run in 0..file.runs().len() {
             std::hint::black_box(file.entries_of_run(run));

@@ -51,7 +51,7 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
         ],
         "tensors" => vec![safetensors()],
         "phrases" => vec![[b"chair\na red sofa\n====\n".as_slice(), &safetensors()].concat()],
-        "sums" => vec![sums()],
+        "contributions" => vec![sums()],
         "region_table" => vec![region_table()],
         "cell_field" => vec![cell_field()],
         "npz" => vec![npz()],
@@ -95,12 +95,12 @@ fn shard(is_exact: bool) -> Vec<u8> {
     let header = ShardHeader {
         cell_id: 5,
         n_gaussians: 6,
-        n_rows: 2,
+        n_centroids: 2,
         dim: 3,
         n_components: 2,
-        n_groups: if is_exact { 0 } else { 2 },
+        n_subspaces: if is_exact { 0 } else { 2 },
         position_bits: [16, 16, 16, 0],
-        row_step: 0.01,
+        centroid_step: 0.01,
         origin_in_world: [1.0, -2.0, 3.0],
         position_step: [0.001, 0.002, 0.0],
         box_min: [0.0, -3.0, 2.0],
@@ -110,20 +110,20 @@ fn shard(is_exact: bool) -> Vec<u8> {
     };
     let embeddings = [f16::from_f32(0.5); 15];
     let mut out = Vec::new();
-    let (mean, words) = ([f16::from_f32(0.1); 3], [f16::from_f32(0.25); 32]);
+    let (mean, codewords) = ([f16::from_f32(0.1); 3], [f16::from_f32(0.25); 32]);
     let positions = [[0, 0, 0], [1, 2, 3], [65535, 65535, 65535], [4, 4, 4], [5, 5, 5], [6, 6, 6]];
     let view = ShardView {
         header,
         positions: Positions::Wide(&positions),
-        row_starts: &[0, 2, 5],
-        rows: &[60, -10, 20, 127],
+        centroid_starts: &[0, 2, 5],
+        centroids: &[60, -10, 20, 127],
         radii: &[0.1, 0.2],
         basis: Some(Basis { mean: &mean, vectors: &[127, 0, 5, -3, 127, 0], steps: &[0.01, 0.01] }),
         residuals: (!is_exact).then_some(Residuals {
-            group_starts: &[0, 1, 2],
-            words: &words,
-            row_scales: &[0.1, 0.2],
-            reaches: &[0.3, 0.4],
+            subspace_starts: &[0, 1, 2],
+            codewords: &codewords,
+            residual_scales: &[0.1, 0.2],
+            residual_norms: &[0.3, 0.4],
             codes: &[0x5a; 32],
         }),
         exact: is_exact.then_some(ExactColumns {
@@ -174,7 +174,7 @@ fn manifest() -> Vec<u8> {
         let record = ShardRecord {
             hash: Hash32([cell_id as u8; 32]),
             len_bytes: 100,
-            n_rows: 2,
+            n_centroids: 2,
             score_error_bound: 0.1,
             score_errors: ScoreErrors::default(),
             position_error: 1e-3,
@@ -268,7 +268,7 @@ fn sums() -> Vec<u8> {
     let header = [u32s(&[2, 2, 2, 1]), u64s(&[3, 1])].concat();
     let run = [u32s(&[0, 0]), u64s(&[0, checksum])].concat();
     let columns = [header, u32s(&[0, 1, 3]), u32s(&[0, 0, 1]), f32s(&[1.0, 0.0, 0.0, 1.0]), run];
-    [sections(b"SLAGSUMS", 2, &columns), entry].concat()
+    [sections(b"SLAGCONT", 2, &columns), entry].concat()
 }
 
 /// CRC-32 (IEEE 802.3), bit by bit.

@@ -33,7 +33,16 @@ pub fn program(name: &str) -> PathBuf {
         let exe = std::env::current_exe().expect("a test has a path");
         let folder = exe.ancestors().nth(2).expect("tests lie in target/PROFILE/deps").to_owned();
         let mut build = Command::new(env!("CARGO"));
-        build.current_dir(root()).args(["build", "--locked", "--bin", "slag-encoder", "--bin", "slag-edge"]);
+        build.current_dir(root()).args([
+            "build",
+            "--locked",
+            "--bin",
+            "slag-encoder",
+            "--bin",
+            "slag-lab",
+            "--bin",
+            "slag-edge",
+        ]);
         if folder.ends_with("release") {
             build.arg("--release");
         }
@@ -46,6 +55,11 @@ pub fn program(name: &str) -> PathBuf {
 /// Returns a command of the encoder.
 pub fn encoder(args: &[&str]) -> Command {
     command("slag-encoder", args)
+}
+
+/// Returns a command of the laboratory.
+pub fn lab(args: &[&str]) -> Command {
+    command("slag-lab", args)
 }
 
 /// Returns a command of the robot's program.

@@ -1,6 +1,6 @@
 """Trains the embedded encoders on crops of generated things, and reports how good they are.
 
-usage: train.py OUT TEST_DIR TRAIN_DIR...     (folders of `slag-encoder generate crops`; see CARD.md)
+usage: train.py OUT TEST_DIR TRAIN_DIR...     (folders of `slag-lab generate crops`; see CARD.md)
 
 Every text says something that is true or false of every crop: which noun, colour, material, kind of thing or
 proportion it names is known exactly. So the loss is a sigmoid per pair of crop and text (SigLIP: Zhai et al.

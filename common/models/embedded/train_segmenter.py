@@ -1,6 +1,6 @@
 """Trains the learnt segmenter: from a photo, how probably each pixel and its neighbour show different things.
 
-usage: train_segmenter.py OUT TEST_DIR TRAIN_DIR...     (folders of `slag-encoder generate photos`)
+usage: train_segmenter.py OUT TEST_DIR TRAIN_DIR...     (folders of `slag-lab generate photos`)
 
 The graph segmenter (Felzenszwalb and Huttenlocher 2004) joins pixels over the lightest edges first; this model
 says how heavy edges are, instead of differences of colour. A small U-Net (Ronneberger et al. 2015).

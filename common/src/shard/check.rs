@@ -5,8 +5,8 @@ use std::ops::Range;
 use half::f16;
 
 use super::{
-    BLOCK, MAGIC, MAX_DIM, MAX_GROUPS, ScoreErrors, ShardHeader, ShardLayout, VERSION, WORDS, is_packed,
-    section,
+    BLOCK, CODEWORDS, MAGIC, MAX_DIM, MAX_SUBSPACES, ScoreErrors, ShardHeader, ShardLayout, VERSION,
+    is_packed, section,
 };
 use crate::container::{ContainerError, Layout};
 use crate::objects::ObjectsLayout;
@@ -15,7 +15,7 @@ use crate::objects::ObjectsLayout;
 const MAX_LENGTH: f32 = 4096.0;
 
 impl ShardLayout {
-    /// Checks a whole shard: container, sizes, row order, finite and sane numbers.
+    /// Checks a whole shard: container, sizes, centroid order, finite and sane numbers.
     ///
     /// # Errors
     /// [`ContainerError`], naming the byte.
@@ -24,17 +24,17 @@ impl ShardLayout {
         let header: ShardHeader = layout.value(bytes, section::HEADER, "header")?;
         let at_header = layout.find(section::HEADER).map_or(0, |range| range.start);
         check_header(&header).map_err(|what| damaged(at_header, what))?;
-        let (n, k, dim) = (header.n_gaussians as usize, header.n_rows as usize, header.dim as usize);
-        let (m, n_groups) = (header.n_components as usize, header.n_groups as usize);
-        let row_starts = layout.column::<u32>(section::ROW_STARTS, "row starts", k + 1)?;
-        let starts: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[row_starts.clone()]);
-        // A row has members: an empty one would only cost time, and K <= N bounds memory.
+        let (n, k, dim) = (header.n_gaussians as usize, header.n_centroids as usize, header.dim as usize);
+        let (m, n_subspaces) = (header.n_components as usize, header.n_subspaces as usize);
+        let centroid_starts = layout.column::<u32>(section::CENTROID_STARTS, "centroid starts", k + 1)?;
+        let starts: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[centroid_starts.clone()]);
+        // A centroid has members: an empty one would only cost time, and K <= N bounds memory.
         if starts[0] != 0 || starts.windows(2).any(|w| w[0] >= w[1]) || starts[k] as usize > n {
-            let what = format!("row starts do not ascend from 0 to at most {n}");
-            return Err(damaged(row_starts.start, what));
+            let what = format!("centroid starts do not ascend from 0 to at most {n}");
+            return Err(damaged(centroid_starts.start, what));
         }
         let n_with_evidence = starts[k] as usize;
-        let rows = layout.column::<i8>(section::ROWS, "rows", k * m)?;
+        let centroids = layout.column::<i8>(section::CENTROIDS, "centroids", k * m)?;
         let radii = lengths(&layout, bytes, section::RADII, "radii", k)?;
         let basis = match layout.find(section::BASIS) {
             None if m != dim => {
@@ -47,23 +47,24 @@ impl ShardLayout {
                 Some([mean, vectors, lengths(&layout, bytes, section::BASIS_STEPS, "basis steps", m)?])
             }
         };
-        let residuals = match n_groups {
+        let residuals = match n_subspaces {
             0 => None,
             _ => {
-                let group_starts =
-                    layout.column::<u32>(section::GROUP_STARTS, "group starts", n_groups + 1)?;
-                let of_groups: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[group_starts.clone()]);
-                let end = of_groups[n_groups] as usize;
-                if of_groups[0] != 0 || of_groups.windows(2).any(|w| w[0] >= w[1]) || end > m {
-                    let what = format!("group starts do not ascend from 0 to at most {m}");
-                    return Err(damaged(group_starts.start, what));
+                let subspace_starts =
+                    layout.column::<u32>(section::SUBSPACE_STARTS, "subspace starts", n_subspaces + 1)?;
+                let of_subspaces: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[subspace_starts.clone()]);
+                let end = of_subspaces[n_subspaces] as usize;
+                if of_subspaces[0] != 0 || of_subspaces.windows(2).any(|w| w[0] >= w[1]) || end > m {
+                    let what = format!("subspace starts do not ascend from 0 to at most {m}");
+                    return Err(damaged(subspace_starts.start, what));
                 }
-                let words = halves(&layout, bytes, section::WORDS, "words", WORDS * end)?;
-                let row_scales = lengths(&layout, bytes, section::ROW_SCALES, "row scales", k)?;
-                let reaches = lengths(&layout, bytes, section::REACHES, "reaches", k)?;
-                let n_codes = n_with_evidence.div_ceil(BLOCK) * BLOCK * n_groups / 2;
+                let codewords = halves(&layout, bytes, section::CODEWORDS, "codewords", CODEWORDS * end)?;
+                let residual_scales =
+                    lengths(&layout, bytes, section::RESIDUAL_SCALES, "centroid scales", k)?;
+                let residual_norms = lengths(&layout, bytes, section::RESIDUAL_NORMS, "residual_norms", k)?;
+                let n_codes = n_with_evidence.div_ceil(BLOCK) * BLOCK * n_subspaces / 2;
                 let codes = layout.column::<u8>(section::CODES, "codes", n_codes)?;
-                Some([group_starts, words, row_scales, reaches, codes])
+                Some([subspace_starts, codewords, residual_scales, residual_norms, codes])
             }
         };
         let exact = match layout.find(section::EMBEDDINGS) {
@@ -93,7 +94,18 @@ impl ShardLayout {
             false => layout.column::<[u16; 3]>(section::POSITIONS, "positions", n)?,
         };
         let objects = ObjectsLayout::check(bytes, &layout, header.n_gaussians, m)?;
-        Ok(Self { header, positions, row_starts, rows, radii, basis, residuals, exact, fine, objects })
+        Ok(Self {
+            header,
+            positions,
+            centroid_starts,
+            centroids,
+            radii,
+            basis,
+            residuals,
+            exact,
+            fine,
+            objects,
+        })
     }
 }
 
@@ -110,19 +122,19 @@ fn check_header(header: &ShardHeader) -> Result<(), String> {
         return Err(format!("box {:?}..{:?} is empty", header.box_min, header.box_max));
     }
     let (n, k, dim, m) =
-        (header.n_gaussians, header.n_rows, header.dim as usize, header.n_components as usize);
+        (header.n_gaussians, header.n_centroids, header.dim as usize, header.n_components as usize);
     if k > n || dim == 0 || dim > MAX_DIM || m > dim {
-        return Err(format!("{k} rows of {m} components of {dim} for {n} Gaussians"));
+        return Err(format!("{k} centroids of {m} components of {dim} for {n} Gaussians"));
     }
-    if header.n_groups as usize > MAX_GROUPS.min(m) || !header.n_groups.is_multiple_of(2) {
-        return Err(format!("{} groups of {m} components", header.n_groups));
+    if header.n_subspaces as usize > MAX_SUBSPACES.min(m) || !header.n_subspaces.is_multiple_of(2) {
+        return Err(format!("{} subspaces of {m} components", header.n_subspaces));
     }
     let bits = header.position_bits;
     if bits[3] != 0 || is_packed(header) && bits.iter().map(|b| u32::from(*b)).sum::<u32>() > 32 {
         return Err(format!("positions of {bits:?} bits"));
     }
-    if !(0.0..=MAX_LENGTH).contains(&header.row_step) {
-        return Err(format!("the rows' step is not within 0..={MAX_LENGTH}"));
+    if !(0.0..=MAX_LENGTH).contains(&header.centroid_step) {
+        return Err(format!("the centroids' step is not within 0..={MAX_LENGTH}"));
     }
     check_errors(&header.errors)
 }

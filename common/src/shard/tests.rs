@@ -4,25 +4,25 @@ use crate::container::AlignedBytes;
 /// What a test edits before the shard is written.
 struct Parts {
     header: ShardHeader,
-    row_starts: Vec<u32>,
+    centroid_starts: Vec<u32>,
     radii: Vec<f32>,
-    group_starts: Vec<u32>,
-    words: Vec<f16>,
+    subspace_starts: Vec<u32>,
+    codewords: Vec<f16>,
     mean: Vec<f16>,
 }
 
-/// Six Gaussians, five of them with evidence, in two rows; four dimensions, three components, two groups.
+/// Six Gaussians, five of them with evidence, in two centroids; four dimensions, three components, two subspaces.
 fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
     let mut parts = Parts {
         header: ShardHeader {
             cell_id: 5,
             n_gaussians: 6,
-            n_rows: 2,
+            n_centroids: 2,
             dim: 4,
             n_components: 3,
-            n_groups: 2,
+            n_subspaces: 2,
             position_bits: [11, 12, 9, 0],
-            row_step: 0.01,
+            centroid_step: 0.01,
             origin_in_world: [1e6, -2.0, 3.0],
             position_step: [0.001, 0.002, 0.0],
             box_min: [1e6 - 1.0, -3.0, 2.0],
@@ -30,10 +30,10 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
             errors: ScoreErrors { mean: 0.01, p999: 0.1, max: 0.2, spread: 0.07 },
             encoder_id: [9; 32],
         },
-        row_starts: vec![0, 2, 5],
+        centroid_starts: vec![0, 2, 5],
         radii: vec![0.1, 0.2],
-        group_starts: vec![0, 1, 3],
-        words: (0..48).map(|i| f16::from_f32(i as f32 / 64.0)).collect(),
+        subspace_starts: vec![0, 1, 3],
+        codewords: (0..48).map(|i| f16::from_f32(i as f32 / 64.0)).collect(),
         mean: [0.5, 0.25, 0.0, -0.5].map(f16::from_f32).to_vec(),
     };
     edit(&mut parts);
@@ -44,8 +44,8 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
     ShardView {
         header: parts.header,
         positions: Positions::Packed(&packed),
-        row_starts: &parts.row_starts,
-        rows: &[1, 2, 3, -4, 5, -128],
+        centroid_starts: &parts.centroid_starts,
+        centroids: &[1, 2, 3, -4, 5, -128],
         radii: &parts.radii,
         basis: Some(Basis {
             mean: &parts.mean,
@@ -53,10 +53,10 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
             steps: &[0.01, 0.02, 0.03],
         }),
         residuals: Some(Residuals {
-            group_starts: &parts.group_starts,
-            words: &parts.words,
-            row_scales: &[0.5, 2.0],
-            reaches: &[1.0, 3.0],
+            subspace_starts: &parts.subspace_starts,
+            codewords: &parts.codewords,
+            residual_scales: &[0.5, 2.0],
+            residual_norms: &[1.0, 3.0],
             codes: &codes,
         }),
         exact: None,
@@ -76,8 +76,8 @@ fn round_trip() {
     assert!((p - DVec3::new(1e6 + 2.047, -2.0 + 4095.0 * 0.002, 3.0)).length() < 1e-9, "{p}");
     assert_eq!(shard.position_in_world(1), DVec3::new(1e6 + 0.001, -2.0 + 0.004, 3.0));
     assert_eq!(shard.position_box().max, p);
-    // Worked out by hand: components of row 1, then code 13 of group 0 (word 13/64), code 3 of group 1
-    // (words (16 + 6)/64 and 23/64), doubled.
+    // Worked out by hand: components of centroid 1, then code 13 of subspace 0 (codeword 13/64), code 3 of subspace 1
+    // (codewords (16 + 6)/64 and 23/64), doubled.
     let mut decoded = [0.0; 4];
     shard.decode(2, &mut decoded);
     let c = [-0.04 + 2.0 * 13.0 / 64.0, 0.05 + 2.0 * 22.0 / 64.0, -1.28 + 2.0 * 23.0 / 64.0];
@@ -96,25 +96,25 @@ fn lies_are_refused() {
     let refused =
         |edit: fn(&mut Parts)| ShardLayout::check(&written(edit)).expect_err("must be refused").to_string();
     assert!(refused(|p| p.header.n_gaussians = u32::MAX).contains("bytes"));
-    assert!(refused(|p| p.header.n_rows = 7).contains("rows"));
+    assert!(refused(|p| p.header.n_centroids = 7).contains("centroids"));
     assert!(refused(|p| p.header.dim = 0).contains("components"));
     assert!(refused(|p| p.header.dim = u32::MAX).contains("components"));
     assert!(refused(|p| p.header.n_components = 5).contains("components"));
     assert!(refused(|p| p.header.n_components = 2).contains("bytes"));
-    assert!(refused(|p| p.header.n_groups = 1).contains("groups"));
-    assert!(refused(|p| p.header.n_groups = u32::MAX).contains("groups"));
+    assert!(refused(|p| p.header.n_subspaces = 1).contains("subspaces"));
+    assert!(refused(|p| p.header.n_subspaces = u32::MAX).contains("subspaces"));
     assert!(refused(|p| p.header.position_bits = [16; 4]).contains("positions"));
     assert!(refused(|p| p.header.position_bits = [16, 16, 17, 0]).contains("positions"));
     assert!(refused(|p| p.header.position_bits = [16, 16, 16, 0]).contains("positions"));
     assert!(refused(|p| p.header.origin_in_world[1] = f64::NAN).contains("finite"));
     assert!(refused(|p| p.header.box_max[0] = -1.0).contains("empty"));
-    assert!(refused(|p| p.header.row_step = f32::NAN).contains("step"));
+    assert!(refused(|p| p.header.centroid_step = f32::NAN).contains("step"));
     assert!(refused(|p| p.header.errors.max = -1.0).contains("error"));
-    assert!(refused(|p| p.row_starts[1] = 9).contains("ascend"));
-    assert!(refused(|p| p.row_starts[2] = 7).contains("ascend"));
+    assert!(refused(|p| p.centroid_starts[1] = 9).contains("ascend"));
+    assert!(refused(|p| p.centroid_starts[2] = 7).contains("ascend"));
     assert!(refused(|p| p.radii[1] = f32::INFINITY).contains("radii"));
-    assert!(refused(|p| p.group_starts[2] = 4).contains("ascend"));
-    assert!(refused(|p| p.group_starts[1] = 3).contains("ascend"));
-    assert!(refused(|p| p.words[4] = f16::INFINITY).contains("finite"));
+    assert!(refused(|p| p.subspace_starts[2] = 4).contains("ascend"));
+    assert!(refused(|p| p.subspace_starts[1] = 3).contains("ascend"));
+    assert!(refused(|p| p.codewords[4] = f16::INFINITY).contains("finite"));
     assert!(refused(|p| p.mean[0] = f16::NAN).contains("finite"));
 }

@@ -18,7 +18,7 @@ use crate::Gaussians;
 const MAX_META_BYTES: u64 = 1 << 20;
 /// Images may be larger than the count asks for by their last rows, or a square of a power of two.
 const SPARE_PIXELS: u64 = 1 << 16;
-/// The palette of harmonics has this many entries a row, and at most 65536: labels have 16 bits.
+/// The codebook of harmonics has this many entries a row, and at most 65536: labels have 16 bits.
 const PALETTE_COLUMNS: usize = 64;
 const MAX_PALETTE_ROWS: u64 = 1024;
 /// Alpha of a rotation's pixel when the first component is the largest; up to 255 for the fourth.
@@ -340,7 +340,7 @@ impl Sog {
         Ok(out)
     }
 
-    /// Decodes the harmonics: each Gaussian has a label, each label a run of pixels in the palette.
+    /// Decodes the harmonics: each Gaussian has a label, each label a run of pixels in the codebook.
     fn decode_sh_rest(
         &mut self,
         sh_rest: &Quantised,
@@ -350,14 +350,14 @@ impl Sog {
     ) -> Result<(), SplatError> {
         let [table]: [_; 1] = self.tables("shN", sh_rest)?;
         let widest = PALETTE_COLUMNS * Gaussians::sh_rest_per_channel(super::MAX_SH_DEGREE);
-        let palette = self.pixels(&sh_rest.files, 0, 1..=widest as u64 * MAX_PALETTE_ROWS)?;
+        let codebook = self.pixels(&sh_rest.files, 0, 1..=widest as u64 * MAX_PALETTE_ROWS)?;
         let Some(degree) = (1..=super::MAX_SH_DEGREE)
-            .find(|degree| palette.width == PALETTE_COLUMNS * Gaussians::sh_rest_per_channel(*degree))
+            .find(|degree| codebook.width == PALETTE_COLUMNS * Gaussians::sh_rest_per_channel(*degree))
         else {
-            return Err(self.malformed("shN", "a palette 192, 512 or 960 pixels wide", palette.width));
+            return Err(self.malformed("shN", "a codebook 192, 512 or 960 pixels wide", codebook.width));
         };
         let per_channel = Gaussians::sh_rest_per_channel(degree);
-        let n_entries = palette.rgba.len() / 4 / per_channel;
+        let n_entries = codebook.rgba.len() / 4 / per_channel;
         let labels = self.pixels(&sh_rest.files, 1, n_pixels)?;
         out.sh_degree = degree;
         out.sh_rest.reserve_exact(count * 3 * per_channel);
@@ -367,7 +367,7 @@ impl Sog {
                 return Err(self.malformed("shN", format_args!("labels below {n_entries}"), label));
             }
             for pixel in label * per_channel..(label + 1) * per_channel {
-                let [r, g, b, _] = palette.get(pixel);
+                let [r, g, b, _] = codebook.get(pixel);
                 out.sh_rest.extend([r, g, b].map(|code| table[usize::from(code)] as f32));
             }
         }

@@ -209,8 +209,8 @@ pub fn write_sog_v1(folder: &Path) {
     write_webp(&folder.join("quats.webp"), 3, &quats);
     let labels: Vec<_> = (0..6).map(|i| [i * 20, 0, 0, 255]).collect();
     write_webp(&folder.join("labels.webp"), 3, &labels);
-    let palette: Vec<_> = (0..192 * 2_u32).map(|i| [i as u8, (i / 2) as u8, (i / 3) as u8, 255]).collect();
-    write_webp(&folder.join("centroids.webp"), 192, &palette);
+    let codebook: Vec<_> = (0..192 * 2_u32).map(|i| [i as u8, (i / 2) as u8, (i / 3) as u8, 255]).collect();
+    write_webp(&folder.join("centroids.webp"), 192, &codebook);
     let meta = r#"{
         "means": {"shape": [6, 3], "mins": [-2, -1, 0], "maxs": [2, 3, 1], "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"mins": [-9, -8, -7], "maxs": [-1, 0, 1], "files": ["scales.webp"]},
@@ -241,8 +241,8 @@ fn sog_version_1() {
             let half = 1.0 + c as f64;
             assert_near(found.sh_dc[i][c].into(), -half + 2.0 * half * byte(4, c) / 255.0, 1e-6, "f_dc");
             for k in 0..3 {
-                let palette = ((i * 20 * 3 + k) / (c + 1)) as u8;
-                let expected = -0.5 + 2.0 * f64::from(palette) / 255.0;
+                let codebook = ((i * 20 * 3 + k) / (c + 1)) as u8;
+                let expected = -0.5 + 2.0 * f64::from(codebook) / 255.0;
                 assert_near(found.sh_rest[(i * 3 + k) * 3 + c].into(), expected, 1e-6, "f_rest");
             }
         }

@@ -69,8 +69,8 @@ pub struct SceneSize {
     pub n_with_evidence: u64,
     /// Shards.
     pub n_shards: usize,
-    /// Palette rows.
-    pub n_rows: u64,
+    /// Codebook rows.
+    pub n_centroids: u64,
     /// Components of an embedding.
     pub dim: usize,
     /// Bytes of all shards.
@@ -178,7 +178,7 @@ pub fn bench_query(
             n_gaussians: shards.iter().map(|shard| u64::from(shard.header.n_gaussians)).sum(),
             n_with_evidence: shards.iter().map(|shard| shard.n_with_evidence() as u64).sum(),
             n_shards: shards.len(),
-            n_rows: shards.iter().map(|shard| u64::from(shard.header.n_rows)).sum(),
+            n_centroids: shards.iter().map(|shard| u64::from(shard.header.n_centroids)).sum(),
             dim: shards.first().map_or(0, |shard| shard.header.dim as usize),
             shard_bytes: snapshot.shards.iter().map(OpenShard::len_bytes).sum(),
         },
@@ -324,12 +324,12 @@ fn timing(kind: Kind, limit: usize, runs: Vec<Run>, read_bytes_per_s: f64) -> Ti
 fn bytes_touched(shards: &[ShardView<'_>], effort: Effort, found: &Columns) -> u64 {
     let of_shard = |shard: &ShardView<'_>| {
         let basis = shard.basis.map_or(0, |b| b.vectors.len() + 2 * b.mean.len() + 4 * b.steps.len());
-        let residuals = shard.residuals.map_or(0, |r| 2 * r.words.len() + 8 * r.row_scales.len());
+        let residuals = shard.residuals.map_or(0, |r| 2 * r.codewords.len() + 8 * r.residual_scales.len());
         let radii = if shard.exact.is_some() { 4 * shard.radii.len() } else { 0 };
-        (shard.rows.len() + 4 * shard.row_starts.len() + basis + residuals + radii) as u64
+        (shard.centroids.len() + 4 * shard.centroid_starts.len() + basis + residuals + radii) as u64
     };
     let first = shards.first();
-    let block = first.map_or(0, |shard| BLOCK as u64 * u64::from(shard.header.n_groups) / 2);
+    let block = first.map_or(0, |shard| BLOCK as u64 * u64::from(shard.header.n_subspaces) / 2);
     let (dim, m) = first.map_or((0, 0), |shard| (shard.header.dim, shard.header.n_components));
     let position = first.map_or(0, |shard| match shard.positions {
         Positions::Packed(_) => 4,

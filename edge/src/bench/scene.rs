@@ -90,11 +90,11 @@ impl Generator {
             let shard = self.shard(cell_id, n, content)?;
             let (hash, len_bytes, bounds) = (Hash32::of(&shard), shard.len() as u64, bounds(cell_id));
             published.objects.insert(hash, shard);
-            let n_rows = ROWS_PER_CELL.min(n);
+            let n_centroids = ROWS_PER_CELL.min(n);
             let record = ShardRecord {
                 hash,
                 len_bytes,
-                n_rows,
+                n_centroids,
                 score_error_bound: 0.1,
                 score_errors: ScoreErrors::default(),
                 position_error: 2e-4,
@@ -129,33 +129,34 @@ impl Generator {
 
     fn shard(&self, cell_id: u32, n: u32, content: u64) -> io::Result<Vec<u8>> {
         let mut random = Random((u64::from(cell_id) << 32) ^ content);
-        let n_rows = ROWS_PER_CELL.min(n);
-        let row_starts: Vec<u32> =
-            (0..=n_rows).map(|row| (u64::from(row) * u64::from(n) / u64::from(n_rows)) as u32).collect();
-        let mut palette: Vec<f32> = Vec::new();
+        let n_centroids = ROWS_PER_CELL.min(n);
+        let centroid_starts: Vec<u32> = (0..=n_centroids)
+            .map(|row| (u64::from(row) * u64::from(n) / u64::from(n_centroids)) as u32)
+            .collect();
+        let mut codebook: Vec<f32> = Vec::new();
         // Members of a row stand together, as in real scenes.
         let mut positions: Vec<[u16; 3]> = Vec::new();
-        for row in 0..n_rows {
+        for row in 0..n_centroids {
             let spread = 0.4 / (self.dim as f32 / 3.0).sqrt();
             let around = concept(random.next(), self.dim);
             let vector = unit(around.into_iter().map(|v| v + spread * random.signed()).collect());
-            palette.extend(vector);
+            codebook.extend(vector);
             let centre = [(); 3].map(|()| random.next() % 60_000);
-            for _ in row_starts[row as usize]..row_starts[row as usize + 1] {
+            for _ in centroid_starts[row as usize]..centroid_starts[row as usize + 1] {
                 positions.push(centre.map(|c| (c + random.next() % 5000) as u16));
             }
         }
-        let (rows, row_step) = shard::quantise(&palette);
+        let (rows, centroid_step) = shard::quantise(&codebook);
         let box_ = bounds(cell_id);
         let header = ShardHeader {
             cell_id,
             n_gaussians: n,
-            n_rows,
+            n_centroids,
             dim: self.dim,
             n_components: self.dim,
-            n_groups: 0,
+            n_subspaces: 0,
             position_bits: [16, 16, 16, 0],
-            row_step,
+            centroid_step,
             origin_in_world: box_.min.into(),
             position_step: [CELL_WIDTH_M / 65535.0; 3],
             box_min: box_.min.into(),
@@ -163,13 +164,13 @@ impl Generator {
             errors: ScoreErrors::default(),
             encoder_id: encoder_id().0,
         };
-        let radii = vec![0.1; n_rows as usize];
+        let radii = vec![0.1; n_centroids as usize];
         let mut out = Vec::new();
         let parts = ShardView {
             header,
             positions: Positions::Wide(&positions),
-            row_starts: &row_starts,
-            rows: &rows,
+            centroid_starts: &centroid_starts,
+            centroids: &rows,
             radii: &radii,
             basis: None,
             residuals: None,

@@ -230,7 +230,7 @@ mod tests {
                 ShardRecord {
                     hash: hash(cell_id),
                     len_bytes: *len_bytes,
-                    n_rows: 1,
+                    n_centroids: 1,
                     score_error_bound: 0.1,
                     score_errors: Default::default(),
                     position_error: 0.1,

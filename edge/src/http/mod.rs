@@ -43,7 +43,7 @@ GET /query?text=chair   clusters of Gaussians that match, best first
     level=clusters      or gaussians
     voxel=v             edge of the voxels that join Gaussians to clusters
     min_count=n         smaller clusters are dropped
-    precision=exact     rows: by palette rows alone, fastest; measured: as far as measured errors decide
+    precision=exact     rows: by codebook rows alone, fastest; measured: as far as measured errors decide
     format=json         or arrow: columns, of gaussians
 GET /status             scene, generation, encoder, shards, and whether the scene is past its expiry
 POST /position          where the robot is, if it is followed; JSON: x, y, z, or lat, lon, height

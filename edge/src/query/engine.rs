@@ -120,8 +120,8 @@ pub struct ShardStatus {
     pub cell_id: u32,
     /// Its Gaussians.
     pub n_gaussians: u32,
-    /// Its palette rows.
-    pub n_rows: u32,
+    /// Its codebook rows.
+    pub n_centroids: u32,
     /// Its length.
     pub len_bytes: u64,
 }
@@ -136,7 +136,12 @@ impl Status {
             .map(|shard| {
                 let header = shard.view().header;
                 let (cell_id, len_bytes) = (header.cell_id, shard.len_bytes());
-                ShardStatus { cell_id, n_gaussians: header.n_gaussians, n_rows: header.n_rows, len_bytes }
+                ShardStatus {
+                    cell_id,
+                    n_gaussians: header.n_gaussians,
+                    n_centroids: header.n_centroids,
+                    len_bytes,
+                }
             })
             .collect();
         Self {

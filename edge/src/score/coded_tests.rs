@@ -1,7 +1,7 @@
 //! Shards with bases and residual codes.
 
 use slag_common::container::AlignedBytes;
-use slag_common::shard::{MAX_GROUPS, ShardLayout};
+use slag_common::shard::{MAX_SUBSPACES, ShardLayout};
 
 use super::collect::UNDECIDED;
 use super::tests::{random_question, score_in_f64, views};
@@ -21,7 +21,7 @@ const SHAPES: [(usize, usize, bool, usize); 10] = [
     (40, 7, true, 2),
     (33, 33, true, 14),
     (512, 96, true, 32),
-    (130, 130, true, MAX_GROUPS),
+    (130, 130, true, MAX_SUBSPACES),
     (515, 3, true, 2),
 ];
 
@@ -31,7 +31,7 @@ fn shards(random: &mut Random, shape: (usize, usize, bool, usize)) -> Vec<BuiltS
 
 fn shards_of(
     random: &mut Random,
-    (dim, n_components, has_basis, n_groups): (usize, usize, bool, usize),
+    (dim, n_components, has_basis, n_subspaces): (usize, usize, bool, usize),
     is_exact: bool,
 ) -> Vec<BuiltShard> {
     // Rows that end in blocks, at their ends, and fill several.
@@ -39,8 +39,8 @@ fn shards_of(
     let mut build = |(at, lens): (usize, &[usize])| {
         let cell_id = 9 - at as u32;
         let origin = DVec3::new(12.0 * at as f64, 0.0, 0.0);
-        let row_lens = lens.to_vec();
-        CodedShard { cell_id, dim, n_components, has_basis, n_groups, is_exact, row_lens, origin }
+        let centroid_lens = lens.to_vec();
+        CodedShard { cell_id, dim, n_components, has_basis, n_subspaces, is_exact, centroid_lens, origin }
             .build(random)
     };
     lens.into_iter().enumerate().map(&mut build).collect()
@@ -49,18 +49,18 @@ fn shards_of(
 /// The score of a Gaussian as the format and the module define it, from the rounded parts, one by one.
 fn defined_score(search: &Search<'_>, shard_at: usize, index: usize) -> f32 {
     let shard = &search.shards[shard_at];
-    let (row, scores) = (shard.row_of(index), &search.scored.shards[shard_at]);
+    let (centroid, scores) = (shard.row_of(index), &search.scored.shards[shard_at]);
     let product = |place: &usize| {
-        let own = scores.rows[*place][row];
+        let own = scores.centroids[*place][centroid];
         let Some(residuals) = shard.residuals.filter(|_| search.precision != Precision::Rows) else {
             return own;
         };
-        let (tables, scale) = (&scores.projections[*place].tables, residuals.row_scales[row]);
+        let (tables, scale) = (&scores.projections[*place].tables, residuals.residual_scales[centroid]);
         let value = |group: usize| {
             let half = if group.is_multiple_of(2) { &tables.low } else { &tables.high };
             u32::from(half[group / 2][residuals.code(index, group)])
         };
-        let sum: u32 = (0..shard.header.n_groups as usize).map(value).sum();
+        let sum: u32 = (0..shard.header.n_subspaces as usize).map(value).sum();
         (own + scale * tables.offset) + scale * tables.step * sum as f32
     };
     let products: Vec<f32> = search.places.iter().map(product).collect();
@@ -83,19 +83,19 @@ fn scores_are_within_the_stated_error() {
                 for (at, (shard, built)) in views.iter().zip(&built).enumerate() {
                     let cell = search.cell(at).expect("searched");
                     for (index, embedding) in built.embeddings.iter().enumerate() {
-                        let row = shard.row_of(index);
+                        let centroid = shard.row_of(index);
                         let found = f64::from(defined_score(&search, at, index));
                         let mut decoded = vec![0.0; shape.0];
                         match precision {
                             Precision::Exact | Precision::Measured => shard.decode(index, &mut decoded),
-                            Precision::Rows => shard.decode_row(row, &mut decoded),
+                            Precision::Rows => shard.decode_centroid(centroid, &mut decoded),
                         }
                         let rounding = (found - score_in_f64(&question, decoded.iter().copied())).abs();
                         let truth = score_in_f64(&question, embedding.iter().map(|e| f64::from(*e)));
-                        let bound = cell.score_error(row);
+                        let bound = cell.score_error(centroid);
                         let of_rounding = match (&shard.residuals, precision) {
-                            (Some(_), Precision::Rows) => cell.row_error(row),
-                            _ => bound - search.steepness * shard.radii[row],
+                            (Some(_), Precision::Rows) => cell.centroid_error(centroid),
+                            _ => bound - search.steepness * shard.radii[centroid],
                         };
                         let share = rounding / f64::from(of_rounding);
                         assert!(
@@ -104,7 +104,7 @@ fn scores_are_within_the_stated_error() {
                         );
                         assert!(share <= 1.0, "{shape:?} {precision:?} {rounding} {of_rounding}");
                         largest_share = largest_share.max(share);
-                        let (lower, upper) = cell.bounds(row);
+                        let (lower, upper) = cell.bounds(centroid);
                         let (lower, upper) = (f64::from(lower), f64::from(upper));
                         assert!(lower <= found && found <= upper, "{shape:?} {lower} {found} {upper}");
                     }
@@ -161,10 +161,10 @@ fn answers_are_those_of_brute_force() {
                 assert_eq!(found.len(), expected.len(), "{shape:?} {precision:?} {threshold}");
                 for ((found, _), expected) in found.iter().zip(&expected) {
                     assert_eq!((found.shard, found.index), (expected.shard, expected.index));
-                    // Of a row that is in as a whole, its own score is given.
-                    let row = views[found.shard as usize].row_of(found.index as usize);
+                    // Of a centroid that is in as a whole, its own score is given.
+                    let centroid = views[found.shard as usize].row_of(found.index as usize);
                     let cell = search.cell(found.shard as usize).expect("searched");
-                    assert!(found.score == expected.score || found.score == cell.rows[row]);
+                    assert!(found.score == expected.score || found.score == cell.centroids[centroid]);
                 }
                 let mut columns = Columns::default();
                 columns.set_runs(&views, &matches.runs);
@@ -194,7 +194,7 @@ fn answers_are_those_of_brute_force() {
             }
         }
     }
-    assert!(n_scanned * 2 < n_all, "the rows served for nothing: {n_scanned} of {n_all}");
+    assert!(n_scanned * 2 < n_all, "the centroids served for nothing: {n_scanned} of {n_all}");
     assert!(n_scanned * 20 > n_all, "hardly any code was read: {n_scanned} of {n_all}");
 }
 
@@ -221,9 +221,11 @@ fn measured_errors_decide_as_defined() {
                 let exact = shard.exact.expect("exact");
                 shard.decode_fine(index, &exact.fine.expect("fine"), &mut decoded);
                 let cell = search.cell(at).expect("searched");
-                let (row, fine) = (shard.row_of(index), score_in_f64(&question, decoded.iter().copied()));
-                let (of_row, bound) = (f64::from(cell.rows[row]), f64::from(cell.embedding_bound(row)));
-                let fine = fine.clamp(of_row - bound, of_row + bound);
+                let (centroid, fine) =
+                    (shard.row_of(index), score_in_f64(&question, decoded.iter().copied()));
+                let (of_centroid, bound) =
+                    (f64::from(cell.centroids[centroid]), f64::from(cell.embedding_bound(centroid)));
+                let fine = fine.clamp(of_centroid - bound, of_centroid + bound);
                 let embedding = &exact.embeddings[index * shape.0..][..shape.0];
                 let exact = score_in_f64(&question, embedding.iter().map(|v| v.to_f64()));
                 [defined_score(&search, at, index), fine as f32, exact as f32]
@@ -294,30 +296,36 @@ fn the_largest_numbers_do_no_harm() {
         let built = shards(&mut random, shape);
         let view = built[0].view();
         let mut header = view.header;
-        header.row_step = 64.0;
-        let rows = vec![-128i8; view.rows.len()];
+        header.centroid_step = 64.0;
+        let centroids = vec![-128i8; view.centroids.len()];
         let (mean, vectors) = (vec![f16::MAX; shape.0], vec![-128i8; shape.0 * shape.1]);
         let steps = vec![64.0; shape.1];
         let basis =
             view.basis.map(|_| slag_common::shard::Basis { mean: &mean, vectors: &vectors, steps: &steps });
-        let n = view.header.n_rows as usize;
-        let words: Vec<f16> = match view.residuals {
+        let n = view.header.n_centroids as usize;
+        let codewords: Vec<f16> = match view.residuals {
             Some(residuals) => {
-                (0..residuals.words.len()).map(|i| if i % 3 == 0 { f16::MAX } else { f16::MIN }).collect()
+                (0..residuals.codewords.len()).map(|i| if i % 3 == 0 { f16::MAX } else { f16::MIN }).collect()
             }
             None => Vec::new(),
         };
-        let (scales, reaches, radii) =
+        let (scales, residual_norms, radii) =
             (vec![64.0; n], vec![if at % 2 == 0 { 0.0 } else { 64.0 }; n], vec![64.0; n]);
         let residuals = view.residuals.map(|old| slag_common::shard::Residuals {
-            words: &words,
-            row_scales: &scales,
-            reaches: &reaches,
+            codewords: &codewords,
+            residual_scales: &scales,
+            residual_norms: &residual_norms,
             ..old
         });
         let mut bytes = Vec::new();
-        let hostile =
-            slag_common::shard::ShardView { header, rows: &rows, basis, residuals, radii: &radii, ..view };
+        let hostile = slag_common::shard::ShardView {
+            header,
+            centroids: &centroids,
+            basis,
+            residuals,
+            radii: &radii,
+            ..view
+        };
         hostile.write(&mut bytes).expect("writes to memory");
         let bytes = AlignedBytes::copy_of(&bytes);
         let layout = ShardLayout::check(&bytes).expect("allowed");

@@ -1,4 +1,4 @@
-//! Gathers what reaches a threshold: rows as a whole where their bounds decide, members where not.
+//! Gathers what reaches a threshold: centroids as a whole where their bounds decide, members where not.
 
 use std::ops::Range;
 
@@ -6,9 +6,9 @@ use half::f16;
 use rayon::prelude::*;
 use slag_common::shard::{BLOCK, ExactColumns, Residuals, ShardView};
 
+use super::centroids::{ShardScores, combine};
 use super::dot::EmbeddingTimesVector;
 use super::project::Projection;
-use super::rows::{ShardScores, combine};
 use super::select::{BINS, bin_of};
 use super::simd::{BlockSums, FindSums, LastBlock, Level, SomeRowsTimesVector};
 use super::{Effort, F16_ROUNDING, Matches, Precision, Region, Run, Search};
@@ -51,7 +51,7 @@ pub(super) struct ShardGather {
     pub found: Matches,
     /// Sums of codes of one block, by vector of the question.
     last: Vec<LastBlock>,
-    /// Members of one row that reach a sum.
+    /// Members of one centroid that reach a sum.
     sums: Vec<(u32, u16)>,
     refine: Refine,
     /// Whether matches are only to be counted.
@@ -60,7 +60,7 @@ pub(super) struct ShardGather {
     pub bins: Vec<u32>,
 }
 
-/// Memory for members of one row that are looked at more closely.
+/// Memory for members of one centroid that are looked at more closely.
 #[derive(Default)]
 struct Refine {
     /// Members with the scores of their codes, then better ones.
@@ -73,7 +73,7 @@ struct Refine {
     scores: Vec<f32>,
 }
 
-/// What members are scored by, beyond their row.
+/// What members are scored by, beyond their centroid.
 #[derive(Clone, Copy)]
 enum Detail<'a> {
     Nothing,
@@ -115,17 +115,17 @@ pub(super) struct Cell<'a> {
     shard: &'a ShardView<'a>,
     search: &'a Search<'a>,
     scores: &'a ShardScores,
-    /// The question's score of each row.
-    pub rows: &'a [f32],
+    /// The question's score of each centroid.
+    pub centroids: &'a [f32],
     detail: Detail<'a>,
     /// The region, where the shard sticks out of it.
     pub filter: Option<Region>,
     level: Level,
     /// How much a score moves at most with a residual of length 1, in components.
     component_steepness: f32,
-    /// Rounding in tables for a row scale of 1.
+    /// Rounding in tables for a centroid scale of 1.
     table_error: f32,
-    /// Sum over vectors of the largest that tables name, for a row scale of 1.
+    /// Sum over vectors of the largest that tables name, for a centroid scale of 1.
     table_reach: f32,
 }
 
@@ -136,8 +136,8 @@ impl<'a> Search<'a> {
         if !scores.is_searched {
             return None;
         }
-        let rows = match self.places.len() {
-            1 => &scores.rows[self.places[0]],
+        let centroids = match self.places.len() {
+            1 => &scores.centroids[self.places[0]],
             _ => &scores.combined[self.asked],
         };
         let detail = match (&shard.exact, &shard.residuals) {
@@ -159,7 +159,7 @@ impl<'a> Search<'a> {
             shard,
             search: self,
             scores,
-            rows,
+            centroids,
             detail,
             filter,
             level: Level::widest(),
@@ -173,8 +173,8 @@ impl<'a> Search<'a> {
         Some(cell)
     }
 
-    /// Gathers what reaches a threshold. `each`: members of shards that know more of them than their row get
-    /// scores of their own even where the row alone decides.
+    /// Gathers what reaches a threshold. `each`: members of shards that know more of them than their centroid get
+    /// scores of their own even where the centroid alone decides.
     pub(super) fn collect(&self, gather: &mut Gather, cut: Cut, each: bool) {
         gather.shards.resize_with(self.shards.len(), ShardGather::default);
         gather.shards.par_iter_mut().enumerate().for_each(|(at, gather)| {
@@ -186,7 +186,7 @@ impl<'a> Search<'a> {
         });
     }
 
-    /// Counts what reaches a threshold, each by its own score, of rows whose own score reaches `floor`.
+    /// Counts what reaches a threshold, each by its own score, of centroids whose own score reaches `floor`.
     pub(super) fn count(&self, gather: &mut Gather, threshold: f32, floor: f32) {
         gather.shards.resize_with(self.shards.len(), ShardGather::default);
         gather.shards.par_iter_mut().enumerate().for_each(|(at, gather)| {
@@ -201,7 +201,7 @@ impl<'a> Search<'a> {
 }
 
 impl Cell<'_> {
-    /// Whether a member's score may differ from its row's.
+    /// Whether a member's score may differ from its centroid's.
     pub fn has_detail(&self) -> bool {
         !matches!(self.detail, Detail::Nothing)
     }
@@ -213,7 +213,7 @@ impl Cell<'_> {
     /// Sets what depends on the question and the residual code alone.
     fn measure(&mut self, residuals: &Residuals<'_>) {
         // Components that no group has do not take part.
-        let n_coded = residuals.group_starts.last().map_or(0, |end| *end as usize);
+        let n_coded = residuals.subspace_starts.last().map_or(0, |end| *end as usize);
         let mut projections = self.projections();
         let own = projections.next().map_or(&[][..], |own| &own.components[..n_coded]);
         let length = |squares: f64| (squares.sqrt() * (1.0 + f64::from(f32::EPSILON))) as f32;
@@ -233,43 +233,44 @@ impl Cell<'_> {
     }
 
     /// Returns a member's score by one vector for a sum of codes of 0, and what each step of the sum adds.
-    fn line(&self, place: usize, row: usize, residuals: &Residuals<'_>) -> (f32, f32) {
-        let (tables, scale) = (&self.scores.projections[place].tables, residuals.row_scales[row]);
-        (self.scores.rows[place][row] + scale * tables.offset, scale * tables.step)
+    fn line(&self, place: usize, centroid: usize, residuals: &Residuals<'_>) -> (f32, f32) {
+        let (tables, scale) = (&self.scores.projections[place].tables, residuals.residual_scales[centroid]);
+        (self.scores.centroids[place][centroid] + scale * tables.offset, scale * tables.step)
     }
 
-    /// Returns by how much members' scores differ at most from their row's through the residual code.
-    fn residual_bound(&self, row: usize, residuals: &Residuals<'_>) -> f32 {
-        let scale = residuals.row_scales[row];
-        let apart = residuals.reaches[row] * self.component_steepness + scale * self.table_error;
+    /// Returns by how much members' scores differ at most from their centroid's through the residual code.
+    fn residual_bound(&self, centroid: usize, residuals: &Residuals<'_>) -> f32 {
+        let scale = residuals.residual_scales[centroid];
+        let apart = residuals.residual_norms[centroid] * self.component_steepness + scale * self.table_error;
         // Three roundings in each line, and those of the bound itself.
-        apart * (1.0 + 4.0 * f32::EPSILON) + self.rounding(row, residuals)
+        apart * (1.0 + 4.0 * f32::EPSILON) + self.rounding(centroid, residuals)
     }
 
     /// Returns a bound on what the rounding in f32 of a member's score comes to.
-    fn rounding(&self, row: usize, residuals: &Residuals<'_>) -> f32 {
-        let of_rows: f32 = self.search.places.iter().map(|place| self.scores.rows[*place][row].abs()).sum();
-        2.0 * f32::EPSILON * (of_rows + residuals.row_scales[row] * self.table_reach)
+    fn rounding(&self, centroid: usize, residuals: &Residuals<'_>) -> f32 {
+        let of_centroids: f32 =
+            self.search.places.iter().map(|place| self.scores.centroids[*place][centroid].abs()).sum();
+        2.0 * f32::EPSILON * (of_centroids + residuals.residual_scales[centroid] * self.table_reach)
     }
 
-    /// Returns two scores that a row's members lie between.
-    pub fn bounds(&self, row: usize) -> (f32, f32) {
-        let score = self.rows[row];
+    /// Returns two scores that a centroid's members lie between.
+    pub fn bounds(&self, centroid: usize) -> (f32, f32) {
+        let score = self.centroids[centroid];
         match &self.detail {
             Detail::Nothing => (score, score),
             Detail::Embeddings(_) => {
-                let slack = self.embedding_bound(row);
+                let slack = self.embedding_bound(centroid);
                 (score - slack, score + slack)
             }
             Detail::Residuals(residuals) | Detail::Measured(Measured { residuals, .. }) => {
-                let apart = self.residual_bound(row, residuals);
+                let apart = self.residual_bound(centroid, residuals);
                 if let [place] = self.search.places[..] {
-                    let (least, step) = self.line(place, row, residuals);
+                    let (least, step) = self.line(place, centroid, residuals);
                     let most = least + step * f32::from(self.scores.projections[place].tables.most);
                     return (least.max(score - apart), most.min(score + apart));
                 }
                 let ends = |place: &usize| {
-                    let (least, step) = self.line(*place, row, residuals);
+                    let (least, step) = self.line(*place, centroid, residuals);
                     let most = self.scores.projections[*place].tables.most;
                     (least, least + step * f32::from(most))
                 };
@@ -283,44 +284,47 @@ impl Cell<'_> {
         }
     }
 
-    /// Returns by how much a stored embedding's score may differ from its row's.
-    pub fn embedding_bound(&self, row: usize) -> f32 {
+    /// Returns by how much a stored embedding's score may differ from its centroid's.
+    pub fn embedding_bound(&self, centroid: usize) -> f32 {
         let question = self.search.question;
-        let distance = self.shard.radii[row] + F16_ROUNDING;
-        self.search.steepness * distance + 2.0 * question.rounding_bound() + self.row_error(row)
+        let distance = self.shard.radii[centroid] + F16_ROUNDING;
+        self.search.steepness * distance + 2.0 * question.rounding_bound() + self.centroid_error(centroid)
     }
 
-    /// Returns a bound on what rounding changes a row's score by.
-    pub fn row_error(&self, row: usize) -> f32 {
+    /// Returns a bound on what rounding changes a centroid's score by.
+    pub fn centroid_error(&self, centroid: usize) -> f32 {
         let error = |projection: &Projection| {
-            // Members are of unit length, so that the row is no longer than 1 and their distance from it.
-            let length = 1.0 + self.shard.radii[row] + projection.mean_length;
+            // Members are of unit length, so that the centroid is no longer than 1 and their distance from it.
+            let length = 1.0 + self.shard.radii[centroid] + projection.mean_length;
             projection.error_per_length * length + projection.error + f32::EPSILON * (1.0 + length)
         };
         let mut errors = self.projections().map(error);
         errors.next().unwrap_or(0.0) + errors.fold(0.0, f32::max)
     }
 
-    /// Returns a bound on the error of the row's score, or of its members' own where they are scored by
+    /// Returns a bound on the error of the centroid's score, or of its members' own where they are scored by
     /// a residual code.
-    pub fn score_error(&self, row: usize) -> f32 {
-        let of_rows = self.search.steepness * self.shard.radii[row] + self.row_error(row);
+    pub fn score_error(&self, centroid: usize) -> f32 {
+        let of_centroids = self.search.steepness * self.shard.radii[centroid] + self.centroid_error(centroid);
         let of_codes = |residuals: &Residuals<'_>| {
-            of_rows + residuals.row_scales[row] * self.table_error + self.rounding(row, residuals)
+            of_centroids
+                + residuals.residual_scales[centroid] * self.table_error
+                + self.rounding(centroid, residuals)
         };
         match (&self.detail, &self.shard.residuals) {
             (Detail::Residuals(residuals), _) => of_codes(residuals),
-            // Beside exact embeddings, radii are measured to the row.
+            // Beside exact embeddings, radii are measured to the centroid.
             (Detail::Measured(Measured { residuals, .. }), _) => {
-                let by_code = of_codes(residuals) + residuals.reaches[row] * self.component_steepness;
-                // Score and truth lie within that bound of the row's score.
-                by_code.max(2.0 * self.embedding_bound(row))
+                let by_code =
+                    of_codes(residuals) + residuals.residual_norms[centroid] * self.component_steepness;
+                // Score and truth lie within that bound of the centroid's score.
+                by_code.max(2.0 * self.embedding_bound(centroid))
             }
-            // Radii are measured to what row and code decode to.
+            // Radii are measured to what centroid and code decode to.
             (_, Some(residuals)) if self.shard.exact.is_none() => {
-                of_rows + residuals.reaches[row] * self.component_steepness
+                of_centroids + residuals.residual_norms[centroid] * self.component_steepness
             }
-            _ => of_rows,
+            _ => of_centroids,
         }
     }
 
@@ -332,38 +336,39 @@ impl Cell<'_> {
             _ => 0.0,
         };
         let mut is_reachable = false;
-        for row in 0..self.rows.len() {
-            if self.rows[row] < floor {
+        for centroid in 0..self.centroids.len() {
+            if self.centroids[centroid] < floor {
                 continue;
             }
-            let (lower, upper) = self.bounds(row);
+            let (lower, upper) = self.bounds(centroid);
             if upper + margin < cut.score {
                 continue;
             }
             is_reachable = true;
             let is_undecided = lower - margin < cut.score;
             let is_scanned = is_undecided || each;
-            let members = self.shard.row_starts[row] as usize..self.shard.row_starts[row + 1] as usize;
+            let members = self.shard.centroid_starts[centroid] as usize
+                ..self.shard.centroid_starts[centroid + 1] as usize;
             for inside in runs_inside(self.shard, self.filter, members) {
                 match self.detail {
                     Detail::Residuals(residuals) if is_scanned => {
-                        self.scan(gather, &residuals, row, inside, cut.score);
+                        self.scan(gather, &residuals, centroid, inside, cut.score);
                         self.push_scanned(gather);
                     }
                     Detail::Measured(measured) if is_scanned => {
-                        self.scan(gather, &measured.residuals, row, inside, cut.score - margin);
+                        self.scan(gather, &measured.residuals, centroid, inside, cut.score - margin);
                         if margin > 0.0 {
-                            self.refine(gather, &measured, row, cut);
+                            self.refine(gather, &measured, centroid, cut);
                         }
                         self.push_scanned(gather);
                     }
                     Detail::Embeddings(embeddings) if is_scanned => {
                         self.rescore(gather, embeddings, inside, cut.score);
                     }
-                    _ => self.push(gather, inside, self.rows[row]),
+                    _ => self.push(gather, inside, self.centroids[centroid]),
                 }
             }
-            gather.found.n_rows_undecided += u64::from(is_undecided);
+            gather.found.n_centroids_undecided += u64::from(is_undecided);
         }
         gather.found.n_shards_below = usize::from(!is_reachable);
     }
@@ -398,12 +403,12 @@ impl Cell<'_> {
         combine(products.next().unwrap_or(0.0), products)
     }
 
-    /// Scores members of a row by their codes; those that reach the threshold are kept in `gather.refine`.
+    /// Scores members of a centroid by their codes; those that reach the threshold are kept in `gather.refine`.
     fn scan(
         &self,
         gather: &mut ShardGather,
         residuals: &Residuals<'_>,
-        row: usize,
+        centroid: usize,
         members: Range<usize>,
         threshold: f32,
     ) {
@@ -413,7 +418,7 @@ impl Cell<'_> {
         let [first, others @ ..] = &mut last[..] else { return };
         let places = &self.search.places;
         let tables = &self.scores.projections[places[0]].tables;
-        let (own, step) = self.line(places[0], row, residuals);
+        let (own, step) = self.line(places[0], centroid, residuals);
         // The score grows with the sum, so that sums are compared and only what matches is scored.
         let is_single = places.len() == 1;
         let least = if is_single { least_sum(own, step, tables.most, threshold) } else { Some(0) };
@@ -439,7 +444,7 @@ impl Cell<'_> {
                 if last.block != Some(block) {
                     *last = self.sum_block(residuals, *place, block);
                 }
-                let (least, step) = self.line(*place, row, residuals);
+                let (least, step) = self.line(*place, centroid, residuals);
                 least + step * f32::from(last.sums[within])
             });
             let score = combine(own + step * f32::from(*sum), negatives);
@@ -469,7 +474,7 @@ impl Cell<'_> {
     }
 
     /// Scores members near the border by what is known better of them, and drops those that are out.
-    fn refine(&self, gather: &mut ShardGather, measured: &Measured<'_>, row: usize, cut: Cut) {
+    fn refine(&self, gather: &mut ShardGather, measured: &Measured<'_>, centroid: usize, cut: Cut) {
         let ShardGather { refine, found, .. } = gather;
         let Refine { members, undecided, which, products, scores } = refine;
         undecided.clear();
@@ -486,17 +491,20 @@ impl Cell<'_> {
             for place in &self.search.places {
                 let rounded = &self.scores.projections[*place].fine;
                 let n_components = self.shard.header.n_components as usize;
-                let (rows, vector) = (fine.values, &rounded.steps[..]);
-                self.level.dispatch(SomeRowsTimesVector { rows, n_components, vector, which, products });
-                let (own, step) = (self.scores.rows[*place][row], f64::from(fine.scales[row]) * rounded.step);
+                let (centroids, vector) = (fine.values, &rounded.steps[..]);
+                self.level.dispatch(SomeRowsTimesVector { centroids, n_components, vector, which, products });
+                let (own, step) = (
+                    self.scores.centroids[*place][centroid],
+                    f64::from(fine.scales[centroid]) * rounded.step,
+                );
                 scores.extend(products.iter().map(|product| own + (step * f64::from(*product)) as f32));
             }
             for (number, (place, _)) in undecided.iter().enumerate() {
                 let mut products = scores[number..].iter().step_by(which.len()).copied();
                 let score = combine(products.next().unwrap_or(0.0), products);
                 // Where the embedding's own score is, whatever the residual says.
-                let (of_row, bound) = (self.rows[row], self.embedding_bound(row));
-                members[*place].1 = score.max(of_row - bound).min(of_row + bound);
+                let (of_centroid, bound) = (self.centroids[centroid], self.embedding_bound(centroid));
+                members[*place].1 = score.max(of_centroid - bound).min(of_centroid + bound);
             }
         }
         for (place, of_code) in undecided.iter() {

@@ -25,7 +25,7 @@ pub struct Columns {
     pub z: Vec<f64>,
 }
 
-/// The same rows of all columns.
+/// The same centroids of all columns.
 struct Part<'a> {
     shard: &'a mut [u32],
     index: &'a mut [u32],
@@ -50,11 +50,11 @@ fn position_in_world(shard: &ShardView<'_>, index: usize) -> [f64; 3] {
     let header = &shard.header;
     let steps = match shard.positions {
         Positions::Wide(steps) => steps[index].map(u32::from),
-        Positions::Packed(words) => {
+        Positions::Packed(codewords) => {
             let [x, y, z, _] = header.position_bits.map(u32::from);
-            let word = u64::from(words[index]);
-            let low = |word: u64, bits: u32| (word & ((1 << bits) - 1)) as u32;
-            [low(word, x), low(word >> x, y), low(word >> (x + y), z)]
+            let codeword = u64::from(codewords[index]);
+            let low = |codeword: u64, bits: u32| (codeword & ((1 << bits) - 1)) as u32;
+            [low(codeword, x), low(codeword >> x, y), low(codeword >> (x + y), z)]
         }
     };
     std::array::from_fn(|axis| {
@@ -84,7 +84,7 @@ impl Columns {
     /// Becomes the columns of [`super::Search::matching`]'s answer, in its order.
     pub fn set_runs(&mut self, shards: &[ShardView<'_>], runs: &[Run]) {
         let mut n = 0usize;
-        // Where each chunk of rows starts: a run, and a member of it.
+        // Where each chunk of centroids starts: a run, and a member of it.
         let mut starts = Vec::new();
         for (place, run) in runs.iter().enumerate() {
             let len = (run.end - run.start) as usize;

@@ -19,18 +19,18 @@ pub(super) fn widen(value: f16) -> f32 {
     f32::from_bits((bits & 0x8000) << 16 | (bits & 0x7fff) << 13) * BIAS
 }
 
-/// Returns `row · vector`, summed in f32 in a fixed order: the same bits on every machine and for
-/// any number of threads. Components past the shorter one's end are ignored; the row must be finite
+/// Returns `centroid · vector`, summed in f32 in a fixed order: the same bits on every machine and for
+/// any number of threads. Components past the shorter one's end are ignored; the centroid must be finite
 /// (a checked shard's is).
 #[inline(always)]
-pub fn dot(row: &[f16], vector: &[f32]) -> f32 {
+pub fn dot(centroid: &[f16], vector: &[f32]) -> f32 {
     let mut lanes = [0.0f32; LANES];
     let mut products = [0.0f32; BLOCK];
-    for (row, vector) in row.chunks(BLOCK).zip(vector.chunks(BLOCK)) {
-        let n = row.len().min(vector.len());
+    for (centroid, vector) in centroid.chunks(BLOCK).zip(vector.chunks(BLOCK)) {
+        let n = centroid.len().min(vector.len());
         // One plain loop each for products and for every halving: the compiler turns those, and not
         // one loop over eight running sums, into vector instructions.
-        for ((product, a), b) in products.iter_mut().zip(row).zip(vector) {
+        for ((product, a), b) in products.iter_mut().zip(centroid).zip(vector) {
             *product = widen(*a) * b;
         }
         let mut width = n.next_power_of_two().max(LANES);
@@ -64,7 +64,7 @@ impl Work for EmbeddingTimesVector<'_> {
 
 /// Returns a bound on the error of [`dot`] for unit vectors: each product passes at most 1 + 6
 /// roundings in its block, one per block and 3 at the end, of 2^-24 each, and the absolute products sum
-/// to at most 1; doubled, since a stored row may be a little longer than 1.
+/// to at most 1; doubled, since a stored centroid may be a little longer than 1.
 pub fn rounding_bound(dim: usize) -> f32 {
     (dim.div_ceil(BLOCK) + 10) as f32 * f32::EPSILON
 }
@@ -88,16 +88,16 @@ mod tests {
         /// Oracle: a plain f64 sum.
         #[test]
         fn equals_a_float64_sum(pairs in prop::collection::vec((-1.0f32..1.0, -1.0f32..1.0), 0..1300)) {
-            let row: Vec<f16> = pairs.iter().map(|(a, _)| f16::from_f32(*a)).collect();
+            let centroid: Vec<f16> = pairs.iter().map(|(a, _)| f16::from_f32(*a)).collect();
             let vector: Vec<f32> = pairs.iter().map(|(_, b)| *b).collect();
-            let terms = || row.iter().zip(&vector).map(|(a, b)| a.to_f64() * f64::from(*b));
+            let terms = || centroid.iter().zip(&vector).map(|(a, b)| a.to_f64() * f64::from(*b));
             let expected: f64 = terms().sum();
             let absolute: f64 = terms().map(f64::abs).sum();
             let bound = f64::from(rounding_bound(pairs.len())) * absolute + 1e-30;
-            prop_assert!((f64::from(dot(&row, &vector)) - expected).abs() <= bound);
+            prop_assert!((f64::from(dot(&centroid, &vector)) - expected).abs() <= bound);
             for level in Level::available() {
-                let found = level.dispatch(EmbeddingTimesVector(&row, &vector));
-                prop_assert_eq!(found.to_bits(), dot(&row, &vector).to_bits(), "{}", level.name());
+                let found = level.dispatch(EmbeddingTimesVector(&centroid, &vector));
+                prop_assert_eq!(found.to_bits(), dot(&centroid, &vector).to_bits(), "{}", level.name());
             }
         }
     }

@@ -1,19 +1,20 @@
-//! Scores questions against shards, palette row by palette row.
+//! Scores questions against shards, codebook centroid by codebook centroid.
 //!
-//! A row's radius `r` bounds `||E_k - P[row]||` over its members, so a score of a member is within
-//! `r * steepness` of the row's, where the steepness is 1 for a plain cosine and `max_j ||q - n_j||` with
-//! negatives; what rounding adds is in `project.rs`. Where a shard knows more of a Gaussian than its row, a
-//! residual code or the exact embedding (and that is asked for), rows that stay at or above the threshold
-//! by more than that are in as a whole, rows below it by more are out, and only members of the rows
-//! between are scored one by one. Where it does not, a row is in when its own score reaches the threshold,
+//! A centroid's radius `r` bounds `||E_k - P[centroid]||` over its members, so a score of a member is within
+//! `r * steepness` of the centroid's, where the steepness is 1 for a plain cosine and `max_j ||q - n_j||` with
+//! negatives; what rounding adds is in `project.rs`. Where a shard knows more of a Gaussian than its centroid, a
+//! residual code or the exact embedding (and that is asked for), centroids that stay at or above the threshold
+//! by more than that are in as a whole, centroids below it by more are out, and only members of the centroids
+//! between are scored one by one. Where it does not, a centroid is in when its own score reaches the threshold,
 //! and the answer carries the bound.
 //!
 //! Hard bounds of codes are tens of times their usual errors, so that exact answers read most embeddings near the
 //! border. With [`Precision::Measured`], codes decide all but what lies within a few of their measured errors
 //! from it, fine residuals all of that but what lies within a few of theirs, and embeddings the rest.
 //!
-//! Scores of rows and codes are sums of integers, scaled once: the same bits on every processor.
+//! Scores of centroids and codes are sums of integers, scaled once: the same bits on every processor.
 
+mod centroids;
 mod collect;
 mod columns;
 mod dot;
@@ -21,7 +22,6 @@ mod objects;
 mod project;
 mod question;
 mod region;
-mod rows;
 mod select;
 mod simd;
 
@@ -31,22 +31,22 @@ use rayon::prelude::*;
 use serde::Serialize;
 use slag_common::shard::{ScoreErrors, ShardView};
 
+use centroids::Scored;
 use collect::{Cell, Cut, Gather, ShardGather};
-use rows::Scored;
 
+pub use centroids::Scratch;
 pub use columns::Columns;
 pub use dot::{dot, rounding_bound};
 pub use objects::{ObjectScores, score_objects};
 pub use question::{Question, RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
 pub use region::{Ball, Region};
-pub use rows::Scratch;
 pub use select::Hit;
 pub use simd::Level;
 
 /// Positions beyond this many world units are no scene (a hundred times the earth's diameter) and
 /// would overflow what is computed from them.
 pub const MAX_COORDINATE: f64 = 1e9;
-/// How far a unit embedding stored as f16 may lie from the one its row's radius was measured to: half a
+/// How far a unit embedding stored as f16 may lie from the one its centroid's radius was measured to: half a
 /// step of f16 at 1 (2^-11), and the steps of components too small for f16's exponents.
 const F16_ROUNDING: f32 = 5e-4;
 
@@ -97,7 +97,7 @@ pub enum ScoreError {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Precision {
-    /// Palette rows alone: fastest, every score within the bound stated.
+    /// Codebook centroids alone: fastest, every score within the bound stated.
     Rows,
     /// As `Exact`, but of shards with exact embeddings only those are read that the measured errors of codes,
     /// and of fine residuals, leave near the border of the answer. Nearly all of the exact answer, tens of times
@@ -116,7 +116,7 @@ impl Precision {
     /// Returns the name used in URLs and flags.
     pub fn name(self) -> &'static str {
         match self {
-            Self::Rows => "rows",
+            Self::Rows => "centroids",
             Self::Measured => "measured",
             Self::Exact => "exact",
         }
@@ -148,7 +148,7 @@ pub struct Run {
     pub start: u32,
     /// One past the last member.
     pub end: u32,
-    /// Score of the row, or of the one Gaussian where it was scored by itself.
+    /// Score of the centroid, or of the one Gaussian where it was scored by itself.
     pub score: f32,
 }
 
@@ -160,10 +160,10 @@ pub struct Matches {
     /// Gaussians in the runs.
     pub n_gaussians: u64,
     /// Rows that could only be decided member by member.
-    pub n_rows_undecided: u64,
+    pub n_centroids_undecided: u64,
     /// What finding them took.
     pub effort: Effort,
-    /// Shards none of whose rows can reach the threshold.
+    /// Shards none of whose centroids can reach the threshold.
     pub n_shards_below: usize,
 }
 
@@ -176,7 +176,7 @@ impl Matches {
     }
 }
 
-/// What finding an answer took, beyond the rows.
+/// What finding an answer took, beyond the centroids.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Effort {
     /// Gaussians that were scored by themselves.
@@ -198,7 +198,7 @@ impl std::ops::AddAssign for Effort {
     }
 }
 
-/// One question's row scores over some shards; gives several kinds of answers without scoring twice.
+/// One question's centroid scores over some shards; gives several kinds of answers without scoring twice.
 pub struct Search<'a> {
     shards: &'a [ShardView<'a>],
     question: &'a Question,
@@ -213,7 +213,7 @@ pub struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
-    /// Scores the rows of the shards that reach into the region. As [`Search::batch`], for one question.
+    /// Scores the centroids of the shards that reach into the region. As [`Search::batch`], for one question.
     ///
     /// # Errors
     /// [`ScoreError`].
@@ -244,9 +244,9 @@ impl<'a> Search<'a> {
         Ok(Self { shards, question, region, precision, scored, places, asked: 0, steepness })
     }
 
-    /// Scores the rows for several questions in one pass; returns a search for each, in their order.
+    /// Scores the centroids for several questions in one pass; returns a search for each, in their order.
     ///
-    /// Costs one product per row, component and distinct vector (negatives that questions share are
+    /// Costs one product per centroid, component and distinct vector (negatives that questions share are
     /// multiplied once), in parallel by shard.
     /// In the memory of earlier searches that are over (else in new memory).
     /// # Errors
@@ -283,7 +283,7 @@ impl<'a> Search<'a> {
         for ShardGather { found, .. } in &gather.shards {
             all.runs.extend_from_slice(&found.runs);
             all.n_gaussians += found.n_gaussians;
-            all.n_rows_undecided += found.n_rows_undecided;
+            all.n_centroids_undecided += found.n_centroids_undecided;
             all.effort += found.effort;
             all.n_shards_below += found.n_shards_below;
         }
@@ -311,12 +311,13 @@ impl<'a> Search<'a> {
         searched.map(|(shard, _)| shard)
     }
 
-    /// Returns the bound on the error of scores: none given here, of a row or a Gaussian, is off from
+    /// Returns the bound on the error of scores: none given here, of a centroid or a Gaussian, is off from
     /// that of any embedding it stands for by more.
     pub fn score_error_bound(&self) -> f32 {
         let cells = (0..self.shards.len()).into_par_iter().filter_map(|at| self.cell(at));
-        let of_cell =
-            |cell: Cell<'_>| (0..cell.rows.len()).map(|row| cell.score_error(row)).fold(0.0, f32::max);
+        let of_cell = |cell: Cell<'_>| {
+            (0..cell.centroids.len()).map(|centroid| cell.score_error(centroid)).fold(0.0, f32::max)
+        };
         cells.map(of_cell).reduce(|| 0.0, f32::max)
     }
 

@@ -9,8 +9,8 @@ use rayon::prelude::*;
 use slag_common::objects::{MAX_VECTORS, Objects, object_score};
 use slag_common::shard::ShardView;
 
+use super::centroids::{combine, distinct};
 use super::project::{Projection, Vector, up};
-use super::rows::{combine, distinct};
 use super::simd::{Level, SomeRowsTimesVector};
 use super::{Question, ScoreError, check};
 use crate::store::objects::ObjectIndex;
@@ -94,32 +94,34 @@ fn of_vector(
     projection.set(level, shard, vector);
     let (n_vectors, n_components) = (objects.header.n_vectors, shard.header.n_components as usize);
     let mut scores = Vec::with_capacity(which.len());
-    let (mut rows, mut products, mut largest_step) = (Vec::new(), Vec::new(), 0.0f32);
+    let (mut centroids, mut products, mut largest_step) = (Vec::new(), Vec::new(), 0.0f32);
     for which in which.chunks(TOGETHER) {
-        rows.clear();
-        rows.extend(which.iter().flat_map(|(number, _)| number * n_vectors..(number + 1) * n_vectors));
+        centroids.clear();
+        centroids.extend(which.iter().flat_map(|(number, _)| number * n_vectors..(number + 1) * n_vectors));
         let vector = &projection.rounded.steps[..];
         products.clear();
         // Vectors of no components are the mean.
         match n_components {
-            0 => products.resize(rows.len(), 0),
+            0 => products.resize(centroids.len(), 0),
             _ => level.dispatch(SomeRowsTimesVector {
-                rows: objects.vectors,
+                centroids: objects.vectors,
                 n_components,
                 vector,
-                which: &rows,
+                which: &centroids,
                 products: &mut products,
             }),
         }
-        for (rows, products) in rows.chunks(n_vectors as usize).zip(products.chunks(n_vectors as usize)) {
+        for (centroids, products) in
+            centroids.chunks(n_vectors as usize).zip(products.chunks(n_vectors as usize))
+        {
             let mut cosines = [0.0; MAX_VECTORS as usize];
-            for ((cosine, row), product) in cosines.iter_mut().zip(rows).zip(products) {
-                let step = objects.steps[*row as usize];
+            for ((cosine, centroid), product) in cosines.iter_mut().zip(centroids).zip(products) {
+                let step = objects.steps[*centroid as usize];
                 let scale = f64::from(step) * projection.rounded.step;
                 *cosine = (projection.base + scale * f64::from(*product)) as f32;
                 largest_step = largest_step.max(step);
             }
-            scores.push(object_score(&cosines[..rows.len()]) + 0.0);
+            scores.push(object_score(&cosines[..centroids.len()]) + 0.0);
         }
     }
     let kept = f64::from(objects.header.score_error_bound);
@@ -149,10 +151,18 @@ mod tests {
 
     /// A shard with an object for each id, of a Gaussian each.
     fn built(random: &mut Random, (dim, m, has_basis): (usize, usize, bool), ids: &[u64]) -> BuiltShard {
-        let (cell_id, n_groups, is_exact, origin) = (1, 0, false, DVec3::ZERO);
-        let row_lens = vec![ids.len()];
-        let shard =
-            CodedShard { cell_id, dim, n_components: m, has_basis, n_groups, is_exact, row_lens, origin };
+        let (cell_id, n_subspaces, is_exact, origin) = (1, 0, false, DVec3::ZERO);
+        let centroid_lens = vec![ids.len()];
+        let shard = CodedShard {
+            cell_id,
+            dim,
+            n_components: m,
+            has_basis,
+            n_subspaces,
+            is_exact,
+            centroid_lens,
+            origin,
+        };
         let shard = shard.build(random);
         // Of length 1 at most, with the mean.
         let objects = (0..).zip(ids).map(|(at, id)| TestObject {

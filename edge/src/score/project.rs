@@ -1,20 +1,20 @@
 //! A question's vector as a cell sees it: rounded to 16 bits, in the cell's basis, and looked up by code.
 //!
 //! With `q^` the vector of the question `q` rounded to 16 bits and `y[c] = basis_steps[c] * basis[c] . q^`,
-//! a row scores `mean . q + row_step * rows[r] . y^`, where `y^` is `y` rounded to 16 bits; without a basis
+//! a centroid scores `mean . q + centroid_step * centroids[r] . y^`, where `y^` is `y` rounded to 16 bits; without a basis
 //! `y^` is `q^`. Both products are of integers. That is off from `q . P[r]` by at most
-//! `|q - q^| |P[r] - mean| + row_step |y - y^| |rows[r]|` (Cauchy-Schwarz).
+//! `|q - q^| |P[r] - mean| + centroid_step |y - y^| |centroids[r]|` (Cauchy-Schwarz).
 //!
-//! A residual code adds `row_scale * (offset + step * sum over groups of table[g][code])`, where
-//! `offset + step * table` is `words . y` rounded to 8 bits. That is off from the decoded residual's product
-//! by at most `|q - q^| |residual| + row_scale * sum over groups of the largest rounding in each`.
+//! A residual code adds `residual_scale * (offset + step * sum over groups of table[g][code])`, where
+//! `offset + step * table` is `codewords . y` rounded to 8 bits. That is off from the decoded residual's product
+//! by at most `|q - q^| |residual| + residual_scale * sum over groups of the largest rounding in each`.
 
-use slag_common::shard::{BLOCK, Fine, Residuals, ShardView, WORDS};
+use slag_common::shard::{BLOCK, CODEWORDS, Fine, Residuals, ShardView};
 
 use super::dot::widen;
 use super::simd::{Column, Level, MatrixTimesVector, PAD};
 
-/// A larger sum of absolute values, times the 128 of a row's largest component, would not fit 32 bits.
+/// A larger sum of absolute values, times the 128 of a centroid's largest component, would not fit 32 bits.
 const MOST_IN_SUM: u64 = (1 << 24) - 1;
 
 /// A vector in steps of 16 bits.
@@ -29,7 +29,7 @@ pub struct Rounded {
 }
 
 impl Rounded {
-    /// Rounds finite values with the smallest step that keeps every product with 8-bit rows in 32 bits.
+    /// Rounds finite values with the smallest step that keeps every product with 8-bit centroids in 32 bits.
     pub fn set(&mut self, values: &[f64]) {
         let largest = values.iter().fold(0.0f64, |most, v| most.max(v.abs()));
         let sum: f64 = values.iter().map(|v| v.abs()).sum();
@@ -70,10 +70,10 @@ impl Vector {
     }
 }
 
-/// Values of a residual code's words, in 8 bits.
+/// Values of a residual code's codewords, in 8 bits.
 #[derive(Clone, Debug, Default)]
 pub struct Tables {
-    /// `[G / 2]`: values of the even groups' words, twice over.
+    /// `[G / 2]`: values of the even groups' codewords, twice over.
     pub low: Vec<Column>,
     /// `[G / 2]`: of the odd groups'.
     pub high: Vec<Column>,
@@ -96,9 +96,9 @@ pub struct Projection {
     pub components: Vec<f64>,
     /// The same in 16 bits.
     pub rounded: Rounded,
-    /// Rounding's part in a row's score, for each unit of the row's distance from the mean.
+    /// Rounding's part in a centroid's score, for each unit of the centroid's distance from the mean.
     pub error_per_length: f32,
-    /// Rounding's part in a row's score beside that.
+    /// Rounding's part in a centroid's score beside that.
     pub error: f32,
     /// Length of the mean.
     pub mean_length: f32,
@@ -115,7 +115,7 @@ impl Projection {
     pub fn set(&mut self, level: Level, shard: &ShardView<'_>, vector: &Vector) {
         self.components.clear();
         let m = shard.header.n_components as usize;
-        let step = f64::from(shard.header.row_step);
+        let step = f64::from(shard.header.centroid_step);
         let Some(basis) = &shard.basis else {
             self.components.extend_from_slice(&vector.exact);
             self.rounded.clone_from(&vector.rounded);
@@ -126,7 +126,7 @@ impl Projection {
         self.components.resize(m, 0.0);
         let components = &mut self.components;
         level.dispatch(MatrixTimesVector {
-            rows: basis.vectors,
+            centroids: basis.vectors,
             n_components: vector.exact.len(),
             vector: &vector.rounded.steps,
             put: |at: usize, dot: i32| {
@@ -141,18 +141,20 @@ impl Projection {
         self.error = up(self.rounded.error * step * 128.0 * (m as f64).sqrt());
     }
 
-    /// Scores a cell's rows. `scores`: `[K]`.
-    pub fn score_rows(&self, level: Level, shard: &ShardView<'_>, scores: &mut Vec<f32>) {
+    /// Scores a cell's centroids. `scores`: `[K]`.
+    pub fn score_centroids(&self, level: Level, shard: &ShardView<'_>, scores: &mut Vec<f32>) {
         scores.clear();
         // Rows of no components are the mean.
-        scores.resize(shard.header.n_rows as usize, self.base as f32 + 0.0);
-        let step = f64::from(shard.header.row_step) * self.rounded.step;
+        scores.resize(shard.header.n_centroids as usize, self.base as f32 + 0.0);
+        let step = f64::from(shard.header.centroid_step) * self.rounded.step;
         level.dispatch(MatrixTimesVector {
-            rows: shard.rows,
+            centroids: shard.centroids,
             n_components: shard.header.n_components as usize,
             vector: &self.rounded.steps,
             // Never -0, which would sort after 0 though it is equal.
-            put: |row: usize, dot: i32| scores[row] = (self.base + step * f64::from(dot)) as f32 + 0.0,
+            put: |centroid: usize, dot: i32| {
+                scores[centroid] = (self.base + step * f64::from(dot)) as f32 + 0.0
+            },
         });
     }
 
@@ -166,16 +168,16 @@ impl Projection {
 
     /// Makes the tables of a residual code.
     pub fn set_tables(&mut self, residuals: &Residuals<'_>) {
-        let n_groups = residuals.group_starts.len() - 1;
+        let n_subspaces = residuals.subspace_starts.len() - 1;
         let tables = &mut self.tables;
-        let mut values = [[0.0f64; WORDS]; slag_common::shard::MAX_GROUPS];
-        let values = &mut values[..n_groups];
+        let mut values = [[0.0f64; CODEWORDS]; slag_common::shard::MAX_SUBSPACES];
+        let values = &mut values[..n_subspaces];
         let (mut offset, mut widest) = (0.0, 0.0f64);
-        for (values, starts) in values.iter_mut().zip(residuals.group_starts.windows(2)) {
+        for (values, starts) in values.iter_mut().zip(residuals.subspace_starts.windows(2)) {
             let (start, end) = (starts[0] as usize, starts[1] as usize);
-            let words = residuals.words[WORDS * start..WORDS * end].chunks_exact(end - start);
-            for (value, word) in values.iter_mut().zip(words) {
-                let terms = word.iter().zip(&self.components[start..end]);
+            let codewords = residuals.codewords[CODEWORDS * start..CODEWORDS * end].chunks_exact(end - start);
+            for (value, codeword) in values.iter_mut().zip(codewords) {
+                let terms = codeword.iter().zip(&self.components[start..end]);
                 *value = terms.map(|(w, y)| f64::from(widen(*w)) * y).sum();
             }
             let least = values.iter().copied().fold(f64::INFINITY, f64::min);
@@ -192,12 +194,12 @@ impl Projection {
         for (group, values) in values.iter().enumerate() {
             let mut column = [0; BLOCK];
             let (mut most, mut largest_rounding) = (0, 0.0f64);
-            for (word, value) in values.iter().enumerate() {
+            for (codeword, value) in values.iter().enumerate() {
                 let steps = if step > 0.0 { nearest(value / step).min(255) } else { 0 };
                 largest_rounding = largest_rounding.max((value - f64::from(steps) * step).abs());
-                column[word] = steps as u8;
-                column[word + WORDS] = column[word];
-                most = most.max(column[word]);
+                column[codeword] = steps as u8;
+                column[codeword + CODEWORDS] = column[codeword];
+                most = most.max(column[codeword]);
             }
             tables.most += u16::from(most);
             error += largest_rounding;

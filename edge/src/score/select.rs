@@ -13,7 +13,7 @@ pub struct Hit {
     pub shard: u32,
     /// Index in the shard.
     pub index: u32,
-    /// Its own where the shard knows more of it than its row and that was asked for, else that of its row.
+    /// Its own where the shard knows more of it than its centroid and that was asked for, else that of its centroid.
     pub score: f32,
 }
 
@@ -74,15 +74,15 @@ impl Search<'_> {
         let mut effort = Effort::default();
         let has_detail = (0..self.shards.len()).any(|at| self.cell(at).is_some_and(|cell| cell.has_detail()));
         let cut = if has_detail {
-            // Half as many again by their rows' scores: the worst of these members by their own scores are
+            // Half as many again by their centroids' scores: the worst of these members by their own scores are
             // not among the best.
             let enough = limit.saturating_add(limit / 2).saturating_add(1);
-            let floor = self.row_score_at(&mut gather.order, enough, f32::NEG_INFINITY);
+            let floor = self.centroid_score_at(&mut gather.order, enough, f32::NEG_INFINITY);
             self.count(&mut gather, threshold, floor.unwrap_or(f32::NEG_INFINITY));
             effort += gather.effort();
             score_reached(&gather, limit).map(|score| score.max(threshold))
         } else {
-            self.row_score_at(&mut gather.order, limit, threshold)
+            self.centroid_score_at(&mut gather.order, limit, threshold)
         };
         self.collect(&mut gather, Cut { score: cut.unwrap_or(threshold), least: threshold }, true);
         effort += gather.effort();
@@ -91,17 +91,18 @@ impl Search<'_> {
         effort
     }
 
-    /// Returns the least of the scores of the rows whose members, with those of better rows, are `limit`
-    /// or more; none if there are fewer with a row that reaches the threshold.
-    fn row_score_at(&self, order: &mut Order, limit: usize, threshold: f32) -> Option<f32> {
+    /// Returns the least of the scores of the centroids whose members, with those of better centroids, are `limit`
+    /// or more; none if there are fewer with a centroid that reaches the threshold.
+    fn centroid_score_at(&self, order: &mut Order, limit: usize, threshold: f32) -> Option<f32> {
         let cells: Vec<Option<Cell<'_>>> = (0..self.shards.len()).map(|at| self.cell(at)).collect();
         let scores = |at: usize| {
-            let rows = cells[at].as_ref().map_or(&[][..], |cell| cell.rows);
-            rows.iter().copied().zip(0..).filter(move |(score, _)| *score >= threshold)
+            let centroids = cells[at].as_ref().map_or(&[][..], |cell| cell.centroids);
+            centroids.iter().copied().zip(0..).filter(move |(score, _)| *score >= threshold)
         };
-        let count = |at: usize, row: usize| {
+        let count = |at: usize, centroid: usize| {
             let shard = &self.shards[at];
-            let members = shard.row_starts[row] as usize..shard.row_starts[row + 1] as usize;
+            let members =
+                shard.centroid_starts[centroid] as usize..shard.centroid_starts[centroid + 1] as usize;
             match cells[at].as_ref().and_then(|cell| cell.filter) {
                 None => members.len() as u64,
                 filter => runs_inside(shard, filter, members).map(|inside| inside.len() as u64).sum(),

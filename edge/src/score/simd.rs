@@ -20,13 +20,13 @@ pub const PAD: usize = 32;
 /// Rows that are multiplied together, so that their sums are folded together.
 pub const ROWS: usize = 4;
 
-/// One byte column of a block of Gaussians, or the words of a group for each half of a byte shuffle.
+/// One byte column of a block of Gaussians, or the codewords of a group for each half of a byte shuffle.
 pub type Column = [u8; BLOCK];
 
 /// What an instruction set does.
 pub trait Kernels: Copy {
-    /// Returns the products of rows with a vector. All have the same length, a multiple of [`PAD`].
-    fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS];
+    /// Returns the products of centroids with a vector. All have the same length, a multiple of [`PAD`].
+    fn dots(self, centroids: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS];
 
     /// Returns for each Gaussian of a block the sum of the values that its codes name. `low`, `high`: for
     /// each byte column the 16 values of the group in the low and in the high half, twice over.
@@ -43,8 +43,8 @@ pub struct Portable;
 
 impl Kernels for Portable {
     #[inline(always)]
-    fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
-        rows.map(|row| dot(row, vector))
+    fn dots(self, centroids: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
+        centroids.map(|centroid| dot(centroid, vector))
     }
 
     #[inline(always)]
@@ -65,10 +65,10 @@ impl Kernels for Portable {
     }
 }
 
-/// Returns the product of a row and a vector, which may be longer.
+/// Returns the product of a centroid and a vector, which may be longer.
 #[inline(always)]
-fn dot(row: &[i8], vector: &[i16]) -> i32 {
-    row.iter().zip(vector).map(|(a, b)| i32::from(*a) * i32::from(*b)).sum()
+fn dot(centroid: &[i8], vector: &[i16]) -> i32 {
+    centroid.iter().zip(vector).map(|(a, b)| i32::from(*a) * i32::from(*b)).sum()
 }
 
 /// Work that is written once for all instruction sets; its `run` and all that it calls must be
@@ -100,7 +100,7 @@ pub enum Level {
     /// AVX2.
     #[cfg(target_arch = "x86_64")]
     Avx2(V3),
-    /// AVX-512, with bytes and words.
+    /// AVX-512, with bytes and codewords.
     #[cfg(target_arch = "x86_64")]
     Avx512(V4),
     /// NEON.
@@ -154,15 +154,15 @@ impl Level {
     }
 }
 
-/// Multiplies every row of a matrix with a vector; gives products in the order of the rows.
+/// Multiplies every centroid of a matrix with a vector; gives products in the order of the centroids.
 pub struct MatrixTimesVector<'a, F> {
     /// `[n][n_components]`.
-    pub rows: &'a [i8],
-    /// Components of a row.
+    pub centroids: &'a [i8],
+    /// Components of a centroid.
     pub n_components: usize,
     /// The vector, padded with zeros to the next multiple of [`PAD`].
     pub vector: &'a [i16],
-    /// Called with the place of a row and its product.
+    /// Called with the place of a centroid and its product.
     pub put: F,
 }
 
@@ -171,24 +171,24 @@ impl<F: FnMut(usize, i32)> Work for MatrixTimesVector<'_, F> {
 
     #[inline(always)]
     fn run<K: Kernels>(self, kernels: K) {
-        let Self { rows, n_components, vector, mut put } = self;
+        let Self { centroids, n_components, vector, mut put } = self;
         // Rows of nothing have no products, and nothing tells how many there are.
-        let Some(n_rows) = rows.len().checked_div(n_components) else { return };
-        // What a row is read beyond its end is multiplied with the padding's zeros; the last rows cannot be.
-        let n_padded = (rows.len() + n_components).saturating_sub(vector.len()) / n_components;
-        let n_together = n_padded.min(n_rows) / ROWS * ROWS;
+        let Some(n_centroids) = centroids.len().checked_div(n_components) else { return };
+        // What a centroid is read beyond its end is multiplied with the padding's zeros; the last centroids cannot be.
+        let n_padded = (centroids.len() + n_components).saturating_sub(vector.len()) / n_components;
+        let n_together = n_padded.min(n_centroids) / ROWS * ROWS;
         for at in (0..n_together).step_by(ROWS) {
             let start = at * n_components;
-            let four = &rows[start..start + (ROWS - 1) * n_components + vector.len()];
+            let four = &centroids[start..start + (ROWS - 1) * n_components + vector.len()];
             let (a, b) = (&four[..vector.len()], &four[n_components..][..vector.len()]);
             let (c, d) = (&four[2 * n_components..][..vector.len()], &four[3 * n_components..]);
             let dots = kernels.dots([a, b, c, d], vector);
-            for (row, dot) in (at..).zip(dots) {
-                put(row, dot);
+            for (centroid, dot) in (at..).zip(dots) {
+                put(centroid, dot);
             }
         }
-        for row in n_together..n_rows {
-            put(row, dot(&rows[row * n_components..][..n_components], vector));
+        for centroid in n_together..n_centroids {
+            put(centroid, dot(&centroids[centroid * n_components..][..n_components], vector));
         }
     }
 }
@@ -267,15 +267,15 @@ impl Work for FindSums<'_> {
     }
 }
 
-/// Multiplies some rows of a matrix with a vector.
+/// Multiplies some centroids of a matrix with a vector.
 pub struct SomeRowsTimesVector<'a> {
     /// `[n][n_components]`.
-    pub rows: &'a [i8],
-    /// Components of a row, not 0.
+    pub centroids: &'a [i8],
+    /// Components of a centroid, not 0.
     pub n_components: usize,
     /// The vector, padded with zeros to the next multiple of [`PAD`].
     pub vector: &'a [i16],
-    /// Which rows, ascending.
+    /// Which centroids, ascending.
     pub which: &'a [u32],
     /// Gets their products.
     pub products: &'a mut Vec<i32>,
@@ -286,20 +286,20 @@ impl Work for SomeRowsTimesVector<'_> {
 
     #[inline(always)]
     fn run<K: Kernels>(self, kernels: K) {
-        let Self { rows, n_components, vector, which, products } = self;
+        let Self { centroids, n_components, vector, which, products } = self;
         products.clear();
         for which in which.chunks(ROWS) {
             let last = which[which.len() - 1] as usize;
-            // As for all rows: what is read beyond a row's end is multiplied with zeros.
-            if last * n_components + vector.len() <= rows.len() {
-                let mut four = [&rows[last * n_components..][..vector.len()]; ROWS];
-                for (row, at) in four.iter_mut().zip(which) {
-                    *row = &rows[*at as usize * n_components..][..vector.len()];
+            // As for all centroids: what is read beyond a centroid's end is multiplied with zeros.
+            if last * n_components + vector.len() <= centroids.len() {
+                let mut four = [&centroids[last * n_components..][..vector.len()]; ROWS];
+                for (centroid, at) in four.iter_mut().zip(which) {
+                    *centroid = &centroids[*at as usize * n_components..][..vector.len()];
                 }
                 products.extend_from_slice(&kernels.dots(four, vector)[..which.len()]);
             } else {
                 for at in which {
-                    products.push(dot(&rows[*at as usize * n_components..][..n_components], vector));
+                    products.push(dot(&centroids[*at as usize * n_components..][..n_components], vector));
                 }
             }
         }
@@ -311,15 +311,15 @@ mod tests {
     use super::*;
     use crate::testing::Random;
 
-    /// Oracle: plain 64-bit sums. Lengths around every width, values at both ends, and the last rows, which
+    /// Oracle: plain 64-bit sums. Lengths around every width, values at both ends, and the last centroids, which
     /// cannot be read past their end.
     #[test]
     fn products_are_the_sums_at_every_level() {
         let mut random = Random(11);
         for n_components in (1..70usize).chain([96, 100, 511, 512, 513, 8192]) {
-            for n_rows in [0, 1, 3, 4, 5, 37] {
-                let is_extreme = n_rows == 5;
-                let rows: Vec<i8> = (0..n_rows * n_components)
+            for n_centroids in [0, 1, 3, 4, 5, 37] {
+                let is_extreme = n_centroids == 5;
+                let centroids: Vec<i8> = (0..n_centroids * n_components)
                     .map(|_| if is_extreme { -128 } else { random.next() as i8 })
                     .collect();
                 // The largest that the sum of absolute values allows, see `rounded`.
@@ -328,18 +328,23 @@ mod tests {
                     .map(|_| if is_extreme { -most } else { random.next() as i64 % (most + 1) } as i16)
                     .collect();
                 vector.resize(n_components.next_multiple_of(PAD), 0);
-                let exact = |row: &[i8]| -> i64 {
-                    row.iter().zip(&vector).map(|(a, b)| i64::from(*a) * i64::from(*b)).sum()
+                let exact = |centroid: &[i8]| -> i64 {
+                    centroid.iter().zip(&vector).map(|(a, b)| i64::from(*a) * i64::from(*b)).sum()
                 };
-                let expected: Vec<i64> = rows.chunks_exact(n_components).map(exact).collect();
+                let expected: Vec<i64> = centroids.chunks_exact(n_components).map(exact).collect();
                 for level in Level::available() {
                     let mut found = Vec::new();
-                    let put = |row: usize, dot: i32| {
-                        assert_eq!(row, found.len());
+                    let put = |centroid: usize, dot: i32| {
+                        assert_eq!(centroid, found.len());
                         found.push(i64::from(dot));
                     };
-                    level.dispatch(MatrixTimesVector { rows: &rows, n_components, vector: &vector, put });
-                    assert_eq!(found, expected, "{} {n_components} {n_rows}", level.name());
+                    level.dispatch(MatrixTimesVector {
+                        centroids: &centroids,
+                        n_components,
+                        vector: &vector,
+                        put,
+                    });
+                    assert_eq!(found, expected, "{} {n_components} {n_centroids}", level.name());
                 }
             }
         }
@@ -357,9 +362,9 @@ mod tests {
                 };
                 let columns = bytes(255);
                 let [low, high] = [0; 2].map(|_| {
-                    let words = bytes(highest);
-                    let twice = |words: &[u8]| [&words[..16], &words[..16]].concat();
-                    words.chunks_exact(BLOCK).flat_map(twice).collect::<Vec<u8>>()
+                    let codewords = bytes(highest);
+                    let twice = |codewords: &[u8]| [&codewords[..16], &codewords[..16]].concat();
+                    codewords.chunks_exact(BLOCK).flat_map(twice).collect::<Vec<u8>>()
                 });
                 let expected: Vec<u64> = (0..BLOCK)
                     .map(|at| {
@@ -380,7 +385,7 @@ mod tests {
         }
     }
 
-    /// Oracle: one comparison for each sum, at both ends of 16 bits and around the sign. The words of code 1 make
+    /// Oracle: one comparison for each sum, at both ends of 16 bits and around the sign. The codewords of code 1 make
     /// a sum of what its columns say.
     #[test]
     fn sums_that_reach_a_value_are_found_at_every_level() {
@@ -391,11 +396,11 @@ mod tests {
             (0..n_blocks * N_COLUMNS).map(|_| [(); BLOCK].map(|()| random.next() as u8)).collect();
         for highest in [3u64, 256] {
             let mut table = || -> Vec<Column> {
-                let words = |_| {
-                    let words: [u8; 16] = [(); 16].map(|()| (random.next() % highest) as u8);
-                    std::array::from_fn(|at| words[at % 16])
+                let codewords = |_| {
+                    let codewords: [u8; 16] = [(); 16].map(|()| (random.next() % highest) as u8);
+                    std::array::from_fn(|at| codewords[at % 16])
                 };
-                (0..N_COLUMNS).map(words).collect()
+                (0..N_COLUMNS).map(codewords).collect()
             };
             let (low, high) = (table(), table());
             let sums: Vec<u16> = columns
@@ -423,25 +428,30 @@ mod tests {
         }
     }
 
-    /// Oracle: plain sums; the last rows cannot be read past their end.
+    /// Oracle: plain sums; the last centroids cannot be read past their end.
     #[test]
     fn products_of_some_rows_are_the_sums_at_every_level() {
         let mut random = Random(14);
         for n_components in [1usize, 2, 31, 32, 33, 96, 126, 512] {
-            let rows: Vec<i8> = (0..40 * n_components).map(|_| random.next() as i8).collect();
+            let centroids: Vec<i8> = (0..40 * n_components).map(|_| random.next() as i8).collect();
             let mut vector: Vec<i16> =
                 (0..n_components).map(|_| (random.next() % 999) as i16 - 500).collect();
             vector.resize(n_components.next_multiple_of(PAD), 0);
             for which in [vec![], vec![39], vec![0, 3, 4, 17, 38], (0..40).collect::<Vec<u32>>()] {
                 let expected: Vec<i32> = which
                     .iter()
-                    .map(|at| dot(&rows[*at as usize * n_components..][..n_components], &vector))
+                    .map(|at| dot(&centroids[*at as usize * n_components..][..n_components], &vector))
                     .collect();
                 for level in Level::available() {
                     let mut products = vec![7];
-                    let (rows, vector, which) = (&rows[..], &vector[..], &which[..]);
-                    let products_of =
-                        SomeRowsTimesVector { rows, n_components, vector, which, products: &mut products };
+                    let (centroids, vector, which) = (&centroids[..], &vector[..], &which[..]);
+                    let products_of = SomeRowsTimesVector {
+                        centroids,
+                        n_components,
+                        vector,
+                        which,
+                        products: &mut products,
+                    };
                     level.dispatch(products_of);
                     assert_eq!(products, expected, "{} {n_components}", level.name());
                 }

@@ -24,20 +24,21 @@ fn exact_shards() -> impl Strategy<Value = Vec<TestShard>> {
         prop::array::uniform3(-3i32..3),
     );
     prop::collection::vec(shard, 0..5).prop_map(|shards| {
-        let build = |(at, (rows, without_evidence, origin)): (usize, (Vec<Vec<Member>>, _, [i32; 3]))| {
-            let origin = DVec3::from(origin.map(|v| f64::from(v) * 8.0));
-            let step = DVec3::new(1.0, 0.5, 0.25) / STEPS_PER_UNIT;
-            let cell_id = at as u32 + 10;
-            TestShard {
-                cell_id,
-                origin,
-                step,
-                without_evidence,
-                has_exact_rows: true,
-                ..TestShard::new(rows)
-            }
-        };
-        shards.into_iter().enumerate().map(build).filter(|s| !s.rows.is_empty()).collect()
+        let build =
+            |(at, (centroids, without_evidence, origin)): (usize, (Vec<Vec<Member>>, _, [i32; 3]))| {
+                let origin = DVec3::from(origin.map(|v| f64::from(v) * 8.0));
+                let step = DVec3::new(1.0, 0.5, 0.25) / STEPS_PER_UNIT;
+                let cell_id = at as u32 + 10;
+                TestShard {
+                    cell_id,
+                    origin,
+                    step,
+                    without_evidence,
+                    has_exact_centroids: true,
+                    ..TestShard::new(centroids)
+                }
+            };
+        shards.into_iter().enumerate().map(build).filter(|s| !s.centroids.is_empty()).collect()
     })
 }
 
@@ -81,12 +82,12 @@ fn brute_force(
     let mut all = Vec::new();
     for (at, shard) in built.iter().enumerate() {
         let view = shard.view();
-        for row in 0..view.header.n_rows as usize {
-            for index in view.members(row) {
+        for centroid in 0..view.header.n_centroids as usize {
+            for index in view.members(centroid) {
                 let mut vector = vec![0.0; question.vector.len()];
                 match precision {
                     Precision::Exact | Precision::Measured => view.decode(index, &mut vector),
-                    Precision::Rows => view.decode_row(row, &mut vector),
+                    Precision::Rows => view.decode_centroid(centroid, &mut vector),
                 }
                 let score = score_in_f64(question, vector.iter().copied());
                 let p = view.position_in_world(index);
@@ -114,7 +115,7 @@ proptest! {
     /// each question of a batch and for one asked alone.
     #[test]
     fn equals_brute_force(
-        shards in exact_shards(), is_exact in any::<bool>(), rows_only in any::<bool>(),
+        shards in exact_shards(), is_exact in any::<bool>(), centroids_only in any::<bool>(),
         questions in prop::collection::vec(exact_question(), 1..4), threshold in -16i32..16, limit in 0usize..30,
         region in region(), near in prop::option::of(prop::array::uniform3(-20i32..20)),
     ) {
@@ -122,7 +123,7 @@ proptest! {
         let built: Vec<_> = shards.iter().rev().map(|s| s.build(is_exact)).collect();
         let views = views(&built);
         let threshold = threshold as f32 / 8.0;
-        let precision = if rows_only { Precision::Rows } else { Precision::Exact };
+        let precision = if centroids_only { Precision::Rows } else { Precision::Exact };
         let batch = Search::batch(&mut Scratch::default(), &views, &questions, region, precision).expect("valid");
         prop_assert_eq!(batch.len(), questions.len());
         for (search, question) in batch.iter().zip(&questions) {
@@ -154,10 +155,10 @@ proptest! {
 }
 
 /// Rows of noisy unit embeddings around random directions.
-fn noisy_shards(random: &mut Random, n_shards: usize, n_rows: usize, dim: usize) -> Vec<TestShard> {
+fn noisy_shards(random: &mut Random, n_shards: usize, n_centroids: usize, dim: usize) -> Vec<TestShard> {
     let mut shard = |cell_id: usize| {
-        let mut rows = Vec::new();
-        for _ in 0..n_rows {
+        let mut centroids = Vec::new();
+        for _ in 0..n_centroids {
             let (centre, noise) = (random.unit(dim), random.signed().abs() * 0.4);
             let member = |random: &mut Random| {
                 let offset = random.unit(dim);
@@ -165,9 +166,9 @@ fn noisy_shards(random: &mut Random, n_shards: usize, n_rows: usize, dim: usize)
                 Member { steps: [0; 3].map(|_| random.next() as u16), embedding }
             };
             let n = 1 + random.next() % 20;
-            rows.push((0..n).map(|_| member(random)).collect());
+            centroids.push((0..n).map(|_| member(random)).collect());
         }
-        TestShard { cell_id: cell_id as u32, ..TestShard::new(rows) }
+        TestShard { cell_id: cell_id as u32, ..TestShard::new(centroids) }
     };
     (0..n_shards).map(&mut shard).collect()
 }
@@ -189,9 +190,9 @@ fn answers_keep_within_the_stated_bound() {
             let search = |views, precision| {
                 Search::new(views, &question, Region::default(), precision).expect("valid")
             };
-            let rows = search(&compact_views, Precision::Exact);
-            let bound = f64::from(rows.score_error_bound());
-            let matches = rows.matching(threshold);
+            let centroids = search(&compact_views, Precision::Exact);
+            let bound = f64::from(centroids.score_error_bound());
+            let matches = centroids.matching(threshold);
             assert_eq!(search(&exact_views, Precision::Rows).matching(threshold), matches);
             let mut expected_in =
                 matches.runs.iter().flat_map(|r| (r.start..r.end).map(|i| (r.shard, i, r.score))).peekable();
@@ -223,13 +224,13 @@ fn answers_keep_within_the_stated_bound() {
                 }
             }
             assert!(expected_in.next().is_none());
-            assert!(exact_search.is_exact() && !rows.is_exact());
+            assert!(exact_search.is_exact() && !centroids.is_exact());
             n_saved += n - exact_matches.effort.n_rescored;
         }
     }
-    println!("largest error of a row's score: {largest_share:.2} of the bound");
+    println!("largest error of a centroid's score: {largest_share:.2} of the bound");
     assert!(n_between > 1000, "the bound was hardly tested: {n_between}");
-    assert!(n_saved > 1000, "every Gaussian was scored by itself: the rows served for nothing");
+    assert!(n_saved > 1000, "every Gaussian was scored by itself: the centroids served for nothing");
 }
 
 pub(super) fn random_question(random: &mut Random, dim: usize, n_negatives: usize) -> Question {
@@ -308,7 +309,7 @@ fn skips_by_box_and_by_bound() {
     assert_eq!(search.searched().count(), 2);
     let matches = search.matching(0.5);
     assert_eq!(members_of(&matches), [(0, 0)]);
-    assert_eq!((matches.n_shards_below, matches.effort.n_rescored, matches.n_rows_undecided), (1, 0, 0));
+    assert_eq!((matches.n_shards_below, matches.effort.n_rescored, matches.n_centroids_undecided), (1, 0, 0));
 }
 
 #[test]

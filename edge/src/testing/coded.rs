@@ -4,8 +4,8 @@ use glam::DVec3;
 use half::f16;
 use slag_common::container::AlignedBytes;
 use slag_common::shard::{
-    BLOCK, Basis, ExactColumns, Fine, Positions, Residuals, ScoreErrors, ShardHeader, ShardLayout, ShardView,
-    WORDS, quantise,
+    BLOCK, Basis, CODEWORDS, ExactColumns, Fine, Positions, Residuals, ScoreErrors, ShardHeader, ShardLayout,
+    ShardView, quantise,
 };
 
 use super::{BuiltShard, Random, normalised};
@@ -18,12 +18,12 @@ pub struct CodedShard {
     pub n_components: usize,
     pub has_basis: bool,
     /// 0: no residual code.
-    pub n_groups: usize,
+    pub n_subspaces: usize,
     /// Whether exact embeddings are beside the code, and fine residuals: any, for nothing is decided by what is not
     /// measured, and these errors are stated: [`CODE_ERROR`] and [`FINE_ERROR`].
     pub is_exact: bool,
-    /// Members of each row.
-    pub row_lens: Vec<usize>,
+    /// Members of each centroid.
+    pub centroid_lens: Vec<usize>,
     pub origin: DVec3,
 }
 
@@ -36,36 +36,38 @@ impl CodedShard {
     /// Writes the shard and reads it back. Embeddings are what it decodes to, off by a little, of unit length.
     pub fn build(&self, random: &mut Random) -> BuiltShard {
         let (dim, m) = (self.dim, self.n_components);
-        let (k, n) = (self.row_lens.len(), self.row_lens.iter().sum::<usize>());
-        let mut row_starts = vec![0u32];
-        self.row_lens.iter().for_each(|len| row_starts.push(row_starts[row_starts.len() - 1] + *len as u32));
+        let (k, n) = (self.centroid_lens.len(), self.centroid_lens.iter().sum::<usize>());
+        let mut centroid_starts = vec![0u32];
+        self.centroid_lens
+            .iter()
+            .for_each(|len| centroid_starts.push(centroid_starts[centroid_starts.len() - 1] + *len as u32));
         let mut floats =
             |n: usize, scale: f32| -> Vec<f32> { (0..n).map(|_| random.signed() * scale).collect() };
-        let (rows, row_step) = quantise(&floats(k * m, 1.5 / (m as f32).sqrt()));
+        let (centroids, centroid_step) = quantise(&floats(k * m, 1.5 / (m as f32).sqrt()));
         let (vectors, basis_step) = quantise(&floats(m * dim, 1.2 / (dim as f32).sqrt()));
         let steps: Vec<f32> = floats(m, 0.5).iter().map(|v| basis_step * (1.0 + v)).collect();
         let mean: Vec<f16> = floats(dim, 0.5 / (dim as f32).sqrt()).into_iter().map(f16::from_f32).collect();
-        // The last component is left without a word where there is room.
-        let n_coded = if m > self.n_groups { m - 1 } else { m };
-        let group_starts: Vec<u32> =
-            (0..=self.n_groups).map(|g| (n_coded * g / self.n_groups.max(1)) as u32).collect();
-        let n_words = WORDS * if self.n_groups == 0 { 0 } else { n_coded };
-        let words: Vec<f16> =
-            floats(n_words, 0.5 / (m as f32).sqrt()).into_iter().map(f16::from_f32).collect();
-        let row_scales: Vec<f32> = floats(k, 1.0).into_iter().map(|v| v.abs()).collect();
+        // The last component is left without a codeword where there is room.
+        let n_coded = if m > self.n_subspaces { m - 1 } else { m };
+        let subspace_starts: Vec<u32> =
+            (0..=self.n_subspaces).map(|g| (n_coded * g / self.n_subspaces.max(1)) as u32).collect();
+        let n_codewords = CODEWORDS * if self.n_subspaces == 0 { 0 } else { n_coded };
+        let codewords: Vec<f16> =
+            floats(n_codewords, 0.5 / (m as f32).sqrt()).into_iter().map(f16::from_f32).collect();
+        let residual_scales: Vec<f32> = floats(k, 1.0).into_iter().map(|v| v.abs()).collect();
         let codes: Vec<u8> =
-            (0..n.div_ceil(BLOCK) * BLOCK * self.n_groups / 2).map(|_| random.next() as u8).collect();
+            (0..n.div_ceil(BLOCK) * BLOCK * self.n_subspaces / 2).map(|_| random.next() as u8).collect();
         let positions: Vec<[u16; 3]> = (0..n).map(|_| [(); 3].map(|()| random.next() as u16)).collect();
         let step = 10.0 / 65536.0;
         let header = ShardHeader {
             cell_id: self.cell_id,
             n_gaussians: n as u32,
-            n_rows: k as u32,
+            n_centroids: k as u32,
             dim: dim as u32,
             n_components: m as u32,
-            n_groups: self.n_groups as u32,
+            n_subspaces: self.n_subspaces as u32,
             position_bits: [16, 16, 16, 0],
-            row_step,
+            centroid_step,
             origin_in_world: self.origin.to_array(),
             position_step: [step; 3],
             box_min: self.origin.to_array(),
@@ -82,27 +84,27 @@ impl CodedShard {
         let view = |radii, reaches| ShardView {
             header,
             positions: Positions::Wide(&positions),
-            row_starts: &row_starts,
-            rows: &rows,
+            centroid_starts: &centroid_starts,
+            centroids: &centroids,
             radii,
             basis: self.has_basis.then_some(Basis { mean: &mean, vectors: &vectors, steps: &steps }),
-            residuals: (self.n_groups > 0).then_some(Residuals {
-                group_starts: &group_starts,
-                words: &words,
-                row_scales: &row_scales,
-                reaches,
+            residuals: (self.n_subspaces > 0).then_some(Residuals {
+                subspace_starts: &subspace_starts,
+                codewords: &codewords,
+                residual_scales: &residual_scales,
+                residual_norms: reaches,
                 codes: &codes,
             }),
             exact: None,
         };
         let measured = view(&[], &[]);
         let mut embeddings = Vec::new();
-        for (row, (radius, reach)) in radii.iter_mut().zip(&mut reaches).enumerate() {
-            for index in measured.members(row) {
+        for (centroid, (radius, reach)) in radii.iter_mut().zip(&mut reaches).enumerate() {
+            for index in measured.members(centroid) {
                 let mut decoded = vec![0.0; dim];
                 measured.decode(index, &mut decoded);
                 let mut stored = vec![0.0; dim];
-                measured.decode_row(row, &mut stored);
+                measured.decode_centroid(centroid, &mut stored);
                 let embedding =
                     normalised(decoded.iter().map(|v| *v as f32 + random.signed() * 0.02).collect());
                 let from = if self.is_exact { &stored } else { &decoded };
@@ -110,12 +112,12 @@ impl CodedShard {
                 *radius = f32::max(*radius, squares.sum::<f64>().sqrt() as f32 * (1.0 + f32::EPSILON));
                 embeddings.push(embedding);
                 let Some(residuals) = &measured.residuals else { continue };
-                let words = group_starts.windows(2).enumerate().flat_map(|(group, starts)| {
+                let codewords = subspace_starts.windows(2).enumerate().flat_map(|(group, starts)| {
                     let (start, len) = (starts[0] as usize, (starts[1] - starts[0]) as usize);
-                    &words[WORDS * start + residuals.code(index, group) * len..][..len]
+                    &codewords[CODEWORDS * start + residuals.code(index, group) * len..][..len]
                 });
-                let length = words.map(|w| w.to_f64().powi(2)).sum::<f64>().sqrt() as f32;
-                *reach = f32::max(*reach, length * row_scales[row] * (1.0 + 2.0 * f32::EPSILON));
+                let length = codewords.map(|w| w.to_f64().powi(2)).sum::<f64>().sqrt() as f32;
+                *reach = f32::max(*reach, length * residual_scales[centroid] * (1.0 + 2.0 * f32::EPSILON));
             }
         }
         let mut bytes = Vec::new();

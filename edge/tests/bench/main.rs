@@ -34,7 +34,7 @@ fn what_is_timed_is_what_is_sought() {
                 n_gaussians: 9_000,
                 dim: 64,
                 n_components: 24,
-                n_groups: 8,
+                n_subspaces: 8,
                 is_balanced,
                 n_objects: if is_balanced { 40 } else { 0 },
             },
@@ -108,6 +108,6 @@ fn generate() {
     let [dir, n, profile, objects] = spec.split(' ').collect::<Vec<_>>()[..] else { panic!("{spec}") };
     let [n_gaussians, n_objects] = [n, objects].map(|n| n.parse().expect("a number"));
     let is_balanced = profile == "balanced";
-    let spec = SceneSpec { n_gaussians, dim: 512, n_components: 96, n_groups: 32, is_balanced, n_objects };
+    let spec = SceneSpec { n_gaussians, dim: 512, n_components: 96, n_subspaces: 32, is_balanced, n_objects };
     scene::write_cache(Path::new(dir), &spec);
 }

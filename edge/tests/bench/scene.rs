@@ -10,7 +10,7 @@ use slag_common::frames::Aabb;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, quantise_vectors};
 use slag_common::shard::{
-    BLOCK, Basis, Positions, Profile, Residuals, ScoreErrors, ShardHeader, ShardView, WORDS, quantise,
+    BLOCK, Basis, CODEWORDS, Positions, Profile, Residuals, ScoreErrors, ShardHeader, ShardView, quantise,
 };
 use slag_edge::store::{Current, CurrentCell, EdgeCache};
 
@@ -29,7 +29,7 @@ pub struct SceneSpec {
     pub n_gaussians: usize,
     pub dim: usize,
     pub n_components: usize,
-    pub n_groups: usize,
+    pub n_subspaces: usize,
     pub is_balanced: bool,
     /// Things in all cells, shared out evenly.
     pub n_objects: usize,
@@ -72,12 +72,12 @@ pub fn write_cache(dir: &Path, spec: &SceneSpec) {
     for start in (0..spec.n_gaussians).step_by(CELL) {
         let n = CELL.min(spec.n_gaussians - start);
         let cell_id = (start / CELL) as u32;
-        let (bytes, bounds, n_rows) = shard(cell_id, n, spec);
+        let (bytes, bounds, n_centroids) = shard(cell_id, n, spec);
         let hash = Hash32::of(&bytes);
         let record = ShardRecord {
             hash,
             len_bytes: bytes.len() as u64,
-            n_rows,
+            n_centroids,
             score_error_bound: 0.5,
             score_errors: ScoreErrors::default(),
             position_error: 0.01,
@@ -133,7 +133,7 @@ fn shard(cell_id: u32, n: usize, spec: &SceneSpec) -> (Vec<u8>, Aabb, u32) {
     let (dim, m) = (spec.dim, spec.n_components);
     // One in a hundred was never seen.
     let n_with_evidence = n - n / 100;
-    let mut row_starts = vec![0u32];
+    let mut centroid_starts = vec![0u32];
     let mut at = 0;
     while at < n_with_evidence {
         // From 1 to several hundred members: half the rows are short.
@@ -142,38 +142,39 @@ fn shard(cell_id: u32, n: usize, spec: &SceneSpec) -> (Vec<u8>, Aabb, u32) {
             _ => 1 + random.below(3 * ROW),
         };
         at = n_with_evidence.min(at + len);
-        row_starts.push(at as u32);
+        centroid_starts.push(at as u32);
     }
-    let k = row_starts.len() - 1;
+    let k = centroid_starts.len() - 1;
     // Components fall off as those of a principal component analysis do; rows of a kind are alike.
     let fall: Vec<f32> = (0..m).map(|c| 1.0 / (1.0 + c as f32 / 6.0)).collect();
     let squares: f32 = fall.iter().map(|f| f * f).sum();
     let fall: Vec<f32> = fall.iter().map(|f| f / squares.sqrt()).collect();
     let kinds = random.normals(KINDS * m, 0.7);
-    let mut rows = Vec::with_capacity(k * m);
+    let mut centroids = Vec::with_capacity(k * m);
     let mut kind = 0;
     for row in 0..k {
         if row % 16 == 0 {
             kind = random.below(KINDS);
         }
-        rows.extend((0..m).map(|c| (kinds[kind * m + c] + 0.35 * random.normal()) * fall[c]));
+        centroids.extend((0..m).map(|c| (kinds[kind * m + c] + 0.35 * random.normal()) * fall[c]));
     }
-    let (rows, row_step) = quantise(&rows);
+    let (centroids, centroid_step) = quantise(&centroids);
     let (vectors, step) = quantise(&random.normals(m * dim, 1.0 / (dim as f32).sqrt()));
     let steps = vec![step; m];
     let mean: Vec<f16> =
         random.normals(dim, 0.6 / (dim as f32).sqrt()).into_iter().map(f16::from_f32).collect();
-    let group_starts: Vec<u32> = (0..=spec.n_groups).map(|g| (m * g / spec.n_groups) as u32).collect();
-    let words = random.normals(WORDS * m, 0.2);
-    let words: Vec<f16> = group_starts
+    let subspace_starts: Vec<u32> =
+        (0..=spec.n_subspaces).map(|g| (m * g / spec.n_subspaces) as u32).collect();
+    let codewords = random.normals(CODEWORDS * m, 0.2);
+    let codewords: Vec<f16> = subspace_starts
         .windows(2)
-        .flat_map(|starts| (0..WORDS).flat_map(move |_| starts[0]..starts[1]))
-        .zip(&words)
+        .flat_map(|starts| (0..CODEWORDS).flat_map(move |_| starts[0]..starts[1]))
+        .zip(&codewords)
         .map(|(c, w)| f16::from_f32(w * fall[c as usize]))
         .collect();
-    let row_scales: Vec<f32> = (0..k).map(|_| 0.4 + random.below(100) as f32 / 80.0).collect();
-    let reaches: Vec<f32> = row_scales.iter().map(|scale| scale * 0.45).collect();
-    let codes: Vec<u8> = (0..n_with_evidence.div_ceil(BLOCK) * BLOCK * spec.n_groups / 16)
+    let residual_scales: Vec<f32> = (0..k).map(|_| 0.4 + random.below(100) as f32 / 80.0).collect();
+    let residual_norms: Vec<f32> = residual_scales.iter().map(|scale| scale * 0.45).collect();
+    let codes: Vec<u8> = (0..n_with_evidence.div_ceil(BLOCK) * BLOCK * spec.n_subspaces / 16)
         .flat_map(|_| random.next().to_le_bytes())
         .collect();
     let positions: Vec<u32> = (0..n).map(|_| random.next() as u32).collect();
@@ -183,12 +184,12 @@ fn shard(cell_id: u32, n: usize, spec: &SceneSpec) -> (Vec<u8>, Aabb, u32) {
     let header = ShardHeader {
         cell_id,
         n_gaussians: n as u32,
-        n_rows: k as u32,
+        n_centroids: k as u32,
         dim: dim as u32,
         n_components: m as u32,
-        n_groups: if spec.is_balanced { spec.n_groups as u32 } else { 0 },
+        n_subspaces: if spec.is_balanced { spec.n_subspaces as u32 } else { 0 },
         position_bits: [11, 11, 10, 0],
-        row_step,
+        centroid_step,
         origin_in_world: bounds.min.to_array(),
         position_step: [0.01; 3],
         box_min: bounds.min.to_array(),
@@ -204,18 +205,18 @@ fn shard(cell_id: u32, n: usize, spec: &SceneSpec) -> (Vec<u8>, Aabb, u32) {
         })
     });
     let residuals = Residuals {
-        group_starts: &group_starts,
-        words: &words,
-        row_scales: &row_scales,
-        reaches: &reaches,
+        subspace_starts: &subspace_starts,
+        codewords: &codewords,
+        residual_scales: &residual_scales,
+        residual_norms: &residual_norms,
         codes: &codes,
     };
     let mut bytes = Vec::new();
     ShardView {
         header,
         positions: Positions::Packed(&positions),
-        row_starts: &row_starts,
-        rows: &rows,
+        centroid_starts: &centroid_starts,
+        centroids: &centroids,
         radii: &radii,
         basis: Some(Basis { mean: &mean, vectors: &vectors, steps: &steps }),
         residuals: spec.is_balanced.then_some(residuals),

@@ -64,16 +64,16 @@ pub fn bounds(cell_id: u32) -> Aabb {
 pub fn shard(spec: &ShardSpec) -> Vec<u8> {
     let mut random = Random(spec.content ^ u64::from(spec.cell_id) << 32);
     let (n, box_) = (spec.n_gaussians, bounds(spec.cell_id));
-    let (rows, row_step) = quantise(&[0.5; DIM as usize]);
+    let (centroids, centroid_step) = quantise(&[0.5; DIM as usize]);
     let header = ShardHeader {
         cell_id: spec.cell_id,
         n_gaussians: n,
-        n_rows: 1,
+        n_centroids: 1,
         dim: DIM,
         n_components: DIM,
-        n_groups: 0,
+        n_subspaces: 0,
         position_bits: [16, 16, 16, 0],
-        row_step,
+        centroid_step,
         origin_in_world: box_.min.into(),
         position_step: [1e-4; 3],
         box_min: box_.min.into(),
@@ -89,8 +89,8 @@ pub fn shard(spec: &ShardSpec) -> Vec<u8> {
     let parts = ShardView {
         header,
         positions: Positions::Wide(&positions),
-        row_starts: &[0, n],
-        rows: &rows,
+        centroid_starts: &[0, n],
+        centroids: &centroids,
         radii: &[0.1],
         basis: None,
         residuals: None,
@@ -114,7 +114,7 @@ impl Published {
                 let record = ShardRecord {
                     hash,
                     len_bytes,
-                    n_rows: 1,
+                    n_centroids: 1,
                     score_error_bound: 0.1,
                     score_errors: ScoreErrors::default(),
                     position_error: 5e-5,

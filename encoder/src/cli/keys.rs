@@ -7,7 +7,7 @@ use anyhow::Result;
 use clap::{Args, Subcommand};
 
 use super::Exit;
-use super::run::{now_unix_secs, print};
+use super::common::{now_unix_secs, print};
 use crate::store::keys::PublicKeys;
 use crate::store::{Store, StoreError};
 

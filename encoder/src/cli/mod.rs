@@ -1,23 +1,127 @@
-//! The command line: flags in, exit code out. Data goes to stdout, everything else to stderr.
+//! The command line, a file a command: flags in, exit code out. Data goes to stdout, everything else to stderr.
 
-mod args;
-mod bench;
-mod eval;
+mod check;
+pub mod common;
+mod devices;
+mod encode;
 mod keys;
-mod noise;
-mod objects;
-mod preset;
-mod progress;
-mod refine;
-mod run;
+mod models;
+pub mod preset;
+pub mod progress;
+mod push;
+mod query;
+pub mod refine;
 mod sam;
-mod tradeoff;
+mod serve;
 mod views;
 
 use std::process::ExitCode;
 
-pub use args::Cli;
-pub use run::run;
+use anyhow::Result;
+use clap::{Parser, Subcommand};
+use serde_json::json;
+use slag_models::commands::ModelsCommand;
+
+use crate::encode::EncodeError;
+use crate::publish::qdrant;
+use push::PushCommand;
+
+/// Makes 3D Gaussian splatting scenes searchable by words.
+#[derive(Debug, Parser)]
+#[command(version, propagate_version = true)]
+pub struct Cli {
+    /// Prints less: no progress, warnings only.
+    #[arg(long, short, global = true)]
+    quiet: bool,
+    /// Prints the result, or the error, as one JSON object.
+    #[arg(long, global = true)]
+    pub json: bool,
+    /// What to do.
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+impl Cli {
+    /// Returns the log level where RUST_LOG does not say otherwise.
+    pub fn log_level(&self) -> &'static str {
+        if self.quiet { "warn" } else { "info" }
+    }
+
+    /// Returns whether progress may be shown.
+    pub fn shows_progress(&self) -> bool {
+        !self.quiet && !self.json
+    }
+}
+
+/// What the program can do.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Renders the scene at sample views and compares it with the photos: do poses and scene fit?
+    Check(check::CheckArgs),
+    /// Encodes a scene into a store.
+    Encode(Box<encode::EncodeArgs>),
+    /// Scores every Gaussian of a store against a text, in full precision.
+    Query(query::QueryArgs),
+    /// Serves a store's manifest and shards over HTTP.
+    Serve(serve::ServeArgs),
+    /// Shows, makes and changes the key that a store signs with.
+    #[command(subcommand)]
+    Keys(keys::KeysCommand),
+    /// Public models: what is known, pulling, checking, showing.
+    #[command(subcommand)]
+    Models(ModelsCommand),
+    /// Pushes a store elsewhere.
+    #[command(subcommand)]
+    Push(push::PushCommand),
+    /// Lists the GPUs that can rasterise.
+    Devices,
+}
+
+/// Runs the program and says how it ended.
+pub fn run(cli: Cli) -> Exit {
+    let json = cli.json;
+    let progress = progress::shown(cli.shows_progress());
+    let result = match cli.command {
+        Command::Check(args) => check::run(&args, json),
+        Command::Encode(args) => encode::run(&args, progress.as_ref(), json),
+        Command::Query(args) => query::run(&args, json),
+        Command::Serve(args) => serve::run(&args),
+        Command::Keys(command) => keys::run(&command, json),
+        Command::Models(command) => models::run(&command, json),
+        Command::Push(PushCommand::Qdrant(args)) => push::run(&args, progress.as_ref(), json),
+        Command::Devices => devices::run(json),
+    };
+    exit_of(result, json)
+}
+
+/// Prints the error of a command, if any, and returns the exit code.
+pub fn exit_of(result: Result<Exit>, json: bool) -> Exit {
+    match result {
+        Ok(exit) => exit,
+        Err(error) if is_broken_pipe(&error) => Exit::Done,
+        Err(error) => {
+            let interrupted = matches!(error.downcast_ref(), Some(EncodeError::Interrupted { .. }))
+                || matches!(error.downcast_ref(), Some(qdrant::PushError::Cancelled));
+            if json {
+                println!(
+                    "{}",
+                    json!({"error": {"message": format!("{error:#}"), "interrupted": interrupted}})
+                );
+            } else {
+                eprintln!("{}: {error:#}", if interrupted { "interrupted" } else { "error" });
+            }
+            if interrupted { Exit::Interrupted } else { Exit::Failed }
+        }
+    }
+}
+
+/// A reader that went away (`| head`) is no failure.
+fn is_broken_pipe(error: &anyhow::Error) -> bool {
+    error
+        .chain()
+        .filter_map(|e| e.downcast_ref::<std::io::Error>())
+        .any(|e| e.kind() == std::io::ErrorKind::BrokenPipe)
+}
 
 /// How a run of the program ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -42,5 +146,44 @@ impl From<Exit> for ExitCode {
             Exit::Interrupted => 130,
         }
         .into()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    use super::*;
+
+    #[test]
+    fn flags_are_consistent_and_checked() {
+        Cli::command().debug_assert();
+        let parse = |line: &str| Cli::try_parse_from(line.split(' '));
+        assert!(
+            parse("slag-encoder encode --scene a.ply --views v --store s --memory 512MiB --masks auto")
+                .is_ok()
+        );
+        for wrong in [
+            "--memory 1",
+            "--memory 5TB",
+            "--views-limit 0",
+            "--views-limit 0%",
+            "--views-limit 101%",
+            "--views-limit NaN%",
+            "--raster-width 15",
+            "--raster-width wide",
+            "--view-order best",
+            "--mask-levels 0",
+            "--time-budget 0",
+            "--time-budget inf",
+            "--threads 0",
+            "--preset best",
+            "--background red",
+        ] {
+            assert!(
+                parse(&format!("slag-encoder encode --scene a.ply --views v --store s {wrong}")).is_err(),
+                "{wrong}"
+            );
+        }
     }
 }

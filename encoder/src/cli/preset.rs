@@ -2,10 +2,10 @@
 
 use clap::ValueEnum;
 
+use crate::codebook::CodebookSettings;
 use crate::embed::Background;
 use crate::encode::{DEFAULT_MASK_LEVELS, RasterWidth, ViewsLimit};
 use crate::lift::Aggregation;
-use crate::palette::PaletteSettings;
 use crate::raster::WeightKind;
 
 /// Bundles of choices. What each costs and gives is in README.md, measured by `bench tradeoff`.
@@ -41,7 +41,7 @@ pub struct Choices {
     /// Width at which weights are rasterised.
     pub raster_width: RasterWidth,
     /// Errors of the profiles.
-    pub palette: PaletteSettings,
+    pub codebook: CodebookSettings,
 }
 
 impl Preset {
@@ -56,7 +56,7 @@ impl Preset {
             min_mask_px: 200,
             views_limit: ViewsLimit::All,
             raster_width: RasterWidth::ByContent,
-            palette: PaletteSettings::default(),
+            codebook: CodebookSettings::default(),
         };
         match self {
             Self::Balanced => balanced,
@@ -73,7 +73,7 @@ impl Preset {
                 ..balanced
             },
             Self::Accurate => Choices {
-                palette: PaletteSettings { compact_error: 0.05, balanced_error: 0.01, ..balanced.palette },
+                codebook: CodebookSettings { compact_error: 0.05, balanced_error: 0.01, ..balanced.codebook },
                 ..balanced
             },
         }
@@ -99,7 +99,7 @@ mod tests {
         assert_eq!(balanced.min_mask_px, library.min_mask_px);
         assert_eq!(balanced.background, library.background);
         assert_eq!(balanced.weights, library.weights);
-        assert_eq!(balanced.palette, library.shards.palette);
+        assert_eq!(balanced.codebook, library.shards.codebook);
         let levels = balanced.mask_levels;
         assert_eq!(library.masks, crate::encode::Masks::Auto { n_levels: levels });
     }
@@ -116,7 +116,7 @@ mod tests {
         assert_eq!((fast.mask_levels, fast.raster_width), (2, RasterWidth::Px(320)));
         assert_eq!(fast.aggregation, balanced.aggregation);
         assert_eq!(accurate.aggregation, balanced.aggregation);
-        assert_eq!(accurate.palette.compact_error, 0.5 * balanced.palette.compact_error);
-        assert_eq!(accurate.palette.balanced_error, 0.5 * balanced.palette.balanced_error);
+        assert_eq!(accurate.codebook.compact_error, 0.5 * balanced.codebook.compact_error);
+        assert_eq!(accurate.codebook.balanced_error, 0.5 * balanced.codebook.balanced_error);
     }
 }

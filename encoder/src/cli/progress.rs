@@ -6,10 +6,15 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use crate::progress::Progress;
+use crate::progress::{Progress, Silent};
 
 /// Time between two plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
+
+/// Returns what shows progress on stderr, or discards it.
+pub fn shown(is_shown: bool) -> Box<dyn Progress> {
+    if is_shown { Box::new(Shown::new()) } else { Box::new(Silent) }
+}
 
 /// Shows progress to a person or writes it to a log.
 pub struct Shown {

@@ -3,7 +3,7 @@
 use clap::Args;
 
 use crate::lift::Aggregation;
-use crate::segment::MaskNoise;
+use crate::segment::noise::MaskNoise;
 
 /// What is done beyond the preset's way to aggregate.
 #[derive(Clone, Debug, Default, Args)]
@@ -22,7 +22,7 @@ pub struct RefineArgs {
     wholeness: Option<f32>,
     /// 0: views count the solid angle that they see of a Gaussian; 1: all alike.
     #[arg(long, value_name = "SHARE", value_parser = share)]
-    evenness: Option<f32>,
+    equalisation: Option<f32>,
     /// A mask counts its agreement with other views to this power; 0: all count alike.
     #[arg(long, value_name = "POWER", value_parser = amount)]
     agreement: Option<f32>,
@@ -44,7 +44,7 @@ pub struct RefineArgs {
     /// Which errors.
     #[arg(long, value_name = "N", hide = true, default_value_t = 1)]
     noise_seed: u64,
-    /// Keeps what the views left behind, so that another encode of the same, with another palette say, is quick.
+    /// Keeps what the views left behind, so that another encode of the same, with another codebook say, is quick.
     #[arg(long)]
     pub keep_views: bool,
 }
@@ -57,7 +57,7 @@ impl RefineArgs {
             min_view_share: self.min_view_share.unwrap_or(preset.min_view_share),
             min_weight_px: self.min_weight.unwrap_or(preset.min_weight_px),
             wholeness: self.wholeness.unwrap_or(preset.wholeness),
-            evenness: self.evenness.unwrap_or(preset.evenness),
+            equalisation: self.equalisation.unwrap_or(preset.equalisation),
             agreement: self.agreement.unwrap_or(preset.agreement),
             median_steps: self.median_steps.unwrap_or(preset.median_steps),
             superpoint: self.superpoint.unwrap_or(preset.superpoint),

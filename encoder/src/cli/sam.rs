@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::run::available_threads;
+use super::common::available_threads;
 use crate::encode::Masks;
 use crate::segment::SamSettings;
 

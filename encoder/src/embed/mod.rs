@@ -8,7 +8,7 @@ use slag_models::{
     preprocess::{Filter, Preprocess, Window, resample},
 };
 
-use crate::segment::{BoxPx, Mask};
+use crate::masks::{BoxPx, Mask};
 
 /// Says why masks could not be embedded.
 #[derive(Debug, thiserror::Error)]

@@ -1,4 +1,4 @@
-//! From the sums of all views to the objects of every cell, within the budget.
+//! From the contributions of all views to the objects of every cell, within the budget.
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -9,15 +9,17 @@ use slag_common::{Gaussians, Hash32, View};
 use slag_models::ModelDir;
 
 use super::job::Job;
-use super::{EncodeError, EncodeSettings, Stopwatch};
+use super::{EncodeError, EncodeSettings, StageTimes};
+use crate::cells::CellSplit;
+use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
 use crate::lift::photos::{self, Photo};
 use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS, extra_field};
 use crate::lift::refine::Refinement;
-use crate::lift::{Aggregation, CellField, PartSums, RegionTable, SumsError, SumsIndex};
+use crate::lift::{
+    Aggregation, CellField, ContributionError, ContributionIndex, PartContributions, RegionTable,
+};
 use crate::objects::{self, ObjectsReport, SceneObjects};
-use crate::palette::{ScoreMetric, TextBank, Yardstick};
 use crate::progress::Progress;
-use crate::shard::cells::CellSplit;
 use crate::shard::{self, BuiltShard, CellEmbeddings};
 use crate::store::{Extras, Store};
 
@@ -27,14 +29,14 @@ pub(super) fn largest_cell_bytes(split: &CellSplit, dim: usize) -> u64 {
     shard::working_bytes(largest, dim)
 }
 
-/// Returns what cell and index leave of `available_bytes` for sums, which need at least `sums_bytes`.
+/// Returns what cell and index leave of `available_bytes` for contributions, which need at least `contributions_bytes`.
 pub(super) fn check_memory(
     available_bytes: u64,
     cell_bytes: u64,
     index_bytes: u64,
-    sums_bytes: u64,
+    contributions_bytes: u64,
 ) -> Result<u64, EncodeError> {
-    let needed_bytes = cell_bytes + index_bytes + sums_bytes;
+    let needed_bytes = cell_bytes + index_bytes + contributions_bytes;
     if needed_bytes > available_bytes {
         return Err(EncodeError::Memory { available_bytes, needed_bytes, cell_bytes, index_bytes });
     }
@@ -48,12 +50,12 @@ pub(super) struct CellBuilder<'a> {
     scene: &'a Gaussians,
     split: &'a CellSplit,
     encoder_id: Hash32,
-    stopwatch: &'a Stopwatch,
-    index: SumsIndex,
+    times: &'a StageTimes,
+    index: ContributionIndex,
     table: RegionTable,
     /// What errors of scores are measured by.
-    yardstick: Yardstick,
-    /// Bytes there are for the sums of a group of cells.
+    score_context: ScoreMetricContext,
+    /// Bytes there are for the contributions of a group of cells.
     group_bytes: u64,
     /// Each view's masks in its photo.
     photos: Vec<Photo>,
@@ -63,7 +65,7 @@ pub(super) struct CellBuilder<'a> {
 pub(super) struct BuiltCells {
     pub(super) records: Vec<CellRecord>,
     /// Half bytes a Gaussian of each cell's residual code.
-    pub(super) n_groups: Vec<u32>,
+    pub(super) n_subspaces: Vec<u32>,
     pub(super) extras: Extras,
     pub(super) n_without_evidence: u64,
     /// Sums over the Gaussians with evidence of mean score and mean squared score, and how many they are.
@@ -94,13 +96,14 @@ impl<'a> CellBuilder<'a> {
         split: &'a CellSplit,
         (job, views): (&Job<'_>, &[&View]),
         (models, bank): (&ModelDir, TextBank),
-        stopwatch: &'a Stopwatch,
+        times: &'a StageTimes,
     ) -> Result<Self, EncodeError> {
         let n_gaussians: Vec<usize> = split.cells.iter().map(|cell| cell.gaussians.len()).collect();
-        let sums_paths: Vec<PathBuf> = views.iter().map(|view| job.sums_path(&view.name)).collect();
-        let (index, mut table) =
-            stopwatch.time("merge", || SumsIndex::open(&sums_paths, models.dim(), &n_gaussians))?;
-        let photo = |(view, n_masks): (&&View, usize)| -> Result<Photo, SumsError> {
+        let contributions_paths: Vec<PathBuf> =
+            views.iter().map(|view| job.contributions_path(&view.name)).collect();
+        let (index, mut table) = times
+            .time("merge", || ContributionIndex::open(&contributions_paths, models.dim(), &n_gaussians))?;
+        let photo = |(view, n_masks): (&&View, usize)| -> Result<Photo, ContributionError> {
             let outlines = photos::read_outlines(&job.outlines_path(&view.name), n_masks)?;
             Ok(Photo { name: view.name.clone(), outlines })
         };
@@ -117,10 +120,10 @@ impl<'a> CellBuilder<'a> {
             index.largest_part_bytes(),
         )?;
         let encoder_id = Hash32(models.encoder_id().hash());
-        let yardstick = stopwatch.time("texts", || {
+        let score_context = times.time("texts", || {
             let metric = ScoreMetric::new(models.dim(), &bank);
             let spread = metric.spread(table.mask_vectors());
-            Yardstick { metric, bank, spread }
+            ScoreMetricContext { metric, bank, spread }
         });
         Ok(Self {
             settings,
@@ -128,10 +131,10 @@ impl<'a> CellBuilder<'a> {
             scene,
             split,
             encoder_id,
-            stopwatch,
+            times,
             index,
             table,
-            yardstick,
+            score_context,
             group_bytes,
             photos,
         })
@@ -148,13 +151,13 @@ impl<'a> CellBuilder<'a> {
             gaussians: self.scene,
             split: self.split,
             photos: &self.photos,
-            yardstick: &self.yardstick,
+            score_context: &self.score_context,
             group_bytes: self.group_bytes,
         };
-        Ok(Some(self.stopwatch.time("objects", || objects::find(&scene))?))
+        Ok(Some(self.times.time("objects", || objects::find(&scene))?))
     }
 
-    pub(super) fn index(&self) -> &SumsIndex {
+    pub(super) fn index(&self) -> &ContributionIndex {
         &self.index
     }
 
@@ -185,7 +188,7 @@ impl<'a> CellBuilder<'a> {
     ) -> Result<Option<BuiltCells>, EncodeError> {
         let mut built = BuiltCells {
             records: Vec::new(),
-            n_groups: Vec::new(),
+            n_subspaces: Vec::new(),
             extras: Extras::new(),
             n_without_evidence: 0,
             score_sums: [0.0; 3],
@@ -194,10 +197,10 @@ impl<'a> CellBuilder<'a> {
         // Of the masks as they are, before any counts less.
         let objects = self.objects()?;
         let aggregation = self.settings.aggregation;
-        let refinement = self.stopwatch.time("refine", || {
-            let sums = (&self.index, &mut self.table);
+        let refinement = self.times.time("refine", || {
+            let contributions = (&self.index, &mut self.table);
             let scene = (self.scene, self.split);
-            Refinement::prepare(aggregation, sums, scene, &self.photos, self.group_bytes, cancel)
+            Refinement::prepare(aggregation, contributions, scene, &self.photos, self.group_bytes, cancel)
         })?;
         if cancel.load(Ordering::Relaxed) {
             return Ok(None);
@@ -211,16 +214,16 @@ impl<'a> CellBuilder<'a> {
         let dim = self.table.dim();
         let mut cell = CellEmbeddings { dim, vectors: Vec::new(), has_evidence: Vec::new() };
         for group in self.index.groups(self.group_bytes) {
-            let sums = self.stopwatch.time("merge", || {
+            let contributions = self.times.time("merge", || {
                 let raw = self.index.read(group)?;
-                self.index.regroup(&raw, &self.table)
+                self.index.transpose(&raw, &self.table)
             })?;
-            for sums in sums {
+            for contributions in contributions {
                 if cancel.load(Ordering::Relaxed) {
                     return Ok(None);
                 }
-                let cell_id = sums.part.cell_id;
-                self.add_part(sums, refinement.as_ref(), &mut cell, &mut built)?;
+                let cell_id = contributions.part.cell_id;
+                self.add_part(contributions, refinement.as_ref(), &mut cell, &mut built)?;
                 if cell.has_evidence.len() == self.split.cells[cell_id as usize].gaussians.len() {
                     self.finish_cell(cell_id, &cell, objects.as_ref(), &mut built)?;
                     cell.has_evidence.clear();
@@ -235,31 +238,31 @@ impl<'a> CellBuilder<'a> {
     /// Adds the next part's embeddings to its cell's, and publishes its field.
     fn add_part(
         &self,
-        mut sums: PartSums,
+        mut contributions: PartContributions,
         refinement: Option<&Refinement>,
         cell: &mut CellEmbeddings,
         built: &mut BuiltCells,
     ) -> Result<(), EncodeError> {
-        let part = sums.part.clone();
+        let part = contributions.part.clone();
         let gaussians = &self.split.cells[part.cell_id as usize].gaussians;
         // Nothing is copied or cleared: the largest cell's vectors are taken once.
         let len = cell.vectors.len().max(gaussians.len() * cell.dim);
         cell.vectors.reserve_exact(len - cell.vectors.len());
         cell.vectors.resize(len, 0.0);
         let vectors = &mut cell.vectors[part.locals.start * cell.dim..part.locals.end * cell.dim];
-        let field = self.stopwatch.time("lift", || {
+        let field = self.times.time("lift", || {
             if let Some(refinement) = refinement {
-                refinement.apply(&mut sums, &gaussians[part.locals.clone()]);
+                refinement.apply(&mut contributions, &gaussians[part.locals.clone()]);
             }
-            CellField::new(gaussians[part.locals.clone()].to_vec(), sums, &self.table, vectors)
+            CellField::new(gaussians[part.locals.clone()].to_vec(), contributions, &self.table, vectors)
         });
         cell.has_evidence.extend((0..field.len()).map(|k| field.has_evidence(k)));
-        let (hash, _) = self.stopwatch.time("write", || self.store.put_object(|out| field.write(out)))?;
+        let (hash, _) = self.times.time("write", || self.store.put_object(|out| field.write(out)))?;
         built.extras.insert(extra_field(part.cell_id, part.number), hash);
         Ok(())
     }
 
-    /// Makes a cell's palette and shards of its embeddings.
+    /// Makes a cell's codebook and shards of its embeddings.
     fn finish_cell(
         &self,
         cell_id: u32,
@@ -269,15 +272,15 @@ impl<'a> CellBuilder<'a> {
     ) -> Result<(), EncodeError> {
         let cell = &self.split.cells[cell_id as usize];
         let (scene, encoder_id, settings) = (self.scene, self.encoder_id, &self.settings.shards);
-        let made = self.stopwatch.time("palette", || {
-            shard::build(scene, cell_id, cell, embeddings, encoder_id, &self.yardstick, settings, objects)
+        let made = self.times.time("codebook", || {
+            shard::build(scene, cell_id, cell, embeddings, encoder_id, &self.score_context, settings, objects)
         });
         let record = |shard: &BuiltShard| -> Result<(Profile, ShardRecord), EncodeError> {
-            let (hash, len_bytes) = self.stopwatch.time("write", || self.store.put_bytes(&shard.bytes))?;
+            let (hash, len_bytes) = self.times.time("write", || self.store.put_bytes(&shard.bytes))?;
             let record = ShardRecord {
                 hash,
                 len_bytes,
-                n_rows: made.n_rows,
+                n_centroids: made.n_centroids,
                 score_error_bound: shard.score_error_bound,
                 score_errors: shard.score_errors,
                 position_error: made.position_error,
@@ -285,11 +288,11 @@ impl<'a> CellBuilder<'a> {
             Ok((shard.profile, record))
         };
         let shards = made.shards.iter().map(record).collect::<Result<_, EncodeError>>()?;
-        built.n_groups.push(made.n_groups);
+        built.n_subspaces.push(made.n_subspaces);
         built.n_without_evidence += made.n_without_evidence as u64;
         let n_with = (cell.gaussians.len() - made.n_without_evidence) as f64;
-        let sums = [made.moments.mean * n_with, made.moments.mean_square * n_with, n_with];
-        built.score_sums.iter_mut().zip(sums).for_each(|(all, of_cell)| *all += of_cell);
+        let contributions = [made.moments.mean * n_with, made.moments.mean_square * n_with, n_with];
+        built.score_sums.iter_mut().zip(contributions).for_each(|(all, of_cell)| *all += of_cell);
         built.records.push(CellRecord {
             cell_id,
             bounds: cell.bounds,

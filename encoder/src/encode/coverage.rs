@@ -12,7 +12,7 @@
 //!
 //! `f` is monotone and submodular, because `g` is growing and concave: so the first `n` views of the greedy order
 //! are worth at least `1 - 1/e` of the best `n` (Nemhauser, Wolsey and Fisher 1978, for every `n` at once). Gains
-//! only fall, so most need not be computed again (Minoux 1978). All sums are integers: the order does not depend
+//! only fall, so most need not be computed again (Minoux 1978). All contributions are integers: the order does not depend
 //! on threads, and equal gains go by the views' names.
 
 use std::cmp::Reverse;
@@ -22,8 +22,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rayon::prelude::*;
 use serde::Serialize;
 
+use crate::masks::{NO_REGION, RegionMap};
 use crate::raster::{LoadedScene, RasterError, RasterView, WeightKind};
-use crate::segment::{NO_REGION, RegionMap};
 
 /// Width of the raster, pixels: a Gaussian that is smaller than a pixel there is smaller than any mask.
 const WIDTH_PX: u32 = 192;
@@ -110,19 +110,19 @@ impl Coverage {
 
     /// Returns all views, each the one that gains most after those before it.
     pub fn order(&self) -> Vec<usize> {
-        let mut sums = vec![0u16; self.n_gaussians];
-        let first: Vec<u64> = self.views.par_iter().map(|view| self.gain(&sums, view)).collect();
+        let mut contributions = vec![0u16; self.n_gaussians];
+        let first: Vec<u64> = self.views.par_iter().map(|view| self.gain(&contributions, view)).collect();
         // (gain, earliest name, how many were chosen when the gain was computed)
         let mut heap: BinaryHeap<_> =
             first.into_iter().enumerate().map(|(view, gain)| (gain, Reverse(view), 0)).collect();
         let mut order = Vec::with_capacity(self.views.len());
         while let Some((_, Reverse(view), n_chosen)) = heap.pop() {
             if n_chosen < order.len() {
-                heap.push((self.gain(&sums, &self.views[view]), Reverse(view), order.len()));
+                heap.push((self.gain(&contributions, &self.views[view]), Reverse(view), order.len()));
                 continue;
             }
             order.push(view);
-            self.add(&mut sums, view);
+            self.add(&mut contributions, view);
         }
         order
     }
@@ -130,10 +130,11 @@ impl Coverage {
     /// Returns how much of what all views show a choice of them shows.
     pub fn report(&self, chosen: impl IntoIterator<Item = usize>) -> CoverageReport {
         let worth = |views: &mut dyn Iterator<Item = usize>| {
-            let mut sums = vec![0u16; self.n_gaussians];
-            views.for_each(|view| self.add(&mut sums, view));
-            let worth: u64 = sums.iter().map(|sum| u64::from(self.gain_of_sum[usize::from(*sum)])).sum();
-            (worth as f64, sums.iter().filter(|sum| **sum > 0).count() as f64)
+            let mut contributions = vec![0u16; self.n_gaussians];
+            views.for_each(|view| self.add(&mut contributions, view));
+            let worth: u64 =
+                contributions.iter().map(|sum| u64::from(self.gain_of_sum[usize::from(*sum)])).sum();
+            (worth as f64, contributions.iter().filter(|sum| **sum > 0).count() as f64)
         };
         let all = worth(&mut (0..self.views.len()));
         let reached = worth(&mut chosen.into_iter());
@@ -142,19 +143,19 @@ impl Coverage {
         CoverageReport { coverage: share(reached.0, all.0), seen: share(reached.1, all.1) }
     }
 
-    fn gain(&self, sums: &[u16], (gaussians, qualities): &(Vec<u32>, Vec<u8>)) -> u64 {
+    fn gain(&self, contributions: &[u16], (gaussians, qualities): &(Vec<u32>, Vec<u8>)) -> u64 {
         let gain = |(k, q): (&u32, &u8)| {
-            let sum = usize::from(sums[*k as usize]);
+            let sum = usize::from(contributions[*k as usize]);
             let more = (sum + usize::from(*q)).min(MAX_SUM);
             u64::from(self.gain_of_sum[more] - self.gain_of_sum[sum])
         };
         gaussians.iter().zip(qualities).map(gain).sum()
     }
 
-    fn add(&self, sums: &mut [u16], view: usize) {
+    fn add(&self, contributions: &mut [u16], view: usize) {
         let (gaussians, qualities) = &self.views[view];
         for (k, q) in gaussians.iter().zip(qualities) {
-            let sum = &mut sums[*k as usize];
+            let sum = &mut contributions[*k as usize];
             *sum = sum.saturating_add(u16::from(*q));
         }
     }
@@ -218,11 +219,11 @@ mod tests {
     fn worth(weights: &[Vec<(u32, f32)>], n_gaussians: usize, chosen: &[usize]) -> f64 {
         let mut best = vec![0.0f64; n_gaussians];
         weights.iter().flatten().for_each(|(k, a)| best[*k as usize] = best[*k as usize].max((*a).into()));
-        let mut sums = vec![0.0; n_gaussians];
+        let mut contributions = vec![0.0; n_gaussians];
         for (k, a) in chosen.iter().flat_map(|view| &weights[*view]) {
-            sums[*k as usize] += (f64::from(*a) / best[*k as usize]).powi(2);
+            contributions[*k as usize] += (f64::from(*a) / best[*k as usize]).powi(2);
         }
-        sums.iter().map(|sum: &f64| (STEEPNESS * sum).ln_1p()).sum()
+        contributions.iter().map(|sum: &f64| (STEEPNESS * sum).ln_1p()).sum()
     }
 
     /// Oracle: every set of n views, and the definition in f64; the bound of Nemhauser, Wolsey and Fisher holds for
@@ -269,13 +270,14 @@ mod tests {
             weights[20] = weights[3].clone();
             weights[7] = weights[3].clone();
             let coverage = Coverage::new(60, weights);
-            let (mut sums, mut left, mut plain) = (vec![0u16; 60], (0..24).collect::<Vec<_>>(), Vec::new());
+            let (mut contributions, mut left, mut plain) =
+                (vec![0u16; 60], (0..24).collect::<Vec<_>>(), Vec::new());
             while !left.is_empty() {
                 let gains: Vec<u64> =
-                    left.iter().map(|view| coverage.gain(&sums, &coverage.views[*view])).collect();
+                    left.iter().map(|view| coverage.gain(&contributions, &coverage.views[*view])).collect();
                 let most = gains.iter().max().expect("some are left");
                 let view = left.remove(gains.iter().position(|gain| gain == most).expect("it is there"));
-                coverage.add(&mut sums, view);
+                coverage.add(&mut contributions, view);
                 plain.push(view);
             }
             assert_eq!(coverage.order(), plain);

@@ -1,4 +1,4 @@
-//! The state of an unfinished encode: which views are done, and their files of sums.
+//! The state of an unfinished encode: which views are done, and their files of contributions.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
 
 use super::EncodeError;
-use crate::lift::ViewSums;
-use crate::lift::photos::{self, Outline};
+use crate::lift::ViewContributions;
+use crate::lift::photos::{self, MaskOutline};
 use crate::store::Store;
 
 const TREE: &str = "job";
@@ -46,7 +46,7 @@ impl<'a> Job<'a> {
         let same = found.as_deref() == Some(&fingerprint.0);
         let published =
             job.records.contains_key(PUBLISHED_KEY).map_err(|source| records_error(store, source))?;
-        // What is published is not lost with its sums.
+        // What is published is not lost with its contributions.
         if found.is_some() && !same && !restart && !published {
             return Err(EncodeError::OtherJob {
                 path: store.dir().to_owned(),
@@ -64,7 +64,7 @@ impl<'a> Job<'a> {
         Ok(job)
     }
 
-    /// Returns the views whose sums are on disk.
+    /// Returns the views whose contributions are on disk.
     pub(super) fn done_views(&self) -> Result<BTreeMap<String, ViewRecord>, EncodeError> {
         let records = self.records.scan_prefix(VIEW_PREFIX);
         records
@@ -77,34 +77,34 @@ impl<'a> Job<'a> {
             .collect()
     }
 
-    /// Returns where a view's sums lie.
-    pub(super) fn sums_path(&self, view: &str) -> PathBuf {
+    /// Returns where a view's contributions lie.
+    pub(super) fn contributions_path(&self, view: &str) -> PathBuf {
         // Names hold separators and may be long; their hash does not.
-        self.folder.join("views").join(format!("{}.sums", Hash32::of(view.as_bytes())))
+        self.folder.join("views").join(format!("{}.contributions", Hash32::of(view.as_bytes())))
     }
 
     /// Returns where the outlines of a view's masks lie.
     pub(super) fn outlines_path(&self, view: &str) -> PathBuf {
-        self.sums_path(view).with_extension("outlines")
+        self.contributions_path(view).with_extension("outlines")
     }
 
-    /// Keeps a view's sums and its masks' outlines: the files first, then the record that counts it as done.
+    /// Keeps a view's contributions and its masks' outlines: the files first, then the record that counts it as done.
     pub(super) fn keep(
         &self,
         view: &str,
-        sums: &ViewSums,
-        outlines: &[Outline],
+        contributions: &ViewContributions,
+        outlines: &[MaskOutline],
         record: ViewRecord,
     ) -> Result<(), EncodeError> {
         photos::write_outlines(&self.outlines_path(view), outlines)?;
-        sums.write(&self.sums_path(view))?;
+        contributions.write(&self.contributions_path(view))?;
         let key = format!("{VIEW_PREFIX}{view}");
         let record = serde_json::to_vec(&record).map_err(std::io::Error::from)?;
         self.records.insert(key, record).map_err(|source| records_error(self.store, source))?;
         self.flush()
     }
 
-    /// Keeps the sums of views that were published, for an encode that goes on with others.
+    /// Keeps the contributions of views that were published, for an encode that goes on with others.
     pub(super) fn keep_published(self) -> Result<(), EncodeError> {
         self.records.insert(PUBLISHED_KEY, &[]).map_err(|source| records_error(self.store, source))?;
         self.flush()

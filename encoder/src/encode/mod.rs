@@ -1,6 +1,6 @@
 //! The pipeline: photos, poses and a splat in, a published generation of shards out.
 //!
-//! Views are independent: each leaves one file of sums in the job's folder, so a killed encode
+//! Views are independent: each leaves one file of contributions in the job's folder, so a killed encode
 //! resumes after the last finished view. Everything after that reads those files in the order of
 //! the views' names, so the store's bytes do not depend on threads, on the order of views or on where
 //! a run was interrupted.
@@ -27,17 +27,16 @@ use slag_common::splat::{self, SplatError};
 use slag_common::{Hash32, View};
 use slag_models::{ModelDir, ModelError, SessionOptions};
 
+use crate::codebook::TextBank;
 use crate::embed::EmbedError;
 use crate::ingest::{self, GeoError, IngestError};
-use crate::lift::{SumsError, SumsIndex};
+use crate::lift::{ContributionError, ContributionIndex};
 use crate::objects::ObjectsReport;
-use crate::palette::TextBank;
 use crate::progress::Progress;
 use crate::raster::{LoadedScene, RasterError, RasterView, Rasterizer};
-use crate::segment::{
-    GivenMasks, GraphSegmenter, GraphSettings, NoisyMasks, SamSegmenter, SegmentError, Segmenter,
-};
-use crate::shard;
+use crate::segment::noise::NoisyMasks;
+use crate::segment::{GivenMasks, GraphSegmenter, GraphSettings, SamSegmenter, SegmentError, Segmenter};
+
 use crate::store::{Store, StoreError};
 use cells::CellBuilder;
 use coverage::{Coverage, CoverageReport};
@@ -89,9 +88,9 @@ pub enum EncodeError {
     /// The store said no.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// A file of sums is damaged.
+    /// A file of contributions is damaged.
     #[error(transparent)]
-    Sums(#[from] SumsError),
+    Sums(#[from] ContributionError),
     /// A working file could not be read or written.
     #[error(transparent)]
     Io(#[from] std::io::Error),
@@ -143,7 +142,7 @@ pub enum EncodeError {
     /// The budget is too small.
     #[error(
         "--memory is {available_bytes} bytes, {needed_bytes} are needed: {cell_bytes} for the largest cell, \
-         {index_bytes} for the masks and sums of all views; raise --memory or lower --cell-gaussians"
+         {index_bytes} for the masks and contributions of all views; raise --memory or lower --cell-gaussians"
     )]
     Memory {
         /// Bytes there are.
@@ -152,7 +151,7 @@ pub enum EncodeError {
         needed_bytes: u64,
         /// Of these, to build the largest cell.
         cell_bytes: u64,
-        /// Of these, for mask vectors and where sums lie.
+        /// Of these, for mask vectors and where contributions lie.
         index_bytes: u64,
     },
     /// Stopped by the user; a rerun resumes.
@@ -194,10 +193,10 @@ pub struct CellReport {
     pub n_gaussians: u32,
     /// Sums per (Gaussian, region).
     pub n_entries: u64,
-    /// Palette rows.
-    pub n_rows: u32,
+    /// Codebook rows.
+    pub n_centroids: u32,
     /// Half bytes a Gaussian of the residual code; 0 where rows are enough for every profile.
-    pub n_groups: u32,
+    pub n_subspaces: u32,
     /// Bytes of its shards by profile.
     pub shard_bytes: BTreeMap<String, u64>,
     /// Mean error of their scores, relative to the spread of scores.
@@ -235,7 +234,7 @@ pub struct EncodeSummary {
     /// Views that were used.
     pub n_views: usize,
     /// Views that there are photos of.
-    pub n_views_there: usize,
+    pub n_views_with_photo: usize,
     /// The order in which they were taken.
     pub view_order: ViewOrder,
     /// What the used views show of what all show, where views were taken by it.
@@ -256,8 +255,8 @@ pub struct EncodeSummary {
     pub n_entries: u64,
     /// Cells.
     pub n_cells: usize,
-    /// Palette rows in all cells.
-    pub n_rows: u64,
+    /// Codebook rows in all cells.
+    pub n_centroids: u64,
     /// Objects, where they were looked for.
     pub objects: Option<ObjectsReport>,
     /// Bytes of all shards by profile.
@@ -282,9 +281,9 @@ pub struct EncodeSummary {
 
 /// Adds up the time spent in each stage, over all threads.
 #[derive(Default)]
-pub(crate) struct Stopwatch(Mutex<BTreeMap<&'static str, f64>>);
+pub(crate) struct StageTimes(Mutex<BTreeMap<&'static str, f64>>);
 
-impl Stopwatch {
+impl StageTimes {
     pub(crate) fn time<T>(&self, stage: &'static str, work: impl FnOnce() -> T) -> T {
         let start = Instant::now();
         let result = work();
@@ -307,14 +306,14 @@ pub fn encode(
     cancel: &AtomicBool,
 ) -> Result<EncodeSummary, EncodeError> {
     let start = Instant::now();
-    let stopwatch = Stopwatch::default();
+    let times = StageTimes::default();
     // First of all, so that a second encode into the same store fails at once.
     let store = Store::create_or_open(&settings.store)?;
     let geo_reference = settings.geo.as_deref().map(ingest::read_geo_reference).transpose()?;
     let read_options = splat::ReadOptions { with_sh_rest: false };
-    let scene = stopwatch.time("read", || splat::read(&settings.scene, &read_options))?;
+    let scene = times.time("read", || splat::read(&settings.scene, &read_options))?;
     let (views, mut skipped) = find_views(settings)?;
-    let split = stopwatch.time("cells", || shard::cells::split(&scene, settings.cells));
+    let split = times.time("cells", || crate::cells::split(&scene, settings.cells));
     if split.cells.is_empty() {
         let n_gaussians = scene.len();
         return Err(EncodeError::NoGaussians { path: settings.scene.clone(), n_gaussians });
@@ -341,7 +340,7 @@ pub fn encode(
     let job = Job::open(&store, fingerprint, settings.restart)?;
 
     let done = job.done_views()?;
-    let loaded = stopwatch.time("raster", || rasterizer.load(&scene))?;
+    let loaded = times.time("raster", || rasterizer.load(&scene))?;
     let coverage_start = Instant::now();
     let (chosen, coverage) = choose_views(settings, loaded.as_ref(), scene.len(), &views, cancel)?;
     let coverage_secs = coverage.as_ref().map_or(0.0, |_| coverage_start.elapsed().as_secs_f64());
@@ -380,16 +379,16 @@ pub fn encode(
         return Err(EncodeError::NoViews { n_views: skipped.len(), reason: first.reason.clone() });
     }
 
-    let bank = stopwatch.time("texts", || match models.text_encoder(session) {
+    let bank = times.time("texts", || match models.text_encoder(session) {
         Ok(mut encoder) => TextBank::of_model(&mut *encoder),
         Err(e) => {
-            tracing::warn!("{e}; palettes take texts in all directions alike");
+            tracing::warn!("{e}; codebooks take texts in all directions alike");
             TextBank::directions(models.dim())
         }
     });
     let mut builder = {
         let views = (&job, &used[..]);
-        CellBuilder::open(settings, &store, &scene, &split, views, (models, bank), &stopwatch)?
+        CellBuilder::open(settings, &store, &scene, &split, views, (models, bank), &times)?
     };
     let mut summary = EncodeSummary {
         generation: store.next_generation()?,
@@ -397,7 +396,7 @@ pub fn encode(
         n_without_evidence: 0,
         n_rejected: split.n_rejected as u64,
         n_views: used.len(),
-        n_views_there: views.len(),
+        n_views_with_photo: views.len(),
         view_order: settings.view_order,
         coverage,
         coverage_secs,
@@ -408,7 +407,7 @@ pub fn encode(
         n_regions: builder.n_regions(),
         n_entries: builder.n_entries(),
         n_cells: split.cells.len(),
-        n_rows: 0,
+        n_centroids: 0,
         objects: None,
         shard_bytes: BTreeMap::new(),
         cells: Vec::new(),
@@ -437,16 +436,16 @@ pub fn encode(
         for (profile, len_bytes) in &shard_bytes {
             *summary.shard_bytes.entry(profile.clone()).or_default() += len_bytes;
         }
-        let n_rows = record.shards.values().map(|shard| shard.n_rows).max().unwrap_or(0);
-        summary.n_rows += u64::from(n_rows);
+        let n_centroids = record.shards.values().map(|shard| shard.n_centroids).max().unwrap_or(0);
+        summary.n_centroids += u64::from(n_centroids);
         let CellRecord { cell_id, n_gaussians, .. } = *record;
         let relative = |errors: &ScoreErrors| errors.mean / errors.spread.max(f32::MIN_POSITIVE);
         summary.cells.push(CellReport {
             cell_id,
             n_gaussians,
             n_entries: n_entries_of_cell[cell_id as usize],
-            n_rows,
-            n_groups: built.n_groups[cell_id as usize],
+            n_centroids,
+            n_subspaces: built.n_subspaces[cell_id as usize],
             shard_bytes,
             score_error: (record.shards.iter())
                 .map(|(profile, shard)| (profile.to_string(), relative(&shard.score_errors)))
@@ -483,13 +482,13 @@ pub fn encode(
         cells: built.records,
     };
     store.publish(&manifest, &built.extras)?;
-    // With views left to do the sums stay: the next encode goes on from them.
+    // With views left to do the contributions stay: the next encode goes on from them.
     match settings.keep_views || done.len() + n_failed < views.len() {
         true => job.keep_published()?,
         false => job.finish()?,
     }
     store.prune()?;
-    summary.busy_secs = stopwatch
+    summary.busy_secs = times
         .0
         .into_inner()
         .unwrap_or_else(PoisonError::into_inner)
@@ -559,7 +558,11 @@ fn choose_views(
 }
 
 /// Returns what was spent on the views that are used.
-fn views_report(used: &[&View], done: &BTreeMap<String, ViewRecord>, index: &SumsIndex) -> ViewsReport {
+fn views_report(
+    used: &[&View],
+    done: &BTreeMap<String, ViewRecord>,
+    index: &ContributionIndex,
+) -> ViewsReport {
     let record = |view: &&View| done.get(&view.name).copied().unwrap_or_default();
     ViewsReport {
         view: used.iter().map(|view| view.name.clone()).collect(),

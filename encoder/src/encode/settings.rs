@@ -9,13 +9,14 @@ use slag_common::{Gaussians, Hash32, View};
 use slag_models::ModelDir;
 
 use super::EncodeError;
+use crate::cells::CellLimits;
+use crate::codebook::CodebookSettings;
 use crate::embed::Background;
 use crate::lift::Aggregation;
-use crate::palette::PaletteSettings;
 use crate::raster::WeightKind;
-use crate::segment::{MaskNoise, SamSettings};
+use crate::segment::SamSettings;
+use crate::segment::noise::MaskNoise;
 use crate::shard::ShardSettings;
-use crate::shard::cells::CellLimits;
 use crate::shard::positions::PositionError;
 
 /// Where masks come from.
@@ -117,7 +118,7 @@ pub struct EncodeSettings {
     pub min_mask_px: u32,
     /// Which weight is summed.
     pub weights: WeightKind,
-    /// How sums become embeddings. No part of what a view leaves behind: views that are done stay so.
+    /// How contributions become embeddings. No part of what a view leaves behind: views that are done stay so.
     pub aggregation: Aggregation,
     /// Errors to lay over the masks, for experiments.
     pub mask_noise: Option<MaskNoise>,
@@ -125,7 +126,7 @@ pub struct EncodeSettings {
     pub keep_views: bool,
     /// Views worked on at a time.
     pub threads: usize,
-    /// Working memory for sums and region vectors.
+    /// Working memory for contributions and region vectors.
     pub memory_bytes: u64,
     /// Whether a missing or unreadable input ends the encode.
     pub strict: bool,
@@ -194,7 +195,7 @@ impl EncodeSettings {
             cells: CellLimits { max_gaussians: 65_536, max_width: metric.then_some(25.0) },
             shards: ShardSettings {
                 profiles: Profile::ALL.to_vec(),
-                palette: PaletteSettings::default(),
+                codebook: CodebookSettings::default(),
                 position_error: PositionError::default_for(metric),
             },
             objects: true,
@@ -221,7 +222,7 @@ impl EncodeSettings {
         Ok(files)
     }
 
-    /// Returns the hash of everything on which a view's sums depend.
+    /// Returns the hash of everything on which a view's contributions depend.
     pub(super) fn fingerprint(
         &self,
         models: &ModelDir,

@@ -11,14 +11,16 @@ use super::job::{Job, ViewRecord};
 use super::pipeline::Stage;
 use super::settings::{LONG_BORDERS, MAX_RASTER_WIDTH_PX, RasterWidth};
 use super::{EncodeError, EncodeSettings};
+use crate::cells::CellSplit;
 use crate::embed;
 use crate::ingest::{self, LoadedImage};
-use crate::lift::ViewSums;
-use crate::lift::photos::Outline;
+use crate::lift::ViewContributions;
+use crate::lift::photos::MaskOutline;
+use crate::masks::regions::{absorb_slivers, border_share, partition};
+use crate::masks::{Mask, RegionMap};
 use crate::progress::Progress;
 use crate::raster::{LoadedScene, RasterError, RasterView};
-use crate::segment::{self, Mask, RegionMap, SegmentInput, Segmenter};
-use crate::shard::cells::CellSplit;
+use crate::segment::{SegmentInput, Segmenter};
 
 /// Views at once in a GPU's image encoder: one is computed while others' pixel values are made and copied.
 const GPU_EMBED_SLOTS: usize = 3;
@@ -57,7 +59,7 @@ enum Next {
     Crop(LoadedImage, Vec<Mask>),
     Embed(Crops, Partition),
     Raster(Vec<f32>, Partition),
-    Write(ViewSums, Vec<Outline>, u32),
+    Write(ViewContributions, Vec<MaskOutline>, u32),
 }
 
 /// What is to be embedded.
@@ -75,7 +77,7 @@ struct Partition {
     regions: RegionMap,
     masks_of_region: Vec<Vec<u32>>,
     /// Of each mask.
-    outlines: Vec<Outline>,
+    outlines: Vec<MaskOutline>,
     /// Pixels of the base width in one of the raster: a view does not count more for being finer.
     weight_scale: f32,
 }
@@ -161,12 +163,13 @@ impl ViewStages<'_> {
                     .map_err(raster_failed)?;
                 weights.entries.iter_mut().for_each(|entry| entry.weight *= weight_scale);
                 let dim = self.models.dim();
-                let sums = ViewSums::new(&weights.entries, masks_of_region, vectors, dim, self.split);
-                Next::Write(sums, outlines, raster_view.intrinsics.width_px)
+                let contributions =
+                    ViewContributions::new(&weights.entries, masks_of_region, vectors, dim, self.split);
+                Next::Write(contributions, outlines, raster_view.intrinsics.width_px)
             }
-            Next::Write(sums, outlines, raster_width_px) => {
+            Next::Write(contributions, outlines, raster_width_px) => {
                 let record = ViewRecord { raster_width_px, secs: work.secs };
-                self.job.keep(&view.name, &sums, &outlines, record)?;
+                self.job.keep(&view.name, &contributions, &outlines, record)?;
                 self.progress.advance(1);
                 return Ok(None);
             }
@@ -191,24 +194,22 @@ impl ViewStages<'_> {
             let Intrinsics { width_px, height_px, .. } = raster_view.intrinsics;
             let (image, valid) = (&loaded.image, loaded.valid.as_deref());
             let (mut regions, mut masks_of_region) =
-                segment::partition(masks, image.width(), image.height(), width_px, height_px, valid);
-            segment::absorb_slivers(&mut regions, &mut masks_of_region);
+                partition(masks, image.width(), image.height(), width_px, height_px, valid);
+            absorb_slivers(&mut regions, &mut masks_of_region);
             (raster_view, regions, masks_of_region)
         };
         let base_px = self.base_width_px(loaded);
         let mut made = regions_at(base_px);
         let mut width_px = base_px;
         // Twice: pixels stay in step with those of the photo, whose masks then are just as they are.
-        if self.settings.raster_width == RasterWidth::ByContent
-            && segment::border_share(&made.1) > LONG_BORDERS
-        {
+        if self.settings.raster_width == RasterWidth::ByContent && border_share(&made.1) > LONG_BORDERS {
             width_px = 2 * base_px;
             made = regions_at(width_px);
         }
         let (raster_view, regions, masks_of_region) = made;
         let weight_scale = (f64::from(base_px) / f64::from(width_px)).powi(2) as f32;
         let (width_px, height_px) = loaded.image.dimensions();
-        let outline = |mask| Outline::of(mask, width_px, height_px, loaded.valid.as_deref());
+        let outline = |mask| MaskOutline::of(mask, width_px, height_px, loaded.valid.as_deref());
         let outlines = masks.iter().map(outline).collect();
         Partition { raster_view, regions, masks_of_region, outlines, weight_scale }
     }

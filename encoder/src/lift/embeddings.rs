@@ -1,4 +1,4 @@
-//! The embeddings of many Gaussians at once, from their sums.
+//! The embeddings of many Gaussians at once, from their contributions.
 //!
 //! A component of an embedding is a sum over hundreds of region vectors, far more than fit a cache.
 //! So a few neighbouring Gaussians, which share most of their regions, are taken together, and of
@@ -10,15 +10,16 @@ use std::ops::Range;
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::field::{MIN_MEAN_LENGTH, dot};
-use super::regroup::PartSums;
+use super::field::MIN_MEAN_LENGTH;
 use super::table::RegionTable;
+use super::transpose::PartContributions;
+use slag_math::dot;
 
 /// Gaussians taken together: their embeddings stay in a core's cache until they are scaled.
 const CHUNK: usize = 512;
 /// Components of the region vectors that are at hand at a time.
 const BLOCK: usize = 128;
-/// Registers that hold sums: enough to hide an addition's latency; BLOCK fills them at any width.
+/// Registers that hold contributions: enough to hide an addition's latency; BLOCK fills them at any width.
 const REGISTERS: usize = 8;
 const UNSEEN: u32 = u32::MAX;
 
@@ -35,13 +36,22 @@ struct Scratch {
 
 /// Writes the unit embedding of each Gaussian of a part to `out` (`[N][dim]`), zeros where there is no
 /// evidence, and returns the lengths of their mean vectors, 0 where there is none.
-pub(super) fn write_embeddings(sums: &PartSums, table: &RegionTable, out: &mut [f32]) -> Vec<f32> {
-    write_embeddings_on(Arch::new(), sums, table, out)
+pub(super) fn write_embeddings(
+    contributions: &PartContributions,
+    table: &RegionTable,
+    out: &mut [f32],
+) -> Vec<f32> {
+    write_embeddings_on(Arch::new(), contributions, table, out)
 }
 
-fn write_embeddings_on(arch: Arch, sums: &PartSums, table: &RegionTable, out: &mut [f32]) -> Vec<f32> {
+fn write_embeddings_on(
+    arch: Arch,
+    contributions: &PartContributions,
+    table: &RegionTable,
+    out: &mut [f32],
+) -> Vec<f32> {
     let dim = table.dim();
-    let mut lengths = vec![0.0; sums.total_weights.len()];
+    let mut lengths = vec![0.0; contributions.total_weights.len()];
     out.par_chunks_mut(CHUNK * dim).zip(lengths.par_chunks_mut(CHUNK)).enumerate().for_each_init(
         || Scratch {
             place_of_region: vec![UNSEEN; table.len()],
@@ -51,8 +61,8 @@ fn write_embeddings_on(arch: Arch, sums: &PartSums, table: &RegionTable, out: &m
         },
         |scratch, (chunk, (out, lengths))| {
             let first = chunk * CHUNK;
-            scratch.number_regions(sums, first..first + lengths.len());
-            lengths.copy_from_slice(&arch.dispatch(Chunk { sums, table, first, scratch, out }));
+            scratch.number_regions(contributions, first..first + lengths.len());
+            lengths.copy_from_slice(&arch.dispatch(Chunk { contributions, table, first, scratch, out }));
             scratch.forget_regions();
         },
     );
@@ -77,10 +87,11 @@ pub(super) fn make_unit(sum: &mut [f32], total_weight: f32) -> f32 {
 
 impl Scratch {
     /// Numbers the regions of some Gaussians in the order in which they come up.
-    fn number_regions(&mut self, sums: &PartSums, gaussians: Range<usize>) {
-        let entries = sums.starts[gaussians.start] as usize..sums.starts[gaussians.end] as usize;
+    fn number_regions(&mut self, contributions: &PartContributions, gaussians: Range<usize>) {
+        let entries =
+            contributions.starts[gaussians.start] as usize..contributions.starts[gaussians.end] as usize;
         self.places.clear();
-        for region in &sums.regions[entries] {
+        for region in &contributions.regions[entries] {
             let place = &mut self.place_of_region[*region as usize];
             if *place == UNSEEN {
                 *place = self.regions.len() as u32;
@@ -95,9 +106,9 @@ impl Scratch {
     }
 }
 
-/// The sums of region vectors of some consecutive Gaussians.
+/// The contributions of region vectors of some consecutive Gaussians.
 struct Chunk<'a> {
-    sums: &'a PartSums,
+    contributions: &'a PartContributions,
     table: &'a RegionTable,
     first: usize,
     scratch: &'a mut Scratch,
@@ -111,26 +122,26 @@ impl WithSimd for Chunk<'_> {
     /// Returns the lengths of the mean vectors.
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) -> Vec<f32> {
-        let Self { sums, table, first, scratch, out } = self;
+        let Self { contributions, table, first, scratch, out } = self;
         let Scratch { regions, places, vectors, .. } = scratch;
         let dim = table.dim();
-        let first_entry = sums.starts[first] as usize;
+        let first_entry = contributions.starts[first] as usize;
         for from in (0..dim).step_by(BLOCK) {
             let width = BLOCK.min(dim - from);
             vectors.resize(vectors.len().max(regions.len()), [0.0; BLOCK]);
             for (vector, region) in vectors.iter_mut().zip(&*regions) {
                 table.components(*region as usize, from, &mut vector[..width]);
             }
-            for (embedding, at) in out.chunks_exact_mut(dim).zip(sums.starts[first..].windows(2)) {
+            for (embedding, at) in out.chunks_exact_mut(dim).zip(contributions.starts[first..].windows(2)) {
                 let entries = at[0] as usize..at[1] as usize;
                 let places = &places[entries.start - first_entry..entries.end - first_entry];
                 let mut sum = [0.0; BLOCK];
-                add_vectors(simd, vectors, places, &sums.weights[entries], &mut sum);
+                add_vectors(simd, vectors, places, &contributions.weights[entries], &mut sum);
                 embedding[from..from + width].copy_from_slice(&sum[..width]);
             }
         }
         let make_unit = |(sum, total): (&mut [f32], &f32)| make_unit(sum, *total);
-        out.chunks_exact_mut(dim).zip(&sums.total_weights[first..]).map(make_unit).collect()
+        out.chunks_exact_mut(dim).zip(&contributions.total_weights[first..]).map(make_unit).collect()
     }
 }
 
@@ -179,12 +190,12 @@ mod tests {
             let scene = scene_of(dim, 600, 11);
             let Scene { index, table, .. } = &scene;
             let raw = index.read(0..index.parts().len()).expect("reads");
-            for sums in index.regroup(&raw, table).expect("regroups") {
+            for contributions in index.transpose(&raw, table).expect("transposes") {
                 let results: Vec<(Vec<f32>, Vec<f32>)> = widths
                     .iter()
                     .map(|arch| {
-                        let mut out = vec![f32::NAN; sums.total_weights.len() * dim];
-                        (write_embeddings_on(*arch, &sums, table, &mut out), out)
+                        let mut out = vec![f32::NAN; contributions.total_weights.len() * dim];
+                        (write_embeddings_on(*arch, &contributions, table, &mut out), out)
                     })
                     .collect();
                 assert!(results.iter().all(|r| *r == results[0]), "dim {dim}");

@@ -1,4 +1,4 @@
-//! The factorised field of a cell: sparse sums over the scene's region vectors, and the scores that
+//! The factorised field of a cell: sparse contributions over the scene's region vectors, and the scores that
 //! follow from it.
 
 use std::io::{self, Write};
@@ -7,17 +7,17 @@ use rayon::prelude::*;
 use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
 
 use super::embeddings::{make_unit, write_embeddings};
-use super::regroup::PartSums;
 use super::table::RegionTable;
+use super::transpose::PartContributions;
 
 /// Below this length of the mean vector the masks that saw a Gaussian cancel: what is left of
-/// them is rounding noise of f32 sums and of the models, so it is flagged as no evidence.
+/// them is rounding noise of f32 contributions and of the models, so it is flagged as no evidence.
 pub const MIN_MEAN_LENGTH: f32 = 1e-3;
 
 const MAGIC: [u8; 8] = *b"SLAGFELD";
 const VERSION: u32 = 1;
 
-/// The sparse sums of one cell's Gaussians, row by row.
+/// The sparse contributions of one cell's Gaussians, row by row.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CellField {
     /// `[N]`: index of each Gaussian in the input file.
@@ -35,11 +35,16 @@ pub struct CellField {
 }
 
 impl CellField {
-    /// Makes the field of a part's sums and writes its embeddings to `embeddings` (`[N][dim]`): unit, or
+    /// Makes the field of a part's contributions and writes its embeddings to `embeddings` (`[N][dim]`): unit, or
     /// zeros where there is no evidence. `input_indices` are of the part's Gaussians.
-    pub fn new(input_indices: Vec<u32>, sums: PartSums, table: &RegionTable, embeddings: &mut [f32]) -> Self {
-        let mean_lengths = write_embeddings(&sums, table, embeddings);
-        let PartSums { starts, regions, weights, total_weights, .. } = sums;
+    pub fn new(
+        input_indices: Vec<u32>,
+        contributions: PartContributions,
+        table: &RegionTable,
+        embeddings: &mut [f32],
+    ) -> Self {
+        let mean_lengths = write_embeddings(&contributions, table, embeddings);
+        let PartContributions { starts, regions, weights, total_weights, .. } = contributions;
         Self { input_indices, starts, regions, weights, total_weights, mean_lengths }
     }
 
@@ -64,7 +69,7 @@ impl CellField {
         self.input_indices.is_empty()
     }
 
-    /// Returns the regions of a Gaussian's sums, and their weights.
+    /// Returns the regions of a Gaussian's contributions, and their weights.
     pub fn entries(&self, k: usize) -> impl Iterator<Item = (usize, f32)> + '_ {
         let range = self.starts[k] as usize..self.starts[k + 1] as usize;
         self.regions[range.clone()].iter().map(|r| *r as usize).zip(self.weights[range].iter().copied())
@@ -143,19 +148,4 @@ impl CellField {
         let what = "starts or regions refer to what is not there".into();
         Err(ContainerError::Damaged { offset_bytes: 0, what })
     }
-}
-
-/// Returns the scalar product, summed in 16 fixed lanes.
-#[inline]
-pub fn dot(a: &[f32], b: &[f32]) -> f32 {
-    let mut lanes = [0.0f32; 16];
-    let (a_blocks, a_rest) = a.as_chunks::<16>();
-    let (b_blocks, b_rest) = b.as_chunks::<16>();
-    for (x, y) in a_blocks.iter().zip(b_blocks) {
-        for lane in 0..16 {
-            lanes[lane] += x[lane] * y[lane];
-        }
-    }
-    let rest: f32 = a_rest.iter().zip(b_rest).map(|(x, y)| x * y).sum();
-    lanes.iter().sum::<f32>() + rest
 }

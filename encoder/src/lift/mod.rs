@@ -1,4 +1,4 @@
-//! Stage 4: sums per (Gaussian, region) become embeddings.
+//! Stage 4: contributions per (Gaussian, region) become embeddings.
 //!
 //! The paper's weighted average (Szilagyi et al. 2025, the equation for E_k) over all views i, masks
 //! j and pixels p is, with the pixels grouped into regions r of equal mask sets,
@@ -8,34 +8,38 @@
 //! V_r = Σ_{j covers r} e_j                    n_r = number of masks that cover r
 //! ```
 //!
-//! so the field stays factorised: a sparse matrix of sums times a small matrix of region vectors.
+//! so the field stays factorised: a sparse matrix of contributions times a small matrix of region vectors.
 //! Sums are taken in one canonical order (views by name, then regions), whatever order, thread or
 //! process made them: the result is the same bit for bit.
 //!
 //! | step | job |
 //! |---|---|
-//! | [`sums`] | a view's sums in a file, ordered by cell |
-//! | [`regroup`] | the sums of all views by Gaussian, a few cells at a time |
+//! | [`contributions`] | a view's contributions in a file, ordered by cell |
+//! | [`transpose`] | the contributions of all views by Gaussian, a few cells at a time |
 //! | [`refine`] | what masks count, and what neighbours add, where more than the plain average is asked for |
 //! | [`embeddings`] | each Gaussian's embedding, computed once |
-//! | [`field`] | what is kept of it: sums, total weight, length |
+//! | [`field`] | what is kept of it: contributions, total weight, length |
 
+mod contributions;
 mod embeddings;
 mod field;
 pub mod photos;
 pub mod published;
 pub mod refine;
-mod regroup;
-mod sums;
+pub mod superpoint;
 mod table;
 #[cfg(test)]
 mod tests;
+mod transpose;
 
-pub use field::{CellField, dot};
+pub use contributions::{
+    Contribution, ContributionError, ContributionFile, GAUSSIANS_PER_SLICE, MAX_REGIONS, ViewContributions,
+    ViewRegions,
+};
+pub use field::CellField;
 pub use refine::Aggregation;
-pub use regroup::{Part, PartSums, RawGroup, SumsIndex};
-pub use sums::{GAUSSIANS_PER_SLICE, MAX_REGIONS, SumEntry, SumsError, SumsFile, ViewRegions, ViewSums};
 pub use table::RegionTable;
+pub use transpose::{ContributionIndex, Part, PartContributions, RawGroup};
 
 /// Returns whether values are ascending from 0 to `end`, as the starts of `starts.len() - 1` rows are.
 fn are_starts(starts: &[u64], end: usize) -> bool {

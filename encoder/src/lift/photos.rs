@@ -1,4 +1,4 @@
-//! How a view's masks lie in its photo, kept beside its sums: what the photo's edge cuts off, and where the object is
+//! How a view's masks lie in its photo, kept beside its contributions: what the photo's edge cuts off, and where the object is
 //! that it shows.
 
 use std::path::Path;
@@ -6,8 +6,8 @@ use std::path::Path;
 use bytemuck::{Pod, Zeroable};
 use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
 
-use super::sums::SumsError;
-use crate::segment::{BoxPx, Mask};
+use super::contributions::ContributionError;
+use crate::masks::{BoxPx, Mask};
 
 const MAGIC: [u8; 8] = *b"SLAGMBOX";
 const VERSION: u32 = 2;
@@ -20,13 +20,13 @@ pub struct Photo {
     /// Name of the view.
     pub name: String,
     /// Of each mask.
-    pub outlines: Vec<Outline>,
+    pub outlines: Vec<MaskOutline>,
 }
 
 /// How a mask lies in its photo.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
-pub struct Outline {
+pub struct MaskOutline {
     /// Box, pixels of the photo free of distortion: x0, y0, x1, y1, the latter exclusive.
     pub box_px: [u32; 4],
     /// Length along which the photo's edge cuts the mask off, pixels.
@@ -35,7 +35,7 @@ pub struct Outline {
     pub level: u32,
 }
 
-impl Outline {
+impl MaskOutline {
     /// Returns the outline of a mask of a photo of `width_px` x `height_px`. `valid`: pixels that show something, `None`
     /// where all do.
     pub fn of(mask: &Mask, width_px: u32, height_px: u32, valid: Option<&[bool]>) -> Self {
@@ -65,28 +65,28 @@ impl Outline {
 
 /// Returns what each mask of some photos counts: its wholeness to a power.
 pub fn mask_weights(photos: &[Photo], power: f32) -> Vec<f32> {
-    let weight = |outline: &Outline| outline.wholeness().max(LEAST_MASK_WEIGHT).powf(power);
+    let weight = |outline: &MaskOutline| outline.wholeness().max(LEAST_MASK_WEIGHT).powf(power);
     photos.iter().flat_map(|photo| &photo.outlines).map(weight).collect()
 }
 
 /// Writes the outlines of a view's masks durably.
 ///
 /// # Errors
-/// [`SumsError::Io`].
-pub fn write_outlines(path: &Path, outlines: &[Outline]) -> Result<(), SumsError> {
+/// [`ContributionError::Io`].
+pub fn write_outlines(path: &Path, outlines: &[MaskOutline]) -> Result<(), ContributionError> {
     let mut bytes = Vec::new();
     let n = outlines.len() as u64;
     let sections = [(1, bytemuck::bytes_of(&n)), (2, container::bytes_of(outlines))];
     container::write(&mut bytes, MAGIC, VERSION, &sections)?;
-    Ok(crate::store::write_durably(path, &bytes)?)
+    Ok(slag_common::durable::write(path, &bytes)?)
 }
 
 /// Reads the outlines of a view of `n_masks` masks.
 ///
 /// # Errors
-/// [`SumsError`], naming the file.
-pub fn read_outlines(path: &Path, n_masks: usize) -> Result<Vec<Outline>, SumsError> {
-    let damaged = |source| SumsError::Damaged { path: path.to_owned(), source };
+/// [`ContributionError`], naming the file.
+pub fn read_outlines(path: &Path, n_masks: usize) -> Result<Vec<MaskOutline>, ContributionError> {
+    let damaged = |source| ContributionError::Damaged { path: path.to_owned(), source };
     let bytes = AlignedBytes::read(path)?;
     let layout = Layout::check(&bytes, MAGIC, VERSION).map_err(damaged)?;
     let n: u64 = layout.value(&bytes, 1, "number of masks").map_err(damaged)?;
@@ -94,7 +94,7 @@ pub fn read_outlines(path: &Path, n_masks: usize) -> Result<Vec<Outline>, SumsEr
         let what = format!("outlines of {n} masks, the view has {n_masks}");
         return Err(damaged(ContainerError::Damaged { offset_bytes: 0, what }));
     }
-    let outlines = layout.column::<Outline>(2, "outlines", n_masks).map_err(damaged)?;
+    let outlines = layout.column::<MaskOutline>(2, "outlines", n_masks).map_err(damaged)?;
     Ok(bytemuck::pod_collect_to_vec(&bytes[outlines]))
 }
 
@@ -114,9 +114,9 @@ mod tests {
     /// By hand: what lies along the photo's edge, and along what undistorting left empty.
     #[test]
     fn the_photos_edge_cuts_off_what_touches_it() {
-        let of = |mask: &Mask, valid| Outline::of(mask, 20, 10, valid);
+        let of = |mask: &Mask, valid| MaskOutline::of(mask, 20, 10, valid);
         let inner = of(&mask([3, 2, 9, 8], |_, _| false), None);
-        assert_eq!(inner, Outline { box_px: [3, 2, 9, 8], cut_px: 0, level: 2 });
+        assert_eq!(inner, MaskOutline { box_px: [3, 2, 9, 8], cut_px: 0, level: 2 });
         assert_eq!(inner.wholeness(), 1.0);
         // 4 of the left, 5 of the lower edge.
         let corner = of(&mask([0, 6, 5, 10], |_, _| false), None);
@@ -136,7 +136,7 @@ mod tests {
     fn outlines_are_kept_and_damage_is_named() {
         let dir = tempfile::tempdir().expect("a temporary folder");
         let path = dir.path().join("a.outlines");
-        let outlines = [[1, 2, 3, 4], [5, 6, 7, 8]].map(|box_px| Outline { box_px, cut_px: 3, level: 1 });
+        let outlines = [[1, 2, 3, 4], [5, 6, 7, 8]].map(|box_px| MaskOutline { box_px, cut_px: 3, level: 1 });
         write_outlines(&path, &outlines).expect("writes");
         assert_eq!(read_outlines(&path, 2).expect("reads"), outlines);
         let message = read_outlines(&path, 3).expect_err("too few").to_string();

@@ -2,17 +2,17 @@
 //!
 //! | field of [`Aggregation`] | what it changes |
 //! |---|---|
-//! | `min_region_share`, `min_view_share` | sums of a region at whose edge a Gaussian lies, of views that hardly see it, are left out |
+//! | `min_region_share`, `min_view_share` | contributions of a region at whose edge a Gaussian lies, of views that hardly see it, are left out |
 //! | `min_weight_px` | a Gaussian that hardly shows anywhere has no evidence |
 //! | `wholeness` | a mask counts less that the photo's edge cuts off |
-//! | `evenness` | views count less by how near, and how little aslant, they see a Gaussian |
+//! | `equalisation` | views count less by how near, and how little aslant, they see a Gaussian |
 //! | `agreement` | a mask counts as far as it agrees with what other views say of its Gaussians |
 //! | `median_steps` | views that disagree count less: steps towards the geometric median |
 //! | `superpoint` | a Gaussian's row takes a part of its superpoint's |
 //! | `coarse` | then a part of a larger superpoint's |
 //! | `fill` | a Gaussian without evidence takes its superpoint's row |
 //!
-//! The result is again sparse sums over regions: masks that count for less are in the [`RegionTable`], and a
+//! The result is again sparse contributions over regions: masks that count for less are in the [`RegionTable`], and a
 //! superpoint is one more region of it, a mixture of masks. So scores, shards and what is published agree, and a
 //! row has two entries more at most.
 //!
@@ -26,18 +26,19 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use slag_common::Gaussians;
 
-use super::field::{MIN_MEAN_LENGTH, dot};
+use super::contributions::ContributionError;
+use super::field::MIN_MEAN_LENGTH;
 use super::photos::{self, LEAST_MASK_WEIGHT, Photo};
-use super::regroup::{PartSums, SumsIndex};
-use super::sums::SumsError;
 use super::table::RegionTable;
-use crate::palette::frame::principal_coordinates;
-use crate::shard::cells::CellSplit;
-use crate::superpoint::{Graph, NO_SUPERPOINT, Sketches, SuperpointSettings, Superpoints};
+use super::transpose::{ContributionIndex, PartContributions};
+use crate::cells::CellSplit;
+use crate::lift::superpoint::{Graph, NO_SUPERPOINT, Sketches, SuperpointSettings, Superpoints};
+use slag_math::axes::principal_coordinates;
+use slag_math::dot;
 
 /// Principal axes: nine tenths of the squares of mask vectors of 512 components (measured).
 const AXES: usize = 48;
-/// Gaussians worked on at a time by a thread; a constant, because sums are taken chunk by chunk.
+/// Gaussians worked on at a time by a thread; a constant, because contributions are taken chunk by chunk.
 const CHUNK: usize = 4096;
 /// Distance on the unit sphere below which the median's steps no longer tell views apart.
 const MEDIAN_RESOLUTION: f32 = 0.1;
@@ -48,7 +49,7 @@ const FILLED_WEIGHT_PX: f32 = 1e-3;
 /// What is left of a Gaussian's sum without a view must be this part of it to say anything of the view.
 const LEAST_REST: f32 = 1e-3;
 
-/// How the sums of all views become embeddings. The default is the paper's plain average.
+/// How the contributions of all views become embeddings. The default is the paper's plain average.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Aggregation {
@@ -62,7 +63,7 @@ pub struct Aggregation {
     pub wholeness: f32,
     /// A view counts its weight for a Gaussian, the solid angle that it sees of it, to the power of 1 less this: 1
     /// lets all views count alike.
-    pub evenness: f32,
+    pub equalisation: f32,
     /// A mask counts its mean cosine with its Gaussians' embeddings from other views to this power; 0: once.
     pub agreement: f32,
     /// Steps (Weiszfeld 1937) from the mean of a Gaussian's views to their geometric median.
@@ -82,7 +83,7 @@ impl Aggregation {
         min_view_share: 0.0,
         min_weight_px: 0.0,
         wholeness: 0.0,
-        evenness: 0.0,
+        equalisation: 0.0,
         agreement: 0.0,
         median_steps: 0,
         superpoint: 0.0,
@@ -110,7 +111,7 @@ impl Aggregation {
             ("views", Self { min_view_share: refined.min_view_share, ..paper }),
             ("gate", Self { min_weight_px: 1.0, ..paper }),
             ("wholeness", Self { wholeness: refined.wholeness, ..paper }),
-            ("evenness", Self { evenness: 0.5, ..paper }),
+            ("equalisation", Self { equalisation: 0.5, ..paper }),
             ("agreement", Self { agreement: refined.agreement, ..paper }),
             ("median", Self { median_steps: 3, ..paper }),
             ("superpoints", Self { superpoint: refined.superpoint, ..paper }),
@@ -135,7 +136,7 @@ struct Mixtures {
     regions: Vec<Option<(u32, f32)>>,
 }
 
-/// What the views of a scene decide together, and how a part's sums are changed by it.
+/// What the views of a scene decide together, and how a part's contributions are changed by it.
 pub struct Refinement {
     settings: Aggregation,
     /// First region of each view.
@@ -155,19 +156,19 @@ struct ViewEntries {
 }
 
 impl Refinement {
-    /// Reads all sums as often as is needed and decides what masks count and what superpoints say; adds both to
+    /// Reads all contributions as often as is needed and decides what masks count and what superpoints say; adds both to
     /// the table. `None` if cancelled, and where the plain average is asked for.
     ///
     /// # Errors
-    /// [`SumsError`].
+    /// [`ContributionError`].
     pub fn prepare(
         settings: Aggregation,
-        (index, table): (&SumsIndex, &mut RegionTable),
+        (index, table): (&ContributionIndex, &mut RegionTable),
         (scene, split): (&Gaussians, &CellSplit),
         photos: &[Photo],
         group_bytes: u64,
         cancel: &AtomicBool,
-    ) -> Result<Option<Self>, SumsError> {
+    ) -> Result<Option<Self>, ContributionError> {
         if settings == Aggregation::PAPER {
             return Ok(None);
         }
@@ -192,21 +193,23 @@ impl Refinement {
         let mask_points = principal_coordinates(table.mask_vectors(), AXES);
         let mask_points: &[Point] = mask_points.as_chunks().0;
         refinement.points = region_points(table, mask_points, 0..table.len());
-        let each_part = |table: &RegionTable, visit: &mut dyn FnMut(PartSums)| -> Result<bool, SumsError> {
+        let each_part = |table: &RegionTable,
+                         visit: &mut dyn FnMut(PartContributions)|
+         -> Result<bool, ContributionError> {
             for group in index.groups(group_bytes) {
-                let sums = index.regroup(&index.read(group)?, table)?;
+                let contributions = index.transpose(&index.read(group)?, table)?;
                 if cancel.load(Ordering::Relaxed) {
                     return Ok(false);
                 }
-                sums.into_iter().for_each(&mut *visit);
+                contributions.into_iter().for_each(&mut *visit);
             }
             Ok(true)
         };
         if settings.agreement > 0.0 {
             let mut votes = vec![Vote::default(); table.len()];
-            let done = each_part(table, &mut |mut sums| {
-                refinement.prune(&mut sums);
-                refinement.add_votes(&sums, &mut votes);
+            let done = each_part(table, &mut |mut contributions| {
+                refinement.prune(&mut contributions);
+                refinement.add_votes(&contributions, &mut votes);
             })?;
             if !done {
                 return Ok(None);
@@ -219,10 +222,11 @@ impl Refinement {
         }
         if settings.needs_superpoints() {
             let mut sketches = vec![0; scene.len() * AXES];
-            let done = each_part(table, &mut |mut sums| {
-                refinement.change_rows(&mut sums);
-                let gaussians = &split.cells[sums.part.cell_id as usize].gaussians[sums.part.locals.clone()];
-                refinement.sketch(&sums, gaussians, &mut sketches);
+            let done = each_part(table, &mut |mut contributions| {
+                refinement.change_rows(&mut contributions);
+                let gaussians = &split.cells[contributions.part.cell_id as usize].gaussians
+                    [contributions.part.locals.clone()];
+                refinement.sketch(&contributions, gaussians, &mut sketches);
             })?;
             if !done {
                 return Ok(None);
@@ -239,11 +243,12 @@ impl Refinement {
             drop(graph);
             let mut regions_of: Vec<Vec<Vec<(u32, f32)>>> =
                 levels.iter().map(|(_, superpoints)| vec![Vec::new(); superpoints.n]).collect();
-            let done = each_part(table, &mut |mut sums| {
-                refinement.change_rows(&mut sums);
-                let gaussians = &split.cells[sums.part.cell_id as usize].gaussians[sums.part.locals.clone()];
+            let done = each_part(table, &mut |mut contributions| {
+                refinement.change_rows(&mut contributions);
+                let gaussians = &split.cells[contributions.part.cell_id as usize].gaussians
+                    [contributions.part.locals.clone()];
                 for ((_, superpoints), regions_of) in levels.iter().zip(&mut regions_of) {
-                    add_rows(&sums, gaussians, superpoints, regions_of);
+                    add_rows(&contributions, gaussians, superpoints, regions_of);
                 }
             })?;
             if !done {
@@ -260,7 +265,7 @@ impl Refinement {
         Ok(Some(refinement))
     }
 
-    /// Returns the bytes that are taken beside the table and the sums, at most, of `n_gaussians` and `n_regions`.
+    /// Returns the bytes that are taken beside the table and the contributions, at most, of `n_gaussians` and `n_regions`.
     pub fn len_bytes(settings: &Aggregation, n_gaussians: usize, n_regions: usize) -> u64 {
         if *settings == Aggregation::PAPER {
             return 0;
@@ -276,31 +281,31 @@ impl Refinement {
         of_regions as u64 + of_superpoints
     }
 
-    /// Changes a part's sums; `gaussians`: the scene's numbers of its Gaussians.
-    pub fn apply(&self, sums: &mut PartSums, gaussians: &[u32]) {
-        self.change_rows(sums);
+    /// Changes a part's contributions; `gaussians`: the scene's numbers of its Gaussians.
+    pub fn apply(&self, contributions: &mut PartContributions, gaussians: &[u32]) {
+        self.change_rows(contributions);
         for (count, mixtures) in &self.mixtures {
-            self.mix(sums, gaussians, mixtures, *count);
+            self.mix(contributions, gaussians, mixtures, *count);
         }
     }
 
     /// All but the superpoints.
-    fn change_rows(&self, sums: &mut PartSums) {
-        self.prune(sums);
-        if self.settings.evenness > 0.0 {
-            self.scale_views(sums, |_, views| self.evened(views));
+    fn change_rows(&self, contributions: &mut PartContributions) {
+        self.prune(contributions);
+        if self.settings.equalisation > 0.0 {
+            self.scale_views(contributions, |_, views| self.evened(views));
         }
         if self.settings.median_steps > 0 {
-            self.scale_views(sums, |sums, views| self.towards_median(sums, views));
+            self.scale_views(contributions, |contributions, views| self.towards_median(contributions, views));
         }
     }
 
     /// Cuts a row of entries, ascending by region, into its views.
-    fn views_of(&self, sums: &PartSums, row: Range<usize>) -> Vec<ViewEntries> {
+    fn views_of(&self, contributions: &PartContributions, row: Range<usize>) -> Vec<ViewEntries> {
         let mut views: Vec<ViewEntries> = Vec::new();
         let mut end_region = 0;
         for entry in row {
-            let region = sums.regions[entry];
+            let region = contributions.regions[entry];
             if views.is_empty() || region >= end_region {
                 let next = self.first_regions.partition_point(|first| *first <= region);
                 end_region = self.first_regions.get(next).copied().unwrap_or(u32::MAX);
@@ -308,24 +313,24 @@ impl Refinement {
             }
             if let Some(view) = views.last_mut() {
                 view.entries.end = entry + 1;
-                view.weight += sums.weights[entry];
+                view.weight += contributions.weights[entry];
             }
         }
         views
     }
 
     /// Drops entries that say little of their Gaussian.
-    fn prune(&self, sums: &mut PartSums) {
+    fn prune(&self, contributions: &mut PartContributions) {
         let Aggregation { min_region_share, min_view_share, min_weight_px, .. } = self.settings;
         if min_region_share <= 0.0 && min_view_share <= 0.0 && min_weight_px <= 0.0 {
             return;
         }
-        let n = sums.total_weights.len();
+        let n = contributions.total_weights.len();
         let kept_of_chunk = |first: usize| -> Vec<Vec<u32>> {
-            let weights = &sums.weights;
+            let weights = &contributions.weights;
             let kept_of = |k: usize| {
-                let row = sums.starts[k] as usize..sums.starts[k + 1] as usize;
-                let views = self.views_of(sums, row);
+                let row = contributions.starts[k] as usize..contributions.starts[k + 1] as usize;
+                let views = self.views_of(contributions, row);
                 let best = views.iter().map(|view| view.weight).fold(0.0, f32::max);
                 if views.iter().map(|view| view.weight).sum::<f32>() < min_weight_px {
                     return Vec::new();
@@ -347,49 +352,54 @@ impl Refinement {
             let mut total = 0.0;
             for entry in kept {
                 let entry = entry as usize;
-                (sums.regions[at], sums.weights[at]) = (sums.regions[entry], sums.weights[entry]);
-                total += f64::from(sums.weights[at]) * f64::from(self.mask_counts[sums.regions[at] as usize]);
+                (contributions.regions[at], contributions.weights[at]) =
+                    (contributions.regions[entry], contributions.weights[entry]);
+                total += f64::from(contributions.weights[at])
+                    * f64::from(self.mask_counts[contributions.regions[at] as usize]);
                 at += 1;
             }
-            sums.starts[k + 1] = at as u64;
-            sums.total_weights[k] = total as f32;
+            contributions.starts[k + 1] = at as u64;
+            contributions.total_weights[k] = total as f32;
         }
-        sums.regions.truncate(at);
-        sums.weights.truncate(at);
+        contributions.regions.truncate(at);
+        contributions.weights.truncate(at);
     }
 
-    fn sum_of(&self, sums: &PartSums, entries: Range<usize>) -> Point {
+    fn sum_of(&self, contributions: &PartContributions, entries: Range<usize>) -> Point {
         let mut sum = [0.0; AXES];
-        for (region, weight) in sums.regions[entries.clone()].iter().zip(&sums.weights[entries]) {
+        for (region, weight) in
+            contributions.regions[entries.clone()].iter().zip(&contributions.weights[entries])
+        {
             add(&mut sum, *weight, &self.points[*region as usize]);
         }
         sum
     }
 
     /// Adds, to each region, the directions in which other views see its Gaussians.
-    fn add_votes(&self, sums: &PartSums, votes: &mut [Vote]) {
-        let n = sums.total_weights.len();
+    fn add_votes(&self, contributions: &PartContributions, votes: &mut [Vote]) {
+        let n = contributions.total_weights.len();
         let of_chunk = |first: usize| -> Vec<(u32, Vote)> {
             let gaussians = first..(first + CHUNK).min(n);
-            let entries = sums.starts[gaussians.start] as usize..sums.starts[gaussians.end] as usize;
-            let mut regions: Vec<u32> = sums.regions[entries].to_vec();
+            let entries =
+                contributions.starts[gaussians.start] as usize..contributions.starts[gaussians.end] as usize;
+            let mut regions: Vec<u32> = contributions.regions[entries].to_vec();
             regions.sort_unstable();
             regions.dedup();
             let mut votes = vec![Vote::default(); regions.len()];
             for k in gaussians {
-                let row = sums.starts[k] as usize..sums.starts[k + 1] as usize;
-                let whole = self.sum_of(sums, row.clone());
+                let row = contributions.starts[k] as usize..contributions.starts[k + 1] as usize;
+                let whole = self.sum_of(contributions, row.clone());
                 let least = LEAST_REST * length(&whole);
-                for view in self.views_of(sums, row) {
+                for view in self.views_of(contributions, row) {
                     let mut rest = whole;
-                    add(&mut rest, -1.0, &self.sum_of(sums, view.entries.clone()));
+                    add(&mut rest, -1.0, &self.sum_of(contributions, view.entries.clone()));
                     let of_rest = length(&rest);
                     if of_rest.is_nan() || of_rest <= least {
                         continue;
                     }
                     for entry in view.entries {
-                        let weight = sums.weights[entry];
-                        if let Ok(at) = regions.binary_search(&sums.regions[entry]) {
+                        let weight = contributions.weights[entry];
+                        if let Ok(at) = regions.binary_search(&contributions.regions[entry]) {
                             add(&mut votes[at].direction, weight / of_rest, &rest);
                             votes[at].weight += weight;
                         }
@@ -410,18 +420,21 @@ impl Refinement {
     /// Scales the entries of each Gaussian's views by factors; the evidence stays what it was.
     fn scale_views(
         &self,
-        sums: &mut PartSums,
-        factors: impl Fn(&PartSums, &[ViewEntries]) -> Vec<f32> + Sync,
+        contributions: &mut PartContributions,
+        factors: impl Fn(&PartContributions, &[ViewEntries]) -> Vec<f32> + Sync,
     ) {
-        let n = sums.total_weights.len();
+        let n = contributions.total_weights.len();
         let factors_of = |k: usize| -> Vec<(Range<usize>, f32)> {
-            let views = self.views_of(sums, sums.starts[k] as usize..sums.starts[k + 1] as usize);
-            let factors = factors(sums, &views);
+            let views = self.views_of(
+                contributions,
+                contributions.starts[k] as usize..contributions.starts[k + 1] as usize,
+            );
+            let factors = factors(contributions, &views);
             views.into_iter().map(|view| view.entries).zip(factors).collect()
         };
         let factors: Vec<Vec<(Range<usize>, f32)>> = (0..n).into_par_iter().map(factors_of).collect();
         for (entries, factor) in factors.into_iter().flatten() {
-            sums.weights[entries].iter_mut().for_each(|weight| *weight *= factor);
+            contributions.weights[entries].iter_mut().for_each(|weight| *weight *= factor);
         }
     }
 
@@ -429,7 +442,7 @@ impl Refinement {
     fn evened(&self, views: &[ViewEntries]) -> Vec<f32> {
         let factors: Vec<f32> = views
             .iter()
-            .map(|view| view.weight.max(f32::MIN_POSITIVE).powf(-self.settings.evenness))
+            .map(|view| view.weight.max(f32::MIN_POSITIVE).powf(-self.settings.equalisation))
             .collect();
         let total: f32 = views.iter().map(|view| view.weight).sum();
         let evened: f32 = views.iter().zip(&factors).map(|(view, factor)| view.weight * factor).sum();
@@ -437,9 +450,9 @@ impl Refinement {
     }
 
     /// Returns the factors that Weiszfeld's steps give a Gaussian's views.
-    fn towards_median(&self, sums: &PartSums, views: &[ViewEntries]) -> Vec<f32> {
+    fn towards_median(&self, contributions: &PartContributions, views: &[ViewEntries]) -> Vec<f32> {
         let mut of_views: Vec<Point> =
-            views.iter().map(|view| self.sum_of(sums, view.entries.clone())).collect();
+            views.iter().map(|view| self.sum_of(contributions, view.entries.clone())).collect();
         let weights: Vec<f32> = of_views.iter().map(length).collect();
         of_views.iter_mut().for_each(make_unit);
         let mut factors = vec![1.0; views.len()];
@@ -458,9 +471,12 @@ impl Refinement {
     }
 
     /// Writes each Gaussian's direction, rounded; zeros where there is no evidence.
-    fn sketch(&self, sums: &PartSums, gaussians: &[u32], sketches: &mut [i8]) {
+    fn sketch(&self, contributions: &PartContributions, gaussians: &[u32], sketches: &mut [i8]) {
         let sketch_of = |k: usize| -> [i8; AXES] {
-            let mut sum = self.sum_of(sums, sums.starts[k] as usize..sums.starts[k + 1] as usize);
+            let mut sum = self.sum_of(
+                contributions,
+                contributions.starts[k] as usize..contributions.starts[k + 1] as usize,
+            );
             make_unit(&mut sum);
             sum.map(|c| (127.0 * c).round() as i8)
         };
@@ -471,14 +487,18 @@ impl Refinement {
     }
 
     /// Adds each Gaussian's superpoint to its row, `count` times as much as the row itself.
-    fn mix(&self, sums: &mut PartSums, gaussians: &[u32], mixtures: &Mixtures, count: f32) {
+    fn mix(&self, contributions: &mut PartContributions, gaussians: &[u32], mixtures: &Mixtures, count: f32) {
         let share = count / (1.0 + count);
         // Region and weight of the entry that is added, and what the row keeps.
         let entry_of = |k: usize| -> Option<(u32, f32, f32)> {
             let superpoint = mixtures.of_gaussian[gaussians[k] as usize];
             let (region, of_mixture) = (*mixtures.regions.get(superpoint as usize)?)?;
-            let own = length(&self.sum_of(sums, sums.starts[k] as usize..sums.starts[k + 1] as usize));
-            if sums.total_weights[k] > 0.0 && own > MIN_MEAN_LENGTH * sums.total_weights[k] {
+            let own = length(&self.sum_of(
+                contributions,
+                contributions.starts[k] as usize..contributions.starts[k + 1] as usize,
+            ));
+            if contributions.total_weights[k] > 0.0 && own > MIN_MEAN_LENGTH * contributions.total_weights[k]
+            {
                 (share > 0.0).then_some((region, share * own / of_mixture, 1.0 - share))
             } else {
                 self.settings.fill.then_some((region, FILLED_WEIGHT_PX, 0.0))
@@ -486,26 +506,26 @@ impl Refinement {
         };
         let added: Vec<Option<(u32, f32, f32)>> =
             (0..gaussians.len()).into_par_iter().map(entry_of).collect();
-        let n_entries = sums.regions.len() + added.iter().flatten().count();
+        let n_entries = contributions.regions.len() + added.iter().flatten().count();
         let (mut regions, mut weights) = (Vec::with_capacity(n_entries), Vec::with_capacity(n_entries));
         let mut start = 0;
         for (k, added) in added.into_iter().enumerate() {
-            let row = start..sums.starts[k + 1] as usize;
+            let row = start..contributions.starts[k + 1] as usize;
             start = row.end;
             let kept = added.map_or(1.0, |(_, _, kept)| kept);
             if kept > 0.0 {
-                regions.extend(&sums.regions[row.clone()]);
-                weights.extend(sums.weights[row].iter().map(|weight| weight * kept));
+                regions.extend(&contributions.regions[row.clone()]);
+                weights.extend(contributions.weights[row].iter().map(|weight| weight * kept));
             } else {
-                sums.total_weights[k] = FILLED_WEIGHT_PX;
+                contributions.total_weights[k] = FILLED_WEIGHT_PX;
             }
             if let Some((region, weight, _)) = added {
                 regions.push(region);
                 weights.push(weight);
             }
-            sums.starts[k + 1] = regions.len() as u64;
+            contributions.starts[k + 1] = regions.len() as u64;
         }
-        (sums.regions, sums.weights) = (regions, weights);
+        (contributions.regions, contributions.weights) = (regions, weights);
     }
 }
 
@@ -556,7 +576,7 @@ fn region_points(table: &RegionTable, mask_points: &[Point], regions: Range<usiz
 
 /// Adds the rows of a part's Gaussians to their superpoints' `(region, weight)`.
 fn add_rows(
-    sums: &PartSums,
+    contributions: &PartContributions,
     gaussians: &[u32],
     superpoints: &Superpoints,
     regions_of: &mut [Vec<(u32, f32)>],
@@ -568,8 +588,14 @@ fn add_rows(
     let of_superpoint = |members: &[u32]| -> (usize, Vec<(u32, f32)>) {
         let mut entries = Vec::new();
         for k in members {
-            let row = sums.starts[*k as usize] as usize..sums.starts[*k as usize + 1] as usize;
-            entries.extend(sums.regions[row.clone()].iter().copied().zip(sums.weights[row].iter().copied()));
+            let row =
+                contributions.starts[*k as usize] as usize..contributions.starts[*k as usize + 1] as usize;
+            entries.extend(
+                contributions.regions[row.clone()]
+                    .iter()
+                    .copied()
+                    .zip(contributions.weights[row].iter().copied()),
+            );
         }
         (superpoint_of(members[0]) as usize, added_up(entries))
     };

@@ -10,9 +10,9 @@
 use std::io::{self, Write};
 use std::ops::Range;
 
-use crate::palette::matrix::Rows;
 use rayon::prelude::*;
 use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
+use slag_math::matrix::Rows;
 
 const MAGIC: [u8; 8] = *b"SLAGREGN";
 const VERSION: u32 = 2;
@@ -162,7 +162,7 @@ impl RegionTable {
     }
 
     fn mask_scores(&self, query: &[f32]) -> Vec<f32> {
-        self.mask_vectors.par_chunks_exact(self.dim).map(|vector| super::dot(vector, query)).collect()
+        self.mask_vectors.par_chunks_exact(self.dim).map(|vector| slag_math::dot(vector, query)).collect()
     }
 
     /// Returns `q · V_r` for every region.

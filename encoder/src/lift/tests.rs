@@ -4,25 +4,26 @@ use proptest::prelude::*;
 use slag_common::container::AlignedBytes;
 
 use super::*;
+use slag_math::dot;
 
-/// Files of sums in a folder, and what was opened of them.
+/// Files of contributions in a folder, and what was opened of them.
 pub(super) struct Scene {
-    pub(super) index: SumsIndex,
+    pub(super) index: ContributionIndex,
     pub(super) table: RegionTable,
     paths: Vec<PathBuf>,
     _dir: tempfile::TempDir,
 }
 
 /// Writes views to files in the order given and opens them, with parts of at most `part_entries`.
-pub(super) fn open(views: &[ViewSums], dim: usize, n_of_cell: &[usize], part_entries: u64) -> Scene {
+pub(super) fn open(views: &[ViewContributions], dim: usize, n_of_cell: &[usize], part_entries: u64) -> Scene {
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let path = |(i, view): (usize, &ViewSums)| {
-        let path = dir.path().join(format!("{i}.sums"));
+    let path = |(i, view): (usize, &ViewContributions)| {
+        let path = dir.path().join(format!("{i}.contributions"));
         view.write(&path).expect("writes");
         path
     };
     let paths: Vec<PathBuf> = views.iter().enumerate().map(path).collect();
-    let (index, table) = SumsIndex::open_with(&paths, dim, n_of_cell, part_entries).expect("opens");
+    let (index, table) = ContributionIndex::open_with(&paths, dim, n_of_cell, part_entries).expect("opens");
     Scene { index, table, paths, _dir: dir }
 }
 
@@ -34,7 +35,7 @@ pub(super) fn scene_of(dim: usize, n_gaussians: u32, n_views: u64) -> Scene {
     };
     let view = |view: u64| {
         let at = |what: u64, i: u64| random(view << 40 ^ what << 32 ^ i);
-        let entry = |g: u32, step: u64| SumEntry {
+        let entry = |g: u32, step: u64| Contribution {
             local: g,
             region: ((at(1, g.into()) % 10) * 3 + step) as u32,
             weight: (at(2, u64::from(g) * 3 + step) % 1000) as f32 / 97.0 + 1e-3,
@@ -42,7 +43,7 @@ pub(super) fn scene_of(dim: usize, n_gaussians: u32, n_views: u64) -> Scene {
         let seen = (0..n_gaussians).filter(|g| !at(3, (*g).into()).is_multiple_of(3));
         let entries = seen.flat_map(|g| (0..1 + at(4, g.into()) % 3).map(move |step| entry(g, step)));
         let mask = |m: u64| (0..dim as u64).map(move |c| at(5, m * 1000 + c) as f32 % 200.0 / 100.0 - 0.9);
-        ViewSums {
+        ViewContributions {
             dim,
             mask_vectors: (0..12).flat_map(mask).collect(),
             masks_of_region: (0..30).map(|r| (0..1 + r % 3).map(|j| (r + j * 4) % 12).collect()).collect(),
@@ -52,15 +53,18 @@ pub(super) fn scene_of(dim: usize, n_gaussians: u32, n_views: u64) -> Scene {
     open(&(0..n_views).map(view).collect::<Vec<_>>(), dim, &[n_gaussians as usize], u64::MAX)
 }
 
-/// Reads and regroups a scene, as much at a time as a budget allows.
-fn regroup(scene: &Scene, budget_bytes: u64) -> Vec<PartSums> {
+/// Reads and transposes a scene, as much at a time as a budget allows.
+fn transpose(scene: &Scene, budget_bytes: u64) -> Vec<PartContributions> {
     let groups = scene.index.groups(budget_bytes);
     let read = |group| scene.index.read(group).expect("reads");
-    groups.into_iter().flat_map(|g| scene.index.regroup(&read(g), &scene.table).expect("regroups")).collect()
+    groups
+        .into_iter()
+        .flat_map(|g| scene.index.transpose(&read(g), &scene.table).expect("transposes"))
+        .collect()
 }
 
 /// The paper's equation in float64, mask by mask: no regions, no sparse rows.
-fn oracle(cell: u32, k: u32, views: &[ViewSums], dim: usize) -> (f64, Option<Vec<f64>>) {
+fn oracle(cell: u32, k: u32, views: &[ViewContributions], dim: usize) -> (f64, Option<Vec<f64>>) {
     let mut sum = vec![0.0f64; dim];
     let mut total = 0.0f64;
     for view in views {
@@ -78,7 +82,7 @@ fn oracle(cell: u32, k: u32, views: &[ViewSums], dim: usize) -> (f64, Option<Vec
     (total, is_clear.then(|| sum.iter().map(|c| c / length).collect()))
 }
 
-/// Cells of which one has three slices, the last of them short; sums crowd around their ends.
+/// Cells of which one has three slices, the last of them short; contributions crowd around their ends.
 const N_OF_CELL: [usize; 3] = [9, 2 * GAUSSIANS_PER_SLICE + 2, 1];
 const LOCALS: [&[u32]; 3] = [&[0, 3, 8], &[0, 1, 4095, 4096, 4097, 8191, 8192, 8193], &[0]];
 
@@ -88,7 +92,7 @@ prop_compose! {
         seeds in prop::collection::vec(-1.0f32..1.0, 5 * dim),
         regions in prop::collection::vec(prop::collection::btree_set(0u32..5, 1..4), 1..6),
         raw in prop::collection::btree_map((0..3usize, 0..8usize, 0u32..6), 1e-3f32..100.0, 0..40),
-    ) -> ViewSums {
+    ) -> ViewContributions {
         let masks_of_region: Vec<Vec<u32>> = regions.iter().map(|set| {
             let masks: std::collections::BTreeSet<u32> = set.iter().map(|m| m % n_masks as u32).collect();
             masks.into_iter().collect()
@@ -102,10 +106,10 @@ prop_compose! {
         let n_regions = masks_of_region.len() as u32;
         let entries_of_cell = (0..3).map(|cell| {
             let of_cell = raw.iter().filter(|((c, at, region), _)| *c == cell && *at < LOCALS[cell].len() && *region < n_regions);
-            let entry = |((_, at, region), weight): (&(usize, usize, u32), &f32)| SumEntry { local: LOCALS[cell][*at], region: *region, weight: *weight };
+            let entry = |((_, at, region), weight): (&(usize, usize, u32), &f32)| Contribution { local: LOCALS[cell][*at], region: *region, weight: *weight };
             (cell as u32, of_cell.map(entry).collect::<Vec<_>>())
         }).filter(|(_, entries)| !entries.is_empty()).collect();
-        ViewSums { dim, mask_vectors, masks_of_region, entries_of_cell }
+        ViewContributions { dim, mask_vectors, masks_of_region, entries_of_cell }
     }
 }
 
@@ -119,11 +123,11 @@ proptest! {
         views in prop::collection::vec(any_view(2), 1..6), part_entries in 1u64..40, budget_bytes in 0u64..500_000,
     ) {
         let scene = open(&views, 2, &N_OF_CELL, part_entries);
-        let parts = regroup(&scene, budget_bytes);
-        prop_assert_eq!(&regroup(&scene, u64::MAX), &parts);
+        let parts = transpose(&scene, budget_bytes);
+        prop_assert_eq!(&transpose(&scene, u64::MAX), &parts);
         let mut next = (0, 0);
-        for sums in &parts {
-            let part = &sums.part;
+        for contributions in &parts {
+            let part = &contributions.part;
             // Parts follow each other without a gap, and end at the ends of cells.
             prop_assert_eq!((part.cell_id as usize, part.locals.start), next);
             next = if part.locals.end == N_OF_CELL[next.0] { (next.0 + 1, 0) } else { (next.0, part.locals.end) };
@@ -137,8 +141,8 @@ proptest! {
                     expected.extend(of_gaussian.map(|e| (e.region + first_region, e.weight)));
                     first_region += view.masks_of_region.len() as u32;
                 }
-                let range = sums.starts[k] as usize..sums.starts[k + 1] as usize;
-                let found: Vec<(u32, f32)> = range.map(|i| (sums.regions[i], sums.weights[i])).collect();
+                let range = contributions.starts[k] as usize..contributions.starts[k + 1] as usize;
+                let found: Vec<(u32, f32)> = range.map(|i| (contributions.regions[i], contributions.weights[i])).collect();
                 prop_assert_eq!(found, expected);
             }
         }
@@ -152,10 +156,10 @@ proptest! {
     ) {
         let scene = open(&views, 7, &N_OF_CELL, 12);
         let table = &scene.table;
-        for sums in regroup(&scene, 0) {
-            let part = sums.part.clone();
+        for contributions in transpose(&scene, 0) {
+            let part = contributions.part.clone();
             let mut embeddings = vec![f32::NAN; part.locals.len() * 7];
-            let field = CellField::new(part.locals.clone().map(|k| k as u32).collect(), sums, table, &mut embeddings);
+            let field = CellField::new(part.locals.clone().map(|k| k as u32).collect(), contributions, table, &mut embeddings);
             let cosines = field.cosines(&table.scores(&query));
             let mut again = vec![0.0; 7];
             let seen = LOCALS[part.cell_id as usize].iter().filter(|k| part.locals.contains(&(**k as usize)));
@@ -187,9 +191,9 @@ fn many_views_keep_the_accuracy() {
     let scene = scene_of(512, 20, 1500);
     let Scene { index, table, .. } = &scene;
     let raw = index.read(0..index.parts().len()).expect("reads");
-    let sums = index.regroup(&raw, table).expect("regroups").remove(0);
+    let contributions = index.transpose(&raw, table).expect("transposes").remove(0);
     let mut embeddings = vec![f32::NAN; 20 * 512];
-    let field = CellField::new((0..20).collect(), sums, table, &mut embeddings);
+    let field = CellField::new((0..20).collect(), contributions, table, &mut embeddings);
     let mut vector = vec![0.0; 512];
     let mut largest = 0.0f64;
     for k in 0..20 {
@@ -220,9 +224,9 @@ fn same_bits_for_any_number_of_threads() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().expect("starts");
         pool.install(|| {
             let scene = scene_of(40, 9000, 5);
-            let sums = regroup(&scene, 0).remove(0);
+            let contributions = transpose(&scene, 0).remove(0);
             let mut embeddings = vec![f32::NAN; 9000 * 40];
-            (CellField::new((0..9000).collect(), sums, &scene.table, &mut embeddings), embeddings)
+            (CellField::new((0..9000).collect(), contributions, &scene.table, &mut embeddings), embeddings)
         })
     };
     assert_eq!(with(1), with(3));
@@ -230,8 +234,8 @@ fn same_bits_for_any_number_of_threads() {
 
 #[test]
 fn masks_that_cancel_are_no_evidence() {
-    let entry = |local, region| SumEntry { local, region, weight: 3.0 };
-    let view = ViewSums {
+    let entry = |local, region| Contribution { local, region, weight: 3.0 };
+    let view = ViewContributions {
         dim: 2,
         mask_vectors: vec![1.0, 0.0, -1.0, 0.0],
         masks_of_region: vec![vec![0], vec![1]],
@@ -239,7 +243,7 @@ fn masks_that_cancel_are_no_evidence() {
     };
     let scene = open(&[view], 2, &[3], u64::MAX);
     let mut embeddings = [f32::NAN; 6];
-    let field = CellField::new(vec![0, 1, 2], regroup(&scene, 0).remove(0), &scene.table, &mut embeddings);
+    let field = CellField::new(vec![0, 1, 2], transpose(&scene, 0).remove(0), &scene.table, &mut embeddings);
     assert_eq!((0..3).map(|k| field.has_evidence(k)).collect::<Vec<_>>(), [false, true, false]);
     assert!(field.cosines(&scene.table.scores(&[1.0, 0.0]))[0].is_nan());
     assert_eq!(field.total_weights, [6.0, 3.0, 0.0]);
@@ -250,52 +254,57 @@ fn masks_that_cancel_are_no_evidence() {
 #[test]
 fn parts_of_a_cell_make_the_cell() {
     let whole = scene_of(5, 10_000, 4);
-    let (index, table) = SumsIndex::open_with(&whole.paths, 5, &[10_000], 1).expect("opens");
+    let (index, table) = ContributionIndex::open_with(&whole.paths, 5, &[10_000], 1).expect("opens");
     assert_eq!(index.parts().len(), 3);
-    let field = |sums: PartSums| {
-        let locals = sums.part.locals.clone();
+    let field = |contributions: PartContributions| {
+        let locals = contributions.part.locals.clone();
         let mut embeddings = vec![0.0; locals.len() * 5];
-        CellField::new(locals.map(|k| k as u32).collect(), sums, &table, &mut embeddings)
+        CellField::new(locals.map(|k| k as u32).collect(), contributions, &table, &mut embeddings)
     };
-    let mut parts = index.regroup(&index.read(0..3).expect("reads"), &table).expect("regroups").into_iter();
+    let mut parts =
+        index.transpose(&index.read(0..3).expect("reads"), &table).expect("transposes").into_iter();
     let mut joined = field(parts.next().expect("a part"));
-    parts.for_each(|sums| joined.append(field(sums)));
-    assert_eq!(joined, field(regroup(&whole, 0).remove(0)));
+    parts.for_each(|contributions| joined.append(field(contributions)));
+    assert_eq!(joined, field(transpose(&whole, 0).remove(0)));
 }
 
-/// Files of another scene or model, and sums that do not fit them, are refused with the file's name.
+/// Files of another scene or model, and contributions that do not fit them, are refused with the file's name.
 #[test]
 fn foreign_files_are_refused() {
     let scene = scene_of(5, 5000, 2);
     let refused = |dim, n_of_cell: &[usize]| {
-        let opened = SumsIndex::open(&scene.paths, dim, n_of_cell);
-        let read = opened.and_then(|(index, table)| index.regroup(&index.read(0..1)?, &table).map(drop));
+        let opened = ContributionIndex::open(&scene.paths, dim, n_of_cell);
+        let read = opened.and_then(|(index, table)| index.transpose(&index.read(0..1)?, &table).map(drop));
         read.expect_err("refused").to_string()
     };
     for message in [refused(6, &[5000]), refused(5, &[4096]), refused(5, &[]), refused(5, &[4990])] {
-        assert!(message.contains(".sums") && message.contains("delete it"), "{message}");
+        assert!(message.contains(".contributions") && message.contains("delete it"), "{message}");
     }
-    let mut view = ViewSums {
+    let mut view = ViewContributions {
         dim: 1,
         mask_vectors: vec![1.0],
         masks_of_region: vec![vec![0]; MAX_REGIONS + 1],
         entries_of_cell: vec![],
     };
-    let path = scene.paths[0].with_file_name("many.sums");
+    let path = scene.paths[0].with_file_name("many.contributions");
     assert!(view.write(&path).expect_err("refused").to_string().contains("1048576 at most"));
     view.masks_of_region.pop();
     view.entries_of_cell =
-        vec![(0, vec![SumEntry { local: 4095, region: MAX_REGIONS as u32 - 1, weight: 1.0 }])];
+        vec![(0, vec![Contribution { local: 4095, region: MAX_REGIONS as u32 - 1, weight: 1.0 }])];
     view.write(&path).expect("writes");
-    let (index, table) = SumsIndex::open(&[path], 1, &[4096]).expect("opens");
-    let sums = index.regroup(&index.read(0..1).expect("reads"), &table).expect("regroups").remove(0);
-    assert_eq!((sums.regions, sums.starts[4095..].to_vec()), (vec![MAX_REGIONS as u32 - 1], vec![0, 1]));
+    let (index, table) = ContributionIndex::open(&[path], 1, &[4096]).expect("opens");
+    let contributions =
+        index.transpose(&index.read(0..1).expect("reads"), &table).expect("transposes").remove(0);
+    assert_eq!(
+        (contributions.regions, contributions.starts[4095..].to_vec()),
+        (vec![MAX_REGIONS as u32 - 1], vec![0, 1])
+    );
 }
 
 #[test]
 fn a_views_weights_are_grouped_by_cell() {
+    use crate::cells::{CellSplit, NO_CELL};
     use crate::raster::RegionWeight;
-    use crate::shard::cells::{CellSplit, NO_CELL};
     let split = CellSplit {
         cells: Vec::new(),
         cell_of_gaussian: vec![1, 0, 1, NO_CELL],
@@ -304,10 +313,11 @@ fn a_views_weights_are_grouped_by_cell() {
     };
     let weight = |gaussian, region| RegionWeight { gaussian, region, weight: (gaussian + region) as f32 };
     let weights = [weight(0, 0), weight(0, 1), weight(1, 1), weight(2, 0), weight(3, 0)];
-    let sums = ViewSums::new(&weights, vec![vec![0], vec![0, 1]], vec![1.0, 0.0, 0.0, 1.0], 2, &split);
-    let entry = |local, region, weight| SumEntry { local, region, weight };
+    let contributions =
+        ViewContributions::new(&weights, vec![vec![0], vec![0, 1]], vec![1.0, 0.0, 0.0, 1.0], 2, &split);
+    let entry = |local, region, weight| Contribution { local, region, weight };
     assert_eq!(
-        sums.entries_of_cell,
+        contributions.entries_of_cell,
         [(0, vec![entry(0, 1, 2.0)]), (1, vec![entry(0, 0, 2.0), entry(1, 0, 0.0), entry(1, 1, 1.0)])]
     );
 }

@@ -1,4 +1,4 @@
-//! Which masks show the same thing: view consensus, after MaskClustering (Yan et al., CVPR 2024), over sums instead
+//! Which masks show the same thing: view consensus, after MaskClustering (Yan et al., CVPR 2024), over contributions instead
 //! of a point cloud.
 //!
 //! A mask is the set of sampled Gaussians that it shows. Two masks are compared by what the views of both see: the

@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use super::consensus::MaskClusters;
 use super::{NONE, Scene};
-use crate::lift::{PartSums, RegionTable, SumsError};
+use crate::lift::{ContributionError, PartContributions, RegionTable};
 
 /// An object has a Gaussian if its masks have this share of the Gaussian's weight: most views say so.
 const MIN_WEIGHT_SHARE: f32 = 0.5;
@@ -55,8 +55,8 @@ impl Members {
     /// most of its weight.
     ///
     /// # Errors
-    /// [`SumsError`].
-    pub fn assign(scene: &Scene<'_>, clusters: &MaskClusters) -> Result<Self, SumsError> {
+    /// [`ContributionError`].
+    pub fn assign(scene: &Scene<'_>, clusters: &MaskClusters) -> Result<Self, ContributionError> {
         let of_region = ClustersOfRegion::new(scene.table, clusters);
         let n_masks = scene.table.n_masks();
         let mut masks = vec![Vec::new(); clusters.consensus.len()];
@@ -71,36 +71,39 @@ impl Members {
         };
         for group in scene.index.groups(scene.group_bytes) {
             let raw = scene.index.read(group)?;
-            for sums in scene.index.regroup(&raw, scene.table)? {
-                let found: Vec<u32> = (0..sums.part.locals.len())
+            for contributions in scene.index.transpose(&raw, scene.table)? {
+                let found: Vec<u32> = (0..contributions.part.locals.len())
                     .into_par_iter()
                     .map_init(
                         || (vec![0.0f32; clusters.consensus.len()], Vec::new()),
                         |(weights, touched), k| {
-                            best_cluster(&sums, k, &of_region, clusters, weights, touched)
+                            best_cluster(&contributions, k, &of_region, clusters, weights, touched)
                         },
                     )
                     .collect();
-                members.add_weights(&sums, &found, scene.table, clusters);
-                let of_cell = &mut members.object_of[sums.part.cell_id as usize];
-                of_cell[sums.part.locals.clone()].copy_from_slice(&found);
+                members.add_weights(&contributions, &found, scene.table, clusters);
+                let of_cell = &mut members.object_of[contributions.part.cell_id as usize];
+                of_cell[contributions.part.locals.clone()].copy_from_slice(&found);
             }
         }
         Ok(members)
     }
 
-    /// Adds a part's weights to its masks'; one after the other, so that the sums are the same every time.
+    /// Adds a part's weights to its masks'; one after the other, so that the contributions are the same every time.
     fn add_weights(
         &mut self,
-        sums: &PartSums,
+        contributions: &PartContributions,
         cluster_of: &[u32],
         table: &RegionTable,
         clusters: &MaskClusters,
     ) {
         for (k, cluster) in cluster_of.iter().enumerate() {
-            for entry in sums.starts[k] as usize..sums.starts[k + 1] as usize {
-                let weight = f64::from(sums.weights[entry]);
-                for mask in table.all_masks_of(sums.regions[entry] as usize).iter().map(|mask| *mask as usize)
+            for entry in contributions.starts[k] as usize..contributions.starts[k + 1] as usize {
+                let weight = f64::from(contributions.weights[entry]);
+                for mask in table
+                    .all_masks_of(contributions.regions[entry] as usize)
+                    .iter()
+                    .map(|mask| *mask as usize)
                 {
                     self.mask_weights[mask] += weight;
                     if *cluster != NONE && clusters.cluster_of_mask[mask] == *cluster {
@@ -139,7 +142,7 @@ impl Members {
 
 /// Returns the cluster of a Gaussian. `weights`, `touched`: working memory, zeros and nothing.
 fn best_cluster(
-    sums: &PartSums,
+    contributions: &PartContributions,
     k: usize,
     of_region: &ClustersOfRegion,
     clusters: &MaskClusters,
@@ -147,10 +150,10 @@ fn best_cluster(
     touched: &mut Vec<u32>,
 ) -> u32 {
     let mut total = 0.0;
-    for entry in sums.starts[k] as usize..sums.starts[k + 1] as usize {
-        let weight = sums.weights[entry];
+    for entry in contributions.starts[k] as usize..contributions.starts[k + 1] as usize {
+        let weight = contributions.weights[entry];
         total += weight;
-        for cluster in of_region.of(sums.regions[entry]) {
+        for cluster in of_region.of(contributions.regions[entry]) {
             let sum = &mut weights[*cluster as usize];
             if *sum == 0.0 {
                 touched.push(*cluster);

@@ -1,6 +1,6 @@
 //! Stage 5: masks of different views that cover the same Gaussians become objects.
 //!
-//! No model and no training: the sparse sums that the lift keeps say which Gaussians each mask shows.
+//! No model and no training: the sparse contributions that the lift keeps say which Gaussians each mask shows.
 //!
 //! | step | job |
 //! |---|---|
@@ -10,7 +10,7 @@
 //! | [`vectors`] | the few vectors that stand for an object's masks |
 //! | [`shards`] | what a cell's shards say of them |
 //!
-//! The sums are read twice, a group of parts at a time as the lift does; what is kept is four bytes a Gaussian.
+//! The contributions are read twice, a group of parts at a time as the lift does; what is kept is four bytes a Gaussian.
 
 pub mod consensus;
 pub mod members;
@@ -25,10 +25,10 @@ use slag_common::Gaussians;
 use slag_common::frames::Aabb;
 use slag_common::manifest::Calibration;
 
-use crate::lift::photos::{Outline, Photo};
-use crate::lift::{RegionTable, SumsError, SumsIndex};
-use crate::palette::Yardstick;
-use crate::shard::cells::CellSplit;
+use crate::cells::CellSplit;
+use crate::codebook::ScoreMetricContext;
+use crate::lift::photos::{MaskOutline, Photo};
+use crate::lift::{ContributionError, ContributionIndex, RegionTable};
 use consensus::Masks;
 use members::Members;
 
@@ -94,27 +94,27 @@ pub struct ObjectsReport {
 
 /// What objects are found in.
 pub struct Scene<'a> {
-    /// The sums of all views.
-    pub index: &'a SumsIndex,
+    /// The contributions of all views.
+    pub index: &'a ContributionIndex,
     /// Their regions.
     pub table: &'a RegionTable,
     /// The Gaussians.
     pub gaussians: &'a Gaussians,
     /// Their cells.
     pub split: &'a CellSplit,
-    /// Each view's masks, in the order of the sums.
+    /// Each view's masks, in the order of the contributions.
     pub photos: &'a [Photo],
     /// Texts that scores are calibrated by.
-    pub yardstick: &'a Yardstick,
-    /// Bytes there are for the sums of a group of parts.
+    pub score_context: &'a ScoreMetricContext,
+    /// Bytes there are for the contributions of a group of parts.
     pub group_bytes: u64,
 }
 
 /// Finds the objects of a scene.
 ///
 /// # Errors
-/// [`SumsError`].
-pub fn find(scene: &Scene<'_>) -> Result<SceneObjects, SumsError> {
+/// [`ContributionError`].
+pub fn find(scene: &Scene<'_>) -> Result<SceneObjects, ContributionError> {
     let Scene { index, table, split, .. } = scene;
     let n_gaussians: usize = split.cells.iter().map(|cell| cell.gaussians.len()).sum();
     let sample_step = sightings::sample_step(n_gaussians);
@@ -132,7 +132,7 @@ pub fn find(scene: &Scene<'_>) -> Result<SceneObjects, SumsError> {
     let mut members = Members::assign(scene, &clusters)?;
     members.drop_small(MIN_GAUSSIANS);
     let objects = describe(scene, &members, &view_of_mask);
-    let calibration = vectors::calibrate(&objects, scene.yardstick, table.dim());
+    let calibration = vectors::calibrate(&objects, scene.score_context, table.dim());
     let report = ObjectsReport {
         n_objects: objects.len(),
         n_gaussians: objects.iter().map(|object| object.n_gaussians as usize).sum(),
@@ -157,7 +157,7 @@ fn describe(scene: &Scene<'_>, members: &Members, view_of_mask: &[u32]) -> Vec<O
         }
     }
     let wholeness: Vec<f32> =
-        scene.photos.iter().flat_map(|photo| &photo.outlines).map(Outline::wholeness).collect();
+        scene.photos.iter().flat_map(|photo| &photo.outlines).map(MaskOutline::wholeness).collect();
     let mut first_mask_of_view = Vec::with_capacity(scene.photos.len());
     let mut n_masks = 0;
     for n in scene.index.n_masks_of_view() {

@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use super::consensus::Sightings;
-use crate::lift::{RegionTable, SumsError, SumsIndex};
+use crate::lift::{ContributionError, ContributionIndex, RegionTable};
 
 /// Gaussians looked at, about: consensus takes time as their number, and masks of [`super::consensus`] need a few each.
 const MAX_SAMPLES: usize = 32_768;
@@ -19,25 +19,30 @@ pub fn sample_step(n_gaussians: usize) -> usize {
 /// Gathers the sightings of every `step`-th Gaussian of each cell.
 ///
 /// # Errors
-/// [`SumsError`].
+/// [`ContributionError`].
 pub fn gather(
-    index: &SumsIndex,
+    index: &ContributionIndex,
     table: &RegionTable,
     step: usize,
     group_bytes: u64,
-) -> Result<Sightings, SumsError> {
+) -> Result<Sightings, ContributionError> {
     let view_of_region = super::repeat_each(index.n_regions_of_view());
     let mut all = Sightings { starts: vec![0], views: Vec::new(), regions: Vec::new() };
     for group in index.groups(group_bytes) {
         let raw = index.read(group)?;
-        for sums in index.regroup(&raw, table)? {
-            let sampled: Vec<usize> = sums.part.locals.clone().filter(|local| local % step == 0).collect();
+        for contributions in index.transpose(&raw, table)? {
+            let sampled: Vec<usize> =
+                contributions.part.locals.clone().filter(|local| local % step == 0).collect();
             let sighted: Vec<Vec<(u32, u32)>> = sampled
                 .par_iter()
                 .map(|local| {
-                    let k = local - sums.part.locals.start;
-                    let entries = sums.starts[k] as usize..sums.starts[k + 1] as usize;
-                    of_gaussian(&sums.regions[entries.clone()], &sums.weights[entries], &view_of_region)
+                    let k = local - contributions.part.locals.start;
+                    let entries = contributions.starts[k] as usize..contributions.starts[k + 1] as usize;
+                    of_gaussian(
+                        &contributions.regions[entries.clone()],
+                        &contributions.weights[entries],
+                        &view_of_region,
+                    )
                 })
                 .collect();
             for of_gaussian in sighted {

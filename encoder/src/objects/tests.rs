@@ -6,9 +6,9 @@ use slag_common::shard::Basis;
 use super::consensus::{MaskClusters, Sightings, cluster_masks};
 use super::shards::{CellObjects, RowFrame};
 use super::*;
-use crate::lift::{SumEntry, ViewSums};
-use crate::palette::{ScoreMetric, TextBank};
-use crate::shard::cells::{CellLimits, split};
+use crate::cells::{CellLimits, split};
+use crate::codebook::{ScoreMetric, TextBank};
+use crate::lift::{Contribution, ViewContributions};
 
 /// Pseudo-random numbers (splitmix64, Steele et al. 2014).
 struct Random(u64);
@@ -244,14 +244,14 @@ fn clusters_are_those_of_the_definition() {
     assert_eq!(check(&Vec::new(), 5, "no view"), 0);
 }
 
-/// Things in a row of cells, in files of sums; thing i's masks have the vector of axis i.
+/// Things in a row of cells, in files of contributions; thing i's masks have the vector of axis i.
 struct World {
     gaussians: Gaussians,
     split: CellSplit,
-    index: SumsIndex,
+    index: ContributionIndex,
     table: RegionTable,
     photos: Vec<Photo>,
-    yardstick: Yardstick,
+    score_context: ScoreMetricContext,
     _dir: tempfile::TempDir,
 }
 
@@ -276,7 +276,7 @@ fn world() -> World {
     let mut random = Random(3);
     let (mut paths, mut photos) = (Vec::new(), Vec::new());
     for view in 0..6u32 {
-        let mut entries: BTreeMap<u32, Vec<SumEntry>> = BTreeMap::new();
+        let mut entries: BTreeMap<u32, Vec<Contribution>> = BTreeMap::new();
         for i in 0..n {
             if random.below(10) >= 8 {
                 continue;
@@ -285,38 +285,47 @@ fn world() -> World {
             let thing = i / PER_THING;
             // A little of each lies under a neighbour's mask too: the last view sees thing 2 whole and large.
             let weight = if view == 5 && thing == 2 { 9.0 } else { 1.0 + random.below(8) as f32 / 8.0 };
-            let spilt = SumEntry { local, region: (thing + 1) % 3, weight: 0.25 };
-            let mut of_gaussian = vec![SumEntry { local, region: thing, weight }, spilt];
+            let spilt = Contribution { local, region: (thing + 1) % 3, weight: 0.25 };
+            let mut of_gaussian = vec![Contribution { local, region: thing, weight }, spilt];
             of_gaussian.sort_by_key(|entry| entry.region);
             entries.entry(cell).or_default().extend(of_gaussian);
         }
         entries.values_mut().for_each(|entries| entries.sort_by_key(|entry| (entry.local, entry.region)));
         let axis = |thing: usize| (0..DIM).map(move |c| f32::from(u8::from(c == thing)));
-        let sums = ViewSums {
+        let contributions = ViewContributions {
             dim: DIM,
             mask_vectors: (0..3).flat_map(axis).collect(),
             masks_of_region: vec![vec![0], vec![1], vec![2]],
             entries_of_cell: entries.into_iter().collect(),
         };
-        let path = dir.path().join(format!("{view}.sums"));
-        sums.write(&path).expect("writes");
+        let path = dir.path().join(format!("{view}.contributions"));
+        contributions.write(&path).expect("writes");
         paths.push(path);
-        let outline = |mask| Outline { box_px: [view, mask, view + 10, mask + 10], ..Outline::default() };
+        let outline =
+            |mask| MaskOutline { box_px: [view, mask, view + 10, mask + 10], ..MaskOutline::default() };
         let outlines = (0..3).map(outline).collect();
         photos.push(Photo { name: format!("{view}.jpg"), outlines });
     }
     let n_of_cell: Vec<usize> = split.cells.iter().map(|cell| cell.gaussians.len()).collect();
-    let (index, table) = SumsIndex::open(&paths, DIM, &n_of_cell).expect("opens");
+    let (index, table) = ContributionIndex::open(&paths, DIM, &n_of_cell).expect("opens");
     let bank = TextBank::directions(DIM);
     let metric = ScoreMetric::new(DIM, &bank);
     let spread = metric.spread(table.mask_vectors());
-    World { gaussians, split, index, table, photos, yardstick: Yardstick { metric, bank, spread }, _dir: dir }
+    World {
+        gaussians,
+        split,
+        index,
+        table,
+        photos,
+        score_context: ScoreMetricContext { metric, bank, spread },
+        _dir: dir,
+    }
 }
 
 impl World {
     fn objects(&self, group_bytes: u64) -> SceneObjects {
-        let Self { gaussians, split, index, table, photos, yardstick, .. } = self;
-        find(&Scene { index, table, gaussians, split, photos, yardstick, group_bytes }).expect("finds")
+        let Self { gaussians, split, index, table, photos, score_context, .. } = self;
+        find(&Scene { index, table, gaussians, split, photos, score_context, group_bytes }).expect("finds")
     }
 }
 

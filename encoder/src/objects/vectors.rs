@@ -4,8 +4,9 @@ use slag_common::manifest::Calibration;
 use slag_common::objects::object_score;
 
 use super::Object;
-use crate::lift::{RegionTable, dot};
-use crate::palette::Yardstick;
+use crate::codebook::ScoreMetricContext;
+use crate::lift::RegionTable;
+use slag_math::dot;
 
 /// Masks that stand for an object's others, beside their mean: the sides that a thing has.
 pub const MAX_MEDOIDS: usize = 4;
@@ -54,10 +55,10 @@ pub fn choose(masks: &[u32], weights: &[f64], table: &RegionTable) -> Vec<f32> {
 }
 
 /// Returns how a bank of texts scores over objects: mean and spread of all scores, as cells have them of Gaussians.
-pub fn calibrate(objects: &[Object], yardstick: &Yardstick, dim: usize) -> Calibration {
+pub fn calibrate(objects: &[Object], score_context: &ScoreMetricContext, dim: usize) -> Calibration {
     let (mut sum, mut squares, mut n) = (0.0, 0.0, 0.0f64);
     for object in objects {
-        for text in yardstick.bank.vectors.chunks_exact(dim) {
+        for text in score_context.bank.vectors.chunks_exact(dim) {
             let cosines: Vec<f32> = object.vectors.chunks_exact(dim).map(|v| dot(v, text)).collect();
             let score = f64::from(object_score(&cosines));
             (sum, squares, n) = (sum + score, squares + score * score, n + 1.0);

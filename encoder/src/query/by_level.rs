@@ -8,15 +8,16 @@
 //! ```
 //!
 //! and its score the best of the levels' cosines, as LangSplat (Qin et al. 2024) takes the best of its three fields.
-//! The sums are those of the plain field: nothing more is published for it but each mask's level.
+//! The contributions are those of the plain field: nothing more is published for it but each mask's level.
 
 use rayon::prelude::*;
 use slag_common::manifest::CellRecord;
 
 use super::{QueryError, Scores, check_dim, scores_of_cells};
 use crate::lift::published::{read_field, read_regions};
-use crate::lift::{CellField, RegionTable, dot};
+use crate::lift::{CellField, RegionTable};
 use crate::store::StoreReader;
+use slag_math::dot;
 
 /// A level with less than this part of the longest level's sum says nothing of a Gaussian.
 const LEAST_SHARE: f32 = 0.1;
@@ -30,7 +31,7 @@ pub struct ByLevel<'a> {
 }
 
 impl<'a> ByLevel<'a> {
-    /// Reads the field once and measures the levels' sums.
+    /// Reads the field once and measures the levels' contributions.
     ///
     /// # Errors
     /// [`QueryError::Field`].
@@ -64,7 +65,7 @@ fn lengths(field: &CellField, table: &RegionTable) -> Vec<f32> {
     let mut lengths = vec![0.0; field.len() * n_levels];
     lengths.par_chunks_exact_mut(n_levels).enumerate().for_each_init(
         || (vec![0.0f32; table.n_masks()], Vec::new(), vec![0.0f32; n_levels * dim]),
-        |(count_of_mask, masks, sums), (k, lengths)| {
+        |(count_of_mask, masks, contributions), (k, lengths)| {
             for (region, weight) in field.entries(k) {
                 for (mask, share) in table.masks_of(region) {
                     masks.push(mask);
@@ -73,14 +74,14 @@ fn lengths(field: &CellField, table: &RegionTable) -> Vec<f32> {
             }
             masks.sort_unstable();
             masks.dedup();
-            sums.fill(0.0);
+            contributions.fill(0.0);
             for mask in masks.drain(..) {
                 let count = std::mem::take(&mut count_of_mask[mask as usize]);
-                let sum = &mut sums[table.level_of(mask) * dim..][..dim];
+                let sum = &mut contributions[table.level_of(mask) * dim..][..dim];
                 let vector = table.mask_vectors().get(mask as usize);
                 sum.iter_mut().zip(vector).for_each(|(s, v)| *s += count * v);
             }
-            for (length, sum) in lengths.iter_mut().zip(sums.chunks_exact(dim)) {
+            for (length, sum) in lengths.iter_mut().zip(contributions.chunks_exact(dim)) {
                 *length = dot(sum, sum).sqrt();
             }
         },
@@ -96,12 +97,15 @@ fn best_of_levels(field: &CellField, of_regions: &[f32], lengths: &[f32], n_leve
         if !field.has_evidence(k) || longest <= 0.0 {
             return f32::NAN;
         }
-        let mut sums = vec![0.0f64; n_levels];
+        let mut contributions = vec![0.0f64; n_levels];
         for (region, weight) in field.entries(k) {
             let of_region = &of_regions[region * n_levels..][..n_levels];
-            sums.iter_mut().zip(of_region).for_each(|(sum, s)| *sum += f64::from(weight) * f64::from(*s));
+            contributions
+                .iter_mut()
+                .zip(of_region)
+                .for_each(|(sum, s)| *sum += f64::from(weight) * f64::from(*s));
         }
-        let known = sums.iter().zip(lengths).filter(|(_, length)| **length >= LEAST_SHARE * longest);
+        let known = contributions.iter().zip(lengths).filter(|(_, length)| **length >= LEAST_SHARE * longest);
         known.map(|(sum, length)| (sum / f64::from(*length)) as f32).fold(f32::MIN, f32::max)
     };
     (0..field.len()).into_par_iter().map(score).collect()

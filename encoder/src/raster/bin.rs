@@ -45,7 +45,7 @@ pub fn bin(visible: &[ScreenGaussian], camera: &Intrinsics) -> Tiles {
                 let Some((a, b)) = ScreenGaussian::pixels_within(low, high, height_px) else { continue };
                 // Depths are positive, so their bits order as they do; the index makes every key unique.
                 let key = u64::from(g.depth.to_bits()) << 32 | index;
-                let outline = Outline::new(g);
+                let outline = Footprint::new(g);
                 for row in a / TILE..=b / TILE {
                     let columns = outline.columns(row * TILE, camera);
                     spanned.extend(columns.map(|columns| ((key, columns), (row, row))));
@@ -76,7 +76,7 @@ fn tile_row<'a>(parts: impl Iterator<Item = &'a [Candidate]>, width_px: u32) -> 
 }
 
 /// The edge of a footprint.
-struct Outline<'a> {
+struct Footprint<'a> {
     gaussian: &'a ScreenGaussian,
     reach2: f64,
     extent_y_px: f64,
@@ -84,7 +84,7 @@ struct Outline<'a> {
     y_of_rightmost: f64,
 }
 
-impl<'a> Outline<'a> {
+impl<'a> Footprint<'a> {
     fn new(gaussian: &'a ScreenGaussian) -> Self {
         let (reach2, extent_px) = (f64::from(gaussian.reach2), gaussian.extent_px());
         // At y = cov_xy / cov_xx * ex.

@@ -11,7 +11,7 @@ use super::{
     CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, StageTime, ViewWeights,
     WeightKind,
 };
-use crate::segment::RegionMap;
+use crate::masks::RegionMap;
 
 /// What the user asks for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -180,7 +180,7 @@ impl Rasterizer for Devices {
             return Ok(cpu);
         }
         let lanes =
-            Lanes { n_free: vec![self.views_in_flight; gpus.len()], is_usable: vec![true; gpus.len()] };
+            DeviceSlots { n_free: vec![self.views_in_flight; gpus.len()], is_usable: vec![true; gpus.len()] };
         Ok(Box::new(SharedScene {
             gpus,
             views_in_flight: self.views_in_flight,
@@ -197,11 +197,11 @@ struct SharedScene<'s> {
     gpus: Vec<Box<dyn LoadedScene + 's>>,
     views_in_flight: usize,
     cpu: Box<dyn LoadedScene + 's>,
-    lanes: Mutex<Lanes>,
+    lanes: Mutex<DeviceSlots>,
     freed: Condvar,
 }
 
-struct Lanes {
+struct DeviceSlots {
     /// Free lanes of each GPU.
     n_free: Vec<usize>,
     is_usable: Vec<bool>,

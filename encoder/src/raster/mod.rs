@@ -29,7 +29,7 @@ use std::time::Instant;
 use glam::{DAffine3, DMat3};
 use slag_common::{Distortion, Gaussians, Intrinsics};
 
-use crate::segment::{NO_REGION, RegionMap};
+use crate::masks::{NO_REGION, RegionMap};
 
 pub use draw::Drawing;
 

@@ -10,7 +10,7 @@ use super::constants::{MIN_ALPHA, MIN_TRANSMITTANCE, SUM_FRACTION_BITS, TILE_SIZ
 use super::project::ScreenGaussian;
 use super::simd::{Lanes, Level};
 use super::{RegionWeight, WeightKind};
-use crate::segment::{NO_REGION, RegionMap};
+use crate::masks::{NO_REGION, RegionMap};
 
 /// Steps of the fixed-point sums in 1.
 const SUM_STEPS: f64 = (1_u64 << SUM_FRACTION_BITS) as f64;

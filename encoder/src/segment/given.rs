@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use slag_common::View;
 
-use super::{
-    BoxPx, MAX_MASK_BYTES, Mask, NO_REGION, Rle, RleError, SegmentError, SegmentInput, Segmenter,
-    masks_of_labels, partition,
-};
+use super::{MAX_MASK_BYTES, SegmentError, SegmentInput, Segmenter};
 use crate::ingest::Undistorter;
+use crate::masks::regions::partition;
+use crate::masks::rle::{Rle, RleError};
+use crate::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
 
 /// What a PNG decoder may allocate beyond the pixels themselves.
 const PNG_OVERHEAD_BYTES: usize = 1 << 20;
@@ -19,7 +19,7 @@ const PNG_OVERHEAD_BYTES: usize = 1 << 20;
 /// Masks from files.
 ///
 /// A folder holds, for image `left/a.jpg`, one of `left/a.png`, `left/a.jpg.png`, `left/a.json` or
-/// `left/a.jpg.json`. A PNG (gray of up to 16 bits, or with a palette) holds ids: 0 is no mask, each
+/// `left/a.jpg.json`. A PNG (gray of up to 16 bits, or with a codebook) holds ids: 0 is no mask, each
 /// other id one. A JSON file is a list of `{"segmentation": {"size": [height, width], "counts": ..}}`
 /// as SAM's automatic generator writes it, or an object with such a list as `annotations`; masks
 /// may overlap. A single JSON file in place of the folder is a whole COCO data set.
@@ -169,7 +169,7 @@ fn check_size(path: &Path, [width, height]: [u32; 2], input: &SegmentInput<'_>) 
     Err(SegmentError::Size { path: path.to_owned(), view, found_px: [width, height], expected_px })
 }
 
-/// Reads the ids of a PNG of the image's size, row-major; a palette's are its indices.
+/// Reads the ids of a PNG of the image's size, row-major; a codebook's are its indices.
 fn read_id_png(path: &Path, input: &SegmentInput<'_>) -> Result<Vec<u32>, SegmentError> {
     let failed = |source| SegmentError::Png { path: path.to_owned(), source };
     let n_pixels = input.image.width() as usize * input.image.height() as usize;
@@ -202,7 +202,7 @@ fn read_id_png(path: &Path, input: &SegmentInput<'_>) -> Result<Vec<u32>, Segmen
                 ids.extend(row.chunks_exact(2).map(|pair| u32::from(u16::from_be_bytes([pair[0], pair[1]]))))
             }
             8 => ids.extend(row.iter().map(|byte| u32::from(*byte))),
-            // Several pixels a byte, the leftmost in the highest bits; a row starts on a new byte.
+            // Several pixels a byte, the leftmost in the highest bits; a centroid starts on a new byte.
             _ => ids.extend((0..width_px as usize).map(|x| {
                 let shift = 8 - bits - x * bits % 8;
                 u32::from(row[x * bits / 8] >> shift) & ((1 << bits) - 1)

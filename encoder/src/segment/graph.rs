@@ -13,8 +13,9 @@ use slag_models::session::SessionError;
 
 use image::{RgbImage, imageops};
 
-use super::regions::nearest;
-use super::{BoxPx, Mask, NO_REGION, SegmentError, SegmentInput, Segmenter, masks_of_labels};
+use super::{SegmentError, SegmentInput, Segmenter};
+use crate::masks::regions::nearest;
+use crate::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
 
 /// Steps of an edge weight per unit of L*a*b* distance; 16 bits then reach beyond black to white.
 const WEIGHT_STEPS: f32 = 200.0;

@@ -4,8 +4,9 @@
 //! an extent that grows with the level; its vector turns, as one object's do from view to view. Every mask has a
 //! random sequence of its own, of seed, view and place: threads and the order of views do not show.
 
-use super::{BoxPx, Mask, NO_REGION, SegmentError, SegmentInput, Segmenter, masks_of_labels};
-use crate::generate::Random;
+use super::{SegmentError, SegmentInput, Segmenter};
+use crate::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
+use slag_math::random::Xorshift;
 
 /// Chances of a mask, per level: SAM's automatic masks of indoor photos lie between levels 1 and 2 (they miss or
 /// break about one object in five; our estimate).
@@ -65,10 +66,10 @@ impl Segmenter for NoisyMasks {
 }
 
 impl MaskNoise {
-    fn random(&self, view: &str, what: &str, index: usize) -> Random {
+    fn random(&self, view: &str, what: &str, index: usize) -> Xorshift {
         let hash = blake3::hash(format!("{}/{view}/{what}/{index}", self.seed).as_bytes());
         let bytes = hash.as_bytes().first_chunk().copied().unwrap_or_default();
-        Random::new(u64::from_le_bytes(bytes))
+        Xorshift::new(u64::from_le_bytes(bytes))
     }
 
     /// Returns the masks of a view of `size_px` as they might have been found; at level 0 as they are.
@@ -77,7 +78,7 @@ impl MaskNoise {
             return masks;
         }
         let level = f64::from(self.level);
-        let mut randoms: Vec<Random> = (0..masks.len()).map(|i| self.random(view, "mask", i)).collect();
+        let mut randoms: Vec<Xorshift> = (0..masks.len()).map(|i| self.random(view, "mask", i)).collect();
         let mut left: Vec<Option<Mask>> = masks
             .into_iter()
             .zip(&mut randoms)
@@ -155,7 +156,7 @@ fn union(a: &Mask, b: &Mask) -> Mask {
 }
 
 /// Cuts a mask along a line near its box's middle; the pieces that have pixels.
-fn split(mask: &Mask, random: &mut Random) -> Vec<Mask> {
+fn split(mask: &Mask, random: &mut Xorshift) -> Vec<Mask> {
     let (sine, cosine) = random.between(0.0, std::f64::consts::PI).sin_cos();
     let BoxPx { x0, y0, .. } = mask.box_px;
     let (width, height) = (f64::from(mask.box_px.width_px()), f64::from(mask.box_px.height_px()));
@@ -170,7 +171,7 @@ fn split(mask: &Mask, random: &mut Random) -> Vec<Mask> {
 }
 
 /// Moves a mask's outline in and out by up to `extent` times the square root of its area.
-fn frayed(mask: &Mask, extent: f64, size_px: [u32; 2], random: &mut Random) -> Option<Mask> {
+fn frayed(mask: &Mask, extent: f64, size_px: [u32; 2], random: &mut Xorshift) -> Option<Mask> {
     let extent_px = extent * f64::from(mask.area_px).sqrt();
     let margin_px = extent_px.ceil() as u32;
     let BoxPx { x0, y0, x1, y1 } = mask.box_px;

@@ -1,6 +1,5 @@
 //! Stage 6: a cell's field becomes its shards.
 
-pub mod cells;
 pub mod positions;
 
 use half::f16;
@@ -11,13 +10,13 @@ use slag_common::shard::{
     Basis, ExactColumns, Fine, Profile, Residuals, ScoreErrors, ShardHeader, ShardView,
 };
 
+use crate::cells::Cell;
+use crate::codebook::measure::ScoreMoments;
+use crate::codebook::{self, CodebookSettings, ScoreMetricContext};
 use crate::objects::SceneObjects;
 use crate::objects::shards::{CellObjects, RowFrame};
-use crate::palette::matrix::Rows;
-use crate::palette::measure::ScoreMoments;
-use crate::palette::{self, PaletteSettings, Yardstick};
-use cells::Cell;
 use positions::{PositionError, QuantisedPositions};
+use slag_math::matrix::Rows;
 
 /// A cell's shard as bytes, with what the manifest says of it.
 pub struct BuiltShard {
@@ -35,10 +34,10 @@ pub struct BuiltShard {
 pub struct BuiltCell {
     /// One a profile.
     pub shards: Vec<BuiltShard>,
-    /// Palette rows.
-    pub n_rows: u32,
+    /// Codebook rows.
+    pub n_centroids: u32,
     /// Half bytes of the residual code.
-    pub n_groups: u32,
+    pub n_subspaces: u32,
     /// Largest error of a position, world units.
     pub position_error: f64,
     /// Of the scores of all texts.
@@ -53,7 +52,7 @@ pub struct ShardSettings {
     /// Which.
     pub profiles: Vec<Profile>,
     /// Of embeddings.
-    pub palette: PaletteSettings,
+    pub codebook: CodebookSettings,
     /// Of positions.
     pub position_error: PositionError,
 }
@@ -69,10 +68,10 @@ pub struct CellEmbeddings {
 }
 
 /// Returns the bytes that a cell of `n_gaussians` takes while its shards are built: embeddings in f32, in f16
-/// and in the shard, and what the palette needs.
+/// and in the shard, and what the codebook needs.
 pub fn working_bytes(n_gaussians: usize, dim: usize) -> u64 {
     let per_component = size_of::<f32>() + 2 * size_of::<f16>();
-    (n_gaussians * (dim * per_component + palette::working_bytes_per_embedding(dim))) as u64
+    (n_gaussians * (dim * per_component + codebook::working_bytes_per_embedding(dim))) as u64
 }
 
 /// Builds a cell's shards, with the objects of the scene if it has any.
@@ -83,7 +82,7 @@ pub fn build(
     cell: &Cell,
     embeddings: &CellEmbeddings,
     encoder_id: Hash32,
-    yardstick: &Yardstick,
+    score_context: &ScoreMetricContext,
     settings: &ShardSettings,
     objects: Option<&SceneObjects>,
 ) -> BuiltCell {
@@ -92,51 +91,51 @@ pub fn build(
         (0..cell.gaussians.len() as u32).partition(|local| embeddings.has_evidence[*local as usize]);
     let rows = Rows { values: &embeddings.vectors, width: dim, index: Some(&with) };
     let has_fine = settings.profiles.contains(&Profile::Exact);
-    let palette = palette::build(rows, yardstick, &PaletteSettings { has_fine, ..settings.palette });
+    let codebook = codebook::build(rows, score_context, &CodebookSettings { has_fine, ..settings.codebook });
     let n_with = with.len();
     // Shard order: by row, then along the Morton curve, which is the order of locals.
-    let in_order = palette.order.iter().map(|at| with[*at as usize]);
+    let in_order = codebook.order.iter().map(|at| with[*at as usize]);
     let locals: Vec<u32> = in_order.chain(without.iter().copied()).collect();
 
     let positions = QuantisedPositions::new(scene, cell, &locals, settings.position_error);
     let header = ShardHeader {
         cell_id,
         n_gaussians: locals.len() as u32,
-        n_rows: palette.radii.len() as u32,
+        n_centroids: codebook.radii.len() as u32,
         dim: dim as u32,
-        n_components: palette.n_components as u32,
-        n_groups: 0,
+        n_components: codebook.n_components as u32,
+        n_subspaces: 0,
         position_bits: positions.bits,
-        row_step: palette.row_step,
+        centroid_step: codebook.centroid_step,
         origin_in_world: cell.mean_bounds.min.to_array(),
         position_step: positions.step,
         box_min: cell.bounds.min.to_array(),
         box_max: cell.bounds.max.to_array(),
-        errors: palette.errors,
+        errors: codebook.errors,
         encoder_id: encoder_id.0,
     };
     let compact = ShardView {
         header,
         positions: positions.view(),
-        row_starts: &palette.row_starts,
-        rows: &palette.rows,
-        radii: &palette.radii,
-        basis: Some(Basis { mean: &palette.mean, vectors: &palette.basis, steps: &palette.basis_steps }),
+        centroid_starts: &codebook.centroid_starts,
+        centroids: &codebook.centroids,
+        radii: &codebook.radii,
+        basis: Some(Basis { mean: &codebook.mean, vectors: &codebook.basis, steps: &codebook.basis_steps }),
         residuals: None,
         exact: None,
     };
-    let balanced = palette.residuals.as_ref().map_or(compact, |residuals| ShardView {
+    let balanced = codebook.residuals.as_ref().map_or(compact, |residuals| ShardView {
         header: ShardHeader {
-            n_groups: residuals.code.n_groups() as u32,
+            n_subspaces: residuals.code.n_subspaces() as u32,
             errors: residuals.errors,
             ..header
         },
         radii: &residuals.radii,
         residuals: Some(Residuals {
-            group_starts: &residuals.code.group_starts,
-            words: &residuals.code.words,
-            row_scales: &residuals.row_scales,
-            reaches: &residuals.reaches,
+            subspace_starts: &residuals.code.subspace_starts,
+            codewords: &residuals.code.codewords,
+            residual_scales: &residuals.residual_scales,
+            residual_norms: &residuals.residual_norms,
             codes: &residuals.codes,
         }),
         ..compact
@@ -145,7 +144,7 @@ pub fn build(
         .map(|objects| CellObjects::new(objects, cell_id, &locals, &RowFrame::new(dim, compact.basis)));
     let objects = objects.as_ref().map(CellObjects::view);
     let largest = |radii: &[f32]| radii.iter().copied().fold(0.0, f32::max);
-    let spread = palette.errors.spread;
+    let spread = codebook.errors.spread;
     let built = |profile, view: &ShardView<'_>| {
         let mut bytes = Vec::new();
         view.write_with(&mut bytes, objects.as_ref()).expect("writing to memory cannot fail");
@@ -168,7 +167,7 @@ pub fn build(
                 out.iter_mut().zip(embedding).for_each(|(o, v)| *o = f16::from_f32(*v));
             });
             // Codes and fine residuals tell which embeddings are worth reading.
-            let fine = palette.residuals.as_ref().and_then(|residuals| residuals.fine.as_ref());
+            let fine = codebook.residuals.as_ref().and_then(|residuals| residuals.fine.as_ref());
             let fine = fine.map(|fine| Fine {
                 errors: fine.errors,
                 steps: &fine.steps,
@@ -181,10 +180,10 @@ pub fn build(
     });
     BuiltCell {
         shards: shards.collect(),
-        n_rows: header.n_rows,
-        n_groups: balanced.header.n_groups,
+        n_centroids: header.n_centroids,
+        n_subspaces: balanced.header.n_subspaces,
         position_error: positions.step.into_iter().fold(0.0, f64::max) / 2.0,
-        moments: palette.moments,
+        moments: codebook.moments,
         n_without_evidence: without.len(),
     }
 }

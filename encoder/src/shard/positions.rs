@@ -4,7 +4,7 @@ use glam::DVec3;
 use slag_common::Gaussians;
 use slag_common::shard::Positions;
 
-use super::cells::Cell;
+use crate::cells::Cell;
 
 /// What a position may be off by, per axis.
 #[derive(Clone, Copy, Debug, PartialEq)]

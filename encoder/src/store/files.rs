@@ -5,6 +5,7 @@ use std::path::Path;
 
 use fs_err::File;
 use slag_common::Hash32;
+pub(super) use slag_common::durable::{Access, move_into_place, replace, sync_folder};
 
 /// Counts and hashes what passes on its way to a file.
 pub(super) struct HashingWriter {
@@ -36,53 +37,6 @@ impl HashingWriter {
         file.sync_all()?;
         Ok((Hash32(*self.hasher.finalize().as_bytes()), self.hasher.count()))
     }
-}
-
-/// Who may read a file that is made.
-#[derive(Clone, Copy)]
-pub(super) enum Access {
-    /// Whoever the process' umask lets.
-    Shared,
-    /// The owner alone (mode 0600).
-    Private,
-}
-
-/// Replaces `path` by `bytes`: a crash leaves the old content or the new, whole.
-pub(super) fn replace(part: &Path, path: &Path, bytes: &[u8], access: Access) -> io::Result<()> {
-    let mut options = fs_err::OpenOptions::new();
-    options.write(true).create_new(true);
-    #[cfg(unix)]
-    if matches!(access, Access::Private) {
-        use fs_err::os::unix::fs::OpenOptionsExt;
-        options.mode(0o600);
-    }
-    let mut file = options.open(part)?;
-    file.write_all(bytes)?;
-    file.sync_all()?;
-    move_into_place(part, path)
-}
-
-/// Replaces a working file by `bytes`, written beside as `.part` first: whole or not at all after a crash.
-pub(crate) fn write_durably(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let mut part = path.as_os_str().to_owned();
-    part.push(".part");
-    let part = Path::new(&part);
-    if part.exists() {
-        fs_err::remove_file(part)?;
-    }
-    replace(part, path, bytes, Access::Shared)
-}
-
-/// Renames a synced file and makes its new name durable.
-pub(super) fn move_into_place(part: &Path, path: &Path) -> io::Result<()> {
-    fs_err::rename(part, path)?;
-    path.parent().map_or(Ok(()), sync_folder)
-}
-
-/// Makes the names in a folder durable.
-pub(super) fn sync_folder(path: &Path) -> io::Result<()> {
-    // Elsewhere a folder cannot be opened for syncing; the file system orders renames itself.
-    if cfg!(unix) { File::open(path)?.sync_all() } else { Ok(()) }
 }
 
 /// Creates a folder durably, unless it is there.

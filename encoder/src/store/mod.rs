@@ -36,7 +36,6 @@ use slag_common::Hash32;
 use slag_common::manifest::{CellRecord, Manifest, TrustedKeys};
 
 pub use error::StoreError;
-pub(crate) use files::write_durably;
 use files::{Access, HashingWriter};
 use keys::Keys;
 pub use reader::{Extras, Published, StoreReader};

@@ -50,7 +50,7 @@ pub(crate) fn manifest(generation: u64, objects: &[(Hash32, u64)]) -> Manifest {
         let record = ShardRecord {
             hash,
             len_bytes,
-            n_rows: 1,
+            n_centroids: 1,
             score_error_bound: 0.0,
             score_errors: Default::default(),
             position_error: 0.0,

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use glam::DVec3;
 use slag_common::{Distortion, Gaussians};
+use slag_encoder::masks::{NO_REGION, RegionMap};
 use slag_encoder::raster::{Drawing, RasterError, RasterView, ViewWeights, WeightKind};
-use slag_encoder::segment::{NO_REGION, RegionMap};
 
 use crate::backends::{Backend, backends};
 use crate::oracle;

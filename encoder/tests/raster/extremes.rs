@@ -3,9 +3,9 @@
 use glam::{DAffine3, DVec3};
 use slag_common::Gaussians;
 use slag_common::splat::{self, ReadOptions};
+use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::constants::{MAX_IMAGE_PX, SUM_FRACTION_BITS};
 use slag_encoder::raster::{RasterView, RegionWeight, WeightKind};
-use slag_encoder::segment::RegionMap;
 
 use crate::backends::{Backend, backends};
 use crate::scenes::{Random, posed, push, random_regions, random_scene, random_view, unproject};

@@ -8,8 +8,8 @@ use glam::{DAffine3, DMat3, DVec3};
 use npyz::Deserialize;
 use npyz::npz::NpzArchive;
 use slag_common::{Distortion, Gaussians, Intrinsics};
+use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::RasterView;
-use slag_encoder::segment::RegionMap;
 
 /// Returns a path of the shared data, or `None` (said aloud) where it is absent; CI must have it.
 pub fn shared(path: &str) -> Option<PathBuf> {

@@ -1,11 +1,11 @@
 //! What only a GPU does: cutting into chunks and bands, sharing views, failing.
 
+use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::devices::{DeviceChoice, DeviceError, Devices};
 use slag_encoder::raster::gpu::{GpuOptions, GpuRasterizer, adapters};
 use slag_encoder::raster::{
     CpuRasterizer, LoadedScene, RasterError, RasterView, Rasterizer, ViewWeights, WeightKind,
 };
-use slag_encoder::segment::RegionMap;
 
 use crate::backends::gpu_is_expected;
 use crate::scenes::{Random, random_regions, random_scene, random_view};

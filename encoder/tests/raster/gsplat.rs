@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use slag_common::Gaussians;
+use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::{RasterView, Rasterizer, ViewWeights, WeightKind};
-use slag_encoder::segment::RegionMap;
 
 use crate::backends::{Backend, backends};
 use crate::fixtures::{Npz, points, view, widened};

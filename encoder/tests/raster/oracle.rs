@@ -8,8 +8,8 @@ use std::collections::BTreeMap;
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use slag_common::Gaussians;
+use slag_encoder::masks::{NO_REGION, RegionMap};
 use slag_encoder::raster::{RasterView, WeightKind};
-use slag_encoder::segment::{NO_REGION, RegionMap};
 
 /// A Gaussian as the oracle sees it.
 pub struct Projected {

@@ -2,8 +2,8 @@
 
 use glam::{DAffine3, DQuat, DVec3};
 use slag_common::{Distortion, Gaussians, Intrinsics};
+use slag_encoder::masks::{NO_REGION, RegionMap};
 use slag_encoder::raster::RasterView;
-use slag_encoder::segment::{NO_REGION, RegionMap};
 
 /// SplitMix64 (Steele et al. 2014): small, seeded, the same everywhere.
 pub struct Random(pub u64);

@@ -52,8 +52,8 @@ pub fn text_graph(kind: TextKind) -> Graph {
         nodes.extend([
             node("Cast", &["attention_mask"], "weights", &[("to", &[kind.floats.code()])]),
             node("Unsqueeze", &["weights"], "line", &[("axes", &[1])]),
-            node("MatMul", &["line", "rows"], "sums", &[]),
-            node("Squeeze", &["sums"], "text_embeds", &[("axes", &[1])]),
+            node("MatMul", &["line", "rows"], "contributions", &[]),
+            node("Squeeze", &["contributions"], "text_embeds", &[("axes", &[1])]),
         ]);
     } else {
         let attributes: &[(&str, &[i64])] = &[("axes", &[1]), ("keepdims", &[0])];

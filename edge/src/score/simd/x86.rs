@@ -10,17 +10,17 @@ use super::{Column, Kernels, ROWS};
 
 impl Kernels for V3 {
     #[inline(always)]
-    fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
+    fn dots(self, centroids: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
         let (avx, avx2) = (self.avx, self.avx2);
-        let [a, b, c, d] = rows;
+        let [a, b, c, d] = centroids;
         let (a, b) = (a.as_chunks::<16>().0, b.as_chunks::<16>().0);
         let (c, d) = (c.as_chunks::<16>().0, d.as_chunks::<16>().0);
         let vector = vector.as_chunks::<16>().0;
         let mut sums = [avx._mm256_setzero_si256(); ROWS];
         for ((((a, b), c), d), vector) in a.iter().zip(b).zip(c).zip(d).zip(vector) {
             let vector: __m256i = cast(*vector);
-            for (sum, row) in sums.iter_mut().zip([a, b, c, d]) {
-                let products = avx2._mm256_madd_epi16(avx2._mm256_cvtepi8_epi16(cast(*row)), vector);
+            for (sum, centroid) in sums.iter_mut().zip([a, b, c, d]) {
+                let products = avx2._mm256_madd_epi16(avx2._mm256_cvtepi8_epi16(cast(*centroid)), vector);
                 *sum = avx2._mm256_add_epi32(*sum, products);
             }
         }
@@ -41,7 +41,7 @@ impl Kernels for V3 {
         let avx2 = self.avx2;
         let least = self.avx._mm256_set1_epi16(least as i16);
         let [low, high]: [__m256i; 2] = cast(*sums);
-        // There is no comparison of unsigned words but by their maximum.
+        // There is no comparison of unsigned codewords but by their maximum.
         let low = avx2._mm256_cmpeq_epi16(avx2._mm256_max_epu16(low, least), low);
         let high = avx2._mm256_cmpeq_epi16(avx2._mm256_max_epu16(high, least), high);
         // Packing works within 128 bits: quarters come as 0, 2, 1, 3.
@@ -52,17 +52,18 @@ impl Kernels for V3 {
 
 impl Kernels for V4 {
     #[inline(always)]
-    fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
+    fn dots(self, centroids: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
         let (avx512f, avx512bw) = (self.avx512f, self.avx512bw);
-        let [a, b, c, d] = rows;
+        let [a, b, c, d] = centroids;
         let (a, b) = (a.as_chunks::<32>().0, b.as_chunks::<32>().0);
         let (c, d) = (c.as_chunks::<32>().0, d.as_chunks::<32>().0);
         let vector = vector.as_chunks::<32>().0;
         let mut sums = [avx512f._mm512_setzero_si512(); ROWS];
         for ((((a, b), c), d), vector) in a.iter().zip(b).zip(c).zip(d).zip(vector) {
             let vector: __m512i = cast(*vector);
-            for (sum, row) in sums.iter_mut().zip([a, b, c, d]) {
-                let products = avx512bw._mm512_madd_epi16(avx512bw._mm512_cvtepi8_epi16(cast(*row)), vector);
+            for (sum, centroid) in sums.iter_mut().zip([a, b, c, d]) {
+                let products =
+                    avx512bw._mm512_madd_epi16(avx512bw._mm512_cvtepi8_epi16(cast(*centroid)), vector);
                 *sum = avx512f._mm512_add_epi32(*sum, products);
             }
         }

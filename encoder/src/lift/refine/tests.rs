@@ -5,10 +5,10 @@ use slag_common::container::AlignedBytes;
 use slag_common::frames::Aabb;
 
 use super::*;
-use crate::lift::photos::Outline;
+use crate::cells::Cell;
+use crate::lift::photos::MaskOutline;
 use crate::lift::tests::{Scene, open};
-use crate::lift::{CellField, SumEntry, ViewSums};
-use crate::shard::cells::Cell;
+use crate::lift::{CellField, Contribution, ViewContributions};
 
 const DIM: usize = 12;
 const N: usize = 90;
@@ -42,7 +42,7 @@ fn split() -> CellSplit {
 }
 
 /// Views of two masks a patch, which overlap; the masks of view 3 have the others' vectors turned round.
-fn views() -> Vec<ViewSums> {
+fn views() -> Vec<ViewContributions> {
     let view = |v: u64| {
         let vector = |mask: u64| {
             let patch = if v == 3 { (mask / 2 + 1) % 3 } else { mask / 2 };
@@ -55,7 +55,7 @@ fn views() -> Vec<ViewSums> {
             let length = dot(&raw, &raw).sqrt();
             raw.into_iter().map(move |x| x / length)
         };
-        let entry = |k: u64, step: u64| SumEntry {
+        let entry = |k: u64, step: u64| Contribution {
             local: k as u32,
             region: (k / 30 * 3 + step) as u32,
             weight: (0.05 + random(v << 30 ^ k << 10 ^ step << 2) * [9.0, 3.0, 0.4][step as usize]) as f32,
@@ -63,7 +63,7 @@ fn views() -> Vec<ViewSums> {
         let seen =
             (0..N as u64).filter(|k| !UNSEEN.contains(&(*k as usize)) && random(v ^ k << 5 ^ 99) > 0.2);
         let entries = seen.flat_map(|k| (0..3).map(move |step| entry(k, step))).collect();
-        ViewSums {
+        ViewContributions {
             dim: DIM,
             mask_vectors: (0..6).flat_map(vector).collect(),
             masks_of_region: (0..9)
@@ -81,7 +81,7 @@ fn views() -> Vec<ViewSums> {
 /// The same box for all masks, of which the photos' edges cut off between nothing and all.
 fn photos() -> Vec<Photo> {
     let outline =
-        |v: u32, mask: u32| Outline { box_px: [4, 4, 14, 14], cut_px: (v * 6 + mask) % 41, level: 0 };
+        |v: u32, mask: u32| MaskOutline { box_px: [4, 4, 14, 14], cut_px: (v * 6 + mask) % 41, level: 0 };
     let photo =
         |v: u32| Photo { name: v.to_string(), outlines: (0..6).map(|mask| outline(v, mask)).collect() };
     (0..7).map(photo).collect()
@@ -108,18 +108,18 @@ fn lifted(settings: Aggregation, group_bytes: u64) -> Lifted {
     )
     .expect("reads");
     let raw = index.read(0..1).expect("reads");
-    let mut sums = index.regroup(&raw, table).expect("regroups").remove(0);
+    let mut contributions = index.transpose(&raw, table).expect("transposes").remove(0);
     if let Some(refinement) = refinement {
-        refinement.apply(&mut sums, &split.cells[0].gaussians);
+        refinement.apply(&mut contributions, &split.cells[0].gaussians);
     }
     let mut embeddings = vec![f32::NAN; N * DIM];
-    let field = CellField::new(split.cells[0].gaussians.clone(), sums, table, &mut embeddings);
+    let field = CellField::new(split.cells[0].gaussians.clone(), contributions, table, &mut embeddings);
     Lifted { field, table: table.clone(), embeddings }
 }
 
 /// Entries of a Gaussian in float64, view by view: `(masks of the view, region, weight)`.
-fn row(views: &[ViewSums], k: usize) -> Vec<Vec<(usize, f64)>> {
-    let of_view = |view: &ViewSums| {
+fn row(views: &[ViewContributions], k: usize) -> Vec<Vec<(usize, f64)>> {
+    let of_view = |view: &ViewContributions| {
         let entries = view.entries_of_cell[0].1.iter().filter(|e| e.local as usize == k);
         entries.map(|e| (e.region as usize, f64::from(e.weight))).collect()
     };
@@ -139,19 +139,19 @@ fn pruned(rows: Vec<Vec<(usize, f64)>>, settings: &Aggregation) -> Vec<Vec<(usiz
     rows.into_iter().map(kept).collect()
 }
 
-/// Views' weights to the power of 1 less the evenness, and the same weight in all.
-fn evened(rows: Vec<Vec<(usize, f64)>>, evenness: f64) -> Vec<Vec<(usize, f64)>> {
+/// Views' weights to the power of 1 less the equalisation, and the same weight in all.
+fn evened(rows: Vec<Vec<(usize, f64)>>, equalisation: f64) -> Vec<Vec<(usize, f64)>> {
     let weights: Vec<f64> = rows.iter().map(|view| view.iter().map(|e| e.1).sum()).collect();
     let total: f64 = weights.iter().sum();
-    let even: f64 = weights.iter().filter(|w| **w > 0.0).map(|w| w.powf(1.0 - evenness)).sum();
+    let even: f64 = weights.iter().filter(|w| **w > 0.0).map(|w| w.powf(1.0 - equalisation)).sum();
     let scaled = |(view, w): (Vec<(usize, f64)>, &f64)| {
-        view.into_iter().map(|(region, a)| (region, a * w.powf(-evenness) * total / even)).collect()
+        view.into_iter().map(|(region, a)| (region, a * w.powf(-equalisation) * total / even)).collect()
     };
     rows.into_iter().zip(&weights).map(scaled).collect()
 }
 
 /// `Σ weight * how often the mask counts * its vector` over a view's entries.
-fn contribution(view: &ViewSums, entries: &[(usize, f64)], counts: &[f64]) -> Vec<f64> {
+fn contribution(view: &ViewContributions, entries: &[(usize, f64)], counts: &[f64]) -> Vec<f64> {
     let mut sum = vec![0.0; DIM];
     for (region, weight) in entries {
         for mask in &view.masks_of_region[*region] {
@@ -168,7 +168,7 @@ fn norm(v: &[f64]) -> f64 {
 }
 
 /// What masks count, by the definition, with everything in float64 and no axes.
-fn oracle_counts(views: &[ViewSums], settings: &Aggregation) -> Vec<Vec<f64>> {
+fn oracle_counts(views: &[ViewContributions], settings: &Aggregation) -> Vec<Vec<f64>> {
     let whole = |v: usize, mask: usize| {
         (1.0 - ((v * 6 + mask) % 41) as f64 / 40.0).max(0.01).powf(settings.wholeness.into())
     };
@@ -250,11 +250,11 @@ fn what_masks_and_views_count_is_that_of_the_definition() {
         (0.0, (0.0, 0.0), 0.0, 0.5),
         (0.5, (0.0, 0.3), 2.0, 1.0),
     ];
-    for (agreement, shares, wholeness, evenness) in cases {
+    for (agreement, shares, wholeness, equalisation) in cases {
         let settings = Aggregation {
             agreement,
             wholeness,
-            evenness,
+            equalisation,
             min_region_share: shares.0,
             min_view_share: shares.1,
             ..Aggregation::PAPER
@@ -262,7 +262,7 @@ fn what_masks_and_views_count_is_that_of_the_definition() {
         let Lifted { field, table, embeddings } = lifted(settings, u64::MAX);
         let counts = oracle_counts(&views, &settings);
         for k in (0..N).filter(|k| !UNSEEN.contains(k)) {
-            let rows = evened(pruned(row(&views, k), &settings), evenness.into());
+            let rows = evened(pruned(row(&views, k), &settings), equalisation.into());
             let mut expected = vec![0.0; DIM];
             for ((view, entries), counts) in views.iter().zip(&rows).zip(&counts) {
                 let part = contribution(view, entries, counts);
@@ -384,26 +384,34 @@ fn threads_and_budget_do_not_show() {
 /// One mask and one view say nothing against each other.
 #[test]
 fn a_single_view_keeps_its_evidence() {
-    let view = ViewSums {
+    let view = ViewContributions {
         dim: 64,
         mask_vectors: (0..64).map(|c| f32::from(u8::from(c == 3))).collect(),
         masks_of_region: vec![vec![0]],
-        entries_of_cell: vec![(0, vec![SumEntry { local: 2, region: 0, weight: 1.0 }])],
+        entries_of_cell: vec![(0, vec![Contribution { local: 2, region: 0, weight: 1.0 }])],
     };
     let mut opened = open(&[view], 64, &[N], u64::MAX);
     let Scene { index, table, .. } = &mut opened;
     let (scene, split) = (gaussians(), split());
-    let (sums, cancel) = ((&*index, &mut *table), AtomicBool::new(false));
-    let photos =
-        [Photo { name: "0".into(), outlines: vec![Outline { box_px: [0, 0, 8, 8], ..Outline::default() }] }];
-    let refinement =
-        Refinement::prepare(Aggregation::REFINED, sums, (&scene, &split), &photos, u64::MAX, &cancel);
+    let (contributions, cancel) = ((&*index, &mut *table), AtomicBool::new(false));
+    let photos = [Photo {
+        name: "0".into(),
+        outlines: vec![MaskOutline { box_px: [0, 0, 8, 8], ..MaskOutline::default() }],
+    }];
+    let refinement = Refinement::prepare(
+        Aggregation::REFINED,
+        contributions,
+        (&scene, &split),
+        &photos,
+        u64::MAX,
+        &cancel,
+    );
     let refinement = refinement.expect("reads").expect("refines");
     let raw = index.read(0..1).expect("reads");
-    let mut sums = index.regroup(&raw, table).expect("regroups").remove(0);
-    refinement.apply(&mut sums, &split.cells[0].gaussians);
+    let mut contributions = index.transpose(&raw, table).expect("transposes").remove(0);
+    refinement.apply(&mut contributions, &split.cells[0].gaussians);
     let mut embeddings = vec![0.0; N * 64];
-    let field = CellField::new((0..N as u32).collect(), sums, table, &mut embeddings);
+    let field = CellField::new((0..N as u32).collect(), contributions, table, &mut embeddings);
     // Its patch is filled, the others know nothing.
     assert!((0..N).all(|k| field.has_evidence(k) == (k < 30)));
     assert!((0..30).all(|k| (embeddings[k * 64 + 3] - 1.0).abs() < 1e-6));

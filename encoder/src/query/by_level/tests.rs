@@ -45,24 +45,24 @@ fn the_best_of_the_levels_is_that_of_the_definition() {
     for query in [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.5, 0.5, 0.5, 0.5], [0.0, -0.6, -0.8, 0.0]] {
         let found = best_of_levels(&field, &table.scores_by_level(&query), &lengths, 3);
         for (k, found) in found.iter().enumerate().take(2) {
-            let mut sums = [[0.0f64; 4]; 3];
+            let mut contributions = [[0.0f64; 4]; 3];
             for (region, weight) in field.entries(k) {
                 for (mask, share) in table.masks_of(region) {
                     let vector = table.mask_vectors().get(mask as usize);
-                    for (sum, v) in sums[table.level_of(mask)].iter_mut().zip(vector) {
+                    for (sum, v) in contributions[table.level_of(mask)].iter_mut().zip(vector) {
                         *sum += f64::from(weight) * f64::from(share) * f64::from(*v);
                     }
                 }
             }
             let length = |s: &[f64; 4]| s.iter().map(|c| c * c).sum::<f64>().sqrt();
-            let longest = sums.iter().map(length).fold(0.0, f64::max);
-            let known = sums.iter().filter(|s| length(s) >= 0.1 * longest);
+            let longest = contributions.iter().map(length).fold(0.0, f64::max);
+            let known = contributions.iter().filter(|s| length(s) >= 0.1 * longest);
             let cosine =
                 |s: &[f64; 4]| s.iter().zip(query).map(|(c, q)| c * f64::from(q)).sum::<f64>() / length(s);
             let expected = known.map(cosine).fold(f64::MIN, f64::max);
             assert!((f64::from(*found) - expected).abs() < 1e-6, "{k}: {found} {expected}");
         }
-        assert!(found[2].is_nan(), "no sums, no score");
+        assert!(found[2].is_nan(), "no contributions, no score");
     }
     // By hand: the third level's 0.25 of a sum of 4 long is less than a tenth, and does not answer.
     let unsaid = best_of_levels(&field, &table.scores_by_level(&[0.0, 0.0, 0.0, 1.0]), &lengths, 3);

@@ -11,7 +11,7 @@ mod device;
 mod jobs;
 mod layout;
 mod shader;
-mod stopwatch;
+mod timestamps;
 mod workspace;
 
 use std::ops::Range;
@@ -27,7 +27,7 @@ use super::{
     CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, RegionWeight, StageTime,
     ViewCounters, ViewWeights, WeightKind, check_regions, check_scene, check_view,
 };
-use crate::segment::RegionMap;
+use crate::masks::RegionMap;
 pub use device::{Adapter, AdapterReport, Device, adapters};
 use layout::{Capacities, RegionSum, SceneGaussian, ViewBlock, screen_layout};
 pub use shader::Precision;

@@ -15,7 +15,7 @@ use super::layout::{
     Background, Capacities, Chunk, RegionSum, ScanJob, SceneGaussian, ViewBlock, screen_layout,
 };
 use super::shader::{Counter, NONE, SORT_BLOCK, WORKGROUP_SIZE};
-use super::stopwatch::{Stopwatch, TIMESTAMPS_BYTES};
+use super::timestamps::{GpuTimestamps, TIMESTAMPS_BYTES};
 use crate::raster::constants::TILE_SIZE_PX;
 use crate::raster::{RasterError, StageTime};
 
@@ -97,7 +97,7 @@ pub struct Workspace {
     /// Region sums that are copied back with the counters.
     n_copied: u32,
     groups: HashMap<(&'static str, u32), wgpu::BindGroup>,
-    stopwatch: Stopwatch,
+    timestamps: GpuTimestamps,
 }
 
 /// Sizes that a workspace is made for.
@@ -163,7 +163,7 @@ impl Workspace {
             staging: Self::staging(device, n_copied)?,
             n_copied,
             groups: HashMap::new(),
-            stopwatch: Stopwatch::new(device)?,
+            timestamps: GpuTimestamps::new(device)?,
         };
         write_jobs(device, &workspace.jobs, room);
         Some(workspace)
@@ -193,16 +193,16 @@ impl Workspace {
         device.queue.write_buffer(&self.regions, 0, bytemuck::cast_slice(regions));
         let mut encoder = self.bin(band)?;
         let [columns, rows] = band.tiles();
-        let mut pass = self.stopwatch.pass(&mut encoder, 3, (true, true));
+        let mut pass = self.timestamps.pass(&mut encoder, 3, (true, true));
         self.blend(device, &mut pass, columns, rows);
         drop(pass);
-        let mut pass = self.stopwatch.pass(&mut encoder, 4, (true, true));
+        let mut pass = self.timestamps.pass(&mut encoder, 4, (true, true));
         let n_regions = band.view.words[6];
         let keys = [(SortKey::Region, bits_of(n_regions)), (SortKey::Member, bits_of(self.room.visible))];
         let entry_order = self.sort(device, &mut pass, &keys);
         self.compact(device, &mut pass, entry_order);
         drop(pass);
-        self.stopwatch.resolve(&mut encoder, &self.staging, COUNTERS_BYTES);
+        self.timestamps.resolve(&mut encoder, &self.staging, COUNTERS_BYTES);
         self.copy_back(&mut encoder);
         let submission = device.queue.submit([encoder.finish()]);
         times.push(StageTime { stage: "submit", ms: start.elapsed().as_secs_f64() * 1e3 });
@@ -280,10 +280,10 @@ impl Workspace {
             }
         }
         let [columns, rows] = band.tiles();
-        let mut pass = self.stopwatch.pass(&mut encoder, 1, (true, true));
+        let mut pass = self.timestamps.pass(&mut encoder, 1, (true, true));
         let depth_order = self.sort(device, &mut pass, &[(SortKey::Depth, 32)]);
         drop(pass);
-        let mut pass = self.stopwatch.pass(&mut encoder, 2, (true, true));
+        let mut pass = self.timestamps.pass(&mut encoder, 2, (true, true));
         self.pair(device, &mut pass, depth_order);
         let pair_order = self.sort(device, &mut pass, &[(SortKey::Tile, bits_of(columns * rows))]);
         self.find_ranges(device, &mut pass, pair_order);
@@ -320,7 +320,7 @@ impl Workspace {
         counts.copy_from_slice(
             &bytemuck::cast_slice::<u8, u32>(&bytes[..COUNTERS_BYTES as usize])[..Counter::ALL.len()],
         );
-        let stages = self.stopwatch.read(&bytes[COUNTERS_BYTES as usize..HEAD_BYTES as usize]);
+        let stages = self.timestamps.read(&bytes[COUNTERS_BYTES as usize..HEAD_BYTES as usize]);
         let on_device_ms: f64 = stages.iter().map(|stage| stage.ms).sum();
         times.extend(stages);
         times.push(StageTime { stage: "copy", ms: (waited_ms - on_device_ms).max(0.0) });
@@ -343,7 +343,7 @@ impl Workspace {
         gaussians: &wgpu::Buffer,
         ends: (bool, bool),
     ) {
-        let mut pass = self.stopwatch.pass(encoder, 0, ends);
+        let mut pass = self.timestamps.pass(encoder, 0, ends);
         let kernels = &device.kernels;
         let n_blocks = chunk.n_gaussians.div_ceil(WORKGROUP_SIZE);
         let chunk_job = part(&chunk.jobs, 0);

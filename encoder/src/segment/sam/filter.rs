@@ -6,7 +6,7 @@ use slag_models::sam::{Decoded, MASKS_PER_PROMPT};
 use super::SamSettings;
 use super::runs::RunMask;
 use super::upsample::Upsampler;
-use crate::segment::BoxPx;
+use crate::masks::BoxPx;
 
 /// Distance at which a box counts as touching an edge; of the reference implementation.
 const EDGE_TOLERANCE_PX: u32 = 20;

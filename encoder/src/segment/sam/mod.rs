@@ -19,7 +19,8 @@ use image::imageops;
 use slag_models::sam::{Decoded, Sam};
 use slag_models::{ModelError, SessionOptions};
 
-use super::{BoxPx, MAX_MASK_BYTES, Mask, SegmentError, SegmentInput, Segmenter};
+use super::{MAX_MASK_BYTES, SegmentError, SegmentInput, Segmenter};
+use crate::masks::{BoxPx, Mask};
 use filter::{Candidate, Filters};
 use upsample::Upsampler;
 

@@ -1,6 +1,6 @@
 //! Where automatic masks are asked for: grids of points, and crops of the image.
 
-use crate::segment::BoxPx;
+use crate::masks::BoxPx;
 
 /// Returns the points of a grid of `n_per_side` x `n_per_side` over an image of the given size, each in the
 /// middle of its cell, row by row, pixels.

@@ -1,6 +1,6 @@
 //! A mask as runs of pixels: small while thousands of candidates wait for the filters.
 
-use crate::segment::{BoxPx, Mask};
+use crate::masks::{BoxPx, Mask};
 
 /// Pixels `x0 <= x < x1` of row `y`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

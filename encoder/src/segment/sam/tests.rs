@@ -9,7 +9,8 @@ use super::filter::Filters;
 use super::runs::{Run, RunMask};
 use super::upsample::Upsampler;
 use super::{SamSegmenter, SamSettings, points};
-use crate::segment::{BoxPx, Mask, Segmenter};
+use crate::masks::{BoxPx, Mask};
+use crate::segment::Segmenter;
 
 /// Edge of the square and of the logits, pixels: the proportion is SAM's.
 const SIZE_PX: u32 = 256;

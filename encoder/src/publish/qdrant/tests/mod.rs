@@ -79,17 +79,17 @@ impl Fixture {
             next_id += n_gaussians;
             let positions: Vec<[u16; 3]> = (0..n as u16).map(|i| [i * 1000, 60_000 - i * 900, i]).collect();
             let embeddings: Vec<f16> = (0..n_with).flat_map(|_| numbers.unit_vector()).collect();
-            let row_starts: &[u32] = if n_with == 0 { &[0] } else { &[0, n_with_evidence] };
-            let n_rows = row_starts.len() as u32 - 1;
+            let centroid_starts: &[u32] = if n_with == 0 { &[0] } else { &[0, n_with_evidence] };
+            let n_centroids = centroid_starts.len() as u32 - 1;
             let header = ShardHeader {
                 cell_id: cell.cell_id,
                 n_gaussians,
-                n_rows,
+                n_centroids,
                 dim: DIM as u32,
                 n_components: DIM as u32,
-                n_groups: 0,
+                n_subspaces: 0,
                 position_bits: [16, 16, 16, 0],
-                row_step: 1.0 / 127.0,
+                centroid_step: 1.0 / 127.0,
                 errors: ScoreErrors::default(),
                 origin_in_world: cell.bounds.min.to_array(),
                 position_step: [90.0 / 65535.0; 3],
@@ -106,9 +106,9 @@ impl Fixture {
             let parts = ShardView {
                 header,
                 positions: Positions::Wide(&positions),
-                row_starts,
-                rows: &vec![127; n_rows as usize * DIM],
-                radii: &vec![1.0; n_rows as usize],
+                centroid_starts,
+                centroids: &vec![127; n_centroids as usize * DIM],
+                radii: &vec![1.0; n_centroids as usize],
                 basis: None,
                 residuals: None,
                 exact: Some(ExactColumns { input_indices: &ids, embeddings: &embeddings, fine: None }),
@@ -117,7 +117,7 @@ impl Fixture {
             let record = ShardRecord {
                 hash,
                 len_bytes,
-                n_rows,
+                n_centroids,
                 score_error_bound: 1.0,
                 score_errors: ScoreErrors::default(),
                 position_error: 1e-3,

@@ -1,0 +1,12 @@
+//! Numerical building blocks shared by the encoder and the robot.
+//!
+//! Every function here returns the same bits on every machine: sums run in a fixed order whatever the width of the
+//! machine's vectors, and results do not depend on the number of threads.
+
+pub mod axes;
+mod dot;
+pub mod eigen;
+pub mod matrix;
+pub mod random;
+
+pub use dot::{dot, dot_f64};

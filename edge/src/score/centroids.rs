@@ -1,0 +1,153 @@
+//! Scores of all centroids, which every kind of answer starts from.
+
+use std::sync::{Arc, Mutex};
+
+use rayon::prelude::*;
+use slag_common::shard::ShardView;
+
+use super::collect::Gather;
+use super::project::{Projection, Vector};
+use super::simd::Level;
+use super::{Precision, Question, Region};
+
+/// Memory of a search, which the next one takes over: then a search allocates little but its answers.
+#[derive(Default)]
+pub struct Scratch {
+    /// Shared with the searches that were made with it.
+    scored: Arc<Scored>,
+}
+
+impl Scratch {
+    /// Returns memory that no search uses any more: the last one's, or new.
+    pub(super) fn take(&mut self) -> &mut Scored {
+        if Arc::get_mut(&mut self.scored).is_none() {
+            self.scored = Arc::default();
+        }
+        // Just made, if it was not its only owner.
+        Arc::get_mut(&mut self.scored).unwrap_or_else(|| unreachable!("the only owner"))
+    }
+
+    /// Whether no centroids were ever scored in it.
+    #[cfg(test)]
+    pub fn is_untouched(&self) -> bool {
+        self.scored.shards.is_empty()
+    }
+
+    /// Shares the memory with a search.
+    pub(super) fn share(&self) -> Arc<Scored> {
+        Arc::clone(&self.scored)
+    }
+}
+
+/// What questions score, centroid by centroid.
+#[derive(Default)]
+pub(super) struct Scored {
+    /// The distinct vectors of all questions.
+    pub vectors: Vec<Vector>,
+    /// By place in the slice of shards.
+    pub shards: Vec<ShardScores>,
+    /// What answers are gathered in.
+    pub gather: Mutex<Gather>,
+}
+
+/// What questions score in one shard.
+#[derive(Default)]
+pub(super) struct ShardScores {
+    /// Whether the shard reaches into the region; if not, all else is of an earlier search.
+    pub is_searched: bool,
+    /// Of each vector.
+    pub projections: Vec<Projection>,
+    /// `[vectors][centroids]`.
+    pub centroids: Vec<Vec<f32>>,
+    /// `[questions][centroids]`: of those with negatives, what these leave.
+    pub combined: Vec<Vec<f32>>,
+}
+
+impl Scored {
+    /// Scores the centroids of the shards that reach into the region. Returns the places of each question's
+    /// vectors, its own first.
+    pub fn score(
+        &mut self,
+        shards: &[ShardView<'_>],
+        questions: &[Question],
+        region: Region,
+        precision: Precision,
+    ) -> Vec<Vec<usize>> {
+        let (distinct, places) = distinct(questions);
+        self.vectors.resize_with(distinct.len(), Vector::default);
+        self.vectors.iter_mut().zip(distinct).for_each(|(vector, values)| vector.set(values));
+        self.shards.resize_with(shards.len(), ShardScores::default);
+        let (level, vectors) = (Level::widest(), &self.vectors);
+        self.shards.par_iter_mut().zip(shards).for_each(|(scores, shard)| {
+            scores.is_searched = region.touches(&shard.position_box());
+            if scores.is_searched {
+                scores.score(level, shard, vectors, &places, precision);
+            }
+        });
+        places
+    }
+}
+
+/// Returns the distinct vectors of some questions, and the places of each question's among them, its own first.
+pub(super) fn distinct(questions: &[Question]) -> (Vec<&[f32]>, Vec<Vec<usize>>) {
+    let mut distinct: Vec<&[f32]> = Vec::new();
+    let mut place = |vector| {
+        distinct.iter().position(|known| *known == vector).unwrap_or_else(|| {
+            distinct.push(vector);
+            distinct.len() - 1
+        })
+    };
+    let places = questions.iter().map(|question| question.vectors().map(&mut place).collect()).collect();
+    (distinct, places)
+}
+
+impl ShardScores {
+    fn score(
+        &mut self,
+        level: Level,
+        shard: &ShardView<'_>,
+        vectors: &[Vector],
+        places: &[Vec<usize>],
+        precision: Precision,
+    ) {
+        self.projections.resize_with(vectors.len(), Projection::default);
+        self.centroids.resize_with(vectors.len(), Vec::new);
+        for ((projection, centroids), vector) in
+            self.projections.iter_mut().zip(&mut self.centroids).zip(vectors)
+        {
+            projection.set(level, shard, vector);
+            projection.score_centroids(level, shard, centroids);
+            let are_codes_read = match precision {
+                Precision::Rows => false,
+                Precision::Measured => true,
+                Precision::Exact => shard.exact.is_none(),
+            };
+            if let Some(residuals) = shard.residuals.as_ref().filter(|_| are_codes_read) {
+                projection.set_tables(residuals);
+            }
+            if let (Some(fine), true) = (shard.exact.and_then(|exact| exact.fine), are_codes_read) {
+                projection.set_fine(&fine);
+            }
+        }
+        self.combined.resize_with(places.len(), Vec::new);
+        for (combined, places) in self.combined.iter_mut().zip(places) {
+            combined.clear();
+            let [own, negatives @ ..] = &places[..] else { continue };
+            if !negatives.is_empty() {
+                let of_centroid = |centroid: usize| {
+                    combine(
+                        self.centroids[*own][centroid],
+                        negatives.iter().map(|n| self.centroids[*n][centroid]),
+                    )
+                };
+                combined.extend((0..self.centroids[*own].len()).map(of_centroid));
+            }
+        }
+    }
+}
+
+/// Returns a product less the largest of those with negatives; never -0, which would sort after 0
+/// though it is equal.
+pub(super) fn combine(own: f32, negatives: impl Iterator<Item = f32>) -> f32 {
+    negatives.reduce(f32::max).map_or(own, |worst| own - worst) + 0.0
+}

@@ -1,0 +1,371 @@
+//! Scenes to measure with: generated ones of any size, and recorded ones from a NumPy archive.
+
+use std::f64::consts::{PI, TAU};
+use std::path::Path;
+
+use glam::{DAffine3, DMat3, DQuat, DVec2, DVec3};
+use slag_common::{Distortion, Gaussians, Intrinsics};
+
+use super::arrays::{Arrays, FixtureError};
+use crate::generate::compose::{looking, pinhole};
+use slag_encoder::masks::RegionMap;
+use slag_encoder::raster::RasterView;
+
+/// Horizontal field of view of generated views.
+const FIELD_OF_VIEW_RAD: f64 = 65.0 * PI / 180.0;
+/// Viewpoints of a generated scene.
+const N_VIEWS: usize = 4;
+/// Objects on the ground of a generated scene.
+const N_OBJECTS: usize = 60;
+/// Radius of the ground; the backdrop stands on its edge.
+const GROUND_RADIUS_M: f64 = 20.0;
+/// Height of the backdrop.
+const BACKDROP_HEIGHT_M: f64 = 8.0;
+/// Standard deviation of a surface Gaussian in spacings, at the median: neighbours overlap.
+const SPREAD: f64 = 0.5;
+
+/// A scene and views of it.
+pub struct BenchScene {
+    /// What the figures are listed under.
+    pub name: String,
+    /// The Gaussians.
+    pub gaussians: Gaussians,
+    /// Views, all of one image size; at least one.
+    pub views: Vec<RasterView>,
+}
+
+impl BenchScene {
+    /// Makes a scene whose statistics are those of a trained one: ground, objects and a backdrop
+    /// covered with flat Gaussians that shrink as their number grows, denser towards the middle,
+    /// log-normal in size, of high and low opacity; a few large faint ones in the air. The views
+    /// stand among the objects. The same numbers give the same scene on every machine with the same
+    /// mathematical library.
+    pub fn generated(n_gaussians: usize, width_px: u32, height_px: u32) -> Self {
+        let mut maker = Maker { random: Random(1), gaussians: Gaussians::default() };
+        let share = |percent: usize| n_gaussians * percent / 100;
+        let (n_ground, n_backdrop, n_floating) = (share(30), share(20), share(5));
+        maker.ground(n_ground);
+        maker.backdrop(n_backdrop);
+        maker.floating(n_floating);
+        maker.objects(n_gaussians - n_ground - n_backdrop - n_floating);
+        let intrinsics = pinhole([width_px, height_px], FIELD_OF_VIEW_RAD);
+        let views = (0..N_VIEWS)
+            .map(|i| {
+                let angle = TAU * i as f64 / N_VIEWS as f64;
+                let position = DVec3::new(4.5 * angle.cos(), 4.5 * angle.sin(), 1.6);
+                let target = DVec3::new(1.5 * (angle + 2.0).cos(), 1.5 * (angle + 2.0).sin(), 0.6);
+                RasterView { camera_from_world: looking(position, target - position), intrinsics }
+            })
+            .collect();
+        Self { name: format!("generated-{n_gaussians}"), gaussians: maker.gaussians, views }
+    }
+
+    /// Reads `means quats scales opacities viewmats Ks width height` of a NumPy archive, as gsplat
+    /// takes them: quaternions `wxyz` of any length, decoded scales and opacities.
+    ///
+    /// # Errors
+    /// [`FixtureError`].
+    pub fn read(path: &Path) -> Result<Self, FixtureError> {
+        let mut arrays = Arrays::open(path)?;
+        let means = arrays.rows::<3>("means", None)?;
+        let n = Some(means.len());
+        let rotations = arrays.rows::<4>("quats", n)?;
+        let scales = arrays.rows::<3>("scales", n)?;
+        let opacities = arrays.rows::<1>("opacities", n)?;
+        let poses = arrays.rows::<16>("viewmats", None)?;
+        let cameras = arrays.rows::<9>("Ks", Some(poses.len()))?;
+        let [width_px, height_px] = [arrays.size_px("width")?, arrays.size_px("height")?];
+        let normalized = |q: [f64; 4]| {
+            let norm = q.iter().map(|c| c * c).sum::<f64>().sqrt();
+            q.map(|c| (c / norm) as f32)
+        };
+        let view = |(m, k): (&[f64; 16], &[f64; 9])| RasterView {
+            camera_from_world: DAffine3 {
+                matrix3: DMat3::from_cols_array(&[m[0], m[4], m[8], m[1], m[5], m[9], m[2], m[6], m[10]]),
+                translation: DVec3::new(m[3], m[7], m[11]),
+            },
+            intrinsics: Intrinsics {
+                width_px,
+                height_px,
+                focal_x_px: k[0],
+                focal_y_px: k[4],
+                centre_x_px: k[2],
+                centre_y_px: k[5],
+                distortion: Distortion::None,
+            },
+        };
+        Ok(Self {
+            name: path.file_stem().map_or_else(String::new, |name| name.to_string_lossy().into_owned()),
+            gaussians: Gaussians {
+                sh_dc: vec![[0.0; 3]; means.len()],
+                means_in_world: means.into_iter().map(DVec3::from_array).collect(),
+                rotations_wxyz: rotations.into_iter().map(normalized).collect(),
+                scales: scales.into_iter().map(|s| s.map(|v| v as f32)).collect(),
+                opacities: opacities.into_iter().map(|[o]| o as f32).collect(),
+                sh_rest: Vec::new(),
+                sh_degree: 0,
+            },
+            views: poses.iter().zip(&cameras).map(view).collect(),
+        })
+    }
+}
+
+/// Returns a map of `columns` x `rows` equal rectangles.
+pub fn grid_regions(width_px: u32, height_px: u32, columns: u32, rows: u32) -> RegionMap {
+    let region = |x: u32, y: u32| {
+        y * rows / height_px * columns + (u64::from(x) * u64::from(columns) / u64::from(width_px)) as u32
+    };
+    let region_of_pixel = (0..height_px).flat_map(|y| (0..width_px).map(move |x| region(x, y))).collect();
+    RegionMap { width_px, height_px, region_of_pixel, n_regions: columns * rows }
+}
+
+/// Returns a map of cells with irregular borders: each pixel is of the nearest of `n_regions` sites,
+/// one site at a random place in each field of a grid.
+pub fn cell_regions(width_px: u32, height_px: u32, n_regions: u32) -> RegionMap {
+    let (width, height) = (f64::from(width_px), f64::from(height_px));
+    let columns = ((f64::from(n_regions) * width / height).sqrt().round() as u32).clamp(1, n_regions.max(1));
+    let rows = n_regions.div_ceil(columns).max(1);
+    let size_px = DVec2::new(width / f64::from(columns), height / f64::from(rows));
+    let mut random = Random(2);
+    let sites: Vec<DVec2> = (0..rows)
+        .flat_map(|row| (0..columns).map(move |column| DVec2::new(f64::from(column), f64::from(row))))
+        .map(|field| (field + DVec2::new(random.unit(), random.unit())) * size_px)
+        .collect();
+    let near = |at: u32, n: u32| at.saturating_sub(1)..(at + 2).min(n);
+    let region = |x: u32, y: u32| {
+        let centre = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
+        let field = (centre / size_px).as_uvec2();
+        let fields = near(field.y, rows).flat_map(|r| near(field.x, columns).map(move |c| r * columns + c));
+        let distance = |&site: &u32| sites[site as usize].distance_squared(centre);
+        let nearest = fields.min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap_or(0);
+        // The last row of the grid may have more fields than there are regions left.
+        nearest.min(n_regions - 1)
+    };
+    let region_of_pixel = (0..height_px).flat_map(|y| (0..width_px).map(move |x| region(x, y))).collect();
+    RegionMap { width_px, height_px, region_of_pixel, n_regions }
+}
+
+/// SplitMix64 (Steele et al. 2014).
+struct Random(u64);
+
+impl Random {
+    /// Returns the next value, uniform in 0..1.
+    fn unit(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
+    /// Returns a normally distributed value (Box and Muller 1958).
+    fn normal(&mut self) -> f64 {
+        let radius = (-2.0 * (1.0 - self.unit()).ln()).sqrt();
+        radius * (TAU * self.unit()).cos()
+    }
+
+    /// Returns a direction, uniform on the sphere.
+    fn direction(&mut self) -> DVec3 {
+        let (z, angle) = (2.0 * self.unit() - 1.0, TAU * self.unit());
+        let r = (1.0 - z * z).sqrt();
+        DVec3::new(r * angle.cos(), r * angle.sin(), z)
+    }
+}
+
+/// Adds Gaussians to a scene.
+struct Maker {
+    random: Random,
+    gaussians: Gaussians,
+}
+
+impl Maker {
+    /// Covers the ground; the density falls as 1 / distance from the middle.
+    fn ground(&mut self, n: usize) {
+        for _ in 0..n {
+            let (radius, angle) = (GROUND_RADIUS_M * self.random.unit(), TAU * self.random.unit());
+            let spacing = (TAU * GROUND_RADIUS_M * radius.max(0.1) / n as f64).sqrt();
+            let position = DVec3::new(radius * angle.cos(), radius * angle.sin(), 0.0);
+            self.surface(position, DVec3::Z, spacing);
+        }
+    }
+
+    fn backdrop(&mut self, n: usize) {
+        let spacing = (TAU * GROUND_RADIUS_M * BACKDROP_HEIGHT_M / n as f64).sqrt();
+        for _ in 0..n {
+            let (angle, height) = (TAU * self.random.unit(), BACKDROP_HEIGHT_M * self.random.unit());
+            let inward = -DVec3::new(angle.cos(), angle.sin(), 0.0);
+            self.surface(-inward * GROUND_RADIUS_M + DVec3::Z * height, inward, spacing);
+        }
+    }
+
+    /// Covers ellipsoids that stand on the ground, equally many Gaussians on each.
+    fn objects(&mut self, n: usize) {
+        for object in 0..N_OBJECTS {
+            let half = DVec3::from_array(std::array::from_fn(|_| 0.15 + 0.6 * self.random.unit().powi(2)));
+            let (radius, angle) = (7.0 * self.random.unit().sqrt(), TAU * self.random.unit());
+            let centre = DVec3::new(radius * angle.cos(), radius * angle.sin(), half.z);
+            let n_here = n * (object + 1) / N_OBJECTS - n * object / N_OBJECTS;
+            // Thomsen's formula for the area, with p = 1.6075.
+            let [a, b, c] = half.to_array().map(|h| h.powf(1.6075));
+            let area = 4.0 * PI * ((a * b + a * c + b * c) / 3.0).powf(1.6075_f64.recip());
+            let spacing = (area / n_here.max(1) as f64).sqrt();
+            for _ in 0..n_here {
+                let direction = self.random.direction();
+                self.surface(centre + direction * half, (direction / half).normalize(), spacing);
+            }
+        }
+    }
+
+    /// Adds large faint Gaussians in the air, as training leaves them.
+    fn floating(&mut self, n: usize) {
+        let spacing = (PI * GROUND_RADIUS_M.powi(2) * BACKDROP_HEIGHT_M / n.max(1) as f64).cbrt();
+        for _ in 0..n {
+            let (radius, angle) = (GROUND_RADIUS_M * self.random.unit(), TAU * self.random.unit());
+            let height = BACKDROP_HEIGHT_M * self.random.unit();
+            let position = DVec3::new(radius * angle.cos(), radius * angle.sin(), height);
+            let scales =
+                std::array::from_fn(|_| (0.15 * spacing * (0.7 * self.random.normal()).exp()) as f32);
+            let opacity = 0.01 + 0.1 * self.random.unit();
+            let normal = self.random.direction();
+            self.push(position, normal, scales, opacity);
+        }
+    }
+
+    /// Adds a flat Gaussian on a surface whose Gaussians are `spacing` apart.
+    fn surface(&mut self, position: DVec3, normal: DVec3, spacing: f64) {
+        let size = SPREAD * spacing * (0.9 * self.random.normal()).exp();
+        let long = (0.4 * self.random.normal()).exp();
+        let scales = [size * long, size / long, 0.15 * size].map(|s| s as f32);
+        let opaque = self.random.unit() < 0.5;
+        let share = self.random.unit();
+        let opacity = if opaque { 1.0 - 0.5 * share * share } else { 0.02 + 0.5 * share };
+        let position = position + normal * (0.2 * spacing * self.random.normal());
+        self.push(position, normal, scales, opacity);
+    }
+
+    fn push(&mut self, position: DVec3, normal: DVec3, scales: [f32; 3], opacity: f64) {
+        let turn = DQuat::from_rotation_z(TAU * self.random.unit());
+        let q = (DQuat::from_rotation_arc(DVec3::Z, normal) * turn).normalize();
+        self.gaussians.means_in_world.push(position);
+        self.gaussians.rotations_wxyz.push([q.w, q.x, q.y, q.z].map(|c| c as f32));
+        self.gaussians.scales.push(scales);
+        self.gaussians.opacities.push(opacity as f32);
+        self.gaussians.sh_dc.push([0.0; 3]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Cursor;
+
+    use npyz::WriterBuilder;
+    use npyz::npz::NpzWriter;
+    use npyz::zip::write::FileOptions;
+
+    use super::*;
+    use slag_encoder::raster::{CpuRasterizer, Rasterizer, WeightKind};
+
+    #[test]
+    fn generated_scenes_are_like_trained_ones() {
+        let scene = BenchScene::generated(20_011, 162, 121);
+        assert_eq!(scene.gaussians.len(), 20_011);
+        assert!((0..20_011).all(|i| scene.gaussians.is_usable(i)));
+        for view in &scene.views {
+            let regions = grid_regions(162, 121, 3, 2);
+            let found = CpuRasterizer.weights(&scene.gaussians, view, &regions, WeightKind::Blend).unwrap();
+            let share_visible = found.counters.visible as f64 / 20_011.0;
+            assert!((0.15..0.6).contains(&share_visible), "{share_visible}");
+            // Hardly any light passes: surfaces are closed.
+            let seen: f64 = found.entries.iter().map(|e| f64::from(e.weight)).sum();
+            assert!(seen > 0.9 * 162.0 * 121.0 * 0.8, "{seen}");
+        }
+    }
+
+    #[test]
+    fn every_region_has_pixels() {
+        for n_regions in [1, 8, 61, 512] {
+            let map = cell_regions(324, 242, n_regions);
+            let mut n_px = vec![0; n_regions as usize];
+            map.region_of_pixel.iter().for_each(|&region| n_px[region as usize] += 1);
+            assert!(n_px.iter().all(|&n| n > 0), "{n_regions}: {n_px:?}");
+        }
+        let grid = grid_regions(17, 9, 8, 6);
+        assert_eq!(
+            (grid.region_of_pixel[0], grid.region_of_pixel[16], grid.region_of_pixel[152]),
+            (0, 7, 47)
+        );
+    }
+
+    /// Writes the arrays of a scene of 2 Gaussians and 1 view, but for one array.
+    fn archive(without: &str) -> Vec<u8> {
+        let mut bytes = Cursor::new(Vec::new());
+        let mut npz = NpzWriter::new(&mut bytes);
+        let pose = [1.0, 0.0, 0.0, 5.0, 0.0, 0.0, -1.0, 6.0, 0.0, 1.0, 0.0, 7.0, 0.0, 0.0, 0.0, 1.0];
+        let arrays: [(&str, &[u64], &[f32]); 6] = [
+            ("means", &[2, 3], &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),
+            ("quats", &[2, 4], &[2.0, 0.0, 0.0, 0.0, 0.0, 3.0, 0.0, 4.0]),
+            ("scales", &[2, 3], &[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]),
+            ("opacities", &[2], &[0.25, 0.75]),
+            ("viewmats", &[1, 4, 4], &pose),
+            ("Ks", &[1, 3, 3], &[90.0, 0.0, 31.5, 0.0, 91.0, 23.5, 0.0, 0.0, 1.0]),
+        ];
+        for (name, shape, values) in arrays.into_iter().filter(|(name, _, _)| *name != without) {
+            let file = npz.array::<f32>(name, FileOptions::default()).unwrap();
+            let mut file = file.default_dtype().shape(shape).begin_nd().unwrap();
+            file.extend(values.iter().copied()).unwrap();
+            file.finish().unwrap();
+        }
+        for (name, value) in [("width", 64), ("height", 48)] {
+            let file = npz.array::<i64>(name, FileOptions::default()).unwrap();
+            let mut file = file.default_dtype().shape(&[]).begin_nd().unwrap();
+            file.push(&value).unwrap();
+            file.finish().unwrap();
+        }
+        drop(npz);
+        bytes.into_inner()
+    }
+
+    #[test]
+    fn an_archive_is_read_as_it_was_written() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("two.npz");
+        fs_err::write(&path, archive("")).unwrap();
+        let scene = BenchScene::read(&path).unwrap();
+        assert_eq!((scene.name.as_str(), scene.gaussians.len(), scene.views.len()), ("two", 2, 1));
+        assert_eq!(scene.gaussians.rotations_wxyz, [[1.0, 0.0, 0.0, 0.0], [0.0, 0.6, 0.0, 0.8]]);
+        assert_eq!(scene.gaussians.scales[1], [0.4, 0.5, 0.6]);
+        let view = scene.views[0];
+        assert_eq!(
+            view.camera_from_world.transform_point3(DVec3::new(1.0, 2.0, 3.0)),
+            DVec3::new(6.0, 3.0, 9.0)
+        );
+        let camera = view.intrinsics;
+        assert_eq!(
+            [camera.focal_x_px, camera.focal_y_px, camera.centre_x_px, camera.centre_y_px],
+            [90.0, 91.0, 31.5, 23.5]
+        );
+        assert_eq!([camera.width_px, camera.height_px], [64, 48]);
+
+        fs_err::write(&path, archive("scales")).unwrap();
+        assert!(matches!(BenchScene::read(&path), Err(FixtureError::Missing { array: "scales", .. })));
+    }
+
+    #[test]
+    fn damaged_archives_are_errors() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("damaged.npz");
+        let whole = archive("");
+        assert!(BenchScene::read(&path).is_err());
+        for length in (0..whole.len()).step_by(97) {
+            fs_err::write(&path, &whole[..length]).unwrap();
+            assert!(BenchScene::read(&path).is_err(), "{length}");
+        }
+        for at in (0..whole.len()).step_by(7) {
+            let mut bytes = whole.clone();
+            bytes[at] ^= 0x2d;
+            fs_err::write(&path, &bytes).unwrap();
+            // Not every byte is one that matters; none may be one that panics.
+            let _ = BenchScene::read(&path);
+        }
+    }
+}

@@ -1,0 +1,93 @@
+//! `eval labelled`.
+
+use std::path::PathBuf;
+
+use anyhow::Result;
+use clap::{Args, ValueEnum};
+use slag_common::shard::Profile;
+use slag_common::splat;
+use slag_encoder::cli::Exit;
+use slag_encoder::cli::common::{ModelArgs, print, text_encoder_of};
+use slag_encoder::raster::CpuRasterizer;
+use slag_encoder::store::StoreReader;
+
+use crate::eval::{self, EvalLevel, EvalSettings, Filter, Truth};
+
+/// `eval labelled`.
+#[derive(Debug, Args)]
+pub struct EvalLabelledArgs {
+    /// Store.
+    #[arg(long, value_name = "DIR")]
+    pub store: PathBuf,
+    /// The splat that was encoded.
+    #[arg(long, value_name = "FILE")]
+    pub scene: PathBuf,
+    /// Folder of the labels: gt/instances.json, gt/gaussian_instance.npy; test/ and gt/test_masks/ if there are.
+    #[arg(long, value_name = "DIR")]
+    pub truth: PathBuf,
+    /// Models; the same that the store was encoded with.
+    #[command(flatten)]
+    pub models: ModelArgs,
+    /// Categories to ask for [default: all].
+    #[arg(long, value_name = "A,B", value_delimiter = ',')]
+    pub words: Vec<String>,
+    /// Score as a robot with shards of this profile does [default: the field in full precision].
+    #[arg(long, value_name = "NAME")]
+    pub profile: Option<Profile>,
+    /// Scores coarse and fine masks apart and takes the best, instead of their mean.
+    #[arg(long, conflicts_with = "profile")]
+    pub by_mask_level: bool,
+    /// Score from which something counts as found [default: the store's].
+    #[arg(long, value_name = "COSINE", allow_negative_numbers = true)]
+    pub threshold: Option<f32>,
+    /// Lets the Gaussians of a superpoint answer together, as the paper does.
+    #[arg(long, value_enum)]
+    pub superpoints: Option<Filter>,
+    /// Whether objects are scored.
+    #[command(flatten)]
+    pub level: EvalLevelArgs,
+}
+
+/// `eval labelled` and `query`: what is scored.
+#[derive(Debug, Args)]
+pub struct EvalLevelArgs {
+    /// What is scored [default: objects, where the scene has them].
+    #[arg(long, value_enum)]
+    pub level: Option<LevelArg>,
+}
+
+/// `--level`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum LevelArg {
+    /// Each Gaussian by itself.
+    Gaussians,
+    /// Objects, and the Gaussians within them; those without by themselves.
+    Objects,
+}
+
+impl From<LevelArg> for EvalLevel {
+    fn from(level: LevelArg) -> Self {
+        match level {
+            LevelArg::Gaussians => Self::Gaussians,
+            LevelArg::Objects => Self::Objects,
+        }
+    }
+}
+
+pub(super) fn run(args: &EvalLabelledArgs, json: bool) -> Result<Exit> {
+    let reader = StoreReader::open(&args.store)?;
+    let mut encoder = text_encoder_of(&reader, &args.models)?;
+    let scene = splat::read(&args.scene, &splat::ReadOptions { with_sh_rest: false })?;
+    let truth = Truth::read(&args.truth, scene.len())?;
+    let settings = EvalSettings {
+        words: args.words.clone(),
+        profile: args.profile,
+        threshold: args.threshold,
+        filter: args.superpoints,
+        level: args.level.level.map(Into::into),
+        by_mask_level: args.by_mask_level,
+    };
+    let report = eval::labelled(&reader, &truth, &scene, &mut *encoder, &CpuRasterizer, &settings)?;
+    print(json, &report, &report)?;
+    Ok(Exit::Done)
+}

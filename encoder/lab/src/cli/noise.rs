@@ -1,0 +1,111 @@
+//! `eval noise`.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, Result, anyhow};
+use clap::Args;
+
+use crate::eval::noise::{self, NoiseRow, NoiseSettings};
+use slag_common::shard::Profile;
+use slag_encoder::cli::Exit;
+use slag_encoder::cli::common::{
+    BackgroundArg, ModelArgs, available_threads, cancel_flag, open_models, print,
+};
+use slag_encoder::codebook::CodebookSettings;
+use slag_encoder::embed::Background;
+use slag_encoder::encode::{EncodeSettings, ViewOrder, ViewsLimit};
+use slag_encoder::lift::Aggregation;
+use slag_encoder::progress::Progress;
+use slag_encoder::raster::devices::{DeviceChoice, Devices};
+use slag_encoder::raster::gpu::GpuOptions;
+use slag_encoder::shard::ShardSettings;
+use slag_encoder::shard::positions::PositionError;
+
+/// `eval noise`.
+#[derive(Debug, Args)]
+pub struct EvalNoiseArgs {
+    /// Labelled scenes with masks, as `generate scene` writes them.
+    #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
+    scene: Vec<PathBuf>,
+    /// Levels of errors over the true masks, 0 (none) to 3.
+    #[arg(long, value_name = "N", value_delimiter = ',', default_values_t = [0, 1, 2, 3], value_parser = clap::value_parser!(u8).range(0..=3))]
+    levels: Vec<u8>,
+    /// Chooses the errors.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Compares with masks of the built-in segmenter instead, as they are.
+    #[arg(long, conflicts_with = "levels")]
+    auto: bool,
+    /// Ways to aggregate [default: all].
+    #[arg(long, value_name = "NAMES", value_delimiter = ',')]
+    methods: Vec<String>,
+    /// Views to use at most, evenly spread.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    views_limit: Option<u32>,
+    /// What fills a crop outside its mask.
+    #[arg(long, value_enum, default_value = "white")]
+    background: BackgroundArg,
+    /// Models.
+    #[command(flatten)]
+    models: ModelArgs,
+    /// Where weights are rasterised: auto (GPUs, else the CPU), gpu, cpu, or an adapter's number.
+    #[arg(long, value_name = "DEVICE", default_value_t)]
+    device: DeviceChoice,
+    /// Folder for the stores; a later run finds the views there.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    let known = Aggregation::methods();
+    let wanted = |name: &str| args.methods.is_empty() || args.methods.iter().any(|method| method == name);
+    if let Some(unknown) = args.methods.iter().find(|name| !known.iter().any(|(known, _)| known == name)) {
+        let names: Vec<&str> = known.iter().map(|(name, _)| *name).collect();
+        return Err(anyhow!("no way to aggregate is called {unknown:?}; there are: {}", names.join(", ")));
+    }
+    let threads = available_threads();
+    rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("cannot start threads")?;
+    let (models, session) = open_models(&args.models)?;
+    let devices = Devices::open(args.device, GpuOptions::default())?;
+    let methods: Vec<(String, Aggregation)> = known
+        .into_iter()
+        .filter(|(name, _)| wanted(name))
+        .map(|(name, way)| (name.to_owned(), way))
+        .collect();
+    let levels = if args.auto { Vec::new() } else { args.levels.clone() };
+    let n_centroids = args.scene.len() * levels.len().max(1) * methods.len();
+    let settings = NoiseSettings {
+        scenes: args.scene.clone(),
+        levels,
+        seed: args.seed,
+        methods,
+        out: args.out.clone(),
+        encode: EncodeSettings {
+            scene_name: "noise".into(),
+            views_limit: args.views_limit.map_or(ViewsLimit::All, |n| ViewsLimit::Count(n as usize)),
+            view_order: ViewOrder::Nth,
+            background: Background::from(args.background),
+            aggregation: Aggregation::PAPER,
+            keep_views: true,
+            threads,
+            strict: true,
+            restart: true,
+            shards: ShardSettings {
+                profiles: vec![Profile::Compact],
+                codebook: CodebookSettings::default(),
+                position_error: PositionError::default_for(true),
+            },
+            objects: false,
+            ..EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true)
+        },
+    };
+    progress.begin("noise", "row", n_centroids as u64, 0);
+    let mut on_row = |row: &NoiseRow| {
+        tracing::info!("{} {:?} {}: mIoU {:.4?}", row.scene, row.level, row.method, row.miou);
+        progress.advance(1);
+    };
+    let report = noise::run(&settings, (&models, &session), &devices, &mut on_row, cancel_flag()?.as_ref())?;
+    progress.end();
+    print(json, &report, &report)?;
+    Ok(Exit::Done)
+}

@@ -1,0 +1,72 @@
+//! `bench tradeoff`.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, Result};
+use clap::Args;
+
+use crate::bench::tradeoff::{self, Grid, LabelledScene, Programs, TradeoffSettings};
+use slag_encoder::cli::Exit;
+use slag_encoder::cli::common::{ModelArgs, open_models, print};
+use slag_encoder::progress::Progress;
+
+/// `bench tradeoff`.
+#[derive(Debug, Args)]
+pub struct TradeoffArgs {
+    /// Labelled scene: a folder as `generate scene` writes it; may be given again.
+    #[arg(long, visible_alias = "scene", value_name = "DIR", required = true, num_args = 1..)]
+    truth: Vec<PathBuf>,
+    /// Folder for figures and plots; what is measured there already is not measured again.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// A small grid with the scenes' own masks: about ten minutes on two cores.
+    #[arg(long)]
+    quick: bool,
+    /// A grid of one's own: JSON, {"points": [..]} of axis, name, and flags (views, lift, eval, profile).
+    #[arg(long, value_name = "FILE", conflicts_with = "quick")]
+    grid: Option<PathBuf>,
+    /// Models.
+    #[command(flatten)]
+    models: ModelArgs,
+}
+
+pub(super) fn run(args: &TradeoffArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    let grid = match &args.grid {
+        Some(path) => Grid::read(path)?,
+        None if args.quick => Grid::quick()?,
+        None => Grid::full()?,
+    };
+    // Before hours of work: a model that cannot be opened.
+    let (models, session) = open_models(&args.models)?;
+    let lab = std::env::current_exe().context("cannot tell where this program is")?;
+    let encoder = lab.with_file_name(format!("slag-encoder{}", std::env::consts::EXE_SUFFIX));
+    let edge = encoder.with_file_name(format!("slag-edge{}", std::env::consts::EXE_SUFFIX));
+    if !edge.is_file() {
+        tracing::warn!("{} is not there: no times of queries; build it beside this program", edge.display());
+    }
+    let mut flags = Vec::new();
+    let mut flag = |name: &str, value: String| flags.extend([name.to_owned(), value]);
+    if let Some(path) = &args.models.models {
+        flag("--models", path.display().to_string());
+    }
+    if let Some(path) = &args.models.how.runtime {
+        flag("--runtime", path.display().to_string());
+    }
+    let providers = args.models.how.provider.iter().map(ToString::to_string).collect::<Vec<_>>().join(",");
+    flag("--provider", providers);
+    if let Some(n) = args.models.how.model_threads {
+        flag("--model-threads", n.to_string());
+    }
+    let programs = Programs {
+        encoder,
+        lab,
+        edge: Some(edge).filter(|path| path.is_file()),
+        models: flags,
+        made_by: format!("{} {}, {:?}", env!("CARGO_PKG_VERSION"), models.encoder_id(), session.providers),
+    };
+    let scenes = args.truth.iter().map(|dir| LabelledScene::find(dir)).collect::<Result<_, _>>()?;
+    let settings = TradeoffSettings { scenes, grid, out: args.out.clone() };
+    let report = tradeoff::run(&settings, &programs, progress)?;
+    print(json, &report, &report)?;
+    Ok(if report.left_out.is_empty() { Exit::Done } else { Exit::Partly })
+}

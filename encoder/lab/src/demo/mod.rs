@@ -1,0 +1,344 @@
+//! The whole system in one run: generate, encode, serve, fetch as a robot would, ask, compare with the truth.
+
+mod picture;
+mod questions;
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+
+use anyhow::{Context, Result, anyhow};
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+use slag_models::{ModelDir, SessionOptions, TextEncoder};
+
+use crate::generate::Scene;
+use crate::generate::grammar::{self, SceneKind};
+use slag_encoder::cells::CellLimits;
+use slag_encoder::encode::{self, EncodeSettings, EncodeSummary};
+use slag_encoder::progress::Progress;
+use slag_encoder::publish::serve::{self, Limits};
+use slag_encoder::query;
+use slag_encoder::raster::CpuRasterizer;
+use slag_encoder::store::StoreReader;
+
+/// A house and a yard beside it.
+const KINDS: [SceneKind; 2] = [SceneKind::Room, SceneKind::Yard];
+/// Photos of both.
+const N_VIEWS: u32 = 72;
+/// The robot stands in the yard, where this photo was taken.
+const ROBOT_VIEW: usize = 1;
+/// What the robot fetches around it: not all of the scene.
+const RADIUS_M: f64 = 9.0;
+/// How far an answer's centre may lie outside the true box: a mask's edge takes in some of what is behind.
+const TOLERANCE_M: f64 = 0.25;
+/// Marks a folder as a demo's, which may be emptied.
+const MARKER: &str = "demo.json";
+
+/// How to run the demo.
+pub struct DemoOptions {
+    /// Folder to work in.
+    pub out: PathBuf,
+    /// Chooses house and yard.
+    pub seed: u64,
+    /// How models are run.
+    pub session: SessionOptions,
+    /// The robot's program.
+    pub edge: PathBuf,
+    /// Creation time to sign.
+    pub created_unix_secs: u64,
+}
+
+/// A finished demo.
+pub struct Demo {
+    /// What came of it.
+    pub report: DemoReport,
+    edge: PathBuf,
+    cache: PathBuf,
+}
+
+/// What came of a demo.
+#[derive(Debug, Serialize)]
+pub struct DemoReport {
+    /// The answers, drawn; and a map of the scene from above, with its cells and what the robot fetched.
+    pub pictures: [PathBuf; 2],
+    /// What the encode did.
+    pub encode: EncodeSummary,
+    /// Bytes that the robot downloaded.
+    pub downloaded_bytes: u64,
+    /// The model's own words about itself.
+    pub about_model: String,
+    /// The questions in turn.
+    pub questions: Vec<Question>,
+}
+
+/// A question and its answer.
+#[derive(Debug, Serialize)]
+pub struct Question {
+    /// What was asked.
+    pub text: String,
+    /// The best answer.
+    pub answer: Option<EdgeAnswer>,
+    /// Why there is none.
+    pub reason: Option<serde_json::Value>,
+    /// What truly is there: name, and the middle of its box.
+    pub truth: Vec<(String, DVec3)>,
+    /// Milliseconds, from the program's start to its end.
+    pub process_ms: f64,
+    /// Whether the answer is the truth.
+    pub right: bool,
+}
+
+/// What `slag-edge query --json` prints, as far as the demo reads it.
+#[derive(Debug, Deserialize)]
+struct EdgeReply {
+    answers: Vec<EdgeAnswer>,
+    reason: Option<serde_json::Value>,
+}
+
+/// A cluster of matching Gaussians.
+#[derive(Clone, Debug, Deserialize, Serialize)]
+pub struct EdgeAnswer {
+    /// Its place.
+    pub position_in_world: DVec3,
+    /// Edge lengths of its box.
+    pub size: DVec3,
+    /// Its score.
+    pub score: f32,
+    /// Its Gaussians.
+    pub n_gaussians: u64,
+    /// Distance from the robot.
+    pub distance: Option<f64>,
+}
+
+#[derive(Deserialize)]
+struct FetchReply {
+    downloaded: Tally,
+}
+
+#[derive(Deserialize)]
+struct Tally {
+    bytes: u64,
+}
+
+impl DemoReport {
+    /// Returns whether every answer is the truth.
+    pub fn all_right(&self) -> bool {
+        self.questions.iter().all(|q| q.right)
+    }
+}
+
+impl Demo {
+    /// Serves the shards and the robot's queries until it is stopped.
+    ///
+    /// # Errors
+    /// If a program cannot be started.
+    pub fn keep(&self) -> Result<()> {
+        let store = self.cache.with_file_name("store");
+        let mut shards =
+            Command::new(self.edge.with_file_name(format!("slag-encoder{}", std::env::consts::EXE_SUFFIX)));
+        let mut shards =
+            shards.arg("serve").arg("--store").arg(store).spawn().context("cannot serve the store")?;
+        println!("try: curl 'http://127.0.0.1:7734/query?text=chair'");
+        let status = Command::new(&self.edge).arg("serve").arg("--cache").arg(&self.cache).status();
+        // It may have ended already, as ctrl-c reaches all.
+        let _ = shards.kill();
+        let _ = shards.wait();
+        status.with_context(|| format!("cannot start {}", self.edge.display()))?;
+        Ok(())
+    }
+}
+
+/// Runs the demo.
+///
+/// # Errors
+/// Whatever step fails, with its name.
+pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &AtomicBool) -> Result<Demo> {
+    if !options.edge.is_file() {
+        return Err(anyhow!(
+            "{} is not there; build it with: cargo build --release --bin slag-edge",
+            options.edge.display()
+        ));
+    }
+    clear(&options.out)?;
+    let store = options.out.join("store");
+    let cache = options.out.join("cache");
+
+    let nouns = grammar::nouns(None).context("generate")?;
+    let mut scene = Scene::new(&KINDS, options.seed, N_VIEWS, &nouns);
+    let written = tokio::task::block_in_place(|| scene.write(&options.out.join("scene"), progress))
+        .context("generate")?;
+    let camera_in_world = scene.views[ROBOT_VIEW].camera_from_world.inverse().translation;
+    let robot_in_world = DVec3::new(camera_in_world.x, camera_in_world.y, 0.0);
+    let models = ModelDir::embedded()?;
+    let settings = EncodeSettings {
+        scene_name: "demo house and yard".into(),
+        memory_bytes: 1 << 30,
+        strict: true,
+        // Small cells, so that the demo has several.
+        cells: CellLimits { max_gaussians: 16_384, max_width: Some(25.0) },
+        created_unix_secs: options.created_unix_secs,
+        ..EncodeSettings::new(written.scene, written.views, store.clone(), true)
+    };
+    let summary = tokio::task::block_in_place(|| {
+        encode::encode(&settings, &models, &options.session, &CpuRasterizer, progress, cancel)
+    })
+    .context("encode")?;
+
+    let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
+    let (listens, listening) = tokio::sync::oneshot::channel();
+    let serving = tokio::spawn(async move {
+        // Errors of the channels mean that the other end is gone: the demo failed and says why itself.
+        let on_listening = |address| {
+            let _ = listens.send(address);
+        };
+        let stopped = async {
+            let _ = stopped.await;
+        };
+        serve::serve(&store, ([127, 0, 0, 1], 0).into(), Limits::default(), on_listening, stopped).await
+    });
+    let Ok(address) = listening.await else {
+        serving.await.context("serve")?.context("serve")?;
+        return Err(anyhow!("serve: ended before it listened"));
+    };
+    let url = format!("http://{address}");
+    let at = format!("{:.3},{:.3},{:.3}", robot_in_world.x, robot_in_world.y, robot_in_world.z);
+    let radius = RADIUS_M.to_string();
+    let fetch = ["fetch", "--from", &url, "--at", &at, "--radius", &radius];
+    let fetched: FetchReply = edge(options, &cache, &fetch).context("fetch")?;
+    // From here on there is no network.
+    let _ = stop.send(());
+    serving.await.context("serve")?.context("serve")?;
+
+    let mut questions = Vec::new();
+    for asked in questions::questions(&scene.objects, robot_in_world, RADIUS_M) {
+        let start = Instant::now();
+        let reply: EdgeReply =
+            edge(options, &cache, &["query", &asked.text, "--near", &at]).context("query")?;
+        let process_ms = start.elapsed().as_secs_f64() * 1e3;
+        let answer = reply.answers.into_iter().next();
+        let right = match &answer {
+            None => asked.truth.is_empty(),
+            Some(answer) => asked.truth.iter().any(|object| {
+                let (low, high) = (object.aabb_min - TOLERANCE_M, object.aabb_max + TOLERANCE_M);
+                answer.position_in_world.cmpge(low).all() && answer.position_in_world.cmple(high).all()
+            }),
+        };
+        let truth = asked.truth.iter().map(|o| (o.category.clone(), o.centre)).collect();
+        questions.push(Question { text: asked.text, answer, reason: reply.reason, truth, process_ms, right });
+    }
+    let mut encoder = models.text_encoder(&options.session)?;
+    let pictures =
+        tokio::task::block_in_place(|| draw(options, &scene, &questions, &mut *encoder, robot_in_world))
+            .context("pictures")?;
+    let report = DemoReport {
+        pictures,
+        encode: summary,
+        downloaded_bytes: fetched.downloaded.bytes,
+        about_model: models.about().to_owned(),
+        questions,
+    };
+    fs_err::write(options.out.join(MARKER), serde_json::to_vec_pretty(&report)?)?;
+    Ok(Demo { report, edge: options.edge.clone(), cache })
+}
+
+/// Draws what was found, from the full-precision scores of the store, and where it is.
+fn draw(
+    options: &DemoOptions,
+    scene: &Scene,
+    questions: &[Question],
+    text: &mut dyn TextEncoder,
+    robot_in_world: DVec3,
+) -> Result<[PathBuf; 2]> {
+    let reader = StoreReader::open(&options.out.join("store"))?;
+    let threshold = reader.manifest().encoder.default_threshold;
+    let mut panels = Vec::new();
+    for question in questions {
+        if let Some(answer) = &question.answer {
+            let cosines = query::scores(&reader, &text.encode(&question.text)?)?.cosines;
+            panels.push(picture::Panel { answer, cosines, threshold });
+        }
+    }
+    let paths = ["answers.png", "map.png"].map(|name| options.out.join(name));
+    picture::answers(&scene.gaussians, &scene.views, &panels)?.save(&paths[0])?;
+    let answers: Vec<DVec3> = panels.iter().map(|panel| panel.answer.position_in_world).collect();
+    let cells: Vec<_> = reader.manifest().cells.iter().map(|cell| cell.bounds).collect();
+    picture::map(&scene.gaussians, &cells, &answers, robot_in_world, RADIUS_M).save(&paths[1])?;
+    Ok(paths)
+}
+
+/// Empties the folder of an earlier demo; refuses a folder that holds anything else.
+fn clear(out: &Path) -> Result<()> {
+    if out.exists() {
+        let foreign = fs_err::read_dir(out)?.next().is_some() && !out.join(MARKER).is_file();
+        if foreign {
+            return Err(anyhow!("{} holds other files; give an empty folder with --out", out.display()));
+        }
+        fs_err::remove_dir_all(out)?;
+    }
+    fs_err::create_dir_all(out)?;
+    // Before any work, so that an interrupted demo can be started again.
+    fs_err::write(out.join(MARKER), "{}")?;
+    Ok(())
+}
+
+/// Runs the robot's program on its cache and reads what it prints.
+fn edge<T: for<'a> Deserialize<'a>>(options: &DemoOptions, cache: &Path, args: &[&str]) -> Result<T> {
+    let mut command = Command::new(&options.edge);
+    command
+        .args(args)
+        .arg("--cache")
+        .arg(cache)
+        .args(["--json", "--quiet"])
+        .stdin(Stdio::null())
+        .stderr(Stdio::inherit());
+    let output = tokio::task::block_in_place(|| command.output())
+        .with_context(|| format!("cannot start {}", options.edge.display()))?;
+    let text = String::from_utf8_lossy(&output.stdout);
+    if !output.status.success() {
+        return Err(anyhow!("slag-edge {}: {}", args.join(" "), text.trim()));
+    }
+    serde_json::from_str(&text).with_context(|| format!("slag-edge {}: {}", args.join(" "), text.trim()))
+}
+
+impl fmt::Display for DemoReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let encode = &self.encode;
+        writeln!(
+            f,
+            "encoded {} Gaussians from {} photos ({} masks) in {:.1} s; the robot fetched {} kB in {} cells\n",
+            encode.n_gaussians,
+            encode.n_views,
+            encode.n_masks,
+            encode.wall_secs,
+            self.downloaded_bytes / 1000,
+            encode.n_cells
+        )?;
+        writeln!(
+            f,
+            "{:<24} {:<46} {:>7}  {:<7} truth",
+            "question", "answer of the robot, offline", "ms", "right"
+        )?;
+        for q in &self.questions {
+            let answer = match &q.answer {
+                Some(a @ EdgeAnswer { position_in_world: p, .. }) => format!(
+                    "{:.1} m away at {:.2} {:.2} {:.2}, score {:.2}",
+                    a.distance.unwrap_or(f64::NAN),
+                    p.x,
+                    p.y,
+                    p.z,
+                    a.score
+                ),
+                None => "nothing found".into(),
+            };
+            let truth = q.truth.iter().map(|(name, p)| format!("{name} at {:.2} {:.2} {:.2}", p.x, p.y, p.z));
+            let truth = truth.reduce(|a, b| a + ", " + &b).unwrap_or_else(|| "there is none".into());
+            let right = if q.right { "yes" } else { "NO" };
+            writeln!(f, "{:<24} {answer:<46} {:>7.0}  {right:<7} {truth}", q.text, q.process_ms)?;
+        }
+        writeln!(f, "\nmodel: {}", self.about_model)?;
+        writeln!(f, "pictures: {}, {}", self.pictures[0].display(), self.pictures[1].display())
+    }
+}

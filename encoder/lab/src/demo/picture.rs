@@ -1,0 +1,181 @@
+//! What the robot found, drawn: each answer's Gaussians in colour, the rest in grey; and all from above.
+
+use glam::{DVec2, DVec3};
+use image::{RgbImage, imageops};
+use slag_common::Gaussians;
+use slag_common::frames::Aabb;
+use slag_common::gaussians::SH_C0;
+
+use super::EdgeAnswer;
+use crate::generate::to_image;
+use slag_encoder::raster::{CpuRasterizer, RasterError, RasterView, Rasterizer};
+
+/// Width of one panel.
+const PANEL_WIDTH_PX: u32 = 320;
+/// Views that are tried for a panel.
+const N_CANDIDATES: usize = 8;
+/// Panels in a row.
+const COLUMNS: usize = 4;
+
+/// One question's part of the picture.
+pub(super) struct Panel<'a> {
+    /// The best answer.
+    pub(super) answer: &'a EdgeAnswer,
+    /// Cosine of each Gaussian with the question; NaN where it has no embedding.
+    pub(super) cosines: Vec<f32>,
+    /// Cosine from which a Gaussian matches.
+    pub(super) threshold: f32,
+}
+
+/// Draws the panels, left to right, top to bottom.
+///
+/// # Errors
+/// [`RasterError`].
+pub(super) fn answers(
+    scene: &Gaussians,
+    views: &[RasterView],
+    panels: &[Panel<'_>],
+) -> Result<RgbImage, RasterError> {
+    let Some(first) = views.first() else { return Ok(RgbImage::new(1, 1)) };
+    let size = first.intrinsics.scaled_to_width(PANEL_WIDTH_PX);
+    let n_centroids = panels.len().div_ceil(COLUMNS).max(1) as u32;
+    let mut picture = RgbImage::from_pixel(
+        size.width_px * COLUMNS as u32,
+        size.height_px * n_centroids,
+        image::Rgb([255; 3]),
+    );
+    for (i, panel) in panels.iter().enumerate() {
+        let mut coloured = scene.clone();
+        for (sh, cosine) in coloured.sh_dc.iter_mut().zip(&panel.cosines) {
+            // NaN compares false: what was never seen stays grey.
+            if *cosine >= panel.threshold {
+                continue;
+            }
+            // Lightened so that dark furniture still shows its shape.
+            let grey = 0.35 + 0.5 * luma(rgb_of(*sh));
+            *sh = [(grey - 0.5) / SH_C0; 3];
+        }
+        let view = best_view(scene, views, panel)?;
+        let view = RasterView { intrinsics: view.intrinsics.scaled_to_width(PANEL_WIDTH_PX), ..view };
+        let drawn = to_image(&CpuRasterizer.draw(&coloured, &view, [0.9; 3])?, &view);
+        let (column, row) = (i % COLUMNS, i / COLUMNS);
+        imageops::replace(
+            &mut picture,
+            &drawn,
+            (column as u32 * size.width_px).into(),
+            (row as u32 * size.height_px).into(),
+        );
+    }
+    Ok(picture)
+}
+
+fn rgb_of(sh_dc: [f32; 3]) -> [f32; 3] {
+    sh_dc.map(|c| 0.5 + SH_C0 * c)
+}
+
+/// BT.601.
+fn luma([r, g, b]: [f32; 3]) -> f32 {
+    0.299 * r + 0.587 * g + 0.114 * b
+}
+
+/// Returns the view that shows most of what was found, of those that have the answer nearest to their middle.
+fn best_view(scene: &Gaussians, views: &[RasterView], panel: &Panel<'_>) -> Result<RasterView, RasterError> {
+    let off_axis = |view: &RasterView| {
+        let in_camera = view.camera_from_world.transform_point3(panel.answer.position_in_world);
+        // Nearer than this an object does not fit the picture.
+        if in_camera.z < 1.5 { f64::INFINITY } else { in_camera.truncate().length() / in_camera.z }
+    };
+    let mut candidates: Vec<&RasterView> = views.iter().collect();
+    candidates.sort_by(|a, b| off_axis(a).total_cmp(&off_axis(b)));
+    candidates.truncate(N_CANDIDATES);
+    // White on black, so that brightness counts pixels; far things of the same kind count too little to matter.
+    let mut found = scene.clone();
+    for (sh, cosine) in found.sh_dc.iter_mut().zip(&panel.cosines) {
+        *sh = [if *cosine >= panel.threshold { 0.5 } else { -0.5 } / SH_C0; 3];
+    }
+    let shown = |view: &RasterView| -> Result<f64, RasterError> {
+        let view = RasterView { intrinsics: view.intrinsics.scaled_to_width(PANEL_WIDTH_PX / 4), ..*view };
+        let drawn = CpuRasterizer.draw(&found, &view, [0.0; 3])?;
+        Ok(drawn.rgb.iter().map(|c| f64::from(*c)).sum())
+    };
+    let mut best = (*candidates.first().expect("there are views"), f64::NEG_INFINITY);
+    for view in candidates {
+        let pixels = shown(view)?;
+        if pixels > best.1 {
+            best = (view, pixels);
+        }
+    }
+    Ok(*best.0)
+}
+
+/// Pixels of the map a metre.
+const MAP_PX_PER_M: f64 = 48.0;
+/// What is higher, roofs and lamps, is not on the map.
+const MAP_HEIGHT_M: f64 = 2.2;
+/// Around what is on the map.
+const MARGIN_M: f64 = 0.5;
+
+/// Draws the scene from above: cells that the robot fetched in colour, with their borders; the others in grey; the
+/// circle around the robot, which stands at the cross; and where the answers are.
+pub(super) fn map(
+    scene: &Gaussians,
+    cells: &[Aabb],
+    answers: &[DVec3],
+    robot_in_world: DVec3,
+    radius_m: f64,
+) -> RgbImage {
+    let mut low = DVec2::INFINITY;
+    let mut high = DVec2::NEG_INFINITY;
+    for cell in cells {
+        (low, high) = (low.min(cell.min.truncate()), high.max(cell.max.truncate()));
+    }
+    let size = ((high - low + 2.0 * MARGIN_M) * MAP_PX_PER_M).max(DVec2::ONE);
+    let (width, height) = (size.x as i64, size.y as i64);
+    let mut map = RgbImage::from_pixel(width as u32, height as u32, image::Rgb([250; 3]));
+    let place = |at: DVec2| {
+        let at = (at - low + MARGIN_M) * MAP_PX_PER_M;
+        (at.x as i64, height - 1 - at.y as i64)
+    };
+    let mut put = |(x, y): (i64, i64), rgb: [u8; 3]| {
+        if (0..width).contains(&x) && (0..height).contains(&y) {
+            map.put_pixel(x as u32, y as u32, image::Rgb(rgb));
+        }
+    };
+    let is_fetched = |bounds: &Aabb| bounds.distance_to(robot_in_world) <= radius_m;
+    let fetched: Vec<&Aabb> = cells.iter().filter(|bounds| is_fetched(bounds)).collect();
+    let mut order: Vec<usize> =
+        (0..scene.len()).filter(|i| scene.means_in_world[*i].z < MAP_HEIGHT_M).collect();
+    order.sort_by(|a, b| scene.means_in_world[*a].z.total_cmp(&scene.means_in_world[*b].z));
+    for i in order {
+        let mean = scene.means_in_world[i];
+        let rgb = rgb_of(scene.sh_dc[i]);
+        let on_board = fetched.iter().any(|bounds| bounds.distance_to(mean) == 0.0);
+        let grey = 0.6 + 0.3 * luma(rgb);
+        let rgb = if on_board { rgb } else { [grey; 3] }.map(|c| (c.clamp(0.0, 1.0) * 255.0) as u8);
+        let (x, y) = place(mean.truncate());
+        let reach = (f64::from(scene.scales[i][0]) * MAP_PX_PER_M).ceil() as i64;
+        (-reach..=reach).for_each(|dy| (-reach..=reach).for_each(|dx| put((x + dx, y + dy), rgb)));
+    }
+    for bounds in fetched {
+        let ((x0, y1), (x1, y0)) = (place(bounds.min.truncate()), place(bounds.max.truncate()));
+        (x0..=x1).for_each(|x| [y0, y1].into_iter().for_each(|y| put((x, y), [30, 90, 200])));
+        (y0..=y1).for_each(|y| [x0, x1].into_iter().for_each(|x| put((x, y), [30, 90, 200])));
+    }
+    let mut ring = |centre: DVec3, radius_m: f64, rgb| {
+        for step in 0..4000 {
+            let angle = std::f64::consts::TAU * f64::from(step) / 4000.0;
+            let (x, y) = place(centre.truncate() + radius_m * DVec2::new(angle.cos(), angle.sin()));
+            [(0, 0), (1, 0), (0, 1), (1, 1)].into_iter().for_each(|(dx, dy)| put((x + dx, y + dy), rgb));
+        }
+    };
+    ring(robot_in_world, radius_m, [0, 0, 0]);
+    for answer in answers {
+        [0.14, 0.17, 0.2].into_iter().for_each(|radius_m| ring(*answer, radius_m, [230, 0, 80]));
+    }
+    let (x, y) = place(robot_in_world.truncate());
+    for step in -9..=9 {
+        let cross = [(step, 0), (step, 1), (0, step), (1, step)];
+        cross.into_iter().for_each(|(dx, dy)| put((x + dx, y + dy), [0, 0, 0]));
+    }
+    map
+}

@@ -1,0 +1,289 @@
+//! How well an encoder tells generated things: every crop is asked which noun, colour and material it shows.
+//!
+//! The scenes' seeds decide what is seen: those of [`Split::Test`] are other shapes than were learnt from, in all
+//! pairs of noun and colour, also those that were kept from learning.
+
+use std::fmt;
+use std::path::Path;
+use std::time::Instant;
+
+use rayon::prelude::*;
+use serde::Serialize;
+use slag_models::{Crop, EncodeError, ModelDir, ModelError, SessionOptions};
+
+use super::ABSENT;
+use crate::generate::crops::{self, Label, Split};
+use crate::generate::grammar::Noun;
+use crate::generate::paint::{Colour, Material};
+use slag_encoder::progress::Progress;
+use slag_math::dot;
+
+/// A crop shows a whole thing if its mask is the true one and so much of it is not hidden.
+const WHOLE: f64 = 0.6;
+/// Scenes whose crops are in memory at a time.
+const SCENES_AT_A_TIME: u64 = 16;
+/// Crops and texts that are timed.
+const N_TIMED: usize = 64;
+
+/// Why an encoder could not be judged.
+#[derive(Debug, thiserror::Error)]
+pub enum EncoderEvalError {
+    /// It does not open.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// It fails.
+    #[error(transparent)]
+    Encode(#[from] EncodeError),
+    /// The picture could not be written.
+    #[error("{}: {source}", path.display())]
+    Picture {
+        /// The picture.
+        path: std::path::PathBuf,
+        /// Why.
+        source: image::ImageError,
+    },
+    /// No crop came of the scenes.
+    #[error("the scenes show nothing; ask for more with --n-scenes")]
+    NoCrops,
+}
+
+/// Right answers over some crops.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Tally {
+    /// Crops.
+    pub n_crops: usize,
+    /// Of these, the best of all nouns is the right one.
+    pub noun: usize,
+    /// The best of all colours is the main one.
+    pub colour: usize,
+    /// The best of all materials is the main one.
+    pub material: usize,
+}
+
+/// Right answers for a noun, over whole things.
+#[derive(Clone, Debug, Serialize)]
+pub struct NounReport {
+    /// The noun.
+    pub noun: String,
+    /// Its crops.
+    pub n_crops: usize,
+    /// Of these, told rightly.
+    pub n_right: usize,
+    /// What it is taken for most often otherwise, and how often.
+    pub taken_for: Vec<(String, usize)>,
+}
+
+/// Figures of an encoder.
+#[derive(Clone, Debug, Serialize)]
+pub struct EncoderReport {
+    /// Its name.
+    pub encoder: String,
+    /// Scenes, the first of which has seed `first_seed`.
+    pub n_scenes: u64,
+    /// Seed of the first.
+    pub first_seed: u64,
+    /// Tallies by what crops show.
+    pub tallies: Vec<(String, Tally)>,
+    /// By noun.
+    pub nouns: Vec<NounReport>,
+    /// Cosine from which something counts as found.
+    pub threshold: Option<f32>,
+    /// Part of the crops whose noun is found.
+    pub found: Option<f64>,
+    /// Part of the pairs of crop and another noun that are found.
+    pub found_others: Option<f64>,
+    /// Part of the pairs of crop and a thing that is nowhere that are found.
+    pub found_absent: Option<f64>,
+    /// Milliseconds a crop and a text with one thread, medians.
+    pub ms_per_crop: f64,
+    /// See above.
+    pub ms_per_text: f64,
+}
+
+/// Judges an encoder on the crops of scenes.
+///
+/// # Errors
+/// [`EncoderEvalError`].
+pub fn evaluate(
+    models: &ModelDir,
+    options: &SessionOptions,
+    nouns: &[Noun],
+    seeds: std::ops::Range<u64>,
+    confusion: Option<&Path>,
+    progress: &dyn Progress,
+) -> Result<EncoderReport, EncoderEvalError> {
+    let mut text = models.text_encoder(options)?;
+    let mut encode = |said: Vec<String>| -> Result<Vec<Vec<f32>>, EncoderEvalError> {
+        Ok(said.iter().map(|text_of| text.encode(text_of)).collect::<Result<_, _>>()?)
+    };
+    let of_nouns = encode(nouns.iter().map(|noun| format!("a {}", noun.name)).collect())?;
+    let of_colours = encode(Colour::ALL.iter().map(|c| format!("something {}", c.word())).collect())?;
+    let of_materials =
+        encode(Material::ALL.iter().map(|m| format!("something made of {}", m.word())).collect())?;
+    let of_absent = encode(ABSENT.iter().map(|thing| format!("a {thing}")).collect())?;
+    let ms_per_text = timed(|i| text.encode(&nouns[i % nouns.len()].name).map(|_| ()))?;
+
+    let mut image = models.image_encoder(options)?;
+    let mut seen: Vec<Seen> = Vec::new();
+    let mut found = [0_u64; 3];
+    let mut timing = Vec::new();
+    let threshold = models.threshold();
+    progress.begin("scenes", "scene", seeds.end - seeds.start, 0);
+    for first in seeds.clone().step_by(SCENES_AT_A_TIME as usize) {
+        let seeds = first..(first + SCENES_AT_A_TIME).min(seeds.end);
+        let n_scenes = seeds.end - seeds.start;
+        let (crops, labels): (Vec<Crop>, Vec<Label>) =
+            seeds.into_par_iter().flat_map_iter(|seed| crops::crops(Split::Test, nouns, seed)).unzip();
+        if timing.is_empty() {
+            timing = crops.iter().take(N_TIMED).cloned().collect();
+        }
+        let vectors = image.encode(&crops)?;
+        for (vector, label) in vectors.chunks_exact(models.dim()).zip(labels) {
+            let scores: Vec<f32> = of_nouns.iter().map(|of| dot(of, vector)).collect();
+            let threshold = threshold.unwrap_or(f32::INFINITY);
+            let n_found = scores.iter().filter(|score| **score >= threshold).count() as u64;
+            let own = u64::from(scores[label.noun] >= threshold);
+            let absent = of_absent.iter().filter(|of| dot(of, vector) >= threshold).count() as u64;
+            found.iter_mut().zip([own, n_found - own, absent]).for_each(|(sum, n)| *sum += n);
+            let best = |of: &[Vec<f32>]| argmax(of.iter().map(|of| dot(of, vector)));
+            seen.push((label, argmax(scores.into_iter()), best(&of_colours), best(&of_materials)));
+        }
+        progress.advance(n_scenes);
+    }
+    progress.end();
+    if seen.is_empty() {
+        return Err(EncoderEvalError::NoCrops);
+    }
+    let ms_per_crop = timed(|i| image.encode(&timing[i % timing.len()..][..1]).map(|_| ()))?;
+    let n = seen.len() as f64;
+    let share = |count: u64, of: usize| threshold.map(|_| count as f64 / (n * of as f64));
+    let report = EncoderReport {
+        encoder: models.encoder_id().name.clone(),
+        n_scenes: seeds.end - seeds.start,
+        first_seed: seeds.start,
+        tallies: tallies(&seen),
+        nouns: of_each_noun(&seen, nouns),
+        threshold,
+        found: share(found[0], 1),
+        found_others: share(found[1], nouns.len() - 1),
+        found_absent: share(found[2], ABSENT.len()),
+        ms_per_crop,
+        ms_per_text,
+    };
+    if let Some(path) = confusion {
+        let picture = picture(&seen, nouns.len());
+        picture.save(path).map_err(|source| EncoderEvalError::Picture { path: path.to_owned(), source })?;
+    }
+    Ok(report)
+}
+
+/// A crop's label, and the noun, colour and material that score best.
+type Seen = (Label, usize, usize, usize);
+/// Whether a crop is one of those that are counted together.
+type Group = fn(&Label) -> bool;
+
+fn is_whole(label: &Label) -> bool {
+    !label.cut && !label.segmented && label.shown > WHOLE
+}
+
+fn argmax(scores: impl Iterator<Item = f32>) -> usize {
+    scores.enumerate().fold((0, f32::NEG_INFINITY), |best, at| if at.1 > best.1 { at } else { best }).0
+}
+
+fn tallies(seen: &[Seen]) -> Vec<(String, Tally)> {
+    let groups: [(&str, Group); 6] = [
+        ("whole things", is_whole),
+        ("whole things, in pairs of noun and colour kept from learning", |l| is_whole(l) && l.held_out),
+        ("cut or half hidden", |l| !l.segmented && !is_whole(l)),
+        ("the graph segmenter's segments", |l| l.segmented),
+        ("all, in pairs kept from learning", |l| l.held_out),
+        ("all", |_| true),
+    ];
+    let tally = |is_in: Group| {
+        let mut tally = Tally::default();
+        for (label, noun, colour, material) in seen.iter().filter(|s| is_in(&s.0)) {
+            tally.n_crops += 1;
+            tally.noun += usize::from(*noun == label.noun);
+            tally.colour += usize::from(Colour::ALL[*colour] == label.colour);
+            tally.material += usize::from(Material::ALL[*material] == label.material);
+        }
+        tally
+    };
+    groups.map(|(name, is_in)| (name.to_owned(), tally(is_in))).to_vec()
+}
+
+/// Returns how often whole things of each noun are taken for each.
+fn confusion(seen: &[Seen], n_nouns: usize) -> Vec<Vec<usize>> {
+    let mut counts = vec![vec![0; n_nouns]; n_nouns];
+    seen.iter().filter(|s| is_whole(&s.0)).for_each(|(label, noun, ..)| counts[label.noun][*noun] += 1);
+    counts
+}
+
+fn of_each_noun(seen: &[Seen], nouns: &[Noun]) -> Vec<NounReport> {
+    let counts = confusion(seen, nouns.len());
+    let report = |(i, counts): (usize, &Vec<usize>)| {
+        let mut others: Vec<usize> = (0..nouns.len()).filter(|j| *j != i && counts[*j] > 0).collect();
+        others.sort_by_key(|j| (std::cmp::Reverse(counts[*j]), *j));
+        NounReport {
+            noun: nouns[i].name.clone(),
+            n_crops: counts.iter().sum(),
+            n_right: counts[i],
+            taken_for: others.iter().take(3).map(|j| (nouns[*j].name.clone(), counts[*j])).collect(),
+        }
+    };
+    counts.iter().enumerate().map(report).collect()
+}
+
+/// Draws the confusion: a row a noun, a column what it is taken for, in the nouns' order; darker is more often.
+fn picture(seen: &[Seen], n_nouns: usize) -> image::GrayImage {
+    const EDGE_PX: u32 = 8;
+    let counts = confusion(seen, n_nouns);
+    image::GrayImage::from_fn(n_nouns as u32 * EDGE_PX, n_nouns as u32 * EDGE_PX, |x, y| {
+        let row = &counts[(y / EDGE_PX) as usize];
+        let share = row[(x / EDGE_PX) as usize] as f64 / row.iter().sum::<usize>().max(1) as f64;
+        image::Luma([(255.0 * (1.0 - share.sqrt())) as u8])
+    })
+}
+
+/// Returns the median time of a call, milliseconds.
+fn timed(mut call: impl FnMut(usize) -> Result<(), EncodeError>) -> Result<f64, EncodeError> {
+    let mut times = Vec::with_capacity(N_TIMED);
+    for i in 0..N_TIMED {
+        let start = Instant::now();
+        call(i)?;
+        times.push(start.elapsed().as_secs_f64() * 1e3);
+    }
+    times.sort_by(f64::total_cmp);
+    Ok(times[N_TIMED / 2])
+}
+
+impl fmt::Display for EncoderReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "{} on {} scenes from seed {}\n", self.encoder, self.n_scenes, self.first_seed)?;
+        writeln!(f, "{:<62} {:>7} {:>7} {:>7} {:>9}", "top-1, %", "crops", "noun", "colour", "material")?;
+        for (name, t) in &self.tallies {
+            let percent = |n: usize| 100.0 * n as f64 / t.n_crops.max(1) as f64;
+            let [noun, colour, material] = [t.noun, t.colour, t.material].map(percent);
+            writeln!(f, "{name:<62} {:>7} {noun:>7.1} {colour:>7.1} {material:>9.1}", t.n_crops)?;
+        }
+        writeln!(f, "\n{:<20} {:>6} {:>6}  taken for", "noun", "crops", "%")?;
+        for noun in &self.nouns {
+            let percent = 100.0 * noun.n_right as f64 / noun.n_crops.max(1) as f64;
+            let others: Vec<String> =
+                noun.taken_for.iter().map(|(other, n)| format!("{other} {n}")).collect();
+            writeln!(f, "{:<20} {:>6} {percent:>6.0}  {}", noun.noun, noun.n_crops, others.join(", "))?;
+        }
+        if let (Some(threshold), Some(own), Some(others), Some(absent)) =
+            (self.threshold, self.found, self.found_others, self.found_absent)
+        {
+            writeln!(
+                f,
+                "\nabove the threshold {threshold:.3}: own noun {:.1} %, another {:.2} %, things that are nowhere {:.2} %",
+                100.0 * own,
+                100.0 * others,
+                100.0 * absent
+            )?;
+        }
+        writeln!(f, "{:.2} ms a crop, {:.2} ms a text, one thread", self.ms_per_crop, self.ms_per_text)
+    }
+}

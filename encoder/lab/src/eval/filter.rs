@@ -1,0 +1,76 @@
+//! Prediction filtering as in the paper: the Gaussians of a superpoint answer together.
+
+use std::collections::BTreeMap;
+
+use slag_encoder::lift::superpoint::{NO_SUPERPOINT, Superpoints};
+
+/// How a superpoint's Gaussians agree on an answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum Filter {
+    /// The class that most of them have; of equally many, the first of the list.
+    Majority,
+    /// All have their mean score.
+    Mean,
+}
+
+/// Gives all Gaussians of a superpoint the mean of those scores that are not NaN.
+pub(super) fn average(scores: &mut [f32], superpoints: &Superpoints) {
+    let mut sums = vec![(0.0f64, 0u32); superpoints.n];
+    for (score, superpoint) in scores.iter().zip(&superpoints.of_gaussian) {
+        if *superpoint != NO_SUPERPOINT && !score.is_nan() {
+            let (sum, n) = &mut sums[*superpoint as usize];
+            *sum += f64::from(*score);
+            *n += 1;
+        }
+    }
+    for (score, superpoint) in scores.iter_mut().zip(&superpoints.of_gaussian) {
+        if let Some((sum, n)) = sums.get(*superpoint as usize).filter(|(_, n)| *n > 0) {
+            *score = (sum / f64::from(*n)) as f32;
+        }
+    }
+}
+
+/// Gives all Gaussians of a superpoint the class that most of them have.
+pub(super) fn vote(classes: &mut [Option<usize>], superpoints: &Superpoints) {
+    let mut votes: Vec<BTreeMap<usize, usize>> = vec![BTreeMap::new(); superpoints.n];
+    for (class, superpoint) in classes.iter().zip(&superpoints.of_gaussian) {
+        if let (Some(class), Some(votes)) = (class, votes.get_mut(*superpoint as usize)) {
+            *votes.entry(*class).or_default() += 1;
+        }
+    }
+    let winner = |votes: &BTreeMap<usize, usize>| {
+        votes.iter().max_by(|a, b| a.1.cmp(b.1).then(b.0.cmp(a.0))).map(|(class, _)| *class)
+    };
+    let winners: Vec<Option<usize>> = votes.iter().map(winner).collect();
+    for (class, superpoint) in classes.iter_mut().zip(&superpoints.of_gaussian) {
+        if let Some(winner) = winners.get(*superpoint as usize) {
+            *class = *winner;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn superpoints() -> Superpoints {
+        Superpoints { of_gaussian: vec![0, 0, 1, 0, 1, NO_SUPERPOINT, 2], n: 3 }
+    }
+
+    #[test]
+    fn means_leave_out_what_has_no_score_and_give_it_one() {
+        let mut scores = [0.2, 0.4, 1.0, f32::NAN, 0.5, 0.7, f32::NAN];
+        average(&mut scores, &superpoints());
+        let expected = [0.3, 0.3, 0.75, 0.3, 0.75, 0.7];
+        assert!(scores.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{scores:?}");
+        assert!(scores[6].is_nan());
+    }
+
+    #[test]
+    fn the_most_frequent_class_wins_and_ties_go_to_the_first() {
+        let mut classes = [Some(2), Some(1), Some(4), Some(2), Some(3), Some(0), None];
+        vote(&mut classes, &superpoints());
+        assert_eq!(classes, [Some(2), Some(2), Some(3), Some(2), Some(3), Some(0), None]);
+    }
+}

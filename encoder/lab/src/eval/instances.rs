@@ -1,0 +1,131 @@
+//! How many of the true things objects find: instance recall.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use serde::Serialize;
+
+use super::Truth;
+use slag_encoder::objects::NONE;
+
+/// Things that were found.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Recall {
+    /// Things there are.
+    pub n: usize,
+    /// With an intersection over union of at least 0.25.
+    pub n_at_25: usize,
+    /// Of at least 0.5.
+    pub n_at_50: usize,
+}
+
+impl Recall {
+    fn count(&mut self, iou: f64) {
+        self.n += 1;
+        self.n_at_25 += usize::from(iou >= 0.25);
+        self.n_at_50 += usize::from(iou >= 0.5);
+    }
+}
+
+impl fmt::Display for Recall {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} and {} of {}", self.n_at_25, self.n_at_50, self.n)
+    }
+}
+
+/// Instance recall of objects, over sets of Gaussians.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct InstanceReport {
+    /// Objects.
+    pub n_objects: usize,
+    /// By any object, whatever it is called: how well the scene was taken apart.
+    pub any: Recall,
+    /// By an object that reaches the threshold with the thing's word.
+    pub of_words: Recall,
+    /// By one of the word's n best objects, n being the things of that word.
+    pub best_of_words: Recall,
+}
+
+/// Compares things with objects. `object_of`: each Gaussian's, `classes`: words with their things' ids, `scores`: of
+/// each word and object.
+pub(super) fn report(
+    truth: &Truth,
+    object_of: &[u32],
+    n_objects: usize,
+    classes: &[(String, Vec<u16>)],
+    scores: &[Vec<f32>],
+    threshold: f32,
+) -> InstanceReport {
+    let mut n_of_object = vec![0u64; n_objects];
+    let mut n_of_thing: BTreeMap<u16, u64> = BTreeMap::new();
+    let mut n_of_both: BTreeMap<(u16, u32), u64> = BTreeMap::new();
+    for (object, thing) in object_of.iter().zip(&truth.id_of_gaussian) {
+        *n_of_thing.entry(*thing).or_default() += 1;
+        if *object != NONE {
+            n_of_object[*object as usize] += 1;
+            *n_of_both.entry((*thing, *object)).or_default() += 1;
+        }
+    }
+    let best_iou = |thing: u16, counts: &dyn Fn(u32) -> bool| {
+        let of_thing =
+            n_of_both.range((thing, 0)..=(thing, u32::MAX)).filter(|((_, object), _)| counts(*object));
+        let iou = |((_, object), both): (&(u16, u32), &u64)| {
+            *both as f64 / (n_of_object[*object as usize] + n_of_thing[&thing] - both) as f64
+        };
+        of_thing.map(iou).fold(0.0, f64::max)
+    };
+    let [mut any, mut of_words, mut best_of_words] = [Recall::default(); 3];
+    // What has no Gaussian cannot be found by any.
+    let things = truth.things.iter().map(|thing| thing.id).filter(|id| n_of_thing.contains_key(id));
+    things.for_each(|thing| any.count(best_iou(thing, &|_| true)));
+    for ((_, ids), scores) in classes.iter().zip(scores) {
+        let ids: Vec<u16> = ids.iter().copied().filter(|id| n_of_thing.contains_key(id)).collect();
+        let mut order: Vec<u32> = (0..n_objects as u32).collect();
+        order.sort_by(|a, b| scores[*b as usize].total_cmp(&scores[*a as usize]).then(a.cmp(b)));
+        order.truncate(ids.len());
+        for thing in ids {
+            of_words.count(best_iou(thing, &|object| scores[object as usize] >= threshold));
+            best_of_words.count(best_iou(thing, &|object| order.contains(&object)));
+        }
+    }
+    InstanceReport { n_objects, any, of_words, best_of_words }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::eval::Thing;
+
+    /// By hand: thing 7 (Gaussians 0..4) is object 0 but for one; thing 8 (4..8) is split between 1 and 2; thing 9 has
+    /// no Gaussian; 8..10 are wall, which object 2 has too.
+    #[test]
+    fn recall_by_hand() {
+        let thing = |id: u16, category: &str| Thing {
+            id,
+            category: category.into(),
+            aabb_min: None,
+            aabb_max: None,
+            words: Vec::new(),
+        };
+        let truth = Truth {
+            things: vec![thing(7, "chair"), thing(8, "chair"), thing(9, "table")],
+            background: vec![thing(1, "wall")],
+            id_of_gaussian: vec![7, 7, 7, 7, 8, 8, 8, 8, 1, 1],
+            views: Vec::new(),
+        };
+        let object_of = [0, 0, 0, NONE, 1, 2, 2, NONE, 2, 2];
+        let classes = [("chair".to_owned(), vec![7, 8]), ("table".to_owned(), vec![9])];
+        // IoU: 3/4; 1/4 with object 1, 2/6 with object 2.
+        let found = |chair: Vec<f32>| report(&truth, &object_of, 3, &classes, &[chair, vec![0.9; 3]], 0.5);
+        let recall = |n, n_at_25, n_at_50| Recall { n, n_at_25, n_at_50 };
+        let report = found(vec![0.9, 0.6, 0.1]);
+        assert_eq!(
+            (report.any, report.of_words, report.best_of_words),
+            (recall(2, 2, 1), recall(2, 2, 1), recall(2, 2, 1))
+        );
+        let report = found(vec![0.4, 0.1, 0.8]);
+        assert_eq!((report.of_words, report.best_of_words), (recall(2, 1, 0), recall(2, 2, 1)));
+        let report = found(vec![0.1, 0.45, 0.48]);
+        assert_eq!((report.of_words, report.best_of_words), (recall(2, 0, 0), recall(2, 1, 0)));
+    }
+}

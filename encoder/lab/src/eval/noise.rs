@@ -1,0 +1,198 @@
+//! How each way to aggregate falls with the errors of masks: true masks are damaged ([`MaskNoise`]), encoded
+//! once a level, and lifted once a way.
+
+use std::fmt;
+use std::path::PathBuf;
+use std::sync::atomic::AtomicBool;
+
+use serde::Serialize;
+use slag_common::splat::{self, SplatError};
+use slag_models::{ModelDir, ModelError, SessionOptions};
+
+use super::{EvalError, EvalSettings, Truth, TruthError, labelled, metrics::mean};
+use slag_encoder::encode::{self, EncodeError, EncodeSettings, Masks};
+use slag_encoder::lift::Aggregation;
+use slag_encoder::progress::Silent;
+use slag_encoder::raster::{CpuRasterizer, Rasterizer};
+use slag_encoder::segment::noise::MaskNoise;
+use slag_encoder::store::{StoreError, StoreReader};
+
+/// Why there is no table.
+#[derive(Debug, thiserror::Error)]
+pub enum NoiseError {
+    /// A folder is no labelled scene.
+    #[error(
+        "{}: no {missing}; expected a labelled scene: scene.ply or point_cloud.ply, transforms.json, gt/masks, \
+         as `generate scene` writes it", dir.display()
+    )]
+    NoScene {
+        /// The folder.
+        dir: PathBuf,
+        /// What is missing.
+        missing: &'static str,
+    },
+    /// A scene cannot be encoded.
+    #[error(transparent)]
+    Encode(#[from] Box<EncodeError>),
+    /// A store cannot be read.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// A splat cannot be read.
+    #[error(transparent)]
+    Splat(#[from] SplatError),
+    /// The labels cannot be used.
+    #[error(transparent)]
+    Truth(#[from] TruthError),
+    /// The text model cannot be opened.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// A store cannot be judged.
+    #[error(transparent)]
+    Eval(#[from] EvalError),
+    /// A folder cannot be made.
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+}
+
+/// What to compare.
+#[derive(Clone, Debug)]
+pub struct NoiseSettings {
+    /// Labelled scenes.
+    pub scenes: Vec<PathBuf>,
+    /// Levels of noise; none: masks from the segmenter that `encode` names, as they are.
+    pub levels: Vec<u8>,
+    /// Chooses the errors.
+    pub seed: u64,
+    /// Names and ways to aggregate.
+    pub methods: Vec<(String, Aggregation)>,
+    /// Where the stores go; what views leave behind is found again there by a later run.
+    pub out: PathBuf,
+    /// Everything else; scene, views, masks, store and noise are set by the comparison.
+    pub encode: EncodeSettings,
+}
+
+/// A scene's figures of one way at one level.
+#[derive(Clone, Debug, Serialize)]
+pub struct NoiseRow {
+    /// The scene's folder name.
+    pub scene: String,
+    /// Level of the errors; absent where masks are the segmenter's.
+    pub level: Option<u8>,
+    /// Name of the way.
+    pub method: String,
+    /// Mean intersection over union of the argmax over all categories.
+    pub miou: Option<f64>,
+    /// Mean accuracy of it.
+    pub macc: Option<f64>,
+    /// Mean average precision over words.
+    pub average_precision: Option<f64>,
+    /// Seconds that refining took, and computing embeddings.
+    pub refine_secs: f64,
+}
+
+/// The table.
+#[derive(Clone, Debug, Serialize)]
+pub struct NoiseReport {
+    /// The encoder.
+    pub encoder: String,
+    /// Which errors.
+    pub seed: u64,
+    /// What was compared.
+    pub methods: Vec<(String, Aggregation)>,
+    /// All figures.
+    pub rows: Vec<NoiseRow>,
+}
+
+/// Makes the table; what it has so far is given to `on_row` row by row.
+///
+/// # Errors
+/// [`NoiseError`].
+pub fn run(
+    settings: &NoiseSettings,
+    (models, session): (&ModelDir, &SessionOptions),
+    rasterizer: &dyn Rasterizer,
+    on_row: &mut dyn FnMut(&NoiseRow),
+    cancel: &AtomicBool,
+) -> Result<NoiseReport, NoiseError> {
+    let mut text = models.text_encoder(session)?;
+    let mut rows = Vec::new();
+    let levels: Vec<Option<u8>> = match settings.levels.is_empty() {
+        true => vec![None],
+        false => settings.levels.iter().copied().map(Some).collect(),
+    };
+    for dir in &settings.scenes {
+        let there = |names: &[&'static str]| -> Result<PathBuf, NoiseError> {
+            let found = names.iter().map(|name| dir.join(name)).find(|path| path.exists());
+            found.ok_or(NoiseError::NoScene { dir: dir.clone(), missing: names[0] })
+        };
+        let (splat_path, views) = (there(&["scene.ply", "point_cloud.ply"])?, there(&["transforms.json"])?);
+        let masks = there(&["gt/masks"])?;
+        let scene = splat::read(&splat_path, &splat::ReadOptions { with_sh_rest: false })?;
+        let mut truth = Truth::read(dir, scene.len())?;
+        // Judged in space alone: drawing every word on every view would take most of the time.
+        truth.views.clear();
+        let name = dir.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        for level in &levels {
+            let folder =
+                level.map_or("as-found".into(), |level| format!("level-{level}-seed-{}", settings.seed));
+            let store = settings.out.join(&name).join(folder);
+            fs_err::create_dir_all(&store)?;
+            for (method, aggregation) in &settings.methods {
+                let encode = EncodeSettings {
+                    scene: splat_path.clone(),
+                    views: views.clone(),
+                    masks: match level {
+                        Some(_) => Masks::Given { dir: masks.clone(), ignore_ids: Vec::new() },
+                        None => settings.encode.masks.clone(),
+                    },
+                    store: store.clone(),
+                    aggregation: *aggregation,
+                    mask_noise: level.map(|level| MaskNoise { level, seed: settings.seed }),
+                    keep_views: true,
+                    ..settings.encode.clone()
+                };
+                let summary = encode::encode(&encode, models, session, rasterizer, &Silent, cancel)
+                    .map_err(Box::new)?;
+                let reader = StoreReader::open(&store)?;
+                let report =
+                    labelled(&reader, &truth, &scene, &mut *text, &CpuRasterizer, &EvalSettings::default())?;
+                let secs = |stage: &str| summary.busy_secs.get(stage).copied().unwrap_or(0.0);
+                let whole = report.multi_class.first();
+                let row = NoiseRow {
+                    scene: name.clone(),
+                    level: *level,
+                    method: method.clone(),
+                    miou: whole.and_then(|all| all.miou),
+                    macc: whole.and_then(|all| all.macc),
+                    average_precision: report.mean_average_precision,
+                    refine_secs: secs("refine") + secs("lift"),
+                };
+                on_row(&row);
+                rows.push(row);
+            }
+        }
+    }
+    let encoder = models.encoder_id().to_string();
+    Ok(NoiseReport { encoder, seed: settings.seed, methods: settings.methods.clone(), rows })
+}
+
+impl fmt::Display for NoiseReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let mut levels: Vec<Option<u8>> = self.rows.iter().map(|row| row.level).collect();
+        levels.sort_unstable();
+        levels.dedup();
+        let heads = levels.iter().map(|level| level.map_or("as found".into(), |l| format!("level {l}")));
+        writeln!(f, "mIoU / mAcc, mean over scenes; errors of seed {}", self.seed)?;
+        writeln!(f, "{:<14}{}", "method", heads.map(|head| format!("{head:>16}")).collect::<String>())?;
+        for (method, _) in &self.methods {
+            let figure = |level: &Option<u8>| {
+                let rows = || self.rows.iter().filter(|row| row.method == *method && row.level == *level);
+                let show = |value: Option<f64>| value.map_or("-".into(), |v| format!("{v:.3}"));
+                let (miou, macc) = (mean(rows().map(|row| row.miou)), mean(rows().map(|row| row.macc)));
+                format!("{:>16}", format!("{} / {}", show(miou), show(macc)))
+            };
+            writeln!(f, "{method:<14}{}", levels.iter().map(figure).collect::<String>())?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,340 @@
+//! Public data sets' layouts, on a wall whose left half is red and whose right half is blue.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use glam::{DAffine3, DVec3};
+use serde_json::{Value, json};
+use slag_common::gaussians::SH_C0;
+use slag_common::shard::Profile;
+use slag_common::{Distortion, Gaussians, Intrinsics, poses, splat};
+use slag_models::{EncodeError, ModelDir, SessionOptions, TextEncoder};
+
+use super::lerf::{LerfLabels, lerf};
+use super::scannet::{Matching, Scan, ScannetReport, scannet};
+use super::*;
+use slag_encoder::cells::CellLimits;
+use slag_encoder::codebook::CodebookSettings;
+use slag_encoder::encode::{self, EncodeSettings, Masks};
+use slag_encoder::lift::Aggregation;
+use slag_encoder::progress::Silent;
+use slag_encoder::raster::CpuRasterizer;
+use slag_encoder::shard::ShardSettings;
+use slag_encoder::shard::positions::PositionError;
+
+/// Gaussians across and down, 0.1 m apart, 2 m in front of the camera.
+const COLUMNS: usize = 24;
+const ROWS: usize = 16;
+const PHOTO_PX: [u32; 2] = [320, 240];
+
+/// What is encoded once for all tests here.
+struct Wall {
+    dir: tempfile::TempDir,
+    gaussians: Gaussians,
+    views: PathBuf,
+}
+
+impl Wall {
+    fn new() -> Self {
+        let dir = tempfile::tempdir().expect("a folder");
+        let mut gaussians = Gaussians::default();
+        for i in 0..COLUMNS * ROWS {
+            let (x, y) = ((i % COLUMNS) as f64 * 0.1 - 1.15, (i / COLUMNS) as f64 * 0.1 - 0.75);
+            gaussians.means_in_world.push(DVec3::new(x, y, 2.0));
+            gaussians.scales.push([0.05, 0.05, 0.002]);
+            gaussians.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+            gaussians.opacities.push(0.99);
+            let rgb = if x < 0.0 { [0.85, 0.08, 0.06] } else { [0.06, 0.1, 0.85] };
+            gaussians.sh_dc.push(rgb.map(|c: f32| (c - 0.5) / SH_C0));
+        }
+        let scene = dir.path().join("scene.ply");
+        splat::ply::write(&scene, &gaussians).expect("writes");
+        let mut frames = Vec::new();
+        for folder in ["images", "masks"] {
+            fs_err::create_dir_all(dir.path().join(folder)).expect("makes");
+        }
+        for (number, x) in [(1, 0.0), (2, 0.1)] {
+            let view = RasterView {
+                camera_from_world: DAffine3::from_translation(DVec3::new(-x, 0.0, 0.0)),
+                intrinsics: camera(),
+            };
+            let drawing = CpuRasterizer.draw(&gaussians, &view, [0.5; 3]).expect("draws");
+            let bytes = drawing.rgb.iter().map(|c| (c.clamp(0.0, 1.0) * 255.0) as u8).collect();
+            let photo = image::RgbImage::from_raw(PHOTO_PX[0], PHOTO_PX[1], bytes).expect("its size");
+            let name = format!("frame_{number:05}.png");
+            photo.save(dir.path().join("images").join(&name)).expect("writes");
+            let middle = 160 - (x * 100.0) as u32;
+            let mask = image::GrayImage::from_fn(PHOTO_PX[0], PHOTO_PX[1], |px, py| {
+                let on_wall = (middle - 120..middle + 120).contains(&px) && (40..200).contains(&py);
+                image::Luma([if !on_wall { 0 } else { 1 + u8::from(px >= middle) }])
+            });
+            mask.save(dir.path().join("masks").join(&name)).expect("writes");
+            // Nerfstudio's axes: y up, z backwards.
+            let matrix = json!([[1, 0, 0, x], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]);
+            frames.push(json!({"file_path": format!("images/{name}"), "transform_matrix": matrix}));
+        }
+        let Intrinsics { focal_x_px, focal_y_px, centre_x_px, centre_y_px, .. } = camera();
+        let views = dir.path().join("transforms.json");
+        let poses = json!({"w": PHOTO_PX[0], "h": PHOTO_PX[1], "fl_x": focal_x_px, "fl_y": focal_y_px,
+            "cx": centre_x_px, "cy": centre_y_px, "frames": frames});
+        fs_err::write(&views, poses.to_string()).expect("writes");
+        let settings = EncodeSettings {
+            masks: Masks::Given { dir: dir.path().join("masks"), ignore_ids: Vec::new() },
+            min_mask_px: 10,
+            threads: 1,
+            memory_bytes: 1 << 28,
+            strict: true,
+            aggregation: Aggregation::PAPER,
+            objects: false,
+            cells: CellLimits { max_gaussians: 4096, max_width: None },
+            shards: ShardSettings {
+                profiles: vec![Profile::Compact],
+                codebook: CodebookSettings::default(),
+                position_error: PositionError::Within(0.01),
+            },
+            ..EncodeSettings::new(scene, views.clone(), dir.path().join("store"), true)
+        };
+        let session = SessionOptions::new(PathBuf::new());
+        let cancel = AtomicBool::new(false);
+        encode::encode(&settings, &ModelDir::colours(), &session, &CpuRasterizer, &Silent, &cancel)
+            .expect("encodes");
+        Self { dir, gaussians, views }
+    }
+
+    fn reader(&self) -> StoreReader {
+        StoreReader::open(&self.dir.path().join("store")).expect("published")
+    }
+
+    fn folder(&self, name: &str) -> PathBuf {
+        let path = self.dir.path().join(name);
+        fs_err::create_dir_all(&path).expect("makes");
+        path
+    }
+}
+
+fn camera() -> Intrinsics {
+    Intrinsics {
+        width_px: PHOTO_PX[0],
+        height_px: PHOTO_PX[1],
+        focal_x_px: 200.0,
+        focal_y_px: 200.0,
+        centre_x_px: 160.0,
+        centre_y_px: 120.0,
+        distortion: Distortion::None,
+    }
+}
+
+/// The built-in colours under other words.
+struct Renamed(Box<dyn TextEncoder>, BTreeMap<&'static str, &'static str>);
+
+impl TextEncoder for Renamed {
+    fn name(&self) -> &str {
+        self.0.name()
+    }
+
+    fn dim(&self) -> usize {
+        self.0.dim()
+    }
+
+    fn encode(&mut self, text: &str) -> Result<Vec<f32>, EncodeError> {
+        self.0.encode(self.1.get(text).copied().unwrap_or(text))
+    }
+}
+
+fn renamed(words: &[(&'static str, &'static str)]) -> Renamed {
+    let session = SessionOptions::new(PathBuf::new());
+    let encoder = ModelDir::colours().text_encoder(&session).expect("needs no runtime");
+    Renamed(encoder, words.iter().copied().collect())
+}
+
+fn rectangle(category: &str, [x1, y1, x2, y2]: [u32; 4]) -> Value {
+    json!({"category": category, "bbox": [x1, y1, x2, y2],
+        "segmentation": [[x1, y1], [x2, y1], [x2, y2], [x1, y2]]})
+}
+
+fn label(dir: &Path, name: &str, size: [u32; 2], objects: &[Value]) {
+    let label = json!({"info": {"name": format!("{name}.jpg"), "width": size[0], "height": size[1]},
+        "objects": objects});
+    fs_err::write(dir.join(format!("{name}.json")), label.to_string()).expect("writes");
+}
+
+/// The wall's left half is red: a label that says so is met, one that says blue is not; a word that the encoder does
+/// not know is not found; a frame without a pose is named. Half of the labels are of photos twice as large.
+#[test]
+fn lerf_labels_are_judged_on_their_frames() {
+    let wall = Wall::new();
+    let dir = wall.folder("label");
+    let objects = [
+        rectangle("red", [40, 40, 159, 199]),
+        rectangle("blue", [40, 40, 159, 199]),
+        rectangle("chair", [0, 0, 30, 30]),
+    ];
+    label(&dir, "frame_00001", PHOTO_PX, &objects);
+    // Two parts of one thing; the camera stands 10 px farther to the right.
+    let parts = [rectangle("blue", [300, 80, 400, 399]), rectangle("blue", [400, 80, 539, 399])];
+    label(&dir, "frame_00002", [640, 480], &parts);
+    label(&dir, "frame_00009", PHOTO_PX, &objects);
+    let views = poses::read(&wall.views, None).expect("poses").views;
+    let labels = LerfLabels::read(&dir, &views).expect("labels");
+    let settings = EvalSettings::default();
+    let report = lerf(&wall.reader(), &labels, &wall.gaussians, &mut renamed(&[]), &CpuRasterizer, &settings)
+        .expect("judges");
+    println!("{report}");
+    let of = |frame: &str, word: &str| {
+        let found = report.things.iter().find(|t| t.frame == frame && t.category == word).expect("judged");
+        (found.iou, found.localised)
+    };
+    let (iou, localised) = of("frame_00001", "red");
+    assert!(iou > 0.85 && localised, "{iou}");
+    let (iou, localised) = of("frame_00001", "blue");
+    assert!(iou < 0.1 && !localised, "{iou}");
+    let (iou, localised) = of("frame_00002", "blue");
+    assert!(iou > 0.85 && localised, "{iou}");
+    assert_eq!(of("frame_00001", "chair"), (0.0, false));
+    assert_eq!(report.things.len(), 4);
+    let mean = report.things.iter().map(|t| t.iou).sum::<f64>() / 4.0;
+    assert!((report.miou.expect("a mean") - mean).abs() < 1e-12, "the unknown word is in the mean");
+    assert_eq!((report.accuracy_at_50, report.localised), (Some(0.5), Some(0.5)));
+    assert_eq!(report.frames_without_view, ["frame_00009"]);
+    assert_eq!(report.unknown_words.keys().collect::<Vec<_>>(), ["chair"]);
+    assert!(report.to_string().contains("left out, no pose: frame_00009"));
+
+    // Nothing can be asked: an error rather than a mean of nothing.
+    let only = EvalSettings { words: vec!["chair".into()], ..EvalSettings::default() };
+    let judged = lerf(&wall.reader(), &labels, &wall.gaussians, &mut renamed(&[]), &CpuRasterizer, &only);
+    assert!(matches!(judged, Err(EvalError::NoWords { n: 1, .. })));
+    // Another splat than the one that was encoded.
+    let mut other = wall.gaussians.clone();
+    other.means_in_world.pop();
+    let judged = lerf(&wall.reader(), &labels, &other, &mut renamed(&[]), &CpuRasterizer, &settings);
+    assert!(matches!(judged, Err(EvalError::Scene { n_store: 384, n_scene: 383 })));
+}
+
+#[test]
+fn wrong_lerf_labels_are_named() {
+    let wall = Wall::new();
+    let views = poses::read(&wall.views, None).expect("poses").views;
+    let dir = wall.folder("wrong");
+    let message = |dir: &Path| LerfLabels::read(dir, &views).expect_err("wrong").to_string();
+    assert!(message(&dir).contains("no frame_*.json"), "{}", message(&dir));
+    label(&dir, "frame_00007", PHOTO_PX, &[]);
+    assert!(message(&dir).contains("none of 1 labelled frames has a pose, the first is frame_00007"));
+    label(&dir, "frame_00001", [320, 200], &[]);
+    assert!(message(&dir).contains("frame_00001.json: 320 x 200 pixels of a view of [320, 240]"));
+    label(&dir, "frame_00001", [u32::MAX, u32::MAX], &[]);
+    assert!(message(&dir).contains("4294967295"), "{}", message(&dir));
+    label(&dir, "frame_00001", PHOTO_PX, &[json!({"category": "red", "bbox": [1, 2]})]);
+    assert!(message(&dir).contains("frame_00001.json") && message(&dir).contains("expected info"));
+}
+
+/// Vertices just in front of the wall: left wall, right floor; five far away; some that no class has.
+fn vertices() -> Vec<([f64; 3], u16)> {
+    let on_wall = (0..COLUMNS * ROWS).map(|i| {
+        let (x, y) = ((i % COLUMNS) as f64 * 0.1 - 1.15, (i / COLUMNS) as f64 * 0.1 - 0.75);
+        ([x + 0.01, y, 1.98], if x < 0.0 { 1 } else { 2 })
+    });
+    let far = (0..5).map(|i| ([f64::from(i), 0.0, 9.0], 1));
+    on_wall.chain(far).chain([([0.0, 0.0, 2.0], 0), ([0.0, 0.0, 2.0], 38)]).collect()
+}
+
+fn write_mesh(path: &Path, rows: &[([f64; 3], u16)], with_labels: bool) {
+    let mut text = format!("ply\nformat ascii 1.0\nelement vertex {}\n", rows.len());
+    text += "property float x\nproperty float y\nproperty float z\n";
+    text += if with_labels { "property ushort label\n" } else { "" };
+    text += "element face 1\nproperty list uchar int vertex_indices\nend_header\n";
+    for ([x, y, z], label) in rows {
+        text += &format!("{x} {y} {z}{}\n", if with_labels { format!(" {label}") } else { String::new() });
+    }
+    fs_err::write(path, text + "3 0 1 2\n").expect("writes");
+}
+
+/// By hand: all 192 + 192 vertices on the wall are right; five of the class wall are out of reach and count as wrong.
+#[test]
+fn scans_are_judged_by_the_protocol() {
+    let wall = Wall::new();
+    let dir = wall.folder("scene0062_00");
+    write_mesh(&dir.join("scene0062_00_vh_clean_2.labels.ply"), &vertices(), true);
+    let scan = Scan::read(&dir, None).expect("a scan");
+    let mut encoder = renamed(&[("wall", "red"), ("floor", "blue"), ("toilet", "green")]);
+    let settings = EvalSettings::default();
+    let judged = scannet(&wall.reader(), &scan, &wall.gaussians, &mut encoder, Matching::Nearest, &settings);
+    let report = judged.expect("judges");
+    assert_eq!((report.n_labelled, report.n_without_answer), (192 * 2 + 5, 5));
+    for subset in &report.subsets {
+        assert_eq!(subset.n_classes, 2);
+        assert!(
+            (subset.miou.expect("two classes") - (192.0 / 197.0 + 1.0) / 2.0).abs() < 1e-12,
+            "{subset:?}"
+        );
+        assert!(
+            (subset.macc.expect("two classes") - (192.0 / 197.0 + 1.0) / 2.0).abs() < 1e-12,
+            "{subset:?}"
+        );
+    }
+    assert_eq!(report.unknown_words.len(), 16);
+    let all = ScannetReport::new(vec![report]);
+    assert_eq!(all.missing_scenes.len(), 9);
+    assert!(all.to_string().contains("not the protocol's mean: without scene0000_00"), "{all}");
+    assert!(all.to_string().contains("5 of 389 labelled vertices have no answer"), "{all}");
+
+    // Words the wrong way round: nothing is right.
+    let mut swapped = renamed(&[("wall", "blue"), ("floor", "red")]);
+    let judged = scannet(&wall.reader(), &scan, &wall.gaussians, &mut swapped, Matching::Nearest, &settings);
+    assert_eq!(judged.expect("judges").subsets[0].miou, Some(0.0));
+    let none =
+        scannet(&wall.reader(), &scan, &wall.gaussians, &mut renamed(&[]), Matching::Nearest, &settings);
+    assert!(matches!(none, Err(EvalError::NoWords { n: 19, .. })));
+
+    // One by one: only with as many vertices, and without the transparent ones.
+    let judged = scannet(&wall.reader(), &scan, &wall.gaussians, &mut encoder, Matching::Index, &settings);
+    let message = judged.expect_err("another length").to_string();
+    assert!(message.contains("391 vertices, the splat has 384 Gaussians"), "{message}");
+    write_mesh(&dir.join("scene0062_00_vh_clean_2.labels.ply"), &vertices()[..COLUMNS * ROWS], true);
+    let scan = Scan::read(&dir, None).expect("a scan");
+    let mut faint = wall.gaussians.clone();
+    faint.opacities[..40].fill(0.05);
+    let judged =
+        scannet(&wall.reader(), &scan, &faint, &mut encoder, Matching::Index, &settings).expect("judges");
+    assert_eq!((judged.n_labelled, judged.subsets[2].miou), (COLUMNS * ROWS - 40, Some(1.0)));
+}
+
+/// The same labels from segments, their groups and the table of categories.
+#[test]
+fn segments_and_groups_give_the_labels() {
+    let wall = Wall::new();
+    let dir = wall.folder("scene0070_00");
+    let rows = vertices();
+    let name = |end: &str| dir.join(format!("scene0070_00{end}"));
+    let table = dir.join("labels.tsv");
+    let read = || Scan::read(&dir, Some(&table));
+    let failed = |what: &str| {
+        let message = read().expect_err("wrong").to_string();
+        assert!(message.contains(what), "{message}");
+    };
+    assert!(Scan::read(&dir, None).expect_err("no labels").to_string().contains("--categories"));
+    fs_err::write(&table, "id\tcategory\n1\twall\n").expect("writes");
+    failed("no columns raw_category and nyu40id");
+    fs_err::write(&table, "id\traw_category\tcategory\tnyu40id\n1\twall\twall\t1\n2\trug\trug\t2\n3\tx\n")
+        .expect("writes");
+    write_mesh(&name("_vh_clean_2.ply"), &rows, false);
+    // A segment a label: 11 for 1, 12 for 2, 48 for 38 (a group that the table lacks); 10 belongs to no group.
+    let segments: Vec<u16> = rows.iter().map(|(_, label)| label + 10).collect();
+    fs_err::write(name("_vh_clean_2.0.010000.segs.json"), json!({"segIndices": segments[1..]}).to_string())
+        .expect("writes");
+    failed("390 segments, expected one for each of 391 vertices");
+    fs_err::write(name("_vh_clean_2.0.010000.segs.json"), json!({"segIndices": segments}).to_string())
+        .expect("writes");
+    failed("aggregation.json");
+    let groups = json!({"segGroups": [{"label": "wall", "segments": [11]}, {"label": "rug", "segments": [12]},
+        {"label": "thing", "segments": [48]}]});
+    fs_err::write(name(".aggregation.json"), groups.to_string()).expect("writes");
+    let scan = read().expect("a scan");
+    let expected: Vec<u16> = rows.iter().map(|(_, label)| if *label == 38 { 0 } else { *label }).collect();
+    assert_eq!(scan.labels, expected);
+    assert_eq!(scan.unknown_labels, BTreeMap::from([("thing".to_owned(), 1)]));
+    assert_eq!(scan.vertices.len(), rows.len());
+
+    write_mesh(&name("_vh_clean_2.labels.ply"), &[([0.0; 3], 41)], true);
+    failed("label 41, expected 0 to 40");
+}

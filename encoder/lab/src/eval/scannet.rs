@@ -1,0 +1,467 @@
+//! ScanNet v2 (Dai et al. 2017) with the protocol of OpenGaussian (Wu et al. 2024): ten scenes, 19, 15 and 10 classes,
+//! argmax over the classes' words, means over the classes that a scene has.
+//!
+//! ```text
+//! SCAN/NAME_vh_clean_2.labels.ply               vertices x y z label (NYU40); or, with the table of categories:
+//! SCAN/NAME_vh_clean_2.ply                      vertices x y z
+//! SCAN/NAME_vh_clean_2.0.010000.segs.json       segIndices: the segment of each vertex
+//! SCAN/NAME.aggregation.json                    segGroups [{label, segments}]
+//! scannetv2-labels.combined.tsv                 raw_category ... nyu40id
+//! ```
+//!
+//! OpenGaussian trains with Gaussians fixed to the mesh's vertices and compares one by one; other splats give each
+//! vertex the answer of the nearest Gaussian. Gaussians with an opacity below [`MIN_OPACITY`] do not count there, as in
+//! its `scripts/eval_scannet.py`.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+use slag_common::Gaussians;
+use slag_common::splat::SplatError;
+use slag_common::splat::ply::read_vertices;
+use slag_models::TextEncoder;
+
+use super::metrics::{Confusion, mean};
+use super::{EvalError, EvalSettings, Subset};
+use slag_encoder::query;
+use slag_encoder::store::StoreReader;
+
+/// The protocol's scenes.
+pub const SCENES: [&str; 10] = [
+    "scene0000_00",
+    "scene0062_00",
+    "scene0070_00",
+    "scene0097_00",
+    "scene0140_00",
+    "scene0200_00",
+    "scene0347_00",
+    "scene0400_00",
+    "scene0590_00",
+    "scene0645_00",
+];
+/// NYU40 ids and words of the 19 classes.
+const CLASSES: [(u16, &str); 19] = [
+    (1, "wall"),
+    (2, "floor"),
+    (3, "cabinet"),
+    (4, "bed"),
+    (5, "chair"),
+    (6, "sofa"),
+    (7, "table"),
+    (8, "door"),
+    (9, "window"),
+    (10, "bookshelf"),
+    (11, "picture"),
+    (12, "counter"),
+    (14, "desk"),
+    (16, "curtain"),
+    (24, "refrigerator"),
+    (28, "shower curtain"),
+    (33, "toilet"),
+    (34, "sink"),
+    (36, "bathtub"),
+];
+/// Ids of the 15 classes, and of the 10.
+const IDS_OF_15: [u16; 15] = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 33, 34];
+const IDS_OF_10: [u16; 10] = [1, 2, 4, 5, 6, 7, 8, 9, 10, 33];
+/// Gaussians that are more transparent take no part.
+const MIN_OPACITY: f32 = 0.1;
+/// A vertex farther from every Gaussian has no answer.
+const MAX_DISTANCE_M: f64 = 0.1;
+/// Largest NYU40 id.
+const MAX_ID: u16 = 40;
+
+/// Why a scan cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ScanError {
+    /// A file could not be read.
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+    /// A mesh cannot be read.
+    #[error(transparent)]
+    Mesh(#[from] SplatError),
+    /// A file is not as expected.
+    #[error("{}: {what}", path.display())]
+    Wrong {
+        /// The file.
+        path: PathBuf,
+        /// What was found, expected, and is to be done.
+        what: String,
+    },
+    /// Gaussians cannot be compared one by one.
+    #[error(
+        "{}: {n_vertices} vertices, the splat has {n_gaussians} Gaussians; only a splat that was trained with its \
+         Gaussians fixed to the vertices can be compared one by one, leave --by-index out", dir.display()
+    )]
+    Length {
+        /// The scan.
+        dir: PathBuf,
+        /// Its vertices.
+        n_vertices: usize,
+        /// Gaussians of the splat.
+        n_gaussians: usize,
+    },
+}
+
+/// A labelled mesh.
+#[derive(Clone, Debug)]
+pub struct Scan {
+    /// The scene's name.
+    pub name: String,
+    dir: PathBuf,
+    /// The vertices, world frame, metres.
+    pub vertices: Vec<[f64; 3]>,
+    /// `[N]`: NYU40 id of each, 0 where there is none.
+    pub labels: Vec<u16>,
+    /// Labels of segments that the table of categories does not have: their vertices count as not labelled.
+    pub unknown_labels: BTreeMap<String, usize>,
+}
+
+#[derive(Deserialize)]
+struct Segments {
+    #[serde(rename = "segIndices")]
+    of_vertex: Vec<u32>,
+}
+
+#[derive(Deserialize)]
+struct Aggregation {
+    #[serde(rename = "segGroups")]
+    groups: Vec<Group>,
+}
+
+#[derive(Deserialize)]
+struct Group {
+    label: String,
+    segments: Vec<u32>,
+}
+
+impl Scan {
+    /// Reads a scan; `categories`: the data set's table, where there is no labelled mesh.
+    ///
+    /// # Errors
+    /// [`ScanError`].
+    pub fn read(dir: &Path, categories: Option<&Path>) -> Result<Self, ScanError> {
+        let name = dir.canonicalize()?.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let scan = |vertices, labels, unknown_labels| Self {
+            name: name.clone(),
+            dir: dir.to_owned(),
+            vertices,
+            labels,
+            unknown_labels,
+        };
+        let path = dir.join(format!("{name}_vh_clean_2.labels.ply"));
+        if !path.is_file() {
+            let Some(categories) = categories else {
+                let what = "is not there; give it, or scannetv2-labels.combined.tsv with --categories".into();
+                return Err(ScanError::Wrong { path, what });
+            };
+            return Self::of_segments(dir, &name, categories).map(|(v, l, u)| scan(v, l, u));
+        }
+        let rows = read_vertices(&path, ["x", "y", "z", "label"])?;
+        if let Some(row) = rows.iter().find(|row| !(0.0..=f64::from(MAX_ID)).contains(&row[3])) {
+            let what =
+                format!("label {}, expected 0 to {MAX_ID} (NYU40); take the file of the v2 release", row[3]);
+            return Err(ScanError::Wrong { path, what });
+        }
+        let (vertices, labels) = rows.iter().map(|[x, y, z, label]| ([*x, *y, *z], *label as u16)).unzip();
+        Ok(scan(vertices, labels, BTreeMap::new()))
+    }
+
+    #[expect(clippy::type_complexity, reason = "what a scan is made of, once")]
+    fn of_segments(
+        dir: &Path,
+        name: &str,
+        categories: &Path,
+    ) -> Result<(Vec<[f64; 3]>, Vec<u16>, BTreeMap<String, usize>), ScanError> {
+        let wrong = |path: &Path, what: String| ScanError::Wrong { path: path.to_owned(), what };
+        let id_of = read_categories(categories)?;
+        let vertices = read_vertices(&dir.join(format!("{name}_vh_clean_2.ply")), ["x", "y", "z"])?;
+        let path = dir.join(format!("{name}_vh_clean_2.0.010000.segs.json"));
+        let segments: Segments = serde_json::from_slice(&fs_err::read(&path)?)
+            .map_err(|error| wrong(&path, format!("{error}; expected segIndices, one a vertex")))?;
+        if segments.of_vertex.len() != vertices.len() {
+            let what = format!(
+                "{} segments, expected one for each of {} vertices; take both files of one release",
+                segments.of_vertex.len(),
+                vertices.len()
+            );
+            return Err(wrong(&path, what));
+        }
+        let path =
+            [".aggregation.json", "_vh_clean.aggregation.json"].map(|end| dir.join(format!("{name}{end}")));
+        let path = path.iter().find(|path| path.is_file()).unwrap_or(&path[0]);
+        let aggregation: Aggregation = serde_json::from_slice(&fs_err::read(path)?).map_err(|error| {
+            wrong(path, format!("{error}; expected segGroups, each with label and segments"))
+        })?;
+        let mut id_of_segment: HashMap<u32, u16> = HashMap::new();
+        let mut unknown: HashMap<u32, &str> = HashMap::new();
+        for group in &aggregation.groups {
+            for segment in &group.segments {
+                match id_of.get(&group.label) {
+                    Some(id) => drop(id_of_segment.insert(*segment, *id)),
+                    None => drop(unknown.insert(*segment, &group.label)),
+                }
+            }
+        }
+        let mut unknown_labels: BTreeMap<String, usize> = BTreeMap::new();
+        for segment in &segments.of_vertex {
+            if let Some(label) = unknown.get(segment) {
+                *unknown_labels.entry((*label).to_owned()).or_default() += 1;
+            }
+        }
+        let labels = segments.of_vertex.iter().map(|s| id_of_segment.get(s).copied().unwrap_or(0)).collect();
+        Ok((vertices, labels, unknown_labels))
+    }
+}
+
+/// Reads which NYU40 id each of the annotators' categories has.
+fn read_categories(path: &Path) -> Result<HashMap<String, u16>, ScanError> {
+    let wrong = |what: &str| ScanError::Wrong { path: path.to_owned(), what: what.to_owned() };
+    let text = fs_err::read_to_string(path)?;
+    let mut lines = text.lines();
+    let head: Vec<&str> = lines.next().unwrap_or_default().split('\t').collect();
+    let column = |name: &str| head.iter().position(|found| *found == name);
+    let (Some(raw), Some(id)) = (column("raw_category"), column("nyu40id")) else {
+        return Err(wrong("no columns raw_category and nyu40id; give scannetv2-labels.combined.tsv"));
+    };
+    let row = |line: &str| {
+        let cells: Vec<&str> = line.split('\t').collect();
+        let id = cells.get(id)?.parse().ok().filter(|id| *id <= MAX_ID)?;
+        Some(((*cells.get(raw)?).to_owned(), id))
+    };
+    Ok(lines.filter_map(row).collect())
+}
+
+/// Which Gaussian answers for a vertex.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Matching {
+    /// The one with the vertex's number.
+    Index,
+    /// The nearest.
+    Nearest,
+}
+
+/// Figures of a scene.
+#[derive(Clone, Debug, Serialize)]
+pub struct ScanReport {
+    /// The scene.
+    pub scene: String,
+    /// 19, 15 and 10 classes; `n_classes` are those that the scene has.
+    pub subsets: Vec<Subset>,
+    /// Labelled vertices of the 19 classes.
+    pub n_labelled: usize,
+    /// Of these, without an answer: no Gaussian near, or one without evidence. They count as wrong.
+    pub n_without_answer: usize,
+    /// Labels that the table of categories does not have, and their vertices: not counted.
+    pub unknown_labels: BTreeMap<String, usize>,
+    /// Classes whose words the encoder does not know, and why: they count as never found.
+    pub unknown_words: BTreeMap<String, String>,
+}
+
+/// Figures of several scenes.
+#[derive(Clone, Debug, Serialize)]
+pub struct ScannetReport {
+    /// Each.
+    pub scenes: Vec<ScanReport>,
+    /// Means over the scenes, of 19, 15 and 10 classes.
+    pub means: Vec<Subset>,
+    /// Scenes of the protocol that are not among them.
+    pub missing_scenes: Vec<&'static str>,
+}
+
+/// Evaluates a store against a labelled mesh. `scene`: the splat that was encoded, in the mesh's frame.
+///
+/// # Errors
+/// [`EvalError`].
+pub fn scannet(
+    reader: &StoreReader,
+    scan: &Scan,
+    scene: &Gaussians,
+    encoder: &mut dyn TextEncoder,
+    matching: Matching,
+    settings: &EvalSettings,
+) -> Result<ScanReport, EvalError> {
+    super::check_scene(reader, scene)?;
+    let gaussian_of = match matching {
+        Matching::Index => by_index(scan, scene)?,
+        Matching::Nearest => by_distance(scan, scene),
+    };
+    let mut unknown_words = BTreeMap::new();
+    let mut first_error = None;
+    let mut scores: Vec<Option<Vec<f32>>> = Vec::new();
+    for (_, word) in CLASSES {
+        let vector = match encoder.encode(word) {
+            Ok(vector) => vector,
+            Err(error) => {
+                unknown_words.insert(word.to_owned(), error.to_string());
+                first_error.get_or_insert((word.to_owned(), error));
+                scores.push(None);
+                continue;
+            }
+        };
+        scores.push(Some(match settings.profile {
+            Some(profile) => query::scores_of_shards(reader, &vector, profile)?.cosines,
+            None => query::scores(reader, &vector)?.cosines,
+        }));
+    }
+    if let (true, Some((first, source))) = (scores.iter().all(Option::is_none), first_error) {
+        return Err(EvalError::NoWords { n: CLASSES.len(), first, source: Box::new(source) });
+    }
+    let score = |class: usize, gaussian: usize| {
+        let of_class = scores[class].as_ref()?;
+        of_class.get(gaussian).copied().filter(|score| !score.is_nan())
+    };
+    let ids_of_19 = CLASSES.map(|(id, _)| id);
+    let subsets = [&ids_of_19[..], &IDS_OF_15, &IDS_OF_10].map(|ids| {
+        let classes: Vec<usize> = CLASSES
+            .iter()
+            .enumerate()
+            .filter(|(_, (id, _))| ids.contains(id))
+            .map(|(class, _)| class)
+            .collect();
+        let mut confusion = Confusion::new(CLASSES.len());
+        for (label, gaussian) in scan.labels.iter().zip(&gaussian_of) {
+            let truth = classes.iter().copied().find(|class| CLASSES[*class].0 == *label);
+            let (Some(truth), Some(gaussian)) = (truth, gaussian.counted()) else { continue };
+            let answer = gaussian.and_then(|gaussian| {
+                let answers = classes.iter().filter_map(|class| Some((*class, score(*class, gaussian)?)));
+                answers.max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)))
+            });
+            confusion.count(truth, answer.map(|(class, _)| class));
+        }
+        // As the protocol: means over what the scene has.
+        let there: Vec<usize> =
+            classes.into_iter().filter(|class| confusion.accuracy(*class).is_some()).collect();
+        Subset {
+            n_classes: there.len(),
+            miou: mean(there.iter().map(|class| confusion.iou(*class))),
+            macc: mean(there.iter().map(|class| confusion.accuracy(*class))),
+        }
+    });
+    let counted = scan.labels.iter().zip(&gaussian_of).filter(|(label, _)| ids_of_19.contains(label));
+    let counted: Vec<Option<usize>> = counted.filter_map(|(_, gaussian)| gaussian.counted()).collect();
+    let has_answer = |gaussian: &Option<usize>| {
+        gaussian.is_some_and(|gaussian| (0..CLASSES.len()).any(|class| score(class, gaussian).is_some()))
+    };
+    Ok(ScanReport {
+        scene: scan.name.clone(),
+        subsets: subsets.into(),
+        n_labelled: counted.len(),
+        n_without_answer: counted.iter().filter(|gaussian| !has_answer(gaussian)).count(),
+        unknown_labels: scan.unknown_labels.clone(),
+        unknown_words,
+    })
+}
+
+/// Who answers for a vertex.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Answerer {
+    /// A Gaussian.
+    Gaussian(usize),
+    /// Nobody, which is wrong.
+    Nobody,
+    /// The vertex is left out.
+    LeftOut,
+}
+
+impl Answerer {
+    /// Returns `None` where the vertex is left out, and else the Gaussian, if there is one.
+    fn counted(self) -> Option<Option<usize>> {
+        match self {
+            Self::Gaussian(gaussian) => Some(Some(gaussian)),
+            Self::Nobody => Some(None),
+            Self::LeftOut => None,
+        }
+    }
+}
+
+fn by_index(scan: &Scan, scene: &Gaussians) -> Result<Vec<Answerer>, ScanError> {
+    let (n_vertices, n_gaussians) = (scan.vertices.len(), scene.len());
+    if n_vertices != n_gaussians {
+        return Err(ScanError::Length { dir: scan.dir.clone(), n_vertices, n_gaussians });
+    }
+    let answerer = |k: usize| match scene.opacities[k] < MIN_OPACITY {
+        true => Answerer::LeftOut,
+        false => Answerer::Gaussian(k),
+    };
+    Ok((0..n_gaussians).map(answerer).collect())
+}
+
+fn by_distance(scan: &Scan, scene: &Gaussians) -> Vec<Answerer> {
+    let counts = |k: &usize| scene.is_usable(*k) && scene.opacities[*k] >= MIN_OPACITY;
+    // Cubes as wide as the reach: what is near enough lies in a vertex's own or in one that touches it.
+    let cube_of = |point: DVec3| (point / MAX_DISTANCE_M).floor().to_array().map(|v| v as i64);
+    let mut cubes: HashMap<[i64; 3], Vec<usize>> = HashMap::new();
+    for k in (0..scene.len()).filter(counts) {
+        cubes.entry(cube_of(scene.means_in_world[k])).or_default().push(k);
+    }
+    let nearest = |vertex: &[f64; 3]| {
+        let vertex = DVec3::from_array(*vertex);
+        let [x, y, z] = cube_of(vertex);
+        let steps =
+            || (-1..=1).flat_map(|dx| (-1..=1).flat_map(move |dy| (-1..=1).map(move |dz| [dx, dy, dz])));
+        let near = steps().filter_map(|[dx, dy, dz]| {
+            cubes.get(&[x.saturating_add(dx), y.saturating_add(dy), z.saturating_add(dz)])
+        });
+        let distances = near.flatten().map(|k| (scene.means_in_world[*k].distance_squared(vertex), *k));
+        // Of equally near ones the first.
+        let (distance2, k) = distances.min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)))?;
+        (distance2 <= MAX_DISTANCE_M * MAX_DISTANCE_M).then_some(k)
+    };
+    scan.vertices.iter().map(|vertex| nearest(vertex).map_or(Answerer::Nobody, Answerer::Gaussian)).collect()
+}
+
+impl ScannetReport {
+    /// Takes the means over scenes.
+    pub fn new(scenes: Vec<ScanReport>) -> Self {
+        let means = (0..3)
+            .map(|subset| Subset {
+                n_classes: [CLASSES.len(), IDS_OF_15.len(), IDS_OF_10.len()][subset],
+                miou: mean(scenes.iter().map(|scene| scene.subsets[subset].miou)),
+                macc: mean(scenes.iter().map(|scene| scene.subsets[subset].macc)),
+            })
+            .collect();
+        let missing_scenes =
+            SCENES.into_iter().filter(|name| !scenes.iter().any(|s| s.scene == *name)).collect();
+        Self { scenes, means, missing_scenes }
+    }
+}
+
+impl fmt::Display for ScannetReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let show = |value: Option<f64>| value.map_or("-".into(), |v| format!("{v:.3}"));
+        let figures = |subsets: &[Subset]| {
+            let figures = subsets.iter().map(|s| format!("{:>7} {:>7}", show(s.miou), show(s.macc)));
+            figures.collect::<Vec<_>>().join(" |")
+        };
+        writeln!(f, "{:<16} {}", "", ["  19 classes    ", "   15 classes    ", "   10 classes"].concat())?;
+        writeln!(f, "{:<16} {}", "scene", ["   mIoU    mAcc"; 3].join(" |"))?;
+        for scene in &self.scenes {
+            writeln!(f, "{:<16} {}", scene.scene, figures(&scene.subsets))?;
+        }
+        writeln!(f, "{:<16} {}", "mean", figures(&self.means))?;
+        for scene in &self.scenes {
+            if scene.n_without_answer > 0 {
+                let (n, of) = (scene.n_without_answer, scene.n_labelled);
+                writeln!(
+                    f,
+                    "{}: {n} of {of} labelled vertices have no answer and count as wrong",
+                    scene.scene
+                )?;
+            }
+            for (label, n) in &scene.unknown_labels {
+                writeln!(f, "{}: {n} vertices left out, the categories have no {label:?}", scene.scene)?;
+            }
+            for (word, reason) in &scene.unknown_words {
+                writeln!(f, "{}: counted as never found: {word} ({reason})", scene.scene)?;
+            }
+        }
+        if !self.missing_scenes.is_empty() {
+            writeln!(f, "not the protocol's mean: without {}", self.missing_scenes.join(", "))?;
+        }
+        writeln!(f, "{}", super::NO_PAPER_ROWS)
+    }
+}

@@ -1,0 +1,296 @@
+//! Crops of generated things with the words that are true of them: what the embedded encoder learns from.
+
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use glam::DVec3;
+use image::RgbImage;
+use rayon::prelude::*;
+use serde::Serialize;
+use slag_common::View;
+use slag_models::Crop;
+use slag_models::preprocess::{Filter, Preprocess, Resize};
+
+use super::compose::{Layout, looking, pinhole};
+use super::grammar::Noun;
+use super::paint::{Colour, Material};
+use super::render::{NOTHING, Photo, Solids};
+use super::{GenerateError, write_npy};
+use slag_encoder::embed::{self, Background};
+use slag_encoder::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
+use slag_encoder::progress::Progress;
+use slag_encoder::raster::RasterView;
+use slag_encoder::segment::{GraphSegmenter, SegmentInput, Segmenter};
+use slag_math::random::Xorshift;
+
+/// Photos that crops are taken from: their edge.
+const PHOTO_PX: u32 = 208;
+/// Photos of a scene.
+const N_PHOTOS: usize = 14;
+/// Masks with fewer pixels are no crops, as with `encode`.
+const MIN_MASK_PX: u32 = 200;
+/// A crop shows at least this part of what it would show if nothing stood before it.
+const MIN_SHOWN: f64 = 0.3;
+/// Of a segment's pixels, at least this part shows the thing that it is labelled with,
+const MIN_PURITY: f64 = 0.8;
+/// and of the pixels that show the thing, at least this part is in the segment.
+const MIN_COVERED: f64 = 0.2;
+/// Of the pairs of noun and colour, one in so many is kept for the test.
+const HELD_OUT_OF: u64 = 7;
+
+/// Which crops to make.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Split {
+    /// To learn from.
+    Train,
+    /// Things of other seeds, in all pairs of noun and colour: those to learn from, and those never seen.
+    Test,
+}
+
+/// What is true of a crop.
+#[derive(Clone, Debug, Serialize)]
+pub struct Label {
+    /// Index of its noun.
+    pub noun: usize,
+    /// Main colour.
+    pub colour: Colour,
+    /// Main material.
+    pub material: Material,
+    /// Whether noun and colour are a pair that is not learnt from.
+    pub held_out: bool,
+    /// Height divided by the larger horizontal edge.
+    pub slenderness: f64,
+    /// Pixels of the mask.
+    pub area_px: u32,
+    /// The part of it that is not hidden.
+    pub shown: f64,
+    /// Whether the mask is a piece of the true one.
+    pub cut: bool,
+    /// Whether the mask is of the segmenter, not the true one.
+    pub segmented: bool,
+}
+
+/// Returns whether a pair of noun and colour is kept for the test; by its words, so that new nouns change nothing.
+pub fn is_held_out(noun: &Noun, colour: Colour) -> bool {
+    // FNV-1a (Fowler, Noll, Vo).
+    let words = noun.name.bytes().chain(colour.word().bytes());
+    let hash =
+        words.fold(0xcbf2_9ce4_8422_2325, |h: u64, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3));
+    // What has one or two colours only cannot spare any.
+    noun.colours().len() > 3 && (hash >> 32) % HELD_OUT_OF == 0
+}
+
+/// Writes crops of `n_scenes` scenes: `crops.npy` (u8 `[n][edge][edge][3]`, as the encoder takes them, white
+/// outside the mask), `labels.json` (a [`Label`] each) and `nouns.json` (the words).
+///
+/// # Errors
+/// [`GenerateError`].
+pub fn write(
+    folder: &Path,
+    split: Split,
+    nouns: &[Noun],
+    seeds: std::ops::Range<u64>,
+    edge_px: u32,
+    progress: &dyn Progress,
+) -> Result<usize, GenerateError> {
+    fs_err::create_dir_all(folder)?;
+    let preprocess = Preprocess::new(edge_px, Resize::Pad, Filter::Bicubic, [0.0; 3], [1.0; 3]);
+    progress.begin("scenes", "scene", seeds.end - seeds.start, 0);
+    let of_seed = |seed: u64| {
+        let crops: Vec<(RgbImage, Label)> = crops(split, nouns, seed)
+            .into_iter()
+            .map(|(crop, label)| (preprocess.square(crop.image()), label))
+            .collect();
+        progress.advance(1);
+        crops
+    };
+    let crops: Vec<(RgbImage, Label)> = seeds.into_par_iter().flat_map_iter(of_seed).collect();
+    progress.end();
+    let pixels: Vec<u8> = crops.iter().flat_map(|(image, _)| image.as_raw().iter().copied()).collect();
+    let edge = u64::from(edge_px);
+    write_npy(&folder.join("crops.npy"), &[crops.len() as u64, edge, edge, 3], &pixels)?;
+    let labels: Vec<&Label> = crops.iter().map(|(_, label)| label).collect();
+    fs_err::write(folder.join("labels.json"), serde_json::to_vec(&labels).map_err(std::io::Error::from)?)?;
+    let mut out = fs_err::File::create(folder.join("nouns.json"))?;
+    let words: Vec<_> = nouns
+        .iter()
+        .map(|noun| {
+            serde_json::json!({
+                "name": noun.name, "words": noun.words, "kinds": noun.kinds,
+                "colours": noun.colours(), "materials": noun.materials(),
+            })
+        })
+        .collect();
+    out.write_all(&serde_json::to_vec_pretty(&words).map_err(std::io::Error::from)?)?;
+    Ok(crops.len())
+}
+
+/// Returns the crops of a scene.
+pub(crate) fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(Crop, Label)> {
+    let allowed = |noun: &Noun, colour| split == Split::Test || !is_held_out(noun, colour);
+    let layout = Layout::of_any_kind(seed, nouns, &allowed);
+    let solids = layout.solids();
+    let mut random = Xorshift::new(seed ^ 0xc405);
+    let mut out = Vec::new();
+    for _ in 0..N_PHOTOS {
+        let Some(view) = look_at_something(&layout, &solids, &mut random) else { continue };
+        let photo = solids.photo(&view);
+        let things = masks_of(&photo);
+        // A third of the photos is cut up as a newcomer's are: by the segmenter that needs no model.
+        let segmented = random.below(3) == 0;
+        let masks = if segmented { segments_of(&photo, &view, &things) } else { things.clone() };
+        for (thing, mask) in masks {
+            let (thing, placed) = (thing as usize, &layout.placed[thing as usize]);
+            let shown = f64::from(mask.area_px) / f64::from(photo.unhidden_px[thing].max(1));
+            if mask.area_px < MIN_MASK_PX || (shown < MIN_SHOWN && !placed.shell && !segmented) {
+                continue;
+            }
+            // Floors and walls are on every photo.
+            if placed.shell && random.below(4) != 0 {
+                continue;
+            }
+            let cut = !segmented && random.below(4) == 0;
+            let mask = if cut { spoilt(&mask, &mut random) } else { mask };
+            let Some(crop) = embed::crop(&photo.image, &mask, Background::White) else { continue };
+            let size = placed.bounds.size();
+            let label = Label {
+                noun: placed.noun,
+                colour: placed.object.colours[0],
+                material: placed.object.paint.material,
+                held_out: is_held_out(&nouns[placed.noun], placed.object.colours[0]),
+                slenderness: size.z / size.x.max(size.y),
+                area_px: mask.area_px,
+                shown,
+                cut,
+                segmented,
+            };
+            out.push((crop, label));
+        }
+    }
+    out
+}
+
+/// Returns a view of a thing from somewhere around it.
+fn look_at_something(layout: &Layout, solids: &Solids, random: &mut Xorshift) -> Option<RasterView> {
+    let things: Vec<usize> = (0..layout.placed.len()).filter(|i| !layout.placed[*i].shell).collect();
+    if things.is_empty() {
+        return None;
+    }
+    for _ in 0..20 {
+        let thing = &solids.things()[*random.pick(&things)];
+        let field_of_view_rad = random.between(40.0, 75.0).to_radians();
+        // Fills between a third of the picture's width and all of it.
+        let fills = random.between(0.35, 1.1);
+        let distance_m = thing.radius_m() / (field_of_view_rad / 2.0 * fills).sin();
+        let azimuth = random.between(0.0, std::f64::consts::TAU);
+        let elevation = random.between(-5.0, 50.0).to_radians();
+        let away =
+            DVec3::new(azimuth.cos() * elevation.cos(), azimuth.sin() * elevation.cos(), elevation.sin());
+        let position = thing.centre() + away * distance_m;
+        if position.z > 0.15 && layout.is_walkable(position) {
+            let aside = DVec3::from([0; 3].map(|_| random.signed())) * 0.25 * thing.radius_m();
+            let camera_from_world = looking(position, thing.centre() + aside - position);
+            return Some(RasterView {
+                camera_from_world,
+                intrinsics: pinhole([PHOTO_PX; 2], field_of_view_rad),
+            });
+        }
+    }
+    None
+}
+
+/// Returns the things on a photo with their masks.
+fn masks_of(photo: &Photo) -> Vec<(u32, Mask)> {
+    let label = |thing: &u16| if *thing == NOTHING { NO_REGION } else { u32::from(*thing) };
+    let labels: Vec<u32> = photo.thing_of_pixel.iter().map(label).collect();
+    masks_of_labels(&labels, photo.image.width(), photo.unhidden_px.len(), u64::MAX).unwrap_or_default()
+}
+
+/// Returns the segments of a photo that show mostly one thing, with the thing.
+fn segments_of(photo: &Photo, raster_view: &RasterView, things: &[(u32, Mask)]) -> Vec<(u32, Mask)> {
+    let view = View {
+        name: String::new(),
+        image_path: PathBuf::new(),
+        intrinsics: raster_view.intrinsics,
+        camera_from_world: raster_view.camera_from_world,
+    };
+    let input =
+        SegmentInput { view: &view, image: &photo.image, valid: None, undistorter: None, depth: None };
+    let segments = GraphSegmenter::default().segment(&input).unwrap_or_default();
+    let width = photo.image.width();
+    let thing_of = |mask: &Mask| {
+        let mut n_px = vec![0_u32; photo.unhidden_px.len()];
+        for (row, y) in mask.inside.chunks(mask.box_px.width_px() as usize).zip(mask.box_px.y0..) {
+            for (_, x) in row.iter().zip(mask.box_px.x0..).filter(|(inside, _)| **inside) {
+                let thing = photo.thing_of_pixel[(y * width + x) as usize];
+                n_px.get_mut(usize::from(thing)).into_iter().for_each(|n| *n += 1);
+            }
+        }
+        let (n, thing) = things.iter().map(|(thing, _)| (n_px[*thing as usize], *thing)).max()?;
+        let whole = things.iter().find(|(of, _)| *of == thing)?.1.area_px;
+        let pure = f64::from(n) >= MIN_PURITY * f64::from(mask.area_px);
+        (pure && f64::from(n) >= MIN_COVERED * f64::from(whole)).then_some(thing)
+    };
+    segments.into_iter().filter_map(|mask| Some((thing_of(&mask)?, mask))).collect()
+}
+
+/// Returns the mask as a segmenter may give it: a side of it is missing.
+fn spoilt(mask: &Mask, random: &mut Xorshift) -> Mask {
+    let (width, height) = (mask.box_px.width_px(), mask.box_px.height_px());
+    let angle = random.between(0.0, std::f64::consts::TAU);
+    let (nx, ny) = (angle.cos(), angle.sin());
+    let along = |x: u32, y: u32| {
+        (f64::from(x) / f64::from(width) - 0.5) * nx + (f64::from(y) / f64::from(height) - 0.5) * ny
+    };
+    let limit = random.between(0.0, 0.35);
+    let kept = |x: u32, y: u32| mask.inside[(y * width + x) as usize] && along(x, y) < limit;
+    let places = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+    let labels: Vec<u32> = places.map(|(x, y)| if kept(x, y) { 0 } else { NO_REGION }).collect();
+    let piece = masks_of_labels(&labels, width, 1, u64::MAX).and_then(|mut masks| masks.pop());
+    let Some((_, piece)) = piece.filter(|(_, piece)| piece.area_px >= MIN_MASK_PX) else {
+        return mask.clone();
+    };
+    let (left, top) = (mask.box_px.x0, mask.box_px.y0);
+    let BoxPx { x0, y0, x1, y1 } = piece.box_px;
+    let box_px = BoxPx { x0: left + x0, y0: top + y0, x1: left + x1, y1: top + y1 };
+    Mask { box_px, level: mask.level, ..piece }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::grammar;
+    use super::*;
+
+    #[test]
+    fn what_is_kept_for_the_test_is_never_learnt_from() {
+        let nouns = grammar::nouns(None).expect("parse");
+        let held_out = |split| {
+            let of_seed = |seed| crops(split, &nouns, seed);
+            let labels = (0..9).flat_map(of_seed).map(|(_, label)| label);
+            labels.filter(|label| is_held_out(&nouns[label.noun], label.colour)).count()
+        };
+        assert_eq!(held_out(Split::Train), 0);
+        assert!(held_out(Split::Test) > 20);
+    }
+
+    /// A crop of a true mask shows as many pixels as the photo has of the thing, on white.
+    #[test]
+    fn crops_are_what_their_labels_say() {
+        let nouns = grammar::nouns(None).expect("parse");
+        let of_seed = |seed| crops(Split::Test, &nouns, seed);
+        let made: Vec<(Crop, Label)> = (0..6).flat_map(of_seed).collect();
+        let n_segmented = made.iter().filter(|(_, label)| label.segmented).count();
+        assert!(n_segmented > 20 && made.len() - n_segmented > 20, "{n_segmented} of {}", made.len());
+        for (crop, label) in &made {
+            let n_inside = crop.inside().iter().filter(|inside| **inside).count();
+            assert_eq!(n_inside, label.area_px as usize);
+            let outside = crop.image().pixels().zip(crop.inside()).filter(|(_, inside)| !**inside);
+            assert!(outside.into_iter().all(|(pixel, _)| pixel.0 == [255; 3]));
+            // A segment may hold some of what is beside the thing.
+            assert!(label.shown > 0.0 && (label.shown <= 1.0 || label.segmented));
+            assert!(nouns[label.noun].colours().contains(&label.colour));
+        }
+        let again: Vec<(Crop, Label)> = (0..6).flat_map(of_seed).collect();
+        assert!(made.iter().zip(&again).all(|(a, b)| a.0 == b.0));
+    }
+}

@@ -1,0 +1,544 @@
+//! Objects as data: one short text file a noun, which says of what parts such things are made.
+//!
+//! ```text
+//! # a chair looks along +y
+//! words: chair, dining chair
+//! is: furniture, something to sit on
+//! found: room wall, room floor
+//! paint seat: wood, plastic | any
+//! paint frame: metal, wood | black, same
+//! let w = 0.40..0.50
+//! let h = 0.44..0.50
+//! box seat: 0, 0, h | w, w, 0.04
+//! cylinder frame: x*(w/2-0.03), y*(w/2-0.03), h/2 | 0.02, h | for x -1, 1 | for y -1, 1
+//! ```
+//!
+//! - The file's name is the noun; `words` are others for it. `is` says what kinds of thing it is.
+//! - `found: SCENE PLACE`: scenes are `room`, `yard`, `street`; places `floor` (free), `wall` (its back to a
+//!   wall or an edge), `hung` (on a wall), `on` (on another thing's top), `shell` (the scene builds it itself).
+//! - `paint NAME: MATERIALS | COLOURS`; the first is the one that gives the thing its colour. `any` colour,
+//!   or `same` as the first paint.
+//! - `let NAME = FROM..TO`, or `pick A, B, C`, or one expression. Metres; z is up, the ground at 0.
+//! - `box`, `ellipsoid`: centre | full sizes; `cylinder`: centre | radius, height; `cone`: centre | radius
+//!   below, radius above, height. Then, in any order: `turn RX, RY, RZ` (degrees, about x, then y, then z),
+//!   `for NAME A, B, C`, `if EXPRESSION` (made where it is above 0).
+//! - `top: z | w, d`: where other things may stand.
+
+use std::path::{Path, PathBuf};
+
+use glam::{DAffine3, DQuat, DVec3, EulerRot};
+use include_dir::{Dir, include_dir};
+
+use super::expression::Expression;
+use super::paint::{Colour, Material, Paint};
+use slag_math::random::Xorshift;
+
+use super::solid::{Part, Shape};
+
+static OBJECTS: Dir<'_> = include_dir!("$CARGO_MANIFEST_DIR/src/generate/objects");
+
+/// Why object files are refused.
+#[derive(Debug, thiserror::Error)]
+pub enum GrammarError {
+    /// A file or folder could not be read.
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+    /// A line is wrong.
+    #[error("{}:{line}: {reason}", path.display())]
+    Line {
+        /// The file.
+        path: PathBuf,
+        /// The line, from 1.
+        line: usize,
+        /// What was found and what was expected.
+        reason: String,
+    },
+}
+
+/// A scene that things belong into.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, clap::ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+pub enum SceneKind {
+    /// Indoors, furnished.
+    Room,
+    /// Outdoors, grass and a fence.
+    Yard,
+    /// Outdoors, a road with pavements.
+    Street,
+}
+
+/// Where in a scene something stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Place {
+    /// Anywhere on the ground.
+    Floor,
+    /// Its back to a wall or to the edge of the scene.
+    Wall,
+    /// On a wall.
+    Hung,
+    /// On the top of another thing.
+    On,
+    /// Made by the scene itself: floors, walls.
+    Shell,
+}
+
+/// Where other things may stand on something, in its own frame, metres.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Top {
+    /// Height.
+    pub z_m: f64,
+    /// Width along x and depth along y.
+    pub size_m: [f64; 2],
+}
+
+/// What all things of a noun have in common.
+#[derive(Clone, Debug)]
+pub struct Noun {
+    /// Its name.
+    pub name: String,
+    /// Other words for it.
+    pub words: Vec<String>,
+    /// Kinds of thing that it is.
+    pub kinds: Vec<String>,
+    /// Where it is found.
+    pub found: Vec<(SceneKind, Place)>,
+    paints: Vec<PaintRule>,
+    variables: Vec<Choice>,
+    parts: Vec<PartRule>,
+    top: Option<[Expression; 3]>,
+}
+
+#[derive(Clone, Debug)]
+struct PaintRule {
+    name: String,
+    materials: Vec<Material>,
+    /// Empty for the colour of the first paint.
+    colours: Vec<Colour>,
+    or_same: bool,
+}
+
+#[derive(Clone, Debug)]
+enum Choice {
+    Between([Expression; 2]),
+    OneOf(Vec<Expression>),
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum ShapeKind {
+    Box,
+    Ellipsoid,
+    Cylinder,
+    Cone,
+}
+
+#[derive(Clone, Debug)]
+struct PartRule {
+    kind: ShapeKind,
+    paint: usize,
+    centre: [Expression; 3],
+    sizes: Vec<Expression>,
+    turn_deg: Option<[Expression; 3]>,
+    /// Variable and its values.
+    loops: Vec<(usize, Vec<Expression>)>,
+    condition: Option<Expression>,
+}
+
+/// A thing made by its noun's rules.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Object {
+    /// What it is made of; its own frame, z up, on the ground at 0, its front along +y.
+    pub parts: Vec<Part>,
+    /// Its colours, the main one first.
+    pub colours: Vec<Colour>,
+    /// Its main paint.
+    pub paint: Paint,
+    /// Where things may stand on it.
+    pub top: Option<Top>,
+}
+
+/// Returns the nouns of a folder of object files, or the ones shipped; sorted by name.
+///
+/// # Errors
+/// [`GrammarError`].
+pub fn nouns(folder: Option<&Path>) -> Result<Vec<Noun>, GrammarError> {
+    let mut texts: Vec<(PathBuf, String)> = match folder {
+        None => OBJECTS
+            .files()
+            .map(|file| (file.path().to_owned(), file.contents_utf8().unwrap_or_default().to_owned()))
+            .collect(),
+        Some(folder) => {
+            let mut texts = Vec::new();
+            for entry in fs_err::read_dir(folder)? {
+                let path = entry?.path();
+                if path.extension().is_some_and(|extension| extension == "txt") {
+                    texts.push((path.clone(), fs_err::read_to_string(&path)?));
+                }
+            }
+            texts
+        }
+    };
+    texts.sort();
+    texts.iter().map(|(path, text)| Noun::parse(path, text)).collect()
+}
+
+/// Returns the pieces of a list, trimmed.
+fn list(text: &str) -> impl Iterator<Item = &str> {
+    text.split(',').map(str::trim)
+}
+
+fn expressions(text: &str, names: &[String]) -> Result<Vec<Expression>, String> {
+    list(text).map(|text| Expression::parse(text, names)).collect()
+}
+
+fn some<const N: usize>(text: &str, names: &[String]) -> Result<[Expression; N], String> {
+    let found = expressions(text, names)?;
+    let n = found.len();
+    found.try_into().map_err(|_| format!("{n} values in `{text}`, expected {N}"))
+}
+
+impl Noun {
+    /// Reads an object file's text; `path` names it and gives the noun.
+    ///
+    /// # Errors
+    /// [`GrammarError::Line`].
+    pub fn parse(path: &Path, text: &str) -> Result<Self, GrammarError> {
+        let name = path.file_stem().unwrap_or_default().to_string_lossy().replace('_', " ");
+        let mut noun = Self {
+            name,
+            words: Vec::new(),
+            kinds: Vec::new(),
+            found: Vec::new(),
+            paints: Vec::new(),
+            variables: Vec::new(),
+            parts: Vec::new(),
+            top: None,
+        };
+        let mut names = Vec::new();
+        let mut last = 0;
+        for (i, line) in text.lines().enumerate() {
+            last = i + 1;
+            let line = line.split('#').next().unwrap_or_default().trim();
+            if !line.is_empty() {
+                noun.line(line, &mut names).map_err(|reason| GrammarError::Line {
+                    path: path.to_owned(),
+                    line: i + 1,
+                    reason,
+                })?;
+            }
+        }
+        let missing = [("paint", noun.paints.is_empty()), ("found", noun.found.is_empty())];
+        match missing.iter().find(|(_, missing)| *missing) {
+            None => Ok(noun),
+            Some((what, _)) => Err(GrammarError::Line {
+                path: path.to_owned(),
+                line: last,
+                reason: format!("the file ends without `{what}`; see the other objects' files"),
+            }),
+        }
+    }
+
+    fn line(&mut self, line: &str, names: &mut Vec<String>) -> Result<(), String> {
+        if let Some(rest) = line.strip_prefix("let ") {
+            let (name, value) = rest.split_once('=').ok_or("no `=`, expected `let NAME = VALUE`")?;
+            let choice = if let Some(values) = value.trim().strip_prefix("pick ") {
+                Choice::OneOf(expressions(values, names)?)
+            } else if let Some((from, to)) = value.split_once("..") {
+                Choice::Between([Expression::parse(from, names)?, Expression::parse(to, names)?])
+            } else {
+                Choice::OneOf(vec![Expression::parse(value, names)?])
+            };
+            names.push(name.trim().to_owned());
+            self.variables.push(choice);
+            return Ok(());
+        }
+        let (head, rest) = line.split_once(':').ok_or_else(|| format!("`{line}`, expected `WORD: ...`"))?;
+        let rest = rest.trim();
+        match head.split_whitespace().collect::<Vec<_>>()[..] {
+            ["words"] => self.words = list(rest).filter(|w| *w != self.name).map(str::to_owned).collect(),
+            ["is"] => self.kinds = list(rest).map(str::to_owned).collect(),
+            ["found"] => {
+                self.found = list(rest).map(found).collect::<Result<_, _>>()?;
+            }
+            ["paint", name] => {
+                let (materials, colours) =
+                    rest.split_once('|').ok_or("no `|`, expected MATERIALS | COLOURS")?;
+                let materials = list(materials).map(Material::parse).collect::<Result<_, _>>()?;
+                let mut rule =
+                    PaintRule { name: name.to_owned(), materials, colours: Vec::new(), or_same: false };
+                for colour in list(colours) {
+                    match colour {
+                        "any" => rule.colours.extend(Colour::ALL),
+                        "same" if !self.paints.is_empty() => rule.or_same = true,
+                        colour => rule.colours.push(Colour::parse(colour)?),
+                    }
+                }
+                self.paints.push(rule);
+            }
+            ["top"] => {
+                let (z, size) = rest.split_once('|').ok_or("no `|`, expected z | width, depth")?;
+                let [w, d] = some(size, names)?;
+                self.top = Some([Expression::parse(z, names)?, w, d]);
+            }
+            [kind, paint] => {
+                let part = self.part(kind, paint, rest, names)?;
+                self.parts.push(part);
+            }
+            _ => return Err(format!("`{head}`, expected words, is, found, paint, let, top or a shape")),
+        }
+        Ok(())
+    }
+
+    fn part(&self, kind: &str, paint: &str, rest: &str, names: &mut Vec<String>) -> Result<PartRule, String> {
+        let (kind, n_sizes) = match kind {
+            "box" => (ShapeKind::Box, 3),
+            "ellipsoid" => (ShapeKind::Ellipsoid, 3),
+            "cylinder" => (ShapeKind::Cylinder, 2),
+            "cone" => (ShapeKind::Cone, 3),
+            _ => return Err(format!("`{kind}`, expected box, ellipsoid, cylinder or cone")),
+        };
+        let paint = self
+            .paints
+            .iter()
+            .position(|rule| rule.name == paint)
+            .ok_or_else(|| format!("`{paint}` is no paint named above"))?;
+        let mut fields = rest.split('|').map(str::trim);
+        let (Some(centre), Some(sizes)) = (fields.next(), fields.next()) else {
+            return Err("no `|`, expected centre | sizes".into());
+        };
+        // Variables of loops are known in the whole line, and nowhere else.
+        let n_names = names.len();
+        let modifiers: Vec<&str> = fields.collect();
+        let mut loops = Vec::new();
+        for modifier in modifiers.iter().filter_map(|m| m.strip_prefix("for ")) {
+            let (name, values) =
+                modifier.trim().split_once(' ').ok_or("no values, expected `for NAME A, B, C`")?;
+            let values = expressions(values, names)?;
+            names.push(name.to_owned());
+            loops.push((names.len() - 1, values));
+        }
+        let part = (|| {
+            let mut turn_deg = None;
+            let mut condition = None;
+            for modifier in modifiers.iter().filter(|m| !m.starts_with("for ")) {
+                match modifier.split_once(' ') {
+                    Some(("turn", angles)) => turn_deg = Some(some(angles, names)?),
+                    Some(("if", expression)) => condition = Some(Expression::parse(expression, names)?),
+                    _ => return Err(format!("`{modifier}`, expected turn, for or if")),
+                }
+            }
+            let found = expressions(sizes, names)?;
+            if found.len() != n_sizes {
+                return Err(format!("{} sizes in `{sizes}`, expected {n_sizes}", found.len()));
+            }
+            let centre = some(centre, names)?;
+            Ok(PartRule { kind, paint, centre, sizes: found, turn_deg, loops, condition })
+        })();
+        names.truncate(n_names);
+        part
+    }
+
+    /// Returns the colours that such a thing may have.
+    pub fn colours(&self) -> &[Colour] {
+        &self.paints[0].colours
+    }
+
+    /// Returns the materials that it may be made of.
+    pub fn materials(&self) -> &[Material] {
+        &self.paints[0].materials
+    }
+
+    /// Makes a thing. `colours`: its main colour is one of these, if any of them is possible.
+    pub fn make(&self, random: &mut Xorshift, allowed: impl Fn(Colour) -> bool) -> Object {
+        let mut variables: Vec<f64> = Vec::new();
+        for choice in &self.variables {
+            let value = match choice {
+                Choice::Between([from, to]) => {
+                    let (from, to) = (from.value(&variables, random), to.value(&variables, random));
+                    from + (to - from) * random.unit()
+                }
+                Choice::OneOf(values) => random.pick(values).value(&variables, random),
+            };
+            variables.push(value);
+        }
+        let mut paints: Vec<(Paint, Colour)> = Vec::new();
+        for rule in &self.paints {
+            let n = rule.colours.len() + usize::from(rule.or_same);
+            let same = rule.or_same && random.below(n.max(1)) == 0;
+            let paint = match paints.first() {
+                Some(first) if same || rule.colours.is_empty() => *first,
+                first => {
+                    let possible: Vec<Colour> = match first {
+                        None => rule.colours.iter().copied().filter(|c| allowed(*c)).collect(),
+                        Some(_) => rule.colours.clone(),
+                    };
+                    let possible = if possible.is_empty() { &rule.colours } else { &possible };
+                    let colour = *random.pick(possible);
+                    let material = *random.pick(&rule.materials);
+                    (Paint { rgb: colour.shade(random), material, seed: random.next_u32() }, colour)
+                }
+            };
+            paints.push(paint);
+        }
+        let mut parts = Vec::new();
+        for rule in &self.parts {
+            rule.make(0, &mut variables, &paints, random, &mut parts);
+        }
+        let top = self.top.as_ref().map(|top| {
+            let [z_m, w, d] = [0, 1, 2].map(|i| top[i].value(&variables, random));
+            Top { z_m, size_m: [w, d] }
+        });
+        let mut colours: Vec<Colour> = Vec::new();
+        for (_, colour) in &paints {
+            if !colours.contains(colour) {
+                colours.push(*colour);
+            }
+        }
+        Object { parts, colours, paint: paints[0].0, top }
+    }
+}
+
+fn found(text: &str) -> Result<(SceneKind, Place), String> {
+    let (scene, place) = text.split_once(' ').ok_or_else(|| format!("`{text}`, expected SCENE PLACE"))?;
+    let scene = match scene {
+        "room" => SceneKind::Room,
+        "yard" => SceneKind::Yard,
+        "street" => SceneKind::Street,
+        _ => return Err(format!("`{scene}`, expected room, yard or street")),
+    };
+    let place = match place.trim() {
+        "floor" => Place::Floor,
+        "wall" => Place::Wall,
+        "hung" => Place::Hung,
+        "on" => Place::On,
+        "shell" => Place::Shell,
+        place => return Err(format!("`{place}`, expected floor, wall, hung, on or shell")),
+    };
+    Ok((scene, place))
+}
+
+impl PartRule {
+    /// Makes the parts of the loops from `level` on.
+    fn make(
+        &self,
+        level: usize,
+        variables: &mut Vec<f64>,
+        paints: &[(Paint, Colour)],
+        random: &mut Xorshift,
+        parts: &mut Vec<Part>,
+    ) {
+        if let Some((index, values)) = self.loops.get(level) {
+            for value in values {
+                let value = value.value(variables, random);
+                variables.truncate(*index);
+                variables.push(value);
+                self.make(level + 1, variables, paints, random, parts);
+            }
+            variables.truncate(*index);
+            return;
+        }
+        if self.condition.as_ref().is_some_and(|condition| condition.value(variables, random) <= 0.0) {
+            return;
+        }
+        let mut vector = |expressions: &[Expression; 3]| {
+            DVec3::from([0, 1, 2].map(|i| expressions[i].value(variables, random)))
+        };
+        let centre = vector(&self.centre);
+        let turn = self.turn_deg.as_ref().map_or(DVec3::ZERO, &mut vector);
+        // Thinner than a millimetre is nothing.
+        let sizes: Vec<f64> = self.sizes.iter().map(|s| s.value(variables, random).max(0.001)).collect();
+        let shape = match self.kind {
+            ShapeKind::Box => Shape::Box(DVec3::new(sizes[0], sizes[1], sizes[2]) / 2.0),
+            ShapeKind::Ellipsoid => Shape::Ellipsoid(DVec3::new(sizes[0], sizes[1], sizes[2]) / 2.0),
+            ShapeKind::Cylinder => Shape::Cone { radii_m: [sizes[0]; 2], half_height_m: sizes[1] / 2.0 },
+            ShapeKind::Cone => Shape::Cone { radii_m: [sizes[0], sizes[1]], half_height_m: sizes[2] / 2.0 },
+        };
+        let turn = turn.map(f64::to_radians);
+        let rotation = DQuat::from_euler(EulerRot::ZYX, turn.z, turn.y, turn.x);
+        let object_from_part = DAffine3::from_rotation_translation(rotation, centre);
+        parts.push(Part { shape, object_from_part, paint: paints[self.paint].0 });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(text: &str) -> Result<Noun, GrammarError> {
+        Noun::parse(Path::new("small_stool.txt"), text)
+    }
+
+    const STOOL: &str = "words: stool, seat  # a comment\nis: furniture, something to sit on\n\
+        found: room floor, yard wall\npaint main: wood | red, blue\npaint legs: metal | same\n\
+        let w = 0.4\nbox main: 0, 0, 0.5 | w, w, 0.1\n\
+        cylinder legs: x*w/2, y*w/2, 0.225 | 0.02, 0.45 | for x -1, 1 | for y -1, 1 | turn 0, 0, 45\n\
+        box main: 0, 0, 9 | 1, 1, 1 | if w - 1\ntop: 0.55 | w, w\n";
+
+    #[test]
+    fn a_file_makes_what_it_says() {
+        let noun = parse(STOOL).expect("parses");
+        assert_eq!((noun.name.as_str(), noun.words.len(), noun.kinds.len()), ("small stool", 2, 2));
+        assert_eq!(noun.found, [(SceneKind::Room, Place::Floor), (SceneKind::Yard, Place::Wall)]);
+        let object = noun.make(&mut Xorshift::new(3), |colour| colour == Colour::Blue);
+        assert_eq!(object.colours, [Colour::Blue]);
+        assert_eq!(object.top, Some(Top { z_m: 0.55, size_m: [0.4, 0.4] }));
+        let centres: Vec<[f64; 3]> =
+            object.parts.iter().map(|part| part.object_from_part.translation.to_array()).collect();
+        let legs = [[-0.2, -0.2], [-0.2, 0.2], [0.2, -0.2], [0.2, 0.2]].map(|[x, y]| [x, y, 0.225]);
+        assert_eq!(centres[0], [0.0, 0.0, 0.5]);
+        assert_eq!(centres[1..], legs);
+        assert!(
+            object.parts.iter().all(|part| part.paint == object.parts[0].paint),
+            "legs in the same paint"
+        );
+    }
+
+    #[test]
+    fn mistakes_are_named_with_their_line() {
+        for (line, mistake) in [
+            (1, "word: a"),
+            (5, "words: a\nis: b\nfound: room floor\npaint m: wood | red\nbox n: 0, 0, 0 | 1, 1, 1"),
+            (1, "paint m: cheese | red"),
+            (1, "paint m: wood | same"),
+            (2, "paint m: wood | red\nbox m: 0, 0 | 1, 1, 1"),
+            (2, "paint m: wood | red\ncylinder m: 0, 0, 0 | 1, 1, 1"),
+            (2, "paint m: wood | red\nbox m: 0, 0, z | 1, 1, 1"),
+            (2, "paint m: wood | red\nbox m: 0, 0, 0 | 1, 1, 1 | spin 3"),
+            (1, "found: room ceiling"),
+            (1, "let a 3"),
+            (1, "paint m: wood | red"),
+        ] {
+            match parse(mistake) {
+                Err(GrammarError::Line { line: found, .. }) => assert_eq!(found, line, "{mistake}"),
+                other => panic!("{mistake}: {other:?}"),
+            }
+        }
+    }
+
+    /// Every shipped file: parses, stands on the ground, is of sensible size, and uses each of its paints.
+    #[test]
+    fn shipped_objects_are_sound() {
+        let nouns = nouns(None).expect("parse");
+        assert!(nouns.len() >= 40, "{} nouns", nouns.len());
+        for noun in &nouns {
+            assert!(!noun.kinds.is_empty(), "{}: no kinds", noun.name);
+            let shell = noun.found.iter().any(|(_, place)| *place == Place::Shell);
+            for seed in 0..50 {
+                let object = noun.make(&mut Xorshift::new(seed), |_| true);
+                if shell {
+                    continue;
+                }
+                let surfels: Vec<DVec3> =
+                    object.parts.iter().flat_map(|part| part.surfels(0.05)).map(|s| s.position).collect();
+                let low = surfels.iter().copied().fold(DVec3::INFINITY, DVec3::min);
+                let size = surfels.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max) - low;
+                let hung = noun.found.iter().any(|(_, place)| *place == Place::Hung);
+                assert!(hung || low.z.abs() < 0.06, "{} {seed}: lowest at {}", noun.name, low.z);
+                assert!(
+                    size.max_element() < 13.0 && size.max_element() > 0.05,
+                    "{} {seed}: {size}",
+                    noun.name
+                );
+            }
+        }
+    }
+}

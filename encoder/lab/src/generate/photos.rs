@@ -1,0 +1,48 @@
+//! Photos with the thing at each pixel: what a segmenter learns from.
+
+use std::path::Path;
+
+use rayon::prelude::*;
+
+use super::compose::{Layout, pinhole};
+use super::grammar::Noun;
+use super::render::{NOTHING, Photo};
+use super::{FIELD_OF_VIEW_RAD, GenerateError, PHOTO_PX, write_npy};
+use slag_encoder::progress::Progress;
+use slag_math::random::Xorshift;
+
+/// Photos of a scene.
+const N_PHOTOS: u32 = 4;
+
+/// Writes photos of the scenes of some seeds: `photos.npy` (u8 `[n][height][width][3]`) and `things.npy` (u16
+/// `[n][height][width]`: a number a thing, 65535 the sky). Returns how many.
+///
+/// # Errors
+/// [`GenerateError`].
+pub fn write(
+    folder: &Path,
+    nouns: &[Noun],
+    seeds: std::ops::Range<u64>,
+    progress: &dyn Progress,
+) -> Result<usize, GenerateError> {
+    fs_err::create_dir_all(folder)?;
+    progress.begin("scenes", "scene", seeds.end - seeds.start, 0);
+    let of_seed = |seed: u64| {
+        let layout = Layout::of_any_kind(seed, nouns, &|_, _| true);
+        let solids = layout.solids();
+        let start = Xorshift::new(seed ^ 0xf070).between(0.0, 1.0);
+        let views = layout.walk(N_PHOTOS, start, pinhole(PHOTO_PX, FIELD_OF_VIEW_RAD));
+        let photos: Vec<Photo> = views.iter().map(|view| solids.photo(view)).collect();
+        progress.advance(1);
+        photos
+    };
+    let photos: Vec<Photo> = seeds.into_par_iter().flat_map_iter(of_seed).collect();
+    progress.end();
+    let shape = [photos.len() as u64, u64::from(PHOTO_PX[1]), u64::from(PHOTO_PX[0])];
+    let pixels: Vec<u8> = photos.iter().flat_map(|photo| photo.image.as_raw().iter().copied()).collect();
+    write_npy(&folder.join("photos.npy"), &[&shape[..], &[3]].concat(), &pixels)?;
+    let things: Vec<u16> = photos.iter().flat_map(|photo| photo.thing_of_pixel.iter().copied()).collect();
+    debug_assert_eq!(NOTHING, u16::MAX);
+    write_npy(&folder.join("things.npy"), &shape, &things)?;
+    Ok(photos.len())
+}

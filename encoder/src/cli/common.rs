@@ -1,0 +1,191 @@
+//! What the commands share: flags of models and inputs, printing, interruption.
+
+use std::fmt::Display;
+use std::io::Write;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use anyhow::{Context, Result, anyhow};
+use clap::{Args, ValueEnum};
+use serde::Serialize;
+use slag_models::commands::{self, RunArgs};
+use slag_models::session::SessionError;
+use slag_models::{ModelDir, SessionOptions, TextEncoder};
+
+use crate::embed::Background;
+use crate::publish::serve;
+use crate::store::StoreReader;
+
+/// Where models come from.
+#[derive(Clone, Debug, Args)]
+pub struct ModelArgs {
+    /// Folder with model.toml, or name of a pulled model (`models list`); the embedded encoders if absent; `colours`
+    /// knows colours only, and needs no ONNX Runtime.
+    #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR")]
+    pub models: Option<PathBuf>,
+    /// How they run.
+    #[command(flatten)]
+    pub how: RunArgs,
+}
+
+/// Scene, poses, photos.
+#[derive(Debug, Args)]
+pub struct InputArgs {
+    /// Splat: .ply, .spz, compressed .ply, .sog (file or folder) or .splat.
+    #[arg(long, value_name = "FILE")]
+    pub scene: PathBuf,
+    /// Poses: a COLMAP model's folder or a nerfstudio transforms.json.
+    #[arg(long, value_name = "PATH")]
+    pub views: PathBuf,
+    /// Photos, where they are not beside the poses.
+    #[arg(long, value_name = "DIR")]
+    pub images: Option<PathBuf>,
+    /// Treats a missing or unreadable photo or mask as an error instead of leaving the view out.
+    #[arg(long)]
+    pub strict: bool,
+}
+
+/// `--background`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum BackgroundArg {
+    /// White.
+    White,
+    /// Mid-grey.
+    Grey,
+    /// The photo, blurred.
+    Blur,
+    /// The photo as it is.
+    Keep,
+}
+
+impl From<BackgroundArg> for Background {
+    fn from(arg: BackgroundArg) -> Self {
+        match arg {
+            BackgroundArg::White => Self::White,
+            BackgroundArg::Grey => Self::Grey,
+            BackgroundArg::Blur => Self::Blur,
+            BackgroundArg::Keep => Self::Keep,
+        }
+    }
+}
+
+/// Prints the result: as one JSON object, or as lines for people.
+pub fn print(json: bool, value: &impl Serialize, lines: impl Display) -> Result<()> {
+    let mut out = std::io::stdout().lock();
+    match json {
+        true => writeln!(out, "{}", serde_json::to_string(value)?)?,
+        false => write!(out, "{lines}")?,
+    }
+    Ok(out.flush()?)
+}
+
+/// Returns a flag that ctrl-c or SIGTERM sets; a second one ends the program at once.
+pub fn cancel_flag() -> Result<Arc<AtomicBool>> {
+    let flag = Arc::new(AtomicBool::new(false));
+    let seen = Arc::clone(&flag);
+    ctrlc::set_handler(move || {
+        if seen.swap(true, Ordering::Relaxed) {
+            std::process::exit(130);
+        }
+        eprintln!("stopping after the views at hand; once more to stop at once");
+    })
+    .context("cannot listen for ctrl-c")?;
+    Ok(flag)
+}
+
+/// Returns the time to sign: SOURCE_DATE_EPOCH if it is set, else now; seconds since 1970.
+pub fn now_unix_secs() -> u64 {
+    // Reproducible builds of a store: the convention of reproducible-builds.org.
+    let given = std::env::var("SOURCE_DATE_EPOCH").ok().and_then(|text| text.parse().ok());
+    given.unwrap_or_else(|| SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs()))
+}
+
+/// Opens the models and says how they are run.
+pub fn open_models(args: &ModelArgs) -> Result<(ModelDir, SessionOptions)> {
+    let models = commands::open(args.models.as_deref(), &|name| std::env::var_os(name))?;
+    Ok((models, session_options(&args.how)?))
+}
+
+/// Returns how models are run: with one thread, because views are encoded side by side.
+pub fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
+    how.session_options(&commands::runtime_folders(&std::env::current_exe().unwrap_or_default()), 1)
+}
+
+/// Opens the text encoder that a store was encoded with.
+pub fn text_encoder_of(reader: &StoreReader, args: &ModelArgs) -> Result<Box<dyn TextEncoder>> {
+    let expected = &reader.manifest().encoder;
+    let (models, session) = open_models(args)?;
+    if slag_common::Hash32(models.encoder_id().hash()) != expected.id {
+        return Err(anyhow!(
+            "the store was encoded with {:?} ({}), the models at hand are {}; give the same with --models",
+            expected.name,
+            expected.id,
+            models.encoder_id()
+        ));
+    }
+    Ok(models.text_encoder(&session)?)
+}
+
+/// Returns the number of cores.
+pub fn available_threads() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
+}
+
+/// Completes when the user or the system asks the program to stop.
+pub async fn stopped() {
+    if let Err(error) = serve::stop_signal().await {
+        tracing::warn!("cannot listen for signals, stopping: {error}");
+    }
+}
+
+/// Starts the runtime of the services.
+///
+/// # Errors
+/// If its threads cannot be started.
+pub fn runtime() -> Result<tokio::runtime::Runtime> {
+    tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .context("cannot start the service's threads")
+}
+
+/// Reads a number of bytes with an optional unit.
+pub fn parse_bytes(text: &str) -> Result<u64, String> {
+    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let factor: u64 = match &text[digits.len()..] {
+        "" | "B" => 1,
+        "KiB" => 1 << 10,
+        "MiB" => 1 << 20,
+        "GiB" => 1 << 30,
+        unit => return Err(format!("unit {unit:?}: expected none, KiB, MiB or GiB")),
+    };
+    let number: u64 = digits.parse().map_err(|_| format!("{text:?} is no number of bytes, as 512MiB is"))?;
+    let bytes = number.checked_mul(factor).ok_or_else(|| format!("{text:?} is too large"))?;
+    if bytes < 64 << 20 { Err(format!("{text:?} is below the least, 64MiB")) } else { Ok(bytes) }
+}
+
+/// Reads an error of scores.
+pub fn parse_error(text: &str) -> Result<f32, String> {
+    match text.parse::<f32>() {
+        Ok(error) if error >= 0.0 && error.is_finite() => Ok(error),
+        _ => Err("a share of the spread of scores, such as 0.1".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bytes_have_units() {
+        assert_eq!(parse_bytes("2GiB"), Ok(2 << 30));
+        assert_eq!(parse_bytes("67108864"), Ok(1 << 26));
+        assert!(
+            parse_bytes("99999999999GiB").is_err()
+                && parse_bytes("-1").is_err()
+                && parse_bytes("GiB").is_err()
+        );
+    }
+}

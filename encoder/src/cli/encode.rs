@@ -1,0 +1,301 @@
+//! `encode`: a scene into a store.
+
+use std::path::PathBuf;
+
+use anyhow::{Context, Result, anyhow};
+use clap::{Args, ValueEnum};
+use slag_common::shard::Profile;
+
+use super::Exit;
+use super::common::{
+    BackgroundArg, InputArgs, ModelArgs, available_threads, cancel_flag, now_unix_secs, open_models,
+    parse_bytes, parse_error, print,
+};
+use super::preset::Preset;
+use super::refine::RefineArgs;
+use super::sam::SamArgs;
+use super::views::{ViewsArgs, parse_raster_width, parse_views_limit};
+use crate::cells::CellLimits;
+use crate::codebook::CodebookSettings;
+use crate::encode::coverage::CoverageReport;
+use crate::encode::{
+    self, CellReport, EncodeSettings, EncodeSummary, Masks, RasterWidth, StageReport, ViewsLimit, ViewsReport,
+};
+use crate::progress::Progress;
+use crate::raster::WeightKind;
+use crate::raster::devices::{DeviceChoice, Devices};
+use crate::raster::gpu::GpuOptions;
+use crate::shard::ShardSettings;
+use crate::shard::positions::PositionError;
+
+/// `encode`.
+#[derive(Debug, Args)]
+pub struct EncodeArgs {
+    /// Scene, poses, photos.
+    #[command(flatten)]
+    pub input: InputArgs,
+    /// Models.
+    #[command(flatten)]
+    pub models: ModelArgs,
+    /// Store to publish into; made if absent.
+    #[arg(long, value_name = "DIR")]
+    pub store: PathBuf,
+    /// `auto` for a segmenter (the embedded one, or --segmenter), `graph` for the one that needs no ONNX Runtime, or a
+    /// folder of masks: id PNGs or COCO RLE JSON.
+    #[arg(long, value_name = "auto|graph|DIR", default_value = "auto")]
+    pub masks: String,
+    /// The segmenter, where it is not the built-in one.
+    #[command(flatten)]
+    pub sam: SamArgs,
+    /// Ids of mask PNGs that are no mask, beside 0.
+    #[arg(long, value_name = "ID", value_delimiter = ',')]
+    pub ignore_mask_ids: Vec<u32>,
+    /// Bundle of the method's choices; flags change single ones.
+    #[arg(long, value_enum, default_value = "balanced")]
+    pub preset: Preset,
+    /// How sums become embeddings, where not as the preset says.
+    #[command(flatten)]
+    pub refine: RefineArgs,
+    /// What fills a crop outside its mask; the preset's if absent.
+    #[arg(long, value_enum)]
+    pub background: Option<BackgroundArg>,
+    /// Weight that is summed; the preset's if absent. `falloff` is the paper's formula as printed.
+    #[arg(long, value_enum)]
+    pub weights: Option<WeightsArg>,
+    /// Views to use at most, or which part of them: the first ones of --view-order [default: the preset's].
+    #[arg(long, value_name = "N|P%", value_parser = parse_views_limit)]
+    pub views_limit: Option<ViewsLimit>,
+    /// Which views come first, and how long to go on.
+    #[command(flatten)]
+    pub views: ViewsArgs,
+    /// Where weights are rasterised: auto (GPUs, else the CPU), gpu, cpu, or an adapter's number.
+    #[arg(long, value_name = "DEVICE", default_value_t)]
+    pub device: DeviceChoice,
+    /// Width at which weights are rasterised: pixels; `photo` for the photo's own, at most 1024; `auto` for twice as much
+    /// in views whose masks have long borders [default: the preset's].
+    #[arg(long, value_name = "auto|photo|PX", value_parser = parse_raster_width)]
+    pub raster_width: Option<RasterWidth>,
+    /// Masks with fewer pixels are left out [default: the preset's].
+    #[arg(long, value_name = "PX")]
+    pub min_mask_px: Option<u32>,
+    /// Threads; all cores if absent.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub threads: Option<u32>,
+    /// Working memory for sums and region vectors: a number with KiB, MiB or GiB.
+    #[arg(long, value_name = "BYTES", default_value = "2GiB", value_parser = parse_bytes)]
+    pub memory: u64,
+    /// Name of the scene; the store's folder name if absent.
+    #[arg(long, value_name = "NAME")]
+    pub name: Option<String>,
+    /// Says that world units are metres (a geo-reference says so too).
+    #[arg(long)]
+    pub metric: bool,
+    /// Geo-reference JSON: {"origin": {"lat", "lon", "alt"}} of the world's east-north-up frame.
+    #[arg(long, value_name = "FILE")]
+    pub geo: Option<PathBuf>,
+    /// Gaussians a cell at most.
+    #[arg(long, value_name = "N", default_value_t = 65_536, value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    pub cell_gaussians: u32,
+    /// Width of a cell at most, metres, in metric scenes.
+    #[arg(long, value_name = "M", default_value_t = 25.0)]
+    pub cell_width_m: f64,
+    /// Which shards to make.
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', num_args = 1.., default_values_t = Profile::ALL)]
+    pub profiles: Vec<Profile>,
+    /// Error of scores that the compact profile may have: mean, relative to the spread of scores [default: the preset's].
+    #[arg(long, value_name = "E", value_parser = parse_error)]
+    pub compact_error: Option<f32>,
+    /// The same for the balanced profile.
+    #[arg(long, value_name = "E", value_parser = parse_error)]
+    pub balanced_error: Option<f32>,
+    /// Error of positions, world units [default: 0.01 in metric scenes, else a quarter of the size of a
+    /// cell's small Gaussians].
+    #[arg(long, value_name = "E")]
+    pub position_error: Option<f64>,
+    /// Objects.
+    #[command(flatten)]
+    pub objects: ObjectArgs,
+    /// Days after which robots refuse the manifest; never if absent.
+    #[arg(long, value_name = "DAYS")]
+    pub expires_days: Option<u32>,
+    /// Drops an unfinished encode of other inputs or settings.
+    #[arg(long)]
+    pub restart: bool,
+}
+
+/// `--weights`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum WeightsArg {
+    /// Alpha times transmittance: what a Gaussian contributes to the picture.
+    Blend,
+    /// The Gaussian's falloff alone.
+    Falloff,
+}
+
+impl From<WeightsArg> for WeightKind {
+    fn from(arg: WeightsArg) -> Self {
+        match arg {
+            WeightsArg::Blend => Self::Blend,
+            WeightsArg::Falloff => Self::Falloff,
+        }
+    }
+}
+
+/// Whether objects are found.
+#[derive(Debug, Args)]
+pub struct ObjectArgs {
+    /// Does not look for objects: masks of different views that show the same Gaussians.
+    #[arg(long)]
+    pub no_objects: bool,
+}
+
+/// Returns the settings that the flags stand for.
+fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
+    let preset = args.preset.choices();
+    let views_limit = args.views_limit.unwrap_or(preset.views_limit);
+    // A geo-reference that lies beside the scene belongs to it.
+    let beside = args.input.scene.with_file_name("geo.json");
+    let geo = args.geo.clone().or_else(|| beside.is_file().then_some(beside));
+    let metric = args.metric || geo.is_some();
+    let folder_name = args.store.file_name().map(|name| name.to_string_lossy().into_owned());
+    let created_unix_secs = now_unix_secs();
+    let masks = match (args.masks.as_str(), args.sam.masks()) {
+        ("graph", None) => Masks::Graph,
+        ("auto", masks) => {
+            masks.unwrap_or(Masks::Auto { n_levels: args.views.mask_levels.unwrap_or(preset.mask_levels) })
+        }
+        (dir, Some(_)) => {
+            return Err(anyhow!("--masks {dir} gives masks, --segmenter finds some; choose one"));
+        }
+        (dir, None) => Masks::Given { dir: dir.into(), ignore_ids: args.ignore_mask_ids.clone() },
+    };
+    Ok(EncodeSettings {
+        scene: args.input.scene.clone(),
+        views: args.input.views.clone(),
+        images: args.input.images.clone(),
+        masks,
+        store: args.store.clone(),
+        scene_name: args.name.clone().or(folder_name).unwrap_or_else(|| "scene".into()),
+        metric,
+        geo,
+        views_limit,
+        view_order: args.views.order(views_limit),
+        time_budget: args.views.time_budget,
+        raster_width: args.raster_width.unwrap_or(preset.raster_width),
+        background: args.background.map_or(preset.background, Into::into),
+        min_mask_px: args.min_mask_px.unwrap_or(preset.min_mask_px),
+        weights: args.weights.map_or(preset.weights, Into::into),
+        aggregation: args.refine.aggregation(preset.aggregation),
+        mask_noise: args.refine.mask_noise(),
+        keep_views: args.refine.keep_views,
+        threads: args.threads.map_or_else(available_threads, |n| n as usize),
+        memory_bytes: args.memory,
+        strict: args.input.strict,
+        restart: args.restart,
+        cells: CellLimits {
+            max_gaussians: args.cell_gaussians as usize,
+            max_width: metric.then_some(args.cell_width_m),
+        },
+        shards: ShardSettings {
+            profiles: args.profiles.clone(),
+            codebook: CodebookSettings {
+                compact_error: args.compact_error.unwrap_or(preset.codebook.compact_error),
+                balanced_error: args.balanced_error.unwrap_or(preset.codebook.balanced_error),
+                ..preset.codebook
+            },
+            position_error: args
+                .position_error
+                .map_or_else(|| PositionError::default_for(metric), PositionError::Within),
+        },
+        objects: preset.objects && !args.objects.no_objects,
+        created_unix_secs,
+        expires_unix_secs: args.expires_days.map(|days| created_unix_secs + u64::from(days) * 86_400),
+    })
+}
+
+pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    let settings = settings(args)?;
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(settings.threads)
+        .build_global()
+        .context("cannot start threads")?;
+    let (models, session) = open_models(&args.models)?;
+    tracing::info!("models: {} ({})", models.encoder_id(), models.about());
+    let devices = Devices::open(args.device, GpuOptions::default())?;
+    let summary = encode::encode(&settings, &models, &session, &devices, progress, cancel_flag()?.as_ref())?;
+    let busy =
+        summary.busy_secs.iter().map(|(stage, s)| format!("{stage} {s:.1}")).collect::<Vec<_>>().join(", ");
+    let of_views: String = (summary.view_stages.iter())
+        .map(|stage| {
+            let StageReport { stage, n_slots, busy_secs, busy_share } = stage;
+            format!("  {stage:<9}{n_slots:>8}{busy_secs:>10.1}{:>7.0} %\n", 100.0 * busy_share)
+        })
+        .collect();
+    let sizes = summary
+        .shard_bytes
+        .iter()
+        .map(|(p, b)| format!("{p} {:.1} MB", *b as f64 / 1e6))
+        .collect::<Vec<_>>()
+        .join(", ");
+    let skipped = match summary.skipped_views.len() {
+        0 => String::new(),
+        n => format!("left out   {n} views, the first: {}\n", summary.skipped_views[0].reason),
+    };
+    let coverage = summary.coverage.map_or(String::new(), |CoverageReport { coverage, seen }| {
+        let (coverage, seen, secs) = (100.0 * coverage, 100.0 * seen, summary.coverage_secs);
+        format!("coverage   {coverage:.1} % of all views, {seen:.1} % of the Gaussians seen; found in {secs:.1} s\n")
+    });
+    let objects = summary.objects.as_ref().map_or(String::new(), |found| {
+        let (n, of_masks, aside) = (found.n_objects, found.n_masks_of_objects, found.n_masks_set_aside);
+        format!(
+            "objects    {n} of {of_masks} masks, {} Gaussians; {aside} masks set aside\n",
+            found.n_gaussians
+        )
+    });
+    let most = most_spent(&summary);
+    let images_on = summary.images_on.as_ref().map_or(String::new(), |on| format!("images on  {on}\n"));
+    let lines = format!(
+        "published  generation {} in {}\n\
+         Gaussians  {} ({} without evidence, {} unusable)\n\
+         views      {} of {} ({} resumed, {} without masks)\n{coverage}{skipped}{images_on}\
+         masks      {} in {} regions, {} sums\n\
+         cells      {} with {} codebook rows\n\
+         {objects}shards     {sizes}\n{most}\
+         seconds    {:.1}; by stage, all threads: {busy}\n\
+         views took {:.1} s\n  stage    at once   seconds    busy\n{of_views}",
+        summary.generation,
+        settings.store.display(),
+        summary.n_gaussians,
+        summary.n_without_evidence,
+        summary.n_rejected,
+        summary.n_views,
+        summary.n_views_with_photo,
+        summary.n_views_resumed,
+        summary.n_views_without_masks,
+        summary.n_masks,
+        summary.n_regions,
+        summary.n_entries,
+        summary.n_cells,
+        summary.n_centroids,
+        summary.wall_secs,
+        summary.views_secs,
+    );
+    print(json, &summary, lines)?;
+    Ok(if summary.skipped_views.is_empty() { Exit::Done } else { Exit::Partly })
+}
+
+/// Returns the line that names the view and the cell on which most was spent.
+fn most_spent(summary: &EncodeSummary) -> String {
+    let (views, cells) = (&summary.views, &summary.cells);
+    let most = (0..views.view.len()).max_by(|a, b| views.secs[*a].total_cmp(&views.secs[*b]));
+    let (Some(at), Some(cell)) = (most, cells.iter().max_by_key(|cell| cell.n_centroids)) else {
+        return String::new();
+    };
+    let ViewsReport { view, raster_width_px, n_masks, n_regions, n_entries, secs } = views;
+    let CellReport { cell_id, n_gaussians, n_centroids, .. } = cell;
+    format!(
+        "most on    view {}, {:.1} s ({} masks, {} regions, {} sums, {} px wide); cell {cell_id}, {n_centroids} rows \
+         ({n_gaussians} Gaussians)\n",
+        view[at], secs[at], n_masks[at], n_regions[at], n_entries[at], raster_width_px[at]
+    )
+}

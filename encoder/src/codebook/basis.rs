@@ -1,0 +1,210 @@
+//! The coordinates in which a cell's embeddings are kept: few, and such that equal distances are equal
+//! errors of scores.
+
+use half::f16;
+
+use slag_models::TextEncoder;
+
+use slag_math::axes::moments_of;
+use slag_math::eigen::{EXTRA_VECTORS, leading_eigenvectors};
+use slag_math::matrix::{Panels, Rows};
+use slag_math::random::mix64;
+use slag_math::{dot, dot_f64};
+
+/// Share of the texts' covariance that is replaced by that of texts in all directions alike, so that a
+/// direction in which no text of the bank points is not thrown away.
+const ISOTROPIC_SHARE: f64 = 0.2;
+/// Most components.
+const MAX_COMPONENTS: usize = 128;
+
+/// Most texts of a bank, and fewest that say where queries point.
+const MAX_TEXTS: usize = 2048;
+const MIN_TEXTS: usize = 8;
+
+/// Texts that queries are expected to be like: `[n][dim]`, unit vectors in the space of the embeddings.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct TextBank {
+    /// Components.
+    pub dim: usize,
+    /// `[n][dim]`.
+    pub vectors: Vec<f32>,
+}
+
+impl TextBank {
+    /// Encodes a model's own vocabulary, or else everyday words, of which those that it does not know are left
+    /// out; pseudo-random directions where too few are left to say where queries point.
+    pub fn of_model(encoder: &mut dyn TextEncoder) -> Self {
+        let words: Vec<String> = match encoder.vocabulary() {
+            Some(words) => words.to_vec(),
+            None => include_str!("texts.txt").lines().map(str::to_owned).collect(),
+        };
+        let stride = words.len().div_ceil(MAX_TEXTS).max(1);
+        let dim = encoder.dim();
+        let vectors = words.iter().step_by(stride).filter_map(|word| encoder.encode(word).ok());
+        let bank = Self { dim, vectors: vectors.flatten().collect() };
+        if bank.len() < MIN_TEXTS { Self::directions(bank.dim) } else { bank }
+    }
+
+    /// Returns unit vectors in all directions alike.
+    pub fn directions(dim: usize) -> Self {
+        let mut vectors: Vec<f32> = (0..(256 * dim) as u64)
+            .map(|i| (0..4).map(|k| (mix64(i << 2 | k) >> 40) as f32 / (1u64 << 23) as f32 - 1.0).sum())
+            .collect();
+        for vector in vectors.chunks_exact_mut(dim) {
+            let length = dot(vector, vector).sqrt();
+            vector.iter_mut().for_each(|v| *v /= length);
+        }
+        Self { dim, vectors }
+    }
+
+    /// Returns the number of texts.
+    pub fn len(&self) -> usize {
+        self.vectors.len().checked_div(self.dim).unwrap_or(0)
+    }
+
+    /// Returns whether there is none.
+    pub fn is_empty(&self) -> bool {
+        self.vectors.is_empty()
+    }
+}
+
+/// How far scores move: for a difference d of embeddings, the mean over texts of (q . d)^2 is |F' d|^2.
+pub struct ScoreMetric {
+    dim: usize,
+    /// `[dim][dim]`: the lower triangle of the Cholesky factor F of the texts' second moments.
+    factor: Vec<f64>,
+}
+
+impl ScoreMetric {
+    /// Takes the metric of a bank; without texts, that of texts in all directions alike.
+    pub fn new(dim: usize, bank: &TextBank) -> Self {
+        let mut moments = vec![0.0; dim * dim];
+        if !bank.is_empty() {
+            let columns = Panels::new(bank.len(), dim, |text, c| bank.vectors[text * dim + c]);
+            let transposed: Vec<f32> = (0..dim)
+                .flat_map(|c| (0..bank.len()).map(move |text| (c, text)))
+                .map(|(c, text)| bank.vectors[text * dim + c])
+                .collect();
+            let products = columns.product(Rows::all(&transposed, bank.len()));
+            let scale = (1.0 - ISOTROPIC_SHARE) / bank.len() as f64;
+            moments.iter_mut().zip(products).for_each(|(m, p)| *m = f64::from(p) * scale);
+        }
+        let isotropic = if bank.is_empty() { 1.0 } else { ISOTROPIC_SHARE } / dim as f64;
+        (0..dim).for_each(|i| moments[i * dim + i] += isotropic);
+        // Cholesky, row by row (Golub and Van Loan, 4.2). The isotropic share keeps every pivot positive.
+        let mut factor = moments;
+        for i in 0..dim {
+            for j in 0..=i {
+                let (before, row) = factor.split_at_mut(i * dim);
+                let known: f64 = match j == i {
+                    true => row[..j].iter().map(|v| v * v).sum(),
+                    false => row[..j].iter().zip(&before[j * dim..]).map(|(a, b)| a * b).sum(),
+                };
+                row[j] = match j == i {
+                    true => (row[i] - known).max(isotropic / 2.0).sqrt(),
+                    false => (row[j] - known) / before[j * dim + j],
+                };
+            }
+            factor[i * dim + i + 1..(i + 1) * dim].fill(0.0);
+        }
+        Self { dim, factor }
+    }
+
+    /// Returns the components of an embedding.
+    pub fn dim(&self) -> usize {
+        self.dim
+    }
+
+    /// Returns the standard deviation of scores over some vectors, as root mean square over texts.
+    pub fn spread(&self, vectors: Rows<'_>) -> f32 {
+        let (_, covariance) = moments_of(vectors);
+        self.whitened(&covariance).iter().step_by(self.dim + 1).map(|v| f64::from(*v)).sum::<f64>().sqrt()
+            as f32
+    }
+
+    /// Returns F' C F.
+    fn whitened(&self, covariance: &[f32]) -> Vec<f32> {
+        let dim = self.dim;
+        let factor = Panels::new(dim, dim, |i, j| self.factor[i * dim + j] as f32);
+        let right = factor.product(Rows::all(covariance, dim));
+        // (F' (C F))' = (C F)' F, and the whole is symmetric.
+        let transposed: Vec<f32> = (0..dim * dim).map(|at| right[at % dim * dim + at / dim]).collect();
+        factor.product(Rows::all(&transposed, dim))
+    }
+}
+
+/// A cell's coordinates: `embedding ~ mean + sum over c of component[c] * basis[c]`.
+pub struct Basis {
+    /// `[dim]`, as stored.
+    pub mean: Vec<f16>,
+    /// Components, m.
+    pub n_components: usize,
+    /// `[m][dim]`: component c of an embedding is `forms[c] . (embedding - mean)`.
+    forms: Vec<f32>,
+    /// `[m][dim]`.
+    pub basis: Vec<f32>,
+}
+
+impl Basis {
+    /// Finds the fewest components that keep the scores' root-mean-square error within a tolerance.
+    pub fn fit(vectors: Rows<'_>, metric: &ScoreMetric, tolerance: f32) -> Self {
+        let dim = metric.dim;
+        let (mean, covariance) = moments_of(vectors);
+        let whitened = metric.whitened(&covariance);
+        let total: f64 = whitened.iter().step_by(dim + 1).map(|v| f64::from(*v)).sum();
+        let (values, directions) =
+            leading_eigenvectors(&whitened, dim, (MAX_COMPONENTS + EXTRA_VECTORS).min(dim));
+        let most = MAX_COMPONENTS.min(dim).min(vectors.len().max(2));
+        let mut left = total;
+        let mut n_components = 0;
+        while n_components < most && (n_components < 2 || left > f64::from(tolerance).powi(2)) {
+            left -= values.get(n_components).copied().unwrap_or(0.0);
+            n_components += 1;
+        }
+        // Groups come in pairs, and each has a component.
+        n_components = n_components.next_multiple_of(2).min(dim);
+        let mut forms = vec![0.0; n_components * dim];
+        let mut basis = vec![0.0; n_components * dim];
+        for c in 0..n_components {
+            let direction = &directions[c * dim..][..dim];
+            // form = F u, basis = F'^-1 u, by back substitution.
+            let mut solved = direction.to_vec();
+            for i in (0..dim).rev() {
+                let row = &metric.factor[i * dim..][..=i];
+                solved[i] /= row[i];
+                let value = solved[i];
+                solved[..i].iter_mut().zip(row).for_each(|(s, f)| *s -= value * f);
+            }
+            for i in 0..dim {
+                let row = &metric.factor[i * dim..][..=i];
+                forms[c * dim + i] = dot_f64(row, &direction[..=i]) as f32;
+                basis[c * dim + i] = solved[i] as f32;
+            }
+        }
+        Self { mean, n_components, forms, basis }
+    }
+
+    /// Returns the components of some embeddings, `[n][m]`.
+    pub fn components(&self, vectors: Rows<'_>) -> Vec<f32> {
+        let (m, dim) = (self.n_components, self.mean.len());
+        let offsets: Vec<f32> = (0..m)
+            .map(|c| {
+                let form = &self.forms[c * dim..][..dim];
+                form.iter().zip(&self.mean).map(|(f, v)| f64::from(*f) * v.to_f64()).sum::<f64>() as f32
+            })
+            .collect();
+        let mut out = Panels::new(dim, m, |i, c| self.forms[c * dim + i]).product(vectors);
+        for components in out.chunks_exact_mut(m) {
+            components.iter_mut().zip(&offsets).for_each(|(c, o)| *c -= o);
+        }
+        out
+    }
+
+    /// Turns the coordinates: new component c is `rotation[c] . old components` (rows `[m][m]`, orthonormal).
+    pub fn rotate(&mut self, rotation: &[f32]) {
+        let (m, dim) = (self.n_components, self.mean.len());
+        for vectors in [&mut self.forms, &mut self.basis] {
+            *vectors = Panels::new(m, dim, |c, i| vectors[c * dim + i]).product(Rows::all(rotation, m));
+        }
+    }
+}

@@ -1,0 +1,168 @@
+//! Which centroid each Gaussian belongs to: clusters of points, as many as the error asks for.
+
+use rayon::prelude::*;
+
+use slag_math::matrix::{Panels, Rows};
+
+/// Rounds of 2-means when a cluster is split; the halves hardly move after the third.
+const SPLIT_ROUNDS: usize = 3;
+/// Rounds of k-means over all centroids at the end.
+const REFINE_ROUNDS: usize = 1;
+/// So few clusters are all split: each is far from good enough.
+const FEW_CLUSTERS: usize = 16;
+/// Share of the clusters that are split at a time: the worst, so that the order is almost that of
+/// splitting one by one, and threads have work.
+const SPLIT_SHARE: usize = 8;
+
+/// Clusters of points.
+pub struct Clusters {
+    /// `[n]`: cluster of each point.
+    pub codes: Vec<u32>,
+    /// `[K][width]`: mean of each cluster's points.
+    pub centres: Vec<f32>,
+}
+
+struct Cluster {
+    /// Ascending.
+    members: Vec<u32>,
+    centre: Vec<f32>,
+    /// Sum of squared distances of the members from the centre.
+    squared_error: f64,
+}
+
+/// Finds clusters whose points are, as root mean square over all, within `max_rms` of their centres, but
+/// no more than `max_clusters`. The result depends on the points alone, not on threads.
+pub fn clusters(points: Rows<'_>, max_rms: f32, max_clusters: usize) -> Clusters {
+    let split = split(points, max_rms, max_clusters.max(1));
+    let mut codes = vec![0; points.len()];
+    for (number, cluster) in split.iter().enumerate() {
+        cluster.members.iter().for_each(|point| codes[*point as usize] = number as u32);
+    }
+    let mut centres: Vec<f32> = split.into_iter().flat_map(|cluster| cluster.centre).collect();
+    for _ in 0..REFINE_ROUNDS {
+        codes = nearest(points, &centres);
+        centres = transpose(points, &mut codes, centres.len() / points.width);
+    }
+    Clusters { codes, centres }
+}
+
+/// Returns the nearest centre of each point.
+pub fn nearest(points: Rows<'_>, centres: &[f32]) -> Vec<u32> {
+    let width = points.width;
+    // ||p - c||² = ||p||² - 2 (p·c - ||c||²/2); the first term is the same for all centres.
+    let half_norms: Vec<f32> =
+        centres.chunks_exact(width).map(|c| c.iter().map(|v| v * v).sum::<f32>() / 2.0).collect();
+    Panels::new(width, half_norms.len(), |i, c| centres[c * width + i]).largest(points, &half_norms)
+}
+
+/// Returns the means of clusters, and numbers those that have points anew.
+fn transpose(points: Rows<'_>, codes: &mut [u32], n_clusters: usize) -> Vec<f32> {
+    let mut members = vec![Vec::new(); n_clusters];
+    codes.iter().enumerate().for_each(|(point, code)| members[*code as usize].push(point as u32));
+    let mut number = 0;
+    let numbers: Vec<u32> = members
+        .iter()
+        .map(|members| {
+            number += u32::from(!members.is_empty());
+            number.max(1) - 1
+        })
+        .collect();
+    codes.iter_mut().for_each(|code| *code = numbers[*code as usize]);
+    members.retain(|members| !members.is_empty());
+    let centres: Vec<Vec<f32>> = members.into_par_iter().map(|members| mean(points, &members)).collect();
+    centres.concat()
+}
+
+fn mean(points: Rows<'_>, members: &[u32]) -> Vec<f32> {
+    let mut sum = vec![0.0f64; points.width];
+    for point in members {
+        sum.iter_mut().zip(points.get(*point as usize)).for_each(|(s, v)| *s += f64::from(*v));
+    }
+    let n = members.len().max(1) as f64;
+    sum.iter().map(|s| (s / n) as f32).collect()
+}
+
+impl Cluster {
+    fn new(points: Rows<'_>, members: Vec<u32>) -> Self {
+        let centre = mean(points, &members);
+        let distance = |point: &u32| f64::from(squared_distance(points.get(*point as usize), &centre));
+        let squared_error = members.iter().map(distance).sum();
+        Self { members, centre, squared_error }
+    }
+}
+
+/// Splits the clusters with the largest squared errors until the sum keeps the budget.
+fn split(points: Rows<'_>, max_rms: f32, max_clusters: usize) -> Vec<Cluster> {
+    let n = points.len();
+    let budget = f64::from(max_rms).powi(2) * n as f64;
+    let mut done: Vec<Cluster> = Vec::new();
+    let mut open = vec![Cluster::new(points, (0..n as u32).collect())];
+    while !open.is_empty() {
+        let n_clusters = done.len() + open.len();
+        let error: f64 = done.iter().chain(&open).map(|cluster| cluster.squared_error).sum();
+        if error <= budget || n_clusters >= max_clusters {
+            break;
+        }
+        open.sort_by(|a, b| b.squared_error.total_cmp(&a.squared_error).then(a.members.cmp(&b.members)));
+        let share = if open.len() < FEW_CLUSTERS { 1 } else { SPLIT_SHARE };
+        let n_split = (open.len() / share).clamp(1, max_clusters - n_clusters);
+        let rest = open.split_off(n_split);
+        let halves: Vec<Result<[Cluster; 2], Cluster>> =
+            open.into_par_iter().map(|cluster| split_in_two(points, cluster)).collect();
+        open = rest;
+        for result in halves {
+            match result {
+                Ok(pair) => open.extend(pair),
+                Err(whole) => done.push(whole),
+            }
+        }
+    }
+    done.extend(open);
+    done
+}
+
+/// 2-means, started from the member farthest from the centre and the one farthest from that; the cluster
+/// itself where all members coincide.
+fn split_in_two(points: Rows<'_>, cluster: Cluster) -> Result<[Cluster; 2], Cluster> {
+    let farthest = |from: &[f32]| {
+        let distance = |point: &u32| (squared_distance(points.get(*point as usize), from), *point);
+        let farther = |a: (f32, u32), b: (f32, u32)| if b.0 > a.0 { b } else { a };
+        let found = cluster.members.iter().map(distance).fold((-1.0, cluster.members[0]), farther);
+        points.get(found.1 as usize)
+    };
+    let first = farthest(&cluster.centre);
+    let second = farthest(first);
+    let mut centres = [first.to_vec(), second.to_vec()];
+    let mut halves = None;
+    for _ in 0..SPLIT_ROUNDS {
+        // |p - a|² <= |p - b|² where p·(a - b) >= (|a|² - |b|²) / 2: one product a point.
+        let direction: Vec<f32> = centres[0].iter().zip(&centres[1]).map(|(a, b)| a - b).collect();
+        let norm = |v: &[f32]| v.iter().map(|x| x * x).sum::<f32>();
+        let border = (norm(&centres[0]) - norm(&centres[1])) / 2.0;
+        let is_first = |point: &u32| slag_math::dot(points.get(*point as usize), &direction) >= border;
+        let (a, b): (Vec<u32>, Vec<u32>) = cluster.members.iter().partition(|point| is_first(point));
+        if a.is_empty() || b.is_empty() {
+            break;
+        }
+        centres = [mean(points, &a), mean(points, &b)];
+        halves = Some([a, b]);
+    }
+    match halves {
+        Some(halves) => Ok(halves.map(|members| Cluster::new(points, members))),
+        None => Err(cluster),
+    }
+}
+
+pub(super) fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
+    let mut lanes = [0.0f32; 16];
+    let (a_blocks, a_rest) = a.as_chunks::<16>();
+    let (b_blocks, b_rest) = b.as_chunks::<16>();
+    for (x, y) in a_blocks.iter().zip(b_blocks) {
+        for lane in 0..16 {
+            let d = x[lane] - y[lane];
+            lanes[lane] += d * d;
+        }
+    }
+    let rest: f32 = a_rest.iter().zip(b_rest).map(|(x, y)| (x - y) * (x - y)).sum();
+    lanes.iter().sum::<f32>() + rest
+}

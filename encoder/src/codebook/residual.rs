@@ -1,0 +1,258 @@
+//! What one centroid leaves of its members: a codeword of 16 for each of some subspaces of components.
+//!
+//! Components are the eigenvectors of the residuals, so that subspaces can be coded one by one (optimised
+//! product quantisation: Ge, He, Ke and Sun 2013; a code of four bits: what a byte shuffle looks up).
+
+use half::f16;
+use rayon::prelude::*;
+use slag_common::shard::{BLOCK, CODEWORDS};
+
+use super::cluster::{clusters, nearest, squared_distance};
+use slag_math::eigen::eigen_symmetric;
+use slag_math::matrix::Rows;
+
+/// Residuals that codewords are trained on.
+const TRAINING_SAMPLE: usize = 6144;
+/// Most components of a subspace: with more, 16 codewords say little of each.
+const MAX_GROUP: usize = 8;
+/// Numbers of subspaces are multiples of this.
+const GROUPS_STEP: usize = 4;
+
+/// A residual code.
+pub struct ResidualCode {
+    /// `[G + 1]`.
+    pub subspace_starts: Vec<u32>,
+    /// Group by subspace `[16][components of the subspace]`.
+    pub codewords: Vec<f16>,
+}
+
+/// Returns the rotation (centroids `[m][m]`) to the residuals' eigenvectors, and their eigenvalues.
+pub fn rotation(residuals: Rows<'_>) -> (Vec<f32>, Vec<f64>) {
+    let m = residuals.width;
+    let stride = residuals.len().div_ceil(TRAINING_SAMPLE).max(1);
+    let sample: Vec<u32> = (0..residuals.len() as u32).step_by(stride).collect();
+    let moments = sample
+        .par_chunks(512)
+        .map(|chunk| {
+            let mut sums = vec![0.0f64; m * m];
+            for centroid in chunk {
+                let residual = residuals.get(*centroid as usize);
+                for (i, a) in residual.iter().enumerate() {
+                    sums[i * m..][..=i].iter_mut().zip(residual).for_each(|(s, b)| *s += f64::from(a * b));
+                }
+            }
+            sums
+        })
+        // Collected in order: the sum is the same for any number of threads.
+        .collect::<Vec<_>>();
+    let mut total = vec![0.0; m * m];
+    moments.iter().for_each(|sums| total.iter_mut().zip(sums).for_each(|(t, s)| *t += s));
+    for i in 0..m {
+        for j in 0..i {
+            total[j * m + i] = total[i * m + j];
+        }
+    }
+    total.iter_mut().for_each(|t| *t /= sample.len().max(1) as f64);
+    let (values, vectors) = eigen_symmetric(total, m);
+    (vectors.into_iter().map(|v| v as f32).collect(), values)
+}
+
+/// Puts components into subspaces so that all together lose least, and returns the components in the order of
+/// their subspaces (those in none last) and where the subspaces start.
+pub fn subspaces(variances: &[f64], n_subspaces: usize) -> (Vec<usize>, Vec<u32>) {
+    let log = |c: usize| log_variance(variances[c]);
+    let mut members: Vec<Vec<usize>> = (0..n_subspaces).map(|c| vec![c]).collect();
+    let mut log_products: Vec<f64> = (0..n_subspaces).map(log).collect();
+    let mut outside = Vec::new();
+    for (c, variance) in variances.iter().enumerate().skip(n_subspaces) {
+        let rise = |g: usize| {
+            let d = members[g].len();
+            loss(d + 1, log_products[g] + log(c)) - loss(d, log_products[g])
+        };
+        let best = (0..n_subspaces)
+            .filter(|g| members[*g].len() < MAX_GROUP)
+            .min_by(|a, b| rise(*a).total_cmp(&rise(*b)));
+        match best.filter(|g| rise(*g) < *variance) {
+            Some(g) => {
+                log_products[g] += log(c);
+                members[g].push(c);
+            }
+            None => outside.push(c),
+        }
+    }
+    let mut starts = vec![0u32];
+    members.iter().for_each(|subspace| starts.push(starts[starts.len() - 1] + subspace.len() as u32));
+    (members.into_iter().flatten().chain(outside).collect(), starts)
+}
+
+impl ResidualCode {
+    /// Trains the codewords of subspaces of consecutive components.
+    pub fn train(residuals: Rows<'_>, subspace_starts: Vec<u32>) -> Self {
+        let stride = residuals.len().div_ceil(TRAINING_SAMPLE).max(1);
+        let sample: Vec<usize> = (0..residuals.len()).step_by(stride).collect();
+        let codewords: Vec<Vec<f16>> = subspace_starts
+            .par_windows(2)
+            .map(|subspace| {
+                let (from, to) = (subspace[0] as usize, subspace[1] as usize);
+                let points: Vec<f32> =
+                    sample.iter().flat_map(|centroid| &residuals.get(*centroid)[from..to]).copied().collect();
+                let mut codewords = trained(Rows::all(&points, to - from), CODEWORDS);
+                // Fewer distinct residuals than codewords: the rest is never named.
+                codewords.resize(CODEWORDS * (to - from), 0.0);
+                codewords.into_iter().map(f16::from_f32).collect()
+            })
+            .collect();
+        Self { subspace_starts, codewords: codewords.concat() }
+    }
+
+    /// Returns the number of subspaces.
+    pub fn n_subspaces(&self) -> usize {
+        self.subspace_starts.len() - 1
+    }
+
+    /// Returns the components that codewords cover.
+    pub fn n_components(&self) -> usize {
+        self.subspace_starts[self.n_subspaces()] as usize
+    }
+
+    /// Returns the codes of residuals, `[ceil(n / 32)][G / 2][32]`, and what they decode to,
+    /// `[n][components covered]`.
+    pub fn encode(&self, residuals: Rows<'_>) -> (Vec<u8>, Vec<f32>) {
+        let (n_subspaces, covered) = (self.n_subspaces(), self.n_components());
+        let codewords: Vec<f32> = self.codewords.iter().map(|w| w.to_f32()).collect();
+        let mut codes = vec![0u8; residuals.len().div_ceil(BLOCK) * BLOCK * n_subspaces / 2];
+        let mut decoded = vec![0.0; residuals.len() * covered];
+        codes
+            .par_chunks_mut(BLOCK * n_subspaces / 2)
+            .zip(decoded.par_chunks_mut(BLOCK * covered))
+            .enumerate()
+            .for_each(|(block, (codes, decoded))| {
+                for (place, decoded) in decoded.chunks_exact_mut(covered).enumerate() {
+                    let residual = residuals.get(block * BLOCK + place);
+                    for subspace in 0..n_subspaces {
+                        let of_subspace = self.subspace_starts[subspace] as usize
+                            ..self.subspace_starts[subspace + 1] as usize;
+                        let codewords =
+                            &codewords[CODEWORDS * of_subspace.start..CODEWORDS * of_subspace.end];
+                        let code = nearest_codeword(&residual[of_subspace.clone()], codewords);
+                        codes[subspace / 2 * BLOCK + place] |= (code as u8) << (4 * (subspace % 2));
+                        let len = of_subspace.len();
+                        decoded[of_subspace].copy_from_slice(&codewords[code * len..][..len]);
+                    }
+                }
+            });
+        (codes, decoded)
+    }
+}
+
+fn nearest_codeword(residual: &[f32], codewords: &[f32]) -> usize {
+    let mut best = (f32::INFINITY, 0);
+    for (code, codeword) in codewords.chunks_exact(residual.len()).enumerate() {
+        let distance: f32 = residual.iter().zip(codeword).map(|(a, b)| (a - b) * (a - b)).sum();
+        if distance < best.0 {
+            best = (distance, code);
+        }
+    }
+    best.1
+}
+
+/// Returns the means of k-means, `n_codewords` at most.
+pub fn trained(points: Rows<'_>, n_codewords: usize) -> Vec<f32> {
+    /// Rounds after those of the clusters: the gain of more is below a hundredth.
+    const ROUNDS: usize = 4;
+    let mut codewords = clusters(points, 0.0, n_codewords).centres;
+    for _ in 0..ROUNDS {
+        let codes = nearest(points, &codewords);
+        let mut sums = vec![0.0f64; codewords.len()];
+        let mut counts = vec![0.0f64; codewords.len() / points.width];
+        for (centroid, code) in codes.iter().enumerate() {
+            counts[*code as usize] += 1.0;
+            let sum = &mut sums[*code as usize * points.width..][..points.width];
+            sum.iter_mut().zip(points.get(centroid)).for_each(|(s, v)| *s += f64::from(*v));
+        }
+        for (at, codeword) in codewords.iter_mut().enumerate() {
+            let count = counts[at / points.width];
+            if count > 0.0 {
+                *codeword = (sums[at] / count) as f32;
+            }
+        }
+    }
+    codewords
+}
+
+/// Returns the smallest number of subspaces whose code leaves at most `max_rms` of the residuals, with the code
+/// and the order of components that it needs; `None` where none is needed. `scales`: what each residual was
+/// divided by.
+pub fn plan(
+    residuals: Rows<'_>,
+    scales: &[f32],
+    variances: &[f64],
+    max_rms: f32,
+    max_subspaces: usize,
+) -> Option<(Vec<usize>, ResidualCode)> {
+    let m = residuals.width;
+    let stride = residuals.len().div_ceil(TRAINING_SAMPLE).max(1);
+    let sample: Vec<usize> = (0..residuals.len()).step_by(stride).collect();
+    let mean_square = |error: &mut dyn FnMut(usize) -> f64| {
+        let total: f64 = sample
+            .iter()
+            .enumerate()
+            .map(|(at, centroid)| error(at) * f64::from(scales[*centroid]).powi(2))
+            .sum();
+        total / sample.len().max(1) as f64
+    };
+    let target = f64::from(max_rms).powi(2);
+    let norm = |centroid: usize| residuals.get(centroid).iter().map(|v| f64::from(v * v)).sum::<f64>();
+    if mean_square(&mut |at| norm(sample[at])) <= target {
+        return None;
+    }
+    let max_subspaces = max_subspaces.min(m) / 2 * 2;
+    let train = |n_subspaces: usize| {
+        let (order, starts) = subspaces(variances, n_subspaces);
+        let points: Vec<f32> =
+            sample.iter().flat_map(|centroid| order.iter().map(|c| residuals.get(*centroid)[*c])).collect();
+        let points = Rows::all(&points, m);
+        let code = ResidualCode::train(points, starts);
+        let (_, decoded) = code.encode(points);
+        let covered = code.n_components();
+        let error = mean_square(&mut |at| {
+            let (inside, outside) = points.get(at).split_at(covered);
+            let inside = squared_distance(inside, &decoded[at * covered..][..covered]);
+            f64::from(inside) + outside.iter().map(|v| f64::from(v * v)).sum::<f64>()
+        });
+        (order, code, error)
+    };
+    // A short code tells how far the residuals are from what the estimate takes them for; the length that is
+    // needed follows from it, and only that one is trained.
+    let few = (2 * GROUPS_STEP).min(max_subspaces);
+    let (order, code, error) = train(few);
+    if error <= target || few == max_subspaces {
+        return Some((order, code));
+    }
+    let factor = error / estimated_loss(variances, few);
+    let steps = (few..max_subspaces).step_by(GROUPS_STEP).skip(1);
+    let enough = steps.into_iter().find(|n| factor * estimated_loss(variances, *n) <= target);
+    let (order, code, _) = train(enough.unwrap_or(max_subspaces));
+    Some((order, code))
+}
+
+/// Returns what a code of so many subspaces leaves of the residuals, as mean square, if they were Gaussian.
+fn estimated_loss(variances: &[f64], n_subspaces: usize) -> f64 {
+    let (order, starts) = subspaces(variances, n_subspaces);
+    let of_subspace = |subspace: &[u32]| {
+        let members = &order[subspace[0] as usize..subspace[1] as usize];
+        loss(members.len(), members.iter().map(|c| log_variance(variances[*c])).sum())
+    };
+    let outside = &order[starts[n_subspaces] as usize..];
+    starts.windows(2).map(of_subspace).sum::<f64>() + outside.iter().map(|c| variances[*c]).sum::<f64>()
+}
+
+/// What four bits leave of `d` components, given the sum of the logarithms of their variances (rate and
+/// distortion of Gaussian ones at equal loss).
+fn loss(d: usize, log_product: f64) -> f64 {
+    d as f64 * ((log_product - 8.0 * std::f64::consts::LN_2) / d as f64).exp()
+}
+
+fn log_variance(variance: f64) -> f64 {
+    variance.max(1e-30).ln()
+}

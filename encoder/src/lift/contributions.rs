@@ -1,0 +1,392 @@
+//! What one view contributes: its mask vectors, its regions, and the sparse contributions, in a file of the
+//! job's folder, so that a killed encode does not compute them again.
+//!
+//! The file is a container with everything but the contributions, and after it the contributions by (cell, slice of
+//! its Gaussians): what a few cells need of a view is one stretch of its file, so bringing all views
+//! together by cell reads each byte once and writes none.
+
+use std::io::{Read, Seek, SeekFrom};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use bytemuck::{Pod, Zeroable};
+use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
+
+use crate::cells::{CellSplit, NO_CELL};
+use crate::raster::RegionWeight;
+
+const MAGIC: [u8; 8] = *b"SLAGCONT";
+const VERSION: u32 = 2;
+const REGION_BITS: u32 = 20;
+
+/// Gaussians of a cell whose contributions lie together: those of one slice, from all views, fit a core's cache.
+pub const GAUSSIANS_PER_SLICE: usize = 1 << (32 - REGION_BITS);
+/// Regions that a view may have.
+pub const MAX_REGIONS: usize = 1 << REGION_BITS;
+
+mod section {
+    pub const HEADER: u32 = 1;
+    pub const REGION_STARTS: u32 = 2;
+    pub const REGION_MASKS: u32 = 3;
+    pub const MASK_VECTORS: u32 = 4;
+    pub const RUNS: u32 = 5;
+    /// Not in the container but after it; the number is that of its errors.
+    pub const ENTRIES: u32 = 6;
+}
+
+#[derive(Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
+struct Header {
+    n_regions: u32,
+    n_masks: u32,
+    dim: u32,
+    n_runs: u32,
+    n_region_masks: u64,
+    n_entries: u64,
+}
+
+/// The contributions of one slice of a cell: those from `start` on, up to the next run's.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct Run {
+    /// The cell.
+    pub cell_id: u32,
+    /// The slice: index within the cell / [`GAUSSIANS_PER_SLICE`].
+    pub slice: u32,
+    /// Its first entry in the file.
+    pub start: u64,
+    /// First 8 bytes of the BLAKE3 hash of its entries.
+    checksum: u64,
+}
+
+/// A sum `a(k, r)`: the blending weight of a Gaussian over the pixels of a region.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Contribution {
+    /// The Gaussian, by its index within its cell.
+    pub local: u32,
+    /// The region of the view.
+    pub region: u32,
+    /// The sum.
+    pub weight: f32,
+}
+
+/// A [`Contribution`] of a known slice, as it lies in the file.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub(super) struct PackedEntry {
+    key: u32,
+    /// The sum.
+    pub(super) weight: f32,
+}
+
+impl PackedEntry {
+    fn new(entry: &Contribution) -> Self {
+        let in_slice = entry.local % GAUSSIANS_PER_SLICE as u32;
+        Self { key: in_slice << REGION_BITS | entry.region, weight: entry.weight }
+    }
+
+    /// Returns the Gaussian's index within the slice.
+    pub(super) fn in_slice(self) -> usize {
+        (self.key >> REGION_BITS) as usize
+    }
+
+    /// Returns the view's region.
+    pub(super) fn region(self) -> u32 {
+        self.key & (MAX_REGIONS as u32 - 1)
+    }
+}
+
+/// One view's part of the lift.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ViewContributions {
+    /// Components of a mask vector.
+    pub dim: usize,
+    /// `[n_masks][dim]`, unit.
+    pub mask_vectors: Vec<f32>,
+    /// The masks that cover each region, ascending.
+    pub masks_of_region: Vec<Vec<u32>>,
+    /// Sums by cell (ascending), within a cell by (Gaussian, region).
+    pub entries_of_cell: Vec<(u32, Vec<Contribution>)>,
+}
+
+/// A file of contributions that cannot be written or used.
+#[derive(Debug, thiserror::Error)]
+pub enum ContributionError {
+    /// The file system said no.
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+    /// The file is damaged.
+    #[error("{}: {source}", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: ContainerError,
+    },
+    /// More regions than an entry can name.
+    #[error("{}: {found} regions, {MAX_REGIONS} at most; give fewer masks or a lower --raster-width", path.display())]
+    TooManyRegions {
+        /// The file.
+        path: PathBuf,
+        /// Regions of the view.
+        found: usize,
+    },
+}
+
+/// CRC-32: the file is our own and never travels, and at a gigabyte a scene a cryptographic hash would be
+/// the slowest step of the lift.
+fn checksum(entries: &[PackedEntry]) -> u64 {
+    u64::from(crc32fast::hash(bytemuck::cast_slice(entries)))
+}
+
+impl ViewContributions {
+    /// Groups a view's weights by cell. `weights` are sorted by (Gaussian, region).
+    pub fn new(
+        weights: &[RegionWeight],
+        masks_of_region: Vec<Vec<u32>>,
+        mask_vectors: Vec<f32>,
+        dim: usize,
+        split: &CellSplit,
+    ) -> Self {
+        let mut keyed: Vec<(u32, Contribution)> = weights
+            .iter()
+            .filter(|w| split.cell_of_gaussian[w.gaussian as usize] != NO_CELL)
+            .map(|w| {
+                let local = split.local_of_gaussian[w.gaussian as usize];
+                let entry = Contribution { local, region: w.region, weight: w.weight };
+                (split.cell_of_gaussian[w.gaussian as usize], entry)
+            })
+            .collect();
+        keyed.sort_unstable_by_key(|(cell, e)| (*cell, e.local, e.region));
+        let entries_of_cell = keyed
+            .chunk_by(|a, b| a.0 == b.0)
+            .map(|run| (run[0].0, run.iter().map(|(_, entry)| *entry).collect()))
+            .collect();
+        Self { dim, mask_vectors, masks_of_region, entries_of_cell }
+    }
+
+    /// Writes the file durably: a temporary name, fsync, rename, fsync of the folder.
+    ///
+    /// # Errors
+    /// [`ContributionError::Io`], [`ContributionError::TooManyRegions`].
+    pub fn write(&self, path: &Path) -> Result<(), ContributionError> {
+        let found = self.masks_of_region.len();
+        if found > MAX_REGIONS {
+            return Err(ContributionError::TooManyRegions { path: path.to_owned(), found });
+        }
+        let mut region_starts = vec![0u32];
+        let mut region_masks: Vec<u32> = Vec::new();
+        for masks in &self.masks_of_region {
+            region_masks.extend(masks);
+            region_starts.push(region_masks.len() as u32);
+        }
+        let mut runs = Vec::new();
+        let mut entries: Vec<PackedEntry> = Vec::new();
+        for (cell_id, of_cell) in &self.entries_of_cell {
+            let slice = |e: &Contribution| e.local / GAUSSIANS_PER_SLICE as u32;
+            for of_slice in of_cell.chunk_by(|a, b| slice(a) == slice(b)) {
+                let start = entries.len();
+                entries.extend(of_slice.iter().map(PackedEntry::new));
+                let checksum = checksum(&entries[start..]);
+                runs.push(Run {
+                    cell_id: *cell_id,
+                    slice: slice(&of_slice[0]),
+                    start: start as u64,
+                    checksum,
+                });
+            }
+        }
+        let header = Header {
+            n_regions: self.masks_of_region.len() as u32,
+            n_masks: (self.mask_vectors.len() / self.dim) as u32,
+            dim: self.dim as u32,
+            n_runs: runs.len() as u32,
+            n_region_masks: region_masks.len() as u64,
+            n_entries: entries.len() as u64,
+        };
+        let sections = [
+            (section::HEADER, bytemuck::bytes_of(&header)),
+            (section::REGION_STARTS, container::bytes_of(&region_starts)),
+            (section::REGION_MASKS, container::bytes_of(&region_masks)),
+            (section::MASK_VECTORS, container::bytes_of(&self.mask_vectors)),
+            (section::RUNS, container::bytes_of(&runs)),
+        ];
+        let mut bytes = Vec::new();
+        container::write(&mut bytes, MAGIC, VERSION, &sections)?;
+        bytes.extend(container::bytes_of(&entries));
+        Ok(slag_common::durable::write(path, &bytes)?)
+    }
+}
+
+/// A file of contributions, checked but for the contributions themselves, which are checked as they are read.
+#[derive(Clone, Debug)]
+pub struct ContributionFile {
+    path: PathBuf,
+    n_regions: usize,
+    n_entries: u64,
+    /// Where the entries start.
+    entries_at_bytes: u64,
+    /// By (cell, slice), ascending.
+    runs: Vec<Run>,
+}
+
+/// What a file of contributions says of its view's regions.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ViewRegions {
+    /// Components of a mask vector.
+    pub dim: usize,
+    /// `[n_masks][dim]`, unit.
+    pub mask_vectors: Vec<f32>,
+    starts: Vec<u32>,
+    masks: Vec<u32>,
+}
+
+impl ViewRegions {
+    /// Returns the masks of each region.
+    pub fn masks_of_region(&self) -> impl Iterator<Item = &[u32]> {
+        self.starts.windows(2).map(|w| &self.masks[w[0] as usize..w[1] as usize])
+    }
+}
+
+impl ContributionFile {
+    /// Opens a file and checks all but its entries.
+    ///
+    /// # Errors
+    /// [`ContributionError`].
+    pub fn open(path: &Path) -> Result<(Self, ViewRegions), ContributionError> {
+        let damaged = |source| ContributionError::Damaged { path: path.to_owned(), source };
+        let mut file = fs_err::File::open(path)?;
+        let found_bytes = file.metadata()?.len();
+        // The container's preamble: at 16 its length.
+        let mut preamble = [0; container::PREAMBLE_BYTES];
+        let expected_bytes = match file.read_exact(&mut preamble) {
+            Ok(()) => u64::from_le_bytes(preamble[16..24].try_into().expect("eight bytes")),
+            Err(_) => container::PREAMBLE_BYTES as u64,
+        };
+        if expected_bytes > found_bytes {
+            return Err(damaged(ContainerError::Length { expected_bytes, found_bytes }));
+        }
+        let mut head = vec![0; expected_bytes as usize];
+        file.seek(SeekFrom::Start(0))?;
+        file.read_exact(&mut head)?;
+        let (header, regions, runs) = parse(&AlignedBytes::copy_of(&head)).map_err(damaged)?;
+        let expected = header
+            .n_entries
+            .checked_mul(size_of::<PackedEntry>() as u64)
+            .and_then(|entries| entries.checked_add(expected_bytes));
+        if expected != Some(found_bytes) {
+            let expected_bytes = expected.unwrap_or(u64::MAX);
+            return Err(damaged(ContainerError::Length { expected_bytes, found_bytes }));
+        }
+        let file = Self {
+            path: path.to_owned(),
+            n_regions: header.n_regions as usize,
+            n_entries: header.n_entries,
+            entries_at_bytes: expected_bytes,
+            runs,
+        };
+        Ok((file, regions))
+    }
+
+    /// Returns where the file lies.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Returns the runs, ascending by (cell, slice).
+    pub fn runs(&self) -> &[Run] {
+        &self.runs
+    }
+
+    /// Returns the number of regions of the view.
+    pub fn n_regions(&self) -> usize {
+        self.n_regions
+    }
+
+    /// Returns the number of contributions of the view.
+    pub fn n_entries(&self) -> u64 {
+        self.n_entries
+    }
+
+    /// Returns where the entries of a run lie.
+    pub fn entries_of_run(&self, run: usize) -> Range<u64> {
+        self.runs[run].start..self.runs.get(run + 1).map_or(self.n_entries, |next| next.start)
+    }
+
+    /// Reads and checks the entries of some runs.
+    ///
+    /// # Errors
+    /// [`ContributionError`].
+    pub(super) fn read(&self, runs: Range<usize>) -> Result<Vec<PackedEntry>, ContributionError> {
+        if runs.is_empty() {
+            return Ok(Vec::new());
+        }
+        let (start, end) = (self.entries_of_run(runs.start).start, self.entries_of_run(runs.end - 1).end);
+        let mut entries = vec![PackedEntry::zeroed(); (end - start) as usize];
+        let mut file = fs_err::File::open(&self.path)?;
+        file.seek(SeekFrom::Start(self.offset_bytes(start)))?;
+        file.read_exact(bytemuck::cast_slice_mut(&mut entries))?;
+        for run in runs {
+            let range = self.entries_of_run(run);
+            self.check(run, &entries[(range.start - start) as usize..(range.end - start) as usize])?;
+        }
+        Ok(entries)
+    }
+
+    fn offset_bytes(&self, entry: u64) -> u64 {
+        self.entries_at_bytes + entry * size_of::<PackedEntry>() as u64
+    }
+
+    fn check(&self, run: usize, entries: &[PackedEntry]) -> Result<(), ContributionError> {
+        let Run { start, checksum: expected, .. } = self.runs[run];
+        let damaged = |source| ContributionError::Damaged { path: self.path.clone(), source };
+        let offset_bytes = self.offset_bytes(start);
+        let found = checksum(entries);
+        if found != expected {
+            let id = section::ENTRIES;
+            return Err(damaged(ContainerError::Checksum { id, offset_bytes, expected, found }));
+        }
+        let usable = |e: &PackedEntry| (e.region() as usize) < self.n_regions && e.weight.is_finite();
+        if !entries.iter().fold(true, |all, e| all & usable(e)) {
+            let what = "entries of regions that are not there, or not finite".into();
+            return Err(damaged(ContainerError::Damaged { offset_bytes, what }));
+        }
+        Ok(())
+    }
+}
+
+/// Checks a file's container.
+fn parse(bytes: &[u8]) -> Result<(Header, ViewRegions, Vec<Run>), ContainerError> {
+    let layout = Layout::check(bytes, MAGIC, VERSION)?;
+    let header: Header = layout.value(bytes, section::HEADER, "header")?;
+    let (n_regions, n_masks, dim) = (header.n_regions as usize, header.n_masks as usize, header.dim as usize);
+    let starts: Vec<u32> = column(bytes, &layout, section::REGION_STARTS, "region starts", n_regions + 1)?;
+    let masks: Vec<u32> =
+        column(bytes, &layout, section::REGION_MASKS, "region masks", header.n_region_masks as usize)?;
+    let mask_vectors =
+        column(bytes, &layout, section::MASK_VECTORS, "mask vectors", n_masks.saturating_mul(dim))?;
+    let runs: Vec<Run> = column(bytes, &layout, section::RUNS, "runs", header.n_runs as usize)?;
+    let consistent = dim > 0
+        && starts.is_sorted()
+        && starts[0] == 0
+        && starts[n_regions] as usize == masks.len()
+        && masks.iter().all(|m| (*m as usize) < n_masks)
+        && runs.is_sorted_by(|a, b| (a.cell_id, a.slice) < (b.cell_id, b.slice) && a.start <= b.start)
+        && runs.first().map_or(header.n_entries, |run| run.start) == 0
+        && runs.last().is_none_or(|run| run.start <= header.n_entries);
+    if !consistent {
+        let what = "regions, masks or runs refer to what is not there".into();
+        return Err(ContainerError::Damaged { offset_bytes: 0, what });
+    }
+    Ok((header, ViewRegions { dim, mask_vectors, starts, masks }, runs))
+}
+
+fn column<T: Pod>(
+    bytes: &[u8],
+    layout: &Layout,
+    id: u32,
+    name: &'static str,
+    len: usize,
+) -> Result<Vec<T>, ContainerError> {
+    Ok(bytemuck::pod_collect_to_vec(&bytes[layout.column::<T>(id, name, len)?]))
+}

@@ -1,0 +1,229 @@
+//! Superpoints: small pieces of surface of one look, by graph-based segmentation (Felzenszwalb and Huttenlocher,
+//! "Efficient Graph-Based Image Segmentation", IJCV 59(2), 2004) of the Gaussians' nearest-neighbour graph.
+//!
+//! An edge is as long as its ends differ in colour, in the direction of their thinnest axes and, where it is
+//! known, in what masks said of them. Distance decides who is whose neighbour.
+
+use rayon::prelude::*;
+use rstar::RTree;
+use rstar::primitives::GeomWithData;
+use slag_common::Gaussians;
+
+use slag_math::dot;
+
+/// The superpoint of a Gaussian that cannot be drawn.
+pub const NO_SUPERPOINT: u32 = u32::MAX;
+
+/// How fine superpoints are.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SuperpointSettings {
+    /// Nearest neighbours that a Gaussian has edges to.
+    pub n_neighbours: usize,
+    /// What an edge from black to white counts, over the square root of 3.
+    pub colour: f32,
+    /// What a right angle between thinnest axes counts.
+    pub normal: f32,
+    /// What a right angle between the embeddings' sketches counts.
+    pub field: f32,
+    /// Scale of observation k: an edge joins two components while it is no longer than both components' longest
+    /// inner edge plus k over their size.
+    pub scale: f32,
+    /// Components with fewer Gaussians are joined to their most similar neighbour.
+    pub min_gaussians: u32,
+}
+
+impl Default for SuperpointSettings {
+    /// Masks, where there are any, say more about what belongs together than colour and shape.
+    fn default() -> Self {
+        Self { n_neighbours: 8, colour: 0.3, normal: 0.3, field: 1.0, scale: 3.0, min_gaussians: 20 }
+    }
+}
+
+impl SuperpointSettings {
+    /// Larger superpoints of the same edges: about a thing's sides, where the default's are patches of them.
+    pub fn coarse() -> Self {
+        Self { scale: 20.0, min_gaussians: 60, ..Self::default() }
+    }
+
+    /// Superpoints of colour and shape alone, where nothing else is known.
+    pub fn of_looks() -> Self {
+        Self { colour: 1.0, ..Self::default() }
+    }
+}
+
+/// A partition of a scene's Gaussians.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Superpoints {
+    /// `[N]`: the superpoint of each Gaussian, [`NO_SUPERPOINT`] where it cannot be drawn.
+    pub of_gaussian: Vec<u32>,
+    /// How many there are, numbered in the order in which the Gaussians meet them.
+    pub n: usize,
+}
+
+/// Short vectors `[N][width]` of any common scale, zeros where nothing is known, that differ as embeddings do.
+#[derive(Clone, Copy, Debug)]
+pub struct Sketches<'a> {
+    /// Components.
+    pub width: usize,
+    /// `[N][width]`.
+    pub values: &'a [i8],
+}
+
+impl Sketches<'_> {
+    /// Returns 1 less the cosine of two sketches; 0 where one is not known, which says nothing.
+    fn difference(&self, a: usize, b: usize) -> f32 {
+        let [a, b] = [a, b].map(|i| &self.values[i * self.width..][..self.width]);
+        let product =
+            |x: &[i8], y: &[i8]| -> i32 { x.iter().zip(y).map(|(x, y)| i32::from(*x) * i32::from(*y)).sum() };
+        let (aa, bb) = (product(a, a), product(b, b));
+        if aa == 0 || bb == 0 {
+            return 0.0;
+        }
+        (1.0 - product(a, b) as f32 / (aa as f32 * bb as f32).sqrt()).max(0.0)
+    }
+}
+
+/// An edge; ascending by length, then by ends.
+type Edge = (u32, u32, u32);
+
+/// A scene's nearest-neighbour graph.
+#[derive(Debug)]
+pub struct Graph {
+    n_gaussians: usize,
+    /// Gaussians that can be drawn.
+    usable: Vec<u32>,
+    /// Ascending.
+    edges: Vec<Edge>,
+}
+
+impl Graph {
+    /// Finds and measures the edges of a scene. `settings`: neighbours, and what differences count.
+    pub fn new(scene: &Gaussians, sketches: Option<Sketches<'_>>, settings: &SuperpointSettings) -> Self {
+        let usable: Vec<u32> = (0..scene.len() as u32).filter(|i| scene.is_usable(*i as usize)).collect();
+        let point = |i: &u32| GeomWithData::new(scene.means_in_world[*i as usize].to_array(), *i);
+        let tree = RTree::bulk_load(usable.iter().map(point).collect());
+        let edges_of = |i: &u32| -> Vec<Edge> {
+            let here = scene.means_in_world[*i as usize].to_array();
+            // Gaussians in one place are each other's neighbours, in any order: one more than is wanted is itself.
+            let near = tree.nearest_neighbor_iter(here).take(settings.n_neighbours + 1);
+            near.filter(|other| other.data != *i)
+                .map(|other| {
+                    let (a, b) = (*i.min(&other.data), *i.max(&other.data));
+                    let length = edge_length(scene, sketches, settings, a as usize, b as usize);
+                    // Lengths are not negative: their bits ascend as they do.
+                    (length.to_bits(), a, b)
+                })
+                .collect()
+        };
+        let mut edges: Vec<Edge> = usable.par_iter().flat_map_iter(edges_of).collect();
+        edges.par_sort_unstable();
+        edges.dedup();
+        Self { n_gaussians: scene.len(), usable, edges }
+    }
+
+    /// Partitions the scene. `settings`: scale and least size.
+    pub fn superpoints(&self, settings: &SuperpointSettings) -> Superpoints {
+        let mut forest = Forest::new(self.n_gaussians, settings.scale);
+        for (length, a, b) in &self.edges {
+            let length = f32::from_bits(*length);
+            let (a, b) = (forest.root(*a), forest.root(*b));
+            if a != b && length <= forest.threshold[a as usize].min(forest.threshold[b as usize]) {
+                forest.join(a, b, length, settings.scale);
+            }
+        }
+        for (_, a, b) in &self.edges {
+            let (a, b) = (forest.root(*a), forest.root(*b));
+            let smaller = forest.size[a as usize].min(forest.size[b as usize]);
+            if a != b && smaller < settings.min_gaussians {
+                forest.join(a, b, 0.0, 0.0);
+            }
+        }
+        let mut number_of_root = vec![NO_SUPERPOINT; self.n_gaussians];
+        let mut of_gaussian = vec![NO_SUPERPOINT; self.n_gaussians];
+        let mut n = 0;
+        for i in &self.usable {
+            let number = &mut number_of_root[forest.root(*i) as usize];
+            if *number == NO_SUPERPOINT {
+                *number = n;
+                n += 1;
+            }
+            of_gaussian[*i as usize] = *number;
+        }
+        Superpoints { of_gaussian, n: n as usize }
+    }
+}
+
+impl Superpoints {
+    /// Partitions a scene. The same input gives the same partition, for any number of threads.
+    pub fn new(scene: &Gaussians, sketches: Option<Sketches<'_>>, settings: &SuperpointSettings) -> Self {
+        Graph::new(scene, sketches, settings).superpoints(settings)
+    }
+
+    /// Returns the bytes that the work on `n_gaussians` takes: tree and edges.
+    pub fn working_bytes(n_gaussians: usize, settings: &SuperpointSettings) -> u64 {
+        let edges = settings.n_neighbours * size_of::<Edge>();
+        let per_gaussian = edges + 2 * size_of::<GeomWithData<[f64; 3], u32>>() + 5 * size_of::<u32>();
+        n_gaussians as u64 * per_gaussian as u64
+    }
+}
+
+fn edge_length(
+    scene: &Gaussians,
+    sketches: Option<Sketches<'_>>,
+    settings: &SuperpointSettings,
+    a: usize,
+    b: usize,
+) -> f32 {
+    let (colour_a, colour_b) = (scene.rgb_dc(a), scene.rgb_dc(b));
+    let colour = [0, 1, 2].map(|c| colour_a[c] - colour_b[c]);
+    let [normal_a, normal_b] = [a, b].map(|i| thinnest_axis(scene.rotations_wxyz[i], scene.scales[i]));
+    let mut length = settings.colour * dot(&colour, &colour).sqrt();
+    length += settings.normal * (1.0 - dot(&normal_a, &normal_b).abs()).max(0.0);
+    if let Some(sketches) = sketches {
+        length += settings.field * sketches.difference(a, b);
+    }
+    length
+}
+
+/// Returns a Gaussian's thinnest axis in the world: the normal, where it lies on a surface.
+fn thinnest_axis([w, x, y, z]: [f32; 4], scales: [f32; 3]) -> [f32; 3] {
+    let thinnest = (0..3).min_by(|a, b| scales[*a].total_cmp(&scales[*b])).unwrap_or(0);
+    match thinnest {
+        0 => [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)],
+        1 => [2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)],
+        _ => [2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)],
+    }
+}
+
+/// Disjoint sets of Gaussians.
+struct Forest {
+    parent: Vec<u32>,
+    size: Vec<u32>,
+    /// Of a root: the length up to which its component takes an edge.
+    threshold: Vec<f32>,
+}
+
+impl Forest {
+    fn new(n: usize, scale: f32) -> Self {
+        Self { parent: (0..n as u32).collect(), size: vec![1; n], threshold: vec![scale; n] }
+    }
+
+    fn root(&mut self, mut i: u32) -> u32 {
+        while self.parent[i as usize] != i {
+            let grandparent = self.parent[self.parent[i as usize] as usize];
+            self.parent[i as usize] = grandparent;
+            i = grandparent;
+        }
+        i
+    }
+
+    fn join(&mut self, a: u32, b: u32, length: f32, scale: f32) {
+        let (root, child) = if self.size[a as usize] >= self.size[b as usize] { (a, b) } else { (b, a) };
+        self.parent[child as usize] = root;
+        self.size[root as usize] += self.size[child as usize];
+        self.threshold[root as usize] = length + scale / self.size[root as usize] as f32;
+    }
+}
+
+#[cfg(test)]
+mod tests;
