@@ -15,7 +15,7 @@ use glam::DVec3;
 use slag_common::Hash32;
 use slag_common::frames::Aabb;
 use slag_common::shard::Profile;
-use slag_edge::query::{DEFAULT_MIN_COUNT, Level, Negatives, parse_box, parse_point};
+use slag_edge::query::{AnswerKind, DEFAULT_MIN_COUNT, Negatives, parse_box, parse_point};
 use slag_edge::score::Precision;
 use slag_models::commands::{ModelsCommand, RunArgs};
 
@@ -231,7 +231,7 @@ struct QueryArgs {
     /// What answers are made of: objects, clusters or gaussians [default: objects where the scene has them, else
     /// clusters].
     #[arg(long)]
-    level: Option<Level>,
+    kind: Option<AnswerKind>,
     /// Edge of the voxels that join Gaussians to clusters, world units [default: 0.25 m, or the scene's].
     #[arg(long)]
     voxel: Option<f64>,
@@ -374,7 +374,7 @@ mod tests {
         };
         assert_eq!(serve.listen, SocketAddr::from(([127, 0, 0, 1], 7734)));
         let Command::Query(query) = parse(
-            "slag-edge query chair --near 1,2,-3 --radius 4 --limit 5 --threshold -0.5 --level gaussians",
+            "slag-edge query chair --near 1,2,-3 --radius 4 --limit 5 --threshold -0.5 --kind gaussians",
         )
         .expect("parses")
         .command
@@ -383,16 +383,16 @@ mod tests {
         };
         assert_eq!((query.text.as_str(), query.near), ("chair", Some(DVec3::new(1.0, 2.0, -3.0))));
         assert_eq!((query.radius, query.limit, query.threshold), (Some(4.0), Some(5), Some(-0.5)));
-        assert_eq!(query.level, Some(Level::Gaussians));
+        assert_eq!(query.kind, Some(AnswerKind::Gaussians));
         let Command::Query(query) =
-            parse("slag-edge query chair --box -1,2,3,4,-5,6 --negatives wall,floor --precision rows")
+            parse("slag-edge query chair --box -1,2,3,4,-5,6 --negatives wall,floor --precision centroids")
                 .expect("parses")
                 .command
         else {
             panic!("query")
         };
         let bounds = Aabb { min: DVec3::new(-1.0, -5.0, 3.0), max: DVec3::new(4.0, 2.0, 6.0) };
-        assert_eq!((query.bounds, query.precision), (Some(bounds), Precision::Rows));
+        assert_eq!((query.bounds, query.precision), (Some(bounds), Precision::Centroids));
         assert_eq!(query.negatives, Negatives::Phrases(vec!["wall".into(), "floor".into()]));
         assert!(parse("slag-edge status --json --cache d").is_ok());
         assert!(parse("slag-edge models pull clip --accept-licence --json").is_ok());
@@ -411,7 +411,7 @@ mod tests {
             "slag-edge query chair --radius 4",
             "slag-edge query chair --near 1,2",
             "slag-edge query chair --near NaN,0,0",
-            "slag-edge query chair --level points",
+            "slag-edge query chair --kind points",
             "slag-edge query chair --limit -1",
             "slag-edge query chair --box 1,2,3",
             "slag-edge query chair --negatives ,",

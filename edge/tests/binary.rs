@@ -227,7 +227,7 @@ fn nobody_reads_and_nobody_complains() {
     let dir = tempfile::tempdir().expect("a folder");
     let from = store(signed, shard);
     assert_eq!(run(dir.path(), &["fetch", "--from", &from, "--at", "0,0,0"]).0, Some(0));
-    let mut child = slag_edge(dir.path(), &["query", "red", "--level", "gaussians", "--json"]);
+    let mut child = slag_edge(dir.path(), &["query", "red", "--kind", "gaussians", "--json"]);
     let mut child = child.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
     drop(child.stdout.take());
     let output = child.wait_with_output().expect("ends");

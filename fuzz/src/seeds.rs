@@ -57,7 +57,7 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
         "npz" => vec![npz()],
         "geo" => text(r#"{"origin":{"lat":46.8,"lon":-91.9,"alt":150.0}}"#),
         "query" => text(
-            "text=a+red%20chair&limit=10&threshold=0.1&near=1,2,3&radius=4&level=gaussians&voxel=0.2&min_count=3",
+            "text=a+red%20chair&limit=10&threshold=0.1&near=1,2,3&radius=4&kind=gaussians&voxel=0.2&min_count=3",
         ),
         "position" => text("1 2 3\n46.8,-91.9,150\n{\"x\":1,\"y\":2,\"z\":3}\n{\"lat\":1,\"lon\":2}\n"),
         _ => Vec::new(),

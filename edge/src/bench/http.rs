@@ -86,7 +86,7 @@ pub fn time_http(
         for at in 0..settings.n_warm_up + settings.n_runs {
             let (text, precision) = (at % n_queries, settings.precision);
             let url = format!(
-                "{service}/query?text={text}&limit={limit}&precision={precision}&threshold=-1&level=gaussians&format=arrow"
+                "{service}/query?text={text}&limit={limit}&precision={precision}&threshold=-1&kind=gaussians&format=arrow"
             );
             let start = Instant::now();
             let answer = agent.get(&url).call();

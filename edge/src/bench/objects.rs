@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::http::given;
 use super::query::{Settings, quantile};
-use crate::query::{Engine, Level, QueryRequest};
+use crate::query::{AnswerKind, Engine, QueryRequest};
 use crate::store::{EdgeCache, OpenShard, Snapshot};
 
 /// Times of answers of objects.
@@ -28,7 +28,7 @@ pub struct ObjectsTiming {
     pub min_ms: f64,
 }
 
-/// Times `level=objects` with all else as a request has it that says nothing; `None` where no shard has objects.
+/// Times `kind=objects` with all else as a request has it that says nothing; `None` where no shard has objects.
 /// `queries`: of unit length, at least one.
 ///
 /// # Errors
@@ -50,7 +50,7 @@ pub fn time_objects(
     let (mut times_ms, mut n_found) = (Vec::new(), Vec::new());
     for at in 0..settings.n_warm_up.max(n_queries) + settings.n_runs {
         let text = (at % n_queries).to_string();
-        let request = QueryRequest { level: Some(Level::Objects), ..QueryRequest::new(&text) };
+        let request = QueryRequest { kind: Some(AnswerKind::Objects), ..QueryRequest::new(&text) };
         let start = Instant::now();
         let reply = engine.answer(&request).map_err(io::Error::other)?;
         let took = start.elapsed();

@@ -103,7 +103,7 @@ pub fn query(args: QueryArgs) -> Result<(), Failure> {
         near: args.near,
         radius: args.radius,
         bounds: args.bounds,
-        level: args.level,
+        kind: args.kind,
         voxel: args.voxel,
         min_count: args.min_count,
         precision: args.precision,

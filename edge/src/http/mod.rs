@@ -40,10 +40,10 @@ GET /query?text=chair   clusters of Gaussians that match, best first
     near=x,y,z          rank by distance too
     radius=r            only within r of near
     box=x,y,z,x,y,z     only between two corners
-    level=clusters      or gaussians
+    kind=clusters       or gaussians
     voxel=v             edge of the voxels that join Gaussians to clusters
     min_count=n         smaller clusters are dropped
-    precision=exact     rows: by codebook rows alone, fastest; measured: as far as measured errors decide
+    precision=exact     centroids: by codebook centroids alone, fastest; measured: as far as measured errors decide
     format=json         or arrow: columns, of gaussians
 GET /status             scene, generation, encoder, shards, and whether the scene is past its expiry
 POST /position          where the robot is, if it is followed; JSON: x, y, z, or lat, lon, height
@@ -229,7 +229,7 @@ async fn status(State(app): State<Arc<App>>) -> Result<Response, Problem> {
     blocking(&app, |app| {
         app.reload_if_stale();
         let snapshot = app.engine.snapshot();
-        let trouble = snapshot.as_ref().map_or_else(
+        let error = snapshot.as_ref().map_or_else(
             |e| Some(e.to_string()),
             |snapshot| app.engine.check_encoder(snapshot).err().map(|e| e.to_string()),
         );
@@ -239,11 +239,11 @@ async fn status(State(app): State<Arc<App>>) -> Result<Response, Problem> {
         let is_expired = manifest.is_some_and(|m| m.check_expiry(crate::now_unix_secs()).is_err());
         let following = app.following.as_ref().map(|following| following.status());
         let scene = snapshot.as_ref().ok().map(|snapshot| Status::of(snapshot));
-        let is_ready = trouble.is_none() && app.engine.text_is_alive();
+        let is_ready = error.is_none() && app.engine.text_is_alive();
         let version = env!("CARGO_PKG_VERSION");
         let text_model = app.engine.encoder();
         Ok(Json(json!({
-            "version": version, "is_ready": is_ready, "trouble": trouble, "text_model": text_model, "scene": scene,
+            "version": version, "is_ready": is_ready, "error": error, "text_model": text_model, "scene": scene,
             "expires_unix_secs": expires_unix_secs, "is_expired": is_expired, "following": following,
         }))
         .into_response())

@@ -4,7 +4,7 @@ use std::str::FromStr;
 
 use axum::http::{HeaderMap, header};
 
-use crate::query::{Format, Level, QueryRequest, RequestError, parse_box, parse_point};
+use crate::query::{AnswerKind, Format, QueryRequest, RequestError, parse_box, parse_point};
 
 /// The parameters there are.
 pub const NAMES: [&str; 12] = [
@@ -15,7 +15,7 @@ pub const NAMES: [&str; 12] = [
     "near",
     "radius",
     "box",
-    "level",
+    "kind",
     "voxel",
     "min_count",
     "precision",
@@ -47,7 +47,7 @@ pub fn parse(
             "near" => request.near = Some(parse_point(value).map_err(refused)?),
             "radius" => request.radius = Some(number(name, value, "a number")?),
             "box" => request.bounds = Some(parse_box(value).map_err(refused)?),
-            "level" => request.level = Some(value.parse().map_err(refused)?),
+            "kind" => request.kind = Some(value.parse().map_err(refused)?),
             "voxel" => request.voxel = Some(number(name, value, "a number")?),
             "min_count" => request.min_count = number(name, value, "a whole number")?,
             "precision" => request.precision = value.parse().map_err(refused)?,
@@ -62,10 +62,10 @@ pub fn parse(
     if request.texts.is_empty() {
         return Err(RequestError::new("text", "nothing", "words to look for"));
     }
-    if format == Format::Arrow && request.level != Some(Level::Gaussians) {
+    if format == Format::Arrow && request.kind != Some(AnswerKind::Gaussians) {
         return Err(RequestError::new(
-            "level",
-            &request.level.unwrap_or_default().to_string(),
+            "kind",
+            &request.kind.unwrap_or_default().to_string(),
             "gaussians, since format is arrow",
         ));
     }

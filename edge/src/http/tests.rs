@@ -107,7 +107,7 @@ async fn answers_questions() {
         (&body["scene"], &body["generation"], &body["unit"]),
         (&"yard".into(), &1.into(), &"m".into())
     );
-    let (_, _, gaussians) = service.get("/query?text=0&level=gaussians&limit=3").await;
+    let (_, _, gaussians) = service.get("/query?text=0&kind=gaussians&limit=3").await;
     assert_eq!(gaussians["answers"].as_array().map(Vec::len), Some(3));
 
     let (status, _, empty) = service.get("/query?text=1").await;
@@ -137,19 +137,19 @@ async fn refusals_are_problem_details() {
         ("/query?text=0&limit=0", 400, "limit"),
         ("/query?text=0&limit=-1", 400, "limit"),
         ("/query?text=0&limit=99999999999999999999", 400, "limit"),
-        ("/query?text=0&level=points", 400, "level"),
+        ("/query?text=0&kind=points", 400, "kind"),
         ("/query?text=0&voxel=0", 400, "voxel"),
         ("/query?text=0&min_count=0", 400, "min_count"),
         ("/query?text=0&text=", 400, "text"),
         ("/query?text=0&limit=1&limit=2", 400, "limit"),
         ("/query?text=0&limit=10001", 400, "limit"),
-        ("/query?text=0&level=gaussians&limit=1000001", 400, "limit"),
-        ("/query?text=0&level=gaussians&text=1&limit=500001", 400, "limit"),
+        ("/query?text=0&kind=gaussians&limit=1000001", 400, "limit"),
+        ("/query?text=0&kind=gaussians&text=1&limit=500001", 400, "limit"),
         ("/query?text=0&box=1,2,3", 400, "box"),
         ("/query?text=0&box=0,0,0,1,1,NaN", 400, "box"),
         ("/query?text=0&precision=maybe", 400, "precision"),
         ("/query?text=0&format=xml", 400, "format"),
-        ("/query?text=0&format=arrow", 400, "level"),
+        ("/query?text=0&format=arrow", 400, "kind"),
         ("/query?text=0&negatives=1,,2", 400, "negatives"),
         ("/query?text=0&negatives=%07", 400, "negatives"),
         ("/query?text=0&negatives=1&threshold=-0.1", 400, "threshold"),
@@ -281,7 +281,7 @@ async fn tells_status_and_metrics() {
     service.get("/query?text=0&limit=x").await;
     service.get("/nowhere").await;
     let (_, _, status) = service.get("/status").await;
-    assert_eq!((&status["is_ready"], &status["trouble"]), (&true.into(), &Value::Null));
+    assert_eq!((&status["is_ready"], &status["error"]), (&true.into(), &Value::Null));
     assert_eq!(
         (&status["text_model"]["name"], &status["text_model"]["execution_provider"]),
         (&"axes".into(), &"none".into())

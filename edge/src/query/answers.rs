@@ -7,7 +7,7 @@ use slag_common::frames::Geographic;
 use slag_common::shard::ShardView;
 
 use super::oriented::OrientedBox;
-use super::request::Level;
+use super::request::AnswerKind;
 use super::threshold::ThresholdSource;
 use crate::score::Hit;
 
@@ -30,7 +30,7 @@ pub struct Answers {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub negatives: Vec<String>,
     /// What the answers are made of.
-    pub level: Level,
+    pub kind: AnswerKind,
     /// Name of the scene.
     pub scene: String,
     /// Generation of the scene.
@@ -59,7 +59,7 @@ pub struct Answers {
     /// Whether all of the region asked for was fetched; absent without `radius` and `box`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub area_fetched: Option<bool>,
-    /// How matches were grouped; only at level `clusters`.
+    /// How matches were grouped; only at kind `clusters`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub clustering: Option<Clustering>,
     /// Why there is no answer; absent if there is one.
@@ -70,7 +70,7 @@ pub struct Answers {
     pub answers: Found,
 }
 
-/// Answers of either level.
+/// Answers of either kind.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Found {
     /// Clusters.

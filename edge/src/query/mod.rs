@@ -23,8 +23,8 @@ pub use engine::{Engine, QueryError, ShardStatus, Status};
 pub use oriented::{Alignment, OrientedBox};
 pub use reply::{Format, Reply};
 pub use request::{
-    CANONICAL_NEGATIVES, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, Level, MAX_CLUSTERS, MAX_GAUSSIANS, MAX_NEGATIVES,
-    MAX_TEXTS, Negatives, QueryRequest, RequestError, parse_box, parse_point,
+    AnswerKind, CANONICAL_NEGATIVES, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, MAX_CLUSTERS, MAX_GAUSSIANS,
+    MAX_NEGATIVES, MAX_TEXTS, Negatives, QueryRequest, RequestError, parse_box, parse_point,
 };
 pub use threshold::{RELEVANCY_THRESHOLD, ThresholdSource, calibrated_threshold};
 
@@ -72,16 +72,19 @@ pub fn answer(
     request: &QueryRequest,
 ) -> Result<Vec<Answers>, ScoreError> {
     let asked = request.texts.iter().map(String::as_str).zip(questions);
-    let level =
-        request.level.unwrap_or(if scene.index.is_empty() { Level::Clusters } else { Level::Objects });
-    if level == Level::Objects {
+    let kind = request.kind.unwrap_or(if scene.index.is_empty() {
+        AnswerKind::Clusters
+    } else {
+        AnswerKind::Objects
+    });
+    if kind == AnswerKind::Objects {
         let scored = score_objects(scene.shards, scene.objects, scene.index, questions)?;
         let answer = |((text, question), scored)| answer_objects(scene, text, question, scored, request);
         return Ok(asked.zip(&scored).map(answer).collect());
     }
     let searches = Search::batch(scratch, scene.shards, questions, request.region(), request.precision)?;
     let answer =
-        |((text, question), search)| answer_gaussians(scene, (text, level), question, search, request);
+        |((text, question), search)| answer_gaussians(scene, (text, kind), question, search, request);
     Ok(asked.zip(&searches).map(answer).collect())
 }
 
@@ -113,14 +116,14 @@ fn answer_objects(
         score_error_bound: scale.error_bound(scored.error_bound),
         reason: found.is_empty().then(|| reason_of_objects(request, said.0, best)),
         answers: found,
-        ..nothing(scene, (text, Level::Objects), scale, said, request)
+        ..nothing(scene, (text, AnswerKind::Objects), scale, said, request)
     }
 }
 
 /// Answers a question by the Gaussians that match, or by clusters of them.
 fn answer_gaussians(
     scene: &Scene<'_>,
-    (text, level): (&str, Level),
+    (text, kind): (&str, AnswerKind),
     question: &Question,
     search: &Search<'_>,
     request: &QueryRequest,
@@ -131,7 +134,7 @@ fn answer_gaussians(
     let score_threshold = scale.to_score(threshold);
     let mut clustering = None;
     let n_matching;
-    let found = if level == Level::Gaussians {
+    let found = if kind == AnswerKind::Gaussians {
         let limit = request.limit.unwrap_or(DEFAULT_LIMIT);
         let mut hits = search.best(limit, score_threshold, request.near);
         // Where all are listed, nobody need count them again.
@@ -159,8 +162,8 @@ fn answer_gaussians(
         Found::Clusters(ranked.into_iter().map(|ranked| cluster_answer(ranked, manifest)).collect())
     };
     // Gaussians of exact shards are listed with their own scores, clusters with their rows'.
-    let score_error_bound = scale.error_bound(match (search.is_exact(), level) {
-        (true, Level::Gaussians) => question.rounding_bound(),
+    let score_error_bound = scale.error_bound(match (search.is_exact(), kind) {
+        (true, AnswerKind::Gaussians) => question.rounding_bound(),
         _ => search.score_error_bound(),
     });
     // With negatives a score is the difference of two.
@@ -175,14 +178,14 @@ fn answer_gaussians(
         clustering,
         reason: found.is_empty().then(|| reason(search, scale, request, threshold, n_matching)),
         answers: found,
-        ..nothing(scene, (text, level), scale, (threshold, threshold_source), request)
+        ..nothing(scene, (text, kind), scale, (threshold, threshold_source), request)
     }
 }
 
 /// Returns an answer of nothing, with what an answer says of its question and its scene.
 fn nothing(
     scene: &Scene<'_>,
-    (text, level): (&str, Level),
+    (text, kind): (&str, AnswerKind),
     scale: Scale,
     (threshold, threshold_source): (f32, ThresholdSource),
     request: &QueryRequest,
@@ -191,7 +194,7 @@ fn nothing(
     Answers {
         text: text.to_owned(),
         negatives: request.negatives.phrases().into_iter().map(str::to_owned).collect(),
-        level,
+        kind,
         scene: manifest.scene.clone(),
         generation: manifest.generation,
         unit: if manifest.metric { "m" } else { "world" },
@@ -219,19 +222,19 @@ impl Scale {
         Self(if question.negatives.is_empty() { ScoreKind::Cosine } else { ScoreKind::Relevancy })
     }
 
-    /// Returns the threshold, and where it comes from. `of_level`: how texts score over what is scored.
+    /// Returns the threshold, and where it comes from. `calibration`: how texts score over what is scored.
     fn threshold(
         self,
         request: &QueryRequest,
         manifest: &Manifest,
-        of_level: Option<Calibration>,
+        calibration: Option<Calibration>,
     ) -> (f32, ThresholdSource) {
         match (request.threshold, self.0) {
             (Some(threshold), _) => (threshold, ThresholdSource::Request),
             (None, ScoreKind::Relevancy) => (RELEVANCY_THRESHOLD, ThresholdSource::Relevancy),
             (None, ScoreKind::Cosine) => {
                 // A model that states its threshold is taken at its word: a cosine is a cosine.
-                let scene = manifest.encoder.calibration.and(of_level);
+                let scene = manifest.encoder.calibration.and(calibration);
                 calibrated_threshold(manifest.encoder.default_threshold, scene)
             }
         }
@@ -393,7 +396,7 @@ fn reason_of_objects(request: &QueryRequest, threshold: f32, best: Option<(f32, 
     let (kind, detail) = match best {
         None => (
             ReasonKind::NothingThere,
-            "the shards on board have no objects; ask with level=clusters, or encode with objects".to_owned(),
+            "the shards on board have no objects; ask with kind=clusters, or encode with objects".to_owned(),
         ),
         Some((score, at)) if score < threshold => (
             ReasonKind::BelowThreshold,

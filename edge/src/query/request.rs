@@ -50,7 +50,7 @@ impl RequestError {
 /// What answers are made of.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Level {
+pub enum AnswerKind {
     /// What the masks of several views agree on, scored as a whole.
     #[default]
     Objects,
@@ -60,7 +60,7 @@ pub enum Level {
     Gaussians,
 }
 
-impl fmt::Display for Level {
+impl fmt::Display for AnswerKind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Objects => "objects",
@@ -70,7 +70,7 @@ impl fmt::Display for Level {
     }
 }
 
-impl FromStr for Level {
+impl FromStr for AnswerKind {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -167,7 +167,7 @@ pub struct QueryRequest {
     /// Only Gaussians within this box count.
     pub bounds: Option<Aabb>,
     /// What answers are made of; objects if absent, where the scene has them, else clusters.
-    pub level: Option<Level>,
+    pub kind: Option<AnswerKind>,
     /// Edge of the voxels that clusters are joined by, world units; the scene's own if absent.
     pub voxel: Option<f64>,
     /// Clusters with fewer Gaussians are dropped, and counted.
@@ -187,7 +187,7 @@ impl QueryRequest {
             near: None,
             radius: None,
             bounds: None,
-            level: None,
+            kind: None,
             voxel: None,
             min_count: DEFAULT_MIN_COUNT,
             precision: Precision::default(),
@@ -228,12 +228,12 @@ impl QueryRequest {
                 return refuse(parameter, &text, "no control characters".into());
             }
         }
-        let most = match self.level {
-            Some(Level::Gaussians) => MAX_GAUSSIANS,
+        let most = match self.kind {
+            Some(AnswerKind::Gaussians) => MAX_GAUSSIANS,
             _ => MAX_CLUSTERS,
         } / self.texts.len();
         if let Some(limit) = self.limit.filter(|limit| !(1..=most).contains(limit)) {
-            let answers = self.level.map_or("answers".to_owned(), |level| level.to_string());
+            let answers = self.kind.map_or("answers".to_owned(), |kind| kind.to_string());
             return refuse("limit", &limit, format!("1 to {most} {answers} a text"));
         }
         let (thresholds, expected) = match self.negatives {
@@ -306,12 +306,12 @@ mod tests {
         assert_eq!(refused(|r| (r.negatives, r.threshold) = (Negatives::Canonical, Some(-0.1))), "threshold");
         assert_eq!(refused(|r| r.limit = Some(MAX_CLUSTERS + 1)), "limit");
         assert_eq!(
-            refused(|r| (r.level, r.limit) = (Some(Level::Gaussians), Some(MAX_GAUSSIANS + 1))),
+            refused(|r| (r.kind, r.limit) = (Some(AnswerKind::Gaussians), Some(MAX_GAUSSIANS + 1))),
             "limit"
         );
         assert_eq!(
             refused(|r| {
-                (r.level, r.limit) = (Some(Level::Gaussians), Some(MAX_GAUSSIANS / 2 + 1));
+                (r.kind, r.limit) = (Some(AnswerKind::Gaussians), Some(MAX_GAUSSIANS / 2 + 1));
                 r.texts.push("table".into());
             }),
             "limit"

@@ -31,7 +31,7 @@ fn ask_about(
     let scene = Scene { shards: &shards, objects: &objects, index: &index, manifest: &manifest, fetched };
     let mut scratch = Scratch::default();
     let answers = answer(&mut scratch, &scene, questions, &request).expect("answers");
-    assert!(answers.iter().all(|answers| (answers.level == Level::Objects) == scratch.is_untouched()));
+    assert!(answers.iter().all(|answers| (answers.kind == AnswerKind::Objects) == scratch.is_untouched()));
     answers
 }
 
@@ -139,7 +139,7 @@ fn empty_answers_say_why() {
     let sticking_out = ask(&yard, ball(DVec3::new(45.0, 0.0, 0.0), 10.0));
     assert_eq!(sticking_out.area_fetched, Some(false));
     let gaussians =
-        ask(&yard, |request, _| (request.level, request.threshold) = (Some(Level::Gaussians), Some(1.0)));
+        ask(&yard, |request, _| (request.kind, request.threshold) = (Some(AnswerKind::Gaussians), Some(1.0)));
     assert_eq!(gaussians.reason.expect("nothing found").kind, ReasonKind::BelowThreshold);
 }
 
@@ -148,7 +148,7 @@ fn gaussians_come_best_then_nearest_first() {
     let near = DVec3::new(20.355, 0.0, 0.0);
     let yard = yard();
     let answers = ask(&yard, |request, _| {
-        (request.level, request.limit, request.near) = (Some(Level::Gaussians), Some(7), Some(near));
+        (request.kind, request.limit, request.near) = (Some(AnswerKind::Gaussians), Some(7), Some(near));
     });
     let found = described(&yard, &answers, Some(near));
     let names: Vec<(u32, u32)> = found.iter().map(|g| (g.cell_id, g.index)).collect();
@@ -161,7 +161,7 @@ fn gaussians_come_best_then_nearest_first() {
 fn exact_shards_answer_exactly() {
     let exact = [thing(1, DVec3::ZERO, 30, 0.7).build(true)];
     let clusters_of = ask(&exact, |_, _| ());
-    let gaussians = ask(&exact, |request, _| request.level = Some(Level::Gaussians));
+    let gaussians = ask(&exact, |request, _| request.kind = Some(AnswerKind::Gaussians));
     assert!(clusters_of.is_exact && gaussians.is_exact && gaussians.score_error_bound < 1e-5);
     let found = described(&exact, &gaussians, None);
     assert_eq!((found.len(), found[2].input_index), (DEFAULT_LIMIT, Some(7)));
@@ -172,10 +172,10 @@ fn exact_shards_answer_exactly() {
 fn exactness_is_a_choice() {
     let exact = [thing(1, DVec3::ZERO, 30, 0.7).build(true)];
     let rows = ask(&exact, |request, _| {
-        (request.level, request.precision) = (Some(Level::Gaussians), Precision::Rows)
+        (request.kind, request.precision) = (Some(AnswerKind::Gaussians), Precision::Centroids)
     });
     let compact = [thing(1, DVec3::ZERO, 30, 0.7).build(false)];
-    assert_eq!(rows, ask(&compact, |request, _| request.level = Some(Level::Gaussians)));
+    assert_eq!(rows, ask(&compact, |request, _| request.kind = Some(AnswerKind::Gaussians)));
     assert!(!rows.is_exact && rows.score_error_bound > 1e-5, "{}", rows.score_error_bound);
 }
 
@@ -206,7 +206,7 @@ fn negatives_make_relevancies() {
     assert!((f64::from(found[0].score) - expected(0.9)).abs() <= bound && bound < 0.02, "{bound}");
     let answers = ask(|request| request.threshold = Some(0.4));
     assert_eq!((answers.n_matching, answers.threshold_source), (224, ThresholdSource::Request));
-    let all = ask(|request| (request.threshold, request.level) = (Some(0.0), Some(Level::Gaussians)));
+    let all = ask(|request| (request.threshold, request.kind) = (Some(0.0), Some(AnswerKind::Gaussians)));
     assert_eq!(all.n_matching, 724);
     let best = &described(&yard, &all, None)[0];
     assert!((f64::from(best.score) - expected(0.95)).abs() <= bound, "{best:?}");
@@ -228,7 +228,7 @@ fn relevancies_keep_within_their_bound_and_use_it() {
     let ask = |row: &[BuiltShard]| {
         let mut answers = ask_about(row, std::slice::from_ref(&question), |request, _| {
             request.negatives = Negatives::Phrases(vec!["other".into()]);
-            (request.level, request.threshold) = (Some(Level::Gaussians), Some(0.0));
+            (request.kind, request.threshold) = (Some(AnswerKind::Gaussians), Some(0.0));
         });
         answers.remove(0)
     };
@@ -247,19 +247,19 @@ fn relevancies_keep_within_their_bound_and_use_it() {
 #[test]
 fn batches_answer_as_single_questions_do() {
     let questions = [Question::new([1.0, 0.0]), Question::new([0.0, 1.0]), Question::new([0.6, 0.8])];
-    for (scene, level) in [
-        (yard(), Some(Level::Clusters)),
-        (yard(), Some(Level::Gaussians)),
-        (scene_of_objects(), Some(Level::Objects)),
+    for (scene, kind) in [
+        (yard(), Some(AnswerKind::Clusters)),
+        (yard(), Some(AnswerKind::Gaussians)),
+        (scene_of_objects(), Some(AnswerKind::Objects)),
     ] {
         let texts = ["thing", "other", "third"].map(str::to_owned);
         let together = ask_about(&scene, &questions, |request, _| {
-            (request.texts, request.level, request.limit) = (texts.to_vec(), level, Some(120));
+            (request.texts, request.kind, request.limit) = (texts.to_vec(), kind, Some(120));
         });
         assert_eq!(together.len(), 3);
         for ((answers, question), text) in together.iter().zip(&questions).zip(&texts) {
             let alone = ask_about(&scene, std::slice::from_ref(question), |request, _| {
-                (request.texts, request.level, request.limit) = (vec![text.clone()], level, Some(120));
+                (request.texts, request.kind, request.limit) = (vec![text.clone()], kind, Some(120));
             });
             assert_eq!(&alone[0], answers);
             assert!(!answers.answers.is_empty());
@@ -367,7 +367,7 @@ fn objects_answer_first_and_once() {
         request.near = Some(DVec3::ZERO);
         manifest.encoder.calibration = Some(Calibration { score_mean: 0.5, score_spread: 0.2 });
     });
-    assert_eq!((answers.level, answers.threshold_source), (Level::Objects, ThresholdSource::Scene));
+    assert_eq!((answers.kind, answers.threshold_source), (AnswerKind::Objects, ThresholdSource::Scene));
     // Of the objects, not of the Gaussians.
     assert!((answers.threshold - 0.4).abs() < 1e-6, "{}", answers.threshold);
     let found = clusters(&answers);
@@ -385,10 +385,10 @@ fn objects_answer_first_and_once() {
     assert!(!answers.is_exact && answers.clustering.is_none() && answers.reason.is_none());
 
     // Without a calibrated scene the encoder's own threshold holds; the other levels are as ever.
-    let answers = ask(&scene, |request, _| request.level = Some(Level::Objects));
+    let answers = ask(&scene, |request, _| request.kind = Some(AnswerKind::Objects));
     assert_eq!(answers.threshold_source, ThresholdSource::Encoder);
     let clusters_of = |built: &[BuiltShard]| {
-        ask(built, |request, _| (request.level, request.threshold) = (Some(Level::Clusters), Some(0.5)))
+        ask(built, |request, _| (request.kind, request.threshold) = (Some(AnswerKind::Clusters), Some(0.5)))
             .answers
     };
     let without =
@@ -404,8 +404,8 @@ fn objects_abstain_and_keep_to_the_region() {
     let answers = ask_objects(&|request| request.threshold = Some(0.9));
     let reason = answers.reason.as_ref().expect("no answer");
     assert_eq!(
-        (answers.level, reason.kind, answers.answers.len()),
-        (Level::Objects, ReasonKind::BelowThreshold, 0)
+        (answers.kind, reason.kind, answers.answers.len()),
+        (AnswerKind::Objects, ReasonKind::BelowThreshold, 0)
     );
     assert!(
         reason.best_score.is_some_and(|s| (s - 0.8).abs() < 0.01) && reason.detail.contains("reaches 0.9"),
@@ -446,7 +446,7 @@ fn objects_abstain_and_keep_to_the_region() {
     let expected = crate::score::relevancy(0.8 - 0.9);
     assert!(found.len() == 1 && (found[0].score - expected).abs() < 0.01, "{found:?}");
     // A scene without objects says so.
-    let answers = ask(&yard(), |request, _| request.level = Some(Level::Objects));
-    assert!(answers.reason.is_some_and(|r| r.detail.contains("level=clusters")));
-    assert_eq!(ask(&yard(), |_, _| ()).level, Level::Clusters);
+    let answers = ask(&yard(), |request, _| request.kind = Some(AnswerKind::Objects));
+    assert!(answers.reason.is_some_and(|r| r.detail.contains("kind=clusters")));
+    assert_eq!(ask(&yard(), |_, _| ()).kind, AnswerKind::Clusters);
 }

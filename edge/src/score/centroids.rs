@@ -118,7 +118,7 @@ impl ShardScores {
             projection.set(level, shard, vector);
             projection.score_centroids(level, shard, centroids);
             let are_codes_read = match precision {
-                Precision::Rows => false,
+                Precision::Centroids => false,
                 Precision::Measured => true,
                 Precision::Exact => shard.exact.is_none(),
             };

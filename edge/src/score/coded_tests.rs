@@ -52,7 +52,7 @@ fn defined_score(search: &Search<'_>, shard_at: usize, index: usize) -> f32 {
     let (centroid, scores) = (shard.row_of(index), &search.scored.shards[shard_at]);
     let product = |place: &usize| {
         let own = scores.centroids[*place][centroid];
-        let Some(residuals) = shard.residuals.filter(|_| search.precision != Precision::Rows) else {
+        let Some(residuals) = shard.residuals.filter(|_| search.precision != Precision::Centroids) else {
             return own;
         };
         let (tables, scale) = (&scores.projections[*place].tables, residuals.residual_scales[centroid]);
@@ -78,7 +78,7 @@ fn scores_are_within_the_stated_error() {
         let views = views(&built);
         for n_negatives in [0, 3] {
             let question = random_question(&mut random, shape.0, n_negatives);
-            for precision in [Precision::Exact, Precision::Rows] {
+            for precision in [Precision::Exact, Precision::Centroids] {
                 let search = Search::new(&views, &question, Region::default(), precision).expect("valid");
                 for (at, (shard, built)) in views.iter().zip(&built).enumerate() {
                     let cell = search.cell(at).expect("searched");
@@ -88,13 +88,13 @@ fn scores_are_within_the_stated_error() {
                         let mut decoded = vec![0.0; shape.0];
                         match precision {
                             Precision::Exact | Precision::Measured => shard.decode(index, &mut decoded),
-                            Precision::Rows => shard.decode_centroid(centroid, &mut decoded),
+                            Precision::Centroids => shard.decode_centroid(centroid, &mut decoded),
                         }
                         let rounding = (found - score_in_f64(&question, decoded.iter().copied())).abs();
                         let truth = score_in_f64(&question, embedding.iter().map(|e| f64::from(*e)));
                         let bound = cell.score_error(centroid);
                         let of_rounding = match (&shard.residuals, precision) {
-                            (Some(_), Precision::Rows) => cell.centroid_error(centroid),
+                            (Some(_), Precision::Centroids) => cell.centroid_error(centroid),
                             _ => bound - search.steepness * shard.radii[centroid],
                         };
                         let share = rounding / f64::from(of_rounding);
@@ -128,10 +128,10 @@ fn answers_are_those_of_brute_force() {
         let views = views(&built);
         for (n_negatives, precision, is_near) in [
             (0, Precision::Exact, false),
-            (0, Precision::Rows, false),
+            (0, Precision::Centroids, false),
             (2, Precision::Exact, false),
             (0, Precision::Exact, true),
-            (2, Precision::Rows, true),
+            (2, Precision::Centroids, true),
         ] {
             let question = random_question(&mut random, shape.0, n_negatives);
             let ball = Ball { centre_in_world: DVec3::new(11.0, 5.0, 5.0), radius: 6.0 };

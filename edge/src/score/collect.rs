@@ -141,7 +141,7 @@ impl<'a> Search<'a> {
             _ => &scores.combined[self.asked],
         };
         let detail = match (&shard.exact, &shard.residuals) {
-            _ if self.precision == Precision::Rows => Detail::Nothing,
+            _ if self.precision == Precision::Centroids => Detail::Nothing,
             // Codes whose errors were not measured say nothing.
             (Some(exact), Some(residuals))
                 if self.precision == Precision::Measured && shard.header.errors.mean > 0.0 =>

@@ -98,7 +98,7 @@ pub enum ScoreError {
 #[serde(rename_all = "kebab-case")]
 pub enum Precision {
     /// Codebook centroids alone: fastest, every score within the bound stated.
-    Rows,
+    Centroids,
     /// As `Exact`, but of shards with exact embeddings only those are read that the measured errors of codes,
     /// and of fine residuals, leave near the border of the answer. Nearly all of the exact answer, tens of times
     /// sooner; [`Search::measured_errors`] says how near its scores are.
@@ -111,12 +111,12 @@ pub enum Precision {
 
 impl Precision {
     /// Every precision, fastest first.
-    pub const ALL: [Self; 3] = [Self::Rows, Self::Measured, Self::Exact];
+    pub const ALL: [Self; 3] = [Self::Centroids, Self::Measured, Self::Exact];
 
     /// Returns the name used in URLs and flags.
     pub fn name(self) -> &'static str {
         match self {
-            Self::Rows => "centroids",
+            Self::Centroids => "centroids",
             Self::Measured => "measured",
             Self::Exact => "exact",
         }
@@ -327,7 +327,7 @@ impl<'a> Search<'a> {
         let mut largest: Option<ScoreErrors> = None;
         for shard in self.searched() {
             let of_codes = match self.precision {
-                Precision::Rows => shard.residuals.is_none() && shard.exact.is_none(),
+                Precision::Centroids => shard.residuals.is_none() && shard.exact.is_none(),
                 Precision::Measured => true,
                 Precision::Exact => shard.exact.is_none(),
             };

@@ -87,7 +87,7 @@ fn brute_force(
                 let mut vector = vec![0.0; question.vector.len()];
                 match precision {
                     Precision::Exact | Precision::Measured => view.decode(index, &mut vector),
-                    Precision::Rows => view.decode_centroid(centroid, &mut vector),
+                    Precision::Centroids => view.decode_centroid(centroid, &mut vector),
                 }
                 let score = score_in_f64(question, vector.iter().copied());
                 let p = view.position_in_world(index);
@@ -123,7 +123,7 @@ proptest! {
         let built: Vec<_> = shards.iter().rev().map(|s| s.build(is_exact)).collect();
         let views = views(&built);
         let threshold = threshold as f32 / 8.0;
-        let precision = if centroids_only { Precision::Rows } else { Precision::Exact };
+        let precision = if centroids_only { Precision::Centroids } else { Precision::Exact };
         let batch = Search::batch(&mut Scratch::default(), &views, &questions, region, precision).expect("valid");
         prop_assert_eq!(batch.len(), questions.len());
         for (search, question) in batch.iter().zip(&questions) {
@@ -193,7 +193,7 @@ fn answers_keep_within_the_stated_bound() {
             let centroids = search(&compact_views, Precision::Exact);
             let bound = f64::from(centroids.score_error_bound());
             let matches = centroids.matching(threshold);
-            assert_eq!(search(&exact_views, Precision::Rows).matching(threshold), matches);
+            assert_eq!(search(&exact_views, Precision::Centroids).matching(threshold), matches);
             let mut expected_in =
                 matches.runs.iter().flat_map(|r| (r.start..r.end).map(|i| (r.shard, i, r.score))).peekable();
             let exact_search = search(&exact_views, Precision::Exact);
@@ -245,7 +245,7 @@ fn the_best_of_noisy_embeddings_are_the_best() {
     for n_negatives in [0, 4] {
         let built: Vec<_> = noisy_shards(&mut random, 4, 60, 64).iter().map(|s| s.build(true)).collect();
         let views = views(&built);
-        for precision in [Precision::Exact, Precision::Rows] {
+        for precision in [Precision::Exact, Precision::Centroids] {
             let question = random_question(&mut random, 64, n_negatives);
             let mut all = brute_force(&built, &question, Region::default(), precision);
             all.sort_by(|a, b| b.2.total_cmp(&a.2));
@@ -257,7 +257,7 @@ fn the_best_of_noisy_embeddings_are_the_best() {
                 for (hit, expected) in best.iter().zip(&all) {
                     let truth = scores[&(hit.shard, hit.index)];
                     // Rows are multiplied with the query in 16 bits.
-                    let rounding = if precision == Precision::Rows { 1e-4 } else { 1e-5 };
+                    let rounding = if precision == Precision::Centroids { 1e-4 } else { 1e-5 };
                     assert!((truth - expected.2).abs() < 2.0 * rounding);
                     assert!((f64::from(hit.score) - truth).abs() < rounding);
                 }

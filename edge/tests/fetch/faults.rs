@@ -11,7 +11,7 @@ use slag_common::container::AlignedBytes;
 use slag_common::manifest::ManifestError;
 use slag_common::shard::{Profile, ShardLayout};
 use slag_edge::fetch::FetchError;
-use slag_edge::query::{Engine, Level, QueryRequest};
+use slag_edge::query::{AnswerKind, Engine, QueryRequest};
 use slag_edge::store::EdgeCache;
 use slag_edge::text::{EncoderInfo, TextService};
 use slag_models::{EncodeError, TextEncoder};
@@ -58,7 +58,7 @@ fn ask(cache: EdgeCache) -> Result<(u64, BTreeSet<Place>), String> {
     let engine = Engine::new(cache, text);
     engine.reload().map_err(|e| slag_edge::error_line(&e))?;
     let request =
-        QueryRequest { level: Some(Level::Gaussians), limit: Some(10_000), ..QueryRequest::new("x") };
+        QueryRequest { kind: Some(AnswerKind::Gaussians), limit: Some(10_000), ..QueryRequest::new("x") };
     let reply = engine.answer(&request).map_err(|e| slag_edge::error_line(&e))?;
     let answers = &reply.answers[0];
     let found = reply.gaussians(answers).iter().map(|g| place(g.position_in_world.into())).collect();

@@ -37,7 +37,7 @@ async fn pieces(response: Response) -> Result<Vec<Vec<u8>>, axum::Error> {
 #[tokio::test]
 async fn long_answers_come_in_small_pieces() {
     let service = Service::new(Some(&many()), Settings::default());
-    let uri = "/query?text=0&level=gaussians&limit=60000&near=0,0,0&threshold=0.5";
+    let uri = "/query?text=0&kind=gaussians&limit=60000&near=0,0,0&threshold=0.5";
     let pieces = pieces(service.send("GET", uri).await).await.expect("a whole body");
     let total: usize = pieces.iter().map(Vec::len).sum();
     let longest = pieces.iter().map(Vec::len).max().expect("pieces");
@@ -60,7 +60,7 @@ async fn long_answers_come_in_small_pieces() {
 #[tokio::test]
 async fn columns_say_what_json_says() {
     let service = Service::new(Some(&many()), Settings::default());
-    let query = "/query?level=gaussians&limit=50000&threshold=0.5";
+    let query = "/query?kind=gaussians&limit=50000&threshold=0.5";
     let uri = format!("{query}&text=0&format=arrow");
     let response = service.send("GET", &uri).await;
     assert_eq!(response.headers()["content-type"], ARROW);
@@ -106,7 +106,7 @@ async fn read_large(response: Response) -> (StatusCode, HeaderMap, Value) {
 #[tokio::test]
 async fn several_texts_make_a_batch() {
     let service = Service::new(Some(&many()), Settings::default());
-    for rest in ["&limit=3", "&level=gaussians&limit=3000&threshold=0.5", "&level=gaussians&negatives=2"] {
+    for rest in ["&limit=3", "&kind=gaussians&limit=3000&threshold=0.5", "&kind=gaussians&negatives=2"] {
         let (_, _, batch) =
             read_large(service.send("GET", &format!("/query?text=1&text=0&text=2{rest}")).await).await;
         let batch = batch["batch"].as_array().expect("a batch");
@@ -117,7 +117,7 @@ async fn several_texts_make_a_batch() {
             assert_eq!(together, &alone, "{text}{rest}");
         }
     }
-    let uri = "/query?text=1&text=0&level=gaussians&limit=20000&threshold=0.5&format=arrow";
+    let uri = "/query?text=1&text=0&kind=gaussians&limit=20000&threshold=0.5&format=arrow";
     let bytes = pieces(service.send("GET", uri).await).await.expect("a whole body").concat();
     let mut counts = [0; 2];
     for batch in StreamReader::try_new(&bytes[..], None).expect("a stream") {
@@ -142,11 +142,11 @@ async fn formats_are_negotiated() {
         }
     };
     let both = format!("text/html, {ARROW};q=0.9");
-    assert_eq!(get("/query?text=0&level=gaussians", &both).await, ARROW);
-    assert_eq!(get("/query?text=0&level=gaussians", "*/*").await, "application/json");
-    assert_eq!(get("/query?text=0&level=gaussians&format=json", ARROW).await, "application/json");
+    assert_eq!(get("/query?text=0&kind=gaussians", &both).await, ARROW);
+    assert_eq!(get("/query?text=0&kind=gaussians", "*/*").await, "application/json");
+    assert_eq!(get("/query?text=0&kind=gaussians&format=json", ARROW).await, "application/json");
     assert_eq!(get("/query?text=0", ARROW).await, "application/problem+json");
-    let uri = "/query?text=1&level=gaussians&format=arrow";
+    let uri = "/query?text=1&kind=gaussians&format=arrow";
     let bytes = pieces(service.send("GET", uri).await).await.expect("a whole body").concat();
     let mut reader = StreamReader::try_new(&bytes[..], None).expect("a stream");
     let questions: Value = serde_json::from_str(&reader.schema().metadata()["questions"]).expect("JSON");
@@ -160,7 +160,7 @@ async fn formats_are_negotiated() {
 async fn answers_that_nobody_reads_are_given_up() {
     let settings = Settings { max_queries: 1, stream_timeout: Duration::from_secs(1), ..Settings::default() };
     let service = Service::new(Some(&many()), settings);
-    let uri = "/query?text=0&level=gaussians&limit=60000&threshold=0.5";
+    let uri = "/query?text=0&kind=gaussians&limit=60000&threshold=0.5";
     let response = service.send("GET", uri).await;
     assert_eq!(response.status(), StatusCode::OK);
     assert_eq!(service.get("/query?text=0").await.2["type"], "urn:slag:problem:overloaded");

@@ -109,8 +109,8 @@ async fn every_answer_is_as_described() {
     };
     let cases = [
         ("/query", "text=0&near=0,0,0&radius=9"),
-        ("/query", "text=0&level=gaussians&near=0,0,0"),
-        ("/query", "text=0&level=gaussians&precision=rows"),
+        ("/query", "text=0&kind=gaussians&near=0,0,0"),
+        ("/query", "text=0&kind=gaussians&precision=centroids"),
         ("/query", "text=0&text=1&negatives=2,1"),
         ("/query", "text=1"),
         ("/query", "text=0&min_count=21"),
@@ -130,15 +130,15 @@ async fn every_answer_is_as_described() {
     let object = TestObject { id: 5, vectors: vec![1.0, 0.0, 0.0], runs: vec![2..8, 8..14], n_gaussians: 40 };
     let calibration = Calibration { score_mean: 0.0, score_spread: 0.1 };
     let service = Service::new(Some(&[exact[0].with_objects(&[object], calibration)]), Settings::default());
-    for (query, level, n) in
-        [("text=0", "objects", 1), ("text=1", "objects", 0), ("text=0&level=clusters", "clusters", 1)]
+    for (query, kind, n) in
+        [("text=0", "objects", 1), ("text=1", "objects", 0), ("text=0&kind=clusters", "clusters", 1)]
     {
         let (_, _, body) = service.get(&format!("/query?{query}&near=0,0,0")).await;
         let schema = response_schema("/query", StatusCode::OK, "application/json");
         assert_eq!(check(&schema, &body, ""), Ok(()), "{query}: {body:#}");
         assert_eq!(
-            (&body["level"], body["answers"].as_array().map(Vec::len)),
-            (&json!(level), Some(n)),
+            (&body["kind"], body["answers"].as_array().map(Vec::len)),
+            (&json!(kind), Some(n)),
             "{body:#}"
         );
     }
