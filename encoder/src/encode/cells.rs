@@ -140,8 +140,8 @@ impl<'a> CellBuilder<'a> {
         })
     }
 
-    /// Finds the objects of the scene, where they are asked for.
-    fn objects(&self) -> Result<Option<SceneObjects>, EncodeError> {
+    /// Finds the objects of the scene, where they are asked for; none if cancelled.
+    fn objects(&self, cancel: &AtomicBool) -> Result<Option<SceneObjects>, EncodeError> {
         if !self.settings.objects {
             return Ok(None);
         }
@@ -153,8 +153,9 @@ impl<'a> CellBuilder<'a> {
             photos: &self.photos,
             score_context: &self.score_context,
             group_bytes: self.group_bytes,
+            cancel,
         };
-        Ok(Some(self.times.time("objects", || objects::find(&scene))?))
+        Ok(self.times.time("objects", || objects::find(&scene))?)
     }
 
     pub(super) fn index(&self) -> &ContributionIndex {
@@ -195,7 +196,7 @@ impl<'a> CellBuilder<'a> {
             objects: None,
         };
         // Of the masks as they are, before any counts less.
-        let objects = self.objects()?;
+        let objects = self.objects(cancel)?;
         let aggregation = self.settings.aggregation;
         let refinement = self.times.time("refine", || {
             let contributions = (&self.index, &mut self.table);

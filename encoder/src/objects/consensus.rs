@@ -13,6 +13,8 @@
 //!
 //! Counts are integers, and every order is fixed: the result does not depend on threads.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use rayon::prelude::*;
 
 use super::NONE;
@@ -81,6 +83,7 @@ pub struct MaskClusters {
 }
 
 /// What the views say of a mask.
+#[derive(Default)]
 struct Judged {
     /// Sum of the views' agreement, its own view's 1 included.
     agreement: f64,
@@ -108,15 +111,25 @@ struct Consensus<'a> {
     seen: Vec<Vec<(u32, u32)>>,
 }
 
-/// Clusters the masks of a scene.
-pub fn cluster_masks<'a>(sightings: &'a Sightings, masks: &'a Masks<'a>) -> MaskClusters {
+/// Clusters the masks of a scene. Returns `None` if cancelled.
+pub fn cluster_masks<'a>(
+    sightings: &'a Sightings,
+    masks: &'a Masks<'a>,
+    cancel: &AtomicBool,
+) -> Option<MaskClusters> {
+    let is_cancelled = || cancel.load(Ordering::Relaxed);
     let consensus = Consensus::new(sightings, masks);
     let n_masks = masks.view_of_mask.len();
     let judged: Vec<Judged> = (0..n_masks)
         .into_par_iter()
-        .map_init(|| Counts::new(masks), |counts, mask| consensus.judge(mask, counts))
+        .map_init(
+            || Counts::new(masks),
+            |counts, mask| if is_cancelled() { Judged::default() } else { consensus.judge(mask, counts) },
+        )
         .collect();
-    consensus.gather(&judged)
+    let clusters = consensus.gather(&judged, &is_cancelled);
+    // A cancelled run leaves masks unjudged: its clusters mean nothing.
+    (!is_cancelled()).then_some(clusters)
 }
 
 impl Counts {
@@ -228,7 +241,7 @@ impl<'a> Consensus<'a> {
     }
 
     /// Lets the masks that most views agree with gather those like them.
-    fn gather(&self, judged: &[Judged]) -> MaskClusters {
+    fn gather(&self, judged: &[Judged], is_cancelled: &dyn Fn() -> bool) -> MaskClusters {
         let n_masks = judged.len() as u32;
         let has_consensus = |mask: &u32| judged[*mask as usize].consensus >= MIN_CONSENSUS;
         let mut seeds: Vec<u32> = (0..n_masks).filter(has_consensus).collect();
@@ -246,6 +259,9 @@ impl<'a> Consensus<'a> {
         let mut counts = Counts::new(self.masks);
         let mut shape = Shape::new(self);
         for seed in seeds {
+            if is_cancelled() {
+                break;
+            }
             if std::mem::replace(&mut is_gathered[seed as usize], true) {
                 continue;
             }

@@ -52,11 +52,11 @@ impl ClustersOfRegion {
 
 impl Members {
     /// Gives each Gaussian to the cluster with most of its weight, times the cluster's consensus, of those that have
-    /// most of its weight.
+    /// most of its weight. Returns `None` if cancelled.
     ///
     /// # Errors
     /// [`ContributionError`].
-    pub fn assign(scene: &Scene<'_>, clusters: &MaskClusters) -> Result<Self, ContributionError> {
+    pub fn assign(scene: &Scene<'_>, clusters: &MaskClusters) -> Result<Option<Self>, ContributionError> {
         let of_region = ClustersOfRegion::new(scene.table, clusters);
         let n_masks = scene.table.n_masks();
         let mut masks = vec![Vec::new(); clusters.consensus.len()];
@@ -70,6 +70,9 @@ impl Members {
             own_weights: vec![0.0; n_masks],
         };
         for group in scene.index.groups(scene.group_bytes) {
+            if scene.is_cancelled() {
+                return Ok(None);
+            }
             let raw = scene.index.read(group)?;
             for contributions in scene.index.transpose(&raw, scene.table)? {
                 let found: Vec<u32> = (0..contributions.part.locals.len())
@@ -86,7 +89,7 @@ impl Members {
                 of_cell[contributions.part.locals.clone()].copy_from_slice(&found);
             }
         }
-        Ok(members)
+        Ok(Some(members))
     }
 
     /// Adds a part's weights to its masks'; one after the other, so that the contributions are the same every time.

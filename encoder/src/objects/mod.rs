@@ -18,6 +18,8 @@ pub mod shards;
 pub mod sightings;
 pub mod vectors;
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use glam::DVec3;
 use rayon::prelude::*;
 use serde::Serialize;
@@ -108,18 +110,26 @@ pub struct Scene<'a> {
     pub score_context: &'a ScoreMetricContext,
     /// Bytes there are for the contributions of a group of parts.
     pub group_bytes: u64,
+    /// Set when the user asks to stop.
+    pub cancel: &'a AtomicBool,
 }
 
-/// Finds the objects of a scene.
+impl Scene<'_> {
+    fn is_cancelled(&self) -> bool {
+        self.cancel.load(Ordering::Relaxed)
+    }
+}
+
+/// Finds the objects of a scene. Returns `None` if it is cancelled.
 ///
 /// # Errors
 /// [`ContributionError`].
-pub fn find(scene: &Scene<'_>) -> Result<SceneObjects, ContributionError> {
+pub fn find(scene: &Scene<'_>) -> Result<Option<SceneObjects>, ContributionError> {
     let Scene { index, table, split, .. } = scene;
     let n_gaussians: usize = split.cells.iter().map(|cell| cell.gaussians.len()).sum();
     let sample_step = sightings::sample_step(n_gaussians);
     let view_of_mask = repeat_each(index.n_masks_of_view());
-    let sightings = sightings::gather(index, table, sample_step, scene.group_bytes)?;
+    let Some(sightings) = sightings::gather(scene, sample_step)? else { return Ok(None) };
     let clusters = consensus::cluster_masks(
         &sightings,
         &Masks {
@@ -127,9 +137,11 @@ pub fn find(scene: &Scene<'_>) -> Result<SceneObjects, ContributionError> {
             view_of_mask: &view_of_mask,
             n_views: scene.photos.len(),
         },
+        scene.cancel,
     );
     drop(sightings);
-    let mut members = Members::assign(scene, &clusters)?;
+    let Some(clusters) = clusters else { return Ok(None) };
+    let Some(mut members) = Members::assign(scene, &clusters)? else { return Ok(None) };
     members.drop_small(MIN_GAUSSIANS);
     let objects = describe(scene, &members, &view_of_mask);
     let calibration = vectors::calibrate(&objects, scene.score_context, table.dim());
@@ -141,7 +153,7 @@ pub fn find(scene: &Scene<'_>) -> Result<SceneObjects, ContributionError> {
         n_masks_of_objects: objects.iter().map(|object| object.n_masks as usize).sum(),
         n_masks_set_aside: clusters.n_set_aside,
     };
-    Ok(SceneObjects { objects, object_of: members.object_of, calibration, report })
+    Ok(Some(SceneObjects { objects, object_of: members.object_of, calibration, report }))
 }
 
 /// Returns each index as often as its count says.

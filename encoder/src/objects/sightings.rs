@@ -2,8 +2,9 @@
 
 use rayon::prelude::*;
 
+use super::Scene;
 use super::consensus::Sightings;
-use crate::lift::{ContributionError, ContributionIndex, RegionTable};
+use crate::lift::ContributionError;
 
 /// Gaussians looked at, about: consensus takes time as their number, and masks of [`super::consensus`] need a few each.
 const MAX_SAMPLES: usize = 32_768;
@@ -16,19 +17,18 @@ pub fn sample_step(n_gaussians: usize) -> usize {
     n_gaussians.div_ceil(MAX_SAMPLES).max(1)
 }
 
-/// Gathers the sightings of every `step`-th Gaussian of each cell.
+/// Gathers the sightings of every `step`-th Gaussian of each cell. Returns `None` if cancelled.
 ///
 /// # Errors
 /// [`ContributionError`].
-pub fn gather(
-    index: &ContributionIndex,
-    table: &RegionTable,
-    step: usize,
-    group_bytes: u64,
-) -> Result<Sightings, ContributionError> {
+pub fn gather(scene: &Scene<'_>, step: usize) -> Result<Option<Sightings>, ContributionError> {
+    let Scene { index, table, group_bytes, .. } = *scene;
     let view_of_region = super::repeat_each(index.n_regions_of_view());
     let mut all = Sightings { starts: vec![0], views: Vec::new(), regions: Vec::new() };
     for group in index.groups(group_bytes) {
+        if scene.is_cancelled() {
+            return Ok(None);
+        }
         let raw = index.read(group)?;
         for contributions in index.transpose(&raw, table)? {
             let sampled: Vec<usize> =
@@ -52,7 +52,7 @@ pub fn gather(
             }
         }
     }
-    Ok(all)
+    Ok(Some(all))
 }
 
 /// Returns (view, region) of each view that sees a Gaussian. Entries are by view, then region.

@@ -69,7 +69,9 @@ impl Made {
         cluster_masks(
             &self.sightings,
             &Masks { of_region: &of_region, view_of_mask: &self.view_of_mask, n_views },
+            &AtomicBool::new(false),
         )
+        .expect("not cancelled")
     }
 }
 
@@ -324,8 +326,13 @@ fn world() -> World {
 
 impl World {
     fn objects(&self, group_bytes: u64) -> SceneObjects {
+        self.objects_unless(group_bytes, &AtomicBool::new(false)).expect("not cancelled")
+    }
+
+    fn objects_unless(&self, group_bytes: u64, cancel: &AtomicBool) -> Option<SceneObjects> {
         let Self { gaussians, split, index, table, photos, score_context, .. } = self;
-        find(&Scene { index, table, gaussians, split, photos, score_context, group_bytes }).expect("finds")
+        let scene = Scene { index, table, gaussians, split, photos, score_context, group_bytes, cancel };
+        find(&scene).expect("finds")
     }
 }
 
@@ -368,6 +375,11 @@ fn objects_are_the_things_for_any_threads_and_memory() {
             assert_eq!(pool.install(|| world.objects(group_bytes)), found, "{n_threads} {group_bytes}");
         }
     }
+}
+
+#[test]
+fn nothing_is_found_once_the_user_has_said_stop() {
+    assert_eq!(world().objects_unless(u64::MAX, &AtomicBool::new(true)), None);
 }
 
 /// What shards say is what was found, in any order of the Gaussians.
