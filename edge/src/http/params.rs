@@ -81,7 +81,7 @@ fn accepted(headers: &HeaderMap) -> Format {
             .split(',')
             .any(|range| range.split(';').next().is_some_and(|r| r.trim().eq_ignore_ascii_case(arrow)))
     };
-    if values.any(names_arrow) { Format::Arrow } else { Format::Json }
+    if cfg!(feature = "arrow") && values.any(names_arrow) { Format::Arrow } else { Format::Json }
 }
 
 fn number<T: FromStr>(name: &str, value: &str, expected: &str) -> Result<T, RequestError> {

@@ -1,6 +1,7 @@
 //! From a question to ranked answers.
 
 mod answers;
+#[cfg(feature = "arrow")]
 mod arrow;
 pub mod cluster;
 mod engine;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use super::{Answers, Found, GaussianAnswer, arrow};
+use super::{Answers, Found, GaussianAnswer};
 use crate::store::Snapshot;
 
 /// Pieces of JSON are cut at the first answer past this.
@@ -39,8 +39,9 @@ impl std::str::FromStr for Format {
     fn from_str(text: &str) -> Result<Self, String> {
         match text {
             "json" => Ok(Self::Json),
-            "arrow" => Ok(Self::Arrow),
-            _ => Err("json or arrow".into()),
+            "arrow" if cfg!(feature = "arrow") => Ok(Self::Arrow),
+            _ if cfg!(feature = "arrow") => Err("json or arrow".into()),
+            _ => Err("json (this program is built without Arrow)".into()),
         }
     }
 }
@@ -72,7 +73,10 @@ impl Reply {
     pub fn pieces(self, format: Format) -> Box<dyn Iterator<Item = io::Result<Vec<u8>>> + Send> {
         match format {
             Format::Json => Box::new(JsonPieces { reply: self, question: 0, item: 0, is_closed: false }),
-            Format::Arrow => Box::new(arrow::Pieces::new(self)),
+            #[cfg(feature = "arrow")]
+            Format::Arrow => Box::new(super::arrow::Pieces::new(self)),
+            #[cfg(not(feature = "arrow"))]
+            Format::Arrow => Box::new(std::iter::once(Err(io::Error::other("built without Arrow")))),
         }
     }
 }

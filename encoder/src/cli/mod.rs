@@ -8,6 +8,7 @@ mod keys;
 mod models;
 pub mod preset;
 pub mod progress;
+#[cfg(feature = "qdrant")]
 mod push;
 mod query;
 pub mod refine;
@@ -23,7 +24,9 @@ use serde_json::json;
 use slag_models::commands::ModelsCommand;
 
 use crate::encode::EncodeError;
+#[cfg(feature = "qdrant")]
 use crate::publish::qdrant;
+#[cfg(feature = "qdrant")]
 use push::PushCommand;
 
 /// Makes 3D Gaussian splatting scenes searchable by words.
@@ -71,6 +74,7 @@ pub enum Command {
     #[command(subcommand)]
     Models(ModelsCommand),
     /// Pushes a store elsewhere.
+    #[cfg(feature = "qdrant")]
     #[command(subcommand)]
     Push(push::PushCommand),
     /// Lists the GPUs that can rasterise.
@@ -88,6 +92,7 @@ pub fn run(cli: Cli) -> Exit {
         Command::Serve(args) => serve::run(&args),
         Command::Keys(command) => keys::run(&command, json),
         Command::Models(command) => models::run(&command, json),
+        #[cfg(feature = "qdrant")]
         Command::Push(PushCommand::Qdrant(args)) => push::run(&args, progress.as_ref(), json),
         Command::Devices => devices::run(json),
     };
@@ -100,8 +105,10 @@ pub fn exit_of(result: Result<Exit>, json: bool) -> Exit {
         Ok(exit) => exit,
         Err(error) if is_broken_pipe(&error) => Exit::Done,
         Err(error) => {
-            let interrupted = matches!(error.downcast_ref(), Some(EncodeError::Interrupted { .. }))
-                || matches!(error.downcast_ref(), Some(qdrant::PushError::Cancelled));
+            let interrupted = matches!(error.downcast_ref(), Some(EncodeError::Interrupted { .. }));
+            #[cfg(feature = "qdrant")]
+            let interrupted =
+                interrupted || matches!(error.downcast_ref(), Some(qdrant::PushError::Cancelled));
             if json {
                 println!(
                     "{}",

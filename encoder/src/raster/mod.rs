@@ -12,12 +12,17 @@
 //! | [`draw`] | colour, depth and coverage per pixel |
 //! | [`sh`] | colour of a Gaussian as seen from the camera |
 
+pub mod adapter;
 pub mod bin;
 pub mod blend;
 pub mod buckets;
 pub mod constants;
 pub mod devices;
 pub mod draw;
+#[cfg(feature = "gpu")]
+pub mod gpu;
+#[cfg(not(feature = "gpu"))]
+#[path = "no_gpu.rs"]
 pub mod gpu;
 pub mod project;
 pub mod sh;

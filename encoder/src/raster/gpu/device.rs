@@ -4,51 +4,27 @@ use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll, Waker};
 
-use serde::Serialize;
-
-use super::shader::{Kernels, Precision};
+use super::shader::Kernels;
 use crate::raster::RasterError;
+use crate::raster::adapter::{AdapterReport, Precision};
 
-/// What an adapter is.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct AdapterReport {
-    /// Name of the device.
-    pub name: String,
-    /// Driver and its version.
-    pub driver: String,
-    /// Interface: Vulkan, Metal, Dx12.
-    pub backend: String,
-    /// `discrete`, `integrated`, `virtual`, `software` or `other`.
-    pub kind: &'static str,
-    /// Precision of the projection.
-    pub precision: Precision,
-    /// Largest piece of memory that a shader can see, bytes.
-    pub max_binding_bytes: u64,
-}
-
-impl AdapterReport {
-    fn new(adapter: &wgpu::Adapter) -> Self {
-        let info = adapter.get_info();
-        let has_f64 = adapter.features().contains(wgpu::Features::SHADER_F64);
-        Self {
-            name: info.name,
-            driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
-            backend: format!("{:?}", info.backend),
-            kind: match info.device_type {
-                wgpu::DeviceType::DiscreteGpu => "discrete",
-                wgpu::DeviceType::IntegratedGpu => "integrated",
-                wgpu::DeviceType::VirtualGpu => "virtual",
-                wgpu::DeviceType::Cpu => "software",
-                wgpu::DeviceType::Other => "other",
-            },
-            precision: if has_f64 { Precision::F64 } else { Precision::F32 },
-            max_binding_bytes: adapter.limits().max_storage_buffer_binding_size,
-        }
-    }
-
-    /// Returns whether the processor does the work.
-    pub fn is_software(&self) -> bool {
-        self.kind == "software"
+/// Describes an adapter.
+fn report_of(adapter: &wgpu::Adapter) -> AdapterReport {
+    let info = adapter.get_info();
+    let has_f64 = adapter.features().contains(wgpu::Features::SHADER_F64);
+    AdapterReport {
+        name: info.name,
+        driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
+        backend: format!("{:?}", info.backend),
+        kind: match info.device_type {
+            wgpu::DeviceType::DiscreteGpu => "discrete",
+            wgpu::DeviceType::IntegratedGpu => "integrated",
+            wgpu::DeviceType::VirtualGpu => "virtual",
+            wgpu::DeviceType::Cpu => "software",
+            wgpu::DeviceType::Other => "other",
+        },
+        precision: if has_f64 { Precision::F64 } else { Precision::F32 },
+        max_binding_bytes: adapter.limits().max_storage_buffer_binding_size,
     }
 }
 
@@ -68,7 +44,7 @@ pub fn adapters() -> Vec<Adapter> {
     let instance = wgpu::Instance::new(descriptor);
     let mut adapters: Vec<Adapter> = ready(instance.enumerate_adapters(wgpu::Backends::PRIMARY))
         .into_iter()
-        .map(|adapter| Adapter { report: AdapterReport::new(&adapter), adapter })
+        .map(|adapter| Adapter { report: report_of(&adapter), adapter })
         .collect();
     let rank =
         |kind| ["discrete", "integrated", "virtual", "other", "software"].iter().position(|k| *k == kind);

@@ -4,7 +4,8 @@ use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
 use slag_common::Gaussians;
 
-use super::shader::{Precision, SUM_FRACTION_BITS};
+use super::shader::SUM_FRACTION_BITS;
+use crate::raster::adapter::Precision;
 use crate::raster::constants::{MIN_ALPHA, TILE_SIZE_PX};
 use crate::raster::project::reach2;
 use crate::raster::{RasterView, RegionWeight};

@@ -21,6 +21,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 use slag_common::Gaussians;
 
+pub use super::adapter::{AdapterReport, GpuOptions, Precision};
 use super::constants::TILE_SIZE_PX;
 use super::sh;
 use super::{
@@ -28,35 +29,10 @@ use super::{
     ViewCounters, ViewWeights, WeightKind, check_regions, check_scene, check_view,
 };
 use crate::masks::RegionMap;
-pub use device::{Adapter, AdapterReport, Device, adapters};
+pub use device::{Adapter, Device, adapters};
 use layout::{Capacities, RegionSum, SceneGaussian, ViewBlock, screen_layout};
-pub use shader::Precision;
 use shader::{Counter, MAX_DISPATCH, REGION_BITS, WORKGROUP_SIZE};
 use workspace::{Band, Counts, PIXEL_BYTES, SCENE_GAUSSIAN_BYTES, SceneChunk, Size, Workspace, band_size};
-
-/// How a device is used.
-#[derive(Clone, Copy, Debug)]
-pub struct GpuOptions {
-    /// Largest buffer, bytes; the device's own limit if larger.
-    pub max_binding_bytes: u64,
-    /// Bytes of the scene that stay on the device; the rest is uploaded for each view.
-    pub max_resident_bytes: u64,
-    /// Visible Gaussians, pairs and sums that there is room for at first; grown when a view needs more.
-    pub first_room: u32,
-    /// Views worked on at once: while one is copied back, others compute.
-    pub views_in_flight: usize,
-}
-
-impl Default for GpuOptions {
-    fn default() -> Self {
-        Self {
-            max_binding_bytes: u64::MAX,
-            max_resident_bytes: u64::MAX,
-            first_room: 1 << 19,
-            views_in_flight: 3,
-        }
-    }
-}
 
 /// A GPU as a backend.
 pub struct GpuRasterizer {

@@ -1,5 +1,6 @@
 //! The shaders: their text, with the constants and the precision put in front, and their pipelines.
 
+use crate::raster::adapter::Precision;
 use std::borrow::Cow;
 use std::fmt::Write;
 
@@ -50,16 +51,6 @@ impl Counter {
         (Self::Entries, "ENTRIES"),
         (Self::RegionSums, "REGION_SUMS"),
     ];
-}
-
-/// Precision of the projection on a device.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Precision {
-    /// As the reference has it.
-    F64,
-    /// Where the device has no more: Gaussians far from the image's centre, and needles, lose digits.
-    F32,
 }
 
 /// The stages' own shaders, without what they share.

@@ -1,0 +1,58 @@
+//! Stands in for the GPU backend in builds without the feature `gpu`: no adapter is found.
+
+use std::convert::Infallible;
+
+use slag_common::Gaussians;
+
+pub use super::adapter::{AdapterReport, GpuOptions, Precision};
+use super::{LoadedScene, RasterError, Rasterizer};
+
+/// An adapter; there is none.
+pub struct Adapter {
+    /// Its description.
+    pub report: AdapterReport,
+    none: Infallible,
+}
+
+/// An opened device; there is none.
+pub struct Device {
+    none: Infallible,
+}
+
+/// The GPU backend; it cannot be made.
+pub struct GpuRasterizer {
+    none: Infallible,
+}
+
+/// Returns no adapter.
+pub fn adapters() -> Vec<Adapter> {
+    Vec::new()
+}
+
+impl Adapter {
+    /// Opens the device.
+    ///
+    /// # Errors
+    /// Never: there is no adapter.
+    pub fn open(&self, _: Precision) -> Result<Device, RasterError> {
+        match self.none {}
+    }
+}
+
+impl GpuRasterizer {
+    /// Uses an opened device.
+    pub fn new(device: Device, _: GpuOptions) -> Self {
+        match device.none {}
+    }
+
+    /// Returns the description of the device.
+    pub fn report(&self) -> &AdapterReport {
+        match self.none {}
+    }
+}
+
+impl Rasterizer for GpuRasterizer {
+    fn load<'s>(&self, _: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
+        match self.none {}
+    }
+}
