@@ -5,6 +5,7 @@ use std::path::Path;
 
 use half::f16;
 use serde_json::Value;
+use slag_common::npz::Npz;
 use slag_common::shard::Profile;
 use slag_encoder::lift::published::{read_field, read_regions};
 use slag_encoder::store::StoreReader;
@@ -108,15 +109,18 @@ fn a_gpu_gives_the_field_of_the_cpu() {
     assert!(relative_l1 < 2e-5 && largest < 0.01, "{relative_l1:e} {largest:e}");
 }
 
+/// Returns an array of an archive.
+fn array<T: npyz::Deserialize>(npz: &mut Npz, name: &str) -> Vec<T> {
+    let member = npz.array(name).expect("readable").expect("there");
+    npyz::NpyFile::new(member).expect("an array").into_vec().expect("of that type")
+}
+
 /// Cosine at least 0.99 for 95 % of the reference's Gaussians, total weights within 1 %.
 fn check_embeddings(house: &Path, store: &Path) {
-    let bytes = fs_err::read(house.join("gt/reference_embeddings.npz")).expect("reads");
-    let mut npz = npyz::npz::NpzArchive::new(std::io::Cursor::new(bytes)).expect("an npz");
-    let index: Vec<u32> = npz.by_name("index").expect("an npz").expect("index").into_vec().expect("u32");
-    let embedding: Vec<f16> =
-        npz.by_name("embedding").expect("an npz").expect("embedding").into_vec().expect("f16");
-    let weight: Vec<f32> =
-        npz.by_name("total_weight").expect("an npz").expect("weight").into_vec().expect("f32");
+    let mut npz = Npz::open(&house.join("gt/reference_embeddings.npz")).expect("an npz");
+    let index: Vec<u32> = array(&mut npz, "index");
+    let embedding: Vec<f16> = array(&mut npz, "embedding");
+    let weight: Vec<f32> = array(&mut npz, "total_weight");
     let dim = embedding.len() / index.len();
 
     let reader = StoreReader::open(store).expect("a published store");

@@ -12,6 +12,7 @@ pub mod frames;
 pub mod gaussians;
 pub mod hash;
 pub mod manifest;
+pub mod npz;
 pub mod objects;
 pub mod poses;
 pub mod shard;

@@ -1,12 +1,10 @@
 //! Reads the shared test data.
 
-use std::fs::File;
-use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
 use glam::{DAffine3, DMat3, DVec3};
-use npyz::Deserialize;
-use npyz::npz::NpzArchive;
+use npyz::{Deserialize, NpyFile};
+use slag_common::npz;
 use slag_common::{Distortion, Gaussians, Intrinsics};
 use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::RasterView;
@@ -25,15 +23,16 @@ pub fn shared(path: &str) -> Option<PathBuf> {
 }
 
 /// An open archive of arrays.
-pub struct Npz(NpzArchive<BufReader<File>>);
+pub struct Npz(npz::Npz);
 
 impl Npz {
     pub fn open(path: &str) -> Option<Self> {
-        Some(Self(NpzArchive::open(shared(path)?).unwrap()))
+        Some(Self(npz::Npz::open(&shared(path)?).unwrap()))
     }
 
     pub fn array<T: Deserialize>(&mut self, name: &str) -> Vec<T> {
-        self.0.by_name(name).unwrap().unwrap_or_else(|| panic!("no array {name}")).into_vec().unwrap()
+        let member = self.0.array(name).unwrap().unwrap_or_else(|| panic!("no array {name}"));
+        NpyFile::new(member).unwrap().into_vec().unwrap()
     }
 
     /// Returns the scene, with the means of the named array.

@@ -6,7 +6,7 @@ pub mod onnx;
 
 use std::path::{Path, PathBuf};
 
-use npyz::npz::NpzArchive;
+use slag_common::npz::Npz;
 use slag_models::SessionOptions;
 
 /// The project's root.
@@ -42,8 +42,9 @@ pub fn options() -> Option<SessionOptions> {
 
 /// An array of an npz file: its shape and elements.
 pub fn array<T: npyz::Deserialize>(npz: &Path, name: &str) -> (Vec<usize>, Vec<T>) {
-    let mut archive = NpzArchive::open(npz).expect("the npz opens");
-    let array = archive.by_name(name).expect("it is readable").unwrap_or_else(|| panic!("no array {name}"));
+    let mut archive = Npz::open(npz).expect("the npz opens");
+    let member = archive.array(name).expect("it is readable").unwrap_or_else(|| panic!("no array {name}"));
+    let array = npyz::NpyFile::new(member).expect("an array");
     let shape = array.shape().iter().map(|&n| n as usize).collect();
     (shape, array.into_vec().expect("elements are of that type"))
 }

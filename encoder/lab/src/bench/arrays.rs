@@ -1,11 +1,10 @@
 //! Reads arrays of a NumPy archive.
 
-use std::io::{self, BufReader};
+use std::io;
 use std::path::{Path, PathBuf};
 
-use fs_err::File;
-use npyz::npz::NpzArchive;
 use npyz::{DType, Deserialize, NpyFile};
+use slag_common::npz::Npz;
 
 /// Why a recorded scene cannot be read.
 #[derive(Debug, thiserror::Error)]
@@ -43,7 +42,7 @@ pub enum FixtureError {
 /// An open archive.
 pub struct Arrays {
     path: PathBuf,
-    archive: NpzArchive<BufReader<File>>,
+    archive: Npz,
 }
 
 impl Arrays {
@@ -53,8 +52,7 @@ impl Arrays {
     /// [`FixtureError::Io`].
     pub fn open(path: &Path) -> Result<Self, FixtureError> {
         let io = |source| FixtureError::Io { path: path.to_owned(), source };
-        let file = File::open(path).map_err(io)?;
-        let archive = NpzArchive::new(BufReader::new(file)).map_err(io)?;
+        let archive = Npz::open(path).map_err(io)?;
         Ok(Self { path: path.to_owned(), archive })
     }
 
@@ -100,9 +98,10 @@ impl Arrays {
     fn values(&mut self, array: &'static str) -> Result<Vec<f64>, FixtureError> {
         let Self { path, archive } = self;
         let io = |source| FixtureError::Io { path: path.clone(), source };
-        let Some(file) = archive.by_name(array).map_err(io)? else {
+        let Some(member) = archive.array(array).map_err(io)? else {
             return Err(FixtureError::Missing { path: path.clone(), array });
         };
+        let file = NpyFile::new(member).map_err(io)?;
         let kind = match file.dtype() {
             DType::Plain(kind) => kind.to_string(),
             other => other.descr(),

@@ -259,8 +259,8 @@ mod tests {
     use std::io::Cursor;
 
     use npyz::WriterBuilder;
-    use npyz::npz::NpzWriter;
-    use npyz::zip::write::FileOptions;
+    use zip::ZipWriter;
+    use zip::write::SimpleFileOptions;
 
     use super::*;
     use slag_encoder::raster::{CpuRasterizer, Rasterizer, WeightKind};
@@ -299,7 +299,7 @@ mod tests {
     /// Writes the arrays of a scene of 2 Gaussians and 1 view, but for one array.
     fn archive(without: &str) -> Vec<u8> {
         let mut bytes = Cursor::new(Vec::new());
-        let mut npz = NpzWriter::new(&mut bytes);
+        let mut npz = ZipWriter::new(&mut bytes);
         let pose = [1.0, 0.0, 0.0, 5.0, 0.0, 0.0, -1.0, 6.0, 0.0, 1.0, 0.0, 7.0, 0.0, 0.0, 0.0, 1.0];
         let arrays: [(&str, &[u64], &[f32]); 6] = [
             ("means", &[2, 3], &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),
@@ -310,18 +310,20 @@ mod tests {
             ("Ks", &[1, 3, 3], &[90.0, 0.0, 31.5, 0.0, 91.0, 23.5, 0.0, 0.0, 1.0]),
         ];
         for (name, shape, values) in arrays.into_iter().filter(|(name, _, _)| *name != without) {
-            let file = npz.array::<f32>(name, FileOptions::default()).unwrap();
-            let mut file = file.default_dtype().shape(shape).begin_nd().unwrap();
+            npz.start_file(format!("{name}.npy"), SimpleFileOptions::default()).unwrap();
+            let mut file =
+                npyz::WriteOptions::new().default_dtype().shape(shape).writer(&mut npz).begin_nd().unwrap();
             file.extend(values.iter().copied()).unwrap();
             file.finish().unwrap();
         }
         for (name, value) in [("width", 64), ("height", 48)] {
-            let file = npz.array::<i64>(name, FileOptions::default()).unwrap();
-            let mut file = file.default_dtype().shape(&[]).begin_nd().unwrap();
-            file.push(&value).unwrap();
+            npz.start_file(format!("{name}.npy"), SimpleFileOptions::default()).unwrap();
+            let mut file =
+                npyz::WriteOptions::new().default_dtype().shape(&[]).writer(&mut npz).begin_nd().unwrap();
+            file.push(&i64::from(value)).unwrap();
             file.finish().unwrap();
         }
-        drop(npz);
+        npz.finish().unwrap();
         bytes.into_inner()
     }
 

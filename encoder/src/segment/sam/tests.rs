@@ -476,8 +476,9 @@ fn tiny(settings: SamSettings) -> Option<SamSegmenter> {
 }
 
 fn array<T: npyz::Deserialize>(npz: &Path, name: &str) -> (Vec<u64>, Vec<T>) {
-    let mut archive = npyz::npz::NpzArchive::open(npz).expect("an npz");
-    let array = archive.by_name(name).expect("readable").expect("there");
+    let mut archive = slag_common::npz::Npz::open(npz).expect("an npz");
+    let member = archive.array(name).expect("readable").expect("there");
+    let array = npyz::NpyFile::new(member).expect("an array");
     (array.shape().to_vec(), array.into_vec().expect("of that type"))
 }
 
