@@ -1,53 +1,38 @@
 //! Scores of all centroids, which every kind of answer starts from.
 
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 use rayon::prelude::*;
 use slag_common::shard::ShardView;
 
-use super::collect::Gather;
+use super::precision::Precision;
 use super::project::{Projection, Vector};
+use super::question::Question;
+use super::region::Region;
 use super::simd::Level;
-use super::{Precision, Question, Region};
-
-/// Memory of a search, which the next one takes over: then a search allocates little but its answers.
-#[derive(Default)]
-pub struct Scratch {
-    /// Shared with the searches that were made with it.
-    scored: Arc<Scored>,
-}
-
-impl Scratch {
-    /// Returns memory that no search uses any more: the last one's, or new.
-    pub(super) fn take(&mut self) -> &mut Scored {
-        if Arc::get_mut(&mut self.scored).is_none() {
-            self.scored = Arc::default();
-        }
-        // Just made, if it was not its only owner.
-        Arc::get_mut(&mut self.scored).unwrap_or_else(|| unreachable!("the only owner"))
-    }
-
-    /// Whether no centroids were ever scored in it.
-    #[cfg(test)]
-    pub fn is_untouched(&self) -> bool {
-        self.scored.shards.is_empty()
-    }
-
-    /// Shares the memory with a search.
-    pub(super) fn share(&self) -> Arc<Scored> {
-        Arc::clone(&self.scored)
-    }
-}
 
 /// What questions score, centroid by centroid.
 #[derive(Default)]
-pub(super) struct Scored {
+pub(super) struct CentroidScores {
     /// The distinct vectors of all questions.
     pub vectors: Vec<Vector>,
     /// By place in the slice of shards.
     pub shards: Vec<ShardScores>,
-    /// What answers are gathered in.
-    pub gather: Mutex<Gather>,
+}
+
+/// One question of those scored, with the shards it asks about.
+pub(super) struct AskedQuestion<'a> {
+    pub shards: &'a [ShardView<'a>],
+    pub question: &'a Question,
+    pub region: Region,
+    pub precision: Precision,
+    pub scored: Arc<CentroidScores>,
+    /// Indices of its vectors among those scored: its own, then its negatives.
+    pub places: Vec<usize>,
+    /// Its index among the questions scored.
+    pub index: usize,
+    /// See [`Question::steepness`].
+    pub steepness: f32,
 }
 
 /// What questions score in one shard.
@@ -63,7 +48,7 @@ pub(super) struct ShardScores {
     pub combined: Vec<Vec<f32>>,
 }
 
-impl Scored {
+impl CentroidScores {
     /// Scores the centroids of the shards that reach into the region. Returns the places of each question's
     /// vectors, its own first.
     pub fn score(

@@ -3,7 +3,7 @@
 use slag_common::container::AlignedBytes;
 use slag_common::shard::{MAX_SUBSPACES, ShardLayout};
 
-use super::collect::UNDECIDED;
+use super::cell::UNDECIDED;
 use super::tests::{random_question, score_in_f64, views};
 use super::*;
 use crate::testing::coded::{CODE_ERROR, CodedShard, FINE_ERROR};
@@ -48,11 +48,12 @@ fn shards_of(
 
 /// The score of a Gaussian as the format and the module define it, from the rounded parts, one by one.
 fn defined_score(search: &Search<'_>, shard_at: usize, index: usize) -> f32 {
-    let shard = &search.shards[shard_at];
-    let (centroid, scores) = (shard.row_of(index), &search.scored.shards[shard_at]);
+    let shard = &search.shards()[shard_at];
+    let (centroid, scores) = (shard.row_of(index), &search.asked.scored.shards[shard_at]);
     let product = |place: &usize| {
         let own = scores.centroids[*place][centroid];
-        let Some(residuals) = shard.residuals.filter(|_| search.precision != Precision::Centroids) else {
+        let Some(residuals) = shard.residuals.filter(|_| search.asked.precision != Precision::Centroids)
+        else {
             return own;
         };
         let (tables, scale) = (&scores.projections[*place].tables, residuals.residual_scales[centroid]);
@@ -63,7 +64,7 @@ fn defined_score(search: &Search<'_>, shard_at: usize, index: usize) -> f32 {
         let sum: u32 = (0..shard.header.n_subspaces as usize).map(value).sum();
         (own + scale * tables.offset) + scale * tables.step * sum as f32
     };
-    let products: Vec<f32> = search.places.iter().map(product).collect();
+    let products: Vec<f32> = search.asked.places.iter().map(product).collect();
     let worst = products[1..].iter().copied().fold(f32::NEG_INFINITY, f32::max);
     if products.len() > 1 { products[0] - worst } else { products[0] }
 }
@@ -81,7 +82,7 @@ fn scores_are_within_the_stated_error() {
             for precision in [Precision::Exact, Precision::Centroids] {
                 let search = Search::new(&views, &question, Region::default(), precision).expect("valid");
                 for (at, (shard, built)) in views.iter().zip(&built).enumerate() {
-                    let cell = search.cell(at).expect("searched");
+                    let cell = search.asked.cell(at).expect("searched");
                     for (index, embedding) in built.embeddings.iter().enumerate() {
                         let centroid = shard.row_of(index);
                         let found = f64::from(defined_score(&search, at, index));
@@ -95,7 +96,7 @@ fn scores_are_within_the_stated_error() {
                         let bound = cell.score_error(centroid);
                         let of_rounding = match (&shard.residuals, precision) {
                             (Some(_), Precision::Centroids) => cell.centroid_error(centroid),
-                            _ => bound - search.steepness * shard.radii[centroid],
+                            _ => bound - search.asked.steepness * shard.radii[centroid],
                         };
                         let share = rounding / f64::from(of_rounding);
                         assert!(
@@ -138,7 +139,7 @@ fn answers_are_those_of_brute_force() {
             let region = Region { ball: is_near.then_some(ball), bounds: None };
             let search = Search::reusing(&mut scratch, &views, &question, region, precision).expect("valid");
             let mut all: Vec<Hit> = Vec::new();
-            for (at, view) in views.iter().enumerate().filter(|(at, _)| search.cell(*at).is_some()) {
+            for (at, view) in views.iter().enumerate().filter(|(at, _)| search.asked.cell(*at).is_some()) {
                 let inside = |index: &usize| region.contains(view.position_in_world(*index));
                 let hit = |index: usize| {
                     let score = defined_score(&search, at, index);
@@ -163,7 +164,7 @@ fn answers_are_those_of_brute_force() {
                     assert_eq!((found.shard, found.index), (expected.shard, expected.index));
                     // Of a centroid that is in as a whole, its own score is given.
                     let centroid = views[found.shard as usize].row_of(found.index as usize);
-                    let cell = search.cell(found.shard as usize).expect("searched");
+                    let cell = search.asked.cell(found.shard as usize).expect("searched");
                     assert!(found.score == expected.score || found.score == cell.centroids[centroid]);
                 }
                 let mut columns = Columns::default();
@@ -220,7 +221,7 @@ fn measured_errors_decide_as_defined() {
                 let (shard, mut decoded) = (&views[at], vec![0.0; shape.0]);
                 let exact = shard.exact.expect("exact");
                 shard.decode_fine(index, &exact.fine.expect("fine"), &mut decoded);
-                let cell = search.cell(at).expect("searched");
+                let cell = search.asked.cell(at).expect("searched");
                 let (centroid, fine) =
                     (shard.row_of(index), score_in_f64(&question, decoded.iter().copied()));
                 let (of_centroid, bound) =

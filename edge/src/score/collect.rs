@@ -1,30 +1,24 @@
-//! Gathers what reaches a threshold: centroids as a whole where their bounds decide, members where not.
+//! Gathers the Gaussians that reach a threshold: whole centroids where their bounds decide, else member by member.
 
 use std::ops::Range;
 
 use half::f16;
 use rayon::prelude::*;
-use slag_common::shard::{BLOCK, ExactColumns, Residuals, ShardView};
+use slag_common::shard::{BLOCK, Residuals, ShardView};
 
-use super::centroids::{ShardScores, combine};
+use super::bins::{BINS, bin_of};
+use super::cell::{Cell, Detail, Measured};
+use super::centroids::{AskedQuestion, combine};
 use super::dot::EmbeddingTimesVector;
-use super::project::Projection;
-use super::select::{BINS, bin_of};
-use super::simd::{BlockSums, FindSums, LastBlock, Level, SomeRowsTimesVector};
-use super::{Effort, F16_ROUNDING, Matches, Precision, Region, Run, Search};
-
-/// With measured errors, what codes or fine residuals leave within so many mean errors of the border is
-/// looked at more closely. Of a generated field's best 1,000 to 100,000, 0.99 and more are then found; with 6,
-/// a few texts' best 1,000 fall short, as the errors of so few are the largest ones.
-pub(super) const UNDECIDED: f32 = 9.0;
+use super::matches::{Effort, Matches, Run};
+use super::region::Region;
+use super::simd::{BlockSums, FindSums, LastBlock, SomeRowsTimesVector};
 
 /// Runs on their way to an answer, and what finding them takes; kept from one answer to the next.
 #[derive(Default)]
 pub(super) struct Gather {
     /// By place in the slice of shards.
     pub shards: Vec<ShardGather>,
-    /// For [`Search::best`].
-    pub order: super::select::Order,
 }
 
 impl Gather {
@@ -73,106 +67,7 @@ struct Refine {
     scores: Vec<f32>,
 }
 
-/// What members are scored by, beyond their centroid.
-#[derive(Clone, Copy)]
-enum Detail<'a> {
-    Nothing,
-    Residuals(Residuals<'a>),
-    Embeddings(&'a [f16]),
-    Measured(Measured<'a>),
-}
-
-/// Codes, fine residuals and embeddings, and how far from the border the errors of each matter.
-#[derive(Clone, Copy)]
-struct Measured<'a> {
-    residuals: Residuals<'a>,
-    exact: ExactColumns<'a>,
-    code_margin: f32,
-    fine_margin: f32,
-}
-
-impl<'a> Measured<'a> {
-    /// `n_products`: of which a score is the difference.
-    fn new(
-        shard: &ShardView<'a>,
-        residuals: Residuals<'a>,
-        exact: ExactColumns<'a>,
-        n_products: f32,
-    ) -> Self {
-        let margin = |mean: f32| UNDECIDED * n_products * mean;
-        Self {
-            residuals,
-            exact,
-            code_margin: margin(shard.header.errors.mean),
-            fine_margin: margin(exact.fine.map_or(0.0, |fine| fine.errors.mean)),
-        }
-    }
-}
-
-/// One question's view of a shard.
-pub(super) struct Cell<'a> {
-    at: u32,
-    shard: &'a ShardView<'a>,
-    search: &'a Search<'a>,
-    scores: &'a ShardScores,
-    /// The question's score of each centroid.
-    pub centroids: &'a [f32],
-    detail: Detail<'a>,
-    /// The region, where the shard sticks out of it.
-    pub filter: Option<Region>,
-    level: Level,
-    /// How much a score moves at most with a residual of length 1, in components.
-    component_steepness: f32,
-    /// Rounding in tables for a centroid scale of 1.
-    table_error: f32,
-    /// Sum over vectors of the largest that tables name, for a centroid scale of 1.
-    table_reach: f32,
-}
-
-impl<'a> Search<'a> {
-    /// Returns the question's view of a shard that was searched.
-    pub(super) fn cell(&'a self, at: usize) -> Option<Cell<'a>> {
-        let (shard, scores) = (&self.shards[at], &self.scored.shards[at]);
-        if !scores.is_searched {
-            return None;
-        }
-        let centroids = match self.places.len() {
-            1 => &scores.centroids[self.places[0]],
-            _ => &scores.combined[self.asked],
-        };
-        let detail = match (&shard.exact, &shard.residuals) {
-            _ if self.precision == Precision::Centroids => Detail::Nothing,
-            // Codes whose errors were not measured say nothing.
-            (Some(exact), Some(residuals))
-                if self.precision == Precision::Measured && shard.header.errors.mean > 0.0 =>
-            {
-                let n_products = if self.places.len() == 1 { 1.0 } else { 2.0 };
-                Detail::Measured(Measured::new(shard, *residuals, *exact, n_products))
-            }
-            (Some(exact), _) => Detail::Embeddings(exact.embeddings),
-            (None, Some(residuals)) => Detail::Residuals(*residuals),
-            (None, None) => Detail::Nothing,
-        };
-        let filter = (!self.region.covers(&shard.position_box())).then_some(self.region);
-        let mut cell = Cell {
-            at: at as u32,
-            shard,
-            search: self,
-            scores,
-            centroids,
-            detail,
-            filter,
-            level: Level::widest(),
-            component_steepness: 0.0,
-            table_error: 0.0,
-            table_reach: 0.0,
-        };
-        if let Some(residuals) = &shard.residuals {
-            cell.measure(residuals);
-        }
-        Some(cell)
-    }
-
+impl AskedQuestion<'_> {
     /// Gathers what reaches a threshold. `each`: members of shards that know more of them than their centroid get
     /// scores of their own even where the centroid alone decides.
     pub(super) fn collect(&self, gather: &mut Gather, cut: Cut, each: bool) {
@@ -201,136 +96,9 @@ impl<'a> Search<'a> {
 }
 
 impl Cell<'_> {
-    /// Whether a member's score may differ from its centroid's.
-    pub fn has_detail(&self) -> bool {
-        !matches!(self.detail, Detail::Nothing)
-    }
-
-    fn projections(&self) -> impl Iterator<Item = &Projection> {
-        self.search.places.iter().map(|place| &self.scores.projections[*place])
-    }
-
-    /// Sets what depends on the question and the residual code alone.
-    fn measure(&mut self, residuals: &Residuals<'_>) {
-        // Components that no group has do not take part.
-        let n_coded = residuals.subspace_starts.last().map_or(0, |end| *end as usize);
-        let mut projections = self.projections();
-        let own = projections.next().map_or(&[][..], |own| &own.components[..n_coded]);
-        let length = |squares: f64| (squares.sqrt() * (1.0 + f64::from(f32::EPSILON))) as f32;
-        let apart =
-            |other: &Projection| own.iter().zip(&other.components).map(|(a, b)| (a - b).powi(2)).sum();
-        let largest = projections.map(apart).reduce(f64::max);
-        let steepness = length(largest.unwrap_or_else(|| own.iter().map(|v| v * v).sum()));
-        let error = |negative: bool| {
-            let errors = self.projections().enumerate().filter(|(at, _)| (*at > 0) == negative);
-            errors.map(|(_, projection)| projection.tables.error).fold(0.0, f32::max)
-        };
-        let table_error = error(false) + error(true);
-        let reach = |p: &Projection| p.tables.offset.abs() + p.tables.step * f32::from(p.tables.most);
-        let table_reach = self.projections().map(reach).sum();
-        (self.component_steepness, self.table_error, self.table_reach) =
-            (steepness, table_error, table_reach);
-    }
-
-    /// Returns a member's score by one vector for a sum of codes of 0, and what each step of the sum adds.
-    fn line(&self, place: usize, centroid: usize, residuals: &Residuals<'_>) -> (f32, f32) {
-        let (tables, scale) = (&self.scores.projections[place].tables, residuals.residual_scales[centroid]);
-        (self.scores.centroids[place][centroid] + scale * tables.offset, scale * tables.step)
-    }
-
-    /// Returns by how much members' scores differ at most from their centroid's through the residual code.
-    fn residual_bound(&self, centroid: usize, residuals: &Residuals<'_>) -> f32 {
-        let scale = residuals.residual_scales[centroid];
-        let apart = residuals.residual_norms[centroid] * self.component_steepness + scale * self.table_error;
-        // Three roundings in each line, and those of the bound itself.
-        apart * (1.0 + 4.0 * f32::EPSILON) + self.rounding(centroid, residuals)
-    }
-
-    /// Returns a bound on what the rounding in f32 of a member's score comes to.
-    fn rounding(&self, centroid: usize, residuals: &Residuals<'_>) -> f32 {
-        let of_centroids: f32 =
-            self.search.places.iter().map(|place| self.scores.centroids[*place][centroid].abs()).sum();
-        2.0 * f32::EPSILON * (of_centroids + residuals.residual_scales[centroid] * self.table_reach)
-    }
-
-    /// Returns two scores that a centroid's members lie between.
-    pub fn bounds(&self, centroid: usize) -> (f32, f32) {
-        let score = self.centroids[centroid];
-        match &self.detail {
-            Detail::Nothing => (score, score),
-            Detail::Embeddings(_) => {
-                let slack = self.embedding_bound(centroid);
-                (score - slack, score + slack)
-            }
-            Detail::Residuals(residuals) | Detail::Measured(Measured { residuals, .. }) => {
-                let apart = self.residual_bound(centroid, residuals);
-                if let [place] = self.search.places[..] {
-                    let (least, step) = self.line(place, centroid, residuals);
-                    let most = least + step * f32::from(self.scores.projections[place].tables.most);
-                    return (least.max(score - apart), most.min(score + apart));
-                }
-                let ends = |place: &usize| {
-                    let (least, step) = self.line(*place, centroid, residuals);
-                    let most = self.scores.projections[*place].tables.most;
-                    (least, least + step * f32::from(most))
-                };
-                let mut all = self.search.places.iter().map(ends);
-                let (mut lower, mut upper) = all.next().unwrap_or_default();
-                if let Some((least, most)) = all.reduce(|a, b| (a.0.max(b.0), a.1.max(b.1))) {
-                    (lower, upper) = (lower - most, upper - least);
-                }
-                (lower.max(score - apart), upper.min(score + apart))
-            }
-        }
-    }
-
-    /// Returns by how much a stored embedding's score may differ from its centroid's.
-    pub fn embedding_bound(&self, centroid: usize) -> f32 {
-        let question = self.search.question;
-        let distance = self.shard.radii[centroid] + F16_ROUNDING;
-        self.search.steepness * distance + 2.0 * question.rounding_bound() + self.centroid_error(centroid)
-    }
-
-    /// Returns a bound on what rounding changes a centroid's score by.
-    pub fn centroid_error(&self, centroid: usize) -> f32 {
-        let error = |projection: &Projection| {
-            // Members are of unit length, so that the centroid is no longer than 1 and their distance from it.
-            let length = 1.0 + self.shard.radii[centroid] + projection.mean_length;
-            projection.error_per_length * length + projection.error + f32::EPSILON * (1.0 + length)
-        };
-        let mut errors = self.projections().map(error);
-        errors.next().unwrap_or(0.0) + errors.fold(0.0, f32::max)
-    }
-
-    /// Returns a bound on the error of the centroid's score, or of its members' own where they are scored by
-    /// a residual code.
-    pub fn score_error(&self, centroid: usize) -> f32 {
-        let of_centroids = self.search.steepness * self.shard.radii[centroid] + self.centroid_error(centroid);
-        let of_codes = |residuals: &Residuals<'_>| {
-            of_centroids
-                + residuals.residual_scales[centroid] * self.table_error
-                + self.rounding(centroid, residuals)
-        };
-        match (&self.detail, &self.shard.residuals) {
-            (Detail::Residuals(residuals), _) => of_codes(residuals),
-            // Beside exact embeddings, radii are measured to the centroid.
-            (Detail::Measured(Measured { residuals, .. }), _) => {
-                let by_code =
-                    of_codes(residuals) + residuals.residual_norms[centroid] * self.component_steepness;
-                // Score and truth lie within that bound of the centroid's score.
-                by_code.max(2.0 * self.embedding_bound(centroid))
-            }
-            // Radii are measured to what centroid and code decode to.
-            (_, Some(residuals)) if self.shard.exact.is_none() => {
-                of_centroids + residuals.residual_norms[centroid] * self.component_steepness
-            }
-            _ => of_centroids,
-        }
-    }
-
     fn collect(&self, gather: &mut ShardGather, cut: Cut, each: bool, floor: f32) {
         gather.last.clear();
-        gather.last.resize_with(self.search.places.len(), LastBlock::default);
+        gather.last.resize_with(self.asked.places.len(), LastBlock::default);
         let margin = match self.detail {
             Detail::Measured(Measured { code_margin, .. }) if !gather.is_counting => code_margin,
             _ => 0.0,
@@ -399,7 +167,7 @@ impl Cell<'_> {
         let dim = self.shard.header.dim as usize;
         let embedding = &embeddings[at * dim..][..dim];
         let product = |vector| self.level.dispatch(EmbeddingTimesVector(embedding, vector));
-        let mut products = self.search.question.vectors().map(product);
+        let mut products = self.asked.question.vectors().map(product);
         combine(products.next().unwrap_or(0.0), products)
     }
 
@@ -416,7 +184,7 @@ impl Cell<'_> {
         gather.refine.members.clear();
         let ShardGather { last, sums, refine, found, .. } = gather;
         let [first, others @ ..] = &mut last[..] else { return };
-        let places = &self.search.places;
+        let places = &self.asked.places;
         let tables = &self.scores.projections[places[0]].tables;
         let (own, step) = self.line(places[0], centroid, residuals);
         // The score grows with the sum, so that sums are compared and only what matches is scored.
@@ -488,7 +256,7 @@ impl Cell<'_> {
         if let Some(fine) = &measured.exact.fine {
             found.effort.n_fine_read += which.len() as u64;
             scores.clear();
-            for place in &self.search.places {
+            for place in &self.asked.places {
                 let rounded = &self.scores.projections[*place].fine;
                 let n_components = self.shard.header.n_components as usize;
                 let (centroids, vector) = (fine.values, &rounded.steps[..]);

@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 use slag_common::shard::{Positions, ShardView};
 
-use super::{Hit, Run};
+use super::matches::{Hit, Run};
 
 /// Gaussians that one thread fills in at a time; few where tests are to need several.
 const CHUNK: usize = if cfg!(test) { 64 } else { 4096 };
@@ -50,11 +50,11 @@ fn position_in_world(shard: &ShardView<'_>, index: usize) -> [f64; 3] {
     let header = &shard.header;
     let steps = match shard.positions {
         Positions::Wide(steps) => steps[index].map(u32::from),
-        Positions::Packed(codewords) => {
+        Positions::Packed(steps) => {
             let [x, y, z, _] = header.position_bits.map(u32::from);
-            let codeword = u64::from(codewords[index]);
-            let low = |codeword: u64, bits: u32| (codeword & ((1 << bits) - 1)) as u32;
-            [low(codeword, x), low(codeword >> x, y), low(codeword >> (x + y), z)]
+            let packed = u64::from(steps[index]);
+            let low = |packed: u64, bits: u32| (packed & ((1 << bits) - 1)) as u32;
+            [low(packed, x), low(packed >> x, y), low(packed >> (x + y), z)]
         }
     };
     std::array::from_fn(|axis| {

@@ -10,9 +10,10 @@ use slag_common::objects::{MAX_VECTORS, Objects, object_score};
 use slag_common::shard::ShardView;
 
 use super::centroids::{combine, distinct};
+use super::error::ScoreError;
 use super::project::{Projection, Vector, up};
+use super::question::{Question, check};
 use super::simd::{Level, SomeRowsTimesVector};
-use super::{Question, ScoreError, check};
 use crate::store::objects::ObjectIndex;
 
 /// Objects whose vectors are multiplied at a time; their products stay in the first-level cache.

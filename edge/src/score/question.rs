@@ -2,7 +2,10 @@
 
 use std::sync::Arc;
 
-use super::{ScoreError, dot::rounding_bound};
+use slag_common::shard::ShardView;
+
+use super::dot::rounding_bound;
+use super::error::{MAX_COORDINATE, ScoreError};
 
 /// Steepness of [`relevancy`], as LERF has it.
 pub const RELEVANCY_STEEPNESS: f32 = 10.0;
@@ -30,7 +33,7 @@ impl Question {
     }
 
     /// Checks that every vector has `dim` components and unit length.
-    pub(super) fn check(&self) -> Result<(), ScoreError> {
+    fn check(&self) -> Result<(), ScoreError> {
         let dim = self.vector.len();
         for vector in self.vectors() {
             if vector.len() != dim {
@@ -60,6 +63,26 @@ impl Question {
         // The difference of two products of at most 1 each is rounded once more.
         if self.negatives.is_empty() { of_dot } else { 2.0 * of_dot + f32::EPSILON }
     }
+}
+
+/// Checks that questions can be asked of shards: dimensions, unit lengths, and the extent of positions.
+pub(super) fn check(shards: &[ShardView<'_>], questions: &[Question]) -> Result<(), ScoreError> {
+    for question in questions {
+        question.check()?;
+        for shard in shards {
+            let header = &shard.header;
+            let (expected, found) = (header.dim as usize, question.vector.len());
+            if expected != found {
+                return Err(ScoreError::Dimension { cell_id: header.cell_id, expected, found });
+            }
+            let reach = shard.position_box();
+            let found = reach.min.abs().max(reach.max.abs()).max_element();
+            if found.is_nan() || found > MAX_COORDINATE {
+                return Err(ScoreError::Extent { cell_id: header.cell_id, found });
+            }
+        }
+    }
+    Ok(())
 }
 
 fn length(components: impl Iterator<Item = f32>) -> f64 {

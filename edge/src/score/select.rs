@@ -3,30 +3,27 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::collect::{Cell, Cut, Gather, runs_inside};
-use super::{Effort, Run, Search};
+use super::bins::{BINS, bin_of, edge_of};
+use super::cell::Cell;
+use super::centroids::AskedQuestion;
+use super::collect::{Cut, Gather, runs_inside};
+use super::matches::{Effort, Hit, Run};
 
-/// One Gaussian and its score.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Hit {
-    /// Position of the shard in the searched slice.
-    pub shard: u32,
-    /// Index in the shard.
-    pub index: u32,
-    /// Its own where the shard knows more of it than its centroid and that was asked for, else that of its centroid.
-    pub score: f32,
-}
-
-/// Into how many parts the range of scores is cut to find a rank in it.
-pub(super) const BINS: usize = 4096;
 /// Bits that keys are sorted by at a time: counts of their values stay in the first-level cache.
 const DIGIT_BITS: u32 = 11;
 /// Fewer runs are not worth a second thread.
 const MIN_RUNS_PER_THREAD: usize = if cfg!(test) { 16 } else { 8192 };
 
-/// Memory for ranking.
+/// Buffers that answers are gathered and ranked in, kept from one answer to the next.
 #[derive(Default)]
-pub(super) struct Order {
+pub(super) struct AnswerBuffers {
+    pub gather: Gather,
+    order: Order,
+}
+
+/// Buffers for ranking.
+#[derive(Default)]
+struct Order {
     parts: Vec<Part>,
     runs: Vec<Run>,
     keys: Vec<u64>,
@@ -49,18 +46,12 @@ struct Part {
     in_bin: Vec<(f32, u64)>,
 }
 
-impl Search<'_> {
-    /// Returns the `limit` best Gaussians that reach a threshold, best first: by score, then by distance
-    /// from `near`, then by cell and index. The selection is exact with respect to the scores returned.
-    pub fn best(&self, limit: usize, threshold: f32, near: Option<DVec3>) -> Vec<Hit> {
-        let mut hits = Vec::new();
-        self.best_into(limit, threshold, near, &mut hits);
-        hits
-    }
-
-    /// As [`Search::best`], into a list that is cleared before. Returns what it took.
-    pub fn best_into(
+impl AskedQuestion<'_> {
+    /// Ranks the `limit` best Gaussians that reach a threshold into `hits`, which is cleared before; see
+    /// [`super::Search::best`].
+    pub(super) fn best_into(
         &self,
+        buffers: &mut AnswerBuffers,
         limit: usize,
         threshold: f32,
         near: Option<DVec3>,
@@ -70,24 +61,23 @@ impl Search<'_> {
         if limit == 0 {
             return Effort::default();
         }
-        let mut gather = self.take_gather();
+        let AnswerBuffers { gather, order } = buffers;
         let mut effort = Effort::default();
         let has_detail = (0..self.shards.len()).any(|at| self.cell(at).is_some_and(|cell| cell.has_detail()));
         let cut = if has_detail {
             // Half as many again by their centroids' scores: the worst of these members by their own scores are
             // not among the best.
             let enough = limit.saturating_add(limit / 2).saturating_add(1);
-            let floor = self.centroid_score_at(&mut gather.order, enough, f32::NEG_INFINITY);
-            self.count(&mut gather, threshold, floor.unwrap_or(f32::NEG_INFINITY));
+            let floor = self.centroid_score_at(order, enough, f32::NEG_INFINITY);
+            self.count(gather, threshold, floor.unwrap_or(f32::NEG_INFINITY));
             effort += gather.effort();
-            score_reached(&gather, limit).map(|score| score.max(threshold))
+            score_reached(gather, limit).map(|score| score.max(threshold))
         } else {
-            self.centroid_score_at(&mut gather.order, limit, threshold)
+            self.centroid_score_at(order, limit, threshold)
         };
-        self.collect(&mut gather, Cut { score: cut.unwrap_or(threshold), least: threshold }, true);
+        self.collect(gather, Cut { score: cut.unwrap_or(threshold), least: threshold }, true);
         effort += gather.effort();
-        self.rank(&mut gather, limit, near, hits);
-        self.put_back(gather);
+        self.rank(gather, order, limit, near, hits);
         effort
     }
 
@@ -112,12 +102,19 @@ impl Search<'_> {
     }
 
     /// Sorts what was gathered.
-    fn rank(&self, gather: &mut Gather, limit: usize, near: Option<DVec3>, hits: &mut Vec<Hit>) {
-        let Gather { shards, order: Order { runs, keys, ranked, .. } } = gather;
+    fn rank(
+        &self,
+        gather: &Gather,
+        order: &mut Order,
+        limit: usize,
+        near: Option<DVec3>,
+        hits: &mut Vec<Hit>,
+    ) {
+        let Order { runs, keys, ranked, .. } = order;
         let mut by_cell: Vec<usize> = (0..self.shards.len()).collect();
         by_cell.sort_by_key(|at| self.shards[*at].header.cell_id);
         runs.clear();
-        by_cell.iter().for_each(|at| runs.extend_from_slice(&shards[*at].found.runs));
+        by_cell.iter().for_each(|at| runs.extend_from_slice(&gather.shards[*at].found.runs));
         keys.clear();
         // Places, in the order of cells and indices, decide between equal scores.
         keys.extend(runs.iter().zip(0u64..).map(|(run, place)| u64::from(!rising(run.score)) << 32 | place));
@@ -141,8 +138,8 @@ impl Search<'_> {
             for key in ties {
                 let Run { shard, start, end, score } = runs[*key as u32 as usize];
                 // All of them where their distance decides.
-                let room = if near.is_some() { usize::MAX } else { limit - hits.len() };
-                let end = end.min(start.saturating_add(u32::try_from(room).unwrap_or(u32::MAX)));
+                let capacity = if near.is_some() { usize::MAX } else { limit - hits.len() };
+                let end = end.min(start.saturating_add(u32::try_from(capacity).unwrap_or(u32::MAX)));
                 hits.extend((start..end).map(|index| Hit { shard, index, score }));
             }
             if let Some(near) = near {
@@ -218,15 +215,7 @@ fn score_reached(gather: &Gather, limit: usize) -> Option<f32> {
         n += bins.iter().filter_map(|bins| bins.get(*bin)).map(|n| u64::from(*n)).sum::<u64>();
         n >= limit as u64
     })?;
-    // The first part has all that is lower. Else a little below its edge: parts are found with rounding.
-    let edge = bin as f32 / (BINS as f32 / 2.0) - 1.0;
-    Some(if bin == 0 { f32::NEG_INFINITY } else { edge - 4.0 * f32::EPSILON })
-}
-
-/// Returns the part of the range of scores that a score lies in; never falls as the score rises.
-pub(super) fn bin_of(score: f32) -> usize {
-    // Few scores lie outside of -1..1, and those share the first and the last part.
-    ((score + 1.0) * (BINS as f32 / 2.0)).clamp(0.0, (BINS - 1) as f32) as usize
+    Some(edge_of(bin))
 }
 
 /// Deals keys out to parts of about the same size, all with a lower upper half to an earlier part; those of a
@@ -333,7 +322,7 @@ mod tests {
 
     /// Oracle: the order that the standard library gives floats.
     #[test]
-    fn keys_and_parts_rise_with_scores() {
+    fn keys_and_bins_rise_with_scores() {
         let mut scores = vec![-1e30, -3.0, -1.0, -0.5, -1e-20, 0.0, 1e-20, 0.25, 0.9995, 1.0, 2.0, 1e30];
         let mut random = Random(32);
         scores.extend((0..3000).map(|_| random.signed()));

@@ -6,6 +6,7 @@ use proptest::prelude::*;
 use slag_common::frames::Aabb;
 use slag_common::shard::ShardView;
 
+use super::cell::F16_ROUNDING;
 use super::*;
 use crate::testing::{BuiltShard, Member, Random, TestShard, normalised};
 

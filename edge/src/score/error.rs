@@ -1,0 +1,48 @@
+//! Errors of scoring.
+
+/// Largest coordinate of a scene, world units. Larger ones (a hundred times the earth's diameter) are refused: they
+/// would overflow what is computed from them.
+pub const MAX_COORDINATE: f64 = 1e9;
+
+/// Why shards cannot be scored.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ScoreError {
+    /// The query vector is of another space.
+    #[error(
+        "cell {cell_id} holds embeddings of {expected} components, the query vector has {found}; use the models that the scene was encoded with"
+    )]
+    Dimension {
+        /// The cell.
+        cell_id: u32,
+        /// Components of the shard.
+        expected: usize,
+        /// Components of the query.
+        found: usize,
+    },
+    /// The query vector is not of unit length, or not finite.
+    #[error("the query vector has length {found}, expected 1; the text model is damaged or of another kind")]
+    NotUnit {
+        /// Its length.
+        found: f32,
+    },
+    /// A negative is of another space than the question.
+    #[error(
+        "a negative has {found} components, the query vector {expected}; take both from the same text model"
+    )]
+    Negative {
+        /// Components of the query.
+        expected: usize,
+        /// Components of the negative.
+        found: usize,
+    },
+    /// A shard's positions lie where no scene is.
+    #[error(
+        "cell {cell_id}: positions reach {found:e}, the limit is {MAX_COORDINATE:e} world units; encode the scene again around a nearer origin"
+    )]
+    Extent {
+        /// The cell.
+        cell_id: u32,
+        /// Largest coordinate.
+        found: f64,
+    },
+}

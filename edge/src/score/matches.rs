@@ -1,0 +1,72 @@
+//! Gaussians found by a search, and the work it took.
+
+/// One Gaussian and its score.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Hit {
+    /// Position of the shard in the searched slice.
+    pub shard: u32,
+    /// Index in the shard.
+    pub index: u32,
+    /// The Gaussian's own score where the shard holds a code or embedding and the precision uses it; else its
+    /// centroid's.
+    pub score: f32,
+}
+
+/// Matching Gaussians of one shard that lie next to each other and share a score.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Run {
+    /// Position of the shard in the searched slice.
+    pub shard: u32,
+    /// First member.
+    pub start: u32,
+    /// One past the last member.
+    pub end: u32,
+    /// Score of the centroid, or of the one Gaussian where it was scored by itself.
+    pub score: f32,
+}
+
+/// Gaussians that reach a threshold.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Matches {
+    /// Runs, by shard and start, ascending; they do not overlap.
+    pub runs: Vec<Run>,
+    /// Gaussians in the runs.
+    pub n_gaussians: u64,
+    /// Rows that could only be decided member by member.
+    pub n_centroids_undecided: u64,
+    /// What finding them took.
+    pub effort: Effort,
+    /// Shards none of whose centroids can reach the threshold.
+    pub n_shards_below: usize,
+}
+
+impl Matches {
+    /// Empties the list; its memory stays.
+    pub fn clear(&mut self) {
+        let mut runs = std::mem::take(&mut self.runs);
+        runs.clear();
+        *self = Self { runs, ..Self::default() };
+    }
+}
+
+/// What finding an answer took, beyond the centroids.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Effort {
+    /// Gaussians that were scored by themselves.
+    pub n_rescored: u64,
+    /// Blocks of residual codes that were read.
+    pub n_blocks_read: u64,
+    /// Fine residuals that were read.
+    pub n_fine_read: u64,
+    /// Exact embeddings that were read.
+    pub n_embeddings_read: u64,
+}
+
+impl std::ops::AddAssign for Effort {
+    fn add_assign(&mut self, other: Self) {
+        self.n_rescored += other.n_rescored;
+        self.n_blocks_read += other.n_blocks_read;
+        self.n_fine_read += other.n_fine_read;
+        self.n_embeddings_read += other.n_embeddings_read;
+    }
+}

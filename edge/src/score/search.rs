@@ -1,0 +1,234 @@
+//! Searches: one or several questions over a set of shards.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use glam::DVec3;
+use rayon::prelude::*;
+use slag_common::shard::{ScoreErrors, ShardView};
+
+use super::cell::Cell;
+use super::centroids::{AskedQuestion, CentroidScores};
+use super::collect::{Cut, ShardGather};
+use super::error::ScoreError;
+use super::matches::{Effort, Hit, Matches};
+use super::precision::Precision;
+use super::question::{Question, check};
+use super::region::Region;
+use super::select::AnswerBuffers;
+
+/// Buffers of a search, reused by the next one: then a search allocates little but its answers.
+#[derive(Default)]
+pub struct Scratch {
+    /// Shared with the searches made from it.
+    scored: Arc<CentroidScores>,
+    buffers: Arc<Mutex<AnswerBuffers>>,
+}
+
+impl Scratch {
+    /// Returns buffers that no search uses: those of the last search if it is over, else new ones.
+    fn take(&mut self) -> &mut CentroidScores {
+        if Arc::get_mut(&mut self.scored).is_none() {
+            *self = Self::default();
+        }
+        // New if it was shared.
+        Arc::get_mut(&mut self.scored).unwrap_or_else(|| unreachable!("the only owner"))
+    }
+
+    fn search<'a>(&self, asked: AskedQuestion<'a>) -> Search<'a> {
+        Search { asked, buffers: Arc::clone(&self.buffers) }
+    }
+
+    /// Whether no centroids were scored in it yet.
+    #[cfg(test)]
+    pub fn is_untouched(&self) -> bool {
+        self.scored.shards.is_empty()
+    }
+}
+
+/// One question's centroid scores over some shards; gives several kinds of answers without scoring twice.
+pub struct Search<'a> {
+    pub(super) asked: AskedQuestion<'a>,
+    /// Shared by the searches of a batch.
+    buffers: Arc<Mutex<AnswerBuffers>>,
+}
+
+impl<'a> Search<'a> {
+    /// Scores the centroids of the shards that reach into the region. As [`Search::batch`], for one question.
+    ///
+    /// # Errors
+    /// [`ScoreError`].
+    pub fn new(
+        shards: &'a [ShardView<'a>],
+        question: &'a Question,
+        region: Region,
+        precision: Precision,
+    ) -> Result<Self, ScoreError> {
+        Self::reusing(&mut Scratch::default(), shards, question, region, precision)
+    }
+
+    /// As [`Search::new`], in the memory of an earlier search that is over (else in new memory).
+    ///
+    /// # Errors
+    /// [`ScoreError`].
+    pub fn reusing(
+        scratch: &mut Scratch,
+        shards: &'a [ShardView<'a>],
+        question: &'a Question,
+        region: Region,
+        precision: Precision,
+    ) -> Result<Self, ScoreError> {
+        let questions = std::slice::from_ref(question);
+        check(shards, questions)?;
+        let places = scratch.take().score(shards, questions, region, precision);
+        let places = places.into_iter().next().unwrap_or_default();
+        Ok(scratch.search(AskedQuestion {
+            shards,
+            question,
+            region,
+            precision,
+            scored: Arc::clone(&scratch.scored),
+            places,
+            index: 0,
+            steepness: question.steepness(),
+        }))
+    }
+
+    /// Scores the centroids for several questions in one pass; returns a search for each, in their order.
+    ///
+    /// Costs one product per centroid, component and distinct vector (negatives that questions share are
+    /// multiplied once), in parallel by shard.
+    /// In the memory of earlier searches that are over (else in new memory).
+    /// # Errors
+    /// [`ScoreError`].
+    pub fn batch(
+        scratch: &mut Scratch,
+        shards: &'a [ShardView<'a>],
+        questions: &'a [Question],
+        region: Region,
+        precision: Precision,
+    ) -> Result<Vec<Self>, ScoreError> {
+        check(shards, questions)?;
+        let places = scratch.take().score(shards, questions, region, precision);
+        let searches = questions.iter().zip(places).enumerate().map(|(index, (question, places))| {
+            scratch.search(AskedQuestion {
+                shards,
+                question,
+                region,
+                precision,
+                scored: Arc::clone(&scratch.scored),
+                places,
+                index,
+                steepness: question.steepness(),
+            })
+        });
+        Ok(searches.collect())
+    }
+
+    /// Returns the Gaussians whose score reaches a threshold, as far as the shards' data tell.
+    pub fn matching(&self, threshold: f32) -> Matches {
+        let mut matches = Matches::default();
+        self.matching_into(threshold, &mut matches);
+        matches
+    }
+
+    /// As [`Search::matching`], into a list that is cleared before.
+    pub fn matching_into(&self, threshold: f32, all: &mut Matches) {
+        let mut buffers = self.take_buffers();
+        let gather = &mut buffers.gather;
+        self.asked.collect(gather, Cut { score: threshold, least: threshold }, false);
+        all.clear();
+        all.runs.reserve(gather.shards.iter().map(|of_shard| of_shard.found.runs.len()).sum());
+        for ShardGather { found, .. } in &gather.shards {
+            all.runs.extend_from_slice(&found.runs);
+            all.n_gaussians += found.n_gaussians;
+            all.n_centroids_undecided += found.n_centroids_undecided;
+            all.effort += found.effort;
+            all.n_shards_below += found.n_shards_below;
+        }
+        self.put_back(buffers);
+    }
+
+    /// Returns the `limit` best Gaussians that reach a threshold, best first: by score, then by distance from `near`,
+    /// then by cell and index. The selection is exact with respect to the scores returned.
+    pub fn best(&self, limit: usize, threshold: f32, near: Option<DVec3>) -> Vec<Hit> {
+        let mut hits = Vec::new();
+        self.best_into(limit, threshold, near, &mut hits);
+        hits
+    }
+
+    /// As [`Search::best`], into a list that is cleared before. Returns the work done.
+    pub fn best_into(
+        &self,
+        limit: usize,
+        threshold: f32,
+        near: Option<DVec3>,
+        hits: &mut Vec<Hit>,
+    ) -> Effort {
+        let mut buffers = self.take_buffers();
+        let effort = self.asked.best_into(&mut buffers, limit, threshold, near, hits);
+        self.put_back(buffers);
+        effort
+    }
+
+    /// Takes the shared buffers, or empty ones while another search of the batch holds them. (A lock held over
+    /// parallel work would block the thread that the other search is scheduled on.)
+    fn take_buffers(&self) -> AnswerBuffers {
+        std::mem::take(&mut *self.buffers.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    fn put_back(&self, buffers: AnswerBuffers) {
+        *self.buffers.lock().unwrap_or_else(PoisonError::into_inner) = buffers;
+    }
+
+    /// Returns all shards, which runs and hits refer to by place.
+    pub fn shards(&self) -> &'a [ShardView<'a>] {
+        self.asked.shards
+    }
+
+    /// Returns the shards that were searched (the others lie outside the region).
+    pub fn searched(&self) -> impl Iterator<Item = &'a ShardView<'a>> {
+        let searched =
+            self.asked.shards.iter().zip(&self.asked.scored.shards).filter(|(_, scores)| scores.is_searched);
+        searched.map(|(shard, _)| shard)
+    }
+
+    /// Returns the bound on the error of scores: none given here, of a centroid or a Gaussian, is off from
+    /// that of any embedding it stands for by more.
+    pub fn score_error_bound(&self) -> f32 {
+        let cells = (0..self.asked.shards.len()).into_par_iter().filter_map(|at| self.asked.cell(at));
+        let of_cell = |cell: Cell<'_>| {
+            (0..cell.centroids.len()).map(|centroid| cell.score_error(centroid)).fold(0.0, f32::max)
+        };
+        cells.map(of_cell).reduce(|| 0.0, f32::max)
+    }
+
+    /// Returns the errors of scores that were measured over a bank of texts, each the largest of the shards
+    /// searched; none where answers are exact, or a shard's were not measured for what is read of it.
+    pub fn measured_errors(&self) -> Option<ScoreErrors> {
+        let mut largest: Option<ScoreErrors> = None;
+        for shard in self.searched() {
+            let of_codes = match self.asked.precision {
+                Precision::Centroids => shard.residuals.is_none() && shard.exact.is_none(),
+                Precision::Measured => true,
+                Precision::Exact => shard.exact.is_none(),
+            };
+            let errors = shard.header.errors;
+            if !of_codes || errors.p999 == 0.0 {
+                return None;
+            }
+            let of = largest.unwrap_or(errors);
+            largest = Some(ScoreErrors {
+                mean: of.mean.max(errors.mean),
+                p999: of.p999.max(errors.p999),
+                max: of.max.max(errors.max),
+                spread: of.spread.max(errors.spread),
+            });
+        }
+        largest
+    }
+
+    /// Whether membership is exact: exact embeddings were asked for and every shard searched carries them.
+    pub fn is_exact(&self) -> bool {
+        self.asked.precision == Precision::Exact && self.searched().all(|shard| shard.exact.is_some())
+    }
+}
