@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use serde_json::json;
 use slag_common::shard::ShardView;
 
-use super::query::normalise;
+use super::vectors::normalise;
 use crate::score::{Precision, Question, Region, ScoreError, Search};
 
 /// Gaussians that are decoded at a time.

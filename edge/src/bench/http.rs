@@ -7,7 +7,7 @@ use serde::Serialize;
 use slag_models::{EncodeError, TextEncoder};
 use tokio::net::TcpListener;
 
-use super::query::{Kind, Settings, Timing, quantile};
+use super::timing::{Kind, Settings, Timing, quantile};
 use crate::http::{self, App};
 use crate::query::{Engine, MAX_GAUSSIANS};
 use crate::store::{EdgeCache, Snapshot};

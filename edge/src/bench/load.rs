@@ -10,7 +10,8 @@ use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::TcpStream;
 use tokio::time::Instant;
 
-use super::{Machine, Percentiles, Times};
+use super::machine::Machine;
+use super::times::{Percentiles, Times};
 
 /// A longer answer than any of ours.
 const MAX_BODY_BYTES: u64 = 64 << 20;

@@ -7,7 +7,7 @@ use std::time::Instant;
 use serde::Serialize;
 
 use super::http::given;
-use super::query::{Settings, quantile};
+use super::timing::{Settings, quantile};
 use crate::query::{AnswerKind, Engine, QueryRequest};
 use crate::store::{EdgeCache, OpenShard, Snapshot};
 

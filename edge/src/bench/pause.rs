@@ -11,8 +11,9 @@ use serde::Serialize;
 use slag_common::manifest::generate_key;
 use tokio::net::TcpListener;
 
+use super::machine::Machine;
 use super::scene::{Generator, Shelf, store, text_service};
-use super::{Machine, Percentiles, Times};
+use super::times::{Percentiles, Times};
 use crate::fetch::{Environment, FetchError, FetchRequest, NetworkLimits, Position, fetch};
 use crate::http::{self, App, Settings};
 use crate::query::Engine;

@@ -7,32 +7,15 @@ use rayon::prelude::*;
 use serde::Serialize;
 use slag_common::shard::{BLOCK, Positions, Profile, ShardView};
 
-use super::Random;
-pub use super::dump::{DumpError, dump_ids, dump_vectors};
-pub use super::http::{HttpTiming, time_http};
-pub use super::machine::{Machine, Memory, read_bandwidth};
-pub use super::objects::{ObjectsTiming, time_objects};
+use super::http::HttpTiming;
+use super::machine::{Machine, Memory, read_bandwidth};
+use super::objects::ObjectsTiming;
+use super::timing::{Kind, Settings, Timing, quantile};
 use crate::score::{Columns, Effort, Hit, Matches, Precision, Question, Region, ScoreError, Scratch, Search};
 use crate::store::{OpenShard, Snapshot};
 
-/// How much of a query like those of a bank of texts is an embedding of the scene: text and image vectors
-/// of one thing have cosines around this (CLIP).
-const LIKENESS: f32 = 0.3;
 /// Queries that recall is taken from: exact answers take their time.
 const N_RECALL: usize = 16;
-
-/// What is measured.
-#[derive(Clone, Debug)]
-pub struct Settings {
-    /// Result sizes.
-    pub limits: Vec<usize>,
-    /// Which data scores come from.
-    pub precision: Precision,
-    /// Timed questions for each size and kind of answer; queries take turns.
-    pub n_runs: usize,
-    /// Untimed questions before them.
-    pub n_warm_up: usize,
-}
 
 /// What was measured.
 #[derive(Clone, Debug, Serialize)]
@@ -75,76 +58,6 @@ pub struct SceneSize {
     pub dim: usize,
     /// Bytes of all shards.
     pub shard_bytes: u64,
-}
-
-/// A kind of answer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Kind {
-    /// The best so many, in order.
-    Best,
-    /// All that reach the score of the last of those.
-    Threshold,
-}
-
-/// Times of one kind of answer at one size.
-#[derive(Clone, Debug, Serialize)]
-pub struct Timing {
-    /// Kind of answer.
-    pub kind: Kind,
-    /// Size asked for.
-    pub limit: usize,
-    /// Timed questions.
-    pub n_runs: usize,
-    /// Fewest and most Gaussians found.
-    pub n_found: [usize; 2],
-    /// Half of the questions took no longer.
-    pub median_ms: f64,
-    /// 99 of 100 took no longer.
-    pub p99_ms: f64,
-    /// The shortest.
-    pub min_ms: f64,
-    /// Share of the exact answer that is found, mean over queries; absent where answers are exact, or the shards
-    /// have no exact embeddings to tell.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub recall: Option<f64>,
-    /// Bytes of the shards that a question reads, median.
-    pub bytes_touched: u64,
-    /// What reading those takes in a plain loop.
-    pub plain_read_ms: f64,
-    /// The median by that.
-    pub times_plain_read: f64,
-}
-
-/// Makes query vectors: every other one in a random direction, the rest as like an embedding of the scene
-/// as a text's vector is to what it names. Same seed, same vectors.
-pub fn make_queries(shards: &[ShardView<'_>], n: usize, seed: u64) -> Vec<Vec<f32>> {
-    let mut random = Random(seed);
-    let mut queries = Vec::with_capacity(n.min(1 << 16));
-    let dim = shards.first().map_or(0, |shard| shard.header.dim as usize);
-    let known: Vec<&ShardView<'_>> = shards.iter().filter(|shard| shard.n_with_evidence() > 0).collect();
-    for at in 0..n {
-        let mut query: Vec<f64> = (0..dim).map(|_| random.normal()).collect();
-        normalise(&mut query);
-        if at % 2 == 1 && !known.is_empty() {
-            let shard = known[random.below(known.len())];
-            let mut like = vec![0.0; dim];
-            shard.decode(random.below(shard.n_with_evidence()), &mut like);
-            normalise(&mut like);
-            let rest = f64::from((1.0 - LIKENESS * LIKENESS).sqrt());
-            query.iter_mut().zip(like).for_each(|(q, l)| *q = *q * rest + l * f64::from(LIKENESS));
-            normalise(&mut query);
-        }
-        queries.push(query.into_iter().map(|v| v as f32).collect());
-    }
-    queries
-}
-
-pub(super) fn normalise(vector: &mut [f64]) {
-    let length = vector.iter().map(|v| v * v).sum::<f64>().sqrt();
-    if length > 0.0 {
-        vector.iter_mut().for_each(|v| *v /= length);
-    }
 }
 
 /// Times questions to a snapshot. `queries`: `[dim]` each, unit length; at least one.
@@ -289,11 +202,6 @@ fn recall(
         sum += n as f64 / truth.len().max(1) as f64;
     }
     Ok(Some(sum / queries.len() as f64))
-}
-
-/// Returns the least of some sorted values, at least one, that so large a share of them does not exceed.
-pub(super) fn quantile<T: Copy>(sorted: &[T], share: f64) -> T {
-    sorted[((sorted.len() as f64 * share).ceil() as usize).clamp(1, sorted.len()) - 1]
 }
 
 fn timing(kind: Kind, limit: usize, runs: Vec<Run>, read_bytes_per_s: f64) -> Timing {

@@ -16,8 +16,7 @@ use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardReco
 use slag_common::shard::{self, Positions, Profile, ScoreErrors, ShardHeader, ShardView};
 use slag_models::{EncodeError, TextEncoder};
 
-use super::Random;
-
+use super::random::Random;
 use crate::text::{EncoderInfo, TextService};
 
 const CELL_GAUSSIANS: u32 = 65_536;

@@ -5,7 +5,8 @@ use std::time::Instant;
 use serde::Serialize;
 use slag_models::{EncodeError, TextEncoder};
 
-use super::{Machine, Percentiles, Times};
+use super::machine::Machine;
+use super::times::{Percentiles, Times};
 
 /// What is measured.
 #[derive(Clone, Debug)]

@@ -6,12 +6,13 @@ use std::time::Duration;
 use anyhow::{Context, anyhow};
 use clap::Args;
 use slag_common::shard::ShardView;
+use slag_edge::bench::http::time_http;
 use slag_edge::bench::load::{self, LoadOptions};
+use slag_edge::bench::objects::time_objects;
 use slag_edge::bench::pause::{self, PauseOptions};
-use slag_edge::bench::query::{
-    Settings, bench_query, dump_ids, dump_vectors, make_queries, time_http, time_objects,
-};
+use slag_edge::bench::query::bench_query;
 use slag_edge::bench::text::{self, TextSettings};
+use slag_edge::bench::{Settings, dump_ids, dump_vectors, make_queries};
 use slag_edge::score::Precision;
 use slag_edge::store::{OpenShard, Snapshot};
 

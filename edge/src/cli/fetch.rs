@@ -8,10 +8,10 @@ use std::time::Duration;
 
 use anyhow::anyhow;
 use slag_common::Hash32;
-use slag_edge::fetch::Failure as DownloadFailure;
 use slag_edge::fetch::follow::{FollowEnvironment, FollowSettings, Following, follow, read_positions};
 use slag_edge::fetch::{
-    self, Environment, FetchError, FetchReport, FetchRequest, NetworkLimits, Position, Progress,
+    self, DownloadFailure, Environment, FetchError, FetchReport, FetchRequest, NetworkLimits, Position,
+    Progress,
 };
 use slag_edge::http::App;
 use slag_edge::store::EdgeCache;

@@ -9,44 +9,9 @@ use slag_common::Hash32;
 use slag_common::manifest::{self, ManifestError};
 use ureq::http::{Response, StatusCode, Uri, header};
 
-use super::{Environment, FetchError};
+use super::environment::Environment;
+use super::error::{DownloadFailure, FetchError};
 use crate::store::files::Files;
-
-/// Patience with a server and with the way to it.
-#[derive(Clone, Debug)]
-pub struct NetworkLimits {
-    /// Failures in a row, without progress, after which a download is given up.
-    pub attempts: u32,
-    /// Wait after the first failure; doubled after each further one, and scaled by 0.5..1.5.
-    pub first_backoff: Duration,
-    /// Longest wait.
-    pub longest_backoff: Duration,
-    /// The longest wait that a server may ask for (`Retry-After`); it is waited beside the backoff.
-    pub longest_retry_after: Duration,
-    /// Time for name resolution and for connecting, each.
-    pub connect_timeout: Duration,
-    /// Time without a byte.
-    pub read_timeout: Duration,
-    /// A body that comes in slower than this on average is broken off (and resumed).
-    pub slowest_bytes_per_sec: u64,
-    /// Bytes received between two writes; a retry counts as progress after as many.
-    pub chunk_bytes: usize,
-}
-
-impl Default for NetworkLimits {
-    fn default() -> Self {
-        Self {
-            attempts: 6,
-            first_backoff: Duration::from_millis(500),
-            longest_backoff: Duration::from_secs(30),
-            longest_retry_after: Duration::from_secs(120),
-            connect_timeout: Duration::from_secs(10),
-            read_timeout: Duration::from_secs(20),
-            slowest_bytes_per_sec: 4096,
-            chunk_bytes: 256 << 10,
-        }
-    }
-}
 
 /// A manifest's expected length, for the time it may take.
 const USUAL_MANIFEST_BYTES: u64 = 1 << 20;
@@ -56,76 +21,18 @@ const MAX_WRONG_HASHES: u32 = 3;
 /// Longest sleep before the cancel flag is looked at again.
 const NAP: Duration = Duration::from_millis(50);
 
-/// Why one attempt failed.
-#[derive(Debug, thiserror::Error)]
-pub enum Failure {
-    /// No connection, or it broke.
-    #[error("{0}")]
-    Transport(#[from] Box<ureq::Error>),
-    /// The body broke off.
-    #[error("the body ends at byte {found_bytes} of {expected_bytes}")]
-    Cut {
-        /// Length expected.
-        expected_bytes: u64,
-        /// Bytes there.
-        found_bytes: u64,
-    },
-    /// The server says no.
-    #[error("the server answers {status}")]
-    Status {
-        /// HTTP status.
-        status: u16,
-        /// When it asks to be asked again (429 and 503, `Retry-After` in seconds).
-        retry_after: Option<Duration>,
-    },
-    /// The server sends to another address; shards and manifests are not followed elsewhere.
-    #[error("the server sends to {location:?}; if that is the store, give that address")]
-    Redirect {
-        /// Where (cut to 200 characters).
-        location: String,
-    },
-    /// The announced length is not the manifest's.
-    #[error("the server announces {found:?} for {expected}")]
-    Length {
-        /// What the request asked for.
-        expected: String,
-        /// Header found.
-        found: String,
-    },
-    /// The content is not what the hash names.
-    #[error("the content has hash {found}, expected {expected}")]
-    Hash {
-        /// Hash expected.
-        expected: Hash32,
-        /// Hash of the content.
-        found: Hash32,
-    },
-}
-
-impl Failure {
-    /// Whether another attempt may help.
-    fn is_passing(&self) -> bool {
-        match self {
-            Self::Redirect { .. } => false,
-            Self::Status { status, .. } => *status >= 500 || matches!(status, 408 | 416 | 429),
-            Self::Transport(e) => !matches!(**e, ureq::Error::BadUri(_) | ureq::Error::Http(_)),
-            Self::Cut { .. } | Self::Length { .. } | Self::Hash { .. } => true,
-        }
-    }
-}
-
 /// How an attempt ended, if not well.
 enum Stop {
     /// The other side or the way: maybe try again.
-    Failed(Failure),
+    Failed(DownloadFailure),
     /// The same, but more bytes are there than after any attempt before.
-    Interrupted(Failure),
+    Interrupted(DownloadFailure),
     /// This side: no.
     Fatal(FetchError),
 }
 
-impl From<Failure> for Stop {
-    fn from(failure: Failure) -> Self {
+impl From<DownloadFailure> for Stop {
+    fn from(failure: DownloadFailure) -> Self {
         Self::Failed(failure)
     }
 }
@@ -144,7 +51,7 @@ impl From<std::io::Error> for Stop {
 
 impl From<ureq::Error> for Stop {
     fn from(e: ureq::Error) -> Self {
-        Self::Failed(Failure::Transport(Box::new(e)))
+        Self::Failed(DownloadFailure::Transport(Box::new(e)))
     }
 }
 
@@ -263,7 +170,7 @@ impl<'a> Client<'a> {
             }
             files.remove(part)?;
             n_wrong_hashes += 1;
-            let failure = Failure::Hash { expected: hash, found };
+            let failure = DownloadFailure::Hash { expected: hash, found };
             match n_wrong_hashes < MAX_WRONG_HASHES {
                 true => Err(Stop::Failed(failure)),
                 false => {
@@ -299,7 +206,7 @@ impl<'a> Client<'a> {
                 let found = header_text(&response, header::CONTENT_RANGE);
                 let expected = format!("bytes {offset}-{}/{len_bytes}", len_bytes - 1);
                 if found != expected {
-                    return Err(Failure::Length { expected, found }.into());
+                    return Err(DownloadFailure::Length { expected, found }.into());
                 }
             }
             StatusCode::OK => offset = 0,
@@ -313,7 +220,7 @@ impl<'a> Client<'a> {
         let left_bytes = len_bytes - offset;
         if let Some(stated) = response.body().content_length().filter(|stated| *stated != left_bytes) {
             let (expected, found) = (format!("{left_bytes} bytes"), format!("{stated} bytes"));
-            return Err(Failure::Length { expected, found }.into());
+            return Err(DownloadFailure::Length { expected, found }.into());
         }
         // Never more than the manifest's length, however long the body goes on.
         let mut body = response.into_body().into_reader().take(left_bytes);
@@ -336,7 +243,7 @@ impl<'a> Client<'a> {
                 return Ok(());
             }
             if n_read == 0 {
-                return Err(Failure::Cut { expected_bytes: len_bytes, found_bytes: offset }.into());
+                return Err(DownloadFailure::Cut { expected_bytes: len_bytes, found_bytes: offset }.into());
             }
         }
     }
@@ -385,7 +292,9 @@ impl<'a> Client<'a> {
             let doubled = limits.first_backoff.saturating_mul(1 << (attempts - 1).min(16));
             let spread = 0.5 + (self.environment.random)().clamp(0.0, 1.0);
             let asked = match &failure {
-                Failure::Status { retry_after: Some(asked), .. } => (*asked).min(limits.longest_retry_after),
+                DownloadFailure::Status { retry_after: Some(asked), .. } => {
+                    (*asked).min(limits.longest_retry_after)
+                }
                 _ => Duration::ZERO,
             };
             // Beside the backoff, so that a fleet that was told the same does not come back in step.
@@ -411,10 +320,10 @@ impl<'a> Client<'a> {
     }
 }
 
-fn refusal(response: &Response<ureq::Body>) -> Failure {
+fn refusal(response: &Response<ureq::Body>) -> DownloadFailure {
     if response.status().is_redirection() && response.status() != StatusCode::NOT_MODIFIED {
         let location = header_text(response, header::LOCATION);
-        return Failure::Redirect { location };
+        return DownloadFailure::Redirect { location };
     }
     let status = response.status();
     let retry_after = match status {
@@ -423,7 +332,7 @@ fn refusal(response: &Response<ureq::Body>) -> Failure {
         }
         _ => None,
     };
-    Failure::Status { status: status.as_u16(), retry_after }
+    DownloadFailure::Status { status: status.as_u16(), retry_after }
 }
 
 /// Returns a header as text, cut to 200 characters; empty if it is not there or not text.

@@ -1,12 +1,12 @@
 //! Why a fetch fails.
 
 use std::io;
+use std::time::Duration;
 
 use slag_common::Hash32;
 use slag_common::manifest::ManifestError;
 
-use super::download::Failure;
-use super::plan::PlanError;
+use super::plan_error::PlanError;
 use super::records::RecordsError;
 use crate::store::StoreError;
 
@@ -43,7 +43,7 @@ pub enum FetchError {
         /// Attempts in a row.
         attempts: u32,
         /// Why the last one failed.
-        failure: Failure,
+        failure: DownloadFailure,
     },
     /// The manifest is refused.
     #[error(transparent)]
@@ -105,4 +105,62 @@ pub enum FetchError {
     /// The cancel flag was set.
     #[error("cancelled; fetch again to go on where it ended")]
     Cancelled,
+}
+
+/// Why one attempt failed.
+#[derive(Debug, thiserror::Error)]
+pub enum DownloadFailure {
+    /// No connection, or it broke.
+    #[error("{0}")]
+    Transport(#[from] Box<ureq::Error>),
+    /// The body broke off.
+    #[error("the body ends at byte {found_bytes} of {expected_bytes}")]
+    Cut {
+        /// Length expected.
+        expected_bytes: u64,
+        /// Bytes there.
+        found_bytes: u64,
+    },
+    /// The server says no.
+    #[error("the server answers {status}")]
+    Status {
+        /// HTTP status.
+        status: u16,
+        /// When it asks to be asked again (429 and 503, `Retry-After` in seconds).
+        retry_after: Option<Duration>,
+    },
+    /// The server sends to another address; shards and manifests are not followed elsewhere.
+    #[error("the server sends to {location:?}; if that is the store, give that address")]
+    Redirect {
+        /// Where (cut to 200 characters).
+        location: String,
+    },
+    /// The announced length is not the manifest's.
+    #[error("the server announces {found:?} for {expected}")]
+    Length {
+        /// What the request asked for.
+        expected: String,
+        /// Header found.
+        found: String,
+    },
+    /// The content is not what the hash names.
+    #[error("the content has hash {found}, expected {expected}")]
+    Hash {
+        /// Hash expected.
+        expected: Hash32,
+        /// Hash of the content.
+        found: Hash32,
+    },
+}
+
+impl DownloadFailure {
+    /// Whether another attempt may help.
+    pub(super) fn is_passing(&self) -> bool {
+        match self {
+            Self::Redirect { .. } => false,
+            Self::Status { status, .. } => *status >= 500 || matches!(status, 408 | 416 | 429),
+            Self::Transport(e) => !matches!(**e, ureq::Error::BadUri(_) | ureq::Error::Http(_)),
+            Self::Cut { .. } | Self::Length { .. } | Self::Hash { .. } => true,
+        }
+    }
 }

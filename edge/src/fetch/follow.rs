@@ -14,8 +14,10 @@ use glam::DVec3;
 use serde::Serialize;
 use slag_common::manifest::Manifest;
 
-use super::position::MAX_TEXT_BYTES;
-use super::{DEFAULT_RADIUS, FetchError, FetchReport, FetchRequest, NotAPosition, Position};
+use super::error::FetchError;
+use super::position::{MAX_TEXT_BYTES, NotAPosition, Position};
+use super::report::FetchReport;
+use super::request::{DEFAULT_RADIUS, FetchRequest};
 use crate::store::EdgeCache;
 
 /// Longest sleep before the cancel flag is looked at again.

@@ -4,8 +4,9 @@ use slag_common::Hash32;
 use slag_common::manifest::{self, Manifest, TrustedKeys};
 
 use super::download::{Client, ManifestAnswer};
+use super::error::FetchError;
 use super::records::{Records, RecordsError};
-use super::{FetchError, FetchRequest};
+use super::request::FetchRequest;
 use crate::store::{Current, EdgeCache};
 
 /// Which keys are accepted.
@@ -130,9 +131,9 @@ impl Offer {
         self.manifest.check_expiry(now_unix_secs)?;
         let (scene, offered) = (&self.manifest.scene, self.manifest.generation);
         // A successor goes on counting where its predecessor was.
-        let same_hands = |key: Hash32| key == self.key || trust.accepted.contains(&key);
+        let same_signer = |key: Hash32| key == self.key || trust.accepted.contains(&key);
         // The records may have been lost; the manifest on board says it too.
-        let on_board = on_board.filter(|old| same_hands(old.key) && old.manifest.scene == *scene);
+        let on_board = on_board.filter(|old| same_signer(old.key) && old.manifest.scene == *scene);
         let mut seen = on_board.map(|old| old.manifest.generation);
         for key in trust.accepted.iter().chain([&self.key]) {
             seen = seen.max(records.highest_generation(*key, scene)?);

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use slag_common::frames::{Aabb, Geographic};
 use slag_common::manifest::Manifest;
 
-use super::plan::PlanError;
+use super::plan_error::PlanError;
 
 /// Longest text that can be a position.
 pub const MAX_TEXT_BYTES: usize = 256;

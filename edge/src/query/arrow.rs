@@ -20,7 +20,8 @@ use arrow_array::{ArrayRef, Float32Array, Float64Array, RecordBatch, UInt32Array
 use arrow_ipc::writer::StreamWriter;
 use arrow_schema::{ArrowError, DataType, Field, Schema};
 
-use super::{Found, Reply};
+use super::answers::Found;
+use super::reply::Reply;
 
 /// Rows of a batch: half a megabyte.
 const BATCH_ROWS: usize = 16 << 10;

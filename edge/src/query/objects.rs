@@ -7,8 +7,8 @@ use glam::DVec3;
 use slag_common::manifest::Calibration;
 use slag_common::objects::{ObjectRecord, Objects};
 
-use super::Scene;
 use super::oriented::{Alignment, OrientedBox};
+use super::scene::Scene;
 use crate::score::Region;
 use crate::store::objects::Part;
 

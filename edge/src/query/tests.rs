@@ -1,8 +1,10 @@
+use glam::DVec3;
 use slag_common::frames::{Aabb, GeoReference, Geographic};
-use slag_common::manifest::Calibration;
+use slag_common::manifest::{Calibration, Manifest};
 
 use super::*;
-use crate::score::{Precision, Scratch};
+use crate::score::{Precision, Question, Scratch};
+use crate::store::objects::ObjectIndex;
 use crate::testing::{BuiltShard, Member, TestObject, TestShard, manifest_of, normalised};
 
 /// A cell whose single row of `n` Gaussians sits at a place, 1 cm apart, at a cosine to axis 0.

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use slag_common::Hash32;
 use slag_common::manifest::{MAX_BYTES, ManifestError};
 use slag_common::shard::Profile;
-use slag_edge::fetch::{Failure, FetchError, PlanError, Progress};
+use slag_edge::fetch::{DownloadFailure, FetchError, PlanError, Progress};
 use slag_edge::store::{Snapshot, StoreError};
 
 use super::scene::{ENCODER, NOW, Published, ShardSpec, key, public, shard};
@@ -94,7 +94,7 @@ fn other_content_under_a_hash_is_refused() {
     assert_eq!(instead.len() as u64, scene.bytes(0..1));
     server.faults(objects(Fault::Instead(instead)));
     let error = robot.fetch().expect_err("refused");
-    assert!(matches!(error, FetchError::Download { failure: Failure::Hash { .. }, .. }), "{error}");
+    assert!(matches!(error, FetchError::Download { failure: DownloadFailure::Hash { .. }, .. }), "{error}");
     assert!(robot.shards().is_empty() && robot.staged().is_empty());
     assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Empty { .. })));
     server.faults(|_| Fault::None);
@@ -147,15 +147,15 @@ fn redirects_are_refused() {
 fn lasting_faults_are_given_up_and_told() {
     let scene = Published::new(1, &[0; 1], 2000);
     let len = scene.bytes(0..1);
-    type Check = fn(&Failure) -> bool;
+    type Check = fn(&DownloadFailure) -> bool;
     let cases: [(Fault, u32, Check); 6] = [
-        (Fault::Status(404), 1, |f| matches!(f, Failure::Status { status: 404, .. })),
-        (Fault::Status(500), 3, |f| matches!(f, Failure::Status { status: 500, .. })),
-        (Fault::Length(1), 3, |f| matches!(f, Failure::Length { .. })),
-        (Fault::Corrupt(900), 3, |f| matches!(f, Failure::Hash { .. })),
-        (Fault::Cut(0), 3, |f| matches!(f, Failure::Transport(_) | Failure::Cut { .. })),
+        (Fault::Status(404), 1, |f| matches!(f, DownloadFailure::Status { status: 404, .. })),
+        (Fault::Status(500), 3, |f| matches!(f, DownloadFailure::Status { status: 500, .. })),
+        (Fault::Length(1), 3, |f| matches!(f, DownloadFailure::Length { .. })),
+        (Fault::Corrupt(900), 3, |f| matches!(f, DownloadFailure::Hash { .. })),
+        (Fault::Cut(0), 3, |f| matches!(f, DownloadFailure::Transport(_) | DownloadFailure::Cut { .. })),
         // A little progress each time, less than counts.
-        (Fault::Cut(100), 3, |f| matches!(f, Failure::Transport(_) | Failure::Cut { .. })),
+        (Fault::Cut(100), 3, |f| matches!(f, DownloadFailure::Transport(_) | DownloadFailure::Cut { .. })),
     ];
     for (fault, expected_attempts, is_expected) in cases {
         let dir = tempfile::tempdir().expect("temporary folder");
@@ -217,7 +217,7 @@ fn signed_nonsense_is_refused() {
     let error = fetched(scene.clone().edited(&key(1), |manifest| {
         manifest.cells[0].shards.get_mut(&Profile::Compact).expect("there").len_bytes = u64::MAX;
     }));
-    assert!(matches!(error, FetchError::Download { failure: Failure::Length { .. }, .. }), "{error}");
+    assert!(matches!(error, FetchError::Download { failure: DownloadFailure::Length { .. }, .. }), "{error}");
 
     // Kept shards are held against the new manifest too.
     let dir = tempfile::tempdir().expect("temporary folder");

@@ -1,0 +1,235 @@
+//! From a checked request to ranked answers.
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use super::answers::{Answers, ClusterAnswer, Clustering, Evidence, Found};
+use super::cluster::{Cluster, Grouping, cluster};
+use super::objects::{self, FoundObject};
+use super::rank::{Ranked, rank};
+use super::reason;
+use super::request::{AnswerKind, DEFAULT_LIMIT, QueryRequest};
+use super::scale::Scale;
+use super::scene::{Scene, alignment, default_voxel};
+use super::threshold::ThresholdSource;
+use crate::score::{ObjectScores, Question, Region, ScoreError, Scratch, Search, score_objects};
+use slag_common::manifest::Manifest;
+
+/// Answers a checked request about a scene: one answer to each question, in their order. `questions`: the
+/// vectors of the request's texts, each with those of its negatives.
+///
+/// Same scene, vectors and request: same answers, for any number of threads, asked alone or together. `scratch`:
+/// memory that earlier answers used, or new.
+/// # Errors
+/// [`ScoreError`].
+pub fn answer(
+    scratch: &mut Scratch,
+    scene: &Scene<'_>,
+    questions: &[Question],
+    request: &QueryRequest,
+) -> Result<Vec<Answers>, ScoreError> {
+    let asked = request.texts.iter().map(String::as_str).zip(questions);
+    let kind = request.kind.unwrap_or(if scene.index.is_empty() {
+        AnswerKind::Clusters
+    } else {
+        AnswerKind::Objects
+    });
+    if kind == AnswerKind::Objects {
+        let scored = score_objects(scene.shards, scene.objects, scene.index, questions)?;
+        let answer = |((text, question), scored)| answer_objects(scene, text, question, scored, request);
+        return Ok(asked.zip(&scored).map(answer).collect());
+    }
+    let searches = Search::batch(scratch, scene.shards, questions, request.region(), request.precision)?;
+    let answer =
+        |((text, question), search)| answer_gaussians(scene, (text, kind), question, search, request);
+    Ok(asked.zip(&searches).map(answer).collect())
+}
+
+/// Answers a question by the objects that match; no row of Gaussians is scored.
+fn answer_objects(
+    scene: &Scene<'_>,
+    text: &str,
+    question: &Question,
+    scored: &ObjectScores,
+    request: &QueryRequest,
+) -> Answers {
+    let (manifest, scale, region) = (scene.manifest, Scale::of(question), request.region());
+    let threshold = scale.threshold(request, manifest, objects::calibration(scene.objects));
+    let of_score = scale.to_score(threshold.0);
+    let found = objects::matching(scene, &scored.scores, of_score, &region, request.min_count);
+    let n_matching = found.iter().map(|object| object.n_gaussians).sum();
+    let key =
+        |object: &FoundObject<'_>| (scale.shown(object.score), object.n_gaussians, object.record.position());
+    let ranked = rank(found, threshold.0, manifest, request, key);
+    // Of those that are told alone.
+    let described = ranked.into_par_iter().map(|ranked| object_answer(scene, ranked, scale, &region));
+    let found = Found::Clusters(described.collect());
+    let best = objects::best(&scored.scores);
+    let best = best.map(|best| (scale.shown(scored.scores[best]), objects::record(scene, best).position()));
+    let searched = scene.shards.iter().filter(|shard| region.touches(&shard.position_box()));
+    Answers {
+        n_searched: searched.map(|shard| shard.n_with_evidence() as u64).sum(),
+        n_matching,
+        score_error_bound: scale.error_bound(scored.error_bound),
+        reason: found.is_empty().then(|| reason::of_objects(request, threshold.0, best)),
+        answers: found,
+        ..empty(scene, (text, AnswerKind::Objects), scale, threshold, request)
+    }
+}
+
+/// Answers a question by the Gaussians that match, or by clusters of them.
+fn answer_gaussians(
+    scene: &Scene<'_>,
+    (text, kind): (&str, AnswerKind),
+    question: &Question,
+    search: &Search<'_>,
+    request: &QueryRequest,
+) -> Answers {
+    let manifest = scene.manifest;
+    let scale = Scale::of(question);
+    let (threshold, threshold_source) = scale.threshold(request, manifest, manifest.encoder.calibration);
+    let score_threshold = scale.to_score(threshold);
+    let mut clustering = None;
+    let n_matching;
+    let found = if kind == AnswerKind::Gaussians {
+        let limit = request.limit.unwrap_or(DEFAULT_LIMIT);
+        let mut hits = search.best(limit, score_threshold, request.near);
+        // Where all are listed, nobody need count them again.
+        let is_whole = hits.len() < limit;
+        n_matching = if is_whole { hits.len() as u64 } else { search.matching(score_threshold).n_gaussians };
+        hits.iter_mut().for_each(|hit| hit.score = scale.shown(hit.score));
+        Found::Gaussians(hits)
+    } else {
+        let mut matches = search.matching(score_threshold);
+        matches.runs.iter_mut().for_each(|run| run.score = scale.shown(run.score));
+        n_matching = matches.n_gaussians;
+        let voxel = request.voxel.unwrap_or_else(|| default_voxel(manifest));
+        let (min_count, alignment) = (request.min_count, alignment(manifest));
+        let grouped =
+            cluster(scene.shards, &matches.runs, &Grouping { voxel, min_count, threshold, alignment });
+        clustering = Some(Clustering {
+            voxel: grouped.voxel,
+            min_count,
+            n_clusters: grouped.clusters.len() as u64,
+            n_small_clusters: grouped.n_small,
+            n_gaussians_in_small_clusters: grouped.n_gaussians_in_small,
+        });
+        let key = |of: &Cluster| (of.score, of.n_gaussians, of.position_in_world);
+        let ranked = rank(grouped.clusters, threshold, manifest, request, key);
+        Found::Clusters(ranked.into_iter().map(|ranked| cluster_answer(ranked, manifest)).collect())
+    };
+    // Gaussians of exact shards are listed with their own scores, clusters with their rows'.
+    let score_error_bound = scale.error_bound(match (search.is_exact(), kind) {
+        (true, AnswerKind::Gaussians) => question.rounding_bound(),
+        _ => search.score_error_bound(),
+    });
+    // With negatives a score is the difference of two.
+    let n_products = if question.negatives.is_empty() { 1.0 } else { 2.0 };
+    let measured = search.measured_errors();
+    Answers {
+        n_searched: search.searched().map(|shard| shard.n_with_evidence() as u64).sum(),
+        n_matching,
+        is_exact: search.is_exact(),
+        score_error_bound,
+        score_error_p999: measured.map(|errors| scale.error_bound(n_products * errors.p999)),
+        clustering,
+        reason: found.is_empty().then(|| reason::of_gaussians(search, scale, request, threshold, n_matching)),
+        answers: found,
+        ..empty(scene, (text, kind), scale, (threshold, threshold_source), request)
+    }
+}
+
+/// Returns an answer of nothing, with what an answer says of its question and its scene.
+fn empty(
+    scene: &Scene<'_>,
+    (text, kind): (&str, AnswerKind),
+    scale: Scale,
+    (threshold, threshold_source): (f32, ThresholdSource),
+    request: &QueryRequest,
+) -> Answers {
+    let manifest = scene.manifest;
+    Answers {
+        text: text.to_owned(),
+        negatives: request.negatives.phrases().into_iter().map(str::to_owned).collect(),
+        kind,
+        scene: manifest.scene.clone(),
+        generation: manifest.generation,
+        unit: if manifest.metric { "m" } else { "world" },
+        score_kind: scale.0,
+        threshold,
+        threshold_source,
+        n_searched: 0,
+        n_matching: 0,
+        is_exact: false,
+        score_error_bound: 0.0,
+        score_error_p999: None,
+        area_fetched: area_fetched(scene.fetched, request),
+        clustering: None,
+        reason: None,
+        answers: Found::Clusters(Vec::new()),
+    }
+}
+
+/// Returns whether the region asked for was fetched: surely where the ball or the box was, since only
+/// what lies in both was asked for.
+fn area_fetched((centre, radius): (DVec3, f64), request: &QueryRequest) -> Option<bool> {
+    let region = request.region();
+    let ball = region.ball.map(|ball| ball.centre_in_world.distance(centre) + ball.radius <= radius);
+    let bounds = region.bounds.map(|b| (b.min - centre).abs().max((b.max - centre).abs()).length() <= radius);
+    ball.into_iter().chain(bounds).reduce(|a, b| a || b)
+}
+
+/// Describes a cluster.
+fn cluster_answer(ranked: Ranked<Cluster>, manifest: &Manifest) -> ClusterAnswer {
+    let Ranked { found: cluster, rank, relevance, distance } = ranked;
+    ClusterAnswer {
+        rank,
+        id: format!("{}-{}", cluster.first.0, cluster.first.1),
+        position_in_world: cluster.position_in_world,
+        geographic: manifest.geo_reference.map(|geo| geo.geographic_from_world(cluster.position_in_world)),
+        box_min_in_world: cluster.box_in_world.min,
+        box_max_in_world: cluster.box_in_world.max,
+        size: cluster.box_in_world.size(),
+        oriented_box: cluster.oriented_box,
+        score: cluster.score,
+        best_score: cluster.best_score,
+        n_gaussians: cluster.n_gaussians,
+        n_gaussians_in_scene: None,
+        evidence: None,
+        relevance,
+        distance,
+    }
+}
+
+/// Describes an object likewise.
+fn object_answer(
+    scene: &Scene<'_>,
+    ranked: Ranked<FoundObject<'_>>,
+    scale: Scale,
+    region: &Region,
+) -> ClusterAnswer {
+    let Ranked { found: FoundObject { object, record, score, n_gaussians }, rank, relevance, distance } =
+        ranked;
+    let (manifest, position) = (scene.manifest, record.position());
+    let (bounds, score) = (record.bounds(), scale.shown(score));
+    ClusterAnswer {
+        rank,
+        id: format!("o{:016x}", record.id),
+        position_in_world: position,
+        geographic: manifest.geo_reference.map(|geo| geo.geographic_from_world(position)),
+        box_min_in_world: bounds.min,
+        box_max_in_world: bounds.max,
+        size: bounds.size(),
+        oriented_box: objects::oriented_box(scene, object, region, alignment(manifest)),
+        score,
+        best_score: score,
+        n_gaussians,
+        n_gaussians_in_scene: Some(u64::from(record.n_gaussians)),
+        evidence: Some(Evidence {
+            photo: objects::photo(scene, object).to_owned(),
+            box_px: record.photo_box_px,
+        }),
+        relevance,
+        distance,
+    }
+}

@@ -1,0 +1,58 @@
+//! The formats that a reply is sent in.
+
+use std::io;
+
+#[cfg(feature = "arrow")]
+use super::arrow;
+use super::json;
+use super::reply::Reply;
+
+/// How a reply is written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Format {
+    /// One object; of several questions, `{"batch":[…]}` of theirs.
+    #[default]
+    Json,
+    /// Columns as an Arrow IPC stream; of Gaussians only.
+    Arrow,
+}
+
+impl Format {
+    /// Returns its media type.
+    pub fn media_type(self) -> &'static str {
+        match self {
+            Self::Json => "application/json",
+            Self::Arrow => "application/vnd.apache.arrow.stream",
+        }
+    }
+}
+
+impl std::str::FromStr for Format {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "json" => Ok(Self::Json),
+            "arrow" if cfg!(feature = "arrow") => Ok(Self::Arrow),
+            _ if cfg!(feature = "arrow") => Err("json or arrow".into()),
+            _ => Err("json (this program is built without Arrow)".into()),
+        }
+    }
+}
+
+impl Reply {
+    /// Returns the pieces of the reply in a format, none longer than a fraction of a megabyte; each is made
+    /// when it is asked for.
+    ///
+    /// # Errors
+    /// A piece is an error where it cannot be written.
+    pub fn pieces(self, format: Format) -> Box<dyn Iterator<Item = io::Result<Vec<u8>>> + Send> {
+        match format {
+            Format::Json => Box::new(json::Pieces::new(self)),
+            #[cfg(feature = "arrow")]
+            Format::Arrow => Box::new(arrow::Pieces::new(self)),
+            #[cfg(not(feature = "arrow"))]
+            Format::Arrow => Box::new(std::iter::once(Err(io::Error::other("built without Arrow")))),
+        }
+    }
+}

@@ -1,0 +1,58 @@
+//! The scale that scores are reported on: cosines, or relevancies where there are negatives.
+
+use slag_common::manifest::{Calibration, Manifest};
+
+use super::answers::ScoreKind;
+use super::request::QueryRequest;
+use super::threshold::{RELEVANCY_THRESHOLD, ThresholdSource, calibrated_threshold};
+use crate::score::{Question, RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
+
+/// How scores are shown: as they are, or as relevancies.
+#[derive(Clone, Copy)]
+pub struct Scale(pub ScoreKind);
+
+impl Scale {
+    pub fn of(question: &Question) -> Self {
+        Self(if question.negatives.is_empty() { ScoreKind::Cosine } else { ScoreKind::Relevancy })
+    }
+
+    /// Returns the threshold, and where it comes from. `calibration`: how texts score over what is scored.
+    pub fn threshold(
+        self,
+        request: &QueryRequest,
+        manifest: &Manifest,
+        calibration: Option<Calibration>,
+    ) -> (f32, ThresholdSource) {
+        match (request.threshold, self.0) {
+            (Some(threshold), _) => (threshold, ThresholdSource::Request),
+            (None, ScoreKind::Relevancy) => (RELEVANCY_THRESHOLD, ThresholdSource::Relevancy),
+            (None, ScoreKind::Cosine) => {
+                // A model that states its threshold is taken at its word: a cosine is a cosine.
+                let scene = manifest.encoder.calibration.and(calibration);
+                calibrated_threshold(manifest.encoder.default_threshold, scene)
+            }
+        }
+    }
+
+    pub fn shown(self, score: f32) -> f32 {
+        match self.0 {
+            ScoreKind::Cosine => score,
+            ScoreKind::Relevancy => relevancy(score),
+        }
+    }
+
+    pub fn to_score(self, shown: f32) -> f32 {
+        match self.0 {
+            ScoreKind::Cosine => shown,
+            ScoreKind::Relevancy => score_of_relevancy(shown),
+        }
+    }
+
+    pub fn error_bound(self, of_score: f32) -> f32 {
+        match self.0 {
+            ScoreKind::Cosine => of_score,
+            // A sigmoid is nowhere steeper than a quarter of its steepness at 0.
+            ScoreKind::Relevancy => (of_score * RELEVANCY_STEEPNESS / 4.0 + f32::EPSILON).min(1.0),
+        }
+    }
+}

@@ -1,0 +1,48 @@
+//! The data that a query runs on.
+
+use glam::DVec3;
+use slag_common::manifest::Manifest;
+use slag_common::objects::Objects;
+use slag_common::shard::ShardView;
+
+use super::oriented::Alignment;
+use crate::store::objects::ObjectIndex;
+
+/// Edge of the voxels in a metric scene, metres: parts of one piece of furniture are nearer to each
+/// other than two such edges, two pieces of furniture mostly are not.
+const METRIC_VOXEL_M: f64 = 0.25;
+/// In a scene without metres, voxels to the middle edge of the median cell.
+const VOXELS_PER_CELL: f64 = 64.0;
+
+/// What a query runs on.
+pub struct Scene<'a> {
+    /// The shards on board.
+    pub shards: &'a [ShardView<'a>],
+    /// The objects of each, where it has them.
+    pub objects: &'a [Option<Objects<'a>>],
+    /// Which of those are the same.
+    pub index: &'a ObjectIndex,
+    /// Their manifest.
+    pub manifest: &'a Manifest,
+    /// The part of space that was fetched: centre and radius.
+    pub fetched: (DVec3, f64),
+}
+
+/// Returns the edge of the voxels where a request states none: 0.25 m in a metric scene, else a 64th
+/// of the median cell's middle edge (sky and ground make the longest and shortest edges meaningless).
+pub fn default_voxel(manifest: &Manifest) -> f64 {
+    if manifest.metric {
+        return METRIC_VOXEL_M;
+    }
+    let middle = |size: DVec3| size.x.max(size.y).min(size.x.max(size.z)).min(size.y.max(size.z));
+    let mut edges: Vec<f64> = manifest.cells.iter().map(|cell| middle(cell.bounds.size())).collect();
+    edges.sort_by(f64::total_cmp);
+    let voxel = edges.get(edges.len() / 2).map_or(0.0, |edge| edge / VOXELS_PER_CELL);
+    if voxel > 0.0 && voxel.is_finite() { voxel } else { 1.0 }
+}
+
+/// Returns how boxes may be turned: a metric or geo-referenced world has z up (`frames.rs`).
+pub(super) fn alignment(manifest: &Manifest) -> Alignment {
+    let z_is_up = manifest.metric || manifest.geo_reference.is_some();
+    if z_is_up { Alignment::Gravity } else { Alignment::Principal }
+}

@@ -1,0 +1,99 @@
+//! What is loaded, for people and monitors.
+
+use glam::DVec3;
+use serde::Serialize;
+use slag_common::Hash32;
+use slag_common::frames::GeoReference;
+use slag_common::shard::Profile;
+
+use crate::store::Snapshot;
+
+/// What is loaded, for people and monitors.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Status {
+    /// Name of the scene.
+    pub scene: String,
+    /// Generation of the scene.
+    pub generation: u64,
+    /// BLAKE3 of the signed manifest.
+    pub manifest_hash: Hash32,
+    /// Public key that signed it.
+    pub key: Hash32,
+    /// Name of the encoder that made the embeddings.
+    pub encoder_name: String,
+    /// Its identity.
+    pub encoder_id: Hash32,
+    /// Cosine from which a Gaussian matches by default.
+    pub default_threshold: f32,
+    /// How much the shards carry.
+    pub profile: Profile,
+    /// Whether a world unit is a metre.
+    pub metric: bool,
+    /// Where the world frame lies on the earth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub geo_reference: Option<GeoReference>,
+    /// Centre of what was fetched.
+    pub centre_in_world: DVec3,
+    /// Radius of what was fetched, world units.
+    pub radius: f64,
+    /// Cells of the scene, on board or not.
+    pub n_cells_in_scene: usize,
+    /// Gaussians on board.
+    pub n_gaussians: u64,
+    /// Bytes of the shards on board.
+    pub len_bytes: u64,
+    /// The shards on board.
+    pub shards: Vec<ShardStatus>,
+}
+
+/// A shard on board.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ShardStatus {
+    /// Its cell.
+    pub cell_id: u32,
+    /// Its Gaussians.
+    pub n_gaussians: u32,
+    /// Its codebook rows.
+    pub n_centroids: u32,
+    /// Its length.
+    pub len_bytes: u64,
+}
+
+impl Status {
+    /// Describes a snapshot.
+    pub fn of(snapshot: &Snapshot) -> Self {
+        let Snapshot { current, manifest, .. } = snapshot;
+        let shards: Vec<ShardStatus> = snapshot
+            .shards
+            .iter()
+            .map(|shard| {
+                let header = shard.view().header;
+                let (cell_id, len_bytes) = (header.cell_id, shard.len_bytes());
+                ShardStatus {
+                    cell_id,
+                    n_gaussians: header.n_gaussians,
+                    n_centroids: header.n_centroids,
+                    len_bytes,
+                }
+            })
+            .collect();
+        Self {
+            scene: manifest.scene.clone(),
+            generation: manifest.generation,
+            manifest_hash: current.manifest_hash,
+            key: current.key,
+            encoder_name: manifest.encoder.name.clone(),
+            encoder_id: manifest.encoder.id,
+            default_threshold: manifest.encoder.default_threshold,
+            profile: current.profile,
+            metric: manifest.metric,
+            geo_reference: manifest.geo_reference,
+            centre_in_world: current.centre_in_world,
+            radius: current.radius,
+            n_cells_in_scene: manifest.cells.len(),
+            n_gaussians: shards.iter().map(|shard| u64::from(shard.n_gaussians)).sum(),
+            len_bytes: shards.iter().map(|shard| shard.len_bytes).sum(),
+            shards,
+        }
+    }
+}

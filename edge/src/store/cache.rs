@@ -1,0 +1,137 @@
+//! A cache folder and the generation pointer in it.
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+use slag_common::Hash32;
+use slag_common::manifest::{self, Manifest, TrustedKeys};
+use slag_common::shard::Profile;
+
+use super::error::StoreError;
+use super::files::{DiskFiles, Files, Stat};
+
+/// A longer `current` is damage (a cell takes about 110 bytes there).
+const MAX_CURRENT_BYTES: u64 = 32 << 20;
+
+/// The generation pointer: which shards of which manifest answer queries.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Current {
+    /// BLAKE3 of the signed manifest.
+    pub manifest_hash: Hash32,
+    /// The public key that fetch accepted for it.
+    pub key: Hash32,
+    /// The profile of the shards.
+    pub profile: Profile,
+    /// Centre of the fetch, world frame.
+    pub centre_in_world: DVec3,
+    /// Radius of the fetch, world units.
+    pub radius: f64,
+    /// The cells, by id, ascending.
+    pub cells: Vec<CurrentCell>,
+}
+
+/// A cell on board.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CurrentCell {
+    /// The cell.
+    pub cell_id: u32,
+    /// BLAKE3 of its shard.
+    pub hash: Hash32,
+    /// Length of its shard.
+    pub len_bytes: u64,
+}
+
+/// A cache folder.
+#[derive(Clone)]
+pub struct EdgeCache {
+    dir: PathBuf,
+    files: Arc<dyn Files>,
+}
+
+impl EdgeCache {
+    /// Names a cache folder on disk; nothing is read or made.
+    pub fn open(dir: impl Into<PathBuf>) -> Self {
+        Self::with_files(dir, Arc::new(DiskFiles))
+    }
+
+    /// Names a cache folder on other storage.
+    pub fn with_files(dir: impl Into<PathBuf>, files: Arc<dyn Files>) -> Self {
+        Self { dir: dir.into(), files }
+    }
+
+    /// Returns the folder.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
+    /// Returns the storage.
+    pub fn files(&self) -> &dyn Files {
+        &*self.files
+    }
+
+    /// Returns where the generation pointer lies.
+    pub fn current_path(&self) -> PathBuf {
+        self.dir.join("current")
+    }
+
+    /// Returns where a shard lies.
+    pub fn shard_path(&self, hash: Hash32) -> PathBuf {
+        self.dir.join("shards").join(hash.to_string())
+    }
+
+    /// Returns where a manifest lies.
+    pub fn manifest_path(&self, hash: Hash32) -> PathBuf {
+        self.dir.join("manifests").join(hash.to_string())
+    }
+
+    /// Returns the state of `current` without opening it: it differs whenever a fetch replaced it.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`].
+    pub fn current_stat(&self) -> Result<Option<Stat>, StoreError> {
+        Ok(self.files.stat(&self.current_path())?)
+    }
+
+    /// Returns the generation pointer; `None` before the first fetch.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`], or [`StoreError::Current`] if it is damaged.
+    pub fn current(&self) -> Result<Option<Current>, StoreError> {
+        let path = self.current_path();
+        let bytes = match self.files.read(&path, MAX_CURRENT_BYTES) {
+            Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
+            other => other?,
+        };
+        let current: Current = serde_json::from_slice(&bytes)
+            .map_err(|e| StoreError::Current { path: path.clone(), what: e.to_string() })?;
+        if current.cells.windows(2).any(|pair| pair[0].cell_id >= pair[1].cell_id) {
+            return Err(StoreError::Current { path, what: "cell ids do not ascend".into() });
+        }
+        Ok(Some(current))
+    }
+
+    /// Reads a manifest of the cache and checks its hash and its signature.
+    ///
+    /// # Errors
+    /// [`StoreError::Missing`], [`StoreError::Hash`], [`StoreError::Manifest`].
+    pub fn read_manifest(&self, hash: Hash32, key: Hash32) -> Result<Manifest, StoreError> {
+        let path = self.manifest_path(hash);
+        let bytes = match self.files.read(&path, manifest::MAX_BYTES) {
+            Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(StoreError::Missing { path }),
+            other => other?,
+        };
+        let found = Hash32::of(&bytes);
+        if found != hash {
+            return Err(StoreError::Hash { path, expected: hash, found });
+        }
+        match Manifest::verify(&bytes, &TrustedKeys::Only(vec![key])) {
+            Ok((manifest, _)) => Ok(manifest),
+            Err(source) => Err(StoreError::Manifest { path, source }),
+        }
+    }
+}

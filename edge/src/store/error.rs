@@ -1,0 +1,85 @@
+//! Errors of the cache.
+
+use std::io;
+use std::path::PathBuf;
+
+use slag_common::Hash32;
+use slag_common::container::ContainerError;
+use slag_common::manifest::ManifestError;
+use slag_common::shard::Profile;
+
+/// Why a cache cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum StoreError {
+    /// The file system's error, with the path.
+    #[error("{0}; check the cache's folder and its permissions")]
+    Io(#[from] io::Error),
+    /// Nothing was fetched yet.
+    #[error("{path} holds no scene yet: fetch one first", path = path.display())]
+    Empty {
+        /// The cache.
+        path: PathBuf,
+    },
+    /// The pointer to the generation is not what fetch writes.
+    #[error("{path}: {what}; delete it and fetch again", path = path.display())]
+    Current {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        what: String,
+    },
+    /// A file is not there although `current` names it.
+    #[error("{path} is missing although `current` names it; fetch again", path = path.display())]
+    Missing {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A file's content is not the one it is named by.
+    #[error("{path}: content has hash {found}, expected {expected}; delete it and fetch again", path = path.display())]
+    Hash {
+        /// The file.
+        path: PathBuf,
+        /// Hash expected.
+        expected: Hash32,
+        /// Hash of the content.
+        found: Hash32,
+    },
+    /// The manifest is refused.
+    #[error("{path}", path = path.display())]
+    Manifest {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: ManifestError,
+    },
+    /// The shard is damaged.
+    #[error("{path}", path = path.display())]
+    Shard {
+        /// The file.
+        path: PathBuf,
+        /// Why and where.
+        source: ContainerError,
+    },
+    /// `current` names a cell or a profile of it that the manifest does not list.
+    #[error("{path}: the manifest lists no {profile} shard of cell {cell_id}; fetch again", path = path.display())]
+    Unlisted {
+        /// The file.
+        path: PathBuf,
+        /// The cell.
+        cell_id: u32,
+        /// The profile.
+        profile: Profile,
+    },
+    /// The shard is sound, but not the one that the manifest describes.
+    #[error("{path}: {field} is {found}, the manifest says {expected}; delete it and fetch again", path = path.display())]
+    Mismatch {
+        /// The file.
+        path: PathBuf,
+        /// What differs.
+        field: &'static str,
+        /// Value in the manifest.
+        expected: String,
+        /// Value found.
+        found: String,
+    },
+}

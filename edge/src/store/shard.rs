@@ -1,0 +1,90 @@
+//! A shard on board: mapped, and checked against the manifest.
+
+use std::io;
+use std::path::Path;
+
+use slag_common::Hash32;
+use slag_common::manifest::{CellRecord, Manifest};
+use slag_common::objects::Objects;
+use slag_common::shard::{Profile, ShardLayout, ShardView};
+
+use super::cache::{CurrentCell, EdgeCache};
+use super::error::StoreError;
+use super::mmap::FileBytes;
+
+/// A mapped and checked shard.
+#[derive(Debug)]
+pub struct OpenShard {
+    /// What the manifest says of its cell.
+    pub cell: CellRecord,
+    layout: ShardLayout,
+    bytes: FileBytes,
+}
+
+impl OpenShard {
+    /// Returns its columns.
+    pub fn view(&self) -> ShardView<'_> {
+        self.layout.view(&self.bytes)
+    }
+
+    /// Returns the objects of its Gaussians, where the shard has them.
+    pub fn objects(&self) -> Option<Objects<'_>> {
+        self.layout.objects(&self.bytes)
+    }
+
+    /// Returns its length.
+    pub fn len_bytes(&self) -> u64 {
+        self.bytes.len() as u64
+    }
+
+    pub(super) fn open(
+        cache: &EdgeCache,
+        manifest: &Manifest,
+        profile: Profile,
+        at: &CurrentCell,
+    ) -> Result<Self, StoreError> {
+        let path = cache.shard_path(at.hash);
+        let bytes = match cache.files().map(&path) {
+            Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(StoreError::Missing { path }),
+            other => other?,
+        };
+        let (cell, layout) = check_shard(&path, &bytes, at, profile, manifest)?;
+        Ok(Self { cell: cell.clone(), layout, bytes })
+    }
+}
+
+/// Checks that bytes are a sound shard, and the one that a manifest lists for a cell.
+///
+/// # Errors
+/// [`StoreError::Shard`], [`StoreError::Mismatch`].
+pub fn check_shard<'a>(
+    path: &Path,
+    bytes: &[u8],
+    at: &CurrentCell,
+    profile: Profile,
+    manifest: &'a Manifest,
+) -> Result<(&'a CellRecord, ShardLayout), StoreError> {
+    let same = |field, expected: &dyn ToString, found: &dyn ToString| {
+        let (expected, found) = (expected.to_string(), found.to_string());
+        match expected == found {
+            true => Ok(()),
+            false => Err(StoreError::Mismatch { path: path.to_owned(), field, expected, found }),
+        }
+    };
+    let position = manifest.cells.partition_point(|cell| cell.cell_id < at.cell_id);
+    let cell = manifest.cells.get(position).filter(|cell| cell.cell_id == at.cell_id);
+    let Some((cell, listed)) = cell.and_then(|cell| Some((cell, cell.shards.get(&profile)?))) else {
+        let (cell_id, path) = (at.cell_id, path.to_owned());
+        return Err(StoreError::Unlisted { path, cell_id, profile });
+    };
+    same("the name", &listed.hash, &at.hash)?;
+    same("the length in bytes", &listed.len_bytes, &bytes.len())?;
+    let layout =
+        ShardLayout::check(bytes).map_err(|source| StoreError::Shard { path: path.to_owned(), source })?;
+    let header = layout.header;
+    same("the cell", &cell.cell_id, &header.cell_id)?;
+    same("the number of Gaussians", &cell.n_gaussians, &header.n_gaussians)?;
+    same("the embedding dimension", &manifest.encoder.dim, &header.dim)?;
+    same("the encoder", &manifest.encoder.id, &Hash32(header.encoder_id))?;
+    Ok((cell, layout))
+}
