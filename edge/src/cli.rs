@@ -1,23 +1,28 @@
 //! The command line: what can be asked for, and how a run ends.
 
+mod args;
 mod bench;
-mod commands;
+mod failure;
 mod fetch;
+mod follow;
+mod models;
+mod network;
 mod output;
+mod progress;
+mod query;
+mod serve;
+mod status;
+mod text;
 
-use std::net::SocketAddr;
-use std::num::NonZeroUsize;
-use std::path::PathBuf;
-use std::process::ExitCode;
+use clap::{Parser, Subcommand};
 
-use clap::{Args, Parser, Subcommand};
-use glam::DVec3;
-use slag_common::Hash32;
-use slag_common::frames::Aabb;
-use slag_common::shard::Profile;
-use slag_edge::query::{AnswerKind, DEFAULT_MIN_COUNT, Negatives, parse_box, parse_point};
-use slag_edge::score::Precision;
-use slag_models::commands::{ModelsCommand, RunArgs};
+use bench::BenchCommand;
+use failure::Exit;
+use fetch::FetchArgs;
+use models::ModelsArgs;
+use query::QueryArgs;
+use serve::ServeArgs;
+use status::StatusArgs;
 
 /// Keeps the shards around a robot and answers text queries offline.
 #[derive(Debug, Parser)]
@@ -50,246 +55,6 @@ enum Command {
     Bench(BenchCommand),
 }
 
-#[derive(Debug, Subcommand)]
-enum BenchCommand {
-    /// Times questions to what is on board, without text model and HTTP.
-    Query(bench::BenchQueryArgs),
-    /// The longest time a query waits while fetches replace the generation.
-    Pause(PauseArgs),
-    /// How a service stands more queries than it can answer.
-    Load(LoadArgs),
-    /// Times the text model.
-    Text(bench::BenchTextArgs),
-}
-
-#[derive(Debug, Args)]
-struct PauseArgs {
-    /// Gaussians of the generated scene.
-    #[arg(long, value_name = "N", default_value_t = 1_000_000, value_parser = clap::value_parser!(u32).range(1000..=16_000_000))]
-    gaussians: u32,
-    /// Components of an embedding.
-    #[arg(long, value_name = "N", default_value_t = 512, value_parser = clap::value_parser!(u32).range(2..=8192))]
-    dim: u32,
-    /// Generations that are fetched, one after the other.
-    #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=1000))]
-    fetches: u32,
-    /// Folder to work in [default: a new one among the system's temporary files].
-    #[arg(long, value_name = "DIR")]
-    work: Option<PathBuf>,
-}
-
-#[derive(Debug, Args)]
-struct LoadArgs {
-    /// The service, as `slag-edge serve` prints it.
-    #[arg(long, value_name = "URL")]
-    url: String,
-    /// What is asked for.
-    #[arg(long, default_value = "red")]
-    text: String,
-    /// Questions a second, as a multiple of what the service answers.
-    #[arg(long, value_name = "X", default_value_t = 10.0)]
-    overload: f64,
-    /// Questions at a time, at most.
-    #[arg(long, value_name = "N", default_value_t = 320, value_parser = clap::value_parser!(u32).range(1..=4096))]
-    clients: u32,
-    /// How long.
-    #[arg(long, value_name = "S", default_value_t = 600)]
-    seconds: u64,
-    /// Process whose memory is watched (Linux).
-    #[arg(long, value_name = "PID")]
-    pid: Option<u32>,
-}
-
-#[derive(Debug, Args)]
-struct CacheArgs {
-    /// Folder of what is on board [default: $XDG_CACHE_HOME/slag, else ~/.cache/slag].
-    #[arg(long, value_name = "DIR")]
-    cache: Option<PathBuf>,
-}
-
-#[derive(Debug, Args)]
-struct ThreadArgs {
-    /// Threads that questions are worked on with [default: as many as there are cores].
-    #[arg(long, value_name = "N")]
-    threads: Option<NonZeroUsize>,
-}
-
-#[derive(Debug, Args)]
-struct ModelArgs {
-    /// Folder of the text model, with its model.toml, or name of a pulled model (`models list`) [default: the
-    /// built-in stand-in].
-    #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR")]
-    models: Option<PathBuf>,
-    #[command(flatten)]
-    how: RunArgs,
-}
-
-#[derive(Debug, Args)]
-struct FetchArgs {
-    /// Address of the store [default: that of the last fetch].
-    #[arg(long, value_name = "URL")]
-    from: Option<String>,
-    /// Where the robot is, world frame [default: where it was at the last fetch].
-    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
-    at: Option<DVec3>,
-    /// Where the robot is: WGS 84 degrees, and metres.
-    #[arg(long, value_name = "LAT,LON[,HEIGHT]", value_parser = parse_geographic, allow_hyphen_values = true, conflicts_with = "at")]
-    at_geo: Option<(f64, f64, Option<f64>)>,
-    /// How far around, world units (metres where the scene is metric).
-    #[arg(long, default_value_t = 50.0)]
-    radius: f64,
-    /// How much each shard carries: compact or exact.
-    #[arg(long, default_value_t = Profile::Compact)]
-    profile: Profile,
-    /// The only public key accepted, or the one that took its place; given again: its successor, for a
-    /// robot that missed the change [default: the one accepted before, or the first one met].
-    #[arg(long, value_name = "HEX")]
-    key: Vec<Hash32>,
-    /// Bytes that shards may take [default: twice what the radius needs].
-    #[arg(long, value_name = "N")]
-    max_bytes: Option<u64>,
-    /// Follow the robot: read positions from stdin, one a line, `x y z` or `lat,lon[,height]`, or as
-    /// JSON, and fetch whenever it needs more.
-    #[arg(long)]
-    watch: bool,
-    #[command(flatten)]
-    follow: FollowArgs,
-    #[command(flatten)]
-    cache: CacheArgs,
-    /// Print the report as JSON (with --watch: one a line).
-    #[arg(long)]
-    json: bool,
-}
-
-/// How a robot is followed.
-#[derive(Debug, Args)]
-struct FollowArgs {
-    /// When following: how much farther than the radius is fetched, world units [default: a quarter of
-    /// the radius].
-    #[arg(long, value_name = "D")]
-    margin: Option<f64>,
-    /// When following: seconds between fetches, at least.
-    #[arg(long, value_name = "S", default_value_t = 2)]
-    min_interval_secs: u64,
-    /// When following: seconds after which a robot that stays looks for a new generation; 0: never.
-    #[arg(long, value_name = "S", default_value_t = 300)]
-    refresh_secs: u64,
-}
-
-#[derive(Debug, Args)]
-struct ServeArgs {
-    /// Address to listen on.
-    #[arg(long, value_name = "IP:PORT", default_value = "127.0.0.1:7734")]
-    listen: SocketAddr,
-    /// Follow the robot: fetch from this store around the positions that POST /position says.
-    #[arg(long, value_name = "URL")]
-    follow: Option<String>,
-    /// When following: how far around the robot cells are kept, world units.
-    #[arg(long, default_value_t = 50.0)]
-    radius: f64,
-    /// When following: how much each shard carries: compact or exact.
-    #[arg(long, default_value_t = Profile::Compact)]
-    profile: Profile,
-    /// When following: the only public keys accepted, at most two.
-    #[arg(long, value_name = "HEX")]
-    key: Vec<Hash32>,
-    /// When following: bytes that shards may take [default: twice what the radius needs].
-    #[arg(long, value_name = "N")]
-    max_bytes: Option<u64>,
-    #[command(flatten)]
-    following: FollowArgs,
-    #[command(flatten)]
-    threads: ThreadArgs,
-    #[command(flatten)]
-    cache: CacheArgs,
-    #[command(flatten)]
-    models: ModelArgs,
-}
-
-#[derive(Debug, Args)]
-struct QueryArgs {
-    /// What to look for.
-    text: String,
-    /// What it is told from: none, canonical (object, things, stuff, texture), or phrases A,B,C.
-    #[arg(long, default_value = "none")]
-    negatives: Negatives,
-    /// Where the asker is, world frame: answers carry their distance and nearer ones rank higher.
-    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
-    near: Option<DVec3>,
-    /// Only within this distance of --near, world units.
-    #[arg(long, requires = "near")]
-    radius: Option<f64>,
-    /// Only between two corners of a box, world frame.
-    #[arg(long = "box", value_name = "X,Y,Z,X,Y,Z", value_parser = parse_box, allow_hyphen_values = true)]
-    bounds: Option<Aabb>,
-    /// Most answers [default: 10].
-    #[arg(long)]
-    limit: Option<usize>,
-    /// Cosine, or relevancy with negatives, from which a Gaussian matches [default: the scene's; 0.5].
-    #[arg(long, allow_hyphen_values = true)]
-    threshold: Option<f32>,
-    /// What answers are made of: objects, clusters or gaussians [default: objects where the scene has them, else
-    /// clusters].
-    #[arg(long)]
-    kind: Option<AnswerKind>,
-    /// Edge of the voxels that join Gaussians to clusters, world units [default: 0.25 m, or the scene's].
-    #[arg(long)]
-    voxel: Option<f64>,
-    /// Clusters with fewer Gaussians are dropped, and counted.
-    #[arg(long, default_value_t = DEFAULT_MIN_COUNT)]
-    min_count: u64,
-    /// Which data scores come from: rows, measured (embeddings only where the measured errors of their codes do
-    /// not decide) or exact.
-    #[arg(long, value_name = "NAME", default_value_t = Precision::Exact)]
-    precision: Precision,
-    #[command(flatten)]
-    threads: ThreadArgs,
-    #[command(flatten)]
-    cache: CacheArgs,
-    #[command(flatten)]
-    models: ModelArgs,
-    /// Print the answers as JSON.
-    #[arg(long)]
-    json: bool,
-}
-
-#[derive(Debug, Args)]
-struct StatusArgs {
-    #[command(flatten)]
-    cache: CacheArgs,
-    /// Print the status as JSON.
-    #[arg(long)]
-    json: bool,
-}
-
-#[derive(Debug, Args)]
-struct ModelsArgs {
-    #[command(subcommand)]
-    command: ModelsCommand,
-    /// Print the result as JSON.
-    #[arg(long, global = true)]
-    json: bool,
-}
-
-/// How a run ends.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Exit {
-    /// Done, even if nothing was found.
-    Done = 0,
-    /// Failed.
-    Failed = 1,
-    /// Asked for something that cannot be; clap exits with it too.
-    Usage = 2,
-    /// Interrupted by a signal (128 + SIGINT).
-    Interrupted = 130,
-}
-
-impl From<Exit> for ExitCode {
-    fn from(exit: Exit) -> Self {
-        Self::from(exit as u8)
-    }
-}
-
 impl Cli {
     /// Returns what is logged unless `RUST_LOG` says otherwise.
     pub fn log_filter(&self) -> &'static str {
@@ -305,11 +70,11 @@ impl Cli {
     /// Runs the command and reports how it went.
     pub fn run(self) -> Exit {
         let (json, result) = match self.command {
-            Command::Fetch(args) => (args.json, fetch::fetch(args, self.quiet)),
-            Command::Serve(args) => (false, commands::serve(args)),
-            Command::Query(args) => (args.json, commands::query(args)),
-            Command::Status(args) => (args.json, commands::status(args)),
-            Command::Models(args) => (args.json, commands::models(args)),
+            Command::Fetch(args) => (args.json, fetch::run(args, self.quiet)),
+            Command::Serve(args) => (false, serve::run(args)),
+            Command::Query(args) => (args.json, query::run(args)),
+            Command::Status(args) => (args.json, status::run(args)),
+            Command::Models(args) => (args.json, models::run(args)),
             Command::Bench(command) => (true, bench::run(command)),
         };
         match result {
@@ -319,20 +84,16 @@ impl Cli {
     }
 }
 
-fn parse_geographic(text: &str) -> Result<(f64, f64, Option<f64>), String> {
-    let numbers: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
-    let in_range = |lat: f64, lon: f64| lat.abs() <= 90.0 && lon.abs() <= 180.0;
-    match numbers.as_deref() {
-        Some([lat, lon]) if in_range(*lat, *lon) => Ok((*lat, *lon, None)),
-        Some([lat, lon, height]) if in_range(*lat, *lon) && height.is_finite() => {
-            Ok((*lat, *lon, Some(*height)))
-        }
-        _ => Err("degrees LAT,LON within ±90 and ±180, optionally a height in metres".into()),
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use std::net::SocketAddr;
+
+    use glam::DVec3;
+    use slag_common::frames::Aabb;
+    use slag_common::shard::Profile;
+    use slag_edge::query::{AnswerKind, Negatives};
+    use slag_edge::score::Precision;
+
     use super::*;
 
     fn parse(line: &str) -> Result<Cli, clap::Error> {

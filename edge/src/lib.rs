@@ -1,6 +1,8 @@
 //! The robot's side of SLAG: keeps the shards around it and answers text queries offline.
 
 pub mod bench;
+mod clock;
+mod error_line;
 pub mod fetch;
 pub mod http;
 pub mod query;
@@ -10,22 +12,5 @@ pub mod store;
 mod testing;
 pub mod text;
 
-/// Returns an error and its causes in one line; a cause that the line already states is left out.
-pub fn error_line(error: &dyn std::error::Error) -> String {
-    let mut line = error.to_string();
-    let mut cause = error.source();
-    while let Some(error) = cause {
-        let text = error.to_string();
-        if !line.contains(&text) {
-            line = format!("{line}: {text}");
-        }
-        cause = error.source();
-    }
-    line
-}
-
-/// Returns the system's clock, seconds since 1970; 0 where it stands before that.
-pub fn now_unix_secs() -> u64 {
-    let since = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
-    since.map_or(0, |since| since.as_secs())
-}
+pub use clock::now_unix_secs;
+pub use error_line::error_line;

@@ -119,7 +119,7 @@ pub fn run(options: &PauseOptions) -> Result<PauseReport, PauseError> {
     };
     let cancel = AtomicBool::new(false);
     let environment = Environment {
-        now_unix_secs: crate::now_unix_secs(),
+        now_unix_secs: crate::clock::now_unix_secs(),
         cancel: &cancel,
         progress: &(),
         random: &|| 0.5,

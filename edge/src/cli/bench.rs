@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::{Context, anyhow};
-use clap::Args;
+use clap::{Args, Subcommand};
 use slag_common::shard::ShardView;
 use slag_edge::bench::http::time_http;
 use slag_edge::bench::load::{self, LoadOptions};
@@ -16,9 +16,59 @@ use slag_edge::bench::{Settings, dump_ids, dump_vectors, make_queries};
 use slag_edge::score::Precision;
 use slag_edge::store::{OpenShard, Snapshot};
 
-use super::commands::{store_failure, text_model};
-use super::output::{Failure, print_json};
-use super::{BenchCommand, CacheArgs, LoadArgs, ModelArgs, PauseArgs, ThreadArgs};
+use super::args::{CacheArgs, ModelArgs, ThreadArgs, text_model};
+use super::failure::{Failure, store_failure};
+use super::output::print_json;
+
+#[derive(Debug, Subcommand)]
+pub enum BenchCommand {
+    /// Times questions to what is on board, without text model and HTTP.
+    Query(BenchQueryArgs),
+    /// The longest time a query waits while fetches replace the generation.
+    Pause(PauseArgs),
+    /// How a service stands more queries than it can answer.
+    Load(LoadArgs),
+    /// Times the text model.
+    Text(BenchTextArgs),
+}
+
+#[derive(Debug, Args)]
+pub struct PauseArgs {
+    /// Gaussians of the generated scene.
+    #[arg(long, value_name = "N", default_value_t = 1_000_000, value_parser = clap::value_parser!(u32).range(1000..=16_000_000))]
+    gaussians: u32,
+    /// Components of an embedding.
+    #[arg(long, value_name = "N", default_value_t = 512, value_parser = clap::value_parser!(u32).range(2..=8192))]
+    dim: u32,
+    /// Generations that are fetched, one after the other.
+    #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    fetches: u32,
+    /// Folder to work in [default: a new one among the system's temporary files].
+    #[arg(long, value_name = "DIR")]
+    work: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub struct LoadArgs {
+    /// The service, as `slag-edge serve` prints it.
+    #[arg(long, value_name = "URL")]
+    url: String,
+    /// What is asked for.
+    #[arg(long, default_value = "red")]
+    text: String,
+    /// Questions a second, as a multiple of what the service answers.
+    #[arg(long, value_name = "X", default_value_t = 10.0)]
+    overload: f64,
+    /// Questions at a time, at most.
+    #[arg(long, value_name = "N", default_value_t = 320, value_parser = clap::value_parser!(u32).range(1..=4096))]
+    clients: u32,
+    /// How long.
+    #[arg(long, value_name = "S", default_value_t = 600)]
+    seconds: u64,
+    /// Process whose memory is watched (Linux).
+    #[arg(long, value_name = "PID")]
+    pid: Option<u32>,
+}
 
 #[derive(Debug, Args)]
 pub struct BenchQueryArgs {

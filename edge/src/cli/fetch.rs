@@ -1,28 +1,61 @@
-//! `fetch`, and the following of `serve`.
+//! `fetch`.
 
-use std::hash::{BuildHasher, Hasher, RandomState};
-use std::io::{self, IsTerminal, Write};
+use std::io::{self, IsTerminal};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::time::Duration;
+use std::sync::atomic::{AtomicBool, Ordering};
 
-use anyhow::anyhow;
+use clap::Args;
+use glam::DVec3;
 use slag_common::Hash32;
-use slag_edge::fetch::follow::{FollowEnvironment, FollowSettings, Following, follow, read_positions};
-use slag_edge::fetch::{
-    self, DownloadFailure, Environment, FetchError, FetchReport, FetchRequest, NetworkLimits, Position,
-    Progress,
-};
-use slag_edge::http::App;
-use slag_edge::store::EdgeCache;
+use slag_common::shard::Profile;
+use slag_edge::fetch::{FetchRequest, Position};
+use slag_edge::query::parse_point;
 
-use super::output::{Failure, print_json, print_pairs};
-use super::{FetchArgs, FollowArgs, ServeArgs};
+use super::args::CacheArgs;
+use super::failure::Failure;
+use super::follow::{FollowArgs, watch};
+use super::network::{checked_keys, failure, fetch_once};
+use super::output::print_json;
+use super::progress::{Bar, print_report};
 
-/// A second key is the successor's, told beforehand; more are a mistake.
-const MAX_KEYS: usize = 2;
+#[derive(Debug, Args)]
+pub struct FetchArgs {
+    /// Address of the store [default: that of the last fetch].
+    #[arg(long, value_name = "URL")]
+    pub from: Option<String>,
+    /// Where the robot is, world frame [default: where it was at the last fetch].
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
+    pub at: Option<DVec3>,
+    /// Where the robot is: WGS 84 degrees, and metres.
+    #[arg(long, value_name = "LAT,LON[,HEIGHT]", value_parser = parse_geographic, allow_hyphen_values = true, conflicts_with = "at")]
+    pub at_geo: Option<(f64, f64, Option<f64>)>,
+    /// How far around, world units (metres where the scene is metric).
+    #[arg(long, default_value_t = 50.0)]
+    pub radius: f64,
+    /// How much each shard carries: compact or exact.
+    #[arg(long, default_value_t = Profile::Compact)]
+    pub profile: Profile,
+    /// The only public key accepted, or the one that took its place; given again: its successor, for a
+    /// robot that missed the change [default: the one accepted before, or the first one met].
+    #[arg(long, value_name = "HEX")]
+    pub key: Vec<Hash32>,
+    /// Bytes that shards may take [default: twice what the radius needs].
+    #[arg(long, value_name = "N")]
+    pub max_bytes: Option<u64>,
+    /// Follow the robot: read positions from stdin, one a line, `x y z` or `lat,lon[,height]`, or as
+    /// JSON, and fetch whenever it needs more.
+    #[arg(long)]
+    pub watch: bool,
+    #[command(flatten)]
+    pub follow: FollowArgs,
+    #[command(flatten)]
+    pub cache: CacheArgs,
+    /// Print the report as JSON (with --watch: one a line).
+    #[arg(long)]
+    pub json: bool,
+}
 
-pub fn fetch(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
+pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
     let at = match (args.at, args.at_geo) {
         (Some(at), _) => Some(Position::World(at)),
         (None, Some((latitude_deg, longitude_deg, height_m))) => {
@@ -45,7 +78,7 @@ pub fn fetch(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
     let on_signal = Arc::clone(&cancel);
     ctrlc::set_handler(move || on_signal.store(true, Ordering::Relaxed))
         .map_err(|e| Failure::Failed("signals", e.into()))?;
-    let bar = Bar { shown: !quiet && !args.json && io::stderr().is_terminal(), ..Bar::default() };
+    let bar = Bar::new(!quiet && !args.json && io::stderr().is_terminal());
     if args.watch {
         return watch(&cache, &request, settings, &cancel, &bar, args.json);
     }
@@ -58,216 +91,14 @@ pub fn fetch(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
     }
 }
 
-fn failure(error: FetchError) -> Failure {
-    match error {
-        FetchError::Cancelled => Failure::Interrupted(error.into()),
-        error => Failure::Failed("fetch", error.into()),
-    }
-}
-
-fn checked_keys(keys: Vec<Hash32>) -> Result<Vec<Hash32>, Failure> {
-    match keys.len() {
-        0..=MAX_KEYS => Ok(keys),
-        n => Err(Failure::Usage(anyhow!("--key is given {n} times, at most {MAX_KEYS} keys are accepted"))),
-    }
-}
-
-fn fetch_once(
-    cache: &EdgeCache,
-    request: &FetchRequest,
-    cancel: &AtomicBool,
-    progress: &dyn Progress,
-) -> Result<FetchReport, FetchError> {
-    let environment = Environment {
-        now_unix_secs: slag_edge::now_unix_secs(),
-        cancel,
-        progress,
-        random: &random,
-        limits: NetworkLimits::default(),
-    };
-    fetch::fetch(cache, request, &environment)
-}
-
-impl FollowArgs {
-    fn settings(&self, radius: f64) -> Result<FollowSettings, Failure> {
-        let margin = self.margin.unwrap_or(radius / 4.0);
-        if !(margin > 0.0 && margin.is_finite()) {
-            return Err(Failure::Usage(anyhow!("the margin is {margin}, it must be more than 0")));
+fn parse_geographic(text: &str) -> Result<(f64, f64, Option<f64>), String> {
+    let numbers: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
+    let in_range = |lat: f64, lon: f64| lat.abs() <= 90.0 && lon.abs() <= 180.0;
+    match numbers.as_deref() {
+        Some([lat, lon]) if in_range(*lat, *lon) => Ok((*lat, *lon, None)),
+        Some([lat, lon, height]) if in_range(*lat, *lon) && height.is_finite() => {
+            Ok((*lat, *lon, Some(*height)))
         }
-        Ok(FollowSettings {
-            radius,
-            margin,
-            min_interval: Duration::from_secs(self.min_interval_secs),
-            refresh: (self.refresh_secs > 0).then(|| Duration::from_secs(self.refresh_secs)),
-            ..FollowSettings::default()
-        })
-    }
-}
-
-/// Follows the positions on stdin until they end.
-fn watch(
-    cache: &EdgeCache,
-    request: &FetchRequest,
-    settings: FollowSettings,
-    cancel: &AtomicBool,
-    bar: &Bar,
-    json: bool,
-) -> Result<(), Failure> {
-    let following = Arc::<Following>::default();
-    if let Some(at) = request.at {
-        following.post(at);
-    }
-    let posting = Arc::clone(&following);
-    // Not joined: it may wait for a line that never comes.
-    std::thread::Builder::new().name("positions".into()).spawn(move || {
-        let read = read_positions(io::stdin().lock(), |line, position| match position {
-            Ok(position) => posting.post(position),
-            Err(error) => tracing::warn!("line {line}: {error}"),
-        });
-        if let Err(error) = read {
-            tracing::warn!("no more positions can be read: {error}");
-        }
-        posting.close();
-    })?;
-    let mut printed = Ok(());
-    let followed = follow(
-        cache,
-        request,
-        settings,
-        &following,
-        FollowEnvironment {
-            fetch: &mut |request| fetch_once(cache, request, cancel, bar),
-            tell: &mut |outcome| {
-                bar.finish();
-                let told = match outcome {
-                    Ok(report) if json => print_json(report),
-                    Ok(report) => print_line(report),
-                    Err(error) => {
-                        tracing::warn!("{}", slag_edge::error_line(error));
-                        Ok(())
-                    }
-                };
-                if told.is_err() {
-                    // Nobody reads any more.
-                    printed = told;
-                    cancel.store(true, Ordering::Relaxed);
-                }
-            },
-            random: &random,
-            cancel,
-        },
-    );
-    printed?;
-    followed.map_err(failure)
-}
-
-/// Follows the positions that the service is told, on a thread of its own, until the flag returned is set.
-pub fn follow_in_background(
-    args: &ServeArgs,
-    cache: EdgeCache,
-    following: Arc<Following>,
-    app: Arc<App>,
-) -> Result<Arc<AtomicBool>, Failure> {
-    let request = FetchRequest {
-        from: args.follow.clone(),
-        profile: args.profile,
-        keys: checked_keys(args.key.clone())?,
-        max_bytes: args.max_bytes,
-        ..FetchRequest::default()
-    };
-    let settings = args.following.settings(args.radius)?;
-    let cancel = Arc::new(AtomicBool::new(false));
-    let stop = Arc::clone(&cancel);
-    std::thread::Builder::new().name("follow".into()).spawn(move || {
-        let environment = FollowEnvironment {
-            fetch: &mut |request| fetch_once(&cache, request, &stop, &()),
-            tell: &mut |outcome| match outcome {
-                Ok(report) => {
-                    let (n, generation) = (report.downloaded.n_shards, report.generation);
-                    tracing::info!("{n} shards of generation {generation} came in");
-                    app.reload_now();
-                }
-                Err(error) => tracing::warn!("{}", slag_edge::error_line(error)),
-            },
-            random: &random,
-            cancel: &stop,
-        };
-        if let Err(error) = follow(&cache, &request, settings, &following, environment) {
-            tracing::info!("no longer following: {error}");
-        }
-    })?;
-    Ok(cancel)
-}
-
-/// Returns a number in 0..1 that differs from robot to robot, so that a fleet does not retry in step.
-fn random() -> f64 {
-    // The standard library's per-process random keys; each call has new ones.
-    (RandomState::new().build_hasher().finish() >> 11) as f64 / (1u64 << 53) as f64
-}
-
-fn print_report(report: &FetchReport) -> Result<(), Failure> {
-    let tally = |t: &fetch::Tally| format!("{} shards, {} bytes", t.n_shards, t.bytes);
-    let trust = match report.replaced_key {
-        _ if report.is_first_contact => " (first contact: compare it with the store's)",
-        Some(_) => " (took the place of the key before, which is no longer accepted)",
-        None => "",
-    };
-    print_pairs(&[
-        ("scene", report.scene.clone()),
-        ("generation", report.generation.to_string()),
-        ("encoder", format!("{} ({})", report.encoder_name, report.encoder_id)),
-        ("cells", format!("{} within {} of {}", report.n_cells, report.radius, report.centre_in_world)),
-        ("downloaded", format!("{} ({} of them resumed)", tally(&report.downloaded), report.resumed_bytes)),
-        ("kept", tally(&report.kept)),
-        ("spare", tally(&report.spare)),
-        ("freed", tally(&report.freed)),
-        ("seconds", format!("{:.2}", report.seconds)),
-        ("signed by", format!("{}{trust}", report.key)),
-    ])
-}
-
-/// Prints a fetch in one line, for a robot that is followed.
-fn print_line(report: &FetchReport) -> Result<(), Failure> {
-    let FetchReport { generation, n_cells, centre_in_world, downloaded, freed, .. } = report;
-    let (came, went) = (downloaded.n_shards, freed.n_shards);
-    writeln!(
-        io::stdout(),
-        "generation {generation}, {n_cells} cells around {centre_in_world}: {came} shards came, {went} went"
-    )?;
-    Ok(())
-}
-
-/// A line on the terminal that says how far the downloads are.
-#[derive(Default)]
-struct Bar {
-    shown: bool,
-    planned_bytes: AtomicU64,
-    received_bytes: AtomicU64,
-}
-
-impl Bar {
-    fn finish(&self) {
-        if self.shown && self.planned_bytes.load(Ordering::Relaxed) > 0 {
-            // Progress that cannot be shown is no reason to stop.
-            let _ = writeln!(io::stderr());
-        }
-    }
-}
-
-impl Progress for Bar {
-    fn planned(&self, _n_shards: usize, bytes: u64) {
-        self.planned_bytes.store(bytes, Ordering::Relaxed);
-    }
-
-    fn received(&self, bytes: u64) {
-        let received = self.received_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
-        let planned = self.planned_bytes.load(Ordering::Relaxed);
-        if self.shown {
-            let _ = write!(io::stderr(), "\r{:.1} of {:.1} MB ", received as f64 / 1e6, planned as f64 / 1e6);
-        }
-    }
-
-    fn retried(&self, url: &str, failure: &DownloadFailure) {
-        tracing::warn!("{url}: {failure}; trying again");
+        _ => Err("degrees LAT,LON within ±90 and ±180, optionally a height in metres".into()),
     }
 }

@@ -1,0 +1,89 @@
+//! Arguments that several commands share.
+
+use std::ffi::OsString;
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+
+use anyhow::anyhow;
+use clap::Args;
+use slag_edge::query::Engine;
+use slag_edge::store::EdgeCache;
+use slag_edge::text::TextService;
+use slag_models::commands::{self as model_commands, RunArgs};
+use slag_models::hub::cache_folder;
+use slag_models::session::SessionError;
+use slag_models::{ModelDir, SessionOptions};
+
+use super::failure::Failure;
+
+/// Threads of a text model: more gain little for short texts.
+const MAX_MODEL_THREADS: usize = 4;
+
+#[derive(Debug, Args)]
+pub struct CacheArgs {
+    /// Folder of what is on board [default: $XDG_CACHE_HOME/slag, else ~/.cache/slag].
+    #[arg(long, value_name = "DIR")]
+    pub cache: Option<PathBuf>,
+}
+
+impl CacheArgs {
+    /// Returns the cache named, or the user's own.
+    pub fn open(self) -> Result<EdgeCache, Failure> {
+        let dir = self.cache.or_else(|| cache_folder(variable));
+        let advice = || Failure::Usage(anyhow!("neither XDG_CACHE_HOME nor HOME is set; give --cache DIR"));
+        Ok(EdgeCache::open(dir.ok_or_else(advice)?))
+    }
+}
+
+#[derive(Debug, Args)]
+pub struct ThreadArgs {
+    /// Threads that questions are worked on with [default: as many as there are cores].
+    #[arg(long, value_name = "N")]
+    pub threads: Option<NonZeroUsize>,
+}
+
+impl ThreadArgs {
+    /// Bounds the threads that questions are worked on with; once in a process.
+    pub fn apply(&self) -> Result<(), Failure> {
+        let Some(n) = self.threads else { return Ok(()) };
+        let built = rayon::ThreadPoolBuilder::new().num_threads(n.get()).build_global();
+        built.map_err(|e| Failure::Failed("threads", e.into()))
+    }
+}
+
+#[derive(Debug, Args)]
+pub struct ModelArgs {
+    /// Folder of the text model, with its model.toml, or name of a pulled model (`models list`) [default: the
+    /// built-in stand-in].
+    #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR")]
+    pub models: Option<PathBuf>,
+    #[command(flatten)]
+    pub how: RunArgs,
+}
+
+/// Joins a cache and a text model.
+pub fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
+    let (models, options) = text_model(models)?;
+    let text = TextService::open(&models, &options);
+    Ok(Engine::new(cache, text.map_err(|e| Failure::Failed("models", e.into()))?))
+}
+
+/// Returns the models that the text model is of, and how it is run.
+pub fn text_model(args: &ModelArgs) -> Result<(ModelDir, SessionOptions), Failure> {
+    let failed = Failure::of("models");
+    let models = model_commands::open(args.models.as_deref(), &variable);
+    let options = session_options(&args.how).map_err(|e| failed(e.into()))?;
+    Ok((models.map_err(|e| failed(e.into()))?, options))
+}
+
+/// Returns how models are run: one text at a time, with a few threads.
+pub fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
+    let exe = std::env::current_exe().unwrap_or_default();
+    let n_cores = std::thread::available_parallelism().map_or(1, usize::from);
+    how.session_options(&model_commands::runtime_folders(&exe), n_cores.min(MAX_MODEL_THREADS))
+}
+
+/// Reads an environment variable.
+pub fn variable(name: &str) -> Option<OsString> {
+    std::env::var_os(name)
+}

@@ -1,0 +1,138 @@
+//! Following a robot: `fetch --watch` and `serve --follow`.
+
+use std::io;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use anyhow::anyhow;
+use clap::Args;
+use slag_edge::fetch::FetchRequest;
+use slag_edge::fetch::follow::{FollowEnvironment, FollowSettings, Following, follow, read_positions};
+use slag_edge::http::App;
+use slag_edge::store::EdgeCache;
+
+use super::failure::Failure;
+use super::network::{failure, fetch_once, random};
+use super::output::print_json;
+use super::progress::{Bar, print_line};
+
+/// How a robot is followed.
+#[derive(Debug, Args)]
+pub struct FollowArgs {
+    /// When following: how much farther than the radius is fetched, world units [default: a quarter of
+    /// the radius].
+    #[arg(long, value_name = "D")]
+    pub margin: Option<f64>,
+    /// When following: seconds between fetches, at least.
+    #[arg(long, value_name = "S", default_value_t = 2)]
+    pub min_interval_secs: u64,
+    /// When following: seconds after which a robot that stays looks for a new generation; 0: never.
+    #[arg(long, value_name = "S", default_value_t = 300)]
+    pub refresh_secs: u64,
+}
+
+impl FollowArgs {
+    /// Returns the settings for a radius.
+    pub fn settings(&self, radius: f64) -> Result<FollowSettings, Failure> {
+        let margin = self.margin.unwrap_or(radius / 4.0);
+        if !(margin > 0.0 && margin.is_finite()) {
+            return Err(Failure::Usage(anyhow!("the margin is {margin}, it must be more than 0")));
+        }
+        Ok(FollowSettings {
+            radius,
+            margin,
+            min_interval: Duration::from_secs(self.min_interval_secs),
+            refresh: (self.refresh_secs > 0).then(|| Duration::from_secs(self.refresh_secs)),
+            ..FollowSettings::default()
+        })
+    }
+}
+
+/// Follows the positions on stdin until they end.
+pub fn watch(
+    cache: &EdgeCache,
+    request: &FetchRequest,
+    settings: FollowSettings,
+    cancel: &AtomicBool,
+    bar: &Bar,
+    json: bool,
+) -> Result<(), Failure> {
+    let following = Arc::<Following>::default();
+    if let Some(at) = request.at {
+        following.post(at);
+    }
+    let posting = Arc::clone(&following);
+    // Not joined: it may wait for a line that never comes.
+    std::thread::Builder::new().name("positions".into()).spawn(move || {
+        let read = read_positions(io::stdin().lock(), |line, position| match position {
+            Ok(position) => posting.post(position),
+            Err(error) => tracing::warn!("line {line}: {error}"),
+        });
+        if let Err(error) = read {
+            tracing::warn!("no more positions can be read: {error}");
+        }
+        posting.close();
+    })?;
+    let mut printed = Ok(());
+    let followed = follow(
+        cache,
+        request,
+        settings,
+        &following,
+        FollowEnvironment {
+            fetch: &mut |request| fetch_once(cache, request, cancel, bar),
+            tell: &mut |outcome| {
+                bar.finish();
+                let told = match outcome {
+                    Ok(report) if json => print_json(report),
+                    Ok(report) => print_line(report),
+                    Err(error) => {
+                        tracing::warn!("{}", slag_edge::error_line(error));
+                        Ok(())
+                    }
+                };
+                if told.is_err() {
+                    // Nobody reads any more.
+                    printed = told;
+                    cancel.store(true, Ordering::Relaxed);
+                }
+            },
+            random: &random,
+            cancel,
+        },
+    );
+    printed?;
+    followed.map_err(failure)
+}
+
+/// Follows the positions that the service is told, on a thread of its own, until the flag returned is set.
+pub fn follow_in_background(
+    request: FetchRequest,
+    settings: FollowSettings,
+    cache: EdgeCache,
+    following: Arc<Following>,
+    app: Arc<App>,
+) -> Result<Arc<AtomicBool>, Failure> {
+    let cancel = Arc::new(AtomicBool::new(false));
+    let stop = Arc::clone(&cancel);
+    std::thread::Builder::new().name("follow".into()).spawn(move || {
+        let environment = FollowEnvironment {
+            fetch: &mut |request| fetch_once(&cache, request, &stop, &()),
+            tell: &mut |outcome| match outcome {
+                Ok(report) => {
+                    let (n, generation) = (report.downloaded.n_shards, report.generation);
+                    tracing::info!("{n} shards of generation {generation} came in");
+                    app.reload_now();
+                }
+                Err(error) => tracing::warn!("{}", slag_edge::error_line(error)),
+            },
+            random: &random,
+            cancel: &stop,
+        };
+        if let Err(error) = follow(&cache, &request, settings, &following, environment) {
+            tracing::info!("no longer following: {error}");
+        }
+    })?;
+    Ok(cancel)
+}

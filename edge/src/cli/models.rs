@@ -1,0 +1,34 @@
+//! `models`.
+
+use std::io::{self, Write};
+
+use clap::Args;
+use slag_models::commands::{self as model_commands, ModelsCommand};
+
+use super::args::{session_options, variable};
+use super::failure::Failure;
+use super::output::print_json;
+
+#[derive(Debug, Args)]
+pub struct ModelsArgs {
+    #[command(subcommand)]
+    pub command: ModelsCommand,
+    /// Print the result as JSON.
+    #[arg(long, global = true)]
+    pub json: bool,
+}
+
+pub fn run(args: ModelsArgs) -> Result<(), Failure> {
+    let context = model_commands::Context {
+        variable: &variable,
+        image: None,
+        ask: &|question| !args.json && model_commands::ask(question),
+        session: &session_options,
+    };
+    let report = model_commands::run(&args.command, &context);
+    let report = report.map_err(|e| Failure::Failed("models", e.into()))?;
+    match args.json {
+        true => print_json(&report),
+        false => Ok(write!(io::stdout(), "{report}")?),
+    }
+}

@@ -1,0 +1,83 @@
+//! How fetches are shown: a progress line on the terminal, and reports.
+
+use std::io::{self, Write};
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use slag_edge::fetch::{DownloadFailure, FetchReport, Progress, Tally};
+
+use super::failure::Failure;
+use super::output::print_pairs;
+
+/// Prints the report of a fetch.
+pub fn print_report(report: &FetchReport) -> Result<(), Failure> {
+    let tally = |t: &Tally| format!("{} shards, {} bytes", t.n_shards, t.bytes);
+    let trust = match report.replaced_key {
+        _ if report.is_first_contact => " (first contact: compare it with the store's)",
+        Some(_) => " (took the place of the key before, which is no longer accepted)",
+        None => "",
+    };
+    print_pairs(&[
+        ("scene", report.scene.clone()),
+        ("generation", report.generation.to_string()),
+        ("encoder", format!("{} ({})", report.encoder_name, report.encoder_id)),
+        ("cells", format!("{} within {} of {}", report.n_cells, report.radius, report.centre_in_world)),
+        ("downloaded", format!("{} ({} of them resumed)", tally(&report.downloaded), report.resumed_bytes)),
+        ("kept", tally(&report.kept)),
+        ("spare", tally(&report.spare)),
+        ("freed", tally(&report.freed)),
+        ("seconds", format!("{:.2}", report.seconds)),
+        ("signed by", format!("{}{trust}", report.key)),
+    ])
+}
+
+/// Prints a fetch in one line, for a robot that is followed.
+pub fn print_line(report: &FetchReport) -> Result<(), Failure> {
+    let FetchReport { generation, n_cells, centre_in_world, downloaded, freed, .. } = report;
+    let (came, went) = (downloaded.n_shards, freed.n_shards);
+    writeln!(
+        io::stdout(),
+        "generation {generation}, {n_cells} cells around {centre_in_world}: {came} shards came, {went} went"
+    )?;
+    Ok(())
+}
+
+/// A line on the terminal that says how far the downloads are.
+#[derive(Default)]
+pub struct Bar {
+    shown: bool,
+    planned_bytes: AtomicU64,
+    received_bytes: AtomicU64,
+}
+
+impl Bar {
+    /// Makes a line that is shown, or none.
+    pub fn new(shown: bool) -> Self {
+        Self { shown, ..Self::default() }
+    }
+
+    /// Ends the line.
+    pub fn finish(&self) {
+        if self.shown && self.planned_bytes.load(Ordering::Relaxed) > 0 {
+            // Progress that cannot be shown is no reason to stop.
+            let _ = writeln!(io::stderr());
+        }
+    }
+}
+
+impl Progress for Bar {
+    fn planned(&self, _n_shards: usize, bytes: u64) {
+        self.planned_bytes.store(bytes, Ordering::Relaxed);
+    }
+
+    fn received(&self, bytes: u64) {
+        let received = self.received_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
+        let planned = self.planned_bytes.load(Ordering::Relaxed);
+        if self.shown {
+            let _ = write!(io::stderr(), "\r{:.1} of {:.1} MB ", received as f64 / 1e6, planned as f64 / 1e6);
+        }
+    }
+
+    fn retried(&self, url: &str, failure: &DownloadFailure) {
+        tracing::warn!("{url}: {failure}; trying again");
+    }
+}

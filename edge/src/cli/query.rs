@@ -1,0 +1,183 @@
+//! `query`.
+
+use std::io::{self, Write};
+
+use clap::Args;
+use glam::DVec3;
+use slag_common::frames::Aabb;
+use slag_edge::query::{
+    AnswerKind, Answers, DEFAULT_MIN_COUNT, Format, Found, Negatives, QueryRequest, Reply, ThresholdSource,
+    parse_box, parse_point,
+};
+use slag_edge::score::Precision;
+
+use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
+use super::failure::{Failure, store_failure};
+use super::text::{table, visible};
+
+#[derive(Debug, Args)]
+pub struct QueryArgs {
+    /// What to look for.
+    pub text: String,
+    /// What it is told from: none, canonical (object, things, stuff, texture), or phrases A,B,C.
+    #[arg(long, default_value = "none")]
+    pub negatives: Negatives,
+    /// Where the asker is, world frame: answers carry their distance and nearer ones rank higher.
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
+    pub near: Option<DVec3>,
+    /// Only within this distance of --near, world units.
+    #[arg(long, requires = "near")]
+    pub radius: Option<f64>,
+    /// Only between two corners of a box, world frame.
+    #[arg(long = "box", value_name = "X,Y,Z,X,Y,Z", value_parser = parse_box, allow_hyphen_values = true)]
+    pub bounds: Option<Aabb>,
+    /// Most answers [default: 10].
+    #[arg(long)]
+    pub limit: Option<usize>,
+    /// Cosine, or relevancy with negatives, from which a Gaussian matches [default: the scene's; 0.5].
+    #[arg(long, allow_hyphen_values = true)]
+    pub threshold: Option<f32>,
+    /// What answers are made of: objects, clusters or gaussians [default: objects where the scene has them, else
+    /// clusters].
+    #[arg(long)]
+    pub kind: Option<AnswerKind>,
+    /// Edge of the voxels that join Gaussians to clusters, world units [default: 0.25 m, or the scene's].
+    #[arg(long)]
+    pub voxel: Option<f64>,
+    /// Clusters with fewer Gaussians are dropped, and counted.
+    #[arg(long, default_value_t = DEFAULT_MIN_COUNT)]
+    pub min_count: u64,
+    /// Which data scores come from: rows, measured (embeddings only where the measured errors of their codes do
+    /// not decide) or exact.
+    #[arg(long, value_name = "NAME", default_value_t = Precision::Exact)]
+    pub precision: Precision,
+    #[command(flatten)]
+    pub threads: ThreadArgs,
+    #[command(flatten)]
+    pub cache: CacheArgs,
+    #[command(flatten)]
+    pub models: ModelArgs,
+    /// Print the answers as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+pub fn run(args: QueryArgs) -> Result<(), Failure> {
+    let request = QueryRequest {
+        texts: vec![args.text],
+        negatives: args.negatives,
+        limit: args.limit,
+        threshold: args.threshold,
+        near: args.near,
+        radius: args.radius,
+        bounds: args.bounds,
+        kind: args.kind,
+        voxel: args.voxel,
+        min_count: args.min_count,
+        precision: args.precision,
+    };
+    request.check().map_err(|e| Failure::Usage(e.into()))?;
+    args.threads.apply()?;
+    let engine = engine(args.cache.open()?, &args.models)?;
+    engine.reload().map_err(store_failure)?;
+    let reply = engine.answer(&request)?;
+    if args.json { write_json(reply) } else { print_reply(&reply) }
+}
+
+/// Prints a reply as one JSON object, piece by piece.
+fn write_json(reply: Reply) -> Result<(), Failure> {
+    let mut out = io::stdout().lock();
+    for piece in reply.pieces(Format::Json) {
+        out.write_all(&piece?)?;
+    }
+    Ok(writeln!(out)?)
+}
+
+/// Prints a reply's answers as tables, and what is to be known about them on stderr.
+fn print_reply(reply: &Reply) -> Result<(), Failure> {
+    reply.answers.iter().try_for_each(|answers| print_answers(reply, answers))
+}
+
+fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
+    if let Some(reason) = &answers.reason {
+        writeln!(io::stderr(), "{}", reason.detail)?;
+        return Ok(());
+    }
+    let exactness = match answers.is_exact {
+        true => "exactly".to_owned(),
+        false => match answers.score_error_p999 {
+            Some(p999) => {
+                format!("999 of 1,000 scores within ±{p999:.3}, all within ±{:.3}", answers.score_error_bound)
+            }
+            None => format!("scores within ±{:.3}", answers.score_error_bound),
+        },
+    };
+    let (n, threshold) = (answers.n_matching, answers.threshold);
+    let source = match answers.threshold_source {
+        ThresholdSource::Request => "as asked",
+        ThresholdSource::Scene => "calibrated on the scene",
+        ThresholdSource::Encoder => "the encoder's default",
+        ThresholdSource::Relevancy => "nearer than any negative",
+    };
+    let searched = answers.n_searched;
+    writeln!(io::stderr(), "{n} Gaussians of {searched} reach {threshold}, {source} ({exactness})")?;
+    if answers.area_fetched == Some(false) {
+        writeln!(io::stderr(), "part of that area is not on board: fetch it for a full answer")?;
+    }
+    let rows: Vec<Vec<String>> = match &answers.answers {
+        Found::Clusters(clusters) => clusters
+            .iter()
+            .map(|c| {
+                let size = format!("{:.2} x {:.2} x {:.2}", c.size.x, c.size.y, c.size.z);
+                let (score, n) = (format!("{:.3}", c.score), c.n_gaussians.to_string());
+                vec![
+                    c.rank.to_string(),
+                    distance(c.distance),
+                    point(c.position_in_world),
+                    size,
+                    score,
+                    n,
+                    match &c.evidence {
+                        Some(evidence) => format!("{} in {}", c.id, visible(&evidence.photo)),
+                        None => c.id.clone(),
+                    },
+                ]
+            })
+            .collect(),
+        Found::Gaussians(_) => reply
+            .gaussians(answers)
+            .into_iter()
+            .map(|g| {
+                let (score, id) = (format!("{:.3}", g.score), format!("{}-{}", g.cell_id, g.index));
+                vec![
+                    g.rank.to_string(),
+                    distance(g.distance),
+                    point(g.position_in_world),
+                    "-".into(),
+                    score,
+                    "1".into(),
+                    id,
+                ]
+            })
+            .collect(),
+    };
+    let unit = answers.unit;
+    let head = [
+        "rank",
+        &format!("distance [{unit}]"),
+        &format!("position [{unit}]"),
+        &format!("size [{unit}]"),
+        "score",
+        "count",
+        "id",
+    ];
+    Ok(write!(io::stdout(), "{}", table(&head, &rows))?)
+}
+
+fn point(p: DVec3) -> String {
+    format!("{:.2}, {:.2}, {:.2}", p.x, p.y, p.z)
+}
+
+fn distance(distance: Option<f64>) -> String {
+    distance.map_or_else(|| "-".to_owned(), |d| format!("{d:.2}"))
+}
