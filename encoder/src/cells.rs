@@ -16,7 +16,7 @@ const EXTENT_SIGMAS: f64 = 3.0;
 const MIN_GAUSSIANS_TO_NARROW: usize = 512;
 
 /// How large a cell may become.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct CellLimits {
     /// Gaussians a cell.
     pub max_gaussians: usize,

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, Result, anyhow};
+use anyhow::{Result, anyhow};
 use clap::{Args, ValueEnum};
 use slag_common::shard::Profile;
 
@@ -11,7 +11,6 @@ use super::common::{
     BackgroundArg, InputArgs, ModelArgs, available_threads, cancel_flag, now_unix_secs, open_models,
     parse_bytes, parse_error, print,
 };
-use super::preset::Preset;
 use super::refine::RefineArgs;
 use super::sam::SamArgs;
 use super::views::{ViewsArgs, parse_raster_width, parse_views_limit};
@@ -19,7 +18,8 @@ use crate::cells::CellLimits;
 use crate::codebook::CodebookSettings;
 use crate::encode::coverage::CoverageReport;
 use crate::encode::{
-    self, CellReport, EncodeSettings, EncodeSummary, Masks, RasterWidth, StageReport, ViewsLimit, ViewsReport,
+    self, CellReport, CellSettings, EncodeSettings, EncodeSummary, Engines, InputSettings, Masks,
+    OutputSettings, Preset, RasterWidth, RunSettings, StageReport, ViewSettings, ViewsLimit, ViewsReport,
 };
 use crate::progress::Progress;
 use crate::raster::WeightKind;
@@ -170,59 +170,69 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
         (dir, None) => Masks::Given { dir: dir.into(), ignore_ids: args.ignore_mask_ids.clone() },
     };
     Ok(EncodeSettings {
-        scene: args.input.scene.clone(),
-        views: args.input.views.clone(),
-        images: args.input.images.clone(),
-        masks,
-        store: args.store.clone(),
-        scene_name: args.name.clone().or(folder_name).unwrap_or_else(|| "scene".into()),
-        metric,
-        geo,
-        views_limit,
-        view_order: args.views.order(views_limit),
-        time_budget: args.views.time_budget,
-        raster_width: args.raster_width.unwrap_or(preset.raster_width),
-        background: args.background.map_or(preset.background, Into::into),
-        min_mask_px: args.min_mask_px.unwrap_or(preset.min_mask_px),
-        weights: args.weights.map_or(preset.weights, Into::into),
+        inputs: InputSettings {
+            scene: args.input.scene.clone(),
+            views: args.input.views.clone(),
+            images: args.input.images.clone(),
+            metric,
+            geo,
+        },
+        view: ViewSettings {
+            masks,
+            min_mask_px: args.min_mask_px.unwrap_or(preset.min_mask_px),
+            background: args.background.map_or(preset.background, Into::into),
+            raster_width: args.raster_width.unwrap_or(preset.raster_width),
+            weights: args.weights.map_or(preset.weights, Into::into),
+        },
         aggregation: args.refine.aggregation(preset.aggregation),
-        mask_noise: args.refine.mask_noise(),
-        keep_views: args.refine.keep_views,
-        threads: args.threads.map_or_else(available_threads, |n| n as usize),
-        memory_bytes: args.memory,
-        strict: args.input.strict,
-        restart: args.restart,
-        cells: CellLimits {
-            max_gaussians: args.cell_gaussians as usize,
-            max_width: metric.then_some(args.cell_width_m),
-        },
-        shards: ShardSettings {
-            profiles: args.profiles.clone(),
-            codebook: CodebookSettings {
-                compact_error: args.compact_error.unwrap_or(preset.codebook.compact_error),
-                balanced_error: args.balanced_error.unwrap_or(preset.codebook.balanced_error),
-                ..preset.codebook
+        cells: CellSettings {
+            limits: CellLimits {
+                max_gaussians: args.cell_gaussians as usize,
+                max_width: metric.then_some(args.cell_width_m),
             },
-            position_error: args
-                .position_error
-                .map_or_else(|| PositionError::default_for(metric), PositionError::Within),
+            shards: shard_settings(args, preset.codebook, metric),
+            objects: preset.objects && !args.objects.no_objects,
         },
-        objects: preset.objects && !args.objects.no_objects,
-        created_unix_secs,
-        expires_unix_secs: args.expires_days.map(|days| created_unix_secs + u64::from(days) * 86_400),
+        output: OutputSettings {
+            store: args.store.clone(),
+            scene_name: args.name.clone().or(folder_name).unwrap_or_else(|| "scene".into()),
+            created_unix_secs,
+            expires_unix_secs: args.expires_days.map(|days| created_unix_secs + u64::from(days) * 86_400),
+        },
+        run: RunSettings {
+            threads: args.threads.map_or_else(available_threads, |n| n as usize),
+            memory_bytes: args.memory,
+            views_limit,
+            view_order: args.views.order(views_limit),
+            time_budget: args.views.time_budget,
+            strict: args.input.strict,
+            restart: args.restart,
+            keep_views: args.refine.keep_views,
+        },
     })
+}
+
+fn shard_settings(args: &EncodeArgs, preset: CodebookSettings, metric: bool) -> ShardSettings {
+    ShardSettings {
+        profiles: args.profiles.clone(),
+        codebook: CodebookSettings {
+            compact_error: args.compact_error.unwrap_or(preset.compact_error),
+            balanced_error: args.balanced_error.unwrap_or(preset.balanced_error),
+            ..preset
+        },
+        position_error: args
+            .position_error
+            .map_or_else(|| PositionError::default_for(metric), PositionError::Within),
+    }
 }
 
 pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
     let settings = settings(args)?;
-    rayon::ThreadPoolBuilder::new()
-        .num_threads(settings.threads)
-        .build_global()
-        .context("cannot start threads")?;
     let (models, session) = open_models(&args.models)?;
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());
     let devices = Devices::open(args.device, GpuOptions::default())?;
-    let summary = encode::encode(&settings, &models, &session, &devices, progress, cancel_flag()?.as_ref())?;
+    let engines = Engines::new(&models, &session, &devices);
+    let summary = encode::encode(&settings, &engines, progress, cancel_flag()?.as_ref())?;
     let busy =
         summary.busy_secs.iter().map(|(stage, s)| format!("{stage} {s:.1}")).collect::<Vec<_>>().join(", ");
     let of_views: String = (summary.view_stages.iter())
@@ -264,7 +274,7 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
          seconds    {:.1}; by stage, all threads: {busy}\n\
          views took {:.1} s\n  stage    at once   seconds    busy\n{of_views}",
         summary.generation,
-        settings.store.display(),
+        settings.output.store.display(),
         summary.n_gaussians,
         summary.n_without_evidence,
         summary.n_rejected,

@@ -6,7 +6,6 @@ mod devices;
 mod encode;
 mod keys;
 mod models;
-pub mod preset;
 pub mod progress;
 #[cfg(feature = "qdrant")]
 mod push;

@@ -3,7 +3,6 @@
 use clap::Args;
 
 use crate::lift::Aggregation;
-use crate::segment::noise::MaskNoise;
 
 /// What is done beyond the preset's way to aggregate.
 #[derive(Clone, Debug, Default, Args)]
@@ -38,12 +37,6 @@ pub struct RefineArgs {
     /// Whether Gaussians without evidence take their superpoint's.
     #[arg(long, value_name = "BOOL")]
     fill: Option<bool>,
-    /// Lays errors over the masks, for experiments: 0 (none) to 3.
-    #[arg(long, value_name = "LEVEL", hide = true, value_parser = clap::value_parser!(u8).range(0..=3))]
-    mask_noise: Option<u8>,
-    /// Which errors.
-    #[arg(long, value_name = "N", hide = true, default_value_t = 1)]
-    noise_seed: u64,
     /// Keeps what the views left behind, so that another encode of the same, with another codebook say, is quick.
     #[arg(long)]
     pub keep_views: bool,
@@ -64,11 +57,6 @@ impl RefineArgs {
             coarse: self.coarse.unwrap_or(preset.coarse),
             fill: self.fill.unwrap_or(preset.fill),
         }
-    }
-
-    /// Returns the errors to lay over masks.
-    pub fn mask_noise(&self) -> Option<MaskNoise> {
-        self.mask_noise.map(|level| MaskNoise { level, seed: self.noise_seed })
     }
 }
 

@@ -43,7 +43,7 @@ pub enum EmbedError {
 }
 
 /// What a crop shows outside its mask.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum, serde::Serialize)]
 pub enum Background {
     /// White.
     White,

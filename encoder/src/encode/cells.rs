@@ -1,16 +1,18 @@
-//! From the contributions of all views to the objects of every cell, within the budget.
+//! The third step: the contributions of all views become objects, fields and shards of every cell.
 
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use slag_common::manifest::{Calibration, CellRecord, ShardRecord};
 use slag_common::shard::Profile;
-use slag_common::{Gaussians, Hash32, View};
-use slag_models::ModelDir;
+use slag_common::{Hash32, View};
 
-use super::job::Job;
-use super::{EncodeError, EncodeSettings, StageTimes};
-use crate::cells::CellSplit;
+use super::context::RunContext;
+use super::error::EncodeError;
+use super::job::ViewRecord;
+use super::memory::Phase;
+use super::plan::Plan;
+use super::report::ViewsReport;
+use super::views::DoneViews;
 use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
 use crate::lift::photos::{self, Photo};
 use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS, extra_field};
@@ -19,59 +21,33 @@ use crate::lift::{
     Aggregation, CellField, ContributionError, ContributionIndex, PartContributions, RegionTable,
 };
 use crate::objects::{self, ObjectsReport, SceneObjects};
-use crate::progress::Progress;
 use crate::shard::{self, BuiltShard, CellEmbeddings};
-use crate::store::{Extras, Store};
+use crate::store::Extras;
 
-/// Returns the bytes that the largest cell takes while it is built.
-pub(super) fn largest_cell_bytes(split: &CellSplit, dim: usize) -> u64 {
-    let largest = split.cells.iter().map(|cell| cell.gaussians.len()).max().unwrap_or(0);
-    shard::working_bytes(largest, dim)
-}
-
-/// Returns what cell and index leave of `available_bytes` for contributions, which need at least `contributions_bytes`.
-pub(super) fn check_memory(
-    available_bytes: u64,
-    cell_bytes: u64,
-    index_bytes: u64,
-    contributions_bytes: u64,
-) -> Result<u64, EncodeError> {
-    let needed_bytes = cell_bytes + index_bytes + contributions_bytes;
-    if needed_bytes > available_bytes {
-        return Err(EncodeError::Memory { available_bytes, needed_bytes, cell_bytes, index_bytes });
-    }
-    Ok(available_bytes - cell_bytes - index_bytes)
-}
-
-/// Builds the cells of a scene whose views are all done.
-pub(super) struct CellBuilder<'a> {
-    settings: &'a EncodeSettings,
-    store: &'a Store,
-    scene: &'a Gaussians,
-    split: &'a CellSplit,
-    encoder_id: Hash32,
-    times: &'a StageTimes,
-    index: ContributionIndex,
-    table: RegionTable,
-    /// What errors of scores are measured by.
-    score_context: ScoreMetricContext,
-    /// Bytes there are for the contributions of a group of cells.
-    group_bytes: u64,
-    /// Each view's masks in its photo.
-    photos: Vec<Photo>,
-}
-
-/// What was built.
+/// The cells of a scene, all objects of them in the store.
 pub(super) struct BuiltCells {
+    /// Manifest records, by cell.
     pub(super) records: Vec<CellRecord>,
-    /// Half bytes a Gaussian of each cell's residual code.
+    /// Subspaces of each cell's residual code.
     pub(super) n_subspaces: Vec<u32>,
+    /// Contributions of each cell.
+    pub(super) n_entries: Vec<u64>,
     pub(super) extras: Extras,
     pub(super) n_without_evidence: u64,
-    /// Sums over the Gaussians with evidence of mean score and mean squared score, and how many they are.
-    score_sums: [f64; 3],
-    /// What was found, where objects were looked for.
+    /// The search for objects, if there was one.
     pub(super) objects: Option<ObjectsReport>,
+    pub(super) counts: Counts,
+    /// Sums over the Gaussians with evidence of mean score and mean squared score, and their number.
+    score_sums: [f64; 3],
+}
+
+/// The size of what the views found.
+pub(super) struct Counts {
+    pub(super) n_views_without_masks: usize,
+    pub(super) n_masks: usize,
+    pub(super) n_regions: usize,
+    pub(super) n_entries: u64,
+    pub(super) views: ViewsReport,
 }
 
 impl BuiltCells {
@@ -84,151 +60,187 @@ impl BuiltCells {
     }
 }
 
+/// Builds all cells and puts their objects into the store.
+///
+/// # Errors
+/// [`EncodeError`].
+pub(super) fn build_cells(
+    plan: &Plan<'_>,
+    views: &DoneViews<'_>,
+    context: &RunContext<'_>,
+) -> Result<BuiltCells, EncodeError> {
+    let bank = text_bank(plan, context);
+    let mut builder = CellBuilder::open(plan, views, bank, context)?;
+    context.progress().begin("cells", "cell", plan.inputs.split.cells.len() as u64, 0);
+    let built = builder.build(views)?;
+    context.progress().end();
+    built.ok_or(EncodeError::Interrupted { n_done: views.used.len(), n_views: views.used.len() })
+}
+
+/// Returns texts that queries are expected to be like.
+fn text_bank(plan: &Plan<'_>, context: &RunContext<'_>) -> TextBank {
+    let models = plan.engines.models;
+    context.time("texts", || match models.text_encoder(plan.engines.session) {
+        Ok(mut encoder) => TextBank::of_model(&mut *encoder),
+        Err(e) => {
+            tracing::warn!("{e}; codebooks are made for queries in all directions alike");
+            TextBank::directions(models.dim())
+        }
+    })
+}
+
+/// Returns the cost of the used views.
+fn views_report(views: &DoneViews<'_>, index: &ContributionIndex) -> ViewsReport {
+    let record = |view: &&View| -> ViewRecord { views.records.get(&view.name).copied().unwrap_or_default() };
+    let used = &views.used;
+    ViewsReport {
+        view: used.iter().map(|view| view.name.clone()).collect(),
+        raster_width_px: used.iter().map(|view| record(view).raster_width_px).collect(),
+        n_masks: index.n_masks_of_view().collect(),
+        n_regions: index.n_regions_of_view().collect(),
+        n_entries: index.n_entries_of_view().collect(),
+        secs: used.iter().map(|view| (f64::from(record(view).secs) * 1e3).round() / 1e3).collect(),
+    }
+}
+
+/// Builds the cells of a scene whose views are all done.
+struct CellBuilder<'a> {
+    plan: &'a Plan<'a>,
+    context: &'a RunContext<'a>,
+    encoder_id: Hash32,
+    index: ContributionIndex,
+    table: RegionTable,
+    /// What errors of scores are measured by.
+    score_context: ScoreMetricContext,
+    /// Bytes for the contributions of a group of cells.
+    group_bytes: u64,
+    /// Each view's masks in its photo.
+    photos: Vec<Photo>,
+}
+
 impl<'a> CellBuilder<'a> {
-    /// Opens what the job keeps of some views, in the order of their names.
+    /// Opens the contributions of the used views and checks the budget against them.
     ///
     /// # Errors
-    /// [`EncodeError::Sums`], [`EncodeError::Memory`].
-    pub(super) fn open(
-        settings: &'a EncodeSettings,
-        store: &'a Store,
-        scene: &'a Gaussians,
-        split: &'a CellSplit,
-        (job, views): (&Job<'_>, &[&View]),
-        (models, bank): (&ModelDir, TextBank),
-        times: &'a StageTimes,
+    /// [`EncodeError::Contributions`], [`EncodeError::Memory`].
+    fn open(
+        plan: &'a Plan<'a>,
+        views: &DoneViews<'_>,
+        bank: TextBank,
+        context: &'a RunContext<'a>,
     ) -> Result<Self, EncodeError> {
-        let n_gaussians: Vec<usize> = split.cells.iter().map(|cell| cell.gaussians.len()).collect();
-        let contributions_paths: Vec<PathBuf> =
-            views.iter().map(|view| job.contributions_path(&view.name)).collect();
-        let (index, mut table) = times
-            .time("merge", || ContributionIndex::open(&contributions_paths, models.dim(), &n_gaussians))?;
+        let (models, job) = (plan.engines.models, &plan.job);
+        let n_gaussians: Vec<usize> =
+            plan.inputs.split.cells.iter().map(|cell| cell.gaussians.len()).collect();
+        let paths: Vec<PathBuf> = views.used.iter().map(|view| job.contributions_path(&view.name)).collect();
+        let (index, mut table) =
+            context.time("merge", || ContributionIndex::open(&paths, models.dim(), &n_gaussians))?;
         let photo = |(view, n_masks): (&&View, usize)| -> Result<Photo, ContributionError> {
             let outlines = photos::read_outlines(&job.outlines_path(&view.name), n_masks)?;
             Ok(Photo { name: view.name.clone(), outlines })
         };
         let photos: Vec<Photo> =
-            views.iter().zip(index.n_masks_of_view()).map(photo).collect::<Result<_, _>>()?;
+            views.used.iter().zip(index.n_masks_of_view()).map(photo).collect::<Result<_, _>>()?;
         let levels = photos.iter().flat_map(|photo| &photo.outlines).map(|outline| outline.level as u8);
         table.set_levels(levels.collect());
-        let group_bytes = check_memory(
-            settings.memory_bytes,
-            largest_cell_bytes(split, models.dim()),
-            table.len_bytes()
-                + index.len_bytes()
-                + Refinement::len_bytes(&settings.aggregation, scene.len(), table.len()),
-            index.largest_part_bytes(),
-        )?;
-        let encoder_id = Hash32(models.encoder_id().hash());
-        let score_context = times.time("texts", || {
+        let mut memory = plan.memory.clone();
+        memory.views_are_done();
+        memory.reserve(Phase::Always, "masks and regions of all views", table.len_bytes());
+        memory.reserve(Phase::Always, "the index of contributions", index.len_bytes());
+        let of_regions = Refinement::len_bytes(&plan.settings.aggregation, 0, table.len());
+        memory.reserve(Phase::Always, "agreement of masks", of_regions);
+        let group_bytes = memory.rest(index.largest_part_bytes())?;
+        let score_context = context.time("texts", || {
             let metric = ScoreMetric::new(models.dim(), &bank);
             let spread = metric.spread(table.mask_vectors());
             ScoreMetricContext { metric, bank, spread }
         });
-        Ok(Self {
-            settings,
-            store,
-            scene,
-            split,
-            encoder_id,
-            times,
-            index,
-            table,
-            score_context,
-            group_bytes,
-            photos,
-        })
+        let encoder_id = Hash32(models.encoder_id().hash());
+        Ok(Self { plan, context, encoder_id, index, table, score_context, group_bytes, photos })
     }
 
-    /// Finds the objects of the scene, where they are asked for; none if cancelled.
-    fn objects(&self, cancel: &AtomicBool) -> Result<Option<SceneObjects>, EncodeError> {
-        if !self.settings.objects {
+    /// Finds the objects of the scene if the settings ask for them; `None` if cancelled, too.
+    fn objects(&self) -> Result<Option<SceneObjects>, EncodeError> {
+        if !self.plan.settings.cells.objects {
             return Ok(None);
         }
         let scene = objects::Scene {
             index: &self.index,
             table: &self.table,
-            gaussians: self.scene,
-            split: self.split,
+            gaussians: &self.plan.inputs.scene,
+            split: &self.plan.inputs.split,
             photos: &self.photos,
             score_context: &self.score_context,
             group_bytes: self.group_bytes,
-            cancel,
+            cancel: self.context.cancel(),
         };
-        Ok(self.times.time("objects", || objects::find(&scene))?)
+        Ok(self.context.time("objects", || objects::find(&scene))?)
     }
 
-    pub(super) fn index(&self) -> &ContributionIndex {
-        &self.index
+    /// Returns the size of what the views found, before refinement adds superpoints to the regions.
+    fn counts(&self, views: &DoneViews<'_>) -> Counts {
+        Counts {
+            n_views_without_masks: self.index.n_views_without_masks(),
+            n_masks: self.table.n_masks(),
+            n_regions: self.table.len(),
+            n_entries: self.index.n_entries(),
+            views: views_report(views, &self.index),
+        }
     }
 
-    pub(super) fn n_views_without_masks(&self) -> usize {
-        self.index.n_views_without_masks()
-    }
-
-    pub(super) fn n_masks(&self) -> usize {
-        self.table.n_masks()
-    }
-
-    pub(super) fn n_regions(&self) -> usize {
-        self.table.len()
-    }
-
-    pub(super) fn n_entries(&self) -> u64 {
-        self.index.n_entries()
-    }
-
-    /// Builds all cells and puts their objects into the store; `None` if cancelled.
+    /// Finds objects, refines the contributions and builds the cells one by one; `None` if cancelled.
     ///
     /// # Errors
     /// [`EncodeError`].
-    pub(super) fn build(
-        &mut self,
-        progress: &dyn Progress,
-        cancel: &AtomicBool,
-    ) -> Result<Option<BuiltCells>, EncodeError> {
+    fn build(&mut self, views: &DoneViews<'_>) -> Result<Option<BuiltCells>, EncodeError> {
+        let Plan { inputs, store, settings, .. } = *self.plan;
+        let mut n_entries = vec![0; inputs.split.cells.len()];
+        self.index.parts().iter().for_each(|part| n_entries[part.cell_id as usize] += part.n_entries);
         let mut built = BuiltCells {
             records: Vec::new(),
             n_subspaces: Vec::new(),
+            n_entries,
             extras: Extras::new(),
             n_without_evidence: 0,
-            score_sums: [0.0; 3],
             objects: None,
+            counts: self.counts(views),
+            score_sums: [0.0; 3],
         };
-        // Of the masks as they are, before any counts less.
-        let objects = self.objects(cancel)?;
-        let aggregation = self.settings.aggregation;
-        let refinement = self.times.time("refine", || {
+        // Objects are found from all masks alike, before refinement gives some less weight.
+        let objects = self.objects()?;
+        let aggregation = settings.aggregation;
+        let refinement = self.context.time("refine", || {
             let contributions = (&self.index, &mut self.table);
-            let scene = (self.scene, self.split);
+            let scene = (&inputs.scene, &inputs.split);
+            let cancel = self.context.cancel();
             Refinement::prepare(aggregation, contributions, scene, &self.photos, self.group_bytes, cancel)
         })?;
-        if cancel.load(Ordering::Relaxed) {
+        if self.context.is_cancelled() {
             return Ok(None);
         }
         if aggregation != Aggregation::PAPER {
             let record = serde_json::to_vec(&aggregation).map_err(std::io::Error::from)?;
-            built.extras.insert(EXTRA_AGGREGATION.into(), self.store.put_bytes(&record)?.0);
+            built.extras.insert(EXTRA_AGGREGATION.into(), store.put_bytes(&record)?.0);
         }
-        let regions = self.store.put_object(|out| self.table.write(out))?.0;
+        let regions = store.put_object(|out| self.table.write(out))?.0;
         built.extras.insert(EXTRA_REGIONS.into(), regions);
         let dim = self.table.dim();
         let mut cell = CellEmbeddings { dim, vectors: Vec::new(), has_evidence: Vec::new() };
         for group in self.index.groups(self.group_bytes) {
-            let contributions = self.times.time("merge", || {
+            let contributions = self.context.time("merge", || {
                 let raw = self.index.read(group)?;
                 self.index.transpose(&raw, &self.table)
             })?;
             for contributions in contributions {
-                if cancel.load(Ordering::Relaxed) {
+                if self.context.is_cancelled() {
                     return Ok(None);
                 }
                 let cell_id = contributions.part.cell_id;
                 self.add_part(contributions, refinement.as_ref(), &mut cell, &mut built)?;
-                if cell.has_evidence.len() == self.split.cells[cell_id as usize].gaussians.len() {
+                if cell.has_evidence.len() == inputs.split.cells[cell_id as usize].gaussians.len() {
                     self.finish_cell(cell_id, &cell, objects.as_ref(), &mut built)?;
                     cell.has_evidence.clear();
-                    progress.advance(1);
+                    self.context.progress().advance(1);
                 }
             }
         }
@@ -245,25 +257,25 @@ impl<'a> CellBuilder<'a> {
         built: &mut BuiltCells,
     ) -> Result<(), EncodeError> {
         let part = contributions.part.clone();
-        let gaussians = &self.split.cells[part.cell_id as usize].gaussians;
-        // Nothing is copied or cleared: the largest cell's vectors are taken once.
+        let gaussians = &self.plan.inputs.split.cells[part.cell_id as usize].gaussians;
+        // The vectors of the largest cell are allocated once; they are neither copied nor cleared.
         let len = cell.vectors.len().max(gaussians.len() * cell.dim);
         cell.vectors.reserve_exact(len - cell.vectors.len());
         cell.vectors.resize(len, 0.0);
         let vectors = &mut cell.vectors[part.locals.start * cell.dim..part.locals.end * cell.dim];
-        let field = self.times.time("lift", || {
+        let field = self.context.time("lift", || {
             if let Some(refinement) = refinement {
                 refinement.apply(&mut contributions, &gaussians[part.locals.clone()]);
             }
             CellField::new(gaussians[part.locals.clone()].to_vec(), contributions, &self.table, vectors)
         });
         cell.has_evidence.extend((0..field.len()).map(|k| field.has_evidence(k)));
-        let (hash, _) = self.times.time("write", || self.store.put_object(|out| field.write(out)))?;
+        let (hash, _) = self.context.time("write", || self.plan.store.put_object(|out| field.write(out)))?;
         built.extras.insert(extra_field(part.cell_id, part.number), hash);
         Ok(())
     }
 
-    /// Makes a cell's codebook and shards of its embeddings.
+    /// Makes a cell's codebook and shards from its embeddings.
     fn finish_cell(
         &self,
         cell_id: u32,
@@ -271,13 +283,14 @@ impl<'a> CellBuilder<'a> {
         objects: Option<&SceneObjects>,
         built: &mut BuiltCells,
     ) -> Result<(), EncodeError> {
-        let cell = &self.split.cells[cell_id as usize];
-        let (scene, encoder_id, settings) = (self.scene, self.encoder_id, &self.settings.shards);
-        let made = self.times.time("codebook", || {
+        let cell = &self.plan.inputs.split.cells[cell_id as usize];
+        let (scene, settings) = (&self.plan.inputs.scene, &self.plan.settings.cells.shards);
+        let encoder_id = self.encoder_id;
+        let made = self.context.time("codebook", || {
             shard::build(scene, cell_id, cell, embeddings, encoder_id, &self.score_context, settings, objects)
         });
         let record = |shard: &BuiltShard| -> Result<(Profile, ShardRecord), EncodeError> {
-            let (hash, len_bytes) = self.times.time("write", || self.store.put_bytes(&shard.bytes))?;
+            let (hash, len_bytes) = self.context.time("write", || self.plan.store.put_bytes(&shard.bytes))?;
             let record = ShardRecord {
                 hash,
                 len_bytes,
@@ -301,20 +314,5 @@ impl<'a> CellBuilder<'a> {
             shards,
         });
         Ok(())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_budget_that_is_too_small_is_refused_with_what_is_needed() {
-        assert_eq!(check_memory(100, 50, 20, 30).expect("enough"), 30);
-        let message = check_memory(99, 50, 20, 30).expect_err("too small").to_string();
-        assert!(
-            message.contains("99 bytes, 100 are needed: 50") && message.contains("raise --memory"),
-            "{message}"
-        );
     }
 }

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
 
-use super::EncodeError;
+use super::error::EncodeError;
 use crate::lift::ViewContributions;
 use crate::lift::photos::{self, MaskOutline};
 use crate::store::Store;

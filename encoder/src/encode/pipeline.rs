@@ -11,7 +11,7 @@ use std::panic::{self, AssertUnwindSafe};
 use std::sync::{Condvar, Mutex, PoisonError};
 use std::time::Instant;
 
-use serde::Serialize;
+use super::report::StageReport;
 
 /// A stage of the pipeline.
 #[derive(Clone, Debug)]
@@ -21,19 +21,6 @@ pub(super) struct Stage {
     pub(super) n_slots: usize,
     /// Whether it keeps a core busy, rather than a GPU or a disk.
     pub(super) on_cpu: bool,
-}
-
-/// How busy a stage was.
-#[derive(Clone, Debug, Serialize)]
-pub struct StageReport {
-    /// The stage.
-    pub stage: String,
-    /// Views that it could take at once.
-    pub n_slots: usize,
-    /// Seconds of work, added over the slots.
-    pub busy_secs: f64,
-    /// Share of the time that its slots were busy on average, 0 to 1.
-    pub busy_share: f64,
 }
 
 struct State<S, T, E> {

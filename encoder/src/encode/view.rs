@@ -1,46 +1,40 @@
-//! One view through the stages.
+//! The stages of one view: decode, (depth,) segment, crop, embed, raster, write.
 
 use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::Instant;
 
 use slag_common::{Intrinsics, View};
 use slag_models::preprocess::Preprocess;
-use slag_models::{Crop, ImageEncoder, ModelDir, SessionOptions};
+use slag_models::{Crop, ImageEncoder};
 
-use super::job::{Job, ViewRecord};
+use super::context::RunContext;
+use super::error::EncodeError;
+use super::job::ViewRecord;
 use super::pipeline::Stage;
+use super::plan::Plan;
 use super::settings::{LONG_BORDERS, MAX_RASTER_WIDTH_PX, RasterWidth};
-use super::{EncodeError, EncodeSettings};
-use crate::cells::CellSplit;
 use crate::embed;
 use crate::ingest::{self, LoadedImage};
 use crate::lift::ViewContributions;
 use crate::lift::photos::MaskOutline;
 use crate::masks::regions::{absorb_slivers, border_share, partition};
 use crate::masks::{Mask, RegionMap};
-use crate::progress::Progress;
-use crate::raster::{LoadedScene, RasterError, RasterView};
-use crate::segment::{SegmentInput, Segmenter};
+use crate::raster::{RasterError, RasterView};
+use crate::segment::SegmentInput;
 
-/// Views at once in a GPU's image encoder: one is computed while others' pixel values are made and copied.
+/// Views at once in a GPU's image encoder: one is computed while the pixel values of others are made and copied.
 const GPU_EMBED_SLOTS: usize = 3;
 
-/// What every view needs.
+/// The stages of a view, with what every view needs.
 pub(super) struct ViewStages<'a> {
-    pub(super) settings: &'a EncodeSettings,
-    pub(super) scene: &'a dyn LoadedScene,
-    pub(super) split: &'a CellSplit,
-    pub(super) segmenter: &'a dyn Segmenter,
-    pub(super) models: &'a ModelDir,
-    pub(super) session: &'a SessionOptions,
-    /// What the image model really runs on, once it is open.
-    pub(super) images_on: OnceLock<Option<String>>,
-    pub(super) job: &'a Job<'a>,
-    pub(super) progress: &'a dyn Progress,
-    /// How crops become the image encoder's squares, where it takes any.
-    pub(super) preprocess: Option<Preprocess>,
+    plan: &'a Plan<'a>,
+    context: &'a RunContext<'a>,
+    /// How crops become the image encoder's squares; `None` if it takes crops of any size.
+    preprocess: Option<Preprocess>,
     /// Image encoders that are not at work; opened as they are needed.
-    pub(super) encoders: Mutex<Vec<Box<dyn ImageEncoder>>>,
+    encoders: Mutex<Vec<Box<dyn ImageEncoder>>>,
+    /// The device that runs the image model, once it is open.
+    images_on: OnceLock<Option<String>>,
 }
 
 /// A view between two stages, with what the next one needs.
@@ -62,23 +56,22 @@ enum Next {
     Write(ViewContributions, Vec<MaskOutline>, u32),
 }
 
-/// What is to be embedded.
+/// The crops to embed.
 #[expect(clippy::large_enum_variant, reason = "a handful at a time, moved a few times a view")]
 enum Crops {
     /// Squares of the model's size.
     Squares(Vec<Crop>),
-    /// Of a model that takes crops of any size: they are cut a batch at a time.
+    /// For a model that takes crops of any size: they are cut a batch at a time.
     Uncut(LoadedImage, Vec<Mask>),
 }
 
-/// The regions of a view, and the masks of each.
+/// The regions of a view, the masks that cover each, and the outlines of masks.
 struct Partition {
     raster_view: RasterView,
     regions: RegionMap,
     masks_of_region: Vec<Vec<u32>>,
-    /// Of each mask.
     outlines: Vec<MaskOutline>,
-    /// Pixels of the base width in one of the raster: a view does not count more for being finer.
+    /// Pixels of the base width in one of the raster, so that a finer view does not count more.
     weight_scale: f32,
 }
 
@@ -92,56 +85,70 @@ impl<'v> Work<'v> {
     }
 }
 
-impl ViewStages<'_> {
+impl<'a> ViewStages<'a> {
+    /// Makes the stages; models are opened when the first view needs them.
+    pub(super) fn new(plan: &'a Plan<'a>, context: &'a RunContext<'a>) -> Self {
+        let preprocess = plan.engines.models.preprocess();
+        Self { plan, context, preprocess, encoders: Mutex::default(), images_on: OnceLock::new() }
+    }
+
+    /// Returns the device that ran the image model, if it ran.
+    pub(super) fn images_on(&self) -> Option<String> {
+        self.images_on.get().cloned().flatten()
+    }
+
     /// Returns the stages, in the order in which [`Self::step`] goes through them.
     pub(super) fn stages(&self) -> Vec<Stage> {
-        let n_cores = self.settings.threads.max(1);
+        let n_cores = self.plan.settings.run.threads;
         let on_cpu = |name| Stage { name, n_slots: n_cores, on_cpu: true };
         let on_device = |name, n_slots: Option<usize>| match n_slots {
             Some(n_slots) => Stage { name, n_slots, on_cpu: false },
             None => on_cpu(name),
         };
-        let embed_slots = (!self.session.is_on_cpu()).then_some(GPU_EMBED_SLOTS);
+        let embed_slots = (!self.plan.engines.session.is_on_cpu()).then_some(GPU_EMBED_SLOTS);
         let mut stages = vec![on_cpu("decode")];
-        if self.segmenter.wants_depth() {
-            stages.push(on_device("depth", self.scene.n_lanes()));
+        if self.plan.segmenter.wants_depth() {
+            stages.push(on_device("depth", self.plan.scene.n_lanes()));
         }
         stages.extend([
-            on_device("segment", self.segmenter.n_lanes()),
+            on_device("segment", self.plan.segmenter.n_lanes()),
             on_cpu("crop"),
             on_device("embed", embed_slots),
-            on_device("raster", self.scene.n_lanes()),
+            on_device("raster", self.plan.scene.n_lanes()),
             on_device("write", Some(1)),
         ]);
         stages
     }
 
-    /// Does the next stage's work.
+    /// Does the work of the view's next stage.
     pub(super) fn step<'v>(&self, work: Work<'v>) -> Result<Option<Work<'v>>, EncodeError> {
         let start = Instant::now();
         let view = work.view;
         let raster_failed = |source: RasterError| EncodeError::Raster { view: view.name.clone(), source };
         let next = match work.next {
             Next::Decode => match ingest::load_image(view)? {
-                loaded if self.segmenter.wants_depth() => Next::Depth(loaded),
+                loaded if self.plan.segmenter.wants_depth() => Next::Depth(loaded),
                 loaded => Next::Segment(loaded, None),
             },
             Next::Depth(loaded) => {
                 let raster_view = raster_view(&loaded, self.base_width_px(&loaded));
-                let drawing = self.scene.draw(&raster_view, [0.0; 3]).map_err(raster_failed)?;
+                let drawing = self.plan.scene.draw(&raster_view, [0.0; 3]).map_err(raster_failed)?;
                 let depth = enlarge(&drawing.depth, &raster_view, &loaded);
                 Next::Segment(loaded, Some(depth))
             }
             Next::Segment(loaded, depth) => {
-                let mut masks = self.segmenter.segment(&SegmentInput::new(&loaded, depth.as_deref()))?;
-                masks.retain(|mask| mask.area_px >= self.settings.min_mask_px);
+                let mut masks = self.plan.segmenter.segment(&SegmentInput::new(&loaded, depth.as_deref()))?;
+                if let Some(perturbation) = self.plan.engines.perturbation {
+                    masks = perturbation.masks(&view.name, masks, loaded.image.dimensions().into());
+                }
+                masks.retain(|mask| mask.area_px >= self.plan.settings.view.min_mask_px);
                 Next::Crop(loaded, masks)
             }
             Next::Crop(loaded, masks) => {
                 let partition = self.partition(&loaded, &masks);
                 let crops = match &self.preprocess {
                     Some(preprocess) => Crops::Squares(
-                        embed::squares(&loaded.image, &masks, self.settings.background, preprocess)
+                        embed::squares(&loaded.image, &masks, self.plan.settings.view.background, preprocess)
                             .map_err(|source| EncodeError::Embed { view: view.name.clone(), source })?,
                     ),
                     None => Crops::Uncut(loaded, masks),
@@ -150,36 +157,42 @@ impl ViewStages<'_> {
             }
             Next::Embed(crops, partition) => {
                 let mut vectors = self.embed(view, &crops)?;
-                if let Some(noise) = &self.settings.mask_noise {
-                    noise.turn_vectors(&view.name, &mut vectors, self.models.dim());
+                if let Some(perturbation) = self.plan.engines.perturbation {
+                    perturbation.vectors(&view.name, &mut vectors, self.plan.engines.models.dim());
                 }
                 Next::Raster(vectors, partition)
             }
             Next::Raster(vectors, partition) => {
                 let Partition { raster_view, regions, masks_of_region, outlines, weight_scale } = partition;
                 let mut weights = self
+                    .plan
                     .scene
-                    .weights(&raster_view, &regions, self.settings.weights)
+                    .weights(&raster_view, &regions, self.plan.settings.view.weights)
                     .map_err(raster_failed)?;
                 weights.entries.iter_mut().for_each(|entry| entry.weight *= weight_scale);
-                let dim = self.models.dim();
-                let contributions =
-                    ViewContributions::new(&weights.entries, masks_of_region, vectors, dim, self.split);
+                let dim = self.plan.engines.models.dim();
+                let contributions = ViewContributions::new(
+                    &weights.entries,
+                    masks_of_region,
+                    vectors,
+                    dim,
+                    &self.plan.inputs.split,
+                );
                 Next::Write(contributions, outlines, raster_view.intrinsics.width_px)
             }
             Next::Write(contributions, outlines, raster_width_px) => {
                 let record = ViewRecord { raster_width_px, secs: work.secs };
-                self.job.keep(&view.name, &contributions, &outlines, record)?;
-                self.progress.advance(1);
+                self.plan.job.keep(&view.name, &contributions, &outlines, record)?;
+                self.context.progress().advance(1);
                 return Ok(None);
             }
         };
         Ok(Some(Work { view, next, secs: work.secs + start.elapsed().as_secs_f32() }))
     }
 
-    /// Returns the width of the raster where nothing of the view's content is known.
+    /// Returns the width of the raster before the view's content is known.
     fn base_width_px(&self, loaded: &LoadedImage) -> u32 {
-        match self.settings.raster_width {
+        match self.plan.settings.view.raster_width {
             RasterWidth::Px(width_px) => width_px,
             RasterWidth::ByContent | RasterWidth::Photo => {
                 loaded.view.intrinsics.width_px.min(MAX_RASTER_WIDTH_PX)
@@ -187,7 +200,7 @@ impl ViewStages<'_> {
         }
     }
 
-    /// Makes the regions of a view's masks, finer where their borders are long, if that is asked for.
+    /// Makes the regions of a view's masks: on a finer raster where their borders are long, if the settings ask for it.
     fn partition(&self, loaded: &LoadedImage, masks: &[Mask]) -> Partition {
         let regions_at = |width_px| {
             let raster_view = raster_view(loaded, width_px);
@@ -201,8 +214,10 @@ impl ViewStages<'_> {
         let base_px = self.base_width_px(loaded);
         let mut made = regions_at(base_px);
         let mut width_px = base_px;
-        // Twice: pixels stay in step with those of the photo, whose masks then are just as they are.
-        if self.settings.raster_width == RasterWidth::ByContent && border_share(&made.1) > LONG_BORDERS {
+        // Twice the width keeps pixels in step with those of the photo, so that masks keep their outlines.
+        if self.plan.settings.view.raster_width == RasterWidth::ByContent
+            && border_share(&made.1) > LONG_BORDERS
+        {
             width_px = 2 * base_px;
             made = regions_at(width_px);
         }
@@ -214,7 +229,7 @@ impl ViewStages<'_> {
         Partition { raster_view, regions, masks_of_region, outlines, weight_scale }
     }
 
-    /// Returns a vector per mask, with an encoder that is free or a new one.
+    /// Returns a vector per mask, from an idle encoder or a new one.
     fn embed(&self, view: &View, crops: &Crops) -> Result<Vec<f32>, EncodeError> {
         if matches!(crops, Crops::Squares(crops) if crops.is_empty()) {
             return Ok(Vec::new());
@@ -223,13 +238,13 @@ impl ViewStages<'_> {
         let free = encoders().pop();
         let mut encoder = match free {
             Some(encoder) => encoder,
-            None => self.models.image_encoder(self.session)?,
+            None => self.plan.engines.models.image_encoder(self.plan.engines.session)?,
         };
         self.images_on.get_or_init(|| encoder.placement().map(ToString::to_string));
         let vectors = match crops {
             Crops::Squares(crops) => embed::embed_crops(crops, 0, encoder.as_mut()),
             Crops::Uncut(loaded, masks) => {
-                let background = self.settings.background;
+                let background = self.plan.settings.view.background;
                 embed::embed_masks(&loaded.image, masks, encoder.as_mut(), background, None)
             }
         };

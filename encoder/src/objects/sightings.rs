@@ -17,6 +17,12 @@ pub fn sample_step(n_gaussians: usize) -> usize {
     n_gaussians.div_ceil(MAX_SAMPLES).max(1)
 }
 
+/// Returns the bytes that the sightings of a scene take, at most: where every view sees every sampled Gaussian.
+pub fn working_bytes(n_gaussians: usize, n_views: usize) -> u64 {
+    let n_sampled = n_gaussians / sample_step(n_gaussians);
+    (n_sampled * (size_of::<usize>() + n_views * 2 * size_of::<u32>())) as u64
+}
+
 /// Gathers the sightings of every `step`-th Gaussian of each cell. Returns `None` if cancelled.
 ///
 /// # Errors

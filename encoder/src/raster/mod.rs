@@ -48,7 +48,7 @@ pub struct RasterView {
 }
 
 /// What is summed over the pixels of a region.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 pub enum WeightKind {
     /// `alpha * T`: what the Gaussian contributes to the picture, behind what lies in front of it.
     Blend,
@@ -230,7 +230,7 @@ pub trait Rasterizer: Send + Sync {
 }
 
 /// A scene that a backend has made ready; views may be asked for from several threads.
-pub trait LoadedScene: Sync {
+pub trait LoadedScene: Send + Sync {
     /// Returns the sums of each Gaussian's weight over each region; pixels of [`NO_REGION`] take
     /// light but record nothing. The same input gives the same bits for any number of threads.
     ///

@@ -2,7 +2,6 @@
 
 mod given;
 mod graph;
-pub mod noise;
 mod sam;
 
 use std::io;
@@ -27,6 +26,14 @@ const MAX_MASK_BYTES: u64 = 1 << 30;
 pub trait Segmenter: Sync {
     /// Returns what identifies the segmenter's results: its method and every parameter of it.
     fn name(&self) -> &str;
+
+    /// Returns a text that differs where masks may differ: the name, and hashes of weights or of files of masks.
+    ///
+    /// # Errors
+    /// [`SegmentError::Io`] if a file of masks cannot be read.
+    fn identity(&self) -> Result<String, SegmentError> {
+        Ok(self.name().to_owned())
+    }
 
     /// Returns whether it looks at [`SegmentInput::depth`], which takes a drawing of the scene.
     fn wants_depth(&self) -> bool {

@@ -2,24 +2,19 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, Result, anyhow};
+use anyhow::{Result, anyhow};
 use clap::Args;
 
 use crate::eval::noise::{self, NoiseRow, NoiseSettings};
 use slag_common::shard::Profile;
 use slag_encoder::cli::Exit;
-use slag_encoder::cli::common::{
-    BackgroundArg, ModelArgs, available_threads, cancel_flag, open_models, print,
-};
-use slag_encoder::codebook::CodebookSettings;
+use slag_encoder::cli::common::{BackgroundArg, ModelArgs, cancel_flag, open_models, print};
 use slag_encoder::embed::Background;
 use slag_encoder::encode::{EncodeSettings, ViewOrder, ViewsLimit};
 use slag_encoder::lift::Aggregation;
 use slag_encoder::progress::Progress;
 use slag_encoder::raster::devices::{DeviceChoice, Devices};
 use slag_encoder::raster::gpu::GpuOptions;
-use slag_encoder::shard::ShardSettings;
-use slag_encoder::shard::positions::PositionError;
 
 /// `eval noise`.
 #[derive(Debug, Args)]
@@ -63,8 +58,6 @@ pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> 
         let names: Vec<&str> = known.iter().map(|(name, _)| *name).collect();
         return Err(anyhow!("no way to aggregate is called {unknown:?}; there are: {}", names.join(", ")));
     }
-    let threads = available_threads();
-    rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().context("cannot start threads")?;
     let (models, session) = open_models(&args.models)?;
     let devices = Devices::open(args.device, GpuOptions::default())?;
     let methods: Vec<(String, Aggregation)> = known
@@ -74,30 +67,22 @@ pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> 
         .collect();
     let levels = if args.auto { Vec::new() } else { args.levels.clone() };
     let n_centroids = args.scene.len() * levels.len().max(1) * methods.len();
+    let mut encode = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
+    encode.output.scene_name = "noise".into();
+    encode.run.views_limit = args.views_limit.map_or(ViewsLimit::All, |n| ViewsLimit::Count(n as usize));
+    encode.run.view_order = ViewOrder::Nth;
+    encode.run.strict = true;
+    encode.run.restart = true;
+    encode.view.background = Background::from(args.background);
+    encode.cells.shards.profiles = vec![Profile::Compact];
+    encode.cells.objects = false;
     let settings = NoiseSettings {
         scenes: args.scene.clone(),
         levels,
         seed: args.seed,
         methods,
         out: args.out.clone(),
-        encode: EncodeSettings {
-            scene_name: "noise".into(),
-            views_limit: args.views_limit.map_or(ViewsLimit::All, |n| ViewsLimit::Count(n as usize)),
-            view_order: ViewOrder::Nth,
-            background: Background::from(args.background),
-            aggregation: Aggregation::PAPER,
-            keep_views: true,
-            threads,
-            strict: true,
-            restart: true,
-            shards: ShardSettings {
-                profiles: vec![Profile::Compact],
-                codebook: CodebookSettings::default(),
-                position_error: PositionError::default_for(true),
-            },
-            objects: false,
-            ..EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true)
-        },
+        encode,
     };
     progress.begin("noise", "row", n_centroids as u64, 0);
     let mut on_row = |row: &NoiseRow| {

@@ -17,7 +17,7 @@ use slag_models::{ModelDir, SessionOptions, TextEncoder};
 use crate::generate::Scene;
 use crate::generate::grammar::{self, SceneKind};
 use slag_encoder::cells::CellLimits;
-use slag_encoder::encode::{self, EncodeSettings, EncodeSummary};
+use slag_encoder::encode::{self, EncodeSettings, EncodeSummary, Engines};
 use slag_encoder::progress::Progress;
 use slag_encoder::publish::serve::{self, Limits};
 use slag_encoder::query;
@@ -173,19 +173,16 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     let camera_in_world = scene.views[ROBOT_VIEW].camera_from_world.inverse().translation;
     let robot_in_world = DVec3::new(camera_in_world.x, camera_in_world.y, 0.0);
     let models = ModelDir::embedded()?;
-    let settings = EncodeSettings {
-        scene_name: "demo house and yard".into(),
-        memory_bytes: 1 << 30,
-        strict: true,
-        // Small cells, so that the demo has several.
-        cells: CellLimits { max_gaussians: 16_384, max_width: Some(25.0) },
-        created_unix_secs: options.created_unix_secs,
-        ..EncodeSettings::new(written.scene, written.views, store.clone(), true)
-    };
-    let summary = tokio::task::block_in_place(|| {
-        encode::encode(&settings, &models, &options.session, &CpuRasterizer, progress, cancel)
-    })
-    .context("encode")?;
+    let mut settings = EncodeSettings::new(written.scene, written.views, store.clone(), true);
+    settings.output.scene_name = "demo house and yard".into();
+    settings.output.created_unix_secs = options.created_unix_secs;
+    settings.run.memory_bytes = 1 << 30;
+    settings.run.strict = true;
+    // Small cells, so that the demo has several.
+    settings.cells.limits = CellLimits { max_gaussians: 16_384, max_width: Some(25.0) };
+    let engines = Engines::new(&models, &options.session, &CpuRasterizer);
+    let summary = tokio::task::block_in_place(|| encode::encode(&settings, &engines, progress, cancel))
+        .context("encode")?;
 
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
     let (listens, listening) = tokio::sync::oneshot::channel();

@@ -10,6 +10,7 @@ pub mod encoder;
 mod filter;
 mod instances;
 pub mod lerf;
+pub mod mask_noise;
 pub mod metrics;
 pub mod noise;
 #[cfg(test)]

@@ -9,12 +9,12 @@ use serde::Serialize;
 use slag_common::splat::{self, SplatError};
 use slag_models::{ModelDir, ModelError, SessionOptions};
 
+use super::mask_noise::MaskNoise;
 use super::{EvalError, EvalSettings, Truth, TruthError, labelled, metrics::mean};
-use slag_encoder::encode::{self, EncodeError, EncodeSettings, Masks};
+use slag_encoder::encode::{self, EncodeError, EncodeSettings, Engines, Masks, Perturbation};
 use slag_encoder::lift::Aggregation;
 use slag_encoder::progress::Silent;
 use slag_encoder::raster::{CpuRasterizer, Rasterizer};
-use slag_encoder::segment::noise::MaskNoise;
 use slag_encoder::store::{StoreError, StoreReader};
 
 /// Why there is no table.
@@ -138,21 +138,19 @@ pub fn run(
             let store = settings.out.join(&name).join(folder);
             fs_err::create_dir_all(&store)?;
             for (method, aggregation) in &settings.methods {
-                let encode = EncodeSettings {
-                    scene: splat_path.clone(),
-                    views: views.clone(),
-                    masks: match level {
-                        Some(_) => Masks::Given { dir: masks.clone(), ignore_ids: Vec::new() },
-                        None => settings.encode.masks.clone(),
-                    },
-                    store: store.clone(),
-                    aggregation: *aggregation,
-                    mask_noise: level.map(|level| MaskNoise { level, seed: settings.seed }),
-                    keep_views: true,
-                    ..settings.encode.clone()
-                };
-                let summary = encode::encode(&encode, models, session, rasterizer, &Silent, cancel)
-                    .map_err(Box::new)?;
+                let mut encode = settings.encode.clone();
+                encode.inputs.scene.clone_from(&splat_path);
+                encode.inputs.views.clone_from(&views);
+                if level.is_some() {
+                    encode.view.masks = Masks::Given { dir: masks.clone(), ignore_ids: Vec::new() };
+                }
+                encode.output.store.clone_from(&store);
+                encode.aggregation = *aggregation;
+                encode.run.keep_views = true;
+                let noise = level.map(|level| MaskNoise { level, seed: settings.seed });
+                let perturbation = noise.as_ref().map(|noise| noise as &dyn Perturbation);
+                let engines = Engines { perturbation, ..Engines::new(models, session, rasterizer) };
+                let summary = encode::encode(&encode, &engines, &Silent, cancel).map_err(Box::new)?;
                 let reader = StoreReader::open(&store)?;
                 let report =
                     labelled(&reader, &truth, &scene, &mut *text, &CpuRasterizer, &EvalSettings::default())?;

@@ -16,7 +16,7 @@ use super::scannet::{Matching, Scan, ScannetReport, scannet};
 use super::*;
 use slag_encoder::cells::CellLimits;
 use slag_encoder::codebook::CodebookSettings;
-use slag_encoder::encode::{self, EncodeSettings, Masks};
+use slag_encoder::encode::{self, CellSettings, EncodeSettings, Engines, Masks};
 use slag_encoder::lift::Aggregation;
 use slag_encoder::progress::Silent;
 use slag_encoder::raster::CpuRasterizer;
@@ -79,26 +79,25 @@ impl Wall {
         let poses = json!({"w": PHOTO_PX[0], "h": PHOTO_PX[1], "fl_x": focal_x_px, "fl_y": focal_y_px,
             "cx": centre_x_px, "cy": centre_y_px, "frames": frames});
         fs_err::write(&views, poses.to_string()).expect("writes");
-        let settings = EncodeSettings {
-            masks: Masks::Given { dir: dir.path().join("masks"), ignore_ids: Vec::new() },
-            min_mask_px: 10,
-            threads: 1,
-            memory_bytes: 1 << 28,
-            strict: true,
-            aggregation: Aggregation::PAPER,
-            objects: false,
-            cells: CellLimits { max_gaussians: 4096, max_width: None },
+        let mut settings = EncodeSettings::new(scene, views.clone(), dir.path().join("store"), true);
+        settings.view.masks = Masks::Given { dir: dir.path().join("masks"), ignore_ids: Vec::new() };
+        settings.view.min_mask_px = 10;
+        settings.aggregation = Aggregation::PAPER;
+        settings.cells = CellSettings {
+            limits: CellLimits { max_gaussians: 4096, max_width: None },
             shards: ShardSettings {
                 profiles: vec![Profile::Compact],
                 codebook: CodebookSettings::default(),
                 position_error: PositionError::Within(0.01),
             },
-            ..EncodeSettings::new(scene, views.clone(), dir.path().join("store"), true)
+            objects: false,
         };
-        let session = SessionOptions::new(PathBuf::new());
-        let cancel = AtomicBool::new(false);
-        encode::encode(&settings, &ModelDir::colours(), &session, &CpuRasterizer, &Silent, &cancel)
-            .expect("encodes");
+        settings.run.threads = 1;
+        settings.run.memory_bytes = 1 << 28;
+        settings.run.strict = true;
+        let (models, session) = (ModelDir::colours(), SessionOptions::new(PathBuf::new()));
+        let engines = Engines::new(&models, &session, &CpuRasterizer);
+        encode::encode(&settings, &engines, &Silent, &AtomicBool::new(false)).expect("encodes");
         Self { dir, gaussians, views }
     }
 

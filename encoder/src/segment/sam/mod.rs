@@ -25,7 +25,7 @@ use filter::{Candidate, Filters};
 use upsample::Upsampler;
 
 /// How many masks are asked for and which are kept. The defaults are those of the reference implementation.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
 pub struct SamSettings {
     /// Points along each side of the grid.
     pub points_per_side: u32,

@@ -1,51 +1,51 @@
-//! `encode --preset`: bundles of choices, of which flags change single ones.
+//! Presets: bundles of choices with a name.
 
 use clap::ValueEnum;
 
+use super::settings::{DEFAULT_MASK_LEVELS, RasterWidth, ViewsLimit};
 use crate::codebook::CodebookSettings;
 use crate::embed::Background;
-use crate::encode::{DEFAULT_MASK_LEVELS, RasterWidth, ViewsLimit};
 use crate::lift::Aggregation;
 use crate::raster::WeightKind;
 
-/// Bundles of choices. What each costs and gives is in README.md, measured by `bench tradeoff`.
+/// A bundle of choices. `slag-lab bench tradeoff` measures the cost and quality of each.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Preset {
     /// The paper's method: white behind the masks, rasters as wide as photos, the plain average, no objects.
     Paper,
-    /// Half of the views, by coverage, two scales of masks, coarse rasters; refined.
+    /// Half of the views, by coverage; two scales of masks; coarse rasters; refined contributions.
     Fast,
-    /// All views; refined.
+    /// All views; refined contributions.
     Balanced,
-    /// As balanced, with half the errors of scores in the shards.
+    /// As `balanced`, with half the errors of scores in the shards.
     Accurate,
 }
 
-/// What a preset stands for.
+/// The choices of a preset.
 #[derive(Clone, Copy, Debug)]
 pub struct Choices {
     /// What fills a crop outside its mask.
     pub background: Background,
     /// Which weight is summed.
     pub weights: WeightKind,
-    /// How sums become embeddings.
+    /// How contributions become embeddings.
     pub aggregation: Aggregation,
-    /// Whether there are objects.
+    /// Whether masks that views agree on become objects.
     pub objects: bool,
-    /// Scales at which the built-in segmenter looks.
+    /// Number of scales at which the built-in segmenter looks.
     pub mask_levels: usize,
     /// Masks with fewer pixels are left out.
     pub min_mask_px: u32,
-    /// Views to use at most.
+    /// Views used at most.
     pub views_limit: ViewsLimit,
     /// Width at which weights are rasterised.
     pub raster_width: RasterWidth,
-    /// Errors of the profiles.
+    /// Errors that the profiles may have.
     pub codebook: CodebookSettings,
 }
 
 impl Preset {
-    /// Returns what the preset stands for.
+    /// Returns the choices of the preset.
     pub fn choices(self) -> Choices {
         let balanced = Choices {
             background: Background::White,
@@ -85,23 +85,23 @@ mod tests {
     use std::path::PathBuf;
 
     use super::*;
-    use crate::encode::EncodeSettings;
+    use crate::encode::{EncodeSettings, Masks};
 
-    /// The program without flags does what the library does without settings.
+    /// The program without flags and the library with default settings do the same.
     #[test]
     fn balanced_is_what_the_library_has_as_its_own() {
         let library = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
         let balanced = Preset::Balanced.choices();
         assert_eq!(balanced.aggregation, library.aggregation);
-        assert_eq!(balanced.objects, library.objects);
-        assert_eq!(balanced.views_limit, library.views_limit);
-        assert_eq!(balanced.raster_width, library.raster_width);
-        assert_eq!(balanced.min_mask_px, library.min_mask_px);
-        assert_eq!(balanced.background, library.background);
-        assert_eq!(balanced.weights, library.weights);
-        assert_eq!(balanced.codebook, library.shards.codebook);
+        assert_eq!(balanced.objects, library.cells.objects);
+        assert_eq!(balanced.views_limit, library.run.views_limit);
+        assert_eq!(balanced.raster_width, library.view.raster_width);
+        assert_eq!(balanced.min_mask_px, library.view.min_mask_px);
+        assert_eq!(balanced.background, library.view.background);
+        assert_eq!(balanced.weights, library.view.weights);
+        assert_eq!(balanced.codebook, library.cells.shards.codebook);
         let levels = balanced.mask_levels;
-        assert_eq!(library.masks, crate::encode::Masks::Auto { n_levels: levels });
+        assert_eq!(library.view.masks, Masks::Auto { n_levels: levels });
     }
 
     /// The others differ in what their descriptions say.

@@ -1,11 +1,11 @@
-//! Errors as segmenters make them, laid over good masks: how far does each method fall with them?
+//! Segmentation errors simulated on good masks, to measure how each method degrades with them.
 //!
-//! A mask is missed, joined with one that touches it, cut in two, and its outline frays, each with a chance or
-//! an extent that grows with the level; its vector turns, as one object's do from view to view. Every mask has a
-//! random sequence of its own, of seed, view and place: threads and the order of views do not show.
+//! A mask is missed, merged with one that touches it, or split; its outline frays; its vector turns, as the vectors
+//! of one object do from view to view. The chance or extent of each error grows with the level. Every mask has its own
+//! random sequence, seeded by seed, view and index, so that results do not depend on threads or the order of views.
 
-use super::{SegmentError, SegmentInput, Segmenter};
-use crate::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
+use slag_encoder::encode::Perturbation;
+use slag_encoder::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
 use slag_math::random::Xorshift;
 
 /// Chances of a mask, per level: SAM's automatic masks of indoor photos lie between levels 1 and 2 (they miss or
@@ -31,37 +31,17 @@ pub struct MaskNoise {
     pub seed: u64,
 }
 
-/// A segmenter whose masks are damaged.
-pub struct NoisyMasks {
-    inner: Box<dyn Segmenter>,
-    noise: MaskNoise,
-    name: String,
-}
-
-impl NoisyMasks {
-    /// Damages the masks of `inner`.
-    pub fn new(inner: Box<dyn Segmenter>, noise: MaskNoise) -> Self {
-        let name = format!("{}, {noise:?}", inner.name());
-        Self { inner, noise, name }
-    }
-}
-
-impl Segmenter for NoisyMasks {
-    fn name(&self) -> &str {
-        &self.name
+impl Perturbation for MaskNoise {
+    fn identity(&self) -> String {
+        format!("{self:?}")
     }
 
-    fn wants_depth(&self) -> bool {
-        self.inner.wants_depth()
+    fn masks(&self, view: &str, masks: Vec<Mask>, size_px: [u32; 2]) -> Vec<Mask> {
+        self.damaged(view, masks, size_px)
     }
 
-    fn n_lanes(&self) -> Option<usize> {
-        self.inner.n_lanes()
-    }
-
-    fn segment(&self, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError> {
-        let size_px = [input.image.width(), input.image.height()];
-        Ok(self.noise.damaged(&input.view.name, self.inner.segment(input)?, size_px))
+    fn vectors(&self, view: &str, vectors: &mut [f32], dim: usize) {
+        self.turn_vectors(view, vectors, dim);
     }
 }
 

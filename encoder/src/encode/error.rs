@@ -1,0 +1,149 @@
+//! Why an encode ends without a new generation.
+
+use std::path::PathBuf;
+
+use slag_common::poses::PoseError;
+use slag_common::splat::SplatError;
+use slag_models::ModelError;
+
+use super::memory::MemoryError;
+use crate::embed::EmbedError;
+use crate::ingest::{GeoError, IngestError};
+use crate::lift::ContributionError;
+use crate::raster::RasterError;
+use crate::segment::SegmentError;
+use crate::store::StoreError;
+
+/// Why an encode ended without a new generation.
+#[derive(Debug, thiserror::Error)]
+pub enum EncodeError {
+    /// A setting is out of its range.
+    #[error("{setting}: {problem}")]
+    Setting {
+        /// The setting's name.
+        setting: &'static str,
+        /// What is wrong with it, and what is expected.
+        problem: String,
+    },
+    /// The worker threads cannot be started.
+    #[error("cannot start {n_threads} threads: {source}; use fewer with --threads")]
+    Threads {
+        /// Threads asked for.
+        n_threads: usize,
+        /// The cause.
+        source: rayon::ThreadPoolBuildError,
+    },
+    /// The scene cannot be read.
+    #[error(transparent)]
+    Splat(#[from] SplatError),
+    /// The poses cannot be read.
+    #[error(transparent)]
+    Poses(#[from] PoseError),
+    /// The geo-reference cannot be read.
+    #[error(transparent)]
+    Geo(#[from] GeoError),
+    /// A photo cannot be read, and `strict` is set.
+    #[error(transparent)]
+    Ingest(#[from] IngestError),
+    /// Masks cannot be made or read.
+    #[error(transparent)]
+    Segment(#[from] SegmentError),
+    /// The scene cannot be rasterised.
+    #[error(transparent)]
+    Scene(#[from] RasterError),
+    /// A view cannot be rasterised.
+    #[error("view {view}: {source}")]
+    Raster {
+        /// The view.
+        view: String,
+        /// The cause.
+        source: RasterError,
+    },
+    /// A model cannot be opened.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// A model failed on a view's crops.
+    #[error("view {view}: {source}")]
+    Embed {
+        /// The view.
+        view: String,
+        /// The cause.
+        source: EmbedError,
+    },
+    /// The store cannot be read or written.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// A file of contributions is damaged or cannot be written.
+    #[error(transparent)]
+    Contributions(#[from] ContributionError),
+    /// A working file cannot be read or written.
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+    /// The job records cannot be read or written.
+    #[error("{}: job records: {source}; start over with --restart", path.display())]
+    Records {
+        /// The store.
+        path: PathBuf,
+        /// The database's error.
+        source: sled::Error,
+    },
+    /// The store holds an unfinished job with another identity.
+    #[error(
+        "{}: holds an unfinished encode of other inputs or settings ({n_done} views done); finish it with its own \
+         inputs and settings, or drop it with --restart", path.display()
+    )]
+    OtherJob {
+        /// The store.
+        path: PathBuf,
+        /// Views that it finished.
+        n_done: usize,
+    },
+    /// Photos are missing, and `strict` is set.
+    #[error("{n_missing} of {n_views} photos are missing, the first is {}; give their folder with --images", first.display())]
+    MissingImages {
+        /// Photos missing.
+        n_missing: usize,
+        /// Views in the poses file.
+        n_views: usize,
+        /// The first missing photo.
+        first: PathBuf,
+    },
+    /// No view can be used.
+    #[error("none of {n_views} views can be used; the first: {reason}")]
+    NoViews {
+        /// Views in the poses file.
+        n_views: usize,
+        /// Why the first one cannot be used.
+        reason: String,
+    },
+    /// The scene has no usable Gaussian.
+    #[error("{}: none of {n_gaussians} Gaussians is usable (finite, positive scales, a rotation); export the splat again", path.display())]
+    NoGaussians {
+        /// The splat file.
+        path: PathBuf,
+        /// Gaussians in it.
+        n_gaussians: usize,
+    },
+    /// The memory budget is too small.
+    #[error(transparent)]
+    Memory(#[from] MemoryError),
+    /// The user stopped the encode; a rerun resumes.
+    #[error("interrupted after {n_done} of {n_views} views; run the same command again to resume")]
+    Interrupted {
+        /// Views finished.
+        n_done: usize,
+        /// Views in all.
+        n_views: usize,
+    },
+}
+
+impl EncodeError {
+    /// Returns whether the error lies in one view's input, so that the other views may go on.
+    pub(super) fn is_of_one_view(&self) -> bool {
+        match self {
+            Self::Ingest(_) => true,
+            Self::Segment(error) => !matches!(error, SegmentError::Model(_)),
+            _ => false,
+        }
+    }
+}

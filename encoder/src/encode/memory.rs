@@ -1,0 +1,152 @@
+//! The budget of working memory: named reservations, each with the bytes that its owner states.
+
+use std::fmt;
+
+/// The steps that hold memory one after the other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Phase {
+    /// From the first view on.
+    Always,
+    /// While objects are found.
+    Objects,
+    /// While masks and superpoints are weighed.
+    Refine,
+    /// While cells become shards.
+    Cells,
+}
+
+/// Memory set aside for one purpose.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Reservation {
+    /// The purpose.
+    pub purpose: &'static str,
+    /// Bytes, at most.
+    pub len_bytes: u64,
+    phase: Phase,
+}
+
+/// The budget is too small.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct MemoryError {
+    /// Bytes in the budget.
+    pub available_bytes: u64,
+    /// Bytes needed at least.
+    pub needed_bytes: u64,
+    /// Whether no view was done yet.
+    pub is_before_views: bool,
+    /// The reservations that are held at the same time, largest first.
+    pub parts: Vec<Reservation>,
+}
+
+impl std::error::Error for MemoryError {}
+
+impl fmt::Display for MemoryError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { available_bytes, needed_bytes, is_before_views, parts } = self;
+        let (when, or_else) = match is_before_views {
+            true => ("before the first view", " or lower --cell-gaussians"),
+            false => ("for the contributions of all views", ""),
+        };
+        let parts = parts.iter().map(|part| format!("{} for {}", part.len_bytes, part.purpose));
+        let parts = parts.collect::<Vec<_>>().join(", ");
+        write!(f, "--memory is {available_bytes} bytes, {needed_bytes} are needed {when}: {parts}; ")?;
+        write!(f, "raise --memory{or_else}")
+    }
+}
+
+/// The reservations of a run, within a budget.
+///
+/// It covers what grows with the scene and the views after they are read: cells, codebooks, objects, superpoints,
+/// mask vectors and contributions. It does not cover the scene itself and the photos in work (their number is that of
+/// the threads), nor the lists of alike masks from which objects are found: their length is known only once they are
+/// made.
+#[derive(Clone, Debug)]
+pub(super) struct MemoryPlan {
+    available_bytes: u64,
+    is_before_views: bool,
+    reservations: Vec<Reservation>,
+}
+
+impl MemoryPlan {
+    /// Makes an empty plan.
+    pub(super) fn new(available_bytes: u64) -> Self {
+        Self { available_bytes, is_before_views: true, reservations: Vec::new() }
+    }
+
+    /// Sets memory aside.
+    pub(super) fn reserve(&mut self, phase: Phase, purpose: &'static str, len_bytes: u64) {
+        self.reservations.push(Reservation { purpose, len_bytes, phase });
+    }
+
+    /// Says that the views are done: what follows depends on their results.
+    pub(super) fn views_are_done(&mut self) {
+        self.is_before_views = false;
+    }
+
+    /// Returns the bytes that the most expensive phase leaves for the contributions that are read at a time.
+    ///
+    /// # Errors
+    /// [`MemoryError`] if `contributions_bytes` do not fit beside the reservations of some phase.
+    pub(super) fn rest(&self, contributions_bytes: u64) -> Result<u64, MemoryError> {
+        let phases = [Phase::Objects, Phase::Refine, Phase::Cells];
+        let held = |phase: Phase| {
+            let of_phase =
+                self.reservations.iter().filter(move |r| r.phase == phase || r.phase == Phase::Always);
+            of_phase.copied()
+        };
+        let len = |phase: Phase| held(phase).fold(0u64, |sum, r| sum.saturating_add(r.len_bytes));
+        let most = phases.into_iter().max_by_key(|phase| len(*phase)).unwrap_or(Phase::Always);
+        let needed_bytes = len(most).saturating_add(contributions_bytes);
+        if needed_bytes <= self.available_bytes {
+            return Ok(self.available_bytes - len(most));
+        }
+        let contributions = Reservation {
+            purpose: "contributions of a part of a cell",
+            len_bytes: contributions_bytes,
+            phase: Phase::Always,
+        };
+        let mut parts: Vec<Reservation> =
+            held(most).chain([contributions]).filter(|r| r.len_bytes > 0).collect();
+        parts.sort_by_key(|r| std::cmp::Reverse(r.len_bytes));
+        let Self { available_bytes, is_before_views, .. } = *self;
+        Err(MemoryError { available_bytes, needed_bytes, is_before_views, parts })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn plan(available_bytes: u64) -> MemoryPlan {
+        let mut plan = MemoryPlan::new(available_bytes);
+        plan.reserve(Phase::Always, "masks", 20);
+        plan.reserve(Phase::Refine, "superpoints", 30);
+        plan.reserve(Phase::Cells, "the largest cell", 50);
+        plan
+    }
+
+    /// By hand: phases follow one another, so the largest one counts, beside what is always held.
+    #[test]
+    fn the_largest_phase_counts() {
+        assert_eq!(plan(100).rest(30), Ok(30));
+        assert_eq!(plan(200).rest(30), Ok(130));
+        assert_eq!(MemoryPlan::new(7).rest(7), Ok(7));
+    }
+
+    #[test]
+    fn a_budget_that_is_too_small_is_refused_with_each_part() {
+        let message = plan(99).rest(30).expect_err("too small").to_string();
+        assert_eq!(
+            message,
+            "--memory is 99 bytes, 100 are needed before the first view: 50 for the largest cell, \
+             30 for contributions of a part of a cell, 20 for masks; raise --memory or lower --cell-gaussians"
+        );
+        let mut later = plan(99);
+        later.views_are_done();
+        let message = later.rest(30).expect_err("too small").to_string();
+        assert!(
+            message.contains("for the contributions of all views: 50") && message.ends_with("raise --memory"),
+            "{message}"
+        );
+    }
+}

@@ -1,0 +1,205 @@
+//! The first step: everything that is read, checked and decided before the first view.
+
+use std::time::Instant;
+
+use slag_common::frames::GeoReference;
+use slag_common::splat::{self, ReadOptions};
+use slag_common::{Gaussians, View, poses};
+use slag_models::SessionOptions;
+
+use super::context::RunContext;
+use super::coverage::{self, Coverage};
+use super::engines::Engines;
+use super::error::EncodeError;
+use super::identity;
+use super::job::Job;
+use super::memory::{MemoryPlan, Phase};
+use super::report::SkippedView;
+use super::settings::{EncodeSettings, Masks, RunSettings, ViewOrder};
+use crate::cells::{self, CellSplit};
+use crate::ingest;
+use crate::lift::refine::Refinement;
+use crate::objects;
+use crate::raster::{LoadedScene, RasterView};
+use crate::segment::{GivenMasks, GraphSegmenter, GraphSettings, SamSegmenter, SegmentError, Segmenter};
+use crate::shard;
+use crate::store::Store;
+
+/// What was read.
+pub(super) struct Inputs {
+    pub(super) scene: Gaussians,
+    pub(super) split: CellSplit,
+    /// The views whose photo exists, in the order of their names.
+    pub(super) views: Vec<View>,
+    /// The views whose photo is missing, in the same order.
+    pub(super) missing: Vec<SkippedView>,
+    pub(super) geo_reference: Option<GeoReference>,
+}
+
+impl Inputs {
+    /// Reads scene, poses and geo-reference, and cuts the scene into cells.
+    ///
+    /// # Errors
+    /// [`EncodeError`] if one cannot be read, or nothing in it can be used.
+    pub(super) fn read(settings: &EncodeSettings, context: &RunContext<'_>) -> Result<Self, EncodeError> {
+        let inputs = &settings.inputs;
+        let geo_reference = inputs.geo.as_deref().map(ingest::read_geo_reference).transpose()?;
+        let options = ReadOptions { with_sh_rest: false };
+        let scene = context.time("read", || splat::read(&inputs.scene, &options))?;
+        let (views, missing) = find_views(settings)?;
+        let limits = settings.cells.limits;
+        let split = context.time("cells", || context.install(|| cells::split(&scene, limits)));
+        if split.cells.is_empty() {
+            return Err(EncodeError::NoGaussians { path: inputs.scene.clone(), n_gaussians: scene.len() });
+        }
+        Ok(Self { scene, split, views, missing, geo_reference })
+    }
+}
+
+/// What was decided.
+pub(super) struct Plan<'a> {
+    pub(super) settings: &'a EncodeSettings,
+    pub(super) engines: &'a Engines<'a>,
+    pub(super) inputs: &'a Inputs,
+    pub(super) store: &'a Store,
+    pub(super) memory: MemoryPlan,
+    pub(super) segmenter: Box<dyn Segmenter>,
+    pub(super) job: Job<'a>,
+    pub(super) scene: Box<dyn LoadedScene + 'a>,
+    /// The views to use, as numbers in the order in which they are taken.
+    pub(super) order: Vec<usize>,
+    pub(super) coverage: Option<Coverage>,
+    pub(super) coverage_secs: f64,
+}
+
+/// Checks the budget, opens segmenter and job, loads the scene and chooses the views.
+///
+/// # Errors
+/// [`EncodeError`].
+pub(super) fn plan<'a>(
+    settings: &'a EncodeSettings,
+    engines: &'a Engines<'a>,
+    store: &'a Store,
+    inputs: &'a Inputs,
+    context: &RunContext<'_>,
+) -> Result<Plan<'a>, EncodeError> {
+    let memory = memory_plan(settings, inputs, engines.models.dim());
+    memory.rest(0)?;
+    let segmenter = open_segmenter(&settings.view.masks, engines.session)?;
+    let identity = context.time("identity", || {
+        context.install(|| identity::identity(settings, engines, segmenter.as_ref(), inputs))
+    })?;
+    let job = Job::open(store, identity, settings.run.restart)?;
+    let scene = context.time("raster", || context.install(|| engines.rasterizer.load(&inputs.scene)))?;
+    let start = Instant::now();
+    let (order, coverage) =
+        context.install(|| choose_views(&settings.run, scene.as_ref(), inputs, context))?;
+    let coverage_secs = coverage.as_ref().map_or(0.0, |_| start.elapsed().as_secs_f64());
+    Ok(Plan {
+        settings,
+        engines,
+        inputs,
+        store,
+        memory,
+        segmenter,
+        job,
+        scene,
+        order,
+        coverage,
+        coverage_secs,
+    })
+}
+
+/// Reserves what is known before the first view; what depends on masks and contributions is reserved once the views
+/// are done.
+fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, dim: usize) -> MemoryPlan {
+    let n_gaussians = inputs.scene.len();
+    let largest = inputs.split.cells.iter().map(|cell| cell.gaussians.len()).max().unwrap_or(0);
+    let mut memory = MemoryPlan::new(settings.run.memory_bytes);
+    memory.reserve(Phase::Cells, "the largest cell", shard::working_bytes(largest, dim));
+    let refinement = Refinement::len_bytes(&settings.aggregation, n_gaussians, 0);
+    memory.reserve(Phase::Refine, "superpoints of all Gaussians", refinement);
+    if settings.cells.objects {
+        let of_gaussians = (n_gaussians * size_of::<u32>()) as u64;
+        memory.reserve(Phase::Always, "the object of each Gaussian", of_gaussians);
+        let sightings = objects::sightings::working_bytes(n_gaussians, inputs.views.len());
+        memory.reserve(Phase::Objects, "views of sampled Gaussians", sightings);
+    }
+    memory
+}
+
+fn open_segmenter(masks: &Masks, session: &SessionOptions) -> Result<Box<dyn Segmenter>, EncodeError> {
+    Ok(match masks {
+        Masks::Auto { n_levels } => {
+            let settings = GraphSettings::learnt(*n_levels);
+            Box::new(GraphSegmenter::learnt(settings, session).map_err(SegmentError::from)?)
+        }
+        Masks::Graph => Box::new(GraphSegmenter::default()),
+        Masks::Given { dir, ignore_ids } => Box::new(GivenMasks::open(dir, ignore_ids.clone())?),
+        Masks::Sam { dir, settings, n_model_threads } => {
+            let session = SessionOptions { intra_op_threads: *n_model_threads, ..session.clone() };
+            Box::new(SamSegmenter::open(dir, settings.clone(), &session)?)
+        }
+    })
+}
+
+/// Reads the poses and sets aside views without a photo.
+fn find_views(settings: &EncodeSettings) -> Result<(Vec<View>, Vec<SkippedView>), EncodeError> {
+    let views = poses::read(&settings.inputs.views, settings.inputs.images.as_deref())?.views;
+    let missing: Vec<String> = ingest::missing_images(&views).into_iter().map(|v| v.name.clone()).collect();
+    if let (true, Some(first)) = (settings.run.strict, ingest::missing_images(&views).first()) {
+        let first = first.image_path.clone();
+        return Err(EncodeError::MissingImages { n_missing: missing.len(), n_views: views.len(), first });
+    }
+    let n_views = views.len();
+    let (found, gone): (Vec<View>, Vec<View>) = views.into_iter().partition(|v| !missing.contains(&v.name));
+    let skipped: Vec<SkippedView> = gone
+        .into_iter()
+        .map(|v| SkippedView {
+            reason: format!(
+                "{}: no such photo; give the photos' folder with --images",
+                v.image_path.display()
+            ),
+            view: v.name,
+        })
+        .collect();
+    if found.is_empty() {
+        let reason = skipped.first().map_or("the poses file has none".into(), |s| s.reason.clone());
+        return Err(EncodeError::NoViews { n_views, reason });
+    }
+    Ok((found, skipped))
+}
+
+/// Returns the views to use, as numbers in the order in which they are taken.
+fn choose_views(
+    run: &RunSettings,
+    scene: &dyn LoadedScene,
+    inputs: &Inputs,
+    context: &RunContext<'_>,
+) -> Result<(Vec<usize>, Option<Coverage>), EncodeError> {
+    let views = &inputs.views;
+    let n = views.len();
+    let limit = run.views_limit.of(n);
+    let spread = |limit: usize| (0..limit).map(|i| i * n / limit).collect::<Vec<_>>();
+    Ok(match run.view_order {
+        ViewOrder::Names => ((0..limit).collect(), None),
+        // With a budget every beginning must be spread, with a limit the whole.
+        ViewOrder::Nth if run.time_budget.is_some() => {
+            let chosen = spread(limit);
+            (coverage::spread_order(limit).into_iter().map(|i| chosen[i]).collect(), None)
+        }
+        ViewOrder::Nth => (spread(limit), None),
+        ViewOrder::Coverage => {
+            let raster_view =
+                |v: &View| RasterView { camera_from_world: v.camera_from_world, intrinsics: v.intrinsics };
+            let raster_views: Vec<RasterView> = views.iter().map(raster_view).collect();
+            let measured = Coverage::measure(scene, inputs.scene.len(), &raster_views, context.cancel());
+            let coverage = measured
+                .map_err(|(view, source)| EncodeError::Raster { view: views[view].name.clone(), source })?
+                .ok_or(EncodeError::Interrupted { n_done: 0, n_views: limit })?;
+            let mut order = coverage.order();
+            order.truncate(limit);
+            (order, Some(coverage))
+        }
+    })
+}

@@ -1,0 +1,126 @@
+//! The last step: the manifest is signed and becomes the store's current generation.
+
+use std::collections::BTreeMap;
+
+use slag_common::Hash32;
+use slag_common::manifest::{self, Calibration, CellRecord, EncoderRecord, Manifest};
+use slag_common::shard::ScoreErrors;
+
+use super::cells::{BuiltCells, Counts};
+use super::context::RunContext;
+use super::error::EncodeError;
+use super::plan::Plan;
+use super::report::{CellReport, EncodeSummary};
+use super::views::DoneViews;
+
+/// Publishes the built cells, ends the job and returns the summary.
+///
+/// # Errors
+/// [`EncodeError::Store`]; the current generation then stays.
+pub(super) fn publish(
+    plan: Plan<'_>,
+    views: DoneViews<'_>,
+    built: BuiltCells,
+    context: &RunContext<'_>,
+) -> Result<EncodeSummary, EncodeError> {
+    let generation = plan.store.next_generation()?;
+    let manifest = manifest(&plan, &built, generation);
+    plan.store.publish(&manifest, &built.extras)?;
+    let mut summary = summary(&plan, &views, built, &manifest);
+    // With views left to do the contributions stay: the next encode goes on from them.
+    let has_open = views.records.len() + views.n_failed < plan.inputs.views.len();
+    match plan.settings.run.keep_views || has_open {
+        true => plan.job.keep_published()?,
+        false => plan.job.finish()?,
+    }
+    plan.store.prune()?;
+    summary.busy_secs = context.busy_secs();
+    for stage in &summary.view_stages {
+        *summary.busy_secs.entry(stage.stage.clone()).or_default() += stage.busy_secs;
+    }
+    summary.wall_secs = context.start().elapsed().as_secs_f64();
+    Ok(summary)
+}
+
+fn manifest(plan: &Plan<'_>, built: &BuiltCells, generation: u64) -> Manifest {
+    let (settings, inputs, models) = (plan.settings, plan.inputs, plan.engines.models);
+    // Robots take a score as an answer from three spreads above the mean on.
+    let of_calibration = || {
+        let Calibration { score_mean, score_spread } = built.calibration();
+        (score_mean + 3.0 * score_spread).clamp(-1.0, 1.0)
+    };
+    Manifest {
+        version: manifest::VERSION,
+        scene: settings.output.scene_name.clone(),
+        generation,
+        created_unix_secs: settings.output.created_unix_secs,
+        expires_unix_secs: settings.output.expires_unix_secs,
+        // The store fills it in.
+        next_key: None,
+        metric: settings.inputs.metric || inputs.geo_reference.is_some(),
+        geo_reference: inputs.geo_reference,
+        encoder: EncoderRecord {
+            name: models.encoder_id().name.clone(),
+            id: Hash32(models.encoder_id().hash()),
+            dim: models.dim() as u32,
+            default_threshold: models.threshold().unwrap_or_else(of_calibration),
+            calibration: models.threshold().is_none().then(|| built.calibration()),
+        },
+        n_gaussians: (inputs.scene.len() - inputs.split.n_rejected) as u64,
+        n_without_evidence: built.n_without_evidence,
+        n_rejected: inputs.split.n_rejected as u64,
+        cells: built.records.clone(),
+    }
+}
+
+fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: &Manifest) -> EncodeSummary {
+    let cells: Vec<CellReport> = built.records.iter().map(|record| cell_report(record, &built)).collect();
+    let mut shard_bytes: BTreeMap<String, u64> = BTreeMap::new();
+    for (profile, len_bytes) in cells.iter().flat_map(|cell| &cell.shard_bytes) {
+        *shard_bytes.entry(profile.clone()).or_default() += len_bytes;
+    }
+    let Counts { n_views_without_masks, n_masks, n_regions, n_entries, views: views_report } = built.counts;
+    EncodeSummary {
+        generation: manifest.generation,
+        n_gaussians: manifest.n_gaussians,
+        n_without_evidence: built.n_without_evidence,
+        n_rejected: manifest.n_rejected,
+        n_views: views.used.len(),
+        n_views_with_photo: plan.inputs.views.len(),
+        view_order: plan.settings.run.view_order,
+        coverage: views.coverage,
+        coverage_secs: plan.coverage_secs,
+        n_views_resumed: views.n_resumed,
+        n_views_without_masks,
+        skipped_views: views.skipped.clone(),
+        n_masks,
+        n_regions,
+        n_entries,
+        n_cells: cells.len(),
+        n_centroids: cells.iter().map(|cell| u64::from(cell.n_centroids)).sum(),
+        objects: built.objects,
+        shard_bytes,
+        cells,
+        views: views_report,
+        busy_secs: BTreeMap::new(),
+        view_stages: views.stages.clone(),
+        views_secs: views.secs,
+        wall_secs: 0.0,
+        images_on: views.images_on.clone(),
+        encoder: plan.engines.models.encoder_id().to_string(),
+    }
+}
+
+fn cell_report(record: &CellRecord, built: &BuiltCells) -> CellReport {
+    let relative = |errors: &ScoreErrors| errors.mean / errors.spread.max(f32::MIN_POSITIVE);
+    let shards = || record.shards.iter().map(|(profile, shard)| (profile.to_string(), shard));
+    CellReport {
+        cell_id: record.cell_id,
+        n_gaussians: record.n_gaussians,
+        n_entries: built.n_entries[record.cell_id as usize],
+        n_centroids: record.shards.values().map(|shard| shard.n_centroids).max().unwrap_or(0),
+        n_subspaces: built.n_subspaces[record.cell_id as usize],
+        shard_bytes: shards().map(|(profile, shard)| (profile, shard.len_bytes)).collect(),
+        score_error: shards().map(|(profile, shard)| (profile, relative(&shard.score_errors))).collect(),
+    }
+}

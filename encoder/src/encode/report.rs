@@ -1,0 +1,126 @@
+//! What an encode did: the summary that the program prints.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use super::coverage::CoverageReport;
+use super::settings::ViewOrder;
+use crate::objects::ObjectsReport;
+
+/// A view that was left out.
+#[derive(Clone, Debug, Serialize)]
+pub struct SkippedView {
+    /// Its name.
+    pub view: String,
+    /// Why it was left out.
+    pub reason: String,
+}
+
+/// The size of one cell and of its shards.
+#[derive(Clone, Debug, Serialize)]
+pub struct CellReport {
+    /// The cell.
+    pub cell_id: u32,
+    /// Gaussians.
+    pub n_gaussians: u32,
+    /// Contributions: pairs of a Gaussian and a region.
+    pub n_entries: u64,
+    /// Centroids of its codebook.
+    pub n_centroids: u32,
+    /// Subspaces of the residual code, half a byte a Gaussian each; 0 where centroids suffice for every profile.
+    pub n_subspaces: u32,
+    /// Bytes of its shards, by profile.
+    pub shard_bytes: BTreeMap<String, u64>,
+    /// Mean error of their scores, relative to the spread of scores, by profile.
+    pub score_error: BTreeMap<String, f32>,
+}
+
+/// The cost of each view, a column per figure, in the order of the names.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct ViewsReport {
+    /// Names.
+    pub view: Vec<String>,
+    /// Width at which weights were rasterised, pixels.
+    pub raster_width_px: Vec<u32>,
+    /// Masks.
+    pub n_masks: Vec<usize>,
+    /// Regions.
+    pub n_regions: Vec<usize>,
+    /// Contributions: pairs of a Gaussian and a region.
+    pub n_entries: Vec<u64>,
+    /// Seconds in all stages but the last, to the millisecond.
+    pub secs: Vec<f64>,
+}
+
+/// The load of one stage of the views' pipeline.
+#[derive(Clone, Debug, Serialize)]
+pub struct StageReport {
+    /// The stage.
+    pub stage: String,
+    /// Views that it takes at once.
+    pub n_slots: usize,
+    /// Seconds of work, added over the slots.
+    pub busy_secs: f64,
+    /// Mean share of the time in which its slots were busy, 0 to 1.
+    pub busy_share: f64,
+}
+
+/// The result of an encode.
+#[derive(Clone, Debug, Serialize)]
+pub struct EncodeSummary {
+    /// The generation that was published.
+    pub generation: u64,
+    /// Gaussians in cells.
+    pub n_gaussians: u64,
+    /// Gaussians without an embedding.
+    pub n_without_evidence: u64,
+    /// Unusable Gaussians, which are in no cell.
+    pub n_rejected: u64,
+    /// Views used.
+    pub n_views: usize,
+    /// Views whose photo exists.
+    pub n_views_with_photo: usize,
+    /// The order in which views were taken.
+    pub view_order: ViewOrder,
+    /// What the used views show of what all views show, where the order is by coverage.
+    pub coverage: Option<CoverageReport>,
+    /// Seconds spent on rasterising all views to find that order.
+    pub coverage_secs: f64,
+    /// Used views that an earlier, interrupted run had finished.
+    pub n_views_resumed: usize,
+    /// Views without any mask: no mask file, or no mask that is large enough.
+    pub n_views_without_masks: usize,
+    /// Views that were left out.
+    pub skipped_views: Vec<SkippedView>,
+    /// Masks embedded.
+    pub n_masks: usize,
+    /// Regions of all views.
+    pub n_regions: usize,
+    /// Contributions: pairs of a Gaussian and a region.
+    pub n_entries: u64,
+    /// Cells.
+    pub n_cells: usize,
+    /// Centroids in all cells.
+    pub n_centroids: u64,
+    /// The search for objects, if there was one.
+    pub objects: Option<ObjectsReport>,
+    /// Bytes of all shards, by profile.
+    pub shard_bytes: BTreeMap<String, u64>,
+    /// The cost of each cell.
+    pub cells: Vec<CellReport>,
+    /// The cost of each view.
+    pub views: ViewsReport,
+    /// Seconds spent in each stage, added over threads.
+    pub busy_secs: BTreeMap<String, f64>,
+    /// The load of the views' stages, in their order.
+    pub view_stages: Vec<StageReport>,
+    /// Seconds from the first view to the last.
+    pub views_secs: f64,
+    /// Seconds from start to end.
+    pub wall_secs: f64,
+    /// The device that ran the image model; absent where no view was left to do, or the model needs no runtime.
+    pub images_on: Option<String>,
+    /// The encoder's name.
+    pub encoder: String,
+}
