@@ -3,9 +3,10 @@
 use slag_tests::*;
 
 /// Photos and splat fit as well as the scene's own notes say (25.02 dB at 1000 px).
+#[needs_shared]
 #[test]
 fn check_confirms_the_poses() {
-    let Some(scene) = shared("scenes/brighton") else { return };
+    let scene = shared("scenes/brighton");
     let dir = tempfile::tempdir().expect("a temporary folder");
     let report = run_json(&mut encoder(&[
         "check",
@@ -28,9 +29,10 @@ fn check_confirms_the_poses() {
 }
 
 /// From photos to a robot: automatic masks, shards around a place given in metres and in degrees.
+#[needs_shared]
 #[test]
 fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
-    let (Some(scene), Some(_)) = (shared("scenes/brighton"), shared("models/image_encoder")) else { return };
+    let (scene, _) = (shared("scenes/brighton"), shared("models/image_encoder"));
     let dir = tempfile::tempdir().expect("a temporary folder");
     let store = dir.path().join("brighton");
     let models = root().join("tests/models/conse");

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 #[path = "../fuzz/src/lib.rs"]
 mod targets;
 
-use slag_tests::shared;
+use slag_test_support::shared_folder;
 
 /// Memory that a decoder may take beyond the multiple of its input: buffers, and small pictures.
 const FREE_BYTES: usize = 64 << 20;
@@ -131,7 +131,7 @@ fn mutated(seeds: &[Vec<u8>], random: &mut Random) -> Vec<u8> {
 
 #[test]
 fn no_decoder_panics() {
-    let folder = shared("fixtures").and_then(|path| Some(path.parent()?.to_owned()));
+    let folder = shared_folder();
     let budget = std::env::var("SLAG_FUZZ_SECS")
         .ok()
         .map(|secs| Duration::from_secs(secs.parse().expect("SLAG_FUZZ_SECS is a number of seconds")));

@@ -14,9 +14,10 @@ use slag_tests::*;
 /// Encodes the house with its given masks and the ConSE encoder and compares total weights, embeddings, and
 /// per word AUC and IoU. The tolerances are the reference's own: crops, resizing and runtime versions
 /// differ a little.
+#[needs_shared]
 #[test]
 fn the_field_agrees_with_the_independent_reference() {
-    let (Some(house), Some(_)) = (shared("scenes/house_a"), shared("models/image_encoder")) else { return };
+    let (house, _) = (shared("scenes/house_a"), shared("models/image_encoder"));
     let dir = tempfile::tempdir().expect("a temporary folder");
     let store = dir.path().join("house");
     let models = root().join("tests/models/conse");
@@ -55,9 +56,10 @@ fn the_field_agrees_with_the_independent_reference() {
 
 /// The GPU's field is the CPU's within the bound of NUMERICS.md: the same sums but for pixels across a cut,
 /// and those together less than a 50,000th. Where the machine has no GPU, a software one does the work.
+#[needs_shared]
 #[test]
 fn a_gpu_gives_the_field_of_the_cpu() {
-    let Some(house) = shared("scenes/house_a") else { return };
+    let house = shared("scenes/house_a");
     let found = run_json(&mut encoder(&["devices"]));
     if found["adapters"].as_array().expect("a list").is_empty() {
         assert!(std::env::var("CI").as_deref() != Ok("true"), "no GPU: install mesa-vulkan-drivers");

@@ -1,13 +1,11 @@
 //! Poses of real scenes, and of small files written for one case each.
 
-mod common;
-
 use std::path::Path;
 
-use common::shared;
 use glam::{DMat3, DVec3};
 use slag_common::camera::{Distortion, View};
 use slag_common::poses::{self, Place, PoseError, PoseProblem, PoseSource, ViewSet};
+use slag_test_support::{needs_shared, shared};
 
 fn largest_difference(a: &View, b: &View) -> f64 {
     let columns = |view: &View| view.camera_from_world.to_cols_array();
@@ -38,9 +36,10 @@ fn problem(result: Result<ViewSet, PoseError>) -> (Place, PoseProblem) {
 
 /// Oracle: the reconstruction's own statement of the camera centres (geo.json, `cam_enu`), which a
 /// separate program computed and rounded to a millimetre.
+#[needs_shared]
 #[test]
 fn brighton_text_is_its_binary_and_lies_where_its_georeference_says() {
-    let Some(scene) = shared("scenes/brighton") else { return };
+    let scene = shared("scenes/brighton");
     let binary = poses::read(&scene, None).unwrap();
     let text = poses::read(&scene.join("sparse/0/images.txt"), None).unwrap();
     assert_eq!((binary.source, text.source), (PoseSource::ColmapBinary, PoseSource::ColmapText));
@@ -70,9 +69,10 @@ fn brighton_text_is_its_binary_and_lies_where_its_georeference_says() {
 
 /// Oracle: the same 96 poses, once in OpenGL axes as world from camera, once in OpenCV axes as
 /// camera from world, both written by the scene's generator.
+#[needs_shared]
 #[test]
 fn house_transforms_and_colmap_agree() {
-    let Some(scene) = shared("scenes/house_a") else { return };
+    let scene = shared("scenes/house_a");
     let colmap = poses::read(&scene, None).unwrap();
     let transforms = poses::read(&scene.join("transforms.json"), None).unwrap();
     assert_eq!((colmap.source, transforms.source), (PoseSource::ColmapText, PoseSource::Transforms));
@@ -92,9 +92,10 @@ fn house_transforms_and_colmap_agree() {
     assert!(test_views.views.iter().all(|view| view.image_path.is_file()));
 }
 
+#[needs_shared]
 #[test]
 fn an_image_folder_of_ones_own_replaces_the_default() {
-    let Some(scene) = shared("scenes/house_a") else { return };
+    let scene = shared("scenes/house_a");
     for path in [scene.clone(), scene.join("transforms.json")] {
         let views = poses::read(&path, Some(Path::new("photos"))).unwrap().views;
         assert_eq!(views[7].image_path, Path::new("photos/0007.jpg"));

@@ -187,6 +187,8 @@ impl Cache {
 mod tests {
     use std::path::Path;
 
+    use slag_test_support::needs_shared;
+
     use super::*;
     use crate::testing::{Axes, Gate, axes_service, open_gate};
 
@@ -232,17 +234,18 @@ mod tests {
     }
 
     #[test]
-    fn built_in_and_described_models_open() {
+    fn built_in_models_open() {
         let options = SessionOptions::new("no-runtime-needed".into());
         let built_in = TextService::open(&ModelDir::colours(), &options).expect("built in");
         assert_eq!(built_in.encode("a red thing").expect("known").len(), built_in.info().dim as usize);
         assert!(matches!(built_in.encode("sofa"), Err(TextError::Encode(EncodeError::UnknownWords { .. }))));
+    }
+
+    #[needs_shared]
+    #[test]
+    fn described_phrase_lists_open() {
+        let options = SessionOptions::new("no-runtime-needed".into());
         let models = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/models/conse");
-        if !models.join("../../../../shared").exists() {
-            assert!(std::env::var("CI").is_err(), "../shared is absent");
-            println!("skipped: ../shared is absent");
-            return;
-        }
         let phrases =
             TextService::open(&ModelDir::open(&models).expect("described"), &options).expect("described");
         let (chair, stool, tree) =

@@ -1,10 +1,6 @@
 //! Crops against a plain recomputation on a labelled view, and vectors of a whole view.
 
-use std::{
-    num::NonZeroUsize,
-    path::{Path, PathBuf},
-    time::Instant,
-};
+use std::{num::NonZeroUsize, time::Instant};
 
 use image::{Rgb, RgbImage};
 use slag_encoder::{
@@ -12,24 +8,7 @@ use slag_encoder::{
     masks::{BoxPx, Mask},
 };
 use slag_models::{Crop, EncodeError, ImageEncoder, ModelDir, SessionOptions};
-
-fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
-}
-
-fn present(path: PathBuf, message: &str) -> Option<PathBuf> {
-    let is_there = path.exists();
-    if !is_there {
-        assert!(std::env::var("CI").as_deref() != Ok("true"), "{message}");
-        println!("skipped: {message}");
-    }
-    is_there.then_some(path)
-}
-
-fn shared(path: &str) -> Option<PathBuf> {
-    let shared = std::env::var_os("SLAG_SHARED").map_or_else(|| root().join("../shared"), PathBuf::from);
-    present(shared, "../shared is absent").map(|shared| shared.join(path))
-}
+use slag_test_support::{needs_shared, onnx_runtime, shared, workspace_root};
 
 /// A labelled view.
 struct Labelled {
@@ -40,8 +19,8 @@ struct Labelled {
     masks: Vec<(u8, Mask)>,
 }
 
-fn view(name: &str) -> Option<Labelled> {
-    let scene = shared("scenes/house_a")?;
+fn view(name: &str) -> Labelled {
+    let scene = shared("scenes/house_a");
     let photo = image::open(scene.join(format!("images/{name}.jpg"))).expect("it decodes").to_rgb8();
     let labels = image::open(scene.join(format!("gt/masks/{name}.png"))).expect("it decodes").to_luma8();
     assert_eq!(photo.dimensions(), labels.dimensions());
@@ -66,7 +45,7 @@ fn view(name: &str) -> Option<Labelled> {
         Some((id, Mask { box_px, inside, area_px: pixels.len() as u32, level: 0 }))
     });
     let masks = masks.collect();
-    Some(Labelled { photo, labels, masks })
+    Labelled { photo, labels, masks }
 }
 
 /// The level that a true Gaussian blur of the box gives, in f64; beyond the edge its pixels are repeated.
@@ -87,9 +66,10 @@ fn blurred(photo: &RgbImage, b: BoxPx, x: u32, y: u32) -> [f64; 3] {
     sum.map(|s| s / total)
 }
 
+#[needs_shared]
 #[test]
 fn crops_equal_a_plain_recomputation() {
-    let Some(Labelled { photo, labels, masks }) = view("0000") else { return };
+    let Labelled { photo, labels, masks } = view("0000");
     assert!(masks.len() > 5, "{}", masks.len());
     let mut worst = 0.0f64;
     let mut differences = Vec::new();
@@ -137,15 +117,12 @@ fn crops_equal_a_plain_recomputation() {
     assert!(mean < 1.0 && worst < 2.0 && differences.len() > 1000, "{mean} {worst} {}", differences.len());
 }
 
+#[needs_shared]
 #[test]
 fn vectors_of_a_view_are_the_crops_own_in_any_batch() {
-    let Some(Labelled { photo, masks, .. }) = view("0000") else { return };
-    let library = format!("target/onnxruntime/{}/libonnxruntime.so", std::env::consts::ARCH);
-    let Some(library) = present(root().join(library), "no ONNX Runtime: run scripts/get-onnxruntime.sh")
-    else {
-        return;
-    };
-    let model = ModelDir::open(&root().join("tests/models/conse")).expect("it opens");
+    let Labelled { photo, masks, .. } = view("0000");
+    let library = onnx_runtime();
+    let model = ModelDir::open(&workspace_root().join("tests/models/conse")).expect("it opens");
     let mut encoder = model.image_encoder(&SessionOptions::new(library)).expect("it loads");
     let masks: Vec<Mask> = masks.into_iter().map(|(_, mask)| mask).collect();
     let start = Instant::now();

@@ -4,7 +4,7 @@ mod common;
 
 use std::path::Path;
 
-use common::shared;
+use common::{needs_shared, shared};
 use glam::DAffine3;
 use image::{Rgb, RgbImage};
 use slag_common::{Distortion, Intrinsics, View, poses};
@@ -154,9 +154,10 @@ fn folded_pixels_are_not_valid() {
     assert!(folded_back_inside > 1_000);
 }
 
+#[needs_shared]
 #[test]
 fn a_pinhole_passes_bit_for_bit() {
-    let Some(scene) = shared("scenes/house_a") else { return };
+    let scene = shared("scenes/house_a");
     let set = poses::read(&scene, None).unwrap();
     let loaded = load_image(&set.views[0]).unwrap();
     assert_eq!(loaded.view, set.views[0]);
@@ -221,6 +222,7 @@ fn absent_and_damaged_images_are_named() {
     assert_eq!(missing_images(&views), [&absent]);
 }
 
+#[needs_shared]
 #[test]
 fn geo_reference() {
     let dir = tempfile::tempdir().unwrap();
@@ -244,7 +246,7 @@ fn geo_reference() {
     {
         assert!(matches!(read(json), Err(GeoError::Json { .. })), "{json}");
     }
-    let Some(brighton) = shared("scenes/brighton/geo.json") else { return };
+    let brighton = shared("scenes/brighton/geo.json");
     let origin = read_geo_reference(&brighton).unwrap().origin;
     assert_eq!(
         (origin.latitude_deg, origin.longitude_deg, origin.height_m),

@@ -4,7 +4,7 @@ mod common;
 
 use std::path::Path;
 
-use common::{Random, shared};
+use common::{Random, needs_shared, shared};
 use glam::DAffine3;
 use image::{GrayImage, ImageBuffer, Luma, RgbImage};
 use proptest::prelude::*;
@@ -221,9 +221,10 @@ fn masks_are_undistorted_like_the_photo() {
 }
 
 /// Oracle: the number of pixels of each instance over all views, counted by the scene's generator.
+#[needs_shared]
 #[test]
 fn house_masks_have_the_pixels_that_the_scene_states() {
-    let Some(scene) = shared("scenes/house_a") else { return };
+    let scene = shared("scenes/house_a");
     let stated: serde_json::Value =
         serde_json::from_slice(&fs_err::read(scene.join("gt/instances.json")).unwrap()).unwrap();
     let mut stated_px = std::collections::BTreeMap::new();
@@ -388,9 +389,10 @@ fn borders_over_area() {
 }
 
 /// Regions of a real photo's masks, written as 16-bit ids, are read back as the same masks.
+#[needs_shared]
 #[test]
 fn a_loaded_photo_makes_the_input() {
-    let Some(scene) = shared("scenes/house_a") else { return };
+    let scene = shared("scenes/house_a");
     let loaded = load_image(&poses::read(&scene, None).unwrap().views[5]).unwrap();
     let masks = GivenMasks::open(&scene.join("gt/masks"), Vec::new()).unwrap();
     let masks = masks.segment(&SegmentInput::new(&loaded, None)).unwrap();

@@ -6,23 +6,11 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::OnceLock;
 
 use serde_json::Value;
+pub use slag_test_support::{needs_shared, shared};
 
 /// Returns the project's root.
 pub fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
-}
-
-/// Returns a path in the data beside the project. Where that is absent the test is skipped, and says so;
-/// in CI that is a failure.
-pub fn shared(path: &str) -> Option<PathBuf> {
-    let folder = std::env::var_os("SLAG_SHARED").map_or_else(|| root().join("../shared"), PathBuf::from);
-    let found = folder.join(path);
-    if found.exists() {
-        return Some(found);
-    }
-    assert!(std::env::var_os("CI").is_none(), "{} is absent", found.display());
-    println!("skipped: {} is absent", found.display());
-    None
+    slag_test_support::workspace_root()
 }
 
 /// Returns a program of the project, built as the tests are.

@@ -2,7 +2,7 @@
 
 mod common;
 
-use common::{array, image, max_difference, model_dir, options, shared, unit};
+use common::{array, image, max_difference, model_dir, needs_shared, options, shared, unit};
 use slag_models::{
     Crop, ModelDir,
     clean::clean,
@@ -15,9 +15,10 @@ fn clip_preprocess() -> Preprocess {
     Preprocess::new(224, Resize::ShortestEdge, Filter::Bicubic, mean, std)
 }
 
+#[needs_shared]
 #[test]
 fn every_step_of_preprocessing_equals_pillow() {
-    let Some(golden) = shared("models/clip_tiny/golden.npz") else { return };
+    let golden = shared("models/clip_tiny/golden.npz");
     let clip = clip_preprocess();
     for k in 0..6 {
         let photo = image(&golden, &format!("image_{k}"));
@@ -53,9 +54,10 @@ fn a_square_stays_as_it_is() {
     }
 }
 
+#[needs_shared]
 #[test]
 fn image_vectors_equal_the_recorded_ones() {
-    let (Some(golden), Some(options)) = (shared("models/clip_tiny/golden.npz"), options()) else { return };
+    let (golden, options) = (shared("models/clip_tiny/golden.npz"), options());
     let mut encoder =
         ModelDir::open(&model_dir("clip_tiny")).expect("it opens").image_encoder(&options).expect("it loads");
     let crops: Vec<Crop> = (0..6).map(|k| Crop::whole(image(&golden, &format!("image_{k}")))).collect();
@@ -69,13 +71,11 @@ fn image_vectors_equal_the_recorded_ones() {
     assert_eq!(found.len(), expected.len());
 }
 
+#[needs_shared]
 #[test]
 fn token_ids_equal_those_of_openai() {
-    let (Some(golden), Some(tokenizer)) =
-        (shared("models/clip_tokenizer/golden_tokens.json"), shared("models/clip_tokenizer/tokenizer.json"))
-    else {
-        return;
-    };
+    let (golden, tokenizer) =
+        (shared("models/clip_tokenizer/golden_tokens.json"), shared("models/clip_tokenizer/tokenizer.json"));
     let golden: serde_json::Value =
         serde_json::from_slice(&fs_err::read(golden).expect("it is readable")).expect("it is JSON");
     let tokens = Tokens::open(&(&tokenizer).into(), 77, 49407).expect("it opens");
@@ -99,9 +99,10 @@ fn token_ids_equal_those_of_openai() {
     assert_eq!(different, ["İstanbul STRASSE ß Σίσυφος ΣΑΣ"]);
 }
 
+#[needs_shared]
 #[test]
 fn text_vectors_equal_the_padded_ones_with_and_without_mask() {
-    let (Some(models), Some(options)) = (shared("models"), options()) else { return };
+    let (models, options) = (shared("models"), options());
     let golden = models.join("clip_tiny/golden.npz");
     let texts: serde_json::Value = serde_json::from_slice(
         &fs_err::read(models.join("clip_tokenizer/golden_tokens.json")).expect("it is readable"),
@@ -139,13 +140,14 @@ fn text_vectors_equal_the_padded_ones_with_and_without_mask() {
     }
 }
 
+#[needs_shared]
 #[test]
 fn the_prompt_goes_around_the_text() {
-    let (Some(_), Some(options)) = (shared("models"), options()) else { return };
+    let options = options();
     let mut encoder =
         ModelDir::open(&model_dir("clip_tiny")).expect("it opens").text_encoder(&options).expect("it loads");
     // Recorded: the first text is "a photo of a chair".
-    let golden = shared("models/clip_tiny/golden.npz").expect("seen above");
+    let golden = shared("models/clip_tiny/golden.npz");
     let (_, expected) = array::<f32>(&golden, "text_embeds");
     let found = encoder.encode("  Chair ").expect("it encodes");
     assert!(max_difference(&found, &unit(&expected[..512])) < 1e-5);

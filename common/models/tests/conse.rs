@@ -3,7 +3,7 @@
 mod common;
 
 use ::image::{RgbImage, imageops};
-use common::{array, max_difference, model_dir, options, shared, unit};
+use common::{array, max_difference, model_dir, needs_shared, options, shared, unit};
 use half::f16;
 use safetensors::SafeTensors;
 use slag_models::{Crop, EncodeError, ModelDir, SessionOptions};
@@ -17,11 +17,10 @@ fn golden_images(golden: &std::path::Path) -> Vec<RgbImage> {
         .collect()
 }
 
+#[needs_shared]
 #[test]
 fn image_vectors_equal_the_recorded_ones_in_any_batch() {
-    let (Some(golden), Some(options)) = (shared("models/image_encoder/golden.npz"), options()) else {
-        return;
-    };
+    let (golden, options) = (shared("models/image_encoder/golden.npz"), options());
     let model = ModelDir::open(&model_dir("conse")).expect("it opens");
     let mut encoder = model.image_encoder(&options).expect("it loads");
     let images = golden_images(&golden);
@@ -47,9 +46,10 @@ fn image_vectors_equal_the_recorded_ones_in_any_batch() {
     assert!(again == together, "vectors depend on the number of threads");
 }
 
+#[needs_shared]
 #[test]
 fn phrase_vectors_equal_the_file_centred_in_f64() {
-    let Some(models) = shared("models") else { return };
+    let models = shared("models");
     // No ONNX Runtime is needed: a robot with the text files only.
     let no_runtime = SessionOptions::new("no-such-library.so".into());
     let mut encoder =
@@ -89,11 +89,9 @@ fn phrase_vectors_equal_the_file_centred_in_f64() {
     }
 }
 
+#[needs_shared]
 #[test]
 fn an_unknown_phrase_is_answered_with_near_ones() {
-    if shared("models").is_none() {
-        return;
-    }
     let no_runtime = SessionOptions::new("no-such-library.so".into());
     let mut encoder =
         ModelDir::open(&model_dir("conse")).expect("it opens").text_encoder(&no_runtime).expect("it loads");
@@ -111,11 +109,10 @@ fn an_unknown_phrase_is_answered_with_near_ones() {
     assert!(matches!(encoder.encode("  "), Err(EncodeError::EmptyText)));
 }
 
+#[needs_shared]
 #[test]
 fn a_photograph_finds_its_words() {
-    let (Some(golden), Some(options)) = (shared("models/image_encoder/golden.npz"), options()) else {
-        return;
-    };
+    let (golden, options) = (shared("models/image_encoder/golden.npz"), options());
     let model = ModelDir::open(&model_dir("conse")).expect("it opens");
     let mut images = model.image_encoder(&options).expect("it loads");
     let mut texts = model.text_encoder(&options).expect("it loads");

@@ -26,7 +26,7 @@ fn mean_of(ids: &[u32]) -> Vec<f64> {
 
 #[test]
 fn ids_masks_and_floats_may_be_of_any_kind() {
-    let Some(options) = options() else { return };
+    let options = options();
     for ids in [Element::I64, Element::I32] {
         for floats in [Element::F32, Element::F16] {
             for has_mask in [false, true] {
@@ -62,7 +62,7 @@ fn ids_masks_and_floats_may_be_of_any_kind() {
 
 #[test]
 fn siglip_texts_are_padded_and_its_scores_are_probabilities() {
-    let Some(options) = options() else { return };
+    let options = options();
     let padded = DESCRIPTION.replace("prompt =", "padding = { n_tokens = 64, token_id = 1 }\nprompt =")
         + "\n[score]\nlogit_scale = 117.330765\nlogit_bias = -12.932437\n";
     for n_tokens in [-1, 64] {
@@ -125,7 +125,7 @@ fn a_probability_becomes_the_cosine_where_the_sigmoid_reaches_it() {
 
 #[test]
 fn outputs_are_named_or_the_only_ones_that_fit() {
-    let Some(options) = options() else { return };
+    let options = options();
     // "rows" has three dimensions, so "text_embeds" is the only one; with a twin it is not.
     let mut twins = text_graph(TextKind::default());
     twins.nodes.push(common::onnx::node("Identity", &["text_embeds"], "pooled", &[]));
@@ -147,7 +147,7 @@ fn outputs_are_named_or_the_only_ones_that_fit() {
 
 #[test]
 fn batches_are_measured_unless_vectors_vary_with_them() {
-    let Some(options) = options() else { return };
+    let options = options();
     let crops: Vec<Crop> = (0..40u8)
         .map(|i| Crop::whole(RgbImage::from_fn(13, 9, |x, y| Rgb([i * 6, (x * 19) as u8, (y * 28) as u8]))))
         .collect();
@@ -170,7 +170,7 @@ fn batches_are_measured_unless_vectors_vary_with_them() {
 
 #[test]
 fn what_really_runs_is_told() {
-    let Some(options) = options() else { return };
+    let options = options();
     let folder = made(DESCRIPTION, TextKind::default(), (Element::F32, -1, false));
     let model = ModelDir::open(folder.path()).expect("it opens");
     let plain = model.text_encoder(&options).expect("it loads");
@@ -201,7 +201,7 @@ fn what_really_runs_is_told() {
 
 #[test]
 fn models_that_do_not_fit_say_so_when_opened() {
-    let Some(options) = options() else { return };
+    let options = options();
     let opened = |folder: &TempDir| {
         let model = ModelDir::open(folder.path()).expect("it opens");
         let opened = model.image_encoder(&options).and_then(|_| model.text_encoder(&options));
@@ -249,7 +249,7 @@ fn models_that_do_not_fit_say_so_when_opened() {
 
 /// The indented lines of README.md that follow a line with `start`.
 fn readme_block(start: &str) -> Vec<String> {
-    let readme = fs_err::read_to_string(common::root().join("README.md")).expect("it is readable");
+    let readme = fs_err::read_to_string(common::workspace_root().join("README.md")).expect("it is readable");
     let after = readme.lines().skip_while(|line| !line.contains(start));
     let indented = after.skip_while(|line| !line.starts_with("    "));
     indented.map_while(|line| Some(line.strip_prefix("    ")?.to_owned())).collect()

@@ -13,7 +13,7 @@ use tempfile::TempDir;
 
 fn setting() -> (PathBuf, PathBuf, SessionOptions) {
     let folder = std::env::var_os("SLAG_CLIP_B32").expect("SLAG_CLIP_B32 names a folder");
-    (folder.into(), shared("models").expect("the test data"), options().expect("the runtime"))
+    (folder.into(), shared("models"), options())
 }
 
 /// The small model's description with full-size files.

@@ -5,11 +5,12 @@ mod common;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use common::{model_dir, options, shared};
+use common::{model_dir, needs_shared, options};
 use slag_models::{ModelDir, SessionOptions, find_runtime};
 
+#[needs_shared]
 #[test]
-fn a_missing_or_wrong_library_says_what_to_do_and_leaves_room_for_the_right_one() {
+fn a_library_is_found_where_it_lies() {
     let absent = PathBuf::from("no/such/libonnxruntime.so");
     let message = find_runtime(Some(&absent), &[]).expect_err("it is absent").to_string();
     assert!(message.contains("no/such/libonnxruntime.so") && message.contains("give the path"), "{message}");
@@ -23,10 +24,15 @@ fn a_missing_or_wrong_library_says_what_to_do_and_leaves_room_for_the_right_one(
         library
     );
     assert_eq!(find_runtime(Some(&library), &[]).expect("it is found"), library);
+}
 
-    if shared("models").is_none() {
-        return;
-    }
+#[needs_shared]
+#[test]
+fn a_wrong_library_is_refused_and_the_right_one_still_loads() {
+    let absent = PathBuf::from("no/such/libonnxruntime.so");
+    let folder = tempfile::tempdir().expect("a folder");
+    let library = folder.path().join("libonnxruntime.so");
+    fs_err::write(&library, "not a library").expect("it is writable");
     let model = ModelDir::open(&model_dir("conse")).expect("it opens");
     let refusal = |runtime: &Path| {
         let error = model.image_encoder(&SessionOptions::new(runtime.to_owned())).err();
@@ -51,7 +57,7 @@ fn a_missing_or_wrong_library_says_what_to_do_and_leaves_room_for_the_right_one(
         assert!(refusal(&old).contains(part), "{}", refusal(&old));
     }
 
-    let Some(options) = options() else { return };
+    let options = options();
     model.image_encoder(&options).expect("the right library still loads");
     fs_err::copy(&options.runtime, &library).expect("it is writable");
     assert!(refusal(&library).contains("use one per process"), "{}", refusal(&library));

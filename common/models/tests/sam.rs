@@ -4,7 +4,7 @@ mod common;
 
 use std::path::Path;
 
-use common::{array, image, model_dir, options, shared};
+use common::{array, image, model_dir, needs_shared, options, shared};
 use slag_models::sam::{Embedding, Frame, Sam};
 
 /// The largest difference between `found`, `[planes][rows][columns]` from which every `step`th row and column is
@@ -21,18 +21,19 @@ fn max_difference(found: &[f32], columns: usize, step: usize, expected: &[f32]) 
     largest
 }
 
-fn open() -> Option<(std::path::PathBuf, Sam)> {
-    let (golden, options) = (shared("models/sam_tiny/golden.npz")?, options()?);
-    Some((golden, Sam::open(&model_dir("sam_tiny"), &options).expect("it opens")))
+fn open() -> (std::path::PathBuf, Sam) {
+    let (golden, options) = (shared("models/sam_tiny/golden.npz"), options());
+    (golden, Sam::open(&model_dir("sam_tiny"), &options).expect("it opens"))
 }
 
 fn recorded_embedding(golden: &Path, sam: &Sam) -> Embedding {
     sam.embed(&image(golden, "image")).expect("it runs")
 }
 
+#[needs_shared]
 #[test]
 fn pixel_values_and_embeddings_equal_the_recorded_ones() {
-    let Some((golden, sam)) = open() else { return };
+    let (golden, sam) = open();
     let photo = image(&golden, "image");
     let (_, expected) = array::<f32>(&golden, "pixel_values_sub16");
     let difference = max_difference(&sam.pixel_values(&photo), 1024, 16, &expected);
@@ -58,9 +59,10 @@ fn size(golden: &Path, name: &str) -> (Vec<usize>, [u32; 2]) {
     (shape, [size[0] as u32, size[1] as u32])
 }
 
+#[needs_shared]
 #[test]
 fn masks_and_scores_equal_the_recorded_ones() {
-    let Some((golden, sam)) = open() else { return };
+    let (golden, sam) = open();
     let embedding = recorded_embedding(&golden, &sam);
     let (_, points) = array::<f32>(&golden, "input_points");
     let (_, labels) = array::<i64>(&golden, "input_labels");
@@ -87,9 +89,10 @@ fn masks_and_scores_equal_the_recorded_ones() {
     assert!(difference < 1e-5, "a single point: {difference}");
 }
 
+#[needs_shared]
 #[test]
 fn a_batch_of_prompts_gives_what_each_gives_alone() {
-    let Some((golden, sam)) = open() else { return };
+    let (golden, sam) = open();
     let embedding = recorded_embedding(&golden, &sam);
     let points: Vec<[f32; 2]> = (0..5).map(|i| [100.0 + 170.0 * i as f32, 620.0 - 90.0 * i as f32]).collect();
     let together = sam.decode(&embedding, 5, &points, &[1; 5]).expect("it runs");
@@ -105,9 +108,10 @@ fn a_batch_of_prompts_gives_what_each_gives_alone() {
     }
 }
 
+#[needs_shared]
 #[test]
 fn wrong_descriptions_and_files_are_named() {
-    let (Some(models), Some(options)) = (shared("models"), options()) else { return };
+    let (models, options) = (shared("models"), options());
     let description =
         fs_err::read_to_string(model_dir("sam_tiny").join("model.toml")).expect("it is readable");
     let (encoder, decoder) = ("vision_encoder.onnx", "prompt_encoder_mask_decoder.onnx");

@@ -10,7 +10,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
 use crate::generated::{gzip, write_sog_v1};
-use crate::{assert_columns_agree, read_all, shared};
+use crate::{assert_columns_agree, needs_shared, read_all, shared};
 
 /// Counts what the current thread has allocated, now and at most.
 struct Counting;
@@ -139,10 +139,11 @@ fn survives_damage(name: &str, content: &[u8], n: u64, pack: impl Fn(&[u8]) -> V
     println!("{name}: {n_read} of {n} still read");
 }
 
-fn fixture(name: &str) -> Option<Vec<u8>> {
-    Some(std::fs::read(shared("fixtures/formats")?.join(name)).expect("the fixture is there"))
+fn fixture(name: &str) -> Vec<u8> {
+    std::fs::read(shared("fixtures/formats").join(name)).expect("the fixture is there")
 }
 
+#[needs_shared]
 #[test]
 fn damaged_files_as_they_are() {
     for name in [
@@ -160,16 +161,17 @@ fn damaged_files_as_they_are() {
         "playbot_lod6.splat",
         "playbot_lod6.sog",
     ] {
-        let Some(bytes) = fixture(name) else { return };
+        let bytes = fixture(name);
         survives_damage(name, &bytes, 1000, <[u8]>::to_vec);
     }
 }
 
 /// Damage under an intact gzip wrapper, which its checksum would else stop.
+#[needs_shared]
 #[test]
 fn damaged_spz_in_intact_gzip() {
     for name in ["minimal-v2.spz", "playbot_lod6_v3.spz"] {
-        let Some(bytes) = fixture(name) else { return };
+        let bytes = fixture(name);
         let mut content = Vec::new();
         flate2::read::GzDecoder::new(&bytes[..]).read_to_end(&mut content).expect("unpacks");
         survives_damage(name, &content, 1000, gzip);
@@ -177,10 +179,11 @@ fn damaged_spz_in_intact_gzip() {
 }
 
 /// Damage in one file of a folder: the checksums of a bundle would else stop it.
+#[needs_shared]
 #[test]
 fn damaged_sog_folders() {
     let folder = tempfile::tempdir().expect("a folder");
-    let Some(bytes) = fixture("playbot_lod6.sog") else { return };
+    let bytes = fixture("playbot_lod6.sog");
     let v2 = folder.path().join("v2");
     zip::ZipArchive::new(std::io::Cursor::new(bytes)).expect("opens").extract(&v2).expect("unpacks");
     let v1 = folder.path().join("v1");

@@ -4,15 +4,16 @@
 use serde_json::Value;
 use slag_common::splat::{ReadOptions, SplatError, read};
 
-use crate::{assert_columns_agree, assert_near, read_all, shared};
+use crate::{assert_columns_agree, assert_near, needs_shared, read_all, shared};
 
 fn numbers(value: &Value) -> Vec<f64> {
     value.as_array().into_iter().flatten().map(|v| v.as_f64().expect("a number")).collect()
 }
 
+#[needs_shared]
 #[test]
 fn every_format_gives_the_recorded_gaussians() {
-    let Some(folder) = shared("fixtures/formats") else { return };
+    let folder = shared("fixtures/formats");
     let text = std::fs::read(folder.join("expected.json")).expect("expected.json is there");
     let expected: Value = serde_json::from_slice(&text).expect("expected.json is JSON");
     let mut n_read = 0;
@@ -69,17 +70,19 @@ fn every_format_gives_the_recorded_gaussians() {
     assert_eq!(n_read, 14, "files with recorded values");
 }
 
+#[needs_shared]
 #[test]
 fn a_folder_is_read_as_its_meta_file() {
-    let Some(folder) = shared("fixtures/formats/playbot_lod3_sog") else { return };
+    let folder = shared("fixtures/formats/playbot_lod3_sog");
     let by_folder = read_all(&folder).expect("reads");
     assert_eq!(by_folder.len(), 31_000);
     assert_eq!(by_folder, read_all(&folder.join("meta.json")).expect("reads"));
 }
 
+#[needs_shared]
 #[test]
 fn higher_harmonics_are_left_out_unless_asked_for() {
-    let Some(folder) = shared("fixtures/formats") else { return };
+    let folder = shared("fixtures/formats");
     for name in ["lod6.ply", "lod6.compressed.ply", "lod6_v3.spz", "lod6_v4.spz", "lod6.sog"] {
         let path = folder.join(format!("playbot_{name}"));
         let mut full = read_all(&path).expect("reads");
@@ -89,9 +92,10 @@ fn higher_harmonics_are_left_out_unless_asked_for() {
     }
 }
 
+#[needs_shared]
 #[test]
 fn small_ply_files_with_another_order_of_properties() {
-    let Some(folder) = shared("fixtures/formats") else { return };
+    let folder = shared("fixtures/formats");
     let text = std::fs::read_to_string(folder.join("gsplatrs_minimal_ascii.ply")).expect("is there");
     let rows = text.lines().skip_while(|line| *line != "end_header").skip(1);
     let ascii = read_all(&folder.join("gsplatrs_minimal_ascii.ply")).expect("reads");
@@ -110,10 +114,11 @@ fn small_ply_files_with_another_order_of_properties() {
 }
 
 /// Oracle: the layout of these files, 17 floats a row, read by position and decoded in f64.
+#[needs_shared]
 #[test]
 fn trained_scenes_row_by_row() {
     for (scene, count) in [("brighton", 149_097), ("house_a", 104_878)] {
-        let Some(path) = shared(&format!("scenes/{scene}/point_cloud.ply")) else { return };
+        let path = shared(&format!("scenes/{scene}/point_cloud.ply"));
         let gaussians = read_all(&path).unwrap_or_else(|error| panic!("{error}"));
         assert_columns_agree(&gaussians);
         assert_eq!((gaussians.len(), gaussians.sh_degree), (count, 0));
@@ -149,9 +154,10 @@ fn a_dot_splat_of_broken_rows_is_refused() {
     }
 }
 
+#[needs_shared]
 #[test]
 fn refusals_say_what_to_do() {
-    let Some(folder) = shared("fixtures/formats") else { return };
+    let folder = shared("fixtures/formats");
     let error = read_all(&folder.join("minimal.ksplat")).expect_err("is refused");
     assert!(matches!(error, SplatError::Unsupported { .. }));
     let text = error.to_string();

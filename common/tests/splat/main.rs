@@ -6,22 +6,11 @@ mod generated;
 mod memory;
 mod ply_variants;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use slag_common::Gaussians;
 use slag_common::splat::{ReadOptions, SplatError, read};
-
-/// Returns a path in the shared test data, or `None`, with a note, where that is absent.
-fn shared(path: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("SLAG_SHARED")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared"), PathBuf::from);
-    if root.is_dir() {
-        return Some(root.join(path));
-    }
-    assert!(std::env::var("CI").as_deref() != Ok("true"), "{} is absent", root.display());
-    println!("skipped: ../shared is absent");
-    None
-}
+use slag_test_support::{needs_shared, shared};
 
 fn read_all(path: &Path) -> Result<Gaussians, SplatError> {
     read(path, &ReadOptions { with_sh_rest: true })

@@ -3,7 +3,7 @@
 use slag_common::Gaussians;
 use slag_common::splat::ply;
 
-use crate::{assert_columns_agree, assert_near, read_all, read_bytes, shared};
+use crate::{assert_columns_agree, assert_near, needs_shared, read_all, read_bytes, shared};
 
 /// The properties and rows of a plain PLY of floats, parsed by hand.
 fn rows_of(bytes: &[u8]) -> (Vec<String>, Vec<Vec<f32>>) {
@@ -63,9 +63,10 @@ fn variant(encoding: &str, kind: &str, names: &[String], rows: &[Vec<f32>]) -> V
     out
 }
 
+#[needs_shared]
 #[test]
 fn encodings_types_and_orders_give_the_same_gaussians() {
-    let Some(path) = shared("fixtures/formats/playbot_lod6.ply") else { return };
+    let path = shared("fixtures/formats/playbot_lod6.ply");
     let expected = read_all(&path).expect("reads");
     let (names, rows) = rows_of(&std::fs::read(&path).expect("is there"));
     assert_eq!((names.len(), rows.len()), (38, 1873));

@@ -1,20 +1,7 @@
 //! What several test files use, not each of them all of it.
-#![allow(dead_code)]
+#![allow(dead_code, unused_imports, reason = "each test program uses a part")]
 
-use std::path::PathBuf;
-
-/// Returns a path in the shared test data; `None`, said aloud, where that is absent outside CI.
-pub fn shared(path: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("SLAG_SHARED")
-        .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../shared"), PathBuf::from);
-    let full = root.join(path);
-    if full.exists() {
-        return Some(full);
-    }
-    assert!(std::env::var("CI").as_deref() != Ok("true"), "{} is absent in CI", full.display());
-    println!("skipped: ../shared is absent");
-    None
-}
+pub use slag_test_support::{needs_shared, shared};
 
 /// Deterministic random numbers (SplitMix64; Steele, Lea and Flood 2014).
 pub struct Random(pub u64);

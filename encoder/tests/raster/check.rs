@@ -7,7 +7,7 @@ use slag_common::{Distortion, Gaussians, Intrinsics};
 use slag_encoder::check::{CheckError, CheckOptions, CheckReport, CheckView, Mistake, check};
 use slag_encoder::raster::{CpuRasterizer, RasterView};
 
-use crate::fixtures::shared;
+use crate::fixtures::{needs_shared, shared};
 
 /// PSNR over all photos that the trainer (gsplat) reports at 1000 x 562.
 const TRAINER_PSNR_DB: f64 = 25.02;
@@ -72,9 +72,10 @@ fn run(scene: &Gaussians, views: &[CheckView], options: &CheckOptions) -> CheckR
     report
 }
 
+#[needs_shared]
 #[test]
 fn a_scene_that_fits_its_photos_passes() {
-    let Some(root) = shared("scenes/brighton") else { return };
+    let root = shared("scenes/brighton");
     let scene = read_scene(&root.join("point_cloud.ply"));
     let pictures_dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join("check");
     let options =
@@ -91,7 +92,7 @@ fn a_scene_that_fits_its_photos_passes() {
 #[test]
 #[ignore = "18 photos at full training size: half a minute"]
 fn psnr_is_what_the_trainer_reports() {
-    let Some(root) = shared("scenes/brighton") else { return };
+    let root = shared("scenes/brighton");
     let scene = read_scene(&root.join("point_cloud.ply"));
     let options = CheckOptions { width_px: 1000, ..CheckOptions::default() };
     let report = run(&scene, &read_views(&root, 1), &options);
@@ -110,9 +111,10 @@ fn shrunk(view: &CheckView, width_px: u32) -> CheckView {
 }
 
 /// Plants each mistake by the inverse of its correction, written out independently of it.
+#[needs_shared]
 #[test]
 fn planted_mistakes_are_diagnosed() {
-    let Some(root) = shared("scenes/brighton") else { return };
+    let root = shared("scenes/brighton");
     let scene = read_scene(&root.join("point_cloud.ply"));
     let views: Vec<CheckView> = read_views(&root, 9).iter().map(|view| shrunk(view, 160)).collect();
     let options = CheckOptions::default();

@@ -1,33 +1,19 @@
 //! Reads the shared test data.
 
-use std::path::{Path, PathBuf};
-
 use glam::{DAffine3, DMat3, DVec3};
 use npyz::{Deserialize, NpyFile};
 use slag_common::npz;
 use slag_common::{Distortion, Gaussians, Intrinsics};
 use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::RasterView;
-
-/// Returns a path of the shared data, or `None` (said aloud) where it is absent; CI must have it.
-pub fn shared(path: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("SLAG_SHARED")
-        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared"), PathBuf::from);
-    let found = root.join(path);
-    if found.exists() {
-        return Some(found);
-    }
-    assert!(std::env::var("CI").as_deref() != Ok("true"), "{} is absent", found.display());
-    println!("skipped: ../shared is absent");
-    None
-}
+pub use slag_test_support::{needs_shared, shared};
 
 /// An open archive of arrays.
 pub struct Npz(npz::Npz);
 
 impl Npz {
-    pub fn open(path: &str) -> Option<Self> {
-        Some(Self(npz::Npz::open(&shared(path)?).unwrap()))
+    pub fn open(path: &str) -> Self {
+        Self(npz::Npz::open(&shared(path)).unwrap())
     }
 
     pub fn array<T: Deserialize>(&mut self, name: &str) -> Vec<T> {

@@ -1,5 +1,5 @@
 //! Where the tests' data lies.
-#![allow(dead_code, reason = "each test program uses a part")]
+#![allow(dead_code, unused_imports, reason = "each test program uses a part")]
 
 pub mod made;
 pub mod onnx;
@@ -8,36 +8,16 @@ use std::path::{Path, PathBuf};
 
 use slag_common::npz::Npz;
 use slag_models::SessionOptions;
-
-/// The project's root.
-pub fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
-}
+pub use slag_test_support::{needs_shared, shared, workspace_root};
 
 /// A model directory of the project's tests.
 pub fn model_dir(name: &str) -> PathBuf {
-    root().join("tests/models").join(name)
+    workspace_root().join("tests/models").join(name)
 }
 
-fn present(path: PathBuf, message: &str) -> Option<PathBuf> {
-    let is_there = path.exists();
-    if !is_there {
-        assert!(std::env::var("CI").as_deref() != Ok("true"), "{message}");
-        println!("skipped: {message}");
-    }
-    is_there.then_some(path)
-}
-
-/// A path in the shared test data, if that is there.
-pub fn shared(path: &str) -> Option<PathBuf> {
-    let shared = std::env::var_os("SLAG_SHARED").map_or_else(|| root().join("../shared"), PathBuf::from);
-    present(shared, "../shared is absent").map(|shared| shared.join(path))
-}
-
-/// Sessions on the library that `scripts/get-onnxruntime.sh` puts into `target`, if it is there.
-pub fn options() -> Option<SessionOptions> {
-    let library = format!("target/onnxruntime/{}/libonnxruntime.so", std::env::consts::ARCH);
-    present(root().join(library), "no ONNX Runtime: run scripts/get-onnxruntime.sh").map(SessionOptions::new)
+/// Sessions on the ONNX Runtime that `scripts/setup.sh` installs.
+pub fn options() -> SessionOptions {
+    SessionOptions::new(slag_test_support::onnx_runtime())
 }
 
 /// An array of an npz file: its shape and elements.

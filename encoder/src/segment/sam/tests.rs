@@ -1,9 +1,10 @@
 //! The filters against a plain recomputation in float64 on made-up logits: dense arrays, no runs, no shared code.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use slag_models::SessionOptions;
 use slag_models::sam::{Decoded, Frame};
-use slag_models::{SessionOptions, find_runtime};
+use slag_test_support::{needs_shared, onnx_runtime, shared, workspace_root};
 
 use super::filter::Filters;
 use super::runs::{Run, RunMask};
@@ -372,10 +373,11 @@ fn stability_equals_a_plain_recomputation() {
 }
 
 /// What an unfinished encode is recognised by: another file or setting is another segmenter.
+#[needs_shared]
 #[test]
 fn the_name_tells_model_and_settings() {
-    let Some(segmenter) = tiny(SamSettings::default()) else { return };
-    let other = tiny(SamSettings { crop_points_divisor: 2, ..SamSettings::default() }).expect("as before");
+    let segmenter = tiny(SamSettings::default());
+    let other = tiny(SamSettings { crop_points_divisor: 2, ..SamSettings::default() });
     assert_ne!(segmenter.name(), other.name());
     for part in ["38dc63289500", "68f6ab0a5d54", "1024 px", "predicted_iou: 0.88", "1 threads"] {
         assert!(segmenter.name().contains(part), "{part}: {}", segmenter.name());
@@ -453,26 +455,9 @@ fn grids_and_crops_are_those_of_the_reference() {
     assert_eq!(edges(20), (2, 420, 300, 640, 480));
 }
 
-/// What the tests need beside the project, if it is there.
-fn shared(path: &str) -> Option<PathBuf> {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-    let folder = std::env::var_os("SLAG_SHARED").map_or_else(|| root.join("../shared"), PathBuf::from);
-    let found = folder.join(path);
-    if !found.exists() {
-        assert!(std::env::var("CI").as_deref() != Ok("true"), "{} is absent", found.display());
-        println!("skipped: {} is absent", found.display());
-        return None;
-    }
-    Some(found)
-}
-
-fn tiny(settings: SamSettings) -> Option<SamSegmenter> {
-    shared("models/sam_tiny")?;
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-    let folder = root.join("target/onnxruntime").join(std::env::consts::ARCH);
-    let runtime = find_runtime(None, &[folder]).expect("a path");
-    let session = SessionOptions::new(runtime);
-    Some(SamSegmenter::open(&root.join("tests/models/sam_tiny"), settings, &session).expect("it opens"))
+fn tiny(settings: SamSettings) -> SamSegmenter {
+    let session = SessionOptions::new(onnx_runtime());
+    SamSegmenter::open(&workspace_root().join("tests/models/sam_tiny"), settings, &session).expect("it opens")
 }
 
 fn array<T: npyz::Deserialize>(npz: &Path, name: &str) -> (Vec<u64>, Vec<T>) {
@@ -483,10 +468,11 @@ fn array<T: npyz::Deserialize>(npz: &Path, name: &str) -> (Vec<u64>, Vec<T>) {
 }
 
 /// Masks at the image's size against `SamImageProcessor.post_process_masks`, recorded.
+#[needs_shared]
 #[test]
 fn enlarged_masks_equal_the_recorded_ones() {
-    let Some(segmenter) = tiny(SamSettings::default()) else { return };
-    let golden = shared("models/sam_tiny/golden.npz").expect("seen above");
+    let segmenter = tiny(SamSettings::default());
+    let golden = shared("models/sam_tiny/golden.npz");
     let (shape, levels) = array::<u8>(&golden, "image");
     let photo = image::RgbImage::from_raw(shape[1] as u32, shape[0] as u32, levels).expect("RGB");
     let embedding = segmenter.sam.embed(&photo).expect("it runs");
