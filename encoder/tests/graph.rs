@@ -2,6 +2,8 @@
 
 mod common;
 
+use std::path::Path;
+
 use common::{Random, needs_shared, shared};
 use glam::DAffine3;
 use image::{Rgb, RgbImage};
@@ -9,6 +11,8 @@ use slag_common::{Distortion, Intrinsics, View, poses};
 use slag_encoder::ingest::load_image;
 use slag_encoder::masks::Mask;
 use slag_encoder::segment::{GivenMasks, GraphSegmenter, GraphSettings, SegmentInput, Segmenter};
+use slag_models::SessionOptions;
+use slag_models::session::find_runtime;
 
 fn segment(image: &RgbImage, depth: Option<&[f32]>, valid: Option<&[bool]>) -> Vec<Mask> {
     let (width_px, height_px) = image.dimensions();
@@ -159,9 +163,21 @@ fn the_largest_masks_are_kept() {
 }
 
 #[test]
-fn the_name_tells_parameters_apart() {
+fn the_identity_depends_on_every_parameter() {
     let other = GraphSettings { depth_weight: 7.0, ..GraphSettings::default() };
-    assert_ne!(GraphSegmenter::new(other).name(), GraphSegmenter::default().name());
+    assert_ne!(GraphSegmenter::new(other).identity().unwrap(), GraphSegmenter::default().identity().unwrap());
+}
+
+/// Oracle: the hash that `sha256sum` prints of the embedded file.
+#[test]
+fn the_identity_holds_the_hash_of_the_embedded_weights() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let runtime = root.join("target/onnxruntime").join(std::env::consts::ARCH);
+    let session = SessionOptions::new(find_runtime(None, &[runtime]).unwrap());
+    let learnt = GraphSegmenter::learnt(GraphSettings::learnt(2), &session).unwrap().identity().unwrap();
+    assert!(learnt.contains("022b1998a06e68a24361831df459ece1fc55716bd7e2f94986447f869f940d9d"), "{learnt}");
+    let without = GraphSegmenter::new(GraphSettings::learnt(2)).identity().unwrap();
+    assert_ne!(learnt, without, "the model's absence shows");
 }
 
 /// Returns the mean over true instance masks of at least 200 pixels of the best overlap, and the

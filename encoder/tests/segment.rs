@@ -95,6 +95,41 @@ fn load(
     loaded
 }
 
+/// Masks are identified by what their files hold: same paths and lengths are not enough, and the place is irrelevant.
+#[test]
+fn the_identity_of_given_masks_is_that_of_their_contents() {
+    let identity =
+        |path: &Path, ignored: &[u32]| GivenMasks::open(path, ignored.to_vec()).unwrap().identity().unwrap();
+    let (dir, other) = (folder(), folder());
+    let png = |rows: &[u8]| {
+        write_png(&dir.path().join("left/a.png"), png::ColorType::Grayscale, png::BitDepth::One, rows);
+    };
+    png(&[0b0011_1100; 6]);
+    let before = identity(dir.path(), &[]);
+    assert_eq!(identity(dir.path(), &[]), before);
+    assert_ne!(identity(dir.path(), &[1]), before, "ignored ids");
+    fs_err::copy(dir.path().join("left/a.png"), other.path().join("left/a.png")).unwrap();
+    assert_eq!(identity(other.path(), &[]), before, "another place");
+    fs_err::rename(other.path().join("left/a.png"), other.path().join("left/b.png")).unwrap();
+    assert_ne!(identity(other.path(), &[]), before, "another view");
+    let len_bytes = fs_err::metadata(dir.path().join("left/a.png")).unwrap().len();
+    png(&[0b0001_1110; 6]);
+    assert_eq!(fs_err::metadata(dir.path().join("left/a.png")).unwrap().len(), len_bytes);
+    assert_ne!(identity(dir.path(), &[]), before, "other pixels in a file of the same length");
+
+    let data_set = dir.path().join("set.json");
+    let write = |runs: &str| {
+        let text = format!(
+            r#"{{"images":[{{"id":1,"file_name":"a"}}],"annotations":[{{"image_id":1,"segmentation":{{"size":[6,8],"counts":[{runs}]}}}}]}}"#
+        );
+        fs_err::write(&data_set, text).unwrap();
+        identity(&data_set, &[])
+    };
+    let before = write("10,20,18");
+    assert_ne!(write("11,20,17"), before, "other runs in a data set of the same length");
+    assert_eq!(write("10,20,18"), before);
+}
+
 fn folder() -> tempfile::TempDir {
     let dir = tempfile::tempdir().unwrap();
     fs_err::create_dir(dir.path().join("left")).unwrap();
@@ -119,13 +154,13 @@ fn id_images_of_every_depth() {
     let eight: Vec<u8> = pixels().map(|(x, y)| id_at(x, y) as u8).collect();
     let four: Vec<u8> = eight.chunks(2).map(|pair| pair[0] << 4 | pair[1]).collect();
     let sixteen: Vec<u8> = pixels().flat_map(|(x, y)| (id_at(x, y) as u16 * 1_000).to_be_bytes()).collect();
-    let (gray, codebook) = (png::ColorType::Grayscale, png::ColorType::Indexed);
+    let (gray, palette) = (png::ColorType::Grayscale, png::ColorType::Indexed);
     for (name, color, depth, rows) in [
         ("left/a.png", gray, png::BitDepth::Eight, &eight),
         ("left/a.png", gray, png::BitDepth::Four, &four),
         ("left/a.jpg.png", gray, png::BitDepth::Sixteen, &sixteen),
-        ("left/a.png", codebook, png::BitDepth::Eight, &eight),
-        ("left/a.jpg.png", codebook, png::BitDepth::Four, &four),
+        ("left/a.png", palette, png::BitDepth::Eight, &eight),
+        ("left/a.jpg.png", palette, png::BitDepth::Four, &four),
     ] {
         let path = dir.path().join(name);
         write_png(&path, color, depth, rows);
@@ -376,6 +411,25 @@ fn slivers_go_to_their_neighbours() {
     let before = map.clone();
     absorb_slivers(&mut map, &mut masks_of_region);
     assert_eq!(map, before, "without a neighbour it stays");
+}
+
+/// A thing behind a grid of others, cut into nine slivers of 10 pixels: the largest stays, the others go.
+#[test]
+fn a_mask_cut_into_slivers_keeps_one() {
+    let (width, height) = (400, 300);
+    let strips: Vec<Mask> = (0..9).map(|i| mask(width, height, |x, _| x / 10 == i).unwrap()).collect();
+    // A line of ten pixels a strip; the fourth piece has one more, below.
+    let thing = mask(width, height, |x, y| (x < 90 && y == 150) || (x, y) == (33, 151)).unwrap();
+    let masks: Vec<Mask> = strips.into_iter().chain([thing]).collect();
+    let (mut map, mut masks_of_region) = partition(&masks, width, height, width, height, None);
+    assert_eq!(map.n_regions, 18);
+    absorb_slivers(&mut map, &mut masks_of_region);
+    assert_eq!((map.n_regions, masks_of_region.len()), (10, 10));
+    let set = |x: u32, y: u32| &masks_of_region[map.region_of_pixel[(y * width + x) as usize] as usize];
+    assert_eq!(set(35, 150), &[3, 9]);
+    assert_eq!(set(33, 151), &[3, 9]);
+    assert_eq!(set(25, 150), &[2]);
+    assert_eq!(masks_of_region.iter().filter(|set| set.contains(&9)).count(), 1);
 }
 
 #[test]

@@ -7,6 +7,7 @@ use std::path::Path;
 
 use ::image::{Rgb, RgbImage};
 use ort::value::TensorElementType;
+use sha2::{Digest, Sha256};
 
 use crate::{
     ModelFile,
@@ -33,6 +34,11 @@ impl Boundaries {
         let model = Model::open(&ModelFile::embedded(Path::new("segment.onnx"), SEGMENT), options)?;
         model.expect_input(INPUT, TensorElementType::Float32, &[1, 3, -1, -1])?;
         Ok(Self(model))
+    }
+
+    /// Returns the SHA-256 of the embedded model file, in hexadecimal.
+    pub fn sha256() -> String {
+        hex::encode(Sha256::digest(SEGMENT))
     }
 
     /// Returns how probably each pixel and its neighbours show different things, 0 to 1, `[4][height][width]`:

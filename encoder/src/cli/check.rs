@@ -52,21 +52,21 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
     }
     let there: Vec<_> = all.into_iter().filter(|v| !missing.contains(&v.image_path)).collect();
     let n = (args.samples as usize).min(there.len());
-    let mut views = Vec::with_capacity(n);
-    for i in 0..n {
+    // One at a time: a photo is loaded when the check reaches it.
+    let views = (0..n).map(|i| {
         let loaded = ingest::load_image(&there[i * there.len() / n])?;
         let view = RasterView {
             camera_from_world: loaded.view.camera_from_world,
             intrinsics: loaded.view.intrinsics,
         };
-        views.push(CheckView { name: loaded.view.name, image: loaded.image, view });
-    }
+        Ok(CheckView { name: loaded.view.name, image: loaded.image, view })
+    });
     let options = CheckOptions {
         width_px: args.raster_width,
         pictures_dir: args.out.clone(),
         ..CheckOptions::default()
     };
-    let report = check::check(&scene, &views, &Devices::open(args.device, GpuOptions::default())?, &options)?;
+    let report = check::check(&scene, views, &Devices::open(args.device, GpuOptions::default())?, &options)?;
     print(json, &report, &report)?;
     Ok(if missing.is_empty() { Exit::Done } else { Exit::Partly })
 }

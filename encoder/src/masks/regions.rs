@@ -1,42 +1,44 @@
-//! The partition of an image into pixels with the same set of masks.
+//! The partition of an image into regions: pixels that lie in the same masks.
 
-use super::Mask;
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
 
-/// Marks a pixel that no mask covers in [`RegionMap::region_of_pixel`].
+use super::mask::Mask;
+
+/// Label of a pixel outside all masks, in [`RegionMap::region_of_pixel`] and in label images.
 pub const NO_REGION: u32 = u32::MAX;
 
-/// The partition of a view that its masks make: pixels with the same set of masks are a region.
+/// The partition of a view by its masks: the pixels of a region lie in the same masks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RegionMap {
     /// Width, pixels.
     pub width_px: u32,
     /// Height, pixels.
     pub height_px: u32,
-    /// Region of each pixel, row-major; [`NO_REGION`] where no mask lies.
+    /// Region of each pixel, row-major; [`NO_REGION`] outside all masks.
     pub region_of_pixel: Vec<u32>,
-    /// Number of regions; numbered in the order in which a row-major scan meets them.
+    /// Number of regions, which are numbered in the order of a row-major scan.
     pub n_regions: u32,
 }
 
-/// The class of pixels that show nothing; no mask ever touches it.
+/// The class of invalid pixels, which belong to no region.
 const INVALID: u32 = u32::MAX;
-/// The class of pixels that no mask has covered so far.
+/// The class of pixels outside all masks so far.
 const UNCOVERED: u32 = 0;
 
-/// One over the share of a raster below which a region may be a sliver: 30 pixels of 640 x 480.
-const SLIVERS_A_RASTER: usize = 10_000;
-/// One over the share of every mask that covers it below which it is one.
-const SLIVERS_A_MASK: u32 = 8;
+/// A sliver has less than one part in this of the raster: 30 pixels of 640 x 480.
+const SLIVERS_PER_RASTER: usize = 10_000;
+/// A sliver has less than one part in this of every mask that covers it.
+const SLIVERS_PER_MASK: u32 = 8;
 
-/// Cuts a raster into regions of pixels that lie in the same set of masks.
+/// Divides a raster into regions, the sets of pixels that lie in the same masks.
 ///
-/// The masks are those of an image of `width_px` x `height_px`. Each pixel centre of the raster of
-/// `target_width_px` x `target_height_px` takes the nearest image pixel. `valid`: `[height_px *
-/// width_px]`, row-major; pixels that are not valid belong to no region. What a mask's box holds
-/// outside the image is ignored.
+/// `masks` belong to an image of `width_px` x `height_px`; the parts of their boxes outside the image are ignored.
+/// Each pixel centre of the raster of `target_width_px` x `target_height_px` takes the nearest image pixel. `valid`:
+/// `[height_px * width_px]`, row-major; invalid pixels belong to no region.
 ///
-/// Returns the map and the masks of each region, as ascending indices into `masks`. Masks refine
-/// the partition one after the other, each within its box, so the time is that of reading the masks.
+/// Returns the map, and the masks of each region as ascending indices into `masks`. Masks refine the partition one
+/// after the other, each within its box, so the time is proportional to the area of the boxes.
 ///
 /// # Panics
 /// If `valid` has another length than the image has pixels.
@@ -53,7 +55,11 @@ pub fn partition(
     let width = columns.len();
     let mut class_of_pixel = vec![UNCOVERED; width * rows.len()];
     if let Some(valid) = valid {
-        assert_eq!(valid.len(), width_px as usize * height_px as usize, "`valid` is of another size");
+        assert_eq!(
+            valid.len(),
+            width_px as usize * height_px as usize,
+            "`valid` needs one value per pixel of the image"
+        );
         for (classes, y) in class_of_pixel.chunks_mut(width.max(1)).zip(&rows) {
             for (class, x) in classes.iter_mut().zip(&columns) {
                 if !valid[*y as usize * width_px as usize + *x as usize] {
@@ -83,8 +89,8 @@ pub fn partition(
         for class in touched.drain(..) {
             let at = class as usize;
             let inside = std::mem::take(&mut inside_of_class[at]);
-            // A class that lies in the mask as a whole stays one, so there are never more classes
-            // than pixels; only the uncovered one must remain what its name says.
+            // A class that lies in the mask entirely keeps its number, so there are never more classes than pixels.
+            // The uncovered class is the exception: its number is reserved.
             split_of_class[at] = class;
             if class == UNCOVERED || inside < size_of_class[at] {
                 split_of_class[at] = size_of_class.len() as u32;
@@ -101,8 +107,10 @@ pub fn partition(
     number_regions(class_of_pixel, size_of_class.len(), masks, &columns, &rows)
 }
 
-/// Returns the length of a partition's borders over its area, both in pixels: pairs of neighbouring pixels of which
-/// just one lies in a region or each in another, over the pixels that lie in any. It falls with the raster's width.
+/// Returns the ratio of a partition's border length to its area.
+///
+/// The length is the number of neighbouring pixel pairs with different labels, the area the number of pixels in any
+/// region. The ratio falls with the width of the raster.
 pub fn border_share(map: &RegionMap) -> f64 {
     let (pixels, width) = (&map.region_of_pixel, (map.width_px as usize).max(1));
     let in_rows = pixels.chunks(width).map(|row| row.windows(2).filter(|pair| pair[0] != pair[1]).count());
@@ -111,25 +119,67 @@ pub fn border_share(map: &RegionMap) -> f64 {
     (in_rows.sum::<usize>() + in_columns) as f64 / n_covered.max(1) as f64
 }
 
-/// Gives slivers, which ragged edges of masks leave where they overlap, to their neighbours. A sliver has less than a
-/// 10,000th of the raster and less than an eighth of every mask that covers it, so that no mask loses its place. It
-/// goes to the region, no sliver itself, with which it has the longest border; where there is none it stays.
+/// Merges slivers, which ragged edges of overlapping masks leave, into their neighbours.
+///
+/// A sliver has fewer pixels than a 10,000th of the raster and than an eighth of every mask that covers it. It joins
+/// the region, not itself a sliver, with which it shares the longest border; without such a neighbour it stays. A mask
+/// never disappears: if all of its regions would join others, its largest one stays.
 pub fn absorb_slivers(map: &mut RegionMap, masks_of_region: &mut Vec<Vec<u32>>) {
     let mut size_of_region = vec![0_u32; map.n_regions as usize];
     let covered = map.region_of_pixel.iter().filter(|region| **region != NO_REGION);
     covered.for_each(|region| size_of_region[*region as usize] += 1);
-    let n_masks = masks_of_region.iter().flatten().max().map_or(0, |mask| *mask as usize + 1);
-    let mut size_of_mask = vec![0_u32; n_masks];
-    for (masks, size) in masks_of_region.iter().zip(&size_of_region) {
-        masks.iter().for_each(|mask| size_of_mask[*mask as usize] += size);
+    let mut regions_of_mask: BTreeMap<u32, Vec<u32>> = BTreeMap::new();
+    for (masks, region) in masks_of_region.iter().zip(0..) {
+        masks.iter().for_each(|mask| regions_of_mask.entry(*mask).or_default().push(region));
     }
-    let max_px = map.region_of_pixel.len() / SLIVERS_A_RASTER;
-    let is_sliver: Vec<bool> = (masks_of_region.iter().zip(&size_of_region))
-        .map(|(masks, size)| {
-            let is_small = |mask: &u32| SLIVERS_A_MASK * size < size_of_mask[*mask as usize];
-            (*size as usize) < max_px && masks.iter().all(is_small)
-        })
+
+    let is_sliver = slivers(map, masks_of_region, &size_of_region, &regions_of_mask);
+    let mut target_of_region = longest_borders(map, &is_sliver);
+    for regions in regions_of_mask.values() {
+        let stays = |region: &u32| target_of_region[*region as usize] == *region;
+        if !regions.iter().any(stays) {
+            let by_size = |region: &&u32| (size_of_region[**region as usize], Reverse(**region));
+            let largest = regions.iter().max_by_key(by_size);
+            largest.into_iter().for_each(|region| target_of_region[*region as usize] = *region);
+        }
+    }
+
+    // Renumbers the regions in the order of the scan.
+    let mut number_of_region = vec![NO_REGION; map.n_regions as usize];
+    let mut masks_of_number = Vec::new();
+    for region in map.region_of_pixel.iter_mut().filter(|region| **region != NO_REGION) {
+        let target = target_of_region[*region as usize] as usize;
+        if number_of_region[target] == NO_REGION {
+            number_of_region[target] = masks_of_number.len() as u32;
+            masks_of_number.push(std::mem::take(&mut masks_of_region[target]));
+        }
+        *region = number_of_region[target];
+    }
+    map.n_regions = masks_of_number.len() as u32;
+    *masks_of_region = masks_of_number;
+}
+
+/// Returns for each region whether it is a sliver.
+fn slivers(
+    map: &RegionMap,
+    masks_of_region: &[Vec<u32>],
+    size_of_region: &[u32],
+    regions_of_mask: &BTreeMap<u32, Vec<u32>>,
+) -> Vec<bool> {
+    let size_of_mask: BTreeMap<u32, u32> = regions_of_mask
+        .iter()
+        .map(|(mask, regions)| (*mask, regions.iter().map(|region| size_of_region[*region as usize]).sum()))
         .collect();
+    let max_px = map.region_of_pixel.len() / SLIVERS_PER_RASTER;
+    let is_sliver = |(masks, size): (&Vec<u32>, &u32)| {
+        (*size as usize) < max_px && masks.iter().all(|mask| SLIVERS_PER_MASK * size < size_of_mask[mask])
+    };
+    masks_of_region.iter().zip(size_of_region).map(is_sliver).collect()
+}
+
+/// Returns for each sliver the region, not itself a sliver, with which it shares the longest border (the first of
+/// equal ones); for every other region, and a sliver without such a neighbour, the region itself.
+fn longest_borders(map: &RegionMap, is_sliver: &[bool]) -> Vec<u32> {
     let is = |region: u32| region != NO_REGION && is_sliver[region as usize];
     // (sliver, neighbour), once for each pair of pixels along their border.
     let mut borders = Vec::new();
@@ -152,22 +202,10 @@ pub fn absorb_slivers(map: &mut RegionMap, masks_of_region: &mut Vec<Vec<u32>>) 
             longest[sliver as usize] = (run.len(), neighbour);
         }
     }
-    // Numbered anew in the order of the scan.
-    let mut number_of_region = vec![NO_REGION; map.n_regions as usize];
-    let mut masks_of_number = Vec::new();
-    for region in map.region_of_pixel.iter_mut().filter(|region| **region != NO_REGION) {
-        let kept = longest[*region as usize].1 as usize;
-        if number_of_region[kept] == NO_REGION {
-            number_of_region[kept] = masks_of_number.len() as u32;
-            masks_of_number.push(std::mem::take(&mut masks_of_region[kept]));
-        }
-        *region = number_of_region[kept];
-    }
-    map.n_regions = masks_of_number.len() as u32;
-    *masks_of_region = masks_of_number;
+    longest.into_iter().map(|(_, region)| region).collect()
 }
 
-/// Numbers the classes in the order of a row-major scan, and finds the masks of each at its first pixel.
+/// Numbers the classes in the order of a row-major scan, and collects the masks of each at its first pixel.
 fn number_regions(
     mut class_of_pixel: Vec<u32>,
     n_classes: usize,
@@ -202,8 +240,7 @@ fn number_regions(
     (map, first_pixels.iter().map(masks_at).collect())
 }
 
-/// Returns, for each pixel centre of a resampled axis, the nearest pixel of the original one;
-/// nothing if that has none.
+/// Returns the nearest original pixel for each pixel centre of a resampled axis; empty if the original axis is.
 pub(crate) fn nearest(size_px: u32, target_size_px: u32) -> Vec<u32> {
     if size_px == 0 {
         return Vec::new();
@@ -213,7 +250,7 @@ pub(crate) fn nearest(size_px: u32, target_size_px: u32) -> Vec<u32> {
     (0..target).map(|i| ((2 * i + 1) * size / (2 * target)) as u32).collect()
 }
 
-/// Calls `visit` with each raster pixel, in row-major order, whose image pixel lies in the mask.
+/// Visits, in row-major order, the raster pixels with an image pixel in the mask.
 fn for_each_pixel(mask: &Mask, columns: &[u32], rows: &[u32], mut visit: impl FnMut(usize)) {
     let range = |axis: &[u32], low: u32, high: u32| {
         let (start, end) = (axis.partition_point(|p| *p < low), axis.partition_point(|p| *p < high));

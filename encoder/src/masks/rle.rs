@@ -1,10 +1,12 @@
-//! COCO's run-length masks: runs of outside and inside in turn, column by column, and their compact
-//! text (signed base-32 digits, little end first, from the third run on as differences to the run
-//! two before; format of the COCO API, `maskApi.c`, described by its authors as "similar to LEB128").
+//! COCO's run-length encoding of masks.
+//!
+//! The runs alternate between outside and inside, column by column. Their compact text has signed base-32 digits,
+//! least significant first; from the third run on, it holds the difference to the run two before. This is the format
+//! of the COCO API (`maskApi.c`), which its authors call "similar to LEB128".
 
-use super::{BoxPx, Mask};
+use super::mask::{BoxPx, Mask};
 
-/// Digits that a number of 32 bits and a sign may take, 5 bits each.
+/// Most digits of a number with 32 bits and a sign, at 5 bits per digit.
 const MAX_DIGITS: u32 = 7;
 
 /// A run-length encoded mask.
@@ -12,11 +14,11 @@ const MAX_DIGITS: u32 = 7;
 pub struct Rle {
     width_px: u32,
     height_px: u32,
-    /// Lengths of runs, outside first; they add up to the number of pixels.
+    /// Run lengths, outside first; their sum is the number of pixels.
     counts: Vec<u32>,
 }
 
-/// Why a run-length encoding is refused.
+/// Reason why a run-length encoding is rejected.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum RleError {
     /// The runs do not fill the image.
@@ -27,8 +29,8 @@ pub enum RleError {
         /// Sum of the runs.
         found: u64,
     },
-    /// A side is longer than any image's may be.
-    #[error("size {width_px} x {height_px} px, the limit is 65535 each way; encode the mask again")]
+    /// The image is too large.
+    #[error("size {width_px} x {height_px} px, expected at most 65535 px per side; encode the mask again")]
     Size {
         /// Width of the image.
         width_px: u32,
@@ -41,14 +43,14 @@ pub enum RleError {
         /// Position of the run, counted from 0.
         index: usize,
     },
-    /// A character that is no digit, a number that is too long or does not end.
-    #[error("counts: byte {offset_bytes} is no valid digit; encode the mask again")]
+    /// A character is no digit, or a number is too long or incomplete.
+    #[error("counts: invalid digit at byte {offset_bytes}; encode the mask again")]
     Digit {
         /// Offset within the text.
         offset_bytes: usize,
     },
     /// The mask is a list of polygons.
-    #[error("{n_polygons} polygons instead of run lengths; convert them (pycocotools: annToRLE)")]
+    #[error("found {n_polygons} polygons, expected run lengths; convert them with annToRLE of pycocotools")]
     Polygons {
         /// Length of the list.
         n_polygons: usize,
@@ -56,11 +58,11 @@ pub enum RleError {
 }
 
 impl Rle {
-    /// Makes a mask of runs in column-major order, outside first.
+    /// Creates a mask from runs in column-major order, outside first.
     ///
     /// # Errors
-    /// [`RleError::Size`] if pixels cannot be counted in 32 bits; [`RleError::Sum`] unless the runs fill
-    /// the image exactly.
+    /// [`RleError::Size`] if the image is too large to count its pixels in 32 bits, [`RleError::Sum`] unless the runs
+    /// fill the image exactly.
     pub fn from_counts(width_px: u32, height_px: u32, counts: Vec<u32>) -> Result<Self, RleError> {
         if width_px.max(height_px) > u32::from(u16::MAX) {
             return Err(RleError::Size { width_px, height_px });
@@ -78,7 +80,7 @@ impl Rle {
     /// Decodes COCO's compact text.
     ///
     /// # Errors
-    /// [`RleError`] if the text is no encoding or does not fill the image exactly.
+    /// [`RleError`] if the text is malformed or does not fill the image exactly.
     pub fn from_text(width_px: u32, height_px: u32, text: &str) -> Result<Self, RleError> {
         let mut counts: Vec<u32> = Vec::new();
         let mut bytes = text.bytes().enumerate();
@@ -127,7 +129,7 @@ impl Rle {
         text
     }
 
-    /// Encodes a mask of an image of the given size; what its box holds outside is ignored.
+    /// Encodes a mask of an image of the given size; the part of its box outside the image is ignored.
     pub fn from_mask(mask: &Mask, width_px: u32, height_px: u32) -> Self {
         let mut counts = Vec::new();
         let (mut run, mut inside) = (0_u32, false);
@@ -149,7 +151,7 @@ impl Rle {
         [self.width_px, self.height_px]
     }
 
-    /// Returns the runs inside the mask: first pixel, column-major, and length.
+    /// Returns the first pixel (column-major) and the length of each run inside the mask.
     fn runs_inside(&self) -> impl Iterator<Item = (u64, u64)> {
         let mut position = 0;
         self.counts.iter().enumerate().filter_map(move |(index, count)| {
@@ -159,7 +161,7 @@ impl Rle {
         })
     }
 
-    /// Returns the tight box around the mask; `None` if no pixel is inside.
+    /// Returns the tight bounding box; `None` if the mask is empty.
     pub fn box_px(&self) -> Option<BoxPx> {
         let height = u64::from(self.height_px);
         let mut box_px = BoxPx { x0: u32::MAX, y0: u32::MAX, x1: 0, y1: 0 };
@@ -171,16 +173,16 @@ impl Rle {
                 box_px.y0 = box_px.y0.min((start % height) as u32);
                 box_px.y1 = box_px.y1.max((last % height) as u32 + 1);
             } else {
-                // A run over the foot of a column holds its last row and the next one's first.
+                // A run past the foot of a column contains the last row and the first row.
                 (box_px.y0, box_px.y1) = (0, self.height_px);
             }
         }
         (box_px.x1 > 0).then_some(box_px)
     }
 
-    /// Decodes to a mask of level 0; `None` if no pixel is inside.
+    /// Decodes to a mask of level 0; `None` if the mask is empty.
     ///
-    /// The memory is that of the mask's box, which [`Rle::box_px`] tells beforehand.
+    /// Allocates one byte per pixel of the bounding box, which [`Rle::box_px`] returns beforehand.
     pub fn to_mask(&self) -> Option<Mask> {
         let box_px = self.box_px()?;
         let width = box_px.width_px() as usize;

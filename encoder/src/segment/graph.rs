@@ -13,7 +13,8 @@ use slag_models::session::SessionError;
 
 use image::{RgbImage, imageops};
 
-use super::{SegmentError, SegmentInput, Segmenter};
+use super::error::SegmentError;
+use super::segmenter::{SegmentInput, Segmenter};
 use crate::masks::regions::nearest;
 use crate::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
 
@@ -83,7 +84,7 @@ impl GraphSettings {
 #[derive(Debug)]
 pub struct GraphSegmenter {
     settings: GraphSettings,
-    name: String,
+    identity: String,
     model: Option<ModelPool>,
 }
 
@@ -110,8 +111,8 @@ impl GraphSegmenter {
     pub fn new(mut settings: GraphSettings) -> Self {
         settings.scales.truncate(256);
         settings.max_side_px = settings.max_side_px.max(1);
-        let name = format!("graph 2, {settings:?}");
-        Self { settings, name, model: None }
+        let identity = format!("graph 2, {settings:?}");
+        Self { settings, identity, model: None }
     }
 
     /// Makes the segmenter that asks the embedded model; it runs on one thread an image.
@@ -121,7 +122,9 @@ impl GraphSegmenter {
     pub fn learnt(settings: GraphSettings, session: &SessionOptions) -> Result<Self, SessionError> {
         let options = SessionOptions { intra_op_threads: 1, ..session.clone() };
         let idle = Mutex::new(vec![Boundaries::open(&options)?]);
-        Ok(Self { model: Some(ModelPool { options, idle }), ..Self::new(settings) })
+        let without = Self::new(settings);
+        let identity = format!("{}, boundaries {}", without.identity, Boundaries::sha256());
+        Ok(Self { model: Some(ModelPool { options, idle }), identity, ..without })
     }
 }
 
@@ -132,8 +135,8 @@ impl Default for GraphSegmenter {
 }
 
 impl Segmenter for GraphSegmenter {
-    fn name(&self) -> &str {
-        &self.name
+    fn identity(&self) -> Result<String, SegmentError> {
+        Ok(self.identity.clone())
     }
 
     fn wants_depth(&self) -> bool {

@@ -1,11 +1,12 @@
 //! The scene check on real drone photos: a trained scene, its 18 photos and their COLMAP poses.
 
 use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use glam::{DAffine3, DQuat, DVec3};
 use slag_common::{Distortion, Gaussians, Intrinsics};
 use slag_encoder::check::{CheckError, CheckOptions, CheckReport, CheckView, Mistake, check};
-use slag_encoder::raster::{CpuRasterizer, RasterView};
+use slag_encoder::raster::{CpuRasterizer, LoadedScene, RasterError, RasterView, Rasterizer};
 
 use crate::fixtures::{needs_shared, shared};
 
@@ -67,7 +68,7 @@ fn read_views(root: &Path, step: usize) -> Vec<CheckView> {
 }
 
 fn run(scene: &Gaussians, views: &[CheckView], options: &CheckOptions) -> CheckReport {
-    let report = check(scene, views, &CpuRasterizer, options).unwrap();
+    let report = check(scene, views.iter().cloned().map(Ok), &CpuRasterizer, options).unwrap();
     println!("mean {:.2} dB, {:?}", report.mean_psnr_db, report.diagnosis.as_ref().map(|d| &d.advice));
     report
 }
@@ -175,24 +176,50 @@ fn planted_mistakes_are_diagnosed() {
 #[test]
 fn contradictions_are_errors() {
     let error = |views: &[CheckView]| {
+        let views = views.iter().cloned().map(Ok);
         check(&Gaussians::default(), views, &CpuRasterizer, &CheckOptions::default()).unwrap_err()
     };
     assert!(matches!(error(&[]), CheckError::NoViews));
-    let view = CheckView {
-        name: "a".to_owned(),
-        image: image::RgbImage::new(4, 3),
-        view: RasterView {
-            camera_from_world: DAffine3::IDENTITY,
-            intrinsics: Intrinsics {
-                width_px: 4,
-                height_px: 4,
-                focal_x_px: 4.0,
-                focal_y_px: 4.0,
-                centre_x_px: 2.0,
-                centre_y_px: 2.0,
-                distortion: Distortion::None,
-            },
-        },
-    };
+    let mut view = tiny_view();
+    view.image = image::RgbImage::new(4, 3);
     assert!(matches!(error(&[view]), CheckError::ImageSize { image_px: [4, 3], camera_px: [4, 4], .. }));
+}
+
+fn tiny_view() -> CheckView {
+    let intrinsics = Intrinsics {
+        width_px: 4,
+        height_px: 4,
+        focal_x_px: 4.0,
+        focal_y_px: 4.0,
+        centre_x_px: 2.0,
+        centre_y_px: 2.0,
+        distortion: Distortion::None,
+    };
+    CheckView {
+        name: "a".to_owned(),
+        image: image::RgbImage::new(4, 4),
+        view: RasterView { camera_from_world: DAffine3::IDENTITY, intrinsics },
+    }
+}
+
+/// Counts drawings.
+struct Counting(AtomicUsize);
+
+impl Rasterizer for Counting {
+    fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
+        self.0.fetch_add(1, Ordering::Relaxed);
+        CpuRasterizer.load(scene)
+    }
+}
+
+/// Each photo is loaded after the view before it was drawn, so that one is in memory however many there are.
+#[test]
+fn photos_are_loaded_one_at_a_time() {
+    let rasterizer = Counting(AtomicUsize::new(0));
+    let views = (0..9).map(|n_drawn| {
+        assert_eq!(rasterizer.0.load(Ordering::Relaxed), n_drawn, "drawings before photo {n_drawn}");
+        Ok(tiny_view())
+    });
+    let report = check(&Gaussians::default(), views, &rasterizer, &CheckOptions::default()).unwrap();
+    assert_eq!(report.views.len(), 9);
 }

@@ -19,7 +19,8 @@ use image::imageops;
 use slag_models::sam::{Decoded, Sam};
 use slag_models::{ModelError, SessionOptions};
 
-use super::{MAX_MASK_BYTES, SegmentError, SegmentInput, Segmenter};
+use super::error::SegmentError;
+use super::segmenter::{MAX_MASK_BYTES, SegmentInput, Segmenter};
 use crate::masks::{BoxPx, Mask};
 use filter::{Candidate, Filters};
 use upsample::Upsampler;
@@ -77,7 +78,7 @@ impl Default for SamSettings {
 pub struct SamSegmenter {
     sam: Sam,
     settings: SamSettings,
-    name: String,
+    identity: String,
 }
 
 impl SamSegmenter {
@@ -88,8 +89,8 @@ impl SamSegmenter {
     pub fn open(dir: &Path, settings: SamSettings, session: &SessionOptions) -> Result<Self, ModelError> {
         let sam = Sam::open(dir, session)?;
         // Sums of matrix products may be split by the threads of a run.
-        let name = format!("{} {settings:?} on {} threads", sam.id(), session.intra_op_threads);
-        Ok(Self { sam, settings, name })
+        let identity = format!("{} {settings:?} on {} threads", sam.id(), session.intra_op_threads);
+        Ok(Self { sam, settings, identity })
     }
 
     /// Returns the masks of one crop, boxes and pixels those of the image.
@@ -141,8 +142,8 @@ fn too_many(input: &SegmentInput<'_>) -> SegmentError {
 }
 
 impl Segmenter for SamSegmenter {
-    fn name(&self) -> &str {
-        &self.name
+    fn identity(&self) -> Result<String, SegmentError> {
+        Ok(self.identity.clone())
     }
 
     /// One image is embedded while another's points are decoded; the model has threads of its own.

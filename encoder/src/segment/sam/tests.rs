@@ -372,15 +372,16 @@ fn stability_equals_a_plain_recomputation() {
     assert!((5..25).contains(&n_soft), "{n_soft}");
 }
 
-/// What an unfinished encode is recognised by: another file or setting is another segmenter.
+/// The identity decides whether an unfinished encode may go on: other files or settings make another segmenter.
 #[needs_shared]
 #[test]
-fn the_name_tells_model_and_settings() {
+fn the_identity_holds_model_and_settings() {
     let segmenter = tiny(SamSettings::default());
     let other = tiny(SamSettings { crop_points_divisor: 2, ..SamSettings::default() });
-    assert_ne!(segmenter.name(), other.name());
+    let identity = segmenter.identity().expect("needs no file");
+    assert_ne!(identity, other.identity().expect("needs no file"));
     for part in ["38dc63289500", "68f6ab0a5d54", "1024 px", "predicted_iou: 0.88", "1 threads"] {
-        assert!(segmenter.name().contains(part), "{part}: {}", segmenter.name());
+        assert!(identity.contains(part), "{part}: {identity}");
     }
 }
 

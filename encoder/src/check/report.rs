@@ -1,0 +1,86 @@
+//! The report of a check, as a table or as JSON.
+
+use std::fmt;
+
+use serde::Serialize;
+
+use super::diagnosis::{Diagnosis, Means};
+
+/// Comparison of one view with its photo.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ViewCheck {
+    /// Name of the view.
+    pub name: String,
+    /// Peak signal-to-noise ratio of the drawing against the photo, dB.
+    pub psnr_db: f64,
+    /// PSNR of a plane of the photo's mean colour, dB: the score without any knowledge of the scene.
+    pub flat_psnr_db: f64,
+    /// Share of the image that the scene covers (alpha above 0.5).
+    pub covered_share: f64,
+    /// Gaussians in view.
+    pub visible_gaussians: usize,
+}
+
+/// Comparison of a scene with its photos.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct CheckReport {
+    /// The views in the given order.
+    pub views: Vec<ViewCheck>,
+    /// Mean of `psnr_db` over the views, dB.
+    pub mean_psnr_db: f64,
+    /// Mean of `flat_psnr_db` over the views, dB.
+    pub mean_flat_psnr_db: f64,
+    /// Mean of `covered_share` over the views.
+    pub mean_covered_share: f64,
+    /// Largest number of Gaussians that cannot be drawn in a view.
+    pub unusable_gaussians: usize,
+    /// Likely mistake; `None` if the drawings match the photos.
+    pub diagnosis: Option<Diagnosis>,
+}
+
+impl CheckReport {
+    pub(super) fn means(&self) -> Means {
+        Means {
+            psnr_db: self.mean_psnr_db,
+            flat_psnr_db: self.mean_flat_psnr_db,
+            covered_share: self.mean_covered_share,
+        }
+    }
+}
+
+/// Prints a table of the views and the diagnosis.
+impl fmt::Display for CheckReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "{:<28} {:>8} {:>14} {:>9} {:>10}",
+            "view", "PSNR dB", "plain colour", "covered", "Gaussians"
+        )?;
+        for view in &self.views {
+            let covered = format!("{:.0} %", view.covered_share * 100.0);
+            let (psnr_db, flat_db, n) = (view.psnr_db, view.flat_psnr_db, view.visible_gaussians);
+            writeln!(f, "{:<28} {psnr_db:>8.2} {flat_db:>14.2} {covered:>9} {n:>10}", view.name)?;
+        }
+        let covered = format!("{:.0} %", self.mean_covered_share * 100.0);
+        writeln!(
+            f,
+            "{:<28} {:>8.2} {:>14.2} {covered:>9}",
+            "mean", self.mean_psnr_db, self.mean_flat_psnr_db
+        )?;
+        match &self.diagnosis {
+            None => writeln!(f, "the drawings match the photos"),
+            Some(Diagnosis { mistake: Some(mistake), tried, .. }) => {
+                let best_db = tried.first().map_or(f64::NAN, |trial| trial.psnr_db);
+                writeln!(
+                    f,
+                    "the drawings do not match the photos; likely mistake: {mistake} ({best_db:.2} dB with the correction)"
+                )
+            }
+            Some(_) => writeln!(
+                f,
+                "the drawings do not match the photos, and no common mistake explains it; check that the scene was made \
+                 from these photos, in the frame of these poses"
+            ),
+        }
+    }
+}

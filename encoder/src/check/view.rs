@@ -1,0 +1,97 @@
+//! A photo with its camera, and its comparison with a drawing.
+
+use std::io::Cursor;
+
+use image::imageops::{self, FilterType};
+use image::{ImageFormat, RgbImage};
+use slag_common::Gaussians;
+
+use super::error::CheckError;
+use crate::raster::{Drawing, RasterView, Rasterizer};
+
+/// A photo with its camera.
+#[derive(Clone, Debug)]
+pub struct CheckView {
+    /// Name of the view.
+    pub name: String,
+    /// The undistorted photo.
+    pub image: RgbImage,
+    /// Its camera, at the resolution of the photo.
+    pub view: RasterView,
+}
+
+/// Scales a view down to a width, the photo with a filter that averages over the pixels it drops.
+pub(super) fn at_width(view: &CheckView, width_px: u32) -> Result<CheckView, CheckError> {
+    let camera = view.view.intrinsics;
+    let (image_px, camera_px) = (view.image.dimensions(), (camera.width_px, camera.height_px));
+    if image_px != camera_px || image_px.0 == 0 || image_px.1 == 0 {
+        return Err(CheckError::ImageSize {
+            view: view.name.clone(),
+            image_px: image_px.into(),
+            camera_px: camera_px.into(),
+        });
+    }
+    let intrinsics = camera.scaled_to_width(width_px.clamp(1, image_px.0));
+    let image =
+        imageops::resize(&view.image, intrinsics.width_px, intrinsics.height_px, FilterType::Lanczos3);
+    Ok(CheckView { name: view.name.clone(), image, view: RasterView { intrinsics, ..view.view } })
+}
+
+/// Draws a view over black, like trainers of splats.
+pub(super) fn draw(
+    scene: &Gaussians,
+    view: &CheckView,
+    rasterizer: &dyn Rasterizer,
+) -> Result<Drawing, CheckError> {
+    rasterizer
+        .draw(scene, &view.view, [0.0; 3])
+        .map_err(|source| CheckError::Raster { view: view.name.clone(), source })
+}
+
+/// Returns the PSNR of a picture against a photo, dB; 100 where they are equal.
+pub fn psnr_db(photo: &RgbImage, value: impl Fn(usize, usize) -> f32) -> f64 {
+    let squares = photo.pixels().enumerate().flat_map(|(pixel, photo)| {
+        let value = &value;
+        (0..3).map(move |c| {
+            let difference = value(pixel, c).clamp(0.0, 1.0) - f32::from(photo[c]) / 255.0;
+            f64::from(difference * difference)
+        })
+    });
+    -10.0 * mean(squares).max(1e-10).log10()
+}
+
+/// Returns the PSNR of the photo's mean colour, dB.
+pub(super) fn flat_psnr_db(photo: &RgbImage) -> f64 {
+    let colour: [f32; 3] =
+        std::array::from_fn(|c| mean(photo.pixels().map(|p| f64::from(p[c]) / 255.0)) as f32);
+    psnr_db(photo, |_, c| colour[c])
+}
+
+/// Returns a PNG with the photo on the left and the drawing on the right.
+pub(super) fn picture(view: &CheckView, drawing: &Drawing) -> Result<Vec<u8>, CheckError> {
+    let (width_px, height_px) = view.image.dimensions();
+    let picture = RgbImage::from_fn(width_px * 2, height_px, |x, y| {
+        if x < width_px {
+            return *view.image.get_pixel(x, y);
+        }
+        let start = ((y * width_px + x - width_px) * 3) as usize;
+        image::Rgb(std::array::from_fn(|c| (drawing.rgb[start + c].clamp(0.0, 1.0) * 255.0).round() as u8))
+    });
+    let mut png = Cursor::new(Vec::new());
+    picture
+        .write_to(&mut png, ImageFormat::Png)
+        .map_err(|source| CheckError::Encode { view: view.name.clone(), source })?;
+    Ok(png.into_inner())
+}
+
+/// Returns the file name of a view's picture: unique by its index, safe for any view name.
+pub(super) fn picture_name(index: usize, view_name: &str) -> String {
+    let safe = |c: char| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '_' };
+    format!("{index:04}_{}.png", view_name.chars().map(safe).take(120).collect::<String>())
+}
+
+/// Returns the mean, 0 of no values.
+pub(super) fn mean(values: impl Iterator<Item = f64>) -> f64 {
+    let (sum, n) = values.fold((0.0, 0_usize), |(sum, n), v| (sum + v, n + 1));
+    sum / n.max(1) as f64
+}

@@ -1,0 +1,49 @@
+//! One mask of an image.
+
+/// A box in pixels: `x0 <= x < x1`, `y0 <= y < y1`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BoxPx {
+    /// Left, inclusive.
+    pub x0: u32,
+    /// Top, inclusive.
+    pub y0: u32,
+    /// Right, exclusive.
+    pub x1: u32,
+    /// Bottom, exclusive.
+    pub y1: u32,
+}
+
+impl BoxPx {
+    /// Returns the width in pixels.
+    pub fn width_px(&self) -> u32 {
+        self.x1 - self.x0
+    }
+
+    /// Returns the height in pixels.
+    pub fn height_px(&self) -> u32 {
+        self.y1 - self.y0
+    }
+}
+
+/// A set of pixels of an image; masks may overlap.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mask {
+    /// The tight bounding box.
+    pub box_px: BoxPx,
+    /// Membership, row-major within the box.
+    pub inside: Vec<bool>,
+    /// Number of pixels.
+    pub area_px: u32,
+    /// Coarseness, if the segmenter has several levels: 0 is the coarsest (whole objects).
+    pub level: u8,
+}
+
+impl Mask {
+    /// Returns whether the mask contains a pixel of the image.
+    pub fn contains(&self, x: u32, y: u32) -> bool {
+        let BoxPx { x0, y0, x1, y1 } = self.box_px;
+        (x0..x1).contains(&x)
+            && (y0..y1).contains(&y)
+            && self.inside[(y - y0) as usize * self.box_px.width_px() as usize + (x - x0) as usize]
+    }
+}

@@ -1,0 +1,124 @@
+//! Run-length masks of JSON files: SAM's lists and COCO data sets.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use serde::Deserialize;
+use slag_common::Hash32;
+
+use super::limits::{check_size, too_large};
+use super::undistort::undistorted;
+use crate::masks::Mask;
+use crate::masks::rle::{Rle, RleError};
+use crate::segment::error::SegmentError;
+use crate::segment::segmenter::{MAX_MASK_BYTES, SegmentInput};
+
+/// Masks of each image by file name, with their indices in the file.
+pub(super) type MasksOfImage = BTreeMap<String, Vec<(usize, Rle)>>;
+
+#[derive(Deserialize)]
+struct Annotation {
+    segmentation: Segmentation,
+    /// Present in data sets only.
+    image_id: Option<u64>,
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Segmentation {
+    Runs { size: [u32; 2], counts: Counts },
+    Polygons(Vec<serde::de::IgnoredAny>),
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Counts {
+    Text(String),
+    Runs(Vec<u32>),
+}
+
+#[derive(Deserialize)]
+struct MaskFile {
+    #[serde(default)]
+    images: Vec<DataSetImage>,
+    annotations: Vec<Annotation>,
+}
+
+#[derive(Deserialize)]
+struct DataSetImage {
+    id: u64,
+    file_name: String,
+}
+
+/// Reads the run-length masks of one photo, with their indices in the file.
+pub(super) fn read_list(path: &Path) -> Result<Vec<(usize, Rle)>, SegmentError> {
+    rles_of(path, parse(path, &fs_err::read(path)?)?.annotations)
+}
+
+/// Parses a list of masks, or an object with a list as `annotations`.
+fn parse(path: &Path, bytes: &[u8]) -> Result<MaskFile, SegmentError> {
+    let is_list = bytes.iter().find(|byte| !byte.is_ascii_whitespace()) == Some(&b'[');
+    let parsed = if is_list {
+        serde_json::from_slice(bytes).map(|annotations| MaskFile { images: Vec::new(), annotations })
+    } else {
+        serde_json::from_slice(bytes)
+    };
+    parsed.map_err(|source| SegmentError::Json { path: path.to_owned(), source })
+}
+
+fn rles_of(path: &Path, annotations: Vec<Annotation>) -> Result<Vec<(usize, Rle)>, SegmentError> {
+    let rle = |(index, annotation): (usize, Annotation)| match rle_of(annotation.segmentation) {
+        Ok(rle) => Ok((index, rle)),
+        Err(source) => Err(SegmentError::Rle { path: path.to_owned(), index, source }),
+    };
+    annotations.into_iter().enumerate().map(rle).collect()
+}
+
+fn rle_of(segmentation: Segmentation) -> Result<Rle, RleError> {
+    match segmentation {
+        Segmentation::Runs { size: [height, width], counts: Counts::Text(text) } => {
+            Rle::from_text(width, height, &text)
+        }
+        Segmentation::Runs { size: [height, width], counts: Counts::Runs(runs) } => {
+            Rle::from_counts(width, height, runs)
+        }
+        Segmentation::Polygons(list) => Err(RleError::Polygons { n_polygons: list.len() }),
+    }
+}
+
+/// Reads a data set: the hash of its bytes, and the masks of each image by file name.
+pub(super) fn read_data_set(path: &Path) -> Result<(Hash32, MasksOfImage), SegmentError> {
+    let bytes = fs_err::read(path)?;
+    let MaskFile { images, annotations } = parse(path, &bytes)?;
+    let image_ids: Vec<Option<u64>> = annotations.iter().map(|annotation| annotation.image_id).collect();
+    let mut rles_of_id: BTreeMap<u64, Vec<(usize, Rle)>> = BTreeMap::new();
+    for (index, rle) in rles_of(path, annotations)? {
+        if let Some(id) = image_ids[index] {
+            rles_of_id.entry(id).or_default().push((index, rle));
+        }
+    }
+    let named =
+        images.into_iter().map(|image| (image.file_name, rles_of_id.remove(&image.id).unwrap_or_default()));
+    Ok((Hash32::of(&bytes), named.collect()))
+}
+
+/// Decodes run-length masks and undistorts them like the photo.
+pub(super) fn masks_of_rles(
+    path: &Path,
+    rles: &[(usize, Rle)],
+    input: &SegmentInput<'_>,
+) -> Result<Vec<Mask>, SegmentError> {
+    let mut left_bytes = MAX_MASK_BYTES;
+    let mut masks = Vec::new();
+    for (_, rle) in rles {
+        check_size(path, rle.size_px(), input)?;
+        let Some(box_px) = rle.box_px() else { continue };
+        let bytes = u64::from(box_px.width_px()) * u64::from(box_px.height_px());
+        left_bytes = left_bytes.checked_sub(bytes).ok_or_else(|| too_large(path))?;
+        masks.extend(rle.to_mask());
+    }
+    Ok(match input.undistorter {
+        None => masks,
+        Some(undistorter) => undistorted(&masks, undistorter, input.image.width(), input.image.height()),
+    })
+}

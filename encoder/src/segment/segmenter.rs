@@ -1,0 +1,66 @@
+//! The interface of all segmenters.
+
+use image::RgbImage;
+use slag_common::View;
+
+use super::error::SegmentError;
+use crate::ingest::{LoadedImage, Undistorter};
+use crate::masks::Mask;
+
+/// Limit on the masks of one view: the total area of their boxes, one byte per pixel.
+pub(super) const MAX_MASK_BYTES: u64 = 1 << 30;
+
+/// Finds the masks of a photo.
+pub trait Segmenter: Sync {
+    /// Returns the identity of the segmenter's results: its method, every parameter, and the hashes of its weights
+    /// or mask files. Two segmenters of equal identity find the same masks.
+    ///
+    /// # Errors
+    /// [`SegmentError::Io`] if a mask file cannot be read.
+    fn identity(&self) -> Result<String, SegmentError>;
+
+    /// Returns whether the segmenter uses [`SegmentInput::depth`], which costs a drawing of the scene.
+    fn wants_depth(&self) -> bool {
+        false
+    }
+
+    /// Returns the number of photos that the segmenter's own threads or device process at once; `None` if it works on
+    /// the caller's thread.
+    fn n_lanes(&self) -> Option<usize> {
+        None
+    }
+
+    /// Returns the masks of a photo; they may overlap.
+    ///
+    /// # Errors
+    /// [`SegmentError`] if masks cannot be found or read.
+    fn segment(&self, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError>;
+}
+
+/// Input of a segmenter: a photo and its context.
+#[derive(Clone, Copy, Debug)]
+pub struct SegmentInput<'a> {
+    /// The view, with the intrinsics of `image` (an ideal pinhole).
+    pub view: &'a View,
+    /// The undistorted photo.
+    pub image: &'a RgbImage,
+    /// Pixels inside the lens image, row-major; `None` if all are.
+    pub valid: Option<&'a [bool]>,
+    /// The mapping that undistorted the photo, to apply to existing masks.
+    pub undistorter: Option<&'a Undistorter>,
+    /// Depth of the scene, camera z per pixel of `image`, row-major; 0 or NaN if unknown.
+    pub depth: Option<&'a [f32]>,
+}
+
+impl<'a> SegmentInput<'a> {
+    /// Creates the input for a loaded photo.
+    pub fn new(loaded: &'a LoadedImage, depth: Option<&'a [f32]>) -> Self {
+        Self {
+            view: &loaded.view,
+            image: &loaded.image,
+            valid: loaded.valid.as_deref(),
+            undistorter: loaded.undistorter.as_ref(),
+            depth,
+        }
+    }
+}
