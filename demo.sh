@@ -1,8 +1,9 @@
 #!/bin/sh
-# Sets everything up, builds, and shows the whole system at work on a room that it generates itself.
+# Sets everything up, builds, and shows the whole system at work on a house and yard that it generates.
 # usage: demo.sh [flags of `slag-lab demo`]
+# The build leaves out the GPU rasteriser, Qdrant and Arrow, which the demo does not use: `cargo build --release` has them.
 set -eu
 cd "$(dirname "$0")"
-sh scripts/setup.sh
-cargo build --release --locked --bin slag-encoder --bin slag-lab --bin slag-edge
-exec target/release/slag-lab demo "$@"
+sh scripts/setup.sh demo
+cargo build --locked --profile demo --no-default-features -p slag-lab -p slag-encoder -p slag-edge --bins
+exec "${CARGO_TARGET_DIR:-target}/demo/slag-lab" demo "$@"

@@ -1,7 +1,7 @@
 #!/bin/sh
 # Installs what SLAG needs beside Rust: a C linker, Python's pip (to unpack ONNX Runtime), ONNX Runtime, and
 # Vulkan with a software GPU, on which the GPU rasteriser is tested where there is no other.
-# usage: setup.sh [cross]     cross: also what the aarch64 build and its smoke test need
+# usage: setup.sh [demo|cross]     demo: without the software GPU; cross: also what the aarch64 build and its smoke test need
 # Does nothing where all is there already. Made for Debian 12; elsewhere install the same by hand.
 set -eu
 cd "$(dirname "$0")/.."
@@ -21,7 +21,7 @@ for pair in $wanted; do
     command -v "${pair%%:*}" >/dev/null 2>&1 || missing="$missing ${pair#*:}"
 done
 # Without a GPU the program runs all the same; tests of the GPU rasteriser need one, or this.
-if command -v apt-get >/dev/null 2>&1; then
+if command -v apt-get >/dev/null 2>&1 && [ "${1:-}" != demo ]; then
     ls /usr/lib/*/libvulkan.so.1 >/dev/null 2>&1 || missing="$missing libvulkan1"
     find /usr/share/vulkan/icd.d /etc/vulkan/icd.d -name '*.json' 2>/dev/null | grep -q . ||
         missing="$missing mesa-vulkan-drivers"
