@@ -6,7 +6,9 @@
 pub mod axes;
 mod dot;
 pub mod eigen;
+pub mod graph_segmentation;
 pub mod matrix;
 pub mod random;
+pub mod union_find;
 
 pub use dot::{dot, dot_f64};

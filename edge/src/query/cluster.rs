@@ -11,6 +11,7 @@ use glam::{DVec3, I64Vec3};
 use rayon::prelude::*;
 use slag_common::frames::Aabb;
 use slag_common::shard::ShardView;
+use slag_math::union_find::UnionFind;
 
 use super::oriented::{Alignment, OrientedBox, trimmed_range};
 use crate::score::Run;
@@ -202,13 +203,6 @@ fn weight_of_score(runs: &[Run], threshold: f32) -> impl Fn(f32) -> f64 {
 
 /// Returns for each voxel (by key, ascending) a number that those of its group share. `masses`: `[voxels]`.
 fn connect(voxels: &[&[Span]], masses: &[f64]) -> Vec<u32> {
-    fn root_of(parents: &mut [u32], mut at: u32) -> u32 {
-        while parents[at as usize] != at {
-            parents[at as usize] = parents[parents[at as usize] as usize];
-            at = parents[at as usize];
-        }
-        at
-    }
     // From here on voxels are named by their rank, from the heaviest; a group's root is its heaviest.
     let mut by_rank: Vec<u32> = (0..voxels.len() as u32).collect();
     let mass = |voxel: u32| masses[voxel as usize];
@@ -237,16 +231,16 @@ fn connect(voxels: &[&[Span]], masses: &[f64]) -> Vec<u32> {
         }
     }
     joints.par_sort_unstable();
-    let mut parents: Vec<u32> = (0..voxels.len() as u32).collect();
+    let mut groups = UnionFind::new(voxels.len());
     let mass = |rank: u32| masses[by_rank[rank as usize] as usize];
     for (lighter, heavier) in joints {
-        let (a, b) = (root_of(&mut parents, lighter), root_of(&mut parents, heavier));
+        let (a, b) = (groups.root(lighter), groups.root(heavier));
         let lesser = a.max(b);
         if mass(lighter) >= BRIDGE_SHARE * mass(lesser) {
-            parents[lesser as usize] = a.min(b);
+            groups.attach(lesser, a.min(b));
         }
     }
-    rank_of.into_iter().map(|rank| root_of(&mut parents, rank)).collect()
+    rank_of.into_iter().map(|rank| groups.root(rank)).collect()
 }
 
 fn summarise(shards: &[ShardView<'_>], runs: &[Run], spans: &[Span], alignment: Alignment) -> Cluster {

@@ -10,9 +10,11 @@ use rstar::primitives::GeomWithData;
 use slag_common::Gaussians;
 
 use slag_math::dot;
+use slag_math::graph_segmentation::Components;
+use slag_math::union_find::{NOT_NUMBERED, Numbering};
 
 /// The superpoint of a Gaussian that cannot be drawn.
-pub const NO_SUPERPOINT: u32 = u32::MAX;
+pub const NO_SUPERPOINT: u32 = NOT_NUMBERED;
 
 /// How fine superpoints are.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -123,33 +125,15 @@ impl Graph {
 
     /// Partitions the scene. `settings`: scale and least size.
     pub fn superpoints(&self, settings: &SuperpointSettings) -> Superpoints {
-        let mut forest = Forest::new(self.n_gaussians, settings.scale);
+        let mut components = Components::new(self.n_gaussians, settings.scale);
         for (length, a, b) in &self.edges {
-            let length = f32::from_bits(*length);
-            let (a, b) = (forest.root(*a), forest.root(*b));
-            if a != b && length <= forest.threshold[a as usize].min(forest.threshold[b as usize]) {
-                forest.join(a, b, length, settings.scale);
-            }
+            components.join_if_similar(*a, *b, f32::from_bits(*length));
         }
         for (_, a, b) in &self.edges {
-            let (a, b) = (forest.root(*a), forest.root(*b));
-            let smaller = forest.size[a as usize].min(forest.size[b as usize]);
-            if a != b && smaller < settings.min_gaussians {
-                forest.join(a, b, 0.0, 0.0);
-            }
+            components.join_if_small(*a, *b, settings.min_gaussians);
         }
-        let mut number_of_root = vec![NO_SUPERPOINT; self.n_gaussians];
-        let mut of_gaussian = vec![NO_SUPERPOINT; self.n_gaussians];
-        let mut n = 0;
-        for i in &self.usable {
-            let number = &mut number_of_root[forest.root(*i) as usize];
-            if *number == NO_SUPERPOINT {
-                *number = n;
-                n += 1;
-            }
-            of_gaussian[*i as usize] = *number;
-        }
-        Superpoints { of_gaussian, n: n as usize }
+        let Numbering { of_item, sizes } = components.number(self.usable.iter().copied());
+        Superpoints { of_gaussian: of_item, n: sizes.len() }
     }
 }
 
@@ -192,36 +176,6 @@ fn thinnest_axis([w, x, y, z]: [f32; 4], scales: [f32; 3]) -> [f32; 3] {
         0 => [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y)],
         1 => [2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + w * x)],
         _ => [2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)],
-    }
-}
-
-/// Disjoint sets of Gaussians.
-struct Forest {
-    parent: Vec<u32>,
-    size: Vec<u32>,
-    /// Of a root: the length up to which its component takes an edge.
-    threshold: Vec<f32>,
-}
-
-impl Forest {
-    fn new(n: usize, scale: f32) -> Self {
-        Self { parent: (0..n as u32).collect(), size: vec![1; n], threshold: vec![scale; n] }
-    }
-
-    fn root(&mut self, mut i: u32) -> u32 {
-        while self.parent[i as usize] != i {
-            let grandparent = self.parent[self.parent[i as usize] as usize];
-            self.parent[i as usize] = grandparent;
-            i = grandparent;
-        }
-        i
-    }
-
-    fn join(&mut self, a: u32, b: u32, length: f32, scale: f32) {
-        let (root, child) = if self.size[a as usize] >= self.size[b as usize] { (a, b) } else { (b, a) };
-        self.parent[child as usize] = root;
-        self.size[root as usize] += self.size[child as usize];
-        self.threshold[root as usize] = length + scale / self.size[root as usize] as f32;
     }
 }
 

@@ -7,6 +7,8 @@ use std::borrow::Cow;
 use std::collections::HashMap;
 use std::sync::{Mutex, PoisonError};
 
+use slag_math::graph_segmentation::Components;
+use slag_math::union_find::{NOT_NUMBERED, Numbering};
 use slag_models::SessionOptions;
 use slag_models::boundaries::Boundaries;
 use slag_models::session::SessionError;
@@ -193,6 +195,9 @@ impl GraphSegmenter {
     }
 }
 
+// Pixels that no component has are in no region.
+const _: () = assert!(NOT_NUMBERED == NO_REGION);
+
 /// An edge of the grid: the pixel it belongs to times 4, plus the index of the neighbour.
 type Edge = u32;
 
@@ -302,53 +307,46 @@ impl Raster {
     /// inner weight plus `scale` over their size; then joins what is smaller than `min_area_px` to
     /// its most similar neighbour.
     fn components(&self, edges: &[(Edge, u16)], scale: f32, min_area_px: u32) -> Labels {
-        let mut forest = Forest::new(self.lab.len(), scale);
+        let mut components = Components::new(self.lab.len(), scale);
         let ends = |edge: Edge| {
             let pixel = edge as usize / 4;
             let (dx, dy) = NEIGHBOURS[edge as usize % 4];
             // Within the raster: the edge was made so.
-            (pixel, (pixel as i64 + dy * i64::from(self.width_px) + dx) as usize)
+            (pixel as u32, (pixel as i64 + dy * i64::from(self.width_px) + dx) as u32)
         };
         let mut open = Vec::new();
         for (edge, weight) in edges {
             let (a, b) = ends(*edge);
-            let (a, b) = (forest.root(a), forest.root(b));
-            if a == b {
-                continue;
-            }
-            let weight = f32::from(*weight);
-            if weight <= forest.threshold[a].min(forest.threshold[b]) {
-                forest.join(a, b, weight + scale / (forest.area_px[a] + forest.area_px[b]) as f32);
-            } else {
+            if !components.join_if_similar(a, b, f32::from(*weight)) {
                 open.push(*edge);
             }
         }
         for edge in &open {
             let (a, b) = ends(*edge);
-            let (a, b) = (forest.root(a), forest.root(b));
-            if a != b && forest.area_px[a].min(forest.area_px[b]) < min_area_px {
-                forest.join(a, b, 0.0);
-            }
+            components.join_if_small(a, b, min_area_px);
         }
-        let mut thick = self.thick(&mut forest);
+        let mut thick = self.thick(&mut components);
         for edge in &open {
             let (a, b) = ends(*edge);
-            let (a, b) = (forest.root(a), forest.root(b));
-            if a != b && !(thick[a] && thick[b]) {
-                let either = thick[a] || thick[b];
-                forest.join(a, b, 0.0);
-                thick[forest.root(a)] = either;
+            let (a, b) = (components.root(a), components.root(b));
+            let [a_is_thick, b_is_thick] = [a, b].map(|root| thick[root as usize]);
+            if a != b && !(a_is_thick && b_is_thick) {
+                let root = components.join_roots(a, b);
+                thick[root as usize] = a_is_thick || b_is_thick;
             }
         }
-        forest.labels(&self.valid)
+        let valid = (0..).zip(&self.valid).filter(|(_, valid)| **valid);
+        let Numbering { of_item, sizes } = components.number(valid.map(|(pixel, _)| pixel));
+        Labels { of_pixel: of_item, area_px: sizes }
     }
 
     /// Returns, at the roots, whether enough of a component is surrounded by itself.
     ///
     /// A smoothed outline is a ramp of colours. A component only as wide as that is a strip of it,
     /// and belongs to no object.
-    fn thick(&self, forest: &mut Forest) -> Vec<bool> {
-        let roots: Vec<usize> = (0..self.lab.len()).map(|pixel| forest.root(pixel)).collect();
+    fn thick(&self, components: &mut Components) -> Vec<bool> {
+        let roots: Vec<usize> =
+            (0..self.lab.len() as u32).map(|pixel| components.root(pixel) as usize).collect();
         let (width, height) = (self.width_px as usize, self.height_px as usize);
         if width < 3 || height < 3 {
             return vec![true; roots.len()];
@@ -360,59 +358,8 @@ impl Raster {
                 |middle: &usize| roots[middle - 1..=middle + 1].iter().all(|root| *root == roots[pixel]);
             surrounded_px[roots[pixel]] += u32::from(rows.iter().all(same));
         }
-        let shares = surrounded_px.iter().zip(&forest.area_px);
+        let shares = surrounded_px.iter().zip(components.sizes());
         shares.map(|(surrounded_px, area_px)| surrounded_px * MIN_SURROUNDED >= *area_px).collect()
-    }
-}
-
-/// Disjoint sets of pixels.
-struct Forest {
-    parent: Vec<u32>,
-    area_px: Vec<u32>,
-    /// Of a root: the weight up to which its component takes an edge.
-    threshold: Vec<f32>,
-}
-
-impl Forest {
-    fn new(n_pixels: usize, scale: f32) -> Self {
-        let parent = (0..n_pixels as u32).collect();
-        Self { parent, area_px: vec![1; n_pixels], threshold: vec![scale; n_pixels] }
-    }
-
-    fn root(&mut self, mut pixel: usize) -> usize {
-        while self.parent[pixel] as usize != pixel {
-            let grandparent = self.parent[self.parent[pixel] as usize];
-            self.parent[pixel] = grandparent;
-            pixel = grandparent as usize;
-        }
-        pixel
-    }
-
-    /// Joins two roots, the smaller below the larger.
-    fn join(&mut self, a: usize, b: usize, threshold: f32) {
-        let (root, child) = if self.area_px[a] >= self.area_px[b] { (a, b) } else { (b, a) };
-        self.parent[child] = root as u32;
-        self.area_px[root] += self.area_px[child];
-        self.threshold[root] = threshold;
-    }
-
-    /// Numbers the sets of valid pixels in the order of a row-major scan.
-    fn labels(mut self, valid: &[bool]) -> Labels {
-        let mut label_of_root = vec![NO_REGION; self.parent.len()];
-        let mut labels = Labels { of_pixel: Vec::with_capacity(valid.len()), area_px: Vec::new() };
-        for (pixel, valid) in valid.iter().enumerate() {
-            if !valid {
-                labels.of_pixel.push(NO_REGION);
-                continue;
-            }
-            let root = self.root(pixel);
-            if label_of_root[root] == NO_REGION {
-                label_of_root[root] = labels.area_px.len() as u32;
-                labels.area_px.push(self.area_px[root]);
-            }
-            labels.of_pixel.push(label_of_root[root]);
-        }
-        labels
     }
 }
 

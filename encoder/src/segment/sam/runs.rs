@@ -1,5 +1,7 @@
 //! A mask as runs of pixels: small while thousands of candidates wait for the filters.
 
+use slag_math::union_find::{Numbering, UnionFind};
+
 use crate::masks::{BoxPx, Mask};
 
 /// Pixels `x0 <= x < x1` of row `y`.
@@ -73,7 +75,7 @@ impl RunMask {
         let outside = complement(&self.runs, width_px, height_px);
         let hole_of = components(&outside);
         let left = outside.iter().zip(&hole_of.of_run);
-        let left = left.filter(|(_, component)| !is_small(&hole_of.sizes_px[**component]));
+        let left = left.filter(|(_, component)| !is_small(&hole_of.sizes_px[**component as usize]));
         let left: Vec<Run> = left.map(|(run, _)| *run).collect();
         let filled = complement(&left, width_px, height_px);
 
@@ -85,7 +87,7 @@ impl RunMask {
         let most_px = island_of.sizes_px.iter().copied().max().filter(is_small);
         let spared = island_of.sizes_px.iter().position(|size_px| Some(*size_px) == most_px);
         let stays = |component: usize| Some(component) == spared || !is_small(&island_of.sizes_px[component]);
-        let kept = filled.iter().zip(&island_of.of_run).filter(|(_, component)| stays(**component));
+        let kept = filled.iter().zip(&island_of.of_run).filter(|(_, component)| stays(**component as usize));
         Self::new(kept.map(|(run, _)| *run).collect())
     }
 }
@@ -112,21 +114,14 @@ fn complement(runs: &[Run], width_px: u32, height_px: u32) -> Vec<Run> {
 /// Connected components of runs.
 struct Components {
     /// Of each run, numbered in the order in which a row-major scan meets them.
-    of_run: Vec<usize>,
+    of_run: Vec<u32>,
     sizes_px: Vec<u64>,
 }
 
 /// Finds the components of runs in row-major order; runs of neighbouring rows that overlap or touch at a corner
 /// are connected.
 fn components(runs: &[Run]) -> Components {
-    let mut parents: Vec<usize> = (0..runs.len()).collect();
-    fn root(parents: &mut [usize], mut run: usize) -> usize {
-        while parents[run] != run {
-            parents[run] = parents[parents[run]];
-            run = parents[run];
-        }
-        run
-    }
+    let mut sets = UnionFind::new(runs.len());
     let mut above = 0;
     for (at, run) in runs.iter().enumerate() {
         while (runs[above].y + 1 < run.y) || (runs[above].y + 1 == run.y && runs[above].x1 < run.x0) {
@@ -134,22 +129,12 @@ fn components(runs: &[Run]) -> Components {
         }
         let touching = runs[above..at].iter().enumerate();
         for (k, _) in touching.take_while(|(_, other)| other.y + 1 == run.y && other.x0 <= run.x1) {
-            let (a, b) = (root(&mut parents, above + k), root(&mut parents, at));
-            parents[a.max(b)] = a.min(b);
+            let (a, b) = (sets.root((above + k) as u32), sets.root(at as u32));
+            sets.attach(a.max(b), a.min(b));
         }
     }
-    let mut number_of_root = vec![usize::MAX; runs.len()];
-    let mut sizes_px = Vec::new();
-    let of_run = (0..runs.len())
-        .map(|at| {
-            let root = root(&mut parents, at);
-            if number_of_root[root] == usize::MAX {
-                number_of_root[root] = sizes_px.len();
-                sizes_px.push(0);
-            }
-            sizes_px[number_of_root[root]] += u64::from(runs[at].x1 - runs[at].x0);
-            number_of_root[root]
-        })
-        .collect();
+    let Numbering { of_item: of_run, sizes } = sets.number(0..runs.len() as u32);
+    let mut sizes_px = vec![0; sizes.len()];
+    runs.iter().zip(&of_run).for_each(|(run, n)| sizes_px[*n as usize] += u64::from(run.x1 - run.x0));
     Components { of_run, sizes_px }
 }
