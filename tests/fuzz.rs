@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 #[path = "../fuzz/src/lib.rs"]
 mod targets;
 
+use slag_math::random::Random;
 use slag_test_support::shared_folder;
 
 /// Memory that a decoder may take beyond the multiple of its input: buffers, and small pictures.
@@ -69,23 +70,6 @@ fn peak_bytes<T>(work: impl FnOnce() -> T) -> (T, usize) {
     (result, (PEAK_BYTES.get() - before) as usize)
 }
 
-/// SplitMix64 (Steele et al. 2014).
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    fn below(&mut self, n: usize) -> usize {
-        (self.next() % n.max(1) as u64) as usize
-    }
-}
-
 /// Changes some bytes, as fuzzers do: bits, numbers, digits, cuts, copies, and pieces of another seed.
 fn mutated(seeds: &[Vec<u8>], random: &mut Random) -> Vec<u8> {
     let mut bytes = seeds[random.below(seeds.len())].clone();
@@ -93,7 +77,7 @@ fn mutated(seeds: &[Vec<u8>], random: &mut Random) -> Vec<u8> {
         let at = random.below(bytes.len());
         match random.below(9) {
             0 | 1 if !bytes.is_empty() => bytes[at] ^= 1 << random.below(8),
-            2 if !bytes.is_empty() => bytes[at] = random.next() as u8,
+            2 if !bytes.is_empty() => bytes[at] = random.bits() as u8,
             3 | 4 => {
                 let width = [1, 2, 4, 8][random.below(4)];
                 let value = INTERESTING[random.below(INTERESTING.len())].to_le_bytes();
@@ -143,7 +127,7 @@ fn no_decoder_panics() {
             continue;
         }
         let start = Instant::now();
-        let mut random = Random(7);
+        let mut random = Random::new(7);
         let (mut n, mut largest_bytes) = (0, 0);
         let mut n_accepted = seeds.iter().filter(|seed| (target.run)(seed)).count();
         if n_accepted == 0 {

@@ -5,19 +5,11 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
+use slag_math::random::Random;
 use slag_tests::*;
 
 const N_ENCODE_KILLS: usize = 20;
 const N_FETCH_KILLS: usize = 100;
-
-/// A pseudo-random sequence in 0..1 (SplitMix64).
-fn random(state: &mut u64) -> f64 {
-    *state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-    let mut z = *state;
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    (z ^ (z >> 31)) as f64 / u64::MAX as f64
-}
 
 /// Runs a command to its end and returns what it printed, or kills it after a while.
 fn run_or_kill(command: &mut Command, after: Duration) -> Option<Vec<u8>> {
@@ -49,13 +41,13 @@ fn killed_encodes_resume_and_show_nothing_half() {
 
     // Killed again and again, within the first half so that several kills hit each store; a store that got
     // finished in between makes room for the next.
-    let mut state = 7;
+    let mut random = Random::new(7);
     let (mut n_kills, mut n_stores, mut n_resumed) = (0, 0, 0);
     while n_kills < N_ENCODE_KILLS {
         let store = dir.path().join(format!("store{n_stores}"));
         let printed = loop {
             let enough = n_kills == N_ENCODE_KILLS;
-            let after = if enough { Duration::MAX } else { encode_time.mul_f64(0.5 * random(&mut state)) };
+            let after = if enough { Duration::MAX } else { encode_time.mul_f64(0.5 * random.unit()) };
             match run_or_kill(&mut encode_room(&room, &store), after) {
                 Some(printed) => break printed,
                 None => n_kills += 1,
@@ -105,13 +97,13 @@ fn killed_fetches_leave_the_old_or_the_new_generation() {
     assert_eq!(expected.each_ref().map(|(generation, _)| *generation), [1, 2]);
     assert!(expected.iter().all(|(_, answers)| !answers.as_array().expect("answers").is_empty()));
 
-    let mut state = 11;
+    let mut random = Random::new(11);
     let (mut n_kills, mut n_runs, mut n_new) = (0, 0, 0);
     while n_kills < N_FETCH_KILLS {
         let cache = dir.path().join(format!("cache{n_runs}"));
         copy_dir(&old, &cache);
         let is_killed =
-            run_or_kill(&mut fetch(&stores[1], &cache), fetch_time.mul_f64(random(&mut state))).is_none();
+            run_or_kill(&mut fetch(&stores[1], &cache), fetch_time.mul_f64(random.unit())).is_none();
         let found = ask(&cache);
         assert!(expected.contains(&found), "run {n_runs}: generation {} answers otherwise", found.0);
         assert!(is_killed || found.0 == 2, "run {n_runs}: a fetch that ended well is there");

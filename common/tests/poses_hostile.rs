@@ -6,6 +6,7 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
 use slag_common::poses::{self, PoseError};
+use slag_math::random::Random;
 
 thread_local! {
     static LARGEST_BYTES: Cell<usize> = const { Cell::new(0) };
@@ -30,19 +31,6 @@ unsafe impl GlobalAlloc for Measuring {
 
 #[global_allocator]
 static ALLOCATOR: Measuring = Measuring;
-
-/// Deterministic random numbers (SplitMix64; Steele, Lea and Flood 2014).
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, n: usize) -> usize {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((z ^ (z >> 31)) % n as u64) as usize
-    }
-}
 
 /// A file, whole or with its end cut off, a few bits flipped or eight bytes set to ones.
 fn damaged(bytes: &[u8], random: &mut Random) -> Vec<u8> {
@@ -115,7 +103,7 @@ fn survive(files: &[(&str, Vec<u8>)]) -> usize {
     assert_eq!(poses::read(dir.path(), None).unwrap().views.len(), 2);
     let mut n_read = 0;
     for (name, bytes) in files {
-        let mut random = Random(bytes.len() as u64);
+        let mut random = Random::new(bytes.len() as u64);
         for round in 0..1_000 {
             let bad = damaged(bytes, &mut random);
             write(name, &bad);

@@ -196,28 +196,6 @@ fn quantise_exactly(values: &[f32]) -> (Vec<i8>, f32) {
     (values.iter().map(|v| (v / step).round() as i8).collect(), step)
 }
 
-/// Pseudo-random numbers for bulk data (splitmix64, Steele et al. 2014).
-pub struct Random(pub u64);
-
-impl Random {
-    pub fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    /// Uniform in -1..1.
-    pub fn signed(&mut self) -> f32 {
-        (self.next() >> 40) as f32 / (1u64 << 23) as f32 - 1.0
-    }
-
-    pub fn unit(&mut self, dim: usize) -> Vec<f32> {
-        normalised((0..dim).map(|_| self.signed()).collect())
-    }
-}
-
 pub fn normalised(vector: Vec<f32>) -> Vec<f32> {
     let length = vector.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
     vector.into_iter().map(|v| (f64::from(v) / length) as f32).collect()

@@ -8,16 +8,13 @@ use slag_encoder::lift::{
     CellField, Contribution, ContributionError, ContributionIndex, PartContributions, RegionTable,
     ViewContributions,
 };
+use slag_math::random::mix64;
 
 const N_MUTATIONS: u64 = 1000;
 
 /// Returns a damaged copy: cut for every fourth seed, else with one to three flipped bits.
 fn damaged(bytes: &[u8], seed: u64) -> Vec<u8> {
-    let random = |salt: u64| {
-        let mut z = (seed * 31 + salt).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        (z ^ (z >> 31)) as usize
-    };
+    let random = |salt: u64| mix64(seed * 31 + salt) as usize;
     if seed.is_multiple_of(4) {
         return bytes[..random(0) % bytes.len()].to_vec();
     }

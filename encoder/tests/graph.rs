@@ -4,13 +4,14 @@ mod common;
 
 use std::path::Path;
 
-use common::{Random, needs_shared, shared};
+use common::{needs_shared, shared};
 use glam::DAffine3;
 use image::{Rgb, RgbImage};
 use slag_common::{Distortion, Intrinsics, View, poses};
 use slag_encoder::ingest::load_image;
 use slag_encoder::masks::Mask;
 use slag_encoder::segment::{GivenMasks, GraphSegmenter, GraphSettings, SegmentInput, Segmenter};
+use slag_math::random::Random;
 use slag_models::SessionOptions;
 use slag_models::session::find_runtime;
 
@@ -58,7 +59,7 @@ fn best_iou(masks: &[Mask], inside: impl Fn(u32, u32) -> bool + Copy, size: (u32
 /// A disc and a bar on a shaded, noisy ground.
 #[test]
 fn shapes_on_a_noisy_ramp() {
-    let mut random = Random(7);
+    let mut random = Random::new(7);
     let disc = |x: u32, y: u32| x.abs_diff(60).pow(2) + y.abs_diff(70).pow(2) < 900;
     let bar = |x: u32, y: u32| (120..180).contains(&x) && (30..50).contains(&y);
     let image = RgbImage::from_fn(240, 160, |x, y| {

@@ -3,7 +3,6 @@
 
 mod common;
 
-use common::Random;
 use glam::DVec3;
 use half::f16;
 use slag_common::container::AlignedBytes;
@@ -15,6 +14,7 @@ use slag_encoder::lift::{CellField, Contribution, ContributionIndex, RegionTable
 use slag_encoder::shard::positions::PositionError;
 use slag_encoder::shard::{self, CellEmbeddings, ShardSettings};
 use slag_math::matrix::Rows;
+use slag_math::random::Random;
 
 const DIM: usize = 512;
 
@@ -138,7 +138,7 @@ fn worst_of(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
 /// Two masks at an angle have a mean of length cos(angle / 2): what is left of antiparallel ones is noise.
 #[test]
 fn parallel_and_antiparallel_vectors() {
-    let random = &mut Random(1);
+    let random = &mut Random::new(1);
     let (mut worst, mut n_flagged) = ([0.0; 4], 0);
     let from_pi = [0.0, 1e-7, 1e-5, 1e-4, 1e-3, 1.9e-3, 2.1e-3, 1e-2, 0.1];
     let angles =
@@ -168,7 +168,7 @@ fn parallel_and_antiparallel_vectors() {
 /// Pairs of opposite vectors in random order cancel exactly; a vector of known weight remains.
 #[test]
 fn masks_that_disagree() {
-    let random = &mut Random(2);
+    let random = &mut Random::new(2);
     let mut worst = [0.0; 4];
     // Shares of the whole that do not cancel, about the limit below which there is no evidence.
     for (share, has_evidence) in [(0.0, false), (1e-6, false), (9e-4, false), (1.1e-3, true), (1e-2, true)] {
@@ -195,7 +195,7 @@ fn masks_that_disagree() {
 /// A Gaussian seen in 16,384 views at 65,536 pixels each: 2^30 pixels in all.
 #[test]
 fn a_billion_pixels_over_many_views() {
-    let random = &mut Random(3);
+    let random = &mut Random::new(3);
     let masks: Vec<Vec<f32>> = (0..7).map(|_| to_f32(&direction(random))).collect();
     let n_views = 1 << 14;
     let vectors = (0..n_views).map(|_| masks[random.below(7)].clone()).collect();
@@ -253,7 +253,7 @@ fn exact_shard(vectors: &[Vec<f32>], means_in_world: Vec<DVec3>) -> AlignedBytes
 /// step of 2^-24, and zero in the end.
 #[test]
 fn embeddings_stored_as_f16() {
-    let random = &mut Random(4);
+    let random = &mut Random::new(4);
     let n = 300;
     let vectors: Vec<Vec<f32>> = (0..n)
         .map(|i| {
@@ -294,7 +294,7 @@ fn embeddings_stored_as_f16() {
 /// Rows stand for their members to the stated radius, positions are right to half a step.
 #[test]
 fn shards_keep_their_bounds() {
-    let random = &mut Random(5);
+    let random = &mut Random::new(5);
     let centres: Vec<Vec<f64>> = (0..8).map(|_| direction(random)).collect();
     let n = 3000;
     let vectors: Vec<Vec<f32>> = (0..n)

@@ -4,7 +4,7 @@ mod common;
 
 use std::path::Path;
 
-use common::{Random, needs_shared, shared};
+use common::{needs_shared, shared};
 use glam::DAffine3;
 use image::{GrayImage, ImageBuffer, Luma, RgbImage};
 use proptest::prelude::*;
@@ -14,6 +14,7 @@ use slag_encoder::masks::regions::{absorb_slivers, border_share, partition};
 use slag_encoder::masks::rle::{Rle, RleError};
 use slag_encoder::masks::{BoxPx, Mask, NO_REGION, RegionMap};
 use slag_encoder::segment::{GivenMasks, SegmentError, SegmentInput, Segmenter};
+use slag_math::random::Random;
 
 /// Makes a mask of a membership function; `None` if no pixel is inside.
 fn mask(width: u32, height: u32, inside: impl Fn(u32, u32) -> bool) -> Option<Mask> {
@@ -347,7 +348,7 @@ proptest! {
     fn regions_are_the_distinct_sets_of_masks(
         seed: u64, n in 0_usize..12, size in (1_u32..40, 1_u32..30), target in (1_u32..60, 1_u32..60), holes: bool,
     ) {
-        let mut random = Random(seed);
+        let mut random = Random::new(seed);
         let mut masks: Vec<Mask> = (0..n).map(|_| random_mask(&mut random, size.0, size.1)).collect();
         // Identical masks, and one of a single pixel.
         masks.extend(masks.first().cloned());
@@ -359,7 +360,7 @@ proptest! {
 
 #[test]
 fn three_hundred_overlapping_masks() {
-    let mut random = Random(3);
+    let mut random = Random::new(3);
     let masks: Vec<Mask> = (0..300).map(|_| random_mask(&mut random, 64, 48)).collect();
     check_partition(&masks, (64, 48), (64, 48), None);
     check_partition(&masks, (64, 48), (31, 100), None);

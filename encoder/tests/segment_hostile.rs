@@ -7,13 +7,13 @@ mod common;
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
-use common::Random;
 use glam::DAffine3;
 use image::RgbImage;
 use slag_common::{Distortion, Intrinsics, View};
 use slag_encoder::masks::Mask;
 use slag_encoder::masks::rle::Rle;
 use slag_encoder::segment::{GivenMasks, SegmentError, SegmentInput};
+use slag_math::random::Random;
 
 thread_local! {
     static LARGEST_BYTES: Cell<usize> = const { Cell::new(0) };
@@ -103,7 +103,7 @@ fn survive(name: &str, bytes: &[u8], whole: bool) {
         GivenMasks::open(if whole { &path } else { dir.path() }, Vec::new())?.load(&input)
     };
     assert!(load(bytes).unwrap().is_some_and(|masks| masks.len() > 1));
-    let mut random = Random(bytes.len() as u64);
+    let mut random = Random::new(bytes.len() as u64);
     let (mut n_read, mut n_errors) = (0, 0);
     for round in 0..1_000 {
         let bad = damaged(bytes, &mut random);

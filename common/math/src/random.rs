@@ -1,5 +1,7 @@
 //! Random numbers with frozen sequences: generated scenes, samples and tests depend on their bits.
 
+use std::fmt::Debug;
+
 use rand_core_09::{RngCore, SeedableRng};
 use rand_xoshiro::SplitMix64;
 
@@ -27,9 +29,10 @@ impl Random {
         self.0.next_u64()
     }
 
-    /// Returns the next integer in `0..n`; 0 if `n` is 0. The bias is below `n / 2^64`.
-    pub fn below(&mut self, n: usize) -> usize {
-        (self.bits() % n.max(1) as u64) as usize
+    /// Returns the next integer in `0..n`; 0 if `n` is not above 0. The bias is below `n / 2^64`.
+    pub fn below<N: TryInto<u64> + TryFrom<u64, Error: Debug>>(&mut self, n: N) -> N {
+        let n = n.try_into().unwrap_or(0).max(1);
+        N::try_from(self.bits() % n).expect("less than n, which fits")
     }
 
     /// Returns the next float64, uniform in `0..1`.
@@ -45,6 +48,13 @@ impl Random {
     /// Returns the next float32, uniform in `-1..1`.
     pub fn signed(&mut self) -> f32 {
         (self.bits() >> 40) as f32 / (1u64 << 23) as f32 - 1.0
+    }
+
+    /// Returns the next vector of length 1: a point of the cube `(-1..1)^dim`, normalised.
+    pub fn unit_vector(&mut self, dim: usize) -> Vec<f32> {
+        let vector: Vec<f32> = (0..dim).map(|_| self.signed()).collect();
+        let length = vector.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+        vector.into_iter().map(|v| (f64::from(v) / length) as f32).collect()
     }
 
     /// Returns the next normally distributed value (Box and Muller 1958): mean 0, variance 1.

@@ -9,6 +9,8 @@ use std::io::Read;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
+use slag_math::random::Random;
+
 use crate::generated::{gzip, write_sog_v1};
 use crate::{assert_columns_agree, needs_shared, read_all, shared};
 
@@ -56,22 +58,6 @@ pub fn peak_bytes<T>(work: impl FnOnce() -> T) -> (T, usize) {
     PEAK_BYTES.set(before);
     let result = work();
     (result, (PEAK_BYTES.get() - before) as usize)
-}
-
-/// xorshift64*: small, and the same everywhere.
-pub struct Random(pub u64);
-
-impl Random {
-    pub fn next(&mut self) -> u64 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        self.0.wrapping_mul(0x2545_F491_4F6C_DD1D)
-    }
-
-    fn below(&mut self, n: usize) -> usize {
-        (self.next() % n as u64) as usize
-    }
 }
 
 /// Damages a file: cut short, bits flipped, a word overwritten with an extreme value, a digit of the
@@ -130,7 +116,7 @@ fn survives_damage(name: &str, content: &[u8], n: u64, pack: impl Fn(&[u8]) -> V
     let path = folder.path().join(name);
     let mut n_read = 0;
     for seed in 1..=n {
-        let file = pack(&damaged(content, &mut Random(seed)));
+        let file = pack(&damaged(content, &mut Random::new(seed)));
         std::fs::write(&path, &file).expect("the temporary folder can be written");
         n_read += usize::from(assert_survives(&path, file.len(), &format!("{name}, seed {seed}")));
         // Overwriting instead would make ext4 wait for the disk.
@@ -198,7 +184,7 @@ fn damaged_sog_folders() {
         let mut n_read = 0;
         for seed in 1..=1000 {
             let index = seed as usize % files.len();
-            let bytes = damaged(&intact[index], &mut Random(seed));
+            let bytes = damaged(&intact[index], &mut Random::new(seed));
             std::fs::remove_file(&files[index]).expect("was written");
             std::fs::write(&files[index], bytes).expect("writes");
             let what = format!("{}, seed {seed}", files[index].display());

@@ -193,8 +193,8 @@ fn compressed_ply_by_hand() {
 
 /// Random Gaussians of a degree, with the ends of the ranges among them.
 fn random_gaussians(n: usize, sh_degree: u8) -> Gaussians {
-    let mut random = crate::damage::Random(7);
-    let mut unit = || random.next() as f32 / u64::MAX as f32;
+    let mut random = slag_math::random::Random::new(7);
+    let mut unit = || random.unit() as f32;
     let mut out = Gaussians { sh_degree, ..Gaussians::default() };
     for i in 0..n {
         out.means_in_world.push(glam::DVec3::from_array([0; 3].map(|_| f64::from(unit() * 200.0 - 100.0))));

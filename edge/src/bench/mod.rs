@@ -7,7 +7,6 @@ mod machine;
 pub mod objects;
 pub mod pause;
 pub mod query;
-mod random;
 mod scene;
 pub mod text;
 mod times;

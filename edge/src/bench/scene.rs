@@ -16,8 +16,8 @@ use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardReco
 use slag_common::shard::{self, Positions, Profile, ScoreErrors, ShardHeader, ShardView};
 use slag_models::{EncodeError, TextEncoder};
 
-use super::random::Random;
 use crate::text::{EncoderInfo, TextService};
+use slag_math::random::Random;
 
 const CELL_GAUSSIANS: u32 = 65_536;
 const ROWS_PER_CELL: u32 = 256;
@@ -34,7 +34,7 @@ fn unit(mut vector: Vec<f32>) -> Vec<f32> {
 }
 
 fn concept(number: u64, dim: u32) -> Vec<f32> {
-    let mut random = Random(number % N_CONCEPTS + 1);
+    let mut random = Random::new(number % N_CONCEPTS + 1);
     unit((0..dim).map(|_| random.signed()).collect())
 }
 
@@ -127,7 +127,7 @@ impl Generator {
     }
 
     fn shard(&self, cell_id: u32, n: u32, content: u64) -> io::Result<Vec<u8>> {
-        let mut random = Random((u64::from(cell_id) << 32) ^ content);
+        let mut random = Random::new((u64::from(cell_id) << 32) ^ content);
         let n_centroids = ROWS_PER_CELL.min(n);
         let centroid_starts: Vec<u32> = (0..=n_centroids)
             .map(|row| (u64::from(row) * u64::from(n) / u64::from(n_centroids)) as u32)
@@ -137,12 +137,12 @@ impl Generator {
         let mut positions: Vec<[u16; 3]> = Vec::new();
         for row in 0..n_centroids {
             let spread = 0.4 / (self.dim as f32 / 3.0).sqrt();
-            let around = concept(random.next(), self.dim);
+            let around = concept(random.bits(), self.dim);
             let vector = unit(around.into_iter().map(|v| v + spread * random.signed()).collect());
             codebook.extend(vector);
-            let centre = [(); 3].map(|()| random.next() % 60_000);
+            let centre = [(); 3].map(|()| random.bits() % 60_000);
             for _ in centroid_starts[row as usize]..centroid_starts[row as usize + 1] {
-                positions.push(centre.map(|c| (c + random.next() % 5000) as u16));
+                positions.push(centre.map(|c| (c + random.bits() % 5000) as u16));
             }
         }
         let (rows, centroid_step) = shard::quantise(&codebook);

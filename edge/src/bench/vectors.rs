@@ -2,7 +2,7 @@
 
 use slag_common::shard::ShardView;
 
-use super::random::Random;
+use slag_math::random::Random;
 
 /// How much of a query like those of a bank of texts is an embedding of the scene: text and image vectors
 /// of one thing have cosines around this (CLIP).
@@ -11,7 +11,7 @@ const LIKENESS: f32 = 0.3;
 /// Makes query vectors: every other one in a random direction, the rest as like an embedding of the scene
 /// as a text's vector is to what it names. Same seed, same vectors.
 pub fn make_queries(shards: &[ShardView<'_>], n: usize, seed: u64) -> Vec<Vec<f32>> {
-    let mut random = Random(seed);
+    let mut random = Random::new(seed);
     let mut queries = Vec::with_capacity(n.min(1 << 16));
     let dim = shards.first().map_or(0, |shard| shard.header.dim as usize);
     let known: Vec<&ShardView<'_>> = shards.iter().filter(|shard| shard.n_with_evidence() > 0).collect();

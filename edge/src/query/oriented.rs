@@ -138,7 +138,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::testing::Random;
+    use slag_math::random::Random;
 
     /// Points on a lattice that fills a box of edges `size` turned by `rotation` around `centre`.
     fn lattice(size: DVec3, rotation: DQuat, centre: DVec3) -> Vec<DVec3> {
@@ -214,7 +214,7 @@ mod tests {
     /// One point in a hundred flies around, up to 50 edges away.
     #[test]
     fn floaters_do_not_move_the_box() {
-        let mut random = Random(9);
+        let mut random = Random::new(9);
         let (size, centre) = (DVec3::new(0.8, 0.4, 1.2), DVec3::new(3.0, -2.0, 0.6));
         let rotation = DQuat::from_rotation_z(0.6);
         let mut points = lattice(size, rotation, centre);

@@ -39,13 +39,13 @@ pub fn calibrated_threshold(encoder_default: f32, scene: Option<Calibration>) ->
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::Random;
+    use slag_math::random::Random;
 
     /// Scenes whose background scores are shifted and stretched as encoders do, with 40 Gaussians each of
     /// 5 things six spreads above: the threshold finds nearly all of those and hardly anything else.
     #[test]
     fn follows_the_encoder_that_scored() {
-        let mut random = Random(6);
+        let mut random = Random::new(6);
         for (shift, stretch) in [(0.0f32, 0.12f32), (0.21, 0.025), (-0.1, 0.05)] {
             // The sum of 12 uniform numbers has a spread of 2: nearly normal.
             let mut background = || (0..12).map(|_| random.signed()).sum::<f32>() / 2.0 * stretch + shift;

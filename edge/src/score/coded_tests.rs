@@ -6,10 +6,11 @@ use slag_common::shard::{MAX_SUBSPACES, ShardLayout};
 use super::cell::UNDECIDED;
 use super::tests::{random_question, score_in_f64, views};
 use super::*;
+use crate::testing::BuiltShard;
 use crate::testing::coded::{CODE_ERROR, CodedShard, FINE_ERROR};
-use crate::testing::{BuiltShard, Random};
 use glam::DVec3;
 use half::f16;
+use slag_math::random::Random;
 
 /// Dimension, components, whether there is a basis, groups.
 const SHAPES: [(usize, usize, bool, usize); 10] = [
@@ -72,7 +73,7 @@ fn defined_score(search: &Search<'_>, shard_at: usize, index: usize) -> f32 {
 /// Oracle: float64 decoding, and the embeddings that the shards were made from.
 #[test]
 fn scores_are_within_the_stated_error() {
-    let mut random = Random(21);
+    let mut random = Random::new(21);
     let mut largest_share = 0.0f64;
     for shape in SHAPES {
         let built = shards(&mut random, shape);
@@ -120,7 +121,7 @@ fn scores_are_within_the_stated_error() {
 /// Oracle: every Gaussian's score as defined, compared and sorted.
 #[test]
 fn answers_are_those_of_brute_force() {
-    let mut random = Random(22);
+    let mut random = Random::new(22);
     let (mut n_scanned, mut n_all) = (0, 0);
     // Memory of other scenes, precisions and questions must not show.
     let mut scratch = Scratch::default();
@@ -203,7 +204,7 @@ fn answers_are_those_of_brute_force() {
 /// and what is in by those.
 #[test]
 fn measured_errors_decide_as_defined() {
-    let mut random = Random(24);
+    let mut random = Random::new(24);
     let (mut n_fine, mut n_embeddings, mut n_all) = (0, 0, 0);
     for shape in SHAPES.into_iter().filter(|shape| shape.3 > 0) {
         let built = shards_of(&mut random, shape, true);
@@ -292,7 +293,7 @@ fn measured_errors_decide_as_defined() {
 /// A shard may state anything that the format allows, at its largest.
 #[test]
 fn the_largest_numbers_do_no_harm() {
-    let mut random = Random(23);
+    let mut random = Random::new(23);
     for (at, shape) in SHAPES.into_iter().enumerate() {
         let built = shards(&mut random, shape);
         let view = built[0].view();

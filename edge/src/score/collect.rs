@@ -337,17 +337,17 @@ pub(super) fn runs_inside(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::Random;
+    use slag_math::random::Random;
 
     /// Oracle: every sum tried. Steps from far below the score's last bit to far above it.
     #[test]
     fn the_least_sum_is_the_first_that_reaches() {
-        let mut random = Random(41);
+        let mut random = Random::new(41);
         for _ in 0..3000 {
             let own = random.signed();
-            let step = [0.0, 1e-10, 1e-9, 1e-7, 1e-4, 0.1][random.next() as usize % 6];
-            let most = (random.next() % 3000) as u16;
-            let at = (random.next() % 3000) as f32;
+            let step = [0.0, 1e-10, 1e-9, 1e-7, 1e-4, 0.1][random.bits() as usize % 6];
+            let most = (random.bits() % 3000) as u16;
+            let at = (random.bits() % 3000) as f32;
             for threshold in [own, own.next_up(), own.next_down(), own + step * at, f32::NEG_INFINITY, 9e9] {
                 let expected = (0..=most).find(|sum| own + step * f32::from(*sum) >= threshold);
                 assert_eq!(

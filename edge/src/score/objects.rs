@@ -145,8 +145,9 @@ mod tests {
     use super::*;
     use crate::score::tests::{random_question, views};
     use crate::testing::coded::CodedShard;
-    use crate::testing::{BuiltShard, Random, TestObject};
+    use crate::testing::{BuiltShard, TestObject};
     use glam::DVec3;
+    use slag_math::random::Random;
 
     const KEPT: f32 = 0.005;
 
@@ -179,7 +180,7 @@ mod tests {
     /// share for what was kept, which no vector here needs.
     #[test]
     fn each_object_scores_as_defined_within_the_bound_and_at_every_level() {
-        let mut random = Random(41);
+        let mut random = Random::new(41);
         let mut largest_share = 0.0f32;
         for shape in
             [(16, 0, true), (1, 1, false), (64, 64, false), (40, 7, true), (512, 96, true), (515, 3, true)]

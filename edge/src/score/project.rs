@@ -234,12 +234,12 @@ pub fn up(bound: f64) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::Random;
+    use slag_math::random::Random;
 
     /// Oracle: the definition, in wide integers and float64.
     #[test]
     fn rounded_vectors_fit_and_are_as_near_as_stated() {
-        let mut random = Random(13);
+        let mut random = Random::new(13);
         let mut rounded = Rounded::default();
         for n in (1..40usize).chain([512, 8191, 8192]) {
             for (scale, is_flat) in [(1.0, false), (1.0, true), (1e-30, false), (1e6, true), (0.0, false)] {

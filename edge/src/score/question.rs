@@ -124,11 +124,11 @@ mod tests {
     /// Oracle: the scores of random embeddings and of others nearby, in f64.
     #[test]
     fn no_score_is_steeper_than_stated() {
-        let mut random = crate::testing::Random(3);
+        let mut random = slag_math::random::Random::new(3);
         let (mut steepest, dim) = (0.0f64, 6);
         for n_negatives in [0, 1, 4] {
             for _ in 0..2000 {
-                let mut unit = || Arc::from(random.unit(dim));
+                let mut unit = || Arc::from(random.unit_vector(dim));
                 let (vector, negatives) = (unit(), (0..n_negatives).map(|_| unit()).collect());
                 let question = Question { vector, negatives };
                 let score = |e: &[f32]| {
@@ -137,7 +137,7 @@ mod tests {
                     let worst = question.negatives.iter().map(|n| dot(n)).reduce(f64::max).unwrap_or(0.0);
                     dot(&question.vector) - worst
                 };
-                let (at, step) = (random.unit(dim), random.unit(dim));
+                let (at, step) = (random.unit_vector(dim), random.unit_vector(dim));
                 let moved: Vec<f32> = at.iter().zip(&step).map(|(a, s)| a + 0.25 * s).collect();
                 let distance = length(at.iter().zip(&moved).map(|(a, b)| a - b));
                 let share = (score(&at) - score(&moved)).abs() / (distance * f64::from(question.steepness()));

@@ -273,17 +273,17 @@ fn rising(score: f32) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::Random;
+    use slag_math::random::Random;
 
     /// Oracle: the standard library's stable sort.
     #[test]
     fn keys_are_sorted_by_score_and_place() {
-        let mut random = Random(31);
+        let mut random = Random::new(31);
         let mut swapped = Vec::new();
         for n in [0, 1, 2, 3000] {
             for n_bits in [0, 1, 11, 12, 23, 32] {
                 let mut key = |place: u64| {
-                    let high = if n_bits == 0 { 7 } else { random.next() >> (64 - n_bits) };
+                    let high = if n_bits == 0 { 7 } else { random.bits() >> (64 - n_bits) };
                     high << 32 | place
                 };
                 let mut keys: Vec<u64> = (0..n).map(&mut key).collect();
@@ -298,12 +298,12 @@ mod tests {
     /// Oracle: the standard library's stable sort, of all parts one after the other.
     #[test]
     fn keys_are_shared_in_order() {
-        let mut random = Random(33);
+        let mut random = Random::new(33);
         for n in [1, 2, 3000] {
             for n_bits in [1, 5, 11, 12, 32] {
                 for n_parts in [1, 2, 3, 7] {
                     let mut keys: Vec<u64> =
-                        (0..n).map(|place| random.next() >> (64 - n_bits) << 32 | place).collect();
+                        (0..n).map(|place| random.bits() >> (64 - n_bits) << 32 | place).collect();
                     let mut expected = keys.clone();
                     expected.sort();
                     let mut parts = Vec::new();
@@ -324,7 +324,7 @@ mod tests {
     #[test]
     fn keys_and_bins_rise_with_scores() {
         let mut scores = vec![-1e30, -3.0, -1.0, -0.5, -1e-20, 0.0, 1e-20, 0.25, 0.9995, 1.0, 2.0, 1e30];
-        let mut random = Random(32);
+        let mut random = Random::new(32);
         scores.extend((0..3000).map(|_| random.signed()));
         scores.sort_by(f32::total_cmp);
         for pair in scores.windows(2) {

@@ -309,23 +309,23 @@ impl Work for SomeRowsTimesVector<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::Random;
+    use slag_math::random::Random;
 
     /// Oracle: plain 64-bit sums. Lengths around every width, values at both ends, and the last centroids, which
     /// cannot be read past their end.
     #[test]
     fn products_are_the_sums_at_every_level() {
-        let mut random = Random(11);
+        let mut random = Random::new(11);
         for n_components in (1..70usize).chain([96, 100, 511, 512, 513, 8192]) {
             for n_centroids in [0, 1, 3, 4, 5, 37] {
                 let is_extreme = n_centroids == 5;
                 let centroids: Vec<i8> = (0..n_centroids * n_components)
-                    .map(|_| if is_extreme { -128 } else { random.next() as i8 })
+                    .map(|_| if is_extreme { -128 } else { random.bits() as i8 })
                     .collect();
                 // The largest that the sum of absolute values allows, see `rounded`.
                 let most = ((1 << 24) / n_components as i64 - 1).clamp(1, 32767);
                 let mut vector: Vec<i16> = (0..n_components)
-                    .map(|_| if is_extreme { -most } else { random.next() as i64 % (most + 1) } as i16)
+                    .map(|_| if is_extreme { -most } else { random.bits() as i64 % (most + 1) } as i16)
                     .collect();
                 vector.resize(n_components.next_multiple_of(PAD), 0);
                 let exact = |centroid: &[i8]| -> i64 {
@@ -353,11 +353,11 @@ mod tests {
     /// Oracle: each code looked up by itself. Up to 64 columns of 255, the most that 16 bits must hold.
     #[test]
     fn sums_of_a_block_are_the_looked_up_values_at_every_level() {
-        let mut random = Random(12);
+        let mut random = Random::new(12);
         for n_columns in (0..20).chain([63, 64]) {
             for highest in [1, 255] {
                 let mut bytes = |most: u64| -> Vec<u8> {
-                    let byte = |_| if most == 1 { 255 } else { (random.next() % (most + 1)) as u8 };
+                    let byte = |_| if most == 1 { 255 } else { (random.bits() % (most + 1)) as u8 };
                     (0..n_columns * BLOCK).map(byte).collect()
                 };
                 let columns = bytes(255);
@@ -389,15 +389,15 @@ mod tests {
     /// a sum of what its columns say.
     #[test]
     fn sums_that_reach_a_value_are_found_at_every_level() {
-        let mut random = Random(13);
+        let mut random = Random::new(13);
         const N_COLUMNS: usize = 64;
         let n_blocks = 5;
         let columns: Vec<Column> =
-            (0..n_blocks * N_COLUMNS).map(|_| [(); BLOCK].map(|()| random.next() as u8)).collect();
+            (0..n_blocks * N_COLUMNS).map(|_| [(); BLOCK].map(|()| random.bits() as u8)).collect();
         for highest in [3u64, 256] {
             let mut table = || -> Vec<Column> {
                 let codewords = |_| {
-                    let codewords: [u8; 16] = [(); 16].map(|()| (random.next() % highest) as u8);
+                    let codewords: [u8; 16] = [(); 16].map(|()| (random.bits() % highest) as u8);
                     std::array::from_fn(|at| codewords[at % 16])
                 };
                 (0..N_COLUMNS).map(codewords).collect()
@@ -431,11 +431,11 @@ mod tests {
     /// Oracle: plain sums; the last centroids cannot be read past their end.
     #[test]
     fn products_of_some_rows_are_the_sums_at_every_level() {
-        let mut random = Random(14);
+        let mut random = Random::new(14);
         for n_components in [1usize, 2, 31, 32, 33, 96, 126, 512] {
-            let centroids: Vec<i8> = (0..40 * n_components).map(|_| random.next() as i8).collect();
+            let centroids: Vec<i8> = (0..40 * n_components).map(|_| random.bits() as i8).collect();
             let mut vector: Vec<i16> =
-                (0..n_components).map(|_| (random.next() % 999) as i16 - 500).collect();
+                (0..n_components).map(|_| (random.bits() % 999) as i16 - 500).collect();
             vector.resize(n_components.next_multiple_of(PAD), 0);
             for which in [vec![], vec![39], vec![0, 3, 4, 17, 38], (0..40).collect::<Vec<u32>>()] {
                 let expected: Vec<i32> = which

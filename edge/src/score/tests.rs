@@ -8,7 +8,8 @@ use slag_common::shard::ShardView;
 
 use super::cell::F16_ROUNDING;
 use super::*;
-use crate::testing::{BuiltShard, Member, Random, TestShard, normalised};
+use crate::testing::{BuiltShard, Member, TestShard, normalised};
+use slag_math::random::Random;
 
 /// Positions spread over all 16 bits, so that a ball can cover a shard.
 const STEPS_PER_UNIT: f64 = 5000.0;
@@ -160,13 +161,13 @@ fn noisy_shards(random: &mut Random, n_shards: usize, n_centroids: usize, dim: u
     let mut shard = |cell_id: usize| {
         let mut centroids = Vec::new();
         for _ in 0..n_centroids {
-            let (centre, noise) = (random.unit(dim), random.signed().abs() * 0.4);
+            let (centre, noise) = (random.unit_vector(dim), random.signed().abs() * 0.4);
             let member = |random: &mut Random| {
-                let offset = random.unit(dim);
+                let offset = random.unit_vector(dim);
                 let embedding = normalised(centre.iter().zip(offset).map(|(c, o)| c + noise * o).collect());
-                Member { steps: [0; 3].map(|_| random.next() as u16), embedding }
+                Member { steps: [0; 3].map(|_| random.bits() as u16), embedding }
             };
-            let n = 1 + random.next() % 20;
+            let n = 1 + random.bits() % 20;
             centroids.push((0..n).map(|_| member(random)).collect());
         }
         TestShard { cell_id: cell_id as u32, ..TestShard::new(centroids) }
@@ -178,7 +179,7 @@ fn noisy_shards(random: &mut Random, n_shards: usize, n_centroids: usize, dim: u
 /// within it; exact membership is wrong nowhere but in the last bits.
 #[test]
 fn answers_keep_within_the_stated_bound() {
-    let mut random = Random(1);
+    let mut random = Random::new(1);
     let (mut n_between, mut n_saved, mut largest_share) = (0, 0, 0.0f64);
     for (dim, n_negatives) in [(5, 0), (64, 0), (64, 4), (515, 0), (515, 2)] {
         let shards = noisy_shards(&mut random, 3, 40, dim);
@@ -235,14 +236,14 @@ fn answers_keep_within_the_stated_bound() {
 }
 
 pub(super) fn random_question(random: &mut Random, dim: usize, n_negatives: usize) -> Question {
-    let mut unit = || Arc::from(random.unit(dim));
+    let mut unit = || Arc::from(random.unit_vector(dim));
     Question { vector: unit(), negatives: (0..n_negatives).map(|_| unit()).collect() }
 }
 
 /// Oracle: all stored embeddings scored and sorted in f64. Ranks may swap within the rounding of f32 only.
 #[test]
 fn the_best_of_noisy_embeddings_are_the_best() {
-    let mut random = Random(4);
+    let mut random = Random::new(4);
     for n_negatives in [0, 4] {
         let built: Vec<_> = noisy_shards(&mut random, 4, 60, 64).iter().map(|s| s.build(true)).collect();
         let views = views(&built);
@@ -269,7 +270,7 @@ fn the_best_of_noisy_embeddings_are_the_best() {
 
 #[test]
 fn does_not_depend_on_threads() {
-    let mut random = Random(2);
+    let mut random = Random::new(2);
     let shards: Vec<_> = noisy_shards(&mut random, 9, 50, 64).iter().map(|s| s.build(true)).collect();
     let views = views(&shards);
     let questions = [0, 2].map(|n_negatives| random_question(&mut random, 64, n_negatives));

@@ -114,23 +114,23 @@ mod tests {
     use slag_common::objects::{ObjectRecord, ObjectsHeader};
 
     use super::*;
-    use crate::testing::Random;
+    use slag_math::random::Random;
 
     /// Oracle: every run of every shard, looked at one by one.
     #[test]
     fn objects_have_the_runs_that_name_them() {
-        let mut random = Random(71);
+        let mut random = Random::new(71);
         for n_shards in [0, 1, 4] {
             let columns: Vec<(Vec<ObjectRecord>, Vec<u32>, Vec<u16>)> = (0..n_shards)
                 .map(|shard| {
                     // The third shard has no objects; ids come several times, even in one shard.
-                    let n = if shard == 2 { 0 } else { 1 + random.next() % 30 };
+                    let n = if shard == 2 { 0 } else { 1 + random.bits() % 30 };
                     let record = |id| ObjectRecord { id, ..bytemuck::Zeroable::zeroed() };
-                    let records = (0..n).map(|_| record(random.next() % 40)).collect();
-                    let numbers = (0..200).map(|_| random.next() % (n + 1));
+                    let records = (0..n).map(|_| record(random.bits() % 40)).collect();
+                    let numbers = (0..200).map(|_| random.bits() % (n + 1));
                     let numbers = numbers.map(|o| if o == n { NO_OBJECT } else { o as u16 }).collect();
                     let ends = (0..200).scan(0, |end, _| {
-                        *end += 1 + random.next() as u32 % 9;
+                        *end += 1 + random.bits() as u32 % 9;
                         Some(*end)
                     });
                     (records, ends.collect(), numbers)

@@ -8,7 +8,8 @@ use slag_common::shard::{
     ShardView, quantise,
 };
 
-use super::{BuiltShard, Random, normalised};
+use super::{BuiltShard, normalised};
+use slag_math::random::Random;
 
 /// What a random shard is to have.
 #[derive(Clone, Debug)]
@@ -56,8 +57,8 @@ impl CodedShard {
             floats(n_codewords, 0.5 / (m as f32).sqrt()).into_iter().map(f16::from_f32).collect();
         let residual_scales: Vec<f32> = floats(k, 1.0).into_iter().map(|v| v.abs()).collect();
         let codes: Vec<u8> =
-            (0..n.div_ceil(BLOCK) * BLOCK * self.n_subspaces / 2).map(|_| random.next() as u8).collect();
-        let positions: Vec<[u16; 3]> = (0..n).map(|_| [(); 3].map(|()| random.next() as u16)).collect();
+            (0..n.div_ceil(BLOCK) * BLOCK * self.n_subspaces / 2).map(|_| random.bits() as u8).collect();
+        let positions: Vec<[u16; 3]> = (0..n).map(|_| [(); 3].map(|()| random.bits() as u16)).collect();
         let step = 10.0 / 65536.0;
         let header = ShardHeader {
             cell_id: self.cell_id,
@@ -77,7 +78,7 @@ impl CodedShard {
         };
         let fine_steps: Vec<f32> = (0..m).map(|_| 1.0 + 0.5 * random.signed()).collect();
         let fine_scales: Vec<f32> = (0..k).map(|_| 2e-4 * (1.5 + random.signed())).collect();
-        let fine_values: Vec<i8> = (0..n * m).map(|_| random.next() as i8).collect();
+        let fine_values: Vec<i8> = (0..n * m).map(|_| random.bits() as i8).collect();
         let fine_errors = ScoreErrors { mean: FINE_ERROR, ..ScoreErrors::default() };
         let input_indices: Vec<u32> = (0..n as u32).collect();
         let (mut radii, mut reaches) = (vec![0.0; k], vec![0.0; k]);

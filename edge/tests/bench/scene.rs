@@ -13,6 +13,7 @@ use slag_common::shard::{
     BLOCK, Basis, CODEWORDS, Positions, Profile, Residuals, ScoreErrors, ShardHeader, ShardView, quantise,
 };
 use slag_edge::store::{Current, CurrentCell, EdgeCache};
+use slag_math::random::Random;
 
 /// Gaussians of a cell.
 const CELL: usize = 65_536;
@@ -35,30 +36,13 @@ pub struct SceneSpec {
     pub n_objects: usize,
 }
 
-/// SplitMix64 (Steele et al. 2014).
-struct Random(u64);
+/// Returns a value of variance 1, about normal.
+fn normal(random: &mut Random) -> f32 {
+    (0..3).map(|_| random.signed()).sum()
+}
 
-impl Random {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    fn below(&mut self, n: usize) -> usize {
-        (self.next() % n as u64) as usize
-    }
-
-    /// Of variance 1, about normal.
-    fn normal(&mut self) -> f32 {
-        (0..3).map(|_| (self.next() >> 40) as f32 / (1u64 << 23) as f32 - 1.0).sum()
-    }
-
-    fn normals(&mut self, n: usize, scale: f32) -> Vec<f32> {
-        (0..n).map(|_| self.normal() * scale).collect()
-    }
+fn normals(random: &mut Random, n: usize, scale: f32) -> Vec<f32> {
+    (0..n).map(|_| normal(random) * scale).collect()
 }
 
 /// Writes a cache as a fetch leaves it.
@@ -129,7 +113,7 @@ pub fn write_cache(dir: &Path, spec: &SceneSpec) {
 }
 
 fn shard(cell_id: u32, n: usize, spec: &SceneSpec) -> (Vec<u8>, Aabb, u32) {
-    let mut random = Random(u64::from(cell_id) << 32 | 5);
+    let mut random = Random::new(u64::from(cell_id) << 32 | 5);
     let (dim, m) = (spec.dim, spec.n_components);
     // One in a hundred was never seen.
     let n_with_evidence = n - n / 100;
@@ -149,23 +133,23 @@ fn shard(cell_id: u32, n: usize, spec: &SceneSpec) -> (Vec<u8>, Aabb, u32) {
     let fall: Vec<f32> = (0..m).map(|c| 1.0 / (1.0 + c as f32 / 6.0)).collect();
     let squares: f32 = fall.iter().map(|f| f * f).sum();
     let fall: Vec<f32> = fall.iter().map(|f| f / squares.sqrt()).collect();
-    let kinds = random.normals(KINDS * m, 0.7);
+    let kinds = normals(&mut random, KINDS * m, 0.7);
     let mut centroids = Vec::with_capacity(k * m);
     let mut kind = 0;
     for row in 0..k {
         if row % 16 == 0 {
             kind = random.below(KINDS);
         }
-        centroids.extend((0..m).map(|c| (kinds[kind * m + c] + 0.35 * random.normal()) * fall[c]));
+        centroids.extend((0..m).map(|c| (kinds[kind * m + c] + 0.35 * normal(&mut random)) * fall[c]));
     }
     let (centroids, centroid_step) = quantise(&centroids);
-    let (vectors, step) = quantise(&random.normals(m * dim, 1.0 / (dim as f32).sqrt()));
+    let (vectors, step) = quantise(&normals(&mut random, m * dim, 1.0 / (dim as f32).sqrt()));
     let steps = vec![step; m];
     let mean: Vec<f16> =
-        random.normals(dim, 0.6 / (dim as f32).sqrt()).into_iter().map(f16::from_f32).collect();
+        normals(&mut random, dim, 0.6 / (dim as f32).sqrt()).into_iter().map(f16::from_f32).collect();
     let subspace_starts: Vec<u32> =
         (0..=spec.n_subspaces).map(|g| (m * g / spec.n_subspaces) as u32).collect();
-    let codewords = random.normals(CODEWORDS * m, 0.2);
+    let codewords = normals(&mut random, CODEWORDS * m, 0.2);
     let codewords: Vec<f16> = subspace_starts
         .windows(2)
         .flat_map(|starts| (0..CODEWORDS).flat_map(move |_| starts[0]..starts[1]))
@@ -175,9 +159,9 @@ fn shard(cell_id: u32, n: usize, spec: &SceneSpec) -> (Vec<u8>, Aabb, u32) {
     let residual_scales: Vec<f32> = (0..k).map(|_| 0.4 + random.below(100) as f32 / 80.0).collect();
     let residual_norms: Vec<f32> = residual_scales.iter().map(|scale| scale * 0.45).collect();
     let codes: Vec<u8> = (0..n_with_evidence.div_ceil(BLOCK) * BLOCK * spec.n_subspaces / 16)
-        .flat_map(|_| random.next().to_le_bytes())
+        .flat_map(|_| random.bits().to_le_bytes())
         .collect();
-    let positions: Vec<u32> = (0..n).map(|_| random.next() as u32).collect();
+    let positions: Vec<u32> = (0..n).map(|_| random.bits() as u32).collect();
     let radii = vec![0.1; k];
     let (x, y) = (f64::from(cell_id % 16) * 20.0, f64::from(cell_id / 16) * 20.0);
     let bounds = Aabb { min: DVec3::new(x, y, 0.0), max: DVec3::new(x + 20.48, y + 20.48, 10.24) };
@@ -201,7 +185,7 @@ fn shard(cell_id: u32, n: usize, spec: &SceneSpec) -> (Vec<u8>, Aabb, u32) {
     let of_objects = (!here.is_empty()).then(|| {
         CellObjects::new(&here, n, m, bounds, |random| {
             let kind = random.below(KINDS);
-            (0..m).map(|c| (kinds[kind * m + c] + 0.35 * random.normal()) * fall[c]).collect()
+            (0..m).map(|c| (kinds[kind * m + c] + 0.35 * normal(random)) * fall[c]).collect()
         })
     });
     let residuals = Residuals {
@@ -260,7 +244,7 @@ impl CellObjects {
             object_of[run].fill(number as u16);
         }
         let (run_ends, run_objects) = collect_runs(object_of);
-        let mut random = Random(ids[0] + 77);
+        let mut random = Random::new(ids[0] + 77);
         let (mut vectors, mut steps) = (Vec::new(), Vec::new());
         for _ in ids {
             let sides: Vec<f32> = (0..N_VECTORS).flat_map(|_| vector(&mut random)).collect();

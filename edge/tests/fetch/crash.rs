@@ -7,10 +7,11 @@ use slag_common::shard::Profile;
 use slag_edge::fetch::{FetchError, FetchReport};
 use slag_edge::store::{Snapshot, StoreError};
 
-use super::scene::{Published, Random};
+use super::scene::Published;
 use super::server::{Fault, Server};
 use super::sim::SimFiles;
 use super::{Robot, assert_holds, at};
+use slag_math::random::Random;
 
 /// What becomes of the records, which have their own store, at a power cut.
 const N_RECORDS_FATES: u64 = 3;
@@ -132,7 +133,7 @@ fn a_power_cut_after_a_killed_fetch() {
             let killed = Arc::new(trial.before.fork(Some(kill_step), seed));
             trial.fetch(&killed, 1).1.expect_err("killed");
             // The step may lie behind the second fetch: then the power fails after it.
-            let cut_step = 1 + Random(seed).below(files.n_steps());
+            let cut_step = 1 + Random::new(seed).below(files.n_steps());
             let second = Arc::new(killed.fork(Some(cut_step), seed));
             let outcome = trial.fetch(&second, 1).1;
             assert!(outcome.is_err() || second.n_steps() < cut_step, "seed {seed}");
@@ -146,8 +147,8 @@ fn a_power_cut_after_a_killed_fetch() {
 fn random_power_cuts_under_faults() {
     let trial = Trial::new();
     for seed in 0..100 {
-        let mut random = Random(seed);
-        let mut faults = Random(seed);
+        let mut random = Random::new(seed);
+        let mut faults = Random::new(seed);
         trial.server.faults(move |_| match faults.below(6) {
             0 => Fault::Cut(faults.below(1200) as usize),
             1 => Fault::Status(503),

@@ -17,10 +17,11 @@ use slag_edge::text::{EncoderInfo, TextService};
 use slag_models::{EncodeError, TextEncoder};
 
 use super::crash::copy_dir;
-use super::scene::{DIM, ENCODER, Published, Random, key, public};
+use super::scene::{DIM, ENCODER, Published, key, public};
 use super::server::{Fault, Seen, Server};
 use super::sim::SimFiles;
 use super::{Robot, at};
+use slag_math::random::Random;
 
 const N_TRIALS: u64 = 1000;
 const N_THREADS: u64 = 4;
@@ -137,7 +138,7 @@ impl Stage {
 
     /// Chooses what happens to each request.
     fn network(&self, seed: u64) -> impl FnMut(&Seen) -> Fault + Send + 'static {
-        let mut random = Random(seed ^ 0x6e65_7477);
+        let mut random = Random::new(seed ^ 0x6e65_7477);
         // Calm, breezy, stormy.
         let one_in = [u64::MAX, 6, 3][random.below(3) as usize];
         let (stale, replay) = (self.stale.clone(), self.stale.signed.clone());
@@ -173,7 +174,7 @@ impl Stage {
     }
 
     fn trial(&self, seed: u64, outcomes: &Outcomes) {
-        let mut random = Random(seed);
+        let mut random = Random::new(seed);
         self.settle_records(1);
         self.server.faults(self.network(seed));
         // A fetch without faults takes some 40 steps.

@@ -9,27 +9,11 @@ use slag_common::Hash32;
 use slag_common::frames::{Aabb, GeoReference};
 use slag_common::manifest::{CellRecord, EncoderRecord, Manifest, ShardRecord, VERSION};
 use slag_common::shard::{ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardView, quantise};
+use slag_math::random::Random;
 
 pub const DIM: u32 = 4;
 pub const ENCODER: Hash32 = Hash32([9; 32]);
 pub const NOW: u64 = 1_800_000_000;
-
-/// SplitMix64 (Steele et al. 2014): enough to be irregular.
-pub struct Random(pub u64);
-
-impl Random {
-    pub fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    pub fn below(&mut self, n: u64) -> u64 {
-        self.next() % n
-    }
-}
 
 pub fn key(seed: u8) -> SigningKey {
     SigningKey::from_bytes(&[seed; 32])
@@ -62,7 +46,7 @@ pub fn bounds(cell_id: u32) -> Aabb {
 }
 
 pub fn shard(spec: &ShardSpec) -> Vec<u8> {
-    let mut random = Random(spec.content ^ u64::from(spec.cell_id) << 32);
+    let mut random = Random::new(spec.content ^ u64::from(spec.cell_id) << 32);
     let (n, box_) = (spec.n_gaussians, bounds(spec.cell_id));
     let (centroids, centroid_step) = quantise(&[0.5; DIM as usize]);
     let header = ShardHeader {
@@ -81,7 +65,7 @@ pub fn shard(spec: &ShardSpec) -> Vec<u8> {
         errors: ScoreErrors::default(),
         encoder_id: spec.encoder.0,
     };
-    let positions: Vec<[u16; 3]> = (0..n).map(|_| [(); 3].map(|()| random.next() as u16)).collect();
+    let positions: Vec<[u16; 3]> = (0..n).map(|_| [(); 3].map(|()| random.bits() as u16)).collect();
     let indices: Vec<u32> = (0..n).collect();
     let embeddings = vec![f16::from_f32(0.5); (n * DIM) as usize];
     let mut out = Vec::new();

@@ -9,7 +9,7 @@ use slag_common::container::AlignedBytes;
 use slag_edge::store::files::{Files, Stat};
 use slag_edge::store::mmap::FileBytes;
 
-use super::scene::Random;
+use slag_math::random::Random;
 
 /// Smallest piece of unsynced content that is lost or kept by itself.
 const SECTOR_BYTES: usize = 128;
@@ -89,7 +89,7 @@ impl SimFiles {
 
     /// Returns what is there after the power comes back.
     pub fn after_power_cut(&self, seed: u64) -> Self {
-        let mut random = Random(seed);
+        let mut random = Random::new(seed);
         let mut state = self.0.lock().expect("sound").clone();
         let mut kept_changes = BTreeSet::new();
         let pending = std::mem::take(&mut state.pending);
@@ -173,14 +173,14 @@ impl SimFiles {
         state.check_power()?;
         state.n_steps += 1;
         if state.cut_at == Some(state.n_steps) {
-            if Random(state.random).below(2) == 0 {
+            if Random::new(state.random).below(2) == 0 {
                 work(&mut state)?;
             }
             state.is_cut = true;
             return state.check_power();
         }
         if state.fail_at == Some(state.n_steps) {
-            if Random(state.random ^ 1).below(2) == 0 {
+            if Random::new(state.random ^ 1).below(2) == 0 {
                 work(&mut state)?;
             }
             return Err(io::Error::other("the medium fails"));

@@ -8,9 +8,10 @@ use slag_common::shard::Profile;
 use slag_edge::fetch::{FetchError, FetchRequest, PlanError, Position, Progress, Records, RecordsError};
 use slag_edge::store::{EdgeCache, Snapshot, StoreError};
 
-use super::scene::{ENCODER, Published, Random, key, public};
+use super::scene::{ENCODER, Published, key, public};
 use super::server::{Fault, Server};
 use super::{Robot, assert_holds, at};
+use slag_math::random::Random;
 
 #[test]
 fn the_second_fetch_brings_only_the_difference() {
@@ -211,7 +212,7 @@ fn parallel_downloads_under_random_faults_converge() {
         let mut robot = Robot::on_disk(dir.path(), &server.url());
         robot.request = FetchRequest { radius: 500.0, parallel: 1 + seed as usize, ..robot.request };
         robot.limits.attempts = 40;
-        let mut random = Random(seed);
+        let mut random = Random::new(seed);
         server.faults(move |_| match random.below(12) {
             0 => Fault::Cut(random.below(1500) as usize),
             1 => Fault::Status(500),

@@ -194,23 +194,15 @@ pub fn spread_order(n: usize) -> Vec<usize> {
 #[cfg(test)]
 mod tests {
     use slag_common::{Distortion, Gaussians, Intrinsics};
+    use slag_math::random::Random;
 
     use super::*;
     use crate::raster::{CpuRasterizer, Rasterizer};
 
-    /// A pseudo-random sequence in 0..1 (SplitMix64).
-    fn random(state: &mut u64) -> f64 {
-        *state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = *state;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        (z ^ (z >> 31)) as f64 / u64::MAX as f64
-    }
-
-    fn small(state: &mut u64, n_views: usize, n_gaussians: usize) -> Vec<Vec<(u32, f32)>> {
+    fn small(random: &mut Random, n_views: usize, n_gaussians: usize) -> Vec<Vec<(u32, f32)>> {
         let mut view = || {
-            let seen = (0..n_gaussians as u32).filter(|_| random(state) < 0.4).collect::<Vec<_>>();
-            seen.into_iter().map(|k| (k, (0.05 + random(state)) as f32)).collect()
+            let seen = (0..n_gaussians as u32).filter(|_| random.unit() < 0.4).collect::<Vec<_>>();
+            seen.into_iter().map(|k| (k, (0.05 + random.unit()) as f32)).collect()
         };
         (0..n_views).map(|_| view()).collect()
     }
@@ -230,12 +222,12 @@ mod tests {
     /// every n, and each step of the order is the best one but for the steps of the tables.
     #[test]
     fn the_order_keeps_the_guarantee() {
-        let mut state = 1;
+        let mut random = Random::new(1);
         let bound = 1.0 - (-1.0f64).exp();
         let mut least = f64::MAX;
         for _ in 0..40 {
             let (n_views, n_gaussians) = (9, 30);
-            let weights = small(&mut state, n_views, n_gaussians);
+            let weights = small(&mut random, n_views, n_gaussians);
             let order = Coverage::new(n_gaussians, weights.clone()).order();
             let mut sorted = order.clone();
             sorted.sort_unstable();
@@ -263,9 +255,9 @@ mod tests {
     /// Lazily evaluated, the order is that of computing every gain anew, ties included.
     #[test]
     fn lazy_is_plain_greedy() {
-        let mut state = 2;
+        let mut random = Random::new(2);
         for _ in 0..30 {
-            let mut weights = small(&mut state, 24, 60);
+            let mut weights = small(&mut random, 24, 60);
             // Ties: views that see the same.
             weights[20] = weights[3].clone();
             weights[7] = weights[3].clone();

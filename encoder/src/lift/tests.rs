@@ -5,6 +5,7 @@ use slag_common::container::AlignedBytes;
 
 use super::*;
 use slag_math::dot;
+use slag_math::random::mix64;
 
 /// Files of contributions in a folder, and what was opened of them.
 pub(super) struct Scene {
@@ -29,10 +30,7 @@ pub(super) fn open(views: &[ViewContributions], dim: usize, n_of_cell: &[usize],
 
 /// A scene of one cell: `n_views` views of 12 masks and 30 regions see two of three Gaussians.
 pub(super) fn scene_of(dim: usize, n_gaussians: u32, n_views: u64) -> Scene {
-    let random = |seed: u64| {
-        let z = seed.wrapping_add(77).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-        (z ^ (z >> 29)).wrapping_mul(0xbf58_476d_1ce4_e5b9) >> 20
-    };
+    let random = |seed: u64| mix64(seed) >> 20;
     let view = |view: u64| {
         let at = |what: u64, i: u64| random(view << 40 ^ what << 32 ^ i);
         let entry = |g: u32, step: u64| Contribution {

@@ -2,6 +2,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
 use slag_common::objects::object_score;
 use slag_common::shard::Basis;
+use slag_math::random::Random;
 
 use super::consensus::{MaskClusters, Sightings, cluster_masks};
 use super::shards::{CellObjects, RowFrame};
@@ -9,18 +10,6 @@ use super::*;
 use crate::cells::{CellLimits, split};
 use crate::codebook::{ScoreMetric, TextBank};
 use crate::lift::{Contribution, ViewContributions};
-
-/// Pseudo-random numbers (splitmix64, Steele et al. 2014).
-struct Random(u64);
-
-impl Random {
-    fn below(&mut self, n: u64) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        (z ^ (z >> 31)) % n
-    }
-}
 
 /// What views show: of each view, the masks of each Gaussian that it sees; masks numbered within the view.
 type Shown = Vec<BTreeMap<u32, BTreeSet<u32>>>;
@@ -190,7 +179,7 @@ fn made_things(random: &mut Random) -> Shown {
 
 #[test]
 fn masks_of_one_thing_meet_and_those_of_several_are_set_aside() {
-    let made = make(&made_things(&mut Random(1)), 40 * N_THINGS);
+    let made = make(&made_things(&mut Random::new(1)), 40 * N_THINGS);
     let found = made.clusters();
     let of = |view: usize, mask: usize| found.cluster_of_mask[N_MASKS * view + mask];
     for thing in 0..N_THINGS as usize {
@@ -224,7 +213,7 @@ fn clusters_are_those_of_the_definition() {
     };
     let mut n_clusters = 0;
     for seed in 0..40 {
-        let mut random = Random(seed);
+        let mut random = Random::new(seed);
         n_clusters += check(&made_things(&mut random), 40 * N_THINGS, &format!("things {seed}"));
         // Anything: few views, masks without sense, Gaussians that nobody sees.
         let n_views = 1 + random.below(5);
@@ -275,7 +264,7 @@ fn world() -> World {
     // Cells of at most 70: the things are cut.
     let split = split(&gaussians, CellLimits { max_gaussians: 70, max_width: None });
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let mut random = Random(3);
+    let mut random = Random::new(3);
     let (mut paths, mut photos) = (Vec::new(), Vec::new());
     for view in 0..6u32 {
         let mut entries: BTreeMap<u32, Vec<Contribution>> = BTreeMap::new();
@@ -414,7 +403,7 @@ fn shards_carry_the_objects_of_their_cell() {
 /// back, of others what is left is at right angles to it, and the stated bound is the largest distance.
 #[test]
 fn vectors_are_kept_in_the_basis_of_rows() {
-    let mut random = Random(9);
+    let mut random = Random::new(9);
     let mut small = |n: usize| -> Vec<i8> { (0..n).map(|_| random.below(255) as u8 as i8).collect() };
     let (m, dim) = (5, 16);
     let mut vectors = small(m * dim);

@@ -9,15 +9,16 @@ use slag_encoder::raster::{Drawing, RasterError, RasterView, ViewWeights, Weight
 
 use crate::backends::{Backend, backends};
 use crate::oracle;
-use crate::scenes::{Random, random_regions, random_scene, random_view};
+use crate::scenes::{random_regions, random_scene, random_view};
 use crate::table::{Case, KINDS, Row};
+use slag_math::random::Random;
 
 const SIZES_PX: [(u32, u32); 7] = [(1, 1), (16, 16), (17, 15), (5, 40), (33, 31), (64, 48), (70, 3)];
 
 #[test]
 fn weights_are_those_of_brute_force() {
     let cases = SIZES_PX.into_iter().enumerate().map(|(seed, (width, height))| {
-        let random = &mut Random(seed as u64);
+        let random = &mut Random::new(seed as u64);
         let view = random_view(random, width, height);
         let scene = random_scene(random, 400, &view, 0);
         let regions = random_regions(random, &view, 9);
@@ -32,7 +33,7 @@ fn weights_are_those_of_brute_force() {
 fn drawings_are_those_of_brute_force() {
     for Backend { rasterizer, bound_factor, cut_tolerance, keeps_order, .. } in backends() {
         for (seed, (width, height)) in SIZES_PX.into_iter().enumerate() {
-            let random = &mut Random(seed as u64);
+            let random = &mut Random::new(seed as u64);
             let view = random_view(random, width, height);
             let scene = random_scene(random, 300, &view, (seed % 4) as u8);
             let background = [0.1, 0.7, 1.0];
@@ -72,7 +73,7 @@ fn drawings_are_those_of_brute_force() {
 #[test]
 fn the_number_of_threads_does_not_change_a_bit() {
     for Backend { rasterizer, .. } in backends() {
-        let random = &mut Random(5);
+        let random = &mut Random::new(5);
         let view = random_view(random, 150, 130);
         let scene = random_scene(random, 20_000, &view, 1);
         let regions = random_regions(random, &view, 300);
@@ -98,7 +99,7 @@ fn sums_over_regions_add_up() {
     for Backend { name, rasterizer, .. } in backends() {
         // A GPU adds up to 8 pixels of a region in f32, the CPU a tile's in f64.
         let rounding = if *name == "cpu" { 2.0_f64.powi(-23) } else { 2.0_f64.powi(-21) };
-        let random = &mut Random(6);
+        let random = &mut Random::new(6);
         let view = random_view(random, 100, 90);
         let scene = random_scene(random, 3000, &view, 0);
         let fine = random_regions(random, &view, 200);
@@ -132,7 +133,7 @@ fn sums_over_regions_add_up() {
 #[test]
 fn nothing_to_see_is_no_error() {
     for Backend { rasterizer, .. } in backends() {
-        let random = &mut Random(7);
+        let random = &mut Random::new(7);
         let view = random_view(random, 20, 20);
         let regions = random_regions(random, &view, 3);
         let mut behind = random_scene(random, 50, &view, 0);
@@ -156,7 +157,7 @@ fn nothing_to_see_is_no_error() {
 #[test]
 fn unusable_gaussians_are_skipped_and_counted() {
     for Backend { rasterizer, .. } in backends() {
-        let random = &mut Random(8);
+        let random = &mut Random::new(8);
         let view = random_view(random, 40, 40);
         let mut scene = random_scene(random, 100, &view, 1);
         let regions = random_regions(random, &view, 3);
@@ -188,7 +189,7 @@ fn unusable_gaussians_are_skipped_and_counted() {
 #[test]
 fn contradictions_are_errors() {
     for Backend { rasterizer, .. } in backends() {
-        let random = &mut Random(9);
+        let random = &mut Random::new(9);
         let view = random_view(random, 20, 10);
         let scene = random_scene(random, 5, &view, 1);
         let regions = random_regions(random, &view, 3);

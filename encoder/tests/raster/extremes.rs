@@ -8,8 +8,9 @@ use slag_encoder::raster::constants::{MAX_IMAGE_PX, SUM_FRACTION_BITS};
 use slag_encoder::raster::{RasterView, RegionWeight, WeightKind};
 
 use crate::backends::{Backend, backends};
-use crate::scenes::{Random, posed, push, random_regions, random_scene, random_view, unproject};
+use crate::scenes::{SceneRandom, posed, push, random_regions, random_scene, random_view, unproject};
 use crate::table::{Case, Row};
+use slag_math::random::Random;
 
 /// Many views of few Gaussians each, so that none hides the others.
 fn cases(
@@ -19,7 +20,7 @@ fn cases(
     fill: impl Fn(&mut Gaussians, &RasterView, &mut Random),
 ) -> Vec<Case> {
     let case = |seed| {
-        let random = &mut Random(seed);
+        let random = &mut Random::new(seed);
         let focal_px = focal_px(random);
         let view = posed(random, size_px, focal_px);
         let mut scene = Gaussians::default();
@@ -198,7 +199,7 @@ fn on_the_cuts() {
 #[test]
 fn pile() {
     let case = |[low, high]: [f64; 2]| {
-        let random = &mut Random(3);
+        let random = &mut Random::new(3);
         let view = posed(random, [2, 2], 50.0);
         let mut scene = Gaussians::default();
         for _ in 0..100_000 {
@@ -247,7 +248,7 @@ fn near_plane() {
 #[test]
 fn far_from_the_origin() {
     let case = |seed: u64| {
-        let random = &mut Random(seed);
+        let random = &mut Random::new(seed);
         let view = random_view(random, 40, 30);
         let mut scene = random_scene(random, 200, &view, 0);
         scene.means_in_world.iter_mut().for_each(|mean| *mean = (*mean * 1048576.0).round() / 1048576.0);
@@ -309,7 +310,7 @@ fn image_sizes() {
 /// it what is left. An f32 running sum ends at 2^24 steps of its own size.
 #[test]
 fn sums_over_many_pixels() {
-    let random = &mut Random(1);
+    let random = &mut Random::new(1);
     let (width_px, height_px) = (8192, 2048);
     let view = posed(random, [width_px, height_px], 4000.0);
     let mut scene = Gaussians::default();

@@ -8,7 +8,8 @@ use slag_encoder::raster::{
 };
 
 use crate::backends::gpu_is_expected;
-use crate::scenes::{Random, random_regions, random_scene, random_view};
+use crate::scenes::{random_regions, random_scene, random_view};
+use slag_math::random::Random;
 
 /// Opens the first adapter in its best precision.
 fn open(options: GpuOptions) -> Option<GpuRasterizer> {
@@ -30,7 +31,7 @@ const SIZES_PX: [(u32, u32); 4] = [(70, 90), (70, 90), (131, 40), (33, 200)];
 #[test]
 fn chunks_and_bands_change_no_bit() {
     let Some(whole) = open(GpuOptions::default()) else { return };
-    let random = &mut Random(20);
+    let random = &mut Random::new(20);
     let view = random_view(random, 70, 90);
     let scene = random_scene(random, 3000, &view, 0);
     // 56 bytes a visible Gaussian, 64 a Gaussian, 16 a sum of a tile: 937 a chunk, 1,071 visible and 3,750
@@ -70,7 +71,7 @@ fn chunks_and_bands_change_no_bit() {
 fn too_much_for_a_device_is_an_error_and_falls_to_the_cpu() {
     let options = GpuOptions { max_binding_bytes: 2000, ..GpuOptions::default() };
     let Some(tiny) = open(options) else { return };
-    let random = &mut Random(21);
+    let random = &mut Random::new(21);
     let view = random_view(random, 60, 16);
     let scene = random_scene(random, 2000, &view, 0);
     let regions = random_regions(random, &view, 3);
@@ -84,7 +85,7 @@ fn too_much_for_a_device_is_an_error_and_falls_to_the_cpu() {
 #[test]
 fn the_same_bits_each_time_from_every_thread() {
     let Some(gpu) = open(GpuOptions { views_in_flight: 2, ..GpuOptions::default() }) else { return };
-    let random = &mut Random(22);
+    let random = &mut Random::new(22);
     let view = random_view(random, 90, 70);
     let scene = random_scene(random, 4000, &view, 0);
     let regions = random_regions(random, &view, 100);
@@ -106,7 +107,7 @@ fn the_same_bits_each_time_from_every_thread() {
 #[test]
 fn a_lost_device_loses_no_view() {
     let (Some(a), Some(b)) = (open(GpuOptions::default()), open(GpuOptions::default())) else { return };
-    let random = &mut Random(23);
+    let random = &mut Random::new(23);
     let views: Vec<RasterView> = (0..6).map(|_| random_view(random, 50, 40)).collect();
     let scene = random_scene(random, 1500, &views[0], 0);
     let regions = random_regions(random, &views[0], 12);

@@ -7,8 +7,9 @@ use slag_encoder::raster::{RasterView, WeightKind};
 
 use crate::backends::{Backend, backends};
 use crate::extremes::read_ply;
-use crate::scenes::{Random, posed, push, random_regions, random_scene, random_view, unproject};
+use crate::scenes::{SceneRandom, posed, push, random_regions, random_scene, random_view, unproject};
 use crate::table::{Case, KINDS, Row};
+use slag_math::random::Random;
 
 /// Changes the Gaussian of an index.
 type Edit = Box<dyn Fn(&mut Gaussians, usize)>;
@@ -47,7 +48,7 @@ fn poisons() -> Vec<(String, Edit)> {
 /// The scene has a Gaussian in front of everything, which is poisoned in each way there is.
 #[test]
 fn values_that_are_no_numbers() {
-    let random = &mut Random(8);
+    let random = &mut Random::new(8);
     let view = posed(random, [30, 20], 30.0);
     let mut scene = random_scene(random, 60, &view, 0);
     push(&mut scene, &view, random, DVec3::Z * 0.02, [0.1; 3], 0.9);
@@ -88,7 +89,7 @@ fn values_that_are_no_numbers() {
 /// Finite numbers beyond the arithmetic: seen nowhere or rejected, never an infinity in the result.
 #[test]
 fn numbers_beyond_the_arithmetic() {
-    let random = &mut Random(9);
+    let random = &mut Random::new(9);
     let view = posed(random, [30, 20], 30.0);
     let scene = random_scene(random, 60, &view, 0);
     let regions = random_regions(random, &view, 4);
@@ -137,7 +138,7 @@ const QUATERNIONS: [([f64; 4], bool); 9] = [
 fn rotations_through_the_readers() {
     let cases: Vec<Case> = (0..20)
         .map(|seed| {
-            let random = &mut Random(seed);
+            let random = &mut Random::new(seed);
             let view = posed(random, [30, 20], 30.0);
             let rows: Vec<[f64; 14]> = (0..QUATERNIONS.len())
                 .map(|i| {
@@ -193,7 +194,7 @@ fn rotations_in_memory() {
     let is_unit = |length: f64| (length - 1.0).abs() < 5e-4;
     let cases: Vec<Case> = (0..20)
         .map(|seed| {
-            let random = &mut Random(seed);
+            let random = &mut Random::new(seed);
             let view: RasterView = random_view(random, 30, 20);
             let mut scene = Gaussians::default();
             for length in lengths {

@@ -4,40 +4,30 @@ use glam::{DAffine3, DQuat, DVec3};
 use slag_common::{Distortion, Gaussians, Intrinsics};
 use slag_encoder::masks::{NO_REGION, RegionMap};
 use slag_encoder::raster::RasterView;
+use slag_math::random::Random;
 
-/// SplitMix64 (Steele et al. 2014): small, seeded, the same everywhere.
-pub struct Random(pub u64);
-
-impl Random {
-    pub fn bits(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    pub fn between(&mut self, low: f64, high: f64) -> f64 {
-        low + (self.bits() >> 11) as f64 * 2.0_f64.powi(-53) * (high - low)
-    }
-
+/// Random numbers as scenes need them.
+pub trait SceneRandom {
     /// Returns a number whose logarithm is evenly spread.
-    pub fn log_between(&mut self, low: f64, high: f64) -> f64 {
+    fn log_between(&mut self, low: f64, high: f64) -> f64;
+    /// Returns a point of the image or of a border as wide as a quarter of it, and a depth.
+    fn in_view(&mut self, view: &RasterView, depths: [f64; 2]) -> DVec3;
+    fn direction(&mut self) -> DVec3;
+}
+
+impl SceneRandom for Random {
+    fn log_between(&mut self, low: f64, high: f64) -> f64 {
         self.between(low.ln(), high.ln()).exp()
     }
 
-    /// Returns a point of the image or of a border as wide as a quarter of it, and a depth.
-    pub fn in_view(&mut self, view: &RasterView, depths: [f64; 2]) -> DVec3 {
+    fn in_view(&mut self, view: &RasterView, depths: [f64; 2]) -> DVec3 {
         let (width, height) = (f64::from(view.intrinsics.width_px), f64::from(view.intrinsics.height_px));
         let (x, y) = (self.between(-0.25, 1.25) * width, self.between(-0.25, 1.25) * height);
         let depth = self.log_between(depths[0], depths[1]);
         unproject(view, x, y, depth)
     }
 
-    pub fn below(&mut self, n: u32) -> u32 {
-        (self.bits() % u64::from(n)) as u32
-    }
-
-    pub fn direction(&mut self) -> DVec3 {
+    fn direction(&mut self) -> DVec3 {
         DVec3::from_array(std::array::from_fn(|_| self.between(-1.0, 1.0))).normalize()
     }
 }

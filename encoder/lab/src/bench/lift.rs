@@ -16,6 +16,7 @@ use serde::Serialize;
 use super::{Machine, Spread, timed_ms};
 use slag_encoder::lift::{CellField, Contribution, ContributionError, ContributionIndex, ViewContributions};
 use slag_encoder::shard;
+use slag_math::random::mix64;
 
 /// Gaussians of the square in which they are enumerated, a power of four.
 const BLOCK: u64 = 4096;
@@ -430,7 +431,7 @@ impl<'a> Plain<'a> {
                 let place = self.place_of(gaussian);
                 let u = (compact_bits(place) as f64 - left) / width;
                 let v = (compact_bits(place >> 1) as f64 - top) / width;
-                let random = mix(view << 40 ^ gaussian);
+                let random = mix64(view << 40 ^ gaussian);
                 if !(0.0..1.0).contains(&u)
                     || !(0.0..1.0).contains(&v)
                     || (random >> 40) as f64 >= SHARE_IN_SIGHT * (1u64 << 24) as f64
@@ -449,7 +450,7 @@ impl<'a> Plain<'a> {
                 let columns = neighbours(u * f64::from(n_across), border);
                 for row in neighbours(v * f64::from(n_across), border) {
                     for column in columns.clone() {
-                        let exponent = (mix(random ^ u64::from(row * 3 + column)) >> 48) as f32 / 65536.0;
+                        let exponent = (mix64(random ^ u64::from(row * 3 + column)) >> 48) as f32 / 65536.0;
                         let weight = 10f32.powf(exponent * 4.5 - 3.0);
                         let local = (gaussian - first_of_cell) as u32;
                         entries.push(Contribution { local, region: row * n_across + column, weight });
@@ -459,7 +460,7 @@ impl<'a> Plain<'a> {
         }
         let per_level = (n_masks / LEVELS).max(1) as u64;
         let masks = |region: u64| {
-            let mask = |level| (level * per_level + mix(region << 8 ^ level) % per_level) as u32;
+            let mask = |level| (level * per_level + mix64(region << 8 ^ level) % per_level) as u32;
             (0..LEVELS.min(n_masks) as u64).map(mask).collect()
         };
         let masks_of_region = (0..u64::from(n_across * n_across)).map(masks).collect();
@@ -477,22 +478,14 @@ fn neighbours(at: f64, border: f64) -> std::ops::RangeInclusive<u32> {
 
 /// Returns a unit vector near a common direction, as those of one encoder are.
 fn unit_vector(seed: u64, dim: usize) -> Vec<f32> {
-    let component = |c: u64| 0.5 * uniform(7, c) + uniform(mix(seed), c) - 0.75;
+    let component = |c: u64| 0.5 * uniform(7, c) + uniform(mix64(seed), c) - 0.75;
     let raw: Vec<f64> = (0..dim as u64).map(component).collect();
     let length = raw.iter().map(|c| c * c).sum::<f64>().sqrt();
     raw.into_iter().map(|c| (c / length) as f32).collect()
 }
 
 fn uniform(seed: u64, index: u64) -> f64 {
-    (mix(seed.wrapping_mul(0x2545_f491_4f6c_dd1d) ^ index) >> 11) as f64 / (1u64 << 53) as f64
-}
-
-/// A well-mixed 64-bit value (Steele, Lea and Flood 2014).
-fn mix(index: u64) -> u64 {
-    let mut z = index.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
+    (mix64(seed.wrapping_mul(0x2545_f491_4f6c_dd1d) ^ index) >> 11) as f64 / (1u64 << 53) as f64
 }
 
 /// Gathers every second bit: a coordinate of a place along the Morton curve.

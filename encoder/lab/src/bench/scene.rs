@@ -10,6 +10,7 @@ use super::arrays::{Arrays, FixtureError};
 use crate::generate::compose::{looking, pinhole};
 use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::RasterView;
+use slag_math::random::Random;
 
 /// Horizontal field of view of generated views.
 const FIELD_OF_VIEW_RAD: f64 = 65.0 * PI / 180.0;
@@ -41,7 +42,7 @@ impl BenchScene {
     /// stand among the objects. The same numbers give the same scene on every machine with the same
     /// mathematical library.
     pub fn generated(n_gaussians: usize, width_px: u32, height_px: u32) -> Self {
-        let mut maker = Maker { random: Random(1), gaussians: Gaussians::default() };
+        let mut maker = Maker { random: Random::new(1), gaussians: Gaussians::default() };
         let share = |percent: usize| n_gaussians * percent / 100;
         let (n_ground, n_backdrop, n_floating) = (share(30), share(20), share(5));
         maker.ground(n_ground);
@@ -126,7 +127,7 @@ pub fn cell_regions(width_px: u32, height_px: u32, n_regions: u32) -> RegionMap 
     let columns = ((f64::from(n_regions) * width / height).sqrt().round() as u32).clamp(1, n_regions.max(1));
     let rows = n_regions.div_ceil(columns).max(1);
     let size_px = DVec2::new(width / f64::from(columns), height / f64::from(rows));
-    let mut random = Random(2);
+    let mut random = Random::new(2);
     let sites: Vec<DVec2> = (0..rows)
         .flat_map(|row| (0..columns).map(move |column| DVec2::new(f64::from(column), f64::from(row))))
         .map(|field| (field + DVec2::new(random.unit(), random.unit())) * size_px)
@@ -145,31 +146,11 @@ pub fn cell_regions(width_px: u32, height_px: u32, n_regions: u32) -> RegionMap 
     RegionMap { width_px, height_px, region_of_pixel, n_regions }
 }
 
-/// SplitMix64 (Steele et al. 2014).
-struct Random(u64);
-
-impl Random {
-    /// Returns the next value, uniform in 0..1.
-    fn unit(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
-    }
-
-    /// Returns a normally distributed value (Box and Muller 1958).
-    fn normal(&mut self) -> f64 {
-        let radius = (-2.0 * (1.0 - self.unit()).ln()).sqrt();
-        radius * (TAU * self.unit()).cos()
-    }
-
-    /// Returns a direction, uniform on the sphere.
-    fn direction(&mut self) -> DVec3 {
-        let (z, angle) = (2.0 * self.unit() - 1.0, TAU * self.unit());
-        let r = (1.0 - z * z).sqrt();
-        DVec3::new(r * angle.cos(), r * angle.sin(), z)
-    }
+/// Returns a direction, uniform on the sphere.
+fn direction(random: &mut Random) -> DVec3 {
+    let (z, angle) = (2.0 * random.unit() - 1.0, TAU * random.unit());
+    let r = (1.0 - z * z).sqrt();
+    DVec3::new(r * angle.cos(), r * angle.sin(), z)
 }
 
 /// Adds Gaussians to a scene.
@@ -210,7 +191,7 @@ impl Maker {
             let area = 4.0 * PI * ((a * b + a * c + b * c) / 3.0).powf(1.6075_f64.recip());
             let spacing = (area / n_here.max(1) as f64).sqrt();
             for _ in 0..n_here {
-                let direction = self.random.direction();
+                let direction = direction(&mut self.random);
                 self.surface(centre + direction * half, (direction / half).normalize(), spacing);
             }
         }
@@ -226,7 +207,7 @@ impl Maker {
             let scales =
                 std::array::from_fn(|_| (0.15 * spacing * (0.7 * self.random.normal()).exp()) as f32);
             let opacity = 0.01 + 0.1 * self.random.unit();
-            let normal = self.random.direction();
+            let normal = direction(&mut self.random);
             self.push(position, normal, scales, opacity);
         }
     }

@@ -3,6 +3,7 @@ use std::sync::atomic::AtomicBool;
 use glam::DVec3;
 use slag_common::container::AlignedBytes;
 use slag_common::frames::Aabb;
+use slag_math::random::mix64;
 
 use super::*;
 use crate::cells::Cell;
@@ -16,8 +17,7 @@ const N: usize = 90;
 const UNSEEN: [usize; 2] = [7, 50];
 
 fn random(seed: u64) -> f64 {
-    let z = seed.wrapping_add(5).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-    ((z ^ (z >> 29)).wrapping_mul(0xbf58_476d_1ce4_e5b9) >> 20) as f64 / (1u64 << 44) as f64
+    (mix64(seed) >> 20) as f64 / (1u64 << 44) as f64
 }
 
 /// Three patches of 30 Gaussians, far apart and each of a colour.

@@ -9,6 +9,8 @@ use slag_common::frames::{Aabb, GeoReference, Geographic};
 use slag_common::manifest::ShardRecord;
 use slag_common::shard::{ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardView};
 
+use slag_math::random::Random;
+
 use super::*;
 use crate::store::tests::manifest_of_boxes;
 use crate::store::{Extras, Store};
@@ -29,24 +31,6 @@ struct Fixture {
     truth: BTreeMap<u64, (DVec3, Vec<f16>, u32)>,
 }
 
-/// Pseudo-random numbers in -1..1 (Steele et al. 2014, SplitMix64).
-struct Numbers(u64);
-
-impl Numbers {
-    fn next(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 52) as f64 - 1.0
-    }
-
-    fn unit_vector(&mut self) -> Vec<f16> {
-        let vector: Vec<f64> = (0..DIM).map(|_| self.next()).collect();
-        let norm = vector.iter().map(|v| v * v).sum::<f64>().sqrt();
-        vector.iter().map(|v| f16::from_f64(v / norm)).collect()
-    }
-}
-
 fn fixture() -> Fixture {
     let dir = tempfile::tempdir().expect("temporary folder");
     let store = Store::create_or_open(dir.path()).expect("opens");
@@ -58,7 +42,7 @@ fn fixture() -> Fixture {
 impl Fixture {
     /// Publishes a generation whose splat indices begin at `first_id`.
     fn publish(&mut self, generation: u64, first_id: u32) {
-        let mut numbers = Numbers(generation);
+        let mut random = Random::new(generation);
         self.truth.clear();
         let boxes: Vec<Aabb> = (0..CELLS.len())
             .map(|i| Aabb {
@@ -78,7 +62,8 @@ impl Fixture {
             let ids: Vec<u32> = (0..n_gaussians).map(|i| next_id + (i * 37) % n_gaussians).collect();
             next_id += n_gaussians;
             let positions: Vec<[u16; 3]> = (0..n as u16).map(|i| [i * 1000, 60_000 - i * 900, i]).collect();
-            let embeddings: Vec<f16> = (0..n_with).flat_map(|_| numbers.unit_vector()).collect();
+            let embeddings: Vec<f16> =
+                (0..n_with).flat_map(|_| random.unit_vector(DIM)).map(f16::from_f32).collect();
             let centroid_starts: &[u32] = if n_with == 0 { &[0] } else { &[0, n_with_evidence] };
             let n_centroids = centroid_starts.len() as u32 - 1;
             let header = ShardHeader {
@@ -201,9 +186,9 @@ async fn every_point_arrives_and_search_equals_brute_force() {
     assert_eq!(server.with(|state| state.indexed.clone()), ["scene", "generation", "location"]);
 
     let client = Qdrant::from_url(&url).api_key("k3y").skip_compatibility_check().build().expect("a client");
-    let mut numbers = Numbers(99);
+    let mut random = Random::new(99);
     for _ in 0..5 {
-        let query: Vec<f32> = (0..DIM).map(|_| numbers.next() as f32).collect();
+        let query: Vec<f32> = (0..DIM).map(|_| random.signed()).collect();
         let search = SearchPointsBuilder::new("yard", query.clone(), 12);
         let found = client.search_points(search).await.expect("answers").result;
         // Oracle: cosines in float64 of the embeddings that the shards were written from.
