@@ -54,7 +54,7 @@ fn the_field_agrees_with_the_independent_reference() {
     check_words(&house, &store, &models, dir.path());
 }
 
-/// The GPU's field is the CPU's within the bound of NUMERICS.md: the same sums but for pixels across a cut,
+/// The GPU's field is the CPU's within the bound of docs/numerics.md: the same sums but for pixels across a cut,
 /// and those together less than a 50,000th. Where the machine has no GPU, a software one does the work.
 #[needs_shared]
 #[test]

@@ -1,4 +1,4 @@
-//! Embeddings at the extremes: rows of the table in NUMERICS.md, each against the paper's equation in
+//! Embeddings at the extremes: rows of the table in docs/numerics.md, each against the paper's equation in
 //! float64 or a closed form.
 
 mod common;

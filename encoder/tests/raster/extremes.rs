@@ -1,4 +1,4 @@
-//! Geometry and opacity at the extremes: rows of the table in NUMERICS.md, each against float64.
+//! Geometry and opacity at the extremes: rows of the table in docs/numerics.md, each against float64.
 
 use glam::{DAffine3, DVec3};
 use slag_common::Gaussians;

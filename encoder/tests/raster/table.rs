@@ -1,4 +1,4 @@
-//! Rows of the table in NUMERICS.md: a range of inputs, and the error that is claimed for it.
+//! Rows of the table in docs/numerics.md: a range of inputs, and the error that is claimed for it.
 
 use std::collections::BTreeMap;
 
