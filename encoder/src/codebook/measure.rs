@@ -45,7 +45,10 @@ impl<'a> Sample<'a> {
         let texts = Panels::new(dim, bank.len(), |c, text| bank.vectors[text * dim + c]);
         let chosen: Vec<f32> =
             order.iter().step_by(stride).flat_map(|at| embeddings.get(*at as usize)).copied().collect();
-        let scores = texts.product(Rows::all(&chosen, dim));
+        let scores = match bank.is_empty() {
+            true => Vec::new(),
+            false => texts.product(Rows::all(&chosen, dim)),
+        };
         let (spread, moments) = (spread(&scores, bank.len()), ScoreMoments::of(&scores));
         Self { bank, texts, stride, spread, moments }
     }
@@ -55,7 +58,8 @@ impl<'a> Sample<'a> {
         place.is_multiple_of(self.stride)
     }
 
-    /// Returns the errors, given what the sample's embeddings are less their decoded form, `[sample][dim]`.
+    /// Returns the errors of scores; zeros without texts. `missed`: the sample's embeddings minus their decoded form,
+    /// `[sample][dim]`.
     pub fn errors(&self, missed: &[f32]) -> ScoreErrors {
         if self.bank.is_empty() || missed.is_empty() {
             return ScoreErrors { spread: self.spread, ..ScoreErrors::default() };
@@ -63,10 +67,10 @@ impl<'a> Sample<'a> {
         let mut errors = self.texts.product(Rows::all(missed, self.bank.dim));
         errors.par_iter_mut().for_each(|e| *e = e.abs());
         let n = errors.len();
-        // Rows one by one, so that the sum is the same for any number of threads.
+        // Gaussian by Gaussian: the sum is the same for any number of threads.
         let mean = errors
             .chunks(self.bank.len())
-            .map(|centroid| centroid.iter().map(|e| f64::from(*e)).sum::<f64>())
+            .map(|of_gaussian| of_gaussian.iter().map(|e| f64::from(*e)).sum::<f64>())
             .sum::<f64>()
             / n as f64;
         let max = errors.iter().copied().fold(0.0, f32::max);
@@ -76,15 +80,15 @@ impl<'a> Sample<'a> {
     }
 }
 
-/// Returns the standard deviation over centroids of each column of `[..][n_columns]`, averaged over the columns.
+/// Returns the standard deviation of each column of `[n][n_columns]`, averaged over the columns.
 pub fn spread(scores: &[f32], n_columns: usize) -> f32 {
     if n_columns == 0 || scores.is_empty() {
         return 0.0;
     }
     let n = (scores.len() / n_columns) as f64;
     let (mut sums, mut squares) = (vec![0.0f64; n_columns], vec![0.0f64; n_columns]);
-    for centroid in scores.chunks_exact(n_columns) {
-        for ((sum, square), score) in sums.iter_mut().zip(&mut squares).zip(centroid) {
+    for row in scores.chunks_exact(n_columns) {
+        for ((sum, square), score) in sums.iter_mut().zip(&mut squares).zip(row) {
             *sum += f64::from(*score);
             *square += f64::from(*score).powi(2);
         }

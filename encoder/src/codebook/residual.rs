@@ -180,9 +180,9 @@ pub fn trained(points: Rows<'_>, n_codewords: usize) -> Vec<f32> {
     codewords
 }
 
-/// Returns the smallest number of subspaces whose code leaves at most `max_rms` of the residuals, with the code
-/// and the order of components that it needs; `None` where none is needed. `scales`: what each residual was
-/// divided by.
+/// Returns the code with the fewest subspaces that leaves at most `max_rms` of the residuals, and the order of
+/// components that it needs; `None` if no code is needed, or if `max_subspaces` is below 2. `scales`: the divisor of each
+/// residual.
 pub fn plan(
     residuals: Rows<'_>,
     scales: &[f32],
@@ -207,6 +207,9 @@ pub fn plan(
         return None;
     }
     let max_subspaces = max_subspaces.min(m) / 2 * 2;
+    if max_subspaces == 0 {
+        return None;
+    }
     let train = |n_subspaces: usize| {
         let (order, starts) = subspaces(variances, n_subspaces);
         let points: Vec<f32> =

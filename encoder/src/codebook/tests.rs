@@ -247,6 +247,32 @@ fn a_few_embeddings_are_finite() {
     }
 }
 
+/// A limit of no subspaces means no residual code.
+#[test]
+fn no_subspaces_make_no_residual_code() {
+    let vectors = clustered(600, 200, 64, 0.4);
+    let score_context = score_context(64, &vectors);
+    for max_subspaces in [0, 1] {
+        let settings = CodebookSettings { max_subspaces, ..CodebookSettings::default() };
+        let codebook = build(Rows::all(&vectors, 64), &score_context, &settings);
+        assert!(codebook.residuals.is_none() && codebook.errors.mean > 0.0, "{max_subspaces}");
+    }
+}
+
+/// Without texts errors cannot be measured, but the codebook and its hard bounds are built.
+#[test]
+fn an_empty_text_bank_measures_no_errors() {
+    let vectors = clustered(600, 200, 64, 0.4);
+    for bank in [TextBank::default(), TextBank { dim: 64, vectors: Vec::new() }] {
+        let metric = ScoreMetric::new(64, &bank);
+        let spread = metric.spread(Rows::all(&vectors, 64));
+        let score_context = ScoreMetricContext { metric, bank, spread };
+        let codebook = build(Rows::all(&vectors, 64), &score_context, &CodebookSettings::default());
+        assert_eq!((codebook.errors.mean, codebook.errors.max, codebook.moments.mean), (0.0, 0.0, 0.0));
+        assert!(codebook.radii.iter().all(|radius| *radius > 0.0) && codebook.residuals.is_some());
+    }
+}
+
 #[test]
 fn equal_embeddings_make_one_row_and_none_makes_none() {
     let same = [0.5f32; 400];
