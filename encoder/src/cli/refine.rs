@@ -16,9 +16,9 @@ pub struct RefineArgs {
     /// Gaussians with less weight over all views, pixels, have no evidence.
     #[arg(long, value_name = "PX", value_parser = amount)]
     min_weight: Option<f32>,
-    /// A mask counts the part of its outline that the photo's edge does not cut off, to this power; 0: all count alike.
+    /// Each mask counts (1 - truncation)^POWER; truncation is the share of its outline that the photo's edge cuts off
     #[arg(long, value_name = "POWER", value_parser = amount)]
-    wholeness: Option<f32>,
+    truncation_power: Option<f32>,
     /// 0: views count the solid angle that they see of a Gaussian; 1: all alike.
     #[arg(long, value_name = "SHARE", value_parser = share)]
     equalisation: Option<f32>,
@@ -49,7 +49,7 @@ impl RefineArgs {
             min_region_share: self.min_region_share.unwrap_or(preset.min_region_share),
             min_view_share: self.min_view_share.unwrap_or(preset.min_view_share),
             min_weight_px: self.min_weight.unwrap_or(preset.min_weight_px),
-            wholeness: self.wholeness.unwrap_or(preset.wholeness),
+            truncation_power: self.truncation_power.unwrap_or(preset.truncation_power),
             equalisation: self.equalisation.unwrap_or(preset.equalisation),
             agreement: self.agreement.unwrap_or(preset.agreement),
             median_steps: self.median_steps.unwrap_or(preset.median_steps),

@@ -226,22 +226,18 @@ impl<'a> CellBuilder<'a> {
         built.extras.insert(EXTRA_REGIONS.into(), regions);
         let dim = self.table.dim();
         let mut cell = CellEmbeddings { dim, vectors: Vec::new(), has_evidence: Vec::new() };
-        for group in self.index.groups(self.group_bytes) {
-            let contributions = self.context.time("merge", || {
-                let raw = self.index.read(group)?;
-                self.index.transpose(&raw, &self.table)
-            })?;
-            for contributions in contributions {
-                if self.context.is_cancelled() {
-                    return Ok(None);
-                }
-                let cell_id = contributions.part.cell_id;
-                self.add_part(contributions, refinement.as_ref(), &mut cell, &mut built)?;
-                if cell.has_evidence.len() == inputs.split.cells[cell_id as usize].gaussians.len() {
-                    self.finish_cell(cell_id, &cell, objects.as_ref(), &mut built)?;
-                    cell.has_evidence.clear();
-                    self.context.progress().advance(1);
-                }
+        let mut parts = self.index.transposed_parts(&self.table, self.group_bytes);
+        while let Some(contributions) = self.context.time("merge", || parts.next()) {
+            if self.context.is_cancelled() {
+                return Ok(None);
+            }
+            let contributions = contributions?;
+            let cell_id = contributions.part.cell_id;
+            self.add_part(contributions, refinement.as_ref(), &mut cell, &mut built)?;
+            if cell.has_evidence.len() == inputs.split.cells[cell_id as usize].gaussians.len() {
+                self.finish_cell(cell_id, &cell, objects.as_ref(), &mut built)?;
+                cell.has_evidence.clear();
+                self.context.progress().advance(1);
             }
         }
         built.objects = objects.map(|objects| objects.report);

@@ -1,25 +1,26 @@
 //! The embeddings of many Gaussians at once, from their contributions.
 //!
-//! A component of an embedding is a sum over hundreds of region vectors, far more than fit a cache.
-//! So a few neighbouring Gaussians, which share most of their regions, are taken together, and of
-//! their regions a few components at a time. Every component is summed in the entries' order, with
-//! products rounded before they are added: the same bits on any machine.
+//! A component of an embedding is a sum over hundreds of region vectors, far more than fit a cache. So neighbouring Gaussians,
+//! which share most of their regions, are processed together, a block of components at a time. Every component is summed
+//! in the order of the entries, and products are rounded before they are added: the bits are the same on any machine.
 
 use std::ops::Range;
 
 use pulp::{Arch, Simd, WithSimd};
 use rayon::prelude::*;
 
-use super::field::MIN_MEAN_LENGTH;
+use super::part::PartContributions;
 use super::table::RegionTable;
-use super::transpose::PartContributions;
 use slag_math::dot;
 
-/// Gaussians taken together: their embeddings stay in a core's cache until they are scaled.
+/// Shortest mean vector with evidence. The masks of a shorter one cancel: the rest is rounding noise of f32
+/// contributions and of the models.
+pub(super) const MIN_MEAN_LENGTH: f32 = 1e-3;
+/// Gaussians processed together: their embeddings stay in a core's cache until they are scaled.
 const CHUNK: usize = 512;
-/// Components of the region vectors that are at hand at a time.
+/// Components of a block.
 const BLOCK: usize = 128;
-/// Registers that hold contributions: enough to hide an addition's latency; BLOCK fills them at any width.
+/// Registers that hold sums: enough to hide the latency of an addition. A block fills them at any width.
 const REGISTERS: usize = 8;
 const UNSEEN: u32 = u32::MAX;
 
@@ -86,7 +87,7 @@ pub(super) fn make_unit(sum: &mut [f32], total_weight: f32) -> f32 {
 }
 
 impl Scratch {
-    /// Numbers the regions of some Gaussians in the order in which they come up.
+    /// Numbers the regions of some Gaussians in the order of their first entry.
     fn number_regions(&mut self, contributions: &PartContributions, gaussians: Range<usize>) {
         let entries =
             contributions.starts[gaussians.start] as usize..contributions.starts[gaussians.end] as usize;
@@ -106,7 +107,7 @@ impl Scratch {
     }
 }
 
-/// The contributions of region vectors of some consecutive Gaussians.
+/// The sums of region vectors of consecutive Gaussians.
 struct Chunk<'a> {
     contributions: &'a PartContributions,
     table: &'a RegionTable,
@@ -145,8 +146,8 @@ impl WithSimd for Chunk<'_> {
     }
 }
 
-/// Writes the sum of `weight * vector` over some entries: a few registers' worth of components at a
-/// time, which stay in them until all entries are added.
+/// Writes the sum of `weight * vector` over some entries. The components of a step stay in registers until all entries are
+/// added.
 #[inline(always)]
 fn add_vectors<S: Simd>(
     simd: S,
@@ -162,7 +163,7 @@ fn add_vectors<S: Simd>(
             let vector = S::as_simd_f32s(&vectors[*place as usize]).0;
             let vector = &vector[step * REGISTERS..][..REGISTERS];
             for i in 0..REGISTERS {
-                // Not fused: other machines could not, and would differ.
+                // Not fused: machines without fused multiply-add would differ.
                 sum[i] = simd.add_f32s(sum[i], simd.mul_f32s(weight, vector[i]));
             }
         }
@@ -175,7 +176,7 @@ mod tests {
     use super::*;
     use crate::lift::tests::{Scene, scene_of};
 
-    /// Whatever vectors the machine has, the bits are those of single numbers.
+    /// Every instruction set of the machine gives the bits of scalar code.
     #[test]
     fn every_width_of_vectors_gives_the_same_bits() {
         let mut widths = vec![Arch::Scalar];

@@ -7,12 +7,9 @@ use rayon::prelude::*;
 use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
 
 use super::embeddings::{make_unit, write_embeddings};
+use super::part::PartContributions;
+use super::starts;
 use super::table::RegionTable;
-use super::transpose::PartContributions;
-
-/// Below this length of the mean vector the masks that saw a Gaussian cancel: what is left of
-/// them is rounding noise of f32 contributions and of the models, so it is flagged as no evidence.
-pub const MIN_MEAN_LENGTH: f32 = 1e-3;
 
 const MAGIC: [u8; 8] = *b"SLAGFELD";
 const VERSION: u32 = 1;
@@ -140,7 +137,7 @@ impl CellField {
             total_weights: bytemuck::pod_collect_to_vec(&bytes[layout.column::<f32>(6, "total weights", n)?]),
             mean_lengths: bytemuck::pod_collect_to_vec(&bytes[layout.column::<f32>(7, "mean lengths", n)?]),
         };
-        let consistent = super::are_starts(&field.starts, n_entries)
+        let consistent = starts::are_valid(&field.starts, n_entries)
             && field.regions.iter().all(|r| (*r as usize) < n_regions);
         if consistent {
             return Ok(field);

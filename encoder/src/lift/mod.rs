@@ -9,23 +9,33 @@
 //! ```
 //!
 //! so the field stays factorised: a sparse matrix of contributions times a small matrix of region vectors.
-//! Sums are taken in one canonical order (views by name, then regions), whatever order, thread or
-//! process made them: the result is the same bit for bit.
+//! Contributions are summed in one canonical order (views by name, then regions), whatever order, thread or process made
+//! them: the result is the same bit for bit.
 //!
-//! | step | job |
+//! | file | job |
 //! |---|---|
 //! | [`contributions`] | a view's contributions in a file, ordered by cell |
-//! | [`transpose`] | the contributions of all views by Gaussian, a few cells at a time |
-//! | [`refine`] | what masks count, and what neighbours add, where more than the plain average is asked for |
+//! | [`photos`] | how a view's masks lie in its photo |
+//! | [`table`] | the regions of all views: which masks cover each |
+//! | [`index`] | the files of all views, and the parts that their entries form |
+//! | [`transpose`] | a group of parts, transposed from the views' order to the Gaussians' |
+//! | [`passes`] | a pass over all parts within the memory budget, from files or from memory |
+//! | [`refine`] | optional refinements: weights of masks, evidence shared within superpoints |
+//! | [`superpoint`] | superpoints: small pieces of surface of one appearance |
 //! | [`embeddings`] | each Gaussian's embedding, computed once |
-//! | [`field`] | what is kept of it: contributions, total weight, length |
+//! | [`field`] | the published field: contributions, total weight, length |
+//! | [`published`] | the field of a published generation, read back |
 
 mod contributions;
 mod embeddings;
 mod field;
+mod index;
+mod part;
+mod passes;
 pub mod photos;
 pub mod published;
 pub mod refine;
+mod starts;
 pub mod superpoint;
 mod table;
 #[cfg(test)]
@@ -37,11 +47,8 @@ pub use contributions::{
     ViewRegions,
 };
 pub use field::CellField;
+pub use index::{ContributionIndex, RawGroup};
+pub use part::{Part, PartContributions};
+pub use passes::TransposedParts;
 pub use refine::Aggregation;
 pub use table::RegionTable;
-pub use transpose::{ContributionIndex, Part, PartContributions, RawGroup};
-
-/// Returns whether values are ascending from 0 to `end`, as the starts of `starts.len() - 1` rows are.
-fn are_starts(starts: &[u64], end: usize) -> bool {
-    starts.first() == Some(&0) && starts.is_sorted() && starts.last() == Some(&(end as u64))
-}

@@ -1,5 +1,5 @@
-//! How a view's masks lie in its photo, kept beside its contributions: what the photo's edge cuts off, and where the object is
-//! that it shows.
+//! The outlines of a view's masks in its photo, kept beside its contributions: how much the photo's edge cuts off, and the
+//! box that shows the object.
 
 use std::path::Path;
 
@@ -11,39 +11,37 @@ use crate::masks::{BoxPx, Mask};
 
 const MAGIC: [u8; 8] = *b"SLAGMBOX";
 const VERSION: u32 = 2;
-/// What a mask counts at least: its Gaussians keep their evidence.
-pub const LEAST_MASK_WEIGHT: f32 = 0.01;
 
-/// A view's name and its masks' outlines.
+/// The masks of a view's photo.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Photo {
     /// Name of the view.
     pub name: String,
-    /// Of each mask.
+    /// The outline of each mask.
     pub outlines: Vec<MaskOutline>,
 }
 
-/// How a mask lies in its photo.
+/// The outline of a mask in its photo.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 pub struct MaskOutline {
-    /// Box, pixels of the photo free of distortion: x0, y0, x1, y1, the latter exclusive.
+    /// Box, pixels of the undistorted photo: x0, y0, x1, y1, the last two exclusive.
     pub box_px: [u32; 4],
-    /// Length along which the photo's edge cuts the mask off, pixels.
+    /// Length of outline on the photo's edge, pixels.
     pub cut_px: u32,
     /// Coarseness, as of [`Mask::level`].
     pub level: u32,
 }
 
 impl MaskOutline {
-    /// Returns the outline of a mask of a photo of `width_px` x `height_px`. `valid`: pixels that show something, `None`
-    /// where all do.
+    /// Returns the outline of a mask of a photo of `width_px` x `height_px`. `valid`: the pixels that undistortion filled;
+    /// `None` if all.
     pub fn of(mask: &Mask, width_px: u32, height_px: u32, valid: Option<&[bool]>) -> Self {
         let BoxPx { x0, y0, x1, y1 } = mask.box_px;
         let is_there = |x: u32, y: u32| {
             x < width_px && y < height_px && valid.is_none_or(|valid| valid[(y * width_px + x) as usize])
         };
-        // Beyond 0 is a number larger than any photo's width.
+        // One less than 0 wraps to more than any photo's width.
         let n_cut = |x: u32, y: u32| {
             let beside = [(x.wrapping_sub(1), y), (x + 1, y), (x, y.wrapping_sub(1)), (x, y + 1)];
             beside.into_iter().filter(|(x, y)| !is_there(*x, *y)).count()
@@ -55,18 +53,12 @@ impl MaskOutline {
         Self { box_px: [x0, y0, x1, y1], cut_px, level: mask.level.into() }
     }
 
-    /// Returns the part of the outline that is the thing's own, 0 to 1: what the photo's edge does not cut off, of the
-    /// box's outline, which is no longer for being ragged.
-    pub fn wholeness(&self) -> f32 {
+    /// Returns 1 - truncation, 0 to 1: the share of the outline that the photo's edge does not cut off. The box's
+    /// perimeter stands for the outline's length, because a ragged outline is no longer for it.
+    pub fn uncut_share(&self) -> f32 {
         let [x0, y0, x1, y1] = self.box_px.map(f64::from);
         (1.0 - f64::from(self.cut_px) / (2.0 * (x1 - x0 + y1 - y0))).max(0.0) as f32
     }
-}
-
-/// Returns what each mask of some photos counts: its wholeness to a power.
-pub fn mask_weights(photos: &[Photo], power: f32) -> Vec<f32> {
-    let weight = |outline: &MaskOutline| outline.wholeness().max(LEAST_MASK_WEIGHT).powf(power);
-    photos.iter().flat_map(|photo| &photo.outlines).map(weight).collect()
 }
 
 /// Writes the outlines of a view's masks durably.
@@ -102,7 +94,7 @@ pub fn read_outlines(path: &Path, n_masks: usize) -> Result<Vec<MaskOutline>, Co
 mod tests {
     use super::*;
 
-    /// A mask of a box, without the pixels that `hole` names.
+    /// A mask that fills a box except for a hole.
     fn mask(box_px: [u32; 4], hole: impl Fn(u32, u32) -> bool) -> Mask {
         let [x0, y0, x1, y1] = box_px;
         let inside: Vec<bool> =
@@ -111,22 +103,22 @@ mod tests {
         Mask { box_px: BoxPx { x0, y0, x1, y1 }, inside, area_px, level: 2 }
     }
 
-    /// By hand: what lies along the photo's edge, and along what undistorting left empty.
+    /// Computed by hand: outlines on the photo's edge, and along pixels that undistortion left empty.
     #[test]
     fn the_photos_edge_cuts_off_what_touches_it() {
         let of = |mask: &Mask, valid| MaskOutline::of(mask, 20, 10, valid);
         let inner = of(&mask([3, 2, 9, 8], |_, _| false), None);
         assert_eq!(inner, MaskOutline { box_px: [3, 2, 9, 8], cut_px: 0, level: 2 });
-        assert_eq!(inner.wholeness(), 1.0);
+        assert_eq!(inner.uncut_share(), 1.0);
         // 4 of the left, 5 of the lower edge.
         let corner = of(&mask([0, 6, 5, 10], |_, _| false), None);
-        assert_eq!((corner.cut_px, corner.wholeness()), (9, 0.5));
+        assert_eq!((corner.cut_px, corner.uncut_share()), (9, 0.5));
         // It touches the right edge with two pixels of its five rows.
         let tip = of(&mask([14, 2, 20, 7], |x, y| x == 19 && !(3..5).contains(&y)), None);
-        assert_eq!((tip.cut_px, tip.wholeness()), (2, 10.0_f32 / 11.0));
+        assert_eq!((tip.cut_px, tip.uncut_share()), (2, 10.0_f32 / 11.0));
         let whole_photo = of(&mask([0, 0, 20, 10], |_, _| false), None);
-        assert_eq!((whole_photo.cut_px, whole_photo.wholeness()), (60, 0.0));
-        // Columns 0 to 2 show nothing: the mask beside them is cut along its 6 rows.
+        assert_eq!((whole_photo.cut_px, whole_photo.uncut_share()), (60, 0.0));
+        // Columns 0 to 2 are empty: the mask beside them is cut along its 6 rows.
         let valid: Vec<bool> = (0..200).map(|at| at % 20 > 2).collect();
         assert_eq!(of(&mask([3, 2, 9, 8], |_, _| false), Some(&valid)).cut_px, 6);
         assert_eq!(of(&mask([4, 2, 9, 8], |_, _| false), Some(&valid)).cut_px, 0);

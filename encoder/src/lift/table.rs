@@ -14,6 +14,8 @@ use rayon::prelude::*;
 use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
 use slag_math::matrix::Rows;
 
+use super::starts;
+
 const MAGIC: [u8; 8] = *b"SLAGREGN";
 const VERSION: u32 = 2;
 
@@ -231,7 +233,7 @@ impl RegionTable {
             },
         };
         let consistent = dim > 0
-            && super::are_starts(&table.starts, n_listed)
+            && starts::are_valid(&table.starts, n_listed)
             && table.masks.iter().all(|mask| (*mask as usize) < n_masks)
             && table.shares.iter().all(|share| share.is_finite() && *share >= 0.0);
         if consistent {

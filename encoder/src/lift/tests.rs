@@ -51,14 +51,9 @@ pub(super) fn scene_of(dim: usize, n_gaussians: u32, n_views: u64) -> Scene {
     open(&(0..n_views).map(view).collect::<Vec<_>>(), dim, &[n_gaussians as usize], u64::MAX)
 }
 
-/// Reads and transposes a scene, as much at a time as a budget allows.
+/// Reads and transposes a scene within a budget.
 fn transpose(scene: &Scene, budget_bytes: u64) -> Vec<PartContributions> {
-    let groups = scene.index.groups(budget_bytes);
-    let read = |group| scene.index.read(group).expect("reads");
-    groups
-        .into_iter()
-        .flat_map(|g| scene.index.transpose(&read(g), &scene.table).expect("transposes"))
-        .collect()
+    scene.index.transposed_parts(&scene.table, budget_bytes).collect::<Result<_, _>>().expect("transposes")
 }
 
 /// The paper's equation in float64, mask by mask: no regions, no sparse rows.
@@ -264,6 +259,31 @@ fn parts_of_a_cell_make_the_cell() {
     let mut joined = field(parts.next().expect("a part"));
     parts.for_each(|contributions| joined.append(field(contributions)));
     assert_eq!(joined, field(transpose(&whole, 0).remove(0)));
+}
+
+/// Where the budget holds all parts, only the first pass reads the files; total weights follow the table all the same.
+#[test]
+fn parts_that_fit_the_budget_are_read_once() {
+    let scene = scene_of(5, 10_000, 4);
+    let (index, mut table) = ContributionIndex::open_with(&scene.paths, 5, &[10_000], 9000).expect("opens");
+    assert!(index.parts().len() > 1);
+    let pass = |table: &RegionTable, budget_bytes| -> Result<Vec<PartContributions>, ContributionError> {
+        index.transposed_parts(table, budget_bytes).collect()
+    };
+    let before = pass(&table, 0).expect("reads");
+    let stopped = index.transposed_parts(&table, u64::MAX).take(1).count();
+    assert_eq!((stopped, index.kept.get()), (1, None), "a pass that stopped early keeps nothing");
+    assert_eq!(pass(&table, u64::MAX).expect("reads"), before);
+    let weights: Vec<f32> = (0..table.n_masks()).map(|mask| 0.3 + mask as f32 / 7.0).collect();
+    table.set_mask_weights(&weights);
+    let (read_again, _) = ContributionIndex::open_with(&scene.paths, 5, &[10_000], 9000).expect("opens");
+    let expected: Vec<PartContributions> =
+        read_again.transposed_parts(&table, 0).collect::<Result<_, _>>().expect("reads");
+    assert_ne!(expected[0].total_weights, before[0].total_weights);
+    scene.paths.iter().for_each(|path| fs_err::remove_file(path).expect("removes"));
+    assert_eq!(pass(&table, u64::MAX).expect("kept"), expected);
+    let mut unkept = read_again.transposed_parts(&table, u64::MAX);
+    assert!(matches!(unkept.next(), Some(Err(ContributionError::Io(_)))) && unkept.next().is_none());
 }
 
 /// Files of another scene or model, and contributions that do not fit them, are refused with the file's name.

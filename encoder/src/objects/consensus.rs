@@ -17,7 +17,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use rayon::prelude::*;
 
-use super::NONE;
+use super::object::NONE;
 
 /// A view sees enough of a mask to judge it (3 in 10, as MaskClustering), in tenths.
 const OBSERVED_TENTHS: usize = 3;

@@ -3,7 +3,8 @@
 use rayon::prelude::*;
 
 use super::consensus::MaskClusters;
-use super::{NONE, Scene};
+use super::object::NONE;
+use super::scene::Scene;
 use crate::lift::{ContributionError, PartContributions, RegionTable};
 
 /// An object has a Gaussian if its masks have this share of the Gaussian's weight: most views say so.
@@ -69,25 +70,23 @@ impl Members {
             mask_weights: vec![0.0; n_masks],
             own_weights: vec![0.0; n_masks],
         };
-        for group in scene.index.groups(scene.group_bytes) {
+        for contributions in scene.index.transposed_parts(scene.table, scene.group_bytes) {
             if scene.is_cancelled() {
                 return Ok(None);
             }
-            let raw = scene.index.read(group)?;
-            for contributions in scene.index.transpose(&raw, scene.table)? {
-                let found: Vec<u32> = (0..contributions.part.locals.len())
-                    .into_par_iter()
-                    .map_init(
-                        || (vec![0.0f32; clusters.consensus.len()], Vec::new()),
-                        |(weights, touched), k| {
-                            best_cluster(&contributions, k, &of_region, clusters, weights, touched)
-                        },
-                    )
-                    .collect();
-                members.add_weights(&contributions, &found, scene.table, clusters);
-                let of_cell = &mut members.object_of[contributions.part.cell_id as usize];
-                of_cell[contributions.part.locals.clone()].copy_from_slice(&found);
-            }
+            let contributions = contributions?;
+            let found: Vec<u32> = (0..contributions.part.locals.len())
+                .into_par_iter()
+                .map_init(
+                    || (vec![0.0f32; clusters.consensus.len()], Vec::new()),
+                    |(weights, touched), k| {
+                        best_cluster(&contributions, k, &of_region, clusters, weights, touched)
+                    },
+                )
+                .collect();
+            members.add_weights(&contributions, &found, scene.table, clusters);
+            let of_cell = &mut members.object_of[contributions.part.cell_id as usize];
+            of_cell[contributions.part.locals.clone()].copy_from_slice(&found);
         }
         Ok(Some(members))
     }
@@ -131,12 +130,12 @@ impl Members {
         self.masks.retain(|_| number.next().is_some_and(|number| *number != NONE));
     }
 
-    /// Returns the mask that shows most of an object, little else, and whole: the weight of the object's Gaussians,
-    /// times their share of the mask's, times the mask's wholeness.
-    pub fn best_mask(&self, masks: &[u32], wholeness: &[f32]) -> u32 {
+    /// Returns the mask that shows an object best: the one with the largest product of the weight of the object's
+    /// Gaussians, their share of the mask's weight, and 1 - truncation.
+    pub fn best_mask(&self, masks: &[u32], uncut_shares: &[f32]) -> u32 {
         let merit = |mask: u32| {
             let (own, all) = (self.own_weights[mask as usize], self.mask_weights[mask as usize]);
-            if all > 0.0 { own * own / all * f64::from(wholeness[mask as usize]) } else { 0.0 }
+            if all > 0.0 { own * own / all * f64::from(uncut_shares[mask as usize]) } else { 0.0 }
         };
         let better = |a: u32, b: u32| if merit(b) > merit(a) { b } else { a };
         masks.iter().copied().reduce(better).unwrap_or(NONE)

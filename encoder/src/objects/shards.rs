@@ -1,4 +1,4 @@
-//! The objects of a cell, as its shards carry them.
+//! The objects of a cell, as its shards store them.
 
 use half::f16;
 use slag_common::objects::{
@@ -6,23 +6,23 @@ use slag_common::objects::{
 };
 use slag_common::shard::Basis;
 
+use super::object::{NONE, SceneObjects};
 use super::vectors::MAX_MEDOIDS;
-use super::{NONE, SceneObjects};
 
 /// Vectors of an object: the mean of its masks' and the medoids.
 const N_VECTORS: usize = 1 + MAX_MEDOIDS;
 
-/// What the components of a cell's rows mean, and how vectors become such.
-pub struct RowFrame<'a> {
+/// The basis of a shard's centroids, and the projection of vectors onto it.
+pub struct CentroidBasis<'a> {
     dim: usize,
-    /// Mean and `[m][dim]`; absent: components are the vector's own.
+    /// Mean, and `[m][dim]`; `None`: a vector's components are its own.
     basis: Option<(&'a [f16], Vec<f64>)>,
     /// `[m][m]`: lower triangle of the Cholesky factor of the basis vectors' products.
     factor: Vec<f64>,
 }
 
-impl<'a> RowFrame<'a> {
-    /// Prepares the basis of a shard's rows.
+impl<'a> CentroidBasis<'a> {
+    /// Prepares the basis of a shard's centroids.
     pub fn new(dim: usize, basis: Option<Basis<'a>>) -> Self {
         let basis = basis.map(|basis| {
             let of_vector = |(v, step): (&[i8], &f32)| {
@@ -34,10 +34,10 @@ impl<'a> RowFrame<'a> {
                 basis.vectors.chunks_exact(dim).zip(basis.steps).flat_map(of_vector).collect::<Vec<f64>>(),
             )
         });
-        let mut frame = Self { dim, basis, factor: Vec::new() };
-        let Some((_, vectors)) = &frame.basis else { return frame };
+        let mut prepared = Self { dim, basis, factor: Vec::new() };
+        let Some((_, vectors)) = &prepared.basis else { return prepared };
         // Row by row (Golub and Van Loan, 4.2). A vector that the others make up gets no component.
-        let m = frame.m();
+        let m = prepared.m();
         let row = |i: usize| &vectors[i * dim..][..dim];
         let mut factor = vec![0.0; m * m];
         for i in 0..m {
@@ -63,8 +63,8 @@ impl<'a> RowFrame<'a> {
                 };
             }
         }
-        frame.factor = factor;
-        frame
+        prepared.factor = factor;
+        prepared
     }
 
     /// Returns the number of components.
@@ -72,7 +72,7 @@ impl<'a> RowFrame<'a> {
         self.basis.as_ref().map_or(self.dim, |(_, vectors)| vectors.len() / self.dim)
     }
 
-    /// Returns the components (`[n][m]`) of the nearest vectors that the basis can make, by least squares.
+    /// Returns the components (`[n][m]`) of the nearest vectors in the span of the basis, by least squares.
     pub fn components(&self, vectors: &[f32]) -> Vec<f32> {
         let Some((mean, basis)) = &self.basis else { return vectors.to_vec() };
         let m = self.m();
@@ -97,7 +97,7 @@ impl<'a> RowFrame<'a> {
         vectors.chunks_exact(self.dim).flat_map(solve).collect()
     }
 
-    /// Returns the largest distance of vectors (`[n][dim]`) from what their rounded components make.
+    /// Returns the largest distance between vectors (`[n][dim]`) and those that their rounded components decode to.
     fn largest_error(&self, vectors: &[f32], components: &[i8], steps: &[f32]) -> f32 {
         let m = self.m();
         let of_vector = |((vector, components), step): ((&[f32], &[i8]), &f32)| {
@@ -131,12 +131,12 @@ pub struct CellObjects {
 }
 
 impl CellObjects {
-    /// Collects the objects of a cell. `locals`: its Gaussians in the order of the shard; `frame`: of its rows.
-    pub fn new(scene: &SceneObjects, cell_id: u32, locals: &[u32], frame: &RowFrame<'_>) -> Self {
+    /// Collects the objects of a cell. `locals`: its Gaussians in the order of the shard; `basis`: of its centroids.
+    pub fn new(scene: &SceneObjects, cell_id: u32, locals: &[u32], basis: &CentroidBasis<'_>) -> Self {
         let object_of = &scene.object_of[cell_id as usize];
         let mut n_here = vec![0u32; scene.objects.len()];
         object_of.iter().filter(|object| **object != NONE).for_each(|object| n_here[*object as usize] += 1);
-        // A cell has 65,536 Gaussians at most, so that hardly ever one is left over.
+        // A cell has at most 65,536 Gaussians: objects beyond the limit are all but impossible.
         let here: Vec<usize> =
             (0..n_here.len()).filter(|object| n_here[*object] > 0).take(usize::from(NO_OBJECT) - 1).collect();
         let mut cell = Self {
@@ -162,7 +162,7 @@ impl CellObjects {
             let n_here = n_here[object];
             let object = &scene.objects[object];
             let name = plain(&object.photo);
-            // Many objects are seen best in the same photo.
+            // Many objects share the photo that shows them best.
             let photo_start = cell.photos.find(&name).unwrap_or_else(|| {
                 cell.photos.push_str(&name);
                 cell.photos.len() - name.len()
@@ -179,8 +179,8 @@ impl CellObjects {
                 photo_bytes: name.len() as u32,
             });
             let (components, steps) =
-                quantise_vectors(&frame.components(&object.vectors), frame.m(), N_VECTORS);
-            let error = frame.largest_error(&object.vectors, &components, &steps);
+                quantise_vectors(&basis.components(&object.vectors), basis.m(), N_VECTORS);
+            let error = basis.largest_error(&object.vectors, &components, &steps);
             cell.header.score_error_bound = cell.header.score_error_bound.max(error);
             cell.vectors.extend(components);
             cell.steps.extend(steps);
@@ -209,7 +209,7 @@ impl CellObjects {
     }
 }
 
-/// Returns a name that terminals and readers take: no control characters, not too long.
+/// Returns a name without control characters, cut to the length that readers accept.
 fn plain(name: &str) -> String {
     let mut plain: String =
         name.chars().map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c }).collect();

@@ -2,8 +2,8 @@
 
 use rayon::prelude::*;
 
-use super::Scene;
 use super::consensus::Sightings;
+use super::scene::Scene;
 use crate::lift::ContributionError;
 
 /// Gaussians looked at, about: consensus takes time as their number, and masks of [`super::consensus`] need a few each.
@@ -29,33 +29,30 @@ pub fn working_bytes(n_gaussians: usize, n_views: usize) -> u64 {
 /// [`ContributionError`].
 pub fn gather(scene: &Scene<'_>, step: usize) -> Result<Option<Sightings>, ContributionError> {
     let Scene { index, table, group_bytes, .. } = *scene;
-    let view_of_region = super::repeat_each(index.n_regions_of_view());
+    let view_of_region = scene.view_of_region();
     let mut all = Sightings { starts: vec![0], views: Vec::new(), regions: Vec::new() };
-    for group in index.groups(group_bytes) {
+    for contributions in index.transposed_parts(table, group_bytes) {
         if scene.is_cancelled() {
             return Ok(None);
         }
-        let raw = index.read(group)?;
-        for contributions in index.transpose(&raw, table)? {
-            let sampled: Vec<usize> =
-                contributions.part.locals.clone().filter(|local| local % step == 0).collect();
-            let sighted: Vec<Vec<(u32, u32)>> = sampled
-                .par_iter()
-                .map(|local| {
-                    let k = local - contributions.part.locals.start;
-                    let entries = contributions.starts[k] as usize..contributions.starts[k + 1] as usize;
-                    of_gaussian(
-                        &contributions.regions[entries.clone()],
-                        &contributions.weights[entries],
-                        &view_of_region,
-                    )
-                })
-                .collect();
-            for of_gaussian in sighted {
-                all.views.extend(of_gaussian.iter().map(|(view, _)| view));
-                all.regions.extend(of_gaussian.iter().map(|(_, region)| region));
-                all.starts.push(all.views.len());
-            }
+        let contributions = contributions?;
+        let locals = &contributions.part.locals;
+        let sampled: Vec<usize> = locals.clone().filter(|local| local % step == 0).collect();
+        let sighted: Vec<Vec<(u32, u32)>> = sampled
+            .par_iter()
+            .map(|local| {
+                let entries = contributions.entries_of(local - locals.start);
+                of_gaussian(
+                    &contributions.regions[entries.clone()],
+                    &contributions.weights[entries],
+                    &view_of_region,
+                )
+            })
+            .collect();
+        for of_gaussian in sighted {
+            all.views.extend(of_gaussian.iter().map(|(view, _)| view));
+            all.regions.extend(of_gaussian.iter().map(|(_, region)| region));
+            all.starts.push(all.views.len());
         }
     }
     Ok(Some(all))

@@ -1,15 +1,19 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
+use std::sync::atomic::AtomicBool;
 
+use glam::DVec3;
+use slag_common::Gaussians;
 use slag_common::objects::object_score;
 use slag_common::shard::Basis;
 use slag_math::random::Random;
 
-use super::consensus::{MaskClusters, Sightings, cluster_masks};
-use super::shards::{CellObjects, RowFrame};
+use super::consensus::{MaskClusters, Masks, Sightings, cluster_masks};
+use super::shards::{CellObjects, CentroidBasis};
 use super::*;
-use crate::cells::{CellLimits, split};
-use crate::codebook::{ScoreMetric, TextBank};
-use crate::lift::{Contribution, ViewContributions};
+use crate::cells::{CellLimits, CellSplit, split};
+use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
+use crate::lift::photos::{MaskOutline, Photo};
+use crate::lift::{Contribution, ContributionIndex, RegionTable, ViewContributions};
 
 /// What views show: of each view, the masks of each Gaussian that it sees; masks numbered within the view.
 type Shown = Vec<BTreeMap<u32, BTreeSet<u32>>>;
@@ -379,7 +383,7 @@ fn shards_carry_the_objects_of_their_cell() {
     for (cell_id, of_cell) in found.object_of.iter().enumerate() {
         let mut locals: Vec<u32> = (0..of_cell.len() as u32).collect();
         locals.sort_by_key(|local| local.wrapping_mul(0x9e37_79b9));
-        let cell = CellObjects::new(&found, cell_id as u32, &locals, &RowFrame::new(DIM, None));
+        let cell = CellObjects::new(&found, cell_id as u32, &locals, &CentroidBasis::new(DIM, None));
         let objects = cell.view();
         let mut n = 0;
         for (run, object) in objects.runs() {
@@ -414,8 +418,8 @@ fn vectors_are_kept_in_the_basis_of_rows() {
     let mean: Vec<half::f16> =
         small(dim).iter().map(|v| half::f16::from_f32(f32::from(*v) / 256.0)).collect();
     let steps = [0.01, 0.02, 0.005, 0.01, 0.01];
-    let frame = RowFrame::new(dim, Some(Basis { mean: &mean, vectors: &vectors, steps: &steps }));
-    assert_eq!(frame.m(), m);
+    let basis = CentroidBasis::new(dim, Some(Basis { mean: &mean, vectors: &vectors, steps: &steps }));
+    assert_eq!(basis.m(), m);
     let row = |c: usize| vectors[c * dim..][..dim].iter().map(move |v| f64::from(*v) * f64::from(steps[c]));
     let make = |components: &[f64]| -> Vec<f64> {
         let mut made: Vec<f64> = mean.iter().map(|mean| mean.to_f64()).collect();
@@ -425,12 +429,12 @@ fn vectors_are_kept_in_the_basis_of_rows() {
         made
     };
     let within: Vec<f32> = make(&[0.3, -0.2, 0.5, 0.1, 0.0]).into_iter().map(|v| v as f32).collect();
-    let found = frame.components(&within);
+    let found = basis.components(&within);
     for (found, expected) in found.iter().zip([0.3, -0.2, 0.5, 0.1, 0.0]) {
         assert!((found - expected).abs() < 1e-4, "{found:?}");
     }
     let outside: Vec<f32> = (0..dim).map(|_| random.below(1000) as f32 / 1000.0).collect();
-    let components: Vec<f64> = frame.components(&outside).into_iter().map(f64::from).collect();
+    let components: Vec<f64> = basis.components(&outside).into_iter().map(f64::from).collect();
     let made = make(&components);
     for c in 0..m {
         let product: f64 =

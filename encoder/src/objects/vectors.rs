@@ -3,7 +3,7 @@
 use slag_common::manifest::Calibration;
 use slag_common::objects::object_score;
 
-use super::Object;
+use super::object::Object;
 use crate::codebook::ScoreMetricContext;
 use crate::lift::RegionTable;
 use slag_math::dot;

@@ -14,7 +14,7 @@ use crate::cells::Cell;
 use crate::codebook::measure::ScoreMoments;
 use crate::codebook::{self, CodebookSettings, ScoreMetricContext};
 use crate::objects::SceneObjects;
-use crate::objects::shards::{CellObjects, RowFrame};
+use crate::objects::shards::{CellObjects, CentroidBasis};
 use positions::{PositionError, QuantisedPositions};
 use slag_math::matrix::Rows;
 
@@ -141,7 +141,7 @@ pub fn build(
         ..compact
     });
     let objects = objects
-        .map(|objects| CellObjects::new(objects, cell_id, &locals, &RowFrame::new(dim, compact.basis)));
+        .map(|objects| CellObjects::new(objects, cell_id, &locals, &CentroidBasis::new(dim, compact.basis)));
     let objects = objects.as_ref().map(CellObjects::view);
     let largest = |radii: &[f32]| radii.iter().copied().fold(0.0, f32::max);
     let spread = codebook.errors.spread;

@@ -10,6 +10,7 @@ use crate::cells::Cell;
 use crate::lift::photos::MaskOutline;
 use crate::lift::tests::{Scene, open};
 use crate::lift::{CellField, Contribution, ViewContributions};
+use slag_math::dot;
 
 const DIM: usize = 12;
 const N: usize = 90;
@@ -140,7 +141,7 @@ fn pruned(rows: Vec<Vec<(usize, f64)>>, settings: &Aggregation) -> Vec<Vec<(usiz
 }
 
 /// Views' weights to the power of 1 less the equalisation, and the same weight in all.
-fn evened(rows: Vec<Vec<(usize, f64)>>, equalisation: f64) -> Vec<Vec<(usize, f64)>> {
+fn equalised(rows: Vec<Vec<(usize, f64)>>, equalisation: f64) -> Vec<Vec<(usize, f64)>> {
     let weights: Vec<f64> = rows.iter().map(|view| view.iter().map(|e| e.1).sum()).collect();
     let total: f64 = weights.iter().sum();
     let even: f64 = weights.iter().filter(|w| **w > 0.0).map(|w| w.powf(1.0 - equalisation)).sum();
@@ -170,7 +171,7 @@ fn norm(v: &[f64]) -> f64 {
 /// What masks count, by the definition, with everything in float64 and no axes.
 fn oracle_counts(views: &[ViewContributions], settings: &Aggregation) -> Vec<Vec<f64>> {
     let whole = |v: usize, mask: usize| {
-        (1.0 - ((v * 6 + mask) % 41) as f64 / 40.0).max(0.01).powf(settings.wholeness.into())
+        (1.0 - ((v * 6 + mask) % 41) as f64 / 40.0).max(0.01).powf(settings.truncation_power.into())
     };
     let whole: Vec<Vec<f64>> =
         (0..views.len()).map(|v| (0..6).map(|mask| whole(v, mask)).collect()).collect();
@@ -250,10 +251,10 @@ fn what_masks_and_views_count_is_that_of_the_definition() {
         (0.0, (0.0, 0.0), 0.0, 0.5),
         (0.5, (0.0, 0.3), 2.0, 1.0),
     ];
-    for (agreement, shares, wholeness, equalisation) in cases {
+    for (agreement, shares, truncation_power, equalisation) in cases {
         let settings = Aggregation {
             agreement,
-            wholeness,
+            truncation_power,
             equalisation,
             min_region_share: shares.0,
             min_view_share: shares.1,
@@ -262,7 +263,7 @@ fn what_masks_and_views_count_is_that_of_the_definition() {
         let Lifted { field, table, embeddings } = lifted(settings, u64::MAX);
         let counts = oracle_counts(&views, &settings);
         for k in (0..N).filter(|k| !UNSEEN.contains(k)) {
-            let rows = evened(pruned(row(&views, k), &settings), equalisation.into());
+            let rows = equalised(pruned(row(&views, k), &settings), equalisation.into());
             let mut expected = vec![0.0; DIM];
             for ((view, entries), counts) in views.iter().zip(&rows).zip(&counts) {
                 let part = contribution(view, entries, counts);

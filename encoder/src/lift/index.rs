@@ -1,0 +1,244 @@
+//! The contribution files of all views, in the order of the views' names, and the parts that their entries form.
+//!
+//! Each view's file is ordered by cell and slice, so that any range of cells is one range of each file.
+
+use std::ops::Range;
+use std::path::PathBuf;
+use std::sync::OnceLock;
+
+use rayon::prelude::*;
+use slag_common::container::ContainerError;
+
+use super::contributions::{ContributionError, ContributionFile, GAUSSIANS_PER_SLICE, PackedEntry, Run};
+use super::part::{Part, PartContributions};
+use super::table::RegionTable;
+
+/// Most entries of a part. A constant, not a share of the budget: parts are published, and a store must not depend on
+/// the memory of the machine that made it.
+const PART_ENTRIES: u64 = 1 << 22;
+/// Most entries of a group, even where the budget allows more: a larger group leaves the processor's caches.
+const GROUP_ENTRIES: u64 = 1 << 22;
+/// Bytes of a transposed entry: region and weight.
+const BYTES_PER_TRANSPOSED_ENTRY: u64 = size_of::<(u32, f32)>() as u64;
+/// Bytes of an entry while it is transposed: as read, and transposed.
+const BYTES_PER_ENTRY: u64 = size_of::<PackedEntry>() as u64 + BYTES_PER_TRANSPOSED_ENTRY;
+/// Bytes of a Gaussian: start, total weight, mean length, index.
+const BYTES_PER_GAUSSIAN: u64 = (size_of::<u64>() + 3 * size_of::<f32>()) as u64;
+
+/// A view's file, and the place of its regions and runs in the whole scene.
+pub(super) struct IndexedView {
+    pub(super) file: ContributionFile,
+    /// Slice of each run, ascending.
+    pub(super) slices: Vec<u32>,
+    pub(super) first_region: u32,
+    n_masks: usize,
+}
+
+/// The files of all views, in the order of the views' names.
+pub struct ContributionIndex {
+    pub(super) views: Vec<IndexedView>,
+    pub(super) parts: Vec<Part>,
+    /// The Gaussians of each slice, by their index within its cell.
+    pub(super) locals_of_slice: Vec<Range<usize>>,
+    n_views_without_masks: usize,
+    /// The transposed parts, once a pass has read them and the budget holds them.
+    pub(super) kept: OnceLock<Vec<PartContributions>>,
+}
+
+/// The entries of a group of parts, in the order of the files.
+pub struct RawGroup {
+    pub(super) parts: Range<usize>,
+    /// Of each view: its runs, and their entries.
+    pub(super) views: Vec<(Range<usize>, Vec<PackedEntry>)>,
+}
+
+impl ContributionIndex {
+    /// Opens the files of all views, in the order of the views' names, and collects their regions. `n_gaussians_of_cell`:
+    /// number of Gaussians of each cell of the scene.
+    ///
+    /// # Errors
+    /// [`ContributionError`].
+    pub fn open(
+        paths: &[PathBuf],
+        dim: usize,
+        n_gaussians_of_cell: &[usize],
+    ) -> Result<(Self, RegionTable), ContributionError> {
+        Self::open_with(paths, dim, n_gaussians_of_cell, PART_ENTRIES)
+    }
+
+    pub(super) fn open_with(
+        paths: &[PathBuf],
+        dim: usize,
+        n_gaussians_of_cell: &[usize],
+        part_entries: u64,
+    ) -> Result<(Self, RegionTable), ContributionError> {
+        let mut first_slice_of_cell = vec![0];
+        let mut locals_of_slice = Vec::new();
+        for n in n_gaussians_of_cell {
+            let starts = (0..*n).step_by(GAUSSIANS_PER_SLICE);
+            locals_of_slice.extend(starts.map(|start| start..(start + GAUSSIANS_PER_SLICE).min(*n)));
+            first_slice_of_cell.push(locals_of_slice.len());
+        }
+        let mut table = RegionTable::new(dim);
+        let mut n_views_without_masks = 0;
+        let mut views = Vec::with_capacity(paths.len());
+        let mut entries_of_slice = vec![0u64; locals_of_slice.len()];
+        for path in paths {
+            let (file, regions) = ContributionFile::open(path)?;
+            let slices = file.runs().iter().map(|run| {
+                let of_cell = first_slice_of_cell.get(run.cell_id as usize..=run.cell_id as usize + 1)?;
+                let slice = of_cell[0] + run.slice as usize;
+                (slice < of_cell[1]).then_some(slice as u32)
+            });
+            let Some(slices) = slices.collect::<Option<Vec<u32>>>().filter(|_| regions.dim == dim) else {
+                let what = "the contributions belong to another scene or model".into();
+                let source = ContainerError::Damaged { offset_bytes: 0, what };
+                return Err(ContributionError::Damaged { path: path.clone(), source });
+            };
+            for (run, slice) in slices.iter().enumerate() {
+                let range = file.entries_of_run(run);
+                entries_of_slice[*slice as usize] += range.end - range.start;
+            }
+            n_views_without_masks += usize::from(regions.mask_vectors.is_empty());
+            let first_region = table.append(&regions.mask_vectors, regions.masks_of_region());
+            let n_masks = regions.mask_vectors.len() / dim;
+            views.push(IndexedView { file, slices, first_region, n_masks });
+        }
+        let parts = first_slice_of_cell
+            .windows(2)
+            .enumerate()
+            .flat_map(|(cell, w)| {
+                cut_into_parts(cell as u32, w[0]..w[1], &entries_of_slice, &locals_of_slice, part_entries)
+            })
+            .collect();
+        let kept = OnceLock::new();
+        Ok((Self { views, parts, locals_of_slice, n_views_without_masks, kept }, table))
+    }
+
+    /// Returns the parts, ascending by cell and within it.
+    pub fn parts(&self) -> &[Part] {
+        &self.parts
+    }
+
+    /// Returns the number of entries of all views.
+    pub fn n_entries(&self) -> u64 {
+        self.parts.iter().map(|part| part.n_entries).sum()
+    }
+
+    /// Returns the first region of each view, in the order of their names.
+    pub fn first_regions(&self) -> Vec<u32> {
+        self.views.iter().map(|view| view.first_region).collect()
+    }
+
+    /// Returns the number of views without any mask.
+    pub fn n_views_without_masks(&self) -> usize {
+        self.n_views_without_masks
+    }
+
+    /// Returns the number of masks of each view.
+    pub fn n_masks_of_view(&self) -> impl Iterator<Item = usize> + '_ {
+        self.views.iter().map(|view| view.n_masks)
+    }
+
+    /// Returns the number of regions of each view.
+    pub fn n_regions_of_view(&self) -> impl Iterator<Item = usize> + '_ {
+        self.views.iter().map(|view| view.file.n_regions())
+    }
+
+    /// Returns the number of entries of each view.
+    pub fn n_entries_of_view(&self) -> impl Iterator<Item = u64> + '_ {
+        self.views.iter().map(|view| view.file.n_entries())
+    }
+
+    /// Returns the bytes that the index takes in memory.
+    pub fn len_bytes(&self) -> u64 {
+        let per_run = size_of::<Run>() + size_of::<u32>();
+        let n_runs: usize = self.views.iter().map(|view| view.slices.len()).sum();
+        (n_runs * per_run + self.parts.len() * size_of::<Part>() + size_of_val(&*self.locals_of_slice)) as u64
+    }
+
+    /// Returns the bytes that the largest part takes while it is transposed: the smallest budget.
+    pub fn largest_part_bytes(&self) -> u64 {
+        self.parts.iter().map(part_bytes).max().unwrap_or(0)
+    }
+
+    /// Returns the bytes of all parts, transposed.
+    pub(super) fn kept_bytes(&self) -> u64 {
+        let of_part = |part: &Part| {
+            part.n_entries * BYTES_PER_TRANSPOSED_ENTRY + part.locals.len() as u64 * BYTES_PER_GAUSSIAN
+        };
+        self.parts.iter().map(of_part).sum()
+    }
+
+    /// Cuts the parts into groups that take at most `budget_bytes` each, or hold a single part.
+    pub fn groups(&self, budget_bytes: u64) -> Vec<Range<usize>> {
+        let mut groups: Vec<Range<usize>> = Vec::new();
+        let (mut bytes, mut entries) = (0, 0);
+        for (i, part) in self.parts.iter().enumerate() {
+            bytes += part_bytes(part);
+            entries += part.n_entries;
+            match groups.last_mut() {
+                Some(group) if bytes <= budget_bytes && entries <= GROUP_ENTRIES => group.end = i + 1,
+                _ => {
+                    (bytes, entries) = (part_bytes(part), part.n_entries);
+                    groups.push(i..i + 1);
+                }
+            }
+        }
+        groups
+    }
+
+    /// Reads and checks the entries of some parts.
+    ///
+    /// # Errors
+    /// [`ContributionError`].
+    pub fn read(&self, parts: Range<usize>) -> Result<RawGroup, ContributionError> {
+        let slices = self.slices_of(&parts);
+        let read = |view: &IndexedView| {
+            let at = |slice: usize| view.slices.partition_point(|s| (*s as usize) < slice);
+            let runs = at(slices.start)..at(slices.end);
+            Ok((runs.clone(), view.file.read(runs)?))
+        };
+        let views = self.views.par_iter().map(read).collect::<Result<_, ContributionError>>()?;
+        Ok(RawGroup { parts, views })
+    }
+
+    /// Returns the slices of some parts.
+    pub(super) fn slices_of(&self, parts: &Range<usize>) -> Range<usize> {
+        let parts = &self.parts[parts.clone()];
+        match (parts.first(), parts.last()) {
+            (Some(first), Some(last)) => first.slices.start..last.slices.end,
+            _ => 0..0,
+        }
+    }
+}
+
+fn part_bytes(part: &Part) -> u64 {
+    part.n_entries * BYTES_PER_ENTRY + part.locals.len() as u64 * BYTES_PER_GAUSSIAN
+}
+
+/// Cuts a cell's slices into parts of at most `max_entries`, or of a single slice.
+fn cut_into_parts(
+    cell_id: u32,
+    slices: Range<usize>,
+    entries_of_slice: &[u64],
+    locals_of_slice: &[Range<usize>],
+    max_entries: u64,
+) -> Vec<Part> {
+    let mut parts: Vec<Part> = Vec::new();
+    for slice in slices {
+        let (n_entries, locals) = (entries_of_slice[slice], locals_of_slice[slice].clone());
+        match parts.last_mut() {
+            Some(part) if part.n_entries + n_entries <= max_entries => {
+                part.n_entries += n_entries;
+                part.locals.end = locals.end;
+                part.slices.end = slice + 1;
+            }
+            _ => {
+                let number = parts.len() as u32;
+                parts.push(Part { cell_id, number, locals, n_entries, slices: slice..slice + 1 });
+            }
+        }
+    }
+    parts
+}

@@ -1,0 +1,179 @@
+//! Gaussians share evidence within superpoints: each superpoint becomes one more region, a mixture of the masks of its
+//! Gaussians, and its Gaussians get an entry of that region.
+
+use rayon::prelude::*;
+
+use super::points::{AXES, Point, add, length, make_unit, sum_of};
+use crate::lift::embeddings::MIN_MEAN_LENGTH;
+use crate::lift::part::PartContributions;
+use crate::lift::superpoint::{NO_SUPERPOINT, Superpoints};
+use crate::lift::table::RegionTable;
+
+/// Most masks of a mixture, the heaviest first: enough for a hundred views of a few masks each.
+const MAX_MASKS: usize = 256;
+/// Evidence of a filled Gaussian, pixels: almost none.
+const FILLED_WEIGHT_PX: f32 = 1e-3;
+
+/// Writes each Gaussian's direction to `sketches` (`[N][AXES]` of the scene), rounded to 8 bits; zeros where there is no
+/// evidence. `gaussians`: scene indices of the part's Gaussians.
+pub(super) fn sketch(
+    contributions: &PartContributions,
+    gaussians: &[u32],
+    region_points: &[Point],
+    sketches: &mut [i8],
+) {
+    let sketch_of = |k: usize| -> [i8; AXES] {
+        let mut sum = sum_of(contributions, contributions.entries_of(k), region_points);
+        make_unit(&mut sum);
+        sum.map(|c| (127.0 * c).round() as i8)
+    };
+    let of_part: Vec<[i8; AXES]> = (0..gaussians.len()).into_par_iter().map(sketch_of).collect();
+    for (gaussian, sketch) in gaussians.iter().zip(of_part) {
+        sketches[*gaussian as usize * AXES..][..AXES].copy_from_slice(&sketch);
+    }
+}
+
+/// The summed contributions of each superpoint's Gaussians.
+pub(super) struct SuperpointSums {
+    superpoints: Superpoints,
+    /// Of each superpoint: `(region, weight)`, one run a part.
+    regions: Vec<Vec<(u32, f32)>>,
+}
+
+impl SuperpointSums {
+    pub(super) fn new(superpoints: Superpoints) -> Self {
+        let regions = vec![Vec::new(); superpoints.n];
+        Self { superpoints, regions }
+    }
+
+    /// Adds the contributions of a part's Gaussians.
+    pub(super) fn add(&mut self, contributions: &PartContributions, gaussians: &[u32]) {
+        let superpoint_of = |k: u32| self.superpoints.of_gaussian[gaussians[k as usize] as usize];
+        let mut members: Vec<u32> =
+            (0..gaussians.len() as u32).filter(|k| superpoint_of(*k) != NO_SUPERPOINT).collect();
+        members.sort_by_key(|k| superpoint_of(*k));
+        let of_superpoint = |members: &[u32]| -> (usize, Vec<(u32, f32)>) {
+            let mut entries = Vec::new();
+            for k in members {
+                let of_gaussian = contributions.entries_of(*k as usize);
+                let regions = contributions.regions[of_gaussian.clone()].iter().copied();
+                entries.extend(regions.zip(contributions.weights[of_gaussian].iter().copied()));
+            }
+            (superpoint_of(members[0]) as usize, summed_by_key(entries))
+        };
+        let runs: Vec<&[u32]> = members.chunk_by(|a, b| superpoint_of(*a) == superpoint_of(*b)).collect();
+        let of_part: Vec<(usize, Vec<(u32, f32)>)> = runs.into_par_iter().map(of_superpoint).collect();
+        of_part.into_iter().for_each(|(superpoint, entries)| self.regions[superpoint].extend(entries));
+    }
+}
+
+/// Returns the sum of the values of each key, ascending by key.
+fn summed_by_key(mut entries: Vec<(u32, f32)>) -> Vec<(u32, f32)> {
+    // A stable sort: values are added in the order given.
+    entries.sort_by_key(|(key, _)| *key);
+    let sum = |run: &[(u32, f32)]| (run[0].0, run.iter().map(|(_, v)| f64::from(*v)).sum::<f64>() as f32);
+    entries.chunk_by(|a, b| a.0 == b.0).map(sum).collect()
+}
+
+/// The region of a mixture, and the length of its point.
+#[derive(Clone, Copy)]
+struct MixtureRegion {
+    region: u32,
+    length: f32,
+}
+
+/// The entry that a Gaussian gets, and the share of its own entries that remains.
+struct AddedEntry {
+    region: u32,
+    weight: f32,
+    kept: f32,
+}
+
+/// The superpoints of a scene as regions of its table.
+pub(super) struct Mixtures {
+    /// Weight of a mixture, relative to the Gaussian's own entries.
+    weight: f32,
+    /// `[N]`: superpoint of each Gaussian of the scene.
+    of_gaussian: Vec<u32>,
+    /// The region of each superpoint; `None` without evidence.
+    regions: Vec<Option<MixtureRegion>>,
+}
+
+impl Mixtures {
+    /// Appends a region to the table for each superpoint with evidence.
+    pub(super) fn new(
+        weight: f32,
+        sums: SuperpointSums,
+        table: &mut RegionTable,
+        mask_points: &[Point],
+    ) -> Self {
+        let of_table = &*table;
+        let mixture = |entries: Vec<(u32, f32)>| -> Vec<(u32, f32)> {
+            let masks_of = |(region, weight): (u32, f32)| {
+                of_table.masks_of(region as usize).map(move |(mask, share)| (mask, weight * share))
+            };
+            let mut masks = summed_by_key(summed_by_key(entries).into_iter().flat_map(masks_of).collect());
+            masks.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+            masks.truncate(MAX_MASKS);
+            masks.sort_by_key(|(mask, _)| *mask);
+            let total: f32 = masks.iter().map(|(_, share)| share).sum();
+            masks.iter_mut().for_each(|(_, share)| *share /= total);
+            masks
+        };
+        let mixtures: Vec<Vec<(u32, f32)>> = sums.regions.into_par_iter().map(mixture).collect();
+        let mut region = |mixture: &Vec<(u32, f32)>| {
+            let mut sum = [0.0; AXES];
+            mixture.iter().for_each(|(mask, share)| add(&mut sum, *share, &mask_points[*mask as usize]));
+            let length = length(&sum);
+            (length > MIN_MEAN_LENGTH)
+                .then(|| MixtureRegion { region: table.append_mixture(mixture), length })
+        };
+        let regions = mixtures.iter().map(&mut region).collect();
+        Self { weight, of_gaussian: sums.superpoints.of_gaussian, regions }
+    }
+
+    /// Adds an entry of its superpoint to each Gaussian of a part. With `fill`, a Gaussian without evidence takes the
+    /// superpoint's mixture alone.
+    pub(super) fn apply(
+        &self,
+        contributions: &mut PartContributions,
+        gaussians: &[u32],
+        region_points: &[Point],
+        fill: bool,
+    ) {
+        let share = self.weight / (1.0 + self.weight);
+        let entry_of = |k: usize| -> Option<AddedEntry> {
+            let superpoint = self.of_gaussian[gaussians[k] as usize];
+            let MixtureRegion { region, length: of_mixture } = (*self.regions.get(superpoint as usize)?)?;
+            let own = length(&sum_of(contributions, contributions.entries_of(k), region_points));
+            if contributions.total_weights[k] > 0.0 && own > MIN_MEAN_LENGTH * contributions.total_weights[k]
+            {
+                let weight = share * own / of_mixture;
+                (share > 0.0).then_some(AddedEntry { region, weight, kept: 1.0 - share })
+            } else {
+                fill.then_some(AddedEntry { region, weight: FILLED_WEIGHT_PX, kept: 0.0 })
+            }
+        };
+        let added: Vec<Option<AddedEntry>> = (0..gaussians.len()).into_par_iter().map(entry_of).collect();
+        let n_entries = contributions.regions.len() + added.iter().flatten().count();
+        let (mut regions, mut weights) = (Vec::with_capacity(n_entries), Vec::with_capacity(n_entries));
+        let mut start = 0;
+        for (k, added) in added.into_iter().enumerate() {
+            let entries = start..contributions.starts[k + 1] as usize;
+            start = entries.end;
+            let kept = added.as_ref().map_or(1.0, |added| added.kept);
+            if kept > 0.0 {
+                regions.extend(&contributions.regions[entries.clone()]);
+                weights.extend(contributions.weights[entries].iter().map(|weight| weight * kept));
+            } else {
+                contributions.total_weights[k] = FILLED_WEIGHT_PX;
+            }
+            if let Some(AddedEntry { region, weight, .. }) = added {
+                regions.push(region);
+                weights.push(weight);
+            }
+            contributions.starts[k + 1] = regions.len() as u64;
+        }
+        (contributions.regions, contributions.weights) = (regions, weights);
+    }
+}

@@ -1,0 +1,250 @@
+//! Optional refinements of the paper's weighted average. Each can be enabled separately; all are off by default.
+//!
+//! | file | field of [`Aggregation`] | effect |
+//! |---|---|---|
+//! | [`truncation`] | `truncation_power` | masks that the photo's edge cuts off count less |
+//! | [`prune`] | `min_region_share`, `min_view_share` | contributions of a region that a Gaussian only touches, and of a view that hardly shows it, are dropped |
+//! | [`prune`] | `min_weight_px` | a Gaussian that hardly shows anywhere has no evidence |
+//! | [`agreement`] | `agreement` | masks that other views contradict count less |
+//! | [`equalise`] | `equalisation` | views count more evenly, whatever their distance and slant |
+//! | [`median`] | `median_steps` | views that disagree count less: steps towards the geometric median |
+//! | [`mixture`] | `superpoint`, `coarse` | a Gaussian takes a share of its superpoint, then of a larger one |
+//! | [`mixture`] | `fill` | a Gaussian without evidence takes its superpoint's mean |
+//!
+//! The result is again sparse contributions over regions. Weights of masks go into the [`RegionTable`], and a superpoint is
+//! one more region of it: a mixture of masks. So scores, shards and the published field need no special case, and a
+//! Gaussian gets at most two more entries.
+//!
+//! All decisions are made in principal coordinates of the mask vectors ([`points`]) and in one order: the result depends
+//! neither on threads nor on the memory budget.
+
+mod agreement;
+mod equalise;
+mod median;
+mod mixture;
+mod points;
+mod prune;
+mod settings;
+mod truncation;
+mod views;
+
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use slag_common::Gaussians;
+use slag_math::axes::principal_coordinates;
+
+use super::contributions::ContributionError;
+use super::index::ContributionIndex;
+use super::part::PartContributions;
+use super::photos::Photo;
+use super::superpoint::{Graph, Sketches, SuperpointSettings, Superpoints};
+use super::table::RegionTable;
+use crate::cells::CellSplit;
+use agreement::Votes;
+use mixture::{Mixtures, SuperpointSums};
+use points::{AXES, Point};
+pub use settings::Aggregation;
+use views::FirstRegions;
+
+/// The refinements of a scene, ready to be applied part by part.
+pub struct Refinement {
+    settings: Aggregation,
+    first_regions: FirstRegions,
+    /// `[n_regions]`: summed weight of each region's masks.
+    mask_counts: Vec<f32>,
+    /// `[n_regions]`: each region's vector; empty where none is needed.
+    region_points: Vec<Point>,
+    /// Of the finer superpoints, then of the larger ones.
+    mixtures: Vec<Mixtures>,
+}
+
+/// The passes over a scene's contributions that the refinements need.
+struct Passes<'a> {
+    index: &'a ContributionIndex,
+    group_bytes: u64,
+    cancel: &'a AtomicBool,
+}
+
+impl Passes<'_> {
+    /// Calls `visit` with each part; returns false if cancelled.
+    fn visit(
+        &self,
+        table: &RegionTable,
+        mut visit: impl FnMut(PartContributions),
+    ) -> Result<bool, ContributionError> {
+        for contributions in self.index.transposed_parts(table, self.group_bytes) {
+            if self.cancel.load(Ordering::Relaxed) {
+                return Ok(false);
+            }
+            visit(contributions?);
+        }
+        Ok(true)
+    }
+}
+
+impl Refinement {
+    /// Decides the weights of masks and the mixtures of superpoints, in up to three passes over all contributions, and adds
+    /// both to the table. Returns `None` if cancelled, and for the plain average.
+    ///
+    /// # Errors
+    /// [`ContributionError`].
+    pub fn prepare(
+        settings: Aggregation,
+        (index, table): (&ContributionIndex, &mut RegionTable),
+        (scene, split): (&Gaussians, &CellSplit),
+        photos: &[Photo],
+        group_bytes: u64,
+        cancel: &AtomicBool,
+    ) -> Result<Option<Self>, ContributionError> {
+        if settings == Aggregation::PAPER {
+            return Ok(None);
+        }
+        let mask_weights = truncation::mask_weights(photos, settings.truncation_power);
+        if settings.truncation_power > 0.0 {
+            table.set_mask_weights(&mask_weights);
+        }
+        let mut refinement = Self {
+            settings,
+            first_regions: FirstRegions(index.first_regions()),
+            mask_counts: table.mask_counts(0..table.len()),
+            region_points: Vec::new(),
+            mixtures: Vec::new(),
+        };
+        if !settings.needs_points() || table.is_empty() {
+            return Ok(Some(refinement));
+        }
+        let mask_points = principal_coordinates(table.mask_vectors(), AXES);
+        let mask_points: &[Point] = mask_points.as_chunks().0;
+        refinement.region_points = points::of_regions(table, mask_points, 0..table.len());
+        let passes = Passes { index, group_bytes, cancel };
+        let mut goes_on = true;
+        if settings.agreement > 0.0 {
+            goes_on = refinement.weigh_by_agreement(&passes, table, mask_points, mask_weights)?;
+        }
+        if goes_on && settings.needs_superpoints() {
+            goes_on = refinement.make_mixtures(&passes, table, mask_points, (scene, split))?;
+        }
+        Ok(goes_on.then_some(refinement))
+    }
+
+    /// Multiplies the weights of masks by their agreement; returns false if cancelled.
+    fn weigh_by_agreement(
+        &mut self,
+        passes: &Passes<'_>,
+        table: &mut RegionTable,
+        mask_points: &[Point],
+        mut mask_weights: Vec<f32>,
+    ) -> Result<bool, ContributionError> {
+        let mut votes = Votes::new(table.len());
+        let done = passes.visit(table, |mut contributions| {
+            self.prune(&mut contributions);
+            votes.add(&contributions, &self.first_regions, &self.region_points);
+        })?;
+        if done {
+            let agreements = votes.agreements(table, mask_points, self.settings.agreement);
+            mask_weights.iter_mut().zip(agreements).for_each(|(weight, agreement)| *weight *= agreement);
+            table.set_mask_weights(&mask_weights);
+            self.mask_counts = table.mask_counts(0..table.len());
+            self.region_points = points::of_regions(table, mask_points, 0..table.len());
+        }
+        Ok(done)
+    }
+
+    /// Finds superpoints and appends their mixtures to the table; returns false if cancelled.
+    fn make_mixtures(
+        &mut self,
+        passes: &Passes<'_>,
+        table: &mut RegionTable,
+        mask_points: &[Point],
+        (scene, split): (&Gaussians, &CellSplit),
+    ) -> Result<bool, ContributionError> {
+        let mut sketches = vec![0; scene.len() * AXES];
+        let done = passes.visit(table, |mut contributions| {
+            self.refine_own(&mut contributions);
+            mixture::sketch(
+                &contributions,
+                contributions.part.gaussians(split),
+                &self.region_points,
+                &mut sketches,
+            );
+        })?;
+        if !done {
+            return Ok(false);
+        }
+        let sketches = Sketches { width: AXES, values: &sketches };
+        let graph = Graph::new(scene, Some(sketches), &SuperpointSettings::default());
+        let mut scales = Vec::new();
+        if self.settings.superpoint > 0.0 || self.settings.fill {
+            scales.push((self.settings.superpoint, graph.superpoints(&SuperpointSettings::default())));
+        }
+        if self.settings.coarse > 0.0 {
+            scales.push((self.settings.coarse, graph.superpoints(&SuperpointSettings::coarse())));
+        }
+        drop(graph);
+        let mut sums: Vec<(f32, SuperpointSums)> = scales
+            .into_iter()
+            .map(|(weight, superpoints)| (weight, SuperpointSums::new(superpoints)))
+            .collect();
+        let done = passes.visit(table, |mut contributions| {
+            self.refine_own(&mut contributions);
+            let gaussians = contributions.part.gaussians(split);
+            sums.iter_mut().for_each(|(_, sums)| sums.add(&contributions, gaussians));
+        })?;
+        if !done {
+            return Ok(false);
+        }
+        for (weight, sums) in sums {
+            self.mixtures.push(Mixtures::new(weight, sums, table, mask_points));
+        }
+        // The larger superpoints are mixed with rows that hold entries of the finer ones.
+        let of_mixtures = points::of_regions(table, mask_points, self.region_points.len()..table.len());
+        self.region_points.extend(of_mixtures);
+        Ok(true)
+    }
+
+    /// Returns the most bytes that the refinements of `n_gaussians` and `n_regions` take, beside the table and the
+    /// contributions.
+    pub fn len_bytes(settings: &Aggregation, n_gaussians: usize, n_regions: usize) -> u64 {
+        if *settings == Aggregation::PAPER {
+            return 0;
+        }
+        let of_regions = n_regions * (size_of::<Point>() + Votes::BYTES_PER_REGION);
+        let of_superpoints = match settings.needs_superpoints() {
+            false => 0,
+            true => {
+                let working = Superpoints::working_bytes(n_gaussians, &SuperpointSettings::default());
+                (n_gaussians * (AXES + size_of::<u32>())) as u64 + working
+            }
+        };
+        of_regions as u64 + of_superpoints
+    }
+
+    /// Refines the contributions of a part. `gaussians`: scene indices of its Gaussians.
+    pub fn apply(&self, contributions: &mut PartContributions, gaussians: &[u32]) {
+        self.refine_own(contributions);
+        for mixtures in &self.mixtures {
+            mixtures.apply(contributions, gaussians, &self.region_points, self.settings.fill);
+        }
+    }
+
+    /// Applies the refinements that need no other Gaussian.
+    fn refine_own(&self, contributions: &mut PartContributions) {
+        let Aggregation { equalisation, median_steps, .. } = self.settings;
+        self.prune(contributions);
+        if equalisation > 0.0 {
+            self.first_regions.scale(contributions, |_, views| equalise::factors(views, equalisation));
+        }
+        if median_steps > 0 {
+            self.first_regions.scale(contributions, |contributions, views| {
+                median::factors(contributions, views, &self.region_points, median_steps)
+            });
+        }
+    }
+
+    fn prune(&self, contributions: &mut PartContributions) {
+        prune::prune(contributions, &self.settings, &self.first_regions, &self.mask_counts);
+    }
+}
+
+#[cfg(test)]
+mod tests;

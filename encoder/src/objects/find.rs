@@ -1,0 +1,113 @@
+//! Finds the objects of a scene, step by step.
+
+use glam::DVec3;
+use rayon::prelude::*;
+use slag_common::frames::Aabb;
+
+use super::consensus::{self, Masks};
+use super::members::Members;
+use super::object::{NONE, Object, ObjectsReport, SceneObjects};
+use super::scene::Scene;
+use super::{sightings, vectors};
+use crate::lift::ContributionError;
+use crate::lift::photos::MaskOutline;
+
+/// Smaller objects are dropped, as the robot drops smaller clusters.
+pub const MIN_GAUSSIANS: usize = 10;
+/// Share of the means that an object's box leaves out on either side of each axis, as boxes of clusters do: floaters
+/// would make the box as large as the room.
+const TRIMMED: f64 = 0.02;
+
+/// Finds the objects of a scene. Returns `None` if cancelled.
+///
+/// # Errors
+/// [`ContributionError`].
+pub fn find(scene: &Scene<'_>) -> Result<Option<SceneObjects>, ContributionError> {
+    let Scene { table, split, .. } = scene;
+    let n_gaussians: usize = split.cells.iter().map(|cell| cell.gaussians.len()).sum();
+    let sample_step = sightings::sample_step(n_gaussians);
+    let view_of_mask = scene.view_of_mask();
+    let Some(sightings) = sightings::gather(scene, sample_step)? else { return Ok(None) };
+    let clusters = consensus::cluster_masks(
+        &sightings,
+        &Masks {
+            of_region: &|region| table.all_masks_of(region as usize),
+            view_of_mask: &view_of_mask,
+            n_views: scene.photos.len(),
+        },
+        scene.cancel,
+    );
+    drop(sightings);
+    let Some(clusters) = clusters else { return Ok(None) };
+    let Some(mut members) = Members::assign(scene, &clusters)? else { return Ok(None) };
+    members.drop_small(MIN_GAUSSIANS);
+    let objects = describe(scene, &members, &view_of_mask);
+    let calibration = vectors::calibrate(&objects, scene.score_context, table.dim());
+    let report = ObjectsReport {
+        n_objects: objects.len(),
+        n_gaussians: objects.iter().map(|object| object.n_gaussians as usize).sum(),
+        sample_step,
+        n_masks: table.n_masks(),
+        n_masks_of_objects: objects.iter().map(|object| object.n_masks as usize).sum(),
+        n_masks_set_aside: clusters.n_set_aside,
+    };
+    Ok(Some(SceneObjects { objects, object_of: members.object_of, calibration, report }))
+}
+
+fn describe(scene: &Scene<'_>, members: &Members, view_of_mask: &[u32]) -> Vec<Object> {
+    let mut gaussians: Vec<Vec<u32>> = vec![Vec::new(); members.masks.len()];
+    for (cell, of_cell) in scene.split.cells.iter().zip(&members.object_of) {
+        for (gaussian, object) in cell.gaussians.iter().zip(of_cell).filter(|(_, object)| **object != NONE) {
+            gaussians[*object as usize].push(*gaussian);
+        }
+    }
+    let uncut_shares: Vec<f32> =
+        scene.photos.iter().flat_map(|photo| &photo.outlines).map(MaskOutline::uncut_share).collect();
+    let mut first_mask_of_view = Vec::with_capacity(scene.photos.len());
+    let mut n_masks = 0;
+    for n in scene.index.n_masks_of_view() {
+        first_mask_of_view.push(n_masks);
+        n_masks += n as u32;
+    }
+    let of_masks = gaussians.into_par_iter().zip(&members.masks);
+    of_masks
+        .map(|(mut gaussians, masks)| {
+            gaussians.sort_unstable();
+            let hash = blake3::hash(bytemuck::cast_slice(&gaussians));
+            let id = hash.as_bytes()[..8].iter().rev().fold(0, |id, byte| id << 8 | u64::from(*byte));
+            let means: Vec<DVec3> =
+                gaussians.iter().map(|i| scene.gaussians.means_in_world[*i as usize]).collect();
+            let (position_in_world, box_in_world) = trimmed_box(&means);
+            let best = members.best_mask(masks, &uncut_shares);
+            let view = view_of_mask[best as usize] as usize;
+            let photo = &scene.photos[view];
+            Object {
+                id,
+                n_gaussians: gaussians.len() as u32,
+                n_masks: masks.len() as u32,
+                position_in_world,
+                box_in_world,
+                vectors: vectors::choose(masks, &members.mask_weights, scene.table),
+                photo: photo.name.clone(),
+                photo_box_px: photo.outlines[(best - first_mask_of_view[view]) as usize].box_px,
+            }
+        })
+        .collect()
+}
+
+/// Returns the box without the outermost means, and the mean of those inside.
+fn trimmed_box(means: &[DVec3]) -> (DVec3, Aabb) {
+    let last = means.len() - 1;
+    let cut = (TRIMMED * last as f64) as usize;
+    let mut bounds = Aabb { min: DVec3::ZERO, max: DVec3::ZERO };
+    for axis in 0..3 {
+        let mut values: Vec<f64> = means.iter().map(|mean| mean[axis]).collect();
+        values.sort_unstable_by(f64::total_cmp);
+        (bounds.min[axis], bounds.max[axis]) = (values[cut], values[last - cut]);
+    }
+    let is_inside = |mean: &&DVec3| mean.cmpge(bounds.min).all() && mean.cmple(bounds.max).all();
+    let inside: Vec<&DVec3> = means.iter().filter(is_inside).collect();
+    let sum: DVec3 = inside.iter().copied().sum();
+    let centre = if inside.is_empty() { bounds.centre() } else { sum / inside.len() as f64 };
+    (centre, bounds)
+}

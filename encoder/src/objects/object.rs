@@ -1,0 +1,60 @@
+//! The objects of a scene.
+
+use glam::DVec3;
+use serde::Serialize;
+use slag_common::frames::Aabb;
+use slag_common::manifest::Calibration;
+
+/// Marks a mask without a cluster, and a Gaussian without an object.
+pub const NONE: u32 = u32::MAX;
+
+/// A thing that several views agree on.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Object {
+    /// First 8 bytes of the BLAKE3 hash of its Gaussians' indices in the input, ascending, u32 little-endian.
+    pub id: u64,
+    /// Its Gaussians, in all cells.
+    pub n_gaussians: u32,
+    /// Masks that show it.
+    pub n_masks: u32,
+    /// Mean of its Gaussians inside the box.
+    pub position_in_world: DVec3,
+    /// From the 2nd to the 98th percentile of its means along each axis.
+    pub box_in_world: Aabb,
+    /// `[n][dim]`, unit: the mean of its masks' vectors, then the medoids of these.
+    pub vectors: Vec<f32>,
+    /// Name of the view that shows it best.
+    pub photo: String,
+    /// Box of its mask there, pixels of the undistorted photo: x0, y0, x1, y1, the last two exclusive.
+    pub photo_box_px: [u32; 4],
+}
+
+/// The objects of a scene.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SceneObjects {
+    /// In the order of their first masks.
+    pub objects: Vec<Object>,
+    /// `[cell][N of the cell]`: index of each Gaussian's object, or [`NONE`].
+    pub object_of: Vec<Vec<u32>>,
+    /// Mean and spread of the text bank's scores over the objects.
+    pub calibration: Calibration,
+    /// Counts for the summary.
+    pub report: ObjectsReport,
+}
+
+/// Counts of objects and masks, for the summary.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct ObjectsReport {
+    /// Objects.
+    pub n_objects: usize,
+    /// Gaussians that belong to one.
+    pub n_gaussians: usize,
+    /// Every n-th Gaussian of a cell was sampled.
+    pub sample_step: usize,
+    /// Masks.
+    pub n_masks: usize,
+    /// Masks that belong to an object.
+    pub n_masks_of_objects: usize,
+    /// Masks without consensus: they cover several things.
+    pub n_masks_set_aside: usize,
+}
