@@ -58,6 +58,12 @@ pub struct InfoArgs {
     how: RunArgs,
 }
 
+/// The name in `--models` of the stand-in without ONNX Runtime.
+const COLOURS: &str = "colours";
+/// Help text of `--models` in every program: the cases of [`open`].
+pub const MODELS_HELP: &str = "Folder with model.toml, or name of a pulled model (`models list`), or `colours`, \
+    which knows colours only and needs no ONNX Runtime [default: the embedded encoders]";
+
 /// How models are run.
 #[derive(Clone, Debug, Args)]
 pub struct RunArgs {
@@ -137,7 +143,7 @@ pub fn open(
 ) -> Result<ModelDir, HubError> {
     Ok(match asked {
         None => ModelDir::embedded()?,
-        Some(name) if name == Path::new("colours") => ModelDir::colours(),
+        Some(name) if name == Path::new(COLOURS) => ModelDir::colours(),
         Some(model) => ModelDir::open(&resolve(model, variable)?)?,
     })
 }

@@ -1,1 +1,24 @@
-//! What both HTTP services share.
+//! The parts that the encoder's service and the robot's service have in common.
+//!
+//! A request passes these stages in order. Each stage is the place for the checks that belong to it:
+//!
+//! | stage | where | what is decided there |
+//! |---|---|---|
+//! | accept | [`listener`] | number of connections; a TLS handshake wraps the stream here, before `Stalling` |
+//! | bytes | [`connection`] | time without progress, for idle clients, slow requests and slow readers alike |
+//! | head | [`listener`] | length of the request head, and time for it |
+//! | request | [`request`] | id, log line, counters, error body; checks of `Host`, `Origin` and bearer tokens |
+//! | route | [`routes`] | path and method, length of a request body (and time for it) |
+//! | handler | the service's own | parameters, admission of expensive work, the answer |
+//!
+//! [`problem`] is the body of every error, [`range`] reads byte ranges and entity tags, [`metrics`] writes
+//! Prometheus' text format, [`stop`] waits for the signals to stop.
+
+pub mod connection;
+pub mod listener;
+pub mod metrics;
+pub mod problem;
+pub mod range;
+pub mod request;
+pub mod routes;
+pub mod stop;

@@ -6,10 +6,12 @@ use std::path::PathBuf;
 
 use anyhow::anyhow;
 use clap::Args;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
+use slag_common::shard::Profile;
 use slag_edge::query::Engine;
 use slag_edge::store::EdgeCache;
 use slag_edge::text::TextService;
-use slag_models::commands::{self as model_commands, RunArgs};
+use slag_models::commands::{self as model_commands, MODELS_HELP, RunArgs};
 use slag_models::hub::cache_folder;
 use slag_models::session::SessionError;
 use slag_models::{ModelDir, SessionOptions};
@@ -53,9 +55,7 @@ impl ThreadArgs {
 
 #[derive(Debug, Args)]
 pub struct ModelArgs {
-    /// Folder of the text model, with its model.toml, or name of a pulled model (`models list`) [default: the
-    /// built-in stand-in].
-    #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR")]
+    #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR", help = MODELS_HELP)]
     pub models: Option<PathBuf>,
     #[command(flatten)]
     pub how: RunArgs,
@@ -86,4 +86,9 @@ pub fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
 /// Reads an environment variable.
 pub fn variable(name: &str) -> Option<OsString> {
     std::env::var_os(name)
+}
+
+/// Returns the parser of profiles, whose names the help text lists.
+pub fn profile_parser() -> impl TypedValueParser<Value = Profile> {
+    PossibleValuesParser::new(Profile::ALL.map(Profile::name)).try_map(|name| name.parse::<Profile>())
 }

@@ -11,7 +11,7 @@ use slag_common::shard::Profile;
 use slag_edge::fetch::{FetchRequest, Position};
 use slag_edge::query::parse_point;
 
-use super::args::CacheArgs;
+use super::args::{CacheArgs, profile_parser};
 use super::failure::Failure;
 use super::follow::{FollowArgs, watch};
 use super::network::{checked_keys, failure, fetch_once};
@@ -32,8 +32,8 @@ pub struct FetchArgs {
     /// How far around, world units (metres where the scene is metric).
     #[arg(long, default_value_t = 50.0)]
     pub radius: f64,
-    /// How much each shard carries: compact or exact.
-    #[arg(long, default_value_t = Profile::Compact)]
+    /// How much each shard carries.
+    #[arg(long, default_value_t = Profile::Compact, value_parser = profile_parser())]
     pub profile: Profile,
     /// The only public key accepted, or the one that took its place; given again: its successor, for a
     /// robot that missed the change [default: the one accepted before, or the first one met].

@@ -5,7 +5,6 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use anyhow::Context;
 use clap::Args;
 use slag_common::Hash32;
 use slag_common::shard::Profile;
@@ -13,9 +12,10 @@ use slag_edge::fetch::FetchRequest;
 use slag_edge::fetch::follow::Following;
 use slag_edge::http::{self, App, Settings};
 use slag_edge::store::StoreError;
-use tokio::net::TcpListener;
+use slag_service::listener::bind;
+use slag_service::stop::stop_signal;
 
-use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
+use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, profile_parser};
 use super::failure::Failure;
 use super::follow::{FollowArgs, follow_in_background};
 use super::network::checked_keys;
@@ -36,8 +36,8 @@ pub struct ServeArgs {
     /// When following: how far around the robot cells are kept, world units.
     #[arg(long, default_value_t = 50.0)]
     pub radius: f64,
-    /// When following: how much each shard carries: compact or exact.
-    #[arg(long, default_value_t = Profile::Compact)]
+    /// When following: how much each shard carries.
+    #[arg(long, default_value_t = Profile::Compact, value_parser = profile_parser())]
     pub profile: Profile,
     /// When following: the only public keys accepted, at most two.
     #[arg(long, value_name = "HEX")]
@@ -72,7 +72,7 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
         tracing::warn!("{error}");
     }
     let settings = Settings::default();
-    let (drain, blocking_threads) = (settings.drain, settings.max_queries + SPARE_BLOCKING_THREADS);
+    let (drain, blocking_threads) = (settings.connections.drain_timeout, settings.max_queries + SPARE_BLOCKING_THREADS);
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(ASYNC_THREADS)
         .max_blocking_threads(blocking_threads)
@@ -80,10 +80,7 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
         .build()?;
     let served = runtime.block_on(async {
         let stop = stop_signal()?;
-        let listener = TcpListener::bind(args.listen).await.with_context(|| {
-            format!("{} cannot be listened on; choose another address with --listen", args.listen)
-        });
-        let listener = listener.map_err(Failure::of("listen"))?;
+        let listener = bind(args.listen).await.map_err(|e| Failure::Failed("listen", e.into()))?;
         // For scripts that let the system choose a port.
         writeln!(io::stdout(), "listening on http://{}", listener.local_addr()?)?;
         let following = args.follow.is_some().then(Arc::<Following>::default);
@@ -110,17 +107,4 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     // A query that does not end must not keep the process.
     runtime.shutdown_timeout(drain);
     served
-}
-
-/// Returns a future that ends at ctrl-c or SIGTERM; the handlers are in place when this returns.
-fn stop_signal() -> io::Result<impl Future<Output = ()>> {
-    use tokio::signal::unix::{SignalKind, signal};
-    let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
-    Ok(async move {
-        tokio::select! {
-            _ = interrupt.recv() => {}
-            _ = terminate.recv() => {}
-        }
-        tracing::info!("stopping: requests under way are finished first");
-    })
 }

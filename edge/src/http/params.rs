@@ -1,33 +1,48 @@
-//! `/query`'s parameters, each error naming its parameter.
+//! The parameters of `/query`.
 
+use std::fmt::Display;
 use std::str::FromStr;
 
 use axum::http::{HeaderMap, header};
+use slag_service::routes::Parameter;
 
-use crate::query::{AnswerKind, Format, QueryRequest, RequestError, parse_box, parse_point};
+use crate::query::{
+    AnswerKind, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, Format, QueryRequest, RequestError, parse_box, parse_point,
+};
+use crate::score::Precision;
 
-/// The parameters there are.
-pub const NAMES: [&str; 12] = [
-    "text",
-    "negatives",
-    "limit",
-    "threshold",
-    "near",
-    "radius",
-    "box",
-    "kind",
-    "voxel",
-    "min_count",
-    "precision",
-    "format",
-];
+/// Returns the parameters, with the values and defaults of the types behind them.
+pub fn parameters() -> [Parameter; 12] {
+    let parameter = |name, example, summary: String| Parameter { name, example, summary };
+    let text = |name, example, summary: &str| parameter(name, example, summary.to_owned());
+    let (kind, precision, format) =
+        (list(&AnswerKind::ALL), list(&Precision::ALL), list(Format::available()));
+    let default_precision = Precision::default();
+    [
+        text("text", "chair", "what to look for; several are answered in one pass, as a batch"),
+        text("negatives", "canonical", "or none, or a,b,c: scores are relevancy against these (default: none)"),
+        parameter("limit", "10", format!("most answers to a text (default: {DEFAULT_LIMIT})")),
+        text("threshold", "0.1", "least cosine, or relevancy with negatives (default: the scene's)"),
+        text("near", "x,y,z", "where the asker is: answers have distances and nearer ones rank higher"),
+        text("radius", "r", "only within this distance of near"),
+        text("box", "x,y,z,x,y,z", "only between two corners"),
+        parameter("kind", "clusters", format!("{kind} (default: objects where the scene has them, else clusters)")),
+        text("voxel", "v", "edge of the voxels that join Gaussians to clusters"),
+        parameter("min_count", "n", format!("smaller clusters are dropped (default: {DEFAULT_MIN_COUNT})")),
+        parameter("precision", "measured", format!("{precision}, fastest first (default: {default_precision})")),
+        parameter("format", "json", format!("{format}; arrow: Gaussians as columns")),
+    ]
+}
 
-/// Reads a question and the format of its answer from decoded `name=value` pairs; values are checked by
-/// [`QueryRequest::check`].
+fn list(values: &[impl Display]) -> String {
+    values.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
+}
+
+/// Reads a question and the format of its answer from decoded `name=value` pairs; [`QueryRequest::check`]
+/// checks the values.
 ///
 /// # Errors
-/// The first parameter that is unknown, given twice (but for `text`) or does not parse, or `text` when it is
-/// missing.
+/// The first parameter that is unknown, repeated (except `text`) or does not parse, or `text` if it is missing.
 pub fn parse(
     pairs: &[(String, String)],
     headers: &HeaderMap,
@@ -54,7 +69,7 @@ pub fn parse(
             "format" => format = value.parse().map_err(refused)?,
             _ => {
                 let name: String = name.chars().take(40).collect();
-                let expected = format!("one of {}", NAMES.join(", "));
+                let expected = format!("one of {}", parameters().map(|parameter| parameter.name).join(", "));
                 return Err(RequestError::new(&name.escape_debug().to_string(), value, expected));
             }
         }
@@ -72,7 +87,7 @@ pub fn parse(
     Ok((request, format))
 }
 
-/// Returns the format that `Accept` names: columns if it lists them, JSON otherwise.
+/// Returns the format of `Accept`: columns if it lists them, JSON otherwise.
 fn accepted(headers: &HeaderMap) -> Format {
     let arrow = Format::Arrow.media_type();
     let mut values = headers.get_all(header::ACCEPT).iter().filter_map(|value| value.to_str().ok());

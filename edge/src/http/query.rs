@@ -5,7 +5,7 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::task::{Context, Poll, ready};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::body::{Body, Bytes};
 use axum::extract::rejection::QueryRejection;
@@ -13,53 +13,70 @@ use axum::extract::{Query, State};
 use axum::http::{HeaderMap, HeaderValue, Uri, header};
 use axum::response::{IntoResponse, Response};
 use hyper::body::Frame;
+use slag_service::problem::Problem;
 use tokio::sync::mpsc::{Receiver, Sender, channel};
 
-use super::{App, Problem, blocking, params};
+use super::app::App;
+use super::params;
+use super::problem::{overloaded, parameter_problem, query_problem, timeout};
 use crate::query::{QueryRequest, RequestError};
 
 /// Pieces made ahead of the client.
 const PIECES_AHEAD: usize = 2;
 
-/// Reads the query string of `/query`; values are checked by [`QueryRequest::check`].
+type Pairs = Query<Vec<(String, String)>>;
+
+fn no_pairs(found: &str) -> RequestError {
+    RequestError::new("query string", found, "name=value pairs")
+}
+
+/// Reads the query string of `/query`; [`QueryRequest::check`] checks the values.
 ///
 /// # Errors
-/// The first parameter that is wrong, or the string if it is none.
+/// The first wrong parameter, or the string if it is no query string.
 pub fn parse_query(query_string: &str) -> Result<QueryRequest, RequestError> {
-    let wrong = |e: &dyn ToString| RequestError::new("query string", &e.to_string(), "name=value pairs");
-    let uri: Uri = format!("/query?{query_string}").parse().map_err(|e| wrong(&e))?;
-    let pairs: Query<Vec<(String, String)>> =
-        Query::try_from_uri(&uri).map_err(|e: QueryRejection| wrong(&e.body_text()))?;
+    let uri: Result<Uri, _> = format!("/query?{query_string}").parse();
+    let uri = uri.map_err(|e| no_pairs(&e.to_string()))?;
+    let pairs = Pairs::try_from_uri(&uri).map_err(|e| no_pairs(&e.body_text()))?;
     Ok(params::parse(&pairs, &HeaderMap::new())?.0)
 }
 
-/// Answers `/query`.
 pub async fn query(
     State(app): State<Arc<App>>,
     headers: HeaderMap,
-    pairs: Result<Query<Vec<(String, String)>>, QueryRejection>,
+    pairs: Result<Pairs, QueryRejection>,
 ) -> Result<Response, Problem> {
-    let Query(pairs) =
-        pairs.map_err(|e| RequestError::new("query string", &e.body_text(), "name=value pairs"))?;
-    let (request, format) = params::parse(&pairs, &headers)?;
-    request.check()?;
+    let started = Instant::now();
+    let answer = answer(&app, &headers, pairs).await;
+    app.metrics.query_times.observe(started.elapsed());
+    answer
+}
+
+async fn answer(
+    app: &Arc<App>,
+    headers: &HeaderMap,
+    pairs: Result<Pairs, QueryRejection>,
+) -> Result<Response, Problem> {
+    let Query(pairs) = pairs.map_err(|e| parameter_problem(no_pairs(&e.body_text())))?;
+    let (request, format) = params::parse(&pairs, headers).map_err(parameter_problem)?;
+    request.check().map_err(parameter_problem)?;
     let permit = Arc::clone(&app.permits)
         .try_acquire_owned()
-        .map_err(|_| Problem::overloaded(app.settings.max_queries))?;
-    let answering = blocking(&app, move |app| {
+        .map_err(|_| overloaded(app.settings.max_queries))?;
+    let answering = app.blocking(move |app| {
         app.reload_if_stale();
-        let reply = app.engine.answer(&request)?;
+        let reply = app.engine.answer(&request).map_err(query_problem)?;
         let n_empty = reply.answers.iter().filter(|answers| answers.answers.is_empty()).count();
         app.metrics.empty_answers.fetch_add(n_empty as u64, Ordering::Relaxed);
         let mut pieces = reply.pieces(format).peekable();
-        let first = pieces.next().transpose().map_err(|e| Problem::internal(&e))?.unwrap_or_default();
+        let first = pieces.next().transpose().map_err(Problem::internal)?.unwrap_or_default();
         let is_whole = pieces.peek().is_none();
-        // The permit is held until the work is done, even if nobody waits for it any more.
+        // The permit is held until the work is done, even if the client has given up.
         Ok((first, (!is_whole).then_some((pieces, permit))))
     });
     let limit = app.settings.query_timeout;
     let (first, rest) =
-        tokio::time::timeout(limit, answering).await.map_err(|_| Problem::timeout(limit))??;
+        tokio::time::timeout(limit, answering).await.map_err(|_| timeout(limit))??;
     let body = match rest {
         None => Body::from(first),
         Some((pieces, permit)) => {
@@ -75,14 +92,15 @@ pub async fn query(
     Ok(([(header::CONTENT_TYPE, HeaderValue::from_static(format.media_type()))], body).into_response())
 }
 
-/// What travels to the body.
+/// A message to the body.
 enum Message {
     Piece(Bytes),
     End,
 }
 
-/// Sends the pieces, each made off the async threads once the client took those before; gives up at the
-/// deadline, so that a client that reads slowly or not at all holds neither a permit nor the answers.
+/// Sends the pieces, each made off the async threads once the client took those before.
+///
+/// It gives up at the deadline: a slow or silent client holds neither a permit nor the answers for longer.
 async fn send_all(
     first: Vec<u8>,
     pieces: impl Iterator<Item = io::Result<Vec<u8>>> + Send + 'static,
@@ -104,7 +122,7 @@ async fn send_all(
         }
         match piece {
             Some(Err(error)) => tracing::error!("an answer broke off: {error}"),
-            // Nothing is lost if the client is gone by now.
+            // Nothing is lost if the client is gone.
             _ => drop(to.send(Message::End).await),
         }
     };
@@ -113,7 +131,7 @@ async fn send_all(
     }
 }
 
-/// A body whose end is either reached or an error: what was cut off must not look complete.
+/// A body that ends complete or with an error: a cut-off answer must not look complete.
 struct Pieces {
     receiver: Receiver<Message>,
     is_complete: bool,

@@ -1,15 +1,24 @@
+use std::sync::Arc;
+use std::time::Duration;
+
 use axum::body::{Body, to_bytes};
+use axum::extract::Request;
 use axum::http::{HeaderMap, StatusCode};
+use axum::response::Response;
 use glam::DVec3;
 use serde_json::{Value, json};
+use slag_service::listener::ConnectionLimits;
 use tempfile::TempDir;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
 use tower::ServiceExt;
 
+use super::router::router;
 use super::*;
 use crate::fetch::Position;
+use crate::fetch::follow::Following;
+use crate::query::Engine;
 use crate::store::EdgeCache;
 use crate::testing::{
     BuiltShard, Gate, Member, TestShard, axes_service, manifest_of, open_gate, write_cache, write_manifest,
@@ -407,26 +416,14 @@ async fn stops_gracefully() {
 
 #[tokio::test]
 async fn stopping_has_a_deadline() {
-    let service =
-        Service::new(Some(&chair(None)), Settings { drain: Duration::from_millis(1), ..Settings::default() });
+    let settings = Settings::default();
+    let connections =
+        ConnectionLimits { drain_timeout: Duration::from_millis(1), ..settings.connections };
+    let service = Service::new(Some(&chair(None)), Settings { connections, ..settings });
     let (address, stop, end) = serve_for_real(&service).await;
     let _waiting = talk(address, ASK_AND_WAIT).await;
     until_in_flight(&service).await;
     stop.send(()).expect("the server lives");
     assert_eq!(soon(end).await.expect("no panic").expect_err("cut off").kind(), std::io::ErrorKind::TimedOut);
     open_gate(&service.gate);
-}
-
-#[tokio::test]
-async fn heads_are_bounded_in_size_and_time() {
-    let service = Service::new(
-        Some(&chair(None)),
-        Settings { header_timeout: Duration::from_millis(20), ..Settings::default() },
-    );
-    let (address, _stop, _end) = serve_for_real(&service).await;
-    let long = format!("GET /query?text=0 HTTP/1.1\r\nhost: x\r\ncookie: {}\r\n\r\n", "x".repeat(30_000));
-    assert!(rest(talk(address, &long).await).await.starts_with("HTTP/1.1 431"));
-    let never_ending = talk(address, "GET /query?text=0 HTTP/1.1\r\nhost: ").await;
-    // The connection is closed, with or without an answer.
-    rest(never_ending).await;
 }

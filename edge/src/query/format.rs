@@ -18,6 +18,19 @@ pub enum Format {
 }
 
 impl Format {
+    /// Returns the formats of this build.
+    pub fn available() -> &'static [Self] {
+        if cfg!(feature = "arrow") { &[Self::Json, Self::Arrow] } else { &[Self::Json] }
+    }
+
+    /// Returns the name used in URLs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Json => "json",
+            Self::Arrow => "arrow",
+        }
+    }
+
     /// Returns its media type.
     pub fn media_type(self) -> &'static str {
         match self {
@@ -27,16 +40,22 @@ impl Format {
     }
 }
 
+impl std::fmt::Display for Format {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
 impl std::str::FromStr for Format {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        match text {
-            "json" => Ok(Self::Json),
-            "arrow" if cfg!(feature = "arrow") => Ok(Self::Arrow),
-            _ if cfg!(feature = "arrow") => Err("json or arrow".into()),
-            _ => Err("json (this program is built without Arrow)".into()),
-        }
+        let found = Self::available().iter().copied().find(|format| format.name() == text);
+        found.ok_or_else(|| {
+            let names = Self::available().iter().map(|format| format.name()).collect::<Vec<_>>().join(", ");
+            let built = if cfg!(feature = "arrow") { "" } else { " (this program is built without Arrow)" };
+            format!("one of {names}{built}")
+        })
     }
 }
 

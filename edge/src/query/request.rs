@@ -60,13 +60,23 @@ pub enum AnswerKind {
     Gaussians,
 }
 
-impl fmt::Display for AnswerKind {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
+impl AnswerKind {
+    /// Every kind, coarsest first.
+    pub const ALL: [Self; 3] = [Self::Objects, Self::Clusters, Self::Gaussians];
+
+    /// Returns the name used in URLs, flags and JSON.
+    pub fn name(self) -> &'static str {
+        match self {
             Self::Objects => "objects",
             Self::Clusters => "clusters",
             Self::Gaussians => "gaussians",
-        })
+        }
+    }
+}
+
+impl fmt::Display for AnswerKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
     }
 }
 
@@ -74,12 +84,8 @@ impl FromStr for AnswerKind {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        match text {
-            "objects" => Ok(Self::Objects),
-            "clusters" => Ok(Self::Clusters),
-            "gaussians" => Ok(Self::Gaussians),
-            _ => Err("objects, clusters or gaussians".into()),
-        }
+        let found = Self::ALL.into_iter().find(|kind| kind.name() == text);
+        found.ok_or_else(|| format!("one of {}", Self::ALL.map(Self::name).join(", ")))
     }
 }
 

@@ -8,22 +8,22 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, Result, anyhow};
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
 use serde::Serialize;
-use slag_models::commands::{self, RunArgs};
+use slag_common::shard::Profile;
+use slag_models::commands::{self, MODELS_HELP, RunArgs};
 use slag_models::session::SessionError;
 use slag_models::{ModelDir, SessionOptions, TextEncoder};
+use slag_service::stop::stop_signal;
 
 use crate::embed::Background;
-use crate::publish::serve;
 use crate::store::StoreReader;
 
 /// Where models come from.
 #[derive(Clone, Debug, Args)]
 pub struct ModelArgs {
-    /// Folder with model.toml, or name of a pulled model (`models list`); the embedded encoders if absent; `colours`
-    /// knows colours only, and needs no ONNX Runtime.
-    #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR")]
+    #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR", help = MODELS_HELP)]
     pub models: Option<PathBuf>,
     /// How they run.
     #[command(flatten)]
@@ -135,8 +135,9 @@ pub fn available_threads() -> usize {
 
 /// Completes when the user or the system asks the program to stop.
 pub async fn stopped() {
-    if let Err(error) = serve::stop_signal().await {
-        tracing::warn!("cannot listen for signals, stopping: {error}");
+    match stop_signal() {
+        Ok(stop) => stop.await,
+        Err(error) => tracing::warn!("cannot listen for signals, stopping: {error}"),
     }
 }
 
@@ -164,6 +165,11 @@ pub fn parse_bytes(text: &str) -> Result<u64, String> {
     let number: u64 = digits.parse().map_err(|_| format!("{text:?} is no number of bytes, as 512MiB is"))?;
     let bytes = number.checked_mul(factor).ok_or_else(|| format!("{text:?} is too large"))?;
     if bytes < 64 << 20 { Err(format!("{text:?} is below the least, 64MiB")) } else { Ok(bytes) }
+}
+
+/// Returns the parser of profiles, whose names the help text lists.
+pub fn profile_parser() -> impl TypedValueParser<Value = Profile> {
+    PossibleValuesParser::new(Profile::ALL.map(Profile::name)).try_map(|name| name.parse::<Profile>())
 }
 
 /// Reads an error of scores.

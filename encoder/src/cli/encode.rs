@@ -9,7 +9,7 @@ use slag_common::shard::Profile;
 use super::Exit;
 use super::common::{
     BackgroundArg, InputArgs, ModelArgs, available_threads, cancel_flag, now_unix_secs, open_models,
-    parse_bytes, parse_error, print,
+    parse_bytes, parse_error, print, profile_parser,
 };
 use super::refine::RefineArgs;
 use super::sam::SamArgs;
@@ -100,7 +100,7 @@ pub struct EncodeArgs {
     #[arg(long, value_name = "M", default_value_t = 25.0)]
     pub cell_width_m: f64,
     /// Which shards to make.
-    #[arg(long, value_name = "NAMES", value_delimiter = ',', num_args = 1.., default_values_t = Profile::ALL)]
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', num_args = 1.., default_values_t = Profile::ALL, value_parser = profile_parser())]
     pub profiles: Vec<Profile>,
     /// Error of scores that the compact profile may have: mean, relative to the spread of scores [default: the preset's].
     #[arg(long, value_name = "E", value_parser = parse_error)]

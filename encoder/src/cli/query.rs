@@ -9,7 +9,7 @@ use serde_json::json;
 use slag_common::shard::Profile;
 
 use super::Exit;
-use super::common::{ModelArgs, print, text_encoder_of};
+use super::common::{ModelArgs, print, profile_parser, text_encoder_of};
 use crate::query::{self, ByLevel};
 use crate::store::StoreReader;
 
@@ -28,7 +28,7 @@ pub struct QueryArgs {
     #[arg(long, default_value_t = 10)]
     pub limit: u32,
     /// Score as a robot with shards of this profile does [default: the field in full precision].
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", value_parser = profile_parser())]
     pub profile: Option<Profile>,
     /// Scores coarse and fine masks apart and takes the best, instead of their mean.
     #[arg(long, conflicts_with = "profile")]

@@ -38,6 +38,7 @@ use slag_common::manifest::{CellRecord, Manifest, TrustedKeys};
 pub use error::StoreError;
 use files::{Access, HashingWriter};
 use keys::Keys;
+pub(crate) use reader::Stamp;
 pub use reader::{Extras, Published, StoreReader};
 
 /// sled keeps whole pages in memory; the records are small.

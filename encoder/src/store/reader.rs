@@ -57,15 +57,20 @@ impl Published {
     }
 }
 
-/// Tells one version of a file from the next without reading it.
+/// The version of a file, read without its content.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Stamp {
+pub(crate) struct Stamp {
     modified: Option<SystemTime>,
     len_bytes: u64,
     inode: u64,
 }
 
 impl Stamp {
+    /// Returns the version of a store's manifest; `None` if there is none or its metadata cannot be read.
+    pub(crate) fn of_manifest(dir: &Path) -> Option<Self> {
+        Self::of(&dir.join(MANIFEST)).ok()
+    }
+
     fn of(path: &Path) -> io::Result<Self> {
         let metadata = fs_err::metadata(path)?;
         #[cfg(unix)]
@@ -109,6 +114,11 @@ impl StoreReader {
             }
         };
         Ok(Self { dir: dir.to_owned(), current, previous, stamp })
+    }
+
+    /// Returns the version of the manifest that this reader read.
+    pub(crate) fn stamp(&self) -> Stamp {
+        self.stamp
     }
 
     /// Returns whether the store still has the manifest that this reader read (one `stat`).

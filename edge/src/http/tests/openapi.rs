@@ -3,8 +3,12 @@
 use std::collections::BTreeSet;
 
 use slag_common::manifest::Calibration;
+use slag_service::routes::Route;
 
+use super::router::{OPENAPI, routes};
 use super::*;
+use crate::query::{AnswerKind, Format};
+use crate::score::Precision;
 use crate::testing::TestObject;
 
 fn description() -> Value {
@@ -70,28 +74,42 @@ async fn every_route_and_parameter_is_described() {
     let api = description();
     assert_eq!(served, api);
     assert_eq!(api["info"]["version"], env!("CARGO_PKG_VERSION"));
+    let (_, table) = routes().with_help("");
     let paths = api["paths"].as_object().expect("paths");
-    assert_eq!(names(paths.keys().map(String::as_str)), names(ROUTES));
-    for path in ROUTES {
+    assert_eq!(names(paths.keys().map(String::as_str)), names(table.iter().map(|route| route.path)));
+    for route in &table {
+        let (path, method) = (route.path, route.method.as_str().to_lowercase());
+        assert!(api["paths"][path][method].is_object(), "{path}");
         assert_ne!(service.get(path).await.0, StatusCode::NOT_FOUND, "{path} is described, not served");
     }
-    let parameters = api["paths"]["/query"]["get"]["parameters"].as_array().expect("parameters");
-    assert_eq!(names(parameters.iter().filter_map(|p| p["name"].as_str())), names(params::NAMES));
+    let described = api["paths"]["/query"]["get"]["parameters"].as_array().expect("parameters");
+    let known = params::parameters().map(|parameter| parameter.name);
+    assert_eq!(names(described.iter().filter_map(|p| p["name"].as_str())), names(known));
     // The parser knows each: it finds a wrong value, or nothing wrong.
-    for parameter in params::NAMES {
+    for parameter in known {
         let (_, _, body) = service.get(&format!("/query?text=0&{parameter}=,&{parameter}=,")).await;
-        let is_text = parameter == "text";
         assert_eq!(body["parameter"], parameter, "{body}");
-        assert!(is_text || !body["expected"].as_str().expect("text").starts_with("one of"), "{body}");
+        let expected = body["expected"].as_str().unwrap_or_default();
+        assert!(!expected.contains("negatives, limit"), "{parameter} is unknown: {body}");
     }
-    // People find them too.
+    // Values and defaults are those of the types.
+    let schema = |name: &str| {
+        let parameter = described.iter().find(|p| p["name"] == name).expect("described");
+        (parameter["schema"]["enum"].clone(), parameter["schema"]["default"].clone())
+    };
+    assert_eq!(schema("kind"), (json!(AnswerKind::ALL.map(AnswerKind::name)), Value::Null));
+    let (values, default) = (Precision::ALL.map(Precision::name), Precision::default().name());
+    assert_eq!(schema("precision"), (json!(values), default.into()));
+    let formats: Vec<&str> = Format::available().iter().map(|format| format.name()).collect();
+    if formats.len() == 2 {
+        assert_eq!(schema("format"), (json!(formats), Format::default().name().into()));
+    }
+    // The help text has them too.
     let help = service.get("/").await.2;
     let help = help.as_str().expect("text");
-    assert!(params::NAMES.iter().all(|name| help.contains(&format!("{name}="))), "{help}");
-    assert!(ROUTES.iter().all(|route| {
-        [format!("GET {route}"), format!("POST {route}")].iter().any(|line| help.contains(line))
-            || *route == "/"
-    }));
+    assert!(known.iter().all(|name| help.contains(&format!("    {name}="))), "{help}");
+    let listed = |route: &Route| help.contains(&format!("\n{} {} ", route.method, route.path));
+    assert!(table.iter().all(listed), "{help}");
 }
 
 #[tokio::test]

@@ -1,10 +1,16 @@
 mod server;
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::num::NonZeroUsize;
+use std::sync::Arc;
+use std::time::Duration;
 
 use glam::DVec3;
 use half::f16;
-use qdrant_client::qdrant::{SearchPointsBuilder, point_id::PointIdOptions, value::Kind};
+use qdrant_client::Qdrant;
+use qdrant_client::qdrant::{
+    Distance, SearchPointsBuilder, VectorParamsBuilder, point_id::PointIdOptions, value::Kind,
+};
 use slag_common::frames::{Aabb, GeoReference, Geographic};
 use slag_common::manifest::ShardRecord;
 use slag_common::shard::{ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardView};
@@ -280,6 +286,24 @@ async fn a_push_that_is_cut_off_continues() {
 
         let again = fixture.push(&options(&url)).await.expect("nothing to do");
         assert_eq!((again.n_points, again.n_sent), (N_POINTS, 0));
+    }
+}
+
+/// Between the collection and its indexes a push may be cut off; the next one makes the missing indexes.
+#[tokio::test]
+async fn missing_payload_indexes_are_made_by_the_next_push() {
+    let fixture = fixture();
+    for n_before in 0..3 {
+        let (server, url) = Server::start(None).await;
+        server.with(|state| state.n_indexes_refused = 1);
+        let refused = fixture.push(&options(&url)).await.expect_err("no index");
+        assert!(matches!(refused, PushError::Database { action: "index a payload field", .. }), "{refused}");
+        let made = ["scene", "generation", "location"][..n_before].iter().map(ToString::to_string);
+        server.with(|state| state.indexed = made.collect());
+        let report = fixture.push(&options(&url)).await.expect("continues");
+        assert_eq!((report.n_points, report.created_collection), (N_POINTS, false));
+        let indexed = server.with(|state| state.indexed.clone());
+        assert_eq!(indexed, ["scene", "generation", "location"], "{n_before} were there");
     }
 }
 

@@ -24,6 +24,8 @@ pub(super) struct Stored {
 pub(super) struct State {
     pub(super) params: Option<VectorParams>,
     pub(super) indexed: Vec<String>,
+    /// Requests for a payload index that are still to be refused.
+    pub(super) n_indexes_refused: u32,
     pub(super) points: BTreeMap<u64, Stored>,
     /// First id of every batch that was acknowledged, in order.
     pub(super) acknowledged: Vec<u64>,
@@ -203,8 +205,14 @@ service!(Points {
 
     async fn create_field_index(&self, request: Request<CreateFieldIndexCollection>) -> Result<Response<PointsOperationResponse>, Status> {
         let field = self.admit(request)?.field_name;
-        self.with(|state| state.indexed.push(field));
-        Ok(self.done())
+        self.with(|state| {
+            if state.n_indexes_refused > 0 {
+                state.n_indexes_refused -= 1;
+                return Err(Status::permission_denied("indexes are refused"));
+            }
+            state.indexed.push(field);
+            Ok(self.done())
+        })
     }
 
     async fn search(&self, request: Request<SearchPoints>) -> Result<Response<SearchResponse>, Status> {
@@ -268,11 +276,13 @@ service!(Collections {
 
     async fn get(&self, request: Request<GetCollectionInfoRequest>) -> Result<Response<GetCollectionInfoResponse>, Status> {
         self.admit(request)?;
-        let params = self.with(|state| state.params).ok_or_else(|| Status::not_found("no collection"))?;
+        let (params, indexed) = self.with(|state| (state.params, state.indexed.clone()));
+        let params = params.ok_or_else(|| Status::not_found("no collection"))?;
         let vectors_config = Some(VectorsConfig { config: Some(vectors_config::Config::Params(params)) });
         let params = Some(CollectionParams { vectors_config, ..Default::default() });
         let config = Some(CollectionConfig { params, ..Default::default() });
-        let result = Some(CollectionInfo { config, ..Default::default() });
+        let payload_schema = indexed.into_iter().map(|field| (field, PayloadSchemaInfo::default())).collect();
+        let result = Some(CollectionInfo { config, payload_schema, ..Default::default() });
         Ok(Response::new(GetCollectionInfoResponse { result, ..Default::default() }))
     }
 } refused {

@@ -1,59 +1,98 @@
 //! Byte ranges and entity tags of HTTP (RFC 9110, sections 8.8, 13 and 14).
 
+use std::fmt;
 use std::ops::RangeInclusive;
 
-/// What a `Range` header asks of a representation.
+use axum::http::{HeaderMap, Method, header};
+
+/// A strong entity tag: equal tags mean equal bytes.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Selection {
-    /// All of it: no range, or one that may be ignored (another unit, malformed, several ranges).
+pub struct EntityTag(String);
+
+impl EntityTag {
+    /// Makes the tag of a representation from a name of its bytes, such as their hash.
+    pub fn new(name: impl fmt::Display) -> Self {
+        Self(format!("\"{name}\""))
+    }
+
+    /// Returns the value of the `ETag` header.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+
+    /// Returns whether the client already has this representation (`If-None-Match`, weak comparison, 13.1.2).
+    pub fn is_known_to(&self, headers: &HeaderMap) -> bool {
+        let values = headers.get_all(header::IF_NONE_MATCH);
+        values.iter().filter_map(|value| value.to_str().ok()).any(|value| self.is_named_in(value))
+    }
+
+    fn is_named_in(&self, if_none_match: &str) -> bool {
+        let tags = || if_none_match.split(',').map(|one| one.trim_matches([' ', '\t']));
+        if_none_match.trim() == "*" || tags().any(|one| one.strip_prefix("W/").unwrap_or(one) == self.0)
+    }
+}
+
+/// The part of a representation that a request selects.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Selection {
+    /// All of it: no range, or a range that may be ignored (another unit, malformed, several ranges).
     Whole,
     /// These bytes; never empty.
     Part(RangeInclusive<u64>),
-    /// Nothing that is there: 416.
+    /// No byte of the representation: 416.
     Unsatisfiable,
 }
 
-/// Reads a `Range` header's value against a representation of `len_bytes`.
-pub(super) fn select(value: &str, len_bytes: u64) -> Selection {
-    let Some((unit, set)) = value.split_once('=') else { return Selection::Whole };
-    if !unit.eq_ignore_ascii_case("bytes") {
-        return Selection::Whole;
+impl Selection {
+    /// Reads `Range` and `If-Range` of a request for a representation of `len_bytes`.
+    ///
+    /// A range counts only with GET (14.2), only once, and with `If-Range` only if its tag is this one (13.1.5).
+    pub fn of_request(method: &Method, headers: &HeaderMap, tag: &EntityTag, len_bytes: u64) -> Self {
+        let mut ranges = headers.get_all(header::RANGE).iter();
+        let (Some(range), None) = (ranges.next(), ranges.next()) else { return Self::Whole };
+        let same = headers.get(header::IF_RANGE).is_none_or(|tagged| tagged.as_bytes() == tag.0.as_bytes());
+        match range.to_str() {
+            Ok(range) if same && method == Method::GET => Self::of_range(range, len_bytes),
+            _ => Self::Whole,
+        }
     }
-    // List elements may be empty and have blanks around commas, but not at the ends (5.6.1.2).
-    let optional_blanks = [' ', '\t'];
-    if set.starts_with(optional_blanks) || set.ends_with(optional_blanks) {
-        return Selection::Whole;
-    }
-    let mut specs = set.split(',').map(|spec| spec.trim_matches(optional_blanks)).filter(|s| !s.is_empty());
-    let (Some(spec), None) = (specs.next(), specs.next()) else { return Selection::Whole };
-    let Some((first, last)) = spec.split_once('-') else { return Selection::Whole };
-    let (Some(first), Some(last)) = (position(first), position(last)) else { return Selection::Whole };
-    match (first, last) {
-        (None, None) => Selection::Whole,
-        (Some(first), Some(last)) if last < first => Selection::Whole,
-        (Some(first), _) if first >= len_bytes => Selection::Unsatisfiable,
-        (Some(first), last) => Selection::Part(first..=last.unwrap_or(u64::MAX).min(len_bytes - 1)),
-        (None, Some(0)) => Selection::Unsatisfiable,
-        // A suffix of nothing is satisfiable, but no `Content-Range` can say it.
-        (None, Some(_)) if len_bytes == 0 => Selection::Whole,
-        (None, Some(suffix)) => Selection::Part(len_bytes.saturating_sub(suffix)..=len_bytes - 1),
+
+    /// Reads the value of a `Range` header.
+    fn of_range(value: &str, len_bytes: u64) -> Self {
+        let Some((unit, set)) = value.split_once('=') else { return Self::Whole };
+        if !unit.eq_ignore_ascii_case("bytes") {
+            return Self::Whole;
+        }
+        // List elements may be empty and have blanks around commas, but not at the ends (5.6.1.2).
+        let optional_blanks = [' ', '\t'];
+        if set.starts_with(optional_blanks) || set.ends_with(optional_blanks) {
+            return Self::Whole;
+        }
+        let mut specs = set.split(',').map(|spec| spec.trim_matches(optional_blanks)).filter(|s| !s.is_empty());
+        let (Some(spec), None) = (specs.next(), specs.next()) else { return Self::Whole };
+        let Some((first, last)) = spec.split_once('-') else { return Self::Whole };
+        let (Some(first), Some(last)) = (position(first), position(last)) else { return Self::Whole };
+        match (first, last) {
+            (None, None) => Self::Whole,
+            (Some(first), Some(last)) if last < first => Self::Whole,
+            (Some(first), _) if first >= len_bytes => Self::Unsatisfiable,
+            (Some(first), last) => Self::Part(first..=last.unwrap_or(u64::MAX).min(len_bytes - 1)),
+            (None, Some(0)) => Self::Unsatisfiable,
+            // A suffix of an empty representation is satisfiable, but no `Content-Range` can express it.
+            (None, Some(_)) if len_bytes == 0 => Self::Whole,
+            (None, Some(suffix)) => Self::Part(len_bytes.saturating_sub(suffix)..=len_bytes - 1),
+        }
     }
 }
 
-/// Reads digits; `Some(None)` without any, `None` if there is something else. Numbers beyond u64 are
-/// beyond any file too.
+/// Reads a position: `Some(None)` without digits, `None` for anything else. Numbers beyond `u64` saturate,
+/// which is beyond any file.
 fn position(digits: &str) -> Option<Option<u64>> {
     match digits {
         "" => Some(None),
         _ if !digits.bytes().all(|b| b.is_ascii_digit()) => None,
         _ => Some(Some(digits.parse().unwrap_or(u64::MAX))),
     }
-}
-
-/// Returns whether an `If-None-Match` value names a tag (weak comparison, 13.1.2).
-pub(super) fn names_tag(value: &str, tag: &str) -> bool {
-    let tags = || value.split(',').map(|one| one.trim_matches([' ', '\t']));
-    value.trim() == "*" || tags().any(|one| one.strip_prefix("W/").unwrap_or(one) == tag)
 }
 
 #[cfg(test)]
@@ -117,7 +156,7 @@ mod tests {
             ("bytes=0-0", u64::MAX, Part(0..=0)),
         ];
         for (value, len_bytes, expected) in table {
-            assert_eq!(select(value, len_bytes), expected, "{value:?} of {len_bytes}");
+            assert_eq!(Selection::of_range(value, len_bytes), expected, "{value:?} of {len_bytes}");
         }
     }
 
@@ -127,7 +166,7 @@ mod tests {
         let pieces = ["", "0", "1", "9", "10", "18446744073709551615", "18446744073709551616", "x"];
         for (first, last) in pieces.iter().flat_map(|a| pieces.iter().map(move |b| (a, b))) {
             for len_bytes in [0, 1, 2, 10, 11, u64::MAX] {
-                if let Selection::Part(part) = select(&format!("bytes={first}-{last}"), len_bytes) {
+                if let Selection::Part(part) = Selection::of_range(&format!("bytes={first}-{last}"), len_bytes) {
                     assert!(part.start() <= part.end() && *part.end() < len_bytes, "{part:?} of {len_bytes}");
                 }
             }
@@ -147,7 +186,7 @@ mod tests {
             ("\"aa\"", false),
             ("", false),
         ] {
-            assert_eq!(names_tag(value, "\"a\""), expected, "{value}");
+            assert_eq!(EntityTag::new("a").is_named_in(value), expected, "{value}");
         }
     }
 }

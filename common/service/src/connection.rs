@@ -1,59 +1,31 @@
-//! Accepting connections: a bounded number, and none that stalls for ever.
+//! A connection's byte stream, with a deadline for progress.
 
 use std::io;
-use std::net::SocketAddr;
 use std::pin::Pin;
-use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
-use axum::serve::Listener;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, Sleep, sleep_until};
 
-/// A listener with a bounded number of connections; further ones wait in the system's queue.
-pub(super) struct BoundedListener {
-    pub(super) tcp: TcpListener,
-    pub(super) slots: Arc<Semaphore>,
-    pub(super) stall_timeout: Duration,
-}
-
-impl Listener for BoundedListener {
-    type Io = Connection<TcpStream>;
-    type Addr = SocketAddr;
-
-    async fn accept(&mut self) -> (Self::Io, SocketAddr) {
-        let slot = Arc::clone(&self.slots).acquire_owned().await.expect("the semaphore is never closed");
-        // tokio's own listener retries after errors such as too many open files.
-        let (stream, address) = Listener::accept(&mut self.tcp).await;
-        (Connection::new(stream, Some(slot), self.stall_timeout), address)
-    }
-
-    fn local_addr(&self) -> io::Result<SocketAddr> {
-        self.tcp.local_addr()
-    }
-}
-
-/// A connection that fails once nothing could be sent for `stall_timeout`.
+/// A stream that fails once nothing could be sent for `stall_timeout`.
 ///
-/// Requests have no bodies, so time without a byte sent is time a client idles, drips its headers or
-/// does not read its answer: one deadline bounds all three.
-pub(super) struct Connection<S> {
+/// Without a byte sent, a client idles, drips its request or does not read its answer: one deadline bounds
+/// all three. Received bytes do not move the deadline, so a request of any length must arrive within it.
+pub struct Stalling<S> {
     stream: S,
     stall_timeout: Duration,
     deadline: Pin<Box<Sleep>>,
-    _slot: Option<OwnedSemaphorePermit>,
 }
 
-impl<S> Connection<S> {
-    pub(super) fn new(stream: S, slot: Option<OwnedSemaphorePermit>, stall_timeout: Duration) -> Self {
+impl<S> Stalling<S> {
+    /// Wraps a stream; its first deadline begins now.
+    pub fn new(stream: S, stall_timeout: Duration) -> Self {
         let deadline = Box::pin(sleep_until(Instant::now() + stall_timeout));
-        Self { stream, stall_timeout, deadline, _slot: slot }
+        Self { stream, stall_timeout, deadline }
     }
 
-    /// Turns "not yet" into an error after the deadline; progress in sending moves the deadline.
+    /// Turns `Pending` into an error after the deadline; a sent byte moves the deadline.
     fn bounded<T>(
         &mut self,
         polled: Poll<io::Result<T>>,
@@ -70,7 +42,7 @@ impl<S> Connection<S> {
     }
 }
 
-impl<S: AsyncRead + Unpin> AsyncRead for Connection<S> {
+impl<S: AsyncRead + Unpin> AsyncRead for Stalling<S> {
     fn poll_read(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
@@ -81,7 +53,7 @@ impl<S: AsyncRead + Unpin> AsyncRead for Connection<S> {
     }
 }
 
-impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
+impl<S: AsyncWrite + Unpin> AsyncWrite for Stalling<S> {
     fn poll_write(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
@@ -124,7 +96,7 @@ mod tests {
     #[tokio::test]
     async fn sending_moves_the_deadline_and_receiving_does_not() {
         let (ours, mut theirs) = tokio::io::duplex(64);
-        let mut connection = Connection::new(ours, None, Duration::from_millis(200));
+        let mut connection = Stalling::new(ours, Duration::from_millis(200));
         for _ in 0..5 {
             tokio::time::sleep(Duration::from_millis(60)).await;
             connection.write_all(b"x").await.expect("room");

@@ -1,0 +1,125 @@
+//! Errors as problem details (RFC 9457).
+
+use std::fmt;
+
+use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde_json::{Map, Value};
+
+/// One error, as a client sees it.
+///
+/// A handler returns it; [`crate::request`] gives the response its body, so that it carries the request's id.
+#[derive(Clone, Debug)]
+pub struct Problem {
+    status: StatusCode,
+    kind: &'static str,
+    title: &'static str,
+    detail: String,
+    members: Map<String, Value>,
+    headers: HeaderMap,
+    cause: Option<String>,
+}
+
+impl Problem {
+    /// Makes a problem; `kind` ends its type URI and never changes its meaning.
+    pub fn new(
+        status: StatusCode,
+        kind: &'static str,
+        title: &'static str,
+        detail: impl Into<String>,
+    ) -> Self {
+        let (members, headers) = (Map::new(), HeaderMap::new());
+        Self { status, kind, title, detail: detail.into(), members, headers, cause: None }
+    }
+
+    /// Makes the problem of an internal error: `cause` is logged, not returned.
+    pub fn internal(cause: impl fmt::Display) -> Self {
+        let detail = "the service failed; its log has the cause under the number of this request";
+        let problem = Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", "Internal error", detail);
+        Self { cause: Some(cause.to_string()), ..problem }
+    }
+
+    /// Makes the problem of a request beyond a limit; the same request may succeed after `retry_secs`.
+    pub fn overloaded(detail: impl Into<String>, retry_secs: u32) -> Self {
+        Self::new(StatusCode::SERVICE_UNAVAILABLE, "overloaded", "Overloaded", detail).retry_after(retry_secs)
+    }
+
+    /// Makes the problem of an answer that took too long; the same request may succeed after `retry_secs`.
+    pub fn timeout(detail: impl Into<String>, retry_secs: u32) -> Self {
+        Self::new(StatusCode::SERVICE_UNAVAILABLE, "timeout", "Timeout", detail).retry_after(retry_secs)
+    }
+
+    /// Adds `Retry-After`: the same request may succeed then.
+    pub fn retry_after(self, seconds: u32) -> Self {
+        self.with_header(header::RETRY_AFTER, seconds.into())
+    }
+
+    /// Adds a header.
+    pub fn with_header(mut self, name: HeaderName, value: HeaderValue) -> Self {
+        self.headers.insert(name, value);
+        self
+    }
+
+    /// Adds a member beyond those of RFC 9457.
+    pub fn with(mut self, member: &str, value: impl Into<Value>) -> Self {
+        self.members.insert(member.to_owned(), value.into());
+        self
+    }
+
+    /// Returns the cause that goes to the log.
+    pub(crate) fn cause(&self) -> Option<&str> {
+        self.cause.as_deref()
+    }
+
+    /// Returns the problem of an error response that came without one, from a layer or the router.
+    pub(crate) fn of_status(status: StatusCode, method: &str, path: &str, headers: &HeaderMap) -> Self {
+        let shown: String = path.chars().take(80).collect();
+        match status {
+            StatusCode::NOT_FOUND => {
+                let detail = format!("there is nothing at {shown:?}; GET / lists the resources");
+                Self::new(status, "not-found", "Not found", detail)
+            }
+            StatusCode::METHOD_NOT_ALLOWED => {
+                let allowed = headers.get(header::ALLOW).and_then(|allow| allow.to_str().ok());
+                let method: String = method.chars().take(20).collect();
+                let detail = format!("found {method:?}, {shown:?} takes {}", allowed.unwrap_or("no method"));
+                Self::new(status, "method-not-allowed", "Method not allowed", detail)
+            }
+            StatusCode::PAYLOAD_TOO_LARGE => {
+                let detail = "the request's body is longer than this resource takes";
+                Self::new(status, "body-too-large", "Body too large", detail)
+            }
+            StatusCode::SERVICE_UNAVAILABLE => {
+                Self::timeout("the answer took too long; try again in a few seconds", 2)
+            }
+            _ => Self::new(status, "refused", "Refused", "the request could not be served"),
+        }
+    }
+
+    /// Writes the body into a response that this problem made.
+    pub(crate) fn render(self, response: Response, instance: String) -> Response {
+        let (mut head, _) = response.into_parts();
+        let mut body = self.members;
+        body.insert("type".into(), format!("urn:slag:problem:{}", self.kind).into());
+        body.insert("title".into(), self.title.into());
+        body.insert("status".into(), self.status.as_u16().into());
+        body.insert("detail".into(), self.detail.into());
+        body.insert("instance".into(), instance.into());
+        for replaced in [header::CONTENT_LENGTH, header::TRANSFER_ENCODING] {
+            head.headers.remove(replaced);
+        }
+        head.headers.extend(self.headers);
+        let content_type = HeaderValue::from_static("application/problem+json");
+        head.headers.insert(header::CONTENT_TYPE, content_type);
+        head.headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
+        Response::from_parts(head, Value::Object(body).to_string().into())
+    }
+}
+
+impl IntoResponse for Problem {
+    fn into_response(self) -> Response {
+        let mut response = self.status.into_response();
+        response.extensions_mut().insert(self);
+        response
+    }
+}

@@ -1,0 +1,35 @@
+use axum::body::{Body, Bytes, to_bytes};
+use axum::http::{Request, StatusCode};
+use tower::ServiceExt;
+
+use super::*;
+
+fn routes() -> Routes<()> {
+    let near = Parameter { name: "near", example: "x,y,z", summary: "rank by distance too".into() };
+    Routes::default()
+        .get("/query", "things that match", async || "found")
+        .parameters([near])
+        .post("/position", "where the robot is", 4, async |body: Bytes| body)
+}
+
+#[tokio::test]
+async fn the_help_lists_what_the_router_serves() {
+    let (router, table) = routes().with_help("A service.");
+    let ask = async |method: &Method, path: &str, body: &'static str| {
+        let request = Request::builder().method(method).uri(path).body(Body::from(body)).expect("a request");
+        let response = router.clone().oneshot(request).await.expect("infallible");
+        let status = response.status();
+        (status, to_bytes(response.into_body(), 1 << 16).await.expect("whole"))
+    };
+    let (_, help) = ask(&Method::GET, "/", "").await;
+    let help = std::str::from_utf8(&help).expect("text");
+    let lines: Vec<Vec<&str>> =
+        help.lines().map(|line| line.splitn(2, "  ").map(str::trim).collect()).collect();
+    assert!(help.starts_with("A service.\n\nGET /query "), "{help}");
+    for Route { method, path, summary, .. } in &table {
+        assert_eq!(ask(method, path, "1 2").await.0, StatusCode::OK, "{method} {path}");
+        assert!(lines.contains(&vec![format!("{method} {path}").as_str(), summary]), "{help}");
+    }
+    assert!(help.contains("\n    near=x,y,z  ") && help.contains(" rank by distance too\n"), "{help}");
+    assert_eq!(ask(&Method::POST, "/position", "1 2 3").await.0, StatusCode::PAYLOAD_TOO_LARGE);
+}

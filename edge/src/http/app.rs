@@ -1,0 +1,87 @@
+//! The service's state.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use slag_service::problem::Problem;
+use tokio::sync::{Semaphore, watch};
+
+use super::metrics::Metrics;
+use super::settings::Settings;
+use crate::fetch::follow::Following;
+use crate::query::Engine;
+
+/// The service's state.
+pub struct App {
+    pub(super) engine: Engine,
+    pub(super) settings: Settings,
+    /// A permit for each query in progress.
+    pub(super) permits: Arc<Semaphore>,
+    pub(super) metrics: Metrics,
+    pub(super) following: Option<Arc<Following>>,
+    is_reloading: AtomicBool,
+    n_reload_attempts: watch::Sender<u64>,
+}
+
+impl App {
+    /// Serves an engine's generation, and those that later fetches bring.
+    pub fn new(engine: Engine, settings: Settings) -> Arc<Self> {
+        Self::following(engine, settings, None)
+    }
+
+    /// Serves an engine as [`App::new`] does, and hands the positions of `POST /position` to `following`.
+    pub fn following(engine: Engine, settings: Settings, following: Option<Arc<Following>>) -> Arc<Self> {
+        Arc::new(Self {
+            engine,
+            permits: Arc::new(Semaphore::new(settings.max_queries)),
+            settings,
+            metrics: Metrics::default(),
+            following,
+            is_reloading: AtomicBool::new(false),
+            n_reload_attempts: watch::Sender::new(0),
+        })
+    }
+
+    /// Returns a counter of finished attempts to load another generation.
+    pub fn reload_attempts(&self) -> watch::Receiver<u64> {
+        self.n_reload_attempts.subscribe()
+    }
+
+    /// Starts loading in the background if the cache changed and no load is in progress. One `stat` call.
+    pub(super) fn reload_if_stale(self: &Arc<Self>) {
+        if !self.engine.is_stale() || self.is_reloading.swap(true, Ordering::AcqRel) {
+            return;
+        }
+        let app = Arc::clone(self);
+        tokio::task::spawn_blocking(move || app.reload());
+    }
+
+    /// Loads the generation of the latest fetch, unless a load is in progress. Blocks; queries do not wait.
+    pub fn reload_now(&self) {
+        if !self.is_reloading.swap(true, Ordering::AcqRel) {
+            self.reload();
+        }
+    }
+
+    fn reload(&self) {
+        let counter = match self.engine.reload() {
+            Ok(()) => &self.metrics.reloads,
+            Err(error) => {
+                tracing::warn!("the newest generation does not open: {}", crate::error_line(&error));
+                &self.metrics.reload_failures
+            }
+        };
+        counter.fetch_add(1, Ordering::Relaxed);
+        self.is_reloading.store(false, Ordering::Release);
+        self.n_reload_attempts.send_modify(|n| *n += 1);
+    }
+
+    /// Runs blocking or computing work off the async threads.
+    pub(super) async fn blocking<T: Send + 'static>(
+        self: &Arc<Self>,
+        work: impl FnOnce(&Arc<Self>) -> Result<T, Problem> + Send + 'static,
+    ) -> Result<T, Problem> {
+        let app = Arc::clone(self);
+        tokio::task::spawn_blocking(move || work(&app)).await.unwrap_or_else(|e| Err(Problem::internal(e)))
+    }
+}

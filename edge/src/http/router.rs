@@ -1,0 +1,54 @@
+//! The routes.
+
+use std::io;
+use std::sync::Arc;
+
+use axum::Router;
+use axum::http::{HeaderName, HeaderValue, header};
+use slag_service::listener;
+use slag_service::request::observed;
+use slag_service::routes::Routes;
+use tokio::net::TcpListener;
+
+use super::app::App;
+use super::{params, position, query, status};
+
+/// First line of the help text.
+const TITLE: &str = "slag-edge answers text queries about the scene around the robot.";
+/// The description for programs, kept by hand; a test compares it with the routes, parameters and answers.
+pub(super) const OPENAPI: &str = include_str!("openapi.json");
+const JSON: (HeaderName, HeaderValue) = (header::CONTENT_TYPE, HeaderValue::from_static("application/json"));
+
+/// Returns the routes.
+pub(super) fn routes() -> Routes<Arc<App>> {
+    Routes::default()
+        .get("/query", "objects, clusters or Gaussians that match texts, best first", query::query)
+        .parameters(params::parameters())
+        .get("/status", "scene, generation, encoder, shards, and whether the scene is past its expiry", status::status)
+        .post(
+            "/position",
+            "where the robot is, if it is followed; JSON: x, y, z, or lat, lon, height",
+            position::MAX_BODY_BYTES,
+            position::position,
+        )
+        .get("/healthz", "whether the process is alive", async || "alive\n")
+        .get("/readyz", "whether a scene is loaded and fits the text model", status::ready)
+        .get("/metrics", "counters in Prometheus' text format", status::metrics)
+        .get("/openapi.json", "description of this service for programs", async || ([JSON], OPENAPI))
+}
+
+/// Returns the service, without a listener.
+pub(super) fn router(app: Arc<App>) -> Router {
+    let responses = Arc::clone(&app.metrics.responses);
+    let (router, _) = routes().with_help(TITLE);
+    observed(router.with_state(app), responses)
+}
+
+/// Serves until `stop` completes, then lets requests in progress finish within the drain deadline.
+///
+/// # Errors
+/// [`io::ErrorKind::TimedOut`] when the deadline cut requests off.
+pub async fn serve(app: Arc<App>, listener: TcpListener, stop: impl Future<Output = ()>) -> io::Result<()> {
+    let limits = app.settings.connections;
+    Ok(listener::serve(router(app), listener, limits, stop).await?)
+}

@@ -1,0 +1,57 @@
+//! `GET /status`, `GET /readyz` and `GET /metrics`.
+
+use std::sync::Arc;
+
+use axum::Json;
+use axum::extract::State;
+use serde_json::{Value, json};
+use slag_service::metrics::Exposition;
+use slag_service::problem::Problem;
+
+use super::app::App;
+use super::problem::query_problem;
+use crate::query::Status;
+
+pub async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Problem> {
+    app.blocking(|app| {
+        app.reload_if_stale();
+        let snapshot = app.engine.snapshot().map_err(query_problem)?;
+        app.engine.check_encoder(&snapshot).map_err(query_problem)?;
+        if app.engine.text_is_alive() {
+            Ok("ready\n")
+        } else {
+            Err(Problem::internal("the text model has stopped"))
+        }
+    })
+    .await
+}
+
+pub async fn status(State(app): State<Arc<App>>) -> Result<Json<Value>, Problem> {
+    app.blocking(|app| {
+        app.reload_if_stale();
+        let snapshot = app.engine.snapshot();
+        let error = snapshot.as_ref().map_or_else(
+            |e| Some(e.to_string()),
+            |snapshot| app.engine.check_encoder(snapshot).err().map(|e| e.to_string()),
+        );
+        let manifest = snapshot.as_ref().ok().map(|snapshot| &snapshot.manifest);
+        let expires_unix_secs = manifest.and_then(|manifest| manifest.expires_unix_secs);
+        // An expired scene still answers: an old map is better than none, if the client can tell.
+        let is_expired = manifest.is_some_and(|m| m.check_expiry(crate::now_unix_secs()).is_err());
+        let following = app.following.as_ref().map(|following| following.status());
+        let scene = snapshot.as_ref().ok().map(|snapshot| Status::of(snapshot));
+        let is_ready = error.is_none() && app.engine.text_is_alive();
+        let version = env!("CARGO_PKG_VERSION");
+        let text_model = app.engine.encoder();
+        Ok(Json(json!({
+            "version": version, "is_ready": is_ready, "error": error, "text_model": text_model, "scene": scene,
+            "expires_unix_secs": expires_unix_secs, "is_expired": is_expired, "following": following,
+        })))
+    })
+    .await
+}
+
+pub async fn metrics(State(app): State<Arc<App>>) -> Exposition {
+    let n_in_progress = app.settings.max_queries - app.permits.available_permits();
+    app.metrics.render(n_in_progress, app.engine.snapshot().ok().as_deref())
+}

@@ -1,0 +1,95 @@
+//! Requests to the database, repeated while their errors may pass.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use qdrant_client::{Qdrant, QdrantError};
+
+use super::error::PushError;
+use super::options::PushOptions;
+
+/// Longest pause between two attempts.
+const MAX_RETRY_DELAY: Duration = Duration::from_secs(30);
+
+/// The client of a database.
+pub(super) struct Database<'a> {
+    pub(super) client: Qdrant,
+    options: &'a PushOptions,
+    n_retries: AtomicU64,
+}
+
+impl<'a> Database<'a> {
+    pub(super) fn new(options: &'a PushOptions) -> Result<Self, PushError> {
+        let client = Qdrant::from_url(&options.url)
+            .api_key(options.api_key.as_deref())
+            .timeout(options.timeout)
+            .connect_timeout(options.timeout)
+            // The check prints to standard output.
+            .skip_compatibility_check()
+            .build()
+            .map_err(|cause| database_error(options, "set up the client", cause))?;
+        Ok(Self { client, options, n_retries: AtomicU64::new(0) })
+    }
+
+    /// Returns the number of repeated attempts.
+    pub(super) fn n_retries(&self) -> u64 {
+        self.n_retries.load(Ordering::Relaxed)
+    }
+
+    /// Sends a request until it succeeds, fails permanently, or no attempts are left.
+    pub(super) async fn attempt<T, F>(&self, action: &'static str, request: impl Fn() -> F) -> Result<T, PushError>
+    where
+        F: Future<Output = Result<T, QdrantError>>,
+    {
+        let mut delay = self.options.retry_delay;
+        for _ in 0..self.options.n_retries {
+            match request().await {
+                Err(e) if may_pass(&e) => {
+                    self.n_retries.fetch_add(1, Ordering::Relaxed);
+                    let asked = match &e {
+                        QdrantError::ResourceExhaustedError { retry_after_seconds, .. } => {
+                            Duration::from_secs(*retry_after_seconds)
+                        }
+                        _ => Duration::ZERO,
+                    };
+                    tracing::warn!("{action}: {e}; trying again");
+                    tokio::time::sleep(delay.max(asked).min(MAX_RETRY_DELAY)).await;
+                    delay = delay.saturating_mul(2);
+                }
+                answer => return answer.map_err(|cause| database_error(self.options, action, cause)),
+            }
+        }
+        request().await.map_err(|cause| database_error(self.options, action, cause))
+    }
+}
+
+fn database_error(options: &PushOptions, action: &'static str, cause: QdrantError) -> PushError {
+    PushError::Database { url: options.url.clone(), action, cause: Box::new(cause) }
+}
+
+/// gRPC status codes (`statuscodes.md` of its specification).
+mod code {
+    pub(super) const CANCELLED: i32 = 1;
+    pub(super) const UNKNOWN: i32 = 2;
+    pub(super) const DEADLINE_EXCEEDED: i32 = 4;
+    pub(super) const RESOURCE_EXHAUSTED: i32 = 8;
+    pub(super) const ABORTED: i32 = 10;
+    pub(super) const INTERNAL: i32 = 13;
+    pub(super) const UNAVAILABLE: i32 = 14;
+}
+
+/// Returns whether the same request may succeed later.
+fn may_pass(error: &QdrantError) -> bool {
+    match error {
+        QdrantError::ResourceExhaustedError { .. } | QdrantError::Io(_) => true,
+        QdrantError::ResponseError { status } => match status.code() as i32 {
+            code::UNAVAILABLE | code::DEADLINE_EXCEEDED | code::RESOURCE_EXHAUSTED | code::ABORTED => true,
+            // The client's own time limit, and a connection that broke during a request.
+            code::CANCELLED | code::UNKNOWN => true,
+            // A refused connection.
+            code::INTERNAL => status.message().starts_with("Failed to connect"),
+            _ => false,
+        },
+        _ => false,
+    }
+}

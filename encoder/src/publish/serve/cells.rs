@@ -1,0 +1,108 @@
+//! `GET /v1/cells` and `GET /v1/coverage.geojson`.
+
+use std::collections::BTreeMap;
+
+use axum::Json;
+use axum::extract::rejection::QueryRejection;
+use axum::extract::{Query, State};
+use axum::http::header;
+use axum::response::{IntoResponse, Response};
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+use slag_common::Hash32;
+use slag_common::frames::Aabb;
+use slag_common::manifest::{Manifest, ShardRecord};
+use slag_common::shard::Profile;
+use slag_service::problem::Problem;
+
+use super::problem::{bad_parameter, not_geo_referenced};
+use super::state::{AppState, Snapshot};
+use crate::publish::geographic;
+
+/// A centre, in one of two frames, and a radius.
+#[derive(Clone, Copy, Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct CellsQuery {
+    x: Option<f64>,
+    y: Option<f64>,
+    z: Option<f64>,
+    lat: Option<f64>,
+    lon: Option<f64>,
+    height: Option<f64>,
+    radius: Option<f64>,
+}
+
+impl CellsQuery {
+    /// Returns centre and radius in the world frame.
+    fn ball_in_world(self, manifest: &Manifest) -> Result<(DVec3, f64), Problem> {
+        let radius = match self.radius {
+            Some(radius) if radius >= 0.0 && radius.is_finite() => radius,
+            _ => {
+                let expected = "radius is required: a finite number, not negative, in units of the world frame";
+                return Err(bad_parameter(expected));
+            }
+        };
+        let centre = match self {
+            Self { x: Some(x), y: Some(y), z: Some(z), lat: None, lon: None, height: None, .. } => {
+                DVec3::new(x, y, z)
+            }
+            Self { x: None, y: None, z: None, lat: Some(lat), lon: Some(lon), height, .. } => {
+                geographic::world_from_geographic(manifest, lat, lon, height)
+                    .map_err(|e| bad_parameter(e.to_string()))?
+            }
+            _ => return Err(bad_parameter("give the centre as x, y and z, or as lat and lon (and height)")),
+        };
+        if !centre.is_finite() {
+            return Err(bad_parameter("the centre must be finite"));
+        }
+        Ok((centre, radius))
+    }
+}
+
+#[derive(Serialize)]
+pub(super) struct CellsAnswer {
+    generation: u64,
+    encoder_id: Hash32,
+    cells: Vec<CellAnswer>,
+}
+
+#[derive(Serialize)]
+struct CellAnswer {
+    cell_id: u32,
+    bounds: Aabb,
+    n_gaussians: u32,
+    /// From the centre to the box, world units; 0 inside.
+    distance: f64,
+    shards: BTreeMap<Profile, ShardRecord>,
+}
+
+pub(super) async fn cells(
+    State(service): AppState,
+    query: Result<Query<CellsQuery>, QueryRejection>,
+) -> Result<Json<CellsAnswer>, Problem> {
+    let Query(query) = query.map_err(|e| bad_parameter(e.body_text()))?;
+    let search = move |snapshot: &Snapshot| {
+        let manifest = snapshot.world();
+        let (centre, radius) = query.ball_in_world(manifest)?;
+        let near = snapshot.index.within(centre, radius).into_iter().map(|i| &manifest.cells[i]);
+        let cells = near.map(|cell| CellAnswer {
+            cell_id: cell.cell_id,
+            bounds: cell.bounds,
+            n_gaussians: cell.n_gaussians,
+            distance: cell.bounds.distance_to(centre),
+            shards: cell.shards.clone(),
+        });
+        let cells = cells.collect();
+        Ok(CellsAnswer { generation: manifest.generation, encoder_id: manifest.encoder.id, cells })
+    };
+    service.with_current(search).await.map(Json)
+}
+
+pub(super) async fn coverage(State(service): AppState) -> Result<Response, Problem> {
+    let draw = |snapshot: &Snapshot| {
+        let drawn = geographic::coverage(snapshot.world()).map_err(not_geo_referenced)?;
+        Ok(drawn.to_string())
+    };
+    let text = service.with_current(draw).await?;
+    Ok(([(header::CONTENT_TYPE, "application/geo+json")], text).into_response())
+}

@@ -1,0 +1,120 @@
+//! `GET /v1/manifest` and `GET /v1/objects/{hash}`.
+
+use std::io;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+
+use axum::body::Body;
+use axum::extract::rejection::PathRejection;
+use axum::extract::{Path as UrlPath, State};
+use axum::http::{HeaderMap, HeaderName, Method, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use slag_common::Hash32;
+use slag_service::problem::Problem;
+use slag_service::range::{EntityTag, Selection};
+use tokio::io::{AsyncRead, AsyncReadExt, AsyncSeekExt, ReadBuf};
+use tokio::sync::OwnedSemaphorePermit;
+use tokio_util::io::ReaderStream;
+
+use super::problem;
+use super::state::{AppState, Snapshot};
+
+/// Pieces in which objects are read and sent.
+const PIECE_BYTES: usize = 64 << 10;
+const BINARY: [(HeaderName, &str); 1] = [(header::CONTENT_TYPE, "application/octet-stream")];
+
+pub(super) async fn manifest(State(service): AppState, headers: HeaderMap) -> Result<Response, Problem> {
+    let published = |snapshot: &Snapshot| Ok((snapshot.reader.current().hash, snapshot.manifest.clone()));
+    let (hash, signed) = service.with_current(published).await?;
+    let tag = EntityTag::new(hash);
+    let about = [(header::ETAG, tag.as_str()), (header::CACHE_CONTROL, "no-cache")];
+    if tag.is_known_to(&headers) {
+        return Ok((StatusCode::NOT_MODIFIED, about).into_response());
+    }
+    Ok((about, BINARY, signed).into_response())
+}
+
+pub(super) async fn object(
+    State(service): AppState,
+    method: Method,
+    hash: Result<UrlPath<Hash32>, PathRejection>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let UrlPath(hash) = hash.map_err(|e| problem::bad_parameter(e.body_text()))?;
+    let tag = EntityTag::new(hash);
+    let about = [
+        (header::ETAG, tag.as_str()),
+        (header::CACHE_CONTROL, "public, max-age=31536000, immutable"),
+        (header::ACCEPT_RANGES, "bytes"),
+    ];
+    let is_known = tag.is_known_to(&headers);
+    let opened = service.with_current(move |snapshot| open_object(snapshot, hash, !is_known)).await?;
+    let Opened { file: Some(file), len_bytes } = opened else {
+        return Ok((StatusCode::NOT_MODIFIED, about).into_response());
+    };
+    let (status, start, n_bytes) = match Selection::of_request(&method, &headers, &tag, len_bytes) {
+        Selection::Unsatisfiable => return Err(problem::range_not_satisfiable(len_bytes)),
+        Selection::Whole => (StatusCode::OK, 0, len_bytes),
+        Selection::Part(part) => (StatusCode::PARTIAL_CONTENT, *part.start(), part.end() - part.start() + 1),
+    };
+    let mut sizes: Vec<(HeaderName, String)> = vec![(header::CONTENT_LENGTH, n_bytes.to_string())];
+    if status == StatusCode::PARTIAL_CONTENT {
+        let end = start + n_bytes - 1;
+        sizes.push((header::CONTENT_RANGE, format!("bytes {start}-{end}/{len_bytes}")));
+    }
+    let body = if method == Method::HEAD {
+        Body::empty()
+    } else {
+        let permit = Arc::clone(&service.downloads).try_acquire_owned().map_err(|_| problem::busy())?;
+        let mut file = tokio::fs::File::from_std(file);
+        let sought = file.seek(io::SeekFrom::Start(start)).await;
+        sought.map_err(|e| Problem::internal(format!("{hash}: {e}")))?;
+        let download = Download { file: file.take(n_bytes), _permit: permit };
+        Body::from_stream(ReaderStream::with_capacity(download, PIECE_BYTES))
+    };
+    let mut response = (status, about, BINARY, body).into_response();
+    for (name, value) in sizes {
+        let value = value.parse().map_err(|_| Problem::internal(format!("header {name}: {value}")))?;
+        response.headers_mut().insert(name, value);
+    }
+    Ok(response)
+}
+
+/// A listed object: its length, and its file where the content is needed.
+struct Opened {
+    file: Option<std::fs::File>,
+    len_bytes: u64,
+}
+
+fn open_object(snapshot: &Snapshot, hash: Hash32, with_file: bool) -> Result<Opened, Problem> {
+    let listed = snapshot.objects.get(&hash);
+    let len_bytes = *listed.ok_or_else(|| problem::not_published(&format!("object {hash}")))?;
+    if !with_file {
+        return Ok(Opened { file: None, len_bytes });
+    }
+    let file = fs_err::File::open(snapshot.reader.object_path(hash)).map_err(Problem::internal)?;
+    let found_bytes = file.metadata().map_err(Problem::internal)?.len();
+    if found_bytes != len_bytes {
+        let path = file.path().display();
+        let cause = format!("{path}: found {found_bytes} bytes, the manifest lists {len_bytes}");
+        return Err(Problem::internal(cause));
+    }
+    Ok(Opened { file: Some(file.into_file()), len_bytes })
+}
+
+/// An object being sent; holds its permit until it is sent or the client is gone.
+struct Download {
+    file: tokio::io::Take<tokio::fs::File>,
+    _permit: OwnedSemaphorePermit,
+}
+
+impl AsyncRead for Download {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.file).poll_read(context, buffer)
+    }
+}
