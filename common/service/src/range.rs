@@ -68,7 +68,8 @@ impl Selection {
         if set.starts_with(optional_blanks) || set.ends_with(optional_blanks) {
             return Self::Whole;
         }
-        let mut specs = set.split(',').map(|spec| spec.trim_matches(optional_blanks)).filter(|s| !s.is_empty());
+        let mut specs =
+            set.split(',').map(|spec| spec.trim_matches(optional_blanks)).filter(|s| !s.is_empty());
         let (Some(spec), None) = (specs.next(), specs.next()) else { return Self::Whole };
         let Some((first, last)) = spec.split_once('-') else { return Self::Whole };
         let (Some(first), Some(last)) = (position(first), position(last)) else { return Self::Whole };
@@ -166,7 +167,9 @@ mod tests {
         let pieces = ["", "0", "1", "9", "10", "18446744073709551615", "18446744073709551616", "x"];
         for (first, last) in pieces.iter().flat_map(|a| pieces.iter().map(move |b| (a, b))) {
             for len_bytes in [0, 1, 2, 10, 11, u64::MAX] {
-                if let Selection::Part(part) = Selection::of_range(&format!("bytes={first}-{last}"), len_bytes) {
+                if let Selection::Part(part) =
+                    Selection::of_range(&format!("bytes={first}-{last}"), len_bytes)
+                {
                     assert!(part.start() <= part.end() && *part.end() < len_bytes, "{part:?} of {len_bytes}");
                 }
             }

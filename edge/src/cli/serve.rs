@@ -72,7 +72,8 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
         tracing::warn!("{error}");
     }
     let settings = Settings::default();
-    let (drain, blocking_threads) = (settings.connections.drain_timeout, settings.max_queries + SPARE_BLOCKING_THREADS);
+    let (drain, blocking_threads) =
+        (settings.connections.drain_timeout, settings.max_queries + SPARE_BLOCKING_THREADS);
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(ASYNC_THREADS)
         .max_blocking_threads(blocking_threads)

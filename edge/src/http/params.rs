@@ -20,16 +20,28 @@ pub fn parameters() -> [Parameter; 12] {
     let default_precision = Precision::default();
     [
         text("text", "chair", "what to look for; several are answered in one pass, as a batch"),
-        text("negatives", "canonical", "or none, or a,b,c: scores are relevancy against these (default: none)"),
+        text(
+            "negatives",
+            "canonical",
+            "or none, or a,b,c: scores are relevancy against these (default: none)",
+        ),
         parameter("limit", "10", format!("most answers to a text (default: {DEFAULT_LIMIT})")),
         text("threshold", "0.1", "least cosine, or relevancy with negatives (default: the scene's)"),
         text("near", "x,y,z", "where the asker is: answers have distances and nearer ones rank higher"),
         text("radius", "r", "only within this distance of near"),
         text("box", "x,y,z,x,y,z", "only between two corners"),
-        parameter("kind", "clusters", format!("{kind} (default: objects where the scene has them, else clusters)")),
+        parameter(
+            "kind",
+            "clusters",
+            format!("{kind} (default: objects where the scene has them, else clusters)"),
+        ),
         text("voxel", "v", "edge of the voxels that join Gaussians to clusters"),
         parameter("min_count", "n", format!("smaller clusters are dropped (default: {DEFAULT_MIN_COUNT})")),
-        parameter("precision", "measured", format!("{precision}, fastest first (default: {default_precision})")),
+        parameter(
+            "precision",
+            "measured",
+            format!("{precision}, fastest first (default: {default_precision})"),
+        ),
         parameter("format", "json", format!("{format}; arrow: Gaussians as columns")),
     ]
 }

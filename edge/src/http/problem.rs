@@ -65,9 +65,11 @@ pub fn query_problem(error: QueryError) -> Problem {
         }
         QueryError::Text(TextError::Encode(error)) | QueryError::Negatives(TextError::Encode(error)) => {
             match error {
-                EncodeError::EmptyText => {
-                    parameter_problem(RequestError::new(parameter, "nothing to look for", "words to look for"))
-                }
+                EncodeError::EmptyText => parameter_problem(RequestError::new(
+                    parameter,
+                    "nothing to look for",
+                    "words to look for",
+                )),
                 EncodeError::UnknownPhrase { text, n_known, near } => {
                     unknown_words(text, format!("one of {n_known} phrases"), near)
                 }

@@ -60,9 +60,8 @@ async fn answer(
     let Query(pairs) = pairs.map_err(|e| parameter_problem(no_pairs(&e.body_text())))?;
     let (request, format) = params::parse(&pairs, headers).map_err(parameter_problem)?;
     request.check().map_err(parameter_problem)?;
-    let permit = Arc::clone(&app.permits)
-        .try_acquire_owned()
-        .map_err(|_| overloaded(app.settings.max_queries))?;
+    let permit =
+        Arc::clone(&app.permits).try_acquire_owned().map_err(|_| overloaded(app.settings.max_queries))?;
     let answering = app.blocking(move |app| {
         app.reload_if_stale();
         let reply = app.engine.answer(&request).map_err(query_problem)?;
@@ -75,8 +74,7 @@ async fn answer(
         Ok((first, (!is_whole).then_some((pieces, permit))))
     });
     let limit = app.settings.query_timeout;
-    let (first, rest) =
-        tokio::time::timeout(limit, answering).await.map_err(|_| timeout(limit))??;
+    let (first, rest) = tokio::time::timeout(limit, answering).await.map_err(|_| timeout(limit))??;
     let body = match rest {
         None => Body::from(first),
         Some((pieces, permit)) => {

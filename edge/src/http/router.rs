@@ -24,7 +24,11 @@ pub(super) fn routes() -> Routes<Arc<App>> {
     Routes::default()
         .get("/query", "objects, clusters or Gaussians that match texts, best first", query::query)
         .parameters(params::parameters())
-        .get("/status", "scene, generation, encoder, shards, and whether the scene is past its expiry", status::status)
+        .get(
+            "/status",
+            "scene, generation, encoder, shards, and whether the scene is past its expiry",
+            status::status,
+        )
         .post(
             "/position",
             "where the robot is, if it is followed; JSON: x, y, z, or lat, lon, height",

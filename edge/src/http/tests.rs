@@ -72,7 +72,7 @@ impl Service {
     }
 }
 
-/// A failed test must end, too: the runtime waits for whoever waits at the gate.
+/// A failed test must end too: the runtime waits for every task at the gate.
 impl Drop for Service {
     fn drop(&mut self) {
         open_gate(&self.gate);
@@ -235,7 +235,7 @@ async fn too_many_questions_are_turned_away() {
     assert_eq!(service.get("/query?text=0").await.0, StatusCode::OK);
 }
 
-/// Who no longer waits still counts against the limit while the work goes on.
+/// A query that timed out counts against the limit until its work ends.
 #[tokio::test]
 async fn a_slow_answer_is_cut_off_and_keeps_its_place() {
     let settings =
@@ -417,8 +417,7 @@ async fn stops_gracefully() {
 #[tokio::test]
 async fn stopping_has_a_deadline() {
     let settings = Settings::default();
-    let connections =
-        ConnectionLimits { drain_timeout: Duration::from_millis(1), ..settings.connections };
+    let connections = ConnectionLimits { drain_timeout: Duration::from_millis(1), ..settings.connections };
     let service = Service::new(Some(&chair(None)), Settings { connections, ..settings });
     let (address, stop, end) = serve_for_real(&service).await;
     let _waiting = talk(address, ASK_AND_WAIT).await;

@@ -23,6 +23,7 @@ use crate::store::StoreReader;
 /// Where models come from.
 #[derive(Clone, Debug, Args)]
 pub struct ModelArgs {
+    /// Folder or name of the models.
     #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR", help = MODELS_HELP)]
     pub models: Option<PathBuf>,
     /// How they run.

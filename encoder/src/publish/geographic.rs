@@ -1,5 +1,5 @@
-//! Where a scene lies on the earth: footprints of its cells in longitude and latitude (GeoJSON,
-//! RFC 7946), and geographic selections in the world frame.
+//! A scene on the earth: footprints of its cells in longitude and latitude (GeoJSON, RFC 7946), and
+//! geographic positions in the world frame.
 
 use geo::{ConvexHull, Coord, GeodesicArea, LineString, MultiPoint, MultiPolygon, Point, Polygon};
 use geojson::{Feature, FeatureCollection, Geometry, GeometryValue, JsonObject, feature::Id};
@@ -11,24 +11,24 @@ use slag_common::manifest::Manifest;
 /// Why a scene cannot be placed on the earth.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum GeographicError {
-    /// The scene's place on the earth is not known.
+    /// The scene has no geo-reference.
     #[error(
         "the scene is not geo-referenced; ask in the world frame (x, y, z), or encode it with a geo-reference"
     )]
     NotGeoReferenced,
-    /// A latitude that does not exist.
+    /// The latitude is out of range.
     #[error("latitude {found_deg} is not within -90..=90 degrees; check the order of lat and lon")]
     Latitude {
         /// Found.
         found_deg: f64,
     },
-    /// A longitude that does not exist.
+    /// The longitude is out of range.
     #[error("longitude {found_deg} is not within -180..=180 degrees")]
     Longitude {
         /// Found.
         found_deg: f64,
     },
-    /// A height that is no number.
+    /// The height is not finite.
     #[error("height {found_m} is not a finite number of metres")]
     Height {
         /// Found.
@@ -40,8 +40,8 @@ fn reference_of(manifest: &Manifest) -> Result<&GeoReference, GeographicError> {
     manifest.geo_reference.as_ref().ok_or(GeographicError::NotGeoReferenced)
 }
 
-/// Returns a geographic position in the world frame, metres; without a height, at that of the world
-/// frame's origin.
+/// Returns a geographic position in the world frame, metres. Without a height, the position has the height
+/// of the world frame's origin.
 ///
 /// # Errors
 /// [`GeographicError`].
@@ -68,15 +68,15 @@ pub fn world_from_geographic(
 /// A piece of the earth's surface.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Footprint {
-    /// In degrees of longitude and latitude. Rings are closed and counter-clockwise; what lies across the
-    /// antimeridian is cut in two (RFC 7946, 3.1.9), what lies around a pole is the band of latitudes
+    /// Degrees of longitude and latitude. Rings are closed and counter-clockwise. A shape across the
+    /// antimeridian is cut in two (RFC 7946, 3.1.9); a shape around a pole becomes the band of latitudes
     /// that covers it.
     pub polygons: MultiPolygon,
     /// Geodesic area on the WGS 84 ellipsoid.
     pub area_m2: f64,
 }
 
-/// Returns the horizontal rectangle of a box, at half its height.
+/// Returns the footprint of a box, at half its height.
 pub fn footprint(bounds: &Aabb, reference: &GeoReference) -> Footprint {
     Footprint::of_ring(&rectangle(bounds), bounds.centre().z, reference)
 }
@@ -104,17 +104,17 @@ impl Footprint {
         let mut ring: Vec<Coord> = Vec::with_capacity(ring_in_world.len());
         for corner in ring_in_world {
             let place = reference.geographic_from_world(DVec3::new(corner.x, corner.y, z));
-            // Longitudes run on past 180, so that neighbours on the ground are neighbours in degrees.
+            // Longitudes continue past 180, so that neighbours on the ground are neighbours in degrees.
             let near = ring.last().map_or(place.longitude_deg, |last| last.x);
             ring.push(Coord { x: nearest_turn(place.longitude_deg, near), y: place.latitude_deg });
         }
-        // Of the ring before it is cut: a parallel that bounds a band is no geodesic.
+        // The area of the uncut ring: the parallel that bounds a band is not a geodesic.
         let area_m2 = closed(ring.clone()).geodesic_area_unsigned();
         Self { polygons: MultiPolygon(polygons(ring)), area_m2 }
     }
 }
 
-/// Cuts a ring whose longitudes run on past 180 into polygons within -180..=180.
+/// Cuts a ring with longitudes beyond 180 into polygons within -180..=180.
 fn polygons(ring: Vec<Coord>) -> Vec<Polygon> {
     let (Some(first), Some(last)) = (ring.first(), ring.last()) else { return vec![] };
     if (nearest_turn(first.x, last.x) - first.x).abs() > 180.0 {
@@ -130,7 +130,7 @@ fn polygons(ring: Vec<Coord>) -> Vec<Polygon> {
     parts.into_iter().filter(|part| part.len() > 2).map(closed).collect()
 }
 
-/// Returns the longitude, whole turns added, that is nearest to another.
+/// Returns the longitude plus the whole turns that bring it nearest to another.
 fn nearest_turn(longitude_deg: f64, near_deg: f64) -> f64 {
     longitude_deg + 360.0 * ((near_deg - longitude_deg) / 360.0).round()
 }
@@ -152,7 +152,7 @@ fn clip(ring: Vec<Coord>, side: f64) -> Vec<Coord> {
     kept
 }
 
-/// Returns the latitudes from a ring's corner nearest to the equator to the pole that it encloses.
+/// Returns the band of latitudes from a ring's corner nearest to the equator to the enclosed pole.
 fn polar_band(ring: &[Coord]) -> Polygon {
     let nearest = ring.iter().map(|corner| corner.y.abs()).fold(90.0, f64::min);
     let north = ring[0].y > 0.0;
@@ -162,7 +162,7 @@ fn polar_band(ring: &[Coord]) -> Polygon {
 }
 
 fn closed(ring: Vec<Coord>) -> Polygon {
-    // `Polygon::new` repeats the first corner at the end; a ring of equal corners is closed by hand.
+    // `Polygon::new` repeats the first corner at the end, except in a ring of equal corners.
     let mut ring = LineString(ring);
     if ring.0.len() > 1 && ring.0.first() == ring.0.last() {
         ring.0.push(ring.0[0]);
@@ -173,7 +173,7 @@ fn closed(ring: Vec<Coord>) -> Polygon {
 /// Returns the footprints of a scene's cells as GeoJSON: one feature a cell, with `cell_id`,
 /// `n_gaussians` and `area_m2` (geodesic, on the WGS 84 ellipsoid).
 ///
-/// The foreign member `scene` has the name, the generation and the convex `outline` of all cells.
+/// The foreign member `scene` has the name, the generation, and the convex `outline` of all cells.
 ///
 /// # Errors
 /// [`GeographicError::NotGeoReferenced`].

@@ -1,4 +1,4 @@
-//! Last stage: makes a scene available, over HTTP to robots and as points to a Qdrant database.
+//! Last stage: serves a scene to robots over HTTP, and pushes it as points to a Qdrant database.
 
 pub mod geographic;
 #[cfg(feature = "qdrant")]

@@ -76,7 +76,8 @@ async fn long_heads_are_refused() {
     let running = start(ConnectionLimits::default()).await;
     let cookie = "x".repeat(30_000);
     let mut stream =
-        connect(running.address, &format!("GET /quick HTTP/1.1\r\nHost: x\r\nCookie: {cookie}\r\n\r\n")).await;
+        connect(running.address, &format!("GET /quick HTTP/1.1\r\nHost: x\r\nCookie: {cookie}\r\n\r\n"))
+            .await;
     let mut received = Vec::new();
     let _ = stream.read_to_end(&mut received).await;
     assert!(received.starts_with(b"HTTP/1.1 431"), "{}", String::from_utf8_lossy(&received));
@@ -105,5 +106,8 @@ async fn stopping_has_a_deadline() {
 async fn an_occupied_address_is_an_error_that_names_it() {
     let running = start(ConnectionLimits::default()).await;
     let refused = bind(running.address).await.expect_err("taken").to_string();
-    assert!(refused.contains(&running.address.to_string()) && refused.contains("another address"), "{refused}");
+    assert!(
+        refused.contains(&running.address.to_string()) && refused.contains("another address"),
+        "{refused}"
+    );
 }

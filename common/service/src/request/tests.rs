@@ -54,7 +54,10 @@ async fn every_error_is_a_problem_with_the_id_of_its_request() {
         assert!(!problem.to_string().contains("secret"), "{problem}");
     }
     let (response, problem) = ask(&router, Method::GET, "/refused").await;
-    assert_eq!((&response.headers()[header::RETRY_AFTER], &problem["limit"]), (&"7".parse().expect("a value"), &3.into()));
+    assert_eq!(
+        (&response.headers()[header::RETRY_AFTER], &problem["limit"]),
+        (&"7".parse().expect("a value"), &3.into())
+    );
 }
 
 /// Paths with parameters count as their route, unknown ones as one.

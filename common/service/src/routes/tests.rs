@@ -6,10 +6,12 @@ use super::*;
 
 fn routes() -> Routes<()> {
     let near = Parameter { name: "near", example: "x,y,z", summary: "rank by distance too".into() };
-    Routes::default()
-        .get("/query", "things that match", async || "found")
-        .parameters([near])
-        .post("/position", "where the robot is", 4, async |body: Bytes| body)
+    Routes::default().get("/query", "things that match", async || "found").parameters([near]).post(
+        "/position",
+        "where the robot is",
+        4,
+        async |body: Bytes| body,
+    )
 }
 
 #[tokio::test]

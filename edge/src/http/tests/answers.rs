@@ -33,7 +33,7 @@ async fn pieces(response: Response) -> Result<Vec<Vec<u8>>, axum::Error> {
     Ok(pieces)
 }
 
-/// However long an answer, no piece is: JSON of 60,000 Gaussians comes in pieces of 64 KiB.
+/// A long answer comes in short pieces: JSON of 60,000 Gaussians in pieces of 64 KiB.
 #[tokio::test]
 async fn long_answers_come_in_small_pieces() {
     let service = Service::new(Some(&many()), Settings::default());
@@ -128,7 +128,7 @@ async fn several_texts_make_a_batch() {
     assert_eq!(counts, [20_000, 20_000]);
 }
 
-/// Columns are asked for by name or by `Accept`, JSON otherwise; nothing found is columns without rows.
+/// `format` or `Accept` asks for columns, the default is JSON; an empty answer has columns without rows.
 #[tokio::test]
 async fn formats_are_negotiated() {
     let service = Service::with_chair();
@@ -154,8 +154,8 @@ async fn formats_are_negotiated() {
     assert!(reader.next().is_none());
 }
 
-/// A client that does not read loses its answer, not the robot its memory: the permit comes back, and what
-/// the client has does not look whole.
+/// A client that does not read loses its answer: the permit comes back, and the cut-off answer does not look
+/// complete.
 #[tokio::test]
 async fn answers_that_nobody_reads_are_given_up() {
     let settings = Settings { max_queries: 1, stream_timeout: Duration::from_secs(1), ..Settings::default() };

@@ -1,4 +1,4 @@
-//! The description for programs is that of this program.
+//! The description for programs matches this program.
 
 use std::collections::BTreeSet;
 

@@ -37,7 +37,11 @@ impl<'a> Database<'a> {
     }
 
     /// Sends a request until it succeeds, fails permanently, or no attempts are left.
-    pub(super) async fn attempt<T, F>(&self, action: &'static str, request: impl Fn() -> F) -> Result<T, PushError>
+    pub(super) async fn attempt<T, F>(
+        &self,
+        action: &'static str,
+        request: impl Fn() -> F,
+    ) -> Result<T, PushError>
     where
         F: Future<Output = Result<T, QdrantError>>,
     {

@@ -1,4 +1,4 @@
-//! Where the vectors of a push come from.
+//! Source of the vectors of a push.
 
 use std::path::PathBuf;
 
@@ -20,12 +20,12 @@ pub struct CellVectors {
     pub means_in_world: Vec<DVec3>,
     /// `[n][dim]` unit embeddings.
     pub embeddings: Vec<f16>,
-    /// Gaussians of the cell without an embedding; they are in no column.
+    /// Gaussians of the cell without an embedding; the columns omit them.
     pub n_without_evidence: u64,
 }
 
 impl CellVectors {
-    /// Checks that the columns fit each other.
+    /// Checks that the columns have matching lengths.
     pub(super) fn check(&self, cell_id: u32, dim: u32) -> Result<(), SourceError> {
         let (n_indices, n_means) = (self.input_indices.len(), self.means_in_world.len());
         let n_components = self.embeddings.len();
@@ -36,7 +36,7 @@ impl CellVectors {
     }
 }
 
-/// Gives the embeddings of a cell, the same ones in the same order at each call.
+/// Reads the embeddings of a cell, in the same order at each call.
 pub trait VectorSource: Send + Sync {
     /// Returns a cell's vectors.
     ///
@@ -45,7 +45,7 @@ pub trait VectorSource: Send + Sync {
     fn load(&self, cell: &CellRecord) -> Result<CellVectors, SourceError>;
 }
 
-/// Why a cell's vectors cannot be had.
+/// Why the vectors of a cell cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum SourceError {
     /// The scene was published without this profile.
@@ -64,12 +64,12 @@ pub enum SourceError {
     Shard {
         /// The shard's file.
         path: PathBuf,
-        /// What is wrong.
+        /// The damage.
         cause: ContainerError,
     },
-    /// Columns of different lengths.
+    /// The columns differ in length.
     #[error(
-        "cell {cell_id}: {n_indices} indices, {n_means} means, {n_components} components; expected one mean and {dim} components an index; this is a fault of the program, please report it"
+        "cell {cell_id}: {n_indices} indices, {n_means} means, {n_components} components; expected one mean and {dim} components an index; this is a bug, please report it"
     )]
     Columns {
         /// The cell.
@@ -83,7 +83,7 @@ pub enum SourceError {
         /// Components of one embedding.
         dim: u32,
     },
-    /// The shard is whole, but another than the manifest lists.
+    /// The shard is intact, but differs from the manifest.
     #[error("{}: {what} is {found}, the manifest says {expected}; encode again", path.display())]
     Mismatch {
         /// The shard's file.

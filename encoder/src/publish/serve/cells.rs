@@ -38,7 +38,8 @@ impl CellsQuery {
         let radius = match self.radius {
             Some(radius) if radius >= 0.0 && radius.is_finite() => radius,
             _ => {
-                let expected = "radius is required: a finite number, not negative, in units of the world frame";
+                let expected =
+                    "radius is required: a finite number, not negative, in units of the world frame";
                 return Err(bad_parameter(expected));
             }
         };

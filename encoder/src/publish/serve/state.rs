@@ -107,7 +107,8 @@ impl Service {
         if version == Some(snapshot.reader.stamp()) {
             return snapshot;
         }
-        let is_known_to_fail = |failed: &Failed| failed.version == version && failed.at.elapsed() < RETRY_PAUSE;
+        let is_known_to_fail =
+            |failed: &Failed| failed.version == version && failed.at.elapsed() < RETRY_PAUSE;
         if failed.as_ref().is_some_and(is_known_to_fail) {
             return snapshot;
         }
@@ -123,7 +124,9 @@ impl Service {
                 let is_new = failed.as_ref().is_none_or(|failed| failed.version != version);
                 if is_new {
                     let generation = snapshot.world().generation;
-                    tracing::warn!("the new manifest does not open, generation {generation} stays served: {error}");
+                    tracing::warn!(
+                        "the new manifest does not open, generation {generation} stays served: {error}"
+                    );
                 }
                 *failed = Some(Failed { version, at: Instant::now() });
                 self.n_reload_failures.fetch_add(1, Relaxed);
@@ -152,6 +155,10 @@ pub(super) async fn metrics(State(service): AppState) -> Result<impl IntoRespons
     text.gauge("downloads_in_progress", "Objects being sent.", n_downloads as u64);
     text.gauge("generation", "Generation served.", generation);
     text.counter("reloads_total", "Generations put in place after the start.", &service.n_reloads);
-    text.counter("reload_failures_total", "Reads of a manifest that did not open.", &service.n_reload_failures);
+    text.counter(
+        "reload_failures_total",
+        "Reads of a manifest that did not open.",
+        &service.n_reload_failures,
+    );
     Ok(text)
 }

@@ -376,7 +376,6 @@ async fn overload_and_timeout_are_problems() {
     let late = get_with(&router, "/never", &[]).await;
     assert!(late.problem(StatusCode::SERVICE_UNAVAILABLE).contains("too long"));
     assert_eq!(late.header(header::RETRY_AFTER), "2");
-
 }
 
 #[tokio::test]
