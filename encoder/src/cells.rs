@@ -7,18 +7,18 @@ use slag_common::frames::Aabb;
 /// Marks a Gaussian that no cell holds in [`CellSplit::cell_of_gaussian`].
 pub const NO_CELL: u32 = u32::MAX;
 
-/// Standard deviations that a Gaussian's extent reaches: 99.7 % of its mass along an axis, and
-/// beyond the 3.33 at which a rasteriser drops an opaque one only by a tenth.
+/// Extent of a Gaussian in standard deviations: 99.7 % of its mass along an axis, and a tenth less than the 3.33 at which a
+/// rasteriser drops an opaque one.
 const EXTENT_SIGMAS: f64 = 3.0;
 
-/// A cell with fewer Gaussians is never cut for its width alone: stray Gaussians far from the
-/// scene would otherwise each become a cell.
+/// A cell with fewer Gaussians is not cut for its width alone: otherwise each stray Gaussian far from the scene would
+/// become a cell.
 const MIN_GAUSSIANS_TO_NARROW: usize = 512;
 
-/// How large a cell may become.
+/// Limits of a cell's size.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct CellLimits {
-    /// Gaussians a cell.
+    /// Most Gaussians of a cell.
     pub max_gaussians: usize,
     /// Longest edge of the box around a cell's means, world units; `None` where units are not metres.
     pub max_width: Option<f64>,
@@ -35,7 +35,7 @@ pub struct Cell {
     pub bounds: Aabb,
 }
 
-/// Which cell holds which Gaussian.
+/// The partition of a scene into cells.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CellSplit {
     /// The cells; a cell's id is its index.
@@ -48,8 +48,8 @@ pub struct CellSplit {
     pub n_rejected: usize,
 }
 
-/// Splits a scene: a box with too many Gaussians is cut at the median of its longest axis, one that
-/// is too wide in the middle of it. The result depends on the Gaussians alone.
+/// Splits a scene: a box with too many Gaussians is cut at the median of its longest axis, a box that is too wide in the
+/// middle of it. The result depends only on the Gaussians and the limits.
 pub fn split(scene: &Gaussians, limits: CellLimits) -> CellSplit {
     let mut indices: Vec<u32> = (0..scene.len() as u32).filter(|i| scene.is_usable(*i as usize)).collect();
     let n_rejected = scene.len() - indices.len();
@@ -67,7 +67,7 @@ pub fn split(scene: &Gaussians, limits: CellLimits) -> CellSplit {
             limits.max_width.is_some_and(|max| size[axis] > max) && part.len() > MIN_GAUSSIANS_TO_NARROW;
         let cut = if part.len() > limits.max_gaussians.max(1) {
             let middle = part.len() / 2;
-            // Ties by index make the order strict, so that the halves are the same sets every time.
+            // Ties are broken by index: the halves are the same sets every time.
             part.select_nth_unstable_by(middle, |a, b| {
                 coordinate(a).total_cmp(&coordinate(b)).then(a.cmp(b))
             });
@@ -115,7 +115,7 @@ fn finish(scene: &Gaussians, part: &[u32], mean_bounds: Aabb) -> Cell {
     Cell { gaussians: keyed.into_iter().map(|(_, i)| i).collect(), mean_bounds, bounds }
 }
 
-/// Returns how far a Gaussian reaches along each world axis: `EXTENT_SIGMAS * sqrt(diag(R S² Rᵀ))`.
+/// Returns a Gaussian's extent along each world axis: `EXTENT_SIGMAS * sqrt(diag(R S² Rᵀ))`.
 fn extent(scene: &Gaussians, index: usize) -> DVec3 {
     let [w, x, y, z] = scene.rotations_wxyz[index].map(f64::from);
     let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());

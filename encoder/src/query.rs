@@ -2,7 +2,7 @@
 
 mod by_level;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::io::{self, Write};
 
 use glam::DVec3;
@@ -28,7 +28,7 @@ pub struct Scores {
     pub total_weights: Vec<f32>,
 }
 
-/// Why scores cannot be had.
+/// Scores cannot be computed.
 #[derive(Debug, thiserror::Error)]
 pub enum QueryError {
     /// The field cannot be read.
@@ -37,7 +37,7 @@ pub enum QueryError {
     /// A shard cannot be read.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// The query is a vector of another space.
+    /// The query's dimension differs from the store's.
     #[error(
         "the query has {found} components, the store's embeddings {expected}; use the models it was encoded with ({encoder})"
     )]
@@ -49,7 +49,7 @@ pub enum QueryError {
         /// The store's encoder.
         encoder: String,
     },
-    /// A field names a Gaussian that the scene does not have.
+    /// A field names an unknown Gaussian.
     #[error("cell {cell_id}: Gaussian {index} of a scene of {n}; the store is damaged, encode again")]
     Index {
         /// The cell.
@@ -75,7 +75,7 @@ pub enum QueryError {
     Shard {
         /// The cell.
         cell_id: u32,
-        /// What is wrong.
+        /// The damage.
         source: slag_common::container::ContainerError,
     },
 }
@@ -149,7 +149,7 @@ pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -
         };
         let (bytes, layout) = read(profile)?;
         let shard = layout.view(&bytes);
-        // All profiles have the same order; only the exact one says whose it is.
+        // All profiles have the same order; only the exact one has input indices.
         let (bytes, layout) = read(Profile::Exact)?;
         let exact =
             layout.view(&bytes).exact.ok_or(QueryError::NoShard { cell_id, profile: Profile::Exact })?;
@@ -161,7 +161,7 @@ pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -
     Ok(scores)
 }
 
-/// What an object's score counts in those of its Gaussians. On generated scenes anything up to a third changed little, and
+/// Share of the object's score in those of its Gaussians. On generated scenes anything up to a third changed little, and
 /// objects alone were worse; on the labelled house, with given masks, more was better.
 const OBJECT_SHARE: f32 = 0.3;
 
@@ -170,14 +170,14 @@ pub fn mixed(of_gaussian: f32, of_object: f32) -> f32 {
     (1.0 - OBJECT_SHARE) * of_gaussian + OBJECT_SHARE * of_object
 }
 
-/// The objects of a published scene, as robots get them.
+/// The objects of a published scene, as robots receive them.
 #[derive(Clone, Debug)]
 pub struct PublishedObjects {
     /// `[N]` in the order of the input file: each Gaussian's object, or [`NONE`].
     pub object_of: Vec<u32>,
     /// Of each object, ascending.
     pub ids: Vec<u64>,
-    /// How a bank of texts scores over them.
+    /// Mean and spread of the text bank's scores over them.
     pub calibration: Calibration,
     /// `[n][n_vectors][dim]`.
     vectors: Vec<f32>,
@@ -186,7 +186,7 @@ pub struct PublishedObjects {
 }
 
 impl PublishedObjects {
-    /// Reads the objects; `None` where the scene has none, or no exact shards that say which Gaussian is which.
+    /// Reads the objects; `None` if the scene has no objects, or no exact shards to identify Gaussians by.
     ///
     /// # Errors
     /// [`QueryError`].
@@ -253,8 +253,8 @@ impl PublishedObjects {
         cosines.chunks_exact(self.n_vectors).map(object_score).collect()
     }
 
-    /// Gives every Gaussian that belongs to an object a part of the object's score: what it shows is judged as a
-    /// whole, and where its shape is wrong the Gaussian's own score has the last word.
+    /// Mixes the object's score into that of each of its Gaussians: the thing is judged as a whole, and where its shape is wrong
+    /// the Gaussian's own score still decides.
     pub fn overlay(&self, of_objects: &[f32], cosines: &mut [f32]) {
         let of_gaussians = cosines.iter_mut().zip(&self.object_of).filter(|(_, object)| **object != NONE);
         of_gaussians.for_each(|(cosine, object)| {
@@ -284,6 +284,7 @@ pub fn best(reader: &StoreReader, scores: &Scores, n: usize) -> Result<Vec<Hit>,
         (0..scores.cosines.len() as u32).filter(|i| !scores.cosines[*i as usize].is_nan()).collect();
     order.sort_by(|a, b| scores.cosines[*b as usize].total_cmp(&scores.cosines[*a as usize]).then(a.cmp(b)));
     order.truncate(n);
+    let wanted: HashSet<u32> = order.iter().copied().collect();
     if order.is_empty() {
         return Ok(Vec::new());
     }
@@ -296,7 +297,7 @@ pub fn best(reader: &StoreReader, scores: &Scores, n: usize) -> Result<Vec<Hit>,
         let view = layout.view(&bytes);
         let indices = view.exact.map_or(&[][..], |exact| exact.input_indices);
         for (at, index) in indices.iter().enumerate() {
-            if order.contains(index) {
+            if wanted.contains(index) {
                 let cosine = scores.cosines[*index as usize];
                 hits.push(Hit { index: *index, cosine, position_in_world: view.position_in_world(at) });
             }
@@ -309,7 +310,7 @@ pub fn best(reader: &StoreReader, scores: &Scores, n: usize) -> Result<Vec<Hit>,
 /// Writes values as a NumPy array of one dimension (`.npy` version 1.0, little-endian f32).
 ///
 /// # Errors
-/// Whatever the writer gives.
+/// Errors of the writer.
 pub fn write_npy(mut out: impl Write, values: &[f32]) -> io::Result<()> {
     let mut header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({},), }}", values.len());
     // Magic, version and length take 10 bytes; the whole is a multiple of 64 and ends in a newline.
@@ -326,7 +327,7 @@ pub fn write_npy(mut out: impl Write, values: &[f32]) -> io::Result<()> {
 mod tests {
     use super::*;
 
-    /// By hand: a Gaussian with an object, one without, and one that only its object says something of.
+    /// Computed by hand: a Gaussian with an object, one without, and one without evidence of its own.
     #[test]
     fn gaussians_take_a_part_of_their_objects_score() {
         let objects = PublishedObjects {

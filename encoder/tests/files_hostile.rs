@@ -1,4 +1,4 @@
-//! The encoder's own files and the geo-reference, damaged in 1,000 ways each: refused with the reason, never a panic.
+//! The encoder's own files and the geo-reference, each damaged in 1,000 ways: refused with the reason, never a panic.
 
 use std::path::Path;
 
@@ -12,7 +12,7 @@ use slag_math::random::mix64;
 
 const N_MUTATIONS: u64 = 1000;
 
-/// Returns a damaged copy: cut for every fourth seed, else with one to three flipped bits.
+/// Returns a damaged copy: truncated for every fourth seed, else with one to three flipped bits.
 fn damaged(bytes: &[u8], seed: u64) -> Vec<u8> {
     let random = |salt: u64| mix64(seed * 31 + salt) as usize;
     if seed.is_multiple_of(4) {
@@ -36,22 +36,22 @@ fn contributions() -> ViewContributions {
     }
 }
 
-/// Opens, reads and transposes a file of contributions as an encode does.
-fn read_sums(path: &Path) -> Result<(RegionTable, Vec<PartContributions>), ContributionError> {
+/// Opens, reads and transposes a contribution file, as an encode does.
+fn read_contributions(path: &Path) -> Result<(RegionTable, Vec<PartContributions>), ContributionError> {
     let (index, table) = ContributionIndex::open(&[path.to_owned()], 4, &[2, 2, 2, 2])?;
     let raw = index.read(0..index.parts().len())?;
     let contributions = index.transpose(&raw, &table)?;
     Ok((table, contributions))
 }
 
-/// What the sections hold lies under a checksum; only the zeros between them do not.
+/// Checksums cover the sections, but not the padding between them.
 #[test]
-fn sums_regions_and_fields_refuse_damage() {
+fn contributions_regions_and_fields_refuse_damage() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let path = dir.path().join("view.contributions");
     contributions().write(&path).expect("writes");
     let file = fs_err::read(&path).expect("reads");
-    let (table, parts) = read_sums(&path).expect("valid");
+    let (table, parts) = read_contributions(&path).expect("valid");
     let field = CellField::new(vec![8, 9], parts[0].clone(), &table, &mut [0.0; 8]);
     let (mut table_file, mut field_file) = (Vec::new(), Vec::new());
     table.write(&mut table_file).expect("writes to memory");
@@ -60,7 +60,7 @@ fn sums_regions_and_fields_refuse_damage() {
     for seed in 0..N_MUTATIONS {
         fs_err::remove_file(&path).expect("removes");
         fs_err::write(&path, damaged(&file, seed)).expect("writes");
-        match read_sums(&path) {
+        match read_contributions(&path) {
             Ok(read) => assert_eq!(read, (table.clone(), parts.clone()), "seed {seed}"),
             Err(error) => {
                 assert!(error.to_string().contains("view.contributions"), "{error}");

@@ -38,7 +38,7 @@ fn direction(random: &mut Random) -> Vec<f64> {
     unit(&(0..DIM).map(|_| uniform(random) - 0.5).collect::<Vec<_>>())
 }
 
-/// Takes a view of one cell, with a region a mask, through its file; returns the embeddings too.
+/// Writes and reads a view of one cell with a region per mask; returns its field, table and embeddings.
 fn one_cell(
     vectors: &[Vec<f32>],
     entries: Vec<Contribution>,
@@ -90,8 +90,8 @@ impl Seen {
         ((0..DIM).map(component).collect(), total)
     }
 
-    /// Returns the errors of the total weight (relative), of the mean length, of the unit embedding and of
-    /// its cosine with a query, the last two times the mean length; `None` where there is no evidence.
+    /// Returns the errors of the total weight (relative), of the mean length, of the unit embedding and of its cosine with a
+    /// query, the last two times the mean length; `None` if there is no evidence.
     fn errors(&self, query: &[f64]) -> Option<[f64; 4]> {
         let (field, table) = self.field();
         let (mean, total) = self.truth();
@@ -135,7 +135,7 @@ fn worst_of(a: [f64; 4], b: [f64; 4]) -> [f64; 4] {
     std::array::from_fn(|i| a[i].max(b[i]))
 }
 
-/// Two masks at an angle have a mean of length cos(angle / 2): what is left of antiparallel ones is noise.
+/// Two masks at an angle have a mean of length cos(angle / 2); antiparallel ones leave only noise.
 #[test]
 fn parallel_and_antiparallel_vectors() {
     let random = &mut Random::new(1);
@@ -170,7 +170,7 @@ fn parallel_and_antiparallel_vectors() {
 fn masks_that_disagree() {
     let random = &mut Random::new(2);
     let mut worst = [0.0; 4];
-    // Shares of the whole that do not cancel, about the limit below which there is no evidence.
+    // Shares that do not cancel, around the limit below which there is no evidence.
     for (share, has_evidence) in [(0.0, false), (1e-6, false), (9e-4, false), (1.1e-3, true), (1e-2, true)] {
         for n_pairs in [1, 30, 1000] {
             let mut terms: Vec<(Vec<f32>, f32)> = Vec::new();
@@ -206,7 +206,7 @@ fn a_billion_pixels_over_many_views() {
     print("contributions of views", "16,384 views, 1.07e9 pixels", errors, 1e-5);
 }
 
-/// What a model must not give and the models' crate refuses: no evidence, never a NaN in the field.
+/// Non-finite mask vectors, which slag-models refuses, give no evidence and never a NaN in the field.
 #[test]
 fn vectors_that_are_no_numbers_are_no_evidence() {
     for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX] {
@@ -249,15 +249,14 @@ fn exact_shard(vectors: &[Vec<f32>], means_in_world: Vec<DVec3>) -> AlignedBytes
     AlignedBytes::copy_of(&built.shards[0].bytes)
 }
 
-/// Components from 1 down to 1e-12 lie in the shard as f16: half a step of 2^-11, below 2^-14 half a
-/// step of 2^-24, and zero in the end.
+/// Components from 1 down to 1e-12 are stored as f16: off by half a step of 2^-11, below 2^-14 of 2^-24, and zero in the end.
 #[test]
 fn embeddings_stored_as_f16() {
     let random = &mut Random::new(4);
     let n = 300;
     let vectors: Vec<Vec<f32>> = (0..n)
         .map(|i| {
-            // Every tenth is a unit axis, so that 1 itself is met.
+            // Every tenth is a unit axis, so that 1 itself occurs.
             let raw = (0..DIM).map(|c| match (i % 10 == 0, c == i) {
                 (true, is_axis) => f64::from(u8::from(is_axis)),
                 _ => (1.0 - 2.0 * random.below(2) as f64) * 10.0_f64.powf(-12.0 * uniform(random)),
@@ -284,14 +283,14 @@ fn embeddings_stored_as_f16() {
         n_zero += stored.iter().zip(&expected).filter(|(s, e)| **s == f16::ZERO && **e != 0.0).count();
         n_subnormal += stored.iter().filter(|s| !s.is_normal() && **s != f16::ZERO).count();
     }
-    assert!(n_zero > 1000 && n_subnormal > 1000, "underflow must be met");
+    assert!(n_zero > 1000 && n_subnormal > 1000, "underflow must occur");
     println!(
         "| f16 embeddings | components 1e-12 to 1 | {worst_step:.3} half steps, vector {worst_vector:.1e} | claimed 1, 5e-4 |"
     );
     assert!(worst_step <= 1.0 && worst_vector <= 5e-4, "{worst_step} {worst_vector}");
 }
 
-/// Rows stand for their members to the stated radius, positions are right to half a step.
+/// Centroids are within the stated radius of their members, positions within half a step.
 #[test]
 fn shards_keep_their_bounds() {
     let random = &mut Random::new(5);
@@ -316,12 +315,12 @@ fn shards_keep_their_bounds() {
 
     let (mut nearest, mut farthest, mut score) = (f64::INFINITY, 0.0_f64, 0.0_f64);
     let queries: Vec<Vec<f64>> = centres.iter().cloned().chain((0..20).map(|_| direction(random))).collect();
-    for row in 0..shard.radii.len() {
+    for centroid in 0..shard.radii.len() {
         let mut stored = vec![0.0; DIM];
-        shard.decode_centroid(row, &mut stored);
-        let radius = f64::from(shard.radii[row]);
+        shard.decode_centroid(centroid, &mut stored);
+        let radius = f64::from(shard.radii[centroid]);
         let mut largest = 0.0_f64;
-        for member in shard.members(row) {
+        for member in shard.members(centroid) {
             let difference: Vec<f64> =
                 vectors[input(member)].iter().zip(&stored).map(|(v, s)| f64::from(*v) - s).collect();
             largest = largest.max(length(&difference));
@@ -333,7 +332,7 @@ fn shards_keep_their_bounds() {
         (nearest, farthest) = (nearest.min(radius / largest), farthest.max(radius / largest));
     }
     println!(
-        "| shards | 25 m cell 1e6 m away, {} rows | position {position:.6} half steps, radius over distance {nearest:.6} \
+        "| shards | 25 m cell 1e6 m away, {} centroids | position {position:.6} half steps, radius over distance {nearest:.6} \
          to {farthest:.6}, score {score:.3} radii |",
         shard.radii.len()
     );

@@ -1,5 +1,4 @@
-//! The coordinates in which a cell's embeddings are kept: few, and such that equal distances are equal
-//! errors of scores.
+//! The coordinates of a cell's embeddings: few, and such that equal distances are equal errors of scores.
 
 use half::f16;
 
@@ -11,17 +10,16 @@ use slag_math::matrix::{Panels, Rows};
 use slag_math::random::mix64;
 use slag_math::{dot, dot_f64};
 
-/// Share of the texts' covariance that is replaced by that of texts in all directions alike, so that a
-/// direction in which no text of the bank points is not thrown away.
+/// Share of an isotropic covariance in that of the texts: it keeps directions in which no text of the bank points.
 const ISOTROPIC_SHARE: f64 = 0.2;
 /// Most components.
 const MAX_COMPONENTS: usize = 128;
 
-/// Most texts of a bank, and fewest that say where queries point.
+/// Most texts of a bank, and fewest that show the directions of queries.
 const MAX_TEXTS: usize = 2048;
 const MIN_TEXTS: usize = 8;
 
-/// Texts that queries are expected to be like: `[n][dim]`, unit vectors in the space of the embeddings.
+/// Texts like the expected queries: `[n][dim]`, unit vectors in the space of the embeddings.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TextBank {
     /// Components.
@@ -31,8 +29,8 @@ pub struct TextBank {
 }
 
 impl TextBank {
-    /// Encodes a model's own vocabulary, or else everyday words, of which those that it does not know are left
-    /// out; pseudo-random directions where too few are left to say where queries point.
+    /// Encodes a model's own vocabulary, or else everyday words; words that the model does not know are left out. Too few words
+    /// are replaced by pseudo-random directions.
     pub fn of_model(encoder: &mut dyn TextEncoder) -> Self {
         let words: Vec<String> = match encoder.vocabulary() {
             Some(words) => words.to_vec(),
@@ -45,7 +43,7 @@ impl TextBank {
         if bank.len() < MIN_TEXTS { Self::directions(bank.dim) } else { bank }
     }
 
-    /// Returns unit vectors in all directions alike.
+    /// Returns unit vectors in pseudo-random directions, isotropic.
     pub fn directions(dim: usize) -> Self {
         let mut vectors: Vec<f32> = (0..(256 * dim) as u64)
             .map(|i| (0..4).map(|k| (mix64(i << 2 | k) >> 40) as f32 / (1u64 << 23) as f32 - 1.0).sum())
@@ -76,7 +74,7 @@ pub struct ScoreMetric {
 }
 
 impl ScoreMetric {
-    /// Takes the metric of a bank; without texts, that of texts in all directions alike.
+    /// Returns the metric of a bank; an isotropic one without texts.
     pub fn new(dim: usize, bank: &TextBank) -> Self {
         let mut moments = vec![0.0; dim * dim];
         if !bank.is_empty() {
@@ -161,7 +159,7 @@ impl Basis {
             left -= values.get(n_components).copied().unwrap_or(0.0);
             n_components += 1;
         }
-        // Groups come in pairs, and each has a component.
+        // Subspaces come in pairs, and each has a component.
         n_components = n_components.next_multiple_of(2).min(dim);
         let mut forms = vec![0.0; n_components * dim];
         let mut basis = vec![0.0; n_components * dim];
@@ -200,7 +198,7 @@ impl Basis {
         out
     }
 
-    /// Turns the coordinates: new component c is `rotation[c] . old components` (rows `[m][m]`, orthonormal).
+    /// Rotates the coordinates: new component c is `rotation[c] . old components` (rows `[m][m]`, orthonormal).
     pub fn rotate(&mut self, rotation: &[f32]) {
         let (m, dim) = (self.n_components, self.mean.len());
         for vectors in [&mut self.forms, &mut self.basis] {

@@ -1,4 +1,4 @@
-//! Which centroid each Gaussian belongs to: clusters of points, as many as the error asks for.
+//! Clusters of points, as many as the error requires: each becomes a centroid.
 
 use rayon::prelude::*;
 
@@ -8,10 +8,10 @@ use slag_math::matrix::{Panels, Rows};
 const SPLIT_ROUNDS: usize = 3;
 /// Rounds of k-means over all centroids at the end.
 const REFINE_ROUNDS: usize = 1;
-/// So few clusters are all split: each is far from good enough.
+/// Up to so many clusters are all split: each is still far too large.
 const FEW_CLUSTERS: usize = 16;
-/// Share of the clusters that are split at a time: the worst, so that the order is almost that of
-/// splitting one by one, and threads have work.
+/// One in so many clusters is split at a time, the worst first: the order is almost that of splitting one by one, and
+/// threads have work.
 const SPLIT_SHARE: usize = 8;
 
 /// Clusters of points.
@@ -41,7 +41,7 @@ pub fn clusters(points: Rows<'_>, max_rms: f32, max_clusters: usize) -> Clusters
     let mut centres: Vec<f32> = split.into_iter().flat_map(|cluster| cluster.centre).collect();
     for _ in 0..REFINE_ROUNDS {
         codes = nearest(points, &centres);
-        centres = transpose(points, &mut codes, centres.len() / points.width);
+        centres = recentre(points, &mut codes, centres.len() / points.width);
     }
     Clusters { codes, centres }
 }
@@ -55,8 +55,8 @@ pub fn nearest(points: Rows<'_>, centres: &[f32]) -> Vec<u32> {
     Panels::new(width, half_norms.len(), |i, c| centres[c * width + i]).largest(points, &half_norms)
 }
 
-/// Returns the means of clusters, and numbers those that have points anew.
-fn transpose(points: Rows<'_>, codes: &mut [u32], n_clusters: usize) -> Vec<f32> {
+/// Returns the means of the clusters that have points, and renumbers these.
+fn recentre(points: Rows<'_>, codes: &mut [u32], n_clusters: usize) -> Vec<f32> {
     let mut members = vec![Vec::new(); n_clusters];
     codes.iter().enumerate().for_each(|(point, code)| members[*code as usize].push(point as u32));
     let mut number = 0;
@@ -121,8 +121,8 @@ fn split(points: Rows<'_>, max_rms: f32, max_clusters: usize) -> Vec<Cluster> {
     done
 }
 
-/// 2-means, started from the member farthest from the centre and the one farthest from that; the cluster
-/// itself where all members coincide.
+/// Splits a cluster by 2-means, starting from the member farthest from the centre and the member farthest from that.
+/// Returns the cluster itself if all members coincide.
 fn split_in_two(points: Rows<'_>, cluster: Cluster) -> Result<[Cluster; 2], Cluster> {
     let farthest = |from: &[f32]| {
         let distance = |point: &u32| (squared_distance(points.get(*point as usize), from), *point);

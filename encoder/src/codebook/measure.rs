@@ -6,10 +6,10 @@ use slag_common::shard::ScoreErrors;
 use super::basis::TextBank;
 use slag_math::matrix::{Panels, Rows};
 
-/// Gaussians of a cell whose scores are compared.
+/// Most sampled Gaussians of a cell.
 const SAMPLE: usize = 1024;
 
-/// Some Gaussians' true scores.
+/// The true scores of some Gaussians.
 pub struct Sample<'a> {
     bank: &'a TextBank,
     texts: Panels,
@@ -38,7 +38,7 @@ impl ScoreMoments {
 }
 
 impl<'a> Sample<'a> {
-    /// Takes every so many of the embeddings, in the order given.
+    /// Takes every n-th embedding, in the given order.
     pub fn new(embeddings: Rows<'_>, order: &[u32], bank: &'a TextBank) -> Self {
         let dim = embeddings.width;
         let stride = order.len().div_ceil(SAMPLE).max(1);

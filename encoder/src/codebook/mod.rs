@@ -1,10 +1,9 @@
 //! Stage 5: an error-bounded codebook per cell, and a residual code where one centroid is not enough.
 //!
-//! Embeddings cluster strongly, so a cell stores K centroids and each Gaussian belongs to one. Rows, and what
-//! they leave, are kept in coordinates of the cell's own ([`basis`]), in which equal distances are equal
-//! errors of scores; K and the code's length follow from the errors asked for ([`cluster`], [`residual`]).
-//! Hard radii are taken from the full embeddings, and scores' errors measured over a bank of texts
-//! ([`measure`]).
+//! Embeddings cluster strongly, so a cell stores K centroids, and each Gaussian belongs to one. Centroids and residuals are
+//! stored in the cell's own coordinates ([`basis`]), in which equal distances are equal errors of scores. K and the
+//! length of the code follow from the requested errors ([`cluster`], [`residual`]). Hard radii are computed from the
+//! full embeddings; errors of scores are measured over a bank of texts ([`measure`]).
 
 pub mod basis;
 pub mod cluster;
@@ -21,15 +20,15 @@ use measure::ScoreMoments;
 use residual::ResidualCode;
 use slag_math::matrix::{Panels, Rows};
 
-/// What a root mean square is to a mean of absolute errors, for a distribution with heavy tails: measured
-/// on the labelled house, 1.3 to 1.4; normally distributed errors have 1.25.
+/// Ratio of the root mean square of errors to their mean absolute value: 1.3 to 1.4 measured on the labelled house, whose
+/// errors have heavy tails; 1.25 for normally distributed errors.
 const RMS_OF_MEAN: f32 = 1.35;
 /// Share of the residual code's error budget that the dimensions without a component may take.
 const TAIL_SHARE: f32 = 0.3;
-/// Embeddings whose decoded form is at hand at a time.
+/// Embeddings decoded at a time.
 const CHUNK: usize = 1024;
 
-/// Bytes that building a codebook takes for each embedding, at most: components, residuals, codes.
+/// Returns the most bytes per embedding that building a codebook takes: components, residuals, codes.
 pub fn working_bytes_per_embedding(dim: usize) -> usize {
     4 * dim.min(128) * size_of::<f32>() + 64
 }
@@ -38,15 +37,15 @@ pub fn working_bytes_per_embedding(dim: usize) -> usize {
 /// standard deviation over the scene).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CodebookSettings {
-    /// Error of the compact profile that is good enough.
+    /// Largest accepted error of the compact profile.
     pub compact_error: f32,
-    /// Error of the balanced profile that is good enough.
+    /// Largest accepted error of the balanced profile.
     pub balanced_error: f32,
-    /// A centroid has so many Gaussians on average, or more.
+    /// Fewest Gaussians per centroid, on average.
     pub min_gaussians_per_centroid: usize,
-    /// Half bytes of a residual code, at most.
+    /// Most subspaces of the residual code (half a byte each); below 2 there is no code.
     pub max_subspaces: usize,
-    /// Whether residuals are also kept in 8 bits a component, as exact shards have them.
+    /// Whether residuals are also stored in 8 bits per component, as in exact shards.
     pub has_fine: bool,
 }
 
@@ -63,17 +62,17 @@ impl Default for CodebookSettings {
     }
 }
 
-/// What errors are measured by.
+/// The metric and the texts that errors of scores are measured by.
 pub struct ScoreMetricContext {
-    /// How far scores move.
+    /// Metric of score errors.
     pub metric: ScoreMetric,
     /// Texts whose scores are compared.
     pub bank: TextBank,
-    /// Spread of a text's scores over the scene, as far as it is known before.
+    /// Spread of a text's scores over the scene, as estimated beforehand.
     pub spread: f32,
 }
 
-/// A cell's centroids, and who belongs to them. Gaussians are in the order of the centroids.
+/// A cell's centroids and their members. Gaussians are in the order of the centroids.
 pub struct Codebook {
     /// `[n]`: the given embeddings in the order of the centroids, then as given.
     pub order: Vec<u32>,
@@ -89,21 +88,21 @@ pub struct Codebook {
     pub basis_steps: Vec<f32>,
     /// `[K][m]`.
     pub centroids: Vec<i8>,
-    /// What the centroids' components are multiplied by.
+    /// Step of the centroids' components.
     pub centroid_step: f32,
-    /// `[K]`: no member is farther from its centroid.
+    /// `[K]`: largest distance of a member from its centroid.
     pub radii: Vec<f32>,
     /// Errors of the centroids' scores.
     pub errors: ScoreErrors,
-    /// Of all texts' scores.
+    /// Moments of all texts' scores.
     pub moments: ScoreMoments,
-    /// What the centroids leave; absent where they are enough.
+    /// The residual code; `None` if the centroids are good enough.
     pub residuals: Option<CodebookResiduals>,
 }
 
 /// The residual code of a codebook.
 pub struct CodebookResiduals {
-    /// Groups and codewords.
+    /// Subspaces and codewords.
     pub code: ResidualCode,
     /// `[K]`.
     pub residual_scales: Vec<f32>,
@@ -111,11 +110,11 @@ pub struct CodebookResiduals {
     pub residual_norms: Vec<f32>,
     /// `[ceil(n / 32)][G / 2][32]`.
     pub codes: Vec<u8>,
-    /// `[K]`: no member is farther from its decoded form.
+    /// `[K]`: largest distance of a member from its decoded form.
     pub radii: Vec<f32>,
     /// Errors of the decoded scores.
     pub errors: ScoreErrors,
-    /// Where they were asked for.
+    /// Residuals in 8 bits, if requested.
     pub fine: Option<FineResiduals>,
 }
 
@@ -131,8 +130,7 @@ pub struct FineResiduals {
     pub errors: ScoreErrors,
 }
 
-/// Builds the codebook of some unit embeddings. The result depends on them and the score_context alone, not on
-/// threads.
+/// Builds the codebook of some unit embeddings. The result does not depend on threads.
 pub fn build(
     embeddings: Rows<'_>,
     score_context: &ScoreMetricContext,
@@ -147,7 +145,7 @@ pub fn build(
     let found = cluster::clusters(Rows::all(&points, m), rms(settings.compact_error), max_centroids);
     let (order, centroid_starts) = sorted(&found.codes, found.centres.len() / m);
 
-    // Turned so that components are the residuals' eigenvectors, each residual measured by its centroid's.
+    // Rotated to the residuals' eigenvectors; each residual is divided by its centroid's scale.
     let mut residuals = points;
     residuals.par_chunks_exact_mut(m).zip(&found.codes).for_each(|(point, centroid)| {
         let centre = &found.centres[*centroid as usize * m..][..m];
@@ -179,7 +177,7 @@ pub fn build(
     let turn: Vec<f32> = components_in_order.iter().flat_map(|c| &turn[c * m..][..m]).copied().collect();
     fitted.rotate(&turn);
 
-    // Rows in 8 bits: each component has a range of its own, which its basis vector takes on.
+    // Centroids in 8 bits: each component has its own range, which goes into its basis vector.
     let centres = Panels::new(m, m, |old, new| turn[new * m + old]).product(Rows::all(&found.centres, m));
     let ranges = ranges(&centres, m, &scales);
     let centroid_step = 1.0 / 127.0;
@@ -214,7 +212,7 @@ pub fn build(
         });
         let (codes, mut decoded) = code.encode(Rows::all(&coded, m));
         let covered = code.n_components();
-        // In the centroids' units, multiplied by the centroids' scales: what a reader decodes.
+        // As readers decode: in the centroids' units, multiplied by the centroids' scales.
         let mut residual_norms = vec![0.0f32; scales.len()];
         let mut codewords = code.codewords.clone();
         for starts in code.subspace_starts.windows(2) {
@@ -287,14 +285,14 @@ fn residual_scales(residuals: Rows<'_>, centroid_starts: &[u32]) -> Vec<f32> {
             let squares = |at: usize| residuals.get(at).iter().map(|v| f64::from(v * v)).sum::<f64>();
             let members = members[0] as usize..members[1] as usize;
             let n = members.len() as f64;
-            // Where all members coincide there is nothing to code; a division by zero is avoided.
+            // At least 1e-6: members that coincide must not cause a division by zero.
             ((members.map(squares).sum::<f64>() / n).sqrt() as f32).max(1e-6)
         })
         .collect()
 }
 
-/// Returns the largest absolute value of each component, but no less than what keeps residuals, which have all
-/// components, within what half floats and readers take.
+/// Returns the largest absolute value of each component. A lower bound keeps residuals within the range of half floats and
+/// readers.
 fn ranges(centres: &[f32], m: usize, scales: &[f32]) -> Vec<f32> {
     let largest_scale = scales.iter().copied().fold(0.0, f32::max);
     let mut ranges = vec![(largest_scale / 8.0).max(1e-3); m];
@@ -304,7 +302,7 @@ fn ranges(centres: &[f32], m: usize, scales: &[f32]) -> Vec<f32> {
     ranges
 }
 
-/// Turns components into vectors, as readers do.
+/// Decodes components to vectors, as readers do.
 #[derive(Clone, Copy)]
 struct Decoder<'a> {
     dim: usize,
@@ -339,7 +337,7 @@ impl Decoder<'_> {
     }
 }
 
-/// Returns what the centroids as stored leave of each embedding, in shard order, divided by the centroids' scales.
+/// Returns the residuals of the stored centroids, in shard order, divided by the centroids' scales.
 fn coded(
     embeddings: Rows<'_>,
     basis: &Basis,
@@ -362,8 +360,8 @@ fn coded(
     points
 }
 
-/// Rounds residuals (`[n][m]`, divided by their centroids' scales) to 8 bits; returns them with what they decode to,
-/// in readers' components. Steps follow the components' sizes, scales the largest of a centroid's members.
+/// Rounds residuals (`[n][m]`, divided by their centroids' scales) to 8 bits. Returns them and their decoded form, in
+/// readers' components. Steps follow the components' sizes, scales the largest of a centroid's members.
 fn fine(
     residuals: &[f32],
     m: usize,
@@ -381,7 +379,7 @@ fn fine(
         }
     }
     let n = (residuals.len() / m).max(1) as f64;
-    // A component that no residual has needs no step, but is divided by one.
+    // At least 1e-9: a component without residuals must not cause a division by zero.
     let sizes: Vec<f32> = squares.iter().map(|s| ((s / n).sqrt() as f32).max(1e-9)).collect();
     let steps: Vec<f32> = sizes.iter().zip(ranges).map(|(size, range)| size / range).collect();
     let (mut scales, mut values) =
@@ -437,7 +435,7 @@ fn compare(
                 for ((d, r), e) in decoded.iter_mut().zip(of_centroid).zip(embedding) {
                     *d = e - (r + *d);
                 }
-                // What the products' rounding may have added: their terms' sizes times the steps of a sum.
+                // Bound of the products' rounding: the sizes of their terms times the number of additions.
                 let rounding = added.as_ref().map_or(0.0, |(_, lengths, m, components)| {
                     let terms = components[place * m..][..*m].iter().zip(lengths).map(|(c, l)| c.abs() * l);
                     terms.sum::<f32>() * (*m as f32 + 4.0) * f32::EPSILON

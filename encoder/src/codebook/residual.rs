@@ -1,7 +1,8 @@
-//! What one centroid leaves of its members: a codeword of 16 for each of some subspaces of components.
+//! The residual code: a residual, an embedding minus its centroid, becomes one of 16 codewords in each subspace of
+//! components.
 //!
-//! Components are the eigenvectors of the residuals, so that subspaces can be coded one by one (optimised
-//! product quantisation: Ge, He, Ke and Sun 2013; a code of four bits: what a byte shuffle looks up).
+//! Components are the eigenvectors of the residuals, so subspaces can be coded one by one (optimised product quantisation: Ge,
+//! He, Ke and Sun 2013). Codes have four bits, which a byte shuffle can look up.
 
 use half::f16;
 use rayon::prelude::*;
@@ -13,20 +14,20 @@ use slag_math::matrix::Rows;
 
 /// Residuals that codewords are trained on.
 const TRAINING_SAMPLE: usize = 6144;
-/// Most components of a subspace: with more, 16 codewords say little of each.
-const MAX_GROUP: usize = 8;
+/// Most components of a subspace: 16 codewords say little about each of more.
+const MAX_SUBSPACE_COMPONENTS: usize = 8;
 /// Numbers of subspaces are multiples of this.
-const GROUPS_STEP: usize = 4;
+const SUBSPACES_STEP: usize = 4;
 
 /// A residual code.
 pub struct ResidualCode {
     /// `[G + 1]`.
     pub subspace_starts: Vec<u32>,
-    /// Group by subspace `[16][components of the subspace]`.
+    /// Subspace by subspace, `[16][components of the subspace]`.
     pub codewords: Vec<f16>,
 }
 
-/// Returns the rotation (centroids `[m][m]`) to the residuals' eigenvectors, and their eigenvalues.
+/// Returns the rotation (rows `[m][m]`) to the residuals' eigenvectors, and their eigenvalues.
 pub fn rotation(residuals: Rows<'_>) -> (Vec<f32>, Vec<f64>) {
     let m = residuals.width;
     let stride = residuals.len().div_ceil(TRAINING_SAMPLE).max(1);
@@ -35,15 +36,15 @@ pub fn rotation(residuals: Rows<'_>) -> (Vec<f32>, Vec<f64>) {
         .par_chunks(512)
         .map(|chunk| {
             let mut sums = vec![0.0f64; m * m];
-            for centroid in chunk {
-                let residual = residuals.get(*centroid as usize);
+            for row in chunk {
+                let residual = residuals.get(*row as usize);
                 for (i, a) in residual.iter().enumerate() {
                     sums[i * m..][..=i].iter_mut().zip(residual).for_each(|(s, b)| *s += f64::from(a * b));
                 }
             }
             sums
         })
-        // Collected in order: the sum is the same for any number of threads.
+        // Collected in order: the sums are the same for any number of threads.
         .collect::<Vec<_>>();
     let mut total = vec![0.0; m * m];
     moments.iter().for_each(|sums| total.iter_mut().zip(sums).for_each(|(t, s)| *t += s));
@@ -57,8 +58,8 @@ pub fn rotation(residuals: Rows<'_>) -> (Vec<f32>, Vec<f64>) {
     (vectors.into_iter().map(|v| v as f32).collect(), values)
 }
 
-/// Puts components into subspaces so that all together lose least, and returns the components in the order of
-/// their subspaces (those in none last) and where the subspaces start.
+/// Assigns components to subspaces with the least total loss. Returns the components in the order of their subspaces
+/// (those in none last), and the starts of the subspaces.
 pub fn subspaces(variances: &[f64], n_subspaces: usize) -> (Vec<usize>, Vec<u32>) {
     let log = |c: usize| log_variance(variances[c]);
     let mut members: Vec<Vec<usize>> = (0..n_subspaces).map(|c| vec![c]).collect();
@@ -70,7 +71,7 @@ pub fn subspaces(variances: &[f64], n_subspaces: usize) -> (Vec<usize>, Vec<u32>
             loss(d + 1, log_products[g] + log(c)) - loss(d, log_products[g])
         };
         let best = (0..n_subspaces)
-            .filter(|g| members[*g].len() < MAX_GROUP)
+            .filter(|g| members[*g].len() < MAX_SUBSPACE_COMPONENTS)
             .min_by(|a, b| rise(*a).total_cmp(&rise(*b)));
         match best.filter(|g| rise(*g) < *variance) {
             Some(g) => {
@@ -95,9 +96,9 @@ impl ResidualCode {
             .map(|subspace| {
                 let (from, to) = (subspace[0] as usize, subspace[1] as usize);
                 let points: Vec<f32> =
-                    sample.iter().flat_map(|centroid| &residuals.get(*centroid)[from..to]).copied().collect();
+                    sample.iter().flat_map(|row| &residuals.get(*row)[from..to]).copied().collect();
                 let mut codewords = trained(Rows::all(&points, to - from), CODEWORDS);
-                // Fewer distinct residuals than codewords: the rest is never named.
+                // With fewer distinct residuals than codewords, the rest is never used.
                 codewords.resize(CODEWORDS * (to - from), 0.0);
                 codewords.into_iter().map(f16::from_f32).collect()
             })
@@ -165,10 +166,10 @@ pub fn trained(points: Rows<'_>, n_codewords: usize) -> Vec<f32> {
         let codes = nearest(points, &codewords);
         let mut sums = vec![0.0f64; codewords.len()];
         let mut counts = vec![0.0f64; codewords.len() / points.width];
-        for (centroid, code) in codes.iter().enumerate() {
+        for (point, code) in codes.iter().enumerate() {
             counts[*code as usize] += 1.0;
             let sum = &mut sums[*code as usize * points.width..][..points.width];
-            sum.iter_mut().zip(points.get(centroid)).for_each(|(s, v)| *s += f64::from(*v));
+            sum.iter_mut().zip(points.get(point)).for_each(|(s, v)| *s += f64::from(*v));
         }
         for (at, codeword) in codewords.iter_mut().enumerate() {
             let count = counts[at / points.width];
@@ -194,15 +195,12 @@ pub fn plan(
     let stride = residuals.len().div_ceil(TRAINING_SAMPLE).max(1);
     let sample: Vec<usize> = (0..residuals.len()).step_by(stride).collect();
     let mean_square = |error: &mut dyn FnMut(usize) -> f64| {
-        let total: f64 = sample
-            .iter()
-            .enumerate()
-            .map(|(at, centroid)| error(at) * f64::from(scales[*centroid]).powi(2))
-            .sum();
+        let total: f64 =
+            sample.iter().enumerate().map(|(at, row)| error(at) * f64::from(scales[*row]).powi(2)).sum();
         total / sample.len().max(1) as f64
     };
     let target = f64::from(max_rms).powi(2);
-    let norm = |centroid: usize| residuals.get(centroid).iter().map(|v| f64::from(v * v)).sum::<f64>();
+    let norm = |row: usize| residuals.get(row).iter().map(|v| f64::from(v * v)).sum::<f64>();
     if mean_square(&mut |at| norm(sample[at])) <= target {
         return None;
     }
@@ -213,7 +211,7 @@ pub fn plan(
     let train = |n_subspaces: usize| {
         let (order, starts) = subspaces(variances, n_subspaces);
         let points: Vec<f32> =
-            sample.iter().flat_map(|centroid| order.iter().map(|c| residuals.get(*centroid)[*c])).collect();
+            sample.iter().flat_map(|row| order.iter().map(|c| residuals.get(*row)[*c])).collect();
         let points = Rows::all(&points, m);
         let code = ResidualCode::train(points, starts);
         let (_, decoded) = code.encode(points);
@@ -225,21 +223,21 @@ pub fn plan(
         });
         (order, code, error)
     };
-    // A short code tells how far the residuals are from what the estimate takes them for; the length that is
-    // needed follows from it, and only that one is trained.
-    let few = (2 * GROUPS_STEP).min(max_subspaces);
+    // The error of a short code shows how far the residuals are from the estimate's Gaussian ones. The needed length follows,
+    // and only that code is trained.
+    let few = (2 * SUBSPACES_STEP).min(max_subspaces);
     let (order, code, error) = train(few);
     if error <= target || few == max_subspaces {
         return Some((order, code));
     }
     let factor = error / estimated_loss(variances, few);
-    let steps = (few..max_subspaces).step_by(GROUPS_STEP).skip(1);
+    let steps = (few..max_subspaces).step_by(SUBSPACES_STEP).skip(1);
     let enough = steps.into_iter().find(|n| factor * estimated_loss(variances, *n) <= target);
     let (order, code, _) = train(enough.unwrap_or(max_subspaces));
     Some((order, code))
 }
 
-/// Returns what a code of so many subspaces leaves of the residuals, as mean square, if they were Gaussian.
+/// Returns the mean squared error that a code of so many subspaces would leave of Gaussian residuals.
 fn estimated_loss(variances: &[f64], n_subspaces: usize) -> f64 {
     let (order, starts) = subspaces(variances, n_subspaces);
     let of_subspace = |subspace: &[u32]| {
@@ -250,8 +248,8 @@ fn estimated_loss(variances: &[f64], n_subspaces: usize) -> f64 {
     starts.windows(2).map(of_subspace).sum::<f64>() + outside.iter().map(|c| variances[*c]).sum::<f64>()
 }
 
-/// What four bits leave of `d` components, given the sum of the logarithms of their variances (rate and
-/// distortion of Gaussian ones at equal loss).
+/// Returns the loss of `d` Gaussian components coded in four bits, from the sum of the logarithms of their variances (rate
+/// distortion at equal loss).
 fn loss(d: usize, log_product: f64) -> f64 {
     d as f64 * ((log_product - 8.0 * std::f64::consts::LN_2) / d as f64).exp()
 }

@@ -138,7 +138,7 @@ fn bounds_and_errors_are_those_of_what_readers_decode() {
 
 /// The longest decoded residual of a centroid's members, as a vector of components.
 #[test]
-fn reaches_bound_decoded_residuals() {
+fn residual_norms_bound_decoded_residuals() {
     let (dim, n) = (64, 600);
     let vectors = clustered(n, 200, dim, 0.4);
     let codebook =
@@ -205,7 +205,7 @@ fn fine_residuals_decode_to_what_was_measured() {
 }
 
 #[test]
-fn rows_follow_the_content_not_the_count() {
+fn centroids_follow_the_content_not_the_count() {
     let build = |n_centres| {
         let vectors = clustered(5000, n_centres, 128, 0.02);
         let settings = CodebookSettings { min_gaussians_per_centroid: 1, ..CodebookSettings::default() };
@@ -274,7 +274,7 @@ fn an_empty_text_bank_measures_no_errors() {
 }
 
 #[test]
-fn equal_embeddings_make_one_row_and_none_makes_none() {
+fn equal_embeddings_make_one_centroid_and_none_makes_none() {
     let same = [0.5f32; 400];
     let codebook = build(Rows::all(&same, 4), &score_context(4, &same), &CodebookSettings::default());
     assert_eq!((codebook.radii.len(), codebook.residuals.is_none()), (1, true));

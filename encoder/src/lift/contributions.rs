@@ -1,9 +1,9 @@
-//! What one view contributes: its mask vectors, its regions, and the sparse contributions, in a file of the
-//! job's folder, so that a killed encode does not compute them again.
+//! A view's mask vectors, regions and sparse contributions, in a file of the job's folder: a killed encode does not compute
+//! them again.
 //!
-//! The file is a container with everything but the contributions, and after it the contributions by (cell, slice of
-//! its Gaussians): what a few cells need of a view is one stretch of its file, so bringing all views
-//! together by cell reads each byte once and writes none.
+//! The file starts with a container that holds all but the contributions. These follow it, ordered by (cell, slice of
+//! its Gaussians): the contributions of consecutive cells are one range of the file, so a pass over all cells reads each
+//! byte once.
 
 use std::io::{Read, Seek, SeekFrom};
 use std::ops::Range;
@@ -19,9 +19,9 @@ const MAGIC: [u8; 8] = *b"SLAGCONT";
 const VERSION: u32 = 2;
 const REGION_BITS: u32 = 20;
 
-/// Gaussians of a cell whose contributions lie together: those of one slice, from all views, fit a core's cache.
+/// Gaussians of a slice: the contributions of one slice from all views fit a core's cache.
 pub const GAUSSIANS_PER_SLICE: usize = 1 << (32 - REGION_BITS);
-/// Regions that a view may have.
+/// Most regions of a view.
 pub const MAX_REGIONS: usize = 1 << REGION_BITS;
 
 mod section {
@@ -30,7 +30,7 @@ mod section {
     pub const REGION_MASKS: u32 = 3;
     pub const MASK_VECTORS: u32 = 4;
     pub const RUNS: u32 = 5;
-    /// Not in the container but after it; the number is that of its errors.
+    /// Follows the container; errors name the section by this number.
     pub const ENTRIES: u32 = 6;
 }
 
@@ -45,7 +45,7 @@ struct Header {
     n_entries: u64,
 }
 
-/// The contributions of one slice of a cell: those from `start` on, up to the next run's.
+/// The contributions of one slice of a cell, from `start` to the start of the next run.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Run {
@@ -55,27 +55,27 @@ pub struct Run {
     pub slice: u32,
     /// Its first entry in the file.
     pub start: u64,
-    /// First 8 bytes of the BLAKE3 hash of its entries.
+    /// CRC-32 of its entries.
     checksum: u64,
 }
 
-/// A sum `a(k, r)`: the blending weight of a Gaussian over the pixels of a region.
+/// A contribution `a(k, r)`: the blending weight of a Gaussian, summed over the pixels of a region.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Contribution {
     /// The Gaussian, by its index within its cell.
     pub local: u32,
     /// The region of the view.
     pub region: u32,
-    /// The sum.
+    /// Its weight, pixels.
     pub weight: f32,
 }
 
-/// A [`Contribution`] of a known slice, as it lies in the file.
+/// A [`Contribution`] of a known slice, in the form of the file.
 #[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct PackedEntry {
     key: u32,
-    /// The sum.
+    /// Its weight, pixels.
     pub(super) weight: f32,
 }
 
@@ -105,14 +105,14 @@ pub struct ViewContributions {
     pub mask_vectors: Vec<f32>,
     /// The masks that cover each region, ascending.
     pub masks_of_region: Vec<Vec<u32>>,
-    /// Sums by cell (ascending), within a cell by (Gaussian, region).
+    /// Contributions by cell, ascending; within a cell by (Gaussian, region).
     pub entries_of_cell: Vec<(u32, Vec<Contribution>)>,
 }
 
-/// A file of contributions that cannot be written or used.
+/// A contribution file cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum ContributionError {
-    /// The file system said no.
+    /// File system error.
     #[error(transparent)]
     Io(#[from] std::io::Error),
     /// The file is damaged.
@@ -120,11 +120,11 @@ pub enum ContributionError {
     Damaged {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The damage.
         source: ContainerError,
     },
     /// More regions than an entry can name.
-    #[error("{}: {found} regions, {MAX_REGIONS} at most; give fewer masks or a lower --raster-width", path.display())]
+    #[error("{}: {found} regions, the limit is {MAX_REGIONS}; give fewer masks or a lower --raster-width", path.display())]
     TooManyRegions {
         /// The file.
         path: PathBuf,
@@ -133,8 +133,8 @@ pub enum ContributionError {
     },
 }
 
-/// CRC-32: the file is our own and never travels, and at a gigabyte a scene a cryptographic hash would be
-/// the slowest step of the lift.
+/// Returns the CRC-32 of some entries. The file never leaves the machine, and at a gigabyte per scene a cryptographic hash
+/// would be the slowest step of the lift.
 fn checksum(entries: &[PackedEntry]) -> u64 {
     u64::from(crc32fast::hash(bytemuck::cast_slice(entries)))
 }
@@ -218,19 +218,19 @@ impl ViewContributions {
     }
 }
 
-/// A file of contributions, checked but for the contributions themselves, which are checked as they are read.
+/// A contribution file, checked except for the contributions: these are checked on reading.
 #[derive(Clone, Debug)]
 pub struct ContributionFile {
     path: PathBuf,
     n_regions: usize,
     n_entries: u64,
-    /// Where the entries start.
+    /// Offset of the first entry.
     entries_at_bytes: u64,
     /// By (cell, slice), ascending.
     runs: Vec<Run>,
 }
 
-/// What a file of contributions says of its view's regions.
+/// The regions of a view, and their masks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewRegions {
     /// Components of a mask vector.
@@ -249,7 +249,7 @@ impl ViewRegions {
 }
 
 impl ContributionFile {
-    /// Opens a file and checks all but its entries.
+    /// Opens a file and checks everything but its entries.
     ///
     /// # Errors
     /// [`ContributionError`].
@@ -257,7 +257,7 @@ impl ContributionFile {
         let damaged = |source| ContributionError::Damaged { path: path.to_owned(), source };
         let mut file = fs_err::File::open(path)?;
         let found_bytes = file.metadata()?.len();
-        // The container's preamble: at 16 its length.
+        // The preamble holds the container's length at byte 16.
         let mut preamble = [0; container::PREAMBLE_BYTES];
         let expected_bytes = match file.read_exact(&mut preamble) {
             Ok(()) => u64::from_le_bytes(preamble[16..24].try_into().expect("eight bytes")),
@@ -288,7 +288,7 @@ impl ContributionFile {
         Ok((file, regions))
     }
 
-    /// Returns where the file lies.
+    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -308,7 +308,7 @@ impl ContributionFile {
         self.n_entries
     }
 
-    /// Returns where the entries of a run lie.
+    /// Returns the range of a run's entries.
     pub fn entries_of_run(&self, run: usize) -> Range<u64> {
         self.runs[run].start..self.runs.get(run + 1).map_or(self.n_entries, |next| next.start)
     }
@@ -348,7 +348,7 @@ impl ContributionFile {
         }
         let usable = |e: &PackedEntry| (e.region() as usize) < self.n_regions && e.weight.is_finite();
         if !entries.iter().fold(true, |all, e| all & usable(e)) {
-            let what = "entries of regions that are not there, or not finite".into();
+            let what = "entries that are not finite or of unknown regions".into();
             return Err(damaged(ContainerError::Damaged { offset_bytes, what }));
         }
         Ok(())
@@ -375,7 +375,7 @@ fn parse(bytes: &[u8]) -> Result<(Header, ViewRegions, Vec<Run>), ContainerError
         && runs.first().map_or(header.n_entries, |run| run.start) == 0
         && runs.last().is_none_or(|run| run.start <= header.n_entries);
     if !consistent {
-        let what = "regions, masks or runs refer to what is not there".into();
+        let what = "regions, masks or runs out of range".into();
         return Err(ContainerError::Damaged { offset_bytes: 0, what });
     }
     Ok((header, ViewRegions { dim, mask_vectors, starts, masks }, runs))

@@ -1,5 +1,4 @@
-//! The factorised field of a cell: sparse contributions over the scene's region vectors, and the scores that
-//! follow from it.
+//! The factorised field of a cell, sparse contributions over the scene's region vectors, and its scores.
 
 use std::io::{self, Write};
 
@@ -14,7 +13,7 @@ use super::table::RegionTable;
 const MAGIC: [u8; 8] = *b"SLAGFELD";
 const VERSION: u32 = 1;
 
-/// The sparse contributions of one cell's Gaussians, row by row.
+/// The sparse contributions of a cell's Gaussians, Gaussian by Gaussian.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CellField {
     /// `[N]`: index of each Gaussian in the input file.
@@ -23,7 +22,7 @@ pub struct CellField {
     pub starts: Vec<u64>,
     /// Region of each entry.
     pub regions: Vec<u32>,
-    /// Sum of each entry.
+    /// Weight of each entry.
     pub weights: Vec<f32>,
     /// `[N]`: `Σ_r a(k, r) n_r`, the evidence for the embedding.
     pub total_weights: Vec<f32>,
@@ -32,8 +31,8 @@ pub struct CellField {
 }
 
 impl CellField {
-    /// Makes the field of a part's contributions and writes its embeddings to `embeddings` (`[N][dim]`): unit, or
-    /// zeros where there is no evidence. `input_indices` are of the part's Gaussians.
+    /// Makes the field of a part and writes its embeddings to `embeddings` (`[N][dim]`): unit, or zeros where there is no
+    /// evidence. `input_indices`: of the part's Gaussians.
     pub fn new(
         input_indices: Vec<u32>,
         contributions: PartContributions,
@@ -104,7 +103,7 @@ impl CellField {
     /// Writes the file form.
     ///
     /// # Errors
-    /// Whatever the writer gives.
+    /// Errors of the writer.
     pub fn write(&self, out: impl Write) -> io::Result<()> {
         let header = [self.len() as u64, self.regions.len() as u64];
         let sections = [
@@ -119,7 +118,7 @@ impl CellField {
         container::write(out, MAGIC, VERSION, &sections)
     }
 
-    /// Reads the file form, whose regions are below `n_regions`.
+    /// Reads the file form; regions must be below `n_regions`.
     ///
     /// # Errors
     /// [`ContainerError`], naming the byte.
@@ -142,7 +141,7 @@ impl CellField {
         if consistent {
             return Ok(field);
         }
-        let what = "starts or regions refer to what is not there".into();
+        let what = "starts or regions out of range".into();
         Err(ContainerError::Damaged { offset_bytes: 0, what })
     }
 }

@@ -1,4 +1,4 @@
-//! The field of a published generation, read back in full precision.
+//! The full-precision field of a published generation.
 
 use slag_common::container::{AlignedBytes, ContainerError};
 
@@ -9,7 +9,7 @@ use crate::store::{StoreError, StoreReader};
 /// Name of the region table among a generation's extras.
 pub const EXTRA_REGIONS: &str = "regions";
 
-/// Name of the record ([`super::Aggregation`], JSON) of how embeddings were made; absent of the plain average.
+/// Name of the record ([`super::Aggregation`], JSON) of the refinements; absent for the plain average.
 pub const EXTRA_AGGREGATION: &str = "aggregation";
 
 /// Returns the name of a part of a cell's field among a generation's extras.
@@ -58,14 +58,14 @@ fn read_extra(reader: &StoreReader, name: &str) -> Result<AlignedBytes, ReadFiel
     Ok(reader.read_object(*hash)?)
 }
 
-/// Why a published field cannot be read.
+/// A published field cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum ReadFieldError {
-    /// The store said no.
+    /// Store error.
     #[error(transparent)]
     Store(#[from] StoreError),
     /// The generation has no such part.
-    #[error("the store has no {name}: it was published by another program; encode again")]
+    #[error("the store has no {name}: another version published it; encode again")]
     Absent {
         /// The part.
         name: String,
@@ -75,7 +75,7 @@ pub enum ReadFieldError {
     Damaged {
         /// The part.
         name: String,
-        /// What is wrong.
+        /// The damage.
         source: ContainerError,
     },
 }

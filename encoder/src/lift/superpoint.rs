@@ -1,8 +1,8 @@
-//! Superpoints: small pieces of surface of one look, by graph-based segmentation (Felzenszwalb and Huttenlocher,
+//! Superpoints: small pieces of surface of one appearance, by graph-based segmentation (Felzenszwalb and Huttenlocher,
 //! "Efficient Graph-Based Image Segmentation", IJCV 59(2), 2004) of the Gaussians' nearest-neighbour graph.
 //!
-//! An edge is as long as its ends differ in colour, in the direction of their thinnest axes and, where it is
-//! known, in what masks said of them. Distance decides who is whose neighbour.
+//! The length of an edge is the difference of its ends in colour, in the direction of their thinnest axes and, if known, in
+//! their embeddings. Distance only decides which Gaussians are neighbours.
 
 use rayon::prelude::*;
 use rstar::RTree;
@@ -16,38 +16,38 @@ use slag_math::union_find::{NOT_NUMBERED, Numbering};
 /// The superpoint of a Gaussian that cannot be drawn.
 pub const NO_SUPERPOINT: u32 = NOT_NUMBERED;
 
-/// How fine superpoints are.
+/// The differences that edges measure, and the size of superpoints.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SuperpointSettings {
-    /// Nearest neighbours that a Gaussian has edges to.
+    /// Nearest neighbours of a Gaussian that get an edge.
     pub n_neighbours: usize,
-    /// What an edge from black to white counts, over the square root of 3.
+    /// Length of an edge from black to white, over the square root of 3.
     pub colour: f32,
-    /// What a right angle between thinnest axes counts.
+    /// Length of a right angle between thinnest axes.
     pub normal: f32,
-    /// What a right angle between the embeddings' sketches counts.
+    /// Length of a right angle between sketches of embeddings.
     pub field: f32,
-    /// Scale of observation k: an edge joins two components while it is no longer than both components' longest
-    /// inner edge plus k over their size.
+    /// Scale of observation k: an edge joins two components if it is at most each component's longest inner edge plus k over
+    /// its size.
     pub scale: f32,
-    /// Components with fewer Gaussians are joined to their most similar neighbour.
+    /// Smaller components are joined to their most similar neighbour.
     pub min_gaussians: u32,
 }
 
 impl Default for SuperpointSettings {
-    /// Masks, where there are any, say more about what belongs together than colour and shape.
+    /// Embeddings, where known, weigh more than colour and shape.
     fn default() -> Self {
         Self { n_neighbours: 8, colour: 0.3, normal: 0.3, field: 1.0, scale: 3.0, min_gaussians: 20 }
     }
 }
 
 impl SuperpointSettings {
-    /// Larger superpoints of the same edges: about a thing's sides, where the default's are patches of them.
+    /// Returns settings for larger superpoints of the same edges: about the sides of a thing, where the default ones are patches.
     pub fn coarse() -> Self {
         Self { scale: 20.0, min_gaussians: 60, ..Self::default() }
     }
 
-    /// Superpoints of colour and shape alone, where nothing else is known.
+    /// Returns settings for superpoints of colour and shape alone.
     pub fn of_looks() -> Self {
         Self { colour: 1.0, ..Self::default() }
     }
@@ -58,11 +58,11 @@ impl SuperpointSettings {
 pub struct Superpoints {
     /// `[N]`: the superpoint of each Gaussian, [`NO_SUPERPOINT`] where it cannot be drawn.
     pub of_gaussian: Vec<u32>,
-    /// How many there are, numbered in the order in which the Gaussians meet them.
+    /// Number of superpoints; they are numbered in the order of their first Gaussians.
     pub n: usize,
 }
 
-/// Short vectors `[N][width]` of any common scale, zeros where nothing is known, that differ as embeddings do.
+/// Short vectors that differ as embeddings do, of any common scale; zeros where unknown.
 #[derive(Clone, Copy, Debug)]
 pub struct Sketches<'a> {
     /// Components.
@@ -72,7 +72,7 @@ pub struct Sketches<'a> {
 }
 
 impl Sketches<'_> {
-    /// Returns 1 less the cosine of two sketches; 0 where one is not known, which says nothing.
+    /// Returns 1 minus the cosine of two sketches; 0 if one is unknown.
     fn difference(&self, a: usize, b: usize) -> f32 {
         let [a, b] = [a, b].map(|i| &self.values[i * self.width..][..self.width]);
         let product =
@@ -99,20 +99,20 @@ pub struct Graph {
 }
 
 impl Graph {
-    /// Finds and measures the edges of a scene. `settings`: neighbours, and what differences count.
+    /// Finds and measures the edges of a scene.
     pub fn new(scene: &Gaussians, sketches: Option<Sketches<'_>>, settings: &SuperpointSettings) -> Self {
         let usable: Vec<u32> = (0..scene.len() as u32).filter(|i| scene.is_usable(*i as usize)).collect();
         let point = |i: &u32| GeomWithData::new(scene.means_in_world[*i as usize].to_array(), *i);
         let tree = RTree::bulk_load(usable.iter().map(point).collect());
         let edges_of = |i: &u32| -> Vec<Edge> {
             let here = scene.means_in_world[*i as usize].to_array();
-            // Gaussians in one place are each other's neighbours, in any order: one more than is wanted is itself.
+            // One more than wanted: a Gaussian is its own neighbour, in any place among those at the same point.
             let near = tree.nearest_neighbor_iter(here).take(settings.n_neighbours + 1);
             near.filter(|other| other.data != *i)
                 .map(|other| {
                     let (a, b) = (*i.min(&other.data), *i.max(&other.data));
                     let length = edge_length(scene, sketches, settings, a as usize, b as usize);
-                    // Lengths are not negative: their bits ascend as they do.
+                    // Lengths are not negative, so their bits have the same order.
                     (length.to_bits(), a, b)
                 })
                 .collect()
@@ -123,7 +123,7 @@ impl Graph {
         Self { n_gaussians: scene.len(), usable, edges }
     }
 
-    /// Partitions the scene. `settings`: scale and least size.
+    /// Partitions the scene. `settings`: scale and smallest size.
     pub fn superpoints(&self, settings: &SuperpointSettings) -> Superpoints {
         let mut components = Components::new(self.n_gaussians, settings.scale);
         for (length, a, b) in &self.edges {
@@ -138,12 +138,12 @@ impl Graph {
 }
 
 impl Superpoints {
-    /// Partitions a scene. The same input gives the same partition, for any number of threads.
+    /// Partitions a scene. The result does not depend on threads.
     pub fn new(scene: &Gaussians, sketches: Option<Sketches<'_>>, settings: &SuperpointSettings) -> Self {
         Graph::new(scene, sketches, settings).superpoints(settings)
     }
 
-    /// Returns the bytes that the work on `n_gaussians` takes: tree and edges.
+    /// Returns the bytes that partitioning `n_gaussians` takes: tree and edges.
     pub fn working_bytes(n_gaussians: usize, settings: &SuperpointSettings) -> u64 {
         let edges = settings.n_neighbours * size_of::<Edge>();
         let per_gaussian = edges + 2 * size_of::<GeomWithData<[f64; 3], u32>>() + 5 * size_of::<u32>();

@@ -1,11 +1,10 @@
 //! The regions of all views: which masks cover each, and the masks' vectors.
 //!
-//! `V_r`, the sum of a region's mask vectors, is never kept: there are several regions a mask, and a
-//! few additions bring it back, so a scene's table is as large as its mask vectors.
+//! `V_r`, the sum of a region's mask vectors, is not stored: a mask has several regions, and a few additions compute the sum
+//! when it is needed. So a scene's table is hardly larger than its mask vectors.
 //!
-//! In a plain average every mask counts once. [`RegionTable::set_mask_weights`] lets a mask count for more or
-//! less, `V_r = Σ_j m_j e_j` and `n_r = Σ_j m_j`, and [`RegionTable::append_mixture`] adds regions that no view
-//! has: any mixture of masks, of which a Gaussian's row takes a part as of any region.
+//! In the plain average every mask has weight 1. [`RegionTable::set_mask_weights`] sets other weights,
+//! `V_r = Σ_j m_j e_j` and `n_r = Σ_j m_j`. [`RegionTable::append_mixture`] adds a region of no view: any mixture of masks.
 
 use std::io::{self, Write};
 use std::ops::Range;
@@ -29,14 +28,14 @@ pub struct RegionTable {
     starts: Vec<u64>,
     /// Masks of each region, numbered over the whole scene.
     masks: Vec<u32>,
-    /// How much each of these counts; empty where all count 1.
+    /// Weight of each of these; empty if all are 1.
     shares: Vec<f32>,
-    /// `[n_masks]`: coarseness of each mask, 0 the coarsest; empty where all are alike.
+    /// `[n_masks]`: level of each mask, 0 the coarsest; empty if there is one level.
     levels: Vec<u8>,
 }
 
 impl RegionTable {
-    /// A table without regions, for vectors of `dim` components.
+    /// Returns a table without regions, for vectors of `dim` components.
     pub fn new(dim: usize) -> Self {
         Self {
             dim,
@@ -82,7 +81,7 @@ impl RegionTable {
         masks_of_region: impl Iterator<Item = &'a [u32]>,
     ) -> u32 {
         let (first, first_mask) = (self.len() as u32, self.n_masks() as u32);
-        // Exactly: doubling would take twice the memory that the budget knows of.
+        // Exact: doubling would take twice the memory of the budget's estimate.
         self.mask_vectors.reserve_exact(mask_vectors.len());
         self.mask_vectors.extend(mask_vectors);
         for masks in masks_of_region {
@@ -95,17 +94,17 @@ impl RegionTable {
         first
     }
 
-    /// Lets each mask count `weights[mask]` times (finite, not negative; `[n_masks]`) wherever it lies.
+    /// Sets the weight of each mask. `weights`: `[n_masks]`, finite, not negative.
     pub fn set_mask_weights(&mut self, weights: &[f32]) {
         self.shares = self.masks.iter().map(|mask| weights[*mask as usize]).collect();
     }
 
-    /// Says how coarse each mask is, `[n_masks]`, 0 the coarsest.
+    /// Sets the level of each mask, `[n_masks]`, 0 the coarsest.
     pub fn set_levels(&mut self, levels: Vec<u8>) {
         self.levels = if levels.iter().all(|level| *level == 0) { Vec::new() } else { levels };
     }
 
-    /// Returns how coarse a mask is.
+    /// Returns the level of a mask, 0 the coarsest.
     pub fn level_of(&self, mask: u32) -> usize {
         self.levels.get(mask as usize).copied().unwrap_or(0).into()
     }
@@ -115,7 +114,7 @@ impl RegionTable {
         usize::from(self.levels.iter().copied().max().unwrap_or(0)) + 1
     }
 
-    /// Appends a region that is a mixture of masks, `(mask, how much it counts)`, and returns its number.
+    /// Appends a region that is a mixture of masks, `(mask, weight)`, and returns its number.
     pub fn append_mixture(&mut self, mixture: &[(u32, f32)]) -> u32 {
         self.shares.resize(self.masks.len(), 1.0);
         self.masks.extend(mixture.iter().map(|(mask, _)| mask));
@@ -124,7 +123,7 @@ impl RegionTable {
         self.len() as u32 - 1
     }
 
-    /// Returns the masks' vectors, one a row.
+    /// Returns the vectors of the masks, one per row.
     pub fn mask_vectors(&self) -> Rows<'_> {
         Rows::all(&self.mask_vectors, self.dim)
     }
@@ -133,12 +132,12 @@ impl RegionTable {
         self.starts[region] as usize..self.starts[region + 1] as usize
     }
 
-    /// Returns the masks of a region, however much they count.
+    /// Returns the masks of a region, whatever their weights.
     pub(crate) fn all_masks_of(&self, region: usize) -> &[u32] {
         &self.masks[self.listed(region)]
     }
 
-    /// Returns the masks of a region, and how much each counts.
+    /// Returns the masks of a region, and the weight of each.
     #[inline(always)]
     pub fn masks_of(&self, region: usize) -> impl Iterator<Item = (u32, f32)> + '_ {
         let listed = self.listed(region);
@@ -147,18 +146,18 @@ impl RegionTable {
         self.masks[listed].iter().enumerate().map(move |(i, mask)| (*mask, share(i)))
     }
 
-    /// Returns how often masks count in each region of a view: how many cover it, if all count once.
+    /// Returns the summed weight of each region's masks: their number, if all weights are 1.
     pub(super) fn mask_counts(&self, regions: Range<usize>) -> Vec<f32> {
         regions.map(|region| self.masks_of(region).map(|(_, share)| share).sum()).collect()
     }
 
-    /// Writes components `from..from + out.len()` of `V_r`; inlined to be compiled for its caller's vectors.
+    /// Writes components `from..from + out.len()` of `V_r`; inlined, to be compiled for the caller's instruction set.
     #[inline(always)]
     pub(super) fn components(&self, region: usize, from: usize, out: &mut [f32]) {
         out.fill(0.0);
         let vector = |mask: u32| &self.mask_vectors[mask as usize * self.dim + from..];
         for (mask, share) in self.masks_of(region) {
-            // Products are rounded before they are added, and 1 times a number is the number.
+            // Products are rounded before they are added; a weight of 1 changes no bit.
             out.iter_mut().zip(vector(mask)).for_each(|(sum, v)| *sum += share * v);
         }
     }
@@ -174,7 +173,7 @@ impl RegionTable {
         (0..self.len()).into_par_iter().map(score).collect()
     }
 
-    /// Returns `q · V_r` of the masks of each level apart, `[n][n_levels]`.
+    /// Returns `q · V_r` for the masks of each level separately, `[n][n_levels]`.
     pub fn scores_by_level(&self, query: &[f32]) -> Vec<f32> {
         let of_masks = self.mask_scores(query);
         let mut scores = vec![0.0; self.len() * self.n_levels()];
@@ -189,7 +188,7 @@ impl RegionTable {
     /// Writes the file form.
     ///
     /// # Errors
-    /// Whatever the writer gives.
+    /// Errors of the writer.
     pub fn write(&self, out: impl Write) -> io::Result<()> {
         let header = [self.dim, self.len(), self.n_masks(), self.masks.len()].map(|n| n as u64);
         let mut sections = vec![
@@ -239,8 +238,7 @@ impl RegionTable {
         if consistent {
             return Ok(table);
         }
-        let what =
-            "regions refer to masks that are not there, or masks count no finite number of times".into();
+        let what = "masks out of range, or weights that are not finite".into();
         Err(ContainerError::Damaged { offset_bytes: 0, what })
     }
 }

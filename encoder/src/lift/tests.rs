@@ -112,7 +112,7 @@ proptest! {
 
     /// Oracle: entries picked from the views one by one.
     #[test]
-    fn sums_by_gaussian_are_those_of_the_views_for_any_budget(
+    fn contributions_by_gaussian_are_those_of_the_views_for_any_budget(
         views in prop::collection::vec(any_view(2), 1..6), part_entries in 1u64..40, budget_bytes in 0u64..500_000,
     ) {
         let scene = open(&views, 2, &N_OF_CELL, part_entries);

@@ -1,17 +1,17 @@
-//! Which masks show the same thing: view consensus, after MaskClustering (Yan et al., CVPR 2024), over contributions instead
-//! of a point cloud.
+//! Clusters the masks that show the same thing by view consensus, after MaskClustering (Yan et al., CVPR 2024), but over
+//! contributions instead of a point cloud.
 //!
-//! A mask is the set of sampled Gaussians that it shows. Two masks are compared by what the views of both see: the
-//! intersection over the union of what they show there. A view *agrees* with a mask as far as the most similar of its
-//! own masks does; the mean over the views that see enough of it is the mask's consensus. A mask without it covers
-//! what other views take apart, or a part that nobody else knows: it is set aside.
+//! A mask is the set of sampled Gaussians that it shows. Two masks are compared by intersection over union, among the Gaussians
+//! that the views of both see. A view's *agreement* with a mask is the best such value of its own masks. A mask's consensus is
+//! the mean agreement of the views that see enough of it. A mask without consensus covers several things, or a part that no
+//! other view separates: it is set aside.
 //!
-//! MaskClustering merges two masks if one mask of most views contains both. Segmenters here give whole and part side
-//! by side, and the coarsest mask contains everything: on the labelled house with automatic masks that rule made one
-//! object of 84 % of the Gaussians. So masks are not chained: the mask that most views agree with gathers those like
-//! it, their majority is the object's shape, and the masks that are like that shape are the object's.
+//! MaskClustering merges two masks if a mask of most views contains both. The segmenters here return wholes and parts side
+//! by side, and the coarsest mask contains everything: with automatic masks of the labelled house, that rule made one
+//! object of 84 % of the Gaussians. So masks are not chained. The mask with most agreement gathers those like it, their
+//! majority is the object's shape, and the masks like that shape belong to the object.
 //!
-//! Counts are integers, and every order is fixed: the result does not depend on threads.
+//! Counts are integers and every order is fixed: the result does not depend on threads.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -19,20 +19,20 @@ use rayon::prelude::*;
 
 use super::object::NONE;
 
-/// A view sees enough of a mask to judge it (3 in 10, as MaskClustering), in tenths.
+/// Share of a mask that a view must see to judge it, in tenths (3, as in MaskClustering).
 const OBSERVED_TENTHS: usize = 3;
-/// The same for a whole object, of which a view sees one side at best.
+/// The same for an object, of which a view sees one side at best.
 const OBJECT_OBSERVED_TENTHS: usize = 1;
-/// Masks that show the same: a majority of what either shows.
+/// Masks with this intersection over union show the same thing: a majority of their union.
 const SAME_IOU: f64 = 0.5;
-/// Consensus without which a mask is set aside: a majority again.
+/// Masks below this consensus are set aside: again a majority.
 const MIN_CONSENSUS: f64 = 0.5;
-/// With fewer sampled Gaussians shares mean nothing.
+/// Smallest mask, sampled Gaussians: shares of fewer mean nothing.
 const MIN_SAMPLES: usize = 3;
-/// Views that must have seen an object: one cannot agree with others.
+/// Fewest views of an object: one cannot agree with others.
 const MIN_VIEWS: usize = 2;
 
-/// What a sample of the Gaussians shows in each view that sees it: of the regions it lies in, the one of most weight.
+/// The region of each sampled Gaussian in each view that sees it: the one with most of its weight.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sightings {
     /// `[n + 1]`: where each sampled Gaussian's sightings start.
@@ -71,25 +71,25 @@ pub struct Masks<'a> {
     pub n_views: usize,
 }
 
-/// What the masks became.
+/// The clusters of a scene's masks.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct MaskClusters {
-    /// `[n_masks]`: the cluster of each mask; [`NONE`] where it is in none.
+    /// `[n_masks]`: the cluster of each mask, or [`NONE`].
     pub cluster_of_mask: Vec<u32>,
-    /// The consensus of each cluster: how well the views that see its shape agree with it, 0..1.
+    /// The consensus of each cluster, 0..1: the mean agreement of the views that see its shape.
     pub consensus: Vec<f64>,
-    /// Masks that were set aside for want of consensus.
+    /// Masks without consensus.
     pub n_set_aside: usize,
 }
 
-/// What the views say of a mask.
+/// The views' judgement of a mask.
 #[derive(Default)]
 struct Judged {
-    /// Sum of the views' agreement, its own view's 1 included.
+    /// Sum of the views' agreement, including its own view's 1.
     agreement: f64,
-    /// Mean of the other views'.
+    /// Mean agreement of the other views.
     consensus: f64,
-    /// The masks that show the same, itself included, ascending.
+    /// The masks that show the same thing, including itself, ascending.
     same: Vec<u32>,
 }
 
@@ -138,7 +138,7 @@ impl Counts {
         Self { of_mask, of_view, masks: Vec::new() }
     }
 
-    /// Counts what the views show of some sampled Gaussians.
+    /// Counts the sightings of some sampled Gaussians, by mask and by view.
     fn add(&mut self, samples: &[u32], sightings: &Sightings, masks: &Masks<'_>) {
         for (view, region) in samples.iter().flat_map(|sample| sightings.of(*sample)) {
             self.of_view[view] += 1;
@@ -195,7 +195,7 @@ impl<'a> Consensus<'a> {
         &self.samples[self.starts[mask as usize]..self.starts[mask as usize + 1]]
     }
 
-    /// Returns how many of a mask's Gaussians a view sees.
+    /// Returns the number of a mask's Gaussians that a view sees.
     fn n_seen(&self, mask: u32, view: usize) -> usize {
         let seen = &self.seen[mask as usize];
         seen.binary_search_by_key(&(view as u32), |(view, _)| *view).map_or(0, |at| seen[at].1 as usize)
@@ -232,7 +232,7 @@ impl<'a> Consensus<'a> {
                 n_judges += 1;
             }
         }
-        // Its own view agrees wholly, which says nothing.
+        // Its own view's agreement is always 1.
         if n_judges >= MIN_VIEWS {
             judged.consensus = (judged.agreement - 1.0) / (n_judges - 1) as f64;
         }
@@ -240,7 +240,7 @@ impl<'a> Consensus<'a> {
         judged
     }
 
-    /// Lets the masks that most views agree with gather those like them.
+    /// Makes clusters: the masks with most agreement, in turn, gather those like them.
     fn gather(&self, judged: &[Judged], is_cancelled: &dyn Fn() -> bool) -> MaskClusters {
         let n_masks = judged.len() as u32;
         let has_consensus = |mask: &u32| judged[*mask as usize].consensus >= MIN_CONSENSUS;
@@ -271,7 +271,7 @@ impl<'a> Consensus<'a> {
                 members.iter().for_each(|mask| is_gathered[*mask as usize] = true);
                 let is_free = |mask: &&u32| clusters.cluster_of_mask[**mask as usize] == NONE;
                 let free: Vec<u32> = members.iter().filter(is_free).copied().collect();
-                // Else it is mostly another object, seen again.
+                // Otherwise it is mostly an earlier object.
                 if free.len() * 2 >= members.len() {
                     let cluster = clusters.consensus.len() as u32;
                     free.iter().for_each(|mask| clusters.cluster_of_mask[*mask as usize] = cluster);
@@ -310,7 +310,7 @@ impl<'a> Consensus<'a> {
     }
 }
 
-/// Finds what most views show of an object.
+/// Finds the shape of an object that most views show.
 struct Shape {
     is_member: Vec<bool>,
     has_member: Vec<bool>,

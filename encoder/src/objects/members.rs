@@ -1,4 +1,4 @@
-//! Each Gaussian's object: by the weight that it has under the objects' masks.
+//! Each Gaussian's object, by its weight under the objects' masks.
 
 use rayon::prelude::*;
 
@@ -7,10 +7,10 @@ use super::object::NONE;
 use super::scene::Scene;
 use crate::lift::{ContributionError, PartContributions, RegionTable};
 
-/// An object has a Gaussian if its masks have this share of the Gaussian's weight: most views say so.
+/// Smallest share of a Gaussian's weight under an object's masks: a majority.
 const MIN_WEIGHT_SHARE: f32 = 0.5;
 
-/// Which Gaussians and masks objects have.
+/// The Gaussians and masks of each object.
 pub struct Members {
     /// `[cell][N of the cell]`: the object of each Gaussian, or [`NONE`].
     pub object_of: Vec<Vec<u32>>,
@@ -52,8 +52,8 @@ impl ClustersOfRegion {
 }
 
 impl Members {
-    /// Gives each Gaussian to the cluster with most of its weight, times the cluster's consensus, of those that have
-    /// most of its weight. Returns `None` if cancelled.
+    /// Assigns each Gaussian to the cluster with the largest product of its weight there and the cluster's consensus, among
+    /// clusters with most of its weight. Returns `None` if cancelled.
     ///
     /// # Errors
     /// [`ContributionError`].
@@ -91,7 +91,7 @@ impl Members {
         Ok(Some(members))
     }
 
-    /// Adds a part's weights to its masks'; one after the other, so that the contributions are the same every time.
+    /// Adds a part's weights to those of its masks, in one order: the sums are the same every time.
     fn add_weights(
         &mut self,
         contributions: &PartContributions,
@@ -116,7 +116,7 @@ impl Members {
         }
     }
 
-    /// Drops objects of fewer Gaussians and numbers the others anew, in their order.
+    /// Drops objects with fewer Gaussians and renumbers the others in order.
     pub fn drop_small(&mut self, min_gaussians: usize) {
         let mut n_of = vec![0usize; self.masks.len()];
         self.object_of.iter().flatten().filter(|o| **o != NONE).for_each(|o| n_of[*o as usize] += 1);
@@ -142,7 +142,7 @@ impl Members {
     }
 }
 
-/// Returns the cluster of a Gaussian. `weights`, `touched`: working memory, zeros and nothing.
+/// Returns the cluster of a Gaussian. `weights`, `touched`: working memory, zeros and empty.
 fn best_cluster(
     contributions: &PartContributions,
     k: usize,

@@ -1,4 +1,4 @@
-//! What a sample of the Gaussians shows in each view.
+//! The region of each sampled Gaussian in each view.
 
 use rayon::prelude::*;
 
@@ -6,13 +6,13 @@ use super::consensus::Sightings;
 use super::scene::Scene;
 use crate::lift::ContributionError;
 
-/// Gaussians looked at, about: consensus takes time as their number, and masks of [`super::consensus`] need a few each.
+/// Approximate number of sampled Gaussians: the time of [`super::consensus`] grows with it, and each mask needs a few.
 const MAX_SAMPLES: usize = 32_768;
-/// A view sees a Gaussian if it weighs at least this share of what it does in the view where it weighs most: what
-/// is left of it behind others says nothing.
+/// A view sees a Gaussian if its weight there is at least this share of that in its best view: remnants behind other
+/// Gaussians say nothing.
 const MIN_WEIGHT_SHARE: f32 = 0.1;
 
-/// Returns which Gaussians of a cell are looked at: every n-th along its Morton curve, so that they are spread evenly.
+/// Returns the step between sampled Gaussians of a cell. These lie along its Morton curve, so the sample is spread evenly.
 pub fn sample_step(n_gaussians: usize) -> usize {
     n_gaussians.div_ceil(MAX_SAMPLES).max(1)
 }
@@ -82,7 +82,7 @@ fn of_gaussian(regions: &[u32], weights: &[f32], view_of_region: &[u32]) -> Vec<
 mod tests {
     use super::*;
 
-    /// By hand: view 0 shows regions 0 and 1, view 1 regions 2 to 4, view 2 a rest of less than a tenth, view 3 nothing.
+    /// Computed by hand: view 0 shows regions 0 and 1, view 1 regions 2 to 4, view 2 less than a tenth, view 3 nothing.
     #[test]
     fn a_gaussian_shows_the_region_of_most_weight_where_it_is_seen() {
         let view_of_region = [0, 0, 1, 1, 1, 2, 3];

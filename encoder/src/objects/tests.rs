@@ -371,7 +371,7 @@ fn objects_are_the_things_for_any_threads_and_memory() {
 }
 
 #[test]
-fn nothing_is_found_once_the_user_has_said_stop() {
+fn a_cancelled_search_returns_none() {
     assert_eq!(world().objects_unless(u64::MAX, &AtomicBool::new(true)), None);
 }
 
@@ -406,7 +406,7 @@ fn shards_carry_the_objects_of_their_cell() {
 /// Oracle: the normal equations, and the definition of what is kept, in float64. Vectors that the basis can make come
 /// back, of others what is left is at right angles to it, and the stated bound is the largest distance.
 #[test]
-fn vectors_are_kept_in_the_basis_of_rows() {
+fn vectors_are_kept_in_the_basis_of_centroids() {
     let mut random = Random::new(9);
     let mut small = |n: usize| -> Vec<i8> { (0..n).map(|_| random.below(255) as u8 as i8).collect() };
     let (m, dim) = (5, 16);

@@ -1,4 +1,4 @@
-//! The few vectors that stand for an object's masks.
+//! The few vectors that represent an object's masks.
 
 use slag_common::manifest::Calibration;
 use slag_common::objects::object_score;
@@ -8,13 +8,13 @@ use crate::codebook::ScoreMetricContext;
 use crate::lift::RegionTable;
 use slag_math::dot;
 
-/// Masks that stand for an object's others, beside their mean: the sides that a thing has.
+/// Most medoids of an object, in addition to its mean: one for each side of a thing.
 pub const MAX_MEDOIDS: usize = 4;
-/// Masks that are looked at, most weight first: the medoids of more are hardly others, and time grows as the square.
+/// Most masks considered, the heaviest first: more hardly change the medoids, and time grows with the square.
 const MAX_MASKS: usize = 256;
 
-/// Returns `[n][dim]`: the direction of the mean of some masks' vectors by weight, then medoids: those that, chosen one
-/// after the other, raise the weighted mean of the others' cosines with the nearest chosen most.
+/// Returns `[n][dim]`: the direction of the weighted mean of some masks' vectors, then medoids. Each medoid in turn is the
+/// mask that most raises the weighted mean of all masks' cosines with their nearest medoid.
 pub fn choose(masks: &[u32], weights: &[f64], table: &RegionTable) -> Vec<f32> {
     let dim = table.dim();
     let vector = |mask: u32| table.mask_vectors().get(mask as usize);
@@ -30,7 +30,7 @@ pub fn choose(masks: &[u32], weights: &[f64], table: &RegionTable) -> Vec<f32> {
     let length = mean.iter().map(|m| m * m).sum::<f64>().sqrt();
     let mut chosen: Vec<f32> = match length > 0.0 {
         true => mean.iter().map(|m| (m / length) as f32).collect(),
-        // Vectors that cancel have no mean: the heaviest stands for it.
+        // Vectors that cancel have no mean direction: the heaviest one replaces it.
         false => vector(masks[0]).to_vec(),
     };
     let n = masks.len();
@@ -54,7 +54,7 @@ pub fn choose(masks: &[u32], weights: &[f64], table: &RegionTable) -> Vec<f32> {
     chosen
 }
 
-/// Returns how a bank of texts scores over objects: mean and spread of all scores, as cells have them of Gaussians.
+/// Returns the mean and spread of the text bank's scores over objects, as cells have them over Gaussians.
 pub fn calibrate(objects: &[Object], score_context: &ScoreMetricContext, dim: usize) -> Calibration {
     let (mut sum, mut squares, mut n) = (0.0, 0.0, 0.0f64);
     for object in objects {

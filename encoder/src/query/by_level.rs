@@ -1,14 +1,14 @@
-//! Scores of the levels of masks apart, fused when a question is asked: what the mask of a whole thing says is not
-//! averaged with what those of its parts say.
+//! Scores each level of masks separately and combines them per query, so that the mask of a whole thing is not averaged with those
+//! of its parts.
 //!
-//! With the masks `j` of level `l` alone, a Gaussian's embedding is the direction of
+//! With only the masks `j` of level `l`, a Gaussian's embedding is the direction of
 //!
 //! ```text
 //! S_l = Σ_r a(k, r) Σ_{j covers r, of level l} m_j e_j
 //! ```
 //!
-//! and its score the best of the levels' cosines, as LangSplat (Qin et al. 2024) takes the best of its three fields.
-//! The contributions are those of the plain field: nothing more is published for it but each mask's level.
+//! and its score is the best of the levels' cosines, as LangSplat (Qin et al. 2024) takes the best of its three fields.
+//! The contributions are those of the plain field; only each mask's level is published in addition.
 
 use rayon::prelude::*;
 use slag_common::manifest::CellRecord;
@@ -19,10 +19,10 @@ use crate::lift::{CellField, RegionTable};
 use crate::store::StoreReader;
 use slag_math::dot;
 
-/// A level with less than this part of the longest level's sum says nothing of a Gaussian.
+/// Smallest length of a level's sum, relative to the longest: a shorter one says nothing about a Gaussian.
 const LEAST_SHARE: f32 = 0.1;
 
-/// A published field whose levels of masks are scored apart.
+/// A published field, scored by level of masks.
 pub struct ByLevel<'a> {
     reader: &'a StoreReader,
     table: RegionTable,
@@ -31,7 +31,7 @@ pub struct ByLevel<'a> {
 }
 
 impl<'a> ByLevel<'a> {
-    /// Reads the field once and measures the levels' contributions.
+    /// Reads the field once and computes the lengths of the levels' sums.
     ///
     /// # Errors
     /// [`QueryError::Field`].
@@ -65,7 +65,7 @@ fn lengths(field: &CellField, table: &RegionTable) -> Vec<f32> {
     let mut lengths = vec![0.0; field.len() * n_levels];
     lengths.par_chunks_exact_mut(n_levels).enumerate().for_each_init(
         || (vec![0.0f32; table.n_masks()], Vec::new(), vec![0.0f32; n_levels * dim]),
-        |(count_of_mask, masks, contributions), (k, lengths)| {
+        |(count_of_mask, masks, sums), (k, lengths)| {
             for (region, weight) in field.entries(k) {
                 for (mask, share) in table.masks_of(region) {
                     masks.push(mask);
@@ -74,14 +74,14 @@ fn lengths(field: &CellField, table: &RegionTable) -> Vec<f32> {
             }
             masks.sort_unstable();
             masks.dedup();
-            contributions.fill(0.0);
+            sums.fill(0.0);
             for mask in masks.drain(..) {
                 let count = std::mem::take(&mut count_of_mask[mask as usize]);
-                let sum = &mut contributions[table.level_of(mask) * dim..][..dim];
+                let sum = &mut sums[table.level_of(mask) * dim..][..dim];
                 let vector = table.mask_vectors().get(mask as usize);
                 sum.iter_mut().zip(vector).for_each(|(s, v)| *s += count * v);
             }
-            for (length, sum) in lengths.iter_mut().zip(contributions.chunks_exact(dim)) {
+            for (length, sum) in lengths.iter_mut().zip(sums.chunks_exact(dim)) {
                 *length = dot(sum, sum).sqrt();
             }
         },
@@ -97,15 +97,12 @@ fn best_of_levels(field: &CellField, of_regions: &[f32], lengths: &[f32], n_leve
         if !field.has_evidence(k) || longest <= 0.0 {
             return f32::NAN;
         }
-        let mut contributions = vec![0.0f64; n_levels];
+        let mut sums = vec![0.0f64; n_levels];
         for (region, weight) in field.entries(k) {
             let of_region = &of_regions[region * n_levels..][..n_levels];
-            contributions
-                .iter_mut()
-                .zip(of_region)
-                .for_each(|(sum, s)| *sum += f64::from(weight) * f64::from(*s));
+            sums.iter_mut().zip(of_region).for_each(|(sum, s)| *sum += f64::from(weight) * f64::from(*s));
         }
-        let known = contributions.iter().zip(lengths).filter(|(_, length)| **length >= LEAST_SHARE * longest);
+        let known = sums.iter().zip(lengths).filter(|(_, length)| **length >= LEAST_SHARE * longest);
         known.map(|(sum, length)| (sum / f64::from(*length)) as f32).fold(f32::MIN, f32::max)
     };
     (0..field.len()).into_par_iter().map(score).collect()

@@ -18,42 +18,42 @@ use crate::objects::shards::{CellObjects, CentroidBasis};
 use positions::{PositionError, QuantisedPositions};
 use slag_math::matrix::Rows;
 
-/// A cell's shard as bytes, with what the manifest says of it.
+/// A cell's shard, with its entry in the manifest.
 pub struct BuiltShard {
-    /// How much it carries.
+    /// The profile.
     pub profile: Profile,
     /// The file.
     pub bytes: Vec<u8>,
-    /// No score is off by more.
+    /// Hard bound of a score's error.
     pub score_error_bound: f32,
-    /// Errors of scores, measured.
+    /// Measured errors of scores.
     pub score_errors: ScoreErrors,
 }
 
 /// A cell's shards.
 pub struct BuiltCell {
-    /// One a profile.
+    /// One per profile.
     pub shards: Vec<BuiltShard>,
-    /// Codebook rows.
+    /// Centroids.
     pub n_centroids: u32,
-    /// Half bytes of the residual code.
+    /// Subspaces of the residual code.
     pub n_subspaces: u32,
     /// Largest error of a position, world units.
     pub position_error: f64,
-    /// Of the scores of all texts.
+    /// Moments of the scores of all texts.
     pub moments: ScoreMoments,
     /// Gaussians without an embedding.
     pub n_without_evidence: usize,
 }
 
-/// Which shards are made, and how fine they are.
+/// The profiles to build, and their precision.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ShardSettings {
-    /// Which.
+    /// Profiles.
     pub profiles: Vec<Profile>,
-    /// Of embeddings.
+    /// Precision of embeddings.
     pub codebook: CodebookSettings,
-    /// Of positions.
+    /// Precision of positions.
     pub position_error: PositionError,
 }
 
@@ -63,19 +63,19 @@ pub struct CellEmbeddings {
     pub dim: usize,
     /// `[N][dim]`: unit, or zeros where there is no evidence.
     pub vectors: Vec<f32>,
-    /// `[N]`: whether there is.
+    /// `[N]`: whether there is evidence.
     pub has_evidence: Vec<bool>,
 }
 
-/// Returns the bytes that a cell of `n_gaussians` takes while its shards are built: embeddings in f32, in f16
-/// and in the shard, and what the codebook needs.
+/// Returns the bytes that building the shards of a cell of `n_gaussians` takes: embeddings in f32, in f16 and in the shard,
+/// and the codebook.
 pub fn working_bytes(n_gaussians: usize, dim: usize) -> u64 {
     let per_component = size_of::<f32>() + 2 * size_of::<f16>();
     (n_gaussians * (dim * per_component + codebook::working_bytes_per_embedding(dim))) as u64
 }
 
 /// Builds a cell's shards, with the objects of the scene if it has any.
-#[expect(clippy::too_many_arguments, reason = "what a cell is made of")]
+#[expect(clippy::too_many_arguments, reason = "the parts of a cell")]
 pub fn build(
     scene: &Gaussians,
     cell_id: u32,
@@ -93,7 +93,7 @@ pub fn build(
     let has_fine = settings.profiles.contains(&Profile::Exact);
     let codebook = codebook::build(rows, score_context, &CodebookSettings { has_fine, ..settings.codebook });
     let n_with = with.len();
-    // Shard order: by row, then along the Morton curve, which is the order of locals.
+    // Shard order: by centroid, then along the Morton curve, the order of locals.
     let in_order = codebook.order.iter().map(|at| with[*at as usize]);
     let locals: Vec<u32> = in_order.chain(without.iter().copied()).collect();
 
@@ -166,7 +166,7 @@ pub fn build(
                 let embedding = &embeddings.vectors[*local as usize * dim..][..dim];
                 out.iter_mut().zip(embedding).for_each(|(o, v)| *o = f16::from_f32(*v));
             });
-            // Codes and fine residuals tell which embeddings are worth reading.
+            // Codes and fine residuals decide which embeddings readers look at.
             let fine = codebook.residuals.as_ref().and_then(|residuals| residuals.fine.as_ref());
             let fine = fine.map(|fine| Fine {
                 errors: fine.errors,
@@ -188,5 +188,5 @@ pub fn build(
     }
 }
 
-/// How far an embedding may lie from its f16 form: half a step of f16 at 1, and of its denormals.
+/// Largest distance between an embedding and its f16 form: half a step of f16 at 1, and of its denormals.
 const F16_ROUNDING: f32 = 5e-4;

@@ -6,17 +6,17 @@ use slag_common::shard::Positions;
 
 use crate::cells::Cell;
 
-/// What a position may be off by, per axis.
+/// Largest error of a position, per axis.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum PositionError {
     /// World units.
     Within(f64),
-    /// A quarter of the size of a cell's small Gaussians: of the 10th percentile of their largest scales.
+    /// A quarter of the 10th percentile of the largest scales of a cell's Gaussians: the size of its small ones.
     OfSize,
 }
 
 impl PositionError {
-    /// One centimetre where the model is metric, else by the Gaussians' size.
+    /// Returns one centimetre for a metric model, else the size of the Gaussians.
     pub fn default_for(metric: bool) -> Self {
         if metric { Self::Within(0.01) } else { Self::OfSize }
     }
@@ -99,12 +99,12 @@ impl QuantisedPositions {
     }
 }
 
-/// Returns the bits of each axis that keep the error, all 32 in use; `None` where 32 are too few.
+/// Returns the bits of each axis, 32 in all, that keep the error; `None` if 32 are too few.
 fn packed_bits(size: [f64; 3], error: f64) -> Option<[u8; 3]> {
     let step_of = |axis: usize, bits: u8| size[axis] / ((1u64 << bits) - 1).max(1) as f64;
     let mut bits = [0u8; 3];
     loop {
-        // Each bit to the axis that is coarsest.
+        // Each bit goes to the coarsest axis.
         let axis = (0..3).max_by(|a, b| {
             let coarseness =
                 |axis: usize| if bits[axis] == 0 { 2.0 * size[axis] } else { step_of(axis, bits[axis]) };
@@ -120,6 +120,6 @@ fn packed_bits(size: [f64; 3], error: f64) -> Option<[u8; 3]> {
     }
     let keeps =
         (0..3).all(|axis| size[axis] <= 0.0 || bits[axis] > 0 && step_of(axis, bits[axis]) / 2.0 <= error);
-    // The wide form is told by its bits.
+    // These bits mark the wide form.
     (keeps && bits != [WIDE_BITS; 3]).then_some(bits)
 }
