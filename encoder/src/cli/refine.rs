@@ -1,49 +1,49 @@
-//! Flags of how sums become embeddings.
+//! Flags of the refinements: how contributions become embeddings.
 
 use clap::Args;
 
 use crate::lift::Aggregation;
 
-/// What is done beyond the preset's way to aggregate.
+/// Changes to the preset's aggregation.
 #[derive(Clone, Debug, Default, Args)]
 pub struct RefineArgs {
-    /// Leaves out sums below this part of a Gaussian's largest in the same view; the preset's if absent.
+    /// Drops contributions below this share of a Gaussian's largest in the same view
     #[arg(long, value_name = "SHARE", value_parser = share)]
     min_region_share: Option<f32>,
-    /// Leaves out views in which a Gaussian has less than this part of its weight in the best.
+    /// Drops views in which a Gaussian has less than this share of its weight in its best view
     #[arg(long, value_name = "SHARE", value_parser = share)]
     min_view_share: Option<f32>,
-    /// Gaussians with less weight over all views, pixels, have no evidence.
+    /// Least weight over all views that is evidence, pixels
     #[arg(long, value_name = "PX", value_parser = amount)]
     min_weight: Option<f32>,
     /// Each mask counts (1 - truncation)^POWER; truncation is the share of its outline that the photo's edge cuts off
     #[arg(long, value_name = "POWER", value_parser = amount)]
     truncation_power: Option<f32>,
-    /// 0: views count the solid angle that they see of a Gaussian; 1: all alike.
+    /// Each view contributes weight^(1 - SHARE): 0 weighs views by projected area, 1 weighs them equally
     #[arg(long, value_name = "SHARE", value_parser = share)]
     equalisation: Option<f32>,
-    /// A mask counts its agreement with other views to this power; 0: all count alike.
+    /// Each mask counts its agreement with other views to this power; 0 weighs masks equally
     #[arg(long, value_name = "POWER", value_parser = amount)]
     agreement: Option<f32>,
-    /// Steps from the mean of a Gaussian's views to their median.
+    /// Steps from the mean of a Gaussian's views to their geometric median
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(0..=100))]
     median_steps: Option<u32>,
-    /// What a superpoint's mean counts beside a Gaussian's own, which counts 1.
+    /// Weight of the superpoint's mean, relative to the Gaussian's own
     #[arg(long, value_name = "TIMES", value_parser = amount)]
     superpoint: Option<f32>,
-    /// What the mean of a larger superpoint counts beside what came of that.
+    /// Weight of the larger superpoint's mean, relative to the result so far
     #[arg(long, value_name = "TIMES", value_parser = amount)]
     coarse: Option<f32>,
-    /// Whether Gaussians without evidence take their superpoint's.
+    /// Whether Gaussians without evidence take their superpoint's mean
     #[arg(long, value_name = "BOOL")]
     fill: Option<bool>,
-    /// Keeps what the views left behind, so that another encode of the same, with another codebook say, is quick.
+    /// Keeps the contributions of views, so that another encode of the same views (with another codebook, say) is quick
     #[arg(long)]
     pub keep_views: bool,
 }
 
 impl RefineArgs {
-    /// Returns the preset's way with these flags' changes.
+    /// Returns the preset's aggregation with these changes.
     pub fn aggregation(&self, preset: Aggregation) -> Aggregation {
         Aggregation {
             min_region_share: self.min_region_share.unwrap_or(preset.min_region_share),

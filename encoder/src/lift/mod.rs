@@ -14,16 +14,16 @@
 //!
 //! | file | job |
 //! |---|---|
-//! | [`contributions`] | a view's contributions in a file, ordered by cell |
+//! | `contributions` | a view's contributions in a file, ordered by cell |
 //! | [`photos`] | how a view's masks lie in its photo |
-//! | [`table`] | the regions of all views: which masks cover each |
-//! | [`index`] | the files of all views, and the parts that their entries form |
-//! | [`transpose`] | a group of parts, transposed from the views' order to the Gaussians' |
-//! | [`passes`] | a pass over all parts within the memory budget, from files or from memory |
+//! | `table` | the regions of all views: which masks cover each |
+//! | `index` | the files of all views, and the parts that their entries form |
+//! | `transpose` | a group of parts, transposed from the views' order to the Gaussians' |
+//! | `passes` | a pass over all parts within the memory budget, from files or from memory |
 //! | [`refine`] | optional refinements: weights of masks, evidence shared within superpoints |
 //! | [`superpoint`] | superpoints: small pieces of surface of one appearance |
-//! | [`embeddings`] | each Gaussian's embedding, computed once |
-//! | [`field`] | the published field: contributions, total weight, length |
+//! | `embeddings` | each Gaussian's embedding, computed once |
+//! | `field` | the published field: contributions, total weight, length |
 //! | [`published`] | the field of a published generation, read back |
 
 mod contributions;

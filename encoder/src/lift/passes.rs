@@ -42,7 +42,7 @@ impl ContributionIndex {
                 Source::Memory { parts: parts.iter(), mask_counts: table.mask_counts(0..table.len()) }
             }
             None => {
-                // Half the budget: the passes' users need lists of their own, of entries' number too.
+                // Half the budget: refinement and objects build lists of their own, which also grow with the entries.
                 let keeps = self.kept_bytes().saturating_add(self.largest_part_bytes()) <= budget_bytes / 2;
                 let for_groups = if keeps { budget_bytes - self.kept_bytes() } else { budget_bytes };
                 Source::Files {

@@ -4,14 +4,14 @@
 //!
 //! | file | job |
 //! |---|---|
-//! | [`scene`] | the input |
-//! | [`find`] | the steps below, in order |
+//! | `scene` | the input |
+//! | `find` | the steps below, in order |
 //! | [`sightings`] | the region of each sampled Gaussian in each view |
 //! | [`consensus`] | clusters of masks that views agree to show one thing |
 //! | [`members`] | each Gaussian's object, by its weight under the objects' masks |
 //! | [`vectors`] | the few vectors that represent an object's masks |
 //! | [`shards`] | the objects of a cell, as its shards store them |
-//! | [`object`] | the result |
+//! | `object` | the result |
 //!
 //! The contributions are needed twice, part by part; the result takes four bytes a Gaussian.
 

@@ -2,20 +2,20 @@
 //!
 //! | file | field of [`Aggregation`] | effect |
 //! |---|---|---|
-//! | [`truncation`] | `truncation_power` | masks that the photo's edge cuts off count less |
-//! | [`prune`] | `min_region_share`, `min_view_share` | contributions of a region that a Gaussian only touches, and of a view that hardly shows it, are dropped |
-//! | [`prune`] | `min_weight_px` | a Gaussian that hardly shows anywhere has no evidence |
-//! | [`agreement`] | `agreement` | masks that other views contradict count less |
-//! | [`equalise`] | `equalisation` | views count more evenly, whatever their distance and slant |
-//! | [`median`] | `median_steps` | views that disagree count less: steps towards the geometric median |
-//! | [`mixture`] | `superpoint`, `coarse` | a Gaussian takes a share of its superpoint, then of a larger one |
-//! | [`mixture`] | `fill` | a Gaussian without evidence takes its superpoint's mean |
+//! | `truncation` | `truncation_power` | masks that the photo's edge cuts off count less |
+//! | `prune` | `min_region_share`, `min_view_share` | contributions of a region that a Gaussian only touches, and of a view that hardly shows it, are dropped |
+//! | `prune` | `min_weight_px` | a Gaussian that hardly shows anywhere has no evidence |
+//! | `agreement` | `agreement` | masks that other views contradict count less |
+//! | `equalise` | `equalisation` | views count more evenly, whatever their distance and slant |
+//! | `median` | `median_steps` | views that disagree count less: steps towards the geometric median |
+//! | `mixture` | `superpoint`, `coarse` | a Gaussian takes a share of its superpoint, then of a larger one |
+//! | `mixture` | `fill` | a Gaussian without evidence takes its superpoint's mean |
 //!
 //! The result is again sparse contributions over regions. Weights of masks go into the [`RegionTable`], and a superpoint is
 //! one more region of it: a mixture of masks. So scores, shards and the published field need no special case, and a
 //! Gaussian gets at most two more entries.
 //!
-//! All decisions are made in principal coordinates of the mask vectors ([`points`]) and in one order: the result depends
+//! All decisions are made in principal coordinates of the mask vectors (`points`) and in one order: the result depends
 //! neither on threads nor on the memory budget.
 
 mod agreement;
