@@ -9,16 +9,16 @@ use super::project::Projection;
 use super::region::Region;
 use super::simd::Level;
 
-/// With measured errors, what codes or fine residuals leave within so many mean errors of the border is
-/// looked at more closely. Of a generated field's best 1,000 to 100,000, 0.99 and more are then found; with 6,
-/// a few texts' best 1,000 fall short, as the errors of so few are the largest ones.
+/// Number of mean measured errors within which a score counts as undecided and is refined. With 9, answers
+/// hold 0.99 and more of a generated field's best 1,000 to 100,000; with 6, the best 1,000 of a few texts
+/// fall short, because so few scores have the largest errors.
 pub(super) const UNDECIDED: f32 = 9.0;
 
 /// How far an f16-rounded unit embedding may lie from the unrounded one that its centroid's radius was measured to:
 /// half a step of f16 at 1 (2^-11), plus the steps of components too small for f16's exponents.
 pub(super) const F16_ROUNDING: f32 = 5e-4;
 
-/// What members are scored by, beyond their centroid.
+/// The data that members are scored by, beyond their centroid.
 #[derive(Clone, Copy)]
 pub(super) enum Detail<'a> {
     Nothing,
@@ -27,7 +27,7 @@ pub(super) enum Detail<'a> {
     Measured(Measured<'a>),
 }
 
-/// Codes, fine residuals and embeddings, and how far from the border the errors of each matter.
+/// Codes, fine residuals and embeddings, with the margin of each around the threshold.
 #[derive(Clone, Copy)]
 pub(super) struct Measured<'a> {
     pub residuals: Residuals<'a>,
@@ -37,7 +37,7 @@ pub(super) struct Measured<'a> {
 }
 
 impl<'a> Measured<'a> {
-    /// `n_products`: of which a score is the difference.
+    /// `n_products`: number of products that a score is the difference of.
     fn new(
         shard: &ShardView<'a>,
         residuals: Residuals<'a>,
@@ -60,22 +60,22 @@ pub(super) struct Cell<'a> {
     pub shard: &'a ShardView<'a>,
     pub asked: &'a AskedQuestion<'a>,
     pub scores: &'a ShardScores,
-    /// The question's score of each centroid.
+    /// `[K]`: the question's score of each centroid.
     pub centroids: &'a [f32],
     pub detail: Detail<'a>,
-    /// The region, where the shard sticks out of it.
+    /// The region; absent if it covers the shard.
     pub filter: Option<Region>,
     pub level: Level,
-    /// How much a score moves at most with a residual of length 1, in components.
+    /// Most that a score changes with a residual of length 1, in components.
     component_steepness: f32,
-    /// Rounding in tables for a centroid scale of 1.
+    /// Rounding error of the tables for a centroid scale of 1.
     table_error: f32,
-    /// Sum over vectors of the largest that tables name, for a centroid scale of 1.
+    /// Sum over vectors of the largest table value, for a centroid scale of 1.
     table_reach: f32,
 }
 
 impl<'a> AskedQuestion<'a> {
-    /// Returns the question's view of a shard that was searched.
+    /// Returns the question's view of a shard; `None` if the shard was not searched.
     pub(super) fn cell(&'a self, at: usize) -> Option<Cell<'a>> {
         let (shard, scores) = (&self.shards[at], &self.scored.shards[at]);
         if !scores.is_searched {
@@ -87,7 +87,7 @@ impl<'a> AskedQuestion<'a> {
         };
         let detail = match (&shard.exact, &shard.residuals) {
             _ if self.precision == Precision::Centroids => Detail::Nothing,
-            // Codes whose errors were not measured say nothing.
+            // Codes with unmeasured errors cannot decide.
             (Some(exact), Some(residuals))
                 if self.precision == Precision::Measured && shard.header.errors.mean > 0.0 =>
             {
@@ -120,7 +120,7 @@ impl<'a> AskedQuestion<'a> {
 }
 
 impl Cell<'_> {
-    /// Whether a member's score may differ from its centroid's.
+    /// Returns whether a member's score may differ from its centroid's.
     pub fn has_detail(&self) -> bool {
         !matches!(self.detail, Detail::Nothing)
     }
@@ -129,9 +129,9 @@ impl Cell<'_> {
         self.asked.places.iter().map(|place| &self.scores.projections[*place])
     }
 
-    /// Sets what depends on the question and the residual code alone.
+    /// Computes the values that depend on the question and the residual code only.
     fn measure(&mut self, residuals: &Residuals<'_>) {
-        // Components that no group has do not take part.
+        // Components outside all subspaces do not take part.
         let n_coded = residuals.subspace_starts.last().map_or(0, |end| *end as usize);
         let mut projections = self.projections();
         let own = projections.next().map_or(&[][..], |own| &own.components[..n_coded]);
@@ -151,13 +151,13 @@ impl Cell<'_> {
             (steepness, table_error, table_reach);
     }
 
-    /// Returns a member's score by one vector for a sum of codes of 0, and what each step of the sum adds.
+    /// Returns a member's score by one vector for a code sum of 0, and the increase per step of the sum.
     pub fn line(&self, place: usize, centroid: usize, residuals: &Residuals<'_>) -> (f32, f32) {
         let (tables, scale) = (&self.scores.projections[place].tables, residuals.residual_scales[centroid]);
         (self.scores.centroids[place][centroid] + scale * tables.offset, scale * tables.step)
     }
 
-    /// Returns by how much members' scores differ at most from their centroid's through the residual code.
+    /// Returns the largest difference between a member's score and its centroid's under the residual code.
     fn residual_bound(&self, centroid: usize, residuals: &Residuals<'_>) -> f32 {
         let scale = residuals.residual_scales[centroid];
         let apart = residuals.residual_norms[centroid] * self.component_steepness + scale * self.table_error;
@@ -165,14 +165,14 @@ impl Cell<'_> {
         apart * (1.0 + 4.0 * f32::EPSILON) + self.rounding(centroid, residuals)
     }
 
-    /// Returns a bound on what the rounding in f32 of a member's score comes to.
+    /// Bounds the error of rounding a member's score to f32.
     fn rounding(&self, centroid: usize, residuals: &Residuals<'_>) -> f32 {
         let of_centroids: f32 =
             self.asked.places.iter().map(|place| self.scores.centroids[*place][centroid].abs()).sum();
         2.0 * f32::EPSILON * (of_centroids + residuals.residual_scales[centroid] * self.table_reach)
     }
 
-    /// Returns two scores that a centroid's members lie between.
+    /// Returns lower and upper bounds on the scores of a centroid's members.
     pub fn bounds(&self, centroid: usize) -> (f32, f32) {
         let score = self.centroids[centroid];
         match &self.detail {
@@ -203,17 +203,17 @@ impl Cell<'_> {
         }
     }
 
-    /// Returns by how much a stored embedding's score may differ from its centroid's.
+    /// Returns the largest difference between the score of a stored embedding and that of its centroid.
     pub fn embedding_bound(&self, centroid: usize) -> f32 {
         let question = self.asked.question;
         let distance = self.shard.radii[centroid] + F16_ROUNDING;
         self.asked.steepness * distance + 2.0 * question.rounding_bound() + self.centroid_error(centroid)
     }
 
-    /// Returns a bound on what rounding changes a centroid's score by.
+    /// Bounds the rounding error of a centroid's score.
     pub fn centroid_error(&self, centroid: usize) -> f32 {
         let error = |projection: &Projection| {
-            // Members are of unit length, so that the centroid is no longer than 1 and their distance from it.
+            // Members have unit length, so neither the centroid nor their distance from it is longer than 1.
             let length = 1.0 + self.shard.radii[centroid] + projection.mean_length;
             projection.error_per_length * length + projection.error + f32::EPSILON * (1.0 + length)
         };
@@ -221,8 +221,8 @@ impl Cell<'_> {
         errors.next().unwrap_or(0.0) + errors.fold(0.0, f32::max)
     }
 
-    /// Returns a bound on the error of the centroid's score, or of its members' own where they are scored by
-    /// a residual code.
+    /// Bounds the error of the centroid's score, or of its members' scores where a residual code gives them
+    /// their own.
     pub fn score_error(&self, centroid: usize) -> f32 {
         let of_centroids = self.asked.steepness * self.shard.radii[centroid] + self.centroid_error(centroid);
         let of_codes = |residuals: &Residuals<'_>| {
@@ -232,14 +232,14 @@ impl Cell<'_> {
         };
         match (&self.detail, &self.shard.residuals) {
             (Detail::Residuals(residuals), _) => of_codes(residuals),
-            // Beside exact embeddings, radii are measured to the centroid.
+            // With exact embeddings present, radii are measured to the centroid.
             (Detail::Measured(Measured { residuals, .. }), _) => {
                 let by_code =
                     of_codes(residuals) + residuals.residual_norms[centroid] * self.component_steepness;
-                // Score and truth lie within that bound of the centroid's score.
+                // Both the score and the true value lie within that bound of the centroid's score.
                 by_code.max(2.0 * self.embedding_bound(centroid))
             }
-            // Radii are measured to what centroid and code decode to.
+            // Radii are measured to the vector that centroid and code decode to.
             (_, Some(residuals)) if self.shard.exact.is_none() => {
                 of_centroids + residuals.residual_norms[centroid] * self.component_steepness
             }

@@ -1,4 +1,4 @@
-//! Scores of all centroids, which every kind of answer starts from.
+//! Scores of all centroids: the first step of every answer.
 
 use std::sync::Arc;
 
@@ -11,12 +11,12 @@ use super::question::Question;
 use super::region::Region;
 use super::simd::Level;
 
-/// What questions score, centroid by centroid.
+/// Scores of one or several questions, centroid by centroid.
 #[derive(Default)]
 pub(super) struct CentroidScores {
     /// The distinct vectors of all questions.
     pub vectors: Vec<Vector>,
-    /// By place in the slice of shards.
+    /// By index in the slice of shards.
     pub shards: Vec<ShardScores>,
 }
 
@@ -35,21 +35,22 @@ pub(super) struct AskedQuestion<'a> {
     pub steepness: f32,
 }
 
-/// What questions score in one shard.
+/// Scores in one shard.
 #[derive(Default)]
 pub(super) struct ShardScores {
-    /// Whether the shard reaches into the region; if not, all else is of an earlier search.
+    /// Whether the shard reaches into the region. If not, the other fields are left over from an earlier
+    /// search.
     pub is_searched: bool,
-    /// Of each vector.
+    /// One for each vector.
     pub projections: Vec<Projection>,
     /// `[vectors][centroids]`.
     pub centroids: Vec<Vec<f32>>,
-    /// `[questions][centroids]`: of those with negatives, what these leave.
+    /// `[questions][centroids]`: scores less those of the negatives; empty for questions without negatives.
     pub combined: Vec<Vec<f32>>,
 }
 
 impl CentroidScores {
-    /// Scores the centroids of the shards that reach into the region. Returns the places of each question's
+    /// Scores the centroids of the shards that reach into the region. Returns the indices of each question's
     /// vectors, its own first.
     pub fn score(
         &mut self,
@@ -73,7 +74,8 @@ impl CentroidScores {
     }
 }
 
-/// Returns the distinct vectors of some questions, and the places of each question's among them, its own first.
+/// Returns the distinct vectors of some questions, and the indices of each question's vectors among them, its
+/// own first.
 pub(super) fn distinct(questions: &[Question]) -> (Vec<&[f32]>, Vec<Vec<usize>>) {
     let mut distinct: Vec<&[f32]> = Vec::new();
     let mut place = |vector| {
@@ -131,8 +133,8 @@ impl ShardScores {
     }
 }
 
-/// Returns a product less the largest of those with negatives; never -0, which would sort after 0
-/// though it is equal.
+/// Returns a product less the largest of its negatives' products. Never -0, which would sort after 0 though
+/// it is equal.
 pub(super) fn combine(own: f32, negatives: impl Iterator<Item = f32>) -> f32 {
     negatives.reduce(f32::max).map_or(own, |worst| own - worst) + 0.0
 }

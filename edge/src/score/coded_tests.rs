@@ -12,7 +12,7 @@ use glam::DVec3;
 use half::f16;
 use slag_math::random::Random;
 
-/// Dimension, components, whether there is a basis, groups.
+/// Dimension, components, whether there is a basis, subspaces.
 const SHAPES: [(usize, usize, bool, usize); 10] = [
     (16, 0, true, 0),
     (1, 1, false, 0),
@@ -35,7 +35,7 @@ fn shards_of(
     (dim, n_components, has_basis, n_subspaces): (usize, usize, bool, usize),
     is_exact: bool,
 ) -> Vec<BuiltShard> {
-    // Rows that end in blocks, at their ends, and fill several.
+    // Centroids that end inside blocks, at block ends, and that span several blocks.
     let lens = [&[1, 31, 32, 33, 70, 64, 5][..], &[1], &[3; 40]];
     let mut build = |(at, lens): (usize, &[usize])| {
         let cell_id = 9 - at as u32;
@@ -47,7 +47,7 @@ fn shards_of(
     lens.into_iter().enumerate().map(&mut build).collect()
 }
 
-/// The score of a Gaussian as the format and the module define it, from the rounded parts, one by one.
+/// Scores a Gaussian as the format and the module define it, from the rounded parts, one by one.
 fn defined_score(search: &Search<'_>, shard_at: usize, index: usize) -> f32 {
     let shard = &search.shards()[shard_at];
     let (centroid, scores) = (shard.row_of(index), &search.asked.scored.shards[shard_at]);
@@ -58,9 +58,9 @@ fn defined_score(search: &Search<'_>, shard_at: usize, index: usize) -> f32 {
             return own;
         };
         let (tables, scale) = (&scores.projections[*place].tables, residuals.residual_scales[centroid]);
-        let value = |group: usize| {
-            let half = if group.is_multiple_of(2) { &tables.low } else { &tables.high };
-            u32::from(half[group / 2][residuals.code(index, group)])
+        let value = |subspace: usize| {
+            let half = if subspace.is_multiple_of(2) { &tables.low } else { &tables.high };
+            u32::from(half[subspace / 2][residuals.code(index, subspace)])
         };
         let sum: u32 = (0..shard.header.n_subspaces as usize).map(value).sum();
         (own + scale * tables.offset) + scale * tables.step * sum as f32
@@ -118,12 +118,12 @@ fn scores_are_within_the_stated_error() {
     assert!(largest_share > 0.05, "the bound says nothing: {largest_share}");
 }
 
-/// Oracle: every Gaussian's score as defined, compared and sorted.
+/// Oracle: every Gaussian's score by definition, compared and sorted.
 #[test]
 fn answers_are_those_of_brute_force() {
     let mut random = Random::new(22);
     let (mut n_scanned, mut n_all) = (0, 0);
-    // Memory of other scenes, precisions and questions must not show.
+    // Buffers of other scenes, precisions and questions must not leak into an answer.
     let mut scratch = Scratch::default();
     for shape in SHAPES {
         let built = shards(&mut random, shape);
@@ -163,7 +163,7 @@ fn answers_are_those_of_brute_force() {
                 assert_eq!(found.len(), expected.len(), "{shape:?} {precision:?} {threshold}");
                 for ((found, _), expected) in found.iter().zip(&expected) {
                     assert_eq!((found.shard, found.index), (expected.shard, expected.index));
-                    // Of a centroid that is in as a whole, its own score is given.
+                    // A centroid that matches as a whole reports its own score.
                     let centroid = views[found.shard as usize].row_of(found.index as usize);
                     let cell = search.asked.cell(found.shard as usize).expect("searched");
                     assert!(found.score == expected.score || found.score == cell.centroids[centroid]);
@@ -200,8 +200,8 @@ fn answers_are_those_of_brute_force() {
     assert!(n_scanned * 20 > n_all, "hardly any code was read: {n_scanned} of {n_all}");
 }
 
-/// Oracle: each Gaussian's scores by code, fine residual and embedding, as the format and the module define them,
-/// and what is in by those.
+/// Oracle: each Gaussian's scores by code, fine residual and embedding, as the format and the module define
+/// them, and the matches that follow.
 #[test]
 fn measured_errors_decide_as_defined() {
     let mut random = Random::new(24);
@@ -237,7 +237,7 @@ fn measured_errors_decide_as_defined() {
                 let of_shard = (0..view.n_with_evidence()).map(|i| (at as u32, i as u32, scores(at, i)));
                 all.extend(of_shard);
             }
-            // Products are rounded to 16 bits, and that decides in a few cases.
+            // Products are rounded to 16 bits, which decides in a few cases.
             let rounding = 1e-3 * n_products;
             let mut codes: Vec<f32> = all.iter().map(|(_, _, scores)| scores[0]).collect();
             codes.sort_by(|a, b| b.total_cmp(a));
@@ -290,7 +290,7 @@ fn measured_errors_decide_as_defined() {
     assert!(n_fine * 50 > n_all && n_embeddings > 0, "{n_all} {n_fine} {n_embeddings}");
 }
 
-/// A shard may state anything that the format allows, at its largest.
+/// A shard may state any value the format allows, at its largest.
 #[test]
 fn the_largest_numbers_do_no_harm() {
     let mut random = Random::new(23);

@@ -14,15 +14,15 @@ use super::matches::{Effort, Matches, Run};
 use super::region::Region;
 use super::simd::{BlockSums, FindSums, LastBlock, SomeRowsTimesVector};
 
-/// Runs on their way to an answer, and what finding them takes; kept from one answer to the next.
+/// Runs found so far, and buffers kept from one answer to the next.
 #[derive(Default)]
 pub(super) struct Gather {
-    /// By place in the slice of shards.
+    /// By index in the slice of shards.
     pub shards: Vec<ShardGather>,
 }
 
 impl Gather {
-    /// Returns what the gathering took.
+    /// Returns the work done.
     pub fn effort(&self) -> Effort {
         let mut effort = Effort::default();
         self.shards.iter().for_each(|of_shard| effort += of_shard.found.effort);
@@ -30,36 +30,36 @@ impl Gather {
     }
 }
 
-/// Which scores are in.
+/// Bounds on the scores to gather.
 #[derive(Clone, Copy)]
 pub(super) struct Cut {
-    /// The score of the last that are.
+    /// Lowest score wanted.
     pub score: f32,
-    /// None below is in, though that score is an estimate.
+    /// No score below this matches, even though `score` is an estimate.
     pub least: f32,
 }
 
-/// What one shard contributes.
+/// Matches of one shard, and buffers.
 #[derive(Default)]
 pub(super) struct ShardGather {
     pub found: Matches,
-    /// Sums of codes of one block, by vector of the question.
+    /// Code sums of the block read last, by vector of the question.
     last: Vec<LastBlock>,
-    /// Members of one centroid that reach a sum.
+    /// Members of one centroid whose code sum reaches the minimum.
     sums: Vec<(u32, u16)>,
     refine: Refine,
-    /// Whether matches are only to be counted.
+    /// Whether matches are only counted.
     is_counting: bool,
-    /// How many have a score in each part of the range of scores; empty where there is none.
+    /// Number of scores in each bin; empty if there is none.
     pub bins: Vec<u32>,
 }
 
-/// Memory for members of one centroid that are looked at more closely.
+/// Buffers for the members of one centroid that are refined.
 #[derive(Default)]
 struct Refine {
-    /// Members with the scores of their codes, then better ones.
+    /// Members with the scores of their codes, later with refined ones.
     members: Vec<(u32, f32)>,
-    /// Places in `members` and members whose codes do not decide.
+    /// Undecided members: index in `members`, and the score of the code.
     undecided: Vec<(usize, f32)>,
     which: Vec<u32>,
     products: Vec<i32>,
@@ -68,8 +68,8 @@ struct Refine {
 }
 
 impl AskedQuestion<'_> {
-    /// Gathers what reaches a threshold. `each`: members of shards that know more of them than their centroid get
-    /// scores of their own even where the centroid alone decides.
+    /// Gathers the Gaussians that reach a threshold. `each`: scores members one by one even where the
+    /// centroid alone decides, in shards that can.
     pub(super) fn collect(&self, gather: &mut Gather, cut: Cut, each: bool) {
         gather.shards.resize_with(self.shards.len(), ShardGather::default);
         gather.shards.par_iter_mut().enumerate().for_each(|(at, gather)| {
@@ -81,7 +81,8 @@ impl AskedQuestion<'_> {
         });
     }
 
-    /// Counts what reaches a threshold, each by its own score, of centroids whose own score reaches `floor`.
+    /// Counts the Gaussians that reach a threshold by their own scores, in centroids that score at least
+    /// `floor`.
     pub(super) fn count(&self, gather: &mut Gather, threshold: f32, floor: f32) {
         gather.shards.resize_with(self.shards.len(), ShardGather::default);
         gather.shards.par_iter_mut().enumerate().for_each(|(at, gather)| {
@@ -171,7 +172,7 @@ impl Cell<'_> {
         combine(products.next().unwrap_or(0.0), products)
     }
 
-    /// Scores members of a centroid by their codes; those that reach the threshold are kept in `gather.refine`.
+    /// Scores members of a centroid by their codes; those that reach the threshold go to `gather.refine`.
     fn scan(
         &self,
         gather: &mut ShardGather,
@@ -187,7 +188,7 @@ impl Cell<'_> {
         let places = &self.asked.places;
         let tables = &self.scores.projections[places[0]].tables;
         let (own, step) = self.line(places[0], centroid, residuals);
-        // The score grows with the sum, so that sums are compared and only what matches is scored.
+        // The score grows with the sum: sums are compared, and only matches are scored.
         let is_single = places.len() == 1;
         let least = if is_single { least_sum(own, step, tables.most, threshold) } else { Some(0) };
         let Some(least) = least else { return };
@@ -241,7 +242,8 @@ impl Cell<'_> {
         found.runs.extend(refine.members.iter().map(run));
     }
 
-    /// Scores members near the border by what is known better of them, and drops those that are out.
+    /// Refines the scores of undecided members by fine residuals and embeddings, and drops those that fall
+    /// out.
     fn refine(&self, gather: &mut ShardGather, measured: &Measured<'_>, centroid: usize, cut: Cut) {
         let ShardGather { refine, found, .. } = gather;
         let Refine { members, undecided, which, products, scores } = refine;
@@ -259,8 +261,8 @@ impl Cell<'_> {
             for place in &self.asked.places {
                 let rounded = &self.scores.projections[*place].fine;
                 let n_components = self.shard.header.n_components as usize;
-                let (centroids, vector) = (fine.values, &rounded.steps[..]);
-                self.level.dispatch(SomeRowsTimesVector { centroids, n_components, vector, which, products });
+                let (rows, vector) = (fine.values, &rounded.steps[..]);
+                self.level.dispatch(SomeRowsTimesVector { rows, n_components, vector, which, products });
                 let (own, step) = (
                     self.scores.centroids[*place][centroid],
                     f64::from(fine.scales[centroid]) * rounded.step,
@@ -270,7 +272,7 @@ impl Cell<'_> {
             for (number, (place, _)) in undecided.iter().enumerate() {
                 let mut products = scores[number..].iter().step_by(which.len()).copied();
                 let score = combine(products.next().unwrap_or(0.0), products);
-                // Where the embedding's own score is, whatever the residual says.
+                // The embedding's score lies within this bound, whatever the residual says.
                 let (of_centroid, bound) = (self.centroids[centroid], self.embedding_bound(centroid));
                 members[*place].1 = score.max(of_centroid - bound).min(of_centroid + bound);
             }
@@ -281,7 +283,8 @@ impl Cell<'_> {
                 found.effort.n_embeddings_read += 1;
                 *score = self.exact_score(measured.exact.embeddings, *at as usize);
             }
-            // What was in by its code stays unless it is below the least: as many are found as were sought.
+            // A member that its code let in stays unless it is below the minimum: the number found then
+            // equals the number asked for.
             let is_out = *of_code < cut.score && *score < cut.score - measured.fine_margin;
             if is_out || *score < cut.least {
                 *score = f32::NEG_INFINITY;
@@ -291,13 +294,14 @@ impl Cell<'_> {
     }
 }
 
-/// Returns the least sum whose score `own + step * sum` reaches a threshold; none up to `most` may.
+/// Returns the least sum with a score `own + step * sum` at or above a threshold; `None` if no sum up to
+/// `most` has one.
 fn least_sum(own: f32, step: f32, most: u16, threshold: f32) -> Option<u16> {
     let reaches = |sum: u16| own + step * f32::from(sum) >= threshold;
     if !reaches(most) {
         return None;
     }
-    // Off by rounding only; a flat line would make it a long way from there.
+    // Off by rounding only, except that a flat line may put it far away.
     let guess = (((threshold - own) / step).ceil() as u16).min(most);
     let near = guess.saturating_sub(2)..guess.saturating_add(2).min(most);
     let (mut low, mut high) = (0, most);
@@ -314,7 +318,7 @@ fn least_sum(own: f32, step: f32, most: u16, threshold: f32) -> Option<u16> {
     Some(low)
 }
 
-/// Returns the parts of a range of Gaussians that lie inside the filter.
+/// Returns the parts of a range of Gaussians that lie in the region.
 pub(super) fn runs_inside(
     shard: &ShardView<'_>,
     filter: Option<Region>,
@@ -339,7 +343,7 @@ mod tests {
     use super::*;
     use slag_math::random::Random;
 
-    /// Oracle: every sum tried. Steps from far below the score's last bit to far above it.
+    /// Oracle: every sum, tried in turn. Steps range from far below the score's last bit to far above it.
     #[test]
     fn the_least_sum_is_the_first_that_reaches() {
         let mut random = Random::new(41);

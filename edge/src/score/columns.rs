@@ -5,13 +5,13 @@ use slag_common::shard::{Positions, ShardView};
 
 use super::matches::{Hit, Run};
 
-/// Gaussians that one thread fills in at a time; few where tests are to need several.
+/// Gaussians that one thread fills in at a time; small in tests, so that several threads take part.
 const CHUNK: usize = if cfg!(test) { 64 } else { 4096 };
 
-/// Gaussians of an answer, a value of each in every column.
+/// Gaussians of an answer as columns of equal length.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Columns {
-    /// Position of the shard in the searched slice.
+    /// Index of the shard in the searched slice.
     pub shard: Vec<u32>,
     /// Index in the shard.
     pub index: Vec<u32>,
@@ -25,7 +25,7 @@ pub struct Columns {
     pub z: Vec<f64>,
 }
 
-/// The same centroids of all columns.
+/// The same rows of all columns.
 struct Part<'a> {
     shard: &'a mut [u32],
     index: &'a mut [u32],
@@ -44,7 +44,7 @@ impl Part<'_> {
     }
 }
 
-/// As [`ShardView::position_in_world`], the same bits, but compiled into the loop over many.
+/// As [`ShardView::position_in_world`], with the same bits, but inlined into the loop.
 #[inline]
 fn position_in_world(shard: &ShardView<'_>, index: usize) -> [f64; 3] {
     let header = &shard.header;
@@ -68,12 +68,12 @@ impl Columns {
         self.index.len()
     }
 
-    /// Whether there is none.
+    /// Returns whether there are none.
     pub fn is_empty(&self) -> bool {
         self.index.is_empty()
     }
 
-    /// Becomes the columns of [`super::Search::best`]'s answer, in its order.
+    /// Replaces the columns by an answer of [`super::Search::best`], in its order.
     pub fn set_hits(&mut self, shards: &[ShardView<'_>], hits: &[Hit]) {
         self.resize(hits.len());
         self.parts().zip(hits.par_chunks(CHUNK)).for_each(|(mut part, hits)| {
@@ -81,10 +81,10 @@ impl Columns {
         });
     }
 
-    /// Becomes the columns of [`super::Search::matching`]'s answer, in its order.
+    /// Replaces the columns by an answer of [`super::Search::matching`], in its order.
     pub fn set_runs(&mut self, shards: &[ShardView<'_>], runs: &[Run]) {
         let mut n = 0usize;
-        // Where each chunk of centroids starts: a run, and a member of it.
+        // Where each chunk of rows starts: a run, and a member of it.
         let mut starts = Vec::new();
         for (place, run) in runs.iter().enumerate() {
             let len = (run.end - run.start) as usize;

@@ -4,14 +4,14 @@ use half::f16;
 
 use super::simd::{Kernels, Work};
 
-/// Sums that are kept apart until the end: one AVX register, two of SSE or NEON.
+/// Partial sums kept apart until the end: one AVX register, two of SSE or NEON.
 const LANES: usize = 8;
-/// Components multiplied at a time; the products stay in the first-level cache.
+/// Components multiplied at a time; their products stay in the L1 cache.
 const BLOCK: usize = 512;
 
-/// Returns a finite f16 as f32, exactly, in operations that every vector unit has: the bits are moved
-/// into place, and the exponents' biases differ by 127 - 15 = 112. (Conversion instructions would have
-/// to be called through a runtime check, every few components.)
+/// Converts a finite f16 to f32, exactly, with operations that every vector unit has: shifts the bits into
+/// place and corrects the exponent bias by 127 - 15 = 112. (Conversion instructions would need a runtime
+/// check every few components.)
 #[inline(always)]
 pub(super) fn widen(value: f16) -> f32 {
     const BIAS: f32 = f32::from_bits((127 + 112) << 23);
@@ -19,18 +19,18 @@ pub(super) fn widen(value: f16) -> f32 {
     f32::from_bits((bits & 0x8000) << 16 | (bits & 0x7fff) << 13) * BIAS
 }
 
-/// Returns `centroid · vector`, summed in f32 in a fixed order: the same bits on every machine and for
-/// any number of threads. Components past the shorter one's end are ignored; the centroid must be finite
-/// (a checked shard's is).
+/// Returns `embedding · vector`, summed in f32 in a fixed order: the same bits on every machine and for any
+/// number of threads. Ignores components past the end of the shorter vector. The embedding must be finite, as
+/// those of a checked shard are.
 #[inline(always)]
-pub fn dot(centroid: &[f16], vector: &[f32]) -> f32 {
+pub fn dot(embedding: &[f16], vector: &[f32]) -> f32 {
     let mut lanes = [0.0f32; LANES];
     let mut products = [0.0f32; BLOCK];
-    for (centroid, vector) in centroid.chunks(BLOCK).zip(vector.chunks(BLOCK)) {
-        let n = centroid.len().min(vector.len());
-        // One plain loop each for products and for every halving: the compiler turns those, and not
-        // one loop over eight running sums, into vector instructions.
-        for ((product, a), b) in products.iter_mut().zip(centroid).zip(vector) {
+    for (embedding, vector) in embedding.chunks(BLOCK).zip(vector.chunks(BLOCK)) {
+        let n = embedding.len().min(vector.len());
+        // One plain loop each for the products and for every halving: the compiler vectorises those, but not
+        // a single loop over eight running sums.
+        for ((product, a), b) in products.iter_mut().zip(embedding).zip(vector) {
             *product = widen(*a) * b;
         }
         let mut width = n.next_power_of_two().max(LANES);
@@ -50,7 +50,7 @@ pub fn dot(centroid: &[f16], vector: &[f32]) -> f32 {
     ((a + e) + (c + g)) + ((b + f) + (d + h))
 }
 
-/// [`dot`] for an instruction set: wider vectors, the same sums.
+/// [`dot`] compiled for an instruction set: wider vectors, the same sums.
 pub(super) struct EmbeddingTimesVector<'a>(pub &'a [f16], pub &'a [f32]);
 
 impl Work for EmbeddingTimesVector<'_> {
@@ -62,9 +62,9 @@ impl Work for EmbeddingTimesVector<'_> {
     }
 }
 
-/// Returns a bound on the error of [`dot`] for unit vectors: each product passes at most 1 + 6
-/// roundings in its block, one per block and 3 at the end, of 2^-24 each, and the absolute products sum
-/// to at most 1; doubled, since a stored centroid may be a little longer than 1.
+/// Bounds the error of [`dot`] for unit vectors: each product passes at most 1 + 6 roundings in its block,
+/// one per block and 3 at the end, of 2^-24 each, and the absolute products sum to at most 1. The bound is
+/// doubled, because a stored embedding may be a little longer than 1.
 pub fn rounding_bound(dim: usize) -> f32 {
     (dim.div_ceil(BLOCK) + 10) as f32 * f32::EPSILON
 }
@@ -88,16 +88,16 @@ mod tests {
         /// Oracle: a plain f64 sum.
         #[test]
         fn equals_a_float64_sum(pairs in prop::collection::vec((-1.0f32..1.0, -1.0f32..1.0), 0..1300)) {
-            let centroid: Vec<f16> = pairs.iter().map(|(a, _)| f16::from_f32(*a)).collect();
+            let embedding: Vec<f16> = pairs.iter().map(|(a, _)| f16::from_f32(*a)).collect();
             let vector: Vec<f32> = pairs.iter().map(|(_, b)| *b).collect();
-            let terms = || centroid.iter().zip(&vector).map(|(a, b)| a.to_f64() * f64::from(*b));
+            let terms = || embedding.iter().zip(&vector).map(|(a, b)| a.to_f64() * f64::from(*b));
             let expected: f64 = terms().sum();
             let absolute: f64 = terms().map(f64::abs).sum();
             let bound = f64::from(rounding_bound(pairs.len())) * absolute + 1e-30;
-            prop_assert!((f64::from(dot(&centroid, &vector)) - expected).abs() <= bound);
+            prop_assert!((f64::from(dot(&embedding, &vector)) - expected).abs() <= bound);
             for level in Level::available() {
-                let found = level.dispatch(EmbeddingTimesVector(&centroid, &vector));
-                prop_assert_eq!(found.to_bits(), dot(&centroid, &vector).to_bits(), "{}", level.name());
+                let found = level.dispatch(EmbeddingTimesVector(&embedding, &vector));
+                prop_assert_eq!(found.to_bits(), dot(&embedding, &vector).to_bits(), "{}", level.name());
             }
         }
     }

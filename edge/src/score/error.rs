@@ -1,13 +1,13 @@
 //! Errors of scoring.
 
-/// Largest coordinate of a scene, world units. Larger ones (a hundred times the earth's diameter) are refused: they
-/// would overflow what is computed from them.
+/// Largest coordinate of a scene, world units. Larger ones (a hundred times the earth's diameter) are
+/// refused, because computations with them would overflow.
 pub const MAX_COORDINATE: f64 = 1e9;
 
-/// Why shards cannot be scored.
+/// Errors of scoring.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ScoreError {
-    /// The query vector is of another space.
+    /// The query vector has another dimension than the shard.
     #[error(
         "cell {cell_id} holds embeddings of {expected} components, the query vector has {found}; use the models that the scene was encoded with"
     )]
@@ -25,7 +25,7 @@ pub enum ScoreError {
         /// Its length.
         found: f32,
     },
-    /// A negative is of another space than the question.
+    /// A negative has another dimension than the question.
     #[error(
         "a negative has {found} components, the query vector {expected}; take both from the same text model"
     )]
@@ -35,7 +35,7 @@ pub enum ScoreError {
         /// Components of the negative.
         found: usize,
     },
-    /// A shard's positions lie where no scene is.
+    /// A shard's positions exceed [`MAX_COORDINATE`].
     #[error(
         "cell {cell_id}: positions reach {found:e}, the limit is {MAX_COORDINATE:e} world units; encode the scene again around a nearer origin"
     )]

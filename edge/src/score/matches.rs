@@ -3,7 +3,7 @@
 /// One Gaussian and its score.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {
-    /// Position of the shard in the searched slice.
+    /// Index of the shard in the searched slice.
     pub shard: u32,
     /// Index in the shard.
     pub index: u32,
@@ -12,36 +12,36 @@ pub struct Hit {
     pub score: f32,
 }
 
-/// Matching Gaussians of one shard that lie next to each other and share a score.
+/// Adjacent matching Gaussians of one shard that share a score.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Run {
-    /// Position of the shard in the searched slice.
+    /// Index of the shard in the searched slice.
     pub shard: u32,
     /// First member.
     pub start: u32,
     /// One past the last member.
     pub end: u32,
-    /// Score of the centroid, or of the one Gaussian where it was scored by itself.
+    /// Score of the centroid, or of the Gaussian itself where it was scored alone.
     pub score: f32,
 }
 
 /// Gaussians that reach a threshold.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Matches {
-    /// Runs, by shard and start, ascending; they do not overlap.
+    /// Disjoint runs, by shard and start, ascending.
     pub runs: Vec<Run>,
     /// Gaussians in the runs.
     pub n_gaussians: u64,
-    /// Rows that could only be decided member by member.
+    /// Centroids that had to be decided member by member.
     pub n_centroids_undecided: u64,
-    /// What finding them took.
+    /// Work done.
     pub effort: Effort,
-    /// Shards none of whose centroids can reach the threshold.
+    /// Shards without a centroid that can reach the threshold.
     pub n_shards_below: usize,
 }
 
 impl Matches {
-    /// Empties the list; its memory stays.
+    /// Empties the list and keeps its memory.
     pub fn clear(&mut self) {
         let mut runs = std::mem::take(&mut self.runs);
         runs.clear();
@@ -49,16 +49,16 @@ impl Matches {
     }
 }
 
-/// What finding an answer took, beyond the centroids.
+/// Work done beyond scoring centroids.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Effort {
-    /// Gaussians that were scored by themselves.
+    /// Gaussians scored individually.
     pub n_rescored: u64,
-    /// Blocks of residual codes that were read.
+    /// Blocks of residual codes read.
     pub n_blocks_read: u64,
-    /// Fine residuals that were read.
+    /// Fine residuals read.
     pub n_fine_read: u64,
-    /// Exact embeddings that were read.
+    /// Exact embeddings read.
     pub n_embeddings_read: u64,
 }
 

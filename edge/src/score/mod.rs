@@ -1,18 +1,19 @@
-//! Scores questions against shards, codebook centroid by codebook centroid.
+//! Scores questions against shards, centroid by centroid.
 //!
-//! A centroid's radius `r` bounds `||E_k - P[centroid]||` over its members, so a score of a member is within
-//! `r * steepness` of the centroid's, where the steepness is 1 for a plain cosine and `max_j ||q - n_j||` with
-//! negatives; what rounding adds is in `project.rs`. Where a shard knows more of a Gaussian than its centroid, a
-//! residual code or the exact embedding (and that is asked for), centroids that stay at or above the threshold
-//! by more than that are in as a whole, centroids below it by more are out, and only members of the centroids
-//! between are scored one by one. Where it does not, a centroid is in when its own score reaches the threshold,
-//! and the answer carries the bound.
+//! A centroid's radius `r` bounds `||E_k - P[centroid]||` over its members, so a member's score lies within
+//! `r * steepness` of the centroid's. The steepness is 1 for a plain cosine and `max_j ||q - n_j||` with
+//! negatives; `project.rs` adds the rounding errors. Where a shard has a residual code or the exact
+//! embedding, and the precision asks for it, centroids above the threshold by more than that bound match as a
+//! whole, centroids below it by more are skipped, and only members of the centroids in between are scored one
+//! by one. Where it has neither, a centroid matches when its own score reaches the threshold, and the answer
+//! states the bound.
 //!
-//! Hard bounds of codes are tens of times their usual errors, so that exact answers read most embeddings near the
-//! border. With [`Precision::Measured`], codes decide all but what lies within a few of their measured errors
-//! from it, fine residuals all of that but what lies within a few of theirs, and embeddings the rest.
+//! Hard bounds of codes are tens of times larger than their usual errors, so exact answers read most
+//! embeddings near the threshold. With [`Precision::Measured`], codes decide everything except scores within
+//! a few of their measured errors of the threshold, fine residuals decide those except within a few of their
+//! own errors, and embeddings decide the rest.
 //!
-//! Scores of centroids and codes are sums of integers, scaled once: the same bits on every processor.
+//! Scores of centroids and codes are integer sums, scaled once: they have the same bits on every processor.
 
 mod bins;
 mod cell;

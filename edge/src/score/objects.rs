@@ -1,9 +1,9 @@
 //! Scores questions against the objects of a generation, each object once.
 //!
-//! With `q^` and `y^` as in `project.rs`, a vector `v` of an object scores `mean . q + step * v . y^`, a product of
-//! integers, scaled once. What is kept of a vector is at most 1 + e long, e being the bound that its shard states for
-//! what keeping it changed; so rounding the question changes its score by at most
-//! `|q - q^| (1 + e + |mean|) + step * |v| * |y - y^|` (Cauchy-Schwarz), and the bounds given here are that and e.
+//! With `q^` and `y^` as in `project.rs`, a vector `v` of an object scores `mean . q + step * v . y^`: an
+//! integer product, scaled once. A stored vector has length at most 1 + e, where e is the quantisation error
+//! bound stated by its shard. Rounding the question therefore changes the score by at most `|q - q^| (1 + e +
+//! |mean|) + step * |v| * |y - y^|` (Cauchy-Schwarz); the bounds returned are the sum of that and e.
 
 use rayon::prelude::*;
 use slag_common::objects::{MAX_VECTORS, Objects, object_score};
@@ -16,24 +16,25 @@ use super::question::{Question, check};
 use super::simd::{Level, SomeRowsTimesVector};
 use crate::store::objects::ObjectIndex;
 
-/// Objects whose vectors are multiplied at a time; their products stay in the first-level cache.
+/// Objects scored at a time; their products stay in the L1 cache.
 const TOGETHER: usize = 64;
-/// Rounding to f32 and the mean of two cosines: half a step of f32 each, at 2 or less.
+/// Rounding of two cosines and their mean to f32: half a step each, at 2 or less.
 const ROUNDING: f64 = 2.0 * f32::EPSILON as f64;
 
-/// How a question scores over the objects of a generation.
+/// Scores of one question over the objects of a generation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ObjectScores {
     /// By object, in the order of the index.
     pub scores: Vec<f32>,
-    /// No score is off by more.
+    /// Bound on the error of every score.
     pub error_bound: f32,
 }
 
-/// Scores all objects: [`object_score`] of a question's vector, less the largest of its negatives'. `objects`, `index`:
-/// of the shards.
+/// Scores all objects: [`object_score`] of the question's vector, less the largest score of its negatives.
+/// `objects` and `index` belong to the shards.
 ///
-/// Negatives that questions share are multiplied once. Same scores for any number of threads and on every processor.
+/// Negatives that questions share are multiplied once. Scores are the same for any number of threads and on
+/// every processor.
 /// # Errors
 /// [`ScoreError`].
 pub fn score_objects(
@@ -72,7 +73,7 @@ pub fn score_objects(
     Ok(all)
 }
 
-/// Returns what a question scores, from what its vector and its negatives do, in this order in `places`.
+/// Combines the scores of a question's vector and of its negatives, which `places` lists in this order.
 fn of_question(scored: &[ObjectScores], places: &[usize]) -> ObjectScores {
     let (own, negatives) = (&scored[places[0]], &places[1..]);
     let of = |(at, own): (usize, &f32)| combine(*own, negatives.iter().map(|n| scored[*n].scores[at]));
@@ -83,7 +84,7 @@ fn of_question(scored: &[ObjectScores], places: &[usize]) -> ObjectScores {
     }
 }
 
-/// Scores some objects of a shard with a vector. `which`: their numbers, and something else.
+/// Scores objects of a shard against one vector. `which`: pairs that begin with an object's number.
 fn of_vector(
     level: Level,
     shard: &ShardView<'_>,
@@ -95,34 +96,34 @@ fn of_vector(
     projection.set(level, shard, vector);
     let (n_vectors, n_components) = (objects.header.n_vectors, shard.header.n_components as usize);
     let mut scores = Vec::with_capacity(which.len());
-    let (mut centroids, mut products, mut largest_step) = (Vec::new(), Vec::new(), 0.0f32);
+    let (mut rows, mut products, mut largest_step) = (Vec::new(), Vec::new(), 0.0f32);
     for which in which.chunks(TOGETHER) {
-        centroids.clear();
-        centroids.extend(which.iter().flat_map(|(number, _)| number * n_vectors..(number + 1) * n_vectors));
+        rows.clear();
+        rows.extend(which.iter().flat_map(|(number, _)| number * n_vectors..(number + 1) * n_vectors));
         let vector = &projection.rounded.steps[..];
         products.clear();
-        // Vectors of no components are the mean.
+        // Vectors without components equal the mean.
         match n_components {
-            0 => products.resize(centroids.len(), 0),
+            0 => products.resize(rows.len(), 0),
             _ => level.dispatch(SomeRowsTimesVector {
-                centroids: objects.vectors,
+                rows: objects.vectors,
                 n_components,
                 vector,
-                which: &centroids,
+                which: &rows,
                 products: &mut products,
             }),
         }
-        for (centroids, products) in
-            centroids.chunks(n_vectors as usize).zip(products.chunks(n_vectors as usize))
+        for (rows, products) in
+            rows.chunks(n_vectors as usize).zip(products.chunks(n_vectors as usize))
         {
             let mut cosines = [0.0; MAX_VECTORS as usize];
-            for ((cosine, centroid), product) in cosines.iter_mut().zip(centroids).zip(products) {
-                let step = objects.steps[*centroid as usize];
+            for ((cosine, row), product) in cosines.iter_mut().zip(rows).zip(products) {
+                let step = objects.steps[*row as usize];
                 let scale = f64::from(step) * projection.rounded.step;
                 *cosine = (projection.base + scale * f64::from(*product)) as f32;
                 largest_step = largest_step.max(step);
             }
-            scores.push(object_score(&cosines[..centroids.len()]) + 0.0);
+            scores.push(object_score(&cosines[..rows.len()]) + 0.0);
         }
     }
     let kept = f64::from(objects.header.score_error_bound);
@@ -151,7 +152,7 @@ mod tests {
 
     const KEPT: f32 = 0.005;
 
-    /// A shard with an object for each id, of a Gaussian each.
+    /// Builds a shard with one object, of one Gaussian, for each id.
     fn built(random: &mut Random, (dim, m, has_basis): (usize, usize, bool), ids: &[u64]) -> BuiltShard {
         let (cell_id, n_subspaces, is_exact, origin) = (1, 0, false, DVec3::ZERO);
         let centroid_lens = vec![ids.len()];
@@ -166,7 +167,7 @@ mod tests {
             origin,
         };
         let shard = shard.build(random);
-        // Of length 1 at most, with the mean.
+        // At most unit length, with the mean.
         let objects = (0..).zip(ids).map(|(at, id)| TestObject {
             id: *id,
             vectors: (0..3 * m).map(|_| random.signed() * 0.9 / (m as f32).sqrt()).collect(),
@@ -176,8 +177,8 @@ mod tests {
         shard.with_objects(&objects.collect::<Vec<_>>(), Calibration { score_mean: 0.0, score_spread: 0.1 })
     }
 
-    /// Oracle: the format's definition in float64, in the first shard that has the object. The bound holds without its
-    /// share for what was kept, which no vector here needs.
+    /// Oracle: the format's definition in float64, in the first shard that has the object. The bound holds
+    /// without the share for quantisation, which no vector here needs.
     #[test]
     fn each_object_scores_as_defined_within_the_bound_and_at_every_level() {
         let mut random = Random::new(41);

@@ -2,18 +2,17 @@
 
 use serde::Serialize;
 
-/// Which data scores come from.
+/// The data that scores come from.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Precision {
-    /// Codebook centroids alone: fastest, every score within the bound stated.
+    /// Codebook centroids only: fastest; every score is within the stated bound.
     Centroids,
-    /// As `Exact`, but of shards with exact embeddings only those are read that the measured errors of codes,
-    /// and of fine residuals, leave near the border of the answer. Nearly all of the exact answer, tens of times
-    /// sooner; [`Search::measured_errors`] says how near its scores are.
+    /// As `Exact`, but in shards with exact embeddings reads only those that the measured errors of codes and
+    /// fine residuals leave undecided. Finds nearly all of the exact answer, tens of times faster;
+    /// [`super::Search::measured_errors`] states the errors of its scores.
     Measured,
-    /// Rows, and for what they cannot decide the residual codes or exact embeddings of shards that carry
-    /// them.
+    /// Centroids, and where they cannot decide, the shard's exact embeddings or residual codes.
     #[default]
     Exact,
 }

@@ -1,41 +1,44 @@
-//! A question's vector as a cell sees it: rounded to 16 bits, in the cell's basis, and looked up by code.
+//! A question's vector in a cell's terms: rounded to 16 bits, projected on the cell's basis, and tabulated
+//! for codes.
 //!
-//! With `q^` the vector of the question `q` rounded to 16 bits and `y[c] = basis_steps[c] * basis[c] . q^`,
-//! a centroid scores `mean . q + centroid_step * centroids[r] . y^`, where `y^` is `y` rounded to 16 bits; without a basis
-//! `y^` is `q^`. Both products are of integers. That is off from `q . P[r]` by at most
-//! `|q - q^| |P[r] - mean| + centroid_step |y - y^| |centroids[r]|` (Cauchy-Schwarz).
+//! With `q^` the question's vector `q` rounded to 16 bits and `y[c] = basis_steps[c] * basis[c] . q^`, a
+//! centroid scores `mean . q + centroid_step * centroids[r] . y^`, where `y^` is `y` rounded to 16 bits;
+//! without a basis `y^` is `q^`. Both are integer products. The score differs from `q . P[r]` by at most `|q
+//! - q^| |P[r] - mean| + centroid_step |y - y^| |centroids[r]|` (Cauchy-Schwarz).
 //!
-//! A residual code adds `residual_scale * (offset + step * sum over groups of table[g][code])`, where
-//! `offset + step * table` is `codewords . y` rounded to 8 bits. That is off from the decoded residual's product
-//! by at most `|q - q^| |residual| + residual_scale * sum over groups of the largest rounding in each`.
+//! A residual code adds `residual_scale * (offset + step * sum over subspaces of table[s][code])`, where
+//! `offset + step * table` is `codewords . y` rounded to 8 bits. It differs from the product of the decoded
+//! residual by at most `|q - q^| |residual| + residual_scale * sum over subspaces of the largest rounding
+//! error in each`.
 
 use slag_common::shard::{BLOCK, CODEWORDS, Fine, Residuals, ShardView};
 
 use super::dot::widen;
 use super::simd::{Column, Level, MatrixTimesVector, PAD};
 
-/// A larger sum of absolute values, times the 128 of a centroid's largest component, would not fit 32 bits.
+/// Largest sum of absolute steps: times the 128 of a centroid's largest component it still fits in 32 bits.
 const MOST_IN_SUM: u64 = (1 << 24) - 1;
 
-/// A vector in steps of 16 bits.
+/// A vector quantised to 16 bits.
 #[derive(Clone, Debug, Default)]
 pub struct Rounded {
-    /// What a step is worth: a power of two, so that it scales exactly.
+    /// Value of one step: a power of two, so that scaling is exact.
     pub step: f64,
     /// Steps, padded with zeros to a multiple of [`PAD`].
     pub steps: Vec<i16>,
-    /// Length of what rounding took away.
+    /// Length of the rounding error.
     pub error: f64,
 }
 
 impl Rounded {
-    /// Rounds finite values with the smallest step that keeps every product with 8-bit centroids in 32 bits.
+    /// Rounds finite values with the smallest step that keeps every product with 8-bit centroids within 32
+    /// bits.
     pub fn set(&mut self, values: &[f64]) {
         let largest = values.iter().fold(0.0f64, |most, v| most.max(v.abs()));
         let sum: f64 = values.iter().map(|v| v.abs()).sum();
         // Rounding adds at most half a step to each.
-        let room = MOST_IN_SUM as f64 - 0.5 * values.len() as f64;
-        let least = (largest / f64::from(i16::MAX)).max(sum / room).max(f64::MIN_POSITIVE);
+        let capacity = MOST_IN_SUM as f64 - 0.5 * values.len() as f64;
+        let least = (largest / f64::from(i16::MAX)).max(sum / capacity).max(f64::MIN_POSITIVE);
         self.step = power_of_two_from(least);
         let mut squares = 0.0;
         self.steps.clear();
@@ -54,14 +57,14 @@ impl Rounded {
 pub struct Vector {
     /// `[dim]`.
     pub exact: Vec<f64>,
-    /// The same in 16 bits.
+    /// The same, quantised to 16 bits.
     pub rounded: Rounded,
     /// Its length.
     pub length: f64,
 }
 
 impl Vector {
-    /// Takes over a question's vector.
+    /// Sets the vector.
     pub fn set(&mut self, values: &[f32]) {
         self.exact.clear();
         self.exact.extend(values.iter().map(|v| f64::from(*v)));
@@ -70,48 +73,48 @@ impl Vector {
     }
 }
 
-/// Values of a residual code's codewords, in 8 bits.
+/// Products of a residual code's codewords, in 8 bits.
 #[derive(Clone, Debug, Default)]
 pub struct Tables {
-    /// `[G / 2]`: values of the even groups' codewords, twice over.
+    /// `[S / 2]`: values of the even subspaces' codewords, twice over.
     pub low: Vec<Column>,
-    /// `[G / 2]`: of the odd groups'.
+    /// `[S / 2]`: the same for the odd subspaces.
     pub high: Vec<Column>,
-    /// What a step is worth.
+    /// Value of one step.
     pub step: f32,
-    /// Sum of the groups' smallest values.
+    /// Sum of the subspaces' smallest values.
     pub offset: f32,
-    /// Largest sum that codes can name.
+    /// Largest sum that a code can give.
     pub most: u16,
-    /// Sum of the groups' largest roundings.
+    /// Sum of the subspaces' largest rounding errors.
     pub error: f32,
 }
 
-/// A vector in a cell's components.
+/// A vector projected on a cell's basis.
 #[derive(Clone, Debug, Default)]
 pub struct Projection {
     /// Product with the cell's mean.
     pub base: f64,
-    /// `[m]`: products with the basis' vectors, or the vector's own components.
+    /// `[m]`: products with the basis vectors, or the vector's own components.
     pub components: Vec<f64>,
-    /// The same in 16 bits.
+    /// The same, quantised to 16 bits.
     pub rounded: Rounded,
-    /// Rounding's part in a centroid's score, for each unit of the centroid's distance from the mean.
+    /// Rounding error of a centroid's score for each unit of the centroid's distance from the mean.
     pub error_per_length: f32,
-    /// Rounding's part in a centroid's score beside that.
+    /// Rounding error of a centroid's score that does not depend on that distance.
     pub error: f32,
     /// Length of the mean.
     pub mean_length: f32,
-    /// What residual codes are worth, of a cell that has them.
+    /// Tables of the residual code, in cells that have one.
     pub tables: Tables,
-    /// What components of fine residuals are worth, of a cell that has them.
+    /// The vector that fine residuals are multiplied with, in cells that have them.
     pub fine: Rounded,
-    /// In float64.
+    /// The same in float64.
     fine_components: Vec<f64>,
 }
 
 impl Projection {
-    /// Brings a vector into a cell's components.
+    /// Projects a vector on a cell's basis.
     pub fn set(&mut self, level: Level, shard: &ShardView<'_>, vector: &Vector) {
         self.components.clear();
         let m = shard.header.n_components as usize;
@@ -126,7 +129,7 @@ impl Projection {
         self.components.resize(m, 0.0);
         let components = &mut self.components;
         level.dispatch(MatrixTimesVector {
-            centroids: basis.vectors,
+            rows: basis.vectors,
             n_components: vector.exact.len(),
             vector: &vector.rounded.steps,
             put: |at: usize, dot: i32| {
@@ -144,11 +147,11 @@ impl Projection {
     /// Scores a cell's centroids. `scores`: `[K]`.
     pub fn score_centroids(&self, level: Level, shard: &ShardView<'_>, scores: &mut Vec<f32>) {
         scores.clear();
-        // Rows of no components are the mean.
+        // Centroids without components equal the mean.
         scores.resize(shard.header.n_centroids as usize, self.base as f32 + 0.0);
         let step = f64::from(shard.header.centroid_step) * self.rounded.step;
         level.dispatch(MatrixTimesVector {
-            centroids: shard.centroids,
+            rows: shard.centroids,
             n_components: shard.header.n_components as usize,
             vector: &self.rounded.steps,
             // Never -0, which would sort after 0 though it is equal.
@@ -158,7 +161,7 @@ impl Projection {
         });
     }
 
-    /// Makes the vector that fine residuals are multiplied with.
+    /// Builds the vector that fine residuals are multiplied with.
     pub fn set_fine(&mut self, fine: &Fine<'_>) {
         self.fine_components.clear();
         self.fine_components
@@ -166,7 +169,7 @@ impl Projection {
         self.fine.set(&self.fine_components);
     }
 
-    /// Makes the tables of a residual code.
+    /// Builds the tables of a residual code.
     pub fn set_tables(&mut self, residuals: &Residuals<'_>) {
         let n_subspaces = residuals.subspace_starts.len() - 1;
         let tables = &mut self.tables;
@@ -191,7 +194,7 @@ impl Projection {
         let mut error = 0.0;
         tables.low.clear();
         tables.high.clear();
-        for (group, values) in values.iter().enumerate() {
+        for (subspace, values) in values.iter().enumerate() {
             let mut column = [0; BLOCK];
             let (mut most, mut largest_rounding) = (0, 0.0f64);
             for (codeword, value) in values.iter().enumerate() {
@@ -203,20 +206,20 @@ impl Projection {
             }
             tables.most += u16::from(most);
             error += largest_rounding;
-            let half = if group.is_multiple_of(2) { &mut tables.low } else { &mut tables.high };
+            let half = if subspace.is_multiple_of(2) { &mut tables.low } else { &mut tables.high };
             half.push(column);
         }
         tables.error = up(error + (offset - f64::from(tables.offset)).abs());
     }
 }
 
-/// Returns the least power of two that is not below a positive number.
+/// Returns the least power of two at or above a positive number.
 fn power_of_two_from(value: f64) -> f64 {
     const MANTISSA: u64 = (1 << 52) - 1;
     f64::from_bits((value.to_bits() + MANTISSA) & !MANTISSA)
 }
 
-/// Rounds to the nearest integer. (Without SSE 4.1 the standard rounding is a call.)
+/// Rounds to the nearest integer. (Without SSE 4.1 the standard rounding is a function call.)
 fn nearest(value: f64) -> i32 {
     (value + 0.5f64.copysign(value)) as i32
 }
@@ -226,7 +229,7 @@ pub fn length(vector: &[f64]) -> f64 {
     vector.iter().map(|v| v * v).sum::<f64>().sqrt()
 }
 
-/// Returns a bound in f32, not below what it was.
+/// Rounds a bound up to f32.
 pub fn up(bound: f64) -> f32 {
     (bound * (1.0 + f64::from(f32::EPSILON))) as f32
 }
@@ -254,7 +257,7 @@ mod tests {
                 let squares: f64 = off.clone().map(|v| v * v).sum();
                 assert!((squares.sqrt() - rounded.error).abs() <= 1e-9 * rounded.error);
                 assert!(off.clone().all(|off| off.abs() <= rounded.step * 0.5));
-                // No step is twice as large as it need be.
+                // No step is more than twice as large as necessary.
                 let largest = rounded.steps.iter().map(|s| s.unsigned_abs()).max();
                 assert!(scale == 0.0 || largest >= Some(1 << 14) || sum * 128 > 1 << 29, "{n} {scale} {sum}");
             }

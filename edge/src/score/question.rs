@@ -1,4 +1,4 @@
-//! What is asked: a vector, and what it is compared with.
+//! A question as vectors.
 
 use std::sync::Arc;
 
@@ -7,17 +7,17 @@ use slag_common::shard::ShardView;
 use super::dot::rounding_bound;
 use super::error::{MAX_COORDINATE, ScoreError};
 
-/// Steepness of [`relevancy`], as LERF has it.
+/// Steepness of [`relevancy`], from LERF.
 pub const RELEVANCY_STEEPNESS: f32 = 10.0;
 
-/// A question in vectors. A Gaussian's score is `q · E_k`, or `q · E_k - max_j n_j · E_k` with negatives:
-/// how much more it is the thing asked for than the likest of what it is not (LERF, Kerr et al. 2023,
-/// section 3.3; [`relevancy`] maps it to 0..1).
+/// A question as vectors. A Gaussian's score is `q · E_k`, or with negatives `q · E_k - max_j n_j · E_k`: how
+/// much closer it is to the thing asked for than to the closest negative (LERF, Kerr et al. 2023, section
+/// 3.3; [`relevancy`] maps it to 0..1).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Question {
     /// `[dim]`, unit length.
     pub vector: Arc<[f32]>,
-    /// `[dim]` each, unit length; none: the score is the cosine.
+    /// `[dim]` each, unit length; if empty, the score is the cosine.
     pub negatives: Vec<Arc<[f32]>>,
 }
 
@@ -40,7 +40,7 @@ impl Question {
                 return Err(ScoreError::Negative { expected: dim, found: vector.len() });
             }
             let found = length(vector.iter().copied()) as f32;
-            // Text models normalise in f32, or from f16 tables.
+            // Text models normalise in f32, or read f16 tables.
             if found.is_nan() || (found - 1.0).abs() > 1e-3 {
                 return Err(ScoreError::NotUnit { found });
             }
@@ -48,8 +48,8 @@ impl Question {
         Ok(())
     }
 
-    /// Returns by how much a score moves at most when an embedding moves by 1: the length of `q`, or the
-    /// largest of `q - n_j`, since the score is the least of all `(q - n_j) · E`, each as steep as that.
+    /// Returns the most that a score changes when an embedding moves by 1: the length of `q`, or of the
+    /// longest `q - n_j`, because the score is the minimum of all `(q - n_j) · E`.
     pub fn steepness(&self) -> f32 {
         let own = length(self.vector.iter().copied());
         let apart = |n: &Arc<[f32]>| length(self.vector.iter().zip(&**n).map(|(q, n)| q - n));
@@ -57,10 +57,10 @@ impl Question {
         (largest * (1.0 + f64::from(f32::EPSILON))) as f32
     }
 
-    /// Returns a bound on what rounding in f32 changes a score by.
+    /// Bounds the error of scoring in f32.
     pub fn rounding_bound(&self) -> f32 {
         let of_dot = rounding_bound(self.vector.len());
-        // The difference of two products of at most 1 each is rounded once more.
+        // The difference of two products, each at most 1, is rounded once more.
         if self.negatives.is_empty() { of_dot } else { 2.0 * of_dot + f32::EPSILON }
     }
 }
@@ -89,14 +89,14 @@ fn length(components: impl Iterator<Item = f32>) -> f64 {
     components.map(|v| f64::from(v).powi(2)).sum::<f64>().sqrt()
 }
 
-/// Returns LERF's relevancy of a score with negatives, `1 / (1 + exp(-t s))` with
-/// [t = 10](RELEVANCY_STEEPNESS): 0.5 where the thing asked for and the likest negative are equally near.
+/// Maps a score with negatives to LERF's relevancy, `1 / (1 + exp(-t s))` with [t = 10](RELEVANCY_STEEPNESS):
+/// 0.5 where the thing asked for and the closest negative are equally near.
 pub fn relevancy(score: f32) -> f32 {
     let t = f64::from(RELEVANCY_STEEPNESS);
     (1.0 / (1.0 + (-t * f64::from(score)).exp())) as f32
 }
 
-/// Returns the score that has a relevancy, the inverse of [`relevancy`]; infinite for 0 and 1.
+/// Maps a relevancy to its score, the inverse of [`relevancy`]; infinite for 0 and 1.
 pub fn score_of_relevancy(relevancy: f32) -> f32 {
     let p = f64::from(relevancy);
     ((p / (1.0 - p)).ln() / f64::from(RELEVANCY_STEEPNESS)) as f32
@@ -106,7 +106,7 @@ pub fn score_of_relevancy(relevancy: f32) -> f32 {
 mod tests {
     use super::*;
 
-    /// Oracle: LERF's own formula, the least of pairwise softmaxes of 10 times the cosines.
+    /// Oracle: LERF's own formula, the minimum of pairwise softmaxes of 10 times the cosines.
     #[test]
     fn relevancy_is_the_least_pairwise_softmax() {
         for (positive, negatives) in
@@ -121,7 +121,7 @@ mod tests {
         assert_eq!((relevancy(0.0), score_of_relevancy(0.5)), (0.5, 0.0));
     }
 
-    /// Oracle: the scores of random embeddings and of others nearby, in f64.
+    /// Oracle: in f64, the scores of random embeddings and of neighbours at a known distance.
     #[test]
     fn no_score_is_steeper_than_stated() {
         let mut random = slag_math::random::Random::new(3);

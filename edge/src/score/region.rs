@@ -20,31 +20,30 @@ impl Ball {
     }
 }
 
-/// Gaussians count whose mean lies in the ball and in the box, borders included; what is absent bounds
-/// nothing.
+/// A ball and a box, either optional. A Gaussian lies inside if its mean lies in both, borders included.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Region {
     /// The ball.
     pub ball: Option<Ball>,
-    /// The box, axes as the world's.
+    /// The box, aligned with the world's axes.
     pub bounds: Option<Aabb>,
 }
 
 impl Region {
-    /// Whether all of space is meant.
+    /// Returns whether the region is all of space.
     pub fn is_everything(&self) -> bool {
         *self == Self::default()
     }
 
-    /// Whether a point is inside.
+    /// Returns whether a point lies inside.
     pub fn contains(&self, point: DVec3) -> bool {
         self.ball.is_none_or(|ball| ball.contains(point))
             && self.bounds.is_none_or(|b| point.cmpge(b.min).all() && point.cmple(b.max).all())
     }
 
-    /// Whether every point of a box is inside.
+    /// Returns whether every point of a box lies inside.
     pub fn covers(&self, of: &Aabb) -> bool {
-        // In the same roundings as `contains`, which grow with every component.
+        // Rounded as in `contains`; the rounding grows with every component.
         let in_ball = |ball: Ball| {
             let farthest = (of.min - ball.centre_in_world).abs().max((of.max - ball.centre_in_world).abs());
             farthest.length_squared() <= ball.radius * ball.radius
@@ -53,8 +52,8 @@ impl Region {
             && self.bounds.is_none_or(|b| of.min.cmpge(b.min).all() && of.max.cmple(b.max).all())
     }
 
-    /// Whether a point of a box can be inside; it may say so of a box that ball and bounds touch in
-    /// different places.
+    /// Returns whether a point of a box can lie inside. May be true although none does, if ball and bounds
+    /// touch the box in different places.
     pub fn touches(&self, of: &Aabb) -> bool {
         let near = |ball: Ball| ball.contains(ball.centre_in_world.clamp(of.min, of.max));
         self.ball.is_none_or(near)

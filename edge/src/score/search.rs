@@ -16,7 +16,7 @@ use super::question::{Question, check};
 use super::region::Region;
 use super::select::AnswerBuffers;
 
-/// Buffers of a search, reused by the next one: then a search allocates little but its answers.
+/// Buffers of a search that the next one reuses: a search then allocates little but its answers.
 #[derive(Default)]
 pub struct Scratch {
     /// Shared with the searches made from it.
@@ -38,14 +38,14 @@ impl Scratch {
         Search { asked, buffers: Arc::clone(&self.buffers) }
     }
 
-    /// Whether no centroids were scored in it yet.
+    /// Returns whether no centroids were scored in these buffers yet.
     #[cfg(test)]
     pub fn is_untouched(&self) -> bool {
         self.scored.shards.is_empty()
     }
 }
 
-/// One question's centroid scores over some shards; gives several kinds of answers without scoring twice.
+/// One question's centroid scores over a set of shards; gives several kinds of answers without scoring twice.
 pub struct Search<'a> {
     pub(super) asked: AskedQuestion<'a>,
     /// Shared by the searches of a batch.
@@ -53,7 +53,7 @@ pub struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
-    /// Scores the centroids of the shards that reach into the region. As [`Search::batch`], for one question.
+    /// Scores the centroids of the shards that reach into the region: [`Search::batch`] for one question.
     ///
     /// # Errors
     /// [`ScoreError`].
@@ -66,7 +66,7 @@ impl<'a> Search<'a> {
         Self::reusing(&mut Scratch::default(), shards, question, region, precision)
     }
 
-    /// As [`Search::new`], in the memory of an earlier search that is over (else in new memory).
+    /// As [`Search::new`], in the buffers of an earlier search if that is over.
     ///
     /// # Errors
     /// [`ScoreError`].
@@ -96,8 +96,7 @@ impl<'a> Search<'a> {
     /// Scores the centroids for several questions in one pass; returns a search for each, in their order.
     ///
     /// Costs one product per centroid, component and distinct vector (negatives that questions share are
-    /// multiplied once), in parallel by shard.
-    /// In the memory of earlier searches that are over (else in new memory).
+    /// multiplied once), in parallel by shard. Reuses the buffers of earlier searches if those are over.
     /// # Errors
     /// [`ScoreError`].
     pub fn batch(
@@ -124,14 +123,14 @@ impl<'a> Search<'a> {
         Ok(searches.collect())
     }
 
-    /// Returns the Gaussians whose score reaches a threshold, as far as the shards' data tell.
+    /// Returns the Gaussians with scores at or above a threshold, as far as the shards' data decide.
     pub fn matching(&self, threshold: f32) -> Matches {
         let mut matches = Matches::default();
         self.matching_into(threshold, &mut matches);
         matches
     }
 
-    /// As [`Search::matching`], into a list that is cleared before.
+    /// As [`Search::matching`], into a list that is cleared first.
     pub fn matching_into(&self, threshold: f32, all: &mut Matches) {
         let mut buffers = self.take_buffers();
         let gather = &mut buffers.gather;
@@ -156,7 +155,7 @@ impl<'a> Search<'a> {
         hits
     }
 
-    /// As [`Search::best`], into a list that is cleared before. Returns the work done.
+    /// As [`Search::best`], into a list that is cleared first. Returns the work done.
     pub fn best_into(
         &self,
         limit: usize,
@@ -180,20 +179,20 @@ impl<'a> Search<'a> {
         *self.buffers.lock().unwrap_or_else(PoisonError::into_inner) = buffers;
     }
 
-    /// Returns all shards, which runs and hits refer to by place.
+    /// Returns all shards; runs and hits refer to them by index.
     pub fn shards(&self) -> &'a [ShardView<'a>] {
         self.asked.shards
     }
 
-    /// Returns the shards that were searched (the others lie outside the region).
+    /// Returns the shards that were searched; the others lie outside the region.
     pub fn searched(&self) -> impl Iterator<Item = &'a ShardView<'a>> {
         let searched =
             self.asked.shards.iter().zip(&self.asked.scored.shards).filter(|(_, scores)| scores.is_searched);
         searched.map(|(shard, _)| shard)
     }
 
-    /// Returns the bound on the error of scores: none given here, of a centroid or a Gaussian, is off from
-    /// that of any embedding it stands for by more.
+    /// Bounds the error of every score: the difference between the score of a centroid or Gaussian and that
+    /// of any embedding it stands for.
     pub fn score_error_bound(&self) -> f32 {
         let cells = (0..self.asked.shards.len()).into_par_iter().filter_map(|at| self.asked.cell(at));
         let of_cell = |cell: Cell<'_>| {
@@ -202,8 +201,8 @@ impl<'a> Search<'a> {
         cells.map(of_cell).reduce(|| 0.0, f32::max)
     }
 
-    /// Returns the errors of scores that were measured over a bank of texts, each the largest of the shards
-    /// searched; none where answers are exact, or a shard's were not measured for what is read of it.
+    /// Returns the score errors that were measured over a bank of texts, each the maximum over the shards
+    /// searched; `None` if answers are exact, or if a shard lacks measurements for the data read.
     pub fn measured_errors(&self) -> Option<ScoreErrors> {
         let mut largest: Option<ScoreErrors> = None;
         for shard in self.searched() {
@@ -227,7 +226,8 @@ impl<'a> Search<'a> {
         largest
     }
 
-    /// Whether membership is exact: exact embeddings were asked for and every shard searched carries them.
+    /// Returns whether membership is exact: exact embeddings are asked for, and every shard searched has
+    /// them.
     pub fn is_exact(&self) -> bool {
         self.asked.precision == Precision::Exact && self.searched().all(|shard| shard.exact.is_some())
     }

@@ -9,9 +9,9 @@ use super::centroids::AskedQuestion;
 use super::collect::{Cut, Gather, runs_inside};
 use super::matches::{Effort, Hit, Run};
 
-/// Bits that keys are sorted by at a time: counts of their values stay in the first-level cache.
+/// Bits per pass of the radix sort: its counters stay in the L1 cache.
 const DIGIT_BITS: u32 = 11;
-/// Fewer runs are not worth a second thread.
+/// With fewer runs, a second thread does not pay off.
 const MIN_RUNS_PER_THREAD: usize = if cfg!(test) { 16 } else { 8192 };
 
 /// Buffers that answers are gathered and ranked in, kept from one answer to the next.
@@ -30,7 +30,7 @@ struct Order {
     ranked: Vec<Ranked>,
 }
 
-/// What one thread ranks.
+/// Input and output of one ranking thread.
 #[derive(Default)]
 struct Ranked {
     keys: Vec<u64>,
@@ -39,7 +39,7 @@ struct Ranked {
     hits: Vec<Hit>,
 }
 
-/// What one thread counts.
+/// Counters of one counting thread.
 #[derive(Default)]
 struct Part {
     bins: Vec<u64>,
@@ -47,7 +47,7 @@ struct Part {
 }
 
 impl AskedQuestion<'_> {
-    /// Ranks the `limit` best Gaussians that reach a threshold into `hits`, which is cleared before; see
+    /// Ranks the `limit` best Gaussians that reach a threshold into `hits`, which is cleared first; see
     /// [`super::Search::best`].
     pub(super) fn best_into(
         &self,
@@ -65,8 +65,8 @@ impl AskedQuestion<'_> {
         let mut effort = Effort::default();
         let has_detail = (0..self.shards.len()).any(|at| self.cell(at).is_some_and(|cell| cell.has_detail()));
         let cut = if has_detail {
-            // Half as many again by their centroids' scores: the worst of these members by their own scores are
-            // not among the best.
+            // Ranks half as many again by centroid scores: members that rank last by their own scores are
+            // then not among the best.
             let enough = limit.saturating_add(limit / 2).saturating_add(1);
             let floor = self.centroid_score_at(order, enough, f32::NEG_INFINITY);
             self.count(gather, threshold, floor.unwrap_or(f32::NEG_INFINITY));
@@ -81,8 +81,8 @@ impl AskedQuestion<'_> {
         effort
     }
 
-    /// Returns the least of the scores of the centroids whose members, with those of better centroids, are `limit`
-    /// or more; none if there are fewer with a centroid that reaches the threshold.
+    /// Returns the lowest centroid score that must be included for the members of centroids at or above it to
+    /// number `limit` or more; `None` if too few centroids reach the threshold.
     fn centroid_score_at(&self, order: &mut Order, limit: usize, threshold: f32) -> Option<f32> {
         let cells: Vec<Option<Cell<'_>>> = (0..self.shards.len()).map(|at| self.cell(at)).collect();
         let scores = |at: usize| {
@@ -101,7 +101,7 @@ impl AskedQuestion<'_> {
         order.score_at(limit, self.shards.len(), scores, count)
     }
 
-    /// Sorts what was gathered.
+    /// Sorts the gathered runs.
     fn rank(
         &self,
         gather: &Gather,
@@ -116,7 +116,7 @@ impl AskedQuestion<'_> {
         runs.clear();
         by_cell.iter().for_each(|at| runs.extend_from_slice(&gather.shards[*at].found.runs));
         keys.clear();
-        // Places, in the order of cells and indices, decide between equal scores.
+        // Equal scores keep the order of the runs, which is that of cells and indices.
         keys.extend(runs.iter().zip(0u64..).map(|(run, place)| u64::from(!rising(run.score)) << 32 | place));
         let n_parts = rayon::current_num_threads().min(keys.len() / MIN_RUNS_PER_THREAD).max(1);
         ranked.resize_with(n_parts, Ranked::default);
@@ -128,7 +128,7 @@ impl AskedQuestion<'_> {
         }
     }
 
-    /// Turns keys into hits, in their order, `limit` at most.
+    /// Turns sorted keys into hits, at most `limit`.
     fn rank_part(&self, part: &mut Ranked, runs: &[Run], limit: usize, near: Option<DVec3>) {
         let Ranked { keys, swapped, tied, hits } = part;
         sort_by_high_half(keys, swapped);
@@ -137,7 +137,7 @@ impl AskedQuestion<'_> {
             let first = hits.len();
             for key in ties {
                 let Run { shard, start, end, score } = runs[*key as u32 as usize];
-                // All of them where their distance decides.
+                // All of them if distance breaks the tie.
                 let capacity = if near.is_some() { usize::MAX } else { limit - hits.len() };
                 let end = end.min(start.saturating_add(u32::try_from(capacity).unwrap_or(u32::MAX)));
                 hits.extend((start..end).map(|index| Hit { shard, index, score }));
@@ -145,7 +145,7 @@ impl AskedQuestion<'_> {
             if let Some(near) = near {
                 tied.clear();
                 tied.extend(hits.drain(first..).map(|hit| (self.distance(near, &hit), hit)));
-                // Stable: those as near stay in the order of their names.
+                // Stable sort: equally near hits stay in the order of cell and index.
                 tied.sort_by(|a, b| a.0.total_cmp(&b.0));
                 hits.extend(tied.iter().map(|(_, hit)| *hit).take(limit - first));
             }
@@ -161,10 +161,10 @@ impl AskedQuestion<'_> {
 }
 
 impl Order {
-    /// Returns the score of the Gaussian at a rank, counted from 1 at the best; none if there are fewer.
+    /// Returns the score of the Gaussian at a rank, counted from 1 for the best; `None` if there are fewer.
     ///
-    /// `scores`: scores at each of `n_places` and what `count` tells by how many Gaussians have them. Counts by
-    /// parts of the range of scores find the part in question, and only that is sorted.
+    /// `scores` gives the scores at each of `n_places`; `count` gives the number of Gaussians with each. A
+    /// histogram locates the bin of the rank, and only that bin is sorted.
     fn score_at<I: Iterator<Item = (f32, usize)>>(
         &mut self,
         rank: usize,
@@ -207,7 +207,7 @@ impl Order {
     }
 }
 
-/// Returns a score that so many of the Gaussians counted reach; none if there are fewer.
+/// Returns a score that at least `limit` of the counted Gaussians reach; `None` if there are fewer.
 fn score_reached(gather: &Gather, limit: usize) -> Option<f32> {
     let bins: Vec<&[u32]> = gather.shards.iter().map(|of_shard| &of_shard.bins[..]).collect();
     let mut n = 0;
@@ -218,8 +218,8 @@ fn score_reached(gather: &Gather, limit: usize) -> Option<f32> {
     Some(edge_of(bin))
 }
 
-/// Deals keys out to parts of about the same size, all with a lower upper half to an earlier part; those of a
-/// part stay in their order.
+/// Distributes keys over parts of similar size. Keys with a lower upper half go to an earlier part; within a
+/// part the order is kept.
 fn share_by_high_half(keys: &mut Vec<u64>, parts: &mut [Ranked]) {
     parts.iter_mut().for_each(|part| part.keys.clear());
     if let [all] = parts {
@@ -240,7 +240,7 @@ fn share_by_high_half(keys: &mut Vec<u64>, parts: &mut [Ranked]) {
     keys.iter().for_each(|key| parts[part_of[digit(*key)]].keys.push(*key));
 }
 
-/// Sorts by the upper 32 bits; equal ones stay in their order. `swapped` is memory.
+/// Sorts by the upper 32 bits, stably. `swapped` is a buffer.
 fn sort_by_high_half(keys: &mut Vec<u64>, swapped: &mut Vec<u64>) {
     let all_high = || keys.iter().map(|key| (key >> 32) as u32);
     let (least, most) = (all_high().min().unwrap_or(0), all_high().max().unwrap_or(0));
@@ -264,7 +264,7 @@ fn sort_by_high_half(keys: &mut Vec<u64>, swapped: &mut Vec<u64>) {
     }
 }
 
-/// Returns a number that rises with a score.
+/// Maps a score to an integer of the same order.
 fn rising(score: f32) -> u32 {
     let bits = score.to_bits();
     if bits >> 31 == 0 { bits | 1 << 31 } else { !bits }
@@ -295,7 +295,7 @@ mod tests {
         }
     }
 
-    /// Oracle: the standard library's stable sort, of all parts one after the other.
+    /// Oracle: the standard library's stable sort of all parts in turn.
     #[test]
     fn keys_are_shared_in_order() {
         let mut random = Random::new(33);
@@ -320,7 +320,7 @@ mod tests {
         }
     }
 
-    /// Oracle: the order that the standard library gives floats.
+    /// Oracle: the standard library's order of floats.
     #[test]
     fn keys_and_bins_rise_with_scores() {
         let mut scores = vec![-1e30, -3.0, -1.0, -0.5, -1e-20, 0.0, 1e-20, 0.25, 0.9995, 1.0, 2.0, 1e30];

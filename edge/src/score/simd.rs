@@ -1,6 +1,6 @@
-//! The two integer loops that queries spend their time in, for every instruction set there is.
+//! The two integer loops in which queries spend their time, for every supported instruction set.
 //!
-//! All sums are of integers and none can overflow, so that every level gives the same bits.
+//! All sums are integers and none can overflow, so every instruction set gives the same bits.
 
 #[cfg(target_arch = "aarch64")]
 mod neon;
@@ -14,37 +14,36 @@ use pulp::aarch64::Neon;
 use pulp::x86::{V3, V4};
 use slag_common::shard::BLOCK;
 
-/// Vectors are padded with zeros to a multiple of this many components: what the widest level multiplies
-/// at once.
+/// Vectors are zero-padded to a multiple of this many components: the width of the widest instruction set.
 pub const PAD: usize = 32;
-/// Rows that are multiplied together, so that their sums are folded together.
+/// Rows multiplied together, so that their sums are reduced together.
 pub const ROWS: usize = 4;
 
-/// One byte column of a block of Gaussians, or the codewords of a group for each half of a byte shuffle.
+/// One byte column of a block of Gaussians, or the codewords of a subspace for each half of a byte shuffle.
 pub type Column = [u8; BLOCK];
 
-/// What an instruction set does.
+/// The kernels of an instruction set.
 pub trait Kernels: Copy {
-    /// Returns the products of centroids with a vector. All have the same length, a multiple of [`PAD`].
-    fn dots(self, centroids: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS];
+    /// Returns the products of rows with a vector. All have the same length, a multiple of [`PAD`].
+    fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS];
 
-    /// Returns for each Gaussian of a block the sum of the values that its codes name. `low`, `high`: for
-    /// each byte column the 16 values of the group in the low and in the high half, twice over.
-    /// There are at most 64 columns, so that no sum exceeds 16 bits.
+    /// Returns, for each Gaussian of a block, the sum of the values that its codes select. `low`, `high`: for
+    /// each byte column the 16 values of the subspace in the low and in the high half, twice over. With at
+    /// most 64 columns no sum exceeds 16 bits.
     fn block_sums(self, columns: &[Column], low: &[Column], high: &[Column]) -> [u16; BLOCK];
 
-    /// Returns a bit for each of a block's sums, from the lowest bit up: whether it is at least `least`.
+    /// Returns one bit for each sum of a block, lowest bit first: whether the sum is at least `least`.
     fn at_least(self, sums: &[u16; BLOCK], least: u16) -> u32;
 }
 
-/// Plain code, for any processor.
+/// Portable code for any processor.
 #[derive(Clone, Copy, Debug)]
 pub struct Portable;
 
 impl Kernels for Portable {
     #[inline(always)]
-    fn dots(self, centroids: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
-        centroids.map(|centroid| dot(centroid, vector))
+    fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
+        rows.map(|row| dot(row, vector))
     }
 
     #[inline(always)]
@@ -65,22 +64,22 @@ impl Kernels for Portable {
     }
 }
 
-/// Returns the product of a centroid and a vector, which may be longer.
+/// Returns the product of a row and a vector, which may be longer.
 #[inline(always)]
-fn dot(centroid: &[i8], vector: &[i16]) -> i32 {
-    centroid.iter().zip(vector).map(|(a, b)| i32::from(*a) * i32::from(*b)).sum()
+fn dot(row: &[i8], vector: &[i16]) -> i32 {
+    row.iter().zip(vector).map(|(a, b)| i32::from(*a) * i32::from(*b)).sum()
 }
 
-/// Work that is written once for all instruction sets; its `run` and all that it calls must be
-/// `inline(always)`, or it is compiled for the plain processor.
+/// Work written once for all instruction sets. `run` and everything it calls must be `inline(always)`, or it
+/// is compiled for the baseline processor.
 pub trait Work {
-    /// What it gives.
+    /// The result.
     type Output;
     /// Does the work.
     fn run<K: Kernels>(self, kernels: K) -> Self::Output;
 }
 
-/// Work on an instruction set that is known.
+/// Work bound to a known instruction set.
 struct On<K, W>(K, W);
 
 impl<K: Kernels, W: Work> NullaryFnOnce for On<K, W> {
@@ -100,7 +99,7 @@ pub enum Level {
     /// AVX2.
     #[cfg(target_arch = "x86_64")]
     Avx2(V3),
-    /// AVX-512, with bytes and codewords.
+    /// AVX-512 with its byte and word extension (BW).
     #[cfg(target_arch = "x86_64")]
     Avx512(V4),
     /// NEON.
@@ -109,7 +108,7 @@ pub enum Level {
 }
 
 impl Level {
-    /// Returns those that this processor has, narrowest first.
+    /// Returns the instruction sets of this processor, narrowest first.
     pub fn available() -> Vec<Self> {
         let mut levels = vec![Self::Portable];
         #[cfg(target_arch = "x86_64")]
@@ -122,7 +121,7 @@ impl Level {
         levels
     }
 
-    /// Returns the widest that this processor has.
+    /// Returns the widest instruction set of this processor.
     pub fn widest() -> Self {
         Self::available().pop().unwrap_or(Self::Portable)
     }
@@ -140,7 +139,7 @@ impl Level {
         }
     }
 
-    /// Does work compiled for this instruction set.
+    /// Runs work compiled for this instruction set.
     pub fn dispatch<W: Work>(self, work: W) -> W::Output {
         match self {
             Self::Portable => work.run(Portable),
@@ -154,15 +153,15 @@ impl Level {
     }
 }
 
-/// Multiplies every centroid of a matrix with a vector; gives products in the order of the centroids.
+/// Multiplies every row of a matrix with a vector; the products come in the order of the rows.
 pub struct MatrixTimesVector<'a, F> {
     /// `[n][n_components]`.
-    pub centroids: &'a [i8],
-    /// Components of a centroid.
+    pub rows: &'a [i8],
+    /// Components of a row.
     pub n_components: usize,
     /// The vector, padded with zeros to the next multiple of [`PAD`].
     pub vector: &'a [i16],
-    /// Called with the place of a centroid and its product.
+    /// Called with the index of a row and its product.
     pub put: F,
 }
 
@@ -171,24 +170,25 @@ impl<F: FnMut(usize, i32)> Work for MatrixTimesVector<'_, F> {
 
     #[inline(always)]
     fn run<K: Kernels>(self, kernels: K) {
-        let Self { centroids, n_components, vector, mut put } = self;
-        // Rows of nothing have no products, and nothing tells how many there are.
-        let Some(n_centroids) = centroids.len().checked_div(n_components) else { return };
-        // What a centroid is read beyond its end is multiplied with the padding's zeros; the last centroids cannot be.
-        let n_padded = (centroids.len() + n_components).saturating_sub(vector.len()) / n_components;
-        let n_together = n_padded.min(n_centroids) / ROWS * ROWS;
+        let Self { rows, n_components, vector, mut put } = self;
+        // Rows without components have no products, and their number is unknown.
+        let Some(n_rows) = rows.len().checked_div(n_components) else { return };
+        // Components read past a row's end meet the padding's zeros. The last rows cannot be read
+        // past their end.
+        let n_padded = (rows.len() + n_components).saturating_sub(vector.len()) / n_components;
+        let n_together = n_padded.min(n_rows) / ROWS * ROWS;
         for at in (0..n_together).step_by(ROWS) {
             let start = at * n_components;
-            let four = &centroids[start..start + (ROWS - 1) * n_components + vector.len()];
+            let four = &rows[start..start + (ROWS - 1) * n_components + vector.len()];
             let (a, b) = (&four[..vector.len()], &four[n_components..][..vector.len()]);
             let (c, d) = (&four[2 * n_components..][..vector.len()], &four[3 * n_components..]);
             let dots = kernels.dots([a, b, c, d], vector);
-            for (centroid, dot) in (at..).zip(dots) {
-                put(centroid, dot);
+            for (row, dot) in (at..).zip(dots) {
+                put(row, dot);
             }
         }
-        for centroid in n_together..n_centroids {
-            put(centroid, dot(&centroids[centroid * n_components..][..n_components], vector));
+        for row in n_together..n_rows {
+            put(row, dot(&rows[row * n_components..][..n_components], vector));
         }
     }
 }
@@ -197,9 +197,9 @@ impl<F: FnMut(usize, i32)> Work for MatrixTimesVector<'_, F> {
 pub struct BlockSums<'a> {
     /// Byte columns of the block.
     pub columns: &'a [Column],
-    /// Values of the groups in the low halves.
+    /// Values of the subspaces in the low halves.
     pub low: &'a [Column],
-    /// Values of the groups in the high halves.
+    /// Values of the subspaces in the high halves.
     pub high: &'a [Column],
 }
 
@@ -212,30 +212,30 @@ impl Work for BlockSums<'_> {
     }
 }
 
-/// The sums of the block that was read last.
+/// The sums of the block read last.
 #[derive(Clone, Debug, Default)]
 pub struct LastBlock {
-    /// Which it was.
+    /// Index of the block.
     pub block: Option<usize>,
     /// Its sums.
     pub sums: [u16; BLOCK],
 }
 
-/// Finds the Gaussians of a range whose codes' sums reach a value; returns the number of blocks read.
+/// Finds the Gaussians of a range with code sums at or above a value; returns the number of blocks read.
 pub struct FindSums<'a> {
     /// Byte columns of all blocks, see [`Kernels::block_sums`].
     pub columns: &'a [Column],
-    /// Values of the groups in the low halves.
+    /// Values of the subspaces in the low halves.
     pub low: &'a [Column],
-    /// Values of the groups in the high halves.
+    /// Values of the subspaces in the high halves.
     pub high: &'a [Column],
-    /// Which Gaussians.
+    /// The Gaussians.
     pub members: std::ops::Range<usize>,
-    /// What sums are compared with.
+    /// The least sum wanted.
     pub least: u16,
-    /// Where an earlier range may have ended.
+    /// The block in which an earlier range may have ended.
     pub last: &'a mut LastBlock,
-    /// Gets Gaussians and their sums, ascending.
+    /// Receives Gaussians and their sums, ascending.
     pub found: &'a mut Vec<(u32, u16)>,
 }
 
@@ -267,17 +267,17 @@ impl Work for FindSums<'_> {
     }
 }
 
-/// Multiplies some centroids of a matrix with a vector.
+/// Multiplies some rows of a matrix with a vector.
 pub struct SomeRowsTimesVector<'a> {
     /// `[n][n_components]`.
-    pub centroids: &'a [i8],
-    /// Components of a centroid, not 0.
+    pub rows: &'a [i8],
+    /// Components of a row, not 0.
     pub n_components: usize,
     /// The vector, padded with zeros to the next multiple of [`PAD`].
     pub vector: &'a [i16],
-    /// Which centroids, ascending.
+    /// The rows, ascending.
     pub which: &'a [u32],
-    /// Gets their products.
+    /// Receives their products.
     pub products: &'a mut Vec<i32>,
 }
 
@@ -286,20 +286,20 @@ impl Work for SomeRowsTimesVector<'_> {
 
     #[inline(always)]
     fn run<K: Kernels>(self, kernels: K) {
-        let Self { centroids, n_components, vector, which, products } = self;
+        let Self { rows, n_components, vector, which, products } = self;
         products.clear();
         for which in which.chunks(ROWS) {
             let last = which[which.len() - 1] as usize;
-            // As for all centroids: what is read beyond a centroid's end is multiplied with zeros.
-            if last * n_components + vector.len() <= centroids.len() {
-                let mut four = [&centroids[last * n_components..][..vector.len()]; ROWS];
-                for (centroid, at) in four.iter_mut().zip(which) {
-                    *centroid = &centroids[*at as usize * n_components..][..vector.len()];
+            // As for all rows: components read past a row's end meet zeros.
+            if last * n_components + vector.len() <= rows.len() {
+                let mut four = [&rows[last * n_components..][..vector.len()]; ROWS];
+                for (row, at) in four.iter_mut().zip(which) {
+                    *row = &rows[*at as usize * n_components..][..vector.len()];
                 }
                 products.extend_from_slice(&kernels.dots(four, vector)[..which.len()]);
             } else {
                 for at in which {
-                    products.push(dot(&centroids[*at as usize * n_components..][..n_components], vector));
+                    products.push(dot(&rows[*at as usize * n_components..][..n_components], vector));
                 }
             }
         }
@@ -311,46 +311,46 @@ mod tests {
     use super::*;
     use slag_math::random::Random;
 
-    /// Oracle: plain 64-bit sums. Lengths around every width, values at both ends, and the last centroids, which
-    /// cannot be read past their end.
+    /// Oracle: plain 64-bit sums. Covers lengths around every width, extreme values, and the last rows,
+    /// which cannot be read past their end.
     #[test]
     fn products_are_the_sums_at_every_level() {
         let mut random = Random::new(11);
         for n_components in (1..70usize).chain([96, 100, 511, 512, 513, 8192]) {
-            for n_centroids in [0, 1, 3, 4, 5, 37] {
-                let is_extreme = n_centroids == 5;
-                let centroids: Vec<i8> = (0..n_centroids * n_components)
+            for n_rows in [0, 1, 3, 4, 5, 37] {
+                let is_extreme = n_rows == 5;
+                let rows: Vec<i8> = (0..n_rows * n_components)
                     .map(|_| if is_extreme { -128 } else { random.bits() as i8 })
                     .collect();
-                // The largest that the sum of absolute values allows, see `rounded`.
+                // The largest value that the bound on absolute sums allows, see `Rounded`.
                 let most = ((1 << 24) / n_components as i64 - 1).clamp(1, 32767);
                 let mut vector: Vec<i16> = (0..n_components)
                     .map(|_| if is_extreme { -most } else { random.bits() as i64 % (most + 1) } as i16)
                     .collect();
                 vector.resize(n_components.next_multiple_of(PAD), 0);
-                let exact = |centroid: &[i8]| -> i64 {
-                    centroid.iter().zip(&vector).map(|(a, b)| i64::from(*a) * i64::from(*b)).sum()
+                let exact = |row: &[i8]| -> i64 {
+                    row.iter().zip(&vector).map(|(a, b)| i64::from(*a) * i64::from(*b)).sum()
                 };
-                let expected: Vec<i64> = centroids.chunks_exact(n_components).map(exact).collect();
+                let expected: Vec<i64> = rows.chunks_exact(n_components).map(exact).collect();
                 for level in Level::available() {
                     let mut found = Vec::new();
-                    let put = |centroid: usize, dot: i32| {
-                        assert_eq!(centroid, found.len());
+                    let put = |row: usize, dot: i32| {
+                        assert_eq!(row, found.len());
                         found.push(i64::from(dot));
                     };
                     level.dispatch(MatrixTimesVector {
-                        centroids: &centroids,
+                        rows: &rows,
                         n_components,
                         vector: &vector,
                         put,
                     });
-                    assert_eq!(found, expected, "{} {n_components} {n_centroids}", level.name());
+                    assert_eq!(found, expected, "{} {n_components} {n_rows}", level.name());
                 }
             }
         }
     }
 
-    /// Oracle: each code looked up by itself. Up to 64 columns of 255, the most that 16 bits must hold.
+    /// Oracle: each code looked up individually. Up to 64 columns of 255, the most that 16 bits must hold.
     #[test]
     fn sums_of_a_block_are_the_looked_up_values_at_every_level() {
         let mut random = Random::new(12);
@@ -385,8 +385,7 @@ mod tests {
         }
     }
 
-    /// Oracle: one comparison for each sum, at both ends of 16 bits and around the sign. The codewords of code 1 make
-    /// a sum of what its columns say.
+    /// Oracle: one comparison per sum, at both ends of 16 bits and around the sign bit.
     #[test]
     fn sums_that_reach_a_value_are_found_at_every_level() {
         let mut random = Random::new(13);
@@ -428,25 +427,25 @@ mod tests {
         }
     }
 
-    /// Oracle: plain sums; the last centroids cannot be read past their end.
+    /// Oracle: plain sums; the last rows cannot be read past their end.
     #[test]
     fn products_of_some_rows_are_the_sums_at_every_level() {
         let mut random = Random::new(14);
         for n_components in [1usize, 2, 31, 32, 33, 96, 126, 512] {
-            let centroids: Vec<i8> = (0..40 * n_components).map(|_| random.bits() as i8).collect();
+            let rows: Vec<i8> = (0..40 * n_components).map(|_| random.bits() as i8).collect();
             let mut vector: Vec<i16> =
                 (0..n_components).map(|_| (random.bits() % 999) as i16 - 500).collect();
             vector.resize(n_components.next_multiple_of(PAD), 0);
             for which in [vec![], vec![39], vec![0, 3, 4, 17, 38], (0..40).collect::<Vec<u32>>()] {
                 let expected: Vec<i32> = which
                     .iter()
-                    .map(|at| dot(&centroids[*at as usize * n_components..][..n_components], &vector))
+                    .map(|at| dot(&rows[*at as usize * n_components..][..n_components], &vector))
                     .collect();
                 for level in Level::available() {
                     let mut products = vec![7];
-                    let (centroids, vector, which) = (&centroids[..], &vector[..], &which[..]);
+                    let (rows, vector, which) = (&rows[..], &vector[..], &which[..]);
                     let products_of = SomeRowsTimesVector {
-                        centroids,
+                        rows,
                         n_components,
                         vector,
                         which,

@@ -14,8 +14,8 @@ use slag_math::random::Random;
 /// Positions spread over all 16 bits, so that a ball can cover a shard.
 const STEPS_PER_UNIT: f64 = 5000.0;
 
-/// Shards whose scores by [`exact_question`] are exact in f32, f64 and any order of addition: components
-/// are multiples of 1/2. Ties are plentiful.
+/// Shards whose scores by [`exact_question`] are exact in f32, in f64 and in any order of addition:
+/// components are multiples of 1/2. Ties are frequent.
 fn exact_shards() -> impl Strategy<Value = Vec<TestShard>> {
     let component = (-2i32..=2).prop_map(|v| v as f32 / 2.0);
     let member = (prop::array::uniform3(0u16..13), prop::collection::vec(component, 4))
@@ -70,7 +70,7 @@ fn region() -> impl Strategy<Value = Region> {
 pub(super) fn score_in_f64(question: &Question, embedding: impl Iterator<Item = f64> + Clone) -> f64 {
     let dot = |v: &[f32]| embedding.clone().zip(v).map(|(e, v)| e * f64::from(*v)).sum::<f64>();
     let worst = question.negatives.iter().map(|n| dot(n)).reduce(f64::max).unwrap_or(0.0);
-    // A sum of nothing but zeros is -0, which sorts before 0.
+    // A sum of zeros only is -0, which sorts before 0.
     dot(&question.vector) - worst + 0.0
 }
 
@@ -121,7 +121,7 @@ proptest! {
         questions in prop::collection::vec(exact_question(), 1..4), threshold in -16i32..16, limit in 0usize..30,
         region in region(), near in prop::option::of(prop::array::uniform3(-20i32..20)),
     ) {
-        // Cells come in any order: names and places are different things.
+        // Cells come in any order: ids and indices differ.
         let built: Vec<_> = shards.iter().rev().map(|s| s.build(is_exact)).collect();
         let views = views(&built);
         let threshold = threshold as f32 / 8.0;
@@ -129,7 +129,7 @@ proptest! {
         let batch = Search::batch(&mut Scratch::default(), &views, &questions, region, precision).expect("valid");
         prop_assert_eq!(batch.len(), questions.len());
         for (search, question) in batch.iter().zip(&questions) {
-            // Rows are rounded with a step of a power of two, after which sums are still exact.
+            // Centroids are rounded with a power-of-two step, so sums stay exact.
             let mut expected = brute_force(&built, question, region, precision);
             expected.retain(|(_, _, score, _)| *score >= f64::from(threshold));
             let matches = search.matching(threshold);
@@ -156,7 +156,7 @@ proptest! {
     }
 }
 
-/// Rows of noisy unit embeddings around random directions.
+/// Centroids of noisy unit embeddings around random directions.
 fn noisy_shards(random: &mut Random, n_shards: usize, n_centroids: usize, dim: usize) -> Vec<TestShard> {
     let mut shard = |cell_id: usize| {
         let mut centroids = Vec::new();
@@ -175,8 +175,8 @@ fn noisy_shards(random: &mut Random, n_shards: usize, n_centroids: usize, dim: u
     (0..n_shards).map(&mut shard).collect()
 }
 
-/// The bound holds for every Gaussian's unrounded embedding, and compact membership is wrong only
-/// within it; exact membership is wrong nowhere but in the last bits.
+/// The bound holds for every Gaussian's unrounded embedding. Compact membership is wrong only within the
+/// bound, exact membership only in the last bits.
 #[test]
 fn answers_keep_within_the_stated_bound() {
     let mut random = Random::new(1);
@@ -240,7 +240,7 @@ pub(super) fn random_question(random: &mut Random, dim: usize, n_negatives: usiz
     Question { vector: unit(), negatives: (0..n_negatives).map(|_| unit()).collect() }
 }
 
-/// Oracle: all stored embeddings scored and sorted in f64. Ranks may swap within the rounding of f32 only.
+/// Oracle: all stored embeddings scored and sorted in f64. Ranks may swap only within f32 rounding.
 #[test]
 fn the_best_of_noisy_embeddings_are_the_best() {
     let mut random = Random::new(4);
@@ -258,7 +258,7 @@ fn the_best_of_noisy_embeddings_are_the_best() {
                 assert_eq!(best.len(), limit.min(all.len()));
                 for (hit, expected) in best.iter().zip(&all) {
                     let truth = scores[&(hit.shard, hit.index)];
-                    // Rows are multiplied with the query in 16 bits.
+                    // Centroids are multiplied with the query in 16 bits.
                     let rounding = if precision == Precision::Centroids { 1e-4 } else { 1e-5 };
                     assert!((truth - expected.2).abs() < 2.0 * rounding);
                     assert!((f64::from(hit.score) - truth).abs() < rounding);
@@ -294,7 +294,7 @@ fn does_not_depend_on_threads() {
     assert!(answers.iter().all(|answer| *answer == answers[0]));
 }
 
-/// Work is skipped, not only left out of the answer.
+/// Counts the work: skipped centroids are not scored at all.
 #[test]
 fn skips_by_box_and_by_bound() {
     let at = |x: f64, direction: [f32; 2]| {

@@ -1,4 +1,4 @@
-//! NEON. Closures would be compiled for the plain processor: loops only.
+//! NEON kernels. Loops only: closures would be compiled for the baseline processor.
 
 use std::arch::aarch64::{int8x16_t, int16x8_t, uint8x16_t, uint16x8_t};
 
@@ -10,22 +10,22 @@ use super::{Column, Kernels, ROWS};
 
 impl Kernels for Neon {
     #[inline(always)]
-    fn dots(self, centroids: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
+    fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
         let neon = self.neon;
-        let [a, b, c, d] = centroids;
+        let [a, b, c, d] = rows;
         let (a, b) = (a.as_chunks::<16>().0, b.as_chunks::<16>().0);
         let (c, d) = (c.as_chunks::<16>().0, d.as_chunks::<16>().0);
         let vector = vector.as_chunks::<16>().0;
         let mut sums = [neon.vdupq_n_s32(0); ROWS];
         for ((((a, b), c), d), vector) in a.iter().zip(b).zip(c).zip(d).zip(vector) {
             let [low, high]: [int16x8_t; 2] = cast(*vector);
-            for (sum, centroid) in sums.iter_mut().zip([a, b, c, d]) {
-                let centroid: int8x16_t = cast(*centroid);
-                for (centroid, vector) in
-                    [(neon.vmovl_s8(neon.vget_low_s8(centroid)), low), (neon.vmovl_high_s8(centroid), high)]
+            for (sum, row) in sums.iter_mut().zip([a, b, c, d]) {
+                let row: int8x16_t = cast(*row);
+                for (row, vector) in
+                    [(neon.vmovl_s8(neon.vget_low_s8(row)), low), (neon.vmovl_high_s8(row), high)]
                 {
-                    *sum = neon.vmlal_s16(*sum, neon.vget_low_s16(centroid), neon.vget_low_s16(vector));
-                    *sum = neon.vmlal_high_s16(*sum, centroid, vector);
+                    *sum = neon.vmlal_s16(*sum, neon.vget_low_s16(row), neon.vget_low_s16(vector));
+                    *sum = neon.vmlal_high_s16(*sum, row, vector);
                 }
             }
         }

@@ -1,4 +1,4 @@
-//! AVX2 and AVX-512. Closures would be compiled for the plain processor: loops only.
+//! AVX2 and AVX-512 kernels. Loops only: closures would be compiled for the baseline processor.
 
 use std::arch::x86_64::{__m128i, __m256i, __m512i};
 
@@ -10,17 +10,17 @@ use super::{Column, Kernels, ROWS};
 
 impl Kernels for V3 {
     #[inline(always)]
-    fn dots(self, centroids: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
+    fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
         let (avx, avx2) = (self.avx, self.avx2);
-        let [a, b, c, d] = centroids;
+        let [a, b, c, d] = rows;
         let (a, b) = (a.as_chunks::<16>().0, b.as_chunks::<16>().0);
         let (c, d) = (c.as_chunks::<16>().0, d.as_chunks::<16>().0);
         let vector = vector.as_chunks::<16>().0;
         let mut sums = [avx._mm256_setzero_si256(); ROWS];
         for ((((a, b), c), d), vector) in a.iter().zip(b).zip(c).zip(d).zip(vector) {
             let vector: __m256i = cast(*vector);
-            for (sum, centroid) in sums.iter_mut().zip([a, b, c, d]) {
-                let products = avx2._mm256_madd_epi16(avx2._mm256_cvtepi8_epi16(cast(*centroid)), vector);
+            for (sum, row) in sums.iter_mut().zip([a, b, c, d]) {
+                let products = avx2._mm256_madd_epi16(avx2._mm256_cvtepi8_epi16(cast(*row)), vector);
                 *sum = avx2._mm256_add_epi32(*sum, products);
             }
         }
@@ -41,10 +41,10 @@ impl Kernels for V3 {
         let avx2 = self.avx2;
         let least = self.avx._mm256_set1_epi16(least as i16);
         let [low, high]: [__m256i; 2] = cast(*sums);
-        // There is no comparison of unsigned codewords but by their maximum.
+        // AVX2 has no unsigned comparison of words; their maximum serves instead.
         let low = avx2._mm256_cmpeq_epi16(avx2._mm256_max_epu16(low, least), low);
         let high = avx2._mm256_cmpeq_epi16(avx2._mm256_max_epu16(high, least), high);
-        // Packing works within 128 bits: quarters come as 0, 2, 1, 3.
+        // Packing works within 128 bits: quarters come out as 0, 2, 1, 3.
         let bytes = avx2._mm256_permute4x64_epi64::<0b11_01_10_00>(avx2._mm256_packs_epi16(low, high));
         avx2._mm256_movemask_epi8(bytes) as u32
     }
@@ -52,18 +52,18 @@ impl Kernels for V3 {
 
 impl Kernels for V4 {
     #[inline(always)]
-    fn dots(self, centroids: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
+    fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
         let (avx512f, avx512bw) = (self.avx512f, self.avx512bw);
-        let [a, b, c, d] = centroids;
+        let [a, b, c, d] = rows;
         let (a, b) = (a.as_chunks::<32>().0, b.as_chunks::<32>().0);
         let (c, d) = (c.as_chunks::<32>().0, d.as_chunks::<32>().0);
         let vector = vector.as_chunks::<32>().0;
         let mut sums = [avx512f._mm512_setzero_si512(); ROWS];
         for ((((a, b), c), d), vector) in a.iter().zip(b).zip(c).zip(d).zip(vector) {
             let vector: __m512i = cast(*vector);
-            for (sum, centroid) in sums.iter_mut().zip([a, b, c, d]) {
+            for (sum, row) in sums.iter_mut().zip([a, b, c, d]) {
                 let products =
-                    avx512bw._mm512_madd_epi16(avx512bw._mm512_cvtepi8_epi16(cast(*centroid)), vector);
+                    avx512bw._mm512_madd_epi16(avx512bw._mm512_cvtepi8_epi16(cast(*row)), vector);
                 *sum = avx512f._mm512_add_epi32(*sum, products);
             }
         }
@@ -77,7 +77,7 @@ impl Kernels for V4 {
         fold(*self, sums)
     }
 
-    /// Two columns at once, one in either half of a register.
+    /// Sums two columns at once, one in each half of a register.
     #[inline(always)]
     fn block_sums(self, columns: &[Column], low: &[Column], high: &[Column]) -> [u16; BLOCK] {
         let (avx512f, avx512bw) = (self.avx512f, self.avx512bw);
@@ -131,8 +131,8 @@ fn fold(simd: V3, [a, b, c, d]: [__m256i; ROWS]) -> [i32; ROWS] {
     cast(simd.sse2._mm_add_epi32(low, high))
 }
 
-/// Adds a column's values. `sums[1]` has those of the odd bytes; `sums[0]` those of the even bytes and,
-/// 256-fold, of the odd ones: taking them apart at the end is cheaper than at every step.
+/// Adds a column's values. `sums[1]` holds those of the odd bytes; `sums[0]` those of the even bytes plus 256
+/// times those of the odd ones. Separating them at the end is cheaper than at every step.
 #[inline(always)]
 fn add_column(simd: V3, sums: &mut [__m256i; 2], codes: &Column, low: &Column, high: &Column) {
     let avx2 = simd.avx2;
@@ -147,7 +147,7 @@ fn add_column(simd: V3, sums: &mut [__m256i; 2], codes: &Column, low: &Column, h
     }
 }
 
-/// Returns the sums that [`add_column`] keeps, in the order of the Gaussians.
+/// Returns the sums that [`add_column`] accumulates, in the order of the Gaussians.
 #[inline(always)]
 fn in_order(simd: V3, [both, odd]: [__m256i; 2]) -> [u16; BLOCK] {
     let avx2 = simd.avx2;
