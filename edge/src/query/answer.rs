@@ -15,11 +15,11 @@ use super::threshold::ThresholdSource;
 use crate::score::{ObjectScores, Question, Region, ScoreError, Scratch, Search, score_objects};
 use slag_common::manifest::Manifest;
 
-/// Answers a checked request about a scene: one answer to each question, in their order. `questions`: the
+/// Answers a checked request about a scene: one answer for each question, in their order. `questions`: the
 /// vectors of the request's texts, each with those of its negatives.
 ///
-/// Same scene, vectors and request: same answers, for any number of threads, asked alone or together. `scratch`:
-/// memory that earlier answers used, or new.
+/// The same scene, vectors and request give the same answers for any number of threads, asked alone or
+/// together. `scratch`: buffers of earlier answers, or new ones.
 /// # Errors
 /// [`ScoreError`].
 pub fn answer(
@@ -45,7 +45,7 @@ pub fn answer(
     Ok(asked.zip(&searches).map(answer).collect())
 }
 
-/// Answers a question by the objects that match; no row of Gaussians is scored.
+/// Answers a question with the objects that match; no centroid is scored.
 fn answer_objects(
     scene: &Scene<'_>,
     text: &str,
@@ -61,7 +61,7 @@ fn answer_objects(
     let key =
         |object: &FoundObject<'_>| (scale.shown(object.score), object.n_gaussians, object.record.position());
     let ranked = rank(found, threshold.0, manifest, request, key);
-    // Of those that are told alone.
+    // Describes only the objects that are returned.
     let described = ranked.into_par_iter().map(|ranked| object_answer(scene, ranked, scale, &region));
     let found = Found::Clusters(described.collect());
     let best = objects::best(&scored.scores);
@@ -94,7 +94,7 @@ fn answer_gaussians(
     let found = if kind == AnswerKind::Gaussians {
         let limit = request.limit.unwrap_or(DEFAULT_LIMIT);
         let mut hits = search.best(limit, score_threshold, request.near);
-        // Where all are listed, nobody need count them again.
+        // If all are listed, their number is known.
         let is_whole = hits.len() < limit;
         n_matching = if is_whole { hits.len() as u64 } else { search.matching(score_threshold).n_gaussians };
         hits.iter_mut().for_each(|hit| hit.score = scale.shown(hit.score));
@@ -118,12 +118,12 @@ fn answer_gaussians(
         let ranked = rank(grouped.clusters, threshold, manifest, request, key);
         Found::Clusters(ranked.into_iter().map(|ranked| cluster_answer(ranked, manifest)).collect())
     };
-    // Gaussians of exact shards are listed with their own scores, clusters with their rows'.
+    // Gaussians of exact shards are listed with their own scores, clusters with their centroids'.
     let score_error_bound = scale.error_bound(match (search.is_exact(), kind) {
         (true, AnswerKind::Gaussians) => question.rounding_bound(),
         _ => search.score_error_bound(),
     });
-    // With negatives a score is the difference of two.
+    // With negatives a score is the difference of two products.
     let n_products = if question.negatives.is_empty() { 1.0 } else { 2.0 };
     let measured = search.measured_errors();
     Answers {
@@ -139,7 +139,7 @@ fn answer_gaussians(
     }
 }
 
-/// Returns an answer of nothing, with what an answer says of its question and its scene.
+/// Returns an empty answer that describes its question and its scene.
 fn empty(
     scene: &Scene<'_>,
     (text, kind): (&str, AnswerKind),
@@ -170,8 +170,8 @@ fn empty(
     }
 }
 
-/// Returns whether the region asked for was fetched: surely where the ball or the box was, since only
-/// what lies in both was asked for.
+/// Returns whether the whole region asked for was fetched: certainly if all of the ball or all of the box
+/// was, since only their intersection is asked for.
 fn area_fetched((centre, radius): (DVec3, f64), request: &QueryRequest) -> Option<bool> {
     let region = request.region();
     let ball = region.ball.map(|ball| ball.centre_in_world.distance(centre) + ball.radius <= radius);
@@ -201,7 +201,7 @@ fn cluster_answer(ranked: Ranked<Cluster>, manifest: &Manifest) -> ClusterAnswer
     }
 }
 
-/// Describes an object likewise.
+/// Describes an object.
 fn object_answer(
     scene: &Scene<'_>,
     ranked: Ranked<FoundObject<'_>>,

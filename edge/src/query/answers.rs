@@ -1,4 +1,4 @@
-//! What an answer says.
+//! The contents of an answer.
 
 use glam::DVec3;
 use serde::Serialize;
@@ -11,7 +11,7 @@ use super::request::AnswerKind;
 use super::threshold::ThresholdSource;
 use crate::score::Hit;
 
-/// What scores and thresholds are.
+/// Meaning of scores and thresholds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ScoreKind {
@@ -21,51 +21,51 @@ pub enum ScoreKind {
     Relevancy,
 }
 
-/// Answers to one question. `answers` comes last, so that long lists can be sent piece by piece.
+/// Answers to one question. `answers` is the last field, so that long lists can be sent piece by piece.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Answers {
     /// The question.
     pub text: String,
-    /// What its thing is told from.
+    /// Negative prompts.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub negatives: Vec<String>,
-    /// What the answers are made of.
+    /// Kind of the answers.
     pub kind: AnswerKind,
     /// Name of the scene.
     pub scene: String,
     /// Generation of the scene.
     pub generation: u64,
-    /// Unit of every position and length: `m`, or `world` where the model is not metric.
+    /// Unit of every position and length: `m`, or `world` if the scene is not metric.
     pub unit: &'static str,
-    /// What scores are.
+    /// Meaning of scores.
     pub score_kind: ScoreKind,
-    /// Score from which a Gaussian matches.
+    /// Score at or above which a Gaussian matches.
     pub threshold: f32,
-    /// Where the threshold comes from.
+    /// Source of the threshold.
     pub threshold_source: ThresholdSource,
-    /// Gaussians with an embedding in the shards that were searched.
+    /// Gaussians with an embedding in the shards searched.
     pub n_searched: u64,
     /// Gaussians that match.
     pub n_matching: u64,
-    /// Whether exactly the Gaussians that reach the threshold match; else a Gaussian whose score lies
-    /// within `score_error_bound` of the threshold may be on the wrong side.
+    /// Whether exactly the Gaussians at or above the threshold match. Otherwise a Gaussian with a score
+    /// within `score_error_bound` of the threshold may be misplaced.
     pub is_exact: bool,
-    /// No score is off by more.
+    /// Bound on the error of every score.
     pub score_error_bound: f32,
-    /// Measured over a bank of texts, 999 of 1,000 scores are off by less; absent where answers are exact, and
-    /// where it was not measured.
+    /// Error that 999 of 1,000 scores do not exceed, measured over a bank of texts; absent if answers are
+    /// exact or the error was not measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub score_error_p999: Option<f32>,
-    /// Whether all of the region asked for was fetched; absent without `radius` and `box`.
+    /// Whether the whole region asked for was fetched; absent without `radius` and `box`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub area_fetched: Option<bool>,
-    /// How matches were grouped; only at kind `clusters`.
+    /// How matches were clustered; only for `kind=clusters`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub clustering: Option<Clustering>,
-    /// Why there is no answer; absent if there is one.
+    /// Reason for an empty answer.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reason: Option<Reason>,
-    /// The answers, best first. Written as an empty list: [`super::Reply::pieces`] fills it.
+    /// The answers, best first. Serialised as an empty list, which [`super::Reply::pieces`] fills.
     #[serde(serialize_with = "empty_list")]
     pub answers: Found,
 }
@@ -75,7 +75,7 @@ pub struct Answers {
 pub enum Found {
     /// Clusters.
     Clusters(Vec<ClusterAnswer>),
-    /// Gaussians; [`GaussianAnswer::new`] says more of each.
+    /// Gaussians; [`GaussianAnswer::new`] describes one.
     Gaussians(Vec<Hit>),
 }
 
@@ -88,7 +88,7 @@ impl Found {
         }
     }
 
-    /// Whether there is no answer.
+    /// Returns whether there is no answer.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -103,50 +103,50 @@ fn empty_list<S: Serializer>(_: &Found, to: S) -> Result<S::Ok, S::Error> {
 pub struct Clustering {
     /// Edge of the voxels.
     pub voxel: f64,
-    /// Members that a cluster needs.
+    /// Members required of a cluster.
     pub min_count: u64,
-    /// Clusters with enough members; those past the limit included.
+    /// Clusters with enough members, including those beyond the limit.
     pub n_clusters: u64,
-    /// Clusters with too few.
+    /// Clusters with too few members.
     pub n_small_clusters: u64,
-    /// Gaussians in those.
+    /// Gaussians in clusters with too few members.
     pub n_gaussians_in_small_clusters: u64,
 }
 
-/// A group of matching Gaussians, or an object.
+/// A cluster of matching Gaussians, or an object.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ClusterAnswer {
-    /// Place in the list, from 1.
+    /// Position in the list, from 1.
     pub rank: usize,
-    /// Cell and index of its first Gaussian, which keeps its meaning within a generation; of an object `o` and 16 hex
-    /// digits, which keep theirs as long as its Gaussians stay the same.
+    /// For a cluster, the cell and index of its first Gaussian: valid within a generation. For an object, `o`
+    /// and 16 hex digits: valid as long as its Gaussians stay the same.
     pub id: String,
     /// Mean of its Gaussians inside the box.
     pub position_in_world: DVec3,
-    /// The same on the earth, where the scene is geo-referenced.
+    /// The same as latitude, longitude and height, if the scene is geo-referenced.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub geographic: Option<Geographic>,
-    /// Smallest corner of its box: 2nd percentile along each axis, so that floaters do not count.
+    /// Smallest corner of its box: the 2nd percentile along each axis, so that floaters do not count.
     pub box_min_in_world: DVec3,
     /// Largest corner: 98th percentile.
     pub box_max_in_world: DVec3,
     /// Edges of the box.
     pub size: DVec3,
-    /// Its box along axes of its own, upright where the world has a known up.
+    /// Its box along axes of its own, upright if the world has a known up.
     pub oriented_box: OrientedBox,
-    /// Mean score of its Gaussians; of an object that of its masks.
+    /// Mean score of its Gaussians; for an object, of its masks.
     pub score: f32,
-    /// Best score of its Gaussians; of an object its score.
+    /// Best score of its Gaussians; for an object, its score.
     pub best_score: f32,
-    /// Its Gaussians; of an object those on board, in the region asked for.
+    /// Its Gaussians; for an object, those on board in the region asked for.
     pub n_gaussians: u64,
-    /// Of an object: its Gaussians in the whole scene.
+    /// For an object: its Gaussians in the whole scene.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub n_gaussians_in_scene: Option<u64>,
-    /// Of an object: where to see it.
+    /// For an object: the photo that shows it best.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub evidence: Option<Evidence>,
-    /// What the list is ranked by, see [`super::relevance`].
+    /// Ranking key, see [`super::relevance`].
     pub relevance: f32,
     /// Distance of the position from `near`.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -156,22 +156,22 @@ pub struct ClusterAnswer {
 /// The photo that shows an object best.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Evidence {
-    /// Name of its view.
+    /// Name of the view.
     pub photo: String,
-    /// Where the object lies in it, free of distortion: x0, y0, x1, y1, the latter exclusive.
+    /// The object's box in the undistorted photo: x0, y0, x1, y1, the latter exclusive.
     pub box_px: [u32; 4],
 }
 
 /// A matching Gaussian.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct GaussianAnswer {
-    /// Place in the list, from 1.
+    /// Position in the list, from 1.
     pub rank: usize,
     /// Its cell.
     pub cell_id: u32,
     /// Its index in the cell's shard.
     pub index: u32,
-    /// Its index in the input splat file, where the profile keeps it.
+    /// Its index in the input splat file, if the profile keeps it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub input_index: Option<u32>,
     /// Its mean.
@@ -184,7 +184,7 @@ pub struct GaussianAnswer {
 }
 
 impl GaussianAnswer {
-    /// Describes the hit at place `at` of the list, from 0. `shard`: the one that it names.
+    /// Describes a hit. `at`: its index in the list; `shard`: its shard.
     pub fn new(at: usize, hit: &Hit, shard: &ShardView<'_>, near: Option<DVec3>) -> Self {
         let position_in_world = shard.position_in_world(hit.index as usize);
         Self {
@@ -199,29 +199,29 @@ impl GaussianAnswer {
     }
 }
 
-/// Why there is no answer.
+/// Kind of reason for an empty answer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ReasonKind {
-    /// No Gaussian reaches the threshold.
+    /// No Gaussian or object reaches the threshold.
     BelowThreshold,
     /// Gaussians match, but no cluster has enough of them.
     ClustersTooSmall,
-    /// No Gaussian with an embedding lies in the part of space asked for.
+    /// The region asked for holds nothing that could match.
     NothingThere,
 }
 
-/// Why there is no answer, and what came nearest.
+/// Reason for an empty answer, with the nearest miss.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Reason {
     /// Kind.
     pub kind: ReasonKind,
-    /// For people.
+    /// The reason in words.
     pub detail: String,
-    /// Best score of a Gaussian.
+    /// Best score found.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub best_score: Option<f32>,
-    /// Where that Gaussian lies.
+    /// Position of the best score.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub best_position_in_world: Option<DVec3>,
 }

@@ -1,16 +1,16 @@
 //! Gaussians as columns: an Arrow IPC stream (https://arrow.apache.org/docs/format/Columnar.html).
 //!
-//! | column | type | what |
+//! | column | type | content |
 //! |---|---|---|
-//! | `question` | u32 | which text, from 0; only where there are several |
+//! | `question` | u32 | index of the text; only if there are several |
 //! | `x`, `y`, `z` | f64 | the mean, world frame |
 //! | `score` | f32 | as in JSON |
 //! | `cell` | u32 | the cell |
 //! | `index` | u32 | index in the cell's shard |
 //!
 //! The schema's metadata: `scene`, `generation`, `frame` (`world`), `unit`, `score_kind`, `threshold` and
-//! `score_error_bound` (of the first text), `questions` (per text what JSON says, without the answers), and
-//! `geo_reference` where the world's place on the earth is known.
+//! `score_error_bound` (of the first text), `questions` (the JSON of each text without its answers), and
+//! `geo_reference` if the scene has one.
 
 use std::collections::HashMap;
 use std::io;
@@ -97,7 +97,7 @@ fn schema(reply: &Reply) -> Schema {
     columns.extend(["cell", "index"].map(|name| column(name, DataType::UInt32)));
 
     let manifest = &reply.snapshot.manifest;
-    // Text and numbers always have JSON.
+    // Text and numbers always serialise.
     let json = |value: serde_json::Result<String>| value.unwrap_or_default();
     let mut metadata = HashMap::from([
         ("scene".to_owned(), manifest.scene.clone()),

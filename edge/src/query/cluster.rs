@@ -1,11 +1,11 @@
-//! Groups matching Gaussians into objects: Gaussians in the same or in touching voxels (26
-//! neighbours) of a world-aligned grid belong together, unless only a thin bridge joins them.
+//! Clusters matching Gaussians: Gaussians in the same voxel or in touching voxels (26 neighbours) of a
+//! world-aligned grid belong together, unless only a thin bridge joins them.
 //!
-//! A voxel's mass is the number of its Gaussians, each weighted by how far its score passes the threshold.
-//! Voxels join from the heaviest to the lightest, each to its heaviest neighbour; where one touches two
-//! groups it joins these too, if its own mass is at least a twentieth of the lesser group's peak (clustering
-//! by prominence: Chazal et al. 2013, "Persistence-based clustering in Riemannian manifolds"). So a string
-//! of floaters does not make one thing of two, however dense or sparse the things are.
+//! A voxel's mass is the number of its Gaussians, each weighted by its margin over the threshold. Voxels join
+//! from the heaviest to the lightest, each to its heaviest neighbour. A voxel that touches two groups joins
+//! them if its mass is at least a twentieth of the lesser group's peak (clustering by prominence: Chazal et
+//! al. 2013, "Persistence-based clustering in Riemannian manifolds"). A string of floaters therefore does not
+//! join two things, however dense or sparse these are.
 
 use glam::{DVec3, I64Vec3};
 use rayon::prelude::*;
@@ -16,35 +16,34 @@ use slag_math::union_find::UnionFind;
 use super::oriented::{Alignment, OrientedBox, trimmed_range};
 use crate::score::Run;
 
-/// Bits of a voxel's coordinate in its key, three of which fill a `u64`.
+/// Bits of a voxel coordinate in its key; three of them fill a `u64`.
 const AXIS_BITS: u32 = 21;
-/// The part of a cluster's members, from either end along each axis, that its box leaves out: a few
-/// floaters must not blow it up.
+/// Share of a cluster's members that its box leaves out at either end of each axis, so that a few floaters do
+/// not inflate it.
 const TRIMMED: f64 = 0.02;
-/// The least mass of a voxel that joins two groups, as a share of the lesser group's heaviest voxel. A thing
-/// fills its voxels with tens of Gaussians, floaters with one or two.
+/// Least mass of a voxel that joins two groups, as a share of the lesser group's heaviest voxel. Things fill
+/// their voxels with tens of Gaussians, floaters with one or two.
 const BRIDGE_SHARE: f64 = 0.05;
-/// What a Gaussian that just reaches the threshold weighs, beside the best one's 1.
+/// Weight of a Gaussian that just reaches the threshold; the best one weighs 1.
 const LEAST_WEIGHT: f64 = 0.1;
 
-/// How to group.
+/// Parameters of clustering.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Grouping {
-    /// Edge of the voxels, world units, positive; it is taken as is, except that it is doubled until the
-    /// matches' extent fits the grid.
+    /// Edge of the voxels, world units, positive. Doubled until the extent of the matches fits the grid.
     pub voxel: f64,
     /// Clusters with fewer members are dropped.
     pub min_count: u64,
-    /// Score from which Gaussians match.
+    /// Score at or above which Gaussians match.
     pub threshold: f32,
-    /// How boxes may be turned.
+    /// Permitted orientations of boxes.
     pub alignment: Alignment,
 }
 
-/// Gaussians that belong together.
+/// A cluster of Gaussians.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cluster {
-    /// Cell and index of its first member: names it within a generation.
+    /// Cell and index of its first member: its id within a generation.
     pub first: (u32, u32),
     /// Members.
     pub n_gaussians: u64,
@@ -54,23 +53,23 @@ pub struct Cluster {
     pub best_score: f32,
     /// Mean of the members inside the box.
     pub position_in_world: DVec3,
-    /// From the 2nd to the 98th percentile of the members' means along each axis (all of them where
-    /// they are fewer than 51).
+    /// From the 2nd to the 98th percentile of the members' means along each axis (all members if they are
+    /// fewer than 51).
     pub box_in_world: Aabb,
-    /// The same along axes of its own: those of the members inside `box_in_world`.
+    /// Box along axes of its own, those of the members inside `box_in_world`.
     pub oriented_box: OrientedBox,
 }
 
-/// All clusters of some matches.
+/// All clusters of a set of matches.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Clusters {
-    /// Those with enough members, by first member, ascending.
+    /// Clusters with enough members, by first member, ascending.
     pub clusters: Vec<Cluster>,
     /// Clusters with too few members.
     pub n_small: u64,
-    /// Gaussians in those.
+    /// Gaussians in clusters with too few members.
     pub n_gaussians_in_small: u64,
-    /// Edge of the voxels: as asked, or doubled until 21 bits could number those of one axis.
+    /// Edge of the voxels: as requested, or doubled until 21 bits could number them along each axis.
     pub voxel: f64,
 }
 
@@ -83,7 +82,7 @@ struct Span {
     end: u32,
 }
 
-/// Numbers the voxels so that keys of neighbours differ by constants.
+/// Numbers voxels so that keys of neighbours differ by constants.
 struct Grid {
     inverse_voxel: f64,
     base: I64Vec3,
@@ -94,7 +93,7 @@ impl Grid {
         loop {
             let inverse_voxel = 1.0 / *voxel;
             let (low, high) = ((reach.min * inverse_voxel).floor(), (reach.max * inverse_voxel).floor());
-            // One voxel is kept free on either side, so that stepping to a neighbour never carries.
+            // One voxel stays free on either side, so that a step to a neighbour never carries.
             if (high - low).max_element() < f64::from((1u32 << AXIS_BITS) - 3) {
                 return Self { inverse_voxel, base: low.as_i64vec3() - 1 };
             }
@@ -108,21 +107,21 @@ impl Grid {
     }
 }
 
-/// Rounds down; the coordinates fit by far. (Without SSE 4.1 the standard rounding is a call.)
+/// Rounds down; the coordinates fit. (Without SSE 4.1 the standard rounding is a function call.)
 fn floor(point: DVec3) -> I64Vec3 {
     let truncated = point.as_i64vec3();
     let is_below = |axis: usize| i64::from(point[axis] < truncated[axis] as f64);
     truncated - I64Vec3::new(is_below(0), is_below(1), is_below(2))
 }
 
-/// Returns the key differences to the 13 neighbours whose key is greater.
+/// Returns the key differences to the 13 neighbours with greater keys.
 fn forward_neighbours() -> impl Iterator<Item = u64> {
     let steps = || -1i64..=1;
     let all = steps().flat_map(move |x| steps().flat_map(move |y| steps().map(move |z| (x, y, z))));
     all.map(|(x, y, z)| (x << (2 * AXIS_BITS)) + (y << AXIS_BITS) + z).filter(|d| *d > 0).map(|d| d as u64)
 }
 
-/// Groups the members of runs, which do not overlap.
+/// Clusters the members of disjoint runs.
 pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], grouping: &Grouping) -> Clusters {
     let Grouping { mut voxel, min_count, threshold, alignment } = *grouping;
     let mut result = Clusters { clusters: Vec::new(), n_small: 0, n_gaussians_in_small: 0, voxel };
@@ -166,7 +165,7 @@ pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], grouping: &Grouping) -> C
         .map(|group| {
             let mut spans: Vec<Span> =
                 group.iter().flat_map(|voxel| voxels[*voxel as usize]).copied().collect();
-            // Members in storage order, so that sums do not depend on how the world is voxelised.
+            // Members in storage order, so that sums do not depend on the voxels.
             spans.sort_unstable_by_key(|span| (span.run, span.start));
             summarise(shards, runs, &spans, alignment)
         })
@@ -191,7 +190,7 @@ fn spans_of(shards: &[ShardView<'_>], runs: &[Run], first_run: usize, grid: &Gri
     spans
 }
 
-/// Returns what a Gaussian of a score weighs: from a tenth at the threshold to 1 at the best score.
+/// Returns the weight of a score: from a tenth at the threshold to 1 at the best score.
 fn weight_of_score(runs: &[Run], threshold: f32) -> impl Fn(f32) -> f64 {
     let best = runs.iter().fold(threshold, |best, run| best.max(run.score));
     let range = f64::from(best) - f64::from(threshold);
@@ -201,20 +200,20 @@ fn weight_of_score(runs: &[Run], threshold: f32) -> impl Fn(f32) -> f64 {
     }
 }
 
-/// Returns for each voxel (by key, ascending) a number that those of its group share. `masses`: `[voxels]`.
+/// Returns for each voxel (by key, ascending) the number of its group. `masses`: `[voxels]`.
 fn connect(voxels: &[&[Span]], masses: &[f64]) -> Vec<u32> {
-    // From here on voxels are named by their rank, from the heaviest; a group's root is its heaviest.
+    // From here on voxels go by rank, heaviest first; a group's root is its heaviest voxel.
     let mut by_rank: Vec<u32> = (0..voxels.len() as u32).collect();
     let mass = |voxel: u32| masses[voxel as usize];
     by_rank.par_sort_unstable_by(|a, b| mass(*b).total_cmp(&mass(*a)).then(a.cmp(b)));
     let mut rank_of = vec![0u32; voxels.len()];
     by_rank.iter().zip(0..).for_each(|(voxel, rank)| rank_of[*voxel as usize] = rank);
 
-    // The lighter end decides when a joint comes into play, then the heavier one.
+    // Joints are processed by their lighter end, then by their heavier one.
     let mut joints: Vec<(u32, u32)> = Vec::new();
     let keys: Vec<u64> = voxels.iter().map(|spans| spans[0].voxel_key).collect();
     for difference in forward_neighbours() {
-        // Keys ascend, so the neighbours sought do too: one walk finds them all.
+        // Keys ascend, so the wanted neighbours do too: one pass finds them all.
         let mut other = 0;
         for at in 0..keys.len() {
             let wanted = keys[at] + difference;

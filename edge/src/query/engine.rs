@@ -1,4 +1,5 @@
-//! A cache, a text model, and the questions to them: what the HTTP service and the command line share.
+//! Query engine: a cache, a text model, and the questions asked of them. Shared by the HTTP service and the
+//! command line.
 
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
 use std::time::{Duration, Instant};
@@ -17,37 +18,37 @@ use crate::store::files::Stat;
 use crate::store::{EdgeCache, OpenShard, Snapshot, StoreError};
 use crate::text::{EncoderInfo, TextError, TextService};
 
-/// A failed load is tried again after this, even if `current` stays the same: the disk may have been
-/// full, or files too many.
+/// Time after which a failed load is tried again even if `current` is unchanged: the disk may have been full,
+/// or too many files open.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
 
-/// Why a question has no answer at all.
+/// Reasons for which a question cannot be answered.
 #[derive(Debug, thiserror::Error)]
 pub enum QueryError {
-    /// The question cannot be.
+    /// The request is invalid.
     #[error(transparent)]
     Request(#[from] RequestError),
-    /// The text has no vector.
+    /// The text cannot be encoded.
     #[error(transparent)]
     Text(#[from] TextError),
-    /// A negative has no vector.
+    /// A negative cannot be encoded.
     #[error("negatives: {0}")]
     Negatives(#[source] TextError),
     /// No scene is loaded.
     #[error("no scene is loaded; run `slag-edge fetch`, or see the log if one was fetched")]
     NoScene,
-    /// Text and scene live in different spaces.
+    /// Text model and scene use different embedding spaces.
     #[error(
         "the text model is {models_name} ({models_id}), the scene was encoded with {scene_name} ({scene_id}); give --models the directory of {scene_name}, or fetch a scene encoded with {models_name}"
     )]
     EncoderMismatch {
         /// Name of the text model's space.
         models_name: String,
-        /// Its identity.
+        /// Its id.
         models_id: Hash32,
         /// Name of the scene's space.
         scene_name: String,
-        /// Its identity.
+        /// Its id.
         scene_id: Hash32,
     },
     /// The shards cannot be scored.
@@ -56,7 +57,7 @@ pub enum QueryError {
 }
 
 impl QueryError {
-    /// Returns a stable name of the kind of error, for programs.
+    /// Returns the stable name of the error's kind, for programs.
     pub fn kind(&self) -> &'static str {
         match self {
             Self::Request(_) => "bad-parameter",
@@ -88,27 +89,27 @@ pub struct Engine {
     cache: EdgeCache,
     text: TextService,
     loaded: RwLock<Loaded>,
-    /// Memory of answers that are over, one for each that was made at a time.
+    /// Buffers of finished answers, one for each answer computed at a time.
     idle: Mutex<Vec<Scratch>>,
 }
 
 impl Engine {
-    /// Joins a cache and a text model; nothing is loaded yet.
+    /// Makes an engine without loading anything yet.
     pub fn new(cache: EdgeCache, text: TextService) -> Self {
         Self { cache, text, loaded: RwLock::default(), idle: Mutex::default() }
     }
 
-    /// Returns which text encoder answers.
+    /// Returns the text encoder in use.
     pub fn encoder(&self) -> &EncoderInfo {
         self.text.info()
     }
 
-    /// Whether the text model runs.
+    /// Returns whether the text model runs.
     pub fn text_is_alive(&self) -> bool {
         self.text.is_alive()
     }
 
-    /// Whether the cache's `current` is another than the one loaded (one `stat` call), or loading it
+    /// Returns whether the cache's `current` differs from the one loaded (one `stat` call), or loading it
     /// failed a while ago.
     pub fn is_stale(&self) -> bool {
         let loaded = self.loaded.read().unwrap_or_else(PoisonError::into_inner);
@@ -116,8 +117,8 @@ impl Engine {
         retry || self.cache.current_stat().is_ok_and(|stat| stat != loaded.tried)
     }
 
-    /// Opens the cache's current generation and puts it in place; questions under way keep theirs.
-    /// If it does not open, the one before stays.
+    /// Opens the cache's current generation and makes it the one in use; questions in progress keep theirs.
+    /// If it does not open, the previous one stays in use.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -129,21 +130,21 @@ impl Engine {
             Ok(snapshot) => {
                 let (tried, snapshot) = (snapshot.current_stat, Some(Arc::new(snapshot)));
                 let before = std::mem::replace(&mut *loaded, Loaded { snapshot, tried, failed_at: None });
-                // Unmapping many shards takes a while: not while others wait for the lock.
+                // Unmapping many shards takes a while; others must not wait for the lock.
                 drop(loaded);
                 drop(before);
                 Ok(())
             }
             Err(error) => {
                 loaded.tried = tried;
-                // An empty cache is no fault that goes away by itself.
+                // An empty cache does not fill by itself.
                 loaded.failed_at = (!matches!(error, StoreError::Empty { .. })).then(Instant::now);
                 Err(error)
             }
         }
     }
 
-    /// Returns the generation that is loaded.
+    /// Returns the loaded generation.
     ///
     /// # Errors
     /// [`QueryError::NoScene`].
@@ -152,7 +153,7 @@ impl Engine {
         loaded.snapshot.clone().ok_or(QueryError::NoScene)
     }
 
-    /// Whether text model and scene share a space.
+    /// Checks that text model and scene use the same embedding space.
     ///
     /// # Errors
     /// [`QueryError::EncoderMismatch`].
@@ -169,7 +170,7 @@ impl Engine {
         })
     }
 
-    /// Answers a request from the generation that is loaded. Blocks: milliseconds of computing.
+    /// Answers a request from the loaded generation. Blocks for milliseconds of computing.
     ///
     /// # Errors
     /// [`QueryError`].

@@ -1,4 +1,4 @@
-//! The formats that a reply is sent in.
+//! Formats of a reply.
 
 use std::io;
 
@@ -7,13 +7,13 @@ use super::arrow;
 use super::json;
 use super::reply::Reply;
 
-/// How a reply is written.
+/// Format of a reply.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Format {
-    /// One object; of several questions, `{"batch":[…]}` of theirs.
+    /// One object; for several questions, `{"batch":[…]}`.
     #[default]
     Json,
-    /// Columns as an Arrow IPC stream; of Gaussians only.
+    /// Columns as an Arrow IPC stream; Gaussians only.
     Arrow,
 }
 
@@ -60,11 +60,10 @@ impl std::str::FromStr for Format {
 }
 
 impl Reply {
-    /// Returns the pieces of the reply in a format, none longer than a fraction of a megabyte; each is made
-    /// when it is asked for.
+    /// Returns the reply in pieces of at most a fraction of a megabyte, each made on demand.
     ///
     /// # Errors
-    /// A piece is an error where it cannot be written.
+    /// A piece is an error if it cannot be written.
     pub fn pieces(self, format: Format) -> Box<dyn Iterator<Item = io::Result<Vec<u8>>> + Send> {
         match format {
             Format::Json => Box::new(json::Pieces::new(self)),

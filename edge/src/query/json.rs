@@ -1,19 +1,19 @@
-//! A reply as JSON, piece by piece: no piece is large, however long the answer.
+//! A reply as JSON, in pieces of limited size however long the answer.
 
 use std::io;
 
 use super::answers::Found;
 use super::reply::Reply;
 
-/// Pieces of JSON are cut at the first answer past this.
+/// A piece ends with the first answer past this size.
 const JSON_PIECE_BYTES: usize = 64 << 10;
-/// Room for the answer that passes it.
+/// Capacity reserved for that last answer.
 const ANSWER_BYTES: usize = 1 << 10;
 
 /// The pieces of a reply as JSON.
 pub struct Pieces {
     reply: Reply,
-    /// What comes next: an item of a question's answers.
+    /// The next item: an index into a question's answers.
     question: usize,
     item: usize,
     is_closed: bool,
@@ -56,7 +56,7 @@ impl Pieces {
                     piece.extend(if self.question == 0 { &b"{\"batch\":["[..] } else { b"," });
                 }
                 serde_json::to_writer(&mut *piece, answers)?;
-                // The list comes last and is written empty: it is opened again.
+                // The list is the last field and was written empty: reopen it.
                 piece.truncate(piece.len() - b"]}".len());
             }
             if self.item == answers.answers.len() {

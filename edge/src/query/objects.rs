@@ -1,7 +1,7 @@
-//! Answers made of objects: what the masks of several views agree on, scored as a whole.
+//! Answers made of objects, which are scored as a whole.
 //!
-//! An object that reaches into several cells is in the shards of all: it is scored once, and its Gaussians are those
-//! on board that lie in the region asked for.
+//! An object that reaches into several cells is stored in all of their shards. It is scored once, and its
+//! Gaussians are those on board in the region asked for.
 
 use glam::DVec3;
 use slag_common::manifest::Calibration;
@@ -12,14 +12,14 @@ use super::scene::Scene;
 use crate::score::Region;
 use crate::store::objects::Part;
 
-/// As [`super::cluster`] trims its boxes.
+/// The same share as [`super::cluster`] trims.
 const TRIMMED: f64 = 0.02;
 
 /// An object that matches.
 pub struct FoundObject<'a> {
-    /// Its place in the index.
+    /// Its index in the object index.
     pub object: usize,
-    /// What its shards say of it.
+    /// Its record in the shards.
     pub record: &'a ObjectRecord,
     /// Its score with the question.
     pub score: f32,
@@ -27,18 +27,19 @@ pub struct FoundObject<'a> {
     pub n_gaussians: u64,
 }
 
-/// Returns how a bank of texts scores over the objects of the scene.
+/// Returns the mean and spread of a bank of texts' scores over the scene's objects.
 pub fn calibration(objects: &[Option<Objects<'_>>]) -> Option<Calibration> {
     let header = objects.iter().flatten().next()?.header;
     Some(Calibration { score_mean: header.score_mean, score_spread: header.score_spread })
 }
 
-/// Returns the object with the best score, the first of equals.
+/// Returns the object with the best score, the first among equals.
 pub fn best(scores: &[f32]) -> Option<usize> {
     (0..scores.len()).reduce(|best, object| if scores[object] > scores[best] { object } else { best })
 }
 
-/// Returns the objects whose scores reach a threshold and that have at least so many Gaussians, and one, in a region; by id.
+/// Returns the objects that reach a threshold and have at least `min_count` Gaussians, and at least one, in a
+/// region; by id.
 pub fn matching<'a>(
     scene: &Scene<'a>,
     scores: &[f32],
@@ -60,7 +61,7 @@ pub fn matching<'a>(
     reaching.filter_map(found).collect()
 }
 
-/// Returns what the shards say of an object.
+/// Returns the record of an object.
 pub fn record<'a>(scene: &Scene<'a>, object: usize) -> &'a ObjectRecord {
     let first = scene.index.parts(object)[0];
     &of_part(scene, first).records[first.number as usize]
@@ -80,7 +81,8 @@ pub fn oriented_box(scene: &Scene<'_>, object: usize, region: &Region, alignment
     OrientedBox::around(&points, in_box, alignment, TRIMMED)
 }
 
-/// Returns how many Gaussians of a part lie in a region; looks at them only where its border crosses the shard.
+/// Returns the number of a part's Gaussians in a region; examines them only if the region's border crosses
+/// the shard.
 fn count(scene: &Scene<'_>, part: Part, region: &Region) -> u64 {
     let reach = scene.shards[part.shard as usize].position_box();
     if !region.touches(&reach) {
@@ -92,7 +94,7 @@ fn count(scene: &Scene<'_>, part: Part, region: &Region) -> u64 {
     points(scene, part, region).count() as u64
 }
 
-/// Returns where the Gaussians of a part that lie in a region are.
+/// Returns the positions of a part's Gaussians in a region.
 fn points<'a>(scene: &'a Scene<'_>, part: Part, region: &'a Region) -> impl Iterator<Item = DVec3> + 'a {
     let shard = &scene.shards[part.shard as usize];
     let members = scene.index.runs(part, of_part(scene, part)).flatten();

@@ -3,34 +3,34 @@
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use serde::Serialize;
 
-/// Which axes a box may have.
+/// Permitted orientations of a box.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Alignment {
-    /// Upright: turned about the world's z axis only, which is up.
+    /// Upright: rotated about the world's z axis only, which points up.
     Gravity,
-    /// Along the points' principal axes.
+    /// Aligned with the points' principal axes.
     Principal,
 }
 
-/// A box with axes of its own.
+/// A box along axes of its own.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct OrientedBox {
-    /// Its middle.
+    /// Its centre.
     pub centre_in_world: DVec3,
     /// Its edges along its own axes; x is the longest (of the horizontal ones, if upright).
     pub size: DVec3,
-    /// Unit quaternion x, y, z, w that turns the box's axes into the world's.
+    /// Unit quaternion x, y, z, w that rotates the box's axes into the world's.
     pub rotation_world_from_box: DQuat,
-    /// Which axes it may have.
+    /// The orientations permitted.
     pub alignment: Alignment,
 }
 
 impl OrientedBox {
-    /// Returns the box of some points: axes from the points inside `core`, extents from the `trimmed` to the
-    /// `1 - trimmed` quantile of all points along them.
+    /// Returns the box of a set of points: axes from the points inside `core`, extents from the `trimmed` to
+    /// the `1 - trimmed` quantile of all points.
     ///
-    /// `core` keeps floaters, whose leverage grows with the square of their distance, out of the axes.
+    /// `core` keeps floaters out of the axes: their leverage grows with the square of their distance.
     pub fn around(
         points: &[DVec3],
         core: impl Fn(&DVec3) -> bool,
@@ -56,13 +56,13 @@ impl OrientedBox {
     }
 }
 
-/// Returns the `trimmed` and `1 - trimmed` quantiles of some values, whose order it changes; zeros for none.
+/// Returns the `trimmed` and `1 - trimmed` quantiles of values, which it reorders; zeros if there are none.
 pub fn trimmed_range(values: &mut [f64], trimmed: f64) -> (f64, f64) {
     let Some(last) = values.len().checked_sub(1) else { return (0.0, 0.0) };
     let cut = (trimmed * last as f64) as usize;
     let (_, low, above) = values.select_nth_unstable_by(cut, f64::total_cmp);
     let low = *low;
-    // The upper quantile's place among what lies above the lower one.
+    // Index of the upper quantile among the values above the lower one.
     let place = above.len().checked_sub(1 + cut);
     (low, place.map_or(low, |place| *above.select_nth_unstable_by(place, f64::total_cmp).1))
 }
@@ -85,8 +85,8 @@ fn axes_of(points: &[DVec3], alignment: Alignment) -> DMat3 {
     }
 }
 
-/// Returns the eigenvectors of a symmetric matrix as columns, by Jacobi's rotations (Golub and Van Loan,
-/// Matrix Computations, 8.5): a dozen of them are enough for 3x3.
+/// Returns the eigenvectors of a symmetric matrix as columns, by Jacobi rotations (Golub and Van Loan, Matrix
+/// Computations, 8.5); a dozen of them suffice for 3x3.
 fn eigenvectors(mut a: DMat3) -> DMat3 {
     let mut axes = DMat3::IDENTITY;
     for _ in 0..16 {
@@ -109,8 +109,8 @@ fn eigenvectors(mut a: DMat3) -> DMat3 {
     axes
 }
 
-/// Renames the axes so that the longest edge comes first (an upright box keeps z), turns each so that its
-/// largest component is positive, and the last so that the three are right-handed: one box, one name.
+/// Makes the box unique: orders the axes by length, longest first (an upright box keeps z), flips each so
+/// that its largest component is positive, and makes them right-handed.
 fn longest_first(axes: DMat3, min: DVec3, max: DVec3, alignment: Alignment) -> (DMat3, DVec3, DVec3) {
     let size = max - min;
     let mut order = [0, 1, 2];
@@ -120,13 +120,13 @@ fn longest_first(axes: DMat3, min: DVec3, max: DVec3, alignment: Alignment) -> (
     for (to, from) in order.into_iter().enumerate() {
         let axis = axes.col(from);
         let largest = (0..3).fold(0, |best, i| if axis[i].abs() > axis[best].abs() { i } else { best });
-        // An upright box's third axis is up already; its second is turned to fit below.
+        // An upright box's third axis points up already; its second is flipped to match below.
         let sign = if axis[largest] < 0.0 { -1.0 } else { 1.0 };
         *out.0.col_mut(to) = axis * sign;
         (out.1[to], out.2[to]) = if sign < 0.0 { (-max[from], -min[from]) } else { (min[from], max[from]) };
     }
     if out.0.determinant() < 0.0 {
-        // Not the third, which may have to stay up.
+        // Not the third, which may have to point up.
         *out.0.col_mut(1) *= -1.0;
         (out.1.y, out.2.y) = (-out.2.y, -out.1.y);
     }
@@ -140,7 +140,7 @@ mod tests {
     use super::*;
     use slag_math::random::Random;
 
-    /// Points on a lattice that fills a box of edges `size` turned by `rotation` around `centre`.
+    /// Points on a lattice that fills a box of edges `size`, rotated by `rotation` around `centre`.
     fn lattice(size: DVec3, rotation: DQuat, centre: DVec3) -> Vec<DVec3> {
         let steps = |edge: f64| (0..12).map(move |i| (f64::from(i) / 11.0 - 0.5) * edge);
         let (x, y, z) = (steps(size.x), steps(size.y), steps(size.z));
@@ -157,7 +157,7 @@ mod tests {
             .prop_map(|v| DQuat::from_array(v).normalize())
     }
 
-    /// The largest distance of a corner of `found` from the nearest corner of the box it was made from.
+    /// The largest distance between a corner of `found` and the nearest corner of the original box.
     fn corner_error(found: &OrientedBox, size: DVec3, rotation: DQuat, centre: DVec3) -> f64 {
         let corners = |centre: DVec3, size: DVec3, rotation: DQuat| {
             let sign = |bit: usize, i: usize| if i >> bit & 1 == 1 { 0.5 } else { -0.5 };
@@ -176,7 +176,7 @@ mod tests {
             rotation in quat(), yaw in -4.0f64..4.0, centre in prop::array::uniform3(-1e3f64..1e3),
             edges in prop::array::uniform3(0.0f64..0.2),
         ) {
-            // Edges that differ: equal ones have no axes.
+            // Edges of different lengths: equal ones have no axes.
             let size = DVec3::new(2.0, 1.0, 0.5) + DVec3::from(edges);
             let centre = DVec3::from(centre);
             let points = lattice(size, rotation, centre);
@@ -194,7 +194,7 @@ mod tests {
             prop_assert!((up - DVec3::Z).length() < 1e-12, "{up}");
         }
 
-        /// Upright boxes stay upright and hold their points, whatever the points.
+        /// Upright boxes stay upright and contain their points, whatever the points.
         #[test]
         fn every_point_is_inside_without_trimming(
             points in prop::collection::vec(prop::array::uniform3(-10.0f64..10.0), 0..40), gravity in any::<bool>(),
@@ -211,7 +211,7 @@ mod tests {
         }
     }
 
-    /// One point in a hundred flies around, up to 50 edges away.
+    /// One point in a hundred is a floater, up to 50 edges away.
     #[test]
     fn floaters_do_not_move_the_box() {
         let mut random = Random::new(9);
@@ -222,7 +222,7 @@ mod tests {
             let mut far = || f64::from(random.signed()) * 40.0;
             points.push(DVec3::new(far(), far(), far()));
         }
-        // The core as clusters have it: between quantiles along the world's axes.
+        // The core that clusters use: between quantiles along the world's axes.
         let range =
             |axis: usize| trimmed_range(&mut points.iter().map(|p| p[axis]).collect::<Vec<_>>(), 0.02);
         let core: [(f64, f64); 3] = std::array::from_fn(range);

@@ -9,17 +9,16 @@ use super::scene::default_voxel;
 /// Distance, in voxels, at which a cluster's relevance is halved (10 m in a metric scene).
 const VOXELS_TO_HALF_RELEVANCE: f64 = 40.0;
 
-/// Returns what clusters are ranked by: `(score - threshold) * ln(1 + n) / (1 + distance / half)`.
+/// Returns the ranking key of an answer: `(score - threshold) * ln(1 + n) / (1 + distance / half)`.
 ///
-/// The score's margin, weighted by the evidence (more Gaussians, but with diminishing effect), halved
-/// at a distance of `half` (40 voxels). In f32, so that the last bits of a machine's logarithm do not
-/// show.
+/// The score's margin, weighted by the number of Gaussians with diminishing effect, and halved at a distance
+/// of `half` (40 voxels). Rounded to f32, so that the last bits of a machine's logarithm do not show.
 pub fn relevance(score: f32, threshold: f32, n_gaussians: u64, distance: Option<f64>, half: f64) -> f32 {
     let margin = f64::from((score - threshold).max(0.0));
     (margin * (1.0 + n_gaussians as f64).ln() / (1.0 + distance.unwrap_or(0.0) / half)) as f32
 }
 
-/// What was found, and where it stands among the answers.
+/// An answer with its rank.
 pub struct Ranked<T> {
     pub found: T,
     pub rank: usize,
@@ -27,8 +26,8 @@ pub struct Ranked<T> {
     pub distance: Option<f64>,
 }
 
-/// Ranks what was found in a fixed order, in which equals stay, and keeps as many as are asked for. `standing`: score as it is
-/// shown, Gaussians, and place.
+/// Ranks answers, keeps equals in their order, and returns as many as are asked for. `key`: score as
+/// reported, number of Gaussians, and position.
 pub fn rank<T>(
     found: Vec<T>,
     threshold: f32,

@@ -1,4 +1,4 @@
-//! Why a question has no answer, and what came nearest.
+//! Reasons for empty answers, with the nearest miss.
 
 use glam::DVec3;
 use slag_common::shard::ShardView;
@@ -8,7 +8,7 @@ use super::request::QueryRequest;
 use super::scale::Scale;
 use crate::score::Search;
 
-/// `best`: score and place of the best object on board.
+/// Returns why no object was found. `best`: score and position of the best object on board.
 pub fn of_objects(request: &QueryRequest, threshold: f32, best: Option<(f32, DVec3)>) -> Reason {
     let place = request.region();
     let (kind, detail) = match best {

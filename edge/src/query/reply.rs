@@ -8,16 +8,16 @@ use super::answers::{Answers, Found, GaussianAnswer};
 use crate::score::Hit;
 use crate::store::Snapshot;
 
-/// The answers to a request, and the generation that they name Gaussians of.
+/// The answers to a request, and the generation they refer to.
 pub struct Reply {
     pub(super) snapshot: Arc<Snapshot>,
     pub(super) near: Option<DVec3>,
-    /// One to each text, in their order.
+    /// One for each text, in their order.
     pub answers: Vec<Answers>,
 }
 
 impl Reply {
-    /// Returns an answer's Gaussians, described; none of an answer of clusters.
+    /// Describes an answer's Gaussians; empty for other kinds.
     pub fn gaussians(&self, answers: &Answers) -> Vec<GaussianAnswer> {
         let Found::Gaussians(hits) = &answers.answers else { return Vec::new() };
         hits.iter().enumerate().map(|(at, hit)| self.gaussian(at, hit)).collect()

@@ -1,4 +1,4 @@
-//! What can be asked, and its limits.
+//! Requests and their limits.
 
 use std::fmt;
 use std::str::FromStr;
@@ -10,36 +10,36 @@ use slag_common::frames::Aabb;
 use crate::score::{Ball, MAX_COORDINATE, Precision, Region};
 use crate::text::MAX_TEXT_BYTES;
 
-/// More clusters than this, over all texts of a request, are refused.
+/// Most clusters or objects in a request, over all its texts.
 pub const MAX_CLUSTERS: usize = 10_000;
-/// More Gaussians than this, over all texts of a request, are refused: 12 MB while they are sent.
+/// Most Gaussians in a request, over all its texts: 12 MB while they are sent.
 pub const MAX_GAUSSIANS: usize = 1_000_000;
-/// Texts of one request.
+/// Most texts in a request.
 pub const MAX_TEXTS: usize = 32;
-/// Negatives of one request.
+/// Most negatives in a request.
 pub const MAX_NEGATIVES: usize = 16;
-/// What LERF compares every text with (Kerr et al. 2023, section 3.3).
+/// LERF's canonical negatives (Kerr et al. 2023, section 3.3).
 pub const CANONICAL_NEGATIVES: [&str; 4] = ["object", "things", "stuff", "texture"];
-/// Answers without a limit in the request.
+/// Answers to each text unless the request sets a limit.
 pub const DEFAULT_LIMIT: usize = 10;
-/// Smaller clusters are dropped, unless the request says otherwise.
+/// Least members of a cluster unless the request sets another number.
 pub const DEFAULT_MIN_COUNT: u64 = 10;
 
-/// A part of a request that cannot be.
+/// An invalid part of a request.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{parameter}: found {found}, expected {expected}")]
 pub struct RequestError {
     /// The parameter.
     pub parameter: String,
-    /// What it is.
+    /// The value found.
     pub found: String,
-    /// What it may be.
+    /// The values allowed.
     pub expected: String,
 }
 
 impl RequestError {
-    /// Names a parameter, what was found (cut to 80 characters, control characters escaped) and what
-    /// was expected.
+    /// Names a parameter, the value found (cut to 80 characters, control characters escaped) and the values
+    /// expected.
     pub fn new(parameter: &str, found: &str, expected: impl Into<String>) -> Self {
         let cut: String = found.chars().take(80).collect();
         let dots = if cut.len() < found.len() { "…" } else { "" };
@@ -47,16 +47,16 @@ impl RequestError {
     }
 }
 
-/// What answers are made of.
+/// Kind of answers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum AnswerKind {
-    /// What the masks of several views agree on, scored as a whole.
+    /// Objects, which the masks of several views agree on, scored as a whole.
     #[default]
     Objects,
-    /// Groups of neighbouring matches.
+    /// Clusters of neighbouring matches.
     Clusters,
-    /// The matches themselves.
+    /// The matching Gaussians themselves.
     Gaussians,
 }
 
@@ -89,10 +89,10 @@ impl FromStr for AnswerKind {
     }
 }
 
-/// What a question's thing is told from.
+/// Negative prompts.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Negatives {
-    /// Nothing: scores are cosines.
+    /// None: scores are cosines.
     #[default]
     None,
     /// [`CANONICAL_NEGATIVES`].
@@ -131,7 +131,7 @@ impl FromStr for Negatives {
 /// Parses `X0,Y0,Z0,X1,Y1,Z1`: two opposite corners of a box.
 ///
 /// # Errors
-/// What was expected.
+/// The expected form.
 pub fn parse_box(text: &str) -> Result<Aabb, String> {
     let numbers: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
     match numbers.as_deref() {
@@ -146,7 +146,7 @@ pub fn parse_box(text: &str) -> Result<Aabb, String> {
 /// Parses `X,Y,Z`.
 ///
 /// # Errors
-/// What was expected.
+/// The expected form.
 pub fn parse_point(text: &str) -> Result<DVec3, String> {
     let numbers: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
     match numbers.as_deref() {
@@ -158,32 +158,32 @@ pub fn parse_point(text: &str) -> Result<DVec3, String> {
 /// One or several questions of the same kind.
 #[derive(Clone, Debug, PartialEq)]
 pub struct QueryRequest {
-    /// What to look for: each is answered by itself.
+    /// Texts to look for; each is answered separately.
     pub texts: Vec<String>,
-    /// What the things looked for are told from.
+    /// Negative prompts.
     pub negatives: Negatives,
-    /// Most answers to each; [`DEFAULT_LIMIT`] if absent.
+    /// Most answers to each text; [`DEFAULT_LIMIT`] if absent.
     pub limit: Option<usize>,
-    /// Cosine, or relevancy with negatives, from which a Gaussian matches; the scene's own if absent.
+    /// Least score of a match: a cosine, or with negatives a relevancy; the scene's own if absent.
     pub threshold: Option<f32>,
-    /// Where the asker is: answers carry their distance from it and nearer ones rank higher.
+    /// Position of the asker: answers carry their distance from it, and nearer ones rank higher.
     pub near: Option<DVec3>,
-    /// Only Gaussians within this distance of `near` count, world units.
+    /// Restricts the search to this distance from `near`, world units.
     pub radius: Option<f64>,
-    /// Only Gaussians within this box count.
+    /// Restricts the search to this box.
     pub bounds: Option<Aabb>,
-    /// What answers are made of; objects if absent, where the scene has them, else clusters.
+    /// Kind of answers; if absent, objects where the scene has them, else clusters.
     pub kind: Option<AnswerKind>,
-    /// Edge of the voxels that clusters are joined by, world units; the scene's own if absent.
+    /// Edge of the voxels used for clustering, world units; the scene's own if absent.
     pub voxel: Option<f64>,
-    /// Clusters with fewer Gaussians are dropped, and counted.
+    /// Least members of a cluster; smaller ones are only counted.
     pub min_count: u64,
     /// Which data scores come from.
     pub precision: Precision,
 }
 
 impl QueryRequest {
-    /// Returns the question for a text, all else as by default.
+    /// Makes a request for a text, with defaults otherwise.
     pub fn new(text: impl Into<String>) -> Self {
         Self {
             texts: vec![text.into()],
@@ -203,7 +203,7 @@ impl QueryRequest {
     /// Checks every limit.
     ///
     /// # Errors
-    /// The first parameter that is outside.
+    /// The first parameter outside its limits.
     pub fn check(&self) -> Result<(), RequestError> {
         let positive = |v: f64| v > 0.0 && v <= MAX_COORDINATE;
         let refuse = |parameter: &str, found: &dyn ToString, expected: String| {

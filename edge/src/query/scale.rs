@@ -1,4 +1,4 @@
-//! The scale that scores are reported on: cosines, or relevancies where there are negatives.
+//! The scale on which scores are reported: cosines, or relevancies where there are negatives.
 
 use slag_common::manifest::{Calibration, Manifest};
 
@@ -7,7 +7,7 @@ use super::request::QueryRequest;
 use super::threshold::{RELEVANCY_THRESHOLD, ThresholdSource, calibrated_threshold};
 use crate::score::{Question, RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
 
-/// How scores are shown: as they are, or as relevancies.
+/// Scale of the reported scores.
 #[derive(Clone, Copy)]
 pub struct Scale(pub ScoreKind);
 
@@ -16,7 +16,8 @@ impl Scale {
         Self(if question.negatives.is_empty() { ScoreKind::Cosine } else { ScoreKind::Relevancy })
     }
 
-    /// Returns the threshold, and where it comes from. `calibration`: how texts score over what is scored.
+    /// Returns the threshold and its source. `calibration`: mean and spread of a bank of texts' scores over
+    /// whatever is scored.
     pub fn threshold(
         self,
         request: &QueryRequest,
@@ -27,7 +28,7 @@ impl Scale {
             (Some(threshold), _) => (threshold, ThresholdSource::Request),
             (None, ScoreKind::Relevancy) => (RELEVANCY_THRESHOLD, ThresholdSource::Relevancy),
             (None, ScoreKind::Cosine) => {
-                // A model that states its threshold is taken at its word: a cosine is a cosine.
+                // An encoder without calibration states its threshold itself, and a cosine is a cosine.
                 let scene = manifest.encoder.calibration.and(calibration);
                 calibrated_threshold(manifest.encoder.default_threshold, scene)
             }

@@ -8,28 +8,28 @@ use slag_common::shard::ShardView;
 use super::oriented::Alignment;
 use crate::store::objects::ObjectIndex;
 
-/// Edge of the voxels in a metric scene, metres: parts of one piece of furniture are nearer to each
-/// other than two such edges, two pieces of furniture mostly are not.
+/// Edge of the voxels in a metric scene, metres. Parts of one piece of furniture are closer to each other
+/// than two edges; two pieces of furniture mostly are not.
 const METRIC_VOXEL_M: f64 = 0.25;
-/// In a scene without metres, voxels to the middle edge of the median cell.
+/// Voxels per middle edge of the median cell, in a scene that is not metric.
 const VOXELS_PER_CELL: f64 = 64.0;
 
-/// What a query runs on.
+/// The data that a query runs on.
 pub struct Scene<'a> {
     /// The shards on board.
     pub shards: &'a [ShardView<'a>],
-    /// The objects of each, where it has them.
+    /// The objects of each shard; absent in shards without them.
     pub objects: &'a [Option<Objects<'a>>],
-    /// Which of those are the same.
+    /// Index of the objects over all shards.
     pub index: &'a ObjectIndex,
     /// Their manifest.
     pub manifest: &'a Manifest,
-    /// The part of space that was fetched: centre and radius.
+    /// Centre and radius of the last fetch.
     pub fetched: (DVec3, f64),
 }
 
-/// Returns the edge of the voxels where a request states none: 0.25 m in a metric scene, else a 64th
-/// of the median cell's middle edge (sky and ground make the longest and shortest edges meaningless).
+/// Returns the default edge of the voxels: 0.25 m in a metric scene, else a 64th of the median cell's middle
+/// edge (sky and ground make the longest and shortest edges meaningless).
 pub fn default_voxel(manifest: &Manifest) -> f64 {
     if manifest.metric {
         return METRIC_VOXEL_M;
@@ -41,7 +41,7 @@ pub fn default_voxel(manifest: &Manifest) -> f64 {
     if voxel > 0.0 && voxel.is_finite() { voxel } else { 1.0 }
 }
 
-/// Returns how boxes may be turned: a metric or geo-referenced world has z up (`frames.rs`).
+/// Returns the permitted orientations of boxes: a metric or geo-referenced world has z up (`frames.rs`).
 pub(super) fn alignment(manifest: &Manifest) -> Alignment {
     let z_is_up = manifest.metric || manifest.geo_reference.is_some();
     if z_is_up { Alignment::Gravity } else { Alignment::Principal }

@@ -1,4 +1,4 @@
-//! What is loaded, for people and monitors.
+//! Status of the loaded generation.
 
 use glam::DVec3;
 use serde::Serialize;
@@ -8,7 +8,7 @@ use slag_common::shard::Profile;
 
 use crate::store::Snapshot;
 
-/// What is loaded, for people and monitors.
+/// The loaded generation, for people and monitors.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Status {
     /// Name of the scene.
@@ -17,26 +17,26 @@ pub struct Status {
     pub generation: u64,
     /// BLAKE3 of the signed manifest.
     pub manifest_hash: Hash32,
-    /// Public key that signed it.
+    /// Public key of its signature.
     pub key: Hash32,
     /// Name of the encoder that made the embeddings.
     pub encoder_name: String,
-    /// Its identity.
+    /// Its id.
     pub encoder_id: Hash32,
-    /// Cosine from which a Gaussian matches by default.
+    /// Default threshold: the least cosine of a match.
     pub default_threshold: f32,
-    /// How much the shards carry.
+    /// Profile of the shards.
     pub profile: Profile,
     /// Whether a world unit is a metre.
     pub metric: bool,
-    /// Where the world frame lies on the earth.
+    /// Geographic reference of the world frame.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub geo_reference: Option<GeoReference>,
-    /// Centre of what was fetched.
+    /// Centre of the last fetch.
     pub centre_in_world: DVec3,
-    /// Radius of what was fetched, world units.
+    /// Radius of the last fetch, world units.
     pub radius: f64,
-    /// Cells of the scene, on board or not.
+    /// Cells in the whole scene.
     pub n_cells_in_scene: usize,
     /// Gaussians on board.
     pub n_gaussians: u64,
@@ -53,7 +53,7 @@ pub struct ShardStatus {
     pub cell_id: u32,
     /// Its Gaussians.
     pub n_gaussians: u32,
-    /// Its codebook rows.
+    /// Its codebook centroids.
     pub n_centroids: u32,
     /// Its length.
     pub len_bytes: u64,

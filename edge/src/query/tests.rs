@@ -7,7 +7,7 @@ use crate::score::{Precision, Question, Scratch};
 use crate::store::objects::ObjectIndex;
 use crate::testing::{BuiltShard, Member, TestObject, TestShard, manifest_of, normalised};
 
-/// A cell whose single row of `n` Gaussians sits at a place, 1 cm apart, at a cosine to axis 0.
+/// A cell with a single centroid of `n` Gaussians at a place, 1 cm apart, at a given cosine to axis 0.
 fn thing(cell_id: u32, at: DVec3, n: u16, cosine: f32) -> TestShard {
     let embedding = normalised(vec![cosine, (1.0 - cosine * cosine).sqrt()]);
     let members = (0..n).map(|i| Member { steps: [i, 0, 0], embedding: embedding.clone() }).collect();
@@ -18,7 +18,7 @@ fn ask(built: &[BuiltShard], edit: impl FnOnce(&mut QueryRequest, &mut Manifest)
     ask_about(built, &[Question::new([1.0, 0.0])], edit).remove(0)
 }
 
-/// Checks on the way that rows are scored for the levels that need them, and for no other.
+/// Also checks that centroids are scored for the kinds that need them, and for no other.
 fn ask_about(
     built: &[BuiltShard],
     questions: &[Question],
@@ -69,14 +69,14 @@ fn clusters_are_ranked_nearest_best() {
     assert_eq!((answers.n_searched, answers.n_matching, answers.unit), (724, 224, "m"));
     assert_eq!((answers.reason.as_ref(), answers.area_fetched, answers.is_exact), (None, None, false));
     let found = clusters(&answers);
-    // Equal things, no place to start from: by first Gaussian. The four Gaussians are too few.
+    // Equal things and no place to measure from: ordered by first Gaussian. The four Gaussians are too few.
     assert_eq!(found.iter().map(|c| c.id.as_str()).collect::<Vec<_>>(), ["3-0", "4-0", "5-0"]);
     let clustering = answers.clustering.as_ref().expect("clusters");
     assert_eq!((clustering.n_small_clusters, clustering.n_gaussians_in_small_clusters), (1, 4));
     let first = &found[0];
     assert_eq!((first.rank, first.n_gaussians, first.distance), (1, 100, None));
     assert!((first.score - 0.9).abs() < 1e-3 && first.best_score >= first.score);
-    // 100 in a row, 1 cm apart: 2 % off either end is one Gaussian each.
+    // 100 in a line, 1 cm apart: 2 % off either end is one Gaussian each.
     assert!((first.position_in_world - DVec3::new(20.495, 0.0, 0.0)).length() < 1e-9);
     assert!((first.size - DVec3::new(0.97, 0.0, 0.0)).length() < 1e-9);
 
@@ -96,7 +96,7 @@ fn clusters_are_ranked_nearest_best() {
     }
 }
 
-/// Near enough, a worse thing beats a better one far away.
+/// If it is near enough, a worse thing beats a better one far away.
 #[test]
 fn distance_and_margin_are_weighed() {
     let yard = yard();
@@ -104,7 +104,7 @@ fn distance_and_margin_are_weighed() {
         |near: DVec3| clusters(&ask(&yard, |request, _| request.near = Some(near)))[0].id.clone();
     assert_eq!(first_from(DVec3::new(0.0, 30.0, 0.0)), "5-0");
     assert_eq!(first_from(DVec3::new(0.0, 18.0, 0.0)), "4-0");
-    // Without any margin nothing but the distance is left.
+    // With a margin of zero only the distance is left.
     let score = clusters(&ask(&yard, |_, _| ()))[0].score;
     for (x, first) in [(30.0, "3-0"), (-30.0, "4-0")] {
         let answers = ask(&yard, |request, _| {
@@ -154,7 +154,8 @@ fn gaussians_come_best_then_nearest_first() {
     });
     let found = described(&yard, &answers, Some(near));
     let names: Vec<(u32, u32)> = found.iter().map(|g| (g.cell_id, g.index)).collect();
-    // Cell 6 has the best score, its Gaussians in order of x; then the two things tie, the near one first.
+    // Cell 6 has the best scores, its Gaussians in order of x; then the two things tie, and the nearer one
+    // comes first.
     assert_eq!(names, [(6, 3), (6, 2), (6, 1), (6, 0), (3, 35), (3, 36), (3, 34)]);
     assert_eq!((answers.n_matching, found[0].input_index, answers.clustering.is_none()), (224, None, true));
 }
@@ -169,16 +170,16 @@ fn exact_shards_answer_exactly() {
     assert_eq!((found.len(), found[2].input_index), (DEFAULT_LIMIT, Some(7)));
 }
 
-/// By rows alone, the same shards answer as compact ones do, and say so.
+/// With centroids only, exact shards answer as compact ones do, and report that.
 #[test]
 fn exactness_is_a_choice() {
     let exact = [thing(1, DVec3::ZERO, 30, 0.7).build(true)];
-    let rows = ask(&exact, |request, _| {
+    let by_centroids = ask(&exact, |request, _| {
         (request.kind, request.precision) = (Some(AnswerKind::Gaussians), Precision::Centroids)
     });
     let compact = [thing(1, DVec3::ZERO, 30, 0.7).build(false)];
-    assert_eq!(rows, ask(&compact, |request, _| request.kind = Some(AnswerKind::Gaussians)));
-    assert!(!rows.is_exact && rows.score_error_bound > 1e-5, "{}", rows.score_error_bound);
+    assert_eq!(by_centroids, ask(&compact, |request, _| request.kind = Some(AnswerKind::Gaussians)));
+    assert!(!by_centroids.is_exact && by_centroids.score_error_bound > 1e-5, "{}", by_centroids.score_error_bound);
 }
 
 /// Oracle: cosines to both axes, and LERF's formula.
@@ -216,8 +217,8 @@ fn negatives_make_relevancies() {
     assert!((f64::from(none.best_score.expect("the best")) - expected(0.95)).abs() <= bound);
 }
 
-/// Half way between question and negative relevancies are steepest: a row's members differ from it by the
-/// bound, nearly.
+/// Relevancies are steepest half way between question and negative: there the members of a centroid differ
+/// from it by nearly the whole bound.
 #[test]
 fn relevancies_keep_within_their_bound_and_use_it() {
     let angles = |turn: f64| [-turn, turn].map(|turn| turn + std::f64::consts::FRAC_PI_4);
@@ -225,27 +226,27 @@ fn relevancies_keep_within_their_bound_and_use_it() {
         steps: [0; 3],
         embedding: [angle.cos(), angle.sin()].map(|v| v as f32).to_vec(),
     };
-    let row = |turn| [TestShard::new(vec![angles(turn).iter().map(member).collect()]).build(false)];
+    let built = |turn| [TestShard::new(vec![angles(turn).iter().map(member).collect()]).build(false)];
     let question = Question { negatives: vec![[0.0, 1.0].into()], ..Question::new([1.0, 0.0]) };
-    let ask = |row: &[BuiltShard]| {
-        let mut answers = ask_about(row, std::slice::from_ref(&question), |request, _| {
+    let ask = |built: &[BuiltShard]| {
+        let mut answers = ask_about(built, std::slice::from_ref(&question), |request, _| {
             request.negatives = Negatives::Phrases(vec!["other".into()]);
             (request.kind, request.threshold) = (Some(AnswerKind::Gaussians), Some(0.0));
         });
         answers.remove(0)
     };
-    // No relevancy is off by more than all there is.
-    assert_eq!(ask(&row(0.7)).score_error_bound, 1.0);
-    let row = row(0.02);
-    let answers = ask(&row);
-    for (angle, found) in angles(0.02).iter().zip(described(&row, &answers, None)) {
+    // No relevancy is off by more than the whole scale.
+    assert_eq!(ask(&built(0.7)).score_error_bound, 1.0);
+    let built = built(0.02);
+    let answers = ask(&built);
+    for (angle, found) in angles(0.02).iter().zip(described(&built, &answers, None)) {
         let truth = 1.0 / (1.0 + (-10.0 * (angle.cos() - angle.sin())).exp());
         let share = (f64::from(found.score) - truth).abs() / f64::from(answers.score_error_bound);
         assert!((0.9..=1.0).contains(&share), "{share} of {}", answers.score_error_bound);
     }
 }
 
-/// Several questions at once are answered as each alone.
+/// Several questions asked together are answered as each alone.
 #[test]
 fn batches_answer_as_single_questions_do() {
     let questions = [Question::new([1.0, 0.0]), Question::new([0.0, 1.0]), Question::new([0.6, 0.8])];
@@ -278,7 +279,7 @@ fn boxes_bound_what_is_searched() {
     assert_eq!((answers.n_matching, answers.area_fetched), (50, Some(true)));
     let far = ask(&yard, |request, _| request.bounds = bounds([0.0; 3], [40.0, 40.0, 0.0]));
     assert_eq!(far.area_fetched, Some(false));
-    // What lies in box and ball was fetched if either was.
+    // The intersection of box and ball was fetched if either was.
     let both = ask(&yard, |request, _| {
         request.bounds = bounds([0.0; 3], [40.0, 40.0, 0.0]);
         (request.near, request.radius) = (Some(DVec3::new(20.0, 0.0, 0.0)), Some(0.105));
@@ -288,7 +289,7 @@ fn boxes_bound_what_is_searched() {
     assert!(nothing.expect("nothing there").detail.contains("in the box [60, 60, 60] to [61, 61, 61]"));
 }
 
-/// A metric world has an up; of another only the principal axes are known.
+/// A metric world has a known up; otherwise only the principal axes are known.
 #[test]
 fn boxes_are_upright_where_up_is_known() {
     // A ramp of 100 Gaussians, 1 cm apart along x and rising half as fast.
@@ -386,7 +387,7 @@ fn objects_answer_first_and_once() {
     assert!((object.oriented_box.size.x - 2.06).abs() < 0.05, "{:?}", object.oriented_box);
     assert!(!answers.is_exact && answers.clustering.is_none() && answers.reason.is_none());
 
-    // Without a calibrated scene the encoder's own threshold holds; the other levels are as ever.
+    // Without a calibrated scene the encoder's own threshold applies; other kinds are unaffected.
     let answers = ask(&scene, |request, _| request.kind = Some(AnswerKind::Objects));
     assert_eq!(answers.threshold_source, ThresholdSource::Encoder);
     let clusters_of = |built: &[BuiltShard]| {
@@ -402,7 +403,7 @@ fn objects_answer_first_and_once() {
 fn objects_abstain_and_keep_to_the_region() {
     let scene = scene_of_objects();
     let ask_objects = |edit: &dyn Fn(&mut QueryRequest)| ask(&scene, |request, _| edit(request));
-    // Below the threshold: the best and its place are named.
+    // Below the threshold: the reason names the best object and its position.
     let answers = ask_objects(&|request| request.threshold = Some(0.9));
     let reason = answers.reason.as_ref().expect("no answer");
     assert_eq!(
@@ -414,14 +415,15 @@ fn objects_abstain_and_keep_to_the_region() {
         "{reason:?}"
     );
     assert_eq!(reason.best_position_in_world, Some(DVec3::new(21.0, 0.0, 0.0)));
-    // Only what lies in the region counts: 20 Gaussians of cell 3 from 20.20 on, to 20.39.
+    // Only Gaussians in the region count: 20 of cell 3, from 20.20 to 20.39.
     let within =
         |min: f64, max: f64| Aabb { min: DVec3::new(min, -1.0, -1.0), max: DVec3::new(max, 1.0, 1.0) };
     let answers = ask_objects(&|request| {
         (request.threshold, request.bounds) = (Some(0.5), Some(within(20.195, 20.9)));
     });
     assert_eq!(clusters(&answers)[0].n_gaussians, 20);
-    // The box holds all of cell 4 and none of the object's Gaussians in cell 3, though its border crosses that cell.
+    // The box holds all of cell 4 and none of the object's Gaussians in cell 3, though its border crosses
+    // that cell.
     let answers = ask_objects(&|request| {
         let bounds = Aabb { min: DVec3::new(21.9, -1.0, -1.0), max: DVec3::splat(1e3) };
         (request.threshold, request.bounds) = (Some(0.5), Some(bounds));
@@ -429,7 +431,7 @@ fn objects_abstain_and_keep_to_the_region() {
     assert_eq!((clusters(&answers)[0].n_gaussians, answers.n_searched), (12, 160));
     // From 22.00 to 22.16: those of cell 3 are not in the box either.
     assert!((clusters(&answers)[0].oriented_box.size.x - 0.16).abs() < 0.011);
-    // All that match count, as many as asked for are told.
+    // All matches are counted, and as many as asked for are returned.
     let answers = ask_about(&scene, &[Question::new([0.6, 0.8])], |request, _| request.limit = Some(1));
     let found = clusters(&answers[0]);
     assert_eq!((found.len(), found[0].rank, found[0].n_gaussians), (1, 1, 42));
@@ -447,7 +449,7 @@ fn objects_abstain_and_keep_to_the_region() {
     let found = clusters(&answers[0]);
     let expected = crate::score::relevancy(0.8 - 0.9);
     assert!(found.len() == 1 && (found[0].score - expected).abs() < 0.01, "{found:?}");
-    // A scene without objects says so.
+    // A scene without objects reports that.
     let answers = ask(&yard(), |request, _| request.kind = Some(AnswerKind::Objects));
     assert!(answers.reason.is_some_and(|r| r.detail.contains("kind=clusters")));
     assert_eq!(ask(&yard(), |_, _| ()).kind, AnswerKind::Clusters);

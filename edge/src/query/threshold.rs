@@ -1,35 +1,35 @@
-//! From which score on something counts as found, and why from there.
+//! Default thresholds and their sources.
 
 use serde::Serialize;
 use slag_common::manifest::Calibration;
 
 /// Spreads above the mean at which a scene's own threshold lies. On the labelled house with ConSE vectors
-/// (1,500 Gaussians, 1,612 texts: mean 0.002, spread 0.118) the mean F1 over its words is best at 3 spreads,
+/// (1,500 Gaussians, 1,612 texts: mean 0.002, spread 0.118) the mean F1 over its words peaks at 3 spreads,
 /// 0.355, where 1.2 % of all pairs of text and Gaussian match.
 const SPREADS_ABOVE_MEAN: f32 = 3.0;
-/// A smaller spread is no measurement: all Gaussians look alike, or hardly any were scored.
+/// A smaller spread is unusable: all Gaussians look alike, or hardly any were scored.
 const MIN_SPREAD: f32 = 1e-3;
 
-/// The relevancy from which a Gaussian matches where a question has negatives: it is nearer to the thing
-/// asked for than to any of them (LERF's own choice).
+/// Threshold for questions with negatives: the thing asked for is closer than any negative (LERF's own
+/// choice).
 pub const RELEVANCY_THRESHOLD: f32 = 0.5;
 
-/// Where a threshold comes from.
+/// Source of a threshold.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ThresholdSource {
     /// The request states it.
     Request,
-    /// The scene's calibration: its mean score of a text bank and three spreads more.
+    /// The scene's calibration: the mean score of a text bank plus three spreads.
     Scene,
-    /// The encoder's description; the scene was not calibrated.
+    /// The encoder's description, because the scene was not calibrated.
     Encoder,
-    /// Relevancy 0.5: nearer to the thing asked for than to any negative.
+    /// Relevancy 0.5: closer to the thing asked for than to any negative.
     Relevancy,
 }
 
-/// Returns the cosine from which a Gaussian matches: three spreads above the scene's mean, or the
-/// encoder's own default where the scene has no usable calibration.
+/// Returns the default cosine threshold: three spreads above the scene's mean, or the encoder's own default
+/// if the scene has no usable calibration.
 pub fn calibrated_threshold(encoder_default: f32, scene: Option<Calibration>) -> (f32, ThresholdSource) {
     let of_scene = |c: Calibration| c.score_mean + SPREADS_ABOVE_MEAN * c.score_spread;
     let usable = scene.filter(|c| c.score_spread >= MIN_SPREAD && (-1.0..=1.0).contains(&of_scene(*c)));
@@ -41,13 +41,13 @@ mod tests {
     use super::*;
     use slag_math::random::Random;
 
-    /// Scenes whose background scores are shifted and stretched as encoders do, with 40 Gaussians each of
-    /// 5 things six spreads above: the threshold finds nearly all of those and hardly anything else.
+    /// Background scores are shifted and stretched as different encoders do, with 40 Gaussians each of 5
+    /// things six spreads above: the threshold finds nearly all of those and hardly anything else.
     #[test]
     fn follows_the_encoder_that_scored() {
         let mut random = Random::new(6);
         for (shift, stretch) in [(0.0f32, 0.12f32), (0.21, 0.025), (-0.1, 0.05)] {
-            // The sum of 12 uniform numbers has a spread of 2: nearly normal.
+            // The sum of 12 uniform numbers has a spread of 2 and is nearly normal.
             let mut background = || (0..12).map(|_| random.signed()).sum::<f32>() / 2.0 * stretch + shift;
             let mut pairs: Vec<(f32, bool)> = (0..20_000).map(|_| (background(), false)).collect();
             pairs.extend((0..200).map(|_| (background() + 6.0 * stretch, true)));

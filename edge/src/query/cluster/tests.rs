@@ -6,22 +6,22 @@ use crate::testing::{Member, TestShard};
 const GROUPING: Grouping =
     Grouping { voxel: 0.25, min_count: 10, threshold: 0.0, alignment: Alignment::Gravity };
 
-/// The clusters of points on a lattice of 5 cm, each list with a score of its own.
+/// Clusters points on a lattice of 5 cm, each list with a score of its own.
 fn clusters_of(lists: &[(f32, Vec<[u16; 3]>)]) -> Vec<Cluster> {
-    let rows = lists.iter().map(|(_, points)| {
+    let centroids = lists.iter().map(|(_, points)| {
         points.iter().map(|at| Member { steps: *at, embedding: vec![1.0, 0.0] }).collect()
     });
-    let shard = TestShard { step: DVec3::splat(0.05), ..TestShard::new(rows.collect()) }.build(false);
+    let shard = TestShard { step: DVec3::splat(0.05), ..TestShard::new(centroids.collect()) }.build(false);
     let view = shard.view();
-    let run = |(row, (score, _)): (usize, &(f32, _))| {
-        let members = view.members(row);
+    let run = |(centroid, (score, _)): (usize, &(f32, _))| {
+        let members = view.members(centroid);
         Run { shard: 0, start: members.start as u32, end: members.end as u32, score: *score }
     };
     let runs: Vec<Run> = lists.iter().enumerate().map(run).collect();
     cluster(&[view], &runs, &Grouping { threshold: 0.3, ..GROUPING }).clusters
 }
 
-/// Lattice points of a box between two corners, the upper one left out.
+/// Lattice points of a box between two corners, excluding the upper one.
 fn block(from: [u16; 3], to: [u16; 3]) -> Vec<[u16; 3]> {
     let along = |axis: usize| from[axis]..to[axis];
     let planes = along(0).flat_map(|x| along(1).map(move |y| (x, y)));
@@ -41,14 +41,14 @@ fn a_string_of_floaters_joins_nothing() {
     let found = clusters_of(&[(0.5, [one.clone(), string(), other.clone()].concat())]);
     let counts: Vec<u64> = found.iter().map(|c| c.n_gaussians).collect();
     assert_eq!((counts.len(), counts.iter().sum::<u64>()), (2, 2006), "{counts:?}");
-    // The string belongs to one of the two, whose box leaves it out.
+    // The string belongs to one of the two, and that one's box leaves it out.
     for (cluster, x) in found.iter().zip([0.225, 2.225]) {
         assert!((cluster.position_in_world - DVec3::new(x, 0.225, 0.225)).length() < 0.05, "{cluster:?}");
         assert!((cluster.oriented_box.size - DVec3::splat(0.45)).abs().max_element() < 0.06, "{cluster:?}");
     }
 }
 
-/// A bridge that hardly passes the threshold is a tenth as strong as one that is as good as its ends.
+/// A bridge just above the threshold weighs a tenth of one that scores as high as its ends.
 #[test]
 fn scores_count_for_bridges() {
     let ends = [block([0, 0, 0], [10, 10, 10]), block([40, 0, 0], [50, 10, 10])].concat();
@@ -57,7 +57,7 @@ fn scores_count_for_bridges() {
     assert_eq!(clusters_of(&[(0.5, ends), (0.301, bridge)]).len(), 2);
 }
 
-/// Where all is sparse, one Gaussian a voxel is enough.
+/// In a sparse cloud one Gaussian per voxel is enough.
 #[test]
 fn sparse_things_hold_together() {
     let ground: Vec<[u16; 3]> = block([0, 0, 0], [10, 10, 1]).into_iter().map(|p| p.map(|v| v * 5)).collect();
@@ -65,8 +65,8 @@ fn sparse_things_hold_together() {
     assert_eq!(clusters_of(&[(0.5, [string(), string()].concat())]).len(), 1);
 }
 
-/// Voxels as coordinates and lists, from the heaviest to the lightest; each joins what it touches, its
-/// heaviest neighbour's group first. `weights`: of the points.
+/// Voxels as coordinates and lists, heaviest first; each joins the voxels it touches, its heaviest
+/// neighbour's group first. `weights`: of the points.
 fn brute_force(points: &[DVec3], weights: &[f64], voxel: f64) -> Vec<Vec<usize>> {
     let mut voxels: Vec<(I64Vec3, f64, Vec<usize>)> = Vec::new();
     for (at, point) in points.iter().enumerate() {
@@ -97,14 +97,14 @@ fn brute_force(points: &[DVec3], weights: &[f64], voxel: f64) -> Vec<Vec<usize>>
     groups.into_iter().map(members).collect()
 }
 
-/// Two lumps, and points here and there: heavy voxels, light ones, and bridges of those between.
+/// Two lumps and scattered points: heavy voxels, light ones, and bridges between them.
 fn lumpy() -> impl Strategy<Value = [u16; 3]> {
     let lump = |x: std::ops::Range<u16>| (x, 0u16..3, 0u16..3).prop_map(|(x, y, z)| [x, y, z]);
     prop_oneof![4 => lump(0..3), 4 => lump(11..14), 1 => lump(0..24), 2 => prop::array::uniform3(0u16..24)]
 }
 
 proptest! {
-    /// Oracle: groups by their definition, all pairs of voxels; sorted columns for the boxes.
+    /// Oracle: groups by definition, over all pairs of voxels; sorted columns for the boxes.
     #[test]
     fn equals_brute_force_groups(
         steps in prop::collection::vec(lumpy(), 1..150), split in 0usize..150,
@@ -125,7 +125,7 @@ proptest! {
         let mut points = Vec::new();
         let mut names = Vec::new();
         let mut runs = Vec::new();
-        // Weights of 1/8 to 1, whose sums are exact; the first is the best, so that weights are scores.
+        // Weights of 1/8 to 1 have exact sums; the first is the best, so that weights equal scores.
         let score_of = |point: usize| if point == 0 { 1.0 } else { (-levels[point] as f32).exp2() };
         for (at, view) in views.iter().enumerate() {
             let n = view.header.n_gaussians;
@@ -163,7 +163,7 @@ proptest! {
     }
 }
 
-/// A voxel far too small for the extent is doubled, and nothing overflows on the way.
+/// A voxel far too small for the extent is doubled without overflow.
 #[test]
 fn hopeless_voxels_grow() {
     let members = vec![
