@@ -1,4 +1,4 @@
-//! The command line: what can be asked for, and how a run ends.
+//! The command line: commands, flags and logging.
 
 mod args;
 mod bench;
@@ -30,33 +30,33 @@ use status::StatusArgs;
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
-    /// Log more (twice: all).
+    /// Log more (twice: everything).
     #[arg(short, long, global = true, action = clap::ArgAction::Count)]
     verbose: u8,
-    /// Log errors only, show no progress.
+    /// Log errors only, and show no progress.
     #[arg(short, long, global = true, conflicts_with = "verbose")]
     quiet: bool,
 }
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Brings the shards around a position on board.
+    /// Fetch the shards around a position.
     Fetch(FetchArgs),
-    /// Answers questions over HTTP, from what is on board.
+    /// Answer questions over HTTP from the shards on board.
     Serve(ServeArgs),
-    /// Answers one question from what is on board.
+    /// Answer one question from the shards on board.
     Query(QueryArgs),
-    /// Shows what is on board.
+    /// Show what is on board.
     Status(StatusArgs),
-    /// Public text models: what is known, pulling, checking, showing.
+    /// List, pull, verify and describe public text models.
     Models(ModelsArgs),
-    /// Measures a service and this machine; prints JSON.
+    /// Measure a service and this machine; prints JSON.
     #[command(subcommand)]
     Bench(BenchCommand),
 }
 
 impl Cli {
-    /// Returns what is logged unless `RUST_LOG` says otherwise.
+    /// Returns the log filter used unless `RUST_LOG` is set.
     pub fn log_filter(&self) -> &'static str {
         match (self.quiet, self.verbose, &self.command) {
             (true, ..) => "error",
@@ -67,7 +67,7 @@ impl Cli {
         }
     }
 
-    /// Runs the command and reports how it went.
+    /// Runs the command and returns its exit code.
     pub fn run(self) -> Exit {
         let (json, result) = match self.command {
             Command::Fetch(args) => (args.json, fetch::run(args, self.quiet)),

@@ -1,6 +1,6 @@
 //! Errors in one line.
 
-/// Returns an error and its causes in one line; a cause that the line already states is left out.
+/// Returns an error and its causes in one line, without causes that the line already contains.
 pub fn error_line(error: &dyn std::error::Error) -> String {
     let mut line = error.to_string();
     let mut cause = error.source();

@@ -1,4 +1,4 @@
-//! Small real shards and caches for the tests of this crate, and a text encoder that is all axes.
+//! Small real shards and caches for tests, and a text encoder with one axis per text.
 
 pub mod coded;
 
@@ -28,14 +28,14 @@ pub struct Member {
     pub embedding: Vec<f32>,
 }
 
-/// What a test shard is built from.
+/// Contents of a test shard.
 #[derive(Clone, Debug)]
 pub struct TestShard {
     pub cell_id: u32,
     pub origin: DVec3,
     pub step: DVec3,
     pub encoder_id: Hash32,
-    /// Whether centroids are rounded with a step that is a power of two: what is exact in f32 stays exact.
+    /// Whether centroids are quantised with a power-of-two step, so that values exact in f32 stay exact.
     pub has_exact_centroids: bool,
     /// Members by centroid.
     pub centroids: Vec<Vec<Member>>,
@@ -50,7 +50,7 @@ pub struct BuiltShard {
     pub embeddings: Vec<Vec<f32>>,
 }
 
-/// An object of a test shard: id, vectors, runs of Gaussians in the shard, and how many it has in all.
+/// An object of a test shard.
 pub struct TestObject {
     pub id: u64,
     /// In components of the shard's centroids.
@@ -60,7 +60,7 @@ pub struct TestObject {
 }
 
 impl BuiltShard {
-    /// Writes the shard again, with objects: boxes around the origin, photos named by their ids.
+    /// Rewrites the shard with objects: boxes around the origin, photos named by their ids.
     pub fn with_objects(&self, objects: &[TestObject], calibration: Calibration) -> Self {
         let shard = self.view();
         let m = shard.header.n_components as usize;
@@ -122,8 +122,8 @@ impl TestShard {
         Self { cell_id: 1, origin, step, encoder_id, has_exact_centroids: false, centroids, without_evidence }
     }
 
-    /// Writes the shard and reads it back: centroids are the members' means, radii the largest distance of
-    /// an unrounded embedding from the stored centroid.
+    /// Writes the shard and reads it back. Centroids are the members' means, radii the largest distance of an
+    /// unrounded embedding from the stored centroid.
     pub fn build(&self, exact: bool) -> BuiltShard {
         let members = || self.centroids.iter().flatten();
         let dim = members().next().map_or(2, |m| m.embedding.len());
@@ -189,7 +189,7 @@ impl TestShard {
     }
 }
 
-/// Rounds to 8 bits with a step that is a power of two.
+/// Quantises to 8 bits with a power-of-two step.
 fn quantise_exactly(values: &[f32]) -> (Vec<i8>, f32) {
     let largest = values.iter().fold(f32::MIN_POSITIVE, |most, v| most.max(v.abs()));
     let step = (largest / 127.0).log2().ceil().exp2();

@@ -1,4 +1,4 @@
-//! Turns query texts into vectors: one thread owns the text encoder, answers are kept.
+//! Encodes query texts: one thread owns the text encoder, and recent vectors are cached.
 
 use std::collections::HashMap;
 use std::io;
@@ -11,48 +11,48 @@ use serde::Serialize;
 use slag_common::Hash32;
 use slag_models::{EncodeError, ModelDir, ModelError, SessionOptions, TextEncoder};
 
-/// Longer query texts are refused: every text model here cuts far below.
+/// Longest query text; every text model here truncates far below.
 pub const MAX_TEXT_BYTES: usize = 512;
-/// Texts that may wait for the encoder; with some 30 ms each, more would time out anyway.
+/// Texts that may wait for the encoder; at about 30 ms each, more would time out anyway.
 const MAX_WAITING: usize = 64;
-/// Texts whose vector is kept (2 MB at 512 components).
+/// Cached vectors (2 MB at 512 components).
 const MAX_CACHED: usize = 1024;
 
-/// Why a text has no vector.
+/// Reasons for which a text cannot be encoded.
 #[derive(Debug, thiserror::Error)]
 pub enum TextError {
-    /// The encoder refuses it, or fails.
+    /// The encoder refuses the text, or fails.
     #[error(transparent)]
     Encode(#[from] EncodeError),
     /// Too many texts wait.
-    #[error("{MAX_WAITING} texts already wait for the text model; ask again in a second")]
+    #[error("{MAX_WAITING} texts are already waiting for the text model; ask again in a second")]
     Busy,
-    /// The encoder's thread is gone.
-    #[error("the text model has stopped, see the log; start the program again")]
+    /// The encoder's thread has stopped.
+    #[error("the text model has stopped; see the log and restart the program")]
     Stopped,
 }
 
-/// Why a text encoder cannot be had.
+/// Reasons for which a text encoder cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum TextOpenError {
-    /// The models do not open.
+    /// The model does not open.
     #[error(transparent)]
     Model(#[from] ModelError),
     /// The thread does not start.
-    #[error("the text model's thread does not start: {0}; free memory or raise the process limit")]
+    #[error("the text model's thread cannot start: {0}; free memory or raise the process limit")]
     Thread(#[from] io::Error),
 }
 
-/// Which encoder answers.
+/// The text encoder in use.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct EncoderInfo {
-    /// Name of the space.
+    /// Name of the embedding space.
     pub name: String,
-    /// Its identity, as manifests record it.
+    /// Its id, as manifests record it.
     pub id: Hash32,
     /// Components of a vector.
     pub dim: u32,
-    /// What the text model runs on, as it turned out: `cpu`, `cuda` ..., or `none` where no runtime is needed.
+    /// The execution provider actually in use: `cpu`, `cuda` ..., or `none` if no runtime is needed.
     pub execution_provider: &'static str,
 }
 
@@ -61,7 +61,7 @@ struct Job {
     reply: SyncSender<Result<Vec<f32>, EncodeError>>,
 }
 
-/// A text encoder behind one owning thread, with the vectors of recent texts.
+/// A text encoder owned by one thread, with a cache of recent vectors.
 pub struct TextService {
     info: EncoderInfo,
     jobs: Option<SyncSender<Job>>,
@@ -71,7 +71,7 @@ pub struct TextService {
 }
 
 impl TextService {
-    /// Opens the text encoder of a pair.
+    /// Opens the text encoder of a model folder.
     ///
     /// # Errors
     /// [`TextOpenError`].
@@ -87,7 +87,7 @@ impl TextService {
     /// Starts the thread that owns an encoder.
     ///
     /// # Errors
-    /// When the thread does not start.
+    /// The thread does not start.
     pub fn start(info: EncoderInfo, encoder: Box<dyn TextEncoder>) -> io::Result<Self> {
         let (jobs, waiting) = sync_channel(MAX_WAITING);
         let thread = std::thread::Builder::new().name("text-model".into()).spawn(|| run(encoder, waiting))?;
@@ -100,12 +100,12 @@ impl TextService {
         })
     }
 
-    /// Returns which encoder answers.
+    /// Returns the encoder in use.
     pub fn info(&self) -> &EncoderInfo {
         &self.info
     }
 
-    /// Whether the encoder's thread answered whenever it was asked.
+    /// Returns whether the encoder's thread has answered every request.
     pub fn is_alive(&self) -> bool {
         !self.has_stopped.load(Ordering::Relaxed)
     }
@@ -146,19 +146,19 @@ impl Drop for TextService {
         if let Some(thread) = self.thread.take()
             && thread.join().is_err()
         {
-            tracing::error!("the text model's thread had panicked");
+            tracing::error!("the text model's thread panicked");
         }
     }
 }
 
 fn run(mut encoder: Box<dyn TextEncoder>, jobs: Receiver<Job>) {
     for job in jobs {
-        // Whoever asked may have given up meanwhile.
+        // The asker may have given up meanwhile.
         drop(job.reply.send(encoder.encode(&job.text)));
     }
 }
 
-/// The vectors of the texts asked for last.
+/// The vectors of recent texts.
 #[derive(Default)]
 struct Cache {
     clock: u64,
@@ -215,7 +215,7 @@ mod tests {
         assert!(cache.get("1").is_none() && cache.get("0").is_some() && cache.get("new").is_some());
     }
 
-    /// One text more than can wait and be worked on: someone is turned away, at once.
+    /// One text more than the queue and the encoder can hold: one of them is refused, at once.
     #[test]
     fn a_full_queue_turns_away() {
         let gate = Gate::default();
@@ -258,7 +258,7 @@ mod tests {
         assert_eq!(phrases.info().execution_provider, "none");
     }
 
-    /// A model that panics stops the service, and every later call says so at once.
+    /// A model that panics stops the service; every later call fails at once.
     #[test]
     fn a_dead_model_is_an_error() {
         let service = TextService::start(Axes::info(2), Box::new(Axes::new(2))).expect("a thread");

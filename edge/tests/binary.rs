@@ -265,7 +265,7 @@ fn a_robot_is_followed_along_stdin() {
     let (code, reports, log) = watch("1 2 3\nnonsense\n\n1 2 4\n{\"x\":1,\"y\":2,\"z\":3}\n");
     assert_eq!((code, reports.len()), (Some(0), 1), "{log}");
     assert_eq!((&reports[0]["n_cells"], &reports[0]["radius"]), (&1.into(), &24.0.into()));
-    assert!(log.contains("line 2: \"nonsense\" is no position"), "{log}");
+    assert!(log.contains("line 2: \"nonsense\" is not a position"), "{log}");
     // A place on the earth means nothing in this scene: the last fetch failed, and what is on board stays.
     let (code, reports, log) = watch("46.8,-92\n");
     assert_eq!((code, &reports[0]["error"]["kind"]), (Some(1), &"fetch".into()), "{log}");
@@ -298,7 +298,7 @@ fn a_robot_is_followed_by_its_service() {
         assert!(Instant::now() < give_up, "the scene does not come in: {status}");
         std::thread::sleep(Duration::from_millis(5));
     }
-    assert!(stop(serving).contains("1 shards of generation 3 came in"));
+    assert!(stop(serving).contains("fetched 1 shards of generation 3"));
 }
 
 /// Ten times more questions than can be answered: some are, quickly enough, the others are turned away.

@@ -17,7 +17,7 @@ const CHUNK: usize = 4096;
 #[derive(Debug, thiserror::Error)]
 pub enum DumpError {
     /// The file system's error, with the path.
-    #[error("{0}; name a folder with room for the vectors")]
+    #[error("{0}; choose a folder with enough space for the vectors")]
     Io(#[from] io::Error),
     /// The queries are of another space.
     #[error(transparent)]

@@ -126,7 +126,7 @@ pub async fn run(options: &LoadOptions) -> io::Result<LoadReport> {
     let unloaded = warm.accepted.percentiles();
     if unloaded.n == 0 {
         let what = format!(
-            "{} answers no {}: is it the address of a robot's service?",
+            "{} does not answer {}; give the address that slag-edge serve prints",
             options.address, options.path
         );
         return Err(io::Error::other(what));

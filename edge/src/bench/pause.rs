@@ -63,7 +63,7 @@ pub struct PauseReport {
 #[derive(Debug, thiserror::Error)]
 pub enum PauseError {
     /// A socket or file.
-    #[error("{0}; check the work folder and that the loopback network is up")]
+    #[error("{0}; check the work folder and the loopback network")]
     Io(#[from] io::Error),
     /// A fetch failed.
     #[error(transparent)]
@@ -72,7 +72,7 @@ pub enum PauseError {
     #[error(transparent)]
     Store(#[from] StoreError),
     /// A query got no answer.
-    #[error("a query was not answered: {what}; the service's log says why")]
+    #[error("a query got no answer: {what}; see the service's log")]
     Query {
         /// What came instead.
         what: String,

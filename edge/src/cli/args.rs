@@ -1,4 +1,4 @@
-//! Arguments that several commands share.
+//! Arguments shared by several commands.
 
 use std::ffi::OsString;
 use std::num::NonZeroUsize;
@@ -18,18 +18,18 @@ use slag_models::{ModelDir, SessionOptions};
 
 use super::failure::Failure;
 
-/// Threads of a text model: more gain little for short texts.
+/// Most threads for a text model by default; more gain little for short texts.
 const MAX_MODEL_THREADS: usize = 4;
 
 #[derive(Debug, Args)]
 pub struct CacheArgs {
-    /// Folder of what is on board [default: $XDG_CACHE_HOME/slag, else ~/.cache/slag].
+    /// Cache folder [default: $XDG_CACHE_HOME/slag, else ~/.cache/slag].
     #[arg(long, value_name = "DIR")]
     pub cache: Option<PathBuf>,
 }
 
 impl CacheArgs {
-    /// Returns the cache named, or the user's own.
+    /// Opens the cache named, or the user's own.
     pub fn open(self) -> Result<EdgeCache, Failure> {
         let dir = self.cache.or_else(|| cache_folder(variable));
         let advice = || Failure::Usage(anyhow!("neither XDG_CACHE_HOME nor HOME is set; give --cache DIR"));
@@ -39,13 +39,13 @@ impl CacheArgs {
 
 #[derive(Debug, Args)]
 pub struct ThreadArgs {
-    /// Threads that questions are worked on with [default: as many as there are cores].
+    /// Threads for answering questions [default: the number of cores].
     #[arg(long, value_name = "N")]
     pub threads: Option<NonZeroUsize>,
 }
 
 impl ThreadArgs {
-    /// Bounds the threads that questions are worked on with; once in a process.
+    /// Sets the number of threads for answering questions; once per process.
     pub fn apply(&self) -> Result<(), Failure> {
         let Some(n) = self.threads else { return Ok(()) };
         let built = rayon::ThreadPoolBuilder::new().num_threads(n.get()).build_global();
@@ -61,14 +61,14 @@ pub struct ModelArgs {
     pub how: RunArgs,
 }
 
-/// Joins a cache and a text model.
+/// Makes an engine from a cache and a text model.
 pub fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
     let (models, options) = text_model(models)?;
     let text = TextService::open(&models, &options);
     Ok(Engine::new(cache, text.map_err(|e| Failure::Failed("models", e.into()))?))
 }
 
-/// Returns the models that the text model is of, and how it is run.
+/// Returns the models of the text model and the options it runs with.
 pub fn text_model(args: &ModelArgs) -> Result<(ModelDir, SessionOptions), Failure> {
     let failed = Failure::of("models");
     let models = model_commands::open(args.models.as_deref(), &variable);
@@ -76,7 +76,7 @@ pub fn text_model(args: &ModelArgs) -> Result<(ModelDir, SessionOptions), Failur
     Ok((models.map_err(|e| failed(e.into()))?, options))
 }
 
-/// Returns how models are run: one text at a time, with a few threads.
+/// Returns the options for running one text at a time, with a few threads.
 pub fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
     let exe = std::env::current_exe().unwrap_or_default();
     let n_cores = std::thread::available_parallelism().map_or(1, usize::from);

@@ -22,13 +22,13 @@ use super::output::print_json;
 
 #[derive(Debug, Subcommand)]
 pub enum BenchCommand {
-    /// Times questions to what is on board, without text model and HTTP.
+    /// Time answers from the cache, without text model and HTTP.
     Query(BenchQueryArgs),
-    /// The longest time a query waits while fetches replace the generation.
+    /// Measure the longest wait of a query while fetches replace the generation.
     Pause(PauseArgs),
-    /// How a service stands more queries than it can answer.
+    /// Load a service with more queries than it can answer.
     Load(LoadArgs),
-    /// Times the text model.
+    /// Time the text model.
     Text(BenchTextArgs),
 }
 
@@ -40,32 +40,32 @@ pub struct PauseArgs {
     /// Components of an embedding.
     #[arg(long, value_name = "N", default_value_t = 512, value_parser = clap::value_parser!(u32).range(2..=8192))]
     dim: u32,
-    /// Generations that are fetched, one after the other.
+    /// Number of generations to fetch, one after the other.
     #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=1000))]
     fetches: u32,
-    /// Folder to work in [default: a new one among the system's temporary files].
+    /// Work folder [default: a new temporary folder].
     #[arg(long, value_name = "DIR")]
     work: Option<PathBuf>,
 }
 
 #[derive(Debug, Args)]
 pub struct LoadArgs {
-    /// The service, as `slag-edge serve` prints it.
+    /// Address of the service, as printed by `slag-edge serve`.
     #[arg(long, value_name = "URL")]
     url: String,
-    /// What is asked for.
+    /// Text to look for.
     #[arg(long, default_value = "red")]
     text: String,
-    /// Questions a second, as a multiple of what the service answers.
+    /// Queries per second, as a multiple of the service's capacity.
     #[arg(long, value_name = "X", default_value_t = 10.0)]
     overload: f64,
-    /// Questions at a time, at most.
+    /// Most queries at a time.
     #[arg(long, value_name = "N", default_value_t = 320, value_parser = clap::value_parser!(u32).range(1..=4096))]
     clients: u32,
-    /// How long.
+    /// Duration.
     #[arg(long, value_name = "S", default_value_t = 600)]
     seconds: u64,
-    /// Process whose memory is watched (Linux).
+    /// Process to sample the memory of (Linux).
     #[arg(long, value_name = "PID")]
     pid: Option<u32>,
 }
@@ -76,26 +76,26 @@ pub struct BenchQueryArgs {
     cache: CacheArgs,
     #[command(flatten)]
     threads: ThreadArgs,
-    /// Sizes of answers.
+    /// Numbers of Gaussians to ask for.
     #[arg(long, value_name = "N,...", value_delimiter = ',', default_values_t = [1_000, 10_000, 50_000, 100_000])]
     limits: Vec<usize>,
-    /// Which data scores come from.
-    #[arg(long, value_name = "rows|measured|exact", default_value_t = Precision::Exact)]
+    /// Data that scores come from.
+    #[arg(long, value_name = "centroids|measured|exact", default_value_t = Precision::Exact)]
     precision: Precision,
-    /// Timed questions for each size and kind of answer.
+    /// Timed queries for each limit and kind of answer.
     #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     runs: u32,
-    /// Query vectors in turn, little-endian f32, of unit length [default: 32 made ones, half of them in random
-    /// directions, half like embeddings of the scene].
+    /// Query vectors to use in turn, little-endian f32, unit length [default: 32 generated ones, half in
+    /// random directions, half similar to embeddings of the scene].
     #[arg(long, value_name = "FILE")]
     queries: Option<PathBuf>,
-    /// Seed of the made queries.
+    /// Seed of the generated queries.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Writes vectors.f32, queries.f32 and meta.json to a folder, for other engines.
+    /// Write vectors.f32, queries.f32 and meta.json to a folder, for other engines.
     #[arg(long, value_name = "DIR")]
     dump: Option<PathBuf>,
-    /// Writes what the queries find to a folder, as places in vectors.f32: PROFILE-LIMIT-QUERY.u32.
+    /// Write the results to a folder, as indices into vectors.f32: PROFILE-LIMIT-QUERY.u32.
     #[arg(long, value_name = "DIR")]
     ids: Option<PathBuf>,
 }
@@ -104,7 +104,7 @@ pub struct BenchQueryArgs {
 pub struct BenchTextArgs {
     #[command(flatten)]
     models: ModelArgs,
-    /// A text to time; may be given again.
+    /// Text to time; may be repeated.
     #[arg(long, default_values = ["chair", "a red fire extinguisher on the wall beside the door"])]
     text: Vec<String>,
     /// Timed runs of each text.
@@ -114,14 +114,14 @@ pub struct BenchTextArgs {
 
 /// Untimed runs of a text before the timed ones.
 const N_TEXT_WARM_UP: usize = 10;
-/// Made queries.
+/// Number of generated queries.
 const N_QUERIES: usize = 32;
-/// Untimed questions before the timed ones.
+/// Untimed queries before the timed ones.
 const N_WARM_UP: usize = 5;
 
-/// Time of queries without fetches, to compare with.
+/// Duration of the queries without fetches, as a baseline.
 const IDLE: Duration = Duration::from_secs(2);
-/// Time to measure what a service answers without overload.
+/// Time to measure a service's capacity without overload.
 const WARM_UP: Duration = Duration::from_secs(2);
 
 pub fn run(command: BenchCommand) -> Result<(), Failure> {
@@ -151,7 +151,7 @@ fn bench_query_command(args: BenchQueryArgs) -> Result<(), Failure> {
     };
     if queries.is_empty() || shards.is_empty() {
         return Err(Failure::Usage(anyhow!(
-            "there is nothing to ask: no query vector, or no shard on board"
+            "there is nothing to measure: no query vector, or no shard on board"
         )));
     }
     let failed = |error: anyhow::Error| Failure::Failed("bench", error);
@@ -204,10 +204,10 @@ fn bench_pause(args: PauseArgs) -> Result<(), Failure> {
 
 fn bench_load(args: LoadArgs) -> Result<(), Failure> {
     if !(0.01..=1e4).contains(&args.overload) {
-        return Err(Failure::Usage(anyhow!("the overload is {}, it must be 0.01 to 10000", args.overload)));
+        return Err(Failure::Usage(anyhow!("the overload is {}, expected 0.01 to 10000", args.overload)));
     }
     let address = args.url.trim_end_matches('/').strip_prefix("http://");
-    let advice = || Failure::Usage(anyhow!("{:?} is no address like http://127.0.0.1:7734", args.url));
+    let advice = || Failure::Usage(anyhow!("{:?} is not an address like http://127.0.0.1:7734", args.url));
     let text: String = args.text.bytes().map(percent_encoded).collect();
     let options = LoadOptions {
         address: address.ok_or_else(advice)?.to_owned(),

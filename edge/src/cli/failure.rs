@@ -1,4 +1,4 @@
-//! How a run ends: exit codes, and errors that name their kind.
+//! Exit codes, and errors with a kind for programs.
 
 use std::io::{self, Write};
 use std::process::ExitCode;
@@ -8,14 +8,14 @@ use slag_edge::store::StoreError;
 
 use super::text::visible;
 
-/// How a run ends.
+/// Exit codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Exit {
-    /// Done, even if nothing was found.
+    /// Success, even if nothing was found.
     Done = 0,
-    /// Failed.
+    /// Failure.
     Failed = 1,
-    /// Asked for something that cannot be; clap exits with it too.
+    /// Invalid request; also clap's exit code.
     Usage = 2,
     /// Interrupted by a signal (128 + SIGINT).
     Interrupted = 130,
@@ -27,25 +27,25 @@ impl From<Exit> for ExitCode {
     }
 }
 
-/// Why a run ends early.
+/// Reasons for ending a run early.
 pub enum Failure {
-    /// Asked for something that cannot be.
+    /// Invalid request.
     Usage(anyhow::Error),
-    /// Failed; `kind` is for programs.
+    /// Failure; the string is the kind of error for programs.
     Failed(&'static str, anyhow::Error),
-    /// A signal came.
+    /// Interrupted by a signal.
     Interrupted(anyhow::Error),
-    /// Nobody reads stdout any more.
+    /// The reader of stdout has gone away.
     BrokenPipe,
 }
 
 impl Failure {
-    /// Wraps an error with its kind.
+    /// Returns a function that wraps an error with its kind.
     pub fn of(kind: &'static str) -> impl Fn(anyhow::Error) -> Self {
         move |error| Self::Failed(kind, error)
     }
 
-    /// Tells the error, as JSON on stdout where that was asked for, and returns the exit code.
+    /// Reports the error on stderr, or as JSON on stdout, and returns the exit code.
     pub fn report(self, json: bool) -> Exit {
         let (exit, kind, error) = match self {
             Self::BrokenPipe => return Exit::Done,
@@ -54,7 +54,7 @@ impl Failure {
             Self::Interrupted(error) => (Exit::Interrupted, "interrupted", error),
         };
         let detail = slag_edge::error_line(&*error);
-        // Nothing is left to do if even this cannot be written.
+        // If even this cannot be written, there is nothing left to do.
         let _ = match json {
             true => writeln!(
                 io::stdout(),
@@ -85,7 +85,7 @@ impl From<QueryError> for Failure {
     }
 }
 
-/// Tells apart that nothing is on board yet.
+/// Wraps an error of the cache; an empty cache has a kind of its own.
 pub fn store_failure(error: StoreError) -> Failure {
     let kind = if matches!(error, StoreError::Empty { .. }) { "no-scene" } else { "store" };
     Failure::Failed(kind, error.into())

@@ -23,34 +23,34 @@ pub struct FetchArgs {
     /// Address of the store [default: that of the last fetch].
     #[arg(long, value_name = "URL")]
     pub from: Option<String>,
-    /// Where the robot is, world frame [default: where it was at the last fetch].
+    /// Position of the robot, world frame [default: that of the last fetch].
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
     pub at: Option<DVec3>,
-    /// Where the robot is: WGS 84 degrees, and metres.
+    /// Position of the robot: WGS 84 degrees, and metres.
     #[arg(long, value_name = "LAT,LON[,HEIGHT]", value_parser = parse_geographic, allow_hyphen_values = true, conflicts_with = "at")]
     pub at_geo: Option<(f64, f64, Option<f64>)>,
-    /// How far around, world units (metres where the scene is metric).
+    /// Radius around the robot, world units (metres in a metric scene).
     #[arg(long, default_value_t = 50.0)]
     pub radius: f64,
-    /// How much each shard carries.
+    /// Profile of the shards.
     #[arg(long, default_value_t = Profile::Compact, value_parser = profile_parser())]
     pub profile: Profile,
-    /// The only public key accepted, or the one that took its place; given again: its successor, for a
-    /// robot that missed the change [default: the one accepted before, or the first one met].
+    /// The only public key accepted, or its replacement. May be given twice: the second is the successor's,
+    /// for a robot that missed the key change [default: the key accepted before, or the first one seen].
     #[arg(long, value_name = "HEX")]
     pub key: Vec<Hash32>,
-    /// Bytes that shards may take [default: twice what the radius needs].
+    /// Byte budget for shards [default: twice what the radius needs].
     #[arg(long, value_name = "N")]
     pub max_bytes: Option<u64>,
-    /// Follow the robot: read positions from stdin, one a line, `x y z` or `lat,lon[,height]`, or as
-    /// JSON, and fetch whenever it needs more.
+    /// Follow the robot: read positions from stdin, one a line, as `x y z`, `lat,lon[,height]` or JSON, and
+    /// fetch when necessary.
     #[arg(long)]
     pub watch: bool,
     #[command(flatten)]
     pub follow: FollowArgs,
     #[command(flatten)]
     pub cache: CacheArgs,
-    /// Print the report as JSON (with --watch: one a line).
+    /// Print the report as JSON (with --watch: one per line).
     #[arg(long)]
     pub json: bool,
 }

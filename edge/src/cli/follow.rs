@@ -1,4 +1,4 @@
-//! Following a robot: `fetch --watch` and `serve --follow`.
+//! Following a robot, for `fetch --watch` and `serve --follow`.
 
 use std::io;
 use std::sync::Arc;
@@ -17,17 +17,16 @@ use super::network::{failure, fetch_once, random};
 use super::output::print_json;
 use super::progress::{Bar, print_line};
 
-/// How a robot is followed.
+/// Settings for following a robot.
 #[derive(Debug, Args)]
 pub struct FollowArgs {
-    /// When following: how much farther than the radius is fetched, world units [default: a quarter of
-    /// the radius].
+    /// When following: distance fetched beyond the radius, world units [default: a quarter of the radius].
     #[arg(long, value_name = "D")]
     pub margin: Option<f64>,
-    /// When following: seconds between fetches, at least.
+    /// When following: least seconds between fetches.
     #[arg(long, value_name = "S", default_value_t = 2)]
     pub min_interval_secs: u64,
-    /// When following: seconds after which a robot that stays looks for a new generation; 0: never.
+    /// When following: seconds after which a resting robot looks for a new generation; 0: never.
     #[arg(long, value_name = "S", default_value_t = 300)]
     pub refresh_secs: u64,
 }
@@ -37,7 +36,7 @@ impl FollowArgs {
     pub fn settings(&self, radius: f64) -> Result<FollowSettings, Failure> {
         let margin = self.margin.unwrap_or(radius / 4.0);
         if !(margin > 0.0 && margin.is_finite()) {
-            return Err(Failure::Usage(anyhow!("the margin is {margin}, it must be more than 0")));
+            return Err(Failure::Usage(anyhow!("the margin is {margin}, it must be greater than 0")));
         }
         Ok(FollowSettings {
             radius,
@@ -70,7 +69,7 @@ pub fn watch(
             Err(error) => tracing::warn!("line {line}: {error}"),
         });
         if let Err(error) = read {
-            tracing::warn!("no more positions can be read: {error}");
+            tracing::warn!("positions can no longer be read: {error}");
         }
         posting.close();
     })?;
@@ -93,7 +92,7 @@ pub fn watch(
                     }
                 };
                 if told.is_err() {
-                    // Nobody reads any more.
+                    // The reader has gone away.
                     printed = told;
                     cancel.store(true, Ordering::Relaxed);
                 }
@@ -106,7 +105,7 @@ pub fn watch(
     followed.map_err(failure)
 }
 
-/// Follows the positions that the service is told, on a thread of its own, until the flag returned is set.
+/// Follows the positions posted to the service, on a thread of its own, until the returned flag is set.
 pub fn follow_in_background(
     request: FetchRequest,
     settings: FollowSettings,
@@ -122,7 +121,7 @@ pub fn follow_in_background(
             tell: &mut |outcome| match outcome {
                 Ok(report) => {
                     let (n, generation) = (report.downloaded.n_shards, report.generation);
-                    tracing::info!("{n} shards of generation {generation} came in");
+                    tracing::info!("fetched {n} shards of generation {generation}");
                     app.reload_now();
                 }
                 Err(error) => tracing::warn!("{}", slag_edge::error_line(error)),

@@ -1,4 +1,4 @@
-//! One fetch as the commands make it: real clock, real network, and the keys that a command line may name.
+//! Fetching with the real clock and network, and with the keys given on the command line.
 
 use std::hash::{BuildHasher, Hasher, RandomState};
 use std::sync::atomic::AtomicBool;
@@ -10,14 +10,14 @@ use slag_edge::store::EdgeCache;
 
 use super::failure::Failure;
 
-/// A second key is the successor's, told beforehand; more are a mistake.
+/// A second key is an announced successor; more are a mistake.
 const MAX_KEYS: usize = 2;
 
 /// Checks the number of keys given.
 pub fn checked_keys(keys: Vec<Hash32>) -> Result<Vec<Hash32>, Failure> {
     match keys.len() {
         0..=MAX_KEYS => Ok(keys),
-        n => Err(Failure::Usage(anyhow!("--key is given {n} times, at most {MAX_KEYS} keys are accepted"))),
+        n => Err(Failure::Usage(anyhow!("--key is given {n} times, the limit is {MAX_KEYS}"))),
     }
 }
 
@@ -40,11 +40,11 @@ pub fn fetch_once(
 
 /// Returns a number in 0..1 that differs from robot to robot, so that a fleet does not retry in step.
 pub fn random() -> f64 {
-    // The standard library's per-process random keys; each call has new ones.
+    // The standard library's random hash keys are new for each call.
     (RandomState::new().build_hasher().finish() >> 11) as f64 / (1u64 << 53) as f64
 }
 
-/// Names the kind of a failed fetch.
+/// Wraps the error of a fetch.
 pub fn failure(error: FetchError) -> Failure {
     match error {
         FetchError::Cancelled => Failure::Interrupted(error.into()),

@@ -1,4 +1,4 @@
-//! How fetches are shown: a progress line on the terminal, and reports.
+//! Display of fetches: a progress line on the terminal, and reports.
 
 use std::io::{self, Write};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -12,8 +12,8 @@ use super::output::print_pairs;
 pub fn print_report(report: &FetchReport) -> Result<(), Failure> {
     let tally = |t: &Tally| format!("{} shards, {} bytes", t.n_shards, t.bytes);
     let trust = match report.replaced_key {
-        _ if report.is_first_contact => " (first contact: compare it with the store's)",
-        Some(_) => " (took the place of the key before, which is no longer accepted)",
+        _ if report.is_first_contact => " (first contact: compare it with the store's key)",
+        Some(_) => " (replaced the previous key, which is no longer accepted)",
         None => "",
     };
     print_pairs(&[
@@ -21,7 +21,7 @@ pub fn print_report(report: &FetchReport) -> Result<(), Failure> {
         ("generation", report.generation.to_string()),
         ("encoder", format!("{} ({})", report.encoder_name, report.encoder_id)),
         ("cells", format!("{} within {} of {}", report.n_cells, report.radius, report.centre_in_world)),
-        ("downloaded", format!("{} ({} of them resumed)", tally(&report.downloaded), report.resumed_bytes)),
+        ("downloaded", format!("{} ({} bytes resumed)", tally(&report.downloaded), report.resumed_bytes)),
         ("kept", tally(&report.kept)),
         ("spare", tally(&report.spare)),
         ("freed", tally(&report.freed)),
@@ -30,18 +30,18 @@ pub fn print_report(report: &FetchReport) -> Result<(), Failure> {
     ])
 }
 
-/// Prints a fetch in one line, for a robot that is followed.
+/// Prints a fetch on one line, while following a robot.
 pub fn print_line(report: &FetchReport) -> Result<(), Failure> {
     let FetchReport { generation, n_cells, centre_in_world, downloaded, freed, .. } = report;
     let (came, went) = (downloaded.n_shards, freed.n_shards);
     writeln!(
         io::stdout(),
-        "generation {generation}, {n_cells} cells around {centre_in_world}: {came} shards came, {went} went"
+        "generation {generation}, {n_cells} cells around {centre_in_world}: {came} shards fetched, {went} freed"
     )?;
     Ok(())
 }
 
-/// A line on the terminal that says how far the downloads are.
+/// A progress line on the terminal.
 #[derive(Default)]
 pub struct Bar {
     shown: bool,
@@ -50,7 +50,7 @@ pub struct Bar {
 }
 
 impl Bar {
-    /// Makes a line that is shown, or none.
+    /// Makes a progress line, shown or not.
     pub fn new(shown: bool) -> Self {
         Self { shown, ..Self::default() }
     }
@@ -58,7 +58,7 @@ impl Bar {
     /// Ends the line.
     pub fn finish(&self) {
         if self.shown && self.planned_bytes.load(Ordering::Relaxed) > 0 {
-            // Progress that cannot be shown is no reason to stop.
+            // Failing to show progress is no reason to stop.
             let _ = writeln!(io::stderr());
         }
     }
@@ -78,6 +78,6 @@ impl Progress for Bar {
     }
 
     fn retried(&self, url: &str, failure: &DownloadFailure) {
-        tracing::warn!("{url}: {failure}; trying again");
+        tracing::warn!("{url}: {failure}; retrying");
     }
 }

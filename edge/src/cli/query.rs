@@ -17,38 +17,38 @@ use super::text::{table, visible};
 
 #[derive(Debug, Args)]
 pub struct QueryArgs {
-    /// What to look for.
+    /// Text to look for.
     pub text: String,
-    /// What it is told from: none, canonical (object, things, stuff, texture), or phrases A,B,C.
+    /// Negative prompts: none, canonical (object, things, stuff, texture), or phrases A,B,C.
     #[arg(long, default_value = "none")]
     pub negatives: Negatives,
-    /// Where the asker is, world frame: answers carry their distance and nearer ones rank higher.
+    /// Position of the asker, world frame: answers carry their distance from it, and nearer ones rank higher.
     #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
     pub near: Option<DVec3>,
-    /// Only within this distance of --near, world units.
+    /// Search only within this distance of --near, world units.
     #[arg(long, requires = "near")]
     pub radius: Option<f64>,
-    /// Only between two corners of a box, world frame.
+    /// Search only within the box between two corners, world frame.
     #[arg(long = "box", value_name = "X,Y,Z,X,Y,Z", value_parser = parse_box, allow_hyphen_values = true)]
     pub bounds: Option<Aabb>,
     /// Most answers [default: 10].
     #[arg(long)]
     pub limit: Option<usize>,
-    /// Cosine, or relevancy with negatives, from which a Gaussian matches [default: the scene's; 0.5].
+    /// Least score of a match: a cosine, or with negatives a relevancy [default: the scene's; 0.5].
     #[arg(long, allow_hyphen_values = true)]
     pub threshold: Option<f32>,
-    /// What answers are made of: objects, clusters or gaussians [default: objects where the scene has them, else
+    /// Kind of answers: objects, clusters or gaussians [default: objects if the scene has them, else
     /// clusters].
     #[arg(long)]
     pub kind: Option<AnswerKind>,
-    /// Edge of the voxels that join Gaussians to clusters, world units [default: 0.25 m, or the scene's].
+    /// Edge of the voxels used for clustering, world units [default: 0.25 m, or the scene's].
     #[arg(long)]
     pub voxel: Option<f64>,
-    /// Clusters with fewer Gaussians are dropped, and counted.
+    /// Least Gaussians of a cluster; smaller ones are only counted.
     #[arg(long, default_value_t = DEFAULT_MIN_COUNT)]
     pub min_count: u64,
-    /// Which data scores come from: rows, measured (embeddings only where the measured errors of their codes do
-    /// not decide) or exact.
+    /// Data that scores come from: centroids, measured (embeddings only where the measured errors of their
+    /// codes do not decide) or exact.
     #[arg(long, value_name = "NAME", default_value_t = Precision::Exact)]
     pub precision: Precision,
     #[command(flatten)]
@@ -93,7 +93,7 @@ fn write_json(reply: Reply) -> Result<(), Failure> {
     Ok(writeln!(out)?)
 }
 
-/// Prints a reply's answers as tables, and what is to be known about them on stderr.
+/// Prints a reply's answers as tables, and notes about them on stderr.
 fn print_reply(reply: &Reply) -> Result<(), Failure> {
     reply.answers.iter().try_for_each(|answers| print_answers(reply, answers))
 }
@@ -114,15 +114,15 @@ fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
     };
     let (n, threshold) = (answers.n_matching, answers.threshold);
     let source = match answers.threshold_source {
-        ThresholdSource::Request => "as asked",
+        ThresholdSource::Request => "as requested",
         ThresholdSource::Scene => "calibrated on the scene",
         ThresholdSource::Encoder => "the encoder's default",
-        ThresholdSource::Relevancy => "nearer than any negative",
+        ThresholdSource::Relevancy => "closer than any negative",
     };
     let searched = answers.n_searched;
     writeln!(io::stderr(), "{n} Gaussians of {searched} reach {threshold}, {source} ({exactness})")?;
     if answers.area_fetched == Some(false) {
-        writeln!(io::stderr(), "part of that area is not on board: fetch it for a full answer")?;
+        writeln!(io::stderr(), "part of that area is not on board; fetch it for a complete answer")?;
     }
     let rows: Vec<Vec<String>> = match &answers.answers {
         Found::Clusters(clusters) => clusters

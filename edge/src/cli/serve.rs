@@ -20,9 +20,9 @@ use super::failure::Failure;
 use super::follow::{FollowArgs, follow_in_background};
 use super::network::checked_keys;
 
-/// Async threads: they only pass requests on.
+/// Async threads: they only forward requests.
 const ASYNC_THREADS: usize = 2;
-/// Threads beside those of queries, for status and for loading a generation.
+/// Blocking threads in addition to those of queries, for status and for loading a generation.
 const SPARE_BLOCKING_THREADS: usize = 8;
 
 #[derive(Debug, Args)]
@@ -30,19 +30,19 @@ pub struct ServeArgs {
     /// Address to listen on.
     #[arg(long, value_name = "IP:PORT", default_value = "127.0.0.1:7734")]
     pub listen: SocketAddr,
-    /// Follow the robot: fetch from this store around the positions that POST /position says.
+    /// Follow the robot: fetch from this store around the positions posted to POST /position.
     #[arg(long, value_name = "URL")]
     pub follow: Option<String>,
-    /// When following: how far around the robot cells are kept, world units.
+    /// When following: radius around the robot within which cells are kept, world units.
     #[arg(long, default_value_t = 50.0)]
     pub radius: f64,
-    /// When following: how much each shard carries.
+    /// When following: profile of the shards.
     #[arg(long, default_value_t = Profile::Compact, value_parser = profile_parser())]
     pub profile: Profile,
     /// When following: the only public keys accepted, at most two.
     #[arg(long, value_name = "HEX")]
     pub key: Vec<Hash32>,
-    /// When following: bytes that shards may take [default: twice what the radius needs].
+    /// When following: byte budget for shards [default: twice what the radius needs].
     #[arg(long, value_name = "N")]
     pub max_bytes: Option<u64>,
     #[command(flatten)]
@@ -62,7 +62,7 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     match engine.reload() {
         Ok(()) => {}
         Err(StoreError::Empty { path }) => {
-            tracing::warn!("{} holds no scene yet; what is fetched there is served at once", path.display());
+            tracing::warn!("{} holds no scene yet; a scene fetched there is served at once", path.display());
         }
         Err(error) => tracing::warn!("no scene is loaded: {}", slag_edge::error_line(&error)),
     }
@@ -101,11 +101,11 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
             None => None,
         };
         let served = http::serve(app, listener, stop).await;
-        // A fetch under way need not be waited for: the next one goes on where it is cut off.
+        // A fetch in progress need not be awaited: the next one resumes it.
         follower.inspect(|cancel| cancel.store(true, Ordering::Relaxed));
         Ok(served?)
     });
-    // A query that does not end must not keep the process.
+    // A query that does not end must not keep the process alive.
     runtime.shutdown_timeout(drain);
     served
 }

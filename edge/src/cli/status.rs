@@ -28,7 +28,7 @@ pub fn run(args: StatusArgs) -> Result<(), Failure> {
     }
     print_status(&status)?;
     match is_expired {
-        true => print_pairs(&[("expired", "yes: it still answers, but fetch refuses it".into())]),
+        true => print_pairs(&[("expired", "yes: queries still work, but fetch refuses it".into())]),
         false => Ok(()),
     }
 }

@@ -1,6 +1,6 @@
-//! Text for a terminal: tables, and names made safe to print.
+//! Text for a terminal: tables, and names that are safe to print.
 
-/// Lays rows out in right-aligned columns under a head.
+/// Formats rows as right-aligned columns under a header.
 pub fn table(head: &[&str], rows: &[Vec<String>]) -> String {
     let width_of = |column: usize| {
         let cells = rows.iter().map(|row| row[column].chars().count());
@@ -16,7 +16,7 @@ pub fn table(head: &[&str], rows: &[Vec<String>]) -> String {
     text
 }
 
-/// Escapes control characters: names come from files, and terminals obey them.
+/// Escapes control characters: names come from files, and terminals obey control characters.
 pub fn visible(text: &str) -> String {
     text.chars()
         .flat_map(|c| if c.is_control() { c.escape_default().collect::<Vec<_>>() } else { vec![c] })

@@ -1,4 +1,4 @@
-//! HTTP: the manifest and shards come in whole or not at all, within the lengths that were announced.
+//! HTTP downloads: the manifest and shards arrive whole or not at all, within their announced lengths.
 
 use std::io::Read;
 use std::path::Path;
@@ -13,21 +13,21 @@ use super::environment::Environment;
 use super::error::{DownloadFailure, FetchError};
 use crate::store::files::Files;
 
-/// A manifest's expected length, for the time it may take.
+/// Expected length of a manifest; sets its time limit.
 const USUAL_MANIFEST_BYTES: u64 = 1 << 20;
-/// How often a shard may come in with other content than its hash before it is given up: once for a
-/// part that a power cut damaged, twice for the way.
+/// Downloads of a shard with wrong content before it is given up: one for a partial file that a power cut
+/// damaged, two for the network.
 const MAX_WRONG_HASHES: u32 = 3;
-/// Longest sleep before the cancel flag is looked at again.
+/// Longest sleep between looks at the cancel flag.
 const NAP: Duration = Duration::from_millis(50);
 
-/// How an attempt ended, if not well.
+/// How an attempt failed.
 enum Stop {
-    /// The other side or the way: maybe try again.
+    /// The server or the network failed; another attempt may help.
     Failed(DownloadFailure),
-    /// The same, but more bytes are there than after any attempt before.
+    /// The same, but more bytes arrived than in any attempt before.
     Interrupted(DownloadFailure),
-    /// This side: no.
+    /// A local failure, or a refusal: no further attempt.
     Fatal(FetchError),
 }
 
@@ -55,30 +55,30 @@ impl From<ureq::Error> for Stop {
     }
 }
 
-/// What the server says of the manifest.
+/// The server's answer to a manifest request.
 pub(super) enum ManifestAnswer {
-    /// It is the one that was named.
+    /// The manifest still has the known hash.
     Unchanged,
-    /// Its bytes.
+    /// A manifest's bytes.
     New(Vec<u8>),
 }
 
-/// A store's address, and what downloads from it share.
+/// Downloads from one store.
 pub(super) struct Client<'a> {
     agent: ureq::Agent,
     base: String,
     environment: &'a Environment<'a>,
-    /// Bytes that earlier attempts had left.
+    /// Bytes left by earlier fetches.
     pub resumed_bytes: AtomicU64,
     /// Attempts beyond the first.
     pub retries: AtomicU64,
 }
 
 impl<'a> Client<'a> {
-    /// Checks an address.
+    /// Checks the address of a store.
     pub fn new(from: &str, environment: &'a Environment<'a>) -> Result<Self, FetchError> {
         let bad = |what: &str| FetchError::Address { from: from.to_owned(), what: what.to_owned() };
-        let uri: Uri = from.parse().map_err(|_| bad("it is no URL"))?;
+        let uri: Uri = from.parse().map_err(|_| bad("it is not a URL"))?;
         if !matches!(uri.scheme_str(), Some("http" | "https")) {
             return Err(bad("it does not begin with http:// or https://"));
         }
@@ -91,7 +91,7 @@ impl<'a> Client<'a> {
         let limits = &environment.limits;
         let agent = ureq::Agent::config_builder()
             .http_status_as_error(false)
-            // Neither another host nor a proxy from the environment: what is asked is what was given.
+            // Neither redirects nor a proxy from the environment: requests go to the given address only.
             .max_redirects(0)
             .proxy(None)
             .timeout_resolve(Some(limits.connect_timeout))
@@ -105,7 +105,7 @@ impl<'a> Client<'a> {
         Ok(Self { agent, base, environment, resumed_bytes: AtomicU64::new(0), retries: AtomicU64::new(0) })
     }
 
-    /// Gets the manifest, unless it is still the one with a given hash.
+    /// Downloads the manifest, unless it still has a known hash.
     pub fn manifest(&self, known: Option<Hash32>) -> Result<ManifestAnswer, FetchError> {
         let url = format!("{}/v1/manifest", self.base);
         self.retrying(&url, || self.try_manifest(&url, known))
@@ -128,15 +128,15 @@ impl<'a> Client<'a> {
         loop {
             self.check_cancelled()?;
             match body.read(&mut chunk).map_err(ureq::Error::from)? {
-                // A body that is too long is refused by the verification.
+                // Verification refuses a body that is too long.
                 0 => return Ok(ManifestAnswer::New(bytes)),
                 n => bytes.extend_from_slice(&chunk[..n]),
             }
         }
     }
 
-    /// Downloads an object into a staged file, going on where an earlier attempt ended, and makes it
-    /// durable. Its content has the hash then.
+    /// Downloads an object into a staged file, resuming an earlier attempt, and makes it durable. Checks its
+    /// hash.
     pub fn object(
         &self,
         files: &dyn Files,
@@ -181,7 +181,7 @@ impl<'a> Client<'a> {
         })
     }
 
-    /// Receives bytes `offset..len_bytes` of an object, or, if the server sends it whole, all of it.
+    /// Receives bytes `offset..len_bytes` of an object, or all of it if the server ignores the range.
     fn receive(
         &self,
         files: &dyn Files,
@@ -192,7 +192,7 @@ impl<'a> Client<'a> {
         part: &Path,
     ) -> Result<(), Stop> {
         if offset == len_bytes {
-            // An empty object has no part yet.
+            // An empty object has no partial file yet.
             return if len_bytes == 0 { Ok(files.write_from(part, 0, &[])?) } else { Ok(()) };
         }
         let mut ranges = Vec::new();
@@ -222,7 +222,7 @@ impl<'a> Client<'a> {
             let (expected, found) = (format!("{left_bytes} bytes"), format!("{stated} bytes"));
             return Err(DownloadFailure::Length { expected, found }.into());
         }
-        // Never more than the manifest's length, however long the body goes on.
+        // Never more than the manifest's length, however long the body is.
         let mut body = response.into_body().into_reader().take(left_bytes);
         let mut chunk = vec![0; (self.environment.limits.chunk_bytes as u64).clamp(1, left_bytes) as usize];
         let mut n_filled = 0;
@@ -232,7 +232,7 @@ impl<'a> Client<'a> {
             let n_read = *read.as_ref().unwrap_or(&0);
             n_filled += n_read;
             self.environment.progress.received(n_read as u64);
-            // Also what came in before a break: the next attempt goes on there.
+            // Also writes what arrived before a break: the next attempt resumes there.
             if n_filled == chunk.len() || n_read == 0 || n_filled as u64 == len_bytes - offset {
                 files.write_from(part, offset, &chunk[..n_filled])?;
                 offset += n_filled as u64;
@@ -257,7 +257,7 @@ impl<'a> Client<'a> {
         let limits = &self.environment.limits;
         let body_secs = expected_bytes / limits.slowest_bytes_per_sec.max(1);
         let body_timeout = limits.read_timeout.saturating_add(Duration::from_secs(body_secs));
-        // A length that no clock holds is as good as no limit.
+        // A time limit beyond the clock's range is no limit.
         let body_timeout = Instant::now().checked_add(body_timeout).is_some().then_some(body_timeout);
         let mut request = self.agent.get(url);
         for (name, value) in headers {
@@ -266,7 +266,7 @@ impl<'a> Client<'a> {
         Ok(request.config().timeout_recv_body(body_timeout).build().call()?)
     }
 
-    /// Tries until it works, fails for good, or has failed too often in a row without progress.
+    /// Retries until an attempt succeeds or fails for good, or too many fail in a row without progress.
     fn retrying<T>(&self, url: &str, mut attempt: impl FnMut() -> Result<T, Stop>) -> Result<T, FetchError> {
         let limits = &self.environment.limits;
         let mut attempts = 0;
@@ -297,7 +297,7 @@ impl<'a> Client<'a> {
                 }
                 _ => Duration::ZERO,
             };
-            // Beside the backoff, so that a fleet that was told the same does not come back in step.
+            // Added to the backoff, so that a fleet that got the same `Retry-After` does not return in step.
             self.sleep(asked.saturating_add(doubled.min(limits.longest_backoff).mul_f64(spread)))?;
         }
     }
@@ -335,7 +335,7 @@ fn refusal(response: &Response<ureq::Body>) -> DownloadFailure {
     DownloadFailure::Status { status: status.as_u16(), retry_after }
 }
 
-/// Returns a header as text, cut to 200 characters; empty if it is not there or not text.
+/// Returns a header as text, cut to 200 characters; empty if it is absent or not text.
 fn header_text(response: &Response<ureq::Body>, name: header::HeaderName) -> String {
     let value = response.headers().get(name).and_then(|value| value.to_str().ok());
     value.unwrap_or_default().chars().take(200).collect()

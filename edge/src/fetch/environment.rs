@@ -1,32 +1,32 @@
-//! What a fetch takes from outside: the clock, the cancel flag, chance, and who is told of progress.
+//! The surroundings of a fetch: clock, cancel flag, random numbers, progress and network limits.
 
 use std::sync::atomic::AtomicBool;
 
 use super::error::DownloadFailure;
 use super::limits::NetworkLimits;
 
-/// Is told how a fetch goes on, from any of its threads.
+/// Receives the progress of a fetch, from any of its threads.
 pub trait Progress: Sync {
-    /// So many shards of so many bytes in all are to be downloaded.
+    /// Called once with the number and total length of the shards to download.
     fn planned(&self, _n_shards: usize, _bytes: u64) {}
-    /// So many bytes came in.
+    /// Called with the number of bytes received since the last call.
     fn received(&self, _bytes: u64) {}
-    /// An attempt failed; another one follows.
+    /// Called when an attempt failed and another follows.
     fn retried(&self, _url: &str, _failure: &DownloadFailure) {}
 }
 
 impl Progress for () {}
 
-/// What a fetch takes from outside.
+/// The surroundings of a fetch.
 pub struct Environment<'a> {
-    /// The clock, seconds since 1970.
+    /// The current time, seconds since 1970.
     pub now_unix_secs: u64,
-    /// Set by anyone who wants the fetch to end; what came in so far is resumed by the next one.
+    /// Set to end the fetch; the next one resumes what arrived.
     pub cancel: &'a AtomicBool,
-    /// Is told how it goes on.
+    /// Receives the progress.
     pub progress: &'a dyn Progress,
-    /// Gives numbers within 0..1, to spread retries.
+    /// Returns numbers within 0..1, to spread retries.
     pub random: &'a (dyn Fn() -> f64 + Sync),
-    /// Patience with the network.
+    /// Network timeouts and retry limits.
     pub limits: NetworkLimits,
 }

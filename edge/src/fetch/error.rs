@@ -1,4 +1,4 @@
-//! Why a fetch fails.
+//! Errors of fetching and downloading.
 
 use std::io;
 use std::time::Duration;
@@ -10,17 +10,19 @@ use super::plan_error::PlanError;
 use super::records::RecordsError;
 use crate::store::StoreError;
 
-/// Why a fetch failed; the generation before it still answers.
+/// Reasons for a failed fetch; the previous generation still answers.
 #[derive(Debug, thiserror::Error)]
 pub enum FetchError {
-    /// Neither the request nor an earlier fetch says it.
-    #[error("the {what} is not given, and no earlier fetch recorded one: give it")]
+    /// A value is neither in the request nor recorded by an earlier fetch.
+    #[error("no {what} is given, and no earlier fetch recorded one; {advice}")]
     NotGiven {
-        /// What is missing.
+        /// The missing value.
         what: &'static str,
+        /// How to give it.
+        advice: &'static str,
     },
-    /// The address is none.
-    #[error("{from:?} is no address of a store: {what}; expected something like http://host:port")]
+    /// The address is invalid.
+    #[error("{from:?} is not the address of a store: {what}; give one like http://host:port")]
     Address {
         /// The address.
         from: String,
@@ -33,24 +35,24 @@ pub enum FetchError {
     /// The cache cannot be read.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// The server or the way to it.
+    /// The server or the network failed.
     #[error(
-        "{url}: {failure} ({attempts} attempts); check the address and the connection, then fetch again: what came in is kept"
+        "{url}: {failure} ({attempts} attempts); check the address and the connection, then fetch again: bytes received so far are kept"
     )]
     Download {
-        /// What was asked for.
+        /// The URL requested.
         url: String,
         /// Attempts in a row.
         attempts: u32,
         /// Why the last one failed.
         failure: DownloadFailure,
     },
-    /// The manifest is refused.
+    /// The manifest is invalid.
     #[error(transparent)]
     Manifest(#[from] ManifestError),
-    /// The manifest is older than one that was accepted.
+    /// The manifest is older than one accepted before.
     #[error(
-        "scene {scene:?} is offered as generation {offered}, generation {seen} was accepted before: an old manifest is being replayed, or the store was restored from a backup; publish a newer one"
+        "scene {scene:?}: the store offers generation {offered}, but generation {seen} was accepted before. An old manifest is being replayed, or the store was restored from a backup; publish a newer generation"
     )]
     Rollback {
         /// The scene.
@@ -60,9 +62,9 @@ pub enum FetchError {
         /// Generation offered.
         offered: u64,
     },
-    /// The scene speaks another embedding space.
+    /// The scene uses another embedding space.
     #[error(
-        "the scene was encoded by {found}, expected is {expected}; use that model, or have the scene encoded again"
+        "the scene was encoded with encoder {found}, expected {expected}; use that model, or have the scene encoded again"
     )]
     Encoder {
         /// Encoder expected.
@@ -70,28 +72,30 @@ pub enum FetchError {
         /// Encoder of the manifest.
         found: Hash32,
     },
-    /// The store signed a shard that no one can use.
-    #[error("shard {hash} has its hash but is no shard of this scene; have the scene published again")]
+    /// The store signed an object that is not a valid shard.
+    #[error(
+        "shard {hash} matches its hash but is not a valid shard of this scene; have the scene published again"
+    )]
     Published {
         /// The shard.
         hash: Hash32,
         /// What is wrong.
         source: Box<StoreError>,
     },
-    /// No plan.
+    /// The fetch cannot be planned.
     #[error(transparent)]
     Plan(#[from] PlanError),
-    /// Without network it cannot be done.
-    #[error("{n_shards} shards ({bytes} bytes) are not on board: fetch with network")]
+    /// Shards are missing, and the network may not be used.
+    #[error("{n_shards} shards ({bytes} bytes) are not on board; fetch with network")]
     Offline {
         /// Shards missing.
         n_shards: usize,
         /// Their bytes.
         bytes: u64,
     },
-    /// No space left.
+    /// The disk is full.
     #[error(
-        "the disk is full: {source}; free {needed_bytes} bytes, or take a smaller radius (what came in was removed)"
+        "the disk is full: {source}; free {needed_bytes} bytes, or fetch a smaller radius (partial downloads were removed)"
     )]
     DiskFull {
         /// Bytes of the shards to download.
@@ -103,47 +107,47 @@ pub enum FetchError {
     #[error("{0}; check the cache's folder and its permissions")]
     Io(#[from] io::Error),
     /// The cancel flag was set.
-    #[error("cancelled; fetch again to go on where it ended")]
+    #[error("cancelled; fetch again to resume")]
     Cancelled,
 }
 
-/// Why one attempt failed.
+/// Reasons for a failed attempt.
 #[derive(Debug, thiserror::Error)]
 pub enum DownloadFailure {
-    /// No connection, or it broke.
+    /// The connection failed.
     #[error("{0}")]
     Transport(#[from] Box<ureq::Error>),
     /// The body broke off.
-    #[error("the body ends at byte {found_bytes} of {expected_bytes}")]
+    #[error("the body ended at byte {found_bytes} of {expected_bytes}")]
     Cut {
         /// Length expected.
         expected_bytes: u64,
-        /// Bytes there.
+        /// Bytes received.
         found_bytes: u64,
     },
-    /// The server says no.
-    #[error("the server answers {status}")]
+    /// The server refuses.
+    #[error("the server answered with status {status}")]
     Status {
         /// HTTP status.
         status: u16,
-        /// When it asks to be asked again (429 and 503, `Retry-After` in seconds).
+        /// When to ask again (429 and 503, `Retry-After` in seconds).
         retry_after: Option<Duration>,
     },
-    /// The server sends to another address; shards and manifests are not followed elsewhere.
-    #[error("the server sends to {location:?}; if that is the store, give that address")]
+    /// The server redirects; shards and manifests are not fetched from elsewhere.
+    #[error("the server redirects to {location:?}; if that is the store, fetch from that address")]
     Redirect {
-        /// Where (cut to 200 characters).
+        /// The target (cut to 200 characters).
         location: String,
     },
-    /// The announced length is not the manifest's.
-    #[error("the server announces {found:?} for {expected}")]
+    /// The announced length differs from the manifest's.
+    #[error("the server announces {found:?}, expected {expected}")]
     Length {
-        /// What the request asked for.
+        /// The length requested.
         expected: String,
-        /// Header found.
+        /// The header found.
         found: String,
     },
-    /// The content is not what the hash names.
+    /// The content does not have the expected hash.
     #[error("the content has hash {found}, expected {expected}")]
     Hash {
         /// Hash expected.
@@ -154,7 +158,7 @@ pub enum DownloadFailure {
 }
 
 impl DownloadFailure {
-    /// Whether another attempt may help.
+    /// Returns whether another attempt may help.
     pub(super) fn is_passing(&self) -> bool {
         match self {
             Self::Redirect { .. } => false,

@@ -1,9 +1,9 @@
-//! Following a robot: when it fetches again, so that what lies around it is on board before it is needed.
+//! Following a robot: decides when to fetch, so that shards are on board before they are needed.
 //!
-//! A fetch covers `radius + margin` around the robot. The next one is due when the robot is farther than
-//! half the margin from that centre, so it has the other half left while the shards come in; what lies
-//! within `radius` of it is on board all the while. A robot that goes to and fro within the half margin,
-//! along the edge of a cell or not, neither downloads nor frees anything.
+//! A fetch covers `radius + margin` around the robot. The next one is due when the robot is farther than half
+//! the margin from that centre: the other half of the margin is left while shards arrive, and everything
+//! within `radius` stays on board. A robot that moves to and fro within half the margin, along a cell's edge
+//! or not, neither downloads nor frees anything.
 
 use std::io::{self, BufRead, Read};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -20,19 +20,19 @@ use super::report::FetchReport;
 use super::request::{DEFAULT_RADIUS, FetchRequest};
 use crate::store::EdgeCache;
 
-/// Longest sleep before the cancel flag is looked at again.
+/// Longest sleep between looks at the cancel flag.
 const NAP: Duration = Duration::from_millis(100);
 
-/// How a robot is followed.
+/// Settings for following a robot.
 #[derive(Clone, Debug)]
 pub struct FollowSettings {
-    /// Cells within this of the robot are on board, as far as the network allows; world units.
+    /// Cells within this distance of the robot are kept on board, as far as the network allows; world units.
     pub radius: f64,
-    /// How much farther is fetched, world units.
+    /// Distance fetched beyond the radius, world units.
     pub margin: f64,
-    /// Fetches do not begin in quicker succession.
+    /// Shortest time between the starts of two fetches.
     pub min_interval: Duration,
-    /// A robot that stays asks for a new generation this often; absent: never.
+    /// Interval at which a resting robot looks for a new generation; absent: never.
     pub refresh: Option<Duration>,
     /// Wait after the first failure; doubled after each further one, and scaled by 0.5..1.5.
     pub first_backoff: Duration,
@@ -53,22 +53,22 @@ impl Default for FollowSettings {
     }
 }
 
-/// What a robot at a place is to do.
+/// What to do next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Decision {
     /// Fetch.
     Fetch,
     /// A fetch is due, but not before this time.
     NotBefore(Duration),
-    /// All is on board; by time alone the next fetch is due then, if ever.
+    /// Everything needed is on board; the next fetch by time is due then, if at all.
     Rest(Option<Duration>),
 }
 
-/// Decides when to fetch. Pure: times are given, counted from any fixed moment.
+/// Decides when to fetch. Pure: times are passed in, relative to any fixed moment.
 #[derive(Clone, Debug)]
 pub struct Follower {
     settings: FollowSettings,
-    /// Centre of the last fetch that worked, and its time.
+    /// Centre and time of the last successful fetch.
     covered: Option<(DVec3, Duration)>,
     attempted: Option<Duration>,
     n_failures: u32,
@@ -76,18 +76,18 @@ pub struct Follower {
 }
 
 impl Follower {
-    /// Starts with nothing known: the first position fetches.
+    /// Makes a follower that fetches at the first position.
     pub fn new(settings: FollowSettings) -> Self {
         Self { settings, covered: None, attempted: None, n_failures: 0, retry_at: Duration::ZERO }
     }
 
-    /// Returns the radius that a fetch asks for, world units.
+    /// Returns the radius to fetch, world units.
     pub fn fetch_radius(&self) -> f64 {
         self.settings.radius + self.settings.margin
     }
 
-    /// Decides for a robot at a place (world frame; absent: on the earth, and no manifest says where that
-    /// is in the scene).
+    /// Decides for a robot at a position in the world frame; `None` if it is geographic and no manifest
+    /// relates it to the scene.
     pub fn decide(&self, now: Duration, at: Option<DVec3>) -> Decision {
         let slack = self.settings.margin / 2.0;
         let rest = match (self.covered, at) {
@@ -108,13 +108,13 @@ impl Follower {
         }
     }
 
-    /// Notes that a fetch that began then worked.
+    /// Records a successful fetch and its start.
     pub fn fetched(&mut self, began: Duration, centre_in_world: DVec3) {
         (self.covered, self.attempted) = (Some((centre_in_world, began)), Some(began));
         (self.n_failures, self.retry_at) = (0, Duration::ZERO);
     }
 
-    /// Notes that a fetch that began at one time failed at another; `random` is within 0..1.
+    /// Records a failed fetch, its start and its end; `random` is within 0..1.
     pub fn failed(&mut self, began: Duration, now: Duration, random: f64) {
         self.attempted = Some(began);
         let doubled = self.settings.first_backoff.saturating_mul(1 << self.n_failures.min(16));
@@ -124,16 +124,16 @@ impl Follower {
     }
 }
 
-/// How following goes on, for people and monitors.
+/// Status of following, for people and monitors.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct FollowStatus {
-    /// Where the robot was said to be last.
+    /// The robot's last known position.
     pub position: Option<Position>,
-    /// Fetches that worked.
+    /// Successful fetches.
     pub n_fetches: u64,
-    /// Fetches that failed.
+    /// Failed fetches.
     pub n_failures: u64,
-    /// Why the last fetch failed; absent if it worked.
+    /// Error of the last fetch; absent if it succeeded.
     pub last_error: Option<String>,
 }
 
@@ -144,7 +144,7 @@ struct Inbox {
     is_over: bool,
 }
 
-/// Where positions are posted, from any thread; the last one counts.
+/// Receives positions from any thread; only the last one counts.
 #[derive(Default)]
 pub struct Following {
     inbox: Mutex<Inbox>,
@@ -152,7 +152,7 @@ pub struct Following {
 }
 
 impl Following {
-    /// Says where the robot is.
+    /// Posts the robot's position.
     pub fn post(&self, position: Position) {
         let mut inbox = self.lock();
         inbox.status.position = Some(position);
@@ -160,13 +160,13 @@ impl Following {
         self.changed.notify_all();
     }
 
-    /// Says that no more positions come.
+    /// Ends the positions.
     pub fn close(&self) {
         self.lock().is_over = true;
         self.changed.notify_all();
     }
 
-    /// Returns how it goes on.
+    /// Returns the status.
     pub fn status(&self) -> FollowStatus {
         self.lock().status.clone()
     }
@@ -175,7 +175,7 @@ impl Following {
         self.inbox.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Waits for a position beyond `n_seen`, the end, or at most a while.
+    /// Waits for a position after `n_seen`, for the end, or for the timeout.
     fn wait(&self, n_seen: u64, at_most: Duration) {
         let is_quiet = |inbox: &mut Inbox| inbox.n_posted == n_seen && !inbox.is_over;
         drop(self.changed.wait_timeout_while(self.lock(), at_most, is_quiet));
@@ -193,23 +193,23 @@ impl Following {
     }
 }
 
-/// What following takes from outside.
+/// The surroundings of following.
 pub struct FollowEnvironment<'a> {
     /// Makes one fetch.
     pub fetch: &'a mut dyn FnMut(&FetchRequest) -> Result<FetchReport, FetchError>,
-    /// Is told how each fetch ended.
+    /// Receives the outcome of each fetch.
     pub tell: &'a mut dyn FnMut(&Result<FetchReport, FetchError>),
-    /// Gives numbers within 0..1, to spread retries.
+    /// Returns numbers within 0..1, to spread retries.
     pub random: &'a dyn Fn() -> f64,
-    /// Set by anyone who wants it to end.
+    /// Set to end following.
     pub cancel: &'a AtomicBool,
 }
 
-/// Follows the positions that are posted until they end and the last one is served, or until cancelled.
-/// `request` says everything but position and radius. Blocks.
+/// Follows the posted positions until they end and the last one is served, or until cancelled. `request`
+/// gives everything except position and radius. Blocks.
 ///
 /// # Errors
-/// That of the last fetch, if it was still due when positions ended; [`FetchError::Cancelled`].
+/// The error of the last fetch, if it was still due when positions ended; [`FetchError::Cancelled`].
 pub fn follow(
     cache: &EdgeCache,
     request: &FetchRequest,
@@ -239,7 +239,7 @@ pub fn follow(
         match follower.decide(now, in_world(position, manifest.as_ref())) {
             Decision::Fetch => {}
             Decision::Rest(_) if is_over => return Ok(()),
-            // At the end nothing more is posted, so there is nobody to be woken by.
+            // After the end nothing is posted, so nothing would end a wait.
             Decision::NotBefore(at) if is_over => {
                 std::thread::sleep(at.saturating_sub(now).min(NAP));
                 continue;
@@ -260,7 +260,7 @@ pub fn follow(
         match outcome {
             Ok(report) => {
                 follower.fetched(now, report.centre_in_world);
-                // Only for the geo-reference: without it every position on the earth fetches.
+                // Needed for its geo-reference only; without it every geographic position fetches.
                 manifest = cache.read_manifest(report.manifest_hash, report.key).ok();
             }
             Err(FetchError::Cancelled) => return Err(FetchError::Cancelled),
@@ -278,11 +278,11 @@ fn in_world(position: Position, manifest: Option<&Manifest>) -> Option<DVec3> {
     }
 }
 
-/// Reads positions, one a line, until the end; empty lines are passed over, overlong ones are not kept.
-/// `each` gets the line's number, from 1.
+/// Reads positions, one a line, until the end. Skips empty lines; overlong ones are not stored. `each`
+/// receives the line number, from 1.
 ///
 /// # Errors
-/// Whatever the reader gives.
+/// Errors of the reader.
 pub fn read_positions(
     mut reader: impl BufRead,
     mut each: impl FnMut(u64, Result<Position, NotAPosition>),
@@ -290,7 +290,7 @@ pub fn read_positions(
     let mut line = Vec::new();
     for number in 1.. {
         line.clear();
-        // One byte more than may be: then it is too long, and refused as that.
+        // One byte more than allowed, so that an overlong line is recognised and refused.
         let limit = MAX_TEXT_BYTES as u64 + 1;
         if reader.by_ref().take(limit).read_until(b'\n', &mut line)? == 0 {
             break;
@@ -341,7 +341,7 @@ mod tests {
         assert_eq!(follower.decide(secs(1), x(-4.1)), Decision::NotBefore(secs(2)));
         assert_eq!(follower.decide(secs(2), x(-4.1)), Decision::Fetch);
         assert_eq!(follower.decide(secs(100), x(0.0)), Decision::Fetch);
-        // Failures: 4, 8, 16, 20, 20 s, halved and more by chance; coming back needs no fetch at all.
+        // Failures: 4, 8, 16, 20, 20 s, scaled at random; returning to the covered area needs no fetch.
         let mut at = secs(10);
         for backoff in [4, 8, 16, 20, 20] {
             follower.failed(at, at, 0.5);
@@ -361,8 +361,8 @@ mod tests {
     }
 
     proptest! {
-        /// Wherever a robot goes: what lies within the radius is covered by the last fetch whenever none
-        /// is due, and fetches keep their distance in time.
+        /// Wherever a robot goes, the last fetch covers the radius whenever none is due, and fetches keep
+        /// their minimum interval.
         #[test]
         fn the_radius_is_covered_whenever_nothing_is_due(
             steps in prop::collection::vec((prop::array::uniform3(-3.0..3.0f64), 0..5u64, prop::bool::weighted(0.2)), 1..200),

@@ -2,24 +2,24 @@
 
 use std::time::Duration;
 
-/// Patience with a server and with the way to it.
+/// Network timeouts and retry limits.
 #[derive(Clone, Debug)]
 pub struct NetworkLimits {
-    /// Failures in a row, without progress, after which a download is given up.
+    /// Failures in a row, without progress, before a download is given up.
     pub attempts: u32,
     /// Wait after the first failure; doubled after each further one, and scaled by 0.5..1.5.
     pub first_backoff: Duration,
     /// Longest wait.
     pub longest_backoff: Duration,
-    /// The longest wait that a server may ask for (`Retry-After`); it is waited beside the backoff.
+    /// Longest `Retry-After` accepted; it is added to the backoff.
     pub longest_retry_after: Duration,
-    /// Time for name resolution and for connecting, each.
+    /// Timeout for name resolution and for connecting, each.
     pub connect_timeout: Duration,
-    /// Time without a byte.
+    /// Longest time without a byte.
     pub read_timeout: Duration,
-    /// A body that comes in slower than this on average is broken off (and resumed).
+    /// Downloads slower than this on average are interrupted (and resumed).
     pub slowest_bytes_per_sec: u64,
-    /// Bytes received between two writes; a retry counts as progress after as many.
+    /// Bytes between two writes; a retry that gained as many counts as progress.
     pub chunk_bytes: usize,
 }
 

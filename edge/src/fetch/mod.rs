@@ -1,15 +1,15 @@
-//! Fetch: brings the shards around the robot on board, and frees what it left behind.
+//! Fetch: brings the shards around the robot on board and frees those it left behind.
 //!
-//! A cut at any moment leaves the old or the new generation, whole: nothing that `current` names is
-//! touched before the new `current` is durable, and nothing counts that was not verified. In order:
+//! An interruption at any moment leaves the old or the new generation, whole: nothing named by `current` is
+//! touched before the new `current` is durable, and nothing unverified is used. In order:
 //!
-//! 0. lock; what a killed fetch has renamed is made durable before anything builds on it
+//! 0. lock; files renamed by a killed fetch are made durable before anything builds on them
 //! 1. manifest: signature, expiry, generation, encoder; key, generation and request are recorded
-//! 2. room: shards that neither the old nor the new generation needs are removed
+//! 2. space: shards that neither the old nor the new generation needs are removed
 //! 3. each missing shard: staged, synced, hashed, checked, renamed into `shards/`; folder synced
 //! 4. manifest: staged, synced, renamed into `manifests/`; folder synced
-//! 5. `current`: written aside, synced, renamed; folder synced: this is the flip
-//! 6. what only the old generation needed is removed
+//! 5. `current`: written aside, synced, renamed; folder synced: this switches generations
+//! 6. shards and manifests that only the old generation needed are removed
 
 mod download;
 mod environment;

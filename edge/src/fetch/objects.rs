@@ -1,4 +1,4 @@
-//! Shards on their way on board: downloaded several at a time, checked against the manifest, renamed into place.
+//! Downloads shards, several at a time, checks them against the manifest and renames them into place.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -15,10 +15,10 @@ use super::plan::Object;
 use super::staging::part_path;
 use crate::store::{self, CurrentCell, EdgeCache, StoreError};
 
-/// More connections than this help no one.
+/// Most connections at a time.
 const MAX_PARALLEL: usize = 64;
 
-/// What an object must be, beyond having its hash.
+/// Checks of an object beyond its hash.
 pub struct Check<'a> {
     manifest: &'a Manifest,
     profile: Profile,
@@ -30,7 +30,7 @@ impl<'a> Check<'a> {
         Self { manifest, profile, cells: cells.iter().map(|cell| (cell.hash, cell)).collect() }
     }
 
-    /// Checks that bytes are what the manifest says of the object: the shard of its cell.
+    /// Checks that bytes are the shard that the manifest describes.
     fn object(&self, path: &Path, hash: Hash32, bytes: &[u8]) -> Result<(), StoreError> {
         match self.cells.get(&hash) {
             Some(cell) => store::check_shard(path, bytes, cell, self.profile, self.manifest).map(drop),
@@ -39,8 +39,8 @@ impl<'a> Check<'a> {
     }
 }
 
-/// Returns the objects a plan keeps that are damaged, or not what the manifest says: they must not get
-/// behind `current`, and are downloaded again.
+/// Returns the objects of a plan that are damaged or differ from the manifest. They are downloaded again, so
+/// that `current` never names them.
 pub fn unfit_objects(cache: &EdgeCache, check: &Check<'_>, kept: &BTreeSet<Hash32>) -> BTreeSet<Hash32> {
     let is_unfit = |hash: &Hash32| {
         let path = cache.shard_path(*hash);
@@ -52,14 +52,14 @@ pub fn unfit_objects(cache: &EdgeCache, check: &Check<'_>, kept: &BTreeSet<Hash3
     unfit
         .into_iter()
         .map(|(hash, e)| {
-            tracing::warn!("a shard on board is downloaded again: {}", crate::error_line::error_line(&e));
+            tracing::warn!("downloading a shard again: {}", crate::error_line::error_line(&e));
             hash
         })
         .collect()
 }
 
-/// Downloads objects, several at a time, and puts them in place, durably. Of several failures the one of
-/// the first object in order is returned.
+/// Downloads objects, several at a time, and puts them in place durably. Of several errors, returns that of
+/// the first object.
 pub fn download_all(
     cache: &EdgeCache,
     client: &Client<'_>,

@@ -1,4 +1,4 @@
-//! The manifest that a store offers, and whose word is taken for it.
+//! Verifies an offered manifest: keys, expiry, rollback, encoder.
 
 use slag_common::Hash32;
 use slag_common::manifest::{self, Manifest, TrustedKeys};
@@ -9,19 +9,19 @@ use super::records::{Records, RecordsError};
 use super::request::FetchRequest;
 use crate::store::{Current, EdgeCache};
 
-/// Which keys are accepted.
+/// The keys accepted.
 ///
-/// A robot that accepted a key accepts its named successor too. Once the successor has signed a manifest,
-/// the old key is refused, also where it is still named on a command line.
+/// A robot that accepted a key also accepts the successor named by it. Once the successor has signed a
+/// manifest, the old key is refused, even if a command line still names it.
 pub(super) struct Trust {
-    /// None: the first contact.
+    /// Empty at the first contact.
     accepted: Vec<Hash32>,
-    /// Keys and their successors, all accepted: those named by a manifest, and those told.
+    /// Keys and their accepted successors: those named by a manifest, and those given in the request.
     changes: Vec<(Hash32, Hash32)>,
 }
 
 impl Trust {
-    /// Decides from the keys that were asked for, the records, and, where they are lost or behind, the
+    /// Determines the accepted keys from the request, the records and, if these are lost or behind, the
     /// generation on board.
     pub fn new(
         asked: &[Hash32],
@@ -32,12 +32,12 @@ impl Trust {
         let of_offer = |offer: &Offer| (offer.key, offer.manifest.next_key);
         let held = records.keys()?.or(on_board.map(of_offer)).or(old.map(|old| (old.key, None)));
         let held = match (held, on_board) {
-            // The flip was made, the records of it are lost.
+            // The generation was switched, but the records of it are lost.
             (Some((_, Some(next))), Some(offer)) if offer.key == next => Some(of_offer(offer)),
             (held, _) => held,
         };
         let held = match held {
-            // A power cut between the records of a change.
+            // A power cut came between the records of a key change.
             Some((key, next)) => match records.successor(key)? {
                 successor if successor == key => Some((key, next)),
                 successor => Some((successor, None)),
@@ -64,12 +64,12 @@ impl Trust {
         Ok(Self { accepted, changes })
     }
 
-    /// Whether any key will be accepted.
+    /// Returns whether any key will be accepted.
     pub fn is_first_contact(&self) -> bool {
         self.accepted.is_empty()
     }
 
-    /// Returns the key whose place a key takes by signing.
+    /// Returns the key that a signature by this key replaces.
     pub fn replaced_by(&self, key: Hash32) -> Option<Hash32> {
         self.changes.iter().find(|(_, next)| *next == key).map(|(old, _)| *old)
     }
@@ -82,7 +82,7 @@ impl Trust {
     }
 }
 
-/// A manifest with a good signature.
+/// A manifest with a valid signature.
 pub(super) struct Offer {
     pub bytes: Vec<u8>,
     pub manifest_hash: Hash32,
@@ -91,7 +91,7 @@ pub(super) struct Offer {
 }
 
 impl Offer {
-    /// Reads the manifest that `current` names; `None` if it is not what it should be.
+    /// Reads the manifest that `current` names; `None` if it is missing or invalid.
     pub fn on_board(cache: &EdgeCache, old: &Current) -> Option<Self> {
         let manifest_hash = old.manifest_hash;
         let bytes = cache.files().read(&cache.manifest_path(manifest_hash), manifest::MAX_BYTES).ok()?;
@@ -99,7 +99,7 @@ impl Offer {
         (Hash32::of(&bytes) == manifest_hash).then_some(Self { bytes, manifest_hash, manifest, key })
     }
 
-    /// Gets the store's manifest, or, offline, that on board.
+    /// Downloads the store's manifest; offline, takes the one on board.
     pub fn get(
         client: &Client<'_>,
         offline: bool,
@@ -113,13 +113,15 @@ impl Offer {
         let bytes = match (answer, on_board) {
             (ManifestAnswer::New(bytes), _) => bytes,
             (ManifestAnswer::Unchanged, Some(offer)) => offer.bytes.clone(),
-            (ManifestAnswer::Unchanged, None) => return Err(FetchError::NotGiven { what: "manifest" }),
+            (ManifestAnswer::Unchanged, None) => {
+                return Err(FetchError::NotGiven { what: "manifest", advice: "fetch once with network" });
+            }
         };
         let (manifest, key) = Manifest::verify(&bytes, &trust.keys())?;
         Ok(Self { manifest_hash: Hash32::of(&bytes), bytes, manifest, key })
     }
 
-    /// Refuses what is expired, older than what was accepted before, or of another encoder.
+    /// Refuses a manifest that is expired, older than one accepted before, or of another encoder.
     pub fn check(
         &self,
         records: &Records,
@@ -130,9 +132,9 @@ impl Offer {
     ) -> Result<(), FetchError> {
         self.manifest.check_expiry(now_unix_secs)?;
         let (scene, offered) = (&self.manifest.scene, self.manifest.generation);
-        // A successor goes on counting where its predecessor was.
+        // A successor continues the generation count of its predecessor.
         let same_signer = |key: Hash32| key == self.key || trust.accepted.contains(&key);
-        // The records may have been lost; the manifest on board says it too.
+        // The records may be lost; the manifest on board holds its generation too.
         let on_board = on_board.filter(|old| same_signer(old.key) && old.manifest.scene == *scene);
         let mut seen = on_board.map(|old| old.manifest.generation);
         for key in trust.accepted.iter().chain([&self.key]) {

@@ -1,4 +1,4 @@
-//! What a fetch does: which cells, which shards to download, keep and free. Pure functions.
+//! Plans a fetch: which cells are needed, and which shards to download, keep and free. Pure functions.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -15,24 +15,24 @@ use crate::store::CurrentCell;
 pub struct Held {
     /// Length of the file.
     pub len_bytes: u64,
-    /// Number of the fetch that last needed it.
+    /// Number of the last fetch that needed it.
     pub last_used: u64,
 }
 
-/// What is wanted on board.
+/// The set of cells wanted on board.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Wanted {
-    /// Which shard of each cell.
+    /// Profile of the shards.
     pub profile: Profile,
     /// Where the robot is.
     pub centre_in_world: DVec3,
-    /// How far cells matter, world units.
+    /// Cells within this distance are needed, world units.
     pub radius: f64,
-    /// Bytes that shards may take; absent: twice what the cells within the radius take.
+    /// Byte budget for shards; absent: twice the length of the needed ones.
     pub max_bytes: Option<u64>,
 }
 
-/// A file that a generation needs: content named by its hash.
+/// A content-addressed file that a generation needs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Object {
     /// BLAKE3 of the content.
@@ -46,13 +46,13 @@ pub struct Object {
 pub struct Plan {
     /// The cells within the radius, by id, ascending.
     pub cells: Vec<CurrentCell>,
-    /// What they need and is not on board.
+    /// Needed objects to download.
     pub download: Vec<Object>,
-    /// Objects on board that are needed.
+    /// Needed objects on board.
     pub keep: BTreeSet<Hash32>,
-    /// Objects on board that are not needed but fit the budget, the most recently used.
+    /// Objects on board that are not needed but fit the budget, most recently used first.
     pub spare: BTreeSet<Hash32>,
-    /// Objects on board that do not.
+    /// Objects on board to remove.
     pub free: BTreeSet<Hash32>,
 }
 
@@ -103,7 +103,7 @@ impl Plan {
         others.sort_by_key(|(hash, held)| (std::cmp::Reverse(held.last_used), **hash));
         let mut left_bytes = Some(budget_bytes - needed_bytes);
         for (hash, held) in others {
-            // The first that does not fit ends it: what is less recent than a freed shard is freed too.
+            // The first that does not fit ends this: everything less recent is freed too.
             left_bytes = left_bytes.and_then(|left| left.checked_sub(held.len_bytes));
             match left_bytes {
                 Some(_) => plan.spare.insert(*hash),
@@ -114,7 +114,7 @@ impl Plan {
     }
 }
 
-/// Returns the cells at some positions of a manifest with their shards of a profile.
+/// Returns the cells at the given indices of a manifest with their shards of a profile.
 fn cells_at(
     manifest: &Manifest,
     profile: Profile,
@@ -135,7 +135,7 @@ fn cells_at(
     listed.collect()
 }
 
-/// Returns everything that must be on board before a generation of these cells is made current.
+/// Returns the objects that must be on board before these cells become current.
 fn objects(cells: &[CurrentCell]) -> Result<Vec<Object>, PlanError> {
     let mut seen = BTreeSet::new();
     let object = |cell: &CurrentCell| match seen.insert(cell.hash) {
@@ -204,7 +204,7 @@ mod tests {
     }
 
     proptest! {
-        /// Oracles: distances by brute force; eviction one at a time, the least recent first.
+        /// Oracles: distances by brute force; eviction one at a time, least recent first.
         #[test]
         fn plan_equals_brute_force(
             boxes in prop::collection::vec(
@@ -259,7 +259,7 @@ mod tests {
             prop_assert_eq!(plan.spare, spare);
         }
 
-        /// Oracle: the horizontal position that went in, and brute force over columns apart.
+        /// Oracle: the original horizontal position, and brute force over columns.
         #[test]
         fn latitude_and_longitude_give_the_same_cells(x in 0.0..200.0f64, y in 0.0..10.0f64, z in -5.0..5.0f64) {
             let boxes: Vec<_> = (0..20).map(|i| {

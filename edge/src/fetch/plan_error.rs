@@ -4,52 +4,52 @@ use glam::DVec3;
 use slag_common::Hash32;
 use slag_common::shard::Profile;
 
-/// Why there is no plan.
+/// Reasons for which a fetch cannot be planned.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum PlanError {
-    /// A number that no place has.
-    #[error("{name} is {value}, it must be {expected}")]
+    /// A number is out of range.
+    #[error("{name} is {value}, expected {expected}")]
     Number {
-        /// What it is.
+        /// Name of the number.
         name: &'static str,
         /// Value found.
         value: f64,
-        /// Values possible.
+        /// Values allowed.
         expected: &'static str,
     },
-    /// Latitude and longitude mean nothing in this scene.
-    #[error("scene {scene:?} has no geo-reference: give the position as x, y, z in its world frame")]
+    /// The scene has no geo-reference.
+    #[error("scene {scene:?} has no geo-reference; give the position as x, y, z in its world frame")]
     NoGeoReference {
         /// The scene.
         scene: String,
     },
-    /// The place is elsewhere.
+    /// No cell is within the radius.
     #[error(
-        "no cell of scene {scene:?} within {radius} of {centre_in_world}, the nearest is {nearest:.1} away; check the position or take a larger radius"
+        "scene {scene:?} has no cell within {radius} of {centre_in_world}, the nearest is {nearest:.1} away; check the position or increase the radius"
     )]
     NoCells {
         /// The scene.
         scene: String,
-        /// Where cells were looked for.
+        /// Centre of the search.
         centre_in_world: DVec3,
-        /// How far.
+        /// Radius of the search.
         radius: f64,
         /// Distance of the nearest cell; infinite in a scene without cells.
         nearest: f64,
     },
-    /// The encoder did not write this profile.
-    #[error("cell {cell_id} has no {profile} shard; it has: {available}")]
+    /// The store has no shard of this profile.
+    #[error("cell {cell_id} has no {profile} shard; it has: {available}; fetch one of those profiles")]
     NoProfile {
         /// The cell.
         cell_id: u32,
         /// Profile asked for.
         profile: Profile,
-        /// Profiles there, separated by commas.
+        /// Available profiles, separated by commas.
         available: String,
     },
-    /// More than the robot may hold.
+    /// The needed shards exceed the byte budget.
     #[error(
-        "the {n_cells} cells take {needed_bytes} bytes, allowed are {max_bytes}; take a smaller radius or a smaller profile"
+        "the {n_cells} cells need {needed_bytes} bytes, the limit is {max_bytes}; choose a smaller radius or profile, or raise the limit"
     )]
     TooLarge {
         /// Cells within the radius.
@@ -59,9 +59,9 @@ pub enum PlanError {
         /// Bytes allowed.
         max_bytes: u64,
     },
-    /// The manifest contradicts itself.
+    /// The manifest lists one shard for two cells.
     #[error(
-        "the manifest gives cell {cell_id} the shard of another cell, {hash}; have the scene published again"
+        "the manifest lists shard {hash} for cell {cell_id} and for another cell; have the scene published again"
     )]
     Conflict {
         /// The second cell.

@@ -1,4 +1,4 @@
-//! Where the robot is, and how people and programs say it.
+//! Positions of a robot, and their text forms.
 
 use std::str::FromStr;
 
@@ -9,31 +9,31 @@ use slag_common::manifest::Manifest;
 
 use super::plan_error::PlanError;
 
-/// Longest text that can be a position.
+/// Longest text of a position.
 pub const MAX_TEXT_BYTES: usize = 256;
 
-/// Where the robot is.
+/// Position of a robot.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Position {
-    /// World frame.
+    /// In the world frame.
     World(DVec3),
-    /// On the earth; needs a geo-referenced scene.
+    /// Geographic; needs a geo-referenced scene.
     Geographic {
         /// Latitude, degrees, north positive (WGS 84).
         latitude_deg: f64,
         /// Longitude, degrees, east positive.
         longitude_deg: f64,
-        /// Height in metres, in the datum of the scene's origin; absent: at the scene's own height
-        /// there (see [`Position::in_world`]).
+        /// Height in metres, in the datum of the scene's origin; absent: the scene's own height there (see
+        /// [`Position::in_world`]).
         height_m: Option<f64>,
     },
 }
 
-/// A text that is no position.
+/// A text is not a position.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "{found:?} is no position; expected `x y z`, `lat,lon[,height]`, {{\"x\":..,\"y\":..,\"z\":..}} or {{\"lat\":..,\"lon\":..,\"height\":..}}"
+    "{found:?} is not a position; expected `x y z`, `lat,lon[,height]`, {{\"x\":..,\"y\":..,\"z\":..}} or {{\"lat\":..,\"lon\":..,\"height\":..}}"
 )]
 pub struct NotAPosition {
     /// The text, cut to 80 characters.
@@ -51,8 +51,8 @@ enum Spoken {
 impl FromStr for Position {
     type Err = NotAPosition;
 
-    /// Reads `x y z` (world frame), `lat,lon[,height]` (degrees, metres), or either as a JSON object.
-    /// Degrees are checked, numbers are finite.
+    /// Parses `x y z` (world frame), `lat,lon[,height]` (degrees, metres), or either as a JSON object.
+    /// Numbers must be finite, degrees in range.
     fn from_str(text: &str) -> Result<Self, NotAPosition> {
         let refuse = || NotAPosition { found: text.trim().chars().take(80).collect() };
         if text.len() > MAX_TEXT_BYTES {
@@ -92,11 +92,11 @@ impl FromStr for Position {
 }
 
 impl Position {
-    /// Returns the position in the world frame.
+    /// Converts the position to the world frame.
     ///
-    /// A geographic position without a height is put at the height of the centre of the box that is
-    /// horizontally nearest (then whose centre is, then of the lowest id), so that a robot that knows
-    /// only latitude and longitude gets the cells around it wherever the scene's zero height lies.
+    /// A geographic position without a height gets the height of the nearest cell's centre, by horizontal
+    /// distance to its box, then to its centre, then by id. A robot that knows only latitude and longitude
+    /// thus gets the cells around it, wherever the scene's zero height lies.
     ///
     /// # Errors
     /// [`PlanError::Number`], [`PlanError::NoGeoReference`].
@@ -132,8 +132,7 @@ impl Position {
     }
 }
 
-/// Returns the z of the centre of the cell that is horizontally nearest; that of the point where there
-/// is no cell.
+/// Returns the z of the centre of the horizontally nearest cell, or of the point if there is no cell.
 fn scene_height(manifest: &Manifest, point: DVec3) -> f64 {
     let rank = |bounds: &Aabb| {
         let flat = Aabb { min: bounds.min.with_z(0.0), max: bounds.max.with_z(0.0) };

@@ -1,4 +1,4 @@
-//! The fetcher's small records, in sled. Its lock is the cache's: one fetch at a time.
+//! Records of earlier fetches, in sled. The database's lock also ensures one fetch at a time.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -9,31 +9,31 @@ use slag_common::manifest::Manifest;
 
 use super::position::Position;
 
-/// Pages kept in memory: the records are a few kilobytes.
+/// sled's page cache; the records take a few kilobytes.
 const CACHE_BYTES: u64 = 1 << 20;
-/// A fetch that has just ended may hold the lock for an instant more: sled lets go of it on a thread of its own.
+/// A fetch that just ended may hold the lock a moment longer: sled releases it on a thread of its own.
 const LOCK_PATIENCE: Duration = Duration::from_secs(2);
 const LOCK_PAUSE: Duration = Duration::from_millis(20);
 
-/// Why the records cannot be used.
+/// Reasons for which the records cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordsError {
-    /// Another fetch has them open.
-    #[error("another fetch works on {path}: wait for it or end it", path = path.display())]
+    /// Another fetch holds the lock.
+    #[error("another fetch uses {path}; wait for it or end it", path = path.display())]
     Busy {
         /// The records' folder.
         path: PathBuf,
     },
-    /// The database's error.
-    #[error("{path}: {source}; check disk space and permissions, or delete the folder and fetch again naming the source", path = path.display())]
+    /// The database failed.
+    #[error("{path}: {source}; check disk space and permissions, or delete the folder and fetch again with --from URL", path = path.display())]
     Database {
         /// The records' folder.
         path: PathBuf,
-        /// What went wrong.
+        /// Its error.
         source: sled::Error,
     },
-    /// A record is not what fetch writes.
-    #[error("{path}: record {record:?} is damaged; delete the folder and fetch again naming the source", path = path.display())]
+    /// A record is damaged.
+    #[error("{path}: record {record:?} is damaged; delete the folder and fetch again with --from URL", path = path.display())]
     Damaged {
         /// The records' folder.
         path: PathBuf,
@@ -42,12 +42,12 @@ pub enum RecordsError {
     },
 }
 
-/// What the last fetch was asked for.
+/// The request of the last fetch.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LastFetch {
     /// The store's address.
     pub from: String,
-    /// The place.
+    /// The position.
     pub at: Position,
 }
 
@@ -57,18 +57,18 @@ pub struct Records {
     db: sled::Db,
     generations: sled::Tree,
     used: sled::Tree,
-    /// Keys that are no longer accepted, and which one took their place.
+    /// Keys that are no longer accepted, and their successors.
     successors: sled::Tree,
 }
 
-/// A key change takes effect when its chain is this short; a longer one is damage.
+/// Longest chain of key changes; a longer one is damage.
 const MAX_SUCCESSORS: usize = 1000;
 
 impl Records {
-    /// Opens the records, or makes them; holds the lock until dropped.
+    /// Opens or creates the records; holds the lock until dropped.
     ///
     /// # Errors
-    /// [`RecordsError`]; so for every operation here.
+    /// [`RecordsError`], as for every operation here.
     pub fn open(path: &Path) -> Result<Self, RecordsError> {
         let config = sled::Config::new().path(path).cache_capacity(CACHE_BYTES).flush_every_ms(None);
         let start = Instant::now();
@@ -82,7 +82,7 @@ impl Records {
             let path = path.to_owned();
             match opened {
                 Ok(records) => return Ok(records),
-                // sled has no variant of its own for this.
+                // sled has no error variant for this.
                 Err(sled::Error::Io(e)) if e.to_string().contains("could not acquire lock") => {
                     if start.elapsed() > LOCK_PATIENCE {
                         return Err(RecordsError::Busy { path });
@@ -94,19 +94,19 @@ impl Records {
         }
     }
 
-    /// Returns what the last fetch was asked for.
+    /// Returns the request of the last fetch.
     pub fn last(&self) -> Result<Option<LastFetch>, RecordsError> {
         let bytes = self.db.get("last").map_err(|e| self.database(e))?;
         bytes.map(|bytes| serde_json::from_slice(&bytes).map_err(|_| self.damaged("last"))).transpose()
     }
 
-    /// Returns the accepted key, and the one that it named as its successor.
+    /// Returns the accepted key and its named successor.
     pub fn keys(&self) -> Result<Option<(Hash32, Option<Hash32>)>, RecordsError> {
         let Some(key) = self.hash(&self.db, b"key", "key")? else { return Ok(None) };
         Ok(Some((key, self.hash(&self.db, b"next_key", "next_key")?)))
     }
 
-    /// Returns the key that stands in a key's place now: itself, unless it was changed for another.
+    /// Returns the key that replaced a key, or the key itself.
     pub fn successor(&self, mut key: Hash32) -> Result<Hash32, RecordsError> {
         for _ in 0..MAX_SUCCESSORS {
             match self.hash(&self.successors, &key.0, "successors")? {
@@ -122,13 +122,13 @@ impl Records {
         self.number(&self.generations, &generation_name(key, scene), "generations")
     }
 
-    /// Returns the number of the last fetch that needed a shard; 0 if none is known.
+    /// Returns the number of the last fetch that needed a shard; 0 if unknown.
     pub fn last_used(&self, shard: Hash32) -> Result<u64, RecordsError> {
         Ok(self.number(&self.used, &shard.0, "used")?.unwrap_or(0))
     }
 
-    /// Records durably that a manifest was accepted, and for which request. Where its key takes the
-    /// place of others, they are no longer accepted.
+    /// Durably records an accepted manifest and the request for it. Keys that its key replaces are no longer
+    /// accepted.
     pub fn accept(
         &self,
         last: &LastFetch,
@@ -137,8 +137,8 @@ impl Records {
         replaced: &[Hash32],
     ) -> Result<(), RecordsError> {
         let last = serde_json::to_vec(last).map_err(|_| self.damaged("last"))?;
-        // Whatever part of this a power cut leaves, in this order: the old key is never accepted again
-        // once the new one is, and never for less than was seen.
+        // In this order: whatever part survives a power cut, the old key is not accepted once the new one is,
+        // and the new one never for an older generation than was seen.
         let write = || {
             let generation = manifest.generation.to_le_bytes();
             self.generations.insert(generation_name(key, &manifest.scene), &generation)?;
@@ -159,7 +159,7 @@ impl Records {
         write().map(drop).map_err(|e| self.database(e))
     }
 
-    /// Records which shards a fetch needed and which it freed.
+    /// Records the shards that a fetch needed and those it freed.
     pub fn finish(
         &self,
         needed: impl Iterator<Item = Hash32>,

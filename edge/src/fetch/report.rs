@@ -1,16 +1,16 @@
-//! What a fetch did.
+//! Report of a fetch.
 
 use glam::DVec3;
 use serde::Serialize;
 use slag_common::Hash32;
 use slag_common::shard::Profile;
 
-/// Some shards.
+/// Number and length of some shards.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Tally {
     /// Shards.
     pub n_shards: usize,
-    /// Their length.
+    /// Their total length.
     pub bytes: u64,
 }
 
@@ -23,7 +23,7 @@ impl Tally {
     }
 }
 
-/// What a fetch did.
+/// Report of a fetch.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct FetchReport {
     /// The scene.
@@ -32,13 +32,13 @@ pub struct FetchReport {
     pub generation: u64,
     /// BLAKE3 of the signed manifest.
     pub manifest_hash: Hash32,
-    /// The public key that signed it.
+    /// Public key of its signature.
     pub key: Hash32,
-    /// The key that it names as its successor; accepted from now on, too.
+    /// The successor that the key names; accepted from now on as well.
     pub next_key: Option<Hash32>,
-    /// The key whose place this one took: no longer accepted from now on.
+    /// The key that this one replaced; refused from now on.
     pub replaced_key: Option<Hash32>,
-    /// Whether the key was accepted just because it was the first.
+    /// Whether the key was accepted because it was the first.
     pub is_first_contact: bool,
     /// The encoder whose text model answers queries.
     pub encoder_id: Hash32,
@@ -46,21 +46,21 @@ pub struct FetchReport {
     pub encoder_name: String,
     /// The profile of the shards.
     pub profile: Profile,
-    /// The centre, world frame.
+    /// Centre, world frame.
     pub centre_in_world: DVec3,
-    /// The radius, world units.
+    /// Radius, world units.
     pub radius: f64,
     /// Cells within it.
     pub n_cells: usize,
-    /// Shards that came in.
+    /// Shards downloaded.
     pub downloaded: Tally,
-    /// Shards that were on board and are needed.
+    /// Needed shards that were on board already.
     pub kept: Tally,
-    /// Shards that are not needed but fit the budget.
+    /// Shards on board that are not needed but fit the budget.
     pub spare: Tally,
-    /// Shards that were removed.
+    /// Shards removed.
     pub freed: Tally,
-    /// Bytes of the downloaded shards that an interrupted fetch had left.
+    /// Bytes of the downloaded shards left by an interrupted fetch.
     pub resumed_bytes: u64,
     /// Attempts beyond the first.
     pub retries: u64,

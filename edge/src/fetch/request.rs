@@ -1,36 +1,36 @@
-//! What a fetch is asked for.
+//! Parameters of a fetch.
 
 use slag_common::Hash32;
 use slag_common::shard::Profile;
 
 use super::position::Position;
 
-/// Radius unless one is given, world units.
+/// Default radius, world units.
 pub const DEFAULT_RADIUS: f64 = 50.0;
-/// Downloads at a time unless a number is given.
+/// Default number of parallel downloads.
 pub const DEFAULT_PARALLEL: usize = 4;
 
-/// What to fetch.
+/// Parameters of a fetch.
 #[derive(Clone, Debug)]
 pub struct FetchRequest {
     /// Address of the store (`http://` or `https://`); absent: that of the last fetch.
     pub from: Option<String>,
-    /// Where the robot is; absent: where it was at the last fetch.
+    /// Position of the robot; absent: that of the last fetch.
     pub at: Option<Position>,
-    /// How far cells matter, world units.
+    /// Cells within this distance are fetched, world units.
     pub radius: f64,
-    /// How much each shard carries.
+    /// Profile of the shards.
     pub profile: Profile,
-    /// The only keys accepted, or those that have taken their places since; empty: the one accepted
-    /// before, or, at the first contact, the server's. A key's named successor is accepted with it.
+    /// The only keys accepted, or their replacements; empty: the key accepted before or, at the first
+    /// contact, the server's. The successor that a key names is accepted with it.
     pub keys: Vec<Hash32>,
     /// The only encoder accepted; absent: any.
     pub expected_encoder: Option<Hash32>,
-    /// Bytes that shards may take; absent: twice what the cells within the radius take.
+    /// Byte budget for shards; absent: twice the length of the needed ones.
     pub max_bytes: Option<u64>,
-    /// Downloads at a time.
+    /// Parallel downloads.
     pub parallel: usize,
-    /// Plan with the manifest and the shards on board, without network.
+    /// Use the manifest and shards on board only.
     pub offline: bool,
 }
 

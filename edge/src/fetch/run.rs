@@ -1,4 +1,4 @@
-//! One fetch, step by step.
+//! A fetch, step by step.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -18,10 +18,10 @@ use super::request::FetchRequest;
 use super::staging::{clear_manifests, clear_staging, held_shards, put, staging};
 use crate::store::{Current, EdgeCache, StoreError};
 
-/// Brings the shards within a radius on board and frees what is too much.
+/// Fetches the shards within a radius and frees those beyond the budget.
 ///
 /// # Errors
-/// [`FetchError`]; the generation before it then still answers.
+/// [`FetchError`]; the previous generation then still answers.
 pub fn fetch(
     cache: &EdgeCache,
     request: &FetchRequest,
@@ -34,17 +34,24 @@ pub fn fetch(
         cache.files().create_dir(dir)?;
     }
     let records = Records::open(&cache.dir().join("db"))?;
-    // A fetch that was killed may have renamed files whose folder it never synced.
+    // A killed fetch may have renamed files without syncing their folder.
     for dir in &dirs {
         cache.files().sync_dir(dir)?;
     }
     let last = records.last()?;
     let (last_from, last_at) = last.map_or((None, None), |last| (Some(last.from), Some(last.at)));
-    let from = request.from.clone().or(last_from).ok_or(FetchError::NotGiven { what: "store's address" })?;
-    let at = request.at.or(last_at).ok_or(FetchError::NotGiven { what: "position" })?;
+    let from = request
+        .from
+        .clone()
+        .or(last_from)
+        .ok_or(FetchError::NotGiven { what: "store address", advice: "give one with --from URL" })?;
+    let at = request.at.or(last_at).ok_or(FetchError::NotGiven {
+        what: "position",
+        advice: "give one with --at X,Y,Z or --at-geo LAT,LON",
+    })?;
     let old = match cache.current() {
         Err(e @ StoreError::Current { .. }) => {
-            tracing::warn!("{e}; it is written anew");
+            tracing::warn!("{e}; it will be rewritten");
             None
         }
         other => other?,
@@ -72,7 +79,7 @@ pub fn fetch(
     }
     records.accept(&LastFetch { from, at }, &offer.manifest, offer.key, replaced_key.as_slice())?;
     if let Some(old) = replaced_key {
-        tracing::info!("key {old} is no longer accepted: {} took its place", offer.key);
+        tracing::info!("key {old} is no longer accepted: {} replaced it", offer.key);
     }
 
     let in_use: BTreeSet<Hash32> = old.iter().flat_map(|old| &old.cells).map(|cell| cell.hash).collect();
@@ -96,7 +103,7 @@ pub fn fetch(
     };
     work().map_err(|e| match e {
         FetchError::Io(source) if is_disk_full(&source) => {
-            // A full disk hurts others too: give the space back, though the next fetch starts over.
+            // A full disk affects other programs: free the space, though the next fetch starts over.
             match clear_staging(cache, &[]) {
                 Ok(()) => FetchError::DiskFull { needed_bytes: downloaded.bytes, source },
                 Err(e) => e,

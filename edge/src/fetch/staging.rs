@@ -1,4 +1,4 @@
-//! The cache's folders: listing, clearing, and replacing files durably.
+//! The cache's folders: lists and clears them, and replaces files durably.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -18,7 +18,7 @@ pub fn part_path(cache: &EdgeCache, hash: Hash32) -> PathBuf {
     staging(cache).join(format!("{hash}.part"))
 }
 
-/// Lists the shards on board; other files among them are removed.
+/// Lists the shards on board and removes other files in their folder.
 pub fn held_shards(cache: &EdgeCache, records: &Records) -> Result<BTreeMap<Hash32, Held>, FetchError> {
     let dir = cache.dir().join("shards");
     let mut held = BTreeMap::new();
@@ -35,7 +35,7 @@ pub fn held_shards(cache: &EdgeCache, records: &Records) -> Result<BTreeMap<Hash
     Ok(held)
 }
 
-/// Removes what lies in `staging/`, but for parts that are still wanted.
+/// Empties `staging/` except for partial downloads still wanted.
 pub fn clear_staging(cache: &EdgeCache, wanted: &[Object]) -> Result<(), FetchError> {
     let wanted: BTreeSet<PathBuf> = wanted.iter().map(|object| part_path(cache, object.hash)).collect();
     for name in cache.files().list(&staging(cache))? {
@@ -57,7 +57,7 @@ pub fn clear_manifests(cache: &EdgeCache, current: Hash32) -> Result<(), FetchEr
     Ok(())
 }
 
-/// Puts a small file in place, durably: under its name lies the old content or the new one, whole.
+/// Replaces a small file durably: its path always holds the old or the new content, whole.
 pub fn put(cache: &EdgeCache, bytes: &[u8], path: &Path) -> Result<(), FetchError> {
     let files = cache.files();
     let aside = staging(cache).join("put");

@@ -35,11 +35,11 @@ pub enum QueryError {
     #[error("negatives: {0}")]
     Negatives(#[source] TextError),
     /// No scene is loaded.
-    #[error("no scene is loaded; run `slag-edge fetch`, or see the log if one was fetched")]
+    #[error("no scene is loaded; run `slag-edge fetch`, or see the log if you have fetched one")]
     NoScene,
     /// Text model and scene use different embedding spaces.
     #[error(
-        "the text model is {models_name} ({models_id}), the scene was encoded with {scene_name} ({scene_id}); give --models the directory of {scene_name}, or fetch a scene encoded with {models_name}"
+        "the text model is {models_name} ({models_id}), but the scene was encoded with {scene_name} ({scene_id}); pass the folder of {scene_name} to --models, or fetch a scene encoded with {models_name}"
     )]
     EncoderMismatch {
         /// Name of the text model's space.

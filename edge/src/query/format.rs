@@ -70,7 +70,9 @@ impl Reply {
             #[cfg(feature = "arrow")]
             Format::Arrow => Box::new(arrow::Pieces::new(self)),
             #[cfg(not(feature = "arrow"))]
-            Format::Arrow => Box::new(std::iter::once(Err(io::Error::other("built without Arrow")))),
+            Format::Arrow => {
+                Box::new(std::iter::once(Err(io::Error::other("this program is built without Arrow"))))
+            }
         }
     }
 }

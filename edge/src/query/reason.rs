@@ -14,7 +14,8 @@ pub fn of_objects(request: &QueryRequest, threshold: f32, best: Option<(f32, DVe
     let (kind, detail) = match best {
         None => (
             ReasonKind::NothingThere,
-            "the shards on board have no objects; ask with kind=clusters, or encode with objects".to_owned(),
+            "the shards on board have no objects; ask with kind=clusters, or encode the scene with objects"
+                .to_owned(),
         ),
         Some((score, at)) if score < threshold => (
             ReasonKind::BelowThreshold,
@@ -23,7 +24,7 @@ pub fn of_objects(request: &QueryRequest, threshold: f32, best: Option<(f32, DVe
         Some(_) => (
             ReasonKind::NothingThere,
             format!(
-                "no object that reaches {threshold} has {} Gaussians{place}; fetch that area, or ask elsewhere",
+                "no object that reaches {threshold} has {} Gaussians{place}; fetch that area, or search elsewhere",
                 request.min_count
             ),
         ),
@@ -51,12 +52,12 @@ pub fn of_gaussians(
     let (kind, detail) = match best {
         None => (
             ReasonKind::NothingThere,
-            format!("no Gaussian with an embedding lies{place}; fetch that area, or ask elsewhere"),
+            format!("there is no Gaussian with an embedding{place}; fetch that area, or search elsewhere"),
         ),
         Some(_) if n_matching > 0 => (
             ReasonKind::ClustersTooSmall,
             format!(
-                "{n_matching} Gaussians{place} reach {threshold}, but no group of them has {}; ask with a smaller min_count or a larger voxel",
+                "{n_matching} Gaussians{place} reach {threshold}, but no cluster of them has {}; lower min_count or increase voxel",
                 request.min_count
             ),
         ),

@@ -240,11 +240,11 @@ impl QueryRequest {
         } / self.texts.len();
         if let Some(limit) = self.limit.filter(|limit| !(1..=most).contains(limit)) {
             let answers = self.kind.map_or("answers".to_owned(), |kind| kind.to_string());
-            return refuse("limit", &limit, format!("1 to {most} {answers} a text"));
+            return refuse("limit", &limit, format!("1 to {most} {answers} per text"));
         }
         let (thresholds, expected) = match self.negatives {
             Negatives::None => (-1.0..=1.0, "a cosine, -1 to 1"),
-            _ => (0.0..=1.0, "a relevancy, 0 to 1, since there are negatives"),
+            _ => (0.0..=1.0, "a relevancy, 0 to 1, because there are negatives"),
         };
         if let Some(threshold) = self.threshold.filter(|t| !thresholds.contains(t)) {
             return refuse("threshold", &threshold, expected.into());
@@ -268,7 +268,7 @@ impl QueryRequest {
             return refuse("radius", &radius, format!("more than 0, at most {MAX_COORDINATE:e}"));
         }
         if let (Some(radius), None) = (self.radius, self.near) {
-            return refuse("near", &"nothing", format!("X,Y,Z, since radius is {radius}"));
+            return refuse("near", &"nothing", format!("X,Y,Z, because radius is {radius}"));
         }
         if let Some(voxel) = self.voxel.filter(|voxel| !positive(*voxel)) {
             return refuse("voxel", &voxel, format!("more than 0, at most {MAX_COORDINATE:e}"));

@@ -179,7 +179,11 @@ fn exactness_is_a_choice() {
     });
     let compact = [thing(1, DVec3::ZERO, 30, 0.7).build(false)];
     assert_eq!(by_centroids, ask(&compact, |request, _| request.kind = Some(AnswerKind::Gaussians)));
-    assert!(!by_centroids.is_exact && by_centroids.score_error_bound > 1e-5, "{}", by_centroids.score_error_bound);
+    assert!(
+        !by_centroids.is_exact && by_centroids.score_error_bound > 1e-5,
+        "{}",
+        by_centroids.score_error_bound
+    );
 }
 
 /// Oracle: cosines to both axes, and LERF's formula.

@@ -9,7 +9,7 @@ pub const MAX_COORDINATE: f64 = 1e9;
 pub enum ScoreError {
     /// The query vector has another dimension than the shard.
     #[error(
-        "cell {cell_id} holds embeddings of {expected} components, the query vector has {found}; use the models that the scene was encoded with"
+        "cell {cell_id} holds embeddings of {expected} components, but the query vector has {found}; use the models that the scene was encoded with"
     )]
     Dimension {
         /// The cell.
@@ -20,14 +20,16 @@ pub enum ScoreError {
         found: usize,
     },
     /// The query vector is not of unit length, or not finite.
-    #[error("the query vector has length {found}, expected 1; the text model is damaged or of another kind")]
+    #[error(
+        "the query vector has length {found}, expected 1; the text model is damaged or does not normalise its vectors"
+    )]
     NotUnit {
         /// Its length.
         found: f32,
     },
     /// A negative has another dimension than the question.
     #[error(
-        "a negative has {found} components, the query vector {expected}; take both from the same text model"
+        "a negative has {found} components, but the query vector has {expected}; encode both with the same text model"
     )]
     Negative {
         /// Components of the query.

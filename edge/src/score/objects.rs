@@ -113,9 +113,7 @@ fn of_vector(
                 products: &mut products,
             }),
         }
-        for (rows, products) in
-            rows.chunks(n_vectors as usize).zip(products.chunks(n_vectors as usize))
-        {
+        for (rows, products) in rows.chunks(n_vectors as usize).zip(products.chunks(n_vectors as usize)) {
             let mut cosines = [0.0; MAX_VECTORS as usize];
             for ((cosine, row), product) in cosines.iter_mut().zip(rows).zip(products) {
                 let step = objects.steps[*row as usize];

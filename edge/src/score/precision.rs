@@ -43,6 +43,6 @@ impl std::str::FromStr for Precision {
     fn from_str(text: &str) -> Result<Self, String> {
         let names = || Self::ALL.map(Self::name).join(", ");
         let found = Self::ALL.into_iter().find(|precision| precision.name() == text);
-        found.ok_or_else(|| format!("{text:?} is no precision; there are: {}", names()))
+        found.ok_or_else(|| format!("{text:?} is not a precision; choose one of {}", names()))
     }
 }

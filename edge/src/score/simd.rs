@@ -338,12 +338,7 @@ mod tests {
                         assert_eq!(row, found.len());
                         found.push(i64::from(dot));
                     };
-                    level.dispatch(MatrixTimesVector {
-                        rows: &rows,
-                        n_components,
-                        vector: &vector,
-                        put,
-                    });
+                    level.dispatch(MatrixTimesVector { rows: &rows, n_components, vector: &vector, put });
                     assert_eq!(found, expected, "{} {n_components} {n_rows}", level.name());
                 }
             }
@@ -444,13 +439,8 @@ mod tests {
                 for level in Level::available() {
                     let mut products = vec![7];
                     let (rows, vector, which) = (&rows[..], &vector[..], &which[..]);
-                    let products_of = SomeRowsTimesVector {
-                        rows,
-                        n_components,
-                        vector,
-                        which,
-                        products: &mut products,
-                    };
+                    let products_of =
+                        SomeRowsTimesVector { rows, n_components, vector, which, products: &mut products };
                     level.dispatch(products_of);
                     assert_eq!(products, expected, "{} {n_components}", level.name());
                 }

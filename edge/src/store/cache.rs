@@ -13,24 +13,24 @@ use slag_common::shard::Profile;
 use super::error::StoreError;
 use super::files::{DiskFiles, Files, Stat};
 
-/// A longer `current` is damage (a cell takes about 110 bytes there).
+/// A longer `current` is damaged (a cell takes about 110 bytes).
 const MAX_CURRENT_BYTES: u64 = 32 << 20;
 
-/// The generation pointer: which shards of which manifest answer queries.
+/// The generation pointer: the manifest and shards that answer queries.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Current {
     /// BLAKE3 of the signed manifest.
     pub manifest_hash: Hash32,
-    /// The public key that fetch accepted for it.
+    /// The public key accepted for it.
     pub key: Hash32,
-    /// The profile of the shards.
+    /// Profile of the shards.
     pub profile: Profile,
     /// Centre of the fetch, world frame.
     pub centre_in_world: DVec3,
     /// Radius of the fetch, world units.
     pub radius: f64,
-    /// The cells, by id, ascending.
+    /// The cells on board, by id, ascending.
     pub cells: Vec<CurrentCell>,
 }
 
@@ -54,7 +54,7 @@ pub struct EdgeCache {
 }
 
 impl EdgeCache {
-    /// Names a cache folder on disk; nothing is read or made.
+    /// Names a cache folder on disk, without reading or creating anything.
     pub fn open(dir: impl Into<PathBuf>) -> Self {
         Self::with_files(dir, Arc::new(DiskFiles))
     }
@@ -74,22 +74,22 @@ impl EdgeCache {
         &*self.files
     }
 
-    /// Returns where the generation pointer lies.
+    /// Returns the path of the generation pointer.
     pub fn current_path(&self) -> PathBuf {
         self.dir.join("current")
     }
 
-    /// Returns where a shard lies.
+    /// Returns the path of a shard.
     pub fn shard_path(&self, hash: Hash32) -> PathBuf {
         self.dir.join("shards").join(hash.to_string())
     }
 
-    /// Returns where a manifest lies.
+    /// Returns the path of a manifest.
     pub fn manifest_path(&self, hash: Hash32) -> PathBuf {
         self.dir.join("manifests").join(hash.to_string())
     }
 
-    /// Returns the state of `current` without opening it: it differs whenever a fetch replaced it.
+    /// Returns the state of `current` without opening it; it changes whenever a fetch replaces the file.
     ///
     /// # Errors
     /// [`StoreError::Io`].

@@ -8,19 +8,19 @@ use slag_common::container::ContainerError;
 use slag_common::manifest::ManifestError;
 use slag_common::shard::Profile;
 
-/// Why a cache cannot be read.
+/// Reasons for which a cache cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
     /// The file system's error, with the path.
     #[error("{0}; check the cache's folder and its permissions")]
     Io(#[from] io::Error),
     /// Nothing was fetched yet.
-    #[error("{path} holds no scene yet: fetch one first", path = path.display())]
+    #[error("{path} holds no scene yet; fetch one first", path = path.display())]
     Empty {
         /// The cache.
         path: PathBuf,
     },
-    /// The pointer to the generation is not what fetch writes.
+    /// The generation pointer is damaged.
     #[error("{path}: {what}; delete it and fetch again", path = path.display())]
     Current {
         /// The file.
@@ -28,13 +28,13 @@ pub enum StoreError {
         /// What is wrong.
         what: String,
     },
-    /// A file is not there although `current` names it.
-    #[error("{path} is missing although `current` names it; fetch again", path = path.display())]
+    /// A file named by `current` is missing.
+    #[error("{path} is missing, but `current` names it; fetch again", path = path.display())]
     Missing {
         /// The file.
         path: PathBuf,
     },
-    /// A file's content is not the one it is named by.
+    /// A file's content does not match its name.
     #[error("{path}: content has hash {found}, expected {expected}; delete it and fetch again", path = path.display())]
     Hash {
         /// The file.
@@ -44,12 +44,12 @@ pub enum StoreError {
         /// Hash of the content.
         found: Hash32,
     },
-    /// The manifest is refused.
+    /// The manifest is invalid.
     #[error("{path}", path = path.display())]
     Manifest {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: ManifestError,
     },
     /// The shard is damaged.
@@ -57,10 +57,10 @@ pub enum StoreError {
     Shard {
         /// The file.
         path: PathBuf,
-        /// Why and where.
+        /// The reason and place.
         source: ContainerError,
     },
-    /// `current` names a cell or a profile of it that the manifest does not list.
+    /// `current` names a cell or profile that the manifest does not list.
     #[error("{path}: the manifest lists no {profile} shard of cell {cell_id}; fetch again", path = path.display())]
     Unlisted {
         /// The file.
@@ -70,12 +70,12 @@ pub enum StoreError {
         /// The profile.
         profile: Profile,
     },
-    /// The shard is sound, but not the one that the manifest describes.
+    /// The shard is intact but differs from the manifest's description.
     #[error("{path}: {field} is {found}, the manifest says {expected}; delete it and fetch again", path = path.display())]
     Mismatch {
         /// The file.
         path: PathBuf,
-        /// What differs.
+        /// The field that differs.
         field: &'static str,
         /// Value in the manifest.
         expected: String,

@@ -1,4 +1,4 @@
-//! The storage seam: every step that a power cut can fall between is one call of [`Files`].
+//! The storage interface: every step that a power cut can separate is one call of [`Files`].
 
 use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::Path;
@@ -6,42 +6,42 @@ use std::time::SystemTime;
 
 use super::mmap::{self, FileBytes};
 
-/// What the file system tells of a file without opening it.
+/// File metadata.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stat {
     /// Length.
     pub len_bytes: u64,
-    /// Last change of its content, where the file system keeps it.
+    /// Time of the last change, if the file system records it.
     pub modified: Option<SystemTime>,
-    /// Identity within the file system; 0 where there is none.
+    /// Inode number; 0 if there is none.
     pub inode: u64,
 }
 
-/// The file operations that the cache is built from.
+/// File operations of the cache.
 ///
-/// Errors are whatever the file system gives, with the path.
-/// Nothing counts as durable before [`Files::sync`] of the file and [`Files::sync_dir`] of its folder.
+/// Errors are those of the file system, with the path. Nothing is durable before [`Files::sync`] of the file
+/// and [`Files::sync_dir`] of its folder.
 pub trait Files: Send + Sync {
-    /// Makes a folder and those above it, durably.
+    /// Creates a folder and its parents, durably.
     fn create_dir(&self, dir: &Path) -> io::Result<()>;
-    /// Writes at an offset, making the file if it is not there; what lay at or behind the offset is cut
-    /// off. Bytes between the old end and the offset are zero.
+    /// Writes at an offset, creating the file if necessary, and truncates it behind the new bytes. Bytes
+    /// between the old end and the offset are zero.
     fn write_from(&self, path: &Path, offset_bytes: u64, bytes: &[u8]) -> io::Result<()>;
     /// Makes a file's content durable.
     fn sync(&self, path: &Path) -> io::Result<()>;
-    /// Renames within the cache, replacing what is there.
+    /// Renames within the cache, replacing the target.
     fn rename(&self, from: &Path, to: &Path) -> io::Result<()>;
-    /// Makes the names in a folder durable.
+    /// Makes the entries of a folder durable.
     fn sync_dir(&self, dir: &Path) -> io::Result<()>;
-    /// Removes a file; one that is not there is no error.
+    /// Removes a file, if it exists.
     fn remove(&self, path: &Path) -> io::Result<()>;
-    /// Returns the names of the files in a folder, sorted; names that are not UTF-8 are left out.
+    /// Returns the names of the files in a folder, sorted; skips names that are not UTF-8.
     fn list(&self, dir: &Path) -> io::Result<Vec<String>>;
     /// Reads a file of at most `max_bytes`.
     fn read(&self, path: &Path, max_bytes: u64) -> io::Result<Vec<u8>>;
-    /// Returns the bytes of a file that no longer changes.
+    /// Returns the bytes of an immutable file.
     fn map(&self, path: &Path) -> io::Result<FileBytes>;
-    /// Returns what is known of a file; `None` if it is not there.
+    /// Returns a file's metadata; `None` if it does not exist.
     fn stat(&self, path: &Path) -> io::Result<Option<Stat>>;
 }
 
@@ -102,8 +102,10 @@ impl Files for DiskFiles {
         let mut bytes = Vec::new();
         fs_err::File::open(path)?.take(max_bytes.saturating_add(1)).read_to_end(&mut bytes)?;
         if bytes.len() as u64 > max_bytes {
-            let what =
-                format!("{} is longer than {max_bytes} bytes, which no file of its kind is", path.display());
+            let what = format!(
+                "{} is longer than {max_bytes} bytes, the limit for this kind of file; it is damaged",
+                path.display()
+            );
             return Err(io::Error::new(io::ErrorKind::InvalidData, what));
         }
         Ok(bytes)

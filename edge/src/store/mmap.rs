@@ -6,10 +6,10 @@ use std::path::Path;
 
 use slag_common::container::AlignedBytes;
 
-/// The bytes of a file that no longer changes, at an address that every column type can be used at.
+/// The bytes of an immutable file, aligned for every column type.
 #[derive(Debug)]
 pub enum FileBytes {
-    /// Mapped: pages are read when touched, and dropped under memory pressure.
+    /// Mapped: pages are read on first access and dropped under memory pressure.
     Mapped(memmap2::Mmap),
     /// Read into memory.
     Read(AlignedBytes),
@@ -28,22 +28,22 @@ impl Deref for FileBytes {
 
 /// Maps a file read-only.
 ///
-/// The file must not change any more: shards never do once they are renamed into place, and a staged
-/// one is mapped only after its last write, by the process that holds the cache's lock.
+/// The file must not change any more: shards never do once they are renamed into place, and a staged file is
+/// mapped only after its last write, by the process that holds the cache's lock.
 ///
 /// # Errors
-/// Whatever the file system gives, with the path.
+/// Errors of the file system, with the path.
 #[expect(unsafe_code, reason = "mapping a file is unsafe by nature; every other module is safe")]
 pub fn map(path: &Path) -> io::Result<FileBytes> {
     let file = fs_err::File::open(path)?;
-    // An empty file cannot be mapped everywhere.
+    // Not every system can map an empty file.
     if file.metadata()?.len() == 0 {
         return Ok(FileBytes::Read(AlignedBytes::default()));
     }
-    // SAFETY: the file is opened read-only and is immutable by this crate's protocol (new content gets
-    // a new name, old names are only unlinked, and an unlinked file stays readable while mapped), so
-    // the bytes behind the shared slice do not change. What cannot be ruled out here is another program
-    // that truncates the file in place: touching the lost pages is then SIGBUS, which ends the process.
+    // SAFETY: the file is opened read-only and is immutable by this crate's protocol (new content gets a new
+    // name, old names are only unlinked, and an unlinked file stays readable while mapped), so the bytes
+    // behind the shared slice do not change. Another program could still truncate the file in place: access
+    // to the lost pages then raises SIGBUS, which ends the process.
     let map = unsafe { memmap2::Mmap::map(file.file()) };
     map.map(FileBytes::Mapped)
         .map_err(|e| io::Error::new(e.kind(), format!("mapping {}: {e}", path.display())))

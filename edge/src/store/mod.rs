@@ -1,14 +1,14 @@
-//! The cache on the robot: where shards lie, and how a consistent set of them is opened.
+//! The cache on the robot: its files, and how a consistent set of them is opened.
 //!
-//! | path | what | changed by |
+//! | path | content | changed by |
 //! |---|---|---|
 //! | `shards/HASH` | verified shards, immutable | fetch: renamed in, removed |
 //! | `manifests/HASH` | verified signed manifests, immutable | fetch: renamed in, removed |
-//! | `current` | [`Current`]: the generation that answers come from | fetch: replaced whole |
-//! | `staging/` | downloads under way | fetch |
-//! | `db/` | the fetcher's records | fetch |
+//! | `current` | [`Current`]: the generation in use | fetch: replaced whole |
+//! | `staging/` | partial downloads | fetch |
+//! | `db/` | records of fetches | fetch |
 //!
-//! Readers need no lock: they read `current` and what it names, and start over if a fetch replaced it
+//! Readers need no lock: they read `current` and the files it names, and start over if a fetch replaces it
 //! meanwhile.
 
 mod cache;

@@ -1,7 +1,7 @@
-//! Which shards each object on board lies in, and which Gaussians are its: made once, when a generation is opened.
+//! Index of the objects on board: the shards and Gaussians of each, built once when a generation is opened.
 //!
-//! An object that reaches into several cells is in the shards of all. Vectors, records and ends of runs stay there; the
-//! index takes 4 bytes for a run of Gaussians and some 30 for an object.
+//! An object that reaches into several cells is stored in all of their shards. Vectors, records and run ends
+//! stay there; the index takes 4 bytes for a run of Gaussians and about 30 for an object.
 
 use std::ops::Range;
 
@@ -10,7 +10,7 @@ use slag_common::objects::{NO_OBJECT, Objects};
 /// An object in a shard.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Part {
-    /// Place of the shard in the generation.
+    /// Index of the shard in the generation.
     pub shard: u32,
     /// The object's number there.
     pub number: u32,
@@ -26,19 +26,19 @@ pub struct ObjectIndex {
     shards: Vec<ShardIndex>,
 }
 
-/// What there is of the objects of one shard.
+/// Index of one shard's objects.
 #[derive(Debug, Default)]
 struct ShardIndex {
-    /// Those that have no part in an earlier shard: their number here, ascending, and the object.
+    /// Objects without a part in an earlier shard: their number in this shard, ascending, and the object.
     first: Vec<(u32, u32)>,
-    /// `[n + 1]`: where the runs of each number start.
+    /// `[n + 1]`: where each object's runs start.
     run_starts: Vec<u32>,
-    /// Runs by number.
+    /// Runs, ordered by object number.
     runs: Vec<u32>,
 }
 
 impl ObjectIndex {
-    /// Makes the index. `objects`: of the generation's shards, in their order.
+    /// Builds the index. `objects`: those of the generation's shards, in their order.
     pub fn new(objects: &[Option<Objects<'_>>]) -> Self {
         let mut index = Self::default();
         let mut parts: Vec<(u64, Part)> = Vec::new();
@@ -64,7 +64,7 @@ impl ObjectIndex {
         self.starts.len().saturating_sub(1)
     }
 
-    /// Whether there are none.
+    /// Returns whether there are none.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -74,13 +74,13 @@ impl ObjectIndex {
         &self.parts[self.starts[object] as usize..self.starts[object + 1] as usize]
     }
 
-    /// Returns the objects whose first part is in a shard: their number there, ascending, and the object. Every object is
-    /// in one shard's list.
+    /// Returns the objects with their first part in a shard: their number there, ascending, and the object.
+    /// Every object is in exactly one shard's list.
     pub fn first_in(&self, shard: usize) -> &[(u32, u32)] {
         &self.shards[shard].first
     }
 
-    /// Returns the runs of Gaussians of a part, ascending. `objects`: of its shard.
+    /// Returns a part's runs of Gaussians, ascending. `objects`: those of its shard.
     pub fn runs<'a>(&'a self, part: Part, objects: &'a Objects<'_>) -> impl Iterator<Item = Range<u32>> + 'a {
         let ShardIndex { run_starts, runs, .. } = &self.shards[part.shard as usize];
         let of_part =
@@ -90,7 +90,7 @@ impl ObjectIndex {
 }
 
 impl ShardIndex {
-    /// Sorts the runs by their objects; which are first here is still open.
+    /// Sorts the runs by object; `first` is filled in later.
     fn new(objects: &Objects<'_>) -> Self {
         let numbers = || (0u32..).zip(objects.run_objects).filter(|(_, number)| **number != NO_OBJECT);
         let mut run_starts = vec![0u32; objects.records.len() + 1];
@@ -116,14 +116,14 @@ mod tests {
     use super::*;
     use slag_math::random::Random;
 
-    /// Oracle: every run of every shard, looked at one by one.
+    /// Oracle: every run of every shard, one by one.
     #[test]
     fn objects_have_the_runs_that_name_them() {
         let mut random = Random::new(71);
         for n_shards in [0, 1, 4] {
             let columns: Vec<(Vec<ObjectRecord>, Vec<u32>, Vec<u16>)> = (0..n_shards)
                 .map(|shard| {
-                    // The third shard has no objects; ids come several times, even in one shard.
+                    // The third shard has no objects; ids repeat, even within a shard.
                     let n = if shard == 2 { 0 } else { 1 + random.bits() % 30 };
                     let record = |id| ObjectRecord { id, ..bytemuck::Zeroable::zeroed() };
                     let records = (0..n).map(|_| record(random.bits() % 40)).collect();

@@ -15,7 +15,7 @@ use super::mmap::FileBytes;
 /// A mapped and checked shard.
 #[derive(Debug)]
 pub struct OpenShard {
-    /// What the manifest says of its cell.
+    /// Its cell in the manifest.
     pub cell: CellRecord,
     layout: ShardLayout,
     bytes: FileBytes,
@@ -27,7 +27,7 @@ impl OpenShard {
         self.layout.view(&self.bytes)
     }
 
-    /// Returns the objects of its Gaussians, where the shard has them.
+    /// Returns its objects, if the shard has any.
     pub fn objects(&self) -> Option<Objects<'_>> {
         self.layout.objects(&self.bytes)
     }
@@ -53,10 +53,10 @@ impl OpenShard {
     }
 }
 
-/// Checks that bytes are a sound shard, and the one that a manifest lists for a cell.
+/// Checks that bytes are an intact shard, and the one that a manifest lists for a cell.
 ///
 /// # Errors
-/// [`StoreError::Shard`], [`StoreError::Mismatch`].
+/// [`StoreError::Shard`], [`StoreError::Mismatch`], [`StoreError::Unlisted`].
 pub fn check_shard<'a>(
     path: &Path,
     bytes: &[u8],

@@ -1,4 +1,4 @@
-//! A generation, opened: a manifest and the shards it lists, mapped and checked.
+//! An open generation: a manifest and its shards, mapped and checked.
 
 use std::sync::OnceLock;
 
@@ -11,15 +11,15 @@ use super::files::Stat;
 use super::objects::ObjectIndex;
 use super::shard::OpenShard;
 
-/// How often a reader starts over because a fetch replaced `current` under it.
+/// Attempts of a reader while fetches replace `current`.
 const MAX_RACES: usize = 16;
 
-/// One generation, whole: immutable however many fetches follow.
+/// An open generation: immutable however many fetches follow.
 #[derive(Debug)]
 pub struct Snapshot {
     /// The generation pointer it was opened from.
     pub current: Current,
-    /// State of `current` just before it was read, to compare with [`EdgeCache::current_stat`].
+    /// State of `current` just before it was read, for comparison with [`EdgeCache::current_stat`].
     pub current_stat: Option<Stat>,
     /// The manifest.
     pub manifest: Manifest,
@@ -30,10 +30,10 @@ pub struct Snapshot {
 }
 
 impl Snapshot {
-    /// Opens the current generation: every shard is mapped and checked once.
+    /// Opens the current generation: maps and checks every shard once.
     ///
     /// # Errors
-    /// [`StoreError`]; a fetch that replaces `current` meanwhile is none.
+    /// [`StoreError`]. A fetch that replaces `current` meanwhile is not an error.
     pub fn open(cache: &EdgeCache) -> Result<Self, StoreError> {
         let mut seen = None;
         for _ in 0..MAX_RACES {
@@ -41,7 +41,7 @@ impl Snapshot {
             let current =
                 cache.current()?.ok_or_else(|| StoreError::Empty { path: cache.dir().to_owned() })?;
             match Self::open_current(cache, current.clone(), current_stat) {
-                // A fetch removes what the old `current` named once the new one is in place.
+                // A fetch removes the files of the old `current` after it has put the new one in place.
                 Err(StoreError::Missing { path }) if seen.as_ref() == Some(&current) => {
                     return Err(StoreError::Missing { path });
                 }
@@ -49,7 +49,7 @@ impl Snapshot {
                 other => return other,
             }
         }
-        let what = format!("it was replaced {MAX_RACES} times while being opened");
+        let what = format!("it was replaced {MAX_RACES} times while it was being opened");
         Err(StoreError::Current { path: cache.current_path(), what })
     }
 
@@ -69,9 +69,9 @@ impl Snapshot {
     }
 }
 
-/// Runs work in parallel on threads of its own, half as many as there are cores.
+/// Runs work in parallel on a pool of its own, half as large as the number of cores.
 ///
-/// Queries are split over the common threads; behind the checks of many shards there, a query would wait
+/// Queries are split over the global pool; a query queued there behind the checks of many shards would wait
 /// for all of them.
 pub(crate) fn beside_queries<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     static POOL: OnceLock<Option<rayon::ThreadPool>> = OnceLock::new();
@@ -81,7 +81,7 @@ pub(crate) fn beside_queries<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     });
     match pool {
         Some(pool) => pool.install(work),
-        // Without memory for threads it takes longer.
+        // Slower, if there is no memory for threads.
         None => work(),
     }
 }

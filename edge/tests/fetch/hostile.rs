@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use slag_common::Hash32;
 use slag_common::manifest::{MAX_BYTES, ManifestError};
 use slag_common::shard::Profile;
-use slag_edge::fetch::{DownloadFailure, FetchError, PlanError, Progress};
+use slag_edge::fetch::{DownloadFailure, FetchError, FetchRequest, PlanError, Progress};
 use slag_edge::store::{Snapshot, StoreError};
 
 use super::scene::{ENCODER, NOW, Published, ShardSpec, key, public, shard};
@@ -252,7 +252,11 @@ fn addresses_that_are_none_are_refused() {
     }
     let mut robot = Robot::on_disk(dir.path(), "http://a");
     robot.request.from = None;
-    assert!(matches!(robot.fetch(), Err(FetchError::NotGiven { what: "store's address" })));
+    let error = robot.fetch().expect_err("no address").to_string();
+    assert!(error.contains("--from URL"), "{error}");
+    robot.request = FetchRequest { from: Some("http://a".into()), at: None, ..robot.request };
+    let error = robot.fetch().expect_err("no position").to_string();
+    assert!(error.contains("--at X,Y,Z") && error.contains("--at-geo"), "{error}");
 }
 
 /// Announced lengths are believed when they are too long, not when they are short enough.

@@ -62,8 +62,7 @@ impl Kernels for V4 {
         for ((((a, b), c), d), vector) in a.iter().zip(b).zip(c).zip(d).zip(vector) {
             let vector: __m512i = cast(*vector);
             for (sum, row) in sums.iter_mut().zip([a, b, c, d]) {
-                let products =
-                    avx512bw._mm512_madd_epi16(avx512bw._mm512_cvtepi8_epi16(cast(*row)), vector);
+                let products = avx512bw._mm512_madd_epi16(avx512bw._mm512_cvtepi8_epi16(cast(*row)), vector);
                 *sum = avx512f._mm512_add_epi32(*sum, products);
             }
         }
