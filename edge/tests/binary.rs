@@ -1,4 +1,4 @@
-//! The real program over a real socket: fetch, status, query, serve, and how it ends.
+//! The real program over a real socket: fetch, status, query, serve, and exit codes.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -16,15 +16,15 @@ use slag_common::shard::{Positions, Profile, ScoreErrors, ShardHeader, ShardView
 use slag_edge::text::TextService;
 use slag_models::{ModelDir, SessionOptions};
 
-/// Returns the signed manifest and the one shard of a scene with 40 red Gaussians around x = 2 and
-/// 60 blue ones around x = 8, in the space of the built-in model.
+/// Returns the signed manifest and the one shard of a scene with 40 red Gaussians around x = 2 and 60 blue
+/// ones around x = 8, in the colour stand-in's space.
 fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
     let text =
         TextService::open(&ModelDir::colours(), &SessionOptions::new("not-needed".into())).expect("built in");
     let mut positions: Vec<[u16; 3]> = (0..40).map(|i| [2000 + i, 0, 0]).collect();
     positions.extend((0..60).map(|i| [8000 + i, 0, 0]));
-    let row = |word: &str| text.encode(word).expect("known").to_vec();
-    let (centroids, centroid_step) = quantise(&[row("red"), row("blue")].concat());
+    let vector = |word: &str| text.encode(word).expect("known").to_vec();
+    let (centroids, centroid_step) = quantise(&[vector("red"), vector("blue")].concat());
     let bounds = Aabb { min: DVec3::ZERO, max: DVec3::splat(10.0) };
     let header = ShardHeader {
         cell_id: 0,
@@ -102,7 +102,7 @@ fn store(signed: Vec<u8>, shard: Vec<u8>) -> String {
             let body = if request.starts_with("GET /v1/manifest ") { &signed } else { &shard };
             let head =
                 format!("HTTP/1.1 200 OK\r\ncontent-length: {}\r\nconnection: close\r\n\r\n", body.len());
-            // The client may have enough of it.
+            // The client may close early.
             let _ = stream.write_all(&[head.as_bytes(), body].concat());
         }
     });
@@ -204,7 +204,7 @@ fn a_robot_fetches_asks_and_serves() {
     assert!(log.contains("stopping"), "{log}");
 }
 
-/// A store that never answers: ctrl-c ends the fetch with the interrupted code.
+/// A store that never answers: ctrl-c ends the fetch with exit code 130.
 #[test]
 fn an_interrupted_fetch_says_so() {
     let silent = TcpListener::bind("127.0.0.1:0").expect("a port");
@@ -212,7 +212,8 @@ fn an_interrupted_fetch_says_so() {
     let dir = tempfile::tempdir().expect("a folder");
     let mut fetching = slag_edge(dir.path(), &["fetch", "--from", &from, "--at", "0,0,0"]);
     let fetching = fetching.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
-    // Its handler is in place before it connects. Closing makes it try again, and look at the flag.
+    // The signal handler is installed before it connects. Closing the connection makes it retry, and check
+    // the flag.
     let (connection, _) = silent.accept().expect("a connection");
     let interrupted = Command::new("kill").args(["-INT", &fetching.id().to_string()]).status().expect("runs");
     assert!(interrupted.success());
@@ -234,7 +235,8 @@ fn nobody_reads_and_nobody_complains() {
     assert_eq!((output.status.code(), output.stderr.len()), (Some(0), 0));
 }
 
-/// Positions on stdin: a fetch for the first, none for those near it, bad lines are told and passed over.
+/// Positions on stdin: the first is fetched, those near it are not, and invalid lines are reported and
+/// skipped.
 #[test]
 fn a_robot_is_followed_along_stdin() {
     let (signed, shard) = red_and_blue();
@@ -261,12 +263,13 @@ fn a_robot_is_followed_along_stdin() {
         let reports: Vec<Value> = String::from_utf8_lossy(&stdout).lines().map(json).collect();
         (status.code(), reports, String::from_utf8_lossy(&stderr).into_owned())
     };
-    // Which of the positions are seen one by one is a matter of time; the last one always is.
+    // Timing decides which positions are seen; the last one always is.
     let (code, reports, log) = watch("1 2 3\nnonsense\n\n1 2 4\n{\"x\":1,\"y\":2,\"z\":3}\n");
     assert_eq!((code, reports.len()), (Some(0), 1), "{log}");
     assert_eq!((&reports[0]["n_cells"], &reports[0]["radius"]), (&1.into(), &24.0.into()));
     assert!(log.contains("line 2: \"nonsense\" is not a position"), "{log}");
-    // A place on the earth means nothing in this scene: the last fetch failed, and what is on board stays.
+    // A geographic position is meaningless in this scene: the last fetch fails, and the generation on board
+    // stays.
     let (code, reports, log) = watch("46.8,-92\n");
     assert_eq!((code, &reports[0]["error"]["kind"]), (Some(1), &"fetch".into()), "{log}");
     assert!(reports[0]["error"]["detail"].as_str().is_some_and(|text| text.contains("geo-reference")));
@@ -274,7 +277,7 @@ fn a_robot_is_followed_along_stdin() {
     assert_eq!(watch("").0, Some(0));
 }
 
-/// The service fetches around the positions it is told, and answers from what came in.
+/// The service fetches around the positions posted to it and answers from the result.
 #[test]
 fn a_robot_is_followed_by_its_service() {
     let (signed, shard) = red_and_blue();
@@ -301,7 +304,7 @@ fn a_robot_is_followed_by_its_service() {
     assert!(stop(serving).contains("fetched 1 shards of generation 3"));
 }
 
-/// Ten times more questions than can be answered: some are, quickly enough, the others are turned away.
+/// Ten times more queries than the service can answer: some are answered quickly, the others are refused.
 #[test]
 fn overload_is_turned_away_and_memory_stays() {
     let (signed, shard) = red_and_blue();
@@ -321,7 +324,7 @@ fn overload_is_turned_away_and_memory_stays() {
     for none in ["/n_without_retry_after", "/n_other_status", "/n_broken"] {
         assert_eq!(number(none), 0.0, "{report}");
     }
-    // A bound, not a measurement: a queue without end would grow for as long as the load lasts.
+    // A bound, not a measurement: an unbounded queue would grow for as long as the load lasts.
     assert!(number("/accepted/p99_ms") < 2000.0, "{report}");
     if cfg!(target_os = "linux") {
         let grown = number("/memory/late_max_bytes") - number("/memory/early_max_bytes");
@@ -329,8 +332,8 @@ fn overload_is_turned_away_and_memory_stays() {
     }
 }
 
-/// The robot's program asks in words: it carries the embedded text model, and not the image model, which is larger than the
-/// rest of the models together.
+/// The robot's program includes the embedded text model, but not the image model, which is larger than all
+/// other models together.
 #[test]
 fn the_image_model_stays_with_the_encoder() {
     let program = std::fs::read(env!("CARGO_BIN_EXE_slag-edge")).expect("the program");

@@ -1,4 +1,4 @@
-//! Vectors of a cache and what was found in it as plain files, for other engines to be compared with.
+//! Writes a cache's vectors and search results as plain files, for comparison with other engines.
 
 use std::io::{self, BufWriter, Write};
 use std::path::Path;
@@ -13,19 +13,19 @@ use crate::score::{Precision, Question, Region, ScoreError, Search};
 /// Gaussians that are decoded at a time.
 const CHUNK: usize = 4096;
 
-/// Why there is no dump.
+/// Reasons for which a dump fails.
 #[derive(Debug, thiserror::Error)]
 pub enum DumpError {
     /// The file system's error, with the path.
     #[error("{0}; choose a folder with enough space for the vectors")]
     Io(#[from] io::Error),
-    /// The queries are of another space.
+    /// The queries have another dimension.
     #[error(transparent)]
     Score(#[from] ScoreError),
 }
 
-/// Writes `vectors.f32` (`[n][dim]`: all Gaussians with an embedding, shard by shard, as decoded, of unit
-/// length), `queries.f32` (`[n_queries][dim]`) and `meta.json` to a folder; floats are little-endian.
+/// Writes `vectors.f32` (`[n][dim]`: all Gaussians with an embedding, shard by shard, decoded, unit length),
+/// `queries.f32` (`[n_queries][dim]`) and `meta.json` to a folder; floats are little-endian.
 ///
 /// # Errors
 /// [`DumpError`].
@@ -56,7 +56,7 @@ pub fn dump_vectors(dir: &Path, shards: &[ShardView<'_>], queries: &[Vec<f32>]) 
     Ok(())
 }
 
-/// Writes what each query finds best, best first, as little-endian u32 places in `vectors.f32`:
+/// Writes the results of each query, best first, as little-endian u32 indices into `vectors.f32`:
 /// `NAME-LIMIT-QUERY.u32`.
 ///
 /// # Errors

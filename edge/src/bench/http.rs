@@ -1,4 +1,4 @@
-//! What the service adds to an answer: whole requests over loopback, as Arrow columns.
+//! Times whole requests over loopback, as Arrow columns: the cost that the service adds to an answer.
 
 use std::io;
 use std::time::Instant;
@@ -13,24 +13,24 @@ use crate::query::{Engine, MAX_GAUSSIANS};
 use crate::store::{EdgeCache, Snapshot};
 use crate::text::{EncoderInfo, TextService};
 
-/// Times of requests at one size.
+/// Times of requests at one limit.
 #[derive(Clone, Debug, Serialize)]
 pub struct HttpTiming {
-    /// Size asked for.
+    /// Number of Gaussians asked for.
     pub limit: usize,
     /// Timed requests.
     pub n_runs: usize,
     /// Bytes of the largest body.
     pub body_bytes: usize,
-    /// Half of the requests took no longer, from the request to the body's last byte.
+    /// Median time, from the request to the body's last byte.
     pub median_ms: f64,
-    /// 99 of 100 took no longer.
+    /// 99th percentile.
     pub p99_ms: f64,
     /// The median less that of the same answer in process.
     pub added_ms: f64,
 }
 
-/// A text model whose texts are the places of given vectors.
+/// A text model whose texts are indices of given vectors.
 struct Given(Vec<Vec<f32>>);
 
 impl TextEncoder for Given {
@@ -48,7 +48,7 @@ impl TextEncoder for Given {
     }
 }
 
-/// Starts a text model of a scene's space whose texts are the places of given vectors.
+/// Starts a text model in a scene's embedding space whose texts are indices of given vectors.
 pub(super) fn given(snapshot: &Snapshot, queries: Vec<Vec<f32>>) -> io::Result<TextService> {
     let encoder = &snapshot.manifest.encoder;
     let (name, id) = (encoder.name.clone(), encoder.id);
@@ -56,11 +56,11 @@ pub(super) fn given(snapshot: &Snapshot, queries: Vec<Vec<f32>>) -> io::Result<T
     TextService::start(info, Box::new(Given(queries)))
 }
 
-/// Times the best Gaussians of a cache through the service. `queries`: of unit length, at least one.
-/// `in_process`: the same answers' times without it. Sizes that the service refuses are left out.
+/// Times requests for the best Gaussians of a cache. `queries`: unit length, at least one. `in_process`:
+/// times of the same answers without the service. Skips limits that the service refuses.
 ///
 /// # Errors
-/// When a socket fails, or a request is not answered.
+/// A socket fails, or a request gets no answer.
 pub fn time_http(
     cache: &EdgeCache,
     snapshot: &Snapshot,

@@ -1,4 +1,4 @@
-//! How a service stands more queries than it can answer: an HTTP client of its own, paced.
+//! Loads a service with more queries than it can answer, using a paced HTTP client.
 
 use std::io;
 use std::sync::Arc;
@@ -13,73 +13,73 @@ use tokio::time::Instant;
 use super::machine::Machine;
 use super::times::{Percentiles, Times};
 
-/// A longer answer than any of ours.
+/// Longest answer body accepted.
 const MAX_BODY_BYTES: u64 = 64 << 20;
 const MAX_LINE_BYTES: u64 = 16 << 10;
-/// Patience with one answer.
-const PATIENCE: Duration = Duration::from_secs(30);
-/// Questions at a time while the capacity is measured.
+/// Timeout of one answer.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(30);
+/// Concurrent queries while the capacity is measured.
 const CAPACITY_CLIENTS: usize = 4;
 
-/// What is asked.
+/// Parameters of a load test.
 #[derive(Clone, Debug)]
 pub struct LoadOptions {
     /// `IP:PORT` of the service.
     pub address: String,
-    /// The path asked for, percent-encoded.
+    /// The request path, percent-encoded.
     pub path: String,
-    /// Questions at a time.
+    /// Concurrent queries.
     pub n_clients: usize,
-    /// Questions offered a second, as a multiple of what the service answers.
+    /// Queries offered per second, as a multiple of the service's capacity.
     pub overload: f64,
-    /// Time to measure what the service answers.
+    /// Time to measure the capacity.
     pub warm_up: Duration,
-    /// Time of the load.
+    /// Duration of the load.
     pub duration: Duration,
-    /// Process whose memory is watched.
+    /// Process to sample the memory of.
     pub pid: Option<u32>,
 }
 
-/// How it went.
+/// Report of a load test.
 #[derive(Clone, Debug, Serialize)]
 pub struct LoadReport {
-    /// Where.
+    /// The machine.
     pub machine: Machine,
-    /// Answers a second without overload.
+    /// Answers per second without overload.
     pub capacity_per_sec: f64,
-    /// Questions sent a second under load.
+    /// Queries sent per second under load.
     pub offered_per_sec: f64,
-    /// Questions at a time, at most.
+    /// Most concurrent queries.
     pub n_clients: usize,
     /// Seconds of load.
     pub seconds: f64,
-    /// Times without overload.
+    /// Response times without overload.
     pub unloaded: Percentiles,
-    /// Times of the answers under load.
+    /// Response times of answers under load.
     pub accepted: Percentiles,
-    /// Times of the refusals (503).
+    /// Response times of refusals (503).
     pub refused: Percentiles,
     /// Refusals without `Retry-After`.
     pub n_without_retry_after: u64,
-    /// Any other status.
+    /// Answers with any other status.
     pub n_other_status: u64,
-    /// Connections that broke or answers that did not come.
+    /// Broken connections and missing answers.
     pub n_broken: u64,
-    /// Memory of the process that was watched.
+    /// Memory of the sampled process.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory: Option<Memory>,
 }
 
-/// Resident memory over the load, sampled.
+/// Resident memory during the load.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Memory {
-    /// Samples.
+    /// Number of samples.
     pub n: usize,
     /// At the beginning.
     pub first_bytes: u64,
-    /// The most in the second quarter of the time: the service has met its load then.
+    /// Maximum in the second quarter of the time, when the service has reached its load.
     pub early_max_bytes: u64,
-    /// The most in the last quarter.
+    /// Maximum in the last quarter.
     pub late_max_bytes: u64,
 }
 
@@ -117,10 +117,10 @@ impl Tally {
     }
 }
 
-/// Asks, first as fast as a few clients can, then more than that.
+/// Measures the capacity with a few clients, then loads the service beyond it.
 ///
 /// # Errors
-/// When the service answers nothing.
+/// The service does not answer.
 pub async fn run(options: &LoadOptions) -> io::Result<LoadReport> {
     let (warm, warm_secs) = load(options, CAPACITY_CLIENTS, None, options.warm_up).await;
     let unloaded = warm.accepted.percentiles();
@@ -157,7 +157,7 @@ pub async fn run(options: &LoadOptions) -> io::Result<LoadReport> {
     })
 }
 
-/// Asks with so many clients; returns what came, and the seconds it took.
+/// Sends queries from `n_clients` clients; returns the outcome and the seconds taken.
 async fn load(
     options: &LoadOptions,
     n_clients: usize,
@@ -184,7 +184,7 @@ async fn load(
     (sum, start.elapsed().as_secs_f64())
 }
 
-/// Sends a question every `period`, or as soon as the one before is answered.
+/// Sends a query every `period`, or as soon as the previous one is answered.
 async fn client(options: LoadOptions, first: Instant, period: Duration, end: Instant) -> Tally {
     let mut tally = Tally::default();
     let mut connection: Option<BufReader<TcpStream>> = None;
@@ -197,7 +197,7 @@ async fn client(options: LoadOptions, first: Instant, period: Duration, end: Ins
             return tally;
         }
         tally.n_sent += 1;
-        let answered = tokio::time::timeout(PATIENCE, async {
+        let answered = tokio::time::timeout(ANSWER_TIMEOUT, async {
             let mut stream = match connection.take() {
                 Some(stream) => stream,
                 None => BufReader::new(TcpStream::connect(&options.address).await?),
@@ -217,7 +217,7 @@ async fn client(options: LoadOptions, first: Instant, period: Duration, end: Ins
             Ok(Ok(_)) => tally.n_other_status += 1,
             Ok(Err(_)) | Err(_) => tally.n_broken += 1,
         }
-        // What was missed is not made up for: the load is what can be sent, at most the rate.
+        // Missed queries are not made up for: the load never exceeds the rate.
         next = (next + period).max(Instant::now());
     }
 }
@@ -227,7 +227,7 @@ struct Answer {
     has_retry_after: bool,
 }
 
-/// Reads one answer with a `Content-Length`, and drops its body.
+/// Reads one answer with a `Content-Length` and discards its body.
 async fn read_answer(stream: &mut BufReader<TcpStream>) -> io::Result<Answer> {
     let bad = |what: &str| io::Error::new(io::ErrorKind::InvalidData, what.to_owned());
     let mut line = String::new();
@@ -254,7 +254,7 @@ async fn read_answer(stream: &mut BufReader<TcpStream>) -> io::Result<Answer> {
     if copied == len_bytes { Ok(Answer { status, has_retry_after }) } else { Err(bad("a short answer")) }
 }
 
-/// Samples a process's resident memory, 100 times and more over the time of the load.
+/// Samples a process's resident memory, at least 100 times during the load.
 async fn watch(pid: u32, is_over: Arc<AtomicBool>, duration: Duration) -> Vec<u64> {
     let pause = (duration / 128).min(Duration::from_secs(1));
     let mut samples = Vec::new();
@@ -265,7 +265,7 @@ async fn watch(pid: u32, is_over: Arc<AtomicBool>, duration: Duration) -> Vec<u6
     samples
 }
 
-/// Returns a process's resident memory; `None` where the system does not tell.
+/// Returns a process's resident memory; `None` if the system does not report it.
 fn resident_bytes(pid: u32) -> Option<u64> {
     let status = fs_err::read_to_string(format!("/proc/{pid}/status")).ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;

@@ -1,4 +1,4 @@
-//! What a measurement ran on, as Linux tells it; absent where there is no `/proc`.
+//! The machine of a measurement, as reported by Linux; fields are absent without `/proc`.
 
 use std::time::Instant;
 
@@ -7,12 +7,12 @@ use serde::Serialize;
 
 use crate::score::Level;
 
-/// Larger than what processors keep in caches.
+/// Larger than processor caches.
 const READ_BYTES: usize = 256 << 20;
-/// What one task of the plain loop reads.
+/// Bytes that one task of the plain loop reads.
 const READ_CHUNK: usize = 1 << 20;
 
-/// The machine that something was measured on.
+/// The machine of a measurement.
 #[derive(Clone, Debug, Serialize)]
 pub struct Machine {
     /// The processor's name.
@@ -21,11 +21,11 @@ pub struct Machine {
     pub arch: &'static str,
     /// Cores that the process may use.
     pub n_cores: usize,
-    /// Threads that questions are worked on with.
+    /// Threads for answering questions.
     pub n_threads: usize,
-    /// Instruction set that rows and codes are worked on with.
+    /// Instruction set used for centroids and codes.
     pub simd: &'static str,
-    /// Whether the program was compiled with checks of overflows, as tests are.
+    /// Whether the program was compiled with overflow checks, as tests are.
     pub is_debug_build: bool,
 }
 
@@ -48,16 +48,16 @@ impl Machine {
 /// Memory of this process.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Memory {
-    /// Resident now, pages of mapped shards included.
+    /// Resident now, including pages of mapped shards.
     pub rss_bytes: Option<u64>,
-    /// Of these, its own (not of files).
+    /// Anonymous part of it.
     pub anonymous_bytes: Option<u64>,
-    /// Most that was resident.
+    /// Peak resident memory.
     pub peak_rss_bytes: Option<u64>,
 }
 
 impl Memory {
-    /// Returns what the process holds now.
+    /// Returns the memory in use now.
     pub fn now() -> Self {
         let status = fs_err::read_to_string("/proc/self/status").unwrap_or_default();
         let bytes = |key: &str| Some(field(&status, key)?.strip_suffix(" kB")?.parse::<u64>().ok()? << 10);
@@ -65,13 +65,13 @@ impl Memory {
     }
 }
 
-/// Returns the value of `key: value` in lines of such.
+/// Returns the value of a `key: value` line.
 fn field<'a>(lines: &'a str, key: &str) -> Option<&'a str> {
     let mut fields = lines.lines().filter_map(|line| line.split_once(':'));
     fields.find(|(found, _)| found.trim() == key).map(|(_, value)| value.trim())
 }
 
-/// Returns bytes per second of a plain loop over memory with all threads: the best of some passes.
+/// Measures the bytes per second of a plain loop over memory on all threads: the best of several passes.
 pub fn read_bandwidth() -> f64 {
     let memory: Vec<u64> = vec![1; READ_BYTES / 8];
     let pass = |_| {

@@ -1,4 +1,4 @@
-//! Measurements as commands: each returns a report that names the machine.
+//! Measurements: each returns a report that describes the machine.
 
 mod dump;
 pub mod http;

@@ -1,4 +1,4 @@
-//! How long answers of objects take in process: from a text whose vector is known to ranked objects.
+//! Times answers of objects in process: from a text with a cached vector to ranked objects.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -20,19 +20,19 @@ pub struct ObjectsTiming {
     pub n_runs: usize,
     /// Fewest and most answers.
     pub n_found: [usize; 2],
-    /// Half of the questions took no longer.
+    /// Median time.
     pub median_ms: f64,
-    /// 99 of 100 took no longer.
+    /// 99th percentile.
     pub p99_ms: f64,
-    /// The shortest.
+    /// Minimum.
     pub min_ms: f64,
 }
 
-/// Times `kind=objects` with all else as a request has it that says nothing; `None` where no shard has objects.
-/// `queries`: of unit length, at least one.
+/// Times `kind=objects` with all other parameters at their defaults; `None` if no shard has objects.
+/// `queries`: unit length, at least one.
 ///
 /// # Errors
-/// When a thread does not start, or a request is not answered.
+/// A thread does not start, or a request is not answered.
 pub fn time_objects(
     cache: &EdgeCache,
     snapshot: &Snapshot,
@@ -54,7 +54,7 @@ pub fn time_objects(
         let start = Instant::now();
         let reply = engine.answer(&request).map_err(io::Error::other)?;
         let took = start.elapsed();
-        // Each text's vector is known after the first round.
+        // The text model has cached every vector after the first round.
         if at >= settings.n_warm_up.max(n_queries) {
             times_ms.push(took.as_secs_f64() * 1e3);
             n_found.push(reply.answers.iter().map(|answers| answers.answers.len()).sum::<usize>());

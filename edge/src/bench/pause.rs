@@ -1,4 +1,5 @@
-//! How long a query waits while fetches replace the generation, through the real service and sockets.
+//! Measures how long a query waits while fetches replace the generation, through the real service and
+//! sockets.
 
 use std::io;
 use std::path::PathBuf;
@@ -19,25 +20,25 @@ use crate::http::{self, App, Settings};
 use crate::query::Engine;
 use crate::store::{EdgeCache, StoreError};
 
-/// What is measured.
+/// Parameters of the measurement.
 #[derive(Clone, Debug)]
 pub struct PauseOptions {
     /// Gaussians of the generated scene.
     pub n_gaussians: u32,
     /// Components of an embedding.
     pub dim: u32,
-    /// Fetches, each of a generation of which half the cells are new.
+    /// Number of fetches, each of a generation in which half the cells are new.
     pub n_fetches: u32,
-    /// Time of queries without fetches, before.
+    /// Duration of the queries without fetches, as a baseline.
     pub idle: Duration,
-    /// Folder to work in; made, and emptied of the cache afterwards.
+    /// Work folder; created, and cleared of the cache at the end.
     pub work_dir: PathBuf,
 }
 
-/// What was measured.
+/// Report of the measurement.
 #[derive(Clone, Debug, Serialize)]
 pub struct PauseReport {
-    /// Where.
+    /// The machine.
     pub machine: Machine,
     /// Gaussians on board.
     pub n_gaussians: u32,
@@ -45,24 +46,24 @@ pub struct PauseReport {
     pub dim: u32,
     /// Fetches.
     pub n_fetches: u32,
-    /// Bytes that came in, a fetch.
+    /// Bytes downloaded per fetch.
     pub bytes_per_fetch: u64,
-    /// Median time of a fetch and the loading of what it brought.
+    /// Median time of a fetch and of loading its generation.
     pub fetch_median_ms: f64,
-    /// Queries while nothing is fetched.
+    /// Response times while nothing is fetched.
     pub idle: Percentiles,
-    /// Queries that ran while a fetch or the loading of a generation did.
+    /// Response times during a fetch or the loading of a generation.
     pub fetching: Percentiles,
-    /// The longest time between a question and its answer while fetching: no pause is longer.
+    /// Longest response time while fetching: no pause is longer.
     pub longest_pause_ms: f64,
     /// Generations that answered.
     pub n_generations_seen: usize,
 }
 
-/// Why there is no report.
+/// Reasons for a failed measurement.
 #[derive(Debug, thiserror::Error)]
 pub enum PauseError {
-    /// A socket or file.
+    /// A socket or file failed.
     #[error("{0}; check the work folder and the loopback network")]
     Io(#[from] io::Error),
     /// A fetch failed.
@@ -74,7 +75,7 @@ pub enum PauseError {
     /// A query got no answer.
     #[error("a query got no answer: {what}; see the service's log")]
     Query {
-        /// What came instead.
+        /// The answer received instead.
         what: String,
     },
 }
@@ -86,7 +87,7 @@ struct Asked {
     generation: u64,
 }
 
-/// Measures.
+/// Runs the measurement.
 ///
 /// # Errors
 /// [`PauseError`].
@@ -153,7 +154,7 @@ pub fn run(options: &PauseOptions) -> Result<PauseReport, PauseError> {
     runtime.shutdown_background();
     worked?;
     queried?;
-    // What was made for the measurement is of no use afterwards.
+    // The generated cache is of no further use.
     fs_err::remove_dir_all(cache.dir())?;
 
     let asked = asked.into_inner().unwrap_or_else(PoisonError::into_inner);
@@ -163,7 +164,7 @@ pub fn run(options: &PauseOptions) -> Result<PauseReport, PauseError> {
         if fetches.iter().any(during) {
             busy.add(query.ended - query.began);
         } else if !publishings.iter().any(during) {
-            // Publishing is the cloud's work, not the robot's: what is asked meanwhile counts for nothing.
+            // Publishing is the cloud's work, not the robot's: queries during it are not counted.
             quiet.add(query.ended - query.began);
         }
     }
@@ -186,7 +187,7 @@ pub fn run(options: &PauseOptions) -> Result<PauseReport, PauseError> {
     })
 }
 
-/// Asks for one thing after the other, without a pause.
+/// Sends one query after the other, without a pause.
 fn ask_until(is_over: &AtomicBool, service: &str, asked: &Mutex<Vec<Asked>>) -> Result<(), PauseError> {
     let agent: ureq::Agent = ureq::Agent::config_builder().proxy(None).build().into();
     let fail = |e: &dyn ToString| PauseError::Query { what: e.to_string() };
@@ -213,7 +214,7 @@ fn ask_until(is_over: &AtomicBool, service: &str, asked: &Mutex<Vec<Asked>>) -> 
 mod tests {
     use super::*;
 
-    /// Every query is answered, by each generation in turn. (The times are the command's business.)
+    /// Every query is answered, by each generation in turn. (Times are reported, not asserted.)
     #[test]
     fn queries_go_on_during_fetches() {
         let dir = tempfile::tempdir().expect("a folder");

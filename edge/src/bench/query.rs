@@ -1,4 +1,4 @@
-//! How fast questions are answered: times over a cache, and the files that other engines are timed on.
+//! Times answers over a cache.
 
 use std::time::{Duration, Instant};
 
@@ -14,45 +14,45 @@ use super::timing::{Kind, Settings, Timing, quantile};
 use crate::score::{Columns, Effort, Hit, Matches, Precision, Question, Region, ScoreError, Scratch, Search};
 use crate::store::{OpenShard, Snapshot};
 
-/// Queries that recall is taken from: exact answers take their time.
+/// Queries used to measure recall; exact answers take long.
 const N_RECALL: usize = 16;
 
-/// What was measured.
+/// Report of the measurement.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
     /// The machine.
     pub machine: Machine,
-    /// What was asked about.
+    /// The cache measured.
     pub scene: SceneSize,
-    /// Which data scores come from.
+    /// Data that scores come from.
     pub precision: Precision,
     /// Distinct query vectors.
     pub n_queries: usize,
-    /// Memory of the process after all questions.
+    /// Memory of the process after all queries.
     pub memory: Memory,
-    /// What a plain loop over memory reads with the same threads, in the same run.
+    /// Read bandwidth of a plain loop over memory on the same threads, in the same run.
     pub read_bytes_per_s: f64,
-    /// Times in process: from the query's vector to columns of Gaussians, scores and positions.
+    /// Times in process: from the query vector to columns of Gaussians, scores and positions.
     pub in_process: Vec<Timing>,
-    /// Times of answers of objects in process; absent where the scene has none.
+    /// Times of answers of objects in process; absent if the scene has none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub objects: Option<ObjectsTiming>,
-    /// Times of the best through the service on loopback, as Arrow columns.
+    /// Times of requests for the best Gaussians over loopback, as Arrow columns.
     pub http: Vec<HttpTiming>,
 }
 
-/// What was asked about.
+/// Size of the cache measured.
 #[derive(Clone, Debug, Serialize)]
 pub struct SceneSize {
     /// Profile of the shards.
     pub profile: Profile,
     /// Gaussians.
     pub n_gaussians: u64,
-    /// Those with an embedding.
+    /// Gaussians with an embedding.
     pub n_with_evidence: u64,
     /// Shards.
     pub n_shards: usize,
-    /// Codebook rows.
+    /// Codebook centroids.
     pub n_centroids: u64,
     /// Components of an embedding.
     pub dim: usize,
@@ -60,7 +60,7 @@ pub struct SceneSize {
     pub shard_bytes: u64,
 }
 
-/// Times questions to a snapshot. `queries`: `[dim]` each, unit length; at least one.
+/// Times queries on a snapshot. `queries`: `[dim]` each, unit length; at least one.
 ///
 /// # Errors
 /// [`ScoreError`].
@@ -105,14 +105,14 @@ pub fn bench_query(
     })
 }
 
-/// One timed question.
+/// One timed query.
 struct Run {
     took: Duration,
     n_found: usize,
     bytes: u64,
 }
 
-/// What a process that answers many questions keeps.
+/// Buffers that a process keeps between queries.
 #[derive(Default)]
 struct Answer {
     scratch: Scratch,
@@ -227,8 +227,8 @@ fn timing(kind: Kind, limit: usize, runs: Vec<Run>, read_bytes_per_s: f64) -> Ti
     }
 }
 
-/// Returns the bytes of the shards that an answer was made of: what belongs to rows, bases and words whole,
-/// and of codes, embeddings and positions what was read.
+/// Returns the bytes of the shards that an answer reads: all centroids, bases and codewords, and of codes,
+/// embeddings and positions those visited.
 fn bytes_touched(shards: &[ShardView<'_>], effort: Effort, found: &Columns) -> u64 {
     let of_shard = |shard: &ShardView<'_>| {
         let basis = shard.basis.map_or(0, |b| b.vectors.len() + 2 * b.mean.len() + 4 * b.steps.len());

@@ -20,11 +20,12 @@ use crate::text::{EncoderInfo, TextService};
 use slag_math::random::Random;
 
 const CELL_GAUSSIANS: u32 = 65_536;
-const ROWS_PER_CELL: u32 = 256;
-/// Things there are; a query asks for one of them.
+const CENTROIDS_PER_CELL: u32 = 256;
+/// Number of concepts; a query asks for one of them.
 const N_CONCEPTS: u64 = 64;
 const CELL_WIDTH_M: f64 = 25.0;
-/// Between a thing's rows (0.9 and more) and those of others (0.2 and less at 512 components).
+/// Between the scores of a concept's centroids (0.9 and more) and those of others (0.2 and less at 512
+/// components).
 const THRESHOLD: f32 = 0.6;
 
 fn unit(mut vector: Vec<f32>) -> Vec<f32> {
@@ -42,7 +43,7 @@ fn encoder_id() -> Hash32 {
     Hash32::of(b"slag-edge bench")
 }
 
-/// Encodes a number as the thing of that number.
+/// Encodes a number as the concept of that number.
 struct Concepts(u32);
 
 impl TextEncoder for Concepts {
@@ -72,7 +73,7 @@ pub(super) struct Published {
     objects: BTreeMap<Hash32, Vec<u8>>,
 }
 
-/// Generates generation after generation of a scene; from one to the next half of the cells change.
+/// Generates successive generations of a scene; half of the cells change from one to the next.
 pub(super) struct Generator {
     pub n_gaussians: u32,
     pub dim: u32,
@@ -89,7 +90,7 @@ impl Generator {
             let shard = self.shard(cell_id, n, content)?;
             let (hash, len_bytes, bounds) = (Hash32::of(&shard), shard.len() as u64, bounds(cell_id));
             published.objects.insert(hash, shard);
-            let n_centroids = ROWS_PER_CELL.min(n);
+            let n_centroids = CENTROIDS_PER_CELL.min(n);
             let record = ShardRecord {
                 hash,
                 len_bytes,
@@ -128,24 +129,24 @@ impl Generator {
 
     fn shard(&self, cell_id: u32, n: u32, content: u64) -> io::Result<Vec<u8>> {
         let mut random = Random::new((u64::from(cell_id) << 32) ^ content);
-        let n_centroids = ROWS_PER_CELL.min(n);
+        let n_centroids = CENTROIDS_PER_CELL.min(n);
         let centroid_starts: Vec<u32> = (0..=n_centroids)
-            .map(|row| (u64::from(row) * u64::from(n) / u64::from(n_centroids)) as u32)
+            .map(|centroid| (u64::from(centroid) * u64::from(n) / u64::from(n_centroids)) as u32)
             .collect();
         let mut codebook: Vec<f32> = Vec::new();
-        // Members of a row stand together, as in real scenes.
+        // Members of a centroid are close together, as in real scenes.
         let mut positions: Vec<[u16; 3]> = Vec::new();
-        for row in 0..n_centroids {
+        for centroid in 0..n_centroids {
             let spread = 0.4 / (self.dim as f32 / 3.0).sqrt();
             let around = concept(random.bits(), self.dim);
             let vector = unit(around.into_iter().map(|v| v + spread * random.signed()).collect());
             codebook.extend(vector);
             let centre = [(); 3].map(|()| random.bits() % 60_000);
-            for _ in centroid_starts[row as usize]..centroid_starts[row as usize + 1] {
+            for _ in centroid_starts[centroid as usize]..centroid_starts[centroid as usize + 1] {
                 positions.push(centre.map(|c| (c + random.bits() % 5000) as u16));
             }
         }
-        let (rows, centroid_step) = shard::quantise(&codebook);
+        let (centroids, centroid_step) = shard::quantise(&codebook);
         let box_ = bounds(cell_id);
         let header = ShardHeader {
             cell_id,
@@ -169,7 +170,7 @@ impl Generator {
             header,
             positions: Positions::Wide(&positions),
             centroid_starts: &centroid_starts,
-            centroids: &rows,
+            centroids: &centroids,
             radii: &radii,
             basis: None,
             residuals: None,
@@ -180,16 +181,16 @@ impl Generator {
     }
 }
 
-/// Cells lie in a row along x.
+/// Cells lie in a line along x.
 fn bounds(cell_id: u32) -> Aabb {
     let min = DVec3::X * (f64::from(cell_id) * CELL_WIDTH_M);
     Aabb { min, max: min + DVec3::splat(CELL_WIDTH_M) }
 }
 
-/// What a store serves at the moment.
+/// The generation that a store serves now.
 pub(super) type Shelf = Arc<RwLock<Published>>;
 
-/// Returns the routes of a store that robots fetch from.
+/// Returns the routes of a store that robots can fetch from.
 pub(super) fn store(shelf: Shelf) -> Router {
     async fn manifest(State(shelf): State<Shelf>) -> Vec<u8> {
         shelf.read().unwrap_or_else(PoisonError::into_inner).signed.clone()

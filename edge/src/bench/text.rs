@@ -1,4 +1,4 @@
-//! How long a text model takes for a question, without the service's memory of recent texts.
+//! Times a text model without the service's cache of recent texts.
 
 use std::time::Instant;
 
@@ -8,35 +8,35 @@ use slag_models::{EncodeError, TextEncoder};
 use super::machine::Machine;
 use super::times::{Percentiles, Times};
 
-/// What is measured.
+/// Parameters of the measurement.
 #[derive(Clone, Debug)]
 pub struct TextSettings {
-    /// The texts, each measured by itself.
+    /// The texts, each measured separately.
     pub texts: Vec<String>,
     /// Timed runs of each.
     pub n_runs: usize,
-    /// Untimed runs of each before that.
+    /// Untimed runs of each text before the timed ones.
     pub n_warm_up: usize,
-    /// Threads that the model is run with.
+    /// Threads of the model.
     pub model_threads: usize,
 }
 
-/// How long it took.
+/// Report of the measurement.
 #[derive(Clone, Debug, Serialize)]
 pub struct TextReport {
-    /// Where.
+    /// The machine.
     pub machine: Machine,
-    /// Programs that wanted to run in the last minute, on average, this one among them (Linux).
+    /// Load average of the last minute, including this program (Linux).
     pub load_1min: Option<f64>,
     /// Name of the model's space.
     pub model: String,
-    /// What the model really runs on.
+    /// The execution provider in use.
     pub runs_on: Option<String>,
-    /// Threads that the model is run with.
+    /// Threads of the model.
     pub model_threads: usize,
     /// Untimed runs of each text.
     pub n_warm_up: usize,
-    /// By text.
+    /// Times by text.
     pub texts: Vec<TextTimes>,
 }
 
@@ -49,10 +49,10 @@ pub struct TextTimes {
     pub times: Percentiles,
 }
 
-/// Encodes each text again and again.
+/// Encodes each text repeatedly.
 ///
 /// # Errors
-/// [`EncodeError`] where the model refuses a text or fails.
+/// The model refuses a text or fails.
 pub fn run(encoder: &mut dyn TextEncoder, settings: &TextSettings) -> Result<TextReport, EncodeError> {
     let mut texts = Vec::with_capacity(settings.texts.len());
     for text in &settings.texts {

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-/// Times of many requests, in buckets 2% wide, so that a long run takes no more memory than a short one.
+/// Times of many requests, in buckets 2 % wide: memory does not grow with the length of a run.
 #[derive(Clone, Debug)]
 pub struct Times {
     counts: Vec<u64>,
@@ -14,11 +14,11 @@ pub struct Times {
 pub struct Percentiles {
     /// Requests.
     pub n: u64,
-    /// Half took no longer.
+    /// Median.
     pub median_ms: f64,
-    /// 99% took no longer.
+    /// 99th percentile.
     pub p99_ms: f64,
-    /// None took longer.
+    /// Maximum.
     pub max_ms: f64,
 }
 

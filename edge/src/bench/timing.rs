@@ -1,19 +1,19 @@
-//! What a measurement of questions is asked for, and the times of one kind of answer.
+//! Parameters of a measurement of queries, and the times of one kind of answer.
 
 use serde::Serialize;
 
 use crate::score::Precision;
 
-/// What is measured.
+/// Parameters of the measurement.
 #[derive(Clone, Debug)]
 pub struct Settings {
-    /// Result sizes.
+    /// Numbers of Gaussians to ask for.
     pub limits: Vec<usize>,
-    /// Which data scores come from.
+    /// Data that scores come from.
     pub precision: Precision,
-    /// Timed questions for each size and kind of answer; queries take turns.
+    /// Timed queries for each limit and kind of answer; query vectors take turns.
     pub n_runs: usize,
-    /// Untimed questions before them.
+    /// Untimed queries before them.
     pub n_warm_up: usize,
 }
 
@@ -21,42 +21,42 @@ pub struct Settings {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Kind {
-    /// The best so many, in order.
+    /// The best `limit`, in order.
     Best,
     /// All that reach the score of the last of those.
     Threshold,
 }
 
-/// Times of one kind of answer at one size.
+/// Times of one kind of answer at one limit.
 #[derive(Clone, Debug, Serialize)]
 pub struct Timing {
     /// Kind of answer.
     pub kind: Kind,
-    /// Size asked for.
+    /// Number of Gaussians asked for.
     pub limit: usize,
-    /// Timed questions.
+    /// Timed queries.
     pub n_runs: usize,
     /// Fewest and most Gaussians found.
     pub n_found: [usize; 2],
-    /// Half of the questions took no longer.
+    /// Median time.
     pub median_ms: f64,
-    /// 99 of 100 took no longer.
+    /// 99th percentile.
     pub p99_ms: f64,
-    /// The shortest.
+    /// Minimum.
     pub min_ms: f64,
-    /// Share of the exact answer that is found, mean over queries; absent where answers are exact, or the shards
-    /// have no exact embeddings to tell.
+    /// Share of the exact answer that is found, averaged over queries; absent if answers are exact or the
+    /// shards have no exact embeddings.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub recall: Option<f64>,
-    /// Bytes of the shards that a question reads, median.
+    /// Median number of bytes of the shards that a query reads.
     pub bytes_touched: u64,
-    /// What reading those takes in a plain loop.
+    /// Time to read those bytes in a plain loop.
     pub plain_read_ms: f64,
-    /// The median by that.
+    /// The median time divided by that.
     pub times_plain_read: f64,
 }
 
-/// Returns the least of some sorted values, at least one, that so large a share of them does not exceed.
+/// Returns the least of the sorted values that a share of them does not exceed; there must be at least one.
 pub fn quantile<T: Copy>(sorted: &[T], share: f64) -> T {
     sorted[((sorted.len() as f64 * share).ceil() as usize).clamp(1, sorted.len()) - 1]
 }

@@ -1,15 +1,15 @@
-//! Query vectors made for a measurement.
+//! Query vectors generated for a measurement.
 
 use slag_common::shard::ShardView;
 
 use slag_math::random::Random;
 
-/// How much of a query like those of a bank of texts is an embedding of the scene: text and image vectors
-/// of one thing have cosines around this (CLIP).
+/// Weight of a scene embedding in a query that resembles a text: text and image vectors of one thing have
+/// cosines around this (CLIP).
 const LIKENESS: f32 = 0.3;
 
-/// Makes query vectors: every other one in a random direction, the rest as like an embedding of the scene
-/// as a text's vector is to what it names. Same seed, same vectors.
+/// Generates query vectors: every other one in a random direction, the rest as similar to an embedding of the
+/// scene as a text's vector is to the thing it names. The same seed gives the same vectors.
 pub fn make_queries(shards: &[ShardView<'_>], n: usize, seed: u64) -> Vec<Vec<f32>> {
     let mut random = Random::new(seed);
     let mut queries = Vec::with_capacity(n.min(1 << 16));

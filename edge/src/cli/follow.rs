@@ -81,9 +81,9 @@ pub fn watch(
         &following,
         FollowEnvironment {
             fetch: &mut |request| fetch_once(cache, request, cancel, bar),
-            tell: &mut |outcome| {
+            report: &mut |outcome| {
                 bar.finish();
-                let told = match outcome {
+                let result = match outcome {
                     Ok(report) if json => print_json(report),
                     Ok(report) => print_line(report),
                     Err(error) => {
@@ -91,9 +91,9 @@ pub fn watch(
                         Ok(())
                     }
                 };
-                if told.is_err() {
+                if result.is_err() {
                     // The reader has gone away.
-                    printed = told;
+                    printed = result;
                     cancel.store(true, Ordering::Relaxed);
                 }
             },
@@ -118,7 +118,7 @@ pub fn follow_in_background(
     std::thread::Builder::new().name("follow".into()).spawn(move || {
         let environment = FollowEnvironment {
             fetch: &mut |request| fetch_once(&cache, request, &stop, &()),
-            tell: &mut |outcome| match outcome {
+            report: &mut |outcome| match outcome {
                 Ok(report) => {
                     let (n, generation) = (report.downloaded.n_shards, report.generation);
                     tracing::info!("fetched {n} shards of generation {generation}");

@@ -198,7 +198,7 @@ pub struct FollowEnvironment<'a> {
     /// Makes one fetch.
     pub fetch: &'a mut dyn FnMut(&FetchRequest) -> Result<FetchReport, FetchError>,
     /// Receives the outcome of each fetch.
-    pub tell: &'a mut dyn FnMut(&Result<FetchReport, FetchError>),
+    pub report: &'a mut dyn FnMut(&Result<FetchReport, FetchError>),
     /// Returns numbers within 0..1, to spread retries.
     pub random: &'a dyn Fn() -> f64,
     /// Set to end following.
@@ -256,7 +256,7 @@ pub fn follow(
         let request = FetchRequest { at: Some(position), radius: follower.fetch_radius(), ..request.clone() };
         let outcome = (environment.fetch)(&request);
         following.note(&outcome);
-        (environment.tell)(&outcome);
+        (environment.report)(&outcome);
         match outcome {
             Ok(report) => {
                 follower.fetched(now, report.centre_in_world);

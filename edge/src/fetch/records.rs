@@ -12,7 +12,7 @@ use super::position::Position;
 /// sled's page cache; the records take a few kilobytes.
 const CACHE_BYTES: u64 = 1 << 20;
 /// A fetch that just ended may hold the lock a moment longer: sled releases it on a thread of its own.
-const LOCK_PATIENCE: Duration = Duration::from_secs(2);
+const LOCK_TIMEOUT: Duration = Duration::from_secs(2);
 const LOCK_PAUSE: Duration = Duration::from_millis(20);
 
 /// Reasons for which the records cannot be used.
@@ -84,7 +84,7 @@ impl Records {
                 Ok(records) => return Ok(records),
                 // sled has no error variant for this.
                 Err(sled::Error::Io(e)) if e.to_string().contains("could not acquire lock") => {
-                    if start.elapsed() > LOCK_PATIENCE {
+                    if start.elapsed() > LOCK_TIMEOUT {
                         return Err(RecordsError::Busy { path });
                     }
                     std::thread::sleep(LOCK_PAUSE);

@@ -1,4 +1,4 @@
-//! `slag-edge bench query` over generated caches, and what it writes for other engines.
+//! `slag-edge bench query` over generated caches, and the files it writes for other engines.
 
 mod scene;
 
@@ -91,7 +91,7 @@ fn what_is_timed_is_what_is_sought() {
             let ids = std::fs::read(dump.join(format!("{profile}-500-{at}.u32"))).expect("written");
             let ids = ids.chunks_exact(4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]) as usize);
             assert_eq!(ids.len(), 500);
-            // Rounding may swap those that are as good.
+            // Rounding may swap equally good results.
             let rounding = if is_balanced { 5e-3 } else { 5e-4 };
             for (id, best) in ids.zip(&ranked) {
                 assert!((scores[id] - best).abs() < rounding, "{id}: {} {best}", scores[id]);
@@ -100,7 +100,8 @@ fn what_is_timed_is_what_is_sought() {
     }
 }
 
-/// `SLAG_GENERATE="DIR N compact|balanced N_OBJECTS" cargo test ... -- --ignored` leaves a cache to time.
+/// `SLAG_GENERATE="DIR N compact|balanced N_OBJECTS" cargo test ... -- --ignored` generates a cache for
+/// timing.
 #[test]
 #[ignore = "writes a large cache where SLAG_GENERATE says"]
 fn generate() {

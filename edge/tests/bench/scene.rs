@@ -1,4 +1,5 @@
-//! Caches of random rows and codes in the proportions of real ones: sizes and skipping are, contents are not.
+//! Caches of random centroids and codes with realistic proportions: sizes and skipping are realistic,
+//! contents are not.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -17,13 +18,13 @@ use slag_math::random::Random;
 
 /// Gaussians of a cell.
 const CELL: usize = 65_536;
-/// Gaussians of a row, mean.
-const ROW: usize = 50;
+/// Mean number of Gaussians of a centroid.
+const CENTROID: usize = 50;
 /// Kinds of things in a cell.
 const KINDS: usize = 24;
 /// Vectors of an object.
 const N_VECTORS: usize = 5;
-/// One in so many objects of a cell reaches into the next.
+/// One object in so many reaches into the next cell.
 const REACHING: usize = 10;
 
 pub struct SceneSpec {
@@ -32,7 +33,7 @@ pub struct SceneSpec {
     pub n_components: usize,
     pub n_subspaces: usize,
     pub is_balanced: bool,
-    /// Things in all cells, shared out evenly.
+    /// Objects in all cells, distributed evenly.
     pub n_objects: usize,
 }
 
@@ -120,24 +121,24 @@ fn shard(cell_id: u32, n: usize, spec: &SceneSpec) -> (Vec<u8>, Aabb, u32) {
     let mut centroid_starts = vec![0u32];
     let mut at = 0;
     while at < n_with_evidence {
-        // From 1 to several hundred members: half the rows are short.
+        // From 1 to several hundred members: half the centroids are short.
         let len = match random.below(2) {
-            0 => 1 + random.below(ROW),
-            _ => 1 + random.below(3 * ROW),
+            0 => 1 + random.below(CENTROID),
+            _ => 1 + random.below(3 * CENTROID),
         };
         at = n_with_evidence.min(at + len);
         centroid_starts.push(at as u32);
     }
     let k = centroid_starts.len() - 1;
-    // Components fall off as those of a principal component analysis do; rows of a kind are alike.
+    // Components decay as in a principal component analysis; centroids of a kind are alike.
     let fall: Vec<f32> = (0..m).map(|c| 1.0 / (1.0 + c as f32 / 6.0)).collect();
     let squares: f32 = fall.iter().map(|f| f * f).sum();
     let fall: Vec<f32> = fall.iter().map(|f| f / squares.sqrt()).collect();
     let kinds = normals(&mut random, KINDS * m, 0.7);
     let mut centroids = Vec::with_capacity(k * m);
     let mut kind = 0;
-    for row in 0..k {
-        if row % 16 == 0 {
+    for centroid in 0..k {
+        if centroid % 16 == 0 {
             kind = random.below(KINDS);
         }
         centroids.extend((0..m).map(|c| (kinds[kind * m + c] + 0.35 * normal(&mut random)) * fall[c]));
@@ -211,7 +212,8 @@ fn shard(cell_id: u32, n: usize, spec: &SceneSpec) -> (Vec<u8>, Aabb, u32) {
     (bytes, bounds, k as u32)
 }
 
-/// Returns the objects that have Gaussians in a cell: its own, and those that reach into it from the one before.
+/// Returns the objects with Gaussians in a cell: its own, and those that reach into it from the previous
+/// cell.
 fn objects_of(cell_id: u32, spec: &SceneSpec) -> Vec<u64> {
     let n_cells = spec.n_gaussians.div_ceil(CELL);
     let own = |cell: usize| spec.n_objects * cell / n_cells..spec.n_objects * (cell + 1) / n_cells;
@@ -232,7 +234,7 @@ struct CellObjects {
 }
 
 impl CellObjects {
-    /// Makes them: in turn, each takes a run of Gaussians three times, and a tenth is left to none.
+    /// Assigns runs of Gaussians to the objects in turn, three to each, and leaves a tenth to none.
     fn new(ids: &[u64], n: usize, m: usize, bounds: Aabb, vector: impl Fn(&mut Random) -> Vec<f32>) -> Self {
         let n_turns = 3 * ids.len();
         let start = |turn: usize| (n - n / 10) * turn / n_turns;

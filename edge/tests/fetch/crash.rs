@@ -1,4 +1,4 @@
-//! Power cuts after every step, and full disks: the old generation or the new one, whole.
+//! Power cuts after every step, and full disks: the old or the new generation remains, whole.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use super::sim::SimFiles;
 use super::{Robot, assert_holds, at};
 use slag_math::random::Random;
 
-/// What becomes of the records, which have their own store, at a power cut.
+/// Possible fates of the records, which have storage of their own, at a power cut.
 const N_RECORDS_FATES: u64 = 3;
 
 pub fn copy_dir(from: &Path, to: &Path) {
@@ -51,7 +51,7 @@ impl Trial {
         Self { dir, server, old, new, before: files.fork(None, 0) }
     }
 
-    /// Puts the records back to what they were before the fetch, or loses them, or leaves them.
+    /// Restores the records of before the fetch (1), deletes them (2), or leaves them (0).
     fn settle_records(&self, fate: u64) {
         let db = self.dir.path().join("cache/db");
         if fate > 0 && db.exists() {
@@ -74,7 +74,7 @@ impl Trial {
         (robot, result)
     }
 
-    /// Cuts the power at a step of a fetch, and returns whether the new generation was visible afterwards.
+    /// Cuts the power at a step of a fetch; returns whether the new generation was visible afterwards.
     fn cut(&self, step: u64, seed: u64, parallel: usize) -> bool {
         self.settle_records(1);
         let files = Arc::new(self.before.fork(Some(step), seed));
@@ -83,7 +83,7 @@ impl Trial {
         self.recover(&files, seed, &format!("step {step} seed {seed} parallel {parallel}"))
     }
 
-    /// Restores the power, checks that a generation is there, and that the next fetch works.
+    /// Restores the power, checks that a whole generation is there and that the next fetch works.
     fn recover(&self, files: &SimFiles, seed: u64, context: &str) -> bool {
         self.settle_records(seed % N_RECORDS_FATES);
         let files = Arc::new(files.after_power_cut(seed));
@@ -121,7 +121,7 @@ fn a_power_cut_at_any_step_leaves_a_whole_generation() {
     assert!(n_new > 0 && n_new < n_steps * 6, "{n_new} of {n_steps} steps: both outcomes are seen");
 }
 
-/// A killed process leaves what the system has not synced yet: the next fetch must not build on it.
+/// A killed process leaves unsynced data behind; the next fetch must not build on it.
 #[test]
 fn a_power_cut_after_a_killed_fetch() {
     let trial = Trial::new();
@@ -132,7 +132,7 @@ fn a_power_cut_after_a_killed_fetch() {
             trial.settle_records(1);
             let killed = Arc::new(trial.before.fork(Some(kill_step), seed));
             trial.fetch(&killed, 1).1.expect_err("killed");
-            // The step may lie behind the second fetch: then the power fails after it.
+            // The step may come after the second fetch; then the power fails after it.
             let cut_step = 1 + Random::new(seed).below(files.n_steps());
             let second = Arc::new(killed.fork(Some(cut_step), seed));
             let outcome = trial.fetch(&second, 1).1;
@@ -142,7 +142,7 @@ fn a_power_cut_after_a_killed_fetch() {
     }
 }
 
-/// Also with a server that breaks connections, and with several downloads at a time.
+/// Likewise with a server that breaks connections, and with parallel downloads.
 #[test]
 fn random_power_cuts_under_faults() {
     let trial = Trial::new();
@@ -154,7 +154,7 @@ fn random_power_cuts_under_faults() {
             1 => Fault::Status(503),
             _ => Fault::None,
         });
-        // Fewer than the steps of a fetch without faults, so the cut always comes.
+        // Fewer than the steps of a fetch without faults, so the cut always happens.
         trial.cut(1 + random.below(25), seed, 3);
     }
 }
@@ -185,23 +185,23 @@ fn a_power_cut_in_the_first_fetch() {
 fn a_full_disk_leaves_the_old_generation() {
     let trial = Trial::new();
     let used_bytes = trial.before.used_bytes();
-    for room_bytes in (0..).step_by(700) {
+    for free_bytes in (0..).step_by(700) {
         trial.settle_records(1);
         let files = Arc::new(trial.before.fork(None, 0));
-        files.limit(Some(used_bytes + room_bytes));
+        files.limit(Some(used_bytes + free_bytes));
         let (robot, result) = trial.fetch(&files, 2);
         match result {
             Ok(_) => {
-                assert!(room_bytes > 1000);
+                assert!(free_bytes > 1000);
                 break;
             }
             Err(FetchError::DiskFull { .. }) => {
                 assert_holds(&robot.snapshot(), &trial.old, 0..3);
                 assert!(robot.staged().is_empty(), "the space is given back");
             }
-            Err(e) => panic!("room for {room_bytes}: {e}"),
+            Err(e) => panic!("space for {free_bytes}: {e}"),
         }
         files.limit(None);
-        trial.fetch(&files, 2).1.expect("there is room again");
+        trial.fetch(&files, 2).1.expect("there is space again");
     }
 }

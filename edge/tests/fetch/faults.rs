@@ -1,5 +1,5 @@
-//! Storage and network that fail together, a thousand times over: after each trial the old or the new
-//! generation answers a real query, whole.
+//! Storage and network fail together, in a thousand trials. After each, the old or the new generation answers
+//! a real query, whole.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -25,10 +25,10 @@ use slag_math::random::Random;
 
 const N_TRIALS: u64 = 1000;
 const N_THREADS: u64 = 4;
-/// Gaussians of a cell: its shard comes in in several pieces.
+/// Gaussians of a cell: its shard arrives in several pieces.
 const N: u32 = 60;
 
-/// Every text is the first axis; every row of these scenes has a cosine of 0.5 with it.
+/// Encodes every text as the first axis; every centroid of these scenes has a cosine of 0.5 with it.
 struct FirstAxis;
 
 impl TextEncoder for FirstAxis {
@@ -52,7 +52,7 @@ fn place(position: [f64; 3]) -> Place {
     position.map(|v| (v * 1e6).round() as i64)
 }
 
-/// Asks for everything; returns the generation that answered, and where.
+/// Asks for everything; returns the generation that answered and the positions found.
 fn ask(cache: EdgeCache) -> Result<(u64, BTreeSet<Place>), String> {
     let info = EncoderInfo { name: "e".into(), id: ENCODER, dim: DIM, execution_provider: "none" };
     let text = TextService::start(info, Box::new(FirstAxis)).expect("a thread");
@@ -66,7 +66,7 @@ fn ask(cache: EdgeCache) -> Result<(u64, BTreeSet<Place>), String> {
     Ok((answers.generation, found))
 }
 
-/// Oracle: the positions as they were published.
+/// Oracle: the published positions.
 fn expected(published: &Published, cell_ids: std::ops::Range<u32>) -> BTreeSet<Place> {
     let of_cell = |cell_id| {
         let bytes = AlignedBytes::copy_of(&published.objects[&published.hash(cell_id, Profile::Compact)]);
@@ -77,7 +77,8 @@ fn expected(published: &Published, cell_ids: std::ops::Range<u32>) -> BTreeSet<P
     cell_ids.flat_map(of_cell).collect()
 }
 
-/// What all trials of a thread start from: generation 2 on board, generation 3 offered, 1 for replays.
+/// Starting point of a thread's trials: generation 2 on board, generation 3 offered, generation 1 for
+/// replays.
 struct Stage {
     dir: tempfile::TempDir,
     server: Server,
@@ -88,7 +89,7 @@ struct Stage {
     is_key_change: bool,
 }
 
-/// What came out of the trials: a harness that never fails a fetch, or always does, tests nothing.
+/// Counts of outcomes: a harness in which fetches never fail, or always do, tests nothing.
 #[derive(Debug, Default)]
 struct Outcomes {
     worked: AtomicU64,
@@ -98,7 +99,7 @@ struct Outcomes {
 
 impl Stage {
     fn new(is_key_change: bool) -> Self {
-        // In memory where there is such a folder: the records there are not what is tested.
+        // In memory if possible: the records there are not under test.
         let shm = Path::new("/dev/shm");
         let dir = if shm.is_dir() { tempfile::tempdir_in(shm) } else { tempfile::tempdir() };
         let dir = dir.expect("temporary folder");
@@ -116,7 +117,7 @@ impl Stage {
         Self { dir, server, stale, new, before: files.fork(None, 0), expected, is_key_change }
     }
 
-    /// The robot goes from cells 0..3 to cells 1..5, and cell 0 must go.
+    /// The robot moves from cells 0..3 to cells 1..5, and cell 0 must be freed.
     fn robot(&self, files: &Arc<SimFiles>) -> Robot {
         let mut robot = Robot::on_sim(self.dir.path(), files.clone(), &self.server.url());
         robot.request.at = Some(at(30.0));
@@ -125,7 +126,7 @@ impl Stage {
         robot
     }
 
-    /// Puts the records back to those of before the trial (1), loses them (2), or leaves them.
+    /// Restores the records of before the trial (1), deletes them (2), or leaves them (0).
     fn settle_records(&self, fate: u64) {
         let db = self.dir.path().join("cache/db");
         if fate > 0 && db.exists() {
@@ -154,7 +155,7 @@ impl Stage {
             }
             match random.below(12) {
                 0 | 1 => Fault::Cut(random.below(1500) as usize),
-                // Truncated, and the announced length agrees.
+                // Truncated, with an announced length to match.
                 2 => Fault::Length(-(1 + random.below(200) as i64)),
                 3 => Fault::Length(1 + random.below(200) as i64),
                 4 => Fault::Delay(Duration::from_millis(1 + random.below(4))),
@@ -163,7 +164,8 @@ impl Stage {
                 7 => Fault::IgnoreRange,
                 8 => Fault::ShiftedRange(random.below(100) as usize),
                 9 => Fault::RetryAfter(503, 1),
-                // An old manifest again; a sound shard of the same cell and length, under another hash.
+                // An old manifest replayed; or an intact shard of the same cell and length under another
+                // hash.
                 _ if seen.path == "/v1/manifest" => Fault::Instead(replay.clone()),
                 _ => match pairs.iter().find(|(name, _)| *name == seen.path) {
                     Some((_, other)) => Fault::Instead(other.clone()),
@@ -177,7 +179,7 @@ impl Stage {
         let mut random = Random::new(seed);
         self.settle_records(1);
         self.server.faults(self.network(seed));
-        // A fetch without faults takes some 40 steps.
+        // A fetch without faults takes about 40 steps.
         let (storage, step) = (random.below(4), 1 + random.below(45));
         let files = Arc::new(self.before.fork((storage == 1).then_some(step), seed));
         files.fail_at((storage == 2).then_some(step));
@@ -188,7 +190,7 @@ impl Stage {
         robot.limits.longest_retry_after = Duration::from_millis(2);
         let result = robot.fetch();
 
-        // The power fails now, if it has not before: what was not synced may be lost, torn, or out of order.
+        // The power fails now, unless it failed before: unsynced data may be lost, torn or reordered.
         let context = format!("seed {seed}, storage {storage} at step {step}: {result:?}");
         self.settle_records(random.below(3));
         let files = match random.below(3) {

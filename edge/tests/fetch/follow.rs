@@ -1,4 +1,4 @@
-//! A robot that moves: what is on board around it, and what it costs.
+//! A moving robot: what is on board around it, and what that costs.
 
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
@@ -14,7 +14,7 @@ use super::{Robot, assert_holds};
 
 const N_CELLS: usize = 30;
 
-/// Follows positions, one a second from a start, and returns the seconds at which a fetch was made.
+/// Follows positions, one a second, and returns the seconds at which a fetch was made.
 fn drive(robot: &mut Robot, follower: &mut Follower, start: u64, xs: impl Iterator<Item = f64>) -> Vec<u64> {
     let mut fetched_at = Vec::new();
     for (second, x) in (start..).zip(xs) {
@@ -41,8 +41,8 @@ fn going_to_and_fro_over_an_edge_costs_one_fetch() {
     let dir = tempfile::tempdir().expect("temporary folder");
     let server = Server::start(Published::new(1, &[0; N_CELLS], 20));
     let mut robot = Robot::on_disk(dir.path(), &server.url());
-    // Cells end at multiples of ten. The edge that matters for the first fetch lies at 100 + 18 = 118
-    // too: there the set of cells in reach changes with every step.
+    // Cells end at multiples of ten. For the first fetch the critical edge is also at 100 + 18 = 118: there
+    // every step changes the set of cells in reach.
     for edge in [100.0, 102.0] {
         let mut follower = Follower::new(settings());
         let to_and_fro = (0..200).map(|i| edge + if i % 2 == 0 { -2.5 } else { 0.4 });
@@ -55,7 +55,7 @@ fn going_to_and_fro_over_an_edge_costs_one_fetch() {
     }
 }
 
-/// Oracle: the boxes of the cells, by brute force, at every position.
+/// Oracle: the cells' boxes, by brute force, at every position.
 #[test]
 fn a_drive_always_has_what_is_around() {
     let dir = tempfile::tempdir().expect("temporary folder");
@@ -93,7 +93,7 @@ fn a_drive_always_has_what_is_around() {
     assert_eq!(objects.len(), (0..N_CELLS as u32).filter(|id| bounds(*id).min.x <= 254.5 + 18.0).count());
 }
 
-/// Within the budget the least recently used go first, so the way back costs only what was freed.
+/// Within the budget the least recently used shards go first, so the way back costs only what was freed.
 #[test]
 fn the_way_back_uses_what_is_still_on_board() {
     let dir = tempfile::tempdir().expect("temporary folder");
@@ -109,7 +109,7 @@ fn the_way_back_uses_what_is_still_on_board() {
     assert_eq!(server.take_objects().len(), 0, "twelve cells hold the whole way");
 }
 
-/// The loop over real sockets: bad weather, no network, a new generation, and the end.
+/// The loop over real sockets: network faults, no network, a new generation, and the end.
 #[test]
 fn following_survives_the_loss_of_the_network() {
     let dir = tempfile::tempdir().expect("temporary folder");
@@ -146,20 +146,20 @@ fn following_survives_the_loss_of_the_network() {
                 let robot = Robot { request: request.clone(), cache: robot.cache.clone(), ..robot.clone() };
                 robot.fetch()
             },
-            tell: &mut |outcome| {
+            report: &mut |outcome| {
                 outcomes.push(outcome.as_ref().map(|report| report.n_cells).map_err(|e| e.to_string()));
                 step += 1;
                 match step {
-                    // On board; the robot moves on, and the network is gone.
+                    // On board; the robot moves on, and the network is down.
                     1 => {
                         assert_holds(&robot.snapshot(), &scene, 0..2);
                         server.faults(|_| Fault::Cut(0));
                         following.post(place(35.0));
                     }
-                    // Three failures: the last generation stays. Then it is back.
+                    // Three failures: the last generation stays. Then the network is back.
                     2 | 3 => assert_holds(&robot.snapshot(), &scene, 0..2),
                     4 => server.faults(|_| Fault::None),
-                    // The same place, said otherwise, costs nothing; one far off on the earth does.
+                    // The same place in another form costs nothing; a distant geographic position does.
                     5 => {
                         following.post(earth(35.5));
                         following.post(earth(75.0));
@@ -181,7 +181,7 @@ fn following_survives_the_loss_of_the_network() {
     assert_eq!(scene.hash(6, Profile::Compact), robot.snapshot().current.cells[0].hash);
 }
 
-/// Positions that end while a fetch is due and fails: the error is told.
+/// Positions end while a fetch is due and fails: the error is returned.
 #[test]
 fn the_end_tells_whether_the_last_position_was_served() {
     let dir = tempfile::tempdir().expect("temporary folder");
@@ -196,7 +196,7 @@ fn the_end_tells_whether_the_last_position_was_served() {
             &robot.request,
             FollowSettings::default(),
             following,
-            FollowEnvironment { fetch: &mut |_| robot.fetch(), tell: &mut |_| {}, random: &|| 0.5, cancel },
+            FollowEnvironment { fetch: &mut |_| robot.fetch(), report: &mut |_| {}, random: &|| 0.5, cancel },
         )
     };
     following.close();

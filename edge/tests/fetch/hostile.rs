@@ -1,4 +1,4 @@
-//! What a hostile or broken server cannot do.
+//! Attacks and faults of a server that must have no effect.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
@@ -25,7 +25,7 @@ impl Progress for Count {
     }
 }
 
-/// After each refusal the generation before it still answers.
+/// After each refusal the previous generation still answers.
 #[test]
 fn refused_manifests_leave_the_old_generation() {
     let dir = tempfile::tempdir().expect("temporary folder");
@@ -67,13 +67,13 @@ fn refused_manifests_leave_the_old_generation() {
         FetchError::Manifest(ManifestError::UnknownKey { .. })
     ));
 
-    // A generation that was seen but never arrived counts: the one before it is a replay now.
+    // A generation that was seen but never arrived counts: the previous one is now a replay.
     server.faults(objects(Fault::Status(404)));
     assert!(matches!(refused(&robot, third.clone()), FetchError::Download { .. }));
     server.faults(|_| Fault::None);
     assert!(matches!(refused(&robot, second.clone()), FetchError::Rollback { seen: 3, offered: 2, .. }));
 
-    // The key is changed only when that is said; then the old one is no longer accepted.
+    // The key changes only on request; the old one is then no longer accepted.
     server.publish(foreign.clone());
     robot.request.keys = vec![public(&key(2))];
     assert_eq!(robot.fetch().expect("accepted").key, public(&key(2)));
@@ -83,7 +83,7 @@ fn refused_manifests_leave_the_old_generation() {
     assert!(matches!(robot.fetch(), Err(FetchError::Manifest(ManifestError::UnknownKey { .. }))));
 }
 
-/// A sound shard of the right cell and length under another's hash: only the hash tells.
+/// An intact shard of the right cell and length under another shard's hash: only the hash reveals it.
 #[test]
 fn other_content_under_a_hash_is_refused() {
     let dir = tempfile::tempdir().expect("temporary folder");
@@ -107,7 +107,7 @@ fn endless_bodies_are_cut_off() {
     let scene = Published::new(1, &[0; 1], 50);
     let server = Server::start(scene.clone());
     let mut robot = Robot::on_disk(dir.path(), &server.url());
-    // The right content, and then more: as many bytes as the manifest says are read.
+    // The right content, followed by more: only the manifest's length is read.
     server.faults(objects(Fault::Endless));
     let count = Count::default();
     robot.fetch_watched(&count, &AtomicBool::new(false)).expect("the content is right");
@@ -124,7 +124,7 @@ fn endless_bodies_are_cut_off() {
     assert_holds(&robot.snapshot(), &scene, 0..1);
 }
 
-/// Neither the manifest nor an object is followed to another server.
+/// Redirects to another server are not followed, neither for the manifest nor for an object.
 #[test]
 fn redirects_are_refused() {
     let scene = Published::new(1, &[0; 1], 50);
@@ -154,7 +154,7 @@ fn lasting_faults_are_given_up_and_told() {
         (Fault::Length(1), 3, |f| matches!(f, DownloadFailure::Length { .. })),
         (Fault::Corrupt(900), 3, |f| matches!(f, DownloadFailure::Hash { .. })),
         (Fault::Cut(0), 3, |f| matches!(f, DownloadFailure::Transport(_) | DownloadFailure::Cut { .. })),
-        // A little progress each time, less than counts.
+        // A little progress each time, but less than counts as progress.
         (Fault::Cut(100), 3, |f| matches!(f, DownloadFailure::Transport(_) | DownloadFailure::Cut { .. })),
     ];
     for (fault, expected_attempts, is_expected) in cases {
@@ -177,7 +177,7 @@ fn lasting_faults_are_given_up_and_told() {
     }
 }
 
-/// A signed manifest may be wrong as well: nothing of it gets behind `current`.
+/// A signed manifest may be wrong too: nothing of it reaches `current`.
 #[test]
 fn signed_nonsense_is_refused() {
     let scene = Published::new(1, &[0; 2], 50);
@@ -200,7 +200,7 @@ fn signed_nonsense_is_refused() {
     }));
     assert!(matches!(error, FetchError::Plan(PlanError::Conflict { .. })), "{error}");
 
-    // A shard that is no shard; one of no bytes; one longer than any disk.
+    // An object that is not a shard; one without bytes; one longer than any disk.
     let mut junk = scene.clone();
     let hash = Hash32::of(b"junk");
     junk.objects.insert(hash, b"junk".to_vec());
@@ -219,7 +219,7 @@ fn signed_nonsense_is_refused() {
     }));
     assert!(matches!(error, FetchError::Download { failure: DownloadFailure::Length { .. }, .. }), "{error}");
 
-    // Kept shards are held against the new manifest too.
+    // Kept shards are checked against the new manifest too.
     let dir = tempfile::tempdir().expect("temporary folder");
     let server = Server::start(scene.clone());
     let robot = Robot::on_disk(dir.path(), &server.url());
@@ -259,7 +259,7 @@ fn addresses_that_are_none_are_refused() {
     assert!(error.contains("--at X,Y,Z") && error.contains("--at-geo"), "{error}");
 }
 
-/// Announced lengths are believed when they are too long, not when they are short enough.
+/// An announced length above the limit is believed at once.
 #[test]
 fn a_manifest_of_a_gigabyte_is_refused_unread() {
     let dir = tempfile::tempdir().expect("temporary folder");
@@ -279,7 +279,7 @@ fn a_manifest_of_a_gigabyte_is_refused_unread() {
     assert_holds(&robot.snapshot(), &scene, 0..1);
 }
 
-/// Names become paths: only 64 hex digits do.
+/// Names become paths: only 64 hex digits are accepted.
 #[test]
 fn names_that_are_paths_are_refused() {
     let scene = Published::new(1, &[0; 1], 50);
@@ -296,7 +296,7 @@ fn names_that_are_paths_are_refused() {
         let error = robot.fetch().expect_err("refused");
         assert!(matches!(error, FetchError::Manifest(ManifestError::Content { .. })), "{path}: {error}");
 
-        // The same in what lies on board.
+        // The same in the files on board.
         server.publish(scene.clone());
         robot.fetch().expect("works");
         let current = fs_err::read_to_string(robot.cache.current_path()).expect("there");
@@ -315,13 +315,13 @@ fn signed_text(json: &str) -> Vec<u8> {
     format!("slag-manifest 1 ed25519 {} {}\n{json}", public(&key), hex(&signature)).into_bytes()
 }
 
-/// Shards with lies under right checksums, hashes and signatures: sizes, sections, counts, offsets.
+/// Shards with false sizes, sections, counts and offsets under valid checksums, hashes and signatures.
 #[test]
 fn shards_that_lie_are_refused() {
     let scene = Published::new(1, &[0; 1], 50);
     let sound = scene.objects[&scene.hash(0, Profile::Compact)].clone();
-    // FORMAT.md: the section table begins at 32, a row is id, 0, offset, length, checksum in 32 bytes; the
-    // header section comes first. The checksum is the hash's beginning.
+    // FORMAT.md: the section table begins at 32; an entry is id, 0, offset, length, checksum in 32 bytes; the
+    // header section comes first. The checksum is the beginning of the hash.
     let row = |n: usize| 32 + 32 * n;
     let set =
         |bytes: &mut Vec<u8>, at: usize, value: u64| bytes[at..at + 8].copy_from_slice(&value.to_le_bytes());

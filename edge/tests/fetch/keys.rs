@@ -1,4 +1,4 @@
-//! Whose manifests a robot accepts while keys change.
+//! The keys that a robot accepts while keys change.
 
 use slag_common::Hash32;
 use slag_common::manifest::ManifestError;
@@ -70,7 +70,7 @@ fn a_named_successor_is_accepted_and_then_alone() {
     trial.does_not_know_the_key_of(signed(2, B, None));
     let report = trial.accepts(signed(2, A, Some(B)));
     assert_eq!((report.next_key, report.replaced_key), (Some(hash(B)), None));
-    // Both are accepted now; a third is not, and nothing counts backwards.
+    // Both keys are accepted now, a third is not, and generations never decrease.
     trial.does_not_know_the_key_of(signed(3, C, None));
     trial.accepts(signed(5, A, Some(B)));
     let error = trial.refuses(signed(4, B, None));
@@ -81,14 +81,14 @@ fn a_named_successor_is_accepted_and_then_alone() {
     trial.accepts(signed(7, B, None));
     let error = trial.refuses(signed(6, B, None));
     assert!(matches!(error, FetchError::Rollback { seen: 7, .. }), "{error}");
-    // And on to the next.
+    // And to the next key.
     trial.accepts(signed(8, B, Some(C)));
     assert_eq!(trial.accepts(signed(9, C, None)).replaced_key, Some(hash(B)));
     trial.does_not_know_the_key_of(signed(10, B, Some(C)));
     trial.does_not_know_the_key_of(signed(10, A, Some(C)));
 }
 
-/// A change that is taken back: what the present key no longer names is no longer accepted.
+/// A retracted change: a successor that the present key no longer names is not accepted.
 #[test]
 fn a_successor_may_be_dropped() {
     let trial = Trial::new(signed(1, A, Some(B)));
@@ -99,7 +99,7 @@ fn a_successor_may_be_dropped() {
     trial.accepts(signed(4, C, None));
 }
 
-/// A command line that names the old key goes on working, and does not bring it back.
+/// A command line that names the old key keeps working, and does not reinstate it.
 #[test]
 fn keys_that_are_named_follow_their_successors() {
     let mut trial = Trial::new(signed(1, A, Some(B)));
@@ -107,7 +107,7 @@ fn keys_that_are_named_follow_their_successors() {
     trial.accepts(signed(2, B, None));
     trial.accepts(signed(3, B, None));
     trial.does_not_know_the_key_of(signed(9, A, Some(B)));
-    // A robot that missed the announcement is told both keys.
+    // A robot that missed the announcement is given both keys.
     let mut late = Trial::new(signed(1, A, None));
     late.does_not_know_the_key_of(signed(3, B, None));
     late.robot.request.keys = vec![hash(A), hash(B)];
@@ -116,7 +116,7 @@ fn keys_that_are_named_follow_their_successors() {
     late.accepts(signed(4, B, None));
 }
 
-/// The records are lost, or are those of before the change: what is on board says it too.
+/// The records are lost, or are those of before the change: the manifest on board still refuses the old key.
 #[test]
 fn the_old_key_stays_refused_without_the_records() {
     let trial = Trial::new(signed(1, A, Some(B)));
@@ -132,13 +132,13 @@ fn the_old_key_stays_refused_without_the_records() {
         assert!(matches!(trial.refuses(signed(1, A, Some(B))), FetchError::Manifest(_)), "{put_back}");
         trial.accepts(signed(2, B, None));
     }
-    // Lost between the announcement and the change: both are accepted still.
+    // Lost between announcement and change: both keys are still accepted.
     let trial = Trial::new(signed(1, A, Some(B)));
     fs_err::remove_dir_all(trial.db()).expect("there");
     trial.accepts(signed(2, B, None));
 }
 
-/// The old generation still answers when the new one was accepted but never came in.
+/// The old generation still answers if the new one was accepted but never arrived.
 #[test]
 fn a_change_of_keys_that_was_cut_off_loses_nothing() {
     let old = signed(1, A, Some(B));
@@ -151,13 +151,13 @@ fn a_change_of_keys_that_was_cut_off_loses_nothing() {
     assert!(matches!(trial.robot.fetch(), Err(FetchError::Download { .. })));
     assert_holds(&trial.robot.snapshot(), &old, 0..3);
     trial.server.faults(|_| super::server::Fault::None);
-    // The new key has signed: the old one is out, though its generation is on board.
+    // The new key has signed: the old one is refused, though its generation is on board.
     trial.does_not_know_the_key_of(signed(9, A, Some(B)));
     trial.does_not_know_the_key_of(old);
     trial.accepts(signed(2, B, None));
 }
 
-/// A generation that was seen under the old key, but never came in, counts for the new one.
+/// A generation seen under the old key that never arrived counts for the new key.
 #[test]
 fn what_was_seen_under_the_old_key_counts_for_the_new_one() {
     let trial = Trial::new(signed(1, A, Some(B)));
@@ -173,7 +173,7 @@ fn what_was_seen_under_the_old_key_counts_for_the_new_one() {
     trial.accepts(signed(7, B, None));
 }
 
-/// What is on board answers beyond its expiry; only fetch refuses.
+/// The generation on board answers beyond its expiry; only fetch refuses it.
 #[test]
 fn an_expired_generation_goes_on_answering() {
     let mut trial = Trial::new(signed(1, A, None));

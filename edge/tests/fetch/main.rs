@@ -1,4 +1,4 @@
-//! Fetch and store against a real HTTP server that misbehaves, and storage that loses power.
+//! Fetch and cache against a real HTTP server that misbehaves and storage that loses power.
 
 mod crash;
 mod faults;
@@ -25,7 +25,7 @@ use slag_edge::store::{EdgeCache, Snapshot};
 use scene::{NOW, Published};
 use sim::SimFiles;
 
-/// Fetches with a small patience, as tests want it.
+/// Fetches with short timeouts and few retries.
 #[derive(Clone)]
 struct Robot {
     cache: EdgeCache,
@@ -96,7 +96,7 @@ fn at(x: f64) -> Position {
     Position::World(DVec3::new(x, 0.0, 105.0))
 }
 
-/// Checks that a snapshot holds exactly these cells of a scene, byte for byte.
+/// Checks that a snapshot holds exactly these cells of a scene.
 fn assert_holds(snapshot: &Snapshot, published: &Published, cell_ids: std::ops::Range<u32>) {
     let found: Vec<u32> = snapshot.shards.iter().map(|shard| shard.cell.cell_id).collect();
     assert_eq!(found, cell_ids.collect::<Vec<_>>());

@@ -11,29 +11,29 @@ use slag_common::Hash32;
 
 use super::scene::Published;
 
-/// What to do to one request instead of answering it.
+/// Fault injected into a request.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Fault {
     None,
     /// Closes the connection after so many body bytes.
     Cut(usize),
-    /// Flips the body's byte there.
+    /// Flips a bit of the body's byte there.
     Corrupt(usize),
-    /// Answers with the whole body.
+    /// Ignores the range and answers with the whole body.
     IgnoreRange,
     /// Answers with this status and no body.
     Status(u16),
-    /// Answers with this status, no body, and when to come back, in seconds.
+    /// Answers with this status, no body, and `Retry-After` in seconds.
     RetryAfter(u16, u64),
-    /// Answers later.
+    /// Delays the answer.
     Delay(Duration),
-    /// Sends elsewhere.
+    /// Redirects.
     Redirect(String),
-    /// Sends the body and then goes on for ever, in chunks.
+    /// Sends the body and then continues for ever, in chunks.
     Endless,
-    /// Announces this many bytes more than there are.
+    /// Announces this many bytes more than it sends.
     Length(i64),
-    /// Answers the range that begins so many bytes later.
+    /// Answers with the range that begins so many bytes later.
     ShiftedRange(usize),
     /// Sends other bytes.
     Instead(Vec<u8>),
@@ -41,7 +41,7 @@ pub enum Fault {
     Stall,
 }
 
-/// One request as it was seen.
+/// A request received.
 #[derive(Clone, Debug)]
 pub struct Seen {
     pub path: String,
@@ -82,7 +82,7 @@ impl Server {
                     break;
                 }
                 let shared = for_thread.clone();
-                // A client that goes away mid-answer is part of the game.
+                // A client that leaves mid-answer is expected.
                 std::thread::spawn(move || stream.map(|stream| answer(&shared, stream)));
             }
         });
@@ -97,7 +97,7 @@ impl Server {
         *self.shared.published.lock().expect("sound") = published;
     }
 
-    /// Lets a function choose what happens to each request from now on.
+    /// Sets the function that chooses the fault for each request.
     pub fn faults(&self, chooser: impl FnMut(&Seen) -> Fault + Send + 'static) {
         *self.shared.chooser.lock().expect("sound") = Box::new(chooser);
     }

@@ -1,4 +1,4 @@
-//! Storage that can lose power: what was not synced is lost, torn or kept, at random.
+//! Storage that can lose power: unsynced data is lost, torn or kept, at random.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
@@ -11,7 +11,7 @@ use slag_edge::store::mmap::FileBytes;
 
 use slag_math::random::Random;
 
-/// Smallest piece of unsynced content that is lost or kept by itself.
+/// Smallest piece of unsynced content that is lost or kept on its own.
 const SECTOR_BYTES: usize = 128;
 
 #[derive(Clone, Default)]
@@ -20,14 +20,14 @@ struct Inode {
     durable: Vec<u8>,
 }
 
-/// A change of a folder that is not synced yet.
+/// An unsynced change of a folder.
 #[derive(Clone)]
 enum Change {
     Link {
         path: PathBuf,
         inode: usize,
     },
-    /// `after`: the link of the same rename; a file is never lost by renaming it.
+    /// `after`: the link of the same rename; renaming never loses a file.
     Unlink {
         path: PathBuf,
         after: Option<usize>,
@@ -46,7 +46,7 @@ struct State {
     inodes: Vec<Inode>,
     live: BTreeMap<PathBuf, usize>,
     durable: BTreeMap<PathBuf, usize>,
-    /// By number; kept in order.
+    /// By number, in order.
     pending: BTreeMap<usize, Change>,
     n_changes: usize,
     n_steps: u64,
@@ -62,14 +62,15 @@ struct State {
 pub struct SimFiles(Mutex<State>);
 
 impl SimFiles {
-    /// Returns a copy that loses power at a step (counted from 1), which may or may not still happen.
-    /// Of storage that is cut it is what a killed process leaves: all that happened, synced or not.
+    /// Returns a copy that loses power at a step (counted from 1), which may or may not still take effect. A
+    /// copy of storage that lost power is in the state a killed process leaves: with everything that
+    /// happened, synced or not.
     pub fn fork(&self, cut_at: Option<u64>, seed: u64) -> Self {
         let state = self.0.lock().expect("sound").clone();
         Self(Mutex::new(State { n_steps: 0, cut_at, is_cut: false, random: seed, ..state }))
     }
 
-    /// Lets one step from now on fail, once, with an error of the medium; it happens or not.
+    /// Lets one step from now on fail once with an I/O error; it may or may not take effect.
     pub fn fail_at(&self, step: Option<u64>) {
         self.0.lock().expect("sound").fail_at = step;
     }
@@ -87,7 +88,7 @@ impl SimFiles {
         self.0.lock().expect("sound").used_bytes()
     }
 
-    /// Returns what is there after the power comes back.
+    /// Returns the storage as it is after the power comes back.
     pub fn after_power_cut(&self, seed: u64) -> Self {
         let mut random = Random::new(seed);
         let mut state = self.0.lock().expect("sound").clone();
@@ -116,7 +117,7 @@ impl SimFiles {
     }
 }
 
-/// Returns one of the contents that an unsynced file may have.
+/// Returns one possible content of an unsynced file.
 fn torn(inode: &Inode, random: &mut Random) -> Vec<u8> {
     let len = match random.below(3) {
         0 => inode.durable.len(),
@@ -167,7 +168,7 @@ impl State {
 }
 
 impl SimFiles {
-    /// Takes one step, unless the power is cut; at the cut it happens or not.
+    /// Takes one step, unless the power is cut; at the cut it may or may not take effect.
     fn step(&self, work: impl FnOnce(&mut State) -> io::Result<()>) -> io::Result<()> {
         let mut state = self.0.lock().expect("sound");
         state.check_power()?;
@@ -196,7 +197,7 @@ impl SimFiles {
 }
 
 impl Files for SimFiles {
-    /// Folders are always there.
+    /// Folders always exist.
     fn create_dir(&self, _dir: &Path) -> io::Result<()> {
         self.look(|_| Ok(()))
     }
@@ -214,9 +215,9 @@ impl Files for SimFiles {
                 }
             };
             state.inodes[inode].live.resize(offset_bytes as usize, 0);
-            let room =
+            let free_bytes =
                 state.capacity_bytes.map_or(u64::MAX, |capacity| capacity.saturating_sub(state.used_bytes()));
-            let n_fitting = bytes.len().min(room as usize);
+            let n_fitting = bytes.len().min(free_bytes as usize);
             state.inodes[inode].live.extend_from_slice(&bytes[..n_fitting]);
             if n_fitting < bytes.len() {
                 return Err(io::Error::new(io::ErrorKind::StorageFull, "no space left"));

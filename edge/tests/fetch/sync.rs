@@ -1,4 +1,4 @@
-//! What a fetch brings, keeps and frees when nothing goes wrong, or something passing does.
+//! Fetches without faults or with transient ones: what they download, keep and free.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -33,7 +33,8 @@ fn the_second_fetch_brings_only_the_difference() {
     assert_holds(&robot.snapshot(), &first, 0..3);
     let stat = robot.cache.current_stat().expect("readable");
 
-    // Nothing new: one conditional request, nothing written. Source and place are those of before.
+    // Nothing new: one conditional request, and nothing written. Source and position are those of the last
+    // fetch.
     robot.request = FetchRequest { from: None, at: None, ..robot.request };
     let report = robot.fetch().expect("works");
     assert_eq!((report.downloaded.n_shards, report.kept.n_shards, report.freed.n_shards), (0, 3, 0));
@@ -42,7 +43,7 @@ fn the_second_fetch_brings_only_the_difference() {
     assert_eq!(robot.cache.current_stat().expect("readable"), stat);
     assert!(!report.is_first_contact);
 
-    // A new generation changes cell 1, and the robot moves: cells 1..=4 (x = 25), cell 0 falls out.
+    // A new generation changes cell 1, and the robot moves: cells 1..=3 (x = 25) are needed, cell 0 is not.
     let second = Published::new(2, &[0, 7, 0, 0, 0, 0, 0, 0], 100);
     server.publish(second.clone());
     robot.request.at = Some(at(25.0));
@@ -57,7 +58,7 @@ fn the_second_fetch_brings_only_the_difference() {
     assert_eq!(robot.shards().len(), 3);
     assert_ne!(robot.cache.current_stat().expect("readable"), stat);
 
-    // Back again without network: what was freed is missing; what is on board is enough further on.
+    // Back without network: the freed shards are missing; farther on, the shards on board suffice.
     robot.request.offline = true;
     robot.request.at = Some(at(5.0));
     assert!(matches!(robot.fetch(), Err(FetchError::Offline { n_shards: 1, .. })));
@@ -75,7 +76,7 @@ fn the_least_recently_used_are_freed_first() {
     let mut robot = Robot::on_disk(dir.path(), &server.url());
     robot.request.radius = 2.0;
     robot.request.max_bytes = Some(scene.bytes(0..3));
-    // Visits cells 0, 1, 0, 2: the next one pushes out cell 1, not cell 0.
+    // Visits cells 0, 1, 0, 2: the next one evicts cell 1, not cell 0.
     for x in [5.0, 15.0, 5.0, 25.0, 35.0] {
         robot.request.at = Some(at(x));
         robot.fetch().expect("works");
@@ -91,7 +92,7 @@ fn the_least_recently_used_are_freed_first() {
     assert_holds(&robot.snapshot(), &scene, 3..4);
 }
 
-/// Latitude and longitude of a point bring the same cells as its x, y, z.
+/// Latitude and longitude of a point fetch the same cells as its x, y, z.
 #[test]
 fn geographic_positions_bring_the_same_shards() {
     let dir = tempfile::tempdir().expect("temporary folder");
@@ -128,7 +129,7 @@ fn an_interrupted_download_goes_on_where_it_ended() {
     server.take_seen();
 
     server.faults(|_| Fault::None);
-    // The request was recorded with the accepted manifest: going on needs no repetition.
+    // The request was recorded with the accepted manifest, so it need not be repeated.
     robot.request.from = None;
     let report = robot.fetch().expect("works");
     let objects = server.take_objects();
@@ -142,8 +143,8 @@ fn an_interrupted_download_goes_on_where_it_ended() {
     assert!(robot.staged().is_empty());
 }
 
-/// One fault of each passing kind on every object, in one fetch: it ends well, and each retry goes on
-/// where the last one ended.
+/// One transient fault of each kind on every object, in one fetch: it succeeds, and each retry resumes the
+/// last attempt.
 #[test]
 fn passing_faults_are_overcome() {
     let faults = [
@@ -176,7 +177,7 @@ fn passing_faults_are_overcome() {
     }
 }
 
-/// The part on board is of another content, or the server knows no ranges, or answers a wrong one.
+/// The partial file has other content, or the server ignores ranges or answers a wrong one.
 #[test]
 fn resuming_never_mixes_contents() {
     for fault in [Fault::None, Fault::IgnoreRange, Fault::ShiftedRange(1), Fault::Status(416)] {
@@ -202,7 +203,7 @@ fn resuming_never_mixes_contents() {
     }
 }
 
-/// Many shards, several at a time, every kind of passing fault at random: always the same outcome.
+/// Many shards in parallel, with random transient faults of every kind: always the same outcome.
 #[test]
 fn parallel_downloads_under_random_faults_converge() {
     let scene = Published::new(1, &[3; 24], 200);
@@ -250,7 +251,7 @@ fn cancelling_ends_soon_and_loses_nothing() {
     let cancel = AtomicBool::new(false);
     let progress = CancelAt { cancel: &cancel, bytes: 10_000, received: AtomicU64::new(0) };
     assert!(matches!(robot.fetch_watched(&progress, &cancel), Err(FetchError::Cancelled)));
-    // One buffer at most comes in after the flag.
+    // At most one buffer arrives after the flag is set.
     assert!(progress.received.load(Ordering::Relaxed) <= 10_000 + 512);
     assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Empty { .. })));
     let report = robot.fetch().expect("works");
@@ -291,7 +292,7 @@ fn damage_on_board_is_found_and_healed() {
     assert_eq!(server.take_objects().len(), 1);
     assert_holds(&robot.snapshot(), &scene, 0..3);
 
-    // A shard that is gone; a manifest that is; a pointer that is no JSON.
+    // A missing shard; a missing manifest; a pointer that is not JSON.
     fs_err::remove_file(&path).expect("there");
     assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Missing { .. })));
     robot.fetch().expect("heals");
@@ -328,7 +329,7 @@ fn a_shard_that_the_manifest_does_not_describe_is_refused() {
     assert_eq!(robot.fetch().expect("heals").encoder_id, ENCODER);
 }
 
-/// Readers that open a snapshot again and again while fetches replace it always get a whole one.
+/// Readers that keep opening snapshots while fetches replace them always get a whole one.
 #[test]
 fn readers_get_a_whole_generation_during_fetches() {
     let dir = tempfile::tempdir().expect("temporary folder");
@@ -363,11 +364,11 @@ fn readers_get_a_whole_generation_during_fetches() {
     assert!(seen.lock().expect("sound").len() > 1);
 }
 
-/// A server's `Retry-After` is waited for, up to a limit, and beside the backoff.
+/// `Retry-After` is honoured up to a limit, in addition to the backoff.
 #[test]
 fn retry_after_is_honoured_within_bounds() {
     let scene = Published::new(1, &[0; 1], 10);
-    // Asked for in seconds, allowed in milliseconds: expected is what was slept at least and the most.
+    // Requested in seconds, limited in milliseconds; expected is the range of the time waited.
     for (fault, allowed_ms, expected_ms) in [
         (Fault::RetryAfter(503, 3600), 120, 120..60_000),
         (Fault::RetryAfter(429, 3600), 120, 120..60_000),

@@ -26,22 +26,22 @@ struct Args {
     /// Folder with vectors.f32, queries.f32 and meta.json.
     #[arg(long, value_name = "DIR")]
     dump: PathBuf,
-    /// Folder for the database; made, and removed at the end [default: qdrant-MODE in the dump].
+    /// Folder for the database; created, and removed at the end [default: qdrant-MODE in the dump].
     #[arg(long, value_name = "DIR")]
     work: Option<PathBuf>,
-    /// What to time.
+    /// Modes to time.
     #[arg(long, value_enum, default_values_t = [Mode::Exact, Mode::Int8])]
     mode: Vec<Mode>,
-    /// Result sizes.
+    /// Numbers of results.
     #[arg(long, value_delimiter = ',', default_values_t = [1_000, 10_000, 50_000, 100_000])]
     limit: Vec<usize>,
-    /// Timed searches per limit, at least; queries take turns.
+    /// Least timed searches per limit; queries take turns.
     #[arg(long, default_value_t = 10)]
     runs: usize,
     /// Untimed searches before them.
     #[arg(long, default_value_t = 2)]
     warm_up: usize,
-    /// Where the JSON goes [default: standard output].
+    /// File for the JSON [default: standard output].
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
     /// Folder for the ids that each search found, as little-endian u32, best first: MODE-LIMIT-QUERY.u32.
@@ -99,7 +99,8 @@ struct SearchReport {
     p99_ms: f64,
     min_ms: f64,
     max_ms: f64,
-    /// Share of the true best that each query found, by the dump's vectors in f64 over ties; the mean.
+    /// Share of the true best results that each query found, by the dump's vectors in f64 and with ties; the
+    /// mean.
     recall: f64,
 }
 
@@ -175,7 +176,7 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// A graph of no edges makes no graph: every search scans.
+/// Without edges there is no graph: every search scans.
 fn config(dim: usize, mode: Mode) -> EdgeConfig {
     let no_graph = HnswIndexConfig {
         m: 0,
@@ -188,7 +189,7 @@ fn config(dim: usize, mode: Mode) -> EdgeConfig {
     };
     let int8 =
         ScalarQuantizationConfig { r#type: ScalarType::Int8, quantile: Some(0.99), always_ram: Some(true) };
-    // Unit vectors: the dot product is the cosine, and nothing is normalised a second time.
+    // Unit vectors: the dot product is the cosine, and normalising again is unnecessary.
     let mut vector =
         EdgeVectorParamsBuilder::new(dim, Distance::Dot).hnsw_config(no_graph.clone()).on_disk(false);
     if mode == Mode::Int8 {
@@ -210,7 +211,7 @@ fn build(dump: &Dump, work: &Path, mode: Mode) -> Result<EdgeShard> {
         let points = PointInsertOperations::PointsList(points.collect());
         shard.update(UpdateOperation::PointOperation(PointOperations::UpsertPoints(points)))?;
     }
-    // Moves the points into immutable segments, quantised where that was asked for.
+    // Moves the points into immutable segments, quantised if the mode asks for it.
     shard.optimize()?;
     shard.flush();
     Ok(shard)
@@ -287,8 +288,7 @@ fn time(args: &Args, dump: &Dump, truth: &[Vec<f64>], mode: Mode) -> Result<Mode
     Ok(ModeReport { mode, build_secs, disk_bytes, rss_bytes, searches })
 }
 
-/// Returns the share of the best `limit` that was found; what ties with the last of them counts as one of
-/// them.
+/// Returns the share of the best `limit` that was found; ties with the last of them count.
 fn recall(found: &[u32], scores: &[f64], limit: usize) -> f64 {
     let limit = limit.min(scores.len());
     let mut sorted = scores.to_vec();
