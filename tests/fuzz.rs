@@ -1,6 +1,6 @@
-//! A smoke of every fuzz target on a stable compiler: seeds, and thousands of seeded mutations of them.
+//! Runs every fuzz target on a stable compiler, on seeds and thousands of seeded mutations of them.
 //!
-//! `SLAG_FUZZ_SECS`: seconds a target, instead of a fixed number of mutations.
+//! `SLAG_FUZZ_SECS` sets the seconds per target, instead of a fixed number of mutations.
 
 #![expect(unsafe_code, reason = "an allocator that counts")]
 
@@ -15,16 +15,17 @@ mod targets;
 use slag_math::random::Random;
 use slag_test_support::shared_folder;
 
-/// Memory that a decoder may take beyond the multiple of its input: buffers, and small pictures.
+/// Memory a decoder may take in addition to [`MAX_EXPANSION`] times its input: buffers and small images.
 const FREE_BYTES: usize = 64 << 20;
+/// Largest ratio of a decoder's memory to its input.
 const MAX_EXPANSION: usize = 256;
-/// Mutations of each target; those that write files and decode pictures take the longest.
+/// Mutations of each target; targets that write files and decode images take the longest.
 const N_MUTATIONS: u64 = 3000;
-/// Bytes and numbers at which decoders turn.
+/// Values at the boundaries of integer types.
 const INTERESTING: [u64; 12] =
     [0, 1, 2, 0x7f, 0x80, 0xff, 0xffff, 0x7fff_ffff, 0x8000_0000, 0xffff_ffff, u64::MAX >> 1, u64::MAX];
 
-/// Counts what the current thread has allocated, now and at most.
+/// Counts the bytes allocated by the current thread, now and at their peak.
 struct Counting;
 
 thread_local! {
@@ -38,23 +39,23 @@ fn count(change: isize) {
     PEAK_BYTES.set(PEAK_BYTES.get().max(live));
 }
 
-// SAFETY: every call goes to the system's allocator unchanged.
+// SAFETY: every call is forwarded unchanged to the system's allocator.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         count(layout.size() as isize);
-        // SAFETY: as required of our caller.
+        // SAFETY: the caller meets the system allocator's requirements.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
         count(layout.size() as isize);
-        // SAFETY: as required of our caller.
+        // SAFETY: the caller meets the system allocator's requirements.
         unsafe { System.alloc_zeroed(layout) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
         count(-(layout.size() as isize));
-        // SAFETY: as required of our caller.
+        // SAFETY: the caller meets the system allocator's requirements.
         unsafe { System.dealloc(pointer, layout) }
     }
 }
@@ -62,7 +63,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// Returns what `work` returns and the most bytes it had allocated at a time.
+/// Returns the result of `work` and the peak of its allocated bytes.
 fn peak_bytes<T>(work: impl FnOnce() -> T) -> (T, usize) {
     let before = LIVE_BYTES.get();
     PEAK_BYTES.set(before);
@@ -70,7 +71,7 @@ fn peak_bytes<T>(work: impl FnOnce() -> T) -> (T, usize) {
     (result, (PEAK_BYTES.get() - before) as usize)
 }
 
-/// Changes some bytes, as fuzzers do: bits, numbers, digits, cuts, copies, and pieces of another seed.
+/// Mutates a seed as fuzzers do: bits, numbers, digits, truncation, copies, pieces of another seed.
 fn mutated(seeds: &[Vec<u8>], random: &mut Random) -> Vec<u8> {
     let mut bytes = seeds[random.below(seeds.len())].clone();
     for _ in 0..1 + random.below(4) {
@@ -81,13 +82,13 @@ fn mutated(seeds: &[Vec<u8>], random: &mut Random) -> Vec<u8> {
             3 | 4 => {
                 let width = [1, 2, 4, 8][random.below(4)];
                 let value = INTERESTING[random.below(INTERESTING.len())].to_le_bytes();
-                // Numbers are mostly aligned.
+                // Most numbers are aligned.
                 let at = if random.below(2) == 0 { at } else { at / width * width };
                 let end = (at + width).min(bytes.len());
                 bytes[at..end].copy_from_slice(&value[..end - at]);
             }
             5 => {
-                // Text: a digit, a sign, or a long number in place of what stands there.
+                // Text: replaced by a digit, a sign or a long number.
                 let piece: &[u8] =
                     [b"-".as_slice(), b"9", b"1e999", b"NaN", b"99999999999999999999", b"\"", b"{"]
                         [random.below(7)];
@@ -119,7 +120,7 @@ fn no_decoder_panics() {
     let budget = std::env::var("SLAG_FUZZ_SECS")
         .ok()
         .map(|secs| Duration::from_secs(secs.parse().expect("SLAG_FUZZ_SECS is a number of seconds")));
-    let mut without_sound_seed = Vec::new();
+    let mut without_valid_seed = Vec::new();
     for target in targets::TARGETS {
         let seeds = targets::seeds::of(target.name, folder.as_deref());
         assert!(!seeds.is_empty() || folder.is_none(), "{} has no seeds", target.name);
@@ -131,26 +132,26 @@ fn no_decoder_panics() {
         let (mut n, mut largest_bytes) = (0, 0);
         let mut n_accepted = seeds.iter().filter(|seed| (target.run)(seed)).count();
         if n_accepted == 0 {
-            without_sound_seed.push(target.name);
+            without_valid_seed.push(target.name);
         }
         while budget.map_or(n < N_MUTATIONS, |budget| start.elapsed() < budget) {
             let input = mutated(&seeds, &mut random);
             let run = || catch_unwind(AssertUnwindSafe(|| targets::run(target.name, &input)));
             let (ended, peak_bytes) = peak_bytes(run);
-            let told = || format!("{} at mutation {n}; the input: {}", target.name, input.escape_ascii());
-            n_accepted += usize::from(ended.unwrap_or_else(|_| panic!("{}", told())));
+            let message = || format!("{} at mutation {n}; the input: {}", target.name, input.escape_ascii());
+            n_accepted += usize::from(ended.unwrap_or_else(|_| panic!("{}", message())));
             largest_bytes = largest_bytes.max(peak_bytes);
             let limit_bytes = FREE_BYTES + input.len() * MAX_EXPANSION;
-            assert!(peak_bytes <= limit_bytes, "{peak_bytes} bytes of memory: {}", told());
+            assert!(peak_bytes <= limit_bytes, "{peak_bytes} bytes of memory: {}", message());
             n += 1;
         }
         println!(
-            "{}: {n} mutations of {} seeds, {n_accepted} of them sound, at most {largest_bytes} bytes, in {:.1?}",
+            "{}: {n} mutations of {} seeds, {n_accepted} accepted, at most {largest_bytes} bytes, in {:.1?}",
             target.name,
             seeds.len(),
             start.elapsed()
         );
     }
-    // Mutations of what is refused at once test nothing.
-    assert!(without_sound_seed.is_empty(), "no seed is sound: {without_sound_seed:?}");
+    // Mutations of refused seeds test little.
+    assert!(without_valid_seed.is_empty(), "no seed is accepted: {without_valid_seed:?}");
 }

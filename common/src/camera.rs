@@ -10,8 +10,7 @@ use serde::{Deserialize, Serialize};
 pub enum Distortion {
     /// An ideal pinhole.
     None,
-    /// Brown-Conrady as OpenCV and COLMAP have it (SIMPLE_RADIAL, RADIAL, OPENCV): radial
-    /// `k1 k2 k3`, tangential `p1 p2`.
+    /// Brown-Conrady as in OpenCV and COLMAP (SIMPLE_RADIAL, RADIAL, OPENCV): radial `k1 k2 k3`, tangential `p1 p2`.
     Brown {
         /// Radial coefficients of r^2, r^4, r^6.
         k: [f64; 3],
@@ -25,7 +24,7 @@ pub enum Distortion {
     },
 }
 
-/// The inner geometry of a camera.
+/// The intrinsics of a camera.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Intrinsics {
     /// Image width, pixels.
@@ -44,15 +43,15 @@ pub struct Intrinsics {
     pub distortion: Distortion,
 }
 
-/// Normalised radius beyond which a pinhole image is not considered: 89.4 degrees off the axis.
+/// Normalised radius beyond which images are ignored: 89.4 degrees off the axis.
 const MAX_NORMALISED_RADIUS: f64 = 100.0;
 
 impl Distortion {
-    /// Moves an ideal normalised point (x/z, y/z) to where the lens images it.
+    /// Returns the distorted position of an ideal normalised point (x/z, y/z).
     ///
-    /// Brown: `x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)` and its like in y.
-    /// Fisheye: `x theta_d / r` with `theta = atan r`. Both as the OpenCV documentation of
-    /// `calib3d` prints them, and as COLMAP's models of the same names have them.
+    /// Brown: `x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)`, and y accordingly.
+    /// Fisheye: `x theta_d / r` with `theta = atan r`. Both formulas are those of OpenCV's
+    /// `calib3d` and of COLMAP's models of the same names.
     pub fn distort(&self, [x, y]: [f64; 2]) -> [f64; 2] {
         match *self {
             Self::None => [x, y],
@@ -66,7 +65,7 @@ impl Distortion {
             }
             Self::Fisheye { k: [k1, k2, k3, k4] } => {
                 let r = x.hypot(y);
-                // The limit of theta_d / r at the axis; the series' next term is r^2 / 3.
+                // The limit of theta_d / r at the axis; the next term of the series is r^2 / 3.
                 if r < 1e-9 {
                     return [x, y];
                 }
@@ -80,9 +79,8 @@ impl Distortion {
 
     /// Returns the normalised radius up to which the radial part grows with the radius.
     ///
-    /// Beyond it the polynomial folds back, so that a second ideal point would fall onto the same
-    /// pixel: what lies there is no image of that direction. Tangential terms are left out of the
-    /// criterion (they are small wherever the model is meaningful).
+    /// Beyond it the polynomial folds back and maps a second direction to the same pixel; such directions have no image.
+    /// The criterion ignores tangential terms, which are small wherever the model is meaningful.
     pub fn monotonic_radius(&self) -> f64 {
         match *self {
             Self::None => MAX_NORMALISED_RADIUS,
@@ -102,8 +100,8 @@ impl Distortion {
     }
 }
 
-/// Returns the ascending points of `low..high` where a polynomial (coefficients from the constant
-/// term up) changes sign: between two roots of its derivative there is at most one.
+/// Returns the ascending points of `low..high` at which a polynomial (coefficients from the constant term up) changes
+/// sign; there is at most one between two roots of its derivative.
 fn roots_between(coefficients: &[f64], low: f64, high: f64) -> Vec<f64> {
     if coefficients.len() < 2 {
         return Vec::new();
@@ -132,22 +130,22 @@ fn roots_between(coefficients: &[f64], low: f64, high: f64) -> Vec<f64> {
 }
 
 impl Intrinsics {
-    /// Moves an ideal normalised point (x/z, y/z) to where the lens images it; see [`Distortion::distort`].
+    /// Returns the distorted position of an ideal normalised point (x/z, y/z); see [`Distortion::distort`].
     pub fn distort(&self, normalised: [f64; 2]) -> [f64; 2] {
         self.distortion.distort(normalised)
     }
 
-    /// Returns the image position, pixels, of a normalised point after distortion.
+    /// Returns the image position, pixels, of a distorted normalised point.
     pub fn pixel_from_distorted(&self, [x, y]: [f64; 2]) -> [f64; 2] {
         [x * self.focal_x_px + self.centre_x_px, y * self.focal_y_px + self.centre_y_px]
     }
 
-    /// Returns the normalised point, distortion still in it, of an image position in pixels.
+    /// Returns the distorted normalised point of an image position, pixels.
     pub fn distorted_from_pixel(&self, [u, v]: [f64; 2]) -> [f64; 2] {
         [(u - self.centre_x_px) / self.focal_x_px, (v - self.centre_y_px) / self.focal_y_px]
     }
 
-    /// Returns the same camera with another image size; focal lengths and centre scale along.
+    /// Returns the camera scaled to another image size, with focal lengths and centre.
     pub fn scaled_to(&self, width_px: u32, height_px: u32) -> Self {
         let sx = f64::from(width_px) / f64::from(self.width_px);
         let sy = f64::from(height_px) / f64::from(self.height_px);
@@ -162,8 +160,7 @@ impl Intrinsics {
         }
     }
 
-    /// Returns the same camera with another image width; the height keeps the aspect ratio
-    /// (rounded to a pixel, at least 1).
+    /// Returns the camera scaled to another image width; the height keeps the aspect ratio, rounded, at least 1.
     pub fn scaled_to_width(&self, width_px: u32) -> Self {
         let height_px = ((f64::from(self.height_px) * f64::from(width_px) / f64::from(self.width_px)).round()
             as u32)
@@ -171,7 +168,7 @@ impl Intrinsics {
         self.scaled_to(width_px, height_px)
     }
 
-    /// Returns the same camera as an ideal pinhole.
+    /// Returns the camera as an ideal pinhole.
     pub fn without_distortion(&self) -> Self {
         Self { distortion: Distortion::None, ..*self }
     }
@@ -180,18 +177,18 @@ impl Intrinsics {
 /// A posed image.
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
-    /// Its name, unique in the set: the image's path relative to the image folder, `/` as separator.
+    /// Its name, unique in the set: the image's path relative to the image folder, with `/` as separator.
     pub name: String,
-    /// Where the image file is expected.
+    /// The expected path of the image file.
     pub image_path: PathBuf,
-    /// The camera it was taken with.
+    /// The camera that took it.
     pub intrinsics: Intrinsics,
     /// The rigid transform from world to camera (OpenCV axes).
     pub camera_from_world: DAffine3,
 }
 
 impl View {
-    /// Returns the camera's centre.
+    /// Returns the centre of the camera.
     pub fn position_in_world(&self) -> DVec3 {
         self.camera_from_world.inverse().translation
     }

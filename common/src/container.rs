@@ -1,47 +1,49 @@
-//! The sectioned file that shards, fields and view sums are: little-endian, 64-byte aligned,
-//! checksummed, usable through mmap without parsing. The byte table is in `FORMAT.md`.
+//! The container of all binary files: checksummed sections, little-endian and 64-byte aligned, so that a mapped file is
+//! used without parsing. The byte table is in `docs/formats.md`.
 
 use std::io::{self, Write};
 use std::ops::Range;
 
 use bytemuck::{AnyBitPattern, NoUninit};
 
-/// Sections start at multiples of this, so that a mapped file can be cast to any column type.
+/// Alignment of sections: a mapped file can be cast to any column type.
 pub const ALIGNMENT_BYTES: usize = 64;
 /// Bytes before the section table.
 pub const PREAMBLE_BYTES: usize = 32;
 /// Bytes of one row of the section table.
 pub const SECTION_ROW_BYTES: usize = 32;
-/// More sections than any format has; a larger count is damage.
+/// Largest number of sections accepted: more than any format has.
 pub const MAX_SECTIONS: u32 = 64;
 
 #[cfg(target_endian = "big")]
 compile_error!("the on-disk columns are used in place and are little-endian");
 
-/// What is wrong with a container, and where.
+/// The fault of a container, and its place.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ContainerError {
     /// The file is shorter than its header or its own stated length.
     #[error(
-        "the file has {found_bytes} bytes, expected {expected_bytes}: it is cut; delete it, it is made or fetched again"
+        "the file has {found_bytes} bytes, expected {expected_bytes}: it is truncated; delete it, and it is made or fetched again"
     )]
     Length {
         /// Bytes expected.
         expected_bytes: u64,
-        /// Bytes there.
+        /// Bytes found.
         found_bytes: u64,
     },
-    /// Another kind of file.
-    #[error("byte 0: magic {found:02x?}, expected {expected:02x?}: this is another kind of file")]
+    /// The file is of another kind.
+    #[error(
+        "byte 0: magic {found:02x?}, expected {expected:02x?}: this is another kind of file; check the path"
+    )]
     Magic {
         /// Magic expected.
         expected: [u8; 8],
         /// Magic found.
         found: [u8; 8],
     },
-    /// A version this program does not read.
+    /// The version is not supported.
     #[error(
-        "byte 8: format version {found}, this program reads {expected}; use a matching program, or encode again"
+        "byte 8: format version {found}, expected {expected}; use a program of the matching version, or encode again"
     )]
     Version {
         /// Version expected.
@@ -49,17 +51,17 @@ pub enum ContainerError {
         /// Version found.
         found: u32,
     },
-    /// A header or table value that cannot be.
-    #[error("byte {offset_bytes}: {what}; the file is damaged, delete it, it is made or fetched again")]
+    /// A value is out of range or contradicts another.
+    #[error("byte {offset_bytes}: {what}; the file is damaged: delete it, and it is made or fetched again")]
     Damaged {
-        /// Where.
+        /// The place.
         offset_bytes: u64,
-        /// What was found and what was expected.
+        /// The value found and the value expected.
         what: String,
     },
-    /// A section's bytes do not have the checksum in the table.
+    /// A section does not match its checksum.
     #[error(
-        "section {id} at byte {offset_bytes}: checksum {found:#018x}, the table says {expected:#018x}; delete the file, it is made or fetched again"
+        "section {id} at byte {offset_bytes}: checksum {found:#018x}, expected {expected:#018x}; the file is damaged: delete it, and it is made or fetched again"
     )]
     Checksum {
         /// The section's id.
@@ -68,11 +70,13 @@ pub enum ContainerError {
         offset_bytes: u64,
         /// Checksum in the table.
         expected: u64,
-        /// Checksum of the bytes.
+        /// Checksum of its bytes.
         found: u64,
     },
-    /// A section that the format needs is not there.
-    #[error("section {id} ({name}) is missing; the file is damaged or of a newer program")]
+    /// A required section is missing.
+    #[error(
+        "section {id} ({name}) is missing; the file was written by another version of this program: encode again"
+    )]
     Missing {
         /// The section's id.
         id: u32,
@@ -94,7 +98,7 @@ fn align_up(n: usize) -> usize {
 /// Writes a container: preamble, table, then each section padded with zeros to 64 bytes.
 ///
 /// # Errors
-/// Whatever the writer gives.
+/// Those of the writer.
 pub fn write(mut out: impl Write, magic: [u8; 8], version: u32, sections: &[(u32, &[u8])]) -> io::Result<()> {
     let mut offset = align_up(PREAMBLE_BYTES + SECTION_ROW_BYTES * sections.len());
     let mut table = Vec::with_capacity(SECTION_ROW_BYTES * sections.len());
@@ -124,17 +128,17 @@ pub fn write(mut out: impl Write, magic: [u8; 8], version: u32, sections: &[(u32
     Ok(())
 }
 
-/// Where the sections of a checked container lie.
+/// The places of a checked container's sections.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Layout {
     sections: Vec<(u32, Range<usize>)>,
 }
 
 impl Layout {
-    /// Checks a whole container (bounds, table, every checksum) and returns where its sections lie.
+    /// Checks a whole container (bounds, table, every checksum) and returns the places of its sections.
     ///
     /// # Errors
-    /// [`ContainerError`], naming the byte, for anything that is not exactly what [`write`] makes.
+    /// [`ContainerError`], with the byte, for anything that [`write`] does not write.
     pub fn check(bytes: &[u8], magic: [u8; 8], version: u32) -> Result<Self, ContainerError> {
         let layout = Self::check_table(bytes, magic, version)?;
         for (row, (id, range)) in layout.sections.iter().enumerate() {
@@ -149,10 +153,10 @@ impl Layout {
         Ok(layout)
     }
 
-    /// Checks preamble and table alone; the sections' bytes are not read.
+    /// Checks the preamble and the table without reading the sections.
     ///
     /// # Errors
-    /// As [`Layout::check`], less the checksums of the sections.
+    /// As [`Layout::check`], without the checksums of the sections.
     pub fn check_table(bytes: &[u8], magic: [u8; 8], version: u32) -> Result<Self, ContainerError> {
         let length = |expected: usize| ContainerError::Length {
             expected_bytes: expected as u64,
@@ -173,7 +177,7 @@ impl Layout {
         }
         let n_sections = read_u32(bytes, 12);
         if n_sections > MAX_SECTIONS {
-            return Err(damaged(12, format!("{n_sections} sections, at most {MAX_SECTIONS} are possible")));
+            return Err(damaged(12, format!("{n_sections} sections, expected at most {MAX_SECTIONS}")));
         }
         let head_bytes = PREAMBLE_BYTES + n_sections as usize * SECTION_ROW_BYTES;
         let file_bytes = read_u64(bytes, 16);
@@ -186,20 +190,23 @@ impl Layout {
         let expected = read_u64(bytes, 24);
         let found = checksum(&[&bytes[..24], &bytes[PREAMBLE_BYTES..head_bytes]].concat());
         if expected != found {
-            return Err(damaged(24, format!("header checksum {expected:#018x}, computed {found:#018x}")));
+            return Err(damaged(
+                24,
+                format!("checksum of preamble and table {found:#018x}, expected {expected:#018x}"),
+            ));
         }
         let mut end = align_up(head_bytes);
         let mut sections = Vec::with_capacity(n_sections as usize);
         for row in 0..n_sections as usize {
             let at = PREAMBLE_BYTES + row * SECTION_ROW_BYTES;
             let (id, start, len) = (read_u32(bytes, at), read_u64(bytes, at + 8), read_u64(bytes, at + 16));
-            // Sections lie in table order without gaps, so none can overlap another or the table.
+            // Sections follow in table order without gaps, so none can overlap another or the table.
             let stop = start.checked_add(len).filter(|stop| *stop <= file_bytes);
             let (true, Some(stop)) = (start == end as u64, stop) else {
                 return Err(damaged(
                     at,
                     format!(
-                        "section {id} lies at {start}+{len}, expected it at {end} within {file_bytes} bytes"
+                        "section {id} has offset {start} and length {len}, expected offset {end} and an end within {file_bytes} bytes"
                     ),
                 ));
             };
@@ -210,17 +217,20 @@ impl Layout {
             end = align_up(stop as usize);
         }
         if end as u64 != file_bytes {
-            return Err(damaged(16, format!("{file_bytes} bytes, the sections end at {end}")));
+            return Err(damaged(
+                16,
+                format!("the file has {file_bytes} bytes, but its sections end at {end}"),
+            ));
         }
         Ok(Self { sections })
     }
 
-    /// Returns where a section lies, if it is there.
+    /// Returns the place of a section, if it exists.
     pub fn find(&self, id: u32) -> Option<Range<usize>> {
         self.sections.iter().find(|(other, _)| *other == id).map(|(_, range)| range.clone())
     }
 
-    /// Returns where a section of `expected_len` values of `T` lies.
+    /// Returns the place of a section of `expected_len` values of `T`.
     ///
     /// # Errors
     /// [`ContainerError::Missing`], or [`ContainerError::Damaged`] if its length differs.
@@ -234,15 +244,16 @@ impl Layout {
         let expected_bytes = expected_len.checked_mul(size_of::<T>());
         if expected_bytes != Some(range.len()) {
             let what = format!(
-                "section {id} ({name}) has {} bytes, {expected_len} values need {expected_bytes:?}",
-                range.len()
+                "section {id} ({name}) has {} bytes, expected {expected_len} values of {} bytes",
+                range.len(),
+                size_of::<T>()
             );
             return Err(ContainerError::Damaged { offset_bytes: range.start as u64, what });
         }
         Ok(range)
     }
 
-    /// Returns a section as one value, copied out.
+    /// Returns a copy of a section that holds one value.
     ///
     /// # Errors
     /// As [`Layout::column`].
@@ -264,7 +275,7 @@ fn read_u64(bytes: &[u8], at: usize) -> u64 {
     u64::from_le_bytes(bytes[at..at + 8].try_into().expect("eight bytes"))
 }
 
-/// Bytes at an address that every column type can be used at, for files that are read, not mapped.
+/// Bytes aligned for every column type, for files that are read, not mapped.
 #[derive(Clone, Debug, Default)]
 pub struct AlignedBytes {
     blocks: Vec<Block>,
@@ -276,10 +287,10 @@ pub struct AlignedBytes {
 struct Block([u8; ALIGNMENT_BYTES]);
 
 impl AlignedBytes {
-    /// Reads a file whole.
+    /// Reads a whole file.
     ///
     /// # Errors
-    /// Whatever the file system gives, with the path.
+    /// Those of the file system, with the path.
     pub fn read(path: &std::path::Path) -> io::Result<Self> {
         use io::Read;
         let mut file = fs_err::File::open(path)?;
@@ -305,7 +316,7 @@ impl std::ops::Deref for AlignedBytes {
     }
 }
 
-/// Returns the bytes of a column, to hand to [`write`].
+/// Returns the bytes of a column, as input to [`write`].
 pub fn bytes_of<T: NoUninit>(column: &[T]) -> &[u8] {
     bytemuck::cast_slice(column)
 }
@@ -335,10 +346,9 @@ mod tests {
         assert_eq!(layout.find(9).expect("there").len(), 0);
     }
 
-    /// Every cut and every single flipped bit is refused: nothing in the file but the zero padding
-    /// lies outside a checksum.
+    /// Every truncation and every flipped bit is refused: checksums cover the whole file but its zero padding.
     #[test]
-    fn every_cut_and_flip_is_refused() {
+    fn every_truncation_and_flipped_bit_is_refused() {
         let bytes = sample();
         for len in 0..bytes.len() {
             assert!(Layout::check(&bytes[..len], MAGIC, 3).is_err(), "cut to {len}");

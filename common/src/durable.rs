@@ -1,20 +1,23 @@
-//! Files that survive a power cut: written beside their final name, synced, renamed, and the folder synced.
+//! Files that survive a power cut: written under a temporary name, synced, renamed, and the folder synced.
+//!
+//! Instead of the crate `atomic-write-file`: it needs the final name first (objects are named by the hash of their
+//! content) and makes up temporary names, which a restart could not find and remove.
 
 use std::io::{self, Write};
 use std::path::Path;
 
 use fs_err::File;
 
-/// Who may read a new file.
+/// The readers of a new file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Access {
-    /// Everyone the process's umask allows.
+    /// Those that the process's umask allows.
     Shared,
     /// The owner only (mode 0600).
     Private,
 }
 
-/// Replaces a file: after a crash it has the old content or the new, whole. Writes `PATH.part` first.
+/// Replaces a file through `PATH.part`: after a crash it has either its complete old content or its complete new one.
 ///
 /// # Errors
 /// The file system's error, with the path.
@@ -28,7 +31,7 @@ pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
     replace(part, path, bytes, Access::Shared)
 }
 
-/// Replaces `path` by `bytes` through `part`, which must not exist and must lie on the same file system.
+/// Replaces the content of `path` by `bytes` through `part`, which must not exist and must be on the same file system.
 ///
 /// # Errors
 /// The file system's error, with the path.
@@ -46,7 +49,7 @@ pub fn replace(part: &Path, path: &Path, bytes: &[u8], access: Access) -> io::Re
     move_into_place(part, path)
 }
 
-/// Renames a synced file and makes its new name durable.
+/// Renames a synced file, durably.
 ///
 /// # Errors
 /// The file system's error, with the path.
@@ -60,6 +63,6 @@ pub fn move_into_place(part: &Path, path: &Path) -> io::Result<()> {
 /// # Errors
 /// The file system's error, with the path.
 pub fn sync_folder(path: &Path) -> io::Result<()> {
-    // Elsewhere a folder cannot be opened for syncing; the file system orders renames itself.
+    // Other systems cannot open a folder to sync it; their file systems order renames.
     if cfg!(unix) { File::open(path)?.sync_all() } else { Ok(()) }
 }

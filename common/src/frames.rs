@@ -2,14 +2,14 @@
 //!
 //! | frame | axes and origin | stored as |
 //! |---|---|---|
-//! | `world` | the input model's own; metres and z up where it is metric | f64 |
+//! | `world` | that of the input model; metres and z up if it is metric | f64 |
 //! | `camera` | x right, y down, z forward (OpenCV, COLMAP) | f64, f32 after rebasing |
 //! | `image` | pixels, origin at the top-left corner of the top-left pixel; the centre of pixel (i, j) is (i + 0.5, j + 0.5) | f32 |
 //! | `shard` | world minus the shard's f64 origin | f32 |
 //! | `enu` | metres east, north, up of a WGS 84 origin (REP-103/105) | f64 |
 //! | `ecef` | metres, earth-centred, earth-fixed (WGS 84) | f64 |
 //!
-//! A transform is named `target_from_source`, so that neighbours cancel:
+//! A transform is named `target_from_source`, so that adjacent names cancel:
 //! `mean_in_camera = camera_from_world * mean_in_world`.
 
 use glam::DVec3;
@@ -27,7 +27,7 @@ pub struct Geographic {
     pub latitude_deg: f64,
     /// Longitude, degrees, east positive, within -180..=180.
     pub longitude_deg: f64,
-    /// Height in metres in the datum of whoever wrote it (ellipsoidal for exact ECEF work).
+    /// Height in metres, in the datum of the source; exact ECEF positions need ellipsoidal heights.
     pub height_m: f64,
 }
 
@@ -45,8 +45,8 @@ impl Geographic {
         )
     }
 
-    /// Returns the geographic position of an ECEF point: Bowring's formula, iterated until the
-    /// latitude no longer moves (two or three rounds; exact to well below a millimetre).
+    /// Returns the geographic position of an ECEF point, by Bowring's formula iterated until the latitude is constant (two
+    /// or three rounds; accurate to well below a millimetre).
     pub fn from_ecef_m(ecef_m: DVec3) -> Self {
         let e2 = WGS84_FLATTENING * (2.0 - WGS84_FLATTENING);
         let p = ecef_m.x.hypot(ecef_m.y);
@@ -63,7 +63,7 @@ impl Geographic {
         }
         let (sin_lat, cos_lat) = lat.sin_cos();
         let n = WGS84_SEMI_MAJOR_M / (1.0 - e2 * sin_lat * sin_lat).sqrt();
-        // Along the ellipsoid's normal: stays well conditioned at the poles, where p / cos(lat) is 0/0.
+        // The height along the normal is well conditioned at the poles, where p / cos(lat) is 0/0.
         let height_m = p * cos_lat + ecef_m.z * sin_lat - n * (1.0 - e2 * sin_lat * sin_lat);
         Self {
             latitude_deg: lat.to_degrees(),
@@ -73,7 +73,7 @@ impl Geographic {
     }
 }
 
-/// Where the `world` frame lies on the earth: `world` is east-north-up at this origin.
+/// The position of the `world` frame on the earth: `world` is east-north-up at this origin.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct GeoReference {
     /// The origin of the world frame.
@@ -92,14 +92,14 @@ impl GeoReference {
         ]
     }
 
-    /// Returns a geographic position in the world (ENU) frame, metres.
+    /// Returns a geographic position in the world frame (ENU), metres.
     pub fn world_from_geographic(&self, position: Geographic) -> DVec3 {
         let offset = position.to_ecef_m() - self.origin.to_ecef_m();
         let [east, north, up] = self.axes_in_ecef();
         DVec3::new(east.dot(offset), north.dot(offset), up.dot(offset))
     }
 
-    /// Returns a world (ENU) position, metres, as latitude, longitude and height.
+    /// Returns a position in the world frame (ENU, metres) as latitude, longitude and height.
     pub fn geographic_from_world(&self, position_in_world: DVec3) -> Geographic {
         let [east, north, up] = self.axes_in_ecef();
         Geographic::from_ecef_m(
@@ -121,10 +121,10 @@ pub struct Aabb {
 }
 
 impl Aabb {
-    /// The box of nothing: extending it by a point gives that point.
+    /// The empty box: extended by a point, it becomes that point.
     pub const EMPTY: Self = Self { min: DVec3::INFINITY, max: DVec3::NEG_INFINITY };
 
-    /// Grows the box to hold a ball.
+    /// Extends the box to contain a ball.
     pub fn extend_ball(&mut self, centre: DVec3, radius: f64) {
         self.min = self.min.min(centre - DVec3::splat(radius));
         self.max = self.max.max(centre + DVec3::splat(radius));
@@ -135,7 +135,7 @@ impl Aabb {
         (self.min - point).max(point - self.max).max(DVec3::ZERO).length()
     }
 
-    /// Returns the middle of the box.
+    /// Returns the centre of the box.
     pub fn centre(&self) -> DVec3 {
         (self.min + self.max) * 0.5
     }

@@ -1,14 +1,14 @@
-//! The Gaussians of a scene, decoded: what every splat file is read into.
+//! The decoded Gaussians of a scene, common to all splat formats.
 
 use glam::DVec3;
 
 /// Zeroth spherical-harmonic basis function, 1 / (2 sqrt(pi)).
 pub const SH_C0: f32 = 0.282_094_79;
 
-/// Largest coordinate of a mean: sizes of boxes and squares of distances stay finite in f64.
+/// Largest coordinate of a mean; keeps box sizes and squared distances finite in f64.
 const MAX_COORDINATE: f64 = f32::MAX as f64;
 
-/// 3D Gaussians, one column a field; every column has [`Gaussians::len`] rows.
+/// 3D Gaussians with a column per field; every column has [`Gaussians::len`] rows.
 ///
 /// Values are decoded: opacities are linear (not logits), scales are standard deviations (not
 /// logs), rotations are unit quaternions.
@@ -41,19 +41,19 @@ impl Gaussians {
         self.means_in_world.is_empty()
     }
 
-    /// Returns the number of higher coefficients a Gaussian has per colour channel.
+    /// Returns the number of higher coefficients per colour channel of a Gaussian.
     pub fn sh_rest_per_channel(degree: u8) -> usize {
         (usize::from(degree) + 1).pow(2) - 1
     }
 
-    /// Returns the colour of degree 0, linear in the coefficients, not clamped.
+    /// Returns the colour of degree 0, not clamped.
     pub fn rgb_dc(&self, index: usize) -> [f32; 3] {
         self.sh_dc[index].map(|c| 0.5 + SH_C0 * c)
     }
 
-    /// Returns whether a Gaussian can be drawn: every field finite, the mean within f32's range, and the
-    /// rotation not degenerate.
-    /// Readers keep unusable rows (indices stay those of the file); stages skip and count them.
+    /// Returns whether a Gaussian can be drawn: finite fields, a mean within the range of f32, a rotation of unit length.
+    ///
+    /// Readers keep unusable rows, so that indices stay those of the file; stages skip and count them.
     pub fn is_usable(&self, index: usize) -> bool {
         let norm2: f32 = self.rotations_wxyz[index].iter().map(|q| q * q).sum();
         self.means_in_world[index].to_array().iter().all(|x| x.abs() <= MAX_COORDINATE)
@@ -63,7 +63,7 @@ impl Gaussians {
             && self.sh_dc[index].iter().all(|c| c.is_finite())
     }
 
-    /// Returns the bytes that `count` Gaussians of `sh_degree` take once decoded.
+    /// Returns the decoded size of `count` Gaussians of degree `sh_degree`, bytes.
     pub fn decoded_bytes(count: usize, sh_degree: u8) -> usize {
         count * (24 + 16 + 12 + 4 + 12 + 12 * Self::sh_rest_per_channel(sh_degree))
     }

@@ -1,4 +1,4 @@
-//! Content hashes: what immutable files are named by.
+//! Content hashes, which name immutable files.
 
 use std::fmt;
 use std::str::FromStr;
@@ -11,15 +11,15 @@ use serde::{Deserialize, Serialize};
 pub struct Hash32(pub [u8; 32]);
 
 impl Hash32 {
-    /// Returns the BLAKE3 hash of some bytes.
+    /// Returns the BLAKE3 hash of bytes.
     pub fn of(bytes: &[u8]) -> Self {
         Self(*blake3::hash(bytes).as_bytes())
     }
 
-    /// Returns the BLAKE3 hash of a stream and its length, reading in bounded pieces.
+    /// Returns the BLAKE3 hash and the length of a stream, read in chunks.
     ///
     /// # Errors
-    /// Whatever the reader gives.
+    /// Those of the reader.
     pub fn of_reader(mut reader: impl std::io::Read) -> std::io::Result<(Self, u64)> {
         let mut hasher = blake3::Hasher::new();
         let mut buffer = vec![0; 1 << 16];
@@ -46,7 +46,7 @@ impl fmt::Debug for Hash32 {
 
 /// A text that is not 64 hex digits.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{found:?} is not a hash: expected 64 hex digits")]
+#[error("{found:?} is not a hash, expected 64 lower-case hex digits")]
 pub struct NotAHash {
     /// The text (cut to 80 characters).
     pub found: String,
@@ -57,7 +57,7 @@ impl FromStr for Hash32 {
 
     fn from_str(text: &str) -> Result<Self, NotAHash> {
         let mut bytes = [0; 32];
-        // Upper-case digits are refused: one content, one name.
+        // Upper-case digits are refused, so that each content has one name.
         if text.bytes().any(|b| b.is_ascii_uppercase()) || hex::decode_to_slice(text, &mut bytes).is_err() {
             return Err(NotAHash { found: text.chars().take(80).collect() });
         }

@@ -1,8 +1,7 @@
-//! Vocabulary, geometry, file formats and embedding arithmetic shared by the
-//! SLAG encoder (cloud) and edge (robot).
+//! Geometry and file formats shared by the SLAG encoder (cloud) and edge (robot).
 //!
-//! Frames, units and transform names are defined once, in [`frames`].
-//! Nothing here performs network access, runs models or starts threads.
+//! [`frames`] defines coordinate frames, units and the names of transforms.
+//! Nothing here accesses the network, runs models or starts threads.
 #![forbid(unsafe_code)]
 
 pub mod camera;
@@ -15,6 +14,7 @@ pub mod manifest;
 pub mod npz;
 pub mod objects;
 pub mod poses;
+mod quantise;
 pub mod shard;
 pub mod splat;
 

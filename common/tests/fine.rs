@@ -1,4 +1,4 @@
-//! Fine residuals of exact shards: written and read, decoded as FORMAT.md says, and refused where they lie.
+//! Fine residuals of exact shards: written, read, decoded as in docs/formats.md, and refused if invalid.
 
 use half::f16;
 use slag_common::container::{AlignedBytes, ContainerError};
@@ -6,7 +6,7 @@ use slag_common::shard::{
     Basis, ExactColumns, Fine, Positions, ScoreErrors, ShardHeader, ShardLayout, ShardView,
 };
 
-/// What a test edits before the shard is written.
+/// The parts of a shard that a test edits before it is written.
 struct Parts {
     errors: ScoreErrors,
     steps: Vec<f32>,
@@ -67,7 +67,7 @@ fn fine_residuals_are_read_and_decoded() {
     let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
     let fine = shard.exact.and_then(|exact| exact.fine).expect("written");
     assert_eq!((fine.errors.p999, fine.steps, fine.scales), (0.005, &[0.5, 0.25][..], &[0.01, 0.02][..]));
-    // By hand: Gaussian 1 is of centroid 1, whose components are 2 and 0.25; its residual adds 127 * 0.5 * 0.02 and
+    // By hand: Gaussian 1 belongs to centroid 1 with components 2 and 0.25; its residual adds 127 * 0.5 * 0.02 and
     // -128 * 0.25 * 0.02.
     let c = [2.0 + 1.27, 0.25 - 0.64];
     let expected = [0.5 + c[0], 0.25 + c[1] * -0.4, -0.5 + c[0] * 0.5 + c[1] * 0.2];
@@ -79,7 +79,7 @@ fn fine_residuals_are_read_and_decoded() {
 }
 
 #[test]
-fn lies_are_refused() {
+fn invalid_contents_are_refused() {
     let refused = |edit: fn(&mut Parts)| -> String {
         let error: ContainerError = ShardLayout::check(&written(edit)).expect_err("must be refused");
         error.to_string()

@@ -1,4 +1,4 @@
-//! FORMAT.md says what the code does: its tables are compared with the constants and layouts.
+//! The tables of docs/formats.md agree with the constants and layouts of the code.
 
 use std::mem::offset_of;
 
@@ -6,10 +6,10 @@ use slag_common::objects::{self, ObjectRecord, ObjectsHeader};
 use slag_common::shard::{self, ShardHeader, section};
 use slag_common::{container, manifest};
 
-/// Returns the cells of every table row of the document.
+/// Returns the cells of all table rows of the document.
 fn rows() -> Vec<Vec<String>> {
-    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../FORMAT.md");
-    let text = fs_err::read_to_string(path).expect("FORMAT.md lies at the project's root");
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/formats.md");
+    let text = fs_err::read_to_string(path).expect("docs/formats.md exists");
     text.lines()
         .filter(|line| line.starts_with('|'))
         .map(|line| line.trim_matches('|').split('|').map(|cell| cell.trim().to_owned()).collect())
@@ -21,7 +21,7 @@ fn has(expected: &[&str]) -> bool {
 }
 
 #[test]
-fn header_offsets_are_those_of_the_struct() {
+fn header_offsets_match_the_struct() {
     macro_rules! field {
         ($name:ident, $size:expr, $kind:expr) => {
             let offset = offset_of!(ShardHeader, $name).to_string();
@@ -42,11 +42,11 @@ fn header_offsets_are_those_of_the_struct() {
     field!(box_max, 24, "f64 x 3");
     field!(errors, 16, "f32 x 4");
     field!(encoder_id, 32, "bytes");
-    assert_eq!(size_of::<ShardHeader>(), 176, "a field is missing in FORMAT.md");
+    assert_eq!(size_of::<ShardHeader>(), 176, "a field is missing in docs/formats.md");
 }
 
 #[test]
-fn objects_are_those_of_the_structs() {
+fn objects_match_the_structs() {
     macro_rules! field {
         ($of:ident, $name:ident, $size:expr, $kind:expr) => {
             let offset = offset_of!($of, $name).to_string();
@@ -73,7 +73,7 @@ fn objects_are_those_of_the_structs() {
 }
 
 #[test]
-fn sections_and_versions_are_those_of_the_code() {
+fn sections_and_versions_match_the_code() {
     let sections = [
         (section::HEADER, "header"),
         (section::POSITIONS, "positions"),

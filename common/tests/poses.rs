@@ -34,8 +34,7 @@ fn problem(result: Result<ViewSet, PoseError>) -> (Place, PoseProblem) {
     }
 }
 
-/// Oracle: the reconstruction's own statement of the camera centres (geo.json, `cam_enu`), which a
-/// separate program computed and rounded to a millimetre.
+/// Oracle: the camera centres in geo.json (`cam_enu`), computed by a separate program and rounded to a millimetre.
 #[needs_shared]
 #[test]
 fn brighton_text_is_its_binary_and_lies_where_its_georeference_says() {
@@ -61,14 +60,14 @@ fn brighton_text_is_its_binary_and_lies_where_its_georeference_says() {
         let stated = DVec3::from_array([0, 1, 2].map(|axis| stated[axis].as_f64().unwrap()));
         let found = view.position_in_world();
         assert!((found - stated).abs().max_element() < 2e-3, "{}: {found} {stated}", view.name);
-        // A photo from the air: the optical axis points down.
+        // An aerial photo: the optical axis points down.
         let forward_in_world = view.camera_from_world.inverse().transform_vector3(DVec3::Z);
         assert!(forward_in_world.z < -0.9, "{}: {forward_in_world}", view.name);
     }
 }
 
-/// Oracle: the same 96 poses, once in OpenGL axes as world from camera, once in OpenCV axes as
-/// camera from world, both written by the scene's generator.
+/// Oracle: the same 96 poses as world from camera in OpenGL axes and as camera from world in OpenCV axes, both written
+/// by the scene's generator.
 #[needs_shared]
 #[test]
 fn house_transforms_and_colmap_agree() {
@@ -94,7 +93,7 @@ fn house_transforms_and_colmap_agree() {
 
 #[needs_shared]
 #[test]
-fn an_image_folder_of_ones_own_replaces_the_default() {
+fn a_given_image_folder_replaces_the_default() {
     let scene = shared("scenes/house_a");
     for path in [scene.clone(), scene.join("transforms.json")] {
         let views = poses::read(&path, Some(Path::new("photos"))).unwrap().views;
@@ -102,7 +101,7 @@ fn an_image_folder_of_ones_own_replaces_the_default() {
     }
 }
 
-/// Every lens model, as text and as binary; the binary files are written here by hand.
+/// Every lens model, as text and as binary; the test builds the binary files itself.
 #[test]
 fn lens_models() {
     let brown = |k1, k2, p| Distortion::Brown { k: [k1, k2, 0.0], p };
@@ -168,7 +167,7 @@ fn lens_models() {
 }
 
 #[test]
-fn colmap_errors_say_what_and_where() {
+fn colmap_errors_have_place_and_fault() {
     const CAMERA: &str = "1 PINHOLE 64 48 50 50 32 24\n";
     const IMAGE: &str = "1 1 0 0 0 0 0 0 1 a.jpg\n\n";
 
@@ -188,7 +187,7 @@ fn colmap_errors_say_what_and_where() {
     let (_, what) = problem(read_text(CAMERA, "1 NaN 0 0 0 0 0 0 1 a.jpg\n\n"));
     assert!(matches!(what, PoseProblem::NotARotation { .. }));
 
-    // The features' lines are missing: the second image must not vanish.
+    // Without the lines of features, the second image must not be skipped silently.
     let (place, _) = problem(read_text(CAMERA, "1 1 0 0 0 0 0 0 1 a.jpg\n2 1 0 0 0 0 0 0 1 b.jpg\n"));
     assert_eq!(place, Place::Line(2));
 
@@ -210,9 +209,9 @@ fn colmap_errors_say_what_and_where() {
     assert!(matches!(read_files(&[("cameras.txt", b"")]), Err(PoseError::NotFound { .. })));
 }
 
-/// A count of 2D features that the file does not hold, by one record and by overflow.
+/// Counts of 2D features that exceed the file, by one record and by overflow.
 #[test]
-fn counts_are_not_believed() {
+fn counts_are_not_trusted() {
     let camera = [&1_u64.to_le_bytes()[..], &1_u32.to_le_bytes(), &0_i32.to_le_bytes()].concat();
     let sizes = [64_u64.to_le_bytes(), 48_u64.to_le_bytes()].concat();
     let params: Vec<u8> = [50.0_f64, 32.0, 24.0].iter().flat_map(|v| v.to_le_bytes()).collect();
@@ -238,7 +237,7 @@ fn frame(file_path: &str) -> serde_json::Value {
 }
 
 #[test]
-fn transforms_cameras_are_shared_or_a_frames_own() {
+fn transforms_cameras_are_shared_or_per_frame() {
     let mut own = frame("images/b.jpg");
     own["fl_x"] = 70.into();
     own["w"] = 100.0.into();
@@ -256,7 +255,7 @@ fn transforms_cameras_are_shared_or_a_frames_own() {
     assert_eq!(a.distortion, Distortion::Brown { k: [0.1, 0.0, 0.0], p: [0.0, 0.3] });
     assert_eq!((b.focal_x_px, b.focal_y_px, b.width_px, b.height_px), (70.0, 61.0, 100, 48));
     assert_eq!(b.distortion, Distortion::Fisheye { k: [0.2, 0.0, 0.0, 0.0] });
-    // OpenGL looks along -z and has y up: a point 5 ahead and 1 up of the camera.
+    // OpenGL cameras look along -z with y up: the point is 5 ahead of the camera and 1 above it.
     let in_camera = a_point_in_camera(&views[1], DVec3::new(1.0, 3.0, -2.0));
     assert!((in_camera - DVec3::new(0.0, -1.0, 5.0)).length() < 1e-12, "{in_camera}");
 }
@@ -265,7 +264,7 @@ fn a_point_in_camera(view: &View, point_in_world: DVec3) -> DVec3 {
     view.camera_from_world.transform_point3(point_in_world)
 }
 
-/// NeRF's first data sets: an angle only, no ending, no size.
+/// NeRF's first data sets have only an angle, no extension and no size.
 #[test]
 fn transforms_with_an_angle_and_bare_names() {
     let dir = tempfile::tempdir().unwrap();
@@ -287,7 +286,7 @@ fn transforms_with_an_angle_and_bare_names() {
 }
 
 #[test]
-fn transforms_errors_say_what_and_where() {
+fn transforms_errors_have_place_and_fault() {
     let with = |key: &str, value: serde_json::Value| {
         let mut json =
             serde_json::json!({"fl_x": 60, "w": 64, "h": 48, "frames": [frame("a.jpg"), frame("b.jpg")]});
@@ -318,4 +317,33 @@ fn transforms_errors_say_what_and_where() {
     let twice = serde_json::json!([frame("images/a.jpg"), frame("images_2/a.jpg")]);
     assert_eq!(with("frames", twice).1, PoseProblem::DuplicateImage { image: "a.jpg".into() });
     assert!(matches!(read_files(&[("transforms.json", b"{\"frames\": 3}")]), Err(PoseError::Json { .. })));
+}
+
+/// Two images of one file name are two views wherever their folders tell them apart.
+#[test]
+fn transforms_names_keep_the_folders_that_tell_images_apart() {
+    let cases = [
+        (["left/a.png", "right/a.png"], ["left/a.png", "right/a.png"]),
+        (["images/left/a.png", "images/right/a.png"], ["left/a.png", "right/a.png"]),
+        (["left/images/a.png", "right/images/a.png"], ["left/images/a.png", "right/images/a.png"]),
+        (
+            ["../rig/left/images/a.png", "../rig/right/images_2/a.png"],
+            ["left/images/a.png", "right/images_2/a.png"],
+        ),
+        (["/data/images/a.png", "/data/images/b.png"], ["a.png", "b.png"]),
+    ];
+    for (paths, expected) in cases {
+        let frames = paths.map(frame);
+        let set = read_json(serde_json::json!({"fl_x": 60, "w": 64, "h": 48, "frames": frames}));
+        let names: Vec<String> = set.unwrap().views.into_iter().map(|view| view.name).collect();
+        assert_eq!(names, expected);
+    }
+}
+
+#[test]
+fn a_missing_pose_file_is_named_once() {
+    let error = poses::read(Path::new("absent.json"), None).unwrap_err();
+    let chain = std::iter::successors(Some(&error as &dyn std::error::Error), |error| error.source());
+    let text = chain.map(ToString::to_string).collect::<Vec<_>>().join(": ");
+    assert_eq!(text.matches("absent.json").count(), 1, "{text}");
 }

@@ -1,5 +1,4 @@
-//! Damaged pose files: an error or a valid result, never a panic, and no allocation that the size
-//! of the file does not justify.
+//! Damaged pose files give an error or a valid result, never a panic or an allocation out of proportion to the file.
 #![expect(unsafe_code, reason = "a global allocator that measures is unsafe to implement")]
 
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -12,19 +11,19 @@ thread_local! {
     static LARGEST_BYTES: Cell<usize> = const { Cell::new(0) };
 }
 
-/// The system's allocator, noting the largest request of each thread.
+/// The system's allocator; it records the largest request of each thread.
 struct Measuring;
 
-// SAFETY: every call is passed on to the system's allocator unchanged.
+// SAFETY: every call is forwarded unchanged to the system's allocator.
 unsafe impl GlobalAlloc for Measuring {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         LARGEST_BYTES.with(|largest| largest.set(largest.get().max(layout.size())));
-        // SAFETY: the caller's promises are the system allocator's.
+        // SAFETY: the caller meets the system allocator's requirements.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promises are the system allocator's.
+        // SAFETY: the caller meets the system allocator's requirements.
         unsafe { System.dealloc(pointer, layout) }
     }
 }
@@ -32,7 +31,7 @@ unsafe impl GlobalAlloc for Measuring {
 #[global_allocator]
 static ALLOCATOR: Measuring = Measuring;
 
-/// A file, whole or with its end cut off, a few bits flipped or eight bytes set to ones.
+/// Returns a file with its end cut off, a few bits flipped, or eight bytes set to ones.
 fn damaged(bytes: &[u8], random: &mut Random) -> Vec<u8> {
     let mut bytes = bytes.to_vec();
     match random.below(3) {
@@ -95,7 +94,7 @@ fn transforms() -> [(&'static str, Vec<u8>); 1] {
     [("transforms.json", json.into())]
 }
 
-/// Reads 1,000 damaged versions of each file; returns how many still gave views.
+/// Reads 1,000 damaged versions of each file and returns the number that still gave views.
 fn survive(files: &[(&str, Vec<u8>)]) -> usize {
     let dir = tempfile::tempdir().unwrap();
     let write = |name: &str, bytes: &[u8]| fs_err::write(dir.path().join(name), bytes).unwrap();
@@ -110,7 +109,7 @@ fn survive(files: &[(&str, Vec<u8>)]) -> usize {
             LARGEST_BYTES.set(0);
             let result = poses::read(dir.path(), None);
             let largest_bytes = LARGEST_BYTES.get();
-            // The read buffer (8 KiB) and growing lists of small records; counts are never believed.
+            // The read buffer (8 KiB) and growing lists of small records; counts are never trusted.
             assert!(largest_bytes <= 16_384 + 8 * bad.len(), "{name} {round}: {largest_bytes} bytes");
             match result {
                 Ok(set) => {
@@ -135,7 +134,7 @@ fn damaged_files_are_errors_or_valid() {
         [(2, text_model().to_vec()), (2, binary_model().to_vec()), (1, transforms().to_vec())]
     {
         let n_read = survive(&files);
-        // Both outcomes must occur, or the damage is not what it should be.
+        // Both outcomes must occur, or the damage tests nothing.
         assert!(n_read > 5 && n_read < 800 * n_files, "{}: {n_read}", files[0].0);
     }
 }

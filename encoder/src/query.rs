@@ -225,7 +225,7 @@ impl PublishedObjects {
                 }
             }
             let n_vectors = objects.header.n_vectors as usize;
-            let decoded = objects.decode(&shard);
+            let decoded = shard.object_vectors(&objects);
             for (record, vectors) in objects.records.iter().zip(decoded.chunks_exact(n_vectors * dim)) {
                 let vectors = || vectors.iter().map(|v| *v as f32).collect();
                 vectors_of_id.entry(record.id).or_insert_with(vectors);

@@ -1,4 +1,4 @@
-//! Every binary of this file is the target of its own name.
+//! Every binary built from this file runs the target of its name.
 
 #![no_main]
 

@@ -1,4 +1,4 @@
-//! The targets.
+//! The fuzz targets, one function per decoder.
 
 use std::cell::RefCell;
 use std::path::Path;
@@ -18,10 +18,10 @@ use slag_encoder::segment::GivenMasks;
 use slag_lab::bench::scene::BenchScene;
 use slag_models::description::Description;
 
-/// Splits inputs of several files.
+/// Separates the files of an input that consists of several.
 const SEPARATOR: &[u8] = b"\n====\n";
 
-/// Gives each thread a folder; in memory, where there is such a place.
+/// Runs `work` in a folder of the current thread, in memory where the system has a place for it.
 fn in_folder(work: impl FnOnce(&Path) -> bool) -> bool {
     thread_local! {
         static FOLDER: RefCell<Option<tempfile::TempDir>> = const { RefCell::new(None) };
@@ -39,13 +39,12 @@ fn in_folder(work: impl FnOnce(&Path) -> bool) -> bool {
 fn in_file(name: &str, data: &[u8], work: impl FnOnce(&Path) -> bool) -> bool {
     in_folder(|folder| {
         let path = folder.join(name);
-        fs_err::write(&path, data).expect("room for a file");
+        fs_err::write(&path, data).expect("the file is written");
         work(&path)
     })
 }
 
-/// Returns the bytes with the checksums of a container's sections and head made right, as a hostile
-/// writer would.
+/// Returns the bytes with correct checksums of the container's sections and head, as a hostile writer can compute them.
 fn with_checksums(data: &[u8]) -> Vec<u8> {
     let mut bytes = data.to_vec();
     let Some(n) = bytes.get(12..16).map(|n| u32::from_le_bytes([n[0], n[1], n[2], n[3]]) as usize) else {
@@ -83,8 +82,8 @@ pub fn shard(data: &[u8]) -> bool {
     let bytes = AlignedBytes::copy_of(&with_checksums(data));
     let Ok(layout) = ShardLayout::check(&bytes) else { return false };
     let view = layout.view(&bytes);
-    for row in 0..view.header.n_centroids as usize {
-        assert!(view.members(row).end <= view.n_with_evidence());
+    for centroid in 0..view.header.n_centroids as usize {
+        assert!(view.members(centroid).end <= view.n_with_evidence());
     }
     for index in 0..view.header.n_gaussians as usize {
         std::hint::black_box(view.position_in_world(index));
@@ -97,12 +96,12 @@ pub fn shard(data: &[u8]) -> bool {
         assert!(
             objects.records.iter().all(|record| objects.photo(record).len() == record.photo_bytes as usize)
         );
-        std::hint::black_box(objects.scores(&view, &vec![1.0; view.header.dim as usize]));
+        std::hint::black_box(view.object_scores(&objects, &vec![1.0; view.header.dim as usize]));
     }
     true
 }
 
-/// The bytes as they come, and the same as text that an accepted key has signed.
+/// The bytes unchanged, and as text signed by an accepted key.
 pub fn manifest(data: &[u8]) -> bool {
     let key = SigningKey::from_bytes(&[7; 32]);
     let public = key.verifying_key().to_bytes();
@@ -115,7 +114,7 @@ pub fn manifest(data: &[u8]) -> bool {
         return false;
     };
     let again = manifest.sign(&key);
-    let read = Manifest::verify(&again, &TrustedKeys::FirstContact).expect("what is written is read");
+    let read = Manifest::verify(&again, &TrustedKeys::FirstContact).expect("a signed manifest verifies");
     assert_eq!(read.0, manifest);
     CellIndex::new(&manifest.cells).within(DVec3::ZERO, 1e9);
     let wanted = slag_edge::fetch::Wanted {
@@ -133,7 +132,7 @@ pub fn manifest(data: &[u8]) -> bool {
 pub fn current(data: &[u8]) -> bool {
     in_folder(|folder| {
         let cache = EdgeCache::open(folder);
-        fs_err::write(cache.current_path(), data).expect("room for a file");
+        fs_err::write(cache.current_path(), data).expect("the file is written");
         cache.current().is_ok()
     })
 }
@@ -148,7 +147,7 @@ fn read_splat(name: &str, data: &[u8]) -> bool {
     })
 }
 
-/// Plain and compressed PLY.
+/// Plain and compressed PLY files.
 pub fn ply(data: &[u8]) -> bool {
     read_splat("x.ply", data)
 }
@@ -157,7 +156,7 @@ pub fn splat(data: &[u8]) -> bool {
     read_splat("x.splat", data)
 }
 
-/// The bytes as they come, and packed by gzip, as versions 1 to 3 are.
+/// The bytes unchanged, and compressed by gzip like versions 1 to 3.
 pub fn spz(data: &[u8]) -> bool {
     use std::io::Write;
     let is_accepted = read_splat("x.spz", data);
@@ -170,7 +169,7 @@ pub fn sog(data: &[u8]) -> bool {
     read_splat("x.sog", data)
 }
 
-/// The description of a folder whose pictures are not there: it is sound when they are missed.
+/// The meta file of a folder without its images: accepted if the error is the missing images.
 pub fn sog_meta(data: &[u8]) -> bool {
     in_file("meta.json", data, |path| {
         let read = splat::read(path, &ReadOptions { with_sh_rest: true });
@@ -187,8 +186,8 @@ fn colmap(data: &[u8], extension: &str) -> bool {
     let (cameras, images) = two_parts(data);
     in_folder(|folder| {
         let path = |stem: &str| folder.join(stem).with_extension(extension);
-        fs_err::write(path("cameras"), cameras).expect("room for a file");
-        fs_err::write(path("images"), images).expect("room for a file");
+        fs_err::write(path("cameras"), cameras).expect("the file is written");
+        fs_err::write(path("images"), images).expect("the file is written");
         poses::read(&path("cameras"), Some(folder)).is_ok()
     })
 }
@@ -205,7 +204,7 @@ pub fn transforms(data: &[u8]) -> bool {
     in_file("transforms.json", data, |path| poses::read(path, None).is_ok())
 }
 
-/// Two bytes of width, two of height, and the text.
+/// Two bytes of width, two of height, and the run lengths.
 pub fn rle(data: &[u8]) -> bool {
     let Some((size, text)) = data.split_at_checked(4) else { return false };
     let side = |at: usize| u32::from(u16::from_le_bytes([size[at], size[at + 1]]));
@@ -229,23 +228,23 @@ pub fn tensors(data: &[u8]) -> bool {
     })
 }
 
-/// Phrases, and their vectors.
+/// Phrases and their vectors.
 pub fn phrases(data: &[u8]) -> bool {
     let (phrases, vectors) = two_parts(data);
     in_folder(|folder| {
         let (text, tensors) = (folder.join("phrases.txt"), folder.join("x.safetensors"));
-        fs_err::write(&text, phrases).expect("room for a file");
-        fs_err::write(&tensors, vectors).expect("room for a file");
+        fs_err::write(&text, phrases).expect("the file is written");
+        fs_err::write(&tensors, vectors).expect("the file is written");
         slag_models::phrases::PhraseEncoder::open("x", 3, &text, (&tensors, "vectors"), None).is_ok()
     })
 }
 
-pub fn sums(data: &[u8]) -> bool {
-    // The entries lie behind the container.
+pub fn contributions(data: &[u8]) -> bool {
+    // The entries follow the container.
     let stated = data.get(16..24).map(|b| u64::from_le_bytes(b.try_into().expect("eight bytes")));
     let at = stated.map_or(data.len(), |at| (at as usize).min(data.len()));
     let bytes = [with_checksums(&data[..at]).as_slice(), &data[at..]].concat();
-    in_file("x.sums", &bytes, |path| {
+    in_file("x.contributions", &bytes, |path| {
         let Ok((file, regions)) = ContributionFile::open(path) else { return false };
         std::hint::black_box(regions.masks_of_region().map(<[u32]>::len).sum::<usize>());
         for run in 0..file.runs().len() {
@@ -271,13 +270,13 @@ pub fn geo(data: &[u8]) -> bool {
     in_file("geo.json", data, |path| read_geo_reference(path).is_ok())
 }
 
-/// The query string of a robot's `/query`.
+/// The query string of `/query`.
 pub fn query(data: &[u8]) -> bool {
     let Ok(text) = std::str::from_utf8(data) else { return false };
     slag_edge::http::parse_query(text).is_ok_and(|request| request.check().is_ok())
 }
 
-/// Lines that say where the robot is.
+/// Lines with positions of the robot.
 pub fn position(data: &[u8]) -> bool {
     let mut n_accepted = 0;
     let read = slag_edge::fetch::follow::read_positions(data, |_, position| {

@@ -1,8 +1,7 @@
-//! One function for each decoder of foreign bytes: whatever the bytes are, it returns.
+//! One function for each decoder of foreign bytes; it must return whatever the bytes are.
 //!
-//! `cargo fuzz` runs them with coverage (`fuzz_targets/`), the workspace's tests with seeded mutations
-//! (`tests/fuzz.rs`). Where a format has checksums or signatures, they are made right first: otherwise
-//! no mutation would get past them.
+//! `cargo fuzz` runs them guided by coverage (`fuzz_targets/`), the tests of the workspace with seeded mutations
+//! (`tests/fuzz.rs`). Checksums and signatures are corrected first, or no mutation would pass them.
 
 #[path = "formats.rs"]
 mod formats;
@@ -11,10 +10,9 @@ pub mod seeds;
 
 /// A decoder to fuzz.
 pub struct Target {
-    /// What `cargo fuzz` calls it.
+    /// Its name in `cargo fuzz`.
     pub name: &'static str,
-    /// Decodes, and says whether the bytes were accepted; must neither panic nor take more memory than
-    /// they justify.
+    /// Decodes the bytes and returns whether they were accepted. It must neither panic nor take memory out of proportion.
     pub run: fn(&[u8]) -> bool,
 }
 
@@ -28,13 +26,13 @@ macro_rules! targets {
 
 targets! {
     container, shard, manifest, current, ply, splat, spz, sog, sog_meta, colmap_text, colmap_bin, transforms,
-    rle, coco, model_toml, tensors, phrases, sums, region_table, cell_field, npz, geo, query, position,
+    rle, coco, model_toml, tensors, phrases, contributions, region_table, cell_field, npz, geo, query, position,
 }
 
 /// Runs a target by name.
 ///
 /// # Panics
-/// If there is none of that name.
+/// If no target has that name.
 pub fn run(name: &str, data: &[u8]) -> bool {
     let target = TARGETS.iter().find(|target| target.name == name).expect("a target of that name");
     (target.run)(data)

@@ -1,4 +1,4 @@
-//! Sound inputs to start from.
+//! Valid inputs to start from.
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -15,10 +15,10 @@ use slag_common::shard::{
 };
 use slag_common::{Hash32, container};
 
-/// Longer files of the data beside the project are not used: mutations would hit nothing that matters.
+/// Longest shared file used: in longer ones mutations rarely hit anything that matters.
 const MAX_SHARED_BYTES: usize = 100_000;
 
-/// Returns the seeds of a target; `shared`: the data beside the project, where it is there.
+/// Returns the seeds of a target; `shared` is the folder of shared test data, if it exists.
 pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
     let text = |text: &str| vec![text.as_bytes().to_vec()];
     let mut seeds = match target {
@@ -51,7 +51,7 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
         ],
         "tensors" => vec![safetensors()],
         "phrases" => vec![[b"chair\na red sofa\n====\n".as_slice(), &safetensors()].concat()],
-        "contributions" => vec![sums()],
+        "contributions" => vec![contributions()],
         "region_table" => vec![region_table()],
         "cell_field" => vec![cell_field()],
         "npz" => vec![npz()],
@@ -210,7 +210,7 @@ fn manifest() -> Vec<u8> {
     manifest.sign(&SigningKey::from_bytes(&[7; 32]))
 }
 
-/// A header of version 2 and one Gaussian of zeros, unpacked: the target packs it.
+/// An uncompressed file of version 2 with one Gaussian of zeros; the target compresses it.
 fn spz() -> Vec<u8> {
     let mut bytes = b"NGSP".to_vec();
     bytes.extend([2, 0, 0, 0, 1, 0, 0, 0, 0, 12, 0, 0]);
@@ -261,8 +261,8 @@ fn sections(magic: &[u8; 8], version: u32, columns: &[Vec<u8>]) -> Vec<u8> {
     out
 }
 
-/// FORMAT.md: two regions of two masks, one run of one entry.
-fn sums() -> Vec<u8> {
+/// Contributions of a view as in docs/formats.md: two regions, two masks, one run of one entry.
+fn contributions() -> Vec<u8> {
     let entry = [u32s(&[1]), f32s(&[0.5])].concat();
     let checksum = u64::from(crc32(&entry));
     let header = [u32s(&[2, 2, 2, 1]), u64s(&[3, 1])].concat();
@@ -297,7 +297,7 @@ fn cell_field() -> Vec<u8> {
     sections(b"SLAGFELD", 1, &columns)
 }
 
-/// A stored (not deflated) archive of one Gaussian and one camera.
+/// An uncompressed archive with one Gaussian and one camera.
 fn npz() -> Vec<u8> {
     let array = |descr: &str, shape: &str, data: Vec<u8>| {
         let head = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}");

@@ -1,7 +1,7 @@
-//! COLMAP models: `cameras` and `images`, as text or binary (COLMAP's documentation, "Output
-//! Format", and its `src/colmap/sensor/models.h` for numbers and parameters of the lens models).
+//! COLMAP models: `cameras` and `images`, as text or binary. Sources: COLMAP's documentation, "Output Format", and
+//! `src/colmap/sensor/models.h` for the numbers and parameters of the lens models.
 //!
-//! Points and 2D features are not needed and are skipped without being stored.
+//! Points and 2D features are skipped without being stored.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read};
@@ -9,12 +9,13 @@ use std::path::{Component, Path, PathBuf};
 
 use fs_err::File;
 
-use super::{
-    Place, PoseError, PoseProblem, PoseSource, ViewSet, affine_from_wxyz, check_intrinsics, parent, view_set,
-};
+use super::checks::{affine_from_wxyz, check_intrinsics};
+use super::error::{Place, PoseError, PoseProblem};
+use super::paths::parent;
+use super::view_set::{PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
 
-/// Longest image name read from a binary file, bytes: what Linux allows for a path.
+/// Longest image name read from a binary file, bytes: Linux's limit for a path.
 const MAX_NAME_BYTES: u64 = 4096;
 /// Bytes of a 2D feature in `images.bin`: x, y (f64) and a point id (u64).
 const FEATURE_BYTES: u64 = 24;
@@ -52,8 +53,8 @@ pub(super) fn read(
     view_set(&images_path, views, source)
 }
 
-/// Returns `images/` beside `sparse/0` or `sparse`, where that is what the model's folder is called
-/// and it exists, else `images/` beside or in the model's folder.
+/// Returns the first of these folders that exists, or else the first: `images/` beside a parent folder `sparse`, beside
+/// the model's folder, in the model's folder.
 fn default_images_dir(model_dir: &Path) -> Result<PathBuf, PoseError> {
     let beside = parent(model_dir)?;
     let mut candidates = vec![beside.join("images"), model_dir.join("images")];
@@ -64,7 +65,7 @@ fn default_images_dir(model_dir: &Path) -> Result<PathBuf, PoseError> {
     Ok(candidates.swap_remove(found))
 }
 
-/// Returns a camera of the given model; the order of the parameters is COLMAP's.
+/// Returns the intrinsics of a lens model; `params` has COLMAP's order.
 fn intrinsics(model: &str, size_px: [f64; 2], params: &[f64]) -> Result<Intrinsics, PoseProblem> {
     let brown = |k1, k2, p| Distortion::Brown { k: [k1, k2, 0.0], p };
     let (focal, centre, distortion) = match (model, params) {
@@ -121,7 +122,7 @@ fn insert(cameras: &mut Cameras, camera_id: u32, camera: Intrinsics) -> Result<(
     }
 }
 
-/// The lines of a text file, one at a time and counted.
+/// A text file that is read line by line, with line numbers.
 struct Lines {
     path: PathBuf,
     reader: BufReader<File>,
@@ -139,7 +140,7 @@ impl Lines {
         problem.at(&self.path, Place::Line(self.number))
     }
 
-    /// Reads the next line; `false` at the end of the file.
+    /// Reads the next line; returns `false` at the end of the file.
     fn advance(&mut self) -> Result<bool, PoseError> {
         let mut bytes = std::mem::take(&mut self.line).into_bytes();
         bytes.clear();
@@ -151,7 +152,7 @@ impl Lines {
         Ok(n > 0)
     }
 
-    /// Reads on to the next line that is neither empty nor a comment.
+    /// Reads up to the next line that is neither empty nor a comment; returns `false` at the end of the file.
     fn advance_to_record(&mut self) -> Result<bool, PoseError> {
         while self.advance()? {
             let line = self.line.trim();
@@ -171,7 +172,7 @@ fn take<T: std::str::FromStr>(rest: &mut &str, expected: &'static str) -> Result
     word.parse().map_err(|_| PoseProblem::Expected { expected, found: excerpt(word) })
 }
 
-/// Returns the start of a text, short enough for a message.
+/// Returns the first 40 characters of a text, for a message.
 fn excerpt(text: &str) -> String {
     text.chars().take(40).collect()
 }
@@ -216,8 +217,8 @@ fn images_from_text(path: &Path, cameras: &Cameras, images_dir: &Path) -> Result
         let view =
             image_from_line(&lines.line, cameras, images_dir).map_err(|problem| lines.fail(problem))?;
         views.push(view);
-        // The features' line is always there, though it may be empty. A file without these lines
-        // would lose every second image unseen, so its number of words is checked.
+        // A line of features follows each image, empty or not. In a file without these lines every second image
+        // would silently be taken for one, so the number of words is checked.
         if lines.advance()? && lines.line.split_ascii_whitespace().count() % 3 != 0 {
             let found = excerpt(&lines.line);
             return Err(lines.fail(PoseProblem::Expected {
@@ -238,7 +239,7 @@ fn image_from_line(line: &str, cameras: &Cameras, images_dir: &Path) -> Result<V
     view(cameras, images_dir, rest.trim(), camera_id, wxyz, translation)
 }
 
-/// A binary file with its length known, so that no count is believed beyond it.
+/// A binary file that is read front to back; counts are checked against its length.
 struct Binary {
     path: PathBuf,
     reader: BufReader<File>,
@@ -283,11 +284,11 @@ impl Binary {
         Ok(numbers)
     }
 
-    /// Reads a text that a zero byte ends.
+    /// Reads a text terminated by a zero byte.
     fn name(&mut self) -> Result<String, PoseError> {
         let mut bytes = Vec::new();
         self.reader.by_ref().take(MAX_NAME_BYTES).read_until(0, &mut bytes)?;
-        let expected = "an image name of at most 4096 bytes that a zero byte ends";
+        let expected = "an image name of at most 4096 bytes, terminated by a zero byte";
         if bytes.last() != Some(&0) {
             return Err(self.fail(PoseProblem::Truncated { expected }));
         }
@@ -302,12 +303,12 @@ impl Binary {
         Ok(name)
     }
 
-    /// Skips `count` records, all of which must be there.
+    /// Skips `count` records, after checking that the file holds them.
     fn skip(&mut self, count: u64, record_bytes: u64, expected: &'static str) -> Result<(), PoseError> {
         let left = self.len_bytes.saturating_sub(self.offset_bytes);
         match count.checked_mul(record_bytes) {
             Some(bytes) if bytes <= left => {
-                // Within the file's length, which is an i64 on every platform.
+                // At most the file's length, which fits an i64.
                 self.reader.seek_relative(bytes as i64)?;
                 self.offset_bytes += bytes;
                 Ok(())

@@ -1,8 +1,7 @@
 //! Nerfstudio's `transforms.json` (its documentation, "Data conventions").
 //!
-//! `transform_matrix` is world from camera in OpenGL axes (x right, y up, z backward). An
-//! `applied_transform` says how the world was moved before; it is left as it is, so that the world
-//! frame is the one that the scene was trained in.
+//! `transform_matrix` is world from camera in OpenGL axes (x right, y up, z backward). An `applied_transform` records an
+//! earlier change of the world frame; it is not undone, so the world frame is the one of training.
 
 use std::f64::consts::PI;
 use std::path::{Component, Path, PathBuf};
@@ -10,16 +9,16 @@ use std::path::{Component, Path, PathBuf};
 use glam::{DAffine3, DMat3, DVec3};
 use serde::Deserialize;
 
-use super::{
-    Place, PoseError, PoseProblem, PoseSource, ViewSet, affine_from_matrix, check_intrinsics, parent,
-    view_set,
-};
+use super::checks::{affine_from_matrix, check_intrinsics};
+use super::error::{Place, PoseError, PoseProblem};
+use super::paths::parent;
+use super::view_set::{PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
 
-/// Endings tried for a `file_path` that has none, in this order.
+/// Extensions tried, in this order, for a `file_path` without one.
 const EXTENSIONS: [&str; 6] = ["png", "jpg", "jpeg", "webp", "PNG", "JPG"];
 
-/// The camera of a frame, or of all frames that say nothing else.
+/// The camera keys of a frame, or those at the top of the file, which hold for frames without their own.
 #[derive(Clone, Default, Deserialize)]
 struct Camera {
     camera_model: Option<String>,
@@ -40,8 +39,9 @@ struct Camera {
     p2: Option<f64>,
 }
 
+/// An element of `frames`: an image and its pose.
 #[derive(Deserialize)]
-struct Frame {
+struct FrameEntry {
     file_path: String,
     transform_matrix: Vec<Vec<f64>>,
     #[serde(flatten)]
@@ -52,76 +52,101 @@ struct Frame {
 struct Transforms {
     #[serde(flatten)]
     camera: Camera,
-    frames: Vec<Frame>,
+    frames: Vec<FrameEntry>,
 }
 
 pub(super) fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError> {
     let bytes = fs_err::read(path)?;
     let transforms: Transforms =
-        serde_json::from_slice(&bytes).map_err(|source| PoseError::Json { path: path.to_owned(), source })?;
+        serde_json::from_slice(&bytes).map_err(|cause| PoseError::Json { path: path.to_owned(), cause })?;
     let folder = parent(path)?;
+    let file_paths: Vec<String> =
+        transforms.frames.iter().map(|frame| frame.file_path.replace('\\', "/")).collect();
+    let names = names_of(&file_paths);
     let mut views = Vec::new();
-    for (index, frame) in transforms.frames.iter().enumerate() {
-        let view = view(frame, &transforms.camera, &folder, images_dir);
+    for (index, ((frame, file_path), name)) in
+        transforms.frames.iter().zip(&file_paths).zip(names).enumerate()
+    {
+        let view = name
+            .ok_or_else(|| PoseProblem::UnsafeName { image: file_path.clone() })
+            .and_then(|name| view(frame, file_path, name, &transforms.camera, &folder, images_dir));
         views.push(view.map_err(|problem| problem.at(path, Place::Frame(index)))?);
     }
     view_set(path, views, PoseSource::Transforms)
 }
 
+/// Returns the view of a frame; `name` may lack the extension, as its `file_path` may.
 fn view(
-    frame: &Frame,
+    frame: &FrameEntry,
+    file_path: &str,
+    name: String,
     shared: &Camera,
     folder: &Path,
     images_dir: Option<&Path>,
 ) -> Result<View, PoseProblem> {
-    let file_path = frame.file_path.replace('\\', "/");
-    let name = name_of(&file_path).ok_or_else(|| PoseProblem::UnsafeName { image: file_path.clone() })?;
-    let (image_path, ending) = match images_dir {
+    let (image_path, extension) = match images_dir {
         Some(dir) => existing(&dir.join(&name)),
-        None => existing(&folder.join(&file_path)),
+        None => existing(&folder.join(file_path)),
     };
-    let name = name + &ending;
+    let name = name + &extension;
     let world_from_camera = world_from_camera(&name, &frame.transform_matrix)?;
     let camera = frame.camera.clone().or(shared);
     let intrinsics = camera.intrinsics(&name, &image_path)?;
     Ok(View { name, image_path, intrinsics, camera_from_world: world_from_camera.inverse() })
 }
 
-/// Returns a frame's name: its path without what lies before and at the image folder.
+/// Returns the name of each image: its path relative to the folder of the images; `None` if it has none.
 ///
-/// The image folder is the first one called `images` or `images_N` (nerfstudio's downscaled
-/// copies), so that names agree with COLMAP's; else it is the folder of the file.
-fn name_of(file_path: &str) -> Option<String> {
-    let parts: Vec<&str> = Path::new(file_path)
-        .components()
-        .filter_map(|part| match part {
-            Component::Normal(part) => part.to_str(),
-            _ => None,
+/// The folder of an image is the first one called `images` or `images_N` (nerfstudio's downscaled copies), so that names
+/// agree with COLMAP's. If these folders differ, as `left/images` and `right/images` do, names keep the folders that
+/// tell them apart: they are relative to the folder that holds all of them. A path without such a folder is a name.
+fn names_of(file_paths: &[String]) -> Vec<Option<String>> {
+    let split: Vec<(Vec<&str>, usize)> = file_paths
+        .iter()
+        .map(|path| {
+            let parts: Vec<&str> = Path::new(path)
+                .components()
+                .filter_map(|part| match part {
+                    Component::Normal(part) => part.to_str(),
+                    _ => None,
+                })
+                .collect();
+            let folders = &parts[..parts.len().saturating_sub(1)];
+            let images_at = folders.iter().position(|part| is_image_folder(part));
+            (parts, images_at.map_or(0, |at| at + 1))
         })
         .collect();
-    let is_image_folder = |part: &str| {
-        part.strip_prefix("images").is_some_and(|rest| {
-            rest.is_empty()
-                || rest
-                    .strip_prefix('_')
-                    .is_some_and(|n| !n.is_empty() && n.bytes().all(|b| b.is_ascii_digit()))
-        })
+    // The folders above the one of the images.
+    let mut parents = split.iter().map(|(parts, start)| &parts[..start.saturating_sub(1)]);
+    let first = parents.next().unwrap_or_default();
+    let (mut n_common, mut all_equal) = (first.len(), true);
+    for parent in parents {
+        n_common = first.iter().zip(parent).take(n_common).take_while(|(a, b)| a == b).count();
+        all_equal &= parent == first;
+    }
+    let name = |(parts, start): &(Vec<&str>, usize)| {
+        let name = parts.get(if all_equal { *start } else { n_common }..)?.join("/");
+        (!name.is_empty() && !name.contains('\0')).then_some(name)
     };
-    let (_file, folders) = parts.split_last()?;
-    let start = folders.iter().position(|part| is_image_folder(part)).map_or(0, |at| at + 1);
-    let name = parts.get(start..)?.join("/");
-    (!name.contains('\0')).then_some(name)
+    split.iter().map(name).collect()
 }
 
-/// Returns the path as it is or, where it has no image ending, with the first one that exists, and
-/// what was added.
+/// Returns whether a folder is called `images` or `images_N`.
+fn is_image_folder(name: &str) -> bool {
+    let is_number = |n: &str| !n.is_empty() && n.bytes().all(|b| b.is_ascii_digit());
+    name.strip_prefix("images")
+        .is_some_and(|rest| rest.is_empty() || rest.strip_prefix('_').is_some_and(is_number))
+}
+
+/// Returns the path and an empty text or, if it has no image extension, the first path with one that exists, and the
+/// text added.
 fn existing(path: &Path) -> (PathBuf, String) {
-    let ending = path.extension().and_then(|e| e.to_str()).unwrap_or("");
-    if EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(ending)) || path.is_file() {
+    let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
+    if EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension)) || path.is_file() {
         return (path.to_owned(), String::new());
     }
     for extension in EXTENSIONS {
-        // Appended, not replaced: `frame.0001` has no ending that could be replaced.
+        // Append, do not replace: the extension of `frame.0001` is a number.
         let mut longer = path.as_os_str().to_owned();
         longer.push(format!(".{extension}"));
         if Path::new(&longer).is_file() {
@@ -146,9 +171,9 @@ fn world_from_camera(image: &str, rows: &[Vec<f64>]) -> Result<DAffine3, PosePro
 }
 
 impl Camera {
-    /// Returns this camera with what it lacks taken from `shared`.
+    /// Returns this camera with missing keys taken from `shared`.
     fn or(self, shared: &Self) -> Self {
-        // A frame's own angle goes before a shared focal length.
+        // A frame's own angle takes precedence over a shared focal length.
         let unless = |own: Option<f64>, value: Option<f64>| if own.is_some() { None } else { value };
         Self {
             camera_model: self.camera_model.or_else(|| shared.camera_model.clone()),
@@ -173,7 +198,7 @@ impl Camera {
     fn intrinsics(&self, image: &str, image_path: &Path) -> Result<Intrinsics, PoseProblem> {
         let [width_px, height_px] = match (self.w, self.h) {
             (Some(w), Some(h)) => [w, h],
-            // NeRF's first data sets say the size nowhere but in the images.
+            // NeRF's first data sets state the size only in the images.
             _ => image::image_dimensions(image_path)
                 .map(|(w, h)| [f64::from(w), f64::from(h)])
                 .map_err(|_| PoseProblem::MissingIntrinsics { image: image.to_owned(), field: "w and h" })?,
@@ -189,7 +214,7 @@ impl Camera {
         check_intrinsics([width_px, height_px], [focal_x_px, focal_y_px], centre_px, self.distortion()?)
     }
 
-    /// Returns the lens; as in nerfstudio, every perspective model may carry coefficients.
+    /// Returns the lens distortion; as in nerfstudio, every perspective model may have coefficients.
     fn distortion(&self) -> Result<Distortion, PoseProblem> {
         let [k1, k2, k3, k4, p1, p2] =
             [self.k1, self.k2, self.k3, self.k4, self.p1, self.p2].map(|c| c.unwrap_or(0.0));

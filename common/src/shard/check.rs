@@ -1,21 +1,21 @@
-//! What is checked of a shard's bytes before they are read.
+//! Checks the bytes of a shard before anything is read from them.
 
 use std::ops::Range;
 
 use half::f16;
 
-use super::{
-    BLOCK, CODEWORDS, MAGIC, MAX_DIM, MAX_SUBSPACES, ScoreErrors, ShardHeader, ShardLayout, VERSION,
-    is_packed, section,
+use super::format::{
+    BLOCK, CODEWORDS, MAGIC, MAX_DIM, MAX_SUBSPACES, ScoreErrors, ShardHeader, VERSION, section,
 };
+use super::layout::ShardLayout;
 use crate::container::{ContainerError, Layout};
 use crate::objects::ObjectsLayout;
 
-/// No length here is larger: embeddings are of unit length, and components scaled to about that.
+/// Largest length accepted: embeddings have unit length, and components are scaled to about that.
 const MAX_LENGTH: f32 = 4096.0;
 
 impl ShardLayout {
-    /// Checks a whole shard: container, sizes, centroid order, finite and sane numbers.
+    /// Checks a whole shard: container, sizes, order of centroids, finite numbers within their ranges.
     ///
     /// # Errors
     /// [`ContainerError`], naming the byte.
@@ -28,7 +28,7 @@ impl ShardLayout {
         let (m, n_subspaces) = (header.n_components as usize, header.n_subspaces as usize);
         let centroid_starts = layout.column::<u32>(section::CENTROID_STARTS, "centroid starts", k + 1)?;
         let starts: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[centroid_starts.clone()]);
-        // A centroid has members: an empty one would only cost time, and K <= N bounds memory.
+        // Every centroid has members: an empty one would cost time, and K <= N bounds memory.
         if starts[0] != 0 || starts.windows(2).any(|w| w[0] >= w[1]) || starts[k] as usize > n {
             let what = format!("centroid starts do not ascend from 0 to at most {n}");
             return Err(damaged(centroid_starts.start, what));
@@ -38,7 +38,10 @@ impl ShardLayout {
         let radii = lengths(&layout, bytes, section::RADII, "radii", k)?;
         let basis = match layout.find(section::BASIS) {
             None if m != dim => {
-                return Err(damaged(at_header, format!("{m} components of {dim} without a basis")));
+                return Err(damaged(
+                    at_header,
+                    format!("{m} components of {dim} without a basis, expected {dim}"),
+                ));
             }
             None => None,
             Some(_) => {
@@ -60,8 +63,8 @@ impl ShardLayout {
                 }
                 let codewords = halves(&layout, bytes, section::CODEWORDS, "codewords", CODEWORDS * end)?;
                 let residual_scales =
-                    lengths(&layout, bytes, section::RESIDUAL_SCALES, "centroid scales", k)?;
-                let residual_norms = lengths(&layout, bytes, section::RESIDUAL_NORMS, "residual_norms", k)?;
+                    lengths(&layout, bytes, section::RESIDUAL_SCALES, "residual scales", k)?;
+                let residual_norms = lengths(&layout, bytes, section::RESIDUAL_NORMS, "residual norms", k)?;
                 let n_codes = n_with_evidence.div_ceil(BLOCK) * BLOCK * n_subspaces / 2;
                 let codes = layout.column::<u8>(section::CODES, "codes", n_codes)?;
                 Some([subspace_starts, codewords, residual_scales, residual_norms, codes])
@@ -89,7 +92,7 @@ impl ShardLayout {
                 Some((errors, [steps, scales, values]))
             }
         };
-        let positions = match is_packed(&header) {
+        let positions = match header.has_packed_positions() {
             true => layout.column::<u32>(section::POSITIONS, "positions", n)?,
             false => layout.column::<[u16; 3]>(section::POSITIONS, "positions", n)?,
         };
@@ -116,7 +119,7 @@ fn damaged(offset: usize, what: String) -> ContainerError {
 fn check_header(header: &ShardHeader) -> Result<(), String> {
     let floats = [header.origin_in_world, header.position_step, header.box_min, header.box_max];
     if floats.as_flattened().iter().any(|v| !v.is_finite()) || header.position_step.iter().any(|s| *s < 0.0) {
-        return Err("a coordinate of the header is not finite, or a step is negative".into());
+        return Err("a coordinate of the header is not finite, or a position step is negative".into());
     }
     if (0..3).any(|axis| header.box_min[axis] > header.box_max[axis]) {
         return Err(format!("box {:?}..{:?} is empty", header.box_min, header.box_max));
@@ -124,17 +127,26 @@ fn check_header(header: &ShardHeader) -> Result<(), String> {
     let (n, k, dim, m) =
         (header.n_gaussians, header.n_centroids, header.dim as usize, header.n_components as usize);
     if k > n || dim == 0 || dim > MAX_DIM || m > dim {
-        return Err(format!("{k} centroids of {m} components of {dim} for {n} Gaussians"));
+        return Err(format!(
+            "{k} centroids for {n} Gaussians, {m} components of {dim}: expected at most a centroid a Gaussian, at most dim components, and dim within 1..={MAX_DIM}"
+        ));
     }
     if header.n_subspaces as usize > MAX_SUBSPACES.min(m) || !header.n_subspaces.is_multiple_of(2) {
-        return Err(format!("{} subspaces of {m} components", header.n_subspaces));
+        return Err(format!(
+            "{} subspaces of {m} components, expected an even number of at most {}",
+            header.n_subspaces,
+            MAX_SUBSPACES.min(m)
+        ));
     }
     let bits = header.position_bits;
-    if bits[3] != 0 || is_packed(header) && bits.iter().map(|b| u32::from(*b)).sum::<u32>() > 32 {
-        return Err(format!("positions of {bits:?} bits"));
+    if bits[3] != 0 || header.has_packed_positions() && bits.iter().map(|b| u32::from(*b)).sum::<u32>() > 32 {
+        return Err(format!("positions of {bits:?} bits, expected 32 in all at most, or [16, 16, 16, 0]"));
     }
     if !(0.0..=MAX_LENGTH).contains(&header.centroid_step) {
-        return Err(format!("the centroids' step is not within 0..={MAX_LENGTH}"));
+        return Err(format!(
+            "the step of the centroids is {}, expected 0..={MAX_LENGTH}",
+            header.centroid_step
+        ));
     }
     check_errors(&header.errors)
 }
@@ -142,12 +154,12 @@ fn check_header(header: &ShardHeader) -> Result<(), String> {
 fn check_errors(errors: &ScoreErrors) -> Result<(), String> {
     let ScoreErrors { mean, p999, max, spread } = *errors;
     if [mean, p999, max, spread].iter().any(|v| !(0.0..=MAX_LENGTH).contains(v)) {
-        return Err(format!("a score's error is not within 0..={MAX_LENGTH}"));
+        return Err(format!("errors of scores are {errors:?}, expected 0..={MAX_LENGTH} each"));
     }
     Ok(())
 }
 
-/// Returns where a column of lengths lies, which are finite and not negative.
+/// Returns the place of a column of lengths after checking that each is within `0..=MAX_LENGTH`.
 fn lengths(
     layout: &Layout,
     bytes: &[u8],
@@ -159,12 +171,12 @@ fn lengths(
     let values = bytes[range.clone()].chunks_exact(4);
     let mut values = values.map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]));
     if values.any(|v| !(0.0..=MAX_LENGTH).contains(&v)) {
-        return Err(damaged(range.start, format!("one of the {name} is not within 0..={MAX_LENGTH}")));
+        return Err(damaged(range.start, format!("a value of the {name} is not within 0..={MAX_LENGTH}")));
     }
     Ok(range)
 }
 
-/// Returns where a column of half floats lies, which are finite.
+/// Returns the place of a column of half floats after checking that each is finite.
 fn halves(
     layout: &Layout,
     bytes: &[u8],
@@ -176,7 +188,7 @@ fn halves(
     // Exponent bits all set is infinity or NaN (IEEE 754 binary16).
     let is_finite = |b: &[u8]| u16::from_le_bytes([b[0], b[1]]) & 0x7c00 != 0x7c00;
     if !bytes[range.clone()].chunks_exact(2).all(is_finite) {
-        return Err(damaged(range.start, format!("a number of the {name} is not finite")));
+        return Err(damaged(range.start, format!("a value of the {name} is not finite")));
     }
     Ok(range)
 }

@@ -1,7 +1,10 @@
+use glam::DVec3;
+use half::f16;
+
 use super::*;
 use crate::container::AlignedBytes;
 
-/// What a test edits before the shard is written.
+/// The parts of a shard that a test edits before it is written.
 struct Parts {
     header: ShardHeader,
     centroid_starts: Vec<u32>,
@@ -70,13 +73,16 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
 fn round_trip() {
     let bytes = AlignedBytes::copy_of(&written(|_| {}));
     let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
-    assert_eq!((shard.members(1), shard.row_of(1), shard.row_of(2), shard.row_of(4)), (2..5, 0, 1, 1));
+    assert_eq!(
+        (shard.members(1), shard.centroid_of(1), shard.centroid_of(2), shard.centroid_of(4)),
+        (2..5, 0, 1, 1)
+    );
     assert_eq!(shard.n_with_evidence(), 5);
     let p = shard.position_in_world(2);
     assert!((p - DVec3::new(1e6 + 2.047, -2.0 + 4095.0 * 0.002, 3.0)).length() < 1e-9, "{p}");
     assert_eq!(shard.position_in_world(1), DVec3::new(1e6 + 0.001, -2.0 + 0.004, 3.0));
     assert_eq!(shard.position_box().max, p);
-    // Worked out by hand: components of centroid 1, then code 13 of subspace 0 (codeword 13/64), code 3 of subspace 1
+    // By hand: components of centroid 1, then code 13 of subspace 0 (codeword 13/64), code 3 of subspace 1
     // (codewords (16 + 6)/64 and 23/64), doubled.
     let mut decoded = [0.0; 4];
     shard.decode(2, &mut decoded);
@@ -90,9 +96,9 @@ fn round_trip() {
     assert!((shard.scores(&query)[2] - score).abs() < 1e-12);
 }
 
-/// A hostile writer computes right checksums over wrong contents: each lie is refused.
+/// A hostile writer can compute correct checksums over invalid contents: each is refused.
 #[test]
-fn lies_are_refused() {
+fn invalid_contents_are_refused() {
     let refused =
         |edit: fn(&mut Parts)| ShardLayout::check(&written(edit)).expect_err("must be refused").to_string();
     assert!(refused(|p| p.header.n_gaussians = u32::MAX).contains("bytes"));

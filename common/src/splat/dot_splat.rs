@@ -1,10 +1,12 @@
-//! `.splat` files as antimatter15/splat writes them: a row of 32 bytes a Gaussian and no header:
+//! `.splat` files as antimatter15/splat writes them: no header, 32 bytes per Gaussian:
 //! mean `3 x f32`, scale `3 x f32` (linear), colour and opacity `4 x u8`, rotation `wxyz 4 x u8`.
 
 use glam::DVec3;
 
+use super::columns::columns;
+use super::error::{Place, SplatError};
 use super::input::Input;
-use super::{Place, SplatError, columns, dc_of_colour, unit_rotation};
+use super::values::{dc_of_colour, unit_rotation};
 use crate::Gaussians;
 
 const ROW_BYTES: usize = 32;
@@ -33,7 +35,7 @@ pub(super) fn read(mut input: Input) -> Result<Gaussians, SplatError> {
         out.scales.push([floats[3], floats[4], floats[5]]);
         out.sh_dc.push(std::array::from_fn(|i| dc_of_colour(bytes[i] / 255.0)));
         out.opacities.push((bytes[3] / 255.0) as f32);
-        // 128 stands for 0, as its writer has it (q * 128 + 128): the identity stays the identity.
+        // The writer stores q * 128 + 128, so 128 is 0 and the identity stays exact.
         out.rotations_wxyz.push(unit_rotation(std::array::from_fn(|i| bytes[4 + i] - 128.0)));
     }
     Ok(out)

@@ -1,14 +1,14 @@
-//! A file read front to back, which knows where it is and how much is left.
+//! A file that is read front to back and knows its offset and the bytes that remain.
 
 use std::io::{self, BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 
-use super::{Place, SplatError};
+use super::error::{Place, SplatError};
 
-/// Large enough that system calls do not count, small against the columns.
+/// Large enough to make system calls negligible, small compared with the columns.
 const BUFFER_BYTES: usize = 1 << 18;
 
-/// A file open for reading; reading through it keeps count.
+/// A file open for reading, with its current offset.
 pub(super) struct Input {
     reader: BufReader<fs_err::File>,
     path: PathBuf,
@@ -41,25 +41,25 @@ impl Input {
         self.len_bytes.saturating_sub(self.offset_bytes)
     }
 
-    /// Returns the position as a place for an error.
+    /// Returns the current offset as the place of an error.
     pub fn place(&self) -> Place {
         Place::Byte(self.offset_bytes)
     }
 
-    /// Returns the next bytes without consuming them, fewer than `n` if the file is shorter; `n` must
-    /// not exceed what a freshly opened file buffers at once.
+    /// Returns the next `n` bytes without consuming them, or fewer if the file is shorter; only for a file that was just
+    /// opened, and small `n`.
     pub fn peek(&mut self, n: usize) -> Result<&[u8], SplatError> {
         let buffered = self.reader.fill_buf()?;
         Ok(&buffered[..n.min(buffered.len())])
     }
 
-    /// Fills `buffer`; the end of the file is an error that names `what` was expected.
+    /// Fills `buffer`. If the file ends too early, the error says that `what` was expected.
     pub fn fill(&mut self, buffer: &mut [u8], what: &str) -> Result<(), SplatError> {
         self.require(buffer.len() as u64, what)?;
         Ok(self.read_exact(buffer)?)
     }
 
-    /// Steps over `n` bytes.
+    /// Skips `n` bytes.
     pub fn skip(&mut self, n: u64, what: &str) -> Result<(), SplatError> {
         self.require(n, what)?;
         self.reader.seek_relative(n as i64)?;
@@ -67,7 +67,7 @@ impl Input {
         Ok(())
     }
 
-    /// Checks that `n` more bytes are there.
+    /// Checks that at least `n` bytes remain.
     pub fn require(&self, n: u64, what: &str) -> Result<(), SplatError> {
         if n <= self.remaining_bytes() {
             return Ok(());
@@ -76,11 +76,11 @@ impl Input {
             &self.path,
             self.place(),
             format_args!("{n} bytes of {what}"),
-            format_args!("{} to the end of the file", self.remaining_bytes()),
+            format_args!("{} up to the end of the file", self.remaining_bytes()),
         ))
     }
 
-    /// Reads a line with its line feed into `line`, at most `limit_bytes` of it; empty at the end.
+    /// Reads a line, line feed included, into `line`, at most `limit_bytes`; `line` is empty at the end of the file.
     pub fn read_line(&mut self, line: &mut Vec<u8>, limit_bytes: u64) -> Result<(), SplatError> {
         line.clear();
         Ok(self.take(limit_bytes).read_until(b'\n', line).map(drop)?)

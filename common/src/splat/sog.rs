@@ -1,6 +1,5 @@
-//! SOG (PlayCanvas): a `meta.json` and lossless WebP images with a pixel a Gaussian, loose in a
-//! folder or in a ZIP bundle. Version 2 looks bytes up in codebooks, version 1 (no `version`) spreads
-//! them over ranges.
+//! SOG (PlayCanvas): a `meta.json` and lossless WebP images with a pixel per Gaussian, in a folder or a ZIP bundle.
+//! Version 2 maps bytes through codebooks; version 1 (without `version`) maps them to ranges.
 
 use std::io::{BufReader, Cursor, Read};
 use std::path::{Component, Path, PathBuf};
@@ -11,17 +10,19 @@ use image::codecs::webp::WebPDecoder;
 use serde::Deserialize;
 use zip::ZipArchive;
 
-use super::{Place, ReadOptions, SplatError, columns, plausible_count, sigmoid, unit_rotation, with_largest};
+use super::columns::{MAX_SH_DEGREE, ReadOptions, columns, plausible_count};
+use super::error::{Place, SplatError};
+use super::values::{sigmoid, unit_rotation, with_largest};
 use crate::Gaussians;
 
-/// Meta files take about 15 kB: three codebooks of 256 numbers.
+/// Meta files take about 15 kB, mostly three codebooks of 256 numbers.
 const MAX_META_BYTES: u64 = 1 << 20;
-/// Images may be larger than the count asks for by their last rows, or a square of a power of two.
+/// Images may be larger than the count requires: their last row is filled up, or they are squares of a power of two.
 const SPARE_PIXELS: u64 = 1 << 16;
-/// The codebook of harmonics has this many entries a row, and at most 65536: labels have 16 bits.
-const PALETTE_COLUMNS: usize = 64;
-const MAX_PALETTE_ROWS: u64 = 1024;
-/// Alpha of a rotation's pixel when the first component is the largest; up to 255 for the fourth.
+/// The codebook of harmonics has this many entries per row, and at most 65,536 entries: labels have 16 bits.
+const CODEBOOK_COLUMNS: usize = 64;
+const MAX_CODEBOOK_ROWS: u64 = 1024;
+/// Alpha of a rotation's pixel if the first component is the largest; 253 to 255 for the others.
 const ROTATION_TAG: u8 = 252;
 
 #[derive(Deserialize)]
@@ -41,7 +42,7 @@ struct Means {
     mins: [f64; 3],
     maxs: [f64; 3],
     files: [String; 2],
-    /// Version 1 has the count here.
+    /// Holds the count in version 1.
     shape: Option<Vec<u64>>,
 }
 
@@ -50,7 +51,7 @@ struct Files {
     files: Vec<String>,
 }
 
-/// How bytes stand for numbers: a codebook (version 2), or a range a channel (version 1).
+/// The map from bytes to numbers: a codebook (version 2), or a range per channel (version 1).
 #[derive(Deserialize)]
 struct Quantised {
     codebook: Option<Vec<Option<f64>>>,
@@ -76,15 +77,15 @@ impl OneOrMany {
 }
 
 impl Quantised {
-    /// Returns the number that each byte of a channel stands for; NaN beyond a short codebook, which
-    /// makes the Gaussians that use it unusable.
+    /// Returns the number of each byte of a channel; NaN beyond the end of a short codebook, which makes the Gaussians
+    /// that use it unusable.
     fn table(&self, channel: usize) -> Option<[f64; 256]> {
         if let Some(codebook) = &self.codebook {
             let mut table = [f64::NAN; 256];
             for (value, entry) in table.iter_mut().zip(codebook) {
                 *value = entry.unwrap_or(f64::NAN);
             }
-            // Some exporters left null in the first place; PlayCanvas extrapolates it like this.
+            // Some exporters write null as the first entry; PlayCanvas extrapolates it this way.
             if codebook.first() == Some(&None) {
                 table[0] = table[1] + (table[1] - table[255]) / 255.0;
             }
@@ -95,21 +96,21 @@ impl Quantised {
     }
 }
 
-/// Where the parts of a SOG are.
+/// The source of a SOG's files.
 enum Parts {
     Folder(PathBuf),
     Bundle(Box<ZipArchive<BufReader<fs_err::File>>>),
 }
 
-/// A SOG whose meta has been read.
+/// An open SOG.
 struct Sog {
-    /// The bundle or the meta file, for errors.
+    /// The bundle or the meta file, named in errors.
     path: PathBuf,
     parts: Parts,
     len_bytes: u64,
 }
 
-/// An image, four bytes a pixel.
+/// An image with four bytes per pixel.
 struct Pixels {
     width: usize,
     rgba: Vec<u8>,
@@ -125,7 +126,7 @@ impl Pixels {
     }
 }
 
-/// Reads a SOG folder by the path of its meta file.
+/// Reads a SOG folder, given its meta file.
 pub(super) fn read_folder(meta_path: &Path, options: ReadOptions) -> Result<Gaussians, SplatError> {
     let folder = meta_path.parent().unwrap_or(Path::new("")).to_path_buf();
     let len_bytes = fs_err::metadata(meta_path)?.len();
@@ -172,16 +173,16 @@ impl Sog {
         SplatError::malformed(&self.path, Place::Part(part.into()), expected, found)
     }
 
-    /// Returns where a part lies in the folder, which it must not leave.
+    /// Returns the path of a part; it must lie directly in the folder.
     fn path_in_folder(&self, part: &str) -> Result<PathBuf, SplatError> {
         let mut components = Path::new(part).components();
         match (&self.parts, components.next(), components.next()) {
             (Parts::Folder(folder), Some(Component::Normal(name)), None) => Ok(folder.join(name)),
-            _ => Err(self.malformed("meta.json", "plain names of files", format_args!("{part:?}"))),
+            _ => Err(self.malformed("meta.json", "plain file names", format_args!("{part:?}"))),
         }
     }
 
-    /// Returns the bytes of a part, of which there may be `max_bytes`.
+    /// Returns the bytes of a part, at most `max_bytes`.
     fn bytes(&mut self, part: &str, max_bytes: u64) -> Result<Vec<u8>, SplatError> {
         let mut bytes = Vec::new();
         let failed = |path: &Path, source: std::io::Error| {
@@ -209,8 +210,7 @@ impl Sog {
         })
     }
 
-    /// Returns the image in the file number `index` of `files`, whose pixels must be within
-    /// `n_pixels`.
+    /// Returns the image at `index` of `files`; its number of pixels must lie in `n_pixels`.
     fn pixels(
         &mut self,
         files: &[String],
@@ -220,7 +220,7 @@ impl Sog {
         let Some(part) = files.get(index) else {
             return Err(self.malformed("meta.json", format_args!("{} files", index + 1), files.len()));
         };
-        // Four bytes a pixel are what lossless WebP takes without compressing anything.
+        // Lossless WebP takes four bytes per pixel if nothing compresses.
         let bytes = self.bytes(part, n_pixels.end() * 5 + SPARE_PIXELS)?;
         if !is_lossless_webp(&bytes) {
             return Err(self.malformed(part, "a lossless WebP image", "another image"));
@@ -283,7 +283,7 @@ impl Sog {
             return Err(self.malformed("meta.json", "the number of Gaussians (`count`)", "none"));
         };
         let place = Place::Part("meta.json".into());
-        let degree = if options.with_sh_rest && meta.sh_rest.is_some() { super::MAX_SH_DEGREE } else { 0 };
+        let degree = if options.with_sh_rest && meta.sh_rest.is_some() { MAX_SH_DEGREE } else { 0 };
         let n = plausible_count(&self.path, place, count, degree, self.len_bytes)?;
         let n_pixels = count..=count.saturating_mul(2) + SPARE_PIXELS;
         let mut out = columns(n, 0);
@@ -294,7 +294,7 @@ impl Sog {
             DVec3::from_array(std::array::from_fn(|axis| {
                 let unit = f64::from(u16::from_le_bytes([low[axis], high[axis]])) / 65535.0;
                 let (min, max) = (meta.means.mins[axis], meta.means.maxs[axis]);
-                // Stored is sign(x) ln(|x| + 1).
+                // The stored value is sign(x) ln(|x| + 1).
                 let log = min + (max - min) * unit;
                 log.abs().exp_m1().copysign(log)
             }))
@@ -340,7 +340,7 @@ impl Sog {
         Ok(out)
     }
 
-    /// Decodes the harmonics: each Gaussian has a label, each label a run of pixels in the codebook.
+    /// Decodes the harmonics: each Gaussian has a label, and each label is a run of pixels in the codebook.
     fn decode_sh_rest(
         &mut self,
         sh_rest: &Quantised,
@@ -349,10 +349,10 @@ impl Sog {
         out: &mut Gaussians,
     ) -> Result<(), SplatError> {
         let [table]: [_; 1] = self.tables("shN", sh_rest)?;
-        let widest = PALETTE_COLUMNS * Gaussians::sh_rest_per_channel(super::MAX_SH_DEGREE);
-        let codebook = self.pixels(&sh_rest.files, 0, 1..=widest as u64 * MAX_PALETTE_ROWS)?;
-        let Some(degree) = (1..=super::MAX_SH_DEGREE)
-            .find(|degree| codebook.width == PALETTE_COLUMNS * Gaussians::sh_rest_per_channel(*degree))
+        let widest = CODEBOOK_COLUMNS * Gaussians::sh_rest_per_channel(MAX_SH_DEGREE);
+        let codebook = self.pixels(&sh_rest.files, 0, 1..=widest as u64 * MAX_CODEBOOK_ROWS)?;
+        let Some(degree) = (1..=MAX_SH_DEGREE)
+            .find(|degree| codebook.width == CODEBOOK_COLUMNS * Gaussians::sh_rest_per_channel(*degree))
         else {
             return Err(self.malformed("shN", "a codebook 192, 512 or 960 pixels wide", codebook.width));
         };
@@ -375,7 +375,7 @@ impl Sog {
     }
 }
 
-/// Returns whether a WebP file has a lossless image and nothing lossy or animated.
+/// Returns whether a WebP file holds a lossless image and nothing lossy or animated.
 fn is_lossless_webp(bytes: &[u8]) -> bool {
     let Some((b"RIFF", mut chunks)) = bytes
         .split_at_checked(4)

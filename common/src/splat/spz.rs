@@ -1,8 +1,8 @@
-//! SPZ files (nianticlabs/spz): column after column of quantised values, versions 2 and 3 in one
-//! gzip stream, version 4 in a Zstandard stream a column.
+//! SPZ files (nianticlabs/spz): columns of quantised values, in one gzip stream (versions 2 and 3) or in a Zstandard
+//! stream per column (version 4).
 //!
-//! Stored axes are right, up, back; they are turned to right, down, front, the frame of the PLY: y
-//! and z change sign.
+//! Stored axes are right, up, back; the reader turns them to right, down, front, the frame of the PLY: y and z change
+//! sign.
 
 use std::collections::VecDeque;
 use std::io::{self, Read};
@@ -12,24 +12,26 @@ use flate2::bufread::GzDecoder;
 use glam::DVec3;
 use ruzstd::decoding::{FrameDecoder, StreamingDecoder};
 
+use super::columns::{ReadOptions, columns, plausible_count};
+use super::error::{Place, SplatError};
 use super::input::Input;
-use super::{Place, ReadOptions, SplatError, columns, plausible_count, unit_rotation, with_largest};
+use super::values::{unit_rotation, with_largest};
 use crate::Gaussians;
 
 const MAGIC: &[u8; 4] = b"NGSP";
-/// Colours are stored scaled by this, not by [`crate::gaussians::SH_C0`], to reach beyond 0..=1.
+/// Scale of stored colours, instead of [`crate::gaussians::SH_C0`], so that they reach beyond 0..=1.
 const COLOUR_SCALE: f64 = 0.15;
 const FLAG_EXTENSIONS: u8 = 2;
-/// The extension that names other axes than right, up, back, and the number of those.
+/// The extension that names the axes, and its value for right, up, back.
 const EXTENSION_COORDINATE_SYSTEM: u32 = 0xADBE_0003;
 const RIGHT_UP_BACK: u32 = 4;
-/// The window that every Zstandard decoder should accept (RFC 8878, 3.1.1.1.2).
+/// Window size that every Zstandard decoder should accept (RFC 8878, 3.1.1.1.2).
 const MIN_WINDOW_BYTES: u64 = 8 << 20;
-/// Rows are decoded in parts of this many.
+/// Rows decoded at a time.
 const ROWS_AT_ONCE: usize = 4096;
 
-/// Signs of the coefficients above degree 0 when y and z change sign: -1 where the basis function
-/// has an odd power of y and z together. Order: y z x, xy yz zz xz xx-yy, then degree 3.
+/// Signs of the coefficients above degree 0 when y and z change sign: -1 where the powers of y and z in the basis
+/// function add up to an odd number. Order: y z x, xy yz zz xz xx-yy, then degree 3.
 const SH_SIGNS: [f32; 15] =
     [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
 
@@ -46,7 +48,7 @@ impl Header {
     /// The fixed part of all versions.
     const BYTES: usize = 16;
 
-    /// Checks the header; `place` makes places of its offsets.
+    /// Parses and checks the header; `place` turns its offsets into places.
     fn parse(path: &Path, raw: &[u8; Self::BYTES], place: fn(u64) -> Place) -> Result<Self, SplatError> {
         let word = |i: usize| u32::from_le_bytes([raw[i], raw[i + 1], raw[i + 2], raw[i + 3]]);
         let malformed = |offset, expected: &str, found: String| {
@@ -78,8 +80,8 @@ impl Header {
         Ok(header)
     }
 
-    /// Returns the stored bytes a Gaussian has of each column: position, opacity, colour, scale,
-    /// rotation and, from degree 1, harmonics.
+    /// Returns the stored bytes per Gaussian of each column: position, opacity, colour, scale, rotation and, from
+    /// degree 1, harmonics.
     fn row_bytes(&self) -> VecDeque<usize> {
         let rotation = if self.version == 2 { 3 } else { 4 };
         let sh = 3 * Gaussians::sh_rest_per_channel(self.sh_degree);
@@ -87,7 +89,7 @@ impl Header {
     }
 }
 
-/// The columns, in the order of the file.
+/// The columns still to be read, in the order of the file.
 struct Columns {
     path: PathBuf,
     count: usize,
@@ -96,14 +98,14 @@ struct Columns {
 }
 
 enum Payload {
-    /// One stream and how much of it has been read.
+    /// One stream, and the bytes read from it so far.
     Whole { stream: Box<dyn Read>, offset_bytes: u64 },
-    /// A stream each; the compressed sizes of those to come.
+    /// A stream per column, and the compressed sizes of those still to come.
     Streams { input: Input, compressed_bytes: VecDeque<u64> },
 }
 
 impl Columns {
-    /// Reads the next column and hands on its rows, cut into fields of `N` bytes.
+    /// Reads the next column and passes its rows on in fields of `N` bytes.
     fn each<const N: usize>(&mut self, mut row: impl FnMut([u8; N])) -> Result<(), SplatError> {
         let row_bytes = self.row_bytes.pop_front().unwrap_or(0);
         let total = row_bytes as u64 * self.count as u64;
@@ -134,7 +136,7 @@ impl Columns {
     }
 }
 
-/// Reads `total` bytes in parts of whole rows.
+/// Reads `total` bytes in chunks of whole rows.
 fn read_rows(
     stream: &mut impl Read,
     total: u64,
@@ -202,7 +204,7 @@ pub(super) fn read(mut input: Input, options: ReadOptions) -> Result<Gaussians, 
     decode(&header, &mut Columns { path, count, row_bytes, payload }, columns(count, degree))
 }
 
-/// Reads versions 2 and 3 from behind the header.
+/// Reads the rest of versions 2 and 3 after the header.
 fn read_whole(
     path: PathBuf,
     header: Header,
@@ -233,14 +235,14 @@ fn read_whole(
     if header.flags & FLAG_EXTENSIONS != 0 {
         check_extensions(&path, &place, &mut stream)?;
     }
-    // To the end: that is where gzip has its checksum.
+    // Read to the end: gzip's checksum stands there.
     io::copy(&mut stream, &mut io::sink())
         .map_err(|source| SplatError::undecodable(&path, place, "the end of the stream", source))?;
     Ok(out)
 }
 
-/// Reads what stands before the streams of version 4: the rest of the header, extensions and the
-/// table of contents, checked; returns the compressed size of each stream.
+/// Reads and checks the part of version 4 that precedes the streams: the rest of the header, the extensions and the table
+/// of contents. Returns the compressed size of each stream.
 fn read_contents(
     input: &mut Input,
     raw: &[u8; Header::BYTES],
@@ -299,7 +301,7 @@ fn read_contents(
     Ok(compressed_bytes)
 }
 
-/// Reads extension records (type, length, content) to the end and refuses the one that matters.
+/// Reads extension records (type, length, content) to the end and refuses coordinate systems other than right, up, back.
 fn check_extensions(path: &Path, place: &Place, stream: &mut impl Read) -> Result<(), SplatError> {
     let failed = |source| SplatError::undecodable(path, place.clone(), "the extensions", source);
     loop {
@@ -323,7 +325,7 @@ fn check_extensions(path: &Path, place: &Place, stream: &mut impl Read) -> Resul
     }
 }
 
-/// Decodes the columns into `out`, whose degree says how much of the harmonics to keep.
+/// Decodes the columns into `out`; its degree limits the harmonics that are kept.
 fn decode(header: &Header, columns: &mut Columns, mut out: Gaussians) -> Result<Gaussians, SplatError> {
     let step = (-f64::from(header.fractional_bits)).exp2();
     columns.each(|[x0, x1, x2, y0, y1, y2, z0, z1, z2]| {
@@ -362,8 +364,8 @@ fn decode(header: &Header, columns: &mut Columns, mut out: Gaussians) -> Result<
     Ok(out)
 }
 
-/// Returns the rotation `wxyz` packed as the index of the largest component (of x y z w) in two
-/// bits, and for each other one a sign and nine bits of its magnitude, 0..=1/sqrt(2).
+/// Returns a rotation `wxyz` packed as the index of its largest component (of x y z w) in two bits, and a sign and nine
+/// bits of magnitude, 0..=1/sqrt(2), for each of the others.
 fn smallest_three(word: u32) -> [f64; 4] {
     let others = [20, 10, 0].map(|shift| {
         let magnitude = f64::from((word >> shift) & 0x1ff) / 511.0 * std::f64::consts::FRAC_1_SQRT_2;

@@ -1,5 +1,5 @@
-//! Damaged files of every format: an error that names the file, or columns that agree; never a panic
-//! or memory out of proportion.
+//! Damaged files of every format give an error that names the file, or consistent columns; never a panic, and never
+//! memory out of proportion.
 
 #![expect(unsafe_code, reason = "an allocator that counts")]
 
@@ -14,7 +14,7 @@ use slag_math::random::Random;
 use crate::generated::{gzip, write_sog_v1};
 use crate::{assert_columns_agree, needs_shared, read_all, shared};
 
-/// Counts what the current thread has allocated, now and at most.
+/// Counts the bytes allocated by the current thread, now and at their peak.
 struct Counting;
 
 thread_local! {
@@ -28,23 +28,23 @@ fn count(change: isize) {
     PEAK_BYTES.set(PEAK_BYTES.get().max(live));
 }
 
-// SAFETY: every call goes to the system's allocator unchanged.
+// SAFETY: every call is forwarded unchanged to the system's allocator.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         count(layout.size() as isize);
-        // SAFETY: as required of our caller.
+        // SAFETY: the caller meets the system allocator's requirements.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
         count(layout.size() as isize);
-        // SAFETY: as required of our caller.
+        // SAFETY: the caller meets the system allocator's requirements.
         unsafe { System.alloc_zeroed(layout) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
         count(-(layout.size() as isize));
-        // SAFETY: as required of our caller.
+        // SAFETY: the caller meets the system allocator's requirements.
         unsafe { System.dealloc(pointer, layout) }
     }
 }
@@ -52,7 +52,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// Returns what `work` returns and the most bytes it had allocated at a time.
+/// Returns the result of `work` and the peak of its allocated bytes.
 pub fn peak_bytes<T>(work: impl FnOnce() -> T) -> (T, usize) {
     let before = LIVE_BYTES.get();
     PEAK_BYTES.set(before);
@@ -60,8 +60,8 @@ pub fn peak_bytes<T>(work: impl FnOnce() -> T) -> (T, usize) {
     (result, (PEAK_BYTES.get() - before) as usize)
 }
 
-/// Damages a file: cut short, bits flipped, a word overwritten with an extreme value, a digit of the
-/// text changed. Half of the places lie near the front, where the headers are.
+/// Damages a file: truncates it, flips bits, overwrites a word with an extreme value, or changes a digit. Half of the
+/// places lie near the front, among the headers.
 fn damaged(bytes: &[u8], random: &mut Random) -> Vec<u8> {
     let mut out = bytes.to_vec();
     let n_changes = 1 + random.below(4);
@@ -90,7 +90,7 @@ fn damaged(bytes: &[u8], random: &mut Random) -> Vec<u8> {
     out
 }
 
-/// Reads `path`, whose files have `len_bytes` in all, and asserts the promise.
+/// Reads `path` (`len_bytes` in all its files) and asserts what the module states; returns whether it was read.
 fn assert_survives(path: &Path, len_bytes: usize, what: &str) -> bool {
     let (result, peak) = peak_bytes(|| catch_unwind(AssertUnwindSafe(|| read_all(path))));
     let result = result.unwrap_or_else(|_| panic!("{what}: panicked"));
@@ -110,7 +110,7 @@ fn assert_survives(path: &Path, len_bytes: usize, what: &str) -> bool {
     }
 }
 
-/// Runs `n` damages of one file; `pack` makes the file of the damaged content.
+/// Damages the content of a file `n` times; `pack` turns the damaged content into the file.
 fn survives_damage(name: &str, content: &[u8], n: u64, pack: impl Fn(&[u8]) -> Vec<u8>) {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join(name);
@@ -152,7 +152,7 @@ fn damaged_files_as_they_are() {
     }
 }
 
-/// Damage under an intact gzip wrapper, which its checksum would else stop.
+/// Damage inside an intact gzip stream; its checksum would otherwise catch the damage.
 #[needs_shared]
 #[test]
 fn damaged_spz_in_intact_gzip() {
@@ -164,7 +164,7 @@ fn damaged_spz_in_intact_gzip() {
     }
 }
 
-/// Damage in one file of a folder: the checksums of a bundle would else stop it.
+/// Damage in one file of a folder; the checksums of a bundle would otherwise catch it.
 #[needs_shared]
 #[test]
 fn damaged_sog_folders() {

@@ -1,5 +1,5 @@
-//! All formats against `expected.json`, recorded with splat-transform 2.7.1 and confirmed there by a
-//! second reader, and the trained scenes against a parse of their own layout.
+//! All formats against `expected.json`, which was recorded with splat-transform 2.7.1 and confirmed by a second reader;
+//! trained scenes against a separate parser of their layout.
 
 use serde_json::Value;
 use slag_common::splat::{ReadOptions, SplatError, read};
@@ -32,22 +32,22 @@ fn every_format_gives_the_recorded_gaussians() {
                 assert_near(found.expect("not empty"), bound, 1e-6, &format!("{name} {side}"));
             }
         }
-        // .splat has bytes for rotations, and readers take 127.5 or 128 for zero: up to 0.9 degrees
-        // apart, so half of that between quaternions. Else f32 rounding of the recorded values.
+        // .splat stores rotations as bytes, and readers take 127.5 or 128 as zero: up to 0.9 degrees, and half of that
+        // between quaternions. For other formats: f32 rounding of the recorded values.
         let rotation_tolerance = if name.ends_with(".splat") { 0.008 } else { 2e-6 };
         for row in expected["gaussians"].as_array().expect("an array") {
             let i = row["index"].as_u64().expect("an index") as usize;
             let what = |field: &str| format!("{name} {i} {field}");
             for (axis, x) in numbers(&row["position"]).into_iter().enumerate() {
-                // f32 rounding: ours is f64.
+                // The recorded positions are f32, ours f64.
                 assert_near(gaussians.means_in_world[i][axis], x, 2e-7, &what("position"));
             }
             for (axis, s) in numbers(&row["scale"]).into_iter().enumerate() {
-                // Relative: the recorded logarithms, up to 10, have f32 rounding of 1e-6.
+                // Relative: the recorded logarithms, up to 10, have f32 rounding errors of 1e-6.
                 assert_near(f64::from(gaussians.scales[i][axis]) / s, 1.0, 2e-6, &what("scale"));
             }
             let opacity = row["opacity"].as_f64().expect("a number");
-            // The recorded ones went through a logit clamped at 1e-6 and 1 - 1e-6.
+            // The recorded opacities passed through a logit clamped to 1e-6 and 1 - 1e-6.
             assert_near(gaussians.opacities[i].into(), opacity, 1.1e-6, &what("opacity"));
             for (channel, c) in numbers(&row["f_dc"]).into_iter().enumerate() {
                 assert_near(gaussians.sh_dc[i][channel].into(), c, 5e-7, &what("f_dc"));
@@ -81,7 +81,7 @@ fn a_folder_is_read_as_its_meta_file() {
 
 #[needs_shared]
 #[test]
-fn higher_harmonics_are_left_out_unless_asked_for() {
+fn higher_harmonics_are_read_on_request() {
     let folder = shared("fixtures/formats");
     for name in ["lod6.ply", "lod6.compressed.ply", "lod6_v3.spz", "lod6_v4.spz", "lod6.sog"] {
         let path = folder.join(format!("playbot_{name}"));
@@ -113,7 +113,7 @@ fn small_ply_files_with_another_order_of_properties() {
     }
 }
 
-/// Oracle: the layout of these files, 17 floats a row, read by position and decoded in f64.
+/// Oracle: the files' 17 floats per row, read by position and decoded in f64.
 #[needs_shared]
 #[test]
 fn trained_scenes_row_by_row() {
@@ -144,7 +144,7 @@ fn trained_scenes_row_by_row() {
 }
 
 #[test]
-fn a_dot_splat_of_broken_rows_is_refused() {
+fn a_dot_splat_with_an_incomplete_row_is_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     for (len, row) in [(0, 0), (63, 32), (65, 64)] {
         let error = crate::read_bytes(folder.path(), "cut.splat", &vec![1; len]).expect_err("is refused");
@@ -156,7 +156,7 @@ fn a_dot_splat_of_broken_rows_is_refused() {
 
 #[needs_shared]
 #[test]
-fn refusals_say_what_to_do() {
+fn refusals_give_advice() {
     let folder = shared("fixtures/formats");
     let error = read_all(&folder.join("minimal.ksplat")).expect_err("is refused");
     assert!(matches!(error, SplatError::Unsupported { .. }));
@@ -167,4 +167,12 @@ fn refusals_say_what_to_do() {
     let error = read_all(&folder.join("absent.ply")).expect_err("is refused");
     assert!(matches!(error, SplatError::Io { .. }));
     assert!(error.to_string().contains("absent.ply"), "{error}");
+}
+
+#[test]
+fn a_missing_file_is_named_once() {
+    let error = read_all(std::path::Path::new("absent.ply")).expect_err("is refused");
+    let chain = std::iter::successors(Some(&error as &dyn std::error::Error), |error| error.source());
+    let text = chain.map(ToString::to_string).collect::<Vec<_>>().join(": ");
+    assert_eq!(text.matches("absent.ply").count(), 1, "{text}");
 }

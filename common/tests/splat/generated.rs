@@ -1,5 +1,5 @@
-//! Files made here for what no recorded file has: SPZ of degree 3 and 4 and its extensions, SOG of
-//! version 1, and counts that lie.
+//! Generated files for cases without a recorded file: SPZ of degree 3 and 4 and its extensions, SOG version 1, and false
+//! counts.
 
 use std::io::Write;
 use std::path::Path;
@@ -67,7 +67,7 @@ fn basis([x, y, z]: [f64; 3]) -> [f64; 15] {
     ]
 }
 
-/// Oracle: a colour seen along a direction is the same before and after the axes are turned.
+/// Oracle: the colour along a direction is the same before and after the axes are turned.
 #[test]
 fn spz_harmonics_turn_with_the_axes() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -124,18 +124,18 @@ fn wrong_checksums_are_refused() {
     let (mut whole, columns) = spz_columns(3, 0, &[]);
     whole.extend(columns.concat());
     let (gz, zstd) = (gzip(&whole), spz_v4(0, &[], &[]));
-    // The checksum stands 8 bytes before the end of gzip, and at the end of a Zstandard frame.
+    // The checksum is 8 bytes before the end of a gzip file, and at the end of a Zstandard frame.
     for (bytes, from_end) in [(gz, 8), (zstd, 4)] {
         read_bytes(folder.path(), "intact.spz", &bytes).unwrap_or_else(|e| panic!("{e}"));
         let mut wrong = bytes.clone();
         wrong[bytes.len() - from_end] ^= 1;
         let error = read_bytes(folder.path(), "wrong.spz", &wrong).expect_err("is refused").to_string();
-        assert!(error.contains("wrong.spz: byte ") && error.contains("cannot be unpacked"), "{error}");
+        assert!(error.contains("wrong.spz: byte ") && error.contains("cannot be decompressed"), "{error}");
     }
 }
 
 #[test]
-fn counts_that_lie_are_refused_before_memory_is_taken() {
+fn false_counts_are_refused_before_memory_is_reserved() {
     let folder = tempfile::tempdir().expect("a folder");
     let names = "x y z opacity rot_0 rot_1 rot_2 rot_3 scale_0 scale_1 scale_2 f_dc_0 f_dc_1 f_dc_2";
     let floats: String = names.split(' ').map(|name| format!("property float {name}\n")).collect();
@@ -155,7 +155,7 @@ fn counts_that_lie_are_refused_before_memory_is_taken() {
     assert!(error.contains("Gaussians in") && error.contains("4294967295"), "{error}");
 }
 
-/// Streams that unpack to far more than the table of contents says: refused, and not kept.
+/// Streams that decompress to far more than the table of contents states are refused without being held in memory.
 #[test]
 fn zstandard_bombs_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -194,7 +194,7 @@ fn write_webp(path: &Path, width: u32, pixels: &[[u8; 4]]) {
         .expect("encodes");
 }
 
-/// Writes a SOG of version 1 of six Gaussians with harmonics of degree 1.
+/// Writes a SOG of version 1 with six Gaussians and harmonics of degree 1.
 pub fn write_sog_v1(folder: &Path) {
     let pixel = |seed: u8| -> Vec<[u8; 4]> {
         (0..6)
@@ -221,7 +221,7 @@ pub fn write_sog_v1(folder: &Path) {
     std::fs::write(folder.join("meta.json"), meta).expect("the temporary folder can be written");
 }
 
-/// Oracle: the formulas of version 1 on the bytes that [`write_sog_v1`] put down.
+/// Oracle: the formulas of version 1, applied to the bytes of [`write_sog_v1`].
 #[test]
 fn sog_version_1() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -275,7 +275,7 @@ fn sog_parts_stay_in_their_folder() {
         std::fs::create_dir_all(inner.join("sub")).expect("the temporary folder can be written");
         std::fs::write(inner.join("meta.json"), meta.replace("sh0.webp", outside)).expect("writes");
         let error = read_all(&inner).expect_err("is refused").to_string();
-        assert!(error.contains("plain names of files") && error.contains(outside), "{error}");
+        assert!(error.contains("plain file names") && error.contains(outside), "{error}");
     }
 }
 

@@ -1,4 +1,4 @@
-//! Splat files against recorded values of other readers, own oracles, and damage.
+//! Splat files: recorded values of other readers, oracles of our own, and damage.
 
 mod damage;
 mod formats;

@@ -1,11 +1,11 @@
-//! Peak memory of reading ten million Gaussians.
+//! Peak memory while ten million Gaussians are read.
 
 use std::io::{BufWriter, Write};
 
 use slag_common::Gaussians;
 use slag_common::splat::{ReadOptions, read};
 
-/// The most memory this process ever held, bytes.
+/// Returns the peak memory of this process, bytes.
 fn peak_rss_bytes() -> usize {
     let status = std::fs::read_to_string("/proc/self/status").expect("Linux");
     let line = status.lines().find(|line| line.starts_with("VmHWM:")).expect("VmHWM");
@@ -13,7 +13,7 @@ fn peak_rss_bytes() -> usize {
 }
 
 #[test]
-#[ignore = "writes 680 MB and measures the process: run it alone, with --ignored"]
+#[ignore = "writes 680 MB and measures the process: run it alone with --ignored"]
 fn ten_million_gaussians_stay_within_twice_their_size() {
     const COUNT: usize = 10_000_000;
     let folder = tempfile::tempdir().expect("a folder");

@@ -1,11 +1,11 @@
-//! PLY in every encoding, type and order of properties, and the writer.
+//! PLY files in every encoding, type and order of properties, and the writer.
 
 use slag_common::Gaussians;
 use slag_common::splat::ply;
 
 use crate::{assert_columns_agree, assert_near, needs_shared, read_all, read_bytes, shared};
 
-/// The properties and rows of a plain PLY of floats, parsed by hand.
+/// Returns the properties and rows of a plain PLY of floats, with a parser of the test's own.
 fn rows_of(bytes: &[u8]) -> (Vec<String>, Vec<Vec<f32>>) {
     let end = bytes.windows(11).position(|w| w == b"end_header\n").expect("a header") + 11;
     let names: Vec<_> = String::from_utf8_lossy(&bytes[..end])
@@ -18,8 +18,7 @@ fn rows_of(bytes: &[u8]) -> (Vec<String>, Vec<Vec<f32>>) {
     (names, rows)
 }
 
-/// Writes rows as the test asks: properties in reverse order between foreign ones, behind a foreign
-/// element with lists.
+/// Writes rows with their properties in reverse order among foreign ones, after a foreign element with lists.
 fn variant(encoding: &str, kind: &str, names: &[String], rows: &[Vec<f32>]) -> Vec<u8> {
     let mut out = format!("ply\r\nformat {encoding} 1.0\r\ncomment made here\r\nelement face 2\r\n");
     out += "property double area\r\nproperty list uchar int vertex_indices\r\nproperty uchar flag\r\n";
@@ -81,7 +80,7 @@ fn encodings_types_and_orders_give_the_same_gaussians() {
         let found = read_bytes(folder.path(), "variant.ply", &bytes).unwrap_or_else(|e| panic!("{e}"));
         assert!(found == expected, "{encoding} {kind}");
     }
-    // ASCII is read in f64, so digits beyond f32 differ in the last place.
+    // ASCII is read as f64, so values may differ in the last place of f32.
     let bytes = variant("ascii", "float", &names, &rows);
     let found = read_bytes(folder.path(), "variant.ply", &bytes).unwrap_or_else(|e| panic!("{e}"));
     assert_eq!((found.len(), found.sh_degree), (1873, 2));
@@ -131,8 +130,8 @@ fn missing_properties_are_named() {
     assert!(error.ends_with("pass the splat's PLY"), "{error}");
 }
 
-/// A compressed PLY of one chunk without colour ranges (as the first version was) and five Gaussians
-/// with harmonics of degree 1, `sh` bytes each the same; counts as told.
+/// Returns a compressed PLY with `n_chunks` chunks without colour ranges (as in the first version) and five Gaussians with
+/// harmonics of degree 1; all harmonics of a Gaussian have the same byte of `sh`.
 fn compressed(n_chunks: usize, sh: &[u8]) -> Vec<u8> {
     let axes = ["x", "y", "z", "scale_x", "scale_y", "scale_z"];
     let ranges = axes.map(|axis| format!("property float min_{axis}\nproperty float max_{axis}\n")).concat();
@@ -155,7 +154,7 @@ fn compressed(n_chunks: usize, sh: &[u8]) -> Vec<u8> {
     out
 }
 
-/// Oracle: PlayCanvas' description of the format, worked out by hand.
+/// Oracle: PlayCanvas' description of the format, computed by hand.
 #[test]
 fn compressed_ply_by_hand() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -170,7 +169,7 @@ fn compressed_ply_by_hand() {
         assert_near(found.into(), expected, 1e-6, "colour");
     }
     assert_eq!(found.opacities[4], 1.0);
-    // w, x, y are 0.5 * sqrt(2) * (2 n / 1023 - 1) for n = 1023, 512, 511; z, the largest, is what is left.
+    // w, x, y are 0.5 * sqrt(2) * (2 n / 1023 - 1) for n = 1023, 512, 511; z, the largest, follows from unit length.
     let small = 0.5_f64.sqrt() / 1023.0;
     for (found, expected) in
         found.rotations_wxyz[4].into_iter().zip([0.5_f64.sqrt(), small, -small, 0.5_f64.sqrt()])
@@ -191,7 +190,7 @@ fn compressed_ply_by_hand() {
     }
 }
 
-/// Random Gaussians of a degree, with the ends of the ranges among them.
+/// Returns random Gaussians of a degree, including the ends of the ranges.
 fn random_gaussians(n: usize, sh_degree: u8) -> Gaussians {
     let mut random = slag_math::random::Random::new(7);
     let mut unit = || random.unit() as f32;
@@ -232,7 +231,7 @@ fn what_is_written_is_read_back() {
                 assert_near(found.into(), written.into(), 2e-7, "rotation");
             }
         }
-        // The layout itself, by name and place: the reader alone would not see a consistent swap.
+        // The layout itself, by name and place: reading back would not reveal a consistent swap.
         let (names, rows) = rows_of(&std::fs::read(&path).expect("is there"));
         let per_channel = Gaussians::sh_rest_per_channel(degree);
         assert_eq!(names.len(), 17 + 3 * per_channel);

@@ -50,7 +50,7 @@ fn shards_of(
 /// Scores a Gaussian as the format and the module define it, from the rounded parts, one by one.
 fn defined_score(search: &Search<'_>, shard_at: usize, index: usize) -> f32 {
     let shard = &search.shards()[shard_at];
-    let (centroid, scores) = (shard.row_of(index), &search.asked.scored.shards[shard_at]);
+    let (centroid, scores) = (shard.centroid_of(index), &search.asked.scored.shards[shard_at]);
     let product = |place: &usize| {
         let own = scores.centroids[*place][centroid];
         let Some(residuals) = shard.residuals.filter(|_| search.asked.precision != Precision::Centroids)
@@ -85,7 +85,7 @@ fn scores_are_within_the_stated_error() {
                 for (at, (shard, built)) in views.iter().zip(&built).enumerate() {
                     let cell = search.asked.cell(at).expect("searched");
                     for (index, embedding) in built.embeddings.iter().enumerate() {
-                        let centroid = shard.row_of(index);
+                        let centroid = shard.centroid_of(index);
                         let found = f64::from(defined_score(&search, at, index));
                         let mut decoded = vec![0.0; shape.0];
                         match precision {
@@ -164,7 +164,7 @@ fn answers_are_those_of_brute_force() {
                 for ((found, _), expected) in found.iter().zip(&expected) {
                     assert_eq!((found.shard, found.index), (expected.shard, expected.index));
                     // A centroid that matches as a whole reports its own score.
-                    let centroid = views[found.shard as usize].row_of(found.index as usize);
+                    let centroid = views[found.shard as usize].centroid_of(found.index as usize);
                     let cell = search.asked.cell(found.shard as usize).expect("searched");
                     assert!(found.score == expected.score || found.score == cell.centroids[centroid]);
                 }
@@ -224,7 +224,7 @@ fn measured_errors_decide_as_defined() {
                 shard.decode_fine(index, &exact.fine.expect("fine"), &mut decoded);
                 let cell = search.asked.cell(at).expect("searched");
                 let (centroid, fine) =
-                    (shard.row_of(index), score_in_f64(&question, decoded.iter().copied()));
+                    (shard.centroid_of(index), score_in_f64(&question, decoded.iter().copied()));
                 let (of_centroid, bound) =
                     (f64::from(cell.centroids[centroid]), f64::from(cell.embedding_bound(centroid)));
                 let fine = fine.clamp(of_centroid - bound, of_centroid + bound);

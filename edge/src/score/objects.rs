@@ -199,9 +199,9 @@ mod tests {
                 let mut expected: BTreeMap<u64, f32> = BTreeMap::new();
                 for (shard, objects) in shards.iter().zip(&objects) {
                     let Some(objects) = objects else { continue };
-                    let own = objects.scores(shard, &question.vector);
+                    let own = shard.object_scores(objects, &question.vector);
                     let negatives: Vec<_> =
-                        question.negatives.iter().map(|n| objects.scores(shard, n)).collect();
+                        question.negatives.iter().map(|n| shard.object_scores(objects, n)).collect();
                     for (number, record) in objects.records.iter().enumerate() {
                         let worst = negatives.iter().map(|scores| scores[number]).reduce(f32::max);
                         expected.entry(record.id).or_insert(own[number] - worst.unwrap_or(0.0));

@@ -74,7 +74,7 @@ impl Files for DiskFiles {
     }
 
     fn sync_dir(&self, dir: &Path) -> io::Result<()> {
-        fs_err::File::open(dir)?.sync_all()
+        slag_common::durable::sync_folder(dir)
     }
 
     fn remove(&self, path: &Path) -> io::Result<()> {

@@ -320,7 +320,7 @@ fn signed_text(json: &str) -> Vec<u8> {
 fn shards_that_lie_are_refused() {
     let scene = Published::new(1, &[0; 1], 50);
     let sound = scene.objects[&scene.hash(0, Profile::Compact)].clone();
-    // FORMAT.md: the section table begins at 32; an entry is id, 0, offset, length, checksum in 32 bytes; the
+    // docs/formats.md: the section table begins at 32; an entry is id, 0, offset, length, checksum in 32 bytes; the
     // header section comes first. The checksum is the beginning of the hash.
     let row = |n: usize| 32 + 32 * n;
     let set =

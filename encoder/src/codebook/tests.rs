@@ -90,7 +90,7 @@ fn bounds_and_errors_are_those_of_what_readers_decode() {
             for (place, at) in codebook.order.iter().enumerate() {
                 let truth = &vectors[*at as usize * dim..][..dim];
                 shard.decode(place, &mut decoded);
-                let centroid = shard.row_of(place);
+                let centroid = shard.centroid_of(place);
                 shard.decode_centroid(centroid, &mut of_centroid);
                 let missed: Vec<f64> = truth.iter().zip(&decoded).map(|(t, d)| f64::from(*t) - d).collect();
                 let length = missed.iter().map(|v| v * v).sum::<f64>().sqrt();
@@ -148,7 +148,7 @@ fn residual_norms_bound_decoded_residuals() {
     let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
     let columns = shard.residuals.expect("balanced");
     for place in 0..n {
-        let centroid = shard.row_of(place);
+        let centroid = shard.centroid_of(place);
         let mut squares = 0.0;
         for (subspace, starts) in columns.subspace_starts.windows(2).enumerate() {
             let len = (starts[1] - starts[0]) as usize;

@@ -1,4 +1,4 @@
-//! Writes the seeds of every target to `corpus/TARGET/`; the argument is the data beside the project.
+//! Writes the seeds of every target to `corpus/TARGET/`; the argument is the folder of shared test data.
 
 use std::path::{Path, PathBuf};
 

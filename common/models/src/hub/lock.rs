@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{HubError, write_atomically};
+use super::HubError;
 use crate::description::Sha256;
 
 /// What was accepted, by model.
@@ -80,7 +80,7 @@ impl Lock {
     /// Writes the lock, whole or not at all.
     pub(super) fn write(&self, root: &Path) -> Result<(), HubError> {
         let text = serde_json::to_vec_pretty(self).map_err(io::Error::from)?;
-        Ok(write_atomically(&path_in(root), &text)?)
+        Ok(slag_common::durable::write(&path_in(root), &text)?)
     }
 
     /// Returns what was accepted of a model.

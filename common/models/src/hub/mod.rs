@@ -8,11 +8,12 @@ mod download;
 mod lock;
 mod table;
 
-use std::io::{self, Write};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde::Serialize;
+use slag_common::durable;
 
 pub use download::Failure;
 pub use lock::{Accepted, Lock, LockedFile, Source};
@@ -319,7 +320,7 @@ impl Hub {
         pull.name_image()?;
         let hash_of = |path: &str| Some(pull.expected(path)?.sha256);
         let description = self.table.description(entry, &hash_of);
-        write_atomically(&self.folder(entry).join(description::FILE_NAME), description.as_bytes())?;
+        durable::write(&self.folder(entry).join(description::FILE_NAME), description.as_bytes())?;
         Ok(pulled)
     }
 
@@ -486,9 +487,8 @@ impl Pull<'_> {
             let first = LockedFile { sha256: found, on_the_word_of: Source::FirstPull };
             let expected = stated.clone().unwrap_or(first);
             if expected.sha256 == found {
-                fs_err::rename(&part, target)?;
+                durable::move_into_place(&part, target)?;
                 discard(&part)?;
-                sync_folder(target)?;
                 return Ok(expected);
             }
             discard(&part)?;
@@ -499,18 +499,4 @@ impl Pull<'_> {
             }
         }
     }
-}
-
-/// Writes a file so that it is there whole or not at all, even after a power cut.
-fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let part = path.with_added_extension("part");
-    let mut file = fs_err::File::create(&part)?;
-    file.write_all(bytes)?;
-    file.sync_all()?;
-    fs_err::rename(&part, path)?;
-    sync_folder(path)
-}
-
-fn sync_folder(path: &Path) -> io::Result<()> {
-    path.parent().map_or(Ok(()), |folder| fs_err::File::open(folder)?.sync_all())
 }

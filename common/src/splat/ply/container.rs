@@ -1,12 +1,12 @@
-//! The PLY container: header, and rows of scalar properties in any encoding, order and type.
+//! The PLY container: a header, then rows of scalar properties in any encoding, order and type.
 //!
 //! Grammar after Turk, "The PLY Polygon File Format" (1994): lines of words up to `end_header`,
 //! then the rows of each element in the order declared.
 
-use super::input::Input;
-use super::{Place, SplatError};
+use crate::splat::error::{Place, SplatError};
+use crate::splat::input::Input;
 
-/// Headers of splats take 1 to 3 kB; comments may add some.
+/// Headers of splats take 1 to 3 kB plus comments.
 const MAX_HEADER_BYTES: u64 = 1 << 20;
 /// Binary rows are decoded from a buffer of about this size.
 const BUFFER_BYTES: usize = 1 << 16;
@@ -54,8 +54,8 @@ impl Scalar {
         }
     }
 
-    /// Returns the value at the start of `bytes`, which holds at least [`Scalar::bytes`]; f64 holds
-    /// every value of every type.
+    /// Returns the value at the start of `bytes`, which holds at least [`Scalar::bytes`]; f64 represents every value of
+    /// every type exactly.
     fn decode(self, bytes: &[u8], encoding: Encoding) -> f64 {
         let mut raw = [0; 8];
         let n = self.bytes();
@@ -104,7 +104,7 @@ impl Element {
         self.properties.iter().position(|p| p.name == name)
     }
 
-    /// Returns the bytes of a binary row, or `None` if it has lists.
+    /// Returns the length of a binary row, or `None` if the element has lists.
     fn row_bytes(&self) -> Option<usize> {
         self.properties
             .iter()
@@ -113,12 +113,12 @@ impl Element {
     }
 }
 
-/// A PLY file, positioned at the rows of the element that comes next.
+/// A PLY file, positioned at the rows of the next element.
 pub(super) struct Ply {
     pub input: Input,
     encoding: Encoding,
     pub elements: Vec<Element>,
-    /// Index of the element whose rows come next.
+    /// Index of the next element.
     next: usize,
     /// Lines read so far.
     line: u64,
@@ -168,7 +168,7 @@ impl Ply {
         self.elements.iter().position(|e| e.name == name)
     }
 
-    /// Returns the index of the property `name` of an element, or the error that it is missing.
+    /// Returns the index of a property of an element, or an error if it is missing.
     pub fn property(&self, element: usize, name: &str, advice: &'static str) -> Result<usize, SplatError> {
         let element = &self.elements[element];
         element.property(name).ok_or_else(|| SplatError::Malformed {
@@ -180,8 +180,7 @@ impl Ply {
         })
     }
 
-    /// Checks that the declared rows of an element to be read next fit into the rest of the file,
-    /// and returns their number.
+    /// Returns the number of rows of the next element after checking that they fit into the rest of the file.
     pub fn checked_count(&self, element: usize) -> Result<usize, SplatError> {
         let element = &self.elements[element];
         let row_bytes = match (self.encoding, element.row_bytes()) {
@@ -192,7 +191,7 @@ impl Ply {
                 return Err(SplatError::Unsupported {
                     path: self.input.path().into(),
                     format: format!("a list property in element {:?}", element.name),
-                    advice: "export the splat without it",
+                    advice: "export the splat without this property",
                 });
             }
         } as u64;
@@ -204,19 +203,19 @@ impl Ply {
                 self.input.path(),
                 self.input.place(),
                 format_args!("{} rows of {row_bytes} bytes or more ({:?})", element.count, element.name),
-                format_args!("{} bytes to the end of the file", self.input.remaining_bytes()),
+                format_args!("{} bytes up to the end of the file", self.input.remaining_bytes()),
             )),
         }
     }
 
-    /// Positions the file at the rows of `element`, which must not lie behind.
+    /// Positions the file at the rows of `element`, which must not have been passed.
     pub fn seek_element(&mut self, element: usize) -> Result<(), SplatError> {
         if element < self.next {
             return Err(SplatError::malformed(
                 self.input.path(),
                 Place::Line(self.line),
                 format_args!("element {:?} later in the file", self.elements[element].name),
-                "it before the one it depends on",
+                "it before an element that it must follow",
             ));
         }
         while self.next < element {
@@ -225,8 +224,8 @@ impl Ply {
         Ok(())
     }
 
-    /// Reads all rows of the next element and hands on the properties `wanted` of each, in that
-    /// order. The caller has used [`Ply::seek_element`] and [`Ply::checked_count`].
+    /// Reads all rows of the next element and passes the properties `wanted` of each row, in that order, to `each`.
+    /// Call [`Ply::seek_element`] and [`Ply::checked_count`] first.
     pub fn rows(&mut self, wanted: &[usize], mut each: impl FnMut(&[f64])) -> Result<(), SplatError> {
         let element = &self.elements[self.next];
         let mut values = vec![0.0; wanted.len()];
@@ -279,7 +278,7 @@ impl Ply {
         Ok(())
     }
 
-    /// Steps over all rows of the next element, lists included.
+    /// Skips all rows of the next element, lists included.
     fn skip_element(&mut self) -> Result<(), SplatError> {
         let element = &self.elements[self.next];
         if self.encoding == Encoding::Ascii {
@@ -297,7 +296,7 @@ impl Ply {
                         Kind::List { len, item } => {
                             let mut raw = [0; 8];
                             self.input.fill(&mut raw[..len.bytes()], &element.name)?;
-                            // A negative or absurd length saturates, and fails in `skip`.
+                            // A negative or huge length saturates, and `skip` rejects it.
                             let n = match len.decode(&raw, self.encoding) {
                                 n if n >= 0.0 => n as u64,
                                 _ => u64::MAX,
@@ -313,7 +312,7 @@ impl Ply {
     }
 }
 
-/// Reads the next line that is not blank as numbers.
+/// Reads the numbers of the next line that is not blank.
 fn read_ascii_row(
     input: &mut Input,
     line_number: &mut u64,
@@ -350,14 +349,14 @@ fn read_ascii_row(
     Ok(())
 }
 
-/// A header in the making.
+/// The part of a header read so far.
 struct Header {
     encoding: Option<Encoding>,
     elements: Vec<Element>,
 }
 
 impl Header {
-    /// Takes in a line; returns whether it was the last, or what was expected instead.
+    /// Reads a line; returns whether it was the last. The error is the content expected.
     fn line(&mut self, text: &str) -> Result<bool, &'static str> {
         let words: Vec<_> = text.split_ascii_whitespace().collect();
         match words.as_slice() {

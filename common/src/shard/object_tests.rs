@@ -1,8 +1,10 @@
 use super::*;
-use crate::container::AlignedBytes;
-use crate::shard::{Positions, ScoreErrors, ShardHeader, ShardLayout, ShardView};
+use crate::container::{self, AlignedBytes, Layout};
+use crate::objects::{
+    NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, object_score, quantise_vectors,
+};
 
-/// What a test edits before the shard is written.
+/// The parts of a shard's objects that a test edits before they are written.
 struct Parts {
     header: ObjectsHeader,
     records: Vec<ObjectRecord>,
@@ -26,7 +28,7 @@ fn record(id: u64, n_here: u32, photo: std::ops::Range<u32>) -> ObjectRecord {
     }
 }
 
-/// Six Gaussians of three dimensions in one row: 0, 1 of object 1, 2 of none, 3, 4 of object 0, 5 of object 1.
+/// Six Gaussians of three dimensions with one centroid: 0 and 1 of object 1, 2 of none, 3 and 4 of object 0, 5 of object 1.
 fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
     let mut parts = Parts {
         header: ObjectsHeader {
@@ -84,14 +86,14 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
     let mut out = Vec::new();
     let sections: Vec<(u32, Vec<u8>)> = {
         shard.write(&mut out).expect("writes to memory");
-        let own = Layout::check(&out, crate::shard::MAGIC, crate::shard::VERSION).expect("valid");
+        let own = Layout::check(&out, MAGIC, VERSION).expect("valid");
         let ids = (1..=19).filter_map(|id| own.find(id).map(|range| (id, out[range].to_vec())));
         let of_objects = objects.sections().map(|(id, bytes)| (id, bytes.to_vec()));
         ids.chain(of_objects).collect()
     };
     let sections: Vec<(u32, &[u8])> = sections.iter().map(|(id, bytes)| (*id, &bytes[..])).collect();
     let mut out = Vec::new();
-    container::write(&mut out, crate::shard::MAGIC, crate::shard::VERSION, &sections).expect("writes");
+    container::write(&mut out, MAGIC, VERSION, &sections).expect("writes");
     out
 }
 
@@ -106,11 +108,11 @@ fn round_trip() {
     assert!(runs.iter().enumerate().all(|(at, (run, _))| objects.run(at) == *run));
     assert_eq!(runs, [(0..2, Some(1)), (2..3, None), (3..5, Some(0)), (5..6, Some(1))]);
     // By hand: object 0 has mean (1, 0, 0) and side (0, 1, 0); object 1 has mean (0, 0, 0.6) and side 0.
-    let scores = objects.scores(&layout.view(&bytes), &[0.5, 0.25, -1.0]);
+    let scores = layout.view(&bytes).object_scores(&objects, &[0.5, 0.25, -1.0]);
     for (found, expected) in scores.iter().zip([0.5 * (0.5 + 0.25), 0.5 * -0.6]) {
         assert!((found - expected).abs() < 1e-6, "{scores:?}");
     }
-    // A shard that is written in one go is the same, and one without objects has none.
+    // Writing both at once gives the same bytes; a shard without objects has none.
     let again = objects;
     let mut out = Vec::new();
     layout.view(&bytes).write_with(&mut out, Some(&again)).expect("writes to memory");
@@ -121,9 +123,9 @@ fn round_trip() {
     assert!(ShardLayout::check(&bytes).expect("valid").objects(&bytes).is_none());
 }
 
-/// A hostile writer computes right checksums over wrong contents: each lie is refused.
+/// A hostile writer can compute correct checksums over invalid contents: each is refused.
 #[test]
-fn lies_are_refused() {
+fn invalid_contents_are_refused() {
     let refused =
         |edit: fn(&mut Parts)| ShardLayout::check(&written(edit)).expect_err("must be refused").to_string();
     assert!(refused(|p| p.header.n_objects = u32::MAX).contains("objects of"));
@@ -142,12 +144,12 @@ fn lies_are_refused() {
     assert!(refused(|p| p.run_ends[0] = 0).contains("ascend"));
     assert!(refused(|p| p.run_ends[3] = 7).contains("ascend"));
     assert!(refused(|p| p.run_objects[0] = 2).contains("object 2 of 2"));
-    assert!(refused(|p| p.run_objects[0] = 0).contains("not those of the runs"));
+    assert!(refused(|p| p.run_objects[0] = 0).contains("differs from the runs"));
     assert!(refused(|p| p.records[0].n_gaussians = 1).contains("fewer Gaussians"));
     assert!(refused(|p| p.records[1].box_max[2] = f64::INFINITY).contains("not finite"));
     assert!(refused(|p| p.records[1].box_min[0] = 2.0).contains("empty"));
     assert!(refused(|p| p.records[1].position_in_world[0] = f64::NAN).contains("not finite"));
-    assert!(refused(|p| p.records[0].photo_box_px[2] = 9).contains("turned over"));
+    assert!(refused(|p| p.records[0].photo_box_px[2] = 9).contains("inverted"));
     assert!(refused(|p| p.records[0].photo_start = u32::MAX).contains("name"));
     assert!(refused(|p| p.records[0].photo_bytes = u32::MAX).contains("name"));
     assert!(refused(|p| p.records[0].photo_bytes = 6).contains("name"), "cuts a character");
@@ -155,16 +157,16 @@ fn lies_are_refused() {
     assert!(refused(|p| p.photos[0] = 0x1b).contains("UTF-8"), "an escape");
 }
 
-/// The Gaussians of [`written`]: what is read from runs is what they were collected from.
+/// The runs of the Gaussians of [`written`].
 #[test]
-fn neighbours_of_an_object_are_a_run() {
+fn consecutive_gaussians_of_an_object_are_a_run() {
     let of_gaussians = [1, 1, NO_OBJECT, 0, 0, 1];
     assert_eq!(collect_runs(of_gaussians), (vec![2, 3, 5, 6], vec![1, NO_OBJECT, 0, 1]));
     assert_eq!(collect_runs([NO_OBJECT; 3]), (vec![3], vec![NO_OBJECT]));
     assert_eq!(collect_runs([]), (vec![], vec![]));
 }
 
-/// Oracle: products in float64. The stated bound holds, and repeats change no score.
+/// Oracle: products in float64. The error stays within its bound, and repeated vectors change no score.
 #[test]
 fn rounded_vectors_keep_scores() {
     let dim = 64;

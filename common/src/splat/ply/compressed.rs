@@ -1,12 +1,14 @@
-//! Compressed PLY as PlayCanvas has it: element `chunk` with the ranges of 256 Gaussians each,
-//! element `vertex` with four packed words a Gaussian, and optionally element `sh` with bytes.
+//! Compressed PLY files of PlayCanvas: the element `chunk` has the ranges of 256 Gaussians, `vertex` has four packed
+//! words per Gaussian, and the optional `sh` has bytes.
 
 use glam::DVec3;
 
-use super::ply::sh_rest_properties;
-use super::ply_container::Ply;
-use super::{ReadOptions, SplatError, columns, dc_of_colour, unit_rotation, with_largest};
+use super::container::Ply;
+use super::harmonics::sh_rest_properties;
 use crate::Gaussians;
+use crate::splat::columns::{ReadOptions, columns};
+use crate::splat::error::SplatError;
+use crate::splat::values::{dc_of_colour, unit_rotation, with_largest};
 
 const GAUSSIANS_PER_CHUNK: usize = 256;
 const RANGES: [&str; 12] = [
@@ -32,7 +34,7 @@ const EXPORT_AGAIN: &str = "export the compressed PLY again";
 struct Chunk([f32; 18]);
 
 impl Chunk {
-    /// Returns `unit`, 0..=1 on each axis, within the range that starts at entry `start`.
+    /// Maps `unit`, 0..=1 on each axis, to the range that starts at entry `start`.
     fn lerp(&self, start: usize, unit: [f64; 3]) -> [f64; 3] {
         std::array::from_fn(|axis| {
             let (min, max) = (f64::from(self.0[start + axis]), f64::from(self.0[start + 3 + axis]));
@@ -41,7 +43,7 @@ impl Chunk {
     }
 }
 
-/// Returns the `bits` of `word` from bit `shift` up as a fraction of their maximum.
+/// Returns `bits` bits of `word` from bit `shift` up, as a fraction of their maximum.
 fn unit(word: u32, shift: u32, bits: u32) -> f64 {
     let max = (1 << bits) - 1;
     f64::from((word >> shift) & max) / f64::from(max)
@@ -52,14 +54,14 @@ fn unit_11_10_11(word: u32) -> [f64; 3] {
     [unit(word, 21, 11), unit(word, 11, 10), unit(word, 0, 11)]
 }
 
-/// Returns the rotation packed as index of the largest component and 10 bits for each other one,
-/// which lie within +-1/sqrt(2).
+/// Returns a rotation packed as the index of its largest component and 10 bits for each of the others, which lie within
+/// +-1/sqrt(2).
 fn unpack_rotation(word: u32) -> [f64; 4] {
     let others = [20, 10, 0].map(|shift| (unit(word, shift, 10) - 0.5) * std::f64::consts::SQRT_2);
     with_largest((word >> 30) as usize, others)
 }
 
-/// Reads the rows of a file whose header has been read.
+/// Reads the rows of a file with its header already read.
 pub(super) fn read(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<Gaussians, SplatError> {
     let Some(chunk) = ply.element("chunk") else {
         return Err(SplatError::malformed(
@@ -73,7 +75,7 @@ pub(super) fn read(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<
     for name in RANGES {
         chunk_properties.push(ply.property(chunk, name, EXPORT_AGAIN)?);
     }
-    // Files of the first version lack them: colours then span 0..=1.
+    // Files of the first version have no colour ranges; colours span 0..=1.
     let has_colour_ranges = ply.elements[chunk].property(COLOUR_RANGES[0]).is_some();
     for name in COLOUR_RANGES.into_iter().filter(|_| has_colour_ranges) {
         chunk_properties.push(ply.property(chunk, name, EXPORT_AGAIN)?);
@@ -107,7 +109,7 @@ pub(super) fn read(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<
         _ => None,
     }
     .filter(|(_, (degree, _))| *degree > 0);
-    // Room for the harmonics only once their bytes are known to be there.
+    // Memory for the harmonics is reserved once their bytes are known to exist.
     let mut out = columns(count, 0);
     ply.rows(&packed, |row| {
         let chunk = chunks[out.means_in_world.len() / GAUSSIANS_PER_CHUNK];
@@ -138,8 +140,7 @@ pub(super) fn read(mut ply: Ply, vertex: usize, options: ReadOptions) -> Result<
     Ok(out)
 }
 
-/// Returns a coefficient stored as a byte: buckets of 1/32 within +-4, the first and last of which
-/// stand for the ends themselves.
+/// Returns a coefficient stored as a byte: buckets of 1/32 within +-4; the first and last stand for the ends.
 fn unpack_sh(byte: f64) -> f32 {
     let unit = if byte <= 0.0 {
         0.0

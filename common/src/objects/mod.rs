@@ -1,0 +1,15 @@
+//! The objects of a shard: things that the masks of several views agree on. The byte table is in `docs/formats.md`.
+//!
+//! A shard carries the complete record of every object that has Gaussians in its cell, so a robot that holds only
+//! part of the scene still knows the size and position of the objects it sees in part. Objects have sections of their
+//! own: readers that do not know them skip them.
+
+mod build;
+mod columns;
+mod layout;
+
+pub use build::{collect_runs, quantise_vectors};
+pub use columns::{
+    MAX_PHOTO_BYTES, MAX_VECTORS, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, object_score, section,
+};
+pub(crate) use layout::ObjectsLayout;

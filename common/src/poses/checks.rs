@@ -1,0 +1,108 @@
+//! Checks that both formats share: intrinsics, rotations and translations.
+
+use glam::{DAffine3, DMat3, DQuat, DVec3};
+
+use super::error::PoseProblem;
+use crate::camera::{Distortion, Intrinsics};
+
+/// Largest image side accepted, pixels: that of the largest JPEG; pixel indices fit 32 bits.
+const MAX_SIDE_PX: u32 = 65_535;
+
+/// Largest deviation of a rotation from unit length or orthonormality that counts as rounding: a printout with 3
+/// decimals stays below it.
+const ROTATION_TOLERANCE: f64 = 5e-3;
+
+/// Returns intrinsics after checking them: sizes within 1..=65,535, focal lengths positive, everything finite.
+pub(super) fn check_intrinsics(
+    [width_px, height_px]: [f64; 2],
+    [focal_x_px, focal_y_px]: [f64; 2],
+    [centre_x_px, centre_y_px]: [f64; 2],
+    distortion: Distortion,
+) -> Result<Intrinsics, PoseProblem> {
+    let side = |field, value: f64| {
+        if value.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE_PX)).contains(&value) {
+            Ok(value as u32)
+        } else {
+            Err(PoseProblem::BadIntrinsics { field, value, expected: "a whole number from 1 to 65535" })
+        }
+    };
+    let focal = |field, value: f64| {
+        if value.is_finite() && value > 0.0 {
+            Ok(value)
+        } else {
+            Err(PoseProblem::BadIntrinsics { field, value, expected: "a positive number of pixels" })
+        }
+    };
+    let finite = |field, value: f64| {
+        if value.is_finite() {
+            Ok(value)
+        } else {
+            Err(PoseProblem::BadIntrinsics { field, value, expected: "a finite number" })
+        }
+    };
+    let coefficients: &[f64] = match &distortion {
+        Distortion::None => &[],
+        Distortion::Brown { k, p } => &[k[0], k[1], k[2], p[0], p[1]],
+        Distortion::Fisheye { k } => k,
+    };
+    for value in coefficients {
+        finite("distortion coefficient", *value)?;
+    }
+    // Coefficients of zero make an ideal pinhole; a fisheye without coefficients is still equidistant.
+    let distortion = match distortion {
+        Distortion::Brown { k: [0.0, 0.0, 0.0], p: [0.0, 0.0] } => Distortion::None,
+        other => other,
+    };
+    Ok(Intrinsics {
+        width_px: side("width", width_px)?,
+        height_px: side("height", height_px)?,
+        focal_x_px: focal("focal length x", focal_x_px)?,
+        focal_y_px: focal("focal length y", focal_y_px)?,
+        centre_x_px: finite("principal point x", centre_x_px)?,
+        centre_y_px: finite("principal point y", centre_y_px)?,
+        distortion,
+    })
+}
+
+/// Returns the transform of a quaternion (w, x, y, z), which is normalised, and a translation.
+pub(super) fn affine_from_wxyz(
+    image: &str,
+    wxyz: [f64; 4],
+    translation: [f64; 3],
+) -> Result<DAffine3, PoseProblem> {
+    let [w, x, y, z] = wxyz;
+    let rotation = DQuat::from_xyzw(x, y, z, w);
+    let deviation = (rotation.length() - 1.0).abs();
+    if deviation.is_nan() || deviation > ROTATION_TOLERANCE {
+        return Err(PoseProblem::NotARotation { image: image.to_owned(), deviation });
+    }
+    let translation = check_translation(translation)?;
+    Ok(DAffine3::from_rotation_translation(rotation.normalize(), translation))
+}
+
+/// Returns the transform of a rotation matrix, which is made exactly orthonormal, and a translation.
+pub(super) fn affine_from_matrix(
+    image: &str,
+    rotation: DMat3,
+    translation: [f64; 3],
+) -> Result<DAffine3, PoseProblem> {
+    let gram = rotation.transpose() * rotation - DMat3::IDENTITY;
+    let largest =
+        gram.to_cols_array().iter().fold(0.0_f64, |m, v| if v.is_nan() { *v } else { m.max(v.abs()) });
+    // A reflection is orthonormal too, with determinant -1 instead of 1.
+    let deviation =
+        if largest <= ROTATION_TOLERANCE { (rotation.determinant() - 1.0).abs() } else { largest };
+    if deviation.is_nan() || deviation > 2.0 * ROTATION_TOLERANCE {
+        return Err(PoseProblem::NotARotation { image: image.to_owned(), deviation });
+    }
+    let translation = check_translation(translation)?;
+    Ok(DAffine3::from_rotation_translation(DQuat::from_mat3(&rotation).normalize(), translation))
+}
+
+fn check_translation(translation: [f64; 3]) -> Result<DVec3, PoseProblem> {
+    let vector = DVec3::from_array(translation);
+    if vector.is_finite() {
+        return Ok(vector);
+    }
+    Err(PoseProblem::Expected { expected: "a finite translation", found: format!("{translation:?}") })
+}

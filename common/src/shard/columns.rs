@@ -1,0 +1,162 @@
+//! The columns of a shard, and what can be read from them without decoding embeddings.
+
+use std::ops::Range;
+
+use glam::DVec3;
+use half::f16;
+
+use super::format::{BLOCK, ScoreErrors, ShardHeader};
+use crate::container;
+use crate::frames::Aabb;
+use crate::hash::Hash32;
+
+/// Quantised means, in steps of `position_step` from `origin_in_world`.
+#[derive(Clone, Copy, Debug)]
+pub enum Positions<'a> {
+    /// x, y and z from the lowest bit up, `position_bits` wide.
+    Packed(&'a [u32]),
+    /// x, y, z.
+    Wide(&'a [[u16; 3]]),
+}
+
+impl Positions<'_> {
+    pub(super) fn bytes(&self) -> &[u8] {
+        match self {
+            Self::Packed(words) => container::bytes_of(words),
+            Self::Wide(steps) => container::bytes_of(steps),
+        }
+    }
+
+    fn steps(&self, index: usize, bits: [u8; 4]) -> [u32; 3] {
+        match self {
+            Self::Wide(steps) => steps[index].map(u32::from),
+            Self::Packed(words) => {
+                let word = u64::from(words[index]);
+                let part = |shift: u8, bits: u8| (word >> shift & ((1 << bits) - 1)) as u32;
+                [part(0, bits[0]), part(bits[0], bits[1]), part(bits[0] + bits[1], bits[2])]
+            }
+        }
+    }
+}
+
+/// The basis of a cell's centroids.
+#[derive(Clone, Copy, Debug)]
+pub struct Basis<'a> {
+    /// `[dim]`.
+    pub mean: &'a [f16],
+    /// `[m][dim]`.
+    pub vectors: &'a [i8],
+    /// `[m]`.
+    pub steps: &'a [f32],
+}
+
+/// The residual code.
+#[derive(Clone, Copy, Debug)]
+pub struct Residuals<'a> {
+    /// `[G + 1]`, strictly ascending, at most m.
+    pub subspace_starts: &'a [u32],
+    /// For each subspace `[16][components of the subspace]`.
+    pub codewords: &'a [f16],
+    /// `[K]`.
+    pub residual_scales: &'a [f32],
+    /// `[K]`: the length of the longest decoded residual of the members, as a vector of components.
+    pub residual_norms: &'a [f32],
+    /// `[ceil(centroid_starts[K] / 32)][G / 2][32]`.
+    pub codes: &'a [u8],
+}
+
+impl Residuals<'_> {
+    /// Returns the index of a Gaussian's codeword in a subspace.
+    pub fn code(&self, index: usize, subspace: usize) -> usize {
+        let n_bytes = (self.subspace_starts.len() - 1) / 2;
+        let byte = self.codes[(index / BLOCK * n_bytes + subspace / 2) * BLOCK + index % BLOCK];
+        usize::from(if subspace.is_multiple_of(2) { byte & 15 } else { byte >> 4 })
+    }
+}
+
+/// The columns of the exact profile.
+#[derive(Clone, Copy, Debug)]
+pub struct ExactColumns<'a> {
+    /// `[N]` index in the input splat file.
+    pub input_indices: &'a [u32],
+    /// `[centroid_starts[K]][dim]` unit embeddings.
+    pub embeddings: &'a [f16],
+    /// Residuals of intermediate precision; absent without a residual code.
+    pub fine: Option<Fine<'a>>,
+}
+
+/// Residuals with 8 bits a component: a Gaussian's take an eighth of the bytes of its embedding.
+#[derive(Clone, Copy, Debug)]
+pub struct Fine<'a> {
+    /// Measured errors of scores from fine residuals.
+    pub errors: ScoreErrors,
+    /// `[m]`.
+    pub steps: &'a [f32],
+    /// `[K]`.
+    pub scales: &'a [f32],
+    /// `[centroid_starts[K]][m]`.
+    pub values: &'a [i8],
+}
+
+/// A shard's columns, borrowed from its bytes or from the data to be written.
+#[derive(Clone, Copy, Debug)]
+pub struct ShardView<'a> {
+    /// The header.
+    pub header: ShardHeader,
+    /// `[N]`; decode with [`ShardView::position_in_world`].
+    pub positions: Positions<'a>,
+    /// `[K + 1]`, ascending.
+    pub centroid_starts: &'a [u32],
+    /// `[K][m]`.
+    pub centroids: &'a [i8],
+    /// `[K]`: at least the largest `||E_k - E'_k||` of the centroid's members, where E' is the embedding as this
+    /// profile decodes it (the centroid, or the centroid and the residual); in exact shards E' is the centroid.
+    pub radii: &'a [f32],
+    /// The basis of the components; absent: components are those of the embedding itself.
+    pub basis: Option<Basis<'a>>,
+    /// The residual code, in the balanced and exact profiles.
+    pub residuals: Option<Residuals<'a>>,
+    /// The columns that only the exact profile has.
+    pub exact: Option<ExactColumns<'a>>,
+}
+
+impl ShardView<'_> {
+    /// Returns the mean of a Gaussian, accurate to half a step per axis.
+    pub fn position_in_world(&self, index: usize) -> DVec3 {
+        let steps = self.positions.steps(index, self.header.position_bits).map(f64::from);
+        DVec3::from(self.header.origin_in_world) + DVec3::from(steps) * DVec3::from(self.header.position_step)
+    }
+
+    /// Returns the box of all representable positions.
+    pub fn position_box(&self) -> Aabb {
+        let steps = self.header.position_bits.map(|bits| ((1u64 << bits) - 1) as f64);
+        let min = DVec3::from(self.header.origin_in_world);
+        let size = DVec3::new(steps[0], steps[1], steps[2]) * DVec3::from(self.header.position_step);
+        Aabb { min, max: min + size }
+    }
+
+    /// Returns the members of a centroid.
+    pub fn members(&self, centroid: usize) -> Range<usize> {
+        self.centroid_starts[centroid] as usize..self.centroid_starts[centroid + 1] as usize
+    }
+
+    /// Returns the centroid of a Gaussian that has evidence.
+    pub fn centroid_of(&self, index: usize) -> usize {
+        self.centroid_starts.partition_point(|start| *start as usize <= index) - 1
+    }
+
+    /// Returns the number of Gaussians that have an embedding.
+    pub fn n_with_evidence(&self) -> usize {
+        self.centroid_starts[self.header.n_centroids as usize] as usize
+    }
+
+    /// Returns the box around the Gaussians' extents.
+    pub fn bounds(&self) -> Aabb {
+        Aabb { min: self.header.box_min.into(), max: self.header.box_max.into() }
+    }
+
+    /// Returns the id of the encoder that defines the space of the centroids.
+    pub fn encoder_id(&self) -> Hash32 {
+        Hash32(self.header.encoder_id)
+    }
+}

@@ -1,0 +1,143 @@
+//! Embeddings and scores of a shard, decoded in float64: the reference that faster code is tested against.
+
+use super::columns::{Fine, ShardView};
+use super::format::CODEWORDS;
+use crate::objects::{Objects, object_score};
+
+impl ShardView<'_> {
+    /// Writes the vector of a centroid to `out` (`[dim]`), in float64; the formula is in the module's documentation.
+    pub fn decode_centroid(&self, centroid: usize, out: &mut [f64]) {
+        let m = self.header.n_components as usize;
+        let step = f64::from(self.header.centroid_step);
+        let components: Vec<f64> =
+            self.centroids[centroid * m..][..m].iter().map(|c| f64::from(*c) * step).collect();
+        self.combine(&components, out);
+    }
+
+    /// Writes the embedding of a Gaussian with evidence to `out` (`[dim]`), as accurately as this profile allows, in
+    /// float64.
+    pub fn decode(&self, index: usize, out: &mut [f64]) {
+        let dim = self.header.dim as usize;
+        if let Some(exact) = &self.exact {
+            let stored = &exact.embeddings[index * dim..][..dim];
+            out.iter_mut().zip(stored).for_each(|(o, v)| *o = v.to_f64());
+            return;
+        }
+        self.combine(&self.components(index), out);
+    }
+
+    /// Writes the embedding of a Gaussian with evidence to `out` (`[dim]`), decoded from its fine residual, in float64.
+    pub fn decode_fine(&self, index: usize, fine: &Fine<'_>, out: &mut [f64]) {
+        let m = self.header.n_components as usize;
+        let centroid = self.centroid_of(index);
+        let (step, scale) = (f64::from(self.header.centroid_step), f64::from(fine.scales[centroid]));
+        let of_centroid = self.centroids[centroid * m..][..m].iter().map(|c| f64::from(*c) * step);
+        let residual = fine.values[index * m..][..m].iter().zip(fine.steps);
+        let residual = residual.map(|(v, step)| f64::from(*v) * f64::from(*step) * scale);
+        self.combine(&of_centroid.zip(residual).map(|(a, b)| a + b).collect::<Vec<_>>(), out);
+    }
+
+    /// Returns the score of every Gaussian with evidence for a query (`[dim]`), from embeddings as this profile decodes
+    /// them, in float64.
+    pub fn scores(&self, query: &[f32]) -> Vec<f64> {
+        let dim = self.header.dim as usize;
+        let product = |vector: &mut dyn Iterator<Item = f64>| -> f64 {
+            vector.zip(query).map(|(v, q)| v * f64::from(*q)).sum()
+        };
+        if let Some(exact) = &self.exact {
+            return exact
+                .embeddings
+                .chunks_exact(dim)
+                .map(|e| product(&mut e.iter().map(|v| v.to_f64())))
+                .collect();
+        }
+        let (offset, of_components) = self.components_of_query(query);
+        let score = |index| {
+            let components = self.components(index);
+            offset + components.iter().zip(&of_components).map(|(c, q)| c * q).sum::<f64>()
+        };
+        (0..self.n_with_evidence()).map(score).collect()
+    }
+
+    /// Returns the products of a query (`[dim]`) with the mean and with each basis vector (`[m]`), in float64.
+    ///
+    /// The score of a vector with components c is the first plus the sum of `c[i]` times the second.
+    pub fn components_of_query(&self, query: &[f32]) -> (f64, Vec<f64>) {
+        let dim = self.header.dim as usize;
+        let product = |vector: &mut dyn Iterator<Item = f64>| -> f64 {
+            vector.zip(query).map(|(v, q)| v * f64::from(*q)).sum()
+        };
+        match &self.basis {
+            None => (0.0, query.iter().map(|q| f64::from(*q)).collect::<Vec<_>>()),
+            Some(basis) => {
+                let vectors = basis.vectors.chunks_exact(dim).zip(basis.steps);
+                let of_component = |(v, step): (&[i8], &f32)| {
+                    product(&mut v.iter().map(|v| f64::from(*v))) * f64::from(*step)
+                };
+                (product(&mut basis.mean.iter().map(|v| v.to_f64())), vectors.map(of_component).collect())
+            }
+        }
+    }
+
+    /// Returns the components of a Gaussian with evidence: the sum of its centroid's and its residual's.
+    fn components(&self, index: usize) -> Vec<f64> {
+        let m = self.header.n_components as usize;
+        let centroid = self.centroid_of(index);
+        let step = f64::from(self.header.centroid_step);
+        let mut components: Vec<f64> =
+            self.centroids[centroid * m..][..m].iter().map(|c| f64::from(*c) * step).collect();
+        if let Some(residuals) = &self.residuals {
+            let scale = f64::from(residuals.residual_scales[centroid]);
+            for subspace in 0..residuals.subspace_starts.len() - 1 {
+                let of_subspace = residuals.subspace_starts[subspace] as usize
+                    ..residuals.subspace_starts[subspace + 1] as usize;
+                let codeword = residuals.code(index, subspace) * of_subspace.len();
+                let codeword =
+                    &residuals.codewords[CODEWORDS * of_subspace.start + codeword..][..of_subspace.len()];
+                components[of_subspace].iter_mut().zip(codeword).for_each(|(c, w)| *c += scale * w.to_f64());
+            }
+        }
+        components
+    }
+
+    /// Writes the vector of some components (`[m]`) to `out` (`[dim]`).
+    fn combine(&self, components: &[f64], out: &mut [f64]) {
+        let Some(basis) = &self.basis else {
+            out.copy_from_slice(components);
+            return;
+        };
+        out.iter_mut().zip(basis.mean).for_each(|(o, v)| *o = v.to_f64());
+        for ((component, vector), step) in
+            components.iter().zip(basis.vectors.chunks_exact(out.len())).zip(basis.steps)
+        {
+            let scale = component * f64::from(*step);
+            out.iter_mut().zip(vector).for_each(|(o, v)| *o += scale * f64::from(*v));
+        }
+    }
+
+    /// Returns the score of each of the shard's objects for a query (`[dim]`), see [`object_score`]; products are in
+    /// float64.
+    pub fn object_scores(&self, objects: &Objects<'_>, query: &[f32]) -> Vec<f32> {
+        let (offset, of_components) = self.components_of_query(query);
+        let m = of_components.len();
+        let product = |(at, step): (usize, &f32)| {
+            let vector = objects.vectors[at * m..][..m].iter();
+            let sum: f64 = vector.zip(&of_components).map(|(v, q)| f64::from(*v) * q).sum();
+            (offset + f64::from(*step) * sum) as f32
+        };
+        let products: Vec<f32> = objects.steps.iter().enumerate().map(product).collect();
+        products.chunks_exact(objects.header.n_vectors as usize).map(object_score).collect()
+    }
+
+    /// Returns the vectors of the shard's objects, `[n][n_vectors][dim]`.
+    pub fn object_vectors(&self, objects: &Objects<'_>) -> Vec<f64> {
+        let (m, dim) = (self.header.n_components as usize, self.header.dim as usize);
+        let mut vectors = vec![0.0; objects.steps.len() * dim];
+        for (at, (out, step)) in vectors.chunks_exact_mut(dim).zip(objects.steps).enumerate() {
+            let vector = objects.vectors[at * m..][..m].iter();
+            let components: Vec<f64> = vector.map(|v| f64::from(*v) * f64::from(*step)).collect();
+            self.combine(&components, out);
+        }
+        vectors
+    }
+}

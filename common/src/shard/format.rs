@@ -1,0 +1,116 @@
+//! Constants, section ids and the header of the shard format.
+
+use bytemuck::{Pod, Zeroable};
+use serde::{Deserialize, Serialize};
+
+/// First bytes of a shard.
+pub const MAGIC: [u8; 8] = *b"SLAGSHRD";
+/// Version of the shard format that is written and read.
+pub const VERSION: u32 = 2;
+/// Gaussians of a block of residual codes: a block holds one column of 32 bytes for each pair of subspaces.
+pub const BLOCK: usize = 32;
+/// Codewords of a subspace: a code takes half a byte.
+pub const CODEWORDS: usize = 16;
+/// Largest number of subspaces of a residual code.
+pub const MAX_SUBSPACES: usize = 128;
+/// Largest `dim` accepted: more than any text-image model has.
+pub const MAX_DIM: usize = 8192;
+
+/// Ids of a shard's sections.
+pub mod section {
+    /// [`super::ShardHeader`].
+    pub const HEADER: u32 = 1;
+    /// `[N]` u32 or `[N][3]` u16, see [`Positions`](crate::shard::Positions).
+    pub const POSITIONS: u32 = 2;
+    /// `[K + 1]` u32.
+    pub const CENTROID_STARTS: u32 = 3;
+    /// `[K][m]` i8.
+    pub const CENTROIDS: u32 = 4;
+    /// `[K]` f32.
+    pub const RADII: u32 = 5;
+    /// `[N]` u32, index in the input splat file.
+    pub const INPUT_INDICES: u32 = 6;
+    /// `[centroid_starts[K]][dim]` f16, unit embeddings.
+    pub const EMBEDDINGS: u32 = 7;
+    /// `[dim]` f16; absent: zero.
+    pub const MEAN: u32 = 8;
+    /// `[m][dim]` i8; absent: components are those of the embedding itself, and m = dim.
+    pub const BASIS: u32 = 9;
+    /// `[m]` f32, present with the basis.
+    pub const BASIS_STEPS: u32 = 10;
+    /// `[G + 1]` u32: subspace g has the components `starts[g]..starts[g + 1]`.
+    pub const SUBSPACE_STARTS: u32 = 11;
+    /// For each subspace `[16][components of the subspace]` f16.
+    pub const CODEWORDS: u32 = 12;
+    /// `[K]` f32: the factor of the codewords of a centroid's members.
+    pub const RESIDUAL_SCALES: u32 = 13;
+    /// `[K]` f32: the length of the longest decoded residual of a centroid's members, in components.
+    pub const RESIDUAL_NORMS: u32 = 14;
+    /// `[ceil(centroid_starts[K] / 32)][G / 2][32]` u8: two codes a byte, the even subspace in the low half.
+    pub const CODES: u32 = 15;
+    /// [`super::ScoreErrors`] of the fine residuals.
+    pub const FINE_ERRORS: u32 = 16;
+    /// `[m]` f32: the factor of each component of a fine residual.
+    pub const FINE_STEPS: u32 = 17;
+    /// `[K]` f32: the factor of the fine residuals of a centroid's members.
+    pub const FINE_SCALES: u32 = 18;
+    /// `[centroid_starts[K]][m]` i8.
+    pub const FINE: u32 = 19;
+}
+
+/// Absolute errors of a profile's scores, measured over a bank of text vectors and a sample of the Gaussians.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+#[repr(C)]
+pub struct ScoreErrors {
+    /// Mean over texts and Gaussians.
+    pub mean: f32,
+    /// 99.9th percentile.
+    pub p999: f32,
+    /// Largest.
+    pub max: f32,
+    /// Standard deviation of a text's scores over the Gaussians, averaged over the texts: the scale to compare
+    /// errors with.
+    pub spread: f32,
+}
+
+/// The fixed-size header of a shard.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct ShardHeader {
+    /// The cell.
+    pub cell_id: u32,
+    /// Gaussians, N.
+    pub n_gaussians: u32,
+    /// Centroids of the codebook, K.
+    pub n_centroids: u32,
+    /// Components of an embedding.
+    pub dim: u32,
+    /// Components of a centroid, m.
+    pub n_components: u32,
+    /// Subspaces of the residual code, G; even; 0 without a residual code.
+    pub n_subspaces: u32,
+    /// Bits of a position's x, y and z: 32 in all at most, or 16 each for the u16 form.
+    pub position_bits: [u8; 4],
+    /// Factor of the 8-bit components of centroids.
+    pub centroid_step: f32,
+    /// Origin of the shard frame in the world frame.
+    pub origin_in_world: [f64; 3],
+    /// World units per step of a quantised position, per axis; the error is at most half a step.
+    pub position_step: [f64; 3],
+    /// Smallest corner of the box around the Gaussians' extents, world frame.
+    pub box_min: [f64; 3],
+    /// Largest corner.
+    pub box_max: [f64; 3],
+    /// Measured errors of this profile; in exact shards, of the residual code.
+    pub errors: ScoreErrors,
+    /// The encoder that defines the space of the centroids.
+    pub encoder_id: [u8; 32],
+}
+
+impl ShardHeader {
+    /// Returns whether positions are packed into 32 bits rather than stored as three u16.
+    pub(super) fn has_packed_positions(&self) -> bool {
+        self.position_bits[..3] != [16; 3]
+    }
+}

@@ -1,0 +1,56 @@
+//! Writes a shard.
+
+use std::io;
+
+use super::columns::ShardView;
+use super::format::{MAGIC, VERSION, section};
+use crate::container;
+use crate::objects::Objects;
+
+impl ShardView<'_> {
+    /// Writes the shard.
+    ///
+    /// # Errors
+    /// Those of the writer.
+    pub fn write(&self, out: impl io::Write) -> io::Result<()> {
+        self.write_with(out, None)
+    }
+
+    /// Writes the shard with the objects of its Gaussians.
+    ///
+    /// # Errors
+    /// Those of the writer.
+    pub fn write_with(&self, out: impl io::Write, objects: Option<&Objects<'_>>) -> io::Result<()> {
+        let mut sections = vec![
+            (section::HEADER, bytemuck::bytes_of(&self.header)),
+            (section::POSITIONS, self.positions.bytes()),
+            (section::CENTROID_STARTS, container::bytes_of(self.centroid_starts)),
+            (section::CENTROIDS, container::bytes_of(self.centroids)),
+            (section::RADII, container::bytes_of(self.radii)),
+        ];
+        if let Some(basis) = &self.basis {
+            sections.push((section::MEAN, container::bytes_of(basis.mean)));
+            sections.push((section::BASIS, container::bytes_of(basis.vectors)));
+            sections.push((section::BASIS_STEPS, container::bytes_of(basis.steps)));
+        }
+        if let Some(residuals) = &self.residuals {
+            sections.push((section::SUBSPACE_STARTS, container::bytes_of(residuals.subspace_starts)));
+            sections.push((section::CODEWORDS, container::bytes_of(residuals.codewords)));
+            sections.push((section::RESIDUAL_SCALES, container::bytes_of(residuals.residual_scales)));
+            sections.push((section::RESIDUAL_NORMS, container::bytes_of(residuals.residual_norms)));
+            sections.push((section::CODES, residuals.codes));
+        }
+        if let Some(exact) = &self.exact {
+            sections.push((section::INPUT_INDICES, container::bytes_of(exact.input_indices)));
+            sections.push((section::EMBEDDINGS, container::bytes_of(exact.embeddings)));
+            if let Some(fine) = &exact.fine {
+                sections.push((section::FINE_ERRORS, bytemuck::bytes_of(&fine.errors)));
+                sections.push((section::FINE_STEPS, container::bytes_of(fine.steps)));
+                sections.push((section::FINE_SCALES, container::bytes_of(fine.scales)));
+                sections.push((section::FINE, container::bytes_of(fine.values)));
+            }
+        }
+        sections.extend(objects.iter().flat_map(|objects| objects.sections()));
+        container::write(out, MAGIC, VERSION, &sections)
+    }
+}

@@ -1,0 +1,109 @@
+//! Errors of the splat readers, and the places they name.
+
+use std::error::Error;
+use std::fmt::{self, Display};
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// Why a splat file could not be read.
+#[derive(Debug, thiserror::Error)]
+pub enum SplatError {
+    /// A file cannot be opened, read or written.
+    #[error("{cause}; check the path and its permissions")]
+    Io {
+        /// The failed call, with the path. The message quotes it, so it is not a `source` as well.
+        cause: io::Error,
+    },
+    /// The content violates the format.
+    #[error("{}: {place}: expected {expected}, found {found}; {advice}", path.display())]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// The place in the file.
+        place: Place,
+        /// The content expected.
+        expected: String,
+        /// The content found.
+        found: String,
+        /// The remedy.
+        advice: &'static str,
+    },
+    /// Compressed content cannot be decompressed.
+    #[error("{}: {place}: {what} cannot be decompressed: {cause}; copy or export the file again", path.display())]
+    Undecodable {
+        /// The file.
+        path: PathBuf,
+        /// The place in the file.
+        place: Place,
+        /// The compressed part.
+        what: &'static str,
+        /// The decompressor's error. The message quotes it, so it is not a `source` as well.
+        cause: Box<dyn Error + Send + Sync>,
+    },
+    /// The format or feature is known but not supported.
+    #[error("{}: {format} is not supported; {advice}", path.display())]
+    Unsupported {
+        /// The file.
+        path: PathBuf,
+        /// The format or feature.
+        format: String,
+        /// The remedy.
+        advice: &'static str,
+    },
+}
+
+/// A place in a splat file.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Place {
+    /// An offset in the file, bytes.
+    Byte(u64),
+    /// An offset in the decompressed content, bytes.
+    DecompressedByte(u64),
+    /// A line, from 1.
+    Line(u64),
+    /// A file of a bundle or folder.
+    Part(String),
+}
+
+impl Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Byte(offset) => write!(f, "byte {offset}"),
+            Self::DecompressedByte(offset) => write!(f, "byte {offset} of the decompressed data"),
+            Self::Line(line) => write!(f, "line {line}"),
+            Self::Part(name) => write!(f, "{name}"),
+        }
+    }
+}
+
+/// Advice for content that contradicts the format.
+const COPY_AGAIN: &str = "the file is damaged or incomplete: copy or export it again";
+
+impl From<io::Error> for SplatError {
+    fn from(cause: io::Error) -> Self {
+        Self::Io { cause }
+    }
+}
+
+impl SplatError {
+    /// Returns a [`SplatError::Malformed`] with the advice to copy or export the file again.
+    pub(super) fn malformed(path: &Path, place: Place, expected: impl Display, found: impl Display) -> Self {
+        Self::Malformed {
+            path: path.into(),
+            place,
+            expected: expected.to_string(),
+            found: found.to_string(),
+            advice: COPY_AGAIN,
+        }
+    }
+
+    /// Returns a [`SplatError::Undecodable`].
+    pub(super) fn undecodable(
+        path: &Path,
+        place: Place,
+        what: &'static str,
+        cause: impl Into<Box<dyn Error + Send + Sync>>,
+    ) -> Self {
+        Self::Undecodable { path: path.into(), place, what, cause: cause.into() }
+    }
+}
