@@ -72,7 +72,7 @@ impl ObjectsLayout {
         if !steps.iter().all(|step| (0.0..=MAX_STEP).contains(step)) {
             return Err(damaged(
                 columns[2].start,
-                format!("a step of the objects is not within 0..={MAX_STEP}"),
+                format!("the steps of the objects are not all within 0..={MAX_STEP}"),
             ));
         }
         let ends: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[columns[3].clone()]);

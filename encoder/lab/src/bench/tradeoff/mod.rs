@@ -259,9 +259,8 @@ fn measure_group<'p>(
             query_ms: run.query_ms(&store, out, point.profile)?,
         };
         // The file last and at once: a point is measured as a whole or not.
-        let partial = path.with_extension("part");
-        fs_err::write(&partial, serde_json::to_vec_pretty(&figures).map_err(std::io::Error::from)?)?;
-        fs_err::rename(&partial, &path)?;
+        let text = serde_json::to_vec_pretty(&figures).map_err(std::io::Error::from)?;
+        slag_common::durable::write(&path, &text)?;
         done.push((*point, Some(figures)));
         progress.advance(1);
     }
