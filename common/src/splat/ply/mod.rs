@@ -23,7 +23,7 @@ use container::Ply;
 
 /// Reads a PLY file, plain or compressed.
 pub(super) fn read(input: Input, options: ReadOptions) -> Result<Gaussians, SplatError> {
-    let mut ply = Ply::open(input)?;
+    let ply = Ply::open(input)?;
     let Some(vertex) = ply.element("vertex") else {
         return Err(SplatError::Malformed {
             path: ply.input.path().into(),
