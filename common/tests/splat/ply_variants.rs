@@ -127,7 +127,7 @@ fn missing_properties_are_named() {
     let folder = tempfile::tempdir().expect("a folder");
     let error = read_bytes(folder.path(), "cloud.ply", text.as_bytes()).expect_err("is refused").to_string();
     assert!(error.contains("cloud.ply: line 7: expected a header with property \"rot_0\""), "{error}");
-    assert!(error.ends_with("pass the splat's PLY"), "{error}");
+    assert!(error.ends_with("give the PLY of the splat"), "{error}");
 }
 
 /// Returns a compressed PLY with `n_chunks` chunks without colour ranges (as in the first version) and five Gaussians with
