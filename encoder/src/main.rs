@@ -4,10 +4,13 @@ use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use clap::Parser;
-use slag_encoder::cli::{self, Cli};
+use slag_encoder::cli::{self, Cli, environment};
 
 fn main() -> ExitCode {
     let cli = Cli::parse();
+    if cli.uses_gpu() {
+        environment::silence_device_selection();
+    }
     tracing_subscriber::fmt()
         .with_writer(std::io::stderr)
         .with_env_filter(

@@ -1,16 +1,16 @@
-//! How long work tells how far it is; the library itself never prints.
+//! Progress of long work. The library itself never prints.
 
-/// Hears of the progress of one run. Stages follow one another.
+/// Receives the progress of one run. Stages follow one another.
 pub trait Progress: Sync {
-    /// A stage begins: `total` steps of `unit` lie ahead, `done` of them were done in an earlier run.
+    /// Begins a stage of `total` steps, each a `unit`; an earlier run has done `done` of them.
     fn begin(&self, stage: &str, unit: &str, total: u64, done: u64);
-    /// `n` more steps are done.
+    /// Counts `n` more steps as done.
     fn advance(&self, n: u64);
-    /// The stage is over.
+    /// Ends the stage.
     fn end(&self);
 }
 
-/// Hears nothing.
+/// Discards progress events.
 pub struct Silent;
 
 impl Progress for Silent {

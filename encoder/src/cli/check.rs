@@ -1,4 +1,4 @@
-//! `check`: do poses and scene fit?
+//! `check`: compares renderings of the scene with the photos.
 
 use std::path::PathBuf;
 
@@ -23,13 +23,13 @@ pub struct CheckArgs {
     /// Views to render, evenly spread.
     #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..))]
     pub samples: u32,
-    /// Where to render: auto, gpu, cpu, or an adapter's number.
+    /// Device to render on: auto, gpu, cpu, or the number of an adapter (`devices`).
     #[arg(long, value_name = "DEVICE", default_value_t)]
     pub device: DeviceChoice,
     /// Width to render at, pixels.
     #[arg(long, value_name = "PX", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(16..=8192))]
     pub raster_width: u32,
-    /// Writes photo and rendering side by side as PNG into this folder.
+    /// Folder for PNGs of each photo beside its rendering.
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
 }

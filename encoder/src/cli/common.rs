@@ -1,8 +1,8 @@
-//! What the commands share: flags of models and inputs, printing, interruption.
+//! Shared by the commands: flags of models and inputs, printing, interruption.
 
 use std::fmt::Display;
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -12,7 +12,7 @@ use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
 use serde::Serialize;
 use slag_common::shard::Profile;
-use slag_models::commands::{self, MODELS_HELP, RunArgs};
+use slag_models::commands::{self, RunArgs};
 use slag_models::session::SessionError;
 use slag_models::{ModelDir, SessionOptions, TextEncoder};
 use slag_service::stop::stop_signal;
@@ -23,10 +23,11 @@ use crate::store::StoreReader;
 /// Where models come from.
 #[derive(Clone, Debug, Args)]
 pub struct ModelArgs {
-    /// Folder or name of the models.
-    #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR", help = MODELS_HELP)]
+    /// Folder with model.toml, or name of a pulled model (`models list`). `colours` knows colours and shapes only, and
+    /// needs no ONNX Runtime [default: the embedded models; for queries, those that the store was encoded with].
+    #[arg(long, visible_alias = "encoder", value_name = "NAME|DIR")]
     pub models: Option<PathBuf>,
-    /// How they run.
+    /// How models run.
     #[command(flatten)]
     pub how: RunArgs,
 }
@@ -37,10 +38,10 @@ pub struct InputArgs {
     /// Splat: .ply, .spz, compressed .ply, .sog (file or folder) or .splat.
     #[arg(long, value_name = "FILE")]
     pub scene: PathBuf,
-    /// Poses: a COLMAP model's folder or a nerfstudio transforms.json.
+    /// Poses: the folder of a COLMAP model, or a nerfstudio transforms.json.
     #[arg(long, value_name = "PATH")]
     pub views: PathBuf,
-    /// Photos, where they are not beside the poses.
+    /// Folder of the photos, if they are not beside the poses.
     #[arg(long, value_name = "DIR")]
     pub images: Option<PathBuf>,
     /// Treats a missing or unreadable photo or mask as an error instead of leaving the view out.
@@ -90,39 +91,54 @@ pub fn cancel_flag() -> Result<Arc<AtomicBool>> {
         if seen.swap(true, Ordering::Relaxed) {
             std::process::exit(130);
         }
-        eprintln!("stopping after the views at hand; once more to stop at once");
+        eprintln!("stopping after the views in work; press ctrl-c again to stop at once");
     })
     .context("cannot listen for ctrl-c")?;
     Ok(flag)
 }
 
-/// Returns the time to sign: SOURCE_DATE_EPOCH if it is set, else now; seconds since 1970.
+/// Returns the time to sign, seconds since 1970: SOURCE_DATE_EPOCH if it is set, else the present.
 pub fn now_unix_secs() -> u64 {
-    // Reproducible builds of a store: the convention of reproducible-builds.org.
+    // The convention of reproducible-builds.org.
     let given = std::env::var("SOURCE_DATE_EPOCH").ok().and_then(|text| text.parse().ok());
     given.unwrap_or_else(|| SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs()))
 }
 
-/// Opens the models and says how they are run.
+/// Opens the models that the flags name, and returns how they are run.
 pub fn open_models(args: &ModelArgs) -> Result<(ModelDir, SessionOptions)> {
     let models = commands::open(args.models.as_deref(), &|name| std::env::var_os(name))?;
     Ok((models, session_options(&args.how)?))
 }
 
-/// Returns how models are run: with one thread, because views are encoded side by side.
+/// Returns the models of the flags as a later run in another folder finds them.
+pub fn lasting_name(models: &Path) -> PathBuf {
+    // A name of a pulled model is no path.
+    if models.is_dir() {
+        std::path::absolute(models).unwrap_or_else(|_| models.into())
+    } else {
+        models.into()
+    }
+}
+
+/// Returns how models run: with one thread each, because views are encoded in parallel.
 pub fn session_options(how: &RunArgs) -> Result<SessionOptions, SessionError> {
     how.session_options(&commands::runtime_folders(&std::env::current_exe().unwrap_or_default()), 1)
 }
 
-/// Opens the text encoder that a store was encoded with.
+/// Opens the text encoder that a store was encoded with: that of --models, else the one that the store remembers.
 pub fn text_encoder_of(reader: &StoreReader, args: &ModelArgs) -> Result<Box<dyn TextEncoder>> {
     let expected = &reader.manifest().encoder;
-    let (models, session) = open_models(args)?;
+    let remembered = reader.models()?.and_then(|record| record.models);
+    let args = ModelArgs { models: args.models.clone().or(remembered), how: args.how.clone() };
+    let (models, session) = open_models(&args).with_context(|| {
+        format!("the store was encoded with {:?}; name these models with --models", expected.name)
+    })?;
     if slag_common::Hash32(models.encoder_id().hash()) != expected.id {
         return Err(anyhow!(
-            "the store was encoded with {:?} ({}), the models at hand are {}; give the same with --models",
+            "the store was encoded with {:?} ({}), but {} is {}; name the store's models with --models",
             expected.name,
             expected.id,
+            args.models.map_or("the embedded model".into(), |models| models.display().to_string()),
             models.encoder_id()
         ));
     }
@@ -142,7 +158,7 @@ pub async fn stopped() {
     }
 }
 
-/// Starts the runtime of the services.
+/// Starts the threads of the services.
 ///
 /// # Errors
 /// If its threads cannot be started.
@@ -163,9 +179,10 @@ pub fn parse_bytes(text: &str) -> Result<u64, String> {
         "GiB" => 1 << 30,
         unit => return Err(format!("unit {unit:?}: expected none, KiB, MiB or GiB")),
     };
-    let number: u64 = digits.parse().map_err(|_| format!("{text:?} is no number of bytes, as 512MiB is"))?;
+    let number: u64 =
+        digits.parse().map_err(|_| format!("{text:?} is no number of bytes; expected for example 512MiB"))?;
     let bytes = number.checked_mul(factor).ok_or_else(|| format!("{text:?} is too large"))?;
-    if bytes < 64 << 20 { Err(format!("{text:?} is below the least, 64MiB")) } else { Ok(bytes) }
+    if bytes < 64 << 20 { Err(format!("{text:?} is too little; expected at least 64MiB")) } else { Ok(bytes) }
 }
 
 /// Returns the parser of profiles, whose names the help text lists.
@@ -177,7 +194,7 @@ pub fn profile_parser() -> impl TypedValueParser<Value = Profile> {
 pub fn parse_error(text: &str) -> Result<f32, String> {
     match text.parse::<f32>() {
         Ok(error) if error >= 0.0 && error.is_finite() => Ok(error),
-        _ => Err("a share of the spread of scores, such as 0.1".into()),
+        _ => Err("expected a share of the spread of scores, for example 0.1".into()),
     }
 }
 

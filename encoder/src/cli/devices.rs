@@ -18,7 +18,7 @@ pub(super) fn run(json: bool) -> Result<Exit> {
         );
     }
     if reports.is_empty() {
-        lines += "no GPU; the CPU does the work\n";
+        lines += "no GPU: the CPU rasterises\n";
     }
     print(json, &json!({ "adapters": reports }), lines)?;
     Ok(Exit::Done)

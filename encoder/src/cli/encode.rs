@@ -8,8 +8,8 @@ use slag_common::shard::Profile;
 
 use super::Exit;
 use super::common::{
-    BackgroundArg, InputArgs, ModelArgs, available_threads, cancel_flag, now_unix_secs, open_models,
-    parse_bytes, parse_error, print, profile_parser,
+    BackgroundArg, InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs,
+    open_models, parse_bytes, parse_error, print, profile_parser,
 };
 use super::refine::RefineArgs;
 use super::sam::SamArgs;
@@ -40,29 +40,29 @@ pub struct EncodeArgs {
     /// Store to publish into; made if absent.
     #[arg(long, value_name = "DIR")]
     pub store: PathBuf,
-    /// `auto` for a segmenter (the embedded one, or --segmenter), `graph` for the one that needs no ONNX Runtime, or a
-    /// folder of masks: id PNGs or COCO RLE JSON.
+    /// Where masks come from: `auto` for a model (the embedded one, or --segmenter), `graph` for the segmenter without
+    /// a model, which needs no ONNX Runtime, or your own masks: a folder of id PNGs or RLE JSON, or a COCO file.
     #[arg(long, value_name = "auto|graph|DIR", default_value = "auto")]
     pub masks: String,
-    /// The segmenter, where it is not the built-in one.
+    /// Segment Anything instead of the built-in segmenter.
     #[command(flatten)]
     pub sam: SamArgs,
-    /// Ids of mask PNGs that are no mask, beside 0.
+    /// Ids in mask PNGs that are no masks; 0 never is one.
     #[arg(long, value_name = "ID", value_delimiter = ',')]
     pub ignore_mask_ids: Vec<u32>,
-    /// Bundle of the method's choices; flags change single ones.
+    /// Bundle of choices; other flags override single choices.
     #[arg(long, value_enum, default_value = "balanced")]
     pub preset: Preset,
-    /// How sums become embeddings, where not as the preset says.
+    /// How contributions become embeddings.
     #[command(flatten)]
     pub refine: RefineArgs,
-    /// What fills a crop outside its mask; the preset's if absent.
+    /// What fills a crop outside its mask [default: the preset's].
     #[arg(long, value_enum)]
     pub background: Option<BackgroundArg>,
-    /// Weight that is summed; the preset's if absent. `falloff` is the paper's formula as printed.
+    /// Weight that is summed; `falloff` is the paper's formula as printed [default: the preset's].
     #[arg(long, value_enum)]
     pub weights: Option<WeightsArg>,
-    /// Views to use at most, or which part of them: the first ones of --view-order [default: the preset's].
+    /// Number or share of the views to use: the first ones of --view-order [default: the preset's].
     #[arg(long, value_name = "N|P%", value_parser = parse_views_limit)]
     pub views_limit: Option<ViewsLimit>,
     /// Which views come first, and how long to go on.
@@ -71,54 +71,55 @@ pub struct EncodeArgs {
     /// Where weights are rasterised: auto (GPUs, else the CPU), gpu, cpu, or an adapter's number.
     #[arg(long, value_name = "DEVICE", default_value_t)]
     pub device: DeviceChoice,
-    /// Width at which weights are rasterised: pixels; `photo` for the photo's own, at most 1024; `auto` for twice as much
-    /// in views whose masks have long borders [default: the preset's].
+    /// Width at which weights are rasterised: a number of pixels, `photo` for the photo's own width, at most 1024, or
+    /// `auto` for twice that width in views with long borders of masks [default: the preset's].
     #[arg(long, value_name = "auto|photo|PX", value_parser = parse_raster_width)]
     pub raster_width: Option<RasterWidth>,
     /// Masks with fewer pixels are left out [default: the preset's].
     #[arg(long, value_name = "PX")]
     pub min_mask_px: Option<u32>,
-    /// Threads; all cores if absent.
+    /// Threads [default: all cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
-    /// Working memory for sums and region vectors: a number with KiB, MiB or GiB.
+    /// Working memory beside the scene and the photos in work: a number with KiB, MiB or GiB.
     #[arg(long, value_name = "BYTES", default_value = "2GiB", value_parser = parse_bytes)]
     pub memory: u64,
-    /// Name of the scene; the store's folder name if absent.
+    /// Name of the scene [default: the name of the store's folder].
     #[arg(long, value_name = "NAME")]
     pub name: Option<String>,
-    /// Says that world units are metres (a geo-reference says so too).
+    /// World units are metres; a geo-reference implies it.
     #[arg(long)]
     pub metric: bool,
-    /// Geo-reference JSON: {"origin": {"lat", "lon", "alt"}} of the world's east-north-up frame.
+    /// Geo-reference JSON, {"origin": {"lat", "lon", "alt"}}, of the world's east-north-up frame [default: geo.json
+    /// beside the scene, if it exists].
     #[arg(long, value_name = "FILE")]
     pub geo: Option<PathBuf>,
-    /// Gaussians a cell at most.
+    /// Most Gaussians in a cell.
     #[arg(long, value_name = "N", default_value_t = 65_536, value_parser = clap::value_parser!(u32).range(1..=65_536))]
     pub cell_gaussians: u32,
-    /// Width of a cell at most, metres, in metric scenes.
+    /// Largest width of a cell, metres, in metric scenes.
     #[arg(long, value_name = "M", default_value_t = 25.0)]
     pub cell_width_m: f64,
-    /// Which shards to make.
+    /// Shards to make.
     #[arg(long, value_name = "NAMES", value_delimiter = ',', num_args = 1.., default_values_t = Profile::ALL, value_parser = profile_parser())]
     pub profiles: Vec<Profile>,
-    /// Error of scores that the compact profile may have: mean, relative to the spread of scores [default: the preset's].
+    /// Mean error of scores that the compact profile may have, relative to the spread of scores [default: the preset's].
     #[arg(long, value_name = "E", value_parser = parse_error)]
     pub compact_error: Option<f32>,
     /// The same for the balanced profile.
     #[arg(long, value_name = "E", value_parser = parse_error)]
     pub balanced_error: Option<f32>,
-    /// Error of positions, world units [default: 0.01 in metric scenes, else a quarter of the size of a
+    /// Largest error of positions, world units [default: 0.01 in metric scenes, else a quarter of the size of a
     /// cell's small Gaussians].
     #[arg(long, value_name = "E")]
     pub position_error: Option<f64>,
-    /// Objects.
+    /// Search for objects.
     #[command(flatten)]
     pub objects: ObjectArgs,
-    /// Days after which robots refuse the manifest; never if absent.
+    /// Days after which robots refuse the manifest [default: never].
     #[arg(long, value_name = "DAYS")]
     pub expires_days: Option<u32>,
-    /// Drops an unfinished encode of other inputs or settings.
+    /// Drops an unfinished encode of other inputs or settings in the store.
     #[arg(long)]
     pub restart: bool,
 }
@@ -141,19 +142,19 @@ impl From<WeightsArg> for WeightKind {
     }
 }
 
-/// Whether objects are found.
+/// The search for objects.
 #[derive(Debug, Args)]
 pub struct ObjectArgs {
-    /// Does not look for objects: masks of different views that show the same Gaussians.
+    /// Skips the search for objects: masks of different views that show the same Gaussians.
     #[arg(long)]
     pub no_objects: bool,
 }
 
-/// Returns the settings that the flags stand for.
+/// Returns the settings of the flags.
 fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
     let preset = args.preset.choices();
     let views_limit = args.views_limit.unwrap_or(preset.views_limit);
-    // A geo-reference that lies beside the scene belongs to it.
+    // A geo-reference beside the scene belongs to it.
     let beside = args.input.scene.with_file_name("geo.json");
     let geo = args.geo.clone().or_else(|| beside.is_file().then_some(beside));
     let metric = args.metric || geo.is_some();
@@ -165,7 +166,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             masks.unwrap_or(Masks::Auto { n_levels: args.views.mask_levels.unwrap_or(preset.mask_levels) })
         }
         (dir, Some(_)) => {
-            return Err(anyhow!("--masks {dir} gives masks, --segmenter finds some; choose one"));
+            return Err(anyhow!("--masks {dir} and --segmenter exclude each other; give one of them"));
         }
         (dir, None) => Masks::Given { dir: dir.into(), ignore_ids: args.ignore_mask_ids.clone() },
     };
@@ -198,6 +199,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             scene_name: args.name.clone().or(folder_name).unwrap_or_else(|| "scene".into()),
             created_unix_secs,
             expires_unix_secs: args.expires_days.map(|days| created_unix_secs + u64::from(days) * 86_400),
+            models: args.models.models.as_deref().map(lasting_name),
         },
         run: RunSettings {
             threads: args.threads.map_or_else(available_threads, |n| n as usize),
@@ -268,8 +270,8 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
         "published  generation {} in {}\n\
          Gaussians  {} ({} without evidence, {} unusable)\n\
          views      {} of {} ({} resumed, {} without masks)\n{coverage}{skipped}{images_on}\
-         masks      {} in {} regions, {} sums\n\
-         cells      {} with {} codebook rows\n\
+         masks      {} in {} regions, {} contributions\n\
+         cells      {} with {} centroids\n\
          {objects}shards     {sizes}\n{most}\
          seconds    {:.1}; by stage, all threads: {busy}\n\
          views took {:.1} s\n  stage    at once   seconds    busy\n{of_views}",
@@ -294,7 +296,7 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     Ok(if summary.skipped_views.is_empty() { Exit::Done } else { Exit::Partly })
 }
 
-/// Returns the line that names the view and the cell on which most was spent.
+/// Returns the line that names the most expensive view and cell.
 fn most_spent(summary: &EncodeSummary) -> String {
     let (views, cells) = (&summary.views, &summary.cells);
     let most = (0..views.view.len()).max_by(|a, b| views.secs[*a].total_cmp(&views.secs[*b]));
@@ -304,7 +306,7 @@ fn most_spent(summary: &EncodeSummary) -> String {
     let ViewsReport { view, raster_width_px, n_masks, n_regions, n_entries, secs } = views;
     let CellReport { cell_id, n_gaussians, n_centroids, .. } = cell;
     format!(
-        "most on    view {}, {:.1} s ({} masks, {} regions, {} sums, {} px wide); cell {cell_id}, {n_centroids} rows \
+        "most on    view {}, {:.1} s ({} masks, {} regions, {} contributions, {} px wide); cell {cell_id}, {n_centroids} centroids \
          ({n_gaussians} Gaussians)\n",
         view[at], secs[at], n_masks[at], n_regions[at], n_entries[at], raster_width_px[at]
     )

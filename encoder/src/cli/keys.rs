@@ -1,4 +1,4 @@
-//! `keys`.
+//! `keys`: the key that a store signs with.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -14,25 +14,25 @@ use crate::store::{Store, StoreError};
 /// `keys`.
 #[derive(Debug, Subcommand)]
 pub enum KeysCommand {
-    /// Shows the public keys: what `slag-edge fetch --key` takes.
+    /// Shows the public keys, for `slag-edge fetch --key`.
     Show(KeysArgs),
-    /// Makes the first key of a store, before anything is encoded into it.
+    /// Makes the first key of a store, before the first encode.
     Generate(KeysArgs),
-    /// Names a successor of the key, and later, with --finish, puts it in place.
+    /// Announces a new key and later, with --finish, switches to it.
     ///
-    /// Robots that fetch between the two steps follow by themselves; those that did not must be told the
-    /// new key (`slag-edge fetch --key`). From the second step on the old key is refused.
+    /// Robots that fetch between the two steps trust the new key by themselves; the others must be given it
+    /// (`slag-edge fetch --key`). After the second step robots refuse the old key.
     Rotate {
-        /// Where.
+        /// The store.
         #[command(flatten)]
         at: KeysArgs,
-        /// The second step: the successor signs from now on.
+        /// The second step: the new key signs from now on.
         #[arg(long)]
         finish: bool,
     },
 }
 
-/// Which store's keys.
+/// The store whose keys are meant.
 #[derive(Debug, Args)]
 pub struct KeysArgs {
     /// Store.
@@ -51,7 +51,7 @@ pub(super) fn run(command: &KeysCommand, json: bool) -> Result<Exit> {
             PublicKeys::read(&at.store)?
         }
         KeysCommand::Rotate { at, finish } => {
-            // A typing error must not make a store.
+            // A mistyped path must not create a store.
             PublicKeys::read(&at.store)?;
             let mut store = Store::create_or_open(&at.store)?;
             match finish {

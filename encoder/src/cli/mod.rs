@@ -4,6 +4,7 @@ mod check;
 pub mod common;
 mod devices;
 mod encode;
+pub mod environment;
 mod keys;
 mod models;
 pub mod progress;
@@ -25,6 +26,7 @@ use slag_models::commands::ModelsCommand;
 use crate::encode::EncodeError;
 #[cfg(feature = "qdrant")]
 use crate::publish::qdrant;
+use crate::raster::devices::DeviceChoice;
 #[cfg(feature = "qdrant")]
 use push::PushCommand;
 
@@ -38,7 +40,7 @@ pub struct Cli {
     /// Prints the result, or the error, as one JSON object.
     #[arg(long, global = true)]
     pub json: bool,
-    /// What to do.
+    /// The command.
     #[command(subcommand)]
     pub command: Command,
 }
@@ -49,16 +51,27 @@ impl Cli {
         if self.quiet { "warn" } else { "info" }
     }
 
+    /// Returns whether the command looks for GPUs.
+    pub fn uses_gpu(&self) -> bool {
+        cfg!(feature = "gpu")
+            && match &self.command {
+                Command::Check(args) => args.device != DeviceChoice::Cpu,
+                Command::Encode(args) => args.device != DeviceChoice::Cpu,
+                Command::Devices => true,
+                _ => false,
+            }
+    }
+
     /// Returns whether progress may be shown.
     pub fn shows_progress(&self) -> bool {
         !self.quiet && !self.json
     }
 }
 
-/// What the program can do.
+/// The commands.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Renders the scene at sample views and compares it with the photos: do poses and scene fit?
+    /// Compares renderings of the scene with the photos: do poses and scene fit?
     Check(check::CheckArgs),
     /// Encodes a scene into a store.
     Encode(Box<encode::EncodeArgs>),
@@ -66,13 +79,13 @@ pub enum Command {
     Query(query::QueryArgs),
     /// Serves a store's manifest and shards over HTTP.
     Serve(serve::ServeArgs),
-    /// Shows, makes and changes the key that a store signs with.
+    /// Shows, makes and rotates the key that a store signs with.
     #[command(subcommand)]
     Keys(keys::KeysCommand),
-    /// Public models: what is known, pulling, checking, showing.
+    /// Lists, pulls, checks and shows public models.
     #[command(subcommand)]
     Models(ModelsCommand),
-    /// Pushes a store elsewhere.
+    /// Copies a store into a vector database.
     #[cfg(feature = "qdrant")]
     #[command(subcommand)]
     Push(push::PushCommand),
@@ -121,7 +134,7 @@ pub fn exit_of(result: Result<Exit>, json: bool) -> Exit {
     }
 }
 
-/// A reader that went away (`| head`) is no failure.
+/// Returns whether the reader of stdout is gone (`| head`), which is no failure.
 fn is_broken_pipe(error: &anyhow::Error) -> bool {
     error
         .chain()
@@ -136,7 +149,7 @@ pub enum Exit {
     Done,
     /// Failed; the message says why.
     Failed,
-    /// Done, but some inputs were left out; the summary names them.
+    /// Done without some inputs; the summary names them.
     Partly,
     /// Interrupted by the user; the same command resumes.
     Interrupted,

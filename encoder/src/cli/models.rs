@@ -1,4 +1,4 @@
-//! `models`: public models.
+//! `models`: lists, pulls and checks public models.
 
 use anyhow::Result;
 use slag_models::ModelDir;

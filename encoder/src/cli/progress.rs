@@ -11,7 +11,7 @@ use crate::progress::{Progress, Silent};
 /// Time between two plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(10);
 
-/// Returns what shows progress on stderr, or discards it.
+/// Returns a receiver that shows progress on stderr, or one that discards it.
 pub fn shown(is_shown: bool) -> Box<dyn Progress> {
     if is_shown { Box::new(Shown::new()) } else { Box::new(Silent) }
 }
@@ -34,7 +34,7 @@ struct State {
 }
 
 impl Shown {
-    /// Bars if stderr is a terminal.
+    /// Returns a receiver that draws bars if stderr is a terminal, else writes lines.
     pub fn new() -> Self {
         Self { terminal: std::io::stderr().is_terminal(), state: Mutex::default() }
     }

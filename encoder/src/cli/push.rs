@@ -1,4 +1,4 @@
-//! `push`: a store into a vector database.
+//! `push`: copies a store into a vector database.
 
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
@@ -29,13 +29,13 @@ pub struct QdrantArgs {
     /// Qdrant's gRPC address.
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:6334")]
     pub url: String,
-    /// Collection; made if absent.
+    /// Collection; created if it does not exist.
     #[arg(long, value_name = "NAME")]
     pub collection: String,
     /// API key.
     #[arg(long, value_name = "KEY", env = "QDRANT_API_KEY", hide_env_values = true)]
     pub api_key: Option<String>,
-    /// Points a request.
+    /// Points per request.
     #[arg(long, value_name = "N", default_value = "256")]
     pub batch: NonZeroUsize,
 }
@@ -46,7 +46,7 @@ pub(super) fn run(args: &QdrantArgs, progress: &dyn Progress, json: bool) -> Res
         n_points_per_batch: args.batch,
         ..qdrant::PushOptions::new(&args.url, &args.collection)
     };
-    // The writer's lock: the state of the push is kept in the store.
+    // A push keeps its state in the store, so it takes the writer's lock.
     let store = Store::create_or_open(&args.store)?;
     let reader = store.reader()?;
     let vectors = Arc::new(qdrant::ExactShards::new(reader.clone()));

@@ -19,18 +19,18 @@ pub struct QueryArgs {
     /// Store.
     #[arg(long, value_name = "DIR")]
     pub store: PathBuf,
-    /// Models; the same that the store was encoded with.
+    /// Models; they must be those that the store was encoded with.
     #[command(flatten)]
     pub models: ModelArgs,
-    /// What to look for.
+    /// Text to look for.
     pub text: String,
     /// Gaussians to print, best first.
     #[arg(long, default_value_t = 10)]
     pub limit: u32,
-    /// Score as a robot with shards of this profile does [default: the field in full precision].
+    /// Scores as a robot with shards of this profile does [default: the field in full precision].
     #[arg(long, value_name = "NAME", value_parser = profile_parser())]
     pub profile: Option<Profile>,
-    /// Scores coarse and fine masks apart and takes the best, instead of their mean.
+    /// Scores coarse and fine masks separately and takes the best score, instead of their mean.
     #[arg(long, conflicts_with = "profile")]
     pub by_mask_level: bool,
     /// Writes every Gaussian's score, in the input's order, as a NumPy array (NaN: no evidence).

@@ -8,28 +8,28 @@ use super::common::available_threads;
 use crate::encode::Masks;
 use crate::segment::SamSettings;
 
-/// Masks from Segment Anything; without `--segmenter` the others say nothing.
+/// Masks from Segment Anything; the other flags need `--segmenter`.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Segment Anything")]
 pub struct SamArgs {
-    /// Model directory (with model.toml) of SAM, MobileSAM or another of its kind, which finds the masks.
+    /// Model directory (with model.toml) of SAM, MobileSAM or another model of that kind.
     #[arg(long, value_name = "DIR")]
     segmenter: Option<PathBuf>,
-    /// Points along each side of the grid that masks are asked for at: 8, 16, 32, 64.
+    /// Points along each side of the grid of prompts: 8, 16, 32, 64.
     #[arg(long, value_name = "N", default_value_t = SamSettings::default().points_per_side,
         value_parser = clap::value_parser!(u32).range(1..=256))]
     points_per_side: u32,
-    /// Points that the model takes at once: more are faster on GPUs and take more memory.
+    /// Points per run of the model: more are faster on GPUs and take more memory.
     #[arg(long, value_name = "N", default_value_t = SamSettings::default().points_per_batch,
         value_parser = clap::value_parser!(u32).range(1..=1024))]
     sam_points_per_batch: u32,
-    /// IoU that the model must predict for a mask, 0 to 1.
+    /// Least IoU that the model predicts for a mask, 0 to 1.
     #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().predicted_iou, value_parser = parse_f32_ratio)]
     sam_predicted_iou: f32,
-    /// IoU that a mask must have with itself under higher and lower thresholds, 0 to 1.
+    /// Least IoU of a mask with itself under a higher and a lower threshold, 0 to 1.
     #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().stability, value_parser = parse_ratio)]
     sam_stability: f64,
-    /// How far those thresholds lie from 0, logits.
+    /// Distance of those thresholds from 0, logits.
     #[arg(long, value_name = "LOGITS", default_value_t = SamSettings::default().stability_offset, value_parser = parse_offset)]
     sam_stability_offset: f32,
     /// IoU of boxes from which two masks are the same.
@@ -38,7 +38,7 @@ pub struct SamArgs {
     /// IoU of pixels from which two masks are the same; 1 compares boxes only.
     #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().mask_nms_iou, value_parser = parse_ratio)]
     sam_mask_nms: f64,
-    /// Layers of crops, which find small things: layer i segments 4^i crops of the image beside the whole.
+    /// Layers of crops, to find small things: layer i segments 4^i crops besides the whole image.
     #[arg(long, value_name = "N", default_value_t = SamSettings::default().crop_layers,
         value_parser = clap::value_parser!(u32).range(0..=4))]
     sam_crop_layers: u32,
@@ -48,20 +48,20 @@ pub struct SamArgs {
     /// Overlap of neighbouring crops, relative to the image's shorter edge.
     #[arg(long, value_name = "RATIO", default_value_t = SamSettings::default().crop_overlap, value_parser = parse_ratio)]
     sam_crop_overlap: f64,
-    /// Divides the points along a side from layer to layer of crops.
+    /// Divisor of the points along a side from one layer of crops to the next.
     #[arg(long, value_name = "N", default_value_t = SamSettings::default().crop_points_divisor,
         value_parser = clap::value_parser!(u32).range(1..=16))]
     sam_crop_points_divisor: u32,
-    /// Holes and islands of masks with fewer pixels are healed.
+    /// Fills holes and drops islands of masks with fewer pixels.
     #[arg(long, value_name = "PX", default_value_t = SamSettings::default().min_region_px)]
     sam_min_region_px: u32,
-    /// Threads within the model [default: all cores]. Masks may depend on it in the last bits.
+    /// Threads within the model; masks may depend on their number in the last bits [default: all cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     sam_threads: Option<u32>,
 }
 
 impl SamArgs {
-    /// Returns where masks come from, if it is Segment Anything.
+    /// Returns Segment Anything as the source of masks, if --segmenter names it.
     pub(super) fn masks(&self) -> Option<Masks> {
         let settings = SamSettings {
             points_per_side: self.points_per_side,

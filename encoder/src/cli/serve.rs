@@ -1,4 +1,4 @@
-//! `serve`: a store over HTTP.
+//! `serve`: publishes a store over HTTP.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -16,7 +16,7 @@ pub struct ServeArgs {
     /// Store.
     #[arg(long, value_name = "DIR")]
     pub store: PathBuf,
-    /// Address to listen on; other machines reach it only if this says so.
+    /// Address to listen on; 0.0.0.0:7733 lets other machines connect.
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:7733")]
     pub listen: SocketAddr,
 }

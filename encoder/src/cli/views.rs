@@ -1,4 +1,4 @@
-//! The flags that choose among views, and how many masks they get.
+//! The flags that choose views and the number of their masks.
 
 use std::time::Duration;
 
@@ -6,24 +6,24 @@ use clap::{Args, ValueEnum};
 
 use crate::encode::{RasterWidth, ViewOrder, ViewsLimit};
 
-/// Which views come first, and how long to go on. Sums of views are kept until all are used, so an encode with a
-/// higher limit or more time goes on from there.
+/// The order of views and the time for them. Contributions are kept until all views are used, so an encode with a
+/// higher limit or more time continues from there.
 #[derive(Debug, Args)]
 pub struct ViewsArgs {
     /// Order in which views are taken [default: coverage with a limit or a budget, else names].
     #[arg(long, value_enum, value_name = "ORDER")]
     view_order: Option<ViewOrderArg>,
-    /// Seconds after which no further view is begun; what is there then is published.
+    /// Seconds after which no further view is begun; the finished views are published.
     #[arg(long, value_name = "SECS", value_parser = parse_secs)]
     pub time_budget: Option<Duration>,
-    /// Scales at which the built-in segmenter looks, coarsest first [default: the preset's].
+    /// Number of scales at which the built-in segmenter looks, coarsest first [default: the preset's].
     #[arg(long, value_name = "N", value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=4))]
     pub mask_levels: Option<usize>,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum ViewOrderArg {
-    /// Those first that together show most of the scene, found by a small raster of all views.
+    /// Those first that together show most of the scene, by a small raster of all views.
     Coverage,
     /// By their names.
     Names,
@@ -32,7 +32,7 @@ enum ViewOrderArg {
 }
 
 impl ViewsArgs {
-    /// Returns the order that the flags stand for.
+    /// Returns the order of the flags.
     pub(super) fn order(&self, views_limit: ViewsLimit) -> ViewOrder {
         match self.view_order {
             Some(ViewOrderArg::Coverage) => ViewOrder::Coverage,
@@ -44,7 +44,7 @@ impl ViewsArgs {
     }
 }
 
-/// Parses how wide rasters are.
+/// Parses the width of rasters.
 pub(super) fn parse_raster_width(text: &str) -> Result<RasterWidth, String> {
     match text {
         "auto" => Ok(RasterWidth::ByContent),
@@ -53,12 +53,12 @@ pub(super) fn parse_raster_width(text: &str) -> Result<RasterWidth, String> {
             let width_px = text.parse().ok().filter(|px| (16..=8192).contains(px));
             width_px
                 .map(RasterWidth::Px)
-                .ok_or_else(|| format!("{text:?} is none of auto, photo, and 16 to 8192 pixels"))
+                .ok_or_else(|| format!("{text:?} is none of: auto, photo, 16 to 8192 pixels"))
         }
     }
 }
 
-/// Parses a number of views, or a part of them in per cent.
+/// Parses a number of views, or a share of them in per cent.
 pub(super) fn parse_views_limit(text: &str) -> Result<ViewsLimit, String> {
     let limit = match text.strip_suffix('%') {
         Some(percent) => percent.parse().ok().map(|p: f64| ViewsLimit::Share(p / 100.0)),
@@ -71,12 +71,13 @@ pub(super) fn parse_views_limit(text: &str) -> Result<ViewsLimit, String> {
     };
     limit
         .filter(is_some)
-        .ok_or_else(|| format!("{text:?} is neither a number of views nor a part, 1% to 100%"))
+        .ok_or_else(|| format!("{text:?} is neither a number of views nor a share, 1% to 100%"))
 }
 
 fn parse_secs(text: &str) -> Result<Duration, String> {
     let secs = text.parse().ok().filter(|secs: &f64| *secs > 0.0);
-    secs.and_then(|secs| Duration::try_from_secs_f64(secs).ok()).ok_or_else(|| "seconds above 0".into())
+    secs.and_then(|secs| Duration::try_from_secs_f64(secs).ok())
+        .ok_or_else(|| "expected seconds above 0".into())
 }
 
 #[cfg(test)]

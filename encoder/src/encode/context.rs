@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use rayon::ThreadPool;
 
-use super::EncodeError;
+use super::error::EncodeError;
 use crate::progress::Progress;
 
 /// Stack of a worker thread: while it waits for others' part of its work, a worker may take up another view.

@@ -141,9 +141,21 @@ impl EncodeError {
     /// Returns whether the error lies in one view's input, so that the other views may go on.
     pub(super) fn is_of_one_view(&self) -> bool {
         match self {
-            Self::Ingest(_) => true,
+            Self::Ingest(_) | Self::Contributions(ContributionError::TooManyRegions { .. }) => true,
             Self::Segment(error) => !matches!(error, SegmentError::Model(_)),
             _ => false,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// One view with too many masks must not end the encode of all others, at every resume.
+    #[test]
+    fn too_many_regions_are_one_views_fault() {
+        let error = ContributionError::TooManyRegions { path: PathBuf::new(), found: usize::MAX };
+        assert!(EncodeError::from(error).is_of_one_view());
     }
 }

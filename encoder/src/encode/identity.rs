@@ -9,6 +9,7 @@ use super::error::EncodeError;
 use super::plan::Inputs;
 use super::settings::{EncodeSettings, LONG_BORDERS, MAX_RASTER_WIDTH_PX, ViewSettings};
 use crate::cells::CellLimits;
+use crate::ingest;
 use crate::segment::Segmenter;
 
 /// Version of the steps from masks to contributions; another number is another encode.
@@ -89,8 +90,113 @@ fn hash_scene(scene: &Gaussians) -> Hash32 {
 fn identity_of_view(view: &View) -> ViewIdentity<'_> {
     ViewIdentity {
         name: &view.name,
-        photo: fs_err::metadata(&view.image_path).ok().map(|m| Hash32::of(&m.len().to_le_bytes())),
+        photo: ingest::hash_file(&view.image_path).ok(),
         intrinsics: view.intrinsics,
         camera_from_world: view.camera_from_world,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::{Path, PathBuf};
+
+    use slag_common::Distortion;
+    use slag_models::{ModelDir, Provider, SessionOptions};
+
+    use super::*;
+    use crate::cells::CellSplit;
+    use crate::encode::Masks;
+    use crate::raster::CpuRasterizer;
+    use crate::segment::{GivenMasks, GraphSegmenter};
+
+    fn inputs(photo: &Path) -> Inputs {
+        let intrinsics = Intrinsics {
+            width_px: 8,
+            height_px: 8,
+            focal_x_px: 8.0,
+            focal_y_px: 8.0,
+            centre_x_px: 4.0,
+            centre_y_px: 4.0,
+            distortion: Distortion::None,
+        };
+        let view = View {
+            name: "a.png".into(),
+            image_path: photo.to_owned(),
+            intrinsics,
+            camera_from_world: glam::DAffine3::IDENTITY,
+        };
+        Inputs {
+            scene: Gaussians::default(),
+            split: CellSplit {
+                cells: Vec::new(),
+                cell_of_gaussian: Vec::new(),
+                local_of_gaussian: Vec::new(),
+                n_rejected: 0,
+            },
+            views: vec![view],
+            missing: Vec::new(),
+            geo_reference: None,
+        }
+    }
+
+    fn identity_with(
+        change: impl FnOnce(&mut EncodeSettings, &mut SessionOptions),
+        segmenter: &dyn Segmenter,
+        photo: &Path,
+    ) -> Hash32 {
+        let mut settings = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
+        settings.view.masks = Masks::Graph;
+        let mut session = SessionOptions::new(PathBuf::new());
+        change(&mut settings, &mut session);
+        let models = ModelDir::colours();
+        let engines = Engines::new(&models, &session, &CpuRasterizer);
+        identity(&settings, &engines, segmenter, &inputs(photo)).expect("an identity")
+    }
+
+    /// Files count by content, where path and length are the same; so do masks in a single COCO file.
+    #[test]
+    fn photos_and_masks_count_by_content() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let photo = dir.path().join("a.png");
+        let (graph, mut found) = (GraphSegmenter::default(), Vec::new());
+        for content in ["one", "two", "one"] {
+            fs_err::write(&photo, content).expect("writes");
+            found.push(identity_with(|_, _| {}, &graph, &photo));
+        }
+        assert!(found[0] == found[2] && found[0] != found[1], "photos");
+
+        let (file, folder) = (dir.path().join("masks.json"), dir.path().join("masks"));
+        fs_err::create_dir_all(folder.join("left")).expect("makes");
+        for (path, given) in [(&file, &file), (&folder.join("left/a.json"), &folder)] {
+            found.clear();
+            for counts in ["[4,60]", "[5,59]", "[4,60]"] {
+                let annotation =
+                    format!(r#"{{"image_id": 1, "segmentation": {{"size": [8, 8], "counts": {counts}}}}}"#);
+                let images = r#"[{"id": 1, "file_name": "a.png"}]"#;
+                let text = format!(r#"{{"images": {images}, "annotations": [{annotation}]}}"#);
+                fs_err::write(path, text).expect("writes");
+                let masks = GivenMasks::open(given, Vec::new()).expect("opens");
+                found.push(identity_with(|_, _| {}, &masks, &photo));
+            }
+            assert!(found[0] == found[2] && found[0] != found[1], "{}", given.display());
+        }
+    }
+
+    #[test]
+    fn the_execution_provider_and_every_view_setting_count() {
+        let (graph, photo) = (GraphSegmenter::default(), Path::new("absent.png"));
+        let with = |change: &dyn Fn(&mut EncodeSettings, &mut SessionOptions)| {
+            identity_with(|settings, session| change(settings, session), &graph, photo)
+        };
+        let plain = with(&|_, _| {});
+        let changed = [
+            with(&|_, session| session.providers = vec![Provider::Cuda]),
+            with(&|settings, _| settings.view.min_mask_px += 1),
+            with(&|settings, _| settings.view.masks = Masks::Auto { n_levels: 2 }),
+            with(&|settings, _| settings.cells.limits.max_gaussians -= 1),
+        ];
+        assert!(changed.iter().all(|identity| *identity != plain));
+        // What is made of the views' contributions is no part of it.
+        assert_eq!(with(&|settings, _| settings.aggregation = crate::lift::Aggregation::PAPER), plain);
     }
 }

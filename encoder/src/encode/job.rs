@@ -12,21 +12,21 @@ use crate::lift::photos::{self, MaskOutline};
 use crate::store::Store;
 
 const TREE: &str = "job";
-const FINGERPRINT_KEY: &[u8] = b"fingerprint";
-/// There once the views that are done were published, with others left to do.
+const IDENTITY_KEY: &[u8] = b"identity";
+/// Present while every finished view of the job is published.
 const PUBLISHED_KEY: &[u8] = b"published";
 const VIEW_PREFIX: &str = "view/";
 
-/// What the record that counts a view as done says of it.
+/// The record of a finished view.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct ViewRecord {
     /// Width at which its weights were rasterised.
     pub(super) raster_width_px: u32,
-    /// Seconds of its stages before this record.
+    /// Seconds in its stages before this record.
     pub(super) secs: f32,
 }
 
-/// An encode under way in a store.
+/// The unfinished encode of a store.
 pub(super) struct Job<'a> {
     store: &'a Store,
     records: sled::Tree,
@@ -34,19 +34,19 @@ pub(super) struct Job<'a> {
 }
 
 impl<'a> Job<'a> {
-    /// Takes up the unfinished encode with this fingerprint, or begins one.
+    /// Takes up the unfinished encode of this identity, or begins one.
     ///
     /// # Errors
-    /// [`EncodeError::OtherJob`] if another one is unfinished and `restart` is not set.
-    pub(super) fn open(store: &'a Store, fingerprint: Hash32, restart: bool) -> Result<Self, EncodeError> {
+    /// [`EncodeError::OtherJob`] if one of another identity is unfinished and `restart` is not set.
+    pub(super) fn open(store: &'a Store, identity: Hash32, restart: bool) -> Result<Self, EncodeError> {
         let folder = store.job_dir()?;
         let records = store.db().open_tree(TREE).map_err(|source| records_error(store, source))?;
         let job = Self { store, records, folder };
-        let found = job.records.get(FINGERPRINT_KEY).map_err(|source| records_error(store, source))?;
-        let same = found.as_deref() == Some(&fingerprint.0);
+        let found = job.records.get(IDENTITY_KEY).map_err(|source| records_error(store, source))?;
+        let same = found.as_deref() == Some(&identity.0);
         let published =
             job.records.contains_key(PUBLISHED_KEY).map_err(|source| records_error(store, source))?;
-        // What is published is not lost with its contributions.
+        // A published job loses only its contributions, which the published generation does not need.
         if found.is_some() && !same && !restart && !published {
             return Err(EncodeError::OtherJob {
                 path: store.dir().to_owned(),
@@ -55,9 +55,7 @@ impl<'a> Job<'a> {
         }
         if !same {
             job.clear()?;
-            job.records
-                .insert(FINGERPRINT_KEY, &fingerprint.0)
-                .map_err(|source| records_error(store, source))?;
+            job.records.insert(IDENTITY_KEY, &identity.0).map_err(|source| records_error(store, source))?;
             job.flush()?;
         }
         fs_err::create_dir_all(job.folder.join("views"))?;
@@ -71,24 +69,24 @@ impl<'a> Job<'a> {
             .map(|record| {
                 let (key, value) = record.map_err(|source| records_error(self.store, source))?;
                 let name = String::from_utf8_lossy(&key[VIEW_PREFIX.len()..]).into_owned();
-                // Only for the report; an older program's says nothing.
+                // The record feeds the report alone.
                 Ok((name, serde_json::from_slice(&value).unwrap_or_default()))
             })
             .collect()
     }
 
-    /// Returns where a view's contributions lie.
+    /// Returns the file of a view's contributions.
     pub(super) fn contributions_path(&self, view: &str) -> PathBuf {
         // Names hold separators and may be long; their hash does not.
         self.folder.join("views").join(format!("{}.contributions", Hash32::of(view.as_bytes())))
     }
 
-    /// Returns where the outlines of a view's masks lie.
+    /// Returns the file of the outlines of a view's masks.
     pub(super) fn outlines_path(&self, view: &str) -> PathBuf {
         self.contributions_path(view).with_extension("outlines")
     }
 
-    /// Keeps a view's contributions and its masks' outlines: the files first, then the record that counts it as done.
+    /// Keeps a view's contributions and its masks' outlines: the files first, then the record that marks it as done.
     pub(super) fn keep(
         &self,
         view: &str,
@@ -100,11 +98,15 @@ impl<'a> Job<'a> {
         contributions.write(&self.contributions_path(view))?;
         let key = format!("{VIEW_PREFIX}{view}");
         let record = serde_json::to_vec(&record).map_err(std::io::Error::from)?;
-        self.records.insert(key, record).map_err(|source| records_error(self.store, source))?;
+        // In one step: with a view that was not published, the job may no longer be dropped silently.
+        let mut batch = sled::Batch::default();
+        batch.insert(key.as_bytes(), record);
+        batch.remove(PUBLISHED_KEY);
+        self.records.apply_batch(batch).map_err(|source| records_error(self.store, source))?;
         self.flush()
     }
 
-    /// Keeps the contributions of views that were published, for an encode that goes on with others.
+    /// Keeps the contributions of published views, for an encode that adds other views.
     pub(super) fn keep_published(self) -> Result<(), EncodeError> {
         self.records.insert(PUBLISHED_KEY, &[]).map_err(|source| records_error(self.store, source))?;
         self.flush()
@@ -133,4 +135,34 @@ impl<'a> Job<'a> {
 
 fn records_error(store: &Store, source: sled::Error) -> EncodeError {
     EncodeError::Records { path: store.dir().to_owned(), source }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn keep(job: &Job<'_>, view: &str) {
+        let contributions = ViewContributions {
+            dim: 1,
+            mask_vectors: Vec::new(),
+            masks_of_region: Vec::new(),
+            entries_of_cell: Vec::new(),
+        };
+        job.keep(view, &contributions, &[], ViewRecord::default()).expect("keeps");
+    }
+
+    /// A published job may be dropped, but not the views that a later run adds to it before it is published again.
+    #[test]
+    fn views_added_to_a_published_job_are_not_dropped_silently() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let store = Store::create_or_open(dir.path()).expect("opens");
+        let open = |identity| Job::open(&store, Hash32([identity; 32]), false);
+        let job = open(1).expect("begins");
+        keep(&job, "a");
+        job.keep_published().expect("marks");
+        keep(&open(1).expect("goes on"), "b");
+        assert!(matches!(open(2), Err(EncodeError::OtherJob { n_done: 2, .. })));
+        open(1).expect("goes on").keep_published().expect("marks");
+        assert!(open(2).expect("what is published may go").done_views().expect("reads").is_empty());
+    }
 }

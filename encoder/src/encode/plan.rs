@@ -203,3 +203,30 @@ fn choose_views(
         }
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::PathBuf;
+
+    use super::*;
+
+    /// Superpoints take 232 bytes a Gaussian, once all views are done: a budget below that is refused before.
+    #[test]
+    fn what_refinement_takes_is_refused_before_the_first_view() {
+        let mut settings = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
+        settings.run.memory_bytes = 100_000 * 232;
+        let scene = Gaussians { means_in_world: vec![glam::DVec3::ZERO; 100_000], ..Gaussians::default() };
+        let split = CellSplit {
+            cells: Vec::new(),
+            cell_of_gaussian: Vec::new(),
+            local_of_gaussian: Vec::new(),
+            n_rejected: 0,
+        };
+        let inputs = Inputs { scene, split, views: Vec::new(), missing: Vec::new(), geo_reference: None };
+        let refused =
+            memory_plan(&settings, &inputs, 512).rest(0).expect_err("the objects' lists come on top");
+        assert!(refused.is_before_views && refused.parts[0].purpose.contains("superpoints"), "{refused}");
+        settings.run.memory_bytes *= 2;
+        memory_plan(&settings, &inputs, 512).rest(0).expect("fits");
+    }
+}

@@ -12,6 +12,7 @@ use super::error::EncodeError;
 use super::plan::Plan;
 use super::report::{CellReport, EncodeSummary};
 use super::views::DoneViews;
+use crate::store::ModelsRecord;
 
 /// Publishes the built cells, ends the job and returns the summary.
 ///
@@ -26,6 +27,8 @@ pub(super) fn publish(
     let generation = plan.store.next_generation()?;
     let manifest = manifest(&plan, &built, generation);
     plan.store.publish(&manifest, &built.extras)?;
+    let models = plan.settings.output.models.clone();
+    plan.store.remember_models(&ModelsRecord { encoder: manifest.encoder.id, models })?;
     let mut summary = summary(&plan, &views, built, &manifest);
     // With views left to do the contributions stay: the next encode goes on from them.
     let has_open = views.records.len() + views.n_failed < plan.inputs.views.len();

@@ -6,7 +6,7 @@ use std::time::Duration;
 use serde::Serialize;
 use slag_common::shard::Profile;
 
-use super::EncodeError;
+use super::error::EncodeError;
 use crate::cells::CellLimits;
 use crate::codebook::CodebookSettings;
 use crate::embed::Background;
@@ -141,6 +141,8 @@ pub struct OutputSettings {
     pub created_unix_secs: u64,
     /// Expiry to sign, seconds since 1970.
     pub expires_unix_secs: Option<u64>,
+    /// Name or folder of the models, as later queries on this machine open them; `None` for the embedded ones.
+    pub models: Option<PathBuf>,
 }
 
 /// How a run goes.
@@ -225,6 +227,7 @@ impl EncodeSettings {
                 scene_name: "scene".into(),
                 created_unix_secs: 0,
                 expires_unix_secs: None,
+                models: None,
             },
             run: RunSettings {
                 threads: std::thread::available_parallelism().map_or(1, usize::from),
@@ -244,7 +247,94 @@ impl EncodeSettings {
     /// # Errors
     /// [`EncodeError::Setting`] with the first one that is out of its range.
     pub fn validate(&self) -> Result<(), EncodeError> {
-        let _ = (MAX_CELL_GAUSSIANS, self);
+        let Self { view, aggregation, cells, run, .. } = self;
+        let codebook = &cells.shards.codebook;
+        let is_positive = |x: f64| x > 0.0 && x.is_finite();
+        let is_error = |x: f32| x >= 0.0 && x.is_finite();
+        let checks = [
+            ("threads", run.threads > 0, "0 threads; expected at least 1"),
+            (
+                "views_limit",
+                !matches!(run.views_limit, ViewsLimit::Share(share) if !(0.0..=1.0).contains(&share)),
+                "expected a share of 0 to 1",
+            ),
+            (
+                "masks",
+                !matches!(view.masks, Masks::Auto { n_levels } if !(1..=4).contains(&n_levels)),
+                "expected 1 to 4 levels",
+            ),
+            (
+                "raster_width",
+                !matches!(view.raster_width, RasterWidth::Px(px) if !(16..=8192).contains(&px)),
+                "expected 16 to 8192 pixels",
+            ),
+            (
+                "max_gaussians",
+                (1..=MAX_CELL_GAUSSIANS).contains(&cells.limits.max_gaussians),
+                "expected 1 to 65536 Gaussians a cell",
+            ),
+            ("max_width", cells.limits.max_width.is_none_or(is_positive), "expected a finite width above 0"),
+            ("profiles", !cells.shards.profiles.is_empty(), "expected at least one profile"),
+            (
+                "max_subspaces",
+                codebook.max_subspaces >= 2 && codebook.max_subspaces.is_multiple_of(2),
+                "expected an even number of subspaces, at least 2: two share a byte",
+            ),
+            ("compact_error", is_error(codebook.compact_error), "expected a finite error, at least 0"),
+            ("balanced_error", is_error(codebook.balanced_error), "expected a finite error, at least 0"),
+            (
+                "position_error",
+                !matches!(cells.shards.position_error, PositionError::Within(error) if !is_positive(error)),
+                "expected a finite error above 0",
+            ),
+        ];
+        let refuse = |setting, problem: String| Err(EncodeError::Setting { setting, problem });
+        if let Some((setting, _, problem)) = checks.into_iter().find(|(_, is_valid, _)| !is_valid) {
+            return refuse(setting, problem.into());
+        }
+        // By their serialised form, so that a new field is checked too.
+        let fields = serde_json::to_value(aggregation).map_err(std::io::Error::from)?;
+        for (field, value) in fields.as_object().into_iter().flatten() {
+            // NaN and infinity are no JSON numbers.
+            let is_valid = value.is_boolean() || value.as_f64().is_some_and(|x| (0.0..=1000.0).contains(&x));
+            if !is_valid {
+                return refuse("aggregation", format!("{field} is out of its range, 0 to 1000"));
+            }
+        }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_out_of_range_are_errors_with_a_name() {
+        let refused = |change: &dyn Fn(&mut EncodeSettings)| {
+            let mut settings = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
+            settings.validate().expect("the default is valid");
+            change(&mut settings);
+            match settings.validate() {
+                Err(EncodeError::Setting { setting, .. }) => setting,
+                other => panic!("{other:?}"),
+            }
+        };
+        assert_eq!(refused(&|s| s.run.threads = 0), "threads");
+        assert_eq!(refused(&|s| s.run.views_limit = ViewsLimit::Share(f64::NAN)), "views_limit");
+        assert_eq!(refused(&|s| s.view.masks = Masks::Auto { n_levels: 0 }), "masks");
+        assert_eq!(refused(&|s| s.view.raster_width = RasterWidth::Px(0)), "raster_width");
+        assert_eq!(refused(&|s| s.cells.limits.max_gaussians = 0), "max_gaussians");
+        assert_eq!(refused(&|s| s.cells.limits.max_width = Some(0.0)), "max_width");
+        assert_eq!(refused(&|s| s.cells.shards.profiles.clear()), "profiles");
+        assert_eq!(refused(&|s| s.cells.shards.codebook.max_subspaces = 0), "max_subspaces");
+        assert_eq!(refused(&|s| s.cells.shards.codebook.max_subspaces = 3), "max_subspaces");
+        assert_eq!(refused(&|s| s.cells.shards.codebook.compact_error = -0.1), "compact_error");
+        assert_eq!(refused(&|s| s.cells.shards.codebook.balanced_error = f32::NAN), "balanced_error");
+        assert_eq!(
+            refused(&|s| s.cells.shards.position_error = PositionError::Within(0.0)),
+            "position_error"
+        );
+        assert_eq!(refused(&|s| s.aggregation.superpoint = f32::INFINITY), "aggregation");
     }
 }

@@ -117,7 +117,8 @@ struct Budget {
 impl Budget {
     /// Returns whether another view may begin, and counts it as begun.
     fn may_begin(&mut self, is_over: bool) -> bool {
-        !is_over || !std::mem::replace(&mut self.has_some, true)
+        let is_first = !std::mem::replace(&mut self.has_some, true);
+        !is_over || is_first
     }
 }
 

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, RgbImage};
-use slag_common::{Distortion, Intrinsics, View};
+use slag_common::{Distortion, Hash32, Intrinsics, View};
 
 pub use geo::{GeoError, read_geo_reference};
 pub use undistort::Undistorter;
@@ -65,6 +65,14 @@ pub enum IngestError {
         /// Width and height according to the camera.
         expected_px: [u32; 2],
     },
+}
+
+/// Returns the BLAKE3 hash of a file's content.
+///
+/// # Errors
+/// If the file cannot be read.
+pub fn hash_file(path: &Path) -> io::Result<Hash32> {
+    Ok(Hash32::of_reader(fs_err::File::open(path)?)?.0)
 }
 
 /// Returns the views whose image file is absent, in the order given.

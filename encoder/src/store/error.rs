@@ -1,4 +1,4 @@
-//! What can go wrong with a store.
+//! Errors of a store.
 
 use std::io;
 use std::path::PathBuf;
@@ -9,10 +9,10 @@ use slag_common::manifest::ManifestError;
 /// Why a store cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
-    /// The file system refused; the text names the path.
+    /// A file operation failed; the text names the path.
     #[error("{0}; check permissions and free space")]
     Io(io::Error),
-    /// A second writer.
+    /// Another process writes to the store.
     #[error("another slag-encoder is writing to {}; wait for it or stop it", store.display())]
     Locked {
         /// The store.
@@ -20,36 +20,36 @@ pub enum StoreError {
     },
     /// The record database is damaged or cannot be written.
     #[error(
-        "{}: {cause}; if it is damaged, remove this folder: published scenes stay, unfinished jobs start over",
+        "{}: {cause}; if the database is damaged, remove this folder: published scenes stay, unfinished jobs start over",
         path.display()
     )]
     Records {
         /// The database's folder.
         path: PathBuf,
-        /// What it says.
+        /// The database's error.
         cause: sled::Error,
     },
-    /// Nothing was published yet.
-    #[error("{} is missing: nothing was published here yet; run `slag-encoder encode` first", path.display())]
+    /// Nothing has been published yet.
+    #[error("{} is missing: nothing has been published here yet; run `slag-encoder encode` first", path.display())]
     NotPublished {
-        /// Where the manifest belongs.
+        /// The manifest's file.
         path: PathBuf,
     },
-    /// A key file that is not 64 hex digits.
-    #[error("{}: expected 64 hex digits; restore it from a backup, or remove it: robots must then accept a new key", path.display())]
+    /// A key file does not hold 64 hex digits.
+    #[error("{}: expected 64 hex digits; restore the file from a backup, or remove it: a new key is made, which robots must be told", path.display())]
     Key {
         /// The key file.
         path: PathBuf,
     },
-    /// The stored manifest is refused.
+    /// The stored manifest cannot be verified.
     #[error("{}: {cause}", path.display())]
     Manifest {
         /// The manifest's file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         cause: ManifestError,
     },
-    /// The record of what was published beside the shards is damaged.
+    /// The list of a generation's extra objects is damaged.
     #[error("{}: {what}; encode again", path.display())]
     Extras {
         /// The record's file.
@@ -57,7 +57,7 @@ pub enum StoreError {
         /// What is wrong.
         what: String,
     },
-    /// A manifest lists what the store does not hold.
+    /// A manifest lists an object that the store does not hold.
     #[error(
         "object {hash}: expected {expected_bytes} bytes at {}, found {}; put the object before publishing",
         path.display(),
@@ -66,22 +66,22 @@ pub enum StoreError {
     MissingObject {
         /// The object.
         hash: Hash32,
-        /// Where it belongs.
+        /// Its file.
         path: PathBuf,
         /// Length listed.
         expected_bytes: u64,
-        /// Length there, if any.
+        /// Length found, if the file exists.
         found_bytes: Option<u64>,
     },
-    /// An object whose content is not what its name says.
-    #[error("{}: content has hash {found}; the file is damaged, remove it and encode again", path.display())]
+    /// An object's content does not match its name.
+    #[error("{}: content has hash {found}, not that of its name: the file is damaged; remove it and encode again", path.display())]
     ObjectHash {
         /// The object's file.
         path: PathBuf,
         /// Hash of the content.
         found: Hash32,
     },
-    /// A change of keys out of order.
+    /// The steps of a key rotation are out of order.
     #[error("{}: {what}; run `slag-encoder keys rotate` first, and finish once every robot has fetched", store.display())]
     Rotation {
         /// The store.
@@ -89,13 +89,13 @@ pub enum StoreError {
         /// What is missing.
         what: &'static str,
     },
-    /// The first key is there already.
+    /// The store has a key already.
     #[error("{} has a key already; to change it, run `slag-encoder keys rotate`", store.display())]
     HasKey {
         /// The store.
         store: PathBuf,
     },
-    /// A generation that would take robots back.
+    /// A generation is not above the current one: robots would go back.
     #[error("generation {found} cannot follow {current}; take the number from `next_generation`")]
     Generation {
         /// Generation offered.

@@ -1,4 +1,4 @@
-//! The cloud store: where a scene's objects, manifest and records lie.
+//! The cloud store: a scene's objects, manifest and records.
 //!
 //! | path | content |
 //! |---|---|
@@ -6,6 +6,7 @@
 //! | `manifest` | the current signed manifest |
 //! | `manifest.previous` | the one before it, which fetches under way may still need |
 //! | `extras/MANIFEST_HASH` | JSON name -> object hash: objects that belong to that manifest but not to robots |
+//! | `models.json` | name or folder of the models of the last encode, for queries on this machine |
 //! | `keys/` | signing keys (mode 0600) and their public halves, hex: see [`keys`] |
 //! | `db/` | sled: scene, generation, cells, state of jobs and pushes; opened by writers alone |
 //! | `job/` | working files of an unfinished encode |
@@ -21,6 +22,7 @@
 mod error;
 mod files;
 pub mod keys;
+mod models;
 mod reader;
 #[cfg(test)]
 pub(crate) mod tests;
@@ -38,12 +40,13 @@ use slag_common::manifest::{CellRecord, Manifest, TrustedKeys};
 pub use error::StoreError;
 use files::{Access, HashingWriter};
 use keys::Keys;
+pub use models::ModelsRecord;
 pub(crate) use reader::Stamp;
 pub use reader::{Extras, Published, StoreReader};
 
 /// sled keeps whole pages in memory; the records are small.
 const RECORD_CACHE_BYTES: u64 = 16 << 20;
-/// A writer that has just ended may hold the lock for an instant more: sled lets go of it on a thread of its own.
+/// Time to wait for the lock: sled releases the lock of a writer that has just ended on a thread of its own.
 const LOCK_PATIENCE: Duration = Duration::from_secs(2);
 const LOCK_PAUSE: Duration = Duration::from_millis(20);
 /// Tree of the records that repeat the manifest.
@@ -54,7 +57,7 @@ const MANIFEST_KEY: &[u8] = b"manifest";
 /// Followed by the cell id, big-endian, so that cells come in order.
 const CELL_PREFIX: &[u8] = b"cell/";
 
-/// What [`Store::prune`] removed.
+/// The result of [`Store::prune`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Pruned {
     /// Objects removed.
@@ -63,7 +66,7 @@ pub struct Pruned {
     pub len_bytes: u64,
 }
 
-/// The one writer of a store.
+/// The only writer of a store.
 #[derive(Debug)]
 pub struct Store {
     dir: PathBuf,
@@ -74,7 +77,7 @@ pub struct Store {
 }
 
 impl Store {
-    /// Opens a store for writing; makes it, with a fresh signing key, if it is not there.
+    /// Opens a store for writing; creates it, with a fresh signing key, if it does not exist.
     ///
     /// # Errors
     /// [`StoreError::Locked`] while another process writes; [`StoreError`] otherwise.
@@ -104,7 +107,7 @@ impl Store {
                 Err(cause) => return Err(StoreError::Records { path: db_path, cause }),
             }
         };
-        // The lock is ours, so whatever lies in tmp/ is of a writer that died.
+        // The lock is held, so the files in tmp/ belong to a writer that died.
         for entry in fs_err::read_dir(dir.join("tmp"))? {
             fs_err::remove_file(entry?.path())?;
         }
@@ -122,7 +125,7 @@ impl Store {
         &self.dir
     }
 
-    /// Returns the folder for working files of an encode, made if need be.
+    /// Returns the folder for working files of an encode, and creates it if it does not exist.
     ///
     /// # Errors
     /// [`StoreError::Io`].
@@ -132,7 +135,7 @@ impl Store {
         Ok(path)
     }
 
-    /// Returns the record database, for the state of jobs and pushes; flush what must last.
+    /// Returns the record database, for the state of jobs and pushes. Records are durable once flushed.
     pub fn db(&self) -> &sled::Db {
         &self.db
     }
@@ -152,7 +155,7 @@ impl Store {
 
     /// Writes an object through a callback and returns its hash and length; safe from many threads.
     ///
-    /// The object is durable on return. One that is there already is kept.
+    /// The object is durable on return. An object that exists already is kept.
     ///
     /// # Errors
     /// [`StoreError::Io`], from the callback too.
@@ -170,7 +173,7 @@ impl Store {
             Ok((hash, len_bytes))
         });
         if placed.is_err() {
-            // Best effort: the next writer clears tmp/ anyway, and the first error is the one to tell.
+            // Best effort: the next writer clears tmp/ anyway, and the first error is the one to report.
             let _ = fs_err::remove_file(&part);
         }
         Ok(placed?)
@@ -253,9 +256,18 @@ impl Store {
         Ok(hash)
     }
 
+    /// Remembers which models the store was encoded with.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`].
+    pub fn remember_models(&self, record: &ModelsRecord) -> Result<(), StoreError> {
+        let bytes = serde_json::to_vec(record).map_err(io::Error::from)?;
+        self.replace(&ModelsRecord::path(&self.dir), &bytes)
+    }
+
     /// Removes objects and extras that neither the current manifest nor the one before it lists.
     ///
-    /// Objects of an encode that has not published yet go too: prune after publishing.
+    /// Objects of an encode that has not published yet are removed too: prune after publishing.
     ///
     /// # Errors
     /// [`StoreError`] if the current manifest or its extras cannot be read: then nothing is removed.
@@ -302,7 +314,7 @@ impl Store {
         Ok(value.and_then(|bytes| Some(u64::from_be_bytes(bytes.as_ref().try_into().ok()?))))
     }
 
-    /// Writes the records of a manifest, in one atomic batch, unless they stand already.
+    /// Writes the records of a manifest in one atomic batch, unless they are current.
     fn write_records(&self, manifest: &Manifest, hash: Hash32) -> Result<(), StoreError> {
         let write = || -> sled::Result<()> {
             if self.published.get(MANIFEST_KEY)?.is_some_and(|found| *found == hash.0[..]) {
@@ -328,8 +340,10 @@ impl Store {
 
     /// Brings the records up to the manifest, which a crash may have left ahead of them.
     fn repair_records(&self) -> Result<(), StoreError> {
-        match self.reader() {
-            Ok(reader) => self.write_records(&reader.current().manifest, reader.current().hash),
+        // Without the extras: a damaged record of them is replaced by the next publication.
+        let own = keys::PublicKeys::read(&self.dir)?.trusted();
+        match reader::read_manifest(&self.dir.join(reader::MANIFEST), &own) {
+            Ok((manifest, signed)) => self.write_records(&manifest, Hash32::of(&signed)),
             Err(StoreError::NotPublished { .. }) => Ok(()),
             Err(e) => Err(e),
         }

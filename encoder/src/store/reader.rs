@@ -9,13 +9,14 @@ use slag_common::Hash32;
 use slag_common::container::AlignedBytes;
 use slag_common::manifest::{self, Manifest, ManifestError, TrustedKeys};
 
-use super::StoreError;
+use super::error::StoreError;
 use super::keys::PublicKeys;
+use super::models::ModelsRecord;
 
 pub(super) const MANIFEST: &str = "manifest";
 pub(super) const MANIFEST_PREVIOUS: &str = "manifest.previous";
 
-/// Objects by name that belong to a generation but are not for robots.
+/// Objects by name that belong to a generation but are not sent to robots.
 pub type Extras = BTreeMap<String, Hash32>;
 
 /// A published generation.
@@ -33,10 +34,7 @@ pub struct Published {
 
 impl Published {
     fn read(dir: &Path, name: &str, own: &TrustedKeys) -> Result<Self, StoreError> {
-        let path = dir.join(name);
-        let Some(signed) = read_signed(&path)? else { return Err(StoreError::NotPublished { path }) };
-        let (manifest, _) =
-            Manifest::verify(&signed, own).map_err(|cause| StoreError::Manifest { path, cause })?;
+        let (manifest, signed) = read_manifest(&dir.join(name), own)?;
         let hash = Hash32::of(&signed);
         let path = extras_path(dir, hash);
         let extras = fs_err::read(&path)?;
@@ -126,6 +124,15 @@ impl StoreReader {
         Stamp::of(&self.dir.join(MANIFEST)).is_ok_and(|stamp| stamp == self.stamp)
     }
 
+    /// Returns which models the current generation was encoded with, if the store recorded it.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`].
+    pub fn models(&self) -> Result<Option<ModelsRecord>, StoreError> {
+        let record = ModelsRecord::read(&self.dir)?;
+        Ok(record.filter(|record| record.encoder == self.manifest().encoder.id))
+    }
+
     /// Returns the store's folder.
     pub fn dir(&self) -> &Path {
         &self.dir
@@ -172,6 +179,16 @@ pub(super) fn object_path(dir: &Path, hash: Hash32) -> PathBuf {
 
 pub(super) fn extras_path(dir: &Path, manifest_hash: Hash32) -> PathBuf {
     dir.join("extras").join(manifest_hash.to_string())
+}
+
+/// Reads a manifest and verifies that one of the store's own keys signed it; returns its signed bytes too.
+pub(super) fn read_manifest(path: &Path, own: &TrustedKeys) -> Result<(Manifest, Vec<u8>), StoreError> {
+    let Some(signed) = read_signed(path)? else {
+        return Err(StoreError::NotPublished { path: path.to_owned() });
+    };
+    let refused = |cause| StoreError::Manifest { path: path.to_owned(), cause };
+    let (manifest, _) = Manifest::verify(&signed, own).map_err(refused)?;
+    Ok((manifest, signed))
 }
 
 /// Reads a signed manifest's bytes, unverified; `None` if there is no such file.

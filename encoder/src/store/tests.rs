@@ -392,3 +392,36 @@ fn a_change_of_keys_that_was_cut_off_is_finished() {
         StoreReader::open(dir.path()).expect("reads");
     }
 }
+
+/// A damaged record of extras hides what robots do not need: it must not keep the next encode from repairing it.
+#[test]
+fn damaged_extras_do_not_keep_a_writer_out() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    let object = store.put_bytes(b"shard").expect("puts");
+    let hash = store.publish(&manifest(1, &[object]), &Extras::new()).expect("publishes");
+    drop(store);
+    fs_err::write(reader::extras_path(dir.path(), hash), "{").expect("damages");
+    assert!(matches!(StoreReader::open(dir.path()), Err(StoreError::Extras { .. })));
+    let store = Store::create_or_open(dir.path()).expect("opens all the same");
+    assert_eq!(store.next_generation().expect("counts"), 2);
+    store.publish(&manifest(2, &[object]), &Extras::new()).expect("publishes");
+    store.prune().expect("prunes");
+    assert_eq!(StoreReader::open(dir.path()).expect("reads").manifest().generation, 2);
+}
+
+/// A record of another encoder, which an interrupted encode left behind, says nothing of what is published.
+#[test]
+fn models_are_remembered_for_their_encoder_alone() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    let manifest = manifest(1, &[]);
+    store.publish(&manifest, &Extras::new()).expect("publishes");
+    let models = || store.reader().expect("reads").models().expect("reads");
+    assert_eq!(models(), None);
+    let record = ModelsRecord { encoder: manifest.encoder.id, models: Some("clip".into()) };
+    store.remember_models(&record).expect("writes");
+    assert_eq!(models(), Some(record.clone()));
+    store.remember_models(&ModelsRecord { encoder: Hash32([9; 32]), ..record }).expect("writes");
+    assert_eq!(models(), None);
+}
