@@ -6,8 +6,8 @@ use anyhow::{Result, anyhow};
 use clap::Args;
 use slag_common::{poses, splat};
 
-use super::Exit;
 use super::common::{InputArgs, print};
+use super::exit::Exit;
 use crate::check::{self, CheckOptions, CheckView};
 use crate::ingest;
 use crate::raster::RasterView;

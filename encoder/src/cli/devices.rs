@@ -3,8 +3,8 @@
 use anyhow::Result;
 use serde_json::json;
 
-use super::Exit;
 use super::common::print;
+use super::exit::Exit;
 use crate::raster::gpu::{AdapterReport, adapters};
 
 pub(super) fn run(json: bool) -> Result<Exit> {

@@ -6,11 +6,11 @@ use anyhow::{Result, anyhow};
 use clap::{Args, ValueEnum};
 use slag_common::shard::Profile;
 
-use super::Exit;
 use super::common::{
     BackgroundArg, InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs,
     open_models, parse_bytes, parse_error, print, profile_parser,
 };
+use super::exit::Exit;
 use super::refine::RefineArgs;
 use super::sam::SamArgs;
 use super::views::{ViewsArgs, parse_raster_width, parse_views_limit};

@@ -6,8 +6,8 @@ use std::path::PathBuf;
 use anyhow::Result;
 use clap::{Args, Subcommand};
 
-use super::Exit;
 use super::common::{now_unix_secs, print};
+use super::exit::Exit;
 use crate::store::keys::PublicKeys;
 use crate::store::{Store, StoreError};
 

@@ -5,6 +5,7 @@ pub mod common;
 mod devices;
 mod encode;
 pub mod environment;
+mod exit;
 mod keys;
 mod models;
 pub mod progress;
@@ -16,8 +17,6 @@ mod sam;
 mod serve;
 mod views;
 
-use std::process::ExitCode;
-
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 use serde_json::json;
@@ -27,6 +26,7 @@ use crate::encode::EncodeError;
 #[cfg(feature = "qdrant")]
 use crate::publish::qdrant;
 use crate::raster::devices::DeviceChoice;
+pub use exit::Exit;
 #[cfg(feature = "qdrant")]
 use push::PushCommand;
 
@@ -140,32 +140,6 @@ fn is_broken_pipe(error: &anyhow::Error) -> bool {
         .chain()
         .filter_map(|e| e.downcast_ref::<std::io::Error>())
         .any(|e| e.kind() == std::io::ErrorKind::BrokenPipe)
-}
-
-/// How a run of the program ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Exit {
-    /// All done.
-    Done,
-    /// Failed; the message says why.
-    Failed,
-    /// Done without some inputs; the summary names them.
-    Partly,
-    /// Interrupted by the user; the same command resumes.
-    Interrupted,
-}
-
-impl From<Exit> for ExitCode {
-    /// 2 is left to clap: wrong usage.
-    fn from(exit: Exit) -> Self {
-        match exit {
-            Exit::Done => 0,
-            Exit::Failed => 1,
-            Exit::Partly => 3,
-            Exit::Interrupted => 130,
-        }
-        .into()
-    }
 }
 
 #[cfg(test)]

@@ -4,8 +4,8 @@ use anyhow::Result;
 use slag_models::ModelDir;
 use slag_models::commands::{self, ModelsCommand};
 
-use super::Exit;
 use super::common::{print, session_options};
+use super::exit::Exit;
 
 pub(super) fn run(command: &ModelsCommand, json: bool) -> Result<Exit> {
     let context = commands::Context {

@@ -8,8 +8,8 @@ use clap::Args;
 use serde_json::json;
 use slag_common::shard::Profile;
 
-use super::Exit;
 use super::common::{ModelArgs, print, profile_parser, text_encoder_of};
+use super::exit::Exit;
 use crate::query::{self, ByLevel};
 use crate::store::StoreReader;
 

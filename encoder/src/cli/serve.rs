@@ -6,8 +6,8 @@ use std::path::PathBuf;
 use anyhow::Result;
 use clap::Args;
 
-use super::Exit;
 use super::common::{runtime, stopped};
+use super::exit::Exit;
 use crate::publish::serve;
 
 /// `serve`.
