@@ -72,7 +72,7 @@ impl Problem {
     }
 
     /// Returns the problem of an error response that came without one, from a layer or the router.
-    pub(crate) fn of_status(status: StatusCode, method: &str, path: &str, headers: &HeaderMap) -> Self {
+    pub(crate) fn of_status(status: StatusCode, method: &str, path: &str) -> Self {
         let shown: String = path.chars().take(80).collect();
         match status {
             StatusCode::NOT_FOUND => {
@@ -80,9 +80,9 @@ impl Problem {
                 Self::new(status, "not-found", "Not found", detail)
             }
             StatusCode::METHOD_NOT_ALLOWED => {
-                let allowed = headers.get(header::ALLOW).and_then(|allow| allow.to_str().ok());
                 let method: String = method.chars().take(20).collect();
-                let detail = format!("found {method:?}, {shown:?} takes {}", allowed.unwrap_or("no method"));
+                let detail =
+                    format!("{shown:?} does not take {method:?}; the Allow header lists its methods");
                 Self::new(status, "method-not-allowed", "Method not allowed", detail)
             }
             StatusCode::PAYLOAD_TOO_LARGE => {

@@ -39,8 +39,7 @@ async fn observe(State(observer): State<Arc<Observer>>, request: Request, next: 
     let status = response.status();
     if status.is_client_error() || status.is_server_error() {
         let problem = response.extensions_mut().remove::<Problem>();
-        let problem =
-            problem.unwrap_or_else(|| Problem::of_status(status, method.as_str(), &path, response.headers()));
+        let problem = problem.unwrap_or_else(|| Problem::of_status(status, method.as_str(), &path));
         if let Some(cause) = problem.cause() {
             tracing::error!(id, %method, path, "{cause}");
         }

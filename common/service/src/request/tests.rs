@@ -36,7 +36,7 @@ async fn every_error_is_a_problem_with_the_id_of_its_request() {
     let router = router(&responses);
     let cases = [
         (Method::GET, "/nowhere", 404, "not-found", "\"/nowhere\""),
-        (Method::POST, "/things/chair", 405, "method-not-allowed", "\"/things/chair\" takes GET,HEAD"),
+        (Method::POST, "/things/chair", 405, "method-not-allowed", "does not take \"POST\""),
         (Method::GET, "/broken", 500, "internal", "the service failed"),
         (Method::GET, "/refused", 503, "overloaded", "come back later"),
     ];
