@@ -7,8 +7,8 @@ max_glibc=2.35
 
 export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc
 export CC_aarch64_unknown_linux_gnu=aarch64-linux-gnu-gcc
-cargo build --release --locked --target $target --package slag-edge --bin slag-edge
-binary=target/$target/release/slag-edge
+cargo build --profile dist --locked --target $target --package slag-edge --bin slag-edge
+binary=target/$target/dist/slag-edge
 
 highest=$(aarch64-linux-gnu-objdump -T "$binary" | grep -o 'GLIBC_[0-9.]*' | sed 's/GLIBC_//' | sort -V | tail -n 1)
 if [ "$(printf '%s\n' "$highest" $max_glibc | sort -V | tail -n 1)" != $max_glibc ]; then

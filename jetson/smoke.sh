@@ -8,7 +8,7 @@ lab=target/debug/slag-lab
 native=target/debug/slag-edge
 cargo build --locked --bin slag-encoder --bin slag-lab --bin slag-edge
 arm() {
-    qemu-aarch64-static -L /usr/aarch64-linux-gnu target/aarch64-unknown-linux-gnu/release/slag-edge "$@"
+    qemu-aarch64-static -L /usr/aarch64-linux-gnu target/aarch64-unknown-linux-gnu/dist/slag-edge "$@"
 }
 
 work=$(mktemp -d)
