@@ -60,7 +60,7 @@ pub enum QueryError {
         n: usize,
     },
     /// A cell has no shard of a profile.
-    #[error("cell {cell_id} has no {profile} shard; encode with --profiles {profile},exact")]
+    #[error("cell {cell_id} has no {profile} shard; encode again with {} in --profiles", with_exact(*profile))]
     NoShard {
         /// The cell.
         cell_id: u32,
@@ -78,6 +78,14 @@ pub enum QueryError {
         /// The damage.
         source: slag_common::container::ContainerError,
     },
+}
+
+/// Returns the profiles that a command needs beside any others: exact shards tell which Gaussian is which.
+fn with_exact(profile: Profile) -> String {
+    match profile {
+        Profile::Exact => "exact".into(),
+        other => format!("{other} and exact"),
+    }
 }
 
 /// Scores every Gaussian against a unit query vector.
@@ -343,6 +351,14 @@ mod tests {
         let mut cosines = [0.2, 0.3, f32::NAN];
         objects.overlay(&of_objects, &mut cosines);
         assert_eq!(cosines, [0.7 * 0.2 + 0.3 * 0.8, 0.3, 0.6]);
+    }
+
+    #[test]
+    fn a_missing_shard_names_each_profile_once() {
+        let message = |profile| QueryError::NoShard { cell_id: 3, profile }.to_string();
+        assert!(message(Profile::Exact).ends_with("with exact in --profiles"), "{}", message(Profile::Exact));
+        let compact = message(Profile::Compact);
+        assert!(compact.ends_with("with compact and exact in --profiles"), "{compact}");
     }
 
     /// Oracle: another reader of the format.

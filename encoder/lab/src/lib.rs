@@ -1,6 +1,6 @@
-//! The laboratory: generated scenes whose contents are known, evaluation against labels, benchmarks, and the demo.
+//! The laboratory: generated scenes with known contents, evaluation against labels, benchmarks, and the demo.
 //!
-//! Depends on the encoder; the encoder does not know of it.
+//! It depends on the encoder, never the other way round.
 
 pub mod bench;
 pub mod cli;

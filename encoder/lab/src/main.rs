@@ -1,4 +1,4 @@
-//! `slag-lab`: generates scenes, judges encodings by them, and measures this machine.
+//! `slag-lab`: generates scenes, evaluates encodings on them, and benchmarks this machine.
 
 use std::io::IsTerminal;
 use std::process::ExitCode;

@@ -11,8 +11,9 @@ use slag_common::container::AlignedBytes;
 use slag_common::shard::{Profile, ShardLayout};
 use slag_common::{Gaussians, Hash32};
 
+use super::machine::Machine;
 use super::plot::{Plot, Scale, Series};
-use super::{Machine, timed_ms};
+use super::timing::timed_ms;
 use crate::generate::field::Field;
 use slag_encoder::cells::{CellLimits, split};
 use slag_encoder::codebook::residual::trained;

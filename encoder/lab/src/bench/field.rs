@@ -9,7 +9,8 @@ use serde::Serialize;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use slag_common::{Gaussians, Hash32};
 
-use super::{Machine, timed_ms};
+use super::machine::Machine;
+use super::timing::timed_ms;
 use crate::generate::field::{Field, place_in_cube};
 use slag_encoder::cells::{CellLimits, split};
 use slag_encoder::codebook::{ScoreMetric, ScoreMetricContext};

@@ -8,8 +8,9 @@ use std::time::Instant;
 
 use serde::Serialize;
 
+use super::machine::Machine;
 use super::scene::BenchScene;
-use super::{Machine, Spread, timed_ms};
+use super::timing::{Spread, timed_ms};
 use slag_encoder::masks::RegionMap;
 use slag_encoder::progress::Progress;
 use slag_encoder::raster::{LoadedScene, RasterError, Rasterizer, StageTime, ViewWeights, WeightKind};

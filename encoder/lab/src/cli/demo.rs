@@ -14,16 +14,16 @@ use crate::demo;
 /// `demo`.
 #[derive(Debug, Args)]
 pub struct DemoArgs {
-    /// Folder to work in; emptied of an earlier demo.
+    /// Working folder; an earlier demo in it is deleted.
     #[arg(long, value_name = "DIR", default_value = "target/demo")]
     pub out: PathBuf,
-    /// Chooses house and yard.
+    /// Seed of house and yard.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// How models are run.
+    /// Model runtime.
     #[command(flatten)]
     pub how: RunArgs,
-    /// Leaves the services running until ctrl-c, to try queries by hand.
+    /// Keeps the services running until ctrl-c, so that you can try queries.
     #[arg(long)]
     pub keep: bool,
 }

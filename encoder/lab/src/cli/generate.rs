@@ -1,4 +1,4 @@
-//! `generate`: scenes, crops and photos whose contents are known.
+//! `generate`: scenes, crops and photos with known contents.
 
 use std::path::PathBuf;
 
@@ -14,30 +14,30 @@ use crate::generate::{self, crops, photos};
 /// `generate`.
 #[derive(Debug, Subcommand)]
 pub enum GenerateCommand {
-    /// A scene: Gaussians, photos, poses, and in `gt/` what is true about it.
+    /// A scene: Gaussians, photos, poses, and the labels in `gt/`.
     Scene(GenerateSceneArgs),
-    /// Crops of things with the words that are true of them, to train an encoder.
+    /// Crops of things with their words, to train an encoder.
     Crops(GenerateCropsArgs),
-    /// Photos with the thing at each pixel, to train a segmenter.
+    /// Photos with the id of the thing at each pixel, to train a segmenter.
     Photos(GeneratePhotosArgs),
 }
 
 /// `generate scene`.
 #[derive(Debug, Args)]
 pub struct GenerateSceneArgs {
-    /// Folder to write into; made if absent.
+    /// Output folder; created if absent.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// What kind of scene; several, separated by commas, are put side by side.
+    /// Kind of scene; several kinds, separated by commas, are placed side by side.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "room")]
     pub kind: Vec<SceneKind>,
-    /// Chooses what stands where and how it looks.
+    /// Seed of the contents and their looks.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-    /// Photos.
+    /// Number of photos.
     #[arg(long, value_name = "N", default_value_t = 36, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub n_views: u32,
-    /// Folder of object files (`NOUN.txt`) instead of those shipped.
+    /// Folder of object files (`NOUN.txt`) instead of the built-in ones.
     #[arg(long, value_name = "DIR")]
     pub objects: Option<PathBuf>,
 }
@@ -45,13 +45,13 @@ pub struct GenerateSceneArgs {
 /// `generate crops`.
 #[derive(Debug, Args)]
 pub struct GenerateCropsArgs {
-    /// Folder to write into; made if absent.
+    /// Output folder; created if absent.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// To learn from, or to test with.
+    /// For training or for testing.
     #[arg(long, value_enum, default_value = "train")]
     pub split: Split,
-    /// Scenes to take crops from.
+    /// Number of scenes to take crops from.
     #[arg(long, value_name = "N", default_value_t = 100)]
     pub n_scenes: u64,
     /// Seed of the first scene; the next ones count up.
@@ -60,7 +60,7 @@ pub struct GenerateCropsArgs {
     /// Edge of the crops, pixels.
     #[arg(long, value_name = "PX", default_value_t = 64, value_parser = clap::value_parser!(u32).range(8..=512))]
     pub edge: u32,
-    /// Folder of object files (`NOUN.txt`) instead of those shipped.
+    /// Folder of object files (`NOUN.txt`) instead of the built-in ones.
     #[arg(long, value_name = "DIR")]
     pub objects: Option<PathBuf>,
 }
@@ -68,16 +68,16 @@ pub struct GenerateCropsArgs {
 /// `generate photos`.
 #[derive(Debug, Args)]
 pub struct GeneratePhotosArgs {
-    /// Folder to write into; made if absent.
+    /// Output folder; created if absent.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Scenes to photograph.
+    /// Number of scenes to photograph.
     #[arg(long, value_name = "N", default_value_t = 100)]
     pub n_scenes: u64,
     /// Seed of the first scene; the next ones count up.
     #[arg(long, default_value_t = 2_000_000)]
     pub seed: u64,
-    /// Folder of object files (`NOUN.txt`) instead of those shipped.
+    /// Folder of object files (`NOUN.txt`) instead of the built-in ones.
     #[arg(long, value_name = "DIR")]
     pub objects: Option<PathBuf>,
 }

@@ -4,20 +4,11 @@ mod bench;
 mod demo;
 mod eval;
 mod generate;
-mod labelled;
-mod noise;
-mod tradeoff;
 
 use clap::{Parser, Subcommand};
 use slag_encoder::cli::{Exit, exit_of, progress};
 
-use bench::{CodecBenchArgs, FieldBenchArgs, LiftBenchArgs, RasterBenchArgs};
-use eval::{EvalEncoderArgs, EvalLerfArgs, EvalScannetArgs};
-use labelled::EvalLabelledArgs;
-use noise::EvalNoiseArgs;
-use tradeoff::TradeoffArgs;
-
-/// Generates scenes whose contents are known, judges encoders and stores by them, and measures this machine.
+/// Generates scenes with known contents, evaluates encoders and stores on them, and benchmarks this machine.
 #[derive(Debug, Parser)]
 #[command(version, propagate_version = true)]
 pub struct Cli {
@@ -27,13 +18,13 @@ pub struct Cli {
     /// Prints the result, or the error, as one JSON object.
     #[arg(long, global = true)]
     pub json: bool,
-    /// What to do.
+    /// The command.
     #[command(subcommand)]
     pub command: Command,
 }
 
 impl Cli {
-    /// Returns the log level where RUST_LOG does not say otherwise.
+    /// Returns the log level; RUST_LOG overrides it.
     pub fn log_level(&self) -> &'static str {
         if self.quiet { "warn" } else { "info" }
     }
@@ -44,70 +35,32 @@ impl Cli {
     }
 }
 
-/// What the program can do.
+/// The commands.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Measures answers against labels.
+    /// Evaluates answers against labels.
     #[command(subcommand)]
-    Eval(EvalCommand),
-    /// Makes scenes and crops whose contents are known.
+    Eval(eval::EvalCommand),
+    /// Generates scenes, crops and photos with known contents.
     #[command(subcommand)]
     Generate(generate::GenerateCommand),
-    /// Generates a house and yard, encodes, serves, fetches and asks: the whole system in one command.
+    /// Generates a house and yard, encodes, serves, fetches and queries them: the whole system in one command.
     Demo(demo::DemoArgs),
-    /// Measures this machine.
+    /// Benchmarks this machine.
     #[command(subcommand)]
-    Bench(BenchCommand),
+    Bench(bench::BenchCommand),
 }
 
-/// `eval`.
-#[derive(Debug, Subcommand)]
-pub enum EvalCommand {
-    /// Against a scene whose every Gaussian has a label (`generate scene` makes such).
-    Labelled(EvalLabelledArgs),
-    /// Against LangSplat's labels of LERF scenes (LERF-OVS).
-    Lerf(EvalLerfArgs),
-    /// Against ScanNet's labelled meshes, with OpenGaussian's protocol.
-    Scannet(EvalScannetArgs),
-    /// On crops of generated things: which noun, colour and material they show.
-    Encoder(EvalEncoderArgs),
-    /// How each way to aggregate falls with errors laid over true masks.
-    Noise(EvalNoiseArgs),
-}
-
-/// `bench`.
-#[derive(Debug, Subcommand)]
-pub enum BenchCommand {
-    /// Bytes against errors of the shards' codes, beside plain 8 bits and product quantisation.
-    Codec(CodecBenchArgs),
-    /// Publishes a store of a generated field, for `slag-edge bench query`.
-    Field(FieldBenchArgs),
-    /// Weights of a view: each device on generated scenes, or on a recorded one.
-    Raster(RasterBenchArgs),
-    /// From the sparse sums of all views to every Gaussian's embedding, on a made-up scene.
-    Lift(LiftBenchArgs),
-    /// What each choice of `encode` costs and gives, on labelled scenes: table, front and plots.
-    Tradeoff(TradeoffArgs),
-}
-
-/// Runs the program and says how it ended.
+/// Runs a command and returns the exit code.
 pub fn run(cli: Cli) -> Exit {
     let json = cli.json;
     let progress = progress::shown(cli.shows_progress());
     let progress = progress.as_ref();
     let result = match cli.command {
-        Command::Eval(EvalCommand::Labelled(args)) => labelled::run(&args, json),
-        Command::Eval(EvalCommand::Encoder(args)) => eval::run_encoder(&args, progress, json),
-        Command::Eval(EvalCommand::Lerf(args)) => eval::run_lerf(&args, json),
-        Command::Eval(EvalCommand::Scannet(args)) => eval::run_scannet(&args, json),
-        Command::Eval(EvalCommand::Noise(args)) => noise::run(&args, progress, json),
+        Command::Eval(command) => eval::run(&command, progress, json),
         Command::Generate(command) => generate::run(&command, progress),
         Command::Demo(args) => demo::run(&args, progress, json),
-        Command::Bench(BenchCommand::Raster(args)) => bench::run_raster(&args, progress, json),
-        Command::Bench(BenchCommand::Lift(args)) => bench::run_lift(&args, json),
-        Command::Bench(BenchCommand::Codec(args)) => bench::run_codec(&args, json),
-        Command::Bench(BenchCommand::Field(args)) => bench::run_field(&args, progress),
-        Command::Bench(BenchCommand::Tradeoff(args)) => tradeoff::run(&args, progress, json),
+        Command::Bench(command) => bench::run(&command, progress, json),
     };
     exit_of(result, json)
 }

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 use slag_models::{Crop, EncodeError, ModelDir, ModelError, SessionOptions};
 
-use super::ABSENT;
+use super::settings::ABSENT;
 use crate::generate::crops::{self, Label, Split};
 use crate::generate::grammar::Noun;
 use crate::generate::paint::{Colour, Material};

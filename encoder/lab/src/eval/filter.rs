@@ -1,4 +1,4 @@
-//! Prediction filtering as in the paper: the Gaussians of a superpoint answer together.
+//! The paper's prediction filter: the Gaussians of a superpoint answer together.
 
 use std::collections::BTreeMap;
 
@@ -8,13 +8,13 @@ use slag_encoder::lift::superpoint::{NO_SUPERPOINT, Superpoints};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
 pub enum Filter {
-    /// The class that most of them have; of equally many, the first of the list.
+    /// All take the most frequent class; ties go to the first of the list.
     Majority,
-    /// All have their mean score.
+    /// All take the mean score.
     Mean,
 }
 
-/// Gives all Gaussians of a superpoint the mean of those scores that are not NaN.
+/// Gives all Gaussians of a superpoint the mean of their scores, NaN left out.
 pub(super) fn average(scores: &mut [f32], superpoints: &Superpoints) {
     let mut sums = vec![(0.0f64, 0u32); superpoints.n];
     for (score, superpoint) in scores.iter().zip(&superpoints.of_gaussian) {
@@ -31,7 +31,7 @@ pub(super) fn average(scores: &mut [f32], superpoints: &Superpoints) {
     }
 }
 
-/// Gives all Gaussians of a superpoint the class that most of them have.
+/// Gives all Gaussians of a superpoint their most frequent class.
 pub(super) fn vote(classes: &mut [Option<usize>], superpoints: &Superpoints) {
     let mut votes: Vec<BTreeMap<usize, usize>> = vec![BTreeMap::new(); superpoints.n];
     for (class, superpoint) in classes.iter().zip(&superpoints.of_gaussian) {

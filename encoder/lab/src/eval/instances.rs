@@ -1,21 +1,21 @@
-//! How many of the true things objects find: instance recall.
+//! Instance recall: the share of the true things that objects find.
 
 use std::collections::BTreeMap;
 use std::fmt;
 
 use serde::Serialize;
 
-use super::Truth;
+use super::truth::Truth;
 use slag_encoder::objects::NONE;
 
-/// Things that were found.
+/// Counts of things found.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Recall {
-    /// Things there are.
+    /// All things.
     pub n: usize,
-    /// With an intersection over union of at least 0.25.
+    /// Things found with an intersection over union of at least 0.25.
     pub n_at_25: usize,
-    /// Of at least 0.5.
+    /// Things found with at least 0.5.
     pub n_at_50: usize,
 }
 
@@ -36,18 +36,19 @@ impl fmt::Display for Recall {
 /// Instance recall of objects, over sets of Gaussians.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct InstanceReport {
-    /// Objects.
+    /// Number of objects.
     pub n_objects: usize,
-    /// By any object, whatever it is called: how well the scene was taken apart.
+    /// Recall by any object, whatever its word: the quality of the segmentation alone.
     pub any: Recall,
-    /// By an object that reaches the threshold with the thing's word.
+    /// Recall by objects that reach the threshold for the thing's word.
     pub of_words: Recall,
-    /// By one of the word's n best objects, n being the things of that word.
+    /// Recall by the word's n best objects, where n is the number of things with that word.
     pub best_of_words: Recall,
 }
 
-/// Compares things with objects. `object_of`: each Gaussian's, `classes`: words with their things' ids, `scores`: of
-/// each word and object.
+/// Compares things with objects.
+///
+/// `object_of`: the object of each Gaussian; `classes`: words with the ids of their things; `scores`: by word and object.
 pub(super) fn report(
     truth: &Truth,
     object_of: &[u32],
@@ -75,7 +76,7 @@ pub(super) fn report(
         of_thing.map(iou).fold(0.0, f64::max)
     };
     let [mut any, mut of_words, mut best_of_words] = [Recall::default(); 3];
-    // What has no Gaussian cannot be found by any.
+    // Things without Gaussians cannot be found.
     let things = truth.things.iter().map(|thing| thing.id).filter(|id| n_of_thing.contains_key(id));
     things.for_each(|thing| any.count(best_iou(thing, &|_| true)));
     for ((_, ids), scores) in classes.iter().zip(scores) {
@@ -94,7 +95,7 @@ pub(super) fn report(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::eval::Thing;
+    use crate::eval::truth::Thing;
 
     /// By hand: thing 7 (Gaussians 0..4) is object 0 but for one; thing 8 (4..8) is split between 1 and 2; thing 9 has
     /// no Gaussian; 8..10 are wall, which object 2 has too.

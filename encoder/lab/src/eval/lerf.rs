@@ -19,27 +19,28 @@ use slag_common::gaussians::SH_C0;
 use slag_common::{Gaussians, View};
 use slag_models::TextEncoder;
 
+use super::error::{EvalError, check_scene};
 use super::metrics::{iou_of_sets, mean};
-use super::{EvalError, EvalSettings};
+use super::settings::EvalSettings;
 use slag_encoder::query;
 use slag_encoder::raster::constants::MAX_IMAGE_PX;
 use slag_encoder::raster::{LoadedScene, RasterError, RasterView, Rasterizer};
 use slag_encoder::store::StoreReader;
 
-/// Hidden share from which a drawn pixel counts as found: OpenGaussian's `render_lerf_by_text.py`.
+/// Alpha from which a drawn pixel counts as found: OpenGaussian's `render_lerf_by_text.py`.
 const MIN_COVERAGE: f32 = 0.7;
-/// Side of the square that scores are averaged over before the best one is sought: LangSplat's.
+/// Side of the square over which scores are averaged before the maximum is taken: LangSplat's.
 const SMOOTHING_PX: usize = 30;
 /// Widest difference of aspect between a label and its view.
 const MAX_ASPECT_ERROR: f64 = 0.01;
 
-/// Why labels cannot be used.
+/// Error in the labels.
 #[derive(Debug, thiserror::Error)]
 pub enum LerfError {
     /// A file could not be read.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// A label is not as expected.
+    /// A label is malformed.
     #[error("{}: {what}; expected info {{name, width, height}} and objects [{{category, bbox, segmentation}}]", path.display())]
     Label {
         /// The file.
@@ -47,20 +48,20 @@ pub enum LerfError {
         /// What was found.
         what: String,
     },
-    /// There are none.
+    /// The folder has no labels.
     #[error("{}: no frame_*.json; give the scene's folder under lerf_ovs/label", dir.display())]
     NoLabels {
         /// The folder.
         dir: PathBuf,
     },
-    /// None of them belongs to a view.
+    /// No labelled frame has a pose.
     #[error("{}: none of {n} labelled frames has a pose, the first is {first}; give the poses of the same scene", dir.display())]
     NoViews {
         /// The folder.
         dir: PathBuf,
         /// Labelled frames.
         n: usize,
-        /// The first one's name.
+        /// Name of the first.
         first: String,
     },
 }
@@ -68,7 +69,7 @@ pub enum LerfError {
 /// A thing on a frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelledThing {
-    /// What it is called.
+    /// Its category.
     pub category: String,
     /// Its pixels, row-major.
     pub mask: Vec<bool>,
@@ -92,7 +93,7 @@ pub struct LabelledFrame {
 pub struct LerfLabels {
     /// Frames that have a pose.
     pub frames: Vec<LabelledFrame>,
-    /// Names of those that have none.
+    /// Names of frames without a pose.
     pub without_view: Vec<String>,
 }
 
@@ -285,7 +286,7 @@ pub fn lerf(
     rasterizer: &dyn Rasterizer,
     settings: &EvalSettings,
 ) -> Result<LerfReport, EvalError> {
-    super::check_scene(reader, scene)?;
+    check_scene(reader, scene)?;
     let threshold = settings.threshold.unwrap_or(reader.manifest().encoder.default_threshold);
     let mut words: Vec<&str> =
         labels.frames.iter().flat_map(|f| f.things.iter().map(|t| t.category.as_str())).collect();
@@ -425,12 +426,12 @@ impl fmt::Display for LerfReport {
             show(self.localised)
         )?;
         for (word, reason) in &self.unknown_words {
-            writeln!(f, "counted as not found, the encoder does not know it: {word} ({reason})")?;
+            writeln!(f, "counted as not found because the encoder does not know it: {word} ({reason})")?;
         }
         for frame in &self.frames_without_view {
-            writeln!(f, "left out, no pose: {frame}")?;
+            writeln!(f, "left out without a pose: {frame}")?;
         }
-        writeln!(f, "{}", super::NO_PAPER_ROWS)
+        Ok(())
     }
 }
 

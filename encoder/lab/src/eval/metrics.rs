@@ -1,6 +1,6 @@
-//! Measures of agreement with labels.
+//! Measures of agreement between answers and labels.
 
-/// Returns the area under the ROC curve, ties counted half (Mann and Whitney 1947); `None` without both kinds.
+/// Returns the area under the ROC curve, ties counted half (Mann and Whitney 1947); `None` without both positives and negatives.
 pub fn area_under_roc(scores: &[f32], positive: &[bool]) -> Option<f64> {
     let n_positive = positive.iter().filter(|p| **p).count() as f64;
     let n_negative = positive.len() as f64 - n_positive;
@@ -44,7 +44,7 @@ fn descending(scores: &[f32]) -> Vec<usize> {
     order
 }
 
-/// Counts of what was answered, by what is true.
+/// A confusion matrix: answers by true class.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Confusion {
     n_classes: usize,
@@ -53,12 +53,12 @@ pub struct Confusion {
 }
 
 impl Confusion {
-    /// Starts with nothing counted.
+    /// Returns an empty matrix.
     pub fn new(n_classes: usize) -> Self {
         Self { n_classes, counts: vec![0; n_classes * (n_classes + 1)] }
     }
 
-    /// Counts one; `answer`: `None` where there is none, which is wrong.
+    /// Counts an answer; `None` is a wrong one.
     pub fn count(&mut self, truth: usize, answer: Option<usize>) {
         self.counts[truth * (self.n_classes + 1) + answer.unwrap_or(self.n_classes)] += 1;
     }
@@ -67,7 +67,7 @@ impl Confusion {
         &self.counts[truth * (self.n_classes + 1)..(truth + 1) * (self.n_classes + 1)]
     }
 
-    /// Returns the intersection over union of a class; `None` where it is neither true nor answered.
+    /// Returns the intersection over union of a class; `None` where it neither occurs nor is answered.
     pub fn iou(&self, class: usize) -> Option<f64> {
         let both = self.row(class)[class];
         let is_true: u64 = self.row(class).iter().sum();
@@ -76,14 +76,14 @@ impl Confusion {
         (union > 0).then(|| both as f64 / union as f64)
     }
 
-    /// Returns the part of a class that is answered rightly; `None` where it is never true.
+    /// Returns the share of a class that is answered correctly; `None` where the class does not occur.
     pub fn accuracy(&self, class: usize) -> Option<f64> {
         let is_true: u64 = self.row(class).iter().sum();
         (is_true > 0).then(|| self.row(class)[class] as f64 / is_true as f64)
     }
 }
 
-/// Returns the mean of what is there; `None` of nothing.
+/// Returns the mean of the values that are present; `None` without any.
 pub fn mean(values: impl IntoIterator<Item = Option<f64>>) -> Option<f64> {
     let (sum, n) = values.into_iter().flatten().fold((0.0, 0), |(sum, n), v| (sum + v, n + 1));
     (n > 0).then(|| sum / f64::from(n))

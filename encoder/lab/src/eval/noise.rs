@@ -1,5 +1,5 @@
-//! How each way to aggregate falls with the errors of masks: true masks are damaged ([`MaskNoise`]), encoded
-//! once a level, and lifted once a way.
+//! Accuracy of each way to aggregate against errors in the masks. True masks are damaged ([`MaskNoise`]), encoded once per
+//! level of noise, and lifted once per way.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -9,15 +9,19 @@ use serde::Serialize;
 use slag_common::splat::{self, SplatError};
 use slag_models::{ModelDir, ModelError, SessionOptions};
 
+use super::error::EvalError;
+use super::labelled::labelled;
 use super::mask_noise::MaskNoise;
-use super::{EvalError, EvalSettings, Truth, TruthError, labelled, metrics::mean};
+use super::metrics::mean;
+use super::settings::EvalSettings;
+use super::truth::{Truth, TruthError};
 use slag_encoder::encode::{self, EncodeError, EncodeSettings, Engines, Masks, Perturbation};
 use slag_encoder::lift::Aggregation;
 use slag_encoder::progress::Silent;
 use slag_encoder::raster::{CpuRasterizer, Rasterizer};
 use slag_encoder::store::{StoreError, StoreReader};
 
-/// Why there is no table.
+/// Error of the comparison.
 #[derive(Debug, thiserror::Error)]
 pub enum NoiseError {
     /// A folder is no labelled scene.

@@ -12,16 +12,18 @@ use slag_common::{Distortion, Gaussians, Intrinsics, poses, splat};
 use slag_models::{EncodeError, ModelDir, SessionOptions, TextEncoder};
 
 use super::lerf::{LerfLabels, lerf};
-use super::scannet::{Matching, Scan, ScannetReport, scannet};
+use super::scan::Scan;
+use super::scannet::{Matching, ScannetReport, scannet};
 use super::*;
 use slag_encoder::cells::CellLimits;
 use slag_encoder::codebook::CodebookSettings;
 use slag_encoder::encode::{self, CellSettings, EncodeSettings, Engines, Masks};
 use slag_encoder::lift::Aggregation;
 use slag_encoder::progress::Silent;
-use slag_encoder::raster::CpuRasterizer;
+use slag_encoder::raster::{CpuRasterizer, RasterView, Rasterizer};
 use slag_encoder::shard::ShardSettings;
 use slag_encoder::shard::positions::PositionError;
+use slag_encoder::store::StoreReader;
 
 /// Gaussians across and down, 0.1 m apart, 2 m in front of the camera.
 const COLUMNS: usize = 24;

@@ -1,31 +1,23 @@
 //! ScanNet v2 (Dai et al. 2017) with the protocol of OpenGaussian (Wu et al. 2024): ten scenes, 19, 15 and 10 classes,
 //! argmax over the classes' words, means over the classes that a scene has.
 //!
-//! ```text
-//! SCAN/NAME_vh_clean_2.labels.ply               vertices x y z label (NYU40); or, with the table of categories:
-//! SCAN/NAME_vh_clean_2.ply                      vertices x y z
-//! SCAN/NAME_vh_clean_2.0.010000.segs.json       segIndices: the segment of each vertex
-//! SCAN/NAME.aggregation.json                    segGroups [{label, segments}]
-//! scannetv2-labels.combined.tsv                 raw_category ... nyu40id
-//! ```
-//!
 //! OpenGaussian trains with Gaussians fixed to the mesh's vertices and compares one by one; other splats give each
 //! vertex the answer of the nearest Gaussian. Gaussians with an opacity below [`MIN_OPACITY`] do not count there, as in
 //! its `scripts/eval_scannet.py`.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fmt;
-use std::path::{Path, PathBuf};
 
 use glam::DVec3;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use slag_common::Gaussians;
-use slag_common::splat::SplatError;
-use slag_common::splat::ply::read_vertices;
 use slag_models::TextEncoder;
 
+use super::error::{EvalError, check_scene};
 use super::metrics::{Confusion, mean};
-use super::{EvalError, EvalSettings, Subset};
+use super::report::Subset;
+use super::scan::{Scan, ScanError};
+use super::settings::EvalSettings;
 use slag_encoder::query;
 use slag_encoder::store::StoreReader;
 
@@ -67,180 +59,16 @@ const CLASSES: [(u16, &str); 19] = [
 /// Ids of the 15 classes, and of the 10.
 const IDS_OF_15: [u16; 15] = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16, 33, 34];
 const IDS_OF_10: [u16; 10] = [1, 2, 4, 5, 6, 7, 8, 9, 10, 33];
-/// Gaussians that are more transparent take no part.
+/// More transparent Gaussians are ignored.
 const MIN_OPACITY: f32 = 0.1;
-/// A vertex farther from every Gaussian has no answer.
+/// Farther from every Gaussian, a vertex has no answer.
 const MAX_DISTANCE_M: f64 = 0.1;
-/// Largest NYU40 id.
-const MAX_ID: u16 = 40;
-
-/// Why a scan cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum ScanError {
-    /// A file could not be read.
-    #[error(transparent)]
-    Io(#[from] std::io::Error),
-    /// A mesh cannot be read.
-    #[error(transparent)]
-    Mesh(#[from] SplatError),
-    /// A file is not as expected.
-    #[error("{}: {what}", path.display())]
-    Wrong {
-        /// The file.
-        path: PathBuf,
-        /// What was found, expected, and is to be done.
-        what: String,
-    },
-    /// Gaussians cannot be compared one by one.
-    #[error(
-        "{}: {n_vertices} vertices, the splat has {n_gaussians} Gaussians; only a splat that was trained with its \
-         Gaussians fixed to the vertices can be compared one by one, leave --by-index out", dir.display()
-    )]
-    Length {
-        /// The scan.
-        dir: PathBuf,
-        /// Its vertices.
-        n_vertices: usize,
-        /// Gaussians of the splat.
-        n_gaussians: usize,
-    },
-}
-
-/// A labelled mesh.
-#[derive(Clone, Debug)]
-pub struct Scan {
-    /// The scene's name.
-    pub name: String,
-    dir: PathBuf,
-    /// The vertices, world frame, metres.
-    pub vertices: Vec<[f64; 3]>,
-    /// `[N]`: NYU40 id of each, 0 where there is none.
-    pub labels: Vec<u16>,
-    /// Labels of segments that the table of categories does not have: their vertices count as not labelled.
-    pub unknown_labels: BTreeMap<String, usize>,
-}
-
-#[derive(Deserialize)]
-struct Segments {
-    #[serde(rename = "segIndices")]
-    of_vertex: Vec<u32>,
-}
-
-#[derive(Deserialize)]
-struct Aggregation {
-    #[serde(rename = "segGroups")]
-    groups: Vec<Group>,
-}
-
-#[derive(Deserialize)]
-struct Group {
-    label: String,
-    segments: Vec<u32>,
-}
-
-impl Scan {
-    /// Reads a scan; `categories`: the data set's table, where there is no labelled mesh.
-    ///
-    /// # Errors
-    /// [`ScanError`].
-    pub fn read(dir: &Path, categories: Option<&Path>) -> Result<Self, ScanError> {
-        let name = dir.canonicalize()?.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let scan = |vertices, labels, unknown_labels| Self {
-            name: name.clone(),
-            dir: dir.to_owned(),
-            vertices,
-            labels,
-            unknown_labels,
-        };
-        let path = dir.join(format!("{name}_vh_clean_2.labels.ply"));
-        if !path.is_file() {
-            let Some(categories) = categories else {
-                let what = "is not there; give it, or scannetv2-labels.combined.tsv with --categories".into();
-                return Err(ScanError::Wrong { path, what });
-            };
-            return Self::of_segments(dir, &name, categories).map(|(v, l, u)| scan(v, l, u));
-        }
-        let rows = read_vertices(&path, ["x", "y", "z", "label"])?;
-        if let Some(row) = rows.iter().find(|row| !(0.0..=f64::from(MAX_ID)).contains(&row[3])) {
-            let what =
-                format!("label {}, expected 0 to {MAX_ID} (NYU40); take the file of the v2 release", row[3]);
-            return Err(ScanError::Wrong { path, what });
-        }
-        let (vertices, labels) = rows.iter().map(|[x, y, z, label]| ([*x, *y, *z], *label as u16)).unzip();
-        Ok(scan(vertices, labels, BTreeMap::new()))
-    }
-
-    #[expect(clippy::type_complexity, reason = "what a scan is made of, once")]
-    fn of_segments(
-        dir: &Path,
-        name: &str,
-        categories: &Path,
-    ) -> Result<(Vec<[f64; 3]>, Vec<u16>, BTreeMap<String, usize>), ScanError> {
-        let wrong = |path: &Path, what: String| ScanError::Wrong { path: path.to_owned(), what };
-        let id_of = read_categories(categories)?;
-        let vertices = read_vertices(&dir.join(format!("{name}_vh_clean_2.ply")), ["x", "y", "z"])?;
-        let path = dir.join(format!("{name}_vh_clean_2.0.010000.segs.json"));
-        let segments: Segments = serde_json::from_slice(&fs_err::read(&path)?)
-            .map_err(|error| wrong(&path, format!("{error}; expected segIndices, one a vertex")))?;
-        if segments.of_vertex.len() != vertices.len() {
-            let what = format!(
-                "{} segments, expected one for each of {} vertices; take both files of one release",
-                segments.of_vertex.len(),
-                vertices.len()
-            );
-            return Err(wrong(&path, what));
-        }
-        let path =
-            [".aggregation.json", "_vh_clean.aggregation.json"].map(|end| dir.join(format!("{name}{end}")));
-        let path = path.iter().find(|path| path.is_file()).unwrap_or(&path[0]);
-        let aggregation: Aggregation = serde_json::from_slice(&fs_err::read(path)?).map_err(|error| {
-            wrong(path, format!("{error}; expected segGroups, each with label and segments"))
-        })?;
-        let mut id_of_segment: HashMap<u32, u16> = HashMap::new();
-        let mut unknown: HashMap<u32, &str> = HashMap::new();
-        for group in &aggregation.groups {
-            for segment in &group.segments {
-                match id_of.get(&group.label) {
-                    Some(id) => drop(id_of_segment.insert(*segment, *id)),
-                    None => drop(unknown.insert(*segment, &group.label)),
-                }
-            }
-        }
-        let mut unknown_labels: BTreeMap<String, usize> = BTreeMap::new();
-        for segment in &segments.of_vertex {
-            if let Some(label) = unknown.get(segment) {
-                *unknown_labels.entry((*label).to_owned()).or_default() += 1;
-            }
-        }
-        let labels = segments.of_vertex.iter().map(|s| id_of_segment.get(s).copied().unwrap_or(0)).collect();
-        Ok((vertices, labels, unknown_labels))
-    }
-}
-
-/// Reads which NYU40 id each of the annotators' categories has.
-fn read_categories(path: &Path) -> Result<HashMap<String, u16>, ScanError> {
-    let wrong = |what: &str| ScanError::Wrong { path: path.to_owned(), what: what.to_owned() };
-    let text = fs_err::read_to_string(path)?;
-    let mut lines = text.lines();
-    let head: Vec<&str> = lines.next().unwrap_or_default().split('\t').collect();
-    let column = |name: &str| head.iter().position(|found| *found == name);
-    let (Some(raw), Some(id)) = (column("raw_category"), column("nyu40id")) else {
-        return Err(wrong("no columns raw_category and nyu40id; give scannetv2-labels.combined.tsv"));
-    };
-    let row = |line: &str| {
-        let cells: Vec<&str> = line.split('\t').collect();
-        let id = cells.get(id)?.parse().ok().filter(|id| *id <= MAX_ID)?;
-        Some(((*cells.get(raw)?).to_owned(), id))
-    };
-    Ok(lines.filter_map(row).collect())
-}
-
-/// Which Gaussian answers for a vertex.
+/// The Gaussian that answers for a vertex.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Matching {
-    /// The one with the vertex's number.
+    /// The Gaussian with the vertex's index.
     Index,
-    /// The nearest.
+    /// The nearest Gaussian.
     Nearest,
 }
 
@@ -253,11 +81,11 @@ pub struct ScanReport {
     pub subsets: Vec<Subset>,
     /// Labelled vertices of the 19 classes.
     pub n_labelled: usize,
-    /// Of these, without an answer: no Gaussian near, or one without evidence. They count as wrong.
+    /// Labelled vertices without an answer, because no Gaussian is near or it has no evidence; they count as wrong.
     pub n_without_answer: usize,
-    /// Labels that the table of categories does not have, and their vertices: not counted.
+    /// Labels that the table of categories lacks, with their vertices, which are not counted.
     pub unknown_labels: BTreeMap<String, usize>,
-    /// Classes whose words the encoder does not know, and why: they count as never found.
+    /// Classes with words that the encoder does not know, and why; they count as never found.
     pub unknown_words: BTreeMap<String, String>,
 }
 
@@ -268,11 +96,13 @@ pub struct ScannetReport {
     pub scenes: Vec<ScanReport>,
     /// Means over the scenes, of 19, 15 and 10 classes.
     pub means: Vec<Subset>,
-    /// Scenes of the protocol that are not among them.
+    /// Scenes of the protocol that were not evaluated.
     pub missing_scenes: Vec<&'static str>,
 }
 
-/// Evaluates a store against a labelled mesh. `scene`: the splat that was encoded, in the mesh's frame.
+/// Evaluates a store against a labelled mesh.
+///
+/// `scene` is the splat that was encoded, in the mesh's frame.
 ///
 /// # Errors
 /// [`EvalError`].
@@ -284,7 +114,7 @@ pub fn scannet(
     matching: Matching,
     settings: &EvalSettings,
 ) -> Result<ScanReport, EvalError> {
-    super::check_scene(reader, scene)?;
+    check_scene(reader, scene)?;
     let gaussian_of = match matching {
         Matching::Index => by_index(scan, scene)?,
         Matching::Nearest => by_distance(scan, scene),
@@ -453,15 +283,23 @@ impl fmt::Display for ScannetReport {
                 )?;
             }
             for (label, n) in &scene.unknown_labels {
-                writeln!(f, "{}: {n} vertices left out, the categories have no {label:?}", scene.scene)?;
+                writeln!(
+                    f,
+                    "{}: {n} vertices left out: the table of categories has no {label:?}",
+                    scene.scene
+                )?;
             }
             for (word, reason) in &scene.unknown_words {
                 writeln!(f, "{}: counted as never found: {word} ({reason})", scene.scene)?;
             }
         }
         if !self.missing_scenes.is_empty() {
-            writeln!(f, "not the protocol's mean: without {}", self.missing_scenes.join(", "))?;
+            writeln!(
+                f,
+                "the means differ from the protocol's: {} were not evaluated",
+                self.missing_scenes.join(", ")
+            )?;
         }
-        writeln!(f, "{}", super::NO_PAPER_ROWS)
+        Ok(())
     }
 }

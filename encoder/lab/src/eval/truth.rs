@@ -1,4 +1,4 @@
-//! What is true of a scene: which thing each Gaussian belongs to, and what is on views kept for tests.
+//! A scene's labels: the thing of each Gaussian, and the things on the held-out test views.
 //!
 //! ```text
 //! DIR/gt/instances.json           things: id, category, aabb_min, aabb_max; "background": floors and walls
@@ -15,13 +15,13 @@ use serde::Deserialize;
 use slag_common::View;
 use slag_common::poses::{self, PoseError};
 
-/// Why the truth cannot be used.
+/// Error in the labels.
 #[derive(Debug, thiserror::Error)]
 pub enum TruthError {
     /// A file could not be read.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// The list of things is not as expected.
+    /// The list of things is malformed.
     #[error("{}: {source}; expected instances and background, each with id and category", path.display())]
     Instances {
         /// The file.
@@ -29,25 +29,25 @@ pub enum TruthError {
         /// Line, column and reason.
         source: serde_json::Error,
     },
-    /// The Gaussians' ids are not as expected.
-    #[error("{}: {reason}; expected u16 ids of shape [{n_gaussians}], one a Gaussian of the splat", path.display())]
+    /// The Gaussians' ids are malformed.
+    #[error("{}: {reason}; expected u16 ids of shape [{n_gaussians}], one per Gaussian of the splat", path.display())]
     Ids {
         /// The file.
         path: PathBuf,
-        /// What was found.
+        /// The problem.
         reason: String,
-        /// Gaussians of the scene.
+        /// Gaussians in the splat.
         n_gaussians: usize,
     },
     /// The test views' poses cannot be read.
     #[error(transparent)]
     Poses(#[from] PoseError),
-    /// A test view's mask cannot be used.
-    #[error("{}: {reason}; expected ids at each pixel of the view", path.display())]
+    /// A test view's mask is malformed.
+    #[error("{}: {reason}; expected an id at each pixel of the view", path.display())]
     Mask {
         /// The file.
         path: PathBuf,
-        /// What was found.
+        /// The problem.
         reason: String,
     },
 }
@@ -55,9 +55,9 @@ pub enum TruthError {
 /// A thing.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Thing {
-    /// Its number.
+    /// Its id.
     pub id: u16,
-    /// What it is.
+    /// Its category.
     pub category: String,
     /// Smallest corner of the box around it, metres.
     #[serde(default)]
@@ -77,13 +77,13 @@ pub struct Truth {
     pub things: Vec<Thing>,
     /// Floors, walls and the like.
     pub background: Vec<Thing>,
-    /// `[N]`: the id of each Gaussian's thing, of no thing where there is none.
+    /// `[N]`: the id of each Gaussian's thing; an id without a thing where there is none.
     pub id_of_gaussian: Vec<u16>,
-    /// Views that were kept for tests, with their ids.
+    /// Held-out test views with their ids.
     pub views: Vec<LabelledView>,
 }
 
-/// A view with the thing at each pixel.
+/// A view with the id of the thing at each pixel.
 #[derive(Clone, Debug)]
 pub struct LabelledView {
     /// The view.
@@ -122,7 +122,7 @@ impl Truth {
         Ok(Self { things: instances, background, id_of_gaussian, views })
     }
 
-    /// Returns the categories of things, most Gaussians first, each with its things' ids.
+    /// Returns the categories with the ids of their things, those with most Gaussians first.
     pub fn categories(&self) -> Vec<(String, Vec<u16>)> {
         let mut n_of_id: BTreeMap<u16, usize> = BTreeMap::new();
         self.id_of_gaussian.iter().for_each(|id| *n_of_id.entry(*id).or_default() += 1);

@@ -12,6 +12,10 @@ use slag_math::random::Xorshift;
 use super::solid::{Part, Shape};
 use slag_encoder::raster::RasterView;
 
+/// Size of the photos.
+pub(super) const PHOTO_PX: [u32; 2] = [640, 480];
+/// Horizontal field of view, 75 degrees: a phone's wide camera.
+pub(super) const FIELD_OF_VIEW_RAD: f64 = 75.0 * std::f64::consts::PI / 180.0;
 /// Height of a walking camera over the ground.
 const CAMERA_HEIGHT_M: f64 = 1.5;
 /// Between things on the ground, so that one can walk around them.

@@ -13,9 +13,9 @@ use slag_models::preprocess::{Filter, Preprocess, Resize};
 
 use super::compose::{Layout, looking, pinhole};
 use super::grammar::Noun;
+use super::output::{GenerateError, write_npy};
 use super::paint::{Colour, Material};
 use super::render::{NOTHING, Photo, Solids};
-use super::{GenerateError, write_npy};
 use slag_encoder::embed::{self, Background};
 use slag_encoder::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
 use slag_encoder::progress::Progress;

@@ -4,10 +4,10 @@ use std::path::Path;
 
 use rayon::prelude::*;
 
-use super::compose::{Layout, pinhole};
+use super::compose::{FIELD_OF_VIEW_RAD, Layout, PHOTO_PX, pinhole};
 use super::grammar::Noun;
+use super::output::{GenerateError, write_npy};
 use super::render::{NOTHING, Photo};
-use super::{FIELD_OF_VIEW_RAD, GenerateError, PHOTO_PX, write_npy};
 use slag_encoder::progress::Progress;
 use slag_math::random::Xorshift;
 

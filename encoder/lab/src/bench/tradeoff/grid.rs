@@ -1,4 +1,4 @@
-//! The grid as data: which flags are tried. A file of one's own is as good as those that are built in.
+//! The grid of flags to measure: built in, or read from a file.
 //!
 //! ```json
 //! {"points": [{
@@ -9,19 +9,19 @@
 //! }]}
 //! ```
 //!
-//! `axis` is the curve of the plots that a point belongs to; `views` are flags of `encode` on which the views' sums
-//! depend, `lift` those that only change what is made of the sums; `eval` are flags of `eval labelled`; the shards of
-//! `profile` are judged, weighed and asked. All profiles are made, because the exact one says which Gaussian is which.
+//! `axis` names the curve of the plots that a point belongs to. `views` are the flags of `encode` that change the views'
+//! contributions; `lift` are its other flags; `eval` are flags of `eval labelled`. The shards of `profile` are evaluated,
+//! measured and queried. All profiles are made, because the exact shards tell which Gaussian is which.
 //!
-//! `{masks}` is the scene's folder of true masks. Points of the same scene with the same `views` share one store, and
-//! their sums are computed once.
+//! `{masks}` stands for the scene's folder of true masks. Points of a scene with the same `views` share one store, and
+//! their contributions are computed once.
 
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use slag_common::shard::Profile;
 
-use super::TradeoffError;
+use super::error::TradeoffError;
 
 const QUICK: &str = include_str!("quick.json");
 const FULL: &str = include_str!("full.json");
@@ -30,7 +30,7 @@ const FULL: &str = include_str!("full.json");
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Grid {
-    /// The points; those that share sums need not be neighbours.
+    /// The points, in any order.
     pub points: Vec<Point>,
 }
 
@@ -38,11 +38,11 @@ pub struct Grid {
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct Point {
-    /// What is varied.
+    /// The varied setting.
     pub axis: String,
-    /// How.
+    /// Its value.
     pub name: String,
-    /// Flags of `encode` on which sums depend.
+    /// Flags of `encode` that change contributions.
     #[serde(default)]
     pub views: String,
     /// Other flags of `encode`.
@@ -51,7 +51,7 @@ pub struct Point {
     /// Flags of `eval labelled`.
     #[serde(default)]
     pub eval: String,
-    /// Which shards count.
+    /// Profile of the evaluated shards.
     #[serde(default = "compact")]
     pub profile: Profile,
 }
@@ -61,19 +61,18 @@ fn compact() -> Profile {
 }
 
 impl Grid {
-    /// Returns the grid for a first look: ten minutes on two cores for a scene of a hundred thousand Gaussians and
-    /// a hundred views with given masks.
+    /// Returns a small grid: ten minutes on two cores for a scene of 100,000 Gaussians and 100 views with given masks.
     ///
     /// # Errors
-    /// None; a test reads it.
+    /// None: a test parses the built-in grid.
     pub fn quick() -> Result<Self, TradeoffError> {
         Self::parse(QUICK, Path::new("quick.json"))
     }
 
-    /// Returns the grid that the docs' figures are from.
+    /// Returns the grid behind the figures in the documentation.
     ///
     /// # Errors
-    /// None; a test reads it.
+    /// None: a test parses the built-in grid.
     pub fn full() -> Result<Self, TradeoffError> {
         Self::parse(FULL, Path::new("full.json"))
     }
@@ -113,7 +112,7 @@ pub struct LabelledScene {
 }
 
 impl LabelledScene {
-    /// Looks what a folder holds.
+    /// Finds the files of a labelled scene in a folder.
     ///
     /// # Errors
     /// [`TradeoffError::Scene`].
@@ -132,15 +131,15 @@ impl LabelledScene {
         Ok(Self { name, dir: dir.to_owned(), splat, poses })
     }
 
-    /// Returns the folder of true masks, where there is one.
+    /// Returns the folder of true masks, if present.
     pub fn masks(&self) -> Option<PathBuf> {
         Some(self.dir.join("gt/masks")).filter(|path| path.is_dir())
     }
 
-    /// Puts the scene's own values into flags; `None` where it lacks them.
+    /// Replaces the placeholders in flags; `None` where the scene lacks the value.
     ///
     /// # Errors
-    /// [`TradeoffError::Flags`] for a placeholder that nobody knows.
+    /// [`TradeoffError::Flags`] for an unknown placeholder.
     pub fn expand(&self, flags: &str) -> Result<Option<Vec<String>>, TradeoffError> {
         let unknown = |word: &str| TradeoffError::Flags { flags: flags.to_owned(), word: word.to_owned() };
         let mut words = Vec::new();

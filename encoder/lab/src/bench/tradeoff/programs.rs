@@ -1,4 +1,4 @@
-//! The programs, as a user runs them.
+//! Runs the programs as a user does.
 
 use std::ffi::OsStr;
 use std::io::{BufRead, BufReader};
@@ -8,26 +8,26 @@ use std::process::{Child, Command, Stdio};
 use serde_json::Value;
 use slag_common::shard::Profile;
 
-use super::TradeoffError;
+use super::error::TradeoffError;
 use super::grid::{LabelledScene, Point};
 
-/// Gaussians that a timed query asks for.
+/// Number of Gaussians that a timed query returns.
 const QUERY_LIMIT: &str = "1000";
 /// Timed queries.
 const QUERY_RUNS: &str = "40";
 
-/// Where the programs are, and what every run of them is told.
+/// Paths of the programs and their common flags.
 #[derive(Clone, Debug)]
 pub struct Programs {
     /// `slag-encoder`.
     pub encoder: PathBuf,
     /// `slag-lab`: this program.
     pub lab: PathBuf,
-    /// `slag-edge`; without it there are no times of queries.
+    /// `slag-edge`; without it queries are not timed.
     pub edge: Option<PathBuf>,
-    /// Flags that say which models are used and how.
+    /// Flags that select the models and their runtime.
     pub models: Vec<String>,
-    /// All that in words, with the version.
+    /// Version, models and device in words.
     pub made_by: String,
 }
 
@@ -45,7 +45,7 @@ impl Programs {
 }
 
 impl Runs<'_> {
-    /// Encodes the scene and returns the summary; the sums are kept.
+    /// Encodes the scene and returns the summary; the views' contributions are kept.
     pub(super) fn encode(
         &self,
         store: &Path,
@@ -58,7 +58,7 @@ impl Runs<'_> {
         self.run(command.args(&self.programs.models).args(views).args(lift))
     }
 
-    /// Judges the store's shards of a profile.
+    /// Evaluates the store's shards of a profile.
     pub(super) fn evaluate(
         &self,
         store: &Path,
@@ -71,7 +71,7 @@ impl Runs<'_> {
         self.run(command.args(["--profile", profile.name()]).args(&self.programs.models).args(eval))
     }
 
-    /// Fetches the shards as a robot does and times queries on them.
+    /// Fetches the shards as a robot does, and times queries on them.
     pub(super) fn query_ms(
         &self,
         store: &Path,
@@ -80,7 +80,7 @@ impl Runs<'_> {
     ) -> Result<Option<f64>, TradeoffError> {
         let Some(edge) = &self.programs.edge else { return Ok(None) };
         let cache = out.join("cache");
-        super::remove(&cache)?;
+        remove(&cache)?;
         let mut command = Command::new(&self.programs.encoder);
         command.args(["--quiet", "serve", "--listen", "127.0.0.1:0", "--store"]).arg(store);
         let mut server = Server(command.stdin(Stdio::null()).stdout(Stdio::piped()).spawn()?);
@@ -89,7 +89,8 @@ impl Runs<'_> {
             BufReader::new(stdout).read_line(&mut line)?;
         }
         let url = line.trim().strip_prefix("listening on ");
-        let url = url.ok_or_else(|| self.failed(&command, format!("it said {line:?}, no address")))?;
+        let url =
+            url.ok_or_else(|| self.failed(&command, format!("expected its address, found {line:?}")))?;
         let mut fetch = Command::new(edge);
         fetch.args(["fetch", "--json", "--quiet", "--at", "0,0,0", "--radius", "1e6", "--from", url]);
         self.run(fetch.args(["--profile", profile.name(), "--cache"]).arg(&cache))?;
@@ -106,28 +107,29 @@ impl Runs<'_> {
             "measured",
         ]);
         let timed = self.run(bench.arg("--cache").arg(&cache))?;
-        super::remove(&cache)?;
+        remove(&cache)?;
         let kinds = timed["in_process"].as_array().into_iter().flatten();
         Ok(kinds.filter(|kind| kind["kind"] == "best").find_map(|kind| kind["median_ms"].as_f64()))
     }
 
-    /// Runs a command and reads the JSON that it prints.
+    /// Runs a command and parses the JSON it prints.
     fn run(&self, command: &mut Command) -> Result<Value, TradeoffError> {
         let output = command.stdin(Stdio::null()).output()?;
         let printed: Option<Value> = serde_json::from_slice(&output.stdout).ok();
-        let said = printed.as_ref().and_then(|value| value["error"]["message"].as_str());
-        // 3: some inputs were left out, which the figures count.
-        match (printed.as_ref(), said, output.status.code()) {
+        let message = printed.as_ref().and_then(|value| value["error"]["message"].as_str());
+        // Exit code 3: some inputs were left out; the figures count them.
+        match (printed.as_ref(), message, output.status.code()) {
             (Some(value), None, Some(0 | 3)) => Ok(value.clone()),
-            (_, Some(said), _) => Err(self.failed(command, said.to_owned())),
+            (_, Some(message), _) => Err(self.failed(command, message.to_owned())),
             _ => Err(self.failed(command, String::from_utf8_lossy(&output.stderr).trim().to_owned())),
         }
     }
 
     /// Returns a figure that a program printed.
     pub(super) fn figure(&self, printed: &Value, name: &str) -> Result<f64, TradeoffError> {
-        let missing =
-            || self.error("its answer".into(), format!("no {name}: the flags leave nothing to measure"));
+        let missing = || {
+            self.error("output".into(), format!("no {name} in the JSON: the flags leave nothing to measure"))
+        };
         printed[name].as_f64().ok_or_else(missing)
     }
 
@@ -147,7 +149,7 @@ impl Runs<'_> {
     }
 }
 
-/// A service that ends with its use.
+/// A service that is stopped when dropped.
 struct Server(Child);
 
 impl Drop for Server {
@@ -155,4 +157,9 @@ impl Drop for Server {
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
+}
+
+/// Removes a folder where it exists.
+pub(super) fn remove(store: &Path) -> std::io::Result<()> {
+    if store.exists() { fs_err::remove_dir_all(store) } else { Ok(()) }
 }

@@ -5,8 +5,10 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use super::{Figures, Point, TradeoffError};
-use crate::bench::Machine;
+use super::error::TradeoffError;
+use super::figures::Figures;
+use super::grid::Point;
+use crate::bench::machine::Machine;
 use crate::bench::plot::{Plot, Scale, Series};
 
 /// What was measured.

@@ -2,8 +2,10 @@ use std::path::Path;
 
 use slag_common::shard::Profile;
 
+use super::measure::PAPER_SECONDS;
 use super::report::pareto;
 use super::*;
+use crate::bench::machine::Machine;
 use slag_encoder::progress::Silent;
 
 fn figures(axis: &str, name: &str, seconds: f64, miou: f64) -> Figures {
@@ -77,10 +79,10 @@ fn reports_name_every_point_and_mark_the_front() {
 }
 
 /// A program that writes down how it is called and answers as the real one does: the second point reuses the first
-/// one's sums, a second run measures nothing, and a point that the scene has no masks for is left out and named.
+/// one's contributions, a second run measures nothing, and a point that the scene has no masks for is left out and named.
 #[cfg(unix)]
 #[test]
-fn points_are_measured_once_and_share_sums() {
+fn points_are_measured_once_and_share_contributions() {
     use std::os::unix::fs::PermissionsExt;
     let dir = tempfile::tempdir().expect("a folder");
     let scene_dir = dir.path().join("room");

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use anyhow::Result;
-use clap::{Args, ValueEnum};
+use clap::Args;
 use slag_common::shard::Profile;
 use slag_common::splat;
 use slag_encoder::cli::Exit;
@@ -11,7 +11,7 @@ use slag_encoder::cli::common::{ModelArgs, print, text_encoder_of};
 use slag_encoder::raster::CpuRasterizer;
 use slag_encoder::store::StoreReader;
 
-use crate::eval::{self, EvalLevel, EvalSettings, Filter, Truth};
+use crate::eval::{self, EvalKind, EvalSettings, Filter, Truth};
 
 /// `eval labelled`.
 #[derive(Debug, Args)]
@@ -22,19 +22,19 @@ pub struct EvalLabelledArgs {
     /// The splat that was encoded.
     #[arg(long, value_name = "FILE")]
     pub scene: PathBuf,
-    /// Folder of the labels: gt/instances.json, gt/gaussian_instance.npy; test/ and gt/test_masks/ if there are.
+    /// Folder of the labels: gt/instances.json, gt/gaussian_instance.npy; test/ and gt/test_masks/ where present.
     #[arg(long, value_name = "DIR")]
     pub truth: PathBuf,
-    /// Models; the same that the store was encoded with.
+    /// The models that the store was encoded with.
     #[command(flatten)]
     pub models: ModelArgs,
-    /// Categories to ask for [default: all].
+    /// Categories to query [default: all].
     #[arg(long, value_name = "A,B", value_delimiter = ',')]
     pub words: Vec<String>,
-    /// Score as a robot with shards of this profile does [default: the field in full precision].
+    /// Scores this profile's shards, as a robot does [default: the field in full precision].
     #[arg(long, value_name = "NAME")]
     pub profile: Option<Profile>,
-    /// Scores coarse and fine masks apart and takes the best, instead of their mean.
+    /// Scores coarse and fine masks separately and takes the best instead of their mean.
     #[arg(long, conflicts_with = "profile")]
     pub by_mask_level: bool,
     /// Score from which something counts as found [default: the store's].
@@ -43,35 +43,9 @@ pub struct EvalLabelledArgs {
     /// Lets the Gaussians of a superpoint answer together, as the paper does.
     #[arg(long, value_enum)]
     pub superpoints: Option<Filter>,
-    /// Whether objects are scored.
-    #[command(flatten)]
-    pub level: EvalLevelArgs,
-}
-
-/// `eval labelled` and `query`: what is scored.
-#[derive(Debug, Args)]
-pub struct EvalLevelArgs {
     /// What is scored [default: objects, where the scene has them].
     #[arg(long, value_enum)]
-    pub level: Option<LevelArg>,
-}
-
-/// `--level`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum LevelArg {
-    /// Each Gaussian by itself.
-    Gaussians,
-    /// Objects, and the Gaussians within them; those without by themselves.
-    Objects,
-}
-
-impl From<LevelArg> for EvalLevel {
-    fn from(level: LevelArg) -> Self {
-        match level {
-            LevelArg::Gaussians => Self::Gaussians,
-            LevelArg::Objects => Self::Objects,
-        }
-    }
+    pub kind: Option<EvalKind>,
 }
 
 pub(super) fn run(args: &EvalLabelledArgs, json: bool) -> Result<Exit> {
@@ -84,7 +58,7 @@ pub(super) fn run(args: &EvalLabelledArgs, json: bool) -> Result<Exit> {
         profile: args.profile,
         threshold: args.threshold,
         filter: args.superpoints,
-        level: args.level.level.map(Into::into),
+        kind: args.kind,
         by_mask_level: args.by_mask_level,
     };
     let report = eval::labelled(&reader, &truth, &scene, &mut *encoder, &CpuRasterizer, &settings)?;

@@ -13,16 +13,16 @@ use slag_encoder::progress::Progress;
 /// `bench tradeoff`.
 #[derive(Debug, Args)]
 pub struct TradeoffArgs {
-    /// Labelled scene: a folder as `generate scene` writes it; may be given again.
+    /// Labelled scene: a folder that `generate scene` wrote; may be repeated.
     #[arg(long, visible_alias = "scene", value_name = "DIR", required = true, num_args = 1..)]
     truth: Vec<PathBuf>,
-    /// Folder for figures and plots; what is measured there already is not measured again.
+    /// Folder for figures and plots; points measured there before are not measured again.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// A small grid with the scenes' own masks: about ten minutes on two cores.
+    /// Measures a small grid with the scenes' own masks: about ten minutes on two cores.
     #[arg(long)]
     quick: bool,
-    /// A grid of one's own: JSON, {"points": [..]} of axis, name, and flags (views, lift, eval, profile).
+    /// Measures the grid in this file: JSON, {"points": [..]} of axis, name, and flags (views, lift, eval, profile).
     #[arg(long, value_name = "FILE", conflicts_with = "quick")]
     grid: Option<PathBuf>,
     /// Models.
@@ -36,13 +36,16 @@ pub(super) fn run(args: &TradeoffArgs, progress: &dyn Progress, json: bool) -> R
         None if args.quick => Grid::quick()?,
         None => Grid::full()?,
     };
-    // Before hours of work: a model that cannot be opened.
+    // Opened first: a model that cannot be opened fails before hours of work.
     let (models, session) = open_models(&args.models)?;
-    let lab = std::env::current_exe().context("cannot tell where this program is")?;
+    let lab = std::env::current_exe().context("cannot find the path of this program")?;
     let encoder = lab.with_file_name(format!("slag-encoder{}", std::env::consts::EXE_SUFFIX));
     let edge = encoder.with_file_name(format!("slag-edge{}", std::env::consts::EXE_SUFFIX));
     if !edge.is_file() {
-        tracing::warn!("{} is not there: no times of queries; build it beside this program", edge.display());
+        tracing::warn!(
+            "{} does not exist, so queries are not timed; build it beside this program",
+            edge.display()
+        );
     }
     let mut flags = Vec::new();
     let mut flag = |name: &str, value: String| flags.extend([name.to_owned(), value]);

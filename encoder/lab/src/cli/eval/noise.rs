@@ -19,34 +19,34 @@ use slag_encoder::raster::gpu::GpuOptions;
 /// `eval noise`.
 #[derive(Debug, Args)]
 pub struct EvalNoiseArgs {
-    /// Labelled scenes with masks, as `generate scene` writes them.
+    /// Labelled scenes with masks, from `generate scene`.
     #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
     scene: Vec<PathBuf>,
-    /// Levels of errors over the true masks, 0 (none) to 3.
+    /// Levels of noise in the true masks, 0 (none) to 3.
     #[arg(long, value_name = "N", value_delimiter = ',', default_values_t = [0, 1, 2, 3], value_parser = clap::value_parser!(u8).range(0..=3))]
     levels: Vec<u8>,
-    /// Chooses the errors.
+    /// Seed of the noise.
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Compares with masks of the built-in segmenter instead, as they are.
+    /// Uses the masks of the built-in segmenter instead, without noise.
     #[arg(long, conflicts_with = "levels")]
     auto: bool,
     /// Ways to aggregate [default: all].
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     methods: Vec<String>,
-    /// Views to use at most, evenly spread.
+    /// Number of views at most, evenly spread.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     views_limit: Option<u32>,
-    /// What fills a crop outside its mask.
+    /// Fill of a crop outside its mask.
     #[arg(long, value_enum, default_value = "white")]
     background: BackgroundArg,
     /// Models.
     #[command(flatten)]
     models: ModelArgs,
-    /// Where weights are rasterised: auto (GPUs, else the CPU), gpu, cpu, or an adapter's number.
+    /// Device that rasterises: auto (GPUs, else the CPU), gpu, cpu, or an adapter's number.
     #[arg(long, value_name = "DEVICE", default_value_t)]
     device: DeviceChoice,
-    /// Folder for the stores; a later run finds the views there.
+    /// Folder for the stores; a later run reuses the views there.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
 }
@@ -56,7 +56,7 @@ pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> 
     let wanted = |name: &str| args.methods.is_empty() || args.methods.iter().any(|method| method == name);
     if let Some(unknown) = args.methods.iter().find(|name| !known.iter().any(|(known, _)| known == name)) {
         let names: Vec<&str> = known.iter().map(|(name, _)| *name).collect();
-        return Err(anyhow!("no way to aggregate is called {unknown:?}; there are: {}", names.join(", ")));
+        return Err(anyhow!("unknown way to aggregate {unknown:?}; expected one of: {}", names.join(", ")));
     }
     let (models, session) = open_models(&args.models)?;
     let devices = Devices::open(args.device, GpuOptions::default())?;
@@ -66,7 +66,7 @@ pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> 
         .map(|(name, way)| (name.to_owned(), way))
         .collect();
     let levels = if args.auto { Vec::new() } else { args.levels.clone() };
-    let n_centroids = args.scene.len() * levels.len().max(1) * methods.len();
+    let n_rows = args.scene.len() * levels.len().max(1) * methods.len();
     let mut encode = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
     encode.output.scene_name = "noise".into();
     encode.run.views_limit = args.views_limit.map_or(ViewsLimit::All, |n| ViewsLimit::Count(n as usize));
@@ -84,7 +84,7 @@ pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> 
         out: args.out.clone(),
         encode,
     };
-    progress.begin("noise", "row", n_centroids as u64, 0);
+    progress.begin("noise", "row", n_rows as u64, 0);
     let mut on_row = |row: &NoiseRow| {
         tracing::info!("{} {:?} {}: mIoU {:.4?}", row.scene, row.level, row.method, row.miou);
         progress.advance(1);

@@ -1,0 +1,182 @@
+//! A labelled scan of ScanNet v2 (Dai et al. 2017), from its release's files.
+//!
+//! ```text
+//! SCAN/NAME_vh_clean_2.labels.ply               vertices x y z label (NYU40); or, with the table of categories:
+//! SCAN/NAME_vh_clean_2.ply                      vertices x y z
+//! SCAN/NAME_vh_clean_2.0.010000.segs.json       segIndices: the segment of each vertex
+//! SCAN/NAME.aggregation.json                    segGroups [{label, segments}]
+//! scannetv2-labels.combined.tsv                 raw_category ... nyu40id
+//! ```
+
+use std::collections::{BTreeMap, HashMap};
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+use slag_common::splat::SplatError;
+use slag_common::splat::ply::read_vertices;
+
+/// Largest NYU40 id.
+const MAX_ID: u16 = 40;
+
+/// Error in a scan.
+#[derive(Debug, thiserror::Error)]
+pub enum ScanError {
+    /// A file could not be read.
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+    /// A mesh cannot be read.
+    #[error(transparent)]
+    Mesh(#[from] SplatError),
+    /// A file is malformed.
+    #[error("{}: {what}", path.display())]
+    Wrong {
+        /// The file.
+        path: PathBuf,
+        /// The problem, the expectation and the remedy.
+        what: String,
+    },
+    /// Gaussians cannot be compared one by one.
+    #[error(
+        "{}: {n_vertices} vertices, the splat has {n_gaussians} Gaussians; only a splat that was trained with its \
+         Gaussians fixed to the vertices can be compared one by one; leave --by-index out", dir.display()
+    )]
+    Length {
+        /// The scan's folder.
+        dir: PathBuf,
+        /// Its vertices.
+        n_vertices: usize,
+        /// Gaussians of the splat.
+        n_gaussians: usize,
+    },
+}
+
+/// A labelled mesh.
+#[derive(Clone, Debug)]
+pub struct Scan {
+    /// The scene's name.
+    pub name: String,
+    /// Its folder.
+    pub dir: PathBuf,
+    /// The vertices, world frame, metres.
+    pub vertices: Vec<[f64; 3]>,
+    /// `[N]`: NYU40 id of each, 0 where there is none.
+    pub labels: Vec<u16>,
+    /// Labels that the table of categories lacks, with their vertices, which count as unlabelled.
+    pub unknown_labels: BTreeMap<String, usize>,
+}
+
+#[derive(Deserialize)]
+struct Segments {
+    #[serde(rename = "segIndices")]
+    of_vertex: Vec<u32>,
+}
+
+#[derive(Deserialize)]
+struct Aggregation {
+    #[serde(rename = "segGroups")]
+    groups: Vec<Group>,
+}
+
+#[derive(Deserialize)]
+struct Group {
+    label: String,
+    segments: Vec<u32>,
+}
+
+impl Scan {
+    /// Reads a scan. `categories` is the data set's table; it is needed where there is no labelled mesh.
+    ///
+    /// # Errors
+    /// [`ScanError`].
+    pub fn read(dir: &Path, categories: Option<&Path>) -> Result<Self, ScanError> {
+        let name = dir.canonicalize()?.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let scan = |vertices, labels, unknown_labels| Self {
+            name: name.clone(),
+            dir: dir.to_owned(),
+            vertices,
+            labels,
+            unknown_labels,
+        };
+        let path = dir.join(format!("{name}_vh_clean_2.labels.ply"));
+        if !path.is_file() {
+            let Some(categories) = categories else {
+                let what =
+                    "does not exist; add it, or give scannetv2-labels.combined.tsv with --categories".into();
+                return Err(ScanError::Wrong { path, what });
+            };
+            return Self::of_segments(dir, &name, categories).map(|(v, l, u)| scan(v, l, u));
+        }
+        let rows = read_vertices(&path, ["x", "y", "z", "label"])?;
+        if let Some(row) = rows.iter().find(|row| !(0.0..=f64::from(MAX_ID)).contains(&row[3])) {
+            let what =
+                format!("label {}, expected 0 to {MAX_ID} (NYU40); take the file of the v2 release", row[3]);
+            return Err(ScanError::Wrong { path, what });
+        }
+        let (vertices, labels) = rows.iter().map(|[x, y, z, label]| ([*x, *y, *z], *label as u16)).unzip();
+        Ok(scan(vertices, labels, BTreeMap::new()))
+    }
+
+    #[expect(clippy::type_complexity, reason = "the parts of a scan, used once")]
+    fn of_segments(
+        dir: &Path,
+        name: &str,
+        categories: &Path,
+    ) -> Result<(Vec<[f64; 3]>, Vec<u16>, BTreeMap<String, usize>), ScanError> {
+        let wrong = |path: &Path, what: String| ScanError::Wrong { path: path.to_owned(), what };
+        let id_of = read_categories(categories)?;
+        let vertices = read_vertices(&dir.join(format!("{name}_vh_clean_2.ply")), ["x", "y", "z"])?;
+        let path = dir.join(format!("{name}_vh_clean_2.0.010000.segs.json"));
+        let segments: Segments = serde_json::from_slice(&fs_err::read(&path)?)
+            .map_err(|error| wrong(&path, format!("{error}; expected segIndices, one a vertex")))?;
+        if segments.of_vertex.len() != vertices.len() {
+            let what = format!(
+                "{} segments, expected one for each of {} vertices; take both files of one release",
+                segments.of_vertex.len(),
+                vertices.len()
+            );
+            return Err(wrong(&path, what));
+        }
+        let path =
+            [".aggregation.json", "_vh_clean.aggregation.json"].map(|end| dir.join(format!("{name}{end}")));
+        let path = path.iter().find(|path| path.is_file()).unwrap_or(&path[0]);
+        let aggregation: Aggregation = serde_json::from_slice(&fs_err::read(path)?).map_err(|error| {
+            wrong(path, format!("{error}; expected segGroups, each with label and segments"))
+        })?;
+        let mut id_of_segment: HashMap<u32, u16> = HashMap::new();
+        let mut unknown: HashMap<u32, &str> = HashMap::new();
+        for group in &aggregation.groups {
+            for segment in &group.segments {
+                match id_of.get(&group.label) {
+                    Some(id) => drop(id_of_segment.insert(*segment, *id)),
+                    None => drop(unknown.insert(*segment, &group.label)),
+                }
+            }
+        }
+        let mut unknown_labels: BTreeMap<String, usize> = BTreeMap::new();
+        for segment in &segments.of_vertex {
+            if let Some(label) = unknown.get(segment) {
+                *unknown_labels.entry((*label).to_owned()).or_default() += 1;
+            }
+        }
+        let labels = segments.of_vertex.iter().map(|s| id_of_segment.get(s).copied().unwrap_or(0)).collect();
+        Ok((vertices, labels, unknown_labels))
+    }
+}
+
+/// Reads the NYU40 id of each of the annotators' categories.
+fn read_categories(path: &Path) -> Result<HashMap<String, u16>, ScanError> {
+    let wrong = |what: &str| ScanError::Wrong { path: path.to_owned(), what: what.to_owned() };
+    let text = fs_err::read_to_string(path)?;
+    let mut lines = text.lines();
+    let head: Vec<&str> = lines.next().unwrap_or_default().split('\t').collect();
+    let column = |name: &str| head.iter().position(|found| *found == name);
+    let (Some(raw), Some(id)) = (column("raw_category"), column("nyu40id")) else {
+        return Err(wrong("no columns raw_category and nyu40id; give scannetv2-labels.combined.tsv"));
+    };
+    let row = |line: &str| {
+        let cells: Vec<&str> = line.split('\t').collect();
+        let id = cells.get(id)?.parse().ok().filter(|id| *id <= MAX_ID)?;
+        Some(((*cells.get(raw)?).to_owned(), id))
+    };
+    Ok(lines.filter_map(row).collect())
+}
