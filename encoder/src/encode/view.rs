@@ -108,13 +108,13 @@ impl<'a> ViewStages<'a> {
         let embed_slots = (!self.plan.engines.session.is_on_cpu()).then_some(GPU_EMBED_SLOTS);
         let mut stages = vec![on_cpu("decode")];
         if self.plan.segmenter.wants_depth() {
-            stages.push(on_device("depth", self.plan.scene.n_lanes()));
+            stages.push(on_device("depth", self.plan.scene.concurrency()));
         }
         stages.extend([
-            on_device("segment", self.plan.segmenter.n_lanes()),
+            on_device("segment", self.plan.segmenter.concurrency()),
             on_cpu("crop"),
             on_device("embed", embed_slots),
-            on_device("raster", self.plan.scene.n_lanes()),
+            on_device("raster", self.plan.scene.concurrency()),
             on_device("write", Some(1)),
         ]);
         stages

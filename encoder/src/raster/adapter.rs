@@ -6,26 +6,26 @@ use serde::Serialize;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Precision {
-    /// As the reference has it.
+    /// Double precision, like the reference.
     F64,
-    /// Where the device has no more: Gaussians far from the image's centre, and needles, lose digits.
+    /// Single precision, for devices without `f64`. Gaussians far from the image centre, and needles, lose digits.
     F32,
 }
 
-/// What an adapter is.
+/// Description of an adapter.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct AdapterReport {
     /// Name of the device.
     pub name: String,
     /// Driver and its version.
     pub driver: String,
-    /// Interface: Vulkan, Metal, Dx12.
+    /// Graphics interface: Vulkan, Metal, Dx12.
     pub backend: String,
     /// `discrete`, `integrated`, `virtual`, `software` or `other`.
     pub kind: &'static str,
     /// Precision of the projection.
     pub precision: Precision,
-    /// Largest piece of memory that a shader can see, bytes.
+    /// Largest buffer that a shader can access, bytes.
     pub max_binding_bytes: u64,
 }
 
@@ -36,16 +36,16 @@ impl AdapterReport {
     }
 }
 
-/// How a device is used.
+/// Options for the use of a device.
 #[derive(Clone, Copy, Debug)]
 pub struct GpuOptions {
-    /// Largest buffer, bytes; the device's own limit if larger.
+    /// Upper limit for a buffer, bytes; the limit of the device applies as well.
     pub max_binding_bytes: u64,
-    /// Bytes of the scene that stay on the device; the rest is uploaded for each view.
+    /// Upper limit for the part of the scene that stays on the device, bytes; the rest is uploaded for each view.
     pub max_resident_bytes: u64,
-    /// Visible Gaussians, pairs and sums that there is room for at first; grown when a view needs more.
-    pub first_room: u32,
-    /// Views worked on at once: while one is copied back, others compute.
+    /// Initial capacity for visible Gaussians, pairs and contributions; it grows when a view needs more.
+    pub first_capacity: u32,
+    /// Views processed at once: while one is copied back, others compute.
     pub views_in_flight: usize,
 }
 
@@ -54,7 +54,7 @@ impl Default for GpuOptions {
         Self {
             max_binding_bytes: u64::MAX,
             max_resident_bytes: u64::MAX,
-            first_room: 1 << 19,
+            first_capacity: 1 << 19,
             views_in_flight: 3,
         }
     }

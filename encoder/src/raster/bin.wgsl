@@ -1,10 +1,10 @@
-// Twin of bin.rs: lists (tile, Gaussian) pairs near to far, and where each tile's begin.
+// Twin of bin.rs: lists (tile, Gaussian) pairs from near to far, and the range of each tile.
 
 @group(0) @binding(0) var<storage, read> view: View;
 @group(0) @binding(1) var<storage, read> counters: array<u32, N_COUNTERS>;
 @group(0) @binding(2) var<storage, read> screen: array<Screen>;
 @group(0) @binding(3) var<storage, read> tile_counts: array<u32>;
-// Visible Gaussians by depth; in `find_ranges` pairs by tile.
+// Order of the visible Gaussians by depth; in `find_ranges`, order of the pairs by tile.
 @group(0) @binding(4) var<storage, read> order: array<u32>;
 @group(0) @binding(5) var<storage, read_write> block_counts: array<u32>;
 @group(0) @binding(6) var<storage, read_write> pairs: array<Pair>;
@@ -33,7 +33,7 @@ fn count_pairs(
     }
 }
 
-// Writes the pairs of a row of tiles from `start` on.
+// Writes the pairs of one row of tiles, from index `start` on.
 fn write_row(member: u32, row: u32, columns: PixelSpan, start: u32) {
     let first = (row - view.first_tile_row) * view.tile_columns;
     for (var column = columns.first; column <= columns.last; column++) {
@@ -48,7 +48,7 @@ fn width_of(columns: PixelSpan) -> u32 {
     return select(0u, columns.last - columns.first + 1u, columns.is_some);
 }
 
-// Writes the pairs of a visible Gaussian from `start` on.
+// Writes the pairs of a visible Gaussian, from index `start` on.
 fn write_tiles(member: u32, start: u32) {
     var at = start;
     let g = screen[member];
@@ -64,7 +64,7 @@ fn write_tiles(member: u32, start: u32) {
     }
 }
 
-// A Gaussian of more tiles is written by all threads of its block, a row each.
+// A Gaussian with more tiles is written by all threads of its block, one row each.
 const MAX_OWN_TILES = 64u;
 
 struct Wide {
@@ -139,7 +139,7 @@ fn write_pairs(
 @group(0) @binding(8) var<storage, read_write> ranges: array<Range>;
 @group(0) @binding(9) var<storage, read_write> members: array<u32>;
 
-// Writes the members of all tiles one after another, and each tile's range; tiles without stay 0..0.
+// Writes the members of all tiles contiguously, and the range of each tile; empty tiles keep the range 0..0.
 @compute @workgroup_size(WORKGROUP_SIZE)
 fn find_ranges(
     @builtin(global_invocation_id) id: vec3<u32>,

@@ -1,21 +1,21 @@
-//! Blends the Gaussians of a tile front to back.
+//! Front-to-back blending of the Gaussians of a tile.
 
 use bytemuck::{cast, cast_slice, cast_slice_mut};
 use pulp::Simd;
 
-use super::WeightKind;
 use super::constants::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE_SIZE_PX};
 use super::project::ScreenGaussian;
 use super::simd::{Lanes, Level, Work};
+use super::weights::WeightKind;
 
-/// Gaussians that are fetched and made ready at once. In between is looked which rows of the tile are
-/// finished.
+/// Gaussians that are fetched and prepared at once. Between batches, rows with only opaque pixels are identified, to
+/// skip them.
 const BATCH: usize = 32;
 
-/// Powers up to here matter: `exp(-6)` is below 1/255, so that no alpha beyond counts.
+/// Largest exponent that matters: `exp(-6)` is below 1/255, so no alpha beyond it counts.
 pub const MAX_POWER: f32 = 6.0;
-/// `exp(t - 3/4)` for `|t| <= 3/4`, interpolated at the Chebyshev nodes; its 4th power is within
-/// 1.6e-7 of the exact one.
+/// Polynomial for `exp(t - 3/4)` with `|t| <= 3/4`, interpolated at the Chebyshev nodes. Its fourth power has a relative
+/// error of at most 1.6e-7.
 pub const EXP_OF_MINUS_C: [f32; 8] = [
     0.472_366_54,
     0.472_366_55,
@@ -30,7 +30,7 @@ pub const EXP_OF_MINUS_C: [f32; 8] = [
 /// One value for each pixel of a tile.
 pub type PerPixel<T> = [[T; TILE_SIZE_PX]; TILE_SIZE_PX];
 
-/// Where a tile lies; its pixels inside the image.
+/// Position of a tile, and its pixels inside the image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TileRect {
     /// Left edge, pixels.
@@ -56,17 +56,17 @@ impl TileRect {
     }
 }
 
-/// Takes the weights of a tile's Gaussians, near to far; `member` indexes the visible ones.
+/// Consumes the weights of the Gaussians of a tile, from near to far. `member` is an index into the visible Gaussians.
 pub trait WeightSink {
-    /// Takes the weights at the pixels of row `y` in vector `v` of the row; 0 where it has none.
+    /// Consumes the weights at the pixels of vector `v` in row `y`; 0 at pixels without weight.
     fn add<S: Lanes>(&mut self, simd: S, member: u32, y: usize, v: usize, weights: S::f32s);
-    /// Ends a Gaussian.
+    /// Ends the current Gaussian.
     fn end<S: Lanes>(&mut self, simd: S, member: u32);
 }
 
-/// Walks the Gaussians of a tile and returns the transmittance left at each pixel.
+/// Blends the Gaussians of a tile and returns the remaining transmittance at each pixel.
 ///
-/// With [`WeightKind::Falloff`] nothing hides anything and the transmittance stays 1.
+/// With [`WeightKind::Falloff`] there is no occlusion, and the transmittance stays 1.
 pub fn walk_tile(
     level: Level,
     visible: &[ScreenGaussian],
@@ -94,7 +94,7 @@ impl<K: WeightSink, const BLEND: bool> Work for Walk<'_, K, BLEND> {
     #[inline(always)]
     fn run<S: Lanes>(self, simd: S) -> PerPixel<f32> {
         let Self { visible, members, rect, sink } = self;
-        // Negative means finished: the sign bit costs no second array, and fails every comparison below.
+        // A negative value marks an opaque pixel: it needs no second array, and fails every comparison below.
         let mut transmittance = [[-1.0_f32; TILE_SIZE_PX]; TILE_SIZE_PX];
         for row in &mut transmittance[..rect.height_px] {
             row[..rect.width_px].fill(1.0);
@@ -111,7 +111,7 @@ impl<K: WeightSink, const BLEND: bool> Work for Walk<'_, K, BLEND> {
             if live == [false; TILE_SIZE_PX] {
                 break;
             }
-            // Copies first: reads that wait for nothing but memory, so that they wait together.
+            // Copies all Gaussians before it uses any, so that their cache misses overlap.
             for (fetched, &member) in fetched.iter_mut().zip(batch) {
                 *fetched = visible[member as usize];
             }
@@ -142,18 +142,18 @@ impl<K: WeightSink, const BLEND: bool> Work for Walk<'_, K, BLEND> {
     }
 }
 
-/// A Gaussian relative to a tile, in `f32`: coordinates are small there, so little is lost.
+/// A Gaussian relative to a tile, in `f32`: coordinates are small there, so little precision is lost.
 #[derive(Clone, Copy, Default)]
 struct InTile {
     /// `u` at the centre of the tile's first pixel.
     u0: f32,
-    /// Step of `u` a pixel right.
+    /// Step of `u` per pixel to the right.
     u_x: f32,
-    /// Step of `u` a pixel down.
+    /// Step of `u` per pixel down.
     u_y: f32,
     /// `v` at the centre of the tile's first pixel.
     v0: f32,
-    /// Step of `v` a pixel down.
+    /// Step of `v` per pixel down.
     v_y: f32,
     /// 1 / `u_x`, pixels.
     width: f32,
@@ -199,15 +199,14 @@ impl InTile {
         }
         let middle = -(self.u0 + self.u_y * y as f32) * self.width;
         let half = left.sqrt() * self.width;
-        // Rounded by truncation, which is an instruction where `ceil` may be a call; a column too many
-        // does no harm.
+        // Rounds by truncation, a single instruction; `ceil` may be a call. One column too many is harmless.
         let first = (middle - half + 0.999).max(0.0) as i32;
         let last = (middle + half).min((TILE_SIZE_PX - 1) as f32);
         let touches = last >= 0.0 && first <= last as i32;
         touches.then_some((first as usize / n_lanes, last as usize / n_lanes + 1))
     }
 
-    /// Returns the weights in vector `v` of row `y` and takes their light.
+    /// Returns the weights in vector `v` of row `y`, and updates the transmittance.
     #[inline(always)]
     fn blend<S: Simd, const BLEND: bool>(
         &self,
@@ -239,16 +238,16 @@ impl InTile {
     }
 }
 
-/// Returns, lane by lane, one value where the mask is set and another where not. `select_f32s` is not
-/// always inlined, which costs AVX2 a call with its masks in memory.
+/// Selects `set` in the lanes of the mask and `unset` in the others. `select_f32s` is not always inlined, which costs
+/// AVX2 a call with its masks in memory.
 #[inline(always)]
 fn select<S: Simd>(simd: S, mask: S::m32s, set: S::f32s, unset: S::f32s) -> S::f32s {
     cast(simd.select_u32s(mask, cast(set), cast(unset)))
 }
 
-/// Returns `exp(-power)` for `power >= 0`, within 1e-6 of the result; beyond [`MAX_POWER`] stays there.
+/// Returns `exp(-power)` for `power >= 0` with a relative error below 1e-6. Powers above [`MAX_POWER`] are clamped.
 ///
-/// Plain arithmetic instead of the platform's `exp`: fits SIMD, and has the same bits everywhere.
+/// It uses basic arithmetic instead of the platform's `exp`, which allows SIMD and gives the same bits everywhere.
 #[inline(always)]
 fn exp_of_minus<S: Simd>(simd: S, power: S::f32s) -> S::f32s {
     let splat = |value| simd.splat_f32s(value);
@@ -257,7 +256,7 @@ fn exp_of_minus<S: Simd>(simd: S, power: S::f32s) -> S::f32s {
     let [first @ .., last] = EXP_OF_MINUS_C;
     let mut root = splat(last);
     for &c in first.iter().rev() {
-        // Not a fused multiply-add: not every processor has one.
+        // No fused multiply-add, because not every processor has one.
         root = simd.add_f32s(simd.mul_f32s(root, t), splat(c));
     }
     let square = simd.mul_f32s(root, root);
@@ -282,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn exp_is_within_a_millionth_and_has_the_same_bits_on_all_levels() {
+    fn exp_is_within_a_millionth_and_has_the_same_bits_for_all_instruction_sets() {
         let powers: Vec<f32> = (0..6000).map(|i| i as f32 / 1000.0).chain([f32::INFINITY; 16]).collect();
         let on_level = |level: Level| {
             let mut values = powers.clone();

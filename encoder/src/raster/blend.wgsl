@@ -1,25 +1,25 @@
-// Twin of blend.rs: blends the Gaussians of a tile front to back, and sums their weights over regions.
+// Twin of blend.rs: blends the Gaussians of a tile front to back and sums their weights over regions.
 //
-// A workgroup is a tile, a thread a pixel. The pixels are dealt out in the order of their regions, so
-// that the pixels of a region lie one after another: the second half of each step then adds up runs,
-// 32 threads a Gaussian, whatever the number of regions.
+// A workgroup processes a tile, a thread a pixel. Pixels are assigned to threads in the order of their
+// regions, so that the pixels of a region are contiguous. The second half of each step then sums runs of
+// pixels with 32 threads per Gaussian, independently of the number of regions.
 
 @group(0) @binding(0) var<storage, read> view: View;
 @group(0) @binding(1) var<storage, read_write> counters: array<atomic<u32>, N_COUNTERS>;
 @group(0) @binding(2) var<storage, read> screen: array<Screen>;
 @group(0) @binding(3) var<storage, read> members: array<u32>;
 @group(0) @binding(4) var<storage, read> ranges: array<Range>;
-// Row-major, of the band alone.
+// Row-major, within the band.
 @group(0) @binding(5) var<storage, read> region_of_pixel: array<u32>;
 @group(0) @binding(6) var<storage, read_write> entries: array<Entry>;
 
-// Gaussians whose weights are summed in one step.
+// Gaussians with weights summed in one step.
 const STEP = 8u;
 // Gaussians loaded at once.
 const LOAD = 64u;
-// Consecutive pixels that a thread adds up.
+// Consecutive pixels that a thread sums.
 const RUN = 8u;
-// One word of padding a run keeps the threads of a Gaussian in different memory banks.
+// One word of padding per run keeps the threads of a Gaussian in different memory banks.
 const WEIGHTS_STRIDE = WORKGROUP_SIZE + WORKGROUP_SIZE / RUN;
 const N_SUMS = 2048u;
 const NO_SLOT = 0xffffu;
@@ -40,7 +40,7 @@ var<workgroup> n_live_shared: u32;
 var<workgroup> n_found: atomic<u32>;
 var<workgroup> first_entry: u32;
 
-// Sorts the tile's pixels by region (Batcher 1968).
+// Sorts the pixels of the tile by region (Batcher 1968).
 fn sort_pixels(thread: u32) {
     for (var size = 2u; size <= WORKGROUP_SIZE; size *= 2u) {
         for (var distance = size / 2u; distance > 0u; distance /= 2u) {
@@ -81,7 +81,7 @@ fn sum_regions(
         is_head = 1u;
     }
     let slot = block_scan(is_head, thread) + is_head - 1u;
-    // Pixels without a region come last.
+    // Pixels without a region are last.
     let has_region = region != NO_REGION_KEY;
     slots[thread] = select(NO_SLOT, slot, has_region);
     if is_head == 1u {
@@ -112,10 +112,10 @@ fn sum_regions(
         atomicAdd(&n_live, 1u);
     }
     let is_falloff = view.falloff != 0u;
-    // The run of pixels that this thread adds up, for one Gaussian of a step.
+    // The run of pixels that this thread sums, for one Gaussian of a step.
     let of_step = thread / (WORKGROUP_SIZE / STEP);
     let run = thread % (WORKGROUP_SIZE / STEP);
-    // Sums fit for so many Gaussians before they are written out.
+    // Number of Gaussians with sums in workgroup memory before they are written out.
     let per_round = min(N_SUMS / n_slots / STEP * STEP, LOAD);
 
     for (var start = range.x; start < range.y; start += per_round) {
@@ -130,7 +130,7 @@ fn sum_regions(
         if thread == 0u {
             n_live_shared = atomicLoad(&n_live);
         }
-        // A barrier, too: the Gaussians are there.
+        // Also a barrier: the Gaussians are loaded.
         if workgroupUniformLoad(&n_live_shared) == 0u {
             break;
         }
@@ -142,13 +142,13 @@ fn sum_regions(
                 if is_live {
                     let u = g.u0 + g.u_y * f32(local_y) + g.u_x * f32(local_x);
                     let v = g.v0 + g.v_y * f32(local_y);
-                    // Beyond its reach no alpha counts; most Gaussians reach few pixels of a tile.
+                    // No alpha counts beyond the reach; most Gaussians reach few pixels of a tile.
                     if u * u + v * v <= g.reach2 {
                         let falloff = exp_of_minus(0.5 * u * u + 0.5 * v * v);
                         let alpha = min(g.opacity * falloff, MAX_ALPHA);
                         let next = transmittance * (1.0 - alpha);
                         if alpha < MIN_ALPHA {
-                            // Skipped.
+                            // The alpha is too small.
                         } else if is_falloff {
                             weight = falloff;
                         } else if next > MIN_TRANSMITTANCE {
@@ -183,8 +183,8 @@ fn sum_regions(
     }
 }
 
-// Adds the sum of a run, at most 8, as a whole number of 2^-SUM_FRACTION_BITS. Its upper word counts
-// 2^(32 - SUM_FRACTION_BITS); both parts of the split are exact.
+// Adds the sum of a run, at most 8, as an integer in units of 2^-SUM_FRACTION_BITS. The upper word has units
+// of 2^(32 - SUM_FRACTION_BITS); both parts of the split are exact.
 fn add(first_sum: u32, slot: u32, sum: f32) {
     if slot != NO_SLOT && sum > 0.0 {
         var high = u32(sum * UPPER_SCALE);
@@ -198,8 +198,8 @@ fn add(first_sum: u32, slot: u32, sum: f32) {
     }
 }
 
-// Appends what was summed to the entries, and clears the sums. The order in which tiles append does not
-// matter: entries are sorted, and whole numbers added, before anything is read.
+// Appends the sums to the entries and clears them. The order in which tiles append does not matter, because
+// entries are sorted and added as integers before they are read.
 fn write_entries(n_loaded: u32, n_slots: u32, thread: u32) {
     var n_own = 0u;
     for (var i = thread; i < n_loaded * n_slots; i += WORKGROUP_SIZE) {

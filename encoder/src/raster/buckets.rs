@@ -1,19 +1,18 @@
-//! Distribution of items over buckets, and the joining of parts that threads made.
+//! Distribution of items over buckets, and parallel concatenation.
 
 use bytemuck::Zeroable;
 use rayon::prelude::*;
 
-/// Items in buckets, one after the other.
+/// Items grouped in buckets, in one contiguous array.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Buckets<T> {
-    /// Bucket `b` holds `items[starts[b]..starts[b + 1]]`; one more than buckets.
+    /// Bucket `b` contains `items[starts[b]..starts[b + 1]]`; the length is the number of buckets plus one.
     starts: Vec<u32>,
     items: Vec<T>,
 }
 
 impl<T: Copy + Zeroable> Buckets<T> {
-    /// Distributes items over the buckets `first..=last` that each belongs to, keeping their order;
-    /// fewer than 2^32 once distributed.
+    /// Copies each item to its buckets `first..=last`, in order. The copies must be fewer than 2^32.
     pub fn new(n_buckets: usize, spanned: &[(T, (u32, u32))]) -> Self {
         let mut starts = vec![0_u32; n_buckets + 1];
         for &(_, (first, last)) in spanned {
@@ -44,12 +43,12 @@ impl<T> Buckets<T> {
         &self.items[self.starts[bucket] as usize..self.starts[bucket + 1] as usize]
     }
 
-    /// Returns the items of each bucket in turn.
+    /// Iterates over the items of each bucket.
     pub fn iter(&self) -> impl Iterator<Item = &[T]> {
         self.starts.windows(2).map(|ends| &self.items[ends[0] as usize..ends[1] as usize])
     }
 
-    /// Returns the items of each bucket in turn, to change.
+    /// Iterates over the items of each bucket, mutably.
     pub fn iter_mut(&mut self) -> impl Iterator<Item = &mut [T]> {
         let mut rest = self.items.as_mut_slice();
         self.starts.windows(2).map(move |ends| {
@@ -59,18 +58,18 @@ impl<T> Buckets<T> {
         })
     }
 
-    /// Returns the number of items, those in several buckets counted in each.
+    /// Returns the total number of items in all buckets.
     pub fn n_items(&self) -> usize {
         self.items.len()
     }
 
-    /// Returns the buckets with each item replaced.
+    /// Converts each item.
     pub fn map<U>(self, f: impl FnMut(T) -> U) -> Buckets<U> {
         Buckets { starts: self.starts, items: self.items.into_iter().map(f).collect() }
     }
 }
 
-/// Joins parts in their order; all threads copy, and touch the new pages.
+/// Concatenates parts. All threads copy, so that page faults are spread over them.
 pub fn concat<T: Copy + Zeroable + Send + Sync>(parts: &[Vec<T>]) -> Vec<T> {
     let mut joined: Vec<T> = bytemuck::zeroed_vec(parts.iter().map(Vec::len).sum());
     let mut rest = joined.as_mut_slice();

@@ -1,9 +1,9 @@
-// What the stages share; `real` is f64 where the device has it, else f32.
+// Definitions shared by all stages. `real` is f64 if the device supports it, else f32.
 
 struct View {
-    // Row-major rotation of camera from world.
+    // Rotation from world to camera, row-major.
     rotation: array<real, 9>,
-    // Camera position relative to the scene's origin, as high and low part.
+    // Camera position relative to the origin of the scene, split into high and low parts.
     position_high: array<real, 3>,
     position_low: array<real, 3>,
     focal_x_px: real,
@@ -12,10 +12,10 @@ struct View {
     centre_y_px: real,
     width_px: u32,
     height_px: u32,
-    // Rows of tiles that are worked on: `first_tile_row..end_tile_row`.
+    // Rows of tiles of the band: `first_tile_row..end_tile_row`.
     first_tile_row: u32,
     end_tile_row: u32,
-    // Tiles of a row.
+    // Tiles per row.
     tile_columns: u32,
     falloff: u32,
     n_regions: u32,
@@ -31,7 +31,7 @@ struct Screen {
     inv_width: real,
     slope: real,
     inv_height: real,
-    // Bits of the camera z as f32; positive, so they order as it does.
+    // Bits of the camera z as f32; z is positive, so they have the same order.
     depth: u32,
     opacity: f32,
     reach2: f32,
@@ -60,14 +60,14 @@ fn extent_px(g: Screen) -> array<real, 2> {
     return array<real, 2>(sqrt(reach2 * cov_xx), sqrt(reach2 * cov_yy));
 }
 
-// Rows of tiles that the footprint touches, of all the image.
+// Returns the rows of tiles that the footprint touches in the whole image.
 fn tile_rows(g: Screen, height_px: u32) -> PixelSpan {
     let extent = sqrt(real(g.reach2)) / g.inv_height;
     let rows = pixels_within(g.mean_y_px - extent, g.mean_y_px + extent, height_px);
     return PixelSpan(rows.first / TILE_SIZE_PX, rows.last / TILE_SIZE_PX, rows.is_some);
 }
 
-// Twin of bin.rs, `tile_row`: columns of tiles that the footprint touches in a row of tiles.
+// Twin of `Footprint::columns` in bin.rs: returns the columns of tiles that the footprint touches in a row of tiles.
 fn tile_columns(g: Screen, extent: array<real, 2>, row: u32, width_px: u32, height_px: u32) -> PixelSpan {
     let reach2 = real(g.reach2);
     let top_px = row * TILE_SIZE_PX;
@@ -115,7 +115,7 @@ fn in_tile(g: Screen, member: u32, x_px: u32, y_px: u32) -> InTile {
 }
 
 struct Pair {
-    // Row-major in the band of tile rows.
+    // Row-major index within the band.
     tile: u32,
     // Index into the visible Gaussians.
     member: u32,
@@ -126,7 +126,7 @@ struct Range {
     end: u32,
 }
 
-// A Gaussian's sum over a region in one tile, in units of 2^-SUM_FRACTION_BITS.
+// Contribution of a Gaussian to a region within one tile, in units of 2^-SUM_FRACTION_BITS.
 struct Entry {
     member: u32,
     region: u32,
@@ -134,10 +134,10 @@ struct Entry {
     high: u32,
 }
 
-// Sum over a workgroup: what every stage places its output by.
+// Prefix sum within a workgroup, which gives every stage the positions of its output.
 var<workgroup> block_values: array<u32, WORKGROUP_SIZE>;
 
-// Returns the sum of the values of the threads before this one (Hillis and Steele 1986).
+// Returns the sum of the values of all lower threads (Hillis and Steele 1986).
 fn block_scan(value: u32, thread: u32) -> u32 {
     block_values[thread] = value;
     workgroupBarrier();

@@ -1,6 +1,6 @@
-// Adds up the sorted entries of each (Gaussian, region): whole numbers, so the order does not show.
+// Sums the sorted entries of each (Gaussian, region). They are integers, so the order does not affect the result.
 
-// A sum over all tiles, in units of 2^-SUM_FRACTION_BITS.
+// Contribution of a Gaussian to a region over all tiles, in units of 2^-SUM_FRACTION_BITS.
 struct RegionSum {
     gaussian: u32,
     region: u32,
@@ -20,7 +20,7 @@ fn n_entries() -> u32 {
     return min(counters[COUNTER_ENTRIES], view.capacity_entries);
 }
 
-// Returns 1 where the sorted entry is the first of its (Gaussian, region).
+// Returns 1 if the sorted entry is the first of its (Gaussian, region), else 0.
 fn is_head(at: u32, n: u32) -> u32 {
     if at >= n {
         return 0u;
@@ -44,7 +44,7 @@ fn count_heads(
     for (var block = group.x; block < n_blocks; block += groups.x) {
         let head = is_head(block * WORKGROUP_SIZE + thread, n);
         let before = block_scan(head, thread);
-        // The sums that `add_up` adds to; there are no more of them than entries.
+        // Clears the sums for `add_up`; they are at most as many as the entries.
         let at = block * WORKGROUP_SIZE + thread;
         if at < n {
             atomicStore(&region_sums[at].low, 0u);
@@ -74,7 +74,7 @@ fn add_up(
                 region_sums[index].gaussian = screen[entry.member].gaussian;
                 region_sums[index].region = entry.region;
             }
-            // The lower word wraps at most once an addition.
+            // The lower word wraps at most once per addition.
             let before = atomicAdd(&region_sums[index].low, entry.low);
             let carried = entry.high + u32(before + entry.low < before);
             if carried > 0u {

@@ -1,4 +1,4 @@
-//! Constants of the rasteriser, as gsplat 1.5.3 has them; every backend takes them from here.
+//! Constants of the rasteriser, equal to those of gsplat 1.5.3; all backends take them from here.
 
 /// Edge of a screen tile, pixels.
 pub const TILE_SIZE_PX: usize = 16;
@@ -6,24 +6,23 @@ pub const TILE_SIZE_PX: usize = 16;
 pub const NEAR_Z: f64 = 0.01;
 /// Camera z above which a Gaussian is not drawn, world units.
 pub const FAR_Z: f64 = 1e10;
-/// Added to the diagonal of a projected covariance, px^2: the reconstruction filter of a pixel.
+/// Added to the diagonal of a projected covariance, px^2: the reconstruction filter of the pixel grid.
 pub const COVARIANCE_BLUR_PX2: f64 = 0.3;
-/// Largest alpha of one Gaussian at a pixel, so that the transmittance never becomes 0.
+/// Largest alpha of a Gaussian at a pixel, so that the transmittance never reaches 0.
 pub const MAX_ALPHA: f32 = 0.999;
-/// Smallest alpha that counts: the footprint of a Gaussian ends where it falls below.
+/// Smallest alpha that counts: the footprint of a Gaussian ends where its alpha falls below.
 pub const MIN_ALPHA: f32 = 1.0 / 255.0;
-/// A pixel is finished by the first Gaussian that would bring its transmittance to this or below;
-/// that Gaussian no longer counts.
+/// Transmittance at which a pixel is opaque. The first Gaussian that would reach it ends the pixel and is not blended.
 pub const MIN_TRANSMITTANCE: f32 = 1e-4;
-/// How far beyond the image the projection's Jacobian is still taken exactly, as a share of half
-/// the field of view's tangent; further out it is taken at that limit.
+/// Margin around the image within which the Jacobian of the projection is exact, as a share of the tangent of half the
+/// field of view. Beyond it, the Jacobian is evaluated at the limit.
 pub const FOV_MARGIN: f64 = 0.3;
-/// Added to the squared Mahalanobis reach of a footprint before culling, so that `f32` rounding
-/// (below 5e-5 there) never culls a pixel whose alpha would count.
+/// Added to the squared Mahalanobis reach of a footprint before culling. The rounding error of `f32` is below 5e-5
+/// there, so no pixel with a sufficient alpha is culled.
 pub const REACH2_MARGIN: f64 = 2e-4;
-/// Largest projected variance, px^2: above it the `f32` arithmetic of the pixels has no meaning.
+/// Largest projected variance, px^2; above it, the `f32` arithmetic of the pixels loses its meaning.
 pub const MAX_VARIANCE_PX2: f64 = 1e24;
 /// Most pixels of one view (16k x 16k).
 pub const MAX_IMAGE_PX: u64 = 1 << 28;
-/// Fraction bits of the fixed-point sums over tiles.
+/// Fraction bits of the fixed-point weights that are summed over tiles.
 pub const SUM_FRACTION_BITS: i32 = 32;

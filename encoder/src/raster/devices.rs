@@ -1,4 +1,4 @@
-//! Which devices do the work: GPUs that share the views, or the CPU.
+//! The devices for rasterisation: GPUs that share the views, or the CPU.
 
 use std::fmt;
 use std::str::FromStr;
@@ -6,24 +6,26 @@ use std::sync::{Condvar, Mutex, PoisonError};
 
 use slag_common::Gaussians;
 
+use super::cpu::CpuRasterizer;
+use super::draw::Drawing;
+use super::error::RasterError;
 use super::gpu::{Adapter, GpuOptions, GpuRasterizer, adapters};
-use super::{
-    CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, StageTime, ViewWeights,
-    WeightKind,
-};
+use super::rasterizer::{LoadedScene, Rasterizer};
+use super::view::RasterView;
+use super::weights::{StageTime, ViewWeights, WeightKind};
 use crate::masks::RegionMap;
 
-/// What the user asks for.
+/// The choice of the user.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum DeviceChoice {
-    /// All GPUs; the CPU where there is none. A GPU that the processor imitates does not count.
+    /// All GPUs, or the CPU if there are none. Software adapters (llvmpipe, WARP) are ignored.
     #[default]
     Auto,
-    /// All GPUs, or an error. An imitated one will do where there is no other.
+    /// All GPUs, or an error. A software adapter is used if there is no other.
     Gpu,
     /// The CPU.
     Cpu,
-    /// One adapter, by its number in the list.
+    /// The adapter with this number in the list.
     Adapter(usize),
 }
 
@@ -37,7 +39,7 @@ impl FromStr for DeviceChoice {
             "cpu" => Ok(Self::Cpu),
             _ => text.parse().map(Self::Adapter).map_err(|_| {
                 format!(
-                    "{text:?}: expected auto, gpu, cpu or the number of an adapter (`slag-encoder devices`)"
+                    "{text:?}: expected auto, gpu, cpu or the number of an adapter, listed by `slag-encoder devices`"
                 )
             }),
         }
@@ -55,39 +57,39 @@ impl fmt::Display for DeviceChoice {
     }
 }
 
-/// No device can be used.
+/// Reason why no device can be used.
 #[derive(Debug, thiserror::Error)]
 pub enum DeviceError {
-    /// There is none.
+    /// There is no GPU.
     #[error(
-        "no GPU was found; install its Vulkan driver (Debian: libvulkan1 and the vendor's driver, or \
+        "no GPU found; install its Vulkan driver (Debian: libvulkan1 and the vendor's driver, or \
          mesa-vulkan-drivers), or use --device cpu"
     )]
     NoAdapter,
-    /// The number is beyond the list.
-    #[error("adapter {number} does not exist, there are {n_adapters}; `slag-encoder devices` lists them")]
+    /// There is no adapter with this number.
+    #[error("adapter {number} does not exist; `slag-encoder devices` lists the {n_adapters} adapters")]
     NoSuchAdapter {
-        /// What was asked for.
+        /// The chosen number.
         number: usize,
-        /// How many there are.
+        /// Number of adapters.
         n_adapters: usize,
     },
-    /// None of those asked for could be opened.
+    /// None of the chosen adapters can be opened.
     #[error(transparent)]
     Unfit(#[from] RasterError),
 }
 
-/// The devices that do the work; a backend itself.
+/// A backend that distributes views over several devices.
 pub struct Devices {
     gpus: Vec<GpuRasterizer>,
     views_in_flight: usize,
 }
 
 impl Devices {
-    /// Opens what was asked for. What is left out is said in the log.
+    /// Opens the chosen devices. Devices that fail are logged and left out.
     ///
     /// # Errors
-    /// [`DeviceError`] unless the choice leaves the CPU.
+    /// [`DeviceError`] if no chosen device works and the choice excludes the CPU.
     pub fn open(choice: DeviceChoice, options: GpuOptions) -> Result<Self, DeviceError> {
         let views_in_flight = options.views_in_flight.max(1);
         let all = if choice == DeviceChoice::Cpu { Vec::new() } else { adapters() };
@@ -99,7 +101,7 @@ impl Devices {
                 None => return Err(DeviceError::NoSuchAdapter { number, n_adapters }),
             },
             DeviceChoice::Auto | DeviceChoice::Gpu => {
-                // A GPU may be there once an interface: those of the best one's interface are distinct.
+                // A GPU appears once per graphics interface; within the interface of the best adapter, GPUs are distinct.
                 let backend = all.first().map(|a| a.report.backend.clone());
                 let (software, hardware): (Vec<Adapter>, Vec<Adapter>) = all
                     .into_iter()
@@ -115,7 +117,7 @@ impl Devices {
             match adapter.open(report.precision) {
                 Ok(device) => {
                     tracing::info!(
-                        "weights on {} ({}, {}, {} GPU, projection in {:?})",
+                        "rasterising on {} ({}, {}, {} GPU, projection in {:?})",
                         report.name,
                         report.backend,
                         report.driver,
@@ -125,7 +127,7 @@ impl Devices {
                     gpus.push(GpuRasterizer::new(device, options));
                 }
                 Err(error) => {
-                    tracing::warn!("a GPU is left out: {error}");
+                    tracing::warn!("ignoring a GPU: {error}");
                     failure = Some(error);
                 }
             }
@@ -133,7 +135,7 @@ impl Devices {
         if gpus.is_empty() {
             match (choice, failure) {
                 (DeviceChoice::Cpu, _) => {}
-                (DeviceChoice::Auto, _) => tracing::info!("weights on the CPU: no GPU was found"),
+                (DeviceChoice::Auto, _) => tracing::info!("rasterising on the CPU: no GPU found"),
                 (_, Some(error)) => return Err(error.into()),
                 (_, None) => return Err(DeviceError::NoAdapter),
             }
@@ -141,7 +143,7 @@ impl Devices {
         Ok(Self { gpus, views_in_flight })
     }
 
-    /// Uses GPUs that are open already.
+    /// Creates a backend from opened GPUs.
     pub fn of(gpus: Vec<GpuRasterizer>, views_in_flight: usize) -> Self {
         Self { gpus, views_in_flight: views_in_flight.max(1) }
     }
@@ -168,84 +170,84 @@ impl Rasterizer for Devices {
             match gpu.load(scene) {
                 Ok(loaded) => gpus.push(loaded),
                 Err(error @ RasterError::Device { .. }) => {
-                    tracing::warn!("a GPU is left out: {error}");
+                    tracing::warn!("ignoring a GPU: {error}");
                 }
                 Err(error) => return Err(error),
             }
         }
         if gpus.is_empty() {
             if !self.gpus.is_empty() {
-                tracing::warn!("the CPU does the work of the GPUs");
+                tracing::warn!("no GPU works; rasterising on the CPU");
             }
             return Ok(cpu);
         }
-        let lanes =
+        let slots =
             DeviceSlots { n_free: vec![self.views_in_flight; gpus.len()], is_usable: vec![true; gpus.len()] };
         Ok(Box::new(SharedScene {
             gpus,
             views_in_flight: self.views_in_flight,
             cpu,
-            lanes: Mutex::new(lanes),
+            slots: Mutex::new(slots),
             freed: Condvar::new(),
         }))
     }
 }
 
-/// A scene on several GPUs. Each has as many lanes as it works on views at once; whoever asks for a
-/// view gets the GPU with the most free lanes, so a slow view holds up none but its own lane.
+/// A scene on several GPUs. Each GPU has one slot per view in flight. A view goes to the GPU with the most free slots,
+/// so a slow view occupies only its own slot.
 struct SharedScene<'s> {
     gpus: Vec<Box<dyn LoadedScene + 's>>,
     views_in_flight: usize,
     cpu: Box<dyn LoadedScene + 's>,
-    lanes: Mutex<DeviceSlots>,
+    slots: Mutex<DeviceSlots>,
     freed: Condvar,
 }
 
 struct DeviceSlots {
-    /// Free lanes of each GPU.
+    /// Free slots of each GPU.
     n_free: Vec<usize>,
     is_usable: Vec<bool>,
 }
 
 impl SharedScene<'_> {
-    /// Returns the GPU with the most free lanes, or `None` if none is usable any more.
+    /// Takes a slot of the GPU with the most free slots, and waits for one if necessary; `None` if no GPU is usable.
     fn take(&self) -> Option<usize> {
-        let mut lanes = self.lanes.lock().unwrap_or_else(PoisonError::into_inner);
-        while lanes.is_usable.contains(&true) {
-            let usable = (0..self.gpus.len()).filter(|gpu| lanes.is_usable[*gpu] && lanes.n_free[*gpu] > 0);
-            // The first of those with as many.
-            if let Some(gpu) = usable.rev().max_by_key(|gpu| lanes.n_free[*gpu]) {
-                lanes.n_free[gpu] -= 1;
+        let mut slots = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
+        while slots.is_usable.contains(&true) {
+            let usable = (0..self.gpus.len()).filter(|gpu| slots.is_usable[*gpu] && slots.n_free[*gpu] > 0);
+            // The first of equals: `max_by_key` returns the last.
+            if let Some(gpu) = usable.rev().max_by_key(|gpu| slots.n_free[*gpu]) {
+                slots.n_free[gpu] -= 1;
                 return Some(gpu);
             }
-            lanes = self.freed.wait(lanes).unwrap_or_else(PoisonError::into_inner);
+            slots = self.freed.wait(slots).unwrap_or_else(PoisonError::into_inner);
         }
         None
     }
 
-    /// Does the work on the next free GPU; where one fails on the next, and at last on the CPU.
+    /// Runs work on the next free GPU; if it fails, on another GPU, and finally on the CPU.
     fn run<T>(&self, work: impl Fn(&dyn LoadedScene) -> Result<T, RasterError>) -> Result<T, RasterError> {
         while let Some(gpu) = self.take() {
             let result = work(self.gpus[gpu].as_ref());
-            let mut lanes = self.lanes.lock().unwrap_or_else(PoisonError::into_inner);
+            let mut slots = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
             let failed = matches!(result, Err(RasterError::Device { .. }));
-            if failed && lanes.is_usable[gpu] {
-                lanes.is_usable[gpu] = false;
+            if failed && slots.is_usable[gpu] {
+                slots.is_usable[gpu] = false;
                 if let Err(error) = &result {
-                    let rest = lanes.is_usable.iter().filter(|usable| **usable).count();
-                    tracing::warn!("a GPU is left out: {error}; {rest} GPUs go on, else the CPU does");
+                    let rest = slots.is_usable.iter().filter(|usable| **usable).count();
+                    tracing::warn!("ignoring a GPU: {error}; {rest} other GPUs remain");
                 }
-                // Whoever waits for a lane must see that there may be none.
+                // Waiting threads must see that there may be no usable GPU.
                 self.freed.notify_all();
             } else if !failed {
-                lanes.n_free[gpu] += 1;
+                slots.n_free[gpu] += 1;
                 self.freed.notify_one();
             }
-            drop(lanes);
+            drop(slots);
             match result {
                 Err(RasterError::Device { .. }) => {}
-                Err(error @ RasterError::DeviceRoom { .. }) => {
-                    tracing::warn!("a view goes to the CPU: {error}");
+                Err(error @ RasterError::DeviceCapacity { .. }) => {
+                    tracing::warn!("rasterising a view on the CPU: {error}");
                     return work(self.cpu.as_ref());
                 }
                 result => return result,
@@ -269,7 +271,7 @@ impl LoadedScene for SharedScene<'_> {
         self.run(|scene| scene.draw(view, background))
     }
 
-    fn n_lanes(&self) -> Option<usize> {
+    fn concurrency(&self) -> Option<usize> {
         Some(self.gpus.len() * self.views_in_flight)
     }
 }

@@ -1,4 +1,4 @@
-//! Draws colour, depth and coverage.
+//! Drawing of colour, depth and coverage.
 
 use bytemuck::cast_slice_mut;
 use rayon::prelude::*;
@@ -8,26 +8,26 @@ use super::blend::{PerPixel, TileRect, WeightSink, walk_tile};
 use super::constants::TILE_SIZE_PX;
 use super::project::ScreenGaussian;
 use super::simd::{Lanes, Level};
-use super::{ViewCounters, WeightKind};
+use super::weights::{ViewCounters, WeightKind};
 
-/// The picture of a scene in one view; every column is row-major.
+/// The picture of a scene in one view; all arrays are row-major.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Drawing {
     /// Width, pixels.
     pub width_px: u32,
     /// Height, pixels.
     pub height_px: u32,
-    /// Colour `[height * width][3]` over the background, at least 0, not limited to 1.
+    /// Colour over the background, `[height * width][3]`; at least 0, not limited to 1.
     pub rgb: Vec<f32>,
-    /// Expected camera z of what is seen, world units: weighted by contribution; 0 where nothing is.
+    /// Expected camera z, weighted by contribution, world units; 0 at pixels without any Gaussian.
     pub depth: Vec<f32>,
-    /// Share of the background that is hidden, 0..=1.
+    /// Opacity of the scene at the pixel, 0..=1: one minus the transmittance.
     pub coverage: Vec<f32>,
-    /// What happened on the way.
+    /// Statistics of the view.
     pub counters: ViewCounters,
 }
 
-/// Draws the Gaussians of every tile; `colours` has one RGB a visible Gaussian.
+/// Draws the Gaussians of all tiles. `colours` contains the RGB colour of each visible Gaussian.
 pub fn draw(
     level: Level,
     visible: &[ScreenGaussian],
@@ -74,7 +74,7 @@ pub fn draw(
     }
 }
 
-/// Adds colour and depth up per pixel of a tile.
+/// Accumulates colour and depth per pixel of a tile.
 struct PixelSink<'a> {
     visible: &'a [ScreenGaussian],
     colours: &'a [[f32; 3]],

@@ -1,4 +1,4 @@
-// Twin of draw.rs: colour, depth and coverage of each pixel; a workgroup is a tile, a thread a pixel.
+// Twin of draw.rs: draws colour, depth and coverage. A workgroup processes a tile, a thread a pixel.
 
 struct Background {
     rgb: vec3<f32>,
@@ -10,9 +10,9 @@ struct Background {
 @group(0) @binding(2) var<storage, read> screen: array<Screen>;
 @group(0) @binding(3) var<storage, read> members: array<u32>;
 @group(0) @binding(4) var<storage, read> ranges: array<Range>;
-// Three a Gaussian of the scene.
+// Three values per Gaussian of the scene.
 @group(0) @binding(5) var<storage, read> colours: array<f32>;
-// Red, green, blue, depth, coverage; row-major, of the band alone.
+// Red, green, blue, depth, coverage; row-major, within the band.
 @group(0) @binding(6) var<storage, read_write> pixels: array<f32>;
 
 const LOAD = 64u;
@@ -53,7 +53,7 @@ fn draw(
     var depth = 0.0;
     var total = 0.0;
     for (var start = range.x; start < range.y; start += LOAD) {
-        // The Gaussians before are done with.
+        // All threads have finished the previous batch.
         workgroupBarrier();
         if thread < LOAD && start + thread < range.y {
             let member = members[start + thread];
@@ -80,7 +80,7 @@ fn draw(
                 let alpha = min(g.opacity * exp_of_minus(0.5 * u * u + 0.5 * v * v), MAX_ALPHA);
                 let next = transmittance * (1.0 - alpha);
                 if alpha < MIN_ALPHA {
-                    // Skipped.
+                    // The alpha is too small.
                 } else if next > MIN_TRANSMITTANCE {
                     let weight = alpha * transmittance;
                     rgb += weight * gaussians[i].rgb;

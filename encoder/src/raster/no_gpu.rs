@@ -5,7 +5,8 @@ use std::convert::Infallible;
 use slag_common::Gaussians;
 
 pub use super::adapter::{AdapterReport, GpuOptions, Precision};
-use super::{LoadedScene, RasterError, Rasterizer};
+use super::error::RasterError;
+use super::rasterizer::{LoadedScene, Rasterizer};
 
 /// An adapter; there is none.
 pub struct Adapter {

@@ -5,18 +5,18 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 use slag_common::{Gaussians, Intrinsics};
 
-use super::RasterView;
 use super::buckets::concat;
 use super::constants::{
     COVARIANCE_BLUR_PX2, FAR_Z, FOV_MARGIN, MAX_VARIANCE_PX2, MIN_ALPHA, NEAR_Z, REACH2_MARGIN,
 };
+use super::view::RasterView;
 
 /// A Gaussian on the screen.
 ///
-/// With `d = pixel centre - mean_px`, `u = inv_width * (d.x - slope * d.y)` and `v = inv_height *
-/// d.y`, the power is `(u^2 + v^2) / 2`: the Cholesky factor of the inverse covariance. A sum of
-/// squares loses no digits where needles cancel in `a dx^2 + 2 b dx dy + c dy^2`.
-/// 56 bytes: tiles read these at random, and a cache line is 64.
+/// With `d = pixel centre - mean_px`, `u = inv_width * (d.x - slope * d.y)` and `v = inv_height * d.y`, the exponent is
+/// `(u^2 + v^2) / 2`: the fields are the Cholesky factor of the inverse covariance. A sum of squares loses no digits,
+/// whereas the terms of `a dx^2 + 2 b dx dy + c dy^2` cancel for needles. The size is 56 bytes, because tiles access
+/// Gaussians at random and a cache line has 64.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Zeroable)]
 pub struct ScreenGaussian {
     /// Index in the scene.
@@ -25,20 +25,20 @@ pub struct ScreenGaussian {
     pub depth: f32,
     /// Opacity.
     pub opacity: f32,
-    /// `u^2 + v^2` within which alpha may count.
+    /// Largest `u^2 + v^2` at which alpha may count.
     pub reach2: f32,
     /// Centre on the screen, pixels.
     pub mean_px: DVec2,
     /// 1 / standard deviation along x at fixed y, 1/px.
     pub inv_width: f64,
-    /// Shift of the ellipse's row centres, pixels of x a pixel of y.
+    /// Shift of the centre of the ellipse per row, pixels of x per pixel of y.
     pub slope: f64,
     /// 1 / standard deviation along y, 1/px.
     pub inv_height: f64,
 }
 
 impl ScreenGaussian {
-    /// Returns half the size of the box around the footprint, pixels.
+    /// Returns half the size of the bounding box of the footprint, pixels.
     pub fn extent_px(&self) -> DVec2 {
         let cov_yy = self.inv_height.powi(-2);
         let cov_xx = self.inv_width.powi(-2) + self.slope * self.slope * cov_yy;
@@ -51,53 +51,52 @@ impl ScreenGaussian {
         [self.mean_px.y - extent, self.mean_px.y + extent]
     }
 
-    /// Returns the pixels `first..=last` along one axis whose centres lie in `[low, high]` and in the
-    /// image; `None` if there is none.
+    /// Returns the pixels `first..=last` of an axis with centres in `[low, high]` and in the image; `None` if there are
+    /// none.
     pub fn pixels_within(low: f64, high: f64, size_px: u32) -> Option<(u32, u32)> {
         let first = (low - 0.5).max(0.0);
         let last = (high - 0.5).min(f64::from(size_px) - 1.0);
         if first > last {
             return None;
         }
-        // Truncation is an instruction where `ceil` and `floor` may be calls.
+        // Truncation is a single instruction; `ceil` and `floor` may be calls.
         let (below, last) = (first as u32, last as u32);
         let first = below + u32::from(f64::from(below) < first);
         (first <= last).then_some((first, last))
     }
 }
 
-/// What of a scene a view can see.
+/// The Gaussians of a scene that a view can see.
 #[derive(Clone, Debug, Default)]
 pub struct Projection {
-    /// Gaussians with at least one pixel centre of the image in the box around their footprint, in
-    /// the scene's order.
+    /// Gaussians with at least one pixel centre of the image in the bounding box of their footprint, in scene order.
     pub visible: Vec<ScreenGaussian>,
-    /// Gaussians that cannot be drawn.
+    /// Number of Gaussians that cannot be drawn.
     pub unusable: usize,
 }
 
-/// Gaussians a task of the thread pool; enough to hide its cost.
+/// Gaussians per task of the thread pool; enough to hide its overhead.
 const CHUNK: usize = 4096;
 
-/// A scene with what decides quickly that a Gaussian is not seen.
+/// A scene with precomputed sizes, to exclude invisible Gaussians quickly.
 pub struct Prepared<'s> {
-    /// The scene; its columns fit each other.
+    /// The scene, with columns of matching lengths.
     pub scene: &'s Gaussians,
     sizes: Vec<Size>,
     unusable: usize,
 }
 
-/// How far a Gaussian can reach.
+/// Extent of a Gaussian.
 #[derive(Clone, Copy, Zeroable)]
 struct Size {
     /// Largest standard deviation, world units.
     max_scale: f32,
-    /// `u^2 + v^2` within which alpha may count; negative where the Gaussian is never drawn.
+    /// Largest `u^2 + v^2` at which alpha may count; negative if the Gaussian is never drawn.
     reach2: f32,
 }
 
 impl<'s> Prepared<'s> {
-    /// Looks at each Gaussian of a scene whose columns fit each other.
+    /// Prepares a scene with columns of matching lengths.
     pub fn new(scene: &'s Gaussians) -> Self {
         let mut sizes: Vec<Size> = bytemuck::zeroed_vec(scene.len());
         let unusable = sizes
@@ -119,7 +118,7 @@ impl<'s> Prepared<'s> {
         Self { scene, sizes, unusable }
     }
 
-    /// Projects what a view can see.
+    /// Projects the Gaussians that a view can see.
     pub fn project(&self, view: &RasterView) -> Projection {
         let bounds = Bounds::new(view);
         let parts: Vec<(Vec<ScreenGaussian>, usize)> = self
@@ -151,22 +150,22 @@ impl<'s> Prepared<'s> {
     }
 }
 
-/// The frustum of a view, for a test that costs little and errs on the side of keeping.
+/// The frustum of a view, for a cheap and conservative visibility test.
 struct Bounds {
     /// Focal lengths, pixels.
     focal_px: DVec2,
-    /// From the centre of the first pixel to the principal point, pixels.
+    /// Distance from the centre of the first pixel to the principal point, pixels.
     before_px: DVec2,
-    /// From the principal point to the centre of the last pixel, pixels.
+    /// Distance from the principal point to the centre of the last pixel, pixels.
     after_px: DVec2,
-    /// Pixels on the screen a world unit at z = 1, at most.
+    /// Upper bound of the screen pixels per world unit at z = 1.
     stretch_px: DVec2,
 }
 
 impl Bounds {
-    /// Taken on top of the extent: rotations are orthonormal only to 1e-3, sums are rounded.
+    /// Factor on the extent: rotations are orthonormal to 1e-3 only, and sums are rounded.
     const SLACK: f64 = 1.002;
-    /// Extents up to here are certain to have a covariance within [`MAX_VARIANCE_PX2`].
+    /// Extents below this have a covariance within [`MAX_VARIANCE_PX2`] for certain.
     const MAX_EXTENT_PX: f64 = 1e9;
 
     fn new(view: &RasterView) -> Self {
@@ -182,14 +181,14 @@ impl Bounds {
         }
     }
 
-    /// Returns whether no pixel centre can be in the footprint of a Gaussian with this mean, camera
-    /// frame. All lengths are times z: no division.
+    /// Returns whether the footprint of a Gaussian with this mean (camera frame) contains no pixel centre for certain.
+    /// All lengths are multiplied by z, which avoids divisions.
     fn exclude(&self, mean: DVec3, size: Size) -> bool {
         if !(NEAR_Z..=FAR_Z).contains(&mean.z) {
             return true;
         }
         let reach = f64::from(size.reach2).sqrt() * Self::SLACK;
-        // The root of a sum is at most the sum of the roots.
+        // The square root of a sum is at most the sum of the square roots.
         let extent =
             (self.stretch_px * f64::from(size.max_scale) + COVARIANCE_BLUR_PX2.sqrt() * mean.z) * reach;
         let offset = self.focal_px * mean.truncate();
@@ -200,15 +199,15 @@ impl Bounds {
     }
 }
 
-/// Returns the squared Mahalanobis distance within which a Gaussian's alpha may reach 1/255.
+/// Returns the squared Mahalanobis distance within which the alpha of a Gaussian may reach 1/255.
 pub fn reach2(opacity: f32) -> f32 {
     ((2.0 * (255.0 * f64::from(opacity)).ln()).max(0.0) + REACH2_MARGIN) as f32
 }
 
-/// The projected covariance is beyond the range of the pixels' arithmetic.
+/// The projected covariance exceeds the range of the pixels' arithmetic.
 struct Unrepresentable;
 
-/// Projects one usable Gaussian whose mean is given in the camera's frame; `None` where it is culled.
+/// Projects a usable Gaussian with its mean in the camera frame; `None` if it is culled.
 fn project_one(
     scene: &Gaussians,
     index: usize,
@@ -226,7 +225,7 @@ fn project_one(
     let world_from_axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
     let scales = DVec3::from_array(scene.scales[index].map(f64::from));
     let camera_from_unit = view.camera_from_world.matrix3 * world_from_axes * DMat3::from_diagonal(scales);
-    // Rows of M, with covariance = M M' + blur I.
+    // Rows of M, where the covariance is M M' + blur I.
     let m_x = camera_from_unit.transpose() * row_x;
     let m_y = camera_from_unit.transpose() * row_y;
     let cov_xx = m_x.length_squared() + COVARIANCE_BLUR_PX2;
@@ -235,7 +234,7 @@ fn project_one(
     if !(cov_xx <= MAX_VARIANCE_PX2 && cov_yy <= MAX_VARIANCE_PX2 && mean_px.is_finite()) {
         return Err(Unrepresentable);
     }
-    // |m_x|^2 |m_y|^2 - (m_x . m_y)^2 = |m_x x m_y|^2 (Lagrange): exact for needles, and above 0.
+    // Lagrange's identity |m_x|^2 |m_y|^2 - (m_x . m_y)^2 = |m_x x m_y|^2 is accurate for needles, and positive.
     let det = m_x.cross(m_y).length_squared() + COVARIANCE_BLUR_PX2 * (cov_xx + cov_yy)
         - COVARIANCE_BLUR_PX2 * COVARIANCE_BLUR_PX2;
     let on_screen = ScreenGaussian {
@@ -255,8 +254,8 @@ fn project_one(
     Ok(in_image.map(|_| on_screen))
 }
 
-/// Returns the rows of the Jacobian of the pinhole projection (Zwicker et al., EWA splatting, 2001),
-/// px per world unit, taken inside a slightly widened field of view.
+/// Returns the rows of the Jacobian of the pinhole projection (Zwicker et al., EWA splatting, 2001), px per world unit,
+/// evaluated within a slightly widened field of view.
 fn jacobian_rows(mean: DVec3, camera: &Intrinsics) -> [DVec3; 2] {
     let [limit_x, limit_y] = tangent_limits(camera);
     let tan_x = (mean.x / mean.z).max(limit_x[0]).min(limit_x[1]);
@@ -267,7 +266,7 @@ fn jacobian_rows(mean: DVec3, camera: &Intrinsics) -> [DVec3; 2] {
     ]
 }
 
-/// Returns the lowest and highest tangent in x and y at which the Jacobian is taken.
+/// Returns the lowest and highest tangents in x and y at which the Jacobian is evaluated.
 fn tangent_limits(camera: &Intrinsics) -> [[f64; 2]; 2] {
     let limits = |focal: f64, centre: f64, size: u32| {
         let margin = FOV_MARGIN * 0.5 * f64::from(size) / focal;

@@ -1,7 +1,7 @@
-// Twin of project.rs: Gaussians to ellipses on the screen.
+// Twin of project.rs: projects Gaussians to ellipses on the screen.
 
-// Four vectors each: mean high part and opacity, mean low part and squared reach, rotation wxyz,
-// scales and padding. An opacity of 0 marks what cannot be drawn.
+// Four vectors each: high part of the mean and opacity, low part of the mean and squared reach, rotation wxyz,
+// scales and padding. An opacity of 0 marks Gaussians that cannot be drawn.
 struct SceneGaussian {
     mean_high: vec3<f32>,
     opacity: f32,
@@ -55,8 +55,8 @@ fn project(index: u32) -> Projected {
     if g.opacity < MIN_ALPHA {
         return result;
     }
-    // High parts first: their difference is exact where it matters, so a scene far from its origin
-    // keeps its accuracy in f32 too.
+    // Subtracts high parts first. Their difference is exact near the camera, so scenes far from the origin
+    // keep their accuracy in f32 as well.
     let from_camera = real3(
         (real(g.mean_high.x) - view.position_high[0]) + (real(g.mean_low.x) - view.position_low[0]),
         (real(g.mean_high.y) - view.position_high[1]) + (real(g.mean_low.y) - view.position_low[1]),
@@ -81,8 +81,9 @@ fn project(index: u32) -> Projected {
     let scale_y = view.focal_y_px / z;
     let blur = real(COVARIANCE_BLUR_PX2);
 
-    // No standard deviation on the screen is above the largest axis times the Jacobian's row; a
-    // footprint outside the image by that needs no covariance. Wider by half: no rounding matters.
+    // A standard deviation on the screen is at most the largest scale times the norm of the Jacobian's row.
+    // Footprints outside the image by this bound need no covariance. The bound is widened by half, so rounding
+    // does not matter.
     let size = real(max(max(g.scales.x, g.scales.y), g.scales.z));
     let spread = real(g.reach2) * real(2.25);
     let most_x = scale_x * scale_x * (ONE + tan_x * tan_x) * size * size + blur;
@@ -91,12 +92,12 @@ fn project(index: u32) -> Projected {
     let beyond_y = max(max(-mean_y, mean_y - height), ZERO);
     let is_far_out = beyond_x * beyond_x > most_x * spread || beyond_y * beyond_y > most_y * spread;
     let limit = real(MAX_VARIANCE_PX2);
-    // What cannot be represented is counted, in the image or not.
+    // Gaussians out of range are counted even outside the image.
     if is_far_out && most_x < limit && most_y < limit && is_coordinate(mean_x) && is_coordinate(mean_y) {
         return result;
     }
 
-    // Rows of camera-from-Gaussian's axes, times scales; then the Jacobian's two rows on them.
+    // Rows of the axes of the Gaussian in the camera frame, times scales; then their products with the Jacobian's rows.
     let q = real4(
         real(g.rotation_wxyz.x),
         real(g.rotation_wxyz.y),
@@ -127,7 +128,7 @@ fn project(index: u32) -> Projected {
         result.status = UNREPRESENTABLE;
         return result;
     }
-    // Lagrange's identity: exact for needles, and above 0.
+    // Lagrange's identity is accurate for needles, and positive.
     let c = real3(
         m_x.y * m_y.z - m_x.z * m_y.y,
         m_x.z * m_y.x - m_x.x * m_y.z,
@@ -155,11 +156,11 @@ fn project(index: u32) -> Projected {
     return result;
 }
 
-// Counts the visible Gaussians of each block of the chunk, and what cannot be represented.
+// Counts the visible Gaussians of each block of the chunk, and the Gaussians out of range.
 @compute @workgroup_size(WORKGROUP_SIZE)
 fn count_visible(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) thread: u32) {
     let index = group.x * WORKGROUP_SIZE + thread;
-    // Bands of tile rows work one after another: each Gaussian is counted in the first that it is in.
+    // Bands are processed one after another; each Gaussian is counted in its first band.
     let is_first_band = view.first_tile_row == 0u;
     var is_visible = 0u;
     var is_new = 0u;
@@ -167,12 +168,12 @@ fn count_visible(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocat
         let p = project(index);
         is_visible = u32(p.status == VISIBLE);
         is_new = u32(p.status == VISIBLE && (is_first_band || p.first_tile_row >= view.first_tile_row));
-        // Rare, so that every thread may count for itself.
+        // Rare, so each thread increments the counter itself.
         if p.status == UNREPRESENTABLE && is_first_band {
             atomicAdd(&counters[COUNTER_UNREPRESENTABLE], 1u);
         }
     }
-    // Two sums in one: each is at most the size of the workgroup.
+    // Packs two sums in one word: each is at most the size of the workgroup.
     let packed = is_visible | (is_new << 16u);
     let sums = block_scan(packed, thread) + packed;
     if thread == WORKGROUP_SIZE - 1u {
@@ -181,7 +182,7 @@ fn count_visible(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocat
     }
 }
 
-// Writes the visible Gaussians in the scene's order, and how many tiles each touches.
+// Writes the visible Gaussians in scene order, and the number of tiles that each touches.
 @compute @workgroup_size(WORKGROUP_SIZE)
 fn write_visible(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) thread: u32) {
     let index = group.x * WORKGROUP_SIZE + thread;

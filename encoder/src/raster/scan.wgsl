@@ -1,12 +1,12 @@
-// Sums over an array: what every stage places its output by.
+// Prefix sums over an array, which give every stage the positions of its output.
 
 struct ScanJob {
-    // The array holds `ceil(n / block) * columns` values; n is counters[items], at most n_most.
+    // The array has `ceil(n / block) * columns` values, where n is counters[items], at most n_most.
     items: u32,
     n_most: u32,
     block: u32,
     columns: u32,
-    // Counter that the scan starts from and adds its sum to, where the array has a total.
+    // Counter that the scan starts from and adds the total to, if there is one.
     total: u32,
 }
 
@@ -18,11 +18,11 @@ struct ScanJob {
 const PER_THREAD = 8u;
 var<workgroup> length: u32;
 
-// Replaces each value by the sum of those before it; one workgroup walks the array.
+// Replaces each value by the sum of all values before it. One workgroup processes the array.
 @compute @workgroup_size(WORKGROUP_SIZE)
 fn scan(@builtin(local_invocation_index) thread: u32) {
     if thread == 0u {
-        // A counter goes on beyond the room; what lies there was never written.
+        // A counter may exceed the capacity; values beyond the capacity were never written.
         var n = job.n_most;
         if job.items != NONE {
             n = min(n, counters[job.items]);
@@ -56,14 +56,14 @@ fn scan(@builtin(local_invocation_index) thread: u32) {
         }
         carry = workgroupUniformLoad(&length);
     }
-    // All have read the old total before it is replaced.
+    // All threads have read the old total before it is replaced.
     workgroupBarrier();
     if thread == 0u && job.total != NONE {
         counters[job.total] = carry;
         for (var kind = 0u; kind < 2u; kind++) {
             let block = select(WORKGROUP_SIZE, SORT_BLOCK, kind == 1u);
             let at = (job.total * 2u + kind) * 4u;
-            // Kernels stride over what is beyond the largest dispatch.
+            // Kernels use a stride for items beyond the largest dispatch.
             dispatches[at] = min((carry + block - 1u) / block, MAX_DISPATCH);
             dispatches[at + 1u] = 1u;
             dispatches[at + 2u] = 1u;

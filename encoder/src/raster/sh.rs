@@ -1,4 +1,4 @@
-//! Colour of Gaussians as seen from a camera: real spherical harmonics up to degree 3.
+//! Colours of Gaussians seen from a camera: real spherical harmonics up to degree 3.
 
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -7,13 +7,13 @@ use slag_common::gaussians::SH_C0;
 
 use super::project::ScreenGaussian;
 
-/// Factors of the real spherical harmonics of degree 1, 2 and 3 in the order and with the signs of
-/// 3DGS (Kerbl et al. 2023), which takes them from Ramamoorthi and Hanrahan's polynomials.
+/// Factors of the real spherical harmonics of degree 1, 2 and 3, in the order and with the signs of 3DGS (Kerbl et al.
+/// 2023), which follows the polynomials of Ramamoorthi and Hanrahan.
 const SH_C1: f32 = 0.488_602_51;
 const SH_C2: [f32; 5] = [1.092_548_4, -1.092_548_4, 0.315_391_57, -1.092_548_4, 0.546_274_2];
 const SH_C3: [f32; 7] =
     [-0.590_043_6, 2.890_611_4, -0.457_045_8, 0.373_176_33, -0.457_045_8, 1.445_305_7, -0.590_043_6];
-/// Higher coefficients of degree 3.
+/// Number of coefficients above degree 0, for degree 3.
 const MAX_REST: usize = 15;
 
 /// Returns the RGB colour of each visible Gaussian seen from a camera.
@@ -36,7 +36,7 @@ pub fn colour(scene: &Gaussians, index: usize, position_in_world: DVec3) -> [f32
             rgb = std::array::from_fn(|c| rgb[c] + value * coefficient[c]);
         }
     }
-    // One broken coefficient must not blot out the picture.
+    // One invalid coefficient must not spoil the picture.
     rgb.map(|c| if c.is_finite() { c.max(0.0) } else { 0.0 })
 }
 

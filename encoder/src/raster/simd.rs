@@ -1,4 +1,4 @@
-//! Instruction sets that the pixels are worked on with.
+//! SIMD instruction sets for the arithmetic of pixels.
 
 use bytemuck::{cast, cast_slice_mut};
 use pulp::{NullaryFnOnce, Scalar, Simd};
@@ -10,9 +10,9 @@ use pulp::{
     x86::{V3, V4},
 };
 
-/// Vectors of an instruction set, with what [`Simd`] lacks.
+/// Vector operations of an instruction set: those of [`Simd`], and a widening addition.
 pub trait Lanes: Simd {
-    /// Adds the values to as many sums.
+    /// Adds each value, widened to `f64`, to the sum of its lane.
     fn add_to_f64(self, values: Self::f32s, sums: &mut [f64]);
 }
 
@@ -58,16 +58,18 @@ impl Lanes for Neon {
     }
 }
 
-/// Work that is written once for all instruction sets; its `run` and all that it calls must be
-/// `inline(always)`, or it is compiled for the plain processor.
+/// Work that is written once for all instruction sets.
+///
+/// `run` and all functions that it calls must be `inline(always)`; otherwise they are compiled for the baseline
+/// instruction set.
 pub trait Work {
-    /// What it gives.
+    /// Result of the work.
     type Output;
     /// Does the work.
     fn run<S: Lanes>(self, simd: S) -> Self::Output;
 }
 
-/// Work on vectors that are known.
+/// Work on the vectors of one instruction set.
 struct On<S, W>(S, W);
 
 impl<S: Lanes, W: Work> NullaryFnOnce for On<S, W> {
@@ -79,11 +81,11 @@ impl<S: Lanes, W: Work> NullaryFnOnce for On<S, W> {
     }
 }
 
-/// An instruction set that this processor has. All give the same bits: nothing is contracted, and
-/// what is summed in another order is summed exactly.
+/// An instruction set of this processor. All give the same bits: multiply-adds are not fused, and sums with another
+/// order are exact.
 #[derive(Clone, Copy, Debug)]
 pub enum Level {
-    /// Plain code, for any processor.
+    /// Scalar code, for any processor.
     Portable,
     /// AVX2, eight `f32` at once.
     #[cfg(target_arch = "x86_64")]
@@ -97,7 +99,7 @@ pub enum Level {
 }
 
 impl Level {
-    /// Returns those that this processor has, narrowest first.
+    /// Returns the instruction sets of this processor, narrowest first.
     pub fn available() -> Vec<Self> {
         let mut levels = vec![Self::Portable];
         #[cfg(target_arch = "x86_64")]
@@ -110,7 +112,7 @@ impl Level {
         levels
     }
 
-    /// Returns the widest that this processor has.
+    /// Returns the widest instruction set of this processor.
     pub fn widest() -> Self {
         Self::available().pop().unwrap_or(Self::Portable)
     }
@@ -128,7 +130,7 @@ impl Level {
         }
     }
 
-    /// Does work compiled for this instruction set.
+    /// Runs work compiled for this instruction set.
     pub fn dispatch<W: Work>(self, work: W) -> W::Output {
         match self {
             Self::Portable => work.run(Scalar),

@@ -1,7 +1,7 @@
-// Stable radix sort of indices by a 32-bit key, 4 bits a pass: count, scan, scatter.
+// Stable radix sort of indices by a 32-bit key, 4 bits per pass: count, scan, scatter.
 //
-// Every thread owns a run of consecutive items, so ranks follow the order of the input without
-// subgroups or atomics: the same on every device.
+// Every thread owns a run of consecutive items, so ranks follow the order of the input without subgroups or
+// atomics, and the result is the same on every device.
 
 struct SortPass {
     // Counter with the number of items.
@@ -10,7 +10,7 @@ struct SortPass {
     stride: u32,
     offset: u32,
     shift: u32,
-    // The first pass takes the items as they are: its input order is not read.
+    // The first pass takes the items in their original order and reads no input order.
     is_first: u32,
     capacity: u32,
 }
@@ -25,7 +25,7 @@ struct SortPass {
 const PER_THREAD = SORT_BLOCK / WORKGROUP_SIZE;
 const RADIX = 16u;
 
-// Counts of each (digit, thread), then where that thread's items of that digit begin.
+// Counts per (digit, thread), then the start of the thread's items with the digit.
 var<workgroup> counts: array<u32, RADIX * WORKGROUP_SIZE>;
 
 fn n_items() -> u32 {
@@ -96,7 +96,7 @@ fn scatter(
             }
         }
         workgroupBarrier();
-        // Thread t scans 16 counts that lie one after another: those of digit t / 16.
+        // Thread t scans 16 consecutive counts, those of digit t / 16.
         var sum = 0u;
         var own: array<u32, RADIX>;
         for (var i = 0u; i < RADIX; i++) {
@@ -105,7 +105,7 @@ fn scatter(
         }
         let before = block_scan(sum, thread);
         let in_digit = thread * RADIX / WORKGROUP_SIZE;
-        // Ranks are wanted from the digit's first item on.
+        // Ranks are relative to the first item of the digit.
         if thread * RADIX % WORKGROUP_SIZE == 0u {
             atomicStore(&block_histogram[in_digit], before);
         }

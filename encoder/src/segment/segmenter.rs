@@ -26,7 +26,7 @@ pub trait Segmenter: Sync {
 
     /// Returns the number of photos that the segmenter's own threads or device process at once; `None` if it works on
     /// the caller's thread.
-    fn n_lanes(&self) -> Option<usize> {
+    fn concurrency(&self) -> Option<usize> {
         None
     }
 

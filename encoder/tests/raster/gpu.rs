@@ -38,15 +38,19 @@ fn chunks_and_bands_change_no_bit() {
     // sums a band. Of the second, part of the scene stays on the device, of the third none.
     let mut n_with_bands = 0;
     // The last has next to no room at first, which must grow to the whole image in one band.
-    for (max_binding_bytes, max_resident_bytes, first_room) in [
+    for (max_binding_bytes, max_resident_bytes, first_capacity) in [
         (60_000, u64::MAX, 1 << 19),
         (90_000, 100_000, 1 << 19),
         (60_000, 0, 1 << 19),
         (1 << 27, u64::MAX, 100),
     ] {
-        let cut =
-            open(GpuOptions { max_binding_bytes, max_resident_bytes, first_room, ..GpuOptions::default() })
-                .unwrap();
+        let cut = open(GpuOptions {
+            max_binding_bytes,
+            max_resident_bytes,
+            first_capacity,
+            ..GpuOptions::default()
+        })
+        .unwrap();
         let (whole, cut) = (whole.load(&scene).unwrap(), cut.load(&scene).unwrap());
         for (width, height) in SIZES_PX {
             let mut view = view;
@@ -76,7 +80,7 @@ fn too_much_for_a_device_is_an_error_and_falls_to_the_cpu() {
     let scene = random_scene(random, 2000, &view, 0);
     let regions = random_regions(random, &view, 3);
     let error = tiny.weights(&scene, &view, &regions, WeightKind::Blend).unwrap_err();
-    assert!(matches!(error, RasterError::DeviceRoom { .. }), "{error}");
+    assert!(matches!(error, RasterError::DeviceCapacity { .. }), "{error}");
     let devices = Devices::of(vec![tiny], 2);
     let found = devices.weights(&scene, &view, &regions, WeightKind::Blend).unwrap();
     assert_eq!(found, CpuRasterizer.weights(&scene, &view, &regions, WeightKind::Blend).unwrap());

@@ -1,12 +1,12 @@
-//! Adapters, and the one that was opened.
+//! Adapters and opened devices.
 
 use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll, Waker};
 
 use super::shader::Kernels;
-use crate::raster::RasterError;
 use crate::raster::adapter::{AdapterReport, Precision};
+use crate::raster::error::RasterError;
 
 /// Describes an adapter.
 fn report_of(adapter: &wgpu::Adapter) -> AdapterReport {
@@ -30,7 +30,7 @@ fn report_of(adapter: &wgpu::Adapter) -> AdapterReport {
 
 /// An adapter that can be opened.
 pub struct Adapter {
-    /// What it is.
+    /// Its description.
     pub report: AdapterReport,
     adapter: wgpu::Adapter,
 }
@@ -39,7 +39,7 @@ pub struct Adapter {
 pub fn adapters() -> Vec<Adapter> {
     let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
     descriptor.backends = wgpu::Backends::PRIMARY;
-    // Dispatch sizes are our own shaders', and within limits: checking them again costs a pass each.
+    // Our own shaders compute the dispatch sizes, within limits; validating them again would cost a pass each.
     descriptor.flags = wgpu::InstanceFlags::empty();
     let instance = wgpu::Instance::new(descriptor);
     let mut adapters: Vec<Adapter> = ready(instance.enumerate_adapters(wgpu::Backends::PRIMARY))
@@ -52,33 +52,33 @@ pub fn adapters() -> Vec<Adapter> {
     adapters
 }
 
-/// An opened device with its compiled shaders.
+/// An opened device with compiled shaders.
 pub struct Device {
     pub(super) device: wgpu::Device,
     pub(super) queue: wgpu::Queue,
     pub(super) kernels: Kernels,
-    /// What it is; the precision is the one that is used.
+    /// Its description, with the precision in use.
     pub report: AdapterReport,
-    /// The first thing that went wrong; the device is not used after it.
+    /// The first error; after it, the device is not used any more.
     failure: Arc<Mutex<Option<String>>>,
 }
 
 impl Adapter {
-    /// Opens the device and compiles the shaders. `precision` may be lower than what the device has.
+    /// Opens the device and compiles the shaders. `precision` may be lower than that of the device.
     ///
     /// # Errors
-    /// [`RasterError::Device`] where the device lacks what the shaders need.
+    /// [`RasterError::Device`] if the device does not meet the requirements of the shaders.
     pub fn open(&self, precision: Precision) -> Result<Device, RasterError> {
         let failed = |what: String| RasterError::Device { adapter: self.report.name.clone(), what };
         let limits = self.adapter.limits();
-        // 256 threads and 32 KiB shared by them: what every desktop device has.
+        // 256 threads and 32 KiB of workgroup memory: every desktop device has them.
         for (name, found, needed) in [
             ("threads of a workgroup", limits.max_compute_invocations_per_workgroup, 256),
             ("bytes of workgroup memory", limits.max_compute_workgroup_storage_size, 32 << 10),
             ("storage buffers of a shader", limits.max_storage_buffers_per_shader_stage, 8),
         ] {
             if found < needed {
-                return Err(failed(format!("has {found} {name}, {needed} are needed")));
+                return Err(failed(format!("has {found} {name}, expected at least {needed}")));
             }
         }
         let has_timestamps = self.adapter.features().contains(wgpu::Features::TIMESTAMP_QUERY);
@@ -118,7 +118,7 @@ impl Adapter {
 }
 
 impl Device {
-    /// Returns an error if anything went wrong since the device was opened.
+    /// Returns the first error since the device was opened.
     pub(super) fn check(&self) -> Result<(), RasterError> {
         match &*self.failure.lock().unwrap_or_else(PoisonError::into_inner) {
             None => Ok(()),
@@ -130,11 +130,11 @@ impl Device {
         RasterError::Device { adapter: self.report.name.clone(), what }
     }
 
-    pub(super) fn room_error(&self, what: String) -> RasterError {
-        RasterError::DeviceRoom { adapter: self.report.name.clone(), what }
+    pub(super) fn capacity_error(&self, what: String) -> RasterError {
+        RasterError::DeviceCapacity { adapter: self.report.name.clone(), what }
     }
 
-    /// Makes a buffer; `None` where the device's memory does not hold it.
+    /// Creates a buffer; `None` if the device memory does not suffice.
     pub(super) fn buffer(
         &self,
         label: &str,
@@ -152,23 +152,23 @@ impl Device {
         ready(scope.pop()).is_none().then_some(buffer)
     }
 
-    /// Waits until a submission is done.
+    /// Waits for the end of a submission.
     pub(super) fn wait(&self, submission: wgpu::SubmissionIndex) -> Result<(), RasterError> {
         let wait = wgpu::PollType::Wait { submission_index: Some(submission), timeout: None };
         let polled = self.device.poll(wait);
-        // Why a submission failed says more than that it did.
+        // The cause of a failure is more informative than the failure of the wait.
         self.check()?;
         polled.map_err(|e| self.error(e.to_string())).map(drop)
     }
 
-    /// Makes the device fail as a lost one does.
+    /// Makes the device fail like a lost device, for tests.
     #[doc(hidden)]
     pub fn lose(&self) {
         self.device.destroy();
     }
 }
 
-/// Runs a future of wgpu, which on native platforms is ready at once.
+/// Runs a future of wgpu; on native platforms it is ready at once.
 fn ready<T>(future: impl Future<Output = T>) -> T {
     let mut future = pin!(future);
     let mut context = Context::from_waker(Waker::noop());

@@ -1,29 +1,29 @@
-//! The small records that tell scans and sorts what to work on.
+//! The parameters of all scans and sorts.
 
 use super::device::Device;
 use super::layout::{Capacities, ScanJob, SortPass, screen_layout};
 use super::shader::{Counter, NONE, SORT_BLOCK, WORKGROUP_SIZE};
 
-/// Bytes from record to record, as bindings must be aligned.
+/// Distance between records, bytes; bindings must be aligned.
 pub const JOB_STRIDE_BYTES: u64 = 256;
-/// Bytes of a record of dispatch sizes.
+/// Size of a record of dispatch sizes, bytes.
 pub const DISPATCH_BYTES: u64 = 16;
-/// Words of a pair.
+/// Size of a pair, words.
 pub const PAIR_WORDS: u32 = 2;
-/// Words of an entry.
+/// Size of an entry, words.
 pub const ENTRY_WORDS: u32 = 4;
 
-/// Scans that are the same for every view.
+/// The scans of a view.
 #[derive(Clone, Copy)]
 pub enum Scan {
     Digits(Counter),
     Pairs,
-    /// No array: only the dispatch sizes.
+    /// Computes dispatch sizes only; there is no array.
     Entries,
     Heads,
 }
 
-/// What is sorted by what.
+/// The sort keys.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub enum SortKey {
     Depth,
@@ -33,9 +33,9 @@ pub enum SortKey {
 }
 
 const SORT_KEYS: [SortKey; 4] = [SortKey::Depth, SortKey::Tile, SortKey::Region, SortKey::Member];
-/// Bits that a pass sorts by.
+/// Bits per sort pass.
 pub const DIGIT_BITS: u32 = 4;
-/// Passes for a key of 32 bits.
+/// Passes for a 32-bit key.
 pub const MAX_PASSES: u32 = 8;
 
 impl SortKey {
@@ -49,11 +49,11 @@ impl SortKey {
     }
 }
 
-/// Scans that are the same for every view.
+/// Number of scan records.
 pub const SCAN_JOBS: u64 = 6;
 
 impl Scan {
-    /// Returns the index of its record.
+    /// Returns the index of the record.
     pub fn index(self) -> u64 {
         match self {
             Self::Digits(Counter::Visible) => 0,
@@ -66,22 +66,23 @@ impl Scan {
     }
 }
 
-/// Returns the index of a pass's record.
+/// Returns the index of the record of a sort pass.
 pub fn sort_job(key: SortKey, pass: u32) -> u64 {
     SCAN_JOBS + key as u64 * u64::from(MAX_PASSES) + u64::from(pass)
 }
 
-/// Returns where the dispatch sizes for a counter's items lie: a thread an item, or a sort block each.
+/// Returns the offset of the dispatch sizes for the items of a counter: one thread per item, or one workgroup per sort
+/// block.
 pub fn dispatch_offset(counter: Counter, by_sort_block: bool) -> u64 {
     (counter as u64 * 2 + u64::from(by_sort_block)) * DISPATCH_BYTES
 }
 
-/// Returns the bits of the numbers below `n`.
+/// Returns the number of bits of the numbers below `n`.
 pub fn bits_of(n: u32) -> u32 {
     u32::BITS - n.saturating_sub(1).leading_zeros()
 }
 
-/// Returns one of the small records of a buffer.
+/// Returns the binding of one record in a buffer.
 pub fn part(buffer: &wgpu::Buffer, index: u64) -> wgpu::BufferBinding<'_> {
     wgpu::BufferBinding {
         buffer,
@@ -90,35 +91,40 @@ pub fn part(buffer: &wgpu::Buffer, index: u64) -> wgpu::BufferBinding<'_> {
     }
 }
 
-/// Writes the records of all scans and sorts for a room.
-pub fn write_jobs(device: &Device, jobs: &wgpu::Buffer, room: Capacities) {
+/// Writes the records of all scans and sorts for the given capacities.
+pub fn write_jobs(device: &Device, jobs: &wgpu::Buffer, capacities: Capacities) {
     let (screen_bytes, depth_word) = screen_layout(device.report.precision);
     let write = |index: u64, bytes: &[u8]| {
         device.queue.write_buffer(jobs, index * JOB_STRIDE_BYTES, bytes);
     };
     let scan = |items, n_most, block, columns, total| ScanJob { items, n_most, block, columns, total };
-    for (counter, most) in
-        [(Counter::Visible, room.visible), (Counter::Pairs, room.pairs), (Counter::Entries, room.entries)]
-    {
+    for (counter, most) in [
+        (Counter::Visible, capacities.visible),
+        (Counter::Pairs, capacities.pairs),
+        (Counter::Entries, capacities.entries),
+    ] {
         let job = scan(counter as u32, most, SORT_BLOCK, 16, NONE);
         write(Scan::Digits(counter).index(), bytemuck::bytes_of(&job));
     }
     for (kind, job) in [
-        (Scan::Pairs, scan(Counter::Visible as u32, room.visible, WORKGROUP_SIZE, 1, Counter::Pairs as u32)),
+        (
+            Scan::Pairs,
+            scan(Counter::Visible as u32, capacities.visible, WORKGROUP_SIZE, 1, Counter::Pairs as u32),
+        ),
         (Scan::Entries, scan(NONE, 0, 1, 1, Counter::Entries as u32)),
         (
             Scan::Heads,
-            scan(Counter::Entries as u32, room.entries, WORKGROUP_SIZE, 1, Counter::RegionSums as u32),
+            scan(Counter::Entries as u32, capacities.entries, WORKGROUP_SIZE, 1, Counter::RegionSums as u32),
         ),
     ] {
         write(kind.index(), bytemuck::bytes_of(&job));
     }
     for key in SORT_KEYS {
         let (stride, offset, capacity) = match key {
-            SortKey::Depth => (screen_bytes / 4, depth_word, room.visible),
-            SortKey::Tile => (PAIR_WORDS, 0, room.pairs),
-            SortKey::Region => (ENTRY_WORDS, 1, room.entries),
-            SortKey::Member => (ENTRY_WORDS, 0, room.entries),
+            SortKey::Depth => (screen_bytes / 4, depth_word, capacities.visible),
+            SortKey::Tile => (PAIR_WORDS, 0, capacities.pairs),
+            SortKey::Region => (ENTRY_WORDS, 1, capacities.entries),
+            SortKey::Member => (ENTRY_WORDS, 0, capacities.entries),
         };
         for pass in 0..MAX_PASSES {
             let job = SortPass {

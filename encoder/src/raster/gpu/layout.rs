@@ -1,4 +1,4 @@
-//! What host and shaders exchange. A test holds these structures against the shaders'.
+//! Data that host and shaders exchange. A test compares these structures with those of the shaders.
 
 use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
@@ -8,19 +8,20 @@ use super::shader::SUM_FRACTION_BITS;
 use crate::raster::adapter::Precision;
 use crate::raster::constants::{MIN_ALPHA, TILE_SIZE_PX};
 use crate::raster::project::reach2;
-use crate::raster::{RasterView, RegionWeight};
+use crate::raster::view::RasterView;
+use crate::raster::weights::RegionWeight;
 
-/// A Gaussian in the device's memory.
+/// A Gaussian in device memory.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub struct SceneGaussian {
     /// Mean relative to the scene's origin, rounded to `f32`.
     pub mean_high: [f32; 3],
-    /// 0 where it cannot be drawn.
+    /// Opacity; 0 if the Gaussian cannot be drawn.
     pub opacity: f32,
-    /// What the rounding left.
+    /// Rounding error of `mean_high`.
     pub mean_low: [f32; 3],
-    /// As [`super::super::project::ScreenGaussian::reach2`].
+    /// See [`crate::raster::project::ScreenGaussian::reach2`].
     pub reach2: f32,
     /// Rotation.
     pub rotation_wxyz: [f32; 4],
@@ -31,7 +32,7 @@ pub struct SceneGaussian {
 }
 
 impl SceneGaussian {
-    /// Takes a Gaussian out of a scene.
+    /// Converts a Gaussian of a scene.
     pub fn new(scene: &Gaussians, index: usize, origin_in_world: DVec3) -> Self {
         let opacity = scene.opacities[index];
         if !scene.is_usable(index) || opacity < MIN_ALPHA {
@@ -54,57 +55,57 @@ impl SceneGaussian {
     }
 }
 
-/// Splits a vector into what `f32` holds and what that leaves: 48 bits in all.
+/// Splits a vector into its `f32` rounding and the error: 48 bits in total.
 fn high_and_low(value: DVec3) -> ([f32; 3], [f32; 3]) {
     let high = value.as_vec3();
     (high.to_array(), (value - high.as_dvec3()).as_vec3().to_array())
 }
 
-/// A part of the scene.
+/// A chunk of the scene.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub struct Chunk {
-    /// Index in the scene of its first Gaussian.
+    /// Index of its first Gaussian in the scene.
     pub first_gaussian: u32,
-    /// How many it has.
+    /// Number of Gaussians.
     pub n_gaussians: u32,
 }
 
-/// A prefix sum, as `scan.wgsl` explains.
+/// Parameters of a prefix sum; see `scan.wgsl`.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub struct ScanJob {
     /// Counter with the number of items.
     pub items: u32,
-    /// Most items there can be; their number where no counter has it.
+    /// Upper limit of the number of items; the number itself if there is no counter.
     pub n_most: u32,
-    /// Items a block.
+    /// Items per block.
     pub block: u32,
-    /// Values a block.
+    /// Values per block.
     pub columns: u32,
     /// Counter for the total.
     pub total: u32,
 }
 
-/// A pass of a radix sort, as `sort.wgsl` explains.
+/// Parameters of a pass of a radix sort; see `sort.wgsl`.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub struct SortPass {
     /// Counter with the number of items.
     pub items: u32,
-    /// Words from key to key.
+    /// Words between keys.
     pub stride: u32,
     /// Word of the first key.
     pub offset: u32,
-    /// Bits below the digit.
+    /// Position of the digit, bits.
     pub shift: u32,
-    /// 1 where the items are still in their own order.
+    /// 1 if the items are in their original order.
     pub is_first: u32,
-    /// Items that there is room for.
+    /// Capacity for items.
     pub capacity: u32,
 }
 
-/// A sum over all tiles of a band, in units of `2^-SUM_FRACTION_BITS`.
+/// A contribution summed over all tiles of a band, in units of `2^-SUM_FRACTION_BITS`.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub struct RegionSum {
@@ -119,19 +120,19 @@ pub struct RegionSum {
 }
 
 impl RegionSum {
-    /// Returns both words of the sum.
+    /// Returns the sum from its two words.
     pub fn fixed(&self) -> u64 {
         u64::from(self.high) << 32 | u64::from(self.low)
     }
 
-    /// Returns the weight of this Gaussian and region for a sum.
+    /// Converts a sum for this Gaussian and region to its weight.
     pub fn weight(&self, fixed: u64) -> RegionWeight {
         let weight = (fixed as f64 / (1u64 << SUM_FRACTION_BITS) as f64) as f32;
         RegionWeight { gaussian: self.gaussian, region: self.region, weight }
     }
 }
 
-/// What a picture is drawn over.
+/// Background of a picture.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub struct Background {
@@ -141,18 +142,18 @@ pub struct Background {
     pub padding: u32,
 }
 
-/// Room in a workspace.
+/// Capacities of the buffers of a workspace.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Capacities {
     /// Visible Gaussians.
     pub visible: u32,
     /// (Tile, Gaussian) pairs.
     pub pairs: u32,
-    /// Sums per tile, Gaussian and region.
+    /// Contributions per tile, Gaussian and region.
     pub entries: u32,
 }
 
-/// The view's part of the shaders' input, for a band of tile rows.
+/// Parameters of the shaders for a band of a view.
 pub struct ViewBlock {
     /// `rotation` (9), `position_high` (3), `position_low` (3), focal lengths, centre.
     pub reals: [f64; 19],
@@ -161,14 +162,14 @@ pub struct ViewBlock {
 }
 
 impl ViewBlock {
-    /// Prepares a view of a scene with an origin.
+    /// Prepares a band of a view. `tile_rows` and whether the weights are of kind `Falloff` select the work;
+    /// `origin_in_world` is the origin of the means on the device.
     pub fn new(
         view: &RasterView,
         origin_in_world: DVec3,
-        tile_rows: [u32; 2],
-        is_falloff: bool,
+        (tile_rows, is_falloff): ([u32; 2], bool),
         n_regions: u32,
-        room: Capacities,
+        capacities: Capacities,
     ) -> Self {
         let camera = &view.intrinsics;
         let rotation = view.camera_from_world.matrix3;
@@ -193,14 +194,14 @@ impl ViewBlock {
             camera.width_px.div_ceil(TILE_SIZE_PX as u32),
             u32::from(is_falloff),
             n_regions,
-            room.visible,
-            room.pairs,
-            room.entries,
+            capacities.visible,
+            capacities.pairs,
+            capacities.entries,
         ];
         Self { reals, words }
     }
 
-    /// Returns the bytes that a device of a precision reads.
+    /// Encodes the block for a device of this precision.
     pub fn to_bytes(&self, precision: Precision) -> Vec<u8> {
         let mut bytes: Vec<u8> = match precision {
             Precision::F64 => self.reals.iter().flat_map(|r| r.to_le_bytes()).collect(),
@@ -211,7 +212,7 @@ impl ViewBlock {
     }
 }
 
-/// Returns the bytes of a Gaussian on the screen, and which of its words is the depth.
+/// Returns the size of a Gaussian on the screen in bytes, and the index of its depth word.
 pub fn screen_layout(precision: Precision) -> (u32, u32) {
     match precision {
         Precision::F64 => (56, 10),
@@ -223,10 +224,10 @@ pub fn screen_layout(precision: Precision) -> (u32, u32) {
 mod tests {
     use std::mem::offset_of;
 
-    use super::super::shader::module_text;
     use super::*;
+    use crate::raster::gpu::shader::module_text;
 
-    /// Returns the members (name, offset, bytes) and the size of a shader's structure.
+    /// Returns the members (name, offset, size) and the total size of a structure in a shader.
     fn layout_of(stage: &str, name: &str, precision: Precision) -> (Vec<(String, usize, usize)>, usize) {
         let module = naga::front::wgsl::parse_str(&module_text(stage, precision)).expect("parses");
         let context = module.to_ctx();
@@ -244,7 +245,7 @@ mod tests {
 
     macro_rules! assert_layout {
         ($stage:literal, $type:ident; $($field:ident),+ $(,)?) => {{
-            // Breaks the build where a field is left out.
+            // Fails to compile if a field is missing.
             let _ = |value: $type| { let $type { $($field: _),+ } = value; };
             let sizes = |value: $type| [$(size_of_val(&value.$field)),+];
             let sizes = sizes($type::zeroed());

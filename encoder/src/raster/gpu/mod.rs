@@ -1,16 +1,21 @@
-//! The rasteriser on any GPU that wgpu knows (Vulkan, Metal, DX12).
+//! The GPU backend, on wgpu (Vulkan, Metal, DX12).
 //!
-//! The stages are those of the CPU, each in a shader of the same name beside its twin. What leaves the
-//! device is the sparse list of sums, sorted. Sums are whole numbers, and every order comes from a
-//! stable sort, so a device gives the same bits each time.
+//! The stages are those of the CPU; each shader has the name of its CPU twin. The result is the sorted sparse list of
+//! contributions. Contributions are integers and every order comes from a stable sort, so a device gives the same bits
+//! each time.
 //!
-//! What is too large for a binding of the device is cut: the scene into chunks, the image into bands of
-//! tile rows. Neither changes a sum, since tiles are independent and whole numbers add up exactly.
+//! Data beyond the limit of a binding is divided: the scene into chunks, the image into bands of tile rows. This changes
+//! no contribution, because tiles are independent and integers add up exactly.
 
+mod band;
+mod bindings;
+mod buffers;
+mod chunk;
 mod device;
 mod jobs;
 mod layout;
 mod shader;
+mod stages;
 mod timestamps;
 mod workspace;
 
@@ -23,35 +28,41 @@ use slag_common::Gaussians;
 
 pub use super::adapter::{AdapterReport, GpuOptions, Precision};
 use super::constants::TILE_SIZE_PX;
+use super::cpu::CpuRasterizer;
+use super::draw::Drawing;
+use super::error::RasterError;
+use super::rasterizer::{LoadedScene, Rasterizer};
 use super::sh;
-use super::{
-    CpuRasterizer, Drawing, LoadedScene, RasterError, RasterView, Rasterizer, RegionWeight, StageTime,
-    ViewCounters, ViewWeights, WeightKind, check_regions, check_scene, check_view,
-};
+use super::validate::{check_regions, check_scene, check_view};
+use super::view::RasterView;
+use super::weights::{RegionWeight, StageTime, ViewCounters, ViewWeights, WeightKind};
 use crate::masks::RegionMap;
+use band::{Band, band_size};
+use buffers::Size;
+use chunk::{SCENE_GAUSSIAN_BYTES, SceneChunk};
 pub use device::{Adapter, Device, adapters};
 use layout::{Capacities, RegionSum, SceneGaussian, ViewBlock, screen_layout};
 use shader::{Counter, MAX_DISPATCH, REGION_BITS, WORKGROUP_SIZE};
-use workspace::{Band, Counts, PIXEL_BYTES, SCENE_GAUSSIAN_BYTES, SceneChunk, Size, Workspace, band_size};
+use workspace::{Counts, PIXEL_BYTES, Workspace};
 
-/// A GPU as a backend.
+/// A backend on one GPU.
 pub struct GpuRasterizer {
     device: Arc<Device>,
     options: GpuOptions,
 }
 
 impl GpuRasterizer {
-    /// Uses an opened device.
+    /// Creates a backend from an opened device.
     pub fn new(device: Device, options: GpuOptions) -> Self {
         Self { device: Arc::new(device), options }
     }
 
-    /// Returns what the device is.
+    /// Returns the description of the device.
     pub fn report(&self) -> &AdapterReport {
         &self.device.report
     }
 
-    /// Makes the device fail as a lost one does.
+    /// Makes the device fail like a lost device, for tests.
     #[doc(hidden)]
     pub fn lose(&self) {
         self.device.lose();
@@ -71,7 +82,7 @@ struct GpuScene<'s> {
     scene: &'s Gaussians,
     options: GpuOptions,
     max_binding_bytes: u64,
-    /// Centre of the scene: means relative to it need fewer digits.
+    /// Centre of the scene; means relative to it need fewer digits.
     origin_in_world: DVec3,
     n_unusable: usize,
     chunks: Vec<SceneChunk>,
@@ -83,8 +94,8 @@ struct GpuScene<'s> {
 struct Pool {
     idle: Vec<Workspace>,
     n_made: usize,
-    /// Room that new ones are made with: what views have needed so far.
-    room: Capacities,
+    /// Capacities of new workspaces: the largest that any view has needed so far.
+    capacities: Capacities,
 }
 
 impl<'s> GpuScene<'s> {
@@ -92,7 +103,7 @@ impl<'s> GpuScene<'s> {
         device.check()?;
         let usable: Vec<bool> = (0..scene.len()).map(|i| scene.is_usable(i)).collect();
         let origin_in_world = middle(scene, &usable);
-        // Buffers are rounded up to 16 bytes.
+        // Buffer sizes are rounded up to 16 bytes.
         let max_binding_bytes = options.max_binding_bytes.min(device.report.max_binding_bytes) & !15;
         let per_chunk = (max_binding_bytes / SCENE_GAUSSIAN_BYTES)
             .clamp(1, u64::from(MAX_DISPATCH) * u64::from(WORKGROUP_SIZE)) as usize;
@@ -107,22 +118,22 @@ impl<'s> GpuScene<'s> {
             workspaces: Mutex::new(Pool {
                 idle: Vec::new(),
                 n_made: 0,
-                room: Capacities { visible: 0, pairs: 0, entries: 0 },
+                capacities: Capacities { visible: 0, pairs: 0, entries: 0 },
             }),
             returned: Condvar::new(),
         };
-        let max = loaded.max_room();
-        loaded.pool().room = Capacities {
-            visible: options.first_room.min(scene.len().max(1) as u32).min(max.visible),
-            pairs: options.first_room.min(max.pairs),
-            entries: options.first_room.min(max.entries),
+        let max = loaded.max_capacities();
+        loaded.pool().capacities = Capacities {
+            visible: options.first_capacity.min(scene.len().max(1) as u32).min(max.visible),
+            pairs: options.first_capacity.min(max.pairs),
+            entries: options.first_capacity.min(max.entries),
         };
         let mut resident_bytes = 0;
         let mut is_full = false;
         for first in (0..scene.len()).step_by(per_chunk) {
             let n = per_chunk.min(scene.len() - first);
             let mut chunk = SceneChunk::new(&loaded.device, first as u32, n as u32)
-                .ok_or_else(|| loaded.device.error("no memory for the scene".into()))?;
+                .ok_or_else(|| loaded.device.error("out of memory for the scene".into()))?;
             resident_bytes += n as u64 * SCENE_GAUSSIAN_BYTES;
             is_full |= resident_bytes > options.max_resident_bytes;
             if !is_full {
@@ -135,12 +146,12 @@ impl<'s> GpuScene<'s> {
         Ok(loaded)
     }
 
-    /// Copies Gaussians to the device; `None` where its memory is full.
+    /// Copies Gaussians to the device; `None` if its memory does not suffice.
     fn upload(&self, first: usize, n: usize) -> Option<wgpu::Buffer> {
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
         let buffer = self.device.buffer("Gaussians", n as u64 * SCENE_GAUSSIAN_BYTES, usage)?;
-        // In pieces, each sent off before the next: the host holds little of the scene twice, and the window
-        // through which it writes may be no larger than 256 MiB.
+        // Uploads in pieces and waits for each. So the host duplicates little of the scene, and the host-visible memory
+        // of the device, which may be only 256 MiB, suffices.
         const PIECE: usize = 1 << 18;
         for start in (0..n).step_by(PIECE) {
             let rows: Vec<SceneGaussian> = (start..(start + PIECE).min(n))
@@ -154,13 +165,13 @@ impl<'s> GpuScene<'s> {
         Some(buffer)
     }
 
-    /// Returns the most elements of a size that one binding holds.
+    /// Returns the largest number of elements of this size in one binding.
     fn max_elements(&self, bytes: u64) -> u32 {
         u32::try_from(self.max_binding_bytes / bytes).unwrap_or(u32::MAX)
     }
 
-    /// Returns the most that a workspace may be made for.
-    fn max_room(&self) -> Capacities {
+    /// Returns the largest capacities that bindings allow.
+    fn max_capacities(&self) -> Capacities {
         let (screen_bytes, _) = screen_layout(self.device.report.precision);
         Capacities {
             visible: self.max_elements(screen_bytes.into()),
@@ -196,15 +207,19 @@ impl<'s> GpuScene<'s> {
         self.returned.notify_one();
     }
 
-    fn make_workspace(&self, room: Capacities, n_tiles: u32, n_px: u32) -> Result<Workspace, RasterError> {
+    fn make_workspace(
+        &self,
+        capacities: Capacities,
+        n_tiles: u32,
+        n_px: u32,
+    ) -> Result<Workspace, RasterError> {
         let n_chunk = self.chunks.iter().map(|c| c.n_gaussians).max().unwrap_or(0);
-        Workspace::new(&self.device, Size { room, n_tiles, n_px, n_chunk })
-            .ok_or_else(|| self.device.room_error(format!("no memory for {room:?}")))
+        Workspace::new(&self.device, Size { capacities, n_tiles, n_px, n_chunk })
+            .ok_or_else(|| self.device.capacity_error(format!("out of memory for {capacities:?}")))
     }
 
-    /// Takes a view through the device, band by band: `work` gets each band's workspace and input, its
-    /// rows of tiles and of pixels, and returns its counts. Where they are beyond the room, the band is
-    /// done again with more, or in two.
+    /// Processes a view band by band. `work` processes one band in a workspace and returns its counts. If a count
+    /// exceeds its capacity, the band is repeated with larger capacities, or in two halves.
     fn each_band(
         &self,
         view: &RasterView,
@@ -228,8 +243,8 @@ impl<'s> GpuScene<'s> {
     ) -> Result<ViewCounters, RasterError> {
         let tile = TILE_SIZE_PX as u32;
         let (width_px, height_px) = (view.intrinsics.width_px, view.intrinsics.height_px);
-        let max = self.max_room();
-        // Bands by pixels first; by what turns out to be in them below.
+        let max = self.max_capacities();
+        // First divides the image by pixels; bands with too much content are divided again below.
         let rows_of_band = (self.max_elements(px_bytes) / width_px / tile).clamp(1, MAX_DISPATCH);
         let n_rows = height_px.div_ceil(tile);
         let mut bands: Vec<[u32; 2]> = (0..n_rows.div_ceil(rows_of_band))
@@ -240,7 +255,7 @@ impl<'s> GpuScene<'s> {
         let upload = |index: usize| {
             let first = self.chunks[..index].iter().map(|c| c.n_gaussians as usize).sum();
             self.upload(first, self.chunks[index].n_gaussians as usize)
-                .ok_or_else(|| self.device.room_error("no memory for a part of the scene".into()))
+                .ok_or_else(|| self.device.capacity_error("out of memory for a chunk of the scene".into()))
         };
         while let Some([first, end]) = bands.pop() {
             let (n_tiles, n_px) = band_size(width_px, height_px, [first, end]);
@@ -248,13 +263,14 @@ impl<'s> GpuScene<'s> {
                 Some(current) if current.holds(n_tiles, n_px) => current,
                 old => {
                     drop(old);
-                    let room = self.pool().room;
-                    self.make_workspace(room, n_tiles, n_px)?
+                    let capacities = self.pool().capacities;
+                    self.make_workspace(capacities, n_tiles, n_px)?
                 }
             };
-            let room = current.room;
+            let capacities = current.capacities;
             let is_falloff = kind == WeightKind::Falloff;
-            let block = ViewBlock::new(view, self.origin_in_world, [first, end], is_falloff, n_regions, room);
+            let rows_and_kind = ([first, end], is_falloff);
+            let block = ViewBlock::new(view, self.origin_in_world, rows_and_kind, n_regions, capacities);
             let band = Band { device: &self.device, chunks: &self.chunks, upload: &upload, view: &block };
             let first_px = (first * tile * width_px) as usize;
             let rows = Rows { px: first_px..first_px + n_px as usize, is_whole: end - first == n_rows };
@@ -274,49 +290,49 @@ impl<'s> GpuScene<'s> {
                 entries: count(Counter::Entries),
             };
             if needed.visible <= max.visible && needed.pairs <= max.pairs && needed.entries <= max.entries {
-                // What counts for later stages is cut off with the first: a quarter more, and again.
+                // An overflow truncates the counts of later stages, so capacities grow by a quarter and the band repeats.
                 let grown = |needed: u32, now: u32, max: u32| {
                     if needed > now { needed.saturating_add(needed / 4).min(max) } else { now }
                 };
-                let room = Capacities {
-                    visible: grown(needed.visible, room.visible, max.visible),
-                    pairs: grown(needed.pairs, room.pairs, max.pairs),
-                    entries: grown(needed.entries, room.entries, max.entries),
+                let grown = Capacities {
+                    visible: grown(needed.visible, capacities.visible, max.visible),
+                    pairs: grown(needed.pairs, capacities.pairs, max.pairs),
+                    entries: grown(needed.entries, capacities.entries, max.entries),
                 };
-                self.pool().room = room;
+                self.pool().capacities = grown;
                 bands.push([first, end]);
             } else if end - first > 1 {
                 let middle = first.midpoint(end);
                 bands.extend([[middle, end], [first, middle]]);
             } else {
-                let what = format!("a row of tiles needs {needed:?}, the device holds {max:?}");
-                return Err(self.device.room_error(what));
+                let what = format!("a row of tiles needs {needed:?}, but the device allows {max:?}");
+                return Err(self.device.capacity_error(what));
             }
         }
         Ok(counters)
     }
 
-    /// Returns the colours of all Gaussians as seen from a view, on the device.
+    /// Uploads the colours of all Gaussians seen from a view.
     fn colours(&self, view: &RasterView) -> Result<wgpu::Buffer, RasterError> {
         let position_in_world = view.camera_from_world.inverse().translation;
         let colours: Vec<[f32; 3]> = (0..self.scene.len())
             .into_par_iter()
             .map(|index| sh::colour(self.scene, index, position_in_world))
             .collect();
-        let no_room = || self.device.room_error("no room for the colours of the scene".into());
+        let no_memory = || self.device.capacity_error("out of memory for the colours of the scene".into());
         let bytes: &[u8] = bytemuck::cast_slice(&colours);
         if bytes.len() as u64 > self.max_binding_bytes {
-            return Err(no_room());
+            return Err(no_memory());
         }
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
-        let buffer = self.device.buffer("colours", bytes.len() as u64, usage).ok_or_else(no_room)?;
+        let buffer = self.device.buffer("colours", bytes.len() as u64, usage).ok_or_else(no_memory)?;
         self.device.queue.write_buffer(&buffer, 0, bytes);
         Ok(buffer)
     }
 }
 
-/// Returns a point near the middle of a scene that no outlier moves: the median along each axis of a
-/// sample, rounded to the scale of the scene, so that differences to it mostly are exact.
+/// Returns a robust centre of a scene: the median of a sample along each axis, rounded to the scale of the scene so that
+/// most differences to it are exact.
 fn middle(scene: &Gaussians, usable: &[bool]) -> DVec3 {
     const N_SAMPLES: usize = 4096;
     let sample: Vec<DVec3> = (0..scene.len())
@@ -336,15 +352,15 @@ fn middle(scene: &Gaussians, usable: &[bool]) -> DVec3 {
     }))
 }
 
-/// What a band is of its image.
+/// The pixels of a band.
 struct Rows {
-    /// Its pixels.
+    /// Row-major range within the image.
     px: Range<usize>,
-    /// Whether it is all of them.
+    /// Whether the band is the whole image.
     is_whole: bool,
 }
 
-/// Regions of a view; the number above stands for no region.
+/// Largest number of regions in a view; the next number stands for "no region".
 const MAX_REGIONS: u32 = (1 << REGION_BITS) - 1;
 
 impl LoadedScene for GpuScene<'_> {
@@ -357,8 +373,8 @@ impl LoadedScene for GpuScene<'_> {
         check_view(view)?;
         check_regions(regions, &view.intrinsics)?;
         if regions.n_regions > MAX_REGIONS {
-            let what = format!("{} regions in a view, {MAX_REGIONS} at most", regions.n_regions);
-            return Err(self.device.room_error(what));
+            let what = format!("the view has {} regions, expected at most {MAX_REGIONS}", regions.n_regions);
+            return Err(self.device.capacity_error(what));
         }
         if self.chunks.is_empty() {
             return Ok(Default::default());
@@ -371,7 +387,7 @@ impl LoadedScene for GpuScene<'_> {
                 true => entries.extend(found.iter().map(|sum| sum.weight(sum.fixed()))),
                 false => sums.extend(found),
             };
-            workspace.sum(band, &regions.region_of_pixel[rows.px], &mut times, &mut take)
+            workspace.contributions(band, &regions.region_of_pixel[rows.px], &mut times, &mut take)
         })?;
         sums.sort_unstable_by_key(|sum| (sum.gaussian, sum.region));
         entries.extend(

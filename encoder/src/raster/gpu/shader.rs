@@ -1,48 +1,48 @@
-//! The shaders: their text, with the constants and the precision put in front, and their pipelines.
+//! The shaders: their source with a prelude of constants and precision, and their pipelines.
 
-use crate::raster::adapter::Precision;
 use std::borrow::Cow;
 use std::fmt::Write;
 
+use crate::raster::adapter::Precision;
 use crate::raster::blend::{EXP_OF_MINUS_C, MAX_POWER};
 use crate::raster::constants::{
     COVARIANCE_BLUR_PX2, FAR_Z, FOV_MARGIN, MAX_ALPHA, MAX_VARIANCE_PX2, MIN_ALPHA, MIN_TRANSMITTANCE,
     NEAR_Z, TILE_SIZE_PX,
 };
 
-/// Threads of a workgroup, which also are the pixels of a tile.
+/// Threads of a workgroup, equal to the pixels of a tile.
 pub const WORKGROUP_SIZE: u32 = (TILE_SIZE_PX * TILE_SIZE_PX) as u32;
-/// Items that a workgroup sorts in one go.
+/// Items that a workgroup sorts at once.
 pub const SORT_BLOCK: u32 = 2048;
-/// Most workgroups of a dispatch, as every device has it.
+/// Largest number of workgroups of a dispatch that every device supports.
 pub const MAX_DISPATCH: u32 = 65_535;
-/// Fraction bits of the sums: with the 2^28 pixels of the largest image, 63 bits.
+/// Fraction bits of fixed-point weights; with the 2^28 pixels of the largest image, sums need 63 bits.
 pub const SUM_FRACTION_BITS: u32 = 35;
-/// Bits of a region's number; a region and a pixel of its tile share a word.
+/// Bits of a region number; a region and a pixel of its tile share a word.
 pub const REGION_BITS: u32 = 24;
-/// No counter.
+/// Stands for "no counter".
 pub const NONE: u32 = u32::MAX;
 
-/// Numbers that shaders count up; the host reads them after each view.
+/// Counters that shaders increment; the host reads them after each band.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u32)]
 pub enum Counter {
     /// Gaussians visible in the band.
     Visible,
-    /// Those not visible in an earlier band.
+    /// Visible Gaussians that were not visible in an earlier band.
     FirstVisible,
-    /// Gaussians whose projection is out of range.
+    /// Gaussians with a projection out of range.
     Unrepresentable,
     /// (Tile, Gaussian) pairs of the band.
     Pairs,
-    /// Sums per tile, Gaussian and region.
+    /// Contributions per tile, Gaussian and region.
     Entries,
-    /// Sums per Gaussian and region.
+    /// Contributions per Gaussian and region.
     RegionSums,
 }
 
 impl Counter {
-    /// All of them, by value.
+    /// All counters with their names in the shaders, by value.
     pub const ALL: [(Self, &'static str); 6] = [
         (Self::Visible, "VISIBLE"),
         (Self::FirstVisible, "FIRST_VISIBLE"),
@@ -53,7 +53,7 @@ impl Counter {
     ];
 }
 
-/// The stages' own shaders, without what they share.
+/// The shaders of the stages, without the common part.
 pub const STAGES: [(&str, &str); 7] = [
     ("project", include_str!("../project.wgsl")),
     ("scan", include_str!("../scan.wgsl")),
@@ -65,14 +65,14 @@ pub const STAGES: [(&str, &str); 7] = [
 ];
 const COMMON: &str = include_str!("../common.wgsl");
 
-/// Returns a stage's whole module.
+/// Returns the complete source of a stage.
 pub fn module_text(stage: &str, precision: Precision) -> String {
     let mut text = String::new();
     let real = match precision {
         Precision::F64 => "f64",
         Precision::F32 => "f32",
     };
-    // Beyond these the squares of f32 arithmetic overflow.
+    // Beyond these limits, squares overflow in f32.
     let (max_variance, max_coordinate) = match precision {
         Precision::F64 => (MAX_VARIANCE_PX2, f64::MAX),
         Precision::F32 => (1e18, 1e18),
@@ -114,7 +114,7 @@ pub fn module_text(stage: &str, precision: Precision) -> String {
     for (counter, name) in Counter::ALL {
         let _ = writeln!(text, "const COUNTER_{name}: u32 = {}u;", counter as u32);
     }
-    // Horner's scheme, written out: an array of constants would be indexed in memory.
+    // Unrolls Horner's scheme, because an array of constants would be indexed in memory.
     let [first @ .., last] = EXP_OF_MINUS_C;
     let _ = writeln!(text, "fn exp_of_minus(power: f32) -> f32 {{");
     let _ = writeln!(text, "    let t = MAX_POWER / 8.0 - min(power, MAX_POWER) * 0.25;");
@@ -158,7 +158,7 @@ impl Kernels {
                 module: &module,
                 entry_point: Some(entry),
                 compilation_options: wgpu::PipelineCompilationOptions {
-                    // Every shader writes its workgroup memory before it reads it.
+                    // All shaders write workgroup memory before they read it.
                     zero_initialize_workgroup_memory: false,
                     ..Default::default()
                 },
@@ -181,6 +181,7 @@ impl Kernels {
         }
     }
 }
+
 #[cfg(test)]
 mod tests {
     use super::*;

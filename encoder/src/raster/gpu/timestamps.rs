@@ -1,24 +1,24 @@
-//! The time of each stage by the device's own clock.
+//! The duration of each stage, measured by the device.
 
 use wgpu::BufferUsages as Usage;
 
 use super::device::Device;
-use crate::raster::StageTime;
+use crate::raster::weights::StageTime;
 
-/// Bytes of all timestamps.
+/// Size of all timestamps, bytes.
 pub const TIMESTAMPS_BYTES: u64 = 2 * 8 * STAGES.len() as u64;
 
-/// Stages that are timed.
+/// Timed stages.
 const STAGES: [&str; 5] = ["project", "sort", "bin", "blend", "compact"];
 
-/// The device's own clock at the ends of each stage, where it has one.
+/// Timestamps at the start and end of each stage, if the device supports them.
 pub struct GpuTimestamps {
     queries: Option<(wgpu::QuerySet, wgpu::Buffer)>,
     period_ns: f32,
 }
 
 impl GpuTimestamps {
-    /// Makes the queries where the device has a clock; `None` where memory is short.
+    /// Creates the queries, if the device supports them; `None` if the memory does not suffice.
     pub fn new(device: &Device) -> Option<Self> {
         let n = 2 * STAGES.len() as u32;
         let queries = if device.device.features().contains(wgpu::Features::TIMESTAMP_QUERY) {
@@ -33,7 +33,7 @@ impl GpuTimestamps {
         Some(Self { queries, period_ns: device.queue.get_timestamp_period() })
     }
 
-    /// Begins a pass of a stage; `ends` says whether it is the stage's first and last.
+    /// Begins a pass of a stage. `ends` states whether it is the first and the last pass of the stage.
     pub fn pass<'e>(
         &self,
         encoder: &'e mut wgpu::CommandEncoder,
@@ -53,7 +53,7 @@ impl GpuTimestamps {
         })
     }
 
-    /// Records the copy of what was measured to a place in `staging`.
+    /// Records the copy of the timestamps to `staging`.
     pub fn resolve(&self, encoder: &mut wgpu::CommandEncoder, staging: &wgpu::Buffer, offset: u64) {
         if let Some((queries, resolved)) = &self.queries {
             let n = 2 * STAGES.len() as u32;
@@ -62,7 +62,7 @@ impl GpuTimestamps {
         }
     }
 
-    /// Returns the time of each stage from what was copied.
+    /// Converts the copied timestamps to the duration of each stage.
     pub fn read(&self, bytes: &[u8]) -> Vec<StageTime> {
         if self.queries.is_none() {
             return Vec::new();

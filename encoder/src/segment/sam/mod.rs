@@ -147,7 +147,7 @@ impl Segmenter for SamSegmenter {
     }
 
     /// One image is embedded while another's points are decoded; the model has threads of its own.
-    fn n_lanes(&self) -> Option<usize> {
+    fn concurrency(&self) -> Option<usize> {
         Some(2)
     }
 

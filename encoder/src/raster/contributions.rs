@@ -1,4 +1,4 @@
-//! Sums the weights of Gaussians over regions: per tile, then over all tiles.
+//! The contribution of each Gaussian to each region: its weight, summed per tile and then over all tiles.
 
 use bytemuck::{Zeroable, cast, cast_slice, cast_slice_mut};
 use rayon::prelude::*;
@@ -9,40 +9,40 @@ use super::buckets::{Buckets, concat};
 use super::constants::{MIN_ALPHA, MIN_TRANSMITTANCE, SUM_FRACTION_BITS, TILE_SIZE_PX};
 use super::project::ScreenGaussian;
 use super::simd::{Lanes, Level};
-use super::{RegionWeight, WeightKind};
+use super::weights::{RegionWeight, WeightKind};
 use crate::masks::{NO_REGION, RegionMap};
 
-/// Steps of the fixed-point sums in 1.
-const SUM_STEPS: f64 = (1_u64 << SUM_FRACTION_BITS) as f64;
+/// Units of a fixed-point weight per pixel.
+const FIXED_UNITS: f64 = (1_u64 << SUM_FRACTION_BITS) as f64;
 
-/// Sums of a tile's weights in `f64` are exact, whatever the order: a weight is at least 2^-22, so it
-/// is a multiple of 2^-45, and 256 of them stay within 53 bits.
+/// Sums of a tile's weights in `f64` are exact in any order. A weight is at least 2^-22, hence a multiple of 2^-45, and
+/// the sum of 256 weights fits 53 bits.
 const _: () = {
     assert!(MIN_ALPHA as f64 * MIN_TRANSMITTANCE as f64 > 1.0 / (1 << 22) as f64);
     assert!(TILE_SIZE_PX * TILE_SIZE_PX <= 1 << 8);
 };
 
-/// A Gaussian's sum over the pixels of a region in one tile, or in all of them.
+/// Contribution of a Gaussian to a region within one tile.
 #[derive(Clone, Copy, Zeroable)]
-pub struct Sum {
+pub struct TileContribution {
     /// Index into the visible Gaussians.
     member: u32,
     region: u32,
-    /// In units of `2^-SUM_FRACTION_BITS`, so that adding is exact in any order.
+    /// Weight in units of `2^-SUM_FRACTION_BITS`, so that addition is exact in any order.
     fixed: u64,
 }
 
-/// Visible Gaussians that one task of [`merge`] brings together: their counts fit the cache.
+/// Visible Gaussians per task of [`merge`]; their counts fit the cache.
 const RANGE: usize = 1 << 13;
 
-/// Returns the sums of all tiles: a part a row of tiles, a bucket for each range of Gaussians.
-pub fn tile_sums(
+/// Returns the contributions within each tile: for each row of tiles, one bucket per range of Gaussians.
+pub fn tile_contributions(
     visible: &[ScreenGaussian],
     tiles: &Tiles,
     regions: &RegionMap,
     kind: WeightKind,
     level: Level,
-) -> Vec<Buckets<Sum>> {
+) -> Vec<Buckets<TileContribution>> {
     let (width_px, height_px) = (tiles.width_px as usize, tiles.height_px as usize);
     tiles
         .rows
@@ -50,56 +50,61 @@ pub fn tile_sums(
         .enumerate()
         .map(|(row, tile_row)| {
             let members: Vec<&[u32]> = tile_row.iter().collect();
-            let sums: Vec<Vec<Sum>> = members
+            let by_tile: Vec<Vec<TileContribution>> = members
                 .into_par_iter()
                 .enumerate()
                 .filter_map(|(column, members)| {
                     let rect = TileRect::new(column, row, width_px, height_px);
                     let mut sink = RegionSink::new(regions, rect)?;
                     walk_tile(level, visible, members, rect, kind, &mut sink);
-                    Some(sink.sums)
+                    Some(sink.contributions)
                 })
                 .collect();
-            let range_of = |sum: &Sum| sum.member / RANGE as u32;
-            let spanned: Vec<_> =
-                sums.iter().flatten().map(|sum| (*sum, (range_of(sum), range_of(sum)))).collect();
+            let range_of = |of_tile: &TileContribution| of_tile.member / RANGE as u32;
+            let spanned: Vec<_> = (by_tile.iter().flatten())
+                .map(|of_tile| (*of_tile, (range_of(of_tile), range_of(of_tile))))
+                .collect();
             Buckets::new(visible.len().div_ceil(RANGE), &spanned)
         })
         .collect()
 }
 
-/// Adds up the sums of all tiles; returns those above zero, ordered by (Gaussian, region).
-pub fn merge(visible: &[ScreenGaussian], rows: &[Buckets<Sum>]) -> Vec<RegionWeight> {
+/// Sums contributions over all tiles. Returns those above zero, ordered by (Gaussian, region).
+pub fn merge(visible: &[ScreenGaussian], rows: &[Buckets<TileContribution>]) -> Vec<RegionWeight> {
     let parts: Vec<Vec<RegionWeight>> = visible
         .par_chunks(RANGE)
         .enumerate()
         .map(|(range, visible)| {
-            let sums: Vec<&[Sum]> = rows.iter().map(|row| row.of(range)).collect();
-            merge_range(visible, range * RANGE, &sums)
+            let by_row: Vec<&[TileContribution]> = rows.iter().map(|row| row.of(range)).collect();
+            merge_range(visible, range * RANGE, &by_row)
         })
         .collect();
     concat(&parts)
 }
 
-/// Adds up the sums of the visible Gaussians from `first` on.
-fn merge_range(visible: &[ScreenGaussian], first: usize, sums: &[&[Sum]]) -> Vec<RegionWeight> {
-    // A counting pass brings each Gaussian's few sums together; only those need sorting.
+/// Sums the contributions of the visible Gaussians from `first` on.
+fn merge_range(
+    visible: &[ScreenGaussian],
+    first: usize,
+    by_row: &[&[TileContribution]],
+) -> Vec<RegionWeight> {
+    // A counting sort groups the few contributions of each Gaussian; only within a group they are sorted by region.
     let mut ends = vec![0_usize; visible.len()];
-    for sum in sums.iter().copied().flatten() {
-        ends[sum.member as usize - first] += 1;
+    for of_tile in by_row.iter().copied().flatten() {
+        ends[of_tile.member as usize - first] += 1;
     }
-    let mut n_sums = 0;
+    let mut n_contributions = 0;
     for end in &mut ends {
-        n_sums += *end;
-        *end = n_sums - *end;
+        n_contributions += *end;
+        *end = n_contributions - *end;
     }
-    let mut by_member = vec![(0_u32, 0_u64); n_sums];
-    for sum in sums.iter().copied().flatten() {
-        let end = &mut ends[sum.member as usize - first];
-        by_member[*end] = (sum.region, sum.fixed);
+    let mut by_member = vec![(0_u32, 0_u64); n_contributions];
+    for of_tile in by_row.iter().copied().flatten() {
+        let end = &mut ends[of_tile.member as usize - first];
+        by_member[*end] = (of_tile.region, of_tile.fixed);
         *end += 1;
     }
-    let mut entries = Vec::with_capacity(n_sums);
+    let mut entries = Vec::with_capacity(n_contributions);
     let mut start = 0;
     for (on_screen, &end) in visible.iter().zip(&ends) {
         let of_gaussian = &mut by_member[start..end];
@@ -107,7 +112,7 @@ fn merge_range(visible: &[ScreenGaussian], first: usize, sums: &[&[Sum]]) -> Vec
         for same in of_gaussian.chunk_by(|a, b| a.0 == b.0) {
             let fixed: u64 = same.iter().map(|&(_, fixed)| fixed).sum();
             if fixed > 0 {
-                let weight = (fixed as f64 / SUM_STEPS) as f32;
+                let weight = (fixed as f64 / FIXED_UNITS) as f32;
                 entries.push(RegionWeight { gaussian: on_screen.gaussian, region: same[0].0, weight });
             }
         }
@@ -120,26 +125,26 @@ fn merge_range(visible: &[ScreenGaussian], first: usize, sums: &[&[Sum]]) -> Vec
 struct Part {
     /// Index into the regions of the tile.
     slot: usize,
-    /// All bits set where a pixel belongs to it.
+    /// All bits are set at the pixels of the region.
     mask: [u32; TILE_SIZE_PX],
 }
 
-/// Adds weights up per region of a tile.
+/// Sums weights per region of a tile.
 struct RegionSink {
     /// Regions of the tile.
     regions: Vec<u32>,
     /// The regions of row `y` are `parts[first_part[y]..first_part[y + 1]]`.
     parts: Vec<Part>,
     first_part: [usize; TILE_SIZE_PX + 1],
-    /// Sums of the current Gaussian, per slot and column.
+    /// Weights of the current Gaussian, per slot and column.
     weights: Vec<[f64; TILE_SIZE_PX]>,
-    /// Slots that the current Gaussian has met, a bit each.
+    /// Slots that the current Gaussian touches, one bit each.
     touched: [u64; TILE_SIZE_PX * TILE_SIZE_PX / 64],
-    sums: Vec<Sum>,
+    contributions: Vec<TileContribution>,
 }
 
 impl RegionSink {
-    /// Relabels the regions of a tile; `None` if no pixel has one.
+    /// Assigns slots to the regions of a tile; `None` if no pixel has a region.
     fn new(map: &RegionMap, rect: TileRect) -> Option<Self> {
         let row_of = |y: usize| {
             let start = (rect.y_px + y) * map.width_px as usize + rect.x_px;
@@ -148,7 +153,7 @@ impl RegionSink {
         let mut regions: Vec<u32> = (0..rect.height_px).flat_map(row_of).copied().collect();
         regions.sort_unstable();
         regions.dedup();
-        // Greater than any region.
+        // `NO_REGION` is greater than any region.
         regions.pop_if(|last| *last == NO_REGION);
         if regions.is_empty() {
             return None;
@@ -168,7 +173,14 @@ impl RegionSink {
             first_part[y + 1..].fill(parts.len());
         }
         let weights = vec![[0.0; TILE_SIZE_PX]; regions.len()];
-        Some(Self { regions, parts, first_part, weights, touched: Default::default(), sums: Vec::new() })
+        Some(Self {
+            regions,
+            parts,
+            first_part,
+            weights,
+            touched: Default::default(),
+            contributions: Vec::new(),
+        })
     }
 }
 
@@ -199,9 +211,10 @@ impl WeightSink for RegionSink {
                 }
                 let weight = simd.reduce_sum_f64s(sum);
                 if weight > 0.0 {
-                    // Rounds: the sum and the half have less than 53 bits together.
-                    let fixed = (weight * SUM_STEPS + 0.5) as u64;
-                    self.sums.push(Sum { member, region: self.regions[slot], fixed });
+                    // Rounds: the weight and the half together need fewer than 53 bits.
+                    let fixed = (weight * FIXED_UNITS + 0.5) as u64;
+                    let region = self.regions[slot];
+                    self.contributions.push(TileContribution { member, region, fixed });
                 }
             }
         }
@@ -215,9 +228,9 @@ mod tests {
     use glam::DVec2;
     use slag_common::{Distortion, Intrinsics};
 
-    use super::super::bin::bin;
-    use super::super::draw::draw;
     use super::*;
+    use crate::raster::bin::bin;
+    use crate::raster::draw::draw;
 
     const WIDTH_PX: u32 = 33;
     const HEIGHT_PX: u32 = 18;
@@ -253,34 +266,34 @@ mod tests {
         RegionMap { width_px: WIDTH_PX, height_px: HEIGHT_PX, region_of_pixel, n_regions }
     }
 
-    /// Sums of whole pixels must differ by no more than the rounding of each part to 2^-32, or masks,
-    /// which are unions of regions, would depend on how other masks cut them.
+    /// A contribution to a region and the sum over its parts differ only by the rounding of each part to 2^-32.
+    /// Otherwise a mask, which is a union of regions, would depend on the other masks that divide it.
     #[test]
-    fn fixed_point_sums_add_up_within_their_last_bit() {
+    fn contributions_add_up_within_their_last_bit() {
         let (visible, tiles) = scene(200);
-        let sums_of = |regions: RegionMap| {
+        let contributions_of = |regions: RegionMap| {
             let mut sums = BTreeMap::<u32, (u64, u64)>::new();
-            let rows = tile_sums(&visible, &tiles, &regions, WeightKind::Blend, Level::widest());
-            for sum in rows.iter().flat_map(Buckets::iter).flatten() {
-                let (fixed, n_parts) = sums.entry(sum.member).or_default();
-                *fixed += sum.fixed;
+            let rows = tile_contributions(&visible, &tiles, &regions, WeightKind::Blend, Level::widest());
+            for of_tile in rows.iter().flat_map(Buckets::iter).flatten() {
+                let (fixed, n_parts) = sums.entry(of_tile.member).or_default();
+                *fixed += of_tile.fixed;
                 *n_parts += 1;
             }
             sums
         };
-        let whole = sums_of(map(1, |_| 0));
-        let parts = sums_of(map(5, |pixel| pixel % 5));
+        let whole = contributions_of(map(1, |_| 0));
+        let parts = contributions_of(map(5, |pixel| pixel % 5));
         assert!(parts.values().any(|sum| sum.1 > 20) && whole.len() == parts.len());
         for (whole, parts) in whole.values().zip(parts.values()) {
             assert!(whole.0.abs_diff(parts.0) <= whole.1 + parts.1, "{whole:?} {parts:?}");
         }
     }
 
-    /// Every instruction set that this processor has, with regions of all shapes: none, one, stripes,
-    /// a region a pixel.
+    /// Compares all instruction sets of this processor on different region maps: one region, stripes with gaps, a
+    /// region per pixel.
     #[test]
-    fn all_levels_give_the_same_bits() {
-        // More than a range of `merge`.
+    fn all_instruction_sets_give_the_same_bits() {
+        // More Gaussians than a range of `merge`.
         let (visible, tiles) = scene(RANGE as u32 + 100);
         let maps = [
             map(1, |_| 0),
@@ -292,7 +305,7 @@ mod tests {
         let on_level = |level: Level| {
             let of_maps = maps.each_ref().map(|map| {
                 [WeightKind::Blend, WeightKind::Falloff]
-                    .map(|kind| merge(&visible, &tile_sums(&visible, &tiles, map, kind, level)))
+                    .map(|kind| merge(&visible, &tile_contributions(&visible, &tiles, map, kind, level)))
             });
             (of_maps, draw(level, &visible, &colours, &tiles, [0.2; 3]))
         };

@@ -1,0 +1,89 @@
+//! The device buffers of one view in flight.
+
+use wgpu::BufferUsages as Usage;
+
+use super::device::Device;
+use super::jobs::{
+    DISPATCH_BYTES, ENTRY_WORDS, JOB_STRIDE_BYTES, MAX_PASSES, PAIR_WORDS, SCAN_JOBS, write_jobs,
+};
+use super::layout::{Capacities, screen_layout};
+use super::shader::{Counter, SORT_BLOCK, WORKGROUP_SIZE};
+
+/// Size of the counters, bytes.
+pub const COUNTERS_BYTES: u64 = 64;
+
+/// Sizes for which buffers are created.
+#[derive(Clone, Copy)]
+pub struct Size {
+    /// Capacities for the output of the shaders.
+    pub capacities: Capacities,
+    /// Tiles of a band.
+    pub n_tiles: u32,
+    /// Pixels of a band.
+    pub n_px: u32,
+    /// Gaussians of the largest chunk.
+    pub n_chunk: u32,
+}
+
+/// The buffers of all stages.
+pub struct Buffers {
+    pub view: wgpu::Buffer,
+    pub counters: wgpu::Buffer,
+    pub dispatches: wgpu::Buffer,
+    pub jobs: wgpu::Buffer,
+    pub block_counts: wgpu::Buffer,
+    pub histogram: wgpu::Buffer,
+    pub screen: wgpu::Buffer,
+    pub tile_counts: wgpu::Buffer,
+    pub visible_order: [wgpu::Buffer; 2],
+    pub pairs: wgpu::Buffer,
+    pub pair_order: [wgpu::Buffer; 2],
+    pub members: wgpu::Buffer,
+    pub ranges: wgpu::Buffer,
+    pub regions: wgpu::Buffer,
+    pub entries: wgpu::Buffer,
+    pub entry_order: [wgpu::Buffer; 2],
+    pub region_sums: wgpu::Buffer,
+}
+
+impl Buffers {
+    /// Creates the buffers; `None` if the device memory does not suffice.
+    pub fn new(device: &Device, size: Size) -> Option<Self> {
+        let Size { capacities, n_tiles, n_px, n_chunk } = size;
+        let storage = |label: &str, words: u64| {
+            device.buffer(label, words * 4, Usage::STORAGE | Usage::COPY_DST | Usage::COPY_SRC)
+        };
+        let (screen_bytes, _) = screen_layout(device.report.precision);
+        let (visible, pairs, entries) =
+            (u64::from(capacities.visible), u64::from(capacities.pairs), u64::from(capacities.entries));
+        let largest = visible.max(pairs).max(entries);
+        let buffers = Self {
+            view: storage("view", 64)?,
+            counters: storage("counters", COUNTERS_BYTES / 4)?,
+            dispatches: device.buffer(
+                "dispatches",
+                2 * Counter::ALL.len() as u64 * DISPATCH_BYTES,
+                Usage::STORAGE | Usage::INDIRECT,
+            )?,
+            jobs: storage("jobs", (SCAN_JOBS + 4 * u64::from(MAX_PASSES)) * JOB_STRIDE_BYTES / 4)?,
+            block_counts: storage(
+                "block counts",
+                largest.max(n_chunk.into()).div_ceil(WORKGROUP_SIZE.into()),
+            )?,
+            histogram: storage("histogram", 16 * largest.div_ceil(SORT_BLOCK.into()))?,
+            screen: storage("screen", visible * u64::from(screen_bytes / 4))?,
+            tile_counts: storage("tile counts", visible)?,
+            visible_order: [storage("order of visible", visible)?, storage("order of visible", visible)?],
+            pairs: storage("pairs", pairs * u64::from(PAIR_WORDS))?,
+            pair_order: [storage("order of pairs", pairs)?, storage("order of pairs", pairs)?],
+            members: storage("members", pairs)?,
+            ranges: storage("ranges", 2 * u64::from(n_tiles))?,
+            regions: storage("regions", n_px.into())?,
+            entries: storage("entries", entries * u64::from(ENTRY_WORDS))?,
+            entry_order: [storage("order of entries", entries)?, storage("order of entries", entries)?],
+            region_sums: storage("region sums", entries * 4)?,
+        };
+        write_jobs(device, &buffers.jobs, capacities);
+        Some(buffers)
+    }
+}

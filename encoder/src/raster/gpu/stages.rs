@@ -1,0 +1,213 @@
+//! The commands of each stage.
+
+use std::collections::HashMap;
+
+use super::bindings::{bind, cached, dispatch, dispatch_indirect, number, whole};
+use super::buffers::Buffers;
+use super::chunk::SceneChunk;
+use super::device::Device;
+use super::jobs::{DIGIT_BITS, Scan, SortKey, dispatch_offset, part, sort_job};
+use super::shader::{Counter, WORKGROUP_SIZE};
+
+/// Records the stages of one view in flight.
+pub struct Stages {
+    /// The buffers of all stages.
+    pub buffers: Buffers,
+    /// Bind groups by kernel and variant.
+    groups: HashMap<(&'static str, u32), wgpu::BindGroup>,
+}
+
+impl Stages {
+    /// Creates the stages on buffers.
+    pub fn new(buffers: Buffers) -> Self {
+        Self { buffers, groups: HashMap::new() }
+    }
+
+    /// Projects the Gaussians of a chunk.
+    pub fn project(
+        &self,
+        device: &Device,
+        pass: &mut wgpu::ComputePass<'_>,
+        chunk: &SceneChunk,
+        gaussians: &wgpu::Buffer,
+    ) {
+        let kernels = &device.kernels;
+        let n_blocks = chunk.n_gaussians.div_ceil(WORKGROUP_SIZE);
+        let chunk_job = part(&chunk.jobs, 0);
+        let bound = [&self.buffers.view, &self.buffers.counters]
+            .map(whole)
+            .into_iter()
+            .chain([chunk_job, whole(gaussians)]);
+        let bound: Vec<_> = bound.chain([whole(&self.buffers.block_counts)]).collect();
+        let group = bind(device, &kernels.count_visible, &number(&bound));
+        dispatch(pass, &kernels.count_visible, &group, [n_blocks, 1]);
+        let scan = [
+            part(&chunk.jobs, 1),
+            whole(&self.buffers.counters),
+            whole(&self.buffers.block_counts),
+            whole(&self.buffers.dispatches),
+        ];
+        let group = bind(device, &kernels.scan, &number(&scan));
+        dispatch(pass, &kernels.scan, &group, [1, 1]);
+        let bound = [
+            (0, whole(&self.buffers.view)),
+            (2, part(&chunk.jobs, 0)),
+            (3, whole(gaussians)),
+            (4, whole(&self.buffers.block_counts)),
+            (5, whole(&self.buffers.screen)),
+            (6, whole(&self.buffers.tile_counts)),
+        ];
+        let group = bind(device, &kernels.write_visible, &bound);
+        dispatch(pass, &kernels.write_visible, &group, [n_blocks, 1]);
+    }
+
+    /// Records a prefix sum.
+    pub fn scan(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, scan: Scan) {
+        let values = match scan {
+            Scan::Digits(_) => &self.buffers.histogram,
+            Scan::Pairs | Scan::Entries | Scan::Heads => &self.buffers.block_counts,
+        };
+        let bound = [
+            part(&self.buffers.jobs, scan.index()),
+            whole(&self.buffers.counters),
+            whole(values),
+            whole(&self.buffers.dispatches),
+        ];
+        let group = cached(&mut self.groups, ("scan", scan.index() as u32), || {
+            bind(device, &device.kernels.scan, &number(&bound))
+        });
+        dispatch(pass, &device.kernels.scan, group, [1, 1]);
+    }
+
+    /// Sorts by several keys, the least significant first. Returns the index of the buffer with the order.
+    pub fn sort(
+        &mut self,
+        device: &Device,
+        pass: &mut wgpu::ComputePass<'_>,
+        keys: &[(SortKey, u32)],
+    ) -> usize {
+        let mut current = 0;
+        for &(key, bits) in keys {
+            for digit in 0..bits.div_ceil(DIGIT_BITS).max(1) {
+                let (values, order) = match key {
+                    SortKey::Depth => (&self.buffers.screen, &self.buffers.visible_order),
+                    SortKey::Tile => (&self.buffers.pairs, &self.buffers.pair_order),
+                    SortKey::Region | SortKey::Member => (&self.buffers.entries, &self.buffers.entry_order),
+                };
+                let job = sort_job(key, digit);
+                let bound = number(&[
+                    part(&self.buffers.jobs, job),
+                    whole(&self.buffers.counters),
+                    whole(values),
+                    whole(&order[current]),
+                    whole(&self.buffers.histogram),
+                    whole(&order[1 - current]),
+                ]);
+                let name = job as u32 * 2 + current as u32;
+                let kernels = &device.kernels;
+                let count = cached(&mut self.groups, ("count_digits", name), || {
+                    bind(device, &kernels.count_digits, &bound[..5])
+                })
+                .clone();
+                let scatter =
+                    cached(&mut self.groups, ("scatter", name), || bind(device, &kernels.scatter, &bound))
+                        .clone();
+                let offset = dispatch_offset(key.counter(), true);
+                dispatch_indirect(pass, &kernels.count_digits, &count, (&self.buffers.dispatches, offset));
+                self.scan(device, pass, Scan::Digits(key.counter()));
+                dispatch_indirect(pass, &kernels.scatter, &scatter, (&self.buffers.dispatches, offset));
+                current = 1 - current;
+            }
+        }
+        current
+    }
+
+    /// Lists the (tile, Gaussian) pairs of the visible Gaussians.
+    pub fn pair(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, depth_order: usize) {
+        let offset = dispatch_offset(Counter::Visible, false);
+        let order = &self.buffers.visible_order[depth_order];
+        let counted = [
+            (0, whole(&self.buffers.view)),
+            (1, whole(&self.buffers.counters)),
+            (3, whole(&self.buffers.tile_counts)),
+            (4, whole(order)),
+            (5, whole(&self.buffers.block_counts)),
+        ];
+        let written = [(2, whole(&self.buffers.screen)), (6, whole(&self.buffers.pairs))];
+        let written: Vec<_> = counted.iter().chain(&written).cloned().collect();
+        let kernels = &device.kernels;
+        let key = depth_order as u32;
+        let group =
+            cached(&mut self.groups, ("count_pairs", key), || bind(device, &kernels.count_pairs, &counted));
+        dispatch_indirect(pass, &kernels.count_pairs, group, (&self.buffers.dispatches, offset));
+        let group =
+            cached(&mut self.groups, ("write_pairs", key), || bind(device, &kernels.write_pairs, &written))
+                .clone();
+        self.scan(device, pass, Scan::Pairs);
+        dispatch_indirect(pass, &kernels.write_pairs, &group, (&self.buffers.dispatches, offset));
+    }
+
+    /// Finds the range of each tile in the sorted pairs.
+    pub fn find_ranges(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, pair_order: usize) {
+        let bound = [
+            (0, whole(&self.buffers.view)),
+            (1, whole(&self.buffers.counters)),
+            (4, whole(&self.buffers.pair_order[pair_order])),
+            (7, whole(&self.buffers.pairs)),
+            (8, whole(&self.buffers.ranges)),
+            (9, whole(&self.buffers.members)),
+        ];
+        let kernel = &device.kernels.find_ranges;
+        let group =
+            cached(&mut self.groups, ("find_ranges", pair_order as u32), || bind(device, kernel, &bound));
+        dispatch_indirect(
+            pass,
+            kernel,
+            group,
+            (&self.buffers.dispatches, dispatch_offset(Counter::Pairs, false)),
+        );
+    }
+
+    /// Blends all tiles and sums their weights over regions.
+    pub fn blend(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, columns: u32, rows: u32) {
+        let bound = [
+            &self.buffers.view,
+            &self.buffers.counters,
+            &self.buffers.screen,
+            &self.buffers.members,
+            &self.buffers.ranges,
+            &self.buffers.regions,
+            &self.buffers.entries,
+        ]
+        .map(whole);
+        let kernel = &device.kernels.sum_regions;
+        let group = cached(&mut self.groups, ("sum_regions", 0), || bind(device, kernel, &number(&bound)));
+        dispatch(pass, kernel, group, [columns, rows]);
+        self.scan(device, pass, Scan::Entries);
+    }
+
+    /// Sums the sorted entries of each (Gaussian, region).
+    pub fn compact(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, entry_order: usize) {
+        let order = &self.buffers.entry_order[entry_order];
+        let bound = [
+            (0, whole(&self.buffers.view)),
+            (1, whole(&self.buffers.counters)),
+            (2, whole(&self.buffers.screen)),
+            (3, whole(&self.buffers.entries)),
+            (4, whole(order)),
+            (5, whole(&self.buffers.block_counts)),
+            (6, whole(&self.buffers.region_sums)),
+        ];
+        let kernels = &device.kernels;
+        let offset = dispatch_offset(Counter::Entries, false);
+        let key = entry_order as u32;
+        let counted: Vec<_> = bound.iter().filter(|b| b.0 != 2).cloned().collect();
+        let add_up =
+            cached(&mut self.groups, ("add_up", key), || bind(device, &kernels.add_up, &bound)).clone();
+        let group =
+            cached(&mut self.groups, ("count_heads", key), || bind(device, &kernels.count_heads, &counted));
+        dispatch_indirect(pass, &kernels.count_heads, group, (&self.buffers.dispatches, offset));
+        self.scan(device, pass, Scan::Heads);
+        dispatch_indirect(pass, &kernels.add_up, &add_up, (&self.buffers.dispatches, offset));
+    }
+}

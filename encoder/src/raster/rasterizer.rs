@@ -1,0 +1,86 @@
+//! The interface of all backends.
+
+use slag_common::Gaussians;
+
+use super::draw::Drawing;
+use super::error::RasterError;
+use super::view::RasterView;
+use super::weights::{StageTime, ViewWeights, WeightKind};
+use crate::masks::RegionMap;
+
+/// A backend that rasterises scenes.
+pub trait Rasterizer: Send + Sync {
+    /// Prepares a scene: validates it and, on a device with its own memory, uploads it.
+    ///
+    /// # Errors
+    /// [`RasterError`] for an inconsistent scene. Individual unusable Gaussians are counted instead.
+    fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError>;
+
+    /// Rasterises one view of a scene; see [`LoadedScene::weights`].
+    ///
+    /// # Errors
+    /// Those of [`Self::load`] and [`LoadedScene::weights`].
+    fn weights(
+        &self,
+        scene: &Gaussians,
+        view: &RasterView,
+        regions: &RegionMap,
+        kind: WeightKind,
+    ) -> Result<ViewWeights, RasterError> {
+        self.load(scene)?.weights(view, regions, kind)
+    }
+
+    /// Draws one view of a scene; see [`LoadedScene::draw`].
+    ///
+    /// # Errors
+    /// Those of [`Self::load`] and [`LoadedScene::draw`].
+    fn draw(
+        &self,
+        scene: &Gaussians,
+        view: &RasterView,
+        background: [f32; 3],
+    ) -> Result<Drawing, RasterError> {
+        self.load(scene)?.draw(view, background)
+    }
+}
+
+/// A scene prepared by a backend; several threads may rasterise views at once.
+pub trait LoadedScene: Send + Sync {
+    /// Returns the contribution of each Gaussian to each region.
+    ///
+    /// Pixels of [`NO_REGION`](crate::masks::NO_REGION) are blended but not recorded. The same input gives the same
+    /// bits for any number of threads.
+    ///
+    /// # Errors
+    /// [`RasterError`] for inconsistent input or if a device fails.
+    fn weights(
+        &self,
+        view: &RasterView,
+        regions: &RegionMap,
+        kind: WeightKind,
+    ) -> Result<ViewWeights, RasterError> {
+        Ok(self.weights_timed(view, regions, kind)?.0)
+    }
+
+    /// Returns [`Self::weights`] and the duration of each stage, in order; empty if the backend does not measure them.
+    ///
+    /// # Errors
+    /// Those of [`Self::weights`].
+    fn weights_timed(
+        &self,
+        view: &RasterView,
+        regions: &RegionMap,
+        kind: WeightKind,
+    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError>;
+
+    /// Draws the scene over a background colour, in the colour space of its training.
+    ///
+    /// # Errors
+    /// [`RasterError`] for inconsistent input or if a device fails.
+    fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError>;
+
+    /// Returns the number of views that GPUs process at once; `None` if views are rasterised on the caller's threads.
+    fn concurrency(&self) -> Option<usize> {
+        None
+    }
+}

@@ -1,0 +1,51 @@
+//! The result of rasterising a view: the weight of each Gaussian in each region.
+
+/// Quantity that is summed over the pixels of a region.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+pub enum WeightKind {
+    /// `alpha * T`: the Gaussian's contribution to the picture, attenuated by the Gaussians in front of it.
+    Blend,
+    /// `exp(-d' S^-1 d / 2)`, as printed in the paper: without opacity and occlusion. The footprint still ends where
+    /// alpha falls below 1/255.
+    Falloff,
+}
+
+/// Contribution of a Gaussian to a region: its weight summed over the pixels.
+#[derive(Clone, Copy, Debug, PartialEq, bytemuck::Zeroable)]
+pub struct RegionWeight {
+    /// Index of the Gaussian in the scene.
+    pub gaussian: u32,
+    /// Region of the view.
+    pub region: u32,
+    /// Weight, pixels; above 0.
+    pub weight: f32,
+}
+
+/// Statistics of one view.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ViewCounters {
+    /// Gaussians with a pixel of the image in their footprint; they may be occluded.
+    pub visible: usize,
+    /// Number of (Gaussian, tile) pairs.
+    pub pairs: usize,
+    /// Gaussians that cannot be drawn: not finite, without a rotation, or beyond the range of `f32` once projected.
+    pub unusable: usize,
+}
+
+/// Sparse weights of one view.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ViewWeights {
+    /// Contributions above zero, ordered by (Gaussian, region); each pair occurs once.
+    pub entries: Vec<RegionWeight>,
+    /// Statistics of the view.
+    pub counters: ViewCounters,
+}
+
+/// Duration of one stage of a view.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StageTime {
+    /// Name of the stage.
+    pub stage: &'static str,
+    /// Wall time, milliseconds.
+    pub ms: f64,
+}
