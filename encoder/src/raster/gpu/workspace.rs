@@ -198,7 +198,7 @@ impl Workspace {
         let contribution_bytes = u64::from(self.n_copied) * size_of::<RegionSum>() as u64;
         encoder.copy_buffer_to_buffer(&self.stages.buffers.counters, 0, &self.staging, 0, COUNTERS_BYTES);
         encoder.copy_buffer_to_buffer(
-            &self.stages.buffers.region_contributions,
+            &self.stages.buffers.region_sums,
             0,
             &self.staging,
             HEAD_BYTES,

@@ -1,25 +1,25 @@
-//! Which of SAM's proposals become masks: the filters of Segment Anything's automatic mask generation, in its order.
+//! The filters of Segment Anything's automatic mask generation, in their order.
 
 use rayon::prelude::*;
 use slag_models::sam::{Decoded, MASKS_PER_PROMPT};
 
-use super::SamSettings;
 use super::runs::RunMask;
+use super::settings::SamSettings;
 use super::upsample::Upsampler;
 use crate::masks::BoxPx;
 
-/// Distance at which a box counts as touching an edge; of the reference implementation.
+/// Distance within which a box touches an edge, as in the reference implementation.
 const EDGE_TOLERANCE_PX: u32 = 20;
 
-/// A mask that may be kept.
+/// A candidate mask.
 #[derive(Clone, Debug)]
 pub(super) struct Candidate {
     pub(super) mask: RunMask,
-    /// The model's own guess of how good it is.
+    /// IoU with the true mask, predicted by the model.
     pub(super) predicted_iou: f32,
     /// 0 whole, 1 part, 2 subpart.
     pub(super) level: u8,
-    /// The crop of the image that it was found in.
+    /// The crop of the image in which the mask was found.
     pub(super) crop: BoxPx,
 }
 
@@ -32,7 +32,7 @@ pub(super) struct Filters<'a> {
 }
 
 impl Filters<'_> {
-    /// Returns the proposals that the model trusts, that are stable, and that no edge of the crop cuts; in their order.
+    /// Returns, in order, the proposals that have a sufficient predicted IoU, are stable and are not cut by the crop.
     pub(super) fn candidates(&self, decoded: &Decoded, upsampler: &Upsampler, crop: BoxPx) -> Vec<Candidate> {
         let SamSettings { predicted_iou: least_iou, stability, stability_offset, .. } = *self.settings;
         let n_logits = (decoded.logits_px[0] * decoded.logits_px[1]) as usize;
@@ -42,16 +42,16 @@ impl Filters<'_> {
             .filter_map(|(at, (logits, predicted_iou))| {
                 let cut = upsampler.cut(logits, stability_offset, [crop.x0, crop.y0])?;
                 let keeps = cut.stability >= stability && !self.is_cut_by(crop, cut.mask.box_px());
-                // Three proposals a prompt, the smallest thing first.
+                // Three proposals per prompt, the smallest first.
                 let level = (MASKS_PER_PROMPT - 1 - at % MASKS_PER_PROMPT) as u8;
                 keeps.then_some(Candidate { mask: cut.mask, predicted_iou: *predicted_iou, level, crop })
             })
             .collect()
     }
 
-    /// Returns whether a box touches an edge of the crop that is not one of the image.
+    /// Returns whether a box touches an edge of the crop that is no edge of the image.
     fn is_cut_by(&self, crop: BoxPx, found: BoxPx) -> bool {
-        // The last column and row, as the reference implementation counts them.
+        // The last column and row are inclusive, as in the reference implementation.
         let edges = |b: BoxPx| [b.x0, b.y0, b.x1, b.y1];
         let found = [found.x0, found.y0, found.x1 - 1, found.y1 - 1];
         let image = [0, 0, self.image_px[0], self.image_px[1]];
@@ -63,18 +63,17 @@ impl Filters<'_> {
             .any(|((found, crop), image)| is_near(found, crop) && !is_near(found, image))
     }
 
-    /// Drops duplicates among the candidates of one crop, the better first.
+    /// Drops duplicates within a crop, keeping the higher predicted IoU.
     pub(super) fn unique_in_crop(&self, candidates: Vec<Candidate>) -> Vec<Candidate> {
         let scores = candidates.iter().map(|candidate| f64::from(candidate.predicted_iou)).collect();
         by_boxes(candidates, scores, self.settings.box_nms_iou)
     }
 
-    /// Drops duplicates among the candidates of all crops, heals holes and islands, and drops the duplicates that
-    /// this made and those that the pixels show.
+    /// Drops duplicates between crops, removes small holes and islands, and then drops duplicates by box and by pixels.
     pub(super) fn unique_in_image(&self, mut candidates: Vec<Candidate>, n_crops: usize) -> Vec<Candidate> {
         let SamSettings { box_nms_iou, crop_nms_iou, mask_nms_iou, min_region_px, .. } = *self.settings;
         if n_crops > 1 {
-            // Small crops show more.
+            // Smaller crops show more detail.
             let area = |b: BoxPx| f64::from(b.width_px()) * f64::from(b.height_px());
             let scores = candidates.iter().map(|candidate| 1.0 / area(candidate.crop)).collect();
             candidates = by_boxes(candidates, scores, crop_nms_iou);
@@ -83,7 +82,7 @@ impl Filters<'_> {
             let [width_px, height_px] = self.image_px;
             let heal = |candidate: &mut Candidate| {
                 let healed = candidate.mask.without_small_regions(width_px, height_px, min_region_px);
-                // Masks that were good as they are come first.
+                // Unchanged masks have priority.
                 let score = f64::from(u8::from(healed.is_none()));
                 candidate.mask = healed.unwrap_or_else(|| candidate.mask.clone());
                 score
@@ -103,8 +102,8 @@ fn by_boxes(candidates: Vec<Candidate>, scores: Vec<f64>, most_iou: f64) -> Vec<
     suppress(candidates, scores, |a, b| box_iou(a.mask.box_px(), b.mask.box_px()) > most_iou)
 }
 
-/// Greedy non-maximum suppression: from the highest score down (the first of equal ones before), keeps what is no
-/// duplicate of anything kept.
+/// Non-maximum suppression: in descending order of scores (equal ones in their order), keeps candidates that are no
+/// duplicate of a kept one.
 fn suppress(
     candidates: Vec<Candidate>,
     scores: Vec<f64>,
@@ -121,8 +120,8 @@ fn suppress(
     kept
 }
 
-/// Returns the IoU of two boxes from first to last pixel: as the reference implementation reckons, whose areas
-/// are a pixel less each way; NaN for two lines.
+/// Returns the IoU of two boxes as computed by the reference implementation, in which areas exclude the last row and
+/// column; NaN for two lines.
 fn box_iou(a: BoxPx, b: BoxPx) -> f64 {
     let area = |b: BoxPx| f64::from(b.width_px() - 1) * f64::from(b.height_px() - 1);
     let overlap = |low: u32, high: u32| f64::from(high.saturating_sub(low + 1));

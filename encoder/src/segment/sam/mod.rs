@@ -1,13 +1,14 @@
-//! Masks from Segment Anything: automatic mask generation as its paper (Kirillov et al. 2023, appendix B) and its
-//! reference implementation define it.
+//! Masks from Segment Anything: automatic mask generation as defined by its paper (Kirillov et al. 2023, appendix B) and
+//! its reference implementation.
 //!
-//! Each point of a grid is a prompt of its own; each gives three masks: the whole thing, a part, a subpart. The
-//! image encoder runs once an image (and crop), the decoder a batch of points at a time; while it works on the next
-//! batch, the masks of the last one are enlarged and filtered in parallel.
+//! Each point of a grid is one prompt, which gives three masks: whole, part and subpart. The image encoder runs once per
+//! image and crop, the decoder once per batch of points. While it decodes a batch, the masks of the previous batch are
+//! enlarged and filtered in parallel.
 
 mod filter;
 mod points;
 mod runs;
+mod settings;
 #[cfg(test)]
 mod tests;
 mod upsample;
@@ -25,53 +26,7 @@ use crate::masks::{BoxPx, Mask};
 use filter::{Candidate, Filters};
 use upsample::Upsampler;
 
-/// How many masks are asked for and which are kept. The defaults are those of the reference implementation.
-#[derive(Clone, Debug, PartialEq, serde::Serialize)]
-pub struct SamSettings {
-    /// Points along each side of the grid.
-    pub points_per_side: u32,
-    /// Points that the decoder takes at once; its memory grows with it: 0.8 MB a point, twice.
-    pub points_per_batch: u32,
-    /// The model's guess of a mask's IoU must be above this; 0 lets all pass.
-    pub predicted_iou: f32,
-    /// IoU that a mask cut at logits of `stability_offset` above 0 and below must have.
-    pub stability: f64,
-    /// Logits.
-    pub stability_offset: f32,
-    /// Of two masks of a crop whose boxes have an IoU above this, the one of better predicted IoU stays.
-    pub box_nms_iou: f64,
-    /// The same for the pixels of all masks at the end; 1 compares none, as the reference implementation.
-    pub mask_nms_iou: f64,
-    /// Layers of crops beside the whole image; layer `i` has 4^i of them.
-    pub crop_layers: u32,
-    /// Of two masks of different crops whose boxes have an IoU above this, the one of the smaller crop stays.
-    pub crop_nms_iou: f64,
-    /// Overlap of neighbouring crops of the first layer, relative to the shorter edge of the image.
-    pub crop_overlap: f64,
-    /// From layer to layer, points along a side are divided by this.
-    pub crop_points_divisor: u32,
-    /// Holes and islands of fewer pixels are healed; 0 heals none.
-    pub min_region_px: u32,
-}
-
-impl Default for SamSettings {
-    fn default() -> Self {
-        Self {
-            points_per_side: 32,
-            points_per_batch: 64,
-            predicted_iou: 0.88,
-            stability: 0.95,
-            stability_offset: 1.0,
-            box_nms_iou: 0.7,
-            mask_nms_iou: 1.0,
-            crop_layers: 0,
-            crop_nms_iou: 0.7,
-            crop_overlap: 512.0 / 1500.0,
-            crop_points_divisor: 1,
-            min_region_px: 0,
-        }
-    }
-}
+pub use settings::SamSettings;
 
 /// Finds masks with SAM.
 #[derive(Debug)]
@@ -82,18 +37,18 @@ pub struct SamSegmenter {
 }
 
 impl SamSegmenter {
-    /// Opens a model directory whose `model.toml` has `[segment]`.
+    /// Opens a model directory with a `[segment]` section in `model.toml`.
     ///
     /// # Errors
-    /// [`ModelError`] where a file is absent or not as described, or ONNX Runtime does not load.
+    /// [`ModelError`] if a file is missing or does not match its description, or ONNX Runtime does not load.
     pub fn open(dir: &Path, settings: SamSettings, session: &SessionOptions) -> Result<Self, ModelError> {
         let sam = Sam::open(dir, session)?;
-        // Sums of matrix products may be split by the threads of a run.
+        // The number of threads may change the order of sums in matrix products.
         let identity = format!("{} {settings:?} on {} threads", sam.id(), session.intra_op_threads);
         Ok(Self { sam, settings, identity })
     }
 
-    /// Returns the masks of one crop, boxes and pixels those of the image.
+    /// Returns the masks of one crop, in pixels of the image.
     fn masks_of_crop(
         &self,
         input: &SegmentInput<'_>,
@@ -109,7 +64,7 @@ impl SamSegmenter {
         let points: Vec<[f32; 2]> = points.into_iter().map(|point| embedding.frame.point(point)).collect();
         let labels = vec![1; points_per_batch as usize];
         let found = std::thread::scope(|scope| {
-            // Of no capacity: two batches of logits at a time, one decoded and one filtered.
+            // A rendezvous channel: at most two batches of logits are in memory, one decoded and one filtered.
             let (sender, receiver) = mpsc::sync_channel::<Decoded>(0);
             let frame = &embedding.frame;
             let filtered = scope.spawn(move || {
@@ -146,7 +101,7 @@ impl Segmenter for SamSegmenter {
         Ok(self.identity.clone())
     }
 
-    /// One image is embedded while another's points are decoded; the model has threads of its own.
+    /// One image is embedded while the points of another are decoded; the model has its own threads.
     fn concurrency(&self) -> Option<usize> {
         Some(2)
     }

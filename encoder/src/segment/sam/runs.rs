@@ -1,4 +1,4 @@
-//! A mask as runs of pixels: small while thousands of candidates wait for the filters.
+//! Masks as runs of pixels, which keeps thousands of candidates small.
 
 use slag_math::union_find::{Numbering, UnionFind};
 
@@ -12,7 +12,7 @@ pub(super) struct Run {
     pub(super) x1: u32,
 }
 
-/// A set of pixels: runs in row-major order, apart from each other.
+/// A set of pixels: disjoint runs in row-major order.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct RunMask {
     runs: Vec<Run>,
@@ -21,7 +21,7 @@ pub(super) struct RunMask {
 }
 
 impl RunMask {
-    /// Returns the set of these runs; `None` if there is none.
+    /// Creates the set of these runs; `None` if there are none.
     pub(super) fn new(runs: Vec<Run>) -> Option<Self> {
         let (first, last) = (runs.first()?, runs.last()?);
         let x0 = runs.iter().map(|run| run.x0).min()?;
@@ -50,7 +50,7 @@ impl RunMask {
         Mask { box_px: self.box_px, inside, area_px: self.area_px, level }
     }
 
-    /// Returns the intersection over the union of two sets.
+    /// Returns the intersection over union of two sets.
     pub(super) fn iou(&self, other: &Self) -> f64 {
         let (mut a, mut b) = (self.runs.iter().peekable(), other.runs.iter().peekable());
         let mut both_px = 0_u64;
@@ -68,8 +68,9 @@ impl RunMask {
         both_px as f64 / (areas_px - both_px) as f64
     }
 
-    /// Fills holes, then drops islands, of fewer than `min_px` pixels in an image of the given size; the largest
-    /// island stays. Pixels that touch at a corner belong together. Returns `None` where no region is small.
+    /// Fills holes and then removes islands with fewer than `min_px` pixels, but keeps the largest island.
+    ///
+    /// Pixels that touch at a corner are connected. Returns `None` if no hole or island is small.
     pub(super) fn without_small_regions(&self, width_px: u32, height_px: u32, min_px: u32) -> Option<Self> {
         let is_small = |size_px: &u64| *size_px < u64::from(min_px);
         let outside = complement(&self.runs, width_px, height_px);
@@ -83,7 +84,7 @@ impl RunMask {
         if !hole_of.sizes_px.iter().any(is_small) && !island_of.sizes_px.iter().any(is_small) {
             return None;
         }
-        // Where all are small, the first of the largest.
+        // If all islands are small, the first of the largest ones.
         let most_px = island_of.sizes_px.iter().copied().max().filter(is_small);
         let spared = island_of.sizes_px.iter().position(|size_px| Some(*size_px) == most_px);
         let stays = |component: usize| Some(component) == spared || !is_small(&island_of.sizes_px[component]);
@@ -92,7 +93,7 @@ impl RunMask {
     }
 }
 
-/// Returns the pixels of an image that no run covers.
+/// Returns the pixels of an image outside the runs.
 fn complement(runs: &[Run], width_px: u32, height_px: u32) -> Vec<Run> {
     let mut gaps = Vec::new();
     let mut runs = runs.iter().peekable();
@@ -113,13 +114,13 @@ fn complement(runs: &[Run], width_px: u32, height_px: u32) -> Vec<Run> {
 
 /// Connected components of runs.
 struct Components {
-    /// Of each run, numbered in the order in which a row-major scan meets them.
+    /// Component of each run, numbered in the order of a row-major scan.
     of_run: Vec<u32>,
     sizes_px: Vec<u64>,
 }
 
-/// Finds the components of runs in row-major order; runs of neighbouring rows that overlap or touch at a corner
-/// are connected.
+/// Finds the connected components of runs in row-major order. Runs in neighbouring rows are connected if they overlap or
+/// touch at a corner.
 fn components(runs: &[Run]) -> Components {
     let mut sets = UnionFind::new(runs.len());
     let mut above = 0;

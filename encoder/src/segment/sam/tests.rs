@@ -1,4 +1,4 @@
-//! The filters against a plain recomputation in float64 on made-up logits: dense arrays, no runs, no shared code.
+//! Compares the filters with an independent recomputation on synthetic logits: float64, dense arrays, no shared code.
 
 use std::path::Path;
 
@@ -13,18 +13,17 @@ use super::{SamSegmenter, SamSettings, points};
 use crate::masks::{BoxPx, Mask};
 use crate::segment::Segmenter;
 
-/// Edge of the square and of the logits, pixels: the proportion is SAM's.
+/// Edges of the square and of the logits, pixels, in SAM's proportion.
 const SIZE_PX: u32 = 256;
 const LOGITS_PX: u32 = 64;
 
-/// A round thing in logits: centre and radius in the square, how fast the logit falls, and what the model
-/// says about it.
+/// A round object in logits: centre and radius in the square, slope of the logits, and predicted IoU.
 #[derive(Clone, Copy)]
 struct Blob {
     centre: [f64; 2],
     radius: f64,
     slope: f64,
-    /// A hole within, or an island beside: centre, radius and slope.
+    /// A hole or an island: centre, radius and slope.
     spot: Option<([f64; 2], f64, f64)>,
     predicted_iou: f32,
 }
@@ -47,8 +46,8 @@ fn logits(blob: &Blob) -> Vec<f32> {
         .collect()
 }
 
-/// Made-up answers to `n` prompts: things here and there, many of them seen several times, some of them soft,
-/// distrusted, cut, with holes or with islands.
+/// Returns synthetic answers to `n` prompts. Many objects repeat; some are soft, have a low predicted IoU, are cut, or
+/// have holes or islands.
 fn blobs(n: usize, seed: u64, extent: [f64; 2]) -> Vec<Blob> {
     let mut state = seed;
     let mut random = move || {
@@ -89,7 +88,7 @@ fn decoded(blobs: &[Blob]) -> Decoded {
     }
 }
 
-/// One bilinear step in float64, pixel centres aligned: `[height][width]` to `[to[1]][to[0]]`.
+/// Resizes bilinearly in float64 with aligned pixel centres, from `[height][width]` to `[to[1]][to[0]]`.
 fn bilinear(values: &[f64], [width, height]: [usize; 2], to: [usize; 2]) -> Vec<f64> {
     let source = |at: usize, n_in: usize, n_out: usize| {
         let s = ((at as f64 + 0.5) * n_in as f64 / n_out as f64 - 0.5).max(0.0);
@@ -108,7 +107,7 @@ fn bilinear(values: &[f64], [width, height]: [usize; 2], to: [usize; 2]) -> Vec<
     out
 }
 
-/// The two steps of SAM's post-processing, with the padding cut off between them.
+/// The two resizing steps of SAM's post-processing, with the crop of the padding between them.
 fn enlarged(logits: &[f32], frame: &Frame, logits_px: [u32; 2]) -> Vec<f64> {
     let logits: Vec<f64> = logits.iter().map(|&logit| f64::from(logit)).collect();
     let size = frame.size_px as usize;
@@ -294,7 +293,7 @@ impl Oracle {
     }
 }
 
-/// Compares the filters with the recomputation and returns how many masks were kept.
+/// Compares the filters with the recomputation and returns the number of masks kept.
 fn compare(settings: SamSettings, image_px: [u32; 2], n_prompts: usize, seed: u64) -> usize {
     let filters = Filters { settings: &settings, image_px };
     let oracle = Oracle { settings: settings.clone(), image_px: image_px.map(|edge| edge as usize) };
@@ -354,7 +353,7 @@ fn the_filters_equal_a_plain_recomputation() {
     assert_eq!(n(&SamSettings { min_region_px: 1_000_000, crop_nms_iou: 1.0, ..all.clone() }), n_all);
 }
 
-/// Soft things too, whose fringe reaches far beyond their mask.
+/// Includes soft objects with a wide fringe around their mask.
 #[test]
 fn stability_equals_a_plain_recomputation() {
     let frame = Frame::new(SIZE_PX, [210, 150]);
@@ -385,7 +384,7 @@ fn the_identity_holds_model_and_settings() {
     }
 }
 
-/// Noise holds every way in which pixels touch, corners too.
+/// Noise contains all neighbourhoods of pixels, including contacts at corners.
 #[test]
 fn healing_of_noise_equals_a_plain_recomputation() {
     let mut state = 5_u64;
@@ -400,7 +399,7 @@ fn healing_of_noise_equals_a_plain_recomputation() {
         let min_region_px = (random() * 12.0) as u32;
         let mut runs = Vec::new();
         for (y, row) in inside.chunks_exact(width).enumerate() {
-            // Runs must be apart: each begins where the pixel before is outside.
+            // Runs must be disjoint: each begins after a pixel outside.
             for x0 in (0..width).filter(|&x| row[x] && (x == 0 || !row[x - 1])) {
                 let x1 = (x0..width).find(|&x| !row[x]).unwrap_or(width);
                 runs.push(Run { y: y as u32, x0: x0 as u32, x1: x1 as u32 });
@@ -437,25 +436,6 @@ fn crops_equal_a_plain_recomputation() {
     }
 }
 
-#[test]
-fn grids_and_crops_are_those_of_the_reference() {
-    let grid = points::grid(2, 640, 480);
-    assert_eq!(grid, [[160.0, 120.0], [480.0, 120.0], [160.0, 360.0], [480.0, 360.0]]);
-    assert_eq!(points::grid(32, 1000, 700).len(), 1024);
-    // By hand: the overlap is int(512 / 1500 * 480 * 2 / 2) = 163 px, then 81 px; a crop is
-    // ceil((163 + 640) / 2) = 402 px wide and ceil((163 + 480) / 2) = 322 px high, then 221 and 181 px.
-    let crops = points::crops(640, 480, 2, 512.0 / 1500.0);
-    assert_eq!(crops.len(), 1 + 4 + 16);
-    let edges = |k: usize| (crops[k].1, crops[k].0.x0, crops[k].0.y0, crops[k].0.x1, crops[k].0.y1);
-    assert_eq!(edges(0), (0, 0, 0, 640, 480));
-    assert_eq!(
-        [1, 2, 3, 4].map(edges),
-        [(1, 0, 0, 402, 322), (1, 0, 159, 402, 480), (1, 239, 0, 640, 322), (1, 239, 159, 640, 480),]
-    );
-    assert_eq!(edges(5), (2, 0, 0, 221, 181));
-    assert_eq!(edges(20), (2, 420, 300, 640, 480));
-}
-
 fn tiny(settings: SamSettings) -> SamSegmenter {
     let session = SessionOptions::new(onnx_runtime());
     SamSegmenter::open(&workspace_root().join("tests/models/sam_tiny"), settings, &session).expect("it opens")
@@ -468,7 +448,7 @@ fn array<T: npyz::Deserialize>(npz: &Path, name: &str) -> (Vec<u64>, Vec<T>) {
     (array.shape().to_vec(), array.into_vec().expect("of that type"))
 }
 
-/// Masks at the image's size against `SamImageProcessor.post_process_masks`, recorded.
+/// Compares enlarged masks with recorded results of `SamImageProcessor.post_process_masks`.
 #[needs_shared]
 #[test]
 fn enlarged_masks_equal_the_recorded_ones() {

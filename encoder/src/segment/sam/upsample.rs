@@ -1,22 +1,22 @@
-//! From the decoder's coarse logits to the pixels of an image.
+//! Upsampling of the decoder's coarse logits to the pixels of an image.
 //!
-//! SAM enlarges the logits to its square, cuts off the padding, and scales what is left to the image, bilinearly
-//! each time with pixel centres aligned. Both steps are linear in each axis, so they are one step with at most
-//! three taps an axis here, and the square is never made.
+//! SAM enlarges the logits to its input square, crops the padding and scales the rest to the image; both steps are
+//! bilinear with aligned pixel centres. They are linear in each axis, so this module combines them into one step with at
+//! most three taps per axis, without the intermediate square.
 
 use slag_models::sam::Frame;
 
 use super::runs::{Run, RunMask};
 
-/// The logits that each pixel of an axis is made of.
+/// The logits and weights of each pixel along an axis.
 struct Axis {
-    /// The first of three logits in a row.
+    /// The first of three consecutive logits.
     first: Vec<usize>,
     weights: Vec<[f32; 3]>,
 }
 
-/// Returns the two neighbours of output pixel `at` and the weight of the second one, where `n_in` pixels are resized
-/// to `n_out`: the source coordinate is (at + 1/2) n_in / n_out - 1/2, clamped to the input.
+/// Returns the two input neighbours of output pixel `at` and the weight of the second, when `n_in` pixels are resized to
+/// `n_out`. The source coordinate is (at + 1/2) n_in / n_out - 1/2, clamped to the input.
 fn neighbours(at: u32, n_in: u32, n_out: u32) -> ([u32; 2], f64) {
     let source = ((f64::from(at) + 0.5) * f64::from(n_in) / f64::from(n_out) - 0.5).max(0.0);
     let low = (source as u32).min(n_in - 1);
@@ -32,7 +32,7 @@ impl Axis {
             let mut weights = [0.0_f64; 3];
             for (pixel, weight) in in_square.into_iter().zip([1.0 - second, second]) {
                 let (logits, second) = neighbours(pixel, n_logits, size_px);
-                // Logits are no finer than the square, so neighbours in it need three of them at most.
+                // Logits are no finer than the square, so two neighbours in it depend on at most three logits.
                 let first = *first.get_or_insert((logits[0] as usize).min(n_logits as usize - 3));
                 weights[logits[0] as usize - first] += weight * (1.0 - second);
                 weights[logits[1] as usize - first] += weight * second;
@@ -43,39 +43,39 @@ impl Axis {
         axis
     }
 
-    /// Returns the pixels that logits `first..=last` have a part in.
+    /// Returns the pixels that depend on any of the logits `first..=last`.
     fn pixels(&self, first: usize, last: usize) -> std::ops::Range<usize> {
         let start = self.first.partition_point(|&tap| tap + 2 < first);
         start..self.first.partition_point(|&tap| tap <= last).max(start)
     }
 }
 
-/// The way from logits to the pixels of one image.
+/// Upsampling from logits to the pixels of one image.
 pub(super) struct Upsampler {
     n_columns: usize,
     x: Axis,
     y: Axis,
 }
 
-/// A mask that was cut out of logits.
+/// A mask from thresholded logits.
 pub(super) struct Cut {
-    /// The pixels whose logit is above 0.
+    /// The pixels with a logit above 0.
     pub(super) mask: RunMask,
-    /// IoU of the masks above `+offset` and above `-offset`.
+    /// IoU between the masks above `+offset` and above `-offset`.
     pub(super) stability: f64,
 }
 
 impl Upsampler {
-    /// `logits_px`: columns and rows of the logits, 3 or more and no more than the square has.
+    /// Creates the upsampling for `logits_px` columns and rows of logits: at least 3, at most the size of the square.
     pub(super) fn new(frame: &Frame, logits_px: [u32; 2]) -> Self {
         let axis = |k: usize| Axis::new(logits_px[k], frame.size_px, frame.resized_px[k], frame.image_px[k]);
         Self { n_columns: logits_px[0] as usize, x: axis(0), y: axis(1) }
     }
 
-    /// Enlarges `logits`, `[rows][columns]`, and cuts at 0; `None` if no pixel is inside. `origin_px` is added to the
-    /// pixels' coordinates.
+    /// Enlarges `logits`, `[rows][columns]`, and thresholds them at 0; `None` if the mask is empty. `origin_px` is added
+    /// to the coordinates of the pixels.
     pub(super) fn cut(&self, logits: &[f32], offset: f32, origin_px: [u32; 2]) -> Option<Cut> {
-        // Means of logits below -offset are below it: nothing else need be enlarged.
+        // Weighted means of logits below -offset are below it too, so only the rest must be enlarged.
         let (mut rows, mut columns) = ((usize::MAX, 0), (usize::MAX, 0));
         for (y, row) in logits.chunks_exact(self.n_columns).enumerate() {
             let mut above = row.iter().enumerate().filter(|(_, logit)| **logit > -offset).map(|(x, _)| x);
