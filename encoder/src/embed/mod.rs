@@ -1,4 +1,4 @@
-//! Stage 2: a crop per mask, and a vector per crop.
+//! Embedding: a crop for each mask, and a vector for each crop.
 
 use std::num::NonZeroUsize;
 
@@ -10,20 +10,20 @@ use slag_models::{
 
 use crate::masks::{BoxPx, Mask};
 
-/// Says why masks could not be embedded.
+/// Reason why masks cannot be embedded.
 #[derive(Debug, thiserror::Error)]
 pub enum EmbedError {
-    /// A mask does not lie in the image, has a box of other size than its pixels, or no pixels.
+    /// A mask is outside the image, is empty, or its box does not match its pixels.
     #[error(
         "mask {index}: box {box_px:?} with {n_inside} pixels inside does not fit an image of {width_px}x{height_px}; \
          segment this image again"
     )]
     Mask {
-        /// Its index among the masks given.
+        /// Index of the mask.
         index: usize,
-        /// Its box.
+        /// Bounding box of the mask.
         box_px: BoxPx,
-        /// Its pixels, counted.
+        /// Number of pixels in the mask.
         n_inside: usize,
         /// Width of the image.
         width_px: u32,
@@ -33,38 +33,38 @@ pub enum EmbedError {
     /// The encoder failed on a batch.
     #[error("masks {first} to {last}: {cause}")]
     Encode {
-        /// Index of the batch's first mask.
+        /// Index of the first mask in the batch.
         first: usize,
-        /// Index of the batch's last mask.
+        /// Index of the last mask in the batch.
         last: usize,
-        /// Why.
+        /// The encoder's error.
         cause: Box<EncodeError>,
     },
 }
 
-/// What a crop shows outside its mask.
+/// Content of a crop outside its mask.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum, serde::Serialize)]
 pub enum Background {
     /// White.
     White,
-    /// The middle grey (128), which is 0 after most models' normalisation.
+    /// Mid-grey (128), which is about 0 after the normalisation of most models.
     Grey,
-    /// The photograph, blurred: surroundings without detail.
+    /// The blurred photo: surroundings without detail.
     Blur,
-    /// The photograph as it is.
+    /// The unchanged photo.
     Keep,
 }
 
-/// Standard deviation of [`Background::Blur`] as a part of the box's longer edge: nothing beside the mask
-/// can be recognised then, yet the colours around it stay.
+/// Standard deviation of [`Background::Blur`] relative to the longer edge of the box. It hides the surroundings of the
+/// mask but keeps their colours.
 const BLUR_OF_EDGE: f32 = 0.05;
 
-/// Crops held at a time: large ones fill a batch before it has as many crops as the encoder prefers.
+/// Largest number of pixels in a batch of crops; large crops fill a batch before the encoder's preferred number.
 const MAX_BATCH_PIXELS: u64 = 1 << 24;
 
-/// Returns the mask's tight box of the image; what lies outside the mask becomes `background`.
+/// Crops the image to the bounding box of a mask and replaces pixels outside the mask by the background.
 ///
-/// Returns `None` where the mask does not fit the image or has no pixels.
+/// Returns `None` if the mask does not fit the image or is empty.
 pub fn crop(image: &RgbImage, mask: &Mask, background: Background) -> Option<Crop> {
     let BoxPx { x0, y0, x1, y1 } = mask.box_px;
     let fits = x0 < x1 && y0 < y1 && x1 <= image.width() && y1 <= image.height();
@@ -90,10 +90,10 @@ pub fn crop(image: &RgbImage, mask: &Mask, background: Background) -> Option<Cro
     Crop::new(pixels, mask.inside.clone())
 }
 
-/// Returns `image` under a Gaussian of standard deviation `sigma_px`.
+/// Blurs an image with a Gaussian of standard deviation `sigma_px`.
 fn blurred(image: &RgbImage, sigma_px: f32) -> RgbImage {
-    // A wide Gaussian leaves nothing that a smaller image does not show, and its time grows with its width.
-    // Short edges keep 8 pixels, so that rounding them to pixels changes the proportions little.
+    // A wide Gaussian removes all detail beyond that of a smaller image, and its cost grows with its width. Short
+    // edges keep at least 8 pixels, so that rounding changes the proportions little.
     let short_px = image.width().min(image.height()) as f32;
     let shrink = (sigma_px / 4.0).min(short_px / 8.0).max(1.0);
     let [width, height] =
@@ -107,7 +107,7 @@ fn resized(image: &RgbImage, width_px: u32, height_px: u32) -> RgbImage {
     resample(image, Filter::Bicubic, [width_px, height_px].map(u64::from), whole)
 }
 
-/// Returns the crop of mask `index`, or says why there is none.
+/// Returns the crop of mask `index`, or the error.
 fn crop_of(
     image: &RgbImage,
     (index, mask): (usize, &Mask),
@@ -122,9 +122,9 @@ fn crop_of(
     })
 }
 
-/// Returns each mask's crop as the square that the image encoder takes: small, whatever the photo's size.
+/// Returns the crop of each mask as the small square that the image encoder takes.
 /// # Errors
-/// [`EmbedError::Mask`] where a mask does not fit the image.
+/// [`EmbedError::Mask`] if a mask does not fit the image.
 pub fn squares(
     image: &RgbImage,
     masks: &[Mask],

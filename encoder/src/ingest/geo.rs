@@ -1,4 +1,4 @@
-//! Where the world frame lies on the earth, as a JSON file says it.
+//! Geo-reference of the world frame, from a JSON file.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use slag_common::frames::{GeoReference, Geographic};
 
-/// Why a geo-reference could not be read.
+/// Reason why a geo-reference cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum GeoError {
-    /// The file could not be read; the message has its path.
+    /// The file cannot be read; the message contains its path.
     #[error("{0}; check that the file exists and may be read")]
     Io(#[from] io::Error),
     /// The file is not JSON of the expected form.
@@ -21,14 +21,14 @@ pub enum GeoError {
         #[source]
         source: serde_json::Error,
     },
-    /// A coordinate lies off the earth.
+    /// A coordinate is out of range.
     #[error("{}: origin.{field} = {value} is outside {min}..={max}; write degrees and metres of WGS 84", path.display())]
     Range {
         /// The file.
         path: PathBuf,
         /// `lat`, `lon` or `alt`.
         field: &'static str,
-        /// Its value.
+        /// The value found.
         value: f64,
         /// Smallest valid value.
         min: f64,
@@ -52,12 +52,12 @@ struct Origin {
 /// Reads `{"origin": {"lat": degrees, "lon": degrees, "alt": metres}}`; other fields are ignored.
 ///
 /// # Errors
-/// [`GeoError`] if the file cannot be read, is of another form or names no place on the earth.
+/// [`GeoError`] if the file cannot be read, is malformed, or contains a coordinate out of range.
 pub fn read_geo_reference(path: &Path) -> Result<GeoReference, GeoError> {
     let bytes = fs_err::read(path)?;
     let GeoFile { origin } =
         serde_json::from_slice(&bytes).map_err(|source| GeoError::Json { path: path.to_owned(), source })?;
-    // Heights: from the deepest trench to the edge of space.
+    // The range of heights is from the deepest trench to the edge of space.
     let ranges = [
         ("lat", origin.lat, -90.0, 90.0),
         ("lon", origin.lon, -180.0, 180.0),

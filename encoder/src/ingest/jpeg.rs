@@ -1,12 +1,13 @@
-//! Whether a JPEG is whole: decoders fill what a cut file lacks with grey and say nothing.
+//! Detection of truncated JPEG files, which decoders fill with grey without an error.
 
 use std::io::{self, BufRead, Read};
 
-/// Returns whether the file reaches its end-of-image marker (ITU-T T.81, B.1.1): segments are skipped by their
-/// lengths, so that the marker of a thumbnail within does not count, and coded data are searched through.
+/// Returns whether the file contains its end-of-image marker (ITU-T T.81, B.1.1).
+///
+/// Segments are skipped by their lengths, so the marker of an embedded thumbnail does not count; coded data are searched.
 ///
 /// # Errors
-/// What reading says.
+/// Errors of the reader, except for the end of the file.
 pub(super) fn is_whole(mut file: impl BufRead) -> io::Result<bool> {
     match find_end(&mut file) {
         Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => Ok(false),
@@ -23,7 +24,7 @@ fn find_end(file: &mut impl BufRead) -> io::Result<()> {
         }
         match code[0] {
             0xD9 => return Ok(()),
-            // A coded 255, and markers without a segment.
+            // A stuffed byte 255, and markers without a segment.
             0x00 | 0x01 | 0xD0..=0xD8 => {}
             _ => {
                 let mut len_bytes = [0; 2];
@@ -39,7 +40,8 @@ fn find_end(file: &mut impl BufRead) -> io::Result<()> {
 mod tests {
     use super::*;
 
-    /// Start, a segment with a thumbnail's end within, a scan header, coded data with a coded 255 and a restart, end.
+    /// Start marker, a segment with the end marker of a thumbnail, a scan header, coded data with a stuffed byte 255 and a
+    /// restart marker, end marker.
     const WHOLE: [u8; 25] = [
         0xFF, 0xD8, 0xFF, 0xE1, 0, 6, 0xFF, 0xD8, 0xFF, 0xD9, 0xFF, 0xDA, 0, 3, 9, 7, 0xFF, 0, 8, 0xFF, 0xD3,
         5, 0xFF, 0xFF, 0xD9,
@@ -51,7 +53,7 @@ mod tests {
         for len in 0..WHOLE.len() {
             assert!(!is_whole(&WHOLE[..len]).expect("memory reads"), "cut after {len}");
         }
-        // What cameras append is no harm.
+        // Data that cameras append are harmless.
         let appended = [&WHOLE[..], &[0; 9]].concat();
         assert!(is_whole(&appended[..]).expect("memory reads"));
     }

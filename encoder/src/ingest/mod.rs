@@ -1,4 +1,4 @@
-//! Stage 0: photos as the later stages want them, ideal pinhole images of a known size.
+//! Ingest: loads photos as ideal pinhole images of known size.
 
 mod geo;
 mod jpeg;
@@ -14,44 +14,44 @@ use slag_common::{Distortion, Hash32, Intrinsics, View};
 pub use geo::{GeoError, read_geo_reference};
 pub use undistort::Undistorter;
 
-/// Largest factor by which a folder of downscaled copies may differ from the intrinsics.
+/// Largest factor between the size in the intrinsics and that of downscaled photos.
 const MAX_DOWNSCALE: u32 = 64;
 
-/// A photo, free of lens distortion.
+/// An undistorted photo.
 #[derive(Clone, Debug)]
 pub struct LoadedImage {
-    /// The view with the image's own size and an ideal pinhole.
+    /// The view, with the size of the image and pinhole intrinsics.
     pub view: View,
-    /// The pixels, black where the lens imaged nothing.
+    /// The pixels; black outside the lens image.
     pub image: RgbImage,
-    /// How the image came about, where the lens distorted it.
+    /// The mapping that undistorted the image, if the lens has distortion.
     pub undistorter: Option<Undistorter>,
-    /// Pixels that show something, row-major; `None` where all do.
+    /// Pixels inside the lens image, row-major; `None` if all are.
     pub valid: Option<Vec<bool>>,
 }
 
-/// Why a photo could not be loaded.
+/// Reason why a photo cannot be loaded.
 #[derive(Debug, thiserror::Error)]
 pub enum IngestError {
-    /// A file could not be read; the message has its path.
+    /// A file cannot be read; the message contains its path.
     #[error("{0}; check that the file exists and may be read")]
     Io(#[from] io::Error),
-    /// A file is no image or damaged.
+    /// A file is damaged or no image.
     #[error("{}: {source}; give a JPEG, PNG or WebP that opens elsewhere", path.display())]
     Decode {
         /// The image.
         path: PathBuf,
-        /// The decoder's reason.
+        /// The decoder's error.
         #[source]
         source: ImageError,
     },
-    /// A JPEG is cut short.
+    /// A JPEG is truncated.
     #[error("{}: the file ends before its image does; copy the photo again", path.display())]
     Cut {
         /// The image.
         path: PathBuf,
     },
-    /// An image's size does not belong to its camera.
+    /// The size of an image does not match its camera.
     #[error(
         "{}: the image is {} x {} px but its camera {} x {} px, and the one is no uniform scale of the other; \
          give the images that the poses were computed from, or whole-factor reductions of them",
@@ -75,19 +75,18 @@ pub fn hash_file(path: &Path) -> io::Result<Hash32> {
     Ok(Hash32::of_reader(fs_err::File::open(path)?)?.0)
 }
 
-/// Returns the views whose image file is absent, in the order given.
+/// Returns the views without an image file, in the given order.
 pub fn missing_images(views: &[View]) -> Vec<&View> {
     views.iter().filter(|view| !view.image_path.is_file()).collect()
 }
 
-/// Loads a view's photo and takes the lens distortion out of it.
+/// Loads the photo of a view and undistorts it.
 ///
-/// An image that is a scaled copy of what the camera took brings a scaled camera with it. A pinhole's
-/// pixels are handed on untouched. An EXIF orientation is ignored, with a warning: poses are computed
-/// from the pixels as they are stored.
+/// If the image is a scaled copy of the original, the camera is scaled with it. Photos of pinhole cameras stay unchanged.
+/// An EXIF orientation is ignored with a warning, because poses are computed from the pixels as stored.
 ///
 /// # Errors
-/// [`IngestError`] if the file cannot be read or decoded, or is of a size that is not the camera's.
+/// [`IngestError`] if the file cannot be read or decoded, or its size does not match the camera.
 pub fn load_image(view: &View) -> Result<LoadedImage, IngestError> {
     let photo = decode(&view.image_path, &view.intrinsics)?;
     let intrinsics = view.intrinsics.scaled_to(photo.width(), photo.height());
@@ -109,7 +108,7 @@ fn decode(path: &Path, camera: &Intrinsics) -> Result<RgbImage, IngestError> {
     }
     let mut decoder = reader.into_decoder().map_err(failed)?;
     let (width_px, height_px) = decoder.dimensions();
-    // Before any pixel is allocated.
+    // Checks the size before it allocates any pixel.
     if !is_scale_of(camera, width_px, height_px) {
         return Err(IngestError::Size {
             path: path.to_owned(),
@@ -127,8 +126,8 @@ fn decode(path: &Path, camera: &Intrinsics) -> Result<RgbImage, IngestError> {
     Ok(DynamicImage::from_decoder(decoder).map_err(failed)?.into_rgb8())
 }
 
-/// Whether a size is exactly proportional to the camera's, or its sides are the camera's divided by
-/// one whole number, each rounded up or down (as downscaled copies are made).
+/// Returns whether a size is exactly proportional to that of the camera, or is a reduction of it by an integer factor with
+/// each side rounded up or down, as in downscaled copies.
 fn is_scale_of(camera: &Intrinsics, width_px: u32, height_px: u32) -> bool {
     let proportional = u64::from(width_px) * u64::from(camera.height_px)
         == u64::from(height_px) * u64::from(camera.width_px);

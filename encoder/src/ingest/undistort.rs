@@ -1,25 +1,25 @@
-//! Lens distortion taken out: each pixel of an ideal pinhole looks up where the lens imaged it.
+//! Undistortion: each pixel of the ideal pinhole image looks up its position in the photo.
 
 use image::RgbImage;
 use slag_common::Intrinsics;
 
-/// Maps images of a distorted camera to the ideal pinhole of the same focal lengths, centre and size.
+/// The mapping from a camera with distortion to the ideal pinhole of the same focal lengths, centre and size.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Undistorter {
-    /// The camera as it is, with distortion, at the image's size.
+    /// The camera with distortion, at the size of the image.
     camera: Intrinsics,
-    /// Beyond this normalised radius the lens polynomial folds back.
+    /// Normalised radius beyond which the lens polynomial is no longer monotonic.
     max_radius: f64,
 }
 
 impl Undistorter {
-    /// Makes the map of a camera whose size is that of the images.
+    /// Creates the mapping of a camera with the size of the images.
     pub fn new(camera: Intrinsics) -> Self {
         Self { camera, max_radius: camera.distortion.monotonic_radius() }
     }
 
-    /// Returns where in the distorted image, pixels, the centre of an ideal pixel is seen; `None`
-    /// outside of the image or of the lens model's range.
+    /// Returns the position of the centre of an ideal pixel in the distorted image, pixels; `None` outside the image or
+    /// the range of the lens model.
     fn source_px(&self, column: u32, row: u32) -> Option<[f64; 2]> {
         let ideal = self.camera.distorted_from_pixel([f64::from(column) + 0.5, f64::from(row) + 0.5]);
         if ideal[0].hypot(ideal[1]) > self.max_radius {
@@ -31,11 +31,11 @@ impl Undistorter {
         inside.then_some([u, v])
     }
 
-    /// Returns the ideal image, sampled bilinearly, and which of its pixels show something (row-major);
-    /// the others are black.
+    /// Returns the ideal image, sampled bilinearly, and whether each of its pixels (row-major) is inside the photo. Pixels
+    /// outside are black.
     ///
     /// # Panics
-    /// If the image is not of the camera's size.
+    /// If the image does not have the size of the camera.
     pub fn image(&self, photo: &RgbImage) -> (RgbImage, Vec<bool>) {
         let (width_px, height_px) = (self.camera.width_px, self.camera.height_px);
         assert_eq!(photo.dimensions(), (width_px, height_px), "the undistorter is of another size");
@@ -51,11 +51,10 @@ impl Undistorter {
         (ideal, valid)
     }
 
-    /// Returns labels (row-major) of the ideal image, each the nearest one of the distorted image,
-    /// and `outside` where that shows nothing.
+    /// Maps labels (row-major) to the ideal image by nearest neighbour. Pixels outside the photo get the label `outside`.
     ///
     /// # Panics
-    /// If there are not as many labels as the camera has pixels.
+    /// If the number of labels is not the number of pixels of the camera.
     pub fn labels(&self, labels: &[u32], outside: u32) -> Vec<u32> {
         let (width_px, height_px) = (self.camera.width_px, self.camera.height_px);
         assert_eq!(
@@ -66,7 +65,7 @@ impl Undistorter {
         let mut ideal = Vec::with_capacity(labels.len());
         for row in 0..height_px {
             ideal.extend((0..width_px).map(|column| match self.source_px(column, row) {
-                // Truncation is the pixel that holds the position: pixel i spans i..i + 1.
+                // Truncation gives the pixel that contains the position: pixel i spans i..i + 1.
                 Some([u, v]) => labels[v as usize * width_px as usize + u as usize],
                 None => outside,
             }));
@@ -75,8 +74,8 @@ impl Undistorter {
     }
 }
 
-/// Returns the colour at a position, pixels, between the four pixel centres around it; the outermost
-/// half pixel takes its edge's colour.
+/// Returns the colour at a position, pixels, interpolated between the four pixel centres around it. Within half a pixel of
+/// the border, the colour is that of the edge.
 fn bilinear(image: &RgbImage, [u, v]: [f64; 2]) -> [u8; 3] {
     let axis = |position: f64, size_px: u32| {
         let from_centre = (position - 0.5).clamp(0.0, f64::from(size_px - 1));

@@ -1,7 +1,8 @@
-//! The built-in segmenter: graph-based image segmentation at several scales (Felzenszwalb and
-//! Huttenlocher, "Efficient Graph-Based Image Segmentation", IJCV 59(2), 2004), over what a small model takes for
-//! boundaries between things, over differences of colour (CIE L*a*b*, where distances are about as large as they
-//! look) and jumps of depth.
+//! The built-in segmenter: graph-based segmentation at several scales (Felzenszwalb and Huttenlocher, "Efficient
+//! Graph-Based Image Segmentation", IJCV 59(2), 2004).
+//!
+//! The weights of edges combine the object boundaries predicted by a small model, differences of colour in CIE L*a*b*
+//! (where distances are about proportional to perceived differences), and jumps of depth.
 
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -20,36 +21,36 @@ use super::segmenter::{SegmentInput, Segmenter};
 use crate::masks::regions::nearest;
 use crate::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
 
-/// Steps of an edge weight per unit of L*a*b* distance; 16 bits then reach beyond black to white.
+/// Steps of an edge weight per unit of L*a*b* distance; 16 bits then exceed the distance from black to white.
 const WEIGHT_STEPS: f32 = 200.0;
-/// One over the least share of a component's pixels that its own kind must surround: a strip 3 px
-/// wide has a third, a ring around an object hardly any.
+/// Inverse of the least share of a component's pixels that are surrounded by the component: it is a third for a strip 3 px
+/// wide, and almost zero for a ring around an object.
 const MIN_SURROUNDED: u32 = 8;
-/// Smallest mask, pixels of the image that is worked on: a block of JPEG's, the size of its artefacts.
+/// Smallest mask, pixels of the working image: a JPEG block, the size of its artefacts.
 const MIN_AREA_PX: u32 = 64;
-/// Neighbours that a pixel has an edge to; the other four have one to it.
+/// The neighbours to which a pixel has an edge; the other four have an edge to the pixel.
 const NEIGHBOURS: [(i64, i64); 4] = [(1, 0), (-1, 1), (0, 1), (1, 1)];
 
 /// The parameters of [`GraphSegmenter`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct GraphSettings {
-    /// Longest side of the image that is worked on, pixels; masks are scaled up from it.
+    /// Longest side of the working image, pixels; masks are scaled up from it.
     pub max_side_px: u32,
-    /// Standard deviation of the smoothing, pixels of that image.
+    /// Standard deviation of the smoothing, pixels of the working image.
     pub smoothing_px: f32,
     /// Scale of observation k of each level, coarsest first, in units of colour distance times pixels.
     pub scales: Vec<f32>,
     /// Smallest component kept, as a share of the image.
     pub min_area_share: f32,
-    /// Weight of the difference of colour itself.
+    /// Weight of a colour difference.
     pub colour_weight: f32,
-    /// Weight of a sure boundary between things, in units of colour distance; 0 asks no model.
+    /// Weight of a certain object boundary, in units of colour distance; 0 disables the model.
     pub boundary_weight: f32,
     /// Weight of a jump to twice the depth, in units of colour distance.
     pub depth_weight: f32,
-    /// Overlap (intersection over union) with a mask of a coarser level above which a mask repeats it.
+    /// A mask is dropped if its intersection over union with a mask of a coarser level exceeds this.
     pub max_overlap_iou: f32,
-    /// Most masks of an image; the largest are kept.
+    /// Largest number of masks per image; the largest masks are kept.
     pub max_masks: usize,
 }
 
@@ -70,7 +71,7 @@ impl Default for GraphSettings {
 }
 
 impl GraphSettings {
-    /// The settings with a model that says where things end, coarsest scales first.
+    /// Returns the settings for use with the boundary model, with the `n_scales` coarsest scales.
     pub fn learnt(n_scales: usize) -> Self {
         Self {
             scales: [1500.0, 800.0, 400.0, 200.0].into_iter().take(n_scales).collect(),
@@ -82,7 +83,7 @@ impl GraphSettings {
     }
 }
 
-/// Finds masks, without a model or with the embedded one.
+/// Finds masks, with or without the embedded boundary model.
 #[derive(Debug)]
 pub struct GraphSegmenter {
     settings: GraphSettings,
@@ -90,7 +91,7 @@ pub struct GraphSegmenter {
     model: Option<ModelPool>,
 }
 
-/// The model, opened as often as images are segmented at a time.
+/// Instances of the model, one per image segmented at a time.
 #[derive(Debug)]
 struct ModelPool {
     options: SessionOptions,
@@ -109,7 +110,7 @@ impl ModelPool {
 }
 
 impl GraphSegmenter {
-    /// Makes the segmenter; only the first 256 scales count.
+    /// Creates a segmenter without the model; only the first 256 scales count.
     pub fn new(mut settings: GraphSettings) -> Self {
         settings.scales.truncate(256);
         settings.max_side_px = settings.max_side_px.max(1);
@@ -117,10 +118,10 @@ impl GraphSegmenter {
         Self { settings, identity, model: None }
     }
 
-    /// Makes the segmenter that asks the embedded model; it runs on one thread an image.
+    /// Creates a segmenter with the embedded model, which runs on one thread per image.
     ///
     /// # Errors
-    /// [`SessionError`] where ONNX Runtime does not load.
+    /// [`SessionError`] if ONNX Runtime does not load.
     pub fn learnt(settings: GraphSettings, session: &SessionOptions) -> Result<Self, SessionError> {
         let options = SessionOptions { intra_op_threads: 1, ..session.clone() };
         let idle = Mutex::new(vec![Boundaries::open(&options)?]);
@@ -198,23 +199,23 @@ impl GraphSegmenter {
 // Pixels that no component has are in no region.
 const _: () = assert!(NOT_NUMBERED == NO_REGION);
 
-/// An edge of the grid: the pixel it belongs to times 4, plus the index of the neighbour.
+/// An edge of the grid: its pixel times 4, plus the index of the neighbour.
 type Edge = u32;
 
-/// The image as it is worked on.
+/// The working image.
 struct Raster {
     width_px: u32,
     height_px: u32,
     /// Smoothed colour, L* a* b*.
     lab: Vec<[f32; 3]>,
-    /// One over the depth, NaN where unknown; empty where there is no depth at all.
+    /// Inverse depth, NaN if unknown; empty without depth.
     inverse_depth: Vec<f32>,
-    /// Pixels that show something.
+    /// Pixels inside the lens image.
     valid: Vec<bool>,
 }
 
 impl Raster {
-    /// Returns the image that is worked on, and what it is made into.
+    /// Scales the photo to the working size and prepares its colours and depths. Returns the scaled photo too.
     fn new<'a>(input: &SegmentInput<'a>, settings: &GraphSettings) -> (Cow<'a, RgbImage>, Self) {
         let (full_width, full_height) = input.image.dimensions();
         let longest = full_width.max(full_height);
@@ -243,18 +244,17 @@ impl Raster {
         (image, Self { width_px, height_px, lab, inverse_depth, valid })
     }
 
-    /// Returns the pixel at the other end of an edge; `None` beyond the border.
+    /// Returns the pixel at the other end of an edge; `None` outside the image.
     fn neighbour(&self, pixel: usize, (dx, dy): (i64, i64)) -> Option<usize> {
         let (width, height) = (i64::from(self.width_px), i64::from(self.height_px));
         let (x, y) = (pixel as i64 % width + dx, pixel as i64 / width + dy);
         ((0..width).contains(&x) && (0..height).contains(&y)).then_some((y * width + x) as usize)
     }
 
-    /// Returns the depth jump between neighbours relative to their depth, 0 if unknown.
+    /// Returns the relative depth jump between neighbours; 0 if unknown.
     ///
-    /// The inverse depth of a plane is linear in the image. So the jump is what remains after the
-    /// slope on either side of the edge has been carried on over it, whichever explains more: a
-    /// slanted floor and the fold between floor and wall have none.
+    /// The inverse depth of a plane is linear in the image. So the slope on each side is extrapolated across the edge, and
+    /// the jump is the smaller of the two residuals. A slanted floor and the fold between floor and wall have no jump.
     fn depth_jump(&self, a: usize, b: usize, step: (i64, i64)) -> f32 {
         let Some((at_a, at_b)) = self.inverse_depth.get(a).zip(self.inverse_depth.get(b)) else { return 0.0 };
         let carried_on = |near: f32, far: f32, beyond: Option<usize>| {
@@ -268,7 +268,7 @@ impl Raster {
         if relative.is_finite() { relative } else { 0.0 }
     }
 
-    /// Returns the edges between valid pixels, ascending by weight and then by position, with weights.
+    /// Returns the edges between valid pixels with their weights, in ascending order of weight and then of position.
     ///
     /// `boundaries`: `[neighbour][pixel]`, 0 to 1.
     fn edges_by_weight(&self, settings: &GraphSettings, boundaries: Option<&[f32]>) -> Vec<(Edge, u16)> {
@@ -288,7 +288,7 @@ impl Raster {
                 edges.push((pixel as u32 * 4 + direction as u32, weight));
             }
         }
-        // Stable, so that ties keep the order of positions.
+        // A stable counting sort keeps the order of positions among equal weights.
         let mut ends = vec![0_u32; usize::from(u16::MAX) + 2];
         edges.iter().for_each(|(_, weight)| ends[usize::from(*weight) + 1] += 1);
         for weight in 1..ends.len() {
@@ -311,7 +311,7 @@ impl Raster {
         let ends = |edge: Edge| {
             let pixel = edge as usize / 4;
             let (dx, dy) = NEIGHBOURS[edge as usize % 4];
-            // Within the raster: the edge was made so.
+            // Inside the image, because edges exist only there.
             (pixel as u32, (pixel as i64 + dy * i64::from(self.width_px) + dx) as u32)
         };
         let mut open = Vec::new();
@@ -340,10 +340,10 @@ impl Raster {
         Labels { of_pixel: of_item, area_px: sizes }
     }
 
-    /// Returns, at the roots, whether enough of a component is surrounded by itself.
+    /// Returns for each root whether a sufficient share of its component is surrounded by the component.
     ///
-    /// A smoothed outline is a ramp of colours. A component only as wide as that is a strip of it,
-    /// and belongs to no object.
+    /// A smoothed outline is a ramp of colours. A component as narrow as this ramp is a strip of it and belongs to no
+    /// object.
     fn thick(&self, components: &mut Components) -> Vec<bool> {
         let roots: Vec<usize> =
             (0..self.lab.len() as u32).map(|pixel| components.root(pixel) as usize).collect();
@@ -363,14 +363,14 @@ impl Raster {
     }
 }
 
-/// One level's partition.
+/// The partition of one level.
 struct Labels {
     of_pixel: Vec<u32>,
     area_px: Vec<u32>,
 }
 
 impl Labels {
-    /// Returns which components overlap one of a coarser level by more than `max_iou`.
+    /// Returns for each component whether its overlap with a component of a coarser level exceeds `max_iou`.
     fn repeats_of(&self, coarser: &[Self], max_iou: f32) -> Vec<bool> {
         let mut repeats = vec![false; self.area_px.len()];
         for other in coarser {
@@ -387,7 +387,7 @@ impl Labels {
     }
 }
 
-/// Reads, for each raster pixel, the value at the nearest pixel of an image `width_px` wide.
+/// Samples, for each pixel of the working image, the nearest pixel of an image with this width.
 fn sample<T>(width_px: u32, columns: &[u32], rows: &[u32], value_at: impl Fn(usize) -> T) -> Vec<T> {
     let mut values = Vec::with_capacity(columns.len() * rows.len());
     for y in rows {
@@ -421,7 +421,7 @@ fn lab_of(image: &RgbImage) -> Vec<[f32; 3]> {
     image.pixels().map(lab).collect()
 }
 
-/// Smooths with a Gaussian cut off at four standard deviations; the border is repeated outwards.
+/// Smooths with a Gaussian truncated at four standard deviations; border pixels are repeated outwards.
 fn smooth(lab: &mut [[f32; 3]], width: usize, sigma_px: f32) {
     let radius = (4.0 * sigma_px).ceil().clamp(0.0, 64.0) as usize;
     if radius == 0 || width == 0 {
@@ -451,7 +451,7 @@ fn smooth(lab: &mut [[f32; 3]], width: usize, sigma_px: f32) {
     (0..width).for_each(|x| along(x, width, height));
 }
 
-/// Scales a mask up; `None` if it has no pixel in the target.
+/// Scales a mask up; `None` if the result is empty.
 fn scaled_up(mask: &Mask, columns: &[u32], rows: &[u32]) -> Option<Mask> {
     let range = |axis: &[u32], low: u32, high: u32| {
         (axis.partition_point(|p| *p < low) as u32, axis.partition_point(|p| *p < high) as u32)
