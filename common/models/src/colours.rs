@@ -9,7 +9,9 @@
 //! asked only where names depend on it (white, grey, black; orange, brown; red, pink), relative to the
 //! crop's own highlights.
 
-use crate::{Crop, EncodeError, ImageEncoder, TextEncoder, normalise};
+use crate::crop::Crop;
+use crate::encoder::{ImageEncoder, TextEncoder, normalise};
+use crate::error::EncodeError;
 
 /// The name of the space.
 pub const NAME: &str = "colour-shape-v1";

@@ -62,6 +62,8 @@ use std::path::{Component, Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use crate::encoder_id::EncoderId;
+pub use crate::file_ref::{FileRef, Sha256};
 use crate::preprocess::{Filter, Preprocess, Resize};
 
 /// The name of the description within a model directory.
@@ -114,59 +116,22 @@ pub enum DescriptionError {
     },
 }
 
-/// A file of the model.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct FileRef {
-    /// Its path below `files_root`.
-    pub path: PathBuf,
-    /// Its SHA-256.
-    pub sha256: Option<Sha256>,
-}
-
-/// A SHA-256, as 64 hexadecimal digits in text.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
-pub struct Sha256(pub [u8; 32]);
-
-impl fmt::Display for Sha256 {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&hex::encode(self.0))
-    }
-}
-
-impl From<Sha256> for String {
-    fn from(sha256: Sha256) -> Self {
-        sha256.to_string()
-    }
-}
-
-impl TryFrom<String> for Sha256 {
-    type Error = String;
-
-    fn try_from(text: String) -> Result<Self, String> {
-        let mut bytes = [0; 32];
-        hex::decode_to_slice(&text, &mut bytes)
-            .map(|()| Self(bytes))
-            .map_err(|error| format!("{text:?} is no SHA-256 of 64 hexadecimal digits: {error}"))
-    }
-}
-
 /// A model directory's description.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Description {
     /// The name of the space.
     pub name: String,
     /// What the model knows and what not.
-    #[serde(default)]
+    #[serde(default, skip_serializing)]
     pub about: String,
     /// Components of a vector.
     pub dim: u32,
     /// The licence of the weights.
+    #[serde(skip_serializing)]
     pub licence: String,
     /// Folder of the files, relative to the description's folder.
-    #[serde(default = "here")]
+    #[serde(default = "here", skip_serializing)]
     pub files_root: PathBuf,
     /// The image side.
     pub image: ImageDescription,
@@ -175,7 +140,7 @@ pub struct Description {
     /// What is subtracted from text vectors.
     pub text_centre: Option<CentreDescription>,
     /// How scores are read.
-    #[serde(default)]
+    #[serde(default, skip_serializing)]
     pub score: Option<ScoreDescription>,
 }
 
@@ -184,7 +149,7 @@ pub(crate) fn here() -> PathBuf {
 }
 
 /// The image side of a model.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ImageDescription {
     /// The ONNX file.
@@ -207,6 +172,7 @@ pub struct ImageDescription {
     /// Whether the output is to be scaled to unit length.
     pub normalise: bool,
     /// Crops in a run; measured if absent.
+    #[serde(skip_serializing)]
     pub batch: Option<u16>,
 }
 
@@ -218,7 +184,7 @@ impl ImageDescription {
 }
 
 /// The text side of a model.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 pub enum TextDescription {
     /// A model for any text.
@@ -228,7 +194,7 @@ pub enum TextDescription {
 }
 
 /// A text encoder in ONNX.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OnnxText {
     /// The ONNX file.
@@ -252,7 +218,7 @@ pub struct OnnxText {
 }
 
 /// How texts are made as long as the model wants them.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Padding {
     /// Tokens of every text, with the begin and end tokens.
@@ -262,7 +228,7 @@ pub struct Padding {
 }
 
 /// A text encoder made of fixed phrases.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PhrasesText {
     /// The phrases, UTF-8, one a line.
@@ -274,7 +240,7 @@ pub struct PhrasesText {
 }
 
 /// What is subtracted from text vectors.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CentreDescription {
     /// The safetensors file.
@@ -363,6 +329,27 @@ impl Description {
         }
         files.extend(self.text_centre.iter().map(|centre| ("text.centre", &centre.file)));
         files
+    }
+
+    /// Returns [`Self::files`] to be changed.
+    pub(crate) fn files_mut(&mut self) -> Vec<(&'static str, &mut FileRef)> {
+        let mut files = vec![("image.model", &mut self.image.file)];
+        match &mut self.text {
+            TextDescription::Onnx(text) => {
+                files.extend([("text.model", &mut text.file), ("text.tokenizer", &mut text.tokenizer)]);
+            }
+            TextDescription::Phrases(text) => {
+                files.extend([("text.phrases", &mut text.file), ("text.vectors", &mut text.vectors)]);
+            }
+        }
+        files.extend(self.text_centre.iter_mut().map(|centre| ("text.centre", &mut centre.file)));
+        files
+    }
+
+    /// Returns the identity of the space. Every file must have its hash.
+    pub(crate) fn encoder_id(&self) -> EncoderId {
+        let definition = serde_json::to_string(self).expect("every file has its hash");
+        EncoderId { name: self.name.clone(), dim: self.dim, definition }
     }
 
     fn check(&self, path: &Path) -> Result<(), DescriptionError> {

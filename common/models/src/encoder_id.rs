@@ -1,11 +1,11 @@
-//! The name of an embedding space: vectors may be compared where their encoder ids are equal.
+//! The identity of an embedding space: vectors may be compared where their encoder ids are equal.
 
-use std::{collections::BTreeMap, fmt};
+use std::fmt;
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-/// Names an embedding space by its model files, image and text side together.
+/// Identifies an embedding space by all that decides vectors, image and text side together.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EncoderId {
@@ -13,17 +13,18 @@ pub struct EncoderId {
     pub name: String,
     /// Components of a vector.
     pub dim: u32,
-    /// SHA-256 of each file in hexadecimal, by role (`image.model`, `text.model` ...); empty for what is built in.
-    pub sha256_of_file: BTreeMap<String, String>,
+    /// The description of the model as JSON, with the SHA-256 of each file in place of its path and without the fields
+    /// that leave vectors as they are; empty for the built-in stand-in.
+    pub definition: String,
 }
 
 impl EncoderId {
-    /// Returns the SHA-256 of the id's canonical form: `slag-encoder-id 1`, a line feed, then the
-    /// JSON array of name, dim and files without spaces, roles in the order of their bytes.
+    /// Returns the SHA-256 of the id's canonical form: `slag-encoder-id 2`, a line feed, then the JSON array of name,
+    /// dim and definition (a string) without spaces.
     pub fn hash(&self) -> [u8; 32] {
         let mut hasher = Sha256::new();
-        hasher.update(b"slag-encoder-id 1\n");
-        hasher.update(serde_json::json!([self.name, self.dim, self.sha256_of_file]).to_string());
+        hasher.update(b"slag-encoder-id 2\n");
+        hasher.update(serde_json::json!([self.name, self.dim, self.definition]).to_string());
         hasher.finalize().into()
     }
 }

@@ -1,7 +1,8 @@
-use crate::{
-    description::DescriptionError, phrases::PhrasesError, session::SessionError, tensors::TensorsError,
-    text::TokenizerError,
-};
+//! Errors of opening and running encoders.
+
+use std::path::PathBuf;
+
+use crate::{description::DescriptionError, session_error::SessionError, tensors::TensorsError};
 
 /// Says why an encoder could not be opened.
 #[derive(Debug, thiserror::Error)]
@@ -21,6 +22,88 @@ pub enum ModelError {
     /// A file of tensors is at fault.
     #[error(transparent)]
     Tensors(#[from] TensorsError),
+}
+
+/// Says why text could not be made into tokens.
+#[derive(Debug, thiserror::Error)]
+pub enum TokenizerError {
+    /// The file could not be read.
+    #[error("{cause}; put the tokenizer there or correct the description")]
+    Read {
+        /// The operating system's answer, which names the path.
+        cause: std::io::Error,
+    },
+    /// The file is not a tokenizer.
+    #[error("{}: {reason}; fetch tokenizer.json again", path.display())]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// The tokenizer is of another model.
+    #[error(
+        "{}: a text ends in token {found:?}, the model's end token is {expected}; use the model's own tokenizer",
+        path.display()
+    )]
+    OtherVocabulary {
+        /// The file.
+        path: PathBuf,
+        /// The end token of the description.
+        expected: u32,
+        /// The last token of a text, if any.
+        found: Option<u32>,
+    },
+    /// The tokenizer has more tokens than the model knows.
+    #[error(
+        "{}: has token ids up to {largest}, the model does not take them ({cause}); use the model's own tokenizer",
+        path.display()
+    )]
+    MoreTokens {
+        /// The file.
+        path: PathBuf,
+        /// Its largest id.
+        largest: u32,
+        /// What the model says to a text of it.
+        cause: Box<SessionError>,
+    },
+    /// The tokenizer fails on a text.
+    #[error("{}: {reason}; use other words", path.display())]
+    Encode {
+        /// The file.
+        path: PathBuf,
+        /// What it says.
+        reason: String,
+    },
+}
+
+/// Says why a list of phrases is refused.
+#[derive(Debug, thiserror::Error)]
+pub enum PhrasesError {
+    /// The file could not be read.
+    #[error("{cause}; put the file there or correct the description")]
+    Read {
+        /// The operating system's answer, which names the path.
+        cause: std::io::Error,
+    },
+    /// A line has no phrase.
+    #[error("{}: line {line} is empty; the list needs one phrase a line", path.display())]
+    EmptyLine {
+        /// The file.
+        path: PathBuf,
+        /// The line, from 1.
+        line: usize,
+    },
+    /// A phrase's vector has no direction.
+    #[error("{}: line {line}: the vector of {phrase:?} is zero after centring; remove the phrase", path.display())]
+    NoDirection {
+        /// The file.
+        path: PathBuf,
+        /// The line, from 1.
+        line: usize,
+        /// The phrase.
+        phrase: String,
+    },
 }
 
 /// Says why something could not be encoded.

@@ -8,9 +8,9 @@ use ort::value::TensorElementType;
 use crate::{
     Crop, EncodeError, ImageEncoder, ModelError, ModelFile,
     description::ImageDescription,
-    normalise,
+    encoder::normalise,
+    placement::Placement,
     preprocess::Preprocess,
-    provider::Placement,
     session::{Model, SessionError, SessionOptions},
 };
 

@@ -16,79 +16,33 @@ pub mod colours;
 pub mod commands;
 mod crop;
 pub mod description;
+mod encoder;
 pub mod encoder_id;
 mod error;
+mod file_ref;
 pub mod hub;
 pub mod image;
 mod model_dir;
 mod model_file;
 pub mod phrases;
+mod placement;
 pub mod preprocess;
 mod provider;
+mod runtime;
+mod runtime_log;
 pub mod sam;
 pub mod session;
+mod session_error;
 pub mod tensors;
 pub mod text;
 
 pub use crop::Crop;
+pub use encoder::{ImageEncoder, TextEncoder};
 pub use encoder_id::EncoderId;
-pub use error::{EncodeError, ModelError};
+pub use error::{EncodeError, ModelError, PhrasesError, TokenizerError};
 pub use model_dir::ModelDir;
 pub use model_file::ModelFile;
-pub use provider::{NoProvider, Placement, Provider};
-pub use session::{SessionOptions, find_runtime};
-
-/// Turns crops of photographs into unit vectors.
-pub trait ImageEncoder: Send {
-    /// Returns the number of components of a vector.
-    fn dim(&self) -> usize;
-
-    /// Returns how many crops are best encoded together.
-    fn preferred_batch(&self) -> usize;
-
-    /// Encodes `crops`: `[n]` in, `[n][dim]` out, unit vectors, row-major.
-    ///
-    /// Memory is bounded by the preferred batch, however many crops are given.
-    /// # Errors
-    /// [`EncodeError`] where a crop is empty or the model fails.
-    fn encode(&mut self, crops: &[Crop]) -> Result<Vec<f32>, EncodeError>;
-
-    /// Returns what ONNX Runtime really runs it on; `None` where it does without.
-    fn placement(&self) -> Option<&Placement> {
-        None
-    }
-}
-
-/// Turns words into unit vectors of the image encoder's space.
-pub trait TextEncoder: Send {
-    /// Returns the name of the model.
-    fn name(&self) -> &str;
-
-    /// Returns the number of components of a vector.
-    fn dim(&self) -> usize;
-
-    /// Encodes `text`: `[dim]`, a unit vector, centred as the description says.
-    /// # Errors
-    /// [`EncodeError`] where the text is empty or unknown, or the model fails.
-    fn encode(&mut self, text: &str) -> Result<Vec<f32>, EncodeError>;
-
-    /// Returns all that it knows, where that is a list; `None` where it takes any text.
-    fn vocabulary(&self) -> Option<&[String]> {
-        None
-    }
-
-    /// Returns what ONNX Runtime really runs it on; `None` where it does without.
-    fn placement(&self) -> Option<&Placement> {
-        None
-    }
-}
-
-/// Scales `vector` to unit length, computed in f64; returns false, leaving it, where it is zero or not finite.
-pub(crate) fn normalise(vector: &mut [f32]) -> bool {
-    let norm = vector.iter().map(|&x| f64::from(x) * f64::from(x)).sum::<f64>().sqrt();
-    let usable = norm.is_finite() && norm > 0.0;
-    if usable {
-        vector.iter_mut().for_each(|x| *x = (f64::from(*x) / norm) as f32);
-    }
-    usable
-}
+pub use placement::Placement;
+pub use provider::{NoProvider, Provider};
+pub use runtime::find_runtime;
+pub use session::SessionOptions;

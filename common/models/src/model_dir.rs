@@ -84,31 +84,24 @@ impl ModelDir {
     }
 
     fn with(description: Description, files: Files) -> Result<Self, ModelError> {
-        let mut id = EncoderId {
-            name: description.name.clone(),
-            dim: description.dim,
-            sha256_of_file: Default::default(),
-        };
-        for (role, file) in description.files() {
+        let mut hashed = description.clone();
+        for (_, file) in hashed.files_mut() {
             let root = match &files {
                 Files::Folder(root) => root,
                 // Every hash is recorded.
                 Files::Embedded => Path::new(""),
             };
-            let sha256 = sha256_of(root, file)?;
-            id.sha256_of_file.insert(role.to_owned(), hex::encode(sha256));
+            file.sha256 = Some(crate::description::Sha256(sha256_of(root, file)?));
         }
+        let id = hashed.encoder_id();
         let source = Source::Files { files, description: Box::new(description), batch: Arc::default() };
         Ok(Self { id, source })
     }
 
     /// Returns the stand-in that knows colours and shapes, and needs no files and no ONNX Runtime.
     pub fn colours() -> Self {
-        let id = EncoderId {
-            name: colours::NAME.to_owned(),
-            dim: colours::DIM as u32,
-            sha256_of_file: Default::default(),
-        };
+        let id =
+            EncoderId { name: colours::NAME.to_owned(), dim: colours::DIM as u32, definition: String::new() };
         Self { id, source: Source::Colours }
     }
 
@@ -232,5 +225,45 @@ pub(crate) fn hash_file(path: &Path) -> io::Result<[u8; 32]> {
             0 => return Ok(hasher.finalize().into()),
             n => hasher.update(&buffer[..n]),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn id_of(description: &str) -> [u8; 32] {
+        let description =
+            Description::parse(Path::new("model.toml"), description).expect("a valid description");
+        ModelDir::with(description, Files::Embedded).expect("every hash is recorded").encoder_id().hash()
+    }
+
+    /// Whatever decides vectors decides the id; prose, places and batches do not.
+    #[test]
+    fn the_encoder_id_covers_the_description() {
+        let text = embedded::DESCRIPTION;
+        let id = id_of(text);
+        for (from, to) in [
+            ("resize = \"pad\"", "resize = \"stretch\""),
+            ("filter = \"bicubic\"", "filter = \"bilinear\""),
+            ("mean = [0.5,", "mean = [0.25,"),
+            ("std = [0.5,", "std = [0.25,"),
+            ("normalise = true", "normalise = false"),
+            ("size_px = 64", "size_px = 65"),
+            ("prompt = \"{}\"", "prompt = \"a {}\""),
+            ("max_tokens = 16", "max_tokens = 15"),
+        ] {
+            assert!(text.contains(from), "{from}");
+            assert_ne!(id_of(&text.replace(from, to)), id, "{to}");
+        }
+        let centre = |tensor: &str| {
+            let sha256 = "0".repeat(64);
+            format!(
+                "{text}\n[text_centre]\nfile = {{ path = \"c\", sha256 = \"{sha256}\" }}\ntensor = \"{tensor}\"\n"
+            )
+        };
+        assert_ne!(id_of(&centre("mean")), id_of(&centre("other")));
+        assert_eq!(id_of(&text.replace("about = \"", "about = \"also: ")), id);
+        assert_eq!(id_of(&text.replace("[text]", "batch = 3\n\n[text]")), id);
     }
 }

@@ -1,40 +1,10 @@
 //! A text encoder made of fixed phrases and their vectors: needs no model and no ONNX Runtime.
 
-use std::{
-    collections::HashMap,
-    path::{Path, PathBuf},
-};
+use std::{collections::HashMap, path::Path};
 
-use crate::{EncodeError, ModelError, TextEncoder, tensors, text::centred};
-
-/// Says why a list of phrases is refused.
-#[derive(Debug, thiserror::Error)]
-pub enum PhrasesError {
-    /// The file could not be read.
-    #[error("{cause}; put the file there or correct the description")]
-    Read {
-        /// The operating system's answer, which names the path.
-        cause: std::io::Error,
-    },
-    /// A line has no phrase.
-    #[error("{}: line {line} is empty; the list needs one phrase a line", path.display())]
-    EmptyLine {
-        /// The file.
-        path: PathBuf,
-        /// The line, from 1.
-        line: usize,
-    },
-    /// A phrase's vector has no direction.
-    #[error("{}: line {line}: the vector of {phrase:?} is zero after centring; remove the phrase", path.display())]
-    NoDirection {
-        /// The file.
-        path: PathBuf,
-        /// The line, from 1.
-        line: usize,
-        /// The phrase.
-        phrase: String,
-    },
-}
+use crate::encoder::TextEncoder;
+use crate::error::{EncodeError, ModelError, PhrasesError};
+use crate::{tensors, text::centred};
 
 /// How many known phrases an unknown one is answered with.
 const N_NEAR: usize = 5;
@@ -105,7 +75,7 @@ impl PhraseEncoder {
                     .any(|w| phrase.split_whitespace().any(|p| p == w || is_start(w, p) || is_start(p, w)));
                 let allowed = letters.len() / 4 + 1;
                 let distance = (letters.len().abs_diff(other.len()) <= allowed)
-                    .then(|| edit_distance(&letters, &other))
+                    .then(|| strsim::generic_levenshtein(&letters, &other))
                     .filter(|&d| d <= allowed);
                 distance
                     .or_else(|| shares_a_word.then(|| allowed + 1 + phrase.matches(' ').count()))
@@ -154,19 +124,4 @@ fn key(text: &str) -> String {
         words.remove(0);
     }
     words.join(" ")
-}
-
-/// Returns the Levenshtein distance: insertions, deletions and replacements.
-fn edit_distance(a: &[char], b: &[char]) -> usize {
-    let mut row: Vec<usize> = (0..=b.len()).collect();
-    for (i, x) in a.iter().enumerate() {
-        let mut diagonal = i;
-        row[0] = i + 1;
-        for (j, y) in b.iter().enumerate() {
-            let replaced = diagonal + usize::from(x != y);
-            diagonal = row[j + 1];
-            row[j + 1] = replaced.min(diagonal + 1).min(row[j] + 1);
-        }
-    }
-    row[b.len()]
 }

@@ -5,10 +5,10 @@
 //! their published figures measured behind it; integers also make it the same on every machine.
 
 use image::RgbImage;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
 /// How a crop of any shape becomes the model's square.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Resize {
     /// The shorter edge becomes `size_px`, the aspect ratio stays, the middle is kept (`CLIPImageProcessor`).
@@ -20,7 +20,7 @@ pub enum Resize {
 }
 
 /// The resampling filter.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Filter {
     /// Cubic convolution with a = -0.5 (Keys 1981), widened when shrinking; Pillow's `BICUBIC`.

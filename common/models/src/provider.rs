@@ -1,19 +1,11 @@
-//! Execution providers: what ONNX Runtime runs a model on, as asked for, and as it turns out.
+//! Execution providers: what ONNX Runtime is asked to run a model on.
 
-use std::{
-    collections::BTreeMap,
-    fmt,
-    str::FromStr,
-    sync::{Arc, Mutex, PoisonError},
-};
+use std::{fmt, str::FromStr};
 
 use ort::{
     ep::{self, ExecutionProvider, ExecutionProviderDispatch},
-    logging::LogLevel,
     session::builder::SessionBuilder,
 };
-
-use crate::session::forward_log;
 
 /// What a model is run on.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -47,7 +39,7 @@ impl Provider {
     }
 
     /// Returns its name within the runtime.
-    fn runtime_name(self) -> &'static str {
+    pub(crate) fn runtime_name(self) -> &'static str {
         match self {
             Self::Cpu => ep::CPU::NAME,
             Self::Cuda => ep::CUDA::NAME,
@@ -84,6 +76,11 @@ impl fmt::Display for Provider {
     }
 }
 
+/// Returns the names of providers, for people.
+pub(crate) fn names(providers: &[Provider]) -> String {
+    providers.iter().map(|provider| provider.name()).collect::<Vec<_>>().join(", ")
+}
+
 /// Says that a name is no provider's.
 #[derive(Debug, thiserror::Error)]
 #[error("{found:?} is no execution provider; use one of cpu, cuda, tensorrt, coreml, directml")]
@@ -101,99 +98,9 @@ impl FromStr for Provider {
     }
 }
 
-/// What a model's nodes really run on.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Placement {
-    provider: Provider,
-    /// By the runtime's own names; empty where only the processor was asked for.
-    nodes: BTreeMap<String, usize>,
-}
-
-impl Placement {
-    /// Returns the first of what was asked for that runs any node, else the processor.
-    pub fn provider(&self) -> Provider {
-        self.provider
-    }
-
-    /// Returns this with [`Self::provider`] chosen among `asked`.
-    pub(crate) fn of_asked(mut self, asked: &[Provider]) -> Self {
-        let is_used = |provider: &Provider| self.nodes.contains_key(provider.runtime_name());
-        self.provider = asked.iter().copied().find(is_used).unwrap_or_default();
-        self
-    }
-
-    /// Takes in a message of the runtime, if it tells of nodes.
-    fn hear(&mut self, message: &str) {
-        let placed = || {
-            let (_, placed) = message.split_once("placed on [")?;
-            let (name, rest) = placed.split_once("]. Number of nodes: ")?;
-            Some((name.to_owned(), rest.trim().parse().ok()?))
-        };
-        self.nodes.extend(placed());
-    }
-}
-
-impl fmt::Display for Placement {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if self.nodes.is_empty() {
-            return f.write_str(Provider::Cpu.name());
-        }
-        for (i, (name, n)) in self.nodes.iter().enumerate() {
-            let known = Provider::ALL.into_iter().find(|provider| provider.runtime_name() == name);
-            let separator = if i == 0 { "" } else { ", " };
-            write!(f, "{separator}{} ({n} nodes)", known.map_or(name.as_str(), |provider| provider.name()))?;
-        }
-        Ok(())
-    }
-}
-
-/// Listens to what the runtime tells of one session: it has no other way to say what runs where.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct Listener(Arc<Mutex<Placement>>);
-
-impl Listener {
-    pub(crate) fn attach(&self, builder: SessionBuilder) -> ort::Result<SessionBuilder> {
-        let placement = Arc::clone(&self.0);
-        let hear = move |level: LogLevel, category: &str, id: &str, location: &str, message: &str| {
-            placement.lock().unwrap_or_else(PoisonError::into_inner).hear(message);
-            if !matches!(level, LogLevel::Info | LogLevel::Verbose) {
-                forward_log(level, category, id, location, message);
-            }
-        };
-        let builder = builder.with_logger(Arc::new(hear))?;
-        builder.with_log_level(LogLevel::Verbose).map_err(ort::Error::<()>::from)
-    }
-
-    pub(crate) fn placement(&self) -> Placement {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// Messages as ONNX Runtime 1.17 to 1.31 write them (`session_state.cc`).
-    #[test]
-    fn what_runs_is_what_took_nodes() {
-        let cpu = Placement::default().of_asked(&[Provider::Cuda]);
-        assert_eq!((cpu.to_string(), cpu.provider()), ("cpu".into(), Provider::Cpu));
-        let mut placement = Placement::default();
-        for message in [
-            "Node placements",
-            " Node(s) placed on [CPUExecutionProvider]. Number of nodes: 14",
-            " Node(s) placed on [CUDAExecutionProvider]. Number of nodes: 212",
-            " Node(s) placed on [NewExecutionProvider]. Number of nodes: many",
-        ] {
-            placement.hear(message);
-        }
-        assert_eq!(placement.to_string(), "cpu (14 nodes), cuda (212 nodes)");
-        let asked = [Provider::TensorRt, Provider::Cuda, Provider::Cpu];
-        assert_eq!(placement.of_asked(&asked).provider(), Provider::Cuda);
-        let mut silent = Placement::default();
-        silent.hear(" All nodes placed on [CPUExecutionProvider]. Number of nodes: 7");
-        assert_eq!(silent.of_asked(&asked[..2]).provider(), Provider::Cpu);
-    }
 
     #[test]
     fn names_are_read_back() {

@@ -1,20 +1,16 @@
-//! ONNX Runtime: finding and loading the library, opening model files, running them.
-//!
-//! The library is loaded at run time, once a process, so that a program without models needs none.
+//! Model files: opened with ONNX Runtime, compared with their description, and run.
 
 use std::{
     collections::BTreeSet,
-    env::consts::{DLL_PREFIX, DLL_SUFFIX},
     fmt::Debug,
     path::{Path, PathBuf},
-    sync::{Arc, Mutex, PoisonError},
+    sync::{Mutex, PoisonError},
 };
 
 use half::f16;
 use ort::{
     ErrorCode,
     environment::Environment,
-    logging::LogLevel,
     session::{Session, SessionInputValue},
     value::{
         DynValue, Outlet, PrimitiveTensorElementType, Tensor as OwnedTensor, TensorElementType, TensorRef,
@@ -22,153 +18,13 @@ use ort::{
     },
 };
 
-use crate::ModelFile;
-use crate::provider::{Listener, Placement, Provider};
+use crate::model_file::ModelFile;
+use crate::placement::{Listener, Placement};
+use crate::provider::{Provider, names};
+use crate::runtime::environment;
 
-/// Says why a model could not be opened or run.
-#[derive(Debug, thiserror::Error)]
-pub enum SessionError {
-    /// The library asked for is not there.
-    #[error("{}: no such ONNX Runtime library; give the path of libonnxruntime.so (1.17 or newer)", path.display())]
-    NoRuntime {
-        /// Where it was expected.
-        path: PathBuf,
-    },
-    /// The library does not load.
-    #[error(
-        "ONNX Runtime: {cause}; install version 1.17 or newer, put libonnxruntime.so beside the program, or give its path"
-    )]
-    Runtime {
-        /// What the loader says; it names the path.
-        cause: Box<ort::LoadDynamicError>,
-    },
-    /// Another library was loaded before.
-    #[error("ONNX Runtime is loaded from {}, {} was asked for; use one per process", loaded.display(), asked.display())]
-    OtherRuntime {
-        /// The library in use.
-        loaded: PathBuf,
-        /// The library asked for.
-        asked: PathBuf,
-    },
-    /// The library refuses to start.
-    #[error("ONNX Runtime does not start: {cause}; check its version (1.17 or newer)")]
-    Start {
-        /// What it says.
-        cause: ort::Error,
-    },
-    /// The accelerator asked for cannot be used.
-    #[error(
-        "ONNX Runtime cannot use {provider}: {cause}; give a libonnxruntime that is built with it, with its drivers \
-         (onnxruntime-gpu for cuda and tensorrt), or let the processor stand in: {provider},cpu"
-    )]
-    Provider {
-        /// The accelerator.
-        provider: Provider,
-        /// What the runtime says.
-        cause: ort::Error,
-    },
-    /// The accelerators asked for take no part of the model.
-    #[error(
-        "{}: runs on {placement} alone, {} was asked for; use another export of the model, or let the processor \
-         stand in by adding cpu", path.display(), names(asked)
-    )]
-    NotPlaced {
-        /// The model file.
-        path: PathBuf,
-        /// What was asked for.
-        asked: Vec<Provider>,
-        /// What runs it.
-        placement: Placement,
-    },
-    /// The model file cannot be read.
-    #[error("{cause}; put the model file there or correct the description")]
-    Read {
-        /// The operating system's answer, which names the path.
-        cause: std::io::Error,
-    },
-    /// The model file cannot be loaded: cut, not ONNX, or of an unknown version.
-    #[error("{}: {cause}; fetch the model file again", path.display())]
-    Load {
-        /// The model file.
-        path: PathBuf,
-        /// What the runtime says.
-        cause: ort::Error,
-    },
-    /// The model file is of a version that the library does not know.
-    #[error(
-        "{}: {cause}; give a newer libonnxruntime, or export the model for an older opset (17 is known to all)",
-        path.display()
-    )]
-    Version {
-        /// The model file.
-        path: PathBuf,
-        /// What the runtime says.
-        cause: ort::Error,
-    },
-    /// The model has no such input or output.
-    #[error("{}: no {role} {name:?}, it has {}; correct the description", path.display(), found.join(", "))]
-    NoTensor {
-        /// The model file.
-        path: PathBuf,
-        /// "input" or "output".
-        role: &'static str,
-        /// The name asked for.
-        name: String,
-        /// The names that it has.
-        found: Vec<String>,
-    },
-    /// Which input or output is meant is not clear.
-    #[error(
-        "{}: the {role} is not named, and of {} not one alone is {expected}; name it in the description",
-        path.display(), found.join(", ")
-    )]
-    Unnamed {
-        /// The model file.
-        path: PathBuf,
-        /// "input" or "output".
-        role: &'static str,
-        /// All that it has, with types and shapes.
-        found: Vec<String>,
-        /// Type and shape looked for; -1 is any size.
-        expected: String,
-    },
-    /// An input or output is of another type or shape.
-    #[error("{}: {role} {name:?} is {found}, expected {expected}; correct the description", path.display())]
-    Shape {
-        /// The model file.
-        path: PathBuf,
-        /// "input" or "output".
-        role: &'static str,
-        /// Its name.
-        name: String,
-        /// Its type and shape.
-        found: String,
-        /// What is expected; -1 is any size.
-        expected: String,
-    },
-    /// The model is of another layout.
-    #[error("{}: {found}; expected {expected}; give the files of one export in their places", path.display())]
-    Layout {
-        /// The model file.
-        path: PathBuf,
-        /// What it has.
-        found: String,
-        /// What is expected.
-        expected: String,
-    },
-    /// Running the model failed.
-    #[error("{}: running the model: {cause}; the file does not fit its description", path.display())]
-    Run {
-        /// The model file.
-        path: PathBuf,
-        /// What the runtime says.
-        cause: ort::Error,
-    },
-}
-
-fn names(providers: &[Provider]) -> String {
-    providers.iter().map(|provider| provider.name()).collect::<Vec<_>>().join(", ")
-}
+pub use crate::runtime::find_runtime;
+pub use crate::session_error::SessionError;
 
 /// How models are run.
 #[derive(Clone, Debug)]
@@ -191,62 +47,6 @@ impl SessionOptions {
     /// Returns whether models are to run on the processor alone.
     pub fn is_on_cpu(&self) -> bool {
         self.providers.first().is_none_or(|first| *first == Provider::Cpu)
-    }
-}
-
-/// Returns the library's path: `explicit`, else the first of the folders `beside` that has it, else its bare
-/// name, for the system's loader to find.
-/// # Errors
-/// [`SessionError::NoRuntime`] if `explicit` is not a file.
-pub fn find_runtime(explicit: Option<&Path>, beside: &[PathBuf]) -> Result<PathBuf, SessionError> {
-    if let Some(path) = explicit {
-        return if path.is_file() {
-            Ok(path.to_owned())
-        } else {
-            Err(SessionError::NoRuntime { path: path.to_owned() })
-        };
-    }
-    let name = format!("{DLL_PREFIX}onnxruntime{DLL_SUFFIX}");
-    let found = beside.iter().map(|folder| folder.join(&name)).find(|path| path.is_file());
-    Ok(found.unwrap_or_else(|| name.into()))
-}
-
-/// The library in use and its environment, of which a process may have one only.
-static RUNTIME: Mutex<Option<(PathBuf, Environment)>> = Mutex::new(None);
-
-fn environment(runtime: &Path) -> Result<Environment, SessionError> {
-    // A relative path with a folder would be looked up beside the program first.
-    let path = if runtime.components().count() > 1 {
-        runtime.canonicalize().map_err(|_| SessionError::NoRuntime { path: runtime.to_owned() })?
-    } else {
-        runtime.to_owned()
-    };
-    let mut loaded = RUNTIME.lock().unwrap_or_else(PoisonError::into_inner);
-    match &*loaded {
-        Some((loaded, environment)) if *loaded == path => return Ok(environment.clone()),
-        Some((loaded, _)) => {
-            return Err(SessionError::OtherRuntime { loaded: loaded.clone(), asked: path });
-        }
-        None => {}
-    }
-    let environment = ort::init_from(&path)
-        .map_err(|cause| SessionError::Runtime { cause: Box::new(cause) })?
-        .with_name("slag")
-        .with_telemetry(false)
-        .with_logger(Arc::new(forward_log))
-        .build()
-        .map_err(|cause| SessionError::Start { cause })?;
-    environment.set_log_level(LogLevel::Warning);
-    *loaded = Some((path, environment.clone()));
-    Ok(environment)
-}
-
-/// Hands the runtime's messages on, which it would print otherwise.
-pub(crate) fn forward_log(level: LogLevel, category: &str, _id: &str, _location: &str, message: &str) {
-    match level {
-        LogLevel::Error | LogLevel::Fatal => tracing::error!(category, "ONNX Runtime: {message}"),
-        LogLevel::Warning => tracing::warn!(category, "ONNX Runtime: {message}"),
-        LogLevel::Info | LogLevel::Verbose => tracing::debug!(category, "ONNX Runtime: {message}"),
     }
 }
 

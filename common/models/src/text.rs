@@ -9,63 +9,11 @@ use crate::{
     EncodeError, ModelError, ModelFile, TextEncoder,
     clean::clean,
     description::OnnxText,
-    normalise,
-    provider::Placement,
+    encoder::normalise,
+    error::TokenizerError,
+    placement::Placement,
     session::{Model, SessionError, SessionOptions},
 };
-
-/// Says why text could not be made into tokens.
-#[derive(Debug, thiserror::Error)]
-pub enum TokenizerError {
-    /// The file could not be read.
-    #[error("{cause}; put the tokenizer there or correct the description")]
-    Read {
-        /// The operating system's answer, which names the path.
-        cause: std::io::Error,
-    },
-    /// The file is not a tokenizer.
-    #[error("{}: {reason}; fetch tokenizer.json again", path.display())]
-    Format {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
-    /// The tokenizer is of another model.
-    #[error(
-        "{}: a text ends in token {found:?}, the model's end token is {expected}; use the model's own tokenizer",
-        path.display()
-    )]
-    OtherVocabulary {
-        /// The file.
-        path: PathBuf,
-        /// The end token of the description.
-        expected: u32,
-        /// The last token of a text, if any.
-        found: Option<u32>,
-    },
-    /// The tokenizer has more tokens than the model knows.
-    #[error(
-        "{}: has token ids up to {largest}, the model does not take them ({cause}); use the model's own tokenizer",
-        path.display()
-    )]
-    MoreTokens {
-        /// The file.
-        path: PathBuf,
-        /// Its largest id.
-        largest: u32,
-        /// What the model says to a text of it.
-        cause: Box<SessionError>,
-    },
-    /// The tokenizer fails on a text.
-    #[error("{}: {reason}; use other words", path.display())]
-    Encode {
-        /// The file.
-        path: PathBuf,
-        /// What it says.
-        reason: String,
-    },
-}
 
 /// Makes text into the token ids of one model.
 #[derive(Debug)]

@@ -6,8 +6,11 @@ use std::time::Duration;
 
 use ureq::http::{HeaderName, Method, Request, Response, StatusCode, Uri, header};
 
-use super::{HubOptions, MAX_FILE_BYTES};
+use super::options::HubOptions;
 use crate::description::Sha256;
+
+/// No file of a model is larger: ONNX files of 2 GiB and more are split.
+pub const MAX_FILE_BYTES: u64 = 2 << 30;
 
 /// Addresses that one request may be sent on to; the hub sends large files to its store.
 const MAX_REDIRECTS: usize = 5;

@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::HubError;
+use super::error::HubError;
+use super::source::Source;
 use crate::description::Sha256;
 
 /// What was accepted, by model.
@@ -43,20 +44,6 @@ impl LockedFile {
     pub(super) fn refusal(self, path: PathBuf, found: Sha256, advice: &'static str) -> HubError {
         HubError::Hash { path, found, expected: self.sha256, by: self.on_the_word_of, advice }
     }
-}
-
-/// Whose word a hash is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Source {
-    /// The table that the program carries.
-    Table,
-    /// The hub, which advertised it.
-    Hub,
-    /// Nobody's: it is the hash of what came first.
-    FirstPull,
-    /// Nobody's: it is the hash of what lay there.
-    PlacedByHand,
 }
 
 /// The lock's place below the folder of models.

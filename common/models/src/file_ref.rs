@@ -1,0 +1,54 @@
+//! References to the files of a model, by path and SHA-256.
+
+use std::fmt;
+use std::path::PathBuf;
+
+use serde::ser::{Error as _, Serializer};
+use serde::{Deserialize, Serialize};
+
+/// A file of the model.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FileRef {
+    /// Its path below `files_root`.
+    pub path: PathBuf,
+    /// Its SHA-256.
+    pub sha256: Option<Sha256>,
+}
+
+/// Writes the hash alone: where a file lies decides no vector.
+impl Serialize for FileRef {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let sha256 =
+            self.sha256.ok_or_else(|| S::Error::custom(format!("{}: no hash", self.path.display())))?;
+        sha256.serialize(serializer)
+    }
+}
+
+/// A SHA-256, as 64 hexadecimal digits in text.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct Sha256(pub [u8; 32]);
+
+impl fmt::Display for Sha256 {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&hex::encode(self.0))
+    }
+}
+
+impl From<Sha256> for String {
+    fn from(sha256: Sha256) -> Self {
+        sha256.to_string()
+    }
+}
+
+impl TryFrom<String> for Sha256 {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        let mut bytes = [0; 32];
+        hex::decode_to_slice(&text, &mut bytes)
+            .map(|()| Self(bytes))
+            .map_err(|error| format!("{text:?} is no SHA-256 of 64 hexadecimal digits: {error}"))
+    }
+}

@@ -1,0 +1,173 @@
+//! One pull: the files of a model, downloaded, checked and locked.
+
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use slag_common::durable;
+
+use super::download::{Advertised, Client, Failure, discard};
+use super::error::{HubError, Wanted};
+use super::lock::{Lock, LockedFile};
+use super::options::HubOptions;
+use super::source::Source;
+use super::table::{Entry, Table};
+use crate::description::Sha256;
+use crate::model_dir::hash_file;
+
+/// Which files of a model are pulled.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Side {
+    /// Those that turn texts into vectors.
+    Text,
+    /// All.
+    Both,
+}
+
+/// A file, pulled or found.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct PulledFile {
+    /// Its path below the model's folder.
+    pub path: String,
+    /// Its SHA-256.
+    pub sha256: Sha256,
+    /// Whose word that is.
+    pub on_the_word_of: Source,
+    /// Whether it was here before.
+    pub was_here: bool,
+}
+
+/// A pull under way.
+pub(super) struct Pull<'a> {
+    pub(super) table: &'a Table,
+    pub(super) options: &'a HubOptions,
+    /// The model's folder.
+    pub(super) folder: PathBuf,
+    pub(super) entry: &'a Entry,
+    pub(super) side: Side,
+    pub(super) client: Client,
+    pub(super) lock: Lock,
+}
+
+impl Pull<'_> {
+    fn url(&self, path: &str) -> String {
+        let hub = self.options.hub.as_deref().unwrap_or(&self.table.hub).trim_end_matches('/');
+        let locked = self.lock.get(&self.entry.name).and_then(|accepted| accepted.revision.as_deref());
+        let revision = self.entry.revision.as_deref().or(locked).unwrap_or("main");
+        format!("{hub}/{}/resolve/{revision}/{path}", self.entry.repository)
+    }
+
+    /// Returns the hash that a file must have, where somebody has said one.
+    pub(super) fn expected(&self, path: &str) -> Option<LockedFile> {
+        let known = self.entry.known.get(path);
+        let known = known.map(|known| LockedFile { sha256: known.sha256, on_the_word_of: Source::Table });
+        known.or_else(|| self.lock.get(&self.entry.name)?.files.get(path).cloned())
+    }
+
+    /// Writes down what a file was accepted as.
+    fn accept(&mut self, path: &str, file: LockedFile) -> Result<(), HubError> {
+        self.lock.entry(&self.entry.name).files.insert(path.to_owned(), file);
+        self.lock.write(&self.options.root)
+    }
+
+    fn unreachable(&self, url: &str, failure: Failure) -> HubError {
+        if let Failure::Io(error) = failure {
+            return HubError::Io(error);
+        }
+        let folder = &self.folder;
+        let paths = self.entry.paths(self.side == Side::Text).into_iter();
+        let wanted = paths.filter(|path| !folder.join(path).is_file()).map(|path| Wanted {
+            url: self.url(path),
+            path: folder.join(path),
+            sha256: self.expected(path).map(|expected| expected.sha256),
+        });
+        HubError::Unreachable { url: url.to_owned(), failure: Box::new(failure), wanted: wanted.collect() }
+    }
+
+    /// Asks what the hub says of a file, which must be of the commit that is pulled.
+    fn ask(&mut self, url: &str) -> Result<Advertised, HubError> {
+        let advertised = self.client.ask(url).map_err(|failure| self.unreachable(url, failure))?;
+        if let Some(found) = advertised.revision.clone() {
+            let accepted = self.lock.entry(&self.entry.name);
+            match self.entry.revision.clone().or(accepted.revision.clone()) {
+                Some(expected) if expected != found => {
+                    return Err(HubError::Revision { url: url.to_owned(), found, expected });
+                }
+                _ => accepted.revision = Some(found),
+            }
+        }
+        Ok(advertised)
+    }
+
+    /// Has the image model's hash known even where the file is not needed: it names the space.
+    pub(super) fn name_image(&mut self) -> Result<(), HubError> {
+        let path = self.entry.paths(false)[0];
+        if self.expected(path).is_some() {
+            return Ok(());
+        }
+        let url = self.url(path);
+        let sha256 = self.ask(&url)?.sha256.ok_or(HubError::NoImageHash { url })?;
+        self.accept(path, LockedFile { sha256, on_the_word_of: Source::Hub })
+    }
+
+    /// Brings one file here and into the lock.
+    pub(super) fn file(&mut self, path: &str) -> Result<PulledFile, HubError> {
+        let target = self.folder.join(path);
+        let was_here = target.is_file();
+        if !was_here {
+            let accepted = self.download(path, &target)?;
+            self.accept(path, accepted)?;
+        }
+        let found = Sha256(hash_file(&target)?);
+        let expected = match self.expected(path) {
+            Some(expected) => expected,
+            // Placed by hand, and nobody has said yet what it should be.
+            None => match self.client.ask(&self.url(path)).ok().and_then(|advertised| advertised.sha256) {
+                Some(sha256) => LockedFile { sha256, on_the_word_of: Source::Hub },
+                None => LockedFile { sha256: found, on_the_word_of: Source::PlacedByHand },
+            },
+        };
+        if found != expected.sha256 {
+            return Err(expected.refusal(target, found, "remove the file and pull again"));
+        }
+        self.accept(path, expected.clone())?;
+        let LockedFile { sha256, on_the_word_of } = expected;
+        Ok(PulledFile { path: path.to_owned(), sha256, on_the_word_of, was_here })
+    }
+
+    /// Downloads a file to `target`; returns what it was found to be, and on whose word.
+    fn download(&mut self, path: &str, target: &Path) -> Result<LockedFile, HubError> {
+        let url = self.url(path);
+        let expected = self.expected(path);
+        let advertised = self.ask(&url)?;
+        if let (Some(expected), Some(advertised)) = (&expected, advertised.sha256)
+            && expected.sha256 != advertised
+        {
+            let (expected, by) = (expected.sha256, expected.on_the_word_of);
+            return Err(HubError::Advertised { url, advertised, expected, by });
+        }
+        let hub = advertised.sha256.map(|sha256| LockedFile { sha256, on_the_word_of: Source::Hub });
+        let stated = expected.or(hub);
+        let part = target.with_added_extension("part");
+        fs_err::create_dir_all(target.parent().unwrap_or(&self.options.root))?;
+        let len_bytes = self.entry.known.get(path).map(|known| known.len_bytes).or(advertised.len_bytes);
+        tracing::info!("pulling {url}");
+        loop {
+            let received = self.client.receive(&url, &part, len_bytes);
+            let was_begun = received.map_err(|failure| self.unreachable(&url, failure))?;
+            let found = Sha256(hash_file(&part)?);
+            let first = LockedFile { sha256: found, on_the_word_of: Source::FirstPull };
+            let expected = stated.clone().unwrap_or(first);
+            if expected.sha256 == found {
+                durable::move_into_place(&part, target)?;
+                discard(&part)?;
+                return Ok(expected);
+            }
+            discard(&part)?;
+            // Perhaps the part that was here already was another file's.
+            if !was_begun {
+                let advice = "what came was thrown away: pull again, or give another --hub";
+                return Err(expected.refusal(target.to_owned(), found, advice));
+            }
+        }
+    }
+}
