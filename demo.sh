@@ -5,5 +5,5 @@
 set -eu
 cd "$(dirname "$0")"
 sh scripts/setup.sh demo
-cargo build --locked --profile demo --no-default-features -p slag-lab -p slag-encoder -p slag-edge --bins
-exec "${CARGO_TARGET_DIR:-target}/demo/slag-lab" demo "$@"
+cargo build --locked --profile quick --no-default-features -p slag-lab -p slag-encoder -p slag-edge --bins
+exec "${CARGO_TARGET_DIR:-target}/quick/slag-lab" demo "$@"

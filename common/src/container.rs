@@ -138,7 +138,7 @@ impl Layout {
     /// Checks a whole container (bounds, table, every checksum) and returns the places of its sections.
     ///
     /// # Errors
-    /// [`ContainerError`], with the byte, for anything that [`write`] does not write.
+    /// [`ContainerError`], with the byte, for anything that [`write()`] does not write.
     pub fn check(bytes: &[u8], magic: [u8; 8], version: u32) -> Result<Self, ContainerError> {
         let layout = Self::check_table(bytes, magic, version)?;
         for (row, (id, range)) in layout.sections.iter().enumerate() {
@@ -316,7 +316,7 @@ impl std::ops::Deref for AlignedBytes {
     }
 }
 
-/// Returns the bytes of a column, as input to [`write`].
+/// Returns the bytes of a column, as input to [`write()`].
 pub fn bytes_of<T: NoUninit>(column: &[T]) -> &[u8] {
     bytemuck::cast_slice(column)
 }

@@ -60,7 +60,7 @@ impl Cli {
     pub fn log_filter(&self) -> &'static str {
         match (self.quiet, self.verbose, &self.command) {
             (true, ..) => "error",
-            (_, 0, Command::Serve(_)) | (_, 1, _) => "warn,slag_edge=info",
+            (_, 0, Command::Serve(_)) | (_, 1, _) => "warn,slag_edge=info,slag_service=info",
             (_, 0, Command::Models(_)) => "warn,slag_models=info",
             (_, 0, _) => "warn",
             _ => "debug",

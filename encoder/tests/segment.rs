@@ -218,7 +218,7 @@ fn run_length_files_of_every_form() {
     for (json, expected) in [
         (r#"[{"segmentation": [[1, 2, 3, 4, 5, 6]]}]"#, "polygons"),
         (r#"[{"segmentation": {"size": [6, 8], "counts": [47]}}]"#, "mask 0: runs add up to 47"),
-        (r#"[{"segmentation": {"size": [8, 6], "counts": [48]}}]"#, "masks of 6 x 8 px"),
+        (r#"[{"segmentation": {"size": [8, 6], "counts": [48]}}]"#, "the masks have 6 x 8 px"),
         (r#"[{"segmentation": 3}]"#, "SAM's list"),
         ("", "SAM's list"),
     ] {

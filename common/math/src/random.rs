@@ -71,7 +71,7 @@ impl Xorshift {
     /// Starts the sequence of a seed.
     pub fn new(seed: u64) -> Self {
         // Mixed (SplitMix64, Steele et al. 2014), so that neighbouring seeds have nothing in common.
-        Self(mix64(seed) | 1)
+        Self(Random::new(seed).bits() | 1)
     }
 
     fn next_u64(&mut self) -> u64 {

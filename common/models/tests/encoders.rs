@@ -247,18 +247,19 @@ fn models_that_do_not_fit_say_so_when_opened() {
     }
 }
 
-/// The indented lines of README.md that follow a line with `start`.
-fn readme_block(start: &str) -> Vec<String> {
-    let readme = fs_err::read_to_string(common::workspace_root().join("README.md")).expect("it is readable");
-    let after = readme.lines().skip_while(|line| !line.contains(start));
+/// Returns the indented lines of docs/models.md that follow a line with `start`.
+fn documented(start: &str) -> Vec<String> {
+    let text =
+        fs_err::read_to_string(common::workspace_root().join("docs/models.md")).expect("it is readable");
+    let after = text.lines().skip_while(|line| !line.contains(start));
     let indented = after.skip_while(|line| !line.starts_with("    "));
     indented.map_while(|line| Some(line.strip_prefix("    ")?.to_owned())).collect()
 }
 
 #[test]
-fn the_descriptions_in_the_readme_are_valid() {
-    let clip = readme_block("A model of your own is a folder");
-    let siglip = readme_block("For SigLIP these differ");
+fn the_documented_descriptions_are_valid() {
+    let clip = documented("A folder with ONNX files");
+    let siglip = documented("SigLIP and SigLIP 2 differ");
     // The second example is the first with some lines instead of others, section by section.
     let mut merged: Vec<(String, String)> = Vec::new();
     let mut section = String::new();

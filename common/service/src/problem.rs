@@ -16,7 +16,7 @@ pub struct Problem {
     title: &'static str,
     detail: String,
     members: Map<String, Value>,
-    headers: HeaderMap,
+    headers: Box<HeaderMap>,
     cause: Option<String>,
 }
 
@@ -28,7 +28,7 @@ impl Problem {
         title: &'static str,
         detail: impl Into<String>,
     ) -> Self {
-        let (members, headers) = (Map::new(), HeaderMap::new());
+        let (members, headers) = (Map::new(), Box::default());
         Self { status, kind, title, detail: detail.into(), members, headers, cause: None }
     }
 
@@ -108,7 +108,7 @@ impl Problem {
         for replaced in [header::CONTENT_LENGTH, header::TRANSFER_ENCODING] {
             head.headers.remove(replaced);
         }
-        head.headers.extend(self.headers);
+        head.headers.extend(*self.headers);
         let content_type = HeaderValue::from_static("application/problem+json");
         head.headers.insert(header::CONTENT_TYPE, content_type);
         head.headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));

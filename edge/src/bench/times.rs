@@ -9,7 +9,7 @@ pub struct Times {
     max_us: u64,
 }
 
-/// Percentiles of [`Times`], milliseconds.
+/// Percentiles of measured times, milliseconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Percentiles {
     /// Requests.

@@ -1,4 +1,4 @@
-//! Gaussians as columns: an Arrow IPC stream (https://arrow.apache.org/docs/format/Columnar.html).
+//! Gaussians as columns: an Arrow IPC stream (<https://arrow.apache.org/docs/format/Columnar.html>).
 //!
 //! | column | type | content |
 //! |---|---|---|

@@ -35,7 +35,7 @@ struct State {
 
 impl Shown {
     /// Returns a receiver that draws bars if stderr is a terminal, else writes lines.
-    pub fn new() -> Self {
+    fn new() -> Self {
         Self { terminal: std::io::stderr().is_terminal(), state: Mutex::default() }
     }
 

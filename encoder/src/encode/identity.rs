@@ -6,7 +6,7 @@ use slag_common::{Gaussians, Hash32, Intrinsics, View};
 
 use super::engines::Engines;
 use super::error::EncodeError;
-use super::plan::Inputs;
+use super::inputs::Inputs;
 use super::settings::{EncodeSettings, LONG_BORDERS, MAX_RASTER_WIDTH_PX, ViewSettings};
 use crate::cells::CellLimits;
 use crate::ingest;

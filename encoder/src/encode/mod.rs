@@ -17,6 +17,7 @@ pub mod coverage;
 mod engines;
 mod error;
 mod identity;
+mod inputs;
 mod job;
 mod memory;
 mod pipeline;
@@ -58,7 +59,7 @@ pub fn encode(
     let context = RunContext::new(settings.run.threads, progress, cancel)?;
     // First of all, so that a second encode into the same store fails at once.
     let store = Store::create_or_open(&settings.output.store)?;
-    let inputs = plan::Inputs::read(settings, &context)?;
+    let inputs = inputs::Inputs::read(settings, &context)?;
     let plan = plan::plan(settings, engines, &store, &inputs, &context)?;
     let views = views::run_views(&plan, &context)?;
     let built = context.install(|| cells::build_cells(&plan, &views, &context))?;

@@ -111,9 +111,9 @@ pub enum Masks {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum RasterWidth {
-    /// As [`Self::Photo`], and twice as wide in views whose regions have [`LONG_BORDERS`].
+    /// As [`Self::Photo`], and twice as wide in views whose regions have long borders (`LONG_BORDERS`).
     ByContent,
-    /// The photo's own width, at most [`MAX_RASTER_WIDTH_PX`].
+    /// The photo's own width, at most `MAX_RASTER_WIDTH_PX`.
     Photo,
     /// This many pixels.
     Px(u32),

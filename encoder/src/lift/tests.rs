@@ -305,7 +305,7 @@ fn foreign_files_are_refused() {
         entries_of_cell: vec![],
     };
     let path = scene.paths[0].with_file_name("many.contributions");
-    assert!(view.write(&path).expect_err("refused").to_string().contains("1048576 at most"));
+    assert!(view.write(&path).expect_err("refused").to_string().contains("the limit is 1048576"));
     view.masks_of_region.pop();
     view.entries_of_cell =
         vec![(0, vec![Contribution { local: 4095, region: MAX_REGIONS as u32 - 1, weight: 1.0 }])];

@@ -1,8 +1,8 @@
 //! The store's keys: the one that signs, and, while a change of keys is under way, the one that will.
 //!
 //! A change takes two steps, days apart, so that every robot that fetches in between follows:
-//! [`Store::begin_rotation`] makes the next key and publishes a generation, signed by the present key,
-//! that names it; [`Store::finish_rotation`] publishes a generation signed by the next key, which is the
+//! [`super::Store::begin_rotation`] makes the next key and publishes a generation, signed by the present key,
+//! that names it; [`super::Store::finish_rotation`] publishes a generation signed by the next key, which is the
 //! commit, and then moves the files. A crash after the commit is made good when the store is opened.
 //!
 //! | file | what |
@@ -19,13 +19,14 @@ use serde::Serialize;
 use slag_common::Hash32;
 use slag_common::manifest::{self, Manifest, TrustedKeys};
 
+use super::error::StoreError;
 use super::files::{self, Access};
-use super::{Store, StoreError, reader};
+use super::signed;
 
 const SECRET: &str = "keys/ed25519";
 const PUBLIC: &str = "keys/ed25519.pub";
-const NEXT_SECRET: &str = "keys/ed25519.next";
-const NEXT_PUBLIC: &str = "keys/ed25519.next.pub";
+pub(super) const NEXT_SECRET: &str = "keys/ed25519.next";
+pub(super) const NEXT_PUBLIC: &str = "keys/ed25519.next.pub";
 const PREVIOUS_PUBLIC: &str = "keys/ed25519.previous.pub";
 
 /// The public keys of a store.
@@ -47,7 +48,7 @@ impl PublicKeys {
     pub fn read(dir: &Path) -> Result<Self, StoreError> {
         // In this order a reader beside a writer that moves them misses none.
         let (next, previous) = (read_if_there(dir, NEXT_PUBLIC)?, read_if_there(dir, PREVIOUS_PUBLIC)?);
-        let present = reader::read_hex_key(&dir.join(PUBLIC))?;
+        let present = signed::read_hex_key(&dir.join(PUBLIC))?;
         Ok(Self { present, next: next.filter(|next| *next != present), previous })
     }
 
@@ -77,7 +78,7 @@ impl Keys {
             Some(next) => write_public(dir, NEXT_PUBLIC, public(next))?,
             None => remove_if_there(dir, NEXT_PUBLIC)?,
         }
-        let signed = reader::read_signed(&dir.join(reader::MANIFEST))?;
+        let signed = signed::read_signed(&dir.join(signed::MANIFEST))?;
         if let (Some(next), Some(signed)) = (&keys.next, signed)
             && Manifest::verify(&signed, &TrustedKeys::Only(vec![public(next)])).is_ok()
         {
@@ -87,7 +88,7 @@ impl Keys {
     }
 
     /// Puts the next key in the present one's place.
-    fn promote(&mut self, dir: &Path) -> Result<(), StoreError> {
+    pub(super) fn promote(&mut self, dir: &Path) -> Result<(), StoreError> {
         let Some(next) = self.next.take() else { return Ok(()) };
         write_public(dir, PREVIOUS_PUBLIC, public(&self.present))?;
         files::move_into_place(&dir.join(NEXT_SECRET), &dir.join(SECRET))?;
@@ -98,72 +99,12 @@ impl Keys {
     }
 }
 
-impl Store {
-    /// Makes the next key, unless there is one, and has the published scene name it.
-    ///
-    /// # Errors
-    /// [`StoreError`]; done again, it goes on where it ended.
-    pub fn begin_rotation(&mut self, now_unix_secs: u64) -> Result<PublicKeys, StoreError> {
-        if self.keys.next.is_none() {
-            self.keys.next = Some(make(&self.dir, NEXT_SECRET)?);
-        }
-        let next = self.keys.next.as_ref().map(public);
-        if let Some(next) = next {
-            write_public(&self.dir, NEXT_PUBLIC, next)?;
-        }
-        if self.published_next_key()?.is_some_and(|named| named != next) {
-            self.publish_again(&self.keys.present, next, now_unix_secs)?;
-        }
-        PublicKeys::read(&self.dir)
-    }
-
-    /// Has the next key sign the published scene, and makes it the store's key.
-    ///
-    /// # Errors
-    /// [`StoreError::Rotation`] unless [`Store::begin_rotation`] came before; [`StoreError`] otherwise.
-    pub fn finish_rotation(&mut self, now_unix_secs: u64) -> Result<PublicKeys, StoreError> {
-        let refuse = |what| Err(StoreError::Rotation { store: self.dir.clone(), what });
-        let Some(next) = &self.keys.next else { return refuse("no next key was made") };
-        match self.published_next_key()? {
-            Some(named) if named != Some(public(next)) => {
-                return refuse("the published manifest does not name the next key");
-            }
-            Some(_) => drop(self.publish_again(next, None, now_unix_secs)?),
-            None => {}
-        }
-        self.keys.promote(&self.dir)?;
-        PublicKeys::read(&self.dir)
-    }
-
-    /// Returns the next key that the published manifest names; `None` if nothing is published.
-    fn published_next_key(&self) -> Result<Option<Option<Hash32>>, StoreError> {
-        match self.reader() {
-            Ok(reader) => Ok(Some(reader.manifest().next_key)),
-            Err(StoreError::NotPublished { .. }) => Ok(None),
-            Err(e) => Err(e),
-        }
-    }
-
-    /// Publishes the current scene as the next generation, with other keys.
-    fn publish_again(
-        &self,
-        signer: &SigningKey,
-        next_key: Option<Hash32>,
-        created_unix_secs: u64,
-    ) -> Result<Hash32, StoreError> {
-        let current = self.reader()?.current().clone();
-        let generation = self.next_generation()?;
-        let manifest = Manifest { generation, created_unix_secs, next_key, ..current.manifest };
-        self.publish_as(signer, &manifest, &current.extras)
-    }
-}
-
 /// Returns a key's public half.
 pub(super) fn public(key: &SigningKey) -> Hash32 {
     Hash32(key.verifying_key().to_bytes())
 }
 
-fn make(dir: &Path, name: &str) -> Result<SigningKey, StoreError> {
+pub(super) fn make(dir: &Path, name: &str) -> Result<SigningKey, StoreError> {
     let key = manifest::generate_key();
     let text = format!("{}\n", hex::encode(key.to_bytes()));
     files::replace(&part(dir), &dir.join(name), text.as_bytes(), Access::Private)?;
@@ -175,13 +116,13 @@ fn read_secret(dir: &Path, name: &str) -> Result<Option<SigningKey>, StoreError>
 }
 
 fn read_if_there(dir: &Path, name: &str) -> Result<Option<Hash32>, StoreError> {
-    match reader::read_hex_key(&dir.join(name)) {
+    match signed::read_hex_key(&dir.join(name)) {
         Err(StoreError::Io(e)) if e.kind() == io::ErrorKind::NotFound => Ok(None),
         read => read.map(Some),
     }
 }
 
-fn write_public(dir: &Path, name: &str, key: Hash32) -> Result<(), StoreError> {
+pub(super) fn write_public(dir: &Path, name: &str, key: Hash32) -> Result<(), StoreError> {
     let (text, path) = (format!("{key}\n"), dir.join(name));
     if fs_err::read(&path).ok().as_deref() != Some(text.as_bytes()) {
         files::replace(&part(dir), &path, text.as_bytes(), Access::Shared)?;

@@ -1,20 +1,18 @@
 //! The lock-free side of a store: needs the manifest, the public key and the objects alone.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::io::{self, Read};
+use std::io;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 use slag_common::Hash32;
 use slag_common::container::AlignedBytes;
-use slag_common::manifest::{self, Manifest, ManifestError, TrustedKeys};
+use slag_common::manifest::{Manifest, TrustedKeys};
 
 use super::error::StoreError;
 use super::keys::PublicKeys;
 use super::models::ModelsRecord;
-
-pub(super) const MANIFEST: &str = "manifest";
-pub(super) const MANIFEST_PREVIOUS: &str = "manifest.previous";
+use super::signed;
 
 /// Objects by name that belong to a generation but are not sent to robots.
 pub type Extras = BTreeMap<String, Hash32>;
@@ -66,7 +64,7 @@ pub(crate) struct Stamp {
 impl Stamp {
     /// Returns the version of a store's manifest; `None` if there is none or its metadata cannot be read.
     pub(crate) fn of_manifest(dir: &Path) -> Option<Self> {
-        Self::of(&dir.join(MANIFEST)).ok()
+        Self::of(&dir.join(signed::MANIFEST)).ok()
     }
 
     fn of(path: &Path) -> io::Result<Self> {
@@ -94,15 +92,15 @@ impl StoreReader {
     /// # Errors
     /// [`StoreError::NotPublished`] before the first publication, [`StoreError`] otherwise.
     pub fn open(dir: &Path) -> Result<Self, StoreError> {
-        let path = dir.join(MANIFEST);
+        let path = dir.join(signed::MANIFEST);
         // Before the content: a manifest that is replaced in between is then noticed, not missed.
         let stamp = Stamp::of(&path).map_err(|e| match e.kind() {
             io::ErrorKind::NotFound => StoreError::NotPublished { path },
             _ => e.into(),
         })?;
         let own = PublicKeys::read(dir)?.trusted();
-        let current = Published::read(dir, MANIFEST, &own)?;
-        let previous = match Published::read(dir, MANIFEST_PREVIOUS, &own) {
+        let current = Published::read(dir, signed::MANIFEST, &own)?;
+        let previous = match Published::read(dir, signed::MANIFEST_PREVIOUS, &own) {
             Ok(previous) => Some(previous),
             Err(StoreError::NotPublished { .. }) => None,
             Err(e) => {
@@ -121,7 +119,7 @@ impl StoreReader {
 
     /// Returns whether the store still has the manifest that this reader read (one `stat`).
     pub fn is_current(&self) -> bool {
-        Stamp::of(&self.dir.join(MANIFEST)).is_ok_and(|stamp| stamp == self.stamp)
+        Stamp::of(&self.dir.join(signed::MANIFEST)).is_ok_and(|stamp| stamp == self.stamp)
     }
 
     /// Returns which models the current generation was encoded with, if the store recorded it.
@@ -183,37 +181,10 @@ pub(super) fn extras_path(dir: &Path, manifest_hash: Hash32) -> PathBuf {
 
 /// Reads a manifest and verifies that one of the store's own keys signed it; returns its signed bytes too.
 pub(super) fn read_manifest(path: &Path, own: &TrustedKeys) -> Result<(Manifest, Vec<u8>), StoreError> {
-    let Some(signed) = read_signed(path)? else {
+    let Some(signed) = signed::read_signed(path)? else {
         return Err(StoreError::NotPublished { path: path.to_owned() });
     };
     let refused = |cause| StoreError::Manifest { path: path.to_owned(), cause };
     let (manifest, _) = Manifest::verify(&signed, own).map_err(refused)?;
     Ok((manifest, signed))
-}
-
-/// Reads a signed manifest's bytes, unverified; `None` if there is no such file.
-pub(super) fn read_signed(path: &Path) -> Result<Option<Vec<u8>>, StoreError> {
-    let file = match fs_err::File::open(path) {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
-        file => file?,
-    };
-    let mut bytes = Vec::new();
-    file.take(manifest::MAX_BYTES + 1).read_to_end(&mut bytes)?;
-    if bytes.len() as u64 > manifest::MAX_BYTES {
-        let cause = ManifestError::TooLong { len_bytes: bytes.len() as u64 };
-        return Err(StoreError::Manifest { path: path.to_owned(), cause });
-    }
-    Ok(Some(bytes))
-}
-
-/// Reads 32 bytes of hex and a line end.
-pub(super) fn read_hex_key(path: &Path) -> Result<Hash32, StoreError> {
-    let mut text = String::new();
-    let file = fs_err::File::open(path)?;
-    let wrong = || StoreError::Key { path: path.to_owned() };
-    match file.take(256).read_to_string(&mut text) {
-        Err(e) if e.kind() == io::ErrorKind::InvalidData => return Err(wrong()),
-        read => read?,
-    };
-    text.trim_end().parse().map_err(|_| wrong())
 }

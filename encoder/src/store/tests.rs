@@ -1,8 +1,11 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::io;
+use std::path::Path;
 
 use glam::DVec3;
+use slag_common::Hash32;
 use slag_common::frames::Aabb;
-use slag_common::manifest::{EncoderRecord, ShardRecord, TrustedKeys, VERSION};
+use slag_common::manifest::{CellRecord, EncoderRecord, Manifest, ShardRecord, TrustedKeys, VERSION};
 use slag_common::shard::Profile;
 
 use super::*;

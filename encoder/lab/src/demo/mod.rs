@@ -1,5 +1,6 @@
 //! The whole system in one run: generate, encode, serve, fetch as a robot would, ask, compare with the truth.
 
+mod answer;
 mod picture;
 mod questions;
 
@@ -13,6 +14,8 @@ use anyhow::{Context, Result, anyhow};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use slag_models::{ModelDir, SessionOptions, TextEncoder};
+
+pub use answer::EdgeAnswer;
 
 use crate::generate::Scene;
 use crate::generate::grammar::{self, SceneKind};
@@ -96,21 +99,6 @@ pub struct Question {
 struct EdgeReply {
     answers: Vec<EdgeAnswer>,
     reason: Option<serde_json::Value>,
-}
-
-/// A cluster of matching Gaussians.
-#[derive(Clone, Debug, Deserialize, Serialize)]
-pub struct EdgeAnswer {
-    /// Its place.
-    pub position_in_world: DVec3,
-    /// Edge lengths of its box.
-    pub size: DVec3,
-    /// Its score.
-    pub score: f32,
-    /// Its Gaussians.
-    pub n_gaussians: u64,
-    /// Distance from the robot.
-    pub distance: Option<f64>,
 }
 
 #[derive(Deserialize)]

@@ -6,7 +6,7 @@ use slag_common::Gaussians;
 use slag_common::frames::Aabb;
 use slag_common::gaussians::SH_C0;
 
-use super::EdgeAnswer;
+use super::answer::EdgeAnswer;
 use crate::generate::to_image;
 use slag_encoder::raster::{CpuRasterizer, RasterError, RasterView, Rasterizer};
 

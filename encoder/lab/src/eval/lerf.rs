@@ -7,8 +7,8 @@
 //! with `bbox` the corners `x1 y1 x2 y2` and `segmentation` a polygon of pixels, as LangSplat's
 //! `eval/evaluate_iou_loc.py` reads them; the frames' poses are those of the scene. Gaussians are selected in three
 //! dimensions and drawn alone, as OpenGaussian (Wu et al. 2024) does: a pixel is found where they hide more than
-//! [`MIN_COVERAGE`] of what is behind. A thing counts as localised where the scores' rendering, averaged over a square
-//! of [`SMOOTHING_PX`], is best inside one of its boxes.
+//! `MIN_COVERAGE` of what is behind. A thing counts as localised where the scores' rendering, averaged over a square
+//! of `SMOOTHING_PX`, is best inside one of its boxes.
 
 use std::collections::BTreeMap;
 use std::fmt;

@@ -199,7 +199,7 @@ fn lerf_labels_are_judged_on_their_frames() {
     assert_eq!((report.accuracy_at_50, report.localised), (Some(0.5), Some(0.5)));
     assert_eq!(report.frames_without_view, ["frame_00009"]);
     assert_eq!(report.unknown_words.keys().collect::<Vec<_>>(), ["chair"]);
-    assert!(report.to_string().contains("left out, no pose: frame_00009"));
+    assert!(report.to_string().contains("left out without a pose: frame_00009"));
 
     // Nothing can be asked: an error rather than a mean of nothing.
     let only = EvalSettings { words: vec!["chair".into()], ..EvalSettings::default() };
@@ -276,7 +276,7 @@ fn scans_are_judged_by_the_protocol() {
     assert_eq!(report.unknown_words.len(), 16);
     let all = ScannetReport::new(vec![report]);
     assert_eq!(all.missing_scenes.len(), 9);
-    assert!(all.to_string().contains("not the protocol's mean: without scene0000_00"), "{all}");
+    assert!(all.to_string().contains("the means differ from the protocol's: scene0000_00"), "{all}");
     assert!(all.to_string().contains("5 of 389 labelled vertices have no answer"), "{all}");
 
     // Words the wrong way round: nothing is right.

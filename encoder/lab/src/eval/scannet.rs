@@ -2,7 +2,7 @@
 //! argmax over the classes' words, means over the classes that a scene has.
 //!
 //! OpenGaussian trains with Gaussians fixed to the mesh's vertices and compares one by one; other splats give each
-//! vertex the answer of the nearest Gaussian. Gaussians with an opacity below [`MIN_OPACITY`] do not count there, as in
+//! vertex the answer of the nearest Gaussian. Gaussians with an opacity below `MIN_OPACITY` do not count there, as in
 //! its `scripts/eval_scannet.py`.
 
 use std::collections::{BTreeMap, HashMap};

@@ -1,0 +1,70 @@
+//! Scene, views and geo-reference as they were read.
+
+use slag_common::frames::GeoReference;
+use slag_common::splat::{self, ReadOptions};
+use slag_common::{Gaussians, View, poses};
+
+use super::context::RunContext;
+use super::error::EncodeError;
+use super::report::SkippedView;
+use super::settings::EncodeSettings;
+use crate::cells::{self, CellSplit};
+use crate::ingest;
+
+/// The inputs of an encode.
+pub(super) struct Inputs {
+    pub(super) scene: Gaussians,
+    pub(super) split: CellSplit,
+    /// The views whose photo exists, in the order of their names.
+    pub(super) views: Vec<View>,
+    /// The views whose photo is missing, in the same order.
+    pub(super) missing: Vec<SkippedView>,
+    pub(super) geo_reference: Option<GeoReference>,
+}
+
+impl Inputs {
+    /// Reads scene, poses and geo-reference, and cuts the scene into cells.
+    ///
+    /// # Errors
+    /// [`EncodeError`] if one cannot be read, or nothing in it can be used.
+    pub(super) fn read(settings: &EncodeSettings, context: &RunContext<'_>) -> Result<Self, EncodeError> {
+        let inputs = &settings.inputs;
+        let geo_reference = inputs.geo.as_deref().map(ingest::read_geo_reference).transpose()?;
+        let options = ReadOptions { with_sh_rest: false };
+        let scene = context.time("read", || splat::read(&inputs.scene, &options))?;
+        let (views, missing) = find_views(settings)?;
+        let limits = settings.cells.limits;
+        let split = context.time("cells", || context.install(|| cells::split(&scene, limits)));
+        if split.cells.is_empty() {
+            return Err(EncodeError::NoGaussians { path: inputs.scene.clone(), n_gaussians: scene.len() });
+        }
+        Ok(Self { scene, split, views, missing, geo_reference })
+    }
+}
+
+/// Reads the poses and sets aside views without a photo.
+fn find_views(settings: &EncodeSettings) -> Result<(Vec<View>, Vec<SkippedView>), EncodeError> {
+    let views = poses::read(&settings.inputs.views, settings.inputs.images.as_deref())?.views;
+    let missing: Vec<String> = ingest::missing_images(&views).into_iter().map(|v| v.name.clone()).collect();
+    if let (true, Some(first)) = (settings.run.strict, ingest::missing_images(&views).first()) {
+        let first = first.image_path.clone();
+        return Err(EncodeError::MissingImages { n_missing: missing.len(), n_views: views.len(), first });
+    }
+    let n_views = views.len();
+    let (found, gone): (Vec<View>, Vec<View>) = views.into_iter().partition(|v| !missing.contains(&v.name));
+    let skipped: Vec<SkippedView> = gone
+        .into_iter()
+        .map(|v| SkippedView {
+            reason: format!(
+                "{}: no such photo; give the photos' folder with --images",
+                v.image_path.display()
+            ),
+            view: v.name,
+        })
+        .collect();
+    if found.is_empty() {
+        let reason = skipped.first().map_or("the poses file has none".into(), |s| s.reason.clone());
+        return Err(EncodeError::NoViews { n_views, reason });
+    }
+    Ok((found, skipped))
+}

@@ -1,0 +1,366 @@
+//! The only writer of a store.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+use ed25519_dalek::SigningKey;
+use slag_common::Hash32;
+use slag_common::manifest::{CellRecord, Manifest, TrustedKeys};
+
+use super::error::StoreError;
+use super::files::{self, Access, HashingWriter};
+use super::keys::{self, Keys};
+use super::models::ModelsRecord;
+use super::reader::{self, Extras, Published, StoreReader};
+use super::signed;
+
+/// sled keeps whole pages in memory; the records are small.
+const RECORD_CACHE_BYTES: u64 = 16 << 20;
+/// Time to wait for the lock: sled releases the lock of a writer that has just ended on a thread of its own.
+const LOCK_PATIENCE: Duration = Duration::from_secs(2);
+const LOCK_PAUSE: Duration = Duration::from_millis(20);
+/// Tree of the records that repeat the manifest.
+const PUBLISHED_TREE: &str = "published";
+const SCENE_KEY: &[u8] = b"scene";
+const GENERATION_KEY: &[u8] = b"generation";
+const MANIFEST_KEY: &[u8] = b"manifest";
+/// Followed by the cell id, big-endian, so that cells come in order.
+const CELL_PREFIX: &[u8] = b"cell/";
+
+/// The result of [`Store::prune`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Pruned {
+    /// Objects removed.
+    pub n_objects: u64,
+    /// Their length together.
+    pub len_bytes: u64,
+}
+
+/// The only writer of a store.
+#[derive(Debug)]
+pub struct Store {
+    pub(super) dir: PathBuf,
+    db: sled::Db,
+    published: sled::Tree,
+    pub(super) keys: Keys,
+    n_parts: AtomicU64,
+}
+
+impl Store {
+    /// Opens a store for writing; creates it, with a fresh signing key, if it does not exist.
+    ///
+    /// # Errors
+    /// [`StoreError::Locked`] while another process writes; [`StoreError`] otherwise.
+    pub fn create_or_open(dir: &Path) -> Result<Self, StoreError> {
+        fs_err::create_dir_all(dir)?;
+        for folder in ["objects", "extras", "keys", "tmp"] {
+            files::ensure_folder(&dir.join(folder))?;
+        }
+        // All at once, so that no object's durability waits on another thread's folder.
+        for first in 0..=u8::MAX {
+            files::ensure_folder_unsynced(&dir.join("objects").join(hex::encode([first])))?;
+        }
+        files::sync_folder(&dir.join("objects"))?;
+        let db_path = dir.join("db");
+        let config = sled::Config::new().path(&db_path).cache_capacity(RECORD_CACHE_BYTES);
+        let start = Instant::now();
+        let db = loop {
+            match config.open() {
+                Ok(db) => break db,
+                // sled has no error kind of its own for this.
+                Err(sled::Error::Io(e)) if e.to_string().contains("could not acquire lock") => {
+                    if start.elapsed() > LOCK_PATIENCE {
+                        return Err(StoreError::Locked { store: dir.to_owned() });
+                    }
+                    std::thread::sleep(LOCK_PAUSE);
+                }
+                Err(cause) => return Err(StoreError::Records { path: db_path, cause }),
+            }
+        };
+        // The lock is held, so the files in tmp/ belong to a writer that died.
+        for entry in fs_err::read_dir(dir.join("tmp"))? {
+            fs_err::remove_file(entry?.path())?;
+        }
+        let published =
+            db.open_tree(PUBLISHED_TREE).map_err(|cause| StoreError::Records { path: db_path, cause })?;
+        let n_parts = AtomicU64::new(0);
+        let keys = Keys::load_or_make(dir)?;
+        let store = Self { dir: dir.to_owned(), db, published, keys, n_parts };
+        store.repair_records()?;
+        Ok(store)
+    }
+
+    /// Returns the store's folder.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
+    /// Returns the folder for working files of an encode, and creates it if it does not exist.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`].
+    pub fn job_dir(&self) -> Result<PathBuf, StoreError> {
+        let path = self.dir.join("job");
+        files::ensure_folder(&path)?;
+        Ok(path)
+    }
+
+    /// Returns the record database, for the state of jobs and pushes. Records are durable once flushed.
+    pub fn db(&self) -> &sled::Db {
+        &self.db
+    }
+
+    /// Returns the key that signs this store's manifests.
+    pub fn signing_key(&self) -> &SigningKey {
+        &self.keys.present
+    }
+
+    /// Returns a reader of what is published.
+    ///
+    /// # Errors
+    /// As [`StoreReader::open`].
+    pub fn reader(&self) -> Result<StoreReader, StoreError> {
+        StoreReader::open(&self.dir)
+    }
+
+    /// Writes an object through a callback and returns its hash and length; safe from many threads.
+    ///
+    /// The object is durable on return. An object that exists already is kept.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`], from the callback too.
+    pub fn put_object(
+        &self,
+        write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
+    ) -> Result<(Hash32, u64), StoreError> {
+        let part = self.part_path();
+        let written = HashingWriter::create(&part).and_then(|mut out| {
+            write(&mut out)?;
+            out.finish()
+        });
+        let placed = written.and_then(|(hash, len_bytes)| {
+            self.place_object(&part, hash, len_bytes)?;
+            Ok((hash, len_bytes))
+        });
+        if placed.is_err() {
+            // Best effort: the next writer clears tmp/ anyway, and the first error is the one to report.
+            let _ = fs_err::remove_file(&part);
+        }
+        Ok(placed?)
+    }
+
+    /// Writes an object; as [`Store::put_object`].
+    ///
+    /// # Errors
+    /// [`StoreError::Io`].
+    pub fn put_bytes(&self, bytes: &[u8]) -> Result<(Hash32, u64), StoreError> {
+        self.put_object(|out| out.write_all(bytes))
+    }
+
+    fn place_object(&self, part: &Path, hash: Hash32, len_bytes: u64) -> io::Result<()> {
+        let path = reader::object_path(&self.dir, hash);
+        if fs_err::metadata(&path).is_ok_and(|found| found.len() == len_bytes) {
+            return fs_err::remove_file(part);
+        }
+        files::move_into_place(part, &path)
+    }
+
+    /// Returns the generation that the next published manifest should have.
+    ///
+    /// # Errors
+    /// [`StoreError::Records`].
+    pub fn next_generation(&self) -> Result<u64, StoreError> {
+        Ok(self.generation()?.map_or(1, |current| current.saturating_add(1)))
+    }
+
+    /// Signs a manifest and makes it, with the objects it lists, the current one; returns its hash.
+    ///
+    /// `extras`: objects by name that this generation needs but robots do not fetch (readers find them
+    /// in [`Published::extras`]). Publishing the current manifest once more changes nothing. The next
+    /// key that it names is the store's, whatever `manifest` says.
+    ///
+    /// # Errors
+    /// [`StoreError::MissingObject`] if an object listed is not there in full,
+    /// [`StoreError::Generation`] unless the generation is above the current one.
+    pub fn publish(&self, manifest: &Manifest, extras: &Extras) -> Result<Hash32, StoreError> {
+        let next_key = self.keys.next.as_ref().map(keys::public);
+        self.publish_as(&self.keys.present, &Manifest { next_key, ..manifest.clone() }, extras)
+    }
+
+    pub(super) fn publish_as(
+        &self,
+        signer: &SigningKey,
+        manifest: &Manifest,
+        extras: &Extras,
+    ) -> Result<Hash32, StoreError> {
+        let shards = manifest.cells.iter().flat_map(|cell| cell.shards.values());
+        for shard in shards {
+            self.check_object(shard.hash, Some(shard.len_bytes))?;
+        }
+        for hash in extras.values() {
+            self.check_object(*hash, None)?;
+        }
+        let signed = manifest.sign(signer);
+        let path = self.dir.join(signed::MANIFEST);
+        let refuse = |cause| StoreError::Manifest { path: path.clone(), cause };
+        let own = TrustedKeys::Only(vec![keys::public(signer)]);
+        Manifest::verify(&signed, &own).map_err(refuse)?;
+        let hash = Hash32::of(&signed);
+        let current = signed::read_signed(&path)?;
+        let again = current.as_deref() == Some(&signed);
+        match self.generation()? {
+            Some(generation) if manifest.generation <= generation && !again => {
+                return Err(StoreError::Generation { found: manifest.generation, current: generation });
+            }
+            _ => {}
+        }
+        let extras_json = serde_json::to_vec(extras).expect("a map of strings is JSON");
+        self.replace(&reader::extras_path(&self.dir, hash), &extras_json)?;
+        if !again {
+            if let Some(current) = current {
+                self.replace(&self.dir.join(signed::MANIFEST_PREVIOUS), &current)?;
+            }
+            self.replace(&path, &signed)?;
+        }
+        self.write_records(manifest, hash)?;
+        Ok(hash)
+    }
+
+    /// Remembers which models the store was encoded with.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`].
+    pub fn remember_models(&self, record: &ModelsRecord) -> Result<(), StoreError> {
+        let bytes = serde_json::to_vec(record).map_err(io::Error::from)?;
+        self.replace(&ModelsRecord::path(&self.dir), &bytes)
+    }
+
+    /// Removes objects and extras that neither the current manifest nor the one before it lists.
+    ///
+    /// Objects of an encode that has not published yet are removed too: prune after publishing.
+    ///
+    /// # Errors
+    /// [`StoreError`] if the current manifest or its extras cannot be read: then nothing is removed.
+    pub fn prune(&self) -> Result<Pruned, StoreError> {
+        let reader = self.reader()?;
+        let both = || std::iter::once(reader.current()).chain(reader.previous());
+        let extras: BTreeSet<Hash32> = both().map(|published| published.hash).collect();
+        let objects: BTreeSet<Hash32> = both().flat_map(Published::all_objects).collect();
+        let mut pruned = Pruned::default();
+        for (path, len_bytes) in files_in(&self.dir.join("extras"))? {
+            if !named_in(&path, &extras) {
+                pruned.len_bytes += len_bytes;
+                fs_err::remove_file(&path)?;
+            }
+        }
+        for folder in fs_err::read_dir(self.dir.join("objects"))? {
+            for (path, len_bytes) in files_in(&folder?.path())? {
+                if !named_in(&path, &objects) {
+                    fs_err::remove_file(&path)?;
+                    pruned.n_objects += 1;
+                    pruned.len_bytes += len_bytes;
+                }
+            }
+        }
+        Ok(pruned)
+    }
+
+    /// Returns the published cells in order of their ids, from the records.
+    ///
+    /// # Errors
+    /// [`StoreError::Records`].
+    pub fn cells(&self) -> Result<Vec<CellRecord>, StoreError> {
+        let decode = |bytes: sled::IVec| {
+            serde_json::from_slice(&bytes).map_err(|e| sled::Error::ReportableBug(e.to_string()))
+        };
+        let cells: Result<Vec<CellRecord>, sled::Error> =
+            self.published.scan_prefix(CELL_PREFIX).values().map(|value| decode(value?)).collect();
+        cells.map_err(|cause| self.records_error(cause))
+    }
+
+    /// Returns the highest generation published, from the records.
+    fn generation(&self) -> Result<Option<u64>, StoreError> {
+        let value = self.published.get(GENERATION_KEY).map_err(|cause| self.records_error(cause))?;
+        Ok(value.and_then(|bytes| Some(u64::from_be_bytes(bytes.as_ref().try_into().ok()?))))
+    }
+
+    /// Writes the records of a manifest in one atomic batch, unless they are current.
+    fn write_records(&self, manifest: &Manifest, hash: Hash32) -> Result<(), StoreError> {
+        let write = || -> sled::Result<()> {
+            if self.published.get(MANIFEST_KEY)?.is_some_and(|found| *found == hash.0[..]) {
+                return Ok(());
+            }
+            let mut batch = sled::Batch::default();
+            let mut gone: BTreeSet<sled::IVec> =
+                self.published.scan_prefix(CELL_PREFIX).keys().collect::<Result<_, _>>()?;
+            for cell in &manifest.cells {
+                let key = [CELL_PREFIX, &cell.cell_id.to_be_bytes()].concat();
+                gone.remove(key.as_slice());
+                batch.insert(key, serde_json::to_vec(cell).expect("a cell record is JSON"));
+            }
+            gone.into_iter().for_each(|key| batch.remove(key));
+            batch.insert(SCENE_KEY, manifest.scene.as_bytes());
+            batch.insert(GENERATION_KEY, &manifest.generation.to_be_bytes());
+            batch.insert(MANIFEST_KEY, &hash.0);
+            self.published.apply_batch(batch)?;
+            self.published.flush().map(drop)
+        };
+        write().map_err(|cause| self.records_error(cause))
+    }
+
+    /// Brings the records up to the manifest, which a crash may have left ahead of them.
+    fn repair_records(&self) -> Result<(), StoreError> {
+        // Without the extras: a damaged record of them is replaced by the next publication.
+        let own = keys::PublicKeys::read(&self.dir)?.trusted();
+        match reader::read_manifest(&self.dir.join(signed::MANIFEST), &own) {
+            Ok((manifest, signed)) => self.write_records(&manifest, Hash32::of(&signed)),
+            Err(StoreError::NotPublished { .. }) => Ok(()),
+            Err(e) => Err(e),
+        }
+    }
+
+    fn check_object(&self, hash: Hash32, expected_bytes: Option<u64>) -> Result<(), StoreError> {
+        let path = reader::object_path(&self.dir, hash);
+        let found_bytes = match fs_err::metadata(&path) {
+            Ok(found) => Some(found.len()),
+            Err(e) if e.kind() == io::ErrorKind::NotFound => None,
+            Err(e) => return Err(e.into()),
+        };
+        if found_bytes.is_none() || expected_bytes.is_some_and(|n| found_bytes != Some(n)) {
+            let expected_bytes = expected_bytes.unwrap_or(0);
+            return Err(StoreError::MissingObject { hash, path, expected_bytes, found_bytes });
+        }
+        Ok(())
+    }
+
+    pub(super) fn replace(&self, path: &Path, bytes: &[u8]) -> Result<(), StoreError> {
+        Ok(files::replace(&self.part_path(), path, bytes, Access::Shared)?)
+    }
+
+    pub(super) fn part_path(&self) -> PathBuf {
+        let part = self.n_parts.fetch_add(1, Ordering::Relaxed);
+        self.dir.join("tmp").join(format!("{part}.part"))
+    }
+
+    fn records_error(&self, cause: sled::Error) -> StoreError {
+        StoreError::Records { path: self.dir.join("db"), cause }
+    }
+}
+
+fn named_in(path: &Path, names: &BTreeSet<Hash32>) -> bool {
+    let name = path.file_name().and_then(|name| name.to_str()).and_then(|name| name.parse().ok());
+    name.is_some_and(|hash: Hash32| names.contains(&hash))
+}
+
+/// Returns the files of a folder with their lengths, by name.
+fn files_in(folder: &Path) -> io::Result<BTreeMap<PathBuf, u64>> {
+    fs_err::read_dir(folder)?
+        .map(|entry| {
+            let entry = entry?;
+            Ok((entry.path(), entry.metadata()?.len()))
+        })
+        .collect()
+}
