@@ -9,6 +9,7 @@ pub mod eigen;
 pub mod graph_segmentation;
 pub mod matrix;
 pub mod random;
+pub mod simd;
 pub mod union_find;
 
 pub use dot::{dot, dot_f64};

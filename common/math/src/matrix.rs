@@ -1,8 +1,10 @@
 //! Dense products, fast and the same to the bit on any machine: lanes are columns, so that every element
 //! is one chain of fused multiply-adds whatever the width of the vectors.
 
-use pulp::{Arch, Simd, WithSimd};
+use pulp::Simd;
 use rayon::prelude::*;
+
+use crate::simd::{InstructionSet, Work};
 
 /// Columns that are packed together: a multiple of every machine's lanes.
 const PANEL: usize = 32;
@@ -70,7 +72,7 @@ impl Panels {
     pub fn product(&self, left: Rows<'_>) -> Vec<f32> {
         let mut out = vec![0.0; left.len() * self.n_columns];
         out.par_chunks_mut(CHUNK * self.n_columns).enumerate().for_each(|(chunk, out)| {
-            Arch::new().dispatch(Product { left, right: self, first: chunk * CHUNK, out })
+            InstructionSet::widest().dispatch(Product { left, right: self, first: chunk * CHUNK, out })
         });
         out
     }
@@ -83,7 +85,7 @@ impl Panels {
         let mut out = vec![0; left.len()];
         out.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, out)| {
             let first = chunk * CHUNK;
-            Arch::new().dispatch(Largest { left, right: self, offsets: &padded, first, out });
+            InstructionSet::widest().dispatch(Largest { left, right: self, offsets: &padded, first, out });
         });
         out
     }
@@ -96,11 +98,11 @@ struct Product<'a> {
     out: &'a mut [f32],
 }
 
-impl WithSimd for Product<'_> {
+impl<S: Simd> Work<S> for Product<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
+    fn run(self, simd: S) {
         let width = self.right.n_columns;
         for (tile, out) in self.out.chunks_mut(TILE * width).enumerate() {
             let rows = tile_rows(self.left, self.first + tile * TILE, out.len() / width);
@@ -129,11 +131,11 @@ struct Largest<'a> {
     out: &'a mut [u32],
 }
 
-impl WithSimd for Largest<'_> {
+impl<S: Simd> Work<S> for Largest<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) {
+    fn run(self, simd: S) {
         for (tile, out) in self.out.chunks_mut(TILE).enumerate() {
             let rows = tile_rows(self.left, self.first + tile * TILE, out.len());
             let mut best = [[simd.splat_f32s(f32::NEG_INFINITY); 2]; TILE];
@@ -236,23 +238,15 @@ mod tests {
     /// Whatever vectors the machine has, the bits are those of single numbers.
     #[test]
     fn every_width_of_vectors_gives_the_same_bits() {
-        let mut widths = vec![Arch::Scalar];
-        #[cfg(target_arch = "x86_64")]
-        {
-            widths.extend(pulp::x86::V3::try_new().map(Arch::V3));
-            widths.extend(pulp::x86::V4::try_new().map(Arch::V4));
-        }
-        #[cfg(target_arch = "aarch64")]
-        widths.extend(pulp::aarch64::Neon::try_new().map(Arch::Neon));
         let (a, b) = (random(30 * 65, 1), random(65 * 77, 2));
         let right = &Panels::new(65, 77, |i, j| b[i * 77 + j]);
         let (left, offsets) = (Rows::all(&a, 65), [[0.25; PANEL]; 3]);
-        let results: Vec<(Vec<f32>, Vec<u32>)> = widths
+        let results: Vec<(Vec<f32>, Vec<u32>)> = InstructionSet::available()
             .iter()
-            .map(|arch| {
+            .map(|set| {
                 let (mut out, mut columns) = (vec![0.0; 30 * 77], vec![0; 30]);
-                arch.dispatch(Product { left, right, first: 0, out: &mut out });
-                arch.dispatch(Largest { left, right, offsets: &offsets, first: 0, out: &mut columns });
+                set.dispatch(Product { left, right, first: 0, out: &mut out });
+                set.dispatch(Largest { left, right, offsets: &offsets, first: 0, out: &mut columns });
                 (out, columns)
             })
             .collect();

@@ -4,8 +4,7 @@ use std::time::Instant;
 
 use rayon::prelude::*;
 use serde::Serialize;
-
-use crate::score::Level;
+use slag_math::simd::InstructionSet;
 
 /// Larger than processor caches.
 const READ_BYTES: usize = 256 << 20;
@@ -39,7 +38,7 @@ impl Machine {
             arch: std::env::consts::ARCH,
             n_cores: std::thread::available_parallelism().map_or(1, usize::from),
             n_threads: rayon::current_num_threads(),
-            simd: Level::widest().name(),
+            simd: InstructionSet::widest().name(),
             is_debug_build: cfg!(debug_assertions),
         }
     }

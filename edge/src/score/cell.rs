@@ -2,12 +2,12 @@
 
 use half::f16;
 use slag_common::shard::{ExactColumns, Residuals, ShardView};
+use slag_math::simd::InstructionSet;
 
 use super::centroids::{AskedQuestion, ShardScores};
 use super::precision::Precision;
 use super::project::Projection;
 use super::region::Region;
-use super::simd::Level;
 
 /// Number of mean measured errors within which a score counts as undecided and is refined. With 9, answers
 /// hold 0.99 and more of a generated field's best 1,000 to 100,000; with 6, the best 1,000 of a few texts
@@ -65,7 +65,7 @@ pub(super) struct Cell<'a> {
     pub detail: Detail<'a>,
     /// The region; absent if it covers the shard.
     pub filter: Option<Region>,
-    pub level: Level,
+    pub instructions: InstructionSet,
     /// Most that a score changes with a residual of length 1, in components.
     component_steepness: f32,
     /// Rounding error of the tables for a centroid scale of 1.
@@ -107,7 +107,7 @@ impl<'a> AskedQuestion<'a> {
             centroids,
             detail,
             filter,
-            level: Level::widest(),
+            instructions: InstructionSet::widest(),
             component_steepness: 0.0,
             table_error: 0.0,
             table_reach: 0.0,

@@ -4,12 +4,12 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 use slag_common::shard::ShardView;
+use slag_math::simd::InstructionSet;
 
 use super::precision::Precision;
 use super::project::{Projection, Vector};
 use super::question::Question;
 use super::region::Region;
-use super::simd::Level;
 
 /// Scores of one or several questions, centroid by centroid.
 #[derive(Default)]
@@ -63,11 +63,11 @@ impl CentroidScores {
         self.vectors.resize_with(distinct.len(), Vector::default);
         self.vectors.iter_mut().zip(distinct).for_each(|(vector, values)| vector.set(values));
         self.shards.resize_with(shards.len(), ShardScores::default);
-        let (level, vectors) = (Level::widest(), &self.vectors);
+        let (instructions, vectors) = (InstructionSet::widest(), &self.vectors);
         self.shards.par_iter_mut().zip(shards).for_each(|(scores, shard)| {
             scores.is_searched = region.touches(&shard.position_box());
             if scores.is_searched {
-                scores.score(level, shard, vectors, &places, precision);
+                scores.score(instructions, shard, vectors, &places, precision);
             }
         });
         places
@@ -91,7 +91,7 @@ pub(super) fn distinct(questions: &[Question]) -> (Vec<&[f32]>, Vec<Vec<usize>>)
 impl ShardScores {
     fn score(
         &mut self,
-        level: Level,
+        instructions: InstructionSet,
         shard: &ShardView<'_>,
         vectors: &[Vector],
         places: &[Vec<usize>],
@@ -102,8 +102,8 @@ impl ShardScores {
         for ((projection, centroids), vector) in
             self.projections.iter_mut().zip(&mut self.centroids).zip(vectors)
         {
-            projection.set(level, shard, vector);
-            projection.score_centroids(level, shard, centroids);
+            projection.set(instructions, shard, vector);
+            projection.score_centroids(instructions, shard, centroids);
             let are_codes_read = match precision {
                 Precision::Centroids => false,
                 Precision::Measured => true,

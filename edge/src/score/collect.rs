@@ -167,7 +167,7 @@ impl Cell<'_> {
     fn exact_score(&self, embeddings: &[f16], at: usize) -> f32 {
         let dim = self.shard.header.dim as usize;
         let embedding = &embeddings[at * dim..][..dim];
-        let product = |vector| self.level.dispatch(EmbeddingTimesVector(embedding, vector));
+        let product = |vector| self.instructions.dispatch(EmbeddingTimesVector(embedding, vector));
         let mut products = self.asked.question.vectors().map(product);
         combine(products.next().unwrap_or(0.0), products)
     }
@@ -193,7 +193,7 @@ impl Cell<'_> {
         let least = if is_single { least_sum(own, step, tables.most, threshold) } else { Some(0) };
         let Some(least) = least else { return };
         sums.clear();
-        found.effort.n_blocks_read += self.level.dispatch(FindSums {
+        found.effort.n_blocks_read += self.instructions.dispatch(FindSums {
             columns: residuals.codes.as_chunks::<BLOCK>().0,
             low: &tables.low,
             high: &tables.high,
@@ -227,7 +227,7 @@ impl Cell<'_> {
         let tables = &self.scores.projections[place].tables;
         let columns = &residuals.codes.as_chunks::<BLOCK>().0[block * tables.low.len()..][..tables.low.len()];
         let work = BlockSums { columns, low: &tables.low, high: &tables.high };
-        LastBlock { block: Some(block), sums: self.level.dispatch(work) }
+        LastBlock { block: Some(block), sums: self.instructions.dispatch(work) }
     }
 
     fn push_scanned(&self, gather: &mut ShardGather) {
@@ -262,7 +262,13 @@ impl Cell<'_> {
                 let rounded = &self.scores.projections[*place].fine;
                 let n_components = self.shard.header.n_components as usize;
                 let (rows, vector) = (fine.values, &rounded.steps[..]);
-                self.level.dispatch(SomeRowsTimesVector { rows, n_components, vector, which, products });
+                self.instructions.dispatch(SomeRowsTimesVector {
+                    rows,
+                    n_components,
+                    vector,
+                    which,
+                    products,
+                });
                 let (own, step) = (
                     self.scores.centroids[*place][centroid],
                     f64::from(fine.scales[centroid]) * rounded.step,

@@ -1,8 +1,9 @@
 //! The loop over exact embeddings: an f16 vector times an f32 vector.
 
 use half::f16;
+use slag_math::simd::Work;
 
-use super::simd::{Kernels, Work};
+use super::simd::Kernels;
 
 /// Partial sums kept apart until the end: one AVX register, two of SSE or NEON.
 const LANES: usize = 8;
@@ -53,11 +54,11 @@ pub fn dot(embedding: &[f16], vector: &[f32]) -> f32 {
 /// [`dot`] compiled for an instruction set: wider vectors, the same sums.
 pub(super) struct EmbeddingTimesVector<'a>(pub &'a [f16], pub &'a [f32]);
 
-impl Work for EmbeddingTimesVector<'_> {
+impl<K: Kernels> Work<K> for EmbeddingTimesVector<'_> {
     type Output = f32;
 
     #[inline(always)]
-    fn run<K: Kernels>(self, _: K) -> f32 {
+    fn run(self, _: K) -> f32 {
         dot(self.0, self.1)
     }
 }
@@ -72,9 +73,9 @@ pub fn rounding_bound(dim: usize) -> f32 {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
+    use slag_math::simd::InstructionSet;
 
     use super::*;
-    use crate::score::simd::Level;
 
     /// Oracle: the half crate's conversion, over every finite f16.
     #[test]
@@ -95,9 +96,9 @@ mod tests {
             let absolute: f64 = terms().map(f64::abs).sum();
             let bound = f64::from(rounding_bound(pairs.len())) * absolute + 1e-30;
             prop_assert!((f64::from(dot(&embedding, &vector)) - expected).abs() <= bound);
-            for level in Level::available() {
-                let found = level.dispatch(EmbeddingTimesVector(&embedding, &vector));
-                prop_assert_eq!(found.to_bits(), dot(&embedding, &vector).to_bits(), "{}", level.name());
+            for set in InstructionSet::available() {
+                let found = set.dispatch(EmbeddingTimesVector(&embedding, &vector));
+                prop_assert_eq!(found.to_bits(), dot(&embedding, &vector).to_bits(), "{}", set.name());
             }
         }
     }

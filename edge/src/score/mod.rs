@@ -41,7 +41,6 @@ pub use precision::Precision;
 pub use question::{Question, RELEVANCY_STEEPNESS, relevancy, score_of_relevancy};
 pub use region::{Ball, Region};
 pub use search::{Scratch, Search};
-pub use simd::Level;
 
 #[cfg(test)]
 mod coded_tests;

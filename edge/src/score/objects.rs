@@ -8,12 +8,13 @@
 use rayon::prelude::*;
 use slag_common::objects::{MAX_VECTORS, Objects, object_score};
 use slag_common::shard::ShardView;
+use slag_math::simd::InstructionSet;
 
 use super::centroids::{combine, distinct};
 use super::error::ScoreError;
 use super::project::{Projection, Vector, up};
 use super::question::{Question, check};
-use super::simd::{Level, SomeRowsTimesVector};
+use super::simd::SomeRowsTimesVector;
 use crate::store::objects::ObjectIndex;
 
 /// Objects scored at a time; their products stay in the L1 cache.
@@ -53,10 +54,11 @@ pub fn score_objects(
             vector
         })
         .collect();
-    let level = Level::widest();
+    let instructions = InstructionSet::widest();
     let of_shard = |(at, objects): (usize, &Option<Objects<'_>>)| -> Vec<ObjectScores> {
         let Some(objects) = objects else { return Vec::new() };
-        let scored = vectors.iter().map(|v| of_vector(level, &shards[at], objects, index.first_in(at), v));
+        let scored =
+            vectors.iter().map(|v| of_vector(instructions, &shards[at], objects, index.first_in(at), v));
         let scored: Vec<ObjectScores> = scored.collect();
         places.iter().map(|places| of_question(&scored, places)).collect()
     };
@@ -86,14 +88,14 @@ fn of_question(scored: &[ObjectScores], places: &[usize]) -> ObjectScores {
 
 /// Scores objects of a shard against one vector. `which`: pairs that begin with an object's number.
 fn of_vector(
-    level: Level,
+    instructions: InstructionSet,
     shard: &ShardView<'_>,
     objects: &Objects<'_>,
     which: &[(u32, u32)],
     vector: &Vector,
 ) -> ObjectScores {
     let mut projection = Projection::default();
-    projection.set(level, shard, vector);
+    projection.set(instructions, shard, vector);
     let (n_vectors, n_components) = (objects.header.n_vectors, shard.header.n_components as usize);
     let mut scores = Vec::with_capacity(which.len());
     let (mut rows, mut products, mut largest_step) = (Vec::new(), Vec::new(), 0.0f32);
@@ -105,7 +107,7 @@ fn of_vector(
         // Vectors without components equal the mean.
         match n_components {
             0 => products.resize(rows.len(), 0),
-            _ => level.dispatch(SomeRowsTimesVector {
+            _ => instructions.dispatch(SomeRowsTimesVector {
                 rows: objects.vectors,
                 n_components,
                 vector,
@@ -221,12 +223,12 @@ mod tests {
             }
             let mut vector = Vector::default();
             vector.set(&questions[0].vector);
-            let at = |level| {
+            let at = |instructions: InstructionSet| {
                 let objects = objects[0].as_ref().expect("has objects");
-                of_vector(level, &shards[0], objects, index.first_in(0), &vector)
+                of_vector(instructions, &shards[0], objects, index.first_in(0), &vector)
             };
-            for level in Level::available() {
-                assert_eq!(at(level), at(Level::Portable), "{} {shape:?}", level.name());
+            for set in InstructionSet::available() {
+                assert_eq!(at(*set), at(InstructionSet::Portable), "{} {shape:?}", set.name());
             }
         }
         assert!(largest_share > 0.02, "the bound was hardly tested: {largest_share}");

@@ -12,9 +12,10 @@
 //! error in each`.
 
 use slag_common::shard::{BLOCK, CODEWORDS, Fine, Residuals, ShardView};
+use slag_math::simd::InstructionSet;
 
 use super::dot::widen;
-use super::simd::{Column, Level, MatrixTimesVector, PAD};
+use super::simd::{Column, MatrixTimesVector, PAD};
 
 /// Largest sum of absolute steps: times the 128 of a centroid's largest component it still fits in 32 bits.
 const MOST_IN_SUM: u64 = (1 << 24) - 1;
@@ -115,7 +116,7 @@ pub struct Projection {
 
 impl Projection {
     /// Projects a vector on a cell's basis.
-    pub fn set(&mut self, level: Level, shard: &ShardView<'_>, vector: &Vector) {
+    pub fn set(&mut self, instructions: InstructionSet, shard: &ShardView<'_>, vector: &Vector) {
         self.components.clear();
         let m = shard.header.n_components as usize;
         let step = f64::from(shard.header.centroid_step);
@@ -128,7 +129,7 @@ impl Projection {
         };
         self.components.resize(m, 0.0);
         let components = &mut self.components;
-        level.dispatch(MatrixTimesVector {
+        instructions.dispatch(MatrixTimesVector {
             rows: basis.vectors,
             n_components: vector.exact.len(),
             vector: &vector.rounded.steps,
@@ -145,12 +146,17 @@ impl Projection {
     }
 
     /// Scores a cell's centroids. `scores`: `[K]`.
-    pub fn score_centroids(&self, level: Level, shard: &ShardView<'_>, scores: &mut Vec<f32>) {
+    pub fn score_centroids(
+        &self,
+        instructions: InstructionSet,
+        shard: &ShardView<'_>,
+        scores: &mut Vec<f32>,
+    ) {
         scores.clear();
         // Centroids without components equal the mean.
         scores.resize(shard.header.n_centroids as usize, self.base as f32 + 0.0);
         let step = f64::from(shard.header.centroid_step) * self.rounded.step;
-        level.dispatch(MatrixTimesVector {
+        instructions.dispatch(MatrixTimesVector {
             rows: shard.centroids,
             n_components: shard.header.n_components as usize,
             vector: &self.rounded.steps,

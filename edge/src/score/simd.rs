@@ -7,12 +7,9 @@ mod neon;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
-use pulp::NullaryFnOnce;
-#[cfg(target_arch = "aarch64")]
-use pulp::aarch64::Neon;
-#[cfg(target_arch = "x86_64")]
-use pulp::x86::{V3, V4};
+use pulp::Scalar;
 use slag_common::shard::BLOCK;
+use slag_math::simd::Work;
 
 /// Vectors are zero-padded to a multiple of this many components: the width of the widest instruction set.
 pub const PAD: usize = 32;
@@ -36,11 +33,7 @@ pub trait Kernels: Copy {
     fn at_least(self, sums: &[u16; BLOCK], least: u16) -> u32;
 }
 
-/// Portable code for any processor.
-#[derive(Clone, Copy, Debug)]
-pub struct Portable;
-
-impl Kernels for Portable {
+impl Kernels for Scalar {
     #[inline(always)]
     fn dots(self, rows: [&[i8]; ROWS], vector: &[i16]) -> [i32; ROWS] {
         rows.map(|row| dot(row, vector))
@@ -70,89 +63,6 @@ fn dot(row: &[i8], vector: &[i16]) -> i32 {
     row.iter().zip(vector).map(|(a, b)| i32::from(*a) * i32::from(*b)).sum()
 }
 
-/// Work written once for all instruction sets. `run` and everything it calls must be `inline(always)`, or it
-/// is compiled for the baseline processor.
-pub trait Work {
-    /// The result.
-    type Output;
-    /// Does the work.
-    fn run<K: Kernels>(self, kernels: K) -> Self::Output;
-}
-
-/// Work bound to a known instruction set.
-struct On<K, W>(K, W);
-
-impl<K: Kernels, W: Work> NullaryFnOnce for On<K, W> {
-    type Output = W::Output;
-
-    #[inline(always)]
-    fn call(self) -> W::Output {
-        self.1.run(self.0)
-    }
-}
-
-/// An instruction set that this processor has.
-#[derive(Clone, Copy, Debug)]
-pub enum Level {
-    /// Plain code.
-    Portable,
-    /// AVX2.
-    #[cfg(target_arch = "x86_64")]
-    Avx2(V3),
-    /// AVX-512 with its byte and word extension (BW).
-    #[cfg(target_arch = "x86_64")]
-    Avx512(V4),
-    /// NEON.
-    #[cfg(target_arch = "aarch64")]
-    Neon(Neon),
-}
-
-impl Level {
-    /// Returns the instruction sets of this processor, narrowest first.
-    pub fn available() -> Vec<Self> {
-        let mut levels = vec![Self::Portable];
-        #[cfg(target_arch = "x86_64")]
-        {
-            levels.extend(V3::try_new().map(Self::Avx2));
-            levels.extend(V4::try_new().map(Self::Avx512));
-        }
-        #[cfg(target_arch = "aarch64")]
-        levels.extend(Neon::try_new().map(Self::Neon));
-        levels
-    }
-
-    /// Returns the widest instruction set of this processor.
-    pub fn widest() -> Self {
-        Self::available().pop().unwrap_or(Self::Portable)
-    }
-
-    /// Returns the name.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Portable => "portable",
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx2(_) => "avx2",
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx512(_) => "avx512",
-            #[cfg(target_arch = "aarch64")]
-            Self::Neon(_) => "neon",
-        }
-    }
-
-    /// Runs work compiled for this instruction set.
-    pub fn dispatch<W: Work>(self, work: W) -> W::Output {
-        match self {
-            Self::Portable => work.run(Portable),
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx2(simd) => pulp::Simd::vectorize(simd, On(simd, work)),
-            #[cfg(target_arch = "x86_64")]
-            Self::Avx512(simd) => pulp::Simd::vectorize(simd, On(simd, work)),
-            #[cfg(target_arch = "aarch64")]
-            Self::Neon(simd) => pulp::Simd::vectorize(simd, On(simd, work)),
-        }
-    }
-}
-
 /// Multiplies every row of a matrix with a vector; the products come in the order of the rows.
 pub struct MatrixTimesVector<'a, F> {
     /// `[n][n_components]`.
@@ -165,11 +75,11 @@ pub struct MatrixTimesVector<'a, F> {
     pub put: F,
 }
 
-impl<F: FnMut(usize, i32)> Work for MatrixTimesVector<'_, F> {
+impl<K: Kernels, F: FnMut(usize, i32)> Work<K> for MatrixTimesVector<'_, F> {
     type Output = ();
 
     #[inline(always)]
-    fn run<K: Kernels>(self, kernels: K) {
+    fn run(self, kernels: K) {
         let Self { rows, n_components, vector, mut put } = self;
         // Rows without components have no products, and their number is unknown.
         let Some(n_rows) = rows.len().checked_div(n_components) else { return };
@@ -203,11 +113,11 @@ pub struct BlockSums<'a> {
     pub high: &'a [Column],
 }
 
-impl Work for BlockSums<'_> {
+impl<K: Kernels> Work<K> for BlockSums<'_> {
     type Output = [u16; BLOCK];
 
     #[inline(always)]
-    fn run<K: Kernels>(self, kernels: K) -> [u16; BLOCK] {
+    fn run(self, kernels: K) -> [u16; BLOCK] {
         kernels.block_sums(self.columns, self.low, self.high)
     }
 }
@@ -239,11 +149,11 @@ pub struct FindSums<'a> {
     pub found: &'a mut Vec<(u32, u16)>,
 }
 
-impl Work for FindSums<'_> {
+impl<K: Kernels> Work<K> for FindSums<'_> {
     type Output = u64;
 
     #[inline(always)]
-    fn run<K: Kernels>(self, kernels: K) -> u64 {
+    fn run(self, kernels: K) -> u64 {
         let Self { columns, low, high, members, least, last, found } = self;
         let mut n_read = 0;
         for block in members.start / BLOCK..members.end.div_ceil(BLOCK) {
@@ -281,11 +191,11 @@ pub struct SomeRowsTimesVector<'a> {
     pub products: &'a mut Vec<i32>,
 }
 
-impl Work for SomeRowsTimesVector<'_> {
+impl<K: Kernels> Work<K> for SomeRowsTimesVector<'_> {
     type Output = ();
 
     #[inline(always)]
-    fn run<K: Kernels>(self, kernels: K) {
+    fn run(self, kernels: K) {
         let Self { rows, n_components, vector, which, products } = self;
         products.clear();
         for which in which.chunks(ROWS) {
@@ -310,11 +220,12 @@ impl Work for SomeRowsTimesVector<'_> {
 mod tests {
     use super::*;
     use slag_math::random::Random;
+    use slag_math::simd::InstructionSet;
 
     /// Oracle: plain 64-bit sums. Covers lengths around every width, extreme values, and the last rows,
     /// which cannot be read past their end.
     #[test]
-    fn products_are_the_sums_at_every_level() {
+    fn products_are_the_sums_with_every_instruction_set() {
         let mut random = Random::new(11);
         for n_components in (1..70usize).chain([96, 100, 511, 512, 513, 8192]) {
             for n_rows in [0, 1, 3, 4, 5, 37] {
@@ -332,14 +243,14 @@ mod tests {
                     row.iter().zip(&vector).map(|(a, b)| i64::from(*a) * i64::from(*b)).sum()
                 };
                 let expected: Vec<i64> = rows.chunks_exact(n_components).map(exact).collect();
-                for level in Level::available() {
+                for set in InstructionSet::available() {
                     let mut found = Vec::new();
                     let put = |row: usize, dot: i32| {
                         assert_eq!(row, found.len());
                         found.push(i64::from(dot));
                     };
-                    level.dispatch(MatrixTimesVector { rows: &rows, n_components, vector: &vector, put });
-                    assert_eq!(found, expected, "{} {n_components} {n_rows}", level.name());
+                    set.dispatch(MatrixTimesVector { rows: &rows, n_components, vector: &vector, put });
+                    assert_eq!(found, expected, "{} {n_components} {n_rows}", set.name());
                 }
             }
         }
@@ -347,7 +258,7 @@ mod tests {
 
     /// Oracle: each code looked up individually. Up to 64 columns of 255, the most that 16 bits must hold.
     #[test]
-    fn sums_of_a_block_are_the_looked_up_values_at_every_level() {
+    fn sums_of_a_block_are_the_looked_up_values_with_every_instruction_set() {
         let mut random = Random::new(12);
         for n_columns in (0..20).chain([63, 64]) {
             for highest in [1, 255] {
@@ -372,9 +283,9 @@ mod tests {
                     })
                     .collect();
                 let [columns, low, high] = [&columns, &low, &high].map(|c| c.as_chunks::<BLOCK>().0);
-                for level in Level::available() {
-                    let found = level.dispatch(BlockSums { columns, low, high });
-                    assert_eq!(found.map(u64::from).to_vec(), expected, "{} {n_columns}", level.name());
+                for set in InstructionSet::available() {
+                    let found = set.dispatch(BlockSums { columns, low, high });
+                    assert_eq!(found.map(u64::from).to_vec(), expected, "{} {n_columns}", set.name());
                 }
             }
         }
@@ -382,7 +293,7 @@ mod tests {
 
     /// Oracle: one comparison per sum, at both ends of 16 bits and around the sign bit.
     #[test]
-    fn sums_that_reach_a_value_are_found_at_every_level() {
+    fn sums_that_reach_a_value_are_found_with_every_instruction_set() {
         let mut random = Random::new(13);
         const N_COLUMNS: usize = 64;
         let n_blocks = 5;
@@ -399,23 +310,22 @@ mod tests {
             let (low, high) = (table(), table());
             let sums: Vec<u16> = columns
                 .chunks_exact(N_COLUMNS)
-                .flat_map(|block| Portable.block_sums(block, &low, &high))
+                .flat_map(|block| Scalar.block_sums(block, &low, &high))
                 .collect();
             let (least_sum, most) = (sums.iter().min().copied(), sums.iter().max().copied());
             for least in [Some(0), Some(u16::MAX), Some(0x8000), least_sum, most, Some(sums[40])] {
                 let least = least.expect("there are sums");
-                for level in Level::available() {
+                for set in InstructionSet::available() {
                     let (mut last, mut found, mut n_read) = (LastBlock::default(), Vec::new(), 0);
                     let ends = [0, 1, 31, 32, 33, 96, 97, 98, 160];
                     for ends in ends.windows(2) {
                         let (columns, members) = (&columns[..], ends[0]..ends[1]);
                         let (last, found, low, high) = (&mut last, &mut found, &low[..], &high[..]);
-                        n_read +=
-                            level.dispatch(FindSums { columns, low, high, members, least, last, found });
+                        n_read += set.dispatch(FindSums { columns, low, high, members, least, last, found });
                     }
                     let expected: Vec<(u32, u16)> =
                         (0..).zip(sums.iter().copied()).filter(|(_, sum)| *sum >= least).collect();
-                    assert_eq!(found, expected, "{} {least}", level.name());
+                    assert_eq!(found, expected, "{} {least}", set.name());
                     assert_eq!(n_read, n_blocks as u64);
                 }
             }
@@ -424,7 +334,7 @@ mod tests {
 
     /// Oracle: plain sums; the last rows cannot be read past their end.
     #[test]
-    fn products_of_some_rows_are_the_sums_at_every_level() {
+    fn products_of_some_rows_are_the_sums_with_every_instruction_set() {
         let mut random = Random::new(14);
         for n_components in [1usize, 2, 31, 32, 33, 96, 126, 512] {
             let rows: Vec<i8> = (0..40 * n_components).map(|_| random.bits() as i8).collect();
@@ -436,13 +346,13 @@ mod tests {
                     .iter()
                     .map(|at| dot(&rows[*at as usize * n_components..][..n_components], &vector))
                     .collect();
-                for level in Level::available() {
+                for set in InstructionSet::available() {
                     let mut products = vec![7];
                     let (rows, vector, which) = (&rows[..], &vector[..], &which[..]);
                     let products_of =
                         SomeRowsTimesVector { rows, n_components, vector, which, products: &mut products };
-                    level.dispatch(products_of);
-                    assert_eq!(products, expected, "{} {n_components}", level.name());
+                    set.dispatch(products_of);
+                    assert_eq!(products, expected, "{} {n_components}", set.name());
                 }
             }
         }

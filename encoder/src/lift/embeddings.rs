@@ -6,12 +6,13 @@
 
 use std::ops::Range;
 
-use pulp::{Arch, Simd, WithSimd};
+use pulp::Simd;
 use rayon::prelude::*;
 
 use super::part::PartContributions;
 use super::table::RegionTable;
 use slag_math::dot;
+use slag_math::simd::{InstructionSet, Work};
 
 /// Shortest mean vector with evidence. The masks of a shorter one cancel: the rest is rounding noise of f32
 /// contributions and of the models.
@@ -42,11 +43,11 @@ pub(super) fn write_embeddings(
     table: &RegionTable,
     out: &mut [f32],
 ) -> Vec<f32> {
-    write_embeddings_on(Arch::new(), contributions, table, out)
+    write_embeddings_on(InstructionSet::widest(), contributions, table, out)
 }
 
 fn write_embeddings_on(
-    arch: Arch,
+    instructions: InstructionSet,
     contributions: &PartContributions,
     table: &RegionTable,
     out: &mut [f32],
@@ -63,7 +64,13 @@ fn write_embeddings_on(
         |scratch, (chunk, (out, lengths))| {
             let first = chunk * CHUNK;
             scratch.number_regions(contributions, first..first + lengths.len());
-            lengths.copy_from_slice(&arch.dispatch(Chunk { contributions, table, first, scratch, out }));
+            lengths.copy_from_slice(&instructions.dispatch(Chunk {
+                contributions,
+                table,
+                first,
+                scratch,
+                out,
+            }));
             scratch.forget_regions();
         },
     );
@@ -117,12 +124,12 @@ struct Chunk<'a> {
     out: &'a mut [f32],
 }
 
-impl WithSimd for Chunk<'_> {
+impl<S: Simd> Work<S> for Chunk<'_> {
     type Output = Vec<f32>;
 
     /// Returns the lengths of the mean vectors.
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) -> Vec<f32> {
+    fn run(self, simd: S) -> Vec<f32> {
         let Self { contributions, table, first, scratch, out } = self;
         let Scratch { regions, places, vectors, .. } = scratch;
         let dim = table.dim();
@@ -179,24 +186,16 @@ mod tests {
     /// Every instruction set of the machine gives the bits of scalar code.
     #[test]
     fn every_width_of_vectors_gives_the_same_bits() {
-        let mut widths = vec![Arch::Scalar];
-        #[cfg(target_arch = "x86_64")]
-        {
-            widths.extend(pulp::x86::V3::try_new().map(Arch::V3));
-            widths.extend(pulp::x86::V4::try_new().map(Arch::V4));
-        }
-        #[cfg(target_arch = "aarch64")]
-        widths.extend(pulp::aarch64::Neon::try_new().map(Arch::Neon));
         for dim in [1, 7, 64, 130, 512] {
             let scene = scene_of(dim, 600, 11);
             let Scene { index, table, .. } = &scene;
             let raw = index.read(0..index.parts().len()).expect("reads");
             for contributions in index.transpose(&raw, table).expect("transposes") {
-                let results: Vec<(Vec<f32>, Vec<f32>)> = widths
+                let results: Vec<(Vec<f32>, Vec<f32>)> = InstructionSet::available()
                     .iter()
-                    .map(|arch| {
+                    .map(|set| {
                         let mut out = vec![f32::NAN; contributions.total_weights.len() * dim];
-                        (write_embeddings_on(*arch, &contributions, table, &mut out), out)
+                        (write_embeddings_on(*set, &contributions, table, &mut out), out)
                     })
                     .collect();
                 assert!(results.iter().all(|r| *r == results[0]), "dim {dim}");

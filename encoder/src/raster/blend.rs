@@ -2,10 +2,11 @@
 
 use bytemuck::{cast, cast_slice, cast_slice_mut};
 use pulp::Simd;
+use slag_math::simd::{InstructionSet, Work};
 
 use super::constants::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE_SIZE_PX};
 use super::project::ScreenGaussian;
-use super::simd::{Lanes, Level, Work};
+use super::simd::Lanes;
 use super::weights::WeightKind;
 
 /// Gaussians that are fetched and prepared at once. Between batches, rows with only opaque pixels are identified, to
@@ -68,7 +69,7 @@ pub trait WeightSink {
 ///
 /// With [`WeightKind::Falloff`] there is no occlusion, and the transmittance stays 1.
 pub fn walk_tile(
-    level: Level,
+    instructions: InstructionSet,
     visible: &[ScreenGaussian],
     members: &[u32],
     rect: TileRect,
@@ -76,8 +77,8 @@ pub fn walk_tile(
     sink: &mut impl WeightSink,
 ) -> PerPixel<f32> {
     match kind {
-        WeightKind::Blend => level.dispatch(Walk::<_, true> { visible, members, rect, sink }),
-        WeightKind::Falloff => level.dispatch(Walk::<_, false> { visible, members, rect, sink }),
+        WeightKind::Blend => instructions.dispatch(Walk::<_, true> { visible, members, rect, sink }),
+        WeightKind::Falloff => instructions.dispatch(Walk::<_, false> { visible, members, rect, sink }),
     }
 }
 
@@ -88,11 +89,11 @@ struct Walk<'a, K, const BLEND: bool> {
     sink: &'a mut K,
 }
 
-impl<K: WeightSink, const BLEND: bool> Work for Walk<'_, K, BLEND> {
+impl<S: Lanes, K: WeightSink, const BLEND: bool> Work<S> for Walk<'_, K, BLEND> {
     type Output = PerPixel<f32>;
 
     #[inline(always)]
-    fn run<S: Lanes>(self, simd: S) -> PerPixel<f32> {
+    fn run(self, simd: S) -> PerPixel<f32> {
         let Self { visible, members, rect, sink } = self;
         // A negative value marks an opaque pixel: it needs no second array, and fails every comparison below.
         let mut transmittance = [[-1.0_f32; TILE_SIZE_PX]; TILE_SIZE_PX];
@@ -269,11 +270,11 @@ mod tests {
 
     struct Exp<'a>(&'a mut [f32]);
 
-    impl Work for Exp<'_> {
+    impl<S: Lanes> Work<S> for Exp<'_> {
         type Output = ();
 
         #[inline(always)]
-        fn run<S: Lanes>(self, simd: S) {
+        fn run(self, simd: S) {
             for power in cast_slice_mut::<f32, S::f32s>(self.0) {
                 *power = exp_of_minus(simd, *power);
             }
@@ -283,19 +284,19 @@ mod tests {
     #[test]
     fn exp_is_within_a_millionth_and_has_the_same_bits_for_all_instruction_sets() {
         let powers: Vec<f32> = (0..6000).map(|i| i as f32 / 1000.0).chain([f32::INFINITY; 16]).collect();
-        let on_level = |level: Level| {
+        let on = |instructions: InstructionSet| {
             let mut values = powers.clone();
-            level.dispatch(Exp(&mut values));
+            instructions.dispatch(Exp(&mut values));
             values
         };
-        let portable = on_level(Level::Portable);
+        let portable = on(InstructionSet::Portable);
         for (power, found) in powers.iter().zip(&portable).take(6000) {
             let expected = (-f64::from(*power)).exp();
             assert!((f64::from(*found) / expected - 1.0).abs() < 1e-6, "{power}: {found} {expected}");
         }
         assert!(portable[6000] < MIN_ALPHA);
-        for level in Level::available() {
-            assert_eq!(on_level(level), portable, "{}", level.name());
+        for set in InstructionSet::available() {
+            assert_eq!(on(*set), portable, "{}", set.name());
         }
     }
 }

@@ -2,13 +2,14 @@
 
 use bytemuck::{Zeroable, cast, cast_slice, cast_slice_mut};
 use rayon::prelude::*;
+use slag_math::simd::InstructionSet;
 
 use super::bin::Tiles;
 use super::blend::{TileRect, WeightSink, walk_tile};
 use super::buckets::{Buckets, concat};
 use super::constants::{MIN_ALPHA, MIN_TRANSMITTANCE, SUM_FRACTION_BITS, TILE_SIZE_PX};
 use super::project::ScreenGaussian;
-use super::simd::{Lanes, Level};
+use super::simd::Lanes;
 use super::weights::{RegionWeight, WeightKind};
 use crate::masks::{NO_REGION, RegionMap};
 
@@ -41,7 +42,7 @@ pub fn tile_contributions(
     tiles: &Tiles,
     regions: &RegionMap,
     kind: WeightKind,
-    level: Level,
+    instructions: InstructionSet,
 ) -> Vec<Buckets<TileContribution>> {
     let (width_px, height_px) = (tiles.width_px as usize, tiles.height_px as usize);
     tiles
@@ -56,7 +57,7 @@ pub fn tile_contributions(
                 .filter_map(|(column, members)| {
                     let rect = TileRect::new(column, row, width_px, height_px);
                     let mut sink = RegionSink::new(regions, rect)?;
-                    walk_tile(level, visible, members, rect, kind, &mut sink);
+                    walk_tile(instructions, visible, members, rect, kind, &mut sink);
                     Some(sink.contributions)
                 })
                 .collect();
@@ -273,7 +274,8 @@ mod tests {
         let (visible, tiles) = scene(200);
         let contributions_of = |regions: RegionMap| {
             let mut sums = BTreeMap::<u32, (u64, u64)>::new();
-            let rows = tile_contributions(&visible, &tiles, &regions, WeightKind::Blend, Level::widest());
+            let rows =
+                tile_contributions(&visible, &tiles, &regions, WeightKind::Blend, InstructionSet::widest());
             for of_tile in rows.iter().flat_map(Buckets::iter).flatten() {
                 let (fixed, n_parts) = sums.entry(of_tile.member).or_default();
                 *fixed += of_tile.fixed;
@@ -302,18 +304,19 @@ mod tests {
         ];
         let colours: Vec<[f32; 3]> =
             visible.iter().map(|g| [0.1, 0.5, 0.01 * (g.gaussian % 99) as f32]).collect();
-        let on_level = |level: Level| {
+        let on = |instructions: InstructionSet| {
             let of_maps = maps.each_ref().map(|map| {
-                [WeightKind::Blend, WeightKind::Falloff]
-                    .map(|kind| merge(&visible, &tile_contributions(&visible, &tiles, map, kind, level)))
+                [WeightKind::Blend, WeightKind::Falloff].map(|kind| {
+                    merge(&visible, &tile_contributions(&visible, &tiles, map, kind, instructions))
+                })
             });
-            (of_maps, draw(level, &visible, &colours, &tiles, [0.2; 3]))
+            (of_maps, draw(instructions, &visible, &colours, &tiles, [0.2; 3]))
         };
-        let portable = on_level(Level::Portable);
+        let portable = on(InstructionSet::Portable);
         assert!(portable.0[2][0].len() > 10_000);
         assert!(portable.0[0][1].iter().any(|entry| entry.gaussian as usize > RANGE));
-        for level in Level::available() {
-            assert!(on_level(level) == portable, "{}", level.name());
+        for set in InstructionSet::available() {
+            assert!(on(*set) == portable, "{}", set.name());
         }
     }
 }

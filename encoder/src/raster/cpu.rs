@@ -3,6 +3,7 @@
 use std::time::Instant;
 
 use slag_common::Gaussians;
+use slag_math::simd::InstructionSet;
 
 use super::bin::{Tiles, bin};
 use super::contributions::{merge, tile_contributions};
@@ -11,7 +12,6 @@ use super::error::RasterError;
 use super::project::{Prepared, Projection};
 use super::rasterizer::{LoadedScene, Rasterizer};
 use super::sh;
-use super::simd::Level;
 use super::validate::{check_regions, check_scene, check_view};
 use super::view::RasterView;
 use super::weights::{StageTime, ViewCounters, ViewWeights, WeightKind};
@@ -23,25 +23,25 @@ pub struct CpuRasterizer;
 
 impl Rasterizer for CpuRasterizer {
     fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
-        CpuLevel(Level::widest()).load(scene)
+        CpuWith(InstructionSet::widest()).load(scene)
     }
 }
 
 /// The reference backend with a chosen instruction set; results have the same bits for all of them.
 #[derive(Clone, Copy, Debug)]
-pub struct CpuLevel(pub Level);
+pub struct CpuWith(pub InstructionSet);
 
-impl Rasterizer for CpuLevel {
+impl Rasterizer for CpuWith {
     fn load<'s>(&self, scene: &'s Gaussians) -> Result<Box<dyn LoadedScene + 's>, RasterError> {
         check_scene(scene)?;
-        Ok(Box::new(CpuScene { prepared: Prepared::new(scene), level: self.0 }))
+        Ok(Box::new(CpuScene { prepared: Prepared::new(scene), instructions: self.0 }))
     }
 }
 
 /// A validated scene and the instruction set for its pixels.
 struct CpuScene<'s> {
     prepared: Prepared<'s>,
-    level: Level,
+    instructions: InstructionSet,
 }
 
 impl LoadedScene for CpuScene<'_> {
@@ -57,8 +57,9 @@ impl LoadedScene for CpuScene<'_> {
         let projection = timed("project", &mut times, || self.prepared.project(view));
         let visible = &projection.visible;
         let tiles = timed("bin", &mut times, || bin(visible, &view.intrinsics));
-        let by_tile =
-            timed("blend", &mut times, || tile_contributions(visible, &tiles, regions, kind, self.level));
+        let by_tile = timed("blend", &mut times, || {
+            tile_contributions(visible, &tiles, regions, kind, self.instructions)
+        });
         let entries = timed("merge", &mut times, || merge(visible, &by_tile));
         Ok((ViewWeights { entries, counters: counters(&projection, &tiles) }, times))
     }
@@ -69,7 +70,7 @@ impl LoadedScene for CpuScene<'_> {
         let tiles = bin(&projection.visible, &view.intrinsics);
         let position_in_world = view.camera_from_world.inverse().translation;
         let colours = sh::colours(self.prepared.scene, &projection.visible, position_in_world);
-        let mut drawing = draw(self.level, &projection.visible, &colours, &tiles, background);
+        let mut drawing = draw(self.instructions, &projection.visible, &colours, &tiles, background);
         drawing.counters = counters(&projection, &tiles);
         Ok(drawing)
     }

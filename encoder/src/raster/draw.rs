@@ -2,12 +2,13 @@
 
 use bytemuck::cast_slice_mut;
 use rayon::prelude::*;
+use slag_math::simd::InstructionSet;
 
 use super::bin::Tiles;
 use super::blend::{PerPixel, TileRect, WeightSink, walk_tile};
 use super::constants::TILE_SIZE_PX;
 use super::project::ScreenGaussian;
-use super::simd::{Lanes, Level};
+use super::simd::Lanes;
 use super::weights::{ViewCounters, WeightKind};
 
 /// The picture of a scene in one view; all arrays are row-major.
@@ -29,7 +30,7 @@ pub struct Drawing {
 
 /// Draws the Gaussians of all tiles. `colours` contains the RGB colour of each visible Gaussian.
 pub fn draw(
-    level: Level,
+    instructions: InstructionSet,
     visible: &[ScreenGaussian],
     colours: &[[f32; 3]],
     tiles: &Tiles,
@@ -49,7 +50,8 @@ pub fn draw(
             for (column, members) in tile_row.iter().enumerate() {
                 let rect = TileRect::new(column, row, width_px, height_px);
                 let mut sink = PixelSink::new(visible, colours);
-                let transmittance = walk_tile(level, visible, members, rect, WeightKind::Blend, &mut sink);
+                let transmittance =
+                    walk_tile(instructions, visible, members, rect, WeightKind::Blend, &mut sink);
                 for (y, light) in transmittance.iter().enumerate().take(rect.height_px) {
                     for (x, &light) in light.iter().enumerate().take(rect.width_px) {
                         let pixel = y * width_px + rect.x_px + x;

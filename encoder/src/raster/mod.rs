@@ -35,7 +35,7 @@ mod validate;
 mod view;
 mod weights;
 
-pub use cpu::{CpuLevel, CpuRasterizer};
+pub use cpu::{CpuRasterizer, CpuWith};
 pub use draw::Drawing;
 pub use error::RasterError;
 pub use rasterizer::{LoadedScene, Rasterizer};

@@ -8,10 +8,10 @@ use clap::Args;
 use slag_encoder::cli::Exit;
 use slag_encoder::cli::common::{available_threads, print};
 use slag_encoder::progress::Progress;
-use slag_encoder::raster::CpuLevel;
+use slag_encoder::raster::CpuWith;
 use slag_encoder::raster::devices::{DeviceChoice, Devices};
 use slag_encoder::raster::gpu::GpuOptions;
-use slag_encoder::raster::simd::Level;
+use slag_math::simd::InstructionSet;
 
 use crate::bench::machine::Machine;
 use crate::bench::raster::{Device, RasterBench, RasterReport};
@@ -84,9 +84,9 @@ pub(super) fn run(args: &RasterBenchArgs, progress: &dyn Progress, json: bool) -
                 devices.push(Device { name: opened.names().join(", "), rasterizer: Box::new(opened) });
             }
             BenchDevice::CpuEach => devices.extend(
-                Level::available()
-                    .into_iter()
-                    .map(|level| Device { name: level.name().into(), rasterizer: Box::new(CpuLevel(level)) }),
+                InstructionSet::available()
+                    .iter()
+                    .map(|set| Device { name: set.name().into(), rasterizer: Box::new(CpuWith(*set)) }),
             ),
         }
     }
