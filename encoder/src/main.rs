@@ -1,6 +1,5 @@
-//! `slag-encoder`: gives a 3DGS scene a language field, cuts it into shards and serves them.
+//! `slag-encoder`: encodes a 3DGS scene, cuts it into shards and serves them.
 
-use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use clap::Parser;
@@ -11,14 +10,6 @@ fn main() -> ExitCode {
     if cli.uses_gpu() {
         environment::silence_device_selection();
     }
-    tracing_subscriber::fmt()
-        .with_writer(std::io::stderr)
-        .with_env_filter(
-            tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| cli.log_level().into()),
-        )
-        .with_ansi(std::io::stderr().is_terminal())
-        .with_target(false)
-        .without_time()
-        .init();
+    cli.output.init_logging();
     cli::run(cli).into()
 }

@@ -1,7 +1,7 @@
-//! Shared by the commands: flags of models and inputs, printing, interruption.
+//! Shared by the commands: flags of output, models and inputs; logging, printing, interruption.
 
 use std::fmt::Display;
-use std::io::Write;
+use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -16,9 +16,43 @@ use slag_models::commands::{self, RunArgs};
 use slag_models::session::SessionError;
 use slag_models::{ModelDir, SessionOptions, TextEncoder};
 use slag_service::stop::stop_signal;
+use tracing_subscriber::EnvFilter;
 
 use crate::embed::Background;
 use crate::store::StoreReader;
+
+/// Flags that every command has.
+#[derive(Clone, Copy, Debug, Args)]
+pub struct OutputArgs {
+    /// Prints less: no progress, warnings only.
+    #[arg(long, short, global = true)]
+    pub quiet: bool,
+    /// Prints the result, or the error, as one JSON object.
+    #[arg(long, global = true)]
+    pub json: bool,
+}
+
+impl OutputArgs {
+    /// Logs to stderr from now on: warnings and above with `--quiet`, else information as well; RUST_LOG overrides both.
+    ///
+    /// # Panics
+    /// If the process logs already.
+    pub fn init_logging(self) {
+        let level = if self.quiet { "warn" } else { "info" };
+        tracing_subscriber::fmt()
+            .with_writer(std::io::stderr)
+            .with_env_filter(EnvFilter::try_from_default_env().unwrap_or_else(|_| level.into()))
+            .with_ansi(std::io::stderr().is_terminal())
+            .with_target(false)
+            .without_time()
+            .init();
+    }
+
+    /// Returns whether progress may be shown.
+    pub fn shows_progress(self) -> bool {
+        !self.quiet && !self.json
+    }
+}
 
 /// Where models come from.
 #[derive(Clone, Debug, Args)]

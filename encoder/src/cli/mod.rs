@@ -26,6 +26,7 @@ use crate::encode::EncodeError;
 #[cfg(feature = "qdrant")]
 use crate::publish::qdrant;
 use crate::raster::devices::DeviceChoice;
+use common::OutputArgs;
 pub use exit::Exit;
 #[cfg(feature = "qdrant")]
 use push::PushCommand;
@@ -34,23 +35,15 @@ use push::PushCommand;
 #[derive(Debug, Parser)]
 #[command(version, propagate_version = true)]
 pub struct Cli {
-    /// Prints less: no progress, warnings only.
-    #[arg(long, short, global = true)]
-    quiet: bool,
-    /// Prints the result, or the error, as one JSON object.
-    #[arg(long, global = true)]
-    pub json: bool,
+    /// Flags that every command has.
+    #[command(flatten)]
+    pub output: OutputArgs,
     /// The command.
     #[command(subcommand)]
     pub command: Command,
 }
 
 impl Cli {
-    /// Returns the log level where RUST_LOG does not say otherwise.
-    pub fn log_level(&self) -> &'static str {
-        if self.quiet { "warn" } else { "info" }
-    }
-
     /// Returns whether the command looks for GPUs.
     pub fn uses_gpu(&self) -> bool {
         cfg!(feature = "gpu")
@@ -60,11 +53,6 @@ impl Cli {
                 Command::Devices => true,
                 _ => false,
             }
-    }
-
-    /// Returns whether progress may be shown.
-    pub fn shows_progress(&self) -> bool {
-        !self.quiet && !self.json
     }
 }
 
@@ -95,8 +83,8 @@ pub enum Command {
 
 /// Runs the program and says how it ended.
 pub fn run(cli: Cli) -> Exit {
-    let json = cli.json;
-    let progress = progress::shown(cli.shows_progress());
+    let json = cli.output.json;
+    let progress = progress::shown(cli.output.shows_progress());
     let result = match cli.command {
         Command::Check(args) => check::run(&args, json),
         Command::Encode(args) => encode::run(&args, progress.as_ref(), json),

@@ -1,4 +1,4 @@
-//! Reads arrays of a NumPy archive.
+//! Reads arrays from a NumPy archive.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -6,35 +6,35 @@ use std::path::{Path, PathBuf};
 use npyz::{DType, Deserialize, NpyFile};
 use slag_common::npz::Npz;
 
-/// Why a recorded scene cannot be read.
+/// Error of reading a recorded scene.
 #[derive(Debug, thiserror::Error)]
 pub enum FixtureError {
-    /// The file cannot be read, or is no NumPy archive.
-    #[error("{}: {source}; give a NumPy archive (.npz) of arrays", path.display())]
+    /// The file cannot be read, or is not a NumPy archive.
+    #[error("{}: {source}; expected a NumPy archive (.npz)", path.display())]
     Io {
         /// The file.
         path: PathBuf,
         /// The reason.
         source: io::Error,
     },
-    /// An array is absent.
-    #[error("{}: no array {array:?}; write it into the archive", path.display())]
+    /// An array is missing.
+    #[error("{}: no array {array:?}; add it to the archive", path.display())]
     Missing {
         /// The file.
         path: PathBuf,
         /// Name of the array.
         array: &'static str,
     },
-    /// An array is of a type or a size that does not fit.
-    #[error("{}: array {array:?} is {found}, {expected} expected; write the archive again", path.display())]
+    /// An array has the wrong type or size.
+    #[error("{}: array {array:?} is {found}, expected {expected}; write the archive again", path.display())]
     Array {
         /// The file.
         path: PathBuf,
         /// Name of the array.
         array: &'static str,
-        /// What is there.
+        /// Its type or size.
         found: String,
-        /// What should be.
+        /// The type or size that it should have.
         expected: String,
     },
 }
@@ -56,20 +56,19 @@ impl Arrays {
         Ok(Self { path: path.to_owned(), archive })
     }
 
-    /// Returns an array as rows of `N` numbers; `n_centroids` where their count is known, at least one row
-    /// otherwise.
+    /// Returns an array as rows of `N` numbers. There must be `n_rows` of them, or at least one where that is `None`.
     ///
     /// # Errors
     /// [`FixtureError`].
     pub fn rows<const N: usize>(
         &mut self,
         array: &'static str,
-        n_centroids: Option<usize>,
+        n_rows: Option<usize>,
     ) -> Result<Vec<[f64; N]>, FixtureError> {
         let values = self.values(array)?;
         let (rows, rest) = values.as_chunks::<N>();
-        if !rest.is_empty() || n_centroids.map_or(rows.is_empty(), |n| rows.len() != n) {
-            let expected = n_centroids.map_or_else(|| "some".into(), |n| n.to_string());
+        if !rest.is_empty() || n_rows.map_or(rows.is_empty(), |n| rows.len() != n) {
+            let expected = n_rows.map_or_else(|| "some".into(), |n| n.to_string());
             return Err(FixtureError::Array {
                 path: self.path.clone(),
                 array,
@@ -124,7 +123,7 @@ impl Arrays {
     }
 }
 
-/// Reads one by one: the header's count is not believed until the bytes are there.
+/// Reads values one by one, so that a false count in the header reserves no memory.
 fn numbers<T: Deserialize>(file: NpyFile<impl io::Read>, to_f64: fn(T) -> f64) -> io::Result<Vec<f64>> {
     let mut values = Vec::new();
     for value in file.data::<T>().map_err(io::Error::other)? {

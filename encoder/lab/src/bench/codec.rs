@@ -1,6 +1,5 @@
-//! How many bytes buy which error: the rate-error curve of the codebook and its residual code, beside plain
-//! vectors in 8 bits and product-quantised ones, over the embeddings of a published scene or of a generated
-//! field.
+//! Bytes against score error: the curve of the codebook and its residual code, compared with 8-bit vectors and product
+//! quantisation, over the embeddings of a published scene or of a generated field.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -23,34 +22,34 @@ use slag_encoder::shard::{self, CellEmbeddings, ShardSettings};
 use slag_encoder::store::{StoreError, StoreReader};
 use slag_math::matrix::{Panels, Rows};
 
-/// Texts whose rankings are compared.
+/// Number of texts with compared rankings.
 const N_RANKED: usize = 100;
 /// Lengths of the rankings.
 const RANKS: [usize; 2] = [1_000, 10_000];
-/// Errors asked of the compact profile, relative to the spread.
+/// Requested errors of the compact profile, relative to the spread.
 const COMPACT_ERRORS: [f32; 5] = [0.3, 0.2, 0.14, 0.1, 0.07];
-/// Errors asked of the balanced profile.
+/// Requested errors of the balanced profile.
 const BALANCED_ERRORS: [f32; 5] = [0.08, 0.06, 0.04, 0.025, 0.015];
-/// Bytes a vector of the product quantiser.
+/// Bytes per vector of the product quantiser.
 const PRODUCT_BYTES: [usize; 4] = [8, 16, 32, 64];
 
-/// Where the embeddings come from.
+/// Source of the embeddings.
 #[derive(Clone, Debug)]
 pub enum Source {
     /// The exact shards of a store.
     Store(PathBuf),
-    /// A generated field of so many Gaussians and components.
+    /// A generated field: number of Gaussians and of components.
     Generated(usize, usize),
 }
 
-/// Why there is no curve.
+/// Error of the benchmark.
 #[derive(Debug, thiserror::Error)]
 pub enum CodecError {
-    /// The store.
+    /// The store cannot be read.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// A cell without exact embeddings.
-    #[error("{}: cell {cell_id} has no sound exact shard; encode with --profiles compact,balanced,exact", path.display())]
+    /// A cell has no exact embeddings.
+    #[error("{}: cell {cell_id} has no valid exact shard; encode with --profiles compact,balanced,exact", path.display())]
     NoExact {
         /// The store.
         path: PathBuf,
@@ -59,47 +58,47 @@ pub enum CodecError {
     },
 }
 
-/// One way of keeping the embeddings.
+/// Figures of a codec with one setting.
 #[derive(Clone, Debug, Serialize)]
 pub struct Point {
-    /// Its family.
+    /// The codec.
     pub codec: &'static str,
     /// Its setting.
     pub setting: String,
-    /// Bytes a Gaussian: everything but the position, tables and codebooks included.
+    /// Bytes per Gaussian without the position, tables and codebooks included.
     pub embedding_bytes: f64,
-    /// The same with the position; of ours, the whole file.
+    /// Bytes per Gaussian with the position; for shards, of the whole file.
     pub bytes: f64,
-    /// Mean of |score error|, relative to the spread of scores.
+    /// Mean of |score error| relative to the spread of scores.
     pub mean_error: f64,
-    /// Its 99.9th percentile.
+    /// 99.9th percentile of the same.
     pub p999_error: f64,
-    /// Its largest.
+    /// Maximum of the same.
     pub max_error: f64,
-    /// Share of the best so many Gaussians of a text that are found among as many.
+    /// Recall of the best Gaussians of a text, for each of [`CodecReport::ranks`].
     pub recall: [f64; 2],
-    /// Gaussians coded a second, on all threads; of ours, until the file is made.
+    /// Gaussians coded per second on all threads; for shards, the writing of the file included.
     pub gaussians_per_sec: f64,
 }
 
 /// The curves.
 #[derive(Clone, Debug, Serialize)]
 pub struct CodecReport {
-    /// Where it ran.
+    /// The machine.
     pub machine: Machine,
-    /// What it is about.
+    /// Title of the plot.
     pub title: String,
     /// Gaussians with an embedding.
     pub n_gaussians: usize,
-    /// Components.
+    /// Components of an embedding.
     pub dim: usize,
-    /// Texts of the bank.
+    /// Texts in the bank.
     pub n_texts: usize,
-    /// Standard deviation of a text's scores over the Gaussians, mean over the texts.
+    /// Standard deviation of a text's scores over the Gaussians, averaged over the texts.
     pub spread: f64,
-    /// Lengths of the rankings that recall is about.
+    /// Lengths of the rankings that recall is measured on.
     pub ranks: [usize; 2],
-    /// All points.
+    /// Figures of each codec and setting.
     pub points: Vec<Point>,
 }
 
@@ -112,7 +111,7 @@ struct Embeddings {
     cells: Vec<usize>,
 }
 
-/// Draws the curves. `bank`: in the space of the embeddings; a generated field brings its own.
+/// Measures the curves. `bank` is in the space of a store's embeddings; a generated field has its own.
 ///
 /// # Errors
 /// [`CodecError`].
@@ -131,7 +130,7 @@ pub fn run(source: &Source, bank: TextBank, title: &str) -> Result<CodecReport, 
     let score_context = ScoreMetricContext { spread: metric.spread(rows), metric, bank };
     let truth = Truth::new(&embeddings, &score_context.bank);
     let mut points = Vec::new();
-    let best = |profile: Profile, compact: f32, balanced: f32| CodebookSettings {
+    let settings = |profile: Profile, compact: f32, balanced: f32| CodebookSettings {
         compact_error: compact,
         balanced_error: balanced,
         max_subspaces: if profile == Profile::Compact { 2 } else { 64 },
@@ -139,26 +138,26 @@ pub fn run(source: &Source, bank: TextBank, title: &str) -> Result<CodecReport, 
         has_fine: false,
     };
     for error in COMPACT_ERRORS {
-        points.push(ours(
+        points.push(shards(
             &embeddings,
             &score_context,
             &truth,
             Profile::Compact,
-            best(Profile::Compact, error, error),
+            settings(Profile::Compact, error, error),
         ));
     }
     for error in BALANCED_ERRORS {
-        points.push(ours(
+        points.push(shards(
             &embeddings,
             &score_context,
             &truth,
             Profile::Balanced,
-            best(Profile::Balanced, 0.1, error),
+            settings(Profile::Balanced, 0.1, error),
         ));
     }
     let default = CodebookSettings::default();
-    points.push(ours(&embeddings, &score_context, &truth, Profile::Compact, default));
-    points.push(ours(&embeddings, &score_context, &truth, Profile::Balanced, default));
+    points.push(shards(&embeddings, &score_context, &truth, Profile::Compact, default));
+    points.push(shards(&embeddings, &score_context, &truth, Profile::Balanced, default));
     points.push(int8(&embeddings, &truth));
     points.extend(
         PRODUCT_BYTES
@@ -201,9 +200,10 @@ struct Truth<'a> {
     texts: Panels,
     n_texts: usize,
     spread: f32,
-    /// Some texts, and their best Gaussians, best first, for each rank.
+    /// Vectors of the ranked texts.
     ranked: Vec<f32>,
     ranks: [usize; 2],
+    /// Best Gaussians of each ranked text, for each length.
     best: Vec<[Vec<u32>; 2]>,
 }
 
@@ -217,13 +217,13 @@ impl<'a> Truth<'a> {
         let spread = slag_encoder::codebook::measure::spread(&scores, bank.len());
         let stride = bank.len().div_ceil(N_RANKED).max(1);
         let ranked: Vec<f32> = bank.vectors.chunks_exact(dim).step_by(stride).flatten().copied().collect();
-        // A ranking of most Gaussians would say little.
+        // A ranking that held most Gaussians would hardly tell codecs apart.
         let ranks = RANKS.map(|rank| rank.min(n / 4).max(1));
         let best = rankings(&embeddings.vectors, dim, &ranked, ranks);
         Self { dim, vectors: &embeddings.vectors, texts, n_texts: bank.len(), spread, ranked, ranks, best }
     }
 
-    /// Compares decoded embeddings, in the order of the true ones.
+    /// Returns errors (mean, 99.9th percentile, maximum) and recall of decoded embeddings, in the order of the true ones.
     fn judge(&self, decoded: &[f32]) -> ([f64; 3], [f64; 2]) {
         let n = self.vectors.len() / self.dim;
         let sample = (0..n).step_by(n.div_ceil(4096).max(1));
@@ -254,7 +254,7 @@ impl<'a> Truth<'a> {
     }
 }
 
-/// Returns for each text the Gaussians of its best scores, ascending by index; of equal ones the first.
+/// Returns the best Gaussians of each text for each rank, in ascending order; ties are broken by index.
 fn rankings(vectors: &[f32], dim: usize, texts: &[f32], ranks: [usize; 2]) -> Vec<[Vec<u32>; 2]> {
     let n_texts = texts.len() / dim;
     let panels = Panels::new(dim, n_texts, |c, text| texts[text * dim + c]);
@@ -274,8 +274,8 @@ fn rankings(vectors: &[f32], dim: usize, texts: &[f32], ranks: [usize; 2]) -> Ve
         .collect()
 }
 
-/// Codes the scene as the encoder does and decodes it as readers do.
-fn ours(
+/// Codes the scene into shards as the encoder does, and decodes them as the robot does.
+fn shards(
     embeddings: &Embeddings,
     score_context: &ScoreMetricContext,
     truth: &Truth<'_>,
@@ -289,7 +289,7 @@ fn ours(
     let (mut bytes, mut position_bytes, mut ms, mut first) = (0, 0, 0.0, 0);
     let (mut n_centroids, mut n_subspaces) = (0, 0);
     for n in &embeddings.cells {
-        // Where the Gaussians lie says nothing here: a 20 m cube, in the order given.
+        // Positions do not matter here: all cells get the same cube of 20 m.
         let scene = Gaussians {
             means_in_world: (0..*n as u64).map(crate::generate::field::place_in_cube).collect(),
             scales: vec![[0.01; 3]; *n],
@@ -317,7 +317,7 @@ fn ours(
         let layout = ShardLayout::check(&file).expect("just made");
         let view = layout.view(&file);
         position_bytes += n * 4;
-        // Positions tell which Gaussian is which: they are all different.
+        // Shards reorder Gaussians; positions are distinct and identify them.
         let index = crate::generate::field::index_by_position(&scene, &view);
         let rows: Vec<(usize, Vec<f32>)> = (0..*n)
             .into_par_iter()
@@ -339,7 +339,7 @@ fn ours(
     Point {
         codec: profile.name(),
         setting: format!(
-            "error {} / {}: {n_centroids} rows, {n_subspaces} groups",
+            "error {} / {}: {n_centroids} centroids, {n_subspaces} subspaces",
             codebook.compact_error, codebook.balanced_error
         ),
         embedding_bytes: (bytes - position_bytes) as f64 / n,
@@ -352,7 +352,7 @@ fn ours(
     }
 }
 
-/// Every component in 8 bits, with a step for each vector.
+/// Codes every component in 8 bits, with one step per vector.
 fn int8(embeddings: &Embeddings, truth: &Truth<'_>) -> Point {
     let mut decoded = embeddings.vectors.clone();
     let ((), ms) = timed_ms(|| {
@@ -364,7 +364,7 @@ fn int8(embeddings: &Embeddings, truth: &Truth<'_>) -> Point {
     let (errors, recall) = truth.judge(&decoded);
     point(
         "int8",
-        "a step a vector".into(),
+        "one step per vector".into(),
         embeddings.dim as f64 + 4.0,
         errors,
         recall,
@@ -373,27 +373,28 @@ fn int8(embeddings: &Embeddings, truth: &Truth<'_>) -> Point {
     )
 }
 
-/// Product quantisation (Jegou, Douze and Schmid 2011): `n_bytes` parts of equally many components, 256
-/// words each, one codebook for the scene.
+/// Codes by product quantisation (Jegou, Douze and Schmid 2011): `n_bytes` subspaces of equal width with 256 codewords
+/// each, one codebook for the scene.
 fn product(embeddings: &Embeddings, truth: &Truth<'_>, n_bytes: usize) -> Point {
     let dim = embeddings.dim;
     let width = dim / n_bytes;
     let n = embeddings.vectors.len() / dim;
     let mut decoded = vec![0.0; embeddings.vectors.len()];
     let ((), ms) = timed_ms(|| {
-        for part in 0..n_bytes {
+        for subspace in 0..n_bytes {
             let points: Vec<f32> = embeddings
                 .vectors
                 .chunks_exact(dim)
-                .flat_map(|v| &v[part * width..][..width])
+                .flat_map(|v| &v[subspace * width..][..width])
                 .copied()
                 .collect();
             let stride = n.div_ceil(16_384).max(1);
             let sample: Vec<u32> = (0..n as u32).step_by(stride).collect();
-            let words = trained(Rows { values: &points, width, index: Some(&sample) }, 256);
-            let codes = slag_encoder::codebook::cluster::nearest(Rows::all(&points, width), &words);
+            let codewords = trained(Rows { values: &points, width, index: Some(&sample) }, 256);
+            let codes = slag_encoder::codebook::cluster::nearest(Rows::all(&points, width), &codewords);
             for (vector, code) in decoded.chunks_exact_mut(dim).zip(codes) {
-                vector[part * width..][..width].copy_from_slice(&words[code as usize * width..][..width]);
+                vector[subspace * width..][..width]
+                    .copy_from_slice(&codewords[code as usize * width..][..width]);
             }
         }
     });
@@ -413,7 +414,7 @@ fn point(
     ms: f64,
 ) -> Point {
     let [mean_error, p999_error, max_error] = errors;
-    // A packed position beside them, as ours.
+    // With a packed position, as in shards.
     let bytes = embedding_bytes + 4.0;
     let gaussians_per_sec = n as f64 / (ms / 1e3);
     Point {
@@ -430,7 +431,7 @@ fn point(
 }
 
 impl CodecReport {
-    /// Returns the curve as SVG: bytes a Gaussian across, mean error up, both logarithmic.
+    /// Returns the curves as SVG: mean error over bytes per Gaussian, both logarithmic.
     pub fn svg(&self) -> String {
         let names = ["compact", "balanced", "int8", "product"];
         let series = names.map(|name| {
@@ -442,7 +443,7 @@ impl CodecReport {
         let plot = Plot {
             note: String::new(),
             title: format!("{}: {} Gaussians, {} texts", self.title, self.n_gaussians, self.n_texts),
-            across: "bytes a Gaussian, position included",
+            across: "bytes per Gaussian, position included",
             up: "mean |score error| / spread of scores",
             up_scale: Scale::Logarithmic,
         };

@@ -1,5 +1,4 @@
-//! A published store of a generated field, for the robot's benchmarks: `slag-edge bench query` over what
-//! `slag-edge fetch` brings from it.
+//! `bench field`: publishes a store of a generated field, which `slag-edge fetch` copies and `slag-edge bench query` times.
 
 use std::io::Write;
 use std::path::Path;
@@ -19,30 +18,30 @@ use slag_encoder::shard::{self, CellEmbeddings, ShardSettings};
 use slag_encoder::store::{Extras, Store, StoreError};
 use slag_math::matrix::Rows;
 
-/// Distance of neighbouring cells: more than their width, so that they do not overlap.
+/// Distance between neighbouring cells; more than their width, so that they do not overlap.
 const CELL_PITCH_M: f64 = 21.0;
 
-/// What was made.
+/// Figures of the published store.
 #[derive(Clone, Debug, Serialize)]
 pub struct FieldReport {
-    /// Where.
+    /// The machine.
     pub machine: Machine,
     /// Gaussians.
     pub n_gaussians: u64,
     /// Cells.
     pub n_cells: usize,
-    /// Codebook rows of all cells.
+    /// Centroids of all cells.
     pub n_centroids: u64,
     /// Bytes of all shards, by profile.
     pub shard_bytes: std::collections::BTreeMap<String, u64>,
-    /// Gaussians coded a second, on all threads: codebook, code, measuring and files.
+    /// Gaussians coded per second on all threads: codebook, residual code, measured errors and files.
     pub gaussians_per_sec: f64,
-    /// Mean over the cells of each profile's mean score error, relative to the spread.
+    /// Mean score error relative to the spread, by profile, averaged over cells.
     pub mean_errors: std::collections::BTreeMap<String, f64>,
 }
 
-/// Publishes a field of `n_gaussians` (rounded down to whole cells), and writes its texts to `texts.f32`
-/// beside it, `[n][dim]`, little-endian.
+/// Publishes a field of `n_gaussians`, rounded down to whole cells. Its texts go to `texts.f32` in the same folder:
+/// `[n][dim]`, little-endian.
 ///
 /// # Errors
 /// [`StoreError`].

@@ -1,8 +1,8 @@
-//! The machine that figures were measured on.
+//! The machine of a benchmark.
 
 use serde::Serialize;
 
-/// The machine that figures were measured on.
+/// The machine of a benchmark.
 #[derive(Clone, Debug, Serialize)]
 pub struct Machine {
     /// Processor, as the system names it.

@@ -1,4 +1,4 @@
-//! Benchmarks as commands: each writes JSON that names the machine and compares side by side in one run.
+//! Benchmarks: each compares its candidates in one run and reports figures with the machine's name.
 
 pub mod arrays;
 pub mod codec;

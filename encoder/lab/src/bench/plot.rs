@@ -1,9 +1,9 @@
-//! A small line plot as SVG, the horizontal axis logarithmic.
+//! A line plot as SVG with a logarithmic horizontal axis.
 
 use std::fmt::Write;
 
 const SIZE: (f64, f64) = (920.0, 480.0);
-/// Where the plot ends and the legend begins.
+/// Right edge of the plot and left edge of the legend.
 const RIGHT: f64 = 760.0;
 const MARGIN: (f64, f64) = (72.0, 48.0);
 const COLOURS: [&str; 12] = [
@@ -11,36 +11,36 @@ const COLOURS: [&str; 12] = [
     "#6a9fd8", "#9acd32", "#b0b0b0",
 ];
 
-/// What the axes are.
+/// Titles and axes of a plot.
 pub struct Plot {
-    /// Above the plot.
+    /// Title above the plot.
     pub title: String,
-    /// Below it, small: what the figures are to be read beside; nothing if empty.
+    /// Small print below the title; may be empty.
     pub note: String,
-    /// Horizontal axis.
+    /// Title of the horizontal axis.
     pub across: &'static str,
-    /// Vertical axis.
+    /// Title of the vertical axis.
     pub up: &'static str,
-    /// How its values are laid out.
+    /// Scale of the vertical axis.
     pub up_scale: Scale,
 }
 
-/// How an axis lays out values.
+/// Scale of an axis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Scale {
-    /// Equal factors are equally long.
+    /// Equal factors have equal lengths.
     Logarithmic,
-    /// Equal differences are.
+    /// Equal differences have equal lengths.
     Linear,
 }
 
-/// Points that belong together, positive, in the order of the line through them.
+/// Points connected by a line, in its order; all values are positive.
 pub struct Series {
-    /// In the legend.
+    /// Name in the legend.
     pub name: String,
-    /// (across, up).
+    /// Horizontal and vertical values.
     pub points: Vec<(f64, f64)>,
-    /// Written beside the points; none if empty.
+    /// Labels of the first points; may be empty.
     pub labels: Vec<String>,
 }
 
@@ -168,7 +168,7 @@ impl Axis {
         self.from + (self.to - self.from) * share
     }
 
-    /// 1, 2 and 5 times powers of ten; of a linear axis multiples of one of these, four to ten of them.
+    /// Returns 1, 2 and 5 times powers of ten; on a linear axis, four to ten multiples of one of these.
     fn ticks(&self) -> Vec<f64> {
         let round = || {
             let factors = |e: i32| [1.0, 2.0, 5.0].map(|m| format!("{m}e{e}").parse::<f64>().unwrap_or(1.0));
@@ -180,7 +180,7 @@ impl Axis {
             Scale::Linear => {
                 let step = round().find(|step| (self.high - self.low) / step <= 10.0).unwrap_or(1.0);
                 let multiples = (self.low / step).ceil() as i64..=(self.high / step).floor() as i64;
-                // Digits that the step does not have are of the product's rounding.
+                // Removes digits beyond the step's, which come from rounding the product.
                 let digits = (-step.log10().floor()).max(0.0) as usize;
                 multiples.map(|n| format!("{:.digits$}", n as f64 * step).parse().unwrap_or(0.0)).collect()
             }
@@ -199,7 +199,7 @@ mod tests {
         assert_eq!(of([0.163, 0.219], Scale::Linear), [0.16, 0.17, 0.18, 0.19, 0.2, 0.21, 0.22]);
         let axis = Axis::of([2.0, 4.0].into_iter(), 100.0, 0.0, Scale::Linear);
         assert!((axis.at(3.0) - 50.0).abs() < 1e-9 && axis.at(4.0) < axis.at(2.0));
-        // One value alone still is an axis.
+        // A single value gives an axis too.
         assert!(Axis::of([0.5].into_iter(), 0.0, 1.0, Scale::Linear).at(0.5).is_finite());
     }
 }

@@ -1,4 +1,4 @@
-//! `bench raster`: how fast each backend of the rasteriser gives the weights of a view.
+//! `bench raster`: the time of each backend of the rasteriser for the weights of a view.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -15,7 +15,7 @@ use slag_encoder::masks::RegionMap;
 use slag_encoder::progress::Progress;
 use slag_encoder::raster::{LoadedScene, RasterError, Rasterizer, StageTime, ViewWeights, WeightKind};
 
-/// A backend under the name its figures are listed under.
+/// A backend and its name in the report.
 pub struct Device {
     /// Name.
     pub name: String,
@@ -23,21 +23,21 @@ pub struct Device {
     pub rasterizer: Box<dyn Rasterizer>,
 }
 
-/// How often and how is measured.
+/// Settings of the benchmark.
 #[derive(Clone, Copy, Debug)]
 pub struct RasterBench {
-    /// Timed views a case and device; at least 1.
+    /// Timed views per case and device; at least 1.
     pub n_repeats: usize,
-    /// Views asked for at once where throughput is measured; at least 1.
+    /// Concurrent views where throughput is measured; at least 1.
     pub n_in_flight: usize,
 }
 
-/// Everything that was measured.
+/// Figures of all cases.
 #[derive(Clone, Debug, Serialize)]
 pub struct RasterReport {
-    /// Where.
+    /// The machine.
     pub machine: Machine,
-    /// One a scene, region map and device.
+    /// One per scene, region map and device.
     pub cases: Vec<RasterCase>,
 }
 
@@ -56,15 +56,15 @@ pub struct RasterCase {
     pub height_px: u32,
     /// Regions of the view.
     pub n_regions: u32,
-    /// Gaussians with a pixel in the image.
+    /// Gaussians that reach a pixel of the image.
     pub n_visible: f64,
     /// (Gaussian, tile) pairs.
     pub n_pairs: f64,
-    /// Sums returned.
+    /// Contributions returned.
     pub n_entries: f64,
-    /// Time to make the scene ready, milliseconds.
+    /// Time to load the scene, milliseconds.
     pub load_ms: f64,
-    /// Time of one view alone, views in turn.
+    /// Time of a view, one at a time.
     pub weights: Spread,
     /// Gaussians of the scene over the median time.
     pub gaussians_per_sec: f64,
@@ -72,17 +72,17 @@ pub struct RasterCase {
     pub pairs_per_sec: f64,
     /// Pixels over the median time.
     pub pixels_per_sec: f64,
-    /// Share of each stage in all repeats; empty where the device does not tell.
+    /// Share of each stage over all repeats; empty where the device does not report stages.
     pub stages: Vec<StageShare>,
-    /// Views asked for at once.
+    /// Concurrent views.
     pub n_in_flight: usize,
-    /// Views a second with that many asked for at once.
+    /// Views per second with that many concurrent views.
     pub views_per_sec: f64,
-    /// Sum of the entries' absolute differences from the first device's over the sum of those.
+    /// Sum of absolute differences from the first device's contributions, relative to the sum of these.
     pub relative_l1: f64,
 }
 
-/// What part of a view's time a stage takes.
+/// Time of a stage.
 #[derive(Clone, Debug, Serialize)]
 pub struct StageShare {
     /// Stage.
@@ -94,11 +94,11 @@ pub struct StageShare {
 }
 
 impl RasterBench {
-    /// Measures all devices on a scene, for each region map; devices take turns view by view, so that
-    /// what else the machine does falls on all of them.
+    /// Measures all devices on a scene, for each region map. Devices take turns view by view, so that other load on the
+    /// machine affects all of them alike.
     ///
     /// # Errors
-    /// [`RasterError`] of the device that fails first.
+    /// [`RasterError`] of the first device that fails.
     pub fn run(
         &self,
         scene: &BenchScene,
@@ -126,7 +126,7 @@ impl RasterBench {
         devices: &[(&str, f64, Box<dyn LoadedScene + '_>)],
     ) -> Result<Vec<RasterCase>, RasterError> {
         let view = |turn: usize| &scene.views[turn % scene.views.len()];
-        // Warms up, and gives the counts.
+        // Warms up and gives the counts.
         let mut results = Vec::with_capacity(devices.len());
         for (_, _, device) in devices {
             let views = scene.views.iter().map(|view| device.weights(view, regions, WeightKind::Blend));
@@ -173,7 +173,7 @@ impl RasterBench {
         Ok(cases)
     }
 
-    /// Returns the views a second when `n_in_flight` threads each ask for the next view.
+    /// Returns views per second when each of `n_in_flight` threads requests one view after another.
     fn throughput(
         &self,
         scene: &BenchScene,
@@ -186,7 +186,7 @@ impl RasterBench {
         let started = OnceLock::new();
         let ask = || {
             let view = |turn: usize| &scene.views[turn % scene.views.len()];
-            // A device makes its buffers for so many views at the first.
+            // A device allocates buffers for concurrent views on first use.
             let first = device.weights(view(0), regions, WeightKind::Blend);
             warm.wait();
             first?;
@@ -211,7 +211,7 @@ impl RasterBench {
     }
 }
 
-/// Sums up the stages of all repeats, in the order in which they first came.
+/// Sums up the stages of all repeats, in order of first occurrence.
 fn shares(times: &[StageTime], n_repeats: usize) -> Vec<StageShare> {
     let mut stages: Vec<StageShare> = Vec::new();
     let total: f64 = times.iter().map(|time| time.ms).sum();
@@ -226,8 +226,8 @@ fn shares(times: &[StageTime], n_repeats: usize) -> Vec<StageShare> {
     stages
 }
 
-/// Returns how far the sums of views are from expected ones: absolute differences over all pairs
-/// that either has, relative to the sum of the expected.
+/// Returns the sum of absolute differences between found and expected contributions, over all (Gaussian, region) pairs of
+/// either, relative to the sum of the expected ones.
 fn relative_l1(found: &[ViewWeights], expected: &[ViewWeights]) -> f64 {
     let (mut off, mut total) = (0.0, 0.0);
     for (found, expected) in found.iter().zip(expected) {

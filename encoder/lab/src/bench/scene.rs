@@ -1,4 +1,4 @@
-//! Scenes to measure with: generated ones of any size, and recorded ones from a NumPy archive.
+//! Scenes for benchmarks: generated ones of any size, and recorded ones from a NumPy archive.
 
 use std::f64::consts::{PI, TAU};
 use std::path::Path;
@@ -18,29 +18,29 @@ const FIELD_OF_VIEW_RAD: f64 = 65.0 * PI / 180.0;
 const N_VIEWS: usize = 4;
 /// Objects on the ground of a generated scene.
 const N_OBJECTS: usize = 60;
-/// Radius of the ground; the backdrop stands on its edge.
+/// Radius of the ground. The backdrop stands on its edge.
 const GROUND_RADIUS_M: f64 = 20.0;
 /// Height of the backdrop.
 const BACKDROP_HEIGHT_M: f64 = 8.0;
-/// Standard deviation of a surface Gaussian in spacings, at the median: neighbours overlap.
+/// Median standard deviation of a surface Gaussian, in spacings: neighbours overlap.
 const SPREAD: f64 = 0.5;
 
 /// A scene and views of it.
 pub struct BenchScene {
-    /// What the figures are listed under.
+    /// Its name in reports.
     pub name: String,
     /// The Gaussians.
     pub gaussians: Gaussians,
-    /// Views, all of one image size; at least one.
+    /// Views of one image size; at least one.
     pub views: Vec<RasterView>,
 }
 
 impl BenchScene {
-    /// Makes a scene whose statistics are those of a trained one: ground, objects and a backdrop
-    /// covered with flat Gaussians that shrink as their number grows, denser towards the middle,
-    /// log-normal in size, of high and low opacity; a few large faint ones in the air. The views
-    /// stand among the objects. The same numbers give the same scene on every machine with the same
-    /// mathematical library.
+    /// Generates a scene with the statistics of a trained one.
+    ///
+    /// Flat Gaussians cover ground, objects and a backdrop; they shrink as their number grows, are denser towards the middle,
+    /// log-normal in size, and of high or low opacity. A few large faint Gaussians float in the air. The cameras stand among
+    /// the objects. Equal arguments give equal scenes on machines with the same mathematical library.
     pub fn generated(n_gaussians: usize, width_px: u32, height_px: u32) -> Self {
         let mut maker = Maker { random: Random::new(1), gaussians: Gaussians::default() };
         let share = |percent: usize| n_gaussians * percent / 100;
@@ -61,8 +61,8 @@ impl BenchScene {
         Self { name: format!("generated-{n_gaussians}"), gaussians: maker.gaussians, views }
     }
 
-    /// Reads `means quats scales opacities viewmats Ks width height` of a NumPy archive, as gsplat
-    /// takes them: quaternions `wxyz` of any length, decoded scales and opacities.
+    /// Reads the arrays `means quats scales opacities viewmats Ks width height` of a NumPy archive, in gsplat's conventions:
+    /// quaternions `wxyz` of any length, decoded scales and opacities.
     ///
     /// # Errors
     /// [`FixtureError`].
@@ -120,8 +120,8 @@ pub fn grid_regions(width_px: u32, height_px: u32, columns: u32, rows: u32) -> R
     RegionMap { width_px, height_px, region_of_pixel, n_regions: columns * rows }
 }
 
-/// Returns a map of cells with irregular borders: each pixel is of the nearest of `n_regions` sites,
-/// one site at a random place in each field of a grid.
+/// Returns a map of regions with irregular borders: each pixel belongs to the nearest of `n_regions` sites, one at a random
+/// place in each field of a grid.
 pub fn cell_regions(width_px: u32, height_px: u32, n_regions: u32) -> RegionMap {
     let (width, height) = (f64::from(width_px), f64::from(height_px));
     let columns = ((f64::from(n_regions) * width / height).sqrt().round() as u32).clamp(1, n_regions.max(1));
@@ -139,7 +139,7 @@ pub fn cell_regions(width_px: u32, height_px: u32, n_regions: u32) -> RegionMap 
         let fields = near(field.y, rows).flat_map(|r| near(field.x, columns).map(move |c| r * columns + c));
         let distance = |&site: &u32| sites[site as usize].distance_squared(centre);
         let nearest = fields.min_by(|a, b| distance(a).total_cmp(&distance(b))).unwrap_or(0);
-        // The last row of the grid may have more fields than there are regions left.
+        // The grid may have more fields than regions.
         nearest.min(n_regions - 1)
     };
     let region_of_pixel = (0..height_px).flat_map(|y| (0..width_px).map(move |x| region(x, y))).collect();
@@ -160,7 +160,7 @@ struct Maker {
 }
 
 impl Maker {
-    /// Covers the ground; the density falls as 1 / distance from the middle.
+    /// Covers the ground, with a density of 1 / distance from the middle.
     fn ground(&mut self, n: usize) {
         for _ in 0..n {
             let (radius, angle) = (GROUND_RADIUS_M * self.random.unit(), TAU * self.random.unit());
@@ -179,7 +179,7 @@ impl Maker {
         }
     }
 
-    /// Covers ellipsoids that stand on the ground, equally many Gaussians on each.
+    /// Covers ellipsoids on the ground with equal numbers of Gaussians.
     fn objects(&mut self, n: usize) {
         for object in 0..N_OBJECTS {
             let half = DVec3::from_array(std::array::from_fn(|_| 0.15 + 0.6 * self.random.unit().powi(2)));
@@ -197,7 +197,7 @@ impl Maker {
         }
     }
 
-    /// Adds large faint Gaussians in the air, as training leaves them.
+    /// Adds large faint Gaussians in the air, as training leaves behind.
     fn floating(&mut self, n: usize) {
         let spacing = (PI * GROUND_RADIUS_M.powi(2) * BACKDROP_HEIGHT_M / n.max(1) as f64).cbrt();
         for _ in 0..n {
@@ -212,7 +212,7 @@ impl Maker {
         }
     }
 
-    /// Adds a flat Gaussian on a surface whose Gaussians are `spacing` apart.
+    /// Adds a flat Gaussian to a surface with Gaussians `spacing` apart.
     fn surface(&mut self, position: DVec3, normal: DVec3, spacing: f64) {
         let size = SPREAD * spacing * (0.9 * self.random.normal()).exp();
         let long = (0.4 * self.random.normal()).exp();
@@ -256,7 +256,7 @@ mod tests {
             let found = CpuRasterizer.weights(&scene.gaussians, view, &regions, WeightKind::Blend).unwrap();
             let share_visible = found.counters.visible as f64 / 20_011.0;
             assert!((0.15..0.6).contains(&share_visible), "{share_visible}");
-            // Hardly any light passes: surfaces are closed.
+            // Surfaces are closed: hardly any light passes.
             let seen: f64 = found.entries.iter().map(|e| f64::from(e.weight)).sum();
             assert!(seen > 0.9 * 162.0 * 121.0 * 0.8, "{seen}");
         }
@@ -277,7 +277,7 @@ mod tests {
         );
     }
 
-    /// Writes the arrays of a scene of 2 Gaussians and 1 view, but for one array.
+    /// Writes the arrays of a scene with 2 Gaussians and 1 view, except one array.
     fn archive(without: &str) -> Vec<u8> {
         let mut bytes = Cursor::new(Vec::new());
         let mut npz = ZipWriter::new(&mut bytes);
@@ -347,7 +347,7 @@ mod tests {
             let mut bytes = whole.clone();
             bytes[at] ^= 0x2d;
             fs_err::write(&path, &bytes).unwrap();
-            // Not every byte is one that matters; none may be one that panics.
+            // Some bytes are ignored; none may cause a panic.
             let _ = BenchScene::read(&path);
         }
     }

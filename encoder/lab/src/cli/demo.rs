@@ -17,13 +17,13 @@ pub struct DemoArgs {
     /// Working folder; an earlier demo in it is deleted.
     #[arg(long, value_name = "DIR", default_value = "target/demo")]
     pub out: PathBuf,
-    /// Seed of house and yard.
+    /// Seed of room and yard.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
     /// Model runtime.
     #[command(flatten)]
     pub how: RunArgs,
-    /// Keeps the services running until ctrl-c, so that you can try queries.
+    /// Keeps the services running until ctrl-c, for queries of your own.
     #[arg(long)]
     pub keep: bool,
 }

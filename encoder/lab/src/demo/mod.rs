@@ -1,6 +1,7 @@
-//! The whole system in one run: generate, encode, serve, fetch as a robot would, ask, compare with the truth.
+//! The whole system in one run: generate, encode, serve, fetch as a robot does, ask, compare with the truth.
 
 mod answer;
+mod caption;
 mod picture;
 mod questions;
 
@@ -27,26 +28,26 @@ use slag_encoder::query;
 use slag_encoder::raster::CpuRasterizer;
 use slag_encoder::store::StoreReader;
 
-/// A house and a yard beside it.
+/// A room and a yard beside it.
 const KINDS: [SceneKind; 2] = [SceneKind::Room, SceneKind::Yard];
-/// Photos of both.
+/// Photos of both together.
 const N_VIEWS: u32 = 72;
-/// The robot stands in the yard, where this photo was taken.
+/// The photo in the yard that was taken where the robot stands.
 const ROBOT_VIEW: usize = 1;
-/// What the robot fetches around it: not all of the scene.
+/// Radius around the robot to fetch, less than the scene.
 const RADIUS_M: f64 = 9.0;
-/// How far an answer's centre may lie outside the true box: a mask's edge takes in some of what is behind.
+/// Distance by which a correct answer's centre may lie outside the true box: a mask's edge covers some background.
 const TOLERANCE_M: f64 = 0.25;
-/// Marks a folder as a demo's, which may be emptied.
+/// Marks a folder as a demo's, so that the next demo may empty it.
 const MARKER: &str = "demo.json";
 
 /// How to run the demo.
 pub struct DemoOptions {
     /// Folder to work in.
     pub out: PathBuf,
-    /// Chooses house and yard.
+    /// Seed of room and yard.
     pub seed: u64,
-    /// How models are run.
+    /// How models run.
     pub session: SessionOptions,
     /// The robot's program.
     pub edge: PathBuf,
@@ -56,41 +57,41 @@ pub struct DemoOptions {
 
 /// A finished demo.
 pub struct Demo {
-    /// What came of it.
+    /// Its report.
     pub report: DemoReport,
     edge: PathBuf,
     cache: PathBuf,
 }
 
-/// What came of a demo.
+/// The report of a demo.
 #[derive(Debug, Serialize)]
 pub struct DemoReport {
-    /// The answers, drawn; and a map of the scene from above, with its cells and what the robot fetched.
+    /// A picture of each answer, and a map of the scene from above with the cells that the robot fetched.
     pub pictures: [PathBuf; 2],
-    /// What the encode did.
+    /// Summary of the encode.
     pub encode: EncodeSummary,
     /// Bytes that the robot downloaded.
     pub downloaded_bytes: u64,
-    /// The model's own words about itself.
+    /// The model's description of itself.
     pub about_model: String,
-    /// The questions in turn.
+    /// The questions, in order.
     pub questions: Vec<Question>,
 }
 
 /// A question and its answer.
 #[derive(Debug, Serialize)]
 pub struct Question {
-    /// What was asked.
+    /// Its text.
     pub text: String,
     /// The best answer.
     pub answer: Option<EdgeAnswer>,
-    /// Why there is none.
+    /// Why there is no answer.
     pub reason: Option<serde_json::Value>,
-    /// What truly is there: name, and the middle of its box.
+    /// The things that it asks for: name, and centre of the box.
     pub truth: Vec<(String, DVec3)>,
-    /// Milliseconds, from the program's start to its end.
+    /// Milliseconds from the start of `slag-edge query` to its end.
     pub process_ms: f64,
-    /// Whether the answer is the truth.
+    /// Whether the answer is correct.
     pub right: bool,
 }
 
@@ -112,7 +113,7 @@ struct Tally {
 }
 
 impl DemoReport {
-    /// Returns whether every answer is the truth.
+    /// Returns whether every answer is correct.
     pub fn all_right(&self) -> bool {
         self.questions.iter().all(|q| q.right)
     }
@@ -131,7 +132,7 @@ impl Demo {
             shards.arg("serve").arg("--store").arg(store).spawn().context("cannot serve the store")?;
         println!("try: curl 'http://127.0.0.1:7734/query?text=chair'");
         let status = Command::new(&self.edge).arg("serve").arg("--cache").arg(&self.cache).status();
-        // It may have ended already, as ctrl-c reaches all.
+        // It may have ended already: ctrl-c reaches all processes of the terminal.
         let _ = shards.kill();
         let _ = shards.wait();
         status.with_context(|| format!("cannot start {}", self.edge.display()))?;
@@ -142,11 +143,11 @@ impl Demo {
 /// Runs the demo.
 ///
 /// # Errors
-/// Whatever step fails, with its name.
+/// The error of the step that failed, with the step's name.
 pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &AtomicBool) -> Result<Demo> {
     if !options.edge.is_file() {
         return Err(anyhow!(
-            "{} is not there; build it with: cargo build --release --bin slag-edge",
+            "{} does not exist; build it with: cargo build --release --bin slag-edge",
             options.edge.display()
         ));
     }
@@ -175,7 +176,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
     let (listens, listening) = tokio::sync::oneshot::channel();
     let serving = tokio::spawn(async move {
-        // Errors of the channels mean that the other end is gone: the demo failed and says why itself.
+        // A channel fails only if its other end is dropped: the demo has failed and reports why.
         let on_listening = |address| {
             let _ = listens.send(address);
         };
@@ -186,14 +187,14 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     });
     let Ok(address) = listening.await else {
         serving.await.context("serve")?.context("serve")?;
-        return Err(anyhow!("serve: ended before it listened"));
+        return Err(anyhow!("serve: ended before it listened on a port"));
     };
     let url = format!("http://{address}");
     let at = format!("{:.3},{:.3},{:.3}", robot_in_world.x, robot_in_world.y, robot_in_world.z);
     let radius = RADIUS_M.to_string();
     let fetch = ["fetch", "--from", &url, "--at", &at, "--radius", &radius];
     let fetched: FetchReply = edge(options, &cache, &fetch).context("fetch")?;
-    // From here on there is no network.
+    // The robot is offline from here on.
     let _ = stop.send(());
     serving.await.context("serve")?.context("serve")?;
 
@@ -229,7 +230,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     Ok(Demo { report, edge: options.edge.clone(), cache })
 }
 
-/// Draws what was found, from the full-precision scores of the store, and where it is.
+/// Draws the answers, from the full-precision scores of the store, and the map.
 fn draw(
     options: &DemoOptions,
     scene: &Scene,
@@ -243,7 +244,7 @@ fn draw(
     for question in questions {
         if let Some(answer) = &question.answer {
             let cosines = query::scores(&reader, &text.encode(&question.text)?)?.cosines;
-            panels.push(picture::Panel { answer, cosines, threshold });
+            panels.push(picture::Panel { question: &question.text, answer, cosines, threshold });
         }
     }
     let paths = ["answers.png", "map.png"].map(|name| options.out.join(name));
@@ -254,7 +255,7 @@ fn draw(
     Ok(paths)
 }
 
-/// Empties the folder of an earlier demo; refuses a folder that holds anything else.
+/// Empties the folder of an earlier demo; refuses a folder with other files.
 fn clear(out: &Path) -> Result<()> {
     if out.exists() {
         let foreign = fs_err::read_dir(out)?.next().is_some() && !out.join(MARKER).is_file();
@@ -269,7 +270,7 @@ fn clear(out: &Path) -> Result<()> {
     Ok(())
 }
 
-/// Runs the robot's program on its cache and reads what it prints.
+/// Runs the robot's program on its cache and parses its output.
 fn edge<T: for<'a> Deserialize<'a>>(options: &DemoOptions, cache: &Path, args: &[&str]) -> Result<T> {
     let mut command = Command::new(&options.edge);
     command
@@ -319,7 +320,7 @@ impl fmt::Display for DemoReport {
                 None => "nothing found".into(),
             };
             let truth = q.truth.iter().map(|(name, p)| format!("{name} at {:.2} {:.2} {:.2}", p.x, p.y, p.z));
-            let truth = truth.reduce(|a, b| a + ", " + &b).unwrap_or_else(|| "there is none".into());
+            let truth = truth.reduce(|a, b| a + ", " + &b).unwrap_or_else(|| "none".into());
             let right = if q.right { "yes" } else { "NO" };
             writeln!(f, "{:<24} {answer:<46} {:>7.0}  {right:<7} {truth}", q.text, q.process_ms)?;
         }

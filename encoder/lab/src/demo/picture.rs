@@ -1,4 +1,4 @@
-//! What the robot found, drawn: each answer's Gaussians in colour, the rest in grey; and all from above.
+//! Pictures of the answers: each answer's Gaussians in colour and the rest in grey, and a map from above.
 
 use glam::{DVec2, DVec3};
 use image::{RgbImage, imageops};
@@ -7,18 +7,21 @@ use slag_common::frames::Aabb;
 use slag_common::gaussians::SH_C0;
 
 use super::answer::EdgeAnswer;
+use super::caption;
 use crate::generate::to_image;
 use slag_encoder::raster::{CpuRasterizer, RasterError, RasterView, Rasterizer};
 
 /// Width of one panel.
 const PANEL_WIDTH_PX: u32 = 320;
-/// Views that are tried for a panel.
+/// Views tried for a panel.
 const N_CANDIDATES: usize = 8;
 /// Panels in a row.
 const COLUMNS: usize = 4;
 
 /// One question's part of the picture.
 pub(super) struct Panel<'a> {
+    /// The question, written across the top.
+    pub(super) question: &'a str,
     /// The best answer.
     pub(super) answer: &'a EdgeAnswer,
     /// Cosine of each Gaussian with the question; NaN where it has no embedding.
@@ -38,16 +41,13 @@ pub(super) fn answers(
 ) -> Result<RgbImage, RasterError> {
     let Some(first) = views.first() else { return Ok(RgbImage::new(1, 1)) };
     let size = first.intrinsics.scaled_to_width(PANEL_WIDTH_PX);
-    let n_centroids = panels.len().div_ceil(COLUMNS).max(1) as u32;
-    let mut picture = RgbImage::from_pixel(
-        size.width_px * COLUMNS as u32,
-        size.height_px * n_centroids,
-        image::Rgb([255; 3]),
-    );
+    let n_rows = panels.len().div_ceil(COLUMNS).max(1) as u32;
+    let mut picture =
+        RgbImage::from_pixel(size.width_px * COLUMNS as u32, size.height_px * n_rows, image::Rgb([255; 3]));
     for (i, panel) in panels.iter().enumerate() {
         let mut coloured = scene.clone();
         for (sh, cosine) in coloured.sh_dc.iter_mut().zip(&panel.cosines) {
-            // NaN compares false: what was never seen stays grey.
+            // NaN compares false: a Gaussian without an embedding stays grey.
             if *cosine >= panel.threshold {
                 continue;
             }
@@ -57,7 +57,8 @@ pub(super) fn answers(
         }
         let view = best_view(scene, views, panel)?;
         let view = RasterView { intrinsics: view.intrinsics.scaled_to_width(PANEL_WIDTH_PX), ..view };
-        let drawn = to_image(&CpuRasterizer.draw(&coloured, &view, [0.9; 3])?, &view);
+        let mut drawn = to_image(&CpuRasterizer.draw(&coloured, &view, [0.9; 3])?, &view);
+        caption::write(&mut drawn, panel.question);
         let (column, row) = (i % COLUMNS, i / COLUMNS);
         imageops::replace(
             &mut picture,
@@ -73,22 +74,22 @@ fn rgb_of(sh_dc: [f32; 3]) -> [f32; 3] {
     sh_dc.map(|c| 0.5 + SH_C0 * c)
 }
 
-/// BT.601.
+/// Returns the brightness of a colour (BT.601).
 fn luma([r, g, b]: [f32; 3]) -> f32 {
     0.299 * r + 0.587 * g + 0.114 * b
 }
 
-/// Returns the view that shows most of what was found, of those that have the answer nearest to their middle.
+/// Returns the view that shows the most matching pixels, of the views with the answer nearest to their middle.
 fn best_view(scene: &Gaussians, views: &[RasterView], panel: &Panel<'_>) -> Result<RasterView, RasterError> {
     let off_axis = |view: &RasterView| {
         let in_camera = view.camera_from_world.transform_point3(panel.answer.position_in_world);
-        // Nearer than this an object does not fit the picture.
+        // Nearer than this, an object does not fit into the picture.
         if in_camera.z < 1.5 { f64::INFINITY } else { in_camera.truncate().length() / in_camera.z }
     };
     let mut candidates: Vec<&RasterView> = views.iter().collect();
     candidates.sort_by(|a, b| off_axis(a).total_cmp(&off_axis(b)));
     candidates.truncate(N_CANDIDATES);
-    // White on black, so that brightness counts pixels; far things of the same kind count too little to matter.
+    // White on black, so that brightness counts pixels. Distant matches are small and hardly count.
     let mut found = scene.clone();
     for (sh, cosine) in found.sh_dc.iter_mut().zip(&panel.cosines) {
         *sh = [if *cosine >= panel.threshold { 0.5 } else { -0.5 } / SH_C0; 3];
@@ -108,15 +109,15 @@ fn best_view(scene: &Gaussians, views: &[RasterView], panel: &Panel<'_>) -> Resu
     Ok(*best.0)
 }
 
-/// Pixels of the map a metre.
+/// Pixels of the map per metre.
 const MAP_PX_PER_M: f64 = 48.0;
-/// What is higher, roofs and lamps, is not on the map.
+/// The map leaves out Gaussians above this height, such as ceilings and lamps.
 const MAP_HEIGHT_M: f64 = 2.2;
-/// Around what is on the map.
+/// Margin around the cells.
 const MARGIN_M: f64 = 0.5;
 
-/// Draws the scene from above: cells that the robot fetched in colour, with their borders; the others in grey; the
-/// circle around the robot, which stands at the cross; and where the answers are.
+/// Draws the scene from above: cells that the robot fetched in colour with their borders, other cells in grey, a
+/// cross at the robot with a circle of `radius_m` around it, and a small ring at each answer.
 pub(super) fn map(
     scene: &Gaussians,
     cells: &[Aabb],

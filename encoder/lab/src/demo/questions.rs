@@ -1,27 +1,27 @@
-//! What the demo asks: texts about what truly stands in the scene, and one about what does not.
+//! The demo's questions: about things in the scene, and about one thing that is absent.
 
 use glam::DVec3;
 
 use crate::generate::TrueObject;
 
-/// Things are asked for if so many pixels of the photos show them.
+/// Only things with at least this many pixels in the photos are asked for.
 const MIN_PIXELS: u64 = 12_000;
-/// Nowhere in any scene.
+/// A thing that no scene has.
 const ABSENT: &str = "an elephant";
 
-/// A text, and what would be a right answer.
+/// A question and its correct answers.
 pub(super) struct Asked<'a> {
     /// The text.
     pub(super) text: String,
-    /// The things of which it is true; none if the right answer is that there is nothing.
+    /// The things that it describes; empty if the correct answer is that nothing was found.
     pub(super) truth: Vec<&'a TrueObject>,
 }
 
-/// A way of asking.
+/// A form of question.
 struct Form {
-    /// Returns the text that asks for a thing so; `None` where the form does not fit it.
+    /// Returns the question about a thing; `None` where the form does not fit the thing.
     text: fn(&TrueObject) -> Option<String>,
-    /// Whether what asks for the first thing is true of the second.
+    /// Whether a question about the first thing also describes the second.
     is_true: fn(&TrueObject, &TrueObject) -> bool,
 }
 
@@ -31,7 +31,7 @@ const FORMS: [Form; 7] = [
         text: |o| Some(format!("{} {}", o.colours.first()?, o.category)),
         is_true: |a, b| same_noun(a, b) && a.colours.first() == b.colours.first(),
     },
-    // Another word for it.
+    // A synonym.
     Form {
         text: |o| o.words.iter().find(|word| **word != o.category).map(|word| format!("the {word}")),
         is_true: same_noun,
@@ -52,7 +52,7 @@ fn same_noun(a: &TrueObject, b: &TrueObject) -> bool {
     a.category == b.category
 }
 
-/// What it is for.
+/// Returns what a thing is used for.
 fn use_of(object: &TrueObject) -> Option<&String> {
     object.kinds.iter().find(|kind| kind.starts_with("something to"))
 }
@@ -65,13 +65,13 @@ fn adjective(material: &str) -> Option<&str> {
     }
 }
 
-/// Returns the plural where it is regular.
+/// Returns the plural of a noun that only takes an s.
 fn plural(noun: &str) -> Option<String> {
     (!noun.ends_with(['s', 'x', 'h', 'y', 'f'])).then(|| format!("{noun}s"))
 }
 
-/// Returns the questions about the things within `radius_m` of the robot: each form once, for the thing shown best
-/// of those that it fits and that were not asked for yet; then one without an answer.
+/// Returns questions about things within `radius_m` of the robot: one a form, about the thing with the most pixels among
+/// those that fit the form and were not asked for yet; then one without an answer.
 pub(super) fn questions(objects: &[TrueObject], robot_in_world: DVec3, radius_m: f64) -> Vec<Asked<'_>> {
     let mut left: Vec<&TrueObject> = objects
         .iter()

@@ -1,7 +1,7 @@
-//! How well an encoder tells generated things: every crop is asked which noun, colour and material it shows.
+//! Evaluates an encoder on crops of generated things: classification by noun, colour and material.
 //!
-//! The scenes' seeds decide what is seen: those of [`Split::Test`] are other shapes than were learnt from, in all
-//! pairs of noun and colour, also those that were kept from learning.
+//! Crops of [`Split::Test`] show shapes from other seeds than the training data, in all pairs of noun and colour, including
+//! those held out from training.
 
 use std::fmt;
 use std::path::Path;
@@ -18,58 +18,58 @@ use crate::generate::paint::{Colour, Material};
 use slag_encoder::progress::Progress;
 use slag_math::dot;
 
-/// A crop shows a whole thing if its mask is the true one and so much of it is not hidden.
+/// A crop shows a whole thing if its mask is the true one and more than this share of the thing is visible.
 const WHOLE: f64 = 0.6;
-/// Scenes whose crops are in memory at a time.
+/// Scenes with crops in memory at a time.
 const SCENES_AT_A_TIME: u64 = 16;
-/// Crops and texts that are timed.
+/// Timed crops and texts.
 const N_TIMED: usize = 64;
 
-/// Why an encoder could not be judged.
+/// Error of the evaluation.
 #[derive(Debug, thiserror::Error)]
 pub enum EncoderEvalError {
-    /// It does not open.
+    /// A model cannot be opened.
     #[error(transparent)]
     Model(#[from] ModelError),
-    /// It fails.
+    /// The encoder failed.
     #[error(transparent)]
     Encode(#[from] EncodeError),
-    /// The picture could not be written.
+    /// The picture cannot be written.
     #[error("{}: {source}", path.display())]
     Picture {
         /// The picture.
         path: std::path::PathBuf,
-        /// Why.
+        /// The reason.
         source: image::ImageError,
     },
-    /// No crop came of the scenes.
-    #[error("the scenes show nothing; ask for more with --n-scenes")]
+    /// The scenes gave no crops.
+    #[error("the scenes gave no crops; generate more with --n-scenes")]
     NoCrops,
 }
 
-/// Right answers over some crops.
+/// Correct answers over a set of crops.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Tally {
     /// Crops.
     pub n_crops: usize,
-    /// Of these, the best of all nouns is the right one.
+    /// Crops with the correct noun.
     pub noun: usize,
-    /// The best of all colours is the main one.
+    /// Crops with the correct main colour.
     pub colour: usize,
-    /// The best of all materials is the main one.
+    /// Crops with the correct main material.
     pub material: usize,
 }
 
-/// Right answers for a noun, over whole things.
+/// Correct answers for a noun, over whole things.
 #[derive(Clone, Debug, Serialize)]
 pub struct NounReport {
     /// The noun.
     pub noun: String,
     /// Its crops.
     pub n_crops: usize,
-    /// Of these, told rightly.
+    /// Crops with this noun as answer.
     pub n_right: usize,
-    /// What it is taken for most often otherwise, and how often.
+    /// Most frequent wrong answers, with their counts.
     pub taken_for: Vec<(String, usize)>,
 }
 
@@ -78,29 +78,29 @@ pub struct NounReport {
 pub struct EncoderReport {
     /// Its name.
     pub encoder: String,
-    /// Scenes, the first of which has seed `first_seed`.
+    /// Number of scenes.
     pub n_scenes: u64,
-    /// Seed of the first.
+    /// Seed of the first scene; the others follow.
     pub first_seed: u64,
-    /// Tallies by what crops show.
+    /// Tallies of several sets of crops, with their names.
     pub tallies: Vec<(String, Tally)>,
-    /// By noun.
+    /// Each noun.
     pub nouns: Vec<NounReport>,
-    /// Cosine from which something counts as found.
+    /// Lowest cosine of a match.
     pub threshold: Option<f32>,
-    /// Part of the crops whose noun is found.
+    /// Share of the crops that match their own noun.
     pub found: Option<f64>,
-    /// Part of the pairs of crop and another noun that are found.
+    /// Share of the pairs of crop and another noun that match.
     pub found_others: Option<f64>,
-    /// Part of the pairs of crop and a thing that is nowhere that are found.
+    /// Share of the pairs of crop and absent category that match.
     pub found_absent: Option<f64>,
-    /// Milliseconds a crop and a text with one thread, medians.
+    /// Median milliseconds per crop with one thread.
     pub ms_per_crop: f64,
-    /// See above.
+    /// Median milliseconds per text with one thread.
     pub ms_per_text: f64,
 }
 
-/// Judges an encoder on the crops of scenes.
+/// Evaluates an encoder on the crops of scenes.
 ///
 /// # Errors
 /// [`EncoderEvalError`].
@@ -113,8 +113,8 @@ pub fn evaluate(
     progress: &dyn Progress,
 ) -> Result<EncoderReport, EncoderEvalError> {
     let mut text = models.text_encoder(options)?;
-    let mut encode = |said: Vec<String>| -> Result<Vec<Vec<f32>>, EncoderEvalError> {
-        Ok(said.iter().map(|text_of| text.encode(text_of)).collect::<Result<_, _>>()?)
+    let mut encode = |texts: Vec<String>| -> Result<Vec<Vec<f32>>, EncoderEvalError> {
+        Ok(texts.iter().map(|content| text.encode(content)).collect::<Result<_, _>>()?)
     };
     let of_nouns = encode(nouns.iter().map(|noun| format!("a {}", noun.name)).collect())?;
     let of_colours = encode(Colour::ALL.iter().map(|c| format!("something {}", c.word())).collect())?;
@@ -177,10 +177,10 @@ pub fn evaluate(
     Ok(report)
 }
 
-/// A crop's label, and the noun, colour and material that score best.
+/// A crop's label, and its best noun, colour and material.
 type Seen = (Label, usize, usize, usize);
-/// Whether a crop is one of those that are counted together.
-type Group = fn(&Label) -> bool;
+/// Whether a crop belongs to a set.
+type IsIn = fn(&Label) -> bool;
 
 fn is_whole(label: &Label) -> bool {
     !label.cut && !label.segmented && label.shown > WHOLE
@@ -191,15 +191,15 @@ fn argmax(scores: impl Iterator<Item = f32>) -> usize {
 }
 
 fn tallies(seen: &[Seen]) -> Vec<(String, Tally)> {
-    let groups: [(&str, Group); 6] = [
+    let sets: [(&str, IsIn); 6] = [
         ("whole things", is_whole),
-        ("whole things, in pairs of noun and colour kept from learning", |l| is_whole(l) && l.held_out),
+        ("whole things, in held-out pairs of noun and colour", |l| is_whole(l) && l.held_out),
         ("cut or half hidden", |l| !l.segmented && !is_whole(l)),
         ("the graph segmenter's segments", |l| l.segmented),
-        ("all, in pairs kept from learning", |l| l.held_out),
+        ("all, in held-out pairs", |l| l.held_out),
         ("all", |_| true),
     ];
-    let tally = |is_in: Group| {
+    let tally = |is_in: IsIn| {
         let mut tally = Tally::default();
         for (label, noun, colour, material) in seen.iter().filter(|s| is_in(&s.0)) {
             tally.n_crops += 1;
@@ -209,10 +209,10 @@ fn tallies(seen: &[Seen]) -> Vec<(String, Tally)> {
         }
         tally
     };
-    groups.map(|(name, is_in)| (name.to_owned(), tally(is_in))).to_vec()
+    sets.map(|(name, is_in)| (name.to_owned(), tally(is_in))).to_vec()
 }
 
-/// Returns how often whole things of each noun are taken for each.
+/// Returns the confusion matrix over whole things: answers by true noun.
 fn confusion(seen: &[Seen], n_nouns: usize) -> Vec<Vec<usize>> {
     let mut counts = vec![vec![0; n_nouns]; n_nouns];
     seen.iter().filter(|s| is_whole(&s.0)).for_each(|(label, noun, ..)| counts[label.noun][*noun] += 1);
@@ -234,7 +234,7 @@ fn of_each_noun(seen: &[Seen], nouns: &[Noun]) -> Vec<NounReport> {
     counts.iter().enumerate().map(report).collect()
 }
 
-/// Draws the confusion: a row a noun, a column what it is taken for, in the nouns' order; darker is more often.
+/// Draws the confusion matrix: a row per true noun, a column per answer; darker is more frequent.
 fn picture(seen: &[Seen], n_nouns: usize) -> image::GrayImage {
     const EDGE_PX: u32 = 8;
     let counts = confusion(seen, n_nouns);
@@ -278,12 +278,12 @@ impl fmt::Display for EncoderReport {
         {
             writeln!(
                 f,
-                "\nabove the threshold {threshold:.3}: own noun {:.1} %, another {:.2} %, things that are nowhere {:.2} %",
+                "\nabove the threshold {threshold:.3}: own noun {:.1} %, another {:.2} %, absent categories {:.2} %",
                 100.0 * own,
                 100.0 * others,
                 100.0 * absent
             )?;
         }
-        writeln!(f, "{:.2} ms a crop, {:.2} ms a text, one thread", self.ms_per_crop, self.ms_per_text)
+        writeln!(f, "{:.2} ms per crop, {:.2} ms per text, one thread", self.ms_per_crop, self.ms_per_text)
     }
 }

@@ -43,10 +43,10 @@ pub enum EvalError {
         source: Box<EncodeError>,
     },
     /// No word is a category of the scene.
-    #[error("none of the words is a category of the labels; the categories are: {there}")]
+    #[error("none of the words is a category of the labels; the categories are: {categories}")]
     NoCategories {
         /// The categories.
-        there: String,
+        categories: String,
     },
 }
 

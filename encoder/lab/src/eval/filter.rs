@@ -14,7 +14,7 @@ pub enum Filter {
     Mean,
 }
 
-/// Gives all Gaussians of a superpoint the mean of their scores, NaN left out.
+/// Gives all Gaussians of a superpoint the mean of their scores, ignoring NaN.
 pub(super) fn average(scores: &mut [f32], superpoints: &Superpoints) {
     let mut sums = vec![(0.0f64, 0u32); superpoints.n];
     for (score, superpoint) in scores.iter().zip(&superpoints.of_gaussian) {
@@ -59,7 +59,7 @@ mod tests {
     }
 
     #[test]
-    fn means_leave_out_what_has_no_score_and_give_it_one() {
+    fn means_ignore_missing_scores_and_replace_them() {
         let mut scores = [0.2, 0.4, 1.0, f32::NAN, 0.5, 0.7, f32::NAN];
         average(&mut scores, &superpoints());
         let expected = [0.3, 0.3, 0.75, 0.3, 0.75, 0.7];

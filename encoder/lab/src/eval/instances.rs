@@ -97,8 +97,8 @@ mod tests {
     use super::*;
     use crate::eval::truth::Thing;
 
-    /// By hand: thing 7 (Gaussians 0..4) is object 0 but for one; thing 8 (4..8) is split between 1 and 2; thing 9 has
-    /// no Gaussian; 8..10 are wall, which object 2 has too.
+    /// By hand: thing 7 (Gaussians 0..4) is object 0 except for one Gaussian; thing 8 (4..8) is split between objects 1 and 2;
+    /// thing 9 has no Gaussians; 8..10 are wall, which object 2 includes.
     #[test]
     fn recall_by_hand() {
         let thing = |id: u16, category: &str| Thing {

@@ -1,4 +1,4 @@
-//! A store against a scene whose every Gaussian has a label.
+//! Evaluates a store against a scene with a label for every Gaussian.
 
 use std::collections::BTreeMap;
 
@@ -72,7 +72,7 @@ pub fn labelled(
         objects.iter().for_each(|objects| objects.overlay(&of_objects, &mut scores.cosines));
         Ok(Some((scores.cosines, of_objects)))
     };
-    let there = || all.iter().map(|(word, _)| word.as_str()).collect::<Vec<_>>().join(", ");
+    let categories = || all.iter().map(|(word, _)| word.as_str()).collect::<Vec<_>>().join(", ");
     for (word, ids) in &all {
         if !settings.words.is_empty() && !settings.words.contains(word) {
             continue;
@@ -96,12 +96,12 @@ pub fn labelled(
     let threshold = settings
         .threshold
         .unwrap_or_else(|| objects.as_ref().map_or(of_scene, |o| query::mixed(of_scene, of_object(o))));
-    let is_there = |word: &str| {
+    let is_present = |word: &str| {
         let things = truth.things.iter().chain(&truth.background);
         things.into_iter().any(|t| t.category.contains(word) || t.words.iter().any(|w| w.contains(word)))
     };
     let mut abstained = [0, 0];
-    for word in ABSENT.into_iter().filter(|word| !is_there(word)) {
+    for word in ABSENT.into_iter().filter(|word| !is_present(word)) {
         if let Some((cosines, _)) = score(word)? {
             let n = cosines.iter().filter(|c| **c >= threshold).count();
             abstained[0] += usize::from(n < MIN_ANSWER);
@@ -113,7 +113,7 @@ pub fn labelled(
             Some((first, source)) => {
                 EvalError::NoWords { n: unknown_words.len(), first, source: Box::new(source) }
             }
-            None => EvalError::NoCategories { there: there() },
+            None => EvalError::NoCategories { categories: categories() },
         });
     }
 
@@ -122,7 +122,7 @@ pub fn labelled(
         scores.iter_mut().for_each(|scores| filter::average(scores, superpoints));
     }
 
-    // Retrieval is judged on the Gaussians of things, argmax on those of the words' classes.
+    // Retrieval counts the Gaussians of all things; argmax only those of the queried categories.
     let class_of_id: BTreeMap<u16, usize> =
         classes.iter().enumerate().flat_map(|(c, (_, ids))| ids.iter().map(move |id| (*id, c))).collect();
     let thing_ids: Vec<u16> = truth.things.iter().map(|thing| thing.id).collect();
@@ -175,7 +175,7 @@ pub fn labelled(
     let mut words = Vec::new();
     for (c, (word, ids)) in classes.iter().enumerate() {
         let positive: Vec<bool> = of_things.iter().map(|i| class_of(*i) == Some(c)).collect();
-        // Without evidence a Gaussian ranks below all others.
+        // Gaussians without evidence rank below all others.
         let of_word: Vec<f32> =
             of_things.iter().map(|i| Some(scores[c][*i]).filter(|s| !s.is_nan()).unwrap_or(-2.0)).collect();
         let found = of_word.iter().map(|score| *score >= threshold);

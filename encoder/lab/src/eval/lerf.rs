@@ -4,11 +4,10 @@
 //! LABELS/frame_00041.json   labelme-like: info {name, width, height}, objects [{category, bbox, segmentation}]
 //! ```
 //!
-//! with `bbox` the corners `x1 y1 x2 y2` and `segmentation` a polygon of pixels, as LangSplat's
-//! `eval/evaluate_iou_loc.py` reads them; the frames' poses are those of the scene. Gaussians are selected in three
-//! dimensions and drawn alone, as OpenGaussian (Wu et al. 2024) does: a pixel is found where they hide more than
-//! `MIN_COVERAGE` of what is behind. A thing counts as localised where the scores' rendering, averaged over a square
-//! of `SMOOTHING_PX`, is best inside one of its boxes.
+//! `bbox` holds the corners `x1 y1 x2 y2` and `segmentation` a polygon of pixels, as in LangSplat's
+//! `eval/evaluate_iou_loc.py`; the frames' poses are those of the scene. Gaussians are selected in 3D and rendered alone, as
+//! OpenGaussian (Wu et al. 2024) does: a pixel is selected where their alpha exceeds `MIN_COVERAGE`. A thing is localised if
+//! the rendered scores, averaged over a square of `SMOOTHING_PX`, have their maximum inside one of its boxes.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -27,11 +26,11 @@ use slag_encoder::raster::constants::MAX_IMAGE_PX;
 use slag_encoder::raster::{LoadedScene, RasterError, RasterView, Rasterizer};
 use slag_encoder::store::StoreReader;
 
-/// Alpha from which a drawn pixel counts as found: OpenGaussian's `render_lerf_by_text.py`.
+/// Alpha above which a rendered pixel is selected, as in OpenGaussian's `render_lerf_by_text.py`.
 const MIN_COVERAGE: f32 = 0.7;
-/// Side of the square over which scores are averaged before the maximum is taken: LangSplat's.
+/// Side of the square for averaging scores before the maximum is taken, as in LangSplat.
 const SMOOTHING_PX: usize = 30;
-/// Widest difference of aspect between a label and its view.
+/// Largest relative difference between the aspect ratios of a label and its view.
 const MAX_ASPECT_ERROR: f64 = 0.01;
 
 /// Error in the labels.
@@ -45,7 +44,7 @@ pub enum LerfError {
     Label {
         /// The file.
         path: PathBuf,
-        /// What was found.
+        /// The problem.
         what: String,
     },
     /// The folder has no labels.
@@ -77,14 +76,14 @@ pub struct LabelledThing {
     pub boxes: Vec<[f64; 4]>,
 }
 
-/// A frame with its things.
+/// A labelled frame.
 #[derive(Clone, Debug)]
 pub struct LabelledFrame {
     /// Its name.
     pub name: String,
-    /// The camera, of the label's size.
+    /// The camera, at the label's size.
     pub view: RasterView,
-    /// The things, by category.
+    /// The things, one per category.
     pub things: Vec<LabelledThing>,
 }
 
@@ -132,7 +131,7 @@ enum Polygons {
 }
 
 impl LerfLabels {
-    /// Reads the labels of a scene whose views are `views`.
+    /// Reads the labels of a scene with these views.
     ///
     /// # Errors
     /// [`LerfError`].
@@ -206,7 +205,7 @@ impl LabelledFrame {
     }
 }
 
-/// Sets the pixels in or on a polygon of whole pixels (even-odd rule); corners are cut to whole ones as LangSplat does.
+/// Sets the pixels in or on a polygon by the even-odd rule; its corners are truncated to whole pixels, as in LangSplat.
 fn fill(polygon: &[[f64; 2]], [width, height]: [usize; 2], mask: &mut [bool]) {
     let corners: Vec<[i64; 2]> = polygon.iter().map(|corner| corner.map(|v| v as i32 as i64)).collect();
     let edges: Vec<_> = corners.iter().zip(corners.iter().cycle().skip(1)).collect();
@@ -223,7 +222,7 @@ fn fill(polygon: &[[f64; 2]], [width, height]: [usize; 2], mask: &mut [bool]) {
         let mut crossings = Vec::new();
         for ([x1, y1], [x2, y2]) in edges.iter().copied() {
             let at = |y: i64| *x1 as f64 + (x2 - x1) as f64 * (y - y1) as f64 / (y2 - y1) as f64;
-            // Half-open, so that a corner counts once; what lies on the border counts besides.
+            // Half-open, so that a corner counts once; pixels on the border are set separately.
             if (*y1 <= y) != (*y2 <= y) {
                 crossings.push(at(y));
             }
@@ -238,43 +237,43 @@ fn fill(polygon: &[[f64; 2]], [width, height]: [usize; 2], mask: &mut [bool]) {
     }
 }
 
-/// One thing on one frame.
+/// Figures of a thing on a frame.
 #[derive(Clone, Debug, Serialize)]
 pub struct ThingReport {
     /// The frame.
     pub frame: String,
     /// The thing.
     pub category: String,
-    /// Intersection over union of the drawn selection with its mask.
+    /// Intersection over union of the rendered selection and its mask.
     pub iou: f64,
-    /// Whether the best score lies in one of its boxes.
+    /// Whether the maximum score lies in one of its boxes.
     pub localised: bool,
 }
 
-/// What an evaluation found.
+/// Figures of an evaluation.
 #[derive(Clone, Debug, Serialize)]
 pub struct LerfReport {
     /// The store's encoder.
     pub encoder: String,
-    /// Score from which a Gaussian is selected.
+    /// Lowest score of a selected Gaussian.
     pub threshold: f32,
     /// Each thing on each frame.
     pub things: Vec<ThingReport>,
     /// Mean intersection over union.
     pub miou: Option<f64>,
-    /// Part of the things with an intersection over union above 0.25.
+    /// Share of the things with an intersection over union above 0.25.
     pub accuracy_at_25: Option<f64>,
-    /// The same above 0.5.
+    /// Share above 0.5.
     pub accuracy_at_50: Option<f64>,
-    /// Part of the things that are localised.
+    /// Share of the things that are localised.
     pub localised: Option<f64>,
     /// Categories that the encoder cannot encode, and why; their things count as not found.
     pub unknown_words: BTreeMap<String, String>,
-    /// Labelled frames without a pose: in no mean.
+    /// Labelled frames without a pose; left out of the means.
     pub frames_without_view: Vec<String>,
 }
 
-/// Evaluates a store against labels of frames. `scene`: the splat that was encoded.
+/// Evaluates a store against labels of frames. `scene` is the splat that was encoded.
 ///
 /// # Errors
 /// [`EvalError`].
@@ -328,9 +327,9 @@ pub fn lerf(
         return Err(EvalError::NoWords { n: unknown_words.len(), first, source: Box::new(source) });
     }
     if things.is_empty() {
-        let there: Vec<&str> =
+        let categories: Vec<&str> =
             labels.frames.iter().flat_map(|f| f.things.iter().map(|t| t.category.as_str())).collect();
-        return Err(EvalError::NoCategories { there: there.join(", ") });
+        return Err(EvalError::NoCategories { categories: categories.join(", ") });
     }
     let share =
         |test: &dyn Fn(&ThingReport) -> bool| mean(things.iter().map(|t| Some(f64::from(u8::from(test(t))))));
@@ -348,21 +347,21 @@ pub fn lerf(
 }
 
 fn n_words(things: &[ThingReport]) -> usize {
-    // Things of a word follow one another.
+    // Things of one word are adjacent.
     things.chunk_by(|a, b| a.category == b.category).count()
 }
 
-/// Returns the scene with only what is selected, and the scene with scores as colours.
+/// Returns the scene with only the selected Gaussians, and the scene with scores as colours.
 fn drawn(scene: &Gaussians, scores: &[f32], threshold: f32) -> (Gaussians, Gaussians) {
     let mut selected = scene.clone();
     selected.sh_degree = 0;
     selected.sh_rest.clear();
     let mut scored = selected.clone();
-    // Below what is ever drawn.
+    // Opacity 0 is never drawn.
     let hide =
         |(opacity, score): (&mut f32, &f32)| *opacity = if *score >= threshold { *opacity } else { 0.0 };
     selected.opacities.iter_mut().zip(scores).for_each(hide);
-    // What has no score is the opposite of the query; a colour must not be below 0.
+    // A Gaussian without a score counts as the opposite of the query. Scores become colours of 0 to 1, so none is clamped.
     let colour = |score: f32| (if score.is_nan() { -1.0 } else { score } + 1.0) / 2.0;
     scored.sh_dc.iter_mut().zip(scores).for_each(|(sh, score)| *sh = [(colour(*score) - 0.5) / SH_C0; 3]);
     (selected, scored)
@@ -388,7 +387,7 @@ fn judge(
     Ok(ThingReport { frame: frame.name.clone(), category: thing.category.clone(), iou, localised })
 }
 
-/// Returns the mean of what lies of a square around each pixel in the image, by sums over rectangles (Crow 1984).
+/// Returns the mean over a square around each pixel, clipped to the image, by a summed-area table (Crow 1984).
 fn box_mean(values: &[f32], width: usize, height: usize, side: usize) -> Vec<f64> {
     let mut sums = vec![0.0f64; (width + 1) * (height + 1)];
     for y in 0..height {
@@ -426,7 +425,7 @@ impl fmt::Display for LerfReport {
             show(self.localised)
         )?;
         for (word, reason) in &self.unknown_words {
-            writeln!(f, "counted as not found because the encoder does not know it: {word} ({reason})")?;
+            writeln!(f, "unknown to the encoder and counted as not found: {word} ({reason})")?;
         }
         for frame in &self.frames_without_view {
             writeln!(f, "left out without a pose: {frame}")?;
@@ -439,7 +438,7 @@ impl fmt::Display for LerfReport {
 mod tests {
     use super::*;
 
-    /// Oracle: for each pixel, its distance to every edge and the even-odd rule along a ray in another direction.
+    /// Oracle: each pixel's distance to every edge, and the even-odd rule along a ray in another direction.
     #[test]
     fn polygons_are_filled_with_their_border() {
         let size = [24, 18];

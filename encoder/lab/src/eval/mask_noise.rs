@@ -1,33 +1,33 @@
 //! Segmentation errors simulated on good masks, to measure how each method degrades with them.
 //!
-//! A mask is missed, merged with one that touches it, or split; its outline frays; its vector turns, as the vectors
-//! of one object do from view to view. The chance or extent of each error grows with the level. Every mask has its own
-//! random sequence, seeded by seed, view and index, so that results do not depend on threads or the order of views.
+//! A mask is missed, merged with a touching mask, or split; its outline frays; its vector turns, as the vectors of one
+//! object vary between views. The probability or extent of each error grows with the level. Every mask has its own random
+//! sequence, seeded by seed, view and index, so results do not depend on threads or the order of views.
 
 use slag_encoder::encode::Perturbation;
 use slag_encoder::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
 use slag_math::random::Xorshift;
 
-/// Chances of a mask, per level: SAM's automatic masks of indoor photos lie between levels 1 and 2 (they miss or
-/// break about one object in five; our estimate).
+/// Probabilities per level. SAM's automatic masks of indoor photos lie between levels 1 and 2: they miss or break about
+/// one object in five (our estimate).
 const MISSED: f64 = 0.05;
 const MERGED: f64 = 0.08;
 const SPLIT: f64 = 0.12;
-/// How far an outline frays per level, as a part of the square root of the mask's area.
+/// Extent of fraying per level, relative to the square root of the mask's area.
 const FRAYED: f64 = 0.03;
-/// How long a fray is, pixels.
+/// Length of a fray, pixels.
 const FRAY_PX: f64 = 8.0;
-/// How far a vector turns per level, radians: CLIP's vectors of one object from two views are about 0.4 apart.
+/// Angle by which a vector turns per level. CLIP's vectors of one object from two views are about 0.4 apart.
 const TURN_RAD: f64 = 0.2;
-/// Masks whose boxes are so near touch, pixels.
+/// Largest gap between the boxes of touching masks.
 const TOUCHING_PX: u32 = 3;
 
-/// How much is wrong with masks, and which of all ways to be.
+/// Level and seed of the simulated errors.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MaskNoise {
-    /// 0: nothing is, to 3: most are damaged.
+    /// From 0, no errors, to 3, most masks damaged.
     pub level: u8,
-    /// Chooses the errors.
+    /// Seed of the errors.
     pub seed: u64,
 }
 
@@ -52,7 +52,7 @@ impl MaskNoise {
         Xorshift::new(u64::from_le_bytes(bytes))
     }
 
-    /// Returns the masks of a view of `size_px` as they might have been found; at level 0 as they are.
+    /// Returns the damaged masks of a view of `size_px`; at level 0 the masks are unchanged.
     pub fn damaged(&self, view: &str, masks: Vec<Mask>, size_px: [u32; 2]) -> Vec<Mask> {
         if self.level == 0 {
             return masks;
@@ -90,7 +90,7 @@ impl MaskNoise {
         let (sine, cosine) = (TURN_RAD * f64::from(self.level)).sin_cos();
         for (i, vector) in vectors.chunks_exact_mut(dim).enumerate() {
             let mut random = self.random(view, "vector", i);
-            // A sum of four uniform values is nearly normal: no axis is preferred.
+            // A sum of four uniform values is nearly normal, so no axis is preferred.
             let normal = |_| (0..4).map(|_| random.signed()).sum::<f64>();
             let mut across: Vec<f64> = (0..dim).map(normal).collect();
             let along: f64 = across.iter().zip(&*vector).map(|(a, v)| a * f64::from(*v)).sum();
@@ -111,7 +111,7 @@ fn touch(a: &Mask, b: &Mask) -> bool {
     !apart(a.x0, a.x1, b.x0, b.x1) && !apart(a.y0, a.y1, b.y0, b.y1)
 }
 
-/// Returns the pixels of a box for which `inside` holds; `None` if there are none.
+/// Returns the mask of the pixels in a box that satisfy `inside`; `None` without any.
 fn mask_where(within: BoxPx, level: u8, inside: impl Fn(u32, u32) -> bool) -> Option<Mask> {
     let label = |x: u32, y: u32| if inside(x, y) { 0 } else { NO_REGION };
     let labels: Vec<u32> = (within.y0..within.y1)
@@ -135,7 +135,7 @@ fn union(a: &Mask, b: &Mask) -> Mask {
     mask_where(within, a.level, |x, y| a.contains(x, y) || b.contains(x, y)).unwrap_or_else(|| a.clone())
 }
 
-/// Cuts a mask along a line near its box's middle; the pieces that have pixels.
+/// Cuts a mask along a line near its box's middle and returns the pieces with pixels.
 fn split(mask: &Mask, random: &mut Xorshift) -> Vec<Mask> {
     let (sine, cosine) = random.between(0.0, std::f64::consts::PI).sin_cos();
     let BoxPx { x0, y0, .. } = mask.box_px;
@@ -161,7 +161,7 @@ fn frayed(mask: &Mask, extent: f64, size_px: [u32; 2], random: &mut Xorshift) ->
         x1: (x1 + margin_px).min(size_px[0]),
         y1: (y1 + margin_px).min(size_px[1]),
     };
-    // Each pixel looks elsewhere, by values of a coarse grid between which it lies.
+    // Each pixel is read from a place shifted by a bilinear interpolation of a coarse random grid.
     let columns = (f64::from(within.width_px()) / FRAY_PX) as usize + 2;
     let rows = (f64::from(within.height_px()) / FRAY_PX) as usize + 2;
     let grid: Vec<[f64; 2]> =
@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn level_0_changes_nothing_and_the_same_seed_and_view_damage_alike() {
+    fn level_0_changes_nothing_and_equal_seeds_and_views_give_equal_damage() {
         let noise = |level, seed| MaskNoise { level, seed };
         let damaged = |noise: MaskNoise, view| noise.damaged(view, discs(), [200, 150]);
         assert_eq!(damaged(noise(0, 1), "a"), discs());
@@ -219,9 +219,9 @@ mod tests {
         assert_ne!(damaged(noise(2, 1), "a"), damaged(noise(2, 1), "b"));
     }
 
-    /// Masks fit their boxes and counts, and are the further from the true ones, the higher the level.
+    /// Masks match their boxes and areas, and deviate more from the true masks with each level.
     #[test]
-    fn masks_are_whole_and_get_worse_with_the_level() {
+    fn masks_are_consistent_and_get_worse_with_the_level() {
         let mean_iou = |level: u8| {
             let found = MaskNoise { level, seed: 5 }.damaged("view", discs(), [200, 150]);
             for mask in &found {

@@ -19,8 +19,8 @@ pub fn area_under_roc(scores: &[f32], positive: &[bool]) -> Option<f64> {
     Some((sum - n_positive * (n_positive + 1.0) / 2.0) / (n_positive * n_negative))
 }
 
-/// Returns the average precision: precision at each step of recall, added up (as TREC and scikit-learn do);
-/// equal scores are one step. `None` without positives.
+/// Returns the average precision: the sum of precision over steps of recall, as in TREC and scikit-learn. Equal scores form
+/// one step. `None` without positives.
 pub fn average_precision(scores: &[f32], positive: &[bool]) -> Option<f64> {
     let n_positive = positive.iter().filter(|p| **p).count() as f64;
     if n_positive == 0.0 {
@@ -103,7 +103,7 @@ mod tests {
 
     /// Oracle: the definition, pair by pair.
     #[test]
-    fn roc_is_the_part_of_pairs_in_order() {
+    fn roc_is_the_share_of_ordered_pairs() {
         let scores = [0.9, 0.4, 0.4, 0.4, 0.1, 0.8, 0.1, -0.3];
         let positive = [true, true, false, true, false, false, true, false];
         let (mut right, mut n) = (0.0, 0.0);

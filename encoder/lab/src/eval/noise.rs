@@ -1,5 +1,5 @@
-//! Accuracy of each way to aggregate against errors in the masks. True masks are damaged ([`MaskNoise`]), encoded once per
-//! level of noise, and lifted once per way.
+//! Accuracy of each aggregation method against errors in the masks. True masks are damaged ([`MaskNoise`]), encoded once
+//! per level of noise, and lifted once per method.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -24,7 +24,7 @@ use slag_encoder::store::{StoreError, StoreReader};
 /// Error of the comparison.
 #[derive(Debug, thiserror::Error)]
 pub enum NoiseError {
-    /// A folder is no labelled scene.
+    /// A folder is not a labelled scene.
     #[error(
         "{}: no {missing}; expected a labelled scene: scene.ply or point_cloud.ply, transforms.json, gt/masks, \
          as `generate scene` writes it", dir.display()
@@ -50,10 +50,10 @@ pub enum NoiseError {
     /// The text model cannot be opened.
     #[error(transparent)]
     Model(#[from] ModelError),
-    /// A store cannot be judged.
+    /// A store cannot be evaluated.
     #[error(transparent)]
     Eval(#[from] EvalError),
-    /// A folder cannot be made.
+    /// A folder cannot be created.
     #[error(transparent)]
     Io(#[from] std::io::Error),
 }
@@ -63,34 +63,34 @@ pub enum NoiseError {
 pub struct NoiseSettings {
     /// Labelled scenes.
     pub scenes: Vec<PathBuf>,
-    /// Levels of noise; none: masks from the segmenter that `encode` names, as they are.
+    /// Levels of noise; if empty, masks come unchanged from the segmenter that `encode` names.
     pub levels: Vec<u8>,
-    /// Chooses the errors.
+    /// Seed of the errors.
     pub seed: u64,
-    /// Names and ways to aggregate.
+    /// Aggregation methods with their names.
     pub methods: Vec<(String, Aggregation)>,
-    /// Where the stores go; what views leave behind is found again there by a later run.
+    /// Folder for the stores; a later run reuses the views there.
     pub out: PathBuf,
-    /// Everything else; scene, views, masks, store and noise are set by the comparison.
+    /// All other settings; the comparison sets scene, views, masks and store.
     pub encode: EncodeSettings,
 }
 
-/// A scene's figures of one way at one level.
+/// Figures of one method on one scene at one level.
 #[derive(Clone, Debug, Serialize)]
 pub struct NoiseRow {
     /// The scene's folder name.
     pub scene: String,
-    /// Level of the errors; absent where masks are the segmenter's.
+    /// Level of the errors; absent for the segmenter's masks.
     pub level: Option<u8>,
-    /// Name of the way.
+    /// Name of the method.
     pub method: String,
     /// Mean intersection over union of the argmax over all categories.
     pub miou: Option<f64>,
-    /// Mean accuracy of it.
+    /// Mean accuracy of the same argmax.
     pub macc: Option<f64>,
     /// Mean average precision over words.
     pub average_precision: Option<f64>,
-    /// Seconds that refining took, and computing embeddings.
+    /// Seconds to refine and to compute embeddings.
     pub refine_secs: f64,
 }
 
@@ -99,15 +99,15 @@ pub struct NoiseRow {
 pub struct NoiseReport {
     /// The encoder.
     pub encoder: String,
-    /// Which errors.
+    /// Seed of the errors.
     pub seed: u64,
-    /// What was compared.
+    /// The methods.
     pub methods: Vec<(String, Aggregation)>,
-    /// All figures.
+    /// Figures of each scene, level and method.
     pub rows: Vec<NoiseRow>,
 }
 
-/// Makes the table; what it has so far is given to `on_row` row by row.
+/// Makes the table and passes each row to `on_row` once it is measured.
 ///
 /// # Errors
 /// [`NoiseError`].
@@ -125,15 +125,15 @@ pub fn run(
         false => settings.levels.iter().copied().map(Some).collect(),
     };
     for dir in &settings.scenes {
-        let there = |names: &[&'static str]| -> Result<PathBuf, NoiseError> {
+        let find = |names: &[&'static str]| -> Result<PathBuf, NoiseError> {
             let found = names.iter().map(|name| dir.join(name)).find(|path| path.exists());
             found.ok_or(NoiseError::NoScene { dir: dir.clone(), missing: names[0] })
         };
-        let (splat_path, views) = (there(&["scene.ply", "point_cloud.ply"])?, there(&["transforms.json"])?);
-        let masks = there(&["gt/masks"])?;
+        let (splat_path, views) = (find(&["scene.ply", "point_cloud.ply"])?, find(&["transforms.json"])?);
+        let masks = find(&["gt/masks"])?;
         let scene = splat::read(&splat_path, &splat::ReadOptions { with_sh_rest: false })?;
         let mut truth = Truth::read(dir, scene.len())?;
-        // Judged in space alone: drawing every word on every view would take most of the time.
+        // Evaluated in 3D only: rendering every word on every view would take most of the time.
         truth.views.clear();
         let name = dir.file_name().unwrap_or_default().to_string_lossy().into_owned();
         for level in &levels {
@@ -159,13 +159,13 @@ pub fn run(
                 let report =
                     labelled(&reader, &truth, &scene, &mut *text, &CpuRasterizer, &EvalSettings::default())?;
                 let secs = |stage: &str| summary.busy_secs.get(stage).copied().unwrap_or(0.0);
-                let whole = report.multi_class.first();
+                let all_classes = report.multi_class.first();
                 let row = NoiseRow {
                     scene: name.clone(),
                     level: *level,
                     method: method.clone(),
-                    miou: whole.and_then(|all| all.miou),
-                    macc: whole.and_then(|all| all.macc),
+                    miou: all_classes.and_then(|all| all.miou),
+                    macc: all_classes.and_then(|all| all.macc),
                     average_precision: report.mean_average_precision,
                     refine_secs: secs("refine") + secs("lift"),
                 };

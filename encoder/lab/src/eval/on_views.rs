@@ -28,10 +28,10 @@ pub(super) fn on_views(
     }
     let mut scored = scene.clone();
     // A Gaussian without a score counts as the opposite of the query. Scores become colours of 0 to 1, so none is clamped.
-    let lift = |score: f32| (if score.is_nan() { -1.0 } else { score } + 1.0) / 2.0;
+    let colour = |score: f32| (if score.is_nan() { -1.0 } else { score } + 1.0) / 2.0;
     scored.sh_degree = 0;
     scored.sh_rest.clear();
-    scored.sh_dc.iter_mut().zip(scores).for_each(|(sh, score)| *sh = [(lift(*score) - 0.5) / SH_C0; 3]);
+    scored.sh_dc.iter_mut().zip(scores).for_each(|(sh, score)| *sh = [(colour(*score) - 0.5) / SH_C0; 3]);
     for labelled in views {
         let on_thing: Vec<bool> = labelled.ids.iter().map(|id| ids.contains(id)).collect();
         if on_thing.iter().filter(|on| **on).count() < MIN_PIXELS {
@@ -45,7 +45,7 @@ pub(super) fn on_views(
         let rendered: Vec<f32> = drawing.rgb.chunks_exact(3).map(|rgb| rgb[0]).collect();
         let best = (0..rendered.len()).max_by(|a, b| rendered[*a].total_cmp(&rendered[*b]).then(b.cmp(a)));
         let hit = best.is_some_and(|best| on_thing[best]);
-        let above = rendered.iter().map(|value| *value >= lift(threshold));
+        let above = rendered.iter().map(|value| *value >= colour(threshold));
         let iou = iou_of_sets(above.zip(on_thing.iter().copied())).unwrap_or(0.0);
         found.push((f32::from(u8::from(hit)), iou));
     }

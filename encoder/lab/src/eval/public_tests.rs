@@ -1,4 +1,4 @@
-//! Public data sets' layouts, on a wall whose left half is red and whose right half is blue.
+//! Layouts of public data sets, on a wall that is red on the left and blue on the right.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -30,7 +30,7 @@ const COLUMNS: usize = 24;
 const ROWS: usize = 16;
 const PHOTO_PX: [u32; 2] = [320, 240];
 
-/// What is encoded once for all tests here.
+/// The encoded wall.
 struct Wall {
     dir: tempfile::TempDir,
     gaussians: Gaussians,
@@ -126,7 +126,7 @@ fn camera() -> Intrinsics {
     }
 }
 
-/// The built-in colours under other words.
+/// The built-in colour encoder with other words for its colours.
 struct Renamed(Box<dyn TextEncoder>, BTreeMap<&'static str, &'static str>);
 
 impl TextEncoder for Renamed {
@@ -160,8 +160,8 @@ fn label(dir: &Path, name: &str, size: [u32; 2], objects: &[Value]) {
     fs_err::write(dir.join(format!("{name}.json")), label.to_string()).expect("writes");
 }
 
-/// The wall's left half is red: a label that says so is met, one that says blue is not; a word that the encoder does
-/// not know is not found; a frame without a pose is named. Half of the labels are of photos twice as large.
+/// The wall's left half is red: the label "red" there is matched, the label "blue" is not. A word unknown to the encoder is
+/// not found, and a frame without a pose is named. One frame's labels are of a photo twice as large.
 #[test]
 fn lerf_labels_are_judged_on_their_frames() {
     let wall = Wall::new();
@@ -201,7 +201,7 @@ fn lerf_labels_are_judged_on_their_frames() {
     assert_eq!(report.unknown_words.keys().collect::<Vec<_>>(), ["chair"]);
     assert!(report.to_string().contains("left out without a pose: frame_00009"));
 
-    // Nothing can be asked: an error rather than a mean of nothing.
+    // No word can be encoded: an error rather than an empty mean.
     let only = EvalSettings { words: vec!["chair".into()], ..EvalSettings::default() };
     let judged = lerf(&wall.reader(), &labels, &wall.gaussians, &mut renamed(&[]), &CpuRasterizer, &only);
     assert!(matches!(judged, Err(EvalError::NoWords { n: 1, .. })));
@@ -229,7 +229,7 @@ fn wrong_lerf_labels_are_named() {
     assert!(message(&dir).contains("frame_00001.json") && message(&dir).contains("expected info"));
 }
 
-/// Vertices just in front of the wall: left wall, right floor; five far away; some that no class has.
+/// Vertices just in front of the wall: left half `wall`, right half `floor`; five far away; two of no class.
 fn vertices() -> Vec<([f64; 3], u16)> {
     let on_wall = (0..COLUMNS * ROWS).map(|i| {
         let (x, y) = ((i % COLUMNS) as f64 * 0.1 - 1.15, (i / COLUMNS) as f64 * 0.1 - 0.75);
@@ -250,7 +250,7 @@ fn write_mesh(path: &Path, rows: &[([f64; 3], u16)], with_labels: bool) {
     fs_err::write(path, text + "3 0 1 2\n").expect("writes");
 }
 
-/// By hand: all 192 + 192 vertices on the wall are right; five of the class wall are out of reach and count as wrong.
+/// By hand: all 192 + 192 vertices on the wall are correct; five of class `wall` are out of reach and count as wrong.
 #[test]
 fn scans_are_judged_by_the_protocol() {
     let wall = Wall::new();
@@ -279,7 +279,7 @@ fn scans_are_judged_by_the_protocol() {
     assert!(all.to_string().contains("the means differ from the protocol's: scene0000_00"), "{all}");
     assert!(all.to_string().contains("5 of 389 labelled vertices have no answer"), "{all}");
 
-    // Words the wrong way round: nothing is right.
+    // Swapped words: no answer is correct.
     let mut swapped = renamed(&[("wall", "blue"), ("floor", "red")]);
     let judged = scannet(&wall.reader(), &scan, &wall.gaussians, &mut swapped, Matching::Nearest, &settings);
     assert_eq!(judged.expect("judges").subsets[0].miou, Some(0.0));
@@ -287,7 +287,7 @@ fn scans_are_judged_by_the_protocol() {
         scannet(&wall.reader(), &scan, &wall.gaussians, &mut renamed(&[]), Matching::Nearest, &settings);
     assert!(matches!(none, Err(EvalError::NoWords { n: 19, .. })));
 
-    // One by one: only with as many vertices, and without the transparent ones.
+    // By index: needs equal numbers of vertices and Gaussians, and leaves out transparent Gaussians.
     let judged = scannet(&wall.reader(), &scan, &wall.gaussians, &mut encoder, Matching::Index, &settings);
     let message = judged.expect_err("another length").to_string();
     assert!(message.contains("391 vertices, the splat has 384 Gaussians"), "{message}");
@@ -319,7 +319,7 @@ fn segments_and_groups_give_the_labels() {
     fs_err::write(&table, "id\traw_category\tcategory\tnyu40id\n1\twall\twall\t1\n2\trug\trug\t2\n3\tx\n")
         .expect("writes");
     write_mesh(&name("_vh_clean_2.ply"), &rows, false);
-    // A segment a label: 11 for 1, 12 for 2, 48 for 38 (a group that the table lacks); 10 belongs to no group.
+    // One segment per label: 11 for 1, 12 for 2, 48 for 38 (a group that the table lacks); 10 belongs to no group.
     let segments: Vec<u16> = rows.iter().map(|(_, label)| label + 10).collect();
     fs_err::write(name("_vh_clean_2.0.010000.segs.json"), json!({"segIndices": segments[1..]}).to_string())
         .expect("writes");

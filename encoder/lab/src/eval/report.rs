@@ -51,7 +51,7 @@ pub struct Subset {
 pub struct EvalReport {
     /// The store's encoder.
     pub encoder: String,
-    /// Profile whose shards were scored; absent for the full field.
+    /// Profile of the scored shards; absent for the full field.
     pub profile: Option<Profile>,
     /// How the Gaussians of a superpoint answered together; absent where each answered for itself.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -62,7 +62,7 @@ pub struct EvalReport {
     pub by_mask_level: bool,
     /// Instance recall; only where objects were scored.
     pub instances: Option<InstanceReport>,
-    /// Score from which something counts as found.
+    /// Lowest score of a match.
     pub threshold: f32,
     /// Each word.
     pub words: Vec<WordReport>,

@@ -35,10 +35,10 @@ pub enum ScanError {
         /// The problem, the expectation and the remedy.
         what: String,
     },
-    /// Gaussians cannot be compared one by one.
+    /// Gaussians cannot be compared by index.
     #[error(
-        "{}: {n_vertices} vertices, the splat has {n_gaussians} Gaussians; only a splat that was trained with its \
-         Gaussians fixed to the vertices can be compared one by one; leave --by-index out", dir.display()
+        "{}: {n_vertices} vertices, the splat has {n_gaussians} Gaussians; --by-index needs a splat trained with its \
+         Gaussians fixed to the vertices; omit it", dir.display()
     )]
     Length {
         /// The scan's folder.
@@ -109,7 +109,7 @@ impl Scan {
         let rows = read_vertices(&path, ["x", "y", "z", "label"])?;
         if let Some(row) = rows.iter().find(|row| !(0.0..=f64::from(MAX_ID)).contains(&row[3])) {
             let what =
-                format!("label {}, expected 0 to {MAX_ID} (NYU40); take the file of the v2 release", row[3]);
+                format!("label {}, expected 0 to {MAX_ID} (NYU40); use the file of the v2 release", row[3]);
             return Err(ScanError::Wrong { path, what });
         }
         let (vertices, labels) = rows.iter().map(|[x, y, z, label]| ([*x, *y, *z], *label as u16)).unzip();
@@ -127,10 +127,10 @@ impl Scan {
         let vertices = read_vertices(&dir.join(format!("{name}_vh_clean_2.ply")), ["x", "y", "z"])?;
         let path = dir.join(format!("{name}_vh_clean_2.0.010000.segs.json"));
         let segments: Segments = serde_json::from_slice(&fs_err::read(&path)?)
-            .map_err(|error| wrong(&path, format!("{error}; expected segIndices, one a vertex")))?;
+            .map_err(|error| wrong(&path, format!("{error}; expected segIndices, one per vertex")))?;
         if segments.of_vertex.len() != vertices.len() {
             let what = format!(
-                "{} segments, expected one for each of {} vertices; take both files of one release",
+                "{} segments, expected one for each of {} vertices; use both files of one release",
                 segments.of_vertex.len(),
                 vertices.len()
             );

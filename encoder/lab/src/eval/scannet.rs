@@ -1,9 +1,9 @@
 //! ScanNet v2 (Dai et al. 2017) with the protocol of OpenGaussian (Wu et al. 2024): ten scenes, 19, 15 and 10 classes,
 //! argmax over the classes' words, means over the classes that a scene has.
 //!
-//! OpenGaussian trains with Gaussians fixed to the mesh's vertices and compares one by one; other splats give each
-//! vertex the answer of the nearest Gaussian. Gaussians with an opacity below `MIN_OPACITY` do not count there, as in
-//! its `scripts/eval_scannet.py`.
+//! OpenGaussian trains with Gaussians fixed to the mesh's vertices and compares by index; for other splats, the nearest
+//! Gaussian answers for a vertex. Gaussians with an opacity below `MIN_OPACITY` do not count, as in its
+//! `scripts/eval_scannet.py`.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fmt;
@@ -63,6 +63,7 @@ const IDS_OF_10: [u16; 10] = [1, 2, 4, 5, 6, 7, 8, 9, 10, 33];
 const MIN_OPACITY: f32 = 0.1;
 /// Farther from every Gaussian, a vertex has no answer.
 const MAX_DISTANCE_M: f64 = 0.1;
+
 /// The Gaussian that answers for a vertex.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Matching {
@@ -162,13 +163,13 @@ pub fn scannet(
             });
             confusion.count(truth, answer.map(|(class, _)| class));
         }
-        // As the protocol: means over what the scene has.
-        let there: Vec<usize> =
+        // The protocol takes means over the classes of the scene.
+        let present: Vec<usize> =
             classes.into_iter().filter(|class| confusion.accuracy(*class).is_some()).collect();
         Subset {
-            n_classes: there.len(),
-            miou: mean(there.iter().map(|class| confusion.iou(*class))),
-            macc: mean(there.iter().map(|class| confusion.accuracy(*class))),
+            n_classes: present.len(),
+            miou: mean(present.iter().map(|class| confusion.iou(*class))),
+            macc: mean(present.iter().map(|class| confusion.accuracy(*class))),
         }
     });
     let counted = scan.labels.iter().zip(&gaussian_of).filter(|(label, _)| ids_of_19.contains(label));
@@ -186,14 +187,14 @@ pub fn scannet(
     })
 }
 
-/// Who answers for a vertex.
+/// The answer's source for a vertex.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Answerer {
     /// A Gaussian.
     Gaussian(usize),
-    /// Nobody, which is wrong.
-    Nobody,
-    /// The vertex is left out.
+    /// None is near; the vertex counts as wrong.
+    None,
+    /// The Gaussian is too transparent; the vertex is left out.
     LeftOut,
 }
 
@@ -202,7 +203,7 @@ impl Answerer {
     fn counted(self) -> Option<Option<usize>> {
         match self {
             Self::Gaussian(gaussian) => Some(Some(gaussian)),
-            Self::Nobody => Some(None),
+            Self::None => Some(None),
             Self::LeftOut => None,
         }
     }
@@ -222,7 +223,7 @@ fn by_index(scan: &Scan, scene: &Gaussians) -> Result<Vec<Answerer>, ScanError> 
 
 fn by_distance(scan: &Scan, scene: &Gaussians) -> Vec<Answerer> {
     let counts = |k: &usize| scene.is_usable(*k) && scene.opacities[*k] >= MIN_OPACITY;
-    // Cubes as wide as the reach: what is near enough lies in a vertex's own or in one that touches it.
+    // Cubes of edge MAX_DISTANCE_M: a Gaussian within reach lies in the vertex's own cube or in a neighbouring one.
     let cube_of = |point: DVec3| (point / MAX_DISTANCE_M).floor().to_array().map(|v| v as i64);
     let mut cubes: HashMap<[i64; 3], Vec<usize>> = HashMap::new();
     for k in (0..scene.len()).filter(counts) {
@@ -237,11 +238,11 @@ fn by_distance(scan: &Scan, scene: &Gaussians) -> Vec<Answerer> {
             cubes.get(&[x.saturating_add(dx), y.saturating_add(dy), z.saturating_add(dz)])
         });
         let distances = near.flatten().map(|k| (scene.means_in_world[*k].distance_squared(vertex), *k));
-        // Of equally near ones the first.
+        // Ties are broken by index.
         let (distance2, k) = distances.min_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)))?;
         (distance2 <= MAX_DISTANCE_M * MAX_DISTANCE_M).then_some(k)
     };
-    scan.vertices.iter().map(|vertex| nearest(vertex).map_or(Answerer::Nobody, Answerer::Gaussian)).collect()
+    scan.vertices.iter().map(|vertex| nearest(vertex).map_or(Answerer::None, Answerer::Gaussian)).collect()
 }
 
 impl ScannetReport {
@@ -285,12 +286,16 @@ impl fmt::Display for ScannetReport {
             for (label, n) in &scene.unknown_labels {
                 writeln!(
                     f,
-                    "{}: {n} vertices left out: the table of categories has no {label:?}",
+                    "{}: {n} vertices left out: the table of categories lacks {label:?}",
                     scene.scene
                 )?;
             }
             for (word, reason) in &scene.unknown_words {
-                writeln!(f, "{}: counted as never found: {word} ({reason})", scene.scene)?;
+                writeln!(
+                    f,
+                    "{}: unknown to the encoder and counted as never found: {word} ({reason})",
+                    scene.scene
+                )?;
             }
         }
         if !self.missing_scenes.is_empty() {

@@ -1,4 +1,4 @@
-//! What to evaluate.
+//! Settings of an evaluation.
 
 use clap::ValueEnum;
 use serde::Serialize;
@@ -16,16 +16,16 @@ pub enum EvalKind {
     Objects,
 }
 
-/// What to evaluate.
+/// Settings of an evaluation.
 #[derive(Clone, Debug, Default)]
 pub struct EvalSettings {
     /// Words to query; all categories of the labels if empty.
     pub words: Vec<String>,
     /// Scores this profile's shards instead of the full field.
     pub profile: Option<Profile>,
-    /// Score from which something counts as found; the store's own by default.
+    /// Lowest score of a match; the store's own by default.
     pub threshold: Option<f32>,
-    /// How the Gaussians of a superpoint of colour and shape answer together.
+    /// How the Gaussians of a superpoint (of colour and shape) agree on an answer.
     pub filter: Option<Filter>,
     /// What is scored; by default objects, where the scene has them.
     pub kind: Option<EvalKind>,

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! DIR/gt/instances.json           things: id, category, aabb_min, aabb_max; "background": floors and walls
-//! DIR/gt/gaussian_instance.npy    u16 [N]: the id of the thing that each Gaussian of the splat belongs to
+//! DIR/gt/gaussian_instance.npy    u16 [N]: the id of each Gaussian's thing
 //! DIR/gt/test_masks/NAME.png      ids at each pixel of the test view NAME
 //! DIR/test/transforms.json        the test views' poses
 //! ```
@@ -65,7 +65,7 @@ pub struct Thing {
     /// Largest corner.
     #[serde(default)]
     pub aabb_max: Option<DVec3>,
-    /// Other words for it.
+    /// Its synonyms.
     #[serde(default)]
     pub words: Vec<String>,
 }
@@ -75,7 +75,7 @@ pub struct Thing {
 pub struct Truth {
     /// The things, without floors and walls.
     pub things: Vec<Thing>,
-    /// Floors, walls and the like.
+    /// Floors, walls and other background.
     pub background: Vec<Thing>,
     /// `[N]`: the id of each Gaussian's thing; an id without a thing where there is none.
     pub id_of_gaussian: Vec<u16>,

@@ -1,4 +1,4 @@
-//! Scenes: which things stand where, seen from where.
+//! Layout of a scene: poses of things, light, and cameras.
 
 use glam::{DAffine3, DMat3, DVec2, DVec3};
 use slag_common::frames::Aabb;
@@ -18,11 +18,11 @@ pub(super) const PHOTO_PX: [u32; 2] = [640, 480];
 pub(super) const FIELD_OF_VIEW_RAD: f64 = 75.0 * std::f64::consts::PI / 180.0;
 /// Height of a walking camera over the ground.
 const CAMERA_HEIGHT_M: f64 = 1.5;
-/// Between things on the ground, so that one can walk around them.
+/// Gap between things on the ground, so that cameras can walk around them.
 const GAP_M: f64 = 0.3;
-/// Nearer to a thing no camera stands.
+/// Smallest distance between a camera and a thing.
 const CAMERA_CLEARANCE_M: f64 = 0.35;
-/// Places tried for a thing before the scene goes without it.
+/// Poses tried for a thing before it is left out.
 const N_TRIES: usize = 30;
 /// Thickness of walls and ground.
 const SHELL_M: f64 = 0.04;
@@ -32,13 +32,13 @@ const SHELL_M: f64 = 0.04;
 pub struct Placed {
     /// Index of its noun.
     pub noun: usize,
-    /// What it is made of.
+    /// Its parts, colours and paint.
     pub object: Object,
-    /// Where it stands.
+    /// Its pose.
     pub world_from_object: DAffine3,
     /// The box around it.
     pub bounds: Aabb,
-    /// Whether it is floor, wall or the like.
+    /// Whether it belongs to the scene's shell, such as floor and walls.
     pub shell: bool,
 }
 
@@ -51,7 +51,7 @@ struct Area {
     height_m: f64,
 }
 
-/// Things, light and where to walk.
+/// Things, light and areas to walk.
 #[derive(Clone, Debug)]
 pub struct Layout {
     /// The things.
@@ -62,11 +62,11 @@ pub struct Layout {
     tint: [f64; 3],
 }
 
-/// Chooses the colours that a noun's things may have.
+/// Returns whether a noun's things may have a colour.
 pub type Colours<'a> = &'a dyn Fn(&Noun, Colour) -> bool;
 
 impl Layout {
-    /// Furnishes scenes, one beside the other along x. The same seed gives the same layout.
+    /// Furnishes scenes side by side along x. Equal seeds give equal layouts.
     pub fn new(kinds: &[SceneKind], seed: u64, nouns: &[Noun], colours: Colours<'_>) -> Self {
         let mut random = Xorshift::new(seed);
         let outdoors = kinds.iter().any(|kind| *kind != SceneKind::Room);
@@ -102,14 +102,14 @@ impl Layout {
                 first.corner + first.size * DVec2::new(random.between(0.3, 0.7), random.between(0.3, 0.7));
             Light::Lamp(at.extend(first.height_m - 0.15))
         };
-        // Under a roof the sun sees nothing.
+        // No sunlight gets under the roof, so a room needs more ambient light.
         if outdoors && kinds.contains(&SceneKind::Room) {
             layout.ambient = 0.75;
         }
         layout
     }
 
-    /// Furnishes a scene to learn from: its kind is the seed's too, each as often.
+    /// Furnishes a training scene. Consecutive seeds cycle through the kinds.
     pub fn of_any_kind(seed: u64, nouns: &[Noun], colours: Colours<'_>) -> Self {
         let kinds = [SceneKind::Room, SceneKind::Yard, SceneKind::Street];
         Self::new(&[kinds[(seed % 3) as usize]], seed, nouns, colours)
@@ -161,7 +161,7 @@ impl Layout {
         self.placed.push(Placed { noun, object, world_from_object, bounds, shell });
     }
 
-    /// Returns a pose to try.
+    /// Returns a pose to try; `None` if there is no such place.
     fn propose(
         &self,
         area: &Area,
@@ -177,7 +177,7 @@ impl Layout {
         let pi = std::f64::consts::PI;
         Some(match place {
             Place::Wall | Place::Hung => {
-                // Quarter turns; the back, -y, goes to the wall.
+                // Quarter turns, with the back (-y) to the wall.
                 let side = random.below(4);
                 let back_m = -own.min.y + SHELL_M + if place == Place::Hung { 0.0 } else { 0.02 };
                 let along = [random.between(low.x, high.x), random.between(low.y, high.y)];
@@ -214,7 +214,7 @@ impl Layout {
                 let (below, top) = *random.pick(&tops);
                 let half = [0, 1].map(|i| top.size_m[i] / 2.0 - own.size()[i] / 2.0);
                 if half.iter().any(|h| *h < 0.0) {
-                    // Turned around or on another top it may fit.
+                    // Too large for this top, but another try may pick a larger one.
                     return Some(around_z(0.0, DVec3::splat(f64::MAX)));
                 }
                 let at = DVec3::new(half[0] * random.signed(), half[1] * random.signed(), top.z_m);
@@ -230,7 +230,7 @@ impl Layout {
             _ => DVec3::splat(0.02),
         };
         self.placed.iter().filter(|p| !p.shell).all(|p| {
-            // What stands on something touches it.
+            // A thing touches the top it stands on.
             let slack = if place == Place::On { DVec3::new(0.0, 0.0, -0.03) } else { DVec3::ZERO };
             let (low, high) = (bounds.min - gap - slack, bounds.max + gap);
             low.cmpgt(p.bounds.max).any() || p.bounds.min.cmpgt(high).any()
@@ -249,8 +249,8 @@ impl Layout {
             && self.placed.iter().filter(|p| !p.shell).all(|p| p.bounds.distance_to(at) > CAMERA_CLEARANCE_M)
     }
 
-    /// Returns cameras on an oval walk through each area, looking outwards and across in turn; `start`: where
-    /// on the oval the first stands, in steps between cameras.
+    /// Returns cameras on an oval walk through each area, which look outwards and across in turn. The first stands `start`
+    /// steps along the oval.
     pub fn walk(&self, n_views: u32, start: f64, intrinsics: Intrinsics) -> Vec<RasterView> {
         let n_areas = self.areas.len() as u32;
         (0..n_views)
@@ -261,7 +261,7 @@ impl Layout {
                 let middle = area.corner + area.size / 2.0;
                 let mut angle = std::f64::consts::TAU * (f64::from(i) + start) / f64::from(n);
                 let mut away = if across { 0.36 } else { 0.14 };
-                // Around what stands in the way.
+                // Moves on where a thing is in the way.
                 for _ in 0..60 {
                     let direction = DVec2::new(angle.cos(), angle.sin());
                     if self.is_walkable((middle + direction * area.size * away).extend(CAMERA_HEIGHT_M)) {
@@ -287,7 +287,7 @@ impl Area {
             && bounds.max.z <= if self.kind == SceneKind::Room { self.height_m } else { f64::INFINITY }
     }
 
-    /// Returns the parts of floor, walls and the like.
+    /// Returns the parts of a shell noun, such as floor or walls.
     fn shell(&self, name: &str, object: &Object) -> Vec<Part> {
         let (middle, size) = (self.corner + self.size / 2.0, self.size);
         let slab = |centre: DVec3, size: DVec3| Part {

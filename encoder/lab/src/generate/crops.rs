@@ -1,4 +1,4 @@
-//! Crops of generated things with the words that are true of them: what the embedded encoder learns from.
+//! Labelled crops of generated things: training data of the embedded encoder.
 
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
@@ -23,31 +23,31 @@ use slag_encoder::raster::RasterView;
 use slag_encoder::segment::{GraphSegmenter, SegmentInput, Segmenter};
 use slag_math::random::Xorshift;
 
-/// Photos that crops are taken from: their edge.
+/// Edge of the photos to take crops from.
 const PHOTO_PX: u32 = 208;
-/// Photos of a scene.
+/// Photos per scene.
 const N_PHOTOS: usize = 14;
-/// Masks with fewer pixels are no crops, as with `encode`.
+/// Masks with fewer pixels are ignored, as in `encode`.
 const MIN_MASK_PX: u32 = 200;
-/// A crop shows at least this part of what it would show if nothing stood before it.
+/// Smallest visible share of a cropped thing.
 const MIN_SHOWN: f64 = 0.3;
-/// Of a segment's pixels, at least this part shows the thing that it is labelled with,
+/// Smallest share of a segment's pixels that show its thing.
 const MIN_PURITY: f64 = 0.8;
-/// and of the pixels that show the thing, at least this part is in the segment.
+/// Smallest share of a thing's pixels in its segment.
 const MIN_COVERED: f64 = 0.2;
-/// Of the pairs of noun and colour, one in so many is kept for the test.
+/// One in this many pairs of noun and colour is held out for testing.
 const HELD_OUT_OF: u64 = 7;
 
-/// Which crops to make.
+/// Crops for training or for testing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Split {
-    /// To learn from.
+    /// For training.
     Train,
-    /// Things of other seeds, in all pairs of noun and colour: those to learn from, and those never seen.
+    /// For testing: all pairs of noun and colour, including those held out from training.
     Test,
 }
 
-/// What is true of a crop.
+/// Label of a crop.
 #[derive(Clone, Debug, Serialize)]
 pub struct Label {
     /// Index of its noun.
@@ -56,32 +56,33 @@ pub struct Label {
     pub colour: Colour,
     /// Main material.
     pub material: Material,
-    /// Whether noun and colour are a pair that is not learnt from.
+    /// Whether the pair of noun and colour is held out from training.
     pub held_out: bool,
     /// Height divided by the larger horizontal edge.
     pub slenderness: f64,
     /// Pixels of the mask.
     pub area_px: u32,
-    /// The part of it that is not hidden.
+    /// Visible share of the thing.
     pub shown: f64,
-    /// Whether the mask is a piece of the true one.
+    /// Whether the mask is a part of the true one.
     pub cut: bool,
-    /// Whether the mask is of the segmenter, not the true one.
+    /// Whether the mask is the segmenter's instead of the true one.
     pub segmented: bool,
 }
 
-/// Returns whether a pair of noun and colour is kept for the test; by its words, so that new nouns change nothing.
+/// Returns whether a pair of noun and colour is held out for testing; a hash of its words decides, so new nouns do not
+/// affect other pairs.
 pub fn is_held_out(noun: &Noun, colour: Colour) -> bool {
     // FNV-1a (Fowler, Noll, Vo).
     let words = noun.name.bytes().chain(colour.word().bytes());
     let hash =
         words.fold(0xcbf2_9ce4_8422_2325, |h: u64, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3));
-    // What has one or two colours only cannot spare any.
+    // A noun with few colours cannot spare any.
     noun.colours().len() > 3 && (hash >> 32) % HELD_OUT_OF == 0
 }
 
-/// Writes crops of `n_scenes` scenes: `crops.npy` (u8 `[n][edge][edge][3]`, as the encoder takes them, white
-/// outside the mask), `labels.json` (a [`Label`] each) and `nouns.json` (the words).
+/// Writes crops of the scenes of some seeds: `crops.npy` (u8 `[n][edge][edge][3]`, the encoder's input, white outside the
+/// mask), `labels.json` (a [`Label`] per crop) and `nouns.json` (their words). Returns the number of crops.
 ///
 /// # Errors
 /// [`GenerateError`].
@@ -136,7 +137,7 @@ pub(crate) fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(Crop, Label
         let Some(view) = look_at_something(&layout, &solids, &mut random) else { continue };
         let photo = solids.photo(&view);
         let things = masks_of(&photo);
-        // A third of the photos is cut up as a newcomer's are: by the segmenter that needs no model.
+        // For a third of the photos, the masks come from the segmenter that needs no model.
         let segmented = random.below(3) == 0;
         let masks = if segmented { segments_of(&photo, &view, &things) } else { things.clone() };
         for (thing, mask) in masks {
@@ -145,12 +146,12 @@ pub(crate) fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(Crop, Label
             if mask.area_px < MIN_MASK_PX || (shown < MIN_SHOWN && !placed.shell && !segmented) {
                 continue;
             }
-            // Floors and walls are on every photo.
+            // Every photo shows floor and walls; most of them are skipped.
             if placed.shell && random.below(4) != 0 {
                 continue;
             }
             let cut = !segmented && random.below(4) == 0;
-            let mask = if cut { spoilt(&mask, &mut random) } else { mask };
+            let mask = if cut { cut_mask(&mask, &mut random) } else { mask };
             let Some(crop) = embed::crop(&photo.image, &mask, Background::White) else { continue };
             let size = placed.bounds.size();
             let label = Label {
@@ -170,7 +171,7 @@ pub(crate) fn crops(split: Split, nouns: &[Noun], seed: u64) -> Vec<(Crop, Label
     out
 }
 
-/// Returns a view of a thing from somewhere around it.
+/// Returns a view of a random thing from a random direction.
 fn look_at_something(layout: &Layout, solids: &Solids, random: &mut Xorshift) -> Option<RasterView> {
     let things: Vec<usize> = (0..layout.placed.len()).filter(|i| !layout.placed[*i].shell).collect();
     if things.is_empty() {
@@ -179,7 +180,7 @@ fn look_at_something(layout: &Layout, solids: &Solids, random: &mut Xorshift) ->
     for _ in 0..20 {
         let thing = &solids.things()[*random.pick(&things)];
         let field_of_view_rad = random.between(40.0, 75.0).to_radians();
-        // Fills between a third of the picture's width and all of it.
+        // The thing fills between a third of the picture's width and all of it.
         let fills = random.between(0.35, 1.1);
         let distance_m = thing.radius_m() / (field_of_view_rad / 2.0 * fills).sin();
         let azimuth = random.between(0.0, std::f64::consts::TAU);
@@ -199,14 +200,14 @@ fn look_at_something(layout: &Layout, solids: &Solids, random: &mut Xorshift) ->
     None
 }
 
-/// Returns the things on a photo with their masks.
+/// Returns the visible things of a photo with their masks.
 fn masks_of(photo: &Photo) -> Vec<(u32, Mask)> {
     let label = |thing: &u16| if *thing == NOTHING { NO_REGION } else { u32::from(*thing) };
     let labels: Vec<u32> = photo.thing_of_pixel.iter().map(label).collect();
     masks_of_labels(&labels, photo.image.width(), photo.unhidden_px.len(), u64::MAX).unwrap_or_default()
 }
 
-/// Returns the segments of a photo that show mostly one thing, with the thing.
+/// Returns the segments of a photo that show mostly one thing, with that thing.
 fn segments_of(photo: &Photo, raster_view: &RasterView, things: &[(u32, Mask)]) -> Vec<(u32, Mask)> {
     let view = View {
         name: String::new(),
@@ -234,8 +235,8 @@ fn segments_of(photo: &Photo, raster_view: &RasterView, things: &[(u32, Mask)]) 
     segments.into_iter().filter_map(|mask| Some((thing_of(&mask)?, mask))).collect()
 }
 
-/// Returns the mask as a segmenter may give it: a side of it is missing.
-fn spoilt(mask: &Mask, random: &mut Xorshift) -> Mask {
+/// Returns the mask without one of its sides, as a segmenter may find it.
+fn cut_mask(mask: &Mask, random: &mut Xorshift) -> Mask {
     let (width, height) = (mask.box_px.width_px(), mask.box_px.height_px());
     let angle = random.between(0.0, std::f64::consts::TAU);
     let (nx, ny) = (angle.cos(), angle.sin());
@@ -262,7 +263,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_kept_for_the_test_is_never_learnt_from() {
+    fn held_out_pairs_are_never_in_the_training_split() {
         let nouns = grammar::nouns(None).expect("parse");
         let held_out = |split| {
             let of_seed = |seed| crops(split, &nouns, seed);
@@ -273,7 +274,7 @@ mod tests {
         assert!(held_out(Split::Test) > 20);
     }
 
-    /// A crop of a true mask shows as many pixels as the photo has of the thing, on white.
+    /// A crop has as many pixels inside its mask as its label states, and is white outside.
     #[test]
     fn crops_are_what_their_labels_say() {
         let nouns = grammar::nouns(None).expect("parse");
@@ -286,7 +287,7 @@ mod tests {
             assert_eq!(n_inside, label.area_px as usize);
             let outside = crop.image().pixels().zip(crop.inside()).filter(|(_, inside)| !**inside);
             assert!(outside.into_iter().all(|(pixel, _)| pixel.0 == [255; 3]));
-            // A segment may hold some of what is beside the thing.
+            // A segment may include surroundings of the thing.
             assert!(label.shown > 0.0 && (label.shown <= 1.0 || label.segmented));
             assert!(nouns[label.noun].colours().contains(&label.colour));
         }

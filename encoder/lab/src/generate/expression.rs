@@ -7,17 +7,17 @@ use slag_math::random::Xorshift;
 pub enum Expression {
     /// A number.
     Number(f64),
-    /// A variable, by its place among the names.
+    /// A variable, by its index among the names.
     Variable(usize),
-    /// A new number in -1..1 at each evaluation.
+    /// A new random number in -1..1 at each evaluation.
     Random,
-    /// Minus something.
+    /// Negation.
     Minus(Box<Expression>),
-    /// Two operands.
+    /// An operator with two operands.
     Binary(Operator, Box<[Expression; 2]>),
 }
 
-/// What is done to two operands.
+/// An operator with two operands.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Operator {
     /// `+`
@@ -31,20 +31,20 @@ pub enum Operator {
 }
 
 impl Expression {
-    /// Parses `text`; `names` are the variables there are.
+    /// Parses an expression with the variables `names`.
     ///
     /// # Errors
-    /// What was found instead of what.
+    /// What was found and what was expected.
     pub fn parse(text: &str, names: &[String]) -> Result<Self, String> {
         let mut parser = Parser { rest: text.trim(), names, depth: 0 };
         let expression = parser.sum()?;
         match parser.rest {
             "" => Ok(expression),
-            rest => Err(format!("`{rest}` after an expression, expected an operator or its end")),
+            rest => Err(format!("`{rest}` after an expression, expected an operator or the end")),
         }
     }
 
-    /// Returns the value; `variables` in the order of the names.
+    /// Returns the value; `variables` are in the order of the names.
     pub fn value(&self, variables: &[f64], random: &mut Xorshift) -> f64 {
         match self {
             Self::Number(number) => *number,
@@ -64,7 +64,7 @@ impl Expression {
     }
 }
 
-/// Parentheses and signs within each other: deeper ones are a mistake.
+/// Deepest nesting of parentheses and signs.
 const MAX_DEPTH: usize = 64;
 
 struct Parser<'a> {
@@ -74,7 +74,7 @@ struct Parser<'a> {
 }
 
 impl Parser<'_> {
-    /// Takes one of some symbols, if it comes next.
+    /// Takes the next character if it is one of the symbols.
     fn take<T: Copy>(&mut self, symbols: &[(char, T)]) -> Option<T> {
         let first = self.rest.chars().next()?;
         let (_, meaning) = symbols.iter().find(|(symbol, _)| *symbol == first)?;
@@ -101,7 +101,7 @@ impl Parser<'_> {
     fn operand(&mut self) -> Result<Expression, String> {
         self.depth += 1;
         if self.depth > MAX_DEPTH {
-            return Err(format!("more than {MAX_DEPTH} parentheses and signs within each other"));
+            return Err(format!("more than {MAX_DEPTH} nested parentheses and signs"));
         }
         let operand = if self.take(&[('-', ())]).is_some() {
             Expression::Minus(Box::new(self.operand()?))

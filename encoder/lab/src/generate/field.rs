@@ -1,7 +1,6 @@
-//! A field of embeddings of any size, made like the ones that lifting gives: things of many kinds, each seen
-//! in several views whose vectors differ, its Gaussians weighing the views differently, and blends where two
-//! things meet. The statistics are those measured on the labelled house: views of a thing 0.45 apart, a
-//! sixth of the Gaussians at borders.
+//! A synthetic field of embeddings of any size with the structure of lifted ones: things of many kinds; several views of a
+//! thing with different vectors, which its Gaussians weigh differently; and blends where two things meet. The statistics
+//! were measured on the labelled house: views of a thing are 0.45 apart, a sixth of the Gaussians lie at borders.
 
 use glam::DVec3;
 use slag_common::Gaussians;
@@ -10,18 +9,19 @@ use slag_common::shard::ShardView;
 use slag_encoder::codebook::TextBank;
 use slag_math::random::mix64;
 
-/// Gaussians of a cell.
+/// Gaussians per cell.
 const CELL: usize = 62_500;
-/// Kinds of things, each with a text.
+/// Kinds of things; each has a text.
 const KINDS: usize = 400;
-/// Gaussians of a thing, on average.
+/// Gaussians per thing.
 const THING: usize = 1_250;
-/// Views of a thing.
+/// Views per thing.
 const VIEWS: usize = 6;
-/// Length of what a view adds to a thing's vector, and a thing to its kind's.
+/// Length of the noise that a view adds to its thing's vector.
 const VIEW_NOISE: f32 = 0.45;
+/// Length of the noise that a thing adds to its kind's vector.
 const THING_NOISE: f32 = 0.25;
-/// Length of what all kinds have in common.
+/// Length of the vector that all kinds have in common.
 const COMMON: f32 = 0.4;
 /// Share of the Gaussians at a border.
 const BORDER: f32 = 0.16;
@@ -36,7 +36,7 @@ pub struct Field {
     kinds: Vec<f32>,
 }
 
-/// A stream of numbers of its own for each purpose.
+/// A random sequence, separate for each purpose and index.
 struct Noise(u64);
 
 impl Noise {
@@ -49,7 +49,7 @@ impl Noise {
         (mix64(self.0) >> 40) as f32 / (1u64 << 24) as f32
     }
 
-    /// Adds a vector of about a length, in few dimensions.
+    /// Adds a random vector of about this length in the first dimensions.
     fn add_noise(&mut self, length: f32, out: &mut [f32]) {
         let n = out.len().min(FILLED);
         // A sum of four uniform numbers has variance 1/3.
@@ -66,7 +66,7 @@ fn make_unit(vector: &mut [f32]) {
 }
 
 impl Field {
-    /// A field of `n_gaussians`, rounded down to whole cells (at least one).
+    /// Makes a field of `n_gaussians`, rounded down to whole cells (at least one).
     pub fn new(n_gaussians: usize, dim: usize) -> Self {
         let mut kinds = vec![0.0; KINDS * dim];
         let mut common = vec![0.0; dim];
@@ -79,7 +79,7 @@ impl Field {
         Self { n_gaussians, dim, kinds }
     }
 
-    /// Returns the Gaussians of a cell.
+    /// Returns the number of Gaussians per cell.
     pub fn cell_gaussians(&self) -> usize {
         CELL.min(self.n_gaussians)
     }
@@ -89,7 +89,7 @@ impl Field {
         self.n_gaussians / self.cell_gaussians()
     }
 
-    /// Returns the embeddings of a cell, `[cell_gaussians][dim]`, unit.
+    /// Returns the embeddings of a cell, `[cell_gaussians][dim]`, as unit vectors.
     pub fn embeddings(&self, cell: usize) -> Vec<f32> {
         let n = self.cell_gaussians();
         let n_things = n.div_ceil(THING);
@@ -97,7 +97,7 @@ impl Field {
         let mut views = vec![0.0; n_things * VIEWS * dim];
         for (thing, views) in views.chunks_exact_mut(VIEWS * dim).enumerate() {
             let mut random = Noise::new(3, cell * n_things + thing);
-            // Few kinds are everywhere, most are rare: the square of a uniform number.
+            // The square of a uniform number makes a few kinds frequent and most rare.
             let kind = (random.uniform().powi(2) * KINDS as f32) as usize;
             let mut own = self.kinds[kind.min(KINDS - 1) * dim..][..dim].to_vec();
             random.add_noise(THING_NOISE, &mut own);
@@ -115,7 +115,7 @@ impl Field {
             let foreign = if is_border { 0.6 * random.uniform() } else { 0.0 };
             for (of, share) in [(thing, 1.0 - foreign), ((thing + 1) % n_things, foreign)] {
                 for view in 0..VIEWS {
-                    // Most Gaussians are seen well in some views and hardly in others.
+                    // Most Gaussians are clearly visible in some views and hardly in others.
                     let weight = share * random.uniform().powi(3);
                     let vector = &views[(of * VIEWS + view) * dim..][..dim];
                     if weight > 0.0 {
@@ -128,7 +128,7 @@ impl Field {
         out
     }
 
-    /// Returns a text for each kind: its vector, as far off as texts are.
+    /// Returns a text for each kind: its vector with noise as large as between texts and images.
     pub fn texts(&self) -> TextBank {
         let mut vectors = self.kinds.clone();
         for (kind, vector) in vectors.chunks_exact_mut(self.dim).enumerate() {
@@ -139,14 +139,13 @@ impl Field {
     }
 }
 
-/// Returns the place of a cell's k-th Gaussian in a cube of 20 m: no two are nearer than 10 cm along all axes.
+/// Returns the place of a cell's k-th Gaussian in a cube of 20 m, on a grid of 0.5 m.
 pub fn place_in_cube(k: u64) -> DVec3 {
-    // 41^3 places, more than a cell's Gaussians; things are runs of k and so stay together.
+    // 41^3 places are more than a cell's Gaussians. Things are runs of k, so they stay together.
     DVec3::new((k / (41 * 41)) as f64, (k / 41 % 41) as f64, (k % 41) as f64) * 0.5
 }
 
-/// Returns for each Gaussian of a shard the index of the mean nearest to its position, where means are
-/// [`place_in_cube`]'s.
+/// Returns for each Gaussian of a shard its index before coding, from its position: means must come from [`place_in_cube`].
 pub fn index_by_position(scene: &Gaussians, shard: &ShardView<'_>) -> Vec<u32> {
     (0..scene.len())
         .map(|k| {

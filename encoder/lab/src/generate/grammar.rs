@@ -1,4 +1,4 @@
-//! Objects as data: one short text file a noun, which says of what parts such things are made.
+//! Objects as data: a text file per noun lists the parts of such things.
 //!
 //! ```text
 //! # a chair looks along +y
@@ -13,16 +13,16 @@
 //! cylinder frame: x*(w/2-0.03), y*(w/2-0.03), h/2 | 0.02, h | for x -1, 1 | for y -1, 1
 //! ```
 //!
-//! - The file's name is the noun; `words` are others for it. `is` says what kinds of thing it is.
-//! - `found: SCENE PLACE`: scenes are `room`, `yard`, `street`; places `floor` (free), `wall` (its back to a
-//!   wall or an edge), `hung` (on a wall), `on` (on another thing's top), `shell` (the scene builds it itself).
-//! - `paint NAME: MATERIALS | COLOURS`; the first is the one that gives the thing its colour. `any` colour,
-//!   or `same` as the first paint.
-//! - `let NAME = FROM..TO`, or `pick A, B, C`, or one expression. Metres; z is up, the ground at 0.
-//! - `box`, `ellipsoid`: centre | full sizes; `cylinder`: centre | radius, height; `cone`: centre | radius
-//!   below, radius above, height. Then, in any order: `turn RX, RY, RZ` (degrees, about x, then y, then z),
-//!   `for NAME A, B, C`, `if EXPRESSION` (made where it is above 0).
-//! - `top: z | w, d`: where other things may stand.
+//! - The file's name is the noun, `words` are its synonyms, `is` its kinds.
+//! - `found: SCENE PLACE`: scenes are `room`, `yard`, `street`; places are `floor` (free-standing), `wall` (its back to a
+//!   wall or an edge), `hung` (on a wall), `on` (on another thing's top), `shell` (built by the scene).
+//! - `paint NAME: MATERIALS | COLOURS`; the first paint gives the thing its main colour. `any` stands for all colours,
+//!   `same` for the first paint.
+//! - `let NAME = FROM..TO`, or `pick A, B, C`, or one expression. Metres; z points up, the ground is at 0.
+//! - `box`, `ellipsoid`: centre | full sizes; `cylinder`: centre | radius, height; `cone`: centre | lower radius, upper
+//!   radius, height. Then, in any order: `turn RX, RY, RZ` (degrees, about x, then y, then z), `for NAME A, B, C`,
+//!   `if EXPRESSION` (the part exists where it is above 0).
+//! - `top: z | w, d`: a surface for other things.
 
 use std::path::{Path, PathBuf};
 
@@ -37,13 +37,13 @@ use super::solid::{Part, Shape};
 
 static OBJECTS: Dir<'_> = include_dir!("$CARGO_MANIFEST_DIR/src/generate/objects");
 
-/// Why object files are refused.
+/// Error in the object files.
 #[derive(Debug, thiserror::Error)]
 pub enum GrammarError {
-    /// A file or folder could not be read.
+    /// A file or folder cannot be read.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// A line is wrong.
+    /// A line is malformed.
     #[error("{}:{line}: {reason}", path.display())]
     Line {
         /// The file.
@@ -55,7 +55,7 @@ pub enum GrammarError {
     },
 }
 
-/// A scene that things belong into.
+/// Kind of a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 pub enum SceneKind {
@@ -67,7 +67,7 @@ pub enum SceneKind {
     Street,
 }
 
-/// Where in a scene something stands.
+/// Place of a thing in a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Place {
     /// Anywhere on the ground.
@@ -78,11 +78,11 @@ pub enum Place {
     Hung,
     /// On the top of another thing.
     On,
-    /// Made by the scene itself: floors, walls.
+    /// Built by the scene: floors, walls.
     Shell,
 }
 
-/// Where other things may stand on something, in its own frame, metres.
+/// Surface for other things on top of a thing, in the thing's frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Top {
     /// Height.
@@ -91,16 +91,16 @@ pub struct Top {
     pub size_m: [f64; 2],
 }
 
-/// What all things of a noun have in common.
+/// A noun: the rules by which its things are made.
 #[derive(Clone, Debug)]
 pub struct Noun {
     /// Its name.
     pub name: String,
-    /// Other words for it.
+    /// Its synonyms.
     pub words: Vec<String>,
-    /// Kinds of thing that it is.
+    /// Kinds of thing that it belongs to.
     pub kinds: Vec<String>,
-    /// Where it is found.
+    /// Scenes and places where it is found.
     pub found: Vec<(SceneKind, Place)>,
     paints: Vec<PaintRule>,
     variables: Vec<Choice>,
@@ -112,7 +112,7 @@ pub struct Noun {
 struct PaintRule {
     name: String,
     materials: Vec<Material>,
-    /// Empty for the colour of the first paint.
+    /// Empty if only the first paint's colour is allowed.
     colours: Vec<Colour>,
     or_same: bool,
 }
@@ -138,7 +138,7 @@ struct PartRule {
     centre: [Expression; 3],
     sizes: Vec<Expression>,
     turn_deg: Option<[Expression; 3]>,
-    /// Variable and its values.
+    /// Variables, by index, and their values.
     loops: Vec<(usize, Vec<Expression>)>,
     condition: Option<Expression>,
 }
@@ -146,17 +146,17 @@ struct PartRule {
 /// A thing made by its noun's rules.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Object {
-    /// What it is made of; its own frame, z up, on the ground at 0, its front along +y.
+    /// Its parts, in its own frame: z up, the ground at 0, the front along +y.
     pub parts: Vec<Part>,
     /// Its colours, the main one first.
     pub colours: Vec<Colour>,
     /// Its main paint.
     pub paint: Paint,
-    /// Where things may stand on it.
+    /// Surface for other things.
     pub top: Option<Top>,
 }
 
-/// Returns the nouns of a folder of object files, or the ones shipped; sorted by name.
+/// Returns the nouns of a folder of object files, or the built-in ones, sorted by name.
 ///
 /// # Errors
 /// [`GrammarError`].
@@ -181,7 +181,7 @@ pub fn nouns(folder: Option<&Path>) -> Result<Vec<Noun>, GrammarError> {
     texts.iter().map(|(path, text)| Noun::parse(path, text)).collect()
 }
 
-/// Returns the pieces of a list, trimmed.
+/// Returns the items of a list, trimmed.
 fn list(text: &str) -> impl Iterator<Item = &str> {
     text.split(',').map(str::trim)
 }
@@ -190,14 +190,14 @@ fn expressions(text: &str, names: &[String]) -> Result<Vec<Expression>, String> 
     list(text).map(|text| Expression::parse(text, names)).collect()
 }
 
-fn some<const N: usize>(text: &str, names: &[String]) -> Result<[Expression; N], String> {
+fn exactly<const N: usize>(text: &str, names: &[String]) -> Result<[Expression; N], String> {
     let found = expressions(text, names)?;
     let n = found.len();
     found.try_into().map_err(|_| format!("{n} values in `{text}`, expected {N}"))
 }
 
 impl Noun {
-    /// Reads an object file's text; `path` names it and gives the noun.
+    /// Parses an object file's text; the file's name is the noun.
     ///
     /// # Errors
     /// [`GrammarError::Line`].
@@ -232,7 +232,7 @@ impl Noun {
             Some((what, _)) => Err(GrammarError::Line {
                 path: path.to_owned(),
                 line: last,
-                reason: format!("the file ends without `{what}`; see the other objects' files"),
+                reason: format!("the file ends without `{what}`; add a line that begins with it"),
             }),
         }
     }
@@ -276,7 +276,7 @@ impl Noun {
             }
             ["top"] => {
                 let (z, size) = rest.split_once('|').ok_or("no `|`, expected z | width, depth")?;
-                let [w, d] = some(size, names)?;
+                let [w, d] = exactly(size, names)?;
                 self.top = Some([Expression::parse(z, names)?, w, d]);
             }
             [kind, paint] => {
@@ -300,12 +300,12 @@ impl Noun {
             .paints
             .iter()
             .position(|rule| rule.name == paint)
-            .ok_or_else(|| format!("`{paint}` is no paint named above"))?;
+            .ok_or_else(|| format!("no paint `{paint}` above, expected the name of one"))?;
         let mut fields = rest.split('|').map(str::trim);
         let (Some(centre), Some(sizes)) = (fields.next(), fields.next()) else {
             return Err("no `|`, expected centre | sizes".into());
         };
-        // Variables of loops are known in the whole line, and nowhere else.
+        // Loop variables are valid in the whole line and nowhere else.
         let n_names = names.len();
         let modifiers: Vec<&str> = fields.collect();
         let mut loops = Vec::new();
@@ -321,7 +321,7 @@ impl Noun {
             let mut condition = None;
             for modifier in modifiers.iter().filter(|m| !m.starts_with("for ")) {
                 match modifier.split_once(' ') {
-                    Some(("turn", angles)) => turn_deg = Some(some(angles, names)?),
+                    Some(("turn", angles)) => turn_deg = Some(exactly(angles, names)?),
                     Some(("if", expression)) => condition = Some(Expression::parse(expression, names)?),
                     _ => return Err(format!("`{modifier}`, expected turn, for or if")),
                 }
@@ -330,24 +330,24 @@ impl Noun {
             if found.len() != n_sizes {
                 return Err(format!("{} sizes in `{sizes}`, expected {n_sizes}", found.len()));
             }
-            let centre = some(centre, names)?;
+            let centre = exactly(centre, names)?;
             Ok(PartRule { kind, paint, centre, sizes: found, turn_deg, loops, condition })
         })();
         names.truncate(n_names);
         part
     }
 
-    /// Returns the colours that such a thing may have.
+    /// Returns the main colours that its things may have.
     pub fn colours(&self) -> &[Colour] {
         &self.paints[0].colours
     }
 
-    /// Returns the materials that it may be made of.
+    /// Returns the main materials that its things may have.
     pub fn materials(&self) -> &[Material] {
         &self.paints[0].materials
     }
 
-    /// Makes a thing. `colours`: its main colour is one of these, if any of them is possible.
+    /// Makes a thing. Its main colour is an `allowed` one, unless the noun has none of these.
     pub fn make(&self, random: &mut Xorshift, allowed: impl Fn(Colour) -> bool) -> Object {
         let mut variables: Vec<f64> = Vec::new();
         for choice in &self.variables {
@@ -417,21 +417,21 @@ fn found(text: &str) -> Result<(SceneKind, Place), String> {
 }
 
 impl PartRule {
-    /// Makes the parts of the loops from `level` on.
+    /// Makes the parts of the loops from index `depth` on.
     fn make(
         &self,
-        level: usize,
+        depth: usize,
         variables: &mut Vec<f64>,
         paints: &[(Paint, Colour)],
         random: &mut Xorshift,
         parts: &mut Vec<Part>,
     ) {
-        if let Some((index, values)) = self.loops.get(level) {
+        if let Some((index, values)) = self.loops.get(depth) {
             for value in values {
                 let value = value.value(variables, random);
                 variables.truncate(*index);
                 variables.push(value);
-                self.make(level + 1, variables, paints, random, parts);
+                self.make(depth + 1, variables, paints, random, parts);
             }
             variables.truncate(*index);
             return;
@@ -444,7 +444,7 @@ impl PartRule {
         };
         let centre = vector(&self.centre);
         let turn = self.turn_deg.as_ref().map_or(DVec3::ZERO, &mut vector);
-        // Thinner than a millimetre is nothing.
+        // At least a millimetre thick.
         let sizes: Vec<f64> = self.sizes.iter().map(|s| s.value(variables, random).max(0.001)).collect();
         let shape = match self.kind {
             ShapeKind::Box => Shape::Box(DVec3::new(sizes[0], sizes[1], sizes[2]) / 2.0),

@@ -1,7 +1,7 @@
-//! Scenes that the project makes itself, from a seed: Gaussians, photos, poses, and what is true about them.
+//! Scenes generated from a seed: Gaussians, photos, poses and labels.
 //!
-//! Things are made by the rules of their nouns' files ([`grammar`]), stand in rooms, yards and streets
-//! ([`compose`]), and are photographed by casting rays ([`render`]); the Gaussians cover the same surfaces.
+//! Object files hold the rules by which things are made ([`grammar`]). Things stand in rooms, yards and streets
+//! ([`compose`]) and are photographed by ray casting ([`render`]); the Gaussians cover the same surfaces.
 
 pub mod compose;
 pub mod crops;

@@ -1,4 +1,4 @@
-//! Errors and files of what is generated.
+//! Errors and output files of generation.
 
 use std::path::{Path, PathBuf};
 
@@ -8,24 +8,24 @@ use slag_encoder::raster::{Drawing, RasterView};
 
 use super::grammar::GrammarError;
 
-/// Why a scene could not be written.
+/// Error of writing generated data.
 #[derive(Debug, thiserror::Error)]
 pub enum GenerateError {
-    /// A file could not be written.
+    /// A file cannot be written.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// The splat could not be written.
+    /// The splat cannot be written.
     #[error(transparent)]
     Splat(#[from] SplatError),
-    /// The objects' files cannot be used.
+    /// The object files cannot be used.
     #[error(transparent)]
     Grammar(#[from] GrammarError),
-    /// A picture could not be written.
+    /// A picture cannot be written.
     #[error("{}: {source}", path.display())]
     Image {
         /// The picture.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: image::ImageError,
     },
 }
@@ -48,5 +48,5 @@ pub(super) fn write_npy<T: npyz::AutoSerialize + Copy>(
 pub(crate) fn to_image(drawing: &Drawing, view: &RasterView) -> RgbImage {
     let bytes = drawing.rgb.iter().map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
     RgbImage::from_raw(view.intrinsics.width_px, view.intrinsics.height_px, bytes)
-        .expect("a drawing has three values a pixel of its view")
+        .expect("a drawing has three values per pixel of its view")
 }

@@ -1,4 +1,4 @@
-//! What surfaces look like: colours by their names, and materials.
+//! Looks of surfaces: named colours, and materials.
 
 use glam::DVec3;
 use serde::Serialize;
@@ -15,7 +15,7 @@ macro_rules! named {
         }
 
         impl $name {
-            /// All there are.
+            /// All values.
             pub const ALL: &[Self] = &[$(Self::$variant),+];
 
             /// Returns its word.
@@ -23,10 +23,10 @@ macro_rules! named {
                 match self { $(Self::$variant => $text),+ }
             }
 
-            /// Returns what a word names.
+            /// Returns the value with this word.
             ///
             /// # Errors
-            /// What was found, and the words there are.
+            /// What was found and what was expected.
             pub fn parse(word: &str) -> Result<Self, String> {
                 Self::ALL.iter().copied().find(|known| known.word() == word).ok_or_else(|| {
                     format!("`{word}`, expected one of: {}", Self::ALL.iter().map(|k| k.word()).collect::<Vec<_>>().join(", "))
@@ -64,7 +64,7 @@ named! {
 }
 
 named! {
-    /// What something is made of.
+    /// A material.
     Material:
     /// Long grain along the part's longest edge.
     Wood "wood",
@@ -98,21 +98,21 @@ named! {
     Tile "tile",
 }
 
-/// A surface's own colour and material.
+/// Colour and material of a surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Paint {
     /// Colour under white light, 0 to 1.
     pub rgb: [f64; 3],
-    /// What it is made of.
+    /// Its material.
     pub material: Material,
-    /// Chooses the pattern.
+    /// Seed of the pattern.
     pub seed: u32,
 }
 
 impl Colour {
-    /// Returns a shade that people call by this colour's name.
+    /// Returns a random shade of this colour.
     pub fn shade(self, random: &mut Xorshift) -> [f64; 3] {
-        // Hue in degrees, saturation, value: the ranges that the name covers without doubt.
+        // Ranges of hue in degrees, saturation and value that clearly belong to the name.
         let [hue, saturation, value] = match self {
             Self::Black => [[0.0, 360.0], [0.0, 0.15], [0.05, 0.14]],
             Self::White => [[0.0, 360.0], [0.0, 0.04], [0.92, 1.0]],
@@ -136,7 +136,7 @@ impl Colour {
 }
 
 impl Material {
-    /// Returns strength and sharpness (Phong's exponent) of its highlight.
+    /// Returns the strength and sharpness (Phong's exponent) of its highlight.
     pub fn highlight(self) -> [f64; 2] {
         match self {
             Self::Metal => [0.45, 18.0],
@@ -151,7 +151,7 @@ impl Material {
 }
 
 impl Paint {
-    /// Returns the colour at a place of a part, its own frame; `longest`: its longest axis.
+    /// Returns the colour at a point of a part, in its own frame. `longest` is the part's longest axis.
     pub fn albedo(&self, at: DVec3, longest: usize) -> [f64; 3] {
         let noise = |scale: DVec3| value_noise(at * scale, self.seed);
         let even = |per_m: f64| noise(DVec3::splat(per_m));
@@ -178,7 +178,7 @@ impl Paint {
             Material::Brick | Material::Tile => {
                 let [width, height] =
                     if self.material == Material::Brick { [0.24, 0.08] } else { [0.3, 0.3] };
-                // Courses run around corners: along x and y alike, upwards along z; a floor's along y.
+                // Courses run along x and y alike, so that they continue around corners, and rise along z, on floors along y.
                 let up = if longest == 2 { at.z } else { at.z + at.y };
                 let course = (up / height).floor();
                 let shift = if self.material == Material::Brick { 0.5 * course } else { 0.0 };
@@ -196,7 +196,7 @@ impl Paint {
     }
 }
 
-/// Returns smooth noise of -1 to 1 that changes over a unit (Perlin 1985's value noise).
+/// Returns smooth noise of -1 to 1 with features one unit wide (value noise).
 fn value_noise(at: DVec3, seed: u32) -> f64 {
     let low = at.floor();
     let t = at - low;

@@ -1,4 +1,4 @@
-//! Photos with the thing at each pixel: what a segmenter learns from.
+//! Photos with the thing at each pixel: training data of the segmenter.
 
 use std::path::Path;
 
@@ -11,11 +11,11 @@ use super::render::{NOTHING, Photo};
 use slag_encoder::progress::Progress;
 use slag_math::random::Xorshift;
 
-/// Photos of a scene.
+/// Photos per scene.
 const N_PHOTOS: u32 = 4;
 
 /// Writes photos of the scenes of some seeds: `photos.npy` (u8 `[n][height][width][3]`) and `things.npy` (u16
-/// `[n][height][width]`: a number a thing, 65535 the sky). Returns how many.
+/// `[n][height][width]`: the thing's number, 65535 for the sky). Returns the number of photos.
 ///
 /// # Errors
 /// [`GenerateError`].

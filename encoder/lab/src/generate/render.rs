@@ -1,4 +1,4 @@
-//! Photos of a generated scene by casting a ray a pixel: what is seen, and what it is.
+//! Photos of a generated scene, with the thing at each pixel, by casting one ray per pixel.
 
 use glam::{DAffine3, DVec3};
 use image::{Rgb, RgbImage};
@@ -7,12 +7,12 @@ use rayon::prelude::*;
 use super::solid::{Part, Surfel};
 use slag_encoder::raster::RasterView;
 
-/// Rays of a tile share the things they may meet.
+/// Edge of a tile. The rays of a tile share one list of candidate things.
 const TILE_PX: u32 = 16;
-/// Rays towards a light start this far from the surface.
+/// Distance from the surface at which shadow rays start.
 const OFF_SURFACE_M: f64 = 1e-4;
 
-/// What lights a scene.
+/// Light source of a scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Light {
     /// From a direction; unit length.
@@ -22,7 +22,7 @@ pub enum Light {
 }
 
 impl Light {
-    /// Returns the direction in which it is seen from a point, and its distance, metres.
+    /// Returns the direction from a point to the light (unit length), and its distance in metres.
     fn from(self, at: DVec3) -> (DVec3, f64) {
         match self {
             Self::Sun(direction) => (direction, f64::INFINITY),
@@ -34,7 +34,7 @@ impl Light {
     }
 }
 
-/// Solids of one thing, in the world.
+/// Solids of one thing, in the world frame.
 #[derive(Clone, Debug)]
 pub struct Thing {
     pieces: Vec<Piece>,
@@ -51,29 +51,29 @@ struct Piece {
     longest_axis: usize,
 }
 
-/// What rays are cast at.
+/// All solids of a scene, and its light.
 #[derive(Clone, Debug)]
 pub struct Solids {
     things: Vec<Thing>,
     light: Light,
-    /// Part of the light that comes from everywhere.
+    /// Share of ambient light.
     ambient: f64,
     /// Colour of the light.
     tint: [f64; 3],
 }
 
-/// A photo and what is on it.
+/// A photo and the things on it.
 #[derive(Clone, Debug)]
 pub struct Photo {
     /// The picture.
     pub image: RgbImage,
-    /// Index of the thing at each pixel, row-major; [`NOTHING`] where there is the sky.
+    /// Index of the thing at each pixel, row-major; [`NOTHING`] for the sky.
     pub thing_of_pixel: Vec<u16>,
-    /// Pixels of each thing that would show it if nothing else were there.
+    /// Pixels that each thing would have without the other things.
     pub unhidden_px: Vec<u32>,
 }
 
-/// No thing.
+/// Index for pixels without a thing.
 pub const NOTHING: u16 = u16::MAX;
 
 struct Hit {
@@ -84,7 +84,7 @@ struct Hit {
 }
 
 impl Thing {
-    /// Places parts, which are in the object's frame.
+    /// Places parts of the object's frame in the world.
     pub fn new(parts: &[Part], world_from_object: DAffine3) -> Self {
         let pieces: Vec<Piece> = parts
             .iter()
@@ -104,17 +104,17 @@ impl Thing {
         Self { pieces, centre, radius_m }
     }
 
-    /// Returns a point in its middle.
+    /// Returns its centre.
     pub fn centre(&self) -> DVec3 {
         self.centre
     }
 
-    /// Returns the radius around the middle that holds all of it.
+    /// Returns the radius of the sphere around the centre that holds all of it.
     pub fn radius_m(&self) -> f64 {
         self.radius_m
     }
 
-    /// Returns points on its surface, about `spacing_m` apart, with the part that each belongs to.
+    /// Returns points on its surface about `spacing_m` apart, each with its piece.
     fn surfels(&self, spacing_m: f64) -> impl Iterator<Item = (&Piece, Surfel)> {
         self.pieces.iter().flat_map(move |piece| piece.part.surfels(spacing_m).map(move |s| (piece, s)))
     }
@@ -133,7 +133,7 @@ impl Piece {
     }
 }
 
-/// Whether a ray passes a sphere; `direction` of unit length.
+/// Returns whether a ray misses a sphere; `direction` has unit length.
 fn misses(centre: DVec3, radius_m: f64, origin: DVec3, direction: DVec3) -> bool {
     let to_centre = centre - origin;
     let along = to_centre.dot(direction);
@@ -142,7 +142,7 @@ fn misses(centre: DVec3, radius_m: f64, origin: DVec3, direction: DVec3) -> bool
 }
 
 impl Solids {
-    /// Puts things into a light; `ambient`: its part from everywhere; `tint`: its colour.
+    /// Lights things; `ambient` is the share of ambient light, `tint` the colour of the light.
     pub fn new(things: Vec<Thing>, light: Light, ambient: f64, tint: [f64; 3]) -> Self {
         Self { things, light, ambient, tint }
     }
@@ -152,7 +152,7 @@ impl Solids {
         &self.things
     }
 
-    /// Returns the colour at a point of a surface without highlights, and whether the light reaches it.
+    /// Returns the diffuse colour at a point of a surface, and whether the light reaches it.
     fn diffuse(&self, piece: &Piece, at: DVec3, normal: DVec3) -> ([f64; 3], bool) {
         let (towards, far) = self.light.from(at);
         let facing = normal.dot(towards);
@@ -162,7 +162,7 @@ impl Solids {
                 thing.pieces.iter().any(|p| p.hit(origin, towards).is_some_and(|(t, _)| t < far))
             });
         let direct = if lit { facing } else { 0.0 };
-        // What faces up gets more of the light from everywhere.
+        // Upward-facing surfaces get more ambient light.
         let everywhere = self.ambient * (0.85 + 0.15 * normal.z);
         let albedo = piece.part.paint.albedo(piece.part_from_world.transform_point3(at), piece.longest_axis);
         let strength = everywhere + (1.0 - self.ambient) * direct;
@@ -197,7 +197,7 @@ impl Solids {
         nearest
     }
 
-    /// Takes a photo; the view is an ideal pinhole.
+    /// Takes a photo with an ideal pinhole camera.
     pub fn photo(&self, view: &RasterView) -> Photo {
         let k = view.intrinsics;
         let world_from_camera = view.camera_from_world.inverse();
@@ -213,7 +213,7 @@ impl Solids {
             .map(|tile| {
                 let (x0, y0) = (tile % columns * TILE_PX, tile / columns * TILE_PX);
                 let (x1, y1) = ((x0 + TILE_PX).min(k.width_px), (y0 + TILE_PX).min(k.height_px));
-                // A cone around the tile's rays, and the things that reach into it.
+                // A cone around the tile's rays, and the things that intersect it.
                 let axis = ray(f64::from(x0 + x1) / 2.0, f64::from(y0 + y1) / 2.0);
                 let spread = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)]
                     .map(|(x, y)| ray(f64::from(x), f64::from(y)).dot(axis).clamp(-1.0, 1.0).acos())
@@ -271,14 +271,14 @@ impl Solids {
         rgb.map(|c| c + highlight)
     }
 
-    /// Returns points that cover a thing about `spacing_m` apart, each with the colour that it shows.
+    /// Returns points that cover a thing about `spacing_m` apart, each with its lit colour.
     pub fn covering(&self, thing: usize, spacing_m: f64) -> Vec<(Surfel, [f64; 3])> {
         let surfels: Vec<_> = self.things[thing].surfels(spacing_m).collect();
         surfels.into_par_iter().map(|(piece, s)| (s, self.diffuse(piece, s.position, s.normal).0)).collect()
     }
 }
 
-/// Bright above, brighter at the horizon.
+/// Returns the colour of the sky, which is brighter at the horizon.
 fn sky(direction: DVec3) -> [f64; 3] {
     let up = direction.z.clamp(0.0, 1.0);
     [0.88 - 0.35 * up, 0.92 - 0.2 * up, 0.97]

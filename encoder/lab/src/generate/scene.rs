@@ -1,4 +1,4 @@
-//! A generated scene: Gaussians, views, and what is true of them.
+//! A generated scene: Gaussians, views and labels.
 
 use std::path::{Path, PathBuf};
 
@@ -16,27 +16,28 @@ use super::grammar::{Noun, SceneKind};
 use super::output::{GenerateError, write_npy};
 use super::render::NOTHING;
 
-/// Distance between surface Gaussians as a part of a thing's radius, and its bounds, metres.
+/// Distance between surface Gaussians, relative to the thing's radius.
 const SPACING_OF_RADIUS: f64 = 0.03;
+/// Bounds of that distance.
 const SPACING_M: [f64; 2] = [0.012, 0.11];
 /// Opacity of a surface Gaussian.
 const OPACITY: f32 = 0.97;
-/// Standard deviation of a surface Gaussian in spacings: neighbours overlap to a closed surface.
+/// Standard deviation of a surface Gaussian in spacings: neighbours overlap into a closed surface.
 const SPREAD: f64 = 0.62;
 /// Thickness of a surface Gaussian.
 const THICKNESS_M: f32 = 0.002;
-/// Views kept for tests, beside those to encode.
+/// Held-out test views.
 const N_TEST_VIEWS: u32 = 6;
-/// Ids of things in the truth begin here, those of floor, walls and the like at 1.
+/// First id of things in the labels. Ids of floor, walls and other background begin at 1.
 const FIRST_ID: u16 = 10;
 
 /// A generated scene.
 pub struct Scene {
     /// The Gaussians; metres, z up.
     pub gaussians: Gaussians,
-    /// Id of the thing that each Gaussian belongs to.
+    /// Id of each Gaussian's thing.
     pub id_of_gaussian: Vec<u16>,
-    /// What stands where, floor and walls as well.
+    /// The objects, including floor and walls.
     pub objects: Vec<TrueObject>,
     /// The cameras of the photos.
     pub views: Vec<RasterView>,
@@ -44,47 +45,47 @@ pub struct Scene {
     layout: Layout,
 }
 
-/// An object as it truly is.
+/// The label of an object.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct TrueObject {
-    /// Its number in masks and labels.
+    /// Its id in masks and labels.
     pub id: u16,
-    /// What it is.
+    /// Its category.
     pub category: String,
-    /// Other words for it.
+    /// Its synonyms.
     pub words: Vec<String>,
-    /// Kinds of thing that it is.
+    /// Kinds of thing that it belongs to.
     pub kinds: Vec<String>,
     /// Its colours, the main one first.
     pub colours: Vec<&'static str>,
     /// Its main material.
     pub material: &'static str,
-    /// Whether it is floor, wall or the like.
+    /// Whether it is background, such as floor and walls.
     pub background: bool,
-    /// Its middle, metres.
+    /// Centre of its box, metres.
     pub centre: DVec3,
     /// Smallest corner of the box around it.
     pub aabb_min: DVec3,
     /// Largest corner.
     pub aabb_max: DVec3,
-    /// Its Gaussians.
+    /// Number of its Gaussians.
     pub n_gaussians: usize,
-    /// Pixels that show it, over all photos.
+    /// Pixels that show it, over all photos to encode.
     pub train_pixels: u64,
 }
 
-/// Where a generated scene was written.
+/// Paths of a written scene.
 pub struct WrittenScene {
     /// The splat.
     pub scene: PathBuf,
     /// The poses.
     pub views: PathBuf,
-    /// The truth.
+    /// The folder of labels.
     pub truth: PathBuf,
 }
 
 impl Scene {
-    /// Makes scenes of some kinds, one beside the other along x. The same seed gives the same scene.
+    /// Makes scenes of these kinds side by side along x. Equal seeds give equal scenes.
     pub fn new(kinds: &[SceneKind], seed: u64, n_views: u32, nouns: &[Noun]) -> Self {
         let layout = Layout::new(kinds, seed, nouns, &|_, _| true);
         let solids = layout.solids();
@@ -134,9 +135,8 @@ impl Scene {
         Self { gaussians, id_of_gaussian, objects, views, test_views, layout }
     }
 
-    /// Writes `scene.ply`, `images/`, `transforms.json`; views kept for tests in `test/`; and the truth in `gt/`:
-    /// `masks/` and `test_masks/` (a thing's id at each pixel, 0 the sky), `instances.json`,
-    /// `gaussian_instance.npy`.
+    /// Writes `scene.ply`, `images/`, `transforms.json`; the held-out views in `test/`; and the labels in `gt/`: `masks/` and
+    /// `test_masks/` (a thing's id at each pixel, 0 for the sky), `instances.json`, `gaussian_instance.npy`.
     ///
     /// # Errors
     /// [`GenerateError`].
@@ -166,7 +166,7 @@ impl Scene {
         Ok(WrittenScene { scene, views, truth })
     }
 
-    /// Writes photos, masks and poses; returns the pixels that show each object.
+    /// Writes photos, masks and poses; returns the number of pixels that show each object.
     fn write_views(
         &self,
         views: &[RasterView],
@@ -189,7 +189,7 @@ impl Scene {
             let ids: Vec<u16> = photo.thing_of_pixel.iter().map(&mut id_of).collect();
             let [width, height] = [view.intrinsics.width_px, view.intrinsics.height_px];
             let mask = image::ImageBuffer::<image::Luma<u16>, _>::from_raw(width, height, ids)
-                .expect("a photo has an id a pixel");
+                .expect("a photo has one id per pixel");
             let name = format!("{i:04}.png");
             let path = masks.join(&name);
             mask.save(&path).map_err(|source| GenerateError::Image { path, source })?;
@@ -212,7 +212,7 @@ impl Scene {
     }
 }
 
-/// Returns a view as transforms.json has it: OpenGL axes, y up, z backward.
+/// Returns a view in the form of transforms.json: OpenGL axes, y up, z backward.
 fn frame(file_path: String, view: &RasterView) -> serde_json::Value {
     let world_from_camera = view.camera_from_world.inverse();
     let [x, y, z] = world_from_camera.matrix3.to_cols_array_2d().map(DVec3::from);
@@ -270,7 +270,7 @@ mod tests {
         }
     }
 
-    /// The Gaussians show what the photos show: two ways of drawing the same scene.
+    /// Renderings of the Gaussians match the ray-cast photos.
     #[test]
     fn gaussians_look_like_the_photos() {
         let nouns = grammar::nouns(None).expect("parse");

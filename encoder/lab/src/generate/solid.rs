@@ -1,4 +1,4 @@
-//! Solids: where rays meet them, and points that cover them.
+//! Solids: intersections with rays, and points that cover their surfaces.
 
 use glam::{DAffine3, DVec3};
 
@@ -9,9 +9,9 @@ use super::paint::Paint;
 pub enum Shape {
     /// A box with these half edges.
     Box(DVec3),
-    /// A cylinder around z, or a cone cut off.
+    /// A cylinder or truncated cone around z.
     Cone {
-        /// Radius at the lower end and at the upper.
+        /// Radii at the lower and the upper end.
         radii_m: [f64; 2],
         /// Half the height.
         half_height_m: f64,
@@ -20,23 +20,23 @@ pub enum Shape {
     Ellipsoid(DVec3),
 }
 
-/// A part of an object: a painted shape at a place.
+/// A part of an object: a painted shape with a pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Part {
     /// Its shape.
     pub shape: Shape,
-    /// Its pose, in the object's frame or the world's: a rotation and a translation.
+    /// Its pose in the object's or the world's frame: a rotation and a translation.
     pub object_from_part: DAffine3,
-    /// What it looks like.
+    /// Its looks.
     pub paint: Paint,
 }
 
 /// A point on a surface.
 #[derive(Clone, Copy, Debug)]
 pub struct Surfel {
-    /// Where.
+    /// Its position.
     pub position: DVec3,
-    /// Outwards, unit length.
+    /// Outward normal, unit length.
     pub normal: DVec3,
 }
 
@@ -60,7 +60,7 @@ impl Shape {
         }
     }
 
-    /// Returns the axis along which it is longest.
+    /// Returns its longest axis.
     pub fn longest_axis(self) -> usize {
         let half = match self {
             Self::Box(half) | Self::Ellipsoid(half) => half,
@@ -69,9 +69,9 @@ impl Shape {
         (0..3).max_by(|a, b| half[*a].total_cmp(&half[*b])).unwrap_or(2)
     }
 
-    /// Returns where a ray first enters, as multiples of `direction`, and the normal there.
+    /// Returns the distance at which a ray enters, in multiples of `direction`, and the normal there.
     ///
-    /// A ray that starts inside meets nothing.
+    /// `None` for a ray that misses or starts inside.
     pub fn hit(self, origin: DVec3, direction: DVec3) -> Option<(f64, DVec3)> {
         match self {
             Self::Box(half) => {
@@ -103,7 +103,7 @@ impl Shape {
                     o.x * o.x + o.y * o.y - radius * radius,
                 )
                 .unwrap_or([f64::NAN; 2]);
-                // Of the double cone only a piece is there, so either crossing may be the one that enters it.
+                // The shape is a piece of the double cone, so the ray may enter it at either crossing.
                 let side = |t: f64| {
                     let p = o + d * t;
                     let normal = DVec3::new(p.x, p.y, -slope * (middle + slope * p.z)).normalize();
@@ -219,7 +219,7 @@ mod tests {
         Shape::Cone { radii_m: [0.0, 0.5], half_height_m: 0.2 },
     ];
 
-    /// How far outside a point is, by the implicit equation of each surface; below 0 inside.
+    /// The implicit equation of each surface: positive outside, negative inside.
     fn outside(shape: Shape, p: DVec3) -> f64 {
         match shape {
             Shape::Box(half) => (p.abs() - half).max_element(),
@@ -284,7 +284,7 @@ mod tests {
                     assert!(outside(shape, at + 1e-5 * normal) > 0.0, "{shape:?} {at} {normal}");
                     n_hits += 1;
                 }
-                // Rays that graze may be missed by steps, never the other way round.
+                // Steps may miss a grazing ray; `hit` must not miss a ray that the steps find.
                 if let Some(walked) = walked {
                     let (t, _) = found.unwrap_or_else(|| panic!("{shape:?} from {origin} along {direction}"));
                     assert!(t <= walked && walked - t < 0.25, "{shape:?}: {t} {walked}");

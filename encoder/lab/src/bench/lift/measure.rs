@@ -1,4 +1,4 @@
-//! Makes the files of contributions, times each step on them, and estimates a larger scene.
+//! Writes files of contributions, times each step on them, and estimates the cost of a larger scene.
 
 use std::io::ErrorKind;
 use std::path::PathBuf;
@@ -15,7 +15,7 @@ use super::report::{EmbeddingModel, LiftReport, Plan, Step};
 use crate::bench::machine::Machine;
 use crate::bench::timing::{Spread, timed_ms};
 
-/// Makes the files, measures, and plans.
+/// Writes the files, times the steps, and estimates.
 ///
 /// # Errors
 /// [`ContributionError`].
@@ -34,7 +34,7 @@ pub fn run(options: &LiftOptions) -> Result<LiftReport, ContributionError> {
         paths.iter().map(|path| Ok(fs_err::metadata(path)?.len())).sum::<std::io::Result<u64>>()?;
     let write_secs = start.elapsed().as_secs_f64();
 
-    // Linux counts the peak from here on; elsewhere the peak is that of the whole run.
+    // Resets the peak on Linux; elsewhere it is not reported.
     let _ = fs_err::write("/proc/self/clear_refs", "5");
     let rss_before_bytes = status_bytes("VmRSS");
     let mut passes = Vec::new();
@@ -71,7 +71,7 @@ fn status_bytes(key: &str) -> Option<u64> {
     Some(line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? * 1024)
 }
 
-/// Wall-clock time and processor time of all threads, in milliseconds.
+/// Wall-clock time, and processor time of all threads, in milliseconds.
 #[derive(Clone, Copy, Default)]
 struct Took {
     wall_ms: f64,
@@ -234,7 +234,7 @@ impl Report<'_> {
 /// Removes the files of contributions, and the folder if nothing else is in it.
 ///
 /// # Errors
-/// Whatever the file system gives.
+/// If a file cannot be removed.
 pub fn clean(options: &LiftOptions) -> std::io::Result<()> {
     for path in options.paths().iter().filter(|path| path.exists()) {
         fs_err::remove_file(path)?;

@@ -1,4 +1,4 @@
-//! `bench lift`: from files of contributions to embeddings, on a made-up scene of any size.
+//! `bench lift`: from files of contributions to embeddings, on a synthetic scene of any size.
 
 mod measure;
 mod options;

@@ -1,11 +1,11 @@
-//! What `bench lift` measures.
+//! Settings of `bench lift`.
 
 use std::path::PathBuf;
 
 use serde::Serialize;
 use slag_encoder::shard;
 
-/// What is measured.
+/// Settings of `bench lift`.
 #[derive(Clone, Debug, Serialize)]
 pub struct LiftOptions {
     /// Gaussians.
@@ -16,17 +16,17 @@ pub struct LiftOptions {
     pub n_masks: usize,
     /// Gaussians with a contribution, per view.
     pub n_visible: usize,
-    /// Contributions of each of these, on average.
+    /// Mean contributions of each of these.
     pub entries_per_visible: f64,
     /// Components of an embedding.
     pub dim: usize,
     /// Gaussians per cell at most.
     pub cell_gaussians: usize,
-    /// Working memory, as `encode --memory`.
+    /// Working memory, as with `encode --memory`.
     pub memory_bytes: u64,
     /// Repeats.
     pub n_repeats: usize,
-    /// Folder for the files of contributions; made if absent.
+    /// Folder for the files of contributions; created if absent.
     pub work_dir: PathBuf,
     /// Gaussians and views of the scene to estimate.
     pub plan: (usize, usize),

@@ -1,6 +1,6 @@
-//! The made-up scene: a plain of Gaussians, numbered along a Morton curve as those of a cell are. A view sees a square
-//! of it, cut into a grid of regions. Some Gaussians of the square are hidden; those near a border have contributions in
-//! two or four regions.
+//! The synthetic scene: a plain of Gaussians, numbered along a Morton curve as in a cell. A view shows a square of the
+//! plain, cut into a grid of regions. Some Gaussians of the square are hidden; Gaussians near a border contribute to two
+//! or four regions.
 
 use slag_encoder::lift::{Contribution, ViewContributions};
 use slag_math::random::mix64;
@@ -9,9 +9,9 @@ use super::options::LiftOptions;
 
 /// Gaussians per block of the enumeration, a power of four.
 const BLOCK: u64 = 4096;
-/// Share of the Gaussians in a view's square that are not hidden.
+/// Share of visible Gaussians in a view's square.
 const SHARE_IN_SIGHT: f64 = 0.6;
-/// Levels of masks, from wholes to parts; each region is covered by one mask per level.
+/// Levels of masks; one mask per level covers each region.
 const LEVELS: usize = 4;
 /// Regions per mask, where masks of several levels overlap.
 const REGIONS_PER_MASK: usize = 3;
@@ -27,7 +27,7 @@ pub(super) struct Plain<'a> {
 impl<'a> Plain<'a> {
     pub(super) fn new(options: &'a LiftOptions) -> Self {
         let n = options.n_gaussians;
-        // As a split at medians does: halves, until they are small enough.
+        // Halved until small enough, as a split at medians does.
         let mut n_cells = 1;
         while n.div_ceil(n_cells) > options.cell_gaussians.max(1) {
             n_cells *= 2;
@@ -64,7 +64,7 @@ impl<'a> Plain<'a> {
         let corner = |axis| uniform(view, axis) * (self.edge as f64 - width);
         let (left, top) = (corner(1), corner(2));
         let n_across = (((n_masks * REGIONS_PER_MASK) as f64).sqrt() as u32).max(1);
-        // A border of this share of a region on two sides: (1 + b)^2 contributions a Gaussian.
+        // A border of width b (in regions) on two sides gives (1 + b)^2 contributions per Gaussian.
         let border = entries_per_visible.sqrt() - 1.0;
         let mut entries_of_cell: Vec<(u32, Vec<Contribution>)> = Vec::new();
         let (mut cell, mut first_of_cell, mut n_seen) = (0, 0, 0);
@@ -116,14 +116,14 @@ impl<'a> Plain<'a> {
     }
 }
 
-/// Returns the regions along an axis that a Gaussian at `at` has contributions in, ascending.
+/// Returns the regions along an axis that a Gaussian at `at` contributes to, ascending.
 fn neighbours(at: f64, border: f64) -> std::ops::RangeInclusive<u32> {
     let own = at as u32;
     let reaches_before = own > 0 && at - f64::from(own) < border;
     own - u32::from(reaches_before)..=own
 }
 
-/// Returns a unit vector near a common direction, as those of one encoder are.
+/// Returns a unit vector near a common direction, like an encoder's embeddings.
 fn unit_vector(seed: u64, dim: usize) -> Vec<f32> {
     let component = |c: u64| 0.5 * uniform(7, c) + uniform(mix64(seed), c) - 0.75;
     let raw: Vec<f64> = (0..dim as u64).map(component).collect();
@@ -135,7 +135,7 @@ fn uniform(seed: u64, index: u64) -> f64 {
     (mix64(seed.wrapping_mul(0x2545_f491_4f6c_dd1d) ^ index) >> 11) as f64 / (1u64 << 53) as f64
 }
 
-/// Gathers every second bit: a coordinate of a place along the Morton curve.
+/// Gathers every second bit, which gives a coordinate of a place along the Morton curve.
 fn compact_bits(place: u64) -> u64 {
     let mut v = place & 0x5555_5555_5555_5555;
     v = (v | v >> 1) & 0x3333_3333_3333_3333;

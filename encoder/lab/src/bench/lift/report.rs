@@ -13,9 +13,9 @@ use crate::bench::timing::Spread;
 pub struct Step {
     /// Its name.
     pub name: &'static str,
-    /// Milliseconds.
+    /// Wall-clock milliseconds.
     pub time: Spread,
-    /// Milliseconds of processor time, median over the repeats; comparable on a busy machine.
+    /// Milliseconds of processor time, median over the repeats; less affected by other load than wall-clock time.
     pub cpu_ms: f64,
     /// Nanoseconds per entry, median.
     pub ns_per_entry: f64,
@@ -25,7 +25,7 @@ pub struct Step {
     pub bytes_made_per_entry: f64,
 }
 
-/// An estimate for a scene of another size, from the figures of this run.
+/// Estimated cost of a scene of another size, from the figures of this run.
 #[derive(Clone, Debug, Serialize)]
 pub struct Plan {
     /// Gaussians.
@@ -40,7 +40,7 @@ pub struct Plan {
     pub index_bytes: u64,
     /// Bytes of the largest cell's embeddings, codebook and shard.
     pub cell_bytes: u64,
-    /// Bytes that `--memory` leaves for a group's contributions.
+    /// Bytes that `--memory` leaves for the contributions of a group of cells.
     pub group_bytes: u64,
     /// Seconds of one processor to open, read and transpose.
     pub aggregation_cpu_secs: f64,
@@ -57,31 +57,31 @@ pub struct LiftReport {
     pub options: LiftOptions,
     /// Entries of all views.
     pub n_entries: u64,
-    /// Gaussians with a contribution per view, as made.
+    /// Gaussians with a contribution per view, as generated.
     pub visible_per_view: f64,
     /// Regions of all views.
     pub n_regions: usize,
     /// Cells.
     pub n_cells: usize,
-    /// Groups of cells; each is transposed at once.
+    /// Groups of cells, each read and transposed at once.
     pub n_groups: usize,
     /// Gaussians with an embedding.
     pub n_with_evidence: usize,
     /// Bytes of the files of contributions.
     pub disk_bytes: u64,
-    /// Seconds to make and write them; not part of the aggregation.
+    /// Seconds to generate and write them; not part of the aggregation.
     pub write_secs: f64,
     /// The steps.
     pub steps: Vec<Step>,
     /// From files of contributions to contributions by Gaussian with total weights: open, read, transpose.
     pub aggregation: Spread,
-    /// The same, with each Gaussian's embedding and its length.
+    /// The same with each Gaussian's embedding and its length.
     pub with_embeddings: Spread,
     /// Cost model of the embeddings.
     pub embedding_model: EmbeddingModel,
     /// Peak memory of the process during the aggregation.
     pub peak_rss_bytes: Option<u64>,
-    /// Memory of the process before it.
+    /// Memory of the process before the aggregation.
     pub rss_before_bytes: Option<u64>,
     /// Estimate for a larger scene.
     pub plan: Plan,

@@ -24,7 +24,7 @@ pub enum TradeoffError {
         /// The word.
         word: String,
     },
-    /// A folder is no labelled scene.
+    /// A folder is not a labelled scene.
     #[error("{}: {what}; give a folder that `generate scene` wrote", dir.display())]
     Scene {
         /// The folder.

@@ -161,6 +161,9 @@ impl LabelledScene {
 
 #[cfg(test)]
 mod tests {
+    use clap::Parser;
+    use slag_encoder::cli::Cli;
+
     use super::*;
 
     fn scene(dir: &Path) -> LabelledScene {
@@ -169,16 +172,27 @@ mod tests {
     }
 
     #[test]
-    fn built_in_grids_are_sound() {
+    fn built_in_grids_have_flags_of_encode() {
         let dir = tempfile::tempdir().expect("a folder");
         fs_err::create_dir_all(dir.path().join("gt/masks")).expect("makes");
         for grid in [Grid::quick(), Grid::full()] {
             let grid = grid.expect("a grid");
             assert!(grid.points.len() > 5);
             for point in &grid.points {
-                for flags in [&point.views, &point.lift, &point.eval] {
-                    assert!(scene(dir.path()).expand(flags).expect("known words").is_some(), "{flags}");
-                }
+                let scene = scene(dir.path());
+                let expand =
+                    |flags: &String| scene.expand(flags).expect("known words").expect("the scene has masks");
+                let mut line: Vec<String> = "slag-encoder encode --scene a --views b --store c"
+                    .split(' ')
+                    .map(str::to_owned)
+                    .collect();
+                line.extend([&point.views, &point.lift].into_iter().flat_map(expand));
+                let parsed = Cli::try_parse_from(&line);
+                assert!(
+                    parsed.is_ok(),
+                    "{line:?}: {}",
+                    parsed.err().map_or(String::new(), |e| e.to_string())
+                );
             }
         }
     }

@@ -1,4 +1,4 @@
-//! Tables and plots of what was measured.
+//! Tables and plots of a measured grid.
 
 use std::fmt;
 use std::path::Path;
@@ -11,22 +11,22 @@ use super::grid::Point;
 use crate::bench::machine::Machine;
 use crate::bench::plot::{Plot, Scale, Series};
 
-/// What was measured.
+/// Figures of a measured grid.
 #[derive(Clone, Debug, Serialize)]
 pub struct TradeoffReport {
-    /// Where.
+    /// The machine.
     pub machine: Machine,
-    /// Seconds of the paper's Table, on its machine and scenes.
+    /// Encode times of the paper's table, on its machine and scenes.
     pub paper_seconds: [f64; 4],
     /// All points, in the order of scenes and grid.
     pub figures: Vec<Figures>,
-    /// Points that a scene has no data for.
+    /// Points left out because a scene lacks their data.
     pub left_out: Vec<String>,
 }
 
-/// What accuracy is weighed against.
+/// A cost to plot accuracy against.
 struct Cost {
-    /// Name of the plots' files.
+    /// Part of the plots' file names.
     file: &'static str,
     axis: &'static str,
     of: fn(&Figures) -> Option<f64>,
@@ -34,14 +34,14 @@ struct Cost {
 
 const COSTS: [Cost; 3] = [
     Cost { file: "seconds", axis: "seconds of the encode", of: |f| Some(f.seconds) },
-    Cost { file: "bytes", axis: "bytes a Gaussian", of: |f| Some(f.bytes_per_gaussian) },
-    Cost { file: "query", axis: "milliseconds of a query", of: |f| f.query_ms },
+    Cost { file: "bytes", axis: "bytes per Gaussian", of: |f| Some(f.bytes_per_gaussian) },
+    Cost { file: "query", axis: "milliseconds per query", of: |f| f.query_ms },
 ];
 
-/// Axis whose points are named in the plots.
+/// Axis with named points in the plots.
 const PRESETS: &str = "preset";
 
-/// Returns which of (cost, accuracy) no other beats: none cheaper or as cheap is better, none as good is cheaper.
+/// Returns which (cost, accuracy) points are Pareto-optimal: no other point is at least as cheap and as accurate, and differs.
 pub fn pareto(points: &[(f64, f64)]) -> Vec<bool> {
     let beats = |a: &(f64, f64), b: &(f64, f64)| a.0 <= b.0 && a.1 >= b.1 && a != b;
     points.iter().map(|point| !points.iter().any(|other| beats(other, point))).collect()
@@ -66,12 +66,12 @@ impl TradeoffReport {
         Ok(())
     }
 
-    /// Returns what the paper says of the same choice.
+    /// Returns the paper's encode times as a sentence.
     fn paper(&self) -> String {
         let seconds = self.paper_seconds.map(|s| s.to_string()).join(", ");
         format!(
-            "Beside it the paper's Table (Szilagyi et al. 2025), other scenes, another machine: {seconds} s; its mIoU is not \
-             in this project's files."
+            "For comparison, the paper (Szilagyi et al. 2025) reports encode times of {seconds} s, on other scenes and another \
+             machine."
         )
     }
 
@@ -85,10 +85,10 @@ impl TradeoffReport {
         self.figures.iter().filter(|f| f.scene == scene).collect()
     }
 
-    /// Returns for each cost which points of a scene nobody beats.
+    /// Returns for each cost which points of a scene are Pareto-optimal.
     fn fronts(&self, scene: &str) -> Vec<Vec<bool>> {
         let of_cost = |cost: &Cost| {
-            // What has no cost is never in front.
+            // A point without this cost is never optimal.
             let value = |f: &&Figures| (cost.of)(f).map_or((f64::MAX, f64::MIN), |value| (value, f.miou));
             let points: Vec<(f64, f64)> = self.of(scene).iter().map(value).collect();
             pareto(&points)
@@ -105,7 +105,7 @@ impl TradeoffReport {
         let show = |value: Option<f64>| value.map_or(String::new(), |v| v.to_string());
         let mut out = String::from(
             "scene,axis,name,views flags,lift flags,eval flags,profile,views,masks,coverage,miou,macc,map,auc,\
-             localised,iou on views,unknown words,seconds,seconds of views,seconds of coverage,bytes a Gaussian,\
+             localised,iou on views,unknown words,seconds,seconds of views,seconds of coverage,bytes per Gaussian,\
              query ms\n",
         );
         for f in &self.figures {
@@ -135,7 +135,7 @@ impl TradeoffReport {
         out
     }
 
-    /// Draws accuracy against a cost: a line an axis of the grid, and one along the front.
+    /// Draws accuracy against a cost: a line per axis of the grid, and one along the Pareto front.
     fn svg(&self, scene: &str, cost: &Cost) -> Option<String> {
         let of_scene = self.of(scene);
         let at = |f: &&Figures| (cost.of)(f).map(|value| (value, f.miou));
@@ -154,14 +154,14 @@ impl TradeoffReport {
                     Series { name: f.point.axis.clone(), points: Vec::new(), labels: Vec::new() };
                 for (at, point) in points.iter().filter(|(_, point)| point.axis == f.point.axis) {
                     of_axis.points.push(*at);
-                    // What users choose by name is named.
+                    // Only presets are labelled: users choose them by name.
                     of_axis.labels.extend((point.axis == PRESETS).then(|| point.name.clone()));
                 }
                 series.push(of_axis);
             }
         }
         let front = all.iter().zip(pareto(&all)).filter(|(_, front)| *front).map(|(point, _)| *point);
-        series.push(Series { name: "nothing better".into(), points: front.collect(), labels: Vec::new() });
+        series.push(Series { name: "Pareto front".into(), points: front.collect(), labels: Vec::new() });
         let plot = Plot {
             title: format!("{scene}: accuracy against {}", cost.axis),
             note: format!("{} threads. {}", self.machine.n_threads, self.paper()),
@@ -178,10 +178,7 @@ impl fmt::Display for TradeoffReport {
         let show = |value: Option<f64>, n: usize| value.map_or("-".into(), |v| format!("{v:.n$}"));
         for scene in self.scenes() {
             let fronts = self.fronts(scene);
-            writeln!(
-                f,
-                "{scene}: marks say that no point is better and no more of seconds (s), bytes (b), query time (q)"
-            )?;
+            writeln!(f, "{scene}: Pareto-optimal in accuracy and seconds (s), bytes (b), query time (q)")?;
             writeln!(
                 f,
                 "{:<3} {:<20} {:<16} {:>8} {:>6} {:>7} {:>6} {:>6} {:>6} {:>8} {:>8} {:>8}",
@@ -227,7 +224,7 @@ impl fmt::Display for TradeoffReport {
         }
         let unknown = self.figures.iter().map(|f| f.n_unknown_words).max().unwrap_or(0);
         if unknown > 0 {
-            writeln!(f, "{unknown} words are in no mean: the encoder does not know them")?;
+            writeln!(f, "{unknown} words are unknown to the encoder and left out of the means")?;
         }
         writeln!(f, "{}", self.paper())
     }

@@ -39,9 +39,9 @@ fn figures(axis: &str, name: &str, seconds: f64, miou: f64) -> Figures {
     }
 }
 
-/// By hand: a dearer worse one, equal ones, a cheaper worse one, a dearer one as good.
+/// By hand: a dearer worse point, equal points, a cheaper worse one, a dearer one of equal accuracy.
 #[test]
-fn nobody_beats_the_front() {
+fn no_point_beats_the_front() {
     let points = [(1.0, 0.2), (2.0, 0.5), (3.0, 0.4), (4.0, 0.6), (2.0, 0.5), (4.0, 0.5), (5.0, 0.6)];
     assert_eq!(pareto(&points), [true, true, false, true, true, false, false]);
     assert_eq!(pareto(&[]), [false; 0]);
@@ -61,10 +61,10 @@ fn reports_name_every_point_and_mark_the_front() {
     };
     let dir = tempfile::tempdir().expect("a folder");
     report.write(dir.path()).expect("writes");
-    let read = |name: &str| fs_err::read_to_string(dir.path().join(name)).expect("is there");
+    let read = |name: &str| fs_err::read_to_string(dir.path().join(name)).expect("reads");
     let table = read("tradeoff.txt");
     let marks: Vec<&str> = table.lines().skip(2).take(3).map(|line| line[..3].trim()).collect();
-    // Bytes are equal: only the best counts there. No query times: nobody is in front.
+    // Bytes are equal: only the most accurate point is optimal. Without query times none is.
     assert_eq!(marks, ["sb", "s", ""]);
     assert!(table.contains("129, 309, 1328, 3026 s") && table.contains("left out: masks / true"), "{table}");
     let csv = read("tradeoff.csv");
@@ -73,13 +73,11 @@ fn reports_name_every_point_and_mark_the_front() {
     assert!(csv.contains("\"--a \"\"b\"\"\""), "{csv}");
     let json: serde_json::Value = serde_json::from_str(&read("tradeoff.json")).expect("JSON");
     assert_eq!(json["figures"][1]["name"], "1/4");
-    assert!(
-        read("room-seconds.svg").contains("nothing better") && !dir.path().join("room-query.svg").exists()
-    );
+    assert!(read("room-seconds.svg").contains("Pareto front") && !dir.path().join("room-query.svg").exists());
 }
 
-/// A program that writes down how it is called and answers as the real one does: the second point reuses the first
-/// one's contributions, a second run measures nothing, and a point that the scene has no masks for is left out and named.
+/// A script records its arguments and prints what the real programs print. The second point reuses the first one's
+/// contributions, a second run measures nothing, and a point without masks in the scene is left out and named.
 #[cfg(unix)]
 #[test]
 fn points_are_measured_once_and_share_contributions() {
@@ -133,7 +131,7 @@ esac
     };
     let report = run(&settings, &programs, &Silent).expect("runs");
     let seconds: Vec<(f64, f64)> = report.figures.iter().map(|f| (f.seconds, f.views_seconds)).collect();
-    assert_eq!(seconds, [(7.25, 7.0), (7.25, 7.0)], "the second one's own half second is not its views'");
+    assert_eq!(seconds, [(7.25, 7.0), (7.25, 7.0)], "the second point has the views' seconds of the first");
     assert_eq!(report.figures[0].bytes_per_gaussian, 4.0);
     assert_eq!(report.left_out, ["a / other on room: it has no gt/masks"]);
     let called = fs_err::read_to_string(&calls).expect("was called");
@@ -145,7 +143,7 @@ esac
     assert_eq!(fs_err::read_to_string(&calls).expect("was called"), called, "nothing is measured twice");
     assert!(!Path::new(&settings.out.join("store")).exists());
 
-    // What a program says is handed on.
+    // The program's error message is passed on.
     fs_err::write(&programs.encoder, "#!/bin/sh\necho '{\"error\":{\"message\":\"no such thing\"}}'; exit 1")
         .expect("writes");
     let settings = TradeoffSettings { grid: Grid { points: vec![point("three", "--y", "")] }, ..settings };

@@ -31,6 +31,7 @@ pub struct CodecBenchArgs {
     /// Writes the report as JSON to this file.
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
+    /// Models of the store's text bank.
     #[command(flatten)]
     models: ModelArgs,
 }

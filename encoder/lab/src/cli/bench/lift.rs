@@ -24,7 +24,7 @@ pub struct LiftBenchArgs {
     /// Gaussians with a contribution, per view.
     #[arg(long, value_name = "N", default_value_t = 400_000, value_parser = clap::value_parser!(u32).range(1..))]
     visible: u32,
-    /// Contributions of each of these; near borders a Gaussian lies in several regions.
+    /// Mean contributions of each of these; a Gaussian near borders contributes to several regions.
     #[arg(long, value_name = "X", default_value_t = 1.4, value_parser = parse_ratio)]
     entries_per_visible: f64,
     /// Components of an embedding.
@@ -33,7 +33,7 @@ pub struct LiftBenchArgs {
     /// Gaussians per cell at most.
     #[arg(long, value_name = "N", default_value_t = 65_536, value_parser = clap::value_parser!(u32).range(1..=65_536))]
     cell_gaussians: u32,
-    /// Working memory, as of `encode`.
+    /// Working memory, as with `encode`.
     #[arg(long, value_name = "BYTES", default_value = "2GiB", value_parser = parse_bytes)]
     memory: u64,
     /// Threads [default: all cores].

@@ -14,15 +14,15 @@ use slag_encoder::progress::Progress;
 /// `bench`.
 #[derive(Debug, Subcommand)]
 pub enum BenchCommand {
-    /// Bytes against errors of the shards' codes, beside plain 8 bits and product quantisation.
+    /// Compares bytes and score errors of shards, 8-bit vectors and product quantisation.
     Codec(codec::CodecBenchArgs),
-    /// Publishes a store of a generated field, for `slag-edge bench query`.
+    /// Publishes a store of a generated field for `slag-edge bench query`.
     Field(field::FieldBenchArgs),
-    /// Weights of a view: each device on generated scenes, or on a recorded one.
+    /// Times the weights of a view: each device on generated scenes, or on a recorded one.
     Raster(raster::RasterBenchArgs),
-    /// From the contributions of all views to every Gaussian's embedding, on a made-up scene.
+    /// Times the way from the contributions of all views to embeddings, on a synthetic scene.
     Lift(lift::LiftBenchArgs),
-    /// Costs and accuracy of the choices of `encode` on labelled scenes: table, Pareto front and plots.
+    /// Measures cost and accuracy of settings of `encode` on labelled scenes: table, Pareto front and plots.
     Tradeoff(tradeoff::TradeoffArgs),
 }
 

@@ -23,7 +23,7 @@ pub struct RasterBenchArgs {
     /// Recorded scene: a NumPy archive of means, quats, scales, opacities, viewmats, Ks, width, height.
     #[arg(long, value_name = "FILE")]
     pub fixture: Option<PathBuf>,
-    /// Gaussians of the generated scenes; by default, without a recorded scene, 100000,1000000,2000000,8000000.
+    /// Gaussians of the generated scenes [default: 100000,1000000,2000000,8000000; none with --fixture].
     #[arg(long, value_name = "N", value_delimiter = ',', value_parser = clap::value_parser!(u32).range(1..))]
     pub gaussians: Vec<u32>,
     /// Regions of a view; a recorded scene is also measured with a grid of 8 x 6.
@@ -42,7 +42,7 @@ pub struct RasterBenchArgs {
     /// Timed views per case.
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..))]
     pub repeats: u32,
-    /// Views in flight where throughput is measured.
+    /// Concurrent views where throughput is measured.
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=256))]
     pub views: u32,
     /// Threads [default: all cores].

@@ -20,7 +20,7 @@ pub struct EvalEncoderArgs {
     /// Number of scenes to take crops from.
     #[arg(long, value_name = "N", default_value_t = 300)]
     n_scenes: u64,
-    /// Seed of the first scene; the next ones count up. The embedded encoders were trained on seeds 1000000 to 1012799.
+    /// Seed of the first scene; the others follow. The embedded encoders were trained on seeds 1000000 to 1012799.
     #[arg(long, default_value_t = 9_000_000)]
     seed: u64,
     /// Writes a picture of the confusion matrix to this file.

@@ -37,10 +37,10 @@ pub struct EvalLabelledArgs {
     /// Scores coarse and fine masks separately and takes the best instead of their mean.
     #[arg(long, conflicts_with = "profile")]
     pub by_mask_level: bool,
-    /// Score from which something counts as found [default: the store's].
+    /// Lowest score of a match [default: the store's].
     #[arg(long, value_name = "COSINE", allow_negative_numbers = true)]
     pub threshold: Option<f32>,
-    /// Lets the Gaussians of a superpoint answer together, as the paper does.
+    /// Gives the Gaussians of a superpoint one answer, as the paper does.
     #[arg(long, value_enum)]
     pub superpoints: Option<Filter>,
     /// What is scored [default: objects, where the scene has them].

@@ -38,7 +38,7 @@ pub struct EvalLerfArgs {
     /// Scores this profile's shards, as a robot does [default: the field in full precision].
     #[arg(long, value_name = "NAME")]
     profile: Option<Profile>,
-    /// Score from which a Gaussian is selected [default: the store's].
+    /// Lowest score of a selected Gaussian [default: the store's].
     #[arg(long, value_name = "COSINE", allow_negative_numbers = true)]
     threshold: Option<f32>,
 }
@@ -56,6 +56,6 @@ pub(super) fn run(args: &EvalLerfArgs, json: bool) -> Result<Exit> {
     };
     let report = lerf::lerf(&reader, &labels, &scene, &mut *encoder, &CpuRasterizer, &settings)?;
     print(json, &report, &report)?;
-    let is_whole = report.unknown_words.is_empty() && report.frames_without_view.is_empty();
-    Ok(if is_whole { Exit::Done } else { Exit::Partly })
+    let is_complete = report.unknown_words.is_empty() && report.frames_without_view.is_empty();
+    Ok(if is_complete { Exit::Done } else { Exit::Partly })
 }

@@ -1,4 +1,4 @@
-//! `eval`: answers and encoders against labels.
+//! `eval`: stores and encoders against labels.
 
 mod encoder;
 mod labelled;
@@ -14,15 +14,15 @@ use slag_encoder::progress::Progress;
 /// `eval`.
 #[derive(Debug, Subcommand)]
 pub enum EvalCommand {
-    /// Against a scene whose every Gaussian has a label (`generate scene` makes such scenes).
+    /// Evaluates a store of a scene with a label for every Gaussian, such as those of `generate scene`.
     Labelled(labelled::EvalLabelledArgs),
-    /// Against LangSplat's labels of LERF scenes (LERF-OVS).
+    /// Evaluates a store on LangSplat's labels of LERF scenes (LERF-OVS).
     Lerf(lerf::EvalLerfArgs),
-    /// Against ScanNet's labelled meshes, with OpenGaussian's protocol.
+    /// Evaluates stores on ScanNet's labelled meshes with OpenGaussian's protocol.
     Scannet(scannet::EvalScannetArgs),
-    /// On crops of generated things: which noun, colour and material they show.
+    /// Evaluates an encoder on crops of generated things: noun, colour and material.
     Encoder(encoder::EvalEncoderArgs),
-    /// How much each way to aggregate loses with errors in the masks.
+    /// Measures the accuracy of each aggregation method with errors in the masks.
     Noise(noise::EvalNoiseArgs),
 }
 

@@ -31,10 +31,10 @@ pub struct EvalNoiseArgs {
     /// Uses the masks of the built-in segmenter instead, without noise.
     #[arg(long, conflicts_with = "levels")]
     auto: bool,
-    /// Ways to aggregate [default: all].
+    /// Aggregation methods [default: all].
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     methods: Vec<String>,
-    /// Number of views at most, evenly spread.
+    /// Largest number of views, evenly spread.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     views_limit: Option<u32>,
     /// Fill of a crop outside its mask.
@@ -56,14 +56,14 @@ pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> 
     let wanted = |name: &str| args.methods.is_empty() || args.methods.iter().any(|method| method == name);
     if let Some(unknown) = args.methods.iter().find(|name| !known.iter().any(|(known, _)| known == name)) {
         let names: Vec<&str> = known.iter().map(|(name, _)| *name).collect();
-        return Err(anyhow!("unknown way to aggregate {unknown:?}; expected one of: {}", names.join(", ")));
+        return Err(anyhow!("unknown aggregation method {unknown:?}; expected one of: {}", names.join(", ")));
     }
     let (models, session) = open_models(&args.models)?;
     let devices = Devices::open(args.device, GpuOptions::default())?;
     let methods: Vec<(String, Aggregation)> = known
         .into_iter()
         .filter(|(name, _)| wanted(name))
-        .map(|(name, way)| (name.to_owned(), way))
+        .map(|(name, aggregation)| (name.to_owned(), aggregation))
         .collect();
     let levels = if args.auto { Vec::new() } else { args.levels.clone() };
     let n_rows = args.scene.len() * levels.len().max(1) * methods.len();

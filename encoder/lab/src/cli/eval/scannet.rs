@@ -60,6 +60,6 @@ pub(super) fn run(args: &EvalScannetArgs, json: bool) -> Result<Exit> {
     }
     let report = ScannetReport::new(scenes);
     print(json, &report, &report)?;
-    let is_whole = |s: &scannet::ScanReport| s.unknown_words.is_empty() && s.unknown_labels.is_empty();
-    Ok(if report.scenes.iter().all(is_whole) { Exit::Done } else { Exit::Partly })
+    let is_complete = |s: &scannet::ScanReport| s.unknown_words.is_empty() && s.unknown_labels.is_empty();
+    Ok(if report.scenes.iter().all(is_complete) { Exit::Done } else { Exit::Partly })
 }

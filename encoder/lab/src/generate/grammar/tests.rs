@@ -1,4 +1,4 @@
-//! Object files: parsing, refusals, and the files that are shipped.
+//! Object files: parsing, errors, and the built-in files.
 
 use super::*;
 
@@ -13,7 +13,7 @@ const STOOL: &str = "words: stool, seat  # a comment\nis: furniture, something t
     box main: 0, 0, 9 | 1, 1, 1 | if w - 1\ntop: 0.55 | w, w\n";
 
 #[test]
-fn a_file_makes_what_it_says() {
+fn a_file_makes_its_parts() {
     let noun = parse(STOOL).expect("parses");
     assert_eq!((noun.name.as_str(), noun.words.len(), noun.kinds.len()), ("small stool", 2, 2));
     assert_eq!(noun.found, [(SceneKind::Room, Place::Floor), (SceneKind::Yard, Place::Wall)]);
@@ -50,9 +50,9 @@ fn mistakes_are_named_with_their_line() {
     }
 }
 
-/// Every shipped file: parses, stands on the ground, is of sensible size, and uses each of its paints.
+/// Every built-in noun has kinds, stands on the ground, and has a sensible size.
 #[test]
-fn shipped_objects_are_sound() {
+fn built_in_objects_are_sound() {
     let nouns = nouns(None).expect("parse");
     assert!(nouns.len() >= 40, "{} nouns", nouns.len());
     for noun in &nouns {
