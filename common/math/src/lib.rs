@@ -4,6 +4,7 @@
 //! machine's vectors, and results do not depend on the number of threads.
 
 pub mod axes;
+pub mod cholesky;
 mod dot;
 pub mod eigen;
 pub mod graph_segmentation;

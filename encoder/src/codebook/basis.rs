@@ -5,6 +5,7 @@ use half::f16;
 use slag_models::TextEncoder;
 
 use slag_math::axes::moments_of;
+use slag_math::cholesky::{SmallPivots, cholesky};
 use slag_math::eigen::{EXTRA_VECTORS, leading_eigenvectors};
 use slag_math::matrix::{Panels, Rows};
 use slag_math::random::mix64;
@@ -89,22 +90,8 @@ impl ScoreMetric {
         }
         let isotropic = if bank.is_empty() { 1.0 } else { ISOTROPIC_SHARE } / dim as f64;
         (0..dim).for_each(|i| moments[i * dim + i] += isotropic);
-        // Cholesky, row by row (Golub and Van Loan, 4.2). The isotropic share keeps every pivot positive.
-        let mut factor = moments;
-        for i in 0..dim {
-            for j in 0..=i {
-                let (before, row) = factor.split_at_mut(i * dim);
-                let known: f64 = match j == i {
-                    true => row[..j].iter().map(|v| v * v).sum(),
-                    false => row[..j].iter().zip(&before[j * dim..]).map(|(a, b)| a * b).sum(),
-                };
-                row[j] = match j == i {
-                    true => (row[i] - known).max(isotropic / 2.0).sqrt(),
-                    false => (row[j] - known) / before[j * dim + j],
-                };
-            }
-            factor[i * dim + i + 1..(i + 1) * dim].fill(0.0);
-        }
+        // The isotropic share keeps every pivot well above the least.
+        let factor = cholesky(moments, dim, SmallPivots::Raise(isotropic / 2.0));
         Self { dim, factor }
     }
 

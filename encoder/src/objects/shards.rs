@@ -5,6 +5,7 @@ use slag_common::objects::{
     MAX_PHOTO_BYTES, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, quantise_vectors,
 };
 use slag_common::shard::Basis;
+use slag_math::cholesky::{SmallPivots, cholesky};
 
 use super::object::{NONE, SceneObjects};
 use super::vectors::MAX_MEDOIDS;
@@ -36,34 +37,16 @@ impl<'a> CentroidBasis<'a> {
         });
         let mut prepared = Self { dim, basis, factor: Vec::new() };
         let Some((_, vectors)) = &prepared.basis else { return prepared };
-        // Row by row (Golub and Van Loan, 4.2). A vector that the others make up gets no component.
         let m = prepared.m();
         let row = |i: usize| &vectors[i * dim..][..dim];
-        let mut factor = vec![0.0; m * m];
+        let mut products = vec![0.0; m * m];
         for i in 0..m {
             for j in 0..=i {
-                let product: f64 = row(i).iter().zip(row(j)).map(|(a, b)| a * b).sum();
-                let known: f64 = (0..j).map(|c| factor[i * m + c] * factor[j * m + c]).sum();
-                let rest = product - known;
-                factor[i * m + j] = match (i == j, factor[j * m + j]) {
-                    (true, _) => {
-                        if rest > 1e-9 * product {
-                            rest.sqrt()
-                        } else {
-                            0.0
-                        }
-                    }
-                    (false, pivot) => {
-                        if pivot > 0.0 {
-                            rest / pivot
-                        } else {
-                            0.0
-                        }
-                    }
-                };
+                products[i * m + j] = row(i).iter().zip(row(j)).map(|(a, b)| a * b).sum();
             }
         }
-        prepared.factor = factor;
+        // A vector that depends on those before gets no component.
+        prepared.factor = cholesky(products, m, SmallPivots::Drop(1e-9));
         prepared
     }
 
