@@ -11,6 +11,7 @@ pub mod graph_segmentation;
 pub mod matrix;
 pub mod random;
 pub mod simd;
+pub mod stats;
 pub mod union_find;
 
 pub use dot::{dot, dot_f64};

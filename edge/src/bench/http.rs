@@ -97,10 +97,9 @@ pub fn time_http(
                 body_bytes = body_bytes.max(body.len());
             }
         }
-        times_ms.sort_by(f64::total_cmp);
         let n_runs = times_ms.len();
         let same = in_process.iter().find(|timing| timing.limit == limit && timing.kind == Kind::Best);
-        let (median_ms, p99_ms) = (quantile(&times_ms, 0.5), quantile(&times_ms, 0.99));
+        let (median_ms, p99_ms) = (quantile(&mut times_ms, 500), quantile(&mut times_ms, 990));
         let added_ms = median_ms - same.map_or(0.0, |timing| timing.median_ms);
         timings.push(HttpTiming { limit, n_runs, body_bytes, median_ms, p99_ms, added_ms });
     }

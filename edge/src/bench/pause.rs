@@ -15,6 +15,7 @@ use tokio::net::TcpListener;
 use super::machine::Machine;
 use super::scene::{Generator, Shelf, store, text_service};
 use super::times::{Percentiles, Times};
+use super::timing::quantile;
 use crate::fetch::{Environment, FetchError, FetchRequest, NetworkLimits, Position, fetch};
 use crate::http::{self, App, Settings};
 use crate::query::Engine;
@@ -170,7 +171,6 @@ pub fn run(options: &PauseOptions) -> Result<PauseReport, PauseError> {
     }
     let mut fetch_ms: Vec<f64> =
         fetches.iter().map(|(began, ended)| (*ended - *began).as_secs_f64() * 1e3).collect();
-    fetch_ms.sort_by(f64::total_cmp);
     let generations: std::collections::BTreeSet<u64> = asked.iter().map(|query| query.generation).collect();
     let fetching = busy.percentiles();
     Ok(PauseReport {
@@ -179,7 +179,7 @@ pub fn run(options: &PauseOptions) -> Result<PauseReport, PauseError> {
         dim,
         n_fetches,
         bytes_per_fetch: bytes / u64::from(n_fetches.max(1)),
-        fetch_median_ms: fetch_ms.get(fetch_ms.len() / 2).copied().unwrap_or(0.0),
+        fetch_median_ms: quantile(&mut fetch_ms, 500),
         idle: quiet.percentiles(),
         fetching,
         longest_pause_ms: fetching.max_ms,

@@ -206,10 +206,8 @@ fn recall(
 
 fn timing(kind: Kind, limit: usize, runs: Vec<Run>, read_bytes_per_s: f64) -> Timing {
     let mut millis: Vec<f64> = runs.iter().map(|run| run.took.as_secs_f64() * 1e3).collect();
-    millis.sort_by(f64::total_cmp);
     let mut bytes: Vec<u64> = runs.iter().map(|run| run.bytes).collect();
-    bytes.sort_unstable();
-    let (median_ms, bytes_touched) = (quantile(&millis, 0.5), quantile(&bytes, 0.5));
+    let (median_ms, bytes_touched) = (quantile(&mut millis, 500), quantile(&mut bytes, 500));
     let plain_read_ms = bytes_touched as f64 / read_bytes_per_s * 1e3;
     let found = || runs.iter().map(|run| run.n_found);
     Timing {
@@ -218,9 +216,9 @@ fn timing(kind: Kind, limit: usize, runs: Vec<Run>, read_bytes_per_s: f64) -> Ti
         n_runs: runs.len(),
         n_found: [found().min().unwrap_or(0), found().max().unwrap_or(0)],
         median_ms,
-        p99_ms: quantile(&millis, 0.99),
+        p99_ms: quantile(&mut millis, 990),
         recall: None,
-        min_ms: millis[0],
+        min_ms: quantile(&mut millis, 0),
         bytes_touched,
         plain_read_ms,
         times_plain_read: median_ms / plain_read_ms,

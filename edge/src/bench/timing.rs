@@ -1,6 +1,7 @@
 //! Parameters of a measurement of queries, and the times of one kind of answer.
 
 use serde::Serialize;
+use slag_math::stats::{self, Ordered, Rank};
 
 use crate::score::Precision;
 
@@ -56,7 +57,8 @@ pub struct Timing {
     pub times_plain_read: f64,
 }
 
-/// Returns the least of the sorted values that a share of them does not exceed; there must be at least one.
-pub fn quantile<T: Copy>(sorted: &[T], share: f64) -> T {
-    sorted[((sorted.len() as f64 * share).ceil() as usize).clamp(1, sorted.len()) - 1]
+/// Returns the least value that this share of the values does not exceed, in thousandths; 0 without any. It reorders the
+/// values.
+pub fn quantile<T: Ordered + Default>(values: &mut [T], per_mille: usize) -> T {
+    stats::quantile(values, per_mille, Rank::Nearest).unwrap_or_default()
 }

@@ -11,9 +11,10 @@ use glam::{DVec3, I64Vec3};
 use rayon::prelude::*;
 use slag_common::frames::Aabb;
 use slag_common::shard::ShardView;
+use slag_math::stats::trimmed_range;
 use slag_math::union_find::UnionFind;
 
-use super::oriented::{Alignment, OrientedBox, trimmed_range};
+use super::oriented::{Alignment, OrientedBox};
 use crate::score::Run;
 
 /// Bits of a voxel coordinate in its key; three of them fill a `u64`.
@@ -278,7 +279,7 @@ fn trimmed_box(points: &[DVec3]) -> Aabb {
     for axis in 0..3 {
         values.clear();
         values.extend(points.iter().map(|point| point[axis]));
-        (min[axis], max[axis]) = trimmed_range(&mut values, TRIMMED);
+        (min[axis], max[axis]) = trimmed_range(&mut values, TRIMMED).unwrap_or_default();
     }
     Aabb { min, max }
 }

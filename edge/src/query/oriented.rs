@@ -2,6 +2,7 @@
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use serde::Serialize;
+use slag_math::stats::trimmed_range;
 
 /// Permitted orientations of a box.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -44,7 +45,7 @@ impl OrientedBox {
         for axis in 0..3 {
             values.clear();
             values.extend(points.iter().map(|point| axes.col(axis).dot(*point)));
-            (min[axis], max[axis]) = trimmed_range(&mut values, trimmed);
+            (min[axis], max[axis]) = trimmed_range(&mut values, trimmed).unwrap_or_default();
         }
         let (axes, min, max) = longest_first(axes, min, max, alignment);
         Self {
@@ -54,17 +55,6 @@ impl OrientedBox {
             alignment,
         }
     }
-}
-
-/// Returns the `trimmed` and `1 - trimmed` quantiles of values, which it reorders; zeros if there are none.
-pub fn trimmed_range(values: &mut [f64], trimmed: f64) -> (f64, f64) {
-    let Some(last) = values.len().checked_sub(1) else { return (0.0, 0.0) };
-    let cut = (trimmed * last as f64) as usize;
-    let (_, low, above) = values.select_nth_unstable_by(cut, f64::total_cmp);
-    let low = *low;
-    // Index of the upper quantile among the values above the lower one.
-    let place = above.len().checked_sub(1 + cut);
-    (low, place.map_or(low, |place| *above.select_nth_unstable_by(place, f64::total_cmp).1))
 }
 
 fn axes_of(points: &[DVec3], alignment: Alignment) -> DMat3 {
@@ -223,8 +213,9 @@ mod tests {
             points.push(DVec3::new(far(), far(), far()));
         }
         // The core that clusters use: between quantiles along the world's axes.
-        let range =
-            |axis: usize| trimmed_range(&mut points.iter().map(|p| p[axis]).collect::<Vec<_>>(), 0.02);
+        let range = |axis: usize| {
+            trimmed_range(&mut points.iter().map(|p| p[axis]).collect::<Vec<_>>(), 0.02).expect("has points")
+        };
         let core: [(f64, f64); 3] = std::array::from_fn(range);
         let in_core = |p: &DVec3| (0..3).all(|axis| (core[axis].0..=core[axis].1).contains(&p[axis]));
         let found = OrientedBox::around(&points, in_core, Alignment::Gravity, 0.02);

@@ -4,6 +4,7 @@ use glam::DVec3;
 use slag_common::manifest::Manifest;
 use slag_common::objects::Objects;
 use slag_common::shard::ShardView;
+use slag_math::stats::median;
 
 use super::oriented::Alignment;
 use crate::store::objects::ObjectIndex;
@@ -36,8 +37,7 @@ pub fn default_voxel(manifest: &Manifest) -> f64 {
     }
     let middle = |size: DVec3| size.x.max(size.y).min(size.x.max(size.z)).min(size.y.max(size.z));
     let mut edges: Vec<f64> = manifest.cells.iter().map(|cell| middle(cell.bounds.size())).collect();
-    edges.sort_by(f64::total_cmp);
-    let voxel = edges.get(edges.len() / 2).map_or(0.0, |edge| edge / VOXELS_PER_CELL);
+    let voxel = median(&mut edges).map_or(0.0, |edge| edge / VOXELS_PER_CELL);
     if voxel > 0.0 && voxel.is_finite() { voxel } else { 1.0 }
 }
 

@@ -3,6 +3,7 @@
 use glam::DVec3;
 use serde::Serialize;
 use slag_common::Gaussians;
+use slag_math::stats::{Rank, quantile};
 
 use super::error::CheckError;
 use super::mistake::{MISTAKES, Mistake};
@@ -155,9 +156,8 @@ fn scene_diagonal(scene: &Gaussians) -> f64 {
     let size = |axis: usize| {
         let finite = |p: &DVec3| Some(p[axis]).filter(|v| v.is_finite());
         let mut values: Vec<f64> = scene.means_in_world.iter().filter_map(finite).collect();
-        values.sort_unstable_by(f64::total_cmp);
-        let at = |percent: usize| values.get(values.len().saturating_sub(1) * percent / 100).copied();
-        at(95).unwrap_or(0.0) - at(5).unwrap_or(0.0)
+        let mut at = |per_mille| quantile(&mut values, per_mille, Rank::Between).unwrap_or_default();
+        at(950) - at(50)
     };
     DVec3::new(size(0), size(1), size(2)).length()
 }

@@ -5,6 +5,7 @@ use slag_common::shard::ScoreErrors;
 
 use super::basis::TextBank;
 use slag_math::matrix::{Panels, Rows};
+use slag_math::stats::{Rank, quantile};
 
 /// Most sampled Gaussians of a cell.
 const SAMPLE: usize = 1024;
@@ -74,8 +75,7 @@ impl<'a> Sample<'a> {
             .sum::<f64>()
             / n as f64;
         let max = errors.iter().copied().fold(0.0, f32::max);
-        let place = ((n as f64 * 0.999) as usize).min(n - 1);
-        let p999 = *errors.select_nth_unstable_by(place, f32::total_cmp).1;
+        let p999 = quantile(&mut errors, 999, Rank::After).unwrap_or_default();
         ScoreErrors { mean: mean as f32, p999, max, spread: self.spread }
     }
 }

@@ -3,6 +3,7 @@
 use glam::DVec3;
 use rayon::prelude::*;
 use slag_common::frames::Aabb;
+use slag_math::stats::trimmed_range;
 
 use super::consensus::{self, Masks};
 use super::members::Members;
@@ -97,13 +98,11 @@ fn describe(scene: &Scene<'_>, members: &Members, view_of_mask: &[u32]) -> Vec<O
 
 /// Returns the box without the outermost means, and the mean of those inside.
 fn trimmed_box(means: &[DVec3]) -> (DVec3, Aabb) {
-    let last = means.len() - 1;
-    let cut = (TRIMMED * last as f64) as usize;
     let mut bounds = Aabb { min: DVec3::ZERO, max: DVec3::ZERO };
     for axis in 0..3 {
         let mut values: Vec<f64> = means.iter().map(|mean| mean[axis]).collect();
-        values.sort_unstable_by(f64::total_cmp);
-        (bounds.min[axis], bounds.max[axis]) = (values[cut], values[last - cut]);
+        (bounds.min[axis], bounds.max[axis]) =
+            trimmed_range(&mut values, TRIMMED).expect("an object has Gaussians");
     }
     let is_inside = |mean: &&DVec3| mean.cmpge(bounds.min).all() && mean.cmple(bounds.max).all();
     let inside: Vec<&DVec3> = means.iter().filter(is_inside).collect();

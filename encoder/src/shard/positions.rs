@@ -3,6 +3,7 @@
 use glam::DVec3;
 use slag_common::Gaussians;
 use slag_common::shard::Positions;
+use slag_math::stats::{Rank, quantile};
 
 use crate::cells::Cell;
 
@@ -30,11 +31,7 @@ impl PositionError {
                     .iter()
                     .map(|g| scene.scales[*g as usize].into_iter().fold(0.0, f32::max))
                     .collect();
-                let place = sizes.len() / 10;
-                match sizes.get(place) {
-                    Some(_) => f64::from(*sizes.select_nth_unstable_by(place, f32::total_cmp).1) / 4.0,
-                    None => 0.0,
-                }
+                quantile(&mut sizes, 100, Rank::After).map_or(0.0, |size| f64::from(size) / 4.0)
             }
         }
     }

@@ -21,6 +21,7 @@ use slag_encoder::shard::positions::PositionError;
 use slag_encoder::shard::{self, CellEmbeddings, ShardSettings};
 use slag_encoder::store::{StoreError, StoreReader};
 use slag_math::matrix::{Panels, Rows};
+use slag_math::stats::{Rank, quantile};
 
 /// Number of texts with compared rankings.
 const N_RANKED: usize = 100;
@@ -238,8 +239,7 @@ impl<'a> Truth<'a> {
             .sum::<f64>()
             / errors.len() as f64;
         let max = errors.iter().copied().fold(0.0, f32::max);
-        let place = (errors.len() as f64 * 0.999) as usize;
-        let p999 = *errors.select_nth_unstable_by(place, f32::total_cmp).1;
+        let p999 = quantile(&mut errors, 999, Rank::After).unwrap_or_default();
         let found = rankings(decoded, self.dim, &self.ranked, self.ranks);
         let recall = |rank: usize| {
             let shares = self.best.iter().zip(&found).map(|(truth, found)| {

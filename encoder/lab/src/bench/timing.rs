@@ -3,6 +3,7 @@
 use std::time::Instant;
 
 use serde::Serialize;
+use slag_math::stats::{Rank, quantile};
 
 /// Several timings of the same work.
 #[derive(Clone, Debug, Serialize)]
@@ -27,10 +28,9 @@ impl Spread {
     /// # Panics
     /// Without any.
     pub fn of(mut timings_ms: Vec<f64>) -> Self {
-        timings_ms.sort_by(f64::total_cmp);
         let n = timings_ms.len();
-        let at = |share: f64| timings_ms[((n - 1) as f64 * share).round() as usize];
-        Self { n, min_ms: at(0.0), p10_ms: at(0.1), median_ms: at(0.5), p90_ms: at(0.9), max_ms: at(1.0) }
+        let mut at = |per_mille| quantile(&mut timings_ms, per_mille, Rank::Nearest).expect("has timings");
+        Self { n, min_ms: at(0), p10_ms: at(100), median_ms: at(500), p90_ms: at(900), max_ms: at(1000) }
     }
 }
 

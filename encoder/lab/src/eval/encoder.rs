@@ -17,6 +17,7 @@ use crate::generate::grammar::Noun;
 use crate::generate::paint::{Colour, Material};
 use slag_encoder::progress::Progress;
 use slag_math::dot;
+use slag_math::stats::{Rank, quantile};
 
 /// A crop shows a whole thing if its mask is the true one and more than this share of the thing is visible.
 const WHOLE: f64 = 0.6;
@@ -253,8 +254,7 @@ fn timed(mut call: impl FnMut(usize) -> Result<(), EncodeError>) -> Result<f64, 
         call(i)?;
         times.push(start.elapsed().as_secs_f64() * 1e3);
     }
-    times.sort_by(f64::total_cmp);
-    Ok(times[N_TIMED / 2])
+    Ok(quantile(&mut times, 500, Rank::Nearest).unwrap_or_default())
 }
 
 impl fmt::Display for EncoderReport {

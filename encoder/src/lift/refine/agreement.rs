@@ -3,6 +3,7 @@
 
 use rayon::prelude::*;
 use slag_math::dot;
+use slag_math::stats::median;
 
 use super::points::{AXES, Point, add, length, sum_of};
 use super::settings::LEAST_MASK_WEIGHT;
@@ -102,8 +103,7 @@ impl Votes {
         };
         let cosines: Vec<Option<f32>> = of_masks.iter().zip(mask_points).map(cosine).collect();
         let mut known: Vec<f32> = cosines.iter().flatten().copied().collect();
-        known.sort_by(f32::total_cmp);
-        let median = known.get(known.len() / 2).copied().unwrap_or(1.0);
+        let median = median(&mut known).unwrap_or(1.0);
         let weight = |cosine: &Option<f32>| cosine.unwrap_or(median).max(LEAST_MASK_WEIGHT).powf(power);
         cosines.iter().map(weight).collect()
     }

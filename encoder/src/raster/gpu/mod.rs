@@ -25,6 +25,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use glam::DVec3;
 use rayon::prelude::*;
 use slag_common::Gaussians;
+use slag_math::stats::{Rank, quantile};
 
 pub use super::adapter::{AdapterReport, GpuOptions, Precision};
 use super::constants::TILE_SIZE_PX;
@@ -345,10 +346,9 @@ fn middle(scene: &Gaussians, usable: &[bool]) -> DVec3 {
     }
     DVec3::from_array(std::array::from_fn(|axis| {
         let mut values: Vec<f64> = sample.iter().map(|mean| mean[axis]).collect();
-        values.sort_unstable_by(f64::total_cmp);
-        let at = |share: usize| values[(values.len() - 1) * share / 10];
-        let scale = (at(9) - at(1)).max(1e-6).log2().ceil().exp2();
-        (at(5) / scale).round() * scale
+        let mut at = |per_mille| quantile(&mut values, per_mille, Rank::Between).unwrap_or_default();
+        let scale = (at(900) - at(100)).max(1e-6).log2().ceil().exp2();
+        (at(500) / scale).round() * scale
     }))
 }
 
