@@ -11,6 +11,7 @@ pub mod frames;
 pub mod gaussians;
 pub mod hash;
 pub mod manifest;
+pub mod npy;
 pub mod npz;
 pub mod objects;
 pub mod poses;

@@ -3,7 +3,6 @@
 mod by_level;
 
 use std::collections::{BTreeMap, HashSet};
-use std::io::{self, Write};
 
 use glam::DVec3;
 use serde::Serialize;
@@ -315,22 +314,6 @@ pub fn best(reader: &StoreReader, scores: &Scores, n: usize) -> Result<Vec<Hit>,
     Ok(hits)
 }
 
-/// Writes values as a NumPy array of one dimension (`.npy` version 1.0, little-endian f32).
-///
-/// # Errors
-/// Errors of the writer.
-pub fn write_npy(mut out: impl Write, values: &[f32]) -> io::Result<()> {
-    let mut header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({},), }}", values.len());
-    // Magic, version and length take 10 bytes; the whole is a multiple of 64 and ends in a newline.
-    let padding = 63 - (10 + header.len()) % 64;
-    header.extend(std::iter::repeat_n(' ', padding));
-    header.push('\n');
-    out.write_all(b"\x93NUMPY\x01\x00")?;
-    out.write_all(&(header.len() as u16).to_le_bytes())?;
-    out.write_all(header.as_bytes())?;
-    out.write_all(bytemuck::cast_slice(values))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -359,19 +342,5 @@ mod tests {
         assert!(message(Profile::Exact).ends_with("with exact in --profiles"), "{}", message(Profile::Exact));
         let compact = message(Profile::Compact);
         assert!(compact.ends_with("with compact and exact in --profiles"), "{compact}");
-    }
-
-    /// Oracle: another reader of the format.
-    #[test]
-    fn npy_is_read_by_another_reader() {
-        for n in [0usize, 1, 70, 1000] {
-            let values: Vec<f32> = (0..n).map(|i| i as f32 * 0.5).collect();
-            let mut bytes = Vec::new();
-            write_npy(&mut bytes, &values).expect("writes to memory");
-            let npy = npyz::NpyFile::new(&bytes[..]).expect("an npy file");
-            assert_eq!(npy.shape(), [n as u64]);
-            assert_eq!(npy.into_vec::<f32>().expect("f32"), values);
-            assert_eq!((bytes.len() - 4 * n) % 64, 0);
-        }
     }
 }

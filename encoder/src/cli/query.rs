@@ -1,11 +1,11 @@
 //! `query`: scores of every Gaussian against a text.
 
-use std::io::Write;
 use std::path::PathBuf;
 
 use anyhow::Result;
 use clap::Args;
 use serde_json::json;
+use slag_common::npy;
 use slag_common::shard::Profile;
 
 use super::common::{ModelArgs, print, profile_parser, text_encoder_of};
@@ -49,9 +49,7 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
         None => query::scores(&reader, &vector)?,
     };
     if let Some(path) = &args.scores {
-        let mut file = std::io::BufWriter::new(fs_err::File::create(path)?);
-        query::write_npy(&mut file, &scores.cosines)?;
-        file.flush()?;
+        npy::write_file(path, &[scores.cosines.len()], &scores.cosines)?;
     }
     let hits = query::best(&reader, &scores, args.limit as usize)?;
     let threshold = manifest.encoder.default_threshold;

@@ -7,13 +7,13 @@ use glam::DVec3;
 use image::RgbImage;
 use rayon::prelude::*;
 use serde::Serialize;
-use slag_common::View;
+use slag_common::{View, npy};
 use slag_models::Crop;
 use slag_models::preprocess::{Filter, Preprocess, Resize};
 
 use super::compose::{Layout, looking, pinhole};
 use super::grammar::Noun;
-use super::output::{GenerateError, write_npy};
+use super::output::GenerateError;
 use super::paint::{Colour, Material};
 use super::render::{NOTHING, Photo, Solids};
 use slag_encoder::embed::{self, Background};
@@ -108,8 +108,8 @@ pub fn write(
     let crops: Vec<(RgbImage, Label)> = seeds.into_par_iter().flat_map_iter(of_seed).collect();
     progress.end();
     let pixels: Vec<u8> = crops.iter().flat_map(|(image, _)| image.as_raw().iter().copied()).collect();
-    let edge = u64::from(edge_px);
-    write_npy(&folder.join("crops.npy"), &[crops.len() as u64, edge, edge, 3], &pixels)?;
+    let edge = edge_px as usize;
+    npy::write_file(&folder.join("crops.npy"), &[crops.len(), edge, edge, 3], &pixels)?;
     let labels: Vec<&Label> = crops.iter().map(|(_, label)| label).collect();
     fs_err::write(folder.join("labels.json"), serde_json::to_vec(&labels).map_err(std::io::Error::from)?)?;
     let mut out = fs_err::File::create(folder.join("nouns.json"))?;

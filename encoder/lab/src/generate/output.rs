@@ -1,6 +1,6 @@
 //! Errors and output files of generation.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use image::RgbImage;
 use slag_common::splat::SplatError;
@@ -30,23 +30,35 @@ pub enum GenerateError {
     },
 }
 
-/// Writes values as an npy file.
-pub(super) fn write_npy<T: npyz::AutoSerialize + Copy>(
-    path: &Path,
-    shape: &[u64],
-    values: &[T],
-) -> std::io::Result<()> {
-    use npyz::WriterBuilder;
-    let mut out = std::io::BufWriter::new(fs_err::File::create(path)?);
-    let mut writer = npyz::WriteOptions::new().default_dtype().shape(shape).writer(&mut out).begin_nd()?;
-    writer.extend(values.iter().copied())?;
-    writer.finish()?;
-    std::io::Write::flush(&mut out)
-}
-
 /// Returns a drawing as 8-bit RGB.
 pub(crate) fn to_image(drawing: &Drawing, view: &RasterView) -> RgbImage {
     let bytes = drawing.rgb.iter().map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
     RgbImage::from_raw(view.intrinsics.width_px, view.intrinsics.height_px, bytes)
         .expect("a drawing has three values per pixel of its view")
+}
+
+#[cfg(test)]
+mod tests {
+    use slag_common::npy;
+
+    /// Oracle: another program's reader of the format.
+    #[test]
+    fn arrays_are_read_by_another_reader() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let path = dir.path().join("array.npy");
+        let values: Vec<u16> = (0..30).map(|i| i * 2003).collect();
+        npy::write_file(&path, &[5, 2, 3], &values).expect("writes");
+        let bytes = fs_err::read(&path).expect("reads");
+        let array = npyz::NpyFile::new(&bytes[..]).expect("an array");
+        assert_eq!(array.shape(), [5, 2, 3]);
+        assert_eq!(array.into_vec::<u16>().expect("u16"), values);
+        for n in [0usize, 1, 70, 1000] {
+            let values: Vec<f32> = (0..n).map(|i| i as f32 * 0.5).collect();
+            let mut bytes = Vec::new();
+            npy::write(&mut bytes, &[n], &values).expect("writes to memory");
+            let array = npyz::NpyFile::new(&bytes[..]).expect("an array");
+            assert_eq!(array.shape(), [n as u64]);
+            assert_eq!(array.into_vec::<f32>().expect("f32"), values);
+        }
+    }
 }

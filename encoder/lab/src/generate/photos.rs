@@ -3,10 +3,11 @@
 use std::path::Path;
 
 use rayon::prelude::*;
+use slag_common::npy;
 
 use super::compose::{FIELD_OF_VIEW_RAD, Layout, PHOTO_PX, pinhole};
 use super::grammar::Noun;
-use super::output::{GenerateError, write_npy};
+use super::output::GenerateError;
 use super::render::{NOTHING, Photo};
 use slag_encoder::progress::Progress;
 use slag_math::random::Xorshift;
@@ -38,11 +39,11 @@ pub fn write(
     };
     let photos: Vec<Photo> = seeds.into_par_iter().flat_map_iter(of_seed).collect();
     progress.end();
-    let shape = [photos.len() as u64, u64::from(PHOTO_PX[1]), u64::from(PHOTO_PX[0])];
+    let shape = [photos.len(), PHOTO_PX[1] as usize, PHOTO_PX[0] as usize];
     let pixels: Vec<u8> = photos.iter().flat_map(|photo| photo.image.as_raw().iter().copied()).collect();
-    write_npy(&folder.join("photos.npy"), &[&shape[..], &[3]].concat(), &pixels)?;
+    npy::write_file(&folder.join("photos.npy"), &[&shape[..], &[3]].concat(), &pixels)?;
     let things: Vec<u16> = photos.iter().flat_map(|photo| photo.thing_of_pixel.iter().copied()).collect();
     debug_assert_eq!(NOTHING, u16::MAX);
-    write_npy(&folder.join("things.npy"), &shape, &things)?;
+    npy::write_file(&folder.join("things.npy"), &shape, &things)?;
     Ok(photos.len())
 }

@@ -6,14 +6,14 @@ use glam::{DQuat, DVec3};
 use serde::Serialize;
 use slag_common::Gaussians;
 use slag_common::gaussians::SH_C0;
-use slag_common::splat;
+use slag_common::{npy, splat};
 use slag_encoder::progress::Progress;
 use slag_encoder::raster::RasterView;
 use slag_math::random::Xorshift;
 
 use super::compose::{FIELD_OF_VIEW_RAD, Layout, PHOTO_PX, pinhole};
 use super::grammar::{Noun, SceneKind};
-use super::output::{GenerateError, write_npy};
+use super::output::GenerateError;
 use super::render::NOTHING;
 
 /// Distance between surface Gaussians, relative to the thing's radius.
@@ -162,7 +162,7 @@ impl Scene {
         });
         write_json(&truth.join("instances.json"), &instances)?;
         let ids = &self.id_of_gaussian;
-        write_npy(&truth.join("gaussian_instance.npy"), &[ids.len() as u64], ids)?;
+        npy::write_file(&truth.join("gaussian_instance.npy"), &[ids.len()], ids)?;
         Ok(WrittenScene { scene, views, truth })
     }
 
