@@ -4,6 +4,7 @@
 //! Nothing here accesses the network, runs models or starts threads.
 #![forbid(unsafe_code)]
 
+pub mod byte_size;
 pub mod camera;
 pub mod container;
 pub mod durable;
@@ -19,6 +20,7 @@ mod quantise;
 pub mod shard;
 pub mod splat;
 
+pub use byte_size::ByteSize;
 pub use camera::{Distortion, Intrinsics, View};
 pub use gaussians::Gaussians;
 pub use hash::Hash32;

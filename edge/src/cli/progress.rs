@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use slag_common::ByteSize;
 use slag_edge::fetch::{DownloadFailure, FetchReport, Progress, Tally};
 
 use super::failure::Failure;
@@ -73,7 +74,8 @@ impl Progress for Bar {
         let received = self.received_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
         let planned = self.planned_bytes.load(Ordering::Relaxed);
         if self.shown {
-            let _ = write!(io::stderr(), "\r{:.1} of {:.1} MB ", received as f64 / 1e6, planned as f64 / 1e6);
+            // As wide as the longest size, so that a line covers the one before.
+            let _ = write!(io::stderr(), "\r{:>8} of {:>8} ", ByteSize(received), ByteSize(planned));
         }
     }
 

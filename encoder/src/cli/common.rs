@@ -11,6 +11,8 @@ use anyhow::{Context, Result, anyhow};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
 use serde::Serialize;
+use slag_common::ByteSize;
+use slag_common::byte_size::ByteSizeError;
 use slag_common::shard::Profile;
 use slag_models::commands::{self, RunArgs};
 use slag_models::session::SessionError;
@@ -203,20 +205,16 @@ pub fn runtime() -> Result<tokio::runtime::Runtime> {
         .context("cannot start the service's threads")
 }
 
-/// Reads a number of bytes with an optional unit.
-pub fn parse_bytes(text: &str) -> Result<u64, String> {
-    let digits = text.trim_end_matches(|c: char| c.is_ascii_alphabetic());
-    let factor: u64 = match &text[digits.len()..] {
-        "" | "B" => 1,
-        "KiB" => 1 << 10,
-        "MiB" => 1 << 20,
-        "GiB" => 1 << 30,
-        unit => return Err(format!("unit {unit:?}: expected none, KiB, MiB or GiB")),
-    };
-    let number: u64 =
-        digits.parse().map_err(|_| format!("{text:?} is no number of bytes; expected for example 512MiB"))?;
-    let bytes = number.checked_mul(factor).ok_or_else(|| format!("{text:?} is too large"))?;
-    if bytes < 64 << 20 { Err(format!("{text:?} is too little; expected at least 64MiB")) } else { Ok(bytes) }
+/// Least working memory, bytes.
+const MIN_MEMORY_BYTES: u64 = 64 << 20;
+
+/// Reads the size of the working memory, see [`ByteSize`].
+pub fn parse_memory(text: &str) -> Result<u64, String> {
+    let ByteSize(bytes) = text.parse().map_err(|e: ByteSizeError| e.to_string())?;
+    if bytes < MIN_MEMORY_BYTES {
+        return Err(format!("{text:?} is too little; expected at least 64MiB"));
+    }
+    Ok(bytes)
 }
 
 /// Returns the parser of profiles, whose names the help text lists.
@@ -237,13 +235,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bytes_have_units() {
-        assert_eq!(parse_bytes("2GiB"), Ok(2 << 30));
-        assert_eq!(parse_bytes("67108864"), Ok(1 << 26));
-        assert!(
-            parse_bytes("99999999999GiB").is_err()
-                && parse_bytes("-1").is_err()
-                && parse_bytes("GiB").is_err()
+    fn memory_has_a_least_size() {
+        assert_eq!(parse_memory("64MiB"), Ok(67_108_864));
+        assert_eq!(
+            parse_memory("67108863"),
+            Err("\"67108863\" is too little; expected at least 64MiB".into())
         );
+        assert_eq!(parse_memory("GB"), Err("unit \"GB\": expected none, KiB, MiB or GiB".into()));
     }
 }

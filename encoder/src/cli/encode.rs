@@ -4,11 +4,12 @@ use std::path::PathBuf;
 
 use anyhow::{Result, anyhow};
 use clap::{Args, ValueEnum};
+use slag_common::ByteSize;
 use slag_common::shard::Profile;
 
 use super::common::{
     BackgroundArg, InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs,
-    open_models, parse_bytes, parse_error, print, profile_parser,
+    open_models, parse_error, parse_memory, print, profile_parser,
 };
 use super::exit::Exit;
 use super::refine::RefineArgs;
@@ -82,7 +83,7 @@ pub struct EncodeArgs {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
     /// Working memory beside the scene and the photos in work: a number with KiB, MiB or GiB.
-    #[arg(long, value_name = "BYTES", default_value = "2GiB", value_parser = parse_bytes)]
+    #[arg(long, value_name = "BYTES", default_value = "2GiB", value_parser = parse_memory)]
     pub memory: u64,
     /// Name of the scene [default: the name of the store's folder].
     #[arg(long, value_name = "NAME")]
@@ -246,7 +247,7 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     let sizes = summary
         .shard_bytes
         .iter()
-        .map(|(p, b)| format!("{p} {:.1} MB", *b as f64 / 1e6))
+        .map(|(p, b)| format!("{p} {}", ByteSize(*b)))
         .collect::<Vec<_>>()
         .join(", ");
     let skipped = match summary.skipped_views.len() {

@@ -3,6 +3,7 @@
 use std::fmt;
 
 use serde::Serialize;
+use slag_common::ByteSize;
 
 use super::options::LiftOptions;
 use crate::bench::machine::Machine;
@@ -99,12 +100,11 @@ pub struct EmbeddingModel {
 impl fmt::Display for LiftReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let LiftOptions { n_gaussians, n_views, n_masks, dim, .. } = self.options;
-        let gb = |bytes: u64| bytes as f64 / 1e9;
         writeln!(
             f,
-            "{n_gaussians} Gaussians, {n_views} views of {n_masks} masks, {dim} components: {} entries, {:.2} GB; {}",
+            "{n_gaussians} Gaussians, {n_views} views of {n_masks} masks, {dim} components: {} entries, {}; {}",
             self.n_entries,
-            gb(self.disk_bytes),
+            ByteSize(self.disk_bytes),
             self.machine.cpu
         )?;
         for step in &self.steps {
@@ -119,25 +119,25 @@ impl fmt::Display for LiftReport {
         if let Some(peak) = self.peak_rss_bytes {
             writeln!(
                 f,
-                "{:<42} {:>9.2} GB of {:.2} GB",
+                "{:<42} {:>12} of {}",
                 "peak memory",
-                gb(peak),
-                gb(self.options.memory_bytes)
+                ByteSize(peak),
+                ByteSize(self.options.memory_bytes)
             )?;
         }
         let plan = &self.plan;
         writeln!(
             f,
-            "estimate for {} Gaussians, {} views: {} entries, {:.1} GB on disk read once, none written; \
-             aggregation {:.1} s and embeddings {:.1} s of one processor; memory {:.2} GB for the index, {:.2} GB for a cell",
+            "estimate for {} Gaussians, {} views: {} entries, {} on disk read once, none written; \
+             aggregation {:.1} s and embeddings {:.1} s of one processor; memory {} for the index, {} for a cell",
             plan.n_gaussians,
             plan.n_views,
             plan.n_entries,
-            gb(plan.disk_bytes),
+            ByteSize(plan.disk_bytes),
             plan.aggregation_cpu_secs,
             plan.embeddings_cpu_secs,
-            gb(plan.index_bytes),
-            gb(plan.cell_bytes)
+            ByteSize(plan.index_bytes),
+            ByteSize(plan.cell_bytes)
         )
     }
 }

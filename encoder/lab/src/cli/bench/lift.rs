@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::{Context, Result};
 use clap::Args;
 use slag_encoder::cli::Exit;
-use slag_encoder::cli::common::{available_threads, parse_bytes, print};
+use slag_encoder::cli::common::{available_threads, parse_memory, print};
 
 use crate::bench::lift::{self, LiftOptions};
 
@@ -34,7 +34,7 @@ pub struct LiftBenchArgs {
     #[arg(long, value_name = "N", default_value_t = 65_536, value_parser = clap::value_parser!(u32).range(1..=65_536))]
     cell_gaussians: u32,
     /// Working memory, as with `encode`.
-    #[arg(long, value_name = "BYTES", default_value = "2GiB", value_parser = parse_bytes)]
+    #[arg(long, value_name = "BYTES", default_value = "2GiB", value_parser = parse_memory)]
     memory: u64,
     /// Threads [default: all cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
