@@ -17,6 +17,7 @@ pub mod npz;
 pub mod objects;
 pub mod poses;
 mod quantise;
+pub mod retry;
 pub mod shard;
 pub mod splat;
 

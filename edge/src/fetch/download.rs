@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use slag_common::Hash32;
 use slag_common::manifest::{self, ManifestError};
+use slag_common::retry::{Backoff, Retries};
 use ureq::http::{Response, StatusCode, Uri, header};
 
 use super::environment::Environment;
@@ -269,27 +270,25 @@ impl<'a> Client<'a> {
     /// Retries until an attempt succeeds or fails for good, or too many fail in a row without progress.
     fn retrying<T>(&self, url: &str, mut attempt: impl FnMut() -> Result<T, Stop>) -> Result<T, FetchError> {
         let limits = &self.environment.limits;
-        let mut attempts = 0;
+        let backoff = Backoff { first: limits.first_backoff, longest: limits.longest_backoff };
+        let mut retries = Retries::new(limits.attempts, backoff);
         loop {
             self.check_cancelled()?;
-            let failure = match attempt() {
+            let (failure, made_progress) = match attempt() {
                 Ok(value) => return Ok(value),
                 Err(Stop::Fatal(e)) => return Err(e),
-                Err(Stop::Failed(failure)) => {
-                    attempts += 1;
-                    failure
-                }
-                Err(Stop::Interrupted(failure)) => {
-                    attempts = 1;
-                    failure
-                }
+                Err(Stop::Failed(failure)) => (failure, false),
+                Err(Stop::Interrupted(failure)) => (failure, true),
             };
-            if !failure.is_passing() || attempts >= limits.attempts {
-                return Err(FetchError::Download { url: url.to_owned(), attempts, failure });
-            }
+            let Some(pause) = retries.failed(made_progress).filter(|_| failure.is_passing()) else {
+                return Err(FetchError::Download {
+                    url: url.to_owned(),
+                    attempts: retries.n_failures(),
+                    failure,
+                });
+            };
             self.retries.fetch_add(1, Ordering::Relaxed);
             self.environment.progress.retried(url, &failure);
-            let doubled = limits.first_backoff.saturating_mul(1 << (attempts - 1).min(16));
             let spread = 0.5 + (self.environment.random)().clamp(0.0, 1.0);
             let asked = match &failure {
                 DownloadFailure::Status { retry_after: Some(asked), .. } => {
@@ -298,7 +297,7 @@ impl<'a> Client<'a> {
                 _ => Duration::ZERO,
             };
             // Added to the backoff, so that a fleet that got the same `Retry-After` does not return in step.
-            self.sleep(asked.saturating_add(doubled.min(limits.longest_backoff).mul_f64(spread)))?;
+            self.sleep(asked.saturating_add(pause.mul_f64(spread)))?;
         }
     }
 

@@ -13,6 +13,7 @@ use std::time::{Duration, Instant};
 use glam::DVec3;
 use serde::Serialize;
 use slag_common::manifest::Manifest;
+use slag_common::retry::Backoff;
 
 use super::error::FetchError;
 use super::position::{MAX_TEXT_BYTES, NotAPosition, Position};
@@ -117,10 +118,10 @@ impl Follower {
     /// Records a failed fetch, its start and its end; `random` is within 0..1.
     pub fn failed(&mut self, began: Duration, now: Duration, random: f64) {
         self.attempted = Some(began);
-        let doubled = self.settings.first_backoff.saturating_mul(1 << self.n_failures.min(16));
-        let backoff = doubled.min(self.settings.longest_backoff).mul_f64(0.5 + random.clamp(0.0, 1.0));
         self.n_failures = self.n_failures.saturating_add(1);
-        self.retry_at = now.saturating_add(backoff);
+        let backoff = Backoff { first: self.settings.first_backoff, longest: self.settings.longest_backoff };
+        let pause = backoff.after(self.n_failures).mul_f64(0.5 + random.clamp(0.0, 1.0));
+        self.retry_at = now.saturating_add(pause);
     }
 }
 

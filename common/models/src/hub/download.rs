@@ -4,6 +4,7 @@ use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::Path;
 use std::time::Duration;
 
+use slag_common::retry::{Backoff, Retries};
 use ureq::http::{HeaderName, Method, Request, Response, StatusCode, Uri, header};
 
 use super::options::HubOptions;
@@ -106,31 +107,27 @@ impl Client {
 
     /// Asks what the hub says of a file, without its bytes.
     pub fn ask(&self, url: &str) -> Result<Advertised, Failure> {
-        self.retrying(|| {
+        let head = || {
             let (response, advertised) = self.request(Method::HEAD, url, &[])?;
             match response.status() {
                 StatusCode::OK => Ok(advertised),
                 status => Err(Failure::Status(status.as_u16())),
             }
-        })
+        };
+        self.retrying(head, || false)
     }
 
     /// Appends to `part` until it is whole; returns whether it was begun before. `len_bytes`: its length, if known.
     pub fn receive(&self, url: &str, part: &Path, len_bytes: Option<u64>) -> Result<bool, Failure> {
         let mut furthest = n_bytes(part);
         let was_begun = furthest > 0;
-        let mut attempts = 0;
-        loop {
-            match self.try_receive(url, part, len_bytes) {
-                Ok(()) => return Ok(was_begun),
-                Err(failure) => {
-                    let reached = n_bytes(part);
-                    attempts = if reached > furthest { 1 } else { attempts + 1 };
-                    furthest = furthest.max(reached);
-                    self.wait_or_give_up(failure, attempts)?;
-                }
-            }
-        }
+        let made_progress = || {
+            let before = furthest;
+            furthest = before.max(n_bytes(part));
+            furthest > before
+        };
+        self.retrying(|| self.try_receive(url, part, len_bytes), made_progress)?;
+        Ok(was_begun)
     }
 
     fn try_receive(&self, url: &str, part: &Path, len_bytes: Option<u64>) -> Result<(), Failure> {
@@ -244,26 +241,23 @@ impl Client {
         Err(Failure::Redirect(uri.to_string()))
     }
 
-    fn retrying<T>(&self, mut attempt: impl FnMut() -> Result<T, Failure>) -> Result<T, Failure> {
-        let mut attempts = 0;
+    /// Repeats attempts until one succeeds, fails for good, or too many fail in a row without progress.
+    fn retrying<T>(
+        &self,
+        mut attempt: impl FnMut() -> Result<T, Failure>,
+        mut made_progress: impl FnMut() -> bool,
+    ) -> Result<T, Failure> {
+        let backoff = Backoff { first: self.first_backoff, longest: Duration::MAX };
+        let mut retries = Retries::new(MAX_ATTEMPTS, backoff);
         loop {
-            match attempt() {
-                Ok(value) => return Ok(value),
-                Err(failure) => {
-                    attempts += 1;
-                    self.wait_or_give_up(failure, attempts)?;
-                }
-            }
+            let failure = match attempt() {
+                Err(failure) if failure.is_passing() => failure,
+                result => return result,
+            };
+            let Some(pause) = retries.failed(made_progress()) else { return Err(failure) };
+            tracing::info!("{failure}; trying again");
+            std::thread::sleep(pause);
         }
-    }
-
-    fn wait_or_give_up(&self, failure: Failure, attempts: u32) -> Result<(), Failure> {
-        if !failure.is_passing() || attempts >= MAX_ATTEMPTS {
-            return Err(failure);
-        }
-        tracing::info!("{failure}; trying again");
-        std::thread::sleep(self.first_backoff * (1 << attempts.saturating_sub(1)));
-        Ok(())
     }
 }
 

@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use qdrant_client::{Qdrant, QdrantError};
+use slag_common::retry::{Backoff, Retries};
 
 use super::error::PushError;
 use super::options::PushOptions;
@@ -45,25 +46,26 @@ impl<'a> Database<'a> {
     where
         F: Future<Output = Result<T, QdrantError>>,
     {
-        let mut delay = self.options.retry_delay;
-        for _ in 0..self.options.n_retries {
-            match request().await {
-                Err(e) if may_pass(&e) => {
-                    self.n_retries.fetch_add(1, Ordering::Relaxed);
-                    let asked = match &e {
-                        QdrantError::ResourceExhaustedError { retry_after_seconds, .. } => {
-                            Duration::from_secs(*retry_after_seconds)
-                        }
-                        _ => Duration::ZERO,
-                    };
-                    tracing::warn!("{action}: {e}; trying again");
-                    tokio::time::sleep(delay.max(asked).min(MAX_RETRY_DELAY)).await;
-                    delay = delay.saturating_mul(2);
+        let backoff = Backoff { first: self.options.retry_delay, longest: MAX_RETRY_DELAY };
+        let mut retries = Retries::new(self.options.n_retries.saturating_add(1), backoff);
+        loop {
+            let error = match request().await {
+                Ok(response) => return Ok(response),
+                Err(error) => error,
+            };
+            let Some(pause) = retries.failed(false).filter(|_| may_pass(&error)) else {
+                return Err(database_error(self.options, action, error));
+            };
+            self.n_retries.fetch_add(1, Ordering::Relaxed);
+            let asked = match &error {
+                QdrantError::ResourceExhaustedError { retry_after_seconds, .. } => {
+                    Duration::from_secs(*retry_after_seconds)
                 }
-                answer => return answer.map_err(|cause| database_error(self.options, action, cause)),
-            }
+                _ => Duration::ZERO,
+            };
+            tracing::warn!("{action}: {error}; trying again");
+            tokio::time::sleep(pause.max(asked).min(MAX_RETRY_DELAY)).await;
         }
-        request().await.map_err(|cause| database_error(self.options, action, cause))
     }
 }
 
