@@ -1,8 +1,8 @@
 //! Adapters and opened devices.
 
-use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::task::{Context, Poll, Waker};
+
+use pollster::block_on;
 
 use super::shader::Kernels;
 use crate::raster::adapter::{AdapterReport, Precision};
@@ -42,7 +42,7 @@ pub fn adapters() -> Vec<Adapter> {
     // Our own shaders compute the dispatch sizes, within limits; validating them again would cost a pass each.
     descriptor.flags = wgpu::InstanceFlags::empty();
     let instance = wgpu::Instance::new(descriptor);
-    let mut adapters: Vec<Adapter> = ready(instance.enumerate_adapters(wgpu::Backends::PRIMARY))
+    let mut adapters: Vec<Adapter> = block_on(instance.enumerate_adapters(wgpu::Backends::PRIMARY))
         .into_iter()
         .map(|adapter| Adapter { report: report_of(&adapter), adapter })
         .collect();
@@ -87,7 +87,7 @@ impl Adapter {
         if precision == Precision::F64 {
             features |= wgpu::Features::SHADER_F64;
         }
-        let (device, queue) = ready(self.adapter.request_device(&wgpu::DeviceDescriptor {
+        let (device, queue) = block_on(self.adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("slag"),
             required_features: features,
             required_limits: limits,
@@ -149,7 +149,7 @@ impl Device {
             mapped_at_creation: false,
         };
         let buffer = self.device.create_buffer(&descriptor);
-        ready(scope.pop()).is_none().then_some(buffer)
+        block_on(scope.pop()).is_none().then_some(buffer)
     }
 
     /// Waits for the end of a submission.
@@ -165,17 +165,5 @@ impl Device {
     #[doc(hidden)]
     pub fn lose(&self) {
         self.device.destroy();
-    }
-}
-
-/// Runs a future of wgpu; on native platforms it is ready at once.
-fn ready<T>(future: impl Future<Output = T>) -> T {
-    let mut future = pin!(future);
-    let mut context = Context::from_waker(Waker::noop());
-    loop {
-        if let Poll::Ready(value) = future.as_mut().poll(&mut context) {
-            return value;
-        }
-        std::thread::yield_now();
     }
 }
