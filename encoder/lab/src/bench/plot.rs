@@ -1,4 +1,7 @@
 //! A line plot as SVG with a logarithmic horizontal axis.
+//!
+//! Not the crate `plotters`: ticks and scales are 60 lines here; its axes are of another type for each scale, and the
+//! legend beside the plot and the labels of points would still be ours.
 
 use std::fmt::Write;
 
@@ -56,7 +59,10 @@ impl Plot {
              <rect width=\"{w}\" height=\"{h}\" fill=\"white\"/>\n\
              <text x=\"{}\" y=\"20\" font-size=\"15\">{}</text>\n\
              <text x=\"{}\" y=\"35\" font-size=\"10\" fill=\"#555\">{}</text>\n",
-            MARGIN.0, self.title, MARGIN.0, self.note
+            MARGIN.0,
+            escaped(&self.title),
+            MARGIN.0,
+            escaped(&self.note)
         );
         let (left, right, bottom, top) = (x.from, x.to, y.from, y.to);
         let mut line = |x1: f64, y1: f64, x2: f64, y2: f64| {
@@ -93,9 +99,9 @@ impl Plot {
              <text transform=\"translate(16 {:.1}) rotate(-90)\" text-anchor=\"middle\">{}</text>",
             (left + right) / 2.0,
             h - 10.0,
-            self.across,
+            escaped(self.across),
             (bottom + top) / 2.0,
-            self.up
+            escaped(self.up)
         );
         for (number, series) in series.iter().enumerate() {
             let colour = COLOURS[number % COLOURS.len()];
@@ -117,9 +123,10 @@ impl Plot {
             for (p, label) in series.points.iter().zip(&series.labels) {
                 let _ = writeln!(
                     out,
-                    "<text x=\"{:.1}\" y=\"{:.1}\" font-size=\"11\" fill=\"{colour}\">{label}</text>",
+                    "<text x=\"{:.1}\" y=\"{:.1}\" font-size=\"11\" fill=\"{colour}\">{}</text>",
                     x.at(p.0) + 6.0,
-                    y.at(p.1) - 5.0
+                    y.at(p.1) - 5.0,
+                    escaped(label)
                 );
             }
             let at = 52.0 + 18.0 * number as f64;
@@ -130,12 +137,17 @@ impl Plot {
                 at,
                 right + 26.0,
                 at + 4.0,
-                series.name
+                escaped(&series.name)
             );
         }
         out.push_str("</svg>\n");
         out
     }
+}
+
+/// Returns a text as it is written between tags.
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
 }
 
 struct Axis {
@@ -191,6 +203,18 @@ impl Axis {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn names_are_text_not_markup() {
+        let (title, note) = ("a < b & c".to_owned(), String::new());
+        let plot = Plot { title, note, across: "s", up: "<i>", up_scale: Scale::Linear };
+        let series = Series { name: "R&D".into(), points: vec![(1.0, 2.0)], labels: vec!["</svg>".into()] };
+        let svg = plot.svg(&[series]);
+        for expected in [">a &lt; b &amp; c<", ">&lt;i&gt;<", ">R&amp;D<", ">&lt;/svg&gt;<"] {
+            assert!(svg.contains(expected), "{expected}: {svg}");
+        }
+        assert_eq!(svg.matches("</svg>").count(), 1);
+    }
 
     #[test]
     fn ticks_are_round_and_inside() {
