@@ -35,6 +35,7 @@ pub mod encode;
 pub mod ingest;
 pub mod lift;
 pub mod masks;
+pub mod memory;
 pub mod objects;
 pub mod progress;
 pub mod publish;

@@ -9,7 +9,6 @@ use slag_common::{Hash32, View};
 use super::context::RunContext;
 use super::error::EncodeError;
 use super::job::ViewRecord;
-use super::memory::Phase;
 use super::plan::Plan;
 use super::report::ViewsReport;
 use super::views::DoneViews;
@@ -145,10 +144,9 @@ impl<'a> CellBuilder<'a> {
         table.set_levels(levels.collect());
         let mut memory = plan.memory.clone();
         memory.views_are_done();
-        memory.reserve(Phase::Always, "masks and regions of all views", table.len_bytes());
-        memory.reserve(Phase::Always, "the index of contributions", index.len_bytes());
-        let of_regions = Refinement::len_bytes(&plan.settings.aggregation, 0, table.len());
-        memory.reserve(Phase::Always, "agreement of masks", of_regions);
+        table.reserve(&mut memory);
+        index.reserve(&mut memory);
+        Refinement::reserve_regions(&mut memory, &plan.settings.aggregation, table.len());
         let group_bytes = memory.rest(index.largest_part_bytes())?;
         let score_context = context.time("texts", || {
             let metric = ScoreMetric::new(models.dim(), &bank);

@@ -6,7 +6,7 @@ use slag_common::poses::PoseError;
 use slag_common::splat::SplatError;
 use slag_models::ModelError;
 
-use super::memory::MemoryError;
+use crate::memory::MemoryError;
 use crate::embed::EmbedError;
 use crate::ingest::{GeoError, IngestError};
 use crate::lift::ContributionError;

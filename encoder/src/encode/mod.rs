@@ -19,7 +19,6 @@ mod error;
 mod identity;
 mod inputs;
 mod job;
-mod memory;
 mod pipeline;
 mod plan;
 mod preset;
@@ -37,7 +36,7 @@ use context::RunContext;
 
 pub use engines::{Engines, Perturbation};
 pub use error::EncodeError;
-pub use memory::{MemoryError, Reservation};
+pub use crate::memory::{MemoryError, Reservation};
 pub use preset::{Choices, Preset};
 pub use report::{CellReport, EncodeSummary, SkippedView, StageReport, ViewsReport};
 pub use settings::{

@@ -12,9 +12,9 @@ use super::error::EncodeError;
 use super::identity;
 use super::inputs::Inputs;
 use super::job::Job;
-use super::memory::{MemoryPlan, Phase};
 use super::settings::{EncodeSettings, Masks, RunSettings, ViewOrder};
 use crate::lift::refine::Refinement;
+use crate::memory::MemoryPlan;
 use crate::objects;
 use crate::raster::{LoadedScene, RasterView};
 use crate::segment::{GivenMasks, GraphSegmenter, GraphSettings, SamSegmenter, SegmentError, Segmenter};
@@ -79,16 +79,11 @@ pub(super) fn plan<'a>(
 /// are done.
 fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, dim: usize) -> MemoryPlan {
     let n_gaussians = inputs.scene.len();
-    let largest = inputs.split.cells.iter().map(|cell| cell.gaussians.len()).max().unwrap_or(0);
     let mut memory = MemoryPlan::new(settings.run.memory_bytes);
-    memory.reserve(Phase::Cells, "the largest cell", shard::working_bytes(largest, dim));
-    let refinement = Refinement::len_bytes(&settings.aggregation, n_gaussians, 0);
-    memory.reserve(Phase::Refine, "superpoints of all Gaussians", refinement);
+    shard::reserve(&mut memory, &inputs.split, dim);
+    Refinement::reserve(&mut memory, &settings.aggregation, n_gaussians);
     if settings.cells.objects {
-        let of_gaussians = (n_gaussians * size_of::<u32>()) as u64;
-        memory.reserve(Phase::Always, "the object of each Gaussian", of_gaussians);
-        let sightings = objects::sightings::working_bytes(n_gaussians, inputs.views.len());
-        memory.reserve(Phase::Objects, "views of sampled Gaussians", sightings);
+        objects::reserve(&mut memory, n_gaussians, inputs.views.len());
     }
     memory
 }

@@ -12,6 +12,7 @@ use slag_common::container::ContainerError;
 use super::contributions::{ContributionError, ContributionFile, GAUSSIANS_PER_SLICE, PackedEntry, Run};
 use super::part::{Part, PartContributions};
 use super::table::RegionTable;
+use crate::memory::{MemoryPlan, Phase};
 
 /// Most entries of a part. A constant, not a share of the budget: parts are published, and a store must not depend on
 /// the memory of the machine that made it.
@@ -155,6 +156,11 @@ impl ContributionIndex {
         let per_run = size_of::<Run>() + size_of::<u32>();
         let n_runs: usize = self.views.iter().map(|view| view.slices.len()).sum();
         (n_runs * per_run + self.parts.len() * size_of::<Part>() + size_of_val(&*self.locals_of_slice)) as u64
+    }
+
+    /// Reserves the index's bytes.
+    pub fn reserve(&self, memory: &mut MemoryPlan) {
+        memory.reserve(Phase::Always, "the index of contributions", self.len_bytes());
     }
 
     /// Returns the bytes that the largest part takes while it is transposed: the smallest budget.

@@ -14,6 +14,7 @@ use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
 use slag_math::matrix::Rows;
 
 use super::starts;
+use crate::memory::{MemoryPlan, Phase};
 
 const MAGIC: [u8; 8] = *b"SLAGREGN";
 const VERSION: u32 = 2;
@@ -71,6 +72,11 @@ impl RegionTable {
     pub fn len_bytes(&self) -> u64 {
         let numbers = size_of_val(&*self.starts) + size_of_val(&*self.masks) + size_of_val(&*self.shares);
         (size_of_val(&*self.mask_vectors) + numbers + self.levels.len()) as u64
+    }
+
+    /// Reserves the table's bytes.
+    pub fn reserve(&self, memory: &mut MemoryPlan) {
+        memory.reserve(Phase::Always, "masks and regions of all views", self.len_bytes());
     }
 
     /// Appends a view's regions and returns the number of the first; `mask_vectors` is `[n][dim]`,

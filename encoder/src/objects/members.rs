@@ -6,6 +6,7 @@ use super::consensus::MaskClusters;
 use super::object::NONE;
 use super::scene::Scene;
 use crate::lift::{ContributionError, PartContributions, RegionTable};
+use crate::memory::{MemoryPlan, Phase};
 
 /// Smallest share of a Gaussian's weight under an object's masks: a majority.
 const MIN_WEIGHT_SHARE: f32 = 0.5;
@@ -49,6 +50,11 @@ impl ClustersOfRegion {
     fn of(&self, region: u32) -> &[u32] {
         &self.clusters[self.starts[region as usize] as usize..self.starts[region as usize + 1] as usize]
     }
+}
+
+/// Reserves the object of each Gaussian.
+pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
+    memory.reserve(Phase::Always, "the object of each Gaussian", (n_gaussians * size_of::<u32>()) as u64);
 }
 
 impl Members {

@@ -24,9 +24,16 @@ pub mod shards;
 pub mod sightings;
 pub mod vectors;
 
+use crate::memory::MemoryPlan;
 pub use find::{MIN_GAUSSIANS, find};
 pub use object::{NONE, Object, ObjectsReport, SceneObjects};
 pub use scene::Scene;
+
+/// Reserves what finding the objects of a scene takes, and the object of each Gaussian.
+pub fn reserve(memory: &mut MemoryPlan, n_gaussians: usize, n_views: usize) {
+    members::reserve(memory, n_gaussians);
+    sightings::reserve(memory, n_gaussians, n_views);
+}
 
 #[cfg(test)]
 mod tests;

@@ -5,6 +5,7 @@ use rayon::prelude::*;
 use super::consensus::Sightings;
 use super::scene::Scene;
 use crate::lift::ContributionError;
+use crate::memory::{MemoryPlan, Phase};
 
 /// Approximate number of sampled Gaussians: the time of [`super::consensus`] grows with it, and each mask needs a few.
 const MAX_SAMPLES: usize = 32_768;
@@ -17,10 +18,11 @@ pub fn sample_step(n_gaussians: usize) -> usize {
     n_gaussians.div_ceil(MAX_SAMPLES).max(1)
 }
 
-/// Returns the bytes that the sightings of a scene take, at most: where every view sees every sampled Gaussian.
-pub fn working_bytes(n_gaussians: usize, n_views: usize) -> u64 {
+/// Reserves the bytes that sightings take at most: every view sees every sampled Gaussian.
+pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize, n_views: usize) {
     let n_sampled = n_gaussians / sample_step(n_gaussians);
-    (n_sampled * (size_of::<usize>() + n_views * 2 * size_of::<u32>())) as u64
+    let len_bytes = n_sampled * (size_of::<usize>() + n_views * 2 * size_of::<u32>());
+    memory.reserve(Phase::Objects, "views of sampled Gaussians", len_bytes as u64);
 }
 
 /// Gathers the sightings of every `step`-th Gaussian of each cell. Returns `None` if cancelled.

@@ -10,9 +10,10 @@ use slag_common::shard::{
     Basis, ExactColumns, Fine, Profile, Residuals, ScoreErrors, ShardHeader, ShardView,
 };
 
-use crate::cells::Cell;
+use crate::cells::{Cell, CellSplit};
 use crate::codebook::measure::ScoreMoments;
 use crate::codebook::{self, CodebookSettings, ScoreMetricContext};
+use crate::memory::{MemoryPlan, Phase};
 use crate::objects::SceneObjects;
 use crate::objects::shards::{CellObjects, CentroidBasis};
 use positions::{PositionError, QuantisedPositions};
@@ -72,6 +73,12 @@ pub struct CellEmbeddings {
 pub fn working_bytes(n_gaussians: usize, dim: usize) -> u64 {
     let per_component = size_of::<f32>() + 2 * size_of::<f16>();
     (n_gaussians * (dim * per_component + codebook::working_bytes_per_embedding(dim))) as u64
+}
+
+/// Reserves the bytes of the largest cell.
+pub fn reserve(memory: &mut MemoryPlan, split: &CellSplit, dim: usize) {
+    let largest = split.cells.iter().map(|cell| cell.gaussians.len()).max().unwrap_or(0);
+    memory.reserve(Phase::Cells, "the largest cell", working_bytes(largest, dim));
 }
 
 /// Builds a cell's shards, with the objects of the scene if it has any.

@@ -40,6 +40,7 @@ use super::photos::Photo;
 use super::superpoint::{Graph, Sketches, SuperpointSettings, Superpoints};
 use super::table::RegionTable;
 use crate::cells::CellSplit;
+use crate::memory::{MemoryPlan, Phase};
 use agreement::Votes;
 use mixture::{Mixtures, SuperpointSums};
 use points::{AXES, Point};
@@ -202,21 +203,26 @@ impl Refinement {
         Ok(true)
     }
 
-    /// Returns the most bytes that the refinements of `n_gaussians` and `n_regions` take, beside the table and the
-    /// contributions.
-    pub fn len_bytes(settings: &Aggregation, n_gaussians: usize, n_regions: usize) -> u64 {
-        if *settings == Aggregation::PAPER {
-            return 0;
+    /// Reserves the lists over all Gaussians: the superpoints' graph while masks are weighed, and each Gaussian's
+    /// superpoints until the last cell.
+    pub fn reserve(memory: &mut MemoryPlan, settings: &Aggregation, n_gaussians: usize) {
+        if !settings.needs_superpoints() {
+            return;
         }
-        let of_regions = n_regions * (size_of::<Point>() + Votes::BYTES_PER_REGION);
-        let of_superpoints = match settings.needs_superpoints() {
-            false => 0,
-            true => {
-                let working = Superpoints::working_bytes(n_gaussians, &SuperpointSettings::default());
-                (n_gaussians * (AXES + size_of::<u32>())) as u64 + working
-            }
-        };
-        of_regions as u64 + of_superpoints
+        let sketches_bytes = (n_gaussians * (AXES + size_of::<u32>())) as u64;
+        let graph_bytes = Superpoints::working_bytes(n_gaussians, &SuperpointSettings::default());
+        memory.reserve(Phase::Refine, "superpoints of all Gaussians", sketches_bytes + graph_bytes);
+        let n_scales = usize::from(settings.superpoint > 0.0 || settings.fill) + usize::from(settings.coarse > 0.0);
+        let labels_bytes = (n_gaussians * n_scales * size_of::<u32>()) as u64;
+        memory.reserve(Phase::Cells, "the superpoints of each Gaussian", labels_bytes);
+    }
+
+    /// Reserves the lists over all regions, whose number is known once the views are done.
+    pub fn reserve_regions(memory: &mut MemoryPlan, settings: &Aggregation, n_regions: usize) {
+        if *settings != Aggregation::PAPER {
+            let len_bytes = n_regions * (size_of::<Point>() + Votes::BYTES_PER_REGION);
+            memory.reserve(Phase::Always, "agreement of masks", len_bytes as u64);
+        }
     }
 
     /// Refines the contributions of a part. `gaussians`: scene indices of its Gaussians.

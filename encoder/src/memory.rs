@@ -1,11 +1,15 @@
-//! The budget of working memory: named reservations, each with the bytes that its owner states.
+//! The budget of working memory: named reservations.
+//!
+//! Each module that allocates what grows with the scene has a function `reserve`, beside the allocation, that names the
+//! purpose and states the bytes. The encoder calls them before the first view, and again once the views are done for
+//! what depends on masks and contributions.
 
 use std::fmt;
 
 /// The steps that hold memory one after the other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Phase {
-    /// From the first view on.
+pub enum Phase {
+    /// From the first view to the end.
     Always,
     /// While objects are found.
     Objects,
@@ -56,12 +60,11 @@ impl fmt::Display for MemoryError {
 
 /// The reservations of a run, within a budget.
 ///
-/// It covers what grows with the scene and the views after they are read: cells, codebooks, objects, superpoints,
-/// mask vectors and contributions. It does not cover the scene itself and the photos in work (their number is that of
-/// the threads), nor the lists of alike masks from which objects are found: their length is known only once they are
-/// made.
+/// The plan covers cells, codebooks, objects, superpoints, mask vectors and contributions. It does not cover the scene
+/// itself, the photos in work (as many as threads), and the lists of similar masks from which objects are found: their
+/// length is known only once they are made.
 #[derive(Clone, Debug)]
-pub(super) struct MemoryPlan {
+pub struct MemoryPlan {
     available_bytes: u64,
     is_before_views: bool,
     reservations: Vec<Reservation>,
@@ -69,17 +72,17 @@ pub(super) struct MemoryPlan {
 
 impl MemoryPlan {
     /// Makes an empty plan.
-    pub(super) fn new(available_bytes: u64) -> Self {
+    pub fn new(available_bytes: u64) -> Self {
         Self { available_bytes, is_before_views: true, reservations: Vec::new() }
     }
 
     /// Sets memory aside.
-    pub(super) fn reserve(&mut self, phase: Phase, purpose: &'static str, len_bytes: u64) {
+    pub fn reserve(&mut self, phase: Phase, purpose: &'static str, len_bytes: u64) {
         self.reservations.push(Reservation { purpose, len_bytes, phase });
     }
 
-    /// Says that the views are done: what follows depends on their results.
-    pub(super) fn views_are_done(&mut self) {
+    /// Marks the views as done: later reservations depend on their results.
+    pub fn views_are_done(&mut self) {
         self.is_before_views = false;
     }
 
@@ -87,7 +90,7 @@ impl MemoryPlan {
     ///
     /// # Errors
     /// [`MemoryError`] if `contributions_bytes` do not fit beside the reservations of some phase.
-    pub(super) fn rest(&self, contributions_bytes: u64) -> Result<u64, MemoryError> {
+    pub fn rest(&self, contributions_bytes: u64) -> Result<u64, MemoryError> {
         let phases = [Phase::Objects, Phase::Refine, Phase::Cells];
         let held = |phase: Phase| {
             let of_phase =
