@@ -16,7 +16,7 @@ use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, coll
 use slag_common::shard::{
     ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardLayout, ShardView, quantise,
 };
-use slag_models::{EncodeError, TextEncoder};
+use slag_models::{InferenceError, TextEncoder};
 
 use crate::store::{Current, CurrentCell, EdgeCache};
 use crate::text::{EncoderInfo, TextService};
@@ -241,7 +241,7 @@ impl TextEncoder for Axes {
         self.dim
     }
 
-    fn encode(&mut self, text: &str) -> Result<Vec<f32>, EncodeError> {
+    fn encode(&mut self, text: &str) -> Result<Vec<f32>, InferenceError> {
         self.n_encoded.fetch_add(1, Ordering::SeqCst);
         let axis = match text {
             "panic" => panic!("asked to"),
@@ -251,7 +251,7 @@ impl TextEncoder for Axes {
                 0
             }
             _ => text.parse().ok().filter(|axis| *axis < self.dim).ok_or_else(|| {
-                EncodeError::UnknownPhrase { text: text.into(), n_known: self.dim, near: vec!["0".into()] }
+                InferenceError::UnknownPhrase { text: text.into(), n_known: self.dim, near: vec!["0".into()] }
             })?,
         };
         Ok((0..self.dim).map(|i| f32::from(i == axis)).collect())

@@ -9,7 +9,7 @@ use std::thread::JoinHandle;
 
 use serde::Serialize;
 use slag_common::Hash32;
-use slag_models::{EncodeError, ModelDir, ModelError, SessionOptions, TextEncoder};
+use slag_models::{InferenceError, ModelDir, ModelError, SessionOptions, TextEncoder};
 
 /// Longest query text; every text model here truncates far below.
 pub const MAX_TEXT_BYTES: usize = 512;
@@ -23,7 +23,7 @@ const MAX_CACHED: usize = 1024;
 pub enum TextError {
     /// The encoder refuses the text, or fails.
     #[error(transparent)]
-    Encode(#[from] EncodeError),
+    Encode(#[from] InferenceError),
     /// Too many texts wait.
     #[error("{MAX_WAITING} texts are already waiting for the text model; ask again in a second")]
     Busy,
@@ -58,7 +58,7 @@ pub struct EncoderInfo {
 
 struct Job {
     text: String,
-    reply: SyncSender<Result<Vec<f32>, EncodeError>>,
+    reply: SyncSender<Result<Vec<f32>, InferenceError>>,
 }
 
 /// A text encoder owned by one thread, with a cache of recent vectors.
@@ -198,7 +198,10 @@ mod tests {
         let first = service.encode("1").expect("known");
         assert_eq!((&*first, &*service.encode("  1 \t").expect("known")), (&[0.0, 1.0, 0.0][..], &*first));
         assert_eq!(n_encoded.load(std::sync::atomic::Ordering::SeqCst), 1);
-        assert!(matches!(service.encode("sofa"), Err(TextError::Encode(EncodeError::UnknownPhrase { .. }))));
+        assert!(matches!(
+            service.encode("sofa"),
+            Err(TextError::Encode(InferenceError::UnknownPhrase { .. }))
+        ));
         assert!(service.encode("2").is_ok() && service.is_alive());
     }
 
@@ -238,7 +241,10 @@ mod tests {
         let options = SessionOptions::new("no-runtime-needed".into());
         let built_in = TextService::open(&ModelDir::colours(), &options).expect("built in");
         assert_eq!(built_in.encode("a red thing").expect("known").len(), built_in.info().dim as usize);
-        assert!(matches!(built_in.encode("sofa"), Err(TextError::Encode(EncodeError::UnknownWords { .. }))));
+        assert!(matches!(
+            built_in.encode("sofa"),
+            Err(TextError::Encode(InferenceError::UnknownWords { .. }))
+        ));
     }
 
     #[needs_shared]

@@ -7,7 +7,7 @@ use slag_encoder::{
     embed::{Background, EmbedError, crop, embed_masks},
     masks::{BoxPx, Mask},
 };
-use slag_models::{Crop, EncodeError, ImageEncoder, ModelDir, SessionOptions};
+use slag_models::{Crop, ImageEncoder, InferenceError, ModelDir, SessionOptions};
 use slag_test_support::{needs_shared, onnx_runtime, shared, workspace_root};
 
 /// A labelled view.
@@ -153,7 +153,7 @@ impl ImageEncoder for Recorder {
     fn preferred_batch(&self) -> usize {
         4
     }
-    fn encode(&mut self, crops: &[Crop]) -> Result<Vec<f32>, EncodeError> {
+    fn encode(&mut self, crops: &[Crop]) -> Result<Vec<f32>, InferenceError> {
         self.batches.push(crops.len());
         Ok(crops.iter().flat_map(|c| [c.image().width() as f32, c.image().height() as f32]).collect())
     }

@@ -1,7 +1,7 @@
-//! The embedded segmentation model: where one thing ends and another begins on a photo, whatever they are.
+//! The embedded segmentation model: predicts boundaries between objects of any kind in a photo.
 //!
-//! A small U-Net (Ronneberger et al. 2015), trained on photos that the project draws itself
-//! (`embedded/train_segmenter.py`). A segmenter joins pixels by what it says.
+//! A small U-Net (Ronneberger et al. 2015), trained on generated photos
+//! (`embedded/train_segmenter.py`). The graph segmenter joins pixels by its predictions.
 
 use std::path::Path;
 
@@ -17,19 +17,19 @@ use crate::{
 const SEGMENT: &[u8] = include_bytes!("../embedded/segment.onnx");
 const INPUT: &str = "pixel_values";
 const OUTPUT: &str = "boundaries";
-/// What width and height are multiples of: it halves them four times.
+/// Width and height must be multiples of this: the model halves them four times.
 const MULTIPLE: u32 = 16;
-/// Neighbours that a pixel may be parted from: right, below left, below, below right.
+/// Neighbours of a pixel with a predicted boundary: right, below left, below, below right.
 pub const N_NEIGHBOURS: usize = 4;
 
-/// The model, opened; one run at a time.
+/// The opened model.
 #[derive(Debug)]
 pub struct Boundaries(Model);
 
 impl Boundaries {
-    /// Opens it.
+    /// Opens the embedded model.
     /// # Errors
-    /// [`SessionError`] where ONNX Runtime does not load.
+    /// [`SessionError`] if ONNX Runtime does not load.
     pub fn open(options: &SessionOptions) -> Result<Self, SessionError> {
         let model = Model::open(&ModelFile::embedded(Path::new("segment.onnx"), SEGMENT), options)?;
         model.expect_input(INPUT, TensorElementType::Float32, &[1, 3, -1, -1])?;
@@ -41,7 +41,7 @@ impl Boundaries {
         hex::encode(Sha256::digest(SEGMENT))
     }
 
-    /// Returns how probably each pixel and its neighbours show different things, 0 to 1, `[4][height][width]`:
+    /// Returns the probability that each pixel and its neighbour show different objects, `[4][height][width]`:
     /// right, below left, below, below right.
     /// # Errors
     /// [`SessionError::Run`].
@@ -51,7 +51,7 @@ impl Boundaries {
         let mut pixels = Vec::with_capacity(3 * wide as usize * high as usize);
         for channel in 0..3 {
             for y in 0..high {
-                // The last row and column go on beyond the border.
+                // The last row and column are repeated beyond the border.
                 pixels.extend((0..wide).map(|x| {
                     let Rgb(rgb) = image.get_pixel(x.min(width - 1), y.min(height - 1));
                     f32::from(rgb[channel]) / 127.5 - 1.0

@@ -1,14 +1,14 @@
-//! Cleaning of text as OpenAI's CLIP does before its tokenizer, where `tokenizer.json` files leave it out.
+//! Text cleaning that OpenAI's CLIP applies before its tokenizer; `tokenizer.json` files leave it out.
 //!
-//! What ftfy and `html.unescape` do to ordinary input: character references, UTF-8 read as Windows-1252,
-//! curly quotes, ligatures, full-width forms, control characters; then spaces are collapsed.
+//! Does what ftfy and `html.unescape` do to ordinary input: replaces character references, UTF-8 read as Windows-1252,
+//! curly quotes, ligatures and full-width forms, removes control characters, and collapses spaces.
 //!
-//! Not the crate `html-escape`: its table of over 2,000 names would add some 0.2 MB to the robot's program, and it leaves references
-//! to control characters in the text.
+//! The crate `html-escape` is not used: its table of over 2,000 names would add some 0.2 MB to the robot's program, and
+//! it leaves references to control characters in the text.
 
 /// Returns `text` cleaned, trimmed, with single spaces.
 pub fn clean(text: &str) -> String {
-    // Twice as CLIP does it, and once before, as ftfy does.
+    // CLIP unescapes twice, after ftfy has done so once.
     let unescaped = unescape(&unescape(&unescape(text)));
     let mut cleaned = String::with_capacity(unescaped.len());
     for c in repair_encoding(&unescaped).chars() {
@@ -18,7 +18,7 @@ pub fn clean(text: &str) -> String {
             '\u{fb00}'..='\u{fb06}' => {
                 cleaned.push_str(["ff", "fi", "fl", "ffi", "ffl", "ſt", "st"][c as usize - 0xfb00]);
             }
-            // Full-width forms stand in the order of ASCII.
+            // Full-width forms are in the order of ASCII.
             '\u{ff01}'..='\u{ff5e}' => cleaned.extend(char::from_u32(c as u32 - 0xff01 + 0x21)),
             '\u{feff}' | '\u{206a}'..='\u{206f}' | '\u{fff9}'..='\u{fffc}' => {}
             c if c.is_control() && !c.is_whitespace() => {}
@@ -36,7 +36,7 @@ const LATIN_1_NAMES: &str = "nbsp iexcl cent pound curren yen brvbar sect uml co
     igrave iacute icirc iuml eth ntilde ograve oacute ocirc otilde ouml divide oslash ugrave uacute ucirc uuml yacute thorn \
     yuml";
 
-/// The other names that occur in ordinary text.
+/// Other names in ordinary text.
 const OTHER_NAMES: [(&str, char); 14] = [
     ("amp", '&'),
     ("lt", '<'),
@@ -54,14 +54,14 @@ const OTHER_NAMES: [(&str, char); 14] = [
     ("bull", '•'),
 ];
 
-/// Replaces the HTML character references that end in a semicolon.
+/// Replaces HTML character references that end in a semicolon.
 fn unescape(text: &str) -> String {
     let mut result = String::with_capacity(text.len());
     let mut rest = text;
     while let Some(start) = rest.find('&') {
         let (before, reference) = rest.split_at(start);
         result.push_str(before);
-        // No name is longer than 8, no number than "#x10ffff".
+        // The longest names have 8 letters; the longest number is "#x10ffff".
         let end = reference.bytes().take(10).position(|b| b == b';');
         match end.and_then(|end| Some((end, referenced(&reference[1..end])?))) {
             Some((end, c)) => {
@@ -91,7 +91,7 @@ fn referenced(name: &str) -> Option<char> {
 }
 
 /// Undoes UTF-8 read as Windows-1252 for U+0080 to U+00FF and U+2000 to U+203F: the accents and quotes of
-/// western text. Other lead bytes are left, for they also occur in right text ("CAFÉ”").
+/// western text. Other lead bytes are left alone: they also occur in correct text ("CAFÉ”").
 fn repair_encoding(text: &str) -> String {
     let chars: Vec<char> = text.chars().collect();
     let mut result = String::with_capacity(text.len());
@@ -118,7 +118,7 @@ fn repair_encoding(text: &str) -> String {
     result
 }
 
-/// Returns the byte of a character in Windows-1252; the five bytes without one stand for themselves.
+/// Returns a character's byte in Windows-1252; the five unassigned bytes map to themselves.
 fn windows_1252(c: char) -> Option<u8> {
     const FROM_0X80: &str = "€\u{81}‚ƒ„…†‡ˆ‰Š‹Œ\u{8d}Ž\u{8f}\u{90}‘’“”•–—˜™š›œ\u{9d}žŸ";
     FROM_0X80

@@ -1,26 +1,25 @@
-//! The built-in stand-in: knows colours and coarse shapes, no objects; needs no files and no ONNX Runtime.
+//! The built-in stand-in: recognises colours and coarse shapes, not objects; needs neither files nor ONNX Runtime.
 //!
 //! An image's vector is a soft histogram over the 11 basic colour terms (Berlin and Kay 1969), followed by
-//! shape terms from the mask. A text's vector is the sum of the prototypes of its words; those of colours
+//! shape terms from the mask. A text's vector is the sum of its words' prototypes; colour prototypes
 //! are centred, so that an absent colour scores below 0.
 //!
-//! Pixels are judged in OKLab (Ottosson 2020). Shade multiplies linear light by k and with it all three of
-//! L, a, b by the cube root of k: hue and chroma / L stay, so these decide between hues, and lightness is
-//! asked only where names depend on it (white, grey, black; orange, brown; red, pink), relative to the
-//! crop's own highlights.
+//! Pixels are judged in OKLab (Ottosson 2020). Shade multiplies linear light by k, and so L, a and b by the
+//! cube root of k: hue and chroma / L are invariant and decide between hues. Lightness matters only for names
+//! that depend on it (white, grey, black; orange, brown; red, pink), relative to the crop's own highlights.
 
 use crate::crop::Crop;
 use crate::encoder::{ImageEncoder, TextEncoder, normalise};
-use crate::error::EncodeError;
+use crate::error::InferenceError;
 
 /// The name of the space.
 pub const NAME: &str = "colour-shape-v1";
 
-/// What it is.
+/// A description for people.
 pub const ABOUT: &str = "built-in stand-in: knows 11 colours and 3 shapes, no objects";
 
-/// The cosine from which something counts as found: a thing half of which has the colour passes with 0.5 or
-/// more, a thing a fifth of which has it does not.
+/// The cosine from which something counts as found: an object with the colour on half of its pixels scores 0.5 or
+/// more and passes; one with the colour on a fifth does not.
 pub const THRESHOLD: f32 = 0.35;
 
 const COLOURS: [&str; 11] =
@@ -45,14 +44,14 @@ enum Colour {
 
 const SHAPES: [&str; 3] = ["tall", "wide", "round"];
 
-/// Components of a vector: one a colour, one a shape.
+/// Components of a vector: one for each colour and each shape.
 pub const DIM: usize = N_COLOURS + SHAPES.len();
 
-/// Length of a whole shape term beside colours of length at most 1: a plain thing then scores 0.45 for its
-/// shape, above the threshold, and 0.88 for its colour.
+/// Length of a full shape term, next to colours of length at most 1: an object of one colour then scores 0.45 for
+/// its shape, above the threshold, and 0.88 for its colour.
 const SHAPE_WEIGHT: f32 = 0.5;
 
-/// Other words for the terms, and the plural forms that queries have.
+/// Synonyms of the terms.
 const SYNONYMS: [(&str, &str); 24] = [
     ("gray", "grey"),
     ("silver", "grey"),
@@ -129,7 +128,7 @@ impl TextEncoder for ColourShape {
         DIM
     }
 
-    fn encode(&mut self, text: &str) -> Result<Vec<f32>, EncodeError> {
+    fn encode(&mut self, text: &str) -> Result<Vec<f32>, InferenceError> {
         let text = text.to_lowercase();
         let words = text.split(|c: char| !c.is_alphanumeric() && c != '-').filter(|w| !w.is_empty());
         let mut vector = vec![0.0; DIM];
@@ -149,12 +148,12 @@ impl TextEncoder for ColourShape {
             }
         }
         if is_empty {
-            return Err(EncodeError::EmptyText);
+            return Err(InferenceError::EmptyText);
         }
-        // All colours at once cancel out: such a text says as little as one of stop words.
+        // All colours together cancel out, as if the text had only stop words.
         if !unknown.is_empty() || !normalise(&mut vector) {
             let known = COLOURS.iter().chain(&SHAPES).map(|&word| word.to_owned()).collect();
-            return Err(EncodeError::UnknownWords { unknown, known });
+            return Err(InferenceError::UnknownWords { unknown, known });
         }
         Ok(vector)
     }
@@ -169,10 +168,10 @@ impl ImageEncoder for ColourShape {
         16
     }
 
-    fn encode(&mut self, crops: &[Crop]) -> Result<Vec<f32>, EncodeError> {
+    fn encode(&mut self, crops: &[Crop]) -> Result<Vec<f32>, InferenceError> {
         let mut vectors = Vec::with_capacity(crops.len() * DIM);
         for (index, crop) in crops.iter().enumerate() {
-            vectors.extend(encode_crop(crop).ok_or(EncodeError::EmptyCrop { index })?);
+            vectors.extend(encode_crop(crop).ok_or(InferenceError::EmptyCrop { index })?);
         }
         Ok(vectors)
     }
@@ -186,7 +185,7 @@ struct Pixel {
     hue_deg: f32,
 }
 
-/// Pixels looked at per crop; more would not change the histogram.
+/// Pixels sampled per crop; more would not change the histogram.
 const MAX_SAMPLES: usize = 1 << 14;
 
 fn encode_crop(crop: &Crop) -> Option<[f32; DIM]> {
@@ -202,7 +201,7 @@ fn encode_crop(crop: &Crop) -> Option<[f32; DIM]> {
         .collect();
     let mut lightness: Vec<f32> = pixels.iter().map(|p| p.lightness).collect();
     lightness.sort_unstable_by(f32::total_cmp);
-    // Nine tenths up, so that a gleam on a dark thing does not count.
+    // The 90th percentile, so that a glint on a dark object does not count.
     let highlight = *lightness.get(lightness.len() * 9 / 10)?;
 
     let mut vector = [0.0; DIM];
@@ -239,8 +238,8 @@ fn ramp(x: f32, from: f32, to: f32) -> f32 {
     ((x - from) / (to - from)).clamp(0.0, 1.0)
 }
 
-/// Hues of the colour terms in OKLab, degrees, the first repeated at the end: those of the sRGB colours of
-/// that name, shifted a little towards the middle of what the name covers.
+/// Hues of the colour terms in OKLab, in degrees, the first repeated at the end: those of the sRGB colours of the
+/// same names, shifted slightly towards the middle of each name's range.
 const HUES: [(f32, Colour); 8] = [
     (27.0, Colour::Red),
     (62.0, Colour::Orange),
@@ -252,19 +251,19 @@ const HUES: [(f32, Colour); 8] = [
     (387.0, Colour::Red),
 ];
 
-/// Adds what `pixel` is, a total of 1, to `shares`; `highlight`: lightness of the crop's lighter pixels.
+/// Adds the colour terms of `pixel`, 1 in total, to `shares`; `highlight`: lightness of the crop's lighter pixels.
 fn add_colours(pixel: &Pixel, highlight: f32, shares: &mut [f32]) {
     let mut add = |colour: Colour, share: f32| shares[colour as usize] += share;
     let Pixel { lightness, saturation, hue_deg } = *pixel;
-    // Photographs tint white walls; a tint below 0.045 is still called white or grey.
+    // Photographs tint white walls: a tint below 0.045 still counts as white or grey.
     let chromatic = ramp(saturation, 0.045, 0.09);
-    // Navy is darker than what is called black without a hue.
+    // Navy is darker than the darkest grey that counts as black.
     let darkest = 0.26 - 0.16 * chromatic;
     let lit = ramp(lightness, darkest, darkest + 0.08);
     add(Colour::Black, 1.0 - lit);
 
-    // A third of the way to the highlight: shade on white down to a quarter of the light stays white, while
-    // a grey part of a white thing stays grey.
+    // A third of the way to the highlight: white in shade stays white down to a quarter of the light, while a grey
+    // part of a white object stays grey.
     let relit = lightness + 0.35 * (highlight - lightness).max(0.0);
     let white = ramp(relit, 0.76, 0.84);
     add(Colour::White, lit * (1.0 - chromatic) * white);
@@ -273,12 +272,12 @@ fn add_colours(pixel: &Pixel, highlight: f32, shares: &mut [f32]) {
     let hue_deg = if hue_deg < HUES[0].0 { hue_deg + 360.0 } else { hue_deg };
     let between = HUES.windows(2).find(|pair| hue_deg < pair[1].0).unwrap_or(&HUES[HUES.len() - 2..]);
     let [(from, before), (to, after)] = [between[0], between[1]];
-    // A name covers the half of the way around it fully.
+    // A name fully covers half of the way to its neighbours.
     let towards_after = ramp((hue_deg - from) / (to - from), 0.25, 0.75);
     for (hue, share) in [(before, 1.0 - towards_after), (after, towards_after)] {
         let share = lit * chromatic * share;
-        // Names that the same hue has when dark, dull or light. Colours in shade keep their name because
-        // the highlight is asked, not the pixel.
+        // Names of the same hue when dark, dull or light. They depend on the highlight, not the pixel, so colours in
+        // shade keep their name.
         let (other, part) = match hue {
             Colour::Red => {
                 let pink = ramp(highlight, 0.68, 0.78) * (1.0 - ramp(saturation, 0.2, 0.3));
@@ -303,17 +302,17 @@ fn shape(inside: &[usize], width_px: usize) -> [f32; 3] {
     let (sum_x, sum_y) = inside.iter().map(|&i| centre(i)).fold((0.0, 0.0), |s, p| (s.0 + p.0, s.1 + p.1));
     let from_mean = |i: usize| (centre(i).0 - sum_x / n, centre(i).1 - sum_y / n);
     let mut radii2 = Vec::with_capacity(inside.len());
-    // A pixel is a square of variance 1/12; without it a line one pixel wide has no width.
+    // The variance of a square pixel is 1/12; without it, a line one pixel wide would have no width.
     let (mut var_x, mut var_y) = (1.0 / 12.0, 1.0 / 12.0);
     for (x, y) in inside.iter().map(|&i| from_mean(i)) {
         var_x += x * x / n;
         var_y += y * y / n;
         radii2.push(x * x + y * y);
     }
-    // Natural logarithm of height over width; 2.5 times as high as wide is fully tall.
+    // Natural logarithm of height over width; a height of 2.5 widths is fully tall.
     let elongation = 0.5 * (var_y / var_x).ln() / 2.5f64.ln();
-    // Share of the circle around the mask that is filled: disc 1, square 0.64, ellipse 2:1 0.5. The
-    // farthest fiftieth is left out, because masks have ragged edges.
+    // The mask's share of its enclosing circle: disc 1, square 0.64, ellipse 2:1 0.5. The farthest 2 % of the
+    // pixels are left out, because masks have ragged edges.
     let (_, &mut radius2, _) = radii2.select_nth_unstable_by((inside.len() - 1) * 49 / 50, f64::total_cmp);
     let filled = n / (std::f64::consts::PI * (radius2.sqrt() + 0.5).powi(2) / 0.98);
     [elongation.clamp(0.0, 1.0) as f32, (-elongation).clamp(0.0, 1.0) as f32, ramp(filled as f32, 0.75, 0.9)]

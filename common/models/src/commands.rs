@@ -1,4 +1,4 @@
-//! `models list|pull|verify|info`, the same in both programs.
+//! `models list|pull|verify|info`, shared by both programs.
 
 use std::fmt;
 use std::io::{self, BufRead, IsTerminal, Write};
@@ -15,32 +15,32 @@ use crate::hub::{
 use crate::session::SessionError;
 use crate::{ImageEncoder, ModelDir, ModelError, Provider, SessionOptions, find_runtime};
 
-/// What can be done with models.
+/// The `models` subcommands.
 #[derive(Debug, Subcommand)]
 pub enum ModelsCommand {
-    /// Lists the public models that are known, and what of them is here.
+    /// Lists the known public models and shows which are pulled.
     List,
-    /// Pulls public models into the user's cache; goes on where it was cut off.
+    /// Pulls public models into the user's cache; resumes an interrupted pull.
     Pull(PullArgs),
-    /// Compares every file of models with its recorded hash.
+    /// Compares the files of models with their recorded hashes.
     Verify {
-        /// Names of pulled models, or folders [default: all that are pulled].
+        /// Names of pulled models, or folders [default: all pulled models].
         models: Vec<PathBuf>,
     },
-    /// Shows what a model is, and, with --run, what it really runs on.
+    /// Describes a model; with --run, also the devices that it runs on.
     Info(InfoArgs),
 }
 
 /// `models pull`.
 #[derive(Debug, Args)]
 pub struct PullArgs {
-    /// Names, as `models list` has them.
+    /// Names from `models list`.
     #[arg(required = true)]
     names: Vec<String>,
-    /// Accepts the models' licences without a question.
+    /// Accepts the models' licences without asking.
     #[arg(long, visible_alias = "accept-license")]
     accept_licence: bool,
-    /// A mirror of the hub.
+    /// Address of a mirror of the hub.
     #[arg(long, value_name = "URL")]
     hub: Option<String>,
 }
@@ -50,40 +50,40 @@ pub struct PullArgs {
 pub struct InfoArgs {
     /// Name of a pulled model, or a folder.
     model: PathBuf,
-    /// Opens the encoders and says what they run on.
+    /// Opens the encoders and shows the devices that they run on.
     #[arg(long)]
     run: bool,
-    /// How they run.
+    /// Options of running them.
     #[command(flatten)]
     how: RunArgs,
 }
 
-/// The name in `--models` of the stand-in without ONNX Runtime.
+/// The name of the stand-in in `--models`.
 const COLOURS: &str = "colours";
 /// Help text of `--models` in every program: the cases of [`open`].
 pub const MODELS_HELP: &str = "Folder with model.toml, or name of a pulled model (`models list`), or `colours`, \
-    which knows colours only and needs no ONNX Runtime [default: the embedded encoders]";
+    which recognises only colours and needs no ONNX Runtime [default: the embedded encoders]";
 
-/// How models are run.
+/// Options of running models.
 #[derive(Clone, Debug, Args)]
 pub struct RunArgs {
-    /// ONNX Runtime library [default: beside this program, else where the system finds it].
+    /// ONNX Runtime library [default: beside this program, else on the system's library path].
     #[arg(long, value_name = "FILE", env = "ORT_DYLIB_PATH")]
     pub runtime: Option<PathBuf>,
-    /// What models run on, the most wanted first: cpu, cuda, tensorrt, coreml, directml. Without cpu in the
+    /// Devices to run models on, in order of preference: cpu, cuda, tensorrt, coreml, directml. Without cpu in the
     /// list, it is an error if none of them can be used.
     #[arg(long, value_name = "NAME,...", value_delimiter = ',', default_value = "cpu")]
     pub provider: Vec<Provider>,
-    /// Threads of one run of a model [default: 1 where views are encoded side by side, else all cores, at most 4].
+    /// Threads for each run of a model [default: 1 if views are encoded in parallel, else all cores, at most 4].
     #[arg(long, value_name = "N")]
     pub model_threads: Option<NonZeroUsize>,
 }
 
 impl RunArgs {
-    /// Returns how models are run, with `default_threads` unless the user says otherwise; `beside`: folders in
-    /// which the runtime is looked for.
+    /// Returns the session options, with `default_threads` unless the user sets a number; `beside`: folders to search
+    /// for the runtime.
     /// # Errors
-    /// [`SessionError::NoRuntime`] where the library that the user gives is not there.
+    /// [`SessionError::NoRuntime`] if the user's library does not exist.
     pub fn session_options(
         &self,
         beside: &[PathBuf],
@@ -96,23 +96,23 @@ impl RunArgs {
     }
 }
 
-/// How an image encoder is opened: [`ModelDir::image_encoder`].
+/// Opens an image encoder, like [`ModelDir::image_encoder`].
 pub type OpenImage = dyn Fn(&ModelDir, &SessionOptions) -> Result<Box<dyn ImageEncoder>, ModelError>;
 
-/// What the program that is run knows.
+/// The calling program's side of the commands.
 pub struct Context<'a> {
-    /// Looks the environment up.
+    /// Looks up an environment variable.
     pub variable: &'a dyn Fn(&str) -> Option<std::ffi::OsString>,
-    /// Opens a model's image side, where the program has one. A robot has none: a program that does not name
-    /// [`ModelDir::image_encoder`] does not carry the embedded image model.
+    /// Opens a model's image side; absent on robots. A program that does not reference [`ModelDir::image_encoder`]
+    /// does not contain the embedded image model.
     pub image: Option<&'a OpenImage>,
-    /// Asks the user a question.
+    /// Asks the user a yes-or-no question.
     pub ask: &'a dyn Fn(&str) -> bool,
-    /// Returns how models run.
+    /// Returns the session options.
     pub session: &'a dyn Fn(&RunArgs) -> Result<SessionOptions, SessionError>,
 }
 
-/// Returns how the hub is reached in this environment.
+/// Returns the hub's options in this environment; `None` without a cache folder.
 fn options(variable: &dyn Fn(&str) -> Option<std::ffi::OsString>) -> Option<HubOptions> {
     let proxy = ["HTTPS_PROXY", "https_proxy"].into_iter().find_map(variable);
     let root = models_folder(&cache_folder(variable)?);
@@ -120,9 +120,9 @@ fn options(variable: &dyn Fn(&str) -> Option<std::ffi::OsString>) -> Option<HubO
     Some(HubOptions { proxy, ..HubOptions::new(root) })
 }
 
-/// Returns the folder that the name of a pulled model, or a folder, stands for.
+/// Returns the folder of a model, given as a folder or the name of a pulled model.
 /// # Errors
-/// [`HubError::NotPulled`] where it is a known model that is not here.
+/// [`HubError::NotPulled`] if it is a known model that is not pulled.
 pub fn resolve(
     model: &Path,
     variable: &dyn Fn(&str) -> Option<std::ffi::OsString>,
@@ -133,7 +133,7 @@ pub fn resolve(
     }
 }
 
-/// Opens what a user asks for: the embedded encoders if nothing, [`ModelDir::colours`] by that name, else a folder or
+/// Opens the model of `--models`: the embedded encoders by default, [`ModelDir::colours`] by that name, else a folder or
 /// a pulled model.
 /// # Errors
 /// As [`resolve`] and [`ModelDir::open`].
@@ -148,13 +148,13 @@ pub fn open(
     })
 }
 
-/// Returns where the set-up puts ONNX Runtime: beside the program `exe`, or in the build folder above it.
+/// Returns the folders in which setup installs ONNX Runtime: that of the program `exe`, or the build folder above it.
 pub fn runtime_folders(exe: &Path) -> Vec<PathBuf> {
     let arch = Path::new("onnxruntime").join(std::env::consts::ARCH);
     exe.ancestors().skip(1).take(3).flat_map(|folder| [folder.to_owned(), folder.join(&arch)]).collect()
 }
 
-/// Asks a question on the terminal; no, where there is none to ask.
+/// Asks a question on the terminal; returns false without a terminal.
 pub fn ask(question: &str) -> bool {
     if !io::stdin().is_terminal() || !io::stderr().is_terminal() {
         return false;
@@ -165,7 +165,7 @@ pub fn ask(question: &str) -> bool {
     asked.is_ok() && matches!(answer.trim(), "y" | "Y" | "yes")
 }
 
-/// Does what `command` says.
+/// Runs `command`.
 /// # Errors
 /// [`HubError`].
 pub fn run(command: &ModelsCommand, context: &Context<'_>) -> Result<Report, HubError> {
@@ -204,7 +204,7 @@ fn pull(hub: &Hub, name: &str, accepts: bool, context: &Context<'_>) -> Result<P
     let side = if context.image.is_some() { Side::Both } else { Side::Text };
     let files = match hub.pull(name, side, accepts) {
         Err(HubError::Licence { name, licence, url, note }) => {
-            let question = format!("{name} is under {licence} ({url}). {note} Accept that?");
+            let question = format!("{name} is licensed under {licence} ({url}). {note} Accept?");
             if !(context.ask)(&question) {
                 return Err(HubError::Licence { name, licence, url, note });
             }
@@ -250,17 +250,17 @@ fn info(folder: &Path, args: &InfoArgs, context: &Context<'_>) -> Result<Info, H
     Ok(info)
 }
 
-/// What a command found or did.
+/// The result of a command.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Report {
-    /// Of `list`.
+    /// Result of `list`.
     Models(Vec<Listed>),
-    /// Of `pull`.
+    /// Result of `pull`.
     Pulled(Vec<Pulled>),
-    /// Of `verify`.
+    /// Result of `verify`.
     Verified(Vec<Verified>),
-    /// Of `info`.
+    /// Result of `info`.
     Info(Box<Info>),
 }
 
@@ -288,14 +288,14 @@ pub struct Pulled {
     files: Vec<PulledFile>,
 }
 
-/// A model whose files are as recorded.
+/// A model with files that match their hashes.
 #[derive(Debug, Serialize)]
 pub struct Verified {
     folder: PathBuf,
     files: Vec<String>,
 }
 
-/// What a model is.
+/// The description of a model.
 #[derive(Debug, Serialize)]
 pub struct Info {
     name: String,
@@ -308,9 +308,9 @@ pub struct Info {
     threshold: Option<f32>,
     files: Vec<DescribedFile>,
     text_runs_on: Option<String>,
-    /// Absent where this program has no image side.
+    /// Absent if this program has no image side.
     image_runs_on: Option<String>,
-    /// Crops in a run.
+    /// Crops in a run of the image encoder.
     batch: Option<usize>,
 }
 
@@ -338,18 +338,23 @@ impl fmt::Display for Report {
                 writeln!(f, "{} in {}", model.name, model.folder.display())?;
                 model.files.iter().try_for_each(|file| {
                     let word = match file.on_the_word_of {
-                        Source::Table => "as known",
-                        Source::Hub => "as the hub advertised",
-                        Source::FirstPull => "nobody states a hash; this one is kept in models.lock",
-                        Source::PlacedByHand => "placed by hand; this hash is kept in models.lock",
+                        Source::Table => "matches the built-in table",
+                        Source::Hub => "matches the hub's hash",
+                        Source::FirstPull => "no published hash; recorded in models.lock",
+                        Source::PlacedByHand => "placed by hand; recorded in models.lock",
                     };
-                    let was_here = if file.was_here { ", was here" } else { "" };
+                    let was_here = if file.was_here { ", already present" } else { "" };
                     writeln!(f, "  {}  {} ({word}{was_here})", file.sha256, file.path)
                 })
             }),
-            Self::Verified(models) if models.is_empty() => writeln!(f, "no model is pulled"),
+            Self::Verified(models) if models.is_empty() => writeln!(f, "no models pulled"),
             Self::Verified(models) => models.iter().try_for_each(|model| {
-                writeln!(f, "{}: {} are as recorded", model.folder.display(), model.files.join(", "))
+                writeln!(
+                    f,
+                    "{}: {} match their recorded hashes",
+                    model.folder.display(),
+                    model.files.join(", ")
+                )
             }),
             Self::Info(info) => info.fmt(f),
         }
@@ -363,15 +368,14 @@ impl fmt::Display for Info {
         writeln!(f, "components  {}\nencoder id  {}", self.dim, self.encoder_id)?;
         match self.threshold {
             Some(cosine) => writeln!(f, "found from  cosine {cosine}")?,
-            None => writeln!(f, "found from  what each scene's scores say")?,
+            None => writeln!(f, "found from  calibrated by each scene's scores")?,
         }
         for file in &self.files {
-            let here = if file.is_here { "" } else { " (not here)" };
+            let here = if file.is_here { "" } else { " (absent)" };
             writeln!(f, "{:11} {}{here}", file.role.trim_start_matches("text."), file.path.display())?;
         }
         if let Some(text) = &self.text_runs_on {
-            let elsewhere =
-                "not here: this program asks; `slag-encoder models info --run` runs the image side";
+            let elsewhere = "not in this program; `slag-encoder models info --run` runs the image side";
             let images = self.image_runs_on.as_deref().unwrap_or(elsewhere);
             writeln!(f, "text on     {text}\nimages on   {images}")?;
         }

@@ -1,6 +1,6 @@
 use ::image::RgbImage;
 
-/// A piece of a photograph and which of its pixels belong to the thing shown.
+/// A piece of a photograph and the mask of the object that it shows.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Crop {
     image: RgbImage,
@@ -8,24 +8,24 @@ pub struct Crop {
 }
 
 impl Crop {
-    /// Returns a crop; `inside`: `[height][width]`, row-major. `None` where the sizes differ.
+    /// Returns a crop; `inside`: `[height][width]`, row-major. `None` if the sizes differ.
     pub fn new(image: RgbImage, inside: Vec<bool>) -> Option<Self> {
         let (width_px, height_px) = image.dimensions();
         (u64::from(width_px) * u64::from(height_px) == inside.len() as u64).then_some(Self { image, inside })
     }
 
-    /// Returns a crop of which every pixel belongs to the thing shown.
+    /// Returns a crop whose mask covers every pixel.
     pub fn whole(image: RgbImage) -> Self {
         let inside = vec![true; image.as_raw().len() / 3];
         Self { image, inside }
     }
 
-    /// Returns the pixels, background filled.
+    /// Returns the pixels; the background may be filled.
     pub fn image(&self) -> &RgbImage {
         &self.image
     }
 
-    /// Returns membership, `[height][width]`, row-major.
+    /// Returns the mask, `[height][width]`, row-major.
     pub fn inside(&self) -> &[bool] {
         &self.inside
     }

@@ -1,38 +1,38 @@
-//! `model.toml`: what a model directory holds and how its files are used.
+//! `model.toml`, the description of a model directory: its files and their use.
 //!
 //! ```toml
 //! name = "clip-vit-b32"            # names the space; part of the encoder id
-//! about = "what it knows and what not"
+//! about = "what it recognises, and what not"
 //! dim = 512                        # components of a vector
 //! licence = "MIT"
 //! files_root = "."                 # folder of the files below, relative to this file's folder
 //!
 //! [image]
-//! file = { path = "vision.onnx", sha256 = "..." }   # sha256 may be left out where the file is there
+//! file = { path = "vision.onnx", sha256 = "..." }   # sha256 may be left out if the file is present
 //! input = "pixel_values"           # f32 or f16 [n,3,size_px,size_px], RGB; n may be fixed to 1
-//! output = "image_embeds"          # f32 or f16 [n,dim]; left out: the only output of that shape
+//! output = "image_embeds"          # f32 or f16 [n,dim]; default: the only output of that shape
 //! size_px = 224
 //! resize = "shortest-edge"         # and centre crop, as CLIPImageProcessor; or "stretch"
 //! filter = "bicubic"
 //! mean = [0.48, 0.46, 0.41]        # pixel value = (level / 255 - mean) / std
 //! std = [0.27, 0.26, 0.28]
 //! normalise = true                 # false: the model's vectors are of unit length already
-//! batch = 16                       # crops in a run; left out: measured (see `OnnxImageEncoder`)
+//! batch = 16                       # crops in a run; default: measured (see `OnnxImageEncoder`)
 //!
 //! [text]
 //! kind = "onnx"
 //! file = { path = "text.onnx" }
 //! tokenizer = { path = "tokenizer.json" }
 //! input_ids = "input_ids"          # i64 or i32 [1,tokens]
-//! attention_mask = "attention_mask"  # left out where the model takes none
-//! output = "text_embeds"           # f32 or f16 [1,dim]; left out: the only output of that shape
+//! attention_mask = "attention_mask"  # left out if the model takes none
+//! output = "text_embeds"           # f32 or f16 [1,dim]; default: the only output of that shape
 //! max_tokens = 77
 //! end_token_id = 49407
-//! padding = { n_tokens = 64, token_id = 1 }  # only where the model was trained on padded texts (SigLIP), or
-//!                                  # takes so many tokens and no others; CLIP is quicker without
+//! padding = { n_tokens = 64, token_id = 1 }  # only if the model was trained on padded texts (SigLIP) or
+//!                                  # takes exactly that many tokens; CLIP is faster without
 //! prompt = "a photo of a {}"
 //!
-//! # or, instead: vectors of fixed phrases
+//! # alternatively, vectors of fixed phrases:
 //! # [text]
 //! # kind = "phrases"
 //! # file = { path = "phrases.txt" }            # one a line
@@ -47,15 +47,15 @@
 //! threshold = 0.25                 # cosine from which something counts as found; without [score],
 //!                                  # every scene is calibrated by its own scores
 //!
-//! # or, for models trained with a sigmoid: probability = 1 / (1 + exp(-(logit_scale * cosine + logit_bias)))
+//! # alternatively, for models trained with a sigmoid: probability = 1 / (1 + exp(-(logit_scale * cosine + logit_bias)))
 //! # [score]
 //! # logit_scale = 117.33           # the factor itself, not its logarithm
 //! # logit_bias = -12.93
-//! # probability = 0.5              # from which something counts as found; 0.5 where left out
+//! # probability = 0.5              # from which something counts as found; default 0.5
 //! ```
 //!
-//! Unknown fields are refused. A robot that has the text files only needs the image file's `sha256`
-//! recorded, because the encoder id states both.
+//! Unknown fields are refused. On a robot, which has only the text files, the image file's `sha256` must be
+//! recorded, because the encoder id covers both.
 
 use std::fmt;
 use std::path::{Component, Path, PathBuf};
@@ -66,27 +66,27 @@ use crate::encoder_id::EncoderId;
 pub use crate::file_ref::{FileRef, Sha256};
 use crate::preprocess::{Filter, Preprocess, Resize};
 
-/// The name of the description within a model directory.
+/// The file name of the description in a model directory.
 pub const FILE_NAME: &str = "model.toml";
 
-/// Says why a description is refused.
+/// Error of reading a description or the files that it names.
 #[derive(Debug, thiserror::Error)]
 pub enum DescriptionError {
     /// A file could not be read.
     #[error("{cause}; put the file there or correct the description")]
     Read {
-        /// The operating system's answer, which names the path.
+        /// The operating system's error, with the path.
         cause: std::io::Error,
     },
-    /// The description is not what is expected here.
+    /// The description is not TOML, or has missing or unknown fields.
     #[error("{}: {cause}; see the fields of {FILE_NAME} in its documentation", path.display())]
     Format {
         /// The description.
         path: PathBuf,
-        /// Line, column and what is wrong.
+        /// The parser's error, with line and column.
         cause: Box<toml::de::Error>,
     },
-    /// A field's value cannot be used.
+    /// A field has an invalid value.
     #[error("{}: {field} is {found}, expected {expected}; correct it", path.display())]
     Value {
         /// The description.
@@ -95,21 +95,21 @@ pub enum DescriptionError {
         field: &'static str,
         /// Its value.
         found: String,
-        /// What is expected.
+        /// The values expected.
         expected: &'static str,
     },
-    /// A file is not the one described.
+    /// A file's hash is not the recorded one.
     #[error("{}: SHA-256 is {found}, expected {expected}; fetch the file again or correct the description", path.display())]
     Hash {
         /// The file.
         path: PathBuf,
-        /// The hash described.
+        /// The recorded hash.
         expected: String,
         /// The hash of the file.
         found: String,
     },
-    /// A file is absent and its hash is not recorded, so that the encoder id cannot be stated.
-    #[error("{}: absent, and {FILE_NAME} records no sha256 of it; record it or put the file there", path.display())]
+    /// A file is absent and its hash is not recorded, so the encoder id cannot be computed.
+    #[error("{}: absent, and {FILE_NAME} records no sha256 for it; record it or put the file there", path.display())]
     NoHash {
         /// The file.
         path: PathBuf,
@@ -122,7 +122,7 @@ pub enum DescriptionError {
 pub struct Description {
     /// The name of the space.
     pub name: String,
-    /// What the model knows and what not.
+    /// What the model recognises and what not, for people.
     #[serde(default, skip_serializing)]
     pub about: String,
     /// Components of a vector.
@@ -137,9 +137,9 @@ pub struct Description {
     pub image: ImageDescription,
     /// The text side.
     pub text: TextDescription,
-    /// What is subtracted from text vectors.
+    /// The mean subtracted from text vectors.
     pub text_centre: Option<CentreDescription>,
-    /// How scores are read.
+    /// The interpretation of scores.
     #[serde(default, skip_serializing)]
     pub score: Option<ScoreDescription>,
 }
@@ -154,24 +154,24 @@ pub(crate) fn here() -> PathBuf {
 pub struct ImageDescription {
     /// The ONNX file.
     pub file: FileRef,
-    /// Its input, f32 or f16 `[n, 3, size_px, size_px]`.
+    /// The input, f32 or f16 `[n, 3, size_px, size_px]`.
     pub input: String,
-    /// Its output, f32 or f16 `[n, dim]`; the only one of that shape if absent.
+    /// The output, f32 or f16 `[n, dim]`; default: the only one of that shape.
     pub output: Option<String>,
-    /// Edge of the square that it takes, pixels.
+    /// Edge length of the model's input square, in pixels.
     pub size_px: u16,
-    /// How a crop becomes that square.
+    /// How crops are resized to that square.
     pub resize: Resize,
-    /// With which filter.
+    /// The resampling filter.
     #[serde(default)]
     pub filter: Filter,
     /// Subtracted from level / 255, per channel.
     pub mean: [f64; 3],
-    /// Divided by after that, per channel.
+    /// Divisor after the subtraction, per channel.
     pub std: [f64; 3],
-    /// Whether the output is to be scaled to unit length.
+    /// Whether to scale the output to unit length.
     pub normalise: bool,
-    /// Crops in a run; measured if absent.
+    /// Crops in a run; default: measured.
     #[serde(skip_serializing)]
     pub batch: Option<u16>,
 }
@@ -205,29 +205,29 @@ pub struct OnnxText {
     pub input_ids: String,
     /// The input for the mask, i64 or i32 `[1, tokens]`, if there is one.
     pub attention_mask: Option<String>,
-    /// The output, f32 or f16 `[1, dim]`; the only one of that shape if absent.
+    /// The output, f32 or f16 `[1, dim]`; default: the only one of that shape.
     pub output: Option<String>,
-    /// The longest text, tokens, with the begin and end tokens.
+    /// Length of the longest text in tokens, including begin and end tokens.
     pub max_tokens: u16,
     /// The token that ends a text.
     pub end_token_id: u32,
-    /// What follows the end token, if anything.
+    /// Padding after the end token, if any.
     pub padding: Option<Padding>,
-    /// What is encoded, `{}` standing for the text.
+    /// The encoded text, with `{}` in place of the query.
     pub prompt: String,
 }
 
-/// How texts are made as long as the model wants them.
+/// Padding of texts to a fixed length.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Padding {
-    /// Tokens of every text, with the begin and end tokens.
+    /// Length of every text in tokens, including begin and end tokens.
     pub n_tokens: u16,
-    /// The token that fills up.
+    /// The padding token.
     pub token_id: u32,
 }
 
-/// A text encoder made of fixed phrases.
+/// A text encoder of fixed phrases.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PhrasesText {
@@ -239,7 +239,7 @@ pub struct PhrasesText {
     pub tensor: String,
 }
 
-/// What is subtracted from text vectors.
+/// The mean subtracted from text vectors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CentreDescription {
@@ -249,15 +249,15 @@ pub struct CentreDescription {
     pub tensor: String,
 }
 
-/// How scores are read: a cosine, or the sigmoid of a scaled one.
+/// The interpretation of scores: as a cosine, or as the sigmoid of a scaled cosine.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ScoreDescription {
     /// The cosine from which something counts as found, by default.
     threshold: Option<f32>,
-    /// What the cosine is multiplied by to become a logit.
+    /// The factor from cosine to logit.
     logit_scale: Option<f64>,
-    /// What is added after that.
+    /// The bias added to the logit.
     logit_bias: Option<f64>,
     /// The probability from which something counts as found, by default.
     probability: Option<f64>,
@@ -279,10 +279,10 @@ impl fmt::Display for ScoreDescription {
 }
 
 impl ScoreDescription {
-    /// Returns the cosine from which something counts as found: as stated, or where
-    /// 1 / (1 + exp(-(scale * cosine + bias))) is the probability stated (Zhai et al. 2023, equation 1).
+    /// Returns the cosine from which something counts as found: the threshold, or the solution of
+    /// 1 / (1 + exp(-(scale * cosine + bias))) = probability (Zhai et al. 2023, equation 1).
     ///
-    /// `None` where the fields are not exactly those of one way, or give no cosine.
+    /// `None` if the fields are not those of exactly one of the two, or give no cosine.
     pub fn threshold(&self) -> Option<f32> {
         let threshold = match *self {
             Self { threshold, logit_scale: None, logit_bias: None, probability: None } => {
@@ -301,15 +301,15 @@ impl ScoreDescription {
 impl Description {
     /// Reads and checks `path`.
     /// # Errors
-    /// [`DescriptionError`] where it cannot be read or used.
+    /// [`DescriptionError`] if it cannot be read or is invalid.
     pub fn read(path: &Path) -> Result<Self, DescriptionError> {
         let text = fs_err::read_to_string(path).map_err(|cause| DescriptionError::Read { cause })?;
         Self::parse(path, &text)
     }
 
-    /// Reads and checks a description's text; `path` is for messages.
+    /// Parses and checks a description; `path` is for messages.
     /// # Errors
-    /// [`DescriptionError`] where it cannot be used.
+    /// [`DescriptionError`] if it is invalid.
     pub(crate) fn parse(path: &Path, text: &str) -> Result<Self, DescriptionError> {
         let description: Self = parse_toml(path, text)?;
         description.check(path)?;
@@ -331,7 +331,7 @@ impl Description {
         files
     }
 
-    /// Returns [`Self::files`] to be changed.
+    /// Mutable [`Self::files`].
     pub(crate) fn files_mut(&mut self) -> Vec<(&'static str, &mut FileRef)> {
         let mut files = vec![("image.model", &mut self.image.file)];
         match &mut self.text {
@@ -346,7 +346,7 @@ impl Description {
         files
     }
 
-    /// Returns the identity of the space. Every file must have its hash.
+    /// Returns the identity of the space. Every file must have a hash.
     pub(crate) fn encoder_id(&self) -> EncoderId {
         let definition = serde_json::to_string(self).expect("every file has its hash");
         EncoderId { name: self.name.clone(), dim: self.dim, definition }
@@ -410,7 +410,7 @@ fn parse_toml<T: serde::de::DeserializeOwned>(path: &Path, text: &str) -> Result
         .map_err(|cause| DescriptionError::Format { path: path.to_owned(), cause: Box::new(cause) })
 }
 
-/// Refuses the value `found` of a field unless it `holds` what is expected.
+/// Returns an error unless `holds`: field `field` is `found`, but should be `expected`.
 pub(crate) fn require(
     path: &Path,
     holds: bool,
@@ -424,7 +424,7 @@ pub(crate) fn require(
     Err(DescriptionError::Value { path: path.to_owned(), field, found, expected })
 }
 
-/// Checks what every description has: a name, and files below a root.
+/// Checks the fields common to all descriptions: the name, and the files below a root.
 pub(crate) fn check_common(
     path: &Path,
     name: &str,

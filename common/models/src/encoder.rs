@@ -1,7 +1,7 @@
-//! What image and text encoders have in common.
+//! The traits of image and text encoders.
 
 use crate::crop::Crop;
-use crate::error::EncodeError;
+use crate::error::InferenceError;
 use crate::placement::Placement;
 
 /// Turns crops of photographs into unit vectors.
@@ -9,17 +9,17 @@ pub trait ImageEncoder: Send {
     /// Returns the number of components of a vector.
     fn dim(&self) -> usize;
 
-    /// Returns how many crops are best encoded together.
+    /// Returns the number of crops to encode together for the best throughput.
     fn preferred_batch(&self) -> usize;
 
     /// Encodes `crops`: `[n]` in, `[n][dim]` out, unit vectors, row-major.
     ///
     /// Memory is bounded by the preferred batch, however many crops are given.
     /// # Errors
-    /// [`EncodeError`] where a crop is empty or the model fails.
-    fn encode(&mut self, crops: &[Crop]) -> Result<Vec<f32>, EncodeError>;
+    /// [`InferenceError`] if a crop is empty or the model fails.
+    fn encode(&mut self, crops: &[Crop]) -> Result<Vec<f32>, InferenceError>;
 
-    /// Returns what ONNX Runtime really runs it on; `None` where it does without.
+    /// Returns the device that ONNX Runtime runs the model on; `None` without ONNX Runtime.
     fn placement(&self) -> Option<&Placement> {
         None
     }
@@ -33,23 +33,23 @@ pub trait TextEncoder: Send {
     /// Returns the number of components of a vector.
     fn dim(&self) -> usize;
 
-    /// Encodes `text`: `[dim]`, a unit vector, centred as the description says.
+    /// Encodes `text`: `[dim]`, a unit vector, centred if the description asks for it.
     /// # Errors
-    /// [`EncodeError`] where the text is empty or unknown, or the model fails.
-    fn encode(&mut self, text: &str) -> Result<Vec<f32>, EncodeError>;
+    /// [`InferenceError`] if the text is empty or unknown, or the model fails.
+    fn encode(&mut self, text: &str) -> Result<Vec<f32>, InferenceError>;
 
-    /// Returns all that it knows, where that is a list; `None` where it takes any text.
+    /// Returns the phrases or words that it accepts; `None` if it accepts any text.
     fn vocabulary(&self) -> Option<&[String]> {
         None
     }
 
-    /// Returns what ONNX Runtime really runs it on; `None` where it does without.
+    /// Returns the device that ONNX Runtime runs the model on; `None` without ONNX Runtime.
     fn placement(&self) -> Option<&Placement> {
         None
     }
 }
 
-/// Scales `vector` to unit length, computed in f64; returns false, leaving it, where it is zero or not finite.
+/// Scales `vector` to unit length, computing in f64. Returns false and leaves it unchanged if it is zero or not finite.
 pub(crate) fn normalise(vector: &mut [f32]) -> bool {
     let norm = vector.iter().map(|&x| f64::from(x) * f64::from(x)).sum::<f64>().sqrt();
     let usable = norm.is_finite() && norm > 0.0;

@@ -1,11 +1,11 @@
-//! The identity of an embedding space: vectors may be compared where their encoder ids are equal.
+//! The identity of an embedding space: vectors are comparable only if their encoder ids are equal.
 
 use std::fmt;
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-/// Identifies an embedding space by all that decides vectors, image and text side together.
+/// Identifies an embedding space by everything that affects vectors, on the image and the text side.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EncoderId {
@@ -14,7 +14,7 @@ pub struct EncoderId {
     /// Components of a vector.
     pub dim: u32,
     /// The description of the model as JSON, with the SHA-256 of each file in place of its path and without the fields
-    /// that leave vectors as they are; empty for the built-in stand-in.
+    /// that do not affect vectors; empty for the built-in stand-in.
     pub definition: String,
 }
 
@@ -29,7 +29,7 @@ impl EncoderId {
     }
 }
 
-/// Shows the name and the start of the hash, enough for a person to tell two apart.
+/// Shows the name and the start of the hash.
 impl fmt::Display for EncoderId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}@{}", self.name, hex::encode(&self.hash()[..6]))

@@ -4,33 +4,33 @@ use std::path::PathBuf;
 
 use crate::{description::DescriptionError, session_error::SessionError, tensors::TensorsError};
 
-/// Says why an encoder could not be opened.
+/// Error of opening an encoder.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
-    /// The description is wrong, or a file is not the one that it names.
+    /// The description is invalid, or a file differs from the one described.
     #[error(transparent)]
     Description(#[from] DescriptionError),
-    /// ONNX Runtime or a model file is at fault.
+    /// Error of ONNX Runtime or a model file.
     #[error(transparent)]
     Session(#[from] SessionError),
-    /// The tokenizer is at fault.
+    /// Error of the tokenizer.
     #[error(transparent)]
     Tokenizer(#[from] TokenizerError),
-    /// The list of phrases is at fault.
+    /// Error of the list of phrases.
     #[error(transparent)]
     Phrases(#[from] PhrasesError),
-    /// A file of tensors is at fault.
+    /// Error of a file of tensors.
     #[error(transparent)]
     Tensors(#[from] TensorsError),
 }
 
-/// Says why text could not be made into tokens.
+/// Error of turning text into tokens.
 #[derive(Debug, thiserror::Error)]
 pub enum TokenizerError {
     /// The file could not be read.
     #[error("{cause}; put the tokenizer there or correct the description")]
     Read {
-        /// The operating system's answer, which names the path.
+        /// The operating system's error, with the path.
         cause: std::io::Error,
     },
     /// The file is not a tokenizer.
@@ -41,9 +41,9 @@ pub enum TokenizerError {
         /// What is wrong.
         reason: String,
     },
-    /// The tokenizer is of another model.
+    /// The tokenizer belongs to another model.
     #[error(
-        "{}: a text ends in token {found:?}, the model's end token is {expected}; use the model's own tokenizer",
+        "{}: texts end in token {found:?}, but the model's end token is {expected}; use the model's own tokenizer",
         path.display()
     )]
     OtherVocabulary {
@@ -54,9 +54,9 @@ pub enum TokenizerError {
         /// The last token of a text, if any.
         found: Option<u32>,
     },
-    /// The tokenizer has more tokens than the model knows.
+    /// The tokenizer has more tokens than the model.
     #[error(
-        "{}: has token ids up to {largest}, the model does not take them ({cause}); use the model's own tokenizer",
+        "{}: has token ids up to {largest}, which the model does not accept ({cause}); use the model's own tokenizer",
         path.display()
     )]
     MoreTokens {
@@ -64,29 +64,29 @@ pub enum TokenizerError {
         path: PathBuf,
         /// Its largest id.
         largest: u32,
-        /// What the model says to a text of it.
+        /// The model's error for a text with that id.
         cause: Box<SessionError>,
     },
-    /// The tokenizer fails on a text.
+    /// The tokenizer failed on a text.
     #[error("{}: {reason}; use other words", path.display())]
     Encode {
         /// The file.
         path: PathBuf,
-        /// What it says.
+        /// The tokenizer's error.
         reason: String,
     },
 }
 
-/// Says why a list of phrases is refused.
+/// Error of reading a list of phrases.
 #[derive(Debug, thiserror::Error)]
 pub enum PhrasesError {
     /// The file could not be read.
     #[error("{cause}; put the file there or correct the description")]
     Read {
-        /// The operating system's answer, which names the path.
+        /// The operating system's error, with the path.
         cause: std::io::Error,
     },
-    /// A line has no phrase.
+    /// A line is empty.
     #[error("{}: line {line} is empty; the list needs one phrase a line", path.display())]
     EmptyLine {
         /// The file.
@@ -106,31 +106,31 @@ pub enum PhrasesError {
     },
 }
 
-/// Says why something could not be encoded.
+/// Error of encoding a text or crops.
 #[derive(Debug, thiserror::Error)]
-pub enum EncodeError {
-    /// There is nothing to encode.
+pub enum InferenceError {
+    /// The text is empty.
     #[error("the text is empty; say what to look for")]
     EmptyText,
-    /// The list of phrases has no such phrase.
+    /// The text is not in the list of phrases.
     #[error("{text:?} is not one of the {n_known} phrases this model knows; {}", suggestion(near))]
     UnknownPhrase {
-        /// The text as it was looked up.
+        /// The normalised text.
         text: String,
-        /// How many phrases are known.
+        /// Number of known phrases.
         n_known: usize,
-        /// Known phrases that look like it, nearest first.
+        /// Similar known phrases, nearest first.
         near: Vec<String>,
     },
-    /// The built-in stand-in knows some words only.
+    /// The built-in stand-in does not know a word.
     #[error("the built-in model knows no {}; use words of: {}", unknown.join(", "), known.join(", "))]
     UnknownWords {
-        /// The words that it does not know.
+        /// The unknown words.
         unknown: Vec<String>,
-        /// All that it knows.
+        /// All known words.
         known: Vec<String>,
     },
-    /// A crop has no pixels, or none inside.
+    /// A crop has no pixels, or none inside its mask.
     #[error("crop {index} has no pixels to encode; drop empty masks first")]
     EmptyCrop {
         /// Its index among the crops given.
@@ -142,7 +142,7 @@ pub enum EncodeError {
     /// The model failed.
     #[error(transparent)]
     Session(#[from] SessionError),
-    /// The model gave a vector without a direction.
+    /// The model returned a zero or non-finite vector.
     #[error("vector {index} of {model} is zero or not finite; the model file does not fit its description")]
     NoDirection {
         /// The model's name.
@@ -150,7 +150,7 @@ pub enum EncodeError {
         /// Index of the vector.
         index: usize,
     },
-    /// The model's vectors are not of unit length though the description says so.
+    /// The model's vectors are not of unit length, contrary to the description.
     #[error("vector {index} of {model} has length {norm}, expected 1; set image.normalise = true")]
     NotUnit {
         /// The model's name.
@@ -164,7 +164,7 @@ pub enum EncodeError {
 
 fn suggestion(near: &[String]) -> String {
     match near {
-        [] => "none is near; ask for its list of phrases".to_owned(),
+        [] => "no known phrase is similar; see its list of phrases".to_owned(),
         _ => format!("did you mean {}?", near.join(", ")),
     }
 }

@@ -16,7 +16,7 @@ pub struct FileRef {
     pub sha256: Option<Sha256>,
 }
 
-/// Writes the hash alone: where a file lies decides no vector.
+/// Serialises the hash alone: the encoder id must not depend on paths.
 impl Serialize for FileRef {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let sha256 =
@@ -49,6 +49,6 @@ impl TryFrom<String> for Sha256 {
         let mut bytes = [0; 32];
         hex::decode_to_slice(&text, &mut bytes)
             .map(|()| Self(bytes))
-            .map_err(|error| format!("{text:?} is no SHA-256 of 64 hexadecimal digits: {error}"))
+            .map_err(|error| format!("{text:?} is not a SHA-256 of 64 hexadecimal digits: {error}"))
     }
 }

@@ -6,7 +6,7 @@ use half::f16;
 use ort::value::TensorElementType;
 
 use crate::{
-    Crop, EncodeError, ImageEncoder, ModelError, ModelFile,
+    Crop, ImageEncoder, InferenceError, ModelError, ModelFile,
     description::ImageDescription,
     encoder::normalise,
     placement::Placement,
@@ -14,20 +14,20 @@ use crate::{
     session::{Model, SessionError, SessionOptions},
 };
 
-/// Where a unit vector of f32 may end up after a model's own scaling.
+/// Largest difference from length 1 in vectors that the model normalises itself.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
-/// Crops in a run where the vectors vary with it: a constant, so that they are the same on every machine.
+/// Batch size for models whose vectors depend on it: a constant, so that vectors are the same on every machine.
 const FIXED_BATCH: usize = 16;
 
-/// What a batch twice as large must save of the time of a crop, to be worth its memory.
+/// Share of the time per crop that doubling the batch must save to be worth its memory.
 const WORTHWHILE: f64 = 0.05;
 
 /// An image encoder that runs an ONNX file.
 ///
-/// Where the description states no batch, it is the fastest of 1, 2, 4, 8, 16 and 32 as measured once a process,
-/// but only of those with which a crop's vector is bit for bit what it is alone. Models whose vectors vary with
-/// what else is in the batch (8-bit ones with scales found at run time) get 16 everywhere.
+/// If the description states no batch size, the fastest of 1, 2, 4, 8, 16 and 32 is measured once a process, among
+/// those that leave a crop's vector bit for bit the same. Models whose vectors depend on the rest of the batch
+/// (8-bit ones with scales computed at run time) always get 16.
 #[derive(Debug)]
 pub struct OnnxImageEncoder {
     name: String,
@@ -42,9 +42,9 @@ pub struct OnnxImageEncoder {
 }
 
 impl OnnxImageEncoder {
-    /// Opens `file` as `description` says; `dim`: components of a vector.
+    /// Opens `file` according to `description`; `dim`: components of a vector.
     /// # Errors
-    /// [`ModelError::Session`] where the runtime or the file is not as described.
+    /// [`ModelError::Session`] if the runtime does not load or the file is not as described.
     pub fn open(
         name: &str,
         dim: usize,
@@ -76,9 +76,9 @@ impl OnnxImageEncoder {
         })
     }
 
-    /// Sets the batch if it is still open, to what `measured` has or else gets by measuring.
+    /// Sets the batch size if the description leaves it open: to `measured`, which is measured if absent.
     /// # Errors
-    /// [`SessionError`] where the model does not run.
+    /// [`SessionError`] if the model does not run.
     pub(crate) fn settle_batch(&mut self, measured: &mut Option<usize>) -> Result<(), SessionError> {
         if self.batch.is_none() {
             self.batch = Some(match *measured {
@@ -91,7 +91,7 @@ impl OnnxImageEncoder {
 
     fn measure_batch(&mut self) -> Result<usize, SessionError> {
         let n_values = 3 * (self.preprocess.size_px() as usize).pow(2);
-        // Noise of two strengths: scales found at run time differ between them.
+        // Noise of two strengths: scales computed at run time differ between them.
         let mut state = 1u32;
         let mut noise = |strength: f32| -> Vec<f32> {
             let mut next = || {
@@ -113,7 +113,7 @@ impl OnnxImageEncoder {
         };
         let (_, is_invariant) = timed(4)?;
         if !is_invariant {
-            tracing::debug!("{}: vectors vary with the batch, which is {FIXED_BATCH}", self.name);
+            tracing::debug!("{}: vectors depend on the batch, so its size is {FIXED_BATCH}", self.name);
             return Ok(FIXED_BATCH);
         }
         let (mut best, mut best_time) = (1, timed(1)?.0);
@@ -128,7 +128,7 @@ impl OnnxImageEncoder {
         Ok(best)
     }
 
-    /// Returns the model's vectors, `[n][dim]`, of pixel values `[n][3][size_px][size_px]`.
+    /// Runs the model on pixel values `[n][3][size_px][size_px]`; returns its vectors, `[n][dim]`.
     fn run(&mut self, pixels: &[f32], n: usize) -> Result<Vec<f32>, SessionError> {
         let size = i64::from(self.preprocess.size_px());
         let shape = vec![n as i64, 3, size, size];
@@ -143,14 +143,14 @@ impl OnnxImageEncoder {
         self.model.run(vec![(self.input.as_str(), input)], &self.output, &[n as i64, self.dim as i64])
     }
 
-    /// Scales or checks vector `index` of the call.
-    fn finish(&self, vector: &mut [f32], index: usize) -> Result<(), EncodeError> {
+    /// Normalises vector `index` of the call, or checks its length.
+    fn finish(&self, vector: &mut [f32], index: usize) -> Result<(), InferenceError> {
         let norm = vector.iter().map(|&x| f64::from(x) * f64::from(x)).sum::<f64>().sqrt();
         if !norm.is_finite() || (self.normalise && !normalise(vector)) {
-            return Err(EncodeError::NoDirection { model: self.name.clone(), index });
+            return Err(InferenceError::NoDirection { model: self.name.clone(), index });
         }
         if !self.normalise && (norm - 1.0).abs() > UNIT_TOLERANCE {
-            return Err(EncodeError::NotUnit { model: self.name.clone(), index, norm });
+            return Err(InferenceError::NotUnit { model: self.name.clone(), index, norm });
         }
         Ok(())
     }
@@ -165,9 +165,9 @@ impl ImageEncoder for OnnxImageEncoder {
         self.batch.unwrap_or(FIXED_BATCH)
     }
 
-    fn encode(&mut self, crops: &[Crop]) -> Result<Vec<f32>, EncodeError> {
+    fn encode(&mut self, crops: &[Crop]) -> Result<Vec<f32>, InferenceError> {
         if let Some(index) = crops.iter().position(|crop| crop.inside().is_empty()) {
-            return Err(EncodeError::EmptyCrop { index });
+            return Err(InferenceError::EmptyCrop { index });
         }
         let mut vectors = Vec::with_capacity(crops.len() * self.dim);
         for crops in crops.chunks(self.preferred_batch()) {

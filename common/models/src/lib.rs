@@ -1,14 +1,15 @@
 //! Model directories: image and text encoders that share one embedding space.
 //!
 //! A [`ModelDir`] is described by one TOML file ([`description`]). Its image side turns crops into
-//! vectors ([`ImageEncoder`]), its text side turns queries into vectors of the same space
-//! ([`TextEncoder`]): through ONNX Runtime ([`session`]), from a list of phrases ([`phrases`]), or
-//! without a model at all ([`colours`]). [`boundaries`] finds where things end. Encoders of our own are part of the program ([`ModelDir::embedded`]). [`sam`] finds masks. [`EncoderId`] names the space, so that a robot can refuse
-//! to compare vectors of two spaces.
+//! vectors ([`ImageEncoder`]); its text side turns queries into vectors of the same space
+//! ([`TextEncoder`]). Both run through ONNX Runtime ([`session`]), or without a model: from a list of
+//! phrases ([`phrases`]) or by colour ([`colours`]). [`ModelDir::embedded`] opens the encoders that are
+//! part of the program. [`EncoderId`] identifies the space, so that a robot can refuse to compare
+//! vectors of two spaces. [`sam`] proposes masks; [`boundaries`] predicts where objects end.
 //!
-//! [`hub`] brings public models here, and [`commands`] is the face that both programs give it.
+//! [`hub`] pulls public models; [`commands`] is its command line, shared by both programs.
 //!
-//! Nothing here prints, reads the environment or starts threads of its own, save the question of [`commands::ask`].
+//! Nothing here prints, reads the environment or starts threads, except the prompt of [`commands::ask`].
 
 pub mod boundaries;
 pub mod clean;
@@ -39,7 +40,7 @@ pub mod text;
 pub use crop::Crop;
 pub use encoder::{ImageEncoder, TextEncoder};
 pub use encoder_id::EncoderId;
-pub use error::{EncodeError, ModelError, PhrasesError, TokenizerError};
+pub use error::{InferenceError, ModelError, PhrasesError, TokenizerError};
 pub use model_dir::ModelDir;
 pub use model_file::ModelFile;
 pub use placement::Placement;

@@ -6,7 +6,7 @@ use std::{
 
 use sha2::{Digest, Sha256};
 
-/// What is part of the program, in `embedded/`.
+/// The files of `embedded/`, which are part of the program.
 mod embedded {
     pub const DESCRIPTION: &str = include_str!("../embedded/model.toml");
     pub const IMAGE: &[u8] = include_bytes!("../embedded/image.onnx");
@@ -24,7 +24,7 @@ use crate::{
     text::OnnxTextEncoder,
 };
 
-/// A pair of image and text encoders: a directory with a description, or what is built in.
+/// A pair of image and text encoders: a directory with a description, or built into the program.
 #[derive(Clone, Debug)]
 pub struct ModelDir {
     id: EncoderId,
@@ -37,7 +37,7 @@ enum Source {
     Files { files: Files, description: Box<Description>, batch: Arc<Mutex<Option<usize>>> },
 }
 
-/// Where the files of a description are.
+/// The location of a description's files.
 #[derive(Clone, Debug)]
 enum Files {
     Embedded,
@@ -45,7 +45,8 @@ enum Files {
 }
 
 impl Files {
-    /// Returns a file after comparing its hash with the recorded one, if any; `embedded` is what the program has of it.
+    /// Returns a file after comparing its hash with the recorded one, if any; `embedded`: the bytes
+    /// in the program.
     fn open(&self, file: &FileRef, embedded: &'static [u8]) -> Result<ModelFile, DescriptionError> {
         match self {
             Self::Embedded => Ok(ModelFile::embedded(&file.path, embedded)),
@@ -53,7 +54,7 @@ impl Files {
         }
     }
 
-    /// Returns the path of a file that embedded models do not have.
+    /// Returns the path of a file of a kind that embedded models do not have.
     fn on_disk(&self, file: &FileRef) -> Result<PathBuf, DescriptionError> {
         match self {
             Self::Embedded => Ok(file.path.clone()),
@@ -63,21 +64,21 @@ impl Files {
 }
 
 impl ModelDir {
-    /// Opens the directory `path`, which holds a [`description`](crate::description) in `model.toml`.
+    /// Opens the directory `path` with a [`description`](crate::description) in `model.toml`.
     ///
-    /// Files whose hash is recorded are not read yet; each is checked when an encoder needs it.
+    /// Files with a recorded hash are read and checked only when an encoder needs them.
     /// # Errors
-    /// [`ModelError::Description`] where the description cannot be used, or a file without a recorded hash is absent.
+    /// [`ModelError::Description`] if the description is invalid, or a file without a recorded hash is absent.
     pub fn open(path: &Path) -> Result<Self, ModelError> {
         let description = Description::read(&path.join(FILE_NAME))?;
         let files_root = path.join(&description.files_root);
         Self::with(description, Files::Folder(files_root))
     }
 
-    /// Returns the encoders that are part of the program: trained on generated things, poor on real photos
-    /// (`embedded/CARD.md`). They need ONNX Runtime as others do.
+    /// Returns the encoders embedded in the program: trained on generated scenes, poor on real photos
+    /// (`embedded/CARD.md`). They need ONNX Runtime too.
     /// # Errors
-    /// [`ModelError::Description`]: never, with the files that the program is built from.
+    /// [`ModelError::Description`] if the embedded description is invalid, which tests rule out.
     pub fn embedded() -> Result<Self, ModelError> {
         let description = Description::parse(Path::new("(embedded)/model.toml"), embedded::DESCRIPTION)?;
         Self::with(description, Files::Embedded)
@@ -88,7 +89,7 @@ impl ModelDir {
         for (_, file) in hashed.files_mut() {
             let root = match &files {
                 Files::Folder(root) => root,
-                // Every hash is recorded.
+                // Not used: the embedded description records every hash.
                 Files::Embedded => Path::new(""),
             };
             file.sha256 = Some(crate::description::Sha256(sha256_of(root, file)?));
@@ -98,14 +99,14 @@ impl ModelDir {
         Ok(Self { id, source })
     }
 
-    /// Returns the stand-in that knows colours and shapes, and needs no files and no ONNX Runtime.
+    /// Returns the stand-in for colours and shapes, which needs neither files nor ONNX Runtime.
     pub fn colours() -> Self {
         let id =
             EncoderId { name: colours::NAME.to_owned(), dim: colours::DIM as u32, definition: String::new() };
         Self { id, source: Source::Colours }
     }
 
-    /// Returns the name of the space.
+    /// Returns the identity of the embedding space.
     pub fn encoder_id(&self) -> &EncoderId {
         &self.id
     }
@@ -115,7 +116,7 @@ impl ModelDir {
         self.id.dim as usize
     }
 
-    /// Returns what the model knows and what not, for people.
+    /// Returns a description for people: what the model can recognise and what not.
     pub fn about(&self) -> &str {
         match &self.source {
             Source::Colours => colours::ABOUT,
@@ -131,7 +132,7 @@ impl ModelDir {
         }
     }
 
-    /// Returns the cosine from which something counts as found, where the model states one.
+    /// Returns the cosine from which something counts as found, if the model states one.
     pub fn threshold(&self) -> Option<f32> {
         match &self.source {
             Source::Colours => Some(colours::THRESHOLD),
@@ -139,9 +140,9 @@ impl ModelDir {
         }
     }
 
-    /// Returns how crops become the squares that the image encoder takes; `None` where it takes any size.
+    /// Returns the steps from a crop to the image encoder's square; `None` if it takes any size.
     ///
-    /// A square that was made so is encoded as its crop is.
+    /// The square and its crop have the same vector.
     pub fn preprocess(&self) -> Option<Preprocess> {
         match &self.source {
             Source::Colours => None,
@@ -151,7 +152,7 @@ impl ModelDir {
 
     /// Opens the image encoder.
     /// # Errors
-    /// [`ModelError`] where a file is absent or not as described, or ONNX Runtime does not load.
+    /// [`ModelError`] if a file is absent or not as described, or ONNX Runtime does not load.
     pub fn image_encoder(&self, options: &SessionOptions) -> Result<Box<dyn ImageEncoder>, ModelError> {
         let Source::Files { files, description, batch } = &self.source else {
             return Ok(Box::new(colours::ColourShape));
@@ -159,14 +160,14 @@ impl ModelDir {
         let image = &description.image;
         let file = files.open(&image.file, embedded::IMAGE)?;
         let mut encoder = OnnxImageEncoder::open(&description.name, self.dim(), &file, image, options)?;
-        // One measures, the others wait, or they would disturb it.
+        // One encoder measures while others wait: parallel runs would disturb the timing.
         encoder.settle_batch(&mut batch.lock().unwrap_or_else(PoisonError::into_inner))?;
         Ok(Box::new(encoder))
     }
 
-    /// Opens the text encoder; ONNX Runtime is loaded only where the text side is ONNX.
+    /// Opens the text encoder; loads ONNX Runtime only if the text side is ONNX.
     /// # Errors
-    /// [`ModelError`] where a file is absent or not as described, or ONNX Runtime does not load.
+    /// [`ModelError`] if a file is absent or not as described, or ONNX Runtime does not load.
     pub fn text_encoder(&self, options: &SessionOptions) -> Result<Box<dyn TextEncoder>, ModelError> {
         let Source::Files { files, description, .. } = &self.source else {
             return Ok(Box::new(colours::ColourShape));
@@ -190,7 +191,7 @@ impl ModelDir {
     }
 }
 
-/// Returns the recorded hash of `file`, else that of what is there.
+/// Returns the recorded hash of `file`, or else computes it.
 pub(crate) fn sha256_of(files_root: &Path, file: &FileRef) -> Result<[u8; 32], DescriptionError> {
     let path = files_root.join(&file.path);
     match file.sha256 {
@@ -238,7 +239,7 @@ mod tests {
         ModelDir::with(description, Files::Embedded).expect("every hash is recorded").encoder_id().hash()
     }
 
-    /// Whatever decides vectors decides the id; prose, places and batches do not.
+    /// The id depends on everything that affects vectors, and not on prose, paths or batch sizes.
     #[test]
     fn the_encoder_id_covers_the_description() {
         let text = embedded::DESCRIPTION;

@@ -1,4 +1,4 @@
-//! Where the bytes of a model's file are.
+//! Model files on disk or in the program.
 
 use std::{
     borrow::Cow,
@@ -6,21 +6,21 @@ use std::{
     path::{Path, PathBuf},
 };
 
-/// A file of a model: on disk, or in the program itself.
+/// A file of a model: on disk, or embedded in the program.
 #[derive(Clone, Debug)]
 pub struct ModelFile {
-    /// Its path, for people where it is in the program.
+    /// Its path; for messages only if it is embedded.
     pub path: PathBuf,
     embedded: Option<&'static [u8]>,
 }
 
 impl ModelFile {
-    /// A file that is part of the program.
+    /// Returns an embedded file.
     pub(crate) fn embedded(path: &Path, bytes: &'static [u8]) -> Self {
         Self { path: Path::new("(embedded)").join(path), embedded: Some(bytes) }
     }
 
-    /// Returns its bytes where it is part of the program.
+    /// Returns its bytes if it is embedded.
     pub(crate) fn embedded_bytes(&self) -> Option<&'static [u8]> {
         self.embedded
     }
@@ -28,7 +28,7 @@ impl ModelFile {
     /// Returns its bytes.
     ///
     /// # Errors
-    /// The operating system's, with the path.
+    /// The operating system's error, with the path.
     pub fn read(&self) -> io::Result<Cow<'static, [u8]>> {
         match self.embedded {
             Some(bytes) => Ok(Cow::Borrowed(bytes)),

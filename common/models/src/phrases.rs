@@ -1,18 +1,18 @@
-//! A text encoder made of fixed phrases and their vectors: needs no model and no ONNX Runtime.
+//! A text encoder of fixed phrases with given vectors; needs no model and no ONNX Runtime.
 
 use std::{collections::HashMap, path::Path};
 
 use crate::encoder::TextEncoder;
-use crate::error::{EncodeError, ModelError, PhrasesError};
+use crate::error::{InferenceError, ModelError, PhrasesError};
 use crate::{tensors, text::centred};
 
-/// How many known phrases an unknown one is answered with.
+/// Number of suggestions for an unknown phrase.
 const N_NEAR: usize = 5;
 
-/// Texts of more letters are sentences, not phrases misspelt; comparing them would only take time.
+/// Longer texts are sentences, not misspelt phrases: they get no suggestions.
 const LONGEST_COMPARED: usize = 100;
 
-/// A text encoder made of fixed phrases.
+/// A text encoder of fixed phrases.
 #[derive(Debug)]
 pub struct PhraseEncoder {
     name: String,
@@ -26,9 +26,9 @@ pub struct PhraseEncoder {
 impl PhraseEncoder {
     /// Reads the phrases, one a line, and their vectors, (file, tensor) `[phrases][dim]`; `centre`: `[dim]`.
     ///
-    /// Where two lines are the same phrase, the first counts.
+    /// If two lines are the same phrase, the first one counts.
     /// # Errors
-    /// [`ModelError::Phrases`] or [`ModelError::Tensors`] where a file is not as described.
+    /// [`ModelError::Phrases`] or [`ModelError::Tensors`] if a file is not as described.
     pub fn open(
         name: &str,
         dim: usize,
@@ -56,7 +56,7 @@ impl PhraseEncoder {
         Ok(Self { name: name.to_owned(), dim, phrases: lines, index_of_key, vectors })
     }
 
-    /// Returns known phrases that look like `key`: few letters apart, or a whole word in common.
+    /// Returns known phrases similar to `key`: within a few edits, or with a word in common.
     fn near(&self, key: &str) -> Vec<String> {
         let letters: Vec<char> = key.chars().collect();
         if letters.len() > LONGEST_COMPARED {
@@ -69,7 +69,7 @@ impl PhraseEncoder {
             .enumerate()
             .filter_map(|(index, phrase)| {
                 let other: Vec<char> = phrase.to_lowercase().chars().collect();
-                // Fewer words in the answer are nearer to what was meant.
+                // Among phrases that share a word, shorter ones rank first.
                 let shares_a_word = key
                     .split(' ')
                     .any(|w| phrase.split_whitespace().any(|p| p == w || is_start(w, p) || is_start(p, w)));
@@ -96,14 +96,14 @@ impl TextEncoder for PhraseEncoder {
         self.dim
     }
 
-    fn encode(&mut self, text: &str) -> Result<Vec<f32>, EncodeError> {
+    fn encode(&mut self, text: &str) -> Result<Vec<f32>, InferenceError> {
         let key = key(text);
         if key.is_empty() {
-            return Err(EncodeError::EmptyText);
+            return Err(InferenceError::EmptyText);
         }
         match self.index_of_key.get(&key) {
             Some(index) => Ok(self.vectors[index * self.dim..][..self.dim].to_vec()),
-            None => Err(EncodeError::UnknownPhrase {
+            None => Err(InferenceError::UnknownPhrase {
                 n_known: self.phrases.len(),
                 near: self.near(&key),
                 text: key,
@@ -116,7 +116,7 @@ impl TextEncoder for PhraseEncoder {
     }
 }
 
-/// Returns what a phrase is looked up by: lower case, single spaces, no leading article.
+/// Returns the lookup key of a phrase: lower case, single spaces, no leading article.
 fn key(text: &str) -> String {
     let text = text.to_lowercase();
     let mut words: Vec<&str> = text.split_whitespace().collect();

@@ -1,4 +1,4 @@
-//! What a model's nodes run on, read from the log of ONNX Runtime.
+//! The providers that a model's nodes run on, read from ONNX Runtime's log.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -9,16 +9,16 @@ use ort::{logging::LogLevel, session::builder::SessionBuilder};
 use crate::provider::Provider;
 use crate::runtime_log::forward_log;
 
-/// What a model's nodes really run on.
+/// The providers that a model's nodes run on.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Placement {
     provider: Provider,
-    /// By the runtime's own names; empty where only the processor was asked for.
+    /// Number of nodes by the runtime's name of the provider; empty if only the CPU was requested.
     nodes: BTreeMap<String, usize>,
 }
 
 impl Placement {
-    /// Returns the first of what was asked for that runs any node, else the processor.
+    /// Returns the first requested provider that runs any node, else the CPU.
     pub fn provider(&self) -> Provider {
         self.provider
     }
@@ -30,8 +30,8 @@ impl Placement {
         self
     }
 
-    /// Takes in a message of the runtime, if it tells of nodes.
-    fn hear(&mut self, message: &str) {
+    /// Records a log message of the runtime that states the placement of nodes; ignores others.
+    fn record(&mut self, message: &str) {
         let placed = || {
             let (_, placed) = message.split_once("placed on [")?;
             let (name, rest) = placed.split_once("]. Number of nodes: ")?;
@@ -55,20 +55,20 @@ impl fmt::Display for Placement {
     }
 }
 
-/// Listens to what the runtime tells of one session: it has no other way to say what runs where.
+/// Collects the placement from the log of one session; the runtime reports it nowhere else.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Listener(Arc<Mutex<Placement>>);
 
 impl Listener {
     pub(crate) fn attach(&self, builder: SessionBuilder) -> ort::Result<SessionBuilder> {
         let placement = Arc::clone(&self.0);
-        let hear = move |level: LogLevel, category: &str, id: &str, location: &str, message: &str| {
-            placement.lock().unwrap_or_else(PoisonError::into_inner).hear(message);
+        let record = move |level: LogLevel, category: &str, id: &str, location: &str, message: &str| {
+            placement.lock().unwrap_or_else(PoisonError::into_inner).record(message);
             if !matches!(level, LogLevel::Info | LogLevel::Verbose) {
                 forward_log(level, category, id, location, message);
             }
         };
-        let builder = builder.with_logger(Arc::new(hear))?;
+        let builder = builder.with_logger(Arc::new(record))?;
         builder.with_log_level(LogLevel::Verbose).map_err(ort::Error::<()>::from)
     }
 
@@ -81,9 +81,9 @@ impl Listener {
 mod tests {
     use super::*;
 
-    /// Messages as ONNX Runtime 1.17 to 1.31 write them (`session_state.cc`).
+    /// Messages in the wording of ONNX Runtime 1.17 to 1.31 (`session_state.cc`).
     #[test]
-    fn what_runs_is_what_took_nodes() {
+    fn placement_is_read_from_the_log() {
         let cpu = Placement::default().of_asked(&[Provider::Cuda]);
         assert_eq!((cpu.to_string(), cpu.provider()), ("cpu".into(), Provider::Cpu));
         let mut placement = Placement::default();
@@ -93,13 +93,13 @@ mod tests {
             " Node(s) placed on [CUDAExecutionProvider]. Number of nodes: 212",
             " Node(s) placed on [NewExecutionProvider]. Number of nodes: many",
         ] {
-            placement.hear(message);
+            placement.record(message);
         }
         assert_eq!(placement.to_string(), "cpu (14 nodes), cuda (212 nodes)");
         let asked = [Provider::TensorRt, Provider::Cuda, Provider::Cpu];
         assert_eq!(placement.of_asked(&asked).provider(), Provider::Cuda);
         let mut silent = Placement::default();
-        silent.hear(" All nodes placed on [CPUExecutionProvider]. Number of nodes: 7");
+        silent.record(" All nodes placed on [CPUExecutionProvider]. Number of nodes: 7");
         assert_eq!(silent.of_asked(&asked[..2]).provider(), Provider::Cpu);
     }
 }

@@ -1,8 +1,8 @@
-//! From a crop to the pixel values that an image model expects: resize, centre crop, normalise.
+//! Turns a crop into the pixel values that an image model expects: resize, centre crop, normalise.
 //!
-//! Resampling is the algorithm of Pillow's `Image.resize` (libImaging/Resample.c: two passes, 8-bit
-//! between them, 22-bit fixed-point weights), pixel for pixel, because the models were trained and
-//! their published figures measured behind it; integers also make it the same on every machine.
+//! Resampling equals Pillow's `Image.resize` (libImaging/Resample.c: two passes, 8-bit between them,
+//! 22-bit fixed-point weights) pixel for pixel, because the models were trained and evaluated with it.
+//! Integer arithmetic gives the same result on every machine.
 
 use image::RgbImage;
 use serde::{Deserialize, Serialize};
@@ -11,11 +11,11 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Resize {
-    /// The shorter edge becomes `size_px`, the aspect ratio stays, the middle is kept (`CLIPImageProcessor`).
+    /// The shorter edge becomes `size_px`, keeping the aspect ratio; the centre is kept (`CLIPImageProcessor`).
     ShortestEdge,
-    /// Both edges become `size_px`: nothing is cut off, the aspect ratio is lost.
+    /// Both edges become `size_px`: nothing is cropped, but the aspect ratio is lost.
     Stretch,
-    /// The longer edge becomes `size_px`, the aspect ratio stays, white fills the square.
+    /// The longer edge becomes `size_px`, keeping the aspect ratio; white fills the rest of the square.
     Pad,
 }
 
@@ -31,7 +31,7 @@ pub enum Filter {
 }
 
 impl Filter {
-    /// Reach to either side, in input pixels at scale 1.
+    /// Half-width of the filter, in input pixels at scale 1.
     fn support(self) -> f64 {
         match self {
             Self::Bicubic => 2.0,
@@ -51,7 +51,7 @@ impl Filter {
     }
 }
 
-/// The part of a resized image that is wanted, pixels of the resized image.
+/// A part of a resized image, in pixels of the resized image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Window {
     /// Left edge.
@@ -64,7 +64,7 @@ pub struct Window {
     pub height_px: u32,
 }
 
-/// Returns (x / 255 - mean) / std of every level x, per channel.
+/// Returns (x / 255 - mean) / std for every level x, per channel.
 pub(crate) fn values_of_levels(mean: [f64; 3], std: [f64; 3]) -> [[f32; 256]; 3] {
     let value = |channel: usize, level: usize| ((level as f64 / 255.0 - mean[channel]) / std[channel]) as f32;
     std::array::from_fn(|c| std::array::from_fn(|level| value(c, level)))
@@ -76,7 +76,7 @@ pub struct Preprocess {
     size_px: u32,
     resize: Resize,
     filter: Filter,
-    /// (x / 255 - mean) / std of every level x, per channel.
+    /// (x / 255 - mean) / std for every level x, per channel.
     values: [[f32; 256]; 3],
 }
 
@@ -86,19 +86,19 @@ impl Preprocess {
         Self { size_px, resize, filter, values: values_of_levels(mean, std) }
     }
 
-    /// Returns the edge of the square, pixels.
+    /// Returns the edge length of the square, in pixels.
     pub fn size_px(&self) -> u32 {
         self.size_px
     }
 
-    /// Returns the size that an image of the given size is resized to, and the part of it that is kept;
-    /// smaller than the square only where it is filled up.
+    /// Returns the resized size of an image and the window of it that is kept. The window is smaller than the
+    /// square only with [`Resize::Pad`].
     ///
     /// Neither edge may be 0.
     pub fn plan(&self, width_px: u32, height_px: u32) -> ([u64; 2], Window) {
         let size = u64::from(self.size_px);
         let short = u64::from(width_px.min(height_px));
-        // The longer edge is cut to whole pixels, as in transformers' get_resize_output_image_size.
+        // The longer edge is rounded down, as in transformers' get_resize_output_image_size.
         let resized = match self.resize {
             Resize::Stretch => [size, size],
             Resize::ShortestEdge => [width_px, height_px].map(|edge| size * u64::from(edge) / short),
@@ -142,16 +142,16 @@ impl Preprocess {
     }
 }
 
-/// Bits after the point of a weight; with 8-bit levels and some overshoot, a sum fits 32 bits.
+/// Fractional bits of a weight: with 8-bit levels and some overshoot, a sum fits into 32 bits.
 const WEIGHT_BITS: u32 = 32 - 8 - 2;
 
-/// Which input pixels one output pixel is made of.
+/// The input pixels of one output pixel, with weights.
 struct Taps {
     first: usize,
     weights: Vec<i32>,
 }
 
-/// Returns the taps of the output pixels `range` where `n_in` pixels are resized to `n_out`.
+/// Returns the taps of the output pixels `range` when `n_in` pixels are resized to `n_out`.
 fn taps(filter: Filter, n_in: u32, n_out: u64, range: std::ops::Range<u64>) -> Vec<Taps> {
     let scale = f64::from(n_in) / n_out as f64;
     let filter_scale = scale.max(1.0);
@@ -178,7 +178,7 @@ fn to_level(sum: i32) -> u8 {
 /// Half a level, so that [`to_level`] rounds.
 const HALF: i32 = 1 << (WEIGHT_BITS - 1);
 
-/// Resizes `image` to `resized` (width, height) and returns `window` of the result, computing no more than that.
+/// Resizes `image` to `resized` (width, height) and returns `window` of the result; only the window is computed.
 ///
 /// Neither `image` nor `resized` may be empty, and the window must lie within `resized`.
 pub fn resample(image: &RgbImage, filter: Filter, resized: [u64; 2], window: Window) -> RgbImage {
@@ -225,7 +225,7 @@ pub fn resample(image: &RgbImage, filter: Filter, resized: [u64; 2], window: Win
 mod tests {
     use super::*;
 
-    /// Oracle: one plain resize to the size that keeps the proportions, put into the middle by hand.
+    /// Oracle: a resize that keeps the aspect ratio, pasted into the centre.
     #[test]
     fn padding_keeps_proportions_and_fills_with_white() {
         for (width, height, inner) in

@@ -1,4 +1,4 @@
-//! Execution providers: what ONNX Runtime is asked to run a model on.
+//! Execution providers: the devices that ONNX Runtime can run a model on.
 
 use std::{fmt, str::FromStr};
 
@@ -7,27 +7,27 @@ use ort::{
     session::builder::SessionBuilder,
 };
 
-/// What a model is run on.
+/// A device that runs models, named as in ONNX Runtime.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Provider {
-    /// The processor.
+    /// The CPU.
     #[default]
     Cpu,
     /// An NVIDIA GPU.
     Cuda,
-    /// An NVIDIA GPU through TensorRT, which compiles the model first.
+    /// An NVIDIA GPU through TensorRT, which compiles the model before the first run.
     TensorRt,
     /// Apple's Core ML.
     CoreMl,
-    /// Any GPU of Windows.
+    /// Any GPU under Windows.
     DirectMl,
 }
 
 impl Provider {
-    /// All of them.
+    /// All providers.
     pub const ALL: [Self; 5] = [Self::Cpu, Self::Cuda, Self::TensorRt, Self::CoreMl, Self::DirectMl];
 
-    /// Returns its name in lower case, as it is asked for and reported.
+    /// Returns its name in options and reports, in lower case.
     pub fn name(self) -> &'static str {
         match self {
             Self::Cpu => "cpu",
@@ -38,7 +38,7 @@ impl Provider {
         }
     }
 
-    /// Returns its name within the runtime.
+    /// Returns ONNX Runtime's name for it.
     pub(crate) fn runtime_name(self) -> &'static str {
         match self {
             Self::Cpu => ep::CPU::NAME,
@@ -49,7 +49,7 @@ impl Provider {
         }
     }
 
-    /// Has `builder` offer the model's nodes to it.
+    /// Registers it with `builder`.
     pub(crate) fn register(self, builder: SessionBuilder) -> ort::Result<SessionBuilder> {
         let (is_built_in, dispatch): (_, ExecutionProviderDispatch) = match self {
             Self::Cpu => return Ok(builder),
@@ -59,9 +59,9 @@ impl Provider {
             Self::DirectMl => (ep::DirectML::is_available()?, ep::DirectML::default().build()),
         };
         if !is_built_in {
-            return Err(ort::Error::new("the library is built without it"));
+            return Err(ort::Error::new("the library was built without it"));
         }
-        // DirectML needs memory of which no pattern is recorded.
+        // DirectML does not support memory patterns.
         let builder = match self {
             Self::DirectMl => builder.with_memory_pattern(false)?,
             _ => builder,
@@ -76,14 +76,14 @@ impl fmt::Display for Provider {
     }
 }
 
-/// Returns the names of providers, for people.
+/// Returns the names of providers, separated by commas.
 pub(crate) fn names(providers: &[Provider]) -> String {
     providers.iter().map(|provider| provider.name()).collect::<Vec<_>>().join(", ")
 }
 
-/// Says that a name is no provider's.
+/// A name is not a provider's.
 #[derive(Debug, thiserror::Error)]
-#[error("{found:?} is no execution provider; use one of cpu, cuda, tensorrt, coreml, directml")]
+#[error("{found:?} is not an execution provider; use one of cpu, cuda, tensorrt, coreml, directml")]
 pub struct NoProvider {
     /// The name.
     found: String,

@@ -1,4 +1,4 @@
-//! The ONNX Runtime library: found, loaded at run time, and once a process, so that a program without models needs none.
+//! Finds the ONNX Runtime library and loads it once a process, on first use: without models it is not needed.
 
 use std::env::consts::{DLL_PREFIX, DLL_SUFFIX};
 use std::path::{Path, PathBuf};
@@ -10,8 +10,8 @@ use ort::logging::LogLevel;
 use crate::runtime_log::forward_log;
 use crate::session_error::SessionError;
 
-/// Returns the library's path: `explicit`, else the first of the folders `beside` that has it, else its bare
-/// name, for the system's loader to find.
+/// Returns the library's path: `explicit`, else in the first of the folders `beside` that has it, else its bare
+/// name, which the system's loader resolves.
 /// # Errors
 /// [`SessionError::NoRuntime`] if `explicit` is not a file.
 pub fn find_runtime(explicit: Option<&Path>, beside: &[PathBuf]) -> Result<PathBuf, SessionError> {
@@ -27,12 +27,12 @@ pub fn find_runtime(explicit: Option<&Path>, beside: &[PathBuf]) -> Result<PathB
     Ok(found.unwrap_or_else(|| name.into()))
 }
 
-/// The library in use and its environment, of which a process may have one only.
+/// The loaded library and its environment; a process may have only one.
 static RUNTIME: Mutex<Option<(PathBuf, Environment)>> = Mutex::new(None);
 
-/// Returns the environment of the library, loading it first where no model was opened before.
+/// Returns the library's environment; loads the library on first use.
 pub(crate) fn environment(runtime: &Path) -> Result<Environment, SessionError> {
-    // A relative path with a folder would be looked up beside the program first.
+    // The loader would look up a relative path with a folder beside the program first.
     let path = if runtime.components().count() > 1 {
         runtime.canonicalize().map_err(|_| SessionError::NoRuntime { path: runtime.to_owned() })?
     } else {

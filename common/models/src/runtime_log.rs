@@ -1,8 +1,8 @@
-//! The messages of ONNX Runtime.
+//! ONNX Runtime's log.
 
 use ort::logging::LogLevel;
 
-/// Hands the runtime's messages on, which it would print otherwise.
+/// Forwards the runtime's messages to `tracing`; by default it prints them.
 pub(crate) fn forward_log(level: LogLevel, category: &str, _id: &str, _location: &str, message: &str) {
     match level {
         LogLevel::Error | LogLevel::Fatal => tracing::error!(category, "ONNX Runtime: {message}"),

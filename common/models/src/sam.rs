@@ -1,5 +1,5 @@
 //! Segment Anything (Kirillov et al. 2023) in two ONNX files: an image encoder, and a prompt encoder with the
-//! mask decoder. SAM, MobileSAM, EdgeSAM and SAM-HQ are exported so.
+//! mask decoder. SAM, MobileSAM, EdgeSAM and SAM-HQ have this layout.
 //!
 //! ```toml
 //! name = "sam-vit-base"
@@ -11,13 +11,13 @@
 //! kind = "sam"
 //! image_encoder = { path = "vision_encoder.onnx", sha256 = "..." }
 //! mask_decoder = { path = "prompt_encoder_mask_decoder.onnx", sha256 = "..." }
-//! size_px = 1024                   # these three may be left out: SAM's own
+//! size_px = 1024                   # this and the next two: SAM's values if left out
 //! mean = [0.485, 0.456, 0.406]     # pixel value = (level / 255 - mean) / std
 //! std = [0.229, 0.224, 0.225]
 //! ```
 //!
-//! Names of inputs and outputs are not described but discovered: an input takes the output of the same name,
-//! points and labels are known by type and shape.
+//! Inputs and outputs are not named in the description: the decoder's inputs are matched with the encoder's outputs
+//! by name, points and labels by type and shape.
 
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
@@ -32,7 +32,7 @@ use crate::model_dir::{checked, sha256_of};
 use crate::preprocess::{Filter, Window, resample, values_of_levels};
 use crate::session::{Model, SessionError, SessionOptions, Tensor};
 
-/// Masks that SAM proposes for a prompt: subpart, part and whole, in this order.
+/// Masks that SAM proposes for a prompt: subpart, part and whole, in that order.
 pub const MASKS_PER_PROMPT: usize = 3;
 
 /// The description of a segmenter's directory.
@@ -41,7 +41,7 @@ pub const MASKS_PER_PROMPT: usize = 3;
 pub struct SamDescription {
     /// The model's name.
     pub name: String,
-    /// What it is good for and what not.
+    /// Its strengths and limits, for people.
     #[serde(default)]
     pub about: String,
     /// The licence of the weights.
@@ -53,7 +53,7 @@ pub struct SamDescription {
     pub segment: SegmentDescription,
 }
 
-/// What a segmenter is made of.
+/// The kinds of segmenters.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case")]
 pub enum SegmentDescription {
@@ -61,21 +61,21 @@ pub enum SegmentDescription {
     Sam(SamFiles),
 }
 
-/// The files of SAM and how images are prepared for them.
+/// The files of SAM and its image preprocessing.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SamFiles {
-    /// From an image to its embedding.
+    /// The model from an image to its embedding.
     pub image_encoder: FileRef,
-    /// From points and the embedding to masks.
+    /// The model from points and the embedding to masks.
     pub mask_decoder: FileRef,
-    /// Edge of the square that the encoder takes, pixels.
+    /// Edge length of the encoder's input square, in pixels.
     #[serde(default = "sam_size_px")]
     pub size_px: u16,
     /// Subtracted from level / 255, per channel.
     #[serde(default = "imagenet_mean")]
     pub mean: [f64; 3],
-    /// Divided by after that, per channel.
+    /// Divisor after the subtraction, per channel.
     #[serde(default = "imagenet_std")]
     pub std: [f64; 3],
 }
@@ -95,7 +95,7 @@ fn imagenet_std() -> [f64; 3] {
 impl SamDescription {
     /// Reads and checks `path`.
     /// # Errors
-    /// [`DescriptionError`] where it cannot be read or used.
+    /// [`DescriptionError`] if it cannot be read or is invalid.
     pub fn read(path: &Path) -> Result<Self, DescriptionError> {
         let description: Self = read_toml(path)?;
         check_common(path, &description.name, &description.files_root, &description.files())?;
@@ -116,76 +116,76 @@ impl SamDescription {
     }
 }
 
-/// An opened SAM; runs of one file follow one another, the two files run side by side.
+/// An opened SAM. Each file runs one call at a time; the two files can run in parallel.
 #[derive(Debug)]
 pub struct Sam {
     id: String,
     size_px: u32,
-    /// Pixel value of each level, per channel.
+    /// Pixel value for each level, per channel.
     values: [[f32; 256]; 3],
     encoder: Mutex<Model>,
     decoder: Mutex<Model>,
     names: Names,
 }
 
-/// Discovered names.
+/// The names of inputs and outputs.
 #[derive(Debug)]
 struct Names {
     pixels: String,
-    /// What the encoder gives the decoder.
-    embeddings: Vec<Handed>,
+    /// Tensors that the decoder takes from the encoder.
+    embeddings: Vec<Link>,
     points: String,
     labels: String,
     scores: String,
     masks: String,
 }
 
-/// A tensor that goes from the encoder to the decoder.
+/// An output of the encoder and the input of the decoder that takes it.
 #[derive(Debug)]
-struct Handed {
+struct Link {
     output: String,
-    /// Of the output as declared; -1 is any size.
+    /// Declared shape of the output; -1 is any size.
     shape: Vec<i64>,
     input: String,
 }
 
-/// What the encoder makes of an image.
+/// The encoder's output for an image.
 #[derive(Clone, Debug)]
 pub struct Embedding {
-    /// By name of the decoder's input.
+    /// Tensors by the name of the decoder's input.
     tensors: Vec<(String, Tensor)>,
-    /// How the image lay in the model's frame.
-    pub frame: Frame,
+    /// Placement of the image in the encoder's square.
+    pub letterbox: Letterbox,
 }
 
 impl Embedding {
-    /// Returns each tensor with its shape, by name of the decoder's input.
+    /// Returns the tensors: name of the decoder's input, shape, values.
     pub fn tensors(&self) -> impl Iterator<Item = (&str, &[i64], &[f32])> {
         self.tensors.iter().map(|(name, tensor)| (name.as_str(), &tensor.shape[..], &tensor.values[..]))
     }
 }
 
-/// How an image lies in the square that the encoder takes: its longer edge fills it, the rest is padding at
-/// the right or below.
+/// Placement of an image in the encoder's square: the longer edge fills it, the rest is padding at the right or
+/// the bottom.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Frame {
-    /// Edge of the square, pixels.
+pub struct Letterbox {
+    /// Edge length of the square, in pixels.
     pub size_px: u32,
-    /// Width and height of the image, pixels.
+    /// Width and height of the image, in pixels.
     pub image_px: [u32; 2],
-    /// Width and height of the image within the square, pixels.
+    /// Width and height of the resized image, in pixels.
     pub resized_px: [u32; 2],
 }
 
-impl Frame {
-    /// Returns how an image of `image_px` (width, height; neither 0) lies in a square of `size_px`.
+impl Letterbox {
+    /// Returns the placement of an image of `image_px` (width, height; neither 0) in a square of `size_px`.
     pub fn new(size_px: u32, image_px: [u32; 2]) -> Self {
         let scale = f64::from(size_px) / f64::from(image_px[0].max(image_px[1]));
         let resized_px = image_px.map(|edge| ((f64::from(edge) * scale + 0.5) as u32).max(1));
         Self { size_px, image_px, resized_px }
     }
 
-    /// Returns where a point of the image, pixels, lies in the square.
+    /// Converts a point from pixels of the image to pixels of the square.
     pub fn point(&self, point_px: [f64; 2]) -> [f32; 2] {
         std::array::from_fn(|axis| {
             (point_px[axis] * (f64::from(self.resized_px[axis]) / f64::from(self.image_px[axis]))) as f32
@@ -193,21 +193,21 @@ impl Frame {
     }
 }
 
-/// What the decoder proposes for prompts.
+/// The decoder's output for prompts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Decoded {
-    /// The model's own guess of each mask's IoU, `[prompts][MASKS_PER_PROMPT]`.
+    /// The model's estimate of each mask's IoU, `[prompts][MASKS_PER_PROMPT]`.
     pub predicted_ious: Vec<f32>,
-    /// Logits, `[prompts][MASKS_PER_PROMPT][rows][columns]`, of the whole square, padding included.
+    /// Logits of the whole square, padding included: `[prompts][MASKS_PER_PROMPT][rows][columns]`.
     pub logits: Vec<f32>,
     /// Columns and rows of the logits.
     pub logits_px: [u32; 2],
 }
 
 impl Sam {
-    /// Opens the directory `dir`, whose `model.toml` has `[segment]`.
+    /// Opens the directory `dir`; its `model.toml` must have `[segment]`.
     /// # Errors
-    /// [`ModelError`] where a file is absent or not as described, or ONNX Runtime does not load.
+    /// [`ModelError`] if a file is absent or not as described, or ONNX Runtime does not load.
     pub fn open(dir: &Path, options: &SessionOptions) -> Result<Self, ModelError> {
         let path = dir.join(FILE_NAME);
         let description = SamDescription::read(&path)?;
@@ -231,15 +231,15 @@ impl Sam {
         })
     }
 
-    /// Returns what identifies the model: its name, the hashes of its files, and how images are prepared.
+    /// Returns the model's identity: its name, the hashes of its files, and its preprocessing.
     pub fn id(&self) -> &str {
         &self.id
     }
 
-    /// Returns an image's pixel values, `[3][size_px][size_px]`: resized so that the longer edge fills the square
-    /// (Pillow's bilinear), scaled, and padded with zeros. `image` must have pixels.
+    /// Returns an image's pixel values, `[3][size_px][size_px]`: resized to fill the square with the longer edge
+    /// (Pillow's bilinear), normalised, and padded with zeros. `image` must have pixels.
     pub fn pixel_values(&self, image: &RgbImage) -> Vec<f32> {
-        let Frame { resized_px: [width_px, height_px], .. } = self.frame_of(image);
+        let Letterbox { resized_px: [width_px, height_px], .. } = self.letterbox_of(image);
         let whole = Window { left_px: 0, top_px: 0, width_px, height_px };
         let resized = resample(image, Filter::Bilinear, [width_px, height_px].map(u64::from), whole);
         let size = self.size_px as usize;
@@ -256,30 +256,30 @@ impl Sam {
         pixels
     }
 
-    fn frame_of(&self, image: &RgbImage) -> Frame {
-        Frame::new(self.size_px, [image.width(), image.height()])
+    fn letterbox_of(&self, image: &RgbImage) -> Letterbox {
+        Letterbox::new(self.size_px, [image.width(), image.height()])
     }
 
     /// Computes an image's embedding; `image` must have pixels.
     /// # Errors
-    /// [`SessionError`] where the model fails.
+    /// [`SessionError`] if the model fails.
     pub fn embed(&self, image: &RgbImage) -> Result<Embedding, SessionError> {
         let (size, pixels) = (i64::from(self.size_px), self.pixel_values(image));
         let mut encoder = self.encoder.lock().unwrap_or_else(PoisonError::into_inner);
         let input = encoder.tensor(vec![1, 3, size, size], &pixels)?;
-        let handed = &self.names.embeddings;
-        let outputs: Vec<_> = handed.iter().map(|h| (h.output.as_str(), &h.shape[..])).collect();
+        let links = &self.names.embeddings;
+        let outputs: Vec<_> = links.iter().map(|link| (link.output.as_str(), &link.shape[..])).collect();
         let found = encoder.run_all(vec![(self.names.pixels.as_str(), input)], &outputs)?;
-        let inputs = handed.iter().map(|h| h.input.clone());
-        Ok(Embedding { tensors: inputs.zip(found).collect(), frame: self.frame_of(image) })
+        let inputs = links.iter().map(|link| link.input.clone());
+        Ok(Embedding { tensors: inputs.zip(found).collect(), letterbox: self.letterbox_of(image) })
     }
 
-    /// Proposes masks for `n_prompts` prompts of as many points each.
+    /// Proposes masks for `n_prompts` prompts with the same number of points each.
     ///
-    /// `points`: `[n_prompts][points]` in the square, as [`Frame::point`] gives them. `labels`: of each point, 1
-    /// within the object, 0 outside, -1 no point.
+    /// `points`: `[n_prompts][points]` in pixels of the square, see [`Letterbox::point`]. `labels`: for each point, 1
+    /// inside the object, 0 outside, -1 no point.
     /// # Errors
-    /// [`SessionError`] where the model fails or gives other shapes than SAM's.
+    /// [`SessionError`] if the model fails or its output is not of SAM's shapes.
     pub fn decode(
         &self,
         embedding: &Embedding,
@@ -305,7 +305,7 @@ impl Sam {
         let mut found = decoder.run_all(inputs, &outputs)?;
         let (masks, scores) = (found.swap_remove(1), found.swap_remove(0));
         let logits_px = [masks.shape[4] as u32, masks.shape[3] as u32];
-        // Fewer have no three taps; more than the square has pixels is no SAM's.
+        // The upsampling needs 3; SAM's logits are never larger than the square.
         if logits_px.iter().any(|edge| !(3..=self.size_px).contains(edge)) {
             let expected = format!("masks of 3 to {} px a side", self.size_px);
             return Err(
@@ -317,7 +317,7 @@ impl Sam {
 }
 
 impl Names {
-    /// Finds out how the two files fit together.
+    /// Matches the inputs and outputs of the two files.
     fn discover(encoder: &Model, decoder: &Model, size_px: i64) -> Result<Self, SessionError> {
         use TensorElementType::{Float32, Int64};
         let pixels = match &encoder.inputs()[..] {
@@ -338,26 +338,26 @@ impl Names {
             let given = offered.iter().find(|(output, _)| *output == name);
             match (given, tensor) {
                 (Some((output, Some((Float32, shape)))), Some((Float32, _))) => {
-                    embeddings.push(Handed { output: output.clone(), shape: shape.clone(), input: name });
+                    embeddings.push(Link { output: output.clone(), shape: shape.clone(), input: name });
                 }
                 (_, Some((Float32, shape))) if matches!(shape[..], [_, _, _, 2]) => points.push(name),
                 (_, Some((Int64, shape))) if shape.len() == 3 => labels.push(name),
                 _ => others.push(name),
             }
         }
-        // Exports that give a single embedding do not always call it the same on both sides.
+        // Some exports name a single embedding differently on both sides.
         if let ([_], [(output, Some((Float32, shape)))], true) =
             (&others[..], &offered[..], embeddings.is_empty())
         {
             let input = others.swap_remove(0);
-            embeddings.push(Handed { output: output.clone(), shape: shape.clone(), input });
+            embeddings.push(Link { output: output.clone(), shape: shape.clone(), input });
         }
         let listed = || format!("its inputs are {}", decoder.listed_inputs());
         let ([points], [labels], [_, ..], []) = (&points[..], &labels[..], &embeddings[..], &others[..])
         else {
             let names: Vec<&str> = offered.iter().map(|(name, _)| name.as_str()).collect();
             let expected = format!(
-                "points f32 [-1, -1, -1, 2], their labels i64 [-1, -1, -1], the image encoder's {}, and no more \
+                "points f32 [-1, -1, -1, 2], their labels i64 [-1, -1, -1], the image encoder's {}, and no others \
                  (no boxes, no earlier masks)",
                 names.join(", ")
             );

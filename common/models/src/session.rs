@@ -1,4 +1,4 @@
-//! Model files: opened with ONNX Runtime, compared with their description, and run.
+//! Opens model files with ONNX Runtime, checks them against their description, and runs them.
 
 use std::{
     collections::BTreeSet,
@@ -26,37 +26,37 @@ use crate::runtime::environment;
 pub use crate::runtime::find_runtime;
 pub use crate::session_error::SessionError;
 
-/// How models are run.
+/// Options of running models.
 #[derive(Clone, Debug)]
 pub struct SessionOptions {
-    /// The library, as [`find_runtime`] returns it.
+    /// The library, from [`find_runtime`].
     pub runtime: PathBuf,
-    /// Threads within one run; small models are fastest with 1, several sessions then run side by side.
+    /// Threads within one run. For small models, 1 and several sessions in parallel is fastest.
     pub intra_op_threads: usize,
-    /// What the model is to run on, the most wanted first. Without the processor in the list, nothing else
-    /// than what is listed will do.
+    /// The devices to run on, in order of preference. Without the CPU in the list, it is an error if none of them can
+    /// be used.
     pub providers: Vec<Provider>,
 }
 
 impl SessionOptions {
-    /// Returns the options for one thread on the processor.
+    /// Returns the options for one thread on the CPU.
     pub fn new(runtime: PathBuf) -> Self {
         Self { runtime, intra_op_threads: 1, providers: vec![Provider::Cpu] }
     }
 
-    /// Returns whether models are to run on the processor alone.
+    /// Returns whether models run on the CPU only.
     pub fn is_on_cpu(&self) -> bool {
         self.providers.first().is_none_or(|first| *first == Provider::Cpu)
     }
 }
 
-/// Warns unless the same was said before: every thread opens models of its own.
+/// Warns once per message: every thread opens its own models.
 fn warn_once(message: String) {
-    static SAID: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
-    let mut said = SAID.lock().unwrap_or_else(PoisonError::into_inner);
-    if !said.contains(&message) {
+    static LOGGED: Mutex<BTreeSet<String>> = Mutex::new(BTreeSet::new());
+    let mut logged = LOGGED.lock().unwrap_or_else(PoisonError::into_inner);
+    if !logged.contains(&message) {
         tracing::warn!("{message}");
-        said.insert(message);
+        logged.insert(message);
     }
 }
 
@@ -67,7 +67,7 @@ pub(crate) struct Tensor {
     pub(crate) values: Vec<f32>,
 }
 
-/// Name, and for tensors element type and shape, where -1 is any size, of an input or output.
+/// An input or output: its name, and for tensors element type and shape; -1 is any size.
 pub(crate) type Declared = (String, Option<(TensorElementType, Vec<i64>)>);
 
 fn declared(outlets: &[Outlet]) -> Vec<Declared> {
@@ -95,7 +95,7 @@ pub(crate) struct Model {
 pub(crate) struct Slot {
     /// Its name.
     pub name: String,
-    /// What its elements are.
+    /// The type of its elements.
     pub element: TensorElementType,
     /// Its shape; -1 is any size.
     pub shape: Vec<i64>,
@@ -104,13 +104,13 @@ pub(crate) struct Slot {
 impl Model {
     pub(crate) fn open(file: &ModelFile, options: &SessionOptions) -> Result<Self, SessionError> {
         let path = &*file.path;
-        // Before the library is asked for, so that a missing model is named as such.
+        // Checked before the library is loaded, so that a missing model is reported as such.
         if file.embedded_bytes().is_none() {
             fs_err::metadata(path).map_err(|cause| SessionError::Read { cause })?;
         }
         let environment = environment(&options.runtime)?;
         let mut wanted = options.providers.clone();
-        // What comes after the processor is never needed: the processor can run everything.
+        // Providers after the CPU are never used: the CPU can run everything.
         let end = wanted.iter().position(|&p| p == Provider::Cpu);
         let may_be_cpu = end.is_some() || wanted.is_empty();
         wanted.truncate(end.unwrap_or(wanted.len()));
@@ -134,13 +134,13 @@ impl Model {
                 return Err(SessionError::NotPlaced { path: path.to_owned(), asked, placement });
             }
             let asked = names(&asked);
-            warn_once(format!("{} runs on the processor; asked for was {asked}", path.display()));
+            warn_once(format!("{} runs on the CPU instead of {asked}", path.display()));
         }
         tracing::debug!("{} runs on {placement}", path.display());
         Ok(Self { path: path.to_owned(), session, placement })
     }
 
-    /// Opens the model with its nodes offered to `providers`, and says who took them where that is asked.
+    /// Opens the model with `providers`; `listens`: determine the placement of its nodes.
     fn commit(
         file: &ModelFile,
         options: &SessionOptions,
@@ -159,7 +159,7 @@ impl Model {
         let mut builder = Session::builder(environment)
             .and_then(|b| b.with_intra_threads(options.intra_op_threads).map_err(ort::Error::from))
             .and_then(|b| b.with_inter_threads(1).map_err(ort::Error::from))
-            // A thread that waits must not take a core from the other stages.
+            // Idle threads must not take cores from the other stages.
             .and_then(|b| b.with_intra_op_spinning(false).map_err(ort::Error::from))
             .map_err(load)?;
         let listener = Listener::default();
@@ -178,7 +178,7 @@ impl Model {
             (None, _) | (_, ErrorCode::InvalidProtobuf | ErrorCode::InvalidGraph | ErrorCode::NoModel) => {
                 load(cause)
             }
-            // Devices and drivers are looked for only now.
+            // The runtime looks for devices and drivers only here.
             (Some(&provider), _) => SessionError::Provider { provider, cause },
         })?;
         Ok((session, listener.placement()))
@@ -188,14 +188,14 @@ impl Model {
         &self.placement
     }
 
-    /// Returns what the elements of input `name` are, if it is there and a tensor.
+    /// Returns the element type of input `name`, if it exists and is a tensor.
     pub(crate) fn input_element(&self, name: &str) -> Option<TensorElementType> {
         let input = self.session.inputs().iter().find(|input| input.name() == name)?;
         input.dtype().tensor_type()
     }
 
-    /// Returns input `name`, or without a name the only one that fits, if it takes `elements` (f32 stands for
-    /// f16 too) of `shape`, where -1 is any size.
+    /// Returns input `name` (`None`: the only one that fits) if it takes `element`, with f16 accepted for f32, and
+    /// `shape`, where -1 is any size.
     pub(crate) fn expect_input<'a>(
         &self,
         name: impl Into<Option<&'a str>>,
@@ -205,8 +205,8 @@ impl Model {
         self.expect("input", self.session.inputs(), name.into(), element, shape)
     }
 
-    /// Returns output `name`, or without a name the only one that fits, if it gives `elements` (f32 stands for
-    /// f16 too) of `shape`, where -1 is any size.
+    /// Returns output `name` (`None`: the only one that fits) if it gives `element`, with f16 accepted for f32, and
+    /// `shape`, where -1 is any size.
     pub(crate) fn expect_output<'a>(
         &self,
         name: impl Into<Option<&'a str>>,
@@ -216,7 +216,7 @@ impl Model {
         self.expect("output", self.session.outputs(), name.into(), element, shape)
     }
 
-    /// Checks that the model has no input beside `names`.
+    /// Checks that the model has no inputs except `names`.
     pub(crate) fn expect_no_input_but(&self, names: &[&str]) -> Result<(), SessionError> {
         match self.session.inputs().iter().find(|input| !names.contains(&input.name())) {
             None => Ok(()),
@@ -266,7 +266,7 @@ impl Model {
         slot_of(outlet).ok_or_else(|| self.shape_error(role, name, type_of(outlet), element, expected))
     }
 
-    /// Says that the model takes texts of one length only.
+    /// Returns the error for a model that takes only one length of text.
     pub(crate) fn fixed_tokens(&self, slot: &Slot) -> SessionError {
         let n = slot.shape[1];
         SessionError::Shape {
@@ -275,7 +275,7 @@ impl Model {
             name: slot.name.clone(),
             found: format!("{} {:?}", slot.element, slot.shape),
             expected: format!(
-                "text.padding = {{ n_tokens = {n}, token_id = the model's }} or tokens of any number"
+                "text.padding = {{ n_tokens = {n}, token_id = the model's }}, or a model with any number of tokens"
             ),
         }
     }
@@ -327,7 +327,7 @@ impl Model {
         Ok(self.run_all(inputs, &[(name, shape)])?.swap_remove(0).values)
     }
 
-    /// Runs the model on `inputs` and returns the f32 outputs named, in this order; -1 in a shape is any size.
+    /// Runs the model on `inputs` and returns the given f32 outputs in order; -1 in a shape is any size.
     pub(crate) fn run_all(
         &mut self,
         inputs: Vec<(&str, SessionInputValue<'_>)>,
@@ -394,12 +394,12 @@ fn type_of(outlet: &Outlet) -> String {
     }
 }
 
-/// Tells whether elements are as expected; halves of f32 are converted.
+/// Returns whether elements are as expected; f16 is accepted for f32 and converted.
 fn is_element(found: TensorElementType, expected: TensorElementType) -> bool {
     found == expected || (expected, found) == (TensorElementType::Float32, TensorElementType::Float16)
 }
 
-/// Tells whether a declared shape admits `expected`; -1 on either side is any size.
+/// Returns whether a declared shape admits `expected`; -1 on either side is any size.
 pub(crate) fn shapes_fit(declared: &[i64], expected: &[i64]) -> bool {
     declared.len() == expected.len()
         && declared.iter().zip(expected).all(|(&d, &e)| d == e || d == -1 || e == -1)

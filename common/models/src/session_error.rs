@@ -5,84 +5,84 @@ use std::path::PathBuf;
 use crate::placement::Placement;
 use crate::provider::{Provider, names};
 
-/// Says why a model could not be opened or run.
+/// Error of opening or running a model.
 #[derive(Debug, thiserror::Error)]
 pub enum SessionError {
-    /// The library asked for is not there.
+    /// The requested library does not exist.
     #[error("{}: no such ONNX Runtime library; give the path of libonnxruntime.so (1.17 or newer)", path.display())]
     NoRuntime {
-        /// Where it was expected.
+        /// Its path.
         path: PathBuf,
     },
-    /// The library does not load.
+    /// The library cannot be loaded.
     #[error(
         "ONNX Runtime: {cause}; install version 1.17 or newer, put libonnxruntime.so beside the program, or give its path"
     )]
     Runtime {
-        /// What the loader says; it names the path.
+        /// The loader's error, with the path.
         cause: Box<ort::LoadDynamicError>,
     },
-    /// Another library was loaded before.
-    #[error("ONNX Runtime is loaded from {}, {} was asked for; use one per process", loaded.display(), asked.display())]
+    /// The process has already loaded another library.
+    #[error("ONNX Runtime is already loaded from {}, but {} is requested; use one per process", loaded.display(), asked.display())]
     OtherRuntime {
         /// The library in use.
         loaded: PathBuf,
-        /// The library asked for.
+        /// The requested library.
         asked: PathBuf,
     },
-    /// The library refuses to start.
+    /// ONNX Runtime fails to start.
     #[error("ONNX Runtime does not start: {cause}; check its version (1.17 or newer)")]
     Start {
-        /// What it says.
+        /// The runtime's error.
         cause: ort::Error,
     },
-    /// The accelerator asked for cannot be used.
+    /// A requested accelerator cannot be used.
     #[error(
-        "ONNX Runtime cannot use {provider}: {cause}; give a libonnxruntime that is built with it, with its drivers \
-         (onnxruntime-gpu for cuda and tensorrt), or let the processor stand in: {provider},cpu"
+        "ONNX Runtime cannot use {provider}: {cause}; install its drivers and a libonnxruntime built with it \
+         (onnxruntime-gpu for cuda and tensorrt), or allow the CPU as well: {provider},cpu"
     )]
     Provider {
         /// The accelerator.
         provider: Provider,
-        /// What the runtime says.
+        /// The runtime's error.
         cause: ort::Error,
     },
-    /// The accelerators asked for take no part of the model.
+    /// None of the requested accelerators runs any part of the model.
     #[error(
-        "{}: runs on {placement} alone, {} was asked for; use another export of the model, or let the processor \
-         stand in by adding cpu", path.display(), names(asked)
+        "{}: runs on {placement} only, but {} is requested; use another export of the model, or add cpu to \
+         allow the CPU as well", path.display(), names(asked)
     )]
     NotPlaced {
         /// The model file.
         path: PathBuf,
-        /// What was asked for.
+        /// The requested accelerators.
         asked: Vec<Provider>,
-        /// What runs it.
+        /// Where its nodes run.
         placement: Placement,
     },
     /// The model file cannot be read.
     #[error("{cause}; put the model file there or correct the description")]
     Read {
-        /// The operating system's answer, which names the path.
+        /// The operating system's error, with the path.
         cause: std::io::Error,
     },
-    /// The model file cannot be loaded: cut, not ONNX, or of an unknown version.
+    /// The model file cannot be loaded: truncated, or not ONNX.
     #[error("{}: {cause}; fetch the model file again", path.display())]
     Load {
         /// The model file.
         path: PathBuf,
-        /// What the runtime says.
+        /// The runtime's error.
         cause: ort::Error,
     },
-    /// The model file is of a version that the library does not know.
+    /// The library does not support the model file's version.
     #[error(
-        "{}: {cause}; give a newer libonnxruntime, or export the model for an older opset (17 is known to all)",
+        "{}: {cause}; give a newer libonnxruntime, or export the model for an older opset (all support 17)",
         path.display()
     )]
     Version {
         /// The model file.
         path: PathBuf,
-        /// What the runtime says.
+        /// The runtime's error.
         cause: ort::Error,
     },
     /// The model has no such input or output.
@@ -92,14 +92,14 @@ pub enum SessionError {
         path: PathBuf,
         /// "input" or "output".
         role: &'static str,
-        /// The name asked for.
+        /// The name in the description.
         name: String,
-        /// The names that it has.
+        /// The model's names.
         found: Vec<String>,
     },
-    /// Which input or output is meant is not clear.
+    /// An input or output is not named in the description, and not exactly one fits.
     #[error(
-        "{}: the {role} is not named, and of {} not one alone is {expected}; name it in the description",
+        "{}: the description names no {role}, and not exactly one of {} is {expected}; name it in the description",
         path.display(), found.join(", ")
     )]
     Unnamed {
@@ -107,12 +107,12 @@ pub enum SessionError {
         path: PathBuf,
         /// "input" or "output".
         role: &'static str,
-        /// All that it has, with types and shapes.
+        /// The model's inputs or outputs, with types and shapes.
         found: Vec<String>,
-        /// Type and shape looked for; -1 is any size.
+        /// Expected type and shape; -1 is any size.
         expected: String,
     },
-    /// An input or output is of another type or shape.
+    /// An input or output has an unexpected type or shape.
     #[error("{}: {role} {name:?} is {found}, expected {expected}; correct the description", path.display())]
     Shape {
         /// The model file.
@@ -123,25 +123,25 @@ pub enum SessionError {
         name: String,
         /// Its type and shape.
         found: String,
-        /// What is expected; -1 is any size.
+        /// Expected type and shape; -1 is any size.
         expected: String,
     },
-    /// The model is of another layout.
-    #[error("{}: {found}; expected {expected}; give the files of one export in their places", path.display())]
+    /// The model's inputs or outputs are not those of its kind.
+    #[error("{}: {found}; expected {expected}; use the files of one export, each in its field", path.display())]
     Layout {
         /// The model file.
         path: PathBuf,
-        /// What it has.
+        /// The layout found.
         found: String,
-        /// What is expected.
+        /// The layout expected.
         expected: String,
     },
     /// Running the model failed.
-    #[error("{}: running the model: {cause}; the file does not fit its description", path.display())]
+    #[error("{}: the model fails to run: {cause}; check that the file fits its description", path.display())]
     Run {
         /// The model file.
         path: PathBuf,
-        /// What the runtime says.
+        /// The runtime's error.
         cause: ort::Error,
     },
 }

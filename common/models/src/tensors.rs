@@ -5,16 +5,16 @@ use std::path::{Path, PathBuf};
 use half::f16;
 use safetensors::{Dtype, SafeTensors};
 
-/// Says why a tensor could not be read.
+/// Error of reading a tensor.
 #[derive(Debug, thiserror::Error)]
 pub enum TensorsError {
     /// The file could not be read.
     #[error("{cause}; put the file there or correct the description")]
     Read {
-        /// The operating system's answer, which names the path.
+        /// The operating system's error, with the path.
         cause: std::io::Error,
     },
-    /// The file is not safetensors, or is cut.
+    /// The file is not safetensors, or is truncated.
     #[error("{}: {cause}; fetch the file again", path.display())]
     Format {
         /// The file.
@@ -22,17 +22,17 @@ pub enum TensorsError {
         /// What is wrong.
         cause: safetensors::SafeTensorError,
     },
-    /// The tensor is not there.
+    /// The file has no such tensor.
     #[error("{}: no tensor {name:?}, it has {}; correct the description", path.display(), found.join(", "))]
     Missing {
         /// The file.
         path: PathBuf,
-        /// The tensor asked for.
+        /// The requested tensor.
         name: String,
-        /// The tensors that are there.
+        /// The tensors in the file.
         found: Vec<String>,
     },
-    /// The tensor is of another kind.
+    /// The tensor has another type or shape.
     #[error("{}: tensor {name:?} is {dtype:?} {found:?}, expected F16 or F32 {expected}; correct the description, or fetch its files again", path.display())]
     Shape {
         /// The file.
@@ -43,7 +43,7 @@ pub enum TensorsError {
         dtype: Dtype,
         /// Its shape.
         found: Vec<usize>,
-        /// The shape asked for, in words.
+        /// The expected shape.
         expected: String,
     },
     /// A number is NaN or infinite.
@@ -60,7 +60,7 @@ pub enum TensorsError {
 
 /// Reads tensor `name` as f32, row-major; `n_rows`: `None` for a vector `[dim]`, else a matrix `[n_rows][dim]`.
 /// # Errors
-/// [`TensorsError`] where the file or the tensor is not as described.
+/// [`TensorsError`] if the file or the tensor is not as described.
 pub fn read(path: &Path, name: &str, n_rows: Option<usize>, dim: usize) -> Result<Vec<f32>, TensorsError> {
     let bytes = fs_err::read(path).map_err(|cause| TensorsError::Read { cause })?;
     let tensors = SafeTensors::deserialize(&bytes)

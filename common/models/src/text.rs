@@ -1,4 +1,4 @@
-//! Text encoders in ONNX: tokens by `tokenizer.json`, then the model.
+//! Text encoders in ONNX: a `tokenizer.json`, then the model.
 
 use std::path::PathBuf;
 
@@ -6,7 +6,7 @@ use ort::value::TensorElementType;
 use tokenizers::Tokenizer;
 
 use crate::{
-    EncodeError, ModelError, ModelFile, TextEncoder,
+    InferenceError, ModelError, ModelFile, TextEncoder,
     clean::clean,
     description::OnnxText,
     encoder::normalise,
@@ -15,7 +15,7 @@ use crate::{
     session::{Model, SessionError, SessionOptions},
 };
 
-/// Makes text into the token ids of one model.
+/// Turns text into the token ids of one model.
 #[derive(Debug)]
 pub struct Tokens {
     path: PathBuf,
@@ -25,15 +25,15 @@ pub struct Tokens {
 }
 
 impl Tokens {
-    /// Reads `file` (`tokenizer.json`); a text becomes at most `max_tokens` ids, the last being `end_token_id`.
+    /// Reads `file` (`tokenizer.json`); a text becomes at most `max_tokens` ids, the last of them `end_token_id`.
     /// # Errors
-    /// [`TokenizerError`] where the file is no tokenizer, or ends texts in another token.
+    /// [`TokenizerError`] if the file is not a tokenizer, or ends texts with another token.
     pub fn open(file: &ModelFile, max_tokens: usize, end_token_id: u32) -> Result<Self, TokenizerError> {
         let path = &*file.path;
         let bytes = file.read().map_err(|cause| TokenizerError::Read { cause })?;
         let mut tokenizer = Tokenizer::from_bytes(bytes)
             .map_err(|error| TokenizerError::Format { path: path.to_owned(), reason: error.to_string() })?;
-        // Both are done here, the same for every file.
+        // Padding and truncation are done here, the same for every file.
         tokenizer.with_padding(None);
         tokenizer
             .with_truncation(None)
@@ -50,7 +50,7 @@ impl Tokens {
         Ok(tokens)
     }
 
-    /// Returns the largest id that a text can have; what is added beside the vocabulary need not occur.
+    /// Returns the largest id that a text can have. Added tokens are left out: they need not occur in a text.
     fn largest_id(&self) -> u32 {
         self.tokenizer.get_vocab(false).into_values().max().unwrap_or(0)
     }
@@ -63,12 +63,12 @@ impl Tokens {
         Ok(encoding.get_ids().to_vec())
     }
 
-    /// Returns the ids of `text` as it stands, up to and with the first end token.
+    /// Returns the ids of `text`, without a prompt, up to and including the first end token.
     ///
-    /// Too long a text loses its end, the end token stays. CLIP's attention is causal and its vector is read
-    /// at the first end token, so what would follow (padding) can change nothing.
+    /// A text that is too long is truncated before the end token. CLIP's attention is causal and its vector is
+    /// read at the first end token, so padding after it would have no effect.
     /// # Errors
-    /// [`TokenizerError::Encode`] where the tokenizer fails.
+    /// [`TokenizerError::Encode`] if the tokenizer fails.
     pub fn ids(&self, text: &str) -> Result<Vec<u32>, TokenizerError> {
         let mut ids = self.raw_ids(text)?;
         ids.truncate(self.max_tokens);
@@ -92,18 +92,18 @@ pub struct OnnxTextEncoder {
     tokens: Tokens,
     description: OnnxText,
     output: String,
-    /// Whether ids and mask are i32, not i64.
+    /// Whether ids and mask are i32; otherwise i64.
     is_i32: bool,
     /// Subtracted from the unit vector, `[dim]`.
     centre: Option<Vec<f32>>,
 }
 
 impl OnnxTextEncoder {
-    /// Opens `model` and `tokenizer` as `description` says; `dim`: components of a vector; `centre`: `[dim]`.
+    /// Opens `model` and `tokenizer` according to `description`; `dim`: components of a vector; `centre`: `[dim]`.
     ///
-    /// A text of the tokenizer's largest id is run, so that a model that does not fit is found now.
+    /// Runs a text with the tokenizer's largest id, to detect a tokenizer of another model at once.
     /// # Errors
-    /// [`ModelError`] where the runtime or a file is not as described.
+    /// [`ModelError`] if the runtime does not load or a file is not as described.
     pub fn open(
         name: &str,
         dim: usize,
@@ -146,7 +146,7 @@ impl OnnxTextEncoder {
         }
     }
 
-    /// Returns the model's vector of token ids, `[dim]`.
+    /// Runs the model on token ids; returns its vector, `[dim]`.
     fn run(&mut self, ids: &[u32]) -> Result<Vec<f32>, SessionError> {
         let (n_real, padding) = (ids.len(), self.description.padding);
         let n_tokens = padding.map_or(n_real, |padding| usize::from(padding.n_tokens));
@@ -172,17 +172,17 @@ impl TextEncoder for OnnxTextEncoder {
         self.dim
     }
 
-    fn encode(&mut self, text: &str) -> Result<Vec<f32>, EncodeError> {
+    fn encode(&mut self, text: &str) -> Result<Vec<f32>, InferenceError> {
         let text = clean(text);
         if text.is_empty() {
-            return Err(EncodeError::EmptyText);
+            return Err(InferenceError::EmptyText);
         }
         let ids = self.tokens.ids(&self.description.prompt.replace("{}", &text))?;
         let mut vector = self.run(&ids)?;
         if centred(&mut vector, self.centre.as_deref()) {
             Ok(vector)
         } else {
-            Err(EncodeError::NoDirection { model: self.name.clone(), index: 0 })
+            Err(InferenceError::NoDirection { model: self.name.clone(), index: 0 })
         }
     }
 
@@ -191,7 +191,7 @@ impl TextEncoder for OnnxTextEncoder {
     }
 }
 
-/// Makes `vector` normalize(normalize(v) - centre), both `[dim]`; returns false where that has no direction.
+/// Replaces `vector` v by normalize(normalize(v) - centre), both `[dim]`; returns false if that is zero or not finite.
 pub(crate) fn centred(vector: &mut [f32], centre: Option<&[f32]>) -> bool {
     if !normalise(vector) {
         return false;

@@ -24,7 +24,7 @@ fn changed(name: &str, models: &Path, replacements: &[(&str, &str)]) -> TempDir 
     folder
 }
 
-/// The message with which opening the description, or one of its encoders, fails.
+/// The error of opening the description or one of its encoders.
 fn failure(folder: &Path, options: &SessionOptions) -> String {
     let opened = ModelDir::open(folder).and_then(|model| {
         model.image_encoder(options)?;
@@ -65,7 +65,7 @@ fn wrong_descriptions_are_named_by_field_or_line() {
     }
     let message = failure(Path::new("no-such-folder"), &no_runtime);
     assert!(message.contains("no-such-folder/model.toml"), "{message}");
-    // Files are opened when an encoder is.
+    // Files are opened with the encoder.
     let folder = changed("conse", &no_models, &[]);
     let message = failure(folder.path(), &no_runtime);
     assert!(message.contains("conse_mnv2_int8.onnx") && message.contains("put the file there"), "{message}");
@@ -134,7 +134,7 @@ fn a_tokenizer_of_another_vocabulary_is_refused() {
         (
             r#"{"version":"1.0","model":{"type":"WordLevel","vocab":{"a":0,"chair":1,"[UNK]":2},"unk_token":"[UNK]"},
             "added_tokens":[],"normalizer":null,"pre_tokenizer":{"type":"Whitespace"},"post_processor":null,"decoder":null}"#,
-            "a text ends in token None, the model's end token is 49407",
+            "texts end in token None, but the model's end token is 49407",
         ),
         ("{}", "fetch tokenizer.json again"),
         ("", "fetch tokenizer.json again"),
@@ -160,7 +160,7 @@ fn cut_files_are_refused() {
     ] {
         let bytes = fs_err::read(models.join(path)).expect("it is readable");
         let text = fs_err::read_to_string(model_dir(name).join("model.toml")).expect("it is readable");
-        // The description without hashes, or every change would be found by its hash.
+        // The description without hashes, which would reveal every change.
         let mut unhashed = String::new();
         for line in text.replace("../../../../shared/models", ".").lines() {
             unhashed += line.split(", sha256").next().expect("one part at least");
@@ -205,7 +205,7 @@ fn the_encoder_id_needs_no_files() {
 fn a_hash_that_is_left_out_is_computed_from_the_file() {
     let full = ModelDir::open(&model_dir("conse")).expect("no file is needed");
     let (id, models) = (full.encoder_id(), shared("models"));
-    // The recorded hash left out, and so computed from the file.
+    // Without a recorded hash, it is computed from the file.
     let hash = ", sha256 = \"0799d6716c84b2a15511cf1b267a0fb6ee91c8ca5b2155680b1b46770b798952\"";
     let folder = changed("conse", &models, &[(hash, "")]);
     assert_eq!(ModelDir::open(folder.path()).expect("it opens").encoder_id(), id);

@@ -42,7 +42,7 @@ fn every_step_of_preprocessing_equals_pillow() {
     assert!(max_difference(&values, &expected) < 1e-6, "{}", max_difference(&values, &expected));
 }
 
-/// Squares that were made ahead are encoded as their crops are: nothing is resized twice.
+/// Squares prepared in advance have the vectors of their crops: nothing is resized twice.
 #[test]
 fn a_square_stays_as_it_is() {
     let photo =
@@ -88,7 +88,7 @@ fn token_ids_equal_those_of_openai() {
     let mut different = Vec::new();
     for entry in golden["texts"].as_array().expect("a list") {
         let text = entry["text"].as_str().expect("a text");
-        // As it stands, the tokenizer equals Hugging Face's; cleaned first, OpenAI's.
+        // Without cleaning, the tokenizer equals Hugging Face's; with cleaning, OpenAI's.
         let hf = if entry["hf_tokenizer_json_equal"] == true { &entry["ids"] } else { &entry["hf_ids"] };
         assert_eq!(tokens.ids(text).expect("it encodes"), ids(hf), "{text:?}");
         if tokens.ids(&clean(text)).expect("it encodes") != ids(&entry["ids"]) {

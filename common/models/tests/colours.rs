@@ -1,7 +1,7 @@
-//! The stand-in on drawn things, lit unevenly and with noise.
+//! The stand-in on drawn objects with uneven light and noise.
 
 use image::{Rgb, RgbImage};
-use slag_models::{Crop, EncodeError, ImageEncoder, ModelDir, SessionOptions, TextEncoder};
+use slag_models::{Crop, ImageEncoder, InferenceError, ModelDir, SessionOptions, TextEncoder};
 
 fn encoders() -> (Box<dyn ImageEncoder>, Box<dyn TextEncoder>) {
     let (model, options) = (ModelDir::colours(), SessionOptions::new("no-such-library.so".into()));
@@ -11,7 +11,7 @@ fn encoders() -> (Box<dyn ImageEncoder>, Box<dyn TextEncoder>) {
     )
 }
 
-/// The sRGB colour under `light` times its light: what a camera sees of a shaded surface.
+/// The sRGB colour of a surface lit by `light` times full light.
 fn lit([r, g, b]: [u8; 3], light: f64) -> Rgb<u8> {
     let level = |level: u8| {
         let x = f64::from(level) / 255.0;
@@ -22,7 +22,7 @@ fn lit([r, g, b]: [u8; 3], light: f64) -> Rgb<u8> {
     Rgb([level(r), level(g), level(b)])
 }
 
-/// A thing of `colour`, from full light at its left to 0.35 of it at its right, on a background to be ignored.
+/// An object of `colour`, from full light at the left to 0.35 of it at the right, on a background to be ignored.
 fn thing(colour: [u8; 3], width: u32, height: u32, inside: impl Fn(u32, u32) -> bool) -> Crop {
     let mut seed = 1u32;
     let image = RgbImage::from_fn(width, height, |x, y| {
@@ -42,7 +42,7 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// CSS colours of that name, and what paint and things of that name look like.
+/// CSS colours of that name, and typical paints and objects.
 const THINGS: [(&str, [u8; 3]); 30] = [
     ("black", [12, 12, 12]),
     ("black", [35, 32, 30]),
@@ -149,14 +149,14 @@ fn words_combine_and_unknown_ones_are_named() {
     let norm = dot(&red, &red);
     assert!((norm - 1.0).abs() < 1e-6);
     match texts.encode("a red chair") {
-        Err(EncodeError::UnknownWords { unknown, known }) => {
+        Err(InferenceError::UnknownWords { unknown, known }) => {
             assert_eq!(unknown, ["chair"]);
             assert_eq!(known.len(), 14);
         }
         other => panic!("{other:?}"),
     }
-    assert!(matches!(texts.encode("the thing"), Err(EncodeError::UnknownWords { .. })));
-    assert!(matches!(texts.encode(" ,, "), Err(EncodeError::EmptyText)));
+    assert!(matches!(texts.encode("the thing"), Err(InferenceError::UnknownWords { .. })));
+    assert!(matches!(texts.encode(" ,, "), Err(InferenceError::EmptyText)));
 }
 
 #[test]
@@ -165,7 +165,7 @@ fn an_empty_mask_is_an_error_and_a_large_one_is_sampled() {
     let empty = Crop::new(RgbImage::new(3, 2), vec![false; 6]).expect("sizes agree");
     let red = thing([255, 0, 0], 2, 1, |_, _| true);
     match images.encode(&[red, empty, Crop::whole(RgbImage::new(0, 0))]) {
-        Err(EncodeError::EmptyCrop { index: 1 }) => {}
+        Err(InferenceError::EmptyCrop { index: 1 }) => {}
         other => panic!("{other:?}"),
     }
     assert!(Crop::new(RgbImage::new(3, 2), vec![true; 5]).is_none());

@@ -6,7 +6,7 @@ use ::image::{RgbImage, imageops};
 use common::{array, max_difference, model_dir, needs_shared, options, shared, unit};
 use half::f16;
 use safetensors::SafeTensors;
-use slag_models::{Crop, EncodeError, ModelDir, SessionOptions};
+use slag_models::{Crop, InferenceError, ModelDir, SessionOptions};
 
 fn golden_images(golden: &std::path::Path) -> Vec<RgbImage> {
     let (shape, levels) = array::<u8>(golden, "images");
@@ -96,7 +96,7 @@ fn an_unknown_phrase_is_answered_with_near_ones() {
     let mut encoder =
         ModelDir::open(&model_dir("conse")).expect("it opens").text_encoder(&no_runtime).expect("it loads");
     let mut near = |text: &str| match encoder.encode(text) {
-        Err(EncodeError::UnknownPhrase { near, n_known: 1612, .. }) => near,
+        Err(InferenceError::UnknownPhrase { near, n_known: 1612, .. }) => near,
         other => panic!("{text:?}: {other:?}"),
     };
     assert_eq!(near("refridgerator")[0], "refrigerator");
@@ -106,7 +106,7 @@ fn an_unknown_phrase_is_answered_with_near_ones() {
     assert!(near("red sofa").contains(&"sofa".to_owned()));
     assert_eq!(near("zzzzzzzz"), Vec::<String>::new());
     assert_eq!(near(&"very long ".repeat(1000)), Vec::<String>::new());
-    assert!(matches!(encoder.encode("  "), Err(EncodeError::EmptyText)));
+    assert!(matches!(encoder.encode("  "), Err(InferenceError::EmptyText)));
 }
 
 #[needs_shared]

@@ -1,5 +1,5 @@
-//! Encoders as exports of CLIP and SigLIP have them: element types, masks, padding, unnamed outputs, batches.
-//! The models are made here; what they answer is computed from their tables in f64.
+//! Encoders with the variations of CLIP and SigLIP exports: element types, masks, padding, unnamed outputs, batches.
+//! The models are generated here; the expected vectors are computed from their tables in f64.
 
 mod common;
 
@@ -82,7 +82,7 @@ fn siglip_texts_are_padded_and_its_scores_are_probabilities() {
         let found = encoder.encode(&"red ".repeat(20)).expect("it runs");
         assert!(max_difference(&found, &mean_of(&ids)) < 1e-6);
     }
-    // A mask says which tokens are filler: it is the sum of the others then.
+    // With a mask, the vector is the sum over the unmasked tokens.
     let masked = padded.replace(
         "input_ids = \"input_ids\"",
         "input_ids = \"input_ids\"\nattention_mask = \"attention_mask\"",
@@ -175,7 +175,7 @@ fn what_really_runs_is_told() {
     let model = ModelDir::open(folder.path()).expect("it opens");
     let plain = model.text_encoder(&options).expect("it loads");
     assert_eq!(plain.placement().expect("it is run").to_string(), "cpu");
-    // The library has none of these; the processor stands in, and says how much it runs.
+    // The library has none of these; the CPU runs all nodes and reports them.
     let providers = vec![Provider::TensorRt, Provider::Cuda, Provider::Cpu, Provider::CoreMl];
     let asked = SessionOptions { providers, ..options.clone() };
     let (text, image) =
@@ -228,7 +228,7 @@ fn models_that_do_not_fit_say_so_when_opened() {
         assert!(message.contains(part), "{message}");
     }
 
-    // From the future.
+    // Versions that no runtime supports.
     for (ir_version, opset) in [(7, 999), (99, 12)] {
         let bytes = common::onnx::versioned(&text_graph(text), ir_version, opset);
         fs_err::write(folder.path().join("text.onnx"), bytes).expect("it is writable");

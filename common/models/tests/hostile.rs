@@ -1,4 +1,4 @@
-//! Descriptions, vector files and phrase lists, damaged in 1,000 ways each: used or refused, never a panic.
+//! Descriptions, vector files and phrase lists with 1,000 damages each: accepted or refused, never a panic.
 
 mod common;
 

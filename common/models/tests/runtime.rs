@@ -44,7 +44,7 @@ fn a_wrong_library_is_refused_and_the_right_one_still_loads() {
         refusal(Path::new("libno-such-onnxruntime.so")).contains("put libonnxruntime.so beside the program")
     );
 
-    // An old ONNX Runtime: all that is asked of it before it is refused is its version.
+    // An old ONNX Runtime: only its version is read before it is refused.
     let source = folder.path().join("old.c");
     let old = folder.path().join("libold.so");
     let code = "static const char* version(void) { return \"1.9.0\"; }\n\

@@ -5,7 +5,7 @@ mod common;
 use std::path::Path;
 
 use common::{array, image, model_dir, needs_shared, options, shared};
-use slag_models::sam::{Embedding, Frame, Sam};
+use slag_models::sam::{Embedding, Letterbox, Sam};
 
 /// The largest difference between `found`, `[planes][rows][columns]` from which every `step`th row and column is
 /// taken, and the recorded `expected`.
@@ -41,7 +41,10 @@ fn pixel_values_and_embeddings_equal_the_recorded_ones() {
 
     let embedding = recorded_embedding(&golden, &sam);
     let (_, [height, width]) = size(&golden, "reshaped_size");
-    assert_eq!(embedding.frame, Frame { size_px: 1024, image_px: [211, 150], resized_px: [width, height] });
+    assert_eq!(
+        embedding.letterbox,
+        Letterbox { size_px: 1024, image_px: [211, 150], resized_px: [width, height] }
+    );
     let mut n_tensors = 0;
     for (name, shape, values) in embedding.tensors() {
         assert_eq!(shape, [1, 32, 64, 64]);

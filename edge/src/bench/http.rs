@@ -4,7 +4,7 @@ use std::io;
 use std::time::Instant;
 
 use serde::Serialize;
-use slag_models::{EncodeError, TextEncoder};
+use slag_models::{InferenceError, TextEncoder};
 use tokio::net::TcpListener;
 
 use super::timing::{Kind, Settings, Timing, quantile};
@@ -42,9 +42,9 @@ impl TextEncoder for Given {
         self.0.first().map_or(0, Vec::len)
     }
 
-    fn encode(&mut self, text: &str) -> Result<Vec<f32>, EncodeError> {
+    fn encode(&mut self, text: &str) -> Result<Vec<f32>, InferenceError> {
         let known = text.parse().ok().and_then(|at: usize| self.0.get(at)).cloned();
-        known.ok_or(EncodeError::EmptyText)
+        known.ok_or(InferenceError::EmptyText)
     }
 }
 

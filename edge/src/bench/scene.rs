@@ -14,7 +14,7 @@ use slag_common::Hash32;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use slag_common::shard::{self, Positions, Profile, ScoreErrors, ShardHeader, ShardView};
-use slag_models::{EncodeError, TextEncoder};
+use slag_models::{InferenceError, TextEncoder};
 
 use crate::text::{EncoderInfo, TextService};
 use slag_math::random::Random;
@@ -55,7 +55,7 @@ impl TextEncoder for Concepts {
         self.0 as usize
     }
 
-    fn encode(&mut self, text: &str) -> Result<Vec<f32>, EncodeError> {
+    fn encode(&mut self, text: &str) -> Result<Vec<f32>, InferenceError> {
         Ok(concept(text.trim().parse().unwrap_or(0), self.0))
     }
 }

@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use serde::Serialize;
-use slag_models::{EncodeError, TextEncoder};
+use slag_models::{InferenceError, TextEncoder};
 
 use super::machine::Machine;
 use super::times::{Percentiles, Times};
@@ -53,7 +53,7 @@ pub struct TextTimes {
 ///
 /// # Errors
 /// The model refuses a text or fails.
-pub fn run(encoder: &mut dyn TextEncoder, settings: &TextSettings) -> Result<TextReport, EncodeError> {
+pub fn run(encoder: &mut dyn TextEncoder, settings: &TextSettings) -> Result<TextReport, InferenceError> {
     let mut texts = Vec::with_capacity(settings.texts.len());
     for text in &settings.texts {
         for _ in 0..settings.n_warm_up {

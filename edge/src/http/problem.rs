@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use axum::http::StatusCode;
 use serde_json::json;
-use slag_models::EncodeError;
+use slag_models::InferenceError;
 use slag_service::problem::Problem;
 
 use crate::query::{QueryError, RequestError};
@@ -65,15 +65,15 @@ pub fn query_problem(error: QueryError) -> Problem {
         }
         QueryError::Text(TextError::Encode(error)) | QueryError::Negatives(TextError::Encode(error)) => {
             match error {
-                EncodeError::EmptyText => parameter_problem(RequestError::new(
+                InferenceError::EmptyText => parameter_problem(RequestError::new(
                     parameter,
                     "nothing to look for",
                     "words to look for",
                 )),
-                EncodeError::UnknownPhrase { text, n_known, near } => {
+                InferenceError::UnknownPhrase { text, n_known, near } => {
                     unknown_words(text, format!("one of {n_known} phrases"), near)
                 }
-                EncodeError::UnknownWords { unknown, known } => {
+                InferenceError::UnknownWords { unknown, known } => {
                     unknown_words(unknown.join(", "), "words that the model knows".into(), known)
                 }
                 _ => Problem::internal(&detail),

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use slag_common::Hash32;
 use slag_common::objects::Objects;
 use slag_common::shard::ShardView;
-use slag_models::EncodeError;
+use slag_models::InferenceError;
 
 use super::answer::answer;
 use super::reply::Reply;
@@ -62,11 +62,11 @@ impl QueryError {
         match self {
             Self::Request(_) => "bad-parameter",
             Self::Text(error) | Self::Negatives(error) => match error {
-                TextError::Encode(EncodeError::EmptyText) => "bad-parameter",
+                TextError::Encode(InferenceError::EmptyText) => "bad-parameter",
                 TextError::Busy => "overloaded",
-                TextError::Encode(EncodeError::UnknownPhrase { .. } | EncodeError::UnknownWords { .. }) => {
-                    "unknown-words"
-                }
+                TextError::Encode(
+                    InferenceError::UnknownPhrase { .. } | InferenceError::UnknownWords { .. },
+                ) => "unknown-words",
                 _ => "text-model",
             },
             Self::NoScene => "no-scene",

@@ -14,7 +14,7 @@ use slag_edge::fetch::FetchError;
 use slag_edge::query::{AnswerKind, Engine, QueryRequest};
 use slag_edge::store::EdgeCache;
 use slag_edge::text::{EncoderInfo, TextService};
-use slag_models::{EncodeError, TextEncoder};
+use slag_models::{InferenceError, TextEncoder};
 
 use super::crash::copy_dir;
 use super::scene::{DIM, ENCODER, Published, key, public};
@@ -40,7 +40,7 @@ impl TextEncoder for FirstAxis {
         DIM as usize
     }
 
-    fn encode(&mut self, _: &str) -> Result<Vec<f32>, EncodeError> {
+    fn encode(&mut self, _: &str) -> Result<Vec<f32>, InferenceError> {
         Ok((0..DIM).map(|axis| if axis == 0 { 1.0 } else { 0.0 }).collect())
     }
 }

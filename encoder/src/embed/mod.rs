@@ -4,7 +4,7 @@ use std::num::NonZeroUsize;
 
 use image::{Rgb, RgbImage, imageops};
 use slag_models::{
-    Crop, EncodeError, ImageEncoder,
+    Crop, ImageEncoder, InferenceError,
     preprocess::{Filter, Preprocess, Window, resample},
 };
 
@@ -38,7 +38,7 @@ pub enum EmbedError {
         /// Index of the last mask in the batch.
         last: usize,
         /// The encoder's error.
-        cause: Box<EncodeError>,
+        cause: Box<InferenceError>,
     },
 }
 

@@ -1,6 +1,5 @@
-//! The models of the table, and those of them in the user's cache.
+//! The models of the table, and those in the user's cache.
 
-use std::io;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
@@ -15,15 +14,15 @@ use super::table::{Entry, Table};
 use crate::description::{self, Description, DescriptionError, Sha256};
 use crate::model_dir::hash_file;
 
-/// What of a model is here.
+/// The part of a model that is in the cache.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Here {
-    /// Nothing that can be used.
+    /// Nothing usable.
     No,
-    /// What texts need.
+    /// The text side.
     Text,
-    /// All.
+    /// All files.
     All,
 }
 
@@ -35,19 +34,19 @@ pub struct Hub {
 }
 
 impl Hub {
-    /// Returns the hub's table over the folder of `options`.
+    /// Returns the hub with the built-in table.
     /// # Errors
     /// [`HubError::Table`], which a test rules out.
     pub fn new(options: HubOptions) -> Result<Self, HubError> {
         Ok(Self { table: Table::embedded()?, options })
     }
 
-    /// Returns the same with another table.
+    /// Returns the hub with another table.
     pub fn with_table(table: Table, options: HubOptions) -> Self {
         Self { table, options }
     }
 
-    /// Returns the models known.
+    /// Returns the table of known models.
     pub fn table(&self) -> &Table {
         &self.table
     }
@@ -59,13 +58,13 @@ impl Hub {
 
     /// Returns a model of the table.
     /// # Errors
-    /// [`HubError::Unknown`] where it has none of that name.
+    /// [`HubError::Unknown`] if the table has no such name.
     pub fn entry(&self, name: &str) -> Result<&Entry, HubError> {
         let known = || self.table.models.iter().map(|entry| entry.name.clone()).collect();
         self.table.find(name).ok_or_else(|| HubError::Unknown { name: name.to_owned(), known: known() })
     }
 
-    /// Says what of a model is here; files are looked for, not read.
+    /// Returns the part of a model that is in the cache; files are not read.
     pub fn here(&self, entry: &Entry) -> Here {
         let folder = self.folder(entry);
         let has = |text_only| entry.paths(text_only).iter().all(|path| folder.join(path).is_file());
@@ -76,12 +75,12 @@ impl Hub {
         }
     }
 
-    /// Pulls what of a model is not here, and writes its `model.toml`.
+    /// Pulls the missing files of a model and writes its `model.toml`.
     ///
-    /// Two pulls at a time wait for each other. Cut off at any moment, a pull leaves whole files and parts to go
-    /// on with.
+    /// Only one pull runs at a time; others wait. An interrupted pull leaves whole files, and partial ones that the next
+    /// pull resumes.
     /// # Errors
-    /// [`HubError`]; [`HubError::Licence`] where the licence is neither accepted now nor was before.
+    /// [`HubError`]; [`HubError::Licence`] if the licence was not accepted, now or earlier.
     pub fn pull(&self, name: &str, side: Side, accepts_licence: bool) -> Result<Vec<PulledFile>, HubError> {
         let entry = self.entry(name)?;
         let root = &self.options.root;
@@ -98,7 +97,7 @@ impl Hub {
         fs_err::create_dir_all(root)?;
         let guard = fs_err::File::create(root.join(".pull"))?;
         guard.file().lock()?;
-        // Another pull may have ended meanwhile.
+        // Another pull may have changed it meanwhile.
         lock = Lock::read(root)?;
         lock.entry(name).licence.clone_from(&entry.licence);
         let client = Client::new(&self.options)?;
@@ -120,16 +119,16 @@ impl Hub {
         Ok(pulled)
     }
 
-    /// Reads every file that is here of a model, and compares its hash with the recorded one.
+    /// Compares the hash of every file of a model with the recorded one.
     /// # Errors
-    /// [`HubError`] where a file is absent that texts need, or not the recorded one.
+    /// [`HubError`] if a file of the text side is absent, or a hash differs.
     pub fn verify(folder: &Path) -> Result<Vec<String>, HubError> {
         let description = Description::read(&folder.join(description::FILE_NAME))?;
         let root = folder.join(&description.files_root);
         let mut verified = Vec::new();
         for (role, file) in description.files() {
             let path = root.join(&file.path);
-            // A robot has the text side alone.
+            // Robots have only the text side.
             if role == "image.model" && file.sha256.is_some() && !path.exists() {
                 continue;
             }
@@ -143,20 +142,16 @@ impl Hub {
         Ok(verified)
     }
 
-    /// Returns the folder that `name` stands for: that of a pulled model, where it is the name of one and no
-    /// folder with a `model.toml`, else `name` itself.
+    /// Returns the folder of the model `name`: that of a pulled model if `name` is one and not itself a folder with a
+    /// `model.toml`, else `name`.
     /// # Errors
-    /// [`HubError::NotPulled`] where it is a model of the table and not here.
+    /// [`HubError::NotPulled`] if it is a model of the table that is not pulled.
     pub fn resolve(&self, name: &Path) -> Result<PathBuf, HubError> {
         let entry = name.to_str().and_then(|name| self.table.find(name));
         match entry {
-            // A name is a name even where the working folder has one of that name without a model in it.
+            // A folder of that name without a model in it does not hide the name.
             Some(entry) if !name.join(description::FILE_NAME).is_file() => match self.here(entry) {
-                Here::No => {
-                    let advice =
-                        format!("{} is not pulled yet: `models pull {}` does", entry.name, entry.name);
-                    Err(HubError::Io(io::Error::new(io::ErrorKind::NotFound, advice)))
-                }
+                Here::No => Err(HubError::NotPulled { name: entry.name.clone() }),
                 _ => Ok(self.folder(entry)),
             },
             _ => Ok(name.to_owned()),

@@ -1,4 +1,4 @@
-//! One file from the hub: what the hub says of it, then its bytes, going on where an earlier pull was cut off.
+//! Downloads one file from the hub: its metadata, then its bytes, resuming interrupted downloads.
 
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::Path;
@@ -10,44 +10,44 @@ use ureq::http::{HeaderName, Method, Request, Response, StatusCode, Uri, header}
 use super::options::HubOptions;
 use crate::description::Sha256;
 
-/// No file of a model is larger: ONNX files of 2 GiB and more are split.
+/// Limit on the size of a file: ONNX files of 2 GiB and more are split.
 pub const MAX_FILE_BYTES: u64 = 2 << 30;
 
-/// Addresses that one request may be sent on to; the hub sends large files to its store.
+/// Limit on redirects of a request; the hub redirects large files to its store.
 const MAX_REDIRECTS: usize = 5;
-/// Attempts in a row that bring nothing.
+/// Limit on consecutive attempts without progress.
 const MAX_ATTEMPTS: u32 = 5;
 const CHUNK_BYTES: usize = 1 << 18;
 
-/// Why a file did not come.
+/// Error of a download.
 #[derive(Debug, thiserror::Error)]
 pub enum Failure {
-    /// No connection, or it broke.
+    /// No connection, or it was lost.
     #[error("{0}")]
     Transport(#[from] Box<ureq::Error>),
-    /// The server says no.
+    /// The server answers with an error status.
     #[error("the server answers {0}")]
     Status(u16),
-    /// The server sends on to an address that is not followed.
-    #[error("the server sends on to {0:?}, which is not followed (too many, or no longer encrypted)")]
+    /// The server redirects to an address that is not followed.
+    #[error("the server redirects to {0:?}, which is not followed (too many redirects, or unencrypted)")]
     Redirect(String),
-    /// The body broke off.
+    /// The body ends early.
     #[error("the body ends at byte {found_bytes} of {expected_bytes}")]
     Cut {
         /// Length announced.
         expected_bytes: u64,
-        /// Bytes there.
+        /// Bytes received.
         found_bytes: u64,
     },
-    /// The length is another than announced before, or too large.
+    /// The length is not the expected one, or too large.
     #[error("it has {found_bytes} bytes, expected {expected}")]
     Length {
-        /// Bytes announced now, or come.
+        /// Bytes announced or received.
         found_bytes: u64,
-        /// What is expected.
+        /// The length expected.
         expected: String,
     },
-    /// A file of this machine fails.
+    /// A local file cannot be read or written.
     #[error(transparent)]
     Io(#[from] std::io::Error),
 }
@@ -59,8 +59,8 @@ impl From<ureq::Error> for Failure {
 }
 
 impl Failure {
-    /// Whether another attempt may help.
-    fn is_passing(&self) -> bool {
+    /// Returns whether another attempt may succeed.
+    fn is_transient(&self) -> bool {
         match self {
             Self::Transport(e) => !matches!(**e, ureq::Error::BadUri(_) | ureq::Error::Http(_)),
             Self::Status(status) => *status >= 500 || matches!(status, 408 | 429),
@@ -70,10 +70,10 @@ impl Failure {
     }
 }
 
-/// What the hub says of a file.
+/// The hub's metadata of a file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Advertised {
-    /// The commit that it belongs to.
+    /// The commit.
     pub revision: Option<String>,
     /// Its SHA-256: the hub's ETag of a file kept in large-file storage.
     pub sha256: Option<Sha256>,
@@ -92,7 +92,7 @@ impl Client {
         let timeout = Some(options.timeout);
         let agent = ureq::Agent::config_builder()
             .http_status_as_error(false)
-            // Followed here, because the hub's word stands in its own answer, not in its store's.
+            // Redirects are followed here, because only the hub's own response has the metadata, not its store's.
             .max_redirects(0)
             .proxy(proxy)
             .timeout_resolve(timeout)
@@ -105,7 +105,7 @@ impl Client {
         Ok(Self { agent, first_backoff: options.first_backoff })
     }
 
-    /// Asks what the hub says of a file, without its bytes.
+    /// Requests a file's metadata.
     pub fn ask(&self, url: &str) -> Result<Advertised, Failure> {
         let head = || {
             let (response, advertised) = self.request(Method::HEAD, url, &[])?;
@@ -117,7 +117,7 @@ impl Client {
         self.retrying(head, || false)
     }
 
-    /// Appends to `part` until it is whole; returns whether it was begun before. `len_bytes`: its length, if known.
+    /// Downloads to `part` until it is whole; returns whether it existed before. `len_bytes`: its length, if known.
     pub fn receive(&self, url: &str, part: &Path, len_bytes: Option<u64>) -> Result<bool, Failure> {
         let mut furthest = n_bytes(part);
         let was_begun = furthest > 0;
@@ -149,7 +149,7 @@ impl Client {
                 match total.and_then(|(_, total)| total.parse::<u64>().ok()) {
                     Some(total) if total >= offset => Some(total),
                     _ => {
-                        // Not the part that was asked for: from the start, then.
+                        // Not the requested range: start again.
                         discard(part)?;
                         return Err(Failure::Cut { expected_bytes: offset, found_bytes: 0 });
                     }
@@ -180,7 +180,7 @@ impl Client {
         file.set_len(offset)?;
         file.seek(SeekFrom::Start(offset))?;
         if offset == 0 {
-            // Only a strong validator says that two parts belong together.
+            // Only a strong validator proves that two parts belong together.
             let etag = text_of(&response, header::ETAG);
             match etag.starts_with('"') {
                 true => fs_err::write(&etag_path, etag)?,
@@ -212,7 +212,7 @@ impl Client {
         }
     }
 
-    /// Sends a request on as the hub says; what the hub itself says of the file is collected on the way.
+    /// Sends a request and follows redirects; collects the metadata from the hub's own responses.
     fn request(
         &self,
         method: Method,
@@ -251,7 +251,7 @@ impl Client {
         let mut retries = Retries::new(MAX_ATTEMPTS, backoff);
         loop {
             let failure = match attempt() {
-                Err(failure) if failure.is_passing() => failure,
+                Err(failure) if failure.is_transient() => failure,
                 result => return result,
             };
             let Some(pause) = retries.failed(made_progress()) else { return Err(failure) };
@@ -262,7 +262,7 @@ impl Client {
 }
 
 impl Advertised {
-    /// Takes what an answer of the hub adds.
+    /// Adds the metadata of a response of the hub.
     fn take(&mut self, response: &Response<ureq::Body>) {
         let text = |name| text_of(response, HeaderName::from_static(name));
         let revision = text("x-repo-commit");
@@ -279,7 +279,7 @@ impl Advertised {
     }
 }
 
-/// Returns where a redirect leads, if it may be followed: never from an encrypted connection to a plain one.
+/// Returns the target of a redirect if it may be followed: never from an encrypted connection to a plain one.
 fn next(from: &Uri, location: &str) -> Option<Uri> {
     let to: Uri = match location.starts_with('/') && !location.starts_with("//") {
         true => format!("{}://{}{location}", from.scheme_str()?, from.authority()?).parse().ok()?,
@@ -290,7 +290,7 @@ fn next(from: &Uri, location: &str) -> Option<Uri> {
     is_kept.then_some(to)
 }
 
-/// Returns a header as text; empty if it is not there or not text.
+/// Returns a header as text; empty if it is absent or not text.
 fn text_of(response: &Response<ureq::Body>, name: HeaderName) -> String {
     response.headers().get(name).and_then(|value| value.to_str().ok()).unwrap_or_default().to_owned()
 }
@@ -299,7 +299,7 @@ fn n_bytes(part: &Path) -> u64 {
     fs_err::metadata(part).map_or(0, |metadata| metadata.len())
 }
 
-/// Removes a part and what is kept of its validator.
+/// Removes a partial file and its validator.
 pub(super) fn discard(part: &Path) -> std::io::Result<()> {
     for path in [part.to_owned(), part.with_extension("etag")] {
         match fs_err::remove_file(path) {

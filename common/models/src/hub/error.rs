@@ -8,20 +8,20 @@ use super::source::Source;
 use crate::description::{DescriptionError, Sha256};
 use crate::error::ModelError;
 
-/// Says why a model is not here.
+/// Error of pulling, finding or verifying a model.
 #[derive(Debug, thiserror::Error)]
 pub enum HubError {
     /// The table has no such model.
-    #[error("no model {name:?} is known, there are {}; choose one, or give the folder of your own", known.join(", "))]
+    #[error("unknown model {name:?}; there are {}: choose one, or give the folder of your own model", known.join(", "))]
     Unknown {
-        /// The name asked for.
+        /// The requested name.
         name: String,
-        /// The names there are.
+        /// The known names.
         known: Vec<String>,
     },
     /// The licence has not been accepted.
     #[error(
-        "{name} is under {licence} ({url}){}; pull it with --accept-licence if you accept that",
+        "{name} is licensed under {licence} ({url}){}; if you accept it, pull with --accept-licence",
         if note.is_empty() { String::new() } else { format!("; note: {}", note.trim_end_matches('.')) }
     )]
     Licence {
@@ -29,48 +29,50 @@ pub enum HubError {
         name: String,
         /// Its licence.
         licence: String,
-        /// Where that stands.
+        /// Address of the licence.
         url: String,
-        /// What else is to be known.
+        /// Remarks on the licence.
         note: String,
     },
-    /// The hub does not give the files.
-    #[error("{url}: {failure}; to do without the hub, put there from elsewhere: {}", wanted.iter().map(Wanted::to_string).collect::<Vec<_>>().join("; "))]
+    /// The hub does not provide the files.
+    #[error("{url}: {failure}; try again, or place these files by hand: {}", wanted.iter().map(Wanted::to_string).collect::<Vec<_>>().join("; "))]
     Unreachable {
-        /// What was asked for.
+        /// The requested address.
         url: String,
-        /// What happened.
+        /// The cause.
         failure: Box<Failure>,
-        /// The model's files that are not here.
+        /// The model's missing files.
         wanted: Vec<Wanted>,
     },
-    /// The model is of the table, but not here.
-    #[error("{name} is not pulled yet; run `models pull {name}`, or give the folder of a model of your own")]
+    /// The model is in the table but not pulled.
+    #[error("{name} is not pulled yet; run `models pull {name}`, or give the folder of your own model")]
     NotPulled {
         /// The model.
         name: String,
     },
     /// There is no folder for models.
-    #[error("neither XDG_CACHE_HOME nor HOME is an absolute path, so models have no place; set one")]
+    #[error(
+        "neither XDG_CACHE_HOME nor HOME is an absolute path, so there is no folder for models; set one of them"
+    )]
     NoFolder,
     /// The proxy cannot be used.
-    #[error("the proxy that HTTPS_PROXY names: {0}; correct or unset it")]
+    #[error("the proxy in HTTPS_PROXY: {0}; correct or unset it")]
     Proxy(#[from] Failure),
-    /// A file is not the expected one.
+    /// A file's hash is not the expected one.
     #[error("{}: SHA-256 is {found}, expected {expected} ({}); {advice}", path.display(), source_of(*by))]
     Hash {
         /// The file.
         path: PathBuf,
         /// Its hash.
         found: Sha256,
-        /// The hash expected.
+        /// The expected hash.
         expected: Sha256,
-        /// Who expects it.
+        /// The source of the expected hash.
         by: Source,
-        /// What to do.
+        /// Advice to the user.
         advice: &'static str,
     },
-    /// The hub now advertises another file.
+    /// The hub advertises another hash.
     #[error(
         "{url}: the hub advertises SHA-256 {advertised}, expected {expected} ({}); do not use it, or take the \
          model out of models.lock if you trust the new one", source_of(*by)
@@ -78,24 +80,24 @@ pub enum HubError {
     Advertised {
         /// The file.
         url: String,
-        /// The hash advertised.
+        /// The advertised hash.
         advertised: Sha256,
-        /// The hash expected.
+        /// The expected hash.
         expected: Sha256,
-        /// Who expects it.
+        /// The source of the expected hash.
         by: Source,
     },
-    /// The hub answers for another commit.
-    #[error("{url}: the hub answers for commit {found}, expected {expected}; give another --hub")]
+    /// The hub serves another commit.
+    #[error("{url}: the hub serves commit {found}, expected {expected}; give another --hub")]
     Revision {
         /// The file.
         url: String,
-        /// The commit answered for.
+        /// The commit served.
         found: String,
-        /// The commit asked for.
+        /// The requested commit.
         expected: String,
     },
-    /// The image model's hash is not known, though its space's name needs it.
+    /// The image model's hash, part of the encoder id, is unknown.
     #[error(
         "{url}: the hub advertises no SHA-256 of the image model; pull the whole model with slag-encoder"
     )]
@@ -108,20 +110,20 @@ pub enum HubError {
     Lock {
         /// The lock.
         path: PathBuf,
-        /// What is wrong.
+        /// The parser's error.
         cause: serde_json::Error,
     },
     /// The program's own table cannot be read.
-    #[error("the program's table of models: {0}; this is our mistake, please report it")]
+    #[error("the program's table of models: {0}; this is a bug, please report it")]
     Table(#[from] Box<toml::de::Error>),
-    /// A model here is not as described.
+    /// Error of a model's description.
     #[error(transparent)]
     Description(#[from] DescriptionError),
-    /// The same.
+    /// Error of opening a model.
     #[error(transparent)]
     Model(#[from] ModelError),
-    /// A file of this machine fails.
-    #[error("{0}; make room, or choose another folder with XDG_CACHE_HOME")]
+    /// A local file cannot be read or written.
+    #[error("{0}; free disk space, or choose another folder with XDG_CACHE_HOME")]
     Io(#[from] io::Error),
 }
 
@@ -134,7 +136,7 @@ fn source_of(by: Source) -> &'static str {
     }
 }
 
-/// A file that is not here.
+/// A missing file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Wanted {
     pub(super) url: String,

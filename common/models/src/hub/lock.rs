@@ -1,4 +1,4 @@
-//! `models.lock`: what was accepted when a model was pulled first, so that later pulls are the same.
+//! `models.lock`: the hashes accepted in a model's first pull, so that later pulls give the same files.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -10,14 +10,14 @@ use super::error::HubError;
 use super::source::Source;
 use crate::description::Sha256;
 
-/// What was accepted, by model.
+/// The entries of all models.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct Lock {
     models: BTreeMap<String, Accepted>,
 }
 
-/// What was accepted of a model.
+/// The accepted licence, commit and files of a model.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Accepted {
@@ -35,26 +35,26 @@ pub struct Accepted {
 pub struct LockedFile {
     /// Its SHA-256.
     pub sha256: Sha256,
-    /// Whose word that is.
+    /// The source of the hash.
     pub on_the_word_of: Source,
 }
 
 impl LockedFile {
-    /// Says that a file is not this one.
+    /// Returns the error for a file with another hash.
     pub(super) fn refusal(self, path: PathBuf, found: Sha256, advice: &'static str) -> HubError {
         HubError::Hash { path, found, expected: self.sha256, by: self.on_the_word_of, advice }
     }
 }
 
-/// The lock's place below the folder of models.
+/// Returns the path of the lock in the folder of models.
 fn path_in(root: &Path) -> PathBuf {
     root.join("models.lock")
 }
 
 impl Lock {
-    /// Reads the lock of the folder of models; an empty one where there is none.
+    /// Reads the lock in the folder of models; returns an empty one if there is none.
     /// # Errors
-    /// [`HubError`] where it cannot be read.
+    /// [`HubError`] if it cannot be read.
     pub fn read(root: &Path) -> Result<Self, HubError> {
         let path = path_in(root);
         match fs_err::read(&path) {
@@ -64,18 +64,18 @@ impl Lock {
         }
     }
 
-    /// Writes the lock, whole or not at all.
+    /// Writes the lock atomically.
     pub(super) fn write(&self, root: &Path) -> Result<(), HubError> {
         let text = serde_json::to_vec_pretty(self).map_err(io::Error::from)?;
         Ok(slag_common::durable::write(&path_in(root), &text)?)
     }
 
-    /// Returns what was accepted of a model.
+    /// Returns the entry of a model.
     pub fn get(&self, name: &str) -> Option<&Accepted> {
         self.models.get(name)
     }
 
-    /// Returns what was accepted of a model, to be changed.
+    /// Returns the mutable entry of a model; creates it if absent.
     pub(super) fn entry(&mut self, name: &str) -> &mut Accepted {
         self.models.entry(name.to_owned()).or_default()
     }

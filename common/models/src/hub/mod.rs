@@ -1,8 +1,8 @@
-//! Public models in the user's cache: pulled once, checked, described for [`ModelDir`](crate::ModelDir).
+//! Pulls public models into the user's cache, checks their hashes, and writes their [`ModelDir`](crate::ModelDir).
 //!
-//! A file counts when its SHA-256 is the one of the [`Table`], else the one that the [`Lock`] has accepted before, else
-//! the one that the hub advertises. Where nobody states one (small files), the first download over the connection to
-//! the pinned commit is accepted and locked, and reported as such.
+//! A file's expected SHA-256 is that of the [`Table`], else that of the [`Lock`], else the one that the hub advertises.
+//! If none of them has it (small files), the hash of the first download from the pinned commit is accepted, recorded in
+//! the lock, and reported as such.
 
 mod cache;
 mod download;

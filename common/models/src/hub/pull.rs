@@ -1,4 +1,4 @@
-//! One pull: the files of a model, downloaded, checked and locked.
+//! One pull: downloads and checks the files of a model and records them in the lock.
 
 use std::path::{Path, PathBuf};
 
@@ -14,25 +14,25 @@ use super::table::{Entry, Table};
 use crate::description::Sha256;
 use crate::model_dir::hash_file;
 
-/// Which files of a model are pulled.
+/// The files of a model to pull.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Side {
-    /// Those that turn texts into vectors.
+    /// The text side.
     Text,
-    /// All.
+    /// All files.
     Both,
 }
 
-/// A file, pulled or found.
+/// A pulled file, or one that was already present.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct PulledFile {
     /// Its path below the model's folder.
     pub path: String,
     /// Its SHA-256.
     pub sha256: Sha256,
-    /// Whose word that is.
+    /// The source of the expected hash.
     pub on_the_word_of: Source,
-    /// Whether it was here before.
+    /// Whether it was already present.
     pub was_here: bool,
 }
 
@@ -56,14 +56,14 @@ impl Pull<'_> {
         format!("{hub}/{}/resolve/{revision}/{path}", self.entry.repository)
     }
 
-    /// Returns the hash that a file must have, where somebody has said one.
+    /// Returns the expected hash of a file from the table or the lock.
     pub(super) fn expected(&self, path: &str) -> Option<LockedFile> {
         let known = self.entry.known.get(path);
         let known = known.map(|known| LockedFile { sha256: known.sha256, on_the_word_of: Source::Table });
         known.or_else(|| self.lock.get(&self.entry.name)?.files.get(path).cloned())
     }
 
-    /// Writes down what a file was accepted as.
+    /// Records an accepted file in the lock.
     fn accept(&mut self, path: &str, file: LockedFile) -> Result<(), HubError> {
         self.lock.entry(&self.entry.name).files.insert(path.to_owned(), file);
         self.lock.write(&self.options.root)
@@ -83,7 +83,7 @@ impl Pull<'_> {
         HubError::Unreachable { url: url.to_owned(), failure: Box::new(failure), wanted: wanted.collect() }
     }
 
-    /// Asks what the hub says of a file, which must be of the commit that is pulled.
+    /// Requests a file's metadata from the hub; it must belong to the pulled commit.
     fn ask(&mut self, url: &str) -> Result<Advertised, HubError> {
         let advertised = self.client.ask(url).map_err(|failure| self.unreachable(url, failure))?;
         if let Some(found) = advertised.revision.clone() {
@@ -98,7 +98,7 @@ impl Pull<'_> {
         Ok(advertised)
     }
 
-    /// Has the image model's hash known even where the file is not needed: it names the space.
+    /// Obtains the image model's hash even if the file is not pulled: it is part of the encoder id.
     pub(super) fn name_image(&mut self) -> Result<(), HubError> {
         let path = self.entry.paths(false)[0];
         if self.expected(path).is_some() {
@@ -109,7 +109,7 @@ impl Pull<'_> {
         self.accept(path, LockedFile { sha256, on_the_word_of: Source::Hub })
     }
 
-    /// Brings one file here and into the lock.
+    /// Downloads a file if it is absent, checks it, and records it in the lock.
     pub(super) fn file(&mut self, path: &str) -> Result<PulledFile, HubError> {
         let target = self.folder.join(path);
         let was_here = target.is_file();
@@ -120,7 +120,7 @@ impl Pull<'_> {
         let found = Sha256(hash_file(&target)?);
         let expected = match self.expected(path) {
             Some(expected) => expected,
-            // Placed by hand, and nobody has said yet what it should be.
+            // Placed by hand, with no expected hash in the table or the lock.
             None => match self.client.ask(&self.url(path)).ok().and_then(|advertised| advertised.sha256) {
                 Some(sha256) => LockedFile { sha256, on_the_word_of: Source::Hub },
                 None => LockedFile { sha256: found, on_the_word_of: Source::PlacedByHand },
@@ -134,7 +134,7 @@ impl Pull<'_> {
         Ok(PulledFile { path: path.to_owned(), sha256, on_the_word_of, was_here })
     }
 
-    /// Downloads a file to `target`; returns what it was found to be, and on whose word.
+    /// Downloads a file to `target`; returns its hash and the source of the expected hash.
     fn download(&mut self, path: &str, target: &Path) -> Result<LockedFile, HubError> {
         let url = self.url(path);
         let expected = self.expected(path);
@@ -163,9 +163,9 @@ impl Pull<'_> {
                 return Ok(expected);
             }
             discard(&part)?;
-            // Perhaps the part that was here already was another file's.
+            // The existing part may belong to another version of the file: try once more from the start.
             if !was_begun {
-                let advice = "what came was thrown away: pull again, or give another --hub";
+                let advice = "the download was discarded: pull again, or give another --hub";
                 return Err(expected.refusal(target.to_owned(), found, advice));
             }
         }

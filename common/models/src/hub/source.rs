@@ -1,17 +1,17 @@
-//! Where the expected hash of a file comes from.
+//! Sources of the expected hash of a file.
 
 use serde::{Deserialize, Serialize};
 
-/// Whose word a hash is.
+/// The source of an expected hash.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Source {
-    /// The table that the program carries.
+    /// The program's table of models.
     Table,
-    /// The hub, which advertised it.
+    /// The hub, which advertises it.
     Hub,
-    /// Nobody's: it is the hash of what came first.
+    /// None: it is the hash of the first download.
     FirstPull,
-    /// Nobody's: it is the hash of what lay there.
+    /// None: it is the hash of a file placed by hand.
     PlacedByHand,
 }

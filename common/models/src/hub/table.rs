@@ -6,7 +6,7 @@ use serde::Deserialize;
 
 use crate::description::Sha256;
 
-/// All that `models.toml` says.
+/// The contents of `models.toml`.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Table {
@@ -18,11 +18,11 @@ pub struct Table {
     pub models: Vec<Entry>,
 }
 
-/// What models of one kind of export have in common.
+/// The common part of all models of one kind of export.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Layout {
-    /// The end of a `model.toml`; IMAGE, TEXT and TOKENIZER stand for the files.
+    /// The end of a `model.toml`, with IMAGE, TEXT and TOKENIZER in place of the files.
     description: String,
 }
 
@@ -32,30 +32,30 @@ struct Layout {
 pub struct Entry {
     /// Its name, here and in `model.toml`.
     pub name: String,
-    /// What it is.
+    /// A description for people.
     pub about: String,
     layout: String,
     dim: u32,
     /// The licence of the weights.
     pub licence: String,
-    /// What is to be known about the licence beside its name.
+    /// Remarks on the licence.
     #[serde(default)]
     pub licence_note: String,
-    /// Where the licence stands.
+    /// Address of the licence.
     pub licence_url: String,
     /// Owner and name at the hub.
     pub repository: String,
-    /// The commit; the first that is met if absent.
+    /// The commit; default: that of the first pull.
     pub revision: Option<String>,
     image: String,
     text: String,
     tokenizer: String,
-    /// What is known of files, by path.
+    /// Known lengths and hashes of files, by path.
     #[serde(default)]
     pub known: BTreeMap<String, Known>,
 }
 
-/// What is known of a file.
+/// The known length and hash of a file.
 #[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Known {
@@ -74,9 +74,9 @@ impl Entry {
 }
 
 impl Table {
-    /// Returns the table that the program carries.
+    /// Returns the table in the program.
     /// # Errors
-    /// Where it does not parse, which a test rules out.
+    /// If it does not parse, which a test rules out.
     pub fn embedded() -> Result<Self, Box<toml::de::Error>> {
         toml::from_str(include_str!("../../models.toml")).map_err(Box::new)
     }
@@ -88,7 +88,7 @@ impl Table {
 
     /// Returns the `model.toml` of `entry`, with the hashes of its files.
     pub fn description(&self, entry: &Entry, sha256_of: &dyn Fn(&str) -> Option<Sha256>) -> String {
-        // Plain letters, of which Rust and TOML write the same.
+        // Plain ASCII text, which Rust and TOML quote alike.
         let quoted = |text: &str| format!("{text:?}");
         let head = format!(
             "name = {}\nabout = {}\ndim = {}\nlicence = {}\n",
@@ -111,7 +111,7 @@ mod tests {
     use super::*;
     use crate::description::Description;
 
-    /// Every entry is complete: a valid description, plain names, hashes of files that it has.
+    /// Every entry has a valid description, a unique name, and hashes of its own files only.
     #[test]
     fn every_entry_can_be_pulled() {
         let table = Table::embedded().expect("it parses");

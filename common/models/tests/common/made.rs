@@ -1,4 +1,4 @@
-//! A model directory of made files, whose vectors are sums that a test can do itself.
+//! A generated model directory; tests can compute its vectors themselves.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ pub const DIM: usize = 4;
 pub const N_TOKENS: usize = 8;
 /// Edge of the images, pixels.
 pub const SIZE_PX: u32 = 8;
-/// What a made tokenizer knows, by id; 1 ends a text, as in SigLIP's.
+/// The tokenizer's vocabulary, by id; 1 ends a text, as in SigLIP's.
 pub const VOCABULARY: [&str; 8] = ["<pad>", "</s>", "<unk>", "▁a", "▁red", "▁chair", "▁", "s"];
 
 /// The text model's vector of a token.
@@ -22,7 +22,7 @@ pub fn row(id: u32) -> [f32; DIM] {
 /// The image model's weights, `[3][DIM]`.
 pub const WEIGHTS: [f32; 3 * DIM] = [1.0, 0.5, -0.25, 0.0, 0.0, 1.0, 0.5, -0.5, 0.25, 0.0, 1.0, 1.0];
 
-/// How the text model is made.
+/// Variations of the text model.
 #[derive(Clone, Copy)]
 pub struct TextKind {
     pub ids: Element,
@@ -38,7 +38,7 @@ impl Default for TextKind {
     }
 }
 
-/// The mean of the tokens' rows; with a mask, the sum of those that it says.
+/// The mean of the tokens' rows; with a mask, the sum of the unmasked ones.
 pub fn text_graph(kind: TextKind) -> Graph {
     let table: Vec<f32> = (0..N_TOKENS as u32).flat_map(row).collect();
     let shape = [N_TOKENS as i64, DIM as i64];

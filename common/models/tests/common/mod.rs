@@ -1,4 +1,4 @@
-//! Where the tests' data lies.
+//! The tests' data.
 #![allow(dead_code, unused_imports, reason = "each test program uses a part")]
 
 pub mod made;

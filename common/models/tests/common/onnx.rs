@@ -1,4 +1,4 @@
-//! Writes small ONNX files, so that tests can have a model of any kind and know its answers without running it.
+//! Writes small ONNX files, so that tests can use a model of any kind with known results.
 
 /// An element type, by its number in `TensorProto.DataType` of onnx.proto.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,4 +1,4 @@
-//! Pulling models from a hub on this machine that answers as the real one does, or worse.
+//! Pulling models from a hub on this machine that behaves like the real one, or worse.
 
 #[path = "../common/mod.rs"]
 mod common;
@@ -39,7 +39,7 @@ fn a_pulled_model_is_checked_described_and_pulled_once() {
     assert_eq!(lock["made"]["files"]["tokenizer.json"]["on_the_word_of"], "first-pull");
     assert_eq!(hub.here(hub.entry("made").expect("known")), Here::All);
 
-    // A second time nothing is asked for, and no licence.
+    // A second pull requests nothing and needs no licence.
     server.asked();
     let again = hub.pull("made", Side::Both, false).expect("it is there");
     assert!(again.iter().all(|file| file.was_here) && server.asked().is_empty());
@@ -50,7 +50,7 @@ fn a_pulled_model_is_checked_described_and_pulled_once() {
     let options = options();
     assert!(model.text_encoder(&options).expect("it loads").encode("red chair").is_ok());
     assert!(model.image_encoder(&options).is_ok());
-    // A changed file is found by both who read it.
+    // Both readers detect a changed file.
     let text = folder.join("onnx/text.onnx");
     let mut bytes = fs_err::read(&text).expect("it is readable");
     bytes[40] ^= 1;
@@ -80,7 +80,7 @@ fn a_robot_pulls_the_text_side_and_still_knows_the_space() {
     hub_of(&table(), &server.url, both.path()).pull("made", Side::Both, true).expect("it is pulled");
     let cloud = ModelDir::open(&both.path().join("made")).expect("it opens");
     assert_eq!(robot.encoder_id(), cloud.encoder_id());
-    // Without the hub's word there is no name.
+    // Without the hub's hash there is no encoder id.
     let bare = tempfile::tempdir().expect("a folder");
     server.change(|files| {
         files.stated.insert("onnx/vision.onnx".into(), "no hash".into());
@@ -93,7 +93,7 @@ fn a_robot_pulls_the_text_side_and_still_knows_the_space() {
 #[test]
 fn a_cut_pull_goes_on_where_it_ended() {
     let (server, root, hub) = setting();
-    // Every body breaks after 100 bytes: there is progress each time, so it is tried on.
+    // Every body ends after 100 bytes: attempts go on, because each makes progress.
     server.change(|files| files.cut_bytes = 100);
     hub.pull("made", Side::Both, true).expect("piece by piece");
     let asked = server.asked();
@@ -143,7 +143,7 @@ fn parts_of_other_files_and_plain_servers_do_no_harm() {
         assert_eq!(files_below(root.path()).len(), 4, "{etag:?}");
         fs_err::remove_file(root.path().join("made/onnx/vision.onnx")).expect("it is there");
     }
-    // A server without validators or ranges: from the start each time, and given up where it always breaks.
+    // A server without validators or ranges: each attempt starts anew, and the pull fails if all break.
     server.change(|files| (files.is_plain, files.cut_bytes) = (true, 100));
     let error = hub.pull("made", Side::Both, true).expect_err("it never ends").to_string();
     assert!(error.contains("disconnected"), "{error}");
@@ -152,9 +152,9 @@ fn parts_of_other_files_and_plain_servers_do_no_harm() {
 }
 
 #[test]
-fn what_is_not_what_was_promised_is_thrown_away() {
+fn downloads_with_another_hash_are_discarded() {
     let (server, root, hub) = setting();
-    // The hub's word against the store's bytes.
+    // The hub's hash differs from that of the store's bytes.
     server.change(|files| {
         files.stated.insert("onnx/vision.onnx".into(), sha256(b"something else"));
     });
@@ -167,7 +167,7 @@ fn what_is_not_what_was_promised_is_thrown_away() {
     }
     assert_eq!(files_below(root.path()), Vec::<PathBuf>::new());
 
-    // The program's word against the hub's: nothing is downloaded.
+    // The program's hash differs from the hub's: nothing is downloaded.
     server.change(|files| files.stated.clear());
     let table = pinned(&server);
     server.change(|files| files.bytes.get_mut("onnx/text.onnx").expect("it is there").push(0));
@@ -196,7 +196,7 @@ fn the_lock_keeps_what_was_accepted_first() {
     assert!(asked.iter().any(|asked| asked.path == "/owner/made/resolve/main/onnx/vision.onnx"));
     let remove = |name: &str| fs_err::remove_file(root.path().join("made").join(name)).expect("it is there");
 
-    // Asked for again, it is the commit that was met first.
+    // A second pull requests the commit of the first.
     remove("tokenizer.json");
     hub.pull("made", Side::Both, false).expect("the same again");
     let path = format!("/owner/made/resolve/{COMMIT}/tokenizer.json");
@@ -223,7 +223,7 @@ fn the_lock_keeps_what_was_accepted_first() {
 }
 
 #[test]
-fn without_the_hub_it_is_said_what_to_put_where() {
+fn without_the_hub_the_error_lists_the_files_to_place() {
     let (server, root, _) = setting();
     let table = pinned(&server);
     for (url, status, part) in [
@@ -235,7 +235,7 @@ fn without_the_hub_it_is_said_what_to_put_where() {
         server.change(|files| files.status = status);
         server.asked();
         let error = hub_of(&table, url, root.path()).pull("made", Side::Both, true).expect_err("unreachable");
-        // Only what may pass is tried again.
+        // Only transient errors are retried.
         assert_eq!(
             server.asked().len(),
             [0, 1, 5][usize::from(status.is_some()) + usize::from(status == Some(503))]
@@ -248,7 +248,7 @@ fn without_the_hub_it_is_said_what_to_put_where() {
             assert!(error.contains(part), "{error}");
         }
     }
-    // Put there by hand, it is a pulled model without the hub, and the lock says so.
+    // Files placed by hand make a pulled model without the hub, and the lock records it.
     for name in ["onnx/vision.onnx", "onnx/text.onnx", "tokenizer.json"] {
         let path = root.path().join("made").join(name);
         fs_err::create_dir_all(path.parent().expect("a folder")).expect("it is writable");
@@ -270,7 +270,7 @@ fn nothing_is_asked_for_before_the_licence_is_accepted() {
     }
     assert!(server.asked().is_empty() && files_below(root.path()).is_empty());
     hub.pull("made", Side::Both, true).expect("accepted");
-    // Another licence is asked for again.
+    // Another licence must be accepted again.
     let relicensed = hub_of(&table().replace("Example-1.0", "Example-2.0"), &server.url, root.path());
     assert!(matches!(relicensed.pull("made", Side::Both, false), Err(HubError::Licence { .. })));
 }

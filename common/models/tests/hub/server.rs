@@ -1,4 +1,4 @@
-//! A hub on this machine that answers as the real one does, or worse; and a made model that it offers.
+//! A hub on this machine that behaves like the real one, or worse, and offers a generated model.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -73,11 +73,11 @@ pub struct Server {
     pub files: Arc<Mutex<Files>>,
 }
 
-/// What the hub has, and how it misbehaves.
+/// The hub's files and faults.
 pub struct Files {
     pub bytes: BTreeMap<String, Vec<u8>>,
     pub commit: &'static str,
-    /// Hashes that the hub states against the truth.
+    /// False hashes that the hub advertises.
     pub stated: BTreeMap<String, String>,
     pub status: Option<u16>,
     /// Bytes after which every body breaks.
@@ -204,7 +204,7 @@ impl Server {
         self.files.lock().expect("no panic").bytes[name].clone()
     }
 
-    /// What was asked since the last time.
+    /// Returns the requests since the last call.
     pub fn asked(&self) -> Vec<Asked> {
         std::mem::take(&mut self.asked.lock().expect("no panic"))
     }

@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use rayon::prelude::*;
 use serde::Serialize;
-use slag_models::{Crop, EncodeError, ModelDir, ModelError, SessionOptions};
+use slag_models::{Crop, InferenceError, ModelDir, ModelError, SessionOptions};
 
 use super::settings::ABSENT;
 use crate::generate::crops::{self, Label, Split};
@@ -34,7 +34,7 @@ pub enum EncoderEvalError {
     Model(#[from] ModelError),
     /// The encoder failed.
     #[error(transparent)]
-    Encode(#[from] EncodeError),
+    Encode(#[from] InferenceError),
     /// The picture cannot be written.
     #[error("{}: {source}", path.display())]
     Picture {
@@ -247,7 +247,7 @@ fn picture(seen: &[Seen], n_nouns: usize) -> image::GrayImage {
 }
 
 /// Returns the median time of a call, milliseconds.
-fn timed(mut call: impl FnMut(usize) -> Result<(), EncodeError>) -> Result<f64, EncodeError> {
+fn timed(mut call: impl FnMut(usize) -> Result<(), InferenceError>) -> Result<f64, InferenceError> {
     let mut times = Vec::with_capacity(N_TIMED);
     for i in 0..N_TIMED {
         let start = Instant::now();

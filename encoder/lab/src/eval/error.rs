@@ -4,7 +4,7 @@ use slag_common::Gaussians;
 use slag_encoder::query::QueryError;
 use slag_encoder::raster::RasterError;
 use slag_encoder::store::StoreReader;
-use slag_models::EncodeError;
+use slag_models::InferenceError;
 
 use super::scan::ScanError;
 use super::truth::TruthError;
@@ -40,7 +40,7 @@ pub enum EvalError {
         /// The first word.
         first: String,
         /// Its error.
-        source: Box<EncodeError>,
+        source: Box<InferenceError>,
     },
     /// No word is a category of the scene.
     #[error("none of the words is a category of the labels; the categories are: {categories}")]

@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use slag_common::gaussians::SH_C0;
 use slag_common::shard::Profile;
 use slag_common::{Distortion, Gaussians, Intrinsics, poses, splat};
-use slag_models::{EncodeError, ModelDir, SessionOptions, TextEncoder};
+use slag_models::{InferenceError, ModelDir, SessionOptions, TextEncoder};
 
 use super::lerf::{LerfLabels, lerf};
 use super::scan::Scan;
@@ -138,7 +138,7 @@ impl TextEncoder for Renamed {
         self.0.dim()
     }
 
-    fn encode(&mut self, text: &str) -> Result<Vec<f32>, EncodeError> {
+    fn encode(&mut self, text: &str) -> Result<Vec<f32>, InferenceError> {
         self.0.encode(self.1.get(text).copied().unwrap_or(text))
     }
 }

@@ -61,17 +61,18 @@ impl SamSegmenter {
         let SamSettings { points_per_side, points_per_batch, crop_points_divisor, .. } = self.settings;
         let n_per_side = (points_per_side / crop_points_divisor.saturating_pow(layer)).max(1);
         let points = points::grid(n_per_side, width_px, height_px);
-        let points: Vec<[f32; 2]> = points.into_iter().map(|point| embedding.frame.point(point)).collect();
+        let points: Vec<[f32; 2]> =
+            points.into_iter().map(|point| embedding.letterbox.point(point)).collect();
         let labels = vec![1; points_per_batch as usize];
         let found = std::thread::scope(|scope| {
             // A rendezvous channel: at most two batches of logits are in memory, one decoded and one filtered.
             let (sender, receiver) = mpsc::sync_channel::<Decoded>(0);
-            let frame = &embedding.frame;
+            let letterbox = &embedding.letterbox;
             let filtered = scope.spawn(move || {
                 let mut found = Vec::new();
                 let mut left_bytes = MAX_MASK_BYTES;
                 for decoded in receiver {
-                    let upsampler = Upsampler::new(frame, decoded.logits_px);
+                    let upsampler = Upsampler::new(letterbox, decoded.logits_px);
                     let candidates = filters.candidates(&decoded, &upsampler, crop);
                     let len_bytes: u64 = candidates.iter().map(|candidate| candidate.mask.len_bytes()).sum();
                     left_bytes = left_bytes.checked_sub(len_bytes)?;

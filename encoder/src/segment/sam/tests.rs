@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use slag_models::SessionOptions;
-use slag_models::sam::{Decoded, Frame};
+use slag_models::sam::{Decoded, Letterbox};
 use slag_test_support::{needs_shared, onnx_runtime, shared, workspace_root};
 
 use super::filter::Filters;
@@ -108,14 +108,14 @@ fn bilinear(values: &[f64], [width, height]: [usize; 2], to: [usize; 2]) -> Vec<
 }
 
 /// The two resizing steps of SAM's post-processing, with the crop of the padding between them.
-fn enlarged(logits: &[f32], frame: &Frame, logits_px: [u32; 2]) -> Vec<f64> {
+fn enlarged(logits: &[f32], letterbox: &Letterbox, logits_px: [u32; 2]) -> Vec<f64> {
     let logits: Vec<f64> = logits.iter().map(|&logit| f64::from(logit)).collect();
-    let size = frame.size_px as usize;
+    let size = letterbox.size_px as usize;
     let square = bilinear(&logits, logits_px.map(|edge| edge as usize), [size; 2]);
-    let [width, height] = frame.resized_px.map(|edge| edge as usize);
+    let [width, height] = letterbox.resized_px.map(|edge| edge as usize);
     let rows = square.chunks_exact(size).take(height);
     let cut: Vec<f64> = rows.flat_map(|row| row[..width].to_vec()).collect();
-    bilinear(&cut, [width, height], frame.image_px.map(|edge| edge as usize))
+    bilinear(&cut, [width, height], letterbox.image_px.map(|edge| edge as usize))
 }
 
 /// A mask of the recomputation.
@@ -231,7 +231,7 @@ impl Oracle {
         }
     }
 
-    fn of_crop(&self, blobs: &[Blob], frame: &Frame, crop: BoxPx) -> Vec<Dense> {
+    fn of_crop(&self, blobs: &[Blob], letterbox: &Letterbox, crop: BoxPx) -> Vec<Dense> {
         let settings = &self.settings;
         let [width, height] = self.image_px;
         let crop = [crop.x0, crop.y0, crop.x1, crop.y1].map(i64::from);
@@ -240,7 +240,7 @@ impl Oracle {
             if blob.predicted_iou <= settings.predicted_iou {
                 continue;
             }
-            let dense = enlarged(&logits(blob), frame, [LOGITS_PX; 2]);
+            let dense = enlarged(&logits(blob), letterbox, [LOGITS_PX; 2]);
             let n_above = |limit: f64| dense.iter().filter(|logit| **logit > limit).count() as f64;
             let offset = f64::from(settings.stability_offset);
             if n_above(0.0) == 0.0 || n_above(offset) / n_above(-offset) < settings.stability {
@@ -248,7 +248,7 @@ impl Oracle {
             }
             let mut inside = vec![false; width * height];
             for (at, logit) in dense.iter().enumerate() {
-                let (x, y) = (at % frame.image_px[0] as usize, at / frame.image_px[0] as usize);
+                let (x, y) = (at % letterbox.image_px[0] as usize, at / letterbox.image_px[0] as usize);
                 inside[(y + crop[1] as usize) * width + x + crop[0] as usize] = *logit > 0.0;
             }
             let found = self.box_of(&inside);
@@ -300,16 +300,16 @@ fn compare(settings: SamSettings, image_px: [u32; 2], n_prompts: usize, seed: u6
     let crops = points::crops(image_px[0], image_px[1], settings.crop_layers, settings.crop_overlap);
     let (mut found, mut expected) = (Vec::new(), Vec::new());
     for (number, (crop, _)) in crops.iter().enumerate() {
-        let frame = Frame::new(SIZE_PX, [crop.width_px(), crop.height_px()]);
-        let all = blobs(n_prompts, seed + number as u64, frame.resized_px.map(f64::from));
+        let letterbox = Letterbox::new(SIZE_PX, [crop.width_px(), crop.height_px()]);
+        let all = blobs(n_prompts, seed + number as u64, letterbox.resized_px.map(f64::from));
         let mut candidates = Vec::new();
         for batch in all.chunks(3 * 8) {
             let decoded = decoded(batch);
-            let upsampler = Upsampler::new(&frame, decoded.logits_px);
+            let upsampler = Upsampler::new(&letterbox, decoded.logits_px);
             candidates.extend(filters.candidates(&decoded, &upsampler, *crop));
         }
         found.extend(filters.unique_in_crop(candidates));
-        expected.extend(oracle.of_crop(&all, &frame, *crop));
+        expected.extend(oracle.of_crop(&all, &letterbox, *crop));
     }
     let found: Vec<Mask> = filters
         .unique_in_image(found, crops.len())
@@ -356,12 +356,12 @@ fn the_filters_equal_a_plain_recomputation() {
 /// Includes soft objects with a wide fringe around their mask.
 #[test]
 fn stability_equals_a_plain_recomputation() {
-    let frame = Frame::new(SIZE_PX, [210, 150]);
-    let upsampler = Upsampler::new(&frame, [LOGITS_PX; 2]);
+    let letterbox = Letterbox::new(SIZE_PX, [210, 150]);
+    let upsampler = Upsampler::new(&letterbox, [LOGITS_PX; 2]);
     let mut n_soft = 0;
-    for (k, blob) in blobs(10, 11, frame.resized_px.map(f64::from)).into_iter().enumerate() {
+    for (k, blob) in blobs(10, 11, letterbox.resized_px.map(f64::from)).into_iter().enumerate() {
         let blob = Blob { slope: 0.01 * 1.2_f64.powi(k as i32), ..blob };
-        let dense = enlarged(&logits(&blob), &frame, [LOGITS_PX; 2]);
+        let dense = enlarged(&logits(&blob), &letterbox, [LOGITS_PX; 2]);
         let n_above = |limit: f64| dense.iter().filter(|logit| **logit > limit).count() as f64;
         let expected = n_above(1.0) / n_above(-1.0);
         let found = upsampler.cut(&logits(&blob), 1.0, [0, 0]).map_or(0.0, |cut| cut.stability);
@@ -461,13 +461,13 @@ fn enlarged_masks_equal_the_recorded_ones() {
     let (_, labels) = array::<i64>(&golden, "input_labels");
     let decoded = segmenter.sam.decode(&embedding, 3, points.as_chunks::<2>().0, &labels).expect("it runs");
     let (shape, recorded) = array::<u8>(&golden, "masks_original_size");
-    let upsampler = Upsampler::new(&embedding.frame, decoded.logits_px);
+    let upsampler = Upsampler::new(&embedding.letterbox, decoded.logits_px);
     let n_logits = (decoded.logits_px[0] * decoded.logits_px[1]) as usize;
     let (width, stride) = (photo.width() as usize, shape[3] as usize);
     let (mut n_inside, mut n_differing) = (0, 0);
     for (k, logits) in decoded.logits.chunks_exact(n_logits).enumerate() {
         let mask = upsampler.cut(logits, 0.0, [0, 0]).map(|cut| cut.mask.to_mask(0));
-        let dense = enlarged(logits, &embedding.frame, decoded.logits_px);
+        let dense = enlarged(logits, &embedding.letterbox, decoded.logits_px);
         for (at, logit) in dense.iter().enumerate() {
             let (x, y) = (at % width, at / width);
             let byte = recorded[(k * photo.height() as usize + y) * stride + x / 8];

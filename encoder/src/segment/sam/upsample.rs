@@ -4,7 +4,7 @@
 //! bilinear with aligned pixel centres. They are linear in each axis, so this module combines them into one step with at
 //! most three taps per axis, without the intermediate square.
 
-use slag_models::sam::Frame;
+use slag_models::sam::Letterbox;
 
 use super::runs::{Run, RunMask};
 
@@ -67,8 +67,10 @@ pub(super) struct Cut {
 
 impl Upsampler {
     /// Creates the upsampling for `logits_px` columns and rows of logits: at least 3, at most the size of the square.
-    pub(super) fn new(frame: &Frame, logits_px: [u32; 2]) -> Self {
-        let axis = |k: usize| Axis::new(logits_px[k], frame.size_px, frame.resized_px[k], frame.image_px[k]);
+    pub(super) fn new(letterbox: &Letterbox, logits_px: [u32; 2]) -> Self {
+        let axis = |k: usize| {
+            Axis::new(logits_px[k], letterbox.size_px, letterbox.resized_px[k], letterbox.image_px[k])
+        };
         Self { n_columns: logits_px[0] as usize, x: axis(0), y: axis(1) }
     }
 
