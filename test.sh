@@ -7,6 +7,9 @@ sh scripts/setup.sh
 # Mesa's Vulkan layer for the choice of a device asks libwayland, which prints an error on machines without a desktop.
 export NODEVICE_SELECT=1
 
+# Cargo builds the programs of the whole workspace before its tests; these need not build them again.
+export SLAG_PROGRAMS_ARE_BUILT=1
+
 log=${CARGO_TARGET_DIR:-target}/test-output.txt
 mkdir -p "${log%/*}"
 # A pipeline returns the exit code of its last command, so cargo's goes through a file.

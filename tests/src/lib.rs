@@ -14,27 +14,23 @@ pub fn root() -> PathBuf {
 }
 
 /// Returns a program of the project, built as the tests are.
+///
+/// `cargo test --workspace` builds all programs before the tests; `./test.sh` says so by `SLAG_PROGRAMS_ARE_BUILT`.
+/// Without that variable the programs are built first: a part of the tests may run alone.
 pub fn program(name: &str) -> PathBuf {
     static BUILT: OnceLock<PathBuf> = OnceLock::new();
     let folder = BUILT.get_or_init(|| {
         // target/PROFILE/deps/this-test
         let exe = std::env::current_exe().expect("a test has a path");
         let folder = exe.ancestors().nth(2).expect("tests lie in target/PROFILE/deps").to_owned();
-        let mut build = Command::new(env!("CARGO"));
-        build.current_dir(root()).args([
-            "build",
-            "--locked",
-            "--bin",
-            "slag-encoder",
-            "--bin",
-            "slag-lab",
-            "--bin",
-            "slag-edge",
-        ]);
-        if folder.ends_with("release") {
-            build.arg("--release");
+        if std::env::var_os("SLAG_PROGRAMS_ARE_BUILT").is_none() {
+            let mut build = Command::new(env!("CARGO"));
+            build.current_dir(root()).args(["build", "--workspace", "--bins", "--locked"]);
+            if folder.ends_with("release") {
+                build.arg("--release");
+            }
+            assert!(build.status().expect("cargo runs").success(), "the programs do not build");
         }
-        assert!(build.status().expect("cargo runs").success(), "the programs do not build");
         folder
     });
     folder.join(name)

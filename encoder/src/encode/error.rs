@@ -6,10 +6,10 @@ use slag_common::poses::PoseError;
 use slag_common::splat::SplatError;
 use slag_models::ModelError;
 
-use crate::memory::MemoryError;
 use crate::embed::EmbedError;
 use crate::ingest::{GeoError, IngestError};
 use crate::lift::ContributionError;
+use crate::memory::MemoryError;
 use crate::raster::RasterError;
 use crate::segment::SegmentError;
 use crate::store::StoreError;

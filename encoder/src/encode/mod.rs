@@ -34,9 +34,9 @@ use crate::progress::Progress;
 use crate::store::Store;
 use context::RunContext;
 
+pub use crate::memory::{MemoryError, Reservation};
 pub use engines::{Engines, Perturbation};
 pub use error::EncodeError;
-pub use crate::memory::{MemoryError, Reservation};
 pub use preset::{Choices, Preset};
 pub use report::{CellReport, EncodeSummary, SkippedView, StageReport, ViewsReport};
 pub use settings::{

@@ -212,7 +212,8 @@ impl Refinement {
         let sketches_bytes = (n_gaussians * (AXES + size_of::<u32>())) as u64;
         let graph_bytes = Superpoints::working_bytes(n_gaussians, &SuperpointSettings::default());
         memory.reserve(Phase::Refine, "superpoints of all Gaussians", sketches_bytes + graph_bytes);
-        let n_scales = usize::from(settings.superpoint > 0.0 || settings.fill) + usize::from(settings.coarse > 0.0);
+        let n_scales =
+            usize::from(settings.superpoint > 0.0 || settings.fill) + usize::from(settings.coarse > 0.0);
         let labels_bytes = (n_gaussians * n_scales * size_of::<u32>()) as u64;
         memory.reserve(Phase::Cells, "the superpoints of each Gaussian", labels_bytes);
     }
