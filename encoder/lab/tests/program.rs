@@ -7,7 +7,9 @@ fn lab(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_slag-lab")).args(args).output().expect("the program starts")
 }
 
+/// Without the feature `measure` there is no `eval` and no `bench`.
 #[test]
+#[cfg(feature = "measure")]
 fn help_names_every_job() {
     let output = lab(&["--help"]);
     let help = String::from_utf8(output.stdout).expect("UTF-8");

@@ -1,7 +1,9 @@
 //! The command line, a file a command: flags in, exit code out.
 
+#[cfg(feature = "measure")]
 mod bench;
 mod demo;
+#[cfg(feature = "measure")]
 mod eval;
 mod generate;
 
@@ -25,6 +27,7 @@ pub struct Cli {
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Evaluates stores and encoders against labels.
+    #[cfg(feature = "measure")]
     #[command(subcommand)]
     Eval(eval::EvalCommand),
     /// Generates scenes, crops and photos with known contents.
@@ -33,6 +36,7 @@ pub enum Command {
     /// Generates a room and a yard, then encodes, serves, fetches and queries them.
     Demo(demo::DemoArgs),
     /// Benchmarks this machine.
+    #[cfg(feature = "measure")]
     #[command(subcommand)]
     Bench(bench::BenchCommand),
 }
@@ -43,9 +47,11 @@ pub fn run(cli: Cli) -> Exit {
     let progress = progress::shown(cli.output.shows_progress());
     let progress = progress.as_ref();
     let result = match cli.command {
+        #[cfg(feature = "measure")]
         Command::Eval(command) => eval::run(&command, progress, json),
         Command::Generate(command) => generate::run(&command, progress),
         Command::Demo(args) => demo::run(&args, progress, json),
+        #[cfg(feature = "measure")]
         Command::Bench(command) => bench::run(&command, progress, json),
     };
     exit_of(result, json)
