@@ -2,7 +2,7 @@
 
 use slag_tests::*;
 
-/// Photos and splat fit as well as the scene's own notes say (25.02 dB at 1000 px).
+/// The splat fits the photos as well as the scene's notes state (25.02 dB at 1000 px).
 #[needs_shared]
 #[test]
 fn check_confirms_the_poses() {
@@ -28,7 +28,7 @@ fn check_confirms_the_poses() {
     assert!(report["diagnosis"].is_null());
 }
 
-/// From photos to a robot: automatic masks, shards around a place given in metres and in degrees.
+/// Encodes photos with automatic masks and fetches the shards around a place, given in metres and in degrees.
 #[needs_shared]
 #[test]
 fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
@@ -56,8 +56,8 @@ fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
     let n_cells = summary["n_cells"].as_u64().expect("a count");
     let server = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
 
-    // A point on the ground near the middle, and the same in degrees (oracle: another implementation's
-    // figures, from an ENU library for the origin of geo.json).
+    // A point on the ground near the middle, and the same point in degrees. Oracle: an ENU library's figures for the
+    // origin of geo.json.
     let origin = server.get("/v1/cells?x=0&y=0&z=2&radius=30");
     let nearby = origin["cells"].as_array().expect("cells").len() as u64;
     assert!(0 < nearby && nearby < n_cells, "{nearby} of {n_cells} cells");

@@ -11,9 +11,8 @@ use slag_encoder::lift::published::{read_field, read_regions};
 use slag_encoder::store::StoreReader;
 use slag_tests::*;
 
-/// Encodes the house with its given masks and the ConSE encoder and compares total weights, embeddings, and
-/// per word AUC and IoU. The tolerances are the reference's own: crops, resizing and runtime versions
-/// differ a little.
+/// Encodes the house with its given masks and the ConSE encoder, and compares total weights, embeddings, and each word's
+/// AUC and IoU. The tolerances are the reference's own, because crops, resizing and runtime versions differ slightly.
 #[needs_shared]
 #[test]
 fn the_field_agrees_with_the_independent_reference() {
@@ -34,12 +33,12 @@ fn the_field_agrees_with_the_independent_reference() {
         "--models",
         text(&models),
         "--preset",
-        "paper",
+        "plain",
         "--background",
         "white",
         "--min-mask-px",
         "200",
-        // The reference's.
+        // The reference's width.
         "--raster-width",
         "640",
         "--metric",
@@ -54,8 +53,8 @@ fn the_field_agrees_with_the_independent_reference() {
     check_words(&house, &store, &models, dir.path());
 }
 
-/// The GPU's field is the CPU's within the bound of docs/numerics.md: the same sums but for pixels across a cut,
-/// and those together less than a 50,000th. Where the machine has no GPU, a software one does the work.
+/// The GPU's field equals the CPU's within the bound of docs/numerics.md: contributions differ only at pixels across a cut,
+/// together by less than a 50,000th. A machine without a GPU uses a software adapter.
 #[needs_shared]
 #[test]
 fn a_gpu_gives_the_field_of_the_cpu() {
@@ -72,7 +71,7 @@ fn a_gpu_gives_the_field_of_the_cpu() {
         let (scene, views, masks) =
             (house.join("point_cloud.ply"), house.join("sparse/0"), house.join("gt/masks"));
         let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views)]);
-        command.args(["--preset", "paper"]);
+        command.args(["--preset", "plain"]);
         command.args(["--masks", text(&masks), "--store", text(&store), "--device", device]);
         run_json(command.args([
             "--views-limit",
@@ -111,13 +110,13 @@ fn a_gpu_gives_the_field_of_the_cpu() {
     assert!(relative_l1 < 2e-5 && largest < 0.01, "{relative_l1:e} {largest:e}");
 }
 
-/// Returns an array of an archive.
+/// Reads an array of an archive.
 fn array<T: npyz::Deserialize>(npz: &mut Npz, name: &str) -> Vec<T> {
     let member = npz.array(name).expect("readable").expect("there");
     npyz::NpyFile::new(member).expect("an array").into_vec().expect("of that type")
 }
 
-/// Cosine at least 0.99 for 95 % of the reference's Gaussians, total weights within 1 %.
+/// Requires a cosine of at least 0.99 for 95 % of the reference's Gaussians, and total weights within 1 %.
 fn check_embeddings(house: &Path, store: &Path) {
     let mut npz = Npz::open(&house.join("gt/reference_embeddings.npz")).expect("an npz");
     let index: Vec<u32> = array(&mut npz, "index");
@@ -164,7 +163,7 @@ fn check_embeddings(house: &Path, store: &Path) {
     assert!(weight_errors[n * 95 / 100] <= 0.01);
 }
 
-/// A word's figures: area under the ROC curve, IoU of the multi-class answer.
+/// A word's area under the ROC curve, and the IoU of the multi-class answer.
 struct Words {
     words: Vec<String>,
     aucs: Vec<f64>,
@@ -195,7 +194,7 @@ fn check_words(house: &Path, store: &Path, models: &Path, dir: &Path) {
     assert!((auc - reference["auc_mean"].as_f64().expect("a figure")).abs() <= 0.01);
     assert!((iou - reference["miou"].as_f64().expect("a figure")).abs() <= 0.02);
 
-    // The program's own evaluation, which shares no code with the judge above.
+    // The program's own evaluation shares no code with the one above.
     let (scene, truth) = (house.join("point_cloud.ply"), house);
     let report = run_json(&mut lab(&[
         "eval",
@@ -223,12 +222,12 @@ fn check_words(house: &Path, store: &Path, models: &Path, dir: &Path) {
         let bytes = bytes as f64 / manifest.n_gaussians as f64;
         println!("{profile}: {bytes:.2} bytes a Gaussian, AUC {:.4}, mIoU {:.4}", of_profile.0, of_profile.1);
         assert!(bytes <= most_bytes);
-        // Half a point, as the profile promises; the others are closer.
+        // The profile promises half a point; the others are closer.
         assert!((of_profile.0 - auc).abs() <= 0.005 && of_profile.1 - iou >= -0.005, "{profile}");
     }
 }
 
-/// Scores the words, by the field in full precision or as a profile decodes it, against the labels.
+/// Scores the words against the labels, by the field in full precision or as a profile decodes it.
 fn judge(
     house: &Path,
     store: &Path,
@@ -248,7 +247,7 @@ fn judge(
         .map(|i| (i["id"].as_u64().expect("an id"), i["category"].as_str().expect("a category").to_owned()))
         .collect();
     let truth: Vec<u16> = read_npy(&house.join("gt/gaussian_instance.npy"));
-    // Gaussians of background surfaces and unlabelled ones take no part.
+    // Background and unlabelled Gaussians are left out.
     let (objects, labels): (Vec<usize>, Vec<&String>) =
         truth.iter().enumerate().filter_map(|(k, id)| category.get(&u64::from(*id)).map(|c| (k, c))).unzip();
 
@@ -263,7 +262,7 @@ fn judge(
         run(command.args(scores_to));
         let all: Vec<f32> = read_npy(&path);
         assert_eq!(all.len(), truth.len());
-        // What was never seen scores below everything.
+        // Gaussians that were never seen score below all others.
         scores.push(
             objects.iter().map(|k| if all[*k].is_nan() { -2.0 } else { all[*k] }).collect::<Vec<f32>>(),
         );

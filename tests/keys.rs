@@ -1,4 +1,4 @@
-//! A store's key is changed under robots that fetch, through the real programs.
+//! Rotates a store's key while robots fetch, with the real programs.
 
 use std::path::Path;
 
@@ -42,14 +42,14 @@ fn robots_follow_a_change_of_keys() {
     let finished = keys(&["rotate", "--finish"]);
     assert_eq!((&finished["present"], &finished["previous"]), (&second, &first));
     assert_eq!(keys(&["show"]), finished);
-    // The robot that fetched in between goes on by itself, though its command line names the old key.
+    // The robot that fetched during the rotation goes on, although its command line names the old key.
     let report = run_json(&mut fetch(&follows, &[pinned]));
     assert_eq!((&report["key"], &report["replaced_key"]), (&second, &first));
     assert_eq!(report["downloaded"]["n_shards"], 0, "the shards are the same");
     let query =
         |cache: &Path| run_json(&mut edge(&["query", "blue", "--cache", text(cache)]))["answers"].clone();
     assert_eq!(query(&follows), query(&sleeps));
-    // The one that slept is told both.
+    // The robot that slept is given both keys.
     let refused = fetch(&sleeps, &[pinned]).output().expect("runs");
     assert!(String::from_utf8_lossy(&refused.stderr).contains("is signed by key"));
     let both = [pinned, second.as_str().expect("text")];

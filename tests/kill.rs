@@ -1,4 +1,4 @@
-//! Power cuts: encode and fetch are killed at random moments and started again.
+//! Power cuts: kills encode and fetch at random moments and starts them again.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -11,9 +11,9 @@ use slag_tests::*;
 const N_ENCODE_KILLS: usize = 20;
 const N_FETCH_KILLS: usize = 100;
 
-/// Runs a command to its end and returns what it printed, or kills it after a while.
+/// Runs a command and returns its output, or kills it after a while.
 fn run_or_kill(command: &mut Command, after: Duration) -> Option<Vec<u8>> {
-    // What is printed is less than a pipe holds, so nobody has to read meanwhile.
+    // The output fits in the pipe's buffer, so nobody has to read it meanwhile.
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("starts");
     let start = Instant::now();
     while start.elapsed() < after {
@@ -39,8 +39,8 @@ fn killed_encodes_resume_and_show_nothing_half() {
     let encode_time = start.elapsed();
     let expected = content(&whole);
 
-    // Killed again and again, within the first half so that several kills hit each store; a store that got
-    // finished in between makes room for the next.
+    // Kills come within the first half of the time, so that several hit each store. A finished store is replaced by a
+    // new one.
     let mut random = Random::new(7);
     let (mut n_kills, mut n_stores, mut n_resumed) = (0, 0, 0);
     while n_kills < N_ENCODE_KILLS {
@@ -65,7 +65,7 @@ fn killed_encodes_resume_and_show_nothing_half() {
     println!("encode: {n_kills} kills, {n_stores} stores, {n_resumed} views not done twice");
 }
 
-/// A robot with generation 1 on board is killed while it fetches generation 2, in which all shards differ.
+/// Kills a robot with generation 1 on board while it fetches generation 2, in which all shards differ.
 #[test]
 fn killed_fetches_leave_the_old_or_the_new_generation() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -109,7 +109,7 @@ fn killed_fetches_leave_the_old_or_the_new_generation() {
         assert!(is_killed || found.0 == 2, "run {n_runs}: a fetch that ended well is there");
         n_kills += usize::from(is_killed);
         n_new += u64::from(is_killed && found.0 == 2);
-        // Often enough to see that what a kill leaves does not stand in the way.
+        // Often enough to show that leftovers of a kill do no harm.
         if n_runs % 10 == 0 {
             run(&mut fetch(&stores[1], &cache));
             assert_eq!(ask(&cache), expected[1], "run {n_runs}: the next fetch");

@@ -24,15 +24,15 @@ const CRATES: [(&str, &str); 7] = [
 /// A module's path, the crate's name first.
 type ModulePath = Vec<String>;
 
-/// One module, as its source has it.
+/// A module of the source.
 #[derive(Default)]
 struct Module {
     file: PathBuf,
     children: BTreeSet<String>,
-    /// Names that `use` brings in: the path as written, and whether other modules see it.
+    /// Names that `use` imports: the path as written, and whether other modules see it.
     imports: BTreeMap<String, ModulePath>,
     globs: Vec<ModulePath>,
-    /// Paths in use, re-exports left out.
+    /// Paths in use, without re-exports.
     paths: BTreeSet<ModulePath>,
 }
 
@@ -82,7 +82,7 @@ impl Workspace {
         for item in items {
             match item {
                 Item::Mod(child) if !is_test(&child.attrs) => {
-                    // Of two alternatives chosen by a feature, the first is read.
+                    // The first of two alternatives that a feature chooses is read.
                     if module.children.insert(child.ident.to_string()) {
                         children.push(child);
                     }
@@ -108,7 +108,7 @@ impl Workspace {
         }
     }
 
-    /// Returns the module that defines what a path names, as seen from a module; `None` for foreign crates.
+    /// Returns the module that defines the item of a path, as seen from a module; `None` for foreign crates.
     fn resolve(&self, from: &ModulePath, path: &[String], depth: usize) -> Option<ModulePath> {
         if depth > 16 {
             return None;
@@ -149,7 +149,7 @@ impl Workspace {
                 at.push(name.clone());
                 rest = &rest[1..];
             } else if let Some(import) = module.imports.get(name) {
-                // An import of its own name, as of a crate, does not lead further.
+                // An import under its own name, such as a crate's, leads no further.
                 if import.first() == Some(name) && import.len() == 1 {
                     return None;
                 }
@@ -163,7 +163,7 @@ impl Workspace {
         self.0.contains_key(&at).then_some(at)
     }
 
-    /// Returns (user, used): modules of different files, with the path that ties them.
+    /// Returns pairs of (user, used) modules of different files, with the path that connects them.
     fn edges(&self) -> Vec<(&ModulePath, ModulePath, String)> {
         let mut edges = Vec::new();
         for (from, module) in &self.0 {
@@ -244,7 +244,7 @@ impl<'ast> Visit<'ast> for Module {
     }
 
     fn visit_macro(&mut self, item: &'ast syn::Macro) {
-        // Arguments of macros are tokens: paths in them are found by their separators.
+        // Macro arguments are tokens; their paths are found by separators.
         let text = item.tokens.to_string().replace(" :: ", "::");
         for word in text.split(|c: char| !(c.is_alphanumeric() || c == '_' || c == ':')) {
             if word.starts_with("crate::") || word.starts_with("super::") {
@@ -255,7 +255,7 @@ impl<'ast> Visit<'ast> for Module {
     }
 }
 
-/// Returns the layers that ARCHITECTURE.md states: of a crate, its modules from the bottom up, those of one line level.
+/// Returns the layers that ARCHITECTURE.md states: the modules of each crate from the bottom up.
 fn stated_layers() -> BTreeMap<String, Vec<Vec<String>>> {
     let text = fs_err::read_to_string(root().join("ARCHITECTURE.md")).expect("ARCHITECTURE.md");
     let block =
@@ -270,7 +270,7 @@ fn stated_layers() -> BTreeMap<String, Vec<Vec<String>>> {
     layers
 }
 
-/// A layer may use the layers before it, and nothing of its own or above.
+/// A layer may use the layers below it, nothing else.
 #[test]
 fn modules_use_only_the_layers_below() {
     let workspace = Workspace::read();
@@ -311,7 +311,7 @@ fn files_form_no_circle() {
         let (user, used) = (&workspace.0[*from].file, &workspace.0[to].file);
         uses.entry(user).or_default().entry(used).or_insert_with(|| path.clone());
     }
-    // What can be reached from a file; two files that reach each other are in a circle.
+    // The files reachable from each file; two files that reach each other form a circle.
     let reach = |start: &Path| -> BTreeSet<&Path> {
         let mut seen = BTreeSet::new();
         let mut open: Vec<&Path> = uses.get(start).into_iter().flat_map(|m| m.keys().copied()).collect();
@@ -336,7 +336,7 @@ fn files_form_no_circle() {
     assert!(wrong.is_empty(), "files in circles:\n{}", wrong.join("\n"));
 }
 
-/// No source file is longer than a reader can hold in mind; tables that a program wrote do not count.
+/// No source file is too long to read at once; generated tables do not count.
 #[test]
 fn no_file_is_over_500_lines() {
     let mut open: Vec<PathBuf> =

@@ -1,5 +1,5 @@
-//! A scene in which every field has been poisoned in every way: what cannot be used is rejected and counted, and
-//! no number of the store is anything but a number.
+//! Poisons every field of a scene in every way: unusable Gaussians are rejected and counted, and the store holds finite
+//! numbers only.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -10,7 +10,7 @@ use slag_encoder::lift::published::{read_field, read_regions};
 use slag_encoder::store::StoreReader;
 use slag_tests::*;
 
-/// A PLY of doubles, made of one of floats.
+/// Converts a PLY of floats into one of doubles.
 struct Ply {
     names: Vec<String>,
     rows: Vec<f64>,
@@ -59,7 +59,7 @@ fn poisons() -> Vec<(Vec<(&'static str, f64)>, bool)> {
         all.extend([nan, infinity, -infinity].map(|bad| (vec![(name, bad)], false)));
     }
     for name in ["scale_0", "scale_1", "scale_2"] {
-        // Logarithms: minus infinity is a flat Gaussian, 100 more than f32 holds.
+        // Logarithms: minus infinity is a flat Gaussian; exp(100) exceeds f32.
         all.extend([nan, infinity, 100.0].map(|bad| (vec![(name, bad)], false)));
         all.push((vec![(name, -infinity)], true));
     }

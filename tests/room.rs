@@ -15,8 +15,8 @@ fn the_demo_answers_rightly() {
     }
 }
 
-/// The embedded encoders on shapes, and pairs of noun and colour, that they never saw; the whole figures are in their
-/// card, by the same command.
+/// Evaluates the embedded encoders on shapes, and pairs of noun and colour, that they never saw. Their card has all
+/// figures, by the same command.
 #[test]
 fn the_embedded_encoders_tell_things() {
     let report = run_json(&mut lab(&["eval", "encoder", "--n-scenes", "30"]));
@@ -25,7 +25,7 @@ fn the_embedded_encoders_tell_things() {
         let tally = &report["tallies"][i][1];
         tally[what].as_f64().expect("a number") / tally["n_crops"].as_f64().expect("a number")
     };
-    // Whole things; the same in pairs that were kept from learning.
+    // Whole things, and held-out pairs.
     assert!(tally(0, "noun") > 0.85 && tally(0, "colour") > 0.85 && tally(0, "material") > 0.7);
     assert!(tally(1, "noun") > 0.65 && tally(1, "colour") > 0.65);
     assert!(report["found"].as_f64() > Some(0.7) && report["found_absent"].as_f64() < Some(0.01));
@@ -37,7 +37,7 @@ fn generate(dir: &Path) -> (std::path::PathBuf, std::path::PathBuf) {
     (room.join("scene.ply"), room.join("transforms.json"))
 }
 
-/// The same shards for any number of threads, any order of views in the poses file, and any working memory.
+/// Shards do not depend on threads, the order of views in the poses file, or working memory.
 #[test]
 fn stores_are_equal_to_the_byte() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -72,7 +72,7 @@ fn stores_are_equal_to_the_byte() {
     assert_eq!(encode("shuffled", &shuffled, "4", "96MiB"), one);
 }
 
-/// What a user does wrong is answered with what to do.
+/// Each mistake of a user gets a message that says what to do.
 #[test]
 fn mistakes_are_named() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -134,7 +134,7 @@ fn the_robots_service_answers() {
     );
     assert_eq!(robot.get("/status")["scene"]["generation"], 1);
 
-    // Its source and place are remembered.
+    // The robot remembers its source and place.
     encode();
     run(&mut edge(&["fetch", "--radius", "50", "--cache", text(&cache)]));
     for _ in 0..100 {
@@ -146,8 +146,8 @@ fn the_robots_service_answers() {
     panic!("the service did not take up the new generation");
 }
 
-/// Views without masks, a mask of one pixel, a view that sees nothing and photos that are missing or damaged are
-/// all normal: counted, named, and left out where they must be.
+/// Views without masks, a mask of one pixel, a view that sees nothing, and missing or damaged photos are normal input: they
+/// are counted and named, and left out where necessary.
 #[test]
 fn odd_views_are_counted_not_fatal() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -222,7 +222,7 @@ fn an_interrupted_encode_resumes() {
         text(&store),
     ];
     let mut child = encoder(&args).stderr(std::process::Stdio::null()).spawn().expect("starts");
-    // Once the first view's sums are there, the encode is in the middle of the others.
+    // Once the first view's contributions are on disk, the encode works on the others.
     let sums = store.join("job/views");
     while fs_err::read_dir(&sums).map_or(0, Iterator::count) == 0 {
         assert!(child.try_wait().expect("waits").is_none(), "ended before it could be interrupted");

@@ -1,4 +1,5 @@
-//! An encode whose masks SAM finds. The model is tiny and its weights random: its masks mean nothing, the way is real.
+//! Encodes with masks from SAM. The model is tiny and its weights are random, so its masks mean nothing; the code path is
+//! the real one.
 
 use std::path::Path;
 
@@ -6,8 +7,8 @@ use serde_json::Value;
 use slag_common::poses;
 use slag_tests::*;
 
-/// Photos that are damaged in the middle of their data are left out and named, the store does not depend on threads,
-/// and a directory of another kind is refused in one message.
+/// Photos with damaged data are left out and named; the store does not depend on threads; a model directory of another kind
+/// is refused in one message.
 #[needs_shared]
 #[test]
 fn sam_finds_masks_the_same_for_any_number_of_threads() {
@@ -16,7 +17,7 @@ fn sam_finds_masks_the_same_for_any_number_of_threads() {
     let (scene, views) = (house.join("point_cloud.ply"), house.join("sparse/0"));
     let images = dir.path().join("images");
     copy_dir(&house.join("images"), &images);
-    // Of three views the first is always one.
+    // The first of three views is always used.
     let first = &poses::read(&views, Some(&images)).expect("poses").views[0];
     let photo = fs_err::read(&first.image_path).expect("reads");
     fs_err::remove_file(&first.image_path).expect("removes");
@@ -35,7 +36,7 @@ fn sam_finds_masks_the_same_for_any_number_of_threads() {
             "nth",
             "--metric",
         ]);
-        // What random weights find is weak.
+        // Random weights find weak masks.
         command.args([
             "--sam-predicted-iou",
             "0",

@@ -1,4 +1,4 @@
-//! Views by coverage: a limit and a budget of time stop an encode early, and the next one goes on.
+//! Views by coverage: a limit or a time budget stops an encode early, and the next one goes on.
 
 use std::path::Path;
 
@@ -35,35 +35,35 @@ fn an_encode_of_some_views_goes_on_with_more() {
     assert_eq!(counts(&six), [6, 3], "the first three are not done again");
     assert!(coverage(&six) > coverage(&three) && coverage(&three) > 0.3, "{three} {six}");
     assert_ne!(content(&store), of_three);
-    // Fewer again: the same three, from what is there.
+    // A lower limit: the same three, from kept contributions.
     let three = encode(&room, &store, &["--views-limit", "3"]);
     assert_eq!(counts(&three), [3, 3]);
     assert_eq!(content(&store), of_three, "the views that are left over do not show");
-    // A budget that is over at once: what is there, and nothing more.
+    // A budget of no time: the kept views, and no more.
     let stopped = encode(&room, &store, &["--time-budget", "0.000001"]);
     assert_eq!(counts(&stopped), [6, 6]);
-    // All of them: the bytes of an encode that knew no order.
+    // All views: the bytes of an encode without an order.
     let all = encode(&room, &store, &["--view-order", "coverage"]);
     assert_eq!((counts(&all), coverage(&all)), ([10, 6], 1.0));
     assert_eq!(content(&store), expected);
-    // All were used, so nothing is kept.
+    // All views were used, so nothing is kept.
     assert_eq!(counts(&encode(&room, &store, &["--view-order", "nth", "--views-limit", "2"])), [2, 0]);
-    // Another raster width is another job: what was published is no unfinished work.
+    // Another raster width is another job; the published views are no unfinished work.
     assert_eq!(counts(&encode(&room, &store, &["--views-limit", "2", "--min-mask-px", "300"])), [2, 0]);
 
-    // An empty store and no time: one view, and a whole generation of it.
+    // An empty store and no time: a generation of one view.
     let one = encode(&room, &dir.path().join("one"), &["--time-budget", "0.000001", "--threads", "1"]);
     assert_eq!(counts(&one), [1, 0]);
 
-    // Kept sums: another codebook of the same views, without the views.
+    // Kept contributions: another codebook of the same views, without their photos.
     let kept = dir.path().join("kept");
     assert_eq!(counts(&encode(&room, &kept, &["--keep-views", "--compact-error", "0.3"])), [10, 0]);
     assert_eq!(counts(&encode(&room, &kept, &[])), [10, 10]);
     assert_eq!(content(&kept), expected);
 }
 
-/// With --raster-width auto each view has its own by its content, weighs no more for a finer one, and the summary says
-/// what was spent on views and cells; threads and resuming do not show.
+/// With --raster-width auto each view's width follows its content, a finer raster gives a view no more weight, and the
+/// summary states the cost of views and cells. Threads and resuming change nothing.
 #[test]
 fn what_was_spent_goes_by_content_and_is_reported() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -74,7 +74,7 @@ fn what_was_spent_goes_by_content_and_is_reported() {
             (room.join("scene.ply"), room.join("transforms.json"), dir.path().join(name));
         let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views), "--metric"]);
         // Few enough masks that some views have long borders and others have not.
-        command.args(["--store", text(&store), "--preset", "paper", "--mask-levels", "2"]);
+        command.args(["--store", text(&store), "--preset", "plain", "--mask-levels", "2"]);
         run_json(command.args(more))
     };
     let column = |summary: &Value, name: &str| {

@@ -48,7 +48,7 @@ fn view(name: &str) -> Labelled {
     Labelled { photo, labels, masks }
 }
 
-/// The level that a true Gaussian blur of the box gives, in f64; beyond the edge its pixels are repeated.
+/// Returns the pixel level under a true Gaussian blur of the box, in f64; edge pixels are repeated beyond the edge.
 fn blurred(photo: &RgbImage, b: BoxPx, x: u32, y: u32) -> [f64; 3] {
     let sigma = 0.05 * f64::from(b.width_px().max(b.height_px()));
     let reach = (4.0 * sigma).ceil() as i64;
@@ -141,7 +141,7 @@ fn vectors_of_a_view_are_the_crops_own_in_any_batch() {
     assert_eq!(none.expect("nothing to do"), Vec::<f32>::new());
 }
 
-/// Notes how many crops it is given at a time; a vector is the crop's width and height.
+/// Records the number of crops per call; a vector is the crop's width and height.
 struct Recorder {
     batches: Vec<usize>,
 }

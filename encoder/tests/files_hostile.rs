@@ -1,4 +1,4 @@
-//! The encoder's own files and the geo-reference, each damaged in 1,000 ways: refused with the reason, never a panic.
+//! Damages the encoder's own files and the geo-reference in 1,000 ways each: they are refused with the reason, without a panic.
 
 use std::path::Path;
 

@@ -86,7 +86,7 @@ fn shapes_on_a_noisy_ramp() {
     }
 }
 
-/// A box of the floor's colour, which only its depth tells from the floor; the floor slants away.
+/// A box of the floor's colour on a slanting floor: only depth separates them.
 #[test]
 fn depth_separates_what_colour_does_not() {
     let size = (200, 150);
@@ -169,7 +169,7 @@ fn the_identity_depends_on_every_parameter() {
     assert_ne!(GraphSegmenter::new(other).identity().unwrap(), GraphSegmenter::default().identity().unwrap());
 }
 
-/// Oracle: the hash that `sha256sum` prints of the embedded file.
+/// Oracle: the output of `sha256sum` for the embedded file.
 #[test]
 fn the_identity_holds_the_hash_of_the_embedded_weights() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
@@ -182,7 +182,7 @@ fn the_identity_holds_the_hash_of_the_embedded_weights() {
 }
 
 /// Returns the mean over true instance masks of at least 200 pixels of the best overlap, and the
-/// number of masks found, over eight photos that the default settings were not chosen with.
+/// number of masks found, over eight photos that were not used to choose the default settings.
 fn house_score(settings: &GraphSettings) -> (f64, f64) {
     let scene = shared("scenes/house_a");
     let truth = GivenMasks::open(&scene.join("gt/masks"), Vec::new()).unwrap();

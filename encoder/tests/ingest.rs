@@ -38,8 +38,8 @@ fn pattern([u, v]: [f64; 2]) -> [f64; 3] {
     [128.0 + 100.0 * (u / 9.0).sin(), 128.0 + 100.0 * (v / 11.0).cos(), 128.0 + 0.5 * (u - v)]
 }
 
-/// Finds the ideal point of a distorted one by Newton's method with a numeric derivative: the
-/// oracle of the tests below, as the code itself only ever goes the other way.
+/// Finds the ideal point of a distorted one by Newton's method with a numeric derivative. Oracle of the tests below: the
+/// code itself only distorts.
 fn invert(distortion: Distortion, [x, y]: [f64; 2]) -> [f64; 2] {
     let mut ideal = [x, y];
     for _ in 0..50 {
@@ -135,7 +135,7 @@ fn labels_are_those_of_the_nearest_pixel() {
     }
 }
 
-/// Beyond the fold of a strong barrel lens there is nothing to see, though the formula leads back in.
+/// Pixels beyond the fold of a strong barrel lens are invalid, although the formula maps them back into the image.
 #[test]
 fn folded_pixels_are_not_valid() {
     let camera = Intrinsics {
@@ -193,7 +193,7 @@ fn sizes_that_are_a_scale_bring_the_camera_along() {
     }
 }
 
-/// An EXIF orientation must not turn the pixels: COLMAP reads them as they are stored, too.
+/// EXIF orientation is ignored, because COLMAP reads pixels as they are stored.
 #[test]
 fn exif_orientation_is_ignored() {
     let dir = tempfile::tempdir().unwrap();

@@ -18,7 +18,7 @@ use slag_math::random::Random;
 
 const DIM: usize = 512;
 
-/// Below this length of the mean vector a Gaussian has no evidence.
+/// A Gaussian with a shorter mean vector has no evidence.
 const MIN_MEAN_LENGTH: f64 = 1e-3;
 
 fn uniform(random: &mut Random) -> f64 {
@@ -249,7 +249,8 @@ fn exact_shard(vectors: &[Vec<f32>], means_in_world: Vec<DVec3>) -> AlignedBytes
     AlignedBytes::copy_of(&built.shards[0].bytes)
 }
 
-/// Components from 1 down to 1e-12 are stored as f16: off by half a step of 2^-11, below 2^-14 of 2^-24, and zero in the end.
+/// Components from 1 down to 1e-12 are stored as f16: the error is half a step of 2^-11, below 2^-14 of 2^-24, and the
+/// smallest become zero.
 #[test]
 fn embeddings_stored_as_f16() {
     let random = &mut Random::new(4);

@@ -1,4 +1,4 @@
-//! Masks: run lengths, files that users give, the partition into regions.
+//! Masks: run lengths, users' files, the partition into regions.
 
 mod common;
 
@@ -79,7 +79,7 @@ fn view(name: &str, width_px: u32, height_px: u32) -> View {
     View { name: name.into(), image_path: "none".into(), intrinsics, camera_from_world: DAffine3::IDENTITY }
 }
 
-/// Loads what a folder of masks gives for image `left/a.jpg` of 8 x 6 pixels.
+/// Loads the masks of image `left/a.jpg`, 8 x 6 pixels, from a folder.
 fn load(
     dir: &Path,
     ignore_ids: &[u32],
@@ -96,7 +96,7 @@ fn load(
     loaded
 }
 
-/// Masks are identified by what their files hold: same paths and lengths are not enough, and the place is irrelevant.
+/// Masks are identified by the contents of their files, not by paths, lengths or place.
 #[test]
 fn the_identity_of_given_masks_is_that_of_their_contents() {
     let identity =
@@ -368,7 +368,7 @@ fn three_hundred_overlapping_masks() {
     assert_eq!(partition(&masks, 64, 48, 64, 48, Some(&[false; 64 * 48])).0.n_regions, 0);
 }
 
-/// Slivers go to the neighbour with the longest border; what is all that a mask has, and what has no neighbour, stays.
+/// Slivers join the neighbour with the longest border; a mask's only region, and one without a neighbour, stay.
 #[test]
 fn slivers_go_to_their_neighbours() {
     let inside =

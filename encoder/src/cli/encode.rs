@@ -79,6 +79,9 @@ pub struct EncodeArgs {
     /// Masks with fewer pixels are left out [default: the preset's].
     #[arg(long, value_name = "PX")]
     pub min_mask_px: Option<u32>,
+    /// Keeps slivers, which ragged edges of overlapping masks leave, as regions; without it they join their neighbours.
+    #[arg(long)]
+    pub keep_slivers: bool,
     /// Threads [default: all cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
@@ -161,7 +164,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
     let metric = args.metric || geo.is_some();
     let folder_name = args.store.file_name().map(|name| name.to_string_lossy().into_owned());
     let created_unix_secs = now_unix_secs();
-    let masks = match (args.masks.as_str(), args.sam.masks()) {
+    let masks = match (args.masks.as_str(), args.sam.masks(&preset.sam)) {
         ("graph", None) => Masks::Graph,
         ("auto", masks) => {
             masks.unwrap_or(Masks::Auto { n_levels: args.views.mask_levels.unwrap_or(preset.mask_levels) })
@@ -185,6 +188,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             background: args.background.map_or(preset.background, Into::into),
             raster_width: args.raster_width.unwrap_or(preset.raster_width),
             weights: args.weights.map_or(preset.weights, Into::into),
+            merges_slivers: preset.merges_slivers && !args.keep_slivers,
         },
         aggregation: args.refine.aggregation(preset.aggregation),
         cells: CellSettings {

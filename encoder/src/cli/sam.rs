@@ -2,11 +2,11 @@
 
 use std::path::PathBuf;
 
-use clap::Args;
+use clap::{Args, ValueEnum};
 
 use super::common::available_threads;
 use crate::encode::Masks;
-use crate::segment::SamSettings;
+use crate::segment::{SamLevels, SamSettings, ScoreFilter};
 
 /// Masks from Segment Anything; the other flags need `--segmenter`.
 #[derive(Debug, Args)]
@@ -15,20 +15,20 @@ pub struct SamArgs {
     /// Model directory (with model.toml) of SAM, MobileSAM or another model of that kind.
     #[arg(long, value_name = "DIR")]
     segmenter: Option<PathBuf>,
-    /// Points along each side of the grid of prompts: 8, 16, 32, 64.
-    #[arg(long, value_name = "N", default_value_t = SamSettings::default().points_per_side,
+    /// Points along each side of the grid of prompts: 8, 16, 32, 64 [default: the preset's].
+    #[arg(long, value_name = "N",
         value_parser = clap::value_parser!(u32).range(1..=256))]
-    points_per_side: u32,
+    points_per_side: Option<u32>,
     /// Points per run of the model: more are faster on GPUs and take more memory.
     #[arg(long, value_name = "N", default_value_t = SamSettings::default().points_per_batch,
         value_parser = clap::value_parser!(u32).range(1..=1024))]
     sam_points_per_batch: u32,
-    /// Least IoU that the model predicts for a mask, 0 to 1.
-    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().predicted_iou, value_parser = parse_f32_ratio)]
-    sam_predicted_iou: f32,
-    /// Least IoU of a mask with itself under a higher and a lower threshold, 0 to 1.
-    #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().stability, value_parser = parse_ratio)]
-    sam_stability: f64,
+    /// Least IoU that the model predicts for a mask, 0 to 1 [default: the preset's].
+    #[arg(long, value_name = "IOU", value_parser = parse_f32_ratio)]
+    sam_predicted_iou: Option<f32>,
+    /// Least IoU of a mask with itself under a higher and a lower threshold, 0 to 1 [default: the preset's].
+    #[arg(long, value_name = "IOU", value_parser = parse_ratio)]
+    sam_stability: Option<f64>,
     /// Distance of those thresholds from 0, logits.
     #[arg(long, value_name = "LOGITS", default_value_t = SamSettings::default().stability_offset, value_parser = parse_offset)]
     sam_stability_offset: f32,
@@ -38,10 +38,11 @@ pub struct SamArgs {
     /// IoU of pixels from which two masks are the same; 1 compares boxes only.
     #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().mask_nms_iou, value_parser = parse_ratio)]
     sam_mask_nms: f64,
-    /// Layers of crops, to find small things: layer i segments 4^i crops besides the whole image.
-    #[arg(long, value_name = "N", default_value_t = SamSettings::default().crop_layers,
+    /// Layers of crops, to find small things: layer i segments 4^i crops besides the whole image [default: the
+    /// preset's].
+    #[arg(long, value_name = "N",
         value_parser = clap::value_parser!(u32).range(0..=4))]
-    sam_crop_layers: u32,
+    sam_crop_layers: Option<u32>,
     /// IoU of boxes from which masks of two crops are the same.
     #[arg(long, value_name = "IOU", default_value_t = SamSettings::default().crop_nms_iou, value_parser = parse_ratio)]
     sam_crop_nms: f64,
@@ -52,30 +53,56 @@ pub struct SamArgs {
     #[arg(long, value_name = "N", default_value_t = SamSettings::default().crop_points_divisor,
         value_parser = clap::value_parser!(u32).range(1..=16))]
     sam_crop_points_divisor: u32,
-    /// Fills holes and drops islands of masks with fewer pixels.
-    #[arg(long, value_name = "PX", default_value_t = SamSettings::default().min_region_px)]
-    sam_min_region_px: u32,
+    /// Fills holes and drops islands of masks with fewer pixels [default: the preset's].
+    #[arg(long, value_name = "PX")]
+    sam_min_region_px: Option<u32>,
+    /// Which of the three masks of each prompt are used [default: the preset's].
+    #[arg(long, value_enum)]
+    sam_levels: Option<SamLevels>,
+    /// Filter of each level's masks at the end [default: the preset's].
+    #[arg(long, value_enum)]
+    sam_score_filter: Option<ScoreFilterArg>,
     /// Threads within the model; masks may depend on their number in the last bits [default: all cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     sam_threads: Option<u32>,
 }
 
+/// `--sam-score-filter`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum ScoreFilterArg {
+    /// None.
+    None,
+    /// LangSplat's: by predicted IoU times stability, without masks that larger ones contain.
+    Langsplat,
+}
+
+impl From<ScoreFilterArg> for Option<ScoreFilter> {
+    fn from(arg: ScoreFilterArg) -> Self {
+        match arg {
+            ScoreFilterArg::None => None,
+            ScoreFilterArg::Langsplat => Some(ScoreFilter::LANGSPLAT),
+        }
+    }
+}
+
 impl SamArgs {
     /// Returns Segment Anything as the source of masks, if --segmenter names it.
-    pub(super) fn masks(&self) -> Option<Masks> {
+    pub(super) fn masks(&self, preset: &SamSettings) -> Option<Masks> {
         let settings = SamSettings {
-            points_per_side: self.points_per_side,
+            points_per_side: self.points_per_side.unwrap_or(preset.points_per_side),
             points_per_batch: self.sam_points_per_batch,
-            predicted_iou: self.sam_predicted_iou,
-            stability: self.sam_stability,
+            predicted_iou: self.sam_predicted_iou.unwrap_or(preset.predicted_iou),
+            stability: self.sam_stability.unwrap_or(preset.stability),
             stability_offset: self.sam_stability_offset,
             box_nms_iou: self.sam_box_nms,
             mask_nms_iou: self.sam_mask_nms,
-            crop_layers: self.sam_crop_layers,
+            crop_layers: self.sam_crop_layers.unwrap_or(preset.crop_layers),
             crop_nms_iou: self.sam_crop_nms,
             crop_overlap: self.sam_crop_overlap,
             crop_points_divisor: self.sam_crop_points_divisor,
-            min_region_px: self.sam_min_region_px,
+            min_region_px: self.sam_min_region_px.unwrap_or(preset.min_region_px),
+            levels: self.sam_levels.unwrap_or(preset.levels),
+            score_filter: self.sam_score_filter.map_or(preset.score_filter, Into::into),
         };
         let n_model_threads = self.sam_threads.map_or_else(available_threads, |n| n as usize);
         Some(Masks::Sam { dir: self.segmenter.clone()?, settings, n_model_threads })

@@ -216,7 +216,7 @@ impl<'a> CellBuilder<'a> {
         if self.context.is_cancelled() {
             return Ok(None);
         }
-        if aggregation != Aggregation::PAPER {
+        if aggregation != Aggregation::PLAIN {
             let record = serde_json::to_vec(&aggregation).map_err(std::io::Error::from)?;
             built.extras.insert(EXTRA_AGGREGATION.into(), store.put_bytes(&record)?.0);
         }

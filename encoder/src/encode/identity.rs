@@ -197,6 +197,6 @@ mod tests {
         ];
         assert!(changed.iter().all(|identity| *identity != plain));
         // What is made of the views' contributions is no part of it.
-        assert_eq!(with(&|settings, _| settings.aggregation = crate::lift::Aggregation::PAPER), plain);
+        assert_eq!(with(&|settings, _| settings.aggregation = crate::lift::Aggregation::PLAIN), plain);
     }
 }

@@ -7,12 +7,17 @@ use crate::codebook::CodebookSettings;
 use crate::embed::Background;
 use crate::lift::Aggregation;
 use crate::raster::WeightKind;
+use crate::segment::SamSettings;
 
 /// A bundle of choices. `slag-lab bench tradeoff` measures the cost and quality of each.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Preset {
-    /// The paper's method: white behind the masks, rasters as wide as photos, the plain average, no objects.
+    /// The paper's own settings: SAM on a grid of 16 x 16 points with LangSplat's filters, whole masks alone, uncleaned;
+    /// white behind the masks, rasters 648 pixels wide, the plain average, no objects. Without `--segmenter` the
+    /// built-in segmenter stands in for SAM, with its coarsest masks.
     Paper,
+    /// The paper's method with the masks of `balanced`: rasters as wide as photos, the plain average, no objects.
+    Plain,
     /// Half of the views, by coverage; two scales of masks; coarse rasters; refined contributions.
     Fast,
     /// All views; refined contributions.
@@ -22,7 +27,7 @@ pub enum Preset {
 }
 
 /// The choices of a preset.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct Choices {
     /// What fills a crop outside its mask.
     pub background: Background,
@@ -36,6 +41,10 @@ pub struct Choices {
     pub mask_levels: usize,
     /// Masks with fewer pixels are left out.
     pub min_mask_px: u32,
+    /// Whether slivers between masks join their neighbours.
+    pub merges_slivers: bool,
+    /// How Segment Anything finds masks, where it does.
+    pub sam: SamSettings,
     /// Views used at most.
     pub views_limit: ViewsLimit,
     /// Width at which weights are rasterised.
@@ -54,16 +63,29 @@ impl Preset {
             objects: true,
             mask_levels: DEFAULT_MASK_LEVELS,
             min_mask_px: 200,
+            merges_slivers: true,
+            sam: SamSettings::default(),
             views_limit: ViewsLimit::All,
             raster_width: RasterWidth::ByContent,
             codebook: CodebookSettings::default(),
         };
         match self {
             Self::Balanced => balanced,
-            Self::Paper => Choices {
-                aggregation: Aggregation::PAPER,
+            Self::Plain => Choices {
+                aggregation: Aggregation::PLAIN,
                 objects: false,
                 raster_width: RasterWidth::Photo,
+                ..balanced
+            },
+            // Section "Settings" of the paper (IEEE RA-L 2025): grid 16, whole level, ScanNet's raster of 648 x 484.
+            Self::Paper => Choices {
+                aggregation: Aggregation::PLAIN,
+                objects: false,
+                mask_levels: 1,
+                min_mask_px: 1,
+                merges_slivers: false,
+                raster_width: RasterWidth::Px(648),
+                sam: SamSettings::paper(),
                 ..balanced
             },
             Self::Fast => Choices {
@@ -86,6 +108,7 @@ mod tests {
 
     use super::*;
     use crate::encode::{EncodeSettings, Masks};
+    use crate::segment::{SamLevels, ScoreFilter};
 
     /// The program without flags and the library with default settings do the same.
     #[test]
@@ -101,22 +124,53 @@ mod tests {
         assert_eq!(balanced.weights, library.view.weights);
         assert_eq!(balanced.codebook, library.cells.shards.codebook);
         let levels = balanced.mask_levels;
+        assert_eq!(balanced.merges_slivers, library.view.merges_slivers);
         assert_eq!(library.view.masks, Masks::Auto { n_levels: levels });
     }
 
     /// The others differ in what their descriptions say.
     #[test]
     fn presets_are_what_they_are_called() {
-        let [paper, fast, balanced, accurate] =
-            [Preset::Paper, Preset::Fast, Preset::Balanced, Preset::Accurate].map(Preset::choices);
+        let [plain, fast, balanced, accurate] =
+            [Preset::Plain, Preset::Fast, Preset::Balanced, Preset::Accurate].map(Preset::choices);
         // The same masks, so that only what is made of them differs.
-        assert_eq!((paper.aggregation, paper.objects), (Aggregation::default(), false));
-        assert_eq!((paper.mask_levels, paper.views_limit), (balanced.mask_levels, ViewsLimit::All));
+        assert_eq!((plain.aggregation, plain.objects), (Aggregation::default(), false));
+        assert_eq!((plain.mask_levels, plain.views_limit), (balanced.mask_levels, ViewsLimit::All));
         assert_eq!(fast.views_limit.of(96), 48);
         assert_eq!((fast.mask_levels, fast.raster_width), (2, RasterWidth::Px(320)));
         assert_eq!(fast.aggregation, balanced.aggregation);
         assert_eq!(accurate.aggregation, balanced.aggregation);
         assert_eq!(accurate.codebook.compact_error, 0.5 * balanced.codebook.compact_error);
         assert_eq!(accurate.codebook.balanced_error, 0.5 * balanced.codebook.balanced_error);
+    }
+
+    /// Oracle: the paper's text and LangSplat's `preprocess.py`, copied by hand.
+    #[test]
+    fn paper_has_the_papers_settings() {
+        let Choices {
+            background,
+            weights,
+            aggregation,
+            objects,
+            min_mask_px,
+            merges_slivers,
+            raster_width,
+            sam,
+            ..
+        } = Preset::Paper.choices();
+        assert_eq!(
+            (background, weights, aggregation),
+            (Background::White, WeightKind::Blend, Aggregation::default())
+        );
+        assert_eq!(
+            (objects, min_mask_px, merges_slivers, raster_width),
+            (false, 1, false, RasterWidth::Px(648))
+        );
+        assert_eq!((sam.points_per_side, sam.levels), (16, SamLevels::Whole));
+        assert_eq!((sam.predicted_iou, sam.stability, sam.stability_offset), (0.7, 0.85, 1.0));
+        assert_eq!((sam.crop_layers, sam.crop_points_divisor, sam.min_region_px), (1, 1, 100));
+        assert_eq!((sam.box_nms_iou, sam.crop_nms_iou, sam.mask_nms_iou), (0.7, 0.7, 1.0));
+        let langsplat = ScoreFilter { min_score: 0.7, max_iou: 0.8, max_contained: 0.5 };
+        assert_eq!(sam.score_filter, Some(langsplat));
     }
 }

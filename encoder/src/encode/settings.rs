@@ -74,6 +74,8 @@ pub struct ViewSettings {
     pub raster_width: RasterWidth,
     /// Which weight is summed.
     pub weights: WeightKind,
+    /// Whether slivers between masks join their neighbours.
+    pub merges_slivers: bool,
 }
 
 /// Where masks come from.
@@ -211,6 +213,7 @@ impl EncodeSettings {
                 background: Background::White,
                 raster_width: RasterWidth::ByContent,
                 weights: WeightKind::Blend,
+                merges_slivers: true,
             },
             aggregation: Aggregation::REFINED,
             cells: CellSettings {

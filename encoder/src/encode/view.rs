@@ -208,7 +208,9 @@ impl<'a> ViewStages<'a> {
             let (image, valid) = (&loaded.image, loaded.valid.as_deref());
             let (mut regions, mut masks_of_region) =
                 partition(masks, image.width(), image.height(), width_px, height_px, valid);
-            absorb_slivers(&mut regions, &mut masks_of_region);
+            if self.plan.settings.view.merges_slivers {
+                absorb_slivers(&mut regions, &mut masks_of_region);
+            }
             (raster_view, regions, masks_of_region)
         };
         let base_px = self.base_width_px(loaded);

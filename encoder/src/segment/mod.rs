@@ -9,5 +9,5 @@ mod segmenter;
 pub use error::SegmentError;
 pub use given::GivenMasks;
 pub use graph::{GraphSegmenter, GraphSettings};
-pub use sam::{SamSegmenter, SamSettings};
+pub use sam::{SamLevels, SamSegmenter, SamSettings, ScoreFilter};
 pub use segmenter::{SegmentInput, Segmenter};

@@ -5,7 +5,7 @@ use std::sync::OnceLock;
 use slag_encoder::raster::gpu::{GpuOptions, GpuRasterizer, Precision, adapters};
 use slag_encoder::raster::{CpuRasterizer, Rasterizer};
 
-/// A rasteriser with what its arithmetic allows.
+/// A rasteriser and the tolerances of its arithmetic.
 pub struct Backend {
     /// Its name in the table.
     pub name: &'static str,
@@ -13,10 +13,10 @@ pub struct Backend {
     pub rasterizer: Box<dyn Rasterizer>,
     /// Factor on the bounds that the rows claim.
     pub bound_factor: f64,
-    /// Relative error of alpha within which a pixel may fall on either side of a cut.
+    /// Relative error of alpha within which either side of a cut is right.
     pub cut_tolerance: f64,
-    /// Whether order in depth and side of a cut are those of the oracle wherever rounding does not decide.
-    /// An f32 projection swaps neighbours in depth: single weights then are others, hardly their sum.
+    /// Whether depth order and sides of cuts equal the oracle's wherever rounding does not decide. An f32 projection swaps
+    /// neighbours in depth, which changes single weights but hardly their sum.
     pub keeps_order: bool,
 }
 
@@ -58,7 +58,7 @@ pub fn backends() -> &'static [Backend] {
     })
 }
 
-/// Returns whether an adapter must be there: the set-up installs one for CI.
+/// Returns whether an adapter is required: the set-up installs one for CI.
 pub fn gpu_is_expected() -> bool {
     std::env::var("CI").as_deref() == Ok("true")
 }

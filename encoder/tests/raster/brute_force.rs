@@ -1,4 +1,4 @@
-//! Sums, drawings and their invariants on random scenes, against brute force and each other.
+//! Contributions, drawings and their invariants on random scenes, against brute force and each other.
 
 use std::collections::BTreeMap;
 
@@ -92,8 +92,8 @@ fn the_number_of_threads_does_not_change_a_bit() {
     }
 }
 
-/// Sums over a coarser partition are the sums of its parts: to the fixed point's 2^-33 a part and
-/// tile, and the final rounding to `f32`.
+/// Contributions to a coarser partition are the sums over its parts, to the fixed point's 2^-33 for each part and tile and
+/// the final rounding to `f32`.
 #[test]
 fn sums_over_regions_add_up() {
     for Backend { name, rasterizer, .. } in backends() {
@@ -153,7 +153,7 @@ fn nothing_to_see_is_no_error() {
     }
 }
 
-/// Broken rows are counted, and change nothing for the others.
+/// Broken Gaussians are counted and do not affect the others.
 #[test]
 fn unusable_gaussians_are_skipped_and_counted() {
     for Backend { rasterizer, .. } in backends() {

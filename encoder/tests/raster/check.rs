@@ -100,7 +100,7 @@ fn psnr_is_what_the_trainer_reports() {
     assert!((report.mean_psnr_db - TRAINER_PSNR_DB).abs() < 0.5, "{}", report.mean_psnr_db);
 }
 
-/// Makes the repeated checks of one test quicker; the filter averages 10 x 10 pixels.
+/// Shrinks photos by averaging 10 x 10 pixels, which makes repeated checks quicker.
 fn shrunk(view: &CheckView, width_px: u32) -> CheckView {
     let intrinsics = view.view.intrinsics.scaled_to_width(width_px);
     let (width, height) = (intrinsics.width_px, intrinsics.height_px);
@@ -111,7 +111,7 @@ fn shrunk(view: &CheckView, width_px: u32) -> CheckView {
     }
 }
 
-/// Plants each mistake by the inverse of its correction, written out independently of it.
+/// Plants each mistake as the inverse of its correction, written independently of the code.
 #[needs_shared]
 #[test]
 fn planted_mistakes_are_diagnosed() {
@@ -212,7 +212,7 @@ impl Rasterizer for Counting {
     }
 }
 
-/// Each photo is loaded after the view before it was drawn, so that one is in memory however many there are.
+/// Each photo is loaded after the previous view was drawn: one photo is in memory, whatever their number.
 #[test]
 fn photos_are_loaded_one_at_a_time() {
     let rasterizer = Counting(AtomicUsize::new(0));

@@ -12,7 +12,7 @@ use crate::scenes::{SceneRandom, posed, push, random_regions, random_scene, rand
 use crate::table::{Case, Row};
 use slag_math::random::Random;
 
-/// Many views of few Gaussians each, so that none hides the others.
+/// Many views of few Gaussians each: none hides the others.
 fn cases(
     n: u64,
     size_px: [u32; 2],
@@ -70,7 +70,7 @@ fn anisotropy() {
     Row { name: "anisotropy", range, claimed: 1e-5, unit_px: 1.0 }.check(&needles(1e4, |_| 50.0));
 }
 
-/// The determinant of such a covariance has no digit left in float64 when it is taken as a difference.
+/// The determinant of such a covariance, taken as a difference, has no correct digit in float64.
 #[test]
 fn anisotropy_through_long_lenses() {
     let range = "ratio to 1e9, focal lengths 2,000 to 20,000 px, to 6e7 px long";
@@ -159,8 +159,7 @@ fn logits() {
     Row { name: "logits", range, claimed: 1e-5, unit_px: 1.0 }.check(&read);
 }
 
-/// Pixels on the very edge of both cuts, a few steps of f32 to either side; beside them a Gaussian in
-/// the middle of nothing, so that what lies on a cut is a small share.
+/// Pixels within a few f32 steps of both cuts, beside an isolated Gaussian, so that pixels on a cut are a small share.
 #[test]
 fn on_the_cuts() {
     let steps = |value: f32, n: i32| f64::from(f32::from_bits(value.to_bits().wrapping_add_signed(n)));
@@ -195,7 +194,7 @@ fn on_the_cuts() {
     Row { name: "on the cuts", range, claimed: 1e-5, unit_px: 1e-2 }.check(&cases);
 }
 
-/// Sums are compared relative to themselves: 2,300 layers of alpha 1/255 leave the last one 1e-4.
+/// Contributions are compared relative to themselves: 2,300 layers of alpha 1/255 leave the last one 1e-4.
 #[test]
 fn pile() {
     let case = |[low, high]: [f64; 2]| {
@@ -306,8 +305,8 @@ fn image_sizes() {
         .check(&cases);
 }
 
-/// Closed form: a Gaussian so wide that it is flat adds its opacity at every pixel, and the one behind
-/// it what is left. An f32 running sum ends at 2^24 steps of its own size.
+/// Closed form: a very wide Gaussian adds its opacity at every pixel, and the one behind it the rest. An f32 running sum
+/// stops growing at 2^24 steps of its own size.
 #[test]
 fn sums_over_many_pixels() {
     let random = &mut Random::new(1);

@@ -1,4 +1,4 @@
-//! What only a GPU does: cutting into chunks and bands, sharing views, failing.
+//! GPU only: chunks and bands, views shared between devices, lost devices.
 
 use slag_encoder::masks::RegionMap;
 use slag_encoder::raster::devices::{DeviceChoice, DeviceError, Devices};
@@ -70,7 +70,7 @@ fn chunks_and_bands_change_no_bit() {
     assert!(n_with_bands > 3);
 }
 
-/// One row of tiles is the least that a device must hold.
+/// A device must hold at least one row of tiles.
 #[test]
 fn too_much_for_a_device_is_an_error_and_falls_to_the_cpu() {
     let options = GpuOptions { max_binding_bytes: 2000, ..GpuOptions::default() };
@@ -107,7 +107,7 @@ fn the_same_bits_each_time_from_every_thread() {
     });
 }
 
-/// Two devices share; one is lost with views asked for from four threads, then the other.
+/// Four threads request views from two devices; one device is lost, then the other.
 #[test]
 fn a_lost_device_loses_no_view() {
     let (Some(a), Some(b)) = (open(GpuOptions::default()), open(GpuOptions::default())) else { return };

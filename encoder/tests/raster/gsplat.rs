@@ -1,4 +1,4 @@
-//! Against recorded weights: the float64 reference beside gsplat 1.5.3.
+//! Compares with recorded weights: a float64 reference, and gsplat 1.5.3.
 
 use std::collections::BTreeMap;
 

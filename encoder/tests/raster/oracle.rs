@@ -11,7 +11,7 @@ use slag_common::Gaussians;
 use slag_encoder::masks::{NO_REGION, RegionMap};
 use slag_encoder::raster::{RasterView, WeightKind};
 
-/// A Gaussian as the oracle sees it.
+/// A projected Gaussian of the oracle.
 pub struct Projected {
     /// Index in the scene.
     pub index: usize,
@@ -23,7 +23,7 @@ pub struct Projected {
     opacity: f64,
 }
 
-/// Returns what the view draws, near to far.
+/// Returns the view's visible Gaussians, near to far.
 fn project(scene: &Gaussians, view: &RasterView) -> Vec<Projected> {
     let camera = &view.intrinsics;
     let (fx, fy) = (camera.focal_x_px, camera.focal_y_px);
@@ -70,14 +70,14 @@ fn whitening_axes(row_x: DVec3, row_y: DVec3) -> [DVec2; 2] {
     })
 }
 
-/// A value and the bounds that it has where rounding decides on a cut.
+/// A value, and its bounds where rounding decides on a cut.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Truth {
     /// In float64.
     pub value: f64,
-    /// The least that is right.
+    /// The least right value.
     pub low: f64,
-    /// The most that is right.
+    /// The greatest right value.
     pub high: f64,
     /// How far the value moves, per relative error of every alpha: its own, and in the light that
     /// surfaces of opacity near 1 leave, the share `alpha / (1 - alpha)` of theirs.
@@ -85,7 +85,7 @@ pub struct Truth {
 }
 
 impl Truth {
-    /// Returns how far a value is from what is right.
+    /// Returns the distance of a value from the right interval.
     pub fn distance(&self, found: f64) -> f64 {
         (self.low - found).max(found - self.high).max(0.0)
     }
@@ -160,7 +160,7 @@ pub fn each_weight(
     }
 }
 
-/// Sums by (Gaussian, region).
+/// Contributions by (Gaussian, region).
 pub type Sums = BTreeMap<(u32, u32), Truth>;
 
 /// Returns the sums of [`each_weight`] over regions.

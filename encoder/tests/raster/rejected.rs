@@ -1,4 +1,4 @@
-//! What cannot be drawn: rejected, counted, and without effect on the others.
+//! Gaussians that cannot be drawn are rejected and counted, and do not affect the others.
 
 use glam::DVec3;
 use slag_common::Gaussians;
@@ -14,7 +14,7 @@ use slag_math::random::Random;
 /// Changes the Gaussian of an index.
 type Edit = Box<dyn Fn(&mut Gaussians, usize)>;
 
-/// Every field with every value that is none.
+/// Every field with every invalid value.
 fn poisons() -> Vec<(String, Edit)> {
     let mut all: Vec<(String, Edit)> = Vec::new();
     for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
@@ -45,7 +45,7 @@ fn poisons() -> Vec<(String, Edit)> {
     all
 }
 
-/// The scene has a Gaussian in front of everything, which is poisoned in each way there is.
+/// Poisons a Gaussian in front of the scene in every way.
 #[test]
 fn values_that_are_no_numbers() {
     let random = &mut Random::new(8);
@@ -119,7 +119,7 @@ fn numbers_beyond_the_arithmetic() {
     }
 }
 
-/// Rotations as they stand in files, and whether a reader can make a rotation of them.
+/// Rotations of files, and whether a reader can normalise them.
 const QUATERNIONS: [([f64; 4], bool); 9] = [
     ([0.0; 4], false),
     ([f64::NAN, 0.0, 0.0, 1.0], false),
@@ -170,7 +170,7 @@ fn rotations_through_the_readers() {
     Row { name: "rotations", range, claimed: 1e-5, unit_px: 1.0 }.check(&cases);
 }
 
-/// A .splat file has bytes for rotations; four zeros are none.
+/// Rotations of .splat files are bytes; four zeros are no rotation.
 #[test]
 fn rotations_of_dot_splat() {
     let row = |rotation: [u8; 4]| {
@@ -187,7 +187,7 @@ fn rotations_of_dot_splat() {
     assert_eq!((0..3).map(|i| scene.is_usable(i)).collect::<Vec<_>>(), [false, true, true]);
 }
 
-/// Handed over in memory, a rotation must have unit length to 5e-4; it is normalised in f64 all the same.
+/// A rotation given in memory must have unit length to 5e-4; it is then normalised in f64.
 #[test]
 fn rotations_in_memory() {
     let lengths = [0.0, 1e-45, 1e-20, 0.5, 0.999, 0.9996, 1.0, 1.0004, 1.001, 2.0, 1e20, 3e38];

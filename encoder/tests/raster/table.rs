@@ -9,10 +9,10 @@ use slag_encoder::raster::{RasterView, ViewWeights, WeightKind};
 use crate::backends::{Backend, backends};
 use crate::oracle;
 
-/// What is summed.
+/// The kind of weight.
 pub const KINDS: [WeightKind; 2] = [WeightKind::Blend, WeightKind::Falloff];
 
-/// Rows whose Gaussians lie at equal depths, or on a cut: a matter of the last bit of f32.
+/// Rows with Gaussians at equal depths or on a cut, where the last bit of f32 decides.
 const ROWS_OF_TIES: [&str; 3] = ["pile", "on the cuts", "rotations"];
 
 /// A view of a scene.
@@ -20,7 +20,7 @@ pub struct Case {
     pub scene: Gaussians,
     pub view: RasterView,
     pub regions: RegionMap,
-    /// The same seen in a frame where float64 is exact, for the oracle.
+    /// The same view in a frame where float64 is exact, for the oracle.
     pub exact: Option<(Gaussians, RasterView)>,
     /// Gaussians that must be counted as unusable.
     pub n_unusable: usize,
@@ -36,15 +36,15 @@ impl Case {
 pub struct Row {
     pub name: &'static str,
     pub range: &'static str,
-    /// Largest error of a sum over its sensitivity, so of every alpha; see [`oracle::Truth`].
+    /// Largest error of a contribution over its sensitivity; see [`oracle::Truth`].
     pub claimed: f64,
-    /// Sums of less sensitivity are measured in this unit.
+    /// Least sensitivity that errors are divided by.
     pub unit_px: f64,
 }
 
 impl Row {
-    /// Compares every sum of every case with the oracle, on every backend, and prints the row; also how far
-    /// the backend is from the first one, beyond what lies on a cut.
+    /// Compares every contribution of every case with the oracle, on every backend, and prints the row, with the backend's
+    /// distance from the first one outside cuts.
     pub fn check(&self, cases: &[Case]) {
         let mut of_first: Vec<Found> = Vec::new();
         for (b, backend) in backends().iter().enumerate() {

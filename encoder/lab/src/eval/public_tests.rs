@@ -84,7 +84,7 @@ impl Wall {
         let mut settings = EncodeSettings::new(scene, views.clone(), dir.path().join("store"), true);
         settings.view.masks = Masks::Given { dir: dir.path().join("masks"), ignore_ids: Vec::new() };
         settings.view.min_mask_px = 10;
-        settings.aggregation = Aggregation::PAPER;
+        settings.aggregation = Aggregation::PLAIN;
         settings.cells = CellSettings {
             limits: CellLimits { max_gaussians: 4096, max_width: None },
             shards: ShardSettings {

@@ -97,7 +97,7 @@ impl Refinement {
         group_bytes: u64,
         cancel: &AtomicBool,
     ) -> Result<Option<Self>, ContributionError> {
-        if settings == Aggregation::PAPER {
+        if settings == Aggregation::PLAIN {
             return Ok(None);
         }
         let mask_weights = truncation::mask_weights(photos, settings.truncation_power);
@@ -220,7 +220,7 @@ impl Refinement {
 
     /// Reserves the lists over all regions, whose number is known once the views are done.
     pub fn reserve_regions(memory: &mut MemoryPlan, settings: &Aggregation, n_regions: usize) {
-        if *settings != Aggregation::PAPER {
+        if *settings != Aggregation::PLAIN {
             let len_bytes = n_regions * (size_of::<Point>() + Votes::BYTES_PER_REGION);
             memory.reserve(Phase::Always, "agreement of masks", len_bytes as u64);
         }

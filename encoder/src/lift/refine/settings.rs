@@ -35,7 +35,7 @@ pub struct Aggregation {
 
 impl Aggregation {
     /// The paper's weighted average.
-    pub const PAPER: Self = Self {
+    pub const PLAIN: Self = Self {
         min_region_share: 0.0,
         min_view_share: 0.0,
         min_weight_px: 0.0,
@@ -56,24 +56,24 @@ impl Aggregation {
         superpoint: 3.0,
         coarse: 0.7,
         fill: true,
-        ..Self::PAPER
+        ..Self::PLAIN
     };
 
     /// Returns the plain average, each refinement alone, and the refined preset: the rows of the comparison tables.
     pub fn methods() -> Vec<(&'static str, Self)> {
-        let (paper, refined) = (Self::PAPER, Self::REFINED);
+        let (plain, refined) = (Self::PLAIN, Self::REFINED);
         vec![
-            ("paper", paper),
-            ("regions", Self { min_region_share: 0.5, ..paper }),
-            ("views", Self { min_view_share: refined.min_view_share, ..paper }),
-            ("gate", Self { min_weight_px: 1.0, ..paper }),
-            ("truncation", Self { truncation_power: refined.truncation_power, ..paper }),
-            ("equalisation", Self { equalisation: 0.5, ..paper }),
-            ("agreement", Self { agreement: refined.agreement, ..paper }),
-            ("median", Self { median_steps: 3, ..paper }),
-            ("superpoints", Self { superpoint: refined.superpoint, ..paper }),
-            ("coarse", Self { coarse: refined.coarse, ..paper }),
-            ("fill", Self { fill: true, ..paper }),
+            ("plain", plain),
+            ("regions", Self { min_region_share: 0.5, ..plain }),
+            ("views", Self { min_view_share: refined.min_view_share, ..plain }),
+            ("gate", Self { min_weight_px: 1.0, ..plain }),
+            ("truncation", Self { truncation_power: refined.truncation_power, ..plain }),
+            ("equalisation", Self { equalisation: 0.5, ..plain }),
+            ("agreement", Self { agreement: refined.agreement, ..plain }),
+            ("median", Self { median_steps: 3, ..plain }),
+            ("superpoints", Self { superpoint: refined.superpoint, ..plain }),
+            ("coarse", Self { coarse: refined.coarse, ..plain }),
+            ("fill", Self { fill: true, ..plain }),
             ("refined", refined),
         ]
     }

@@ -227,7 +227,7 @@ fn the_plain_average_is_left_alone_and_its_file_is_what_it_was() {
     let before = table.clone();
     let (scene, split) = (gaussians(), split());
     let none = Refinement::prepare(
-        Aggregation::PAPER,
+        Aggregation::PLAIN,
         (index, table),
         (&scene, &split),
         &photos(),
@@ -236,7 +236,7 @@ fn the_plain_average_is_left_alone_and_its_file_is_what_it_was() {
     );
     assert!(none.expect("reads").is_none());
     assert_eq!(*table, before);
-    assert_eq!(Aggregation::default(), Aggregation::PAPER);
+    assert_eq!(Aggregation::default(), Aggregation::PLAIN);
 }
 
 /// Oracle: float64 by definition, Gaussian by Gaussian.
@@ -258,7 +258,7 @@ fn what_masks_and_views_count_is_that_of_the_definition() {
             equalisation,
             min_region_share: shares.0,
             min_view_share: shares.1,
-            ..Aggregation::PAPER
+            ..Aggregation::PLAIN
         };
         let Lifted { field, table, embeddings } = lifted(settings, u64::MAX);
         let counts = oracle_counts(&views, &settings);
@@ -295,7 +295,7 @@ fn a_superpoint_gives_its_part_and_fills_what_no_view_sees() {
         sum
     };
     // Larger superpoints are the same patches here.
-    let parts = |superpoint, coarse| Aggregation { superpoint, coarse, fill: true, ..Aggregation::PAPER };
+    let parts = |superpoint, coarse| Aggregation { superpoint, coarse, fill: true, ..Aggregation::PLAIN };
     for (settings, n_levels) in [(parts(1.0, 0.0), 1), (parts(0.0, 0.5), 2), (parts(2.0, 0.5), 2)] {
         let Lifted { field, embeddings, table } = lifted(settings, u64::MAX);
         for k in 0..N {
@@ -320,12 +320,12 @@ fn a_superpoint_gives_its_part_and_fills_what_no_view_sees() {
         assert_eq!(RegionTable::from_bytes(&AlignedBytes::copy_of(&bytes)).expect("valid"), table);
     }
 
-    let unfilled = lifted(Aggregation { superpoint: 1.0, ..Aggregation::PAPER }, u64::MAX);
+    let unfilled = lifted(Aggregation { superpoint: 1.0, ..Aggregation::PLAIN }, u64::MAX);
     assert!(UNSEEN.iter().all(|k| !unfilled.field.has_evidence(*k)));
-    let only_filled = lifted(Aggregation { fill: true, ..Aggregation::PAPER }, u64::MAX);
-    let paper = lifted(Aggregation::PAPER, u64::MAX);
+    let only_filled = lifted(Aggregation { fill: true, ..Aggregation::PLAIN }, u64::MAX);
+    let plain = lifted(Aggregation::PLAIN, u64::MAX);
     for k in 0..N {
-        let same = only_filled.embeddings[k * DIM..][..DIM] == paper.embeddings[k * DIM..][..DIM];
+        let same = only_filled.embeddings[k * DIM..][..DIM] == plain.embeddings[k * DIM..][..DIM];
         assert_eq!(same, !UNSEEN.contains(&k), "{k}");
     }
 }
@@ -348,16 +348,16 @@ fn the_median_leaves_the_view_that_contradicts() {
         }
         cost
     };
-    let mean = cost(&lifted(Aggregation::PAPER, u64::MAX));
+    let mean = cost(&lifted(Aggregation::PLAIN, u64::MAX));
     let costs = [1, 3, 20]
-        .map(|median_steps| cost(&lifted(Aggregation { median_steps, ..Aggregation::PAPER }, u64::MAX)));
+        .map(|median_steps| cost(&lifted(Aggregation { median_steps, ..Aggregation::PLAIN }, u64::MAX)));
     println!("{mean} {costs:?}");
     assert!(costs[0] < 0.97 * mean && costs[1] < costs[0] && costs[2] <= costs[1]);
 }
 
 #[test]
 fn the_gate_takes_the_evidence_of_what_hardly_shows() {
-    let settings = Aggregation { min_weight_px: 30.0, ..Aggregation::PAPER };
+    let settings = Aggregation { min_weight_px: 30.0, ..Aggregation::PLAIN };
     let Lifted { field, .. } = lifted(settings, u64::MAX);
     let views = views();
     let mut n_gated = 0;

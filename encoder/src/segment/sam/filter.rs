@@ -3,25 +3,14 @@
 use rayon::prelude::*;
 use slag_models::sam::{Decoded, MASKS_PER_PROMPT};
 
-use super::runs::RunMask;
+use super::candidate::Candidate;
+use super::score_filter;
 use super::settings::SamSettings;
 use super::upsample::Upsampler;
 use crate::masks::BoxPx;
 
 /// Distance within which a box touches an edge, as in the reference implementation.
 const EDGE_TOLERANCE_PX: u32 = 20;
-
-/// A candidate mask.
-#[derive(Clone, Debug)]
-pub(super) struct Candidate {
-    pub(super) mask: RunMask,
-    /// IoU with the true mask, predicted by the model.
-    pub(super) predicted_iou: f32,
-    /// 0 whole, 1 part, 2 subpart.
-    pub(super) level: u8,
-    /// The crop of the image in which the mask was found.
-    pub(super) crop: BoxPx,
-}
 
 /// The filters for the masks of one image.
 #[derive(Clone, Copy, Debug)]
@@ -36,15 +25,20 @@ impl Filters<'_> {
     pub(super) fn candidates(&self, decoded: &Decoded, upsampler: &Upsampler, crop: BoxPx) -> Vec<Candidate> {
         let SamSettings { predicted_iou: least_iou, stability, stability_offset, .. } = *self.settings;
         let n_logits = (decoded.logits_px[0] * decoded.logits_px[1]) as usize;
+        let lists = self.settings.levels.lists();
+        // Three proposals per prompt, the smallest first.
+        let level_of = |at: usize| (MASKS_PER_PROMPT - 1 - at % MASKS_PER_PROMPT) as u8;
         let proposals = decoded.logits.par_chunks_exact(n_logits).zip(&decoded.predicted_ious).enumerate();
         proposals
+            .filter(|(at, _)| lists.iter().any(|list| list.contains(&level_of(*at))))
             .filter(|&(_, (_, &predicted_iou))| predicted_iou > least_iou || least_iou == 0.0)
             .filter_map(|(at, (logits, predicted_iou))| {
                 let cut = upsampler.cut(logits, stability_offset, [crop.x0, crop.y0])?;
                 let keeps = cut.stability >= stability && !self.is_cut_by(crop, cut.mask.box_px());
-                // Three proposals per prompt, the smallest first.
-                let level = (MASKS_PER_PROMPT - 1 - at % MASKS_PER_PROMPT) as u8;
-                keeps.then_some(Candidate { mask: cut.mask, predicted_iou: *predicted_iou, level, crop })
+                let (mask, stability) = (cut.mask, cut.stability);
+                let candidate =
+                    Candidate { mask, predicted_iou: *predicted_iou, stability, level: level_of(at), crop };
+                keeps.then_some(candidate)
             })
             .collect()
     }
@@ -63,15 +57,28 @@ impl Filters<'_> {
             .any(|((found, crop), image)| is_near(found, crop) && !is_near(found, image))
     }
 
+    /// Splits candidates into the lists that are filtered by themselves.
+    pub(super) fn lists(&self, candidates: Vec<Candidate>) -> Vec<Vec<Candidate>> {
+        let lists = self.settings.levels.lists();
+        let mut found = vec![Vec::new(); lists.len()];
+        for candidate in candidates {
+            let at = lists.iter().position(|list| list.contains(&candidate.level));
+            at.into_iter().for_each(|at| found[at].push(candidate.clone()));
+        }
+        found
+    }
+
     /// Drops duplicates within a crop, keeping the higher predicted IoU.
     pub(super) fn unique_in_crop(&self, candidates: Vec<Candidate>) -> Vec<Candidate> {
         let scores = candidates.iter().map(|candidate| f64::from(candidate.predicted_iou)).collect();
         by_boxes(candidates, scores, self.settings.box_nms_iou)
     }
 
-    /// Drops duplicates between crops, removes small holes and islands, and then drops duplicates by box and by pixels.
+    /// Drops duplicates between crops, removes small holes and islands, then drops duplicates by box
+    /// and by pixels, and applies LangSplat's filter if the settings ask for it.
     pub(super) fn unique_in_image(&self, mut candidates: Vec<Candidate>, n_crops: usize) -> Vec<Candidate> {
-        let SamSettings { box_nms_iou, crop_nms_iou, mask_nms_iou, min_region_px, .. } = *self.settings;
+        let SamSettings { box_nms_iou, crop_nms_iou, mask_nms_iou, min_region_px, score_filter, .. } =
+            *self.settings;
         if n_crops > 1 {
             // Smaller crops show more detail.
             let area = |b: BoxPx| f64::from(b.width_px()) * f64::from(b.height_px());
@@ -94,7 +101,10 @@ impl Filters<'_> {
             let scores = candidates.iter().map(|candidate| f64::from(candidate.predicted_iou)).collect();
             candidates = suppress(candidates, scores, |a, b| a.mask.iou(&b.mask) > mask_nms_iou);
         }
-        candidates
+        match score_filter {
+            Some(filter) => score_filter::keep(candidates, &filter),
+            None => candidates,
+        }
     }
 }
 

@@ -5,9 +5,11 @@
 //! image and crop, the decoder once per batch of points. While it decodes a batch, the masks of the previous batch are
 //! enlarged and filtered in parallel.
 
+mod candidate;
 mod filter;
 mod points;
 mod runs;
+mod score_filter;
 mod settings;
 #[cfg(test)]
 mod tests;
@@ -23,10 +25,11 @@ use slag_models::{ModelError, SessionOptions};
 use super::error::SegmentError;
 use super::segmenter::{MAX_MASK_BYTES, SegmentInput, Segmenter};
 use crate::masks::{BoxPx, Mask};
-use filter::{Candidate, Filters};
+use candidate::Candidate;
+use filter::Filters;
 use upsample::Upsampler;
 
-pub use settings::SamSettings;
+pub use settings::{SamLevels, SamSettings, ScoreFilter};
 
 /// Finds masks with SAM.
 #[derive(Debug)]
@@ -48,13 +51,13 @@ impl SamSegmenter {
         Ok(Self { sam, settings, identity })
     }
 
-    /// Returns the masks of one crop, in pixels of the image.
+    /// Returns the masks of one crop, in pixels of the image, by list.
     fn masks_of_crop(
         &self,
         input: &SegmentInput<'_>,
         (crop, layer): (BoxPx, u32),
         filters: Filters<'_>,
-    ) -> Result<Vec<Candidate>, SegmentError> {
+    ) -> Result<Vec<Vec<Candidate>>, SegmentError> {
         let (width_px, height_px) = (crop.width_px(), crop.height_px());
         let cropped = imageops::crop_imm(input.image, crop.x0, crop.y0, width_px, height_px).to_image();
         let embedding = self.sam.embed(&cropped)?;
@@ -89,7 +92,8 @@ impl SamSegmenter {
             drop(sender);
             Ok::<_, SegmentError>(filtered.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
         })?;
-        Ok(filters.unique_in_crop(found.ok_or_else(|| too_many(input))?))
+        let lists = filters.lists(found.ok_or_else(|| too_many(input))?);
+        Ok(lists.into_iter().map(|list| filters.unique_in_crop(list)).collect())
     }
 }
 
@@ -111,15 +115,16 @@ impl Segmenter for SamSegmenter {
         let (width_px, height_px) = input.image.dimensions();
         let filters = Filters { settings: &self.settings, image_px: [width_px, height_px] };
         let crops = points::crops(width_px, height_px, self.settings.crop_layers, self.settings.crop_overlap);
-        let mut found = Vec::new();
+        let mut found = vec![Vec::new(); self.settings.levels.lists().len()];
         let mut left_bytes = MAX_MASK_BYTES;
         for &crop in &crops {
             let of_crop = self.masks_of_crop(input, crop, filters)?;
-            let len_bytes: u64 = of_crop.iter().map(|candidate| candidate.mask.len_bytes()).sum();
+            let len_bytes: u64 = of_crop.iter().flatten().map(|candidate| candidate.mask.len_bytes()).sum();
             left_bytes = left_bytes.checked_sub(len_bytes).ok_or_else(|| too_many(input))?;
-            found.extend(of_crop);
+            found.iter_mut().zip(of_crop).for_each(|(list, of_crop)| list.extend(of_crop));
         }
-        let kept = filters.unique_in_image(found, crops.len());
+        let kept: Vec<Candidate> =
+            found.into_iter().flat_map(|list| filters.unique_in_image(list, crops.len())).collect();
         let area = |b: BoxPx| u64::from(b.width_px()) * u64::from(b.height_px());
         if kept.iter().map(|candidate| area(candidate.mask.box_px())).sum::<u64>() > MAX_MASK_BYTES {
             return Err(too_many(input));
