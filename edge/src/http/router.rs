@@ -15,7 +15,8 @@ use super::{params, position, query, status};
 
 /// First line of the help text.
 const TITLE: &str = "slag-edge answers text queries about the scene around the robot.";
-/// The description for programs, kept by hand; a test compares it with the routes, parameters and answers.
+/// The description for programs. It is kept by hand, not by `utoipa`: a test compares it with every route, parameter and
+/// answer, and most of its text is no doc comment of a type.
 pub(super) const OPENAPI: &str = include_str!("openapi.json");
 const JSON: (HeaderName, HeaderValue) = (header::CONTENT_TYPE, HeaderValue::from_static("application/json"));
 
