@@ -6,7 +6,8 @@ cd "$(dirname "$0")/.."
 encoder=target/debug/slag-encoder
 lab=target/debug/slag-lab
 native=target/debug/slag-edge
-cargo build --locked --bin slag-encoder --bin slag-lab --bin slag-edge
+# After `test.sh` they are there; alone, cargo would build them again, with the features of fewer packages.
+[ -n "${SLAG_PROGRAMS_ARE_BUILT:-}" ] || cargo build --locked --bin slag-encoder --bin slag-lab --bin slag-edge
 arm() {
     qemu-aarch64-static -L /usr/aarch64-linux-gnu target/aarch64-unknown-linux-gnu/dist/slag-edge "$@"
 }
