@@ -19,9 +19,11 @@ pub mod poses;
 mod quantise;
 pub mod retry;
 pub mod shard;
+pub mod similarity;
 pub mod splat;
 
 pub use byte_size::ByteSize;
 pub use camera::{Distortion, Intrinsics, View};
 pub use gaussians::Gaussians;
 pub use hash::Hash32;
+pub use similarity::Similarity;

@@ -245,7 +245,7 @@ fn transforms_cameras_are_shared_or_per_frame() {
     own["camera_model"] = "OPENCV_FISHEYE".into();
     let views = read_json(serde_json::json!({
         "camera_model": "OPENCV", "fl_x": 60.5, "fl_y": 61, "cx": 31, "cy": 25, "w": 64, "h": 48,
-        "k1": 0.1, "p2": 0.3, "applied_transform": [[0, 1, 0, 0]], "frames": [own, frame("images/left/a.jpg")],
+        "k1": 0.1, "p2": 0.3, "applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], "frames": [own, frame("images/left/a.jpg")],
     }))
     .unwrap()
     .views;

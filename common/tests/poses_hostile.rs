@@ -94,10 +94,27 @@ fn transforms() -> [(&'static str, Vec<u8>); 1] {
     [("transforms.json", json.into())]
 }
 
+fn scannet() -> Vec<(&'static str, Vec<u8>)> {
+    let mut png = std::io::Cursor::new(Vec::new());
+    image::RgbImage::new(64, 48).write_to(&mut png, image::ImageFormat::Png).unwrap();
+    let pose = |x: f64| format!("0 -1 0 {x}\n1 0 0 2.5\n0 0 1 -3\n0 0 0 1\n").into_bytes();
+    vec![
+        ("intrinsic/intrinsic_color.txt", b"50.5 0 32 0\n0 50.5 24 0\n0 0 1 0\n0 0 0 1\n".to_vec()),
+        ("pose/0.txt", pose(1.5)),
+        ("pose/1.txt", pose(1e3)),
+        ("pose/2.txt", b"-inf -inf -inf -inf\n".repeat(4)),
+        ("color/0.png", png.into_inner()),
+    ]
+}
+
 /// Reads 1,000 damaged versions of each file and returns the number that still gave views.
-fn survive(files: &[(&str, Vec<u8>)]) -> usize {
+fn survive(files: &[(&'static str, Vec<u8>)]) -> usize {
     let dir = tempfile::tempdir().unwrap();
-    let write = |name: &str, bytes: &[u8]| fs_err::write(dir.path().join(name), bytes).unwrap();
+    let write = |name: &str, bytes: &[u8]| {
+        let path = dir.path().join(name);
+        fs_err::create_dir_all(path.parent().unwrap()).unwrap();
+        fs_err::write(path, bytes).unwrap();
+    };
     files.iter().for_each(|(name, bytes)| write(name, bytes));
     assert_eq!(poses::read(dir.path(), None).unwrap().views.len(), 2);
     let mut n_read = 0;
@@ -130,10 +147,9 @@ fn survive(files: &[(&str, Vec<u8>)]) -> usize {
 
 #[test]
 fn damaged_files_are_errors_or_valid() {
-    for (n_files, files) in
-        [(2, text_model().to_vec()), (2, binary_model().to_vec()), (1, transforms().to_vec())]
-    {
-        let n_read = survive(&files);
+    let sets = [text_model().to_vec(), binary_model().to_vec(), transforms().to_vec(), scannet()];
+    for files in sets {
+        let (n_files, n_read) = (files.len(), survive(&files));
         // Both outcomes must occur, or the damage tests nothing.
         assert!(n_read > 5 && n_read < 800 * n_files, "{}: {n_read}", files[0].0);
     }

@@ -1,4 +1,4 @@
-//! Checks that both formats share: intrinsics, rotations and translations.
+//! Checks that the formats share: intrinsics, rotations and translations.
 
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 
@@ -81,7 +81,7 @@ pub(super) fn affine_from_wxyz(
 }
 
 /// Returns the transform of a rotation matrix, which is made exactly orthonormal, and a translation.
-pub(super) fn affine_from_matrix(
+fn affine_from_matrix(
     image: &str,
     rotation: DMat3,
     translation: [f64; 3],
@@ -97,6 +97,20 @@ pub(super) fn affine_from_matrix(
     }
     let translation = check_translation(translation)?;
     Ok(DAffine3::from_rotation_translation(DQuat::from_mat3(&rotation).normalize(), translation))
+}
+
+/// Returns the transform of the rows of a matrix, with its source's axes expressed by the columns of `axes`.
+pub(super) fn affine_from_rows(image: &str, rows: &[Vec<f64>], axes: DMat3) -> Result<DAffine3, PoseProblem> {
+    let expected = "a matrix of 3 or 4 rows and 4 columns, the fourth row being 0 0 0 1";
+    let row = |index: usize| rows.get(index).and_then(|row| <[f64; 4]>::try_from(row.as_slice()).ok());
+    let ([Some(a), Some(b), Some(c)], true) = ([row(0), row(1), row(2)], matches!(rows.len(), 3 | 4)) else {
+        return Err(PoseProblem::Expected { expected, found: format!("{} rows", rows.len()) });
+    };
+    if rows.len() == 4 && row(3) != Some([0.0, 0.0, 0.0, 1.0]) {
+        return Err(PoseProblem::Expected { expected, found: format!("{:?}", rows[3]) });
+    }
+    let rotation = DMat3::from_cols_array_2d(&[0, 1, 2].map(|column| [a[column], b[column], c[column]]));
+    affine_from_matrix(image, rotation * axes, [a[3], b[3], c[3]])
 }
 
 fn check_translation(translation: [f64; 3]) -> Result<DVec3, PoseProblem> {

@@ -12,8 +12,8 @@ pub enum PoseError {
     Io(io::Error),
     /// There is no pose file at the path.
     #[error(
-        "{}: no poses found: it has no cameras and images (.bin or .txt), directly or in sparse/0 or sparse, and no \
-         transforms.json; give the folder of a COLMAP model or a transforms.json",
+        "{}: no poses found: it has no cameras and images (.bin or .txt), directly or in sparse/0 or sparse, no \
+         transforms.json and no pose/; give the folder of a COLMAP model, a transforms.json or a ScanNet scene",
         path.display()
     )]
     NotFound {
@@ -33,6 +33,15 @@ pub enum PoseError {
     /// A JSON file does not have the structure of a `transforms.json`.
     #[error("{}: {cause}; export the file again with nerfstudio", path.display())]
     Json {
+        /// The file.
+        path: PathBuf,
+        /// Line, column and reason. The message quotes them, so this is not a `source` as well.
+        cause: serde_json::Error,
+    },
+    /// A JSON file does not have the structure of a `dataparser_transforms.json`.
+    #[error("{}: {cause}; expected nerfstudio's transform (3 x 4) and scale; remove the file, or name another with \
+             --splat-frame", path.display())]
+    Frame {
         /// The file.
         path: PathBuf,
         /// Line, column and reason. The message quotes them, so this is not a `source` as well.
@@ -109,7 +118,7 @@ pub enum PoseProblem {
     },
     /// A matrix or quaternion is not a rotation.
     #[error(
-        "image {image:?}: not a rotation (off by {deviation:.3e}); export the poses again, without scale or shear"
+        "{image:?}: not a rotation (off by {deviation:.3e}); export the poses again, without scale or shear"
     )]
     NotARotation {
         /// The image.
@@ -148,6 +157,39 @@ pub enum PoseProblem {
     DuplicateCamera {
         /// The camera.
         camera_id: u32,
+    },
+    /// The principal point lies far from the middle of the image.
+    #[error(
+        "the principal point ({}, {}) px is far from the middle of images of {} x {} px; the intrinsics belong to \
+         another image size: export the images in the size of the intrinsics",
+        centre_px[0], centre_px[1], size_px[0], size_px[1]
+    )]
+    OtherImageSize {
+        /// The principal point.
+        centre_px: [f64; 2],
+        /// Width and height of the images.
+        size_px: [u32; 2],
+    },
+    /// The size of the images is stated nowhere.
+    #[error(
+        "no image of the {n_poses} posed frames can be read in {}, and their size is stated nowhere else; \
+         give their folder with --images", folder.display()
+    )]
+    NoImageSize {
+        /// Frames with a pose.
+        n_poses: usize,
+        /// The folder of the images.
+        folder: PathBuf,
+    },
+    /// A file is larger than its content can be.
+    #[error("the file has {bytes} bytes, at most {most} were expected; check that it is {expected}")]
+    TooLarge {
+        /// Its size.
+        bytes: u64,
+        /// The largest size accepted.
+        most: u64,
+        /// What the file should be.
+        expected: &'static str,
     },
     /// An image name is empty or leads out of the image folder.
     #[error("image name {image:?} is not a relative path inside the image folder; correct it")]

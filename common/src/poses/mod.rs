@@ -1,27 +1,33 @@
-//! Posed views from a COLMAP model or a nerfstudio `transforms.json`.
+//! Posed views from a COLMAP model, a nerfstudio `transforms.json` or a ScanNet scene folder.
 //!
-//! Both give [`View`](crate::View)s in OpenCV camera axes; the world frame stays the file's own.
+//! All give [`View`](crate::View)s in OpenCV camera axes; the world frame stays the file's own.
 
 mod checks;
 mod colmap;
 mod error;
+mod every;
 mod paths;
+mod scannet;
+mod splat_frame;
 mod transforms;
 mod view_set;
 
 use std::path::Path;
 
 pub use error::{Place, PoseError, PoseProblem};
-pub use view_set::{PoseSource, ViewSet};
+pub use splat_frame::{FRAME_FILE, Origin, SplatFrame, SplatFromPoses};
+pub use view_set::{AppliedTransform, PoseSource, ViewSet};
 
 /// Reads the posed views at `path`.
 ///
 /// `path` is the folder of a COLMAP model (or one of its files, or a folder with `sparse/0` or `sparse`), or a nerfstudio
-/// `transforms.json` (or its folder). COLMAP takes precedence over `transforms.json`, and binary over text, which is
+/// `transforms.json` (or its folder), or a scene folder as ScanNet's SensReader exports it (`color/`, `pose/`,
+/// `intrinsic/`). COLMAP takes precedence over `transforms.json`, that over ScanNet, and binary over text, which is
 /// rounded.
 ///
 /// `images_dir` is the folder of the images. The default is `images/` beside COLMAP's `sparse/` (or beside or in the
-/// model's folder), and the paths in a `transforms.json`. Images need not exist.
+/// model's folder), the paths in a `transforms.json`, and ScanNet's `color/`. Images need not exist, except that ScanNet
+/// states their size nowhere else.
 ///
 /// # Errors
 /// [`PoseError`], with file and place, for data that is missing, damaged or not supported.
@@ -45,6 +51,8 @@ pub fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError
     let json = path.join("transforms.json");
     if json.is_file() {
         transforms::read(&json, images_dir)
+    } else if path.join(scannet::POSES).is_dir() {
+        scannet::read(path, images_dir)
     } else {
         Err(PoseError::NotFound { path: path.to_owned() })
     }

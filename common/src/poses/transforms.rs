@@ -1,7 +1,7 @@
 //! Nerfstudio's `transforms.json` (its documentation, "Data conventions").
 //!
 //! `transform_matrix` is world from camera in OpenGL axes (x right, y up, z backward). An `applied_transform` records an
-//! earlier change of the world frame; it is not undone, so the world frame is the one of training.
+//! earlier change of the world frame; it is not undone, so the world frame is that of the file's poses.
 
 use std::f64::consts::PI;
 use std::path::{Component, Path, PathBuf};
@@ -9,10 +9,10 @@ use std::path::{Component, Path, PathBuf};
 use glam::{DAffine3, DMat3, DVec3};
 use serde::Deserialize;
 
-use super::checks::{affine_from_matrix, check_intrinsics};
+use super::checks::{affine_from_rows, check_intrinsics};
 use super::error::{Place, PoseError, PoseProblem};
 use super::paths::parent;
-use super::view_set::{PoseSource, ViewSet, view_set};
+use super::view_set::{AppliedTransform, PoseSource, ViewSet, view_set};
 use crate::camera::{Distortion, Intrinsics, View};
 
 /// Extensions tried, in this order, for a `file_path` without one.
@@ -53,6 +53,8 @@ struct Transforms {
     #[serde(flatten)]
     camera: Camera,
     frames: Vec<FrameEntry>,
+    applied_transform: Option<Vec<Vec<f64>>>,
+    applied_scale: Option<f64>,
 }
 
 pub(super) fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, PoseError> {
@@ -72,8 +74,30 @@ pub(super) fn read(path: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Po
             .and_then(|name| view(frame, file_path, name, &transforms.camera, &folder, images_dir));
         views.push(view.map_err(|problem| problem.at(path, Place::Frame(index)))?);
     }
-    view_set(path, views, PoseSource::Transforms)
+    let applied = applied(&transforms, &folder).map_err(|problem| problem.at(path, Place::File))?;
+    Ok(ViewSet { applied, ..view_set(path, views, PoseSource::Transforms)? })
 }
+
+/// Returns the earlier change of the world frame. Files of old versions of nerfstudio do not record it; it assumes
+/// [`COLMAP_AXES`] for them where the folder has `colmap/sparse/0` (its `nerfstudio_dataparser.py`).
+fn applied(transforms: &Transforms, folder: &Path) -> Result<Option<AppliedTransform>, PoseProblem> {
+    let scale = transforms.applied_scale.unwrap_or(1.0);
+    if !(scale.is_finite() && scale > 0.0) {
+        let found = scale.to_string();
+        return Err(PoseProblem::Expected { expected: "an applied_scale above 0", found });
+    }
+    let transform = match &transforms.applied_transform {
+        Some(rows) => affine_from_rows("applied_transform", rows, DMat3::IDENTITY)?,
+        None if folder.join("colmap/sparse/0").is_dir() => DAffine3::from_mat3(COLMAP_AXES),
+        None if transforms.applied_scale.is_some() => DAffine3::IDENTITY,
+        None => return Ok(None),
+    };
+    Ok(Some(AppliedTransform { transform, scale }))
+}
+
+/// Nerfstudio's world axes from COLMAP's and ScanNet's: x and y swapped, z negated.
+pub(super) const COLMAP_AXES: DMat3 =
+    DMat3::from_cols(DVec3::new(0.0, 1.0, 0.0), DVec3::new(1.0, 0.0, 0.0), DVec3::new(0.0, 0.0, -1.0));
 
 /// Returns the view of a frame; `name` may lack the extension, as its `file_path` may.
 fn view(
@@ -89,7 +113,8 @@ fn view(
         None => existing(&folder.join(file_path)),
     };
     let name = name + &extension;
-    let world_from_camera = world_from_camera(&name, &frame.transform_matrix)?;
+    let opencv_axes_in_opengl = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+    let world_from_camera = affine_from_rows(&name, &frame.transform_matrix, opencv_axes_in_opengl)?;
     let camera = frame.camera.clone().or(shared);
     let intrinsics = camera.intrinsics(&name, &image_path)?;
     Ok(View { name, image_path, intrinsics, camera_from_world: world_from_camera.inverse() })
@@ -140,7 +165,7 @@ fn is_image_folder(name: &str) -> bool {
 
 /// Returns the path and an empty text or, if it has no image extension, the first path with one that exists, and the
 /// text added.
-fn existing(path: &Path) -> (PathBuf, String) {
+pub(super) fn existing(path: &Path) -> (PathBuf, String) {
     let extension = path.extension().and_then(|e| e.to_str()).unwrap_or("");
     if EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension)) || path.is_file() {
         return (path.to_owned(), String::new());
@@ -154,20 +179,6 @@ fn existing(path: &Path) -> (PathBuf, String) {
         }
     }
     (path.to_owned(), String::new())
-}
-
-fn world_from_camera(image: &str, rows: &[Vec<f64>]) -> Result<DAffine3, PoseProblem> {
-    let expected = "a transform_matrix of 3 or 4 rows and 4 columns, the fourth row being 0 0 0 1";
-    let row = |index: usize| rows.get(index).and_then(|row| <[f64; 4]>::try_from(row.as_slice()).ok());
-    let ([Some(a), Some(b), Some(c)], true) = ([row(0), row(1), row(2)], matches!(rows.len(), 3 | 4)) else {
-        return Err(PoseProblem::Expected { expected, found: format!("{} rows", rows.len()) });
-    };
-    if rows.len() == 4 && row(3) != Some([0.0, 0.0, 0.0, 1.0]) {
-        return Err(PoseProblem::Expected { expected, found: format!("{:?}", rows[3]) });
-    }
-    let opencv_axes_in_opengl = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
-    let rotation = DMat3::from_cols_array_2d(&[0, 1, 2].map(|column| [a[column], b[column], c[column]]));
-    affine_from_matrix(image, rotation * opencv_axes_in_opengl, [a[3], b[3], c[3]])
 }
 
 impl Camera {

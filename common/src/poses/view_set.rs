@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use glam::DAffine3;
+
 use super::error::{Place, PoseError, PoseProblem};
 use crate::camera::View;
 
@@ -12,6 +14,19 @@ pub struct ViewSet {
     pub views: Vec<View>,
     /// The format they were read from.
     pub source: PoseSource,
+    /// Names of frames that are listed without a pose (ScanNet's `-inf`), sorted; they are not in `views`.
+    pub without_pose: Vec<String>,
+    /// The change of the world frame that a `transforms.json` says it contains already.
+    pub applied: Option<AppliedTransform>,
+}
+
+/// A change of the world frame by nerfstudio's `ns-process-data`: `saved = scale * transform * original`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct AppliedTransform {
+    /// `applied_transform`: a rotation and a translation.
+    pub transform: DAffine3,
+    /// `applied_scale`.
+    pub scale: f64,
 }
 
 /// A format of poses.
@@ -23,6 +38,8 @@ pub enum PoseSource {
     ColmapBinary,
     /// Nerfstudio `transforms.json`.
     Transforms,
+    /// A folder of ScanNet's SensReader.
+    Scannet,
 }
 
 /// Sorts views by name; an empty set or two equal names are errors.
@@ -34,5 +51,5 @@ pub(super) fn view_set(path: &Path, mut views: Vec<View>, source: PoseSource) ->
     if let Some(pair) = views.windows(2).find(|pair| pair[0].name == pair[1].name) {
         return Err(PoseProblem::DuplicateImage { image: pair[0].name.clone() }.at(path, Place::File));
     }
-    Ok(ViewSet { views, source })
+    Ok(ViewSet { views, source, without_pose: Vec::new(), applied: None })
 }

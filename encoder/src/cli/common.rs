@@ -2,6 +2,7 @@
 
 use std::fmt::Display;
 use std::io::{IsTerminal, Write};
+use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,6 +22,7 @@ use slag_service::stop::stop_signal;
 use tracing_subscriber::EnvFilter;
 
 use crate::embed::Background;
+use crate::ingest::FrameChoice;
 use crate::store::StoreReader;
 
 /// Flags that every command has.
@@ -74,15 +76,34 @@ pub struct InputArgs {
     /// Splat: .ply, .spz, compressed .ply, .sog (file or folder) or .splat.
     #[arg(long, value_name = "FILE")]
     pub scene: PathBuf,
-    /// Poses: the folder of a COLMAP model, or a nerfstudio transforms.json.
+    /// Poses: the folder of a COLMAP model, a nerfstudio transforms.json, or a ScanNet scene folder (color/, pose/,
+    /// intrinsic/).
     #[arg(long, value_name = "PATH")]
     pub views: PathBuf,
     /// Folder of the photos, if they are not beside the poses.
     #[arg(long, value_name = "DIR")]
     pub images: Option<PathBuf>,
+    /// Takes every Nth frame, counted by the numbers in the file names.
+    #[arg(long, value_name = "N")]
+    pub every: Option<NonZeroU32>,
+    /// Says how the splat's frame follows from that of the poses: `auto` for dataparser_transforms.json beside the
+    /// splat, where nerfstudio's export lies with the file of its training run; `none` where both have one frame; or a
+    /// file in that format, as `check --write-frame` makes it.
+    #[arg(long, value_name = "auto|none|FILE", default_value = "auto", value_parser = parse_frame)]
+    pub splat_frame: FrameChoice,
     /// Treats a missing or unreadable photo or mask as an error instead of leaving the view out.
     #[arg(long)]
     pub strict: bool,
+}
+
+/// Parses the file that states the splat's frame.
+pub fn parse_frame(text: &str) -> Result<FrameChoice, String> {
+    Ok(match text {
+        "" => return Err("expected auto, none or a file".into()),
+        "auto" => FrameChoice::Auto,
+        "none" => FrameChoice::None,
+        path => FrameChoice::File(path.into()),
+    })
 }
 
 /// `--background`.

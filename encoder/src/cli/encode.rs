@@ -179,6 +179,8 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             scene: args.input.scene.clone(),
             views: args.input.views.clone(),
             images: args.input.images.clone(),
+            every: args.input.every,
+            splat_frame: args.input.splat_frame.clone(),
             metric,
             geo,
         },

@@ -1,13 +1,14 @@
 //! Scene, views and geo-reference as they were read.
 
 use slag_common::frames::GeoReference;
+use slag_common::poses::ViewSet;
 use slag_common::splat::{self, ReadOptions};
 use slag_common::{Gaussians, View, poses};
 
 use super::context::RunContext;
 use super::error::EncodeError;
 use super::report::SkippedView;
-use super::settings::EncodeSettings;
+use super::settings::{EncodeSettings, InputSettings};
 use crate::cells::{self, CellSplit};
 use crate::ingest;
 
@@ -31,8 +32,14 @@ impl Inputs {
         let inputs = &settings.inputs;
         let geo_reference = inputs.geo.as_deref().map(ingest::read_geo_reference).transpose()?;
         let options = ReadOptions { with_sh_rest: false };
-        let scene = context.time("read", || splat::read(&inputs.scene, &options))?;
-        let (views, missing) = find_views(settings)?;
+        let mut scene = context.time("read", || splat::read(&inputs.scene, &options))?;
+        let set = read_views(inputs)?;
+        let frame = ingest::find_frame(&inputs.scene, &inputs.splat_frame, set.source, set.applied)?;
+        if let Some(frame) = frame {
+            tracing::info!("{frame}; the splat is brought into the world of the poses");
+            frame.to_poses(&mut scene);
+        }
+        let (views, missing) = find_views(settings, set.views)?;
         let limits = settings.cells.limits;
         let split = context.time("cells", || context.install(|| cells::split(&scene, limits)));
         if split.cells.is_empty() {
@@ -42,9 +49,26 @@ impl Inputs {
     }
 }
 
-/// Reads the poses and sets aside views without a photo.
-fn find_views(settings: &EncodeSettings) -> Result<(Vec<View>, Vec<SkippedView>), EncodeError> {
-    let views = poses::read(&settings.inputs.views, settings.inputs.images.as_deref())?.views;
+/// Reads the poses of every nth frame.
+fn read_views(inputs: &InputSettings) -> Result<ViewSet, EncodeError> {
+    let mut set = poses::read(&inputs.views, inputs.images.as_deref())?;
+    if let Some(n) = inputs.every {
+        let n_frames = set.views.len() + set.without_pose.len();
+        set = set.every(n);
+        tracing::info!("every {n}th frame: {} of {n_frames}", set.views.len() + set.without_pose.len());
+    }
+    if let Some(first) = set.without_pose.first() {
+        let (n, of) = (set.without_pose.len(), set.views.len() + set.without_pose.len());
+        tracing::info!("{n} of {of} frames have no pose (-inf) and are left out, the first is {first}");
+    }
+    Ok(set)
+}
+
+/// Sets aside views without a photo.
+fn find_views(
+    settings: &EncodeSettings,
+    views: Vec<View>,
+) -> Result<(Vec<View>, Vec<SkippedView>), EncodeError> {
     let missing: Vec<String> = ingest::missing_images(&views).into_iter().map(|v| v.name.clone()).collect();
     if let (true, Some(first)) = (settings.run.strict, ingest::missing_images(&views).first()) {
         let first = first.image_path.clone();

@@ -1,5 +1,6 @@
 //! The settings of an encode, split by the step that reads them.
 
+use std::num::NonZeroU32;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -10,6 +11,7 @@ use super::error::EncodeError;
 use crate::cells::CellLimits;
 use crate::codebook::CodebookSettings;
 use crate::embed::Background;
+use crate::ingest::FrameChoice;
 use crate::lift::Aggregation;
 use crate::raster::WeightKind;
 use crate::segment::SamSettings;
@@ -51,10 +53,14 @@ pub struct EncodeSettings {
 pub struct InputSettings {
     /// The splat file.
     pub scene: PathBuf,
-    /// The poses: a COLMAP model or a transforms.json.
+    /// The poses: a COLMAP model, a transforms.json or a ScanNet scene folder.
     pub views: PathBuf,
     /// The photos' folder, where it is not beside the poses.
     pub images: Option<PathBuf>,
+    /// Every how many frames one is taken, by their numbers; all where absent.
+    pub every: Option<NonZeroU32>,
+    /// What states the splat's frame against that of the poses.
+    pub splat_frame: FrameChoice,
     /// Whether a world unit is a metre; a geo-reference implies it.
     pub metric: bool,
     /// A geo-reference file.
@@ -206,7 +212,15 @@ impl EncodeSettings {
     /// Returns the settings to encode a splat and its photos into a store: those of the program without flags.
     pub fn new(scene: PathBuf, views: PathBuf, store: PathBuf, metric: bool) -> Self {
         Self {
-            inputs: InputSettings { scene, views, images: None, metric, geo: None },
+            inputs: InputSettings {
+                scene,
+                views,
+                images: None,
+                every: None,
+                splat_frame: FrameChoice::Auto,
+                metric,
+                geo: None,
+            },
             view: ViewSettings {
                 masks: Masks::Auto { n_levels: DEFAULT_MASK_LEVELS },
                 min_mask_px: 200,

@@ -2,6 +2,7 @@
 
 mod geo;
 mod jpeg;
+mod splat_frame;
 mod undistort;
 
 use std::io;
@@ -12,6 +13,7 @@ use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Rg
 use slag_common::{Distortion, Hash32, Intrinsics, View};
 
 pub use geo::{GeoError, read_geo_reference};
+pub use splat_frame::{FoundFrame, FrameChoice, find_frame};
 pub use undistort::Undistorter;
 
 /// Largest factor between the size in the intrinsics and that of downscaled photos.

@@ -1,5 +1,6 @@
 //! Compares the filters with an independent recomputation on synthetic logits: float64, dense arrays, no shared code.
 
+mod langsplat;
 mod levels;
 
 use std::path::Path;

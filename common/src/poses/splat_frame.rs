@@ -1,0 +1,140 @@
+//! The frame of a splat that was trained in another one than its poses': nerfstudio's `dataparser_transforms.json`.
+//!
+//! `ns-train` changes the world of its input poses and writes the change into the run's folder:
+//! `trained = scale * (transform * original)`. `ns-export gaussian-splat` writes the splat in the trained frame. Which
+//! frame is `original` depends on the dataparser (nerfstudio 1.1, `data/dataparsers/`):
+//!
+//! | poses | `original` |
+//! |---|---|
+//! | COLMAP | COLMAP's world |
+//! | `transforms.json` | the world before its `applied_transform` and `applied_scale` |
+//! | ScanNet | ScanNet's world with x and y swapped and z negated, which the file does not mention |
+//!
+//! The ScanNet dataparser never rotates further, so a file with a rotation is of another dataparser and begins at the
+//! poses themselves.
+
+use std::fmt;
+use std::io::Read;
+use std::path::Path;
+
+use fs_err::File;
+use glam::{DAffine3, DMat3, DQuat};
+use serde::{Deserialize, Serialize};
+
+use super::checks::affine_from_rows;
+use super::error::{Place, PoseError, PoseProblem};
+use super::transforms::COLMAP_AXES;
+use super::view_set::{AppliedTransform, PoseSource};
+use crate::similarity::Similarity;
+
+/// Nerfstudio's name of the file.
+pub const FRAME_FILE: &str = "dataparser_transforms.json";
+/// Value of `from` in files of [`SplatFrame::to_json`].
+const FROM_POSES: &str = "poses";
+/// Largest size of a file: 13 numbers and their names.
+const MAX_BYTES: u64 = 65_536;
+
+/// A file that says how a splat's frame follows from that of the poses.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SplatFrame {
+    transform: DAffine3,
+    scale: f64,
+    from_poses: bool,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Json {
+    transform: Vec<Vec<f64>>,
+    scale: f64,
+    /// Ours: `poses` where the transform begins at the poses as they are read. Nerfstudio ignores it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    from: Option<String>,
+}
+
+impl SplatFrame {
+    /// Reads a `dataparser_transforms.json`.
+    ///
+    /// # Errors
+    /// [`PoseError`], with the file, if it cannot be read, or has no rotation, translation and positive scale.
+    pub fn read(path: &Path) -> Result<Self, PoseError> {
+        let mut bytes = Vec::new();
+        File::open(path)?.take(MAX_BYTES + 1).read_to_end(&mut bytes)?;
+        let fail = |problem: PoseProblem| problem.at(path, Place::File);
+        if bytes.len() as u64 > MAX_BYTES {
+            let bytes = fs_err::metadata(path)?.len();
+            return Err(fail(PoseProblem::TooLarge { bytes, most: MAX_BYTES, expected: FRAME_FILE }));
+        }
+        let json: Json =
+            serde_json::from_slice(&bytes).map_err(|cause| PoseError::Frame { path: path.to_owned(), cause })?;
+        // A factor beyond this is no change of unit, and squares of lengths would leave the range of f32.
+        if !(1e-9..=1e9).contains(&json.scale) {
+            let found = json.scale.to_string();
+            return Err(fail(PoseProblem::Expected { expected: "a scale from 1e-9 to 1e9", found }));
+        }
+        let transform = affine_from_rows("transform", &json.transform, DMat3::IDENTITY).map_err(fail)?;
+        Ok(Self { transform, scale: json.scale, from_poses: json.from.as_deref() == Some(FROM_POSES) })
+    }
+
+    /// Returns the text of a file that states `splat_from_poses`, in nerfstudio's format.
+    pub fn to_json(splat_from_poses: &Similarity) -> String {
+        let Similarity { scale, rotation, translation } = *splat_from_poses;
+        let rotation = DMat3::from_quat(rotation);
+        let translation = translation / scale;
+        let row = |axis: usize| {
+            let row = rotation.row(axis);
+            vec![row.x, row.y, row.z, translation[axis]]
+        };
+        let json = Json { transform: (0..3).map(row).collect(), scale, from: Some(FROM_POSES.to_owned()) };
+        // Numbers and texts always serialise.
+        serde_json::to_string_pretty(&json).unwrap_or_default() + "\n"
+    }
+
+    /// Returns the transform from the world of poses to the splat's; `source` and `applied` are those of their
+    /// [`ViewSet`](super::ViewSet).
+    pub fn splat_from_poses(&self, source: PoseSource, applied: Option<AppliedTransform>) -> SplatFromPoses {
+        let direct = |scale| Similarity::from_rigid_then_scale(self.transform, scale);
+        let (similarity, begins_at) = match (self.from_poses, source, applied) {
+            (false, PoseSource::Transforms, Some(applied)) => {
+                let transform = self.transform * applied.transform.inverse();
+                let similarity = Similarity::from_rigid_then_scale(transform, self.scale / applied.scale);
+                (similarity, Origin::BeforeAppliedTransform)
+            }
+            (false, PoseSource::Scannet, _) if direct(1.0).is_unrotated() => {
+                let axes = Similarity::from_rotation(DQuat::from_mat3(&COLMAP_AXES));
+                (direct(self.scale).after(&axes), Origin::ScannetDataparser)
+            }
+            _ => (direct(self.scale), Origin::Poses),
+        };
+        SplatFromPoses { similarity, begins_at }
+    }
+}
+
+/// A transform from the world of the poses to the splat's.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SplatFromPoses {
+    /// The transform.
+    pub similarity: Similarity,
+    /// Where the file's transform begins.
+    pub begins_at: Origin,
+}
+
+/// Where the transform of a file begins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Origin {
+    /// At the poses as they are read.
+    Poses,
+    /// Before the `applied_transform` of the `transforms.json`.
+    BeforeAppliedTransform,
+    /// At the axes of nerfstudio's ScanNet dataparser.
+    ScannetDataparser,
+}
+
+impl fmt::Display for Origin {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Poses => "the poses as they are",
+            Self::BeforeAppliedTransform => "the world before the applied_transform of transforms.json",
+            Self::ScannetDataparser => "the axes of nerfstudio's ScanNet dataparser (x and y swapped, z negated)",
+        })
+    }
+}

@@ -1,0 +1,79 @@
+//! The frame of the splat against that of the poses: which file says so.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use slag_common::poses::{AppliedTransform, FRAME_FILE, PoseError, PoseSource, SplatFrame, SplatFromPoses};
+use slag_common::{Gaussians, Similarity};
+
+/// Where the splat's frame is stated.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum FrameChoice {
+    /// By `dataparser_transforms.json` beside the splat, if there is one.
+    #[default]
+    Auto,
+    /// Nowhere: splat and poses have one frame.
+    None,
+    /// By this file.
+    File(PathBuf),
+}
+
+/// A file that states the splat's frame.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FoundFrame {
+    /// The file.
+    pub path: PathBuf,
+    /// What it states of the given poses.
+    pub stated: SplatFromPoses,
+}
+
+/// Looks for the file that states the frame of the splat at `scene`; `source` and `applied` are those of the poses.
+///
+/// # Errors
+/// [`PoseError`] if the file cannot be read.
+pub fn find_frame(
+    scene: &Path,
+    choice: &FrameChoice,
+    source: PoseSource,
+    applied: Option<AppliedTransform>,
+) -> Result<Option<FoundFrame>, PoseError> {
+    let path = match choice {
+        FrameChoice::None => return Ok(None),
+        FrameChoice::File(path) => path.clone(),
+        FrameChoice::Auto => {
+            let beside = scene.with_file_name(FRAME_FILE);
+            if !beside.is_file() {
+                return Ok(None);
+            }
+            beside
+        }
+    };
+    let stated = SplatFrame::read(&path)?.splat_from_poses(source, applied);
+    Ok(Some(FoundFrame { path, stated }))
+}
+
+impl FoundFrame {
+    /// Returns the transform from the world of the poses to the splat's.
+    pub fn splat_from_poses(&self) -> Similarity {
+        self.stated.similarity
+    }
+
+    /// Brings a splat into the world of the poses. Harmonics above degree 0 are dropped.
+    pub fn to_poses(&self, scene: &mut Gaussians) {
+        self.stated.similarity.inverse().transform_gaussians(scene);
+    }
+}
+
+impl fmt::Display for FoundFrame {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let SplatFromPoses { similarity, begins_at } = self.stated;
+        write!(
+            f,
+            "{}: the splat's world is that of the poses times {:.6}, rotated by {:.2} degrees and moved; the transform \
+             begins at {begins_at}",
+            self.path.display(),
+            similarity.scale,
+            similarity.rotation.angle_between(Similarity::IDENTITY.rotation).to_degrees(),
+        )
+    }
+}
