@@ -107,12 +107,17 @@ mod tests {
     /// Oracle: 4 x 4 matrices.
     #[test]
     fn composition_and_inverse_are_those_of_matrices() {
-        let other = Similarity { scale: 2.5, rotation: DQuat::from_rotation_y(-0.4), translation: DVec3::ONE };
-        let matrix =
-            |s: &Similarity| DAffine3::from_scale_rotation_translation(DVec3::splat(s.scale), s.rotation, s.translation);
+        let other =
+            Similarity { scale: 2.5, rotation: DQuat::from_rotation_y(-0.4), translation: DVec3::ONE };
+        let matrix = |s: &Similarity| {
+            DAffine3::from_scale_rotation_translation(DVec3::splat(s.scale), s.rotation, s.translation)
+        };
         let (a, b) = (example(), other);
         let close = |x: DAffine3, y: DAffine3| {
-            assert!(x.to_cols_array().iter().zip(y.to_cols_array()).all(|(x, y)| (x - y).abs() < 1e-12), "{x} {y}");
+            assert!(
+                x.to_cols_array().iter().zip(y.to_cols_array()).all(|(x, y)| (x - y).abs() < 1e-12),
+                "{x} {y}"
+            );
         };
         close(matrix(&a.after(&b)), matrix(&a) * matrix(&b));
         close(matrix(&a.inverse()), matrix(&a).inverse());
@@ -122,10 +127,12 @@ mod tests {
     #[test]
     fn the_transformed_camera_sees_the_same() {
         let s = example();
-        let camera = DAffine3::from_rotation_translation(DQuat::from_rotation_x(0.3), DVec3::new(0.1, -2.0, 4.0));
+        let camera =
+            DAffine3::from_rotation_translation(DQuat::from_rotation_x(0.3), DVec3::new(0.1, -2.0, 4.0));
         let moved = s.camera_from_target(camera);
         for point in [DVec3::ZERO, DVec3::new(1.0, -5.0, 2.0), DVec3::new(-3.0, 0.2, 7.0)] {
-            let (before, after) = (camera.transform_point3(point), moved.transform_point3(s.transform_point(point)));
+            let (before, after) =
+                (camera.transform_point3(point), moved.transform_point3(s.transform_point(point)));
             assert!((after - before * s.scale).length() < 1e-12, "{before} {after}");
         }
     }

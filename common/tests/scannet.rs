@@ -162,7 +162,8 @@ fn dataparser_transforms_begin_where_their_dataparser_does() {
     same(found.similarity.transform_point(point), orient.transform_point3(point) * 0.5);
     // The dataparser orients the saved poses by `orient` and scales them by 0.5; its file states `orient * applied`
     // and 0.5 * 4.
-    let views = json(r#""applied_transform": [[0,1,0,0],[1,0,0,0],[0,0,-1,0]], "applied_scale": 4.0,"#).unwrap();
+    let views =
+        json(r#""applied_transform": [[0,1,0,0],[1,0,0,0],[0,0,-1,0]], "applied_scale": 4.0,"#).unwrap();
     let found = read(orient * swap, 0.5 * 4.0).splat_from_poses(views.source, views.applied);
     assert_eq!(found.begins_at, Origin::BeforeAppliedTransform);
     same(found.similarity.transform_point(point), orient.transform_point3(point) * 0.5);
@@ -209,6 +210,8 @@ fn damaged_frames_are_named() {
     assert!(message(&format!(r#"{{"transform": {unit}, "scale": 0}}"#)).contains("a scale from"));
     assert!(message(&format!(r#"{{"transform": {unit}, "scale": -1}}"#)).contains("a scale from"));
     assert!(message(r#"{"transform": [[1,0,0,0]], "scale": 1}"#).contains("3 or 4 rows"));
-    assert!(message(r#"{"transform": [[2,0,0,0],[0,2,0,0],[0,0,2,0]], "scale": 1}"#).contains("not a rotation"));
+    assert!(
+        message(r#"{"transform": [[2,0,0,0],[0,2,0,0],[0,0,2,0]], "scale": 1}"#).contains("not a rotation")
+    );
     assert!(message(&" ".repeat(70_000)).contains("70000 bytes"));
 }

@@ -81,11 +81,7 @@ pub(super) fn affine_from_wxyz(
 }
 
 /// Returns the transform of a rotation matrix, which is made exactly orthonormal, and a translation.
-fn affine_from_matrix(
-    image: &str,
-    rotation: DMat3,
-    translation: [f64; 3],
-) -> Result<DAffine3, PoseProblem> {
+fn affine_from_matrix(image: &str, rotation: DMat3, translation: [f64; 3]) -> Result<DAffine3, PoseProblem> {
     let gram = rotation.transpose() * rotation - DMat3::IDENTITY;
     let largest =
         gram.to_cols_array().iter().fold(0.0_f64, |m, v| if v.is_nan() { *v } else { m.max(v.abs()) });

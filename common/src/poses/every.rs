@@ -12,8 +12,12 @@ impl ViewSet {
     /// are known. If any name has no number, all frames are counted in the order of their names instead.
     pub fn every(mut self, n: NonZeroU32) -> Self {
         let n = u64::from(n.get());
-        let mut names: Vec<&str> =
-            self.views.iter().map(|v| v.name.as_str()).chain(self.without_pose.iter().map(String::as_str)).collect();
+        let mut names: Vec<&str> = self
+            .views
+            .iter()
+            .map(|v| v.name.as_str())
+            .chain(self.without_pose.iter().map(String::as_str))
+            .collect();
         names.sort_unstable();
         let numbers: Option<Vec<u64>> = names.iter().map(|name| number(name)).collect();
         let numbers = numbers.unwrap_or_else(|| (0..names.len() as u64).collect());

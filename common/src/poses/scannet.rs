@@ -42,7 +42,9 @@ pub(super) fn read(dir: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Pos
     let intrinsics_path = dir.join(INTRINSICS);
     let Matrix::Known(camera) = read_matrix(&intrinsics_path)? else {
         let found = "-inf".to_owned();
-        return Err(PoseProblem::Expected { expected: "a camera matrix", found }.at(&intrinsics_path, Place::File));
+        return Err(
+            PoseProblem::Expected { expected: "a camera matrix", found }.at(&intrinsics_path, Place::File)
+        );
     };
     let mut stems = Vec::new();
     for entry in fs_err::read_dir(dir.join(POSES))? {
@@ -82,7 +84,8 @@ pub(super) fn read(dir: &Path, images_dir: Option<&Path>) -> Result<ViewSet, Pos
     };
     let intrinsics =
         intrinsics(&camera, size_px).map_err(|problem| problem.at(&intrinsics_path, Place::File))?;
-    let view = |(name, image_path, camera_from_world)| View { name, image_path, intrinsics, camera_from_world };
+    let view =
+        |(name, image_path, camera_from_world)| View { name, image_path, intrinsics, camera_from_world };
     let views = posed.into_iter().map(view).collect();
     Ok(ViewSet { without_pose, ..view_set(&dir.join(POSES), views, PoseSource::Scannet)? })
 }
@@ -131,7 +134,8 @@ fn read_matrix(path: &Path) -> Result<Matrix, PoseError> {
         }
     }
     if !matches!(rows.len(), 3 | 4) || rows.iter().any(|row| row.len() != 4) {
-        let found = format!("{} rows of {:?} numbers", rows.len(), rows.iter().map(Vec::len).collect::<Vec<_>>());
+        let found =
+            format!("{} rows of {:?} numbers", rows.len(), rows.iter().map(Vec::len).collect::<Vec<_>>());
         let found = found.chars().take(60).collect();
         return fail(PoseProblem::Expected { expected: "4 rows of 4 numbers", found }, Place::File);
     }

@@ -64,8 +64,8 @@ impl SplatFrame {
             let bytes = fs_err::metadata(path)?.len();
             return Err(fail(PoseProblem::TooLarge { bytes, most: MAX_BYTES, expected: FRAME_FILE }));
         }
-        let json: Json =
-            serde_json::from_slice(&bytes).map_err(|cause| PoseError::Frame { path: path.to_owned(), cause })?;
+        let json: Json = serde_json::from_slice(&bytes)
+            .map_err(|cause| PoseError::Frame { path: path.to_owned(), cause })?;
         // A factor beyond this is no change of unit, and squares of lengths would leave the range of f32.
         if !(1e-9..=1e9).contains(&json.scale) {
             let found = json.scale.to_string();
@@ -134,7 +134,9 @@ impl fmt::Display for Origin {
         f.write_str(match self {
             Self::Poses => "the poses as they are",
             Self::BeforeAppliedTransform => "the world before the applied_transform of transforms.json",
-            Self::ScannetDataparser => "the axes of nerfstudio's ScanNet dataparser (x and y swapped, z negated)",
+            Self::ScannetDataparser => {
+                "the axes of nerfstudio's ScanNet dataparser (x and y swapped, z negated)"
+            }
         })
     }
 }

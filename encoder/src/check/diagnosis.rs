@@ -2,13 +2,15 @@
 
 use glam::DVec3;
 use serde::Serialize;
-use slag_common::Gaussians;
+use slag_common::{Gaussians, Similarity};
 use slag_math::stats::{Rank, quantile};
 
 use super::error::CheckError;
-use super::mistake::{MISTAKES, Mistake};
+use super::frames::FrameCandidate;
+use super::mistake::Mistake;
+use super::search::Search;
 use super::view::{CheckView, at_width, draw, flat_psnr_db, mean, psnr_db};
-use crate::raster::{RasterView, Rasterizer};
+use crate::raster::Rasterizer;
 
 /// Result of the search for a mistake.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -17,6 +19,10 @@ pub struct Diagnosis {
     pub given_psnr_db: f64,
     /// The mistake whose correction explains the photos, if any does.
     pub mistake: Option<Mistake>,
+    /// A second mistake, corrected after the first.
+    pub and: Option<Mistake>,
+    /// The similarity from the world of the poses to that of the splat, where the mistake is one and nothing else.
+    pub splat_from_poses: Option<Similarity>,
     /// All corrections tried, best first.
     pub tried: Vec<Trial>,
     /// Diagonal of the box around the middle 90 % of the Gaussians along each axis, world units.
@@ -32,8 +38,17 @@ pub struct Diagnosis {
 pub struct Trial {
     /// The corrected mistake.
     pub mistake: Mistake,
+    /// A second mistake, corrected after the first.
+    pub and: Option<Mistake>,
     /// Mean PSNR with the correction, dB.
     pub psnr_db: f64,
+}
+
+impl Trial {
+    /// Returns the corrections in their order.
+    pub(super) fn corrections(&self) -> Vec<Mistake> {
+        std::iter::once(self.mistake).chain(self.and).collect()
+    }
 }
 
 /// Least gain that counts as clear, both of a correction over the given poses and of a drawing over a plain colour, dB.
@@ -81,39 +96,40 @@ impl Samples {
         Ok(())
     }
 
-    /// Tries every correction on the samples.
+    /// Searches for the correction with which the samples match; `frames` are tried beside common mistakes.
     pub(super) fn diagnose(
         &self,
         scene: &Gaussians,
         rasterizer: &dyn Rasterizer,
         means: Means,
+        frames: &[FrameCandidate],
     ) -> Result<Diagnosis, CheckError> {
-        let psnr_with = |correct: &dyn Fn(&RasterView) -> RasterView| -> Result<f64, CheckError> {
+        let psnr_with = |corrections: &[Mistake]| -> Result<f64, CheckError> {
             let mut sum = 0.0;
             for sample in &self.views {
-                let drawing =
-                    draw(scene, &CheckView { view: correct(&sample.view), ..sample.clone() }, rasterizer)?;
+                let view = corrections.iter().fold(sample.view, |view, mistake| mistake.corrected(&view));
+                let drawing = draw(scene, &CheckView { view, ..sample.clone() }, rasterizer)?;
                 sum += psnr_db(&sample.image, |pixel, c| drawing.rgb[pixel * 3 + c]);
             }
             Ok(sum / self.views.len() as f64)
         };
-        let given_psnr_db = psnr_with(&|view| *view)?;
-        let mut tried = MISTAKES
-            .into_iter()
-            .map(|mistake| Ok(Trial { mistake, psnr_db: psnr_with(&|view| mistake.corrected(view))? }))
-            .collect::<Result<Vec<_>, CheckError>>()?;
-        tried.sort_by(|a, b| b.psnr_db.total_cmp(&a.psnr_db));
+        let given_psnr_db = psnr_with(&[])?;
         // A correction that merely turns black into some colour gains too, but never exceeds the mean colour.
         let flat_db = mean(self.views.iter().map(|sample| flat_psnr_db(&sample.image)));
-        let mistake = tried
-            .first()
-            .filter(|best| best.psnr_db > given_psnr_db + CLEAR_GAIN_DB && best.psnr_db > flat_db)
-            .map(|best| best.mistake);
+        let enough_db = (given_psnr_db + CLEAR_GAIN_DB).max(flat_db);
+        let scene_diagonal = scene_diagonal(scene);
+        let centre = scene_middle(scene);
+        let tried = Search { psnr_db: &psnr_with, frames, enough_db, centre, scene_diagonal }.run()?;
+        let best = tried.first().filter(|best| best.psnr_db > enough_db);
         let mut diagnosis = Diagnosis {
             given_psnr_db,
-            mistake,
+            mistake: best.map(|best| best.mistake),
+            and: best.and_then(|best| best.and),
+            splat_from_poses: best
+                .filter(|best| best.and.is_none())
+                .and_then(|best| best.mistake.splat_from_poses()),
             tried,
-            scene_diagonal: scene_diagonal(scene),
+            scene_diagonal,
             camera_spread: spread(&self.camera_positions),
             advice: Vec::new(),
         };
@@ -125,10 +141,13 @@ impl Samples {
 fn advice(diagnosis: &Diagnosis, means: Means) -> Vec<String> {
     let mut advice = Vec::new();
     match diagnosis.mistake {
-        Some(mistake) => advice.push(format!(
-            "{mistake} (PSNR {:.1} dB instead of {:.1} dB)",
-            diagnosis.tried[0].psnr_db, diagnosis.given_psnr_db
-        )),
+        Some(mistake) => {
+            let and = diagnosis.and.map_or(String::new(), |and| format!("; and {and}"));
+            advice.push(format!(
+                "{mistake}{and} (PSNR {:.1} dB instead of {:.1} dB)",
+                diagnosis.tried[0].psnr_db, diagnosis.given_psnr_db
+            ));
+        }
         None => advice.push(format!(
             "the drawings match the photos hardly better than a plain colour (PSNR {:.1} dB, plain colour {:.1} dB), \
              and no common mistake explains it; check that photos, poses and scene come from the same reconstruction",
@@ -153,13 +172,21 @@ fn advice(diagnosis: &Diagnosis, means: Means) -> Vec<String> {
 
 /// Returns the diagonal of the box around the middle 90 % of the means along each axis.
 fn scene_diagonal(scene: &Gaussians) -> f64 {
-    let size = |axis: usize| {
+    (at_per_mille(scene, 950) - at_per_mille(scene, 50)).length()
+}
+
+/// Returns the medians of the means along the axes.
+fn scene_middle(scene: &Gaussians) -> DVec3 {
+    at_per_mille(scene, 500)
+}
+
+fn at_per_mille(scene: &Gaussians, per_mille: usize) -> DVec3 {
+    let along = |axis: usize| {
         let finite = |p: &DVec3| Some(p[axis]).filter(|v| v.is_finite());
         let mut values: Vec<f64> = scene.means_in_world.iter().filter_map(finite).collect();
-        let mut at = |per_mille| quantile(&mut values, per_mille, Rank::Between).unwrap_or_default();
-        at(950) - at(50)
+        quantile(&mut values, per_mille, Rank::Between).unwrap_or_default()
     };
-    DVec3::new(size(0), size(1), size(2)).length()
+    DVec3::new(along(0), along(1), along(2))
 }
 
 /// Returns the largest distance of a position from the mean of all positions.

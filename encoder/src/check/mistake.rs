@@ -4,7 +4,9 @@ use std::fmt;
 
 use glam::{DAffine3, DMat3, DVec3};
 use serde::Serialize;
+use slag_common::Similarity;
 
+use super::frames::{FrameCandidate, from_axes, right_angles, write_axes};
 use crate::raster::RasterView;
 
 /// A common mistake in poses or intrinsics.
@@ -21,28 +23,38 @@ pub enum Mistake {
     SceneScale(f64),
     /// The focal lengths must be multiplied by this factor.
     FocalScale(f64),
-    /// The scene must be rotated about the world's x axis by this many quarter turns (y up instead of z up, or the
-    /// reverse).
-    WorldQuarterTurns(u8),
+    /// The worlds differ by right angles: axis i of the splat's is this axis of the cameras', counted from 1, with its
+    /// sign.
+    WorldAxes([i8; 3]),
+    /// The worlds differ by a similarity.
+    Frame(FrameCandidate),
 }
 
-/// All mistakes that are tried.
-pub(super) const MISTAKES: [Mistake; 12] = [
-    Mistake::OpenGlAxes,
-    Mistake::WorldFromCamera,
-    Mistake::WorldFromOpenGlCamera,
-    Mistake::SceneScale(0.01),
-    Mistake::SceneScale(0.1),
-    Mistake::SceneScale(10.0),
-    Mistake::SceneScale(100.0),
-    Mistake::FocalScale(0.5),
-    Mistake::FocalScale(2.0),
-    Mistake::WorldQuarterTurns(1),
-    Mistake::WorldQuarterTurns(2),
-    Mistake::WorldQuarterTurns(3),
-];
+/// The wrong conventions of cameras.
+pub(super) const CAMERA_CONVENTIONS: [Mistake; 3] =
+    [Mistake::OpenGlAxes, Mistake::WorldFromCamera, Mistake::WorldFromOpenGlCamera];
+
+/// Returns all mistakes that are tried by themselves, beside frames.
+pub(super) fn single_mistakes() -> Vec<Mistake> {
+    let scales = [0.01, 0.1, 10.0, 100.0].map(Mistake::SceneScale);
+    let focals = [0.5, 2.0].map(Mistake::FocalScale);
+    let axes = right_angles().into_iter().map(Mistake::WorldAxes);
+    CAMERA_CONVENTIONS.into_iter().chain(scales).chain(focals).chain(axes).collect()
+}
 
 impl Mistake {
+    /// Returns the similarity from the world of the poses to that of the splat; `None` for mistakes of cameras.
+    pub fn splat_from_poses(self) -> Option<Similarity> {
+        match self {
+            Self::SceneScale(factor) => Some(Similarity::from_scale(factor)),
+            Self::WorldAxes(axes) => Some(from_axes(axes)),
+            Self::Frame(frame) => Some(frame.splat_from_poses),
+            Self::OpenGlAxes | Self::WorldFromCamera | Self::WorldFromOpenGlCamera | Self::FocalScale(_) => {
+                None
+            }
+        }
+    }
+
     /// Returns the view with the mistake corrected.
     pub fn corrected(self, view: &RasterView) -> RasterView {
         let mut corrected = *view;
@@ -52,14 +64,14 @@ impl Mistake {
             Self::OpenGlAxes => *pose = opencv_from_opengl * *pose,
             Self::WorldFromCamera => *pose = pose.inverse(),
             Self::WorldFromOpenGlCamera => *pose = opencv_from_opengl * pose.inverse(),
-            Self::SceneScale(factor) => pose.translation *= factor,
             Self::FocalScale(factor) => {
                 corrected.intrinsics.focal_x_px *= factor;
                 corrected.intrinsics.focal_y_px *= factor;
             }
-            Self::WorldQuarterTurns(quarters) => {
-                let angle_rad = f64::from(quarters) * std::f64::consts::FRAC_PI_2;
-                *pose *= DAffine3::from_rotation_x(angle_rad);
+            Self::SceneScale(_) | Self::WorldAxes(_) | Self::Frame(_) => {
+                if let Some(similarity) = self.splat_from_poses() {
+                    *pose = similarity.camera_from_target(*pose);
+                }
             }
         }
         corrected
@@ -84,11 +96,8 @@ impl fmt::Display for Mistake {
             Self::FocalScale(factor) => {
                 write!(f, "the focal length belongs to another image size or sensor; multiply it by {factor}")
             }
-            Self::WorldQuarterTurns(quarters) => write!(
-                f,
-                "scene and cameras differ in their up axis; rotate the scene by {} degrees about x",
-                u32::from(*quarters) * 90
-            ),
+            Self::WorldAxes(axes) => write_axes(*axes, f),
+            Self::Frame(frame) => write!(f, "{}", frame.cause),
         }
     }
 }

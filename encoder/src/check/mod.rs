@@ -3,10 +3,15 @@
 //! The check draws sample views of the scene, compares each with its photo and, where they differ, looks for common
 //! mistakes in poses and intrinsics.
 
+mod align;
 mod diagnosis;
 mod error;
+mod frames;
 mod mistake;
 mod report;
+mod search;
+#[cfg(test)]
+mod tests;
 mod view;
 
 use std::path::PathBuf;
@@ -18,8 +23,10 @@ use crate::raster::Rasterizer;
 use diagnosis::{CLEAR_GAIN_DB, Samples};
 use view::{at_width, draw, flat_psnr_db, mean, picture, picture_name};
 
+pub use align::{AlignError, Alignment, align};
 pub use diagnosis::{Diagnosis, Trial};
 pub use error::CheckError;
+pub use frames::{FrameCandidate, FrameCause, nerfstudio_defaults};
 pub use mistake::Mistake;
 pub use report::{CheckReport, ViewCheck};
 pub use view::{CheckView, psnr_db};
@@ -35,11 +42,19 @@ pub struct CheckOptions {
     pub diagnosis_width_px: u32,
     /// Number of views in which mistakes are searched, spread evenly over all views.
     pub diagnosis_views: usize,
+    /// Similarities between the worlds of poses and splat that are tried beside common mistakes.
+    pub frames: Vec<FrameCandidate>,
 }
 
 impl Default for CheckOptions {
     fn default() -> Self {
-        Self { width_px: 800, pictures_dir: None, diagnosis_width_px: 240, diagnosis_views: 4 }
+        Self {
+            width_px: 800,
+            pictures_dir: None,
+            diagnosis_width_px: 240,
+            diagnosis_views: 4,
+            frames: Vec::new(),
+        }
     }
 }
 
@@ -93,10 +108,11 @@ where
         mean_covered_share: mean(checks.iter().map(|c| c.covered_share)),
         views: checks,
         unusable_gaussians,
+        notes: Vec::new(),
         diagnosis: None,
     };
     if report.mean_psnr_db < report.mean_flat_psnr_db + CLEAR_GAIN_DB {
-        report.diagnosis = Some(samples.diagnose(scene, rasterizer, report.means())?);
+        report.diagnosis = Some(samples.diagnose(scene, rasterizer, report.means(), &options.frames)?);
     }
     Ok(report)
 }

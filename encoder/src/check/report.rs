@@ -3,6 +3,7 @@
 use std::fmt;
 
 use serde::Serialize;
+use slag_common::Similarity;
 
 use super::diagnosis::{Diagnosis, Means};
 
@@ -34,6 +35,8 @@ pub struct CheckReport {
     pub mean_covered_share: f64,
     /// Largest number of Gaussians that cannot be drawn in a view.
     pub unusable_gaussians: usize,
+    /// What else is known of the inputs, a sentence each.
+    pub notes: Vec<String>,
     /// Likely mistake; `None` if the drawings match the photos.
     pub diagnosis: Option<Diagnosis>,
 }
@@ -67,14 +70,36 @@ impl fmt::Display for CheckReport {
             "{:<28} {:>8.2} {:>14.2} {covered:>9}",
             "mean", self.mean_psnr_db, self.mean_flat_psnr_db
         )?;
+        for note in &self.notes {
+            writeln!(f, "{note}")?;
+        }
         match &self.diagnosis {
             None => writeln!(f, "the drawings match the photos"),
-            Some(Diagnosis { mistake: Some(mistake), tried, .. }) => {
+            Some(Diagnosis { mistake: Some(mistake), and, tried, splat_from_poses, .. }) => {
                 let best_db = tried.first().map_or(f64::NAN, |trial| trial.psnr_db);
+                let and = and.map_or(String::new(), |and| format!("; and {and}"));
                 writeln!(
                     f,
-                    "the drawings do not match the photos; likely mistake: {mistake} ({best_db:.2} dB with the correction)"
-                )
+                    "the drawings do not match the photos; likely mistake: {mistake}{and} ({best_db:.2} dB with the \
+                     correction)"
+                )?;
+                if let Some(Similarity { scale, rotation, translation }) = splat_from_poses {
+                    let (axis, angle_rad) = rotation.to_axis_angle();
+                    writeln!(
+                        f,
+                        "the splat's world is that of the poses times {scale:.6}, rotated by {:.3} degrees about \
+                         ({:.4}, {:.4}, {:.4}), then moved by ({:.6}, {:.6}, {:.6}); write it with --write-frame FILE \
+                         and encode with --splat-frame FILE",
+                        angle_rad.to_degrees(),
+                        axis.x,
+                        axis.y,
+                        axis.z,
+                        translation.x,
+                        translation.y,
+                        translation.z
+                    )?;
+                }
+                Ok(())
             }
             Some(_) => writeln!(
                 f,

@@ -1,15 +1,16 @@
 //! `check`: compares renderings of the scene with the photos.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use anyhow::{Result, anyhow};
+use anyhow::{Context, Result, anyhow};
 use clap::Args;
-use slag_common::{poses, splat};
+use slag_common::poses::SplatFrame;
+use slag_common::{View, durable, poses, splat};
 
 use super::common::{InputArgs, print};
 use super::exit::Exit;
-use crate::check::{self, CheckOptions, CheckView};
-use crate::ingest;
+use crate::check::{self, Alignment, CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause};
+use crate::ingest::{self, FoundFrame};
 use crate::raster::RasterView;
 use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
@@ -32,11 +33,31 @@ pub struct CheckArgs {
     /// Folder for PNGs of each photo beside its rendering.
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
+    /// A second set of poses of the same photos, in the splat's world: the similarity between both worlds follows from
+    /// the camera centres, and is tried.
+    #[arg(long, value_name = "PATH")]
+    pub also_poses: Option<PathBuf>,
+    /// Where splat and poses differ by a similarity (rotation, scale, translation), writes it into this file, in the
+    /// format of nerfstudio's dataparser_transforms.json; `encode --splat-frame FILE` applies it.
+    #[arg(long, value_name = "FILE")]
+    pub write_frame: Option<PathBuf>,
 }
 
 pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
-    let scene = splat::read(&args.input.scene, &splat::ReadOptions { with_sh_rest: true })?;
-    let all = poses::read(&args.input.views, args.input.images.as_deref())?.views;
+    let input = &args.input;
+    let scene = splat::read(&input.scene, &splat::ReadOptions { with_sh_rest: true })?;
+    let mut set = poses::read(&input.views, input.images.as_deref())?;
+    let mut notes = Vec::new();
+    let frame = ingest::find_frame(&input.scene, &input.splat_frame, set.source, set.applied)?;
+    let frames = candidates(args, &set.views, frame.as_ref(), &mut notes)?;
+    if let Some(n) = input.every {
+        set = set.every(n);
+    }
+    if let Some(first) = set.without_pose.first() {
+        let (n, of) = (set.without_pose.len(), set.views.len() + set.without_pose.len());
+        notes.push(format!("{n} of {of} frames have no pose (-inf) and are left out, the first is {first}"));
+    }
+    let all = set.views;
     let missing: Vec<_> = ingest::missing_images(&all).into_iter().map(|v| v.image_path.clone()).collect();
     if let Some(first) = missing.first() {
         let message = format!(
@@ -45,18 +66,20 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
             all.len(),
             first.display()
         );
-        if args.input.strict || missing.len() == all.len() {
+        if input.strict || missing.len() == all.len() {
             return Err(anyhow!("{message}; give their folder with --images"));
         }
         tracing::warn!("{message}");
     }
     let there: Vec<_> = all.into_iter().filter(|v| !missing.contains(&v.image_path)).collect();
     let n = (args.samples as usize).min(there.len());
+    let stated = frame.as_ref().map(FoundFrame::splat_from_poses);
     // One at a time: a photo is loaded when the check reaches it.
     let views = (0..n).map(|i| {
         let loaded = ingest::load_image(&there[i * there.len() / n])?;
+        let camera_from_world = loaded.view.camera_from_world;
         let view = RasterView {
-            camera_from_world: loaded.view.camera_from_world,
+            camera_from_world: stated.map_or(camera_from_world, |s| s.camera_from_target(camera_from_world)),
             intrinsics: loaded.view.intrinsics,
         };
         Ok(CheckView { name: loaded.view.name, image: loaded.image, view })
@@ -64,9 +87,67 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
     let options = CheckOptions {
         width_px: args.raster_width,
         pictures_dir: args.out.clone(),
+        frames,
         ..CheckOptions::default()
     };
-    let report = check::check(&scene, views, &Devices::open(args.device, GpuOptions::default())?, &options)?;
+    let devices = Devices::open(args.device, GpuOptions::default())?;
+    let mut report = check::check(&scene, views, &devices, &options)?;
+    // Cameras were in the stated frame already; what is reported and written begins at the poses.
+    if let (Some(stated), Some(diagnosis)) = (stated, &mut report.diagnosis) {
+        diagnosis.splat_from_poses = diagnosis.splat_from_poses.map(|found| found.after(&stated));
+    }
+    if let Some(path) = &args.write_frame {
+        notes.push(write_frame(path, &report)?);
+    }
+    report.notes = notes;
     print(json, &report, &report)?;
     Ok(if missing.is_empty() { Exit::Done } else { Exit::Partly })
+}
+
+/// Returns the similarities to try; all begin where `frame` leads, if there is one.
+fn candidates(
+    args: &CheckArgs,
+    views: &[View],
+    frame: Option<&FoundFrame>,
+    notes: &mut Vec<String>,
+) -> Result<Vec<FrameCandidate>> {
+    let mut found = Vec::new();
+    if let Some(path) = &args.also_poses {
+        let other = poses::read(path, None)?.views;
+        let Alignment { similarity, n_cameras, residual } = check::align(views, &other)?;
+        notes.push(format!(
+            "{n_cameras} photos are in both sets of poses; a similarity of scale {:.6} brings them together, up to {:.2} \
+             % of their spread",
+            similarity.scale,
+            100.0 * residual
+        ));
+        found.push(FrameCandidate { cause: FrameCause::OtherPoses, splat_from_poses: similarity });
+    }
+    found.extend(check::nerfstudio_defaults(views));
+    if let Some(frame) = frame {
+        notes.push(format!("{frame}; the cameras are drawn in the splat's world"));
+        let poses_from_stated = frame.splat_from_poses().inverse();
+        for candidate in &mut found {
+            candidate.splat_from_poses = candidate.splat_from_poses.after(&poses_from_stated);
+        }
+        found.push(FrameCandidate {
+            cause: FrameCause::FrameFileNotMeant,
+            splat_from_poses: poses_from_stated,
+        });
+    }
+    Ok(found)
+}
+
+/// Writes the similarity that was found, and returns what was done.
+fn write_frame(path: &Path, report: &CheckReport) -> Result<String> {
+    let similarity = report.diagnosis.as_ref().and_then(|diagnosis| diagnosis.splat_from_poses);
+    Ok(match (similarity, &report.diagnosis) {
+        (Some(similarity), _) => {
+            durable::write(path, SplatFrame::to_json(&similarity).as_bytes())
+                .with_context(|| format!("cannot write {}", path.display()))?;
+            format!("wrote {}; encode with --splat-frame {}", path.display(), path.display())
+        }
+        (None, None) => format!("{} not written: splat and poses have one frame already", path.display()),
+        (None, Some(_)) => format!("{} not written: no similarity was found", path.display()),
+    })
 }

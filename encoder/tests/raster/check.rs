@@ -164,7 +164,7 @@ fn planted_mistakes_are_diagnosed() {
         let m = &mut view.camera_from_world.matrix3;
         (m.y_axis, m.z_axis) = (m.z_axis, -m.y_axis);
     };
-    assert_eq!(diagnosed(&scene, &y_up), Some(Mistake::WorldQuarterTurns(3)));
+    assert_eq!(diagnosed(&scene, &y_up), Some(Mistake::WorldAxes([1, -3, 2])));
 
     let other_way = |view: &mut RasterView| {
         let pose = &mut view.camera_from_world;

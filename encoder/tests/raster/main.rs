@@ -5,6 +5,7 @@ mod brute_force;
 mod check;
 mod extremes;
 mod fixtures;
+mod frames;
 mod gpu;
 mod gsplat;
 mod oracle;

@@ -13,7 +13,7 @@ use slag_models::{InferenceError, ModelDir, SessionOptions, TextEncoder};
 
 use super::lerf::{LerfLabels, lerf};
 use super::scan::Scan;
-use super::scannet::{Matching, ScannetReport, scannet};
+use super::scannet::{Matching, ScannetReport, Segments, scannet};
 use super::*;
 use slag_encoder::cells::CellLimits;
 use slag_encoder::codebook::CodebookSettings;
@@ -259,7 +259,8 @@ fn scans_are_judged_by_the_protocol() {
     let scan = Scan::read(&dir, None).expect("a scan");
     let mut encoder = renamed(&[("wall", "red"), ("floor", "blue"), ("toilet", "green")]);
     let settings = EvalSettings::default();
-    let judged = scannet(&wall.reader(), &scan, &wall.gaussians, &mut encoder, Matching::Nearest, &settings);
+    let judged =
+        scannet(&wall.reader(), &scan, &wall.gaussians, &mut encoder, Matching::Nearest, None, &settings);
     let report = judged.expect("judges");
     assert_eq!((report.n_labelled, report.n_without_answer), (192 * 2 + 5, 5));
     for subset in &report.subsets {
@@ -281,22 +282,31 @@ fn scans_are_judged_by_the_protocol() {
 
     // Swapped words: no answer is correct.
     let mut swapped = renamed(&[("wall", "blue"), ("floor", "red")]);
-    let judged = scannet(&wall.reader(), &scan, &wall.gaussians, &mut swapped, Matching::Nearest, &settings);
+    let judged =
+        scannet(&wall.reader(), &scan, &wall.gaussians, &mut swapped, Matching::Nearest, None, &settings);
     assert_eq!(judged.expect("judges").subsets[0].miou, Some(0.0));
-    let none =
-        scannet(&wall.reader(), &scan, &wall.gaussians, &mut renamed(&[]), Matching::Nearest, &settings);
+    let none = scannet(
+        &wall.reader(),
+        &scan,
+        &wall.gaussians,
+        &mut renamed(&[]),
+        Matching::Nearest,
+        None,
+        &settings,
+    );
     assert!(matches!(none, Err(EvalError::NoWords { n: 19, .. })));
 
     // By index: needs equal numbers of vertices and Gaussians, and leaves out transparent Gaussians.
-    let judged = scannet(&wall.reader(), &scan, &wall.gaussians, &mut encoder, Matching::Index, &settings);
+    let judged =
+        scannet(&wall.reader(), &scan, &wall.gaussians, &mut encoder, Matching::Index, None, &settings);
     let message = judged.expect_err("another length").to_string();
     assert!(message.contains("391 vertices, the splat has 384 Gaussians"), "{message}");
     write_mesh(&dir.join("scene0062_00_vh_clean_2.labels.ply"), &vertices()[..COLUMNS * ROWS], true);
     let scan = Scan::read(&dir, None).expect("a scan");
     let mut faint = wall.gaussians.clone();
     faint.opacities[..40].fill(0.05);
-    let judged =
-        scannet(&wall.reader(), &scan, &faint, &mut encoder, Matching::Index, &settings).expect("judges");
+    let judged = scannet(&wall.reader(), &scan, &faint, &mut encoder, Matching::Index, None, &settings)
+        .expect("judges");
     assert_eq!((judged.n_labelled, judged.subsets[2].miou), (COLUMNS * ROWS - 40, Some(1.0)));
 }
 
@@ -338,4 +348,98 @@ fn segments_and_groups_give_the_labels() {
 
     write_mesh(&name("_vh_clean_2.labels.ply"), &[([0.0; 3], 41)], true);
     failed("label 41, expected 0 to 40");
+}
+
+/// Oracle: the rules restated. The wall's answers are known (left half `wall`, right half `floor`); segments and labels are
+/// made at random; votes are counted segment by segment, IoU and accuracy by sets.
+#[test]
+fn filtered_answers_are_the_majority_of_each_segment() {
+    let wall = Wall::new();
+    let dir = wall.folder("scene0097_00");
+    let mut random = slag_math::random::Random::new(5);
+    let n = COLUMNS * ROWS;
+    // 30 segments with large numbers, each mostly of one half; labels mostly right, some of neither class.
+    let answers: Vec<usize> = (0..n).map(|i| usize::from(i % COLUMNS >= COLUMNS / 2)).collect();
+    let segments: Vec<u32> = answers
+        .iter()
+        .map(|answer| {
+            let half = if random.below(4) == 0 { 1 - answer } else { *answer };
+            4_000_000_000 - 1000 * (half as u32 * 15 + random.below(15) as u32)
+        })
+        .collect();
+    let rows: Vec<([f64; 3], u16)> = (0..n)
+        .map(|i| {
+            let label = match random.below(10) {
+                0 => 0,
+                1 => 4,
+                2 => 2 - answers[i] as u16,
+                _ => 1 + answers[i] as u16,
+            };
+            (wall.gaussians.means_in_world[i].to_array(), label)
+        })
+        .collect();
+    write_mesh(&dir.join("scene0097_00_vh_clean_2.labels.ply"), &rows, true);
+    let mut splat = wall.gaussians.clone();
+    splat.opacities[7..40].fill(0.05);
+    let scan = Scan::read(&dir, None).expect("a scan");
+    let mut encoder = renamed(&[("wall", "red"), ("floor", "blue")]);
+    let settings = EvalSettings::default();
+    let mut judged =
+        |from| scannet(&wall.reader(), &scan, &splat, &mut encoder, Matching::Index, from, &settings);
+    let message = judged(Some(Segments::Scan)).expect_err("no segments").to_string();
+    assert!(message.contains("segs.json") && message.contains("--segments superpoints"), "{message}");
+    assert_eq!(
+        judged(Some(Segments::Auto)).expect("judges").filtered.expect("filtered").segments,
+        Segments::Superpoints
+    );
+
+    let path = dir.join("scene0097_00_vh_clean_2.0.010000.segs.json");
+    fs_err::write(&path, json!({"segIndices": segments[1..]}).to_string()).expect("writes");
+    assert!(judged(Some(Segments::Auto)).expect_err("short").to_string().contains("383 segments"));
+    fs_err::write(&path, json!({"segIndices": segments}).to_string()).expect("writes");
+    assert!(judged(None).expect("judges").filtered.is_none());
+    let report = judged(Some(Segments::Auto)).expect("judges");
+
+    let counted: Vec<usize> = (0..n).filter(|i| !(7..40).contains(i)).collect();
+    let voted: Vec<usize> = (0..n)
+        .map(|i| {
+            let of_segment = counted.iter().filter(|k| segments[**k] == segments[i]);
+            let (walls, floors): (Vec<usize>, Vec<usize>) = of_segment.partition(|k| answers[**k] == 0);
+            usize::from(floors.len() > walls.len())
+        })
+        .collect();
+    let means = |answers: &[usize]| {
+        let of_class = |(class, label): (usize, u16)| {
+            // Vertices of other labels than the classes' are not judged.
+            let judged = counted.iter().filter(|i| [1, 2, 4].contains(&rows[**i].1));
+            let (mut both, mut either, mut truth) = (0.0, 0.0, 0.0);
+            for i in judged {
+                let (is, said) = (rows[*i].1 == label, answers[*i] == class);
+                both += f64::from(u8::from(is && said));
+                either += f64::from(u8::from(is || said));
+                truth += f64::from(u8::from(is));
+            }
+            [both / either, both / truth]
+        };
+        // `bed` is in the scene and never the answer.
+        let figures = [(0, 1), (1, 2)].map(of_class);
+        [0, 1].map(|at| (figures[0][at] + figures[1][at]) / 3.0)
+    };
+    let filtered = report.filtered.as_ref().expect("filtered");
+    let n_segments = counted.iter().map(|i| segments[*i]).collect::<std::collections::BTreeSet<_>>().len();
+    assert_eq!((filtered.segments, filtered.n_segments), (Segments::Scan, n_segments));
+    assert_ne!(voted, answers, "the filter changes answers");
+    for (subsets, expected) in [(&report.subsets, means(&answers)), (&filtered.subsets, means(&voted))] {
+        for subset in subsets {
+            assert_eq!(subset.n_classes, 3);
+            let found = [subset.miou, subset.macc].map(|figure| figure.expect("three classes"));
+            assert!((0..2).all(|at| (found[at] - expected[at]).abs() < 1e-12), "{found:?} {expected:?}");
+        }
+    }
+    let text = ScannetReport::new(vec![report]).to_string();
+    for row in
+        ["scene0097_00 PF", "mean PF", "SLAG (paper)", "SLAG PF (paper)    0.375   0.500 |   0.377   0.507"]
+    {
+        assert!(text.contains(row), "{row}\n{text}");
+    }
 }

@@ -116,6 +116,24 @@ impl Scan {
         Ok(scan(vertices, labels, BTreeMap::new()))
     }
 
+    /// Returns the segment of each vertex (`[N]`, numbers of the file) by ScanNet's Segmentator, or `None` where the scan
+    /// has no such file.
+    ///
+    /// # Errors
+    /// [`ScanError`] if the file is malformed or of another mesh.
+    pub fn segments(&self) -> Result<Option<Vec<u32>>, ScanError> {
+        let path = segments_path(&self.dir, &self.name);
+        if !path.is_file() {
+            return Ok(None);
+        }
+        read_segments(&path, self.vertices.len()).map(Some)
+    }
+
+    /// Returns where the file of segments is expected.
+    pub fn segments_path(&self) -> PathBuf {
+        segments_path(&self.dir, &self.name)
+    }
+
     #[expect(clippy::type_complexity, reason = "the parts of a scan, used once")]
     fn of_segments(
         dir: &Path,
@@ -125,17 +143,7 @@ impl Scan {
         let wrong = |path: &Path, what: String| ScanError::Wrong { path: path.to_owned(), what };
         let id_of = read_categories(categories)?;
         let vertices = read_vertices(&dir.join(format!("{name}_vh_clean_2.ply")), ["x", "y", "z"])?;
-        let path = dir.join(format!("{name}_vh_clean_2.0.010000.segs.json"));
-        let segments: Segments = serde_json::from_slice(&fs_err::read(&path)?)
-            .map_err(|error| wrong(&path, format!("{error}; expected segIndices, one per vertex")))?;
-        if segments.of_vertex.len() != vertices.len() {
-            let what = format!(
-                "{} segments, expected one for each of {} vertices; use both files of one release",
-                segments.of_vertex.len(),
-                vertices.len()
-            );
-            return Err(wrong(&path, what));
-        }
+        let segments = read_segments(&segments_path(dir, name), vertices.len())?;
         let path =
             [".aggregation.json", "_vh_clean.aggregation.json"].map(|end| dir.join(format!("{name}{end}")));
         let path = path.iter().find(|path| path.is_file()).unwrap_or(&path[0]);
@@ -153,14 +161,32 @@ impl Scan {
             }
         }
         let mut unknown_labels: BTreeMap<String, usize> = BTreeMap::new();
-        for segment in &segments.of_vertex {
+        for segment in &segments {
             if let Some(label) = unknown.get(segment) {
                 *unknown_labels.entry((*label).to_owned()).or_default() += 1;
             }
         }
-        let labels = segments.of_vertex.iter().map(|s| id_of_segment.get(s).copied().unwrap_or(0)).collect();
+        let labels = segments.iter().map(|s| id_of_segment.get(s).copied().unwrap_or(0)).collect();
         Ok((vertices, labels, unknown_labels))
     }
+}
+
+fn segments_path(dir: &Path, name: &str) -> PathBuf {
+    dir.join(format!("{name}_vh_clean_2.0.010000.segs.json"))
+}
+
+/// Reads the segment of each vertex.
+fn read_segments(path: &Path, n_vertices: usize) -> Result<Vec<u32>, ScanError> {
+    let wrong = |what: String| ScanError::Wrong { path: path.to_owned(), what };
+    let segments: Segments = serde_json::from_slice(&fs_err::read(path)?)
+        .map_err(|error| wrong(format!("{error}; expected segIndices, one per vertex")))?;
+    if segments.of_vertex.len() != n_vertices {
+        return Err(wrong(format!(
+            "{} segments, expected one for each of {n_vertices} vertices; use both files of one release",
+            segments.of_vertex.len()
+        )));
+    }
+    Ok(segments.of_vertex)
 }
 
 /// Reads the NYU40 id of each of the annotators' categories.

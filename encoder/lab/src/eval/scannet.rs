@@ -14,10 +14,12 @@ use slag_common::Gaussians;
 use slag_models::TextEncoder;
 
 use super::error::{EvalError, check_scene};
+use super::filter;
 use super::metrics::{Confusion, mean};
 use super::report::Subset;
 use super::scan::{Scan, ScanError};
 use super::settings::EvalSettings;
+use slag_encoder::lift::superpoint::{NO_SUPERPOINT, SuperpointSettings, Superpoints};
 use slag_encoder::query;
 use slag_encoder::store::StoreReader;
 
@@ -73,6 +75,29 @@ pub enum Matching {
     Nearest,
 }
 
+/// Where the segments of the prediction filter come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum Segments {
+    /// The scan's segs.json, or else superpoints.
+    Auto,
+    /// The scan's segs.json.
+    Scan,
+    /// Our superpoints of the splat.
+    Superpoints,
+}
+
+/// Figures of a scene after the prediction filter.
+#[derive(Clone, Debug, Serialize)]
+pub struct FilteredReport {
+    /// Where the segments came from: `Scan` or `Superpoints`.
+    pub segments: Segments,
+    /// Segments with a vertex.
+    pub n_segments: usize,
+    /// 19, 15 and 10 classes.
+    pub subsets: Vec<Subset>,
+}
+
 /// Figures of a scene.
 #[derive(Clone, Debug, Serialize)]
 pub struct ScanReport {
@@ -80,6 +105,9 @@ pub struct ScanReport {
     pub scene: String,
     /// 19, 15 and 10 classes; `n_classes` are those that the scene has.
     pub subsets: Vec<Subset>,
+    /// The same after the prediction filter, where it was asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub filtered: Option<FilteredReport>,
     /// Labelled vertices of the 19 classes.
     pub n_labelled: usize,
     /// Labelled vertices without an answer, because no Gaussian is near or it has no evidence; they count as wrong.
@@ -97,13 +125,35 @@ pub struct ScannetReport {
     pub scenes: Vec<ScanReport>,
     /// Means over the scenes, of 19, 15 and 10 classes.
     pub means: Vec<Subset>,
+    /// The same after the prediction filter, where it was asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub filtered_means: Option<Vec<Subset>>,
+    /// The paper's rows, over its ten scenes.
+    pub paper: [PaperRow; 2],
     /// Scenes of the protocol that were not evaluated.
     pub missing_scenes: Vec<&'static str>,
 }
 
+/// A row of the paper's ScanNet table, in percent (Szilagyi, Engelmann, Bohg, RA-L 2025).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct PaperRow {
+    /// Its name.
+    pub name: &'static str,
+    /// mIoU and mAcc of 19, 15 and 10 classes.
+    pub percent: [[f64; 2]; 3],
+}
+
+/// The paper's rows without and with its prediction filter.
+const PAPER: [PaperRow; 2] = [
+    PaperRow { name: "SLAG (paper)", percent: [[28.98, 43.40], [28.98, 44.26], [37.14, 54.80]] },
+    PaperRow { name: "SLAG PF (paper)", percent: [[37.54, 49.99], [37.71, 50.70], [45.46, 60.08]] },
+];
+
 /// Evaluates a store against a labelled mesh.
 ///
-/// `scene` is the splat that was encoded, in the mesh's frame.
+/// `scene` is the splat that was encoded, in the mesh's frame. With `segments`, the figures after the paper's prediction
+/// filter are beside the plain ones: all vertices of a segment take the class that most of its vertices with an answer
+/// have, ties going to the first of the list. Labels have no part in it; vertices without one vote too.
 ///
 /// # Errors
 /// [`EvalError`].
@@ -113,6 +163,7 @@ pub fn scannet(
     scene: &Gaussians,
     encoder: &mut dyn TextEncoder,
     matching: Matching,
+    segments: Option<Segments>,
     settings: &EvalSettings,
 ) -> Result<ScanReport, EvalError> {
     check_scene(reader, scene)?;
@@ -146,31 +197,28 @@ pub fn scannet(
         of_class.get(gaussian).copied().filter(|score| !score.is_nan())
     };
     let ids_of_19 = CLASSES.map(|(id, _)| id);
-    let subsets = [&ids_of_19[..], &IDS_OF_15, &IDS_OF_10].map(|ids| {
-        let classes: Vec<usize> = CLASSES
-            .iter()
-            .enumerate()
-            .filter(|(_, (id, _))| ids.contains(id))
-            .map(|(class, _)| class)
-            .collect();
-        let mut confusion = Confusion::new(CLASSES.len());
-        for (label, gaussian) in scan.labels.iter().zip(&gaussian_of) {
-            let truth = classes.iter().copied().find(|class| CLASSES[*class].0 == *label);
-            let (Some(truth), Some(gaussian)) = (truth, gaussian.counted()) else { continue };
-            let answer = gaussian.and_then(|gaussian| {
-                let answers = classes.iter().filter_map(|class| Some((*class, score(*class, gaussian)?)));
-                answers.max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)))
-            });
-            confusion.count(truth, answer.map(|(class, _)| class));
+    let filter = segments.map(|from| segments_of(scan, scene, &gaussian_of, from)).transpose()?;
+    let judge = |ids: &[u16], filter: Option<&Superpoints>| {
+        let classes: Vec<usize> =
+            (0..CLASSES.len()).filter(|class| ids.contains(&CLASSES[*class].0)).collect();
+        let answer = |answerer: &Answerer| {
+            let gaussian = answerer.counted()??;
+            let answers = classes.iter().filter_map(|class| Some((*class, score(*class, gaussian)?)));
+            answers.max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0))).map(|(class, _)| class)
+        };
+        let mut answers: Vec<Option<usize>> = gaussian_of.iter().map(answer).collect();
+        if let Some(segments) = filter {
+            filter::vote(&mut answers, segments);
         }
-        // The protocol takes means over the classes of the scene.
-        let present: Vec<usize> =
-            classes.into_iter().filter(|class| confusion.accuracy(*class).is_some()).collect();
-        Subset {
-            n_classes: present.len(),
-            miou: mean(present.iter().map(|class| confusion.iou(*class))),
-            macc: mean(present.iter().map(|class| confusion.accuracy(*class))),
-        }
+        subset(&classes, scan, &gaussian_of, &answers)
+    };
+    let all_subsets =
+        |filter| [&ids_of_19[..], &IDS_OF_15, &IDS_OF_10].map(|ids| judge(ids, filter)).to_vec();
+    let subsets = all_subsets(None);
+    let filtered = filter.map(|(segments, of_vertex)| FilteredReport {
+        segments,
+        n_segments: of_vertex.n,
+        subsets: all_subsets(Some(&of_vertex)),
     });
     let counted = scan.labels.iter().zip(&gaussian_of).filter(|(label, _)| ids_of_19.contains(label));
     let counted: Vec<Option<usize>> = counted.filter_map(|(_, gaussian)| gaussian.counted()).collect();
@@ -179,12 +227,68 @@ pub fn scannet(
     };
     Ok(ScanReport {
         scene: scan.name.clone(),
-        subsets: subsets.into(),
+        subsets,
+        filtered,
         n_labelled: counted.len(),
         n_without_answer: counted.iter().filter(|gaussian| !has_answer(gaussian)).count(),
         unknown_labels: scan.unknown_labels.clone(),
         unknown_words,
     })
+}
+
+/// Compares answers with labels; means are over the classes that the scene has, as in the protocol.
+fn subset(classes: &[usize], scan: &Scan, gaussian_of: &[Answerer], answers: &[Option<usize>]) -> Subset {
+    let mut confusion = Confusion::new(CLASSES.len());
+    for ((label, answerer), answer) in scan.labels.iter().zip(gaussian_of).zip(answers) {
+        let truth = classes.iter().copied().find(|class| CLASSES[*class].0 == *label);
+        if let (Some(truth), Some(_)) = (truth, answerer.counted()) {
+            confusion.count(truth, *answer);
+        }
+    }
+    let present: Vec<usize> =
+        classes.iter().copied().filter(|class| confusion.accuracy(*class).is_some()).collect();
+    Subset {
+        n_classes: present.len(),
+        miou: mean(present.iter().map(|class| confusion.iou(*class))),
+        macc: mean(present.iter().map(|class| confusion.accuracy(*class))),
+    }
+}
+
+/// Returns the segment of each vertex, numbered from 0, and where it came from. Vertices that are left out are in none.
+fn segments_of(
+    scan: &Scan,
+    scene: &Gaussians,
+    gaussian_of: &[Answerer],
+    from: Segments,
+) -> Result<(Segments, Superpoints), EvalError> {
+    let of_scan = if from == Segments::Superpoints { None } else { scan.segments()? };
+    if of_scan.is_none() && from == Segments::Scan {
+        let what = "does not exist; add it, or use --segments superpoints".to_owned();
+        return Err(ScanError::Wrong { path: scan.segments_path(), what }.into());
+    }
+    let (used, ids) = match of_scan {
+        Some(ids) => (Segments::Scan, ids),
+        None => {
+            let superpoints = Superpoints::new(scene, None, &SuperpointSettings::of_looks());
+            let of_vertex = |answerer: &Answerer| match answerer {
+                Answerer::Gaussian(gaussian) => superpoints.of_gaussian[*gaussian],
+                Answerer::None | Answerer::LeftOut => NO_SUPERPOINT,
+            };
+            (Segments::Superpoints, gaussian_of.iter().map(of_vertex).collect())
+        }
+    };
+    let mut number_of = HashMap::new();
+    let mut of_gaussian = Vec::with_capacity(ids.len());
+    for (id, answerer) in ids.iter().zip(gaussian_of) {
+        if *answerer == Answerer::LeftOut || (used == Segments::Superpoints && *id == NO_SUPERPOINT) {
+            of_gaussian.push(NO_SUPERPOINT);
+            continue;
+        }
+        // Fewer segments than vertices, which a mesh of less than 4 GiB numbers with 32 bits.
+        let next = number_of.len() as u32;
+        of_gaussian.push(*number_of.entry(*id).or_insert(next));
+    }
+    Ok((used, Superpoints { of_gaussian, n: number_of.len() }))
 }
 
 /// The answer's source for a vertex.
@@ -248,16 +352,20 @@ fn by_distance(scan: &Scan, scene: &Gaussians) -> Vec<Answerer> {
 impl ScannetReport {
     /// Takes the means over scenes.
     pub fn new(scenes: Vec<ScanReport>) -> Self {
-        let means = (0..3)
-            .map(|subset| Subset {
-                n_classes: [CLASSES.len(), IDS_OF_15.len(), IDS_OF_10.len()][subset],
-                miou: mean(scenes.iter().map(|scene| scene.subsets[subset].miou)),
-                macc: mean(scenes.iter().map(|scene| scene.subsets[subset].macc)),
-            })
-            .collect();
+        let means_of = |subsets: &dyn Fn(&ScanReport) -> Option<Vec<Subset>>| -> Option<Vec<Subset>> {
+            let of_scenes: Vec<Vec<Subset>> = scenes.iter().map(subsets).collect::<Option<_>>()?;
+            let mean_of = |at: usize| Subset {
+                n_classes: [CLASSES.len(), IDS_OF_15.len(), IDS_OF_10.len()][at],
+                miou: mean(of_scenes.iter().map(|subsets| subsets[at].miou)),
+                macc: mean(of_scenes.iter().map(|subsets| subsets[at].macc)),
+            };
+            Some((0..3).map(mean_of).collect())
+        };
+        let means = means_of(&|scene| Some(scene.subsets.clone())).unwrap_or_default();
+        let filtered_means = means_of(&|scene| Some(scene.filtered.as_ref()?.subsets.clone()));
         let missing_scenes =
             SCENES.into_iter().filter(|name| !scenes.iter().any(|s| s.scene == *name)).collect();
-        Self { scenes, means, missing_scenes }
+        Self { scenes, means, filtered_means, paper: PAPER, missing_scenes }
     }
 }
 
@@ -272,8 +380,30 @@ impl fmt::Display for ScannetReport {
         writeln!(f, "{:<16} {}", "scene", ["   mIoU    mAcc"; 3].join(" |"))?;
         for scene in &self.scenes {
             writeln!(f, "{:<16} {}", scene.scene, figures(&scene.subsets))?;
+            if let Some(filtered) = &scene.filtered {
+                writeln!(f, "{:<16} {}", format!("{} PF", scene.scene), figures(&filtered.subsets))?;
+            }
         }
         writeln!(f, "{:<16} {}", "mean", figures(&self.means))?;
+        if let Some(means) = &self.filtered_means {
+            writeln!(f, "{:<16} {}", "mean PF", figures(means))?;
+        }
+        for row in &self.paper {
+            let figures =
+                row.percent.map(|[miou, macc]| format!("{:>7.3} {:>7.3}", miou / 100.0, macc / 100.0));
+            writeln!(f, "{:<16} {}", row.name, figures.join(" |"))?;
+        }
+        for scene in &self.scenes {
+            if let Some(FilteredReport { segments, n_segments, .. }) = &scene.filtered {
+                let from = match segments {
+                    Segments::Superpoints => {
+                        "superpoints of the splat, as the scan has no segs.json or it was not asked for"
+                    }
+                    Segments::Auto | Segments::Scan => "segments of ScanNet's segs.json",
+                };
+                writeln!(f, "{} PF: majority class of {n_segments} {from}", scene.scene)?;
+            }
+        }
         for scene in &self.scenes {
             if scene.n_without_answer > 0 {
                 let (n, of) = (scene.n_without_answer, scene.n_labelled);

@@ -4,15 +4,17 @@ use std::path::PathBuf;
 
 use anyhow::{Result, anyhow};
 use clap::Args;
+use slag_common::poses::PoseSource;
 use slag_common::shard::Profile;
 use slag_common::splat;
 use slag_encoder::cli::Exit;
-use slag_encoder::cli::common::{ModelArgs, print, text_encoder_of};
+use slag_encoder::cli::common::{ModelArgs, parse_frame, print, text_encoder_of};
+use slag_encoder::ingest::{self, FrameChoice};
 use slag_encoder::store::StoreReader;
 
 use crate::eval::EvalSettings;
 use crate::eval::scan::Scan;
-use crate::eval::scannet::{self, Matching, ScannetReport};
+use crate::eval::scannet::{self, Matching, ScannetReport, Segments};
 
 /// `eval scannet`.
 #[derive(Debug, Args)]
@@ -20,7 +22,7 @@ pub struct EvalScannetArgs {
     /// Store; once per scan.
     #[arg(long, value_name = "DIR", required = true)]
     store: Vec<PathBuf>,
-    /// The splat that was encoded, in the mesh's frame; once per scan.
+    /// The splat that was encoded; once per scan.
     #[arg(long, value_name = "FILE", required = true)]
     scene: Vec<PathBuf>,
     /// Scan: scans/sceneXXXX_YY; may be repeated.
@@ -32,6 +34,13 @@ pub struct EvalScannetArgs {
     /// Compares Gaussians and vertices one by one, for splats trained with Gaussians fixed to the vertices (OpenGaussian).
     #[arg(long)]
     by_index: bool,
+    /// Also evaluates with the paper's prediction filter (PF): all vertices of a segment take its most frequent class.
+    /// `scan` reads ScanNet's segs.json, `superpoints` segments the splat, `auto` the first that there is.
+    #[arg(long, value_enum, value_name = "FROM", num_args = 0..=1, default_missing_value = "auto")]
+    segments: Option<Segments>,
+    /// Says how the splat's frame follows from that of the scan, see `slag-encoder encode --help`: auto, none or a file.
+    #[arg(long, value_name = "auto|none|FILE", default_value = "auto", value_parser = parse_frame)]
+    splat_frame: FrameChoice,
     /// The models that the stores were encoded with.
     #[command(flatten)]
     models: ModelArgs,
@@ -54,9 +63,22 @@ pub(super) fn run(args: &EvalScannetArgs, json: bool) -> Result<Exit> {
     for ((scan, store), scene) in args.scan.iter().zip(&args.store).zip(&args.scene) {
         let reader = StoreReader::open(store)?;
         let mut encoder = text_encoder_of(&reader, &args.models)?;
-        let scene = splat::read(scene, &splat::ReadOptions { with_sh_rest: false })?;
+        let frame = ingest::find_frame(scene, &args.splat_frame, PoseSource::Scannet, None)?;
+        let mut scene = splat::read(scene, &splat::ReadOptions { with_sh_rest: false })?;
+        if let Some(frame) = frame {
+            tracing::info!("{frame}; the splat is brought into the world of the scan");
+            frame.to_poses(&mut scene);
+        }
         let scan = Scan::read(scan, args.categories.as_deref())?;
-        scenes.push(scannet::scannet(&reader, &scan, &scene, &mut *encoder, matching, &settings)?);
+        scenes.push(scannet::scannet(
+            &reader,
+            &scan,
+            &scene,
+            &mut *encoder,
+            matching,
+            args.segments,
+            &settings,
+        )?);
     }
     let report = ScannetReport::new(scenes);
     print(json, &report, &report)?;

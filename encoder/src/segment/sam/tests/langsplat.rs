@@ -88,7 +88,9 @@ fn the_score_filter_keeps_what_langsplats_own_code_keeps() {
             })
             .collect();
         // Scores tell the masks of a set apart. LangSplat leaves masks in their order, ours go by score.
-        let of = |score: f64| candidates.iter().position(|c| c.score().total_cmp(&score).is_eq()).expect("one of them");
+        let of = |score: f64| {
+            candidates.iter().position(|c| c.score().total_cmp(&score).is_eq()).expect("one of them")
+        };
         let mut kept: Vec<usize> = keep(candidates.clone(), &filter).iter().map(|c| of(c.score())).collect();
         kept.sort_unstable();
         assert_eq!(kept, set.kept, "set {at}");

@@ -1,0 +1,165 @@
+//! Tests of similarities from camera centres and of nerfstudio's frames.
+
+use std::path::PathBuf;
+
+use glam::{DAffine3, DMat3, DQuat, DVec3};
+use slag_common::{Distortion, Intrinsics, Similarity, View};
+
+use super::{AlignError, FrameCause, align, nerfstudio_defaults};
+
+fn view(name: &str, world_from_camera: DAffine3) -> View {
+    View {
+        name: name.to_owned(),
+        image_path: PathBuf::from(name),
+        intrinsics: Intrinsics {
+            width_px: 64,
+            height_px: 48,
+            focal_x_px: 50.0,
+            focal_y_px: 50.0,
+            centre_x_px: 32.0,
+            centre_y_px: 24.0,
+            distortion: Distortion::None,
+        },
+        camera_from_world: world_from_camera.inverse(),
+    }
+}
+
+fn views(centres: &[[f64; 3]]) -> Vec<View> {
+    let at = |(i, centre): (usize, &[f64; 3])| {
+        let turn = DQuat::from_rotation_y(0.3 * i as f64);
+        view(&format!("{i:03}.jpg"), DAffine3::from_rotation_translation(turn, DVec3::from_array(*centre)))
+    };
+    centres.iter().enumerate().map(at).collect()
+}
+
+const FROM: [[f64; 3]; 6] = [
+    [0.3, -1.2, 2.5],
+    [4.1, 0.7, -0.4],
+    [-2.2, 3.3, 1.8],
+    [1.9, -2.6, -3.1],
+    [0.0, 1.5, 0.9],
+    [-3.7, -0.8, -1.4],
+];
+const TO: [[f64; 3]; 6] = [
+    [12.1, -3.4, 7.7],
+    [9.0, 4.6, -1.2],
+    [19.3, -2.9, 0.4],
+    [2.2, 1.1, 12.5],
+    [14.0, 0.2, 3.3],
+    [8.8, -11.7, 8.1],
+];
+
+/// Oracle: Umeyama's method by singular values in NumPy, float64, recorded. The points are unrelated; those of the
+/// second case are mirrored, so the best orthogonal matrix of one of them is a reflection, which must not be taken.
+#[test]
+fn similarities_are_umeyamas() {
+    let recorded = [
+        (
+            1.0,
+            1.967_024_567_261_443_5,
+            [
+                [-0.4098612285704881, 0.9080215372606628, 0.08666407090295482],
+                [0.8549927540877511, 0.4155447412321632, -0.31033845796442494],
+                [-0.317806802589455, -0.05309854899219634, -0.9466675130809076],
+            ],
+            [10.677308521847024, -2.220871955478967, 5.283781754538377],
+            0.5405787789704621,
+        ),
+        (
+            -1.0,
+            2.137_209_527_207_881_3,
+            [
+                [-0.2876807422874066, 0.26232715172858256, 0.9210994821315098],
+                [0.9465760167148813, -0.0684507009699394, 0.3151322676542548],
+                [0.1457176554064601, 0.9625481634716743, -0.22862064189427675],
+            ],
+            [10.758462592256896, -2.1632665794428148, -5.43823983253438],
+            0.40553110230539163,
+        ),
+    ];
+    for (flip, scale, rows, translation, residual) in recorded {
+        let to = TO.map(|[x, y, z]| [x, y, flip * z]);
+        let found = align(&views(&FROM), &views(&to)).unwrap();
+        let rotation = DMat3::from_quat(found.similarity.rotation);
+        assert!((found.similarity.scale - scale).abs() < 1e-12, "{}", found.similarity.scale);
+        for (i, row) in rows.iter().enumerate() {
+            assert!((rotation.row(i) - DVec3::from_array(*row)).length() < 1e-12, "{rotation}");
+        }
+        let translation_error = found.similarity.translation - DVec3::from_array(translation);
+        assert!(translation_error.length() < 1e-11, "{translation_error}");
+        assert!((found.residual - residual).abs() < 1e-12, "{}", found.residual);
+        assert_eq!(found.n_cameras, 6);
+    }
+}
+
+#[test]
+fn cameras_are_paired_by_name_and_must_determine_a_rotation() {
+    let stated = Similarity {
+        scale: 0.2,
+        rotation: DQuat::from_axis_angle(DVec3::new(1.0, -1.0, 0.5).normalize(), 2.9),
+        translation: DVec3::new(7.0, 8.0, -9.0),
+    };
+    let from = views(&FROM);
+    let mut to = views(&FROM.map(|p| stated.transform_point(DVec3::from_array(p)).to_array()));
+    // Other folders, extensions, order, and a view that only one set has.
+    to.iter_mut().for_each(|view| view.name = format!("left/{}", view.name.replace("jpg", "png")));
+    to.reverse();
+    to.push(view("left/extra.png", DAffine3::IDENTITY));
+    let found = align(&from, &to).unwrap();
+    assert_eq!(found.n_cameras, 6);
+    assert!(found.residual < 1e-12, "{}", found.residual);
+    assert!((found.similarity.scale - 0.2).abs() < 1e-12);
+    assert!(found.similarity.rotation.angle_between(stated.rotation) < 1e-7);
+    assert!((found.similarity.translation - stated.translation).length() < 1e-10);
+
+    assert_eq!(align(&from[..2], &to), Err(AlignError::Few { n: 2 }));
+    let line = [[0.0; 3], [1.0, 2.0, 3.0], [2.0, 4.0, 6.0], [-3.0, -6.0, -9.0]];
+    assert_eq!(align(&views(&line), &from), Err(AlignError::Line));
+    assert_eq!(align(&from, &views(&[[1.0; 3]; 6])), Err(AlignError::Line));
+    // Two views of one file name tell nothing of it.
+    let twice: Vec<View> =
+        to.iter().flat_map(|v| [v.clone(), View { name: format!("b/{}", v.name), ..v.clone() }]).collect();
+    assert_eq!(align(&from, &twice), Err(AlignError::Few { n: 0 }));
+}
+
+/// Restates `auto_orient_and_center_poses` (method `up`, centre `poses`) in matrices, with Rodrigues' formula, and the
+/// scaling of nerfstudio's dataparser.
+#[test]
+fn nerfstudios_defaults_are_its_formulas() {
+    let views = views(&FROM);
+    let swap = DMat3::from_cols(DVec3::Y, DVec3::X, -DVec3::Z);
+    let found = nerfstudio_defaults(&views);
+    assert_eq!(found.len(), 4);
+    for (candidate, (axes, orients)) in
+        found.iter().zip([(DMat3::IDENTITY, true), (DMat3::IDENTITY, false), (swap, true), (swap, false)])
+    {
+        assert_eq!(candidate.cause, FrameCause::NerfstudioDefaults);
+        // Camera to world with OpenGL axes.
+        let poses: Vec<(DMat3, DVec3)> = views
+            .iter()
+            .map(|view| {
+                let pose = view.camera_from_world.inverse();
+                let opengl = pose.matrix3 * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
+                (axes * opengl, axes * pose.translation)
+            })
+            .collect();
+        let mean = poses.iter().map(|p| p.1).sum::<DVec3>() / poses.len() as f64;
+        let up = poses.iter().map(|p| p.0.y_axis).sum::<DVec3>().normalize();
+        let v = up.cross(DVec3::Z);
+        let k = DMat3::from_cols(
+            DVec3::new(0.0, v.z, -v.y),
+            DVec3::new(-v.z, 0.0, v.x),
+            DVec3::new(v.y, -v.x, 0.0),
+        );
+        let rotation = match orients {
+            true => DMat3::IDENTITY + k + k * k * ((1.0 - up.z) / v.length_squared()),
+            false => DMat3::IDENTITY,
+        };
+        let centred: Vec<DVec3> = poses.iter().map(|p| rotation * (p.1 - mean)).collect();
+        let scale = 1.0 / centred.iter().map(|c| c.abs().max_element()).fold(0.0, f64::max);
+        for (centre, expected) in FROM.iter().zip(centred) {
+            let image = candidate.splat_from_poses.transform_point(DVec3::from_array(*centre));
+            assert!((image - expected * scale).length() < 1e-12, "{image}");
+        }
+    }
+}

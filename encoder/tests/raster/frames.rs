@@ -1,0 +1,137 @@
+//! Splats in another frame than their poses: the labelled house, moved on purpose.
+
+use glam::{DAffine3, DMat3, DQuat, DVec3};
+use slag_common::{Gaussians, Similarity, View, poses, splat};
+use slag_encoder::check::{
+    CheckOptions, CheckReport, CheckView, FrameCandidate, FrameCause, Mistake, align, check,
+    nerfstudio_defaults,
+};
+use slag_encoder::ingest::load_image;
+use slag_encoder::raster::{CpuRasterizer, RasterView};
+
+use crate::fixtures::{needs_shared, shared};
+
+struct House {
+    splat: Gaussians,
+    views: Vec<View>,
+    photos: Vec<CheckView>,
+}
+
+impl House {
+    fn read() -> Self {
+        let root = shared("scenes/house_a");
+        let splat =
+            splat::read(&root.join("point_cloud.ply"), &splat::ReadOptions { with_sh_rest: false }).unwrap();
+        let views = poses::read(&root, None).unwrap().views;
+        let photo = |view: &View| {
+            let loaded = load_image(view).unwrap();
+            let intrinsics = loaded.view.intrinsics.scaled_to_width(160);
+            let image = image::imageops::thumbnail(&loaded.image, intrinsics.width_px, intrinsics.height_px);
+            let view = RasterView { camera_from_world: loaded.view.camera_from_world, intrinsics };
+            CheckView { name: loaded.view.name, image, view }
+        };
+        let photos = views.iter().step_by(views.len() / 3).map(photo).collect();
+        Self { splat, views, photos }
+    }
+
+    /// Checks the house with its splat moved and its cameras changed.
+    fn check(
+        &self,
+        moved: &Similarity,
+        camera: &dyn Fn(DAffine3) -> DAffine3,
+        frames: Vec<FrameCandidate>,
+    ) -> CheckReport {
+        let mut splat = self.splat.clone();
+        moved.transform_gaussians(&mut splat);
+        let photos = self.photos.iter().cloned().map(|mut photo| {
+            photo.view.camera_from_world = camera(photo.view.camera_from_world);
+            Ok(photo)
+        });
+        let photos: Vec<_> = photos.collect();
+        let options = CheckOptions { width_px: 160, diagnosis_views: 3, frames, ..CheckOptions::default() };
+        let report = check(&splat, photos, &CpuRasterizer, &options).unwrap();
+        println!("{report}");
+        report
+    }
+
+    /// Returns the largest distance between the images of cameras under two similarities, in units of the first.
+    fn off(&self, a: &Similarity, b: &Similarity) -> f64 {
+        let off = |view: &View| {
+            let centre = view.position_in_world();
+            (a.transform_point(centre) - b.transform_point(centre)).length()
+        };
+        self.views.iter().map(off).fold(0.0, f64::max) / a.scale
+    }
+}
+
+#[needs_shared]
+#[test]
+fn moved_splats_are_brought_back() {
+    let house = House::read();
+    let same = |pose: DAffine3| pose;
+    assert_eq!(house.check(&Similarity::IDENTITY, &same, Vec::new()).diagnosis, None);
+
+    // nerfstudio's training frame, as its own formulas state it of all poses.
+    let defaults = nerfstudio_defaults(&house.views);
+    let trained = defaults[0].splat_from_poses;
+    let found = house.check(&trained, &same, defaults.clone()).diagnosis.expect("a diagnosis");
+    assert!(matches!(found.mistake, Some(Mistake::Frame(f)) if f.cause == FrameCause::NerfstudioDefaults));
+    let off = house.off(&found.splat_from_poses.expect("a similarity"), &trained);
+    assert!(off < 1e-3, "{off} world units");
+    // Trained on some of the photos only: the frame is a little off, and the drawings mend it.
+    let some: Vec<View> = house.views.iter().step_by(3).cloned().collect();
+    let trained = nerfstudio_defaults(&some)[0].splat_from_poses;
+    let before = house.off(&defaults[0].splat_from_poses, &trained);
+    let found = house.check(&trained, &same, defaults).diagnosis.expect("a diagnosis");
+    let off = house.off(&found.splat_from_poses.expect("a similarity"), &trained);
+    println!("{before} -> {off} world units");
+    assert!(off < 0.5 * before, "{before} -> {off} world units");
+
+    // Any similarity, where a second set of poses is in the splat's frame.
+    let stated = Similarity {
+        scale: 0.31,
+        rotation: DQuat::from_axis_angle(DVec3::new(0.2, 1.0, -0.7).normalize(), 1.9),
+        translation: DVec3::new(40.0, -7.0, 3.0),
+    };
+    let other: Vec<View> = (house.views.iter())
+        .map(|view| View {
+            camera_from_world: stated.camera_from_target(view.camera_from_world),
+            ..view.clone()
+        })
+        .collect();
+    let splat_from_poses = align(&house.views, &other).unwrap().similarity;
+    let candidate = FrameCandidate { cause: FrameCause::OtherPoses, splat_from_poses };
+    let found = house.check(&stated, &same, vec![candidate]).diagnosis.expect("a diagnosis");
+    assert_eq!(found.mistake, Some(Mistake::Frame(candidate)));
+    assert!(house.off(&stated, &splat_from_poses) < 1e-9);
+    assert_eq!(
+        house.check(&stated, &same, Vec::new()).diagnosis.expect("a diagnosis").splat_from_poses,
+        None
+    );
+}
+
+#[needs_shared]
+#[test]
+fn other_axes_and_scales_are_named() {
+    let house = House::read();
+    let same = |pose: DAffine3| pose;
+    // COLMAP's world against nerfstudio's.
+    let swap = DMat3::from_cols(DVec3::Y, DVec3::X, -DVec3::Z);
+    let swap = Similarity { rotation: DQuat::from_mat3(&swap), ..Similarity::IDENTITY };
+    let report = house.check(&swap, &same, Vec::new());
+    assert!(report.to_string().contains("nerfstudio's world against COLMAP's"));
+    let found = report.diagnosis.expect("a diagnosis");
+    assert_eq!(found.mistake, Some(Mistake::WorldAxes([2, 1, -3])));
+    assert!(house.off(&found.splat_from_poses.expect("a similarity"), &swap) < 1e-9);
+    // The same, and cameras in OpenGL's axes.
+    let opengl =
+        |pose: DAffine3| DAffine3::from_mat3(DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0))) * pose;
+    let found = house.check(&swap, &opengl, Vec::new()).diagnosis.expect("a diagnosis");
+    let both = (Some(Mistake::OpenGlAxes), Some(Mistake::WorldAxes([2, 1, -3])));
+    assert_eq!((found.mistake, found.and, found.splat_from_poses), (both.0, both.1, None));
+    // A scale that is no power of ten.
+    let scaled = Similarity { scale: 3.7, ..Similarity::IDENTITY };
+    let found = house.check(&scaled, &same, Vec::new()).diagnosis.expect("a diagnosis");
+    let off = house.off(&found.splat_from_poses.expect("a similarity"), &scaled);
+    assert!(matches!(found.mistake, Some(Mistake::SceneScale(_))) && off < 0.02, "{off} world units");
+}
