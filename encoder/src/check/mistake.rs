@@ -89,10 +89,13 @@ impl fmt::Display for Mistake {
                 f,
                 "the poses are world-from-camera with OpenGL axes; invert them, then negate the y and z rows"
             ),
-            Self::SceneScale(factor) => write!(
-                f,
-                "the scene is {factor} times as large as the cameras' world; multiply the camera positions by {factor}"
-            ),
+            Self::SceneScale(factor) => {
+                write!(
+                    f,
+                    "the scene is {factor:.4} times as large as the cameras' world; multiply the camera positions by \
+                     {factor:.4}"
+                )
+            }
             Self::FocalScale(factor) => {
                 write!(f, "the focal length belongs to another image size or sensor; multiply it by {factor}")
             }

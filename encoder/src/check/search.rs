@@ -15,6 +15,8 @@ const SWEEP_LIMIT: f64 = 64.0;
 const FIRST_STEP: f64 = 0.02;
 /// Number of times that the step is halved.
 const HALVINGS: u32 = 6;
+/// Gain below which the refinement fits noise of the few small samples, dB: the frame stays as computed.
+const REFINED_GAIN_DB: f64 = 1.0;
 
 /// What a search tries and measures with.
 pub(super) struct Search<'a> {
@@ -126,7 +128,8 @@ impl Search<'_> {
             }
             step *= 0.5;
         }
-        Ok(Trial { psnr_db, ..with(similarity) })
+        let is_clear = psnr_db > best.psnr_db + REFINED_GAIN_DB;
+        Ok(if is_clear { Trial { psnr_db, ..with(similarity) } } else { best })
     }
 
     /// Returns a similarity moved a step in one of 14 directions: scale, three rotations and three translations, up and

@@ -212,8 +212,9 @@ pub fn scannet(
         }
         subset(&classes, scan, &gaussian_of, &answers)
     };
-    let all_subsets =
-        |filter| [&ids_of_19[..], &IDS_OF_15, &IDS_OF_10].map(|ids| judge(ids, filter)).to_vec();
+    let all_subsets = |filter: Option<&Superpoints>| {
+        [&ids_of_19[..], &IDS_OF_15, &IDS_OF_10].map(|ids| judge(ids, filter)).to_vec()
+    };
     let subsets = all_subsets(None);
     let filtered = filter.map(|(segments, of_vertex)| FilteredReport {
         segments,
