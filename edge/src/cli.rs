@@ -156,7 +156,7 @@ mod tests {
         assert_eq!((query.bounds, query.precision), (Some(bounds), Precision::Centroids));
         assert_eq!(query.negatives, Negatives::Phrases(vec!["wall".into(), "floor".into()]));
         assert!(parse("slag-edge status --json --cache d").is_ok());
-        assert!(parse("slag-edge models pull clip --accept-licence --json").is_ok());
+        assert!(parse("slag-edge models pull clip --accept-licence apple-amlr --json").is_ok());
         assert!(
             parse("slag-edge bench text --encoder clip --provider tensorrt,cuda,cpu --model-threads 2")
                 .is_ok()

@@ -8,10 +8,11 @@ use std::path::{Path, PathBuf};
 use clap::{Args, Subcommand};
 use serde::Serialize;
 
-use crate::description::{Description, FILE_NAME};
+use crate::described::Described;
 use crate::hub::{
     Entry, Here, Hub, HubError, HubOptions, PulledFile, Side, Source, cache_folder, models_folder,
 };
+use crate::sam::SamDescription;
 use crate::session::SessionError;
 use crate::{ImageEncoder, ModelDir, ModelError, Provider, SessionOptions, find_runtime};
 
@@ -37,9 +38,10 @@ pub struct PullArgs {
     /// Names from `models list`.
     #[arg(required = true)]
     names: Vec<String>,
-    /// Accepts the models' licences without asking.
-    #[arg(long, visible_alias = "accept-license")]
-    accept_licence: bool,
+    /// Accepts a licence that restricts the use of a model, by its name; without it, the terminal asks. Licences that
+    /// do not restrict use are shown and need no consent.
+    #[arg(long, visible_alias = "accept-license", value_name = "LICENCE")]
+    accept_licence: Vec<String>,
     /// Address of a mirror of the hub.
     #[arg(long, value_name = "URL")]
     hub: Option<String>,
@@ -179,7 +181,7 @@ pub fn run(command: &ModelsCommand, context: &Context<'_>) -> Result<Report, Hub
             Ok(Report::Models(hub.table().models.iter().map(|entry| Listed::new(&hub, entry)).collect()))
         }
         ModelsCommand::Pull(args) => {
-            let pulled = args.names.iter().map(|name| pull(&hub, name, args.accept_licence, context));
+            let pulled = args.names.iter().map(|name| pull(&hub, name, &args.accept_licence, context));
             Ok(Report::Pulled(pulled.collect::<Result<_, _>>()?))
         }
         ModelsCommand::Verify { models } => {
@@ -195,14 +197,15 @@ pub fn run(command: &ModelsCommand, context: &Context<'_>) -> Result<Report, Hub
             Ok(Report::Verified(verified.collect::<Result<_, HubError>>()?))
         }
         ModelsCommand::Info(args) => {
-            Ok(Report::Info(Box::new(info(&hub.resolve(&args.model)?, args, context)?)))
+            info(&hub.resolve(&args.model)?, args, context)
         }
     }
 }
 
-fn pull(hub: &Hub, name: &str, accepts: bool, context: &Context<'_>) -> Result<Pulled, HubError> {
+fn pull(hub: &Hub, name: &str, accepted: &[String], context: &Context<'_>) -> Result<Pulled, HubError> {
     let side = if context.image.is_some() { Side::Both } else { Side::Text };
-    let files = match hub.pull(name, side, accepts) {
+    let entry = hub.entry(name)?;
+    let files = match hub.pull(name, side, accepted.contains(&entry.licence)) {
         Err(HubError::Licence { name, licence, url, note }) => {
             let question = format!("{name} is licensed under {licence} ({url}). {note} Accept?");
             if !(context.ask)(&question) {
@@ -212,18 +215,31 @@ fn pull(hub: &Hub, name: &str, accepts: bool, context: &Context<'_>) -> Result<P
         }
         pulled => pulled?,
     };
-    Ok(Pulled { name: name.to_owned(), folder: hub.folder(hub.entry(name)?), files })
+    let Entry { licence, licence_url, licence_note, .. } = entry.clone();
+    Ok(Pulled { name: name.to_owned(), licence, licence_url, licence_note, folder: hub.folder(entry), files })
 }
 
-fn info(folder: &Path, args: &InfoArgs, context: &Context<'_>) -> Result<Info, HubError> {
-    let model = ModelDir::open(folder)?;
-    let description = Description::read(&folder.join(FILE_NAME))?;
-    let root = folder.join(&description.files_root);
-    let files = description.files().into_iter().map(|(role, file)| DescribedFile {
+fn described_files(folder: &Path, described: &Described) -> Vec<DescribedFile> {
+    let root = folder.join(described.files_root());
+    let files = described.files().into_iter().map(|(role, file)| DescribedFile {
         role,
         path: file.path.clone(),
         is_here: root.join(&file.path).is_file(),
     });
+    files.collect()
+}
+
+fn info(folder: &Path, args: &InfoArgs, context: &Context<'_>) -> Result<Report, HubError> {
+    let described = Described::read(folder)?;
+    let files = described_files(folder, &described);
+    let description = match described {
+        Described::Segmenter(segmenter) => {
+            let SamDescription { name, about, licence, .. } = *segmenter;
+            return Ok(Report::Segmenter(SegmenterInfo { name, about, licence, folder: folder.to_owned(), files }));
+        }
+        Described::Encoders(description) => description,
+    };
+    let model = ModelDir::open(folder)?;
     let mut info = Info {
         name: description.name.clone(),
         about: model.about().to_owned(),
@@ -232,7 +248,7 @@ fn info(folder: &Path, args: &InfoArgs, context: &Context<'_>) -> Result<Info, H
         dim: description.dim,
         encoder_id: hex::encode(model.encoder_id().hash()),
         threshold: model.threshold(),
-        files: files.collect(),
+        files,
         text_runs_on: None,
         image_runs_on: None,
         batch: None,
@@ -247,7 +263,7 @@ fn info(folder: &Path, args: &InfoArgs, context: &Context<'_>) -> Result<Info, H
             info.batch = Some(image.preferred_batch());
         }
     }
-    Ok(info)
+    Ok(Report::Info(Box::new(info)))
 }
 
 /// The result of a command.
@@ -260,8 +276,10 @@ pub enum Report {
     Pulled(Vec<Pulled>),
     /// Result of `verify`.
     Verified(Vec<Verified>),
-    /// Result of `info`.
+    /// Result of `info` on encoders.
     Info(Box<Info>),
+    /// Result of `info` on a segmenter.
+    Segmenter(SegmenterInfo),
 }
 
 /// A model of the table.
@@ -284,6 +302,9 @@ impl Listed {
 #[derive(Debug, Serialize)]
 pub struct Pulled {
     name: String,
+    licence: String,
+    licence_url: String,
+    licence_note: String,
     folder: PathBuf,
     files: Vec<PulledFile>,
 }
@@ -314,6 +335,16 @@ pub struct Info {
     batch: Option<usize>,
 }
 
+/// The description of a segmenter.
+#[derive(Debug, Serialize)]
+pub struct SegmenterInfo {
+    name: String,
+    about: String,
+    licence: String,
+    folder: PathBuf,
+    files: Vec<DescribedFile>,
+}
+
 /// A file that a description names.
 #[derive(Debug, Serialize)]
 pub struct DescribedFile {
@@ -336,6 +367,7 @@ impl fmt::Display for Report {
             }),
             Self::Pulled(models) => models.iter().try_for_each(|model| {
                 writeln!(f, "{} in {}", model.name, model.folder.display())?;
+                writeln!(f, "  licence {} ({}) {}", model.licence, model.licence_url, model.licence_note)?;
                 model.files.iter().try_for_each(|file| {
                     let word = match file.on_the_word_of {
                         Source::Table => "matches the built-in table",
@@ -357,7 +389,20 @@ impl fmt::Display for Report {
                 )
             }),
             Self::Info(info) => info.fmt(f),
+            Self::Segmenter(info) => {
+                writeln!(f, "name        {}\nabout       {}", info.name, info.about)?;
+                writeln!(f, "licence     {}\nfolder      {}", info.licence, info.folder.display())?;
+                info.files.iter().try_for_each(|file| file.fmt(f))
+            }
         }
+    }
+}
+
+impl fmt::Display for DescribedFile {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let here = if self.is_here { "" } else { " (absent)" };
+        let role = self.role.trim_start_matches("text.").trim_start_matches("segment.");
+        writeln!(f, "{role:11} {}{here}", self.path.display())
     }
 }
 
@@ -370,10 +415,7 @@ impl fmt::Display for Info {
             Some(cosine) => writeln!(f, "found from  cosine {cosine}")?,
             None => writeln!(f, "found from  calibrated by each scene's scores")?,
         }
-        for file in &self.files {
-            let here = if file.is_here { "" } else { " (absent)" };
-            writeln!(f, "{:11} {}{here}", file.role.trim_start_matches("text."), file.path.display())?;
-        }
+        self.files.iter().try_for_each(|file| file.fmt(f))?;
         if let Some(text) = &self.text_runs_on {
             let elsewhere = "not in this program; `slag-encoder models info --run` runs the image side";
             let images = self.image_runs_on.as_deref().unwrap_or(elsewhere);

@@ -8,7 +8,8 @@
 //! files_root = "."                 # folder of the files below, relative to this file's folder
 //!
 //! [image]
-//! file = { path = "vision.onnx", sha256 = "..." }   # sha256 may be left out if the file is present
+//! file = { path = "vision.onnx", sha256 = "..." }   # sha256 may be left out if the file is present; weights in a file
+//!                                  # of their own: data = { path = "vision.onnx_data", sha256 = "..." }
 //! input = "pixel_values"           # f32 or f16 [n,3,size_px,size_px], RGB; n may be fixed to 1
 //! output = "image_embeds"          # f32 or f16 [n,dim]; default: the only output of that shape
 //! size_px = 224
@@ -31,6 +32,7 @@
 //! padding = { n_tokens = 64, token_id = 1 }  # only if the model was trained on padded texts (SigLIP) or
 //!                                  # takes exactly that many tokens; CLIP is faster without
 //! prompt = "a photo of a {}"
+//! lowercase = true                 # if the model was trained on lower case and its tokenizer keeps case (SigLIP 2)
 //!
 //! # alternatively, vectors of fixed phrases:
 //! # [text]
@@ -215,6 +217,9 @@ pub struct OnnxText {
     pub padding: Option<Padding>,
     /// The encoded text, with `{}` in place of the query.
     pub prompt: String,
+    /// Whether texts are turned to lower case before the tokenizer sees them.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub lowercase: bool,
 }
 
 /// Padding of texts to a fixed length.
@@ -316,7 +321,7 @@ impl Description {
         Ok(description)
     }
 
-    /// Returns the files with their roles, image first.
+    /// Returns the files with their roles, image first; a file of weights has the role of its model.
     pub fn files(&self) -> Vec<(&'static str, &FileRef)> {
         let mut files = vec![("image.model", &self.image.file)];
         match &self.text {
@@ -328,10 +333,10 @@ impl Description {
             }
         }
         files.extend(self.text_centre.iter().map(|centre| ("text.centre", &centre.file)));
-        files
+        files.into_iter().flat_map(|(role, file)| file.parts().map(move |part| (role, part))).collect()
     }
 
-    /// Mutable [`Self::files`].
+    /// Mutable [`Self::files`], without the files of weights.
     pub(crate) fn files_mut(&mut self) -> Vec<(&'static str, &mut FileRef)> {
         let mut files = vec![("image.model", &mut self.image.file)];
         match &mut self.text {
@@ -442,6 +447,8 @@ pub(crate) fn check_common(
         let mut components = file.path.components().peekable();
         let is_below = components.peek().is_some() && components.all(|c| matches!(c, Component::Normal(_)));
         require(path, is_below, role, file.path.display().to_string(), "a relative path without ..")?;
+        let is_flat = file.data.as_ref().is_none_or(|data| data.data.is_none());
+        require(path, is_flat, role, "data of data".to_owned(), "weights in one file")?;
     }
     Ok(())
 }

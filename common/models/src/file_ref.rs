@@ -14,14 +14,34 @@ pub struct FileRef {
     pub path: PathBuf,
     /// Its SHA-256.
     pub sha256: Option<Sha256>,
+    /// The weights of an ONNX file that keeps them in a file of its own (`.onnx_data`), which it names relative to its
+    /// own folder.
+    #[serde(default)]
+    pub data: Option<Box<FileRef>>,
 }
 
-/// Serialises the hash alone: the encoder id must not depend on paths.
+impl FileRef {
+    /// Returns the file and, if there is one, the file of its weights.
+    pub fn parts(&self) -> impl Iterator<Item = &Self> {
+        std::iter::successors(Some(self), |file| file.data.as_deref())
+    }
+
+    /// Mutable [`Self::parts`], called one after the other.
+    pub(crate) fn for_each_part<E>(&mut self, mut run: impl FnMut(&mut Self) -> Result<(), E>) -> Result<(), E> {
+        run(self)?;
+        self.data.as_deref_mut().map_or(Ok(()), run)
+    }
+}
+
+/// Serialises the hashes alone: the encoder id must not depend on paths.
 impl Serialize for FileRef {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let sha256 =
             self.sha256.ok_or_else(|| S::Error::custom(format!("{}: no hash", self.path.display())))?;
-        sha256.serialize(serializer)
+        match &self.data {
+            None => sha256.serialize(serializer),
+            Some(data) => (sha256, data).serialize(serializer),
+        }
     }
 }
 

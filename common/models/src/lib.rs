@@ -16,6 +16,7 @@ pub mod clean;
 pub mod colours;
 pub mod commands;
 mod crop;
+mod described;
 pub mod description;
 mod encoder;
 pub mod encoder_id;

@@ -92,7 +92,10 @@ impl ModelDir {
                 // Not used: the embedded description records every hash.
                 Files::Embedded => Path::new(""),
             };
-            file.sha256 = Some(crate::description::Sha256(sha256_of(root, file)?));
+            file.for_each_part(|part| {
+                part.sha256 = Some(crate::description::Sha256(sha256_of(root, part)?));
+                Ok::<_, DescriptionError>(())
+            })?;
         }
         let id = hashed.encoder_id();
         let source = Source::Files { files, description: Box::new(description), batch: Arc::default() };
@@ -203,17 +206,18 @@ pub(crate) fn sha256_of(files_root: &Path, file: &FileRef) -> Result<[u8; 32], D
     }
 }
 
-/// Returns the path of `file` after comparing its hash with the recorded one, if any.
+/// Returns the path of `file` after comparing its hash, and that of its weights, with the recorded ones, if any.
 pub(crate) fn checked(files_root: &Path, file: &FileRef) -> Result<PathBuf, DescriptionError> {
-    let path = files_root.join(&file.path);
-    if let Some(expected) = file.sha256 {
+    for part in file.parts() {
+        let path = files_root.join(&part.path);
+        let Some(expected) = part.sha256 else { continue };
         let found = hash_file(&path).map_err(|cause| DescriptionError::Read { cause })?;
         if found != expected.0 {
             let (expected, found) = (hex::encode(expected.0), hex::encode(found));
             return Err(DescriptionError::Hash { path, expected, found });
         }
     }
-    Ok(path)
+    Ok(files_root.join(&file.path))
 }
 
 /// Returns the SHA-256 of a file.

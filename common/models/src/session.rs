@@ -61,7 +61,7 @@ fn warn_once(message: String) {
 }
 
 /// A tensor of f32, row-major.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Tensor {
     pub(crate) shape: Vec<i64>,
     pub(crate) values: Vec<f32>,

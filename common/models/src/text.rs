@@ -177,7 +177,11 @@ impl TextEncoder for OnnxTextEncoder {
         if text.is_empty() {
             return Err(InferenceError::EmptyText);
         }
-        let ids = self.tokens.ids(&self.description.prompt.replace("{}", &text))?;
+        let mut prompt = self.description.prompt.replace("{}", &text);
+        if self.description.lowercase {
+            prompt = prompt.to_lowercase();
+        }
+        let ids = self.tokens.ids(&prompt)?;
         let mut vector = self.run(&ids)?;
         if centred(&mut vector, self.centre.as_deref()) {
             Ok(vector)

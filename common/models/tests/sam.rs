@@ -43,7 +43,7 @@ fn pixel_values_and_embeddings_equal_the_recorded_ones() {
     let (_, [height, width]) = size(&golden, "reshaped_size");
     assert_eq!(
         embedding.letterbox,
-        Letterbox { size_px: 1024, image_px: [211, 150], resized_px: [width, height] }
+        Letterbox { size_px: 1024, image_px: [211, 150], resized_px: [width, height], is_stretched: false }
     );
     let mut n_tensors = 0;
     for (name, shape, values) in embedding.tensors() {
@@ -142,7 +142,7 @@ fn wrong_descriptions_and_files_are_named() {
         Sam::open(folder.path(), &options).expect_err("it must be refused").to_string()
     };
     for (from, to, expected) in [
-        ("kind = \"sam\"", "kind = \"sam2\"", "sam2"),
+        ("kind = \"sam\"", "kind = \"sam3\"", "sam3"),
         ("kind = \"sam\"", "kind = \"sam\"\nsize_px = 7", "segment.size_px is 7, expected 64 to 2048"),
         ("kind = \"sam\"", "kind = \"sam\"\nstd = [0.0, 1.0, 1.0]", "segment.std is [0.0"),
         ("kind = \"sam\"", "kind = \"sam\"\nboxes = true", "boxes"),

@@ -164,7 +164,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
     let metric = args.metric || geo.is_some();
     let folder_name = args.store.file_name().map(|name| name.to_string_lossy().into_owned());
     let created_unix_secs = now_unix_secs();
-    let masks = match (args.masks.as_str(), args.sam.masks(&preset.sam)) {
+    let masks = match (args.masks.as_str(), args.sam.masks(&preset.sam)?) {
         ("graph", None) => Masks::Graph,
         ("auto", masks) => {
             masks.unwrap_or(Masks::Auto { n_levels: args.views.mask_levels.unwrap_or(preset.mask_levels) })

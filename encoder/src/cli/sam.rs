@@ -2,7 +2,9 @@
 
 use std::path::PathBuf;
 
+use anyhow::Result;
 use clap::{Args, ValueEnum};
+use slag_models::commands;
 
 use super::common::available_threads;
 use crate::encode::Masks;
@@ -12,8 +14,9 @@ use crate::segment::{SamLevels, SamSettings, ScoreFilter};
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Segment Anything")]
 pub struct SamArgs {
-    /// Model directory (with model.toml) of SAM, MobileSAM or another model of that kind.
-    #[arg(long, value_name = "DIR")]
+    /// SAM, SAM 2, MobileSAM, EdgeTAM or another model of that kind: a folder with model.toml, or the name of a pulled
+    /// model (`models list`).
+    #[arg(long, value_name = "NAME|DIR")]
     segmenter: Option<PathBuf>,
     /// Points along each side of the grid of prompts: 8, 16, 32, 64 [default: the preset's].
     #[arg(long, value_name = "N",
@@ -87,7 +90,11 @@ impl From<ScoreFilterArg> for Option<ScoreFilter> {
 
 impl SamArgs {
     /// Returns Segment Anything as the source of masks, if --segmenter names it.
-    pub(super) fn masks(&self, preset: &SamSettings) -> Option<Masks> {
+    /// # Errors
+    /// If it names a public model that is not pulled.
+    pub(super) fn masks(&self, preset: &SamSettings) -> Result<Option<Masks>> {
+        let Some(segmenter) = &self.segmenter else { return Ok(None) };
+        let dir = commands::resolve(segmenter, &|name| std::env::var_os(name))?;
         let settings = SamSettings {
             points_per_side: self.points_per_side.unwrap_or(preset.points_per_side),
             points_per_batch: self.sam_points_per_batch,
@@ -105,7 +112,7 @@ impl SamArgs {
             score_filter: self.sam_score_filter.map_or(preset.score_filter, Into::into),
         };
         let n_model_threads = self.sam_threads.map_or_else(available_threads, |n| n as usize);
-        Some(Masks::Sam { dir: self.segmenter.clone()?, settings, n_model_threads })
+        Ok(Some(Masks::Sam { dir, settings, n_model_threads }))
     }
 }
 

@@ -11,7 +11,8 @@ use super::lock::Lock;
 use super::options::HubOptions;
 use super::pull::{Pull, PulledFile, Side};
 use super::table::{Entry, Table};
-use crate::description::{self, Description, DescriptionError, Sha256};
+use crate::described::Described;
+use crate::description::{self, DescriptionError, Sha256};
 use crate::model_dir::hash_file;
 
 /// The part of a model that is in the cache.
@@ -67,10 +68,14 @@ impl Hub {
     /// Returns the part of a model that is in the cache; files are not read.
     pub fn here(&self, entry: &Entry) -> Here {
         let folder = self.folder(entry);
+        if entry.export.is_some() {
+            return if folder.join(description::FILE_NAME).is_file() { Here::All } else { Here::No };
+        }
         let has = |text_only| entry.paths(text_only).iter().all(|path| folder.join(path).is_file());
         match folder.join(description::FILE_NAME).is_file() && has(true) {
             false => Here::No,
             true if has(false) => Here::All,
+            true if entry.is_segmenter() => Here::No,
             true => Here::Text,
         }
     }
@@ -80,13 +85,20 @@ impl Hub {
     /// Only one pull runs at a time; others wait. An interrupted pull leaves whole files, and partial ones that the next
     /// pull resumes.
     /// # Errors
-    /// [`HubError`]; [`HubError::Licence`] if the licence was not accepted, now or earlier.
+    /// [`HubError`]; [`HubError::Licence`] if the licence restricts use and was not accepted, now or earlier.
     pub fn pull(&self, name: &str, side: Side, accepts_licence: bool) -> Result<Vec<PulledFile>, HubError> {
         let entry = self.entry(name)?;
         let root = &self.options.root;
+        if let Some(script) = entry.export.clone() {
+            let (name, folder) = (name.to_owned(), self.folder(entry));
+            return Err(HubError::NotExported { name, repository: entry.repository.clone(), script, folder });
+        }
+        if side == Side::Text && entry.is_segmenter() {
+            return Err(HubError::NoTextSide { name: name.to_owned() });
+        }
         let mut lock = Lock::read(root)?;
         let was_accepted = lock.get(name).is_some_and(|accepted| accepted.licence == entry.licence);
-        if !was_accepted && !accepts_licence {
+        if entry.restricts_use && !was_accepted && !accepts_licence {
             return Err(HubError::Licence {
                 name: name.to_owned(),
                 licence: entry.licence.clone(),
@@ -123,10 +135,10 @@ impl Hub {
     /// # Errors
     /// [`HubError`] if a file of the text side is absent, or a hash differs.
     pub fn verify(folder: &Path) -> Result<Vec<String>, HubError> {
-        let description = Description::read(&folder.join(description::FILE_NAME))?;
-        let root = folder.join(&description.files_root);
+        let described = Described::read(folder)?;
+        let root = folder.join(described.files_root());
         let mut verified = Vec::new();
-        for (role, file) in description.files() {
+        for (role, file) in described.files() {
             let path = root.join(&file.path);
             // Robots have only the text side.
             if role == "image.model" && file.sha256.is_some() && !path.exists() {

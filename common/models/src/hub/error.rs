@@ -21,7 +21,8 @@ pub enum HubError {
     },
     /// The licence has not been accepted.
     #[error(
-        "{name} is licensed under {licence} ({url}){}; if you accept it, pull with --accept-licence",
+        "{name} is licensed under {licence} ({url}), which restricts its use{}; if you accept it, pull with \
+         --accept-licence {licence}",
         if note.is_empty() { String::new() } else { format!("; note: {}", note.trim_end_matches('.')) }
     )]
     Licence {
@@ -33,6 +34,28 @@ pub enum HubError {
         url: String,
         /// Remarks on the licence.
         note: String,
+    },
+    /// No ONNX export of the weights is published.
+    #[error(
+        "{name}: {repository} publishes weights, but no ONNX files; make them with `{script} {}` where PyTorch and the \
+         hub can be reached, then use the model by its name",
+        folder.display()
+    )]
+    NotExported {
+        /// The model.
+        name: String,
+        /// Owner and name at the hub.
+        repository: String,
+        /// The script that makes the files.
+        script: String,
+        /// The folder for them.
+        folder: PathBuf,
+    },
+    /// A segmenter has nothing for a robot.
+    #[error("{name} finds masks in photos, which a robot does not do; pull it with slag-encoder")]
+    NoTextSide {
+        /// The model.
+        name: String,
     },
     /// The hub does not provide the files.
     #[error("{url}: {failure}; try again, or place these files by hand: {}", wanted.iter().map(Wanted::to_string).collect::<Vec<_>>().join("; "))]

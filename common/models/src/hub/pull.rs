@@ -98,15 +98,17 @@ impl Pull<'_> {
         Ok(advertised)
     }
 
-    /// Obtains the image model's hash even if the file is not pulled: it is part of the encoder id.
+    /// Obtains the image model's hashes even if its files are not pulled: they are part of the encoder id.
     pub(super) fn name_image(&mut self) -> Result<(), HubError> {
-        let path = self.entry.paths(false)[0];
-        if self.expected(path).is_some() {
-            return Ok(());
+        for path in self.entry.image_paths() {
+            if self.expected(path).is_some() {
+                continue;
+            }
+            let url = self.url(path);
+            let sha256 = self.ask(&url)?.sha256.ok_or(HubError::NoImageHash { url })?;
+            self.accept(path, LockedFile { sha256, on_the_word_of: Source::Hub })?;
         }
-        let url = self.url(path);
-        let sha256 = self.ask(&url)?.sha256.ok_or(HubError::NoImageHash { url })?;
-        self.accept(path, LockedFile { sha256, on_the_word_of: Source::Hub })
+        Ok(())
     }
 
     /// Downloads a file if it is absent, checks it, and records it in the lock.

@@ -22,7 +22,7 @@ pub struct Table {
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Layout {
-    /// The end of a `model.toml`, with IMAGE, TEXT and TOKENIZER in place of the files.
+    /// The end of a `model.toml`, with the role of each file in capitals in place of its path.
     description: String,
 }
 
@@ -35,7 +35,8 @@ pub struct Entry {
     /// A description for people.
     pub about: String,
     layout: String,
-    dim: u32,
+    /// Components of a vector; segmenters have none.
+    dim: Option<u32>,
     /// The licence of the weights.
     pub licence: String,
     /// Remarks on the licence.
@@ -43,17 +44,29 @@ pub struct Entry {
     pub licence_note: String,
     /// Address of the licence.
     pub licence_url: String,
+    /// Whether the licence restricts the use of the weights (research only, for example), so that the user must accept it.
+    #[serde(default)]
+    pub restricts_use: bool,
     /// Owner and name at the hub.
     pub repository: String,
     /// The commit; default: that of the first pull.
     pub revision: Option<String>,
-    image: String,
-    text: String,
-    tokenizer: String,
+    /// The script that makes the files from the published weights, where no export is published; nothing is pulled then.
+    pub export: Option<String>,
+    /// Files at the hub by role: `image`, `text` and `tokenizer`, or `image_encoder` and `mask_decoder`.
+    #[serde(default)]
+    files: BTreeMap<String, String>,
+    /// Files of weights, of ONNX files that keep them apart, by the same roles.
+    #[serde(default)]
+    data: BTreeMap<String, String>,
     /// Known lengths and hashes of files, by path.
     #[serde(default)]
     pub known: BTreeMap<String, Known>,
 }
+
+/// The roles of files, in the order of their pull; a robot needs those from [`FIRST_OF_TEXT`].
+const ROLES: [&str; 5] = ["image_encoder", "mask_decoder", "image", "text", "tokenizer"];
+const FIRST_OF_TEXT: usize = 3;
 
 /// The known length and hash of a file.
 #[derive(Clone, Copy, Debug, Deserialize)]
@@ -66,10 +79,22 @@ pub struct Known {
 }
 
 impl Entry {
-    /// Returns the files' paths, image first; `text_only`: without the image model.
+    /// Returns the files' paths, the image side first, each followed by its file of weights; `text_only`: without the
+    /// image side.
     pub fn paths(&self, text_only: bool) -> Vec<&str> {
-        let all = [self.image.as_str(), self.text.as_str(), self.tokenizer.as_str()];
-        all[usize::from(text_only)..].to_vec()
+        let roles = &ROLES[if text_only { FIRST_OF_TEXT } else { 0 }..];
+        let parts = |role: &&str| [self.files.get(*role), self.data.get(*role)];
+        roles.iter().flat_map(parts).flatten().map(String::as_str).collect()
+    }
+
+    /// Returns the paths of the image model, the first of which is the ONNX file; empty if there is none.
+    pub(super) fn image_paths(&self) -> Vec<&str> {
+        [self.files.get("image"), self.data.get("image")].into_iter().flatten().map(String::as_str).collect()
+    }
+
+    /// Returns whether it finds masks.
+    pub fn is_segmenter(&self) -> bool {
+        self.files.contains_key("mask_decoder")
     }
 }
 
@@ -90,18 +115,21 @@ impl Table {
     pub fn description(&self, entry: &Entry, sha256_of: &dyn Fn(&str) -> Option<Sha256>) -> String {
         // Plain ASCII text, which Rust and TOML quote alike.
         let quoted = |text: &str| format!("{text:?}");
+        let dim = entry.dim.map_or(String::new(), |dim| format!("dim = {dim}\n"));
         let head = format!(
-            "name = {}\nabout = {}\ndim = {}\nlicence = {}\n",
+            "name = {}\nabout = {}\n{dim}licence = {}\n",
             quoted(&entry.name),
             quoted(&entry.about),
-            entry.dim,
             quoted(&entry.licence)
         );
-        let body = self.layout.get(&entry.layout).map_or("", |layout| layout.description.as_str());
-        let placeholders = [("IMAGE", &entry.image), ("TEXT", &entry.text), ("TOKENIZER", &entry.tokenizer)];
-        placeholders.into_iter().fold(head + body, |text, (placeholder, path)| {
+        let part = |path: &str| {
             let hash = sha256_of(path).map_or(String::new(), |sha256| format!(", sha256 = \"{sha256}\""));
-            text.replace(&format!("path = \"{placeholder}\""), &format!("path = {}{hash}", quoted(path)))
+            format!("path = {}{hash}", quoted(path))
+        };
+        let body = self.layout.get(&entry.layout).map_or("", |layout| layout.description.as_str());
+        entry.files.iter().fold(head + body, |text, (role, path)| {
+            let data = entry.data.get(role).map_or(String::new(), |data| format!(", data = {{ {} }}", part(data)));
+            text.replace(&format!("path = {:?}", role.to_uppercase()), &format!("{}{data}", part(path)))
         })
     }
 }
@@ -109,7 +137,8 @@ impl Table {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::description::Description;
+    use crate::description::{Description, FileRef};
+    use crate::sam::SamDescription;
 
     /// Every entry has a valid description, a unique name, and hashes of its own files only.
     #[test]
@@ -123,12 +152,29 @@ mod tests {
             assert!(entry.licence_url.starts_with("https://") && !entry.licence.is_empty(), "{name}");
             assert!(entry.revision.iter().all(|r| r.len() == 40), "{name}");
             assert!(entry.known.keys().all(|path| entry.paths(false).contains(&path.as_str())), "{name}");
+            let roles = entry.files.keys().chain(entry.data.keys());
+            assert!(roles.into_iter().all(|role| ROLES.contains(&role.as_str())), "{name}");
+            if entry.export.is_some() {
+                assert!(entry.files.is_empty(), "{name}");
+                continue;
+            }
             let path = folder.path().join("model.toml");
             let hash = Sha256([7; 32]);
             fs_err::write(&path, table.description(entry, &|_| Some(hash))).expect("it is writable");
-            let description = Description::read(&path).expect(name);
-            assert_eq!(&description.name, name);
-            let files: Vec<_> = description.files().into_iter().map(|(_, file)| file.clone()).collect();
+            let owned = |files: Vec<(&str, &FileRef)>| -> Vec<FileRef> {
+                files.into_iter().map(|(_, file)| file.clone()).collect()
+            };
+            let (found, files) = match entry.is_segmenter() {
+                true => {
+                    let description = SamDescription::read(&path).expect(name);
+                    (description.name.clone(), owned(description.files()))
+                }
+                false => {
+                    let description = Description::read(&path).expect(name);
+                    (description.name.clone(), owned(description.files()))
+                }
+            };
+            assert_eq!(&found, name);
             assert!(files.iter().all(|file| file.sha256 == Some(hash)), "{name}");
             let paths: Vec<_> = files.iter().map(|file| file.path.to_str().expect("UTF-8")).collect();
             assert_eq!(paths, entry.paths(false), "{name}");

@@ -2,6 +2,7 @@
 
 #[path = "../common/mod.rs"]
 mod common;
+mod segmenter;
 mod server;
 
 use std::path::{Path, PathBuf};
@@ -39,7 +40,7 @@ fn a_pulled_model_is_checked_described_and_pulled_once() {
     assert_eq!(lock["made"]["files"]["tokenizer.json"]["on_the_word_of"], "first-pull");
     assert_eq!(hub.here(hub.entry("made").expect("known")), Here::All);
 
-    // A second pull requests nothing and needs no licence.
+    // A second pull requests nothing and asks for no consent.
     server.asked();
     let again = hub.pull("made", Side::Both, false).expect("it is there");
     assert!(again.iter().all(|file| file.was_here) && server.asked().is_empty());
@@ -265,7 +266,7 @@ fn without_the_hub_the_error_lists_the_files_to_place() {
 fn nothing_is_asked_for_before_the_licence_is_accepted() {
     let (server, root, hub) = setting();
     let error = hub.pull("made", Side::Both, false).expect_err("not accepted").to_string();
-    for part in ["Example-1.0", "https://licence.example/", "Not a real one;", "--accept-licence"] {
+    for part in ["Example-1.0", "https://licence.example/", "Not a real one;", "--accept-licence Example-1.0"] {
         assert!(error.contains(part), "{error}");
     }
     assert!(server.asked().is_empty() && files_below(root.path()).is_empty());
@@ -273,6 +274,10 @@ fn nothing_is_asked_for_before_the_licence_is_accepted() {
     // Another licence must be accepted again.
     let relicensed = hub_of(&table().replace("Example-1.0", "Example-2.0"), &server.url, root.path());
     assert!(matches!(relicensed.pull("made", Side::Both, false), Err(HubError::Licence { .. })));
+    // A licence that does not restrict use needs no consent.
+    let open = tempfile::tempdir().expect("a folder");
+    let hub = hub_of(&table().replace("restricts_use = true", ""), &server.url, open.path());
+    hub.pull("made", Side::Both, false).expect("no consent is needed");
 }
 
 #[test]

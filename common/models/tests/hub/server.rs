@@ -26,10 +26,9 @@ dim = 4
 licence = "Example-1.0"
 licence_note = "Not a real one."
 licence_url = "https://licence.example/"
+restricts_use = true
 repository = "owner/made"
-image = "onnx/vision.onnx"
-text = "onnx/text.onnx"
-tokenizer = "tokenizer.json"
+files = { image = "onnx/vision.onnx", text = "onnx/text.onnx", tokenizer = "tokenizer.json" }
 "#;
 
 /// The table of that model alone.

@@ -21,7 +21,8 @@ pub(super) struct Filters<'a> {
 }
 
 impl Filters<'_> {
-    /// Returns, in order, the proposals that have a sufficient predicted IoU, are stable and are not cut by the crop.
+    /// Returns, in order, the proposals of prompts that show an object, which have a sufficient predicted IoU, are stable
+    /// and are not cut by the crop.
     pub(super) fn candidates(&self, decoded: &Decoded, upsampler: &Upsampler, crop: BoxPx) -> Vec<Candidate> {
         let SamSettings { predicted_iou: least_iou, stability, stability_offset, .. } = *self.settings;
         let n_logits = (decoded.logits_px[0] * decoded.logits_px[1]) as usize;
@@ -29,7 +30,10 @@ impl Filters<'_> {
         // Three proposals per prompt, the smallest first.
         let level_of = |at: usize| (MASKS_PER_PROMPT - 1 - at % MASKS_PER_PROMPT) as u8;
         let proposals = decoded.logits.par_chunks_exact(n_logits).zip(&decoded.predicted_ious).enumerate();
+        // SAM 2's own rule: there is an object where the logit is above 0.
+        let shows_object = |at: usize| decoded.object_logits.get(at / MASKS_PER_PROMPT).is_none_or(|&logit| logit > 0.0);
         proposals
+            .filter(|(at, _)| shows_object(*at))
             .filter(|(at, _)| lists.iter().any(|list| list.contains(&level_of(*at))))
             .filter(|&(_, (_, &predicted_iou))| predicted_iou > least_iou || least_iou == 0.0)
             .filter_map(|(at, (logits, predicted_iou))| {

@@ -2,6 +2,7 @@
 
 mod langsplat;
 mod levels;
+mod sam2;
 
 use std::path::Path;
 
@@ -88,6 +89,7 @@ fn decoded(blobs: &[Blob]) -> Decoded {
         predicted_ious: blobs.iter().map(|blob| blob.predicted_iou).collect(),
         logits: blobs.iter().flat_map(logits).collect(),
         logits_px: [LOGITS_PX; 2],
+        object_logits: Vec::new(),
     }
 }
 

@@ -2,7 +2,7 @@
 //!
 //! SAM enlarges the logits to its input square, crops the padding and scales the rest to the image; both steps are
 //! bilinear with aligned pixel centres. They are linear in each axis, so this module combines them into one step with at
-//! most three taps per axis, without the intermediate square.
+//! most three taps per axis, without the intermediate square. SAM 2 enlarges the logits to the image at once.
 
 use slag_models::sam::Letterbox;
 
@@ -31,6 +31,9 @@ impl Axis {
             let mut first = None;
             let mut weights = [0.0_f64; 3];
             for (pixel, weight) in in_square.into_iter().zip([1.0 - second, second]) {
+                if weight == 0.0 {
+                    continue;
+                }
                 let (logits, second) = neighbours(pixel, n_logits, size_px);
                 // Logits are no finer than the square, so two neighbours in it depend on at most three logits.
                 let first = *first.get_or_insert((logits[0] as usize).min(n_logits as usize - 3));
@@ -69,7 +72,12 @@ impl Upsampler {
     /// Creates the upsampling for `logits_px` columns and rows of logits: at least 3, at most the size of the square.
     pub(super) fn new(letterbox: &Letterbox, logits_px: [u32; 2]) -> Self {
         let axis = |k: usize| {
-            Axis::new(logits_px[k], letterbox.size_px, letterbox.resized_px[k], letterbox.image_px[k])
+            let image_px = letterbox.image_px[k];
+            let (square_px, resized_px) = match letterbox.is_stretched {
+                true => (image_px, image_px),
+                false => (letterbox.size_px, letterbox.resized_px[k]),
+            };
+            Axis::new(logits_px[k], square_px, resized_px, image_px)
         };
         Self { n_columns: logits_px[0] as usize, x: axis(0), y: axis(1) }
     }

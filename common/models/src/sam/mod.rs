@@ -1,0 +1,237 @@
+//! Segment Anything (Kirillov et al. 2023) and Segment Anything 2 (Ravi et al. 2024) in two ONNX files: an image encoder,
+//! and a prompt encoder with the mask decoder. SAM, MobileSAM, EdgeSAM and SAM-HQ have the first layout; SAM 2, SAM 2.1
+//! and EdgeTAM the second.
+//!
+//! ```toml
+//! name = "sam-vit-base"
+//! about = "class-agnostic masks of photographs"
+//! licence = "Apache-2.0"
+//! files_root = "."                 # folder of the files below, relative to this file's folder
+//!
+//! [segment]
+//! kind = "sam"                     # or "sam2": photos are stretched over the square, not padded
+//! image_encoder = { path = "vision_encoder.onnx", sha256 = "..." }
+//! mask_decoder = { path = "prompt_encoder_mask_decoder.onnx", sha256 = "..." }
+//!                                  # weights in a file of their own: data = { path = "...onnx_data", sha256 = "..." }
+//! size_px = 1024                   # this and the next two: SAM's values if left out
+//! mean = [0.485, 0.456, 0.406]     # pixel value = (level / 255 - mean) / std
+//! std = [0.229, 0.224, 0.225]
+//! ```
+//!
+//! Inputs and outputs are not named in the description: the decoder's inputs are matched with the encoder's outputs
+//! by name, points, labels and boxes by type and shape. Boxes, where a decoder takes them, are none. SAM 2's decoder takes
+//! one prompt a call and tells whether there is an object at all (`object_score_logits`).
+
+mod description;
+mod letterbox;
+mod names;
+
+use std::path::Path;
+use std::sync::{Mutex, PoisonError};
+
+use image::RgbImage;
+
+use crate::ModelError;
+use crate::description::FILE_NAME;
+use crate::model_dir::{checked, sha256_of};
+use crate::preprocess::{Filter, Window, resample, values_of_levels};
+use crate::session::{Model, SessionError, SessionOptions, Tensor};
+use names::Names;
+
+pub use description::{SamDescription, SamFiles, SegmentDescription};
+pub use letterbox::Letterbox;
+
+/// Masks that SAM proposes for a prompt: subpart, part and whole, in that order.
+pub const MASKS_PER_PROMPT: usize = 3;
+
+/// An opened SAM. Each file runs one call at a time; the two files can run in parallel.
+#[derive(Debug)]
+pub struct Sam {
+    id: String,
+    size_px: u32,
+    is_stretched: bool,
+    /// Pixel value for each level, per channel.
+    values: [[f32; 256]; 3],
+    encoder: Mutex<Model>,
+    decoder: Mutex<Model>,
+    names: Names,
+}
+
+/// The encoder's output for an image.
+#[derive(Clone, Debug)]
+pub struct Embedding {
+    /// Tensors by the name of the decoder's input.
+    tensors: Vec<(String, Tensor)>,
+    /// Placement of the image in the encoder's square.
+    pub letterbox: Letterbox,
+}
+
+impl Embedding {
+    /// Returns the tensors: name of the decoder's input, shape, values.
+    pub fn tensors(&self) -> impl Iterator<Item = (&str, &[i64], &[f32])> {
+        self.tensors.iter().map(|(name, tensor)| (name.as_str(), &tensor.shape[..], &tensor.values[..]))
+    }
+}
+
+/// The decoder's output for prompts.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Decoded {
+    /// The model's estimate of each mask's IoU, `[prompts][MASKS_PER_PROMPT]`.
+    pub predicted_ious: Vec<f32>,
+    /// The model's logit of each prompt that there is an object at all, `[prompts]`; empty if the model does not tell.
+    pub object_logits: Vec<f32>,
+    /// Logits of the whole square, padding included: `[prompts][MASKS_PER_PROMPT][rows][columns]`.
+    pub logits: Vec<f32>,
+    /// Columns and rows of the logits.
+    pub logits_px: [u32; 2],
+}
+
+impl Sam {
+    /// Opens the directory `dir`; its `model.toml` must have `[segment]`.
+    /// # Errors
+    /// [`ModelError`] if a file is absent or not as described, or ONNX Runtime does not load.
+    pub fn open(dir: &Path, options: &SessionOptions) -> Result<Self, ModelError> {
+        let path = dir.join(FILE_NAME);
+        let description = SamDescription::read(&path)?;
+        let files_root = dir.join(&description.files_root);
+        let mut id = description.name.clone();
+        let sam = description.segment.files();
+        for file in [&sam.image_encoder, &sam.mask_decoder] {
+            for part in file.parts() {
+                id = format!("{id} {}", hex::encode(sha256_of(&files_root, part)?));
+            }
+        }
+        let encoder = Model::open(&checked(&files_root, &sam.image_encoder)?.into(), options)?;
+        let decoder = Model::open(&checked(&files_root, &sam.mask_decoder)?.into(), options)?;
+        let size_px = u32::from(sam.size_px);
+        let names = Names::discover(&encoder, &decoder, i64::from(size_px))?;
+        Ok(Self {
+            id: format!("{id} {:?} {:?} {size_px} px", sam.mean, sam.std),
+            size_px,
+            is_stretched: description.segment.is_stretched(),
+            values: values_of_levels(sam.mean, sam.std),
+            encoder: Mutex::new(encoder),
+            decoder: Mutex::new(decoder),
+            names,
+        })
+    }
+
+    /// Returns the model's identity: its name, the hashes of its files, and its preprocessing.
+    pub fn id(&self) -> &str {
+        &self.id
+    }
+
+    /// Returns an image's pixel values, `[3][size_px][size_px]`: resized (Pillow's bilinear) to fill the square with the
+    /// longer edge or, for SAM 2, with both, normalised, and padded with zeros. `image` must have pixels.
+    pub fn pixel_values(&self, image: &RgbImage) -> Vec<f32> {
+        let Letterbox { resized_px: [width_px, height_px], .. } = self.letterbox_of(image);
+        let whole = Window { left_px: 0, top_px: 0, width_px, height_px };
+        let resized = resample(image, Filter::Bilinear, [width_px, height_px].map(u64::from), whole);
+        let size = self.size_px as usize;
+        let mut pixels = vec![0.0; 3 * size * size];
+        for ((channel, value_of_level), plane) in
+            self.values.iter().enumerate().zip(pixels.chunks_exact_mut(size * size))
+        {
+            let rows = resized.as_raw().chunks_exact(width_px as usize * 3);
+            for (out, row) in plane.chunks_exact_mut(size).zip(rows) {
+                let levels = row.iter().skip(channel).step_by(3);
+                out.iter_mut().zip(levels).for_each(|(x, &level)| *x = value_of_level[usize::from(level)]);
+            }
+        }
+        pixels
+    }
+
+    fn letterbox_of(&self, image: &RgbImage) -> Letterbox {
+        let place = if self.is_stretched { Letterbox::stretched } else { Letterbox::new };
+        place(self.size_px, [image.width(), image.height()])
+    }
+
+    /// Computes an image's embedding; `image` must have pixels.
+    /// # Errors
+    /// [`SessionError`] if the model fails.
+    pub fn embed(&self, image: &RgbImage) -> Result<Embedding, SessionError> {
+        let (size, pixels) = (i64::from(self.size_px), self.pixel_values(image));
+        let mut encoder = self.encoder.lock().unwrap_or_else(PoisonError::into_inner);
+        let input = encoder.tensor(vec![1, 3, size, size], &pixels)?;
+        let links = &self.names.embeddings;
+        let outputs: Vec<_> = links.iter().map(|link| (link.output.as_str(), &link.shape[..])).collect();
+        let found = encoder.run_all(vec![(self.names.pixels.as_str(), input)], &outputs)?;
+        let inputs = links.iter().map(|link| link.input.clone());
+        Ok(Embedding { tensors: inputs.zip(found).collect(), letterbox: self.letterbox_of(image) })
+    }
+
+    /// Proposes masks for `n_prompts` prompts with the same number of points each.
+    ///
+    /// `points`: `[n_prompts][points]` in pixels of the square, see [`Letterbox::point`]. `labels`: for each point, 1
+    /// inside the object, 0 outside, -1 no point.
+    /// # Errors
+    /// [`SessionError`] if the model fails or its output is not of SAM's shapes.
+    pub fn decode(
+        &self,
+        embedding: &Embedding,
+        n_prompts: usize,
+        points: &[[f32; 2]],
+        labels: &[i64],
+    ) -> Result<Decoded, SessionError> {
+        let mut decoder = self.decoder.lock().unwrap_or_else(PoisonError::into_inner);
+        let per_call = if self.names.is_one_by_one { 1 } else { n_prompts.max(1) };
+        let n_points = points.len() / n_prompts.max(1);
+        let mut decoded = Decoded::default();
+        let calls = points.chunks(per_call * n_points.max(1)).zip(labels.chunks(per_call * n_points.max(1)));
+        for (points, labels) in calls {
+            decoded.append(self.decode_call(&mut decoder, embedding, n_points, (points, labels))?);
+        }
+        Ok(decoded)
+    }
+
+    /// Runs the decoder once, on prompts of `n_points` points each.
+    fn decode_call(
+        &self,
+        decoder: &mut Model,
+        embedding: &Embedding,
+        n_points: usize,
+        (points, labels): (&[[f32; 2]], &[i64]),
+    ) -> Result<Decoded, SessionError> {
+        let n = (points.len() / n_points.max(1)) as i64;
+        let n_points = n_points as i64;
+        let names = &self.names;
+        let mut inputs = vec![
+            (names.points.as_str(), decoder.tensor(vec![1, n, n_points, 2], points.as_flattened())?),
+            (names.labels.as_str(), decoder.tensor(vec![1, n, n_points], labels)?),
+        ];
+        if let Some(boxes) = &names.boxes {
+            inputs.push((boxes.as_str(), decoder.tensor::<f32>(vec![1, 0, 4], &[])?));
+        }
+        for (name, tensor) in &embedding.tensors {
+            inputs.push((name.as_str(), decoder.tensor(tensor.shape.clone(), &tensor.values)?));
+        }
+        let n_masks = MASKS_PER_PROMPT as i64;
+        let (scores, masks, objects) =
+            (&[1, n, n_masks][..], &[1, n, n_masks, -1, -1][..], &[1, n, 1][..]);
+        let mut outputs = vec![(names.scores.as_str(), scores), (names.masks.as_str(), masks)];
+        outputs.extend(names.objects.iter().map(|name| (name.as_str(), objects)));
+        let mut found = decoder.run_all(inputs, &outputs)?.into_iter();
+        let mut next = || found.next().unwrap_or_default();
+        let (scores, masks, objects) = (next(), next(), next());
+        let logits_px = [masks.shape[4] as u32, masks.shape[3] as u32];
+        // The upsampling needs 3; SAM's logits are never larger than the square.
+        if logits_px.iter().any(|edge| !(3..=self.size_px).contains(edge)) {
+            let expected = format!("masks of 3 to {} px a side", self.size_px);
+            return Err(
+                decoder.layout_error(format!("masks are {} x {} px", logits_px[0], logits_px[1]), expected)
+            );
+        }
+        let (predicted_ious, logits, object_logits) = (scores.values, masks.values, objects.values);
+        Ok(Decoded { predicted_ious, object_logits, logits, logits_px })
+    }
+}
+
+impl Decoded {
+    /// Appends the output for further prompts of the same image.
+    fn append(&mut self, mut more: Self) {
+        self.predicted_ious.append(&mut more.predicted_ious);
+        self.object_logits.append(&mut more.object_logits);
+        self.logits.append(&mut more.logits);
+        self.logits_px = more.logits_px;
+    }
+}
