@@ -19,6 +19,8 @@
 //! std = [0.27, 0.26, 0.28]
 //! normalise = true                 # false: the model's vectors are of unit length already
 //! batch = 16                       # crops in a run; default: measured (see `OnnxImageEncoder`)
+//! patches = { output = "patch_embeddings", patch_px = 14 }  # optional: a vector of the same space for each patch of the
+//!                                  # square, f32 or f16 [n,(size_px/patch_px)^2,dim], row by row; photos are stretched
 //!
 //! [text]
 //! kind = "onnx"
@@ -28,7 +30,7 @@
 //! attention_mask = "attention_mask"  # left out if the model takes none
 //! output = "text_embeds"           # f32 or f16 [1,dim]; default: the only output of that shape
 //! max_tokens = 77
-//! end_token_id = 49407
+//! end_token_id = 49407             # left out if texts have no such token (TIPSv2)
 //! padding = { n_tokens = 64, token_id = 1 }  # only if the model was trained on padded texts (SigLIP) or
 //!                                  # takes exactly that many tokens; CLIP is faster without
 //! prompt = "a photo of a {}"
@@ -70,6 +72,9 @@ use crate::preprocess::{Filter, Preprocess, Resize};
 
 /// The file name of the description in a model directory.
 pub const FILE_NAME: &str = "model.toml";
+
+/// Most patches along a side of the square.
+const MAX_PATCHES_PER_SIDE: u16 = 256;
 
 /// Error of reading a description or the files that it names.
 #[derive(Debug, thiserror::Error)]
@@ -176,9 +181,27 @@ pub struct ImageDescription {
     /// Crops in a run; default: measured.
     #[serde(skip_serializing)]
     pub batch: Option<u16>,
+    /// The vectors of patches, if the model has them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub patches: Option<PatchDescription>,
+}
+
+/// The vectors of an image model's patches, in the space of its texts.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PatchDescription {
+    /// The output, f32 or f16 `[n, per_side^2, dim]`, row by row.
+    pub output: String,
+    /// Edge length of a patch, in pixels of the square.
+    pub patch_px: u16,
 }
 
 impl ImageDescription {
+    /// Returns the patches along each side of the square, if the model has vectors of patches.
+    pub fn patches_per_side(&self) -> Option<u32> {
+        self.patches.as_ref().map(|patches| u32::from(self.size_px / patches.patch_px.max(1)))
+    }
+
     /// Returns the steps from a crop to pixel values.
     pub fn preprocess(&self) -> Preprocess {
         Preprocess::new(u32::from(self.size_px), self.resize, self.filter, self.mean, self.std)
@@ -211,8 +234,8 @@ pub struct OnnxText {
     pub output: Option<String>,
     /// Length of the longest text in tokens, including begin and end tokens.
     pub max_tokens: u16,
-    /// The token that ends a text.
-    pub end_token_id: u32,
+    /// The token that ends a text; absent if texts have none (TIPSv2).
+    pub end_token_id: Option<u32>,
     /// Padding after the end token, if any.
     pub padding: Option<Padding>,
     /// The encoded text, with `{}` in place of the query.
@@ -382,6 +405,13 @@ impl Description {
             format!("{:?}", image.std),
             "three numbers above 0",
         )?;
+        if let Some(PatchDescription { patch_px, .. }) = image.patches {
+            let fits = (1..=image.size_px).contains(&patch_px)
+                && image.size_px % patch_px == 0
+                && image.size_px / patch_px <= MAX_PATCHES_PER_SIDE;
+            let expected = "a divisor of image.size_px that gives at most 256 patches a side";
+            require(fits, "image.patches.patch_px", patch_px.to_string(), expected)?;
+        }
         if let TextDescription::Onnx(text) = &self.text {
             let max_tokens = text.max_tokens;
             require(max_tokens >= 2, "text.max_tokens", max_tokens.to_string(), "2 or more")?;

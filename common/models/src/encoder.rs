@@ -1,5 +1,7 @@
 //! The traits of image and text encoders.
 
+use image::RgbImage;
+
 use crate::crop::Crop;
 use crate::error::InferenceError;
 use crate::placement::Placement;
@@ -18,6 +20,20 @@ pub trait ImageEncoder: Send {
     /// # Errors
     /// [`InferenceError`] if a crop is empty or the model fails.
     fn encode(&mut self, crops: &[Crop]) -> Result<Vec<f32>, InferenceError>;
+
+    /// Returns the patches along each side of the square over which photos are stretched for [`Self::encode_patches`];
+    /// `None` if the encoder has no vectors of patches.
+    fn patches_per_side(&self) -> Option<u32> {
+        None
+    }
+
+    /// Encodes the patches of a whole photo: `[patches_per_side^2][dim]`, unit vectors, row by row; `None` if the encoder has
+    /// no vectors of patches.
+    /// # Errors
+    /// [`InferenceError`] if the photo is empty or the model fails.
+    fn encode_patches(&mut self, _photo: &RgbImage) -> Result<Option<Vec<f32>>, InferenceError> {
+        Ok(None)
+    }
 
     /// Returns the device that ONNX Runtime runs the model on; `None` without ONNX Runtime.
     fn placement(&self) -> Option<&Placement> {

@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use half::f16;
+use image::RgbImage;
 use ort::value::TensorElementType;
 
 use crate::{
@@ -39,6 +40,8 @@ pub struct OnnxImageEncoder {
     output: String,
     normalise: bool,
     batch: Option<usize>,
+    /// The output of patch vectors and the patches along a side.
+    patches: Option<(String, u32)>,
 }
 
 impl OnnxImageEncoder {
@@ -63,6 +66,12 @@ impl OnnxImageEncoder {
         }
         model.expect_no_input_but(&[input])?;
         let output = model.expect_output(description.output.as_deref(), f32, &[-1, dim as i64])?.name;
+        let mut patches = None;
+        if let (Some(of), Some(per_side)) = (&description.patches, description.patches_per_side()) {
+            let n = i64::from(per_side).pow(2);
+            let slot = model.expect_output(of.output.as_str(), f32, &[-1, n, dim as i64])?;
+            patches = Some((slot.name, per_side));
+        }
         Ok(Self {
             name: name.to_owned(),
             dim,
@@ -72,6 +81,7 @@ impl OnnxImageEncoder {
             is_f16: slot.element == TensorElementType::Float16,
             output,
             normalise: description.normalise,
+            patches,
             batch: if takes_one { Some(1) } else { description.batch.map(usize::from) },
         })
     }
@@ -130,17 +140,29 @@ impl OnnxImageEncoder {
 
     /// Runs the model on pixel values `[n][3][size_px][size_px]`; returns its vectors, `[n][dim]`.
     fn run(&mut self, pixels: &[f32], n: usize) -> Result<Vec<f32>, SessionError> {
+        let (output, dim) = (self.output.clone(), self.dim as i64);
+        self.run_for(pixels, n, &output, &[n as i64, dim])
+    }
+
+    /// Runs the model on pixel values `[n][3][size_px][size_px]`; returns `output`, which has `shape`.
+    fn run_for(
+        &mut self,
+        pixels: &[f32],
+        n: usize,
+        output: &str,
+        shape: &[i64],
+    ) -> Result<Vec<f32>, SessionError> {
         let size = i64::from(self.preprocess.size_px());
-        let shape = vec![n as i64, 3, size, size];
+        let input_shape = vec![n as i64, 3, size, size];
         let halves: Vec<f16>;
         let input = match self.is_f16 {
             true => {
                 halves = pixels.iter().map(|&x| f16::from_f32(x)).collect();
-                self.model.tensor(shape, &halves)?
+                self.model.tensor(input_shape, &halves)?
             }
-            false => self.model.tensor(shape, pixels)?,
+            false => self.model.tensor(input_shape, pixels)?,
         };
-        self.model.run(vec![(self.input.as_str(), input)], &self.output, &[n as i64, self.dim as i64])
+        self.model.run(vec![(self.input.as_str(), input)], output, shape)
     }
 
     /// Normalises vector `index` of the call, or checks its length.
@@ -182,6 +204,25 @@ impl ImageEncoder for OnnxImageEncoder {
             vectors.append(&mut batch);
         }
         Ok(vectors)
+    }
+
+    fn patches_per_side(&self) -> Option<u32> {
+        self.patches.as_ref().map(|(_, per_side)| *per_side)
+    }
+
+    fn encode_patches(&mut self, photo: &RgbImage) -> Result<Option<Vec<f32>>, InferenceError> {
+        let Some((output, per_side)) = self.patches.clone() else { return Ok(None) };
+        if photo.width() == 0 || photo.height() == 0 {
+            return Err(InferenceError::EmptyCrop { index: 0 });
+        }
+        let mut pixels = Vec::new();
+        self.preprocess.stretched().append_pixel_values(photo, &mut pixels);
+        let shape = [1, i64::from(per_side).pow(2), self.dim as i64];
+        let mut vectors = self.run_for(&pixels, 1, &output, &shape)?;
+        for (index, vector) in vectors.chunks_exact_mut(self.dim).enumerate() {
+            self.finish(vector, index)?;
+        }
+        Ok(Some(vectors))
     }
 
     fn placement(&self) -> Option<&Placement> {

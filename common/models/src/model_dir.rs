@@ -153,6 +153,14 @@ impl ModelDir {
         }
     }
 
+    /// Returns the patches along each side of a photo that have vectors; `None` if the model has none.
+    pub fn patches_per_side(&self) -> Option<u32> {
+        match &self.source {
+            Source::Colours => None,
+            Source::Files { description, .. } => description.image.patches_per_side(),
+        }
+    }
+
     /// Opens the image encoder.
     /// # Errors
     /// [`ModelError`] if a file is absent or not as described, or ONNX Runtime does not load.

@@ -86,6 +86,11 @@ impl Preprocess {
         Self { size_px, resize, filter, values: values_of_levels(mean, std) }
     }
 
+    /// Returns the same steps, but for stretching over the square.
+    pub fn stretched(&self) -> Self {
+        Self { resize: Resize::Stretch, ..self.clone() }
+    }
+
     /// Returns the edge length of the square, in pixels.
     pub fn size_px(&self) -> u32 {
         self.size_px

@@ -21,14 +21,16 @@ pub struct Tokens {
     path: PathBuf,
     tokenizer: Tokenizer,
     max_tokens: usize,
-    end_token_id: u32,
+    end_token_id: Option<u32>,
 }
 
 impl Tokens {
-    /// Reads `file` (`tokenizer.json`); a text becomes at most `max_tokens` ids, the last of them `end_token_id`.
+    /// Reads `file` (`tokenizer.json`); a text becomes at most `max_tokens` ids, the last of them `end_token_id` if there is
+    /// one.
     /// # Errors
     /// [`TokenizerError`] if the file is not a tokenizer, or ends texts with another token.
-    pub fn open(file: &ModelFile, max_tokens: usize, end_token_id: u32) -> Result<Self, TokenizerError> {
+    pub fn open(file: &ModelFile, max_tokens: usize, end_token_id: impl Into<Option<u32>>) -> Result<Self, TokenizerError> {
+        let end_token_id = end_token_id.into();
         let path = &*file.path;
         let bytes = file.read().map_err(|cause| TokenizerError::Read { cause })?;
         let mut tokenizer = Tokenizer::from_bytes(bytes)
@@ -40,14 +42,12 @@ impl Tokens {
             .map_err(|error| TokenizerError::Format { path: path.to_owned(), reason: error.to_string() })?;
         let tokens = Self { path: path.to_owned(), tokenizer, max_tokens, end_token_id };
         let found = tokens.raw_ids("")?.last().copied();
-        if found != Some(end_token_id) {
-            return Err(TokenizerError::OtherVocabulary {
-                path: path.to_owned(),
-                expected: end_token_id,
-                found,
-            });
+        match end_token_id {
+            Some(expected) if found != Some(expected) => {
+                Err(TokenizerError::OtherVocabulary { path: path.to_owned(), expected, found })
+            }
+            _ => Ok(tokens),
         }
-        Ok(tokens)
     }
 
     /// Returns the largest id that a text can have. Added tokens are left out: they need not occur in a text.
@@ -72,11 +72,12 @@ impl Tokens {
     pub fn ids(&self, text: &str) -> Result<Vec<u32>, TokenizerError> {
         let mut ids = self.raw_ids(text)?;
         ids.truncate(self.max_tokens);
-        match ids.iter().position(|&id| id == self.end_token_id) {
+        let Some(end_token_id) = self.end_token_id else { return Ok(ids) };
+        match ids.iter().position(|&id| id == end_token_id) {
             Some(end) => ids.truncate(end + 1),
             None => {
                 ids.truncate(self.max_tokens - 1);
-                ids.push(self.end_token_id);
+                ids.push(end_token_id);
             }
         }
         Ok(ids)
@@ -135,7 +136,7 @@ impl OnnxTextEncoder {
         let (name, description) = (name.to_owned(), description.clone());
         let mut encoder = Self { name, dim, model, tokens, description, output, is_i32, centre };
         let largest = encoder.tokens.largest_id();
-        let end = encoder.description.end_token_id;
+        let end = encoder.description.end_token_id.unwrap_or(0);
         match encoder.run(&[largest, end]) {
             Ok(_) => Ok(encoder),
             Err(cause) if encoder.run(&[end, end]).is_ok() => {

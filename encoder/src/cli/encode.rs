@@ -20,7 +20,7 @@ use crate::codebook::CodebookSettings;
 use crate::encode::coverage::CoverageReport;
 use crate::encode::{
     self, CellReport, CellSettings, EncodeSettings, EncodeSummary, Engines, InputSettings, Masks,
-    OutputSettings, Preset, RasterWidth, RunSettings, StageReport, ViewSettings, ViewsLimit, ViewsReport,
+    OutputSettings, Preset, RasterWidth, Regions, RunSettings, StageReport, ViewSettings, ViewsLimit, ViewsReport,
 };
 use crate::progress::Progress;
 use crate::raster::WeightKind;
@@ -48,6 +48,10 @@ pub struct EncodeArgs {
     /// Segment Anything instead of the built-in segmenter.
     #[command(flatten)]
     pub sam: SamArgs,
+    /// What of a photo has vectors: masks by their crops, the patches of an image model that aligns them with text
+    /// (model.toml: image.patches), or both. With patches, no objects are found.
+    #[arg(long, value_enum, default_value = "masks")]
+    pub regions: Regions,
     /// Ids in mask PNGs that are no masks; 0 never is one.
     #[arg(long, value_name = "ID", value_delimiter = ',')]
     pub ignore_mask_ids: Vec<u32>,
@@ -191,6 +195,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             raster_width: args.raster_width.unwrap_or(preset.raster_width),
             weights: args.weights.map_or(preset.weights, Into::into),
             merges_slivers: preset.merges_slivers && !args.keep_slivers,
+            regions: args.regions,
         },
         aggregation: args.refine.aggregation(preset.aggregation),
         cells: CellSettings {
@@ -199,7 +204,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
                 max_width: metric.then_some(args.cell_width_m),
             },
             shards: shard_settings(args, preset.codebook, metric),
-            objects: preset.objects && !args.objects.no_objects,
+            objects: preset.objects && !args.objects.no_objects && !args.regions.have_patches(),
         },
         output: OutputSettings {
             store: args.store.clone(),

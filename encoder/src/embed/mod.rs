@@ -30,6 +30,12 @@ pub enum EmbedError {
         /// Height of the image.
         height_px: u32,
     },
+    /// The encoder failed on the patches of a photo, or has none.
+    #[error("patches of the photo: {cause}")]
+    Patches {
+        /// The encoder's error.
+        cause: Box<InferenceError>,
+    },
     /// The encoder failed on a batch.
     #[error("masks {first} to {last}: {cause}")]
     Encode {
@@ -148,6 +154,20 @@ pub fn embed_crops(
         last: (first + crops.len()).saturating_sub(1),
         cause: Box::new(cause),
     })
+}
+
+/// Returns a unit vector per patch of `of`, `[of][dim]`, numbers of patches row by row; none if the encoder has no vectors
+/// of patches.
+/// # Errors
+/// [`EmbedError::Patches`] where the encoder fails.
+pub fn embed_patches(
+    photo: &RgbImage,
+    of: &[usize],
+    encoder: &mut dyn ImageEncoder,
+) -> Result<Vec<f32>, EmbedError> {
+    let vectors = encoder.encode_patches(photo).map_err(|cause| EmbedError::Patches { cause: Box::new(cause) })?;
+    let (vectors, dim) = (vectors.unwrap_or_default(), encoder.dim());
+    Ok(of.iter().filter_map(|&k| vectors.get(k * dim..(k + 1) * dim)).flatten().copied().collect())
 }
 
 /// Returns a unit vector per mask, `[masks][dim]`.

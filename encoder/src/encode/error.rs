@@ -25,6 +25,14 @@ pub enum EncodeError {
         /// What is wrong with it, and what is expected.
         problem: String,
     },
+    /// Patches are asked for, but the image model has none.
+    #[error(
+        "{model} has no vectors of patches; give a model whose model.toml has image.patches, or use --regions masks"
+    )]
+    NoPatches {
+        /// The model.
+        model: String,
+    },
     /// The worker threads cannot be started.
     #[error("cannot start {n_threads} threads: {source}; use fewer with --threads")]
     Threads {

@@ -41,7 +41,7 @@ pub use preset::{Choices, Preset};
 pub use report::{CellReport, EncodeSummary, SkippedView, StageReport, ViewsReport};
 pub use settings::{
     CellSettings, DEFAULT_MASK_LEVELS, EncodeSettings, InputSettings, Masks, OutputSettings, RasterWidth,
-    RunSettings, ViewOrder, ViewSettings, ViewsLimit,
+    Regions, RunSettings, ViewOrder, ViewSettings, ViewsLimit,
 };
 
 /// Encodes a scene into a store and publishes the result as its next generation.

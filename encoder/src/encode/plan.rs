@@ -12,12 +12,14 @@ use super::error::EncodeError;
 use super::identity;
 use super::inputs::Inputs;
 use super::job::Job;
-use super::settings::{EncodeSettings, Masks, RunSettings, ViewOrder};
+use super::settings::{EncodeSettings, Masks, Regions, RunSettings, ViewOrder};
 use crate::lift::refine::Refinement;
 use crate::memory::MemoryPlan;
 use crate::objects;
 use crate::raster::{LoadedScene, RasterView};
-use crate::segment::{GivenMasks, GraphSegmenter, GraphSettings, SamSegmenter, SegmentError, Segmenter};
+use crate::segment::{
+    GivenMasks, GraphSegmenter, GraphSettings, NoMasks, SamSegmenter, SegmentError, Segmenter,
+};
 use crate::shard;
 use crate::store::Store;
 
@@ -50,7 +52,14 @@ pub(super) fn plan<'a>(
 ) -> Result<Plan<'a>, EncodeError> {
     let memory = memory_plan(settings, inputs, engines.models.dim());
     memory.rest(0)?;
-    let segmenter = open_segmenter(&settings.view.masks, engines.session)?;
+    let regions = settings.view.regions;
+    if regions.have_patches() && engines.models.patches_per_side().is_none() {
+        return Err(EncodeError::NoPatches { model: engines.models.encoder_id().to_string() });
+    }
+    let segmenter: Box<dyn Segmenter> = match regions {
+        Regions::Patches => Box::new(NoMasks),
+        Regions::Masks | Regions::Both => open_segmenter(&settings.view.masks, engines.session)?,
+    };
     let identity = context.time("identity", || {
         context.install(|| identity::identity(settings, engines, segmenter.as_ref(), inputs))
     })?;

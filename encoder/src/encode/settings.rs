@@ -82,6 +82,33 @@ pub struct ViewSettings {
     pub weights: WeightKind,
     /// Whether slivers between masks join their neighbours.
     pub merges_slivers: bool,
+    /// Which parts of a photo have vectors.
+    #[serde(skip_serializing_if = "Regions::are_masks")]
+    pub regions: Regions,
+}
+
+/// Which parts of a photo have vectors.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Regions {
+    /// Masks, by a crop each.
+    #[default]
+    Masks,
+    /// Patches of an image model whose patches are aligned with text: neither masks nor crops.
+    Patches,
+    /// Both: a pixel counts for its masks and its patch.
+    Both,
+}
+
+impl Regions {
+    fn are_masks(&self) -> bool {
+        *self == Self::Masks
+    }
+
+    /// Returns whether patches have vectors.
+    pub fn have_patches(self) -> bool {
+        self != Self::Masks
+    }
 }
 
 /// Where masks come from.
@@ -228,6 +255,7 @@ impl EncodeSettings {
                 raster_width: RasterWidth::ByContent,
                 weights: WeightKind::Blend,
                 merges_slivers: true,
+                regions: Regions::Masks,
             },
             aggregation: Aggregation::REFINED,
             cells: CellSettings {

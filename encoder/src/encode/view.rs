@@ -3,6 +3,7 @@
 use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::Instant;
 
+use image::RgbImage;
 use slag_common::{Intrinsics, View};
 use slag_models::preprocess::Preprocess;
 use slag_models::{Crop, ImageEncoder};
@@ -17,6 +18,7 @@ use crate::embed;
 use crate::ingest::{self, LoadedImage};
 use crate::lift::ViewContributions;
 use crate::lift::photos::MaskOutline;
+use crate::masks::patches::patch_masks;
 use crate::masks::regions::{absorb_slivers, border_share, partition};
 use crate::masks::{Mask, RegionMap};
 use crate::raster::{RasterError, RasterView};
@@ -51,7 +53,7 @@ enum Next {
     Depth(LoadedImage),
     Segment(LoadedImage, Option<Vec<f32>>),
     Crop(LoadedImage, Vec<Mask>),
-    Embed(Crops, Partition),
+    Embed(Crops, Option<Patches>, Partition),
     Raster(Vec<f32>, Partition),
     Write(ViewContributions, Vec<MaskOutline>, u32),
 }
@@ -63,6 +65,13 @@ enum Crops {
     Squares(Vec<Crop>),
     /// For a model that takes crops of any size: they are cut a batch at a time.
     Uncut(LoadedImage, Vec<Mask>),
+}
+
+/// The patches of a photo to embed.
+struct Patches {
+    photo: RgbImage,
+    /// Their numbers, row by row.
+    of: Vec<usize>,
 }
 
 /// The regions of a view, the masks that cover each, and the outlines of masks.
@@ -145,7 +154,16 @@ impl<'a> ViewStages<'a> {
                 Next::Crop(loaded, masks)
             }
             Next::Crop(loaded, masks) => {
-                let partition = self.partition(&loaded, &masks);
+                let mut regions = masks.clone();
+                let patches = self.plan.engines.models.patches_per_side();
+                let patches = patches.filter(|_| self.plan.settings.view.regions.have_patches()).map(|per_side| {
+                    let (width_px, height_px) = loaded.image.dimensions();
+                    let (of, of_patches): (Vec<_>, Vec<_>) =
+                        patch_masks(per_side, width_px, height_px).into_iter().unzip();
+                    regions.extend(of_patches);
+                    Patches { photo: loaded.image.clone(), of }
+                });
+                let partition = self.partition(&loaded, &regions);
                 let crops = match &self.preprocess {
                     Some(preprocess) => Crops::Squares(
                         embed::squares(&loaded.image, &masks, self.plan.settings.view.background, preprocess)
@@ -153,10 +171,10 @@ impl<'a> ViewStages<'a> {
                     ),
                     None => Crops::Uncut(loaded, masks),
                 };
-                Next::Embed(crops, partition)
+                Next::Embed(crops, patches, partition)
             }
-            Next::Embed(crops, partition) => {
-                let mut vectors = self.embed(view, &crops)?;
+            Next::Embed(crops, patches, partition) => {
+                let mut vectors = self.embed(view, &crops, patches.as_ref())?;
                 if let Some(perturbation) = self.plan.engines.perturbation {
                     perturbation.vectors(&view.name, &mut vectors, self.plan.engines.models.dim());
                 }
@@ -231,9 +249,9 @@ impl<'a> ViewStages<'a> {
         Partition { raster_view, regions, masks_of_region, outlines, weight_scale }
     }
 
-    /// Returns a vector per mask, from an idle encoder or a new one.
-    fn embed(&self, view: &View, crops: &Crops) -> Result<Vec<f32>, EncodeError> {
-        if matches!(crops, Crops::Squares(crops) if crops.is_empty()) {
+    /// Returns a vector per mask, then one per patch, from an idle encoder or a new one.
+    fn embed(&self, view: &View, crops: &Crops, patches: Option<&Patches>) -> Result<Vec<f32>, EncodeError> {
+        if patches.is_none() && matches!(crops, Crops::Squares(crops) if crops.is_empty()) {
             return Ok(Vec::new());
         }
         let encoders = || self.encoders.lock().unwrap_or_else(PoisonError::into_inner);
@@ -243,13 +261,19 @@ impl<'a> ViewStages<'a> {
             None => self.plan.engines.models.image_encoder(self.plan.engines.session)?,
         };
         self.images_on.get_or_init(|| encoder.placement().map(ToString::to_string));
-        let vectors = match crops {
+        let mut vectors = match crops {
             Crops::Squares(crops) => embed::embed_crops(crops, 0, encoder.as_mut()),
             Crops::Uncut(loaded, masks) => {
                 let background = self.plan.settings.view.background;
                 embed::embed_masks(&loaded.image, masks, encoder.as_mut(), background, None)
             }
         };
+        if let (Ok(vectors), Some(Patches { photo, of })) = (&mut vectors, patches) {
+            match embed::embed_patches(photo, of, encoder.as_mut()) {
+                Ok(mut of_patches) => vectors.append(&mut of_patches),
+                Err(error) => return Err(EncodeError::Embed { view: view.name.clone(), source: error }),
+            }
+        }
         encoders().push(encoder);
         vectors.map_err(|source| EncodeError::Embed { view: view.name.clone(), source })
     }

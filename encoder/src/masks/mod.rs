@@ -2,6 +2,7 @@
 
 mod labels;
 mod mask;
+pub mod patches;
 pub mod regions;
 pub mod rle;
 

@@ -3,11 +3,13 @@
 mod error;
 mod given;
 mod graph;
+mod none;
 mod sam;
 mod segmenter;
 
 pub use error::SegmentError;
 pub use given::GivenMasks;
 pub use graph::{GraphSegmenter, GraphSettings};
+pub use none::NoMasks;
 pub use sam::{SamLevels, SamSegmenter, SamSettings, ScoreFilter};
 pub use segmenter::{SegmentInput, Segmenter};

@@ -15,6 +15,7 @@ pub mod mask_noise;
 pub mod metrics;
 pub mod noise;
 mod on_views;
+pub mod protocol;
 #[cfg(test)]
 mod public_tests;
 mod report;

@@ -4,6 +4,7 @@ mod encoder;
 mod labelled;
 mod lerf;
 mod noise;
+mod protocol;
 mod scannet;
 
 use anyhow::Result;
@@ -20,6 +21,8 @@ pub enum EvalCommand {
     Lerf(lerf::EvalLerfArgs),
     /// Evaluates stores on ScanNet's labelled meshes with OpenGaussian's protocol.
     Scannet(scannet::EvalScannetArgs),
+    /// Writes one page with the figures of `eval lerf` and `eval scannet` beside the paper's rows, by the protocol's rules.
+    Report(protocol::EvalReportArgs),
     /// Evaluates an encoder on crops of generated things: noun, colour and material.
     Encoder(encoder::EvalEncoderArgs),
     /// Measures the accuracy of each aggregation method with errors in the masks.
@@ -31,6 +34,7 @@ pub(super) fn run(command: &EvalCommand, progress: &dyn Progress, json: bool) ->
         EvalCommand::Labelled(args) => labelled::run(args, json),
         EvalCommand::Lerf(args) => lerf::run(args, json),
         EvalCommand::Scannet(args) => scannet::run(args, json),
+        EvalCommand::Report(args) => protocol::run(args),
         EvalCommand::Encoder(args) => encoder::run(args, progress, json),
         EvalCommand::Noise(args) => noise::run(args, progress, json),
     }

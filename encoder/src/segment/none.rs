@@ -1,0 +1,19 @@
+//! No masks, for regions that are patches of the image model alone.
+
+use super::error::SegmentError;
+use super::segmenter::{SegmentInput, Segmenter};
+use crate::masks::Mask;
+
+/// Finds no masks.
+#[derive(Clone, Copy, Debug)]
+pub struct NoMasks;
+
+impl Segmenter for NoMasks {
+    fn identity(&self) -> Result<String, SegmentError> {
+        Ok("no masks".into())
+    }
+
+    fn segment(&self, _input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError> {
+        Ok(Vec::new())
+    }
+}
