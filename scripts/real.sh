@@ -80,7 +80,7 @@ if [ "$scannet" != - ]; then
         for scene in $scenes; do
             set -- "$@" --store "$out/stores/$scene" --scene "$scannet/$scene/point_cloud.ply" --scan "$scannet/scans/$scene"
         done
-        done_or_partly "$lab" eval scannet --json --models "$models" "$@" >"$out/scannet.json.part"
+        done_or_partly "$lab" eval scannet --json --segments auto --models "$models" "$@" >"$out/scannet.json.part"
     )
     mv "$out/scannet.json.part" "$out/scannet.json"
     set -- "$@" --scannet "$models, $preset=$out/scannet.json"

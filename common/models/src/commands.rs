@@ -196,9 +196,7 @@ pub fn run(command: &ModelsCommand, context: &Context<'_>) -> Result<Report, Hub
             });
             Ok(Report::Verified(verified.collect::<Result<_, HubError>>()?))
         }
-        ModelsCommand::Info(args) => {
-            info(&hub.resolve(&args.model)?, args, context)
-        }
+        ModelsCommand::Info(args) => info(&hub.resolve(&args.model)?, args, context),
     }
 }
 
@@ -235,7 +233,13 @@ fn info(folder: &Path, args: &InfoArgs, context: &Context<'_>) -> Result<Report,
     let description = match described {
         Described::Segmenter(segmenter) => {
             let SamDescription { name, about, licence, .. } = *segmenter;
-            return Ok(Report::Segmenter(SegmenterInfo { name, about, licence, folder: folder.to_owned(), files }));
+            return Ok(Report::Segmenter(SegmenterInfo {
+                name,
+                about,
+                licence,
+                folder: folder.to_owned(),
+                files,
+            }));
         }
         Described::Encoders(description) => description,
     };

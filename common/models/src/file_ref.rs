@@ -27,7 +27,10 @@ impl FileRef {
     }
 
     /// Mutable [`Self::parts`], called one after the other.
-    pub(crate) fn for_each_part<E>(&mut self, mut run: impl FnMut(&mut Self) -> Result<(), E>) -> Result<(), E> {
+    pub(crate) fn for_each_part<E>(
+        &mut self,
+        mut run: impl FnMut(&mut Self) -> Result<(), E>,
+    ) -> Result<(), E> {
         run(self)?;
         self.data.as_deref_mut().map_or(Ok(()), run)
     }

@@ -29,7 +29,11 @@ impl Tokens {
     /// one.
     /// # Errors
     /// [`TokenizerError`] if the file is not a tokenizer, or ends texts with another token.
-    pub fn open(file: &ModelFile, max_tokens: usize, end_token_id: impl Into<Option<u32>>) -> Result<Self, TokenizerError> {
+    pub fn open(
+        file: &ModelFile,
+        max_tokens: usize,
+        end_token_id: impl Into<Option<u32>>,
+    ) -> Result<Self, TokenizerError> {
         let end_token_id = end_token_id.into();
         let path = &*file.path;
         let bytes = file.read().map_err(|cause| TokenizerError::Read { cause })?;

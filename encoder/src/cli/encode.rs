@@ -20,7 +20,8 @@ use crate::codebook::CodebookSettings;
 use crate::encode::coverage::CoverageReport;
 use crate::encode::{
     self, CellReport, CellSettings, EncodeSettings, EncodeSummary, Engines, InputSettings, Masks,
-    OutputSettings, Preset, RasterWidth, Regions, RunSettings, StageReport, ViewSettings, ViewsLimit, ViewsReport,
+    OutputSettings, Preset, RasterWidth, Regions, RunSettings, StageReport, ViewSettings, ViewsLimit,
+    ViewsReport,
 };
 use crate::progress::Progress;
 use crate::raster::WeightKind;

@@ -165,7 +165,8 @@ pub fn embed_patches(
     of: &[usize],
     encoder: &mut dyn ImageEncoder,
 ) -> Result<Vec<f32>, EmbedError> {
-    let vectors = encoder.encode_patches(photo).map_err(|cause| EmbedError::Patches { cause: Box::new(cause) })?;
+    let vectors =
+        encoder.encode_patches(photo).map_err(|cause| EmbedError::Patches { cause: Box::new(cause) })?;
     let (vectors, dim) = (vectors.unwrap_or_default(), encoder.dim());
     Ok(of.iter().filter_map(|&k| vectors.get(k * dim..(k + 1) * dim)).flatten().copied().collect())
 }

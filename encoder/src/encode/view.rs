@@ -156,13 +156,14 @@ impl<'a> ViewStages<'a> {
             Next::Crop(loaded, masks) => {
                 let mut regions = masks.clone();
                 let patches = self.plan.engines.models.patches_per_side();
-                let patches = patches.filter(|_| self.plan.settings.view.regions.have_patches()).map(|per_side| {
-                    let (width_px, height_px) = loaded.image.dimensions();
-                    let (of, of_patches): (Vec<_>, Vec<_>) =
-                        patch_masks(per_side, width_px, height_px).into_iter().unzip();
-                    regions.extend(of_patches);
-                    Patches { photo: loaded.image.clone(), of }
-                });
+                let patches =
+                    patches.filter(|_| self.plan.settings.view.regions.have_patches()).map(|per_side| {
+                        let (width_px, height_px) = loaded.image.dimensions();
+                        let (of, of_patches): (Vec<_>, Vec<_>) =
+                            patch_masks(per_side, width_px, height_px).into_iter().unzip();
+                        regions.extend(of_patches);
+                        Patches { photo: loaded.image.clone(), of }
+                    });
                 let partition = self.partition(&loaded, &regions);
                 let crops = match &self.preprocess {
                     Some(preprocess) => Crops::Squares(

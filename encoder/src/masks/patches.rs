@@ -43,7 +43,11 @@ mod tests {
                         let of = |at: u32, edge: u32| {
                             ((f64::from(at) + 0.5) * f64::from(per_side) / f64::from(edge)).floor() as usize
                         };
-                        assert_eq!(*index, of(y, height) * per_side as usize + of(x, width), "{per_side} {width}x{height} at {x},{y}");
+                        assert_eq!(
+                            *index,
+                            of(y, height) * per_side as usize + of(x, width),
+                            "{per_side} {width}x{height} at {x},{y}"
+                        );
                         seen[(y * width + x) as usize] += 1;
                     }
                 }

@@ -128,7 +128,8 @@ impl Table {
         };
         let body = self.layout.get(&entry.layout).map_or("", |layout| layout.description.as_str());
         entry.files.iter().fold(head + body, |text, (role, path)| {
-            let data = entry.data.get(role).map_or(String::new(), |data| format!(", data = {{ {} }}", part(data)));
+            let data =
+                entry.data.get(role).map_or(String::new(), |data| format!(", data = {{ {} }}", part(data)));
             text.replace(&format!("path = {:?}", role.to_uppercase()), &format!("{}{data}", part(path)))
         })
     }

@@ -99,7 +99,8 @@ impl SamDescription {
     /// Returns the files with their roles, each followed by its weights' file if there is one.
     pub fn files(&self) -> Vec<(&'static str, &FileRef)> {
         let files = self.segment.files();
-        let both = [("segment.image_encoder", &files.image_encoder), ("segment.mask_decoder", &files.mask_decoder)];
+        let both =
+            [("segment.image_encoder", &files.image_encoder), ("segment.mask_decoder", &files.mask_decoder)];
         both.into_iter().flat_map(|(role, file)| file.parts().map(move |part| (role, part))).collect()
     }
 }

@@ -40,9 +40,7 @@ use names::Names;
 
 pub use description::{SamDescription, SamFiles, SegmentDescription};
 pub use letterbox::Letterbox;
-
-/// Masks that SAM proposes for a prompt: subpart, part and whole, in that order.
-pub const MASKS_PER_PROMPT: usize = 3;
+pub use names::MASKS_PER_PROMPT;
 
 /// An opened SAM. Each file runs one call at a time; the two files can run in parallel.
 #[derive(Debug)]
@@ -206,8 +204,7 @@ impl Sam {
             inputs.push((name.as_str(), decoder.tensor(tensor.shape.clone(), &tensor.values)?));
         }
         let n_masks = MASKS_PER_PROMPT as i64;
-        let (scores, masks, objects) =
-            (&[1, n, n_masks][..], &[1, n, n_masks, -1, -1][..], &[1, n, 1][..]);
+        let (scores, masks, objects) = (&[1, n, n_masks][..], &[1, n, n_masks, -1, -1][..], &[1, n, 1][..]);
         let mut outputs = vec![(names.scores.as_str(), scores), (names.masks.as_str(), masks)];
         outputs.extend(names.objects.iter().map(|name| (name.as_str(), objects)));
         let mut found = decoder.run_all(inputs, &outputs)?.into_iter();

@@ -2,8 +2,10 @@
 
 use ort::value::TensorElementType::{Float32, Int64};
 
-use super::MASKS_PER_PROMPT;
 use crate::session::{Declared, Model, SessionError, shapes_fit};
+
+/// Masks that SAM proposes for a prompt: subpart, part and whole, in that order.
+pub const MASKS_PER_PROMPT: usize = 3;
 
 /// The names of inputs and outputs.
 #[derive(Debug)]
@@ -51,7 +53,11 @@ impl Inputs {
             let given = offered.iter().find(|(output, _)| *output == name);
             match (given, tensor) {
                 (Some((output, Some((Float32, shape)))), Some((Float32, _))) => {
-                    inputs.embeddings.push(Link { output: output.clone(), shape: shape.clone(), input: name });
+                    inputs.embeddings.push(Link {
+                        output: output.clone(),
+                        shape: shape.clone(),
+                        input: name,
+                    });
                 }
                 (_, Some((Float32, shape))) if matches!(shape[..], [_, _, _, 2]) => {
                     inputs.is_one_by_one = shape[1] == 1;
@@ -88,9 +94,13 @@ impl Names {
 
         let offered = encoder.outputs();
         let inputs = Inputs::sort(decoder, &offered);
-        let ([points], [labels], [] | [_], [_, ..], []) =
-            (&inputs.points[..], &inputs.labels[..], &inputs.boxes[..], &inputs.embeddings[..], &inputs.others[..])
-        else {
+        let ([points], [labels], [] | [_], [_, ..], []) = (
+            &inputs.points[..],
+            &inputs.labels[..],
+            &inputs.boxes[..],
+            &inputs.embeddings[..],
+            &inputs.others[..],
+        ) else {
             let names: Vec<&str> = offered.iter().map(|(name, _)| name.as_str()).collect();
             let expected = format!(
                 "points f32 [-1, -1, -1, 2], their labels i64 [-1, -1, -1], the image encoder's {}, boxes \
@@ -117,9 +127,8 @@ impl Names {
 /// Returns the decoder's f32 output of shape `expected`: the one called `name`, else the first that fits.
 fn output(decoder: &Model, name: &str, expected: &[i64]) -> Result<String, SessionError> {
     let outputs = decoder.outputs();
-    let fits = |declared: &&Declared| {
-        matches!(&declared.1, Some((Float32, shape)) if shapes_fit(shape, expected))
-    };
+    let fits =
+        |declared: &&Declared| matches!(&declared.1, Some((Float32, shape)) if shapes_fit(shape, expected));
     let named = outputs.iter().filter(fits).find(|(found, _)| found == name);
     // An undeclared size fits anything, so the score of objects goes by its name alone.
     let by_shape = || outputs.iter().find(|declared| expected.last() != Some(&1) && fits(declared));

@@ -266,7 +266,8 @@ fn without_the_hub_the_error_lists_the_files_to_place() {
 fn nothing_is_asked_for_before_the_licence_is_accepted() {
     let (server, root, hub) = setting();
     let error = hub.pull("made", Side::Both, false).expect_err("not accepted").to_string();
-    for part in ["Example-1.0", "https://licence.example/", "Not a real one;", "--accept-licence Example-1.0"] {
+    for part in ["Example-1.0", "https://licence.example/", "Not a real one;", "--accept-licence Example-1.0"]
+    {
         assert!(error.contains(part), "{error}");
     }
     assert!(server.asked().is_empty() && files_below(root.path()).is_empty());

@@ -31,7 +31,8 @@ impl Filters<'_> {
         let level_of = |at: usize| (MASKS_PER_PROMPT - 1 - at % MASKS_PER_PROMPT) as u8;
         let proposals = decoded.logits.par_chunks_exact(n_logits).zip(&decoded.predicted_ious).enumerate();
         // SAM 2's own rule: there is an object where the logit is above 0.
-        let shows_object = |at: usize| decoded.object_logits.get(at / MASKS_PER_PROMPT).is_none_or(|&logit| logit > 0.0);
+        let shows_object =
+            |at: usize| decoded.object_logits.get(at / MASKS_PER_PROMPT).is_none_or(|&logit| logit > 0.0);
         proposals
             .filter(|(at, _)| shows_object(*at))
             .filter(|(at, _)| lists.iter().any(|list| list.contains(&level_of(*at))))

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-pub use page::{ScannetMeans, page};
+pub use page::{Means, ScannetMeans, Scene, page};
 
 /// Intersection over union from which a thing counts as found, as in OpenGaussian.
 const FOUND_IOU: f64 = 0.25;
@@ -58,7 +58,9 @@ pub enum ProtocolError {
         n_other: usize,
     },
     /// Labelled frames have no pose.
-    #[error("{scene}: {n} labelled frames have no pose of their name, the first is {first}; give the poses of the same scene")]
+    #[error(
+        "{scene}: {n} labelled frames have no pose of their name, the first is {first}; give the poses of the same scene"
+    )]
     Frames {
         /// The scene.
         scene: String,
@@ -68,7 +70,9 @@ pub enum ProtocolError {
         first: String,
     },
     /// Scenes were evaluated at different thresholds.
-    #[error("{scene} was evaluated at thresholds {found:?}, another scene at {expected:?}; evaluate all at the same")]
+    #[error(
+        "{scene} was evaluated at thresholds {found:?}, another scene at {expected:?}; evaluate all at the same"
+    )]
     Thresholds {
         /// The scene.
         scene: String,
@@ -164,7 +168,8 @@ fn name_of(path: &Path) -> String {
 pub fn read_sweeps(dir: &Path) -> Result<Vec<Sweep>, ProtocolError> {
     let mut sweeps = Vec::new();
     for scene in children(dir)?.into_iter().filter(|path| path.is_dir()) {
-        let files = children(&scene)?.into_iter().filter(|path| path.extension().is_some_and(|e| e == "json"));
+        let files =
+            children(&scene)?.into_iter().filter(|path| path.extension().is_some_and(|e| e == "json"));
         let mut reports = files.map(|path| parse::<LerfFigures>(&path)).collect::<Result<Vec<_>, _>>()?;
         reports.sort_by(|a, b| a.threshold.total_cmp(&b.threshold));
         sweeps.push(Sweep { scene: name_of(&scene), reports });

@@ -35,6 +35,9 @@ const SCANNET: [(&str, [[f64; 2]; 3]); 6] = [
 pub struct ScannetMeans {
     /// Means over the scenes, of 19, 15 and 10 classes.
     pub means: Vec<Means>,
+    /// The same after the prediction filter, where it was asked for.
+    #[serde(default)]
+    pub filtered_means: Option<Vec<Means>>,
     /// Scenes of the protocol that were not evaluated.
     #[serde(default)]
     pub missing_scenes: Vec<String>,
@@ -76,7 +79,11 @@ fn mean(values: &[Option<f64>]) -> Option<f64> {
 
 /// Returns the page in Markdown. `frozen`: each LERF scene at the threshold of the others; `fixed`: at the paper's 0.28;
 /// `scannet`: reports with the name of their row.
-pub fn page(frozen: &[Judged], fixed: &BTreeMap<String, Judged>, scannet: &[(String, ScannetMeans)]) -> String {
+pub fn page(
+    frozen: &[Judged],
+    fixed: &BTreeMap<String, Judged>,
+    scannet: &[(String, ScannetMeans)],
+) -> String {
     let mut page = String::from("# Measured beside the paper\n\n");
     page += "The paper's rows: Szilagyi, Engelmann, Bohg, IEEE RA-L 2025, as printed there. Figures in percent.\n";
     if !frozen.is_empty() {
@@ -93,7 +100,11 @@ fn lerf(page: &mut String, frozen: &[Judged], fixed: &BTreeMap<String, Judged>) 
         frozen.iter().map(|judged| (judged.scene.clone(), judged.clone())).collect();
     let rows = [("measured, threshold of the other scenes", &frozen_by), ("measured, threshold 0.28", fixed)];
     for (name, of_paper, of) in [("mIoU", 0, miou as fn(&Judged) -> f64), ("mAcc at IoU 0.25", 1, accuracy)] {
-        let _ = writeln!(page, "\n## LERF-OVS, {name}\n\n| | {} | mean |\n|---|---|---|---|---|---|", SCENES.join(" | "));
+        let _ = writeln!(
+            page,
+            "\n## LERF-OVS, {name}\n\n| | {} | mean |\n|---|---|---|---|---|---|",
+            SCENES.join(" | ")
+        );
         for (method, mious, maccs) in &LERF {
             let values = [mious, maccs][of_paper].map(|value| format!("{value:.2}"));
             let _ = writeln!(page, "| {method} | {} |", values.join(" | "));
@@ -107,7 +118,10 @@ fn lerf(page: &mut String, frozen: &[Judged], fixed: &BTreeMap<String, Judged>) 
     page.push_str("\nProtocol:\n");
     for Judged { scene, threshold, frozen_on, n_things, .. } in frozen {
         let scenes = frozen_on.join(", ");
-        let _ = writeln!(page, "- {scene}: threshold {threshold} frozen on {scenes}; all {n_things} labelled things reported.");
+        let _ = writeln!(
+            page,
+            "- {scene}: threshold {threshold} frozen on {scenes}; all {n_things} labelled things reported."
+        );
     }
     page.push_str("- Frames are matched with cameras by name; a word that the encoder does not know counts as not found.\n");
     for scene in SCENES.iter().filter(|scene| !frozen_by.contains_key(**scene)) {
@@ -130,20 +144,32 @@ fn scannet(page: &mut String, reports: &[(String, ScannetMeans)]) {
         let _ = writeln!(page, "| {method} | {} |", cells.join(" | "));
     }
     for (name, report) in reports {
-        let cells = [0, 1, 2].map(|at| match report.means.get(at) {
-            Some(means) => format!("{} {}", cell(means.miou), cell(means.macc)),
-            None => "-".into(),
-        });
-        let _ = writeln!(page, "| **measured: {name}** | {} |", cells.join(" | "));
+        let rows = [("", Some(&report.means)), (", prediction filtering", report.filtered_means.as_ref())];
+        for (filter, means) in rows.into_iter().filter_map(|(filter, means)| Some((filter, means?))) {
+            let cells = [0, 1, 2].map(|at| match means.get(at) {
+                Some(means) => format!("{} {}", cell(means.miou), cell(means.macc)),
+                None => "-".into(),
+            });
+            let _ = writeln!(page, "| **measured: {name}{filter}** | {} |", cells.join(" | "));
+        }
     }
     for (name, report) in reports {
         if !report.missing_scenes.is_empty() {
             let missing = report.missing_scenes.join(", ");
-            let _ = writeln!(page, "\n{name}: these scenes of the protocol were not evaluated, so the means are of others: {missing}.");
+            let _ = writeln!(
+                page,
+                "\n{name}: these scenes of the protocol were not evaluated, so the means are of others: {missing}."
+            );
         }
-        for Scene { scene, unknown_words } in report.scenes.iter().filter(|scene| !scene.unknown_words.is_empty()) {
+        for Scene { scene, unknown_words } in
+            report.scenes.iter().filter(|scene| !scene.unknown_words.is_empty())
+        {
             let words: Vec<&str> = unknown_words.keys().map(String::as_str).collect();
-            let _ = writeln!(page, "\n{name}, {scene}: never found, because the encoder does not know them: {}.", words.join(", "));
+            let _ = writeln!(
+                page,
+                "\n{name}, {scene}: never found, because the encoder does not know them: {}.",
+                words.join(", ")
+            );
         }
     }
 }

@@ -18,7 +18,10 @@ fn sweep(scene: &str, reports: Vec<LerfFigures>) -> Sweep {
 /// Scene a is best at 0.2, b and c at 0.4; a must be judged at 0.4, and b at what a and c choose together.
 fn three() -> Vec<Sweep> {
     vec![
-        sweep("a", vec![report(0.2, &[("cup", 0.9), ("jug", 0.5)]), report(0.4, &[("cup", 0.2), ("jug", 0.0)])]),
+        sweep(
+            "a",
+            vec![report(0.2, &[("cup", 0.9), ("jug", 0.5)]), report(0.4, &[("cup", 0.2), ("jug", 0.0)])],
+        ),
         sweep("b", vec![report(0.2, &[("cup", 0.1)]), report(0.4, &[("cup", 0.3)])]),
         sweep("c", vec![report(0.2, &[("hat", 0.2)]), report(0.4, &[("hat", 0.6)])]),
     ]
@@ -33,7 +36,9 @@ fn a_scene_does_not_choose_its_own_threshold() {
     assert_eq!(of(1), (0.2, 0.1, 0.0));
     // Others of c: 0.7 + 0.1 against 0.1 + 0.3.
     assert_eq!(of(2), (0.2, 0.2, 0.0));
-    assert!(judged.iter().all(|judged| !judged.frozen_on.contains(&judged.scene) && judged.frozen_on.len() == 2));
+    assert!(
+        judged.iter().all(|judged| !judged.frozen_on.contains(&judged.scene) && judged.frozen_on.len() == 2)
+    );
     let fixed = at_fixed(&three(), 0.4);
     assert_eq!((fixed["c"].miou, fixed["c"].accuracy), (0.6, 1.0));
     assert!(at_fixed(&three(), 0.3).is_empty());
@@ -70,7 +75,12 @@ fn the_page_has_the_papers_rows_and_ours() {
     let means = Means { n_classes: 19, miou: Some(0.3), macc: Some(0.4) };
     let unknown_words = BTreeMap::from([("counter".to_owned(), "unknown".to_owned())]);
     let scene = Scene { scene: "scene0000_00".into(), unknown_words };
-    let report = ScannetMeans { means: vec![means], missing_scenes: vec!["scene0062_00".into()], scenes: vec![scene] };
+    let report = ScannetMeans {
+        filtered_means: Some(vec![Means { miou: Some(0.5), ..means.clone() }]),
+        means: vec![means],
+        missing_scenes: vec!["scene0062_00".into()],
+        scenes: vec![scene],
+    };
     let page = page(&frozen, &at_fixed(&sweeps, 0.28), &[("default".into(), report)]);
     for part in [
         "| SLAG | 48.10 | 56.12 | 24.76 | 27.55 | 39.13 |",
@@ -78,6 +88,7 @@ fn the_page_has_the_papers_rows_and_ours() {
         "- ramen: threshold 0.28 frozen on figurines, teatime, waldo_kitchen; all 1 labelled things reported.",
         "| SLAG, prediction filtering | 37.54 49.99 | 37.71 50.70 | 45.46 60.08 |",
         "| **measured: default** | 30.00 40.00 | - | - |",
+        "| **measured: default, prediction filtering** | 50.00 40.00 | - | - |",
         "scene0062_00",
         "never found, because the encoder does not know them: counter",
     ] {
@@ -86,5 +97,8 @@ fn the_page_has_the_papers_rows_and_ours() {
     // A scene that was not evaluated leaves no mean.
     let frozen = leave_one_out(&sweeps[..3]).expect("one threshold");
     let partial = super::page(&frozen, &BTreeMap::new(), &[]);
-    assert!(partial.contains("| 20.00 | - | - |") && partial.contains("waldo_kitchen was not evaluated"), "{partial}");
+    assert!(
+        partial.contains("| 20.00 | - | - |") && partial.contains("waldo_kitchen was not evaluated"),
+        "{partial}"
+    );
 }

@@ -82,7 +82,8 @@ fn masks_are_enlarged_in_one_step() {
     let photo = photo();
     let embedding = segmenter.sam.embed(&photo).expect("it runs");
     let (_, points) = array::<f32>(&golden, "points");
-    let decoded = segmenter.sam.decode(&embedding, 1, &points.as_chunks::<2>().0[..1], &[1]).expect("it runs");
+    let decoded =
+        segmenter.sam.decode(&embedding, 1, &points.as_chunks::<2>().0[..1], &[1]).expect("it runs");
     let (shape, expected) = array::<f32>(&golden, "first_masks_enlarged_sub3");
     let upsampler = Upsampler::new(&embedding.letterbox, decoded.logits_px);
     let mut n_inside = 0;
