@@ -204,6 +204,33 @@ pub fn transforms(data: &[u8]) -> bool {
     in_file("transforms.json", data, |path| poses::read(path, None).is_ok())
 }
 
+/// The camera matrix and a pose of a ScanNet scene whose one photo is whole.
+pub fn scannet(data: &[u8]) -> bool {
+    let (camera, pose) = two_parts(data);
+    in_folder(|folder| {
+        let scene = folder.join("scannet");
+        for name in ["intrinsic", "pose", "color"] {
+            fs_err::create_dir_all(scene.join(name)).expect("the folder is made");
+        }
+        let photo = scene.join("color/0.png");
+        if !photo.is_file() {
+            image::RgbImage::new(64, 48).save(&photo).expect("the photo is written");
+        }
+        fs_err::write(scene.join("intrinsic/intrinsic_color.txt"), camera).expect("the file is written");
+        fs_err::write(scene.join("pose/0.txt"), pose).expect("the file is written");
+        poses::read(&scene, None).is_ok()
+    })
+}
+
+pub fn splat_frame(data: &[u8]) -> bool {
+    in_file(poses::FRAME_FILE, data, |path| {
+        let read = poses::SplatFrame::read(path);
+        read.is_ok_and(|frame| {
+            frame.splat_from_poses(poses::PoseSource::Scannet, None).similarity.scale > 0.0
+        })
+    })
+}
+
 /// Two bytes of width, two of height, and the run lengths.
 pub fn rle(data: &[u8]) -> bool {
     let Some((size, text)) = data.split_at_checked(4) else { return false };

@@ -26,7 +26,7 @@ macro_rules! targets {
 
 targets! {
     container, shard, manifest, current, ply, splat, spz, sog, sog_meta, colmap_text, colmap_bin, transforms,
-    rle, coco, model_toml, tensors, phrases, contributions, region_table, cell_field, npz, geo, query, position,
+    scannet, splat_frame, rle, coco, model_toml, tensors, phrases, contributions, region_table, cell_field, npz, geo, query, position,
 }
 
 /// Runs a target by name.

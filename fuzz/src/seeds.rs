@@ -41,6 +41,10 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
         "transforms" => text(
             r#"{"camera_model":"OPENCV","fl_x":500.0,"fl_y":500.0,"cx":320.0,"cy":240.0,"w":640,"h":480,"k1":0.01,"frames":[{"file_path":"images/a.jpg","transform_matrix":[[1,0,0,0],[0,1,0,0],[0,0,1,2],[0,0,0,1]]}]}"#,
         ),
+        "scannet" => text(
+            "50.5 0 32 0\n0 50.5 24 0\n0 0 1 0\n0 0 0 1\n====\n0 -1 0 1.5\n1 0 0 2.5\n0 0 1 -3\n0 0 0 1\n",
+        ),
+        "splat_frame" => text(r#"{"transform":[[0,1,0,0.5],[1,0,0,-2],[0,0,-1,3]],"scale":0.25}"#),
         "rle" => vec![b"\x04\x00\x03\x00453".to_vec(), b"\x0a\x00\x0a\x00\x64\x00\x00\x00".to_vec()],
         "coco" => text(
             r#"{"images":[{"id":1,"file_name":"a.jpg","width":4,"height":3}],"annotations":[{"id":1,"image_id":1,"segmentation":{"size":[3,4],"counts":"453"}},{"id":2,"image_id":1,"segmentation":{"size":[3,4],"counts":[4,5,3]}}]}"#,

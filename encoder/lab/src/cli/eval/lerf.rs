@@ -7,7 +7,8 @@ use clap::Args;
 use slag_common::shard::Profile;
 use slag_common::{poses, splat};
 use slag_encoder::cli::Exit;
-use slag_encoder::cli::common::{ModelArgs, print, text_encoder_of};
+use slag_encoder::cli::common::{ModelArgs, parse_frame, print, text_encoder_of};
+use slag_encoder::ingest::{self, FrameChoice};
 use slag_encoder::raster::CpuRasterizer;
 use slag_encoder::store::StoreReader;
 
@@ -29,6 +30,9 @@ pub struct EvalLerfArgs {
     /// Labels of the scene: the folder of frame_*.json, lerf_ovs/label/NAME.
     #[arg(long, value_name = "DIR")]
     labels: PathBuf,
+    /// Says how the splat's frame follows from that of the poses, see `slag-encoder encode --help`: auto, none or a file.
+    #[arg(long, value_name = "auto|none|FILE", default_value = "auto", value_parser = parse_frame)]
+    splat_frame: FrameChoice,
     /// The models that the store was encoded with.
     #[command(flatten)]
     models: ModelArgs,
@@ -46,8 +50,14 @@ pub struct EvalLerfArgs {
 pub(super) fn run(args: &EvalLerfArgs, json: bool) -> Result<Exit> {
     let reader = StoreReader::open(&args.store)?;
     let mut encoder = text_encoder_of(&reader, &args.models)?;
-    let scene = splat::read(&args.scene, &splat::ReadOptions { with_sh_rest: false })?;
-    let labels = LerfLabels::read(&args.labels, &poses::read(&args.views, None)?.views)?;
+    let views = poses::read(&args.views, None)?;
+    let frame = ingest::find_frame(&args.scene, &args.splat_frame, views.source, views.applied)?;
+    let mut scene = splat::read(&args.scene, &splat::ReadOptions { with_sh_rest: false })?;
+    if let Some(frame) = frame {
+        tracing::info!("{frame}; the splat is brought into the world of the poses");
+        frame.to_poses(&mut scene);
+    }
+    let labels = LerfLabels::read(&args.labels, &views.views)?;
     let settings = EvalSettings {
         words: args.words.clone(),
         profile: args.profile,
