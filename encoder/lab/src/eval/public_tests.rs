@@ -438,7 +438,7 @@ fn filtered_answers_are_the_majority_of_each_segment() {
     }
     let text = ScannetReport::new(vec![report]).to_string();
     for row in
-        ["scene0097_00 PF", "mean PF", "SLAG (paper)", "SLAG PF (paper)    0.375   0.500 |   0.377   0.507"]
+        ["scene0097_00 PF", "mean PF", "SLAG (paper)", "SLAG PF (paper)    0.375   0.500 |  0.377   0.507"]
     {
         assert!(text.contains(row), "{row}\n{text}");
     }
