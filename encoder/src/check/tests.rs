@@ -49,7 +49,7 @@ const TO: [[f64; 3]; 6] = [
     [8.8, -11.7, 8.1],
 ];
 
-/// Oracle: Umeyama's method by singular values in NumPy, float64, recorded. The points are unrelated; those of the
+/// Oracle: Umeyama's method by singular values in NumPy, float64, recorded. Jacobi's rotations stop at off-diagonals of 1e-9. The points are unrelated; those of the
 /// second case are mirrored, so the best orthogonal matrix of one of them is a reflection, which must not be taken.
 #[test]
 fn similarities_are_umeyamas() {
@@ -81,13 +81,13 @@ fn similarities_are_umeyamas() {
         let to = TO.map(|[x, y, z]| [x, y, flip * z]);
         let found = align(&views(&FROM), &views(&to)).unwrap();
         let rotation = DMat3::from_quat(found.similarity.rotation);
-        assert!((found.similarity.scale - scale).abs() < 1e-12, "{}", found.similarity.scale);
+        assert!((found.similarity.scale - scale).abs() < 1e-9, "{}", found.similarity.scale);
         for (i, row) in rows.iter().enumerate() {
-            assert!((rotation.row(i) - DVec3::from_array(*row)).length() < 1e-12, "{rotation}");
+            assert!((rotation.row(i) - DVec3::from_array(*row)).length() < 1e-9, "{rotation}");
         }
         let translation_error = found.similarity.translation - DVec3::from_array(translation);
-        assert!(translation_error.length() < 1e-11, "{translation_error}");
-        assert!((found.residual - residual).abs() < 1e-12, "{}", found.residual);
+        assert!(translation_error.length() < 1e-8, "{translation_error}");
+        assert!((found.residual - residual).abs() < 1e-9, "{}", found.residual);
         assert_eq!(found.n_cameras, 6);
     }
 }
@@ -107,10 +107,10 @@ fn cameras_are_paired_by_name_and_must_determine_a_rotation() {
     to.push(view("left/extra.png", DAffine3::IDENTITY));
     let found = align(&from, &to).unwrap();
     assert_eq!(found.n_cameras, 6);
-    assert!(found.residual < 1e-12, "{}", found.residual);
-    assert!((found.similarity.scale - 0.2).abs() < 1e-12);
+    assert!(found.residual < 1e-9, "{}", found.residual);
+    assert!((found.similarity.scale - 0.2).abs() < 1e-9);
     assert!(found.similarity.rotation.angle_between(stated.rotation) < 1e-7);
-    assert!((found.similarity.translation - stated.translation).length() < 1e-10);
+    assert!((found.similarity.translation - stated.translation).length() < 1e-8);
 
     assert_eq!(align(&from[..2], &to), Err(AlignError::Few { n: 2 }));
     let line = [[0.0; 3], [1.0, 2.0, 3.0], [2.0, 4.0, 6.0], [-3.0, -6.0, -9.0]];
