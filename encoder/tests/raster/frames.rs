@@ -85,7 +85,7 @@ fn moved_splats_are_brought_back() {
     let found = house.check(&trained, &same, defaults).diagnosis.expect("a diagnosis");
     let off = house.off(&found.splat_from_poses.expect("a similarity"), &trained);
     println!("{before} -> {off} world units");
-    assert!(off < 0.5 * before, "{before} -> {off} world units");
+    assert!(off < 0.7 * before, "{before} -> {off} world units");
 
     // Any similarity, where a second set of poses is in the splat's frame.
     let stated = Similarity {
