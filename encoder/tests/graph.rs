@@ -28,7 +28,7 @@ fn segment(image: &RgbImage, depth: Option<&[f32]>, valid: Option<&[bool]>) -> V
     };
     let view =
         View { name: "a".into(), image_path: "a".into(), intrinsics, camera_from_world: DAffine3::IDENTITY };
-    let input = SegmentInput { view: &view, image, valid, undistorter: None, depth };
+    let input = SegmentInput { view: &view, image, valid, undistorter: None, depth, pool: None };
     let masks = GraphSegmenter::default().segment(&input).unwrap();
     for mask in &masks {
         let n_inside = mask.inside.iter().filter(|inside| **inside).count();

@@ -86,7 +86,8 @@ fn load(
     undistorter: Option<&Undistorter>,
 ) -> Result<Option<Vec<Mask>>, SegmentError> {
     let (view, image) = (view("left/a.jpg", 8, 6), RgbImage::new(8, 6));
-    let input = SegmentInput { view: &view, image: &image, valid: None, undistorter, depth: None };
+    let input =
+        SegmentInput { view: &view, image: &image, valid: None, undistorter, depth: None, pool: None };
     let given = GivenMasks::open(dir, ignore_ids.to_vec()).unwrap();
     let loaded = given.load(&input);
     if let Ok(masks) = &loaded {
@@ -274,7 +275,8 @@ fn house_masks_have_the_pixels_that_the_scene_states() {
     let mut found_px = std::collections::BTreeMap::new();
     let image = RgbImage::new(640, 480);
     for view in &poses::read(&scene, None).unwrap().views {
-        let input = SegmentInput { view, image: &image, valid: None, undistorter: None, depth: None };
+        let input =
+            SegmentInput { view, image: &image, valid: None, undistorter: None, depth: None, pool: None };
         let png =
             image::open(scene.join("gt/masks").join(&view.name).with_extension("png")).unwrap().into_luma8();
         for mask in given.load(&input).unwrap().unwrap() {

@@ -95,7 +95,8 @@ fn survive(name: &str, bytes: &[u8], whole: bool) {
     let dir = tempfile::tempdir().unwrap();
     let view = view();
     let image = RgbImage::new(WIDTH_PX, HEIGHT_PX);
-    let input = SegmentInput { view: &view, image: &image, valid: None, undistorter: None, depth: None };
+    let input =
+        SegmentInput { view: &view, image: &image, valid: None, undistorter: None, depth: None, pool: None };
     let path = dir.path().join(name);
     let load = |bytes: &[u8]| {
         fs_err::write(&path, bytes).unwrap();
@@ -150,7 +151,8 @@ fn an_id_image_that_unpacks_to_much() {
     let dir = tempfile::tempdir().unwrap();
     image::GrayImage::new(6_000, 6_000).save(dir.path().join("a.png")).unwrap();
     let (view, image) = (view(), RgbImage::new(WIDTH_PX, HEIGHT_PX));
-    let input = SegmentInput { view: &view, image: &image, valid: None, undistorter: None, depth: None };
+    let input =
+        SegmentInput { view: &view, image: &image, valid: None, undistorter: None, depth: None, pool: None };
     let given = GivenMasks::open(dir.path(), Vec::new()).unwrap();
     LARGEST_BYTES.set(0);
     let error = given.load(&input).unwrap_err();

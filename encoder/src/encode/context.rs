@@ -64,6 +64,11 @@ impl<'a> RunContext<'a> {
         self.cancel.load(Ordering::Relaxed)
     }
 
+    /// Returns the run's threads, for a step that waits for a device and needs them only in between.
+    pub(super) fn pool(&self) -> &ThreadPool {
+        &self.pool
+    }
+
     /// Runs work on the run's threads: parallel iterators inside use these alone.
     pub(super) fn install<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
         self.pool.install(work)

@@ -146,7 +146,9 @@ impl<'a> ViewStages<'a> {
                 Next::Segment(loaded, Some(depth))
             }
             Next::Segment(loaded, depth) => {
-                let mut masks = self.plan.segmenter.segment(&SegmentInput::new(&loaded, depth.as_deref()))?;
+                let pool = Some(self.context.pool());
+                let input = SegmentInput { pool, ..SegmentInput::new(&loaded, depth.as_deref()) };
+                let mut masks = self.plan.segmenter.segment(&input)?;
                 if let Some(perturbation) = self.plan.engines.perturbation {
                     masks = perturbation.masks(&view.name, masks, loaded.image.dimensions().into());
                 }

@@ -1,6 +1,7 @@
 //! The interface of all segmenters.
 
 use image::RgbImage;
+use rayon::ThreadPool;
 use slag_common::View;
 
 use super::error::SegmentError;
@@ -50,10 +51,13 @@ pub struct SegmentInput<'a> {
     pub undistorter: Option<&'a Undistorter>,
     /// Depth of the scene, camera z per pixel of `image`, row-major; 0 or NaN if unknown.
     pub depth: Option<&'a [f32]>,
+    /// The threads for [`Self::install`]. A segmenter with threads of its own is not called from one of them: it would
+    /// wait for itself.
+    pub pool: Option<&'a ThreadPool>,
 }
 
 impl<'a> SegmentInput<'a> {
-    /// Creates the input for a loaded photo.
+    /// Creates the input for a loaded photo, without a pool.
     pub fn new(loaded: &'a LoadedImage, depth: Option<&'a [f32]>) -> Self {
         Self {
             view: &loaded.view,
@@ -61,6 +65,15 @@ impl<'a> SegmentInput<'a> {
             valid: loaded.valid.as_deref(),
             undistorter: loaded.undistorter.as_ref(),
             depth,
+            pool: None,
+        }
+    }
+
+    /// Runs work on the pool's threads, to which its parallel iterators keep; without a pool, where it is called.
+    pub(super) fn install<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
+        match self.pool {
+            Some(pool) => pool.install(work),
+            None => work(),
         }
     }
 }

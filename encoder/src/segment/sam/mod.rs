@@ -76,7 +76,7 @@ impl SamSegmenter {
                 let mut left_bytes = MAX_MASK_BYTES;
                 for decoded in receiver {
                     let upsampler = Upsampler::new(letterbox, decoded.logits_px);
-                    let candidates = filters.candidates(&decoded, &upsampler, crop);
+                    let candidates = input.install(|| filters.candidates(&decoded, &upsampler, crop));
                     let len_bytes: u64 = candidates.iter().map(|candidate| candidate.mask.len_bytes()).sum();
                     left_bytes = left_bytes.checked_sub(len_bytes)?;
                     found.extend(candidates);
@@ -93,7 +93,7 @@ impl SamSegmenter {
             Ok::<_, SegmentError>(filtered.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
         })?;
         let lists = filters.lists(found.ok_or_else(|| too_many(input))?);
-        Ok(lists.into_iter().map(|list| filters.unique_in_crop(list)).collect())
+        Ok(input.install(|| lists.into_iter().map(|list| filters.unique_in_crop(list)).collect()))
     }
 }
 
@@ -123,8 +123,8 @@ impl Segmenter for SamSegmenter {
             left_bytes = left_bytes.checked_sub(len_bytes).ok_or_else(|| too_many(input))?;
             found.iter_mut().zip(of_crop).for_each(|(list, of_crop)| list.extend(of_crop));
         }
-        let kept: Vec<Candidate> =
-            found.into_iter().flat_map(|list| filters.unique_in_image(list, crops.len())).collect();
+        let unique = |list| filters.unique_in_image(list, crops.len());
+        let kept: Vec<Candidate> = input.install(|| found.into_iter().flat_map(unique).collect());
         let area = |b: BoxPx| u64::from(b.width_px()) * u64::from(b.height_px());
         if kept.iter().map(|candidate| area(candidate.mask.box_px())).sum::<u64>() > MAX_MASK_BYTES {
             return Err(too_many(input));

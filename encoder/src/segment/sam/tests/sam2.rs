@@ -38,7 +38,7 @@ fn segment(segmenter: &SamSegmenter, image: &image::RgbImage) -> Vec<Mask> {
         Intrinsics { width_px, height_px, focal_x_px, focal_y_px, centre_x_px, centre_y_px, distortion };
     let camera_from_world = glam::DAffine3::IDENTITY;
     let view = View { name: "photo".into(), image_path: "photo".into(), intrinsics, camera_from_world };
-    let input = SegmentInput { view: &view, image, valid: None, undistorter: None, depth: None };
+    let input = SegmentInput { view: &view, image, valid: None, undistorter: None, depth: None, pool: None };
     segmenter.segment(&input).expect("it segments")
 }
 
