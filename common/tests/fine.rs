@@ -17,7 +17,7 @@ struct Parts {
 /// Three Gaussians with evidence in two centroids and one without; three dimensions, two components.
 fn written(edit: impl FnOnce(&mut Parts)) -> AlignedBytes {
     let mut parts = Parts {
-        errors: ScoreErrors { mean: 0.001, p999: 0.005, max: 0.01, spread: 0.07 },
+        errors: ScoreErrors { mean: 0.001, likely: 0.005, max: 0.01, spread: 0.07 },
         steps: vec![0.5, 0.25],
         scales: vec![0.01, 0.02],
         values: vec![1, -2, 127, -128, 5, 0],
@@ -55,6 +55,7 @@ fn written(edit: impl FnOnce(&mut Parts)) -> AlignedBytes {
             embeddings: &[f16::from_f32(0.5); 9],
             fine: Some(fine),
         }),
+        packed_indices: None,
     }
     .write(&mut out)
     .expect("writes to memory");
@@ -66,7 +67,7 @@ fn fine_residuals_are_read_and_decoded() {
     let bytes = written(|_| {});
     let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
     let fine = shard.exact.and_then(|exact| exact.fine).expect("written");
-    assert_eq!((fine.errors.p999, fine.steps, fine.scales), (0.005, &[0.5, 0.25][..], &[0.01, 0.02][..]));
+    assert_eq!((fine.errors.likely, fine.steps, fine.scales), (0.005, &[0.5, 0.25][..], &[0.01, 0.02][..]));
     // By hand: Gaussian 1 belongs to centroid 1 with components 2 and 0.25; its residual adds 127 * 0.5 * 0.02 and
     // -128 * 0.25 * 0.02.
     let c = [2.0 + 1.27, 0.25 - 0.64];

@@ -7,6 +7,7 @@ use half::f16;
 use super::format::{
     BLOCK, CODEWORDS, MAGIC, MAX_DIM, MAX_SUBSPACES, ScoreErrors, ShardHeader, VERSION, section,
 };
+use super::indices::{self, IndicesHeader, PackedIndices};
 use super::layout::ShardLayout;
 use crate::container::{ContainerError, Layout};
 use crate::objects::ObjectsLayout;
@@ -96,6 +97,10 @@ impl ShardLayout {
             true => layout.column::<u32>(section::POSITIONS, "positions", n)?,
             false => layout.column::<[u16; 3]>(section::POSITIONS, "positions", n)?,
         };
+        let packed_indices = match layout.find(section::PACKED_INDICES) {
+            None => None,
+            Some(_) => Some(packed_indices(&layout, bytes, n)?),
+        };
         let objects = ObjectsLayout::check(bytes, &layout, header.n_gaussians, m)?;
         Ok(Self {
             header,
@@ -107,6 +112,7 @@ impl ShardLayout {
             residuals,
             exact,
             fine,
+            packed_indices,
             objects,
         })
     }
@@ -152,8 +158,8 @@ fn check_header(header: &ShardHeader) -> Result<(), String> {
 }
 
 fn check_errors(errors: &ScoreErrors) -> Result<(), String> {
-    let ScoreErrors { mean, p999, max, spread } = *errors;
-    if [mean, p999, max, spread].iter().any(|v| !(0.0..=MAX_LENGTH).contains(v)) {
+    let ScoreErrors { mean, likely, max, spread } = *errors;
+    if [mean, likely, max, spread].iter().any(|v| !(0.0..=MAX_LENGTH).contains(v)) {
         return Err(format!("errors of scores are {errors:?}, expected 0..={MAX_LENGTH} each"));
     }
     Ok(())
@@ -174,6 +180,27 @@ fn lengths(
         return Err(damaged(range.start, format!("a value of the {name} is not within 0..={MAX_LENGTH}")));
     }
     Ok(range)
+}
+
+/// Returns the place of the packed indices of `n` Gaussians after checking each.
+fn packed_indices(
+    layout: &Layout,
+    bytes: &[u8],
+    n: usize,
+) -> Result<(IndicesHeader, Range<usize>), ContainerError> {
+    let header: IndicesHeader =
+        layout.value(bytes, section::PACKED_INDICES_HEADER, "header of packed indices")?;
+    let at_header = layout.find(section::PACKED_INDICES_HEADER).map_or(0, |range| range.start);
+    let Some(n_words) = indices::n_words(n, header.width_bits) else {
+        return Err(damaged(
+            at_header,
+            format!("input indices of {} bits, expected 0..=32", header.width_bits),
+        ));
+    };
+    let range = layout.column::<u32>(section::PACKED_INDICES, "packed indices", n_words)?;
+    let words: Vec<u32> = bytemuck::pod_collect_to_vec(&bytes[range.clone()]);
+    PackedIndices { header, words: &words }.check(n).map_err(|what| damaged(range.start, what))?;
+    Ok((header, range))
 }
 
 /// Returns the place of a column of half floats after checking that each is finite.

@@ -56,6 +56,10 @@ pub mod section {
     pub const FINE_SCALES: u32 = 18;
     /// `[centroid_starts[K]][m]` i8.
     pub const FINE: u32 = 19;
+    /// [`crate::shard::IndicesHeader`]; 20 to 26 are those of [`crate::objects`].
+    pub const PACKED_INDICES_HEADER: u32 = 27;
+    /// `[ceil(N * width_bits / 32)]` u32.
+    pub const PACKED_INDICES: u32 = 28;
 }
 
 /// Absolute errors of a profile's scores, measured over a bank of text vectors and a sample of the Gaussians.
@@ -65,8 +69,9 @@ pub mod section {
 pub struct ScoreErrors {
     /// Mean over texts and Gaussians.
     pub mean: f32,
-    /// 99.9th percentile.
-    pub p999: f32,
+    /// For 95 of 100 texts like those held out of the bank, 99 of 100 scores err by no more; 0 where too few texts were
+    /// held out.
+    pub likely: f32,
     /// Largest.
     pub max: f32,
     /// Standard deviation of a text's scores over the Gaussians, averaged over the texts: the scale to compare

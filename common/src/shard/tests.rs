@@ -12,6 +12,8 @@ struct Parts {
     subspace_starts: Vec<u32>,
     codewords: Vec<f16>,
     mean: Vec<f16>,
+    indices: IndicesHeader,
+    index_words: Vec<u32>,
 }
 
 /// Six Gaussians, five of them with evidence, in two centroids; four dimensions, three components, two subspaces.
@@ -30,7 +32,7 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
             position_step: [0.001, 0.002, 0.0],
             box_min: [1e6 - 1.0, -3.0, 2.0],
             box_max: [1e6 + 66.0, 130.0, 4.0],
-            errors: ScoreErrors { mean: 0.01, p999: 0.1, max: 0.2, spread: 0.07 },
+            errors: ScoreErrors { mean: 0.01, likely: 0.1, max: 0.2, spread: 0.07 },
             encoder_id: [9; 32],
         },
         centroid_starts: vec![0, 2, 5],
@@ -38,6 +40,9 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
         subspace_starts: vec![0, 1, 3],
         codewords: (0..48).map(|i| f16::from_f32(i as f32 / 64.0)).collect(),
         mean: [0.5, 0.25, 0.0, -0.5].map(f16::from_f32).to_vec(),
+        indices: IndicesHeader { least: 1000, width_bits: 6 },
+        // 1, 63, 0, 7, 2, and 9, whose bits 30 and 31 are the first of two words.
+        index_words: vec![1 | 63 << 6 | 7 << 18 | 2 << 24 | 9 << 30, 9 >> 2],
     };
     edit(&mut parts);
     let mut codes = vec![0u8; BLOCK];
@@ -63,6 +68,7 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
             codes: &codes,
         }),
         exact: None,
+        packed_indices: Some(PackedIndices { header: parts.indices, words: &parts.index_words }),
     }
     .write(&mut out)
     .expect("writes to memory");
@@ -78,6 +84,8 @@ fn round_trip() {
         (2..5, 0, 1, 1)
     );
     assert_eq!(shard.n_with_evidence(), 5);
+    let indices = (0..6).map(|index| shard.input_index(index));
+    assert_eq!(indices.collect::<Vec<_>>(), [1001, 1063, 1000, 1007, 1002, 1009].map(Some));
     let p = shard.position_in_world(2);
     assert!((p - DVec3::new(1e6 + 2.047, -2.0 + 4095.0 * 0.002, 3.0)).length() < 1e-9, "{p}");
     assert_eq!(shard.position_in_world(1), DVec3::new(1e6 + 0.001, -2.0 + 0.004, 3.0));
@@ -123,4 +131,8 @@ fn invalid_contents_are_refused() {
     assert!(refused(|p| p.subspace_starts[1] = 3).contains("ascend"));
     assert!(refused(|p| p.codewords[4] = f16::INFINITY).contains("finite"));
     assert!(refused(|p| p.mean[0] = f16::NAN).contains("finite"));
+    assert!(refused(|p| p.indices.width_bits = 33).contains("33 bits"));
+    assert!(refused(|p| p.indices.width_bits = 32).contains("bytes"));
+    assert!(refused(|p| p.indices.least = u32::MAX - 62).contains("Gaussian 1"));
+    assert!(refused(|p| p.index_words[1] |= 1 << 4).contains("not zero"));
 }

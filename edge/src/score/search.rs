@@ -202,7 +202,7 @@ impl<'a> Search<'a> {
     }
 
     /// Returns the score errors that were measured over a bank of texts, each the maximum over the shards
-    /// searched; `None` if answers are exact, or if a shard lacks measurements for the data read.
+    /// searched, so that the likely one holds for each of them; `None` if answers are exact, or if a shard lacks measurements for the data read.
     pub fn measured_errors(&self) -> Option<ScoreErrors> {
         let mut largest: Option<ScoreErrors> = None;
         for shard in self.searched() {
@@ -212,13 +212,13 @@ impl<'a> Search<'a> {
                 Precision::Exact => shard.exact.is_none(),
             };
             let errors = shard.header.errors;
-            if !of_codes || errors.p999 == 0.0 {
+            if !of_codes || errors.likely == 0.0 {
                 return None;
             }
             let of = largest.unwrap_or(errors);
             largest = Some(ScoreErrors {
                 mean: of.mean.max(errors.mean),
-                p999: of.p999.max(errors.p999),
+                likely: of.likely.max(errors.likely),
                 max: of.max.max(errors.max),
                 spread: of.spread.max(errors.spread),
             });

@@ -7,59 +7,37 @@
 
 pub mod basis;
 pub mod cluster;
+mod compare;
+mod decoder;
+mod fine;
 pub mod measure;
 pub mod residual;
+mod settings;
 
 use half::f16;
 use rayon::prelude::*;
 use slag_common::shard::{self, ScoreErrors};
 
 use basis::Basis;
-pub use basis::{ScoreMetric, TextBank};
+use compare::compare;
+use decoder::Decoder;
 use measure::ScoreMoments;
 use residual::ResidualCode;
 use slag_math::matrix::{Panels, Rows};
+
+pub use basis::{ScoreMetric, TextBank};
+pub use fine::FineResiduals;
+pub use settings::CodebookSettings;
 
 /// Ratio of the root mean square of errors to their mean absolute value: 1.3 to 1.4 measured on the labelled house, whose
 /// errors have heavy tails; 1.25 for normally distributed errors.
 const RMS_OF_MEAN: f32 = 1.35;
 /// Share of the residual code's error budget that the dimensions without a component may take.
 const TAIL_SHARE: f32 = 0.3;
-/// Embeddings decoded at a time.
-const CHUNK: usize = 1024;
 
 /// Returns the most bytes per embedding that building a codebook takes: components, residuals, codes.
 pub fn working_bytes_per_embedding(dim: usize) -> usize {
     4 * dim.min(128) * size_of::<f32>() + 64
-}
-
-/// How fine a codebook is. Errors are means of `|score error|`, relative to the spread of scores (their
-/// standard deviation over the scene).
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct CodebookSettings {
-    /// Largest accepted error of the compact profile.
-    pub compact_error: f32,
-    /// Largest accepted error of the balanced profile.
-    pub balanced_error: f32,
-    /// Fewest Gaussians per centroid, on average.
-    pub min_gaussians_per_centroid: usize,
-    /// Most subspaces of the residual code (half a byte each); below 2 there is no code.
-    pub max_subspaces: usize,
-    /// Whether residuals are also stored in 8 bits per component, as in exact shards.
-    pub has_fine: bool,
-}
-
-impl Default for CodebookSettings {
-    /// On the labelled house, 0.1 keeps the exact field's task accuracy, and 0.02 its ranking (README.md).
-    fn default() -> Self {
-        Self {
-            compact_error: 0.1,
-            balanced_error: 0.02,
-            min_gaussians_per_centroid: 45,
-            max_subspaces: 32,
-            has_fine: false,
-        }
-    }
 }
 
 /// The metric and the texts that errors of scores are measured by.
@@ -116,18 +94,6 @@ pub struct CodebookResiduals {
     pub errors: ScoreErrors,
     /// Residuals in 8 bits, if requested.
     pub fine: Option<FineResiduals>,
-}
-
-/// Residuals in 8 bits a component.
-pub struct FineResiduals {
-    /// `[m]`.
-    pub steps: Vec<f32>,
-    /// `[K]`.
-    pub scales: Vec<f32>,
-    /// `[n][m]`.
-    pub values: Vec<i8>,
-    /// Errors of the decoded scores.
-    pub errors: ScoreErrors,
 }
 
 /// Builds the codebook of some unit embeddings. The result does not depend on threads.
@@ -199,7 +165,7 @@ pub fn build(
     let residuals = planned.map(|(_, code)| {
         let coded = coded(embeddings, &fitted, &order, &centroid_starts, &decoded_centroids, &scales);
         let fine = settings.has_fine.then(|| {
-            let (fine, decoded) = fine(&coded, m, &centroid_starts, &scales, &ranges);
+            let (fine, decoded) = fine::round(&coded, m, &centroid_starts, &scales, &ranges);
             let (_, errors) = compare(
                 embeddings,
                 &order,
@@ -302,41 +268,6 @@ fn ranges(centres: &[f32], m: usize, scales: &[f32]) -> Vec<f32> {
     ranges
 }
 
-/// Decodes components to vectors, as readers do.
-#[derive(Clone, Copy)]
-struct Decoder<'a> {
-    dim: usize,
-    m: usize,
-    mean: &'a [f16],
-    basis: &'a [i8],
-    steps: &'a [f32],
-}
-
-impl Decoder<'_> {
-    /// Returns `[n][dim]` of components `[n][m]`.
-    fn decode(&self, components: &[f32], with_mean: bool) -> Vec<f32> {
-        let mut out = self.panels().product(Rows::all(components, self.m));
-        if with_mean {
-            for vector in out.chunks_exact_mut(self.dim) {
-                vector.iter_mut().zip(self.mean).for_each(|(v, mean)| *v += mean.to_f32());
-            }
-        }
-        out
-    }
-
-    fn panels(&self) -> Panels {
-        Panels::new(self.m, self.dim, |c, i| f32::from(self.basis[c * self.dim + i]) * self.steps[c])
-    }
-
-    /// Returns the length of each basis vector.
-    fn lengths(&self) -> Vec<f32> {
-        let length = |(vector, step): (&[i8], &f32)| {
-            vector.iter().map(|v| f32::from(*v).powi(2)).sum::<f32>().sqrt() * step
-        };
-        self.basis.chunks_exact(self.dim).zip(self.steps).map(length).collect()
-    }
-}
-
 /// Returns the residuals of the stored centroids, in shard order, divided by the centroids' scales.
 fn coded(
     embeddings: Rows<'_>,
@@ -358,104 +289,6 @@ fn coded(
         }
     }
     points
-}
-
-/// Rounds residuals (`[n][m]`, divided by their centroids' scales) to 8 bits. Returns them and their decoded form, in
-/// readers' components. Steps follow the components' sizes, scales the largest of a centroid's members.
-fn fine(
-    residuals: &[f32],
-    m: usize,
-    centroid_starts: &[u32],
-    residual_scales: &[f32],
-    ranges: &[f32],
-) -> (FineResiduals, Vec<f32>) {
-    const MOST: f32 = 127.0;
-    let of_centroid =
-        |centroid: usize| centroid_starts[centroid] as usize * m..centroid_starts[centroid + 1] as usize * m;
-    let mut squares = vec![0.0f64; m];
-    for (centroid, scale) in residual_scales.iter().enumerate() {
-        for (at, v) in residuals[of_centroid(centroid)].iter().enumerate() {
-            squares[at % m] += f64::from(v * scale).powi(2);
-        }
-    }
-    let n = (residuals.len() / m).max(1) as f64;
-    // At least 1e-9: a component without residuals must not cause a division by zero.
-    let sizes: Vec<f32> = squares.iter().map(|s| ((s / n).sqrt() as f32).max(1e-9)).collect();
-    let steps: Vec<f32> = sizes.iter().zip(ranges).map(|(size, range)| size / range).collect();
-    let (mut scales, mut values) =
-        (Vec::with_capacity(residual_scales.len()), Vec::with_capacity(residuals.len()));
-    let mut decoded = Vec::with_capacity(residuals.len());
-    for (centroid, residual_scale) in residual_scales.iter().enumerate() {
-        let in_sizes = |(at, v): (usize, &f32)| v * residual_scale / sizes[at % m];
-        let members = || residuals[of_centroid(centroid)].iter().enumerate();
-        let scale = members().map(in_sizes).fold(0.0f32, |most, v| most.max(v.abs())) / MOST;
-        let factor = if scale > 0.0 { scale.recip() } else { 0.0 };
-        for (at, v) in members() {
-            let value = (in_sizes((at, v)) * factor).round().clamp(-MOST, MOST);
-            values.push(value as i8);
-            decoded.push(value * steps[at % m] * scale);
-        }
-        scales.push(scale);
-    }
-    (FineResiduals { steps, scales, values, errors: ScoreErrors::default() }, decoded)
-}
-
-/// Returns for each centroid the largest distance of a member from its decoded form, and the errors of the decoded
-/// scores. `residuals`: components, in shard order, to add to the centroids.
-fn compare(
-    embeddings: Rows<'_>,
-    order: &[u32],
-    centroid_starts: &[u32],
-    decoded_centroids: &[f32],
-    residuals: Option<(&Decoder<'_>, &[f32])>,
-    sample: &measure::Sample<'_>,
-) -> (Vec<f32>, ScoreErrors) {
-    let dim = embeddings.width;
-    let added =
-        residuals.map(|(decoder, components)| (decoder.panels(), decoder.lengths(), decoder.m, components));
-    let chunks: Vec<(Vec<f32>, Vec<f32>)> = (0..order.len().div_ceil(CHUNK))
-        .into_par_iter()
-        .map(|chunk| {
-            let places = chunk * CHUNK..order.len().min((chunk + 1) * CHUNK);
-            let mut decoded = match &added {
-                Some((panels, _, m, components)) => {
-                    panels.product(Rows::all(&components[places.start * m..places.end * m], *m))
-                }
-                None => vec![0.0; places.len() * dim],
-            };
-            let mut centroid = centroid_starts.partition_point(|start| *start as usize <= places.start) - 1;
-            let mut distances = Vec::with_capacity(places.len());
-            let mut missed = Vec::new();
-            for (place, decoded) in places.zip(decoded.chunks_exact_mut(dim)) {
-                while centroid_starts[centroid + 1] as usize <= place {
-                    centroid += 1;
-                }
-                let embedding = embeddings.get(order[place] as usize);
-                let of_centroid = &decoded_centroids[centroid * dim..][..dim];
-                for ((d, r), e) in decoded.iter_mut().zip(of_centroid).zip(embedding) {
-                    *d = e - (r + *d);
-                }
-                // Bound of the products' rounding: the sizes of their terms times the number of additions.
-                let rounding = added.as_ref().map_or(0.0, |(_, lengths, m, components)| {
-                    let terms = components[place * m..][..*m].iter().zip(lengths).map(|(c, l)| c.abs() * l);
-                    terms.sum::<f32>() * (*m as f32 + 4.0) * f32::EPSILON
-                });
-                let slack = 1.0 + dim as f32 * f32::EPSILON;
-                let length = slag_math::dot(decoded, decoded).sqrt();
-                distances.push((length * slack + rounding + 2.0 * f32::EPSILON).next_up());
-                if sample.has(place) {
-                    missed.extend_from_slice(decoded);
-                }
-            }
-            (distances, missed)
-        })
-        .collect();
-    let distances: Vec<f32> = chunks.iter().flat_map(|(distances, _)| distances).copied().collect();
-    let missed: Vec<f32> = chunks.into_iter().flat_map(|(_, missed)| missed).collect();
-    let radius = |members: &[u32]| {
-        distances[members[0] as usize..members[1] as usize].iter().copied().fold(0.0, f32::max)
-    };
-    (centroid_starts.windows(2).map(radius).collect(), sample.errors(&missed))
 }
 
 #[cfg(test)]

@@ -64,6 +64,7 @@ fn shard_of(codebook: &Codebook, dim: usize, balanced: bool) -> AlignedBytes {
             codes: &r.codes,
         }),
         exact: None,
+        packed_indices: None,
     }
     .write(&mut out)
     .expect("writes to memory");
