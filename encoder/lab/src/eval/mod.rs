@@ -5,11 +5,13 @@
 //! curve); and on held-out views as LERF does (Kerr et al. 2023): the scores are rendered, the best pixel must lie on the
 //! thing (localisation), and the pixels above the threshold are compared with its mask.
 
+pub mod defaults;
 pub mod encoder;
 mod error;
 mod filter;
 mod instances;
 mod labelled;
+mod labelled_scene;
 pub mod lerf;
 pub mod mask_noise;
 pub mod metrics;
@@ -28,6 +30,7 @@ pub use error::EvalError;
 pub use filter::Filter;
 pub use instances::{InstanceReport, Recall};
 pub use labelled::labelled;
+pub use labelled_scene::CompareError;
 pub use report::{EvalReport, Subset, WordReport};
 pub use settings::{EvalKind, EvalSettings};
 pub use truth::{LabelledView, Thing, Truth, TruthError};

@@ -6,57 +6,19 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 use serde::Serialize;
-use slag_common::splat::{self, SplatError};
-use slag_models::{ModelDir, ModelError, SessionOptions};
+use slag_models::{ModelDir, SessionOptions};
 
-use super::error::EvalError;
 use super::labelled::labelled;
+use super::labelled_scene::{CompareError, LabelledScene};
 use super::mask_noise::MaskNoise;
 use super::metrics::mean;
 use super::settings::EvalSettings;
-use super::truth::{Truth, TruthError};
-use slag_encoder::encode::{self, EncodeError, EncodeSettings, Engines, Masks, Perturbation};
+use super::truth::Truth;
+use slag_encoder::encode::{self, EncodeSettings, Engines, Masks, Perturbation};
 use slag_encoder::lift::Aggregation;
 use slag_encoder::progress::Silent;
 use slag_encoder::raster::{CpuRasterizer, Rasterizer};
-use slag_encoder::store::{StoreError, StoreReader};
-
-/// Error of the comparison.
-#[derive(Debug, thiserror::Error)]
-pub enum NoiseError {
-    /// A folder is not a labelled scene.
-    #[error(
-        "{}: no {missing}; expected a labelled scene: scene.ply or point_cloud.ply, transforms.json, gt/masks, \
-         as `generate scene` writes it", dir.display()
-    )]
-    NoScene {
-        /// The folder.
-        dir: PathBuf,
-        /// What is missing.
-        missing: &'static str,
-    },
-    /// A scene cannot be encoded.
-    #[error(transparent)]
-    Encode(#[from] Box<EncodeError>),
-    /// A store cannot be read.
-    #[error(transparent)]
-    Store(#[from] StoreError),
-    /// A splat cannot be read.
-    #[error(transparent)]
-    Splat(#[from] SplatError),
-    /// The labels cannot be used.
-    #[error(transparent)]
-    Truth(#[from] TruthError),
-    /// The text model cannot be opened.
-    #[error(transparent)]
-    Model(#[from] ModelError),
-    /// A store cannot be evaluated.
-    #[error(transparent)]
-    Eval(#[from] EvalError),
-    /// A folder cannot be created.
-    #[error(transparent)]
-    Io(#[from] std::io::Error),
-}
+use slag_encoder::store::StoreReader;
 
 /// What to compare.
 #[derive(Clone, Debug)]
@@ -110,14 +72,14 @@ pub struct NoiseReport {
 /// Makes the table and passes each row to `on_row` once it is measured.
 ///
 /// # Errors
-/// [`NoiseError`].
+/// [`CompareError`].
 pub fn run(
     settings: &NoiseSettings,
     (models, session): (&ModelDir, &SessionOptions),
     rasterizer: &dyn Rasterizer,
     on_row: &mut dyn FnMut(&NoiseRow),
     cancel: &AtomicBool,
-) -> Result<NoiseReport, NoiseError> {
+) -> Result<NoiseReport, CompareError> {
     let mut text = models.text_encoder(session)?;
     let mut rows = Vec::new();
     let levels: Vec<Option<u8>> = match settings.levels.is_empty() {
@@ -125,17 +87,11 @@ pub fn run(
         false => settings.levels.iter().copied().map(Some).collect(),
     };
     for dir in &settings.scenes {
-        let find = |names: &[&'static str]| -> Result<PathBuf, NoiseError> {
-            let found = names.iter().map(|name| dir.join(name)).find(|path| path.exists());
-            found.ok_or(NoiseError::NoScene { dir: dir.clone(), missing: names[0] })
-        };
-        let (splat_path, views) = (find(&["scene.ply", "point_cloud.ply"])?, find(&["transforms.json"])?);
-        let masks = find(&["gt/masks"])?;
-        let scene = splat::read(&splat_path, &splat::ReadOptions { with_sh_rest: false })?;
+        let LabelledScene { name, splat: splat_path, views, images, masks, gaussians: scene } =
+            LabelledScene::open(dir)?;
         let mut truth = Truth::read(dir, scene.len())?;
         // Evaluated in 3D only: rendering every word on every view would take most of the time.
         truth.views.clear();
-        let name = dir.file_name().unwrap_or_default().to_string_lossy().into_owned();
         for level in &levels {
             let folder =
                 level.map_or("as-found".into(), |level| format!("level-{level}-seed-{}", settings.seed));
@@ -145,6 +101,7 @@ pub fn run(
                 let mut encode = settings.encode.clone();
                 encode.inputs.scene.clone_from(&splat_path);
                 encode.inputs.views.clone_from(&views);
+                encode.inputs.images.clone_from(&images);
                 if level.is_some() {
                     encode.view.masks = Masks::Given { dir: masks.clone(), ignore_ids: Vec::new() };
                 }

@@ -91,6 +91,7 @@ impl Wall {
                 profiles: vec![Profile::Compact],
                 codebook: CodebookSettings::default(),
                 position_error: PositionError::Within(0.01),
+                input_indices: false,
             },
             objects: false,
         };

@@ -1,5 +1,6 @@
 //! `eval`: stores and encoders against labels.
 
+mod defaults;
 mod encoder;
 mod labelled;
 mod lerf;
@@ -25,6 +26,8 @@ pub enum EvalCommand {
     Report(protocol::EvalReportArgs),
     /// Evaluates an encoder on crops of generated things: noun, colour and material.
     Encoder(encoder::EvalEncoderArgs),
+    /// Compares the plain average with the default on labelled scenes, with true and automatic masks.
+    Defaults(defaults::EvalDefaultsArgs),
     /// Measures the accuracy of each aggregation method with errors in the masks.
     Noise(noise::EvalNoiseArgs),
 }
@@ -36,6 +39,7 @@ pub(super) fn run(command: &EvalCommand, progress: &dyn Progress, json: bool) ->
         EvalCommand::Scannet(args) => scannet::run(args, json),
         EvalCommand::Report(args) => protocol::run(args),
         EvalCommand::Encoder(args) => encoder::run(args, progress, json),
+        EvalCommand::Defaults(args) => defaults::run(args, progress, json),
         EvalCommand::Noise(args) => noise::run(args, progress, json),
     }
 }

@@ -1,0 +1,167 @@
+//! The plain average beside the default, on labelled scenes, with true and with automatic masks, by Gaussian and by
+//! object: the figures that a default is chosen and judged by.
+
+use std::fmt;
+use std::path::PathBuf;
+use std::sync::atomic::AtomicBool;
+
+use serde::Serialize;
+use slag_models::{ModelDir, SessionOptions};
+
+use super::instances::InstanceReport;
+use super::labelled::labelled;
+use super::labelled_scene::{CompareError, LabelledScene};
+use super::settings::{EvalKind, EvalSettings};
+use super::truth::Truth;
+use slag_encoder::encode::{self, DEFAULT_MASK_LEVELS, EncodeSettings, Engines, Masks};
+use slag_encoder::lift::Aggregation;
+use slag_encoder::progress::Silent;
+use slag_encoder::raster::{CpuRasterizer, Rasterizer};
+use slag_encoder::store::StoreReader;
+
+/// What to compare.
+#[derive(Clone, Debug)]
+pub struct DefaultsSettings {
+    /// Labelled scenes.
+    pub scenes: Vec<PathBuf>,
+    /// Folder for the stores; a later run reuses the views there.
+    pub out: PathBuf,
+    /// All other settings; the comparison sets inputs, masks, aggregation, objects and store.
+    pub encode: EncodeSettings,
+}
+
+/// Where masks come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum MaskSource {
+    /// The labels.
+    Given,
+    /// The built-in segmenter.
+    Automatic,
+}
+
+/// Figures of one scene with one source of masks.
+#[derive(Clone, Debug, Serialize)]
+pub struct DefaultsRow {
+    /// The scene's folder name.
+    pub scene: String,
+    /// Where masks came from.
+    pub masks: MaskSource,
+    /// Whether it is the default rather than the plain average.
+    pub is_default: bool,
+    /// What was scored.
+    pub kind: EvalKind,
+    /// Mean intersection over union of the argmax over all categories.
+    pub miou: Option<f64>,
+    /// Mean average precision over words.
+    pub average_precision: Option<f64>,
+    /// Mean area under the ROC curve over words.
+    pub area_under_roc: Option<f64>,
+    /// Instance recall, by object.
+    pub instances: Option<InstanceReport>,
+    /// Seconds of the encode; few, where the views were there already.
+    pub encode_secs: f64,
+}
+
+/// The table.
+#[derive(Clone, Debug, Serialize)]
+pub struct DefaultsReport {
+    /// The encoder.
+    pub encoder: String,
+    /// The default.
+    pub aggregation: Aggregation,
+    /// By scene, masks, method and kind.
+    pub rows: Vec<DefaultsRow>,
+}
+
+/// Makes the table and calls `on_row` once a row is measured.
+///
+/// # Errors
+/// [`CompareError`].
+pub fn run(
+    settings: &DefaultsSettings,
+    (models, session): (&ModelDir, &SessionOptions),
+    rasterizer: &dyn Rasterizer,
+    on_row: &mut dyn FnMut(&DefaultsRow),
+    cancel: &AtomicBool,
+) -> Result<DefaultsReport, CompareError> {
+    let mut text = models.text_encoder(session)?;
+    let mut rows = Vec::new();
+    for dir in &settings.scenes {
+        let scene = LabelledScene::open(dir)?;
+        let mut truth = Truth::read(dir, scene.gaussians.len())?;
+        // Evaluated in 3D only: rendering every word on every view would take most of the time.
+        truth.views.clear();
+        for source in [MaskSource::Given, MaskSource::Automatic] {
+            let mut encode = settings.encode.clone();
+            encode.inputs.scene.clone_from(&scene.splat);
+            encode.inputs.views.clone_from(&scene.views);
+            encode.inputs.images.clone_from(&scene.images);
+            let (masks, folder) = match source {
+                MaskSource::Given => {
+                    (Masks::Given { dir: scene.masks.clone(), ignore_ids: Vec::new() }, "given")
+                }
+                MaskSource::Automatic => (Masks::Auto { n_levels: DEFAULT_MASK_LEVELS }, "automatic"),
+            };
+            encode.view.masks = masks;
+            encode.run.keep_views = true;
+            encode.output.store = settings.out.join(&scene.name).join(folder);
+            fs_err::create_dir_all(&encode.output.store)?;
+            for is_default in [false, true] {
+                encode.aggregation = if is_default { Aggregation::REFINED } else { Aggregation::PLAIN };
+                encode.cells.objects = is_default;
+                let engines = Engines::new(models, session, rasterizer);
+                let start = std::time::Instant::now();
+                encode::encode(&encode, &engines, &Silent, cancel).map_err(Box::new)?;
+                let encode_secs = start.elapsed().as_secs_f64();
+                let reader = StoreReader::open(&encode.output.store)?;
+                let kinds = [EvalKind::Gaussians, EvalKind::Objects];
+                for kind in &kinds[..1 + usize::from(is_default)] {
+                    let eval = EvalSettings { kind: Some(*kind), ..EvalSettings::default() };
+                    let report =
+                        labelled(&reader, &truth, &scene.gaussians, &mut *text, &CpuRasterizer, &eval)?;
+                    let row = DefaultsRow {
+                        scene: scene.name.clone(),
+                        masks: source,
+                        is_default,
+                        kind: *kind,
+                        miou: report.multi_class.first().and_then(|all| all.miou),
+                        average_precision: report.mean_average_precision,
+                        area_under_roc: report.mean_area_under_roc,
+                        instances: report.instances,
+                        encode_secs,
+                    };
+                    on_row(&row);
+                    rows.push(row);
+                }
+            }
+        }
+    }
+    Ok(DefaultsReport { encoder: models.encoder_id().to_string(), aggregation: Aggregation::REFINED, rows })
+}
+
+impl fmt::Display for DefaultsReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "| scene | masks | aggregation | by | mIoU | AP | AUC | things found at IoU 0.25, 0.5 |"
+        )?;
+        writeln!(f, "|---|---|---|---|---|---|---|---|")?;
+        for row in &self.rows {
+            let show = |value: Option<f64>| value.map_or("-".into(), |v| format!("{v:.3}"));
+            let masks = match row.masks {
+                MaskSource::Given => "given",
+                MaskSource::Automatic => "automatic",
+            };
+            let method = if row.is_default { "default" } else { "plain" };
+            let kind = match row.kind {
+                EvalKind::Gaussians => "Gaussian",
+                EvalKind::Objects => "object",
+            };
+            let figures = [row.miou, row.average_precision, row.area_under_roc].map(show).join(" | ");
+            let found = row.instances.as_ref().map_or(String::new(), |instances| instances.any.to_string());
+            writeln!(f, "| {} | {masks} | {method} | {kind} | {figures} | {found} |", row.scene)?;
+        }
+        Ok(())
+    }
+}
