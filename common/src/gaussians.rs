@@ -51,6 +51,30 @@ impl Gaussians {
         self.sh_dc[index].map(|c| 0.5 + SH_C0 * c)
     }
 
+    /// Returns some of the Gaussians, in the order of `indices`.
+    ///
+    /// # Panics
+    /// If an index is not below [`Gaussians::len`].
+    pub fn select(&self, indices: &[u32]) -> Self {
+        fn pick<T: Copy>(column: &[T], indices: &[u32]) -> Vec<T> {
+            indices.iter().map(|index| column[*index as usize]).collect()
+        }
+        let rest = 3 * Self::sh_rest_per_channel(self.sh_degree);
+        Self {
+            means_in_world: pick(&self.means_in_world, indices),
+            rotations_wxyz: pick(&self.rotations_wxyz, indices),
+            scales: pick(&self.scales, indices),
+            opacities: pick(&self.opacities, indices),
+            sh_dc: pick(&self.sh_dc, indices),
+            sh_rest: indices
+                .iter()
+                .flat_map(|at| &self.sh_rest[*at as usize * rest..][..rest])
+                .copied()
+                .collect(),
+            sh_degree: self.sh_degree,
+        }
+    }
+
     /// Returns whether a Gaussian can be drawn: finite fields, a mean within the range of f32, a rotation of unit length.
     ///
     /// Readers keep unusable rows, so that indices stay those of the file; stages skip and count them.

@@ -94,6 +94,8 @@ fn sections_and_versions_match_the_code() {
         (section::FINE_STEPS, "fine_steps"),
         (section::FINE_SCALES, "fine_scales"),
         (section::FINE, "fine"),
+        (section::PACKED_INDICES_HEADER, "packed_indices_header"),
+        (section::PACKED_INDICES, "packed_indices"),
         (objects::section::HEADER, "objects_header"),
         (objects::section::RECORDS, "objects"),
         (objects::section::VECTORS, "object_vectors"),

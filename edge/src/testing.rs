@@ -14,7 +14,7 @@ use slag_common::hash::Hash32;
 use slag_common::manifest::{self, Calibration, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, quantise_vectors};
 use slag_common::shard::{
-    ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardLayout, ShardView, quantise,
+    ExactColumns, IndexColumn, Positions, Profile, ScoreErrors, ShardHeader, ShardLayout, ShardView, quantise,
 };
 use slag_models::{InferenceError, TextEncoder};
 
@@ -37,6 +37,8 @@ pub struct TestShard {
     pub encoder_id: Hash32,
     /// Whether centroids are quantised with a power-of-two step, so that values exact in f32 stay exact.
     pub has_exact_centroids: bool,
+    /// Whether the shard has the indices in the input splat file whatever its profile.
+    pub has_packed_indices: bool,
     /// Members by centroid.
     pub centroids: Vec<Vec<Member>>,
     /// Gaussians without a centroid, after the centroids'.
@@ -119,7 +121,16 @@ impl TestShard {
     pub fn new(centroids: Vec<Vec<Member>>) -> Self {
         let (origin, step) = (DVec3::ZERO, DVec3::splat(0.01));
         let (encoder_id, without_evidence) = (Hash32([7; 32]), Vec::new());
-        Self { cell_id: 1, origin, step, encoder_id, has_exact_centroids: false, centroids, without_evidence }
+        Self {
+            cell_id: 1,
+            origin,
+            step,
+            encoder_id,
+            has_exact_centroids: false,
+            has_packed_indices: false,
+            centroids,
+            without_evidence,
+        }
     }
 
     /// Writes the shard and reads it back. Centroids are the members' means, radii the largest distance of an
@@ -165,6 +176,7 @@ impl TestShard {
             errors: ScoreErrors::default(),
             encoder_id: self.encoder_id.0,
         };
+        let packed = IndexColumn::pack(&input_indices);
         let exact = exact.then_some(ExactColumns {
             input_indices: &input_indices,
             embeddings: &embeddings,
@@ -180,6 +192,7 @@ impl TestShard {
             basis: None,
             residuals: None,
             exact,
+            packed_indices: self.has_packed_indices.then(|| packed.view()),
         }
         .write(&mut bytes)
         .expect("writes to memory");
@@ -250,9 +263,15 @@ impl TextEncoder for Axes {
                 drop(self.gate.1.wait_while(open, |open| !*open).expect("no panic inside"));
                 0
             }
-            _ => text.parse().ok().filter(|axis| *axis < self.dim).ok_or_else(|| {
-                InferenceError::UnknownPhrase { text: text.into(), n_known: self.dim, near: vec!["0".into()] }
-            })?,
+            // The first line alone, so that a text may have a second one.
+            _ => {
+                let axis = text.lines().next().and_then(|line| line.parse().ok());
+                axis.filter(|axis| *axis < self.dim).ok_or_else(|| InferenceError::UnknownPhrase {
+                    text: text.into(),
+                    n_known: self.dim,
+                    near: vec!["0".into()],
+                })?
+            }
         };
         Ok((0..self.dim).map(|i| f32::from(i == axis)).collect())
     }

@@ -52,6 +52,7 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
         basis: None,
         residuals: None,
         exact: None,
+        packed_indices: None,
     }
     .write(&mut shard)
     .expect("writes to memory");

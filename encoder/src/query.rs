@@ -1,11 +1,11 @@
 //! Full-precision scores of a published field, for evaluation and trust.
 
 mod by_level;
+mod hits;
+mod picture;
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::BTreeMap;
 
-use glam::DVec3;
-use serde::Serialize;
 use slag_common::container::AlignedBytes;
 use slag_common::manifest::Calibration;
 use slag_common::objects::object_score;
@@ -16,6 +16,8 @@ use crate::lift::{CellField, RegionTable};
 use crate::objects::NONE;
 use crate::store::{StoreError, StoreReader};
 pub use by_level::ByLevel;
+pub use hits::{Hit, SceneMismatch, check_scene, located, points_ply};
+pub use picture::{draw_lit, luma};
 use slag_math::dot;
 
 /// Cosines of every Gaussian of the input with a query.
@@ -156,13 +158,14 @@ pub fn scores_of_shards(reader: &StoreReader, query: &[f32], profile: Profile) -
         };
         let (bytes, layout) = read(profile)?;
         let shard = layout.view(&bytes);
-        // All profiles have the same order; only the exact one has input indices.
-        let (bytes, layout) = read(Profile::Exact)?;
-        let exact =
-            layout.view(&bytes).exact.ok_or(QueryError::NoShard { cell_id, profile: Profile::Exact })?;
-        for (cosine, index) in shard.scores(query).into_iter().zip(exact.input_indices) {
-            let found = scores.cosines.get_mut(*index as usize);
-            *found.ok_or(QueryError::Index { cell_id, index: *index, n })? = cosine as f32;
+        // All profiles have the same order, so the exact one knows the indices of those encoded without them.
+        let exact = if shard.has_input_indices() { None } else { Some(read(Profile::Exact)?) };
+        let indexed = exact.as_ref().map_or(shard, |(bytes, layout)| layout.view(bytes));
+        for (at, cosine) in shard.scores(query).into_iter().enumerate() {
+            let index = indexed.input_index(at);
+            let index = index.ok_or(QueryError::NoShard { cell_id, profile: Profile::Exact })?;
+            let found = scores.cosines.get_mut(index as usize);
+            *found.ok_or(QueryError::Index { cell_id, index, n })? = cosine as f32;
         }
     }
     Ok(scores)
@@ -269,49 +272,6 @@ impl PublishedObjects {
             *cosine = if cosine.is_nan() { of_object } else { mixed(*cosine, of_object) };
         });
     }
-}
-
-/// A Gaussian that answers a query.
-#[derive(Clone, Copy, Debug, Serialize)]
-pub struct Hit {
-    /// Index in the input file.
-    pub index: u32,
-    /// Cosine with the query.
-    pub cosine: f32,
-    /// Mean, world frame.
-    pub position_in_world: DVec3,
-}
-
-/// Returns the `n` best Gaussians with their positions (from the exact shards), best first.
-///
-/// # Errors
-/// [`QueryError`].
-pub fn best(reader: &StoreReader, scores: &Scores, n: usize) -> Result<Vec<Hit>, QueryError> {
-    let mut order: Vec<u32> =
-        (0..scores.cosines.len() as u32).filter(|i| !scores.cosines[*i as usize].is_nan()).collect();
-    order.sort_by(|a, b| scores.cosines[*b as usize].total_cmp(&scores.cosines[*a as usize]).then(a.cmp(b)));
-    order.truncate(n);
-    let wanted: HashSet<u32> = order.iter().copied().collect();
-    if order.is_empty() {
-        return Ok(Vec::new());
-    }
-    let mut hits = Vec::with_capacity(order.len());
-    for cell in &reader.manifest().cells {
-        let Some(shard) = cell.shards.get(&Profile::Exact) else { continue };
-        let bytes = reader.read_object(shard.hash)?;
-        let layout = ShardLayout::check(&bytes)
-            .map_err(|source| QueryError::Shard { cell_id: cell.cell_id, source })?;
-        let view = layout.view(&bytes);
-        let indices = view.exact.map_or(&[][..], |exact| exact.input_indices);
-        for (at, index) in indices.iter().enumerate() {
-            if wanted.contains(index) {
-                let cosine = scores.cosines[*index as usize];
-                hits.push(Hit { index: *index, cosine, position_in_world: view.position_in_world(at) });
-            }
-        }
-    }
-    hits.sort_by(|a, b| b.cosine.total_cmp(&a.cosine).then(a.index.cmp(&b.index)));
-    Ok(hits)
 }
 
 #[cfg(test)]

@@ -11,7 +11,8 @@ use slag_common::frames::Aabb;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader};
 use slag_common::shard::{
-    Basis, ExactColumns, Fine, Positions, Profile, Residuals, ScoreErrors, ShardHeader, ShardView,
+    Basis, ExactColumns, Fine, IndexColumn, Positions, Profile, Residuals, ScoreErrors, ShardHeader,
+    ShardView,
 };
 use slag_common::{Hash32, container};
 
@@ -116,6 +117,7 @@ fn shard(is_exact: bool) -> Vec<u8> {
     let mut out = Vec::new();
     let (mean, codewords) = ([f16::from_f32(0.1); 3], [f16::from_f32(0.25); 32]);
     let positions = [[0, 0, 0], [1, 2, 3], [65535, 65535, 65535], [4, 4, 4], [5, 5, 5], [6, 6, 6]];
+    let indices = IndexColumn::pack(&[10, 11, 12, 13, 14, 1500]);
     let view = ShardView {
         header,
         positions: Positions::Wide(&positions),
@@ -140,6 +142,7 @@ fn shard(is_exact: bool) -> Vec<u8> {
                 values: &[1, -2, 127, -128, 5, 0, 3, 4, -5, 6],
             }),
         }),
+        packed_indices: (!is_exact).then(|| indices.view()),
     };
     let record = |id: u64, n_gaussians_here: u32| ObjectRecord {
         id,

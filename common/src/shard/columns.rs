@@ -6,6 +6,7 @@ use glam::DVec3;
 use half::f16;
 
 use super::format::{BLOCK, ScoreErrors, ShardHeader};
+use super::indices::PackedIndices;
 use crate::container;
 use crate::frames::Aabb;
 use crate::hash::Hash32;
@@ -118,6 +119,8 @@ pub struct ShardView<'a> {
     pub residuals: Option<Residuals<'a>>,
     /// The columns that only the exact profile has.
     pub exact: Option<ExactColumns<'a>>,
+    /// Indices in the input splat file, where the scene was encoded with them; exact shards have a column of their own.
+    pub packed_indices: Option<PackedIndices<'a>>,
 }
 
 impl ShardView<'_> {
@@ -125,6 +128,17 @@ impl ShardView<'_> {
     pub fn position_in_world(&self, index: usize) -> DVec3 {
         let steps = self.positions.steps(index, self.header.position_bits).map(f64::from);
         DVec3::from(self.header.origin_in_world) + DVec3::from(steps) * DVec3::from(self.header.position_step)
+    }
+
+    /// Returns whether the shard knows the Gaussians' indices in the input splat file.
+    pub fn has_input_indices(&self) -> bool {
+        self.exact.is_some() || self.packed_indices.is_some()
+    }
+
+    /// Returns the index of a Gaussian in the input splat file, if the shard knows it.
+    pub fn input_index(&self, index: usize) -> Option<u32> {
+        let packed = || self.packed_indices.map(|indices| indices.get(index));
+        self.exact.map(|exact| exact.input_indices[index]).or_else(packed)
     }
 
     /// Returns the box of all representable positions.

@@ -6,6 +6,7 @@ use bytemuck::Pod;
 
 use super::columns::{Basis, ExactColumns, Fine, Positions, Residuals, ShardView};
 use super::format::{ScoreErrors, ShardHeader};
+use super::indices::{IndicesHeader, PackedIndices};
 use crate::objects::{Objects, ObjectsLayout};
 
 /// The header of a checked shard and the places of its columns; [`ShardLayout::view`] gives the columns.
@@ -21,6 +22,7 @@ pub struct ShardLayout {
     pub(super) residuals: Option<[Range<usize>; 5]>,
     pub(super) exact: Option<[Range<usize>; 2]>,
     pub(super) fine: Option<(ScoreErrors, [Range<usize>; 3])>,
+    pub(super) packed_indices: Option<(IndicesHeader, Range<usize>)>,
     pub(super) objects: Option<ObjectsLayout>,
 }
 
@@ -75,6 +77,8 @@ impl ShardLayout {
                     values: cast(bytes, values),
                 }),
             }),
+            packed_indices: (self.packed_indices.as_ref())
+                .map(|(header, words)| PackedIndices { header: *header, words: cast(bytes, words) }),
         }
     }
 }

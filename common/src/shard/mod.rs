@@ -14,6 +14,7 @@ mod check;
 mod columns;
 mod decode;
 mod format;
+mod indices;
 mod layout;
 mod profile;
 mod write;
@@ -28,5 +29,6 @@ pub use columns::{Basis, ExactColumns, Fine, Positions, Residuals, ShardView};
 pub use format::{
     BLOCK, CODEWORDS, MAGIC, MAX_DIM, MAX_SUBSPACES, ScoreErrors, ShardHeader, VERSION, section,
 };
+pub use indices::{IndexColumn, IndicesHeader, PackedIndices};
 pub use layout::ShardLayout;
 pub use profile::Profile;

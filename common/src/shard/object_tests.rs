@@ -73,6 +73,7 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
         basis: None,
         residuals: None,
         exact: None,
+        packed_indices: None,
     };
     let objects = Objects {
         header: parts.header,

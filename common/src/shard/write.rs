@@ -50,6 +50,10 @@ impl ShardView<'_> {
                 sections.push((section::FINE, container::bytes_of(fine.values)));
             }
         }
+        if let Some(indices) = &self.packed_indices {
+            sections.push((section::PACKED_INDICES_HEADER, bytemuck::bytes_of(&indices.header)));
+            sections.push((section::PACKED_INDICES, container::bytes_of(indices.words)));
+        }
         sections.extend(objects.iter().flat_map(|objects| objects.sections()));
         container::write(out, MAGIC, VERSION, &sections)
     }

@@ -175,6 +175,7 @@ impl Generator {
             basis: None,
             residuals: None,
             exact: None,
+            packed_indices: None,
         };
         parts.write(&mut out)?;
         Ok(out)

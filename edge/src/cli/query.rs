@@ -1,6 +1,7 @@
 //! `query`.
 
 use std::io::{self, Write};
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use glam::DVec3;
@@ -57,6 +58,10 @@ pub struct QueryArgs {
     pub cache: CacheArgs,
     #[command(flatten)]
     pub models: ModelArgs,
+    /// Write the Gaussians that answered to a PLY of points: position, score, rank of their answer, and index in the input
+    /// splat file where the shards know it.
+    #[arg(long, value_name = "FILE")]
+    pub ply: Option<PathBuf>,
     /// Print the answers as JSON.
     #[arg(long)]
     pub json: bool,
@@ -75,13 +80,26 @@ pub fn run(args: QueryArgs) -> Result<(), Failure> {
         voxel: args.voxel,
         min_count: args.min_count,
         precision: args.precision,
+        members: args.ply.is_some(),
     };
     request.check().map_err(|e| Failure::Usage(e.into()))?;
     args.threads.apply()?;
     let engine = engine(args.cache.open()?, &args.models)?;
     engine.reload().map_err(store_failure)?;
     let reply = engine.answer(&request)?;
+    if let Some(path) = &args.ply {
+        write_ply(&reply, path)?;
+    }
     if args.json { write_json(reply) } else { print_reply(&reply) }
+}
+
+/// Writes the Gaussians of a reply, piece by piece.
+fn write_ply(reply: &Reply, path: &Path) -> Result<(), Failure> {
+    let mut file = fs_err::File::create(path)?;
+    for piece in reply.ply() {
+        file.write_all(&piece?)?;
+    }
+    Ok(())
 }
 
 /// Prints a reply as one JSON object, piece by piece.
@@ -105,10 +123,11 @@ fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
     }
     let exactness = match answers.is_exact {
         true => "exactly".to_owned(),
-        false => match answers.score_error_p999 {
-            Some(p999) => {
-                format!("999 of 1,000 scores within ±{p999:.3}, all within ±{:.3}", answers.score_error_bound)
-            }
+        false => match answers.score_error_likely {
+            Some(likely) => format!(
+                "99 of 100 scores within ±{likely:.3} (for 95 of 100 questions), all within ±{:.3}",
+                answers.score_error_bound
+            ),
             None => format!("scores within ±{:.3}", answers.score_error_bound),
         },
     };

@@ -42,7 +42,11 @@ pub fn parameters() -> [Parameter; 12] {
             "measured",
             format!("{precision}, fastest first (default: {default_precision})"),
         ),
-        parameter("format", "json", format!("{format}; arrow: Gaussians as columns")),
+        parameter(
+            "format",
+            "json",
+            format!("{format}; arrow: Gaussians as columns; ply: the answers' Gaussians as points"),
+        ),
     ]
 }
 
@@ -96,6 +100,7 @@ pub fn parse(
             "gaussians, since format is arrow",
         ));
     }
+    request.members = format == Format::Ply;
     Ok((request, format))
 }
 

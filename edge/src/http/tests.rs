@@ -28,6 +28,7 @@ use slag_common::manifest::Manifest;
 
 mod answers;
 mod openapi;
+mod ply;
 
 struct Service {
     dir: TempDir,

@@ -62,7 +62,8 @@ fn answer_objects(
         |object: &FoundObject<'_>| (scale.shown(object.score), object.n_gaussians, object.record.position());
     let ranked = rank(found, threshold.0, manifest, request, key);
     // Describes only the objects that are returned.
-    let described = ranked.into_par_iter().map(|ranked| object_answer(scene, ranked, scale, &region));
+    let described =
+        ranked.into_par_iter().map(|ranked| object_answer(scene, ranked, scale, &region, request.members));
     let found = Found::Clusters(described.collect());
     let best = objects::best(&scored.scores);
     let best = best.map(|best| (scale.shown(scored.scores[best]), objects::record(scene, best).position()));
@@ -104,9 +105,12 @@ fn answer_gaussians(
         matches.runs.iter_mut().for_each(|run| run.score = scale.shown(run.score));
         n_matching = matches.n_gaussians;
         let voxel = request.voxel.unwrap_or_else(|| default_voxel(manifest));
-        let (min_count, alignment) = (request.min_count, alignment(manifest));
-        let grouped =
-            cluster(scene.shards, &matches.runs, &Grouping { voxel, min_count, threshold, alignment });
+        let (min_count, alignment, with_members) = (request.min_count, alignment(manifest), request.members);
+        let grouped = cluster(
+            scene.shards,
+            &matches.runs,
+            &Grouping { voxel, min_count, threshold, alignment, with_members },
+        );
         clustering = Some(Clustering {
             voxel: grouped.voxel,
             min_count,
@@ -131,7 +135,7 @@ fn answer_gaussians(
         n_matching,
         is_exact: search.is_exact(),
         score_error_bound,
-        score_error_p999: measured.map(|errors| scale.error_bound(n_products * errors.p999)),
+        score_error_likely: measured.map(|errors| scale.error_bound(n_products * errors.likely)),
         clustering,
         reason: found.is_empty().then(|| reason::of_gaussians(search, scale, request, threshold, n_matching)),
         answers: found,
@@ -162,7 +166,7 @@ fn empty(
         n_matching: 0,
         is_exact: false,
         score_error_bound: 0.0,
-        score_error_p999: None,
+        score_error_likely: None,
         area_fetched: area_fetched(scene.fetched, request),
         clustering: None,
         reason: None,
@@ -198,6 +202,7 @@ fn cluster_answer(ranked: Ranked<Cluster>, manifest: &Manifest) -> ClusterAnswer
         evidence: None,
         relevance,
         distance,
+        members: cluster.members,
     }
 }
 
@@ -207,6 +212,7 @@ fn object_answer(
     ranked: Ranked<FoundObject<'_>>,
     scale: Scale,
     region: &Region,
+    with_members: bool,
 ) -> ClusterAnswer {
     let Ranked { found: FoundObject { object, record, score, n_gaussians }, rank, relevance, distance } =
         ranked;
@@ -231,5 +237,6 @@ fn object_answer(
         }),
         relevance,
         distance,
+        members: if with_members { objects::members(scene, object, region, score) } else { Vec::new() },
     }
 }

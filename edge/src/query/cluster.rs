@@ -39,6 +39,8 @@ pub struct Grouping {
     pub threshold: f32,
     /// Permitted orientations of boxes.
     pub alignment: Alignment,
+    /// Whether clusters list their members.
+    pub with_members: bool,
 }
 
 /// A cluster of Gaussians.
@@ -59,6 +61,8 @@ pub struct Cluster {
     pub box_in_world: Aabb,
     /// Box along axes of its own, those of the members inside `box_in_world`.
     pub oriented_box: OrientedBox,
+    /// Its members, in storage order; empty unless they are asked for.
+    pub members: Vec<Run>,
 }
 
 /// All clusters of a set of matches.
@@ -124,7 +128,7 @@ fn forward_neighbours() -> impl Iterator<Item = u64> {
 
 /// Clusters the members of disjoint runs.
 pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], grouping: &Grouping) -> Clusters {
-    let Grouping { mut voxel, min_count, threshold, alignment } = *grouping;
+    let Grouping { mut voxel, min_count, threshold, alignment, with_members } = *grouping;
     let mut result = Clusters { clusters: Vec::new(), n_small: 0, n_gaussians_in_small: 0, voxel };
     let mut reach = Aabb::EMPTY;
     for runs_of_shard in runs.chunk_by(|a, b| a.shard == b.shard) {
@@ -168,7 +172,8 @@ pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], grouping: &Grouping) -> C
                 group.iter().flat_map(|voxel| voxels[*voxel as usize]).copied().collect();
             // Members in storage order, so that sums do not depend on the voxels.
             spans.sort_unstable_by_key(|span| (span.run, span.start));
-            summarise(shards, runs, &spans, alignment)
+            let members = if with_members { members(runs, &spans) } else { Vec::new() };
+            Cluster { members, ..summarise(shards, runs, &spans, alignment) }
         })
         .collect();
     result.clusters.sort_unstable_by_key(|cluster| cluster.first);
@@ -243,6 +248,20 @@ fn connect(voxels: &[&[Span]], masses: &[f64]) -> Vec<u32> {
     rank_of.into_iter().map(|rank| groups.root(rank)).collect()
 }
 
+/// Returns the Gaussians of spans (in storage order) as runs; neighbouring spans of a run are joined.
+fn members(runs: &[Run], spans: &[Span]) -> Vec<Run> {
+    let mut members: Vec<Run> = Vec::new();
+    let mut last_run = None;
+    for span in spans {
+        match members.last_mut() {
+            Some(last) if last_run == Some(span.run) && last.end == span.start => last.end = span.end,
+            _ => members.push(Run { start: span.start, end: span.end, ..runs[span.run as usize] }),
+        }
+        last_run = Some(span.run);
+    }
+    members
+}
+
 fn summarise(shards: &[ShardView<'_>], runs: &[Run], spans: &[Span], alignment: Alignment) -> Cluster {
     let mut points: Vec<DVec3> = Vec::new();
     let (mut score_sum, mut best_score, mut first) = (0.0, f32::NEG_INFINITY, (u32::MAX, u32::MAX));
@@ -269,6 +288,7 @@ fn summarise(shards: &[ShardView<'_>], runs: &[Run], spans: &[Span], alignment: 
         position_in_world: sum / n_inside as f64,
         box_in_world,
         oriented_box: OrientedBox::around(&points, inside, alignment, TRIMMED),
+        members: Vec::new(),
     }
 }
 

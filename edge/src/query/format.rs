@@ -5,6 +5,7 @@ use std::io;
 #[cfg(feature = "arrow")]
 use super::arrow;
 use super::json;
+use super::ply;
 use super::reply::Reply;
 
 /// Format of a reply.
@@ -15,12 +16,14 @@ pub enum Format {
     Json,
     /// Columns as an Arrow IPC stream; Gaussians only.
     Arrow,
+    /// The Gaussians of all answers as a PLY of points.
+    Ply,
 }
 
 impl Format {
     /// Returns the formats of this build.
     pub fn available() -> &'static [Self] {
-        if cfg!(feature = "arrow") { &[Self::Json, Self::Arrow] } else { &[Self::Json] }
+        if cfg!(feature = "arrow") { &[Self::Json, Self::Arrow, Self::Ply] } else { &[Self::Json, Self::Ply] }
     }
 
     /// Returns the name used in URLs.
@@ -28,6 +31,7 @@ impl Format {
         match self {
             Self::Json => "json",
             Self::Arrow => "arrow",
+            Self::Ply => "ply",
         }
     }
 
@@ -36,6 +40,8 @@ impl Format {
         match self {
             Self::Json => "application/json",
             Self::Arrow => "application/vnd.apache.arrow.stream",
+            // PLY has no registered type.
+            Self::Ply => "application/octet-stream",
         }
     }
 }
@@ -60,6 +66,12 @@ impl std::str::FromStr for Format {
 }
 
 impl Reply {
+    /// Returns the Gaussians of all answers as a PLY of points, in the same pieces as [`Reply::pieces`] does. Clusters and
+    /// objects need [`QueryRequest::members`](super::QueryRequest::members).
+    pub fn ply(&self) -> impl Iterator<Item = io::Result<Vec<u8>>> {
+        ply::Pieces::new(self)
+    }
+
     /// Returns the reply in pieces of at most a fraction of a megabyte, each made on demand.
     ///
     /// # Errors
@@ -67,6 +79,7 @@ impl Reply {
     pub fn pieces(self, format: Format) -> Box<dyn Iterator<Item = io::Result<Vec<u8>>> + Send> {
         match format {
             Format::Json => Box::new(json::Pieces::new(self)),
+            Format::Ply => Box::new(ply::Pieces::new(self)),
             #[cfg(feature = "arrow")]
             Format::Arrow => Box::new(arrow::Pieces::new(self)),
             #[cfg(not(feature = "arrow"))]

@@ -10,6 +10,7 @@ mod format;
 mod json;
 mod objects;
 mod oriented;
+mod ply;
 mod rank;
 mod reason;
 mod reply;

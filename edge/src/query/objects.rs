@@ -9,7 +9,7 @@ use slag_common::objects::{ObjectRecord, Objects};
 
 use super::oriented::{Alignment, OrientedBox};
 use super::scene::Scene;
-use crate::score::Region;
+use crate::score::{Region, Run};
 use crate::store::objects::Part;
 
 /// The same share as [`super::cluster`] trims.
@@ -79,6 +79,22 @@ pub fn oriented_box(scene: &Scene<'_>, object: usize, region: &Region, alignment
     let bounds = record(scene, object).bounds();
     let in_box = |p: &DVec3| p.cmpge(bounds.min).all() && p.cmple(bounds.max).all();
     OrientedBox::around(&points, in_box, alignment, TRIMMED)
+}
+
+/// Returns an object's Gaussians in a region, by shard and index. `score`: the object's.
+pub fn members(scene: &Scene<'_>, object: usize, region: &Region, score: f32) -> Vec<Run> {
+    let mut members: Vec<Run> = Vec::new();
+    for part in scene.index.parts(object) {
+        let shard = &scene.shards[part.shard as usize];
+        let indices = scene.index.runs(*part, of_part(scene, *part)).flatten();
+        for index in indices.filter(|index| region.contains(shard.position_in_world(*index as usize))) {
+            match members.last_mut() {
+                Some(last) if (last.shard, last.end) == (part.shard, index) => last.end = index + 1,
+                _ => members.push(Run { shard: part.shard, start: index, end: index + 1, score }),
+            }
+        }
+    }
+    members
 }
 
 /// Returns the number of a part's Gaussians in a region; examines them only if the region's border crosses

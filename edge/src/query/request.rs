@@ -180,6 +180,8 @@ pub struct QueryRequest {
     pub min_count: u64,
     /// Which data scores come from.
     pub precision: Precision,
+    /// Whether clusters and objects list their Gaussians.
+    pub members: bool,
 }
 
 impl QueryRequest {
@@ -197,6 +199,7 @@ impl QueryRequest {
             voxel: None,
             min_count: DEFAULT_MIN_COUNT,
             precision: Precision::default(),
+            members: false,
         }
     }
 

@@ -97,6 +97,7 @@ impl CodedShard {
                 codes: &codes,
             }),
             exact: None,
+            packed_indices: None,
         };
         let measured = view(&[], &[]);
         let mut embeddings = Vec::new();

@@ -206,6 +206,7 @@ fn shard(cell_id: u32, n: usize, spec: &SceneSpec) -> (Vec<u8>, Aabb, u32) {
         basis: Some(Basis { mean: &mean, vectors: &vectors, steps: &steps }),
         residuals: spec.is_balanced.then_some(residuals),
         exact: None,
+        packed_indices: None,
     }
     .write_with(&mut bytes, of_objects.as_ref().map(CellObjects::view).as_ref())
     .expect("writes to memory");

@@ -79,6 +79,7 @@ pub fn shard(spec: &ShardSpec) -> Vec<u8> {
         basis: None,
         residuals: None,
         exact: spec.is_exact.then_some(exact),
+        packed_indices: None,
     };
     parts.write(&mut out).expect("writes to memory");
     out

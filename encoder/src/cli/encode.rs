@@ -122,6 +122,10 @@ pub struct EncodeArgs {
     /// cell's small Gaussians].
     #[arg(long, value_name = "E")]
     pub position_error: Option<f64>,
+    /// Compact and balanced shards say which Gaussian of the splat file each of theirs is, as exact ones always do: at most
+    /// 4 bytes a Gaussian, 2.5 in a scene of a million.
+    #[arg(long)]
+    pub input_indices: bool,
     /// Search for objects.
     #[command(flatten)]
     pub objects: ObjectArgs,
@@ -238,6 +242,7 @@ fn shard_settings(args: &EncodeArgs, preset: CodebookSettings, metric: bool) -> 
         position_error: args
             .position_error
             .map_or_else(|| PositionError::default_for(metric), PositionError::Within),
+        input_indices: args.input_indices,
     }
 }
 

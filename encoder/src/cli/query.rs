@@ -1,17 +1,22 @@
-//! `query`: scores of every Gaussian against a text.
+//! `query`: scores of every Gaussian against a text, and the Gaussians that match it.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use anyhow::Result;
+use anyhow::{Context, Result, anyhow};
 use clap::Args;
 use serde_json::json;
-use slag_common::npy;
 use slag_common::shard::Profile;
+use slag_common::splat::{self, ReadOptions, ply};
+use slag_common::{Gaussians, npy, poses};
 
 use super::common::{ModelArgs, print, profile_parser, text_encoder_of};
 use super::exit::Exit;
-use crate::query::{self, ByLevel};
+use crate::query::{self, ByLevel, Hit, Scores};
+use crate::raster::RasterView;
 use crate::store::StoreReader;
+
+/// Largest width of a picture.
+const MAX_PICTURE_WIDTH_PX: u32 = 1600;
 
 /// `query`.
 #[derive(Debug, Args)]
@@ -27,6 +32,9 @@ pub struct QueryArgs {
     /// Gaussians to print, best first.
     #[arg(long, default_value_t = 10)]
     pub limit: u32,
+    /// Least cosine of a match, -1 to 1 [default: the encoder's].
+    #[arg(long, value_name = "C", allow_hyphen_values = true)]
+    pub threshold: Option<f32>,
     /// Scores as a robot with shards of this profile does [default: the field in full precision].
     #[arg(long, value_name = "NAME", value_parser = profile_parser())]
     pub profile: Option<Profile>,
@@ -36,11 +44,31 @@ pub struct QueryArgs {
     /// Writes every Gaussian's score, in the input's order, as a NumPy array (NaN: no evidence).
     #[arg(long, value_name = "FILE")]
     pub scores: Option<PathBuf>,
+    /// Writes the Gaussians that match as a PLY, best first: with --scene a splat, else points with position, score and
+    /// index in the input.
+    #[arg(long, value_name = "FILE")]
+    pub ply: Option<PathBuf>,
+    /// The splat that the store was encoded from.
+    #[arg(long, value_name = "FILE")]
+    pub scene: Option<PathBuf>,
+    /// Draws a view in which the Gaussians that match keep their colours and all others are grey.
+    #[arg(long, value_name = "FILE", requires_all = ["scene", "views", "view"])]
+    pub png: Option<PathBuf>,
+    /// Poses of the views: the folder of a COLMAP model, or a nerfstudio transforms.json.
+    #[arg(long, value_name = "PATH")]
+    pub views: Option<PathBuf>,
+    /// Name of the photo whose view --png draws.
+    #[arg(long, value_name = "PHOTO")]
+    pub view: Option<String>,
 }
 
 pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     let reader = StoreReader::open(&args.store)?;
     let manifest = reader.manifest();
+    let threshold = args.threshold.unwrap_or(manifest.encoder.default_threshold);
+    if !(-1.0..=1.0).contains(&threshold) {
+        return Err(anyhow!("--threshold is {threshold}, expected a cosine, -1 to 1"));
+    }
     let mut encoder = text_encoder_of(&reader, &args.models)?;
     let vector = encoder.encode(&args.text)?;
     let scores = match args.profile {
@@ -51,9 +79,17 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     if let Some(path) = &args.scores {
         npy::write_file(path, &[scores.cosines.len()], &scores.cosines)?;
     }
-    let hits = query::best(&reader, &scores, args.limit as usize)?;
-    let threshold = manifest.encoder.default_threshold;
-    let n_matching = scores.cosines.iter().filter(|c| **c >= threshold).count();
+    let hits = query::located(&reader, &scores, &scores.best(args.limit as usize))?;
+    let scene = args.scene.as_deref().map(|path| read_scene(path, &reader, &hits)).transpose()?;
+    let matching = scores.matching(threshold);
+    if let Some(path) = &args.ply {
+        let located = query::located(&reader, &scores, &matching)?;
+        write_ply(path, scene.as_ref(), &matching, &located, &args.text)?;
+    }
+    if let (Some(path), Some(scene), Some(views), Some(view)) = (&args.png, &scene, &args.views, &args.view) {
+        draw(path, scene, &scores, threshold, &view_of(views, view)?)?;
+    }
+    let n_matching = matching.len();
     let n_scored = scores.cosines.iter().filter(|c| !c.is_nan()).count();
     let mut lines = format!("{n_matching} of {n_scored} Gaussians reach {threshold}\n");
     for hit in &hits {
@@ -66,4 +102,56 @@ pub(super) fn run(args: &QueryArgs, json: bool) -> Result<Exit> {
     });
     print(json, &value, lines)?;
     Ok(Exit::Done)
+}
+
+/// Reads a splat and checks that it is the store's.
+fn read_scene(path: &Path, reader: &StoreReader, hits: &[Hit]) -> Result<Gaussians> {
+    let scene = splat::read(path, &ReadOptions { with_sh_rest: true })?;
+    query::check_scene(reader, &scene, hits).with_context(|| path.display().to_string())?;
+    Ok(scene)
+}
+
+/// Writes the Gaussians that match, from the splat if there is one. `located`: those whose position a shard knows.
+fn write_ply(
+    path: &Path,
+    scene: Option<&Gaussians>,
+    matching: &[u32],
+    located: &[Hit],
+    text: &str,
+) -> Result<()> {
+    if let Some(scene) = scene {
+        return Ok(ply::write(path, &scene.select(matching))?);
+    }
+    if located.len() < matching.len() {
+        return Err(anyhow!(
+            "the shards do not say which Gaussian is which, so {} of {} matches have no position; give the splat with --scene, or encode with --input-indices",
+            matching.len() - located.len(),
+            matching.len()
+        ));
+    }
+    Ok(fs_err::write(path, query::points_ply(located, &[format!("text {text}")]))?)
+}
+
+/// Returns the camera of a photo, without its lens's distortion.
+fn view_of(views: &Path, name: &str) -> Result<RasterView> {
+    let all = poses::read(views, None)?.views;
+    let Some(view) = all.iter().find(|view| view.name == name) else {
+        let first = all.first().map_or("none", |view| &view.name);
+        return Err(anyhow!(
+            "{}: no view is named {name:?}; it has {} views, the first is {first:?}",
+            views.display(),
+            all.len()
+        ));
+    };
+    let intrinsics = view.intrinsics.without_distortion();
+    let width_px = intrinsics.width_px.min(MAX_PICTURE_WIDTH_PX);
+    Ok(RasterView {
+        camera_from_world: view.camera_from_world,
+        intrinsics: intrinsics.scaled_to_width(width_px),
+    })
+}
+
+fn draw(path: &Path, scene: &Gaussians, scores: &Scores, threshold: f32, view: &RasterView) -> Result<()> {
+    let picture = query::draw_lit(scene, &scores.cosines, threshold, view)?;
+    picture.save_with_format(path, image::ImageFormat::Png).with_context(|| path.display().to_string())
 }

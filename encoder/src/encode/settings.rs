@@ -264,6 +264,7 @@ impl EncodeSettings {
                     profiles: Profile::ALL.to_vec(),
                     codebook: CodebookSettings::default(),
                     position_error: PositionError::default_for(metric),
+                    input_indices: false,
                 },
                 objects: true,
             },

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use slag_common::Gaussians;
 use slag_common::hash::Hash32;
 use slag_common::shard::{
-    Basis, ExactColumns, Fine, Profile, Residuals, ScoreErrors, ShardHeader, ShardView,
+    Basis, ExactColumns, Fine, IndexColumn, Profile, Residuals, ScoreErrors, ShardHeader, ShardView,
 };
 
 use crate::cells::{Cell, CellSplit};
@@ -56,6 +56,8 @@ pub struct ShardSettings {
     pub codebook: CodebookSettings,
     /// Precision of positions.
     pub position_error: PositionError,
+    /// Whether compact and balanced shards have the indices of their Gaussians in the input splat file, too.
+    pub input_indices: bool,
 }
 
 /// The embeddings of a cell's Gaussians.
@@ -104,6 +106,8 @@ pub fn build(
     let in_order = codebook.order.iter().map(|at| with[*at as usize]);
     let locals: Vec<u32> = in_order.chain(without.iter().copied()).collect();
 
+    let in_input = || locals.iter().map(|local| cell.gaussians[*local as usize]).collect::<Vec<u32>>();
+    let packed_indices = settings.input_indices.then(|| IndexColumn::pack(&in_input()));
     let positions = QuantisedPositions::new(scene, cell, &locals, settings.position_error);
     let header = ShardHeader {
         cell_id,
@@ -130,6 +134,7 @@ pub fn build(
         basis: Some(Basis { mean: &codebook.mean, vectors: &codebook.basis, steps: &codebook.basis_steps }),
         residuals: None,
         exact: None,
+        packed_indices: packed_indices.as_ref().map(IndexColumn::view),
     };
     let balanced = codebook.residuals.as_ref().map_or(compact, |residuals| ShardView {
         header: ShardHeader {
@@ -166,8 +171,7 @@ pub fn build(
         Profile::Compact => built(profile, &compact),
         Profile::Balanced => built(profile, &balanced),
         Profile::Exact => {
-            let input_indices: Vec<u32> =
-                locals.iter().map(|local| cell.gaussians[*local as usize]).collect();
+            let input_indices = in_input();
             let mut halves = vec![f16::ZERO; n_with * dim];
             halves.par_chunks_exact_mut(dim).zip(&locals[..n_with]).for_each(|(out, local)| {
                 let embedding = &embeddings.vectors[*local as usize * dim..][..dim];
@@ -182,7 +186,7 @@ pub fn build(
                 values: &fine.values,
             });
             let exact = Some(ExactColumns { input_indices: &input_indices, embeddings: &halves, fine });
-            built(profile, &ShardView { radii: compact.radii, exact, ..balanced })
+            built(profile, &ShardView { radii: compact.radii, exact, packed_indices: None, ..balanced })
         }
     });
     BuiltCell {

@@ -9,9 +9,11 @@ mod compressed;
 mod container;
 mod harmonics;
 mod plain;
+mod points;
 mod vertices;
 mod write;
 
+pub use points::{Point, PointProperties};
 pub use vertices::read_vertices;
 pub use write::{write, write_to};
 

@@ -3,8 +3,13 @@ use proptest::prelude::*;
 use super::*;
 use crate::testing::{Member, TestShard};
 
-const GROUPING: Grouping =
-    Grouping { voxel: 0.25, min_count: 10, threshold: 0.0, alignment: Alignment::Gravity };
+const GROUPING: Grouping = Grouping {
+    voxel: 0.25,
+    min_count: 10,
+    threshold: 0.0,
+    alignment: Alignment::Gravity,
+    with_members: false,
+};
 
 /// Clusters points on a lattice of 5 cm, each list with a score of its own.
 fn clusters_of(lists: &[(f32, Vec<[u16; 3]>)]) -> Vec<Cluster> {

@@ -283,8 +283,12 @@ fn shards(
     codebook: CodebookSettings,
 ) -> Point {
     let dim = embeddings.dim;
-    let settings =
-        ShardSettings { profiles: vec![profile], codebook, position_error: PositionError::Within(0.01) };
+    let settings = ShardSettings {
+        profiles: vec![profile],
+        codebook,
+        position_error: PositionError::Within(0.01),
+        input_indices: false,
+    };
     let mut decoded = vec![0.0f32; embeddings.vectors.len()];
     let (mut bytes, mut position_bytes, mut ms, mut first) = (0, 0, 0.0, 0);
     let (mut n_centroids, mut n_subspaces) = (0, 0);

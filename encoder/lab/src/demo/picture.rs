@@ -8,7 +8,7 @@ use slag_common::gaussians::SH_C0;
 
 use super::answer::EdgeAnswer;
 use super::caption;
-use crate::generate::to_image;
+use slag_encoder::query::{draw_lit, luma};
 use slag_encoder::raster::{CpuRasterizer, RasterError, RasterView, Rasterizer};
 
 /// Width of one panel.
@@ -45,19 +45,9 @@ pub(super) fn answers(
     let mut picture =
         RgbImage::from_pixel(size.width_px * COLUMNS as u32, size.height_px * n_rows, image::Rgb([255; 3]));
     for (i, panel) in panels.iter().enumerate() {
-        let mut coloured = scene.clone();
-        for (sh, cosine) in coloured.sh_dc.iter_mut().zip(&panel.cosines) {
-            // NaN compares false: a Gaussian without an embedding stays grey.
-            if *cosine >= panel.threshold {
-                continue;
-            }
-            // Lightened so that dark furniture still shows its shape.
-            let grey = 0.35 + 0.5 * luma(rgb_of(*sh));
-            *sh = [(grey - 0.5) / SH_C0; 3];
-        }
         let view = best_view(scene, views, panel)?;
         let view = RasterView { intrinsics: view.intrinsics.scaled_to_width(PANEL_WIDTH_PX), ..view };
-        let mut drawn = to_image(&CpuRasterizer.draw(&coloured, &view, [0.9; 3])?, &view);
+        let mut drawn = draw_lit(scene, &panel.cosines, panel.threshold, &view)?;
         caption::write(&mut drawn, panel.question);
         let (column, row) = (i % COLUMNS, i / COLUMNS);
         imageops::replace(
@@ -68,15 +58,6 @@ pub(super) fn answers(
         );
     }
     Ok(picture)
-}
-
-fn rgb_of(sh_dc: [f32; 3]) -> [f32; 3] {
-    sh_dc.map(|c| 0.5 + SH_C0 * c)
-}
-
-/// Returns the brightness of a colour (BT.601).
-fn luma([r, g, b]: [f32; 3]) -> f32 {
-    0.299 * r + 0.587 * g + 0.114 * b
 }
 
 /// Returns the view that shows the most matching pixels, of the views with the answer nearest to their middle.
@@ -149,7 +130,7 @@ pub(super) fn map(
     order.sort_by(|a, b| scene.means_in_world[*a].z.total_cmp(&scene.means_in_world[*b].z));
     for i in order {
         let mean = scene.means_in_world[i];
-        let rgb = rgb_of(scene.sh_dc[i]);
+        let rgb = scene.rgb_dc(i);
         let on_board = fetched.iter().any(|bounds| bounds.distance_to(mean) == 0.0);
         let grey = 0.6 + 0.3 * luma(rgb);
         let rgb = if on_board { rgb } else { [grey; 3] }.map(|c| (c.clamp(0.0, 1.0) * 255.0) as u8);

@@ -215,8 +215,14 @@ fn segments_of(photo: &Photo, raster_view: &RasterView, things: &[(u32, Mask)]) 
         intrinsics: raster_view.intrinsics,
         camera_from_world: raster_view.camera_from_world,
     };
-    let input =
-        SegmentInput { view: &view, image: &photo.image, valid: None, undistorter: None, depth: None };
+    let input = SegmentInput {
+        view: &view,
+        image: &photo.image,
+        valid: None,
+        undistorter: None,
+        depth: None,
+        pool: None,
+    };
     let segments = GraphSegmenter::default().segment(&input).unwrap_or_default();
     let width = photo.image.width();
     let thing_of = |mask: &Mask| {

@@ -16,5 +16,4 @@ mod scene;
 mod solid;
 
 pub use output::GenerateError;
-pub(crate) use output::to_image;
 pub use scene::{Scene, TrueObject, WrittenScene};

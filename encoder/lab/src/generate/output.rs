@@ -2,9 +2,7 @@
 
 use std::path::PathBuf;
 
-use image::RgbImage;
 use slag_common::splat::SplatError;
-use slag_encoder::raster::{Drawing, RasterView};
 
 use super::grammar::GrammarError;
 
@@ -28,13 +26,6 @@ pub enum GenerateError {
         /// The reason.
         source: image::ImageError,
     },
-}
-
-/// Returns a drawing as 8-bit RGB.
-pub(crate) fn to_image(drawing: &Drawing, view: &RasterView) -> RgbImage {
-    let bytes = drawing.rgb.iter().map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-    RgbImage::from_raw(view.intrinsics.width_px, view.intrinsics.height_px, bytes)
-        .expect("a drawing has three values per pixel of its view")
 }
 
 #[cfg(test)]

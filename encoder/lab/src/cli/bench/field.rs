@@ -42,6 +42,7 @@ pub(super) fn run(args: &FieldBenchArgs, progress: &dyn Progress) -> Result<Exit
         profiles: args.profiles.clone(),
         codebook: CodebookSettings { balanced_error: args.balanced_error, ..CodebookSettings::default() },
         position_error: PositionError::Within(0.01),
+        input_indices: false,
     };
     let report =
         field::publish(args.gaussians as usize, args.dim as usize, &args.store, &settings, progress)?;

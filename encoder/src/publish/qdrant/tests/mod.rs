@@ -103,6 +103,7 @@ impl Fixture {
                 basis: None,
                 residuals: None,
                 exact: Some(ExactColumns { input_indices: &ids, embeddings: &embeddings, fine: None }),
+                packed_indices: None,
             };
             let (hash, len_bytes) = self.store.put_object(|out| parts.write(out)).expect("room");
             let record = ShardRecord {

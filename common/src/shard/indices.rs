@@ -1,0 +1,148 @@
+//! Indices of Gaussians in the input splat file, packed into as few bits as a cell's range of indices needs.
+//!
+//! Every profile may have the column. Each index has the same width, so that a reader finds any one without reading the
+//! others: `index[i] = least + the width_bits bits from bit i * width_bits on`, bits counted from the lowest of each word.
+
+use bytemuck::{Pod, Zeroable};
+
+/// The fixed-size header of the column.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
+#[repr(C)]
+pub struct IndicesHeader {
+    /// Smallest index.
+    pub least: u32,
+    /// Bits of an index, 0..=32.
+    pub width_bits: u32,
+}
+
+/// A packed column of indices.
+#[derive(Clone, Copy, Debug)]
+pub struct PackedIndices<'a> {
+    /// Its header.
+    pub header: IndicesHeader,
+    /// `[ceil(N * width_bits / 32)]`.
+    pub words: &'a [u32],
+}
+
+impl PackedIndices<'_> {
+    /// Returns the index of a Gaussian in the input splat file.
+    pub fn get(&self, at: usize) -> u32 {
+        self.header.least.wrapping_add(self.offset(at))
+    }
+
+    /// Returns the packed bits of a Gaussian.
+    fn offset(&self, at: usize) -> u32 {
+        let width = u64::from(self.header.width_bits);
+        if width == 0 {
+            return 0;
+        }
+        let bit = at as u64 * width;
+        let (word, shift) = ((bit / 32) as usize, bit % 32);
+        let high = self.words.get(word + 1).map_or(0, |high| u64::from(*high) << 32);
+        ((u64::from(self.words[word]) | high) >> shift & ((1 << width) - 1)) as u32
+    }
+
+    /// Checks a column of `n` indices: a width of at most 32 bits, no index above the largest u32, zeros after the last.
+    pub(super) fn check(&self, n: usize) -> Result<(), String> {
+        let IndicesHeader { least, .. } = self.header;
+        if let Some(at) = (0..n).find(|at| least.checked_add(self.offset(*at)).is_none()) {
+            return Err(format!("input index of Gaussian {at} is above {}", u32::MAX));
+        }
+        let used = n as u64 * u64::from(self.header.width_bits) % 32;
+        match self.words.last() {
+            Some(last) if used > 0 && last >> used != 0 => {
+                Err("bits after the last input index are not zero".into())
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Returns the words of `n` indices; `None` if there is no such width.
+pub(super) fn n_words(n: usize, width_bits: u32) -> Option<usize> {
+    (width_bits <= 32).then(|| (n as u64 * u64::from(width_bits)).div_ceil(32) as usize)
+}
+
+/// A packed column, to be written.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct IndexColumn {
+    header: IndicesHeader,
+    words: Vec<u32>,
+}
+
+impl IndexColumn {
+    /// Packs indices.
+    pub fn pack(indices: &[u32]) -> Self {
+        let least = indices.iter().copied().min().unwrap_or(0);
+        let range = indices.iter().copied().max().unwrap_or(0) - least;
+        let width_bits = u32::BITS - range.leading_zeros();
+        let n_bits = indices.len() as u64 * u64::from(width_bits);
+        let mut words = vec![0u32; n_bits.div_ceil(32) as usize];
+        for (at, index) in indices.iter().enumerate().filter(|(_, index)| **index > least) {
+            let bit = at as u64 * u64::from(width_bits);
+            let (word, shift) = ((bit / 32) as usize, bit % 32);
+            let bits = u64::from(index - least) << shift;
+            words[word] |= bits as u32;
+            if bits >> 32 != 0 {
+                words[word + 1] |= (bits >> 32) as u32;
+            }
+        }
+        Self { header: IndicesHeader { least, width_bits }, words }
+    }
+
+    /// Returns the column as readers see it.
+    pub fn view(&self) -> PackedIndices<'_> {
+        PackedIndices { header: self.header, words: &self.words }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn unpacked(indices: &[u32]) -> Vec<u32> {
+        let column = IndexColumn::pack(indices);
+        assert_eq!(column.view().check(indices.len()), Ok(()), "{indices:?}");
+        (0..indices.len()).map(|at| column.view().get(at)).collect()
+    }
+
+    /// Oracle: the indices themselves, of every width, also those that cross words.
+    #[test]
+    fn every_width_comes_back() {
+        let mut random = slag_math::random::Random::new(5);
+        for width in 0..=32u32 {
+            for n in [1usize, 2, 31, 32, 33, 200] {
+                let most = (1u64 << width) - 1;
+                let least = (u64::from(u32::MAX) - most).min(random.bits() >> 40) as u32;
+                let mut indices: Vec<u32> =
+                    (0..n).map(|_| least + (u64::from(random.bits() as u32) & most) as u32).collect();
+                // The range is reached, so the width is the one meant.
+                indices[0] = least;
+                indices[n - 1] = least + if n > 1 { most as u32 } else { 0 };
+                assert_eq!(unpacked(&indices), indices, "{width} bits");
+                let column = IndexColumn::pack(&indices);
+                assert_eq!(column.header.width_bits, if n > 1 { width } else { 0 });
+                assert_eq!(Some(column.words.len()), n_words(n, column.header.width_bits));
+            }
+        }
+        assert!(unpacked(&[]).is_empty());
+    }
+
+    /// By hand: 5 + 0b101, 5 + 0b000, 5 + 0b011 in three bits each.
+    #[test]
+    fn the_first_index_lies_in_the_lowest_bits() {
+        let column = IndexColumn::pack(&[10, 5, 8]);
+        let expected =
+            IndexColumn { header: IndicesHeader { least: 5, width_bits: 3 }, words: vec![0b011_000_101] };
+        assert_eq!(column, expected);
+    }
+
+    #[test]
+    fn indices_past_the_largest_are_refused() {
+        let header = IndicesHeader { least: u32::MAX - 2, width_bits: 2 };
+        let check = |words: &[u32]| PackedIndices { header, words }.check(3);
+        assert_eq!(check(&[0b10_10_01]), Ok(()));
+        assert!(check(&[0b10_11_01]).is_err_and(|e| e.contains("Gaussian 1")));
+        assert!(check(&[0b01_10_10_01]).is_err_and(|e| e.contains("not zero")));
+    }
+}

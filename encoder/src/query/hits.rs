@@ -1,0 +1,172 @@
+//! The Gaussians that a query found: which they are in the input splat file, where they lie, and themselves as a splat.
+
+use std::collections::HashMap;
+
+use glam::DVec3;
+use serde::Serialize;
+use slag_common::Gaussians;
+use slag_common::container::AlignedBytes;
+use slag_common::manifest::CellRecord;
+use slag_common::shard::{Profile, ShardLayout};
+use slag_common::splat::ply::{Point, PointProperties};
+
+use super::{QueryError, Scores};
+use crate::store::StoreReader;
+
+/// Largest f32 rounding of a coordinate, relative to it: splat files keep means in f32.
+const F32_ROUNDING: f64 = 1e-7;
+
+/// A Gaussian that answers a query.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct Hit {
+    /// Index in the input file.
+    pub index: u32,
+    /// Cosine with the query.
+    pub cosine: f32,
+    /// Mean, world frame.
+    pub position_in_world: DVec3,
+}
+
+/// A splat is not the one that a store was encoded from.
+#[derive(Debug, thiserror::Error)]
+pub enum SceneMismatch {
+    /// It has another number of Gaussians.
+    #[error("the splat has {found} Gaussians, the store was encoded from one of {expected}; give that splat")]
+    Count {
+        /// Gaussians of the store.
+        expected: u64,
+        /// Gaussians of the splat.
+        found: usize,
+    },
+    /// A Gaussian lies elsewhere.
+    #[error(
+        "Gaussian {index} lies at {found} in the splat, at {expected} in the store; give the splat that the store was encoded from"
+    )]
+    Position {
+        /// Its index.
+        index: u32,
+        /// Its position in the store.
+        expected: DVec3,
+        /// Its position in the splat.
+        found: DVec3,
+    },
+}
+
+impl Scores {
+    /// Returns the `n` best Gaussians, best first: by cosine, then by index.
+    pub fn best(&self, n: usize) -> Vec<u32> {
+        let mut order = self.matching(f32::NEG_INFINITY);
+        order.truncate(n);
+        order
+    }
+
+    /// Returns the Gaussians with cosines at or above a threshold, best first: by cosine, then by index.
+    pub fn matching(&self, threshold: f32) -> Vec<u32> {
+        // NaN compares false: a Gaussian without evidence matches nothing.
+        let mut order: Vec<u32> =
+            (0..self.cosines.len() as u32).filter(|i| self.cosines[*i as usize] >= threshold).collect();
+        let cosine = |index: &u32| self.cosines[*index as usize];
+        order.sort_by(|a, b| cosine(b).total_cmp(&cosine(a)).then(a.cmp(b)));
+        order
+    }
+}
+
+/// Returns Gaussians of the input with their positions, in the order given. Those that no shard knows the index of are left
+/// out; a scene encoded with exact shards or input indices has none.
+///
+/// # Errors
+/// [`QueryError`].
+pub fn located(reader: &StoreReader, scores: &Scores, indices: &[u32]) -> Result<Vec<Hit>, QueryError> {
+    let mut positions: HashMap<u32, Option<DVec3>> = indices.iter().map(|index| (*index, None)).collect();
+    if positions.is_empty() {
+        return Ok(Vec::new());
+    }
+    for cell in &reader.manifest().cells {
+        let Some((bytes, layout)) = indexed_shard(reader, cell)? else { continue };
+        let shard = layout.view(&bytes);
+        for at in 0..shard.header.n_gaussians as usize {
+            if let Some(place) = shard.input_index(at).and_then(|index| positions.get_mut(&index)) {
+                *place = Some(shard.position_in_world(at));
+            }
+        }
+    }
+    let hit = |index: &u32| {
+        let position_in_world = positions.get(index).copied().flatten()?;
+        Some(Hit { index: *index, cosine: scores.cosines[*index as usize], position_in_world })
+    };
+    Ok(indices.iter().filter_map(hit).collect())
+}
+
+/// Returns the smallest shard of a cell that knows the indices of its Gaussians.
+fn indexed_shard(
+    reader: &StoreReader,
+    cell: &CellRecord,
+) -> Result<Option<(AlignedBytes, ShardLayout)>, QueryError> {
+    for record in Profile::ALL.iter().filter_map(|profile| cell.shards.get(profile)) {
+        let bytes = reader.read_object(record.hash)?;
+        let layout = ShardLayout::check(&bytes)
+            .map_err(|source| QueryError::Shard { cell_id: cell.cell_id, source })?;
+        if layout.view(&bytes).has_input_indices() {
+            return Ok(Some((bytes, layout)));
+        }
+    }
+    Ok(None)
+}
+
+/// Checks that a splat is the one that a store was encoded from: by its number of Gaussians, and by the positions of some.
+///
+/// # Errors
+/// [`SceneMismatch`].
+pub fn check_scene(reader: &StoreReader, scene: &Gaussians, hits: &[Hit]) -> Result<(), SceneMismatch> {
+    let manifest = reader.manifest();
+    let expected = manifest.n_gaussians + manifest.n_rejected;
+    if scene.len() as u64 != expected {
+        return Err(SceneMismatch::Count { expected, found: scene.len() });
+    }
+    let shards = manifest.cells.iter().flat_map(|cell| cell.shards.values());
+    let error = shards.map(|shard| shard.position_error).fold(0.0, f64::max);
+    for Hit { index, position_in_world: expected, .. } in hits {
+        let found = scene.means_in_world[*index as usize];
+        let rounding = F32_ROUNDING * expected.abs().max_element();
+        // `NaN <= x` is false: it matches nothing.
+        let is_same = (found - *expected).abs().max_element() <= 1.01 * error + rounding;
+        if !is_same {
+            return Err(SceneMismatch::Position { index: *index, expected: *expected, found });
+        }
+    }
+    Ok(())
+}
+
+/// Returns Gaussians as a PLY of points; the answer of each is its rank.
+pub fn points_ply(hits: &[Hit], comments: &[String]) -> Vec<u8> {
+    let properties = PointProperties { question: false, shard_index: false, input_index: true };
+    let mut file = properties.header(hits.len() as u64, comments).into_bytes();
+    file.reserve_exact(hits.len() * properties.point_bytes());
+    for (hit, answer) in hits.iter().zip(1..) {
+        let point = Point {
+            question: 0,
+            answer,
+            position_in_world: hit.position_in_world,
+            score: hit.cosine,
+            shard_index: (0, 0),
+            input_index: hit.index,
+        };
+        properties.put(&point, &mut file);
+    }
+    file
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn matches_are_ordered_by_cosine_then_index() {
+        let cosines = vec![0.2, f32::NAN, 0.5, 0.5, 0.1, -0.3];
+        let scores = Scores { total_weights: vec![0.0; 6], cosines };
+        assert_eq!(scores.matching(0.2), [2, 3, 0]);
+        assert_eq!(scores.best(4), [2, 3, 0, 4]);
+        assert_eq!(scores.best(9).len(), 5);
+        assert!(scores.matching(0.6).is_empty());
+    }
+}
