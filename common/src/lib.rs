@@ -8,6 +8,7 @@ pub mod byte_size;
 pub mod camera;
 pub mod container;
 pub mod durable;
+mod error_line;
 pub mod frames;
 pub mod gaussians;
 pub mod hash;
@@ -24,6 +25,7 @@ pub mod splat;
 
 pub use byte_size::ByteSize;
 pub use camera::{Distortion, Intrinsics, View};
+pub use error_line::error_line;
 pub use gaussians::Gaussians;
 pub use hash::Hash32;
 pub use similarity::Similarity;

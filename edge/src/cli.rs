@@ -116,16 +116,19 @@ mod tests {
             panic!("fetch")
         };
         assert_eq!(
-            (fetch.at, fetch.radius, fetch.profile),
+            (fetch.at, fetch.download.radius, fetch.download.profile),
             (Some(DVec3::new(-1.0, 2.5, -30.0)), 20.0, Profile::Exact)
         );
-        assert_eq!((fetch.max_bytes, fetch.cache.cache, fetch.json), (Some(7), Some("c".into()), true));
+        assert_eq!(
+            (fetch.download.max_bytes, fetch.cache.cache, fetch.json),
+            (Some(7), Some("c".into()), true)
+        );
         let Command::Fetch(fetch) = parse("slag-edge fetch --at-geo -46.8,-92").expect("parses").command
         else {
             panic!("fetch")
         };
         assert_eq!(
-            (fetch.at_geo, fetch.radius, fetch.profile),
+            (fetch.at_geo, fetch.download.radius, fetch.download.profile),
             (Some((-46.8, -92.0, None)), 50.0, Profile::Compact)
         );
         assert!(parse("slag-edge bench pause --gaussians 5000").is_ok());

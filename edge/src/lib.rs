@@ -2,7 +2,6 @@
 
 pub mod bench;
 mod clock;
-mod error_line;
 pub mod fetch;
 pub mod http;
 pub mod query;
@@ -13,4 +12,4 @@ mod testing;
 pub mod text;
 
 pub use clock::now_unix_secs;
-pub use error_line::error_line;
+pub use slag_common::error_line;

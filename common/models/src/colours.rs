@@ -8,6 +8,8 @@
 //! cube root of k: hue and chroma / L are invariant and decide between hues. Lightness matters only for names
 //! that depend on it (white, grey, black; orange, brown; red, pink), relative to the crop's own highlights.
 
+use slag_math::stats::{Rank, quantile};
+
 use crate::crop::Crop;
 use crate::encoder::{ImageEncoder, TextEncoder, normalise};
 use crate::error::InferenceError;
@@ -200,9 +202,8 @@ fn encode_crop(crop: &Crop) -> Option<[f32; DIM]> {
         .map(|&i| oklab([0, 1, 2].map(|channel| linear_of_level[usize::from(levels[i * 3 + channel])])))
         .collect();
     let mut lightness: Vec<f32> = pixels.iter().map(|p| p.lightness).collect();
-    lightness.sort_unstable_by(f32::total_cmp);
     // The 90th percentile, so that a glint on a dark object does not count.
-    let highlight = *lightness.get(lightness.len() * 9 / 10)?;
+    let highlight = quantile(&mut lightness, 900, Rank::After)?;
 
     let mut vector = [0.0; DIM];
     for pixel in &pixels {

@@ -373,7 +373,7 @@ impl fmt::Display for Report {
                 writeln!(f, "{} in {}", model.name, model.folder.display())?;
                 writeln!(f, "  licence {} ({}) {}", model.licence, model.licence_url, model.licence_note)?;
                 model.files.iter().try_for_each(|file| {
-                    let word = match file.on_the_word_of {
+                    let word = match file.hash_source {
                         Source::Table => "matches the built-in table",
                         Source::Hub => "matches the hub's hash",
                         Source::FirstPull => "no published hash; recorded in models.lock",

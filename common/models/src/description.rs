@@ -407,7 +407,7 @@ impl Description {
         )?;
         if let Some(PatchDescription { patch_px, .. }) = image.patches {
             let fits = (1..=image.size_px).contains(&patch_px)
-                && image.size_px % patch_px == 0
+                && image.size_px.is_multiple_of(patch_px)
                 && image.size_px / patch_px <= MAX_PATCHES_PER_SIDE;
             let expected = "a divisor of image.size_px that gives at most 256 patches a side";
             require(fits, "image.patches.patch_px", patch_px.to_string(), expected)?;

@@ -7,7 +7,9 @@ use std::path::PathBuf;
 use anyhow::anyhow;
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
+use slag_common::Hash32;
 use slag_common::shard::Profile;
+use slag_edge::fetch::{FetchRequest, Position};
 use slag_edge::query::Engine;
 use slag_edge::store::EdgeCache;
 use slag_edge::text::TextService;
@@ -17,6 +19,7 @@ use slag_models::session::SessionError;
 use slag_models::{ModelDir, SessionOptions};
 
 use super::failure::Failure;
+use super::network::checked_keys;
 
 /// Most threads for a text model by default; more gain little for short texts.
 const MAX_MODEL_THREADS: usize = 4;
@@ -34,6 +37,39 @@ impl CacheArgs {
         let dir = self.cache.or_else(|| cache_folder(variable));
         let advice = || Failure::Usage(anyhow!("neither XDG_CACHE_HOME nor HOME is set; give --cache DIR"));
         Ok(EdgeCache::open(dir.ok_or_else(advice)?))
+    }
+}
+
+/// What a fetch brings and whom it trusts.
+#[derive(Debug, Args)]
+pub struct DownloadArgs {
+    /// Radius around the robot within which cells are kept, world units (metres in a metric scene).
+    #[arg(long, default_value_t = 50.0)]
+    pub radius: f64,
+    /// Profile of the shards.
+    #[arg(long, default_value_t = Profile::Compact, value_parser = profile_parser())]
+    pub profile: Profile,
+    /// The only public key accepted, or its replacement. May be given twice: the second is the successor's,
+    /// for a robot that missed the key change [default: the key accepted before, or the first one seen].
+    #[arg(long, value_name = "HEX")]
+    pub key: Vec<Hash32>,
+    /// Byte budget for shards [default: twice what the radius needs].
+    #[arg(long, value_name = "N")]
+    pub max_bytes: Option<u64>,
+}
+
+impl DownloadArgs {
+    /// Returns the request for a store and a position; without them, those of the last fetch.
+    pub fn request(self, from: Option<String>, at: Option<Position>) -> Result<FetchRequest, Failure> {
+        Ok(FetchRequest {
+            from,
+            at,
+            radius: self.radius,
+            profile: self.profile,
+            keys: checked_keys(self.key)?,
+            max_bytes: self.max_bytes,
+            ..FetchRequest::default()
+        })
     }
 }
 

@@ -6,15 +6,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use glam::DVec3;
-use slag_common::Hash32;
-use slag_common::shard::Profile;
-use slag_edge::fetch::{FetchRequest, Position};
+use slag_edge::fetch::Position;
 use slag_edge::query::parse_point;
 
-use super::args::{CacheArgs, profile_parser};
+use super::args::{CacheArgs, DownloadArgs};
 use super::failure::Failure;
 use super::follow::{FollowArgs, watch};
-use super::network::{checked_keys, failure, fetch_once};
+use super::network::{failure, fetch_once};
 use super::output::print_json;
 use super::progress::{Bar, print_report};
 
@@ -29,19 +27,8 @@ pub struct FetchArgs {
     /// Position of the robot: WGS 84 degrees, and metres.
     #[arg(long, value_name = "LAT,LON[,HEIGHT]", value_parser = parse_geographic, allow_hyphen_values = true, conflicts_with = "at")]
     pub at_geo: Option<(f64, f64, Option<f64>)>,
-    /// Radius around the robot, world units (metres in a metric scene).
-    #[arg(long, default_value_t = 50.0)]
-    pub radius: f64,
-    /// Profile of the shards.
-    #[arg(long, default_value_t = Profile::Compact, value_parser = profile_parser())]
-    pub profile: Profile,
-    /// The only public key accepted, or its replacement. May be given twice: the second is the successor's,
-    /// for a robot that missed the key change [default: the key accepted before, or the first one seen].
-    #[arg(long, value_name = "HEX")]
-    pub key: Vec<Hash32>,
-    /// Byte budget for shards [default: twice what the radius needs].
-    #[arg(long, value_name = "N")]
-    pub max_bytes: Option<u64>,
+    #[command(flatten)]
+    pub download: DownloadArgs,
     /// Follow the robot: read positions from stdin, one a line, as `x y z`, `lat,lon[,height]` or JSON, and
     /// fetch when necessary.
     #[arg(long)]
@@ -63,16 +50,8 @@ pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
         }
         (None, None) => None,
     };
-    let request = FetchRequest {
-        from: args.from,
-        at,
-        radius: args.radius,
-        profile: args.profile,
-        keys: checked_keys(args.key)?,
-        max_bytes: args.max_bytes,
-        ..FetchRequest::default()
-    };
-    let settings = args.follow.settings(args.radius)?;
+    let settings = args.follow.settings(args.download.radius)?;
+    let request = args.download.request(args.from, at)?;
     let cache = args.cache.open()?;
     let cancel = Arc::new(AtomicBool::new(false));
     let on_signal = Arc::clone(&cancel);

@@ -6,19 +6,15 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use clap::Args;
-use slag_common::Hash32;
-use slag_common::shard::Profile;
-use slag_edge::fetch::FetchRequest;
 use slag_edge::fetch::follow::Following;
 use slag_edge::http::{self, App, Settings};
 use slag_edge::store::StoreError;
 use slag_service::listener::bind;
 use slag_service::stop::stop_signal;
 
-use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine, profile_parser};
+use super::args::{CacheArgs, DownloadArgs, ModelArgs, ThreadArgs, engine};
 use super::failure::Failure;
 use super::follow::{FollowArgs, follow_in_background};
-use super::network::checked_keys;
 
 /// Async threads: they only forward requests.
 const ASYNC_THREADS: usize = 2;
@@ -33,18 +29,8 @@ pub struct ServeArgs {
     /// Follow the robot: fetch from this store around the positions posted to POST /position.
     #[arg(long, value_name = "URL")]
     pub follow: Option<String>,
-    /// When following: radius around the robot within which cells are kept, world units.
-    #[arg(long, default_value_t = 50.0)]
-    pub radius: f64,
-    /// When following: profile of the shards.
-    #[arg(long, default_value_t = Profile::Compact, value_parser = profile_parser())]
-    pub profile: Profile,
-    /// When following: the only public keys accepted, at most two.
-    #[arg(long, value_name = "HEX")]
-    pub key: Vec<Hash32>,
-    /// When following: byte budget for shards [default: twice what the radius needs].
-    #[arg(long, value_name = "N")]
-    pub max_bytes: Option<u64>,
+    #[command(flatten, next_help_heading = "When following")]
+    pub download: DownloadArgs,
     #[command(flatten)]
     pub following: FollowArgs,
     #[command(flatten)]
@@ -88,14 +74,8 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
         let app = App::following(engine, settings, following.clone());
         let follower = match following {
             Some(following) => {
-                let request = FetchRequest {
-                    from: args.follow.clone(),
-                    profile: args.profile,
-                    keys: checked_keys(args.key.clone())?,
-                    max_bytes: args.max_bytes,
-                    ..FetchRequest::default()
-                };
-                let settings = args.following.settings(args.radius)?;
+                let settings = args.following.settings(args.download.radius)?;
+                let request = args.download.request(args.follow, None)?;
                 Some(follow_in_background(request, settings, cache, following, Arc::clone(&app))?)
             }
             None => None,

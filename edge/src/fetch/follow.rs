@@ -188,7 +188,7 @@ impl Following {
             Ok(_) => (status.n_fetches, status.last_error) = (status.n_fetches + 1, None),
             Err(error) => {
                 status.n_failures += 1;
-                status.last_error = Some(crate::error_line::error_line(error));
+                status.last_error = Some(crate::error_line(error));
             }
         }
     }

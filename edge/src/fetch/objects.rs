@@ -52,7 +52,7 @@ pub fn unfit_objects(cache: &EdgeCache, check: &Check<'_>, kept: &BTreeSet<Hash3
     unfit
         .into_iter()
         .map(|(hash, e)| {
-            tracing::warn!("downloading a shard again: {}", crate::error_line::error_line(&e));
+            tracing::warn!("downloading a shard again: {}", crate::error_line(&e));
             hash
         })
         .collect()

@@ -20,6 +20,7 @@ mod views;
 use anyhow::Result;
 use clap::{Parser, Subcommand};
 use serde_json::json;
+use slag_common::error_line;
 use slag_models::commands::ModelsCommand;
 
 use crate::encode::EncodeError;
@@ -116,10 +117,11 @@ pub fn exit_of(result: Result<Exit>, json: bool) -> Exit {
             if json {
                 println!(
                     "{}",
-                    json!({"error": {"message": format!("{error:#}"), "interrupted": interrupted}})
+                    json!({"error": {"message": error_line(&*error), "interrupted": interrupted}})
                 );
             } else {
-                eprintln!("{}: {error:#}", if interrupted { "interrupted" } else { "error" });
+                let kind = if interrupted { "interrupted" } else { "error" };
+                eprintln!("{kind}: {}", error_line(&*error));
             }
             if interrupted { Exit::Interrupted } else { Exit::Failed }
         }

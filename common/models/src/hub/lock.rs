@@ -36,13 +36,13 @@ pub struct LockedFile {
     /// Its SHA-256.
     pub sha256: Sha256,
     /// The source of the hash.
-    pub on_the_word_of: Source,
+    pub hash_source: Source,
 }
 
 impl LockedFile {
     /// Returns the error for a file with another hash.
     pub(super) fn refusal(self, path: PathBuf, found: Sha256, advice: &'static str) -> HubError {
-        HubError::Hash { path, found, expected: self.sha256, by: self.on_the_word_of, advice }
+        HubError::Hash { path, found, expected: self.sha256, by: self.hash_source, advice }
     }
 }
 

@@ -31,7 +31,7 @@ pub struct PulledFile {
     /// Its SHA-256.
     pub sha256: Sha256,
     /// The source of the expected hash.
-    pub on_the_word_of: Source,
+    pub hash_source: Source,
     /// Whether it was already present.
     pub was_here: bool,
 }
@@ -59,7 +59,7 @@ impl Pull<'_> {
     /// Returns the expected hash of a file from the table or the lock.
     pub(super) fn expected(&self, path: &str) -> Option<LockedFile> {
         let known = self.entry.known.get(path);
-        let known = known.map(|known| LockedFile { sha256: known.sha256, on_the_word_of: Source::Table });
+        let known = known.map(|known| LockedFile { sha256: known.sha256, hash_source: Source::Table });
         known.or_else(|| self.lock.get(&self.entry.name)?.files.get(path).cloned())
     }
 
@@ -106,7 +106,7 @@ impl Pull<'_> {
             }
             let url = self.url(path);
             let sha256 = self.ask(&url)?.sha256.ok_or(HubError::NoImageHash { url })?;
-            self.accept(path, LockedFile { sha256, on_the_word_of: Source::Hub })?;
+            self.accept(path, LockedFile { sha256, hash_source: Source::Hub })?;
         }
         Ok(())
     }
@@ -124,16 +124,16 @@ impl Pull<'_> {
             Some(expected) => expected,
             // Placed by hand, with no expected hash in the table or the lock.
             None => match self.client.ask(&self.url(path)).ok().and_then(|advertised| advertised.sha256) {
-                Some(sha256) => LockedFile { sha256, on_the_word_of: Source::Hub },
-                None => LockedFile { sha256: found, on_the_word_of: Source::PlacedByHand },
+                Some(sha256) => LockedFile { sha256, hash_source: Source::Hub },
+                None => LockedFile { sha256: found, hash_source: Source::PlacedByHand },
             },
         };
         if found != expected.sha256 {
             return Err(expected.refusal(target, found, "remove the file and pull again"));
         }
         self.accept(path, expected.clone())?;
-        let LockedFile { sha256, on_the_word_of } = expected;
-        Ok(PulledFile { path: path.to_owned(), sha256, on_the_word_of, was_here })
+        let LockedFile { sha256, hash_source } = expected;
+        Ok(PulledFile { path: path.to_owned(), sha256, hash_source, was_here })
     }
 
     /// Downloads a file to `target`; returns its hash and the source of the expected hash.
@@ -144,10 +144,10 @@ impl Pull<'_> {
         if let (Some(expected), Some(advertised)) = (&expected, advertised.sha256)
             && expected.sha256 != advertised
         {
-            let (expected, by) = (expected.sha256, expected.on_the_word_of);
+            let (expected, by) = (expected.sha256, expected.hash_source);
             return Err(HubError::Advertised { url, advertised, expected, by });
         }
-        let hub = advertised.sha256.map(|sha256| LockedFile { sha256, on_the_word_of: Source::Hub });
+        let hub = advertised.sha256.map(|sha256| LockedFile { sha256, hash_source: Source::Hub });
         let stated = expected.or(hub);
         let part = target.with_added_extension("part");
         fs_err::create_dir_all(target.parent().unwrap_or(&self.options.root))?;
@@ -157,7 +157,7 @@ impl Pull<'_> {
             let received = self.client.receive(&url, &part, len_bytes);
             let was_begun = received.map_err(|failure| self.unreachable(&url, failure))?;
             let found = Sha256(hash_file(&part)?);
-            let first = LockedFile { sha256: found, on_the_word_of: Source::FirstPull };
+            let first = LockedFile { sha256: found, hash_source: Source::FirstPull };
             let expected = stated.clone().unwrap_or(first);
             if expected.sha256 == found {
                 durable::move_into_place(&part, target)?;

@@ -19,7 +19,7 @@ fn a_pulled_model_is_checked_described_and_pulled_once() {
     let hub = hub_of(&pinned(&server), &server.url, root.path());
     let pulled = hub.pull("made", Side::Both, true).expect("it is pulled");
     let words: Vec<_> =
-        pulled.iter().map(|file| (file.path.as_str(), file.on_the_word_of, file.was_here)).collect();
+        pulled.iter().map(|file| (file.path.as_str(), file.hash_source, file.was_here)).collect();
     let expected = [
         ("onnx/vision.onnx", Source::Hub, false),
         ("onnx/text.onnx", Source::Table, false),
@@ -37,7 +37,7 @@ fn a_pulled_model_is_checked_described_and_pulled_once() {
         (&lock["made"]["licence"], &lock["made"]["revision"]),
         (&"Example-1.0".into(), &COMMIT.into())
     );
-    assert_eq!(lock["made"]["files"]["tokenizer.json"]["on_the_word_of"], "first-pull");
+    assert_eq!(lock["made"]["files"]["tokenizer.json"]["hash_source"], "first-pull");
     assert_eq!(hub.here(hub.entry("made").expect("known")), Here::All);
 
     // A second pull requests nothing and asks for no consent.
@@ -257,7 +257,7 @@ fn without_the_hub_the_error_lists_the_files_to_place() {
     }
     let hub = hub_of(&table, "http://127.0.0.1:1", root.path());
     let pulled = hub.pull("made", Side::Both, true).expect("all is there");
-    let words: Vec<_> = pulled.iter().map(|file| file.on_the_word_of).collect();
+    let words: Vec<_> = pulled.iter().map(|file| file.hash_source).collect();
     assert_eq!(words, [Source::PlacedByHand, Source::Table, Source::PlacedByHand]);
     assert!(ModelDir::open(&hub.resolve(Path::new("made")).expect("here")).is_ok());
 }

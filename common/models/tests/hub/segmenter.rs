@@ -61,7 +61,7 @@ fn weights_beside_a_graph_are_pulled_checked_and_described() {
     let error = hub.pull("sam2", Side::Text, false).expect_err("no text side").to_string();
     assert!(error.contains("slag-encoder"), "{error}");
     let pulled = hub.pull("sam2", Side::Both, false).expect("it is pulled");
-    let files: Vec<_> = pulled.iter().map(|file| (file.path.as_str(), file.on_the_word_of)).collect();
+    let files: Vec<_> = pulled.iter().map(|file| (file.path.as_str(), file.hash_source)).collect();
     let expected = ["vision_encoder.onnx", "vision_encoder.onnx_data"]
         .into_iter()
         .chain(["prompt_encoder_mask_decoder.onnx", "prompt_encoder_mask_decoder.onnx_data"])
