@@ -9,6 +9,8 @@ const MIN_CAMERAS: usize = 3;
 /// Cameras whose second-largest spread is below this share of the largest stand on a line: the rotation about it is
 /// undetermined.
 const MIN_SPREAD: f64 = 1e-3;
+/// Points this near to their mean, relative to the mean's distance from the origin, are one point.
+const ROUNDING: f64 = 1e-12;
 
 /// The similarity that best maps one set of camera centres to another.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -80,7 +82,11 @@ fn similarity(pairs: &[(DVec3, DVec3)]) -> Result<Alignment, AlignError> {
     let mean = |point: fn(&(DVec3, DVec3)) -> DVec3| pairs.iter().map(point).sum::<DVec3>() / n as f64;
     let (from_mean, to_mean) = (mean(|pair| pair.0), mean(|pair| pair.1));
     let centred: Vec<(DVec3, DVec3)> = pairs.iter().map(|(a, b)| (*a - from_mean, *b - to_mean)).collect();
-    for side in [|pair: &(DVec3, DVec3)| pair.0, |pair: &(DVec3, DVec3)| pair.1] {
+    type Side = fn(&(DVec3, DVec3)) -> DVec3;
+    let sides: [(Side, DVec3); 2] = [(|pair| pair.0, from_mean), (|pair| pair.1, to_mean)];
+    for (side, mean) in sides {
+        // Equal points differ from their mean by rounding.
+        let rounding = n as f64 * (ROUNDING * mean.length()).powi(2);
         let mut covariance = vec![0.0; 9];
         for point in centred.iter().map(side) {
             for (at, entry) in covariance.iter_mut().enumerate() {
@@ -88,7 +94,7 @@ fn similarity(pairs: &[(DVec3, DVec3)]) -> Result<Alignment, AlignError> {
             }
         }
         let (values, _) = eigen_symmetric(covariance, 3);
-        if !(values[0] > 0.0 && values[1] > MIN_SPREAD * MIN_SPREAD * values[0]) {
+        if !(values[0] > rounding && values[1] > MIN_SPREAD * MIN_SPREAD * values[0]) {
             return Err(AlignError::Line);
         }
     }

@@ -9,6 +9,7 @@ use super::error::CheckError;
 use super::frames::FrameCandidate;
 use super::mistake::Mistake;
 use super::search::Search;
+use super::trial::Trial;
 use super::view::{CheckView, at_width, draw, flat_psnr_db, mean, psnr_db};
 use crate::raster::Rasterizer;
 
@@ -31,24 +32,6 @@ pub struct Diagnosis {
     pub camera_spread: f64,
     /// The findings as sentences.
     pub advice: Vec<String>,
-}
-
-/// A correction and the PSNR it leads to.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Trial {
-    /// The corrected mistake.
-    pub mistake: Mistake,
-    /// A second mistake, corrected after the first.
-    pub and: Option<Mistake>,
-    /// Mean PSNR with the correction, dB.
-    pub psnr_db: f64,
-}
-
-impl Trial {
-    /// Returns the corrections in their order.
-    pub(super) fn corrections(&self) -> Vec<Mistake> {
-        std::iter::once(self.mistake).chain(self.and).collect()
-    }
 }
 
 /// Least gain that counts as clear, both of a correction over the given poses and of a drawing over a plain colour, dB.

@@ -12,6 +12,7 @@ mod report;
 mod search;
 #[cfg(test)]
 mod tests;
+mod trial;
 mod view;
 
 use std::path::PathBuf;
@@ -24,11 +25,12 @@ use diagnosis::{CLEAR_GAIN_DB, Samples};
 use view::{at_width, draw, flat_psnr_db, mean, picture, picture_name};
 
 pub use align::{AlignError, Alignment, align};
-pub use diagnosis::{Diagnosis, Trial};
+pub use diagnosis::Diagnosis;
 pub use error::CheckError;
 pub use frames::{FrameCandidate, FrameCause, nerfstudio_defaults};
 pub use mistake::Mistake;
 pub use report::{CheckReport, ViewCheck};
+pub use trial::Trial;
 pub use view::{CheckView, psnr_db};
 
 /// Settings of a check.

@@ -3,10 +3,10 @@
 use glam::{DQuat, DVec3};
 use slag_common::Similarity;
 
-use super::diagnosis::Trial;
 use super::error::CheckError;
 use super::frames::{FrameCandidate, FrameCause};
 use super::mistake::{CAMERA_CONVENTIONS, Mistake, single_mistakes};
+use super::trial::Trial;
 
 /// Factor between neighbouring scales of the sweep, and the largest scale; the smallest is its inverse.
 const SWEEP_STEP: f64 = 1.06;
@@ -135,7 +135,7 @@ impl Search<'_> {
     /// Returns a similarity moved a step in one of 14 directions: scale, three rotations and three translations, up and
     /// down.
     fn moved(&self, similarity: Similarity, direction: usize, step: f64) -> Similarity {
-        let step = if direction % 2 == 0 { step } else { -step };
+        let step = if direction.is_multiple_of(2) { step } else { -step };
         let axis = |at: usize| DVec3::from_array(std::array::from_fn(|i| if i == at { 1.0 } else { 0.0 }));
         let mut change = Similarity::IDENTITY;
         match direction / 2 {
