@@ -346,6 +346,29 @@ mod tests {
         assert_eq!(layout.find(9).expect("there").len(), 0);
     }
 
+    /// `docs/formats.md`: a section can be added without a new version, and columns are found as before.
+    #[test]
+    fn unknown_sections_are_skipped() {
+        let mut out = Vec::new();
+        write(&mut out, MAGIC, 3, &[(4_000_000_000, b"later"), (1, b"abc"), (8, b"")])
+            .expect("writes to memory");
+        let layout = Layout::check(&out, MAGIC, 3).expect("valid");
+        assert_eq!(&out[layout.find(1).expect("there")], b"abc");
+        assert_eq!(layout.find(7), None);
+    }
+
+    /// Offsets by hand: each section begins at the next multiple of 64, and all bytes outside sections are zero.
+    #[test]
+    fn padding_is_zero_up_to_a_multiple_of_64() {
+        let mut out = Vec::new();
+        write(&mut out, MAGIC, 3, &[(1, b"abc"), (7, &[9; 64]), (9, &[8; 65])]).expect("writes to memory");
+        let layout = Layout::check(&out, MAGIC, 3).expect("valid");
+        // The table ends at 32 + 3 * 32 = 128.
+        let ranges: Vec<_> = layout.sections.iter().map(|(_, range)| range.clone()).collect();
+        assert_eq!((ranges, out.len()), (vec![128..131, 192..256, 256..321], 384));
+        assert!(out[131..192].iter().chain(&out[321..]).all(|byte| *byte == 0));
+    }
+
     /// Every truncation and every flipped bit is refused: checksums cover the whole file but its zero padding.
     #[test]
     fn every_truncation_and_flipped_bit_is_refused() {

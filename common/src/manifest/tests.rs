@@ -71,6 +71,41 @@ fn signed_round_trip_and_refusals() {
     ));
 }
 
+/// Under a valid signature: a field that this version does not know, in the manifest, its encoder and a cell.
+#[test]
+fn unknown_fields_are_refused() {
+    use ed25519_dalek::Signer;
+    let key = generate_key();
+    let signed = manifest(1).sign(&key);
+    let end = signed.iter().position(|byte| *byte == b'\n').expect("a first line") + 1;
+    let json = std::str::from_utf8(&signed[end..]).expect("JSON");
+    let verify = |json: &str| {
+        let public = hex::encode(key.verifying_key().to_bytes());
+        let signature = hex::encode(key.sign(json.as_bytes()).to_bytes());
+        let text = format!("slag-manifest {VERSION} ed25519 {public} {signature}\n{json}");
+        Manifest::verify(text.as_bytes(), &TrustedKeys::FirstContact)
+    };
+    assert_eq!(verify(json).expect("valid").0, manifest(1));
+    for place in ["{\"version\"", "{\"name\"", "{\"cell_id\""] {
+        assert!(json.contains(place), "{place}");
+        let changed = json.replace(place, &format!("{{\"later\":1,{}", &place[1..]));
+        let error = verify(&changed).expect_err(place);
+        assert!(matches!(error, ManifestError::Content { .. }), "{place}: {error}");
+        assert!(error.to_string().contains("later"), "{place}: {error}");
+    }
+}
+
+/// One byte above 64 MiB is refused for its length, 64 MiB for what it contains.
+#[test]
+fn manifests_above_64_mib_are_refused() {
+    let verify = |len_bytes: usize| {
+        let error =
+            Manifest::verify(&vec![b'x'; len_bytes], &TrustedKeys::FirstContact).expect_err("no manifest");
+        matches!(error, ManifestError::TooLong { len_bytes: found } if found == len_bytes as u64)
+    };
+    assert_eq!((verify(64 << 20), verify((64 << 20) + 1)), (false, true));
+}
+
 #[test]
 fn every_flipped_bit_is_refused() {
     let key = generate_key();
