@@ -263,9 +263,9 @@ impl TextEncoder for Axes {
                 drop(self.gate.1.wait_while(open, |open| !*open).expect("no panic inside"));
                 0
             }
-            // The first line alone, so that a text may have a second one.
+            // The first word alone, so that a text may have others.
             _ => {
-                let axis = text.lines().next().and_then(|line| line.parse().ok());
+                let axis = text.split_whitespace().next().and_then(|word| word.parse().ok());
                 axis.filter(|axis| *axis < self.dim).ok_or_else(|| InferenceError::UnknownPhrase {
                     text: text.into(),
                     n_known: self.dim,

@@ -54,11 +54,11 @@ fn points(bytes: &[u8]) -> (Vec<String>, Vec<Point>) {
 
 async fn get_points(service: &Service, query: &str) -> (Vec<String>, Vec<Point>) {
     let response = service.send("GET", &format!("/query?{query}&format=ply")).await;
-    assert_eq!(
-        (response.status(), response.headers()["content-type"].to_str().ok()),
-        (StatusCode::OK, Some("application/octet-stream"))
-    );
-    points(&to_bytes(response.into_body(), 1 << 20).await.expect("a body"))
+    let (status, kind) = (response.status(), response.headers()["content-type"].clone());
+    let body = to_bytes(response.into_body(), 1 << 20).await.expect("a body");
+    assert_eq!(status, StatusCode::OK, "{}", String::from_utf8_lossy(&body));
+    assert_eq!(kind, "application/octet-stream");
+    points(&body)
 }
 
 #[tokio::test]
