@@ -71,7 +71,7 @@ pub struct ModelArgs {
 }
 
 /// Scene, poses, photos.
-#[derive(Debug, Args)]
+#[derive(Clone, Debug, Args)]
 pub struct InputArgs {
     /// Splat: .ply, .spz, compressed .ply, .sog (file or folder) or .splat.
     #[arg(long, value_name = "FILE")]

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Result, anyhow};
-use clap::{Args, ValueEnum};
+use anyhow::{Context, Result, anyhow};
+use clap::{Args, FromArgMatches, ValueEnum};
 use slag_common::ByteSize;
 use slag_common::shard::Profile;
 
@@ -14,6 +14,7 @@ use super::common::{
 use super::exit::Exit;
 use super::refine::RefineArgs;
 use super::sam::SamArgs;
+use super::target::{REFINEMENTS, TUNED, TargetArgs};
 use super::views::{ViewsArgs, parse_raster_width, parse_views_limit};
 use crate::cells::CellLimits;
 use crate::codebook::CodebookSettings;
@@ -31,7 +32,7 @@ use crate::shard::ShardSettings;
 use crate::shard::positions::PositionError;
 
 /// `encode`.
-#[derive(Debug, Args)]
+#[derive(Clone, Debug, Args)]
 pub struct EncodeArgs {
     /// Scene, poses, photos.
     #[command(flatten)]
@@ -59,6 +60,9 @@ pub struct EncodeArgs {
     /// Bundle of choices; other flags override single choices.
     #[arg(long, value_enum, default_value = "balanced")]
     pub preset: Preset,
+    /// A target instead of a preset.
+    #[command(flatten)]
+    pub target: TargetArgs,
     /// How contributions become embeddings.
     #[command(flatten)]
     pub refine: RefineArgs,
@@ -77,9 +81,10 @@ pub struct EncodeArgs {
     /// Where weights are rasterised: auto (GPUs, else the CPU), gpu, cpu, or an adapter's number.
     #[arg(long, value_name = "DEVICE", default_value_t)]
     pub device: DeviceChoice,
-    /// Width at which weights are rasterised: a number of pixels, `photo` for the photo's own width, at most 1024, or
-    /// `auto` for twice that width in views with long borders of masks [default: the preset's].
-    #[arg(long, value_name = "auto|photo|PX", value_parser = parse_raster_width)]
+    /// Width at which weights are rasterised: a number of pixels, `photo` for the photo's own width, at most 1024,
+    /// `twice` for twice that width, or `auto` for `twice` in views with long borders of masks alone [default: the
+    /// preset's].
+    #[arg(long, value_name = "auto|photo|twice|PX", value_parser = parse_raster_width)]
     pub raster_width: Option<RasterWidth>,
     /// Masks with fewer pixels are left out [default: the preset's].
     #[arg(long, value_name = "PX")]
@@ -156,7 +161,7 @@ impl From<WeightsArg> for WeightKind {
 }
 
 /// The search for objects.
-#[derive(Debug, Args)]
+#[derive(Clone, Debug, Args)]
 pub struct ObjectArgs {
     /// Skips the search for objects: masks of different views that show the same Gaussians.
     #[arg(long)]
@@ -247,7 +252,11 @@ fn shard_settings(args: &EncodeArgs, preset: CodebookSettings, metric: bool) -> 
 }
 
 pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    let settings = settings(args)?;
+    let mut settings = settings(args)?;
+    let expected = args.target.choose(&settings.inputs)?;
+    if let Some(expected) = &expected {
+        settings = self::settings(&with_setting(args, &expected.setting.flags)?)?;
+    }
     let (models, session) = open_models(&args.models)?;
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());
     let devices = Devices::open(args.device, GpuOptions::default())?;
@@ -284,8 +293,20 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     });
     let most = most_spent(&summary);
     let images_on = summary.images_on.as_ref().map_or(String::new(), |on| format!("images on  {on}\n"));
+    let of_target = expected.as_ref().map_or(String::new(), |e| {
+        let profile = e.setting.profile.name();
+        let bytes = summary.shard_bytes.get(profile).map_or("none made".into(), |b| ByteSize(*b).to_string());
+        format!(
+            "target     {} ({}): {:.1} s and {} of {profile} shards expected; {:.1} s and {bytes} used\n",
+            e.setting.name,
+            e.setting.flags,
+            e.seconds,
+            ByteSize(e.bytes as u64),
+            summary.wall_secs
+        )
+    });
     let lines = format!(
-        "published  generation {} in {}\n\
+        "{of_target}published  generation {} in {}\n\
          Gaussians  {} ({} without evidence, {} unusable)\n\
          views      {} of {} ({} resumed, {} without masks)\n{coverage}{skipped}{images_on}\
          masks      {} in {} regions, {} contributions\n\
@@ -328,4 +349,92 @@ fn most_spent(summary: &EncodeSummary) -> String {
          ({n_gaussians} Gaussians)\n",
         view[at], secs[at], n_masks[at], n_regions[at], n_entries[at], raster_width_px[at]
     )
+}
+
+/// Returns the arguments with the choices of a setting's flags.
+///
+/// # Errors
+/// If the flags have one that is no choice of a front.
+fn with_setting(args: &EncodeArgs, setting: &str) -> Result<EncodeArgs> {
+    let foreign = setting.split_whitespace().filter_map(|word| word.strip_prefix("--")).find(|flag| {
+        let name = flag.split('=').next().unwrap_or_default().replace('-', "_");
+        name == "segmenter" || !TUNED.iter().chain(&REFINEMENTS).any(|tuned| *tuned == name)
+    });
+    if let Some(flag) = foreign {
+        return Err(anyhow!(
+            "the front's setting {setting:?} has --{flag}, which no front may set; remove it"
+        ));
+    }
+    let words =
+        ["--scene", "-", "--views", "-", "--store", "-"].into_iter().chain(setting.split_whitespace());
+    let command = EncodeArgs::augment_args(clap::Command::new("encode").no_binary_name(true));
+    let chosen = command
+        .try_get_matches_from(words)
+        .and_then(|matches| EncodeArgs::from_arg_matches(&matches))
+        .with_context(|| format!("the front's setting {setting:?} is not understood"))?;
+    let mut with = args.clone();
+    with.preset = chosen.preset;
+    with.background = chosen.background;
+    with.weights = chosen.weights;
+    with.views_limit = chosen.views_limit;
+    with.raster_width = chosen.raster_width;
+    with.min_mask_px = chosen.min_mask_px;
+    with.keep_slivers = chosen.keep_slivers;
+    with.compact_error = chosen.compact_error;
+    with.objects = chosen.objects.clone();
+    with.refine = chosen.refine.clone();
+    with.refine.keep_views = args.refine.keep_views;
+    with.views = chosen.views.clone();
+    with.views.time_budget = args.views.time_budget;
+    Ok(with)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(flags: &str) -> Result<EncodeArgs, clap::Error> {
+        let command = EncodeArgs::augment_args(clap::Command::new("encode").no_binary_name(true));
+        let line = format!("--scene a --views b --store c {flags}");
+        EncodeArgs::from_arg_matches(&command.try_get_matches_from(line.split_whitespace())?)
+    }
+
+    #[test]
+    fn a_setting_changes_its_choices_and_nothing_else() {
+        let args = parse("--front f.json --target-seconds 60 --time-budget 9 --threads 3 --keep-views")
+            .expect("parses");
+        let with =
+            with_setting(&args, "--preset fast --views-limit 25% --median-steps 3").expect("understood");
+        assert_eq!((with.preset, with.views_limit), (Preset::Fast, Some(ViewsLimit::Share(0.25))));
+        assert_eq!(with.refine.aggregation(crate::lift::Aggregation::REFINED).median_steps, 3);
+        assert_eq!((with.threads, with.refine.keep_views, with.store), (Some(3), true, "c".into()));
+        assert_eq!(with.views.time_budget.map(|t| t.as_secs()), Some(9));
+        for wrong in ["--scene x", "--segmenter x", "--threads 1", "--preset nothing", "--models=x"] {
+            let message = with_setting(&args, wrong).expect_err("refused").to_string();
+            assert!(message.contains(wrong), "{message}");
+        }
+    }
+
+    #[test]
+    fn a_target_excludes_what_it_chooses() {
+        for tuned in TUNED.iter().chain(&REFINEMENTS) {
+            let value = match *tuned {
+                "preset" => " fast",
+                "background" => " white",
+                "weights" => " blend",
+                "view_order" => " names",
+                "raster_width" => " 320",
+                "fill" => " true",
+                "keep_slivers" | "no_objects" => "",
+                _ => " 1",
+            };
+            let flag = format!("--{}{value}", tuned.replace('_', "-"));
+            parse(&flag).expect("a flag of encode");
+            let error = parse(&format!("--front f.json --target-bytes 3MiB {flag}")).expect_err("excluded");
+            assert_eq!(error.kind(), clap::error::ErrorKind::ArgumentConflict, "{flag}");
+        }
+        assert!(parse("--front f.json --target-seconds 0").is_err());
+        let without = parse("--target-seconds 60").expect_err("no front");
+        assert_eq!(without.kind(), clap::error::ErrorKind::MissingRequiredArgument);
+    }
 }

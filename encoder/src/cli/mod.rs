@@ -15,6 +15,7 @@ mod query;
 pub mod refine;
 mod sam;
 mod serve;
+mod target;
 mod views;
 
 use anyhow::Result;

@@ -11,7 +11,7 @@ use crate::encode::Masks;
 use crate::segment::{SamLevels, SamSettings, ScoreFilter};
 
 /// Masks from Segment Anything; the other flags need `--segmenter`.
-#[derive(Debug, Args)]
+#[derive(Clone, Debug, Args)]
 #[command(next_help_heading = "Segment Anything")]
 pub struct SamArgs {
     /// SAM, SAM 2, MobileSAM, EdgeTAM or another model of that kind: a folder with model.toml, or the name of a pulled

@@ -8,7 +8,7 @@ use crate::encode::{RasterWidth, ViewOrder, ViewsLimit};
 
 /// The order of views and the time for them. Contributions are kept until all views are used, so an encode with a
 /// higher limit or more time continues from there.
-#[derive(Debug, Args)]
+#[derive(Clone, Debug, Args)]
 pub struct ViewsArgs {
     /// Order in which views are taken [default: coverage with a limit or a budget, else names].
     #[arg(long, value_enum, value_name = "ORDER")]
@@ -49,11 +49,12 @@ pub(super) fn parse_raster_width(text: &str) -> Result<RasterWidth, String> {
     match text {
         "auto" => Ok(RasterWidth::ByContent),
         "photo" => Ok(RasterWidth::Photo),
+        "twice" => Ok(RasterWidth::Twice),
         _ => {
             let width_px = text.parse().ok().filter(|px| (16..=8192).contains(px));
             width_px
                 .map(RasterWidth::Px)
-                .ok_or_else(|| format!("{text:?} is none of: auto, photo, 16 to 8192 pixels"))
+                .ok_or_else(|| format!("{text:?} is none of: auto, photo, twice, 16 to 8192 pixels"))
         }
     }
 }

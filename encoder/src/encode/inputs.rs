@@ -49,6 +49,16 @@ impl Inputs {
     }
 }
 
+/// Returns the numbers of views with a photo and of Gaussians.
+///
+/// # Errors
+/// [`EncodeError`] if scene or poses cannot be read.
+pub fn count_inputs(inputs: &InputSettings) -> Result<(usize, usize), EncodeError> {
+    let scene = splat::read(&inputs.scene, &ReadOptions { with_sh_rest: false })?;
+    let views = read_views(inputs)?.views;
+    Ok((views.len() - ingest::missing_images(&views).len(), scene.len()))
+}
+
 /// Reads the poses of every nth frame.
 fn read_views(inputs: &InputSettings) -> Result<ViewSet, EncodeError> {
     let mut set = poses::read(&inputs.views, inputs.images.as_deref())?;

@@ -16,6 +16,7 @@ mod context;
 pub mod coverage;
 mod engines;
 mod error;
+pub mod front;
 mod identity;
 mod inputs;
 mod job;
@@ -37,6 +38,7 @@ use context::RunContext;
 pub use crate::memory::{MemoryError, Reservation};
 pub use engines::{Engines, Perturbation};
 pub use error::EncodeError;
+pub use inputs::count_inputs;
 pub use preset::{Choices, Preset};
 pub use report::{CellReport, EncodeSummary, SkippedView, StageReport, ViewsReport};
 pub use settings::{

@@ -22,7 +22,7 @@ pub enum Preset {
     Fast,
     /// All views; refined contributions.
     Balanced,
-    /// As `balanced`, with half the errors of scores in the shards.
+    /// As `balanced`, with rasters of twice the photo's width in every view.
     Accurate,
 }
 
@@ -94,10 +94,8 @@ impl Preset {
                 raster_width: RasterWidth::Px(320),
                 ..balanced
             },
-            Self::Accurate => Choices {
-                codebook: CodebookSettings { compact_error: 0.05, balanced_error: 0.01, ..balanced.codebook },
-                ..balanced
-            },
+            // Finer shards are no choice here: exact vectors answer no better than compact ones (docs/accuracy.md).
+            Self::Accurate => Choices { raster_width: RasterWidth::Twice, ..balanced },
         }
     }
 }
@@ -139,9 +137,8 @@ mod tests {
         assert_eq!(fast.views_limit.of(96), 48);
         assert_eq!((fast.mask_levels, fast.raster_width), (2, RasterWidth::Px(320)));
         assert_eq!(fast.aggregation, balanced.aggregation);
+        assert_eq!((accurate.raster_width, accurate.codebook), (RasterWidth::Twice, balanced.codebook));
         assert_eq!(accurate.aggregation, balanced.aggregation);
-        assert_eq!(accurate.codebook.compact_error, 0.5 * balanced.codebook.compact_error);
-        assert_eq!(accurate.codebook.balanced_error, 0.5 * balanced.codebook.balanced_error);
     }
 
     /// Oracle: the paper's text and LangSplat's `preprocess.py`, copied by hand.

@@ -150,6 +150,8 @@ pub enum RasterWidth {
     ByContent,
     /// The photo's own width, at most `MAX_RASTER_WIDTH_PX`.
     Photo,
+    /// Twice the width of [`Self::Photo`] in every view.
+    Twice,
     /// This many pixels.
     Px(u32),
 }

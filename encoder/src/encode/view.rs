@@ -215,7 +215,7 @@ impl<'a> ViewStages<'a> {
     fn base_width_px(&self, loaded: &LoadedImage) -> u32 {
         match self.plan.settings.view.raster_width {
             RasterWidth::Px(width_px) => width_px,
-            RasterWidth::ByContent | RasterWidth::Photo => {
+            RasterWidth::ByContent | RasterWidth::Photo | RasterWidth::Twice => {
                 loaded.view.intrinsics.width_px.min(MAX_RASTER_WIDTH_PX)
             }
         }
@@ -235,15 +235,15 @@ impl<'a> ViewStages<'a> {
             (raster_view, regions, masks_of_region)
         };
         let base_px = self.base_width_px(loaded);
-        let mut made = regions_at(base_px);
-        let mut width_px = base_px;
         // Twice the width keeps pixels in step with those of the photo, so that masks keep their outlines.
-        if self.plan.settings.view.raster_width == RasterWidth::ByContent
-            && border_share(&made.1) > LONG_BORDERS
-        {
-            width_px = 2 * base_px;
-            made = regions_at(width_px);
-        }
+        let (width_px, made) = match self.plan.settings.view.raster_width {
+            RasterWidth::Twice => (2 * base_px, regions_at(2 * base_px)),
+            RasterWidth::ByContent => match regions_at(base_px) {
+                made if border_share(&made.1) > LONG_BORDERS => (2 * base_px, regions_at(2 * base_px)),
+                made => (base_px, made),
+            },
+            RasterWidth::Photo | RasterWidth::Px(_) => (base_px, regions_at(base_px)),
+        };
         let (raster_view, regions, masks_of_region) = made;
         let weight_scale = (f64::from(base_px) / f64::from(width_px)).powi(2) as f32;
         let (width_px, height_px) = loaded.image.dimensions();

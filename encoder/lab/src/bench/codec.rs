@@ -11,7 +11,7 @@ use slag_common::shard::{Profile, ShardLayout};
 use slag_common::{Gaussians, Hash32};
 
 use super::machine::Machine;
-use super::plot::{Plot, Scale, Series};
+use super::plot::{Plot, Scale, Series, Style};
 use super::timing::timed_ms;
 use crate::generate::field::Field;
 use slag_encoder::cells::{CellLimits, split};
@@ -442,7 +442,7 @@ impl CodecReport {
             let of_name = self.points.iter().filter(|p| p.codec == name);
             let mut points: Vec<(f64, f64)> = of_name.map(|p| (p.bytes, p.mean_error)).collect();
             points.sort_by(|a, b| a.0.total_cmp(&b.0));
-            Series { name: name.into(), points, labels: Vec::new() }
+            Series { name: name.into(), style: Style::Line, points, labels: Vec::new(), spreads: Vec::new() }
         });
         let plot = Plot {
             note: String::new(),

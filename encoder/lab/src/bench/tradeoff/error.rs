@@ -9,7 +9,7 @@ pub enum TradeoffError {
     #[error(transparent)]
     Io(#[from] std::io::Error),
     /// The grid is malformed.
-    #[error("{}: {what}; expected {{\"points\": [..]}}, each with axis and name, and optionally views, lift, eval, profile", path.display())]
+    #[error("{}: {what}; expected {{\"points\": [..]}}, each with axis and name, and optionally views, lift, eval, profile; and \"ordered\": [axis, ..]", path.display())]
     Grid {
         /// The file.
         path: PathBuf,
@@ -17,7 +17,7 @@ pub enum TradeoffError {
         what: String,
     },
     /// The flags have an unknown placeholder.
-    #[error("{flags:?}: unknown placeholder {word}; the only one is {{masks}}")]
+    #[error("{flags:?}: unknown placeholder {word}; known are {{masks}}, {{sam}} and {{gpu:N}}")]
     Flags {
         /// The flags.
         flags: String,

@@ -16,6 +16,10 @@ pub struct Figures {
     pub made_by: String,
     /// Views used.
     pub n_views: u64,
+    /// Views with a photo: the scene's, of which those were chosen.
+    pub n_photos: u64,
+    /// Gaussians in cells.
+    pub n_gaussians: u64,
     /// Masks used.
     pub n_masks: u64,
     /// Coverage by the chosen views relative to all views, where views were chosen by coverage.

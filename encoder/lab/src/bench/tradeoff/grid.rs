@@ -13,8 +13,11 @@
 //! contributions; `lift` are its other flags; `eval` are flags of `eval labelled`. The shards of `profile` are evaluated,
 //! measured and queried. All profiles are made, because the exact shards tell which Gaussian is which.
 //!
-//! `{masks}` stands for the scene's folder of true masks. Points of a scene with the same `views` share one store, and
-//! their contributions are computed once.
+//! `{masks}` stands for the scene's folder of true masks, `{sam}` for the model directory of Segment Anything, and
+//! `{gpu:N}` for the number N, where the machine has more GPUs than that; without these a point is left out. Points of
+//! a scene with the same `views` share one store, and their contributions are computed once.
+//!
+//! `ordered` names the axes whose points ascend: plots connect these by a line, in the order of the grid.
 
 use std::path::{Path, PathBuf};
 
@@ -25,6 +28,7 @@ use super::error::TradeoffError;
 
 const QUICK: &str = include_str!("quick.json");
 const FULL: &str = include_str!("full.json");
+const PAPER: &str = include_str!("paper.json");
 
 /// Points to measure.
 #[derive(Clone, Debug, Deserialize)]
@@ -32,6 +36,9 @@ const FULL: &str = include_str!("full.json");
 pub struct Grid {
     /// The points, in any order.
     pub points: Vec<Point>,
+    /// Axes whose points ascend.
+    #[serde(default)]
+    pub ordered: Vec<String>,
 }
 
 /// One way of encoding a scene.
@@ -77,6 +84,14 @@ impl Grid {
         Self::parse(FULL, Path::new("full.json"))
     }
 
+    /// Returns the paper's four configurations: grid of SAM's points by image step.
+    ///
+    /// # Errors
+    /// None: a test parses the built-in grid.
+    pub fn paper() -> Result<Self, TradeoffError> {
+        Self::parse(PAPER, Path::new("paper.json"))
+    }
+
     /// Reads a grid.
     ///
     /// # Errors
@@ -94,9 +109,26 @@ impl Grid {
                 return Err(wrong(format!("{} / {} occurs twice", point.axis, point.name)));
             }
         }
+        for axis in &grid.ordered {
+            if !grid.points.iter().any(|p| p.axis == *axis) {
+                return Err(wrong(format!("{axis} is ordered, and no point has this axis")));
+            }
+        }
         Ok(grid)
     }
 }
+
+/// What placeholders stand for, besides the scene's own data.
+#[derive(Clone, Debug, Default)]
+pub struct Equipment {
+    /// Model directory of Segment Anything.
+    pub segmenter: Option<PathBuf>,
+    /// GPUs, software renderers not counted.
+    pub n_gpus: usize,
+}
+
+/// Flags whose placeholders are filled in, or what is missing for it.
+pub type Expanded = Result<Vec<String>, &'static str>;
 
 /// A labelled scene: splat and poses beside `gt/` and `test/`, as `generate scene` and the labelled house have them.
 #[derive(Clone, Debug)]
@@ -136,11 +168,11 @@ impl LabelledScene {
         Some(self.dir.join("gt/masks")).filter(|path| path.is_dir())
     }
 
-    /// Replaces the placeholders in flags; `None` where the scene lacks the value.
+    /// Replaces the placeholders in flags; the inner error says what scene or machine lacks.
     ///
     /// # Errors
     /// [`TradeoffError::Flags`] for an unknown placeholder.
-    pub fn expand(&self, flags: &str) -> Result<Option<Vec<String>>, TradeoffError> {
+    pub fn expand(&self, flags: &str, equipment: &Equipment) -> Result<Expanded, TradeoffError> {
         let unknown = |word: &str| TradeoffError::Flags { flags: flags.to_owned(), word: word.to_owned() };
         let mut words = Vec::new();
         for word in flags.split_whitespace() {
@@ -150,12 +182,23 @@ impl LabelledScene {
                 None => word.to_owned(),
                 Some("masks") => match self.masks() {
                     Some(path) => path.display().to_string(),
-                    None => return Ok(None),
+                    None => return Ok(Err("it has no gt/masks")),
                 },
-                Some(_) => return Err(unknown(word)),
+                Some("sam") => match &equipment.segmenter {
+                    Some(path) => path.display().to_string(),
+                    None => return Ok(Err("no --segmenter is given")),
+                },
+                Some(inner) => {
+                    let number = inner.strip_prefix("gpu:").and_then(|n| n.parse::<usize>().ok());
+                    match number {
+                        Some(number) if number < equipment.n_gpus => number.to_string(),
+                        Some(_) => return Ok(Err("the machine has too few GPUs")),
+                        None => return Err(unknown(word)),
+                    }
+                }
             });
         }
-        Ok(Some(words))
+        Ok(Ok(words))
     }
 }
 
@@ -175,13 +218,15 @@ mod tests {
     fn built_in_grids_have_flags_of_encode() {
         let dir = tempfile::tempdir().expect("a folder");
         fs_err::create_dir_all(dir.path().join("gt/masks")).expect("makes");
-        for grid in [Grid::quick(), Grid::full()] {
+        let equipment = Equipment { segmenter: Some(dir.path().into()), n_gpus: 16 };
+        for grid in [Grid::quick(), Grid::full(), Grid::paper()] {
             let grid = grid.expect("a grid");
-            assert!(grid.points.len() > 5);
+            assert!(grid.points.len() >= 4);
             for point in &grid.points {
                 let scene = scene(dir.path());
-                let expand =
-                    |flags: &String| scene.expand(flags).expect("known words").expect("the scene has masks");
+                let expand = |flags: &String| {
+                    scene.expand(flags, &equipment).expect("known words").expect("it has all")
+                };
                 let mut line: Vec<String> = "slag-encoder encode --scene a --views b --store c"
                     .split(' ')
                     .map(str::to_owned)
@@ -201,11 +246,20 @@ mod tests {
     fn placeholders_are_the_scenes() {
         let dir = tempfile::tempdir().expect("a folder");
         let scene = scene(dir.path());
-        let words = scene.expand("--views-limit 25% --x").expect("known").expect("there");
+        let nothing = Equipment::default();
+        let words = scene.expand("--views-limit 25% --x", &nothing).expect("known").expect("there");
         assert_eq!(words, ["--views-limit", "25%", "--x"]);
-        assert_eq!(scene.expand("--masks {masks}").expect("known"), None, "the scene has none");
-        for wrong in ["{view}", "{masks", "a{masks}"] {
-            let message = scene.expand(wrong).expect_err("unknown").to_string();
+        assert_eq!(scene.expand("--masks {masks}", &nothing).expect("known"), Err("it has no gt/masks"));
+        assert_eq!(
+            scene.expand("--segmenter {sam}", &nothing).expect("known"),
+            Err("no --segmenter is given")
+        );
+        let one = Equipment { segmenter: Some("/a b".into()), n_gpus: 1 };
+        assert_eq!(scene.expand("--x {sam}", &one).expect("known"), Ok(vec!["--x".into(), "/a b".into()]));
+        assert_eq!(scene.expand("{gpu:0}", &one).expect("known"), Ok(vec!["0".into()]));
+        assert!(scene.expand("{gpu:1}", &one).expect("known").is_err());
+        for wrong in ["{view}", "{masks", "a{masks}", "{gpu:x}"] {
+            let message = scene.expand(wrong, &nothing).expect_err("unknown").to_string();
             assert!(message.contains(wrong), "{message}");
         }
         let wrong = r#"{"points": [{"axis": "a", "name": "b"}, {"axis": "a", "name": "b"}]}"#;

@@ -9,12 +9,10 @@ use slag_encoder::progress::Progress;
 use super::error::TradeoffError;
 use super::figures::Figures;
 use super::grid::{Grid, LabelledScene, Point};
+use super::paper::PAPER;
 use super::programs::{Programs, remove};
 use super::report::TradeoffReport;
 use crate::bench::machine::Machine;
-
-/// Published encode times of the paper's four settings, seconds.
-pub(super) const PAPER_SECONDS: [f64; 4] = [129.0, 309.0, 1328.0, 3026.0];
 
 /// What to measure.
 #[derive(Clone, Debug)]
@@ -61,16 +59,19 @@ pub fn run(
         // In the order of the grid, whatever the order of the work.
         for point in &settings.grid.points {
             match of_point.remove(&(point.axis.as_str(), point.name.as_str())) {
-                Some(Some(figures)) => measured.push(figures),
-                _ => left_out
-                    .push(format!("{} / {} on {}: it has no gt/masks", point.axis, point.name, scene.name)),
+                Some(Ok(figures)) => measured.push(figures),
+                Some(Err(reason)) => {
+                    left_out.push(format!("{} / {} on {}: {reason}", point.axis, point.name, scene.name));
+                }
+                None => {}
             }
         }
     }
     progress.end();
     let report = TradeoffReport {
         machine: Machine::here(),
-        paper_seconds: PAPER_SECONDS,
+        paper: PAPER,
+        ordered: settings.grid.ordered.clone(),
         figures: measured,
         left_out,
     };
@@ -78,14 +79,17 @@ pub fn run(
     Ok(report)
 }
 
-/// Measures points with the same contributions; `None` where the scene lacks the data that a point needs.
+/// A point, and its figures or what it needs that scene or machine lack.
+type Measured<'p> = (&'p Point, Result<Figures, &'static str>);
+
+/// Measures points with the same contributions.
 fn measure_group<'p>(
     scene: &LabelledScene,
     group: &[&'p Point],
     programs: &Programs,
     out: &Path,
     progress: &dyn Progress,
-) -> Result<Vec<(&'p Point, Option<Figures>)>, TradeoffError> {
+) -> Result<Vec<Measured<'p>>, TradeoffError> {
     let store = out.join("store");
     let mut done = Vec::new();
     // Seconds of the views, once known.
@@ -96,17 +100,19 @@ fn measure_group<'p>(
             let figures: Figures = serde_json::from_slice(&fs_err::read(&path)?)
                 .map_err(|source| TradeoffError::Measured { path, source })?;
             views_seconds.get_or_insert(figures.views_seconds);
-            done.push((*point, Some(figures)));
+            done.push((*point, Ok(figures)));
             progress.advance(1);
             continue;
         }
-        let expand = |flags: &str| scene.expand(flags);
-        let (Some(views), Some(lift), Some(eval)) =
-            (expand(&point.views)?, expand(&point.lift)?, expand(&point.eval)?)
-        else {
-            done.push((*point, None));
-            progress.advance(1);
-            continue;
+        let expand = |flags: &str| scene.expand(flags, &programs.equipment);
+        let flags = [expand(&point.views)?, expand(&point.lift)?, expand(&point.eval)?];
+        let (views, lift, eval) = match flags {
+            [Ok(views), Ok(lift), Ok(eval)] => (views, lift, eval),
+            [Err(reason), ..] | [_, Err(reason), _] | [.., Err(reason)] => {
+                done.push((*point, Err(reason)));
+                progress.advance(1);
+                continue;
+            }
         };
         let run = programs.of(scene, point);
         // The duration of views that an earlier run left is unknown.
@@ -132,6 +138,8 @@ fn measure_group<'p>(
             point: (*point).clone(),
             made_by: programs.made_by.clone(),
             n_views: integer(&encoded, "n_views"),
+            n_photos: integer(&encoded, "n_views_with_photo"),
+            n_gaussians: n_gaussians as u64,
             n_masks: integer(&encoded, "n_masks"),
             coverage: encoded["coverage"]["coverage"].as_f64(),
             miou: run.figure(all, "miou")?,
@@ -150,7 +158,7 @@ fn measure_group<'p>(
         // Renamed into place last: a point is measured completely or not at all.
         let text = serde_json::to_vec_pretty(&figures).map_err(std::io::Error::from)?;
         slag_common::durable::write(&path, &text)?;
-        done.push((*point, Some(figures)));
+        done.push((*point, Ok(figures)));
         progress.advance(1);
     }
     remove(&store)?;
@@ -160,7 +168,8 @@ fn measure_group<'p>(
 /// Returns the name of a point's file; it depends on scene, point and programs.
 fn file_name(scene: &LabelledScene, point: &Point, programs: &Programs) -> String {
     let dir = scene.dir.canonicalize().unwrap_or_else(|_| scene.dir.clone());
-    let key = format!("{dir:?} {point:?} {}", programs.made_by);
+    // The first word is the version of the figures: files of another one are not read.
+    let key = format!("2 {dir:?} {point:?} {}", programs.made_by);
     format!("{}-{}.json", scene.name, &blake3::hash(key.as_bytes()).to_hex()[..16])
 }
 

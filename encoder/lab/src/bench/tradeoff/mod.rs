@@ -7,8 +7,12 @@
 
 mod error;
 mod figures;
+mod front;
 pub mod grid;
+mod means;
 mod measure;
+mod paper;
+mod picture;
 mod programs;
 mod report;
 #[cfg(test)]
@@ -16,7 +20,7 @@ mod tests;
 
 pub use error::TradeoffError;
 pub use figures::Figures;
-pub use grid::{Grid, LabelledScene, Point};
+pub use grid::{Equipment, Grid, LabelledScene, Point};
 pub use measure::{TradeoffSettings, run};
 pub use programs::Programs;
 pub use report::TradeoffReport;

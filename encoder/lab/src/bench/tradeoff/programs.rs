@@ -9,7 +9,7 @@ use serde_json::Value;
 use slag_common::shard::Profile;
 
 use super::error::TradeoffError;
-use super::grid::{LabelledScene, Point};
+use super::grid::{Equipment, LabelledScene, Point};
 
 /// Number of Gaussians that a timed query returns.
 const QUERY_LIMIT: &str = "1000";
@@ -29,6 +29,8 @@ pub struct Programs {
     pub models: Vec<String>,
     /// Version, models and device in words.
     pub made_by: String,
+    /// What placeholders of flags stand for.
+    pub equipment: Equipment,
 }
 
 /// The runs of one point.

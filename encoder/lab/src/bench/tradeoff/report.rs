@@ -7,17 +7,18 @@ use serde::Serialize;
 
 use super::error::TradeoffError;
 use super::figures::Figures;
-use super::grid::Point;
+use super::paper::PaperRow;
 use crate::bench::machine::Machine;
-use crate::bench::plot::{Plot, Scale, Series};
 
 /// Figures of a measured grid.
 #[derive(Clone, Debug, Serialize)]
 pub struct TradeoffReport {
     /// The machine.
     pub machine: Machine,
-    /// Encode times of the paper's table, on its machine and scenes.
-    pub paper_seconds: [f64; 4],
+    /// The paper's table, on its machine and scene.
+    pub paper: [PaperRow; 4],
+    /// Axes whose points ascend.
+    pub ordered: Vec<String>,
     /// All points, in the order of scenes and grid.
     pub figures: Vec<Figures>,
     /// Points left out because a scene lacks their data.
@@ -25,11 +26,11 @@ pub struct TradeoffReport {
 }
 
 /// A cost to plot accuracy against.
-struct Cost {
+pub(super) struct Cost {
     /// Part of the plots' file names.
-    file: &'static str,
-    axis: &'static str,
-    of: fn(&Figures) -> Option<f64>,
+    pub(super) file: &'static str,
+    pub(super) axis: &'static str,
+    pub(super) of: fn(&Figures) -> Option<f64>,
 }
 
 const COSTS: [Cost; 3] = [
@@ -38,9 +39,6 @@ const COSTS: [Cost; 3] = [
     Cost { file: "query", axis: "milliseconds per query", of: |f| f.query_ms },
 ];
 
-/// Axis with named points in the plots.
-const PRESETS: &str = "preset";
-
 /// Returns which (cost, accuracy) points are Pareto-optimal: no other point is at least as cheap and as accurate, and differs.
 pub fn pareto(points: &[(f64, f64)]) -> Vec<bool> {
     let beats = |a: &(f64, f64), b: &(f64, f64)| a.0 <= b.0 && a.1 >= b.1 && a != b;
@@ -48,7 +46,8 @@ pub fn pareto(points: &[(f64, f64)]) -> Vec<bool> {
 }
 
 impl TradeoffReport {
-    /// Writes `tradeoff.csv`, `tradeoff.json`, `tradeoff.txt` and the plots.
+    /// Writes `tradeoff.csv`, `tradeoff.json`, `tradeoff.txt`, `front.json` and the plots: one per scene and cost, and of
+    /// several scenes one of their mean.
     pub(super) fn write(&self, out: &Path) -> Result<(), TradeoffError> {
         fs_err::write(out.join("tradeoff.csv"), self.csv())?;
         fs_err::write(
@@ -56,10 +55,18 @@ impl TradeoffReport {
             serde_json::to_vec_pretty(self).map_err(std::io::Error::from)?,
         )?;
         fs_err::write(out.join("tradeoff.txt"), self.to_string())?;
-        for scene in self.scenes() {
+        let front = serde_json::to_vec_pretty(&self.front()).map_err(std::io::Error::from)?;
+        fs_err::write(out.join("front.json"), front)?;
+        let scenes = self.scenes();
+        let mut pictures: Vec<(&str, &[&str])> =
+            scenes.iter().map(|s| (*s, std::slice::from_ref(s))).collect();
+        if scenes.len() > 1 {
+            pictures.push(("mean", &scenes));
+        }
+        for (name, scenes) in pictures {
             for cost in &COSTS {
-                if let Some(svg) = self.svg(scene, cost) {
-                    fs_err::write(out.join(format!("{scene}-{}.svg", cost.file)), svg)?;
+                if let Some(svg) = self.svg(name, scenes, cost) {
+                    fs_err::write(out.join(format!("{name}-{}.svg", cost.file)), svg)?;
                 }
             }
         }
@@ -68,14 +75,14 @@ impl TradeoffReport {
 
     /// Returns the paper's encode times as a sentence.
     fn paper(&self) -> String {
-        let seconds = self.paper_seconds.map(|s| s.to_string()).join(", ");
+        let seconds = self.paper.map(|row| row.seconds.to_string()).join(", ");
         format!(
             "For comparison, the paper (Szilagyi et al. 2025) reports encode times of {seconds} s, on other scenes and another \
              machine."
         )
     }
 
-    fn scenes(&self) -> Vec<&str> {
+    pub(super) fn scenes(&self) -> Vec<&str> {
         let mut scenes: Vec<&str> = self.figures.iter().map(|f| f.scene.as_str()).collect();
         scenes.dedup();
         scenes
@@ -133,43 +140,6 @@ impl TradeoffReport {
             out += &format!("{texts},{}\n", figures.join(","));
         }
         out
-    }
-
-    /// Draws accuracy against a cost: a line per axis of the grid, and one along the Pareto front.
-    fn svg(&self, scene: &str, cost: &Cost) -> Option<String> {
-        let of_scene = self.of(scene);
-        let at = |f: &&Figures| (cost.of)(f).map(|value| (value, f.miou));
-        let mut points: Vec<((f64, f64), &Point)> =
-            of_scene.iter().filter_map(|f| Some((at(f)?, &f.point))).collect();
-        points.sort_by(|a, b| a.0.0.total_cmp(&b.0.0));
-        let all: Vec<(f64, f64)> = points.iter().map(|(at, _)| *at).collect();
-        if all.is_empty() {
-            return None;
-        }
-        // In the order of the grid.
-        let mut series: Vec<Series> = Vec::new();
-        for f in &of_scene {
-            if !series.iter().any(|series| series.name == f.point.axis) {
-                let mut of_axis =
-                    Series { name: f.point.axis.clone(), points: Vec::new(), labels: Vec::new() };
-                for (at, point) in points.iter().filter(|(_, point)| point.axis == f.point.axis) {
-                    of_axis.points.push(*at);
-                    // Only presets are labelled: users choose them by name.
-                    of_axis.labels.extend((point.axis == PRESETS).then(|| point.name.clone()));
-                }
-                series.push(of_axis);
-            }
-        }
-        let front = all.iter().zip(pareto(&all)).filter(|(_, front)| *front).map(|(point, _)| *point);
-        series.push(Series { name: "Pareto front".into(), points: front.collect(), labels: Vec::new() });
-        let plot = Plot {
-            title: format!("{scene}: accuracy against {}", cost.axis),
-            note: format!("{} threads. {}", self.machine.n_threads, self.paper()),
-            across: cost.axis,
-            up: "multi-class mIoU",
-            up_scale: Scale::Linear,
-        };
-        Some(plot.svg(&series))
     }
 }
 

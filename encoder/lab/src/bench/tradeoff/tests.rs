@@ -2,7 +2,7 @@ use std::path::Path;
 
 use slag_common::shard::Profile;
 
-use super::measure::PAPER_SECONDS;
+use super::paper::PAPER;
 use super::report::pareto;
 use super::*;
 use crate::bench::machine::Machine;
@@ -22,6 +22,8 @@ fn figures(axis: &str, name: &str, seconds: f64, miou: f64) -> Figures {
         },
         made_by: text("test"),
         n_views: 8,
+        n_photos: 8,
+        n_gaussians: 2_000_000,
         n_masks: 100,
         coverage: Some(0.5),
         miou,
@@ -51,7 +53,8 @@ fn no_point_beats_the_front() {
 fn reports_name_every_point_and_mark_the_front() {
     let report = TradeoffReport {
         machine: Machine::here(),
-        paper_seconds: PAPER_SECONDS,
+        paper: PAPER,
+        ordered: vec!["views".into()],
         figures: vec![
             figures("views", "all", 10.0, 0.5),
             figures("views", "1/4", 3.0, 0.45),
@@ -74,6 +77,76 @@ fn reports_name_every_point_and_mark_the_front() {
     let json: serde_json::Value = serde_json::from_str(&read("tradeoff.json")).expect("JSON");
     assert_eq!(json["figures"][1]["name"], "1/4");
     assert!(read("room-seconds.svg").contains("Pareto front") && !dir.path().join("room-query.svg").exists());
+}
+
+/// Oracle: for every budget, the best accuracy of all points that it pays for.
+#[test]
+fn the_front_is_the_best_for_every_budget() {
+    let random = |n: u64| (slag_math::random::mix64(n) >> 40) as f64 / f64::from(1 << 24);
+    let points: Vec<(f64, f64)> =
+        // Few values, so that ties occur.
+        (0..200).map(|n| ((random(2 * n) * 20.0).floor(), (random(2 * n + 1) * 20.0).floor())).collect();
+    let on_front = pareto(&points);
+    for (point, is_on) in points.iter().zip(&on_front) {
+        let affordable = points.iter().filter(|other| other.0 <= point.0);
+        let best = affordable.map(|other| other.1).fold(f64::MIN, f64::max);
+        let cheapest =
+            points.iter().filter(|other| other.1 >= point.1).map(|other| other.0).fold(f64::MAX, f64::min);
+        assert_eq!(*is_on, best == point.1 && cheapest == point.0, "{point:?}");
+    }
+}
+
+/// Means, spread and front by hand: two scenes, of which the second is harder.
+#[test]
+fn several_scenes_have_a_mean_and_a_front() {
+    let of = |scene: &str, axis: &str, name: &str, seconds: f64, miou: f64| {
+        let mut figures = figures(axis, name, seconds, miou);
+        figures.scene = scene.into();
+        figures.point.views = format!("--preset {name}");
+        figures
+    };
+    let mut given = of("b", "masks", "given", 1.0, 0.9);
+    given.point.views = "--masks {masks}".into();
+    let mut given_a = given.clone();
+    given_a.scene = "a".into();
+    let report = TradeoffReport {
+        machine: Machine::here(),
+        paper: PAPER,
+        ordered: Vec::new(),
+        figures: vec![
+            of("a", "preset", "fast", 5.0, 0.6),
+            of("a", "preset", "plain", 9.0, 0.5),
+            given_a,
+            of("b", "preset", "fast", 7.0, 0.4),
+            of("b", "preset", "plain", 9.0, 0.3),
+            given,
+        ],
+        left_out: Vec::new(),
+    };
+    let dir = tempfile::tempdir().expect("a folder");
+    report.write(dir.path()).expect("writes");
+    let front: serde_json::Value =
+        serde_json::from_slice(&fs_err::read(dir.path().join("front.json")).expect("reads")).expect("JSON");
+    let settings = front["settings"].as_array().expect("settings");
+    // `plain` costs as many bytes and more seconds; given masks are no setting for every scene.
+    assert_eq!(settings.len(), 1, "{front}");
+    assert_eq!(settings[0]["flags"], "--preset fast");
+    let near = |name: &str, expected: f64| {
+        let found = settings[0][name].as_f64().expect("a number");
+        assert!((found - expected).abs() < 1e-12, "{name}: {found}");
+    };
+    near("miou", 0.5);
+    near("miou_spread", 0.02f64.sqrt());
+    // One of the seconds is the views', 8 of them; the rest, 4 and 6, is for 2 million Gaussians.
+    near("seconds_per_view", 0.125);
+    near("seconds_per_million_gaussians", 2.5);
+    let svg = fs_err::read_to_string(dir.path().join("mean-seconds.svg")).expect("reads");
+    assert!(svg.contains("over 2 scenes") && svg.contains("ScanNet scene0000_00"), "{svg}");
+    for label in [">16/20<", ">32/2<", ">fast<", ">given<"] {
+        assert_eq!(svg.matches(label).count(), 1, "{label}");
+    }
+    // Presets have no order: the front is the only line.
+    assert_eq!(svg.matches("<polyline").count(), 1, "{svg}");
 }
 
 /// A script records its arguments and prints what the real programs print. The second point reuses the first one's
@@ -120,14 +193,18 @@ esac
         point("other", "--masks {masks}", ""),
         point("two", "--x 1", "--compact-error 0.3"),
     ];
-    let settings =
-        TradeoffSettings { scenes: vec![scene], grid: Grid { points }, out: dir.path().join("out") };
+    let settings = TradeoffSettings {
+        scenes: vec![scene],
+        grid: Grid { points, ordered: Vec::new() },
+        out: dir.path().join("out"),
+    };
     let programs = Programs {
         encoder: program.clone(),
         lab: program,
         edge: None,
         models: vec!["--models".into(), "m".into()],
         made_by: "t".into(),
+        equipment: Equipment::default(),
     };
     let report = run(&settings, &programs, &Silent).expect("runs");
     let seconds: Vec<(f64, f64)> = report.figures.iter().map(|f| (f.seconds, f.views_seconds)).collect();
@@ -146,7 +223,10 @@ esac
     // The program's error message is passed on.
     fs_err::write(&programs.encoder, "#!/bin/sh\necho '{\"error\":{\"message\":\"no such thing\"}}'; exit 1")
         .expect("writes");
-    let settings = TradeoffSettings { grid: Grid { points: vec![point("three", "--y", "")] }, ..settings };
+    let settings = TradeoffSettings {
+        grid: Grid { points: vec![point("three", "--y", "")], ordered: Vec::new() },
+        ..settings
+    };
     let message = run(&settings, &programs, &Silent).expect_err("it fails").to_string();
     assert!(message.contains("a / three on room") && message.contains("no such thing"), "{message}");
 }

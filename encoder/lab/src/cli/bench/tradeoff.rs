@@ -5,10 +5,11 @@ use std::path::PathBuf;
 use anyhow::{Context, Result};
 use clap::Args;
 
-use crate::bench::tradeoff::{self, Grid, LabelledScene, Programs, TradeoffSettings};
+use crate::bench::tradeoff::{self, Equipment, Grid, LabelledScene, Programs, TradeoffSettings};
 use slag_encoder::cli::Exit;
 use slag_encoder::cli::common::{ModelArgs, open_models, print};
 use slag_encoder::progress::Progress;
+use slag_encoder::raster::gpu::adapters;
 
 /// `bench tradeoff`.
 #[derive(Debug, Args)]
@@ -19,22 +20,29 @@ pub struct TradeoffArgs {
     /// Folder for figures and plots; points measured there before are not measured again.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Measures a small grid with the scenes' own masks: about ten minutes on two cores.
-    #[arg(long)]
+    /// The same as `--grid quick`.
+    #[arg(long, conflicts_with = "grid")]
     quick: bool,
-    /// Measures the grid in this file: JSON, {"points": [..]} of axis, name, and flags (views, lift, eval, profile).
-    #[arg(long, value_name = "FILE", conflicts_with = "quick")]
-    grid: Option<PathBuf>,
+    /// What to measure: `full`; `quick`, a small grid with the scenes' own masks (ten minutes on two cores); `paper`,
+    /// the paper's four configurations of SAM's grid and image step (needs --segmenter); or a file: JSON,
+    /// {"points": [..]} of axis, name, and flags (views, lift, eval, profile).
+    #[arg(long, value_name = "full|quick|paper|FILE", default_value = "full")]
+    grid: PathBuf,
+    /// Model directory of Segment Anything; without it the points that need one are left out.
+    #[arg(long, value_name = "DIR")]
+    segmenter: Option<PathBuf>,
     /// Models.
     #[command(flatten)]
     models: ModelArgs,
 }
 
 pub(super) fn run(args: &TradeoffArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    let grid = match &args.grid {
-        Some(path) => Grid::read(path)?,
-        None if args.quick => Grid::quick()?,
-        None => Grid::full()?,
+    let grid = match args.grid.to_str() {
+        _ if args.quick => Grid::quick()?,
+        Some("quick") => Grid::quick()?,
+        Some("paper") => Grid::paper()?,
+        Some("full") => Grid::full()?,
+        _ => Grid::read(&args.grid)?,
     };
     // Opened first: a model that cannot be opened fails before hours of work.
     let (models, session) = open_models(&args.models)?;
@@ -65,6 +73,7 @@ pub(super) fn run(args: &TradeoffArgs, progress: &dyn Progress, json: bool) -> R
         lab,
         edge: Some(edge).filter(|path| path.is_file()),
         models: flags,
+        equipment: Equipment { segmenter: args.segmenter.clone(), n_gpus: n_gpus() },
         made_by: format!("{} {}, {:?}", env!("CARGO_PKG_VERSION"), models.encoder_id(), session.providers),
     };
     let scenes = args.truth.iter().map(|dir| LabelledScene::find(dir)).collect::<Result<_, _>>()?;
@@ -72,4 +81,12 @@ pub(super) fn run(args: &TradeoffArgs, progress: &dyn Progress, json: bool) -> R
     let report = tradeoff::run(&settings, &programs, progress)?;
     print(json, &report, &report)?;
     Ok(if report.left_out.is_empty() { Exit::Done } else { Exit::Partly })
+}
+
+/// Returns the number of GPUs that `--device` numbers.
+fn n_gpus() -> usize {
+    let reports: Vec<_> = adapters().into_iter().map(|adapter| adapter.report).collect();
+    // A GPU appears once per graphics interface.
+    let first = reports.first().map(|report| report.backend.clone());
+    reports.iter().filter(|r| Some(&r.backend) == first.as_ref() && !r.is_software()).count()
 }

@@ -1,0 +1,219 @@
+//! The measured front of settings, and the choice of one for a target of seconds or bytes.
+//!
+//! `slag-lab bench tradeoff` writes it. Seconds are a sum of two shares: those of the views grow with their number, the
+//! others with the number of Gaussians. Photos of another size, other models or another machine need a front of their
+//! own.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use slag_common::shard::Profile;
+
+/// Settings that no other beats, and what they cost.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Front {
+    /// The machine that measured.
+    pub machine: String,
+    /// Version and models.
+    pub measured_with: String,
+    /// Scenes of the mean.
+    pub n_scenes: usize,
+    /// The settings.
+    pub settings: Vec<FrontSetting>,
+}
+
+/// A setting and its figures, means over scenes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FrontSetting {
+    /// Name.
+    pub name: String,
+    /// Flags of `encode`.
+    pub flags: String,
+    /// The profile whose bytes and accuracy these are.
+    pub profile: Profile,
+    /// Seconds per photo of the scene, used or not.
+    pub seconds_per_view: f64,
+    /// All other seconds, per million Gaussians.
+    pub seconds_per_million_gaussians: f64,
+    /// Bytes per Gaussian.
+    pub bytes_per_gaussian: f64,
+    /// Multi-class mIoU.
+    pub miou: f64,
+    /// Its standard deviation over scenes.
+    pub miou_spread: f64,
+}
+
+/// What a user accepts; at least one of the two.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Target {
+    /// Seconds of the encode at most.
+    pub seconds: Option<f64>,
+    /// Bytes of the profile's shards at most.
+    pub bytes: Option<u64>,
+}
+
+/// A chosen setting.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Expectation {
+    /// The setting.
+    pub setting: FrontSetting,
+    /// Expected seconds.
+    pub seconds: f64,
+    /// Expected bytes of the profile's shards.
+    pub bytes: f64,
+}
+
+/// Reason why a front cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum FrontError {
+    /// The file could not be read.
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+    /// The file is no front.
+    #[error("{}: {what}; expected front.json as `slag-lab bench tradeoff` writes it", path.display())]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// The problem.
+        what: String,
+    },
+    /// No setting meets the target.
+    #[error(
+        "no measured setting meets the target: the quickest, {quickest}, is expected to take {seconds:.1} s, the smallest, {smallest}, {bytes:.0} bytes; raise the target"
+    )]
+    OutOfReach {
+        /// The quickest setting.
+        quickest: String,
+        /// Its seconds.
+        seconds: f64,
+        /// The smallest setting.
+        smallest: String,
+        /// Its bytes.
+        bytes: f64,
+    },
+}
+
+impl Front {
+    /// Reads a front.
+    ///
+    /// # Errors
+    /// [`FrontError`].
+    pub fn read(path: &Path) -> Result<Self, FrontError> {
+        Self::parse(&fs_err::read_to_string(path)?, path)
+    }
+
+    fn parse(text: &str, path: &Path) -> Result<Self, FrontError> {
+        let wrong = |what: String| FrontError::Malformed { path: path.to_owned(), what };
+        let front: Self = serde_json::from_str(text).map_err(|error| wrong(error.to_string()))?;
+        if front.settings.is_empty() {
+            return Err(wrong("no settings".into()));
+        }
+        for setting in &front.settings {
+            let costs =
+                [setting.seconds_per_view, setting.seconds_per_million_gaussians, setting.bytes_per_gaussian];
+            if !costs.iter().all(|cost| (0.0..1e12).contains(cost)) {
+                return Err(wrong(format!("{}: costs {costs:?}; expected 0 to 1e12", setting.name)));
+            }
+        }
+        Ok(front)
+    }
+
+    /// Returns the most accurate setting that is expected to meet the target, the quicker one of equals.
+    ///
+    /// # Errors
+    /// [`FrontError::OutOfReach`].
+    pub fn choose(
+        &self,
+        target: Target,
+        n_photos: usize,
+        n_gaussians: usize,
+    ) -> Result<Expectation, FrontError> {
+        let expect = |setting: &FrontSetting| Expectation {
+            seconds: setting.seconds_per_view * n_photos as f64
+                + setting.seconds_per_million_gaussians * n_gaussians as f64 / 1e6,
+            bytes: setting.bytes_per_gaussian * n_gaussians as f64,
+            setting: setting.clone(),
+        };
+        let all: Vec<Expectation> = self.settings.iter().map(expect).collect();
+        let meets = |e: &&Expectation| {
+            target.seconds.is_none_or(|most| e.seconds <= most)
+                && target.bytes.is_none_or(|most| e.bytes <= most as f64)
+        };
+        let best = all
+            .iter()
+            .filter(meets)
+            .max_by(|a, b| a.setting.miou.total_cmp(&b.setting.miou).then(b.seconds.total_cmp(&a.seconds)));
+        let quickest = || all.iter().min_by(|a, b| a.seconds.total_cmp(&b.seconds));
+        let smallest = || all.iter().min_by(|a, b| a.bytes.total_cmp(&b.bytes));
+        match (best, quickest(), smallest()) {
+            (Some(best), ..) => Ok(best.clone()),
+            (None, Some(quick), Some(small)) => Err(FrontError::OutOfReach {
+                quickest: quick.setting.name.clone(),
+                seconds: quick.seconds,
+                smallest: small.setting.name.clone(),
+                bytes: small.bytes,
+            }),
+            (None, ..) => Err(FrontError::Malformed { path: "front".into(), what: "no settings".into() }),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn setting(name: &str, per_view: f64, bytes: f64, miou: f64) -> FrontSetting {
+        FrontSetting {
+            name: name.into(),
+            flags: "--preset fast".into(),
+            profile: Profile::Compact,
+            seconds_per_view: per_view,
+            seconds_per_million_gaussians: 10.0,
+            bytes_per_gaussian: bytes,
+            miou,
+            miou_spread: 0.1,
+        }
+    }
+
+    /// By hand: 100 photos and half a million Gaussians take 100 times the view's seconds and 5 more.
+    #[test]
+    fn the_best_setting_within_the_target_is_chosen() {
+        let settings = vec![
+            setting("slow", 0.5, 5.0, 0.9),
+            setting("quick", 0.1, 6.0, 0.7),
+            setting("small", 0.3, 4.0, 0.8),
+        ];
+        let front = Front { machine: "m".into(), measured_with: "w".into(), n_scenes: 1, settings };
+        let choose = |seconds, bytes| front.choose(Target { seconds, bytes }, 100, 500_000);
+        let name = |seconds, bytes| choose(seconds, bytes).expect("in reach").setting.name;
+        assert_eq!(name(Some(55.0), None), "slow");
+        assert_eq!(name(Some(54.9), None), "small");
+        assert_eq!(name(Some(34.9), None), "quick");
+        assert_eq!(name(None, Some(2_499_999)), "small");
+        assert_eq!(name(Some(1e9), Some(2_000_000)), "small");
+        let chosen = choose(Some(60.0), None).expect("in reach");
+        assert_eq!((chosen.seconds, chosen.bytes), (55.0, 2_500_000.0));
+        let message = choose(Some(14.9), None).expect_err("out of reach").to_string();
+        assert!(
+            message.contains("quick") && message.contains("15.0 s") && message.contains("2000000"),
+            "{message}"
+        );
+    }
+
+    #[test]
+    fn fronts_are_checked() {
+        let refused =
+            |text: &str| Front::parse(text, Path::new("f.json")).expect_err("malformed").to_string();
+        assert!(refused("{}").contains("f.json"), "{}", refused("{}"));
+        let empty = r#"{"machine": "", "measured_with": "", "n_scenes": 1, "settings": []}"#;
+        assert!(refused(empty).contains("no settings"));
+        let wrong = setting("wrong", -1.0, 5.0, 0.5);
+        let mut front =
+            Front { machine: "m".into(), measured_with: "w".into(), n_scenes: 1, settings: vec![wrong] };
+        let text = serde_json::to_string(&front).expect("JSON");
+        assert!(refused(&text).contains("expected 0 to"), "{}", refused(&text));
+        front.settings[0].seconds_per_view = 1.0;
+        let text = serde_json::to_string(&front).expect("JSON");
+        assert_eq!(Front::parse(&text, Path::new("f.json")).expect("well-formed"), front);
+    }
+}
