@@ -2,10 +2,9 @@
 
 usage: train.py OUT TEST_DIR TRAIN_DIR...     (folders of `slag-lab generate crops`; see CARD.md)
 
-Every text says something that is true or false of every crop: which noun, colour, material, kind of thing or
-proportion it names is known exactly. So the loss is a sigmoid per pair of crop and text (SigLIP: Zhai et al.
-2023), with softmax terms over nouns, colours and materials. The cosine at which the sigmoid passes 1/2 is the
-threshold from which something counts as found.
+Crops are generated, so it is known whether a text (a noun, colour, material, kind of thing or proportion) is true
+of each crop. The loss is therefore a sigmoid per pair of crop and text (SigLIP: Zhai et al. 2023), with softmax
+terms over nouns, colours and materials. The cosine where the sigmoid reaches 1/2 is the threshold for "found".
 """
 
 import argparse, copy, json, math, pathlib, random, time
@@ -23,10 +22,10 @@ MATERIAL_WORDS = {
     "wood": ["wooden", "wood"], "fabric": ["fabric", "cloth", "textile"], "leaf": ["leafy"], "ceramic": ["ceramic", "china"],
     "metal": ["metal", "steel", "metallic"], "stone": ["stone", "concrete"], "paper": ["paper", "cardboard"],
 }
-# Words that say nothing which a crop could show.
+# Words that a crop cannot show.
 IDLE = ["big", "small", "large", "little", "old", "new", "nice", "closest", "nearest"]
 PROMPTS = ["{}", "{}", "{}", "a {}", "the {}", "a photo of a {}", "find the {}", "where is the {}", "some {}", "my {}"]
-# Things that are nowhere: a text that names one is false of every crop.
+# Things that are in no crop: texts that name them are false everywhere.
 ABSENT = """elephant airplane helicopter boat ship submarine piano guitar violin drum-kit trumpet cat horse cow sheep pig
 chicken duck bird eagle fish shark whale snake spider butterfly lion tiger bear wolf monkey giraffe zebra kangaroo penguin
 dinosaur unicorn dragon robot rocket satellite moon sun cloud rainbow mountain volcano river lake waterfall beach island
@@ -56,7 +55,7 @@ def plural(noun):
 
 
 class Words:
-    """What can be said, and of which crops it is true."""
+    """The texts, and the crops that each is true of."""
 
     def __init__(self, nouns):
         self.nouns = nouns
@@ -66,7 +65,7 @@ class Words:
                 self.of_word.setdefault(word, set()).add(i)
             for kind in noun["kinds"]:
                 self.of_kind.setdefault(kind, set()).add(i)
-        # A kind's word may be a noun's word too (a container): what it names then is both.
+        # A word may name both a kind and a noun (container): it then stands for both.
         for word in set(self.of_word) & set(self.of_kind):
             self.of_word[word] |= self.of_kind[word]
             self.of_kind[word] = self.of_word[word]
@@ -74,7 +73,7 @@ class Words:
                          for i, n in enumerate(nouns)]
 
     def sample(self, noun, colour, material, tall):
-        """Returns a text, and what a crop must be for it to be true: (nouns, colour, material, tall)."""
+        """Returns a text and the (nouns, colour, material, tall) that make it true."""
         r = random.random()
         material_word = random.choice(MATERIAL_WORDS.get(material, [material]))
         if r < 0.08:
@@ -157,7 +156,7 @@ class ImageEncoder(nn.Module):
 
     def forward(self, pixels):
         x = self.layers(pixels)
-        # Four quarters, so that top and bottom, left and right stay apart.
+        # Pooled by quarters, which keeps top and bottom, left and right apart.
         x = F.avg_pool2d(x, 2).flatten(1)
         return F.normalize(self.head(x), dim=-1)
 
@@ -219,7 +218,7 @@ class Data:
         self.tall = np.where(slender > limits[self.noun, 1], 1, np.where(slender < limits[self.noun, 0], 0, -1))
 
     def to(self, device):
-        """Puts crops and labels on the device, where batches are made."""
+        """Copies crops and labels to the device, where batches are made."""
         self.crops = torch.cat([torch.from_numpy(np.ascontiguousarray(p)).permute(0, 3, 1, 2).contiguous().to(device) for p in self.pixels])
         self.labels = {name: torch.from_numpy(getattr(self, name)).long().to(device) for name in ("noun", "colour", "material", "tall")}
         self.colourful = torch.tensor([len(noun["colours"]) > 3 for noun in self.nouns], device=device)
@@ -227,7 +226,7 @@ class Data:
 
 
 def augment(images):
-    """Light, colour cast, sharpness and noise as photos differ in them; a shift and another size; mirrored."""
+    """Augments: light, colour cast, sharpness, noise, shift, scale, mirroring."""
     n, device = len(images), images.device
     uniform = lambda *shape: 2 * torch.rand(*shape, device=device) - 1
     x = images.float() / 255
@@ -239,7 +238,7 @@ def augment(images):
     blurred = F.interpolate(F.interpolate(x, size=size, mode="area"), size=EDGE, mode="bilinear")
     x = torch.where(soft[:, None, None, None], blurred, x)
     x = torch.lerp(x, torch.ones_like(x), white)
-    # A mirrored, stretched, shifted and slightly turned picture; white beyond its border.
+    # Mirrored, stretched, shifted and rotated a little; white beyond the border.
     flip = (torch.rand(n, device=device) < 0.5).float() * -2 + 1
     wide, high, turn = 1 + 0.1 * uniform(n), 1 + 0.1 * uniform(n), 0.08 * uniform(n)
     affine = torch.stack([torch.stack([flip * wide, -turn, 0.08 * uniform(n)], 1), torch.stack([turn, high, 0.08 * uniform(n)], 1)], 1)
@@ -248,17 +247,17 @@ def augment(images):
 
 
 def recolour(images, chosen):
-    """Gives the chosen crops other colours: turned hues, or shades of one colour. Shapes must suffice to tell nouns
-    in colours that were never seen; what colour and material they have is unknown then."""
+    """Recolours the chosen crops (rotated hues, or shades of one colour), so that nouns are learnt from shape. Their
+    colour and material are unknown afterwards."""
     n, device = len(images), images.device
     x = images.float() / 255
     white = (images.amin(1, keepdim=True) == 255)
     luma = (x * torch.tensor([0.299, 0.587, 0.114], device=device)[:, None, None]).sum(1, keepdim=True)
-    # Turned around the axis of grey (Rodrigues' formula) by any angle.
+    # Rotated around the grey axis by a random angle (Rodrigues' formula).
     angle = 2 * math.pi * torch.rand(n, 1, 1, 1, device=device)
     turned = x * angle.cos() + torch.cat([x[:, 2:] - x[:, 1:2], x[:, :1] - x[:, 2:], x[:, 1:2] - x[:, :1]], 1) * (angle.sin() / math.sqrt(3))
     turned = turned + x.mean(1, keepdim=True) * (1 - angle.cos())
-    # Shades: as bright, relative to the mean, as before.
+    # Shades keep each pixel's brightness relative to the mean.
     shown = (~white).float()
     mean = (luma * shown).sum((2, 3), keepdim=True) / shown.sum((2, 3), keepdim=True).clamp(min=1)
     shades = (luma / mean.clamp(min=0.05)) * (0.08 + 0.84 * torch.rand(n, 3, 1, 1, device=device))
@@ -268,12 +267,12 @@ def recolour(images, chosen):
 
 
 class Batches(torch.utils.data.IterableDataset):
-    """Batches of crops' numbers with texts about them, made by worker processes."""
+    """Batches of crop indices and texts about them, made by worker processes."""
 
     def __init__(self, data, words, tokenizer, args):
         self.words, self.tokenizer, self.args = words, tokenizer, args
         self.labels = data.noun, data.colour, data.material, data.tall
-        # Seldom nouns more often than they come, but not as often as the frequent.
+        # Rare nouns are drawn more often than they occur, though less often than frequent ones.
         self.chance = 1 / np.sqrt(np.bincount(data.noun, minlength=len(data.nouns))[data.noun])
         self.chance = np.cumsum(self.chance / self.chance.sum())
 
@@ -293,7 +292,7 @@ class Batches(torch.utils.data.IterableDataset):
                 if random.random() < 0.08:
                     text, true = words.absent()
                 texts.append(text); said.append(true)
-            # The softmax terms: one text of each noun, colour and material.
+            # For the softmax terms: one text for each noun, colour and material.
             noun_words = [random.choice(of) for of in words.words_of]
             texts += [random.choice(PROMPTS).format(word) for word in noun_words]
             texts += [random.choice(["{}", "something {}", "{} thing"]).format(c) for c in COLOURS]
@@ -310,7 +309,7 @@ class Batches(torch.utils.data.IterableDataset):
 
 
 def tokens_of(tokenizer, texts):
-    """Returns ids, padded, and their numbers."""
+    """Returns the padded ids and the length of each row."""
     ids = [encoding.ids for encoding in tokenizer.encode_batch(texts)]
     ids = [i if len(i) <= TOKENS else i[:TOKENS - 1] + [0] for i in ids]
     lengths = torch.tensor([len(i) for i in ids])
@@ -334,7 +333,7 @@ def truth_of(labels, of, asked):
         said, of_crop = asked[:, column], labels[name][:, None]
         known &= ~((said != -1) & (of_crop == -1))
         true = true & ((said == -1) | (of_crop == said) | (of_crop == -1))
-    # What is false for another reason is false, whatever is unknown.
+    # A text that is false for one reason is false, even if the rest is unknown.
     return torch.where(known | ~true, true.long(), -1)
 
 
@@ -344,7 +343,7 @@ def train(args, data, words, tokenizer):
     image, text, log_scale, bias = load(args.resume) if args.resume else (ImageEncoder(), TextEncoder(), math.log(12.0), -7.0)
     image, text = image.train().to(device).to(memory_format=torch.channels_last), text.train().to(device)
     scale, bias = (nn.Parameter(torch.tensor(value, device=device)) for value in (log_scale, bias))
-    # What is kept is the mean over the last steps of training.
+    # The kept weights are the mean over the last steps.
     kept = copy.deepcopy([image, text])
     groups = [{"params": [*image.parameters(), *text.parameters()], "weight_decay": 0.02}, {"params": [scale, bias], "weight_decay": 0.0}]
     optimiser = torch.optim.AdamW(groups, lr=args.rate, betas=(0.9, 0.98))
@@ -354,7 +353,7 @@ def train(args, data, words, tokenizer):
     began = time.time()
     step, mean = 0, None
     while True:
-        # Time decides how long, so that the rate can reach 0 on any machine; the card states the steps made.
+        # Training lasts a given time, so the rate reaches 0 on any machine; the card states the number of steps.
         done = min(1.0, (time.time() - began) / args.seconds) if args.seconds else step / args.steps
         if done >= 1:
             break
@@ -362,7 +361,7 @@ def train(args, data, words, tokenizer):
             group["lr"] = args.rate * min(1, (step + 1) / 500) * (0.5 + 0.5 * math.cos(math.pi * done))
         index, ids, lengths, of, asked, also = (t.to(device, non_blocking=True) for t in next(batches))
         labels = {name: of_all[index] for name, of_all in data.labels.items()}
-        # Not what has few colours: those tell what it is.
+        # Only nouns seen in many colours: for others, the colour is evidence.
         recoloured = (torch.rand(len(index), device=device) < args.recoloured) & data.colourful[labels["noun"]]
         for name in ("colour", "material"):
             labels[name] = torch.where(recoloured, -1, labels[name])
@@ -408,7 +407,7 @@ def load(folder):
 
 @torch.no_grad()
 def keep(kept, now, share):
-    """Moves the kept models' parameters towards those of now; statistics of batches are taken over."""
+    """Moves the averaged parameters towards the current ones; batch statistics are copied."""
     for old, new in zip(kept, now):
         torch._foreach_lerp_(list(old.parameters()), list(new.parameters()), 1 - share)
         for a, b in zip(old.buffers(), new.buffers()):
@@ -424,7 +423,7 @@ def evaluate(image, text, tokenizer, data, words, scale, bias, device):
     colours = x @ encode([f"something {c}" for c in COLOURS]).T
     materials = x @ encode([f"something made of {m}" for m in MATERIALS]).T
     top1 = nouns.argmax(1).numpy() == data.noun
-    # A crop of the noun asked for: which of its colours?
+    # Among crops of one noun: which colour?
     pairs = encode([f"{c} {n['name']}" for n in data.nouns for c in COLOURS]).reshape(len(data.nouns), len(COLOURS), DIM)
     of_noun = torch.einsum("nd,ncd->nc", x, pairs[data.noun]).argmax(1).numpy() == data.colour
     found = lambda mask, right: float(right[mask].mean()) if mask.any() else None
@@ -445,7 +444,7 @@ def evaluate(image, text, tokenizer, data, words, scale, bias, device):
         mask = (data.noun == i) & data.whole
         wrong = [(data.nouns[j]["name"], int(confusion[i, j])) for j in np.argsort(-confusion[i])[:4] if j != i and confusion[i, j] > 0]
         report["nouns"][noun["name"]] = {"crops": int(mask.sum()), "top-1": found(mask, top1), "taken for": wrong[:3]}
-    # Found or not: texts of what is there against texts of what is nowhere.
+    # Present or absent: texts of present things against texts of absent ones.
     absent = x @ encode([f"a {word}" for word in ABSENT]).T
     own = nouns[torch.arange(len(x)), torch.from_numpy(data.noun)]
     threshold = -bias / scale
@@ -456,7 +455,7 @@ def evaluate(image, text, tokenizer, data, words, scale, bias, device):
 
 
 def halve(path):
-    """Stores the weights of a model in 16 bits; the runtime widens them when it opens the file."""
+    """Stores a model's weights in 16 bits; the runtime widens them on loading."""
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 

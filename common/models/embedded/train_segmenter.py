@@ -1,9 +1,9 @@
-"""Trains the learnt segmenter: from a photo, how probably each pixel and its neighbour show different things.
+"""Trains the segmenter: the probability that a pixel and its neighbour show different things.
 
 usage: train_segmenter.py OUT TEST_DIR TRAIN_DIR...     (folders of `slag-lab generate photos`)
 
-The graph segmenter (Felzenszwalb and Huttenlocher 2004) joins pixels over the lightest edges first; this model
-says how heavy edges are, instead of differences of colour. A small U-Net (Ronneberger et al. 2015).
+The graph segmenter (Felzenszwalb and Huttenlocher 2004) merges pixels across the lightest edges first. This small
+U-Net (Ronneberger et al. 2015) gives the edges' weights, in place of colour differences.
 """
 
 import argparse, json, math, pathlib, random, time
@@ -15,7 +15,7 @@ import torch.nn.functional as F
 
 from train import halve
 
-# As encoder/src/segment/graph.rs has them: right, down left, down, down right.
+# The order of encoder/src/segment/graph.rs: right, down left, down, down right.
 NEIGHBOURS = [(1, 0), (-1, 1), (0, 1), (1, 1)]
 PATCH = 256
 
@@ -49,7 +49,7 @@ class Boundaries(nn.Module):
 
 
 def boundaries(things):
-    """[n, h, w] -> [n, 4, h, w], 1 where a pixel and its neighbour are of different things; and where both are."""
+    """[n, h, w] -> [n, 4, h, w], 1 where a pixel and its neighbour show different things; and where both exist."""
     n, h, w = things.shape
     truth = torch.zeros(n, 4, h, w, device=things.device)
     known = torch.zeros(n, 4, h, w, dtype=torch.bool, device=things.device)
@@ -65,10 +65,10 @@ def augment(x):
     n = len(x)
     uniform = lambda *shape: 2 * torch.rand(*shape, device=x.device) - 1
     x = x * (1 + 0.25 * uniform(n, 1, 1, 1) + 0.1 * uniform(n, 3, 1, 1)) + 0.1 * uniform(n, 1, 1, 1)
-    # Shadows and stains: slow changes of brightness that are no boundary.
+    # Shadows and stains: gradual brightness changes, which are no boundaries.
     stain = F.interpolate(uniform(n, 1, 5, 5), size=x.shape[-2:], mode="bicubic")
     x = x * (1 + 0.25 * stain)
-    # Texture: noise of several sizes.
+    # Texture: noise at several scales.
     for size in (64, 128, 256):
         amount = 0.05 * torch.rand(n, 1, 1, 1, device=x.device)
         x = x + amount * F.interpolate(torch.randn(n, 1, size, size, device=x.device), size=x.shape[-2:], mode="bilinear")
@@ -120,7 +120,7 @@ def main():
         x = ((augment(x) - 0.5) / 0.5).contiguous(memory_format=torch.channels_last)
         with torch.autocast(device, dtype=torch.bfloat16):
             logits = model(x)
-        # Boundaries are a few per cent of the pixels: they count three times.
+        # Boundary pixels are few, so they are weighted three times.
         loss = F.binary_cross_entropy_with_logits(logits.float(), truth, weight=known * (1 + 2 * truth))
         optimiser.zero_grad(set_to_none=True)
         loss.backward()

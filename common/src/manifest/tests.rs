@@ -95,7 +95,7 @@ fn unknown_fields_are_refused() {
     }
 }
 
-/// One byte above 64 MiB is refused for its length, 64 MiB for what it contains.
+/// 64 MiB are parsed, and refused as malformed; one byte more is refused for its length.
 #[test]
 fn manifests_above_64_mib_are_refused() {
     let verify = |len_bytes: usize| {

@@ -34,7 +34,7 @@ const FROM_POSES: &str = "poses";
 /// Largest size of a file: 13 numbers and their names.
 const MAX_BYTES: u64 = 65_536;
 
-/// A file that says how a splat's frame follows from that of the poses.
+/// Contents of a `dataparser_transforms.json`: the similarity between the frames of the poses and of the splat.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SplatFrame {
     transform: DAffine3,

@@ -16,7 +16,7 @@ pub struct ViewSet {
     pub source: PoseSource,
     /// Names of frames that are listed without a pose (ScanNet's `-inf`), sorted; they are not in `views`.
     pub without_pose: Vec<String>,
-    /// The change of the world frame that a `transforms.json` says it contains already.
+    /// The transform that `transforms.json` states was applied to its poses already.
     pub applied: Option<AppliedTransform>,
 }
 

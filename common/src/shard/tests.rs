@@ -41,7 +41,7 @@ fn written(edit: impl FnOnce(&mut Parts)) -> Vec<u8> {
         codewords: (0..48).map(|i| f16::from_f32(i as f32 / 64.0)).collect(),
         mean: [0.5, 0.25, 0.0, -0.5].map(f16::from_f32).to_vec(),
         indices: IndicesHeader { least: 1000, width_bits: 6 },
-        // 1, 63, 0, 7, 2, and 9, whose bits 30 and 31 are the first of two words.
+        // 1, 63, 0, 7, 2 and 9, six bits each; the last begins at bit 30 and ends in the second word.
         index_words: vec![1 | 63 << 6 | 7 << 18 | 2 << 24 | 9 << 30, 9 >> 2],
     };
     edit(&mut parts);

@@ -53,7 +53,7 @@ pub struct DownloadArgs {
     /// for a robot that missed the key change [default: the key accepted before, or the first one seen].
     #[arg(long, value_name = "HEX")]
     pub key: Vec<Hash32>,
-    /// Byte budget for shards [default: twice what the radius needs].
+    /// Most bytes kept on disk for shards [default: twice the bytes of the shards within the radius].
     #[arg(long, value_name = "N")]
     pub max_bytes: Option<u64>,
 }

@@ -87,7 +87,7 @@ impl Entry {
         roles.iter().flat_map(parts).flatten().map(String::as_str).collect()
     }
 
-    /// Returns the paths of the image model, the first of which is the ONNX file; empty if there is none.
+    /// Returns the paths of the image model: the ONNX file, then its weights if they are separate. Empty without one.
     pub(super) fn image_paths(&self) -> Vec<&str> {
         [self.files.get("image"), self.data.get("image")].into_iter().flatten().map(String::as_str).collect()
     }

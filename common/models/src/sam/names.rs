@@ -130,7 +130,7 @@ fn output(decoder: &Model, name: &str, expected: &[i64]) -> Result<String, Sessi
     let fits =
         |declared: &&Declared| matches!(&declared.1, Some((Float32, shape)) if shapes_fit(shape, expected));
     let named = outputs.iter().filter(fits).find(|(found, _)| found == name);
-    // An undeclared size fits anything, so the score of objects goes by its name alone.
+    // Any output fits where sizes are not declared; the object score is therefore found by its name alone.
     let by_shape = || outputs.iter().find(|declared| expected.last() != Some(&1) && fits(declared));
     let found = named.or_else(by_shape);
     found.map(|(name, _)| name.clone()).ok_or_else(|| {

@@ -7,7 +7,7 @@ use slag_common::manifest::Calibration;
 use super::*;
 use crate::testing::TestObject;
 
-/// Two things 20 m apart, each split over two cells in one of which only every other Gaussian matches.
+/// Two things, 20 m apart. Each lies in two cells: in one every Gaussian matches, in the other every second.
 fn two_things(has_packed_indices: bool) -> [BuiltShard; 2] {
     [(5u32, 0u16), (9, 2_000)].map(|(cell_id, x)| {
         let member = |i: u16| {

@@ -12,7 +12,6 @@ use super::instances::InstanceReport;
 use super::labelled::labelled;
 use super::labelled_scene::{CompareError, LabelledScene};
 use super::settings::{EvalKind, EvalSettings};
-use super::truth::Truth;
 use slag_encoder::encode::{self, DEFAULT_MASK_LEVELS, EncodeSettings, Engines, Masks};
 use slag_encoder::lift::Aggregation;
 use slag_encoder::progress::Silent;
@@ -88,25 +87,15 @@ pub fn run(
     let mut text = models.text_encoder(session)?;
     let mut rows = Vec::new();
     for dir in &settings.scenes {
-        let scene = LabelledScene::open(dir)?;
-        let mut truth = Truth::read(dir, scene.gaussians.len())?;
-        // Evaluated in 3D only: rendering every word on every view would take most of the time.
-        truth.views.clear();
+        let scene = LabelledScene::open(dir, &settings.encode.inputs)?;
         for source in [MaskSource::Given, MaskSource::Automatic] {
-            let mut encode = settings.encode.clone();
-            encode.inputs.scene.clone_from(&scene.splat);
-            encode.inputs.views.clone_from(&scene.views);
-            encode.inputs.images.clone_from(&scene.images);
             let (masks, folder) = match source {
-                MaskSource::Given => {
-                    (Masks::Given { dir: scene.masks.clone(), ignore_ids: Vec::new() }, "given")
-                }
+                MaskSource::Given => (scene.true_masks(), "given"),
                 MaskSource::Automatic => (Masks::Auto { n_levels: DEFAULT_MASK_LEVELS }, "automatic"),
             };
+            let store = settings.out.join(&scene.name).join(folder);
+            let mut encode = scene.encode_settings(&settings.encode, store)?;
             encode.view.masks = masks;
-            encode.run.keep_views = true;
-            encode.output.store = settings.out.join(&scene.name).join(folder);
-            fs_err::create_dir_all(&encode.output.store)?;
             for is_default in [false, true] {
                 encode.aggregation = if is_default { Aggregation::REFINED } else { Aggregation::PLAIN };
                 encode.cells.objects = is_default;
@@ -119,7 +108,7 @@ pub fn run(
                 for kind in &kinds[..1 + usize::from(is_default)] {
                     let eval = EvalSettings { kind: Some(*kind), ..EvalSettings::default() };
                     let report =
-                        labelled(&reader, &truth, &scene.gaussians, &mut *text, &CpuRasterizer, &eval)?;
+                        labelled(&reader, &scene.truth, &scene.gaussians, &mut *text, &CpuRasterizer, &eval)?;
                     let row = DefaultsRow {
                         scene: scene.name.clone(),
                         masks: source,

@@ -1,15 +1,16 @@
 //! A folder with a labelled scene, to be encoded and judged.
 
+use std::io;
 use std::path::{Path, PathBuf};
 
 use slag_common::Gaussians;
 use slag_common::splat::{self, SplatError};
-use slag_encoder::encode::EncodeError;
+use slag_encoder::encode::{EncodeError, EncodeSettings, InputSettings, Masks};
 use slag_encoder::store::StoreError;
 use slag_models::ModelError;
 
 use super::error::EvalError;
-use super::truth::TruthError;
+use super::truth::{Truth, TruthError};
 
 /// Error of a comparison on labelled scenes.
 #[derive(Debug, thiserror::Error)]
@@ -52,21 +53,19 @@ pub enum CompareError {
 pub(super) struct LabelledScene {
     /// The folder's name.
     pub(super) name: String,
-    pub(super) splat: PathBuf,
-    pub(super) views: PathBuf,
-    /// The photos' folder, where there is one of that name.
-    pub(super) images: Option<PathBuf>,
-    /// The true masks.
-    pub(super) masks: PathBuf,
     pub(super) gaussians: Gaussians,
+    /// The labels, for an evaluation in 3D alone.
+    pub(super) truth: Truth,
+    inputs: InputSettings,
+    masks: PathBuf,
 }
 
 impl LabelledScene {
-    /// Finds the files and reads the splat.
+    /// Finds the files, reads as `base` says where they leave a choice, and reads the splat and the labels.
     ///
     /// # Errors
-    /// [`CompareError::NoScene`], [`CompareError::Splat`].
-    pub(super) fn open(dir: &Path) -> Result<Self, CompareError> {
+    /// [`CompareError::NoScene`], [`CompareError::Splat`], [`CompareError::Truth`].
+    pub(super) fn open(dir: &Path, base: &InputSettings) -> Result<Self, CompareError> {
         let find = |names: &[&'static str]| -> Result<PathBuf, CompareError> {
             let found = names.iter().map(|name| dir.join(name)).find(|path| path.exists());
             found.ok_or(CompareError::NoScene { dir: dir.to_owned(), missing: names[0] })
@@ -74,13 +73,39 @@ impl LabelledScene {
         let splat = find(&["scene.ply", "point_cloud.ply"])?;
         let gaussians = splat::read(&splat, &splat::ReadOptions { with_sh_rest: false })?;
         let images = dir.join("images");
-        Ok(Self {
-            name: dir.file_name().unwrap_or_default().to_string_lossy().into_owned(),
-            splat,
+        let inputs = InputSettings {
+            scene: splat,
             views: find(&["transforms.json"])?,
             images: images.is_dir().then_some(images),
-            masks: find(&["gt/masks"])?,
-            gaussians,
-        })
+            ..base.clone()
+        };
+        let masks = find(&["gt/masks"])?;
+        let mut truth = Truth::read(dir, gaussians.len())?;
+        // Rendering every word on every view would take most of the time.
+        truth.views.clear();
+        let name = dir.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        Ok(Self { name, gaussians, truth, inputs, masks })
+    }
+
+    /// Returns `base` with this scene's files, with its views kept in `store`, which is created.
+    ///
+    /// # Errors
+    /// If the folder cannot be created.
+    pub(super) fn encode_settings(
+        &self,
+        base: &EncodeSettings,
+        store: PathBuf,
+    ) -> io::Result<EncodeSettings> {
+        fs_err::create_dir_all(&store)?;
+        let mut settings = base.clone();
+        settings.inputs = self.inputs.clone();
+        settings.output.store = store;
+        settings.run.keep_views = true;
+        Ok(settings)
+    }
+
+    /// The true masks.
+    pub(super) fn true_masks(&self) -> Masks {
+        Masks::Given { dir: self.masks.clone(), ignore_ids: Vec::new() }
     }
 }

@@ -13,8 +13,7 @@ use super::labelled_scene::{CompareError, LabelledScene};
 use super::mask_noise::MaskNoise;
 use super::metrics::mean;
 use super::settings::EvalSettings;
-use super::truth::Truth;
-use slag_encoder::encode::{self, EncodeSettings, Engines, Masks, Perturbation};
+use slag_encoder::encode::{self, EncodeSettings, Engines, Perturbation};
 use slag_encoder::lift::Aggregation;
 use slag_encoder::progress::Silent;
 use slag_encoder::raster::{CpuRasterizer, Rasterizer};
@@ -87,38 +86,29 @@ pub fn run(
         false => settings.levels.iter().copied().map(Some).collect(),
     };
     for dir in &settings.scenes {
-        let LabelledScene { name, splat: splat_path, views, images, masks, gaussians: scene } =
-            LabelledScene::open(dir)?;
-        let mut truth = Truth::read(dir, scene.len())?;
-        // Evaluated in 3D only: rendering every word on every view would take most of the time.
-        truth.views.clear();
+        let scene = LabelledScene::open(dir, &settings.encode.inputs)?;
         for level in &levels {
             let folder =
                 level.map_or("as-found".into(), |level| format!("level-{level}-seed-{}", settings.seed));
-            let store = settings.out.join(&name).join(folder);
-            fs_err::create_dir_all(&store)?;
+            let store = settings.out.join(&scene.name).join(folder);
+            let mut encode = scene.encode_settings(&settings.encode, store)?;
+            if level.is_some() {
+                encode.view.masks = scene.true_masks();
+            }
             for (method, aggregation) in &settings.methods {
-                let mut encode = settings.encode.clone();
-                encode.inputs.scene.clone_from(&splat_path);
-                encode.inputs.views.clone_from(&views);
-                encode.inputs.images.clone_from(&images);
-                if level.is_some() {
-                    encode.view.masks = Masks::Given { dir: masks.clone(), ignore_ids: Vec::new() };
-                }
-                encode.output.store.clone_from(&store);
                 encode.aggregation = *aggregation;
-                encode.run.keep_views = true;
                 let noise = level.map(|level| MaskNoise { level, seed: settings.seed });
                 let perturbation = noise.as_ref().map(|noise| noise as &dyn Perturbation);
                 let engines = Engines { perturbation, ..Engines::new(models, session, rasterizer) };
                 let summary = encode::encode(&encode, &engines, &Silent, cancel).map_err(Box::new)?;
-                let reader = StoreReader::open(&store)?;
+                let reader = StoreReader::open(&encode.output.store)?;
+                let eval = EvalSettings::default();
                 let report =
-                    labelled(&reader, &truth, &scene, &mut *text, &CpuRasterizer, &EvalSettings::default())?;
+                    labelled(&reader, &scene.truth, &scene.gaussians, &mut *text, &CpuRasterizer, &eval)?;
                 let secs = |stage: &str| summary.busy_secs.get(stage).copied().unwrap_or(0.0);
                 let all_classes = report.multi_class.first();
                 let row = NoiseRow {
-                    scene: name.clone(),
+                    scene: scene.name.clone(),
                     level: *level,
                     method: method.clone(),
                     miou: all_classes.and_then(|all| all.miou),

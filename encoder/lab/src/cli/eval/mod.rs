@@ -1,5 +1,6 @@
 //! `eval`: stores and encoders against labels.
 
+mod comparison;
 mod defaults;
 mod encoder;
 mod labelled;

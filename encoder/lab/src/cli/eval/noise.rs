@@ -1,27 +1,26 @@
 //! `eval noise`.
 
-use std::path::PathBuf;
-
 use anyhow::{Result, anyhow};
 use clap::Args;
 
+use super::comparison::{ComparisonArgs, encode_settings};
 use crate::eval::noise::{self, NoiseRow, NoiseSettings};
 use slag_common::shard::Profile;
 use slag_encoder::cli::Exit;
-use slag_encoder::cli::common::{BackgroundArg, ModelArgs, cancel_flag, open_models, print};
+use slag_encoder::cli::common::{BackgroundArg, cancel_flag, open_models, print};
 use slag_encoder::embed::Background;
-use slag_encoder::encode::{EncodeSettings, ViewOrder, ViewsLimit};
+use slag_encoder::encode::{ViewOrder, ViewsLimit};
 use slag_encoder::lift::Aggregation;
 use slag_encoder::progress::Progress;
-use slag_encoder::raster::devices::{DeviceChoice, Devices};
+use slag_encoder::raster::devices::Devices;
 use slag_encoder::raster::gpu::GpuOptions;
 
 /// `eval noise`.
 #[derive(Debug, Args)]
 pub struct EvalNoiseArgs {
-    /// Labelled scenes with masks, from `generate scene`.
-    #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
-    scene: Vec<PathBuf>,
+    /// Scenes, models and output.
+    #[command(flatten)]
+    on: ComparisonArgs,
     /// Levels of noise in the true masks, 0 (none) to 3.
     #[arg(long, value_name = "N", value_delimiter = ',', default_values_t = [0, 1, 2, 3], value_parser = clap::value_parser!(u8).range(0..=3))]
     levels: Vec<u8>,
@@ -40,15 +39,6 @@ pub struct EvalNoiseArgs {
     /// Fill of a crop outside its mask.
     #[arg(long, value_enum, default_value = "white")]
     background: BackgroundArg,
-    /// Models.
-    #[command(flatten)]
-    models: ModelArgs,
-    /// Device that rasterises: auto (GPUs, else the CPU), gpu, cpu, or an adapter's number.
-    #[arg(long, value_name = "DEVICE", default_value_t)]
-    device: DeviceChoice,
-    /// Folder for the stores; a later run reuses the views there.
-    #[arg(long, value_name = "DIR")]
-    out: PathBuf,
 }
 
 pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
@@ -58,30 +48,27 @@ pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> 
         let names: Vec<&str> = known.iter().map(|(name, _)| *name).collect();
         return Err(anyhow!("unknown aggregation method {unknown:?}; expected one of: {}", names.join(", ")));
     }
-    let (models, session) = open_models(&args.models)?;
-    let devices = Devices::open(args.device, GpuOptions::default())?;
+    let (models, session) = open_models(&args.on.models)?;
+    let devices = Devices::open(args.on.device, GpuOptions::default())?;
     let methods: Vec<(String, Aggregation)> = known
         .into_iter()
         .filter(|(name, _)| wanted(name))
         .map(|(name, aggregation)| (name.to_owned(), aggregation))
         .collect();
     let levels = if args.auto { Vec::new() } else { args.levels.clone() };
-    let n_rows = args.scene.len() * levels.len().max(1) * methods.len();
-    let mut encode = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
-    encode.output.scene_name = "noise".into();
+    let n_rows = args.on.scene.len() * levels.len().max(1) * methods.len();
+    let mut encode = encode_settings("noise");
     encode.run.views_limit = args.views_limit.map_or(ViewsLimit::All, |n| ViewsLimit::Count(n as usize));
     encode.run.view_order = ViewOrder::Nth;
-    encode.run.strict = true;
-    encode.run.restart = true;
     encode.view.background = Background::from(args.background);
     encode.cells.shards.profiles = vec![Profile::Compact];
     encode.cells.objects = false;
     let settings = NoiseSettings {
-        scenes: args.scene.clone(),
+        scenes: args.on.scene.clone(),
         levels,
         seed: args.seed,
         methods,
-        out: args.out.clone(),
+        out: args.on.out.clone(),
         encode,
     };
     progress.begin("noise", "row", n_rows as u64, 0);
