@@ -250,6 +250,38 @@ fn exact_shard(vectors: &[Vec<f32>], means_in_world: Vec<DVec3>) -> AlignedBytes
     AlignedBytes::copy_of(&built.shards[0].bytes)
 }
 
+/// Gaussians lie by centroid, then along the Morton curve; those without evidence come last. Oracle: bits interleaved one by one.
+#[test]
+fn gaussians_are_in_the_order_of_the_format() {
+    let random = &mut Random::new(6);
+    let n = 2000;
+    let directions: Vec<Vec<f32>> = (0..9).map(|_| to_f32(&direction(random))).collect();
+    let vectors: Vec<Vec<f32>> = (0..n)
+        .map(|i| if i % 10 == 0 { vec![f32::NAN; DIM] } else { directions[random.below(9)].clone() })
+        .collect();
+    let means: Vec<DVec3> =
+        (0..n).map(|_| DVec3::new(uniform(random), 30.0 * uniform(random), -uniform(random))).collect();
+    let bytes = exact_shard(&vectors, means.clone());
+    let shard = ShardLayout::check(&bytes).expect("valid").view(&bytes);
+    let indices = shard.exact.expect("exact").input_indices;
+    let least = means.iter().copied().reduce(DVec3::min).expect("means");
+    let size = means.iter().copied().reduce(DVec3::max).expect("means") - least;
+    let morton = |index: &u32| {
+        let steps = (means[*index as usize] - least) / (size / f64::from((1 << 21) - 1));
+        (0..21).rev().fold(0u64, |code, bit| {
+            [steps.z, steps.y, steps.x].iter().fold(code, |code, axis| code << 1 | (*axis as u64 >> bit & 1))
+        })
+    };
+    let starts: Vec<usize> = shard.centroid_starts.iter().map(|start| *start as usize).chain([n]).collect();
+    assert!(starts.len() > 5, "{starts:?}");
+    for run in starts.windows(2).map(|ends| &indices[ends[0]..ends[1]]) {
+        assert!(run.is_sorted_by_key(|index| (morton(index), *index)), "{run:?}");
+    }
+    let n_with = n - n / 10;
+    assert_eq!(*shard.centroid_starts.last().expect("starts") as usize, n_with);
+    assert!(indices[n_with..].iter().all(|index| index % 10 == 0));
+}
+
 /// Components from 1 down to 1e-12 are stored as f16: the error is half a step of 2^-11, below 2^-14 of 2^-24, and the
 /// smallest become zero.
 #[test]

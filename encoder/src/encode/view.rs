@@ -141,7 +141,9 @@ impl<'a> ViewStages<'a> {
             },
             Next::Depth(loaded) => {
                 let raster_view = raster_view(&loaded, self.base_width_px(&loaded));
-                let drawing = self.plan.scene.draw(&raster_view, [0.0; 3]).map_err(raster_failed)?;
+                // A GPU waits for colours that these threads compute, rather than they for it.
+                let draw = || self.plan.scene.draw(&raster_view, [0.0; 3]);
+                let drawing = self.context.install(draw).map_err(raster_failed)?;
                 let depth = enlarge(&drawing.depth, &raster_view, &loaded);
                 Next::Segment(loaded, Some(depth))
             }
