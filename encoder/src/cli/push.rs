@@ -1,11 +1,12 @@
 //! `push`: copies a store into a vector database.
 
+use std::fmt::Write;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use anyhow::Result;
-use clap::{Args, Subcommand};
+use clap::{Args, Subcommand, ValueEnum};
 
 use super::common::{print, runtime, stopped};
 use super::exit::Exit;
@@ -16,7 +17,7 @@ use crate::store::Store;
 /// `push`.
 #[derive(Debug, Subcommand)]
 pub enum PushCommand {
-    /// Pushes every embedding with its position to a Qdrant collection; resumes where it stopped.
+    /// Pushes every embedding with its position to Qdrant; resumes where it stopped.
     Qdrant(QdrantArgs),
 }
 
@@ -29,7 +30,7 @@ pub struct QdrantArgs {
     /// Qdrant's gRPC address.
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:6334")]
     pub url: String,
-    /// Collection; created if it does not exist.
+    /// Collection; created if it does not exist. With `--layout cells`: NAME-cell-ID for each cell.
     #[arg(long, value_name = "NAME")]
     pub collection: String,
     /// API key.
@@ -38,12 +39,96 @@ pub struct QdrantArgs {
     /// Points per request.
     #[arg(long, value_name = "N", default_value = "256")]
     pub batch: NonZeroUsize,
+    /// One collection for the scene, or one for each cell.
+    #[arg(long, value_enum, default_value = "one")]
+    pub layout: LayoutArg,
+    /// Makes a snapshot of each collection at the end, on the server's disk.
+    #[arg(long)]
+    pub snapshots: bool,
+    /// Settings of the collections.
+    #[command(flatten)]
+    pub index: IndexArgs,
+}
+
+/// Settings of collections: new ones are created with them, existing ones are changed to them.
+#[derive(Clone, Debug, Args)]
+pub struct IndexArgs {
+    /// Edges of each node of the HNSW graph: more are more accurate and take more memory; 0 builds no graph
+    /// [default: Qdrant's, or the collection's own].
+    #[arg(long, value_name = "N")]
+    hnsw_m: Option<u64>,
+    /// Neighbours considered per node while the graph is built: more are more accurate and take more time
+    /// [default: Qdrant's, or the collection's own].
+    #[arg(long, value_name = "N")]
+    hnsw_ef_construct: Option<u64>,
+    /// Compressed copies of the vectors, kept in memory [default: Qdrant's, or the collection's own].
+    #[arg(long, value_enum)]
+    quantisation: Option<QuantisationArg>,
+    /// Leaves vectors, graph and payload on disk, for scenes larger than the server's memory.
+    #[arg(long)]
+    on_disk: bool,
+}
+
+impl From<&IndexArgs> for qdrant::IndexSettings {
+    fn from(args: &IndexArgs) -> Self {
+        Self {
+            hnsw_m: args.hnsw_m,
+            hnsw_ef_construct: args.hnsw_ef_construct,
+            quantisation: args.quantisation.map(Into::into),
+            on_disk: args.on_disk,
+        }
+    }
+}
+
+/// `--layout`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum LayoutArg {
+    /// One collection, NAME.
+    One,
+    /// A collection for each cell, NAME-cell-ID: each can be snapshotted, dropped and restored alone.
+    Cells,
+}
+
+impl From<LayoutArg> for qdrant::Layout {
+    fn from(arg: LayoutArg) -> Self {
+        match arg {
+            LayoutArg::One => Self::One,
+            LayoutArg::Cells => Self::Cells,
+        }
+    }
+}
+
+/// `--quantisation`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum QuantisationArg {
+    /// None.
+    None,
+    /// Scalar: a byte a component, a quarter of the vectors' size.
+    Int8,
+    /// Binary: a bit a component, 1/32 of the size.
+    Binary,
+    /// Product: a byte for four components, 1/16 of the size.
+    Product,
+}
+
+impl From<QuantisationArg> for qdrant::Quantisation {
+    fn from(arg: QuantisationArg) -> Self {
+        match arg {
+            QuantisationArg::None => Self::None,
+            QuantisationArg::Int8 => Self::Int8,
+            QuantisationArg::Binary => Self::Binary,
+            QuantisationArg::Product => Self::Product,
+        }
+    }
 }
 
 pub(super) fn run(args: &QdrantArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
     let options = qdrant::PushOptions {
         api_key: args.api_key.clone(),
         n_points_per_batch: args.batch,
+        layout: args.layout.into(),
+        index: (&args.index).into(),
+        snapshots: args.snapshots,
         ..qdrant::PushOptions::new(&args.url, &args.collection)
     };
     // A push keeps its state in the store, so it takes the writer's lock.
@@ -62,10 +147,40 @@ pub(super) fn run(args: &QdrantArgs, progress: &dyn Progress, json: bool) -> Res
         runtime()?.block_on(qdrant::push(&reader, vectors, store.db(), &options, on_batch, stopped()));
     progress.end();
     let report = pushed?;
-    let lines = format!(
-        "{} points in collection {}: {} sent now, {} Gaussians without evidence left out, {} attempts repeated\n",
-        report.n_points, args.collection, report.n_sent, report.n_without_evidence, report.n_retries
-    );
-    print(json, &report, lines)?;
+    print(json, &report, lines(args, &report))?;
     Ok(Exit::Done)
+}
+
+/// Returns the report as text.
+fn lines(args: &QdrantArgs, report: &qdrant::PushReport) -> String {
+    let place = match args.layout {
+        LayoutArg::One => format!("collection {}", args.collection),
+        LayoutArg::Cells => format!("{} collections {}-cell-ID", report.n_collections, args.collection),
+    };
+    let mut lines = format!(
+        "{} points in {place}: {} sent now, {} Gaussians without evidence left out, {} attempts repeated\n",
+        report.n_points, report.n_sent, report.n_without_evidence, report.n_retries
+    );
+    let mut line = |text: std::fmt::Arguments<'_>| writeln!(lines, "{text}").expect("a string takes text");
+    for change in &report.changed_settings {
+        let (setting, before, after) = (change.setting, &change.before, &change.after);
+        line(format_args!("collection {}: {setting} changed from {before} to {after}", change.collection));
+    }
+    for name in &report.deleted_collections {
+        line(format_args!("collection {name} deleted: the scene no longer has this cell"));
+    }
+    for name in &report.left_collections {
+        line(format_args!(
+            "collection {name} left alone: the scene has no such cell, but it holds points of other scenes, or is \
+             empty and was not made from this store; delete it yourself if nothing needs it"
+        ));
+    }
+    for snapshot in &report.snapshots {
+        let sha256 = snapshot.sha256.as_deref().unwrap_or("not stated");
+        line(format_args!(
+            "snapshot of {}: {}, {} bytes, SHA-256 {sha256}",
+            snapshot.collection, snapshot.name, snapshot.size_bytes
+        ));
+    }
+    lines
 }

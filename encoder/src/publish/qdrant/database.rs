@@ -15,21 +15,36 @@ const MAX_RETRY_DELAY: Duration = Duration::from_secs(30);
 /// The client of a database.
 pub(super) struct Database<'a> {
     pub(super) client: Qdrant,
+    /// For requests that take as long as their collection is large.
+    pub(super) patient_client: Qdrant,
     options: &'a PushOptions,
     n_retries: AtomicU64,
 }
 
 impl<'a> Database<'a> {
     pub(super) fn new(options: &'a PushOptions) -> Result<Self, PushError> {
-        let client = Qdrant::from_url(&options.url)
-            .api_key(options.api_key.as_deref())
-            .timeout(options.timeout)
-            .connect_timeout(options.timeout)
-            // The check prints to standard output.
-            .skip_compatibility_check()
-            .build()
-            .map_err(|cause| database_error(options, "set up the client", cause))?;
-        Ok(Self { client, options, n_retries: AtomicU64::new(0) })
+        let client = |timeout| {
+            Qdrant::from_url(&options.url)
+                .api_key(options.api_key.as_deref())
+                .timeout(timeout)
+                .connect_timeout(options.timeout)
+                // The check prints to standard output.
+                .skip_compatibility_check()
+                .build()
+                .map_err(|cause| database_error(options, "set up the client", cause))
+        };
+        Ok(Self {
+            client: client(options.timeout)?,
+            patient_client: client(options.snapshot_timeout)?,
+            options,
+            n_retries: AtomicU64::new(0),
+        })
+    }
+
+    /// Returns the names of all collections.
+    pub(super) async fn collection_names(&self) -> Result<Vec<String>, PushError> {
+        let listed = self.attempt("list the collections", || self.client.list_collections()).await?;
+        Ok(listed.collections.into_iter().map(|collection| collection.name).collect())
     }
 
     /// Returns the number of repeated attempts.

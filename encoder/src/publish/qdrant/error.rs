@@ -61,6 +61,12 @@ pub enum PushError {
         /// Points in the collection.
         found: u64,
     },
+    /// The database made no snapshot, and says nothing of why.
+    #[error("the database describes no snapshot of collection {collection:?}; see its log")]
+    NoSnapshot {
+        /// The collection.
+        collection: String,
+    },
     /// The push was cancelled.
     #[error("the push was stopped; run the push again: it continues")]
     Cancelled,

@@ -1,6 +1,6 @@
-//! Pushes a scene's embeddings into a Qdrant collection: one point a Gaussian.
+//! Pushes a scene's embeddings into Qdrant: one point a Gaussian.
 //!
-//! A collection holds one scene. The id of a point is the Gaussian's index in the input splat file. Its
+//! A collection holds one scene, or one cell of it ([`Layout`]). The id of a point is the Gaussian's index in the input splat file. Its
 //! payload has `x`, `y`, `z` (world frame), `cell_id`, `scene`, `generation` and, if the scene is
 //! geo-referenced, `location` (`lat`, `lon`).
 //!
@@ -11,16 +11,23 @@
 mod collection;
 mod database;
 mod error;
+mod index;
+mod layout;
 mod options;
 mod points;
 mod push;
+mod record;
 mod report;
+mod snapshot;
 mod source;
 
 pub use error::PushError;
+pub use index::{IndexSettings, Quantisation};
+pub use layout::Layout;
 pub use options::PushOptions;
 pub use push::push;
-pub use report::{PushProgress, PushReport};
+pub use report::{PushProgress, PushReport, SettingChange};
+pub use snapshot::Snapshot;
 pub use source::{CellVectors, ExactShards, SourceError, VectorSource};
 
 #[cfg(test)]

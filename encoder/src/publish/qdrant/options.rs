@@ -4,13 +4,22 @@ use std::fmt;
 use std::num::NonZeroUsize;
 use std::time::Duration;
 
+use super::index::IndexSettings;
+use super::layout::Layout;
+
 /// Target and pace of a push.
 #[derive(Clone)]
 pub struct PushOptions {
     /// gRPC address of the database, such as `http://127.0.0.1:6334`.
     pub url: String,
-    /// The collection; created if absent.
+    /// The collection, or the beginning of the names of one a cell; created if absent.
     pub collection: String,
+    /// Which collections the scene is pushed to.
+    pub layout: Layout,
+    /// Settings of the collections.
+    pub index: IndexSettings,
+    /// Whether each collection has a snapshot at the end.
+    pub snapshots: bool,
     /// Key sent with every request.
     pub api_key: Option<String>,
     /// Points in one request.
@@ -21,6 +30,8 @@ pub struct PushOptions {
     pub retry_delay: Duration,
     /// Time limit of one request.
     pub timeout: Duration,
+    /// Time limit of a request for a snapshot.
+    pub snapshot_timeout: Duration,
 }
 
 impl PushOptions {
@@ -30,11 +41,15 @@ impl PushOptions {
         Self {
             url: url.into(),
             collection: collection.into(),
+            layout: Layout::One,
+            index: IndexSettings::default(),
+            snapshots: false,
             api_key: None,
             n_points_per_batch: const { NonZeroUsize::new(256).expect("not zero") },
             n_retries: 8,
             retry_delay: Duration::from_millis(250),
             timeout: Duration::from_secs(60),
+            snapshot_timeout: Duration::from_secs(3600),
         }
     }
 }
@@ -46,6 +61,9 @@ impl fmt::Debug for PushOptions {
         f.debug_struct("PushOptions")
             .field("url", &self.url)
             .field("collection", &self.collection)
+            .field("layout", &self.layout)
+            .field("index", &self.index)
+            .field("snapshots", &self.snapshots)
             .field("api_key", &api_key)
             .finish_non_exhaustive()
     }

@@ -2,6 +2,8 @@
 
 use serde::Serialize;
 
+use super::snapshot::Snapshot;
+
 /// Progress of a push.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PushProgress {
@@ -12,7 +14,7 @@ pub struct PushProgress {
 }
 
 /// Result of a push.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct PushReport {
     /// Points of this generation, all in the database.
     pub n_points: u64,
@@ -22,6 +24,30 @@ pub struct PushReport {
     pub n_without_evidence: u64,
     /// Repeated attempts.
     pub n_retries: u64,
-    /// Whether this run created the collection.
-    pub created_collection: bool,
+    /// Collections of this generation.
+    pub n_collections: usize,
+    /// How many of them this run created.
+    pub n_created_collections: usize,
+    /// Settings of existing collections that this run changed.
+    pub changed_settings: Vec<SettingChange>,
+    /// Collections of cells that this generation no longer has, deleted.
+    pub deleted_collections: Vec<String>,
+    /// Collections named like those of cells that this generation does not have, left alone: they hold points of
+    /// other scenes, or none at all and no push from this store is known.
+    pub left_collections: Vec<String>,
+    /// Snapshots of the collections, where asked for.
+    pub snapshots: Vec<Snapshot>,
+}
+
+/// An index setting of an existing collection that differed from the one asked for.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct SettingChange {
+    /// The collection.
+    pub collection: String,
+    /// Which setting.
+    pub setting: &'static str,
+    /// Its former value.
+    pub before: String,
+    /// Its value now.
+    pub after: String,
 }

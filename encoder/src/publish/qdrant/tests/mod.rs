@@ -1,3 +1,6 @@
+mod cells;
+mod collections;
+mod index;
 mod server;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -48,9 +51,14 @@ fn fixture() -> Fixture {
 impl Fixture {
     /// Publishes a generation whose splat indices begin at `first_id`.
     fn publish(&mut self, generation: u64, first_id: u32) {
+        self.publish_cells(generation, first_id, &CELLS);
+    }
+
+    /// Publishes a generation of these cells: Gaussians, and how many have an embedding.
+    fn publish_cells(&mut self, generation: u64, first_id: u32, cells: &[(u32, u32)]) {
         let mut random = Random::new(generation);
         self.truth.clear();
-        let boxes: Vec<Aabb> = (0..CELLS.len())
+        let boxes: Vec<Aabb> = (0..cells.len())
             .map(|i| Aabb {
                 min: DVec3::X * 100.0 * i as f64,
                 max: DVec3::new(100.0 * i as f64 + 90.0, 90.0, 9.0),
@@ -62,7 +70,7 @@ impl Fixture {
         let origin = Geographic { latitude_deg: 46.842657, longitude_deg: -91.994008, height_m: 158.5 };
         manifest.geo_reference = Some(GeoReference { origin });
         let mut next_id = first_id;
-        for (cell, (n_gaussians, n_with_evidence)) in manifest.cells.iter_mut().zip(CELLS) {
+        for (cell, (n_gaussians, n_with_evidence)) in manifest.cells.iter_mut().zip(cells.iter().copied()) {
             let (n, n_with) = (n_gaussians as usize, n_with_evidence as usize);
             // Interleaved ids, so that shard order is not id order.
             let ids: Vec<u32> = (0..n_gaussians).map(|i| next_id + (i * 37) % n_gaussians).collect();
@@ -117,8 +125,8 @@ impl Fixture {
             cell.n_gaussians = n_gaussians;
             cell.shards.insert(Profile::Exact, record);
         }
-        manifest.n_gaussians = CELLS.iter().map(|cell| u64::from(cell.0)).sum();
-        manifest.n_without_evidence = manifest.n_gaussians - N_POINTS;
+        manifest.n_gaussians = cells.iter().map(|cell| u64::from(cell.0)).sum();
+        manifest.n_without_evidence = cells.iter().map(|cell| u64::from(cell.0 - cell.1)).sum();
         self.store.publish(&manifest, &Extras::new()).expect("publishes");
     }
 
@@ -138,9 +146,35 @@ impl Fixture {
         self.push_until(options, std::future::pending()).await.map(|(report, _)| report)
     }
 
+    /// Pushes until the server has acknowledged some batches.
+    async fn push_cut_off(
+        &self,
+        server: &Server,
+        options: &PushOptions,
+        n_batches: usize,
+    ) -> Result<PushReport, PushError> {
+        let (stop, mut stopped) = tokio::sync::watch::channel(false);
+        *server.watcher.lock().expect("free") = Some(Arc::new(move |n_acknowledged| {
+            if n_acknowledged == n_batches {
+                let _ = stop.send(true);
+            }
+        }));
+        let cancel = async move {
+            let _ = stopped.wait_for(|stop| *stop).await;
+        };
+        let ended = self.push_until(options, cancel).await;
+        *server.watcher.lock().expect("free") = None;
+        ended.map(|(report, _)| report)
+    }
+
     /// Checks that the server holds exactly this generation, every value as it was made.
     fn assert_arrived(&self, server: &Server, generation: i64) {
-        let points = server.with(|state| state.points.clone());
+        let points = server.with(|state| state.collections["yard"].points.clone());
+        self.assert_points(&points, generation);
+    }
+
+    /// Checks that points are exactly this generation's, every value as it was made.
+    fn assert_points(&self, points: &BTreeMap<u64, server::Stored>, generation: i64) {
         assert_eq!(points.keys().collect::<Vec<_>>(), self.truth.keys().collect::<Vec<_>>());
         let reader = self.store.reader().expect("published");
         let reference = reader.manifest().geo_reference.expect("geo-referenced");
@@ -184,13 +218,18 @@ async fn every_point_arrives_and_search_equals_brute_force() {
         n_sent: N_POINTS,
         n_without_evidence: 17,
         n_retries: 0,
-        created_collection: true,
+        n_collections: 1,
+        n_created_collections: 1,
+        ..PushReport::default()
     };
     assert_eq!(report, expected);
     assert_eq!(seen.len(), N_BATCHES);
     assert_eq!(seen.last(), Some(&PushProgress { n_points: N_POINTS, n_points_expected: N_POINTS }));
     fixture.assert_arrived(&server, 1);
-    assert_eq!(server.with(|state| state.indexed.clone()), ["scene", "generation", "location"]);
+    assert_eq!(
+        server.with(|state| state.collections["yard"].indexed.clone()),
+        ["scene", "generation", "location"]
+    );
 
     let client = Qdrant::from_url(&url).api_key("k3y").skip_compatibility_check().build().expect("a client");
     let mut random = Random::new(99);
@@ -259,24 +298,13 @@ async fn a_push_that_is_cut_off_continues() {
     for stop_after in [1, 5, 7, 8, 12, N_BATCHES] {
         let fixture = fixture();
         let (server, url) = Server::start(None).await;
-        let (stop, stopped) = tokio::sync::watch::channel(false);
-        *server.watcher.lock().expect("free") = Some(Arc::new(move |n_acknowledged| {
-            if n_acknowledged == stop_after {
-                let _ = stop.send(true);
-            }
-        }));
-        let mut stopped_too = stopped.clone();
-        let cancel = async move {
-            let _ = stopped_too.wait_for(|stop| *stop).await;
-        };
-        let ended = fixture.push_until(&options(&url), cancel).await;
+        let ended = fixture.push_cut_off(&server, &options(&url), stop_after).await;
         assert!(matches!(ended, Err(PushError::Cancelled)), "{stop_after}: {ended:?}");
-        *server.watcher.lock().expect("free") = None;
         let before = server.with(|state| state.acknowledged.clone());
         assert!(before.len() >= stop_after && before.len() <= stop_after + 1, "{stop_after}: {before:?}");
 
         let report = fixture.push(&options(&url)).await.expect("continues");
-        assert!(!report.created_collection);
+        assert_eq!(report.n_created_collections, 0);
         assert_eq!((report.n_points, report.n_without_evidence), (N_POINTS, 17), "{stop_after}");
         let all = server.with(|state| state.acknowledged.clone());
         // At most the one batch that was acknowledged but not noted comes twice.
@@ -300,10 +328,10 @@ async fn missing_payload_indexes_are_made_by_the_next_push() {
         let refused = fixture.push(&options(&url)).await.expect_err("no index");
         assert!(matches!(refused, PushError::Database { action: "index a payload field", .. }), "{refused}");
         let made = ["scene", "generation", "location"][..n_before].iter().map(ToString::to_string);
-        server.with(|state| state.indexed = made.collect());
+        server.with(|state| state.collections.get_mut("yard").expect("created").indexed = made.collect());
         let report = fixture.push(&options(&url)).await.expect("continues");
-        assert_eq!((report.n_points, report.created_collection), (N_POINTS, false));
-        let indexed = server.with(|state| state.indexed.clone());
+        assert_eq!((report.n_points, report.n_created_collections), (N_POINTS, 0));
+        let indexed = server.with(|state| state.collections["yard"].indexed.clone());
         assert_eq!(indexed, ["scene", "generation", "location"], "{n_before} were there");
     }
 }
@@ -315,15 +343,15 @@ async fn a_new_generation_starts_over_and_replaces() {
     fixture.push(&options(&url)).await.expect("pushes");
     fixture.publish(2, 30);
     let report = fixture.push(&options(&url)).await.expect("pushes");
-    assert_eq!((report.n_sent, report.created_collection), (N_POINTS, false));
+    assert_eq!((report.n_sent, report.n_created_collections), (N_POINTS, 0));
     fixture.assert_arrived(&server, 2);
 
     // A collection that was deleted is filled again, whatever the record says.
     server.with(|state| *state = server::State::default());
     let report = fixture.push(&options(&url)).await.expect("pushes");
-    assert_eq!((report.n_sent, report.created_collection), (N_POINTS, true));
+    assert_eq!((report.n_sent, report.n_created_collections), (N_POINTS, 1));
     // One that lost points is noticed, and filled by the next push.
-    server.with(|state| state.points.pop_first());
+    server.with(|state| state.collections.get_mut("yard").expect("created").points.pop_first());
     let lost = fixture.push(&options(&url)).await.expect_err("a point is missing");
     assert!(matches!(lost, PushError::Count { expected: N_POINTS, found: 94, .. }), "{lost}");
     fixture.push(&options(&url)).await.expect("starts over");
@@ -336,7 +364,7 @@ async fn collections_that_do_not_fit_are_refused() {
     let (server, url) = Server::start(None).await;
     for (dim, distance) in [(DIM as u64 + 1, Distance::Cosine), (DIM as u64, Distance::Dot)] {
         let params = VectorParamsBuilder::new(dim, distance).build();
-        server.with(|state| state.params = Some(params));
+        server.with(|state| state.collections.insert("yard".into(), server::Held::new(params)));
         let refused = fixture.push(&options(&url)).await.expect_err("does not fit").to_string();
         let expected = format!(
             "collection \"yard\" has vectors of {dim} components, distance {}, this scene needs vectors of 16 components, distance Cosine; choose another collection, or delete this one",
@@ -344,13 +372,18 @@ async fn collections_that_do_not_fit_are_refused() {
         );
         assert_eq!(refused, expected);
     }
-    server.with(|state| state.params = Some(VectorParamsBuilder::new(DIM as u64, Distance::Cosine).build()));
+    let mut held = server::Held::new(VectorParamsBuilder::new(DIM as u64, Distance::Cosine).build());
     let foreign =
         server::Stored { vector: vec![1.0; DIM], payload: [("scene".to_owned(), "attic".into())].into() };
-    server.with(|state| state.points.insert(7, foreign));
+    held.points.insert(7, foreign);
+    server.with(|state| state.collections.insert("yard".into(), held));
     let refused = fixture.push(&options(&url)).await.expect_err("another scene");
     assert!(matches!(refused, PushError::OtherScene { n_points: 1, .. }), "{refused}");
-    assert_eq!(server.with(|state| (state.points.len(), state.acknowledged.len())), (1, 0), "untouched");
+    assert_eq!(
+        server.with(|state| (state.collections["yard"].points.len(), state.acknowledged.len())),
+        (1, 0),
+        "untouched"
+    );
 }
 
 #[tokio::test]

@@ -3,8 +3,9 @@
 use std::collections::{BTreeMap, HashMap};
 use std::sync::{Arc, Mutex};
 
-use ::qdrant_client::qdrant::collections_server::{Collections, CollectionsServer};
+use ::qdrant_client::qdrant::collections_server::CollectionsServer;
 use ::qdrant_client::qdrant::points_server::{Points, PointsServer};
+use ::qdrant_client::qdrant::snapshots_server::SnapshotsServer;
 use ::qdrant_client::qdrant::vector::Vector as Kind;
 use ::qdrant_client::qdrant::*;
 use ::qdrant_client::qdrant::{
@@ -20,18 +21,56 @@ pub(super) struct Stored {
     pub(super) payload: HashMap<String, Value>,
 }
 
+/// A collection as stored.
+#[derive(Clone, Default)]
+pub(super) struct Held {
+    /// As created and updated.
+    pub(super) config: CollectionConfig,
+    pub(super) indexed: Vec<String>,
+    pub(super) points: BTreeMap<u64, Stored>,
+    pub(super) snapshots: Vec<SnapshotDescription>,
+}
+
+impl Held {
+    pub(super) fn new(vectors: VectorParams) -> Self {
+        let vectors_config = Some(VectorsConfig { config: Some(vectors_config::Config::Params(vectors)) });
+        let params = Some(CollectionParams { vectors_config, ..Default::default() });
+        Self { config: CollectionConfig { params, ..Default::default() }, ..Self::default() }
+    }
+
+    pub(super) fn vectors(&mut self) -> &mut VectorParams {
+        let config = self.config.params.as_mut().and_then(|params| params.vectors_config.as_mut());
+        match config.and_then(|config| config.config.as_mut()) {
+            Some(vectors_config::Config::Params(vectors)) => vectors,
+            other => panic!("no unnamed vectors: {other:?}"),
+        }
+    }
+}
+
 #[derive(Default)]
 pub(super) struct State {
-    pub(super) params: Option<VectorParams>,
-    pub(super) indexed: Vec<String>,
+    pub(super) collections: BTreeMap<String, Held>,
+    /// Requests that create and update collections, in order.
+    pub(super) created: Vec<CreateCollection>,
+    pub(super) updated: Vec<UpdateCollection>,
+    /// Quantisation of collections that are created without one, as the server's operator may set it.
+    pub(super) default_quantization: Option<QuantizationConfig>,
+    /// Snapshots that are still to be made before one is refused.
+    pub(super) n_snapshots_allowed: Option<u32>,
     /// Requests for a payload index that are still to be refused.
     pub(super) n_indexes_refused: u32,
-    pub(super) points: BTreeMap<u64, Stored>,
     /// First id of every batch that was acknowledged, in order.
     pub(super) acknowledged: Vec<u64>,
     /// Batches that are still to fail, by first id: how often, and whether after they took effect.
     pub(super) failures: HashMap<u64, (u32, bool)>,
     pub(super) n_failed: u32,
+}
+
+impl State {
+    /// Returns a collection, as every service finds it.
+    pub(super) fn held(&mut self, name: &str) -> Result<&mut Held, Status> {
+        self.collections.get_mut(name).ok_or_else(|| Status::not_found(format!("no collection {name}")))
+    }
 }
 
 /// Called with the number of acknowledged batches.
@@ -52,7 +91,8 @@ impl Server {
         let url = format!("http://{}", listener.local_addr().expect("bound"));
         let router = tonic::transport::Server::builder()
             .add_service(PointsServer::new(server.clone()))
-            .add_service(CollectionsServer::new(server.clone()));
+            .add_service(CollectionsServer::new(server.clone()))
+            .add_service(SnapshotsServer::new(server.clone()));
         tokio::spawn(router.serve_with_incoming(tokio_stream::wrappers::TcpListenerStream::new(listener)));
         (server, url)
     }
@@ -61,7 +101,7 @@ impl Server {
         work(&mut self.state.lock().expect("no test panics within"))
     }
 
-    fn admit<T>(&self, request: Request<T>) -> Result<T, Status> {
+    pub(super) fn admit<T>(&self, request: Request<T>) -> Result<T, Status> {
         let key = request.metadata().get("api-key").and_then(|key| key.to_str().ok());
         match self.api_key {
             Some(expected) if key != Some(expected) => Err(Status::unauthenticated("wrong or missing key")),
@@ -79,7 +119,7 @@ impl Server {
         let mut state = self.state.lock().expect("no test panics within");
         let points: Vec<(u64, Stored)> = request.points.into_iter().map(stored).collect::<Result<_, _>>()?;
         let first = points.first().ok_or_else(|| Status::invalid_argument("no points"))?.0;
-        let dim = state.params.as_ref().ok_or_else(|| Status::not_found("no collection"))?.size;
+        let dim = state.held(&request.collection_name)?.vectors().size;
         if points.iter().any(|(_, point)| point.vector.len() as u64 != dim) {
             return Err(Status::invalid_argument("wrong dimension"));
         }
@@ -91,7 +131,7 @@ impl Server {
             _ => None,
         };
         if failure != Some(false) {
-            state.points.extend(points);
+            state.held(&request.collection_name)?.points.extend(points);
         }
         if failure.is_some() {
             state.n_failed += 1;
@@ -168,6 +208,8 @@ macro_rules! service {
     };
 }
 
+pub(super) use service;
+
 service!(Points {
     async fn upsert(&self, request: Request<UpsertPoints>) -> Result<Response<PointsOperationResponse>, Status> {
         self.upsert_now(self.admit(request)?)?;
@@ -175,18 +217,20 @@ service!(Points {
     }
 
     async fn delete(&self, request: Request<DeletePoints>) -> Result<Response<PointsOperationResponse>, Status> {
-        let selector = self.admit(request)?.points.and_then(|points| points.points_selector_one_of);
+        let request = self.admit(request)?;
+        let selector = request.points.and_then(|points| points.points_selector_one_of);
         let Some(PointsSelectorOneOf::Filter(filter)) = selector else {
             return Err(Status::unimplemented("only by filter"));
         };
         self.with(|state| {
+            let held = state.held(&request.collection_name)?;
             let mut kept = BTreeMap::new();
-            for (id, point) in std::mem::take(&mut state.points) {
+            for (id, point) in std::mem::take(&mut held.points) {
                 if !passes(&point.payload, &filter)? {
                     kept.insert(id, point);
                 }
             }
-            state.points = kept;
+            held.points = kept;
             Ok(self.done())
         })
     }
@@ -196,21 +240,22 @@ service!(Points {
         assert_eq!(request.exact, Some(true));
         let filter = request.filter.unwrap_or_default();
         self.with(|state| {
+            let points = &state.held(&request.collection_name)?.points;
             let passed: Result<Vec<bool>, Status> =
-                state.points.values().map(|point| passes(&point.payload, &filter)).collect();
+                points.values().map(|point| passes(&point.payload, &filter)).collect();
             let count = passed?.into_iter().filter(|passed| *passed).count() as u64;
             Ok(Response::new(CountResponse { result: Some(CountResult { count }), ..Default::default() }))
         })
     }
 
     async fn create_field_index(&self, request: Request<CreateFieldIndexCollection>) -> Result<Response<PointsOperationResponse>, Status> {
-        let field = self.admit(request)?.field_name;
+        let request = self.admit(request)?;
         self.with(|state| {
             if state.n_indexes_refused > 0 {
                 state.n_indexes_refused -= 1;
                 return Err(Status::permission_denied("indexes are refused"));
             }
-            state.indexed.push(field);
+            state.held(&request.collection_name)?.indexed.push(request.field_name);
             Ok(self.done())
         })
     }
@@ -224,7 +269,7 @@ service!(Points {
                 payload: point.payload.clone(),
                 ..Default::default()
             };
-            let mut result: Vec<ScoredPoint> = state.points.iter().map(score).collect();
+            let mut result: Vec<ScoredPoint> = state.held(&request.collection_name)?.points.iter().map(score).collect();
             result.sort_by(|a, b| b.score.total_cmp(&a.score));
             result.truncate(request.limit as usize);
             Ok(Response::new(SearchResponse { result, ..Default::default() }))
@@ -256,45 +301,4 @@ service!(Points {
     facet: FacetCounts => FacetResponse;
     search_matrix_pairs: SearchMatrixPoints => SearchMatrixPairsResponse;
     search_matrix_offsets: SearchMatrixPoints => SearchMatrixOffsetsResponse;
-});
-
-service!(Collections {
-    async fn collection_exists(&self, request: Request<CollectionExistsRequest>) -> Result<Response<CollectionExistsResponse>, Status> {
-        self.admit(request)?;
-        let exists = self.with(|state| state.params.is_some());
-        Ok(Response::new(CollectionExistsResponse { result: Some(CollectionExists { exists }), ..Default::default() }))
-    }
-
-    async fn create(&self, request: Request<CreateCollection>) -> Result<Response<CollectionOperationResponse>, Status> {
-        let config = self.admit(request)?.vectors_config.and_then(|config| config.config);
-        let Some(vectors_config::Config::Params(params)) = config else {
-            return Err(Status::unimplemented("only one unnamed vector"));
-        };
-        self.with(|state| state.params = Some(params));
-        Ok(Response::new(CollectionOperationResponse { result: true, ..Default::default() }))
-    }
-
-    async fn get(&self, request: Request<GetCollectionInfoRequest>) -> Result<Response<GetCollectionInfoResponse>, Status> {
-        self.admit(request)?;
-        let (params, indexed) = self.with(|state| (state.params, state.indexed.clone()));
-        let params = params.ok_or_else(|| Status::not_found("no collection"))?;
-        let vectors_config = Some(VectorsConfig { config: Some(vectors_config::Config::Params(params)) });
-        let params = Some(CollectionParams { vectors_config, ..Default::default() });
-        let config = Some(CollectionConfig { params, ..Default::default() });
-        let payload_schema = indexed.into_iter().map(|field| (field, PayloadSchemaInfo::default())).collect();
-        let result = Some(CollectionInfo { config, payload_schema, ..Default::default() });
-        Ok(Response::new(GetCollectionInfoResponse { result, ..Default::default() }))
-    }
-} refused {
-    list: ListCollectionsRequest => ListCollectionsResponse;
-    update: UpdateCollection => CollectionOperationResponse;
-    delete: DeleteCollection => CollectionOperationResponse;
-    update_aliases: ChangeAliases => CollectionOperationResponse;
-    list_collection_aliases: ListCollectionAliasesRequest => ListAliasesResponse;
-    list_aliases: ListAliasesRequest => ListAliasesResponse;
-    collection_cluster_info: CollectionClusterInfoRequest => CollectionClusterInfoResponse;
-    update_collection_cluster_setup: UpdateCollectionClusterSetupRequest => UpdateCollectionClusterSetupResponse;
-    create_shard_key: CreateShardKeyRequest => CreateShardKeyResponse;
-    delete_shard_key: DeleteShardKeyRequest => DeleteShardKeyResponse;
-    list_shard_keys: ListShardKeysRequest => ListShardKeysResponse;
 });

@@ -1,0 +1,180 @@
+//! The collections and snapshots of the small Qdrant.
+
+use ::qdrant_client::qdrant::collections_server::Collections;
+use ::qdrant_client::qdrant::snapshots_server::Snapshots;
+use ::qdrant_client::qdrant::*;
+use tonic::{Request, Response, Status};
+
+use super::server::{Held, Server, service};
+
+fn done() -> Response<CollectionOperationResponse> {
+    Response::new(CollectionOperationResponse { result: true, ..Default::default() })
+}
+
+/// Copies the fields that a difference has.
+macro_rules! merge {
+    ($into:expr, $from:expr, $($field:ident)*) => {
+        $(if $from.$field.is_some() {
+            $into.$field = $from.$field;
+        })*
+    };
+}
+
+fn merge_hnsw(into: &mut Option<HnswConfigDiff>, from: Option<HnswConfigDiff>) {
+    let Some(from) = from else { return };
+    #[expect(deprecated, reason = "older servers know no other field")]
+    {
+        let into = into.get_or_insert_default();
+        merge!(into, from, m ef_construct on_disk memory);
+    }
+}
+
+fn merge_quantization(into: &mut Option<QuantizationConfig>, from: Option<QuantizationConfigDiff>) {
+    use quantization_config::Quantization;
+    use quantization_config_diff::Quantization as Diff;
+    let quantization = match from.and_then(|from| from.quantization) {
+        None => return,
+        Some(Diff::Disabled(_)) => {
+            *into = None;
+            return;
+        }
+        Some(Diff::Scalar(scalar)) => Quantization::Scalar(scalar),
+        Some(Diff::Product(product)) => Quantization::Product(product),
+        Some(Diff::Binary(binary)) => Quantization::Binary(binary),
+        Some(Diff::Turboquant(turbo)) => Quantization::Turboquant(turbo),
+    };
+    *into = Some(QuantizationConfig { quantization: Some(quantization) });
+}
+
+/// Changes a collection as the comments of the client's messages say.
+fn update(held: &mut Held, request: UpdateCollection) -> Result<(), Status> {
+    merge_hnsw(&mut held.config.hnsw_config, request.hnsw_config);
+    merge_quantization(&mut held.config.quantization_config, request.quantization_config);
+    match request.vectors_config.map(|vectors| vectors.config) {
+        None => {}
+        Some(Some(vectors_config_diff::Config::Params(diff))) => {
+            let vectors = held.vectors();
+            merge_hnsw(&mut vectors.hnsw_config, diff.hnsw_config);
+            merge_quantization(&mut vectors.quantization_config, diff.quantization_config);
+            #[expect(deprecated, reason = "older servers know no other field")]
+            {
+                merge!(vectors, diff, on_disk memory);
+            }
+        }
+        Some(_) => return Err(Status::unimplemented("only one unnamed vector")),
+    }
+    if let Some(diff) = request.params {
+        let params = held.config.params.get_or_insert_default();
+        #[expect(deprecated, reason = "older servers know no other field")]
+        if let Some(on_disk) = diff.on_disk_payload {
+            params.on_disk_payload = on_disk;
+        }
+        merge!(params, diff, payload);
+    }
+    Ok(())
+}
+
+service!(Collections {
+    async fn collection_exists(&self, request: Request<CollectionExistsRequest>) -> Result<Response<CollectionExistsResponse>, Status> {
+        let name = self.admit(request)?.collection_name;
+        let exists = self.with(|state| state.collections.contains_key(&name));
+        Ok(Response::new(CollectionExistsResponse { result: Some(CollectionExists { exists }), ..Default::default() }))
+    }
+
+    async fn create(&self, request: Request<CreateCollection>) -> Result<Response<CollectionOperationResponse>, Status> {
+        let request = self.admit(request)?;
+        self.with(|state| {
+            state.created.push(request.clone());
+            let config = request.vectors_config.and_then(|config| config.config);
+            let Some(vectors_config::Config::Params(vectors)) = config else {
+                return Err(Status::unimplemented("only one unnamed vector"));
+            };
+            let mut held = Held::new(vectors);
+            held.config.hnsw_config = request.hnsw_config;
+            held.config.quantization_config = request.quantization_config.or(state.default_quantization);
+            #[expect(deprecated, reason = "older servers know no other field")]
+            if let (Some(params), Some(on_disk)) = (&mut held.config.params, request.on_disk_payload) {
+                params.on_disk_payload = on_disk;
+            }
+            match state.collections.insert(request.collection_name, held) {
+                None => Ok(done()),
+                Some(_) => Err(Status::already_exists("exists")),
+            }
+        })
+    }
+
+    async fn get(&self, request: Request<GetCollectionInfoRequest>) -> Result<Response<GetCollectionInfoResponse>, Status> {
+        let name = self.admit(request)?.collection_name;
+        let Held { config, indexed, .. } = self.with(|state| state.held(&name).cloned())?;
+        let payload_schema = indexed.into_iter().map(|field| (field, PayloadSchemaInfo::default())).collect();
+        let result = Some(CollectionInfo { config: Some(config), payload_schema, ..Default::default() });
+        Ok(Response::new(GetCollectionInfoResponse { result, ..Default::default() }))
+    }
+
+    async fn list(&self, request: Request<ListCollectionsRequest>) -> Result<Response<ListCollectionsResponse>, Status> {
+        self.admit(request)?;
+        let names = self.with(|state| state.collections.keys().cloned().collect::<Vec<_>>());
+        let collections = names.into_iter().map(|name| CollectionDescription { name }).collect();
+        Ok(Response::new(ListCollectionsResponse { collections, ..Default::default() }))
+    }
+
+    async fn update(&self, request: Request<UpdateCollection>) -> Result<Response<CollectionOperationResponse>, Status> {
+        let request = self.admit(request)?;
+        self.with(|state| {
+            state.updated.push(request.clone());
+            update(state.held(&request.collection_name)?, request)?;
+            Ok(done())
+        })
+    }
+
+    async fn delete(&self, request: Request<DeleteCollection>) -> Result<Response<CollectionOperationResponse>, Status> {
+        let name = self.admit(request)?.collection_name;
+        self.with(|state| {
+            state.held(&name)?;
+            state.collections.remove(&name);
+            Ok(done())
+        })
+    }
+} refused {
+    update_aliases: ChangeAliases => CollectionOperationResponse;
+    list_collection_aliases: ListCollectionAliasesRequest => ListAliasesResponse;
+    list_aliases: ListAliasesRequest => ListAliasesResponse;
+    collection_cluster_info: CollectionClusterInfoRequest => CollectionClusterInfoResponse;
+    update_collection_cluster_setup: UpdateCollectionClusterSetupRequest => UpdateCollectionClusterSetupResponse;
+    create_shard_key: CreateShardKeyRequest => CreateShardKeyResponse;
+    delete_shard_key: DeleteShardKeyRequest => DeleteShardKeyResponse;
+    list_shard_keys: ListShardKeysRequest => ListShardKeysResponse;
+});
+
+service!(Snapshots {
+    /// A snapshot has a new name, the number of points as its size, and a checksum made of the collection's name.
+    async fn create(&self, request: Request<CreateSnapshotRequest>) -> Result<Response<CreateSnapshotResponse>, Status> {
+        let name = self.admit(request)?.collection_name;
+        self.with(|state| {
+            if let Some(n_left) = &mut state.n_snapshots_allowed {
+                *n_left = n_left.checked_sub(1).ok_or_else(|| Status::permission_denied("the disk is full"))?;
+            }
+            let held = state.held(&name)?;
+            let snapshot = SnapshotDescription {
+                name: format!("{name}-{}.snapshot", held.snapshots.len() + 1),
+                creation_time: None,
+                size: held.points.len() as i64 + 1000,
+                checksum: Some(format!("sha256 of {name}")),
+            };
+            held.snapshots.push(snapshot.clone());
+            let snapshot_description = Some(snapshot);
+            Ok(Response::new(CreateSnapshotResponse { snapshot_description, ..Default::default() }))
+        })
+    }
+
+    async fn list(&self, request: Request<ListSnapshotsRequest>) -> Result<Response<ListSnapshotsResponse>, Status> {
+        let name = self.admit(request)?.collection_name;
+        let snapshot_descriptions = self.with(|state| state.held(&name).map(|held| held.snapshots.clone()))?;
+        Ok(Response::new(ListSnapshotsResponse { snapshot_descriptions, ..Default::default() }))
+    }
+} refused {
+    delete: DeleteSnapshotRequest => DeleteSnapshotResponse;
+    create_full: CreateFullSnapshotRequest => CreateSnapshotResponse;
+    list_full: ListFullSnapshotsRequest => ListSnapshotsResponse;
+    delete_full: DeleteFullSnapshotRequest => DeleteSnapshotResponse;
+});

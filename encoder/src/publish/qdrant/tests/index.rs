@@ -1,0 +1,222 @@
+//! Index settings: what is sent at creation, and to collections that exist.
+#![expect(deprecated, reason = "older servers know no other field than the deprecated ones")]
+
+use qdrant_client::qdrant::{
+    BinaryQuantization, CollectionParamsDiff, CompressionRatio, CreateCollection, CreateCollectionBuilder,
+    Disabled, Distance, HnswConfigDiff, Memory, PayloadStorageParams, ProductQuantization,
+    QuantizationConfig, QuantizationConfigDiff, QuantizationType, ScalarQuantization, UpdateCollection,
+    VectorParamsBuilder, VectorParamsDiff, VectorsConfigDiff, quantization_config::Quantization as Stored,
+    quantization_config_diff::Quantization as Diff, vectors_config_diff,
+};
+
+use super::server::{Held, Server};
+use super::*;
+
+/// A creation without any setting: vectors and distance alone.
+fn plain() -> CreateCollection {
+    let vectors = VectorParamsBuilder::new(DIM as u64, Distance::Cosine);
+    CreateCollectionBuilder::new("yard").vectors_config(vectors).build()
+}
+
+fn with_quantization(quantization: Stored) -> CreateCollection {
+    let quantization_config = Some(QuantizationConfig { quantization: Some(quantization) });
+    CreateCollection { quantization_config, ..plain() }
+}
+
+fn scalar() -> ScalarQuantization {
+    ScalarQuantization {
+        r#type: QuantizationType::Int8.into(),
+        quantile: None,
+        always_ram: Some(true),
+        memory: None,
+    }
+}
+
+fn change(setting: &'static str, before: &str, after: &str) -> SettingChange {
+    SettingChange { collection: "yard".into(), setting, before: before.into(), after: after.into() }
+}
+
+const ALL: IndexSettings = IndexSettings {
+    hnsw_m: Some(32),
+    hnsw_ef_construct: Some(200),
+    quantisation: Some(Quantisation::Int8),
+    on_disk: true,
+};
+
+#[tokio::test]
+async fn a_collection_is_created_with_the_settings_given_and_no_others() {
+    let none = IndexSettings::default();
+    let hnsw = |hnsw| CreateCollection { hnsw_config: Some(hnsw), ..plain() };
+    let binary =
+        BinaryQuantization { encoding: None, query_encoding: None, always_ram: Some(true), memory: None };
+    let product = ProductQuantization {
+        compression: CompressionRatio::X16.into(),
+        always_ram: Some(true),
+        memory: None,
+    };
+    let quantised = |quantisation| IndexSettings { quantisation: Some(quantisation), ..none };
+    let cases = [
+        (none, plain()),
+        (
+            IndexSettings { hnsw_m: Some(0), ..none },
+            hnsw(HnswConfigDiff { m: Some(0), ..Default::default() }),
+        ),
+        (
+            IndexSettings { hnsw_ef_construct: Some(64), ..none },
+            hnsw(HnswConfigDiff { ef_construct: Some(64), ..Default::default() }),
+        ),
+        (quantised(Quantisation::None), plain()),
+        (quantised(Quantisation::Int8), with_quantization(Stored::Scalar(scalar()))),
+        (quantised(Quantisation::Binary), with_quantization(Stored::Binary(binary))),
+        (quantised(Quantisation::Product), with_quantization(Stored::Product(product))),
+        (IndexSettings { on_disk: true, ..none }, {
+            let vectors = VectorParamsBuilder::new(DIM as u64, Distance::Cosine).on_disk(true);
+            CreateCollection {
+                hnsw_config: Some(HnswConfigDiff { on_disk: Some(true), ..Default::default() }),
+                ..CreateCollectionBuilder::new("yard").vectors_config(vectors).on_disk_payload(true).build()
+            }
+        }),
+    ];
+    let fixture = fixture();
+    for (index, expected) in cases {
+        let (server, url) = Server::start(None).await;
+        let options = PushOptions { index, ..options(&url) };
+        let report = fixture.push(&options).await.expect("pushes");
+        assert_eq!(server.with(|state| state.created.clone()), [expected], "{index:?}");
+        assert_eq!(report.changed_settings, [], "{index:?}");
+        let again = fixture.push(&options).await.expect("nothing to do");
+        assert_eq!(again.changed_settings, [], "{index:?}");
+        assert_eq!(server.with(|state| state.updated.clone()), [], "{index:?}");
+        fixture.assert_arrived(&server, 1);
+    }
+}
+
+#[tokio::test]
+async fn a_collection_of_other_settings_is_changed_once_and_only_where_asked() {
+    let fixture = fixture();
+    let (server, url) = Server::start(None).await;
+    fixture.push(&options(&url)).await.expect("pushes");
+    let options = PushOptions { index: ALL, ..options(&url) };
+    let report = fixture.push(&options).await.expect("changes");
+    assert_eq!((report.n_points, report.n_sent), (N_POINTS, 0));
+    let expected = [
+        change("hnsw-m", "the default", "32"),
+        change("hnsw-ef-construct", "the default", "200"),
+        change("quantisation", "none", "int8"),
+        change("vectors", "in memory", "on disk"),
+        change("graph", "in memory", "on disk"),
+        change("payload", "in memory", "on disk"),
+    ];
+    assert_eq!(report.changed_settings, expected);
+    let vectors = VectorParamsDiff { on_disk: Some(true), ..Default::default() };
+    let request = UpdateCollection {
+        collection_name: "yard".into(),
+        params: Some(CollectionParamsDiff { on_disk_payload: Some(true), ..Default::default() }),
+        hnsw_config: Some(HnswConfigDiff {
+            m: Some(32),
+            ef_construct: Some(200),
+            on_disk: Some(true),
+            ..Default::default()
+        }),
+        vectors_config: Some(VectorsConfigDiff {
+            config: Some(vectors_config_diff::Config::Params(vectors)),
+        }),
+        quantization_config: Some(QuantizationConfigDiff { quantization: Some(Diff::Scalar(scalar())) }),
+        ..Default::default()
+    };
+    assert_eq!(server.with(|state| state.updated.clone()), [request]);
+    fixture.push(&options).await.expect("nothing to do");
+
+    // One setting alone: the others stay, in the request and in the collection.
+    let index = IndexSettings { hnsw_m: Some(0), ..IndexSettings::default() };
+    let report = fixture.push(&PushOptions { index, ..options.clone() }).await.expect("changes");
+    assert_eq!(report.changed_settings, [change("hnsw-m", "32", "0")]);
+    let index = IndexSettings { quantisation: Some(Quantisation::None), ..IndexSettings::default() };
+    let report = fixture.push(&PushOptions { index, ..options }).await.expect("changes");
+    assert_eq!(report.changed_settings, [change("quantisation", "int8", "none")]);
+    let updated = server.with(|state| state.updated.clone());
+    let disabled = QuantizationConfigDiff { quantization: Some(Diff::Disabled(Disabled {})) };
+    let graph = HnswConfigDiff { m: Some(0), ..Default::default() };
+    let name = || UpdateCollection { collection_name: "yard".into(), ..Default::default() };
+    assert_eq!(
+        updated[1..],
+        [
+            UpdateCollection { hnsw_config: Some(graph), ..name() },
+            UpdateCollection { quantization_config: Some(disabled), ..name() },
+        ]
+    );
+    let held = server.with(|state| state.collections["yard"].config.clone());
+    assert_eq!(held.quantization_config, None);
+    assert_eq!(held.hnsw_config.and_then(|hnsw| hnsw.ef_construct), Some(200));
+    fixture.assert_arrived(&server, 1);
+}
+
+/// Settings of the vectors override those of the collection, and `memory` the older flags.
+#[tokio::test]
+async fn settings_are_changed_where_they_are_in_force() {
+    let fixture = fixture();
+    let (server, url) = Server::start(None).await;
+    let mut held = Held::new(VectorParamsBuilder::new(DIM as u64, Distance::Cosine).build());
+    // As asked at the level of the collection, otherwise at that of the vectors.
+    held.config.hnsw_config = Some(HnswConfigDiff {
+        m: Some(32),
+        ef_construct: Some(200),
+        on_disk: Some(true),
+        ..Default::default()
+    });
+    held.config.quantization_config =
+        Some(QuantizationConfig { quantization: Some(Stored::Scalar(scalar())) });
+    let params = held.config.params.as_mut().expect("has some");
+    params.on_disk_payload = true;
+    params.payload = Some(PayloadStorageParams { memory: Some(Memory::Cached.into()) });
+    let vectors = held.vectors();
+    vectors.on_disk = Some(true);
+    vectors.memory = Some(Memory::Cached.into());
+    vectors.hnsw_config =
+        Some(HnswConfigDiff { m: Some(8), memory: Some(Memory::Pinned.into()), ..Default::default() });
+    let slow = ScalarQuantization { always_ram: Some(false), ..scalar() };
+    vectors.quantization_config = Some(QuantizationConfig { quantization: Some(Stored::Scalar(slow)) });
+    server.with(|state| state.collections.insert("yard".into(), held));
+
+    let options = PushOptions { index: ALL, ..options(&url) };
+    let report = fixture.push(&options).await.expect("changes");
+    let expected = [
+        change("hnsw-m", "8", "32"),
+        change("quantisation", "int8, not kept in memory", "int8"),
+        change("vectors", "in memory", "on disk"),
+        change("graph", "in memory", "on disk"),
+        change("payload", "in memory", "on disk"),
+    ];
+    assert_eq!(report.changed_settings, expected);
+    let mut held = server.with(|state| state.collections["yard"].clone());
+    let vectors = held.vectors().clone();
+    let cold = Some(i32::from(Memory::Cold));
+    let graph = vectors.hnsw_config.expect("kept");
+    assert_eq!((graph.m, graph.ef_construct, graph.memory), (Some(32), Some(200), cold));
+    assert_eq!(vectors.memory, cold);
+    assert_eq!(
+        vectors.quantization_config.and_then(|q| q.quantization),
+        Some(Stored::Scalar(scalar())),
+        "the vectors' own"
+    );
+    let payload = held.config.params.and_then(|params| params.payload);
+    assert_eq!(payload.and_then(|payload| payload.memory), cold);
+    let again = fixture.push(&options).await.expect("nothing to do");
+    assert_eq!(again.changed_settings, []);
+    assert_eq!(server.with(|state| state.updated.len()), 1);
+}
+
+/// A server whose operator quantises by default does so unless the push says `none`.
+#[tokio::test]
+async fn none_switches_the_servers_own_quantisation_off() {
+    let fixture = fixture();
+    let default = Some(QuantizationConfig { quantization: Some(Stored::Scalar(scalar())) });
+    for (quantisation, expected) in [(None, default), (Some(Quantisation::None), None)] {
+        let (server, url) = Server::start(None).await;
+        server.with(|state| state.default_quantization = default);
+        let index = IndexSettings { quantisation, ..IndexSettings::default() };
+        fixture.push(&PushOptions { index, ..options(&url) }).await.expect("pushes");
+        let held = server.with(|state| state.collections["yard"].config.quantization_config);
+        assert_eq!(held, expected, "{quantisation:?}");
+    }
+}
