@@ -86,7 +86,7 @@ impl IndexSettings {
             memory: cold(found.vectors.memory),
         };
         let vectors = (vectors != VectorParamsDiff::default())
-            .then(|| VectorsConfigDiff { config: Some(vectors_config_diff::Config::Params(vectors)) });
+            .then_some(VectorsConfigDiff { config: Some(vectors_config_diff::Config::Params(vectors)) });
         let params = self.on_disk.then(|| CollectionParamsDiff {
             on_disk_payload: Some(true),
             payload: cold(found.payload_memory).map(|memory| PayloadStorageParams { memory: Some(memory) }),
