@@ -189,7 +189,7 @@ async fn settings_are_changed_where_they_are_in_force() {
     ];
     assert_eq!(report.changed_settings, expected);
     let mut held = server.with(|state| state.collections["yard"].clone());
-    let vectors = held.vectors().clone();
+    let vectors = *held.vectors();
     let cold = Some(i32::from(Memory::Cold));
     let graph = vectors.hnsw_config.expect("kept");
     assert_eq!((graph.m, graph.ef_construct, graph.memory), (Some(32), Some(200), cold));
