@@ -12,8 +12,7 @@ use qdrant_client::qdrant::{
     VectorsConfigDiff, quantization_config::Quantization as Stored,
     quantization_config_diff::Quantization as Diff, vectors_config, vectors_config_diff,
 };
-
-use super::report::SettingChange;
+use serde::Serialize;
 
 /// Index settings; the default leaves all to the database.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -46,6 +45,19 @@ pub enum Quantisation {
 pub(super) struct Update {
     pub(super) request: UpdateCollection,
     pub(super) changes: Vec<SettingChange>,
+}
+
+/// An index setting of an existing collection that differed from the one asked for.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct SettingChange {
+    /// The collection.
+    pub collection: String,
+    /// Which setting.
+    pub setting: &'static str,
+    /// Its former value.
+    pub before: String,
+    /// Its value now.
+    pub after: String,
 }
 
 impl IndexSettings {

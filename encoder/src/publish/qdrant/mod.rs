@@ -22,11 +22,11 @@ mod snapshot;
 mod source;
 
 pub use error::PushError;
-pub use index::{IndexSettings, Quantisation};
+pub use index::{IndexSettings, Quantisation, SettingChange};
 pub use layout::Layout;
 pub use options::PushOptions;
 pub use push::push;
-pub use report::{PushProgress, PushReport, SettingChange};
+pub use report::{PushProgress, PushReport};
 pub use snapshot::Snapshot;
 pub use source::{CellVectors, ExactShards, SourceError, VectorSource};
 

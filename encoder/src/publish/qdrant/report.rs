@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use super::index::SettingChange;
 use super::snapshot::Snapshot;
 
 /// Progress of a push.
@@ -37,17 +38,4 @@ pub struct PushReport {
     pub left_collections: Vec<String>,
     /// Snapshots of the collections, where asked for.
     pub snapshots: Vec<Snapshot>,
-}
-
-/// An index setting of an existing collection that differed from the one asked for.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct SettingChange {
-    /// The collection.
-    pub collection: String,
-    /// Which setting.
-    pub setting: &'static str,
-    /// Its former value.
-    pub before: String,
-    /// Its value now.
-    pub after: String,
 }
