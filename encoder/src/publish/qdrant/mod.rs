@@ -1,8 +1,8 @@
 //! Pushes a scene's embeddings into Qdrant: one point a Gaussian.
 //!
-//! A collection holds one scene, or one cell of it ([`Layout`]). The id of a point is the Gaussian's index in the input splat file. Its
-//! payload has `x`, `y`, `z` (world frame), `cell_id`, `scene`, `generation` and, if the scene is
-//! geo-referenced, `location` (`lat`, `lon`).
+//! A collection holds one scene, or one cell of it ([`Layout`]). The id of a point is the Gaussian's index in the
+//! input splat file. Its payload has `x`, `y`, `z` (world frame), `cell_id`, `scene`, `generation` and, if the
+//! scene is geo-referenced, `location` (`lat`, `lon`).
 //!
 //! Each batch is acknowledged as applied before the next is sent, then recorded in the store, so that an
 //! interrupted push continues there. Upserts by id are idempotent: a batch whose acknowledgement was lost

@@ -76,7 +76,7 @@ impl Plot {
         self.svg_beside(series, None)
     }
 
-    /// Draws the series, and to the right a second plot, whose axes are its own.
+    /// Draws the series, with a second plot, on axes of its own, to the right.
     pub fn svg_beside(&self, series: &[Series], beside: Option<(&Plot, &[Series])>) -> String {
         let (w, h) = (SIZE.0 + beside.map_or(0.0, |_| BESIDE), SIZE.1);
         let mut out = format!(

@@ -16,7 +16,7 @@ pub struct Figures {
     pub made_by: String,
     /// Views used.
     pub n_views: u64,
-    /// Views with a photo: the scene's, of which those were chosen.
+    /// Views of the scene with a photo, before any were chosen.
     pub n_photos: u64,
     /// Gaussians in cells.
     pub n_gaussians: u64,

@@ -17,7 +17,7 @@
 //! `{gpu:N}` for the number N, where the machine has more GPUs than that; without these a point is left out. Points of
 //! a scene with the same `views` share one store, and their contributions are computed once.
 //!
-//! `ordered` names the axes whose points ascend: plots connect these by a line, in the order of the grid.
+//! `ordered` names the axes whose points ascend: plots connect their points, in the grid's order.
 
 use std::path::{Path, PathBuf};
 
@@ -127,7 +127,7 @@ pub struct Equipment {
     pub n_gpus: usize,
 }
 
-/// Flags whose placeholders are filled in, or what is missing for it.
+/// Flags with their placeholders filled in, or what is missing to do so.
 pub type Expanded = Result<Vec<String>, &'static str>;
 
 /// A labelled scene: splat and poses beside `gt/` and `test/`, as `generate scene` and the labelled house have them.
@@ -168,7 +168,7 @@ impl LabelledScene {
         Some(self.dir.join("gt/masks")).filter(|path| path.is_dir())
     }
 
-    /// Replaces the placeholders in flags; the inner error says what scene or machine lacks.
+    /// Replaces the placeholders in flags; the inner error says what the scene or machine lacks.
     ///
     /// # Errors
     /// [`TradeoffError::Flags`] for an unknown placeholder.

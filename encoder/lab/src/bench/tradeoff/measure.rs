@@ -79,7 +79,7 @@ pub fn run(
     Ok(report)
 }
 
-/// A point, and its figures or what it needs that scene or machine lack.
+/// A point, and its figures or what the scene or machine lacks for it.
 type Measured<'p> = (&'p Point, Result<Figures, &'static str>);
 
 /// Measures points with the same contributions.

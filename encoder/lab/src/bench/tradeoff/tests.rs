@@ -96,7 +96,7 @@ fn the_front_is_the_best_for_every_budget() {
     }
 }
 
-/// Means, spread and front by hand: two scenes, of which the second is harder.
+/// Means, spread and front of two scenes, worked out by hand; the second scene is harder.
 #[test]
 fn several_scenes_have_a_mean_and_a_front() {
     let of = |scene: &str, axis: &str, name: &str, seconds: f64, miou: f64| {

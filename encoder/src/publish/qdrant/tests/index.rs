@@ -32,6 +32,11 @@ fn scalar() -> ScalarQuantization {
     }
 }
 
+/// The graph of [`ALL`].
+fn graph() -> HnswConfigDiff {
+    HnswConfigDiff { m: Some(32), ef_construct: Some(200), on_disk: Some(true), ..Default::default() }
+}
+
 fn change(setting: &'static str, before: &str, after: &str) -> SettingChange {
     SettingChange { collection: "yard".into(), setting, before: before.into(), after: after.into() }
 }
@@ -112,12 +117,7 @@ async fn a_collection_of_other_settings_is_changed_once_and_only_where_asked() {
     let request = UpdateCollection {
         collection_name: "yard".into(),
         params: Some(CollectionParamsDiff { on_disk_payload: Some(true), ..Default::default() }),
-        hnsw_config: Some(HnswConfigDiff {
-            m: Some(32),
-            ef_construct: Some(200),
-            on_disk: Some(true),
-            ..Default::default()
-        }),
+        hnsw_config: Some(graph()),
         vectors_config: Some(VectorsConfigDiff {
             config: Some(vectors_config_diff::Config::Params(vectors)),
         }),
@@ -158,12 +158,7 @@ async fn settings_are_changed_where_they_are_in_force() {
     let (server, url) = Server::start(None).await;
     let mut held = Held::new(VectorParamsBuilder::new(DIM as u64, Distance::Cosine).build());
     // As asked at the level of the collection, otherwise at that of the vectors.
-    held.config.hnsw_config = Some(HnswConfigDiff {
-        m: Some(32),
-        ef_construct: Some(200),
-        on_disk: Some(true),
-        ..Default::default()
-    });
+    held.config.hnsw_config = Some(graph());
     held.config.quantization_config =
         Some(QuantizationConfig { quantization: Some(Stored::Scalar(scalar())) });
     let params = held.config.params.as_mut().expect("has some");
