@@ -8,7 +8,7 @@ use serde_json::Value;
 use slag_math::random::Random;
 use slag_tests::*;
 
-const N_ENCODE_KILLS: usize = 20;
+const N_ENCODE_KILLS: usize = 12;
 const N_FETCH_KILLS: usize = 100;
 
 /// Runs a command and returns its output, or kills it after a while.
@@ -32,7 +32,7 @@ fn run_or_kill(command: &mut Command, after: Duration) -> Option<Vec<u8>> {
 fn killed_encodes_resume_and_show_nothing_half() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let room = dir.path().join("room");
-    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "10"]));
+    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "6"]));
     let whole = dir.path().join("whole");
     let start = Instant::now();
     run(&mut encode_room(&room, &whole));

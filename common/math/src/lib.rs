@@ -9,6 +9,7 @@ mod dot;
 pub mod eigen;
 pub mod graph_segmentation;
 pub mod matrix;
+pub mod nearest;
 pub mod random;
 pub mod simd;
 pub mod stats;

@@ -1,6 +1,13 @@
 //! The third step: the contributions of all views become objects, fields and shards of every cell.
+//!
+//! Contributions are read and lifted cell by cell. Codebooks and shards are made of several cells at once, as many as the
+//! memory plan holds: much of a codebook is work that one thread does. A cell's bytes do not depend on the others'.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use slag_common::manifest::{Calibration, CellRecord, ShardRecord};
 use slag_common::shard::Profile;
@@ -23,6 +30,9 @@ use crate::objects::{self, ObjectsReport, SceneObjects};
 use crate::shard::{self, BuiltShard, CellEmbeddings};
 use crate::store::Extras;
 
+/// How long the thread that lifts sleeps while others hold all cells and leave it no work.
+const WAIT: Duration = Duration::from_micros(200);
+
 /// The cells of a scene, all objects of them in the store.
 pub(super) struct BuiltCells {
     /// Manifest records, by cell.
@@ -40,6 +50,15 @@ pub(super) struct BuiltCells {
     score_sums: [f64; 3],
 }
 
+/// A cell whose shards are in the store.
+struct FinishedCell {
+    record: CellRecord,
+    n_subspaces: u32,
+    n_without_evidence: u64,
+    /// As of all cells.
+    score_sums: [f64; 3],
+}
+
 /// The size of what the views found.
 pub(super) struct Counts {
     pub(super) n_views_without_masks: usize,
@@ -50,6 +69,13 @@ pub(super) struct Counts {
 }
 
 impl BuiltCells {
+    fn add(&mut self, cell: FinishedCell) {
+        self.records.push(cell.record);
+        self.n_subspaces.push(cell.n_subspaces);
+        self.n_without_evidence += cell.n_without_evidence;
+        self.score_sums.iter_mut().zip(cell.score_sums).for_each(|(all, of_cell)| *all += of_cell);
+    }
+
     /// Returns how the bank of texts scores in all cells.
     pub(super) fn calibration(&self) -> Calibration {
         let [sum, squares, n] = self.score_sums;
@@ -113,6 +139,8 @@ struct CellBuilder<'a> {
     score_context: ScoreMetricContext,
     /// Bytes for the contributions of a group of cells.
     group_bytes: u64,
+    /// Cells whose embeddings are held at once.
+    n_at_once: usize,
     /// Each view's masks in its photo.
     photos: Vec<Photo>,
 }
@@ -147,14 +175,20 @@ impl<'a> CellBuilder<'a> {
         table.reserve(&mut memory);
         index.reserve(&mut memory);
         Refinement::reserve_regions(&mut memory, &plan.settings.aggregation, table.len());
-        let group_bytes = memory.rest(index.largest_part_bytes())?;
+        let rest_bytes = memory.rest(index.largest_part_bytes())?;
+        let cell_bytes = shard::largest_cell_bytes(&plan.inputs.split, models.dim());
+        // Cells come second: contributions that are not kept in memory are read six times.
+        let spare_bytes = rest_bytes - index.budget_bytes(rest_bytes);
+        let n_more = (spare_bytes / cell_bytes.max(1)).min(context.pool().current_num_threads() as u64 - 1);
+        let group_bytes = rest_bytes - n_more * cell_bytes;
         let score_context = context.time("texts", || {
             let metric = ScoreMetric::new(models.dim(), &bank);
             let spread = metric.spread(table.mask_vectors());
             ScoreMetricContext { metric, bank, spread }
         });
         let encoder_id = Hash32(models.encoder_id().hash());
-        Ok(Self { plan, context, encoder_id, index, table, score_context, group_bytes, photos })
+        let n_at_once = 1 + n_more as usize;
+        Ok(Self { plan, context, encoder_id, index, table, score_context, group_bytes, n_at_once, photos })
     }
 
     /// Finds the objects of the scene if the settings ask for them; `None` if cancelled, too.
@@ -186,7 +220,7 @@ impl<'a> CellBuilder<'a> {
         }
     }
 
-    /// Finds objects, refines the contributions and builds the cells one by one; `None` if cancelled.
+    /// Finds objects, refines the contributions and builds the cells; `None` if cancelled.
     ///
     /// # Errors
     /// [`EncodeError`].
@@ -222,24 +256,63 @@ impl<'a> CellBuilder<'a> {
         }
         let regions = store.put_object(|out| self.table.write(out))?.0;
         built.extras.insert(EXTRA_REGIONS.into(), regions);
-        let dim = self.table.dim();
-        let mut cell = CellEmbeddings { dim, vectors: Vec::new(), has_evidence: Vec::new() };
-        let mut parts = self.index.transposed_parts(&self.table, self.group_bytes);
-        while let Some(contributions) = self.context.time("merge", || parts.next()) {
-            if self.context.is_cancelled() {
-                return Ok(None);
-            }
-            let contributions = contributions?;
-            let cell_id = contributions.part.cell_id;
-            self.add_part(contributions, refinement.as_ref(), &mut cell, &mut built)?;
-            if cell.has_evidence.len() == inputs.split.cells[cell_id as usize].gaussians.len() {
-                self.finish_cell(cell_id, &cell, objects.as_ref(), &mut built)?;
-                cell.has_evidence.clear();
-                self.context.progress().advance(1);
-            }
-        }
+        let Some(finished) = self.build_shards(refinement.as_ref(), objects.as_ref(), &mut built.extras)?
+        else {
+            return Ok(None);
+        };
+        finished.into_iter().for_each(|cell| built.add(cell));
         built.objects = objects.map(|objects| objects.report);
         Ok(Some(built))
+    }
+
+    /// Lifts the cells one after the other, and makes the shards of several at once; `None` if cancelled.
+    ///
+    /// # Errors
+    /// [`EncodeError`]: of the first cell that failed.
+    fn build_shards(
+        &self,
+        refinement: Option<&Refinement>,
+        objects: Option<&SceneObjects>,
+        extras: &mut Extras,
+    ) -> Result<Option<Vec<FinishedCell>>, EncodeError> {
+        let dim = self.table.dim();
+        let empty = || CellEmbeddings { dim, vectors: Vec::new(), has_evidence: Vec::new() };
+        // The vectors of a large cell are allocated once and used again; they are neither copied nor cleared.
+        let free: Mutex<Vec<CellEmbeddings>> = Mutex::new((0..self.n_at_once).map(|_| empty()).collect());
+        let finished: Mutex<BTreeMap<u32, Result<FinishedCell, EncodeError>>> = Mutex::default();
+        let has_failed = AtomicBool::new(false);
+        let is_stopped = || self.context.is_cancelled() || has_failed.load(Ordering::Relaxed);
+        rayon::scope(|scope| -> Result<(), EncodeError> {
+            let mut parts = self.index.transposed_parts(&self.table, self.group_bytes);
+            let mut cell = take_when_free(&free);
+            while let Some(contributions) = self.context.time("merge", || parts.next()) {
+                if is_stopped() {
+                    break;
+                }
+                let contributions = contributions?;
+                let cell_id = contributions.part.cell_id;
+                self.add_part(contributions, refinement, &mut cell, extras)?;
+                if cell.has_evidence.len() < self.plan.inputs.split.cells[cell_id as usize].gaussians.len() {
+                    continue;
+                }
+                let (free, finished, has_failed) = (&free, &finished, &has_failed);
+                scope.spawn(move |_| {
+                    if !is_stopped() {
+                        let result = self.finish_cell(cell_id, &cell, objects);
+                        has_failed.fetch_or(result.is_err(), Ordering::Relaxed);
+                        locked(finished).insert(cell_id, result);
+                        self.context.progress().advance(1);
+                    }
+                    cell.has_evidence.clear();
+                    locked(free).push(cell);
+                });
+                cell = take_when_free(free);
+            }
+            Ok(())
+        })?;
+        let finished = finished.into_inner().unwrap_or_else(PoisonError::into_inner);
+        let finished: Vec<FinishedCell> = finished.into_values().collect::<Result<_, _>>()?;
+        Ok((!self.context.is_cancelled()).then_some(finished))
     }
 
     /// Adds the next part's embeddings to its cell's, and publishes its field.
@@ -248,11 +321,10 @@ impl<'a> CellBuilder<'a> {
         mut contributions: PartContributions,
         refinement: Option<&Refinement>,
         cell: &mut CellEmbeddings,
-        built: &mut BuiltCells,
+        extras: &mut Extras,
     ) -> Result<(), EncodeError> {
         let part = contributions.part.clone();
         let gaussians = &self.plan.inputs.split.cells[part.cell_id as usize].gaussians;
-        // The vectors of the largest cell are allocated once; they are neither copied nor cleared.
         let len = cell.vectors.len().max(gaussians.len() * cell.dim);
         cell.vectors.reserve_exact(len - cell.vectors.len());
         cell.vectors.resize(len, 0.0);
@@ -265,7 +337,7 @@ impl<'a> CellBuilder<'a> {
         });
         cell.has_evidence.extend((0..field.len()).map(|k| field.has_evidence(k)));
         let (hash, _) = self.context.time("write", || self.plan.store.put_object(|out| field.write(out)))?;
-        built.extras.insert(extra_field(part.cell_id, part.number), hash);
+        extras.insert(extra_field(part.cell_id, part.number), hash);
         Ok(())
     }
 
@@ -275,8 +347,7 @@ impl<'a> CellBuilder<'a> {
         cell_id: u32,
         embeddings: &CellEmbeddings,
         objects: Option<&SceneObjects>,
-        built: &mut BuiltCells,
-    ) -> Result<(), EncodeError> {
+    ) -> Result<FinishedCell, EncodeError> {
         let cell = &self.plan.inputs.split.cells[cell_id as usize];
         let (scene, settings) = (&self.plan.inputs.scene, &self.plan.settings.cells.shards);
         let encoder_id = self.encoder_id;
@@ -296,17 +367,33 @@ impl<'a> CellBuilder<'a> {
             Ok((shard.profile, record))
         };
         let shards = made.shards.iter().map(record).collect::<Result<_, EncodeError>>()?;
-        built.n_subspaces.push(made.n_subspaces);
-        built.n_without_evidence += made.n_without_evidence as u64;
         let n_with = (cell.gaussians.len() - made.n_without_evidence) as f64;
-        let contributions = [made.moments.mean * n_with, made.moments.mean_square * n_with, n_with];
-        built.score_sums.iter_mut().zip(contributions).for_each(|(all, of_cell)| *all += of_cell);
-        built.records.push(CellRecord {
-            cell_id,
-            bounds: cell.bounds,
-            n_gaussians: cell.gaussians.len() as u32,
-            shards,
-        });
-        Ok(())
+        Ok(FinishedCell {
+            record: CellRecord {
+                cell_id,
+                bounds: cell.bounds,
+                n_gaussians: cell.gaussians.len() as u32,
+                shards,
+            },
+            n_subspaces: made.n_subspaces,
+            n_without_evidence: made.n_without_evidence as u64,
+            score_sums: [made.moments.mean * n_with, made.moments.mean_square * n_with, n_with],
+        })
+    }
+}
+
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Takes an item, or does other work of this run until one is free.
+fn take_when_free<T>(free: &Mutex<Vec<T>>) -> T {
+    loop {
+        let item = locked(free).pop();
+        match item {
+            Some(item) => return item,
+            None if rayon::yield_now() == Some(rayon::Yield::Executed) => {}
+            None => std::thread::sleep(WAIT),
+        }
     }
 }

@@ -34,6 +34,13 @@ enum Source<'a> {
 }
 
 impl ContributionIndex {
+    /// Returns what passes want of a budget: enough to keep all parts, if that is in the budget, else half.
+    pub fn budget_bytes(&self, budget_bytes: u64) -> u64 {
+        let to_keep_bytes = self.kept_bytes().saturating_add(self.largest_part_bytes()).saturating_mul(2);
+        let wanted_bytes = if to_keep_bytes <= budget_bytes { to_keep_bytes } else { budget_bytes / 2 };
+        wanted_bytes.max(self.largest_part_bytes())
+    }
+
     /// Starts a pass that takes at most `budget_bytes`, or what the largest part needs. Total weights follow the table's
     /// present weights of masks.
     pub fn transposed_parts<'a>(&'a self, table: &'a RegionTable, budget_bytes: u64) -> TransposedParts<'a> {

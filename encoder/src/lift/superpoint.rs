@@ -5,12 +5,11 @@
 //! their embeddings. Distance only decides which Gaussians are neighbours.
 
 use rayon::prelude::*;
-use rstar::RTree;
-use rstar::primitives::GeomWithData;
 use slag_common::Gaussians;
 
 use slag_math::dot;
 use slag_math::graph_segmentation::Components;
+use slag_math::nearest::{self, Neighbours};
 use slag_math::union_find::{NOT_NUMBERED, Numbering};
 
 /// The superpoint of a Gaussian that cannot be drawn.
@@ -85,6 +84,9 @@ impl Sketches<'_> {
     }
 }
 
+/// Gaussians whose edges a thread measures at once.
+const GAUSSIANS_PER_TASK: usize = 1 << 12;
+
 /// An edge; ascending by length, then by ends.
 type Edge = (u32, u32, u32);
 
@@ -102,24 +104,36 @@ impl Graph {
     /// Finds and measures the edges of a scene.
     pub fn new(scene: &Gaussians, sketches: Option<Sketches<'_>>, settings: &SuperpointSettings) -> Self {
         let usable: Vec<u32> = (0..scene.len() as u32).filter(|i| scene.is_usable(*i as usize)).collect();
-        let point = |i: &u32| GeomWithData::new(scene.means_in_world[*i as usize].to_array(), *i);
-        let tree = RTree::bulk_load(usable.iter().map(point).collect());
-        let edges_of = |i: &u32| -> Vec<Edge> {
-            let here = scene.means_in_world[*i as usize].to_array();
-            // One more than wanted: a Gaussian is its own neighbour, in any place among those at the same point.
-            let near = tree.nearest_neighbor_iter(here).take(settings.n_neighbours + 1);
-            near.filter(|other| other.data != *i)
-                .map(|other| {
-                    let (a, b) = (*i.min(&other.data), *i.max(&other.data));
-                    let length = edge_length(scene, sketches, settings, a as usize, b as usize);
-                    // Lengths are not negative, so their bits have the same order.
-                    (length.to_bits(), a, b)
-                })
-                .collect()
+        let means: Vec<[f64; 3]> =
+            usable.iter().map(|i| scene.means_in_world[*i as usize].to_array()).collect();
+        let neighbours = Neighbours::new(&means, settings.n_neighbours);
+        drop(means);
+        let looks: Vec<Look> = usable.par_iter().map(|i| Look::of(scene, *i as usize)).collect();
+        let edge = |i: u32, j: u32| -> Edge {
+            let (i, j) = (i.min(j) as usize, i.max(j) as usize);
+            let (a, b) = (usable[i], usable[j]);
+            let mut length = looks[i].difference(&looks[j], settings);
+            if let Some(sketches) = sketches {
+                length += settings.field * sketches.difference(a as usize, b as usize);
+            }
+            // Lengths are not negative, so their bits have the same order.
+            (length.to_bits(), a, b)
         };
-        let mut edges: Vec<Edge> = usable.par_iter().flat_map_iter(edges_of).collect();
+        let edges_of = |chunk: &[u32], first: usize| {
+            let mut edges = Vec::with_capacity(chunk.len() * settings.n_neighbours);
+            for i in (first as u32..).take(chunk.len()) {
+                // Two that are each other's neighbours have one edge.
+                let is_new = |j: &&u32| i < **j || !neighbours.of(**j).contains(&i);
+                edges.extend(neighbours.of(i).iter().filter(is_new).map(|j| edge(i, *j)));
+            }
+            edges
+        };
+        let chunks = usable.par_chunks(GAUSSIANS_PER_TASK).enumerate();
+        let chunks: Vec<Vec<Edge>> =
+            chunks.map(|(at, chunk)| edges_of(chunk, at * GAUSSIANS_PER_TASK)).collect();
+        let mut edges = Vec::with_capacity(chunks.iter().map(Vec::len).sum());
+        chunks.into_iter().for_each(|chunk| edges.extend(chunk));
         edges.par_sort_unstable();
-        edges.dedup();
         Self { n_gaussians: scene.len(), usable, edges }
     }
 
@@ -143,30 +157,32 @@ impl Superpoints {
         Graph::new(scene, sketches, settings).superpoints(settings)
     }
 
-    /// Returns the bytes that partitioning `n_gaussians` takes: tree and edges.
+    /// Returns the bytes that partitioning `n_gaussians` takes: neighbours while they are searched, then with the edges.
     pub fn working_bytes(n_gaussians: usize, settings: &SuperpointSettings) -> u64 {
-        let edges = settings.n_neighbours * size_of::<Edge>();
-        let per_gaussian = edges + 2 * size_of::<GeomWithData<[f64; 3], u32>>() + 5 * size_of::<u32>();
-        n_gaussians as u64 * per_gaussian as u64
+        let n = settings.n_neighbours;
+        let searched = size_of::<[f64; 3]>() + nearest::working_bytes_per_point(n);
+        let joined = n * (size_of::<u32>() + size_of::<Edge>()) + size_of::<Look>() + 4 * size_of::<u32>();
+        n_gaussians as u64 * (size_of::<u32>() + searched.max(joined)) as u64
     }
 }
 
-fn edge_length(
-    scene: &Gaussians,
-    sketches: Option<Sketches<'_>>,
-    settings: &SuperpointSettings,
-    a: usize,
-    b: usize,
-) -> f32 {
-    let (colour_a, colour_b) = (scene.rgb_dc(a), scene.rgb_dc(b));
-    let colour = [0, 1, 2].map(|c| colour_a[c] - colour_b[c]);
-    let [normal_a, normal_b] = [a, b].map(|i| thinnest_axis(scene.rotations_wxyz[i], scene.scales[i]));
-    let mut length = settings.colour * dot(&colour, &colour).sqrt();
-    length += settings.normal * (1.0 - dot(&normal_a, &normal_b).abs()).max(0.0);
-    if let Some(sketches) = sketches {
-        length += settings.field * sketches.difference(a, b);
+/// What the edges of a Gaussian compare, but for its embedding.
+#[derive(Clone, Copy)]
+struct Look {
+    colour: [f32; 3],
+    normal: [f32; 3],
+}
+
+impl Look {
+    fn of(scene: &Gaussians, i: usize) -> Self {
+        Self { colour: scene.rgb_dc(i), normal: thinnest_axis(scene.rotations_wxyz[i], scene.scales[i]) }
     }
-    length
+
+    fn difference(&self, other: &Self, settings: &SuperpointSettings) -> f32 {
+        let colour = [0, 1, 2].map(|c| self.colour[c] - other.colour[c]);
+        let straight = dot(&self.normal, &other.normal).abs();
+        settings.colour * dot(&colour, &colour).sqrt() + settings.normal * (1.0 - straight).max(0.0)
+    }
 }
 
 /// Returns a Gaussian's thinnest axis in the world: the normal, where it lies on a surface.

@@ -77,10 +77,14 @@ pub fn working_bytes(n_gaussians: usize, dim: usize) -> u64 {
     (n_gaussians * (dim * per_component + codebook::working_bytes_per_embedding(dim))) as u64
 }
 
+/// Returns the bytes that building the shards of a scene's largest cell takes.
+pub fn largest_cell_bytes(split: &CellSplit, dim: usize) -> u64 {
+    working_bytes(split.cells.iter().map(|cell| cell.gaussians.len()).max().unwrap_or(0), dim)
+}
+
 /// Reserves the bytes of the largest cell.
 pub fn reserve(memory: &mut MemoryPlan, split: &CellSplit, dim: usize) {
-    let largest = split.cells.iter().map(|cell| cell.gaussians.len()).max().unwrap_or(0);
-    memory.reserve(Phase::Cells, "the largest cell", working_bytes(largest, dim));
+    memory.reserve(Phase::Cells, "the largest cell", largest_cell_bytes(split, dim));
 }
 
 /// Builds a cell's shards, with the objects of the scene if it has any.

@@ -18,6 +18,19 @@ pub struct Backend {
     /// Whether depth order and sides of cuts equal the oracle's wherever rounding does not decide. An f32 projection swaps
     /// neighbours in depth, which changes single weights but hardly their sum.
     pub keeps_order: bool,
+    /// Whether it runs on a processor through a graphics driver: a hundred times slower than a GPU.
+    pub is_software_gpu: bool,
+}
+
+/// Cases from which a software GPU takes a part, and every how many.
+const MANY_CASES: usize = 40;
+const SOFTWARE_GPU_STEP: usize = 4;
+
+impl Backend {
+    /// Every how many of `n` cases it is tested on.
+    pub fn case_step(&self, n: usize) -> usize {
+        if self.is_software_gpu && n >= MANY_CASES { SOFTWARE_GPU_STEP } else { 1 }
+    }
 }
 
 /// Returns the rasterisers that every test of this binary runs on.
@@ -33,6 +46,7 @@ pub fn backends() -> &'static [Backend] {
                 bound_factor: 1.0,
                 cut_tolerance: 2e-5,
                 keeps_order: true,
+                is_software_gpu: false,
             },
         ];
         let adapter = adapters().into_iter().next();
@@ -50,7 +64,15 @@ pub fn backends() -> &'static [Backend] {
                     let device = adapter.open(precision).expect("the adapter opens");
                     let rasterizer = Box::new(GpuRasterizer::new(device, GpuOptions::default()));
                     let keeps_order = precision == Precision::F64;
-                    backends.push(Backend { name, rasterizer, bound_factor, cut_tolerance, keeps_order });
+                    let is_software_gpu = adapter.report.kind == "software";
+                    backends.push(Backend {
+                        name,
+                        rasterizer,
+                        bound_factor,
+                        cut_tolerance,
+                        keeps_order,
+                        is_software_gpu,
+                    });
                 }
             }
         }

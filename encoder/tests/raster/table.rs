@@ -54,7 +54,7 @@ impl Row {
             }
             let (mut worst, mut place) = (0.0, String::new());
             let (mut apart, mut on_a_cut_px, mut whole_px, mut n_sums) = (0.0_f64, 0.0, 0.0, 0);
-            for (i, case) in cases.iter().enumerate() {
+            for (i, case) in cases.iter().enumerate().step_by(backend.case_step(cases.len())) {
                 let (scene, view) = case.exact.as_ref().map_or((&case.scene, &case.view), |(s, v)| (s, v));
                 for (k, kind) in KINDS.into_iter().enumerate() {
                     let expected = oracle::weights(scene, view, &case.regions, kind, backend.cut_tolerance);

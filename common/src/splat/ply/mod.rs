@@ -15,7 +15,7 @@ mod write;
 
 pub use points::{Point, PointProperties};
 pub use vertices::read_vertices;
-pub use write::{write, write_to};
+pub use write::{write, write_header, write_rows, write_to};
 
 use super::columns::ReadOptions;
 use super::error::SplatError;

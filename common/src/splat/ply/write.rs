@@ -22,16 +22,32 @@ pub fn write(path: &Path, gaussians: &Gaussians) -> Result<(), SplatError> {
 /// # Errors
 /// Those of the writer.
 pub fn write_to(mut writer: impl Write, gaussians: &Gaussians) -> std::io::Result<()> {
-    let per_channel = Gaussians::sh_rest_per_channel(gaussians.sh_degree);
+    write_header(&mut writer, gaussians.len() as u64, gaussians.sh_degree)?;
+    write_rows(writer, gaussians)
+}
+
+/// Writes the header of a file of `n` Gaussians.
+///
+/// # Errors
+/// Those of the writer.
+pub fn write_header(mut writer: impl Write, n: u64, sh_degree: u8) -> std::io::Result<()> {
+    let per_channel = Gaussians::sh_rest_per_channel(sh_degree);
     let rest_names = (0..3 * per_channel).map(|i| format!("f_rest_{i}"));
     let names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"].map(String::from);
     let tail = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];
-    writeln!(writer, "ply\nformat binary_little_endian 1.0\nelement vertex {}", gaussians.len())?;
+    writeln!(writer, "ply\nformat binary_little_endian 1.0\nelement vertex {n}")?;
     for name in names.into_iter().chain(rest_names).chain(tail.map(String::from)) {
         writeln!(writer, "property float {name}")?;
     }
-    writeln!(writer, "end_header")?;
+    writeln!(writer, "end_header")
+}
 
+/// Writes Gaussians of the header's degree.
+///
+/// # Errors
+/// Those of the writer.
+pub fn write_rows(mut writer: impl Write, gaussians: &Gaussians) -> std::io::Result<()> {
+    let per_channel = Gaussians::sh_rest_per_channel(gaussians.sh_degree);
     let mut row: Vec<u8> = Vec::new();
     for index in 0..gaussians.len() {
         row.clear();

@@ -4,6 +4,7 @@
 //! ([`compose`]) and are photographed by ray casting ([`render`]); the Gaussians cover the same surfaces.
 
 pub mod compose;
+pub mod copies;
 pub mod crops;
 mod expression;
 pub mod field;

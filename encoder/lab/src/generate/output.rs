@@ -18,6 +18,14 @@ pub enum GenerateError {
     /// The object files cannot be used.
     #[error(transparent)]
     Grammar(#[from] GrammarError),
+    /// A folder is not a scene to copy.
+    #[error("{}: {what}", path.display())]
+    Source {
+        /// The folder.
+        path: PathBuf,
+        /// What is wrong with it.
+        what: String,
+    },
     /// A picture cannot be written.
     #[error("{}: {source}", path.display())]
     Image {

@@ -120,15 +120,18 @@ impl Mixtures {
             masks.iter_mut().for_each(|(_, share)| *share /= total);
             masks
         };
-        let mixtures: Vec<Vec<(u32, f32)>> = sums.regions.into_par_iter().map(mixture).collect();
-        let mut region = |mixture: &Vec<(u32, f32)>| {
+        let with_length = |entries| {
+            let mixture = mixture(entries);
             let mut sum = [0.0; AXES];
             mixture.iter().for_each(|(mask, share)| add(&mut sum, *share, &mask_points[*mask as usize]));
-            let length = length(&sum);
-            (length > MIN_MEAN_LENGTH)
-                .then(|| MixtureRegion { region: table.append_mixture(mixture), length })
+            (mixture, length(&sum))
         };
-        let regions = mixtures.iter().map(&mut region).collect();
+        let mixtures: Vec<(Vec<(u32, f32)>, f32)> = sums.regions.into_par_iter().map(with_length).collect();
+        let mut region = |(mixture, length): (Vec<(u32, f32)>, f32)| {
+            (length > MIN_MEAN_LENGTH)
+                .then(|| MixtureRegion { region: table.append_mixture(&mixture), length })
+        };
+        let regions = mixtures.into_iter().map(&mut region).collect();
         Self { weight, of_gaussian: sums.superpoints.of_gaussian, regions }
     }
 

@@ -174,18 +174,18 @@ impl Refinement {
         }
         let sketches = Sketches { width: AXES, values: &sketches };
         let graph = Graph::new(scene, Some(sketches), &SuperpointSettings::default());
-        let mut scales = Vec::new();
-        if self.settings.superpoint > 0.0 || self.settings.fill {
-            scales.push((self.settings.superpoint, graph.superpoints(&SuperpointSettings::default())));
-        }
-        if self.settings.coarse > 0.0 {
-            scales.push((self.settings.coarse, graph.superpoints(&SuperpointSettings::coarse())));
-        }
+        let Aggregation { superpoint, coarse, fill, .. } = self.settings;
+        let partition = |weight: f32, is_needed: bool, settings: SuperpointSettings| {
+            is_needed.then(|| (weight, graph.superpoints(&settings)))
+        };
+        let (fine, larger) = rayon::join(
+            || partition(superpoint, superpoint > 0.0 || fill, SuperpointSettings::default()),
+            || partition(coarse, coarse > 0.0, SuperpointSettings::coarse()),
+        );
+        let scales = fine.into_iter().chain(larger);
         drop(graph);
-        let mut sums: Vec<(f32, SuperpointSums)> = scales
-            .into_iter()
-            .map(|(weight, superpoints)| (weight, SuperpointSums::new(superpoints)))
-            .collect();
+        let mut sums: Vec<(f32, SuperpointSums)> =
+            scales.map(|(weight, superpoints)| (weight, SuperpointSums::new(superpoints))).collect();
         let done = passes.visit(table, |mut contributions| {
             self.refine_own(&mut contributions);
             let gaussians = contributions.part.gaussians(split);

@@ -1,5 +1,6 @@
 //! `generate`: scenes, crops and photos with known contents.
 
+mod copies;
 mod crops;
 mod photos;
 mod scene;
@@ -14,6 +15,8 @@ use slag_encoder::progress::Progress;
 pub enum GenerateCommand {
     /// A scene: Gaussians, photos, poses, and the labels in `gt/`.
     Scene(scene::GenerateSceneArgs),
+    /// A large scene: copies of a labelled one on a grid, with photos, masks and poses.
+    Copies(copies::GenerateCopiesArgs),
     /// Labelled crops of things, to train an encoder.
     Crops(crops::GenerateCropsArgs),
     /// Photos with the thing's id at each pixel, to train a segmenter.
@@ -23,6 +26,7 @@ pub enum GenerateCommand {
 pub(super) fn run(command: &GenerateCommand, progress: &dyn Progress) -> Result<Exit> {
     match command {
         GenerateCommand::Scene(args) => scene::run(args, progress),
+        GenerateCommand::Copies(args) => copies::run(args, progress),
         GenerateCommand::Crops(args) => crops::run(args, progress),
         GenerateCommand::Photos(args) => photos::run(args, progress),
     }

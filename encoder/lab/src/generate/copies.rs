@@ -1,0 +1,204 @@
+//! Large scenes: a photographed scene many times over, on a square grid, with its photos, masks and poses moved along.
+
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use glam::DVec3;
+use slag_common::splat::{self, ReadOptions};
+use slag_encoder::progress::Progress;
+use slag_math::stats::trimmed_range;
+
+use super::output::GenerateError;
+
+/// Share of the means on either side of an axis that does not count for the distance of copies: floaters.
+const TRIMMED: f64 = 0.005;
+/// Distance between copies, relative to their size.
+const SPACING: f64 = 1.1;
+
+/// The size of a scene of copies.
+#[derive(Clone, Copy, Debug)]
+pub struct CopiesSettings {
+    /// Copies of the splat.
+    pub n_copies: u32,
+    /// Photos, spread over the copies.
+    pub n_views: u32,
+}
+
+/// What was written.
+#[derive(Clone, Debug)]
+pub struct WrittenCopies {
+    /// The splat.
+    pub scene: PathBuf,
+    /// The poses.
+    pub views: PathBuf,
+    /// The masks, if the scene has any.
+    pub masks: Option<PathBuf>,
+    /// Gaussians.
+    pub n_gaussians: u64,
+    /// Distance between neighbouring copies, world units.
+    pub spacing: f64,
+}
+
+/// Writes `scene.ply`, `transforms.json`, `images/` and `gt/masks/` from a folder with a labelled scene. Photos and masks are
+/// hard links where the file system allows it. Cameras see neighbouring copies in the distance, where photos show none.
+///
+/// # Errors
+/// [`GenerateError`]; [`GenerateError::Source`] for a folder that is no such scene or has too few photos.
+pub fn write(
+    source: &Path,
+    folder: &Path,
+    settings: CopiesSettings,
+    progress: &dyn Progress,
+) -> Result<WrittenCopies, GenerateError> {
+    let CopiesSettings { n_copies, n_views } = settings;
+    let unfit = |what: String| GenerateError::Source { path: source.to_owned(), what };
+    let splat =
+        ["scene.ply", "point_cloud.ply"].map(|name| source.join(name)).into_iter().find(|p| p.exists());
+    let splat = splat.ok_or_else(|| unfit("no scene.ply or point_cloud.ply".into()))?;
+    let mut gaussians = splat::read(&splat, &ReadOptions { with_sh_rest: true })?;
+    let poses: serde_json::Value = serde_json::from_slice(&fs_err::read(source.join("transforms.json"))?)
+        .map_err(|e| unfit(format!("transforms.json: {e}")))?;
+    let frames = poses["frames"].as_array().filter(|frames| !frames.is_empty());
+    let frames = frames.ok_or_else(|| unfit("transforms.json has no frames".into()))?;
+    if u64::from(n_views) > u64::from(n_copies) * frames.len() as u64 {
+        let n = frames.len();
+        return Err(unfit(format!(
+            "it has {n} photos, too few for {n_views} of {n_copies} copies; ask for fewer"
+        )));
+    }
+
+    let size = [0, 1, 2].map(|axis| {
+        let mut values: Vec<f64> = gaussians.means_in_world.iter().map(|mean| mean[axis]).collect();
+        trimmed_range(&mut values, TRIMMED).map_or(0.0, |(low, high)| high - low)
+    });
+    // Which axis points up is not known: the grid spans the two longest sides.
+    let up = (0..3).min_by(|a, b| size[*a].total_cmp(&size[*b])).unwrap_or(2);
+    let spacing = size.into_iter().fold(0.0, f64::max) * SPACING;
+    let side = f64::from(n_copies).sqrt().ceil() as u32;
+    let offset = |copy: u32| {
+        let mut offset = DVec3::ZERO;
+        offset[(up + 1) % 3] = f64::from(copy % side) * spacing;
+        offset[(up + 2) % 3] = f64::from(copy / side) * spacing;
+        offset
+    };
+
+    let masks = source.join("gt/masks");
+    let masks = masks.is_dir().then_some(masks);
+    fs_err::create_dir_all(folder.join("images"))?;
+    fs_err::create_dir_all(folder.join("gt/masks"))?;
+    let scene = folder.join("scene.ply");
+    let n_gaussians = gaussians.len() as u64 * u64::from(n_copies);
+    progress.begin("copies", "copy", u64::from(n_copies), 0);
+    let mut out = BufWriter::new(fs_err::File::create(&scene)?);
+    splat::ply::write_header(&mut out, n_gaussians, gaussians.sh_degree)?;
+    let means = gaussians.means_in_world.clone();
+    for copy in 0..n_copies {
+        let moved = offset(copy);
+        gaussians.means_in_world.iter_mut().zip(&means).for_each(|(out, mean)| *out = *mean + moved);
+        splat::ply::write_rows(&mut out, &gaussians)?;
+        progress.advance(1);
+    }
+    out.flush()?;
+    progress.end();
+
+    let mut moved_frames = Vec::with_capacity(n_views as usize);
+    let n_views = u64::from(n_views);
+    for view in 0..n_views {
+        let copy = (view * u64::from(n_copies) / n_views) as u32;
+        // Neighbouring copies show different photos where each has few.
+        let first = (u64::from(copy) * n_views).div_ceil(u64::from(n_copies));
+        let of_copy = ((u64::from(copy) + 1) * n_views).div_ceil(u64::from(n_copies)) - first;
+        let at = (view - first) * frames.len() as u64 / of_copy + u64::from(copy) * 7;
+        let mut frame = frames[at as usize % frames.len()].clone();
+        let path = frame["file_path"].as_str().ok_or_else(|| unfit("a frame without file_path".into()))?;
+        let photo = source.join(path);
+        let (stem, suffix) = (file_part(photo.file_stem()), file_part(photo.extension()));
+        let name = format!("c{copy:04}_{stem}");
+        link(&photo, &folder.join(format!("images/{name}.{suffix}")))?;
+        if let Some(masks) = &masks {
+            link(&masks.join(format!("{stem}.png")), &folder.join(format!("gt/masks/{name}.png")))?;
+        }
+        frame["file_path"] = format!("images/{name}.{suffix}").into();
+        for (axis, by) in offset(copy).to_array().into_iter().enumerate() {
+            let cell = &mut frame["transform_matrix"][axis][3];
+            let value = cell.as_f64().ok_or_else(|| unfit("a transform_matrix that is not 4x4".into()))?;
+            *cell = (value + by).into();
+        }
+        if let Some(frame) = frame.as_object_mut() {
+            frame.remove("mask_instance_path");
+        }
+        moved_frames.push(frame);
+    }
+    let mut poses = poses;
+    poses["frames"] = moved_frames.into();
+    let views = folder.join("transforms.json");
+    fs_err::write(&views, serde_json::to_vec(&poses).map_err(std::io::Error::from)?)?;
+    let masks = masks.map(|_| folder.join("gt/masks"));
+    Ok(WrittenCopies { scene, views, masks, n_gaussians, spacing })
+}
+
+fn file_part(part: Option<&std::ffi::OsStr>) -> String {
+    part.unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// Makes `to` the same file as `from`, or a copy on another file system.
+fn link(from: &Path, to: &Path) -> std::io::Result<()> {
+    if to.exists() {
+        fs_err::remove_file(to)?;
+    }
+    fs_err::hard_link(from, to).or_else(|_| fs_err::copy(from, to).map(|_| ()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::generate::Scene;
+    use crate::generate::grammar::{self, SceneKind};
+    use slag_common::poses;
+    use slag_encoder::progress::Silent;
+
+    /// Each camera sees its copy as the source's camera sees the source, and has the source's photo and mask.
+    #[test]
+    fn copies_look_like_their_source() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let (source, copies) = (dir.path().join("source"), dir.path().join("copies"));
+        let nouns = grammar::nouns(None).expect("object files");
+        Scene::new(&[SceneKind::Room], 5, 6, &nouns).write(&source, &Silent).expect("writes");
+        let settings = CopiesSettings { n_copies: 5, n_views: 13 };
+        let written = write(&source, &copies, settings, &Silent).expect("writes");
+        let read = |path: &Path| splat::read(path, &ReadOptions { with_sh_rest: true }).expect("reads");
+        let (one, all) = (read(&source.join("scene.ply")), read(&written.scene));
+        assert_eq!((all.len(), written.n_gaussians), (5 * one.len(), 5 * one.len() as u64));
+        let views = poses::read(&written.views, None).expect("reads").views;
+        let of_source = poses::read(&source.join("transforms.json"), None).expect("reads").views;
+        assert_eq!(views.len(), 13);
+        let mut n_views_of = [0; 5];
+        for view in &views {
+            let (copy, stem) = view.name["c".len()..].split_once('_').expect("a copy and a name");
+            let copy: usize = copy.parse().expect("a number");
+            n_views_of[copy] += 1;
+            let original = of_source.iter().find(|v| v.name == stem).expect("the source's view");
+            for k in (0..one.len()).step_by(97) {
+                let expected = original.camera_from_world.transform_point3(one.means_in_world[k]);
+                let found = view.camera_from_world.transform_point3(all.means_in_world[copy * one.len() + k]);
+                assert!((found - expected).length() < 1e-4, "{found} {expected}");
+            }
+            let same = |path: &Path, of: &Path| fs_err::read(path).unwrap() == fs_err::read(of).unwrap();
+            assert!(same(&view.image_path, &original.image_path));
+            let mask = |dir: &Path, name: &str| dir.join("gt/masks").join(name).with_extension("png");
+            assert!(same(&mask(&copies, &view.name), &mask(&source, stem)));
+        }
+        assert_eq!(n_views_of, [3, 3, 2, 3, 2]);
+        assert_eq!(all.scales[one.len()..2 * one.len()], one.scales[..]);
+    }
+
+    #[test]
+    fn too_many_photos_are_refused() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let nouns = grammar::nouns(None).expect("object files");
+        Scene::new(&[SceneKind::Room], 5, 2, &nouns).write(dir.path(), &Silent).expect("writes");
+        let settings = CopiesSettings { n_copies: 2, n_views: 5 };
+        let error = write(dir.path(), &dir.path().join("out"), settings, &Silent).expect_err("too many");
+        assert!(error.to_string().contains("it has 2 photos"), "{error}");
+    }
+}
