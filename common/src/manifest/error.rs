@@ -24,7 +24,7 @@ pub enum ManifestError {
     },
     /// The signing key is not accepted.
     #[error(
-        "the manifest is signed by key {found}, accepted: {accepted}; if the change is intended, accept the new key with `slag-edge fetch --key`"
+        "the manifest is signed by key {found}, accepted: {accepted}; if the store's key was changed, name the accepted key and the new one once: `slag-edge fetch --key OLD --key NEW`"
     )]
     UnknownKey {
         /// The key found.

@@ -9,7 +9,7 @@ use serde::Serialize;
 use super::http::given;
 use super::timing::{Settings, quantile};
 use crate::query::{AnswerKind, Engine, QueryRequest};
-use crate::store::{EdgeCache, OpenShard, Snapshot};
+use crate::store::{EdgeCache, Snapshot};
 
 /// Times of answers of objects.
 #[derive(Clone, Debug, Serialize)]
@@ -39,7 +39,7 @@ pub fn time_objects(
     queries: Vec<Vec<f32>>,
     settings: &Settings,
 ) -> io::Result<Option<ObjectsTiming>> {
-    let records = snapshot.shards.iter().filter_map(OpenShard::objects).flat_map(|objects| objects.records);
+    let records = snapshot.shards.iter().filter_map(|shard| shard.objects()).flat_map(|objects| objects.records);
     let n_objects = records.map(|record| record.id).collect::<BTreeSet<u64>>().len();
     if n_objects == 0 {
         return Ok(None);

@@ -12,7 +12,7 @@ use super::machine::{Machine, Memory, read_bandwidth};
 use super::objects::ObjectsTiming;
 use super::timing::{Kind, Settings, Timing, quantile};
 use crate::score::{Columns, Effort, Hit, Matches, Precision, Question, Region, ScoreError, Scratch, Search};
-use crate::store::{OpenShard, Snapshot};
+use crate::store::Snapshot;
 
 /// Queries used to measure recall; exact answers take long.
 const N_RECALL: usize = 16;
@@ -69,7 +69,7 @@ pub fn bench_query(
     queries: &[Vec<f32>],
     settings: &Settings,
 ) -> Result<Report, ScoreError> {
-    let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(OpenShard::view).collect();
+    let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(|shard| shard.view()).collect();
     let mut answer = Answer::default();
     let mut timed = Vec::new();
     for limit in &settings.limits {
@@ -93,7 +93,7 @@ pub fn bench_query(
             n_shards: shards.len(),
             n_centroids: shards.iter().map(|shard| u64::from(shard.header.n_centroids)).sum(),
             dim: shards.first().map_or(0, |shard| shard.header.dim as usize),
-            shard_bytes: snapshot.shards.iter().map(OpenShard::len_bytes).sum(),
+            shard_bytes: snapshot.shards.iter().map(|shard| shard.len_bytes()).sum(),
         },
         precision: settings.precision,
         n_queries: queries.len(),

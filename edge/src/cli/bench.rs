@@ -14,7 +14,7 @@ use slag_edge::bench::query::bench_query;
 use slag_edge::bench::text::{self, TextSettings};
 use slag_edge::bench::{Settings, dump_ids, dump_vectors, make_queries};
 use slag_edge::score::Precision;
-use slag_edge::store::{OpenShard, Snapshot};
+use slag_edge::store::Snapshot;
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, text_model};
 use super::failure::{Failure, store_failure};
@@ -137,7 +137,7 @@ fn bench_query_command(args: BenchQueryArgs) -> Result<(), Failure> {
     args.threads.apply()?;
     let cache = args.cache.open()?;
     let snapshot = Snapshot::open(&cache).map_err(store_failure)?;
-    let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(OpenShard::view).collect();
+    let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(|shard| shard.view()).collect();
     let queries = match &args.queries {
         None => make_queries(&shards, N_QUERIES, args.seed),
         Some(path) => {

@@ -17,6 +17,8 @@ pub enum Exit {
     Failed = 1,
     /// Invalid request; also clap's exit code.
     Usage = 2,
+    /// A fetch brought all cells but some.
+    Partial = 3,
     /// Interrupted by a signal (128 + SIGINT).
     Interrupted = 130,
 }
@@ -33,6 +35,8 @@ pub enum Failure {
     Usage(anyhow::Error),
     /// Failure; the string is the kind of error for programs.
     Failed(&'static str, anyhow::Error),
+    /// A fetch brought all cells but some; its report is printed.
+    Partial(anyhow::Error),
     /// Interrupted by a signal.
     Interrupted(anyhow::Error),
     /// The reader of stdout has gone away.
@@ -49,6 +53,11 @@ impl Failure {
     pub fn report(self, json: bool) -> Exit {
         let (exit, kind, error) = match self {
             Self::BrokenPipe => return Exit::Done,
+            Self::Partial(error) => {
+                // The report is on stdout already, and names the cells.
+                let _ = writeln!(io::stderr(), "error: {}", visible(&slag_edge::error_line(&*error)));
+                return Exit::Partial;
+            }
             Self::Usage(error) => (Exit::Usage, "usage", error),
             Self::Failed(kind, error) => (Exit::Failed, kind, error),
             Self::Interrupted(error) => (Exit::Interrupted, "interrupted", error),
@@ -107,11 +116,12 @@ mod tests {
         let error = || anyhow::anyhow!("x");
         assert_eq!(Failure::Usage(error()).report(false), Exit::Usage);
         assert_eq!(Failure::Failed("io", error()).report(false), Exit::Failed);
+        assert_eq!(Failure::Partial(error()).report(true), Exit::Partial);
         assert_eq!(Failure::Interrupted(error()).report(false), Exit::Interrupted);
         assert_eq!(Failure::from(io::Error::from(io::ErrorKind::BrokenPipe)).report(false), Exit::Done);
         assert_eq!(
-            [Exit::Done as u8, Exit::Failed as u8, Exit::Usage as u8, Exit::Interrupted as u8],
-            [0, 1, 2, 130]
+            [Exit::Done, Exit::Failed, Exit::Usage, Exit::Partial, Exit::Interrupted].map(|exit| exit as u8),
+            [0, 1, 2, 3, 130]
         );
     }
 }

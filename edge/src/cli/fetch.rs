@@ -4,9 +4,10 @@ use std::io::{self, IsTerminal};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use anyhow::anyhow;
 use clap::Args;
 use glam::DVec3;
-use slag_edge::fetch::Position;
+use slag_edge::fetch::{FetchRequest, Position};
 use slag_edge::query::parse_point;
 
 use super::args::{CacheArgs, DownloadArgs};
@@ -14,7 +15,7 @@ use super::failure::Failure;
 use super::follow::{FollowArgs, watch};
 use super::network::{failure, fetch_once};
 use super::output::print_json;
-use super::progress::{Bar, print_report};
+use super::progress::{Bar, bad_cells, print_report};
 
 #[derive(Debug, Args)]
 pub struct FetchArgs {
@@ -27,6 +28,10 @@ pub struct FetchArgs {
     /// Position of the robot: WGS 84 degrees, and metres.
     #[arg(long, value_name = "LAT,LON[,HEIGHT]", value_parser = parse_geographic, allow_hyphen_values = true, conflicts_with = "at")]
     pub at_geo: Option<(f64, f64, Option<f64>)>,
+    /// Change the robot's scene: accept this scene only, from now on. Without it, a store that offers another
+    /// scene than the first one fetched is refused.
+    #[arg(long, value_name = "NAME")]
+    pub scene: Option<String>,
     #[command(flatten)]
     pub download: DownloadArgs,
     /// Follow the robot: read positions from stdin, one a line, as `x y z`, `lat,lon[,height]` or JSON, and
@@ -51,7 +56,7 @@ pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
         (None, None) => None,
     };
     let settings = args.follow.settings(args.download.radius)?;
-    let request = args.download.request(args.from, at)?;
+    let request = FetchRequest { scene: args.scene, ..args.download.request(args.from, at)? };
     let cache = args.cache.open()?;
     let cancel = Arc::new(AtomicBool::new(false));
     let on_signal = Arc::clone(&cancel);
@@ -64,8 +69,13 @@ pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
     let result = fetch_once(&cache, &request, &cancel, &bar);
     bar.finish();
     match result {
-        Ok(report) if args.json => print_json(&report),
-        Ok(report) => print_report(&report),
+        Ok(report) => {
+            if args.json { print_json(&report) } else { print_report(&report) }?;
+            match bad_cells(&report) {
+                Some(what) => Err(Failure::Partial(anyhow!(what))),
+                None => Ok(()),
+            }
+        }
         Err(error) => Err(failure(error)),
     }
 }

@@ -31,6 +31,20 @@ pub fn print_report(report: &FetchReport) -> Result<(), Failure> {
     ])
 }
 
+/// Returns what is to be said about cells that could not be fetched.
+pub fn bad_cells(report: &FetchReport) -> Option<String> {
+    if report.bad_cells.is_empty() {
+        return None;
+    }
+    let cells: Vec<String> = report.bad_cells.iter().map(ToString::to_string).collect();
+    Some(format!(
+        "{} of {} cells could not be fetched: {}; all others are on board. Have the scene published again, and fetch again",
+        cells.len(),
+        report.n_cells,
+        cells.join(", ")
+    ))
+}
+
 /// Prints a fetch on one line, while following a robot.
 pub fn print_line(report: &FetchReport) -> Result<(), Failure> {
     let FetchReport { generation, n_cells, centre_in_world, downloaded, freed, .. } = report;
@@ -39,6 +53,9 @@ pub fn print_line(report: &FetchReport) -> Result<(), Failure> {
         io::stdout(),
         "generation {generation}, {n_cells} cells around {centre_in_world}: {came} shards fetched, {went} freed"
     )?;
+    if let Some(what) = bad_cells(report) {
+        tracing::warn!("{what}");
+    }
     Ok(())
 }
 

@@ -143,6 +143,13 @@ fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
     if answers.area_fetched == Some(false) {
         writeln!(io::stderr(), "part of that area is not on board; fetch it for a complete answer")?;
     }
+    for bad in &answers.bad_cells {
+        let id = bad.cell_id;
+        match bad.generation {
+            Some(old) => writeln!(io::stderr(), "cell {id} could not be fetched; generation {old} answers for it")?,
+            None => writeln!(io::stderr(), "cell {id} could not be fetched, and is not on board")?,
+        }
+    }
     let rows: Vec<Vec<String>> = match &answers.answers {
         Found::Clusters(clusters) => clusters
             .iter()

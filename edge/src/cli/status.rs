@@ -2,6 +2,7 @@
 
 use clap::Args;
 use serde::Serialize;
+use slag_edge::fetch::accepted;
 use slag_edge::query::Status;
 use slag_edge::store::Snapshot;
 
@@ -19,14 +20,16 @@ pub struct StatusArgs {
 }
 
 pub fn run(args: StatusArgs) -> Result<(), Failure> {
-    let snapshot = Snapshot::open(&args.cache.open()?).map_err(store_failure)?;
+    let cache = args.cache.open()?;
+    let snapshot = Snapshot::open(&cache).map_err(store_failure)?;
+    let pinned_scene = accepted(&cache).map(|accepted| accepted.scene);
     let status = Status::of(&snapshot);
     let expires_unix_secs = snapshot.manifest.expires_unix_secs;
     let is_expired = snapshot.manifest.check_expiry(slag_edge::now_unix_secs()).is_err();
     if args.json {
-        return print_json(&OnBoard { status: &status, expires_unix_secs, is_expired });
+        return print_json(&OnBoard { status: &status, pinned_scene, expires_unix_secs, is_expired });
     }
-    print_status(&status)?;
+    print_status(&status, pinned_scene)?;
     match is_expired {
         true => print_pairs(&[("expired", "yes: queries still work, but fetch refuses it".into())]),
         false => Ok(()),
@@ -37,21 +40,25 @@ pub fn run(args: StatusArgs) -> Result<(), Failure> {
 struct OnBoard<'a> {
     #[serde(flatten)]
     status: &'a Status,
+    pinned_scene: Option<String>,
     expires_unix_secs: Option<u64>,
     is_expired: bool,
 }
 
 /// Prints what is on board.
-fn print_status(status: &Status) -> Result<(), Failure> {
+fn print_status(status: &Status, pinned_scene: Option<String>) -> Result<(), Failure> {
     let unit = if status.metric { "m" } else { "world units" };
+    let bad_cells: Vec<String> = status.bad_cells.iter().map(ToString::to_string).collect();
     print_pairs(&[
         ("scene", status.scene.clone()),
+        ("pinned to", pinned_scene.unwrap_or_else(|| "unknown: see the next fetch".into())),
         ("generation", status.generation.to_string()),
         ("encoder", format!("{} ({})", status.encoder_name, status.encoder_id)),
         ("threshold", status.default_threshold.to_string()),
         ("profile", status.profile.to_string()),
         ("fetched", format!("{} {unit} around {:.2}", status.radius, status.centre_in_world)),
         ("shards", format!("{} of {} cells", status.shards.len(), status.n_cells_in_scene)),
+        ("bad cells", if bad_cells.is_empty() { "none".into() } else { bad_cells.join(", ") }),
         ("Gaussians", status.n_gaussians.to_string()),
         ("bytes", status.len_bytes.to_string()),
         ("signed by", status.key.to_string()),

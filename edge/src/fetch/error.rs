@@ -1,6 +1,7 @@
 //! Errors of fetching and downloading.
 
 use std::io;
+use std::path::PathBuf;
 use std::time::Duration;
 
 use slag_common::Hash32;
@@ -50,6 +51,26 @@ pub enum FetchError {
     /// The manifest is invalid.
     #[error(transparent)]
     Manifest(#[from] ManifestError),
+    /// No key of the request is accepted.
+    #[error(
+        "--key {asked} is not the key that this robot accepted, {held}, nor its successor; if the store's key was changed from {held}, name both once, the accepted key first: --key OLD --key NEW"
+    )]
+    Key {
+        /// The keys of the request.
+        asked: String,
+        /// The keys accepted.
+        held: String,
+    },
+    /// The store offers another scene.
+    #[error(
+        "the store offers scene {offered:?}, this robot expects {expected:?}; check the address, or change the robot's scene once with `slag-edge fetch --scene NAME`"
+    )]
+    Scene {
+        /// Scene expected.
+        expected: String,
+        /// Scene offered.
+        offered: String,
+    },
     /// The manifest is older than one accepted before.
     #[error(
         "scene {scene:?}: the store offers generation {offered}, but generation {seen} was accepted before. An old manifest is being replayed, or the store was restored from a backup; publish a newer generation"
@@ -93,9 +114,21 @@ pub enum FetchError {
         /// Their bytes.
         bytes: u64,
     },
-    /// The disk is full.
+    /// The disk has too little space for the download.
     #[error(
-        "the disk is full: {source}; free {needed_bytes} bytes, or fetch a smaller radius (partial downloads were removed)"
+        "{path}: {free_bytes} bytes are free, the fetch needs {needed_bytes}; free some space, or fetch a smaller radius", path = path.display()
+    )]
+    NoSpace {
+        /// The cache.
+        path: PathBuf,
+        /// Bytes that are still to be written.
+        needed_bytes: u64,
+        /// Bytes free.
+        free_bytes: u64,
+    },
+    /// The disk became full.
+    #[error(
+        "the disk is full: {source}; free up to {needed_bytes} bytes, or fetch a smaller radius (bytes received so far are kept)"
     )]
     DiskFull {
         /// Bytes of the shards to download.

@@ -11,11 +11,14 @@
 //! 5. `current`: written aside, synced, renamed; folder synced: this switches generations
 //! 6. shards and manifests that only the old generation needed are removed
 
+mod copies;
 mod download;
 mod environment;
 mod error;
 pub mod follow;
+mod generation;
 mod limits;
+mod lock;
 mod objects;
 mod offer;
 mod plan;
@@ -25,7 +28,9 @@ mod records;
 mod report;
 mod request;
 mod run;
+mod scrub;
 mod staging;
+mod usage;
 
 pub use environment::{Environment, Progress};
 pub use error::{DownloadFailure, FetchError};
@@ -33,7 +38,7 @@ pub use limits::NetworkLimits;
 pub use plan::{Held, Object, Plan, Wanted};
 pub use plan_error::PlanError;
 pub use position::{NotAPosition, Position};
-pub use records::{LastFetch, Records, RecordsError};
+pub use records::{Accepted, LastFetch, Records, RecordsError, accepted};
 pub use report::{FetchReport, Tally};
 pub use request::{DEFAULT_PARALLEL, DEFAULT_RADIUS, FetchRequest};
 pub use run::fetch;

@@ -2,26 +2,27 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
+use std::sync::Mutex;
+use std::sync::PoisonError;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
-use rayon::prelude::*;
 use slag_common::Hash32;
 use slag_common::manifest::Manifest;
 use slag_common::shard::Profile;
 
 use super::download::Client;
-use super::error::FetchError;
+use super::error::{DownloadFailure, FetchError};
 use super::plan::Object;
 use super::staging::part_path;
-use crate::store::{self, CurrentCell, EdgeCache, StoreError};
+use crate::store::{self, CellFault, CurrentCell, EdgeCache, StoreError};
 
 /// Most connections at a time.
 const MAX_PARALLEL: usize = 64;
 
 /// Checks of an object beyond its hash.
 pub struct Check<'a> {
-    manifest: &'a Manifest,
-    profile: Profile,
+    pub manifest: &'a Manifest,
+    pub profile: Profile,
     cells: BTreeMap<Hash32, &'a CurrentCell>,
 }
 
@@ -30,53 +31,69 @@ impl<'a> Check<'a> {
         Self { manifest, profile, cells: cells.iter().map(|cell| (cell.hash, cell)).collect() }
     }
 
+    /// Returns the cell of an object.
+    pub fn cell(&self, hash: Hash32) -> Option<&'a CurrentCell> {
+        self.cells.get(&hash).copied()
+    }
+
     /// Checks that bytes are the shard that the manifest describes.
-    fn object(&self, path: &Path, hash: Hash32, bytes: &[u8]) -> Result<(), StoreError> {
-        match self.cells.get(&hash) {
+    pub fn object(&self, path: &Path, hash: Hash32, bytes: &[u8]) -> Result<(), StoreError> {
+        match self.cell(hash) {
             Some(cell) => store::check_shard(path, bytes, cell, self.profile, self.manifest).map(drop),
             None => Ok(()),
         }
     }
 }
 
-/// Returns the objects of a plan that are damaged or differ from the manifest. They are downloaded again, so
-/// that `current` never names them.
-pub fn unfit_objects(cache: &EdgeCache, check: &Check<'_>, kept: &BTreeSet<Hash32>) -> BTreeSet<Hash32> {
-    let is_unfit = |hash: &Hash32| {
-        let path = cache.shard_path(*hash);
-        let mapped = cache.files().map(&path).map_err(StoreError::Io);
-        mapped.and_then(|bytes| check.object(&path, *hash, &bytes)).err().map(|e| (*hash, e))
-    };
-    let unfit: Vec<(Hash32, StoreError)> =
-        store::beside_queries(|| kept.par_iter().filter_map(is_unfit).collect());
-    unfit
-        .into_iter()
-        .map(|(hash, e)| {
-            tracing::warn!("downloading a shard again: {}", crate::error_line(&e));
-            hash
-        })
-        .collect()
+/// Objects that could not be had, by hash, with the fault and the error; and those that are in place.
+#[derive(Default)]
+pub struct Downloaded {
+    pub bad: BTreeMap<Hash32, (CellFault, FetchError)>,
+    pub good: BTreeSet<Hash32>,
 }
 
-/// Downloads objects, several at a time, and puts them in place durably. Of several errors, returns that of
-/// the first object.
+/// Returns the fault of a cell, if an error is about its shard alone: the store answers, but not with that
+/// shard.
+fn fault_of(error: &FetchError) -> Option<CellFault> {
+    match error {
+        FetchError::Published { .. } => Some(CellFault::Invalid),
+        FetchError::Download { failure, .. } => match failure {
+            DownloadFailure::Hash { .. } | DownloadFailure::Length { .. } => Some(CellFault::Damaged),
+            // 500: a store that cannot read the object.
+            DownloadFailure::Status { status: 404 | 410 | 500, .. } => Some(CellFault::Missing),
+            _ => None,
+        },
+        _ => None,
+    }
+}
+
+/// Downloads objects, several at a time, and puts them in place durably. An object that the store does not
+/// have whole costs that object only; of several other errors, returns that of the first object.
 pub fn download_all(
     cache: &EdgeCache,
     client: &Client<'_>,
     check: &Check<'_>,
     objects: &[Object],
     parallel: usize,
-) -> Result<(), FetchError> {
+) -> Result<Downloaded, FetchError> {
     let next = AtomicUsize::new(0);
     let failed = AtomicBool::new(false);
+    let downloaded = Mutex::new(Downloaded::default());
+    let downloaded_now = || downloaded.lock().unwrap_or_else(PoisonError::into_inner);
     let worker = || {
         let mut first_failure = None;
         while !failed.load(Ordering::Relaxed) {
             let index = next.fetch_add(1, Ordering::Relaxed);
             let Some(object) = objects.get(index) else { break };
-            if let Err(e) = download_one(cache, client, check, *object) {
-                failed.store(true, Ordering::Relaxed);
-                first_failure = Some((index, e));
+            match download_one(cache, client, check, *object) {
+                Ok(()) => drop(downloaded_now().good.insert(object.hash)),
+                Err(e) => match fault_of(&e) {
+                    Some(fault) => drop(downloaded_now().bad.insert(object.hash, (fault, e))),
+                    None => {
+                        failed.store(true, Ordering::Relaxed);
+                        first_failure = Some((index, e));
+                    }
+                },
             }
         }
         first_failure
@@ -90,11 +107,14 @@ pub fn download_all(
         });
         joined.collect::<Vec<_>>()
     });
-    match failures.into_iter().flatten().min_by_key(|(index, _)| *index) {
-        Some((_, e)) => Err(e),
-        None if objects.is_empty() => Ok(()),
-        None => Ok(cache.files().sync_dir(&cache.dir().join("shards"))?),
+    if let Some((_, e)) = failures.into_iter().flatten().min_by_key(|(index, _)| *index) {
+        return Err(e);
     }
+    let downloaded = downloaded.into_inner().unwrap_or_else(PoisonError::into_inner);
+    if !downloaded.good.is_empty() {
+        cache.files().sync_dir(&cache.dir().join("shards"))?;
+    }
+    Ok(downloaded)
 }
 
 fn download_one(
@@ -107,6 +127,8 @@ fn download_one(
     client.object(cache.files(), hash, len_bytes, &part)?;
     let bytes = cache.files().map(&part)?;
     if let Err(source) = check.object(&part, hash, &bytes) {
+        // It would be the same the next time.
+        cache.files().remove(&part)?;
         return Err(FetchError::Published { hash, source: Box::new(source) });
     }
     Ok(cache.files().rename(&part, &cache.shard_path(hash))?)

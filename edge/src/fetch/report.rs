@@ -5,6 +5,8 @@ use serde::Serialize;
 use slag_common::Hash32;
 use slag_common::shard::Profile;
 
+use crate::store::BadCell;
+
 /// Number and length of some shards.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Tally {
@@ -52,6 +54,8 @@ pub struct FetchReport {
     pub radius: f64,
     /// Cells within it.
     pub n_cells: usize,
+    /// Those whose shard could not be fetched.
+    pub bad_cells: Vec<BadCell>,
     /// Shards downloaded.
     pub downloaded: Tally,
     /// Needed shards that were on board already.

@@ -22,8 +22,12 @@ pub struct FetchRequest {
     /// Profile of the shards.
     pub profile: Profile,
     /// The only keys accepted, or their replacements; empty: the key accepted before or, at the first
-    /// contact, the server's. The successor that a key names is accepted with it.
+    /// contact, the server's. The successor that a key names is accepted with it. A pair (accepted key, new
+    /// key) accepts a successor that no manifest named.
     pub keys: Vec<Hash32>,
+    /// The only scene accepted, from now on; absent: the one accepted before or, at the first contact, the
+    /// server's.
+    pub scene: Option<String>,
     /// The only encoder accepted; absent: any.
     pub expected_encoder: Option<Hash32>,
     /// Byte budget for shards; absent: twice the length of the needed ones.
@@ -42,6 +46,7 @@ impl Default for FetchRequest {
             radius: DEFAULT_RADIUS,
             profile: Profile::Compact,
             keys: Vec::new(),
+            scene: None,
             expected_encoder: None,
             max_bytes: None,
             parallel: DEFAULT_PARALLEL,

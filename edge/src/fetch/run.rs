@@ -9,14 +9,22 @@ use slag_common::Hash32;
 use super::download::Client;
 use super::environment::Environment;
 use super::error::FetchError;
-use super::objects::{Check, download_all, unfit_objects};
+use super::generation::{Before, assemble};
+use super::objects::{Check, download_all};
 use super::offer::{Offer, Trust};
-use super::plan::{Plan, Wanted};
-use super::records::{LastFetch, Records};
+use super::plan::{Object, Plan, Wanted};
+use super::records::{LastFetch, Records, RecordsError};
 use super::report::{FetchReport, Tally};
 use super::request::FetchRequest;
-use super::staging::{clear_manifests, clear_staging, held_shards, put, staging};
+use super::scrub::{digests, scrub};
+use super::staging::{clear_manifests, clear_staging, held_shards, part_path, put, staging};
+use super::usage::Usage;
 use crate::store::{Current, EdgeCache, StoreError};
+
+/// Most bytes of a cell in `current`.
+const CELL_BYTES: u64 = 512;
+/// Space for records of fetches.
+const SPARE_BYTES: u64 = 4096;
 
 /// Fetches the shards within a radius and frees those beyond the budget.
 ///
@@ -33,12 +41,13 @@ pub fn fetch(
     for dir in dirs.iter().rev() {
         cache.files().create_dir(dir)?;
     }
-    let records = Records::open(&cache.dir().join("db"))?;
+    let mut records = Records::open(cache)?;
+    let mut usage = Usage::open(cache.dir().join("db"));
     // A killed fetch may have renamed files without syncing their folder.
     for dir in &dirs {
         cache.files().sync_dir(dir)?;
     }
-    let last = records.last()?;
+    let last = records.last().cloned();
     let (last_from, last_at) = last.map_or((None, None), |last| (Some(last.from), Some(last.at)));
     let from = request
         .from
@@ -51,75 +60,96 @@ pub fn fetch(
     })?;
     let old = match cache.current() {
         Err(e @ StoreError::Current { .. }) => {
-            tracing::warn!("{e}; it will be rewritten");
+            tracing::warn!("{e}");
             None
         }
         other => other?,
     };
     let client = Client::new(&from, environment)?;
     let on_board = old.as_ref().and_then(|old| Offer::on_board(cache, old));
-    let trust = Trust::new(&request.keys, &records, old.as_ref(), on_board.as_ref())?;
+    let trust = Trust::new(request, &records, old.as_ref(), on_board.as_ref())?;
     let offer = Offer::get(&client, request.offline, on_board.as_ref(), &trust)?;
     offer.check(&records, on_board.as_ref(), &trust, request, environment.now_unix_secs)?;
     let replaced_key = trust.replaced_by(offer.key);
 
     let centre_in_world = at.in_world(&offer.manifest)?;
-    let mut held = held_shards(cache, &records)?;
+    let mut held = held_shards(cache, &usage)?;
     let FetchRequest { profile, radius, max_bytes, .. } = *request;
     let wanted = Wanted { profile, centre_in_world, radius, max_bytes };
     let mut plan = Plan::new(&offer.manifest, &wanted, &held)?;
-    let unfit = unfit_objects(cache, &Check::new(&offer.manifest, profile, &plan.cells), &plan.keep);
-    if !unfit.is_empty() {
-        held.retain(|hash, _| !unfit.contains(hash));
+    let check = Check::new(&offer.manifest, profile, &plan.cells);
+    let scrubbed = scrub(cache, &check, &plan.keep, &usage, environment.now_unix_secs);
+    if !scrubbed.unfit.is_empty() {
+        held.retain(|hash, _| !scrubbed.unfit.contains(hash));
         plan = Plan::new(&offer.manifest, &wanted, &held)?;
     }
-    let downloaded = Tally::of(plan.download.iter().map(|object| object.len_bytes));
-    if request.offline && downloaded.n_shards > 0 {
-        return Err(FetchError::Offline { n_shards: downloaded.n_shards, bytes: downloaded.bytes });
+    let planned = Tally::of(plan.download.iter().map(|object| object.len_bytes));
+    if request.offline && planned.n_shards > 0 {
+        return Err(FetchError::Offline { n_shards: planned.n_shards, bytes: planned.bytes });
     }
-    records.accept(&LastFetch { from, at }, &offer.manifest, offer.key, replaced_key.as_slice())?;
+    records
+        .accept(cache, &LastFetch { from, at }, &offer.manifest, offer.key, replaced_key)
+        .map_err(|e| match e {
+            RecordsError::Io(source) => disk_full(source, planned.bytes),
+            e => e.into(),
+        })?;
     if let Some(old) = replaced_key {
         tracing::info!("key {old} is no longer accepted: {} replaced it", offer.key);
     }
 
-    let in_use: BTreeSet<Hash32> = old.iter().flat_map(|old| &old.cells).map(|cell| cell.hash).collect();
+    let in_use: BTreeSet<Hash32> = old.iter().flat_map(Current::shards).collect();
     for hash in plan.free.difference(&in_use) {
         cache.files().remove(&cache.shard_path(*hash))?;
     }
     clear_staging(cache, &plan.download)?;
-    environment.progress.planned(downloaded.n_shards, downloaded.bytes);
+    environment.progress.planned(planned.n_shards, planned.bytes);
+    let before = Before { cache, current: old.as_ref(), offer: on_board.as_ref() };
     let work = || {
+        let other_bytes = offer.bytes.len() as u64 + plan.cells.len() as u64 * CELL_BYTES + SPARE_BYTES;
+        check_space(cache, &plan.download, other_bytes)?;
         let check = Check::new(&offer.manifest, profile, &plan.cells);
-        download_all(cache, &client, &check, &plan.download, request.parallel)?;
-        let Offer { manifest_hash, key, .. } = offer;
-        let current =
-            Current { manifest_hash, key, profile, centre_in_world, radius, cells: plan.cells.clone() };
+        let mut downloaded = download_all(cache, &client, &check, &plan.download, request.parallel)?;
+        let current = assemble(before, &offer, &wanted, &plan, &downloaded.bad);
+        for (hash, (_, error)) in &downloaded.bad {
+            let cell_id = check.cell(*hash).map_or(0, |cell| cell.cell_id);
+            tracing::warn!("cell {cell_id}: {}", crate::error_line(error));
+        }
+        if current.cells.is_empty() {
+            let first = plan.download.iter().find_map(|object| downloaded.bad.remove(&object.hash));
+            if let Some((_, error)) = first {
+                return Err(error);
+            }
+        }
         if old.as_ref() != Some(&current) {
-            put(cache, &offer.bytes, &cache.manifest_path(manifest_hash))?;
+            put(cache, &offer.bytes, &cache.manifest_path(offer.manifest_hash))?;
             let bytes = serde_json::to_vec(&current).map_err(io::Error::from)?;
             put(cache, &bytes, &cache.current_path())?;
         }
-        Ok(())
+        let sound = scrubbed.sound.iter().chain(&downloaded.good).copied();
+        Ok((digests(cache, &check, sound), downloaded.good, current))
     };
-    work().map_err(|e| match e {
-        FetchError::Io(source) if is_disk_full(&source) => {
-            // A full disk affects other programs: free the space, though the next fetch starts over.
-            match clear_staging(cache, &[]) {
-                Ok(()) => FetchError::DiskFull { needed_bytes: downloaded.bytes, source },
-                Err(e) => e,
-            }
-        }
+    let (digests, downloaded, current) = work().map_err(|e| match e {
+        FetchError::Io(source) => disk_full(source, planned.bytes),
         other => other,
     })?;
 
+    let in_use: BTreeSet<Hash32> = current.shards().collect();
+    plan.free.retain(|hash| !in_use.contains(hash));
     for hash in &plan.free {
         cache.files().remove(&cache.shard_path(*hash))?;
     }
-    clear_manifests(cache, offer.manifest_hash)?;
+    let manifests = current.old_shards().map(|(_, old)| old.manifest_hash).chain([offer.manifest_hash]);
+    clear_manifests(cache, &manifests.collect())?;
     clear_staging(cache, &[])?;
-    records.finish(plan.cells.iter().map(|cell| cell.hash), plan.free.iter().copied())?;
+    let on_board = in_use.iter().chain(&plan.spare).copied().collect();
+    usage.finish(&in_use, &digests, &on_board, environment.now_unix_secs);
     let tally = |hashes: &BTreeSet<Hash32>| Tally::of(hashes.iter().map(|hash| held[hash].len_bytes));
+    let is_downloaded = |object: &&Object| downloaded.contains(&object.hash);
     Ok(FetchReport {
+        downloaded: Tally::of(plan.download.iter().filter(is_downloaded).map(|object| object.len_bytes)),
+        kept: tally(&plan.keep),
+        spare: tally(&plan.spare),
+        freed: tally(&plan.free),
         scene: offer.manifest.scene,
         generation: offer.manifest.generation,
         manifest_hash: offer.manifest_hash,
@@ -133,16 +163,33 @@ pub fn fetch(
         centre_in_world,
         radius,
         n_cells: plan.cells.len(),
-        downloaded,
-        kept: tally(&plan.keep),
-        spare: tally(&plan.spare),
-        freed: tally(&plan.free),
+        bad_cells: current.bad_cells,
         resumed_bytes: client.resumed_bytes.into_inner(),
         retries: client.retries.into_inner(),
         seconds: started.elapsed().as_secs_f64(),
     })
 }
 
-fn is_disk_full(e: &io::Error) -> bool {
-    matches!(e.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
+/// Refuses a download for which there is no space, before it begins. `other_bytes`: what is written besides.
+fn check_space(cache: &EdgeCache, download: &[Object], other_bytes: u64) -> Result<(), FetchError> {
+    let Some(free_bytes) = cache.files().free_bytes(cache.dir())? else { return Ok(()) };
+    let mut needed_bytes = other_bytes;
+    for Object { hash, len_bytes } in download {
+        let staged_bytes = cache.files().stat(&part_path(cache, *hash))?.map_or(0, |stat| stat.len_bytes);
+        needed_bytes = needed_bytes.saturating_add(len_bytes.saturating_sub(staged_bytes));
+    }
+    match !download.is_empty() && needed_bytes > free_bytes {
+        true => Err(FetchError::NoSpace { path: cache.dir().to_owned(), needed_bytes, free_bytes }),
+        false => Ok(()),
+    }
+}
+
+/// Tells a full disk from other errors of the file system.
+fn disk_full(source: io::Error, needed_bytes: u64) -> FetchError {
+    match source.kind() {
+        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
+            FetchError::DiskFull { needed_bytes, source }
+        }
+        _ => FetchError::Io(source),
+    }
 }

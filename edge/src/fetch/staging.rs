@@ -7,7 +7,7 @@ use slag_common::Hash32;
 
 use super::error::FetchError;
 use super::plan::{Held, Object};
-use super::records::Records;
+use super::usage::Usage;
 use crate::store::EdgeCache;
 
 pub fn staging(cache: &EdgeCache) -> PathBuf {
@@ -19,14 +19,14 @@ pub fn part_path(cache: &EdgeCache, hash: Hash32) -> PathBuf {
 }
 
 /// Lists the shards on board and removes other files in their folder.
-pub fn held_shards(cache: &EdgeCache, records: &Records) -> Result<BTreeMap<Hash32, Held>, FetchError> {
+pub fn held_shards(cache: &EdgeCache, usage: &Usage) -> Result<BTreeMap<Hash32, Held>, FetchError> {
     let dir = cache.dir().join("shards");
     let mut held = BTreeMap::new();
     for name in cache.files().list(&dir)? {
         let path = dir.join(&name);
         match (name.parse::<Hash32>(), cache.files().stat(&path)?) {
             (Ok(hash), Some(stat)) => {
-                let last_used = records.last_used(hash)?;
+                let last_used = usage.last_used(hash);
                 held.insert(hash, Held { len_bytes: stat.len_bytes, last_used });
             }
             _ => cache.files().remove(&path)?,
@@ -47,10 +47,11 @@ pub fn clear_staging(cache: &EdgeCache, wanted: &[Object]) -> Result<(), FetchEr
     Ok(())
 }
 
-pub fn clear_manifests(cache: &EdgeCache, current: Hash32) -> Result<(), FetchError> {
+/// Removes the manifests that are not needed any more.
+pub fn clear_manifests(cache: &EdgeCache, needed: &BTreeSet<Hash32>) -> Result<(), FetchError> {
     let dir = cache.dir().join("manifests");
     for name in cache.files().list(&dir)? {
-        if name != current.to_string() {
+        if !name.parse().is_ok_and(|hash| needed.contains(&hash)) {
             cache.files().remove(&dir.join(name))?;
         }
     }

@@ -10,6 +10,7 @@ use slag_service::problem::Problem;
 
 use super::app::App;
 use super::problem::query_problem;
+use crate::fetch::accepted;
 use crate::query::Status;
 
 pub async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Problem> {
@@ -38,6 +39,7 @@ pub async fn status(State(app): State<Arc<App>>) -> Result<Json<Value>, Problem>
         let expires_unix_secs = manifest.and_then(|manifest| manifest.expires_unix_secs);
         // An expired scene still answers: an old map is better than none, if the client can tell.
         let is_expired = manifest.is_some_and(|m| m.check_expiry(crate::now_unix_secs()).is_err());
+        let pinned_scene = accepted(app.engine.cache()).map(|accepted| accepted.scene);
         let following = app.following.as_ref().map(|following| following.status());
         let scene = snapshot.as_ref().ok().map(|snapshot| Status::of(snapshot));
         let is_ready = error.is_none() && app.engine.text_is_alive();
@@ -45,6 +47,7 @@ pub async fn status(State(app): State<Arc<App>>) -> Result<Json<Value>, Problem>
         let text_model = app.engine.encoder();
         Ok(Json(json!({
             "version": version, "is_ready": is_ready, "error": error, "text_model": text_model, "scene": scene,
+            "pinned_scene": pinned_scene,
             "expires_unix_secs": expires_unix_secs, "is_expired": is_expired, "following": following,
         })))
     })

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::answers::{Answers, ClusterAnswer, Clustering, Evidence, Found};
+use super::answers::{Answers, BadCellAnswer, ClusterAnswer, Clustering, Evidence, Found};
 use super::cluster::{Cluster, Grouping, cluster};
 use super::objects::{self, FoundObject};
 use super::rank::{Ranked, rank};
@@ -13,6 +13,7 @@ use super::scale::Scale;
 use super::scene::{Scene, alignment, default_voxel};
 use super::threshold::ThresholdSource;
 use crate::score::{ObjectScores, Question, Region, ScoreError, Scratch, Search, score_objects};
+use crate::store::{BadCell, cell_of};
 use slag_common::manifest::Manifest;
 
 /// Answers a checked request about a scene: one answer for each question, in their order. `questions`: the
@@ -152,6 +153,7 @@ fn empty(
     request: &QueryRequest,
 ) -> Answers {
     let manifest = scene.manifest;
+    let bad_cells = bad_cells(scene, &request.region());
     Answers {
         text: text.to_owned(),
         negatives: request.negatives.phrases().into_iter().map(str::to_owned).collect(),
@@ -167,11 +169,23 @@ fn empty(
         is_exact: false,
         score_error_bound: 0.0,
         score_error_likely: None,
-        area_fetched: area_fetched(scene.fetched, request),
+        area_fetched: area_fetched(scene.fetched, request)
+            .map(|is_fetched| is_fetched && bad_cells.iter().all(|bad| bad.generation.is_some())),
+        bad_cells,
         clustering: None,
         reason: None,
         answers: Found::Clusters(Vec::new()),
     }
+}
+
+/// Returns the cells of a region whose shards could not be fetched.
+fn bad_cells(scene: &Scene<'_>, region: &Region) -> Vec<BadCellAnswer> {
+    let touches = |bad: &&BadCell| {
+        cell_of(scene.manifest, bad.cell_id).is_none_or(|cell| region.touches(&cell.bounds))
+    };
+    let generation = |bad: &BadCell| bad.old.map(|old| old.generation);
+    let described = |bad: &BadCell| BadCellAnswer { cell_id: bad.cell_id, generation: generation(bad) };
+    scene.bad_cells.iter().filter(touches).map(described).collect()
 }
 
 /// Returns whether the whole region asked for was fetched: certainly if all of the ball or all of the box

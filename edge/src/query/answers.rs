@@ -59,6 +59,9 @@ pub struct Answers {
     /// Whether the whole region asked for was fetched; absent without `radius` and `box`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub area_fetched: Option<bool>,
+    /// Cells in the region asked for whose shards could not be fetched.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub bad_cells: Vec<BadCellAnswer>,
     /// How matches were clustered; only for `kind=clusters`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub clustering: Option<Clustering>,
@@ -68,6 +71,16 @@ pub struct Answers {
     /// The answers, best first. Serialised as an empty list, which [`super::Reply::pieces`] fills.
     #[serde(serialize_with = "empty_list")]
     pub answers: Found,
+}
+
+/// A cell whose shard could not be fetched.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct BadCellAnswer {
+    /// The cell.
+    pub cell_id: u32,
+    /// The earlier generation that answers for it; absent: nothing of it is on board.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub generation: Option<u64>,
 }
 
 /// Answers of either kind.

@@ -15,7 +15,7 @@ use super::request::{QueryRequest, RequestError};
 use super::scene::Scene;
 use crate::score::{Question, ScoreError, Scratch};
 use crate::store::files::Stat;
-use crate::store::{EdgeCache, OpenShard, Snapshot, StoreError};
+use crate::store::{EdgeCache, Snapshot, StoreError};
 use crate::text::{EncoderInfo, TextError, TextService};
 
 /// Time after which a failed load is tried again even if `current` is unchanged: the disk may have been full,
@@ -99,6 +99,11 @@ impl Engine {
         Self { cache, text, loaded: RwLock::default(), idle: Mutex::default() }
     }
 
+    /// Returns the cache.
+    pub fn cache(&self) -> &EdgeCache {
+        &self.cache
+    }
+
     /// Returns the text encoder in use.
     pub fn encoder(&self) -> &EncoderInfo {
         self.text.info()
@@ -124,7 +129,9 @@ impl Engine {
     /// [`StoreError`].
     pub fn reload(&self) -> Result<(), StoreError> {
         let tried = self.cache.current_stat().ok().flatten();
-        let opened = Snapshot::open(&self.cache);
+        let before = self.snapshot().ok();
+        let opened = Snapshot::open_after(&self.cache, before.as_deref());
+        drop(before);
         let mut loaded = self.loaded.write().unwrap_or_else(PoisonError::into_inner);
         match opened {
             Ok(snapshot) => {
@@ -183,11 +190,12 @@ impl Engine {
         let question =
             |text: &String| Ok(Question { vector: self.text.encode(text)?, negatives: negatives.clone() });
         let questions = request.texts.iter().map(question).collect::<Result<Vec<_>, TextError>>()?;
-        let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(OpenShard::view).collect();
+        let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(|shard| shard.view()).collect();
         let fetched = (snapshot.current.centre_in_world, snapshot.current.radius);
-        let objects: Vec<Option<Objects<'_>>> = snapshot.shards.iter().map(OpenShard::objects).collect();
+        let objects: Vec<Option<Objects<'_>>> = snapshot.shards.iter().map(|shard| shard.objects()).collect();
         let (index, manifest) = (&snapshot.objects, &snapshot.manifest);
-        let scene = Scene { shards: &shards, objects: &objects, index, manifest, fetched };
+        let bad_cells = &snapshot.bad_cells;
+        let scene = Scene { shards: &shards, objects: &objects, index, manifest, fetched, bad_cells };
         let idle = || self.idle.lock().unwrap_or_else(PoisonError::into_inner);
         let mut scratch = idle().pop().unwrap_or_default();
         let answers = answer(&mut scratch, &scene, &questions, request);

@@ -8,7 +8,6 @@ use slag_common::splat::ply::{Point, PointProperties};
 use super::answers::{Answers, Found};
 use super::reply::Reply;
 use crate::score::Run;
-use crate::store::OpenShard;
 
 /// A piece ends with the first point past this size.
 const PIECE_BYTES: usize = 256 << 10;
@@ -58,7 +57,7 @@ impl<R: Borrow<Reply>> Pieces<R> {
     /// Appends points to a piece until it is full or none is left.
     fn fill(&mut self, piece: &mut Vec<u8>) {
         let reply = self.reply.borrow();
-        let shards: Vec<_> = reply.snapshot.shards.iter().map(OpenShard::view).collect();
+        let shards: Vec<_> = reply.snapshot.shards.iter().map(|shard| shard.view()).collect();
         while let Some(answers) = reply.answers.get(self.at.question) {
             let Some(run) = run(answers, self.at.answer, self.at.run) else {
                 self.at = match self.at.answer + 1 < answers.answers.len() {

@@ -7,6 +7,7 @@ use slag_common::shard::ShardView;
 use slag_math::stats::median;
 
 use super::oriented::Alignment;
+use crate::store::BadCell;
 use crate::store::objects::ObjectIndex;
 
 /// Edge of the voxels in a metric scene, metres. Parts of one piece of furniture are closer to each other
@@ -27,6 +28,8 @@ pub struct Scene<'a> {
     pub manifest: &'a Manifest,
     /// Centre and radius of the last fetch.
     pub fetched: (DVec3, f64),
+    /// Cells within it whose shards could not be fetched.
+    pub bad_cells: &'a [BadCell],
 }
 
 /// Returns the default edge of the voxels: 0.25 m in a metric scene, else a 64th of the median cell's middle

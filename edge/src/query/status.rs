@@ -6,7 +6,7 @@ use slag_common::Hash32;
 use slag_common::frames::GeoReference;
 use slag_common::shard::Profile;
 
-use crate::store::Snapshot;
+use crate::store::{BadCell, Snapshot};
 
 /// The loaded generation, for people and monitors.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -38,6 +38,8 @@ pub struct Status {
     pub radius: f64,
     /// Cells in the whole scene.
     pub n_cells_in_scene: usize,
+    /// Cells within the radius whose shards could not be fetched.
+    pub bad_cells: Vec<BadCell>,
     /// Gaussians on board.
     pub n_gaussians: u64,
     /// Bytes of the shards on board.
@@ -91,6 +93,7 @@ impl Status {
             centre_in_world: current.centre_in_world,
             radius: current.radius,
             n_cells_in_scene: manifest.cells.len(),
+            bad_cells: snapshot.bad_cells.clone(),
             n_gaussians: shards.iter().map(|shard| u64::from(shard.n_gaussians)).sum(),
             len_bytes: shards.iter().map(|shard| shard.len_bytes).sum(),
             shards,

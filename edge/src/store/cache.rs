@@ -10,6 +10,7 @@ use slag_common::Hash32;
 use slag_common::manifest::{self, Manifest, TrustedKeys};
 use slag_common::shard::Profile;
 
+use super::bad_cell::{BadCell, OldShard};
 use super::error::StoreError;
 use super::files::{DiskFiles, Files, Stat};
 
@@ -32,6 +33,22 @@ pub struct Current {
     pub radius: f64,
     /// The cells on board, by id, ascending.
     pub cells: Vec<CurrentCell>,
+    /// The other cells within the radius, whose shards could not be fetched; by id, ascending.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub bad_cells: Vec<BadCell>,
+}
+
+impl Current {
+    /// Returns all shards that answer.
+    pub fn shards(&self) -> impl Iterator<Item = Hash32> + '_ {
+        let old = self.old_shards().map(|(_, old)| old.hash);
+        self.cells.iter().map(|cell| cell.hash).chain(old)
+    }
+
+    /// Returns the shards of earlier generations that answer for bad cells.
+    pub fn old_shards(&self) -> impl Iterator<Item = (u32, OldShard)> + '_ {
+        self.bad_cells.iter().filter_map(|bad| Some((bad.cell_id, bad.old?)))
+    }
 }
 
 /// A cell on board.
@@ -109,8 +126,13 @@ impl EdgeCache {
         };
         let current: Current = serde_json::from_slice(&bytes)
             .map_err(|e| StoreError::Current { path: path.clone(), what: e.to_string() })?;
-        if current.cells.windows(2).any(|pair| pair[0].cell_id >= pair[1].cell_id) {
+        let ids = || current.cells.iter().map(|cell| cell.cell_id);
+        let bad_ids = || current.bad_cells.iter().map(|cell| cell.cell_id);
+        if !ids().is_sorted_by(|a, b| a < b) || !bad_ids().is_sorted_by(|a, b| a < b) {
             return Err(StoreError::Current { path, what: "cell ids do not ascend".into() });
+        }
+        if bad_ids().any(|id| current.cells.binary_search_by_key(&id, |cell| cell.cell_id).is_ok()) {
+            return Err(StoreError::Current { path, what: "a cell is on board and bad".into() });
         }
         Ok(Some(current))
     }

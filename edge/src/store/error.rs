@@ -21,7 +21,7 @@ pub enum StoreError {
         path: PathBuf,
     },
     /// The generation pointer is damaged.
-    #[error("{path}: {what}; delete it and fetch again", path = path.display())]
+    #[error("{path}: {what}; fetch again, which writes it anew", path = path.display())]
     Current {
         /// The file.
         path: PathBuf,
@@ -35,7 +35,7 @@ pub enum StoreError {
         path: PathBuf,
     },
     /// A file's content does not match its name.
-    #[error("{path}: content has hash {found}, expected {expected}; delete it and fetch again", path = path.display())]
+    #[error("{path}: content has hash {found}, expected {expected}; fetch again, which replaces it", path = path.display())]
     Hash {
         /// The file.
         path: PathBuf,
@@ -71,7 +71,7 @@ pub enum StoreError {
         profile: Profile,
     },
     /// The shard is intact but differs from the manifest's description.
-    #[error("{path}: {field} is {found}, the manifest says {expected}; delete it and fetch again", path = path.display())]
+    #[error("{path}: {field} is {found}, the manifest says {expected}; fetch again, which replaces it", path = path.display())]
     Mismatch {
         /// The file.
         path: PathBuf,

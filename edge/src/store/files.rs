@@ -43,6 +43,9 @@ pub trait Files: Send + Sync {
     fn map(&self, path: &Path) -> io::Result<FileBytes>;
     /// Returns a file's metadata; `None` if it does not exist.
     fn stat(&self, path: &Path) -> io::Result<Option<Stat>>;
+    /// Returns the free space of the file system that holds a folder, as far as this user may use it; `None` if
+    /// the system does not say.
+    fn free_bytes(&self, dir: &Path) -> io::Result<Option<u64>>;
 }
 
 /// The real file system.
@@ -125,5 +128,17 @@ impl Files for DiskFiles {
         #[cfg(not(unix))]
         let inode = 0;
         Ok(Some(Stat { len_bytes: metadata.len(), modified: metadata.modified().ok(), inode }))
+    }
+
+    #[cfg(unix)]
+    fn free_bytes(&self, dir: &Path) -> io::Result<Option<u64>> {
+        let stat = rustix::fs::statvfs(dir)
+            .map_err(|e| io::Error::new(e.kind(), format!("free space of {}: {e}", dir.display())))?;
+        Ok(Some(stat.f_bavail.saturating_mul(stat.f_frsize)))
+    }
+
+    #[cfg(not(unix))]
+    fn free_bytes(&self, _dir: &Path) -> io::Result<Option<u64>> {
+        Ok(None)
     }
 }

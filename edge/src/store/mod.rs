@@ -6,11 +6,14 @@
 //! | `manifests/HASH` | verified signed manifests, immutable | fetch: renamed in, removed |
 //! | `current` | [`Current`]: the generation in use | fetch: replaced whole |
 //! | `staging/` | partial downloads | fetch |
-//! | `db/` | records of fetches | fetch |
+//! | `trust/` | accepted keys, scene and generations, in two copies | fetch |
+//! | `db/` | which shards were used and checked | fetch |
+//! | `lock` | locked by the one fetch | |
 //!
 //! Readers need no lock: they read `current` and the files it names, and start over if a fetch replaces it
 //! meanwhile.
 
+mod bad_cell;
 mod cache;
 mod error;
 pub mod files;
@@ -19,6 +22,7 @@ pub mod objects;
 mod shard;
 mod snapshot;
 
+pub use bad_cell::{BadCell, CellFault, OldShard, can_stand_in, cell_of};
 pub use cache::{Current, CurrentCell, EdgeCache};
 pub use error::StoreError;
 pub use shard::{OpenShard, check_shard};

@@ -8,8 +8,10 @@ use slag_common::manifest::{CellRecord, Manifest};
 use slag_common::objects::Objects;
 use slag_common::shard::{Profile, ShardLayout, ShardView};
 
+use super::bad_cell::cell_of;
 use super::cache::{CurrentCell, EdgeCache};
 use super::error::StoreError;
+use super::files::Stat;
 use super::mmap::FileBytes;
 
 /// A mapped and checked shard.
@@ -19,6 +21,9 @@ pub struct OpenShard {
     pub cell: CellRecord,
     layout: ShardLayout,
     bytes: FileBytes,
+    profile: Profile,
+    /// State of the file just before it was mapped.
+    stat: Option<Stat>,
 }
 
 impl OpenShard {
@@ -37,6 +42,24 @@ impl OpenShard {
         self.bytes.len() as u64
     }
 
+    /// Returns whether this is a manifest's shard of a cell, and still the file on board.
+    pub(super) fn is(
+        &self,
+        cache: &EdgeCache,
+        manifest: &Manifest,
+        profile: Profile,
+        at: &CurrentCell,
+    ) -> bool {
+        let header = self.view().header;
+        let is_listed = cell_of(manifest, at.cell_id) == Some(&self.cell) && self.profile == profile;
+        let is_named = self.cell.shards.get(&profile).is_some_and(|shard| shard.hash == at.hash);
+        let is_readable = (header.dim, header.encoder_id) == (manifest.encoder.dim, manifest.encoder.id.0);
+        // Storage without times cannot show that a file was replaced.
+        let is_unchanged = self.stat.is_some_and(|stat| stat.modified.is_some())
+            && cache.files().stat(&cache.shard_path(at.hash)).is_ok_and(|stat| stat == self.stat);
+        is_listed && is_named && is_readable && is_unchanged
+    }
+
     pub(super) fn open(
         cache: &EdgeCache,
         manifest: &Manifest,
@@ -44,12 +67,13 @@ impl OpenShard {
         at: &CurrentCell,
     ) -> Result<Self, StoreError> {
         let path = cache.shard_path(at.hash);
+        let stat = cache.files().stat(&path)?;
         let bytes = match cache.files().map(&path) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(StoreError::Missing { path }),
             other => other?,
         };
         let (cell, layout) = check_shard(&path, &bytes, at, profile, manifest)?;
-        Ok(Self { cell: cell.clone(), layout, bytes })
+        Ok(Self { cell: cell.clone(), layout, bytes, profile, stat })
     }
 }
 
@@ -71,8 +95,7 @@ pub fn check_shard<'a>(
             false => Err(StoreError::Mismatch { path: path.to_owned(), field, expected, found }),
         }
     };
-    let position = manifest.cells.partition_point(|cell| cell.cell_id < at.cell_id);
-    let cell = manifest.cells.get(position).filter(|cell| cell.cell_id == at.cell_id);
+    let cell = cell_of(manifest, at.cell_id);
     let Some((cell, listed)) = cell.and_then(|cell| Some((cell, cell.shards.get(&profile)?))) else {
         let (cell_id, path) = (at.cell_id, path.to_owned());
         return Err(StoreError::Unlisted { path, cell_id, profile });

@@ -1,11 +1,12 @@
 //! An open generation: a manifest and its shards, mapped and checked.
 
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 
 use rayon::prelude::*;
 use slag_common::manifest::Manifest;
 
-use super::cache::{Current, EdgeCache};
+use super::bad_cell::{BadCell, can_stand_in};
+use super::cache::{Current, CurrentCell, EdgeCache};
 use super::error::StoreError;
 use super::files::Stat;
 use super::objects::ObjectIndex;
@@ -23,8 +24,10 @@ pub struct Snapshot {
     pub current_stat: Option<Stat>,
     /// The manifest.
     pub manifest: Manifest,
-    /// The shards, by cell id, ascending.
-    pub shards: Vec<OpenShard>,
+    /// The shards, by cell id, ascending; shared with snapshots of other generations that list them.
+    pub shards: Vec<Arc<OpenShard>>,
+    /// Cells within the radius whose shards could not be fetched; some have an earlier generation's shard.
+    pub bad_cells: Vec<BadCell>,
     /// Their objects.
     pub objects: ObjectIndex,
 }
@@ -35,12 +38,21 @@ impl Snapshot {
     /// # Errors
     /// [`StoreError`]. A fetch that replaces `current` meanwhile is not an error.
     pub fn open(cache: &EdgeCache) -> Result<Self, StoreError> {
+        Self::open_after(cache, None)
+    }
+
+    /// Opens the current generation as [`Snapshot::open`] does, and takes over the shards that a snapshot of
+    /// the same cache has open: they are neither mapped nor checked again.
+    ///
+    /// # Errors
+    /// As [`Snapshot::open`].
+    pub fn open_after(cache: &EdgeCache, before: Option<&Self>) -> Result<Self, StoreError> {
         let mut seen = None;
         for _ in 0..MAX_RACES {
             let current_stat = cache.current_stat()?;
             let current =
                 cache.current()?.ok_or_else(|| StoreError::Empty { path: cache.dir().to_owned() })?;
-            match Self::open_current(cache, current.clone(), current_stat) {
+            match Self::open_current(cache, current.clone(), current_stat, before) {
                 // A fetch removes the files of the old `current` after it has put the new one in place.
                 Err(StoreError::Missing { path }) if seen.as_ref() == Some(&current) => {
                     return Err(StoreError::Missing { path });
@@ -57,15 +69,43 @@ impl Snapshot {
         cache: &EdgeCache,
         current: Current,
         current_stat: Option<Stat>,
+        before: Option<&Self>,
     ) -> Result<Self, StoreError> {
         let manifest = cache.read_manifest(current.manifest_hash, current.key)?;
-        let open = |cell| OpenShard::open(cache, &manifest, current.profile, cell);
-        let opened: Vec<Result<OpenShard, StoreError>> =
-            beside_queries(|| current.cells.par_iter().map(open).collect());
-        let shards: Vec<OpenShard> = opened.into_iter().collect::<Result<_, _>>()?;
-        let objects = shards.iter().map(OpenShard::objects).collect::<Vec<_>>();
+        let profile = current.profile;
+        let open = |manifest: &Manifest, cell: &CurrentCell| {
+            let held = before.map_or(&[][..], |before| &before.shards);
+            let held = held.binary_search_by_key(&cell.cell_id, |shard| shard.cell.cell_id).ok().map(|at| &held[at]);
+            match held.filter(|shard| shard.is(cache, manifest, profile, cell)) {
+                Some(shard) => Ok(Arc::clone(shard)),
+                None => OpenShard::open(cache, manifest, profile, cell).map(Arc::new),
+            }
+        };
+        let opened: Vec<Result<Arc<OpenShard>, StoreError>> =
+            beside_queries(|| current.cells.par_iter().map(|cell| open(&manifest, cell)).collect());
+        let mut shards: Vec<Arc<OpenShard>> = opened.into_iter().collect::<Result<_, _>>()?;
+        let mut bad_cells = current.bad_cells.clone();
+        for bad in &mut bad_cells {
+            let Some(old) = bad.old else { continue };
+            let cell = CurrentCell { cell_id: bad.cell_id, hash: old.hash, len_bytes: old.len_bytes };
+            let of_old = cache.read_manifest(old.manifest_hash, old.key).and_then(|of_old| {
+                let may_stand_in = can_stand_in(&of_old, &manifest, bad.cell_id);
+                may_stand_in.then(|| open(&of_old, &cell)).transpose()
+            });
+            match of_old {
+                Ok(Some(shard)) => shards.push(shard),
+                Ok(None) => bad.old = None,
+                // Less to answer from; the next fetch tries the cell again.
+                Err(e) => {
+                    tracing::warn!("cell {} has no shard: {}", bad.cell_id, crate::error_line(&e));
+                    bad.old = None;
+                }
+            }
+        }
+        shards.sort_by_key(|shard| shard.cell.cell_id);
+        let objects = shards.iter().map(|shard| shard.objects()).collect::<Vec<_>>();
         let objects = ObjectIndex::new(&objects);
-        Ok(Self { current, current_stat, manifest, shards, objects })
+        Ok(Self { current, current_stat, manifest, shards, bad_cells, objects })
     }
 }
 

@@ -7,7 +7,7 @@ use std::process::Command;
 
 use scene::SceneSpec;
 use serde_json::Value;
-use slag_edge::store::{EdgeCache, OpenShard, Snapshot};
+use slag_edge::store::{EdgeCache, Snapshot};
 
 fn bench(cache: &Path, args: &[&str]) -> Value {
     let mut command = Command::new(env!("CARGO_BIN_EXE_slag-edge"));
@@ -71,7 +71,7 @@ fn what_is_timed_is_what_is_sought() {
         assert_eq!((vectors.len(), queries.len()), (n * dim, 32 * dim));
         let snapshot = Snapshot::open(&EdgeCache::open(&cache)).expect("opens");
         let mut decoded = Vec::new();
-        for shard in snapshot.shards.iter().map(OpenShard::view) {
+        for shard in snapshot.shards.iter().map(|shard| shard.view()) {
             for index in 0..shard.n_with_evidence() {
                 let mut vector = vec![0.0; dim];
                 shard.decode(index, &mut vector);

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use slag_common::shard::Profile;
 use slag_edge::fetch::{FetchError, FetchReport};
+use slag_edge::store::files::Files;
 use slag_edge::store::{Snapshot, StoreError};
 
 use super::scene::Published;
@@ -13,8 +14,19 @@ use super::sim::SimFiles;
 use super::{Robot, assert_holds, at};
 use slag_math::random::Random;
 
-/// Possible fates of the records, which have storage of their own, at a power cut.
+/// Possible fates of the records of use, which have storage of their own, at a power cut.
 const N_RECORDS_FATES: u64 = 3;
+
+/// Damages one copy of what the robot believes, or neither: the medium rots while the power is off. Only if the
+/// power cut damaged none: together they would be two faults.
+pub fn rot_one_copy(files: &SimFiles, cache: &Path, seed: u64) {
+    let mut random = Random::new(seed ^ 0x726f_7474);
+    let copies = ["0", "1"].map(|name| cache.join("trust").join(name));
+    let [first, second] = copies.each_ref().map(|path| files.read(path, u64::MAX).ok());
+    if first == second && random.below(3) > 0 {
+        files.flip(&copies[random.below(2) as usize], &mut random);
+    }
+}
 
 pub fn copy_dir(from: &Path, to: &Path) {
     fs_err::create_dir_all(to).expect("made");
@@ -51,7 +63,7 @@ impl Trial {
         Self { dir, server, old, new, before: files.fork(None, 0) }
     }
 
-    /// Restores the records of before the fetch (1), deletes them (2), or leaves them (0).
+    /// Restores the records of use of before the fetch (1), deletes them (2), or leaves them (0).
     fn settle_records(&self, fate: u64) {
         let db = self.dir.path().join("cache/db");
         if fate > 0 && db.exists() {
@@ -88,6 +100,7 @@ impl Trial {
         self.settle_records(seed % N_RECORDS_FATES);
         let files = Arc::new(files.after_power_cut(seed));
         let robot = Robot::on_sim(self.dir.path(), files.clone(), &self.server.url());
+        rot_one_copy(&files, robot.cache.dir(), seed);
         let snapshot = Snapshot::open(&robot.cache).unwrap_or_else(|e| panic!("{context}: {e}: {:?}", e));
         let is_new = snapshot.manifest.generation == 2;
         match is_new {
@@ -181,27 +194,40 @@ fn a_power_cut_in_the_first_fetch() {
     }
 }
 
+/// The free space is known, or other programs use it up meanwhile.
 #[test]
 fn a_full_disk_leaves_the_old_generation() {
     let trial = Trial::new();
     let used_bytes = trial.before.used_bytes();
-    for free_bytes in (0..).step_by(700) {
-        trial.settle_records(1);
-        let files = Arc::new(trial.before.fork(None, 0));
-        files.limit(Some(used_bytes + free_bytes));
-        let (robot, result) = trial.fetch(&files, 2);
-        match result {
-            Ok(_) => {
-                assert!(free_bytes > 1000);
-                break;
+    let mut n_resumed = 0;
+    for is_known in [true, false] {
+        for free_bytes in (0..).step_by(700) {
+            trial.settle_records(1);
+            let files = Arc::new(trial.before.fork(None, 0));
+            match is_known {
+                true => files.limit(Some(used_bytes + free_bytes)),
+                false => files.limit_unseen(used_bytes + free_bytes),
             }
-            Err(FetchError::DiskFull { .. }) => {
-                assert_holds(&robot.snapshot(), &trial.old, 0..3);
-                assert!(robot.staged().is_empty(), "the space is given back");
+            let (robot, result) = trial.fetch(&files, 2);
+            let staged: Vec<String> = robot.staged().into_iter().filter(|name| name != "put").collect();
+            match result {
+                Ok(_) => {
+                    assert!(free_bytes > 1000);
+                    break;
+                }
+                Err(FetchError::NoSpace { needed_bytes, .. }) => {
+                    assert!(is_known && staged.is_empty(), "nothing is begun: {staged:?}");
+                    assert!(needed_bytes > free_bytes, "{needed_bytes} are needed of {free_bytes}");
+                }
+                Err(FetchError::DiskFull { .. }) if !is_known || free_bytes < 1000 => {}
+                Err(e) => panic!("space for {free_bytes}: {e}"),
             }
-            Err(e) => panic!("space for {free_bytes}: {e}"),
+            assert_holds(&robot.snapshot(), &trial.old, 0..3);
+            files.limit(None);
+            let report = trial.fetch(&files, 2).1.expect("there is space again");
+            assert_eq!(report.resumed_bytes > 0, !staged.is_empty(), "what arrived is kept: {staged:?}");
+            n_resumed += u64::from(report.resumed_bytes > 0);
         }
-        files.limit(None);
-        trial.fetch(&files, 2).1.expect("there is space again");
     }
+    assert!(n_resumed > 3, "{n_resumed}");
 }

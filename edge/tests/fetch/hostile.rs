@@ -6,7 +6,7 @@ use slag_common::Hash32;
 use slag_common::manifest::{MAX_BYTES, ManifestError};
 use slag_common::shard::Profile;
 use slag_edge::fetch::{DownloadFailure, FetchError, FetchRequest, PlanError, Progress};
-use slag_edge::store::{Snapshot, StoreError};
+use slag_edge::store::{BadCell, CellFault, Snapshot, StoreError};
 
 use super::scene::{ENCODER, NOW, Published, ShardSpec, key, public, shard};
 use super::server::{Fault, Seen, Server};
@@ -60,7 +60,7 @@ fn refused_manifests_leave_the_old_generation() {
     robot.request.expected_encoder = Some(ENCODER);
 
     // Losing the records loses neither the key nor the generation.
-    fs_err::remove_dir_all(robot.cache.dir().join("db")).expect("there");
+    fs_err::remove_dir_all(robot.cache.dir().join("trust")).expect("there");
     assert!(matches!(refused(&robot, replayed), FetchError::Rollback { seen: 2, .. }));
     assert!(matches!(
         refused(&robot, foreign.clone()),
@@ -73,9 +73,11 @@ fn refused_manifests_leave_the_old_generation() {
     server.faults(|_| Fault::None);
     assert!(matches!(refused(&robot, second.clone()), FetchError::Rollback { seen: 3, offered: 2, .. }));
 
-    // The key changes only on request; the old one is then no longer accepted.
+    // The key changes only on a request that names both; the old one is then no longer accepted.
     server.publish(foreign.clone());
     robot.request.keys = vec![public(&key(2))];
+    assert!(matches!(robot.fetch(), Err(FetchError::Key { .. })));
+    robot.request.keys = vec![public(&key(1)), public(&key(2))];
     assert_eq!(robot.fetch().expect("accepted").key, public(&key(2)));
     assert_holds(&robot.snapshot(), &foreign, 0..3);
     robot.request.keys.clear();
@@ -189,8 +191,17 @@ fn signed_nonsense_is_refused() {
         assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Empty { .. })));
         error
     };
-    let error = fetched(scene.clone().edited(&key(1), |manifest| manifest.cells[1].n_gaussians = 51));
-    assert!(matches!(error, FetchError::Published { .. }), "{error}");
+    // Of one cell: the other is good.
+    let without_a_cell = |published: Published, bad_id: u32| {
+        let dir = tempfile::tempdir().expect("temporary folder");
+        let server = Server::start(published);
+        let robot = Robot::on_disk(dir.path(), &server.url());
+        let bad = BadCell { cell_id: bad_id, fault: CellFault::Invalid, old: None };
+        assert_eq!(robot.fetch().expect("the other cell").bad_cells, [bad]);
+        let on_board: Vec<u32> = robot.snapshot().shards.iter().map(|shard| shard.cell.cell_id).collect();
+        assert_eq!(on_board, [1 - bad_id]);
+    };
+    without_a_cell(scene.clone().edited(&key(1), |manifest| manifest.cells[1].n_gaussians = 51), 1);
     let error = fetched(scene.clone().edited(&key(1), |manifest| manifest.encoder.id = Hash32([5; 32])));
     assert!(matches!(error, FetchError::Published { .. }), "{error}");
     let error = fetched(scene.clone().edited(&key(1), |manifest| manifest.encoder.dim = 5));
@@ -204,20 +215,20 @@ fn signed_nonsense_is_refused() {
     let mut junk = scene.clone();
     let hash = Hash32::of(b"junk");
     junk.objects.insert(hash, b"junk".to_vec());
-    let error = fetched(junk.edited(&key(1), |manifest| {
+    let junk = junk.edited(&key(1), |manifest| {
         let record = manifest.cells[0].shards.get_mut(&Profile::Compact).expect("there");
         (record.hash, record.len_bytes) = (hash, 4);
-    }));
-    assert!(matches!(error, FetchError::Published { .. }), "{error}");
-    let error = fetched(scene.clone().edited(&key(1), |manifest| {
+    });
+    without_a_cell(junk, 0);
+    let nothing = scene.clone().edited(&key(1), |manifest| {
         let record = manifest.cells[0].shards.get_mut(&Profile::Compact).expect("there");
         (record.hash, record.len_bytes) = (Hash32::of(b""), 0);
-    }));
-    assert!(matches!(error, FetchError::Published { .. }), "{error}");
+    });
+    without_a_cell(nothing, 0);
     let error = fetched(scene.clone().edited(&key(1), |manifest| {
         manifest.cells[0].shards.get_mut(&Profile::Compact).expect("there").len_bytes = u64::MAX;
     }));
-    assert!(matches!(error, FetchError::Download { failure: DownloadFailure::Length { .. }, .. }), "{error}");
+    assert!(matches!(error, FetchError::NoSpace { needed_bytes: u64::MAX, .. }), "{error}");
 
     // Kept shards are checked against the new manifest too.
     let dir = tempfile::tempdir().expect("temporary folder");

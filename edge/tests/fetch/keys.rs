@@ -55,8 +55,8 @@ impl Trial {
         assert!(matches!(error, FetchError::Manifest(ManifestError::UnknownKey { .. })), "{error}");
     }
 
-    fn db(&self) -> std::path::PathBuf {
-        self.robot.cache.dir().join("db")
+    fn records(&self) -> std::path::PathBuf {
+        self.robot.cache.dir().join("trust")
     }
 }
 
@@ -121,12 +121,12 @@ fn keys_that_are_named_follow_their_successors() {
 fn the_old_key_stays_refused_without_the_records() {
     let trial = Trial::new(signed(1, A, Some(B)));
     let before = trial.dir.path().join("before");
-    copy_dir(&trial.db(), &before);
+    copy_dir(&trial.records(), &before);
     trial.accepts(signed(2, B, None));
     for put_back in [false, true] {
-        fs_err::remove_dir_all(trial.db()).expect("there");
+        fs_err::remove_dir_all(trial.records()).expect("there");
         if put_back {
-            copy_dir(&before, &trial.db());
+            copy_dir(&before, &trial.records());
         }
         trial.does_not_know_the_key_of(signed(9, A, Some(B)));
         assert!(matches!(trial.refuses(signed(1, A, Some(B))), FetchError::Manifest(_)), "{put_back}");
@@ -134,7 +134,7 @@ fn the_old_key_stays_refused_without_the_records() {
     }
     // Lost between announcement and change: both keys are still accepted.
     let trial = Trial::new(signed(1, A, Some(B)));
-    fs_err::remove_dir_all(trial.db()).expect("there");
+    fs_err::remove_dir_all(trial.records()).expect("there");
     trial.accepts(signed(2, B, None));
 }
 

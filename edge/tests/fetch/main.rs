@@ -5,10 +5,13 @@ mod faults;
 mod follow;
 mod hostile;
 mod keys;
+mod partial;
 mod scene;
 mod server;
 mod sim;
 mod sync;
+mod trust;
+mod unread;
 
 use std::path::Path;
 use std::sync::Arc;

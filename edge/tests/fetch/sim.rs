@@ -54,6 +54,8 @@ struct State {
     fail_at: Option<u64>,
     is_cut: bool,
     capacity_bytes: Option<u64>,
+    /// Whether the free space is unknown before it is used up.
+    hides_free_space: bool,
     random: u64,
 }
 
@@ -80,7 +82,26 @@ impl SimFiles {
     }
 
     pub fn limit(&self, capacity_bytes: Option<u64>) {
-        self.0.lock().expect("sound").capacity_bytes = capacity_bytes;
+        let mut state = self.0.lock().expect("sound");
+        (state.capacity_bytes, state.hides_free_space) = (capacity_bytes, false);
+    }
+
+    /// Limits the bytes of all files without showing it: other programs use the space up meanwhile.
+    pub fn limit_unseen(&self, capacity_bytes: u64) {
+        let mut state = self.0.lock().expect("sound");
+        (state.capacity_bytes, state.hides_free_space) = (Some(capacity_bytes), true);
+    }
+
+    /// Flips a bit of a file, if there is one: the medium rots.
+    pub fn flip(&self, path: &Path, random: &mut Random) {
+        let mut state = self.0.lock().expect("sound");
+        let Some(inode) = state.live.get(path).copied() else { return };
+        let Inode { live, durable } = &mut state.inodes[inode];
+        if !live.is_empty() {
+            let (at, bit) = (random.below(live.len() as u64) as usize, 1 << random.below(8));
+            live[at] ^= bit;
+            durable.get_mut(at).into_iter().for_each(|byte| *byte ^= bit);
+        }
     }
 
     /// Returns the bytes of all files.
@@ -283,7 +304,9 @@ impl Files for SimFiles {
     fn read(&self, path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
         self.look(|state| {
             let bytes = &state.inodes[state.inode(path)?].live;
-            assert!(bytes.len() as u64 <= max_bytes, "{} is too long", path.display());
+            if bytes.len() as u64 > max_bytes {
+                return Err(io::Error::new(io::ErrorKind::InvalidData, "the file is too long"));
+            }
             Ok(bytes.clone())
         })
     }
@@ -300,6 +323,13 @@ impl Files for SimFiles {
                 inode: *inode as u64,
             };
             Ok(state.live.get(path).map(stat))
+        })
+    }
+
+    fn free_bytes(&self, _dir: &Path) -> io::Result<Option<u64>> {
+        self.look(|state| {
+            let capacity = state.capacity_bytes.filter(|_| !state.hides_free_space);
+            Ok(capacity.map(|capacity| capacity.saturating_sub(state.used_bytes())))
         })
     }
 }

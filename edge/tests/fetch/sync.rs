@@ -265,7 +265,7 @@ fn one_fetch_at_a_time() {
     let server = Server::start(Published::new(1, &[0; 3], 10));
     let robot = Robot::on_disk(dir.path(), &server.url());
     robot.fetch().expect("works");
-    let records = Records::open(&robot.cache.dir().join("db")).expect("free");
+    let records = Records::open(&robot.cache).expect("free");
     assert!(matches!(robot.fetch(), Err(FetchError::Records(RecordsError::Busy { .. }))));
     // Reading needs no lock.
     robot.snapshot();

@@ -1,0 +1,246 @@
+//! A small record in two checksummed copies: neither a power cut nor a damaged copy loses it.
+//!
+//! A copy is `slag-record 1 SEQUENCE HASH\n` and the content; HASH is the BLAKE3 hash of `SEQUENCE\n` and the
+//! content. One copy is durable before the other is replaced, so one is whole at any moment, and at rest both
+//! are the same.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use slag_common::Hash32;
+
+use crate::store::files::Files;
+
+/// A longer copy is damaged.
+pub const MAX_COPY_BYTES: u64 = 1 << 20;
+const NAMES: [&str; 2] = ["0", "1"];
+
+/// The state of the copies.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Found {
+    /// Neither exists.
+    Nothing,
+    /// The newest whole copy.
+    Record(Version),
+    /// There are copies, and none is whole; the fault of the first.
+    Damaged(String),
+}
+
+/// A version of the record.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Version {
+    /// Number of the version, from 1.
+    pub sequence: u64,
+    /// The content.
+    pub content: Vec<u8>,
+    /// The copy that it was read from.
+    index: usize,
+    /// Whether the other copy is the same.
+    pub is_twice: bool,
+}
+
+/// One copy.
+enum Copy {
+    Missing,
+    Damaged(String),
+    Unreadable(io::Error),
+    Whole(u64, Vec<u8>),
+}
+
+/// The two copies, in a folder of their own.
+#[derive(Clone, Debug)]
+pub struct Copies {
+    dir: PathBuf,
+}
+
+impl Copies {
+    /// Names the copies, without reading or creating anything.
+    pub fn new(dir: PathBuf) -> Self {
+        Self { dir }
+    }
+
+    /// Returns the folder.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
+    fn path(&self, index: usize) -> PathBuf {
+        self.dir.join(NAMES[index])
+    }
+
+    /// Reads the newest whole copy.
+    ///
+    /// # Errors
+    /// The file system's, if no copy is whole and one could not be read.
+    pub fn read(&self, files: &dyn Files) -> io::Result<Found> {
+        let [first, second] = [0, 1].map(|index| match files.read(&self.path(index), MAX_COPY_BYTES) {
+            Ok(bytes) => parse(&bytes),
+            Err(e) if e.kind() == io::ErrorKind::NotFound => Copy::Missing,
+            Err(e) if e.kind() == io::ErrorKind::InvalidData => Copy::Damaged(e.to_string()),
+            Err(e) => Copy::Unreadable(e),
+        });
+        let version = |sequence, content, index, is_twice| {
+            Ok(Found::Record(Version { sequence, content, index, is_twice }))
+        };
+        match (first, second) {
+            (Copy::Whole(a, content), Copy::Whole(b, other)) => match a >= b {
+                true => version(a, content.clone(), 0, a == b && content == other),
+                false => version(b, other, 1, false),
+            },
+            (Copy::Whole(sequence, content), _) => version(sequence, content, 0, false),
+            (_, Copy::Whole(sequence, content)) => version(sequence, content, 1, false),
+            (Copy::Unreadable(e), _) | (_, Copy::Unreadable(e)) => Err(e),
+            (Copy::Damaged(what), _) | (_, Copy::Damaged(what)) => Ok(Found::Damaged(what)),
+            (Copy::Missing, Copy::Missing) => Ok(Found::Nothing),
+        }
+    }
+
+    /// Makes a version that was read durable: a killed process may have left it unsynced.
+    ///
+    /// # Errors
+    /// The file system's.
+    pub fn settle(&self, files: &dyn Files, version: &Version) -> io::Result<()> {
+        files.sync(&self.path(version.index))?;
+        files.sync_dir(&self.dir)
+    }
+
+    /// Makes the other copy the same as a settled version.
+    ///
+    /// # Errors
+    /// The file system's; the version itself is not touched.
+    pub fn heal(&self, files: &dyn Files, version: &mut Version) -> io::Result<()> {
+        if !version.is_twice {
+            self.write_one(files, 1 - version.index, version.sequence, &version.content)?;
+            version.is_twice = true;
+        }
+        Ok(())
+    }
+
+    /// Writes the next version, durably. `present`: the settled version, if there is one.
+    ///
+    /// # Errors
+    /// The file system's; the present or the next version is whole.
+    pub fn write(
+        &self,
+        files: &dyn Files,
+        present: Option<&Version>,
+        content: Vec<u8>,
+    ) -> io::Result<Version> {
+        let sequence = present.map_or(1, |present| present.sequence.saturating_add(1));
+        let index = present.map_or(0, |present| 1 - present.index);
+        self.write_one(files, index, sequence, &content)?;
+        self.write_one(files, 1 - index, sequence, &content)?;
+        Ok(Version { sequence, content, index, is_twice: true })
+    }
+
+    fn write_one(&self, files: &dyn Files, index: usize, sequence: u64, content: &[u8]) -> io::Result<()> {
+        // Renamed into place, so that a power cut leaves no half of the first copy ever written.
+        let aside = self.dir.join("new");
+        files.write_from(&aside, 0, &copy_of(sequence, content))?;
+        files.sync(&aside)?;
+        files.rename(&aside, &self.path(index))?;
+        files.sync_dir(&self.dir)
+    }
+}
+
+fn copy_of(sequence: u64, content: &[u8]) -> Vec<u8> {
+    let counted = [format!("{sequence}\n").as_bytes(), content].concat();
+    let head = format!("slag-record 1 {sequence} {}\n", Hash32::of(&counted));
+    [head.as_bytes(), content].concat()
+}
+
+fn parse(bytes: &[u8]) -> Copy {
+    let read = || {
+        let end = bytes.iter().position(|b| *b == b'\n')?;
+        let words: Vec<&str> = std::str::from_utf8(&bytes[..end]).ok()?.split(' ').collect();
+        let ["slag-record", "1", sequence, _] = words[..] else { return None };
+        Some((sequence.parse::<u64>().ok()?, &bytes[end + 1..]))
+    };
+    match read() {
+        // Numbers have several spellings; only the one that is written counts.
+        Some((sequence, content)) if copy_of(sequence, content) == bytes => {
+            Copy::Whole(sequence, content.to_vec())
+        }
+        Some(_) => Copy::Damaged("the content does not match its checksum".into()),
+        None => Copy::Damaged("line 1 is not `slag-record 1 SEQUENCE HASH`".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::store::files::DiskFiles;
+
+    fn written(contents: &[&str]) -> (tempfile::TempDir, Copies) {
+        let dir = tempfile::tempdir().expect("a folder");
+        let copies = Copies::new(dir.path().to_owned());
+        let mut present = None;
+        for content in contents {
+            let content = content.as_bytes().to_vec();
+            present = Some(copies.write(&DiskFiles, present.as_ref(), content).expect("written"));
+        }
+        (dir, copies)
+    }
+
+    fn found(copies: &Copies) -> Option<(u64, Vec<u8>, bool)> {
+        match copies.read(&DiskFiles).expect("readable") {
+            Found::Record(version) => Some((version.sequence, version.content, version.is_twice)),
+            _ => None,
+        }
+    }
+
+    /// Every bit of either copy, every length, and a copy that is gone.
+    #[test]
+    fn every_fault_of_one_copy_leaves_the_record() {
+        let (_dir, copies) = written(&["one", "{\"key\":\"two\"}"]);
+        let newest = Some((2, b"{\"key\":\"two\"}".to_vec(), false));
+        for index in [0, 1] {
+            let path = copies.path(index);
+            let whole = fs_err::read(&path).expect("there");
+            for bit in 0..whole.len() * 8 {
+                let mut flipped = whole.clone();
+                flipped[bit / 8] ^= 1 << (bit % 8);
+                fs_err::write(&path, flipped).expect("written");
+                assert_eq!(found(&copies), newest, "copy {index}, bit {bit}");
+            }
+            for len in 0..whole.len() {
+                fs_err::write(&path, &whole[..len]).expect("written");
+                assert_eq!(found(&copies), newest, "copy {index}, {len} bytes");
+            }
+            fs_err::remove_file(&path).expect("there");
+            assert_eq!(found(&copies), newest, "copy {index} gone");
+            let Found::Record(mut version) = copies.read(&DiskFiles).expect("readable") else {
+                panic!("copy {index}")
+            };
+            copies.heal(&DiskFiles, &mut version).expect("healed");
+            assert_eq!(fs_err::read(&path).expect("there"), whole);
+        }
+    }
+
+    #[test]
+    fn damage_is_told_from_absence() {
+        let (_dir, copies) = written(&[]);
+        assert_eq!(copies.read(&DiskFiles).expect("readable"), Found::Nothing);
+        let (_dir, copies) = written(&["x"]);
+        for index in [0, 1] {
+            fs_err::write(copies.path(index), vec![b'x'; MAX_COPY_BYTES as usize + 1]).expect("written");
+        }
+        assert!(matches!(copies.read(&DiskFiles).expect("readable"), Found::Damaged(_)));
+        fs_err::remove_file(copies.path(0)).expect("there");
+        assert!(matches!(copies.read(&DiskFiles).expect("readable"), Found::Damaged(_)));
+    }
+
+    /// Between the two writes the newer copy counts; an older one never does while the newer is whole.
+    #[test]
+    fn the_newest_whole_copy_counts() {
+        let (_dir, copies) = written(&["old"]);
+        let old = fs_err::read(copies.path(0)).expect("there");
+        let (_other, next) = written(&["old", "new"]);
+        let new = fs_err::read(next.path(0)).expect("there");
+        for (a, b) in [(&old, &new), (&new, &old)] {
+            fs_err::write(copies.path(0), a).expect("written");
+            fs_err::write(copies.path(1), b).expect("written");
+            assert_eq!(found(&copies), Some((2, b"new".to_vec(), false)));
+        }
+    }
+}
