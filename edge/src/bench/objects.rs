@@ -39,7 +39,8 @@ pub fn time_objects(
     queries: Vec<Vec<f32>>,
     settings: &Settings,
 ) -> io::Result<Option<ObjectsTiming>> {
-    let records = snapshot.shards.iter().filter_map(|shard| shard.objects()).flat_map(|objects| objects.records);
+    let records =
+        snapshot.shards.iter().filter_map(|shard| shard.objects()).flat_map(|objects| objects.records);
     let n_objects = records.map(|record| record.id).collect::<BTreeSet<u64>>().len();
     if n_objects == 0 {
         return Ok(None);

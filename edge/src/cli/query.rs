@@ -146,7 +146,9 @@ fn print_answers(reply: &Reply, answers: &Answers) -> Result<(), Failure> {
     for bad in &answers.bad_cells {
         let id = bad.cell_id;
         match bad.generation {
-            Some(old) => writeln!(io::stderr(), "cell {id} could not be fetched; generation {old} answers for it")?,
+            Some(old) => {
+                writeln!(io::stderr(), "cell {id} could not be fetched; generation {old} answers for it")?
+            }
             None => writeln!(io::stderr(), "cell {id} could not be fetched, and is not on board")?,
         }
     }

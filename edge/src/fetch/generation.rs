@@ -73,8 +73,10 @@ impl Before<'_> {
         let path = self.cache.shard_path(old.hash);
         let cell = CurrentCell { cell_id, hash: old.hash, len_bytes: old.len_bytes };
         store::can_stand_in(manifest, new, cell_id)
-            && self.cache.files().map(&path).is_ok_and(|bytes| {
-                store::check_shard(&path, &bytes, &cell, wanted.profile, manifest).is_ok()
-            })
+            && self
+                .cache
+                .files()
+                .map(&path)
+                .is_ok_and(|bytes| store::check_shard(&path, &bytes, &cell, wanted.profile, manifest).is_ok())
     }
 }

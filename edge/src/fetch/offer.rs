@@ -60,8 +60,7 @@ impl Trust {
         if !asked.is_empty() {
             // A successor is accepted with its predecessor.
             let is_asked = |key: &Hash32| {
-                asked.contains(key)
-                    || changes.iter().any(|(old, next)| next == key && asked.contains(old))
+                asked.contains(key) || changes.iter().any(|(old, next)| next == key && asked.contains(old))
             };
             let held = accepted.clone();
             accepted.retain(is_asked);

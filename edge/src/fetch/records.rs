@@ -119,7 +119,10 @@ impl Records {
         if let Some(version) = &mut version {
             copies.settle(cache.files(), version)?;
             if !version.is_twice {
-                tracing::warn!("{}: one copy is damaged or outdated; it is written anew", copies.dir().display());
+                tracing::warn!(
+                    "{}: one copy is damaged or outdated; it is written anew",
+                    copies.dir().display()
+                );
             }
             // The whole copy is enough for now; a full disk must not keep a robot from fetching.
             if let Err(e) = copies.heal(cache.files(), version) {

@@ -87,12 +87,12 @@ pub fn fetch(
     if request.offline && planned.n_shards > 0 {
         return Err(FetchError::Offline { n_shards: planned.n_shards, bytes: planned.bytes });
     }
-    records
-        .accept(cache, &LastFetch { from, at }, &offer.manifest, offer.key, replaced_key)
-        .map_err(|e| match e {
+    records.accept(cache, &LastFetch { from, at }, &offer.manifest, offer.key, replaced_key).map_err(
+        |e| match e {
             RecordsError::Io(source) => disk_full(source, planned.bytes),
             e => e.into(),
-        })?;
+        },
+    )?;
     if let Some(old) = replaced_key {
         tracing::info!("key {old} is no longer accepted: {} replaced it", offer.key);
     }

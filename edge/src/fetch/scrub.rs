@@ -103,7 +103,8 @@ fn digest(cache: &EdgeCache, check: &Check<'_>, hash: Hash32) -> Option<Hash32> 
     let encoder = &check.manifest.encoder;
     let numbers = [len_bytes, inode, cell.len_bytes, u64::from(cell.cell_id)];
     let more = [listed.n_gaussians, encoder.dim];
-    let mut bytes = [&hash.0[..], &encoder.id.0, &nanos.to_le_bytes(), check.profile.name().as_bytes()].concat();
+    let mut bytes =
+        [&hash.0[..], &encoder.id.0, &nanos.to_le_bytes(), check.profile.name().as_bytes()].concat();
     bytes.extend(numbers.iter().flat_map(|number| number.to_le_bytes()));
     bytes.extend(more.iter().flat_map(|number| number.to_le_bytes()));
     Some(Hash32::of(&bytes))

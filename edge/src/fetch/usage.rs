@@ -61,13 +61,7 @@ pub struct Usage {
 impl Usage {
     /// Opens the records; makes them anew if they are damaged, and goes on without if that fails.
     pub fn open(dir: PathBuf) -> Self {
-        let mut usage = Self {
-            dir,
-            tables: None,
-            count: 0,
-            used: BTreeMap::new(),
-            checked: BTreeMap::new(),
-        };
+        let mut usage = Self { dir, tables: None, count: 0, used: BTreeMap::new(), checked: BTreeMap::new() };
         match usage.load() {
             Ok(()) => return usage,
             Err(Fault::Busy) => {
@@ -107,7 +101,8 @@ impl Usage {
                 let (name, value) = pair?;
                 let (digest, unix_secs) =
                     value.split_at_checked(32).ok_or_else(|| Fault::Failed("a short record".into()))?;
-                checked.insert(hash(&name)?, Checked { digest: hash(digest)?, unix_secs: number(unix_secs)? });
+                checked
+                    .insert(hash(&name)?, Checked { digest: hash(digest)?, unix_secs: number(unix_secs)? });
             }
             Ok((tables, count, used, checked))
         })?;
@@ -177,7 +172,8 @@ fn open(dir: &Path) -> Result<Tables, Fault> {
 
 /// Runs work on a database that may be damaged: sled panics on some damage.
 fn guarded<T>(work: impl FnOnce() -> Result<T, Fault>) -> Result<T, Fault> {
-    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|_| Err(Fault::Failed("the database panicked".into())))
+    catch_unwind(AssertUnwindSafe(work))
+        .unwrap_or_else(|_| Err(Fault::Failed("the database panicked".into())))
 }
 
 fn remove(dir: &Path) -> Result<(), Fault> {

@@ -180,9 +180,8 @@ fn empty(
 
 /// Returns the cells of a region whose shards could not be fetched.
 fn bad_cells(scene: &Scene<'_>, region: &Region) -> Vec<BadCellAnswer> {
-    let touches = |bad: &&BadCell| {
-        cell_of(scene.manifest, bad.cell_id).is_none_or(|cell| region.touches(&cell.bounds))
-    };
+    let touches =
+        |bad: &&BadCell| cell_of(scene.manifest, bad.cell_id).is_none_or(|cell| region.touches(&cell.bounds));
     let generation = |bad: &BadCell| bad.old.map(|old| old.generation);
     let described = |bad: &BadCell| BadCellAnswer { cell_id: bad.cell_id, generation: generation(bad) };
     scene.bad_cells.iter().filter(touches).map(described).collect()

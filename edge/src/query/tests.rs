@@ -30,7 +30,14 @@ fn ask_about(
     let shards: Vec<_> = built.iter().map(BuiltShard::view).collect();
     let objects: Vec<_> = built.iter().map(|shard| shard.layout.objects(&shard.bytes)).collect();
     let (index, fetched) = (ObjectIndex::new(&objects), (DVec3::ZERO, 50.0));
-    let scene = Scene { shards: &shards, objects: &objects, index: &index, manifest: &manifest, fetched, bad_cells: &[] };
+    let scene = Scene {
+        shards: &shards,
+        objects: &objects,
+        index: &index,
+        manifest: &manifest,
+        fetched,
+        bad_cells: &[],
+    };
     let mut scratch = Scratch::default();
     let answers = answer(&mut scratch, &scene, questions, &request).expect("answers");
     assert!(answers.iter().all(|answers| (answers.kind == AnswerKind::Objects) == scratch.is_untouched()));

@@ -75,7 +75,8 @@ impl Snapshot {
         let profile = current.profile;
         let open = |manifest: &Manifest, cell: &CurrentCell| {
             let held = before.map_or(&[][..], |before| &before.shards);
-            let held = held.binary_search_by_key(&cell.cell_id, |shard| shard.cell.cell_id).ok().map(|at| &held[at]);
+            let held =
+                held.binary_search_by_key(&cell.cell_id, |shard| shard.cell.cell_id).ok().map(|at| &held[at]);
             match held.filter(|shard| shard.is(cache, manifest, profile, cell)) {
                 Some(shard) => Ok(Arc::clone(shard)),
                 None => OpenShard::open(cache, manifest, profile, cell).map(Arc::new),

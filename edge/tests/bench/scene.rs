@@ -100,6 +100,7 @@ pub fn write_cache(dir: &Path, spec: &SceneSpec) {
         profile,
         centre_in_world: DVec3::ZERO,
         radius: 1e6,
+        bad_cells: Vec::new(),
         cells: manifest
             .cells
             .iter()
