@@ -86,8 +86,6 @@ impl Cli {
 
 #[cfg(test)]
 mod tests {
-    use std::net::SocketAddr;
-
     use glam::DVec3;
     use slag_common::frames::Aabb;
     use slag_common::shard::Profile;
@@ -136,7 +134,11 @@ mod tests {
         let Command::Serve(serve) = parse("slag-edge serve").expect("parses").command else {
             panic!("serve")
         };
-        assert_eq!(serve.listen, SocketAddr::from(([127, 0, 0, 1], 7734)));
+        assert_eq!(serve.listen.to_string(), "127.0.0.1:7734");
+        assert!(
+            parse("slag-edge serve --listen unix:/run/s --host a --host b --cors https://c --token-file t")
+                .is_ok()
+        );
         let Command::Query(query) = parse(
             "slag-edge query chair --near 1,2,-3 --radius 4 --limit 5 --threshold -0.5 --kind gaussians",
         )

@@ -342,6 +342,7 @@ pub fn write_manifest(dir: &Path, shards: &[BuiltShard], manifest: Manifest) {
         profile: Profile::Compact,
         centre_in_world: DVec3::ZERO,
         radius: 50.0,
+        bad_cells: Vec::new(),
         cells: manifest
             .cells
             .iter()

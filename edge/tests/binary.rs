@@ -286,7 +286,8 @@ fn a_robot_is_followed_by_its_service() {
     let from = store(signed, shard);
     let (serving, url) = serve(dir.path(), &["--follow", &from, "--radius", "20"]);
     assert_eq!(get(&format!("{url}/query?text=blue")).0, 503);
-    let posted = ureq::post(format!("{url}/position")).send(r#"{"x":1,"y":2,"z":3}"#).expect("an answer");
+    let posted = ureq::post(format!("{url}/position")).content_type("application/json");
+    let posted = posted.send(r#"{"x":1,"y":2,"z":3}"#).expect("an answer");
     assert_eq!(posted.status().as_u16(), 202);
     let give_up = Instant::now() + Duration::from_secs(60);
     loop {

@@ -8,37 +8,53 @@ use std::time::Duration;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::time::{Instant, Sleep, sleep_until};
 
-/// A stream that fails once nothing could be sent for `stall_timeout`.
+/// Bytes that count as progress where a client takes less than it is offered.
+const PROGRESS_BYTES: usize = 64 << 10;
+
+/// A stream that fails once sending made no progress for `stall_timeout`.
 ///
-/// Without a byte sent, a client idles, drips its request or does not read its answer: one deadline bounds
-/// all three. Received bytes do not move the deadline, so a request of any length must arrive within it.
+/// Without progress, a client idles, drips its request or does not read its answer: one deadline bounds
+/// all three. Received bytes do not move the deadline, so a request of any length must arrive within it. A write that
+/// is taken whole is progress; of partial ones, every 64 KiB, so that a client that reads a byte at a time does not
+/// hold its connection.
 pub struct Stalling<S> {
     stream: S,
     stall_timeout: Duration,
     deadline: Pin<Box<Sleep>>,
+    /// Bytes sent since the last progress.
+    n_partial: usize,
 }
 
 impl<S> Stalling<S> {
     /// Wraps a stream; its first deadline begins now.
     pub fn new(stream: S, stall_timeout: Duration) -> Self {
         let deadline = Box::pin(sleep_until(Instant::now() + stall_timeout));
-        Self { stream, stall_timeout, deadline }
+        Self { stream, stall_timeout, deadline, n_partial: 0 }
     }
 
-    /// Turns `Pending` into an error after the deadline; a sent byte moves the deadline.
-    fn bounded<T>(
-        &mut self,
-        polled: Poll<io::Result<T>>,
-        sending: bool,
-        context: &mut Context<'_>,
-    ) -> Poll<io::Result<T>> {
+    /// Turns `Pending` into an error after the deadline.
+    fn bounded<T>(&mut self, polled: Poll<io::Result<T>>, context: &mut Context<'_>) -> Poll<io::Result<T>> {
         if polled.is_pending() {
             return self.deadline.as_mut().poll(context).map(|()| Err(io::ErrorKind::TimedOut.into()));
         }
-        if sending {
-            self.deadline.as_mut().reset(Instant::now() + self.stall_timeout);
-        }
         polled
+    }
+
+    /// As [`Stalling::bounded`], for a write of `offered` bytes, which moves the deadline if it is progress.
+    fn sent(
+        &mut self,
+        polled: Poll<io::Result<usize>>,
+        offered: usize,
+        context: &mut Context<'_>,
+    ) -> Poll<io::Result<usize>> {
+        if let Poll::Ready(Ok(n)) = &polled {
+            self.n_partial += n;
+            if *n == offered || self.n_partial >= PROGRESS_BYTES {
+                self.n_partial = 0;
+                self.deadline.as_mut().reset(Instant::now() + self.stall_timeout);
+            }
+        }
+        self.bounded(polled, context)
     }
 }
 
@@ -49,7 +65,7 @@ impl<S: AsyncRead + Unpin> AsyncRead for Stalling<S> {
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
         let polled = Pin::new(&mut self.stream).poll_read(context, buffer);
-        self.bounded(polled, false, context)
+        self.bounded(polled, context)
     }
 }
 
@@ -60,7 +76,7 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Stalling<S> {
         bytes: &[u8],
     ) -> Poll<io::Result<usize>> {
         let polled = Pin::new(&mut self.stream).poll_write(context, bytes);
-        self.bounded(polled, true, context)
+        self.sent(polled, bytes.len(), context)
     }
 
     fn poll_write_vectored(
@@ -69,7 +85,7 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Stalling<S> {
         slices: &[io::IoSlice<'_>],
     ) -> Poll<io::Result<usize>> {
         let polled = Pin::new(&mut self.stream).poll_write_vectored(context, slices);
-        self.bounded(polled, true, context)
+        self.sent(polled, slices.iter().map(|slice| slice.len()).sum(), context)
     }
 
     fn is_write_vectored(&self) -> bool {
@@ -78,12 +94,12 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Stalling<S> {
 
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
         let polled = Pin::new(&mut self.stream).poll_flush(context);
-        self.bounded(polled, false, context)
+        self.bounded(polled, context)
     }
 
     fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
         let polled = Pin::new(&mut self.stream).poll_shutdown(context);
-        self.bounded(polled, false, context)
+        self.bounded(polled, context)
     }
 }
 
@@ -116,5 +132,23 @@ mod tests {
         assert_eq!(ended.kind(), io::ErrorKind::TimedOut);
         drop(connection);
         drip.await.expect("ends with the connection");
+    }
+    /// The attack: a reader that takes a byte at a time would hold its connection for ever.
+    #[tokio::test]
+    async fn a_reader_that_drips_is_dropped() {
+        let (ours, mut theirs) = tokio::io::duplex(64);
+        let mut connection = Stalling::new(ours, Duration::from_millis(200));
+        let drip = tokio::spawn(async move {
+            for _ in 0..100 {
+                tokio::time::sleep(Duration::from_millis(20)).await;
+                if theirs.read_u8().await.is_err() {
+                    return;
+                }
+            }
+        });
+        let ended = connection.write_all(&[7; 4096]).await.expect_err("ends before the drip does");
+        assert_eq!(ended.kind(), io::ErrorKind::TimedOut);
+        drop(connection);
+        drip.abort();
     }
 }

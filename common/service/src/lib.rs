@@ -4,19 +4,23 @@
 //!
 //! | stage | where | what is decided there |
 //! |---|---|---|
-//! | accept | [`listener`] | number of connections; a TLS handshake wraps the stream here, before `Stalling` |
+//! | accept | [`listener`] | number of connections, in all, for each peer, and for health alone |
 //! | bytes | [`connection`] | time without progress, for idle clients, slow requests and slow readers alike |
 //! | head | [`listener`] | length of the request head, and time for it |
-//! | request | [`request`] | id, log line, counters, error body; checks of `Host`, `Origin` and bearer tokens |
-//! | route | [`routes`] | path and method, length of a request body (and time for it) |
+//! | request | [`request`], [`access`] | id, log line, counters, error body; `Host`, `Origin`, bearer token, CORS |
+//! | route | [`routes`] | path and method; type and length of a request body, and time for it |
 //! | handler | the service's own | parameters, admission of expensive work, the answer |
 //!
-//! [`problem`] is the body of every error, [`range`] reads byte ranges and entity tags, [`metrics`] writes
+//! [`listen`] has the addresses to listen on, [`problem`] is the body of every error, [`range`] reads byte ranges and entity tags, [`metrics`] writes
 //! Prometheus' text format, [`stop`] waits for the signals to stop.
 
+pub mod access;
+mod body;
 pub mod connection;
+pub mod listen;
 pub mod listener;
 pub mod metrics;
+mod permits;
 pub mod problem;
 pub mod range;
 pub mod request;

@@ -1,61 +1,65 @@
-//! The accept loop: a bounded number of connections, bounded request heads, a stop with a deadline.
+//! The accept loop: a bounded number of connections, deadlines for their requests and answers, a stop with a deadline.
 
 use std::io;
-use std::net::SocketAddr;
-use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
+use axum::body::Body;
+use hyper::Request;
+use hyper::body::Incoming;
 use hyper::server::conn::http1;
+use hyper::service::{Service, service_fn};
 use hyper_util::rt::{TokioIo, TokioTimer};
-use hyper_util::server::graceful::GracefulShutdown;
+use hyper_util::server::graceful::{GracefulShutdown, Watcher};
 use hyper_util::service::TowerToHyperService;
-use tokio::net::TcpListener;
-use tokio::sync::Semaphore;
 
+use crate::body::TimedBody;
 use crate::connection::Stalling;
+use crate::listen::{Listener, Stream};
+use crate::permits::{Permit, Permits, Reserved};
 
 /// Pause after a failed accept. Out of file descriptors, an immediate retry would only burn the CPU.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+/// Longest time for the request of a connection beyond the limits, and for sending its answer.
+const RESERVED_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Bounds of a service's connections.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ConnectionLimits {
-    /// Open connections; further ones wait in the system's queue.
+    /// Open connections. Further ones are answered once, and with 503 unless they ask for health, readiness or metrics.
     pub n_connections: usize,
+    /// Open connections of one peer: an IPv4 address, or a /64 network of IPv6.
+    pub n_per_peer: usize,
+    /// Open connections beyond these limits. Another one ends the oldest.
+    pub n_reserved: usize,
     /// Length of a request head; a longer one is answered with 431.
     pub head_bytes: usize,
     /// Time for a request head, and time that a connection may idle.
     pub head_timeout: Duration,
-    /// Time without a byte sent after which a connection is dropped ([`Stalling`]). It should exceed the
-    /// sum of `head_timeout` and the service's own time for an answer.
+    /// Time for a request body, from the end of its head; a slower one is answered with 408.
+    pub body_timeout: Duration,
+    /// Time without progress in sending after which a connection is dropped ([`Stalling`]). It should exceed the
+    /// sum of `head_timeout`, `body_timeout` and the service's own time for an answer.
     pub stall_timeout: Duration,
     /// Time for requests in progress after the signal to stop.
     pub drain_timeout: Duration,
 }
 
 impl Default for ConnectionLimits {
-    /// Returns bounds for a machine with a few cores.
+    /// Returns bounds for a machine with a few cores, below the usual limit of 1024 open files.
     fn default() -> Self {
         Self {
-            n_connections: 1024,
+            n_connections: 768,
+            n_per_peer: 512,
+            n_reserved: 32,
             // Ten times the longest sensible query of the robot's service.
             head_bytes: 16 << 10,
-            head_timeout: Duration::from_secs(20),
+            head_timeout: Duration::from_secs(10),
+            body_timeout: Duration::from_secs(5),
             stall_timeout: Duration::from_secs(30),
             drain_timeout: Duration::from_secs(10),
         }
     }
-}
-
-/// The address that a service cannot listen on.
-#[derive(Debug, thiserror::Error)]
-#[error("cannot listen on {address}: {cause}; choose another address or port")]
-pub struct ListenError {
-    /// The address.
-    pub address: SocketAddr,
-    /// The system's error.
-    pub cause: io::Error,
 }
 
 /// The drain deadline passed before all requests were answered.
@@ -72,66 +76,73 @@ impl From<CutOff> for io::Error {
     }
 }
 
-/// Starts listening; with port 0 the system chooses the port.
-///
-/// # Errors
-/// [`ListenError`].
-pub async fn bind(address: SocketAddr) -> Result<TcpListener, ListenError> {
-    TcpListener::bind(address).await.map_err(|cause| ListenError { address, cause })
-}
-
 /// Serves until `stop` completes, then lets requests in progress finish within the drain deadline.
 ///
 /// # Errors
 /// [`CutOff`] when the deadline ended requests.
 pub async fn serve(
     router: Router,
-    listener: TcpListener,
+    listener: impl Into<Listener>,
     limits: ConnectionLimits,
     stop: impl Future<Output = ()>,
 ) -> Result<(), CutOff> {
-    let service = TowerToHyperService::new(router);
-    let connections = Arc::new(Semaphore::new(limits.n_connections));
+    let listener = listener.into();
+    let permits = Permits::new(limits.n_connections, limits.n_per_peer, limits.n_reserved);
     let graceful = GracefulShutdown::new();
     let mut stop = std::pin::pin!(stop);
     loop {
-        let accepting = async {
-            // The semaphore is never closed.
-            let permit = Arc::clone(&connections).acquire_owned().await;
-            (permit, listener.accept().await)
-        };
-        let (permit, accepted) = tokio::select! {
+        let accepted = tokio::select! {
             () = &mut stop => break,
-            accepted = accepting => accepted,
+            accepted = listener.accept() => accepted,
         };
-        let stream = match accepted {
-            Ok((stream, _)) => stream,
+        let (stream, peer) = match accepted {
+            Ok(accepted) => accepted,
             Err(error) => {
                 tracing::warn!("a connection was not accepted: {error}");
                 tokio::time::sleep(ACCEPT_PAUSE).await;
                 continue;
             }
         };
-        // Otherwise an answer in two pieces may wait 40 ms for the acknowledgement of the first.
-        if let Err(error) = stream.set_nodelay(true) {
-            tracing::debug!("TCP_NODELAY is not set on a connection: {error}");
-        }
-        let connection = http1::Builder::new()
-            .timer(TokioTimer::new())
-            .header_read_timeout(limits.head_timeout)
-            .max_buf_size(limits.head_bytes)
-            .serve_connection(TokioIo::new(Stalling::new(stream, limits.stall_timeout)), service.clone());
-        let connection = graceful.watch(connection);
-        tokio::spawn(async move {
-            let _permit = permit;
-            if let Err(error) = connection.await {
-                tracing::debug!("a connection ended: {error}");
-            }
-        });
+        let permit = permits.admit(peer);
+        tokio::spawn(converse(router.clone(), stream, permit, limits, graceful.watcher()));
     }
     drop(listener);
     let drained = tokio::time::timeout(limits.drain_timeout, graceful.shutdown()).await;
     drained.map_err(|_| CutOff { after: limits.drain_timeout })
+}
+
+/// Answers the requests of a connection.
+async fn converse(
+    router: Router,
+    stream: Box<dyn Stream>,
+    mut permit: Permit,
+    limits: ConnectionLimits,
+    watcher: Watcher,
+) {
+    let is_reserved = permit.is_reserved();
+    let at_most = |timeout: Duration| if is_reserved { timeout.min(RESERVED_TIMEOUT) } else { timeout };
+    let router = TowerToHyperService::new(router);
+    let service = service_fn(move |request: Request<Incoming>| {
+        let mut request = request.map(|body| Body::new(TimedBody::new(body, limits.body_timeout)));
+        if is_reserved {
+            request.extensions_mut().insert(Reserved);
+        }
+        router.call(request)
+    });
+    let connection = http1::Builder::new()
+        .timer(TokioTimer::new())
+        .keep_alive(!is_reserved)
+        .header_read_timeout(at_most(limits.head_timeout))
+        .max_buf_size(limits.head_bytes)
+        .serve_connection(TokioIo::new(Stalling::new(stream, at_most(limits.stall_timeout))), service);
+    tokio::select! {
+        ended = watcher.watch(connection) => {
+            if let Err(error) = ended {
+                tracing::debug!("a connection ended: {error}");
+            }
+        }
+        () = permit.ended() => tracing::debug!("a connection made room for another"),
+    }
 }
 
 #[cfg(test)]

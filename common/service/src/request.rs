@@ -1,4 +1,4 @@
-//! The stage around every request: its id, its log line, its counter, and the body of an error.
+//! The stage around every request: its id, whether it is admitted, its log line, its counter, and the body of an error.
 
 use std::any::Any;
 use std::sync::Arc;
@@ -7,49 +7,90 @@ use std::time::Instant;
 
 use axum::Router;
 use axum::extract::{MatchedPath, Request, State};
-use axum::http::HeaderValue;
+use axum::http::{HeaderMap, HeaderValue};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use tower_http::catch_panic::CatchPanicLayer;
 
+use crate::access::Access;
 use crate::metrics::ResponseCounts;
+use crate::permits::{HEALTH_PATHS, Reserved};
 use crate::problem::Problem;
 
 /// The label of paths that are no route: a scanner must not fill the metrics.
 const OTHER: &str = "other";
 
+/// The header of a request's id.
+const REQUEST_ID: &str = "x-request-id";
+/// Longest id taken over from a client.
+const MAX_ID_CHARS: usize = 64;
+/// Pause before a request is worth another attempt when there are too many connections.
+const RETRY_SECS: u32 = 1;
+
 struct Observer {
     n_requests: AtomicU64,
     responses: Arc<ResponseCounts>,
+    access: Access,
 }
 
-/// Puts this stage around a router: ids in `x-request-id`, a problem as the body of every error (a panic
-/// of a handler is one), counts in `responses`.
-pub fn observed(router: Router, responses: Arc<ResponseCounts>) -> Router {
-    let observer = Arc::new(Observer { n_requests: AtomicU64::new(0), responses });
+/// Puts this stage around a router: ids in `x-request-id` (the client's own if it sent one), the checks of `access`, a
+/// problem as the body of every error (a panic of a handler is one), counts in `responses`.
+pub fn observed(router: Router, responses: Arc<ResponseCounts>, access: Access) -> Router {
+    let observer = Arc::new(Observer { n_requests: AtomicU64::new(0), responses, access });
     router.layer(CatchPanicLayer::custom(panicked)).layer(from_fn_with_state(observer, observe))
 }
 
 async fn observe(State(observer): State<Arc<Observer>>, request: Request, next: Next) -> Response {
     let started = Instant::now();
-    let id = observer.n_requests.fetch_add(1, Ordering::Relaxed) + 1;
+    let number = observer.n_requests.fetch_add(1, Ordering::Relaxed) + 1;
+    let id = id_of(request.headers()).unwrap_or_else(|| number.to_string());
     let (method, path) = (request.method().clone(), request.uri().path().to_owned());
     let matched = request.extensions().get::<MatchedPath>().cloned();
-    let mut response = next.run(request).await;
+    let reader = observer.access.reader(request.headers());
+    let mut response = match admitted(&observer.access, &request) {
+        Ok(()) => match observer.access.preflight(&request) {
+            Some(response) => response,
+            None => next.run(request).await,
+        },
+        Err(problem) => problem.into_response(),
+    };
     let status = response.status();
     if status.is_client_error() || status.is_server_error() {
         let problem = response.extensions_mut().remove::<Problem>();
         let problem = problem.unwrap_or_else(|| Problem::of_status(status, method.as_str(), &path));
         if let Some(cause) = problem.cause() {
-            tracing::error!(id, %method, path, "{cause}");
+            tracing::error!(%id, %method, path, "{cause}");
         }
         response = problem.render(response, format!("{path}#request-{id}"));
     }
     let route = matched.as_ref().map_or(OTHER, MatchedPath::as_str);
     observer.responses.count(route, status.as_u16());
-    tracing::debug!(id, %method, route, status = status.as_u16(), took = ?started.elapsed(), "request");
-    response.headers_mut().insert("x-request-id", HeaderValue::from(id));
+    tracing::debug!(%id, %method, route, status = status.as_u16(), took = ?started.elapsed(), "request");
+    // An id is visible ASCII, so it is a header's value.
+    if let Ok(id) = HeaderValue::from_str(&id) {
+        response.headers_mut().insert(REQUEST_ID, id);
+    }
+    if let Some(origin) = reader {
+        Access::allow(&mut response, origin);
+    }
     response
+}
+
+/// Returns the id that a client gave its request, if it is a short word.
+fn id_of(headers: &HeaderMap) -> Option<String> {
+    let id = headers.get(REQUEST_ID)?.to_str().ok()?;
+    let is_word = id.bytes().all(|b| b.is_ascii_alphanumeric() || b"-._".contains(&b));
+    (is_word && (1..=MAX_ID_CHARS).contains(&id.len())).then(|| id.to_owned())
+}
+
+/// Checks who asks, and on a connection beyond the limits, for what.
+fn admitted(access: &Access, request: &Request) -> Result<(), Problem> {
+    access.check(request)?;
+    if request.extensions().get::<Reserved>().is_some() && !HEALTH_PATHS.contains(&request.uri().path()) {
+        let detail = "too many connections are open, in all or from this address; close some, or try again";
+        return Err(Problem::overloaded(detail, RETRY_SECS));
+    }
+    Ok(())
 }
 
 fn panicked(panic: Box<dyn Any + Send>) -> Response {

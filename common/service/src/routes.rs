@@ -4,10 +4,14 @@ use std::convert::Infallible;
 use std::fmt::Write;
 
 use axum::Router;
-use axum::extract::DefaultBodyLimit;
+use axum::extract::Request;
 use axum::handler::Handler;
 use axum::http::Method;
+use axum::middleware::{Next, from_fn};
+use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodRouter, get, post};
+
+use crate::body;
 
 /// Column in which the help text's summaries begin.
 const SUMMARY_COLUMN: usize = 36;
@@ -71,7 +75,8 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         self.add(Method::GET, path, summary, get(handler))
     }
 
-    /// Adds a resource that takes a body of at most `max_body_bytes`.
+    /// Adds a resource that takes a JSON body of at most `max_body_bytes`. The body is read, and bodies of another type,
+    /// longer ones and slow ones are refused, before the handler is called.
     pub fn post<T: 'static>(
         self,
         path: &'static str,
@@ -79,7 +84,8 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         max_body_bytes: usize,
         handler: impl Handler<T, S>,
     ) -> Self {
-        let handler = post(handler).layer(DefaultBodyLimit::max(max_body_bytes));
+        let whole = from_fn(move |request: Request, next: Next| whole_body(max_body_bytes, request, next));
+        let handler = post(handler).route_layer(whole);
         self.add(Method::POST, path, summary, handler)
     }
 
@@ -99,6 +105,19 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         let text = help(title, &self.table);
         let router = self.router.route(path, get(async move || text));
         (router, self.table)
+    }
+}
+
+/// Hands a request on with its body read.
+async fn whole_body(max_bytes: usize, request: Request, next: Next) -> Response {
+    let (head, body) = request.into_parts();
+    let checked = match body::check_json(&head.headers) {
+        Ok(()) => body::read(body, max_bytes).await,
+        Err(problem) => Err(problem),
+    };
+    match checked {
+        Ok(bytes) => next.run(Request::from_parts(head, bytes.into())).await,
+        Err(problem) => problem.into_response(),
     }
 }
 

@@ -9,7 +9,7 @@ use anyhow::anyhow;
 use clap::Args;
 use slag_edge::fetch::FetchRequest;
 use slag_edge::fetch::follow::{FollowEnvironment, FollowSettings, Following, follow, read_positions};
-use slag_edge::http::App;
+use slag_edge::http::{App, RESTARTS, keep_following};
 use slag_edge::store::EdgeCache;
 
 use super::failure::Failure;
@@ -105,7 +105,8 @@ pub fn watch(
     followed.map_err(failure)
 }
 
-/// Follows the positions posted to the service, on a thread of its own, until the returned flag is set.
+/// Follows the positions posted to the service, on a thread of its own, until the returned flag is set. A follower that
+/// panics is reported by the service, and begins again.
 pub fn follow_in_background(
     request: FetchRequest,
     settings: FollowSettings,
@@ -116,20 +117,23 @@ pub fn follow_in_background(
     let cancel = Arc::new(AtomicBool::new(false));
     let stop = Arc::clone(&cancel);
     std::thread::Builder::new().name("follow".into()).spawn(move || {
-        let environment = FollowEnvironment {
-            fetch: &mut |request| fetch_once(&cache, request, &stop, &()),
-            report: &mut |outcome| match outcome {
-                Ok(report) => {
-                    let (n, generation) = (report.downloaded.n_shards, report.generation);
-                    tracing::info!("fetched {n} shards of generation {generation}");
-                    app.reload_now();
-                }
-                Err(error) => tracing::warn!("{}", slag_edge::error_line(error)),
-            },
-            random: &random,
-            cancel: &stop,
-        };
-        if let Err(error) = follow(&cache, &request, settings, &following, environment) {
+        let followed = keep_following(&following, RESTARTS, &stop, || {
+            let environment = FollowEnvironment {
+                fetch: &mut |request| fetch_once(&cache, request, &stop, &()),
+                report: &mut |outcome| match outcome {
+                    Ok(report) => {
+                        let (n, generation) = (report.downloaded.n_shards, report.generation);
+                        tracing::info!("fetched {n} shards of generation {generation}");
+                        app.reload_now();
+                    }
+                    Err(error) => tracing::warn!("{}", slag_edge::error_line(error)),
+                },
+                random: &random,
+                cancel: &stop,
+            };
+            follow(&cache, &request, settings.clone(), &following, environment)
+        });
+        if let Some(Err(error)) = followed {
             tracing::info!("no longer following: {error}");
         }
     })?;

@@ -1,15 +1,17 @@
 //! `serve`.
 
 use std::io::{self, Write};
-use std::net::SocketAddr;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
+use anyhow::anyhow;
 use clap::Args;
 use slag_edge::fetch::follow::Following;
 use slag_edge::http::{self, App, Settings};
 use slag_edge::store::StoreError;
-use slag_service::listener::bind;
+use slag_service::access::{Access, AccessSettings};
+use slag_service::listen::{Listen, bind};
 use slag_service::stop::stop_signal;
 
 use super::args::{CacheArgs, DownloadArgs, ModelArgs, ThreadArgs, engine};
@@ -23,9 +25,19 @@ const SPARE_BLOCKING_THREADS: usize = 8;
 
 #[derive(Debug, Args)]
 pub struct ServeArgs {
-    /// Address to listen on.
-    #[arg(long, value_name = "IP:PORT", default_value = "127.0.0.1:7734")]
-    pub listen: SocketAddr,
+    /// Address to listen on, or unix:PATH.
+    #[arg(long, value_name = "IP:PORT|unix:PATH", default_value = "127.0.0.1:7734")]
+    pub listen: Listen,
+    /// Name that clients call this machine by, besides localhost and IP addresses; other names are refused. May be
+    /// repeated.
+    #[arg(long, value_name = "NAME")]
+    pub host: Vec<String>,
+    /// Let pages of this origin ask and read answers (CORS), such as https://map.example. May be repeated.
+    #[arg(long, value_name = "ORIGIN")]
+    pub cors: Vec<String>,
+    /// File with the bearer token that POST needs; beyond this machine nothing is taken without one.
+    #[arg(long, value_name = "FILE")]
+    pub token_file: Option<PathBuf>,
     /// Follow the robot: fetch from this store around the positions posted to POST /position.
     #[arg(long, value_name = "URL")]
     pub follow: Option<String>,
@@ -43,6 +55,7 @@ pub struct ServeArgs {
 
 pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     args.threads.apply()?;
+    let access = access(&mut args)?;
     let cache = std::mem::replace(&mut args.cache, CacheArgs { cache: None }).open()?;
     let engine = engine(cache.clone(), &args.models)?;
     match engine.reload() {
@@ -57,7 +70,7 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     {
         tracing::warn!("{error}");
     }
-    let settings = Settings::default();
+    let settings = Settings { access, ..Settings::default() };
     let (drain, blocking_threads) =
         (settings.connections.drain_timeout, settings.max_queries + SPARE_BLOCKING_THREADS);
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -67,9 +80,9 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
         .build()?;
     let served = runtime.block_on(async {
         let stop = stop_signal()?;
-        let listener = bind(args.listen).await.map_err(|e| Failure::Failed("listen", e.into()))?;
+        let listener = bind(&args.listen).await.map_err(|e| Failure::Failed("listen", e.into()))?;
         // For scripts that let the system choose a port.
-        writeln!(io::stdout(), "listening on http://{}", listener.local_addr()?)?;
+        writeln!(io::stdout(), "listening on {}", listener.url()?)?;
         let following = args.follow.is_some().then(Arc::<Following>::default);
         let app = App::following(engine, settings, following.clone());
         let follower = match following {
@@ -88,4 +101,22 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     // A query that does not end must not keep the process alive.
     runtime.shutdown_timeout(drain);
     served
+}
+
+/// Returns who may ask.
+fn access(args: &mut ServeArgs) -> Result<Access, Failure> {
+    let settings = AccessSettings {
+        hosts: std::mem::take(&mut args.host),
+        origins: std::mem::take(&mut args.cors),
+        token_file: args.token_file.take(),
+    };
+    let access = Access::new(&args.listen, settings).map_err(|e| Failure::Usage(e.into()))?;
+    if args.follow.is_some() && !access.takes_writes() {
+        return Err(Failure::Usage(anyhow!(
+            "--follow needs positions, and on {} everybody could post them; give --token-file FILE, or listen on \
+             127.0.0.1 or unix:PATH",
+            args.listen
+        )));
+    }
+    Ok(access)
 }

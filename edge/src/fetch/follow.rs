@@ -136,6 +136,10 @@ pub struct FollowStatus {
     pub n_failures: u64,
     /// Error of the last fetch; absent if it succeeded.
     pub last_error: Option<String>,
+    /// Times that the follower itself failed and began again.
+    pub n_restarts: u64,
+    /// Why nothing is followed just now; absent once a fetch has ended since.
+    pub failure: Option<String>,
 }
 
 #[derive(Default)]
@@ -143,6 +147,8 @@ struct Inbox {
     status: FollowStatus,
     n_posted: u64,
     is_over: bool,
+    /// Failures of the follower itself since the last fetch that ended.
+    n_failures_in_a_row: u64,
 }
 
 /// Receives positions from any thread; only the last one counts.
@@ -172,6 +178,24 @@ impl Following {
         self.lock().status.clone()
     }
 
+    /// Returns why nothing is followed just now, if so.
+    pub fn failure(&self) -> Option<String> {
+        self.lock().status.failure.clone()
+    }
+
+    /// Records that the follower itself failed, and returns how often it did in a row.
+    pub fn note_failure(&self, failure: &str) -> u64 {
+        let mut inbox = self.lock();
+        inbox.status.failure = Some(failure.to_owned());
+        inbox.n_failures_in_a_row += 1;
+        inbox.n_failures_in_a_row
+    }
+
+    /// Records that following begins again.
+    pub fn note_restart(&self) {
+        self.lock().status.n_restarts += 1;
+    }
+
     fn lock(&self) -> MutexGuard<'_, Inbox> {
         self.inbox.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -183,7 +207,11 @@ impl Following {
     }
 
     fn note(&self, outcome: &Result<FetchReport, FetchError>) {
-        let status = &mut self.lock().status;
+        let mut inbox = self.lock();
+        // Whatever came of the fetch, the follower lives.
+        inbox.n_failures_in_a_row = 0;
+        let status = &mut inbox.status;
+        status.failure = None;
         match outcome {
             Ok(_) => (status.n_fetches, status.last_error) = (status.n_fetches + 1, None),
             Err(error) => {

@@ -64,6 +64,18 @@ impl App {
     }
 
     fn reload(&self) {
+        /// Ends the attempt even if it panics: otherwise no later one would begin.
+        struct Attempt<'a>(&'a App);
+        impl Drop for Attempt<'_> {
+            fn drop(&mut self) {
+                if std::thread::panicking() {
+                    self.0.metrics.reload_failures.fetch_add(1, Ordering::Relaxed);
+                }
+                self.0.is_reloading.store(false, Ordering::Release);
+                self.0.n_reload_attempts.send_modify(|n| *n += 1);
+            }
+        }
+        let _attempt = Attempt(self);
         let counter = match self.engine.reload() {
             Ok(()) => &self.metrics.reloads,
             Err(error) => {
@@ -72,8 +84,6 @@ impl App {
             }
         };
         counter.fetch_add(1, Ordering::Relaxed);
-        self.is_reloading.store(false, Ordering::Release);
-        self.n_reload_attempts.send_modify(|n| *n += 1);
     }
 
     /// Runs blocking or computing work off the async threads.

@@ -5,6 +5,7 @@ use std::sync::atomic::AtomicU64;
 
 use slag_service::metrics::{Exposition, Histogram, ResponseCounts};
 
+use crate::fetch::follow::FollowStatus;
 use crate::store::Snapshot;
 
 /// Upper bounds of the buckets of query times, seconds: from a cached text over few centroids to a timeout.
@@ -38,8 +39,13 @@ impl Default for Metrics {
 }
 
 impl Metrics {
-    /// Returns the scrape, with gauges of the loaded generation.
-    pub fn render(&self, n_in_progress: usize, snapshot: Option<&Snapshot>) -> Exposition {
+    /// Returns the scrape, with gauges of the loaded generation and of following.
+    pub fn render(
+        &self,
+        n_in_progress: usize,
+        snapshot: Option<&Snapshot>,
+        following: Option<&FollowStatus>,
+    ) -> Exposition {
         let mut text = Exposition::new("slag_edge");
         text.responses(&self.responses);
         text.histogram(
@@ -56,6 +62,22 @@ impl Metrics {
             text.gauge("shards", "Shards on board.", snapshot.shards.len() as u64);
             let n_gaussians = snapshot.shards.iter().map(|shard| u64::from(shard.cell.n_gaussians)).sum();
             text.gauge("gaussians", "Gaussians on board.", n_gaussians);
+        }
+        if let Some(following) = following {
+            let counts =
+                [following.n_fetches, following.n_failures, following.n_restarts].map(AtomicU64::new);
+            text.gauge(
+                "follower_up",
+                "Whether positions are followed.",
+                u64::from(following.failure.is_none()),
+            );
+            text.counter("follow_fetches_total", "Successful fetches of the follower.", &counts[0]);
+            text.counter("follow_failures_total", "Failed fetches of the follower.", &counts[1]);
+            text.counter(
+                "follower_restarts_total",
+                "Times that the follower failed and began again.",
+                &counts[2],
+            );
         }
         text
     }

@@ -1,6 +1,7 @@
 //! The robot's own HTTP service: questions, status, health and metrics.
 
 mod app;
+mod follower;
 mod metrics;
 mod params;
 mod position;
@@ -11,6 +12,7 @@ mod settings;
 mod status;
 
 pub use app::App;
+pub use follower::{RESTARTS, keep_following};
 pub use query::parse_query;
 pub use router::serve;
 pub use settings::Settings;

@@ -12,6 +12,8 @@ use crate::text::TextError;
 
 /// Time after which a request beyond a limit may succeed.
 const RETRY_SECS: u32 = 1;
+/// Time after which a follower that failed may follow again.
+const FOLLOWER_RETRY_SECS: u32 = 5;
 
 /// The limit of queries in progress is reached.
 pub fn overloaded(limit: usize) -> Problem {
@@ -28,6 +30,15 @@ pub fn timeout(limit: Duration) -> Problem {
 pub fn not_following() -> Problem {
     let detail = "positions are not followed; start the service with --follow URL";
     Problem::new(StatusCode::CONFLICT, "not-following", "Not following", detail)
+}
+
+/// The follower panicked and has not fetched since.
+pub fn follower_failed(failure: &str) -> Problem {
+    let detail = format!(
+        "positions are kept but not followed just now: {failure}; following starts again by itself, the log has more"
+    );
+    Problem::new(StatusCode::SERVICE_UNAVAILABLE, "follower-failed", "Follower failed", detail)
+        .retry_after(FOLLOWER_RETRY_SECS)
 }
 
 /// Returns the problem of a parameter that is refused.

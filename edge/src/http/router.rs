@@ -5,10 +5,10 @@ use std::sync::Arc;
 
 use axum::Router;
 use axum::http::{HeaderName, HeaderValue, header};
+use slag_service::listen::Listener;
 use slag_service::listener;
 use slag_service::request::observed;
 use slag_service::routes::Routes;
-use tokio::net::TcpListener;
 
 use super::app::App;
 use super::{params, position, query, status};
@@ -37,23 +37,31 @@ pub(super) fn routes() -> Routes<Arc<App>> {
             position::position,
         )
         .get("/healthz", "whether the process is alive", async || "alive\n")
-        .get("/readyz", "whether a scene is loaded and fits the text model", status::ready)
+        .get(
+            "/readyz",
+            "whether a scene is loaded and fits the text model, and positions are followed",
+            status::ready,
+        )
         .get("/metrics", "counters in Prometheus' text format", status::metrics)
         .get("/openapi.json", "description of this service for programs", async || ([JSON], OPENAPI))
 }
 
 /// Returns the service, without a listener.
 pub(super) fn router(app: Arc<App>) -> Router {
-    let responses = Arc::clone(&app.metrics.responses);
+    let (responses, access) = (Arc::clone(&app.metrics.responses), app.settings.access.clone());
     let (router, _) = routes().with_help(TITLE);
-    observed(router.with_state(app), responses)
+    observed(router.with_state(app), responses, access)
 }
 
 /// Serves until `stop` completes, then lets requests in progress finish within the drain deadline.
 ///
 /// # Errors
 /// [`io::ErrorKind::TimedOut`] when the deadline cut requests off.
-pub async fn serve(app: Arc<App>, listener: TcpListener, stop: impl Future<Output = ()>) -> io::Result<()> {
+pub async fn serve(
+    app: Arc<App>,
+    listener: impl Into<Listener>,
+    stop: impl Future<Output = ()>,
+) -> io::Result<()> {
     let limits = app.settings.connections;
     Ok(listener::serve(router(app), listener, limits, stop).await?)
 }

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use slag_service::access::Access;
 use slag_service::listener::ConnectionLimits;
 
 /// Bounds of the service.
@@ -9,6 +10,8 @@ use slag_service::listener::ConnectionLimits;
 pub struct Settings {
     /// Bounds of the connections.
     pub connections: ConnectionLimits,
+    /// Who may ask.
+    pub access: Access,
     /// Queries in progress; further ones get 503.
     pub max_queries: usize,
     /// Time until an answer must begin, else 503.
@@ -21,13 +24,14 @@ impl Default for Settings {
     fn default() -> Self {
         let connections = ConnectionLimits {
             n_connections: 512,
-            head_timeout: Duration::from_secs(30),
+            n_per_peer: 384,
             stall_timeout: Duration::from_secs(60),
             drain_timeout: Duration::from_secs(5),
             ..ConnectionLimits::default()
         };
         Self {
             connections,
+            access: Access::default(),
             max_queries: 32,
             query_timeout: Duration::from_secs(10),
             stream_timeout: Duration::from_secs(60),

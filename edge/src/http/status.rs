@@ -9,7 +9,7 @@ use slag_service::metrics::Exposition;
 use slag_service::problem::Problem;
 
 use super::app::App;
-use super::problem::query_problem;
+use super::problem::{follower_failed, query_problem};
 use crate::fetch::accepted;
 use crate::query::Status;
 
@@ -18,10 +18,12 @@ pub async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Problem>
         app.reload_if_stale();
         let snapshot = app.engine.snapshot().map_err(query_problem)?;
         app.engine.check_encoder(&snapshot).map_err(query_problem)?;
-        if app.engine.text_is_alive() {
-            Ok("ready\n")
-        } else {
-            Err(Problem::internal("the text model has stopped"))
+        if !app.engine.text_is_alive() {
+            return Err(Problem::internal("the text model has stopped"));
+        }
+        match app.following.as_ref().and_then(|following| following.failure()) {
+            Some(failure) => Err(follower_failed(&failure)),
+            None => Ok("ready\n"),
         }
     })
     .await
@@ -56,5 +58,6 @@ pub async fn status(State(app): State<Arc<App>>) -> Result<Json<Value>, Problem>
 
 pub async fn metrics(State(app): State<Arc<App>>) -> Exposition {
     let n_in_progress = app.settings.max_queries - app.permits.available_permits();
-    app.metrics.render(n_in_progress, app.engine.snapshot().ok().as_deref())
+    let following = app.following.as_ref().map(|following| following.status());
+    app.metrics.render(n_in_progress, app.engine.snapshot().ok().as_deref(), following.as_ref())
 }

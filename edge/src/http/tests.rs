@@ -27,6 +27,7 @@ use slag_common::Hash32;
 use slag_common::manifest::Manifest;
 
 mod answers;
+mod attacks;
 mod openapi;
 mod ply;
 
@@ -343,7 +344,8 @@ async fn an_expired_scene_answers_and_the_status_says_so() {
 async fn positions_are_handed_on_or_refused() {
     let service = Service::with_chair();
     let say = |app: &Arc<App>, body: &str| {
-        let request = Request::post("/position").body(Body::from(body.to_owned())).expect("a request");
+        let request = Request::post("/position").header("content-type", "application/json");
+        let request = request.body(Body::from(body.to_owned())).expect("a request");
         let router = router(Arc::clone(app));
         soon(async { read(router.oneshot(request).await.expect("infallible")).await })
     };
@@ -360,12 +362,12 @@ async fn positions_are_handed_on_or_refused() {
     assert_eq!(say(&app, r#"{"lat":46.8,"lon":-92}"#).await.0, StatusCode::ACCEPTED);
     let at = Position::Geographic { latitude_deg: 46.8, longitude_deg: -92.0, height_m: None };
     assert_eq!(following.status().position, Some(at));
-    for bad in
-        ["", "{}", r#"{"x":1}"#, r#"{"lat":91,"lon":0}"#, "\u{1b}[2J", &"1".repeat(900), &"1".repeat(100_000)]
-    {
+    for bad in ["", "{}", r#"{"x":1}"#, r#"{"lat":91,"lon":0}"#, "\u{1b}[2J", &"1".repeat(900)] {
         let (status, _, body) = say(&app, bad).await;
         assert_eq!((status.as_u16(), &body["parameter"]), (400, &"body".into()), "{bad}");
     }
+    let (status, _, body) = say(&app, &"1".repeat(100_000)).await;
+    assert_eq!((status.as_u16(), &body["type"]), (413, &"urn:slag:problem:body-too-large".into()));
     assert_eq!(following.status().position, Some(at), "what is refused changes nothing");
 }
 
@@ -392,7 +394,7 @@ async fn rest(mut stream: TcpStream) -> String {
     text
 }
 
-const ASK_AND_WAIT: &str = "GET /query?text=wait HTTP/1.1\r\nhost: x\r\n\r\n";
+const ASK_AND_WAIT: &str = "GET /query?text=wait HTTP/1.1\r\nhost: localhost\r\n\r\n";
 
 /// Resolves once a query is being answered.
 async fn until_in_flight(service: &Service) {

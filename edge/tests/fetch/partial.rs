@@ -141,7 +141,7 @@ fn a_network_that_fails_publishes_nothing() {
     robot.fetch().expect("works");
     let before = answering(&robot.snapshot());
     server.publish(second.clone());
-    for fault in [Fault::Cut(300), Fault::Status(503)] {
+    for fault in [Fault::Cut(0), Fault::Status(503)] {
         server.faults(at_cells(&second, &[1], &fault));
         let error = robot.fetch().expect_err("unreachable");
         let is_network = matches!(

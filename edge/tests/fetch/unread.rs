@@ -88,7 +88,7 @@ fn trial() -> Trial {
 
 #[test]
 fn checked_files_are_not_read_at_every_fetch() {
-    let Trial { server, files, mut robot, .. } = trial();
+    let Trial { _dir, server, files, mut robot } = trial();
     robot.fetch().expect("nothing new");
     assert_eq!(files.take(), 0, "all were checked");
     // One of three is new: mapped once for its hash, once for its content.
@@ -113,7 +113,7 @@ fn checked_files_are_not_read_at_every_fetch() {
 /// A bit that flips on the medium leaves the file's time alone.
 #[test]
 fn rot_is_found_within_a_day() {
-    let Trial { files, mut robot, .. } = trial();
+    let Trial { _dir, server: _server, files, mut robot } = trial();
     let victim = robot.cache.shard_path(robot.snapshot().current.cells[1].hash);
     let modified = fs_err::metadata(&victim).expect("there").modified().expect("known");
     let mut bytes = fs_err::read(&victim).expect("there");
@@ -134,7 +134,7 @@ fn rot_is_found_within_a_day() {
 /// A new generation shares the open shards of the one before.
 #[test]
 fn open_shards_are_shared_by_generations() {
-    let Trial { server, files, robot, .. } = trial();
+    let Trial { _dir, server, files, robot } = trial();
     let first = robot.snapshot();
     assert_eq!(files.take(), 3);
     server.publish(Published::new(2, &[0, 7, 0], 40));

@@ -1,14 +1,14 @@
 //! `serve`: publishes a store over HTTP.
 
-use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use anyhow::Result;
 use clap::Args;
+use slag_service::listen::Listen;
 
 use super::common::{runtime, stopped};
 use super::exit::Exit;
-use crate::publish::serve;
+use crate::publish::serve::{self, Access, AccessSettings};
 
 /// `serve`.
 #[derive(Debug, Args)]
@@ -16,16 +16,28 @@ pub struct ServeArgs {
     /// Store.
     #[arg(long, value_name = "DIR")]
     pub store: PathBuf,
-    /// Address to listen on; 0.0.0.0:7733 lets other machines connect.
-    #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:7733")]
-    pub listen: SocketAddr,
+    /// Address to listen on, or unix:PATH; 0.0.0.0:7733 lets other machines connect.
+    #[arg(long, value_name = "IP:PORT|unix:PATH", default_value = "127.0.0.1:7733")]
+    pub listen: Listen,
+    /// Name that robots call this machine by; other names are then refused. May be repeated [default: any name beyond
+    /// this machine, else localhost and IP addresses].
+    #[arg(long, value_name = "NAME")]
+    pub host: Vec<String>,
+    /// Let pages of this origin read answers (CORS), such as https://map.example. May be repeated.
+    #[arg(long, value_name = "ORIGIN")]
+    pub cors: Vec<String>,
 }
 
 pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
+    let is_any_host = args.host.is_empty() && !args.listen.is_local();
+    let settings = AccessSettings { hosts: args.host.clone(), origins: args.cors.clone(), token_file: None };
+    let access = Access::new(&args.listen, settings)?;
+    let access = if is_any_host { access.with_any_host() } else { access };
     runtime()?.block_on(async {
         // On stdout: with port 0 this is where a script learns the port.
-        let listening = |address| println!("listening on http://{address}");
-        serve::serve(&args.store, args.listen, serve::Limits::default(), listening, stopped()).await
+        let listening = |url| println!("listening on {url}");
+        let limits = serve::Limits::default();
+        serve::serve(&args.store, args.listen.clone(), limits, access, listening, stopped()).await
     })?;
     Ok(Exit::Done)
 }

@@ -1,3 +1,6 @@
+use std::net::SocketAddr;
+
+use axum::body::Bytes;
 use axum::routing::get;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
@@ -5,8 +8,12 @@ use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
 
 use super::*;
+use crate::access::Access;
+use crate::listen::{Listen, bind};
+use crate::request::observed;
+use crate::routes::Routes;
 
-const REQUEST: &str = "GET /quick HTTP/1.1\r\nHost: x\r\n\r\n";
+const REQUEST: &str = "GET /quick HTTP/1.1\r\nHost: localhost\r\n\r\n";
 /// More than the sockets' buffers hold.
 const LONG_BYTES: usize = 40_000_000;
 
@@ -18,12 +25,17 @@ struct Running {
 }
 
 async fn start(limits: ConnectionLimits) -> Running {
-    let router = Router::new()
-        .route("/quick", get(async || "done"))
-        .route("/long", get(async || vec![7u8; LONG_BYTES]));
+    let routes = Routes::default()
+        .get("/quick", "an answer", async || "done")
+        .get("/healthz", "whether it lives", async || "alive")
+        .post("/things", "takes a thing", 64, async |body: Bytes| body);
+    let router = routes.with_help("").0.route("/long", get(async || vec![7u8; LONG_BYTES]));
+    let router = observed(router, std::sync::Arc::default(), Access::default());
     let (stop, stopped) = oneshot::channel();
-    let listener = bind("127.0.0.1:0".parse().expect("an address")).await.expect("a port");
-    let address = listener.local_addr().expect("bound");
+    let any_port: SocketAddr = "127.0.0.1:0".parse().expect("an address");
+    let listener = bind(&any_port.into()).await.expect("a port");
+    let url = listener.url().expect("bound");
+    let address = url.strip_prefix("http://").and_then(|address| address.parse().ok()).expect("an address");
     let ended = tokio::spawn(serve(router, listener, limits, async move {
         let _ = stopped.await;
     }));
@@ -36,18 +48,77 @@ async fn connect(address: SocketAddr, text: &str) -> TcpStream {
     stream
 }
 
+const HALF_A_BODY: &str = "POST /things HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n{\"x\"";
+
+/// Sends a request and returns all that comes back until the other end closes.
+async fn ask_once(address: SocketAddr, text: &str) -> String {
+    let mut stream = connect(address, text).await;
+    let mut received = Vec::new();
+    let whole = tokio::time::timeout(Duration::from_secs(5), stream.read_to_end(&mut received)).await;
+    drop(whole.expect("ends"));
+    String::from_utf8_lossy(&received).into_owned()
+}
+
+/// The attack: sockets that send half a body take every place.
 #[tokio::test]
-async fn connections_beyond_the_limit_wait() {
-    let running = start(ConnectionLimits { n_connections: 1, ..ConnectionLimits::default() }).await;
-    let mut first = connect(running.address, REQUEST).await;
-    first.read_exact(&mut [0; 12]).await.expect("answered");
-    let mut second = connect(running.address, REQUEST).await;
-    let mut received = [0; 12];
-    let early = tokio::time::timeout(Duration::from_millis(100), second.read_exact(&mut received)).await;
-    assert!(early.is_err(), "not while the first is open");
-    drop(first);
-    second.read_exact(&mut received).await.expect("answered then");
-    assert_eq!(&received, b"HTTP/1.1 200");
+async fn half_bodies_leave_room_for_health_and_end() {
+    let body_timeout = Duration::from_millis(1500);
+    let limits =
+        ConnectionLimits { n_connections: 8, n_reserved: 4, body_timeout, ..ConnectionLimits::default() };
+    let running = start(limits).await;
+    let mut half = Vec::new();
+    for _ in 0..20 {
+        half.push(connect(running.address, HALF_A_BODY).await);
+    }
+    let started = tokio::time::Instant::now();
+    let health = ask_once(running.address, "GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n").await;
+    assert!(health.starts_with("HTTP/1.1 200") && health.ends_with("alive"), "{health}");
+    let refused = ask_once(running.address, REQUEST).await.to_lowercase();
+    assert!(refused.starts_with("http/1.1 503") && refused.contains("retry-after: "), "{refused}");
+    assert!(started.elapsed() < body_timeout, "while all are half");
+    let mut slow = Vec::new();
+    half[0].read_to_end(&mut slow).await.expect("ends");
+    let slow = String::from_utf8_lossy(&slow);
+    assert!(slow.starts_with("HTTP/1.1 408") && slow.contains("urn:slag:problem:body-timeout"), "{slow}");
+    drop(half);
+    let again = REQUEST.replace("\r\n\r\n", "\r\nConnection: close\r\n\r\n");
+    assert!(ask_once(running.address, &again).await.ends_with("done"));
+}
+
+#[tokio::test]
+async fn bodies_are_whole_json_and_short() {
+    let running = start(ConnectionLimits::default()).await;
+    let whole = HALF_A_BODY.replace("{\"x\"", "{\"x\":1.5}").replace(": 9", ": 9\r\nConnection: close");
+    assert!(ask_once(running.address, &whole).await.ends_with("{\"x\":1.5}"));
+    for (from, to, status) in [
+        ("application/json", "text/plain", 415),
+        ("Content-Type: application/json\r\n", "", 415),
+        ("Content-Length: 9", "Content-Length: 65", 413),
+        ("Content-Length: 9", "Transfer-Encoding: chunked", 400),
+    ] {
+        let answer = ask_once(running.address, &whole.replace(from, to)).await;
+        assert!(answer.starts_with(&format!("HTTP/1.1 {status}")), "{to}: {answer}");
+    }
+}
+
+#[cfg(unix)]
+#[tokio::test]
+async fn unix_sockets_are_served() {
+    let path = std::env::temp_dir().join(format!("slag-service-{}", std::process::id()));
+    let listener = bind(&Listen::Unix(path.clone())).await.expect("binds");
+    let router = Router::new().route("/quick", get(async || "done"));
+    let limits = ConnectionLimits { n_per_peer: 0, ..ConnectionLimits::default() };
+    let (stop, stopped) = oneshot::channel::<()>();
+    let served = tokio::spawn(serve(router, listener, limits, async move { drop(stopped.await) }));
+    let mut stream = tokio::net::UnixStream::connect(&path).await.expect("listens");
+    let request = REQUEST.replace("\r\n\r\n", "\r\nConnection: close\r\n\r\n");
+    stream.write_all(request.as_bytes()).await.expect("sends");
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).await.expect("answers");
+    assert!(answer.starts_with("HTTP/1.1 200") && answer.ends_with("done"), "{answer}");
+    stop.send(()).expect("runs");
+    assert_eq!(served.await.expect("ends"), Ok(()));
+    assert!(!path.exists());
 }
 
 /// Either deadline ends half a request and an idle connection.
@@ -75,9 +146,11 @@ async fn stalled_connections_are_dropped() {
 async fn long_heads_are_refused() {
     let running = start(ConnectionLimits::default()).await;
     let cookie = "x".repeat(30_000);
-    let mut stream =
-        connect(running.address, &format!("GET /quick HTTP/1.1\r\nHost: x\r\nCookie: {cookie}\r\n\r\n"))
-            .await;
+    let mut stream = connect(
+        running.address,
+        &format!("GET /quick HTTP/1.1\r\nHost: localhost\r\nCookie: {cookie}\r\n\r\n"),
+    )
+    .await;
     let mut received = Vec::new();
     let _ = stream.read_to_end(&mut received).await;
     assert!(received.starts_with(b"HTTP/1.1 431"), "{}", String::from_utf8_lossy(&received));
@@ -105,7 +178,7 @@ async fn stopping_has_a_deadline() {
 #[tokio::test]
 async fn an_occupied_address_is_an_error_that_names_it() {
     let running = start(ConnectionLimits::default()).await;
-    let refused = bind(running.address).await.expect_err("taken").to_string();
+    let refused = bind(&running.address.into()).await.expect_err("taken").to_string();
     assert!(
         refused.contains(&running.address.to_string()) && refused.contains("another address"),
         "{refused}"

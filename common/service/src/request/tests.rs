@@ -20,7 +20,7 @@ fn router(responses: &Arc<ResponseCounts>) -> Router {
         .route("/things/{name}", get(async || "a thing"))
         .route("/broken", get(broken))
         .route("/refused", get(refused));
-    observed(routes, Arc::clone(responses))
+    observed(routes, Arc::clone(responses), Access::default())
 }
 
 async fn ask(router: &Router, method: Method, path: &str) -> (Response, Value) {

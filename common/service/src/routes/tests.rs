@@ -18,7 +18,8 @@ fn routes() -> Routes<()> {
 async fn the_help_lists_what_the_router_serves() {
     let (router, table) = routes().with_help("A service.");
     let ask = async |method: &Method, path: &str, body: &'static str| {
-        let request = Request::builder().method(method).uri(path).body(Body::from(body)).expect("a request");
+        let request = Request::builder().method(method).uri(path).header("content-type", "application/json");
+        let request = request.body(Body::from(body)).expect("a request");
         let response = router.clone().oneshot(request).await.expect("infallible");
         let status = response.status();
         (status, to_bytes(response.into_body(), 1 << 16).await.expect("whole"))

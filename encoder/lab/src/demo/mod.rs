@@ -23,7 +23,7 @@ use crate::generate::grammar::{self, SceneKind};
 use slag_encoder::cells::CellLimits;
 use slag_encoder::encode::{self, EncodeSettings, EncodeSummary, Engines};
 use slag_encoder::progress::Progress;
-use slag_encoder::publish::serve::{self, Limits};
+use slag_encoder::publish::serve::{self, Access, Limits};
 use slag_encoder::query;
 use slag_encoder::raster::CpuRasterizer;
 use slag_encoder::store::StoreReader;
@@ -177,19 +177,19 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     let (listens, listening) = tokio::sync::oneshot::channel();
     let serving = tokio::spawn(async move {
         // A channel fails only if its other end is dropped: the demo has failed and reports why.
-        let on_listening = |address| {
-            let _ = listens.send(address);
+        let on_listening = |url| {
+            let _ = listens.send(url);
         };
         let stopped = async {
             let _ = stopped.await;
         };
-        serve::serve(&store, ([127, 0, 0, 1], 0).into(), Limits::default(), on_listening, stopped).await
+        let address = std::net::SocketAddr::from(([127, 0, 0, 1], 0));
+        serve::serve(&store, address, Limits::default(), Access::default(), on_listening, stopped).await
     });
-    let Ok(address) = listening.await else {
+    let Ok(url) = listening.await else {
         serving.await.context("serve")?.context("serve")?;
         return Err(anyhow!("serve: ended before it listened on a port"));
     };
-    let url = format!("http://{address}");
     let at = format!("{:.3},{:.3},{:.3}", robot_in_world.x, robot_in_world.y, robot_in_world.z);
     let radius = RADIUS_M.to_string();
     let fetch = ["fetch", "--from", &url, "--at", &at, "--radius", &radius];

@@ -10,14 +10,15 @@ mod problem;
 mod router;
 mod state;
 
-use std::net::SocketAddr;
 use std::path::Path;
 
-use slag_service::listener::{self, ListenError};
+use slag_service::listen::{Listen, ListenError, bind};
+use slag_service::listener;
 
 use crate::store::StoreError;
 pub use limits::Limits;
 pub use router::router;
+pub use slag_service::access::{Access, AccessSettings};
 
 /// Why the service does not start.
 #[derive(Debug, thiserror::Error)]
@@ -32,20 +33,22 @@ pub enum ServeError {
 
 /// Serves a store until `shutdown` completes, then lets answers in progress finish within the drain deadline.
 ///
-/// `on_listening` gets the address: the system chooses the port if `listen` has port 0.
+/// `on_listening` gets the address to connect to, `http://IP:PORT` or `unix:PATH`: the system chooses the port if
+/// `listen` has port 0.
 ///
 /// # Errors
 /// [`ServeError`]; a store without a published scene is one.
 pub async fn serve(
     dir: &Path,
-    listen: SocketAddr,
+    listen: impl Into<Listen>,
     limits: Limits,
-    on_listening: impl FnOnce(SocketAddr),
+    access: Access,
+    on_listening: impl FnOnce(String),
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), ServeError> {
-    let router = router(dir, limits)?;
-    let listener = listener::bind(listen).await?;
-    on_listening(listener.local_addr().map_err(|cause| ListenError { address: listen, cause })?);
+    let (router, listen) = (router(dir, limits, access)?, listen.into());
+    let listener = bind(&listen).await?;
+    on_listening(listener.url().map_err(|cause| ListenError { address: listen, cause })?);
     if let Err(cut_off) = listener::serve(router, listener, limits.connections, shutdown).await {
         // A robot continues its download at the next start.
         tracing::warn!("{cut_off}");

@@ -8,6 +8,7 @@ use axum::extract::State;
 use axum::http::StatusCode;
 use axum::{BoxError, Json, Router};
 use serde_json::json;
+use slag_service::access::Access;
 use slag_service::metrics::ResponseCounts;
 use slag_service::problem::Problem;
 use slag_service::request::observed;
@@ -32,11 +33,11 @@ const REQUEST_BODY_BYTES: usize = 1024;
 ///
 /// # Errors
 /// [`StoreError`] if nothing is published or the store cannot be read.
-pub fn router(dir: &Path, limits: Limits) -> Result<Router, StoreError> {
+pub fn router(dir: &Path, limits: Limits, access: Access) -> Result<Router, StoreError> {
     let service = Arc::new(Service::open(dir, &limits)?);
     let responses = Arc::clone(&service.responses);
     let (router, _) = routes().with_help(TITLE);
-    Ok(bounded(router.with_state(service), limits, responses))
+    Ok(bounded(router.with_state(service), limits, responses, access))
 }
 
 /// Returns the routes.
@@ -61,7 +62,12 @@ pub(super) fn routes() -> Routes<Arc<Service>> {
 }
 
 /// Puts the limits around routes, and a problem as the body of every error.
-pub(super) fn bounded(routes: Router, limits: Limits, responses: Arc<ResponseCounts>) -> Router {
+pub(super) fn bounded(
+    routes: Router,
+    limits: Limits,
+    responses: Arc<ResponseCounts>,
+    access: Access,
+) -> Router {
     let timeout = TimeoutLayer::with_status_code(StatusCode::SERVICE_UNAVAILABLE, limits.answer_timeout);
     let shed = ServiceBuilder::new()
         .layer(HandleErrorLayer::new(|_: BoxError| std::future::ready(problem::busy())))
@@ -70,7 +76,7 @@ pub(super) fn bounded(routes: Router, limits: Limits, responses: Arc<ResponseCou
         .layer(GlobalConcurrencyLimitLayer::new(limits.n_requests))
         .layer(RequestBodyLimitLayer::new(REQUEST_BODY_BYTES))
         .layer(timeout);
-    observed(routes.layer(shed), responses)
+    observed(routes.layer(shed), responses, access)
 }
 
 async fn health(State(service): AppState) -> Result<Json<serde_json::Value>, Problem> {

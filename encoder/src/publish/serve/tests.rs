@@ -1,3 +1,4 @@
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -52,7 +53,7 @@ impl Fixture {
     }
 
     fn router(&self) -> Router {
-        router(self.dir.path(), Limits::default()).expect("published")
+        router(self.dir.path(), Limits::default(), Access::default()).expect("published")
     }
 }
 
@@ -343,7 +344,10 @@ async fn new_manifest_is_noticed_and_a_damaged_one_is_not_served() {
     fs_err::write(&path, b"damaged otherwise").expect("writable");
     assert_eq!(generation(&router).await, 3);
     assert_eq!(counted("slag_store_reload_failures_total ").await, 2, "a changed file is read again");
-    assert!(super::router(fixture.dir.path(), Limits::default()).is_err(), "but nothing starts from it");
+    assert!(
+        super::router(fixture.dir.path(), Limits::default(), Access::default()).is_err(),
+        "but nothing starts from it"
+    );
     fs_err::write(&path, good).expect("writable");
     assert_eq!(generation(&router).await, 3);
     assert_eq!(counted("slag_store_reloads_total ").await, 2, "it is put in place when it opens again");
@@ -360,7 +364,8 @@ async fn overload_and_timeout_are_problems() {
     };
     let routes = || Router::new().route("/quick", get(async || "done"));
     let limits = Limits { n_requests: 1, ..Limits::default() };
-    let router = router::bounded(routes().route("/wait", get(wait)), limits, Arc::default());
+    let router =
+        router::bounded(routes().route("/wait", get(wait)), limits, Arc::default(), Access::default());
     let held = tokio::spawn(router.clone().oneshot(request("/wait", &[])));
     inside.recv().await.expect("the handler runs");
     let turned_away = get_with(&router, "/quick", &[]).await;
@@ -372,7 +377,7 @@ async fn overload_and_timeout_are_problems() {
 
     let limits = Limits { answer_timeout: Duration::from_millis(20), ..Limits::default() };
     let never = get(async || std::future::pending::<()>().await);
-    let router = router::bounded(routes().route("/never", never), limits, Arc::default());
+    let router = router::bounded(routes().route("/never", never), limits, Arc::default(), Access::default());
     let late = get_with(&router, "/never", &[]).await;
     assert!(late.problem(StatusCode::SERVICE_UNAVAILABLE).contains("too long"));
     assert_eq!(late.header(header::RETRY_AFTER), "2");
@@ -382,7 +387,7 @@ async fn overload_and_timeout_are_problems() {
 async fn downloads_are_counted_until_they_end() {
     let fixture = fixture();
     let limits = Limits { n_downloads: 1, ..Limits::default() };
-    let router = router(fixture.dir.path(), limits).expect("published");
+    let router = router(fixture.dir.path(), limits, Access::default()).expect("published");
     let path = format!("/v1/objects/{}", fixture.shards[1].0);
     let unread = router.clone().oneshot(request(&path, &[])).await.expect("infallible");
     assert_eq!(unread.status(), StatusCode::OK);
@@ -404,13 +409,16 @@ async fn start(dir: &Path, limits: Limits) -> Running {
     let (told, listening) = tokio::sync::oneshot::channel();
     let dir = dir.to_owned();
     let ended = tokio::spawn(async move {
-        let any_port = "127.0.0.1:0".parse().expect("an address");
+        let any_port = SocketAddr::from(([127, 0, 0, 1], 0));
         let shutdown = async move {
             let _ = stopped.await;
         };
-        serve(&dir, any_port, limits, |address| told.send(address).expect("awaited"), shutdown).await
+        let told = |url: String| told.send(url).expect("awaited");
+        serve(&dir, any_port, limits, Access::default(), told, shutdown).await
     });
-    Running { address: listening.await.expect("listens"), stop, ended }
+    let url = listening.await.expect("listens");
+    let address = url.strip_prefix("http://").and_then(|address| address.parse().ok()).expect("an address");
+    Running { address, stop, ended }
 }
 
 async fn connect(address: SocketAddr, text: &str) -> tokio::net::TcpStream {
@@ -426,7 +434,7 @@ async fn over_tcp_a_download_outlives_the_stop() {
     let (hash, len_bytes) = fixture.store.put_bytes(&big).expect("room");
     fixture.store.publish(&manifest(3, &[(hash, len_bytes)]), &Extras::new()).expect("publishes");
     let running = start(fixture.dir.path(), Limits::default()).await;
-    let text = format!("GET /v1/objects/{hash} HTTP/1.1\r\nHost: x\r\nRange: bytes=5-\r\n\r\n");
+    let text = format!("GET /v1/objects/{hash} HTTP/1.1\r\nHost: localhost\r\nRange: bytes=5-\r\n\r\n");
     let mut stream = connect(running.address, &text).await;
     let mut received = vec![0; 1000];
     stream.read_exact(&mut received).await.expect("begins");
@@ -444,8 +452,9 @@ async fn over_tcp_a_download_outlives_the_stop() {
 #[tokio::test]
 async fn nothing_published_is_an_error_at_the_start() {
     let dir = tempfile::tempdir().expect("temporary folder");
-    let any_port = "127.0.0.1:0".parse().expect("an address");
-    let ended = serve(dir.path(), any_port, Limits::default(), |_| (), std::future::pending()).await;
+    let any_port = SocketAddr::from(([127, 0, 0, 1], 0));
+    let limits = Limits::default();
+    let ended = serve(dir.path(), any_port, limits, Access::default(), |_| (), std::future::pending()).await;
     assert!(matches!(ended, Err(ServeError::Store(StoreError::NotPublished { .. }))));
 }
 

@@ -1,0 +1,197 @@
+//! What was tried against the service, and what stops it.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+use slag_common::retry::Backoff;
+use slag_service::access::{Access, AccessSettings};
+
+use super::*;
+use crate::fetch::follow::{FollowEnvironment, FollowSettings, follow};
+use crate::fetch::{FetchError, FetchRequest};
+
+const HALF_A_BODY: &str = "POST /position HTTP/1.1\r\nhost: 127.0.0.1\r\ncontent-type: application/json\r\n\
+                           content-length: 20\r\n\r\n{\"x\":1,";
+
+/// Sends a request with headers to a service that follows a robot; returns the status and the problem's type.
+async fn ask(app: &Arc<App>, method: &str, uri: &str, headers: &[(&str, &str)]) -> (u16, Value) {
+    let mut request = Request::builder().method(method).uri(uri).header("host", "127.0.0.1:7734");
+    for (name, value) in headers {
+        if *name == "host" {
+            request.headers_mut().expect("sound").remove("host");
+        }
+        request = request.header(*name, *value);
+    }
+    let body = if method == "POST" { Body::from(r#"{"x":1,"y":2,"z":3}"#) } else { Body::empty() };
+    let request = request.body(body).expect("a request");
+    let (status, _, body) = read(router(Arc::clone(app)).oneshot(request).await.expect("infallible")).await;
+    (status.as_u16(), body["type"].clone())
+}
+
+fn following_app(service: &Service, access: Access) -> (Arc<App>, Arc<Following>) {
+    let following = Arc::<Following>::default();
+    let (text, _) = axes_service(3, Gate::default());
+    let engine = Engine::new(EdgeCache::open(service.dir.path()), text);
+    engine.reload().expect("a scene");
+    let settings = Settings { access, ..Settings::default() };
+    (App::following(engine, settings, Some(Arc::clone(&following))), following)
+}
+
+/// 513 sockets send half a body: one more than the service has connections.
+#[tokio::test]
+async fn half_bodies_do_not_stop_health_checks() {
+    let service = Service::with_chair();
+    let (address, stop, end) = serve_for_real(&service).await;
+    let mut half = Vec::new();
+    for _ in 0..513 {
+        half.push(talk(address, HALF_A_BODY).await);
+    }
+    for path in ["/healthz", "/readyz", "/metrics"] {
+        let request = format!("GET {path} HTTP/1.1\r\nhost: 127.0.0.1\r\nconnection: close\r\n\r\n");
+        let answer = rest(talk(address, &request).await).await;
+        assert!(answer.starts_with("HTTP/1.1 200"), "{path}: {answer}");
+    }
+    drop(half);
+    stop.send(()).expect("the server lives");
+    soon(end).await.expect("no panic").expect("a clean end");
+}
+
+/// A web page posts to the robot, or reads it by a name that it lets resolve to the robot.
+#[tokio::test]
+async fn web_pages_neither_write_nor_read() {
+    let service = Service::with_chair();
+    let (app, following) = following_app(&service, Access::default());
+    let json = ("content-type", "application/json");
+    let problem = |kind: &str| Value::String(format!("urn:slag:problem:{kind}"));
+    for (method, uri, headers, status, kind) in [
+        ("POST", "/position", &[("content-type", "text/plain")][..], 415, "unsupported-media-type"),
+        (
+            "POST",
+            "/position",
+            &[("content-type", "application/x-www-form-urlencoded")],
+            415,
+            "unsupported-media-type",
+        ),
+        ("POST", "/position", &[], 415, "unsupported-media-type"),
+        ("POST", "/position", &[json, ("origin", "https://evil.example")], 403, "foreign-origin"),
+        ("POST", "/position", &[json, ("origin", "null")], 403, "foreign-origin"),
+        ("POST", "/position", &[json, ("host", "evil.example")], 421, "wrong-host"),
+        ("GET", "/status", &[("host", "evil.example:7734")], 421, "wrong-host"),
+        (
+            "GET",
+            "/query?text=0",
+            &[("sec-fetch-site", "cross-site"), ("sec-fetch-mode", "no-cors")],
+            403,
+            "foreign-origin",
+        ),
+        (
+            "OPTIONS",
+            "/position",
+            &[("origin", "https://evil.example"), ("access-control-request-method", "POST")],
+            403,
+            "foreign-origin",
+        ),
+    ] {
+        assert_eq!(
+            ask(&app, method, uri, headers).await,
+            (status, problem(kind)),
+            "{method} {uri} {headers:?}"
+        );
+    }
+    assert_eq!(following.status().position, None, "nothing moved the robot");
+    assert_eq!(ask(&app, "POST", "/position", &[json]).await.0, 202);
+    assert_eq!(ask(&app, "POST", "/position", &[json, ("origin", "http://127.0.0.1:7734")]).await.0, 202);
+}
+
+#[tokio::test]
+async fn an_origin_that_was_given_may_ask_and_read() {
+    let service = Service::with_chair();
+    let listen = "127.0.0.1:7734".parse().expect("an address");
+    let settings =
+        AccessSettings { origins: vec!["https://map.example".into()], ..AccessSettings::default() };
+    let (app, _) = following_app(&service, Access::new(&listen, settings).expect("sound"));
+    for (method, uri, status) in
+        [("OPTIONS", "/position", 204), ("GET", "/query?text=0", 200), ("GET", "/query", 400)]
+    {
+        let request = Request::builder().method(method).uri(uri).header("host", "127.0.0.1:7734");
+        let request =
+            request.header("origin", "https://map.example").header("access-control-request-method", "POST");
+        let request = request.header("x-request-id", "map-17").body(Body::empty()).expect("a request");
+        let response = router(Arc::clone(&app)).oneshot(request).await.expect("infallible");
+        assert_eq!(response.status().as_u16(), status, "{method} {uri}");
+        let header = |name: &str| response.headers().get(name).and_then(|value| value.to_str().ok());
+        assert_eq!(header("access-control-allow-origin"), Some("https://map.example"));
+        assert_eq!((header("vary"), header("x-request-id")), (Some("origin"), Some("map-17")));
+        assert_eq!(header("access-control-allow-methods").is_some(), status == 204);
+    }
+    // Without an origin nothing is said about any.
+    let (_, headers, _) = service.get("/query?text=0").await;
+    assert!(!headers.contains_key("access-control-allow-origin"));
+}
+
+/// The follower panics: nothing claims that the robot is followed until it is again.
+#[tokio::test]
+async fn a_follower_that_panics_is_reported_and_begins_again() {
+    let service = Service::with_chair();
+    let (app, following) = following_app(&service, Access::default());
+    let json = [("content-type", "application/json")];
+    assert_eq!(ask(&app, "GET", "/readyz", &[]).await.0, 200);
+    let (n_runs, cancel, heal) = (AtomicU64::new(0), AtomicBool::new(false), AtomicBool::new(false));
+    let restarts = Backoff { first: Duration::from_millis(20), longest: Duration::from_millis(80) };
+    let run = || {
+        n_runs.fetch_add(1, Ordering::SeqCst);
+        assert!(heal.load(Ordering::SeqCst), "the disk of {}", "a test");
+        "followed"
+    };
+    let failed = std::thread::scope(|threads| {
+        let kept = threads.spawn(|| keep_following(&following, restarts, &cancel, &run));
+        let give_up = std::time::Instant::now() + Duration::from_secs(10);
+        while n_runs.load(Ordering::SeqCst) < 3 && std::time::Instant::now() < give_up {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        let failed = following.failure();
+        heal.store(true, Ordering::SeqCst);
+        assert_eq!(kept.join().expect("no panic"), Some("followed"));
+        failed
+    });
+    assert!(failed.is_some_and(|text| text.contains("the disk of a test")));
+    assert!(n_runs.load(Ordering::SeqCst) >= 4 && following.status().n_restarts >= 3);
+
+    // It runs again, but no fetch has ended yet.
+    let down = Value::String("urn:slag:problem:follower-failed".into());
+    assert_eq!(ask(&app, "GET", "/readyz", &[]).await, (503, down.clone()));
+    assert_eq!(ask(&app, "POST", "/position", &json).await, (503, down));
+    assert_eq!(
+        following.status().position,
+        Some(Position::World(DVec3::new(1.0, 2.0, 3.0))),
+        "kept all the same"
+    );
+    let metrics = read(service_of(&app, "/metrics").await).await.2;
+    let metrics = metrics.as_str().expect("text");
+    let restarts = following.status().n_restarts;
+    assert!(metrics.contains("slag_edge_follower_up 0\n"), "{metrics}");
+    assert!(metrics.contains(&format!("slag_edge_follower_restarts_total {restarts}\n")), "{metrics}");
+
+    let cancelled = AtomicBool::new(true);
+    assert_eq!(keep_following(&following, restarts_of(60), &cancelled, || -> () { panic!("again") }), None);
+    let environment = FollowEnvironment {
+        fetch: &mut |_| Err(FetchError::Cancelled),
+        report: &mut |_| (),
+        random: &|| 0.5,
+        cancel: &AtomicBool::new(false),
+    };
+    let cache = EdgeCache::open(service.dir.path());
+    let followed =
+        follow(&cache, &FetchRequest::default(), FollowSettings::default(), &following, environment);
+    assert!(matches!(followed, Err(FetchError::Cancelled)), "a fetch has ended");
+    assert_eq!(ask(&app, "GET", "/readyz", &[]).await.0, 200);
+    assert_eq!(ask(&app, "POST", "/position", &json).await.0, 202);
+}
+
+fn restarts_of(seconds: u64) -> Backoff {
+    Backoff { first: Duration::from_secs(seconds), longest: Duration::from_secs(seconds) }
+}
+
+async fn service_of(app: &Arc<App>, uri: &str) -> Response {
+    let request = Request::get(uri).body(Body::empty()).expect("a request");
+    router(Arc::clone(app)).oneshot(request).await.expect("infallible")
+}
