@@ -130,6 +130,11 @@ impl Aabb {
         self.max = self.max.max(centre + DVec3::splat(radius));
     }
 
+    /// Returns whether a point lies inside, borders included.
+    pub fn contains(&self, point: DVec3) -> bool {
+        point.cmpge(self.min).all() && point.cmple(self.max).all()
+    }
+
     /// Returns the distance from a point to the box; 0 inside.
     pub fn distance_to(&self, point: DVec3) -> f64 {
         (self.min - point).max(point - self.max).max(DVec3::ZERO).length()

@@ -9,6 +9,7 @@ use serde::Serialize;
 use super::http::given;
 use super::timing::{Settings, quantile};
 use crate::query::{AnswerKind, Engine, QueryRequest};
+use crate::score::Budget;
 use crate::store::{EdgeCache, Snapshot};
 
 /// Times of answers of objects.
@@ -53,7 +54,7 @@ pub fn time_objects(
         let text = (at % n_queries).to_string();
         let request = QueryRequest { kind: Some(AnswerKind::Objects), ..QueryRequest::new(&text) };
         let start = Instant::now();
-        let reply = engine.answer(&request).map_err(io::Error::other)?;
+        let reply = engine.answer(&request, &Budget::default()).map_err(io::Error::other)?;
         let took = start.elapsed();
         // The text model has cached every vector after the first round.
         if at >= settings.n_warm_up.max(n_queries) {

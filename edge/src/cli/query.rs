@@ -10,7 +10,7 @@ use slag_edge::query::{
     AnswerKind, Answers, DEFAULT_MIN_COUNT, Format, Found, Negatives, QueryRequest, Reply, ThresholdSource,
     parse_box, parse_point,
 };
-use slag_edge::score::Precision;
+use slag_edge::score::{Budget, Precision};
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
 use super::failure::{Failure, store_failure};
@@ -86,7 +86,7 @@ pub fn run(args: QueryArgs) -> Result<(), Failure> {
     args.threads.apply()?;
     let engine = engine(args.cache.open()?, &args.models)?;
     engine.reload().map_err(store_failure)?;
-    let reply = engine.answer(&request)?;
+    let reply = engine.answer(&request, &Budget::default())?;
     if let Some(path) = &args.ply {
         write_ply(&reply, path)?;
     }

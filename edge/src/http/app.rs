@@ -10,6 +10,7 @@ use super::metrics::Metrics;
 use super::settings::Settings;
 use crate::fetch::follow::Following;
 use crate::query::Engine;
+use crate::score::{Budget, Pool};
 
 /// The service's state.
 pub struct App {
@@ -17,6 +18,8 @@ pub struct App {
     pub(super) settings: Settings,
     /// A permit for each query in progress.
     pub(super) permits: Arc<Semaphore>,
+    /// Memory of the queries in progress.
+    query_memory: Arc<Pool>,
     pub(super) metrics: Metrics,
     pub(super) following: Option<Arc<Following>>,
     is_reloading: AtomicBool,
@@ -34,12 +37,18 @@ impl App {
         Arc::new(Self {
             engine,
             permits: Arc::new(Semaphore::new(settings.max_queries)),
+            query_memory: Pool::new(settings.all_queries_bytes),
             settings,
             metrics: Metrics::default(),
             following,
             is_reloading: AtomicBool::new(false),
             n_reload_attempts: watch::Sender::new(0),
         })
+    }
+
+    /// Returns what a query that begins now may use.
+    pub(super) fn query_budget(&self) -> Budget {
+        Budget::new(self.settings.query_bytes, self.settings.query_timeout, &self.query_memory)
     }
 
     /// Returns a counter of finished attempts to load another generation.

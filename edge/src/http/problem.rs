@@ -8,6 +8,7 @@ use slag_models::InferenceError;
 use slag_service::problem::Problem;
 
 use crate::query::{QueryError, RequestError};
+use crate::score::{OverBudget, ScoreError};
 use crate::text::TextError;
 
 /// Time after which a request beyond a limit may succeed.
@@ -68,6 +69,10 @@ pub fn query_problem(error: QueryError) -> Problem {
         QueryError::NoScene => unavailable("No scene"),
         QueryError::Text(TextError::Busy) | QueryError::Negatives(TextError::Busy) => {
             unavailable("Overloaded")
+        }
+        QueryError::Score(ScoreError::OverBudget(OverBudget::Together { .. })) => unavailable("Overloaded"),
+        QueryError::Score(ScoreError::OverBudget(_)) => {
+            Problem::new(StatusCode::UNPROCESSABLE_ENTITY, kind, "Over budget", detail)
         }
         QueryError::EncoderMismatch { models_name, models_id, scene_name, scene_id } => {
             Problem::new(StatusCode::CONFLICT, kind, "Text model does not fit the scene", detail)

@@ -62,26 +62,28 @@ async fn answer(
     request.check().map_err(parameter_problem)?;
     let permit =
         Arc::clone(&app.permits).try_acquire_owned().map_err(|_| overloaded(app.settings.max_queries))?;
+    let budget = app.query_budget();
     let answering = app.blocking(move |app| {
         app.reload_if_stale();
-        let reply = app.engine.answer(&request).map_err(query_problem)?;
+        let reply = app.engine.answer(&request, &budget).map_err(query_problem)?;
         let n_empty = reply.answers.iter().filter(|answers| answers.answers.is_empty()).count();
         app.metrics.empty_answers.fetch_add(n_empty as u64, Ordering::Relaxed);
         let mut pieces = reply.pieces(format).peekable();
         let first = pieces.next().transpose().map_err(Problem::internal)?.unwrap_or_default();
         let is_whole = pieces.peek().is_none();
         // The permit is held until the work is done, even if the client has given up.
-        Ok((first, (!is_whole).then_some((pieces, permit))))
+        Ok((first, (!is_whole).then_some((pieces, permit, budget))))
     });
     let limit = app.settings.query_timeout;
     let (first, rest) = tokio::time::timeout(limit, answering).await.map_err(|_| timeout(limit))??;
     let body = match rest {
         None => Body::from(first),
-        Some((pieces, permit)) => {
+        Some((pieces, permit, budget)) => {
             let (sender, receiver) = channel(PIECES_AHEAD);
             let deadline = app.settings.stream_timeout;
             tokio::spawn(async move {
-                let _permit = permit;
+                // What the answers take counts until they are sent.
+                let _held = (permit, budget);
                 send_all(first, pieces, sender, deadline).await;
             });
             Body::new(Pieces { receiver, is_complete: false })

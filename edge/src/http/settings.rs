@@ -14,8 +14,12 @@ pub struct Settings {
     pub access: Access,
     /// Queries in progress; further ones get 503.
     pub max_queries: usize,
-    /// Time until an answer must begin, else 503.
+    /// Time until an answer must begin, else 503; and what a query may compute for.
     pub query_timeout: Duration,
+    /// Memory that a query may use; one that needs more gets 422.
+    pub query_bytes: u64,
+    /// Memory that all queries in progress may use; one that exceeds it gets 503.
+    pub all_queries_bytes: u64,
     /// Time for sending a long answer.
     pub stream_timeout: Duration,
 }
@@ -34,6 +38,8 @@ impl Default for Settings {
             access: Access::default(),
             max_queries: 32,
             query_timeout: Duration::from_secs(10),
+            query_bytes: 256 << 20,
+            all_queries_bytes: 1 << 30,
             stream_timeout: Duration::from_secs(60),
         }
     }

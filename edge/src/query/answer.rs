@@ -3,16 +3,17 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::answers::{Answers, BadCellAnswer, ClusterAnswer, Clustering, Evidence, Found};
+use super::answers::{Answers, BadCellAnswer, ClusterAnswer, Clustering, Evidence, Found, Whole};
 use super::cluster::{Cluster, Grouping, cluster};
+use super::extent::Extent;
 use super::objects::{self, FoundObject};
-use super::rank::{Ranked, rank};
+use super::rank::{Order, Ranked};
 use super::reason;
 use super::request::{AnswerKind, DEFAULT_LIMIT, QueryRequest};
 use super::scale::Scale;
 use super::scene::{Scene, alignment, default_voxel};
 use super::threshold::ThresholdSource;
-use crate::score::{ObjectScores, Question, Region, ScoreError, Scratch, Search, score_objects};
+use crate::score::{Budget, Hit, ObjectScores, Question, Region, ScoreError, Scratch, Search, score_objects};
 use crate::store::{BadCell, cell_of};
 use slag_common::manifest::Manifest;
 
@@ -20,9 +21,9 @@ use slag_common::manifest::Manifest;
 /// vectors of the request's texts, each with those of its negatives.
 ///
 /// The same scene, vectors and request give the same answers for any number of threads, asked alone or
-/// together. `scratch`: buffers of earlier answers, or new ones.
+/// together. `scratch`: buffers of earlier answers, or new ones, and what the request may use.
 /// # Errors
-/// [`ScoreError`].
+/// [`ScoreError`]; one is a request that needs more than its budget.
 pub fn answer(
     scratch: &mut Scratch,
     scene: &Scene<'_>,
@@ -41,9 +42,15 @@ pub fn answer(
         return Ok(asked.zip(&scored).map(answer).collect());
     }
     let searches = Search::batch(scratch, scene.shards, questions, request.region(), request.precision)?;
-    let answer =
-        |((text, question), search)| answer_gaussians(scene, (text, kind), question, search, request);
-    Ok(asked.zip(&searches).map(answer).collect())
+    let budget = scratch.budget();
+    let answer = |((text, question), search)| {
+        let used_bytes = budget.used_bytes();
+        let answers = answer_gaussians(scene, (text, kind), question, search, budget, request);
+        budget.check()?;
+        budget.give_back_to(used_bytes, answers.answers.len_bytes());
+        Ok(answers)
+    };
+    asked.zip(&searches).map(answer).collect()
 }
 
 /// Answers a question with the objects that match; no centroid is scored.
@@ -55,13 +62,14 @@ fn answer_objects(
     request: &QueryRequest,
 ) -> Answers {
     let (manifest, scale, region) = (scene.manifest, Scale::of(question), request.region());
-    let threshold = scale.threshold(request, manifest, objects::calibration(scene.objects));
+    let calibration = objects::calibration(scene.objects);
+    let threshold = scale.threshold(request, manifest, calibration);
     let of_score = scale.to_score(threshold.0);
     let found = objects::matching(scene, &scored.scores, of_score, &region, request.min_count);
     let n_matching = found.iter().map(|object| object.n_gaussians).sum();
-    let key =
-        |object: &FoundObject<'_>| (scale.shown(object.score), object.n_gaussians, object.record.position());
-    let ranked = rank(found, threshold.0, manifest, request, key);
+    let key = |object: &FoundObject<'_>| (scale.shown(object.score), object.extent().position_in_world);
+    let order = Order::new(scale.base(calibration), manifest, request);
+    let ranked = order.rank(found, key);
     // Describes only the objects that are returned.
     let described =
         ranked.into_par_iter().map(|ranked| object_answer(scene, ranked, scale, &region, request.members));
@@ -85,6 +93,7 @@ fn answer_gaussians(
     (text, kind): (&str, AnswerKind),
     question: &Question,
     search: &Search<'_>,
+    budget: &Budget,
     request: &QueryRequest,
 ) -> Answers {
     let manifest = scene.manifest;
@@ -95,6 +104,8 @@ fn answer_gaussians(
     let n_matching;
     let found = if kind == AnswerKind::Gaussians {
         let limit = request.limit.unwrap_or(DEFAULT_LIMIT);
+        budget
+            .take(limit.min(search.searched().map(|shard| shard.n_with_evidence()).sum()) * size_of::<Hit>());
         let mut hits = search.best(limit, score_threshold, request.near);
         // If all are listed, their number is known.
         let is_whole = hits.len() < limit;
@@ -111,6 +122,7 @@ fn answer_gaussians(
             scene.shards,
             &matches.runs,
             &Grouping { voxel, min_count, threshold, alignment, with_members },
+            budget,
         );
         clustering = Some(Clustering {
             voxel: grouped.voxel,
@@ -119,8 +131,9 @@ fn answer_gaussians(
             n_small_clusters: grouped.n_small,
             n_gaussians_in_small_clusters: grouped.n_gaussians_in_small,
         });
-        let key = |of: &Cluster| (of.score, of.n_gaussians, of.position_in_world);
-        let ranked = rank(grouped.clusters, threshold, manifest, request, key);
+        let key = |of: &Cluster| (of.score, of.extent.position_in_world);
+        let order = Order::new(scale.base(manifest.encoder.calibration), manifest, request);
+        let ranked = order.rank(grouped.clusters, key);
         Found::Clusters(ranked.into_iter().map(|ranked| cluster_answer(ranked, manifest)).collect())
     };
     // Gaussians of exact shards are listed with their own scores, clusters with their centroids'.
@@ -199,19 +212,21 @@ fn area_fetched((centre, radius): (DVec3, f64), request: &QueryRequest) -> Optio
 /// Describes a cluster.
 fn cluster_answer(ranked: Ranked<Cluster>, manifest: &Manifest) -> ClusterAnswer {
     let Ranked { found: cluster, rank, relevance, distance } = ranked;
+    let Extent { position_in_world, box_in_world } = cluster.extent;
     ClusterAnswer {
         rank,
         id: format!("{}-{}", cluster.first.0, cluster.first.1),
-        position_in_world: cluster.position_in_world,
-        geographic: manifest.geo_reference.map(|geo| geo.geographic_from_world(cluster.position_in_world)),
-        box_min_in_world: cluster.box_in_world.min,
-        box_max_in_world: cluster.box_in_world.max,
-        size: cluster.box_in_world.size(),
+        position_in_world,
+        geographic: manifest.geo_reference.map(|geo| geo.geographic_from_world(position_in_world)),
+        box_min_in_world: box_in_world.min,
+        box_max_in_world: box_in_world.max,
+        size: box_in_world.size(),
         oriented_box: cluster.oriented_box,
         score: cluster.score,
         best_score: cluster.best_score,
         n_gaussians: cluster.n_gaussians,
         n_gaussians_in_scene: None,
+        whole: None,
         evidence: None,
         relevance,
         distance,
@@ -227,23 +242,28 @@ fn object_answer(
     region: &Region,
     with_members: bool,
 ) -> ClusterAnswer {
-    let Ranked { found: FoundObject { object, record, score, n_gaussians }, rank, relevance, distance } =
-        ranked;
-    let (manifest, position) = (scene.manifest, record.position());
-    let (bounds, score) = (record.bounds(), scale.shown(score));
+    let Ranked { found, rank, relevance, distance } = ranked;
+    let FoundObject { object, record, n_gaussians, cut, .. } = found;
+    let (manifest, score) = (scene.manifest, scale.shown(found.score));
+    let Extent { position_in_world, box_in_world } = found.extent();
+    let whole = cut.map(|_| {
+        let (position_in_world, bounds) = (record.position(), record.bounds());
+        Whole { position_in_world, box_min_in_world: bounds.min, box_max_in_world: bounds.max }
+    });
     ClusterAnswer {
         rank,
         id: format!("o{:016x}", record.id),
-        position_in_world: position,
-        geographic: manifest.geo_reference.map(|geo| geo.geographic_from_world(position)),
-        box_min_in_world: bounds.min,
-        box_max_in_world: bounds.max,
-        size: bounds.size(),
-        oriented_box: objects::oriented_box(scene, object, region, alignment(manifest)),
+        position_in_world,
+        geographic: manifest.geo_reference.map(|geo| geo.geographic_from_world(position_in_world)),
+        box_min_in_world: box_in_world.min,
+        box_max_in_world: box_in_world.max,
+        size: box_in_world.size(),
+        oriented_box: objects::oriented_box(scene, &found, region, alignment(manifest)),
         score,
         best_score: score,
         n_gaussians,
         n_gaussians_in_scene: Some(u64::from(record.n_gaussians)),
+        whole,
         evidence: Some(Evidence {
             photo: objects::photo(scene, object).to_owned(),
             box_px: record.photo_box_px,

@@ -101,6 +101,17 @@ impl Found {
         }
     }
 
+    /// Returns the bytes that the answers take in memory.
+    pub fn len_bytes(&self) -> usize {
+        match self {
+            Self::Clusters(answers) => {
+                let members: usize = answers.iter().map(|answer| size_of_val(&answer.members[..])).sum();
+                size_of_val(&answers[..]) + members
+            }
+            Self::Gaussians(hits) => size_of_val(&hits[..]),
+        }
+    }
+
     /// Returns whether there is no answer.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
@@ -156,6 +167,9 @@ pub struct ClusterAnswer {
     /// For an object: its Gaussians in the whole scene.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub n_gaussians_in_scene: Option<u64>,
+    /// For an object that the region asked for cuts: where the whole of it is. Everything else describes the part inside.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub whole: Option<Whole>,
     /// For an object: the photo that shows it best.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub evidence: Option<Evidence>,
@@ -167,6 +181,17 @@ pub struct ClusterAnswer {
     /// Its Gaussians on board in the region asked for; only where the request asks for members.
     #[serde(skip)]
     pub members: Vec<Run>,
+}
+
+/// Where the whole of an object is.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Whole {
+    /// Mean of its Gaussians inside its box.
+    pub position_in_world: DVec3,
+    /// Smallest corner of its box.
+    pub box_min_in_world: DVec3,
+    /// Largest corner.
+    pub box_max_in_world: DVec3,
 }
 
 /// The photo that shows an object best.

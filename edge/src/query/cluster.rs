@@ -11,17 +11,14 @@ use glam::{DVec3, I64Vec3};
 use rayon::prelude::*;
 use slag_common::frames::Aabb;
 use slag_common::shard::ShardView;
-use slag_math::stats::trimmed_range;
 use slag_math::union_find::UnionFind;
 
+use super::extent::{Extent, TRIMMED};
 use super::oriented::{Alignment, OrientedBox};
-use crate::score::Run;
+use crate::score::{Budget, Run};
 
 /// Bits of a voxel coordinate in its key; three of them fill a `u64`.
 const AXIS_BITS: u32 = 21;
-/// Share of a cluster's members that its box leaves out at either end of each axis, so that a few floaters do
-/// not inflate it.
-const TRIMMED: f64 = 0.02;
 /// Least mass of a voxel that joins two groups, as a share of the lesser group's heaviest voxel. Things fill
 /// their voxels with tens of Gaussians, floaters with one or two.
 const BRIDGE_SHARE: f64 = 0.05;
@@ -54,12 +51,9 @@ pub struct Cluster {
     pub score: f32,
     /// Best of the members' scores.
     pub best_score: f32,
-    /// Mean of the members inside the box.
-    pub position_in_world: DVec3,
-    /// From the 2nd to the 98th percentile of the members' means along each axis (all members if they are
-    /// fewer than 51).
-    pub box_in_world: Aabb,
-    /// Box along axes of its own, those of the members inside `box_in_world`.
+    /// Where its members' means are.
+    pub extent: Extent,
+    /// Box along axes of its own, those of the members inside the extent's box.
     pub oriented_box: OrientedBox,
     /// Its members, in storage order; empty unless they are asked for.
     pub members: Vec<Run>,
@@ -126,8 +120,13 @@ fn forward_neighbours() -> impl Iterator<Item = u64> {
     all.map(|(x, y, z)| (x << (2 * AXIS_BITS)) + (y << AXIS_BITS) + z).filter(|d| *d > 0).map(|d| d as u64)
 }
 
-/// Clusters the members of disjoint runs.
-pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], grouping: &Grouping) -> Clusters {
+/// Bytes of a voxel while voxels are joined: its key, mass, rank, order, group, and where its spans are.
+const VOXEL_BYTES: usize = 48;
+/// Bytes of a member while its cluster is described: its point, and its coordinate along an axis.
+const MEMBER_BYTES: usize = size_of::<DVec3>() + size_of::<f64>();
+
+/// Clusters the members of disjoint runs. If the budget is spent the result is of no use: ask [`Budget::check`].
+pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], grouping: &Grouping, budget: &Budget) -> Clusters {
     let Grouping { mut voxel, min_count, threshold, alignment, with_members } = *grouping;
     let mut result = Clusters { clusters: Vec::new(), n_small: 0, n_gaussians_in_small: 0, voxel };
     let mut reach = Aabb::EMPTY;
@@ -141,18 +140,26 @@ pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], grouping: &Grouping) -> C
     let grid = Grid::new(reach, &mut voxel);
     result.voxel = voxel;
 
-    let mut spans: Vec<Span> = runs
-        .par_chunks(256)
-        .enumerate()
-        .flat_map_iter(|(chunk, runs)| spans_of(shards, runs, chunk * 256, &grid))
-        .collect();
+    let mut spans: Vec<Span> =
+        runs.par_chunks(256)
+            .enumerate()
+            .map(|(chunk, runs)| {
+                if budget.goes_on() { spans_of(shards, runs, chunk * 256, &grid, budget) } else { Vec::new() }
+            })
+            .flatten_iter()
+            .collect();
     spans.par_sort_unstable();
     let voxels: Vec<&[Span]> = spans.chunk_by(|a, b| a.voxel_key == b.voxel_key).collect();
+    if !budget.take(voxels.len() * VOXEL_BYTES) {
+        return result;
+    }
     let weight = weight_of_score(runs, threshold);
     let mass = |spans: &&[Span]| -> f64 {
         spans.iter().map(|s| weight(runs[s.run as usize].score) * f64::from(s.end - s.start)).sum()
     };
-    let roots = connect(&voxels, &voxels.iter().map(mass).collect::<Vec<_>>());
+    let Some(roots) = connect(&voxels, &voxels.iter().map(mass).collect::<Vec<_>>(), budget) else {
+        return result;
+    };
     let mut by_root: Vec<u32> = (0..voxels.len() as u32).collect();
     by_root.sort_by_key(|voxel| roots[*voxel as usize]);
     let groups: Vec<&[u32]> = by_root.chunk_by(|a, b| roots[*a as usize] == roots[*b as usize]).collect();
@@ -165,8 +172,11 @@ pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], grouping: &Grouping) -> C
         groups.into_iter().partition(|group| count(group) >= min_count);
     result.n_small = small.len() as u64;
     result.n_gaussians_in_small = small.into_iter().map(count).sum();
+    // Twice: once found, once ranked.
+    budget.take(large.len() * 2 * size_of::<Cluster>());
     result.clusters = large
         .into_par_iter()
+        .filter(|group| budget.goes_on() && budget.take(count(group) as usize * MEMBER_BYTES))
         .map(|group| {
             let mut spans: Vec<Span> =
                 group.iter().flat_map(|voxel| voxels[*voxel as usize]).copied().collect();
@@ -180,7 +190,13 @@ pub fn cluster(shards: &[ShardView<'_>], runs: &[Run], grouping: &Grouping) -> C
     result
 }
 
-fn spans_of(shards: &[ShardView<'_>], runs: &[Run], first_run: usize, grid: &Grid) -> Vec<Span> {
+fn spans_of(
+    shards: &[ShardView<'_>],
+    runs: &[Run],
+    first_run: usize,
+    grid: &Grid,
+    budget: &Budget,
+) -> Vec<Span> {
     let mut spans: Vec<Span> = Vec::new();
     for (at, run) in runs.iter().enumerate() {
         let shard = &shards[run.shard as usize];
@@ -193,6 +209,8 @@ fn spans_of(shards: &[ShardView<'_>], runs: &[Run], first_run: usize, grid: &Gri
             }
         }
     }
+    // Twice: those of this chunk, and all in one list.
+    budget.take(2 * size_of_val(&spans[..]));
     spans
 }
 
@@ -206,8 +224,9 @@ fn weight_of_score(runs: &[Run], threshold: f32) -> impl Fn(f32) -> f64 {
     }
 }
 
-/// Returns for each voxel (by key, ascending) the number of its group. `masses`: `[voxels]`.
-fn connect(voxels: &[&[Span]], masses: &[f64]) -> Vec<u32> {
+/// Returns for each voxel (by key, ascending) the number of its group; `None` if the budget is spent. `masses`:
+/// `[voxels]`.
+fn connect(voxels: &[&[Span]], masses: &[f64], budget: &Budget) -> Option<Vec<u32>> {
     // From here on voxels go by rank, heaviest first; a group's root is its heaviest voxel.
     let mut by_rank: Vec<u32> = (0..voxels.len() as u32).collect();
     let mass = |voxel: u32| masses[voxel as usize];
@@ -219,6 +238,7 @@ fn connect(voxels: &[&[Span]], masses: &[f64]) -> Vec<u32> {
     let mut joints: Vec<(u32, u32)> = Vec::new();
     let keys: Vec<u64> = voxels.iter().map(|spans| spans[0].voxel_key).collect();
     for difference in forward_neighbours() {
+        let n_before = joints.len();
         // Keys ascend, so the wanted neighbours do too: one pass finds them all.
         let mut other = 0;
         for at in 0..keys.len() {
@@ -234,6 +254,9 @@ fn connect(voxels: &[&[Span]], masses: &[f64]) -> Vec<u32> {
                 joints.push((a.max(b), a.min(b)));
             }
         }
+        if !budget.take((joints.len() - n_before) * size_of::<(u32, u32)>()) {
+            return None;
+        }
     }
     joints.par_sort_unstable();
     let mut groups = UnionFind::new(voxels.len());
@@ -245,7 +268,7 @@ fn connect(voxels: &[&[Span]], masses: &[f64]) -> Vec<u32> {
             groups.attach(lesser, a.min(b));
         }
     }
-    rank_of.into_iter().map(|rank| groups.root(rank)).collect()
+    Some(rank_of.into_iter().map(|rank| groups.root(rank)).collect())
 }
 
 /// Returns the Gaussians of spans (in storage order) as runs; neighbouring spans of a run are joined.
@@ -273,35 +296,17 @@ fn summarise(shards: &[ShardView<'_>], runs: &[Run], spans: &[Span], alignment: 
         best_score = best_score.max(run.score);
         first = first.min((shard.header.cell_id, span.start));
     }
-    let box_in_world = trimmed_box(&points);
-    let inside = |p: &DVec3| p.cmpge(box_in_world.min).all() && p.cmple(box_in_world.max).all();
-    let (sum, n_inside) = points
-        .iter()
-        .filter(|p| inside(p))
-        .fold((DVec3::ZERO, 0u64), |(sum, n), point| (sum + *point, n + 1));
+    let extent = Extent::of(&points);
+    let inside = |point: &DVec3| extent.box_in_world.contains(*point);
     Cluster {
         first,
         n_gaussians: points.len() as u64,
         score: (score_sum / points.len() as f64) as f32,
         best_score,
-        // Trimming leaves out at most 4 % per axis, so some member is inside along all three.
-        position_in_world: sum / n_inside as f64,
-        box_in_world,
+        extent,
         oriented_box: OrientedBox::around(&points, inside, alignment, TRIMMED),
         members: Vec::new(),
     }
-}
-
-/// Returns the box between the `TRIMMED` and `1 - TRIMMED` quantiles along each axis.
-fn trimmed_box(points: &[DVec3]) -> Aabb {
-    let (mut min, mut max) = (DVec3::ZERO, DVec3::ZERO);
-    let mut values = Vec::with_capacity(points.len());
-    for axis in 0..3 {
-        values.clear();
-        values.extend(points.iter().map(|point| point[axis]));
-        (min[axis], max[axis]) = trimmed_range(&mut values, TRIMMED).unwrap_or_default();
-    }
-    Aabb { min, max }
 }
 
 #[cfg(test)]

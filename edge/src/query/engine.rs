@@ -13,11 +13,13 @@ use super::answer::answer;
 use super::reply::Reply;
 use super::request::{QueryRequest, RequestError};
 use super::scene::Scene;
-use crate::score::{Question, ScoreError, Scratch};
+use crate::score::{Budget, OverBudget, Question, ScoreError, Scratch};
 use crate::store::files::Stat;
 use crate::store::{EdgeCache, Snapshot, StoreError};
 use crate::text::{EncoderInfo, TextError, TextService};
 
+/// Most bytes that an answer may have used for its buffers to be kept.
+const KEPT_BYTES: u64 = 32 << 20;
 /// Time after which a failed load is tried again even if `current` is unchanged: the disk may have been full,
 /// or too many files open.
 const RETRY_AFTER: Duration = Duration::from_secs(5);
@@ -71,6 +73,8 @@ impl QueryError {
             },
             Self::NoScene => "no-scene",
             Self::EncoderMismatch { .. } => "encoder-mismatch",
+            Self::Score(ScoreError::OverBudget(OverBudget::Together { .. })) => "overloaded",
+            Self::Score(ScoreError::OverBudget(_)) => "over-budget",
             Self::Score(_) => "score",
         }
     }
@@ -177,11 +181,12 @@ impl Engine {
         })
     }
 
-    /// Answers a request from the loaded generation. Blocks for milliseconds of computing.
+    /// Answers a request from the loaded generation. Blocks for milliseconds of computing, at most as long as the budget
+    /// says.
     ///
     /// # Errors
     /// [`QueryError`].
-    pub fn answer(&self, request: &QueryRequest) -> Result<Reply, QueryError> {
+    pub fn answer(&self, request: &QueryRequest, budget: &Budget) -> Result<Reply, QueryError> {
         request.check()?;
         let snapshot = self.snapshot()?;
         self.check_encoder(&snapshot)?;
@@ -198,8 +203,13 @@ impl Engine {
         let scene = Scene { shards: &shards, objects: &objects, index, manifest, fetched, bad_cells };
         let idle = || self.idle.lock().unwrap_or_else(PoisonError::into_inner);
         let mut scratch = idle().pop().unwrap_or_default();
+        scratch.set_budget(budget.clone());
         let answers = answer(&mut scratch, &scene, &questions, request);
-        idle().push(scratch);
+        scratch.set_budget(Budget::default());
+        // The buffers of an unusually large answer are not kept.
+        if budget.used_bytes() <= KEPT_BYTES {
+            idle().push(scratch);
+        }
         let answers = answers?;
         Ok(Reply { snapshot, near: request.near, answers })
     }

@@ -6,6 +6,7 @@ mod answers;
 mod arrow;
 pub mod cluster;
 mod engine;
+mod extent;
 mod format;
 mod json;
 mod objects;

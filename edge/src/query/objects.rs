@@ -7,13 +7,11 @@ use glam::DVec3;
 use slag_common::manifest::Calibration;
 use slag_common::objects::{ObjectRecord, Objects};
 
+use super::extent::{Extent, TRIMMED};
 use super::oriented::{Alignment, OrientedBox};
 use super::scene::Scene;
 use crate::score::{Region, Run};
 use crate::store::objects::Part;
-
-/// The same share as [`super::cluster`] trims.
-const TRIMMED: f64 = 0.02;
 
 /// An object that matches.
 pub struct FoundObject<'a> {
@@ -25,6 +23,17 @@ pub struct FoundObject<'a> {
     pub score: f32,
     /// Its Gaussians on board, in the region asked for.
     pub n_gaussians: u64,
+    /// Where these are, if the region cuts the object.
+    pub cut: Option<Extent>,
+}
+
+impl FoundObject<'_> {
+    /// Returns where the part in the region asked for is.
+    pub fn extent(&self) -> Extent {
+        let whole =
+            || Extent { position_in_world: self.record.position(), box_in_world: self.record.bounds() };
+        self.cut.unwrap_or_else(whole)
+    }
 }
 
 /// Returns the mean and spread of a bank of texts' scores over the scene's objects.
@@ -49,14 +58,16 @@ pub fn matching<'a>(
 ) -> Vec<FoundObject<'a>> {
     let reaching = (0..scores.len()).filter(|object| scores[*object] >= threshold);
     let found = |object| {
-        let n_gaussians = scene.index.parts(object).iter().map(|part| count(scene, *part, region)).sum();
-        let is_found = n_gaussians >= min_count.max(1);
-        is_found.then(|| FoundObject {
-            object,
-            record: record(scene, object),
-            score: scores[object],
-            n_gaussians,
-        })
+        let (parts, record, score) = (scene.index.parts(object), record(scene, object), scores[object]);
+        let n_gaussians = parts.iter().map(|part| count(scene, *part, region)).sum();
+        if n_gaussians < min_count.max(1) {
+            return None;
+        }
+        let cut = (!region.covers(&record.bounds())).then(|| {
+            let inside: Vec<DVec3> = parts.iter().flat_map(|part| points(scene, *part, region)).collect();
+            Extent::of(&inside)
+        });
+        Some(FoundObject { object, record, score, n_gaussians, cut })
     };
     reaching.filter_map(found).collect()
 }
@@ -73,12 +84,16 @@ pub fn photo<'a>(scene: &Scene<'a>, object: usize) -> &'a str {
 }
 
 /// Returns a box around an object's Gaussians in a region.
-pub fn oriented_box(scene: &Scene<'_>, object: usize, region: &Region, alignment: Alignment) -> OrientedBox {
-    let parts = scene.index.parts(object).iter();
+pub fn oriented_box(
+    scene: &Scene<'_>,
+    found: &FoundObject<'_>,
+    region: &Region,
+    alignment: Alignment,
+) -> OrientedBox {
+    let parts = scene.index.parts(found.object).iter();
     let points: Vec<DVec3> = parts.flat_map(|part| points(scene, *part, region)).collect();
-    let bounds = record(scene, object).bounds();
-    let in_box = |p: &DVec3| p.cmpge(bounds.min).all() && p.cmple(bounds.max).all();
-    OrientedBox::around(&points, in_box, alignment, TRIMMED)
+    let bounds = found.extent().box_in_world;
+    OrientedBox::around(&points, |point| bounds.contains(*point), alignment, TRIMMED)
 }
 
 /// Returns an object's Gaussians in a region, by shard and index. `score`: the object's.

@@ -1,4 +1,4 @@
-//! The order of answers.
+//! The order of answers: by score, and if there is an asker, nearer ones first.
 
 use glam::DVec3;
 use slag_common::manifest::Manifest;
@@ -6,16 +6,24 @@ use slag_common::manifest::Manifest;
 use super::request::{DEFAULT_LIMIT, QueryRequest};
 use super::scene::default_voxel;
 
-/// Distance, in voxels, at which a cluster's relevance is halved (10 m in a metric scene).
+/// Distance, in default voxels, at which an answer's relevance is halved (10 m in a metric scene).
 const VOXELS_TO_HALF_RELEVANCE: f64 = 40.0;
 
-/// Returns the ranking key of an answer: `(score - threshold) * ln(1 + n) / (1 + distance / half)`.
+/// Returns the ranking key of an answer: `(score - base) / (1 + distance / half)`, and 0 below `base`.
 ///
-/// The score's margin, weighted by the number of Gaussians with diminishing effect, and halved at a distance
-/// of `half` (40 voxels). Rounded to f32, so that the last bits of a machine's logarithm do not show.
-pub fn relevance(score: f32, threshold: f32, n_gaussians: u64, distance: Option<f64>, half: f64) -> f32 {
-    let margin = f64::from((score - threshold).max(0.0));
-    (margin * (1.0 + n_gaussians as f64).ln() / (1.0 + distance.unwrap_or(0.0) / half)) as f32
+/// `base`: the score of what has nothing to do with the question. Neither the threshold, which only filters, nor another
+/// parameter of a request changes it. Rounded to f32, so that the last bits of a machine's division do not show.
+pub fn relevance(score: f32, base: f32, distance: Option<f64>, half: f64) -> f32 {
+    let margin = (f64::from(score) - f64::from(base)).max(0.0);
+    (margin / (1.0 + distance.unwrap_or(0.0) / half)) as f32
+}
+
+/// The order of a request's answers.
+pub struct Order {
+    base: f32,
+    half: f64,
+    near: Option<DVec3>,
+    limit: usize,
 }
 
 /// An answer with its rank.
@@ -26,28 +34,28 @@ pub struct Ranked<T> {
     pub distance: Option<f64>,
 }
 
-/// Ranks answers, keeps equals in their order, and returns as many as are asked for. `key`: score as
-/// reported, number of Gaussians, and position.
-pub fn rank<T>(
-    found: Vec<T>,
-    threshold: f32,
-    manifest: &Manifest,
-    request: &QueryRequest,
-    key: impl Fn(&T) -> (f32, u64, DVec3),
-) -> Vec<Ranked<T>> {
-    let half = VOXELS_TO_HALF_RELEVANCE * request.voxel.unwrap_or_else(|| default_voxel(manifest));
-    let weighed = found.into_iter().map(|found| {
-        let (score, n_gaussians, at) = key(&found);
-        let distance = request.near.map(|near| near.distance(at));
-        let relevance = relevance(score, threshold, n_gaussians, distance, half);
-        Ranked { found, rank: 0, relevance, distance }
-    });
-    let mut ranked: Vec<Ranked<T>> = weighed.collect();
-    ranked.sort_by(|a, b| {
-        let nearer = a.distance.unwrap_or(0.0).total_cmp(&b.distance.unwrap_or(0.0));
-        b.relevance.total_cmp(&a.relevance).then(nearer)
-    });
-    ranked.truncate(request.limit.unwrap_or(DEFAULT_LIMIT));
-    ranked.iter_mut().zip(1..).for_each(|(ranked, rank)| ranked.rank = rank);
-    ranked
+impl Order {
+    pub fn new(base: f32, manifest: &Manifest, request: &QueryRequest) -> Self {
+        let half = VOXELS_TO_HALF_RELEVANCE * default_voxel(manifest);
+        Self { base, half, near: request.near, limit: request.limit.unwrap_or(DEFAULT_LIMIT) }
+    }
+
+    /// Ranks answers, keeps equals in their order, and returns as many as are asked for. `key`: score as reported, and
+    /// position.
+    pub fn rank<T>(&self, found: Vec<T>, key: impl Fn(&T) -> (f32, DVec3)) -> Vec<Ranked<T>> {
+        let weighed = found.into_iter().map(|found| {
+            let (score, position_in_world) = key(&found);
+            let distance = self.near.map(|near| near.distance(position_in_world));
+            let relevance = relevance(score, self.base, distance, self.half);
+            (score, Ranked { found, rank: 0, relevance, distance })
+        });
+        let mut ranked: Vec<(f32, Ranked<T>)> = weighed.collect();
+        ranked.sort_by(|(score, ranked), (other_score, other)| {
+            let nearer = || ranked.distance.unwrap_or(0.0).total_cmp(&other.distance.unwrap_or(0.0));
+            let by_relevance = other.relevance.total_cmp(&ranked.relevance);
+            by_relevance.then(other_score.total_cmp(score)).then_with(nearer)
+        });
+        ranked.truncate(self.limit);
+        ranked.into_iter().zip(1..).map(|((_, ranked), rank)| Ranked { rank, ..ranked }).collect()
+    }
 }

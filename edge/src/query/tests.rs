@@ -1,9 +1,11 @@
+use std::time::Duration;
+
 use glam::DVec3;
 use slag_common::frames::{Aabb, GeoReference, Geographic};
 use slag_common::manifest::{Calibration, Manifest};
 
 use super::*;
-use crate::score::{Precision, Question, Scratch};
+use crate::score::{Budget, OverBudget, Pool, Precision, Question, ScoreError, Scratch};
 use crate::store::objects::ObjectIndex;
 use crate::testing::{BuiltShard, Member, TestObject, TestShard, manifest_of, normalised};
 
@@ -97,27 +99,110 @@ fn clusters_are_ranked_nearest_best() {
     );
     for cluster in found {
         let distance = cluster.position_in_world.distance(near);
-        let n = cluster.n_gaussians as f64;
-        let expected = f64::from(cluster.score - 0.5) * (1.0 + n).ln() / (1.0 + distance / 10.0);
+        let expected = f64::from(cluster.score) / (1.0 + distance / 10.0);
         assert!((f64::from(cluster.relevance) - expected).abs() < 1e-6);
     }
 }
 
 /// If it is near enough, a worse thing beats a better one far away.
 #[test]
-fn distance_and_margin_are_weighed() {
+fn distance_and_score_are_weighed() {
     let yard = yard();
     let first_from =
         |near: DVec3| clusters(&ask(&yard, |request, _| request.near = Some(near)))[0].id.clone();
     assert_eq!(first_from(DVec3::new(0.0, 30.0, 0.0)), "5-0");
-    assert_eq!(first_from(DVec3::new(0.0, 18.0, 0.0)), "4-0");
-    // With a margin of zero only the distance is left.
-    let score = clusters(&ask(&yard, |_, _| ()))[0].score;
+    assert_eq!(first_from(DVec3::new(0.0, 10.0, 0.0)), "4-0");
+    // Where nothing scores better than what has nothing to do with the question, score and distance are left.
     for (x, first) in [(30.0, "3-0"), (-30.0, "4-0")] {
-        let answers = ask(&yard, |request, _| {
-            (request.threshold, request.near) = (Some(score), Some(DVec3::new(x, 0.0, 0.0)));
+        let answers = ask(&yard, |request, manifest| {
+            (request.threshold, request.near) = (Some(0.5), Some(DVec3::new(x, 0.0, 0.0)));
+            manifest.encoder.calibration = Some(Calibration { score_mean: 0.91, score_spread: 0.01 });
         });
         assert_eq!((clusters(&answers)[0].id.as_str(), clusters(&answers)[0].relevance), (first, 0.0));
+    }
+}
+
+/// A threshold filters and a voxel groups; neither moves what it leaves.
+#[test]
+fn neither_threshold_nor_voxel_changes_the_order() {
+    let yard = yard();
+    let near = DVec3::new(0.0, 14.0, 0.0);
+    let asked = |threshold: f32, voxel: f64, min_count: u64| {
+        let answers = ask(&yard, |request, _| {
+            (request.threshold, request.near) = (Some(threshold), Some(near));
+            (request.voxel, request.min_count) = (Some(voxel), min_count);
+        });
+        let key = |cluster: &ClusterAnswer| (cluster.id.clone(), cluster.relevance);
+        clusters(&answers).iter().map(key).collect::<Vec<_>>()
+    };
+    let all = asked(0.2, 0.25, 1);
+    assert_eq!(
+        all.iter().map(|(id, _)| id.as_str()).collect::<Vec<_>>(),
+        ["4-0", "6-0", "5-0", "3-0", "7-0"]
+    );
+    for (threshold, n_left) in [(0.5, 4), (0.69, 4), (0.85, 3), (0.94, 1)] {
+        for voxel in [0.05, 0.25, 1.0] {
+            let left = asked(threshold, voxel, 1);
+            let expected: Vec<_> =
+                all.iter().filter(|other| left.iter().any(|(id, _)| *id == other.0)).cloned().collect();
+            assert_eq!((left.len(), &left), (n_left, &expected), "threshold {threshold}, voxel {voxel}");
+        }
+    }
+    assert_eq!(asked(0.5, 0.25, 10).len(), 3, "the four Gaussians are too few");
+}
+
+/// Whatever the budget, a request gets its answer or is told the budget; what it took is given back.
+#[test]
+fn a_budget_is_enough_or_is_named() {
+    let yard = yard();
+    let shards: Vec<_> = yard.iter().map(BuiltShard::view).collect();
+    let objects: Vec<_> = yard.iter().map(|shard| shard.layout.objects(&shard.bytes)).collect();
+    let (index, manifest) = (ObjectIndex::new(&objects), manifest_of(&yard, 7));
+    let scene = Scene {
+        shards: &shards,
+        objects: &objects,
+        index: &index,
+        manifest: &manifest,
+        fetched: (DVec3::ZERO, 50.0),
+        bad_cells: &[],
+    };
+    let questions = [Question::new([1.0, 0.0]), Question::new([0.6, 0.8])];
+    let pool = Pool::new(u64::MAX);
+    for kind in [AnswerKind::Clusters, AnswerKind::Gaussians] {
+        let request = QueryRequest {
+            texts: vec!["thing".into(), "other".into()],
+            kind: Some(kind),
+            threshold: Some(-1.0),
+            voxel: Some(1e-9),
+            min_count: 1,
+            limit: Some(1),
+            ..QueryRequest::new("thing")
+        };
+        let ask = |budget: Budget| {
+            let mut scratch = Scratch::default();
+            scratch.set_budget(budget);
+            answer(&mut scratch, &scene, &questions, &request)
+        };
+        let expected = ask(Budget::default()).expect("without bounds");
+        let (mut n_refused, mut is_answered) = (0, false);
+        for bytes in (0..22).map(|power| 1u64 << power) {
+            let answers = ask(Budget::new(bytes, Duration::from_secs(3600), &pool));
+            match answers {
+                Ok(answers) => {
+                    assert_eq!(answers, expected, "{bytes}");
+                    is_answered = true;
+                }
+                Err(error) => {
+                    assert_eq!(error, ScoreError::OverBudget(OverBudget::Bytes { bytes }));
+                    assert!(!is_answered && error.to_string().contains(&bytes.to_string()), "{error}");
+                    n_refused += 1;
+                }
+            }
+            assert_eq!(pool.used_bytes(), 0);
+        }
+        assert!(is_answered && n_refused > 4, "{kind:?}: {n_refused}");
+        let error = ask(Budget::new(u64::MAX, Duration::ZERO, &pool)).expect_err("no time");
+        assert_eq!(error, ScoreError::OverBudget(OverBudget::Time { time: Duration::ZERO }));
     }
 }
 
@@ -432,7 +517,27 @@ fn objects_abstain_and_keep_to_the_region() {
     let answers = ask_objects(&|request| {
         (request.threshold, request.bounds) = (Some(0.5), Some(within(20.195, 20.9)));
     });
-    assert_eq!(clusters(&answers)[0].n_gaussians, 20);
+    let cut = &clusters(&answers)[0];
+    assert_eq!(cut.n_gaussians, 20);
+    // Position and box are those of the part inside; the whole object's have a name of their own.
+    assert!((cut.position_in_world - DVec3::new(20.295, 0.0, 0.0)).length() < 1e-6, "{cut:?}");
+    assert!(cut.box_min_in_world.x >= 20.195 && cut.box_max_in_world.x <= 20.9, "{cut:?}");
+    let whole = cut.whole.expect("the box cuts the object");
+    assert_eq!(
+        (whole.position_in_world, whole.box_max_in_world - whole.box_min_in_world),
+        (DVec3::new(21.0, 0.0, 0.0), DVec3::splat(2.0))
+    );
+    // Nothing within a radius is answered from beyond it.
+    let near = DVec3::new(20.0, 0.0, 0.0);
+    for radius in [0.15, 0.3, 1.0, 2.05, 30.0] {
+        let answers = ask_objects(&|request| {
+            (request.threshold, request.near, request.radius) = (Some(0.5), Some(near), Some(radius));
+            request.min_count = 1;
+        });
+        let object = &clusters(&answers)[0];
+        assert!(object.distance.is_some_and(|distance| distance <= radius), "{radius}: {object:?}");
+        assert_eq!(object.whole.is_none(), radius == 30.0);
+    }
     // The box holds all of cell 4 and none of the object's Gaussians in cell 3, though its border crosses
     // that cell.
     let answers = ask_objects(&|request| {

@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use slag_common::shard::ShardView;
 use slag_math::simd::InstructionSet;
 
+use super::budget::Budget;
 use super::precision::Precision;
 use super::project::{Projection, Vector};
 use super::question::Question;
@@ -27,6 +28,8 @@ pub(super) struct AskedQuestion<'a> {
     pub region: Region,
     pub precision: Precision,
     pub scored: Arc<CentroidScores>,
+    /// What finding matches may use.
+    pub budget: Budget,
     /// Indices of its vectors among those scored: its own, then its negatives.
     pub places: Vec<usize>,
     /// Its index among the questions scored.

@@ -75,8 +75,9 @@ impl AskedQuestion<'_> {
         gather.shards.par_iter_mut().enumerate().for_each(|(at, gather)| {
             gather.found.clear();
             gather.is_counting = false;
-            if let Some(cell) = self.cell(at) {
+            if let Some(cell) = self.cell(at).filter(|_| self.budget.goes_on()) {
                 cell.collect(gather, cut, each, f32::NEG_INFINITY);
+                self.budget.take(size_of_val(&gather.found.runs[..]));
             }
         });
     }
@@ -89,7 +90,7 @@ impl AskedQuestion<'_> {
             gather.found.clear();
             gather.is_counting = true;
             gather.bins.clear();
-            if let Some(cell) = self.cell(at) {
+            if let Some(cell) = self.cell(at).filter(|_| self.budget.goes_on()) {
                 cell.collect(gather, Cut { score: threshold, least: threshold }, true, floor);
             }
         });

@@ -1,5 +1,7 @@
 //! Errors of scoring.
 
+use super::budget::OverBudget;
+
 /// Largest coordinate of a scene, world units. Larger ones (a hundred times the earth's diameter) are
 /// refused, because computations with them would overflow.
 pub const MAX_COORDINATE: f64 = 1e9;
@@ -7,6 +9,9 @@ pub const MAX_COORDINATE: f64 = 1e9;
 /// Errors of scoring.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ScoreError {
+    /// The question needs more than its budget.
+    #[error(transparent)]
+    OverBudget(#[from] OverBudget),
     /// The query vector has another dimension than the shard.
     #[error(
         "cell {cell_id} holds embeddings of {expected} components, but the query vector has {found}; use the models that the scene was encoded with"

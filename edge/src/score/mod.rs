@@ -16,6 +16,7 @@
 //! Scores of centroids and codes are integer sums, scaled once: they have the same bits on every processor.
 
 mod bins;
+mod budget;
 mod cell;
 mod centroids;
 mod collect;
@@ -32,6 +33,7 @@ mod search;
 mod select;
 mod simd;
 
+pub use budget::{Budget, OverBudget, Pool};
 pub use columns::Columns;
 pub use dot::{dot, rounding_bound};
 pub use error::{MAX_COORDINATE, ScoreError};

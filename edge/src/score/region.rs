@@ -38,7 +38,7 @@ impl Region {
     /// Returns whether a point lies inside.
     pub fn contains(&self, point: DVec3) -> bool {
         self.ball.is_none_or(|ball| ball.contains(point))
-            && self.bounds.is_none_or(|b| point.cmpge(b.min).all() && point.cmple(b.max).all())
+            && self.bounds.is_none_or(|bounds| bounds.contains(point))
     }
 
     /// Returns whether every point of a box lies inside.

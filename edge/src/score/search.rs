@@ -6,6 +6,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 use slag_common::shard::{ScoreErrors, ShardView};
 
+use super::budget::Budget;
 use super::cell::Cell;
 use super::centroids::{AskedQuestion, CentroidScores};
 use super::collect::{Cut, ShardGather};
@@ -16,19 +17,38 @@ use super::question::{Question, check};
 use super::region::Region;
 use super::select::AnswerBuffers;
 
-/// Buffers of a search that the next one reuses: a search then allocates little but its answers.
+/// What a search may use: a budget, and buffers that the next search reuses, so that it allocates little but its answers.
 #[derive(Default)]
 pub struct Scratch {
+    budget: Budget,
     /// Shared with the searches made from it.
     scored: Arc<CentroidScores>,
     buffers: Arc<Mutex<AnswerBuffers>>,
 }
 
 impl Scratch {
+    /// Sets what the searches to come may use; without bounds by default.
+    pub fn set_budget(&mut self, budget: Budget) {
+        self.budget = budget;
+    }
+
+    /// Returns what the searches may use.
+    pub fn budget(&self) -> &Budget {
+        &self.budget
+    }
+
+    /// Takes the bytes of the centroids' scores from the budget.
+    fn take_scores(&self, shards: &[ShardView<'_>], questions: &[Question]) -> Result<(), ScoreError> {
+        let n_centroids: usize = shards.iter().map(|shard| shard.header.n_centroids as usize).sum();
+        let n_vectors: usize = questions.iter().map(|question| question.vectors().count()).sum();
+        self.budget.take(n_centroids * n_vectors * size_of::<f32>());
+        Ok(self.budget.check()?)
+    }
+
     /// Returns buffers that no search uses: those of the last search if it is over, else new ones.
     fn take(&mut self) -> &mut CentroidScores {
         if Arc::get_mut(&mut self.scored).is_none() {
-            *self = Self::default();
+            *self = Self { budget: std::mem::take(&mut self.budget), ..Self::default() };
         }
         // New if it was shared.
         Arc::get_mut(&mut self.scored).unwrap_or_else(|| unreachable!("the only owner"))
@@ -79,6 +99,7 @@ impl<'a> Search<'a> {
     ) -> Result<Self, ScoreError> {
         let questions = std::slice::from_ref(question);
         check(shards, questions)?;
+        scratch.take_scores(shards, questions)?;
         let places = scratch.take().score(shards, questions, region, precision);
         let places = places.into_iter().next().unwrap_or_default();
         Ok(scratch.search(AskedQuestion {
@@ -87,6 +108,7 @@ impl<'a> Search<'a> {
             region,
             precision,
             scored: Arc::clone(&scratch.scored),
+            budget: scratch.budget.clone(),
             places,
             index: 0,
             steepness: question.steepness(),
@@ -107,6 +129,7 @@ impl<'a> Search<'a> {
         precision: Precision,
     ) -> Result<Vec<Self>, ScoreError> {
         check(shards, questions)?;
+        scratch.take_scores(shards, questions)?;
         let places = scratch.take().score(shards, questions, region, precision);
         let searches = questions.iter().zip(places).enumerate().map(|(index, (question, places))| {
             scratch.search(AskedQuestion {
@@ -115,6 +138,7 @@ impl<'a> Search<'a> {
                 region,
                 precision,
                 scored: Arc::clone(&scratch.scored),
+                budget: scratch.budget.clone(),
                 places,
                 index,
                 steepness: question.steepness(),

@@ -60,7 +60,9 @@ fn ask(cache: EdgeCache) -> Result<(u64, BTreeSet<Place>), String> {
     engine.reload().map_err(|e| slag_edge::error_line(&e))?;
     let request =
         QueryRequest { kind: Some(AnswerKind::Gaussians), limit: Some(10_000), ..QueryRequest::new("x") };
-    let reply = engine.answer(&request).map_err(|e| slag_edge::error_line(&e))?;
+    let reply = engine
+        .answer(&request, &slag_edge::score::Budget::default())
+        .map_err(|e| slag_edge::error_line(&e))?;
     let answers = &reply.answers[0];
     let found = reply.gaussians(answers).iter().map(|g| place(g.position_in_world.into())).collect();
     Ok((answers.generation, found))

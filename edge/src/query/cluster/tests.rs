@@ -23,7 +23,7 @@ fn clusters_of(lists: &[(f32, Vec<[u16; 3]>)]) -> Vec<Cluster> {
         Run { shard: 0, start: members.start as u32, end: members.end as u32, score: *score }
     };
     let runs: Vec<Run> = lists.iter().enumerate().map(run).collect();
-    cluster(&[view], &runs, &Grouping { threshold: 0.3, ..GROUPING }).clusters
+    cluster(&[view], &runs, &Grouping { threshold: 0.3, ..GROUPING }, &Budget::default()).clusters
 }
 
 /// Lattice points of a box between two corners, excluding the upper one.
@@ -48,7 +48,10 @@ fn a_string_of_floaters_joins_nothing() {
     assert_eq!((counts.len(), counts.iter().sum::<u64>()), (2, 2006), "{counts:?}");
     // The string belongs to one of the two, and that one's box leaves it out.
     for (cluster, x) in found.iter().zip([0.225, 2.225]) {
-        assert!((cluster.position_in_world - DVec3::new(x, 0.225, 0.225)).length() < 0.05, "{cluster:?}");
+        assert!(
+            (cluster.extent.position_in_world - DVec3::new(x, 0.225, 0.225)).length() < 0.05,
+            "{cluster:?}"
+        );
         assert!((cluster.oriented_box.size - DVec3::splat(0.45)).abs().max_element() < 0.06, "{cluster:?}");
     }
 }
@@ -138,7 +141,7 @@ proptest! {
             points.extend((0..n as usize).map(|i| view.position_in_world(i)));
             names.extend((0..n).map(|i| (view.header.cell_id, i)));
         }
-        let found = cluster(&views, &runs, &Grouping { voxel, min_count, ..GROUPING });
+        let found = cluster(&views, &runs, &Grouping { voxel, min_count, ..GROUPING }, &Budget::default());
         let weights: Vec<f64> = (0..points.len()).map(|point| f64::from(score_of(point))).collect();
         let (large, small): (Vec<_>, Vec<_>) =
             brute_force(&points, &weights, voxel).into_iter().partition(|m| m.len() as u64 >= min_count);
@@ -159,11 +162,11 @@ proptest! {
                 let mut column: Vec<f64> = members.iter().map(|m| points[*m][axis]).collect();
                 column.sort_by(f64::total_cmp);
                 let (low, high) = (column[cut], column[column.len() - 1 - cut]);
-                prop_assert_eq!((cluster.box_in_world.min[axis], cluster.box_in_world.max[axis]), (low, high));
+                prop_assert_eq!((cluster.extent.box_in_world.min[axis], cluster.extent.box_in_world.max[axis]), (low, high));
                 inside.retain(|m| (low..=high).contains(&points[*m][axis]));
             }
             let mean = inside.iter().map(|m| points[*m]).sum::<DVec3>() / inside.len() as f64;
-            prop_assert!((cluster.position_in_world - mean).length() < 1e-9);
+            prop_assert!((cluster.extent.position_in_world - mean).length() < 1e-9);
         }
     }
 }
@@ -178,12 +181,24 @@ fn hopeless_voxels_grow() {
     let shard = TestShard { step: DVec3::splat(1e4), ..TestShard::new(vec![members]) }.build(false);
     let runs = [Run { shard: 0, start: 0, end: 2, score: 0.5 }];
     for voxel in [f64::MIN_POSITIVE, 1e-9, 0.25] {
-        let found = cluster(&[shard.view()], &runs, &Grouping { voxel, min_count: 1, ..GROUPING });
+        let found = cluster(
+            &[shard.view()],
+            &runs,
+            &Grouping { voxel, min_count: 1, ..GROUPING },
+            &Budget::default(),
+        );
         assert_eq!(found.clusters.len(), 2);
         assert!(found.voxel >= 65535e4 / f64::from(1 << AXIS_BITS), "{}", found.voxel);
     }
     assert_eq!(
-        cluster(&[shard.view()], &runs, &Grouping { voxel: 1e300, min_count: 1, ..GROUPING }).clusters.len(),
+        cluster(
+            &[shard.view()],
+            &runs,
+            &Grouping { voxel: 1e300, min_count: 1, ..GROUPING },
+            &Budget::default()
+        )
+        .clusters
+        .len(),
         1
     );
 }

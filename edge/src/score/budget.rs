@@ -1,0 +1,171 @@
+//! What a request may use: bytes and time, checked while it is scored and clustered.
+//!
+//! Work that fans out over threads cannot return an error from every loop, so a budget latches: once it is spent, loops
+//! end early, and whoever started the work asks [`Budget::check`] before it uses the result.
+
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+use std::sync::{Arc, OnceLock};
+use std::time::{Duration, Instant};
+
+/// Why a request was given up.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum OverBudget {
+    /// It needs too much memory.
+    #[error(
+        "the query needs more than {bytes} bytes of memory, its budget; raise threshold, min_count or voxel, or ask for a smaller radius or box"
+    )]
+    Bytes {
+        /// The budget.
+        bytes: u64,
+    },
+    /// All requests together need too much memory.
+    #[error(
+        "the queries in progress need more than {bytes} bytes of memory, their budget together; ask again"
+    )]
+    Together {
+        /// The budget of all requests.
+        bytes: u64,
+    },
+    /// It takes too long.
+    #[error(
+        "the query took more than {} s, its budget; raise threshold, min_count or voxel, or ask for a smaller radius or box",
+        time.as_secs_f64()
+    )]
+    Time {
+        /// The budget.
+        time: Duration,
+    },
+}
+
+/// Bytes that all requests may use together.
+#[derive(Debug)]
+pub struct Pool {
+    bytes: u64,
+    used: AtomicU64,
+}
+
+impl Pool {
+    /// Makes a pool of so many bytes.
+    pub fn new(bytes: u64) -> Arc<Self> {
+        Arc::new(Self { bytes, used: AtomicU64::new(0) })
+    }
+
+    /// Returns the bytes in use.
+    pub fn used_bytes(&self) -> u64 {
+        self.used.load(Relaxed)
+    }
+}
+
+/// What a request may still use; without bounds by default. Clones share it.
+#[derive(Clone, Debug, Default)]
+pub struct Budget(Option<Arc<Account>>);
+
+#[derive(Debug)]
+struct Account {
+    bytes: u64,
+    time: Duration,
+    started: Instant,
+    pool: Arc<Pool>,
+    used: AtomicU64,
+    spent: OnceLock<OverBudget>,
+}
+
+impl Budget {
+    /// Makes the budget of a request that begins now.
+    pub fn new(bytes: u64, time: Duration, pool: &Arc<Pool>) -> Self {
+        let (started, pool, used) = (Instant::now(), Arc::clone(pool), AtomicU64::new(0));
+        Self(Some(Arc::new(Account { bytes, time, started, pool, used, spent: OnceLock::new() })))
+    }
+
+    /// Takes bytes. Returns whether the work may go on.
+    pub fn take(&self, bytes: usize) -> bool {
+        let Some(account) = &self.0 else { return true };
+        let bytes = bytes as u64;
+        let used = account.used.fetch_add(bytes, Relaxed).saturating_add(bytes);
+        let together = account.pool.used.fetch_add(bytes, Relaxed).saturating_add(bytes);
+        if used > account.bytes {
+            account.spend(OverBudget::Bytes { bytes: account.bytes });
+        } else if together > account.pool.bytes {
+            account.spend(OverBudget::Together { bytes: account.pool.bytes });
+        }
+        self.goes_on()
+    }
+
+    /// Returns the bytes taken so far.
+    pub fn used_bytes(&self) -> u64 {
+        self.0.as_ref().map_or(0, |account| account.used.load(Relaxed))
+    }
+
+    /// Gives back what was taken since `used_bytes` was this, except `kept` bytes.
+    pub fn give_back_to(&self, used_bytes: u64, kept: usize) {
+        let Some(account) = &self.0 else { return };
+        let bytes = self.used_bytes().saturating_sub(used_bytes.saturating_add(kept as u64));
+        account.used.fetch_sub(bytes, Relaxed);
+        account.pool.used.fetch_sub(bytes, Relaxed);
+    }
+
+    /// Returns whether the work may go on: neither bytes nor time are spent.
+    pub fn goes_on(&self) -> bool {
+        let Some(account) = &self.0 else { return true };
+        if account.spent.get().is_none() && account.started.elapsed() > account.time {
+            account.spend(OverBudget::Time { time: account.time });
+        }
+        account.spent.get().is_none()
+    }
+
+    /// Returns what is spent, if anything is.
+    ///
+    /// # Errors
+    /// [`OverBudget`].
+    pub fn check(&self) -> Result<(), OverBudget> {
+        match self.0.as_ref().filter(|_| !self.goes_on()).and_then(|account| account.spent.get()) {
+            Some(spent) => Err(spent.clone()),
+            None => Ok(()),
+        }
+    }
+}
+
+impl Account {
+    /// The first reason stays.
+    fn spend(&self, why: OverBudget) {
+        let _ = self.spent.set(why);
+    }
+}
+
+impl Drop for Account {
+    fn drop(&mut self) {
+        self.pool.used.fetch_sub(*self.used.get_mut(), Relaxed);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bytes_and_time_are_spent_once_and_given_back() {
+        let (pool, hour) = (Pool::new(100), Duration::from_secs(3600));
+        let first = Budget::new(70, hour, &pool);
+        assert!(first.take(40) && first.clone().take(20) && first.check().is_ok());
+        let before = first.used_bytes();
+        assert!(first.take(10));
+        first.give_back_to(before, 3);
+        assert_eq!((first.used_bytes(), pool.used_bytes()), (63, 63));
+        assert!(!first.take(8));
+        assert_eq!(first.check(), Err(OverBudget::Bytes { bytes: 70 }));
+        first.give_back_to(0, 0);
+        assert_eq!(first.check(), Err(OverBudget::Bytes { bytes: 70 }), "it stays spent");
+
+        let (second, third) = (Budget::new(70, hour, &pool), Budget::new(70, hour, &pool));
+        assert!(second.take(60) && !third.take(50));
+        assert_eq!(third.check(), Err(OverBudget::Together { bytes: 100 }));
+        drop((first, second, third));
+        assert_eq!(pool.used_bytes(), 0);
+
+        let late = Budget::new(70, Duration::ZERO, &pool);
+        std::thread::sleep(Duration::from_millis(1));
+        assert!(!late.goes_on());
+        assert_eq!(late.check(), Err(OverBudget::Time { time: Duration::ZERO }));
+        assert!(Budget::default().take(usize::MAX) && Budget::default().check().is_ok());
+    }
+}
