@@ -1,13 +1,16 @@
-use std::time::Duration;
-
 use glam::DVec3;
 use slag_common::frames::{Aabb, GeoReference, Geographic};
 use slag_common::manifest::{Calibration, Manifest};
 
 use super::*;
-use crate::score::{Budget, OverBudget, Pool, Precision, Question, ScoreError, Scratch};
+use crate::score::{Precision, Question, Scratch};
 use crate::store::objects::ObjectIndex;
-use crate::testing::{BuiltShard, Member, TestObject, TestShard, manifest_of, normalised};
+use crate::testing::{BuiltShard, Member, TestShard, manifest_of, normalised};
+
+mod budget;
+mod objects;
+
+use objects::scene_of_objects;
 
 /// A cell with a single centroid of `n` Gaussians at a place, 1 cm apart, at a given cosine to axis 0.
 fn thing(cell_id: u32, at: DVec3, n: u16, cosine: f32) -> TestShard {
@@ -149,61 +152,6 @@ fn neither_threshold_nor_voxel_changes_the_order() {
         }
     }
     assert_eq!(asked(0.5, 0.25, 10).len(), 3, "the four Gaussians are too few");
-}
-
-/// Whatever the budget, a request gets its answer or is told the budget; what it took is given back.
-#[test]
-fn a_budget_is_enough_or_is_named() {
-    let yard = yard();
-    let shards: Vec<_> = yard.iter().map(BuiltShard::view).collect();
-    let objects: Vec<_> = yard.iter().map(|shard| shard.layout.objects(&shard.bytes)).collect();
-    let (index, manifest) = (ObjectIndex::new(&objects), manifest_of(&yard, 7));
-    let scene = Scene {
-        shards: &shards,
-        objects: &objects,
-        index: &index,
-        manifest: &manifest,
-        fetched: (DVec3::ZERO, 50.0),
-        bad_cells: &[],
-    };
-    let questions = [Question::new([1.0, 0.0]), Question::new([0.6, 0.8])];
-    let pool = Pool::new(u64::MAX);
-    for kind in [AnswerKind::Clusters, AnswerKind::Gaussians] {
-        let request = QueryRequest {
-            texts: vec!["thing".into(), "other".into()],
-            kind: Some(kind),
-            threshold: Some(-1.0),
-            voxel: Some(1e-9),
-            min_count: 1,
-            limit: Some(1),
-            ..QueryRequest::new("thing")
-        };
-        let ask = |budget: Budget| {
-            let mut scratch = Scratch::default();
-            scratch.set_budget(budget);
-            answer(&mut scratch, &scene, &questions, &request)
-        };
-        let expected = ask(Budget::default()).expect("without bounds");
-        let (mut n_refused, mut is_answered) = (0, false);
-        for bytes in (0..22).map(|power| 1u64 << power) {
-            let answers = ask(Budget::new(bytes, Duration::from_secs(3600), &pool));
-            match answers {
-                Ok(answers) => {
-                    assert_eq!(answers, expected, "{bytes}");
-                    is_answered = true;
-                }
-                Err(error) => {
-                    assert_eq!(error, ScoreError::OverBudget(OverBudget::Bytes { bytes }));
-                    assert!(!is_answered && error.to_string().contains(&bytes.to_string()), "{error}");
-                    n_refused += 1;
-                }
-            }
-            assert_eq!(pool.used_bytes(), 0);
-        }
-        assert!(is_answered && n_refused > 4, "{kind:?}: {n_refused}");
-        let error = ask(Budget::new(u64::MAX, Duration::ZERO, &pool)).expect_err("no time");
-        assert_eq!(error, ScoreError::OverBudget(OverBudget::Time { time: Duration::ZERO }));
-    }
 }
 
 #[test]
@@ -433,140 +381,4 @@ fn voxels_of_a_scene_without_metres_follow_its_cells() {
     assert_eq!(default_voxel(&manifest), 3.0);
     manifest.cells.clear();
     assert_eq!(default_voxel(&manifest), 1.0);
-}
-
-/// Cells 3 and 4 share object 21 (30 Gaussians and 12 of 50 in all); cell 4 has object 22 too.
-fn scene_of_objects() -> Vec<BuiltShard> {
-    let [a, b, c] = [[1.0f32, 0.0], [0.6, 0.8], [0.0, 1.0]];
-    let object = |id: u64, vectors: [[f32; 2]; 3], runs: &[std::ops::Range<u32>], n_gaussians| TestObject {
-        id,
-        vectors: vectors.concat(),
-        runs: runs.to_vec(),
-        n_gaussians,
-    };
-    let shared = |runs: &[std::ops::Range<u32>]| object(21, [b, a, c], runs, 50);
-    let calibration = Calibration { score_mean: 0.1, score_spread: 0.1 };
-    let built =
-        [thing(3, DVec3::new(20.0, 0.0, 0.0), 100, 0.9), thing(4, DVec3::new(22.0, 0.0, 0.0), 60, 0.9)];
-    let built = built.map(|thing| thing.build(false));
-    vec![
-        built[0].with_objects(&[shared(&[10..25, 25..40])], calibration),
-        built[1].with_objects(
-            &[shared(&[0..5, 10..17]), object(22, [c, c, c], &[20..30, 30..50], 30)],
-            calibration,
-        ),
-    ]
-}
-
-/// Oracle: scores by hand. The mean's cosine is 0.6, the best side's 1.
-#[test]
-fn objects_answer_first_and_once() {
-    let scene = scene_of_objects();
-    let answers = ask(&scene, |request, manifest| {
-        request.near = Some(DVec3::ZERO);
-        manifest.encoder.calibration = Some(Calibration { score_mean: 0.5, score_spread: 0.2 });
-    });
-    assert_eq!((answers.kind, answers.threshold_source), (AnswerKind::Objects, ThresholdSource::Scene));
-    // Of the objects, not of the Gaussians.
-    assert!((answers.threshold - 0.4).abs() < 1e-6, "{}", answers.threshold);
-    let found = clusters(&answers);
-    assert_eq!(found.len(), 1, "{found:?}");
-    let object = &found[0];
-    assert!((object.score - 0.8).abs() <= answers.score_error_bound && answers.score_error_bound < 0.01);
-    assert_eq!((object.id.as_str(), object.rank), ("o0000000000000015", 1));
-    assert_eq!((object.n_gaussians, object.n_gaussians_in_scene, answers.n_matching), (42, Some(50), 42));
-    let evidence = Evidence { photo: "21.jpg".into(), box_px: [1, 2, 30, 40] };
-    assert_eq!(object.evidence.as_ref(), Some(&evidence));
-    assert_eq!((object.position_in_world, object.distance), (DVec3::new(21.0, 0.0, 0.0), Some(21.0)));
-    assert_eq!(object.size, DVec3::splat(2.0));
-    // From 20.10 to 22.16, without 2 % at either end.
-    assert!((object.oriented_box.size.x - 2.06).abs() < 0.05, "{:?}", object.oriented_box);
-    assert!(!answers.is_exact && answers.clustering.is_none() && answers.reason.is_none());
-
-    // Without a calibrated scene the encoder's own threshold applies; other kinds are unaffected.
-    let answers = ask(&scene, |request, _| request.kind = Some(AnswerKind::Objects));
-    assert_eq!(answers.threshold_source, ThresholdSource::Encoder);
-    let clusters_of = |built: &[BuiltShard]| {
-        ask(built, |request, _| (request.kind, request.threshold) = (Some(AnswerKind::Clusters), Some(0.5)))
-            .answers
-    };
-    let without =
-        [thing(3, DVec3::new(20.0, 0.0, 0.0), 100, 0.9), thing(4, DVec3::new(22.0, 0.0, 0.0), 60, 0.9)];
-    assert_eq!(clusters_of(&scene), clusters_of(&without.map(|thing| thing.build(false))));
-}
-
-#[test]
-fn objects_abstain_and_keep_to_the_region() {
-    let scene = scene_of_objects();
-    let ask_objects = |edit: &dyn Fn(&mut QueryRequest)| ask(&scene, |request, _| edit(request));
-    // Below the threshold: the reason names the best object and its position.
-    let answers = ask_objects(&|request| request.threshold = Some(0.9));
-    let reason = answers.reason.as_ref().expect("no answer");
-    assert_eq!(
-        (answers.kind, reason.kind, answers.answers.len()),
-        (AnswerKind::Objects, ReasonKind::BelowThreshold, 0)
-    );
-    assert!(
-        reason.best_score.is_some_and(|s| (s - 0.8).abs() < 0.01) && reason.detail.contains("reaches 0.9"),
-        "{reason:?}"
-    );
-    assert_eq!(reason.best_position_in_world, Some(DVec3::new(21.0, 0.0, 0.0)));
-    // Only Gaussians in the region count: 20 of cell 3, from 20.20 to 20.39.
-    let within =
-        |min: f64, max: f64| Aabb { min: DVec3::new(min, -1.0, -1.0), max: DVec3::new(max, 1.0, 1.0) };
-    let answers = ask_objects(&|request| {
-        (request.threshold, request.bounds) = (Some(0.5), Some(within(20.195, 20.9)));
-    });
-    let cut = &clusters(&answers)[0];
-    assert_eq!(cut.n_gaussians, 20);
-    // Position and box are those of the part inside; the whole object's have a name of their own.
-    assert!((cut.position_in_world - DVec3::new(20.295, 0.0, 0.0)).length() < 1e-6, "{cut:?}");
-    assert!(cut.box_min_in_world.x >= 20.195 && cut.box_max_in_world.x <= 20.9, "{cut:?}");
-    let whole = cut.whole.expect("the box cuts the object");
-    assert_eq!(
-        (whole.position_in_world, whole.box_max_in_world - whole.box_min_in_world),
-        (DVec3::new(21.0, 0.0, 0.0), DVec3::splat(2.0))
-    );
-    // Nothing within a radius is answered from beyond it.
-    let near = DVec3::new(20.0, 0.0, 0.0);
-    for radius in [0.15, 0.3, 1.0, 2.05, 30.0] {
-        let answers = ask_objects(&|request| {
-            (request.threshold, request.near, request.radius) = (Some(0.5), Some(near), Some(radius));
-            request.min_count = 1;
-        });
-        let object = &clusters(&answers)[0];
-        assert!(object.distance.is_some_and(|distance| distance <= radius), "{radius}: {object:?}");
-        assert_eq!(object.whole.is_none(), radius == 30.0);
-    }
-    // The box holds all of cell 4 and none of the object's Gaussians in cell 3, though its border crosses
-    // that cell.
-    let answers = ask_objects(&|request| {
-        let bounds = Aabb { min: DVec3::new(21.9, -1.0, -1.0), max: DVec3::splat(1e3) };
-        (request.threshold, request.bounds) = (Some(0.5), Some(bounds));
-    });
-    assert_eq!((clusters(&answers)[0].n_gaussians, answers.n_searched), (12, 160));
-    // From 22.00 to 22.16: those of cell 3 are not in the box either.
-    assert!((clusters(&answers)[0].oriented_box.size.x - 0.16).abs() < 0.011);
-    // All matches are counted, and as many as asked for are returned.
-    let answers = ask_about(&scene, &[Question::new([0.6, 0.8])], |request, _| request.limit = Some(1));
-    let found = clusters(&answers[0]);
-    assert_eq!((found.len(), found[0].rank, found[0].n_gaussians), (1, 1, 42));
-    assert_eq!((answers[0].n_matching, found[0].id.as_str()), (72, "o0000000000000015"));
-    let answers = ask_objects(&|request| {
-        (request.threshold, request.bounds) = (Some(0.5), Some(within(50.0, 60.0)));
-    });
-    assert_eq!(answers.reason.map(|r| r.kind), Some(ReasonKind::NothingThere));
-    // With a negative the score is the difference of the object's scores: 0.8 - 0.9 for 21, 0 - 1 for 22.
-    let question =
-        Question { negatives: vec![std::sync::Arc::from([0.0f32, 1.0])], ..Question::new([1.0, 0.0]) };
-    let answers = ask_about(&scene, &[question], |request, _| {
-        (request.negatives, request.threshold) = (Negatives::Phrases(vec!["other".into()]), Some(0.2));
-    });
-    let found = clusters(&answers[0]);
-    let expected = crate::score::relevancy(0.8 - 0.9);
-    assert!(found.len() == 1 && (found[0].score - expected).abs() < 0.01, "{found:?}");
-    // A scene without objects reports that.
-    let answers = ask(&yard(), |request, _| request.kind = Some(AnswerKind::Objects));
-    assert!(answers.reason.is_some_and(|r| r.detail.contains("kind=clusters")));
-    assert_eq!(ask(&yard(), |_, _| ()).kind, AnswerKind::Clusters);
 }

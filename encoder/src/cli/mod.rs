@@ -15,6 +15,7 @@ mod query;
 pub mod refine;
 mod sam;
 mod serve;
+mod store;
 mod target;
 mod views;
 
@@ -76,6 +77,9 @@ pub enum Command {
     /// Shows, makes and rotates the key that a store signs with.
     #[command(subcommand)]
     Keys(keys::KeysCommand),
+    /// Lists, verifies and tidies a store.
+    #[command(subcommand)]
+    Store(store::StoreCommand),
     /// Lists, pulls, checks and shows public models.
     #[command(subcommand)]
     Models(ModelsCommand),
@@ -97,6 +101,7 @@ pub fn run(cli: Cli) -> Exit {
         Command::Query(args) => query::run(&args, json),
         Command::Serve(args) => serve::run(&args),
         Command::Keys(command) => keys::run(&command, json),
+        Command::Store(command) => store::run(&command, progress.as_ref(), json),
         Command::Models(command) => models::run(&command, json),
         #[cfg(feature = "qdrant")]
         Command::Push(PushCommand::Qdrant(args)) => push::run(&args, progress.as_ref(), json),

@@ -39,6 +39,13 @@ impl HashingWriter {
     }
 }
 
+/// Returns the hash and length of a file's content, read piece by piece.
+pub(super) fn hash_of(path: &Path) -> io::Result<(Hash32, u64)> {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update_reader(File::open(path)?)?;
+    Ok((Hash32(*hasher.finalize().as_bytes()), hasher.count()))
+}
+
 /// Creates a folder durably, unless it is there.
 pub(super) fn ensure_folder(path: &Path) -> io::Result<()> {
     ensure_folder_unsynced(path)?;

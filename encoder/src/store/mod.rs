@@ -28,10 +28,12 @@ mod rotation;
 mod signed;
 #[cfg(test)]
 pub(crate) mod tests;
+mod verify;
 mod writer;
 
 pub use error::StoreError;
 pub use models::ModelsRecord;
 pub(crate) use reader::Stamp;
 pub use reader::{Extras, Published, StoreReader};
+pub use verify::{BadObject, Fault, Listing, Verified};
 pub use writer::{Pruned, Store};

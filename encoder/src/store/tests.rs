@@ -154,6 +154,15 @@ fn objects_are_named_by_content_and_kept() {
     fs_err::write(&path, b"cut").expect("writable");
     store.put_bytes(expected.as_bytes()).expect("room");
     assert_eq!(fs_err::read(&path).expect("there"), expected.as_bytes(), "a cut one is");
+    let mut flipped = expected.clone().into_bytes();
+    flipped[500] ^= 1;
+    fs_err::write(&path, flipped).expect("writable");
+    store.put_bytes(expected.as_bytes()).expect("room");
+    assert_eq!(
+        fs_err::read(&path).expect("there"),
+        expected.as_bytes(),
+        "a damaged one of the same length, too"
+    );
 
     let failed = store.put_object(|out| {
         out.write_all(b"half")?;
@@ -175,6 +184,11 @@ fn what_is_not_whole_is_not_published() {
     assert!(missing(store.publish(&manifest(1, &[(shards[0].0, 2)]), &Extras::new())));
     let extras = Extras::from([("field".to_owned(), nothing)]);
     assert!(missing(store.publish(&manifest(1, &shards), &extras)));
+    let path = reader::object_path(dir.path(), shards[0].0);
+    fs_err::write(&path, b"b").expect("writable");
+    let damaged = store.publish(&manifest(1, &shards), &Extras::new());
+    assert!(matches!(damaged, Err(StoreError::ObjectHash { .. })), "{damaged:?}");
+    fs_err::write(&path, b"a").expect("writable");
     let mut hostile = manifest(1, &shards);
     hostile.cells.push(hostile.cells[0].clone());
     assert!(matches!(store.publish(&hostile, &Extras::new()), Err(StoreError::Manifest { .. })));
@@ -427,4 +441,33 @@ fn models_are_remembered_for_their_encoder_alone() {
     assert_eq!(models(), Some(record.clone()));
     store.remember_models(&ModelsRecord { encoder: Hash32([9; 32]), ..record }).expect("writes");
     assert_eq!(models(), None);
+}
+
+#[test]
+fn verification_reads_every_byte_and_names_what_is_bad() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    let all = put_many(&store, &["shard one", "shard two", "field", "unlisted"]);
+    let extras = Extras::from([("field".to_owned(), all[2].0)]);
+    store.publish(&manifest(1, &all[..1]), &extras).expect("publishes");
+    store.publish(&manifest(2, &all[1..2]), &Extras::new()).expect("publishes");
+    let verify = || {
+        let n_read = std::sync::atomic::AtomicU64::new(0);
+        let reader = store.reader().expect("published");
+        let verified = reader.listing().verify(|| {
+            n_read.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+        });
+        assert_eq!((verified.n_objects, n_read.into_inner()), (3, 3));
+        verified
+    };
+    let sound = verify();
+    assert_eq!((sound.bad.len(), sound.len_bytes), (0, all[..3].iter().map(|(_, n)| n).sum()));
+    let path = |at: usize| reader::object_path(dir.path(), all[at].0);
+    fs_err::write(path(1), b"shard twO").expect("writable");
+    fs_err::remove_file(path(2)).expect("there");
+    let mut bad: Vec<_> = verify().bad.into_iter().map(|bad| (bad.holds, bad.fault)).collect();
+    bad.sort_by_key(|(holds, _)| holds.clone());
+    let expected =
+        [("cell 0, compact, generation 2", Fault::Damaged), ("field, generation 1", Fault::Missing)];
+    assert_eq!(bad, expected.map(|(holds, fault)| (vec![holds.to_owned()], fault)));
 }

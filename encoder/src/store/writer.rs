@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use ed25519_dalek::SigningKey;
+use rayon::prelude::*;
 use slag_common::Hash32;
 use slag_common::manifest::{CellRecord, Manifest, TrustedKeys};
 
@@ -31,7 +32,7 @@ const MANIFEST_KEY: &[u8] = b"manifest";
 const CELL_PREFIX: &[u8] = b"cell/";
 
 /// The result of [`Store::prune`].
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
 pub struct Pruned {
     /// Objects removed.
     pub n_objects: u64,
@@ -128,7 +129,7 @@ impl Store {
 
     /// Writes an object through a callback and returns its hash and length; safe from many threads.
     ///
-    /// The object is durable on return. An object that exists already is kept.
+    /// The object is durable on return. An object that is there already is kept if its content has its hash, else replaced.
     ///
     /// # Errors
     /// [`StoreError::Io`], from the callback too.
@@ -142,7 +143,7 @@ impl Store {
             out.finish()
         });
         let placed = written.and_then(|(hash, len_bytes)| {
-            self.place_object(&part, hash, len_bytes)?;
+            self.place_object(&part, hash)?;
             Ok((hash, len_bytes))
         });
         if placed.is_err() {
@@ -160,10 +161,12 @@ impl Store {
         self.put_object(|out| out.write_all(bytes))
     }
 
-    fn place_object(&self, part: &Path, hash: Hash32, len_bytes: u64) -> io::Result<()> {
+    fn place_object(&self, part: &Path, hash: Hash32) -> io::Result<()> {
         let path = reader::object_path(&self.dir, hash);
-        if fs_err::metadata(&path).is_ok_and(|found| found.len() == len_bytes) {
-            return fs_err::remove_file(part);
+        match files::hash_of(&path) {
+            Ok((found, _)) if found == hash => return fs_err::remove_file(part),
+            Ok(_) => tracing::warn!("{} was damaged; it is written anew", path.display()),
+            Err(_) => {}
         }
         files::move_into_place(part, &path)
     }
@@ -183,7 +186,7 @@ impl Store {
     /// key that it names is the store's, whatever `manifest` says.
     ///
     /// # Errors
-    /// [`StoreError::MissingObject`] if an object listed is not there in full,
+    /// [`StoreError::MissingObject`] if an object listed is not there in full, [`StoreError::ObjectHash`] if it is damaged,
     /// [`StoreError::Generation`] unless the generation is above the current one.
     pub fn publish(&self, manifest: &Manifest, extras: &Extras) -> Result<Hash32, StoreError> {
         let next_key = self.keys.next.as_ref().map(keys::public);
@@ -197,12 +200,11 @@ impl Store {
         extras: &Extras,
     ) -> Result<Hash32, StoreError> {
         let shards = manifest.cells.iter().flat_map(|cell| cell.shards.values());
-        for shard in shards {
-            self.check_object(shard.hash, Some(shard.len_bytes))?;
-        }
-        for hash in extras.values() {
-            self.check_object(*hash, None)?;
-        }
+        let shards = shards.map(|shard| (shard.hash, Some(shard.len_bytes)));
+        let all: BTreeSet<_> = shards.chain(extras.values().map(|hash| (*hash, None))).collect();
+        let check = |(hash, len_bytes): &(Hash32, Option<u64>)| self.check_object(*hash, *len_bytes);
+        let all: Vec<_> = all.into_iter().collect();
+        all.par_iter().map(check).collect::<Vec<_>>().into_iter().collect::<Result<(), _>>()?;
         let signed = manifest.sign(signer);
         let path = self.dir.join(signed::MANIFEST);
         let refuse = |cause| StoreError::Manifest { path: path.clone(), cause };
@@ -324,16 +326,17 @@ impl Store {
 
     fn check_object(&self, hash: Hash32, expected_bytes: Option<u64>) -> Result<(), StoreError> {
         let path = reader::object_path(&self.dir, hash);
-        let found_bytes = match fs_err::metadata(&path) {
-            Ok(found) => Some(found.len()),
-            Err(e) if e.kind() == io::ErrorKind::NotFound => None,
-            Err(e) => return Err(e.into()),
-        };
-        if found_bytes.is_none() || expected_bytes.is_some_and(|n| found_bytes != Some(n)) {
+        let missing = |path, found_bytes| {
             let expected_bytes = expected_bytes.unwrap_or(0);
-            return Err(StoreError::MissingObject { hash, path, expected_bytes, found_bytes });
+            Err(StoreError::MissingObject { hash, path, expected_bytes, found_bytes })
+        };
+        match files::hash_of(&path) {
+            Ok((_, n)) if expected_bytes.is_some_and(|expected| expected != n) => missing(path, Some(n)),
+            Ok((found, _)) if found != hash => Err(StoreError::ObjectHash { path, found }),
+            Ok(_) => Ok(()),
+            Err(e) if e.kind() == io::ErrorKind::NotFound => missing(path, None),
+            Err(e) => Err(e.into()),
         }
-        Ok(())
     }
 
     pub(super) fn replace(&self, path: &Path, bytes: &[u8]) -> Result<(), StoreError> {

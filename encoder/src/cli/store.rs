@@ -1,0 +1,136 @@
+//! `store`: what a store holds, whether it is whole, and what can go.
+
+use std::fmt;
+use std::path::PathBuf;
+
+use anyhow::Result;
+use clap::{Args, Subcommand};
+use serde::Serialize;
+use slag_common::Hash32;
+use slag_common::byte_size::ByteSize;
+
+use super::common::print;
+use super::exit::Exit;
+use crate::progress::Progress;
+use crate::store::{Fault, Published, Store, StoreReader, Verified};
+
+/// `store`.
+#[derive(Debug, Subcommand)]
+pub enum StoreCommand {
+    /// Lists the generations of a store with their cells and bytes.
+    Ls(StoreArgs),
+    /// Reads every byte that a store publishes, and names what is damaged or missing. `encode` writes it anew.
+    Verify(StoreArgs),
+    /// Removes what neither the current generation nor the one before it needs.
+    Gc(StoreArgs),
+}
+
+/// The store meant.
+#[derive(Debug, Args)]
+pub struct StoreArgs {
+    /// Store.
+    #[arg(long, value_name = "DIR")]
+    pub store: PathBuf,
+}
+
+pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    match command {
+        StoreCommand::Ls(at) => {
+            let reader = StoreReader::open(&at.store)?;
+            let of = |published: &Published| Generation::of(published);
+            let listed = Listed { current: of(reader.current()), previous: reader.previous().map(of) };
+            print(json, &listed, &listed)?;
+            Ok(Exit::Done)
+        }
+        StoreCommand::Verify(at) => {
+            let reader = StoreReader::open(&at.store)?;
+            let listing = reader.listing();
+            progress.begin("verify", "object", listing.n_objects() as u64, 0);
+            let verified = listing.verify(|| progress.advance(1));
+            progress.end();
+            print(json, &verified, Lines(&verified))?;
+            Ok(if verified.bad.is_empty() { Exit::Done } else { Exit::Failed })
+        }
+        StoreCommand::Gc(at) => {
+            // A mistyped path must not create a store.
+            StoreReader::open(&at.store)?;
+            let pruned = Store::create_or_open(&at.store)?.prune()?;
+            let lines = format!("{} objects removed, {}\n", pruned.n_objects, ByteSize(pruned.len_bytes));
+            print(json, &pruned, lines)?;
+            Ok(Exit::Done)
+        }
+    }
+}
+
+#[derive(Serialize)]
+struct Listed {
+    current: Generation,
+    previous: Option<Generation>,
+}
+
+#[derive(Serialize)]
+struct Generation {
+    scene: String,
+    generation: u64,
+    manifest_hash: Hash32,
+    created_unix_secs: u64,
+    expires_unix_secs: Option<u64>,
+    encoder: String,
+    n_cells: usize,
+    n_gaussians: u64,
+    n_objects: usize,
+    shard_bytes: u64,
+}
+
+impl Generation {
+    fn of(published: &Published) -> Self {
+        let manifest = &published.manifest;
+        let shards = published.shard_lens();
+        Self {
+            scene: manifest.scene.clone(),
+            generation: manifest.generation,
+            manifest_hash: published.hash,
+            created_unix_secs: manifest.created_unix_secs,
+            expires_unix_secs: manifest.expires_unix_secs,
+            encoder: manifest.encoder.name.clone(),
+            n_cells: manifest.cells.len(),
+            n_gaussians: manifest.cells.iter().map(|cell| u64::from(cell.n_gaussians)).sum(),
+            n_objects: shards.len() + published.extras.len(),
+            shard_bytes: shards.values().sum(),
+        }
+    }
+}
+
+impl fmt::Display for Listed {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for generation in std::iter::once(&self.current).chain(&self.previous) {
+            let Generation {
+                scene, generation, encoder, n_cells, n_gaussians, n_objects, shard_bytes, ..
+            } = generation;
+            let bytes = ByteSize(*shard_bytes);
+            writeln!(
+                f,
+                "generation {generation} of {scene}: {n_gaussians} Gaussians in {n_cells} cells by {encoder}, {n_objects} objects, {bytes} of shards"
+            )?;
+        }
+        Ok(())
+    }
+}
+
+struct Lines<'a>(&'a Verified);
+
+impl fmt::Display for Lines<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Verified { n_objects, len_bytes, bad } = self.0;
+        for object in bad {
+            let fault = match &object.fault {
+                Fault::Missing => "missing",
+                Fault::Damaged => "damaged",
+                Fault::Unreadable(error) => error,
+            };
+            writeln!(f, "{}: {fault} ({})", object.path.display(), object.holds.join("; "))?;
+        }
+        write!(f, "{n_objects} objects, {} read, {} bad", ByteSize(*len_bytes), bad.len())?;
+        writeln!(f, "{}", if bad.is_empty() { "" } else { "; encode again: what is bad is written anew" })
+    }
+}

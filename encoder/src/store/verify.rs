@@ -1,0 +1,110 @@
+//! Reads every byte of what a store publishes.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use rayon::prelude::*;
+use serde::Serialize;
+use slag_common::Hash32;
+
+use super::files;
+use super::reader::{Published, StoreReader};
+
+/// What is wrong with an object.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Fault {
+    /// It is not there.
+    Missing,
+    /// Its content has another hash or length than the manifest lists.
+    Damaged,
+    /// It cannot be read; the system's error.
+    Unreadable(String),
+}
+
+/// An object that robots or queries would fail on.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct BadObject {
+    /// Its hash.
+    pub hash: Hash32,
+    /// Its file.
+    pub path: PathBuf,
+    /// What is wrong.
+    pub fault: Fault,
+    /// What it holds, such as `cell 3, balanced, generation 2`.
+    pub holds: Vec<String>,
+}
+
+/// What was read, and what of it is bad.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Verified {
+    /// Objects that the current generation and the one before it list.
+    pub n_objects: usize,
+    /// Bytes read.
+    pub len_bytes: u64,
+    /// Bad ones, by hash.
+    pub bad: Vec<BadObject>,
+}
+
+/// The objects that a store publishes.
+pub struct Listing<'a> {
+    reader: &'a StoreReader,
+    /// What each holds, by hash and length if a manifest states it.
+    holds: BTreeMap<(Hash32, Option<u64>), Vec<String>>,
+}
+
+impl StoreReader {
+    /// Lists the objects of the current generation and the one before it.
+    pub fn listing(&self) -> Listing<'_> {
+        let mut holds: BTreeMap<_, Vec<String>> = BTreeMap::new();
+        for published in std::iter::once(self.current()).chain(self.previous()) {
+            for (hash, len_bytes, what) in contents(published) {
+                let generation = published.manifest.generation;
+                holds.entry((hash, len_bytes)).or_default().push(format!("{what}, generation {generation}"));
+            }
+        }
+        Listing { reader: self, holds }
+    }
+}
+
+impl Listing<'_> {
+    /// Returns the number of objects.
+    pub fn n_objects(&self) -> usize {
+        self.holds.len()
+    }
+
+    /// Reads every object, several at a time. `on_read`: called after each, from any thread.
+    pub fn verify(&self, on_read: impl Fn() + Sync) -> Verified {
+        let bytes_read = AtomicU64::new(0);
+        let check = |((hash, len_bytes), holds): (&(Hash32, Option<u64>), &Vec<String>)| {
+            let path = self.reader.object_path(*hash);
+            let fault = match files::hash_of(&path) {
+                Ok((found, n)) => {
+                    bytes_read.fetch_add(n, Ordering::Relaxed);
+                    let is_sound = found == *hash && len_bytes.is_none_or(|expected| expected == n);
+                    (!is_sound).then_some(Fault::Damaged)
+                }
+                Err(e) if e.kind() == io::ErrorKind::NotFound => Some(Fault::Missing),
+                Err(e) => Some(Fault::Unreadable(e.to_string())),
+            };
+            on_read();
+            fault.map(|fault| BadObject { hash: *hash, path, fault, holds: holds.clone() })
+        };
+        let bad = self.holds.par_iter().filter_map(check).collect();
+        Verified { n_objects: self.n_objects(), len_bytes: bytes_read.into_inner(), bad }
+    }
+}
+
+/// Lists the objects of a generation: hash, length if the manifest states it, and content.
+fn contents(published: &Published) -> Vec<(Hash32, Option<u64>, String)> {
+    let shards = published.manifest.cells.iter().flat_map(|cell| {
+        let of_profile = |(profile, shard): (&_, &slag_common::manifest::ShardRecord)| {
+            (shard.hash, Some(shard.len_bytes), format!("cell {}, {profile}", cell.cell_id))
+        };
+        cell.shards.iter().map(of_profile).collect::<Vec<_>>()
+    });
+    let extras = published.extras.iter().map(|(name, hash)| (*hash, None, name.clone()));
+    shards.chain(extras).collect()
+}
