@@ -1,6 +1,7 @@
 //! The adaptive split of a scene into cells.
 
 use glam::{DMat3, DQuat, DVec3};
+use rayon::prelude::*;
 use slag_common::Gaussians;
 use slag_common::frames::Aabb;
 
@@ -48,42 +49,16 @@ pub struct CellSplit {
     pub n_rejected: usize,
 }
 
+/// Gaussians from which the halves of a box are worth a thread each.
+const MIN_GAUSSIANS_TO_SHARE: usize = 1 << 13;
+
 /// Splits a scene: a box with too many Gaussians is cut at the median of its longest axis, a box that is too wide in the
 /// middle of it. The result depends only on the Gaussians and the limits.
 pub fn split(scene: &Gaussians, limits: CellLimits) -> CellSplit {
-    let mut indices: Vec<u32> = (0..scene.len() as u32).filter(|i| scene.is_usable(*i as usize)).collect();
+    let indices = (0..scene.len() as u32).into_par_iter();
+    let mut indices: Vec<u32> = indices.filter(|i| scene.is_usable(*i as usize)).collect();
     let n_rejected = scene.len() - indices.len();
-    let mut cells = Vec::new();
-    let mut rest: Vec<&mut [u32]> = vec![&mut indices];
-    while let Some(part) = rest.pop() {
-        if part.is_empty() {
-            continue;
-        }
-        let mean_bounds = bounds_of_means(scene, part);
-        let size = mean_bounds.size();
-        let axis = (0..3).max_by(|a, b| size[*a].total_cmp(&size[*b])).unwrap_or(0);
-        let coordinate = |i: &u32| scene.means_in_world[*i as usize][axis];
-        let too_wide =
-            limits.max_width.is_some_and(|max| size[axis] > max) && part.len() > MIN_GAUSSIANS_TO_NARROW;
-        let cut = if part.len() > limits.max_gaussians.max(1) {
-            let middle = part.len() / 2;
-            // Ties are broken by index: the halves are the same sets every time.
-            part.select_nth_unstable_by(middle, |a, b| {
-                coordinate(a).total_cmp(&coordinate(b)).then(a.cmp(b))
-            });
-            middle
-        } else if too_wide {
-            let plane = mean_bounds.centre()[axis];
-            part.sort_unstable_by(|a, b| coordinate(a).total_cmp(&coordinate(b)).then(a.cmp(b)));
-            part.partition_point(|i| coordinate(i) < plane)
-        } else {
-            cells.push(finish(scene, part, mean_bounds));
-            continue;
-        };
-        let (low, high) = part.split_at_mut(cut);
-        rest.push(high);
-        rest.push(low);
-    }
+    let cells = split_part(scene, &mut indices, limits);
     let mut cell_of_gaussian = vec![NO_CELL; scene.len()];
     let mut local_of_gaussian = vec![0; scene.len()];
     for (cell_id, cell) in cells.iter().enumerate() {
@@ -93,6 +68,41 @@ pub fn split(scene: &Gaussians, limits: CellLimits) -> CellSplit {
         }
     }
     CellSplit { cells, cell_of_gaussian, local_of_gaussian, n_rejected }
+}
+
+/// Returns the cells of a part, those of its lower half first.
+fn split_part(scene: &Gaussians, part: &mut [u32], limits: CellLimits) -> Vec<Cell> {
+    if part.is_empty() {
+        return Vec::new();
+    }
+    let mean_bounds = bounds_of_means(scene, part);
+    let size = mean_bounds.size();
+    let axis = (0..3).max_by(|a, b| size[*a].total_cmp(&size[*b])).unwrap_or(0);
+    let coordinate = |i: &u32| scene.means_in_world[*i as usize][axis];
+    let too_wide =
+        limits.max_width.is_some_and(|max| size[axis] > max) && part.len() > MIN_GAUSSIANS_TO_NARROW;
+    let cut = if part.len() > limits.max_gaussians.max(1) {
+        let middle = part.len() / 2;
+        // Ties are broken by index: the halves are the same sets every time.
+        part.select_nth_unstable_by(middle, |a, b| coordinate(a).total_cmp(&coordinate(b)).then(a.cmp(b)));
+        middle
+    } else if too_wide {
+        let plane = mean_bounds.centre()[axis];
+        part.sort_unstable_by(|a, b| coordinate(a).total_cmp(&coordinate(b)).then(a.cmp(b)));
+        part.partition_point(|i| coordinate(i) < plane)
+    } else {
+        return vec![finish(scene, part, mean_bounds)];
+    };
+    let is_shared = part.len() >= MIN_GAUSSIANS_TO_SHARE;
+    let (low, high) = part.split_at_mut(cut);
+    let (of_low, of_high) = (|| split_part(scene, low, limits), || split_part(scene, high, limits));
+    let (mut cells, high) = if is_shared { rayon::join(of_low, of_high) } else { serially(of_low, of_high) };
+    cells.extend(high);
+    cells
+}
+
+fn serially<A, B>(a: impl FnOnce() -> A, b: impl FnOnce() -> B) -> (A, B) {
+    (a(), b())
 }
 
 fn bounds_of_means(scene: &Gaussians, part: &[u32]) -> Aabb {

@@ -1,12 +1,23 @@
 //! Graph-based segmentation (Felzenszwalb and Huttenlocher, "Efficient Graph-Based Image Segmentation", IJCV 59(2),
 //! 2004): components of any weighted graph, grown over edges of ascending weight.
+//!
+//! Edges are decided one after the other, but few of them join anything. Those that cannot are dropped by all threads
+//! before, block by block: their ends are in one component already, or an end's component accepts no edge of that weight. Both
+//! stay so whatever is joined in between: components only grow, and one that refuses an edge refuses all heavier ones and
+//! so is never joined again. The result is that of deciding each edge in turn.
+
+use rayon::prelude::*;
 
 use crate::union_find::{Numbering, UnionFind};
 
+/// Edges that are looked at together.
+const BLOCK: usize = 1 << 17;
+
 /// Components of a graph while they grow.
 ///
-/// The caller visits the edges in ascending order of weight and calls [`Self::join_if_similar`] for each; a second
-/// visit with [`Self::join_if_small`] removes components that are too small.
+/// The caller visits the edges in ascending order of weight and calls [`Self::join_if_similar`] for each, or
+/// [`Self::join_all_similar`] for all; a second visit with [`Self::join_if_small`] or [`Self::join_all_small`] removes
+/// components that are too small.
 #[derive(Clone, Debug)]
 pub struct Components {
     sets: UnionFind,
@@ -58,6 +69,44 @@ impl Components {
         }
     }
 
+    /// Calls [`Self::join_if_similar`] for edges in ascending order of weight. `of`: ends and weight of an edge.
+    pub fn join_all_similar<E: Sync>(&mut self, edges: &[E], of: impl Fn(&E) -> (u32, u32, f32) + Sync) {
+        for block in edges.chunks(BLOCK) {
+            let components = &*self;
+            let may_join = |edge: &&E| {
+                let (a, b, weight) = of(edge);
+                let (a, b) = (components.sets.root_of(a), components.sets.root_of(b));
+                let threshold = components.thresholds[a as usize].min(components.thresholds[b as usize]);
+                a != b && weight <= threshold
+            };
+            let left: Vec<&E> = block.par_iter().filter(may_join).collect();
+            for (a, b, weight) in left.into_iter().map(&of) {
+                self.join_if_similar(a, b, weight);
+            }
+        }
+    }
+
+    /// Calls [`Self::join_if_small`] for edges in ascending order of weight. `of`: ends and weight of an edge.
+    pub fn join_all_small<E: Sync>(
+        &mut self,
+        edges: &[E],
+        of: impl Fn(&E) -> (u32, u32, f32) + Sync,
+        min_size: u32,
+    ) {
+        for block in edges.chunks(BLOCK) {
+            let components = &*self;
+            let may_join = |edge: &&E| {
+                let (a, b, _) = of(edge);
+                let (a, b) = (components.sets.root_of(a), components.sets.root_of(b));
+                a != b && components.sizes[a as usize].min(components.sizes[b as usize]) < min_size
+            };
+            let left: Vec<&E> = block.par_iter().filter(may_join).collect();
+            for (a, b, _) in left.into_iter().map(&of) {
+                self.join_if_small(a, b, min_size);
+            }
+        }
+    }
+
     /// Joins two components, given by their roots, whatever their weights; returns the root of both.
     pub fn join_roots(&mut self, a: u32, b: u32) -> u32 {
         let is_larger = self.sizes[a as usize] >= self.sizes[b as usize];
@@ -92,6 +141,32 @@ mod tests {
         edges.iter().for_each(|(_, a, b)| components.join_if_small(*a, *b, 2));
         let numbering = components.number(0..8);
         assert_eq!((numbering.of_item, numbering.sizes), (vec![0, 0, 0, 0, 1, 1, 1, 1], vec![4, 4]));
+    }
+
+    /// Oracle: each edge in turn. Weights repeat, so that equal ones come in one block.
+    #[test]
+    fn all_at_once_is_as_one_by_one() {
+        let mut random = crate::random::Random::new(17);
+        for (n, n_edges, scale) in [(40, 200, 0.3_f32), (5_000, 400_000, 0.02), (200_000, 900_000, 1.5)] {
+            let mut edge = || {
+                let a = random.below(n);
+                // Mostly near, so that components are regions and not one.
+                let b = (a + 1 + random.below(6)) % n;
+                ((random.below(1000) as f32) / 1000.0, a as u32, b as u32)
+            };
+            let mut edges: Vec<(f32, u32, u32)> = (0..n_edges).map(|_| edge()).collect();
+            edges.sort_by(|a, b| a.partial_cmp(b).expect("no NaN"));
+            let (mut one_by_one, mut at_once) = (Components::new(n, scale), Components::new(n, scale));
+            edges.iter().for_each(|(weight, a, b)| drop(one_by_one.join_if_similar(*a, *b, *weight)));
+            at_once.join_all_similar(&edges, |(weight, a, b)| (*a, *b, *weight));
+            let numbered = |components: &mut Components| components.number(0..n as u32);
+            let expected = numbered(&mut one_by_one);
+            assert!(expected.sizes.len() > n / 100 && expected.sizes.len() < n, "{}", expected.sizes.len());
+            assert_eq!(numbered(&mut at_once), expected);
+            edges.iter().for_each(|(_, a, b)| one_by_one.join_if_small(*a, *b, 30));
+            at_once.join_all_small(&edges, |(weight, a, b)| (*a, *b, *weight), 30);
+            assert_eq!(numbered(&mut at_once), numbered(&mut one_by_one));
+        }
     }
 
     /// The threshold of a component falls with its size: what one vertex accepts, ten do not.

@@ -35,6 +35,14 @@ impl UnionFind {
         item
     }
 
+    /// Returns the root of an item's set without shortening its path: several threads can ask at once.
+    pub fn root_of(&self, mut item: u32) -> u32 {
+        while self.parents[item as usize] != item {
+            item = self.parents[item as usize];
+        }
+        item
+    }
+
     /// Joins the set of the root `child` to the set of the root `root`, which remains a root.
     pub fn attach(&mut self, child: u32, root: u32) {
         self.parents[child as usize] = root;

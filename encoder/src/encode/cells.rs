@@ -1,7 +1,8 @@
 //! The third step: the contributions of all views become objects, fields and shards of every cell.
 //!
-//! Contributions are read and lifted cell by cell. Codebooks and shards are made of several cells at once, as many as the
-//! memory plan holds: much of a codebook is work that one thread does. A cell's bytes do not depend on the others'.
+//! One thread reads the contributions, cell by cell. Several cells at once are lifted and become codebooks and shards, as
+//! many as the memory plan holds: much of a codebook is work that one thread does. A cell's bytes do not depend on the
+//! others'.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -13,7 +14,7 @@ use slag_common::manifest::{Calibration, CellRecord, ShardRecord};
 use slag_common::shard::Profile;
 use slag_common::{Hash32, View};
 
-use super::context::RunContext;
+use super::context::{Phase, RunContext};
 use super::error::EncodeError;
 use super::job::ViewRecord;
 use super::plan::Plan;
@@ -30,8 +31,11 @@ use crate::objects::{self, ObjectsReport, SceneObjects};
 use crate::shard::{self, BuiltShard, CellEmbeddings};
 use crate::store::Extras;
 
-/// How long the thread that lifts sleeps while others hold all cells and leave it no work.
+/// How long the thread that reads sleeps while others hold all cells.
 const WAIT: Duration = Duration::from_micros(200);
+/// Cells at once below which that thread makes cells as well. Among many threads it only reads: while it made a cell, those
+/// that are done would wait for the next.
+const FEW_AT_ONCE: usize = 8;
 
 /// The cells of a scene, all objects of them in the store.
 pub(super) struct BuiltCells {
@@ -50,9 +54,18 @@ pub(super) struct BuiltCells {
     score_sums: [f64; 3],
 }
 
+/// A cell whose parts are being lifted.
+struct CellInWork {
+    embeddings: CellEmbeddings,
+    /// Fields in the store, by name.
+    fields: Vec<(String, Hash32)>,
+}
+
 /// A cell whose shards are in the store.
 struct FinishedCell {
     record: CellRecord,
+    /// As of the cell in work.
+    fields: Vec<(String, Hash32)>,
     n_subspaces: u32,
     n_without_evidence: u64,
     /// As of all cells.
@@ -71,6 +84,7 @@ pub(super) struct Counts {
 impl BuiltCells {
     fn add(&mut self, cell: FinishedCell) {
         self.records.push(cell.record);
+        self.extras.extend(cell.fields);
         self.n_subspaces.push(cell.n_subspaces);
         self.n_without_evidence += cell.n_without_evidence;
         self.score_sums.iter_mut().zip(cell.score_sums).for_each(|(all, of_cell)| *all += of_cell);
@@ -176,7 +190,8 @@ impl<'a> CellBuilder<'a> {
         index.reserve(&mut memory);
         Refinement::reserve_regions(&mut memory, &plan.settings.aggregation, table.len());
         let rest_bytes = memory.rest(index.largest_part_bytes())?;
-        let cell_bytes = shard::largest_cell_bytes(&plan.inputs.split, models.dim());
+        let cell_bytes =
+            shard::largest_cell_bytes(&plan.inputs.split, models.dim()) + index.largest_part_bytes();
         // Cells come second: contributions that are not kept in memory are read six times.
         let spare_bytes = rest_bytes - index.budget_bytes(rest_bytes);
         let n_more = (spare_bytes / cell_bytes.max(1)).min(context.pool().current_num_threads() as u64 - 1);
@@ -239,7 +254,9 @@ impl<'a> CellBuilder<'a> {
             score_sums: [0.0; 3],
         };
         // Objects are found from all masks alike, before refinement gives some less weight.
+        self.context.begin_phase(Phase::Objects);
         let objects = self.objects()?;
+        self.context.begin_phase(Phase::Refine);
         let aggregation = settings.aggregation;
         let refinement = self.context.time("refine", || {
             let contributions = (&self.index, &mut self.table);
@@ -256,8 +273,8 @@ impl<'a> CellBuilder<'a> {
         }
         let regions = store.put_object(|out| self.table.write(out))?.0;
         built.extras.insert(EXTRA_REGIONS.into(), regions);
-        let Some(finished) = self.build_shards(refinement.as_ref(), objects.as_ref(), &mut built.extras)?
-        else {
+        self.context.begin_phase(Phase::Cells);
+        let Some(finished) = self.build_shards(refinement.as_ref(), objects.as_ref())? else {
             return Ok(None);
         };
         finished.into_iter().for_each(|cell| built.add(cell));
@@ -265,7 +282,7 @@ impl<'a> CellBuilder<'a> {
         Ok(Some(built))
     }
 
-    /// Lifts the cells one after the other, and makes the shards of several at once; `None` if cancelled.
+    /// Lifts the cells and makes their shards, several at once; `None` if cancelled.
     ///
     /// # Errors
     /// [`EncodeError`]: of the first cell that failed.
@@ -273,40 +290,47 @@ impl<'a> CellBuilder<'a> {
         &self,
         refinement: Option<&Refinement>,
         objects: Option<&SceneObjects>,
-        extras: &mut Extras,
     ) -> Result<Option<Vec<FinishedCell>>, EncodeError> {
         let dim = self.table.dim();
-        let empty = || CellEmbeddings { dim, vectors: Vec::new(), has_evidence: Vec::new() };
+        let empty = || CellInWork {
+            embeddings: CellEmbeddings { dim, vectors: Vec::new(), has_evidence: Vec::new() },
+            fields: Vec::new(),
+        };
         // The vectors of a large cell are allocated once and used again; they are neither copied nor cleared.
-        let free: Mutex<Vec<CellEmbeddings>> = Mutex::new((0..self.n_at_once).map(|_| empty()).collect());
+        let free: Mutex<Vec<CellInWork>> = Mutex::new((0..self.n_at_once).map(|_| empty()).collect());
+        let is_helping = self.n_at_once < FEW_AT_ONCE;
         let finished: Mutex<BTreeMap<u32, Result<FinishedCell, EncodeError>>> = Mutex::default();
         let has_failed = AtomicBool::new(false);
         let is_stopped = || self.context.is_cancelled() || has_failed.load(Ordering::Relaxed);
         rayon::scope(|scope| -> Result<(), EncodeError> {
             let mut parts = self.index.transposed_parts(&self.table, self.group_bytes);
-            let mut cell = take_when_free(&free);
+            let mut cell = take_when_free(&free, is_helping);
             while let Some(contributions) = self.context.time("merge", || parts.next()) {
                 if is_stopped() {
                     break;
                 }
                 let contributions = contributions?;
                 let cell_id = contributions.part.cell_id;
-                self.add_part(contributions, refinement, &mut cell, extras)?;
-                if cell.has_evidence.len() < self.plan.inputs.split.cells[cell_id as usize].gaussians.len() {
+                let n_gaussians = self.plan.inputs.split.cells[cell_id as usize].gaussians.len();
+                if contributions.part.locals.end < n_gaussians {
+                    // A large cell comes in parts, so that only one of them is held.
+                    self.add_part(contributions, refinement, &mut cell)?;
                     continue;
                 }
                 let (free, finished, has_failed) = (&free, &finished, &has_failed);
                 scope.spawn(move |_| {
                     if !is_stopped() {
-                        let result = self.finish_cell(cell_id, &cell, objects);
+                        let added = self.add_part(contributions, refinement, &mut cell);
+                        let result = added.and_then(|()| self.finish_cell(cell_id, &mut cell, objects));
                         has_failed.fetch_or(result.is_err(), Ordering::Relaxed);
                         locked(finished).insert(cell_id, result);
                         self.context.progress().advance(1);
                     }
-                    cell.has_evidence.clear();
+                    cell.embeddings.has_evidence.clear();
+                    cell.fields.clear();
                     locked(free).push(cell);
                 });
-                cell = take_when_free(free);
+                cell = take_when_free(free, is_helping);
             }
             Ok(())
         })?;
@@ -320,11 +344,11 @@ impl<'a> CellBuilder<'a> {
         &self,
         mut contributions: PartContributions,
         refinement: Option<&Refinement>,
-        cell: &mut CellEmbeddings,
-        extras: &mut Extras,
+        cell: &mut CellInWork,
     ) -> Result<(), EncodeError> {
         let part = contributions.part.clone();
         let gaussians = &self.plan.inputs.split.cells[part.cell_id as usize].gaussians;
+        let CellInWork { embeddings: cell, fields } = cell;
         let len = cell.vectors.len().max(gaussians.len() * cell.dim);
         cell.vectors.reserve_exact(len - cell.vectors.len());
         cell.vectors.resize(len, 0.0);
@@ -337,7 +361,7 @@ impl<'a> CellBuilder<'a> {
         });
         cell.has_evidence.extend((0..field.len()).map(|k| field.has_evidence(k)));
         let (hash, _) = self.context.time("write", || self.plan.store.put_object(|out| field.write(out)))?;
-        extras.insert(extra_field(part.cell_id, part.number), hash);
+        fields.push((extra_field(part.cell_id, part.number), hash));
         Ok(())
     }
 
@@ -345,12 +369,13 @@ impl<'a> CellBuilder<'a> {
     fn finish_cell(
         &self,
         cell_id: u32,
-        embeddings: &CellEmbeddings,
+        in_work: &mut CellInWork,
         objects: Option<&SceneObjects>,
     ) -> Result<FinishedCell, EncodeError> {
         let cell = &self.plan.inputs.split.cells[cell_id as usize];
         let (scene, settings) = (&self.plan.inputs.scene, &self.plan.settings.cells.shards);
         let encoder_id = self.encoder_id;
+        let embeddings = &in_work.embeddings;
         let made = self.context.time("codebook", || {
             shard::build(scene, cell_id, cell, embeddings, encoder_id, &self.score_context, settings, objects)
         });
@@ -375,6 +400,7 @@ impl<'a> CellBuilder<'a> {
                 n_gaussians: cell.gaussians.len() as u32,
                 shards,
             },
+            fields: std::mem::take(&mut in_work.fields),
             n_subspaces: made.n_subspaces,
             n_without_evidence: made.n_without_evidence as u64,
             score_sums: [made.moments.mean * n_with, made.moments.mean_square * n_with, n_with],
@@ -386,13 +412,13 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Takes an item, or does other work of this run until one is free.
-fn take_when_free<T>(free: &Mutex<Vec<T>>) -> T {
+/// Takes an item once one is free; until then does other work of this run if `is_helping`.
+fn take_when_free<T>(free: &Mutex<Vec<T>>, is_helping: bool) -> T {
     loop {
         let item = locked(free).pop();
         match item {
             Some(item) => return item,
-            None if rayon::yield_now() == Some(rayon::Yield::Executed) => {}
+            None if is_helping && rayon::yield_now() == Some(rayon::Yield::Executed) => {}
             None => std::thread::sleep(WAIT),
         }
     }

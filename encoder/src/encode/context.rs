@@ -8,6 +8,7 @@ use std::time::Instant;
 use rayon::ThreadPool;
 
 use super::error::EncodeError;
+use super::report::PhaseReport;
 use crate::progress::Progress;
 
 /// Stack of a worker thread: while it waits for others' part of its work, a worker may take up another view.
@@ -17,6 +18,39 @@ const STACK_BYTES: usize = 8 << 20;
 #[derive(Default)]
 struct StageTimes(Mutex<BTreeMap<&'static str, f64>>);
 
+/// A part of a run, one after the other.
+#[derive(Clone, Copy)]
+pub(super) enum Phase {
+    /// Scene and poses are read and split into cells.
+    Read,
+    /// What is to do is decided, and what is done is found.
+    Plan,
+    /// Views are segmented, embedded and rasterised.
+    Views,
+    /// The views' contributions are opened.
+    Merge,
+    Objects,
+    Refine,
+    /// Cells become codebooks and shards.
+    Cells,
+    Publish,
+}
+
+impl Phase {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Read => "read",
+            Self::Plan => "plan",
+            Self::Views => "views",
+            Self::Merge => "merge",
+            Self::Objects => "objects",
+            Self::Refine => "refine",
+            Self::Cells => "cells",
+            Self::Publish => "publish",
+        }
+    }
+}
+
 /// The state that the steps of one run share.
 ///
 /// Threads belong to the run: two encodes in one process do not share them, and rayon's global pool stays as it is.
@@ -25,6 +59,8 @@ pub(super) struct RunContext<'a> {
     progress: &'a dyn Progress,
     cancel: &'a AtomicBool,
     times: StageTimes,
+    /// When each phase began.
+    phases: Mutex<Vec<(Phase, Instant)>>,
     pool: ThreadPool,
 }
 
@@ -41,7 +77,24 @@ impl<'a> RunContext<'a> {
         let start = Instant::now();
         let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).stack_size(STACK_BYTES).build();
         let pool = pool.map_err(|source| EncodeError::Threads { n_threads, source })?;
-        Ok(Self { start, progress, cancel, times: StageTimes::default(), pool })
+        let phases = Mutex::new(vec![(Phase::Read, start)]);
+        Ok(Self { start, progress, cancel, times: StageTimes::default(), phases, pool })
+    }
+
+    /// Ends the present phase and begins the next.
+    pub(super) fn begin_phase(&self, phase: Phase) {
+        self.phases.lock().unwrap_or_else(PoisonError::into_inner).push((phase, Instant::now()));
+    }
+
+    /// Returns the phases so far, of which the last one ends at `end`: they add up to the time since the start.
+    pub(super) fn phases(&self, end: Instant) -> Vec<PhaseReport> {
+        let phases = self.phases.lock().unwrap_or_else(PoisonError::into_inner);
+        let ends = phases.iter().skip(1).map(|(_, began)| *began).chain([end]);
+        let report = |((phase, began), ended): (&(Phase, Instant), Instant)| PhaseReport {
+            phase: phase.name().to_owned(),
+            secs: ended.duration_since(*began).as_secs_f64(),
+        };
+        phases.iter().zip(ends).map(report).collect()
     }
 
     /// Returns when the run began.

@@ -33,14 +33,14 @@ use std::sync::atomic::AtomicBool;
 
 use crate::progress::Progress;
 use crate::store::Store;
-use context::RunContext;
+use context::{Phase, RunContext};
 
 pub use crate::memory::{MemoryError, Reservation};
 pub use engines::{Engines, Perturbation};
 pub use error::EncodeError;
 pub use inputs::count_inputs;
 pub use preset::{Choices, Preset};
-pub use report::{CellReport, EncodeSummary, SkippedView, StageReport, ViewsReport};
+pub use report::{CellReport, EncodeSummary, PhaseReport, SkippedView, StageReport, ViewsReport};
 pub use settings::{
     CellSettings, DEFAULT_MASK_LEVELS, EncodeSettings, InputSettings, Masks, OutputSettings, RasterWidth,
     Regions, RunSettings, ViewOrder, ViewSettings, ViewsLimit,
@@ -61,8 +61,12 @@ pub fn encode(
     // First of all, so that a second encode into the same store fails at once.
     let store = Store::create_or_open(&settings.output.store)?;
     let inputs = inputs::Inputs::read(settings, &context)?;
+    context.begin_phase(Phase::Plan);
     let plan = plan::plan(settings, engines, &store, &inputs, &context)?;
+    context.begin_phase(Phase::Views);
     let views = views::run_views(&plan, &context)?;
+    context.begin_phase(Phase::Merge);
     let built = context.install(|| cells::build_cells(&plan, &views, &context))?;
+    context.begin_phase(Phase::Publish);
     publish::publish(plan, views, built, &context)
 }

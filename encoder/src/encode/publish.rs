@@ -1,6 +1,7 @@
 //! The last step: the manifest is signed and becomes the store's current generation.
 
 use std::collections::BTreeMap;
+use std::time::Instant;
 
 use slag_common::Hash32;
 use slag_common::manifest::{self, Calibration, CellRecord, EncoderRecord, Manifest};
@@ -41,7 +42,9 @@ pub(super) fn publish(
     for stage in &summary.view_stages {
         *summary.busy_secs.entry(stage.stage.clone()).or_default() += stage.busy_secs;
     }
-    summary.wall_secs = context.start().elapsed().as_secs_f64();
+    let end = Instant::now();
+    summary.wall_secs = end.duration_since(context.start()).as_secs_f64();
+    summary.phases = context.phases(end);
     Ok(summary)
 }
 
@@ -107,6 +110,7 @@ fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: 
         views: views_report,
         busy_secs: BTreeMap::new(),
         view_stages: views.stages.clone(),
+        phases: Vec::new(),
         views_secs: views.secs,
         wall_secs: 0.0,
         images_on: views.images_on.clone(),

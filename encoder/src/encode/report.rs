@@ -66,6 +66,15 @@ pub struct StageReport {
     pub busy_share: f64,
 }
 
+/// A part of the run. The parts follow each other and add up to the run's time.
+#[derive(Clone, Debug, Serialize)]
+pub struct PhaseReport {
+    /// The part: read, plan, views, merge, objects, refine, cells, publish.
+    pub phase: String,
+    /// Seconds.
+    pub secs: f64,
+}
+
 /// The result of an encode.
 #[derive(Clone, Debug, Serialize)]
 pub struct EncodeSummary {
@@ -115,6 +124,8 @@ pub struct EncodeSummary {
     pub busy_secs: BTreeMap<String, f64>,
     /// The load of the views' stages, in their order.
     pub view_stages: Vec<StageReport>,
+    /// The parts of the run, in their order.
+    pub phases: Vec<PhaseReport>,
     /// Seconds from the first view to the last.
     pub views_secs: f64,
     /// Seconds from start to end.

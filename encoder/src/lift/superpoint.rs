@@ -140,12 +140,9 @@ impl Graph {
     /// Partitions the scene. `settings`: scale and smallest size.
     pub fn superpoints(&self, settings: &SuperpointSettings) -> Superpoints {
         let mut components = Components::new(self.n_gaussians, settings.scale);
-        for (length, a, b) in &self.edges {
-            components.join_if_similar(*a, *b, f32::from_bits(*length));
-        }
-        for (_, a, b) in &self.edges {
-            components.join_if_small(*a, *b, settings.min_gaussians);
-        }
+        let edge = |(length, a, b): &Edge| (*a, *b, f32::from_bits(*length));
+        components.join_all_similar(&self.edges, edge);
+        components.join_all_small(&self.edges, edge, settings.min_gaussians);
         let Numbering { of_item, sizes } = components.number(self.usable.iter().copied());
         Superpoints { of_gaussian: of_item, n: sizes.len() }
     }

@@ -49,19 +49,23 @@ impl SuperpointSums {
     /// Adds the contributions of a part's Gaussians.
     pub(super) fn add(&mut self, contributions: &PartContributions, gaussians: &[u32]) {
         let superpoint_of = |k: u32| self.superpoints.of_gaussian[gaussians[k as usize] as usize];
-        let mut members: Vec<u32> =
-            (0..gaussians.len() as u32).filter(|k| superpoint_of(*k) != NO_SUPERPOINT).collect();
-        members.sort_by_key(|k| superpoint_of(*k));
-        let of_superpoint = |members: &[u32]| -> (usize, Vec<(u32, f32)>) {
+        // By superpoint, then by Gaussian.
+        let mut members: Vec<(u32, u32)> = (0..gaussians.len() as u32)
+            .into_par_iter()
+            .map(|k| (superpoint_of(k), k))
+            .filter(|(superpoint, _)| *superpoint != NO_SUPERPOINT)
+            .collect();
+        members.par_sort_unstable();
+        let of_superpoint = |members: &[(u32, u32)]| -> (usize, Vec<(u32, f32)>) {
             let mut entries = Vec::new();
-            for k in members {
+            for (_, k) in members {
                 let of_gaussian = contributions.entries_of(*k as usize);
                 let regions = contributions.regions[of_gaussian.clone()].iter().copied();
                 entries.extend(regions.zip(contributions.weights[of_gaussian].iter().copied()));
             }
-            (superpoint_of(members[0]) as usize, summed_by_key(entries))
+            (members[0].0 as usize, summed_by_key(entries))
         };
-        let runs: Vec<&[u32]> = members.chunk_by(|a, b| superpoint_of(*a) == superpoint_of(*b)).collect();
+        let runs: Vec<&[(u32, u32)]> = members.chunk_by(|a, b| a.0 == b.0).collect();
         let of_part: Vec<(usize, Vec<(u32, f32)>)> = runs.into_par_iter().map(of_superpoint).collect();
         of_part.into_iter().for_each(|(superpoint, entries)| self.regions[superpoint].extend(entries));
     }
