@@ -186,6 +186,8 @@ fn what_is_not_whole_is_not_published() {
     assert!(missing(store.publish(&manifest(1, &shards), &extras)));
     let path = reader::object_path(dir.path(), shards[0].0);
     fs_err::write(&path, b"b").expect("writable");
+    drop(store);
+    let store = Store::create_or_open(dir.path()).expect("opens");
     let damaged = store.publish(&manifest(1, &shards), &Extras::new());
     assert!(matches!(damaged, Err(StoreError::ObjectHash { .. })), "{damaged:?}");
     fs_err::write(&path, b"a").expect("writable");

@@ -4,10 +4,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use ed25519_dalek::SigningKey;
-use rayon::prelude::*;
 use slag_common::Hash32;
 use slag_common::manifest::{CellRecord, Manifest, TrustedKeys};
 
@@ -48,6 +48,8 @@ pub struct Store {
     published: sled::Tree,
     pub(super) keys: Keys,
     n_parts: AtomicU64,
+    /// Objects whose content this writer has hashed.
+    read: Mutex<BTreeSet<Hash32>>,
 }
 
 impl Store {
@@ -89,7 +91,7 @@ impl Store {
             db.open_tree(PUBLISHED_TREE).map_err(|cause| StoreError::Records { path: db_path, cause })?;
         let n_parts = AtomicU64::new(0);
         let keys = Keys::load_or_make(dir)?;
-        let store = Self { dir: dir.to_owned(), db, published, keys, n_parts };
+        let store = Self { dir: dir.to_owned(), db, published, keys, n_parts, read: Mutex::default() };
         store.repair_records()?;
         Ok(store)
     }
@@ -164,11 +166,16 @@ impl Store {
     fn place_object(&self, part: &Path, hash: Hash32) -> io::Result<()> {
         let path = reader::object_path(&self.dir, hash);
         match files::hash_of(&path) {
-            Ok((found, _)) if found == hash => return fs_err::remove_file(part),
-            Ok(_) => tracing::warn!("{} was damaged; it is written anew", path.display()),
-            Err(_) => {}
+            Ok((found, _)) if found == hash => fs_err::remove_file(part)?,
+            found => {
+                if found.is_ok() {
+                    tracing::warn!("{} was damaged; it is written anew", path.display());
+                }
+                files::move_into_place(part, &path)?;
+            }
         }
-        files::move_into_place(part, &path)
+        self.note_read(hash);
+        Ok(())
     }
 
     /// Returns the generation that the next published manifest should have.
@@ -201,10 +208,9 @@ impl Store {
     ) -> Result<Hash32, StoreError> {
         let shards = manifest.cells.iter().flat_map(|cell| cell.shards.values());
         let shards = shards.map(|shard| (shard.hash, Some(shard.len_bytes)));
-        let all: BTreeSet<_> = shards.chain(extras.values().map(|hash| (*hash, None))).collect();
-        let check = |(hash, len_bytes): &(Hash32, Option<u64>)| self.check_object(*hash, *len_bytes);
-        let all: Vec<_> = all.into_iter().collect();
-        all.par_iter().map(check).collect::<Vec<_>>().into_iter().collect::<Result<(), _>>()?;
+        for (hash, len_bytes) in shards.chain(extras.values().map(|hash| (*hash, None))) {
+            self.check_object(hash, len_bytes)?;
+        }
         let signed = manifest.sign(signer);
         let path = self.dir.join(signed::MANIFEST);
         let refuse = |cause| StoreError::Manifest { path: path.clone(), cause };
@@ -330,13 +336,26 @@ impl Store {
             let expected_bytes = expected_bytes.unwrap_or(0);
             Err(StoreError::MissingObject { hash, path, expected_bytes, found_bytes })
         };
-        match files::hash_of(&path) {
+        let is_read = self.read.lock().unwrap_or_else(PoisonError::into_inner).contains(&hash);
+        let found = match is_read {
+            // Written or read by this writer: only its being there is in question.
+            true => fs_err::metadata(&path).map(|found| (hash, found.len())),
+            false => files::hash_of(&path),
+        };
+        match found {
             Ok((_, n)) if expected_bytes.is_some_and(|expected| expected != n) => missing(path, Some(n)),
             Ok((found, _)) if found != hash => Err(StoreError::ObjectHash { path, found }),
-            Ok(_) => Ok(()),
+            Ok(_) => {
+                self.note_read(hash);
+                Ok(())
+            }
             Err(e) if e.kind() == io::ErrorKind::NotFound => missing(path, None),
             Err(e) => Err(e.into()),
         }
+    }
+
+    fn note_read(&self, hash: Hash32) {
+        self.read.lock().unwrap_or_else(PoisonError::into_inner).insert(hash);
     }
 
     pub(super) fn replace(&self, path: &Path, bytes: &[u8]) -> Result<(), StoreError> {
