@@ -43,7 +43,9 @@ fn tests_named(text: &str) -> Vec<&str> {
 fn every_test_that_the_documents_name_exists() {
     let mut known = BTreeSet::new();
     FOLDERS.iter().for_each(|folder| collect(&root().join(folder), &mut known));
-    for (document, n_least) in [("formats.md", 20), ("numerics.md", 40), ("accuracy.md", 5)] {
+    for (document, n_least) in
+        [("formats.md", 20), ("numerics.md", 40), ("accuracy.md", 5), ("security.md", 20)]
+    {
         let text = fs_err::read_to_string(root().join("docs").join(document)).expect("the document");
         let named = tests_named(&text);
         assert!(named.len() >= n_least, "{document} names {} tests", named.len());

@@ -158,7 +158,9 @@ mod tests {
             let mut edges: Vec<(f32, u32, u32)> = (0..n_edges).map(|_| edge()).collect();
             edges.sort_by(|a, b| a.partial_cmp(b).expect("no NaN"));
             let (mut one_by_one, mut at_once) = (Components::new(n, scale), Components::new(n, scale));
-            edges.iter().for_each(|(weight, a, b)| drop(one_by_one.join_if_similar(*a, *b, *weight)));
+            for (weight, a, b) in &edges {
+                one_by_one.join_if_similar(*a, *b, *weight);
+            }
             at_once.join_all_similar(&edges, |(weight, a, b)| (*a, *b, *weight));
             let numbered = |components: &mut Components| components.number(0..n as u32);
             let expected = numbered(&mut one_by_one);
