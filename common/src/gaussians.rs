@@ -41,6 +41,14 @@ impl Gaussians {
         self.means_in_world.is_empty()
     }
 
+    /// Returns the bytes that the columns take.
+    pub fn len_bytes(&self) -> u64 {
+        let Self { means_in_world, rotations_wxyz, scales, opacities, sh_dc, sh_rest, sh_degree: _ } = self;
+        let shape = size_of_val(&**means_in_world) + size_of_val(&**rotations_wxyz) + size_of_val(&**scales);
+        let colour = size_of_val(&**opacities) + size_of_val(&**sh_dc) + size_of_val(&**sh_rest);
+        (shape + colour) as u64
+    }
+
     /// Returns the number of higher coefficients per colour channel of a Gaussian.
     pub fn sh_rest_per_channel(degree: u8) -> usize {
         (usize::from(degree) + 1).pow(2) - 1

@@ -5,6 +5,8 @@ use rayon::prelude::*;
 use slag_common::Gaussians;
 use slag_common::frames::Aabb;
 
+use crate::memory::{MemoryPlan, Phase};
+
 /// Marks a Gaussian that no cell holds in [`CellSplit::cell_of_gaussian`].
 pub const NO_CELL: u32 = u32::MAX;
 
@@ -47,6 +49,17 @@ pub struct CellSplit {
     pub local_of_gaussian: Vec<u32>,
     /// Unusable Gaussians.
     pub n_rejected: usize,
+}
+
+impl CellSplit {
+    /// Reserves the partition: each Gaussian's cell, its index there, and its place in the cell's list.
+    pub fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
+        memory.reserve(
+            Phase::Always,
+            "the cell of each Gaussian",
+            (n_gaussians * 3 * size_of::<u32>()) as u64,
+        );
+    }
 }
 
 /// Gaussians from which the halves of a box are worth a thread each.

@@ -11,6 +11,8 @@ use std::fmt;
 pub enum Phase {
     /// From the first view to the end.
     Always,
+    /// While views are worked on.
+    Views,
     /// While objects are found.
     Objects,
     /// While masks and superpoints are weighed.
@@ -38,6 +40,8 @@ pub struct MemoryError {
     pub needed_bytes: u64,
     /// Whether no view was done yet.
     pub is_before_views: bool,
+    /// The step that needs the most.
+    phase: Phase,
     /// The reservations that are held at the same time, largest first.
     pub parts: Vec<Reservation>,
 }
@@ -46,10 +50,15 @@ impl std::error::Error for MemoryError {}
 
 impl fmt::Display for MemoryError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { available_bytes, needed_bytes, is_before_views, parts } = self;
-        let (when, or_else) = match is_before_views {
-            true => ("before the first view", " or lower --cell-gaussians"),
-            false => ("for the contributions of all views", ""),
+        let Self { available_bytes, needed_bytes, is_before_views, phase, parts } = self;
+        let when = match is_before_views {
+            true => "at least",
+            false => "for the contributions of all views",
+        };
+        let or_else = match (is_before_views, phase) {
+            (true, Phase::Views) => " or lower --threads",
+            (true, Phase::Cells) => " or lower --cell-gaussians",
+            _ => "",
         };
         let parts = parts.iter().map(|part| format!("{} for {}", part.len_bytes, part.purpose));
         let parts = parts.collect::<Vec<_>>().join(", ");
@@ -60,9 +69,9 @@ impl fmt::Display for MemoryError {
 
 /// The reservations of a run, within a budget.
 ///
-/// The plan covers cells, codebooks, objects, superpoints, mask vectors and contributions. It does not cover the scene
-/// itself, the photos in work (as many as threads), and the lists of similar masks from which objects are found: their
-/// length is known only once they are made.
+/// The plan covers the scene, the photos in work, cells, codebooks, objects, superpoints, mask vectors and
+/// contributions. It does not cover models, and the lists of similar masks from which objects are found: their length is
+/// known only once they are made.
 #[derive(Clone, Debug)]
 pub struct MemoryPlan {
     available_bytes: u64,
@@ -91,14 +100,15 @@ impl MemoryPlan {
     /// # Errors
     /// [`MemoryError`] if `contributions_bytes` do not fit beside the reservations of some phase.
     pub fn rest(&self, contributions_bytes: u64) -> Result<u64, MemoryError> {
-        let phases = [Phase::Objects, Phase::Refine, Phase::Cells];
+        let phases = [Phase::Views, Phase::Objects, Phase::Refine, Phase::Cells];
+        let phases = &phases[usize::from(!self.is_before_views)..];
         let held = |phase: Phase| {
             let of_phase =
                 self.reservations.iter().filter(move |r| r.phase == phase || r.phase == Phase::Always);
             of_phase.copied()
         };
         let len = |phase: Phase| held(phase).fold(0u64, |sum, r| sum.saturating_add(r.len_bytes));
-        let most = phases.into_iter().max_by_key(|phase| len(*phase)).unwrap_or(Phase::Always);
+        let most = phases.iter().copied().max_by_key(|phase| len(*phase)).unwrap_or(Phase::Always);
         let needed_bytes = len(most).saturating_add(contributions_bytes);
         if needed_bytes <= self.available_bytes {
             return Ok(self.available_bytes - len(most));
@@ -112,7 +122,7 @@ impl MemoryPlan {
             held(most).chain([contributions]).filter(|r| r.len_bytes > 0).collect();
         parts.sort_by_key(|r| std::cmp::Reverse(r.len_bytes));
         let Self { available_bytes, is_before_views, .. } = *self;
-        Err(MemoryError { available_bytes, needed_bytes, is_before_views, parts })
+        Err(MemoryError { available_bytes, needed_bytes, is_before_views, phase: most, parts })
     }
 }
 
@@ -123,6 +133,7 @@ mod tests {
     fn plan(available_bytes: u64) -> MemoryPlan {
         let mut plan = MemoryPlan::new(available_bytes);
         plan.reserve(Phase::Always, "masks", 20);
+        plan.reserve(Phase::Views, "photos", 40);
         plan.reserve(Phase::Refine, "superpoints", 30);
         plan.reserve(Phase::Cells, "the largest cell", 50);
         plan
@@ -136,12 +147,27 @@ mod tests {
         assert_eq!(MemoryPlan::new(7).rest(7), Ok(7));
     }
 
+    /// Photos are gone once the views are done; until then fewer threads hold fewer of them.
+    #[test]
+    fn photos_count_until_the_views_are_done() {
+        let mut plan = plan(100);
+        plan.reserve(Phase::Views, "more photos", 41);
+        let message = plan.rest(0).expect_err("too small").to_string();
+        assert_eq!(
+            message,
+            "--memory is 100 bytes, 101 are needed at least: 41 for more photos, 40 for photos, 20 for masks; \
+             raise --memory or lower --threads"
+        );
+        plan.views_are_done();
+        assert_eq!(plan.rest(30), Ok(30));
+    }
+
     #[test]
     fn a_budget_that_is_too_small_is_refused_with_each_part() {
         let message = plan(99).rest(30).expect_err("too small").to_string();
         assert_eq!(
             message,
-            "--memory is 99 bytes, 100 are needed before the first view: 50 for the largest cell, \
+            "--memory is 99 bytes, 100 are needed at least: 50 for the largest cell, \
              30 for contributions of a part of a cell, 20 for masks; raise --memory or lower --cell-gaussians"
         );
         let mut later = plan(99);

@@ -12,8 +12,6 @@ use anyhow::{Context, Result, anyhow};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
 use serde::Serialize;
-use slag_common::ByteSize;
-use slag_common::byte_size::ByteSizeError;
 use slag_common::shard::Profile;
 use slag_models::commands::{self, RunArgs};
 use slag_models::session::SessionError;
@@ -226,18 +224,6 @@ pub fn runtime() -> Result<tokio::runtime::Runtime> {
         .context("cannot start the service's threads")
 }
 
-/// Least working memory, bytes.
-const MIN_MEMORY_BYTES: u64 = 64 << 20;
-
-/// Reads the size of the working memory, see [`ByteSize`].
-pub fn parse_memory(text: &str) -> Result<u64, String> {
-    let ByteSize(bytes) = text.parse().map_err(|e: ByteSizeError| e.to_string())?;
-    if bytes < MIN_MEMORY_BYTES {
-        return Err(format!("{text:?} is too little; expected at least 64MiB"));
-    }
-    Ok(bytes)
-}
-
 /// Returns the parser of profiles, whose names the help text lists.
 pub fn profile_parser() -> impl TypedValueParser<Value = Profile> {
     PossibleValuesParser::new(Profile::ALL.map(Profile::name)).try_map(|name| name.parse::<Profile>())
@@ -248,20 +234,5 @@ pub fn parse_error(text: &str) -> Result<f32, String> {
     match text.parse::<f32>() {
         Ok(error) if error >= 0.0 && error.is_finite() => Ok(error),
         _ => Err("expected a share of the spread of scores, for example 0.1".into()),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn memory_has_a_least_size() {
-        assert_eq!(parse_memory("64MiB"), Ok(67_108_864));
-        assert_eq!(
-            parse_memory("67108863"),
-            Err("\"67108863\" is too little; expected at least 64MiB".into())
-        );
-        assert_eq!(parse_memory("GB"), Err("unit \"GB\": expected none, KiB, MiB or GiB".into()));
     }
 }

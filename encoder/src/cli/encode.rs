@@ -9,9 +9,10 @@ use slag_common::shard::Profile;
 
 use super::common::{
     BackgroundArg, InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs,
-    open_models, parse_error, parse_memory, print, profile_parser,
+    open_models, parse_error, print, profile_parser,
 };
 use super::exit::Exit;
+use super::memory::{default_memory_bytes, parse_memory};
 use super::refine::RefineArgs;
 use super::sam::SamArgs;
 use super::target::{REFINEMENTS, TUNED, TargetArgs};
@@ -95,9 +96,9 @@ pub struct EncodeArgs {
     /// Threads [default: all cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
-    /// Working memory beside the scene and the photos in work: a number with KiB, MiB or GiB.
-    #[arg(long, value_name = "BYTES", default_value = "2GiB", value_parser = parse_memory)]
-    pub memory: u64,
+    /// Memory for scene, photos in work and lists: a number with KiB, MiB or GiB [default: half of what is free].
+    #[arg(long, value_name = "BYTES", value_parser = parse_memory)]
+    pub memory: Option<u64>,
     /// Name of the scene [default: the name of the store's folder].
     #[arg(long, value_name = "NAME")]
     pub name: Option<String>,
@@ -225,7 +226,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
         },
         run: RunSettings {
             threads: args.threads.map_or_else(available_threads, |n| n as usize),
-            memory_bytes: args.memory,
+            memory_bytes: args.memory.unwrap_or_else(default_memory_bytes),
             views_limit,
             view_order: args.views.order(views_limit),
             time_budget: args.views.time_budget,

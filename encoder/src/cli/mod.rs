@@ -7,6 +7,7 @@ mod encode;
 pub mod environment;
 mod exit;
 mod keys;
+mod memory;
 mod models;
 pub mod progress;
 #[cfg(feature = "qdrant")]

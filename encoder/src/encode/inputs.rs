@@ -11,6 +11,7 @@ use super::report::SkippedView;
 use super::settings::{EncodeSettings, InputSettings};
 use crate::cells::{self, CellSplit};
 use crate::ingest;
+use crate::memory::{MemoryPlan, Phase};
 
 /// The inputs of an encode.
 pub(super) struct Inputs {
@@ -47,6 +48,11 @@ impl Inputs {
         }
         Ok(Self { scene, split, views, missing, geo_reference })
     }
+}
+
+/// Reserves the scene's columns.
+pub(super) fn reserve(memory: &mut MemoryPlan, scene: &Gaussians) {
+    memory.reserve(Phase::Always, "the scene", scene.len_bytes());
 }
 
 /// Returns the numbers of views with a photo and of Gaussians.

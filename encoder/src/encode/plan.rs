@@ -10,12 +10,15 @@ use super::coverage::{self, Coverage};
 use super::engines::Engines;
 use super::error::EncodeError;
 use super::identity;
-use super::inputs::Inputs;
+use super::inputs::{self, Inputs};
 use super::job::Job;
 use super::settings::{EncodeSettings, Masks, Regions, RunSettings, ViewOrder};
+use super::view;
+use crate::cells::CellSplit;
 use crate::lift::refine::Refinement;
 use crate::memory::MemoryPlan;
 use crate::objects;
+use crate::raster::project::Prepared;
 use crate::raster::{LoadedScene, RasterView};
 use crate::segment::{
     GivenMasks, GraphSegmenter, GraphSettings, NoMasks, SamSegmenter, SegmentError, Segmenter,
@@ -89,6 +92,10 @@ pub(super) fn plan<'a>(
 fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, dim: usize) -> MemoryPlan {
     let n_gaussians = inputs.scene.len();
     let mut memory = MemoryPlan::new(settings.run.memory_bytes);
+    inputs::reserve(&mut memory, &inputs.scene);
+    CellSplit::reserve(&mut memory, n_gaussians);
+    Prepared::reserve(&mut memory, n_gaussians);
+    view::reserve(&mut memory, &inputs.views, settings.run.threads);
     shard::reserve(&mut memory, &inputs.split, dim);
     Refinement::reserve(&mut memory, &settings.aggregation, n_gaussians);
     if settings.cells.objects {

@@ -187,7 +187,7 @@ pub struct OutputSettings {
 pub struct RunSettings {
     /// Worker threads, and views worked on at a time.
     pub threads: usize,
-    /// Working memory; `encode/memory.rs` says what it covers.
+    /// Working memory; [`MemoryPlan`](crate::memory::MemoryPlan) says what it covers.
     pub memory_bytes: u64,
     /// Views used at most: the first ones of the order.
     pub views_limit: ViewsLimit,

@@ -10,6 +10,7 @@ use super::constants::{
     COVARIANCE_BLUR_PX2, FAR_Z, FOV_MARGIN, MAX_VARIANCE_PX2, MIN_ALPHA, NEAR_Z, REACH2_MARGIN,
 };
 use super::view::RasterView;
+use crate::memory::{MemoryPlan, Phase};
 
 /// A Gaussian on the screen.
 ///
@@ -96,6 +97,11 @@ struct Size {
 }
 
 impl<'s> Prepared<'s> {
+    /// Reserves the sizes of a scene's Gaussians.
+    pub fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
+        memory.reserve(Phase::Views, "the size of each Gaussian", (n_gaussians * size_of::<Size>()) as u64);
+    }
+
     /// Prepares a scene with columns of matching lengths.
     pub fn new(scene: &'s Gaussians) -> Self {
         let mut sizes: Vec<Size> = bytemuck::zeroed_vec(scene.len());

@@ -1,0 +1,65 @@
+//! The working memory of an encode: what the user gives, or half of what the machine has free.
+
+use std::fs;
+
+use slag_common::ByteSize;
+use slag_common::byte_size::ByteSizeError;
+
+/// Least working memory, bytes.
+const MIN_MEMORY_BYTES: u64 = 64 << 20;
+/// Working memory where the machine does not say what is free.
+const UNKNOWN_MEMORY_BYTES: u64 = 2 << 30;
+
+/// Reads the size of the working memory, see [`ByteSize`].
+pub fn parse_memory(text: &str) -> Result<u64, String> {
+    let ByteSize(bytes) = text.parse().map_err(|e: ByteSizeError| e.to_string())?;
+    if bytes < MIN_MEMORY_BYTES {
+        return Err(format!("{text:?} is too little; expected at least 64MiB"));
+    }
+    Ok(bytes)
+}
+
+/// Returns half of the free memory, within the limit of the control group (version 2) if there is one.
+pub fn default_memory_bytes() -> u64 {
+    let read = |path: &str| fs::read_to_string(path).ok();
+    let group = |file: &str| read(&format!("/sys/fs/cgroup/memory.{file}"))?.trim().parse::<u64>().ok();
+    half_of_free(read("/proc/meminfo").as_deref(), group("max"), group("current"))
+}
+
+/// `meminfo`: the text of Linux's file of this name. `max_bytes`: the group's limit; `current_bytes`: what it uses.
+fn half_of_free(meminfo: Option<&str>, max_bytes: Option<u64>, current_bytes: Option<u64>) -> u64 {
+    let available = |text: &str| {
+        let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
+        line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()?.checked_mul(1024)
+    };
+    let of_machine = meminfo.and_then(available);
+    let of_group = max_bytes.map(|max| max.saturating_sub(current_bytes.unwrap_or(0)));
+    let free = of_machine.into_iter().chain(of_group).min();
+    free.map_or(UNKNOWN_MEMORY_BYTES, |bytes| (bytes / 2).max(MIN_MEMORY_BYTES))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn memory_has_a_least_size() {
+        assert_eq!(parse_memory("64MiB"), Ok(67_108_864));
+        assert_eq!(
+            parse_memory("67108863"),
+            Err("\"67108863\" is too little; expected at least 64MiB".into())
+        );
+        assert_eq!(parse_memory("GB"), Err("unit \"GB\": expected none, KiB, MiB or GiB".into()));
+    }
+
+    #[test]
+    fn the_default_is_half_of_what_is_free() {
+        let meminfo =
+            "MemTotal:       24683964 kB\nMemFree: 1 kB\nMemAvailable:   20971520 kB\nBuffers: 5 kB\n";
+        assert_eq!(half_of_free(Some(meminfo), None, None), 10 << 30);
+        assert_eq!(half_of_free(Some(meminfo), Some(8 << 30), Some(2 << 30)), 3 << 30);
+        assert_eq!(half_of_free(Some(meminfo), Some(1 << 30), Some(2 << 30)), 64 << 20);
+        assert_eq!(half_of_free(Some("MemAvailable: many"), None, None), 2 << 30);
+        assert_eq!(half_of_free(None, None, None), 2 << 30);
+    }
+}
