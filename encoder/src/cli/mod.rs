@@ -7,7 +7,7 @@ mod encode;
 pub mod environment;
 mod exit;
 mod keys;
-mod memory;
+pub mod memory;
 mod models;
 pub mod progress;
 #[cfg(feature = "qdrant")]

@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use anyhow::{Context, Result};
 use clap::Args;
 use slag_encoder::cli::Exit;
-use slag_encoder::cli::common::{available_threads, parse_memory, print};
+use slag_encoder::cli::common::{available_threads, print};
+use slag_encoder::cli::memory::parse_memory;
 
 use crate::bench::lift::{self, LiftOptions};
 
