@@ -9,8 +9,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, Result, anyhow};
+use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
-use clap::{Args, ValueEnum};
 use serde::Serialize;
 use slag_common::shard::Profile;
 use slag_models::commands::{self, RunArgs};
@@ -19,7 +19,6 @@ use slag_models::{ModelDir, SessionOptions, TextEncoder};
 use slag_service::stop::stop_signal;
 use tracing_subscriber::EnvFilter;
 
-use crate::embed::Background;
 use crate::ingest::FrameChoice;
 use crate::store::StoreReader;
 
@@ -102,30 +101,6 @@ pub fn parse_frame(text: &str) -> Result<FrameChoice, String> {
         "none" => FrameChoice::None,
         path => FrameChoice::File(path.into()),
     })
-}
-
-/// `--background`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum BackgroundArg {
-    /// White.
-    White,
-    /// Mid-grey.
-    Grey,
-    /// The photo, blurred.
-    Blur,
-    /// The photo as it is.
-    Keep,
-}
-
-impl From<BackgroundArg> for Background {
-    fn from(arg: BackgroundArg) -> Self {
-        match arg {
-            BackgroundArg::White => Self::White,
-            BackgroundArg::Grey => Self::Grey,
-            BackgroundArg::Blur => Self::Blur,
-            BackgroundArg::Keep => Self::Keep,
-        }
-    }
 }
 
 /// Prints the result: as one JSON object, or as lines for people.

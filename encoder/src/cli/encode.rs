@@ -3,13 +3,13 @@
 use std::path::PathBuf;
 
 use anyhow::{Context, Result, anyhow};
-use clap::{Args, FromArgMatches, ValueEnum};
+use clap::{Args, FromArgMatches};
 use slag_common::ByteSize;
 use slag_common::shard::Profile;
 
 use super::common::{
-    BackgroundArg, InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs,
-    open_models, parse_error, print, profile_parser,
+    InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs, open_models,
+    parse_error, print, profile_parser,
 };
 use super::exit::Exit;
 use super::memory::{default_memory_bytes, parse_memory};
@@ -19,6 +19,7 @@ use super::target::{REFINEMENTS, TUNED, TargetArgs};
 use super::views::{ViewsArgs, parse_raster_width, parse_views_limit};
 use crate::cells::CellLimits;
 use crate::codebook::CodebookSettings;
+use crate::embed::Background;
 use crate::encode::coverage::CoverageReport;
 use crate::encode::{
     self, CellReport, CellSettings, EncodeSettings, EncodeSummary, Engines, InputSettings, Masks,
@@ -69,10 +70,10 @@ pub struct EncodeArgs {
     pub refine: RefineArgs,
     /// What fills a crop outside its mask [default: the preset's].
     #[arg(long, value_enum)]
-    pub background: Option<BackgroundArg>,
+    pub background: Option<Background>,
     /// Weight that is summed; `falloff` is the paper's formula as printed [default: the preset's].
     #[arg(long, value_enum)]
-    pub weights: Option<WeightsArg>,
+    pub weights: Option<WeightKind>,
     /// Number or share of the views to use: the first ones of --view-order [default: the preset's].
     #[arg(long, value_name = "N|P%", value_parser = parse_views_limit)]
     pub views_limit: Option<ViewsLimit>,
@@ -143,24 +144,6 @@ pub struct EncodeArgs {
     pub restart: bool,
 }
 
-/// `--weights`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum WeightsArg {
-    /// Alpha times transmittance: what a Gaussian contributes to the picture.
-    Blend,
-    /// The Gaussian's falloff alone.
-    Falloff,
-}
-
-impl From<WeightsArg> for WeightKind {
-    fn from(arg: WeightsArg) -> Self {
-        match arg {
-            WeightsArg::Blend => Self::Blend,
-            WeightsArg::Falloff => Self::Falloff,
-        }
-    }
-}
-
 /// The search for objects.
 #[derive(Clone, Debug, Args)]
 pub struct ObjectArgs {
@@ -202,9 +185,9 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
         view: ViewSettings {
             masks,
             min_mask_px: args.min_mask_px.unwrap_or(preset.min_mask_px),
-            background: args.background.map_or(preset.background, Into::into),
+            background: args.background.unwrap_or(preset.background),
             raster_width: args.raster_width.unwrap_or(preset.raster_width),
-            weights: args.weights.map_or(preset.weights, Into::into),
+            weights: args.weights.unwrap_or(preset.weights),
             merges_slivers: preset.merges_slivers && !args.keep_slivers,
             regions: args.regions,
         },

@@ -1,5 +1,7 @@
 //! Scene, views and geo-reference as they were read.
 
+use std::collections::HashSet;
+
 use slag_common::frames::GeoReference;
 use slag_common::poses::ViewSet;
 use slag_common::splat::{self, ReadOptions};
@@ -85,13 +87,14 @@ fn find_views(
     settings: &EncodeSettings,
     views: Vec<View>,
 ) -> Result<(Vec<View>, Vec<SkippedView>), EncodeError> {
-    let missing: Vec<String> = ingest::missing_images(&views).into_iter().map(|v| v.name.clone()).collect();
-    if let (true, Some(first)) = (settings.run.strict, ingest::missing_images(&views).first()) {
-        let first = first.image_path.clone();
-        return Err(EncodeError::MissingImages { n_missing: missing.len(), n_views: views.len(), first });
-    }
     let n_views = views.len();
-    let (found, gone): (Vec<View>, Vec<View>) = views.into_iter().partition(|v| !missing.contains(&v.name));
+    let missing: HashSet<String> =
+        ingest::missing_images(&views).into_iter().map(|v| v.name.clone()).collect();
+    let (gone, found): (Vec<View>, Vec<View>) = views.into_iter().partition(|v| missing.contains(&v.name));
+    if let (true, Some(first)) = (settings.run.strict, gone.first()) {
+        let first = first.image_path.clone();
+        return Err(EncodeError::MissingImages { n_missing: gone.len(), n_views, first });
+    }
     let skipped: Vec<SkippedView> = gone
         .into_iter()
         .map(|v| SkippedView {

@@ -159,7 +159,7 @@ mod tests {
 
     use super::*;
     use crate::cells::CellSplit;
-    use slag_common::Gaussians;
+    use slag_common::{Distortion, Gaussians, Intrinsics};
 
     /// Superpoints take 204 bytes a Gaussian, once all views are done: a budget below that is refused before.
     #[test]
@@ -179,5 +179,33 @@ mod tests {
         assert!(refused.is_before_views && refused.parts[0].purpose.contains("superpoints"), "{refused}");
         settings.run.memory_bytes *= 2;
         memory_plan(&settings, &inputs, 512).rest(0).expect("fits");
+    }
+
+    /// By hand: two threads hold a photo of 400 x 300 pixels, whose file is absent, and one of 40 x 30, which its header
+    /// says, of the same camera; 15 bytes a pixel.
+    #[test]
+    fn photos_in_work_are_reserved_by_their_files() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let view = |name: &str| View {
+            name: name.into(),
+            image_path: folder.path().join(name),
+            intrinsics: Intrinsics {
+                width_px: 400,
+                height_px: 300,
+                focal_x_px: 300.0,
+                focal_y_px: 300.0,
+                centre_x_px: 200.0,
+                centre_y_px: 150.0,
+                distortion: Distortion::None,
+            },
+            camera_from_world: glam::DAffine3::IDENTITY,
+        };
+        for name in ["a.png", "c.png"] {
+            image::RgbImage::new(40, 30).save(folder.path().join(name)).expect("it is writable");
+        }
+        let mut memory = MemoryPlan::new(0);
+        view::reserve(&mut memory, &["a.png", "b.png", "c.png"].map(view), 2);
+        let refused = memory.rest(0).expect_err("nothing fits");
+        assert_eq!(refused.needed_bytes, 15 * (400 * 300 + 40 * 30));
     }
 }

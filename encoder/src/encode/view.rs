@@ -34,8 +34,7 @@ const PHOTO_BYTES_PER_PX: u64 = 3 + 3 + 1 + 4 + 4;
 
 /// Reserves the photos in work: one a thread, the largest ones.
 pub(super) fn reserve(memory: &mut MemoryPlan, views: &[View], threads: usize) {
-    let area_px = |view: &View| u64::from(view.intrinsics.width_px) * u64::from(view.intrinsics.height_px);
-    let mut areas_px: Vec<u64> = views.iter().map(area_px).collect();
+    let mut areas_px: Vec<u64> = views.iter().map(ingest::photo_area_px).collect();
     areas_px.sort_unstable_by(|a, b| b.cmp(a));
     let in_work_px: u64 = areas_px.iter().take(threads).sum();
     memory.reserve(Phase::Views, "photos in work", in_work_px * PHOTO_BYTES_PER_PX);

@@ -82,6 +82,17 @@ pub fn missing_images(views: &[View]) -> Vec<&View> {
     views.iter().filter(|view| !view.image_path.is_file()).collect()
 }
 
+/// Returns the pixels of a view's photo by its header; those of the camera where the header cannot be read.
+pub fn photo_area_px(view: &View) -> u64 {
+    let of_header =
+        || ImageReader::open(&view.image_path).ok()?.with_guessed_format().ok()?.into_dimensions().ok();
+    let of_camera = (view.intrinsics.width_px, view.intrinsics.height_px);
+    let (width_px, height_px) = of_header()
+        .filter(|(width_px, height_px)| is_scale_of(&view.intrinsics, *width_px, *height_px))
+        .unwrap_or(of_camera);
+    u64::from(width_px) * u64::from(height_px)
+}
+
 /// Loads the photo of a view and undistorts it.
 ///
 /// If the image is a scaled copy of the original, the camera is scaled with it. Photos of pinhole cameras stay unchanged.

@@ -7,7 +7,7 @@ use super::comparison::{ComparisonArgs, encode_settings};
 use crate::eval::noise::{self, NoiseRow, NoiseSettings};
 use slag_common::shard::Profile;
 use slag_encoder::cli::Exit;
-use slag_encoder::cli::common::{BackgroundArg, cancel_flag, open_models, print};
+use slag_encoder::cli::common::{cancel_flag, open_models, print};
 use slag_encoder::embed::Background;
 use slag_encoder::encode::{ViewOrder, ViewsLimit};
 use slag_encoder::lift::Aggregation;
@@ -38,7 +38,7 @@ pub struct EvalNoiseArgs {
     views_limit: Option<u32>,
     /// Fill of a crop outside its mask.
     #[arg(long, value_enum, default_value = "white")]
-    background: BackgroundArg,
+    background: Background,
 }
 
 pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
@@ -60,7 +60,7 @@ pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> 
     let mut encode = encode_settings("noise");
     encode.run.views_limit = args.views_limit.map_or(ViewsLimit::All, |n| ViewsLimit::Count(n as usize));
     encode.run.view_order = ViewOrder::Nth;
-    encode.view.background = Background::from(args.background);
+    encode.view.background = args.background;
     encode.cells.shards.profiles = vec![Profile::Compact];
     encode.cells.objects = false;
     let settings = NoiseSettings {
