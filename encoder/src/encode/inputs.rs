@@ -15,6 +15,10 @@ use crate::cells::{self, CellSplit};
 use crate::ingest;
 use crate::memory::{MemoryPlan, Phase};
 
+/// Bytes that a pixel of a photo takes until its crops are made: three as read and three without distortion, one for
+/// whether the lens shows it, four each for its depth and its segment.
+const PHOTO_BYTES_PER_PX: u64 = 3 + 3 + 1 + 4 + 4;
+
 /// The inputs of an encode.
 pub(super) struct Inputs {
     pub(super) scene: Gaussians,
@@ -55,6 +59,14 @@ impl Inputs {
 /// Reserves the scene's columns.
 pub(super) fn reserve(memory: &mut MemoryPlan, scene: &Gaussians) {
     memory.reserve(Phase::Always, "the scene", scene.len_bytes());
+}
+
+/// Reserves the photos in work: one a thread, the largest ones.
+pub(super) fn reserve_photos(memory: &mut MemoryPlan, views: &[View], threads: usize) {
+    let mut areas_px: Vec<u64> = views.iter().map(ingest::photo_area_px).collect();
+    areas_px.sort_unstable_by(|a, b| b.cmp(a));
+    let in_work_px: u64 = areas_px.iter().take(threads).sum();
+    memory.reserve(Phase::Views, "photos in work", in_work_px * PHOTO_BYTES_PER_PX);
 }
 
 /// Returns the numbers of views with a photo and of Gaussians.

@@ -13,7 +13,6 @@ use super::identity;
 use super::inputs::{self, Inputs};
 use super::job::Job;
 use super::settings::{EncodeSettings, Masks, Regions, RunSettings, ViewOrder};
-use super::view;
 use crate::cells::CellSplit;
 use crate::lift::refine::Refinement;
 use crate::memory::MemoryPlan;
@@ -95,7 +94,7 @@ fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, dim: usize) -> Memory
     inputs::reserve(&mut memory, &inputs.scene);
     CellSplit::reserve(&mut memory, n_gaussians);
     Prepared::reserve(&mut memory, n_gaussians);
-    view::reserve(&mut memory, &inputs.views, settings.run.threads);
+    inputs::reserve_photos(&mut memory, &inputs.views, settings.run.threads);
     shard::reserve(&mut memory, &inputs.split, dim);
     Refinement::reserve(&mut memory, &settings.aggregation, n_gaussians);
     if settings.cells.objects {
@@ -204,7 +203,7 @@ mod tests {
             image::RgbImage::new(40, 30).save(folder.path().join(name)).expect("it is writable");
         }
         let mut memory = MemoryPlan::new(0);
-        view::reserve(&mut memory, &["a.png", "b.png", "c.png"].map(view), 2);
+        inputs::reserve_photos(&mut memory, &["a.png", "b.png", "c.png"].map(view), 2);
         let refused = memory.rest(0).expect_err("nothing fits");
         assert_eq!(refused.needed_bytes, 15 * (400 * 300 + 40 * 30));
     }

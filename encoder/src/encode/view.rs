@@ -21,24 +21,11 @@ use crate::lift::photos::MaskOutline;
 use crate::masks::patches::patch_masks;
 use crate::masks::regions::{absorb_slivers, border_share, partition};
 use crate::masks::{Mask, RegionMap};
-use crate::memory::{MemoryPlan, Phase};
 use crate::raster::{RasterError, RasterView};
 use crate::segment::SegmentInput;
 
 /// Views at once in a GPU's image encoder: one is computed while the pixel values of others are made and copied.
 const GPU_EMBED_SLOTS: usize = 3;
-
-/// Bytes that a pixel of a photo takes until its crops are made: three as read and three without distortion, one for
-/// whether the lens shows it, four each for its depth and its segment.
-const PHOTO_BYTES_PER_PX: u64 = 3 + 3 + 1 + 4 + 4;
-
-/// Reserves the photos in work: one a thread, the largest ones.
-pub(super) fn reserve(memory: &mut MemoryPlan, views: &[View], threads: usize) {
-    let mut areas_px: Vec<u64> = views.iter().map(ingest::photo_area_px).collect();
-    areas_px.sort_unstable_by(|a, b| b.cmp(a));
-    let in_work_px: u64 = areas_px.iter().take(threads).sum();
-    memory.reserve(Phase::Views, "photos in work", in_work_px * PHOTO_BYTES_PER_PX);
-}
 
 /// The stages of a view, with what every view needs.
 pub(super) struct ViewStages<'a> {
