@@ -97,7 +97,7 @@ pub struct EncodeArgs {
     /// Threads [default: all cores].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     pub threads: Option<u32>,
-    /// Memory for scene, photos in work and lists: a number with KiB, MiB or GiB [default: half of what is free].
+    /// Memory for the scene, photos and lists: a number with KiB, MiB or GiB [default: half of the free memory].
     #[arg(long, value_name = "BYTES", value_parser = parse_memory)]
     pub memory: Option<u64>,
     /// Name of the scene [default: the name of the store's folder].

@@ -1,4 +1,4 @@
-//! The working memory of an encode: what the user gives, or half of what the machine has free.
+//! The working memory of an encode: the flag's value, or half of the free memory.
 
 use std::fs;
 
@@ -7,7 +7,7 @@ use slag_common::byte_size::ByteSizeError;
 
 /// Least working memory, bytes.
 const MIN_MEMORY_BYTES: u64 = 64 << 20;
-/// Working memory where the machine does not say what is free.
+/// Working memory on machines that do not report free memory.
 const UNKNOWN_MEMORY_BYTES: u64 = 2 << 30;
 
 /// Reads the size of the working memory, see [`ByteSize`].
@@ -26,7 +26,7 @@ pub fn default_memory_bytes() -> u64 {
     half_of_free(read("/proc/meminfo").as_deref(), group("max"), group("current"))
 }
 
-/// `meminfo`: the text of Linux's file of this name. `max_bytes`: the group's limit; `current_bytes`: what it uses.
+/// `meminfo`: the content of `/proc/meminfo`. `max_bytes`, `current_bytes`: the control group's limit and use.
 fn half_of_free(meminfo: Option<&str>, max_bytes: Option<u64>, current_bytes: Option<u64>) -> u64 {
     let available = |text: &str| {
         let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;

@@ -157,7 +157,6 @@ mod tests {
     use std::path::PathBuf;
 
     use super::*;
-    use crate::cells::CellSplit;
     use slag_common::{Distortion, Gaussians, Intrinsics};
 
     /// Superpoints take 204 bytes a Gaussian, once all views are done: a budget below that is refused before.

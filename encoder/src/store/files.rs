@@ -41,9 +41,7 @@ impl HashingWriter {
 
 /// Returns the hash and length of a file's content, read piece by piece.
 pub(super) fn hash_of(path: &Path) -> io::Result<(Hash32, u64)> {
-    let mut hasher = blake3::Hasher::new();
-    hasher.update_reader(File::open(path)?)?;
-    Ok((Hash32(*hasher.finalize().as_bytes()), hasher.count()))
+    Hash32::of_reader(File::open(path)?)
 }
 
 /// Creates a folder durably, unless it is there.
