@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use slag_service::problem::Problem;
 use tokio::sync::{Semaphore, watch};
@@ -22,6 +23,10 @@ pub struct App {
     query_memory: Arc<Pool>,
     pub(super) metrics: Metrics,
     pub(super) following: Option<Arc<Following>>,
+    /// A permit for each client of `GET /v1/events`.
+    pub(super) listeners: Arc<Semaphore>,
+    /// Whether the service stops: what never ends by itself ends then.
+    pub(super) stopping: watch::Sender<bool>,
     is_reloading: AtomicBool,
     n_reload_attempts: watch::Sender<u64>,
 }
@@ -38,6 +43,8 @@ impl App {
             engine,
             permits: Arc::new(Semaphore::new(settings.max_queries)),
             query_memory: Pool::new(settings.all_queries_bytes),
+            listeners: Arc::new(Semaphore::new(settings.max_listeners)),
+            stopping: watch::Sender::new(false),
             settings,
             metrics: Metrics::default(),
             following,
@@ -48,7 +55,13 @@ impl App {
 
     /// Returns what a query that begins now may use.
     pub(super) fn query_budget(&self) -> Budget {
-        Budget::new(self.settings.query_bytes, self.settings.query_timeout, &self.query_memory)
+        self.query_budget_within(None)
+    }
+
+    /// Returns what a query that begins now may use, and less time if it asks for less.
+    pub(super) fn query_budget_within(&self, time: Option<Duration>) -> Budget {
+        let time = time.map_or(self.settings.query_timeout, |time| time.min(self.settings.query_timeout));
+        Budget::new(self.settings.query_bytes, time, &self.query_memory)
     }
 
     /// Returns a counter of finished attempts to load another generation.

@@ -10,6 +10,7 @@ mod query;
 mod router;
 mod settings;
 mod status;
+mod v1;
 
 pub use app::App;
 pub use follower::{RESTARTS, keep_following};

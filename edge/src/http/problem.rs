@@ -21,6 +21,11 @@ pub fn overloaded(limit: usize) -> Problem {
     Problem::overloaded(format!("{limit} queries are in progress, the limit; ask again"), RETRY_SECS)
 }
 
+/// The limit of clients that listen to events is reached.
+pub fn too_many_listeners(limit: usize) -> Problem {
+    Problem::overloaded(format!("{limit} clients listen to events, the limit; ask again"), RETRY_SECS)
+}
+
 /// The answer took too long.
 pub fn timeout(limit: Duration) -> Problem {
     let detail = format!("no answer within {} s; ask for a smaller radius, or again", limit.as_secs_f64());

@@ -11,7 +11,7 @@ use slag_service::request::observed;
 use slag_service::routes::Routes;
 
 use super::app::App;
-use super::{params, position, query, status};
+use super::{params, position, query, status, v1};
 
 /// First line of the help text.
 const TITLE: &str = "slag-edge answers text queries about the scene around the robot.";
@@ -22,7 +22,7 @@ const JSON: (HeaderName, HeaderValue) = (header::CONTENT_TYPE, HeaderValue::from
 
 /// Returns the routes.
 pub(super) fn routes() -> Routes<Arc<App>> {
-    Routes::default()
+    v1::routes(Routes::default())
         .get("/query", "objects, clusters or Gaussians that match texts, best first", query::query)
         .parameters(params::parameters())
         .get(
@@ -63,5 +63,10 @@ pub async fn serve(
     stop: impl Future<Output = ()>,
 ) -> io::Result<()> {
     let limits = app.settings.connections;
+    let stopping = Arc::clone(&app);
+    let stop = async move {
+        stop.await;
+        stopping.stopping.send_replace(true);
+    };
     Ok(listener::serve(router(app), listener, limits, stop).await?)
 }

@@ -14,6 +14,8 @@ pub struct Settings {
     pub access: Access,
     /// Queries in progress; further ones get 503.
     pub max_queries: usize,
+    /// Clients of `GET /v1/events`; further ones get 503.
+    pub max_listeners: usize,
     /// Time until an answer must begin, else 503; and what a query may compute for.
     pub query_timeout: Duration,
     /// Memory that a query may use; one that needs more gets 422.
@@ -37,6 +39,7 @@ impl Default for Settings {
             connections,
             access: Access::default(),
             max_queries: 32,
+            max_listeners: 32,
             query_timeout: Duration::from_secs(10),
             query_bytes: 256 << 20,
             all_queries_bytes: 1 << 30,

@@ -30,6 +30,7 @@ mod answers;
 mod attacks;
 mod openapi;
 mod ply;
+mod v1;
 
 struct Service {
     dir: TempDir,

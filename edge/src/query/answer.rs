@@ -71,8 +71,10 @@ fn answer_objects(
     let order = Order::new(scale.base(calibration), manifest, request);
     let ranked = order.rank(found, key);
     // Describes only the objects that are returned.
-    let described =
-        ranked.into_par_iter().map(|ranked| object_answer(scene, ranked, scale, &region, request.members));
+    let described = ranked.into_par_iter().map(|ranked| {
+        let score = scale.shown(ranked.found.score);
+        object_answer(scene, ranked, score, &region, request.members)
+    });
     let found = Found::Clusters(described.collect());
     let best = objects::best(&scored.scores);
     let best = best.map(|best| (scale.shown(scored.scores[best]), objects::record(scene, best).position()));
@@ -234,17 +236,17 @@ fn cluster_answer(ranked: Ranked<Cluster>, manifest: &Manifest) -> ClusterAnswer
     }
 }
 
-/// Describes an object.
-fn object_answer(
+/// Describes an object. `score`: as reported.
+pub(super) fn object_answer(
     scene: &Scene<'_>,
     ranked: Ranked<FoundObject<'_>>,
-    scale: Scale,
+    score: f32,
     region: &Region,
     with_members: bool,
 ) -> ClusterAnswer {
     let Ranked { found, rank, relevance, distance } = ranked;
     let FoundObject { object, record, n_gaussians, cut, .. } = found;
-    let (manifest, score) = (scene.manifest, scale.shown(found.score));
+    let manifest = scene.manifest;
     let Extent { position_in_world, box_in_world } = found.extent();
     let whole = cut.map(|_| {
         let (position_in_world, bounds) = (record.position(), record.bounds());
@@ -252,7 +254,7 @@ fn object_answer(
     });
     ClusterAnswer {
         rank,
-        id: format!("o{:016x}", record.id),
+        id: found.public_id(),
         position_in_world,
         geographic: manifest.geo_reference.map(|geo| geo.geographic_from_world(position_in_world)),
         box_min_in_world: box_in_world.min,

@@ -190,11 +190,33 @@ impl Engine {
         request.check()?;
         let snapshot = self.snapshot()?;
         self.check_encoder(&snapshot)?;
-        let negatives = request.negatives.phrases().into_iter().map(|phrase| self.text.encode(phrase));
-        let negatives: Vec<_> = negatives.collect::<Result<_, _>>().map_err(QueryError::Negatives)?;
+        let negatives = self.encode_negatives(request)?;
         let question =
             |text: &String| Ok(Question { vector: self.text.encode(text)?, negatives: negatives.clone() });
         let questions = request.texts.iter().map(question).collect::<Result<Vec<_>, TextError>>()?;
+        let work = |scratch: &mut Scratch, scene: &Scene<'_>| answer(scratch, scene, &questions, request);
+        let answers = self.on_scene(&snapshot, budget, work)?;
+        Ok(Reply { snapshot, near: request.near, answers })
+    }
+
+    /// Returns the vector of a text.
+    pub(super) fn encode_text(&self, text: &str) -> Result<Arc<[f32]>, QueryError> {
+        Ok(self.text.encode(text)?)
+    }
+
+    /// Returns the vectors of a request's negatives.
+    pub(super) fn encode_negatives(&self, request: &QueryRequest) -> Result<Vec<Arc<[f32]>>, QueryError> {
+        let negatives = request.negatives.phrases().into_iter().map(|phrase| self.text.encode(phrase));
+        negatives.collect::<Result<_, _>>().map_err(QueryError::Negatives)
+    }
+
+    /// Runs work on a generation, with buffers of earlier answers.
+    pub(super) fn on_scene<T>(
+        &self,
+        snapshot: &Snapshot,
+        budget: &Budget,
+        work: impl FnOnce(&mut Scratch, &Scene<'_>) -> T,
+    ) -> T {
         let shards: Vec<ShardView<'_>> = snapshot.shards.iter().map(|shard| shard.view()).collect();
         let fetched = (snapshot.current.centre_in_world, snapshot.current.radius);
         let objects: Vec<Option<Objects<'_>>> = snapshot.shards.iter().map(|shard| shard.objects()).collect();
@@ -204,13 +226,12 @@ impl Engine {
         let idle = || self.idle.lock().unwrap_or_else(PoisonError::into_inner);
         let mut scratch = idle().pop().unwrap_or_default();
         scratch.set_budget(budget.clone());
-        let answers = answer(&mut scratch, &scene, &questions, request);
+        let done = work(&mut scratch, &scene);
         scratch.set_budget(Budget::default());
         // The buffers of an unusually large answer are not kept.
         if budget.used_bytes() <= KEPT_BYTES {
             idle().push(scratch);
         }
-        let answers = answers?;
-        Ok(Reply { snapshot, near: request.near, answers })
+        done
     }
 }

@@ -2,18 +2,24 @@
 
 mod answer;
 mod answers;
+mod area;
 #[cfg(feature = "arrow")]
 mod arrow;
+mod ask;
 pub mod cluster;
 mod engine;
 mod extent;
 mod format;
+mod inventory;
 mod json;
+mod map;
 mod objects;
 mod oriented;
 mod ply;
+mod point;
 mod rank;
 mod reason;
+pub mod relations;
 mod reply;
 mod request;
 mod scale;
@@ -23,11 +29,17 @@ mod threshold;
 
 pub use answer::answer;
 pub use answers::{
-    Answers, ClusterAnswer, Clustering, Evidence, Found, GaussianAnswer, Reason, ReasonKind, ScoreKind,
+    Answers, BadCellAnswer, ClusterAnswer, Clustering, Evidence, Found, GaussianAnswer, Reason, ReasonKind,
+    ScoreKind,
 };
+pub use area::{Area, AreaBall, AreaBox};
+pub use ask::{Ask, AskReply, Asked, MAX_PAGE, Outcome, RelatedAnswers};
 pub use engine::{Engine, QueryError};
 pub use format::Format;
+pub use inventory::{FRAME, ObjectFilter, ObjectOnBoard, ObjectPage, object_id};
+pub use map::{MapCell, MapStatus, MissingCell};
 pub use oriented::{Alignment, OrientedBox};
+pub use point::{Corner, LatLon, Point};
 pub use rank::relevance;
 pub use reply::Reply;
 pub use request::{

@@ -14,6 +14,7 @@ use crate::score::{Region, Run};
 use crate::store::objects::Part;
 
 /// An object that matches.
+#[derive(Clone, Copy)]
 pub struct FoundObject<'a> {
     /// Its index in the object index.
     pub object: usize,
@@ -34,6 +35,26 @@ impl FoundObject<'_> {
             || Extent { position_in_world: self.record.position(), box_in_world: self.record.bounds() };
         self.cut.unwrap_or_else(whole)
     }
+
+    /// Returns its id as answers name it.
+    pub fn public_id(&self) -> String {
+        public_id(self.record.id)
+    }
+}
+
+/// Returns an object's id as answers name it: `o` and 16 hex digits.
+pub fn public_id(id: u64) -> String {
+    format!("o{id:016x}")
+}
+
+/// Returns whether at least `min_count` of an object's Gaussians, and at least one, lie in a region.
+pub fn in_region(scene: &Scene<'_>, object: usize, region: &Region, min_count: u64) -> bool {
+    count_in(scene, object, region) >= min_count.max(1)
+}
+
+/// Returns the number of an object's Gaussians in a region.
+pub fn count_in(scene: &Scene<'_>, object: usize, region: &Region) -> u64 {
+    scene.index.parts(object).iter().map(|part| count(scene, *part, region)).sum()
 }
 
 /// Returns the mean and spread of a bank of texts' scores over the scene's objects.
@@ -59,7 +80,7 @@ pub fn matching<'a>(
     let reaching = (0..scores.len()).filter(|object| scores[*object] >= threshold);
     let found = |object| {
         let (parts, record, score) = (scene.index.parts(object), record(scene, object), scores[object]);
-        let n_gaussians = parts.iter().map(|part| count(scene, *part, region)).sum();
+        let n_gaussians = count_in(scene, object, region);
         if n_gaussians < min_count.max(1) {
             return None;
         }

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use glam::DVec3;
+use slag_common::manifest::Manifest;
 
 use super::answers::{Answers, Found, GaussianAnswer};
 use crate::score::Hit;
@@ -17,6 +18,11 @@ pub struct Reply {
 }
 
 impl Reply {
+    /// Returns the manifest of the generation that answered.
+    pub fn manifest(&self) -> &Manifest {
+        &self.snapshot.manifest
+    }
+
     /// Describes an answer's Gaussians; empty for other kinds.
     pub fn gaussians(&self, answers: &Answers) -> Vec<GaussianAnswer> {
         let Found::Gaussians(hits) = &answers.answers else { return Vec::new() };

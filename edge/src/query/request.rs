@@ -2,12 +2,13 @@
 
 use std::fmt;
 use std::str::FromStr;
+use std::sync::Arc;
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use slag_common::frames::Aabb;
 
-use crate::score::{Ball, MAX_COORDINATE, Precision, Region};
+use crate::score::{Ball, MAX_COORDINATE, Polygon, Precision, Region};
 use crate::text::MAX_TEXT_BYTES;
 
 /// Most clusters or objects in a request, over all its texts.
@@ -170,8 +171,12 @@ pub struct QueryRequest {
     pub near: Option<DVec3>,
     /// Restricts the search to this distance from `near`, world units.
     pub radius: Option<f64>,
+    /// Restricts the search to this ball, whatever `near` is; instead of `radius`.
+    pub ball: Option<Ball>,
     /// Restricts the search to this box.
     pub bounds: Option<Aabb>,
+    /// Restricts the search to this polygon.
+    pub polygon: Option<Arc<Polygon>>,
     /// Kind of answers; if absent, objects where the scene has them, else clusters.
     pub kind: Option<AnswerKind>,
     /// Edge of the voxels used for clustering, world units; the scene's own if absent.
@@ -194,7 +199,9 @@ impl QueryRequest {
             threshold: None,
             near: None,
             radius: None,
+            ball: None,
             bounds: None,
+            polygon: None,
             kind: None,
             voxel: None,
             min_count: DEFAULT_MIN_COUNT,
@@ -270,6 +277,13 @@ impl QueryRequest {
         if let Some(radius) = self.radius.filter(|radius| !positive(*radius)) {
             return refuse("radius", &radius, format!("more than 0, at most {MAX_COORDINATE:e}"));
         }
+        if let Some(ball) = self.ball.filter(|ball| {
+            let centre = ball.centre_in_world;
+            !(positive(ball.radius) && centre.is_finite() && centre.abs().max_element() <= MAX_COORDINATE)
+        }) {
+            let found = format!("{} around {}", ball.radius, ball.centre_in_world);
+            return refuse("region", &found, format!("a radius and a centre within ±{MAX_COORDINATE:e}"));
+        }
         if let (Some(radius), None) = (self.radius, self.near) {
             return refuse("near", &"nothing", format!("X,Y,Z, because radius is {radius}"));
         }
@@ -284,9 +298,9 @@ impl QueryRequest {
 
     /// Returns the part of space asked for.
     pub fn region(&self) -> Region {
-        let ball = self.near.zip(self.radius);
-        let ball = ball.map(|(centre_in_world, radius)| Ball { centre_in_world, radius });
-        Region { ball, bounds: self.bounds }
+        let around = self.near.zip(self.radius);
+        let around = around.map(|(centre_in_world, radius)| Ball { centre_in_world, radius });
+        Region { ball: self.ball.or(around), bounds: self.bounds, polygon: self.polygon.clone() }
     }
 }
 

@@ -98,7 +98,7 @@ impl<'a> AskedQuestion<'a> {
             (None, Some(residuals)) => Detail::Residuals(*residuals),
             (None, None) => Detail::Nothing,
         };
-        let filter = (!self.region.covers(&shard.position_box())).then_some(self.region);
+        let filter = (!self.region.covers(&shard.position_box())).then(|| self.region.clone());
         let mut cell = Cell {
             at: at as u32,
             shard,

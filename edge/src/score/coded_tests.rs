@@ -137,8 +137,9 @@ fn answers_are_those_of_brute_force() {
         ] {
             let question = random_question(&mut random, shape.0, n_negatives);
             let ball = Ball { centre_in_world: DVec3::new(11.0, 5.0, 5.0), radius: 6.0 };
-            let region = Region { ball: is_near.then_some(ball), bounds: None };
-            let search = Search::reusing(&mut scratch, &views, &question, region, precision).expect("valid");
+            let region = Region { ball: is_near.then_some(ball), bounds: None, polygon: None };
+            let search =
+                Search::reusing(&mut scratch, &views, &question, region.clone(), precision).expect("valid");
             let mut all: Vec<Hit> = Vec::new();
             for (at, view) in views.iter().enumerate().filter(|(at, _)| search.asked.cell(*at).is_some()) {
                 let inside = |index: &usize| region.contains(view.position_in_world(*index));

@@ -119,7 +119,7 @@ impl Cell<'_> {
             let is_scanned = is_undecided || each;
             let members = self.shard.centroid_starts[centroid] as usize
                 ..self.shard.centroid_starts[centroid + 1] as usize;
-            for inside in runs_inside(self.shard, self.filter, members) {
+            for inside in runs_inside(self.shard, self.filter.as_ref(), members) {
                 match self.detail {
                     Detail::Residuals(residuals) if is_scanned => {
                         self.scan(gather, &residuals, centroid, inside, cut.score);
@@ -328,7 +328,7 @@ fn least_sum(own: f32, step: f32, most: u16, threshold: f32) -> Option<u16> {
 /// Returns the parts of a range of Gaussians that lie in the region.
 pub(super) fn runs_inside(
     shard: &ShardView<'_>,
-    filter: Option<Region>,
+    filter: Option<&Region>,
     members: Range<usize>,
 ) -> impl Iterator<Item = Range<usize>> {
     let mut at = members.start;

@@ -1,9 +1,12 @@
 //! The part of space that a question asks about.
 
 use std::fmt;
+use std::sync::Arc;
 
 use glam::DVec3;
 use slag_common::frames::Aabb;
+
+use super::polygon::Polygon;
 
 /// A ball in the world frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -20,13 +23,16 @@ impl Ball {
     }
 }
 
-/// A ball and a box, either optional. A Gaussian lies inside if its mean lies in both, borders included.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+/// A ball, a box and a polygon, each optional. A Gaussian lies inside if its mean lies in all of them; the borders of ball and
+/// box are included.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Region {
     /// The ball.
     pub ball: Option<Ball>,
     /// The box, aligned with the world's axes.
     pub bounds: Option<Aabb>,
+    /// The polygon, seen from above.
+    pub polygon: Option<Arc<Polygon>>,
 }
 
 impl Region {
@@ -39,6 +45,7 @@ impl Region {
     pub fn contains(&self, point: DVec3) -> bool {
         self.ball.is_none_or(|ball| ball.contains(point))
             && self.bounds.is_none_or(|bounds| bounds.contains(point))
+            && self.polygon.as_ref().is_none_or(|polygon| polygon.contains(point.truncate()))
     }
 
     /// Returns whether every point of a box lies inside.
@@ -50,6 +57,7 @@ impl Region {
         };
         self.ball.is_none_or(in_ball)
             && self.bounds.is_none_or(|b| of.min.cmpge(b.min).all() && of.max.cmple(b.max).all())
+            && self.polygon.as_ref().is_none_or(|polygon| polygon.covers(of))
     }
 
     /// Returns whether a point of a box can lie inside. May be true although none does, if ball and bounds
@@ -58,6 +66,7 @@ impl Region {
         let near = |ball: Ball| ball.contains(ball.centre_in_world.clamp(of.min, of.max));
         self.ball.is_none_or(near)
             && self.bounds.is_none_or(|b| of.min.cmple(b.max).all() && of.max.cmpge(b.min).all())
+            && self.polygon.as_ref().is_none_or(|polygon| polygon.touches(of))
     }
 }
 
@@ -68,6 +77,9 @@ impl fmt::Display for Region {
         }
         if let Some(bounds) = &self.bounds {
             write!(f, " in the box {} to {}", bounds.min, bounds.max)?;
+        }
+        if let Some(polygon) = &self.polygon {
+            write!(f, " in a polygon of {} corners", polygon.corners().len())?;
         }
         Ok(())
     }
@@ -94,6 +106,7 @@ mod tests {
             let region = Region {
                 ball: centre.map(|(centre_in_world, r)| Ball { centre_in_world, radius: f64::from(r) / 2.0 }),
                 bounds: bounds.map(|(a, b)| Aabb { min: a.min(b), max: a.max(b) }),
+                polygon: None,
             };
             let steps = of.size() * 2.0;
             let along = |axis: usize| 0..=steps[axis] as i32;

@@ -100,7 +100,7 @@ impl<'a> Search<'a> {
         let questions = std::slice::from_ref(question);
         check(shards, questions)?;
         scratch.take_scores(shards, questions)?;
-        let places = scratch.take().score(shards, questions, region, precision);
+        let places = scratch.take().score(shards, questions, region.clone(), precision);
         let places = places.into_iter().next().unwrap_or_default();
         Ok(scratch.search(AskedQuestion {
             shards,
@@ -130,12 +130,12 @@ impl<'a> Search<'a> {
     ) -> Result<Vec<Self>, ScoreError> {
         check(shards, questions)?;
         scratch.take_scores(shards, questions)?;
-        let places = scratch.take().score(shards, questions, region, precision);
+        let places = scratch.take().score(shards, questions, region.clone(), precision);
         let searches = questions.iter().zip(places).enumerate().map(|(index, (question, places))| {
             scratch.search(AskedQuestion {
                 shards,
                 question,
-                region,
+                region: region.clone(),
                 precision,
                 scored: Arc::clone(&scratch.scored),
                 budget: scratch.budget.clone(),

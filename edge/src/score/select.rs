@@ -93,7 +93,7 @@ impl AskedQuestion<'_> {
             let shard = &self.shards[at];
             let members =
                 shard.centroid_starts[centroid] as usize..shard.centroid_starts[centroid + 1] as usize;
-            match cells[at].as_ref().and_then(|cell| cell.filter) {
+            match cells[at].as_ref().and_then(|cell| cell.filter.as_ref()) {
                 None => members.len() as u64,
                 filter => runs_inside(shard, filter, members).map(|inside| inside.len() as u64).sum(),
             }

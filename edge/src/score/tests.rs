@@ -63,7 +63,11 @@ fn region() -> impl Strategy<Value = Region> {
     let ball = (point(), 0u32..40)
         .prop_map(|(centre_in_world, radius)| Ball { centre_in_world, radius: f64::from(radius) + 0.1 });
     let bounds = (point(), point()).prop_map(|(a, b)| Aabb { min: a.min(b), max: a.max(b) });
-    (prop::option::of(ball), prop::option::of(bounds)).prop_map(|(ball, bounds)| Region { ball, bounds })
+    (prop::option::of(ball), prop::option::of(bounds)).prop_map(|(ball, bounds)| Region {
+        ball,
+        bounds,
+        polygon: None,
+    })
 }
 
 /// `q · e - max_j n_j · e` in f64.
@@ -126,11 +130,11 @@ proptest! {
         let views = views(&built);
         let threshold = threshold as f32 / 8.0;
         let precision = if centroids_only { Precision::Centroids } else { Precision::Exact };
-        let batch = Search::batch(&mut Scratch::default(), &views, &questions, region, precision).expect("valid");
+        let batch = Search::batch(&mut Scratch::default(), &views, &questions, region.clone(), precision).expect("valid");
         prop_assert_eq!(batch.len(), questions.len());
         for (search, question) in batch.iter().zip(&questions) {
             // Centroids are rounded with a power-of-two step, so sums stay exact.
-            let mut expected = brute_force(&built, question, region, precision);
+            let mut expected = brute_force(&built, question, region.clone(), precision);
             expected.retain(|(_, _, score, _)| *score >= f64::from(threshold));
             let matches = search.matching(threshold);
             prop_assert_eq!(members_of(&matches), expected.iter().map(|e| (e.0, e.1)).collect::<Vec<_>>());
@@ -149,7 +153,7 @@ proptest! {
             let found: Vec<_> = best.iter().map(|h| (h.shard, h.index, f64::from(h.score))).collect();
             prop_assert_eq!(found, expected.iter().map(|e| (e.0, e.1, e.2)).collect::<Vec<_>>());
 
-            let alone = Search::new(&views, question, region, precision).expect("valid");
+            let alone = Search::new(&views, question, region.clone(), precision).expect("valid");
             prop_assert_eq!(&alone.matching(threshold), &matches);
             prop_assert_eq!(&alone.best(limit, threshold, near), &best);
         }
@@ -306,7 +310,7 @@ fn skips_by_box_and_by_bound() {
     let ball = Ball { centre_in_world: DVec3::ZERO, radius: 20.0 };
     let shards = views(&built);
     let question = Question::new([1.0, 0.0]);
-    let region = Region { ball: Some(ball), bounds: None };
+    let region = Region { ball: Some(ball), bounds: None, polygon: None };
     let search = Search::new(&shards, &question, region, Precision::Exact).expect("valid");
     assert_eq!(search.searched().count(), 2);
     let matches = search.matching(0.5);

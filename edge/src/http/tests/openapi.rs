@@ -75,12 +75,19 @@ async fn every_route_and_parameter_is_described() {
     assert_eq!(served, api);
     assert_eq!(api["info"]["version"], env!("CARGO_PKG_VERSION"));
     let (_, table) = routes().with_help("");
+    // Events end when the service stops.
+    service.app.stopping.send_replace(true);
     let paths = api["paths"].as_object().expect("paths");
     assert_eq!(names(paths.keys().map(String::as_str)), names(table.iter().map(|route| route.path)));
     for route in &table {
         let (path, method) = (route.path, route.method.as_str().to_lowercase());
-        assert!(api["paths"][path][method].is_object(), "{path}");
-        assert_ne!(service.get(path).await.0, StatusCode::NOT_FOUND, "{path} is described, not served");
+        assert!(api["paths"][path][&method].is_object(), "{path}");
+        let uri = path.replace("{id}", "x");
+        assert_ne!(service.get(&uri).await.0, StatusCode::NOT_FOUND, "{path} is described, not served");
+        let described = api["paths"][path][&method]["parameters"].as_array().cloned().unwrap_or_default();
+        let of_query = described.iter().filter(|p| p["in"] == "query").filter_map(|p| p["name"].as_str());
+        let known = route.parameters.iter().map(|parameter| parameter.name);
+        assert_eq!(names(of_query), names(known), "{path}");
     }
     let described = api["paths"]["/query"]["get"]["parameters"].as_array().expect("parameters");
     let known = params::parameters().map(|parameter| parameter.name);
@@ -159,6 +166,29 @@ async fn every_answer_is_as_described() {
             (&json!(kind), Some(n)),
             "{body:#}"
         );
+    }
+    let cases = [
+        ("/v1/query", "text=0&text=1&near=0,0,0"),
+        ("/v1/query", "text=0%20near%20the%201&min_score=-1"),
+        ("/v1/query", "text=nearest%200&near=0,0,0"),
+        ("/v1/query", "text=0%20on%20the%201"),
+        ("/v1/query", "text=0&kind=gaussians&negative=1"),
+        ("/v1/query", "text=1&kind=clusters"),
+        ("/v1/query", "text=sofa"),
+        ("/v1/query", "text=0&limit=0"),
+        ("/v1/objects", "limit=1"),
+        ("/v1/objects", "limit=x"),
+        ("/v1/map", ""),
+        ("/v1/objects/{id}", "o0000000000000005"),
+        ("/v1/objects/{id}", "o0000000000000006"),
+        ("/v1/objects/{id}", "5"),
+    ];
+    for (path, query) in cases {
+        let uri = if path.contains('{') { path.replace("{id}", query) } else { format!("{path}?{query}") };
+        let (status, headers, body) = service.get(&uri).await;
+        let kind = headers["content-type"].to_str().expect("text");
+        let found = check(&response_schema(path, status, kind), &body, "");
+        assert_eq!(found, Ok(()), "{uri}: {body:#}");
     }
     let empty = Service::new(None, Settings::default());
     let (_, _, body) = empty.get("/status").await;

@@ -1,0 +1,296 @@
+//! Version 1 of the API: one shape of reply, areas, pages, relations, the things on board, events.
+
+use axum::body::Bytes;
+use slag_common::manifest::Calibration;
+
+use super::*;
+use crate::testing::TestObject;
+
+/// Gaussians on a lattice between two corners, in steps of 0.01.
+fn lattice(from: [u16; 3], to: [u16; 3], n: [u16; 3], axis: usize) -> Vec<Member> {
+    let at = |i: u16, n: u16, from: u16, to: u16| from + (to - from) * i / (n - 1);
+    let embedding: Vec<f32> = (0..3).map(|i| f32::from(i == axis)).collect();
+    let mut members = Vec::new();
+    for x in 0..n[0] {
+        for y in 0..n[1] {
+            for z in 0..n[2] {
+                let steps =
+                    [at(x, n[0], from[0], to[0]), at(y, n[1], from[1], to[1]), at(z, n[2], from[2], to[2])];
+                members.push(Member { steps, embedding: embedding.clone() });
+            }
+        }
+    }
+    members
+}
+
+/// Two mugs (axis 0), one of them on a table (axis 1), and nothing of axis 2. Metres: the table is 1.6 x 0.9 x 0.74 in a
+/// corner of the world, the other mug stands 3 m along x on the floor.
+fn room() -> [BuiltShard; 1] {
+    let mugs = [
+        lattice([50, 40, 75], [60, 50, 88], [4, 4, 4], 0),
+        lattice([300, 40, 0], [310, 50, 13], [4, 4, 4], 0),
+    ];
+    let table = lattice([0, 0, 0], [160, 90, 74], [9, 7, 6], 1);
+    let ends = [0u32, 64, 128, 128 + table.len() as u32];
+    let shard = TestShard::new(vec![mugs.concat(), table]).build(false);
+    let object = |id: u64, axis: usize, at: usize| TestObject {
+        id,
+        vectors: (0..9).map(|i| f32::from(i % 3 == axis)).collect(),
+        runs: std::iter::once(ends[at]..ends[at + 1]).collect(),
+        n_gaussians: ends[at + 1] - ends[at],
+    };
+    let objects = [object(1, 0, 0), object(2, 0, 1), object(3, 1, 2)];
+    [shard.with_objects(&objects, Calibration { score_mean: 0.0, score_spread: 0.1 })]
+}
+
+async fn post(service: &Service, body: &Value) -> (StatusCode, HeaderMap, Value) {
+    let request = Request::builder()
+        .method("POST")
+        .uri("/v1/query")
+        .header("content-type", "application/json")
+        .body(Body::from(body.to_string()))
+        .expect("a request");
+    let router = router(Arc::clone(&service.app));
+    soon(async { read(router.oneshot(request).await.expect("infallible")).await }).await
+}
+
+fn ids(result: &Value) -> Vec<String> {
+    let answers = result["answers"].as_array().expect("answers");
+    answers.iter().map(|answer| answer["id"].as_str().expect("an id").to_owned()).collect()
+}
+
+const MUG_ON_TABLE: &str = "o0000000000000001";
+const MUG_ON_FLOOR: &str = "o0000000000000002";
+const TABLE: &str = "o0000000000000003";
+
+#[tokio::test]
+async fn get_and_post_answer_in_one_shape() {
+    let service = Service::new(Some(&room()), Settings::default());
+    let (status, _, got) = service.get("/v1/query?text=0&text=1&near=0,0,0").await;
+    assert_eq!(status, StatusCode::OK, "{got}");
+    let (status, _, posted) = post(&service, &json!({"texts": ["0", "1"], "near": [0, 0, 0]})).await;
+    assert_eq!((status, &got), (StatusCode::OK, &posted));
+    assert_eq!(
+        (&got["scene"], &got["generation"], &got["frame"], &got["unit"]),
+        (&json!("yard"), &json!(1), &json!("world"), &json!("m"))
+    );
+    let (_, _, one) = service.get("/v1/query?text=1&near=0,0,0").await;
+    assert_eq!(one["results"][0], got["results"][1], "one question has the shape of many");
+    assert_eq!(ids(&got["results"][0]), [MUG_ON_TABLE, MUG_ON_FLOOR]);
+    let answer = &got["results"][0]["answers"][0];
+    assert_eq!((&answer["frame"], &answer["generation"]), (&json!("world"), &json!(1)));
+    // The same vector without the text model; its length does not count.
+    let (status, _, vector) =
+        post(&service, &json!({"vectors": [[5.0, 0.0, 0.0], [0.0, 0.5, 0.0]], "near": [0, 0, 0]})).await;
+    assert_eq!(status, StatusCode::OK, "{vector}");
+    for at in 0..2 {
+        let (text, vector) = (&got["results"][at], &vector["results"][at]);
+        assert_eq!((&text["answers"], &vector["question"]), (&vector["answers"], &json!({"vector": at})));
+    }
+    let (_, _, old) = service.get("/query?text=0&near=0,0,0").await;
+    for name in ["id", "position_in_world", "score", "relevance", "distance"] {
+        assert_eq!(old["answers"][0][name], answer[name], "{name}");
+    }
+}
+
+#[tokio::test]
+async fn pages_are_the_whole_in_pieces() {
+    let service = Service::new(Some(&room()), Settings::default());
+    for kind in ["gaussians", "objects"] {
+        let (_, _, all) = service.get(&format!("/v1/query?text=0&kind={kind}&limit=1000")).await;
+        let all = &all["results"][0];
+        assert_eq!(all["next_offset"], Value::Null);
+        let (mut pages, mut offset) = (Vec::new(), 0);
+        loop {
+            let uri = format!("/v1/query?text=0&kind={kind}&limit=1&offset={offset}");
+            let (_, _, page) = service.get(&uri).await;
+            let page = &page["results"][0];
+            pages.extend(page["answers"].as_array().expect("answers").clone());
+            match page["next_offset"].as_u64() {
+                Some(next) => offset = next,
+                None => break,
+            }
+        }
+        assert_eq!(all["answers"], Value::Array(pages), "{kind}");
+    }
+}
+
+#[tokio::test]
+async fn areas_restrict_what_is_found() {
+    let service = Service::new(Some(&room()), Settings::default());
+    let near = [MUG_ON_TABLE];
+    let by_box = json!({"box": {"from": [-1, -1, -1], "to": [2, 2, 2]}});
+    let by_ball = json!({"ball": {"centre": [0.5, 0.5, 0.8], "radius": 1.0}});
+    let by_polygon = json!({"polygon": [[-1, -1], [2, -1], [2, 2], [-1, 2]]});
+    for region in [&by_box, &by_ball, &by_polygon] {
+        for text in ["0", "0 near the 1"] {
+            let (status, _, body) = post(&service, &json!({"texts": [text], "region": region})).await;
+            assert_eq!(
+                (status, ids(&body["results"][0]).as_slice()),
+                (StatusCode::OK, &near.map(str::to_owned)[..]),
+                "{body}"
+            );
+        }
+    }
+    let (_, _, body) = service.get("/v1/query?text=0&polygon=-1,-1,2,-1,2,2,-1,2").await;
+    assert_eq!(ids(&body["results"][0]), near);
+    let far = json!({"ball": {"centre": [50, 50, 0], "radius": 1.0}});
+    let (_, _, body) = post(&service, &json!({"texts": ["0 on the 1"], "region": far})).await;
+    assert_eq!(body["results"][0]["none"]["kind"], "not-in-region", "{body}");
+    let (status, _, body) = service.get("/v1/query?text=0&near_lat_lon=47,8&radius=5").await;
+    assert_eq!((status, &body["parameter"]), (StatusCode::BAD_REQUEST, &json!("region")), "{body}");
+}
+
+#[tokio::test]
+async fn relations_are_answered_and_say_what_failed() {
+    let service = Service::new(Some(&room()), Settings::default());
+    let (status, _, body) = service.get("/v1/query?text=0%20on%20the%201").await;
+    let result = &body["results"][0];
+    assert_eq!((status, ids(result)), (StatusCode::OK, vec![MUG_ON_TABLE.to_owned()]), "{body}");
+    let phrase = json!({"thing": "0", "relation": {"is": "on", "of": {"thing": "1"}}});
+    assert_eq!(result["understood"], phrase);
+    assert_eq!(result["answers"][0]["related_to"][0]["id"], TABLE);
+    let (_, _, posted) = post(&service, &json!({"phrases": [phrase]})).await;
+    assert_eq!(posted["results"][0]["answers"], result["answers"]);
+    // The text alone, as it is.
+    let (_, _, plain) = service.get("/v1/query?text=0%20on%20the%201&relations=off").await;
+    assert_eq!(ids(&plain["results"][0]).len(), 2);
+    let asks = [
+        ("largest 0", vec![MUG_ON_TABLE, MUG_ON_FLOOR], None),
+        ("0 beside the 1", vec![], Some(("no-such-pair", "0"))),
+        ("0 on the 2", vec![], Some(("no-such-thing", "2"))),
+        ("2 on the 1", vec![], Some(("no-such-thing", "2"))),
+        ("2nd 0 from the 1", vec![MUG_ON_FLOOR], None),
+        ("3rd 0 from the 1", vec![], Some(("too-few", "0"))),
+        ("nearest 0", vec![MUG_ON_FLOOR], None),
+        ("0 in front of the 1", vec![MUG_ON_FLOOR], None),
+        ("0 behind the 1", vec![], Some(("no-such-pair", "0"))),
+    ];
+    for (text, expected, none) in asks {
+        let (status, _, body) = post(&service, &json!({"texts": [text], "near": [6, 0.45, 0]})).await;
+        let result = &body["results"][0];
+        assert_eq!(status, StatusCode::OK, "{text}: {body}");
+        // Both mugs have the same size up to rounding.
+        let found = ids(result);
+        match text {
+            "largest 0" => assert!(found.len() == 1 && expected.contains(&found[0].as_str()), "{body}"),
+            _ => assert_eq!(found, expected, "{text}: {body}"),
+        }
+        let failed = none.map(|(kind, thing)| (json!(kind), json!(thing)));
+        let failed = failed.unwrap_or_default();
+        assert_eq!((&result["none"]["kind"], &result["none"]["thing"]), (&failed.0, &failed.1), "{text}");
+    }
+}
+
+#[tokio::test]
+async fn wrong_requests_are_refused_by_name() {
+    let service = Service::new(Some(&room()), Settings::default());
+    let cases = [
+        (json!({}), "texts"),
+        (json!({"texts": vec!["0"; 33]}), "texts"),
+        (json!({"texts": ["0"], "colour": 1}), "body"),
+        (json!({"texts": "0"}), "body"),
+        (json!({"vectors": [[1.0, 0.0]]}), "vectors"),
+        (json!({"vectors": [[0.0, 0.0, 0.0]]}), "vectors"),
+        (json!({"vectors": [[1e39, 0.0, 0.0]]}), "body"),
+        (json!({"texts": ["0"], "limit": 0}), "limit"),
+        (json!({"texts": ["0", "1"], "limit": 5001}), "limit"),
+        (json!({"texts": ["0"], "offset": 1u64 << 40}), "limit"),
+        (json!({"texts": ["0"], "min_score": 3}), "threshold"),
+        (json!({"texts": ["0"], "precision": "maybe"}), "precision"),
+        (json!({"texts": ["0"], "time_budget_ms": 0}), "time_budget_ms"),
+        (json!({"texts": ["0"], "near": [1e12, 0, 0]}), "near"),
+        (json!({"texts": ["0"], "region": {"polygon": [[0, 0], [1, 1]]}}), "region"),
+        (json!({"texts": ["0"], "region": {"ball": {"centre": [0, 0, 0], "radius": -1}}}), "region"),
+        (json!({"texts": ["0 behind the 1"]}), "near"),
+        (json!({"texts": ["0 left of me"], "near": [0, 0, 0]}), "heading_rad"),
+        (json!({"phrases": [{"thing": "me"}]}), "phrases"),
+        (json!({"phrases": [{"thing": "0"}], "kind": "clusters"}), "kind"),
+    ];
+    for (body, parameter) in cases {
+        let (status, _, reply) = post(&service, &body).await;
+        assert_eq!(
+            (status, &reply["parameter"]),
+            (StatusCode::BAD_REQUEST, &json!(parameter)),
+            "{body}: {reply}"
+        );
+    }
+    for (query, parameter) in [
+        ("text=0&colour=1", "colour"),
+        ("text=0&limit=1&limit=2", "limit"),
+        ("text=0&radius=3", "near"),
+        ("text=0&relations=maybe", "relations"),
+        ("text=0&polygon=1,2,3", "polygon"),
+    ] {
+        let (status, _, reply) = service.get(&format!("/v1/query?{query}")).await;
+        assert_eq!(
+            (status, &reply["parameter"]),
+            (StatusCode::BAD_REQUEST, &json!(parameter)),
+            "{query}: {reply}"
+        );
+    }
+    // A negative may have a comma.
+    let (_, _, reply) = post(&service, &json!({"texts": ["0"], "negatives": ["1 red, 2 blue"]})).await;
+    assert_eq!(reply["results"][0]["negatives"], json!(["1 red, 2 blue"]), "{reply}");
+    let empty = Service::new(None, Settings::default());
+    assert_eq!(post(&empty, &json!({"texts": ["0"]})).await.0, StatusCode::SERVICE_UNAVAILABLE);
+}
+
+#[tokio::test]
+async fn things_on_board_are_listed_in_pages() {
+    let service = Service::new(Some(&room()), Settings::default());
+    let (status, _, all) = service.get("/v1/objects").await;
+    assert_eq!((status, &all["n_objects"], &all["next_after"]), (StatusCode::OK, &json!(3), &Value::Null));
+    let (_, _, first) = service.get("/v1/objects?limit=2").await;
+    let after = first["next_after"].as_str().expect("there are more");
+    let (_, _, rest) = service.get(&format!("/v1/objects?limit=2&after={after}")).await;
+    let mut pages = first["objects"].as_array().expect("a list").clone();
+    pages.extend(rest["objects"].as_array().expect("a list").clone());
+    assert_eq!((&all["objects"], &rest["next_after"]), (&Value::Array(pages), &Value::Null));
+    let (_, _, table) = service.get(&format!("/v1/objects/{TABLE}")).await;
+    assert_eq!((&table, &table["frame"]), (&all["objects"][2], &json!("world")));
+    // Records of these objects lie along x by their ids.
+    let (_, _, near) = service.get("/v1/objects?near=1,0,0&radius=1.5").await;
+    assert_eq!(near["n_objects"], 2);
+    assert_eq!(service.get("/v1/objects?min_size=2.5").await.2["n_objects"], 0);
+    let (status, _, body) = service.get("/v1/objects/o00000000000000ff").await;
+    assert_eq!((status, &body["type"]), (StatusCode::NOT_FOUND, &json!("urn:slag:problem:no-such-object")));
+    for bad in [
+        "/v1/objects/1-0",
+        "/v1/objects?limit=0",
+        "/v1/objects?after=3",
+        "/v1/objects?radius=3",
+        "/v1/objects?x=1",
+    ] {
+        assert_eq!(service.get(bad).await.0, StatusCode::BAD_REQUEST, "{bad}");
+    }
+    let (_, _, map) = service.get("/v1/map").await;
+    assert_eq!(
+        (&map["n_objects"], &map["cells"][0]["generation"], &map["missing"], &map["z_is_up"]),
+        (&json!(3), &json!(1), &json!([]), &json!(true))
+    );
+}
+
+#[tokio::test]
+async fn events_tell_of_generations_until_the_service_stops() {
+    let settings = Settings { max_listeners: 1, ..Settings::default() };
+    let service = Service::new(Some(&room()), settings);
+    let response = soon(service.send("GET", "/v1/events")).await;
+    assert_eq!(response.headers()["content-type"], "text/event-stream");
+    let mut body = response.into_body();
+    let mut next = async || -> Option<Bytes> {
+        let frame = std::future::poll_fn(|context| {
+            hyper::body::Body::poll_frame(std::pin::Pin::new(&mut body), context)
+        });
+        soon(frame).await.map(|frame| frame.expect("no error").into_data().expect("data"))
+    };
+    let first = next().await.expect("an event");
+    let text = String::from_utf8_lossy(&first);
+    assert!(text.starts_with("event: generation\ndata: {") && text.contains("\"generation\":1"), "{text}");
+    assert_eq!(service.get("/v1/events").await.0, StatusCode::SERVICE_UNAVAILABLE);
+    write_cache(service.dir.path(), &room(), 2);
+    let second = next().await.expect("an event");
+    assert!(String::from_utf8_lossy(&second).contains("\"generation\":2"));
+    service.app.stopping.send_replace(true);
+    assert!(next().await.is_none());
+}

@@ -1,0 +1,133 @@
+//! The body of `POST /v1/query`.
+
+use std::time::Duration;
+
+use serde::Deserialize;
+
+use crate::query::relations::{self, Phrase};
+use crate::query::{
+    AnswerKind, Area, Ask, Asked, DEFAULT_MIN_COUNT, MAX_TEXTS, Negatives, Point, QueryRequest, RequestError,
+};
+use crate::score::Precision;
+
+/// Longest body: 32 vectors of 2048 components as text.
+pub const MAX_BODY_BYTES: usize = 1 << 20;
+
+/// A request for answers. Everything but what is asked for is optional.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Body {
+    /// Texts for the text model; those that name a relation are understood as phrases.
+    pub texts: Vec<String>,
+    /// Vectors of the scene's embedding space.
+    pub vectors: Vec<Vec<f32>>,
+    /// Things by their relations.
+    pub phrases: Vec<Phrase>,
+    /// Whether texts that name a relation are understood as phrases; true if absent.
+    pub relations: Option<bool>,
+    /// Negative prompts; `canonical` alone stands for LERF's.
+    pub negatives: Vec<String>,
+    /// Kind of answers.
+    pub kind: Option<AnswerKind>,
+    /// The part of space to search.
+    pub region: Area,
+    /// The asker's position.
+    pub near: Option<Point>,
+    /// The asker's heading, from x towards y, radians.
+    pub heading_rad: Option<f64>,
+    /// Least score of a match.
+    pub min_score: Option<f32>,
+    /// Answers to each question in a page.
+    pub limit: Option<usize>,
+    /// Answers to each question before the page.
+    pub offset: usize,
+    /// Least Gaussians of an answer.
+    pub min_count: Option<u64>,
+    /// Edge of the voxels that join Gaussians to clusters.
+    pub voxel: Option<f64>,
+    /// Where scores come from.
+    pub precision: Option<String>,
+    /// Most time to compute, milliseconds.
+    pub time_budget_ms: Option<u64>,
+}
+
+/// A request, and the text behind each phrase that was understood.
+pub struct Understood {
+    pub ask: Ask,
+    /// The question of each answer, as the client wrote it.
+    pub questions: Vec<serde_json::Value>,
+    pub time_budget: Option<Duration>,
+}
+
+impl Body {
+    /// Reads a body.
+    ///
+    /// # Errors
+    /// It is no JSON, or no request.
+    pub fn parse(bytes: &[u8]) -> Result<Self, RequestError> {
+        let refused = |e: serde_json::Error| {
+            RequestError::new("body", &e.to_string(), "a request as GET /openapi.json describes it")
+        };
+        serde_json::from_slice(bytes).map_err(refused)
+    }
+
+    /// Checks the number of questions, and understands texts. `has_objects`: whether relations can be answered; where they
+    /// cannot, texts stay texts.
+    ///
+    /// # Errors
+    /// The first parameter that is wrong.
+    pub fn understand(self, has_objects: bool) -> Result<Understood, RequestError> {
+        let n = self.texts.len() + self.vectors.len() + self.phrases.len();
+        if !(1..=MAX_TEXTS).contains(&n) {
+            let expected = format!("1 to {MAX_TEXTS} texts, vectors and phrases together");
+            return Err(RequestError::new("texts", &format!("{n} questions"), expected));
+        }
+        let is_of_objects = matches!(self.kind, None | Some(AnswerKind::Objects));
+        let with_relations = self.relations.unwrap_or(true) && has_objects && is_of_objects;
+        let (mut asked, mut questions) = (Vec::with_capacity(n), Vec::with_capacity(n));
+        for text in self.texts {
+            questions.push(serde_json::json!({ "text": text }));
+            let phrase = if with_relations { relations::understand(&text) } else { None };
+            // A phrase that breaks a limit is one text for the text model, as one without relations is.
+            let phrase = phrase.filter(|phrase| phrase.check().is_ok());
+            asked.push(phrase.map_or(Asked::Text(text), Asked::Phrase));
+        }
+        for (at, vector) in self.vectors.into_iter().enumerate() {
+            questions.push(serde_json::json!({ "vector": at }));
+            asked.push(Asked::Vector(vector));
+        }
+        for phrase in self.phrases {
+            questions.push(serde_json::json!({ "phrase": phrase }));
+            asked.push(Asked::Phrase(phrase));
+        }
+        let precision = match &self.precision {
+            Some(name) => name.parse().map_err(|e: String| RequestError::new("precision", name, e))?,
+            None => Precision::default(),
+        };
+        let time_budget = match self.time_budget_ms {
+            Some(0) => return Err(RequestError::new("time_budget_ms", "0", "at least 1")),
+            time => time.map(Duration::from_millis),
+        };
+        let request = QueryRequest {
+            negatives: negatives(self.negatives),
+            limit: self.limit,
+            threshold: self.min_score,
+            kind: self.kind,
+            voxel: self.voxel,
+            min_count: self.min_count.unwrap_or(DEFAULT_MIN_COUNT),
+            precision,
+            ..QueryRequest::new("")
+        };
+        let (near, heading_rad, offset) = (self.near, self.heading_rad, self.offset);
+        let ask = Ask { asked, request, area: self.region, near, heading_rad, offset };
+        Ok(Understood { ask, questions, time_budget })
+    }
+}
+
+fn negatives(phrases: Vec<String>) -> Negatives {
+    match phrases.as_slice() {
+        [] => Negatives::None,
+        [one] if one == "canonical" => Negatives::Canonical,
+        _ => Negatives::Phrases(phrases),
+    }
+}

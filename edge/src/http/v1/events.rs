@@ -1,0 +1,117 @@
+//! `GET /v1/events`: server-sent events (WHATWG HTML, 9.2), so that a client need not poll.
+
+use std::io;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use axum::body::{Body, Bytes};
+use axum::extract::State;
+use axum::http::{HeaderValue, header};
+use axum::response::{IntoResponse, Response};
+use hyper::body::Frame;
+use serde_json::{Value, json};
+use slag_service::problem::Problem;
+use tokio::sync::mpsc::{Receiver, channel};
+
+use crate::fetch::follow::FollowStatus;
+use crate::http::app::App;
+use crate::http::problem::too_many_listeners;
+use crate::query::FRAME;
+
+/// Time between looks at what is on board.
+const TICK: Duration = Duration::from_millis(500);
+/// Time without an event after which a comment is sent: a client that is gone is noticed.
+const KEEP_ALIVE: Duration = Duration::from_secs(15);
+/// Events made ahead of the client.
+const EVENTS_AHEAD: usize = 4;
+
+pub async fn events(State(app): State<Arc<App>>) -> Result<Response, Problem> {
+    let permit = Arc::clone(&app.listeners).try_acquire_owned();
+    let permit = permit.map_err(|_| too_many_listeners(app.settings.max_listeners))?;
+    let (sender, receiver) = channel::<Bytes>(EVENTS_AHEAD);
+    let mut stopping = app.stopping.subscribe();
+    let telling = async move {
+        let _permit = permit;
+        let mut told = Told::default();
+        let mut quiet = Duration::ZERO;
+        loop {
+            app.reload_if_stale();
+            let mut text = told.news(&app);
+            if text.is_empty() && quiet >= KEEP_ALIVE {
+                text.push_str(": still here\n\n");
+            }
+            quiet = if text.is_empty() { quiet + TICK } else { Duration::ZERO };
+            // A client that takes nothing is cut off by the connection's own limit.
+            if !text.is_empty() && sender.send(text.into()).await.is_err() {
+                return;
+            }
+            tokio::select! {
+                () = tokio::time::sleep(TICK) => {}
+                () = sender.closed() => return,
+                _ = stopping.wait_for(|is_stopping| *is_stopping) => return,
+            }
+        }
+    };
+    tokio::spawn(telling);
+    let headers = [
+        (header::CONTENT_TYPE, HeaderValue::from_static("text/event-stream")),
+        (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
+    ];
+    Ok((headers, Body::new(Events(receiver))).into_response())
+}
+
+/// What a client was told.
+#[derive(Default)]
+struct Told {
+    /// The generation's manifest; the inner one is absent without a scene.
+    scene: Option<Option<slag_common::Hash32>>,
+    following: Option<FollowStatus>,
+}
+
+impl Told {
+    /// Returns what has changed, as events; at first everything.
+    fn news(&mut self, app: &App) -> String {
+        let mut text = String::new();
+        let snapshot = app.engine.snapshot().ok();
+        let scene = snapshot.as_ref().map(|snapshot| snapshot.current.manifest_hash);
+        if self.scene != Some(scene) {
+            self.scene = Some(scene);
+            let data = snapshot.as_ref().map(|snapshot| {
+                json!({
+                    "scene": snapshot.manifest.scene, "generation": snapshot.manifest.generation, "frame": FRAME,
+                    "n_cells": snapshot.shards.len(), "n_objects": snapshot.objects.len(),
+                    "n_bad_cells": snapshot.bad_cells.len(),
+                })
+            });
+            push(&mut text, "generation", &data.unwrap_or(Value::Null));
+        }
+        let following = app.following.as_ref().map(|following| following.status());
+        if following.is_some() && following != self.following {
+            push(&mut text, "following", &json!(following));
+            self.following = following;
+        }
+        text
+    }
+}
+
+/// Writes an event; JSON has no line breaks of its own.
+fn push(text: &mut String, name: &str, data: &Value) {
+    text.push_str(&format!("event: {name}\ndata: {data}\n\n"));
+}
+
+/// A body of events, which ends when the service stops.
+struct Events(Receiver<Bytes>);
+
+impl hyper::body::Body for Events {
+    type Data = Bytes;
+    type Error = io::Error;
+
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, io::Error>>> {
+        self.0.poll_recv(context).map(|event| event.map(|event| Ok(Frame::data(event))))
+    }
+}

@@ -1,0 +1,21 @@
+//! `GET /v1/map`: what is on board, how old it is, and what is missing.
+
+use std::sync::Arc;
+
+use axum::Json;
+use axum::extract::State;
+use serde_json::{Value, json};
+use slag_service::problem::Problem;
+
+use crate::http::app::App;
+use crate::http::problem::query_problem;
+use crate::query::MapStatus;
+
+pub async fn map(State(app): State<Arc<App>>) -> Result<Json<Value>, Problem> {
+    app.blocking(|app| {
+        app.reload_if_stale();
+        let snapshot = app.engine.snapshot().map_err(query_problem)?;
+        Ok(Json(json!(MapStatus::of(&snapshot, crate::now_unix_secs()))))
+    })
+    .await
+}

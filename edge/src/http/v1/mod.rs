@@ -1,0 +1,32 @@
+//! The API for programs, version 1: one shape of reply for every question.
+
+mod body;
+mod events;
+mod map;
+mod objects;
+mod params;
+mod query;
+mod reply;
+
+use std::sync::Arc;
+
+use slag_service::routes::Routes;
+
+use super::app::App;
+
+/// Adds the routes.
+pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
+    to.get("/v1/query", "things that match texts or relations, best first, in one shape of reply", query::get)
+        .parameters(params::query_parameters())
+        .post(
+            "/v1/query",
+            "the same, asked in JSON: texts, vectors, phrases, areas",
+            body::MAX_BODY_BYTES,
+            query::post,
+        )
+        .get("/v1/objects", "all things on board, by id, in pages", objects::list)
+        .parameters(params::objects_parameters())
+        .get("/v1/objects/{id}", "one thing on board", objects::one)
+        .get("/v1/map", "the area on board, its age, and what is missing", map::map)
+        .get("/v1/events", "server-sent events: generations and fetches as they happen", events::events)
+}

@@ -1,0 +1,69 @@
+//! `GET` and `POST /v1/query`.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use axum::body::Bytes;
+use axum::extract::State;
+use axum::extract::rejection::QueryRejection;
+use axum::http::header;
+use axum::response::{IntoResponse, Response};
+use slag_service::problem::Problem;
+
+use super::body::{Body, Understood};
+use super::params::{self, Pairs};
+use super::reply::{Described, Replied};
+use crate::http::app::App;
+use crate::http::problem::{overloaded, parameter_problem, query_problem, timeout};
+use crate::query::Asked;
+
+pub async fn get(
+    State(app): State<Arc<App>>,
+    pairs: Result<Pairs, QueryRejection>,
+) -> Result<Response, Problem> {
+    let body = params::pairs(pairs).and_then(|pairs| params::parse(&pairs).map_err(parameter_problem));
+    answer(&app, body).await
+}
+
+pub async fn post(State(app): State<Arc<App>>, bytes: Bytes) -> Result<Response, Problem> {
+    answer(&app, Body::parse(&bytes).map_err(parameter_problem)).await
+}
+
+async fn answer(app: &Arc<App>, body: Result<Body, Problem>) -> Result<Response, Problem> {
+    let started = Instant::now();
+    let answer = answer_within(app, body).await;
+    app.metrics.query_times.observe(started.elapsed());
+    let body = answer?;
+    Ok(([(header::CONTENT_TYPE, "application/json")], body).into_response())
+}
+
+async fn answer_within(app: &Arc<App>, body: Result<Body, Problem>) -> Result<Vec<u8>, Problem> {
+    let body = body?;
+    let asked_for = body.time_budget_ms.map(Duration::from_millis);
+    let limit = asked_for.map_or(app.settings.query_timeout, |time| time.min(app.settings.query_timeout));
+    let permit =
+        Arc::clone(&app.permits).try_acquire_owned().map_err(|_| overloaded(app.settings.max_queries))?;
+    let answering = app.blocking(move |app| {
+        // Held until the work is done, even if the client has given up.
+        let _permit = permit;
+        app.reload_if_stale();
+        let has_objects = !app.engine.snapshot().map_err(query_problem)?.objects.is_empty();
+        let Understood { ask, questions, time_budget } =
+            body.understand(has_objects).map_err(parameter_problem)?;
+        let budget = app.query_budget_within(time_budget);
+        let found = app.engine.ask(&ask, &budget).map_err(query_problem)?;
+        let n_empty = found.outcomes.iter().filter(|outcome| outcome.is_empty()).count();
+        app.metrics.empty_answers.fetch_add(n_empty as u64, Ordering::Relaxed);
+        let results = questions.into_iter().zip(&ask.asked).zip(&found.outcomes);
+        let results = results.map(|((question, asked), outcome)| {
+            let understood = match asked {
+                Asked::Phrase(phrase) => Some(phrase),
+                _ => None,
+            };
+            Described::new(&found.reply, (question, understood), outcome, (ask.offset, ask.page()))
+        });
+        serde_json::to_vec(&Replied::new(&found.reply, results.collect())).map_err(Problem::internal)
+    });
+    tokio::time::timeout(limit, answering).await.map_err(|_| timeout(limit))?
+}

@@ -1,0 +1,74 @@
+//! The part of space that a request names.
+
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+use slag_common::frames::Aabb;
+use slag_common::manifest::Manifest;
+
+use super::point::{Corner, Point};
+use super::request::{QueryRequest, RequestError};
+use crate::score::{Ball, MAX_CORNERS, Polygon};
+
+/// A ball, a box and a polygon, each optional; what lies in all of them is asked for.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Area {
+    /// A ball.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ball: Option<AreaBall>,
+    /// A box along the axes of the world frame.
+    #[serde(rename = "box", skip_serializing_if = "Option::is_none")]
+    pub bounds: Option<AreaBox>,
+    /// A polygon, seen from above.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub polygon: Vec<Corner>,
+}
+
+/// A ball.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AreaBall {
+    /// Its centre.
+    pub centre: Point,
+    /// Its radius, world units.
+    pub radius: f64,
+}
+
+/// A box, by two opposite corners.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AreaBox {
+    /// One corner.
+    pub from: Point,
+    /// The corner opposite.
+    pub to: Point,
+}
+
+impl Area {
+    /// Restricts a request to this area.
+    ///
+    /// # Errors
+    /// The part that is out of bounds, or geographic in a scene without a geographic reference.
+    pub fn restrict(&self, request: &mut QueryRequest, manifest: &Manifest) -> Result<(), RequestError> {
+        if let Some(AreaBall { centre, radius }) = self.ball {
+            let centre_in_world = centre.in_world("region", manifest)?;
+            request.ball = Some(Ball { centre_in_world, radius });
+        }
+        if let Some(AreaBox { from, to }) = self.bounds {
+            let (from, to) = (from.in_world("region", manifest)?, to.in_world("region", manifest)?);
+            request.bounds = Some(Aabb { min: from.min(to), max: from.max(to) });
+        }
+        if !self.polygon.is_empty() {
+            let corners = self.polygon.iter().map(|corner| corner.in_world("region", manifest));
+            let corners = corners.collect::<Result<Vec<_>, _>>()?;
+            let found = format!("{} corners", corners.len());
+            let refused = || {
+                let expected = format!("a polygon of 3 to {MAX_CORNERS} corners within bounds");
+                RequestError::new("region", &found, expected)
+            };
+            request.polygon = Some(Arc::new(Polygon::new(corners).ok_or_else(refused)?));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,129 @@
+//! The things on board, and the area that they lie in.
+
+use glam::DVec3;
+use serde::Serialize;
+use slag_common::frames::{Aabb, Geographic};
+
+use super::answers::Evidence;
+use super::engine::Engine;
+use super::extent::Extent;
+use super::objects::{self, FoundObject};
+use super::oriented::OrientedBox;
+use super::scene::{Scene, alignment};
+use crate::score::{Budget, Region};
+use crate::store::Snapshot;
+
+/// Name of the frame of every position: the scene's world frame (`docs/api.md`).
+pub const FRAME: &str = "world";
+
+/// Which objects are listed.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ObjectFilter {
+    /// Only those with larger ids.
+    pub after: Option<u64>,
+    /// Only those with their position within this distance of a point.
+    pub ball: Option<(DVec3, f64)>,
+    /// Least length of the longest edge of the box.
+    pub min_size: f64,
+}
+
+/// An object on board.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ObjectOnBoard {
+    /// Its id: `o` and 16 hex digits.
+    pub id: String,
+    /// Frame of every position.
+    pub frame: &'static str,
+    /// Generation that they belong to.
+    pub generation: u64,
+    /// Mean of its Gaussians inside the box.
+    pub position_in_world: DVec3,
+    /// The same on the earth, if the scene is geo-referenced.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub geographic: Option<Geographic>,
+    /// Smallest corner of its box.
+    pub box_min_in_world: DVec3,
+    /// Largest corner.
+    pub box_max_in_world: DVec3,
+    /// Its box along axes of its own; of the part on board.
+    pub oriented_box: OrientedBox,
+    /// Its Gaussians on board.
+    pub n_gaussians: u64,
+    /// Its Gaussians in the whole scene.
+    pub n_gaussians_in_scene: u64,
+    /// The photo that shows it best.
+    pub evidence: Evidence,
+}
+
+/// A page of the objects on board.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ObjectPage {
+    /// Objects that pass the filter but for `after`.
+    pub n_matching: usize,
+    /// The id to go on after, if there are more.
+    pub next_after: Option<String>,
+    /// The objects, by id.
+    pub objects: Vec<ObjectOnBoard>,
+}
+
+/// Reads an object's id as answers name it.
+pub fn object_id(text: &str) -> Option<u64> {
+    let digits = text.strip_prefix('o')?;
+    let is_hex = digits.len() == 16 && digits.bytes().all(|b| b.is_ascii_hexdigit());
+    is_hex.then(|| u64::from_str_radix(digits, 16).ok())?
+}
+
+impl Engine {
+    /// Returns the objects of a generation that pass a filter, by id, at most `limit`.
+    pub fn objects(&self, snapshot: &Snapshot, filter: &ObjectFilter, limit: usize) -> ObjectPage {
+        self.on_scene(snapshot, &Budget::default(), |_, scene| page(scene, filter, limit))
+    }
+
+    /// Returns an object of a generation.
+    pub fn object(&self, snapshot: &Snapshot, id: u64) -> Option<ObjectOnBoard> {
+        self.on_scene(snapshot, &Budget::default(), |_, scene| {
+            // Objects are in order of their ids.
+            let (mut low, mut high) = (0, scene.index.len());
+            while low < high {
+                let middle = low.midpoint(high);
+                if objects::record(scene, middle).id < id { low = middle + 1 } else { high = middle }
+            }
+            let is_it = low < scene.index.len() && objects::record(scene, low).id == id;
+            is_it.then(|| describe(scene, low))
+        })
+    }
+}
+
+fn page(scene: &Scene<'_>, filter: &ObjectFilter, limit: usize) -> ObjectPage {
+    let passes = |object: &usize| {
+        let record = objects::record(scene, *object);
+        filter.ball.is_none_or(|(centre, radius)| record.position().distance(centre) <= radius)
+            && record.bounds().size().max_element() >= filter.min_size
+    };
+    let all: Vec<usize> = (0..scene.index.len()).filter(passes).collect();
+    let is_after = |object: &usize| filter.after.is_none_or(|id| objects::record(scene, *object).id > id);
+    let mut rest = all.iter().copied().filter(is_after);
+    let objects: Vec<ObjectOnBoard> = rest.by_ref().take(limit).map(|at| describe(scene, at)).collect();
+    let next_after = rest.next().and_then(|_| objects.last()).map(|last| last.id.clone());
+    ObjectPage { n_matching: all.len(), next_after, objects }
+}
+
+fn describe(scene: &Scene<'_>, object: usize) -> ObjectOnBoard {
+    let (record, everywhere) = (objects::record(scene, object), Region::default());
+    let n_gaussians = objects::count_in(scene, object, &everywhere);
+    let found = FoundObject { object, record, score: 0.0, n_gaussians, cut: None };
+    let Extent { position_in_world, box_in_world: Aabb { min, max } } = found.extent();
+    ObjectOnBoard {
+        id: found.public_id(),
+        frame: FRAME,
+        generation: scene.manifest.generation,
+        position_in_world,
+        geographic: scene.manifest.geo_reference.map(|geo| geo.geographic_from_world(position_in_world)),
+        box_min_in_world: min,
+        box_max_in_world: max,
+        oriented_box: objects::oriented_box(scene, &found, &everywhere, alignment(scene.manifest)),
+        n_gaussians,
+        n_gaussians_in_scene: u64::from(record.n_gaussians),
+        evidence: Evidence { photo: objects::photo(scene, object).to_owned(), box_px: record.photo_box_px },
+    }
+}

@@ -1,0 +1,165 @@
+use glam::DVec2;
+use proptest::prelude::*;
+use slag_common::frames::Aabb;
+
+use super::*;
+use glam::DVec3;
+
+const METRES: Scale = Scale { metre: 1.0 };
+
+fn solid(centre: [f64; 3], size: [f64; 3]) -> Solid {
+    Solid { centre: centre.into(), half: DVec3::from(size) * 0.5, along: DVec2::X }
+}
+
+fn turned(of: Solid, yaw_rad: f64, about: DVec2) -> Solid {
+    let turn = DVec2::from_angle(yaw_rad);
+    let at = turn.rotate(of.centre.truncate() - about) + about;
+    Solid { centre: at.extend(of.centre.z), along: turn.rotate(of.along), ..of }
+}
+
+fn any_solid() -> impl Strategy<Value = Solid> {
+    let (centre, size) = (prop::array::uniform3(-2.0f64..2.0), prop::array::uniform3(0.1f64..2.0));
+    (centre, size, -4.0f64..4.0).prop_map(|(centre, size, yaw)| {
+        let one = solid(centre, size);
+        turned(one, yaw, one.centre.truncate())
+    })
+}
+
+/// A room by hand: which relations hold between which things.
+#[test]
+fn a_room_by_hand() {
+    let table = solid([0.0, 0.0, 0.37], [1.6, 0.9, 0.74]);
+    let mug = solid([0.3, 0.1, 0.81], [0.1, 0.1, 0.14]);
+    let ball = solid([0.2, -0.1, 0.12], [0.24, 0.24, 0.24]);
+    let chair = solid([1.2, 0.0, 0.45], [0.5, 0.5, 0.9]);
+    let cushion = solid([1.2, 0.0, 0.5], [0.4, 0.4, 0.1]);
+    let wall = solid([0.0, 3.0, 1.3], [6.0, 0.05, 2.6]);
+    let clock = solid([0.5, 2.93, 1.8], [0.3, 0.06, 0.3]);
+    let rug = solid([0.0, 0.0, 0.01], [3.0, 2.0, 0.02]);
+    let cupboard = solid([-2.0, 2.5, 0.9], [1.0, 0.5, 1.8]);
+    let plate = solid([-2.0, 2.5, 1.0], [0.3, 0.3, 0.05]);
+    let lamp = solid([0.0, 0.0, 2.2], [0.4, 0.4, 0.3]);
+    // From the south, looking north.
+    let viewer = Viewer { position_in_world: DVec3::new(0.0, -4.0, 0.0), heading_rad: Some(1.57) };
+    let holds = |is, a: &Solid, b: &Solid| degree(is, a, b, Some(&viewer), METRES) >= HOLDS;
+    for (is, a, b) in [
+        (Relation::On, &mug, &table),
+        (Relation::On, &cushion, &chair),
+        (Relation::On, &clock, &wall),
+        (Relation::On, &table, &rug),
+        (Relation::On, &chair, &rug),
+        (Relation::Under, &ball, &table),
+        (Relation::Under, &table, &lamp),
+        (Relation::Above, &lamp, &table),
+        (Relation::In, &plate, &cupboard),
+        (Relation::Near, &mug, &table),
+        (Relation::Near, &chair, &table),
+        (Relation::Beside, &chair, &table),
+        (Relation::RightOf, &chair, &table),
+        (Relation::Behind, &wall, &table),
+        (Relation::InFrontOf, &table, &wall),
+    ] {
+        assert!(holds(is, a, b), "{is} {a:?} {b:?}: {}", degree(is, a, b, Some(&viewer), METRES));
+    }
+    for (is, a, b) in [
+        (Relation::On, &table, &mug),
+        (Relation::On, &ball, &table),
+        (Relation::On, &lamp, &table),
+        (Relation::On, &chair, &table),
+        (Relation::On, &cupboard, &wall),
+        (Relation::Under, &mug, &table),
+        (Relation::Under, &plate, &cupboard),
+        (Relation::Under, &chair, &table),
+        (Relation::In, &chair, &table),
+        (Relation::In, &cupboard, &plate),
+        (Relation::Near, &plate, &mug),
+        (Relation::Beside, &mug, &table),
+        (Relation::Beside, &clock, &table),
+        (Relation::LeftOf, &chair, &table),
+        (Relation::Behind, &chair, &table),
+        (Relation::InFrontOf, &wall, &table),
+    ] {
+        assert!(!holds(is, a, b), "{is} {a:?} {b:?}: {}", degree(is, a, b, Some(&viewer), METRES));
+    }
+    assert!(between(&table, &solid([-2.0, 0.0, 0.5], [1.0; 3]), &solid([2.0, 0.3, 0.5], [1.0; 3])) > HOLDS);
+    assert!(between(&cupboard, &table, &chair) < HOLDS);
+}
+
+/// Beside the asker itself, its heading decides.
+#[test]
+fn the_asker_has_a_left_and_a_front() {
+    let position_in_world = DVec3::new(1.0, 1.0, 0.0);
+    let me = Solid::point(position_in_world);
+    // Looks along y.
+    let viewer = Viewer { position_in_world, heading_rad: Some(std::f64::consts::FRAC_PI_2) };
+    let at = |x: f64, y: f64| solid([1.0 + x, 1.0 + y, 0.3], [0.3; 3]);
+    for (is, x, y) in [
+        (Relation::LeftOf, -2.0, 0.0),
+        (Relation::RightOf, 2.0, 0.0),
+        (Relation::InFrontOf, 0.0, 2.0),
+        (Relation::Behind, 0.0, -2.0),
+    ] {
+        for other in [Relation::LeftOf, Relation::RightOf, Relation::InFrontOf, Relation::Behind] {
+            let degree = degree(other, &at(x, y), &me, Some(&viewer), METRES);
+            assert_eq!(degree >= HOLDS, is == other, "{other} {x} {y}: {degree}");
+        }
+    }
+    let blind = Viewer { heading_rad: None, ..viewer };
+    assert_eq!(degree(Relation::LeftOf, &at(-2.0, 0.0), &me, Some(&blind), METRES), 0.0);
+}
+
+proptest! {
+    /// Oracle: points on a lattice, one by one.
+    #[test]
+    fn outlines_share_what_a_lattice_says(a in any_solid(), b in any_solid()) {
+        let inside = |of: &Solid, p: DVec2| {
+            let offset = p - of.centre.truncate();
+            offset.dot(of.along).abs() <= of.half.x && offset.dot(of.along.perp()).abs() <= of.half.y
+        };
+        let step = 0.02;
+        let steps = || (0..).map(|i| -4.0 + step * (f64::from(i) + 0.5)).take_while(|v| *v < 4.0);
+        let all = || steps().flat_map(|x| steps().map(move |y| DVec2::new(x, y)));
+        let n_shared = all().filter(|p| inside(&a, *p) && inside(&b, *p)).count();
+        let counted = n_shared as f64 * step * step;
+        prop_assert!((a.shared_area(&b) - counted).abs() < 0.1, "{} {counted}", a.shared_area(&b));
+        prop_assert!((a.shared_area(&b) - b.shared_area(&a)).abs() < 1e-9);
+        // Points of each outline's border, all against all.
+        let border = |of: &Solid| {
+            let corners = of.corners();
+            (0..4).flat_map(move |i| (0..=40).map(move |s| corners[i].lerp(corners[(i + 1) % 4], f64::from(s) / 40.0)))
+        };
+        let mut least = border(&a).flat_map(|p| border(&b).map(move |q| p.distance(q))).fold(f64::MAX, f64::min);
+        if n_shared > 0 {
+            least = 0.0;
+        }
+        prop_assert!((a.horizontal_gap(&b) - least).abs() < 0.08, "{} {least}", a.horizontal_gap(&b));
+    }
+
+    /// Degrees are numbers from 0 to 1 and do not depend on the world's axes.
+    #[test]
+    fn turning_the_world_changes_nothing(a in any_solid(), b in any_solid(), yaw in -4.0f64..4.0) {
+        let viewer = Viewer { position_in_world: DVec3::new(5.0, 1.0, 0.0), heading_rad: Some(0.3) };
+        let at = DVec2::from_angle(yaw).rotate(viewer.position_in_world.truncate());
+        let other = Viewer { position_in_world: at.extend(0.0), heading_rad: Some(0.3 + yaw) };
+        for is in Relation::ALL {
+            let one = degree(is, &a, &b, Some(&viewer), METRES);
+            let turn = |of: &Solid| turned(*of, yaw, DVec2::ZERO);
+            let two = degree(is, &turn(&a), &turn(&b), Some(&other), METRES);
+            prop_assert!((0.0..=1.0).contains(&one) && (one - two).abs() < 1e-6, "{is} {one} {two}");
+        }
+    }
+}
+
+#[test]
+fn flat_and_empty_boxes_have_degrees_too() {
+    let flat = solid([0.0; 3], [1.0, 0.0, 0.0]);
+    let nothing = Solid::of_aabb(&Aabb { min: DVec3::ZERO, max: DVec3::ZERO });
+    let viewer = Viewer { position_in_world: DVec3::ZERO, heading_rad: None };
+    for is in Relation::ALL {
+        for (a, b) in [(&flat, &nothing), (&nothing, &flat), (&nothing, &nothing)] {
+            let degree = degree(is, a, b, Some(&viewer), METRES);
+            assert!((0.0..=1.0).contains(&degree), "{is}: {degree}");
+        }
+    }
+    assert_eq!(between(&flat, &nothing, &nothing), 0.0);
+}

@@ -1,0 +1,14 @@
+//! Relations between things: "mug on the table", "second pallet from the gate". Plain geometry over the objects on board,
+//! without a language model; the same scene and phrase give the same answer.
+
+mod candidates;
+mod geometry;
+mod grammar;
+mod phrase;
+mod rank;
+
+pub use candidates::{Found, Things};
+pub use geometry::{HOLDS, Scale, Viewer};
+pub use grammar::understand;
+pub use phrase::{ASKER, By, MAX_NTH, MAX_THINGS, Phrase, Pick, Place, Relation};
+pub use rank::{Miss, MissKind, Related, Witness, relate};

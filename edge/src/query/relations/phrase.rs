@@ -1,0 +1,250 @@
+//! What a phrase about things and their places means, in words or as JSON.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use crate::query::RequestError;
+use crate::text::MAX_TEXT_BYTES;
+
+/// Most things that a phrase may name.
+pub const MAX_THINGS: usize = 8;
+/// Most `n` of a pick.
+pub const MAX_NTH: usize = 100;
+/// Names that stand for the asker, wherever it is.
+pub const ASKER: [&str; 4] = ["me", "myself", "us", "here"];
+
+/// A thing, chosen by what it is, where it is, and how it compares with others of its kind.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Phrase {
+    /// What it is, in the text model's words; [`ASKER`] stands for the asker.
+    pub thing: String,
+    /// Which one, if several fit.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pick: Option<Pick>,
+    /// Where it is.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub relation: Option<Box<Place>>,
+}
+
+/// Where a thing is: a relation to another thing.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Place {
+    /// The relation.
+    pub is: Relation,
+    /// The other thing.
+    pub of: Phrase,
+    /// The second one, for `between`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub and: Option<Phrase>,
+}
+
+/// A relation between things.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Relation {
+    /// Rests on it, or hangs on it.
+    On,
+    /// Below it, within its outline.
+    Under,
+    /// Over it, within its outline.
+    Above,
+    /// Inside it.
+    In,
+    /// A short way from it.
+    Near,
+    /// Next to it, at the same height.
+    Beside,
+    /// Between two things.
+    Between,
+    /// To the left of it, seen by the asker.
+    LeftOf,
+    /// To the right of it, seen by the asker.
+    RightOf,
+    /// Nearer to the asker than it, in the same direction.
+    InFrontOf,
+    /// Farther from the asker than it, in the same direction.
+    Behind,
+}
+
+impl Relation {
+    /// Every relation.
+    pub const ALL: [Self; 11] = [
+        Self::On,
+        Self::Under,
+        Self::Above,
+        Self::In,
+        Self::Near,
+        Self::Beside,
+        Self::Between,
+        Self::LeftOf,
+        Self::RightOf,
+        Self::InFrontOf,
+        Self::Behind,
+    ];
+
+    /// Returns its name in JSON.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::On => "on",
+            Self::Under => "under",
+            Self::Above => "above",
+            Self::In => "in",
+            Self::Near => "near",
+            Self::Beside => "beside",
+            Self::Between => "between",
+            Self::LeftOf => "left-of",
+            Self::RightOf => "right-of",
+            Self::InFrontOf => "in-front-of",
+            Self::Behind => "behind",
+        }
+    }
+
+    /// Returns whether it depends on where the asker is.
+    pub fn is_seen(self) -> bool {
+        matches!(self, Self::LeftOf | Self::RightOf | Self::InFrontOf | Self::Behind)
+    }
+
+    /// Returns whether it has a meaning only where up is known.
+    pub fn needs_up(self) -> bool {
+        !matches!(self, Self::In | Self::Near | Self::Between)
+    }
+}
+
+impl fmt::Display for Relation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.name().replace('-', " "))
+    }
+}
+
+/// Which of several things is meant.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Pick {
+    /// What they are compared by.
+    pub by: By,
+    /// Which one in that order, from 1.
+    #[serde(default = "first")]
+    pub n: usize,
+    /// For `nearest` and `farthest`: from what; from the asker if absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub from: Option<Box<Phrase>>,
+}
+
+fn first() -> usize {
+    1
+}
+
+/// What things are compared by.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum By {
+    /// Volume of the box, falling.
+    Largest,
+    /// Volume of the box, rising.
+    Smallest,
+    /// Distance, rising.
+    Nearest,
+    /// Distance, falling.
+    Farthest,
+}
+
+impl By {
+    /// Returns whether distances are compared.
+    pub fn is_distance(self) -> bool {
+        matches!(self, Self::Nearest | Self::Farthest)
+    }
+}
+
+impl Phrase {
+    /// Names a thing alone.
+    pub fn thing(thing: impl Into<String>) -> Self {
+        Self { thing: thing.into(), pick: None, relation: None }
+    }
+
+    /// Returns whether it stands for the asker.
+    pub fn is_asker(&self) -> bool {
+        ASKER.contains(&self.thing.as_str())
+    }
+
+    /// Returns the phrases directly inside.
+    pub fn inner(&self) -> impl Iterator<Item = &Phrase> {
+        let place = self.relation.iter().flat_map(|place| std::iter::once(&place.of).chain(&place.and));
+        place.chain(self.pick.iter().flat_map(|pick| pick.from.as_deref()))
+    }
+
+    /// Returns the names of all things but the asker, each once, in the order of the phrase.
+    pub fn things(&self) -> Vec<&str> {
+        let mut things = Vec::new();
+        self.collect(&mut things);
+        things
+    }
+
+    fn collect<'a>(&'a self, things: &mut Vec<&'a str>) {
+        if !self.is_asker() && !things.contains(&self.thing.as_str()) {
+            things.push(&self.thing);
+        }
+        self.inner().for_each(|inner| inner.collect(things));
+    }
+
+    fn n_things(&self) -> usize {
+        1 + self.inner().map(Phrase::n_things).sum::<usize>()
+    }
+
+    /// Returns whether a part needs the asker's position, and whether a part needs its heading.
+    pub fn needs(&self) -> [bool; 2] {
+        let seen = self.relation.as_ref().is_some_and(|place| place.is.is_seen());
+        let from_asker = self.relation.as_ref().is_some_and(|place| place.of.is_asker());
+        let compared = self.pick.as_ref().is_some_and(|pick| pick.by.is_distance() && pick.from.is_none());
+        let own = [seen || compared || self.is_asker(), seen && from_asker];
+        self.inner().map(Phrase::needs).fold(own, |[a, b], [c, d]| [a || c, b || d])
+    }
+
+    /// Checks every limit of a phrase, and that `between` has two things and only it has.
+    ///
+    /// # Errors
+    /// What is wrong, under the name `phrases`.
+    pub fn check(&self) -> Result<(), RequestError> {
+        let refuse = |found: &str, expected: &str| Err(RequestError::new("phrases", found, expected));
+        if self.is_asker() {
+            return refuse(
+                &self.thing,
+                "a thing to look for; the asker can only be what it is compared with",
+            );
+        }
+        if self.n_things() > MAX_THINGS {
+            return refuse(&format!("{} things", self.n_things()), &format!("at most {MAX_THINGS}"));
+        }
+        self.check_parts()
+    }
+
+    fn check_parts(&self) -> Result<(), RequestError> {
+        let refuse = |found: &str, expected: &str| Err(RequestError::new("phrases", found, expected));
+        let is_text = |c: char| !c.is_control() || c.is_whitespace();
+        if self.thing.trim().is_empty()
+            || self.thing.len() > MAX_TEXT_BYTES
+            || !self.thing.chars().all(is_text)
+        {
+            return refuse(&self.thing, &format!("a thing in 1 to {MAX_TEXT_BYTES} bytes of words"));
+        }
+        if self.is_asker() && (self.relation.is_some() || self.pick.is_some()) {
+            return refuse(&self.thing, "the asker without a relation or pick of its own");
+        }
+        if let Some(place) = &self.relation
+            && (place.is == Relation::Between) != place.and.is_some()
+        {
+            return refuse(place.is.name(), "`and` with between, and only there");
+        }
+        if let Some(pick) = &self.pick {
+            if !(1..=MAX_NTH).contains(&pick.n) {
+                return refuse(&pick.n.to_string(), &format!("n from 1 to {MAX_NTH}"));
+            }
+            if pick.from.is_some() && !pick.by.is_distance() {
+                return refuse("from", "from only with nearest and farthest");
+            }
+        }
+        self.inner().try_for_each(Phrase::check_parts)
+    }
+}

@@ -1,0 +1,261 @@
+//! From candidates to the things that a phrase means, best first, or the part of the phrase that failed.
+
+use glam::DVec3;
+use serde::Serialize;
+
+use super::candidates::{Candidate, Things};
+use super::geometry::{self, HOLDS, Scale, Solid, Viewer};
+use super::phrase::{By, Phrase, Pick, Place};
+
+/// A pick compares only things with at least this share of the best one's score: a doubtful large thing must not win over a
+/// sure one.
+const SURE: f64 = 0.5;
+
+/// A thing that a phrase means.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Related {
+    /// Its index among the candidates of the phrase's thing.
+    pub candidate: usize,
+    /// Product of the confidences and degrees of every part, 0 to 1.
+    pub score: f64,
+    /// Degree of the phrase's own relation; 1 without one.
+    pub degree: f64,
+    /// What it is related to.
+    pub to: Vec<Witness>,
+}
+
+/// A thing that another is related to.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Witness {
+    /// The words that it answers to.
+    pub thing: String,
+    /// Its id; absent for the asker.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub id: Option<String>,
+    /// Where it is.
+    pub position_in_world: DVec3,
+    /// Its score with the words; absent for the asker.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub score: Option<f32>,
+}
+
+/// Which part of a phrase failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum MissKind {
+    /// Nothing on board is such a thing.
+    NoSuchThing,
+    /// Such things are on board, but none is so placed.
+    NoSuchPair,
+    /// There are fewer of them than counted.
+    TooFew,
+    /// Such things are on board, but none in the region asked for.
+    NotInRegion,
+}
+
+/// Why nothing was found.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Miss {
+    /// The part that failed.
+    pub kind: MissKind,
+    /// The same in words.
+    pub detail: String,
+    /// The thing that is missing, or not so placed.
+    pub thing: String,
+    /// Greatest degree of the relation among all pairs.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub best_degree: Option<f64>,
+}
+
+impl Miss {
+    fn new(kind: MissKind, thing: &str, detail: String) -> Self {
+        Self { kind, detail, thing: thing.to_owned(), best_degree: None }
+    }
+}
+
+/// A thing that others are compared with.
+struct Anchor {
+    solid: Solid,
+    score: f64,
+    witness: Witness,
+    /// The object; absent for the asker.
+    object: Option<usize>,
+}
+
+/// What relations are measured by.
+struct Measure<'a, 'b> {
+    things: &'a Things<'b>,
+    viewer: Option<&'a Viewer>,
+    scale: Scale,
+}
+
+/// Returns the things that a phrase means, best first; only those in the region asked for.
+///
+/// # Errors
+/// The part of the phrase that failed.
+pub fn relate(
+    things: &Things<'_>,
+    phrase: &Phrase,
+    viewer: Option<&Viewer>,
+    scale: Scale,
+) -> Result<Vec<Related>, Miss> {
+    let of = things.of(&phrase.thing);
+    let missing = || {
+        let detail = format!("nothing {} is in the region asked for", quoted(&phrase.thing));
+        Miss::new(MissKind::NotInRegion, &phrase.thing, detail)
+    };
+    if !of.is_empty() && !of.iter().any(|candidate| candidate.is_inside) {
+        return Err(missing());
+    }
+    Measure { things, viewer, scale }.matches(phrase, |candidate| candidate.is_inside)
+}
+
+impl<'b> Measure<'_, 'b> {
+    /// Returns the candidates that a phrase means, best first.
+    fn matches(
+        &self,
+        phrase: &Phrase,
+        is_asked_for: impl Fn(&Candidate<'b>) -> bool,
+    ) -> Result<Vec<Related>, Miss> {
+        let all = self.things.of(&phrase.thing);
+        if all.is_empty() {
+            let detail = format!("nothing on board is {}", quoted(&phrase.thing));
+            return Err(Miss::new(MissKind::NoSuchThing, &phrase.thing, detail));
+        }
+        let mut found = match &phrase.relation {
+            None => (0..all.len()).map(|at| alone(at, &all[at])).collect(),
+            Some(place) => self.placed(phrase, place)?,
+        };
+        found.retain(|related| is_asked_for(&all[related.candidate]));
+        found.sort_by(|a, b| b.score.total_cmp(&a.score).then(a.candidate.cmp(&b.candidate)));
+        let described = quoted(&phrase.thing);
+        if found.is_empty() {
+            let detail = format!("nothing {described} that is so placed is in the region asked for");
+            return Err(Miss::new(MissKind::NotInRegion, &phrase.thing, detail));
+        }
+        match &phrase.pick {
+            None => Ok(found),
+            Some(pick) => self.picked(phrase, pick, found),
+        }
+    }
+
+    /// Returns the candidates that are so placed.
+    fn placed(&self, phrase: &Phrase, place: &Place) -> Result<Vec<Related>, Miss> {
+        let ones = self.anchors(&place.of)?;
+        let others = match &place.and {
+            Some(other) => Some((other, self.anchors(other)?)),
+            None => None,
+        };
+        let all = self.things.of(&phrase.thing);
+        let (mut found, mut best_degree) = (Vec::new(), 0.0f64);
+        for (candidate, thing) in all.iter().enumerate() {
+            let mut best: Option<Related> = None;
+            let mut consider = |degree: f64, score: f64, to: &[&Anchor]| {
+                best_degree = best_degree.max(degree);
+                let score = degree * score * thing.confidence;
+                if degree >= HOLDS && best.as_ref().is_none_or(|best| score > best.score) {
+                    let to = to.iter().map(|anchor| anchor.witness.clone()).collect();
+                    best = Some(Related { candidate, score, degree, to });
+                }
+            };
+            let is_other = |anchor: &&Anchor| anchor.object != Some(thing.found.object);
+            for one in ones.iter().filter(is_other) {
+                match &others {
+                    None => {
+                        let degree =
+                            geometry::degree(place.is, &thing.solid, &one.solid, self.viewer, self.scale);
+                        consider(degree, one.score, &[one]);
+                    }
+                    Some((_, others)) => {
+                        for other in others.iter().filter(is_other).filter(|o| o.object != one.object) {
+                            let degree = geometry::between(&thing.solid, &one.solid, &other.solid);
+                            consider(degree, one.score * other.score, &[one, other]);
+                        }
+                    }
+                }
+            }
+            found.extend(best);
+        }
+        if found.is_empty() {
+            let and = others.map_or(String::new(), |(other, _)| format!(" and {}", quoted(&other.thing)));
+            let (thing, of, is) = (quoted(&phrase.thing), quoted(&place.of.thing), place.is);
+            let detail = format!("{thing} and {of}{and} are on board, but no {thing} is {is} {of}{and}");
+            let miss = Miss::new(MissKind::NoSuchPair, &phrase.thing, detail);
+            return Err(Miss { best_degree: Some(best_degree), ..miss });
+        }
+        Ok(found)
+    }
+
+    /// Returns the things that others are compared with.
+    fn anchors(&self, phrase: &Phrase) -> Result<Vec<Anchor>, Miss> {
+        if phrase.is_asker() {
+            let at = self.viewer.map_or(DVec3::ZERO, |viewer| viewer.position_in_world);
+            let witness =
+                Witness { thing: phrase.thing.clone(), id: None, position_in_world: at, score: None };
+            return Ok(vec![Anchor { solid: Solid::point(at), score: 1.0, witness, object: None }]);
+        }
+        let all = self.things.of(&phrase.thing);
+        let found = self.matches(phrase, |_| true)?.into_iter();
+        let anchor = |related: Related| {
+            let of = &all[related.candidate];
+            let witness = Witness {
+                thing: phrase.thing.clone(),
+                id: Some(of.found.public_id()),
+                position_in_world: of.found.record.position(),
+                score: Some(of.score),
+            };
+            Anchor { solid: of.solid, score: related.score, witness, object: Some(of.found.object) }
+        };
+        Ok(found.map(anchor).collect())
+    }
+
+    /// Returns the one that is meant of several.
+    fn picked(&self, phrase: &Phrase, pick: &Pick, mut found: Vec<Related>) -> Result<Vec<Related>, Miss> {
+        let all = self.things.of(&phrase.thing);
+        let from = match (&pick.from, pick.by.is_distance()) {
+            (Some(from), _) => self.anchors(from)?,
+            (None, true) => self.anchors(&Phrase::thing(super::phrase::ASKER[0]))?,
+            (None, false) => Vec::new(),
+        };
+        let best = found[0].score;
+        found.retain(|related| related.score >= SURE * best);
+        // The surest of those that it is counted from.
+        let origin = from.first();
+        found.retain(|related| {
+            origin.is_none_or(|origin| origin.object != Some(all[related.candidate].found.object))
+        });
+        let key = |related: &Related| {
+            let solid = &all[related.candidate].solid;
+            match (pick.by, origin) {
+                (By::Largest, _) => -solid.volume(),
+                (By::Smallest, _) => solid.volume(),
+                (By::Nearest, Some(origin)) => solid.gap(&origin.solid),
+                (By::Farthest, Some(origin)) => -solid.gap(&origin.solid),
+                _ => 0.0,
+            }
+        };
+        found.sort_by(|a, b| key(a).total_cmp(&key(b)).then(a.candidate.cmp(&b.candidate)));
+        let n = found.len();
+        if n < pick.n {
+            let detail = format!("{} was asked for, but {n} fit", nth(pick.n, &phrase.thing));
+            return Err(Miss::new(MissKind::TooFew, &phrase.thing, detail));
+        }
+        let mut chosen = found.swap_remove(pick.n - 1);
+        chosen.to.extend(origin.map(|origin| origin.witness.clone()));
+        Ok(vec![chosen])
+    }
+}
+
+fn alone(candidate: usize, thing: &Candidate<'_>) -> Related {
+    Related { candidate, score: thing.confidence, degree: 1.0, to: Vec::new() }
+}
+
+/// Quotes a text of a client: cut, and control characters escaped.
+fn quoted(text: &str) -> String {
+    let cut: String = text.chars().take(40).collect();
+    format!("{cut:?}")
+}
+
+fn nth(n: usize, thing: &str) -> String {
+    format!("number {n} of {}", quoted(thing))
+}
