@@ -12,14 +12,12 @@ use super::rank::Ranked;
 use super::relations::{self, Found, Miss, Phrase, Scale, Things, Viewer, Witness};
 use super::reply::Reply;
 use super::request::{AnswerKind, DEFAULT_LIMIT, MAX_CLUSTERS, QueryRequest, RequestError};
-use super::scene::{Scene, default_voxel};
+use super::scene::Scene;
 use crate::score::{Budget, Question, Region, Scratch, score_objects};
 use std::sync::Arc;
 
 /// Most answers in a page, over all questions.
 pub const MAX_PAGE: usize = MAX_CLUSTERS;
-/// Default voxels in a metre of a metric scene; in others as many stand for a metre.
-const VOXELS_PER_METRE: f64 = 4.0;
 
 /// What is looked for.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -227,7 +225,7 @@ fn related(
     }
     let scored = score_objects(scene.shards, scene.objects, scene.index, questions)?;
     let things = Things::find(scene, &phrase.things(), questions, &scored, request);
-    let metre = if scene.manifest.metric { 1.0 } else { VOXELS_PER_METRE * default_voxel(scene.manifest) };
+    let metre = relations::metre(scene.manifest);
     let parts = things.found();
     let found = match relations::relate(&things, phrase, viewer, Scale { metre }) {
         Ok(found) => found,

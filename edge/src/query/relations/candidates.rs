@@ -2,18 +2,25 @@
 
 use rayon::prelude::*;
 use serde::Serialize;
+use slag_common::manifest::Manifest;
 
 use super::geometry::Solid;
 use crate::query::objects::{self, FoundObject};
 use crate::query::request::QueryRequest;
 use crate::query::scale::Scale;
-use crate::query::scene::{Scene, alignment};
+use crate::query::scene::{Scene, alignment, default_voxel};
 use crate::score::{ObjectScores, Question, Region};
 
 /// Most objects that are weighed for a thing, best first.
 const MAX_CANDIDATES: usize = 256;
 
-/// An object that may be meant.
+/// Metres by which a piece may stick out of the thing that it is a piece of.
+const PIECE_SLACK_M: f64 = 0.1;
+/// Default voxels in a metre of a metric scene; in others as many stand for a metre.
+const VOXELS_PER_METRE: f64 = 4.0;
+
+/// An object that may be meant. Objects that lie inside a better one of the same words are pieces of it, and are left out:
+/// they must not be counted, or compared with it.
 pub struct Candidate<'a> {
     pub found: FoundObject<'a>,
     pub solid: Solid,
@@ -100,6 +107,19 @@ fn candidates<'a>(
             found,
         }
     };
-    let candidates = found.into_par_iter().map(candidate).collect();
-    (Found { thing: thing.to_owned(), n_found, threshold, best_score }, candidates)
+    let candidates: Vec<Candidate<'a>> = found.into_par_iter().map(candidate).collect();
+    let metre = metre(scene.manifest);
+    let mut whole: Vec<Candidate<'a>> = Vec::new();
+    for candidate in candidates {
+        let is_piece = |of: &Candidate<'_>| candidate.solid.is_piece_of(&of.solid, PIECE_SLACK_M * metre);
+        if !whole.iter().any(is_piece) {
+            whole.push(candidate);
+        }
+    }
+    (Found { thing: thing.to_owned(), n_found, threshold, best_score }, whole)
+}
+
+/// Returns a metre in world units; in a scene that is not metric, what stands for one.
+pub fn metre(manifest: &Manifest) -> f64 {
+    if manifest.metric { 1.0 } else { VOXELS_PER_METRE * default_voxel(manifest) }
 }

@@ -7,7 +7,7 @@ mod grammar;
 mod phrase;
 mod rank;
 
-pub use candidates::{Found, Things};
+pub use candidates::{Found, Things, metre};
 pub use geometry::{HOLDS, Scale, Viewer};
 pub use grammar::understand;
 pub use phrase::{ASKER, By, MAX_NTH, MAX_THINGS, Phrase, Pick, Place, Relation};

@@ -20,6 +20,7 @@ mod on_views;
 pub mod protocol;
 #[cfg(test)]
 mod public_tests;
+pub mod relations;
 mod report;
 pub mod scan;
 pub mod scannet;

@@ -6,6 +6,9 @@ use slag_common::frames::Aabb;
 use super::outline;
 use crate::query::oriented::{Alignment, OrientedBox};
 
+/// Share of the smaller of two boxes that lies in the larger one if they are of one thing.
+const PIECE: f64 = 0.6;
+
 /// An upright box in the world frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Solid {
@@ -80,6 +83,15 @@ impl Solid {
     /// Returns half its reach along a horizontal direction.
     pub fn reach(&self, direction: DVec2) -> f64 {
         self.half.x * direction.dot(self.along).abs() + self.half.y * direction.dot(self.along.perp()).abs()
+    }
+
+    /// Returns whether most of the smaller of two boxes lies in the other, or sticks out by at most `slack`.
+    pub fn is_piece_of(&self, other: &Self, slack: f64) -> bool {
+        let (small, large) = if self.volume() <= other.volume() { (self, other) } else { (other, self) };
+        let large = large.grown(slack);
+        let of_outline = small.shared_area(&large) / small.area().max(f64::MIN_POSITIVE);
+        let of_height = small.shared_height(&large).max(0.0) / small.height().max(f64::MIN_POSITIVE);
+        of_outline * of_height >= PIECE
     }
 
     /// Returns the length that two height ranges share, negative if there is a gap.

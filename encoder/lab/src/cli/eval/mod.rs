@@ -7,6 +7,7 @@ mod labelled;
 mod lerf;
 mod noise;
 mod protocol;
+mod relations;
 mod scannet;
 
 use anyhow::Result;
@@ -31,6 +32,8 @@ pub enum EvalCommand {
     Defaults(defaults::EvalDefaultsArgs),
     /// Measures the accuracy of each aggregation method with errors in the masks.
     Noise(noise::EvalNoiseArgs),
+    /// Asks the robot's program for things by their relations in generated scenes, beside the plain phrase and the noun.
+    Relations(relations::EvalRelationsArgs),
 }
 
 pub(super) fn run(command: &EvalCommand, progress: &dyn Progress, json: bool) -> Result<Exit> {
@@ -42,5 +45,6 @@ pub(super) fn run(command: &EvalCommand, progress: &dyn Progress, json: bool) ->
         EvalCommand::Encoder(args) => encoder::run(args, progress, json),
         EvalCommand::Defaults(args) => defaults::run(args, progress, json),
         EvalCommand::Noise(args) => noise::run(args, progress, json),
+        EvalCommand::Relations(args) => relations::run(args, progress, json),
     }
 }

@@ -1,0 +1,247 @@
+//! Relations between things, judged on generated scenes: each question is asked of the robot's program as relations, as the
+//! plain phrase, and by the noun alone, and the answers are compared with the layout.
+
+mod report;
+mod robot;
+mod truth;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use anyhow::{Context, Result, anyhow};
+use glam::DVec3;
+use serde::Deserialize;
+use serde_json::{Value, json};
+use slag_common::frames::Aabb;
+use slag_encoder::progress::Progress;
+
+pub use report::{Counts, RelationsReport, Way};
+use robot::Service;
+pub use truth::{Asked, TrueThing};
+
+use crate::generate::grammar::SceneKind;
+
+/// Things with fewer pixels over all photos are not asked about.
+const MIN_PIXELS: u64 = 4000;
+/// Least intersection over union of an answer's box and a thing's; else the thing that its position lies in.
+const MIN_IOU: f64 = 0.1;
+/// Distance by which a position may lie outside.
+const TOLERANCE_M: f64 = 0.25;
+/// Most questions about a relation in a scene, with and without an answer each.
+const MAX_QUESTIONS: usize = 12;
+/// Most answers to a question.
+const LIMIT: usize = 10;
+
+/// What to judge on.
+#[derive(Clone, Debug)]
+pub struct RelationsSettings {
+    /// Folder of scenes, stores and caches; what a run before left there is used.
+    pub out: PathBuf,
+    /// Kinds of scenes.
+    pub kinds: Vec<SceneKind>,
+    /// Seeds of each kind.
+    pub seeds: Vec<u64>,
+    /// Photos of each scene.
+    pub n_views: u32,
+    /// Folder of the programs.
+    pub programs: PathBuf,
+}
+
+/// A question with its truth.
+struct Question {
+    asked: Asked,
+    thing: String,
+    text: String,
+    /// Indices of the things meant; empty if none is.
+    truth: Vec<usize>,
+}
+
+#[derive(Deserialize)]
+struct Instances {
+    instances: Vec<TrueThing>,
+}
+
+/// Asks about every scene.
+///
+/// # Errors
+/// A program fails, or a scene cannot be read.
+pub fn run(settings: &RelationsSettings, progress: &dyn Progress) -> Result<RelationsReport> {
+    let mut report = RelationsReport::default();
+    progress.begin("relations", "scene", (settings.kinds.len() * settings.seeds.len()) as u64, 0);
+    for kind in &settings.kinds {
+        for seed in &settings.seeds {
+            let name = clap::ValueEnum::to_possible_value(kind).map(|value| value.get_name().to_owned());
+            let name = name.ok_or_else(|| anyhow!("{kind:?} has no name"))?;
+            let dir = settings.out.join(format!("{name}-{seed}"));
+            prepare(settings, &dir, &name, *seed).with_context(|| dir.display().to_string())?;
+            judge(settings, &dir, &mut report).with_context(|| dir.display().to_string())?;
+            report.scenes.push(format!("{name}-{seed}"));
+            progress.advance(1);
+        }
+    }
+    progress.end();
+    Ok(report)
+}
+
+/// Generates, encodes and fetches a scene, as far as that was not done before.
+fn prepare(settings: &RelationsSettings, dir: &Path, kind: &str, seed: u64) -> Result<()> {
+    let program = |name: &str| settings.programs.join(format!("{name}{}", std::env::consts::EXE_SUFFIX));
+    let (scene, store, cache) = (dir.join("scene"), dir.join("store"), dir.join("cache"));
+    let (poses, splat) = (scene.join("transforms.json"), scene.join("scene.ply"));
+    if !poses.is_file() {
+        let (seed, n_views) = (seed.to_string(), settings.n_views.to_string());
+        let mut command = Command::new(program("slag-lab"));
+        command.args(["generate", "scene", "--kind", kind, "--seed", &seed, "--n-views", &n_views, "--out"]);
+        finish(command.arg(&scene))?;
+    }
+    if !store.join("manifest").is_file() {
+        let mut command = Command::new(program("slag-encoder"));
+        command.args(["encode", "--metric", "--scene"]).arg(&splat).arg("--views").arg(&poses);
+        finish(command.arg("--store").arg(&store))?;
+    }
+    if !cache.join("current").is_file() {
+        let server = Service::start(&program("slag-encoder"), &["--store"], &store)?;
+        let mut command = Command::new(program("slag-edge"));
+        command.args(["fetch", "--at", "0,0,0", "--radius", "1e6", "--from", &server.url(), "--cache"]);
+        finish(command.arg(&cache))?;
+    }
+    Ok(())
+}
+
+fn finish(command: &mut Command) -> Result<()> {
+    let output =
+        command.stdin(Stdio::null()).output().with_context(|| format!("cannot start {command:?}"))?;
+    if output.status.success() {
+        return Ok(());
+    }
+    Err(anyhow!("{command:?}: {}", String::from_utf8_lossy(&output.stderr).trim()))
+}
+
+/// Asks a robot about a scene.
+fn judge(settings: &RelationsSettings, dir: &Path, report: &mut RelationsReport) -> Result<()> {
+    let text = fs_err::read(dir.join("scene/gt/instances.json"))?;
+    let Instances { instances: things } = serde_json::from_slice(&text)?;
+    let robot = middle(&things);
+    let edge = settings.programs.join(format!("slag-edge{}", std::env::consts::EXE_SUFFIX));
+    let service = Service::start(&edge, &["--cache"], &dir.join("cache"))?;
+    for question in questions(&things, robot) {
+        for way in Way::ALL {
+            let answered = ask(&service, &question, way, robot)?;
+            let found: Vec<Option<usize>> = answered.iter().map(|answer| thing_of(&things, answer)).collect();
+            let is_right = |at: &Option<usize>| at.is_some_and(|at| question.truth.contains(&at));
+            let distinct: BTreeSet<usize> = found.iter().copied().flatten().collect();
+            let counts = Counts {
+                n_questions: 1,
+                n_right: usize::from(match found.first() {
+                    Some(first) => is_right(first),
+                    None => question.truth.is_empty(),
+                }),
+                n_answers: found.len(),
+                n_answers_right: found.iter().filter(|at| is_right(at)).count(),
+                n_meant: question.truth.len(),
+                n_meant_found: distinct.iter().filter(|at| question.truth.contains(at)).count(),
+            };
+            report.count(question.asked, !question.truth.is_empty(), way, counts);
+        }
+    }
+    Ok(())
+}
+
+/// Returns the middle of a scene, where the robot stands.
+fn middle(things: &[TrueThing]) -> DVec3 {
+    let all = things.iter().fold(Aabb::EMPTY, |all, thing| Aabb {
+        min: all.min.min(thing.aabb_min),
+        max: all.max.max(thing.aabb_max),
+    });
+    all.centre().with_z(0.0)
+}
+
+/// Returns questions about the things of a scene: for each relation those with an answer and those without, evenly spread
+/// over all pairs of words.
+fn questions(things: &[TrueThing], robot: DVec3) -> Vec<Question> {
+    let is_shown = |thing: &&TrueThing| thing.train_pixels >= MIN_PIXELS;
+    let nouns: BTreeSet<&str> = things.iter().filter(is_shown).map(|thing| thing.category.as_str()).collect();
+    let mut n_of_kind: BTreeMap<&str, usize> = BTreeMap::new();
+    // "Furniture", but not "something to sit on", which is a relation in words.
+    let kinds = things.iter().filter(is_shown).flat_map(|thing| &thing.kinds);
+    kinds
+        .filter(|kind| !kind.starts_with("something"))
+        .for_each(|kind| *n_of_kind.entry(kind).or_default() += 1);
+    let several = n_of_kind.into_iter().filter(|(_, n)| *n > 1).map(|(kind, _)| kind);
+    let ones: Vec<&str> = nouns.iter().copied().chain(several).collect();
+    let mut all = Vec::new();
+    for asked in Asked::ALL {
+        let mut of_relation: [Vec<Question>; 2] = [Vec::new(), Vec::new()];
+        for thing in &ones {
+            for of in nouns.iter().filter(|of| *of != thing) {
+                // One thing must be meant by the second word, or the question is ambiguous.
+                let n_of = things.iter().filter(|thing| thing.sounds_like(of)).count();
+                let is_part = |at: &TrueThing| at.sounds_like(thing) && at.sounds_like(of);
+                if n_of != 1 || things.iter().any(is_part) {
+                    continue;
+                }
+                let truth = truth::meant(things, asked, thing, of, robot);
+                // What a picked thing is compared with must be visible to be compared.
+                if truth.iter().any(|at| things[*at].train_pixels < MIN_PIXELS) {
+                    continue;
+                }
+                let text = asked.text(thing, of);
+                let has_answer = usize::from(!truth.is_empty());
+                of_relation[has_answer].push(Question { asked, thing: (*thing).to_owned(), text, truth });
+            }
+        }
+        for questions in of_relation {
+            let step = questions.len().div_ceil(MAX_QUESTIONS).max(1);
+            all.extend(questions.into_iter().step_by(step));
+        }
+    }
+    all
+}
+
+/// Asks a question one way; returns the answers, best first.
+fn ask(service: &Service, question: &Question, way: Way, robot: DVec3) -> Result<Vec<Value>> {
+    let near = [robot.x, robot.y, 0.0];
+    // Nearness of the answers must not decide: the plain phrase is asked without a position.
+    let body = match way {
+        Way::Relations => json!({"texts": [question.text], "near": near, "limit": LIMIT}),
+        Way::Phrase => json!({"texts": [question.text], "relations": false, "limit": LIMIT}),
+        Way::BestOfPhrase => {
+            json!({"texts": [question.text], "relations": false, "limit": 1, "min_score": -1.0})
+        }
+        Way::Noun => json!({"texts": [question.thing], "relations": false, "limit": LIMIT}),
+    };
+    let mut reply = service.post("/v1/query", &body)?;
+    match reply["results"][0]["answers"].take() {
+        Value::Array(answers) => Ok(answers),
+        // Words that the model does not know are no answer.
+        _ if reply["status"] == 422 => Ok(Vec::new()),
+        _ => Err(anyhow!("{}: {}", question.text, reply["detail"])),
+    }
+}
+
+/// Returns the thing that an answer is about.
+fn thing_of(things: &[TrueThing], answer: &Value) -> Option<usize> {
+    let corner = |name: &str| serde_json::from_value::<DVec3>(answer[name].clone()).ok();
+    let of = Aabb { min: corner("box_min_in_world")?, max: corner("box_max_in_world")? };
+    let position = corner("position_in_world")?;
+    let overlap = |at: &usize| iou(&of, &things[*at].bounds());
+    let best = (0..things.len()).max_by(|a, b| overlap(a).total_cmp(&overlap(b)));
+    let inside = |at: &usize| {
+        let bounds = things[*at].bounds();
+        bounds.distance_to(position) <= TOLERANCE_M
+    };
+    let nearest = |a: &usize, b: &usize| {
+        let distance = |at: &usize| things[*at].bounds().distance_to(position);
+        let size = |at: &usize| things[*at].bounds().size().element_product();
+        distance(a).total_cmp(&distance(b)).then(size(a).total_cmp(&size(b)))
+    };
+    best.filter(|at| overlap(at) >= MIN_IOU)
+        .or_else(|| (0..things.len()).filter(inside).min_by(|a, b| nearest(a, b)))
+}
+
+fn iou(a: &Aabb, b: &Aabb) -> f64 {
+    let shared = (a.max.min(b.max) - a.min.max(b.min)).max(DVec3::ZERO).element_product();
+    let both = a.size().element_product() + b.size().element_product() - shared;
+    if both > 0.0 { shared / both } else { 0.0 }
+}

@@ -1,0 +1,215 @@
+//! Which relations truly hold in a generated scene: by the boxes of its layout, with rules of their own, which share no code
+//! with the robot's.
+
+use glam::{DVec2, DVec3};
+use serde::Deserialize;
+use serde::Serialize;
+use slag_common::frames::Aabb;
+
+/// Distance of two boxes at which their things are near each other, metres.
+const NEAR_M: f64 = 1.0;
+/// The same for things beside each other.
+const BESIDE_M: f64 = 0.8;
+/// Distance up to which directions are asked about.
+const SEEN_M: f64 = 5.0;
+/// Largest angle from a direction, degrees: the four directions share no thing.
+const SEEN_DEG: f64 = 45.0;
+/// Gap between a thing and the top that it stands on.
+const TOUCHES_M: f64 = 0.05;
+/// A thing on another is at least this far from the ground.
+const RAISED_M: f64 = 0.1;
+
+/// A thing of the layout.
+#[derive(Clone, Debug, Deserialize)]
+pub struct TrueThing {
+    /// Its category.
+    pub category: String,
+    /// Kinds of thing that it belongs to.
+    #[serde(default)]
+    pub kinds: Vec<String>,
+    /// Smallest corner of its box, metres.
+    pub aabb_min: DVec3,
+    /// Largest corner.
+    pub aabb_max: DVec3,
+    /// Pixels that show it, over all photos.
+    pub train_pixels: u64,
+}
+
+/// A relation that is asked about.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Asked {
+    /// "on the".
+    On,
+    /// "near the".
+    Near,
+    /// "beside the".
+    Beside,
+    /// "left of the".
+    LeftOf,
+    /// "right of the".
+    RightOf,
+    /// "in front of the".
+    InFrontOf,
+    /// "behind the".
+    Behind,
+    /// "nearest ... to the".
+    Nearest,
+    /// "second ... from the".
+    Second,
+    /// "largest ... near the".
+    Largest,
+}
+
+impl Asked {
+    /// Every relation.
+    pub const ALL: [Self; 10] = [
+        Self::On,
+        Self::Near,
+        Self::Beside,
+        Self::LeftOf,
+        Self::RightOf,
+        Self::InFrontOf,
+        Self::Behind,
+        Self::Nearest,
+        Self::Second,
+        Self::Largest,
+    ];
+
+    /// Returns the question about two words.
+    pub fn text(self, thing: &str, of: &str) -> String {
+        match self {
+            Self::On => format!("{thing} on the {of}"),
+            Self::Near => format!("{thing} near the {of}"),
+            Self::Beside => format!("{thing} beside the {of}"),
+            Self::LeftOf => format!("{thing} left of the {of}"),
+            Self::RightOf => format!("{thing} right of the {of}"),
+            Self::InFrontOf => format!("{thing} in front of the {of}"),
+            Self::Behind => format!("{thing} behind the {of}"),
+            Self::Nearest => format!("nearest {thing} to the {of}"),
+            Self::Second => format!("second {thing} from the {of}"),
+            Self::Largest => format!("largest {thing} near the {of}"),
+        }
+    }
+}
+
+impl TrueThing {
+    /// Returns its box.
+    pub fn bounds(&self) -> Aabb {
+        Aabb { min: self.aabb_min, max: self.aabb_max }
+    }
+
+    /// Returns whether a word names it.
+    pub fn is_called(&self, word: &str) -> bool {
+        self.category == word || self.kinds.iter().any(|kind| kind == word)
+    }
+
+    /// Returns whether it looks like what a word names: "chair" names an armchair to some.
+    pub fn sounds_like(&self, word: &str) -> bool {
+        self.is_called(word) || self.category.contains(word)
+    }
+
+    fn centre(&self) -> DVec3 {
+        self.bounds().centre()
+    }
+
+    fn volume(&self) -> f64 {
+        self.bounds().size().element_product()
+    }
+}
+
+/// Returns the things that a question means, by their indices. `robot`: where it is asked.
+pub fn meant(things: &[TrueThing], asked: Asked, thing: &str, of: &str, robot: DVec3) -> Vec<usize> {
+    let named =
+        |word: &str| -> Vec<usize> { (0..things.len()).filter(|at| things[*at].sounds_like(word)).collect() };
+    let (ones, others) = (named(thing), named(of));
+    let related = |holds: &dyn Fn(&TrueThing, &TrueThing) -> bool| -> Vec<usize> {
+        let is_related =
+            |at: &usize| others.iter().any(|other| other != at && holds(&things[*at], &things[*other]));
+        ones.iter().copied().filter(is_related).collect()
+    };
+    let by_distance = |n: usize| -> Vec<usize> {
+        let Some(from) = others.first() else { return Vec::new() };
+        let mut sorted: Vec<usize> = ones.iter().copied().filter(|at| at != from).collect();
+        sorted.sort_by(|a, b| gap(&things[*a], &things[*from]).total_cmp(&gap(&things[*b], &things[*from])));
+        sorted.get(n).copied().into_iter().collect()
+    };
+    match asked {
+        Asked::On => related(&is_on),
+        Asked::Near => related(&|a, b| gap(a, b) <= NEAR_M),
+        Asked::Beside => related(&|a, b| gap(a, b) <= BESIDE_M && is_level(a, b)),
+        Asked::LeftOf => related(&|a, b| is_seen(a, b, robot, 90.0)),
+        Asked::RightOf => related(&|a, b| is_seen(a, b, robot, -90.0)),
+        Asked::InFrontOf => related(&|a, b| is_seen(a, b, robot, 180.0)),
+        Asked::Behind => related(&|a, b| is_seen(a, b, robot, 0.0)),
+        Asked::Nearest => by_distance(0),
+        Asked::Second => by_distance(1),
+        Asked::Largest => {
+            let near = related(&|a, b| gap(a, b) <= NEAR_M);
+            near.into_iter()
+                .max_by(|a, b| things[*a].volume().total_cmp(&things[*b].volume()))
+                .into_iter()
+                .collect()
+        }
+    }
+}
+
+/// Returns whether a thing stands on another, as the layout places things on tops.
+fn is_on(thing: &TrueThing, below: &TrueThing) -> bool {
+    let centre = thing.centre().truncate();
+    let over = centre.cmpge(below.aabb_min.truncate()).all() && centre.cmple(below.aabb_max.truncate()).all();
+    let bottom = thing.aabb_min.z;
+    over && bottom > RAISED_M && bottom > below.centre().z - RAISED_M && bottom < below.aabb_max.z + TOUCHES_M
+}
+
+fn gap(a: &TrueThing, b: &TrueThing) -> f64 {
+    (a.aabb_min - b.aabb_max).max(b.aabb_min - a.aabb_max).max(DVec3::ZERO).length()
+}
+
+fn is_level(a: &TrueThing, b: &TrueThing) -> bool {
+    let shared = a.aabb_max.z.min(b.aabb_max.z) - a.aabb_min.z.max(b.aabb_min.z);
+    let lower = (a.aabb_max.z - a.aabb_min.z).min(b.aabb_max.z - b.aabb_min.z);
+    shared >= 0.3 * lower
+}
+
+/// Returns whether a thing lies in a direction from another: degrees to the left of the line from the robot to that.
+fn is_seen(thing: &TrueThing, of: &TrueThing, robot: DVec3, direction_deg: f64) -> bool {
+    let sight = (of.centre() - robot).truncate();
+    let offset = (thing.centre() - of.centre()).truncate();
+    let meant = DVec2::from_angle(direction_deg.to_radians()).rotate(sight);
+    gap(thing, of) <= SEEN_M && offset.angle_to(meant).abs().to_degrees() <= SEEN_DEG
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn thing(category: &str, min: [f64; 3], max: [f64; 3]) -> TrueThing {
+        let kinds = vec!["furniture".into()];
+        let (aabb_min, aabb_max) = (min.into(), max.into());
+        TrueThing { category: category.into(), kinds, aabb_min, aabb_max, train_pixels: 1 }
+    }
+
+    /// A room by hand.
+    #[test]
+    fn a_room_by_hand() {
+        let things = [
+            thing("table", [0.0, 0.0, 0.0], [1.6, 0.9, 0.75]),
+            thing("mug", [0.5, 0.4, 0.75], [0.6, 0.5, 0.9]),
+            thing("chair", [2.0, 0.0, 0.0], [2.5, 0.5, 0.9]),
+            thing("chair", [6.0, 0.0, 0.0], [6.5, 0.5, 0.9]),
+        ];
+        // From the south, looking north.
+        let robot = DVec3::new(0.8, -3.0, 0.0);
+        let meant = |asked, one, other| meant(&things, asked, one, other, robot);
+        assert_eq!(meant(Asked::On, "mug", "table"), [1]);
+        assert_eq!(meant(Asked::On, "chair", "table"), [0usize; 0]);
+        assert_eq!(meant(Asked::Near, "chair", "table"), [2]);
+        assert_eq!(meant(Asked::Beside, "furniture", "chair"), [0]);
+        assert_eq!(meant(Asked::RightOf, "chair", "table"), [2, 3]);
+        assert_eq!(meant(Asked::LeftOf, "chair", "table"), [0usize; 0]);
+        assert_eq!(meant(Asked::Nearest, "chair", "table"), [2]);
+        assert_eq!(meant(Asked::Second, "chair", "table"), [3]);
+        assert_eq!(meant(Asked::Largest, "furniture", "mug"), [0]);
+    }
+}
