@@ -1,14 +1,12 @@
 //! The third step: the contributions of all views become objects, fields and shards of every cell.
 //!
-//! One thread reads the contributions, cell by cell. Several cells at once are lifted and become codebooks and shards, as
-//! many as the memory plan holds: much of a codebook is work that one thread does. A cell's bytes do not depend on the
-//! others'.
+//! Contributions are read cell by cell. Several cells at once are lifted and become codebooks and shards, as many as the
+//! memory plan holds. A cell's bytes do not depend on the others'.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
 use slag_common::manifest::{Calibration, CellRecord, ShardRecord};
 use slag_common::shard::Profile;
@@ -30,12 +28,6 @@ use crate::lift::{
 use crate::objects::{self, ObjectsReport, SceneObjects};
 use crate::shard::{self, BuiltShard, CellEmbeddings};
 use crate::store::Extras;
-
-/// How long the thread that reads sleeps while others hold all cells.
-const WAIT: Duration = Duration::from_micros(200);
-/// Cells at once below which that thread makes cells as well. Among many threads it only reads: while it made a cell, those
-/// that are done would wait for the next.
-const FEW_AT_ONCE: usize = 8;
 
 /// The cells of a scene, all objects of them in the store.
 pub(super) struct BuiltCells {
@@ -59,6 +51,13 @@ struct CellInWork {
     embeddings: CellEmbeddings,
     /// Fields in the store, by name.
     fields: Vec<(String, Hash32)>,
+}
+
+impl CellInWork {
+    fn empty(dim: usize) -> Self {
+        let embeddings = CellEmbeddings { dim, vectors: Vec::new(), has_evidence: Vec::new() };
+        Self { embeddings, fields: Vec::new() }
+    }
 }
 
 /// A cell whose shards are in the store.
@@ -108,8 +107,10 @@ pub(super) fn build_cells(
     views: &DoneViews<'_>,
     context: &RunContext<'_>,
 ) -> Result<BuiltCells, EncodeError> {
-    let bank = text_bank(plan, context);
-    let mut builder = CellBuilder::open(plan, views, bank, context)?;
+    let mut builder = context.install(|| {
+        let bank = text_bank(plan, context);
+        CellBuilder::open(plan, views, bank, context)
+    })?;
     context.progress().begin("cells", "cell", plan.inputs.split.cells.len() as u64, 0);
     let built = builder.build(views)?;
     context.progress().end();
@@ -255,14 +256,17 @@ impl<'a> CellBuilder<'a> {
         };
         // Objects are found from all masks alike, before refinement gives some less weight.
         self.context.begin_phase(Phase::Objects);
-        let objects = self.objects()?;
+        let objects = self.context.install(|| self.objects())?;
         self.context.begin_phase(Phase::Refine);
         let aggregation = settings.aggregation;
         let refinement = self.context.time("refine", || {
             let contributions = (&self.index, &mut self.table);
             let scene = (&inputs.scene, &inputs.split);
             let cancel = self.context.cancel();
-            Refinement::prepare(aggregation, contributions, scene, &self.photos, self.group_bytes, cancel)
+            let photos = &self.photos;
+            let prepare =
+                || Refinement::prepare(aggregation, contributions, scene, photos, self.group_bytes, cancel);
+            self.context.install(prepare)
         })?;
         if self.context.is_cancelled() {
             return Ok(None);
@@ -271,7 +275,7 @@ impl<'a> CellBuilder<'a> {
             let record = serde_json::to_vec(&aggregation).map_err(std::io::Error::from)?;
             built.extras.insert(EXTRA_AGGREGATION.into(), store.put_bytes(&record)?.0);
         }
-        let regions = store.put_object(|out| self.table.write(out))?.0;
+        let regions = self.context.install(|| store.put_object(|out| self.table.write(out)))?.0;
         built.extras.insert(EXTRA_REGIONS.into(), regions);
         self.context.begin_phase(Phase::Cells);
         let Some(finished) = self.build_shards(refinement.as_ref(), objects.as_ref())? else {
@@ -292,20 +296,19 @@ impl<'a> CellBuilder<'a> {
         objects: Option<&SceneObjects>,
     ) -> Result<Option<Vec<FinishedCell>>, EncodeError> {
         let dim = self.table.dim();
-        let empty = || CellInWork {
-            embeddings: CellEmbeddings { dim, vectors: Vec::new(), has_evidence: Vec::new() },
-            fields: Vec::new(),
-        };
         // The vectors of a large cell are allocated once and used again; they are neither copied nor cleared.
-        let free: Mutex<Vec<CellInWork>> = Mutex::new((0..self.n_at_once).map(|_| empty()).collect());
-        let is_helping = self.n_at_once < FEW_AT_ONCE;
+        let free = FreeCells::new((0..self.n_at_once).map(|_| CellInWork::empty(dim)).collect());
         let finished: Mutex<BTreeMap<u32, Result<FinishedCell, EncodeError>>> = Mutex::default();
         let has_failed = AtomicBool::new(false);
         let is_stopped = || self.context.is_cancelled() || has_failed.load(Ordering::Relaxed);
-        rayon::scope(|scope| -> Result<(), EncodeError> {
-            let mut parts = self.index.transposed_parts(&self.table, self.group_bytes);
-            let mut cell = take_when_free(&free, is_helping);
-            while let Some(contributions) = self.context.time("merge", || parts.next()) {
+        let workers = self.context.workers();
+        let n_alone = workers.n_alone(self.plan.inputs.split.cells.len(), self.n_at_once);
+        std::thread::scope(|scope| -> Result<(), EncodeError> {
+            let mut parts =
+                self.context.install(|| self.index.transposed_parts(&self.table, self.group_bytes));
+            let mut next_part = || self.context.time("merge", || self.context.install(|| parts.next()));
+            let mut lent = free.take();
+            while let Some(contributions) = next_part() {
                 if is_stopped() {
                     break;
                 }
@@ -314,23 +317,22 @@ impl<'a> CellBuilder<'a> {
                 let n_gaussians = self.plan.inputs.split.cells[cell_id as usize].gaussians.len();
                 if contributions.part.locals.end < n_gaussians {
                     // A large cell comes in parts, so that only one of them is held.
-                    self.add_part(contributions, refinement, &mut cell)?;
+                    self.context.install(|| self.add_part(contributions, refinement, &mut lent.cell))?;
                     continue;
                 }
-                let (free, finished, has_failed) = (&free, &finished, &has_failed);
-                scope.spawn(move |_| {
+                let (finished, has_failed) = (&finished, &has_failed);
+                let work = move || {
                     if !is_stopped() {
-                        let added = self.add_part(contributions, refinement, &mut cell);
-                        let result = added.and_then(|()| self.finish_cell(cell_id, &mut cell, objects));
+                        let added = self.add_part(contributions, refinement, &mut lent.cell);
+                        let result = added.and_then(|()| self.finish_cell(cell_id, &mut lent.cell, objects));
                         has_failed.fetch_or(result.is_err(), Ordering::Relaxed);
                         locked(finished).insert(cell_id, result);
                         self.context.progress().advance(1);
                     }
-                    cell.embeddings.has_evidence.clear();
-                    cell.fields.clear();
-                    locked(free).push(cell);
-                });
-                cell = take_when_free(free, is_helping);
+                    drop(lent);
+                };
+                scope.spawn(move || workers.run((cell_id as usize) < n_alone, work));
+                lent = free.take();
             }
             Ok(())
         })?;
@@ -408,18 +410,45 @@ impl<'a> CellBuilder<'a> {
     }
 }
 
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+/// Cells that are not in work.
+struct FreeCells {
+    cells: Mutex<Vec<CellInWork>>,
+    given_back: Condvar,
 }
 
-/// Takes an item once one is free; until then does other work of this run if `is_helping`.
-fn take_when_free<T>(free: &Mutex<Vec<T>>, is_helping: bool) -> T {
-    loop {
-        let item = locked(free).pop();
-        match item {
-            Some(item) => return item,
-            None if is_helping && rayon::yield_now() == Some(rayon::Yield::Executed) => {}
-            None => std::thread::sleep(WAIT),
+impl FreeCells {
+    fn new(cells: Vec<CellInWork>) -> Self {
+        Self { cells: Mutex::new(cells), given_back: Condvar::new() }
+    }
+
+    /// Waits until one is free.
+    fn take(&self) -> LentCell<'_> {
+        let mut cells = locked(&self.cells);
+        loop {
+            match cells.pop() {
+                Some(cell) => return LentCell { cell, owner: self },
+                None => cells = self.given_back.wait(cells).unwrap_or_else(PoisonError::into_inner),
+            }
         }
     }
+}
+
+/// A cell that goes back, emptied, whatever becomes of the work.
+struct LentCell<'a> {
+    cell: CellInWork,
+    owner: &'a FreeCells,
+}
+
+impl Drop for LentCell<'_> {
+    fn drop(&mut self) {
+        let mut cell = std::mem::replace(&mut self.cell, CellInWork::empty(0));
+        cell.embeddings.has_evidence.clear();
+        cell.fields.clear();
+        locked(&self.owner.cells).push(cell);
+        self.owner.given_back.notify_one();
+    }
+}
+
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -9,10 +9,8 @@ use rayon::ThreadPool;
 
 use super::error::EncodeError;
 use super::report::PhaseReport;
+use super::workers::Workers;
 use crate::progress::Progress;
-
-/// Stack of a worker thread: while it waits for others' part of its work, a worker may take up another view.
-const STACK_BYTES: usize = 8 << 20;
 
 /// The time spent in each stage, added over all threads.
 #[derive(Default)]
@@ -52,8 +50,6 @@ impl Phase {
 }
 
 /// The state that the steps of one run share.
-///
-/// Threads belong to the run: two encodes in one process do not share them, and rayon's global pool stays as it is.
 pub(super) struct RunContext<'a> {
     start: Instant,
     progress: &'a dyn Progress,
@@ -61,7 +57,7 @@ pub(super) struct RunContext<'a> {
     times: StageTimes,
     /// When each phase began.
     phases: Mutex<Vec<(Phase, Instant)>>,
-    pool: ThreadPool,
+    workers: Workers,
 }
 
 impl<'a> RunContext<'a> {
@@ -75,10 +71,10 @@ impl<'a> RunContext<'a> {
         cancel: &'a AtomicBool,
     ) -> Result<Self, EncodeError> {
         let start = Instant::now();
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).stack_size(STACK_BYTES).build();
-        let pool = pool.map_err(|source| EncodeError::Threads { n_threads, source })?;
+        let workers =
+            Workers::start(n_threads).map_err(|source| EncodeError::Threads { n_threads, source })?;
         let phases = Mutex::new(vec![(Phase::Read, start)]);
-        Ok(Self { start, progress, cancel, times: StageTimes::default(), phases, pool })
+        Ok(Self { start, progress, cancel, times: StageTimes::default(), phases, workers })
     }
 
     /// Ends the present phase and begins the next.
@@ -119,12 +115,17 @@ impl<'a> RunContext<'a> {
 
     /// Returns the run's threads, for a step that waits for a device and needs them only in between.
     pub(super) fn pool(&self) -> &ThreadPool {
-        &self.pool
+        self.workers.shared()
+    }
+
+    /// Returns the run's threads.
+    pub(super) fn workers(&self) -> &Workers {
+        &self.workers
     }
 
     /// Runs work on the run's threads: parallel iterators inside use these alone.
     pub(super) fn install<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
-        self.pool.install(work)
+        self.workers.run(false, work)
     }
 
     /// Runs work and adds its time to a stage.

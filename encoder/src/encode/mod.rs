@@ -28,6 +28,7 @@ mod report;
 mod settings;
 mod view;
 mod views;
+mod workers;
 
 use std::sync::atomic::AtomicBool;
 
@@ -66,7 +67,7 @@ pub fn encode(
     context.begin_phase(Phase::Views);
     let views = views::run_views(&plan, &context)?;
     context.begin_phase(Phase::Merge);
-    let built = context.install(|| cells::build_cells(&plan, &views, &context))?;
+    let built = cells::build_cells(&plan, &views, &context)?;
     context.begin_phase(Phase::Publish);
     publish::publish(plan, views, built, &context)
 }

@@ -79,14 +79,18 @@ fn run_open_views(
     let is_over = || deadline.is_some_and(|deadline| Instant::now() >= deadline);
     let mut budget = Budget { has_some: views().any(|view| done.contains_key(&view.name)) };
     // After ctrl-c no view is begun; those in work are finished.
-    let source = open.take_while(|_| !context.is_cancelled() && budget.may_begin(is_over())).map(Work::begin);
+    let n_alone = context.workers().n_alone(open.clone().count(), run.threads);
+    let source = open
+        .take_while(|_| !context.is_cancelled() && budget.may_begin(is_over()))
+        .enumerate()
+        .map(|(i, view)| (i < n_alone, Work::begin(view)));
     let skipped = Mutex::new(Vec::new());
     let list = stages.stages();
-    let reports = pipeline::run(&list, run.threads, source, |at, work| {
+    let reports = pipeline::run(&list, run.threads, source, |at, (is_alone, work)| {
         let view = work.view();
         // The run's threads do the processor's work. Those that wait for a device or the disk must not hold one.
         let result = match list[at].on_cpu {
-            true => context.install(|| stages.step(work)),
+            true => context.workers().run(is_alone, || stages.step(work)),
             false => stages.step(work),
         };
         match result {
@@ -98,7 +102,7 @@ fn run_open_views(
                 skipped.lock().unwrap_or_else(PoisonError::into_inner).push(skip);
                 Ok(None)
             }
-            result => result,
+            result => result.map(|work| Some((is_alone, work?))),
         }
     })?;
     if context.is_cancelled() {

@@ -17,8 +17,9 @@ use crate::memory::{MemoryPlan, Phase};
 /// Most entries of a part. A constant, not a share of the budget: parts are published, and a store must not depend on
 /// the memory of the machine that made it.
 const PART_ENTRIES: u64 = 1 << 22;
-/// Most entries of a group, even where the budget allows more: a larger group leaves the processor's caches.
-const GROUP_ENTRIES: u64 = 1 << 22;
+/// Most entries of a group that is transposed, even where the budget allows more: a larger one leaves the processor's
+/// caches. As many as a part's.
+const GROUP_ENTRIES: u64 = PART_ENTRIES;
 /// Bytes of a transposed entry: region and weight.
 const BYTES_PER_TRANSPOSED_ENTRY: u64 = size_of::<(u32, f32)>() as u64;
 /// Bytes of an entry while it is transposed: as read, and transposed.
@@ -176,15 +177,17 @@ impl ContributionIndex {
         self.parts.iter().map(of_part).sum()
     }
 
-    /// Cuts the parts into groups that take at most `budget_bytes` each, or hold a single part.
-    pub fn groups(&self, budget_bytes: u64) -> Vec<Range<usize>> {
+    /// Cuts the parts into groups that take at most `budget_bytes` each, or hold a single part. `n_largest`: how many of
+    /// the largest parts a group may hold where the budget allows more.
+    pub fn groups(&self, budget_bytes: u64, n_largest: u64) -> Vec<Range<usize>> {
+        let max_entries = GROUP_ENTRIES.saturating_mul(n_largest);
         let mut groups: Vec<Range<usize>> = Vec::new();
         let (mut bytes, mut entries) = (0, 0);
         for (i, part) in self.parts.iter().enumerate() {
             bytes += part_bytes(part);
             entries += part.n_entries;
             match groups.last_mut() {
-                Some(group) if bytes <= budget_bytes && entries <= GROUP_ENTRIES => group.end = i + 1,
+                Some(group) if bytes <= budget_bytes && entries <= max_entries => group.end = i + 1,
                 _ => {
                     (bytes, entries) = (part_bytes(part), part.n_entries);
                     groups.push(i..i + 1);

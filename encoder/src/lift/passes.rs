@@ -10,24 +10,22 @@ use super::index::ContributionIndex;
 use super::part::PartContributions;
 use super::table::RegionTable;
 
-/// One pass over the transposed contributions, part by part in the order of [`ContributionIndex::parts`].
-pub struct TransposedParts<'a> {
+/// One pass over the transposed contributions, group by group in the order of [`ContributionIndex::parts`].
+pub struct TransposedGroups<'a> {
     index: &'a ContributionIndex,
     table: &'a RegionTable,
+    /// Parts to be read or copied.
+    groups: std::vec::IntoIter<Range<usize>>,
     source: Source<'a>,
 }
 
 enum Source<'a> {
     Files {
-        /// Groups to be read.
-        groups: std::vec::IntoIter<Range<usize>>,
-        /// The rest of the last group.
-        transposed: std::vec::IntoIter<PartContributions>,
         /// Copies of all parts so far, if they are to be kept.
         kept: Option<Vec<PartContributions>>,
     },
     Memory {
-        parts: std::slice::Iter<'a, PartContributions>,
+        parts: &'a [PartContributions],
         /// `[n_regions]`: summed weight of each region's masks.
         mask_counts: Vec<f32>,
     },
@@ -42,68 +40,77 @@ impl ContributionIndex {
     }
 
     /// Starts a pass that takes at most `budget_bytes`, or what the largest part needs. Total weights follow the table's
-    /// present weights of masks.
-    pub fn transposed_parts<'a>(&'a self, table: &'a RegionTable, budget_bytes: u64) -> TransposedParts<'a> {
-        let source = match self.kept.get() {
+    /// present weights of masks. A group is what all threads work on at a time.
+    pub fn transposed_groups<'a>(
+        &'a self,
+        table: &'a RegionTable,
+        budget_bytes: u64,
+    ) -> TransposedGroups<'a> {
+        let n_threads = rayon::current_num_threads() as u64;
+        let (groups, source) = match self.kept.get() {
             Some(parts) => {
-                Source::Memory { parts: parts.iter(), mask_counts: table.mask_counts(0..table.len()) }
+                let mask_counts = table.mask_counts(0..table.len());
+                let for_groups = budget_bytes.saturating_sub(self.kept_bytes());
+                (self.groups(for_groups, n_threads), Source::Memory { parts, mask_counts })
             }
             None => {
                 // Half the budget: refinement and objects build lists of their own, which also grow with the entries.
                 let keeps = self.kept_bytes().saturating_add(self.largest_part_bytes()) <= budget_bytes / 2;
                 let for_groups = if keeps { budget_bytes - self.kept_bytes() } else { budget_bytes };
-                Source::Files {
-                    groups: self.groups(for_groups).into_iter(),
-                    transposed: Vec::new().into_iter(),
-                    kept: keeps.then(|| Vec::with_capacity(self.parts().len())),
-                }
+                let kept = keeps.then(|| Vec::with_capacity(self.parts().len()));
+                (self.groups(for_groups, 1), Source::Files { kept })
             }
         };
-        TransposedParts { index: self, table, source }
+        TransposedGroups { index: self, table, groups: groups.into_iter(), source }
     }
 
-    fn read_and_transpose(
-        &self,
-        group: Range<usize>,
-        table: &RegionTable,
-    ) -> Result<Vec<PartContributions>, ContributionError> {
-        self.transpose(&self.read(group)?, table)
+    /// Starts a pass as [`Self::transposed_groups`] does, which hands out one part at a time.
+    pub fn transposed_parts<'a>(
+        &'a self,
+        table: &'a RegionTable,
+        budget_bytes: u64,
+    ) -> impl Iterator<Item = Result<PartContributions, ContributionError>> + 'a {
+        let mut groups = self.transposed_groups(table, budget_bytes);
+        if let Source::Memory { parts, .. } = &groups.source {
+            groups.groups = (0..parts.len()).map(|i| i..i + 1).collect::<Vec<_>>().into_iter();
+        }
+        groups.flat_map(|group| match group {
+            Ok(parts) => parts.into_iter().map(Ok).collect(),
+            Err(error) => vec![Err(error)],
+        })
     }
 }
 
-impl Iterator for TransposedParts<'_> {
-    type Item = Result<PartContributions, ContributionError>;
+impl Iterator for TransposedGroups<'_> {
+    type Item = Result<Vec<PartContributions>, ContributionError>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        match &mut self.source {
+        let Self { index, table, groups, source } = self;
+        let group = groups.next();
+        match source {
             Source::Memory { parts, mask_counts } => {
-                let mut part = parts.next()?.clone();
-                weigh(&mut part, mask_counts);
-                Some(Ok(part))
+                let weighed = |part: &PartContributions| {
+                    let mut part = part.clone();
+                    weigh(&mut part, mask_counts);
+                    part
+                };
+                Some(Ok(parts[group?].par_iter().map(weighed).collect()))
             }
-            Source::Files { groups, transposed, kept } => {
-                if transposed.len() == 0 {
-                    let Some(group) = groups.next() else {
-                        if let Some(kept) = kept.take() {
-                            // Another pass may have kept them meanwhile: they are the same.
-                            let _ = self.index.kept.set(kept);
-                        }
-                        return None;
-                    };
-                    match self.index.read_and_transpose(group, self.table) {
-                        Ok(parts) => {
-                            if let Some(kept) = kept {
-                                kept.extend_from_slice(&parts);
-                            }
-                            *transposed = parts.into_iter();
-                        }
-                        Err(error) => {
-                            (*groups, *kept) = (Vec::new().into_iter(), None);
-                            return Some(Err(error));
-                        }
+            Source::Files { kept } => {
+                let Some(group) = group else {
+                    if let Some(kept) = kept.take() {
+                        // Another pass may have kept them meanwhile: they are the same.
+                        let _ = index.kept.set(kept);
                     }
+                    return None;
+                };
+                let read = index.read(group).and_then(|raw| index.transpose(&raw, table));
+                match (&read, &mut *kept) {
+                    (Ok(parts), Some(kept)) => kept.par_extend(parts.par_iter().cloned()),
+                    (Ok(_), None) => {}
+                    (Err(_), _) => (*groups, *kept) = (Vec::new().into_iter(), None),
                 }
-                transposed.next().map(Ok)
+                Some(read)
             }
         }
     }

@@ -103,9 +103,10 @@ pub struct Graph {
 impl Graph {
     /// Finds and measures the edges of a scene.
     pub fn new(scene: &Gaussians, sketches: Option<Sketches<'_>>, settings: &SuperpointSettings) -> Self {
-        let usable: Vec<u32> = (0..scene.len() as u32).filter(|i| scene.is_usable(*i as usize)).collect();
+        let usable: Vec<u32> =
+            (0..scene.len() as u32).into_par_iter().filter(|i| scene.is_usable(*i as usize)).collect();
         let means: Vec<[f64; 3]> =
-            usable.iter().map(|i| scene.means_in_world[*i as usize].to_array()).collect();
+            usable.par_iter().map(|i| scene.means_in_world[*i as usize].to_array()).collect();
         let neighbours = Neighbours::new(&means, settings.n_neighbours);
         drop(means);
         let looks: Vec<Look> = usable.par_iter().map(|i| Look::of(scene, *i as usize)).collect();
@@ -131,8 +132,12 @@ impl Graph {
         let chunks = usable.par_chunks(GAUSSIANS_PER_TASK).enumerate();
         let chunks: Vec<Vec<Edge>> =
             chunks.map(|(at, chunk)| edges_of(chunk, at * GAUSSIANS_PER_TASK)).collect();
-        let mut edges = Vec::with_capacity(chunks.iter().map(Vec::len).sum());
-        chunks.into_iter().for_each(|chunk| edges.extend(chunk));
+        let mut edges: Vec<Edge> = vec![(0, 0, 0); chunks.iter().map(Vec::len).sum()];
+        let mut rest = &mut edges[..];
+        let places: Vec<&mut [Edge]> =
+            chunks.iter().map(|chunk| rest.split_off_mut(..chunk.len()).unwrap_or_default()).collect();
+        places.into_par_iter().zip(&chunks).for_each(|(place, chunk)| place.copy_from_slice(chunk));
+        drop(chunks);
         edges.par_sort_unstable();
         Self { n_gaussians: scene.len(), usable, edges }
     }

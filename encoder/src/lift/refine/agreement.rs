@@ -30,6 +30,9 @@ impl Default for Vote {
     }
 }
 
+/// The votes of a part's Gaussians.
+pub(super) struct PartVotes(Vec<Vec<(u32, Vote)>>);
+
 /// The votes of all Gaussians so far, by region.
 pub(super) struct Votes(Vec<Vote>);
 
@@ -41,13 +44,12 @@ impl Votes {
         Self(vec![Vote::default(); n_regions])
     }
 
-    /// Adds the votes of a part's Gaussians.
-    pub(super) fn add(
-        &mut self,
+    /// Returns the votes of a part's Gaussians by region, chunk by chunk.
+    pub(super) fn of_part(
         contributions: &PartContributions,
         first_regions: &FirstRegions,
         region_points: &[Point],
-    ) {
+    ) -> PartVotes {
         let n = contributions.total_weights.len();
         let of_chunk = |first: usize| -> Vec<(u32, Vote)> {
             let gaussians = first..(first + CHUNK).min(n);
@@ -80,8 +82,12 @@ impl Votes {
             regions.into_iter().zip(votes).collect()
         };
         let firsts: Vec<usize> = (0..n).step_by(CHUNK).collect();
-        let of_chunks: Vec<Vec<(u32, Vote)>> = firsts.into_par_iter().map(of_chunk).collect();
-        for (region, vote) in of_chunks.into_iter().flatten() {
+        PartVotes(firsts.into_par_iter().map(of_chunk).collect())
+    }
+
+    /// Adds the votes of a part.
+    pub(super) fn add(&mut self, of_part: PartVotes) {
+        for (region, vote) in of_part.0.into_iter().flatten() {
             let sum = &mut self.0[region as usize];
             add(&mut sum.direction, 1.0, &vote.direction);
             sum.weight += vote.weight;

@@ -14,41 +14,27 @@ const MAX_MASKS: usize = 256;
 /// Evidence of a filled Gaussian, pixels: almost none.
 const FILLED_WEIGHT_PX: f32 = 1e-3;
 
-/// Writes each Gaussian's direction to `sketches` (`[N][AXES]` of the scene), rounded to 8 bits; zeros where there is no
-/// evidence. `gaussians`: scene indices of the part's Gaussians.
-pub(super) fn sketch(
-    contributions: &PartContributions,
-    gaussians: &[u32],
-    region_points: &[Point],
-    sketches: &mut [i8],
-) {
+/// Returns the direction of each of a part's Gaussians, rounded to 8 bits; zeros where there is no evidence.
+pub(super) fn sketches(contributions: &PartContributions, region_points: &[Point]) -> Vec<[i8; AXES]> {
     let sketch_of = |k: usize| -> [i8; AXES] {
         let mut sum = sum_of(contributions, contributions.entries_of(k), region_points);
         make_unit(&mut sum);
         sum.map(|c| (127.0 * c).round() as i8)
     };
-    let of_part: Vec<[i8; AXES]> = (0..gaussians.len()).into_par_iter().map(sketch_of).collect();
-    for (gaussian, sketch) in gaussians.iter().zip(of_part) {
-        sketches[*gaussian as usize * AXES..][..AXES].copy_from_slice(&sketch);
-    }
+    (0..contributions.part.locals.len()).into_par_iter().map(sketch_of).collect()
 }
 
-/// The summed contributions of each superpoint's Gaussians.
-pub(super) struct SuperpointSums {
-    superpoints: Superpoints,
-    /// Of each superpoint: `(region, weight)`, one run a part.
-    regions: Vec<Vec<(u32, f32)>>,
-}
+/// The summed contributions of the Gaussians that a part has of each superpoint: `(superpoint, [(region, weight)])`.
+pub(super) struct PartSums(Vec<(usize, Vec<(u32, f32)>)>);
 
-impl SuperpointSums {
-    pub(super) fn new(superpoints: Superpoints) -> Self {
-        let regions = vec![Vec::new(); superpoints.n];
-        Self { superpoints, regions }
-    }
-
-    /// Adds the contributions of a part's Gaussians.
-    pub(super) fn add(&mut self, contributions: &PartContributions, gaussians: &[u32]) {
-        let superpoint_of = |k: u32| self.superpoints.of_gaussian[gaussians[k as usize] as usize];
+impl PartSums {
+    /// Adds up the contributions of a part's Gaussians. `gaussians`: their scene indices.
+    pub(super) fn new(
+        contributions: &PartContributions,
+        gaussians: &[u32],
+        superpoints: &Superpoints,
+    ) -> Self {
+        let superpoint_of = |k: u32| superpoints.of_gaussian[gaussians[k as usize] as usize];
         // By superpoint, then by Gaussian.
         let mut members: Vec<(u32, u32)> = (0..gaussians.len() as u32)
             .into_par_iter()
@@ -66,8 +52,25 @@ impl SuperpointSums {
             (members[0].0 as usize, summed_by_key(entries))
         };
         let runs: Vec<&[(u32, u32)]> = members.chunk_by(|a, b| a.0 == b.0).collect();
-        let of_part: Vec<(usize, Vec<(u32, f32)>)> = runs.into_par_iter().map(of_superpoint).collect();
-        of_part.into_iter().for_each(|(superpoint, entries)| self.regions[superpoint].extend(entries));
+        Self(runs.into_par_iter().map(of_superpoint).collect())
+    }
+}
+
+/// The summed contributions of each superpoint's Gaussians so far: `(region, weight)`, one run a part.
+pub(super) struct SuperpointSums(Vec<Vec<(u32, f32)>>);
+
+impl SuperpointSums {
+    pub(super) fn new(n_superpoints: usize) -> Self {
+        Self(vec![Vec::new(); n_superpoints])
+    }
+
+    /// Adds the contributions of a part's Gaussians.
+    pub(super) fn add(&mut self, of_part: PartSums) {
+        for (superpoint, entries) in of_part.0 {
+            let sum = &mut self.0[superpoint];
+            // Most superpoints lie within a part.
+            if sum.is_empty() { *sum = entries } else { sum.extend(entries) }
+        }
     }
 }
 
@@ -107,6 +110,7 @@ impl Mixtures {
     /// Appends a region to the table for each superpoint with evidence.
     pub(super) fn new(
         weight: f32,
+        superpoints: Superpoints,
         sums: SuperpointSums,
         table: &mut RegionTable,
         mask_points: &[Point],
@@ -130,13 +134,13 @@ impl Mixtures {
             mixture.iter().for_each(|(mask, share)| add(&mut sum, *share, &mask_points[*mask as usize]));
             (mixture, length(&sum))
         };
-        let mixtures: Vec<(Vec<(u32, f32)>, f32)> = sums.regions.into_par_iter().map(with_length).collect();
+        let mixtures: Vec<(Vec<(u32, f32)>, f32)> = sums.0.into_par_iter().map(with_length).collect();
         let mut region = |(mixture, length): (Vec<(u32, f32)>, f32)| {
             (length > MIN_MEAN_LENGTH)
                 .then(|| MixtureRegion { region: table.append_mixture(&mixture), length })
         };
         let regions = mixtures.into_iter().map(&mut region).collect();
-        Self { weight, of_gaussian: sums.superpoints.of_gaussian, regions }
+        Self { weight, of_gaussian: superpoints.of_gaussian, regions }
     }
 
     /// Adds an entry of its superpoint to each Gaussian of a part. With `fill`, a Gaussian without evidence takes the

@@ -30,6 +30,7 @@ mod views;
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use rayon::prelude::*;
 use slag_common::Gaussians;
 use slag_math::axes::principal_coordinates;
 
@@ -42,7 +43,7 @@ use super::table::RegionTable;
 use crate::cells::CellSplit;
 use crate::memory::{MemoryPlan, Phase};
 use agreement::Votes;
-use mixture::{Mixtures, SuperpointSums};
+use mixture::{Mixtures, PartSums, SuperpointSums};
 use points::{AXES, Point};
 pub use settings::Aggregation;
 use views::FirstRegions;
@@ -67,17 +68,20 @@ struct Passes<'a> {
 }
 
 impl Passes<'_> {
-    /// Calls `visit` with each part; returns false if cancelled.
-    fn visit(
+    /// Calls `work` with each part, on all threads, and `merge` with the results, in the order of the parts; returns false
+    /// if cancelled.
+    fn visit<T: Send>(
         &self,
         table: &RegionTable,
-        mut visit: impl FnMut(PartContributions),
+        work: impl Fn(PartContributions) -> T + Sync,
+        mut merge: impl FnMut(T),
     ) -> Result<bool, ContributionError> {
-        for contributions in self.index.transposed_parts(table, self.group_bytes) {
+        for group in self.index.transposed_groups(table, self.group_bytes) {
             if self.cancel.load(Ordering::Relaxed) {
                 return Ok(false);
             }
-            visit(contributions?);
+            let results: Vec<T> = group?.into_par_iter().map(&work).collect();
+            results.into_iter().for_each(&mut merge);
         }
         Ok(true)
     }
@@ -137,10 +141,11 @@ impl Refinement {
         mut mask_weights: Vec<f32>,
     ) -> Result<bool, ContributionError> {
         let mut votes = Votes::new(table.len());
-        let done = passes.visit(table, |mut contributions| {
+        let of_part = |mut contributions: PartContributions| {
             self.prune(&mut contributions);
-            votes.add(&contributions, &self.first_regions, &self.region_points);
-        })?;
+            Votes::of_part(&contributions, &self.first_regions, &self.region_points)
+        };
+        let done = passes.visit(table, of_part, |of_part| votes.add(of_part))?;
         if done {
             let agreements = votes.agreements(table, mask_points, self.settings.agreement);
             mask_weights.iter_mut().zip(agreements).for_each(|(weight, agreement)| *weight *= agreement);
@@ -160,14 +165,15 @@ impl Refinement {
         (scene, split): (&Gaussians, &CellSplit),
     ) -> Result<bool, ContributionError> {
         let mut sketches = vec![0; scene.len() * AXES];
-        let done = passes.visit(table, |mut contributions| {
+        let of_part = |mut contributions: PartContributions| {
             self.refine_own(&mut contributions);
-            mixture::sketch(
-                &contributions,
-                contributions.part.gaussians(split),
-                &self.region_points,
-                &mut sketches,
-            );
+            let of_part = mixture::sketches(&contributions, &self.region_points);
+            (contributions.part, of_part)
+        };
+        let done = passes.visit(table, of_part, |(part, of_part)| {
+            for (gaussian, sketch) in part.gaussians(split).iter().zip(of_part) {
+                sketches[*gaussian as usize * AXES..][..AXES].copy_from_slice(&sketch);
+            }
         })?;
         if !done {
             return Ok(false);
@@ -182,20 +188,22 @@ impl Refinement {
             || partition(superpoint, superpoint > 0.0 || fill, SuperpointSettings::default()),
             || partition(coarse, coarse > 0.0, SuperpointSettings::coarse()),
         );
-        let scales = fine.into_iter().chain(larger);
+        let scales: Vec<(f32, Superpoints)> = fine.into_iter().chain(larger).collect();
         drop(graph);
-        let mut sums: Vec<(f32, SuperpointSums)> =
-            scales.map(|(weight, superpoints)| (weight, SuperpointSums::new(superpoints))).collect();
-        let done = passes.visit(table, |mut contributions| {
+        let mut sums: Vec<SuperpointSums> = scales.iter().map(|(_, of)| SuperpointSums::new(of.n)).collect();
+        let of_part = |mut contributions: PartContributions| -> Vec<PartSums> {
             self.refine_own(&mut contributions);
             let gaussians = contributions.part.gaussians(split);
-            sums.iter_mut().for_each(|(_, sums)| sums.add(&contributions, gaussians));
+            scales.iter().map(|(_, of)| PartSums::new(&contributions, gaussians, of)).collect()
+        };
+        let done = passes.visit(table, of_part, |of_part| {
+            sums.iter_mut().zip(of_part).for_each(|(sums, of_part)| sums.add(of_part));
         })?;
         if !done {
             return Ok(false);
         }
-        for (weight, sums) in sums {
-            self.mixtures.push(Mixtures::new(weight, sums, table, mask_points));
+        for ((weight, superpoints), sums) in scales.into_iter().zip(sums) {
+            self.mixtures.push(Mixtures::new(weight, superpoints, sums, table, mask_points));
         }
         // The larger superpoints are mixed with rows that hold entries of the finer ones.
         let of_mixtures = points::of_regions(table, mask_points, self.region_points.len()..table.len());

@@ -123,7 +123,7 @@ impl Pass {
         pass.n_entries = index.n_entries();
         pass.n_regions = table.len();
         pass.index_bytes = table.len_bytes() + index.len_bytes();
-        let groups = index.groups(options.group_bytes(pass.index_bytes));
+        let groups = index.groups(options.group_bytes(pass.index_bytes), 1);
         pass.n_groups = groups.len();
         let mut embeddings = vec![0.0; plain.largest_cell() * options.dim];
         for group in groups {
