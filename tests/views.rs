@@ -117,3 +117,80 @@ fn what_was_spent_goes_by_content_and_is_reported() {
     let ratio = weight("first") / weight("fixed");
     assert!((ratio - 1.0).abs() < 0.01, "{ratio}");
 }
+
+/// Photos of a second flight come in and one goes: only new views are done, and the bytes are those of an encode of
+/// all photos from the beginning. Masks of the new photos lie beside the old ones.
+#[test]
+fn photos_are_added_and_withdrawn() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let room = dir.path().join("room");
+    run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "10", "--seed", "31"]));
+    let (masks, views) = (room.join("gt/masks"), room.join("transforms.json"));
+    let poses: Value = serde_json::from_slice(&fs_err::read(&views).expect("reads")).expect("JSON");
+    let name = |i: usize| poses["frames"][i]["file_path"].as_str().expect("a path").to_owned();
+    let poses_of = |file: &str, frames: &[usize]| {
+        let mut some = poses.clone();
+        some["frames"] = frames.iter().map(|i| poses["frames"][*i].clone()).collect();
+        fs_err::write(room.join(file), some.to_string()).expect("writes");
+        room.join(file)
+    };
+    let encode = |store: &str, views: &Path, more: &[&str]| {
+        let (scene, store) = (room.join("scene.ply"), dir.path().join(store));
+        let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(views), "--metric"]);
+        command.args(["--masks", text(&masks), "--store", text(&store), "--raster-width", "320"]);
+        command.args(["--name", "room"]);
+        let summary = run_json(command.args(more));
+        let counts = ["n_views", "n_views_resumed"].map(|name| summary[name].as_u64().expect("a count"));
+        (counts, content(&store))
+    };
+    let first = poses_of("first.json", &[0, 2, 3, 5, 6, 7]);
+    let second = poses_of("second.json", &[1, 4, 8, 9]);
+    // The masks of the second flight do not exist yet.
+    let later: Vec<_> = files(&masks)
+        .into_iter()
+        .filter(|path| [1, 4, 8, 9].iter().any(|i| path.file_stem() == Path::new(&name(*i)).file_stem()))
+        .collect();
+    assert_eq!(later.len(), 4, "one for each new photo");
+    let aside = dir.path().join("aside");
+    fs_err::create_dir(&aside).expect("makes");
+    later
+        .iter()
+        .for_each(|path| fs_err::rename(path, aside.join(path.file_name().expect("a name"))).expect("moves"));
+    assert_eq!(encode("grown", &first, &["--keep-views"]).0, [6, 0]);
+    later
+        .iter()
+        .for_each(|path| fs_err::rename(aside.join(path.file_name().expect("a name")), path).expect("moves"));
+
+    let added = encode("grown", &first, &["--add", text(&second)]);
+    assert_eq!(added.0, [10, 6], "only the new views are done");
+    assert_eq!(added.1, encode("whole", &views, &[]).1, "all photos from the beginning");
+
+    let without = poses_of("without.json", &[0, 1, 2, 4, 5, 6, 7, 8, 9]);
+    let dropped = encode("grown", &views, &["--drop", &name(3)]);
+    assert_eq!(dropped.0, [9, 9], "nothing is done again");
+    assert_eq!(dropped.1, encode("fewer", &without, &[]).1, "without the photo from the beginning");
+    // A withdrawn photo leaves nothing behind, and comes back as a new one.
+    assert_eq!(encode("grown", &views, &["--keep-views"]).0, [10, 9]);
+
+    // A photo that was replaced under its name is done again, and its neighbours are not.
+    fs_err::copy(room.join(name(0)), room.join(name(5))).expect("copies");
+    let replaced = encode("grown", &views, &["--keep-views"]);
+    assert_eq!(replaced.0, [10, 9]);
+    assert_eq!(replaced.1, encode("replaced", &views, &[]).1);
+
+    let fails = |more: &[&str]| {
+        let (scene, store) = (room.join("scene.ply"), dir.path().join("grown"));
+        let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views)]);
+        let output = command.args(["--store", text(&store)]).args(more).output().expect("starts");
+        assert!(!output.status.success());
+        String::from_utf8_lossy(&output.stderr).into_owned()
+    };
+    assert!(fails(&["--add", text(&second)]).contains("has a pose already"));
+    assert!(fails(&["--drop", "absent.png"]).contains("absent.png"));
+}
+
+/// Returns the files in a folder and its subfolders.
+fn files(folder: &Path) -> Vec<std::path::PathBuf> {
+    let entries = fs_err::read_dir(folder).expect("reads").map(|entry| entry.expect("reads").path());
+    entries.flat_map(|path| if path.is_dir() { files(&path) } else { vec![path] }).collect()
+}

@@ -30,6 +30,7 @@ pub mod cells;
 pub mod check;
 pub mod cli;
 pub mod codebook;
+pub mod diff;
 pub mod embed;
 pub mod encode;
 pub mod ingest;

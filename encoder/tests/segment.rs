@@ -100,8 +100,11 @@ fn load(
 /// Masks are identified by the contents of their files, not by paths, lengths or place.
 #[test]
 fn the_identity_of_given_masks_is_that_of_their_contents() {
-    let identity =
-        |path: &Path, ignored: &[u32]| GivenMasks::open(path, ignored.to_vec()).unwrap().identity().unwrap();
+    let of_view = |name: &str, path: &Path, ignored: &[u32]| {
+        let given = GivenMasks::open(path, ignored.to_vec()).unwrap();
+        (given.identity(), given.identity_of_view(&view(name, 8, 6)).unwrap())
+    };
+    let identity = |path: &Path, ignored: &[u32]| of_view("left/a.jpg", path, ignored);
     let (dir, other) = (folder(), folder());
     let png = |rows: &[u8]| {
         write_png(&dir.path().join("left/a.png"), png::ColorType::Grayscale, png::BitDepth::One, rows);
@@ -114,22 +117,26 @@ fn the_identity_of_given_masks_is_that_of_their_contents() {
     assert_eq!(identity(other.path(), &[]), before, "another place");
     fs_err::rename(other.path().join("left/a.png"), other.path().join("left/b.png")).unwrap();
     assert_ne!(identity(other.path(), &[]), before, "another view");
+    assert_eq!(of_view("left/b.jpg", other.path(), &[]), before, "the view that has the file now");
     let len_bytes = fs_err::metadata(dir.path().join("left/a.png")).unwrap().len();
     png(&[0b0001_1110; 6]);
     assert_eq!(fs_err::metadata(dir.path().join("left/a.png")).unwrap().len(), len_bytes);
     assert_ne!(identity(dir.path(), &[]), before, "other pixels in a file of the same length");
 
     let data_set = dir.path().join("set.json");
-    let write = |runs: &str| {
+    let write_with = |more: &str, runs: &str| {
         let text = format!(
-            r#"{{"images":[{{"id":1,"file_name":"a"}}],"annotations":[{{"image_id":1,"segmentation":{{"size":[6,8],"counts":[{runs}]}}}}]}}"#
+            r#"{{"images":[{{"id":1,"file_name":"left/a.jpg"}},{{"id":2,"file_name":"b"}}],"annotations":[{more}{{"image_id":1,"segmentation":{{"size":[6,8],"counts":[{runs}]}}}}]}}"#
         );
         fs_err::write(&data_set, text).unwrap();
         identity(&data_set, &[])
     };
+    let write = |runs: &str| write_with("", runs);
     let before = write("10,20,18");
     assert_ne!(write("11,20,17"), before, "other runs in a data set of the same length");
     assert_eq!(write("10,20,18"), before);
+    let of_another = r#"{"image_id":2,"segmentation":{"size":[6,8],"counts":[9,20,19]}},"#;
+    assert_eq!(write_with(of_another, "10,20,18"), before, "masks of another view");
 }
 
 fn folder() -> tempfile::TempDir {

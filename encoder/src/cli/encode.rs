@@ -139,7 +139,7 @@ pub struct EncodeArgs {
     /// Days after which robots refuse the manifest [default: never].
     #[arg(long, value_name = "DAYS")]
     pub expires_days: Option<u32>,
-    /// Drops an unfinished encode of other inputs or settings in the store.
+    /// Drops an unfinished encode of another splat or with other settings in the store.
     #[arg(long)]
     pub restart: bool,
 }
@@ -177,6 +177,8 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             scene: args.input.scene.clone(),
             views: args.input.views.clone(),
             images: args.input.images.clone(),
+            added: args.views.added.clone(),
+            dropped: args.views.dropped.clone(),
             every: args.input.every,
             splat_frame: args.input.splat_frame.clone(),
             metric,
@@ -215,7 +217,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             time_budget: args.views.time_budget,
             strict: args.input.strict,
             restart: args.restart,
-            keep_views: args.refine.keep_views,
+            keep_views: args.refine.keep_views || args.views.changes_photos(),
         },
     })
 }
@@ -370,6 +372,8 @@ fn with_setting(args: &EncodeArgs, setting: &str) -> Result<EncodeArgs> {
     with.refine.keep_views = args.refine.keep_views;
     with.views = chosen.views.clone();
     with.views.time_budget = args.views.time_budget;
+    with.views.added = args.views.added.clone();
+    with.views.dropped = args.views.dropped.clone();
     Ok(with)
 }
 

@@ -3,6 +3,7 @@
 mod check;
 pub mod common;
 mod devices;
+mod diff;
 mod encode;
 pub mod environment;
 mod exit;
@@ -73,6 +74,8 @@ pub enum Command {
     Encode(Box<encode::EncodeArgs>),
     /// Scores every Gaussian of a store against a text, in full precision.
     Query(query::QueryArgs),
+    /// Lists the things that appeared, went or moved between two generations, and what robots have to fetch.
+    Diff(diff::DiffArgs),
     /// Serves a store's manifest and shards over HTTP.
     Serve(serve::ServeArgs),
     /// Shows, makes and rotates the key that a store signs with.
@@ -100,6 +103,7 @@ pub fn run(cli: Cli) -> Exit {
         Command::Check(args) => check::run(&args, json),
         Command::Encode(args) => encode::run(&args, progress.as_ref(), json),
         Command::Query(args) => query::run(&args, json),
+        Command::Diff(args) => diff::run(&args, json),
         Command::Serve(args) => serve::run(&args),
         Command::Keys(command) => keys::run(&command, json),
         Command::Store(command) => store::run(&command, progress.as_ref(), json),

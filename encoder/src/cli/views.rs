@@ -1,5 +1,6 @@
 //! The flags that choose views and the number of their masks.
 
+use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
@@ -19,6 +20,15 @@ pub struct ViewsArgs {
     /// Number of scales at which the built-in segmenter looks, coarsest first [default: the preset's].
     #[arg(long, value_name = "N", value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=4))]
     pub mask_levels: Option<usize>,
+    /// Poses of further photos in the same world, in one file of poses or several: the scene is encoded from these and
+    /// those of --views, and only views that the store does not keep are segmented, embedded and rasterised. Keeps the
+    /// contributions of views, as --keep-views does.
+    #[arg(long = "add", value_name = "POSES")]
+    pub added: Vec<PathBuf>,
+    /// Leaves out a view, by its name in the poses file; nothing else is segmented, embedded and rasterised again. Keeps
+    /// the contributions of views, as --keep-views does.
+    #[arg(long = "drop", value_name = "VIEW")]
+    pub dropped: Vec<String>,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -32,6 +42,11 @@ enum ViewOrderArg {
 }
 
 impl ViewsArgs {
+    /// Returns whether photos are added to those of the poses file or left out.
+    pub(super) fn changes_photos(&self) -> bool {
+        !self.added.is_empty() || !self.dropped.is_empty()
+    }
+
     /// Returns the order of the flags.
     pub(super) fn order(&self, views_limit: ViewsLimit) -> ViewOrder {
         match self.view_order {

@@ -95,10 +95,10 @@ pub enum EncodeError {
         /// The database's error.
         source: sled::Error,
     },
-    /// The store holds an unfinished job with another identity.
+    /// The store holds an unfinished encode of another scene or with other settings.
     #[error(
-        "{}: holds an unfinished encode of other inputs or settings ({n_done} views done); finish it with its own \
-         inputs and settings, or drop it with --restart", path.display()
+        "{}: holds an unfinished encode of another splat or with other settings ({n_done} views done); finish it with its own \
+         splat and settings, or drop it with --restart", path.display()
     )]
     OtherJob {
         /// The store.
@@ -115,6 +115,32 @@ pub enum EncodeError {
         n_views: usize,
         /// The first missing photo.
         first: PathBuf,
+    },
+    /// Two poses files name the same view.
+    #[error("{}: view {view} has a pose already in {}; give the photos other names, or leave one of the files out", path.display(), first.display())]
+    AddedTwice {
+        /// The view.
+        view: String,
+        /// The poses file that was given first.
+        first: PathBuf,
+        /// The one that was added.
+        path: PathBuf,
+    },
+    /// Poses that are added are in another frame.
+    #[error("{}: applied_transform or applied_scale differ from those of {}; bring both poses into one frame", path.display(), first.display())]
+    AddedFrame {
+        /// The poses file that was given first.
+        first: PathBuf,
+        /// The one that was added.
+        path: PathBuf,
+    },
+    /// A view to leave out is in no poses file.
+    #[error("--drop {view}: no poses file has this view; its first view is {first:?}")]
+    NoViewToDrop {
+        /// The name as given.
+        view: String,
+        /// A view that there is.
+        first: String,
     },
     /// No view can be used.
     #[error("none of {n_views} views can be used; the first: {reason}")]

@@ -1,4 +1,4 @@
-//! What makes two encodes the same, so that one may go on from the other's views.
+//! What makes two views' contributions the same, so that an encode may go on from those of an earlier one.
 
 use rayon::prelude::*;
 use serde::Serialize;
@@ -15,11 +15,20 @@ use crate::segment::Segmenter;
 /// Version of the steps from masks to contributions; another number is another encode.
 const REGIONS_VERSION: u32 = 3;
 
-/// Everything on which the contributions of views depend: files by their content, settings as they are.
+/// The identities of an encode.
+pub(super) struct Identities {
+    /// Hash of everything on which the contributions of all views depend.
+    pub(super) of_scene: Hash32,
+    /// `[n_views]`: hash of everything on which the contributions of a view depend, in the order of the views. That
+    /// includes `of_scene`, but no other view: photos can be added and withdrawn.
+    pub(super) of_view: Vec<Hash32>,
+}
+
+/// Everything on which the contributions of all views depend: files by their content, settings as they are.
 ///
 /// A setting is part of it by being a field of [`ViewSettings`].
 #[derive(Serialize)]
-struct Identity<'a> {
+struct SceneIdentity<'a> {
     program: &'static str,
     regions: (u32, f64, u32),
     encoder: Hash32,
@@ -27,7 +36,6 @@ struct Identity<'a> {
     segmenter: String,
     perturbation: Option<String>,
     scene: Hash32,
-    views: Vec<ViewIdentity<'a>>,
     settings: &'a ViewSettings,
     cells: CellLimits,
 }
@@ -41,25 +49,28 @@ struct Session {
 
 #[derive(Serialize)]
 struct ViewIdentity<'a> {
+    of_scene: Hash32,
     name: &'a str,
     /// Hash of the photo's file; absent where it cannot be read.
     photo: Option<Hash32>,
+    /// Hash of its mask file; absent where it has none.
+    masks: Option<Hash32>,
     intrinsics: Intrinsics,
     camera_from_world: glam::DAffine3,
 }
 
-/// Returns the hash of everything on which the contributions of views depend.
+/// Returns the identities of an encode of these inputs.
 ///
 /// # Errors
 /// [`EncodeError::Segment`] if a file of masks cannot be read.
-pub(super) fn identity(
+pub(super) fn identities(
     settings: &EncodeSettings,
     engines: &Engines<'_>,
     segmenter: &dyn Segmenter,
     inputs: &Inputs,
-) -> Result<Hash32, EncodeError> {
+) -> Result<Identities, EncodeError> {
     let Engines { models, session, perturbation, .. } = engines;
-    let identity = Identity {
+    let of_scene = hash_of(&SceneIdentity {
         program: env!("CARGO_PKG_VERSION"),
         regions: (REGIONS_VERSION, LONG_BORDERS, MAX_RASTER_WIDTH_PX),
         encoder: Hash32(models.encoder_id().hash()),
@@ -67,14 +78,28 @@ pub(super) fn identity(
             providers: session.providers.iter().map(ToString::to_string).collect(),
             n_threads: session.intra_op_threads,
         },
-        segmenter: segmenter.identity()?,
+        segmenter: segmenter.identity(),
         perturbation: perturbation.map(|perturbation| perturbation.identity()),
         scene: hash_scene(&inputs.scene),
-        views: inputs.views.par_iter().map(identity_of_view).collect(),
         settings: &settings.view,
         cells: settings.cells.limits,
+    })?;
+    let of_view = |view: &View| -> Result<Hash32, EncodeError> {
+        hash_of(&ViewIdentity {
+            of_scene,
+            name: &view.name,
+            photo: ingest::hash_file(&view.image_path).ok(),
+            masks: segmenter.identity_of_view(view)?,
+            intrinsics: view.intrinsics,
+            camera_from_world: view.camera_from_world,
+        })
     };
-    Ok(Hash32::of(&serde_json::to_vec(&identity).map_err(std::io::Error::from)?))
+    let of_view = inputs.views.par_iter().map(of_view).collect::<Result<_, _>>()?;
+    Ok(Identities { of_scene, of_view })
+}
+
+fn hash_of(identity: &impl Serialize) -> Result<Hash32, EncodeError> {
+    Ok(Hash32::of(&serde_json::to_vec(identity).map_err(std::io::Error::from)?))
 }
 
 fn hash_scene(scene: &Gaussians) -> Hash32 {
@@ -85,15 +110,6 @@ fn hash_scene(scene: &Gaussians) -> Hash32 {
         bytemuck::cast_slice(&scene.opacities),
     ];
     Hash32::of(&columns.map(|column| Hash32::of(column).0).concat())
-}
-
-fn identity_of_view(view: &View) -> ViewIdentity<'_> {
-    ViewIdentity {
-        name: &view.name,
-        photo: ingest::hash_file(&view.image_path).ok(),
-        intrinsics: view.intrinsics,
-        camera_from_world: view.camera_from_world,
-    }
 }
 
 #[cfg(test)]
@@ -150,7 +166,7 @@ mod tests {
         change(&mut settings, &mut session);
         let models = ModelDir::colours();
         let engines = Engines::new(&models, &session, &CpuRasterizer);
-        identity(&settings, &engines, segmenter, &inputs(photo)).expect("an identity")
+        identities(&settings, &engines, segmenter, &inputs(photo)).expect("readable").of_view[0]
     }
 
     /// Files count by content, where path and length are the same; so do masks in a single COCO file.
@@ -166,8 +182,8 @@ mod tests {
         assert!(found[0] == found[2] && found[0] != found[1], "photos");
 
         let (file, folder) = (dir.path().join("masks.json"), dir.path().join("masks"));
-        fs_err::create_dir_all(folder.join("left")).expect("makes");
-        for (path, given) in [(&file, &file), (&folder.join("left/a.json"), &folder)] {
+        fs_err::create_dir_all(&folder).expect("makes");
+        for (path, given) in [(&file, &file), (&folder.join("a.json"), &folder)] {
             found.clear();
             for counts in ["[4,60]", "[5,59]", "[4,60]"] {
                 let annotation =

@@ -1,6 +1,7 @@
 //! Scene, views and geo-reference as they were read.
 
 use std::collections::HashSet;
+use std::path::Path;
 
 use slag_common::frames::GeoReference;
 use slag_common::poses::ViewSet;
@@ -82,6 +83,9 @@ pub fn count_inputs(inputs: &InputSettings) -> Result<(usize, usize), EncodeErro
 /// Reads the poses of every nth frame.
 fn read_views(inputs: &InputSettings) -> Result<ViewSet, EncodeError> {
     let mut set = poses::read(&inputs.views, inputs.images.as_deref())?;
+    for path in &inputs.added {
+        add_views(&mut set, &inputs.views, path)?;
+    }
     if let Some(n) = inputs.every {
         let n_frames = set.views.len() + set.without_pose.len();
         set = set.every(n);
@@ -91,7 +95,38 @@ fn read_views(inputs: &InputSettings) -> Result<ViewSet, EncodeError> {
         let (n, of) = (set.without_pose.len(), set.views.len() + set.without_pose.len());
         tracing::info!("{n} of {of} frames have no pose (-inf) and are left out, the first is {first}");
     }
+    drop_views(&mut set.views, &inputs.dropped)?;
     Ok(set)
+}
+
+/// Adds the views of another poses file. `first`: the file of those that are there, for errors.
+fn add_views(set: &mut ViewSet, first: &Path, path: &Path) -> Result<(), EncodeError> {
+    let added = poses::read(path, None)?;
+    if added.applied != set.applied {
+        return Err(EncodeError::AddedFrame { first: first.to_owned(), path: path.to_owned() });
+    }
+    let known: HashSet<&str> = set.views.iter().map(|view| view.name.as_str()).collect();
+    if let Some(view) = added.views.iter().find(|view| known.contains(view.name.as_str())) {
+        let view = view.name.clone();
+        return Err(EncodeError::AddedTwice { view, first: first.to_owned(), path: path.to_owned() });
+    }
+    set.views.extend(added.views);
+    set.views.sort_by(|a, b| a.name.cmp(&b.name));
+    set.without_pose.extend(added.without_pose);
+    set.without_pose.sort();
+    Ok(())
+}
+
+/// Leaves out the views of these names.
+fn drop_views(views: &mut Vec<View>, names: &[String]) -> Result<(), EncodeError> {
+    for name in names {
+        let Some(at) = views.iter().position(|view| view.name == *name) else {
+            let first = views.first().map(|view| view.name.clone()).unwrap_or_default();
+            return Err(EncodeError::NoViewToDrop { view: name.clone(), first });
+        };
+        views.remove(at);
+    }
+    Ok(())
 }
 
 /// Sets aside views without a photo.

@@ -1,6 +1,6 @@
 //! The state of an unfinished encode: which views are done, and their files of contributions.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -15,6 +15,7 @@ const TREE: &str = "job";
 const IDENTITY_KEY: &[u8] = b"identity";
 /// Present while every finished view of the job is published.
 const PUBLISHED_KEY: &[u8] = b"published";
+/// Followed by the view's identity.
 const VIEW_PREFIX: &str = "view/";
 
 /// The record of a finished view.
@@ -31,54 +32,65 @@ pub(super) struct Job<'a> {
     store: &'a Store,
     records: sled::Tree,
     folder: PathBuf,
+    /// The identity of each view of this encode, by name.
+    id_of_view: BTreeMap<String, Hash32>,
 }
 
 impl<'a> Job<'a> {
-    /// Takes up the unfinished encode of this identity, or begins one.
+    /// Takes up what an encode of the same scene left, or begins one. Views that it has done are done here, too, where
+    /// their identities are the same. `id_of_view`: by name.
     ///
     /// # Errors
-    /// [`EncodeError::OtherJob`] if one of another identity is unfinished and `restart` is not set.
-    pub(super) fn open(store: &'a Store, identity: Hash32, restart: bool) -> Result<Self, EncodeError> {
+    /// [`EncodeError::OtherJob`] if one of another scene or other settings is unfinished and `restart` is not set.
+    pub(super) fn open(
+        store: &'a Store,
+        of_scene: Hash32,
+        id_of_view: BTreeMap<String, Hash32>,
+        restart: bool,
+    ) -> Result<Self, EncodeError> {
         let folder = store.job_dir()?;
         let records = store.db().open_tree(TREE).map_err(|source| records_error(store, source))?;
-        let job = Self { store, records, folder };
+        let job = Self { store, records, folder, id_of_view };
         let found = job.records.get(IDENTITY_KEY).map_err(|source| records_error(store, source))?;
-        let same = found.as_deref() == Some(&identity.0);
+        let same = found.as_deref() == Some(&of_scene.0);
         let published =
             job.records.contains_key(PUBLISHED_KEY).map_err(|source| records_error(store, source))?;
         // A published job loses only its contributions, which the published generation does not need.
         if found.is_some() && !same && !restart && !published {
             return Err(EncodeError::OtherJob {
                 path: store.dir().to_owned(),
-                n_done: job.done_views()?.len(),
+                n_done: job.records.scan_prefix(VIEW_PREFIX).count(),
             });
         }
         if !same {
             job.clear()?;
-            job.records.insert(IDENTITY_KEY, &identity.0).map_err(|source| records_error(store, source))?;
+            job.records.insert(IDENTITY_KEY, &of_scene.0).map_err(|source| records_error(store, source))?;
             job.flush()?;
         }
-        fs_err::create_dir_all(job.folder.join("views"))?;
+        fs_err::create_dir_all(job.views_folder())?;
         Ok(job)
     }
 
-    /// Returns the views whose contributions are on disk.
+    /// Returns the views of this encode whose contributions are on disk.
     pub(super) fn done_views(&self) -> Result<BTreeMap<String, ViewRecord>, EncodeError> {
-        let records = self.records.scan_prefix(VIEW_PREFIX);
-        records
-            .map(|record| {
-                let (key, value) = record.map_err(|source| records_error(self.store, source))?;
-                let name = String::from_utf8_lossy(&key[VIEW_PREFIX.len()..]).into_owned();
+        let mut done = BTreeMap::new();
+        for (name, id) in &self.id_of_view {
+            let record = self.records.get(record_key(*id));
+            if let Some(value) = record.map_err(|source| records_error(self.store, source))? {
                 // The record feeds the report alone.
-                Ok((name, serde_json::from_slice(&value).unwrap_or_default()))
-            })
-            .collect()
+                done.insert(name.clone(), serde_json::from_slice(&value).unwrap_or_default());
+            }
+        }
+        Ok(done)
     }
 
     /// Returns the file of a view's contributions.
+    ///
+    /// # Panics
+    /// If the view is none of this encode's.
     pub(super) fn contributions_path(&self, view: &str) -> PathBuf {
-        // Names hold separators and may be long; their hash does not.
-        self.folder.join("views").join(format!("{}.contributions", Hash32::of(view.as_bytes())))
+        // By identity: a photo that is replaced gets another file, and a record never names the old one's.
+        self.views_folder().join(format!("{}.contributions", self.id_of_view[view]))
     }
 
     /// Returns the file of the outlines of a view's masks.
@@ -96,18 +108,19 @@ impl<'a> Job<'a> {
     ) -> Result<(), EncodeError> {
         photos::write_outlines(&self.outlines_path(view), outlines)?;
         contributions.write(&self.contributions_path(view))?;
-        let key = format!("{VIEW_PREFIX}{view}");
         let record = serde_json::to_vec(&record).map_err(std::io::Error::from)?;
         // In one step: with a view that was not published, the job may no longer be dropped silently.
         let mut batch = sled::Batch::default();
-        batch.insert(key.as_bytes(), record);
+        batch.insert(record_key(self.id_of_view[view]), record);
         batch.remove(PUBLISHED_KEY);
         self.records.apply_batch(batch).map_err(|source| records_error(self.store, source))?;
         self.flush()
     }
 
-    /// Keeps the contributions of published views, for an encode that adds other views.
+    /// Keeps the contributions of published views, for an encode that adds other views. Those of photos that are
+    /// none of this encode's go.
     pub(super) fn keep_published(self) -> Result<(), EncodeError> {
+        self.forget_others()?;
         self.records.insert(PUBLISHED_KEY, &[]).map_err(|source| records_error(self.store, source))?;
         self.flush()
     }
@@ -115,6 +128,31 @@ impl<'a> Job<'a> {
     /// Forgets the job: it was published.
     pub(super) fn finish(self) -> Result<(), EncodeError> {
         self.clear()
+    }
+
+    /// Removes the records and files of views that are none of this encode's.
+    fn forget_others(&self) -> Result<(), EncodeError> {
+        let own: BTreeSet<String> = self.id_of_view.values().map(Hash32::to_string).collect();
+        let mut batch = sled::Batch::default();
+        for key in self.records.scan_prefix(VIEW_PREFIX).keys() {
+            let key = key.map_err(|source| records_error(self.store, source))?;
+            if !own.contains(&*String::from_utf8_lossy(&key[VIEW_PREFIX.len()..])) {
+                batch.remove(key);
+            }
+        }
+        self.records.apply_batch(batch).map_err(|source| records_error(self.store, source))?;
+        self.flush()?;
+        for entry in fs_err::read_dir(self.views_folder())? {
+            let path = entry?.path();
+            if !path.file_stem().and_then(|stem| stem.to_str()).is_some_and(|stem| own.contains(stem)) {
+                fs_err::remove_file(path)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn views_folder(&self) -> PathBuf {
+        self.folder.join("views")
     }
 
     /// Records go first: a file without a record is redone, a record without a file would be an error.
@@ -131,6 +169,10 @@ impl<'a> Job<'a> {
         self.records.flush().map_err(|source| records_error(self.store, source))?;
         Ok(())
     }
+}
+
+fn record_key(id: Hash32) -> Vec<u8> {
+    format!("{VIEW_PREFIX}{id}").into_bytes()
 }
 
 fn records_error(store: &Store, source: sled::Error) -> EncodeError {
@@ -151,12 +193,43 @@ mod tests {
         job.keep(view, &contributions, &[], ViewRecord::default()).expect("keeps");
     }
 
+    fn open_with<'a>(store: &'a Store, of_scene: u8, views: &[(&str, u8)]) -> Result<Job<'a>, EncodeError> {
+        let id_of_view = views.iter().map(|(name, id)| ((*name).to_owned(), Hash32([*id; 32]))).collect();
+        Job::open(store, Hash32([of_scene; 32]), id_of_view, false)
+    }
+
+    /// A view is done where its identity is: photos come, go and are replaced, and what none of them is goes when
+    /// the views are published.
+    #[test]
+    fn views_are_known_by_their_identities() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let store = Store::create_or_open(dir.path()).expect("opens");
+        let names = |job: &Job<'_>| job.done_views().expect("reads").into_keys().collect::<Vec<_>>();
+        let job = open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("begins");
+        keep(&job, "a");
+        keep(&job, "b");
+        let of_b = job.contributions_path("b");
+        assert_eq!(names(&open_with(&store, 1, &[("a", 1), ("c", 3)]).expect("goes on")), ["a"]);
+        // Another photo of the same name is not done, and does not take the place of the old one's file.
+        let replaced = open_with(&store, 1, &[("b", 4)]).expect("goes on");
+        assert!(names(&replaced).is_empty());
+        keep(&replaced, "b");
+        let job = open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("goes on");
+        assert!(names(&job) == ["a", "b"] && of_b.exists());
+        drop(job);
+        let kept = open_with(&store, 1, &[("a", 1)]).expect("goes on");
+        let of_a = kept.contributions_path("a");
+        kept.keep_published().expect("publishes");
+        assert!(of_a.exists() && !of_b.exists());
+        assert_eq!(names(&open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("goes on")), ["a"]);
+    }
+
     /// A published job may be dropped, but not the views that a later run adds to it before it is published again.
     #[test]
     fn views_added_to_a_published_job_are_not_dropped_silently() {
         let dir = tempfile::tempdir().expect("a folder");
         let store = Store::create_or_open(dir.path()).expect("opens");
-        let open = |identity| Job::open(&store, Hash32([identity; 32]), false);
+        let open = |of_scene| open_with(&store, of_scene, &[("a", 1), ("b", 2)]);
         let job = open(1).expect("begins");
         keep(&job, "a");
         job.keep_published().expect("marks");

@@ -62,10 +62,11 @@ pub(super) fn plan<'a>(
         Regions::Patches => Box::new(NoMasks),
         Regions::Masks | Regions::Both => open_segmenter(&settings.view.masks, engines.session)?,
     };
-    let identity = context.time("identity", || {
-        context.install(|| identity::identity(settings, engines, segmenter.as_ref(), inputs))
+    let ids = context.time("identity", || {
+        context.install(|| identity::identities(settings, engines, segmenter.as_ref(), inputs))
     })?;
-    let job = Job::open(store, identity, settings.run.restart)?;
+    let id_of_view = inputs.views.iter().map(|view| view.name.clone()).zip(ids.of_view).collect();
+    let job = Job::open(store, ids.of_scene, id_of_view, settings.run.restart)?;
     let scene = context.time("raster", || context.install(|| engines.rasterizer.load(&inputs.scene)))?;
     let start = Instant::now();
     let (order, coverage) =

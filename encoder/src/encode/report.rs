@@ -96,7 +96,7 @@ pub struct EncodeSummary {
     pub coverage: Option<CoverageReport>,
     /// Seconds spent on rasterising all views to find that order.
     pub coverage_secs: f64,
-    /// Used views that an earlier, interrupted run had finished.
+    /// Used views that an earlier run had finished.
     pub n_views_resumed: usize,
     /// Views without any mask: no mask file, or no mask that is large enough.
     pub n_views_without_masks: usize,

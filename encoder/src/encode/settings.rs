@@ -57,6 +57,10 @@ pub struct InputSettings {
     pub views: PathBuf,
     /// The photos' folder, where it is not beside the poses.
     pub images: Option<PathBuf>,
+    /// Poses of further photos in the same world, which lie where these files say.
+    pub added: Vec<PathBuf>,
+    /// Names of views to leave out.
+    pub dropped: Vec<String>,
     /// Every how many frames one is taken, by their numbers; all where absent.
     pub every: Option<NonZeroU32>,
     /// What states the splat's frame against that of the poses.
@@ -197,7 +201,7 @@ pub struct RunSettings {
     pub time_budget: Option<Duration>,
     /// Whether a missing or unreadable input ends the encode.
     pub strict: bool,
-    /// Whether an unfinished encode of other inputs or settings is dropped.
+    /// Whether an unfinished encode of another splat or with other settings is dropped.
     pub restart: bool,
     /// Whether the views' contributions are kept after publication, for an encode with another aggregation.
     pub keep_views: bool,
@@ -245,6 +249,8 @@ impl EncodeSettings {
                 scene,
                 views,
                 images: None,
+                added: Vec::new(),
+                dropped: Vec::new(),
                 every: None,
                 splat_frame: FrameChoice::Auto,
                 metric,

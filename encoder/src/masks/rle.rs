@@ -4,13 +4,15 @@
 //! least significant first; from the third run on, it holds the difference to the run two before. This is the format
 //! of the COCO API (`maskApi.c`), which its authors call "similar to LEB128".
 
+use serde::Serialize;
+
 use super::mask::{BoxPx, Mask};
 
 /// Most digits of a number with 32 bits and a sign, at 5 bits per digit.
 const MAX_DIGITS: u32 = 7;
 
 /// A run-length encoded mask.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Rle {
     width_px: u32,
     height_px: u32,

@@ -138,8 +138,8 @@ impl Default for GraphSegmenter {
 }
 
 impl Segmenter for GraphSegmenter {
-    fn identity(&self) -> Result<String, SegmentError> {
-        Ok(self.identity.clone())
+    fn identity(&self) -> String {
+        self.identity.clone()
     }
 
     fn wants_depth(&self) -> bool {

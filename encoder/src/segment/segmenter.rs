@@ -2,7 +2,7 @@
 
 use image::RgbImage;
 use rayon::ThreadPool;
-use slag_common::View;
+use slag_common::{Hash32, View};
 
 use super::error::SegmentError;
 use crate::ingest::{LoadedImage, Undistorter};
@@ -13,12 +13,17 @@ pub(super) const MAX_MASK_BYTES: u64 = 1 << 30;
 
 /// Finds the masks of a photo.
 pub trait Segmenter: Sync {
-    /// Returns the identity of the segmenter's results: its method, every parameter, and the hashes of its weights
-    /// or mask files. Two segmenters of equal identity find the same masks.
+    /// Returns the identity of the segmenter: its method, every parameter, and the hashes of its weights. Two
+    /// segmenters of equal identity find the same masks in a photo for which [`Self::identity_of_view`] is equal too.
+    fn identity(&self) -> String;
+
+    /// Returns the hash of what this view's masks come from beside the photo: its mask file; `None` if nothing.
     ///
     /// # Errors
-    /// [`SegmentError::Io`] if a mask file cannot be read.
-    fn identity(&self) -> Result<String, SegmentError>;
+    /// [`SegmentError`] if a mask file cannot be read.
+    fn identity_of_view(&self, _view: &View) -> Result<Option<Hash32>, SegmentError> {
+        Ok(None)
+    }
 
     /// Returns whether the segmenter uses [`SegmentInput::depth`], which costs a drawing of the scene.
     fn wants_depth(&self) -> bool {

@@ -74,6 +74,8 @@ impl LabelledScene {
         let gaussians = splat::read(&splat, &splat::ReadOptions { with_sh_rest: false })?;
         let images = dir.join("images");
         let inputs = InputSettings {
+            added: Vec::new(),
+            dropped: Vec::new(),
             scene: splat,
             views: find(&["transforms.json"])?,
             images: images.is_dir().then_some(images),

@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde::Deserialize;
-use slag_common::Hash32;
 
 use super::limits::{check_size, too_large};
 use super::undistort::undistorted;
@@ -86,10 +85,9 @@ fn rle_of(segmentation: Segmentation) -> Result<Rle, RleError> {
     }
 }
 
-/// Reads a data set: the hash of its bytes, and the masks of each image by file name.
-pub(super) fn read_data_set(path: &Path) -> Result<(Hash32, MasksOfImage), SegmentError> {
-    let bytes = fs_err::read(path)?;
-    let MaskFile { images, annotations } = parse(path, &bytes)?;
+/// Reads a data set: the masks of each image by file name.
+pub(super) fn read_data_set(path: &Path) -> Result<MasksOfImage, SegmentError> {
+    let MaskFile { images, annotations } = parse(path, &fs_err::read(path)?)?;
     let image_ids: Vec<Option<u64>> = annotations.iter().map(|annotation| annotation.image_id).collect();
     let mut rles_of_id: BTreeMap<u64, Vec<(usize, Rle)>> = BTreeMap::new();
     for (index, rle) in rles_of(path, annotations)? {
@@ -99,7 +97,7 @@ pub(super) fn read_data_set(path: &Path) -> Result<(Hash32, MasksOfImage), Segme
     }
     let named =
         images.into_iter().map(|image| (image.file_name, rles_of_id.remove(&image.id).unwrap_or_default()));
-    Ok((Hash32::of(&bytes), named.collect()))
+    Ok(named.collect())
 }
 
 /// Decodes run-length masks and undistorts them like the photo.

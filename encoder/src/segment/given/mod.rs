@@ -5,13 +5,13 @@ mod id_image;
 mod limits;
 mod undistort;
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use slag_common::{Hash32, View};
 
 use super::error::SegmentError;
 use super::segmenter::{MAX_MASK_BYTES, SegmentInput, Segmenter};
+use crate::masks::rle::Rle;
 use crate::masks::{Mask, NO_REGION, masks_of_labels};
 use limits::too_large;
 
@@ -33,7 +33,7 @@ pub struct GivenMasks {
 #[derive(Debug)]
 enum Source {
     Folder(PathBuf),
-    DataSet { path: PathBuf, content: Hash32, masks_of_image: coco::MasksOfImage },
+    DataSet { path: PathBuf, masks_of_image: coco::MasksOfImage },
 }
 
 impl GivenMasks {
@@ -45,8 +45,8 @@ impl GivenMasks {
         let source = if fs_err::metadata(path)?.is_dir() {
             Source::Folder(path.to_owned())
         } else {
-            let (content, masks_of_image) = coco::read_data_set(path)?;
-            Source::DataSet { path: path.to_owned(), content, masks_of_image }
+            let masks_of_image = coco::read_data_set(path)?;
+            Source::DataSet { path: path.to_owned(), masks_of_image }
         };
         Ok(Self { source, ignore_ids })
     }
@@ -98,12 +98,22 @@ impl GivenMasks {
 }
 
 impl Segmenter for GivenMasks {
-    fn identity(&self) -> Result<String, SegmentError> {
-        let content = match &self.source {
-            Source::Folder(dir) => hash_folder(dir)?,
-            Source::DataSet { content, .. } => *content,
-        };
-        Ok(format!("given masks {content}, ignored ids {:?}", self.ignore_ids))
+    fn identity(&self) -> String {
+        format!("given masks, ignored ids {:?}", self.ignore_ids)
+    }
+
+    fn identity_of_view(&self, view: &View) -> Result<Option<Hash32>, SegmentError> {
+        match &self.source {
+            Source::Folder(dir) => file_of(dir, view).map(|path| hash_of_file(&path)).transpose(),
+            Source::DataSet { masks_of_image, .. } => {
+                let hash = |rles: &Vec<(usize, Rle)>| -> Result<Hash32, SegmentError> {
+                    // Their places in the file name them in errors only.
+                    let rles: Vec<&Rle> = rles.iter().map(|(_, rle)| rle).collect();
+                    Ok(Hash32::of(&serde_json::to_vec(&rles).map_err(std::io::Error::from)?))
+                };
+                masks_of_image.get(&view.name).map(hash).transpose()
+            }
+        }
     }
 
     fn segment(&self, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError> {
@@ -120,42 +130,9 @@ fn file_of(dir: &Path, view: &View) -> Option<PathBuf> {
         .find(|path| path.is_file())
 }
 
-/// Returns the hash of the paths (within the folder) and contents of all PNG and JSON files in a folder and its
-/// subfolders.
-fn hash_folder(dir: &Path) -> Result<Hash32, SegmentError> {
-    let mut hash_of_file = BTreeMap::new();
-    // Links are followed, as `file_of` does; a folder that is reached twice is read once.
-    let mut read = BTreeSet::new();
-    let mut folders = vec![dir.to_owned()];
-    while let Some(folder) = folders.pop() {
-        let target = fs_err::canonicalize(&folder)?;
-        if !read.insert(target.clone()) {
-            hash_of_file.insert(relative(&folder, dir), Hash32::of(target.as_os_str().as_encoded_bytes()));
-            continue;
-        }
-        for entry in fs_err::read_dir(&folder)? {
-            let path = entry?.path();
-            if path.is_dir() {
-                folders.push(path);
-            } else if path.is_file()
-                && path.extension().is_some_and(|ending| ending == "png" || ending == "json")
-            {
-                let (hash, _) = Hash32::of_reader(fs_err::File::open(&path)?)?;
-                hash_of_file.insert(relative(&path, dir), hash);
-            }
-        }
-    }
-    let mut bytes = Vec::new();
-    for (path, hash) in hash_of_file {
-        // The length separates the path from the hash.
-        bytes.extend((path.len() as u64).to_le_bytes());
-        bytes.extend(path);
-        bytes.extend(hash.0);
-    }
-    Ok(Hash32::of(&bytes))
-}
-
-/// Returns the bytes of a path within a folder.
-fn relative(path: &Path, dir: &Path) -> Vec<u8> {
-    path.strip_prefix(dir).unwrap_or(path).as_os_str().as_encoded_bytes().to_owned()
+/// Returns the hash of a mask file: its ending, which says how it is read, and its content.
+fn hash_of_file(path: &Path) -> Result<Hash32, SegmentError> {
+    let (content, _) = Hash32::of_reader(fs_err::File::open(path)?)?;
+    let ending = path.extension().unwrap_or_default().as_encoded_bytes();
+    Ok(Hash32::of(&[ending, &content.0].concat()))
 }

@@ -102,8 +102,8 @@ fn too_many(input: &SegmentInput<'_>) -> SegmentError {
 }
 
 impl Segmenter for SamSegmenter {
-    fn identity(&self) -> Result<String, SegmentError> {
-        Ok(self.identity.clone())
+    fn identity(&self) -> String {
+        self.identity.clone()
     }
 
     /// One image is embedded while the points of another are decoded; the model has its own threads.

@@ -1,0 +1,87 @@
+//! What changed between two generations: things that appeared, went or moved, and the bytes that robots have to fetch.
+//!
+//! `things.rs` reads the objects of a generation, `matching.rs` (pure) says which of two generations are the same.
+
+mod matching;
+mod things;
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::Serialize;
+use slag_common::Hash32;
+
+use crate::store::{Published, StoreReader};
+pub use matching::Moved;
+pub use things::{DiffError, Thing};
+
+/// A generation of a store.
+#[derive(Clone, Copy, Debug)]
+pub struct Generation<'a> {
+    /// The store.
+    pub reader: &'a StoreReader,
+    /// Its current generation or the one before it.
+    pub published: &'a Published,
+}
+
+/// What changed from one generation to another.
+#[derive(Clone, Debug, Serialize)]
+pub struct Diff {
+    /// The earlier generation.
+    pub old_generation: u64,
+    /// The later one.
+    pub new_generation: u64,
+    /// Whether lengths and positions are metres.
+    pub metric: bool,
+    /// Things of exactly the same Gaussians.
+    pub n_same: usize,
+    /// Things at the same place whose Gaussians changed.
+    pub n_stayed: usize,
+    /// Things of the later generation alone, by their ids.
+    pub appeared: Vec<Thing>,
+    /// Things of the earlier generation alone, by their ids.
+    pub went: Vec<Thing>,
+    /// Things that lie elsewhere, by the ids that they had.
+    pub moved: Vec<Moved>,
+    /// Cells of the later generation.
+    pub n_cells: usize,
+    /// Those that have a shard which the earlier generation does not have.
+    pub n_cells_changed: usize,
+    /// Bytes of shards that a robot with the earlier generation has to fetch, by profile.
+    pub fetch_bytes: BTreeMap<String, u64>,
+}
+
+/// Compares two generations.
+///
+/// # Errors
+/// [`DiffError`] if a shard cannot be read, or the generations are of different encoders, whose vectors do not compare.
+pub fn diff(old: Generation<'_>, new: Generation<'_>) -> Result<Diff, DiffError> {
+    let (old_manifest, manifest) = (&old.published.manifest, &new.published.manifest);
+    if old_manifest.encoder.id != manifest.encoder.id {
+        let [old, new] = [old_manifest, manifest].map(|m| format!("{} ({})", m.encoder.name, m.encoder.id));
+        return Err(DiffError::Encoders { old, new });
+    }
+    let changes = matching::changes(things::read(old)?, things::read(new)?);
+    let known: BTreeSet<Hash32> = old.published.shard_lens().into_keys().collect();
+    let mut fetch_bytes: BTreeMap<String, u64> = BTreeMap::new();
+    let mut n_cells_changed = 0;
+    for cell in &manifest.cells {
+        n_cells_changed += usize::from(cell.shards.values().any(|shard| !known.contains(&shard.hash)));
+        for (profile, shard) in &cell.shards {
+            let bytes = fetch_bytes.entry(profile.to_string()).or_default();
+            *bytes += if known.contains(&shard.hash) { 0 } else { shard.len_bytes };
+        }
+    }
+    Ok(Diff {
+        old_generation: old_manifest.generation,
+        new_generation: manifest.generation,
+        metric: manifest.metric && old_manifest.metric,
+        n_same: changes.n_same,
+        n_stayed: changes.n_stayed,
+        appeared: changes.appeared,
+        went: changes.went,
+        moved: changes.moved,
+        n_cells: manifest.cells.len(),
+        n_cells_changed,
+        fetch_bytes,
+    })
+}
