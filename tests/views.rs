@@ -166,7 +166,7 @@ fn photos_are_added_and_withdrawn() {
     assert_eq!(added.1, encode("whole", &views, &[]).1, "all photos from the beginning");
 
     let without = poses_of("without.json", &[0, 1, 2, 4, 5, 6, 7, 8, 9]);
-    let dropped = encode("grown", &views, &["--drop", &name(3)]);
+    let dropped = encode("grown", &views, &["--drop", "0003.png"]);
     assert_eq!(dropped.0, [9, 9], "nothing is done again");
     assert_eq!(dropped.1, encode("fewer", &without, &[]).1, "without the photo from the beginning");
     // A withdrawn photo leaves nothing behind, and comes back as a new one.
