@@ -10,18 +10,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::Serialize;
 use slag_common::Hash32;
 
-use crate::store::{Published, StoreReader};
 pub use matching::Moved;
-pub use things::{DiffError, Thing};
-
-/// A generation of a store.
-#[derive(Clone, Copy, Debug)]
-pub struct Generation<'a> {
-    /// The store.
-    pub reader: &'a StoreReader,
-    /// Its current generation or the one before it.
-    pub published: &'a Published,
-}
+pub use things::{DiffError, Generation, Thing};
 
 /// What changed from one generation to another.
 #[derive(Clone, Debug, Serialize)]

@@ -8,8 +8,16 @@ use slag_common::container::ContainerError;
 use slag_common::frames::Aabb;
 use slag_common::shard::ShardLayout;
 
-use super::Generation;
-use crate::store::StoreError;
+use crate::store::{Published, StoreError, StoreReader};
+
+/// A generation of a store.
+#[derive(Clone, Copy, Debug)]
+pub struct Generation<'a> {
+    /// The store.
+    pub reader: &'a StoreReader,
+    /// Its current generation or the one before it.
+    pub published: &'a Published,
+}
 
 /// Two generations cannot be compared.
 #[derive(Debug, thiserror::Error)]
