@@ -22,6 +22,7 @@ pub mod retry;
 pub mod shard;
 pub mod similarity;
 pub mod splat;
+pub mod tuf;
 
 pub use byte_size::ByteSize;
 pub use camera::{Distortion, Intrinsics, View};

@@ -1,0 +1,60 @@
+//! What a client remembers of a repository between updates.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use super::error::TufError;
+use super::metadata::{Body, Root, Timestamp};
+use super::signed::SignedMetadata;
+use super::time::parse_utc;
+
+/// Metadata that was accepted, byte for byte. It is checked again whenever it is used, against the newest root.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Kept {
+    /// The newest root.
+    pub root: String,
+    /// The newest timestamp.
+    pub timestamp: Option<String>,
+    /// The newest snapshot.
+    pub snapshot: Option<String>,
+    /// The newest targets metadata, by role.
+    pub targets: BTreeMap<String, String>,
+}
+
+impl Kept {
+    /// Begins with a root that was trusted by hand.
+    ///
+    /// # Errors
+    /// [`TufError`] unless it is a root that its own keys signed.
+    pub fn from_root(bytes: &[u8]) -> Result<Self, TufError> {
+        parse_own_root(bytes)?;
+        Ok(Self { root: text(Root::TYPE, bytes)?, timestamp: None, snapshot: None, targets: BTreeMap::new() })
+    }
+
+    /// Returns the time of signing that the newest timestamp states, seconds since 1970; it lies before its expiry.
+    pub fn signed_unix_secs(&self) -> Option<u64> {
+        let bytes = self.timestamp.as_ref()?.as_bytes();
+        signed_unix_secs(&SignedMetadata::parse(Timestamp::TYPE, bytes).ok()?)
+    }
+}
+
+/// Returns the time of signing that a timestamp states.
+pub(super) fn signed_unix_secs(timestamp: &SignedMetadata<Timestamp>) -> Option<u64> {
+    let signed = timestamp.body.signed_at.as_deref().and_then(parse_utc)?;
+    (signed < timestamp.expires_unix_secs).then_some(signed)
+}
+
+/// Parses a root that is signed as it asks for itself.
+pub(super) fn parse_own_root(bytes: &[u8]) -> Result<SignedMetadata<Root>, TufError> {
+    let root = SignedMetadata::<Root>::parse(Root::TYPE, bytes)?;
+    root.check_signatures(Root::TYPE, &root.body.keys, &root.body.roles[Root::TYPE])?;
+    Ok(root)
+}
+
+/// Returns accepted metadata as text; JSON that was parsed is UTF-8.
+pub(super) fn text(role: &str, bytes: &[u8]) -> Result<String, TufError> {
+    String::from_utf8(bytes.to_vec())
+        .map_err(|e| TufError::Format { role: role.to_owned(), what: e.to_string() })
+}

@@ -1,0 +1,266 @@
+//! What the roles sign. Members that are not listed here are ignored, as the specification asks.
+
+use std::collections::BTreeMap;
+
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use sha2::{Digest, Sha256, Sha512};
+
+use super::error::TufError;
+use super::key::Key;
+
+/// What a role signs, beside the head.
+pub trait Body: Serialize + DeserializeOwned {
+    /// `_type` of the metadata.
+    const TYPE: &'static str;
+
+    /// Checks what types alone do not say; returns what is wrong.
+    ///
+    /// # Errors
+    /// One clause.
+    fn check(&self) -> Result<(), String> {
+        Ok(())
+    }
+}
+
+/// The keys of a role, and how many of them must sign.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RoleKeys {
+    /// Ids of the keys.
+    pub keyids: Vec<String>,
+    /// Signatures by different keys that are enough.
+    pub threshold: u32,
+}
+
+impl RoleKeys {
+    fn check(&self, role: &str) -> Result<(), String> {
+        if self.threshold == 0 {
+            return Err(format!("role {role} needs no signature"));
+        }
+        let mut ids: Vec<&String> = self.keyids.iter().collect();
+        ids.sort_unstable();
+        match ids.windows(2).find(|pair| pair[0] == pair[1]) {
+            Some(pair) => Err(format!("role {role} lists key {} twice", pair[0])),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Root: the keys of all roles.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Root {
+    /// Whether file names begin with version or hash; only such repositories are read.
+    pub consistent_snapshot: bool,
+    /// Keys by id.
+    pub keys: BTreeMap<String, Key>,
+    /// `root`, `targets`, `snapshot` and `timestamp`.
+    pub roles: BTreeMap<String, RoleKeys>,
+}
+
+impl Body for Root {
+    const TYPE: &'static str = "root";
+
+    fn check(&self) -> Result<(), String> {
+        if !self.consistent_snapshot {
+            return Err(
+                "consistent_snapshot is false; only repositories with consistent snapshots are read".into()
+            );
+        }
+        for role in ["root", "targets", "snapshot", "timestamp"] {
+            self.roles.get(role).ok_or_else(|| format!("role {role} is missing"))?.check(role)?;
+        }
+        Ok(())
+    }
+}
+
+/// Version of a metadata file, and its length and hashes where they are stated.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FileMeta {
+    /// Version.
+    pub version: u64,
+    /// Length, bytes.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub length: Option<u64>,
+    /// Hashes by algorithm, hex.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub hashes: Option<BTreeMap<String, String>>,
+}
+
+impl FileMeta {
+    /// Describes metadata bytes.
+    pub fn of(version: u64, bytes: &[u8]) -> Self {
+        Self { version, length: Some(bytes.len() as u64), hashes: Some(hashes_of(bytes)) }
+    }
+
+    /// Checks bytes against length and hashes, where they are stated.
+    pub(super) fn check(&self, role: &str, bytes: &[u8]) -> Result<(), TufError> {
+        check_content(role, bytes, self.length, self.hashes.as_ref())
+    }
+}
+
+/// Timestamp: which snapshot is the newest.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Timestamp {
+    /// `snapshot.json` alone.
+    pub meta: BTreeMap<String, FileMeta>,
+    /// Time of signing; a member of our own, which other clients ignore.
+    #[serde(rename = "x-slag-signed-at", skip_serializing_if = "Option::is_none", default)]
+    pub signed_at: Option<String>,
+}
+
+impl Timestamp {
+    /// Returns what is stated of the snapshot.
+    pub fn snapshot(&self) -> &FileMeta {
+        &self.meta["snapshot.json"]
+    }
+}
+
+impl Body for Timestamp {
+    const TYPE: &'static str = "timestamp";
+
+    fn check(&self) -> Result<(), String> {
+        match self.meta.contains_key("snapshot.json") && self.meta.len() == 1 {
+            true => Ok(()),
+            false => Err("meta does not list snapshot.json alone".into()),
+        }
+    }
+}
+
+/// Snapshot: the versions of all targets metadata.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Snapshot {
+    /// By file name without version, such as `targets.json`.
+    pub meta: BTreeMap<String, FileMeta>,
+}
+
+impl Body for Snapshot {
+    const TYPE: &'static str = "snapshot";
+
+    fn check(&self) -> Result<(), String> {
+        match self.meta.contains_key("targets.json") {
+            true => Ok(()),
+            false => Err("meta does not list targets.json".into()),
+        }
+    }
+}
+
+/// A file of the repository.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct TargetFile {
+    /// Length, bytes.
+    pub length: u64,
+    /// Hashes by algorithm, hex.
+    pub hashes: BTreeMap<String, String>,
+    /// Anything that the publisher states of it.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub custom: Option<Value>,
+}
+
+impl TargetFile {
+    /// Describes a file.
+    pub fn of(bytes: &[u8]) -> Self {
+        Self { length: bytes.len() as u64, hashes: hashes_of(bytes), custom: None }
+    }
+
+    /// Checks a file's bytes.
+    ///
+    /// # Errors
+    /// [`TufError::Content`].
+    pub fn check(&self, path: &str, bytes: &[u8]) -> Result<(), TufError> {
+        check_content(path, bytes, Some(self.length), Some(&self.hashes))
+    }
+}
+
+/// Targets: the files, or who signs for them.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Targets {
+    /// Files by path.
+    pub targets: BTreeMap<String, TargetFile>,
+    /// Roles that sign for some paths.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub delegations: Option<Delegations>,
+}
+
+impl Body for Targets {
+    const TYPE: &'static str = "targets";
+
+    fn check(&self) -> Result<(), String> {
+        let roles = self.delegations.iter().flat_map(|delegations| &delegations.roles);
+        let mut names = std::collections::BTreeSet::new();
+        for role in roles {
+            role.keys.check(&role.name)?;
+            if ["root", "targets", "snapshot", "timestamp", ""].contains(&role.name.as_str()) {
+                return Err(format!("a delegated role is called {:?}", role.name));
+            }
+            if !names.insert(&role.name) {
+                return Err(format!("role {} is delegated to twice", role.name));
+            }
+            if role.paths.is_some() == role.path_hash_prefixes.is_some() {
+                return Err(format!("role {} has not one of paths and path_hash_prefixes", role.name));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Roles that a targets role trusts for some paths.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Delegations {
+    /// Keys by id.
+    pub keys: BTreeMap<String, Key>,
+    /// In order of priority.
+    pub roles: Vec<DelegatedRole>,
+}
+
+/// A role that signs for some paths.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DelegatedRole {
+    /// Its name.
+    pub name: String,
+    /// Its keys.
+    #[serde(flatten)]
+    pub keys: RoleKeys,
+    /// Whether no later role is asked for its paths.
+    pub terminating: bool,
+    /// Patterns of paths.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub paths: Option<Vec<String>>,
+    /// Beginnings of the SHA-256 of paths, hex.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub path_hash_prefixes: Option<Vec<String>>,
+}
+
+fn hashes_of(bytes: &[u8]) -> BTreeMap<String, String> {
+    BTreeMap::from([("sha256".to_owned(), hex::encode(Sha256::digest(bytes)))])
+}
+
+fn check_content(
+    what: &str,
+    bytes: &[u8],
+    length: Option<u64>,
+    hashes: Option<&BTreeMap<String, String>>,
+) -> Result<(), TufError> {
+    let refuse = |fault: String| Err(TufError::Content { what: what.to_owned(), fault });
+    let found_bytes = bytes.len() as u64;
+    if let Some(expected) = length.filter(|expected| *expected != found_bytes) {
+        return refuse(format!("it has {found_bytes} bytes, expected {expected}"));
+    }
+    let Some(hashes) = hashes else { return Ok(()) };
+    let mut n_known = 0;
+    for (algorithm, expected) in hashes {
+        let found = match algorithm.as_str() {
+            "sha256" => hex::encode(Sha256::digest(bytes)),
+            "sha512" => hex::encode(Sha512::digest(bytes)),
+            _ => continue,
+        };
+        n_known += 1;
+        if found != *expected {
+            return refuse(format!("its {algorithm} is {found}, expected {expected}"));
+        }
+    }
+    match n_known {
+        0 => refuse("no hash of a known kind is stated, expected sha256 or sha512".into()),
+        _ => Ok(()),
+    }
+}

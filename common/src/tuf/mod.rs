@@ -1,0 +1,50 @@
+//! The Update Framework: which files of a store may be believed, whoever carried them.
+//!
+//! The client workflow of the TUF specification 1.0 (section 5) without network, clock or files: bytes come from a
+//! [`Source`], the time is an argument, and what must be remembered is [`Kept`]. A store is a TUF repository with
+//! consistent snapshots; its keys are Ed25519.
+//!
+//! | role | signs | where its key lives |
+//! |---|---|---|
+//! | root | the keys of all roles | offline, several with a threshold |
+//! | targets | lengths and hashes of the files | where scenes are published |
+//! | snapshot | the versions of all targets metadata | where scenes are published |
+//! | timestamp | the version of the snapshot, for a short time | where a timer can sign |
+
+mod canonical;
+mod delegation;
+mod error;
+mod kept;
+mod key;
+mod metadata;
+mod signed;
+mod time;
+mod trusted;
+mod update;
+
+pub use canonical::{NotCanonical, canonical_json};
+pub use error::TufError;
+pub use kept::Kept;
+pub use key::Key;
+pub use metadata::{
+    Body, DelegatedRole, Delegations, FileMeta, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp,
+};
+pub use signed::{Head, MetadataSignature, SignedMetadata, sign};
+pub use time::{format_utc, parse_utc};
+pub use trusted::{Offered, Trusted};
+pub use update::{Source, find_target, refresh};
+
+/// Version of the specification that is written.
+pub const SPEC_VERSION: &str = "1.0.31";
+/// Longest root metadata read.
+pub const MAX_ROOT_BYTES: u64 = 512 << 10;
+/// Longest timestamp metadata read.
+pub const MAX_TIMESTAMP_BYTES: u64 = 16 << 10;
+/// Longest snapshot metadata read where the timestamp states no length.
+pub const MAX_SNAPSHOT_BYTES: u64 = 2 << 20;
+/// Longest targets metadata read where the snapshot states no length.
+pub const MAX_TARGETS_BYTES: u64 = 5 << 20;
+/// Most new roots read in one update.
+pub const MAX_ROOTS: u32 = 256;
+/// Most delegated roles read for one target.
+pub const MAX_DELEGATIONS: usize = 32;

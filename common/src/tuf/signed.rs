@@ -1,0 +1,159 @@
+//! Signed metadata: parsing, the threshold of signatures, signing.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use ed25519_dalek::{Signer, SigningKey};
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use super::canonical::canonical_json;
+use super::error::TufError;
+use super::key::{Key, is_signed};
+use super::metadata::{Body, RoleKeys};
+use super::time::{format_utc, parse_utc};
+
+/// What all metadata begins with.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Head {
+    /// Kind of metadata.
+    #[serde(rename = "_type")]
+    pub kind: String,
+    /// Version of the specification.
+    pub spec_version: String,
+    /// Version of the metadata, from 1.
+    pub version: u64,
+    /// Time from which it is refused, UTC.
+    pub expires: String,
+}
+
+/// A signature in metadata.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct MetadataSignature {
+    /// Id of the key.
+    pub keyid: String,
+    /// Signature, hex.
+    pub sig: String,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Envelope {
+    signatures: Vec<MetadataSignature>,
+    signed: Value,
+}
+
+/// Metadata whose form is checked; its signatures are checked by [`SignedMetadata::check_signatures`].
+#[derive(Clone, Debug)]
+pub struct SignedMetadata<T> {
+    /// The head.
+    pub head: Head,
+    /// Seconds since 1970 from which it is refused.
+    pub expires_unix_secs: u64,
+    /// What the role says.
+    pub body: T,
+    signatures: Vec<MetadataSignature>,
+    canonical: Vec<u8>,
+}
+
+impl<T: Body> SignedMetadata<T> {
+    /// Parses metadata of a role; `role` is for messages.
+    ///
+    /// # Errors
+    /// [`TufError::Format`].
+    pub fn parse(role: &str, bytes: &[u8]) -> Result<Self, TufError> {
+        let refuse = |what: String| TufError::Format { role: role.to_owned(), what };
+        let Envelope { signatures, signed } =
+            serde_json::from_slice(bytes).map_err(|e| refuse(e.to_string()))?;
+        let canonical = canonical_json(&signed).map_err(|e| refuse(e.to_string()))?;
+        let head = Head::deserialize(&signed).map_err(|e| refuse(e.to_string()))?;
+        if head.kind != T::TYPE {
+            return Err(refuse(format!("its _type is {:?}, expected {:?}", head.kind, T::TYPE)));
+        }
+        if head.spec_version.split('.').next() != Some("1") {
+            return Err(refuse(format!("its spec_version is {:?}, expected 1.x", head.spec_version)));
+        }
+        if head.version == 0 {
+            return Err(refuse("its version is 0, expected 1 or more".into()));
+        }
+        let expires_unix_secs = parse_utc(&head.expires)
+            .ok_or_else(|| refuse(format!("expires is {:?}, expected YYYY-MM-DDTHH:MM:SSZ", head.expires)))?;
+        let mut signers = BTreeSet::new();
+        if let Some(twice) = signatures.iter().find(|signature| !signers.insert(&signature.keyid)) {
+            return Err(refuse(format!("key {} signed it twice", twice.keyid)));
+        }
+        let body = T::deserialize(&signed).map_err(|e| refuse(e.to_string()))?;
+        body.check().map_err(refuse)?;
+        Ok(Self { head, expires_unix_secs, body, signatures, canonical })
+    }
+
+    /// Checks that enough different keys of a role signed it.
+    ///
+    /// # Errors
+    /// [`TufError::Signatures`].
+    pub fn check_signatures(
+        &self,
+        role: &str,
+        keys: &BTreeMap<String, Key>,
+        role_keys: &RoleKeys,
+    ) -> Result<(), TufError> {
+        let mut signers = BTreeSet::new();
+        for signature in &self.signatures {
+            if !role_keys.keyids.contains(&signature.keyid) {
+                continue;
+            }
+            let Some(key) = keys.get(&signature.keyid).and_then(Key::verifying_key) else { continue };
+            if is_signed(&key, &self.canonical, &signature.sig) {
+                // By public key: one key under two ids is one signer.
+                signers.insert(key.to_bytes());
+            }
+        }
+        match signers.len() >= role_keys.threshold as usize {
+            true => Ok(()),
+            false => Err(TufError::Signatures {
+                role: role.to_owned(),
+                found: signers.len(),
+                threshold: role_keys.threshold,
+            }),
+        }
+    }
+
+    /// Checks the expiry against a reference time, seconds since 1970.
+    ///
+    /// # Errors
+    /// [`TufError::Expired`].
+    pub fn check_expiry(&self, role: &str, now_unix_secs: u64) -> Result<(), TufError> {
+        match self.expires_unix_secs <= now_unix_secs {
+            true => Err(TufError::Expired {
+                role: role.to_owned(),
+                expired: self.head.expires.clone(),
+                now: format_utc(now_unix_secs),
+            }),
+            false => Ok(()),
+        }
+    }
+}
+
+/// Signs metadata with keys in a fixed order; the same content and keys give the same bytes.
+pub fn sign<T: Body>(version: u64, expires_unix_secs: u64, body: &T, keys: &[&SigningKey]) -> Vec<u8> {
+    let head = Head {
+        kind: T::TYPE.into(),
+        spec_version: super::SPEC_VERSION.into(),
+        version,
+        expires: format_utc(expires_unix_secs),
+    };
+    let mut signed = serde_json::to_value(head).expect("a head is JSON");
+    let body = serde_json::to_value(body).expect("a body is JSON");
+    if let (Value::Object(signed), Value::Object(body)) = (&mut signed, body) {
+        signed.extend(body);
+    }
+    let canonical = canonical_json(&signed).expect("our metadata holds whole numbers only");
+    let mut signatures: Vec<MetadataSignature> = keys
+        .iter()
+        .map(|key| MetadataSignature {
+            keyid: Key::of(key).id(),
+            sig: hex::encode(key.sign(&canonical).to_bytes()),
+        })
+        .collect();
+    signatures.sort_by(|a, b| a.keyid.cmp(&b.keyid));
+    signatures.dedup();
+    serde_json::to_vec(&Envelope { signatures, signed }).expect("metadata is JSON")
+}

@@ -1,0 +1,220 @@
+//! The rules of each step: what a new file must satisfy, given what is trusted already.
+//!
+//! Steps come in the order of the specification: roots, timestamp, snapshot, targets. A step that fails leaves the rest
+//! as it was.
+
+use std::collections::BTreeMap;
+
+use super::error::TufError;
+use super::kept::{parse_own_root, signed_unix_secs};
+use super::metadata::{
+    Body, DelegatedRole, Delegations, FileMeta, RoleKeys, Root, Snapshot, Targets, Timestamp,
+};
+use super::signed::SignedMetadata;
+
+/// Whether an offered file is news.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Offered {
+    /// It replaces the file before.
+    New,
+    /// It has the version of the file before, which stays.
+    Same,
+}
+
+/// The metadata that is trusted at present.
+#[derive(Clone, Debug)]
+pub struct Trusted {
+    root: SignedMetadata<Root>,
+    timestamp: Option<SignedMetadata<Timestamp>>,
+    snapshot: Option<SignedMetadata<Snapshot>>,
+    targets: BTreeMap<String, SignedMetadata<Targets>>,
+    now_unix_secs: u64,
+}
+
+impl Trusted {
+    /// Begins with a root that is trusted. `now_unix_secs`: the clock.
+    ///
+    /// # Errors
+    /// [`TufError`] unless it is a root that its own keys signed.
+    pub fn new(root: &[u8], now_unix_secs: u64) -> Result<Self, TufError> {
+        let root = parse_own_root(root)?;
+        Ok(Self { root, timestamp: None, snapshot: None, targets: BTreeMap::new(), now_unix_secs })
+    }
+
+    /// Returns the root.
+    pub fn root(&self) -> &SignedMetadata<Root> {
+        &self.root
+    }
+
+    /// Returns the timestamp, once there is one.
+    pub fn timestamp(&self) -> Option<&SignedMetadata<Timestamp>> {
+        self.timestamp.as_ref()
+    }
+
+    /// Returns the snapshot, once there is one.
+    pub fn snapshot(&self) -> Option<&SignedMetadata<Snapshot>> {
+        self.snapshot.as_ref()
+    }
+
+    /// Returns targets metadata of a role, once there is some.
+    pub fn targets(&self, role: &str) -> Option<&SignedMetadata<Targets>> {
+        self.targets.get(role)
+    }
+
+    /// Returns the reference time: the later of the clock and the newest signed time, seconds since 1970.
+    pub fn now_unix_secs(&self) -> u64 {
+        self.now_unix_secs
+    }
+
+    /// Takes the next root (5.3.4 and 5.3.5): the version after the present one, signed by the present root's keys and
+    /// by its own.
+    ///
+    /// # Errors
+    /// [`TufError`].
+    pub fn add_root(&mut self, bytes: &[u8]) -> Result<(), TufError> {
+        self.before_timestamp(Root::TYPE)?;
+        let next = SignedMetadata::<Root>::parse(Root::TYPE, bytes)?;
+        self.check_signatures(Root::TYPE, &next)?;
+        let expected = self.root.head.version.saturating_add(1);
+        if next.head.version != expected {
+            let (role, found) = (Root::TYPE.to_owned(), next.head.version);
+            return Err(TufError::Version { role, expected, found });
+        }
+        self.root = parse_own_root(bytes)?;
+        Ok(())
+    }
+
+    /// Takes the timestamp of an earlier update, whatever its expiry.
+    ///
+    /// # Errors
+    /// [`TufError`], if the present root does not vouch for it; it then counts as absent.
+    pub fn recall_timestamp(&mut self, bytes: &[u8]) -> Result<(), TufError> {
+        self.before_timestamp(Timestamp::TYPE)?;
+        let kept = SignedMetadata::<Timestamp>::parse(Timestamp::TYPE, bytes)?;
+        self.check_signatures(Timestamp::TYPE, &kept)?;
+        self.now_unix_secs = self.now_unix_secs.max(signed_unix_secs(&kept).unwrap_or(0));
+        self.timestamp = Some(kept);
+        Ok(())
+    }
+
+    /// Takes a timestamp (5.4): signed, not older than the one before, not expired.
+    ///
+    /// # Errors
+    /// [`TufError`].
+    pub fn add_timestamp(&mut self, bytes: &[u8]) -> Result<Offered, TufError> {
+        if self.snapshot.is_some() {
+            return Err(TufError::Order { role: Timestamp::TYPE.into() });
+        }
+        self.root.check_expiry(Root::TYPE, self.now_unix_secs)?;
+        let new = SignedMetadata::<Timestamp>::parse(Timestamp::TYPE, bytes)?;
+        self.check_signatures(Timestamp::TYPE, &new)?;
+        if let Some(before) = &self.timestamp {
+            check_not_older(Timestamp::TYPE, before.head.version, new.head.version)?;
+            if before.head.version == new.head.version {
+                before.check_expiry(Timestamp::TYPE, self.now_unix_secs)?;
+                return Ok(Offered::Same);
+            }
+            let (seen, offered) = (before.body.snapshot().version, new.body.snapshot().version);
+            check_not_older(Snapshot::TYPE, seen, offered)?;
+        }
+        new.check_expiry(Timestamp::TYPE, self.now_unix_secs)?;
+        self.now_unix_secs = self.now_unix_secs.max(signed_unix_secs(&new).unwrap_or(0));
+        // The newest signed time may be later than the clock by which the root was good.
+        self.root.check_expiry(Root::TYPE, self.now_unix_secs)?;
+        self.timestamp = Some(new);
+        Ok(Offered::New)
+    }
+
+    /// Takes a snapshot (5.5): the one that the timestamp states, signed, not expired. `before`: the snapshot of an
+    /// earlier update, whose targets metadata must all be there, none of them older.
+    ///
+    /// # Errors
+    /// [`TufError`].
+    pub fn add_snapshot(&mut self, bytes: &[u8], before: Option<&[u8]>) -> Result<(), TufError> {
+        let order = || TufError::Order { role: Snapshot::TYPE.into() };
+        let meta = self.timestamp.as_ref().filter(|_| self.targets.is_empty()).ok_or_else(order)?;
+        let meta = meta.body.snapshot();
+        meta.check(Snapshot::TYPE, bytes)?;
+        let new = SignedMetadata::<Snapshot>::parse(Snapshot::TYPE, bytes)?;
+        self.check_signatures(Snapshot::TYPE, &new)?;
+        check_version(Snapshot::TYPE, meta, new.head.version)?;
+        let before = before.and_then(|bytes| SignedMetadata::<Snapshot>::parse(Snapshot::TYPE, bytes).ok());
+        // A snapshot that the present root does not vouch for says nothing (recovery from a fast-forward attack).
+        let before = before.filter(|before| self.check_signatures(Snapshot::TYPE, before).is_ok());
+        for (name, seen) in before.iter().flat_map(|before| &before.body.meta) {
+            match new.body.meta.get(name) {
+                Some(offered) => check_not_older(name, seen.version, offered.version)?,
+                None => return Err(TufError::Missing { what: name.clone() }),
+            }
+        }
+        new.check_expiry(Snapshot::TYPE, self.now_unix_secs)?;
+        self.snapshot = Some(new);
+        Ok(())
+    }
+
+    /// Takes targets metadata (5.6): the one that the snapshot states, signed by the keys that the delegating role
+    /// names, not expired. `from`: the delegating role and what it says of this one; `None` for the top-level role.
+    ///
+    /// # Errors
+    /// [`TufError`].
+    pub fn add_targets(
+        &mut self,
+        bytes: &[u8],
+        from: Option<(&Delegations, &DelegatedRole)>,
+    ) -> Result<&SignedMetadata<Targets>, TufError> {
+        let role = from.map_or(Targets::TYPE, |(_, delegated)| &delegated.name);
+        let meta = self.targets_meta(role)?;
+        meta.check(role, bytes)?;
+        let new = SignedMetadata::<Targets>::parse(role, bytes)?;
+        match from {
+            Some((delegations, delegated)) => {
+                new.check_signatures(role, &delegations.keys, &delegated.keys)?;
+            }
+            None => self.check_signatures(role, &new)?,
+        }
+        check_version(role, meta, new.head.version)?;
+        new.check_expiry(role, self.now_unix_secs)?;
+        let role = role.to_owned();
+        Ok(self.targets.entry(role).insert_entry(new).into_mut())
+    }
+
+    /// Returns what the snapshot states of targets metadata.
+    ///
+    /// # Errors
+    /// [`TufError::Order`] without a snapshot, [`TufError::Missing`] if it does not list the role.
+    pub fn targets_meta(&self, role: &str) -> Result<&FileMeta, TufError> {
+        let order = || TufError::Order { role: role.to_owned() };
+        let snapshot = self.snapshot.as_ref().ok_or_else(order)?;
+        let name = format!("{role}.json");
+        snapshot.body.meta.get(&name).ok_or(TufError::Missing { what: name })
+    }
+
+    fn check_signatures<T: Body>(&self, role: &str, metadata: &SignedMetadata<T>) -> Result<(), TufError> {
+        metadata.check_signatures(role, &self.root.body.keys, self.keys_of(role))
+    }
+
+    fn keys_of(&self, role: &str) -> &RoleKeys {
+        &self.root.body.roles[role]
+    }
+
+    fn before_timestamp(&self, role: &str) -> Result<(), TufError> {
+        match self.timestamp {
+            Some(_) => Err(TufError::Order { role: role.to_owned() }),
+            None => Ok(()),
+        }
+    }
+}
+
+fn check_not_older(role: &str, seen: u64, offered: u64) -> Result<(), TufError> {
+    match offered < seen {
+        true => Err(TufError::Rollback { role: role.to_owned(), seen, offered }),
+        false => Ok(()),
+    }
+}
+
+fn check_version(role: &str, stated: &FileMeta, found: u64) -> Result<(), TufError> {
+    match stated.version == found {
+        true => Ok(()),
+        false => Err(TufError::Version { role: role.to_owned(), expected: stated.version, found }),
+    }
+}

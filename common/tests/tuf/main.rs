@@ -1,0 +1,7 @@
+//! The attacks that TUF names, each against a client that has updated once, and other people's TUF.
+
+mod attacks;
+mod delegated;
+
+mod recovery;
+mod repo;
