@@ -31,6 +31,7 @@ mod attacks;
 mod openapi;
 mod ply;
 mod v1;
+mod view;
 
 struct Service {
     dir: TempDir,

@@ -15,6 +15,7 @@ mod json;
 mod map;
 mod objects;
 mod oriented;
+mod picture;
 mod ply;
 mod point;
 mod rank;
