@@ -19,6 +19,7 @@ use super::target::{REFINEMENTS, TUNED, TargetArgs};
 use super::views::{ViewsArgs, parse_raster_width, parse_views_limit};
 use crate::cells::CellLimits;
 use crate::codebook::CodebookSettings;
+use crate::codebook::basis::MAX_COMPONENTS;
 use crate::embed::Background;
 use crate::encode::coverage::CoverageReport;
 use crate::encode::{
@@ -125,6 +126,9 @@ pub struct EncodeArgs {
     /// The same for the balanced profile.
     #[arg(long, value_name = "E", value_parser = parse_error)]
     pub balanced_error: Option<f32>,
+    /// Most components of a vector in compact and balanced shards, even [default: as many as the errors need, at most 128].
+    #[arg(long, value_name = "N", value_parser = parse_components)]
+    pub max_components: Option<usize>,
     /// Largest error of positions, world units [default: 0.01 in metric scenes, else a quarter of the size of a
     /// cell's small Gaussians].
     #[arg(long, value_name = "E")]
@@ -222,12 +226,19 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
     })
 }
 
+fn parse_components(text: &str) -> Result<usize, String> {
+    let is_valid = |n: &usize| (2..=MAX_COMPONENTS).contains(n) && n.is_multiple_of(2);
+    let components = text.parse().ok().filter(is_valid);
+    components.ok_or_else(|| format!("expected an even number from 2 to {MAX_COMPONENTS}"))
+}
+
 fn shard_settings(args: &EncodeArgs, preset: CodebookSettings, metric: bool) -> ShardSettings {
     ShardSettings {
         profiles: args.profiles.clone(),
         codebook: CodebookSettings {
             compact_error: args.compact_error.unwrap_or(preset.compact_error),
             balanced_error: args.balanced_error.unwrap_or(preset.balanced_error),
+            max_components: args.max_components.unwrap_or(preset.max_components),
             ..preset
         },
         position_error: args

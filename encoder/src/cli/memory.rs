@@ -19,22 +19,31 @@ pub fn parse_memory(text: &str) -> Result<u64, String> {
     Ok(bytes)
 }
 
-/// Returns half of the free memory, within the limit of the control group (version 2) if there is one.
+/// Returns half of the free memory.
 pub fn default_memory_bytes() -> u64 {
+    half_of(free_memory_bytes())
+}
+
+/// Returns the free memory, within the limit of the control group (version 2) if there is one; `None` on machines that do
+/// not report it.
+pub fn free_memory_bytes() -> Option<u64> {
     let read = |path: &str| fs::read_to_string(path).ok();
     let group = |file: &str| read(&format!("/sys/fs/cgroup/memory.{file}"))?.trim().parse::<u64>().ok();
-    half_of_free(read("/proc/meminfo").as_deref(), group("max"), group("current"))
+    free(read("/proc/meminfo").as_deref(), group("max"), group("current"))
 }
 
 /// `meminfo`: the content of `/proc/meminfo`. `max_bytes`, `current_bytes`: the control group's limit and use.
-fn half_of_free(meminfo: Option<&str>, max_bytes: Option<u64>, current_bytes: Option<u64>) -> u64 {
+fn free(meminfo: Option<&str>, max_bytes: Option<u64>, current_bytes: Option<u64>) -> Option<u64> {
     let available = |text: &str| {
         let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
         line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()?.checked_mul(1024)
     };
     let of_machine = meminfo.and_then(available);
     let of_group = max_bytes.map(|max| max.saturating_sub(current_bytes.unwrap_or(0)));
-    let free = of_machine.into_iter().chain(of_group).min();
+    of_machine.into_iter().chain(of_group).min()
+}
+
+fn half_of(free: Option<u64>) -> u64 {
     free.map_or(UNKNOWN_MEMORY_BYTES, |bytes| (bytes / 2).max(MIN_MEMORY_BYTES))
 }
 
@@ -56,10 +65,11 @@ mod tests {
     fn the_default_is_half_of_what_is_free() {
         let meminfo =
             "MemTotal:       24683964 kB\nMemFree: 1 kB\nMemAvailable:   20971520 kB\nBuffers: 5 kB\n";
-        assert_eq!(half_of_free(Some(meminfo), None, None), 10 << 30);
-        assert_eq!(half_of_free(Some(meminfo), Some(8 << 30), Some(2 << 30)), 3 << 30);
-        assert_eq!(half_of_free(Some(meminfo), Some(1 << 30), Some(2 << 30)), 64 << 20);
-        assert_eq!(half_of_free(Some("MemAvailable: many"), None, None), 2 << 30);
-        assert_eq!(half_of_free(None, None, None), 2 << 30);
+        let half = |meminfo, max, current| half_of(free(meminfo, max, current));
+        assert_eq!(half(Some(meminfo), None, None), 10 << 30);
+        assert_eq!(half(Some(meminfo), Some(8 << 30), Some(2 << 30)), 3 << 30);
+        assert_eq!(half(Some(meminfo), Some(1 << 30), Some(2 << 30)), 64 << 20);
+        assert_eq!(half(Some("MemAvailable: many"), None, None), 2 << 30);
+        assert_eq!(half(None, None, None), 2 << 30);
     }
 }

@@ -10,7 +10,7 @@ use crate::encode::front::{Expectation, Front, Target};
 use crate::encode::{InputSettings, count_inputs};
 
 /// Flags that a front sets, by their names in the program, so a user cannot give them beside a target.
-pub(super) const TUNED: [&str; 12] = [
+pub(super) const TUNED: [&str; 13] = [
     "preset",
     "background",
     "weights",
@@ -21,6 +21,7 @@ pub(super) const TUNED: [&str; 12] = [
     "min_mask_px",
     "keep_slivers",
     "compact_error",
+    "max_components",
     "no_objects",
     "segmenter",
 ];

@@ -14,7 +14,7 @@ use slag_math::{dot, dot_f64};
 /// Share of an isotropic covariance in that of the texts: it keeps directions in which no text of the bank points.
 const ISOTROPIC_SHARE: f64 = 0.2;
 /// Most components.
-const MAX_COMPONENTS: usize = 128;
+pub const MAX_COMPONENTS: usize = 128;
 
 /// Most texts of a bank, and fewest that show the directions of queries.
 const MAX_TEXTS: usize = 2048;
@@ -143,14 +143,14 @@ pub struct Basis {
 
 impl Basis {
     /// Finds the fewest components that keep the scores' root-mean-square error within a tolerance.
-    pub fn fit(vectors: Rows<'_>, metric: &ScoreMetric, tolerance: f32) -> Self {
+    pub fn fit(vectors: Rows<'_>, metric: &ScoreMetric, tolerance: f32, max_components: usize) -> Self {
         let dim = metric.dim;
         let (mean, covariance) = moments_of(vectors);
         let whitened = metric.whitened(&covariance);
         let total: f64 = whitened.iter().step_by(dim + 1).map(|v| f64::from(*v)).sum();
         let (values, directions) =
             leading_eigenvectors(&whitened, dim, (MAX_COMPONENTS + EXTRA_VECTORS).min(dim));
-        let most = MAX_COMPONENTS.min(dim).min(vectors.len().max(2));
+        let most = MAX_COMPONENTS.min(max_components).min(dim).min(vectors.len().max(2));
         let mut left = total;
         let mut n_components = 0;
         while n_components < most && (n_components < 2 || left > f64::from(tolerance).powi(2)) {

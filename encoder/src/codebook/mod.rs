@@ -104,7 +104,8 @@ pub fn build(
 ) -> Codebook {
     let dim = embeddings.width;
     let rms = |error: f32| error * RMS_OF_MEAN * score_context.spread;
-    let mut fitted = Basis::fit(embeddings, &score_context.metric, TAIL_SHARE * rms(settings.balanced_error));
+    let tolerance = TAIL_SHARE * rms(settings.balanced_error);
+    let mut fitted = Basis::fit(embeddings, &score_context.metric, tolerance, settings.max_components);
     let m = fitted.n_components;
     let points = fitted.components(embeddings);
     let max_centroids = (embeddings.len() / settings.min_gaussians_per_centroid.max(1)).max(1);

@@ -1,5 +1,7 @@
 //! How fine a codebook is.
 
+use super::basis::MAX_COMPONENTS;
+
 /// How fine a codebook is. Errors are means of `|score error|`, relative to the spread of scores (their
 /// standard deviation over the scene).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -8,6 +10,9 @@ pub struct CodebookSettings {
     pub compact_error: f32,
     /// Largest accepted error of the balanced profile.
     pub balanced_error: f32,
+    /// Most components of a centroid: the dimension of compact and balanced shards. Fewer are taken where the errors
+    /// allow it; even, 2 to [`MAX_COMPONENTS`].
+    pub max_components: usize,
     /// Fewest Gaussians per centroid, on average.
     pub min_gaussians_per_centroid: usize,
     /// Most subspaces of the residual code (half a byte each); below 2 there is no code.
@@ -22,6 +27,7 @@ impl Default for CodebookSettings {
         Self {
             compact_error: 0.1,
             balanced_error: 0.02,
+            max_components: MAX_COMPONENTS,
             min_gaussians_per_centroid: 45,
             max_subspaces: 32,
             has_fine: false,

@@ -248,6 +248,23 @@ fn a_few_embeddings_are_finite() {
     }
 }
 
+/// Fewer components are fewer bytes a centroid and larger errors; the limit is only a limit.
+#[test]
+fn components_are_limited() {
+    let vectors = clustered(600, 200, 64, 0.4);
+    let score_context = score_context(64, &vectors);
+    let with = |max_components| {
+        let settings = CodebookSettings { max_components, ..CodebookSettings::default() };
+        let codebook = build(Rows::all(&vectors, 64), &score_context, &settings);
+        assert_eq!(codebook.centroids.len(), codebook.n_components * codebook.radii.len());
+        (codebook.n_components, codebook.errors.mean)
+    };
+    let (few, some, most) = (with(2), with(8), with(128));
+    assert_eq!((few.0, some.0), (2, 8));
+    assert!(some.0 < most.0 && most.0 <= 64, "{most:?}");
+    assert!(few.1 > some.1 && some.1 > most.1, "{few:?} {some:?} {most:?}");
+}
+
 /// A limit of no subspaces means no residual code.
 #[test]
 fn no_subspaces_make_no_residual_code() {

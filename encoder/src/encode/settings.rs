@@ -10,6 +10,7 @@ use slag_common::shard::Profile;
 use super::error::EncodeError;
 use crate::cells::CellLimits;
 use crate::codebook::CodebookSettings;
+use crate::codebook::basis::MAX_COMPONENTS;
 use crate::embed::Background;
 use crate::ingest::FrameChoice;
 use crate::lift::Aggregation;
@@ -330,6 +331,12 @@ impl EncodeSettings {
             ("max_width", cells.limits.max_width.is_none_or(is_positive), "expected a finite width above 0"),
             ("profiles", !cells.shards.profiles.is_empty(), "expected at least one profile"),
             (
+                "max_components",
+                (2..=MAX_COMPONENTS).contains(&codebook.max_components)
+                    && codebook.max_components.is_multiple_of(2),
+                "expected an even number of components, 2 to 128: subspaces come in pairs",
+            ),
+            (
                 "max_subspaces",
                 codebook.max_subspaces >= 2 && codebook.max_subspaces.is_multiple_of(2),
                 "expected an even number of subspaces, at least 2: two share a byte",
@@ -381,6 +388,9 @@ mod tests {
         assert_eq!(refused(&|s| s.cells.limits.max_gaussians = 0), "max_gaussians");
         assert_eq!(refused(&|s| s.cells.limits.max_width = Some(0.0)), "max_width");
         assert_eq!(refused(&|s| s.cells.shards.profiles.clear()), "profiles");
+        assert_eq!(refused(&|s| s.cells.shards.codebook.max_components = 0), "max_components");
+        assert_eq!(refused(&|s| s.cells.shards.codebook.max_components = 7), "max_components");
+        assert_eq!(refused(&|s| s.cells.shards.codebook.max_components = 130), "max_components");
         assert_eq!(refused(&|s| s.cells.shards.codebook.max_subspaces = 0), "max_subspaces");
         assert_eq!(refused(&|s| s.cells.shards.codebook.max_subspaces = 3), "max_subspaces");
         assert_eq!(refused(&|s| s.cells.shards.codebook.compact_error = -0.1), "compact_error");

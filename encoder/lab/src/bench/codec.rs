@@ -136,7 +136,7 @@ pub fn run(source: &Source, bank: TextBank, title: &str) -> Result<CodecReport, 
         balanced_error: balanced,
         max_subspaces: if profile == Profile::Compact { 2 } else { 64 },
         min_gaussians_per_centroid: 16,
-        has_fine: false,
+        ..CodebookSettings::default()
     };
     for error in COMPACT_ERRORS {
         points.push(shards(

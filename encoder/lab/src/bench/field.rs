@@ -1,5 +1,6 @@
 //! `bench field`: publishes a store of a generated field, which `slag-edge fetch` copies and `slag-edge bench query` times.
 
+use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::Path;
 
@@ -11,7 +12,7 @@ use slag_common::{Gaussians, Hash32};
 use super::machine::Machine;
 use super::timing::timed_ms;
 use crate::generate::field::{Field, place_in_cube};
-use slag_encoder::cells::{CellLimits, split};
+use slag_encoder::cells::{Cell, CellLimits, split};
 use slag_encoder::codebook::{ScoreMetric, ScoreMetricContext};
 use slag_encoder::progress::Progress;
 use slag_encoder::shard::{self, CellEmbeddings, ShardSettings};
@@ -33,11 +34,11 @@ pub struct FieldReport {
     /// Centroids of all cells.
     pub n_centroids: u64,
     /// Bytes of all shards, by profile.
-    pub shard_bytes: std::collections::BTreeMap<String, u64>,
+    pub shard_bytes: BTreeMap<String, u64>,
     /// Gaussians coded per second on all threads: codebook, residual code, measured errors and files.
     pub gaussians_per_sec: f64,
     /// Mean score error relative to the spread, by profile, averaged over cells.
-    pub mean_errors: std::collections::BTreeMap<String, f64>,
+    pub mean_errors: BTreeMap<String, f64>,
 }
 
 /// Publishes a field of `n_gaussians`, rounded down to whole cells. Its texts go to `texts.f32` in the same folder:
@@ -53,64 +54,93 @@ pub fn publish(
     progress: &dyn Progress,
 ) -> Result<FieldReport, StoreError> {
     let field = Field::new(n_gaussians, dim);
-    let store = Store::create_or_open(dir)?;
-    let bank = field.texts();
-    fs_err::File::create(dir.join("texts.f32"))?.write_all(bytemuck::cast_slice(&bank.vectors))?;
-    let metric = ScoreMetric::new(dim, &bank);
-    let first = field.embeddings(0);
-    let score_context = ScoreMetricContext { spread: metric.spread(Rows::all(&first, dim)), metric, bank };
-    let encoder_id = Hash32::of(b"generated-field");
+    let mut writer = FieldWriter::create(dir, &field, dim, settings)?;
     let n = field.cell_gaussians();
     let per_side = (field.n_cells() as f64).sqrt().ceil() as usize;
-    let mut report = FieldReport {
-        machine: Machine::here(),
-        n_gaussians: (n * field.n_cells()) as u64,
-        n_cells: field.n_cells(),
-        n_centroids: 0,
-        shard_bytes: Default::default(),
-        gaussians_per_sec: 0.0,
-        mean_errors: Default::default(),
-    };
-    let mut ms = 0.0;
-    let mut cells = Vec::new();
     progress.begin("cells", "cell", field.n_cells() as u64, 0);
     for cell_id in 0..field.n_cells() {
         let corner = DVec3::new((cell_id % per_side) as f64, (cell_id / per_side) as f64, 0.0) * CELL_PITCH_M;
-        let scene = Gaussians {
-            means_in_world: (0..n as u64).map(|k| corner + place_in_cube(k)).collect(),
-            rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n],
-            scales: vec![[0.05; 3]; n],
-            opacities: vec![1.0; n],
-            sh_dc: vec![[0.0; 3]; n],
-            ..Gaussians::default()
-        };
-        let vectors = field.embeddings(cell_id);
+        let scene = grey_gaussians((0..n as u64).map(|k| corner + place_in_cube(k)).collect());
         let cut = split(&scene, CellLimits { max_gaussians: n, max_width: None });
-        let cell = &cut.cells[0];
+        writer.add(&scene, &cut.cells[0], &field.embeddings(cell_id))?;
+        progress.advance(1);
+    }
+    progress.end();
+    writer.publish()
+}
+
+/// Returns opaque round Gaussians at these means.
+pub(super) fn grey_gaussians(means_in_world: Vec<DVec3>) -> Gaussians {
+    let n = means_in_world.len();
+    Gaussians {
+        means_in_world,
+        rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; n],
+        scales: vec![[0.05; 3]; n],
+        opacities: vec![1.0; n],
+        sh_dc: vec![[0.0; 3]; n],
+        ..Gaussians::default()
+    }
+}
+
+/// Writes a store of a field cell by cell.
+pub(super) struct FieldWriter<'a> {
+    store: Store,
+    settings: &'a ShardSettings,
+    score_context: ScoreMetricContext,
+    dim: usize,
+    cells: Vec<CellRecord>,
+    report: FieldReport,
+    coding_ms: f64,
+}
+
+impl<'a> FieldWriter<'a> {
+    /// Creates or opens a store, and writes the field's texts.
+    pub(super) fn create(
+        dir: &Path,
+        field: &Field,
+        dim: usize,
+        settings: &'a ShardSettings,
+    ) -> Result<Self, StoreError> {
+        let store = Store::create_or_open(dir)?;
+        let bank = field.texts();
+        fs_err::File::create(dir.join("texts.f32"))?.write_all(bytemuck::cast_slice(&bank.vectors))?;
+        let metric = ScoreMetric::new(dim, &bank);
+        let first = field.embeddings(0);
+        let spread = metric.spread(Rows::all(&first, dim));
+        let report = FieldReport {
+            machine: Machine::here(),
+            n_gaussians: 0,
+            n_cells: 0,
+            n_centroids: 0,
+            shard_bytes: BTreeMap::new(),
+            gaussians_per_sec: 0.0,
+            mean_errors: BTreeMap::new(),
+        };
+        let score_context = ScoreMetricContext { spread, metric, bank };
+        Ok(Self { store, settings, score_context, dim, cells: Vec::new(), report, coding_ms: 0.0 })
+    }
+
+    /// Adds a cell. `vectors`: the embeddings of the scene's Gaussians, `[n][dim]`.
+    pub(super) fn add(&mut self, scene: &Gaussians, cell: &Cell, vectors: &[f32]) -> Result<(), StoreError> {
+        let (n, dim, cell_id) = (cell.gaussians.len(), self.dim, self.cells.len() as u32);
         let vectors: Vec<f32> =
             cell.gaussians.iter().flat_map(|k| &vectors[*k as usize * dim..][..dim]).copied().collect();
         let embeddings = CellEmbeddings { dim, vectors, has_evidence: vec![true; n] };
-        let (built, took) = timed_ms(|| {
-            shard::build(
-                &scene,
-                cell_id as u32,
-                cell,
-                &embeddings,
-                encoder_id,
-                &score_context,
-                settings,
-                None,
-            )
+        let (context, settings) = (&self.score_context, self.settings);
+        let (built, ms) = timed_ms(|| {
+            shard::build(scene, cell_id, cell, &embeddings, encoder_id(), context, settings, None)
         });
-        ms += took;
-        report.n_centroids += u64::from(built.n_centroids);
-        let mut shards = std::collections::BTreeMap::new();
+        self.coding_ms += ms;
+        self.report.n_gaussians += n as u64;
+        self.report.n_cells += 1;
+        self.report.n_centroids += u64::from(built.n_centroids);
+        let mut shards = BTreeMap::new();
         for made in &built.shards {
-            let (hash, len_bytes) = store.put_bytes(&made.bytes)?;
+            let (hash, len_bytes) = self.store.put_bytes(&made.bytes)?;
             let name = made.profile.to_string();
-            *report.shard_bytes.entry(name.clone()).or_default() += len_bytes;
-            *report.mean_errors.entry(name).or_default() +=
-                f64::from(made.score_errors.mean / made.score_errors.spread) / field.n_cells() as f64;
+            *self.report.shard_bytes.entry(name.clone()).or_default() += len_bytes;
+            *self.report.mean_errors.entry(name).or_default() +=
+                f64::from(made.score_errors.mean / made.score_errors.spread);
             let record = ShardRecord {
                 hash,
                 len_bytes,
@@ -121,21 +151,19 @@ pub fn publish(
             };
             shards.insert(made.profile, record);
         }
-        cells.push(CellRecord {
-            cell_id: cell_id as u32,
-            bounds: cell.bounds,
-            n_gaussians: n as u32,
-            shards,
-        });
-        progress.advance(1);
+        self.cells.push(CellRecord { cell_id, bounds: cell.bounds, n_gaussians: n as u32, shards });
+        Ok(())
     }
-    progress.end();
-    report.gaussians_per_sec = report.n_gaussians as f64 / (ms / 1e3);
-    store.publish(
-        &Manifest {
+
+    /// Publishes the cells as the store's next generation.
+    pub(super) fn publish(mut self) -> Result<FieldReport, StoreError> {
+        self.report.gaussians_per_sec = self.report.n_gaussians as f64 / (self.coding_ms / 1e3);
+        let n_cells = self.report.n_cells.max(1) as f64;
+        self.report.mean_errors.values_mut().for_each(|error| *error /= n_cells);
+        let manifest = Manifest {
             version: manifest::VERSION,
             scene: "generated-field".into(),
-            generation: store.next_generation()?,
+            generation: self.store.next_generation()?,
             created_unix_secs: 0,
             expires_unix_secs: None,
             next_key: None,
@@ -143,18 +171,22 @@ pub fn publish(
             geo_reference: None,
             encoder: EncoderRecord {
                 name: "generated-field".into(),
-                id: encoder_id,
-                dim: dim as u32,
+                id: encoder_id(),
+                dim: self.dim as u32,
                 default_threshold: 0.5,
                 calibration: None,
             },
-            n_gaussians: report.n_gaussians,
+            n_gaussians: self.report.n_gaussians,
             n_without_evidence: 0,
             n_rejected: 0,
-            cells,
-        },
-        &Extras::new(),
-    )?;
-    store.prune()?;
-    Ok(report)
+            cells: self.cells,
+        };
+        self.store.publish(&manifest, &Extras::new())?;
+        self.store.prune()?;
+        Ok(self.report)
+    }
+}
+
+fn encoder_id() -> Hash32 {
+    Hash32::of(b"generated-field")
 }

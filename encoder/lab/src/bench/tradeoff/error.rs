@@ -17,7 +17,7 @@ pub enum TradeoffError {
         what: String,
     },
     /// The flags have an unknown placeholder.
-    #[error("{flags:?}: unknown placeholder {word}; known are {{masks}}, {{sam}} and {{gpu:N}}")]
+    #[error("{flags:?}: unknown placeholder {word}; known are {{masks}}, {{sam}}, {{gpu:N}} and {{gpus:N}}")]
     Flags {
         /// The flags.
         flags: String,

@@ -14,7 +14,8 @@
 //! measured and queried. All profiles are made, because the exact shards tell which Gaussian is which.
 //!
 //! `{masks}` stands for the scene's folder of true masks, `{sam}` for the model directory of Segment Anything, and
-//! `{gpu:N}` for the number N, where the machine has more GPUs than that; without these a point is left out. Points of
+//! `{gpu:N}` for the number N, where the machine has more GPUs than that, and `{gpus:N}` for `gpu`, all of them, where it
+//! has at least N; without these a point is not run. Points of
 //! a scene with the same `views` share one store, and their contributions are computed once.
 //!
 //! `ordered` names the axes whose points ascend: plots connect their points, in the grid's order.
@@ -189,8 +190,15 @@ impl LabelledScene {
                     None => return Ok(Err("no --segmenter is given")),
                 },
                 Some(inner) => {
-                    let number = inner.strip_prefix("gpu:").and_then(|n| n.parse::<usize>().ok());
-                    match number {
+                    let number_of = |name: &str| inner.strip_prefix(name)?.parse::<usize>().ok();
+                    if let Some(least) = number_of("gpus:") {
+                        match equipment.n_gpus >= least {
+                            true => words.push("gpu".to_owned()),
+                            false => return Ok(Err("the machine has too few GPUs")),
+                        }
+                        continue;
+                    }
+                    match number_of("gpu:") {
                         Some(number) if number < equipment.n_gpus => number.to_string(),
                         Some(_) => return Ok(Err("the machine has too few GPUs")),
                         None => return Err(unknown(word)),

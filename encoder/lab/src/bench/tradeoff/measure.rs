@@ -10,9 +10,11 @@ use super::error::TradeoffError;
 use super::figures::Figures;
 use super::grid::{Grid, LabelledScene, Point};
 use super::paper::PAPER;
-use super::programs::{Programs, remove};
+use super::prediction::predictions;
+use super::programs::Programs;
 use super::report::TradeoffReport;
 use crate::bench::machine::Machine;
+use crate::bench::programs::remove;
 
 /// What to measure.
 #[derive(Clone, Debug)]
@@ -72,6 +74,7 @@ pub fn run(
         machine: Machine::here(),
         paper: PAPER,
         ordered: settings.grid.ordered.clone(),
+        predictions: predictions(&measured),
         figures: measured,
         left_out,
     };

@@ -13,6 +13,7 @@ mod means;
 mod measure;
 mod paper;
 mod picture;
+mod prediction;
 mod programs;
 mod report;
 #[cfg(test)]

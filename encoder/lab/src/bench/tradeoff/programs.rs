@@ -1,15 +1,14 @@
 //! Runs the programs as a user does.
 
-use std::ffi::OsStr;
-use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::Command;
 
 use serde_json::Value;
 use slag_common::shard::Profile;
 
 use super::error::TradeoffError;
 use super::grid::{Equipment, LabelledScene, Point};
+use crate::bench::programs::{ProgramError, Server, json_of, remove};
 
 /// Number of Gaussians that a timed query returns.
 const QUERY_LIMIT: &str = "1000";
@@ -82,21 +81,9 @@ impl Runs<'_> {
     ) -> Result<Option<f64>, TradeoffError> {
         let Some(edge) = &self.programs.edge else { return Ok(None) };
         let cache = out.join("cache");
-        remove(&cache)?;
-        let mut command = Command::new(&self.programs.encoder);
-        command.args(["--quiet", "serve", "--listen", "127.0.0.1:0", "--store"]).arg(store);
-        let mut server = Server(command.stdin(Stdio::null()).stdout(Stdio::piped()).spawn()?);
-        let mut line = String::new();
-        if let Some(stdout) = server.0.stdout.take() {
-            BufReader::new(stdout).read_line(&mut line)?;
-        }
-        let url = line.trim().strip_prefix("listening on ");
-        let url =
-            url.ok_or_else(|| self.failed(&command, format!("expected its address, found {line:?}")))?;
-        let mut fetch = Command::new(edge);
-        fetch.args(["fetch", "--json", "--quiet", "--at", "0,0,0", "--radius", "1e6", "--from", url]);
-        self.run(fetch.args(["--profile", profile.name(), "--cache"]).arg(&cache))?;
-        drop(server);
+        let fetched = Server::start(&self.programs.encoder, store)
+            .and_then(|server| server.fetch_all(edge, &cache, profile));
+        fetched.map_err(|error| self.of_program(error))?;
         let mut bench = Command::new(edge);
         bench.args([
             "bench",
@@ -114,16 +101,14 @@ impl Runs<'_> {
         Ok(kinds.filter(|kind| kind["kind"] == "best").find_map(|kind| kind["median_ms"].as_f64()))
     }
 
-    /// Runs a command and parses the JSON it prints.
     fn run(&self, command: &mut Command) -> Result<Value, TradeoffError> {
-        let output = command.stdin(Stdio::null()).output()?;
-        let printed: Option<Value> = serde_json::from_slice(&output.stdout).ok();
-        let message = printed.as_ref().and_then(|value| value["error"]["message"].as_str());
-        // Exit code 3: some inputs were left out; the figures count them.
-        match (printed.as_ref(), message, output.status.code()) {
-            (Some(value), None, Some(0 | 3)) => Ok(value.clone()),
-            (_, Some(message), _) => Err(self.failed(command, message.to_owned())),
-            _ => Err(self.failed(command, String::from_utf8_lossy(&output.stderr).trim().to_owned())),
+        json_of(command).map_err(|error| self.of_program(error))
+    }
+
+    fn of_program(&self, error: ProgramError) -> TradeoffError {
+        match error {
+            ProgramError::Io(error) => error.into(),
+            ProgramError::Failed { command, message } => self.error(command, message),
         }
     }
 
@@ -135,11 +120,6 @@ impl Runs<'_> {
         printed[name].as_f64().ok_or_else(missing)
     }
 
-    fn failed(&self, command: &Command, message: String) -> TradeoffError {
-        let words = std::iter::once(command.get_program()).chain(command.get_args());
-        self.error(words.map(OsStr::to_string_lossy).collect::<Vec<_>>().join(" "), message)
-    }
-
     fn error(&self, command: String, message: String) -> TradeoffError {
         TradeoffError::Program {
             scene: self.scene.name.clone(),
@@ -149,19 +129,4 @@ impl Runs<'_> {
             message,
         }
     }
-}
-
-/// A service that is stopped when dropped.
-struct Server(Child);
-
-impl Drop for Server {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-/// Removes a folder where it exists.
-pub(super) fn remove(store: &Path) -> std::io::Result<()> {
-    if store.exists() { fs_err::remove_dir_all(store) } else { Ok(()) }
 }

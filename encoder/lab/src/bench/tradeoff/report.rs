@@ -8,6 +8,7 @@ use serde::Serialize;
 use super::error::TradeoffError;
 use super::figures::Figures;
 use super::paper::PaperRow;
+use super::prediction::{Prediction, Ratios};
 use crate::bench::machine::Machine;
 
 /// Figures of a measured grid.
@@ -23,6 +24,8 @@ pub struct TradeoffReport {
     pub figures: Vec<Figures>,
     /// Points left out because a scene lacks their data.
     pub left_out: Vec<String>,
+    /// How well each scene's costs follow from the other scenes; empty for one scene.
+    pub predictions: Vec<Prediction>,
 }
 
 /// A cost to plot accuracy against.
@@ -190,7 +193,17 @@ impl fmt::Display for TradeoffReport {
             }
         }
         for point in &self.left_out {
-            writeln!(f, "left out: {point}")?;
+            writeln!(f, "not run: {point}")?;
+        }
+        for (what, of) in
+            [("seconds", Prediction::seconds as fn(&Prediction) -> f64), ("bytes", Prediction::bytes)]
+        {
+            if let Some(ratios) = Ratios::of(self.predictions.iter().map(of)) {
+                writeln!(
+                    f,
+                    "{what} of a scene predicted from the others, as --target-{what} does: {ratios}"
+                )?;
+            }
         }
         let unknown = self.figures.iter().map(|f| f.n_unknown_words).max().unwrap_or(0);
         if unknown > 0 {

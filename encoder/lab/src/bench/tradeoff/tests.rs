@@ -3,6 +3,7 @@ use std::path::Path;
 use slag_common::shard::Profile;
 
 use super::paper::PAPER;
+use super::prediction::{Prediction, Ratios, predictions};
 use super::report::pareto;
 use super::*;
 use crate::bench::machine::Machine;
@@ -60,6 +61,7 @@ fn reports_name_every_point_and_mark_the_front() {
             figures("views", "1/4", 3.0, 0.45),
             figures("width", "160 px", 9.0, 0.4),
         ],
+        predictions: Vec::new(),
         left_out: vec!["masks / true on room: it has no gt/masks".into()],
     };
     let dir = tempfile::tempdir().expect("a folder");
@@ -69,7 +71,7 @@ fn reports_name_every_point_and_mark_the_front() {
     let marks: Vec<&str> = table.lines().skip(2).take(3).map(|line| line[..3].trim()).collect();
     // Bytes are equal: only the most accurate point is optimal. Without query times none is.
     assert_eq!(marks, ["sb", "s", ""]);
-    assert!(table.contains("129, 309, 1328, 3026 s") && table.contains("left out: masks / true"), "{table}");
+    assert!(table.contains("129, 309, 1328, 3026 s") && table.contains("not run: masks / true"), "{table}");
     let csv = read("tradeoff.csv");
     let widths: Vec<usize> = csv.lines().map(|line| line.split(',').count()).collect();
     assert_eq!(widths, [22; 4], "{csv}");
@@ -122,6 +124,7 @@ fn several_scenes_have_a_mean_and_a_front() {
             given,
         ],
         left_out: Vec::new(),
+        predictions: Vec::new(),
     };
     let dir = tempfile::tempdir().expect("a folder");
     report.write(dir.path()).expect("writes");
@@ -147,6 +150,31 @@ fn several_scenes_have_a_mean_and_a_front() {
     }
     // Presets have no order: the front is the only line.
     assert_eq!(svg.matches("<polyline").count(), 1, "{svg}");
+}
+
+/// By hand. Scene a takes 0.1 s a view and 2 s a million, b 0.3 s and 4 s; each is predicted by the other's.
+#[test]
+fn scenes_are_predicted_from_the_others() {
+    let of = |scene: &str, n_photos: u64, views: f64, rest: f64, bytes: f64| {
+        let mut figures = figures("preset", "fast", views + rest, 0.5);
+        (figures.scene, figures.n_photos, figures.views_seconds) = (scene.into(), n_photos, views);
+        (figures.n_gaussians, figures.bytes_per_gaussian) = (1_000_000, bytes);
+        figures
+    };
+    let mut all = vec![of("a", 10, 1.0, 2.0, 4.0), of("b", 20, 6.0, 4.0, 5.0)];
+    let mut alone = of("a", 10, 1.0, 2.0, 4.0);
+    alone.point.name = "slow".into();
+    all.push(alone);
+    let found = predictions(&all);
+    assert_eq!(found.len(), 2, "a point of one scene has no other");
+    // a: 10 x 0.3 + 4 = 7 s for 3 s; b: 20 x 0.1 + 2 = 4 s for 10 s.
+    assert!(
+        (found[0].seconds_ratio - 7.0 / 3.0).abs() < 1e-12 && (found[1].seconds_ratio - 0.4).abs() < 1e-12
+    );
+    assert_eq!([found[0].bytes_ratio, found[1].bytes_ratio], [1.25, 0.8]);
+    let ratios = Ratios::of(found.iter().map(Prediction::seconds)).expect("some").to_string();
+    assert_eq!(ratios, "predicted/measured 0.40 in the median, 0.40 to 2.33 (2 predictions)");
+    assert_eq!(Ratios::of([f64::NAN].into_iter()), None);
 }
 
 /// A script records its arguments and prints what the real programs print. The second point reuses the first one's

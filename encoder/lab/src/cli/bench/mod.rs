@@ -3,10 +3,14 @@
 mod codec;
 mod field;
 mod lift;
+mod partition;
 mod raster;
+mod robot;
 mod tradeoff;
 
-use anyhow::Result;
+use std::path::PathBuf;
+
+use anyhow::{Context, Result};
 use clap::Subcommand;
 use slag_encoder::cli::Exit;
 use slag_encoder::progress::Progress;
@@ -22,6 +26,10 @@ pub enum BenchCommand {
     Raster(raster::RasterBenchArgs),
     /// Times the way from the contributions of all views to embeddings, on a synthetic scene.
     Lift(lift::LiftBenchArgs),
+    /// Measures what a robot downloads, and how long it takes, by radius and width of cells.
+    Partition(partition::PartitionArgs),
+    /// Fills the paper's table of query times on the robot, with other engines on the same vectors beside it.
+    Robot(robot::RobotArgs),
     /// Measures cost and accuracy of settings of `encode` on labelled scenes: table, Pareto front and plots.
     Tradeoff(tradeoff::TradeoffArgs),
 }
@@ -32,6 +40,14 @@ pub(super) fn run(command: &BenchCommand, progress: &dyn Progress, json: bool) -
         BenchCommand::Field(args) => field::run(args, progress),
         BenchCommand::Raster(args) => raster::run(args, progress, json),
         BenchCommand::Lift(args) => lift::run(args, json),
+        BenchCommand::Partition(args) => partition::run(args, progress, json),
+        BenchCommand::Robot(args) => robot::run(args, progress, json),
         BenchCommand::Tradeoff(args) => tradeoff::run(args, progress, json),
     }
+}
+
+/// Returns the path of a program beside this one.
+fn sibling(name: &str) -> Result<PathBuf> {
+    let lab = std::env::current_exe().context("cannot find the path of this program")?;
+    Ok(lab.with_file_name(format!("{name}{}", std::env::consts::EXE_SUFFIX)))
 }

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::{Context, Result};
 use clap::Args;
 
+use super::sibling;
 use crate::bench::tradeoff::{self, Equipment, Grid, LabelledScene, Programs, TradeoffSettings};
 use slag_encoder::cli::Exit;
 use slag_encoder::cli::common::{ModelArgs, open_models, print};
@@ -47,8 +48,7 @@ pub(super) fn run(args: &TradeoffArgs, progress: &dyn Progress, json: bool) -> R
     // Opened first: a model that cannot be opened fails before hours of work.
     let (models, session) = open_models(&args.models)?;
     let lab = std::env::current_exe().context("cannot find the path of this program")?;
-    let encoder = lab.with_file_name(format!("slag-encoder{}", std::env::consts::EXE_SUFFIX));
-    let edge = encoder.with_file_name(format!("slag-edge{}", std::env::consts::EXE_SUFFIX));
+    let (encoder, edge) = (sibling("slag-encoder")?, sibling("slag-edge")?);
     if !edge.is_file() {
         tracing::warn!(
             "{} does not exist, so queries are not timed; build it beside this program",

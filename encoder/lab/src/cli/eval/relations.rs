@@ -20,7 +20,7 @@ pub struct EvalRelationsArgs {
     /// Kinds of scenes.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "room,yard")]
     pub kind: Vec<SceneKind>,
-    /// Seeds of each kind. The constants of the relations were chosen on seeds 1 to 4.
+    /// Seeds of each kind. One choice of the relations was made on rooms 1 to 4: judge by others.
     #[arg(long, value_name = "N", value_delimiter = ',', default_values_t = [11, 12, 13, 14])]
     pub seeds: Vec<u64>,
     /// Photos of each scene.
