@@ -62,8 +62,7 @@ async fn message(
 
 fn parse(pairs: &[(String, String)]) -> Result<(String, Negatives), RequestError> {
     params::check_names(pairs, &scores_parameters(), &["negative"])?;
-    let of =
-        |name: &'static str| pairs.iter().filter(move |(key, _)| key == name).map(|(_, value)| value.clone());
+    let of = |name: &str| pairs.iter().filter(move |(key, _)| key == name).map(|(_, value)| value.clone());
     let text = of("text").next();
     let text = text.ok_or_else(|| RequestError::new("text", "nothing", "words to look for"))?;
     Ok((text, body::negatives(of("negative").collect())))
