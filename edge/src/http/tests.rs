@@ -31,7 +31,6 @@ mod attacks;
 mod openapi;
 mod ply;
 mod v1;
-mod view;
 
 struct Service {
     dir: TempDir,

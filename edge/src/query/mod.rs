@@ -15,7 +15,6 @@ mod json;
 mod map;
 mod objects;
 mod oriented;
-mod picture;
 mod ply;
 mod point;
 mod rank;

@@ -124,8 +124,7 @@ impl Body {
     }
 }
 
-/// Returns negative prompts as the engine takes them.
-pub fn negatives(phrases: Vec<String>) -> Negatives {
+fn negatives(phrases: Vec<String>) -> Negatives {
     match phrases.as_slice() {
         [] => Negatives::None,
         [one] if one == "canonical" => Negatives::Canonical,

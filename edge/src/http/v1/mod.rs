@@ -7,7 +7,6 @@ mod objects;
 mod params;
 mod query;
 mod reply;
-mod view;
 
 use std::sync::Arc;
 
@@ -29,8 +28,5 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         .parameters(params::objects_parameters())
         .get("/v1/objects/{id}", "one thing on board", objects::one)
         .get("/v1/map", "the area on board, its age, and what is missing", map::map)
-        .get("/v1/view/scores", "the score of every Gaussian on board, one byte each", view::scores)
-        .parameters(view::scores_parameters())
-        .get("/v1/view/cells/{id}", "the positions of a cell's Gaussians, in binary", view::cell)
         .get("/v1/events", "server-sent events: generations and fetches as they happen", events::events)
 }
