@@ -378,6 +378,7 @@ fn with_setting(args: &EncodeArgs, setting: &str) -> Result<EncodeArgs> {
     with.min_mask_px = chosen.min_mask_px;
     with.keep_slivers = chosen.keep_slivers;
     with.compact_error = chosen.compact_error;
+    with.max_components = chosen.max_components;
     with.objects = chosen.objects.clone();
     with.refine = chosen.refine.clone();
     with.refine.keep_views = args.refine.keep_views;
@@ -423,6 +424,7 @@ mod tests {
                 "weights" => " blend",
                 "view_order" => " names",
                 "raster_width" => " 320",
+                "max_components" => " 8",
                 "fill" => " true",
                 "keep_slivers" | "no_objects" => "",
                 _ => " 1",
