@@ -11,11 +11,12 @@ use syn::visit::{self, Visit};
 use syn::{Attribute, Item, UseTree, Visibility};
 
 /// Crates and their folders.
-const CRATES: [(&str, &str); 7] = [
+const CRATES: [(&str, &str); 8] = [
     ("slag_math", "common/math"),
     ("slag_common", "common"),
     ("slag_models", "common/models"),
     ("slag_service", "common/service"),
+    ("slag_view", "common/view"),
     ("slag_encoder", "encoder"),
     ("slag_edge", "edge"),
     ("slag_lab", "encoder/lab"),

@@ -1,0 +1,90 @@
+// The camera: turning around a point, flying with keys, and gliding to a place.
+
+import * as THREE from "three";
+import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+
+export const FIELD_OF_VIEW_DEG = 55;
+const GLIDE_MS = 700;
+const KEYS = ["KeyW", "KeyS", "KeyA", "KeyD", "KeyQ", "KeyE", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"];
+
+interface Glide {
+  startMs: number;
+  from: [THREE.Vector3, THREE.Vector3];
+  to: [THREE.Vector3, THREE.Vector3];
+}
+
+export class Camera {
+  readonly camera = new THREE.PerspectiveCamera(FIELD_OF_VIEW_DEG, 1, 0.02, 5000);
+  readonly controls: OrbitControls;
+  private readonly pressed = new Set<string>();
+  private glide: Glide | null = null;
+  private lastMs = 0;
+
+  constructor(canvas: HTMLCanvasElement, private readonly up: THREE.Vector3, onMove: () => void) {
+    this.camera.up.copy(up);
+    this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.addEventListener("change", onMove);
+    this.controls.addEventListener("start", () => (this.glide = null));
+    canvas.addEventListener("keydown", (event) => {
+      if (!KEYS.includes(event.code) || event.ctrlKey || event.metaKey || event.altKey) return;
+      event.preventDefault();
+      this.glide = null;
+      this.pressed.add(event.code);
+      onMove();
+    });
+    canvas.addEventListener("keyup", (event) => this.pressed.delete(event.code));
+    canvas.addEventListener("blur", () => this.pressed.clear());
+  }
+
+  place(position: THREE.Vector3, target: THREE.Vector3): void {
+    this.camera.position.copy(position);
+    this.controls.target.copy(target);
+    this.controls.update();
+  }
+
+  flyTo(position: THREE.Vector3, target: THREE.Vector3): void {
+    if (matchMedia("(prefers-reduced-motion: reduce)").matches) return this.place(position, target);
+    this.glide = { startMs: performance.now(), from: [this.camera.position.clone(), this.controls.target.clone()], to: [position, target] };
+  }
+
+  /** Looks at a sphere from the side on which the camera is, a little from above. */
+  frame(centre: THREE.Vector3, radiusM: number, from?: THREE.Vector3): [THREE.Vector3, THREE.Vector3] {
+    const away = (from ?? this.camera.position.clone().sub(centre)).clone();
+    away.addScaledVector(this.up, -away.dot(this.up));
+    if (away.lengthSq() < 1e-6) away.set(1, 0, 0);
+    away.normalize().addScaledVector(this.up, 0.6).normalize();
+    const distance = radiusM / Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360);
+    return [centre.clone().addScaledVector(away, distance), centre];
+  }
+
+  /** Moves on; true while it is under way. */
+  step(nowMs: number): boolean {
+    const seconds = Math.min((nowMs - this.lastMs) / 1000, 0.1);
+    this.lastMs = nowMs;
+    if (this.glide) {
+      const share = Math.min((nowMs - this.glide.startMs) / GLIDE_MS, 1);
+      const eased = share * share * (3 - 2 * share);
+      const [from, to] = [this.glide.from, this.glide.to];
+      if (share >= 1) this.glide = null;
+      this.place(from[0].clone().lerp(to[0], eased), from[1].clone().lerp(to[1], eased));
+    }
+    if (this.pressed.size > 0) this.moveByKeys(seconds);
+    return this.glide !== null || this.pressed.size > 0;
+  }
+
+  private moveByKeys(seconds: number): void {
+    const held = (code: string) => (this.pressed.has(code) ? 1 : 0);
+    const forward = this.controls.target.clone().sub(this.camera.position);
+    const speedM = Math.max(forward.length(), 1) * seconds;
+    forward.normalize();
+    const right = forward.clone().cross(this.up).normalize();
+    const move = forward.clone().multiplyScalar(held("KeyW") - held("KeyS")).addScaledVector(right, held("KeyD") - held("KeyA"))
+      .addScaledVector(this.up, held("KeyE") - held("KeyQ")).multiplyScalar(speedM);
+    const look = this.controls.target.clone().sub(this.camera.position);
+    look.applyAxisAngle(this.up, (held("ArrowLeft") - held("ArrowRight")) * seconds);
+    const tilted = look.clone().applyAxisAngle(right, (held("ArrowUp") - held("ArrowDown")) * seconds);
+    if (Math.abs(tilted.clone().normalize().dot(this.up)) < 0.98) look.copy(tilted);
+    const position = this.camera.position.clone().add(move);
+    this.place(position, position.clone().add(look));
+  }
+}

@@ -1,0 +1,81 @@
+// One mesh of splats a cell, each around its own origin because centres are half floats.
+
+import { PackedSplats, RgbaArray, SplatMesh } from "@sparkjsdev/spark";
+import type * as THREE from "three";
+import type { CellGaussians, Scores } from "../messages";
+import { colourByScore } from "./ramp";
+
+interface Drawn {
+  gaussians: CellGaussians;
+  mesh: SplatMesh;
+  rgba: RgbaArray | null;
+}
+
+export class Cells {
+  private readonly drawn = new Map<number, Drawn>();
+  private scores: Scores | null = null;
+  private threshold = 0;
+
+  constructor(private readonly parent: THREE.Object3D) {}
+
+  has(cell: number): boolean {
+    return this.drawn.has(cell);
+  }
+
+  get nGaussians(): number {
+    return [...this.drawn.values()].reduce((sum, cell) => sum + cell.gaussians.n, 0);
+  }
+
+  add(cell: number, gaussians: CellGaussians): void {
+    this.remove(cell);
+    const packedSplats = new PackedSplats({ packedArray: gaussians.packed, numSplats: gaussians.n });
+    const mesh = new SplatMesh({ packedSplats });
+    mesh.position.set(...gaussians.originM);
+    this.parent.add(mesh);
+    const drawn = { gaussians, mesh, rgba: null };
+    this.drawn.set(cell, drawn);
+    this.colourOne(cell, drawn);
+  }
+
+  remove(cell: number): void {
+    const drawn = this.drawn.get(cell);
+    if (!drawn) return;
+    this.parent.remove(drawn.mesh);
+    drawn.mesh.dispose();
+    drawn.rgba?.dispose();
+    this.drawn.delete(cell);
+  }
+
+  clear(): void {
+    for (const cell of [...this.drawn.keys()]) this.remove(cell);
+  }
+
+  /** Colours by scores, lit from a level on; null gives the scene's own colours back. */
+  colour(scores: Scores | null, threshold: number): void {
+    this.scores = scores;
+    this.threshold = threshold;
+    for (const [cell, drawn] of this.drawn) this.colourOne(cell, drawn);
+  }
+
+  private colourOne(cell: number, drawn: Drawn): void {
+    const { gaussians, mesh } = drawn;
+    if (!this.scores) {
+      if (mesh.splatRgba === null) return;
+      mesh.splatRgba = null;
+      mesh.updateGenerator();
+      return;
+    }
+    const found = this.scores.byCell.get(cell);
+    const levels = found?.length === gaussians.n ? found : new Uint8Array(gaussians.n);
+    drawn.rgba ??= new RgbaArray({ array: new Uint8Array(gaussians.packed.length), count: gaussians.n });
+    const array = drawn.rgba.array;
+    if (!array) return;
+    colourByScore(array, gaussians.packed, gaussians.n, levels, this.threshold);
+    drawn.rgba.needsUpdate = true;
+    if (mesh.splatRgba === null) {
+      mesh.splatRgba = drawn.rgba;
+      mesh.updateGenerator();
+    }
+    mesh.updateVersion();
+  }
+}

@@ -1,0 +1,142 @@
+// The picture: splats, marks over them and labels, drawn only when something changed.
+
+import { SparkRenderer } from "@sparkjsdev/spark";
+import * as THREE from "three";
+import type { Answer, Description, Vector } from "../network";
+import { Camera } from "./camera";
+import { Cells } from "./cells";
+import { boxOf, Marks } from "./marks";
+
+const MAX_LABELS = 8;
+
+export class Drawing {
+  readonly camera: Camera;
+  readonly cells: Cells;
+  readonly marks: Marks;
+  /** Side of a square of the grid. */
+  stepM = 1;
+  private readonly renderer: THREE.WebGLRenderer;
+  private readonly scene = new THREE.Scene();
+  /** Holds everything in world metres, moved so that the scene's middle is at the origin: the GPU has 32-bit floats. */
+  private readonly world = new THREE.Group();
+  private readonly box = new THREE.Box3();
+  private readonly up: THREE.Vector3;
+  private readonly isDark = matchMedia("(prefers-color-scheme: dark)");
+  private answers: Answer[] = [];
+  private isDirty = true;
+
+  constructor(private readonly canvas: HTMLCanvasElement, private readonly labels: HTMLElement, description: Description) {
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.up = new THREE.Vector3(...description.up).normalize();
+    for (const cell of description.cells) this.box.union(new THREE.Box3(new THREE.Vector3(...cell.box_m.min), new THREE.Vector3(...cell.box_m.max)));
+    if (this.box.isEmpty()) this.box.set(new THREE.Vector3(-1, -1, -1), new THREE.Vector3(1, 1, 1));
+    this.world.position.copy(this.box.getCenter(new THREE.Vector3())).negate();
+    this.scene.add(new SparkRenderer({ renderer: this.renderer, onDirty: () => this.redraw() }), this.world);
+    this.cells = new Cells(this.world);
+    this.marks = new Marks(this.world);
+    this.camera = new Camera(canvas, this.up, () => this.redraw());
+    const themed = () => {
+      this.scene.background = new THREE.Color(this.isDark.matches ? 0x14181d : 0xeceff2);
+      this.stepM = this.marks.showGround(this.box, this.up, description.geographic, this.isDark.matches);
+      this.redraw();
+    };
+    themed();
+    this.isDark.addEventListener("change", themed);
+    this.marks.showPhotos(description.views, this.radiusM / 40);
+    new ResizeObserver(() => this.resize()).observe(canvas);
+    this.resize();
+    this.showWhole(true);
+    this.renderer.setAnimationLoop((nowMs) => this.step(nowMs));
+  }
+
+  redraw(): void {
+    this.isDirty = true;
+  }
+
+  stop(): void {
+    this.renderer.setAnimationLoop(null);
+    this.cells.clear();
+    this.renderer.dispose();
+  }
+
+  showWhole(atOnce = false): void {
+    const pose = this.camera.frame(new THREE.Vector3(), this.radiusM * 0.75, new THREE.Vector3(-0.5, -1, 0));
+    if (atOnce) this.camera.place(...pose);
+    else this.camera.flyTo(...pose);
+    this.redraw();
+  }
+
+  showAnswers(answers: Answer[], chosen: number | null): void {
+    this.answers = answers;
+    this.marks.showAnswers(answers, chosen);
+    this.labels.replaceChildren(...answers.slice(0, MAX_LABELS).map((answer) => {
+      const label = document.createElement("span");
+      label.textContent = answer.score.toFixed(2);
+      return label;
+    }));
+    this.redraw();
+  }
+
+  flyToAnswer(answer: Answer): void {
+    const box = boxOf(answer);
+    const centre = new THREE.Vector3(...box.centre).add(this.world.position);
+    this.camera.flyTo(...this.camera.frame(centre, Math.max(new THREE.Vector3(...box.size).length() * 1.5, 0.5)));
+    this.redraw();
+  }
+
+  /** Index of the answer under a point of the canvas. */
+  answerAt(xPx: number, yPx: number): number | null {
+    const caster = new THREE.Raycaster();
+    caster.setFromCamera(new THREE.Vector2((xPx / this.canvas.clientWidth) * 2 - 1, 1 - (yPx / this.canvas.clientHeight) * 2), this.camera.camera);
+    const hit = caster.intersectObjects(this.marks.boxes.children.filter((child) => child instanceof THREE.Mesh))[0];
+    return hit ? (hit.object.userData.index as number) : null;
+  }
+
+  showRobot(position: Description["position"]): void {
+    this.marks.showRobot(position, this.up);
+    this.redraw();
+  }
+
+  pose(): { position: Vector; target: Vector } {
+    const world = (local: THREE.Vector3) => local.clone().sub(this.world.position).toArray() as Vector;
+    return { position: world(this.camera.camera.position), target: world(this.camera.controls.target) };
+  }
+
+  placeAt(pose: { position: Vector; target: Vector }): void {
+    const local = (point: Vector) => new THREE.Vector3(...point).add(this.world.position);
+    this.camera.place(local(pose.position), local(pose.target));
+    this.redraw();
+  }
+
+  private get radiusM(): number {
+    return this.box.getSize(new THREE.Vector3()).length() / 2;
+  }
+
+  private resize(): void {
+    const { clientWidth, clientHeight } = this.canvas;
+    this.renderer.setSize(clientWidth, clientHeight, false);
+    this.camera.camera.aspect = clientWidth / Math.max(clientHeight, 1);
+    this.camera.camera.updateProjectionMatrix();
+    this.redraw();
+  }
+
+  private step(nowMs: number): void {
+    if (this.camera.step(nowMs)) this.redraw();
+    if (!this.isDirty) return;
+    this.isDirty = false;
+    this.renderer.render(this.scene, this.camera.camera);
+    this.placeLabels();
+  }
+
+  private placeLabels(): void {
+    [...this.labels.children].forEach((label, i) => {
+      const answer = this.answers[i];
+      if (!answer || !(label instanceof HTMLElement)) return;
+      const box = boxOf(answer);
+      const point = new THREE.Vector3(...box.centre).addScaledVector(this.up, box.size[2] / 2).add(this.world.position).project(this.camera.camera);
+      label.hidden = point.z > 1 || !this.marks.boxes.visible;
+      label.style.transform = `translate(${((point.x + 1) / 2) * this.canvas.clientWidth}px, ${((1 - point.y) / 2) * this.canvas.clientHeight - 24}px)`;
+    });
+  }
+}

@@ -1,0 +1,100 @@
+// What stands over the splat: boxes of answers, the ground grid, photos' frusta, and the robot.
+
+import * as THREE from "three";
+import type { Answer, Description, Photo, Vector } from "../network";
+
+function disposeAll(group: THREE.Group): void {
+  group.traverse((object) => {
+    if (!(object instanceof THREE.Mesh || object instanceof THREE.LineSegments)) return;
+    object.geometry.dispose();
+    (object.material as THREE.Material).dispose();
+  });
+  group.clear();
+}
+
+export class Marks {
+  readonly boxes = new THREE.Group();
+  readonly ground = new THREE.Group();
+  readonly photos = new THREE.Group();
+  readonly robot = new THREE.Group();
+
+  constructor(parent: THREE.Object3D) {
+    this.photos.visible = false;
+    this.photos.renderOrder = this.robot.renderOrder = 5;
+    parent.add(this.boxes, this.ground, this.photos, this.robot);
+  }
+
+  /** Each box has a solid twin that is never drawn, for clicks. Only transparent things are drawn after the splats. */
+  showAnswers(answers: Answer[], chosen: number | null): void {
+    disposeAll(this.boxes);
+    answers.forEach((answer, index) => {
+      const box = boxOf(answer);
+      const solid = new THREE.BoxGeometry(...box.size);
+      const colour = index === chosen ? 0xffffff : 0x58c4ff;
+      const edges = new THREE.LineSegments(new THREE.EdgesGeometry(solid), new THREE.LineBasicMaterial({ color: colour, depthTest: false, transparent: true }));
+      const target = new THREE.Mesh(solid, new THREE.MeshBasicMaterial({ colorWrite: false, depthWrite: false, side: THREE.DoubleSide }));
+      target.userData.index = index;
+      for (const object of [edges, target]) {
+        object.position.set(...box.centre);
+        object.quaternion.copy(box.rotation);
+        object.renderOrder = 10;
+        this.boxes.add(object);
+      }
+    });
+  }
+
+  /** Lines a metre apart, or ten, on the plane under everything. */
+  showGround(box: THREE.Box3, up: THREE.Vector3, isGeographic: boolean, isDark: boolean): number {
+    disposeAll(this.ground);
+    const size = box.getSize(new THREE.Vector3()).length();
+    const stepM = size > 200 ? 10 : 1;
+    const n = Math.min(200, Math.ceil((size * 1.2) / stepM / 2) * 2);
+    const grid = new THREE.GridHelper(n * stepM, n, isDark ? 0x4a5563 : 0xa7b1bc, isDark ? 0x2a313a : 0xd2d8de);
+    const centre = box.getCenter(new THREE.Vector3());
+    const lowest = [box.min, box.max].map((corner) => corner.clone().sub(centre).dot(up)).reduce((a, b) => Math.min(a, b));
+    this.ground.add(grid);
+    if (isGeographic) this.ground.add(new THREE.ArrowHelper(new THREE.Vector3(0, 0, -1), new THREE.Vector3(), (n * stepM) / 2, 0xe05a4e));
+    // Three's grid lies in x and z; its -z becomes the world's y, which is north where the scene is geo-referenced.
+    this.ground.quaternion.setFromUnitVectors(new THREE.Vector3(0, 1, 0), up);
+    this.ground.position.copy(centre).addScaledVector(up, lowest);
+    return stepM;
+  }
+
+  showPhotos(photos: Photo[], lengthM: number): void {
+    disposeAll(this.photos);
+    const points: THREE.Vector3[] = [];
+    for (const photo of photos.slice(0, 2000)) {
+      const place = new THREE.Vector3(...photo.position_m);
+      const rotation = new THREE.Quaternion(...photo.rotation_xyzw);
+      const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([x, y]) =>
+        new THREE.Vector3((x * photo.width_px) / 2 / photo.focal_px, (y * photo.height_px) / 2 / photo.focal_px, 1)
+          .multiplyScalar(lengthM).applyQuaternion(rotation).add(place));
+      corners.forEach((corner, i) => points.push(place, corner, corner, corners[(i + 1) % 4]));
+    }
+    this.photos.add(new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(points), new THREE.LineBasicMaterial({ color: 0x6fbf8b, transparent: true })));
+  }
+
+  showRobot(position: Description["position"], up: THREE.Vector3): void {
+    disposeAll(this.robot);
+    if (!position?.position_m) return;
+    const at = new THREE.Vector3(...position.position_m);
+    const points: THREE.Vector3[] = [at.clone(), at.clone().addScaledVector(up, 1)];
+    const turn = new THREE.Quaternion().setFromUnitVectors(new THREE.Vector3(0, 0, 1), up);
+    for (const radius of [0.3, position.radius_m ?? 0].filter((radius) => radius > 0)) {
+      for (let i = 0; i < 64; i++) {
+        for (const angle of [i, i + 1].map((k) => (k * Math.PI) / 32)) {
+          points.push(new THREE.Vector3(Math.cos(angle) * radius, Math.sin(angle) * radius, 0).applyQuaternion(turn).add(at));
+        }
+      }
+    }
+    this.robot.add(new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(points), new THREE.LineBasicMaterial({ color: 0x4fd1a5, transparent: true })));
+  }
+}
+
+export function boxOf(answer: Answer): { centre: Vector; size: Vector; rotation: THREE.Quaternion } {
+  const oriented = answer.oriented_box;
+  if (oriented) return { centre: oriented.centre_in_world, size: oriented.size, rotation: new THREE.Quaternion(...oriented.rotation_world_from_box) };
+  const [min, max] = [answer.box_min_in_world, answer.box_max_in_world];
+  const combine = (f: (low: number, high: number) => number) => min.map((low, i) => f(low, max[i])) as Vector;
+  return { centre: combine((low, high) => (low + high) / 2), size: combine((low, high) => high - low), rotation: new THREE.Quaternion() };
+}

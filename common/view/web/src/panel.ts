@@ -1,0 +1,121 @@
+// The panel's elements, and what is written in them.
+
+import { rampColour } from "./drawing/ramp";
+import type { Answer, Description } from "./network";
+
+function element<T extends HTMLElement>(id: string): T {
+  const found = document.getElementById(id);
+  if (!found) throw new Error(`index.html has no #${id}`);
+  return found as T;
+}
+
+export const panel = {
+  canvas: element<HTMLCanvasElement>("canvas"),
+  labels: element("labels"),
+  form: element<HTMLFormElement>("ask"),
+  question: element<HTMLInputElement>("question"),
+  threshold: element<HTMLInputElement>("threshold"),
+  showBoxes: element<HTMLInputElement>("show-boxes"),
+  showGrid: element<HTMLInputElement>("show-grid"),
+  showPhotos: element<HTMLInputElement>("show-photos"),
+  whole: element<HTMLButtonElement>("whole"),
+};
+
+const count = new Intl.NumberFormat("en");
+
+export function say(text: string, isError = false): void {
+  element("message").textContent = text;
+  element("message").classList.toggle("error", isError);
+}
+
+export function showFacts(description: Description, nDrawn: number, stepM: number): void {
+  const missing = description.cells.filter((cell) => cell.state === "missing").length;
+  document.title = `${description.scene} · SLAG`;
+  element("scene").textContent = description.scene;
+  element("facts").textContent = [
+    `${count.format(nDrawn)} of ${count.format(description.n_gaussians)} Gaussians`,
+    `generation ${description.generation}`,
+    missing > 0 ? `${missing} of ${description.cells.length} cells missing` : "",
+    `grid ${stepM} m`,
+  ].filter(Boolean).join(" · ");
+  element("photos-label").hidden = description.views.length === 0;
+}
+
+export function showHistory(questions: string[]): void {
+  element("history").replaceChildren(...questions.map((question) => new Option(question, question)));
+}
+
+export function showLegend(range: { min: number; max: number } | null, level: number): void {
+  element("legend").hidden = range === null;
+  if (!range) return;
+  const score = (l: number) => (range.min + (l / 255) * (range.max - range.min)).toFixed(2);
+  panel.threshold.value = String(level);
+  panel.threshold.setAttribute("aria-valuetext", score(level));
+  element("threshold-value").textContent = score(level);
+  element("lowest").textContent = score(0);
+  element("highest").textContent = score(255);
+  const context = element<HTMLCanvasElement>("ramp").getContext("2d");
+  for (let l = 0; context && l < 256; l++) {
+    const [r, g, b] = l >= level ? rampColour((l - level) / Math.max(255 - level, 1)) : [120, 126, 133];
+    context.fillStyle = `rgb(${r} ${g} ${b})`;
+    context.fillRect(l, 0, 1, 1);
+  }
+}
+
+export function showAnswers(name: string, answers: Answer[], chosen: number | null, onChoose: (index: number) => void): void {
+  const focused = document.activeElement?.closest("#answers li");
+  const focusedIndex = focused ? [...element("answers").children].indexOf(focused) : -1;
+  element("answers").replaceChildren(...answers.map((answer, index) => {
+    const button = document.createElement("button");
+    button.type = "button";
+    button.setAttribute("aria-pressed", String(index === chosen));
+    const title = document.createElement("span");
+    title.textContent = `${index + 1}. ${name}`;
+    const score = document.createElement("span");
+    score.className = "score";
+    score.textContent = answer.score.toFixed(2);
+    const place = document.createElement("small");
+    const gaussians = answer.n_gaussians === undefined ? "" : ` · ${count.format(answer.n_gaussians)} Gaussians`;
+    place.textContent = `${answer.position_in_world.map((v) => v.toFixed(2)).join(", ")} m${gaussians}`;
+    button.append(title, score, place);
+    button.addEventListener("click", () => onChoose(index));
+    const item = document.createElement("li");
+    item.append(button);
+    return item;
+  }));
+  if (focusedIndex >= 0) element("answers").children[focusedIndex]?.querySelector("button")?.focus();
+}
+
+export function showDetails(name: string, answer: Answer | null, isGeographic: boolean): void {
+  const section = element("details");
+  section.hidden = answer === null;
+  if (!answer) return;
+  const metres = (v: number[]) => `${v.map((x) => x.toFixed(2)).join(", ")} m`;
+  const size = answer.oriented_box?.size ?? answer.box_max_in_world.map((v, i) => v - answer.box_min_in_world[i]);
+  const rows: [string, string][] = [
+    [isGeographic ? "East, north, up" : "World", metres(answer.position_in_world)],
+    ["Size", metres(size)],
+    ["Score", answer.score.toFixed(3)],
+  ];
+  if (answer.position_geographic) rows.push(["Lat, lon", `${answer.position_geographic.lat.toFixed(7)}, ${answer.position_geographic.lon.toFixed(7)}`]);
+  if (answer.evidence) rows.push(["Best photo", answer.evidence.photo]);
+  if (answer.id) rows.push(["Id", answer.id]);
+  const heading = document.createElement("h2");
+  heading.textContent = name;
+  const list = document.createElement("dl");
+  for (const [term, text] of rows) {
+    const [dt, dd] = [document.createElement("dt"), document.createElement("dd")];
+    dt.textContent = term;
+    dd.textContent = text;
+    list.append(dt, dd);
+  }
+  section.replaceChildren(heading, list);
+}
+
+/** Asks for the service's token. */
+export function askToken(): Promise<string> {
+  const dialog = element<HTMLDialogElement>("token-dialog");
+  const input = element<HTMLInputElement>("token");
+  dialog.showModal();
+  return new Promise((resolve) => dialog.addEventListener("close", () => resolve(input.value), { once: true }));
+}

@@ -1,0 +1,205 @@
+// The built page in Chromium with a software GPU: what is lit is compared with the boxes that are true.
+
+import assert from "node:assert/strict";
+import { mkdirSync, readFileSync } from "node:fs";
+import { createRequire } from "node:module";
+import { after, before, test } from "node:test";
+import { startService, THINGS } from "./service.mjs";
+
+const fromPage = createRequire(new URL("../../common/view/web/package.json", import.meta.url));
+const { chromium } = fromPage("playwright-core");
+const axe = readFileSync(fromPage.resolve("axe-core/axe.min.js"), "utf8");
+
+const [WIDTH, HEIGHT] = [1100, 640];
+const PANEL_PX = 360;
+const POSITION = [0.5, -6, 4];
+const TARGET = [0, 0, 0.5];
+const CAMERA = [...POSITION, ...TARGET].join(",");
+const FIELD_OF_VIEW_DEG = 55;
+const PICTURES = process.env.SLAG_PAGE_PICTURES;
+
+let browser;
+before(async () => {
+  browser = await chromium.launch({
+    executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
+    args: ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"],
+  });
+});
+after(() => browser?.close());
+
+/** A page of a fresh service; fails at errors in the console and requests to others, but for those expected. */
+async function opened(run, { behaviour = {}, fragment = "", options = {}, expected = null } = {}) {
+  const service = await startService(behaviour);
+  const context = await browser.newContext({ viewport: { width: WIDTH, height: HEIGHT }, colorScheme: "dark", reducedMotion: "reduce", bypassCSP: false, ...options });
+  const page = await context.newPage();
+  const wrong = [];
+  page.on("console", (message) => message.type() === "error" && wrong.push(message.text()));
+  page.on("pageerror", (error) => wrong.push(String(error)));
+  page.on("request", (request) => {
+    const url = request.url();
+    if (!url.startsWith(service.url) && !url.startsWith("blob:") && !url.startsWith("data:")) wrong.push(`foreign request: ${url}`);
+  });
+  try {
+    await page.goto(`${service.url}/view#${fragment}`);
+    await run(page, service);
+    assert.deepEqual(wrong.filter((text) => !expected?.test(text)), []);
+  } finally {
+    await context.close();
+    await service.stop();
+  }
+}
+
+const drawn = (page) => page.waitForFunction(() => document.documentElement.dataset.gaussians === "7360", null, { timeout: 30000 });
+const answered = (page, question) => page.waitForFunction((q) => document.documentElement.dataset.answered === q, question, { timeout: 30000 });
+
+/** Waits until two pictures in a row are equal. */
+async function picture(page, name) {
+  let last = null;
+  for (let i = 0; i < 40; i++) {
+    const next = await page.screenshot();
+    if (last?.equals(next)) break;
+    last = next;
+    await page.waitForTimeout(250);
+  }
+  if (PICTURES && name) {
+    mkdirSync(PICTURES, { recursive: true });
+    await page.screenshot({ path: `${PICTURES}/${name}.png` });
+  }
+  return last;
+}
+
+/** Pixels of strong colour beside the panel; the scene itself is grey. */
+async function litPixels(page, name) {
+  await page.uncheck("#show-boxes");
+  await page.uncheck("#show-grid");
+  const png = (await picture(page, name)).toString("base64");
+  const scratch = await browser.newPage();
+  try {
+    return await scratch.evaluate(async ([data, left]) => {
+      const image = await createImageBitmap(new Blob([Uint8Array.from(atob(data), (c) => c.charCodeAt(0))]));
+      const context = new OffscreenCanvas(image.width, image.height).getContext("2d");
+      context.drawImage(image, 0, 0);
+      const { data: rgba, width, height } = context.getImageData(0, 0, image.width, image.height);
+      const found = [];
+      for (let y = 0; y < height; y++) {
+        for (let x = left; x < width; x++) {
+          const [r, g, b] = rgba.subarray(4 * (y * width + x), 4 * (y * width + x) + 3);
+          if (r > 90 && r - Math.min(g, b) > 45) found.push([x, y]);
+        }
+      }
+      return found;
+    }, [png, PANEL_PX]);
+  } finally {
+    await scratch.close();
+  }
+}
+
+const minus = (a, b) => a.map((v, i) => v - b[i]);
+const dot = (a, b) => a.reduce((sum, v, i) => sum + v * b[i], 0);
+const cross = ([a, b, c], [d, e, f]) => [b * f - c * e, c * d - a * f, a * e - b * d];
+const unit = (v) => v.map((x) => x / Math.hypot(...v));
+
+/** Pixel of a world point, computed apart from the page. */
+function project(point) {
+  const forward = unit(minus(TARGET, POSITION));
+  const right = unit(cross(forward, [0, 0, 1]));
+  const ray = minus(point, POSITION);
+  const focal = HEIGHT / 2 / Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360);
+  const depth = dot(ray, forward);
+  return [WIDTH / 2 + (focal * dot(ray, right)) / depth, HEIGHT / 2 - (focal * dot(ray, cross(right, forward))) / depth];
+}
+
+/** The true mask: pixels inside the hull of a box's projected corners, which `grownPx` moves outward. */
+function isInside(thing, [x, y], grownPx) {
+  const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((i) => project(thing.min.map((low, k) => ((i >> k) & 1 ? thing.max[k] : low))));
+  // Inside the hull if no direction separates the point from all corners.
+  for (let i = 0; i < 72; i++) {
+    const [dx, dy] = [Math.cos((i * Math.PI) / 36), Math.sin((i * Math.PI) / 36)];
+    if (x * dx + y * dy > Math.max(...corners.map(([cx, cy]) => cx * dx + cy * dy)) + grownPx) return false;
+  }
+  return true;
+}
+
+for (const name of ["chair", "ball"]) {
+  test(`pixels that "${name}" lights are those of the truth`, () => opened(async (page) => {
+    await drawn(page);
+    await answered(page, name);
+    await picture(page, `${name}-answered`);
+    const lit = await litPixels(page, `${name}-lit`);
+    const thing = THINGS.find((entry) => entry.name === name);
+    let truePixels = 0;
+    for (let x = PANEL_PX; x < WIDTH; x++) for (let y = 0; y < HEIGHT; y++) truePixels += isInside(thing, [x, y], 0) ? 1 : 0;
+    const precision = lit.filter((pixel) => isInside(thing, pixel, 8)).length / lit.length;
+    const recall = lit.filter((pixel) => isInside(thing, pixel, 0)).length / truePixels;
+    console.log(`${name}: ${lit.length} lit, precision ${precision.toFixed(3)}, recall ${recall.toFixed(3)}`);
+    assert.ok(truePixels > 2000 && precision > 0.98 && recall > 0.85);
+  }, { fragment: `q=${name}&camera=${CAMERA}` }));
+}
+
+test("typing asks after a pause, the slider unlights, a click shows the thing, and the address keeps it", () => opened(async (page) => {
+  await drawn(page);
+  assert.ok(Number(await page.evaluate(() => document.documentElement.dataset.firstPictureMs)) < 10000);
+  await page.locator("#question").pressSequentially("chair");
+  await answered(page, "chair");
+  assert.match(page.url(), /q=chair/);
+  const before = (await litPixels(page)).length;
+  await page.locator("#threshold").fill("250");
+  const after = (await litPixels(page)).length;
+  assert.ok(before > 2000 && after === 0, `${before} lit, then ${after}`);
+  assert.match(page.url(), /threshold=0\.98/);
+  const [x, y] = project([1.2, 0.8, 0.5]);
+  await page.check("#show-boxes");
+  await page.mouse.click(x, y);
+  await page.locator("#details").waitFor();
+  assert.match(await page.locator("#details").innerText(), /1\.20, 0\.80, 0\.50 m/);
+  await page.fill("#question", "unicorn");
+  await page.getByText("nothing found").waitFor();
+}, { fragment: `camera=${CAMERA}` }));
+
+test("negatives go to the service", () => opened(async (page, service) => {
+  await drawn(page);
+  await page.fill("#question", "chair -wall -floor");
+  await answered(page, "chair -wall -floor");
+  assert.ok(service.behaviour.requests.includes("/v1/view/scores?text=chair&negative=wall%2Cfloor"));
+}));
+
+test("the token is asked for once", () => opened(async (page, service) => {
+  await page.locator("#token").fill("secret");
+  await page.keyboard.press("Enter");
+  await drawn(page);
+  assert.equal(service.behaviour.requests.filter((path) => path === "/v1/view").length, 2);
+}, { behaviour: { token: "secret" }, expected: /401/ }));
+
+test("a lost service and another generation are told", () => opened(async (page, service) => {
+  await drawn(page);
+  service.behaviour.isGone = true;
+  await page.getByText("cannot be reached").waitFor({ timeout: 15000 });
+  service.behaviour.isGone = false;
+  service.behaviour.generation = 2;
+  await page.getByText("generation 2 now").waitFor({ timeout: 15000 });
+  await drawn(page);
+}, { expected: /ERR_EMPTY_RESPONSE|ERR_CONNECTION|ERR_SOCKET/ }));
+
+for (const [name, options] of [["dark", {}], ["light", { colorScheme: "light" }], ["narrow", { viewport: { width: 360, height: 640 } }]]) {
+  test(`axe finds nothing: ${name}`, () => opened(async (page) => {
+    await drawn(page);
+    await answered(page, "chair");
+    await picture(page, name);
+    assert.ok(await page.evaluate(() => document.documentElement.scrollWidth <= innerWidth));
+    const found = await page.evaluate(`(() => { ${axe}; return axe.run(); })()`);
+    assert.deepEqual(found.violations.map(({ id, nodes }) => `${id}: ${nodes[0].html}`), []);
+  }, { fragment: "q=chair", options }));
+}
+
+test("without WebGL 2 a plain message says so", async () => {
+  await opened(async (page) => {
+    await page.addInitScript(() => {
+      const original = HTMLCanvasElement.prototype.getContext;
+      HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+        return kind === "webgl2" ? null : original.call(this, kind, ...rest);
+      };
+    });
+    await page.reload();
+    await page.getByText("no WebGL 2").waitFor();
+  });
+});

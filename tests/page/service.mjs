@@ -1,0 +1,103 @@
+// A service that speaks the page's protocol over a small known scene, so that tests can refuse, vanish and publish at will.
+
+import { createReadStream, readFileSync, statSync } from "node:fs";
+import { createServer } from "node:http";
+
+const DIST = new URL("../../common/view/dist/", import.meta.url);
+const POLICY = readFileSync(new URL("../../common/view/src/csp.txt", import.meta.url), "utf8").trim();
+const TYPES = { html: "text/html", js: "text/javascript", css: "text/css", svg: "image/svg+xml" };
+
+/** Boxes in world metres that hold Gaussians, grey all of them. */
+export const THINGS = [
+  { name: "floor", min: [-4, -4, -0.1], max: [4, 4, 0], n: [64, 64, 1] },
+  { name: "chair", min: [0.5, 0.5, 0], max: [1.9, 1.1, 1], n: [16, 8, 12] },
+  { name: "ball", min: [-2, -1.5, 0], max: [-1, -0.5, 1], n: [12, 12, 12] },
+];
+
+function half(value) {
+  if (value === 0) return 0;
+  const sign = value < 0 ? 0x8000 : 0;
+  const exponent = Math.floor(Math.log2(Math.abs(value)));
+  return exponent < -14 ? sign : sign | ((exponent + 15) << 10) | Math.floor((Math.abs(value) / 2 ** exponent - 1) * 1024);
+}
+
+function cellMessage(thing) {
+  const n = thing.n.reduce((a, b) => a * b);
+  const origin = thing.min.map((low, i) => (low + thing.max[i]) / 2);
+  const bytes = Buffer.alloc(32 + 16 * n);
+  bytes.write("SLGG");
+  bytes.writeUInt32LE(1, 4);
+  bytes.writeUInt32LE(n, 8);
+  origin.forEach((v, i) => bytes.writeFloatLE(v, 12 + 4 * i));
+  bytes.writeUInt32LE(1, 24);
+  const sigma = thing.min.map((low, i) => ((thing.max[i] - low) / thing.n[i]) * 0.5);
+  for (let i = 0; i < n; i++) {
+    const at = [i % thing.n[0], Math.floor(i / thing.n[0]) % thing.n[1], Math.floor(i / thing.n[0] / thing.n[1])];
+    for (let k = 0; k < 3; k++) {
+      const centre = thing.min[k] + ((at[k] + 0.5) / thing.n[k]) * (thing.max[k] - thing.min[k]) - origin[k];
+      bytes.writeUInt16LE(half(centre), 32 + 6 * i + 2 * k);
+      bytes[32 + 6 * n + 3 * i + k] = 110;
+      bytes[32 + 10 * n + 3 * i + k] = Math.round(((Math.log(sigma[k]) + 12) * 254) / 21) + 1;
+      bytes[32 + 13 * n + 3 * i + k] = k < 2 ? 128 : 0;
+    }
+    bytes[32 + 9 * n + i] = 230;
+  }
+  return bytes;
+}
+
+function scoresMessage(text) {
+  const counts = THINGS.map((thing) => thing.n.reduce((a, b) => a * b));
+  const head = Buffer.alloc(24 + 8 * THINGS.length);
+  head.write("SLGS");
+  head.writeUInt32LE(1, 4);
+  head.writeFloatLE(0, 8);
+  head.writeFloatLE(1, 12);
+  head.writeUInt32LE(THINGS.length, 16);
+  counts.forEach((n, i) => {
+    head.writeUInt32LE(i, 24 + 8 * i);
+    head.writeUInt32LE(n, 28 + 8 * i);
+  });
+  return Buffer.concat([head, ...THINGS.map((thing, i) => Buffer.alloc(counts[i], thing.name === text ? 220 : 30))]);
+}
+
+/** Starts it on a free port; `behaviour` may be changed while it runs. */
+export async function startService(behaviour = {}) {
+  Object.assign(behaviour, { token: null, generation: 1, isGone: false, requests: [], ...behaviour });
+  const json = (response, status, body) => response.writeHead(status, { "content-type": "application/json" }).end(JSON.stringify(body));
+  const server = createServer((request, response) => {
+    const url = new URL(request.url, "http://localhost");
+    behaviour.requests.push(request.url);
+    if (behaviour.isGone) return request.socket.destroy();
+    if (url.pathname === "/view" || url.pathname.startsWith("/view/")) {
+      const name = url.pathname.replace(/^\/view\/?/, "") || "index.html";
+      const path = new URL(name, DIST);
+      if (!path.href.startsWith(DIST.href) || !statSync(path, { throwIfNoEntry: false })?.isFile()) return response.writeHead(404).end();
+      response.writeHead(200, { "content-type": TYPES[name.split(".").pop()], "content-security-policy": POLICY });
+      return createReadStream(path).pipe(response);
+    }
+    if (behaviour.token && request.headers.authorization !== `Bearer ${behaviour.token}`) return json(response, 401, { detail: "token" });
+    const cell = url.pathname.match(/^\/v1\/view\/cells\/(\d+)$/);
+    if (cell) return response.writeHead(200).end(cellMessage(THINGS[Number(cell[1])]));
+    if (url.pathname === "/v1/view/scores") return response.writeHead(200).end(scoresMessage(url.searchParams.get("text")));
+    if (url.pathname === "/v1/query") {
+      const thing = THINGS.find(({ name }) => name === url.searchParams.get("text"));
+      const answers = thing ? [{
+        id: "o1", score: 0.86, n_gaussians: 1536, position_in_world: thing.min.map((low, i) => (low + thing.max[i]) / 2),
+        box_min_in_world: thing.min, box_max_in_world: thing.max,
+      }] : [];
+      const none = thing ? null : { reason: "nothing-there", detail: "nothing found" };
+      return json(response, 200, { results: [{ answers, none, parts: [{ threshold: 0.5 }] }] });
+    }
+    if (url.pathname !== "/v1/view") return json(response, 404, { detail: "nothing here" });
+    json(response, 200, {
+      program: "slag-edge", scene: "test room", generation: behaviour.generation, dim: 8, up: [0, 0, 1], geographic: false, levels: [], views: [],
+      n_gaussians: THINGS.reduce((sum, { n }) => sum + n[0] * n[1] * n[2], 0), position: { position_m: [-3, 3, 0], radius_m: 0.8 },
+      cells: THINGS.map(({ min, max, n }, i) => ({
+        cell: i, n_gaussians: n[0] * n[1] * n[2], state: "on_board", appearance: true, box_m: { min, max }, origin_m: [0, 0, 0],
+      })),
+    });
+  });
+  await new Promise((resolve) => server.listen(0, "127.0.0.1", resolve));
+  const stop = () => new Promise((resolve) => { server.closeAllConnections(); server.close(resolve); });
+  return { url: `http://127.0.0.1:${server.address().port}`, behaviour, stop };
+}
