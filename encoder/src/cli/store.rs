@@ -8,10 +8,12 @@ use clap::{Args, Subcommand};
 use serde::Serialize;
 use slag_common::Hash32;
 use slag_common::byte_size::ByteSize;
+use slag_common::tuf::format_utc;
 
-use super::common::print;
+use super::common::{now_unix_secs, print};
 use super::exit::Exit;
 use crate::progress::Progress;
+use crate::store::metadata::{Metadata, TIMESTAMP_DAYS};
 use crate::store::{Fault, Published, Store, StoreReader, Verified};
 
 /// `store`.
@@ -23,6 +25,17 @@ pub enum StoreCommand {
     Verify(StoreArgs),
     /// Removes what neither the current generation nor the one before it needs.
     Gc(StoreArgs),
+    /// Signs a new timestamp, so that clients can tell a store without news from one that hides them.
+    ///
+    /// For a timer; an encode that runs is no hindrance.
+    Refresh {
+        /// The store.
+        #[command(flatten)]
+        at: StoreArgs,
+        /// Days for which clients accept it.
+        #[arg(long, value_name = "N", default_value_t = TIMESTAMP_DAYS, value_parser = clap::value_parser!(u32).range(1..=3650))]
+        days: u32,
+    },
 }
 
 /// The store meant.
@@ -57,6 +70,15 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
             let pruned = Store::create_or_open(&at.store)?.prune()?;
             let lines = format!("{} objects removed, {}\n", pruned.n_objects, ByteSize(pruned.len_bytes));
             print(json, &pruned, lines)?;
+            Ok(Exit::Done)
+        }
+        StoreCommand::Refresh { at, days } => {
+            // A mistyped path must not create a store.
+            StoreReader::open(&at.store)?;
+            let refreshed = Metadata::open(&at.store)?.refresh(now_unix_secs(), *days)?;
+            let expires = format_utc(refreshed.expires_unix_secs);
+            let line = format!("timestamp {} until {expires}\n", refreshed.timestamp_version);
+            print(json, &refreshed, line)?;
             Ok(Exit::Done)
         }
     }

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use slag_common::Hash32;
 use slag_common::manifest::ManifestError;
+use slag_common::tuf::TufError;
 
 /// Why a store cannot be read or written.
 #[derive(Debug, thiserror::Error)]
@@ -48,6 +49,22 @@ pub enum StoreError {
         path: PathBuf,
         /// The cause.
         cause: ManifestError,
+    },
+    /// Stored metadata is damaged.
+    #[error("{}: {cause}; restore the store's folder metadata/ from a backup", path.display())]
+    Metadata {
+        /// The metadata file.
+        path: PathBuf,
+        /// The cause.
+        cause: TufError,
+    },
+    /// A role's key is not the one that the root names.
+    #[error("{}: it does not name the store's {role} key; restore the file keys/{role}.key that belongs to it", path.display())]
+    RoleKey {
+        /// The role.
+        role: String,
+        /// The newest root.
+        path: PathBuf,
     },
     /// The list of a generation's extra objects is damaged.
     #[error("{}: {what}; encode again", path.display())]

@@ -8,6 +8,7 @@
 //! | `extras/MANIFEST_HASH` | JSON name -> object hash: objects that belong to that manifest but not to robots |
 //! | `models.json` | name or folder of the models of the last encode, for queries on this machine |
 //! | `keys/` | signing keys (mode 0600) and their public halves, hex: see [`keys`] |
+//! | `metadata/` | metadata of The Update Framework: see [`metadata`] |
 //! | `db/` | sled: scene, generation, cells, state of jobs and pushes; opened by writers alone |
 //! | `job/` | working files of an unfinished encode |
 //! | `tmp/` | files being written |
@@ -15,15 +16,20 @@
 //! **Crash safety.** [`Store::publish`] goes in an order where each step leaves a whole store:
 //! objects are durable before (they are synced and renamed one by one, and checked here), then
 //! `extras/NEW`, then `manifest.previous` becomes the current one, then `manifest` is replaced. That
-//! last rename is the commit: since extras are named by the hash of the manifest they belong to, it
-//! switches both at once. The records in sled only repeat the manifest, for ordered look-ups; a crash
-//! before they are flushed is repaired at the next [`Store::create_or_open`].
+//! last rename is the commit for readers of this machine: since extras are named by the hash of the manifest
+//! they belong to, it switches both at once. Clients of the metadata follow `metadata/timestamp.json`, which
+//! comes after it. The records in sled only repeat the manifest, for ordered look-ups. What a crash left out
+//! of metadata and records is made good at the next [`Store::create_or_open`].
 
 mod error;
 mod files;
 pub mod keys;
+pub mod metadata;
+#[cfg(test)]
+mod metadata_tests;
 mod models;
 mod reader;
+mod roles;
 mod rotation;
 mod signed;
 #[cfg(test)]

@@ -14,6 +14,7 @@ use slag_common::manifest::{CellRecord, Manifest, TrustedKeys};
 use super::error::StoreError;
 use super::files::{self, Access, HashingWriter};
 use super::keys::{self, Keys};
+use super::metadata::Metadata;
 use super::models::ModelsRecord;
 use super::reader::{self, Extras, Published, StoreReader};
 use super::signed;
@@ -233,6 +234,7 @@ impl Store {
             }
             self.replace(&path, &signed)?;
         }
+        Metadata::open(&self.dir)?.publish(&signed, manifest.created_unix_secs)?;
         self.write_records(manifest, hash)?;
         Ok(hash)
     }
@@ -324,7 +326,10 @@ impl Store {
         // Without the extras: a damaged record of them is replaced by the next publication.
         let own = keys::PublicKeys::read(&self.dir)?.trusted();
         match reader::read_manifest(&self.dir.join(signed::MANIFEST), &own) {
-            Ok((manifest, signed)) => self.write_records(&manifest, Hash32::of(&signed)),
+            Ok((manifest, signed)) => {
+                Metadata::open(&self.dir)?.publish(&signed, manifest.created_unix_secs)?;
+                self.write_records(&manifest, Hash32::of(&signed))
+            }
             Err(StoreError::NotPublished { .. }) => Ok(()),
             Err(e) => Err(e),
         }

@@ -5,6 +5,7 @@
 
 mod cells;
 mod limits;
+mod metadata;
 mod objects;
 mod problem;
 mod router;

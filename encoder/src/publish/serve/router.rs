@@ -21,7 +21,7 @@ use tower_http::timeout::TimeoutLayer;
 
 use super::limits::Limits;
 use super::state::{AppState, Service, metrics};
-use super::{cells, objects, problem};
+use super::{cells, metadata, objects, problem};
 use crate::store::StoreError;
 
 /// First line of the help text.
@@ -45,6 +45,8 @@ pub(super) fn routes() -> Routes<Arc<Service>> {
     let parameter = |name, example, summary: &str| Parameter { name, example, summary: summary.to_owned() };
     Routes::default()
         .get("/v1/manifest", "signed manifest of the current generation, with ETag", objects::manifest)
+        .get("/v1/metadata/{name}", "TUF metadata, such as timestamp.json", metadata::metadata)
+        .get("/v1/targets/{name}", "the TUF target SHA256.manifest", metadata::target)
         .get("/v1/objects/{hash}", "shard of the current or previous manifest; byte ranges", objects::object)
         .get("/v1/cells", "cells near a point, with distances and shards", cells::cells)
         .parameters([

@@ -11,11 +11,13 @@ use axum::extract::State;
 use axum::response::IntoResponse;
 use slag_common::Hash32;
 use slag_common::manifest::{CellIndex, Manifest};
+use slag_common::tuf::TargetFile;
 use slag_service::metrics::{Exposition, ResponseCounts};
 use slag_service::problem::Problem;
 use tokio::sync::Semaphore;
 
 use super::limits::Limits;
+use crate::store::metadata::MANIFEST_TARGET;
 use crate::store::{Stamp, StoreError, StoreReader};
 
 /// Pause before a manifest that did not open is read again. The fault may lie in another file or pass by
@@ -30,16 +32,23 @@ pub(super) struct Snapshot {
     pub(super) index: CellIndex,
     /// Lengths of the shards that may be fetched: those of the current manifest and of the one before.
     pub(super) objects: BTreeMap<Hash32, u64>,
+    /// The manifests by their names as targets: the current one and the one before.
+    pub(super) targets: BTreeMap<String, Bytes>,
 }
 
 impl Snapshot {
     fn open(dir: &Path) -> Result<Self, StoreError> {
         let reader = StoreReader::open(dir)?;
-        let both = [reader.previous(), Some(reader.current())].into_iter().flatten();
+        let both = || [reader.previous(), Some(reader.current())].into_iter().flatten();
+        let target = |signed: &[u8]| {
+            let hash = &TargetFile::of(signed).hashes["sha256"];
+            (format!("{hash}.{MANIFEST_TARGET}"), Bytes::copy_from_slice(signed))
+        };
         Ok(Self {
+            targets: both().map(|published| target(&published.signed)).collect(),
             manifest: reader.current().signed.clone().into(),
             index: CellIndex::new(&reader.manifest().cells),
-            objects: both.flat_map(|published| published.shard_lens()).collect(),
+            objects: both().flat_map(|published| published.shard_lens()).collect(),
             reader,
         })
     }

@@ -52,6 +52,13 @@ impl Fixture {
         self.shards[range].iter().map(|(hash, bytes)| (*hash, bytes.len() as u64)).collect()
     }
 
+    /// The manifest's name among the targets, as the metadata states it.
+    fn manifest_sha256(&self) -> String {
+        let targets = fs_err::read(self.dir.path().join("metadata/2.targets.json")).expect("there");
+        let targets: Value = serde_json::from_slice(&targets).expect("JSON");
+        targets["signed"]["targets"]["manifest"]["hashes"]["sha256"].as_str().expect("text").to_owned()
+    }
+
     fn router(&self) -> Router {
         router(self.dir.path(), Limits::default(), Access::default()).expect("published")
     }
@@ -468,7 +475,11 @@ async fn the_help_lists_every_resource_and_parameter() {
     assert!(table.len() >= 7, "{table:?}");
     for route in &table {
         assert!(help.contains(&format!("\n{} {} ", route.method, route.path)), "{}: {help}", route.path);
-        let path = route.path.replace("{hash}", &fixture.shards[1].0.to_string());
+        let path = match route.path {
+            "/v1/metadata/{name}" => "/v1/metadata/timestamp.json".to_owned(),
+            "/v1/targets/{name}" => format!("/v1/targets/{}.manifest", fixture.manifest_sha256()),
+            path => path.replace("{hash}", &fixture.shards[1].0.to_string()),
+        };
         let status = get_with(&router, &path, &[]).await.status;
         assert_ne!(status, StatusCode::NOT_FOUND, "{path}");
         // The handler knows each parameter: it names another one than this in its refusal.

@@ -1,0 +1,226 @@
+//! The store as a repository of The Update Framework: its manifest is the target `manifest`.
+//!
+//! | file | what |
+//! |---|---|
+//! | `metadata/N.root.json` | the keys of all roles |
+//! | `metadata/N.targets.json` | length and hash of the manifest |
+//! | `metadata/N.snapshot.json` | version of the targets metadata |
+//! | `metadata/timestamp.json` | version of the snapshot, for a short time; its rename publishes the rest |
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use slag_common::durable;
+use slag_common::tuf::{
+    Body, FileMeta, MAX_ROOT_BYTES, MAX_SNAPSHOT_BYTES, MAX_TARGETS_BYTES, MAX_TIMESTAMP_BYTES, Root,
+    SignedMetadata, Snapshot, TargetFile, Targets, Timestamp, TufError, format_utc, sign,
+};
+
+use super::error::StoreError;
+use super::{files, roles};
+
+/// Path of the manifest among the targets.
+pub const MANIFEST_TARGET: &str = "manifest";
+/// The newest timestamp.
+pub const TIMESTAMP_FILE: &str = "timestamp.json";
+/// Days for which a timestamp counts, unless a refresh says otherwise.
+pub const TIMESTAMP_DAYS: u32 = 30;
+const SECS_PER_DAY: u64 = 86_400;
+const TARGETS_SECS: u64 = 365 * SECS_PER_DAY;
+const ROOT_SECS: u64 = 5 * 365 * SECS_PER_DAY;
+
+/// What a signature of the timestamp states.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Refreshed {
+    /// Version of the timestamp.
+    pub timestamp_version: u64,
+    /// Version of the snapshot that it names.
+    pub snapshot_version: u64,
+    /// When clients refuse it, seconds since 1970.
+    pub expires_unix_secs: u64,
+}
+
+/// The metadata of a store, held by one writer at a time.
+pub struct Metadata {
+    store: PathBuf,
+    _lock: File,
+}
+
+impl Metadata {
+    /// Opens the metadata for writing. An encode that runs does not hinder it; another signature is waited for.
+    ///
+    /// # Errors
+    /// [`StoreError::Io`].
+    pub fn open(store: &Path) -> Result<Self, StoreError> {
+        let folder = folder(store);
+        files::ensure_folder(&folder)?;
+        let path = folder.join("lock");
+        let file = fs_err::OpenOptions::new().write(true).create(true).truncate(false).open(&path)?;
+        let lock = file.into_parts().0;
+        lock.lock().map_err(|e| io::Error::new(e.kind(), format!("locking {}: {e}", path.display())))?;
+        Ok(Self { store: store.to_owned(), _lock: lock })
+    }
+
+    /// Publishes a manifest; nothing changes if it is published already. Makes keys and root at the first time.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub fn publish(&self, manifest: &[u8], now_unix_secs: u64) -> Result<(), StoreError> {
+        if !self.path("1.root.json").exists() {
+            self.make_root(now_unix_secs)?;
+        }
+        let targets = BTreeMap::from([(MANIFEST_TARGET.to_owned(), TargetFile::of(manifest))]);
+        if self.published()?.is_some_and(|published| published.body.targets == targets) {
+            return Ok(());
+        }
+        self.sign_all(&Targets { targets, delegations: None }, now_unix_secs)
+    }
+
+    /// Signs the timestamp anew, and the rest before half of its time is over. Needs the root's key never.
+    ///
+    /// # Errors
+    /// [`StoreError::NotPublished`] before the first publication; [`StoreError`] otherwise.
+    pub fn refresh(&self, now_unix_secs: u64, days: u32) -> Result<Refreshed, StoreError> {
+        let not_published = || StoreError::NotPublished { path: self.path(TIMESTAMP_FILE) };
+        let targets = self.published()?.ok_or_else(not_published)?;
+        let timestamp = self.timestamp()?.ok_or_else(not_published)?;
+        let name = format!("{}.snapshot.json", timestamp.body.snapshot().version);
+        let snapshot = self.read::<Snapshot>(&name, MAX_SNAPSHOT_BYTES)?.ok_or_else(not_published)?;
+        let soonest = targets.expires_unix_secs.min(snapshot.expires_unix_secs);
+        if soonest < now_unix_secs.saturating_add(TARGETS_SECS / 2) {
+            self.sign_all(&targets.body, now_unix_secs)?;
+        }
+        let version = self.timestamp()?.ok_or_else(not_published)?.body.snapshot().version;
+        let bytes = fs_err::read(self.path(&format!("{version}.snapshot.json")))?;
+        self.sign_timestamp(FileMeta::of(version, &bytes), now_unix_secs, days)
+    }
+
+    /// Returns the targets metadata that the timestamp names; `None` before the first publication.
+    fn published(&self) -> Result<Option<SignedMetadata<Targets>>, StoreError> {
+        let Some(timestamp) = self.timestamp()? else { return Ok(None) };
+        let name = format!("{}.snapshot.json", timestamp.body.snapshot().version);
+        let Some(snapshot) = self.read::<Snapshot>(&name, MAX_SNAPSHOT_BYTES)? else { return Ok(None) };
+        let name = format!("{}.targets.json", snapshot.body.meta["targets.json"].version);
+        self.read::<Targets>(&name, MAX_TARGETS_BYTES)
+    }
+
+    fn timestamp(&self) -> Result<Option<SignedMetadata<Timestamp>>, StoreError> {
+        self.read::<Timestamp>(TIMESTAMP_FILE, MAX_TIMESTAMP_BYTES)
+    }
+
+    fn make_root(&self, now_unix_secs: u64) -> Result<(), StoreError> {
+        let (body, key) = roles::make_all(&self.store)?;
+        let bytes = sign(1, now_unix_secs.saturating_add(ROOT_SECS), &body, &[&key]);
+        self.write("1.root.json", &bytes)?;
+        tracing::info!(
+            "the store's root of trust is {}; its key lies in {}, which can be kept elsewhere",
+            self.path("1.root.json").display(),
+            roles::root_folder(&self.store).display()
+        );
+        Ok(())
+    }
+
+    fn sign_all(&self, targets: &Targets, now_unix_secs: u64) -> Result<(), StoreError> {
+        let expires = now_unix_secs.saturating_add(TARGETS_SECS);
+        let version = self.next_version("targets")?;
+        let bytes = sign(version, expires, targets, &[&self.key(Targets::TYPE)?]);
+        self.write(&format!("{version}.targets.json"), &bytes)?;
+        let meta = BTreeMap::from([("targets.json".to_owned(), FileMeta::of(version, &bytes))]);
+        let version = self.next_version("snapshot")?;
+        let bytes = sign(version, expires, &Snapshot { meta }, &[&self.key(Snapshot::TYPE)?]);
+        self.write(&format!("{version}.snapshot.json"), &bytes)?;
+        self.sign_timestamp(FileMeta::of(version, &bytes), now_unix_secs, TIMESTAMP_DAYS).map(drop)
+    }
+
+    fn sign_timestamp(&self, snapshot: FileMeta, now: u64, days: u32) -> Result<Refreshed, StoreError> {
+        let timestamp_version = self.timestamp()?.map_or(1, |before| before.head.version.saturating_add(1));
+        let expires_unix_secs = now.saturating_add(u64::from(days) * SECS_PER_DAY);
+        let snapshot_version = snapshot.version;
+        let meta = BTreeMap::from([("snapshot.json".to_owned(), snapshot)]);
+        let body = Timestamp { meta, signed_at: Some(format_utc(now)) };
+        let key = self.key(Timestamp::TYPE)?;
+        self.write(TIMESTAMP_FILE, &sign(timestamp_version, expires_unix_secs, &body, &[&key]))?;
+        Ok(Refreshed { timestamp_version, snapshot_version, expires_unix_secs })
+    }
+
+    /// Returns a role's key, if the newest root names it: a signature by another one would lock clients out.
+    fn key(&self, role: &str) -> Result<ed25519_dalek::SigningKey, StoreError> {
+        let key = roles::read(&self.store, role)?;
+        let version = self.next_version(Root::TYPE)? - 1;
+        let name = format!("{version}.root.json");
+        let root = self.read::<Root>(&name, MAX_ROOT_BYTES)?;
+        let id = slag_common::tuf::Key::of(&key).id();
+        match root.is_some_and(|root| root.body.roles[role].keyids.contains(&id)) {
+            true => Ok(key),
+            false => Err(StoreError::RoleKey { role: role.to_owned(), path: self.path(&name) }),
+        }
+    }
+
+    /// Returns the version after the highest one of a role's numbered files.
+    fn next_version(&self, role: &str) -> Result<u64, StoreError> {
+        let suffix = format!(".{role}.json");
+        let mut highest = 0;
+        for entry in fs_err::read_dir(folder(&self.store))? {
+            let name = entry?.file_name();
+            let number = name.to_str().and_then(|name| name.strip_suffix(&suffix)?.parse::<u64>().ok());
+            highest = highest.max(number.unwrap_or(0));
+        }
+        Ok(highest.saturating_add(1))
+    }
+
+    fn read<T: Body>(&self, name: &str, max_bytes: u64) -> Result<Option<SignedMetadata<T>>, StoreError> {
+        let Some(bytes) = read_file(&self.store, name, max_bytes)? else { return Ok(None) };
+        let refuse = |cause| StoreError::Metadata { path: self.path(name), cause };
+        SignedMetadata::parse(T::TYPE, &bytes).map(Some).map_err(refuse)
+    }
+
+    fn write(&self, name: &str, bytes: &[u8]) -> Result<(), StoreError> {
+        Ok(durable::write(&self.path(name), bytes)?)
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        folder(&self.store).join(name)
+    }
+}
+
+/// Reads a metadata file of a store by the name that clients ask for; `None` if there is no such file.
+///
+/// # Errors
+/// [`StoreError::Io`]; [`StoreError::Metadata`] for one that is too long.
+pub fn read_published(store: &Path, name: &str) -> Result<Option<Vec<u8>>, StoreError> {
+    let max_bytes = match name.split_once('.') {
+        Some(("timestamp", "json")) => MAX_TIMESTAMP_BYTES,
+        // One spelling a number, so that no name leaves the folder.
+        Some((version, role)) if version.parse().is_ok_and(|v: u64| v.to_string() == version) => match role {
+            "root.json" => MAX_ROOT_BYTES,
+            "snapshot.json" => MAX_SNAPSHOT_BYTES,
+            "targets.json" => MAX_TARGETS_BYTES,
+            _ => return Ok(None),
+        },
+        _ => return Ok(None),
+    };
+    read_file(store, name, max_bytes)
+}
+
+fn read_file(store: &Path, name: &str, max_bytes: u64) -> Result<Option<Vec<u8>>, StoreError> {
+    let path = folder(store).join(name);
+    let file = match fs_err::File::open(&path) {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
+        file => file?,
+    };
+    let mut bytes = Vec::new();
+    io::Read::read_to_end(&mut io::Read::take(file, max_bytes + 1), &mut bytes)?;
+    match bytes.len() as u64 > max_bytes {
+        true => {
+            Err(StoreError::Metadata { path, cause: TufError::TooLong { what: name.to_owned(), max_bytes } })
+        }
+        false => Ok(Some(bytes)),
+    }
+}
+
+fn folder(store: &Path) -> PathBuf {
+    store.join("metadata")
+}

@@ -1,0 +1,137 @@
+//! What clients of The Update Framework see of a store; the oracle is the client of `slag-common`.
+
+use std::path::Path;
+
+use slag_common::manifest::Manifest;
+use slag_common::tuf::{Kept, Source, TargetFile, Trusted, TufError, find_target, refresh};
+
+use super::metadata::{MANIFEST_TARGET, Metadata, read_published};
+use super::tests::manifest;
+use super::{Extras, Store, StoreError};
+
+const DAY: u64 = 86_400;
+const NOW: u64 = 20_000 * DAY;
+
+struct Folder<'a>(&'a Path);
+
+impl Source for Folder<'_> {
+    fn metadata(&mut self, name: &str, _: u64) -> Result<Option<Vec<u8>>, String> {
+        read_published(self.0, name).map_err(|e| e.to_string())
+    }
+}
+
+fn publish(store: &Store, generation: u64, now: u64) {
+    let scene = Manifest { created_unix_secs: now, ..manifest(generation, &[]) };
+    store.publish(&scene, &Extras::new()).expect("publishes");
+}
+
+fn client(dir: &Path) -> Kept {
+    Kept::from_root(&read_published(dir, "1.root.json").expect("readable").expect("there")).expect("a root")
+}
+
+fn update(kept: &mut Kept, dir: &Path, now: u64) -> Result<(Trusted, TargetFile), TufError> {
+    let mut trusted = refresh(kept, &mut Folder(dir), now)?;
+    let found = find_target(&mut trusted, kept, &mut Folder(dir), MANIFEST_TARGET)?;
+    Ok((trusted, found.expect("listed")))
+}
+
+#[test]
+fn each_generation_is_a_target() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    publish(&store, 1, NOW);
+    let mut kept = client(dir.path());
+    for generation in 2..5 {
+        publish(&store, generation, NOW + generation);
+        let (trusted, target) = update(&mut kept, dir.path(), NOW).expect("honest");
+        let signed = fs_err::read(dir.path().join("manifest")).expect("there");
+        target.check("manifest", &signed).expect("the manifest");
+        assert_eq!(trusted.timestamp().map(|t| t.head.version), Some(generation));
+        assert_eq!(trusted.now_unix_secs(), NOW + generation, "the signed time is later than the clock");
+    }
+    // The same again signs nothing.
+    let before = fs_err::read(dir.path().join("metadata/timestamp.json")).expect("there");
+    publish(&store, 4, NOW + 4);
+    assert_eq!(fs_err::read(dir.path().join("metadata/timestamp.json")).expect("there"), before);
+}
+
+/// A crash after the manifest was replaced leaves clients with the generation before; opening makes it good.
+#[test]
+fn metadata_behind_the_manifest_is_made_good() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    publish(&store, 1, NOW);
+    let timestamp = dir.path().join("metadata/timestamp.json");
+    let old = fs_err::read(&timestamp).expect("there");
+    publish(&store, 2, NOW);
+    fs_err::write(&timestamp, old).expect("written");
+    drop(store);
+    Store::create_or_open(dir.path()).expect("opens");
+    let (_, target) = update(&mut client(dir.path()), dir.path(), NOW).expect("honest");
+    target
+        .check("manifest", &fs_err::read(dir.path().join("manifest")).expect("there"))
+        .expect("generation 2");
+}
+
+#[test]
+fn a_refresh_keeps_clients_and_needs_no_root_key() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    assert!(matches!(
+        Metadata::open(dir.path()).and_then(|metadata| metadata.refresh(NOW, 1)),
+        Err(StoreError::NotPublished { .. })
+    ));
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    publish(&store, 1, NOW);
+    let mut kept = client(dir.path());
+    fs_err::remove_dir_all(dir.path().join("keys/root")).expect("there");
+    let later = NOW + 31 * DAY;
+    assert!(matches!(update(&mut kept, dir.path(), later), Err(TufError::Expired { .. })));
+    // While a writer is open.
+    let refreshed = Metadata::open(dir.path()).expect("opens").refresh(later, 1).expect("signs");
+    assert_eq!((refreshed.timestamp_version, refreshed.snapshot_version), (2, 1));
+    assert_eq!(refreshed.expires_unix_secs, later + DAY);
+    update(&mut kept, dir.path(), later).expect("fresh");
+    // Long after: snapshot and targets are signed anew too.
+    let later = NOW + 400 * DAY;
+    let refreshed = Metadata::open(dir.path()).expect("opens").refresh(later, 1).expect("signs");
+    assert_eq!(refreshed.snapshot_version, 2);
+    update(&mut kept, dir.path(), later).expect("fresh");
+}
+
+/// A key that the root does not name would lock every client out.
+#[test]
+fn a_key_that_the_root_does_not_name_signs_nothing() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let store = Store::create_or_open(dir.path()).expect("opens");
+    publish(&store, 1, NOW);
+    fs_err::write(dir.path().join("keys/timestamp.key"), "07".repeat(32)).expect("written");
+    let refused = Metadata::open(dir.path()).expect("opens").refresh(NOW, 1);
+    assert!(
+        matches!(refused, Err(StoreError::RoleKey { ref role, .. }) if role == "timestamp"),
+        "{refused:?}"
+    );
+}
+
+#[cfg(unix)]
+#[test]
+fn role_keys_are_private() {
+    use std::os::unix::fs::PermissionsExt;
+    let dir = tempfile::tempdir().expect("temporary folder");
+    publish(&Store::create_or_open(dir.path()).expect("opens"), 1, NOW);
+    for name in ["root/1", "targets", "snapshot", "timestamp"] {
+        let path = dir.path().join("keys").join(format!("{name}.key"));
+        let mode = fs_err::metadata(path).expect("there").permissions().mode();
+        assert_eq!(mode & 0o777, 0o600, "{name}");
+    }
+}
+
+#[test]
+fn only_names_of_metadata_are_read() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    publish(&Store::create_or_open(dir.path()).expect("opens"), 1, NOW);
+    fs_err::copy(dir.path().join("metadata/1.root.json"), dir.path().join("metadata/01.root.json"))
+        .expect("copied");
+    for name in ["01.root.json", "+1.root.json", "root.json", "lock", "../manifest", "1.timestamp.json", ""] {
+        assert_eq!(read_published(dir.path(), name).expect("readable"), None, "{name}");
+    }
+}
