@@ -28,8 +28,8 @@ for _ in 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20; do
 done
 [ -n "$url" ] || { cat "$work/log" >&2; exit 1; }
 
-$native fetch --from "$url" --at 3.5,2.7,0 --radius 3 --cache "$work/native" --json >/dev/null
-arm fetch --from "$url" --at 3.5,2.7,0 --radius 3 --cache "$work/arm" --json
+$native fetch --trust-first --from "$url" --at 3.5,2.7,0 --radius 3 --cache "$work/native" --json >/dev/null
+arm fetch --trust-first --from "$url" --at 3.5,2.7,0 --radius 3 --cache "$work/arm" --json
 for question in red blue pink; do
     $native query "$question" --models colours --cache "$work/native" --near 3.5,2.7,0 --json >"$work/native.json" || true
     arm query "$question" --models colours --cache "$work/arm" --near 3.5,2.7,0 --json >"$work/arm.json" || true

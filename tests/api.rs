@@ -21,7 +21,8 @@ fn the_python_client_asks_a_robot() {
     run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "12"]));
     run(encode_room(&room, &store).args(["--models", "colours"]));
     let server = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
-    run(edge(&["fetch", "--from", &server.url, "--at", "3.5,2.7,0"]).args(["--cache", text(&cache)]));
+    run(edge(&["fetch", "--trust-first", "--from", &server.url, "--at", "3.5,2.7,0"])
+        .args(["--cache", text(&cache)]));
     let robot = Service::start(&mut edge(&["serve", "--models", "colours", "--cache", text(&cache)]));
     let test = root().join("clients/python/tests/against_the_program.py");
     let asked = run(Command::new(python).args([text(&test), &robot.url, "red"]));

@@ -64,7 +64,8 @@ fn a_robot_fetches_what_lies_around_it_by_metres_or_by_degrees() {
 
     let fetch = |at: &[&str], cache: &str| {
         let cache = dir.path().join(cache);
-        let mut args = vec!["fetch", "--from", &server.url, "--radius", "30", "--cache", text(&cache)];
+        let mut args =
+            vec!["fetch", "--trust-first", "--from", &server.url, "--radius", "30", "--cache", text(&cache)];
         args.extend(at);
         let report = run_json(&mut edge(&args));
         println!("{report}");

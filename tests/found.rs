@@ -53,7 +53,8 @@ fn a_robots_answer_names_gaussians_of_the_input() {
     let server = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
     for profile in ["compact", "balanced"] {
         let cache = dir.path().join(profile);
-        let fetch = ["fetch", "--from", &server.url, "--at", "3.5,2.7,0", "--profile", profile];
+        let fetch =
+            ["fetch", "--trust-first", "--from", &server.url, "--at", "3.5,2.7,0", "--profile", profile];
         run(edge(&fetch).args(["--cache", text(&cache)]));
         for kind in ["objects", "clusters", "gaussians"] {
             let file = dir.path().join(format!("{profile}-{kind}.ply"));

@@ -1,57 +1,50 @@
-//! Rotates a store's key while robots fetch, with the real programs.
+//! First trust and a store's metadata, with the real programs.
 
 use std::path::Path;
 
 use slag_tests::*;
 
 #[test]
-fn robots_follow_a_change_of_keys() {
+fn robots_believe_the_store_that_they_were_told_of() {
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let (room, store) = (dir.path().join("room"), dir.path().join("store"));
-    let keys =
-        |args: &[&str]| run_json(&mut encoder(&[&["keys"], args, &["--store", text(&store)]].concat()));
-    let first = keys(&["generate"])["present"].clone();
-    assert!(
-        !encoder(&["keys", "generate", "--store", text(&store)]).output().expect("runs").status.success()
-    );
-    let nowhere = dir.path().join("nowhere");
-    assert!(
-        !encoder(&["keys", "rotate", "--store", text(&nowhere)]).output().expect("runs").status.success()
-    );
-    assert!(!nowhere.exists(), "a typing error makes no store");
-
+    let (room, store, other) = (dir.path().join("room"), dir.path().join("store"), dir.path().join("other"));
     run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "3"]));
-    run(&mut encode_room(&room, &store));
+    for store in [&store, &other] {
+        run(&mut encode_room(&room, store));
+    }
     let service = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
-    let fetch = |cache: &Path, keys: &[&str]| {
-        let mut command = edge(&["fetch", "--from", &service.url, "--at", "3.5,2.7,0", "--radius", "50"]);
-        command.args(["--cache", text(cache)]).args(keys.iter().flat_map(|key| ["--key", key]));
+    let impostor = Service::start(&mut encoder(&["serve", "--store", text(&other)]));
+    let fetch = |cache: &Path, from: &Service| {
+        let mut command = edge(&["fetch", "--from", &from.url, "--at", "3.5,2.7,0", "--radius", "50"]);
+        command.args(["--cache", text(cache)]);
         command
     };
-    let (follows, sleeps) = (dir.path().join("follows"), dir.path().join("sleeps"));
-    let pinned = first.as_str().expect("text");
-    for cache in [&follows, &sleeps] {
-        assert_eq!(run_json(&mut fetch(cache, &[pinned]))["key"], first);
+    let add =
+        |cache: &Path, how: &[&str]| edge(&[&["trust", "add"], how, &["--cache", text(cache)]].concat());
+    let refused = |mut command: std::process::Command, expected: &str| {
+        let output = command.output().expect("runs");
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert!(!output.status.success() && error.contains(expected), "{error}");
+    };
+    let (by_file, by_hash) = (dir.path().join("by-file"), dir.path().join("by-hash"));
+    refused(fetch(&by_file, &service), "slag-edge trust add");
+    let root = store.join("metadata/1.root.json");
+    let added = run_json(&mut add(&by_file, &["--root", text(&root)]));
+    let sha256 = added["sha256"].as_str().expect("text");
+    let added = run_json(&mut add(&by_hash, &[&service.url, "--sha256", sha256]));
+    assert_eq!((&added["version"], &added["is_new"]), (&1.into(), &true.into()));
+    for cache in [&by_file, &by_hash] {
+        let report = run_json(&mut fetch(cache, &service));
+        assert_eq!((&report["root_version"], &report["is_first_contact"]), (&1.into(), &false.into()));
+        refused(fetch(cache, &impostor), "timestamp metadata: 0 of its keys signed it");
+        let first = ["--trust-first"];
+        refused(add(cache, &[&[impostor.url.as_str()][..], &first].concat()), "--replace");
     }
 
-    let begun = keys(&["rotate"]);
-    let second = begun["next"].clone();
-    assert_eq!(begun["present"], first);
-    let report = run_json(&mut fetch(&follows, &[pinned]));
-    assert_eq!((&report["key"], &report["next_key"], &report["generation"]), (&first, &second, &2.into()));
-    let finished = keys(&["rotate", "--finish"]);
-    assert_eq!((&finished["present"], &finished["previous"]), (&second, &first));
-    assert_eq!(keys(&["show"]), finished);
-    // The robot that fetched during the rotation goes on, although its command line names the old key.
-    let report = run_json(&mut fetch(&follows, &[pinned]));
-    assert_eq!((&report["key"], &report["replaced_key"]), (&second, &first));
-    assert_eq!(report["downloaded"]["n_shards"], 0, "the shards are the same");
-    let query =
-        |cache: &Path| run_json(&mut edge(&["query", "blue", "--cache", text(cache)]))["answers"].clone();
-    assert_eq!(query(&follows), query(&sleeps));
-    // The robot that slept is given both keys.
-    let refused = fetch(&sleeps, &[pinned]).output().expect("runs");
-    assert!(String::from_utf8_lossy(&refused.stderr).contains("is signed by key"));
-    let both = [pinned, second.as_str().expect("text")];
-    assert_eq!(run_json(&mut fetch(&sleeps, &both))["key"], second);
+    // A refresh needs no encode, and a robot sees it.
+    let refreshed = run_json(&mut encoder(&["store", "refresh", "--store", text(&store), "--days", "3"]));
+    run(&mut fetch(&by_file, &service));
+    let shown = run_json(&mut edge(&["trust", "show", "--cache", text(&by_file)]));
+    assert_eq!(shown["expires_unix_secs"], refreshed["expires_unix_secs"]);
+    assert_eq!(shown["root_sha256"], sha256);
 }

@@ -79,7 +79,8 @@ fn killed_fetches_leave_the_old_or_the_new_generation() {
     let stores =
         [&first, &second].map(|store| Service::start(&mut encoder(&["serve", "--store", text(store)])));
     let fetch = |from: &Service, cache: &Path| {
-        let mut command = edge(&["fetch", "--from", &from.url, "--at", "3.5,2.7,0", "--radius", "50"]);
+        let mut command =
+            edge(&["fetch", "--trust-first", "--from", &from.url, "--at", "3.5,2.7,0", "--radius", "50"]);
         command.args(["--cache", text(cache)]);
         command
     };

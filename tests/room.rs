@@ -123,7 +123,16 @@ fn the_robots_service_answers() {
     };
     encode();
     let server = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
-    run(&mut edge(&["fetch", "--from", &server.url, "--at", "3.5,2.7,0", "--cache", text(&cache)]));
+    run(&mut edge(&[
+        "fetch",
+        "--trust-first",
+        "--from",
+        &server.url,
+        "--at",
+        "3.5,2.7,0",
+        "--cache",
+        text(&cache),
+    ]));
     let robot = Service::start(&mut edge(&["serve", "--cache", text(&cache)]));
     let reply = robot.get("/query?text=red&near=3.5,2.7,0");
     assert!(!reply["answers"].as_array().expect("answers").is_empty(), "{reply}");

@@ -13,6 +13,7 @@ mod query;
 mod serve;
 mod status;
 mod text;
+mod trust;
 
 use clap::{Parser, Subcommand};
 
@@ -23,6 +24,7 @@ use models::ModelsArgs;
 use query::QueryArgs;
 use serve::ServeArgs;
 use status::StatusArgs;
+use trust::TrustCommand;
 
 /// Keeps the shards around a robot and answers text queries offline.
 #[derive(Debug, Parser)]
@@ -48,6 +50,9 @@ enum Command {
     Query(QueryArgs),
     /// Show what is on board.
     Status(StatusArgs),
+    /// Whom this robot believes.
+    #[command(subcommand)]
+    Trust(TrustCommand),
     /// List, pull, verify and describe public text models.
     Models(ModelsArgs),
     /// Measure a service and this machine; prints JSON.
@@ -74,6 +79,7 @@ impl Cli {
             Command::Serve(args) => (false, serve::run(args)),
             Command::Query(args) => (args.json, query::run(args)),
             Command::Status(args) => (args.json, status::run(args)),
+            Command::Trust(command) => (command.is_json(), trust::run(command)),
             Command::Models(args) => (args.json, models::run(args)),
             Command::Bench(command) => (true, bench::run(command)),
         };
@@ -183,7 +189,9 @@ mod tests {
             "slag-edge query chair --negatives ,",
             "slag-edge fetch --at 1,2,3 --at-geo 1,2",
             "slag-edge fetch --at-geo 91,0",
-            "slag-edge fetch --key 12",
+            "slag-edge trust add http://a",
+            "slag-edge trust add http://a --trust-first --root f",
+            "slag-edge trust add --trust-first",
             "slag-edge fetch --margin",
             "slag-edge bench",
             "slag-edge bench pause --gaussians 1",

@@ -13,6 +13,7 @@ use slag_common::Hash32;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use slag_common::shard::{Positions, Profile, ScoreErrors, ShardHeader, ShardView, quantise};
+use slag_common::tuf::one_key_repository;
 use slag_edge::text::TextService;
 use slag_models::{ModelDir, SessionOptions};
 
@@ -89,10 +90,11 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
     (manifest.sign(&manifest::generate_key()), shard)
 }
 
-/// Serves the two files of a store from a thread for as long as the tests run; returns its address.
+/// Serves the manifest, the metadata and the shard of a store from a thread for as long as the tests run; returns its address.
 fn store(signed: Vec<u8>, shard: Vec<u8>) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
     let address = format!("http://{}", listener.local_addr().expect("an address"));
+    let metadata = one_key_repository(&manifest::generate_key(), 3, manifest::TARGET, &signed);
     std::thread::spawn(move || {
         for stream in listener.incoming() {
             let mut stream = stream.expect("a connection");
@@ -100,9 +102,16 @@ fn store(signed: Vec<u8>, shard: Vec<u8>) -> String {
                 BufReader::new(stream.try_clone().expect("a handle")).lines().map_while(Result::ok);
             let request = lines.next().unwrap_or_default();
             lines.take_while(|line| !line.is_empty()).for_each(drop);
-            let body = if request.starts_with("GET /v1/manifest ") { &signed } else { &shard };
+            let path = request.split(' ').nth(1).and_then(|path| path.strip_prefix("/v1/")?.split_once('/'));
+            let body = match path {
+                Some(("metadata", name)) => metadata.get(name),
+                Some(("targets", _)) => Some(&signed),
+                _ => Some(&shard),
+            };
+            let status = if body.is_some() { "200 OK" } else { "404 Not Found" };
+            let body = body.map_or(&[][..], Vec::as_slice);
             let head =
-                format!("HTTP/1.1 200 OK\r\ncontent-length: {}\r\nconnection: close\r\n\r\n", body.len());
+                format!("HTTP/1.1 {status}\r\ncontent-length: {}\r\nconnection: close\r\n\r\n", body.len());
             // The client may close early.
             let _ = stream.write_all(&[head.as_bytes(), body].concat());
         }
@@ -167,8 +176,10 @@ fn a_robot_fetches_asks_and_serves() {
 
     let (code, out, _) = run(&cache, &["query", "red", "--json"]);
     assert_eq!((code, &json(&out)["error"]["kind"]), (Some(1), &"no-scene".into()));
-    let (code, out, err) =
-        run(&cache, &["fetch", "--from", &from, "--at", "0,0,0", "--radius", "20", "--json"]);
+    let (code, out, err) = run(
+        &cache,
+        &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0", "--radius", "20", "--json"],
+    );
     assert_eq!((code, err.as_str()), (Some(0), ""), "{out}");
     assert_eq!(json(&out)["downloaded"]["n_shards"], 1);
     let (code, out, _) = run(&cache, &["status", "--json"]);
@@ -211,7 +222,7 @@ fn an_interrupted_fetch_says_so() {
     let silent = TcpListener::bind("127.0.0.1:0").expect("a port");
     let from = format!("http://{}", silent.local_addr().expect("an address"));
     let dir = tempfile::tempdir().expect("a folder");
-    let mut fetching = slag_edge(dir.path(), &["fetch", "--from", &from, "--at", "0,0,0"]);
+    let mut fetching = slag_edge(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]);
     let fetching = fetching.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
     // The signal handler is installed before it connects. Closing the connection makes it retry, and check
     // the flag.
@@ -228,7 +239,7 @@ fn nobody_reads_and_nobody_complains() {
     let (signed, shard) = red_and_blue();
     let dir = tempfile::tempdir().expect("a folder");
     let from = store(signed, shard);
-    assert_eq!(run(dir.path(), &["fetch", "--from", &from, "--at", "0,0,0"]).0, Some(0));
+    assert_eq!(run(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]).0, Some(0));
     let mut child = slag_edge(dir.path(), &["query", "red", "--kind", "gaussians", "--json"]);
     let mut child = child.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
     drop(child.stdout.take());
@@ -246,6 +257,7 @@ fn a_robot_is_followed_along_stdin() {
     let watch = |text: &str| {
         let args = [
             "fetch",
+            "--trust-first",
             "--watch",
             "--from",
             &from,
@@ -284,7 +296,7 @@ fn a_robot_is_followed_by_its_service() {
     let (signed, shard) = red_and_blue();
     let dir = tempfile::tempdir().expect("a folder");
     let from = store(signed, shard);
-    let (serving, url) = serve(dir.path(), &["--follow", &from, "--radius", "20"]);
+    let (serving, url) = serve(dir.path(), &["--trust-first", "--follow", &from, "--radius", "20"]);
     assert_eq!(get(&format!("{url}/query?text=blue")).0, 503);
     let posted = ureq::post(format!("{url}/position")).content_type("application/json");
     let posted = posted.send(r#"{"x":1,"y":2,"z":3}"#).expect("an answer");
@@ -312,7 +324,7 @@ fn overload_is_turned_away_and_memory_stays() {
     let (signed, shard) = red_and_blue();
     let dir = tempfile::tempdir().expect("a folder");
     let from = store(signed, shard);
-    assert_eq!(run(dir.path(), &["fetch", "--from", &from, "--at", "0,0,0"]).0, Some(0));
+    assert_eq!(run(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]).0, Some(0));
     let (serving, url) = serve(dir.path(), &[]);
     let mut load = Command::new(env!("CARGO_BIN_EXE_slag-edge"));
     load.args(["bench", "load", "--url", &url, "--text", "blue", "--seconds", "10", "--clients", "320"]);

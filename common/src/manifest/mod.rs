@@ -13,5 +13,7 @@ mod tests;
 
 pub use error::ManifestError;
 pub use index::CellIndex;
-pub use records::{Calibration, CellRecord, EncoderRecord, MAX_BYTES, Manifest, ShardRecord, VERSION};
+pub use records::{
+    Calibration, CellRecord, EncoderRecord, MAX_BYTES, Manifest, ShardRecord, TARGET, VERSION,
+};
 pub use signature::{TrustedKeys, generate_key};

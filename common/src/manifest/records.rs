@@ -10,6 +10,8 @@ use crate::shard::{Profile, ScoreErrors};
 
 /// Version of the manifest format that is written and read.
 pub const VERSION: u32 = 1;
+/// Path of the manifest among a store's targets.
+pub const TARGET: &str = "manifest";
 /// Largest manifest read: a cell takes about 600 bytes, so this allows 100,000 cells.
 pub const MAX_BYTES: u64 = 64 << 20;
 

@@ -76,7 +76,7 @@ pub enum TufError {
         max_bytes: u64,
     },
     /// A file that must be there is missing.
-    #[error("{what} is missing in the store; publish the scene again")]
+    #[error("{what} is missing in the store; check the address, or publish the scene again")]
     Missing {
         /// The file or role.
         what: String,

@@ -19,7 +19,9 @@ pub struct Kept {
     pub timestamp: Option<String>,
     /// The newest snapshot.
     pub snapshot: Option<String>,
-    /// The newest targets metadata, by role.
+    /// The newest targets metadata, by role: saves downloads, and need not outlive the process, because the snapshot
+    /// states its versions.
+    #[serde(skip)]
     pub targets: BTreeMap<String, String>,
 }
 
@@ -31,6 +33,17 @@ impl Kept {
     pub fn from_root(bytes: &[u8]) -> Result<Self, TufError> {
         parse_own_root(bytes)?;
         Ok(Self { root: text(Root::TYPE, bytes)?, timestamp: None, snapshot: None, targets: BTreeMap::new() })
+    }
+
+    /// Returns the version of the newest root.
+    pub fn root_version(&self) -> Option<u64> {
+        SignedMetadata::<Root>::parse(Root::TYPE, self.root.as_bytes()).ok().map(|root| root.head.version)
+    }
+
+    /// Returns when the newest timestamp expires, seconds since 1970.
+    pub fn expires_unix_secs(&self) -> Option<u64> {
+        let bytes = self.timestamp.as_ref()?.as_bytes();
+        Some(SignedMetadata::<Timestamp>::parse(Timestamp::TYPE, bytes).ok()?.expires_unix_secs)
     }
 
     /// Returns the time of signing that the newest timestamp states, seconds since 1970; it lies before its expiry.

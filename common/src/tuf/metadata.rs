@@ -163,6 +163,24 @@ impl TargetFile {
         Self { length: bytes.len() as u64, hashes: hashes_of(bytes), custom: None }
     }
 
+    /// Returns the name of the file at a path in a repository with consistent snapshots.
+    ///
+    /// # Errors
+    /// [`TufError::Content`] if no hash of a known kind is stated.
+    pub fn file_name(&self, path: &str) -> Result<String, TufError> {
+        let hash = ["sha256", "sha512"].into_iter().find_map(|algorithm| self.hashes.get(algorithm));
+        // A hash becomes part of a name: nothing but hex digits may.
+        let hash =
+            hash.filter(|hash| hash.bytes().all(|byte| byte.is_ascii_hexdigit())).ok_or_else(|| {
+                let fault = "no hash of a known kind is stated, expected sha256 or sha512".into();
+                TufError::Content { what: path.to_owned(), fault }
+            })?;
+        Ok(match path.rsplit_once('/') {
+            Some((folder, name)) => format!("{folder}/{hash}.{name}"),
+            None => format!("{hash}.{path}"),
+        })
+    }
+
     /// Checks a file's bytes.
     ///
     /// # Errors
@@ -231,8 +249,13 @@ pub struct DelegatedRole {
     pub path_hash_prefixes: Option<Vec<String>>,
 }
 
+/// Returns the SHA-256 of bytes, hex.
+pub fn sha256_hex(bytes: &[u8]) -> String {
+    hex::encode(Sha256::digest(bytes))
+}
+
 fn hashes_of(bytes: &[u8]) -> BTreeMap<String, String> {
-    BTreeMap::from([("sha256".to_owned(), hex::encode(Sha256::digest(bytes)))])
+    BTreeMap::from([("sha256".to_owned(), sha256_hex(bytes))])
 }
 
 fn check_content(
@@ -250,7 +273,7 @@ fn check_content(
     let mut n_known = 0;
     for (algorithm, expected) in hashes {
         let found = match algorithm.as_str() {
-            "sha256" => hex::encode(Sha256::digest(bytes)),
+            "sha256" => sha256_hex(bytes),
             "sha512" => hex::encode(Sha512::digest(bytes)),
             _ => continue,
         };

@@ -17,6 +17,7 @@ mod error;
 mod kept;
 mod key;
 mod metadata;
+mod repository;
 mod signed;
 mod time;
 mod trusted;
@@ -28,7 +29,9 @@ pub use kept::Kept;
 pub use key::Key;
 pub use metadata::{
     Body, DelegatedRole, Delegations, FileMeta, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp,
+    sha256_hex,
 };
+pub use repository::one_key_repository;
 pub use signed::{Head, MetadataSignature, SignedMetadata, sign};
 pub use time::{format_utc, parse_utc};
 pub use trusted::{Offered, Trusted};
@@ -37,12 +40,12 @@ pub use update::{Source, find_target, refresh};
 /// Version of the specification that is written.
 pub const SPEC_VERSION: &str = "1.0.31";
 /// Longest root metadata read.
-pub const MAX_ROOT_BYTES: u64 = 512 << 10;
+pub const MAX_ROOT_BYTES: u64 = 256 << 10;
 /// Longest timestamp metadata read.
 pub const MAX_TIMESTAMP_BYTES: u64 = 16 << 10;
-/// Longest snapshot metadata read where the timestamp states no length.
-pub const MAX_SNAPSHOT_BYTES: u64 = 2 << 20;
-/// Longest targets metadata read where the snapshot states no length.
+/// Longest snapshot metadata read. A client keeps root, timestamp and snapshot; this bounds what it keeps.
+pub const MAX_SNAPSHOT_BYTES: u64 = 256 << 10;
+/// Longest targets metadata read.
 pub const MAX_TARGETS_BYTES: u64 = 5 << 20;
 /// Most new roots read in one update.
 pub const MAX_ROOTS: u32 = 256;

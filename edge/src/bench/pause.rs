@@ -117,6 +117,7 @@ pub fn run(options: &PauseOptions) -> Result<PauseReport, PauseError> {
         from: Some(from),
         at: Some(Position::World(DVec3::ZERO)),
         radius: 1e6,
+        trust_first: true,
         ..FetchRequest::default()
     };
     let cancel = AtomicBool::new(false);

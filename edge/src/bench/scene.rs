@@ -14,6 +14,7 @@ use slag_common::Hash32;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use slag_common::shard::{self, Positions, Profile, ScoreErrors, ShardHeader, ShardView};
+use slag_common::tuf::one_key_repository;
 use slag_models::{InferenceError, TextEncoder};
 
 use crate::text::{EncoderInfo, TextService};
@@ -70,6 +71,7 @@ pub(super) fn text_service(dim: u32) -> io::Result<TextService> {
 #[derive(Default)]
 pub(super) struct Published {
     signed: Vec<u8>,
+    metadata: BTreeMap<String, Vec<u8>>,
     objects: BTreeMap<Hash32, Vec<u8>>,
 }
 
@@ -124,6 +126,7 @@ impl Generator {
             cells,
         };
         published.signed = manifest.sign(&self.key);
+        published.metadata = one_key_repository(&self.key, generation, manifest::TARGET, &published.signed);
         Ok(published)
     }
 
@@ -193,6 +196,13 @@ pub(super) type Shelf = Arc<RwLock<Published>>;
 
 /// Returns the routes of a store that robots can fetch from.
 pub(super) fn store(shelf: Shelf) -> Router {
+    async fn metadata(State(shelf): State<Shelf>, Path(name): Path<String>) -> Response {
+        let shelf = shelf.read().unwrap_or_else(PoisonError::into_inner);
+        match shelf.metadata.get(&name) {
+            Some(bytes) => bytes.clone().into_response(),
+            None => StatusCode::NOT_FOUND.into_response(),
+        }
+    }
     async fn manifest(State(shelf): State<Shelf>) -> Vec<u8> {
         shelf.read().unwrap_or_else(PoisonError::into_inner).signed.clone()
     }
@@ -204,7 +214,8 @@ pub(super) fn store(shelf: Shelf) -> Router {
         }
     }
     Router::new()
-        .route("/v1/manifest", get(manifest))
+        .route("/v1/metadata/{name}", get(metadata))
+        .route("/v1/targets/{name}", get(manifest))
         .route("/v1/objects/{hash}", get(object))
         .with_state(shelf)
 }

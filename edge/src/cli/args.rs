@@ -7,7 +7,6 @@ use std::path::PathBuf;
 use anyhow::anyhow;
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
-use slag_common::Hash32;
 use slag_common::shard::Profile;
 use slag_edge::fetch::{FetchRequest, Position};
 use slag_edge::query::Engine;
@@ -19,7 +18,6 @@ use slag_models::session::SessionError;
 use slag_models::{ModelDir, SessionOptions};
 
 use super::failure::Failure;
-use super::network::checked_keys;
 
 /// Most threads for a text model by default; more gain little for short texts.
 const MAX_MODEL_THREADS: usize = 4;
@@ -49,10 +47,9 @@ pub struct DownloadArgs {
     /// Profile of the shards.
     #[arg(long, default_value_t = Profile::Compact, value_parser = profile_parser())]
     pub profile: Profile,
-    /// The only public key accepted, or its replacement. May be given twice: the second is the successor's,
-    /// for a robot that missed the key change [default: the key accepted before, or the first one seen].
-    #[arg(long, value_name = "HEX")]
-    pub key: Vec<Hash32>,
+    /// At the first contact, trust whoever answers at the address. Safer: `slag-edge trust add` beforehand.
+    #[arg(long)]
+    pub trust_first: bool,
     /// Most bytes kept on disk for shards [default: twice the bytes of the shards within the radius].
     #[arg(long, value_name = "N")]
     pub max_bytes: Option<u64>,
@@ -60,16 +57,16 @@ pub struct DownloadArgs {
 
 impl DownloadArgs {
     /// Returns the request for a store and a position; without them, those of the last fetch.
-    pub fn request(self, from: Option<String>, at: Option<Position>) -> Result<FetchRequest, Failure> {
-        Ok(FetchRequest {
+    pub fn request(self, from: Option<String>, at: Option<Position>) -> FetchRequest {
+        FetchRequest {
             from,
             at,
             radius: self.radius,
             profile: self.profile,
-            keys: checked_keys(self.key)?,
+            trust_first: self.trust_first,
             max_bytes: self.max_bytes,
             ..FetchRequest::default()
-        })
+        }
     }
 }
 

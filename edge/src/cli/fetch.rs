@@ -56,7 +56,7 @@ pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
         (None, None) => None,
     };
     let settings = args.follow.settings(args.download.radius)?;
-    let request = FetchRequest { scene: args.scene, ..args.download.request(args.from, at)? };
+    let request = FetchRequest { scene: args.scene, ..args.download.request(args.from, at) };
     let cache = args.cache.open()?;
     let cancel = Arc::new(AtomicBool::new(false));
     let on_signal = Arc::clone(&cancel);

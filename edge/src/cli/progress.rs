@@ -12,10 +12,12 @@ use super::output::print_pairs;
 /// Prints the report of a fetch.
 pub fn print_report(report: &FetchReport) -> Result<(), Failure> {
     let tally = |t: &Tally| format!("{} shards, {} bytes", t.n_shards, t.bytes);
-    let trust = match report.replaced_key {
-        _ if report.is_first_contact => " (first contact: compare it with the store's key)",
-        Some(_) => " (replaced the previous key, which is no longer accepted)",
-        None => "",
+    let trust = match (report.root_version, report.is_first_contact) {
+        (Some(version), true) => {
+            format!("root {version}, trusted at first contact: compare it with the store's")
+        }
+        (Some(version), false) => format!("root {version}"),
+        (None, _) => "no root yet".into(),
     };
     print_pairs(&[
         ("scene", report.scene.clone()),
@@ -27,7 +29,7 @@ pub fn print_report(report: &FetchReport) -> Result<(), Failure> {
         ("spare", tally(&report.spare)),
         ("freed", tally(&report.freed)),
         ("seconds", format!("{:.2}", report.seconds)),
-        ("signed by", format!("{}{trust}", report.key)),
+        ("trusted by", trust),
     ])
 }
 

@@ -88,7 +88,7 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
         let follower = match following {
             Some(following) => {
                 let settings = args.following.settings(args.download.radius)?;
-                let request = args.download.request(args.follow, None)?;
+                let request = args.download.request(args.follow, None);
                 Some(follow_in_background(request, settings, cache, following, Arc::clone(&app))?)
             }
             None => None,

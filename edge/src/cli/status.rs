@@ -22,7 +22,7 @@ pub struct StatusArgs {
 pub fn run(args: StatusArgs) -> Result<(), Failure> {
     let cache = args.cache.open()?;
     let snapshot = Snapshot::open(&cache).map_err(store_failure)?;
-    let pinned_scene = accepted(&cache).map(|accepted| accepted.scene);
+    let pinned_scene = accepted(&cache).and_then(|accepted| accepted.scene);
     let status = Status::of(&snapshot);
     let expires_unix_secs = snapshot.manifest.expires_unix_secs;
     let is_expired = snapshot.manifest.check_expiry(slag_edge::now_unix_secs()).is_err();

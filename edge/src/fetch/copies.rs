@@ -7,12 +7,13 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
-use slag_common::Hash32;
+use slag_common::{Hash32, tuf};
 
 use crate::store::files::Files;
 
-/// A longer copy is damaged.
-pub const MAX_COPY_BYTES: u64 = 1 << 20;
+/// A longer copy is damaged. It holds the longest metadata that a client keeps, with its quotes escaped.
+pub const MAX_COPY_BYTES: u64 =
+    2 * (tuf::MAX_ROOT_BYTES + tuf::MAX_TIMESTAMP_BYTES + tuf::MAX_SNAPSHOT_BYTES) + (64 << 10);
 const NAMES: [&str; 2] = ["0", "1"];
 
 /// The state of the copies.

@@ -1,4 +1,4 @@
-//! HTTP downloads: the manifest and shards arrive whole or not at all, within their announced lengths.
+//! HTTP downloads: small files and shards arrive whole or not at all, within their lengths.
 
 use std::io::Read;
 use std::path::Path;
@@ -6,16 +6,14 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use slag_common::Hash32;
-use slag_common::manifest::{self, ManifestError};
 use slag_common::retry::{Backoff, Retries};
+use slag_common::tuf::TufError;
 use ureq::http::{Response, StatusCode, Uri, header};
 
 use super::environment::Environment;
 use super::error::{DownloadFailure, FetchError};
 use crate::store::files::Files;
 
-/// Expected length of a manifest; sets its time limit.
-const USUAL_MANIFEST_BYTES: u64 = 1 << 20;
 /// Downloads of a shard with wrong content before it is given up: one for a partial file that a power cut
 /// damaged, two for the network.
 const MAX_WRONG_HASHES: u32 = 3;
@@ -54,14 +52,6 @@ impl From<ureq::Error> for Stop {
     fn from(e: ureq::Error) -> Self {
         Self::Failed(DownloadFailure::Transport(Box::new(e)))
     }
-}
-
-/// The server's answer to a manifest request.
-pub(super) enum ManifestAnswer {
-    /// The manifest still has the known hash.
-    Unchanged,
-    /// A manifest's bytes.
-    New(Vec<u8>),
 }
 
 /// Downloads from one store.
@@ -106,33 +96,42 @@ impl<'a> Client<'a> {
         Ok(Self { agent, base, environment, resumed_bytes: AtomicU64::new(0), retries: AtomicU64::new(0) })
     }
 
-    /// Downloads the manifest, unless it still has a known hash.
-    pub fn manifest(&self, known: Option<Hash32>) -> Result<ManifestAnswer, FetchError> {
-        let url = format!("{}/v1/manifest", self.base);
-        self.retrying(&url, || self.try_manifest(&url, known))
+    /// Returns the address of the store.
+    pub fn base(&self) -> &str {
+        &self.base
     }
 
-    fn try_manifest(&self, url: &str, known: Option<Hash32>) -> Result<ManifestAnswer, Stop> {
-        let etag = known.map(|hash| (header::IF_NONE_MATCH, format!("\"{hash}\"")));
-        let response = self.get(url, USUAL_MANIFEST_BYTES, etag)?;
+    /// Downloads a file of at most `max_bytes`; `None` if the store does not have it.
+    pub fn file(&self, path: &str, max_bytes: u64) -> Result<Option<Vec<u8>>, FetchError> {
+        let url = format!("{}/v1/{path}", self.base);
+        self.retrying(&url, || self.try_file(&url, path, max_bytes))
+    }
+
+    fn try_file(&self, url: &str, path: &str, max_bytes: u64) -> Result<Option<Vec<u8>>, Stop> {
+        let too_long = || FetchError::from(TufError::TooLong { what: path.to_owned(), max_bytes });
+        let response = self.get(url, max_bytes, None)?;
         match response.status() {
-            StatusCode::NOT_MODIFIED if known.is_some() => return Ok(ManifestAnswer::Unchanged),
+            StatusCode::NOT_FOUND => return Ok(None),
             StatusCode::OK => {}
             _ => return Err(refusal(&response).into()),
         }
-        if let Some(len_bytes) = response.body().content_length().filter(|len| *len > manifest::MAX_BYTES) {
-            return Err(FetchError::from(ManifestError::TooLong { len_bytes }).into());
+        let stated = response.body().content_length();
+        if stated.is_some_and(|len_bytes| len_bytes > max_bytes) {
+            return Err(too_long().into());
         }
-        let mut body = response.into_body().into_reader().take(manifest::MAX_BYTES + 1);
+        let mut body = response.into_body().into_reader().take(max_bytes.saturating_add(1));
         let mut bytes = Vec::new();
         let mut chunk = vec![0; self.environment.limits.chunk_bytes.max(1)];
         loop {
             self.check_cancelled()?;
             match body.read(&mut chunk).map_err(ureq::Error::from)? {
-                // Verification refuses a body that is too long.
-                0 => return Ok(ManifestAnswer::New(bytes)),
+                0 => break,
                 n => bytes.extend_from_slice(&chunk[..n]),
             }
+        }
+        match bytes.len() as u64 > max_bytes {
+            true => Err(too_long().into()),
+            false => Ok(Some(bytes)),
         }
     }
 

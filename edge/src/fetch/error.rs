@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use slag_common::Hash32;
 use slag_common::manifest::ManifestError;
+use slag_common::tuf::TufError;
 
 use super::plan_error::PlanError;
 use super::records::RecordsError;
@@ -51,15 +52,34 @@ pub enum FetchError {
     /// The manifest is invalid.
     #[error(transparent)]
     Manifest(#[from] ManifestError),
-    /// No key of the request is accepted.
+    /// The store's metadata is refused.
+    #[error(transparent)]
+    Tuf(#[from] TufError),
+    /// No root is trusted yet.
     #[error(
-        "--key {asked} is not the key that this robot accepted, {held}, nor its successor; if the store's key was changed from {held}, name both once, the accepted key first: --key OLD --key NEW"
+        "this robot trusts no store yet; run `slag-edge trust add {from} --sha256 HEX` with the SHA-256 of the store's file metadata/1.root.json, or fetch once with --trust-first to trust whoever answers there"
     )]
-    Key {
-        /// The keys of the request.
-        asked: String,
-        /// The keys accepted.
+    NoTrust {
+        /// Address of the store.
+        from: String,
+    },
+    /// Another root is trusted.
+    #[error(
+        "this robot began with another root, {held}, than the one offered, {offered}; to trust the latter in its place, add it with --replace"
+    )]
+    OtherRoot {
+        /// SHA-256 of the root that was trusted first.
         held: String,
+        /// SHA-256 of the one offered.
+        offered: String,
+    },
+    /// The store has no root of a given hash.
+    #[error("{from} has no root with SHA-256 {sha256}; check the hash and the address")]
+    NoSuchRoot {
+        /// Address of the store.
+        from: String,
+        /// The hash.
+        sha256: String,
     },
     /// The store offers another scene.
     #[error(
@@ -70,18 +90,6 @@ pub enum FetchError {
         expected: String,
         /// Scene offered.
         offered: String,
-    },
-    /// The manifest is older than one accepted before.
-    #[error(
-        "scene {scene:?}: the store offers generation {offered}, but generation {seen} was accepted before. An old manifest is being replayed, or the store was restored from a backup; publish a newer generation"
-    )]
-    Rollback {
-        /// The scene.
-        scene: String,
-        /// Highest generation accepted.
-        seen: u64,
-        /// Generation offered.
-        offered: u64,
     },
     /// The scene uses another embedding space.
     #[error(

@@ -4,7 +4,7 @@
 //! touched before the new `current` is durable, and nothing unverified is used. In order:
 //!
 //! 0. lock; files renamed by a killed fetch are made durable before anything builds on them
-//! 1. manifest: signature, expiry, generation, encoder; key, generation and request are recorded
+//! 1. metadata: brought up to date and recorded; manifest: hash, scene, encoder; scene and request are recorded
 //! 2. space: shards that neither the old nor the new generation needs are removed
 //! 3. each missing shard: staged, synced, hashed, checked, renamed into `shards/`; folder synced
 //! 4. manifest: staged, synced, renamed into `manifests/`; folder synced
@@ -30,6 +30,7 @@ mod request;
 mod run;
 mod scrub;
 mod staging;
+mod trust;
 mod usage;
 
 pub use environment::{Environment, Progress};
@@ -42,3 +43,4 @@ pub use records::{Accepted, LastFetch, Records, RecordsError, accepted};
 pub use report::{FetchReport, Tally};
 pub use request::{DEFAULT_PARALLEL, DEFAULT_RADIUS, FetchRequest};
 pub use run::fetch;
+pub use trust::{AddedRoot, FirstRoot, add_root};

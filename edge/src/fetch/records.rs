@@ -1,14 +1,11 @@
-//! What a robot believes: the key and scene that it accepted, the keys that were replaced, and the highest
-//! generations seen. Two checksummed copies on the cache's own storage ([`Copies`]); the lock of the cache
-//! ensures one fetch at a time.
+//! What a robot believes: the metadata and the scene that it accepted. Two checksummed copies on the cache's own
+//! storage ([`Copies`]); the lock of the cache ensures one fetch at a time.
 
-use std::collections::BTreeMap;
 use std::io;
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
-use slag_common::Hash32;
-use slag_common::manifest::Manifest;
+use slag_common::tuf::{Kept, sha256_hex};
 
 use super::copies::{Copies, Found, MAX_COPY_BYTES, Version};
 use super::lock::Lock;
@@ -27,8 +24,8 @@ pub enum RecordsError {
         /// The cache.
         path: PathBuf,
     },
-    /// Both copies are damaged, and no key is given.
-    #[error("{path}: both copies of the record of accepted keys are damaged ({what}), so that no key is accepted; what is on board keeps answering. Give the store's key once (`fetch --key HEX`, as `slag-encoder keys show` prints it): the record is then written anew", path = path.display())]
+    /// Both copies are damaged.
+    #[error("{path}: both copies of the record of trust are damaged ({what}), so that no store is believed; what is on board keeps answering. Add the store's newest root by hand (`slag-edge trust add --root FILE`): the record is then written anew", path = path.display())]
     Damaged {
         /// The copies' folder.
         path: PathBuf,
@@ -37,7 +34,7 @@ pub enum RecordsError {
     },
     /// The record would be too long to be read again.
     #[error(
-        "the record of accepted keys and scenes would take {len_bytes} bytes, the limit is {MAX_CONTENT_BYTES}; publish the scene under a shorter name"
+        "the record of trust would take {len_bytes} bytes, the limit is {MAX_CONTENT_BYTES}; publish the scene under a shorter name"
     )]
     TooLong {
         /// Its length.
@@ -60,33 +57,27 @@ pub struct LastFetch {
 /// What a robot accepted.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Accepted {
-    /// The scene; another one needs a request that names it.
-    pub scene: String,
-    /// The key.
-    pub key: Hash32,
-    /// The successor that the key names.
-    pub next_key: Option<Hash32>,
-}
-
-/// The highest generation seen of a scene signed by a key.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Floor {
-    key: Hash32,
-    scene: String,
-    generation: u64,
+    /// The scene; another one needs a request that names it. Absent before the first fetch.
+    pub scene: Option<String>,
+    /// SHA-256 of the newest root, hex.
+    pub root_sha256: String,
+    /// Its version.
+    pub root_version: u64,
+    /// When the newest timestamp says it was signed, seconds since 1970.
+    pub signed_unix_secs: Option<u64>,
+    /// When it expires, seconds since 1970.
+    pub expires_unix_secs: Option<u64>,
 }
 
 /// The content of the copies, as JSON.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Record {
+    /// SHA-256 of the root that was trusted first, hex.
+    first_root_sha256: Option<String>,
+    /// What the client of the metadata keeps.
+    kept: Option<Kept>,
     scene: Option<String>,
-    key: Option<Hash32>,
-    next_key: Option<Hash32>,
-    /// Keys that are no longer accepted, and their successors.
-    successors: BTreeMap<Hash32, Hash32>,
-    generations: Vec<Floor>,
     last: Option<LastFetch>,
 }
 
@@ -148,57 +139,38 @@ impl Records {
         self.record.scene.as_deref()
     }
 
-    /// Returns the accepted key and its named successor.
-    pub fn keys(&self) -> Option<(Hash32, Option<Hash32>)> {
-        self.record.key.map(|key| (key, self.record.next_key))
+    /// Returns the metadata accepted; `None` before the first trust.
+    pub fn kept(&self) -> Option<&Kept> {
+        self.record.kept.as_ref()
     }
 
-    /// Returns the key that replaced a key, or the key itself.
-    pub fn successor(&self, mut key: Hash32) -> Hash32 {
-        // A chain is never longer than the list; a circle would be.
-        for _ in 0..self.record.successors.len() {
-            match self.record.successors.get(&key) {
-                Some(successor) => key = *successor,
-                None => break,
-            }
-        }
-        key
+    /// Returns the SHA-256 of the root that was trusted first, hex.
+    pub fn first_root_sha256(&self) -> Option<&str> {
+        self.record.first_root_sha256.as_deref()
     }
 
-    /// Returns the highest generation seen of a scene signed by a key.
-    pub fn highest_generation(&self, key: Hash32, scene: &str) -> Option<u64> {
-        let of_key = self.record.generations.iter().filter(|floor| floor.key == key && floor.scene == scene);
-        of_key.map(|floor| floor.generation).max()
+    /// Durably trusts a root, and forgets what was trusted before.
+    pub fn trust(&mut self, cache: &EdgeCache, kept: Kept) -> Result<(), RecordsError> {
+        let first_root_sha256 = Some(sha256_hex(kept.root.as_bytes()));
+        self.write(cache, Record { first_root_sha256, kept: Some(kept), ..self.record.clone() })
     }
 
-    /// Durably records an accepted manifest and the request for it. A key that its key replaces is no longer
-    /// accepted.
-    pub fn accept(
-        &mut self,
-        cache: &EdgeCache,
-        last: &LastFetch,
-        manifest: &Manifest,
-        key: Hash32,
-        replaced: Option<Hash32>,
-    ) -> Result<(), RecordsError> {
-        let mut record = self.record.clone();
-        record.scene = Some(manifest.scene.clone());
-        (record.key, record.next_key) = (Some(key), manifest.next_key);
-        record.last = Some(last.clone());
-        record.successors.remove(&key);
-        if let Some(old) = replaced.filter(|old| *old != key) {
-            record.successors.insert(old, key);
-            // A successor continues the generation counts.
-            record.generations.iter_mut().filter(|f| f.key == old).for_each(|floor| floor.key = key);
-        }
-        let scene = manifest.scene.clone();
-        record.generations.push(Floor { key, scene, generation: manifest.generation });
-        record.generations = highest(record.generations);
-        let is_same = self.version.as_ref().is_some_and(|version| version.is_twice);
-        if is_same && record == self.record {
+    /// Durably records accepted metadata.
+    pub fn keep(&mut self, cache: &EdgeCache, kept: &Kept) -> Result<(), RecordsError> {
+        self.write(cache, Record { kept: Some(kept.clone()), ..self.record.clone() })
+    }
+
+    /// Durably records an accepted scene and the request for it.
+    pub fn accept(&mut self, cache: &EdgeCache, last: &LastFetch, scene: &str) -> Result<(), RecordsError> {
+        let (scene, last) = (Some(scene.to_owned()), Some(last.clone()));
+        self.write(cache, Record { scene, last, ..self.record.clone() })
+    }
+
+    fn write(&mut self, cache: &EdgeCache, record: Record) -> Result<(), RecordsError> {
+        let content = serde_json::to_vec(&record).map_err(io::Error::from)?;
+        if self.version.as_ref().is_some_and(|version| version.is_twice && version.content == content) {
             return Ok(());
         }
-        let content = serde_json::to_vec(&record).map_err(io::Error::from)?;
         let len_bytes = content.len() as u64;
         if len_bytes > MAX_CONTENT_BYTES {
             return Err(RecordsError::TooLong { len_bytes });
@@ -209,13 +181,20 @@ impl Records {
     }
 }
 
-/// Returns what a robot accepted, without the lock; `None` before the first fetch, or if the records are
+/// Returns what a robot accepted, without the lock; `None` before the first trust, or if the records are
 /// damaged.
 pub fn accepted(cache: &EdgeCache) -> Option<Accepted> {
     match read(cache, &copies_of(cache)) {
         Ok(Read::Record(_, record)) => {
-            let Record { scene, key, next_key, .. } = *record;
-            Some(Accepted { scene: scene?, key: key?, next_key })
+            let Record { scene, kept, .. } = *record;
+            let kept = kept?;
+            Some(Accepted {
+                scene,
+                root_sha256: sha256_hex(kept.root.as_bytes()),
+                root_version: kept.root_version()?,
+                signed_unix_secs: kept.signed_unix_secs(),
+                expires_unix_secs: kept.expires_unix_secs(),
+            })
         }
         _ => None,
     }
@@ -235,7 +214,7 @@ fn read(cache: &EdgeCache, copies: &Copies) -> io::Result<Read> {
     Ok(match copies.read(cache.files())? {
         Found::Nothing => Read::Nothing,
         Found::Damaged(what) => Read::Damaged(what),
-        // A whole copy of another version of this program: as damaged, no key of it counts.
+        // A whole copy of another version of this program: as damaged, nothing of it counts.
         Found::Record(version) => match serde_json::from_slice(&version.content) {
             Ok(record) => Read::Record(version, Box::new(record)),
             Err(e) => Read::Damaged(e.to_string()),
@@ -243,9 +222,27 @@ fn read(cache: &EdgeCache, copies: &Copies) -> io::Result<Read> {
     })
 }
 
-/// Keeps the highest generation of each key and scene.
-fn highest(mut floors: Vec<Floor>) -> Vec<Floor> {
-    floors.sort_by(|a, b| (a.key, &a.scene, b.generation).cmp(&(b.key, &b.scene, a.generation)));
-    floors.dedup_by(|later, first| later.key == first.key && later.scene == first.scene);
-    floors
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use slag_common::tuf::{MAX_ROOT_BYTES, MAX_SNAPSHOT_BYTES, MAX_TIMESTAMP_BYTES};
+
+    use super::*;
+
+    /// Quotes are the longest: JSON within JSON doubles them.
+    #[test]
+    fn the_longest_metadata_is_kept() {
+        let quotes = |max_bytes: u64| "\"".repeat(max_bytes as usize);
+        let kept = Kept {
+            root: quotes(MAX_ROOT_BYTES),
+            timestamp: Some(quotes(MAX_TIMESTAMP_BYTES)),
+            snapshot: Some(quotes(MAX_SNAPSHOT_BYTES)),
+            targets: BTreeMap::new(),
+        };
+        let dir = tempfile::tempdir().expect("temporary folder");
+        let cache = EdgeCache::open(dir.path());
+        Records::open(&cache).expect("opens").keep(&cache, &kept).expect("fits");
+        assert_eq!(Records::open(&cache).expect("opens").kept(), Some(&kept));
+    }
 }

@@ -36,11 +36,9 @@ pub struct FetchReport {
     pub manifest_hash: Hash32,
     /// Public key of its signature.
     pub key: Hash32,
-    /// The successor that the key names; accepted from now on as well.
-    pub next_key: Option<Hash32>,
-    /// The key that this one replaced; refused from now on.
-    pub replaced_key: Option<Hash32>,
-    /// Whether the key was accepted because it was the first.
+    /// Version of the root by which the manifest is trusted; absent if nothing was trusted yet (offline).
+    pub root_version: Option<u64>,
+    /// Whether that root was accepted because it was the first.
     pub is_first_contact: bool,
     /// The encoder whose text model answers queries.
     pub encoder_id: Hash32,

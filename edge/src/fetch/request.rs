@@ -21,10 +21,8 @@ pub struct FetchRequest {
     pub radius: f64,
     /// Profile of the shards.
     pub profile: Profile,
-    /// The only keys accepted, or their replacements; empty: the key accepted before or, at the first
-    /// contact, the server's. The successor that a key names is accepted with it. A pair (accepted key, new
-    /// key) accepts a successor that no manifest named.
-    pub keys: Vec<Hash32>,
+    /// At the first contact, trust the root that the store offers.
+    pub trust_first: bool,
     /// The only scene accepted, from now on; absent: the one accepted before or, at the first contact, the
     /// server's.
     pub scene: Option<String>,
@@ -45,7 +43,7 @@ impl Default for FetchRequest {
             at: None,
             radius: DEFAULT_RADIUS,
             profile: Profile::Compact,
-            keys: Vec::new(),
+            trust_first: false,
             scene: None,
             expected_encoder: None,
             max_bytes: None,

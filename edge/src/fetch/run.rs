@@ -5,19 +5,21 @@ use std::io;
 use std::time::Instant;
 
 use slag_common::Hash32;
+use slag_common::tuf::Kept;
 
 use super::download::Client;
 use super::environment::Environment;
 use super::error::FetchError;
 use super::generation::{Before, assemble};
 use super::objects::{Check, download_all};
-use super::offer::{Offer, Trust};
+use super::offer::Offer;
 use super::plan::{Object, Plan, Wanted};
 use super::records::{LastFetch, Records, RecordsError};
 use super::report::{FetchReport, Tally};
 use super::request::FetchRequest;
 use super::scrub::{digests, scrub};
 use super::staging::{clear_manifests, clear_staging, held_shards, part_path, put, staging};
+use super::trust::trust_first;
 use super::usage::Usage;
 use crate::store::{Current, EdgeCache, StoreError};
 
@@ -67,10 +69,26 @@ pub fn fetch(
     };
     let client = Client::new(&from, environment)?;
     let on_board = old.as_ref().and_then(|old| Offer::on_board(cache, old));
-    let trust = Trust::new(request, &records, old.as_ref(), on_board.as_ref())?;
-    let offer = Offer::get(&client, request.offline, on_board.as_ref(), &trust)?;
-    offer.check(&records, on_board.as_ref(), &trust, request, environment.now_unix_secs)?;
-    let replaced_key = trust.replaced_by(offer.key);
+    let known_scene = records.scene().or(on_board.as_ref().map(|offer| offer.manifest.scene.as_str()));
+    let scene = request.scene.as_deref().or(known_scene).map(str::to_owned);
+    let mut is_first_contact = false;
+    let offer = match request.offline {
+        true => on_board
+            .clone()
+            .ok_or(FetchError::NotGiven { what: "manifest", advice: "fetch once with network" })?,
+        false => {
+            if let Some(damage) = records.damage() {
+                return Err(damage.into());
+            }
+            if request.trust_first {
+                is_first_contact = trust_first(&client, cache, &mut records)?;
+            }
+            let offer =
+                Offer::get(&client, cache, &mut records, environment.now_unix_secs, on_board.as_ref());
+            offer.map_err(|e| disk_full(e, SPARE_BYTES))?
+        }
+    };
+    offer.check(scene.as_deref(), request, environment.now_unix_secs)?;
 
     let centre_in_world = at.in_world(&offer.manifest)?;
     let mut held = held_shards(cache, &usage)?;
@@ -87,15 +105,8 @@ pub fn fetch(
     if request.offline && planned.n_shards > 0 {
         return Err(FetchError::Offline { n_shards: planned.n_shards, bytes: planned.bytes });
     }
-    records.accept(cache, &LastFetch { from, at }, &offer.manifest, offer.key, replaced_key).map_err(
-        |e| match e {
-            RecordsError::Io(source) => disk_full(source, planned.bytes),
-            e => e.into(),
-        },
-    )?;
-    if let Some(old) = replaced_key {
-        tracing::info!("key {old} is no longer accepted: {} replaced it", offer.key);
-    }
+    let accepted = records.accept(cache, &LastFetch { from, at }, &offer.manifest.scene);
+    accepted.map_err(|e| disk_full(e.into(), planned.bytes))?;
 
     let in_use: BTreeSet<Hash32> = old.iter().flat_map(Current::shards).collect();
     for hash in plan.free.difference(&in_use) {
@@ -128,10 +139,7 @@ pub fn fetch(
         let sound = scrubbed.sound.iter().chain(&downloaded.good).copied();
         Ok((digests(cache, &check, sound), downloaded.good, current))
     };
-    let (digests, downloaded, current) = work().map_err(|e| match e {
-        FetchError::Io(source) => disk_full(source, planned.bytes),
-        other => other,
-    })?;
+    let (digests, downloaded, current) = work().map_err(|e| disk_full(e, planned.bytes))?;
 
     let in_use: BTreeSet<Hash32> = current.shards().collect();
     plan.free.retain(|hash| !in_use.contains(hash));
@@ -154,9 +162,8 @@ pub fn fetch(
         generation: offer.manifest.generation,
         manifest_hash: offer.manifest_hash,
         key: offer.key,
-        next_key: offer.manifest.next_key,
-        replaced_key,
-        is_first_contact: trust.is_first_contact(),
+        root_version: records.kept().and_then(Kept::root_version),
+        is_first_contact,
         encoder_id: offer.manifest.encoder.id,
         encoder_name: offer.manifest.encoder.name,
         profile,
@@ -184,12 +191,14 @@ fn check_space(cache: &EdgeCache, download: &[Object], other_bytes: u64) -> Resu
     }
 }
 
-/// Tells a full disk from other errors of the file system.
-fn disk_full(source: io::Error, needed_bytes: u64) -> FetchError {
-    match source.kind() {
-        io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
+/// Tells a full disk from other errors.
+fn disk_full(error: FetchError, needed_bytes: u64) -> FetchError {
+    let is_full =
+        |e: &io::Error| matches!(e.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded);
+    match error {
+        FetchError::Io(source) | FetchError::Records(RecordsError::Io(source)) if is_full(&source) => {
             FetchError::DiskFull { needed_bytes, source }
         }
-        _ => FetchError::Io(source),
+        error => error,
     }
 }

@@ -41,7 +41,7 @@ pub async fn status(State(app): State<Arc<App>>) -> Result<Json<Value>, Problem>
         let expires_unix_secs = manifest.and_then(|manifest| manifest.expires_unix_secs);
         // An expired scene still answers: an old map is better than none, if the client can tell.
         let is_expired = manifest.is_some_and(|m| m.check_expiry(crate::now_unix_secs()).is_err());
-        let pinned_scene = accepted(app.engine.cache()).map(|accepted| accepted.scene);
+        let pinned_scene = accepted(app.engine.cache()).and_then(|accepted| accepted.scene);
         let following = app.following.as_ref().map(|following| following.status());
         let scene = snapshot.as_ref().ok().map(|snapshot| Status::of(snapshot));
         let is_ready = error.is_none() && app.engine.text_is_alive();

@@ -6,7 +6,7 @@
 //! | `manifests/HASH` | verified signed manifests, immutable | fetch: renamed in, removed |
 //! | `current` | [`Current`]: the generation in use | fetch: replaced whole |
 //! | `staging/` | partial downloads | fetch |
-//! | `trust/` | accepted keys, scene and generations, in two copies | fetch |
+//! | `trust/` | accepted metadata and scene, in two copies | fetch |
 //! | `db/` | which shards were used and checked | fetch |
 //! | `lock` | locked by the one fetch | |
 //!

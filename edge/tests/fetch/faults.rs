@@ -8,8 +8,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use slag_common::container::AlignedBytes;
-use slag_common::manifest::ManifestError;
 use slag_common::shard::{Profile, ShardLayout};
+use slag_common::tuf::TufError;
 use slag_edge::fetch::FetchError;
 use slag_edge::query::{AnswerKind, Engine, QueryRequest};
 use slag_edge::store::{BadCell, EdgeCache};
@@ -17,12 +17,14 @@ use slag_edge::text::{EncoderInfo, TextService};
 use slag_models::{InferenceError, TextEncoder};
 
 use super::crash::{copy_dir, rot_one_copy};
-use super::scene::{DIM, ENCODER, Published, key, public};
+use super::scene::{DIM, ENCODER, FIRST, Published, RootKeys};
 use super::server::{Fault, Seen, Server};
 use super::sim::SimFiles;
 use super::{Robot, at};
 use slag_math::random::Random;
 
+/// The keys of the next root.
+const SECOND: RootKeys = RootKeys { root: 3, online: 4 };
 const N_TRIALS: u64 = 1000;
 const N_THREADS: u64 = 4;
 /// Gaussians of a cell: its shard arrives in several pieces.
@@ -106,11 +108,12 @@ impl Stage {
         let shm = Path::new("/dev/shm");
         let dir = if shm.is_dir() { tempfile::tempdir_in(shm) } else { tempfile::tempdir() };
         let dir = dir.expect("temporary folder");
-        let (present, next) = (key(1), if is_key_change { key(2) } else { key(1) });
         let stale = Published::new(1, &[9; 7], N);
-        let named = is_key_change.then(|| public(&next));
-        let old = Published::new(2, &[0; 7], N).edited(&present, |manifest| manifest.next_key = named);
-        let new = Published::new(3, &[0, 0, 5, 0, 5, 0, 0], N).edited(&next, |_| {});
+        let old = Published::new(2, &[0; 7], N);
+        let mut new = Published::new(3, &[0, 0, 5, 0, 5, 0, 0], N);
+        if is_key_change {
+            new = new.signed_by(&[FIRST, SECOND], 3);
+        }
         let server = Server::start(old.clone());
         let files = Arc::new(SimFiles::default());
         Robot::on_sim(dir.path(), files.clone(), &server.url()).fetch().expect("works");
@@ -163,7 +166,7 @@ impl Stage {
             let fault = [Fault::Status(404), Fault::Corrupt(700)][random.below(2) as usize].clone();
             (format!("/v1/objects/{hash}"), fault)
         });
-        let (stale, replay) = (self.stale.clone(), self.stale.signed.clone());
+        let stale = self.stale.clone();
         let pairs: Vec<(String, Vec<u8>)> = (0..7)
             .map(|id| {
                 let name = format!("/v1/objects/{}", self.new.hash(id, Profile::Compact));
@@ -174,7 +177,9 @@ impl Stage {
             if let Some((_, fault)) = bad.as_ref().filter(|(path, _)| *path == seen.path) {
                 return fault.clone();
             }
-            if random.below(one_in) != 0 {
+            // Metadata that is refused is not asked for again, so most of it comes through.
+            let is_spared = !seen.path.contains("objects") && random.below(4) != 0;
+            if is_spared || random.below(one_in) != 0 {
                 return Fault::None;
             }
             match random.below(12) {
@@ -188,9 +193,11 @@ impl Stage {
                 7 => Fault::IgnoreRange,
                 8 => Fault::ShiftedRange(random.below(100) as usize),
                 9 => Fault::RetryAfter(503, 1),
-                // An old manifest replayed; or an intact shard of the same cell and length under another
-                // hash.
-                _ if seen.path == "/v1/manifest" => Fault::Instead(replay.clone()),
+                // An old state replayed; or an intact shard of the same cell and length under another hash.
+                _ if seen.path.ends_with("timestamp.json") => {
+                    Fault::Instead(stale.metadata["timestamp.json"].clone())
+                }
+                _ if seen.path.contains("/targets/") => Fault::Instead(stale.signed.clone()),
                 _ => match pairs.iter().find(|(name, _)| *name == seen.path) {
                     Some((_, other)) => Fault::Instead(other.clone()),
                     None => Fault::None,
@@ -255,14 +262,21 @@ impl Stage {
         assert_eq!(ask(robot.cache.clone()), Ok((3, self.expected(3, &[]))), "{context}");
         assert_eq!(robot.snapshot().bad_cells, [], "{context}");
         assert!(robot.staged().is_empty(), "{context}");
-        if self.is_key_change && seed.is_multiple_of(4) {
-            let later = Published::new(9, &[0; 7], N);
-            self.server.publish(later);
-            let error = robot.fetch().expect_err("the old key is out");
-            let is_refused = matches!(error, FetchError::Manifest(ManifestError::UnknownKey { .. }));
-            assert!(is_refused, "{context}: {error}");
-            self.server.publish(self.new.clone());
+        if seed.is_multiple_of(4) {
+            self.check_trust(&robot, &context);
         }
+    }
+
+    /// The robot has gone over to the new state, whatever happened: old keys and old states are refused.
+    fn check_trust(&self, robot: &Robot, context: &str) {
+        let published = if self.is_key_change { Published::new(9, &[0; 7], N) } else { self.old.clone() };
+        self.server.publish(published);
+        match (robot.fetch(), self.is_key_change) {
+            (Err(FetchError::Tuf(TufError::Signatures { .. })), true) => {}
+            (Err(FetchError::Tuf(TufError::Rollback { seen: 3, offered: 2, .. })), false) => {}
+            (other, _) => panic!("{context}: {other:?}"),
+        }
+        self.server.publish(self.new.clone());
     }
 }
 
@@ -273,7 +287,7 @@ fn a_thousand_faults_leave_a_whole_generation() {
         for thread in 0..N_THREADS {
             let outcomes = &outcomes;
             scope.spawn(move || {
-                // In every other thread the new generation is signed by the next key.
+                // In every other thread the new generation comes under a new root.
                 let stage = Stage::new(thread % 2 == 1);
                 (thread..N_TRIALS).step_by(N_THREADS as usize).for_each(|seed| stage.trial(seed, outcomes));
             });

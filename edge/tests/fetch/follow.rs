@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use glam::DVec3;
 use slag_common::shard::Profile;
+use slag_common::tuf::TufError;
 use slag_edge::fetch::follow::{Decision, FollowEnvironment, FollowSettings, Follower, Following, follow};
 use slag_edge::fetch::{FetchError, Position};
 
@@ -50,8 +51,8 @@ fn going_to_and_fro_over_an_edge_costs_one_fetch() {
         let fetched_at = drive(&mut robot, &mut follower, 0, to_and_fro);
         assert_eq!(fetched_at, [0], "edge at {edge}");
         let seen = server.take_seen();
-        let n_manifests = seen.iter().filter(|seen| seen.path.contains("manifest")).count();
-        assert_eq!(n_manifests, 1, "{seen:?}");
+        let n_timestamps = seen.iter().filter(|seen| seen.path.contains("timestamp")).count();
+        assert_eq!(n_timestamps, 1, "{seen:?}");
     }
 }
 
@@ -202,7 +203,7 @@ fn the_end_tells_whether_the_last_position_was_served() {
     following.close();
     run(&following, &cancel).expect("no position, no fetch");
     following.post(Position::World(DVec3::ZERO));
-    assert!(matches!(run(&following, &cancel), Err(FetchError::Download { .. })));
+    assert!(matches!(run(&following, &cancel), Err(FetchError::Tuf(TufError::Missing { .. }))));
     cancel.store(true, std::sync::atomic::Ordering::Relaxed);
     assert!(matches!(run(&following, &cancel), Err(FetchError::Cancelled)));
 }

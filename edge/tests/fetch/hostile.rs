@@ -3,17 +3,22 @@
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use slag_common::Hash32;
-use slag_common::manifest::{MAX_BYTES, ManifestError};
+use slag_common::manifest::ManifestError;
 use slag_common::shard::Profile;
+use slag_common::tuf::TufError;
 use slag_edge::fetch::{DownloadFailure, FetchError, FetchRequest, PlanError, Progress};
 use slag_edge::store::{BadCell, CellFault, Snapshot, StoreError};
 
-use super::scene::{ENCODER, NOW, Published, ShardSpec, key, public, shard};
+use super::scene::{ENCODER, FIRST, NOW, Published, RootKeys, ShardSpec, key, metadata, shard};
 use super::server::{Fault, Seen, Server};
 use super::{Robot, assert_holds};
 
 fn objects(fault: Fault) -> impl FnMut(&Seen) -> Fault + Send + 'static {
     move |seen| if seen.path.contains("objects") { fault.clone() } else { Fault::None }
+}
+
+fn targets(fault: Fault) -> impl FnMut(&Seen) -> Fault + Send + 'static {
+    move |seen| if seen.path.contains("/targets/") { fault.clone() } else { Fault::None }
 }
 
 #[derive(Default)]
@@ -41,48 +46,36 @@ fn refused_manifests_leave_the_old_generation() {
         error
     };
 
-    let foreign = third.clone().edited(&key(2), |_| {});
-    let error = refused(&robot, foreign.clone());
-    assert!(matches!(error, FetchError::Manifest(ManifestError::UnknownKey { .. })), "{error}");
-    let mut forged = third.clone();
-    *forged.signed.last_mut().expect("not empty") ^= 1;
-    let error = refused(&robot, forged);
-    assert!(matches!(error, FetchError::Manifest(ManifestError::Signature)), "{error}");
-    let expired = third.clone().edited(&key(1), |manifest| manifest.expires_unix_secs = Some(NOW - 1));
-    let error = refused(&robot, expired);
-    assert!(matches!(error, FetchError::Manifest(ManifestError::Expired { .. })), "{error}");
-    let replayed = Published::new(1, &[0; 4], 50);
-    let error = refused(&robot, replayed.clone());
-    assert!(matches!(error, FetchError::Rollback { seen: 2, offered: 1, .. }), "{error}");
+    let tuf = |error: FetchError| match error {
+        FetchError::Tuf(error) => error,
+        error => panic!("{error}"),
+    };
+    let foreign = third.clone().signed_by(&[RootKeys { root: 1, online: 9 }], 3);
+    let error = tuf(refused(&robot, foreign));
+    assert!(matches!(error, TufError::Signatures { .. }), "{error}");
+    let expired = metadata(&[FIRST], 3, NOW - 1, &third.signed);
+    let error = tuf(refused(&robot, Published { metadata: expired, ..third.clone() }));
+    assert!(matches!(error, TufError::Expired { .. }), "{error}");
+    let error = tuf(refused(&robot, Published::new(1, &[0; 4], 50)));
+    assert!(matches!(error, TufError::Rollback { seen: 2, offered: 1, .. }), "{error}");
     robot.request.expected_encoder = Some(Hash32([3; 32]));
     let error = refused(&robot, third.clone());
     assert!(matches!(error, FetchError::Encoder { found: ENCODER, .. }), "{error}");
     robot.request.expected_encoder = Some(ENCODER);
-
-    // Losing the records loses neither the key nor the generation.
-    fs_err::remove_dir_all(robot.cache.dir().join("trust")).expect("there");
-    assert!(matches!(refused(&robot, replayed), FetchError::Rollback { seen: 2, .. }));
-    assert!(matches!(
-        refused(&robot, foreign.clone()),
-        FetchError::Manifest(ManifestError::UnknownKey { .. })
-    ));
-
-    // A generation that was seen but never arrived counts: the previous one is now a replay.
+    let mut forged = third.signed.clone();
+    *forged.last_mut().expect("not empty") ^= 1;
+    server.faults(targets(Fault::Instead(forged)));
+    let error = tuf(refused(&robot, third.clone()));
+    assert!(matches!(error, TufError::Content { .. }), "{error}");
+    // A state that was seen but never arrived counts: the previous one is now a replay.
     server.faults(objects(Fault::Status(404)));
     assert!(matches!(refused(&robot, third.clone()), FetchError::Download { .. }));
     server.faults(|_| Fault::None);
-    assert!(matches!(refused(&robot, second.clone()), FetchError::Rollback { seen: 3, offered: 2, .. }));
-
-    // The key changes only on a request that names both; the old one is then no longer accepted.
-    server.publish(foreign.clone());
-    robot.request.keys = vec![public(&key(2))];
-    assert!(matches!(robot.fetch(), Err(FetchError::Key { .. })));
-    robot.request.keys = vec![public(&key(1)), public(&key(2))];
-    assert_eq!(robot.fetch().expect("accepted").key, public(&key(2)));
-    assert_holds(&robot.snapshot(), &foreign, 0..3);
-    robot.request.keys.clear();
-    server.publish(Published::new(9, &[0; 4], 50));
-    assert!(matches!(robot.fetch(), Err(FetchError::Manifest(ManifestError::UnknownKey { .. }))));
+    let error = tuf(refused(&robot, second.clone()));
+    assert!(matches!(error, TufError::Rollback { seen: 3, offered: 2, .. }), "{error}");
+    server.publish(third.clone());
+    robot.fetch().expect("honest");
+    assert_holds(&robot.snapshot(), &third, 0..3);
 }
 
 /// An intact shard of the right cell and length under another shard's hash: only the hash reveals it.
@@ -116,22 +109,25 @@ fn endless_bodies_are_cut_off() {
     assert_eq!(count.0.load(Ordering::Relaxed), scene.bytes(0..1));
     robot.limits.chunk_bytes = 1 << 16;
     server.publish(Published::new(2, &[0; 1], 50));
-    server.faults(|_| Fault::Endless);
-    let error = robot.fetch().expect_err("refused");
-    let limit = MAX_BYTES + 1;
-    assert!(
-        matches!(error, FetchError::Manifest(ManifestError::TooLong { len_bytes }) if len_bytes == limit),
-        "{error}"
-    );
-    assert_holds(&robot.snapshot(), &scene, 0..1);
+    type Faults = Box<dyn FnMut(&Seen) -> Fault + Send>;
+    let cases: [(Faults, &str); 2] =
+        [(Box::new(|_| Fault::Endless), "timestamp.json"), (Box::new(targets(Fault::Endless)), "manifest")];
+    for (faults, expected) in cases {
+        server.faults(faults);
+        let error = robot.fetch().expect_err("refused");
+        let is_expected =
+            matches!(&error, FetchError::Tuf(TufError::TooLong { what, .. }) if what.ends_with(expected));
+        assert!(is_expected, "{expected}: {error}");
+        assert_holds(&robot.snapshot(), &scene, 0..1);
+    }
 }
 
-/// Redirects to another server are not followed, neither for the manifest nor for an object.
+/// Redirects to another server are not followed, for no kind of file.
 #[test]
 fn redirects_are_refused() {
     let scene = Published::new(1, &[0; 1], 50);
     let (server, elsewhere) = (Server::start(scene.clone()), Server::start(scene));
-    for part in ["manifest", "objects"] {
+    for part in ["timestamp", "/targets/", "objects"] {
         let dir = tempfile::tempdir().expect("temporary folder");
         let robot = Robot::on_disk(dir.path(), &server.url());
         let location = elsewhere.url();
@@ -201,12 +197,12 @@ fn signed_nonsense_is_refused() {
         let on_board: Vec<u32> = robot.snapshot().shards.iter().map(|shard| shard.cell.cell_id).collect();
         assert_eq!(on_board, [1 - bad_id]);
     };
-    without_a_cell(scene.clone().edited(&key(1), |manifest| manifest.cells[1].n_gaussians = 51), 1);
-    let error = fetched(scene.clone().edited(&key(1), |manifest| manifest.encoder.id = Hash32([5; 32])));
+    without_a_cell(scene.clone().edited(|manifest| manifest.cells[1].n_gaussians = 51), 1);
+    let error = fetched(scene.clone().edited(|manifest| manifest.encoder.id = Hash32([5; 32])));
     assert!(matches!(error, FetchError::Published { .. }), "{error}");
-    let error = fetched(scene.clone().edited(&key(1), |manifest| manifest.encoder.dim = 5));
+    let error = fetched(scene.clone().edited(|manifest| manifest.encoder.dim = 5));
     assert!(matches!(error, FetchError::Published { .. }), "{error}");
-    let error = fetched(scene.clone().edited(&key(1), |manifest| {
+    let error = fetched(scene.clone().edited(|manifest| {
         manifest.cells[1].shards = manifest.cells[0].shards.clone();
     }));
     assert!(matches!(error, FetchError::Plan(PlanError::Conflict { .. })), "{error}");
@@ -215,17 +211,17 @@ fn signed_nonsense_is_refused() {
     let mut junk = scene.clone();
     let hash = Hash32::of(b"junk");
     junk.objects.insert(hash, b"junk".to_vec());
-    let junk = junk.edited(&key(1), |manifest| {
+    let junk = junk.edited(|manifest| {
         let record = manifest.cells[0].shards.get_mut(&Profile::Compact).expect("there");
         (record.hash, record.len_bytes) = (hash, 4);
     });
     without_a_cell(junk, 0);
-    let nothing = scene.clone().edited(&key(1), |manifest| {
+    let nothing = scene.clone().edited(|manifest| {
         let record = manifest.cells[0].shards.get_mut(&Profile::Compact).expect("there");
         (record.hash, record.len_bytes) = (Hash32::of(b""), 0);
     });
     without_a_cell(nothing, 0);
-    let error = fetched(scene.clone().edited(&key(1), |manifest| {
+    let error = fetched(scene.clone().edited(|manifest| {
         manifest.cells[0].shards.get_mut(&Profile::Compact).expect("there").len_bytes = u64::MAX;
     }));
     assert!(matches!(error, FetchError::NoSpace { needed_bytes: u64::MAX, .. }), "{error}");
@@ -235,7 +231,7 @@ fn signed_nonsense_is_refused() {
     let server = Server::start(scene.clone());
     let robot = Robot::on_disk(dir.path(), &server.url());
     robot.fetch().expect("works");
-    server.publish(scene.clone().edited(&key(1), |manifest| {
+    server.publish(scene.clone().edited(|manifest| {
         (manifest.generation, manifest.encoder.id) = (2, Hash32([5; 32]));
     }));
     assert!(matches!(robot.fetch(), Err(FetchError::Published { .. })));
@@ -280,14 +276,17 @@ fn a_manifest_of_a_gigabyte_is_refused_unread() {
     robot.fetch().expect("works");
     server.publish(Published::new(2, &[1; 1], 50));
     server.take_seen();
-    server.faults(|_| Fault::Length(1 << 30));
-    let error = robot.fetch().expect_err("refused");
-    assert!(
-        matches!(error, FetchError::Manifest(ManifestError::TooLong { len_bytes }) if len_bytes > 1 << 30),
-        "{error}"
-    );
-    assert_eq!(server.take_seen().len(), 1, "no second attempt");
-    assert_holds(&robot.snapshot(), &scene, 0..1);
+    type Faults = Box<dyn FnMut(&Seen) -> Fault + Send>;
+    // The first request, for another root, finds none.
+    let cases: [(Faults, usize); 2] =
+        [(Box::new(|_| Fault::Length(1 << 30)), 2), (Box::new(targets(Fault::Length(1 << 30))), 5)];
+    for (faults, n_requests) in cases {
+        server.faults(faults);
+        let error = robot.fetch().expect_err("refused");
+        assert!(matches!(error, FetchError::Tuf(TufError::TooLong { .. })), "{error}");
+        assert_eq!(server.take_seen().len(), n_requests, "no second attempt");
+        assert_holds(&robot.snapshot(), &scene, 0..1);
+    }
 }
 
 /// Names become paths: only 64 hex digits are accepted.
@@ -302,13 +301,14 @@ fn names_that_are_paths_are_refused() {
         let dir = tempfile::tempdir().expect("temporary folder");
         let mut hostile = scene.clone();
         hostile.signed = signed_text(&json.replace(&name, path));
+        let hostile = hostile.signed_by(&[FIRST], 1);
         let server = Server::start(hostile);
         let robot = Robot::on_disk(dir.path(), &server.url());
         let error = robot.fetch().expect_err("refused");
         assert!(matches!(error, FetchError::Manifest(ManifestError::Content { .. })), "{path}: {error}");
 
         // The same in the files on board.
-        server.publish(scene.clone());
+        server.publish(scene.clone().signed_by(&[FIRST], 2));
         robot.fetch().expect("works");
         let current = fs_err::read_to_string(robot.cache.current_path()).expect("there");
         fs_err::write(robot.cache.current_path(), current.replace(&name, path)).expect("written");
@@ -323,7 +323,8 @@ fn signed_text(json: &str) -> Vec<u8> {
     let key = key(1);
     let signature = key.sign(json.as_bytes()).to_bytes();
     let hex = |bytes: &[u8]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
-    format!("slag-manifest 1 ed25519 {} {}\n{json}", public(&key), hex(&signature)).into_bytes()
+    let public = hex(&key.verifying_key().to_bytes());
+    format!("slag-manifest 1 ed25519 {public} {}\n{json}", hex(&signature)).into_bytes()
 }
 
 /// Shards with false sizes, sections, counts and offsets under valid checksums, hashes and signatures.
@@ -383,7 +384,7 @@ fn shards_that_lie_are_refused() {
         let mut hostile = scene.clone();
         let (hash, len_bytes) = (Hash32::of(&bytes), bytes.len() as u64);
         hostile.objects.insert(hash, bytes);
-        let hostile = hostile.edited(&key(1), |manifest| {
+        let hostile = hostile.edited(|manifest| {
             let record = manifest.cells[0].shards.get_mut(&Profile::Compact).expect("there");
             (record.hash, record.len_bytes) = (hash, len_bytes);
         });

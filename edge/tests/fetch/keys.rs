@@ -1,26 +1,23 @@
-//! The keys that a robot accepts while keys change.
+//! The attacks that The Update Framework names, over a real connection: whose metadata a robot accepts, and which.
 
-use slag_common::Hash32;
-use slag_common::manifest::ManifestError;
+use slag_common::tuf::{TufError, sign};
 use slag_edge::fetch::{FetchError, FetchReport};
 
-use super::crash::copy_dir;
-use super::scene::{Published, key, public};
-use super::server::Server;
+use super::scene::{FIRST, NOW, Published, RootKeys, key, metadata, root_of};
+use super::server::{Fault, Server};
 use super::{Robot, assert_holds};
 
-const A: u8 = 1;
-const B: u8 = 2;
-const C: u8 = 3;
+const SECOND: RootKeys = RootKeys { root: 3, online: 4 };
+const THIRD: RootKeys = RootKeys { root: 5, online: 6 };
+const THIEF: RootKeys = RootKeys { root: 9, online: 9 };
 
-/// A generation signed by one key, naming the next.
-fn signed(generation: u64, by: u8, next: Option<u8>) -> Published {
-    Published::new(generation, &[generation; 3], 20)
-        .edited(&key(by), |manifest| manifest.next_key = next.map(|next| public(&key(next))))
+/// A generation whose content is its number, under the last of these roots.
+fn of(generation: u64, roots: &[RootKeys], version: u64) -> Published {
+    Published::new(generation, &[generation; 3], 20).signed_by(roots, version)
 }
 
 struct Trial {
-    dir: tempfile::TempDir,
+    _dir: tempfile::TempDir,
     server: Server,
     robot: Robot,
 }
@@ -32,7 +29,7 @@ impl Trial {
         let robot = Robot::on_disk(dir.path(), &server.url());
         assert!(robot.fetch().expect("first contact").is_first_contact);
         assert_holds(&robot.snapshot(), &first, 0..3);
-        Self { dir, server, robot }
+        Self { _dir: dir, server, robot }
     }
 
     fn accepts(&self, published: Published) -> FetchReport {
@@ -42,145 +39,118 @@ impl Trial {
         report
     }
 
-    fn refuses(&self, published: Published) -> FetchError {
+    fn refuses(&self, published: Published) -> TufError {
         let before = self.robot.snapshot().manifest;
         self.server.publish(published);
         let error = self.robot.fetch().expect_err("refused");
         assert_eq!(self.robot.snapshot().manifest, before);
-        error
-    }
-
-    fn does_not_know_the_key_of(&self, published: Published) {
-        let error = self.refuses(published);
-        assert!(matches!(error, FetchError::Manifest(ManifestError::UnknownKey { .. })), "{error}");
-    }
-
-    fn records(&self) -> std::path::PathBuf {
-        self.robot.cache.dir().join("trust")
-    }
-}
-
-fn hash(seed: u8) -> Hash32 {
-    public(&key(seed))
-}
-
-#[test]
-fn a_named_successor_is_accepted_and_then_alone() {
-    let trial = Trial::new(signed(1, A, None));
-    trial.does_not_know_the_key_of(signed(2, B, None));
-    let report = trial.accepts(signed(2, A, Some(B)));
-    assert_eq!((report.next_key, report.replaced_key), (Some(hash(B)), None));
-    // Both keys are accepted now, a third is not, and generations never decrease.
-    trial.does_not_know_the_key_of(signed(3, C, None));
-    trial.accepts(signed(5, A, Some(B)));
-    let error = trial.refuses(signed(4, B, None));
-    assert!(matches!(error, FetchError::Rollback { seen: 5, offered: 4, .. }), "{error}");
-    let report = trial.accepts(signed(6, B, None));
-    assert_eq!((report.key, report.replaced_key, report.next_key), (hash(B), Some(hash(A)), None));
-    trial.does_not_know_the_key_of(signed(9, A, Some(B)));
-    trial.accepts(signed(7, B, None));
-    let error = trial.refuses(signed(6, B, None));
-    assert!(matches!(error, FetchError::Rollback { seen: 7, .. }), "{error}");
-    // And to the next key.
-    trial.accepts(signed(8, B, Some(C)));
-    assert_eq!(trial.accepts(signed(9, C, None)).replaced_key, Some(hash(B)));
-    trial.does_not_know_the_key_of(signed(10, B, Some(C)));
-    trial.does_not_know_the_key_of(signed(10, A, Some(C)));
-}
-
-/// A retracted change: a successor that the present key no longer names is not accepted.
-#[test]
-fn a_successor_may_be_dropped() {
-    let trial = Trial::new(signed(1, A, Some(B)));
-    trial.accepts(signed(2, A, None));
-    trial.does_not_know_the_key_of(signed(3, B, None));
-    trial.accepts(signed(3, A, Some(C)));
-    trial.does_not_know_the_key_of(signed(4, B, None));
-    trial.accepts(signed(4, C, None));
-}
-
-/// A command line that names the old key keeps working, and does not reinstate it.
-#[test]
-fn keys_that_are_named_follow_their_successors() {
-    let mut trial = Trial::new(signed(1, A, Some(B)));
-    trial.robot.request.keys = vec![hash(A)];
-    trial.accepts(signed(2, B, None));
-    trial.accepts(signed(3, B, None));
-    trial.does_not_know_the_key_of(signed(9, A, Some(B)));
-    // A robot that missed the announcement is given both keys.
-    let mut late = Trial::new(signed(1, A, None));
-    late.does_not_know_the_key_of(signed(3, B, None));
-    late.robot.request.keys = vec![hash(A), hash(B)];
-    assert_eq!(late.accepts(signed(3, B, None)).replaced_key, Some(hash(A)));
-    late.does_not_know_the_key_of(signed(9, A, None));
-    late.accepts(signed(4, B, None));
-}
-
-/// The records are lost, or are those of before the change: the manifest on board still refuses the old key.
-#[test]
-fn the_old_key_stays_refused_without_the_records() {
-    let trial = Trial::new(signed(1, A, Some(B)));
-    let before = trial.dir.path().join("before");
-    copy_dir(&trial.records(), &before);
-    trial.accepts(signed(2, B, None));
-    for put_back in [false, true] {
-        fs_err::remove_dir_all(trial.records()).expect("there");
-        if put_back {
-            copy_dir(&before, &trial.records());
+        match error {
+            FetchError::Tuf(error) => error,
+            error => panic!("{error}"),
         }
-        trial.does_not_know_the_key_of(signed(9, A, Some(B)));
-        assert!(matches!(trial.refuses(signed(1, A, Some(B))), FetchError::Manifest(_)), "{put_back}");
-        trial.accepts(signed(2, B, None));
     }
-    // Lost between announcement and change: both keys are still accepted.
-    let trial = Trial::new(signed(1, A, Some(B)));
-    fs_err::remove_dir_all(trial.records()).expect("there");
-    trial.accepts(signed(2, B, None));
+
+    fn does_not_know_the_keys_of(&self, published: Published) {
+        let error = self.refuses(published);
+        assert!(matches!(error, TufError::Signatures { ref role, .. } if role == "timestamp"), "{error}");
+    }
 }
 
-/// The old generation still answers if the new one was accepted but never arrived.
+/// Wrong keys, and a leaked online key that a new root took out of use.
 #[test]
-fn a_change_of_keys_that_was_cut_off_loses_nothing() {
-    let old = signed(1, A, Some(B));
-    let trial = Trial::new(old.clone());
-    trial.server.publish(signed(2, B, None));
+fn a_robot_follows_new_roots_and_refuses_revoked_keys() {
+    let (trial, sleeps) = (Trial::new(of(1, &[FIRST], 1)), Trial::new(of(1, &[FIRST], 1)));
+    trial.does_not_know_the_keys_of(of(2, &[THIEF], 2));
+    let report = trial.accepts(of(2, &[FIRST, SECOND], 2));
+    assert_eq!((report.root_version, report.is_first_contact), (Some(2), false));
+    trial.does_not_know_the_keys_of(of(9, &[FIRST], 9));
+    assert_eq!(trial.accepts(of(3, &[FIRST, SECOND, THIRD], 3)).root_version, Some(3));
+    trial.does_not_know_the_keys_of(of(9, &[FIRST], 9));
+    trial.does_not_know_the_keys_of(of(9, &[FIRST, SECOND], 9));
+    // A robot that missed both changes follows them at once.
+    assert_eq!(sleeps.accepts(of(3, &[FIRST, SECOND, THIRD], 3)).root_version, Some(3));
+}
+
+/// A thief of the online keys cannot name keys of his own.
+#[test]
+fn a_root_that_the_present_one_does_not_sign_is_refused() {
+    let trial = Trial::new(of(1, &[FIRST], 1));
+    for signers in [vec![9], vec![2, 9], vec![1]] {
+        let signers: Vec<_> = signers.into_iter().map(key).collect();
+        let mut published = of(2, &[FIRST, THIEF], 2);
+        let root = sign(2, NOW + 1000, &root_of(THIEF), &signers.iter().collect::<Vec<_>>());
+        published.metadata.insert("2.root.json".into(), root);
+        let error = trial.refuses(published);
+        assert!(matches!(error, TufError::Signatures { ref role, .. } if role == "root"), "{error}");
+    }
+    assert_eq!(trial.accepts(of(2, &[FIRST], 2)).root_version, Some(1));
+}
+
+/// A thief of the online keys signs the highest version; the owner of the root undoes it without visiting robots.
+#[test]
+fn a_fast_forward_is_undone_by_a_new_root() {
+    let trial = Trial::new(of(1, &[FIRST], 1));
+    trial.accepts(of(u64::MAX, &[FIRST], u64::MAX));
+    let error = trial.refuses(of(2, &[FIRST], 2));
+    assert!(matches!(error, TufError::Rollback { seen: u64::MAX, offered: 2, .. }), "{error}");
+    trial.accepts(of(2, &[FIRST, SECOND], 2));
+    trial.does_not_know_the_keys_of(of(u64::MAX, &[FIRST], u64::MAX));
+    trial.accepts(of(3, &[FIRST, SECOND], 3));
+}
+
+#[test]
+fn an_old_state_is_refused_even_if_the_new_one_never_arrived() {
+    let trial = Trial::new(of(2, &[FIRST], 2));
+    assert!(matches!(trial.refuses(of(1, &[FIRST], 1)), TufError::Rollback { seen: 2, offered: 1, .. }));
+    trial.server.publish(of(7, &[FIRST], 7));
     trial.server.faults(|seen| match seen.path.contains("objects") {
-        true => super::server::Fault::Status(404),
-        false => super::server::Fault::None,
+        true => Fault::Status(404),
+        false => Fault::None,
     });
     assert!(matches!(trial.robot.fetch(), Err(FetchError::Download { .. })));
-    assert_holds(&trial.robot.snapshot(), &old, 0..3);
-    trial.server.faults(|_| super::server::Fault::None);
-    // The new key has signed: the old one is refused, though its generation is on board.
-    trial.does_not_know_the_key_of(signed(9, A, Some(B)));
-    trial.does_not_know_the_key_of(old);
-    trial.accepts(signed(2, B, None));
+    trial.server.faults(|_| Fault::None);
+    assert!(matches!(trial.refuses(of(6, &[FIRST], 6)), TufError::Rollback { seen: 7, offered: 6, .. }));
+    trial.accepts(of(7, &[FIRST], 7));
 }
 
-/// A generation seen under the old key that never arrived counts for the new key.
+/// Each file is genuine, but of another state.
 #[test]
-fn what_was_seen_under_the_old_key_counts_for_the_new_one() {
-    let trial = Trial::new(signed(1, A, Some(B)));
-    trial.server.publish(signed(7, A, Some(B)));
-    trial.server.faults(|seen| match seen.path.contains("objects") {
-        true => super::server::Fault::Status(404),
-        false => super::server::Fault::None,
+fn files_of_different_states_are_not_mixed() {
+    let trial = Trial::new(of(1, &[FIRST], 1));
+    let (other, new) = (of(5, &[FIRST], 2), of(2, &[FIRST], 2));
+    for name in ["2.snapshot.json", "2.targets.json"] {
+        let mut mixed = new.clone().signed_by(&[FIRST], 2);
+        mixed.metadata.insert(name.into(), other.metadata[name].clone());
+        let error = trial.refuses(mixed);
+        assert!(matches!(error, TufError::Content { .. }), "{name}: {error}");
+    }
+    trial.server.publish(new.clone());
+    let instead = other.signed.clone();
+    trial.server.faults(move |seen| match seen.path.contains("/targets/") {
+        true => Fault::Instead(instead.clone()),
+        false => Fault::None,
     });
-    assert!(matches!(trial.robot.fetch(), Err(FetchError::Download { .. })));
-    trial.server.faults(|_| super::server::Fault::None);
-    let error = trial.refuses(signed(6, B, None));
-    assert!(matches!(error, FetchError::Rollback { seen: 7, offered: 6, .. }), "{error}");
-    trial.accepts(signed(7, B, None));
+    assert!(matches!(trial.robot.fetch(), Err(FetchError::Tuf(TufError::Content { .. }))));
+    trial.server.faults(|_| Fault::None);
+    trial.accepts(new);
 }
 
-/// The generation on board answers beyond its expiry; only fetch refuses it.
+/// A network that repeats the last state for ever is noticed when the timestamp expires; what is on board answers on.
+/// A clock that is behind does not help: the newest time that was signed counts.
 #[test]
-fn an_expired_generation_goes_on_answering() {
-    let mut trial = Trial::new(signed(1, A, None));
-    let expires = signed(1, A, None).manifest.expires_unix_secs.expect("given");
-    trial.robot.now_unix_secs = expires;
-    trial.accepts(signed(1, A, None));
-    trial.robot.now_unix_secs = expires + 1;
-    let error = trial.refuses(signed(1, A, None));
-    assert!(matches!(error, FetchError::Manifest(ManifestError::Expired { .. })), "{error}");
+fn a_frozen_store_is_noticed() {
+    let expiring = |at: u64, version: u64| {
+        let published = of(version, &[FIRST], version);
+        let metadata = metadata(&[FIRST], version, at, &published.signed);
+        Published { metadata, ..published }
+    };
+    let mut trial = Trial::new(of(1, &[FIRST], 1));
+    trial.robot.now_unix_secs = NOW + 999;
+    trial.accepts(of(1, &[FIRST], 1));
+    trial.robot.now_unix_secs = NOW + 1000;
+    assert!(matches!(trial.refuses(of(1, &[FIRST], 1)), TufError::Expired { .. }));
+    // Timestamps here are signed at NOW - 1000.
+    trial.robot.now_unix_secs = 0;
+    assert!(matches!(trial.refuses(expiring(NOW - 1000, 2)), TufError::Expired { .. }));
+    trial.accepts(expiring(NOW - 999, 2));
 }

@@ -21,7 +21,8 @@ use std::time::Duration;
 use glam::DVec3;
 use slag_common::Hash32;
 use slag_edge::fetch::{
-    Environment, FetchError, FetchReport, FetchRequest, NetworkLimits, Position, Progress, fetch,
+    AddedRoot, Environment, FetchError, FetchReport, FetchRequest, FirstRoot, NetworkLimits, Position,
+    Progress, add_root, fetch,
 };
 use slag_edge::store::{EdgeCache, Snapshot};
 
@@ -52,6 +53,7 @@ impl Robot {
             at: Some(at(5.0)),
             radius: 20.0,
             parallel: 1,
+            trust_first: true,
             ..FetchRequest::default()
         };
         Self { cache, request, now_unix_secs: NOW, limits }
@@ -70,14 +72,17 @@ impl Robot {
     }
 
     fn fetch_watched(&self, progress: &dyn Progress, cancel: &AtomicBool) -> Result<FetchReport, FetchError> {
-        let environment = Environment {
-            now_unix_secs: self.now_unix_secs,
-            cancel,
-            progress,
-            random: &|| 0.5,
-            limits: self.limits.clone(),
-        };
-        fetch(&self.cache, &self.request, &environment)
+        fetch(&self.cache, &self.request, &self.environment(progress, cancel))
+    }
+
+    fn environment<'a>(&self, progress: &'a dyn Progress, cancel: &'a AtomicBool) -> Environment<'a> {
+        let (now_unix_secs, limits) = (self.now_unix_secs, self.limits.clone());
+        Environment { now_unix_secs, cancel, progress, random: &|| 0.5, limits }
+    }
+
+    fn add_root(&self, root: &FirstRoot, replace: bool) -> Result<AddedRoot, FetchError> {
+        let cancel = AtomicBool::new(false);
+        add_root(&self.cache, root, replace, &self.environment(&(), &cancel))
     }
 
     fn snapshot(&self) -> Snapshot {

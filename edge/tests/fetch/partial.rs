@@ -6,7 +6,7 @@ use slag_edge::fetch::{DownloadFailure, FetchError};
 use slag_edge::store::{BadCell, CellFault, Snapshot};
 
 use super::Robot;
-use super::scene::{Published, key};
+use super::scene::Published;
 use super::server::{Fault, Seen, Server};
 
 /// Misbehaves for the compact shards of these cells.
@@ -121,7 +121,7 @@ fn an_old_copy_answers_only_where_it_belongs() {
         let server = Server::start(first.clone());
         let robot = Robot::on_disk(dir.path(), &server.url());
         robot.fetch().expect("works");
-        let second = Published::new(2, &[0, 7, 0], 40).edited(&key(1), edit);
+        let second = Published::new(2, &[0, 7, 0], 40).edited(edit);
         server.publish(second.clone());
         server.faults(at_cells(&second, &[1], &Fault::Status(404)));
         let report = robot.fetch().expect("the others are good");

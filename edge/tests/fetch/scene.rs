@@ -7,20 +7,29 @@ use glam::DVec3;
 use half::f16;
 use slag_common::Hash32;
 use slag_common::frames::{Aabb, GeoReference};
-use slag_common::manifest::{CellRecord, EncoderRecord, Manifest, ShardRecord, VERSION};
+use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord, VERSION};
 use slag_common::shard::{ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardView, quantise};
+use slag_common::tuf::{
+    FileMeta, Key, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp, format_utc, sign,
+};
 use slag_math::random::Random;
 
 pub const DIM: u32 = 4;
 pub const ENCODER: Hash32 = Hash32([9; 32]);
 pub const NOW: u64 = 1_800_000_000;
 
-pub fn key(seed: u8) -> SigningKey {
-    SigningKey::from_bytes(&[seed; 32])
+/// The keys of a root, by seeds: its own, and that of the other roles.
+#[derive(Clone, Copy, Debug)]
+pub struct RootKeys {
+    pub root: u8,
+    pub online: u8,
 }
 
-pub fn public(key: &SigningKey) -> Hash32 {
-    Hash32(key.verifying_key().to_bytes())
+/// The first root of every scene here.
+pub const FIRST: RootKeys = RootKeys { root: 1, online: 2 };
+
+pub fn key(seed: u8) -> SigningKey {
+    SigningKey::from_bytes(&[seed; 32])
 }
 
 /// A scene as a store has it.
@@ -28,6 +37,8 @@ pub fn public(key: &SigningKey) -> Hash32 {
 pub struct Published {
     pub manifest: Manifest,
     pub signed: Vec<u8>,
+    /// Metadata files by name.
+    pub metadata: BTreeMap<String, Vec<u8>>,
     pub objects: BTreeMap<Hash32, Vec<u8>>,
 }
 
@@ -135,13 +146,21 @@ impl Published {
             n_rejected: 0,
             cells: cells.collect(),
         };
-        Self { signed: manifest.sign(&key(1)), manifest, objects }
+        let (signed, metadata) = (Vec::new(), BTreeMap::new());
+        Self { manifest, signed, metadata, objects }.edited(|_| ())
     }
 
     /// Changes the manifest and signs it again.
-    pub fn edited(mut self, signer: &SigningKey, edit: impl FnOnce(&mut Manifest)) -> Self {
+    pub fn edited(mut self, edit: impl FnOnce(&mut Manifest)) -> Self {
         edit(&mut self.manifest);
-        self.signed = self.manifest.sign(signer);
+        self.signed = self.manifest.sign(&key(1));
+        let version = self.manifest.generation;
+        self.signed_by(&[FIRST], version)
+    }
+
+    /// Signs the metadata again: under the last of these roots, with this version of all other roles.
+    pub fn signed_by(mut self, roots: &[RootKeys], version: u64) -> Self {
+        self.metadata = metadata(roots, version, NOW + 1000, &self.signed);
         self
     }
 
@@ -149,7 +168,44 @@ impl Published {
         self.manifest.cells[cell_id as usize].shards[&profile].hash
     }
 
+    /// Returns the first root.
+    pub fn first_root(&self) -> Vec<u8> {
+        self.metadata["1.root.json"].clone()
+    }
+
     pub fn bytes(&self, cell_ids: std::ops::Range<u32>) -> u64 {
         cell_ids.map(|id| self.objects[&self.hash(id, Profile::Compact)].len() as u64).sum()
     }
+}
+
+/// Returns metadata files by name. Roots are each signed by the one before, too. `expires`: of the timestamp.
+pub fn metadata(roots: &[RootKeys], version: u64, expires: u64, target: &[u8]) -> BTreeMap<String, Vec<u8>> {
+    let lasting = NOW + 1_000_000;
+    let mut files = BTreeMap::new();
+    for (at, keys) in roots.iter().enumerate() {
+        let (own, before) = (key(keys.root), key(roots[at.saturating_sub(1)].root));
+        let bytes = sign(at as u64 + 1, lasting, &root_of(*keys), &[&own, &before]);
+        files.insert(format!("{}.root.json", at + 1), bytes);
+    }
+    let online = key(roots[roots.len() - 1].online);
+    let targets = BTreeMap::from([(manifest::TARGET.to_owned(), TargetFile::of(target))]);
+    let targets = sign(version, lasting, &Targets { targets, delegations: None }, &[&online]);
+    let meta = BTreeMap::from([("targets.json".to_owned(), FileMeta::of(version, &targets))]);
+    let snapshot = sign(version, lasting, &Snapshot { meta }, &[&online]);
+    let meta = BTreeMap::from([("snapshot.json".to_owned(), FileMeta::of(version, &snapshot))]);
+    let timestamp = Timestamp { meta, signed_at: Some(format_utc(NOW - 1000)) };
+    files.insert("timestamp.json".to_owned(), sign(version, expires, &timestamp, &[&online]));
+    files.insert(format!("{version}.snapshot.json"), snapshot);
+    files.insert(format!("{version}.targets.json"), targets);
+    files
+}
+
+pub fn root_of(seeds: RootKeys) -> Root {
+    let [root, online] = [seeds.root, seeds.online].map(|seed| Key::of(&key(seed)));
+    let role = |key: &Key| RoleKeys { keyids: vec![key.id()], threshold: 1 };
+    let mut roles: BTreeMap<String, RoleKeys> =
+        ["targets", "snapshot", "timestamp"].map(|name| (name.to_owned(), role(&online))).into();
+    roles.insert("root".to_owned(), role(&root));
+    let keys = [root, online].map(|key| (key.id(), key)).into();
+    Root { consistent_snapshot: true, keys, roles }
 }

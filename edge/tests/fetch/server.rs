@@ -7,7 +7,8 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use slag_common::Hash32;
+use slag_common::tuf::TargetFile;
+use slag_common::{Hash32, manifest};
 
 use super::scene::Published;
 
@@ -148,9 +149,16 @@ fn answer(shared: &Shared, mut stream: TcpStream) -> std::io::Result<()> {
     let path = request_line.split(' ').nth(1).unwrap_or_default().to_owned();
     let content = {
         let published = shared.published.lock().expect("sound");
-        match path.strip_prefix("/v1/objects/") {
-            Some(hash) => hash.parse().ok().and_then(|hash: Hash32| published.objects.get(&hash).cloned()),
-            None => (path == "/v1/manifest").then(|| published.signed.clone()),
+        match path.strip_prefix("/v1/").and_then(|path| path.split_once('/')) {
+            Some(("objects", hash)) => {
+                hash.parse().ok().and_then(|hash: Hash32| published.objects.get(&hash).cloned())
+            }
+            Some(("metadata", name)) => published.metadata.get(name).cloned(),
+            Some(("targets", name)) => {
+                let expected = TargetFile::of(&published.signed).file_name(manifest::TARGET);
+                (expected.as_deref() == Ok(name)).then(|| published.signed.clone())
+            }
+            _ => None,
         }
     };
     let mut seen = Seen { path, range_start, status: 0, body_bytes: 0 };

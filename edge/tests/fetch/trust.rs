@@ -1,32 +1,25 @@
-//! Attacks on what a robot remembers: damaged, lost and outdated records of keys, generations and scenes.
+//! First trust, and attacks on what a robot remembers: damaged and lost records, other roots, other scenes.
 
 use std::path::{Path, PathBuf};
 
-use slag_common::Hash32;
-use slag_common::manifest::ManifestError;
-use slag_edge::fetch::{FetchError, RecordsError};
+use slag_common::tuf::{TufError, sha256_hex};
+use slag_edge::fetch::{FetchError, FirstRoot, RecordsError, accepted};
 
 use super::crash::copy_dir;
-use super::scene::{Published, key, public};
+use super::scene::{FIRST, Published, RootKeys};
 use super::server::Server;
 use super::{Robot, assert_holds};
 
-const A: u8 = 1;
-const B: u8 = 2;
-const C: u8 = 3;
+const SECOND: RootKeys = RootKeys { root: 3, online: 4 };
+const OTHER: RootKeys = RootKeys { root: 8, online: 9 };
 /// Flips of each file of records.
 const N_FLIPS: usize = 120;
 
-fn hash(seed: u8) -> Hash32 {
-    public(&key(seed))
+fn of(generation: u64, roots: &[RootKeys]) -> Published {
+    Published::new(generation, &[generation; 3], 20).signed_by(roots, generation)
 }
 
-fn signed(generation: u64, by: u8, next: Option<u8>) -> Published {
-    Published::new(generation, &[generation; 3], 20)
-        .edited(&key(by), |manifest| manifest.next_key = next.map(hash))
-}
-
-/// A robot that has followed from key A to key B; generation 2 is on board.
+/// A robot that has followed from the first root to the second; generation 2 is on board.
 struct Rotated {
     dir: tempfile::TempDir,
     server: Server,
@@ -36,11 +29,12 @@ struct Rotated {
 impl Rotated {
     fn new() -> Self {
         let dir = tempfile::tempdir().expect("temporary folder");
-        let server = Server::start(signed(1, A, Some(B)));
-        let robot = Robot::on_disk(dir.path(), &server.url());
+        let server = Server::start(of(1, &[FIRST]));
+        let mut robot = Robot::on_disk(dir.path(), &server.url());
         robot.fetch().expect("first contact");
-        server.publish(signed(2, B, None));
-        assert_eq!(robot.fetch().expect("accepted").replaced_key, Some(hash(A)));
+        robot.request.trust_first = false;
+        server.publish(of(2, &[FIRST, SECOND]));
+        assert_eq!(robot.fetch().expect("accepted").root_version, Some(2));
         Self { dir, server, robot }
     }
 
@@ -50,19 +44,26 @@ impl Rotated {
         folders.into_iter().filter(|folder| folder.is_dir()).collect()
     }
 
-    fn refuses_the_old_key(&self, context: &str) -> String {
-        self.server.publish(signed(9, A, Some(B)));
+    fn refuses_the_old_keys(&self, context: &str) {
+        self.server.publish(of(9, &[FIRST]));
         let error = self.robot.fetch().expect_err(context);
-        let is_refused =
-            matches!(error, FetchError::Manifest(ManifestError::UnknownKey { .. }) | FetchError::Key { .. });
-        assert!(is_refused, "{context}: {error}");
-        assert_holds(&self.robot.snapshot(), &signed(2, B, None), 0..3);
-        slag_edge::error_line(&error)
+        assert!(matches!(error, FetchError::Tuf(TufError::Signatures { .. })), "{context}: {error}");
+        assert_holds(&self.robot.snapshot(), &of(2, &[FIRST, SECOND]), 0..3);
     }
 
-    fn accepts_the_new_key(&self, context: &str) {
-        self.server.publish(signed(2, B, None));
+    fn accepts_the_new_keys(&self, context: &str) {
+        self.server.publish(of(2, &[FIRST, SECOND]));
         self.robot.fetch().unwrap_or_else(|e| panic!("{context}: {}", slag_edge::error_line(&e)));
+    }
+
+    /// Flips a bit in both copies.
+    fn damage_both_copies(&self) {
+        for name in ["0", "1"] {
+            let path = self.robot.cache.dir().join("trust").join(name);
+            let mut bytes = fs_err::read(&path).expect("there");
+            *bytes.last_mut().expect("not empty") ^= 1;
+            fs_err::write(path, bytes).expect("written");
+        }
     }
 }
 
@@ -76,7 +77,7 @@ fn files_below(dir: &Path, found: &mut Vec<PathBuf>) {
     }
 }
 
-/// A flipped bit in any file of records neither stops a robot nor brings an old key back.
+/// A flipped bit in any file of records neither stops a robot nor brings old keys back.
 #[test]
 fn a_flipped_bit_in_the_records_costs_nothing() {
     let rotated = Rotated::new();
@@ -100,86 +101,129 @@ fn a_flipped_bit_in_the_records_costs_nothing() {
             flipped[*at] ^= 1 << (at % 8);
             fs_err::write(&file, flipped).expect("written");
             let context = format!("bit {} of byte {at} of {}", at % 8, file.display());
-            rotated.refuses_the_old_key(&context);
-            rotated.accepts_the_new_key(&context);
+            rotated.refuses_the_old_keys(&context);
+            rotated.accepts_the_new_keys(&context);
             n_trials += 1;
         }
     }
     assert!(n_trials > 100, "{n_trials}");
 }
 
-/// A command line that still names the old key: with its records, without them, and with damaged ones.
+/// A script that adds the first root again, after its keys were revoked, changes nothing; another root needs --replace.
 #[test]
-fn a_command_line_with_the_old_key_does_not_bring_it_back() {
+fn adding_the_first_root_again_does_not_bring_its_keys_back() {
+    let rotated = Rotated::new();
+    let first = FirstRoot::Bytes(of(1, &[FIRST]).first_root());
+    for root in [first, FirstRoot::Any { from: rotated.server.url() }] {
+        assert!(!rotated.robot.add_root(&root, false).expect("known").is_new);
+        rotated.refuses_the_old_keys("the first root is added again");
+        rotated.accepts_the_new_keys("the first root is added again");
+    }
+    let other = FirstRoot::Bytes(of(3, &[OTHER]).first_root());
+    let error = rotated.robot.add_root(&other, false).expect_err("another root");
+    assert!(matches!(error, FetchError::OtherRoot { .. }), "{error}");
+    rotated.accepts_the_new_keys("another root was refused");
+    assert!(rotated.robot.add_root(&other, true).expect("asked for").is_new);
+    let error = rotated.robot.fetch().expect_err("the former root's store");
+    assert!(matches!(error, FetchError::Tuf(TufError::Signatures { .. })), "{error}");
+    rotated.server.publish(of(1, &[OTHER]));
+    assert_eq!(rotated.robot.fetch().expect("the other store").generation, 1);
+}
+
+/// Without a step that says so, nobody is trusted.
+#[test]
+fn first_trust_is_a_step_of_its_own() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let published = of(2, &[FIRST, SECOND]);
+    let server = Server::start(published.clone());
+    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    robot.request.trust_first = false;
+    let error = robot.fetch().expect_err("nothing is trusted");
+    assert!(matches!(error, FetchError::NoTrust { .. }), "{error}");
+    assert_eq!(server.take_seen().len(), 0, "nothing is asked");
+    assert_eq!(accepted(&robot.cache), None);
+
+    let second_root = published.metadata["2.root.json"].clone();
+    let by_hash = |sha256: String| FirstRoot::Sha256 { from: server.url(), sha256 };
+    let error = robot.add_root(&by_hash("0".repeat(64)), false).expect_err("no such root");
+    assert!(matches!(error, FetchError::NoSuchRoot { .. }), "{error}");
+    let junk = robot.add_root(&FirstRoot::Bytes(b"{}".to_vec()), false).expect_err("no root");
+    assert!(matches!(junk, FetchError::Tuf(TufError::Format { .. })), "{junk}");
+    let mut forged = second_root.clone();
+    let digit = forged.iter().rposition(|byte| byte.is_ascii_digit()).expect("a digit");
+    forged[digit] ^= 1;
+    assert!(robot.add_root(&FirstRoot::Bytes(forged), false).is_err());
+
+    let added = robot.add_root(&by_hash(sha256_hex(&second_root)), false).expect("there");
+    assert_eq!((added.version, added.is_new), (2, true));
+    let report = robot.fetch().expect("works");
+    assert_eq!((report.root_version, report.is_first_contact), (Some(2), false));
+    assert_holds(&robot.snapshot(), &published, 0..3);
+    let kept = accepted(&robot.cache).expect("recorded");
+    assert_eq!((kept.scene.as_deref(), kept.root_version), (Some("yard"), 2));
+    assert_eq!(kept.root_sha256, sha256_hex(&second_root));
+}
+
+/// Both copies are damaged: nobody is believed until a root is added by hand.
+#[test]
+fn without_a_whole_copy_no_store_is_believed() {
     let mut rotated = Rotated::new();
-    rotated.robot.request.keys = vec![hash(A)];
-    let error = rotated.refuses_the_old_key("records intact");
-    assert!(!error.contains("delete"), "{error}");
-    rotated.accepts_the_new_key("the old key's successor signs");
+    rotated.damage_both_copies();
+    rotated.server.publish(of(2, &[FIRST, SECOND]));
+    for trust_first in [false, true] {
+        rotated.robot.request.trust_first = trust_first;
+        let error = rotated.robot.fetch().expect_err("fails closed");
+        assert!(matches!(error, FetchError::Records(RecordsError::Damaged { .. })), "{error}");
+        assert!(!error.to_string().contains("delete"), "{error}");
+        assert_holds(&rotated.robot.snapshot(), &of(2, &[FIRST, SECOND]), 0..3);
+    }
+    rotated.robot.request.trust_first = false;
+    let second_root = of(2, &[FIRST, SECOND]).metadata["2.root.json"].clone();
+    assert!(rotated.robot.add_root(&FirstRoot::Bytes(second_root), false).expect("a root").is_new);
+    rotated.refuses_the_old_keys("the record is written anew");
+    rotated.accepts_the_new_keys("the record is written anew");
+}
+
+/// Records that are gone are no first contact by themselves.
+#[test]
+fn a_robot_without_records_asks_for_a_root() {
+    let rotated = Rotated::new();
     for folder in rotated.records() {
         fs_err::remove_dir_all(folder).expect("there");
     }
-    let error = rotated.refuses_the_old_key("records lost");
-    assert!(!error.contains("delete"), "{error}");
+    assert!(matches!(rotated.robot.fetch(), Err(FetchError::NoTrust { .. })));
+    assert_holds(&rotated.robot.snapshot(), &of(2, &[FIRST, SECOND]), 0..3);
 }
 
-/// Floors of generations are counted by scene: another scene could bring an older map without a word.
+/// A store is trusted for one scene: another one could bring an older map without a word.
 #[test]
-fn another_scene_of_the_same_key_is_refused() {
+fn another_scene_of_the_same_root_is_refused() {
     let dir = tempfile::tempdir().expect("temporary folder");
-    let second = Published::new(2, &[0; 3], 20);
-    let server = Server::start(second.clone());
+    let server = Server::start(of(2, &[FIRST]));
     let robot = Robot::on_disk(dir.path(), &server.url());
     robot.fetch().expect("works");
-    let other = Published::new(1, &[4; 3], 20).edited(&key(A), |manifest| manifest.scene = "barn".into());
-    server.publish(other.clone());
+    let barn = |version| {
+        Published::new(1, &[4; 3], 20)
+            .edited(|manifest| manifest.scene = "barn".into())
+            .signed_by(&[FIRST], version)
+    };
+    server.publish(barn(3));
     let error = robot.fetch().expect_err("another scene").to_string();
     assert!(error.contains("\"barn\"") && error.contains("\"yard\"") && error.contains("--scene"), "{error}");
-    assert_holds(&robot.snapshot(), &second, 0..3);
+    assert_holds(&robot.snapshot(), &of(2, &[FIRST]), 0..3);
 
-    // To go there is a step of its own; and so is the way back, to the generation that was seen.
+    // To go there is a step of its own; and so is the way back.
     let mut moved = robot.clone();
     moved.request.scene = Some("shed".into());
     let error = moved.fetch().expect_err("a third scene").to_string();
     assert!(error.contains("\"barn\"") && error.contains("\"shed\""), "{error}");
     moved.request.scene = Some("barn".into());
     assert_eq!(moved.fetch().expect("asked for").scene, "barn");
-    assert_holds(&robot.snapshot(), &other, 0..3);
+    assert_holds(&robot.snapshot(), &barn(3), 0..3);
     assert_eq!(robot.fetch().expect("pinned now").scene, "barn");
-    server.publish(Published::new(1, &[0; 3], 20));
+    server.publish(Published::new(2, &[0; 3], 20).signed_by(&[FIRST], 4));
     assert!(matches!(robot.fetch(), Err(FetchError::Scene { .. })));
-    moved.request.scene = Some("yard".into());
-    assert!(matches!(moved.fetch(), Err(FetchError::Rollback { seen: 2, offered: 1, .. })));
-    assert_holds(&robot.snapshot(), &other, 0..3);
     // The scene on board counts if the records are lost.
     fs_err::remove_dir_all(robot.cache.dir().join("trust")).expect("there");
-    server.publish(second);
     assert!(matches!(robot.fetch(), Err(FetchError::Scene { .. })));
-}
-
-/// Both copies are damaged: no key is accepted until one is named, and then only that of the generation on
-/// board.
-#[test]
-fn without_a_whole_copy_no_key_is_accepted() {
-    let mut rotated = Rotated::new();
-    let copies = ["0", "1"].map(|name| rotated.robot.cache.dir().join("trust").join(name));
-    for path in &copies {
-        let mut bytes = fs_err::read(path).expect("there");
-        *bytes.last_mut().expect("not empty") ^= 1;
-        fs_err::write(path, bytes).expect("written");
-    }
-    rotated.server.publish(signed(2, B, None));
-    for keys in [vec![], vec![hash(A)], vec![hash(A), hash(C)]] {
-        rotated.robot.request.keys = keys;
-        let error = rotated.robot.fetch().expect_err("fails closed");
-        let is_closed =
-            matches!(error, FetchError::Records(RecordsError::Damaged { .. }) | FetchError::Key { .. });
-        assert!(is_closed && !error.to_string().contains("delete"), "{error}");
-        assert_holds(&rotated.robot.snapshot(), &signed(2, B, None), 0..3);
-    }
-    rotated.robot.request.keys = vec![hash(B)];
-    rotated.accepts_the_new_key("the key of the generation on board");
-    rotated.robot.request.keys.clear();
-    rotated.accepts_the_new_key("the record is written anew");
-    rotated.refuses_the_old_key("the record is written anew");
 }

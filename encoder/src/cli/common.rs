@@ -6,7 +6,6 @@ use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, Result, anyhow};
 use clap::Args;
@@ -21,6 +20,7 @@ use tracing_subscriber::EnvFilter;
 
 use crate::ingest::FrameChoice;
 use crate::store::StoreReader;
+use crate::store::metadata::clock_unix_secs;
 
 /// Flags that every command has.
 #[derive(Clone, Copy, Debug, Args)]
@@ -131,7 +131,7 @@ pub fn cancel_flag() -> Result<Arc<AtomicBool>> {
 pub fn now_unix_secs() -> u64 {
     // The convention of reproducible-builds.org.
     let given = std::env::var("SOURCE_DATE_EPOCH").ok().and_then(|text| text.parse().ok());
-    given.unwrap_or_else(|| SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs()))
+    given.unwrap_or_else(clock_unix_secs)
 }
 
 /// Opens the models that the flags name, and returns how they are run.

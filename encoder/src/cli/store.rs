@@ -10,10 +10,10 @@ use slag_common::Hash32;
 use slag_common::byte_size::ByteSize;
 use slag_common::tuf::format_utc;
 
-use super::common::{now_unix_secs, print};
+use super::common::print;
 use super::exit::Exit;
 use crate::progress::Progress;
-use crate::store::metadata::{Metadata, TIMESTAMP_DAYS};
+use crate::store::metadata::{Metadata, TIMESTAMP_DAYS, clock_unix_secs};
 use crate::store::{Fault, Published, Store, StoreReader, Verified};
 
 /// `store`.
@@ -75,7 +75,7 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
         StoreCommand::Refresh { at, days } => {
             // A mistyped path must not create a store.
             StoreReader::open(&at.store)?;
-            let refreshed = Metadata::open(&at.store)?.refresh(now_unix_secs(), *days)?;
+            let refreshed = Metadata::open(&at.store)?.refresh(clock_unix_secs(), *days)?;
             let expires = format_utc(refreshed.expires_unix_secs);
             let line = format!("timestamp {} until {expires}\n", refreshed.timestamp_version);
             print(json, &refreshed, line)?;

@@ -11,9 +11,11 @@ use std::collections::BTreeMap;
 use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde::Serialize;
 use slag_common::durable;
+use slag_common::manifest;
 use slag_common::tuf::{
     Body, FileMeta, MAX_ROOT_BYTES, MAX_SNAPSHOT_BYTES, MAX_TARGETS_BYTES, MAX_TIMESTAMP_BYTES, Root,
     SignedMetadata, Snapshot, TargetFile, Targets, Timestamp, TufError, format_utc, sign,
@@ -22,8 +24,6 @@ use slag_common::tuf::{
 use super::error::StoreError;
 use super::{files, roles};
 
-/// Path of the manifest among the targets.
-pub const MANIFEST_TARGET: &str = "manifest";
 /// The newest timestamp.
 pub const TIMESTAMP_FILE: &str = "timestamp.json";
 /// Days for which a timestamp counts, unless a refresh says otherwise.
@@ -65,14 +65,17 @@ impl Metadata {
     }
 
     /// Publishes a manifest; nothing changes if it is published already. Makes keys and root at the first time.
+    /// `created_unix_secs`: when the manifest was made; the clock counts if it is later, because a manifest may be dated
+    /// back to be reproducible.
     ///
     /// # Errors
     /// [`StoreError`].
-    pub fn publish(&self, manifest: &[u8], now_unix_secs: u64) -> Result<(), StoreError> {
+    pub fn publish(&self, signed: &[u8], created_unix_secs: u64) -> Result<(), StoreError> {
+        let now_unix_secs = created_unix_secs.max(clock_unix_secs());
         if !self.path("1.root.json").exists() {
             self.make_root(now_unix_secs)?;
         }
-        let targets = BTreeMap::from([(MANIFEST_TARGET.to_owned(), TargetFile::of(manifest))]);
+        let targets = BTreeMap::from([(manifest::TARGET.to_owned(), TargetFile::of(signed))]);
         if self.published()?.is_some_and(|published| published.body.targets == targets) {
             return Ok(());
         }
@@ -184,6 +187,11 @@ impl Metadata {
     fn path(&self, name: &str) -> PathBuf {
         folder(&self.store).join(name)
     }
+}
+
+/// Returns the system's time, seconds since 1970.
+pub fn clock_unix_secs() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs())
 }
 
 /// Reads a metadata file of a store by the name that clients ask for; `None` if there is no such file.

@@ -2,15 +2,16 @@
 
 use std::path::Path;
 
-use slag_common::manifest::Manifest;
+use slag_common::manifest::{self, Manifest};
 use slag_common::tuf::{Kept, Source, TargetFile, Trusted, TufError, find_target, refresh};
 
-use super::metadata::{MANIFEST_TARGET, Metadata, read_published};
-use super::tests::manifest;
+use super::metadata::{Metadata, clock_unix_secs, read_published};
+use super::tests::manifest as manifest_of;
 use super::{Extras, Store, StoreError};
 
 const DAY: u64 = 86_400;
-const NOW: u64 = 20_000 * DAY;
+/// Later than the clock, in the year 2079.
+const NOW: u64 = 40_000 * DAY;
 
 struct Folder<'a>(&'a Path);
 
@@ -21,7 +22,7 @@ impl Source for Folder<'_> {
 }
 
 fn publish(store: &Store, generation: u64, now: u64) {
-    let scene = Manifest { created_unix_secs: now, ..manifest(generation, &[]) };
+    let scene = Manifest { created_unix_secs: now, ..manifest_of(generation, &[]) };
     store.publish(&scene, &Extras::new()).expect("publishes");
 }
 
@@ -31,7 +32,7 @@ fn client(dir: &Path) -> Kept {
 
 fn update(kept: &mut Kept, dir: &Path, now: u64) -> Result<(Trusted, TargetFile), TufError> {
     let mut trusted = refresh(kept, &mut Folder(dir), now)?;
-    let found = find_target(&mut trusted, kept, &mut Folder(dir), MANIFEST_TARGET)?;
+    let found = find_target(&mut trusted, kept, &mut Folder(dir), manifest::TARGET)?;
     Ok((trusted, found.expect("listed")))
 }
 
@@ -134,4 +135,12 @@ fn only_names_of_metadata_are_read() {
     for name in ["01.root.json", "+1.root.json", "root.json", "lock", "../manifest", "1.timestamp.json", ""] {
         assert_eq!(read_published(dir.path(), name).expect("readable"), None, "{name}");
     }
+}
+
+/// A reproducible encode dates its manifest back; its timestamp must count nevertheless.
+#[test]
+fn a_manifest_that_is_dated_back_is_signed_today() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    publish(&Store::create_or_open(dir.path()).expect("opens"), 1, 1);
+    update(&mut client(dir.path()), dir.path(), clock_unix_secs()).expect("fresh");
 }

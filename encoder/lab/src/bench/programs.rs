@@ -85,7 +85,18 @@ impl Server {
     pub fn fetch_all(&self, edge: &Path, cache: &Path, profile: Profile) -> Result<(), ProgramError> {
         remove(cache)?;
         let mut fetch = Command::new(edge);
-        fetch.args(["fetch", "--json", "--quiet", "--at", "0,0,0", "--radius", "1e6", "--from", &self.url]);
+        fetch.args([
+            "fetch",
+            "--trust-first",
+            "--json",
+            "--quiet",
+            "--at",
+            "0,0,0",
+            "--radius",
+            "1e6",
+            "--from",
+            &self.url,
+        ]);
         json_of(fetch.args(["--profile", profile.name(), "--cache"]).arg(cache)).map(|_| ())
     }
 }

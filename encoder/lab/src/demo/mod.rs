@@ -192,7 +192,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     };
     let at = format!("{:.3},{:.3},{:.3}", robot_in_world.x, robot_in_world.y, robot_in_world.z);
     let radius = RADIUS_M.to_string();
-    let fetch = ["fetch", "--from", &url, "--at", &at, "--radius", &radius];
+    let fetch = ["fetch", "--trust-first", "--from", &url, "--at", &at, "--radius", &radius];
     let fetched: FetchReply = edge(options, &cache, &fetch).context("fetch")?;
     // The robot is offline from here on.
     let _ = stop.send(());

@@ -10,14 +10,13 @@ use axum::body::Bytes;
 use axum::extract::State;
 use axum::response::IntoResponse;
 use slag_common::Hash32;
-use slag_common::manifest::{CellIndex, Manifest};
+use slag_common::manifest::{self, CellIndex, Manifest};
 use slag_common::tuf::TargetFile;
 use slag_service::metrics::{Exposition, ResponseCounts};
 use slag_service::problem::Problem;
 use tokio::sync::Semaphore;
 
 use super::limits::Limits;
-use crate::store::metadata::MANIFEST_TARGET;
 use crate::store::{Stamp, StoreError, StoreReader};
 
 /// Pause before a manifest that did not open is read again. The fault may lie in another file or pass by
@@ -41,11 +40,11 @@ impl Snapshot {
         let reader = StoreReader::open(dir)?;
         let both = || [reader.previous(), Some(reader.current())].into_iter().flatten();
         let target = |signed: &[u8]| {
-            let hash = &TargetFile::of(signed).hashes["sha256"];
-            (format!("{hash}.{MANIFEST_TARGET}"), Bytes::copy_from_slice(signed))
+            let name = TargetFile::of(signed).file_name(manifest::TARGET).ok()?;
+            Some((name, Bytes::copy_from_slice(signed)))
         };
         Ok(Self {
-            targets: both().map(|published| target(&published.signed)).collect(),
+            targets: both().filter_map(|published| target(&published.signed)).collect(),
             manifest: reader.current().signed.clone().into(),
             index: CellIndex::new(&reader.manifest().cells),
             objects: both().flat_map(|published| published.shard_lens()).collect(),

@@ -120,7 +120,7 @@ fn fetches(
     for place in &places {
         remove(&cache)?;
         let mut command = Command::new(&settings.edge);
-        command.args(["fetch", "--json", "--quiet", "--profile", "compact", "--from", url]);
+        command.args(["fetch", "--trust-first", "--json", "--quiet", "--profile", "compact", "--from", url]);
         command.arg("--at").arg(format!("{},{},{}", place.x, place.y, place.z));
         command.args(["--radius", &radius.to_string()]).arg("--cache").arg(&cache);
         let start = Instant::now();

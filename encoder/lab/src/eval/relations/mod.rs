@@ -103,7 +103,17 @@ fn prepare(settings: &RelationsSettings, dir: &Path, kind: &str, seed: u64) -> R
     if !cache.join("current").is_file() {
         let server = Service::start(&program("slag-encoder"), &["--store"], &store)?;
         let mut command = Command::new(program("slag-edge"));
-        command.args(["fetch", "--at", "0,0,0", "--radius", "1e6", "--from", &server.url(), "--cache"]);
+        command.args([
+            "fetch",
+            "--trust-first",
+            "--at",
+            "0,0,0",
+            "--radius",
+            "1e6",
+            "--from",
+            &server.url(),
+            "--cache",
+        ]);
         finish(command.arg(&cache))?;
     }
     Ok(())

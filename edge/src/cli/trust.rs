@@ -1,0 +1,129 @@
+//! `trust`: whom a robot believes.
+
+use std::path::PathBuf;
+use std::sync::atomic::AtomicBool;
+
+use anyhow::anyhow;
+use clap::{ArgGroup, Args, Subcommand};
+use slag_common::tuf::{MAX_ROOT_BYTES, format_utc};
+use slag_edge::fetch::{AddedRoot, FirstRoot, accepted, add_root};
+
+use super::args::CacheArgs;
+use super::failure::Failure;
+use super::network::{environment, failure};
+use super::output::{print_json, print_pairs};
+
+#[derive(Debug, Subcommand)]
+pub enum TrustCommand {
+    /// Trust a store by its root: the file metadata/1.root.json of the store, or a later one.
+    Add(AddArgs),
+    /// Show the root and scene that this robot keeps to.
+    Show(ShowArgs),
+}
+
+impl TrustCommand {
+    /// Returns whether JSON is asked for.
+    pub fn is_json(&self) -> bool {
+        match self {
+            Self::Add(args) => args.json,
+            Self::Show(args) => args.json,
+        }
+    }
+}
+
+#[derive(Debug, Args)]
+#[command(group = ArgGroup::new("first").required(true).args(["root", "sha256", "trust_first"]))]
+pub struct AddArgs {
+    /// Address of the store; not needed with --root.
+    #[arg(value_name = "URL", required_unless_present = "root")]
+    pub from: Option<String>,
+    /// The root itself, brought by hand.
+    #[arg(long, value_name = "FILE")]
+    pub root: Option<PathBuf>,
+    /// SHA-256 of the root, brought by hand; the store at the address has the root itself.
+    #[arg(long, value_name = "HEX", value_parser = parse_sha256)]
+    pub sha256: Option<String>,
+    /// Trust whoever answers at the address now: everything later depends on it.
+    #[arg(long)]
+    pub trust_first: bool,
+    /// Trust this root in place of another one.
+    #[arg(long)]
+    pub replace: bool,
+    #[command(flatten)]
+    pub cache: CacheArgs,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[derive(Debug, Args)]
+pub struct ShowArgs {
+    #[command(flatten)]
+    pub cache: CacheArgs,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+pub fn run(command: TrustCommand) -> Result<(), Failure> {
+    match command {
+        TrustCommand::Add(args) => add(args),
+        TrustCommand::Show(args) => show(args),
+    }
+}
+
+fn add(args: AddArgs) -> Result<(), Failure> {
+    let from = args.from.unwrap_or_default();
+    let root = match (args.root, args.sha256) {
+        (Some(path), _) => FirstRoot::Bytes(read_root(&path)?),
+        (None, Some(sha256)) => FirstRoot::Sha256 { from, sha256 },
+        (None, None) => FirstRoot::Any { from },
+    };
+    let cache = args.cache.open()?;
+    let cancel = AtomicBool::new(false);
+    let added = add_root(&cache, &root, args.replace, &environment(&cancel, &())).map_err(failure)?;
+    if args.json {
+        return print_json(&added);
+    }
+    let AddedRoot { sha256, version, is_new } = added;
+    let what = if is_new { "trusted from now on" } else { "this robot began with it; nothing changed" };
+    print_pairs(&[("root", format!("{version}, {what}")), ("SHA-256", sha256)])
+}
+
+fn show(args: ShowArgs) -> Result<(), Failure> {
+    let accepted = accepted(&args.cache.open()?);
+    if args.json {
+        return print_json(&accepted);
+    }
+    let Some(accepted) = accepted else {
+        return print_pairs(&[("root", "none: see `slag-edge trust add --help`".into())]);
+    };
+    let time = |time: Option<u64>| time.map_or("unknown".into(), format_utc);
+    print_pairs(&[
+        ("root", accepted.root_version.to_string()),
+        ("SHA-256", accepted.root_sha256),
+        ("scene", accepted.scene.unwrap_or_else(|| "that of the first fetch".into())),
+        ("refreshed", time(accepted.signed_unix_secs)),
+        ("expires", time(accepted.expires_unix_secs)),
+    ])
+}
+
+fn read_root(path: &std::path::Path) -> Result<Vec<u8>, Failure> {
+    use std::io::Read;
+    let mut bytes = Vec::new();
+    fs_err::File::open(path)?.take(MAX_ROOT_BYTES + 1).read_to_end(&mut bytes)?;
+    match bytes.len() as u64 > MAX_ROOT_BYTES {
+        true => Err(Failure::Usage(anyhow!(
+            "{}: longer than {MAX_ROOT_BYTES} bytes; expected a root such as metadata/1.root.json of a store",
+            path.display()
+        ))),
+        false => Ok(bytes),
+    }
+}
+
+fn parse_sha256(text: &str) -> Result<String, String> {
+    match text.len() == 64 && text.bytes().all(|byte| byte.is_ascii_hexdigit()) {
+        true => Ok(text.to_ascii_lowercase()),
+        false => Err("expected 64 hex digits".into()),
+    }
+}

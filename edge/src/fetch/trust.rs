@@ -1,0 +1,105 @@
+//! First trust: the root by which a robot believes a store.
+
+use serde::Serialize;
+use slag_common::tuf::{Kept, MAX_ROOT_BYTES, MAX_ROOTS, TufError, sha256_hex};
+
+use super::download::Client;
+use super::environment::Environment;
+use super::error::FetchError;
+use super::records::Records;
+use crate::store::EdgeCache;
+
+/// Where the first root comes from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum FirstRoot {
+    /// Its bytes, which came by hand.
+    Bytes(Vec<u8>),
+    /// The store at an address has it; its SHA-256 in hex came by hand.
+    Sha256 {
+        /// Address of the store.
+        from: String,
+        /// The hash.
+        sha256: String,
+    },
+    /// The first root of the store at an address, whoever answers there.
+    Any {
+        /// Address of the store.
+        from: String,
+    },
+}
+
+/// A root that is trusted.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct AddedRoot {
+    /// SHA-256, hex.
+    pub sha256: String,
+    /// Version.
+    pub version: u64,
+    /// Whether it was trusted just now; otherwise the robot began with it, and nothing changed.
+    pub is_new: bool,
+}
+
+/// Trusts a root by hand. A root that the robot began with changes nothing, so that keys which were revoked since stay
+/// revoked. `replace`: trust it in place of another one.
+///
+/// # Errors
+/// [`FetchError`].
+pub fn add_root(
+    cache: &EdgeCache,
+    root: &FirstRoot,
+    replace: bool,
+    environment: &Environment<'_>,
+) -> Result<AddedRoot, FetchError> {
+    let bytes = match root {
+        FirstRoot::Bytes(bytes) => bytes.clone(),
+        FirstRoot::Sha256 { from, sha256 } => find_root(&Client::new(from, environment)?, sha256)?,
+        FirstRoot::Any { from } => first_root(&Client::new(from, environment)?)?,
+    };
+    let kept = Kept::from_root(&bytes)?;
+    let (sha256, version) = (sha256_hex(&bytes), kept.root_version().unwrap_or(0));
+    cache.files().create_dir(cache.dir())?;
+    let mut records = Records::open(cache)?;
+    let is_new = match records.first_root_sha256() {
+        Some(held) if held == sha256 => false,
+        Some(held) if !replace => {
+            return Err(FetchError::OtherRoot { held: held.to_owned(), offered: sha256 });
+        }
+        _ => true,
+    };
+    if is_new {
+        records.trust(cache, kept)?;
+    }
+    Ok(AddedRoot { sha256, version, is_new })
+}
+
+/// At the first contact, trusts the store's first root; returns whether it did.
+pub(super) fn trust_first(
+    client: &Client<'_>,
+    cache: &EdgeCache,
+    records: &mut Records,
+) -> Result<bool, FetchError> {
+    if records.kept().is_some() {
+        return Ok(false);
+    }
+    records.trust(cache, Kept::from_root(&first_root(client)?)?)?;
+    Ok(true)
+}
+
+fn first_root(client: &Client<'_>) -> Result<Vec<u8>, FetchError> {
+    let name = "metadata/1.root.json";
+    let missing = || TufError::Missing { what: name.to_owned() };
+    Ok(client.file(name, MAX_ROOT_BYTES)?.ok_or_else(missing)?)
+}
+
+fn find_root(client: &Client<'_>, sha256: &str) -> Result<Vec<u8>, FetchError> {
+    let sha256 = sha256.to_ascii_lowercase();
+    for version in 1..=MAX_ROOTS {
+        let Some(bytes) = client.file(&format!("metadata/{version}.root.json"), MAX_ROOT_BYTES)? else {
+            break;
+        };
+        if sha256_hex(&bytes) == sha256 {
+            return Ok(bytes);
+        }
+    }
+    Err(FetchError::NoSuchRoot { from: client.base().to_owned(), sha256 })
+}
