@@ -47,4 +47,29 @@ fn robots_believe_the_store_that_they_were_told_of() {
     let shown = run_json(&mut edge(&["trust", "show", "--cache", text(&by_file)]));
     assert_eq!(shown["expires_unix_secs"], refreshed["expires_unix_secs"]);
     assert_eq!(shown["root_sha256"], sha256);
+
+    // A key leaked: a new root replaces it, and robots follow. Root's keys lie elsewhere, so a draft is carried there.
+    let elsewhere = dir.path().join("elsewhere");
+    std::fs::rename(store.join("keys/root"), &elsewhere).expect("moved");
+    let status = run_json(&mut encoder(&["keys", "status", "--store", text(&store)]));
+    assert_eq!(status["root_sha256"], sha256);
+    let keys = status["keys"].as_array().expect("a list");
+    let leaked = keys.iter().find(|key| key["role"] == "timestamp").expect("listed");
+    let id = leaked["id"].as_str().expect("text");
+    let revoked = run_json(&mut encoder(&["keys", "revoke", id, "--store", text(&store)]));
+    let draft = revoked["draft"].as_str().expect("a draft");
+    refused(encoder(&["keys", "install", draft, "--store", text(&store)]), "keys sign");
+    run(&mut encoder(&["keys", "sign", draft, "--root-keys", text(&elsewhere)]));
+    let installed = run_json(&mut encoder(&["keys", "install", draft, "--store", text(&store)]));
+    assert_eq!(installed["root_version"], 2);
+    for cache in [&by_file, &by_hash] {
+        assert_eq!(run_json(&mut fetch(cache, &service))["root_version"], 2);
+    }
+    // Adding the first root again is harmless; a new robot may begin with either.
+    assert_eq!(run_json(&mut add(&by_file, &[&service.url, "--sha256", sha256]))["is_new"], false);
+    assert_eq!(run_json(&mut fetch(&by_file, &service))["root_version"], 2);
+    let late = dir.path().join("late");
+    let newest = installed["root_sha256"].as_str().expect("text");
+    assert_eq!(run_json(&mut add(&late, &[&service.url, "--sha256", newest]))["version"], 2);
+    run(&mut fetch(&late, &service));
 }

@@ -157,3 +157,23 @@ pub fn sign<T: Body>(version: u64, expires_unix_secs: u64, body: &T, keys: &[&Si
     signatures.dedup();
     serde_json::to_vec(&Envelope { signatures, signed }).expect("metadata is JSON")
 }
+
+/// Adds the signatures of keys that have not signed metadata yet.
+///
+/// # Errors
+/// [`TufError::Format`].
+pub fn add_signatures(role: &str, bytes: &[u8], keys: &[SigningKey]) -> Result<Vec<u8>, TufError> {
+    let refuse = |what: String| TufError::Format { role: role.to_owned(), what };
+    let Envelope { mut signatures, signed } =
+        serde_json::from_slice(bytes).map_err(|e| refuse(e.to_string()))?;
+    let canonical = canonical_json(&signed).map_err(|e| refuse(e.to_string()))?;
+    for key in keys {
+        let keyid = Key::of(key).id();
+        if signatures.iter().all(|signature| signature.keyid != keyid) {
+            let sig = hex::encode(key.sign(&canonical).to_bytes());
+            signatures.push(MetadataSignature { keyid, sig });
+        }
+    }
+    signatures.sort_by(|a, b| a.keyid.cmp(&b.keyid));
+    Ok(serde_json::to_vec(&Envelope { signatures, signed }).expect("metadata is JSON"))
+}

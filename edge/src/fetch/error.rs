@@ -57,7 +57,7 @@ pub enum FetchError {
     Tuf(#[from] TufError),
     /// No root is trusted yet.
     #[error(
-        "this robot trusts no store yet; run `slag-edge trust add {from} --sha256 HEX` with the SHA-256 of the store's file metadata/1.root.json, or fetch once with --trust-first to trust whoever answers there"
+        "this robot trusts no store yet; run `slag-edge trust add {from} --sha256 HEX` with the SHA-256 that `slag-encoder keys status` prints there, or fetch once with --trust-first to trust whoever answers there"
     )]
     NoTrust {
         /// Address of the store.

@@ -1,34 +1,70 @@
-//! `keys`: the key that a store signs with.
+//! `keys`: the keys of a store's roles.
 
 use std::fmt;
 use std::path::PathBuf;
 
-use anyhow::Result;
-use clap::{Args, Subcommand};
+use anyhow::{Result, bail};
+use clap::{Args, Subcommand, ValueEnum};
+use serde::Serialize;
+use slag_common::tuf::format_utc;
 
-use super::common::{now_unix_secs, print};
+use super::common::print;
 use super::exit::Exit;
-use crate::store::keys::PublicKeys;
-use crate::store::{Store, StoreError};
+use crate::store::ceremony::{Change, Changed, KeysStatus, default_root_folder, sign_draft};
+use crate::store::metadata::{Metadata, clock_unix_secs};
 
 /// `keys`.
 #[derive(Debug, Subcommand)]
 pub enum KeysCommand {
-    /// Shows the public keys, for `slag-edge fetch --key`.
-    Show(KeysArgs),
-    /// Makes the first key of a store, before the first encode.
-    Generate(KeysArgs),
-    /// Announces a new key and later, with --finish, switches to it.
-    ///
-    /// Robots that fetch between the two steps trust the new key by themselves; the others must be given it
-    /// (`slag-edge fetch --key`). After the second step robots refuse the old key.
-    Rotate {
+    /// Makes all keys and the first root, before the first encode. Without it, the first encode makes one key a role.
+    Init {
         /// The store.
         #[command(flatten)]
         at: KeysArgs,
-        /// The second step: the new key signs from now on.
-        #[arg(long)]
-        finish: bool,
+        /// Number of root keys.
+        #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
+        n_root_keys: u32,
+        /// Root keys that must sign a change of keys.
+        #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
+        threshold: u32,
+    },
+    /// Shows root, keys and expiry, and the SHA-256 for `slag-edge trust add --sha256`.
+    Status(KeysArgs),
+    /// Replaces all keys of some roles by new ones. Robots follow by themselves.
+    Rotate {
+        /// The roles.
+        #[arg(required = true, value_name = "ROLE")]
+        roles: Vec<Role>,
+        /// The store.
+        #[command(flatten)]
+        at: KeysArgs,
+    },
+    /// Replaces a key that leaked or was lost, by its id (`keys status`). Robots follow by themselves.
+    Revoke {
+        /// Id of the key.
+        #[arg(value_name = "ID")]
+        id: String,
+        /// The store.
+        #[command(flatten)]
+        at: KeysArgs,
+    },
+    /// Signs the draft of a root, on the machine that has root's keys.
+    Sign {
+        /// The draft, `keys/N.root.draft.json` of the store.
+        #[arg(value_name = "FILE")]
+        draft: PathBuf,
+        /// Folder of root's keys.
+        #[arg(long, value_name = "DIR")]
+        root_keys: PathBuf,
+    },
+    /// Puts a signed draft in place, and signs again what the former keys signed.
+    Install {
+        /// The draft.
+        #[arg(value_name = "FILE")]
+        draft: PathBuf,
+        /// The store.
+        #[command(flatten)]
+        at: KeysArgs,
     },
 }
 
@@ -38,44 +74,111 @@ pub struct KeysArgs {
     /// Store.
     #[arg(long, value_name = "DIR")]
     pub store: PathBuf,
+    /// Folder of root's keys [default: keys/root in the store].
+    #[arg(long, value_name = "DIR")]
+    pub root_keys: Option<PathBuf>,
+}
+
+impl KeysArgs {
+    fn root_folder(&self) -> PathBuf {
+        self.root_keys.clone().unwrap_or_else(|| default_root_folder(&self.store))
+    }
+
+    /// Opens the metadata of a store that exists.
+    fn open(&self) -> Result<Metadata> {
+        if !self.store.join("metadata").is_dir() {
+            bail!("{}: there is no store; run `slag-encoder keys init`, or encode", self.store.display());
+        }
+        Ok(Metadata::open(&self.store)?)
+    }
+}
+
+/// A role of The Update Framework.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Role {
+    /// Names the keys of all roles.
+    Root,
+    /// Signs for the manifest.
+    Targets,
+    /// Signs the version of the targets metadata.
+    Snapshot,
+    /// Signs the version of the snapshot, for a short time.
+    Timestamp,
 }
 
 pub(super) fn run(command: &KeysCommand, json: bool) -> Result<Exit> {
-    let keys = match command {
-        KeysCommand::Show(at) => PublicKeys::read(&at.store)?,
-        KeysCommand::Generate(at) if PublicKeys::read(&at.store).is_ok() => {
-            return Err(StoreError::HasKey { store: at.store.clone() }.into());
-        }
-        KeysCommand::Generate(at) => {
-            Store::create_or_open(&at.store)?;
-            PublicKeys::read(&at.store)?
-        }
-        KeysCommand::Rotate { at, finish } => {
-            // A mistyped path must not create a store.
-            PublicKeys::read(&at.store)?;
-            let mut store = Store::create_or_open(&at.store)?;
-            match finish {
-                false => store.begin_rotation(now_unix_secs())?,
-                true => store.finish_rotation(now_unix_secs())?,
+    let now = clock_unix_secs();
+    match command {
+        KeysCommand::Init { at, n_root_keys, threshold } => {
+            if threshold > n_root_keys {
+                bail!("--threshold is {threshold} of {n_root_keys} root keys; expected at most as many");
             }
+            fs_err::create_dir_all(&at.store)?;
+            let metadata = Metadata::open(&at.store)?;
+            metadata.make_root(&at.root_folder(), *n_root_keys as usize, *threshold, now)?;
+            show(json, &metadata.keys_status(&at.root_folder())?)
         }
-    };
-    print(json, &keys, Lines(&keys))?;
+        KeysCommand::Status(at) => show(json, &at.open()?.keys_status(&at.root_folder())?),
+        KeysCommand::Rotate { roles, at } => {
+            let names = roles.iter().filter_map(|role| Some(role.to_possible_value()?.get_name().to_owned()));
+            let change = Change::Roles(names.collect());
+            changed(json, &at.open()?.change_keys(&change, &at.root_folder(), now)?)
+        }
+        KeysCommand::Revoke { id, at } => {
+            changed(json, &at.open()?.change_keys(&Change::Key(id.clone()), &at.root_folder(), now)?)
+        }
+        KeysCommand::Sign { draft, root_keys } => {
+            let n_keys = sign_draft(draft, root_keys)?;
+            let line =
+                format!("signed with {n_keys} keys; next: slag-encoder keys install, where the store lies\n");
+            print(json, &Signed { n_keys }, line)?;
+            Ok(Exit::Done)
+        }
+        KeysCommand::Install { draft, at } => changed(json, &at.open()?.install_root(draft, now)?),
+    }
+}
+
+#[derive(Serialize)]
+struct Signed {
+    n_keys: usize,
+}
+
+fn show(json: bool, status: &KeysStatus) -> Result<Exit> {
+    print(json, status, Lines(status))?;
     Ok(Exit::Done)
 }
 
-struct Lines<'a>(&'a PublicKeys);
+fn changed(json: bool, changed: &Changed) -> Result<Exit> {
+    let version = changed.root_version;
+    let line = match (&changed.draft, &changed.root_sha256) {
+        (Some(draft), _) => format!(
+            "root {version} lacks signatures: carry {} to root's keys, run `slag-encoder keys sign` there, and \
+             `slag-encoder keys install` here\n",
+            draft.display()
+        ),
+        (None, sha256) => {
+            format!("root {version} is in place, SHA-256 {}\n", sha256.as_deref().unwrap_or(""))
+        }
+    };
+    print(json, changed, line)?;
+    Ok(Exit::Done)
+}
+
+struct Lines<'a>(&'a KeysStatus);
 
 impl fmt::Display for Lines<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let PublicKeys { present, next, previous } = self.0;
-        writeln!(f, "present   {present}")?;
-        if let Some(next) = next {
-            writeln!(f, "next      {next} (in place after `slag-encoder keys rotate --finish`)")?;
+        let status = self.0;
+        let expires = format_utc(status.root_expires_unix_secs);
+        writeln!(f, "root       {} until {expires}", status.root_version)?;
+        writeln!(f, "SHA-256    {}", status.root_sha256)?;
+        writeln!(f, "threshold  {}", status.threshold)?;
+        let timestamp = status.timestamp_expires_unix_secs.map_or("not published yet".into(), format_utc);
+        writeln!(f, "timestamp  until {timestamp}")?;
+        for key in &status.keys {
+            let place = if key.is_here { "" } else { " (elsewhere)" };
+            writeln!(f, "{:<10} {}{place}", key.role, key.id)?;
         }
-        match previous {
-            Some(previous) => writeln!(f, "previous  {previous} (no longer accepted)"),
-            None => Ok(()),
-        }
+        Ok(())
     }
 }

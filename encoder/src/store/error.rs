@@ -59,11 +59,11 @@ pub enum StoreError {
         cause: TufError,
     },
     /// A role's key is not the one that the root names.
-    #[error("{}: it does not name the store's {role} key; restore the file keys/{role}.key that belongs to it", path.display())]
+    #[error("{}: the newest root does not name the key in keys/{role}.key; restore that file, or run `slag-encoder keys rotate {role}`", path.display())]
     RoleKey {
         /// The role.
         role: String,
-        /// The newest root.
+        /// The folder of the roots.
         path: PathBuf,
     },
     /// The list of a generation's extra objects is damaged.
@@ -98,19 +98,31 @@ pub enum StoreError {
         /// Hash of the content.
         found: Hash32,
     },
-    /// The steps of a key rotation are out of order.
-    #[error("{}: {what}; run `slag-encoder keys rotate` first, and finish once every robot has fetched", store.display())]
-    Rotation {
+    /// The store has a root already.
+    #[error("{} has a root already; to change its keys, run `slag-encoder keys rotate` or `revoke`", store.display())]
+    HasRoot {
         /// The store.
         store: PathBuf,
-        /// What is missing.
-        what: &'static str,
     },
-    /// The store has a key already.
-    #[error("{} has a key already; to change it, run `slag-encoder keys rotate`", store.display())]
-    HasKey {
+    /// The store has no root yet.
+    #[error("{} has no root yet; run `slag-encoder keys init`, or encode", store.display())]
+    NoRoot {
         /// The store.
         store: PathBuf,
+    },
+    /// The root names no such key.
+    #[error("no role has the key {id}; `slag-encoder keys status` lists the keys")]
+    NoSuchKey {
+        /// The id given.
+        id: String,
+    },
+    /// A root is not signed as it must be.
+    #[error("{}: {cause}; have `slag-encoder keys sign` sign the draft where root's keys lie", path.display())]
+    RootDraft {
+        /// The draft.
+        path: PathBuf,
+        /// The cause.
+        cause: TufError,
     },
     /// A generation is not above the current one: robots would go back.
     #[error("generation {found} cannot follow {current}; take the number from `next_generation`")]

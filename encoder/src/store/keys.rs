@@ -1,10 +1,5 @@
 //! The store's keys: the one that signs, and, while a change of keys is under way, the one that will.
 //!
-//! A change takes two steps, days apart, so that every robot that fetches in between follows:
-//! [`super::Store::begin_rotation`] makes the next key and publishes a generation, signed by the present key,
-//! that names it; [`super::Store::finish_rotation`] publishes a generation signed by the next key, which is the
-//! commit, and then moves the files. A crash after the commit is made good when the store is opened.
-//!
 //! | file | what |
 //! |---|---|
 //! | `keys/ed25519`, `.pub` | signing key (mode 0600), and its public half |

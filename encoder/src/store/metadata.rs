@@ -13,11 +13,12 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use ed25519_dalek::SigningKey;
 use serde::Serialize;
 use slag_common::durable;
 use slag_common::manifest;
 use slag_common::tuf::{
-    Body, FileMeta, MAX_ROOT_BYTES, MAX_SNAPSHOT_BYTES, MAX_TARGETS_BYTES, MAX_TIMESTAMP_BYTES, Root,
+    Body, FileMeta, Key, MAX_ROOT_BYTES, MAX_SNAPSHOT_BYTES, MAX_TARGETS_BYTES, MAX_TIMESTAMP_BYTES, Root,
     SignedMetadata, Snapshot, TargetFile, Targets, Timestamp, TufError, format_utc, sign,
 };
 
@@ -30,7 +31,7 @@ pub const TIMESTAMP_FILE: &str = "timestamp.json";
 pub const TIMESTAMP_DAYS: u32 = 30;
 const SECS_PER_DAY: u64 = 86_400;
 const TARGETS_SECS: u64 = 365 * SECS_PER_DAY;
-const ROOT_SECS: u64 = 5 * 365 * SECS_PER_DAY;
+pub(super) const ROOT_SECS: u64 = 5 * 365 * SECS_PER_DAY;
 
 /// What a signature of the timestamp states.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -43,9 +44,15 @@ pub struct Refreshed {
     pub expires_unix_secs: u64,
 }
 
+/// A root, parsed, and its bytes.
+pub(super) struct RootFile {
+    pub root: SignedMetadata<Root>,
+    pub bytes: Vec<u8>,
+}
+
 /// The metadata of a store, held by one writer at a time.
 pub struct Metadata {
-    store: PathBuf,
+    pub(super) store: PathBuf,
     _lock: File,
 }
 
@@ -72,8 +79,8 @@ impl Metadata {
     /// [`StoreError`].
     pub fn publish(&self, signed: &[u8], created_unix_secs: u64) -> Result<(), StoreError> {
         let now_unix_secs = created_unix_secs.max(clock_unix_secs());
-        if !self.path("1.root.json").exists() {
-            self.make_root(now_unix_secs)?;
+        if self.newest_root()?.is_none() {
+            self.make_root(&roles::root_folder(&self.store), 1, 1, now_unix_secs)?;
         }
         let targets = BTreeMap::from([(manifest::TARGET.to_owned(), TargetFile::of(signed))]);
         if self.published()?.is_some_and(|published| published.body.targets == targets) {
@@ -102,7 +109,7 @@ impl Metadata {
     }
 
     /// Returns the targets metadata that the timestamp names; `None` before the first publication.
-    fn published(&self) -> Result<Option<SignedMetadata<Targets>>, StoreError> {
+    pub(super) fn published(&self) -> Result<Option<SignedMetadata<Targets>>, StoreError> {
         let Some(timestamp) = self.timestamp()? else { return Ok(None) };
         let name = format!("{}.snapshot.json", timestamp.body.snapshot().version);
         let Some(snapshot) = self.read::<Snapshot>(&name, MAX_SNAPSHOT_BYTES)? else { return Ok(None) };
@@ -110,23 +117,45 @@ impl Metadata {
         self.read::<Targets>(&name, MAX_TARGETS_BYTES)
     }
 
-    fn timestamp(&self) -> Result<Option<SignedMetadata<Timestamp>>, StoreError> {
+    pub(super) fn timestamp(&self) -> Result<Option<SignedMetadata<Timestamp>>, StoreError> {
         self.read::<Timestamp>(TIMESTAMP_FILE, MAX_TIMESTAMP_BYTES)
     }
 
-    fn make_root(&self, now_unix_secs: u64) -> Result<(), StoreError> {
-        let (body, key) = roles::make_all(&self.store)?;
-        let bytes = sign(1, now_unix_secs.saturating_add(ROOT_SECS), &body, &[&key]);
+    /// Makes keys and the first root. `root_folder`: where root's keys lie, `n_root_keys` of them.
+    ///
+    /// # Errors
+    /// [`StoreError::HasRoot`]; [`StoreError`] otherwise.
+    pub fn make_root(
+        &self,
+        root_folder: &Path,
+        n_root_keys: usize,
+        threshold: u32,
+        now_unix_secs: u64,
+    ) -> Result<(), StoreError> {
+        if self.newest_root()?.is_some() {
+            return Err(StoreError::HasRoot { store: self.store.clone() });
+        }
+        let (body, keys) = roles::make_all(&self.store, root_folder, n_root_keys, threshold)?;
+        let keys: Vec<&SigningKey> = keys.iter().collect();
+        let bytes = sign(1, now_unix_secs.saturating_add(ROOT_SECS), &body, &keys);
         self.write("1.root.json", &bytes)?;
         tracing::info!(
-            "the store's root of trust is {}; its key lies in {}, which can be kept elsewhere",
+            "the store's root of trust is {}; its keys lie in {}, which can be kept elsewhere",
             self.path("1.root.json").display(),
-            roles::root_folder(&self.store).display()
+            root_folder.display()
         );
         Ok(())
     }
 
-    fn sign_all(&self, targets: &Targets, now_unix_secs: u64) -> Result<(), StoreError> {
+    /// Returns the newest root and its bytes; `None` before the first one.
+    pub(super) fn newest_root(&self) -> Result<Option<RootFile>, StoreError> {
+        let name = format!("{}.root.json", self.next_version(Root::TYPE)? - 1);
+        let Some(bytes) = read_file(&self.store, &name, MAX_ROOT_BYTES)? else { return Ok(None) };
+        let refuse = |cause| StoreError::Metadata { path: self.path(&name), cause };
+        Ok(Some(RootFile { root: SignedMetadata::parse(Root::TYPE, &bytes).map_err(refuse)?, bytes }))
+    }
+
+    pub(super) fn sign_all(&self, targets: &Targets, now_unix_secs: u64) -> Result<(), StoreError> {
         let expires = now_unix_secs.saturating_add(TARGETS_SECS);
         let version = self.next_version("targets")?;
         let bytes = sign(version, expires, targets, &[&self.key(Targets::TYPE)?]);
@@ -150,15 +179,15 @@ impl Metadata {
     }
 
     /// Returns a role's key, if the newest root names it: a signature by another one would lock clients out.
-    fn key(&self, role: &str) -> Result<ed25519_dalek::SigningKey, StoreError> {
+    fn key(&self, role: &str) -> Result<SigningKey, StoreError> {
+        let wrong = || StoreError::RoleKey { role: role.to_owned(), path: folder(&self.store) };
+        let root = self.newest_root()?.ok_or_else(wrong)?.root;
+        // A crash after the root was installed may have left the key behind.
+        roles::promote(&self.store, role, &root.body)?;
         let key = roles::read(&self.store, role)?;
-        let version = self.next_version(Root::TYPE)? - 1;
-        let name = format!("{version}.root.json");
-        let root = self.read::<Root>(&name, MAX_ROOT_BYTES)?;
-        let id = slag_common::tuf::Key::of(&key).id();
-        match root.is_some_and(|root| root.body.roles[role].keyids.contains(&id)) {
+        match root.body.roles[role].keyids.contains(&Key::of(&key).id()) {
             true => Ok(key),
-            false => Err(StoreError::RoleKey { role: role.to_owned(), path: self.path(&name) }),
+            false => Err(wrong()),
         }
     }
 
@@ -180,11 +209,11 @@ impl Metadata {
         SignedMetadata::parse(T::TYPE, &bytes).map(Some).map_err(refuse)
     }
 
-    fn write(&self, name: &str, bytes: &[u8]) -> Result<(), StoreError> {
+    pub(super) fn write(&self, name: &str, bytes: &[u8]) -> Result<(), StoreError> {
         Ok(durable::write(&self.path(name), bytes)?)
     }
 
-    fn path(&self, name: &str) -> PathBuf {
+    pub(super) fn path(&self, name: &str) -> PathBuf {
         folder(&self.store).join(name)
     }
 }

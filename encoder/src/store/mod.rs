@@ -21,6 +21,9 @@
 //! comes after it. The records in sled only repeat the manifest, for ordered look-ups. What a crash left out
 //! of metadata and records is made good at the next [`Store::create_or_open`].
 
+pub mod ceremony;
+#[cfg(test)]
+mod ceremony_tests;
 mod error;
 mod files;
 pub mod keys;
@@ -30,7 +33,6 @@ mod metadata_tests;
 mod models;
 mod reader;
 mod roles;
-mod rotation;
 mod signed;
 #[cfg(test)]
 pub(crate) mod tests;

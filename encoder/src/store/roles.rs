@@ -2,8 +2,9 @@
 //!
 //! | file | what |
 //! |---|---|
-//! | `keys/root/1.key` | root's key; nothing but a change of keys needs it, so it may be kept elsewhere |
+//! | `keys/root/N.key` | root's keys; nothing but a change of keys needs them, so they may be kept elsewhere |
 //! | `keys/targets.key`, `keys/snapshot.key`, `keys/timestamp.key` | keys that sign what is published |
+//! | `keys/ROLE.next.key` | the same, from when it is made until a root that names it is installed |
 //!
 //! All are 64 hex digits, mode 0600.
 
@@ -13,14 +14,14 @@ use std::path::{Path, PathBuf};
 
 use ed25519_dalek::SigningKey;
 use slag_common::manifest;
-use slag_common::tuf::{Key, RoleKeys, Root};
+use slag_common::tuf::{Body, Key, RoleKeys, Root};
 
 use super::error::StoreError;
 use super::files::{self, Access};
 use super::signed;
 
 /// The roles whose keys lie with the store.
-const ONLINE: [&str; 3] = ["targets", "snapshot", "timestamp"];
+pub(super) const ONLINE: [&str; 3] = ["targets", "snapshot", "timestamp"];
 
 /// Returns the folder of root's key, unless it was moved away.
 pub(super) fn root_folder(store: &Path) -> PathBuf {
@@ -35,24 +36,76 @@ pub(super) fn read(store: &Path, role: &str) -> Result<SigningKey, StoreError> {
     Ok(SigningKey::from_bytes(&signed::read_hex_key(&key_path(store, role))?.0))
 }
 
-/// Makes the keys of all roles that have none, and returns the body of a root that names them and root's key.
-pub(super) fn make_all(store: &Path) -> Result<(Root, SigningKey), StoreError> {
-    let folder = root_folder(store);
+/// Makes the keys of all roles that have none, and returns the body of a root that names them and root's keys.
+/// `n_root_keys`: in `root_folder`.
+pub(super) fn make_all(
+    store: &Path,
+    root_folder: &Path,
+    n_root_keys: usize,
+    threshold: u32,
+) -> Result<(Root, Vec<SigningKey>), StoreError> {
     files::ensure_folder(&store.join("keys"))?;
-    files::ensure_folder(&folder)?;
+    fs_err::create_dir_all(root_folder)?;
+    let mut root_keys = read_folder(root_folder)?;
+    while root_keys.len() < n_root_keys {
+        root_keys.push(make_root_key(root_folder)?);
+    }
+    root_keys.truncate(n_root_keys);
     let mut roles = BTreeMap::new();
     let mut keys = BTreeMap::new();
-    let mut add = |role: &str, key: &SigningKey| {
-        let public = Key::of(key);
-        roles.insert(role.to_owned(), RoleKeys { keyids: vec![public.id()], threshold: 1 });
-        keys.insert(public.id(), public);
+    let mut add = |role: &str, signers: &[SigningKey], threshold: u32| {
+        let public: Vec<Key> = signers.iter().map(Key::of).collect();
+        roles.insert(role.to_owned(), RoleKeys { keyids: public.iter().map(Key::id).collect(), threshold });
+        keys.extend(public.into_iter().map(|key| (key.id(), key)));
     };
-    let root = read_or_make(&folder.join("1.key"))?;
-    add("root", &root);
+    add(Root::TYPE, &root_keys, threshold);
     for role in ONLINE {
-        add(role, &read_or_make(&key_path(store, role))?);
+        add(role, &[read_or_make(&key_path(store, role))?], 1);
     }
-    Ok((Root { consistent_snapshot: true, keys, roles }, root))
+    Ok((Root { consistent_snapshot: true, keys, roles }, root_keys))
+}
+
+/// Reads all keys of a folder, by name; none if the folder is not there.
+pub(super) fn read_folder(folder: &Path) -> Result<Vec<SigningKey>, StoreError> {
+    let mut names = Vec::new();
+    match fs_err::read_dir(folder) {
+        Err(e) if e.kind() == io::ErrorKind::NotFound => {}
+        entries => {
+            for entry in entries? {
+                names.push(entry?.path());
+            }
+        }
+    }
+    names.retain(|path| path.extension().is_some_and(|extension| extension == "key"));
+    names.sort();
+    names.iter().map(|path| Ok(SigningKey::from_bytes(&signed::read_hex_key(path)?.0))).collect()
+}
+
+/// Makes a further key of root.
+pub(super) fn make_root_key(folder: &Path) -> Result<SigningKey, StoreError> {
+    let path = (1u32..).map(|number| folder.join(format!("{number}.key"))).find(|path| !path.exists());
+    read_or_make(&path.unwrap_or_else(|| folder.join("0.key")))
+}
+
+/// Makes the key that a role will have, unless there is one.
+pub(super) fn make_next(store: &Path, role: &str) -> Result<SigningKey, StoreError> {
+    read_or_make(&next_path(store, role))
+}
+
+/// Puts a role's next key in place of its key, if a root names it.
+pub(super) fn promote(store: &Path, role: &str, root: &Root) -> Result<(), StoreError> {
+    let next = match signed::read_hex_key(&next_path(store, role)) {
+        Err(StoreError::Io(e)) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
+        next => SigningKey::from_bytes(&next?.0),
+    };
+    if root.roles[role].keyids.contains(&Key::of(&next).id()) {
+        files::move_into_place(&next_path(store, role), &key_path(store, role))?;
+    }
+    Ok(())
+}
+
+fn next_path(store: &Path, role: &str) -> PathBuf {
+    store.join("keys").join(format!("{role}.next.key"))
 }
 
 fn key_path(store: &Path, role: &str) -> PathBuf {

@@ -1,0 +1,211 @@
+//! Changes of the keys that a store's root names.
+//!
+//! The next root takes effect once enough keys of the present root and of its own have signed it. Where root's keys lie
+//! elsewhere, it waits as a draft, `keys/N.root.draft.json`: the draft is carried there, signed, carried back and
+//! installed.
+
+use std::path::{Path, PathBuf};
+
+use ed25519_dalek::SigningKey;
+use serde::Serialize;
+use slag_common::tuf::{
+    Body, Key, Root, SignedMetadata, Trusted, TufError, add_signatures, sha256_hex, sign,
+};
+
+use super::error::StoreError;
+use super::metadata::{Metadata, ROOT_SECS, RootFile};
+use super::{files, roles};
+
+/// Which keys are replaced by new ones.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Change {
+    /// All keys of these roles.
+    Roles(Vec<String>),
+    /// The key of this id, in all roles.
+    Key(String),
+}
+
+/// A root that was made.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Changed {
+    /// Its version.
+    pub root_version: u64,
+    /// SHA-256 of the root, hex; absent while it is a draft.
+    pub root_sha256: Option<String>,
+    /// The draft, if it lacks signatures.
+    pub draft: Option<PathBuf>,
+}
+
+/// A key that the newest root names.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct KeyStatus {
+    /// The role.
+    pub role: String,
+    /// Its id.
+    pub id: String,
+    /// Whether its secret half lies here.
+    pub is_here: bool,
+}
+
+/// The keys of a store, and until when they count.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct KeysStatus {
+    /// Version of the newest root.
+    pub root_version: u64,
+    /// Its SHA-256, hex.
+    pub root_sha256: String,
+    /// When it expires, seconds since 1970.
+    pub root_expires_unix_secs: u64,
+    /// Root's keys that must sign a change.
+    pub threshold: u32,
+    /// All keys, by role.
+    pub keys: Vec<KeyStatus>,
+    /// When the timestamp expires, seconds since 1970; absent before the first publication.
+    pub timestamp_expires_unix_secs: Option<u64>,
+}
+
+impl Metadata {
+    /// Makes new keys, and a root that names them. It is installed at once if root's keys in `root_folder` are enough;
+    /// otherwise it is a draft.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub fn change_keys(
+        &self,
+        change: &Change,
+        root_folder: &Path,
+        now_unix_secs: u64,
+    ) -> Result<Changed, StoreError> {
+        let present = self.newest_root()?.ok_or_else(|| self.no_root())?.root;
+        let body = self.next_root(&present.body, change, root_folder)?;
+        let is_of_root = |key: &SigningKey| {
+            let id = Key::of(key).id();
+            [&present.body, &body].iter().any(|root| root.roles[Root::TYPE].keyids.contains(&id))
+        };
+        let signers: Vec<SigningKey> =
+            roles::read_folder(root_folder)?.into_iter().filter(is_of_root).collect();
+        let root_version = present.head.version.saturating_add(1);
+        let expires = now_unix_secs.saturating_add(ROOT_SECS);
+        let bytes = sign(root_version, expires, &body, &signers.iter().collect::<Vec<_>>());
+        let draft = self.store.join("keys").join(format!("{root_version}.root.draft.json"));
+        slag_common::durable::write(&draft, &bytes)?;
+        match self.install_root(&draft, now_unix_secs) {
+            Err(StoreError::RootDraft { cause: TufError::Signatures { .. }, .. }) => {
+                Ok(Changed { root_version, root_sha256: None, draft: Some(draft) })
+            }
+            installed => installed,
+        }
+    }
+
+    /// Installs a draft that is signed, and signs again what the former keys signed.
+    ///
+    /// # Errors
+    /// [`StoreError::RootDraft`] unless it follows the present root; [`StoreError`] otherwise.
+    pub fn install_root(&self, draft: &Path, now_unix_secs: u64) -> Result<Changed, StoreError> {
+        let RootFile { root: present, bytes } = self.newest_root()?.ok_or_else(|| self.no_root())?;
+        let next = fs_err::read(draft)?;
+        let refuse = |cause| StoreError::RootDraft { path: draft.to_owned(), cause };
+        let mut trusted = Trusted::new(&bytes, now_unix_secs).map_err(refuse)?;
+        trusted.add_root(&next).map_err(refuse)?;
+        let root = trusted.root();
+        let root_version = root.head.version;
+        self.write(&format!("{root_version}.root.json"), &next)?;
+        for role in roles::ONLINE {
+            roles::promote(&self.store, role, &root.body)?;
+        }
+        let is_changed = |role: &str| root.body.roles[role] != present.body.roles[role];
+        if let (Some(published), true) = (self.published()?, roles::ONLINE.into_iter().any(is_changed)) {
+            self.sign_all(&published.body, now_unix_secs)?;
+        }
+        let made_here = self.store.join("keys").join(format!("{root_version}.root.draft.json"));
+        if made_here.exists() {
+            fs_err::remove_file(&made_here)?;
+            files::sync_folder(&self.store.join("keys"))?;
+        }
+        Ok(Changed { root_version, root_sha256: Some(sha256_hex(&next)), draft: None })
+    }
+
+    /// Describes the keys. `root_folder`: where root's keys may lie.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub fn keys_status(&self, root_folder: &Path) -> Result<KeysStatus, StoreError> {
+        let RootFile { root, bytes } = self.newest_root()?.ok_or_else(|| self.no_root())?;
+        let mut here: Vec<String> =
+            roles::read_folder(root_folder)?.iter().map(|key| Key::of(key).id()).collect();
+        let online = roles::ONLINE.iter().filter_map(|role| roles::read(&self.store, role).ok());
+        here.extend(online.map(|key| Key::of(&key).id()));
+        let mut keys = Vec::new();
+        for role in std::iter::once(Root::TYPE).chain(roles::ONLINE) {
+            keys.extend(root.body.roles[role].keyids.iter().map(|id| KeyStatus {
+                role: role.to_owned(),
+                id: id.clone(),
+                is_here: here.contains(id),
+            }));
+        }
+        Ok(KeysStatus {
+            root_version: root.head.version,
+            root_sha256: sha256_hex(&bytes),
+            root_expires_unix_secs: root.expires_unix_secs,
+            threshold: root.body.roles[Root::TYPE].threshold,
+            keys,
+            timestamp_expires_unix_secs: self.timestamp()?.map(|timestamp| timestamp.expires_unix_secs),
+        })
+    }
+
+    /// Returns the present root with new keys in place of those that are replaced.
+    fn next_root(&self, present: &Root, change: &Change, root_folder: &Path) -> Result<Root, StoreError> {
+        let is_replaced = |role: &str, id: &str| match change {
+            Change::Roles(roles) => roles.iter().any(|named| named == role),
+            Change::Key(key) => key == id,
+        };
+        let mut next = present.clone();
+        let mut n_replaced = 0;
+        for (role, keys) in &mut next.roles {
+            for id in &mut keys.keyids {
+                if !is_replaced(role, id) {
+                    continue;
+                }
+                let key = match role == Root::TYPE {
+                    true => roles::make_root_key(root_folder)?,
+                    false => roles::make_next(&self.store, role)?,
+                };
+                let public = Key::of(&key);
+                *id = public.id();
+                next.keys.insert(public.id(), public);
+                n_replaced += 1;
+            }
+            keys.keyids.sort();
+            keys.keyids.dedup();
+        }
+        if let (0, Change::Key(id)) = (n_replaced, change) {
+            return Err(StoreError::NoSuchKey { id: id.clone() });
+        }
+        let used: Vec<&String> = next.roles.values().flat_map(|keys| &keys.keyids).collect();
+        next.keys.retain(|id, _| used.contains(&id));
+        Ok(next)
+    }
+
+    fn no_root(&self) -> StoreError {
+        StoreError::NoRoot { store: self.store.clone() }
+    }
+}
+
+/// Signs a draft with all keys of a folder, and returns how many these are.
+///
+/// # Errors
+/// [`StoreError::RootDraft`] if it is no root; [`StoreError`] otherwise.
+pub fn sign_draft(draft: &Path, root_folder: &Path) -> Result<usize, StoreError> {
+    let refuse = |cause| StoreError::RootDraft { path: draft.to_owned(), cause };
+    let bytes = fs_err::read(draft)?;
+    SignedMetadata::<Root>::parse(Root::TYPE, &bytes).map_err(refuse)?;
+    let keys = roles::read_folder(root_folder)?;
+    let signed = add_signatures(Root::TYPE, &bytes, &keys).map_err(refuse)?;
+    slag_common::durable::write(draft, &signed)?;
+    Ok(keys.len())
+}
+
+/// Returns where a store's root keys lie unless they are kept elsewhere.
+pub fn default_root_folder(store: &Path) -> PathBuf {
+    roles::root_folder(store)
+}

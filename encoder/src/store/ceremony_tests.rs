@@ -1,0 +1,138 @@
+//! Changes of keys; the oracle is the client of `slag-common`.
+
+use std::path::Path;
+
+use slag_common::manifest::{self, Manifest};
+use slag_common::tuf::{Kept, Source, TufError, find_target, refresh};
+
+use super::ceremony::{Change, default_root_folder, sign_draft};
+use super::metadata::{Metadata, clock_unix_secs, read_published};
+use super::tests::manifest as manifest_of;
+use super::{Extras, Store, StoreError};
+
+struct Folder<'a>(&'a Path);
+
+impl Source for Folder<'_> {
+    fn metadata(&mut self, name: &str, _: u64) -> Result<Option<Vec<u8>>, String> {
+        read_published(self.0, name).map_err(|e| e.to_string())
+    }
+}
+
+/// Publishes a generation.
+fn publish(dir: &Path, generation: u64) {
+    let scene = Manifest { created_unix_secs: 1, ..manifest_of(generation, &[]) };
+    Store::create_or_open(dir).expect("opens").publish(&scene, &Extras::new()).expect("publishes");
+}
+
+fn client(dir: &Path) -> Kept {
+    Kept::from_root(&read_published(dir, "1.root.json").expect("readable").expect("there")).expect("a root")
+}
+
+/// A robot sees the manifest that is published.
+fn follows(kept: &mut Kept, dir: &Path) -> Result<(), TufError> {
+    let mut trusted = refresh(kept, &mut Folder(dir), clock_unix_secs())?;
+    let found = find_target(&mut trusted, kept, &mut Folder(dir), manifest::TARGET)?.expect("listed");
+    found.check(manifest::TARGET, &fs_err::read(dir.join("manifest")).expect("there"))
+}
+
+fn roles(names: &[&str]) -> Change {
+    Change::Roles(names.iter().map(|name| (*name).to_owned()).collect())
+}
+
+#[test]
+fn robots_follow_every_change_of_keys() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    publish(dir.path(), 1);
+    let (mut kept, mut sleeper) = (client(dir.path()), client(dir.path()));
+    let root_keys = default_root_folder(dir.path());
+    let changes = [
+        &["timestamp"][..],
+        &["snapshot"],
+        &["targets"],
+        &["root"],
+        &["root", "targets", "snapshot", "timestamp"],
+    ];
+    for (version, names) in (2u64..).zip(changes) {
+        follows(&mut kept, dir.path()).expect("before");
+        let metadata = Metadata::open(dir.path()).expect("opens");
+        let before = metadata.keys_status(&root_keys).expect("a root").keys;
+        let changed = metadata.change_keys(&roles(names), &root_keys, clock_unix_secs()).expect("signs");
+        assert_eq!((changed.root_version, changed.draft), (version, None));
+        let after = metadata.keys_status(&root_keys).expect("a root").keys;
+        for (old, new) in before.iter().zip(&after) {
+            assert_eq!(old.id != new.id, names.contains(&old.role.as_str()), "{names:?}: {}", old.role);
+            assert!(new.is_here, "{}", new.role);
+        }
+        drop(metadata);
+        publish(dir.path(), version);
+        follows(&mut kept, dir.path()).unwrap_or_else(|e| panic!("{names:?}: {e}"));
+    }
+    follows(&mut sleeper, dir.path()).expect("follows all roots at once");
+}
+
+/// Two of three root keys must sign; they lie on other machines, one each.
+#[test]
+fn a_draft_is_carried_to_the_root_keys() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let (store, usb) = (dir.path().join("store"), dir.path().join("usb"));
+    fs_err::create_dir(&store).expect("made");
+    Metadata::open(&store).and_then(|m| m.make_root(&usb, 3, 2, clock_unix_secs())).expect("made");
+    publish(&store, 1);
+    assert!(!default_root_folder(&store).exists(), "the store never has a root key");
+    let mut kept = client(&store);
+    follows(&mut kept, &store).expect("honest");
+
+    let holders = ["a", "b"].map(|name| dir.path().join(name));
+    for (holder, number) in holders.iter().zip(1..) {
+        fs_err::create_dir(holder).expect("made");
+        fs_err::copy(usb.join(format!("{number}.key")), holder.join("mine.key")).expect("copied");
+    }
+    let metadata = Metadata::open(&store).expect("opens");
+    let nowhere = default_root_folder(&store);
+    let stolen = metadata.keys_status(&usb).expect("a root").keys;
+    let stolen = stolen.iter().find(|key| key.role == "timestamp").expect("there").id.clone();
+    let changed =
+        metadata.change_keys(&Change::Key(stolen.clone()), &nowhere, clock_unix_secs()).expect("drafted");
+    let draft = changed.draft.expect("without a key it is a draft");
+    // The store goes on under the present root meanwhile.
+    metadata.refresh(clock_unix_secs(), 1).expect("signs");
+    follows(&mut kept, &store).expect("nothing has changed");
+    for holder in &holders {
+        assert!(matches!(
+            metadata.install_root(&draft, clock_unix_secs()),
+            Err(StoreError::RootDraft { cause: TufError::Signatures { .. }, .. })
+        ));
+        // Signed twice, it counts once.
+        for _ in 0..2 {
+            assert_eq!(sign_draft(&draft, holder).expect("signs"), 1);
+        }
+    }
+    assert_eq!(metadata.install_root(&draft, clock_unix_secs()).expect("two of three").root_version, 2);
+    assert!(!draft.exists());
+    let keys = metadata.keys_status(&usb).expect("a root").keys;
+    assert!(keys.iter().all(|key| key.id != stolen), "{keys:?}");
+    follows(&mut kept, &store).expect("follows");
+    assert!(matches!(
+        metadata.change_keys(&Change::Key(stolen), &usb, clock_unix_secs()),
+        Err(StoreError::NoSuchKey { .. })
+    ));
+    assert!(matches!(metadata.make_root(&usb, 1, 1, 0), Err(StoreError::HasRoot { .. })));
+}
+
+/// A crash between the root and the keys: the key that the root names is put in place when it is needed.
+#[test]
+fn a_key_that_a_crash_left_behind_is_put_in_place() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    publish(dir.path(), 1);
+    let mut kept = client(dir.path());
+    let metadata = Metadata::open(dir.path()).expect("opens");
+    let key = |name: &str| dir.path().join("keys").join(name);
+    let old = fs_err::read(key("timestamp.key")).expect("there");
+    metadata
+        .change_keys(&roles(&["timestamp"]), &default_root_folder(dir.path()), clock_unix_secs())
+        .expect("signs");
+    fs_err::rename(key("timestamp.key"), key("timestamp.next.key")).expect("moved");
+    fs_err::write(key("timestamp.key"), old).expect("written");
+    metadata.refresh(clock_unix_secs(), 1).expect("signs with the new key");
+    follows(&mut kept, dir.path()).expect("fresh");
+}
