@@ -109,7 +109,7 @@ fn sections_and_versions_match_the_code() {
     }
     let magic = String::from_utf8(shard::MAGIC.to_vec()).expect("ASCII");
     assert!(has(&["shard", &format!("`{magic}`"), &shard::VERSION.to_string()]));
-    assert!(has(&["manifest", "`slag-manifest`", &manifest::VERSION.to_string()]));
+    assert!(has(&["manifest", "none: JSON", &manifest::VERSION.to_string()]));
     assert!(has(&["12", "4", "u32", "n_sections", &format!("0..={}", container::MAX_SECTIONS)]));
     assert!(has(&[&container::PREAMBLE_BYTES.to_string(), &format!("{} n", container::SECTION_ROW_BYTES)]));
 }

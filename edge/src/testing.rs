@@ -309,8 +309,6 @@ pub fn manifest_of(shards: &[BuiltShard], generation: u64) -> Manifest {
         scene: "yard".into(),
         generation,
         created_unix_secs: 1_700_000_000,
-        expires_unix_secs: None,
-        next_key: None,
         metric: true,
         geo_reference: None,
         encoder: EncoderRecord {
@@ -334,11 +332,9 @@ pub fn write_cache(dir: &Path, shards: &[BuiltShard], generation: u64) {
 
 /// As [`write_cache`], with a manifest that may say more.
 pub fn write_manifest(dir: &Path, shards: &[BuiltShard], manifest: Manifest) {
-    let key = manifest::generate_key();
-    let signed = manifest.sign(&key);
+    let bytes = manifest.to_bytes();
     let current = Current {
-        manifest_hash: Hash32::of(&signed),
-        key: Hash32(key.verifying_key().to_bytes()),
+        manifest_hash: Hash32::of(&bytes),
         profile: Profile::Compact,
         centre_in_world: DVec3::ZERO,
         radius: 50.0,
@@ -359,7 +355,7 @@ pub fn write_manifest(dir: &Path, shards: &[BuiltShard], manifest: Manifest) {
     for shard in shards {
         fs_err::write(cache.shard_path(Hash32::of(&shard.bytes)), &*shard.bytes).expect("a file");
     }
-    fs_err::write(cache.manifest_path(current.manifest_hash), &signed).expect("a file");
+    fs_err::write(cache.manifest_path(current.manifest_hash), &bytes).expect("a file");
     let staged = dir.join("current.new");
     fs_err::write(&staged, serde_json::to_vec(&current).expect("JSON")).expect("a file");
     fs_err::rename(staged, cache.current_path()).expect("a rename");

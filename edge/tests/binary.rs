@@ -13,11 +13,11 @@ use slag_common::Hash32;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use slag_common::shard::{Positions, Profile, ScoreErrors, ShardHeader, ShardView, quantise};
-use slag_common::tuf::one_key_repository;
+use slag_common::tuf::{generate_key, one_key_repository};
 use slag_edge::text::TextService;
 use slag_models::{ModelDir, SessionOptions};
 
-/// Returns the signed manifest and the one shard of a scene with 40 red Gaussians around x = 2 and 60 blue
+/// Returns the manifest and the one shard of a scene with 40 red Gaussians around x = 2 and 60 blue
 /// ones around x = 8, in the colour stand-in's space.
 fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
     let text =
@@ -71,8 +71,6 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
         scene: "paint".into(),
         generation: 3,
         created_unix_secs: 1_700_000_000,
-        expires_unix_secs: None,
-        next_key: None,
         metric: true,
         geo_reference: None,
         encoder: EncoderRecord {
@@ -87,14 +85,14 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
         n_rejected: 0,
         cells: vec![CellRecord { cell_id: 0, bounds, n_gaussians: 100, shards }],
     };
-    (manifest.sign(&manifest::generate_key()), shard)
+    (manifest.to_bytes(), shard)
 }
 
 /// Serves the manifest, the metadata and the shard of a store from a thread for as long as the tests run; returns its address.
-fn store(signed: Vec<u8>, shard: Vec<u8>) -> String {
+fn store(listed: Vec<u8>, shard: Vec<u8>) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
     let address = format!("http://{}", listener.local_addr().expect("an address"));
-    let metadata = one_key_repository(&manifest::generate_key(), 3, manifest::TARGET, &signed);
+    let metadata = one_key_repository(&generate_key(), 3, manifest::TARGET, &listed);
     std::thread::spawn(move || {
         for stream in listener.incoming() {
             let mut stream = stream.expect("a connection");
@@ -105,7 +103,7 @@ fn store(signed: Vec<u8>, shard: Vec<u8>) -> String {
             let path = request.split(' ').nth(1).and_then(|path| path.strip_prefix("/v1/")?.split_once('/'));
             let body = match path {
                 Some(("metadata", name)) => metadata.get(name),
-                Some(("targets", _)) => Some(&signed),
+                Some(("targets", _)) => Some(&listed),
                 _ => Some(&shard),
             };
             let status = if body.is_some() { "200 OK" } else { "404 Not Found" };
@@ -169,8 +167,8 @@ fn get(url: &str) -> (u16, Value) {
 
 #[test]
 fn a_robot_fetches_asks_and_serves() {
-    let (signed, shard) = red_and_blue();
-    let from = store(signed, shard);
+    let (listed, shard) = red_and_blue();
+    let from = store(listed, shard);
     let dir = tempfile::tempdir().expect("a folder");
     let cache = dir.path().join("cache");
 
@@ -236,9 +234,9 @@ fn an_interrupted_fetch_says_so() {
 
 #[test]
 fn nobody_reads_and_nobody_complains() {
-    let (signed, shard) = red_and_blue();
+    let (listed, shard) = red_and_blue();
     let dir = tempfile::tempdir().expect("a folder");
-    let from = store(signed, shard);
+    let from = store(listed, shard);
     assert_eq!(run(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]).0, Some(0));
     let mut child = slag_edge(dir.path(), &["query", "red", "--kind", "gaussians", "--json"]);
     let mut child = child.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
@@ -251,9 +249,9 @@ fn nobody_reads_and_nobody_complains() {
 /// skipped.
 #[test]
 fn a_robot_is_followed_along_stdin() {
-    let (signed, shard) = red_and_blue();
+    let (listed, shard) = red_and_blue();
     let dir = tempfile::tempdir().expect("a folder");
-    let from = store(signed, shard);
+    let from = store(listed, shard);
     let watch = |text: &str| {
         let args = [
             "fetch",
@@ -293,9 +291,9 @@ fn a_robot_is_followed_along_stdin() {
 /// The service fetches around the positions posted to it and answers from the result.
 #[test]
 fn a_robot_is_followed_by_its_service() {
-    let (signed, shard) = red_and_blue();
+    let (listed, shard) = red_and_blue();
     let dir = tempfile::tempdir().expect("a folder");
-    let from = store(signed, shard);
+    let from = store(listed, shard);
     let (serving, url) = serve(dir.path(), &["--trust-first", "--follow", &from, "--radius", "20"]);
     assert_eq!(get(&format!("{url}/query?text=blue")).0, 503);
     let posted = ureq::post(format!("{url}/position")).content_type("application/json");
@@ -321,9 +319,9 @@ fn a_robot_is_followed_by_its_service() {
 /// Ten times more queries than the service can answer: some are answered quickly, the others are refused.
 #[test]
 fn overload_is_turned_away_and_memory_stays() {
-    let (signed, shard) = red_and_blue();
+    let (listed, shard) = red_and_blue();
     let dir = tempfile::tempdir().expect("a folder");
-    let from = store(signed, shard);
+    let from = store(listed, shard);
     assert_eq!(run(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]).0, Some(0));
     let (serving, url) = serve(dir.path(), &[]);
     let mut load = Command::new(env!("CARGO_BIN_EXE_slag-edge"));

@@ -4,7 +4,6 @@ use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::Path;
 
-use ed25519_dalek::SigningKey;
 use glam::DVec3;
 use half::f16;
 use slag_common::frames::Aabb;
@@ -26,7 +25,7 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
         "container" | "shard" => vec![shard(false), shard(true)],
         "manifest" => vec![manifest()],
         "current" => text(&format!(
-            r#"{{"manifest_hash":"{0}","key":"{0}","profile":"compact","centre_in_world":[0.0,1.0,2.5],"radius":50.0,"cells":[{{"cell_id":1,"hash":"{0}","len_bytes":7}}]}}"#,
+            r#"{{"manifest_hash":"{0}","profile":"compact","centre_in_world":[0.0,1.0,2.5],"radius":50.0,"cells":[{{"cell_id":1,"hash":"{0}","len_bytes":7}}]}}"#,
             "ab".repeat(32)
         )),
         "ply" => text(PLY),
@@ -198,8 +197,6 @@ fn manifest() -> Vec<u8> {
         scene: "yard".into(),
         generation: 3,
         created_unix_secs: 1_700_000_000,
-        expires_unix_secs: Some(1_900_000_000),
-        next_key: Some(Hash32([3; 32])),
         metric: true,
         geo_reference: None,
         encoder: EncoderRecord {
@@ -214,7 +211,7 @@ fn manifest() -> Vec<u8> {
         n_rejected: 0,
         cells: vec![cell(1), cell(2)],
     };
-    manifest.sign(&SigningKey::from_bytes(&[7; 32]))
+    manifest.to_bytes()
 }
 
 /// An uncompressed file of version 2 with one Gaussian of zeros; the target compresses it.

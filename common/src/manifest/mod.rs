@@ -1,13 +1,12 @@
-//! The manifest: the signed list of a scene's shards.
+//! The manifest: the list of a scene's shards.
 //!
-//! On disk and on the wire it is one ASCII line, `slag-manifest 1 ed25519 PUBLIC_KEY SIGNATURE\n` (hex), followed by the
-//! JSON text. The signature covers that text byte for byte, so no two readers can disagree on it. The same scene gives
-//! the same JSON: fields in declaration order, no spaces.
+//! On disk and on the wire it is JSON text. The same scene gives the same bytes: fields in declaration order, no spaces.
+//! It is a target of the store's metadata ([`crate::tuf`]), which says whose it is and whether it is the newest.
 
 mod error;
 mod index;
+mod json;
 mod records;
-mod signature;
 #[cfg(test)]
 mod tests;
 
@@ -16,4 +15,3 @@ pub use index::CellIndex;
 pub use records::{
     Calibration, CellRecord, EncoderRecord, MAX_BYTES, Manifest, ShardRecord, TARGET, VERSION,
 };
-pub use signature::{TrustedKeys, generate_key};

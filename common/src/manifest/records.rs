@@ -9,13 +9,13 @@ use crate::hash::Hash32;
 use crate::shard::{Profile, ScoreErrors};
 
 /// Version of the manifest format that is written and read.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 /// Path of the manifest among a store's targets.
 pub const TARGET: &str = "manifest";
 /// Largest manifest read: a cell takes about 600 bytes, so this allows 100,000 cells.
 pub const MAX_BYTES: u64 = 64 << 20;
 
-/// A signed list of the shards of one generation of a scene.
+/// A list of the shards of one generation of a scene.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
@@ -23,17 +23,10 @@ pub struct Manifest {
     pub version: u32,
     /// Name of the scene.
     pub scene: String,
-    /// Number of this encode of the scene; a robot never goes back to a smaller one.
+    /// Number of this encode of the scene, for people; the metadata's versions decide what is newer.
     pub generation: u64,
-    /// Time of signing, seconds since 1970.
+    /// When it was made, seconds since 1970.
     pub created_unix_secs: u64,
-    /// Time after which robots refuse it, seconds since 1970; absent: never.
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub expires_unix_secs: Option<u64>,
-    /// The public key that signs later generations. Robots that accept this manifest's key also accept this one, and only
-    /// this one once it has signed a manifest. Absent: the key is not being changed.
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub next_key: Option<Hash32>,
     /// Whether a world unit is a metre.
     pub metric: bool,
     /// Position of the world frame on the earth, if known.

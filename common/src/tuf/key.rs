@@ -49,6 +49,11 @@ impl Key {
     }
 }
 
+/// Generates a signing key from the system's randomness.
+pub fn generate_key() -> SigningKey {
+    SigningKey::generate(&mut rand_core::OsRng)
+}
+
 /// Returns whether a signature in hex is that of a message.
 pub(super) fn is_signed(key: &VerifyingKey, message: &[u8], signature_hex: &str) -> bool {
     let mut bytes = [0; 64];

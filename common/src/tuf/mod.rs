@@ -26,7 +26,7 @@ mod update;
 pub use canonical::{NotCanonical, canonical_json};
 pub use error::TufError;
 pub use kept::Kept;
-pub use key::Key;
+pub use key::{Key, generate_key};
 pub use metadata::{
     Body, DelegatedRole, Delegations, FileMeta, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp,
     sha256_hex,

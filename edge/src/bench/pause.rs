@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use glam::DVec3;
 use serde::Serialize;
-use slag_common::manifest::generate_key;
+use slag_common::tuf::generate_key;
 use tokio::net::TcpListener;
 
 use super::machine::Machine;

@@ -70,7 +70,7 @@ pub(super) fn text_service(dim: u32) -> io::Result<TextService> {
 /// One generation, as a store serves it.
 #[derive(Default)]
 pub(super) struct Published {
-    signed: Vec<u8>,
+    manifest: Vec<u8>,
     metadata: BTreeMap<String, Vec<u8>>,
     objects: BTreeMap<Hash32, Vec<u8>>,
 }
@@ -109,8 +109,6 @@ impl Generator {
             scene: "generated".into(),
             generation,
             created_unix_secs: 1,
-            expires_unix_secs: None,
-            next_key: None,
             metric: true,
             geo_reference: None,
             encoder: EncoderRecord {
@@ -125,8 +123,8 @@ impl Generator {
             n_rejected: 0,
             cells,
         };
-        published.signed = manifest.sign(&self.key);
-        published.metadata = one_key_repository(&self.key, generation, manifest::TARGET, &published.signed);
+        published.manifest = manifest.to_bytes();
+        published.metadata = one_key_repository(&self.key, generation, manifest::TARGET, &published.manifest);
         Ok(published)
     }
 
@@ -204,7 +202,7 @@ pub(super) fn store(shelf: Shelf) -> Router {
         }
     }
     async fn manifest(State(shelf): State<Shelf>) -> Vec<u8> {
-        shelf.read().unwrap_or_else(PoisonError::into_inner).signed.clone()
+        shelf.read().unwrap_or_else(PoisonError::into_inner).manifest.clone()
     }
     async fn object(State(shelf): State<Shelf>, Path(hash): Path<String>) -> Response {
         let shelf = shelf.read().unwrap_or_else(PoisonError::into_inner);

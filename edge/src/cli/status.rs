@@ -22,16 +22,20 @@ pub struct StatusArgs {
 pub fn run(args: StatusArgs) -> Result<(), Failure> {
     let cache = args.cache.open()?;
     let snapshot = Snapshot::open(&cache).map_err(store_failure)?;
-    let pinned_scene = accepted(&cache).and_then(|accepted| accepted.scene);
+    let accepted = accepted(&cache);
+    let expires_unix_secs = accepted.as_ref().and_then(|accepted| accepted.expires_unix_secs);
+    let is_expired = expires_unix_secs.is_some_and(|expires| expires <= slag_edge::now_unix_secs());
+    let pinned_scene = accepted.and_then(|accepted| accepted.scene);
     let status = Status::of(&snapshot);
-    let expires_unix_secs = snapshot.manifest.expires_unix_secs;
-    let is_expired = snapshot.manifest.check_expiry(slag_edge::now_unix_secs()).is_err();
     if args.json {
         return print_json(&OnBoard { status: &status, pinned_scene, expires_unix_secs, is_expired });
     }
     print_status(&status, pinned_scene)?;
     match is_expired {
-        true => print_pairs(&[("expired", "yes: queries still work, but fetch refuses it".into())]),
+        true => print_pairs(&[(
+            "expired",
+            "yes: queries still work, but there may be news; fetch again, or have the store refreshed".into(),
+        )]),
         false => Ok(()),
     }
 }
@@ -61,6 +65,5 @@ fn print_status(status: &Status, pinned_scene: Option<String>) -> Result<(), Fai
         ("bad cells", if bad_cells.is_empty() { "none".into() } else { bad_cells.join(", ") }),
         ("Gaussians", status.n_gaussians.to_string()),
         ("bytes", status.len_bytes.to_string()),
-        ("signed by", status.key.to_string()),
     ])
 }

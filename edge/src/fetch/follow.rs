@@ -290,7 +290,7 @@ pub fn follow(
             Ok(report) => {
                 follower.fetched(now, report.centre_in_world);
                 // Needed for its geo-reference only; without it every geographic position fetches.
-                manifest = cache.read_manifest(report.manifest_hash, report.key).ok();
+                manifest = cache.read_manifest(report.manifest_hash).ok();
             }
             Err(FetchError::Cancelled) => return Err(FetchError::Cancelled),
             Err(error) if is_over => return Err(error),

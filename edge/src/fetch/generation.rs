@@ -35,7 +35,6 @@ pub fn assemble(
     });
     Current {
         manifest_hash: offer.manifest_hash,
-        key: offer.key,
         profile: wanted.profile,
         centre_in_world: wanted.centre_in_world,
         radius: wanted.radius,
@@ -48,11 +47,11 @@ impl Before<'_> {
     /// Returns a whole shard of an earlier generation that may answer for a cell of a new one.
     fn stand_in(&self, new: &Manifest, wanted: &Wanted, cell_id: u32) -> Option<OldShard> {
         let current = self.current.filter(|current| current.profile == wanted.profile)?;
-        let Current { manifest_hash, key, .. } = *current;
+        let Current { manifest_hash, .. } = *current;
         let generation = self.offer.map(|offer| offer.manifest.generation);
         let of_current = current.cells.iter().filter_map(|cell| {
             let CurrentCell { hash, len_bytes, .. } = *cell;
-            Some((cell.cell_id, OldShard { generation: generation?, manifest_hash, key, hash, len_bytes }))
+            Some((cell.cell_id, OldShard { generation: generation?, manifest_hash, hash, len_bytes }))
         });
         let mut of_cell = of_current.chain(current.old_shards()).filter(|(id, _)| *id == cell_id);
         of_cell.find(|(_, old)| self.is_fit(old, new, wanted, cell_id)).map(|(_, old)| old)
@@ -62,7 +61,7 @@ impl Before<'_> {
         let read;
         let manifest = match self.offer.filter(|offer| offer.manifest_hash == old.manifest_hash) {
             Some(offer) => &offer.manifest,
-            None => match self.cache.read_manifest(old.manifest_hash, old.key) {
+            None => match self.cache.read_manifest(old.manifest_hash) {
                 Ok(manifest) => {
                     read = manifest;
                     &read

@@ -1,7 +1,7 @@
 //! What a store offers: its metadata is brought up to date, and the manifest that it names is downloaded if it is news.
 
 use slag_common::Hash32;
-use slag_common::manifest::{self, Manifest, ManifestError, TrustedKeys};
+use slag_common::manifest::{self, Manifest, ManifestError};
 use slag_common::tuf::{Source, TargetFile, TufError, find_target, refresh};
 
 use super::download::Client;
@@ -16,7 +16,6 @@ pub(super) struct Offer {
     pub bytes: Vec<u8>,
     pub manifest_hash: Hash32,
     pub manifest: Manifest,
-    pub key: Hash32,
 }
 
 impl Offer {
@@ -24,8 +23,8 @@ impl Offer {
     pub fn on_board(cache: &EdgeCache, old: &Current) -> Option<Self> {
         let manifest_hash = old.manifest_hash;
         let bytes = cache.files().read(&cache.manifest_path(manifest_hash), manifest::MAX_BYTES).ok()?;
-        let (manifest, key) = Manifest::verify(&bytes, &TrustedKeys::Only(vec![old.key])).ok()?;
-        (Hash32::of(&bytes) == manifest_hash).then_some(Self { bytes, manifest_hash, manifest, key })
+        let manifest = Manifest::parse(&bytes).ok()?;
+        (Hash32::of(&bytes) == manifest_hash).then_some(Self { bytes, manifest_hash, manifest })
     }
 
     /// Brings what the robot believes of the store up to date, durably, and returns the manifest that counts.
@@ -61,18 +60,12 @@ impl Offer {
         let missing = || TufError::Missing { what: path.clone() };
         let bytes = client.file(&path, target.length)?.ok_or_else(missing)?;
         target.check(manifest::TARGET, &bytes)?;
-        let (manifest, key) = Manifest::verify(&bytes, &TrustedKeys::FirstContact)?;
-        Ok(Self { manifest_hash: Hash32::of(&bytes), bytes, manifest, key })
+        let manifest = Manifest::parse(&bytes)?;
+        Ok(Self { manifest_hash: Hash32::of(&bytes), bytes, manifest })
     }
 
-    /// Refuses a manifest that is expired, or of another scene or encoder. `scene`: the one that the robot keeps to.
-    pub fn check(
-        &self,
-        scene: Option<&str>,
-        request: &FetchRequest,
-        now_unix_secs: u64,
-    ) -> Result<(), FetchError> {
-        self.manifest.check_expiry(now_unix_secs)?;
+    /// Refuses a manifest of another scene or encoder. `scene`: the one that the robot keeps to.
+    pub fn check(&self, scene: Option<&str>, request: &FetchRequest) -> Result<(), FetchError> {
         let offered = &self.manifest.scene;
         if let Some(expected) = scene.filter(|expected| expected != offered) {
             return Err(FetchError::Scene { expected: expected.to_owned(), offered: offered.clone() });

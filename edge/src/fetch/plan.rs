@@ -177,8 +177,6 @@ mod tests {
             scene: "s".into(),
             generation: 1,
             created_unix_secs: 0,
-            expires_unix_secs: None,
-            next_key: None,
             metric: true,
             geo_reference: Some(GeoReference { origin }),
             encoder: EncoderRecord {

@@ -32,10 +32,8 @@ pub struct FetchReport {
     pub scene: String,
     /// Its generation.
     pub generation: u64,
-    /// BLAKE3 of the signed manifest.
+    /// BLAKE3 of the manifest.
     pub manifest_hash: Hash32,
-    /// Public key of its signature.
-    pub key: Hash32,
     /// Version of the root by which the manifest is trusted; absent if nothing was trusted yet (offline).
     pub root_version: Option<u64>,
     /// Whether that root was accepted because it was the first.

@@ -88,7 +88,7 @@ pub fn fetch(
             offer.map_err(|e| disk_full(e, SPARE_BYTES))?
         }
     };
-    offer.check(scene.as_deref(), request, environment.now_unix_secs)?;
+    offer.check(scene.as_deref(), request)?;
 
     let centre_in_world = at.in_world(&offer.manifest)?;
     let mut held = held_shards(cache, &usage)?;
@@ -161,7 +161,6 @@ pub fn fetch(
         scene: offer.manifest.scene,
         generation: offer.manifest.generation,
         manifest_hash: offer.manifest_hash,
-        key: offer.key,
         root_version: records.kept().and_then(Kept::root_version),
         is_first_contact,
         encoder_id: offer.manifest.encoder.id,

@@ -37,11 +37,11 @@ pub async fn status(State(app): State<Arc<App>>) -> Result<Json<Value>, Problem>
             |e| Some(e.to_string()),
             |snapshot| app.engine.check_encoder(snapshot).err().map(|e| e.to_string()),
         );
-        let manifest = snapshot.as_ref().ok().map(|snapshot| &snapshot.manifest);
-        let expires_unix_secs = manifest.and_then(|manifest| manifest.expires_unix_secs);
-        // An expired scene still answers: an old map is better than none, if the client can tell.
-        let is_expired = manifest.is_some_and(|m| m.check_expiry(crate::now_unix_secs()).is_err());
-        let pinned_scene = accepted(app.engine.cache()).and_then(|accepted| accepted.scene);
+        let accepted = accepted(app.engine.cache());
+        let expires_unix_secs = accepted.as_ref().and_then(|accepted| accepted.expires_unix_secs);
+        // A scene that may be outdated still answers: an old map is better than none, if the client can tell.
+        let is_expired = expires_unix_secs.is_some_and(|expires| expires <= crate::now_unix_secs());
+        let pinned_scene = accepted.and_then(|accepted| accepted.scene);
         let following = app.following.as_ref().map(|following| following.status());
         let scene = snapshot.as_ref().ok().map(|snapshot| Status::of(snapshot));
         let is_ready = error.is_none() && app.engine.text_is_alive();

@@ -16,15 +16,13 @@ use tower::ServiceExt;
 
 use super::router::router;
 use super::*;
-use crate::fetch::Position;
 use crate::fetch::follow::Following;
+use crate::fetch::{Position, Records};
 use crate::query::Engine;
 use crate::store::EdgeCache;
-use crate::testing::{
-    BuiltShard, Gate, Member, TestShard, axes_service, manifest_of, open_gate, write_cache, write_manifest,
-};
+use crate::testing::{BuiltShard, Gate, Member, TestShard, axes_service, open_gate, write_cache};
 use slag_common::Hash32;
-use slag_common::manifest::Manifest;
+use slag_common::tuf::{Kept, SignedMetadata, Timestamp, generate_key, one_key_repository, sign};
 
 mod answers;
 mod attacks;
@@ -321,24 +319,37 @@ async fn tells_status_and_metrics() {
     }
 }
 
+/// The scene answers whatever the store's timestamp says.
 #[tokio::test]
 async fn an_expired_scene_answers_and_the_status_says_so() {
-    for (expires_unix_secs, is_expired) in [(None, false), (Some(1), true), (Some(u64::MAX), false)] {
+    for (expires_unix_secs, is_expired) in [(1, true), (4_000_000_000, false)] {
         let service = Service::with_chair();
-        let mut attempts = service.app.reload_attempts();
-        let manifest = Manifest { expires_unix_secs, ..manifest_of(&chair(None), 2) };
-        write_manifest(service.dir.path(), &chair(None), manifest);
-        service.get("/query?text=0").await;
-        soon(attempts.changed()).await.expect("the service lives");
+        keep_timestamp(service.dir.path(), expires_unix_secs);
         let (_, _, body) = service.get("/status").await;
-        assert_eq!((&body["scene"]["generation"], &body["is_ready"]), (&2.into(), &true.into()));
         assert_eq!(
-            (&body["is_expired"], body["expires_unix_secs"].as_u64()),
-            (&is_expired.into(), expires_unix_secs)
+            (&body["is_expired"], &body["expires_unix_secs"], &body["is_ready"]),
+            (&is_expired.into(), &expires_unix_secs.into(), &true.into())
+        );
+        let (_, _, map) = service.get("/v1/map").await;
+        assert_eq!(
+            (&map["is_expired"], &map["expires_unix_secs"]),
+            (&is_expired.into(), &expires_unix_secs.into())
         );
         let (status, _, body) = service.get("/query?text=0").await;
         assert_eq!((status, &body["answers"][0]["n_gaussians"]), (StatusCode::OK, &20.into()));
     }
+}
+
+/// Has a cache remember a timestamp that expires at a time.
+fn keep_timestamp(dir: &std::path::Path, expires_unix_secs: u64) {
+    let key = generate_key();
+    let files = one_key_repository(&key, 1, "manifest", b"");
+    let text = |bytes: &[u8]| String::from_utf8(bytes.to_vec()).expect("JSON");
+    let mut kept = Kept::from_root(&files["1.root.json"]).expect("a root");
+    let body = SignedMetadata::<Timestamp>::parse("timestamp", &files["timestamp.json"]).expect("sound").body;
+    kept.timestamp = Some(text(&sign(1, expires_unix_secs, &body, &[&key])));
+    let cache = EdgeCache::open(dir);
+    Records::open(&cache).expect("opens").keep(&cache, &kept).expect("kept");
 }
 
 #[tokio::test]

@@ -27,7 +27,7 @@ pub struct MapStatus {
     pub created_unix_secs: u64,
     /// Seconds since then; 0 if the clock is behind.
     pub age_secs: u64,
-    /// When it expires, Unix seconds.
+    /// Until when it is known to be the newest, Unix seconds: when the store's timestamp expires.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub expires_unix_secs: Option<u64>,
     /// Whether it is past that.
@@ -75,8 +75,8 @@ pub struct MissingCell {
 }
 
 impl MapStatus {
-    /// Describes a snapshot. `now_unix_secs`: the clock.
-    pub fn of(snapshot: &Snapshot, now_unix_secs: u64) -> Self {
+    /// Describes a snapshot. `now_unix_secs`: the clock. `expires_unix_secs`: when the store's timestamp expires.
+    pub fn of(snapshot: &Snapshot, now_unix_secs: u64, expires_unix_secs: Option<u64>) -> Self {
         let Snapshot { current, manifest, .. } = snapshot;
         let bad = |cell_id: u32| -> Option<&BadCell> {
             snapshot.bad_cells.iter().find(|bad| bad.cell_id == cell_id)
@@ -115,8 +115,8 @@ impl MapStatus {
             geo_reference: manifest.geo_reference,
             created_unix_secs: manifest.created_unix_secs,
             age_secs: now_unix_secs.saturating_sub(manifest.created_unix_secs),
-            expires_unix_secs: manifest.expires_unix_secs,
-            is_expired: manifest.check_expiry(now_unix_secs).is_err(),
+            expires_unix_secs,
+            is_expired: expires_unix_secs.is_some_and(|expires| expires <= now_unix_secs),
             centre_in_world: current.centre_in_world,
             radius: current.radius,
             n_objects: snapshot.objects.len(),

@@ -15,10 +15,8 @@ pub struct Status {
     pub scene: String,
     /// Generation of the scene.
     pub generation: u64,
-    /// BLAKE3 of the signed manifest.
+    /// BLAKE3 of the manifest.
     pub manifest_hash: Hash32,
-    /// Public key of its signature.
-    pub key: Hash32,
     /// Name of the encoder that made the embeddings.
     pub encoder_name: String,
     /// Its id.
@@ -83,7 +81,6 @@ impl Status {
             scene: manifest.scene.clone(),
             generation: manifest.generation,
             manifest_hash: current.manifest_hash,
-            key: current.key,
             encoder_name: manifest.encoder.name.clone(),
             encoder_id: manifest.encoder.id,
             default_threshold: manifest.encoder.default_threshold,

@@ -53,10 +53,8 @@ impl fmt::Display for BadCell {
 pub struct OldShard {
     /// The generation.
     pub generation: u64,
-    /// BLAKE3 of its signed manifest, which is kept on board.
+    /// BLAKE3 of its manifest, which is kept on board.
     pub manifest_hash: Hash32,
-    /// The public key accepted for it.
-    pub key: Hash32,
     /// BLAKE3 of the shard.
     pub hash: Hash32,
     /// Length of the shard.

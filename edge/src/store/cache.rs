@@ -7,7 +7,7 @@ use std::sync::Arc;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
-use slag_common::manifest::{self, Manifest, TrustedKeys};
+use slag_common::manifest::{self, Manifest};
 use slag_common::shard::Profile;
 
 use super::bad_cell::{BadCell, OldShard};
@@ -21,10 +21,8 @@ const MAX_CURRENT_BYTES: u64 = 32 << 20;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Current {
-    /// BLAKE3 of the signed manifest.
+    /// BLAKE3 of the manifest.
     pub manifest_hash: Hash32,
-    /// The public key accepted for it.
-    pub key: Hash32,
     /// Profile of the shards.
     pub profile: Profile,
     /// Centre of the fetch, world frame.
@@ -137,11 +135,11 @@ impl EdgeCache {
         Ok(Some(current))
     }
 
-    /// Reads a manifest of the cache and checks its hash and its signature.
+    /// Reads a manifest of the cache and checks its hash.
     ///
     /// # Errors
     /// [`StoreError::Missing`], [`StoreError::Hash`], [`StoreError::Manifest`].
-    pub fn read_manifest(&self, hash: Hash32, key: Hash32) -> Result<Manifest, StoreError> {
+    pub fn read_manifest(&self, hash: Hash32) -> Result<Manifest, StoreError> {
         let path = self.manifest_path(hash);
         let bytes = match self.files.read(&path, manifest::MAX_BYTES) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(StoreError::Missing { path }),
@@ -151,9 +149,6 @@ impl EdgeCache {
         if found != hash {
             return Err(StoreError::Hash { path, expected: hash, found });
         }
-        match Manifest::verify(&bytes, &TrustedKeys::Only(vec![key])) {
-            Ok((manifest, _)) => Ok(manifest),
-            Err(source) => Err(StoreError::Manifest { path, source }),
-        }
+        Manifest::parse(&bytes).map_err(|source| StoreError::Manifest { path, source })
     }
 }

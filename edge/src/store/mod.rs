@@ -3,7 +3,7 @@
 //! | path | content | changed by |
 //! |---|---|---|
 //! | `shards/HASH` | verified shards, immutable | fetch: renamed in, removed |
-//! | `manifests/HASH` | verified signed manifests, immutable | fetch: renamed in, removed |
+//! | `manifests/HASH` | verified manifests, immutable | fetch: renamed in, removed |
 //! | `current` | [`Current`]: the generation in use | fetch: replaced whole |
 //! | `staging/` | partial downloads | fetch |
 //! | `trust/` | accepted metadata and scene, in two copies | fetch |

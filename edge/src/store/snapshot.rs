@@ -71,7 +71,7 @@ impl Snapshot {
         current_stat: Option<Stat>,
         before: Option<&Self>,
     ) -> Result<Self, StoreError> {
-        let manifest = cache.read_manifest(current.manifest_hash, current.key)?;
+        let manifest = cache.read_manifest(current.manifest_hash)?;
         let profile = current.profile;
         let open = |manifest: &Manifest, cell: &CurrentCell| {
             let held = before.map_or(&[][..], |before| &before.shards);
@@ -89,7 +89,7 @@ impl Snapshot {
         for bad in &mut bad_cells {
             let Some(old) = bad.old else { continue };
             let cell = CurrentCell { cell_id: bad.cell_id, hash: old.hash, len_bytes: old.len_bytes };
-            let of_old = cache.read_manifest(old.manifest_hash, old.key).and_then(|of_old| {
+            let of_old = cache.read_manifest(old.manifest_hash).and_then(|of_old| {
                 let may_stand_in = can_stand_in(&of_old, &manifest, bad.cell_id);
                 may_stand_in.then(|| open(&of_old, &cell)).transpose()
             });

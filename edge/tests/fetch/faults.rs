@@ -197,7 +197,7 @@ impl Stage {
                 _ if seen.path.ends_with("timestamp.json") => {
                     Fault::Instead(stale.metadata["timestamp.json"].clone())
                 }
-                _ if seen.path.contains("/targets/") => Fault::Instead(stale.signed.clone()),
+                _ if seen.path.contains("/targets/") => Fault::Instead(stale.listed.clone()),
                 _ => match pairs.iter().find(|(name, _)| *name == seen.path) {
                     Some((_, other)) => Fault::Instead(other.clone()),
                     None => Fault::None,

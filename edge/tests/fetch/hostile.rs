@@ -9,7 +9,7 @@ use slag_common::tuf::TufError;
 use slag_edge::fetch::{DownloadFailure, FetchError, FetchRequest, PlanError, Progress};
 use slag_edge::store::{BadCell, CellFault, Snapshot, StoreError};
 
-use super::scene::{ENCODER, FIRST, NOW, Published, RootKeys, ShardSpec, key, metadata, shard};
+use super::scene::{ENCODER, FIRST, NOW, Published, RootKeys, ShardSpec, metadata, shard};
 use super::server::{Fault, Seen, Server};
 use super::{Robot, assert_holds};
 
@@ -53,7 +53,7 @@ fn refused_manifests_leave_the_old_generation() {
     let foreign = third.clone().signed_by(&[RootKeys { root: 1, online: 9 }], 3);
     let error = tuf(refused(&robot, foreign));
     assert!(matches!(error, TufError::Signatures { .. }), "{error}");
-    let expired = metadata(&[FIRST], 3, NOW - 1, &third.signed);
+    let expired = metadata(&[FIRST], 3, NOW - 1, &third.listed);
     let error = tuf(refused(&robot, Published { metadata: expired, ..third.clone() }));
     assert!(matches!(error, TufError::Expired { .. }), "{error}");
     let error = tuf(refused(&robot, Published::new(1, &[0; 4], 50)));
@@ -62,7 +62,7 @@ fn refused_manifests_leave_the_old_generation() {
     let error = refused(&robot, third.clone());
     assert!(matches!(error, FetchError::Encoder { found: ENCODER, .. }), "{error}");
     robot.request.expected_encoder = Some(ENCODER);
-    let mut forged = third.signed.clone();
+    let mut forged = third.listed.clone();
     *forged.last_mut().expect("not empty") ^= 1;
     server.faults(targets(Fault::Instead(forged)));
     let error = tuf(refused(&robot, third.clone()));
@@ -293,14 +293,13 @@ fn a_manifest_of_a_gigabyte_is_refused_unread() {
 #[test]
 fn names_that_are_paths_are_refused() {
     let scene = Published::new(1, &[0; 1], 50);
-    let end = scene.signed.iter().position(|b| *b == b'\n').expect("a first line") + 1;
-    let json = String::from_utf8(scene.signed[end..].to_vec()).expect("JSON");
+    let json = String::from_utf8(scene.listed.clone()).expect("JSON");
     let name = scene.hash(0, Profile::Compact).to_string();
     let upper = name.to_uppercase();
     for path in ["../../../etc/passwd", "/etc/passwd", "", ".", "..\\\\x", "a/b", &name[1..], &upper] {
         let dir = tempfile::tempdir().expect("temporary folder");
         let mut hostile = scene.clone();
-        hostile.signed = signed_text(&json.replace(&name, path));
+        hostile.listed = json.replace(&name, path).into_bytes();
         let hostile = hostile.signed_by(&[FIRST], 1);
         let server = Server::start(hostile);
         let robot = Robot::on_disk(dir.path(), &server.url());
@@ -315,16 +314,6 @@ fn names_that_are_paths_are_refused() {
         let error = Snapshot::open(&robot.cache).expect_err("refused");
         assert!(matches!(error, StoreError::Current { .. }), "{path}: {error}");
     }
-}
-
-/// Signs any text as a manifest.
-fn signed_text(json: &str) -> Vec<u8> {
-    use ed25519_dalek::Signer;
-    let key = key(1);
-    let signature = key.sign(json.as_bytes()).to_bytes();
-    let hex = |bytes: &[u8]| bytes.iter().map(|b| format!("{b:02x}")).collect::<String>();
-    let public = hex(&key.verifying_key().to_bytes());
-    format!("slag-manifest 1 ed25519 {public} {}\n{json}", hex(&signature)).into_bytes()
 }
 
 /// Shards with false sizes, sections, counts and offsets under valid checksums, hashes and signatures.

@@ -125,7 +125,7 @@ fn files_of_different_states_are_not_mixed() {
         assert!(matches!(error, TufError::Content { .. }), "{name}: {error}");
     }
     trial.server.publish(new.clone());
-    let instead = other.signed.clone();
+    let instead = other.listed.clone();
     trial.server.faults(move |seen| match seen.path.contains("/targets/") {
         true => Fault::Instead(instead.clone()),
         false => Fault::None,
@@ -141,7 +141,7 @@ fn files_of_different_states_are_not_mixed() {
 fn a_frozen_store_is_noticed() {
     let expiring = |at: u64, version: u64| {
         let published = of(version, &[FIRST], version);
-        let metadata = metadata(&[FIRST], version, at, &published.signed);
+        let metadata = metadata(&[FIRST], version, at, &published.listed);
         Published { metadata, ..published }
     };
     let mut trial = Trial::new(of(1, &[FIRST], 1));

@@ -91,7 +91,7 @@ fn a_bad_cell_costs_that_cell_only() {
         assert_eq!(robot.fetch().expect("heals").bad_cells, []);
         assert_eq!(answering(&robot.snapshot()), whole(&third));
         let manifests = robot.cache.files().list(&robot.cache.dir().join("manifests")).expect("there");
-        assert_eq!(manifests, [Hash32::of(&third.signed).to_string()], "the old manifest is gone");
+        assert_eq!(manifests, [Hash32::of(&third.listed).to_string()], "the old manifest is gone");
 
         // A scene without a good cell brings nothing.
         let fourth = Published::new(4, &[9; 3], 40);

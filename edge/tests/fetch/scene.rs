@@ -36,7 +36,8 @@ pub fn key(seed: u8) -> SigningKey {
 #[derive(Clone)]
 pub struct Published {
     pub manifest: Manifest,
-    pub signed: Vec<u8>,
+    /// The manifest's bytes.
+    pub listed: Vec<u8>,
     /// Metadata files by name.
     pub metadata: BTreeMap<String, Vec<u8>>,
     pub objects: BTreeMap<Hash32, Vec<u8>>,
@@ -124,8 +125,6 @@ impl Published {
             scene: "yard".into(),
             generation,
             created_unix_secs: NOW - 1000,
-            expires_unix_secs: Some(NOW + 1000),
-            next_key: None,
             metric: true,
             geo_reference: Some(GeoReference {
                 origin: slag_common::frames::Geographic {
@@ -146,21 +145,21 @@ impl Published {
             n_rejected: 0,
             cells: cells.collect(),
         };
-        let (signed, metadata) = (Vec::new(), BTreeMap::new());
-        Self { manifest, signed, metadata, objects }.edited(|_| ())
+        let (listed, metadata) = (Vec::new(), BTreeMap::new());
+        Self { manifest, listed, metadata, objects }.edited(|_| ())
     }
 
     /// Changes the manifest and signs it again.
     pub fn edited(mut self, edit: impl FnOnce(&mut Manifest)) -> Self {
         edit(&mut self.manifest);
-        self.signed = self.manifest.sign(&key(1));
+        self.listed = self.manifest.to_bytes();
         let version = self.manifest.generation;
         self.signed_by(&[FIRST], version)
     }
 
     /// Signs the metadata again: under the last of these roots, with this version of all other roles.
     pub fn signed_by(mut self, roots: &[RootKeys], version: u64) -> Self {
-        self.metadata = metadata(roots, version, NOW + 1000, &self.signed);
+        self.metadata = metadata(roots, version, NOW + 1000, &self.listed);
         self
     }
 

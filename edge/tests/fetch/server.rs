@@ -155,8 +155,8 @@ fn answer(shared: &Shared, mut stream: TcpStream) -> std::io::Result<()> {
             }
             Some(("metadata", name)) => published.metadata.get(name).cloned(),
             Some(("targets", name)) => {
-                let expected = TargetFile::of(&published.signed).file_name(manifest::TARGET);
-                (expected.as_deref() == Ok(name)).then(|| published.signed.clone())
+                let expected = TargetFile::of(&published.listed).file_name(manifest::TARGET);
+                (expected.as_deref() == Ok(name)).then(|| published.listed.clone())
             }
             _ => None,
         }

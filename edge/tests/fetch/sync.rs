@@ -297,7 +297,7 @@ fn damage_on_board_is_found_and_healed() {
     fs_err::remove_file(&path).expect("there");
     assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Missing { .. })));
     robot.fetch().expect("heals");
-    fs_err::write(robot.cache.manifest_path(Hash32::of(&scene.signed)), b"x").expect("written");
+    fs_err::write(robot.cache.manifest_path(Hash32::of(&scene.listed)), b"x").expect("written");
     assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Hash { .. })));
     fs_err::write(robot.cache.current_path(), b"{").expect("written");
     assert!(matches!(Snapshot::open(&robot.cache), Err(StoreError::Current { .. })));

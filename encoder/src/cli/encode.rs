@@ -140,9 +140,6 @@ pub struct EncodeArgs {
     /// Search for objects.
     #[command(flatten)]
     pub objects: ObjectArgs,
-    /// Days after which robots refuse the manifest [default: never].
-    #[arg(long, value_name = "DAYS")]
-    pub expires_days: Option<u32>,
     /// Drops an unfinished encode of another splat or with other settings in the store.
     #[arg(long)]
     pub restart: bool,
@@ -210,7 +207,6 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             store: args.store.clone(),
             scene_name: args.name.clone().or(folder_name).unwrap_or_else(|| "scene".into()),
             created_unix_secs,
-            expires_unix_secs: args.expires_days.map(|days| created_unix_secs + u64::from(days) * 86_400),
             models: args.models.models.as_deref().map(lasting_name),
         },
         run: RunSettings {

@@ -5,7 +5,7 @@
 //! | plan | inputs read and checked, memory reserved, the order of views | `plan.rs` |
 //! | run views | a file of contributions per view, in the job's folder | `views.rs`, `view.rs`, `pipeline.rs`, `job.rs` |
 //! | build cells | objects, fields and shards in the store | `cells.rs` |
-//! | publish | the signed manifest, the summary | `publish.rs` |
+//! | publish | the manifest and its metadata, the summary | `publish.rs` |
 //!
 //! Views are independent: a killed encode resumes after the last finished view, if it is the same encode
 //! (`identity.rs`). The later steps read the contributions in the order of the views' names, so the store's bytes do

@@ -60,9 +60,6 @@ fn manifest(plan: &Plan<'_>, built: &BuiltCells, generation: u64) -> Manifest {
         scene: settings.output.scene_name.clone(),
         generation,
         created_unix_secs: settings.output.created_unix_secs,
-        expires_unix_secs: settings.output.expires_unix_secs,
-        // The store fills it in.
-        next_key: None,
         metric: settings.inputs.metric || inputs.geo_reference.is_some(),
         geo_reference: inputs.geo_reference,
         encoder: EncoderRecord {

@@ -179,10 +179,8 @@ pub struct OutputSettings {
     pub store: PathBuf,
     /// Name of the scene.
     pub scene_name: String,
-    /// Creation time to sign, seconds since 1970.
+    /// When it is made, seconds since 1970.
     pub created_unix_secs: u64,
-    /// Expiry to sign, seconds since 1970.
-    pub expires_unix_secs: Option<u64>,
     /// Name or folder of the models, as later queries on this machine open them; `None` for the embedded ones.
     pub models: Option<PathBuf>,
 }
@@ -277,13 +275,7 @@ impl EncodeSettings {
                 },
                 objects: true,
             },
-            output: OutputSettings {
-                store,
-                scene_name: "scene".into(),
-                created_unix_secs: 0,
-                expires_unix_secs: None,
-                models: None,
-            },
+            output: OutputSettings { store, scene_name: "scene".into(), created_unix_secs: 0, models: None },
             run: RunSettings {
                 threads: std::thread::available_parallelism().map_or(1, usize::from),
                 memory_bytes: 2 << 30,

@@ -16,7 +16,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use ed25519_dalek::SigningKey;
 use serde::Serialize;
 use slag_common::durable;
-use slag_common::manifest;
+use slag_common::manifest::TARGET;
 use slag_common::tuf::{
     Body, FileMeta, Key, MAX_ROOT_BYTES, MAX_SNAPSHOT_BYTES, MAX_TARGETS_BYTES, MAX_TIMESTAMP_BYTES, Root,
     SignedMetadata, Snapshot, TargetFile, Targets, Timestamp, TufError, format_utc, sign,
@@ -77,12 +77,12 @@ impl Metadata {
     ///
     /// # Errors
     /// [`StoreError`].
-    pub fn publish(&self, signed: &[u8], created_unix_secs: u64) -> Result<(), StoreError> {
+    pub fn publish(&self, manifest: &[u8], created_unix_secs: u64) -> Result<(), StoreError> {
         let now_unix_secs = created_unix_secs.max(clock_unix_secs());
         if self.newest_root()?.is_none() {
             self.make_root(&roles::root_folder(&self.store), 1, 1, now_unix_secs)?;
         }
-        let targets = BTreeMap::from([(manifest::TARGET.to_owned(), TargetFile::of(signed))]);
+        let targets = BTreeMap::from([(TARGET.to_owned(), TargetFile::of(manifest))]);
         if self.published()?.is_some_and(|published| published.body.targets == targets) {
             return Ok(());
         }

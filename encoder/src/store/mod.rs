@@ -3,11 +3,11 @@
 //! | path | content |
 //! |---|---|
 //! | `objects/ab/HASH` | immutable files named by the BLAKE3 of their content |
-//! | `manifest` | the current signed manifest |
+//! | `manifest` | the current manifest |
 //! | `manifest.previous` | the one before it, which fetches under way may still need |
 //! | `extras/MANIFEST_HASH` | JSON name -> object hash: objects that belong to that manifest but not to robots |
 //! | `models.json` | name or folder of the models of the last encode, for queries on this machine |
-//! | `keys/` | signing keys (mode 0600) and their public halves, hex: see [`keys`] |
+//! | `keys/` | signing keys (mode 0600), hex: see [`ceremony`] |
 //! | `metadata/` | metadata of The Update Framework: see [`metadata`] |
 //! | `db/` | sled: scene, generation, cells, state of jobs and pushes; opened by writers alone |
 //! | `job/` | working files of an unfinished encode |
@@ -26,14 +26,13 @@ pub mod ceremony;
 mod ceremony_tests;
 mod error;
 mod files;
-pub mod keys;
+mod manifest_file;
 pub mod metadata;
 #[cfg(test)]
 mod metadata_tests;
 mod models;
 mod reader;
 mod roles;
-mod signed;
 #[cfg(test)]
 pub(crate) mod tests;
 mod verify;

@@ -7,12 +7,11 @@ use std::time::SystemTime;
 
 use slag_common::Hash32;
 use slag_common::container::AlignedBytes;
-use slag_common::manifest::{Manifest, TrustedKeys};
+use slag_common::manifest::Manifest;
 
 use super::error::StoreError;
-use super::keys::PublicKeys;
+use super::manifest_file;
 use super::models::ModelsRecord;
-use super::signed;
 
 /// Objects by name that belong to a generation but are not sent to robots.
 pub type Extras = BTreeMap<String, Hash32>;
@@ -22,23 +21,23 @@ pub type Extras = BTreeMap<String, Hash32>;
 pub struct Published {
     /// The manifest.
     pub manifest: Manifest,
-    /// Its signed bytes, as robots get them.
-    pub signed: Vec<u8>,
-    /// BLAKE3 of the signed bytes.
+    /// Its bytes, as robots get them.
+    pub bytes: Vec<u8>,
+    /// BLAKE3 of the bytes.
     pub hash: Hash32,
     /// Objects beside the shards.
     pub extras: Extras,
 }
 
 impl Published {
-    fn read(dir: &Path, name: &str, own: &TrustedKeys) -> Result<Self, StoreError> {
-        let (manifest, signed) = read_manifest(&dir.join(name), own)?;
-        let hash = Hash32::of(&signed);
+    fn read(dir: &Path, name: &str) -> Result<Self, StoreError> {
+        let (manifest, bytes) = read_manifest(&dir.join(name))?;
+        let hash = Hash32::of(&bytes);
         let path = extras_path(dir, hash);
         let extras = fs_err::read(&path)?;
         let extras =
             serde_json::from_slice(&extras).map_err(|e| StoreError::Extras { path, what: e.to_string() })?;
-        Ok(Self { manifest, signed, hash, extras })
+        Ok(Self { manifest, bytes, hash, extras })
     }
 
     /// Returns the lengths of the shards, by hash.
@@ -64,7 +63,7 @@ pub(crate) struct Stamp {
 impl Stamp {
     /// Returns the version of a store's manifest; `None` if there is none or its metadata cannot be read.
     pub(crate) fn of_manifest(dir: &Path) -> Option<Self> {
-        Self::of(&dir.join(signed::MANIFEST)).ok()
+        Self::of(&dir.join(manifest_file::MANIFEST)).ok()
     }
 
     fn of(path: &Path) -> io::Result<Self> {
@@ -87,20 +86,19 @@ pub struct StoreReader {
 }
 
 impl StoreReader {
-    /// Reads the manifest and verifies that a key of this store signed it.
+    /// Reads the manifest.
     ///
     /// # Errors
     /// [`StoreError::NotPublished`] before the first publication, [`StoreError`] otherwise.
     pub fn open(dir: &Path) -> Result<Self, StoreError> {
-        let path = dir.join(signed::MANIFEST);
+        let path = dir.join(manifest_file::MANIFEST);
         // Before the content: a manifest that is replaced in between is then noticed, not missed.
         let stamp = Stamp::of(&path).map_err(|e| match e.kind() {
             io::ErrorKind::NotFound => StoreError::NotPublished { path },
             _ => e.into(),
         })?;
-        let own = PublicKeys::read(dir)?.trusted();
-        let current = Published::read(dir, signed::MANIFEST, &own)?;
-        let previous = match Published::read(dir, signed::MANIFEST_PREVIOUS, &own) {
+        let current = Published::read(dir, manifest_file::MANIFEST)?;
+        let previous = match Published::read(dir, manifest_file::MANIFEST_PREVIOUS) {
             Ok(previous) => Some(previous),
             Err(StoreError::NotPublished { .. }) => None,
             Err(e) => {
@@ -119,7 +117,7 @@ impl StoreReader {
 
     /// Returns whether the store still has the manifest that this reader read (one `stat`).
     pub fn is_current(&self) -> bool {
-        Stamp::of(&self.dir.join(signed::MANIFEST)).is_ok_and(|stamp| stamp == self.stamp)
+        Stamp::of(&self.dir.join(manifest_file::MANIFEST)).is_ok_and(|stamp| stamp == self.stamp)
     }
 
     /// Returns which models the current generation was encoded with, if the store recorded it.
@@ -179,12 +177,11 @@ pub(super) fn extras_path(dir: &Path, manifest_hash: Hash32) -> PathBuf {
     dir.join("extras").join(manifest_hash.to_string())
 }
 
-/// Reads a manifest and verifies that one of the store's own keys signed it; returns its signed bytes too.
-pub(super) fn read_manifest(path: &Path, own: &TrustedKeys) -> Result<(Manifest, Vec<u8>), StoreError> {
-    let Some(signed) = signed::read_signed(path)? else {
+/// Reads a manifest; returns its bytes too.
+pub(super) fn read_manifest(path: &Path) -> Result<(Manifest, Vec<u8>), StoreError> {
+    let Some(bytes) = manifest_file::read_bytes(path)? else {
         return Err(StoreError::NotPublished { path: path.to_owned() });
     };
     let refused = |cause| StoreError::Manifest { path: path.to_owned(), cause };
-    let (manifest, _) = Manifest::verify(&signed, own).map_err(refused)?;
-    Ok((manifest, signed))
+    Ok((Manifest::parse(&bytes).map_err(refused)?, bytes))
 }

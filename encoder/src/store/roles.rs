@@ -9,16 +9,15 @@
 //! All are 64 hex digits, mode 0600.
 
 use std::collections::BTreeMap;
-use std::io;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
 use ed25519_dalek::SigningKey;
-use slag_common::manifest;
-use slag_common::tuf::{Body, Key, RoleKeys, Root};
+use slag_common::Hash32;
+use slag_common::tuf::{Body, Key, RoleKeys, Root, generate_key};
 
 use super::error::StoreError;
 use super::files::{self, Access};
-use super::signed;
 
 /// The roles whose keys lie with the store.
 pub(super) const ONLINE: [&str; 3] = ["targets", "snapshot", "timestamp"];
@@ -33,7 +32,7 @@ pub(super) fn root_folder(store: &Path) -> PathBuf {
 /// # Errors
 /// [`StoreError::Io`] if it is not there, [`StoreError::Key`] for a damaged file.
 pub(super) fn read(store: &Path, role: &str) -> Result<SigningKey, StoreError> {
-    Ok(SigningKey::from_bytes(&signed::read_hex_key(&key_path(store, role))?.0))
+    Ok(SigningKey::from_bytes(&read_hex_key(&key_path(store, role))?.0))
 }
 
 /// Makes the keys of all roles that have none, and returns the body of a root that names them and root's keys.
@@ -78,7 +77,7 @@ pub(super) fn read_folder(folder: &Path) -> Result<Vec<SigningKey>, StoreError> 
     }
     names.retain(|path| path.extension().is_some_and(|extension| extension == "key"));
     names.sort();
-    names.iter().map(|path| Ok(SigningKey::from_bytes(&signed::read_hex_key(path)?.0))).collect()
+    names.iter().map(|path| Ok(SigningKey::from_bytes(&read_hex_key(path)?.0))).collect()
 }
 
 /// Makes a further key of root.
@@ -94,7 +93,7 @@ pub(super) fn make_next(store: &Path, role: &str) -> Result<SigningKey, StoreErr
 
 /// Puts a role's next key in place of its key, if a root names it.
 pub(super) fn promote(store: &Path, role: &str, root: &Root) -> Result<(), StoreError> {
-    let next = match signed::read_hex_key(&next_path(store, role)) {
+    let next = match read_hex_key(&next_path(store, role)) {
         Err(StoreError::Io(e)) if e.kind() == io::ErrorKind::NotFound => return Ok(()),
         next => SigningKey::from_bytes(&next?.0),
     };
@@ -113,12 +112,12 @@ fn key_path(store: &Path, role: &str) -> PathBuf {
 }
 
 fn read_or_make(path: &Path) -> Result<SigningKey, StoreError> {
-    match signed::read_hex_key(path) {
+    match read_hex_key(path) {
         Ok(secret) => return Ok(SigningKey::from_bytes(&secret.0)),
         Err(StoreError::Io(e)) if e.kind() == io::ErrorKind::NotFound => {}
         Err(e) => return Err(e),
     }
-    let key = manifest::generate_key();
+    let key = generate_key();
     let part = path.with_extension("part");
     if part.exists() {
         fs_err::remove_file(&part)?;
@@ -126,4 +125,16 @@ fn read_or_make(path: &Path) -> Result<SigningKey, StoreError> {
     let text = format!("{}\n", hex::encode(key.to_bytes()));
     files::replace(&part, path, text.as_bytes(), Access::Private)?;
     Ok(key)
+}
+
+/// Reads 32 bytes of hex and a line end.
+fn read_hex_key(path: &Path) -> Result<Hash32, StoreError> {
+    let mut text = String::new();
+    let file = fs_err::File::open(path)?;
+    let wrong = || StoreError::Key { path: path.to_owned() };
+    match file.take(256).read_to_string(&mut text) {
+        Err(e) if e.kind() == io::ErrorKind::InvalidData => return Err(wrong()),
+        read => read?,
+    };
+    text.trim_end().parse().map_err(|_| wrong())
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 use glam::DVec3;
 use slag_common::Hash32;
 use slag_common::frames::Aabb;
-use slag_common::manifest::{CellRecord, EncoderRecord, Manifest, ShardRecord, TrustedKeys, VERSION};
+use slag_common::manifest::{CellRecord, EncoderRecord, Manifest, ShardRecord, VERSION};
 use slag_common::shard::Profile;
 
 use super::*;
@@ -23,8 +23,6 @@ pub(crate) fn manifest_of_boxes(boxes: &[Aabb]) -> Manifest {
         scene: "yard".into(),
         generation: 1,
         created_unix_secs: 1,
-        expires_unix_secs: None,
-        next_key: None,
         metric: true,
         geo_reference: None,
         encoder: EncoderRecord {
@@ -88,10 +86,6 @@ fn published_scene_is_read_back_verified() {
     assert_eq!(*reader.manifest(), manifest(1, &shards));
     assert_eq!((reader.current().hash, &reader.current().extras), (hash, &extras));
     assert_eq!(Hash32::of(&fs_err::read(dir.path().join("manifest")).expect("there")), hash);
-    // The key by another way than the reader's: from the file, by `common` alone.
-    let public = fs_err::read_to_string(dir.path().join("keys/ed25519.pub")).expect("there");
-    let trusted = TrustedKeys::Only(vec![public.trim_end().parse().expect("hex")]);
-    assert!(Manifest::verify(&reader.current().signed, &trusted).is_ok());
 
     assert_eq!(&*reader.read_object(shards[1].0).expect("intact"), b"bb");
     fs_err::write(reader.object_path(shards[1].0), b"bx").expect("writable");
@@ -115,23 +109,6 @@ fn second_writer_is_refused_until_the_first_is_gone() {
     assert_eq!(refused.to_string(), expected);
     drop(first);
     Store::create_or_open(dir.path()).expect("the lock is released with its holder");
-}
-
-#[test]
-fn signing_key_is_made_once_and_private() {
-    let dir = tempfile::tempdir().expect("temporary folder");
-    let secret = dir.path().join("keys/ed25519");
-    let first = Store::create_or_open(dir.path()).expect("opens").signing_key().to_bytes();
-    assert_eq!(fs_err::read_to_string(&secret).expect("there"), format!("{}\n", hex::encode(first)));
-    assert_eq!(Store::create_or_open(dir.path()).expect("opens").signing_key().to_bytes(), first);
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt;
-        let mode = fs_err::metadata(&secret).expect("there").permissions().mode();
-        assert_eq!(mode & 0o777, 0o600);
-    }
-    fs_err::write(&secret, "ab").expect("writable");
-    assert!(matches!(Store::create_or_open(dir.path()), Err(StoreError::Key { .. })));
 }
 
 #[test]
@@ -238,7 +215,7 @@ fn records_behind_the_manifest_are_repaired() {
         shards = put_many(&store, &["a", "b", "c"]);
         store.publish(&manifest(1, &shards), &Extras::new()).expect("publishes");
         // A crash between the manifest's rename and the records' flush leaves exactly this.
-        let signed = manifest(2, &shards[1..]).sign(store.signing_key());
+        let signed = manifest(2, &shards[1..]).to_bytes();
         store.replace(&reader::extras_path(dir.path(), Hash32::of(&signed)), b"{}").expect("writable");
         store.replace(&dir.path().join("manifest"), &signed).expect("writable");
         fs_err::write(dir.path().join("tmp/9.part"), b"left over").expect("writable");

@@ -7,17 +7,15 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use ed25519_dalek::SigningKey;
 use slag_common::Hash32;
-use slag_common::manifest::{CellRecord, Manifest, TrustedKeys};
+use slag_common::manifest::{CellRecord, Manifest};
 
 use super::error::StoreError;
 use super::files::{self, Access, HashingWriter};
-use super::keys::{self, Keys};
+use super::manifest_file;
 use super::metadata::Metadata;
 use super::models::ModelsRecord;
 use super::reader::{self, Extras, Published, StoreReader};
-use super::signed;
 
 /// sled keeps whole pages in memory; the records are small.
 const RECORD_CACHE_BYTES: u64 = 16 << 20;
@@ -47,14 +45,13 @@ pub struct Store {
     pub(super) dir: PathBuf,
     db: sled::Db,
     published: sled::Tree,
-    pub(super) keys: Keys,
     n_parts: AtomicU64,
     /// Objects whose content this writer has hashed.
     read: Mutex<BTreeSet<Hash32>>,
 }
 
 impl Store {
-    /// Opens a store for writing; creates it, with a fresh signing key, if it does not exist.
+    /// Opens a store for writing; creates it if it does not exist.
     ///
     /// # Errors
     /// [`StoreError::Locked`] while another process writes; [`StoreError`] otherwise.
@@ -91,8 +88,7 @@ impl Store {
         let published =
             db.open_tree(PUBLISHED_TREE).map_err(|cause| StoreError::Records { path: db_path, cause })?;
         let n_parts = AtomicU64::new(0);
-        let keys = Keys::load_or_make(dir)?;
-        let store = Self { dir: dir.to_owned(), db, published, keys, n_parts, read: Mutex::default() };
+        let store = Self { dir: dir.to_owned(), db, published, n_parts, read: Mutex::default() };
         store.repair_records()?;
         Ok(store)
     }
@@ -115,11 +111,6 @@ impl Store {
     /// Returns the record database, for the state of jobs and pushes. Records are durable once flushed.
     pub fn db(&self) -> &sled::Db {
         &self.db
-    }
-
-    /// Returns the key that signs this store's manifests.
-    pub fn signing_key(&self) -> &SigningKey {
-        &self.keys.present
     }
 
     /// Returns a reader of what is published.
@@ -197,29 +188,18 @@ impl Store {
     /// [`StoreError::MissingObject`] if an object listed is not there in full, [`StoreError::ObjectHash`] if it is damaged,
     /// [`StoreError::Generation`] unless the generation is above the current one.
     pub fn publish(&self, manifest: &Manifest, extras: &Extras) -> Result<Hash32, StoreError> {
-        let next_key = self.keys.next.as_ref().map(keys::public);
-        self.publish_as(&self.keys.present, &Manifest { next_key, ..manifest.clone() }, extras)
-    }
-
-    pub(super) fn publish_as(
-        &self,
-        signer: &SigningKey,
-        manifest: &Manifest,
-        extras: &Extras,
-    ) -> Result<Hash32, StoreError> {
         let shards = manifest.cells.iter().flat_map(|cell| cell.shards.values());
         let shards = shards.map(|shard| (shard.hash, Some(shard.len_bytes)));
         for (hash, len_bytes) in shards.chain(extras.values().map(|hash| (*hash, None))) {
             self.check_object(hash, len_bytes)?;
         }
-        let signed = manifest.sign(signer);
-        let path = self.dir.join(signed::MANIFEST);
+        let bytes = manifest.to_bytes();
+        let path = self.dir.join(manifest_file::MANIFEST);
         let refuse = |cause| StoreError::Manifest { path: path.clone(), cause };
-        let own = TrustedKeys::Only(vec![keys::public(signer)]);
-        Manifest::verify(&signed, &own).map_err(refuse)?;
-        let hash = Hash32::of(&signed);
-        let current = signed::read_signed(&path)?;
-        let again = current.as_deref() == Some(&signed);
+        Manifest::parse(&bytes).map_err(refuse)?;
+        let hash = Hash32::of(&bytes);
+        let current = manifest_file::read_bytes(&path)?;
+        let again = current.as_deref() == Some(&bytes);
         match self.generation()? {
             Some(generation) if manifest.generation <= generation && !again => {
                 return Err(StoreError::Generation { found: manifest.generation, current: generation });
@@ -230,11 +210,11 @@ impl Store {
         self.replace(&reader::extras_path(&self.dir, hash), &extras_json)?;
         if !again {
             if let Some(current) = current {
-                self.replace(&self.dir.join(signed::MANIFEST_PREVIOUS), &current)?;
+                self.replace(&self.dir.join(manifest_file::MANIFEST_PREVIOUS), &current)?;
             }
-            self.replace(&path, &signed)?;
+            self.replace(&path, &bytes)?;
         }
-        Metadata::open(&self.dir)?.publish(&signed, manifest.created_unix_secs)?;
+        Metadata::open(&self.dir)?.publish(&bytes, manifest.created_unix_secs)?;
         self.write_records(manifest, hash)?;
         Ok(hash)
     }
@@ -324,11 +304,10 @@ impl Store {
     /// Brings the records up to the manifest, which a crash may have left ahead of them.
     fn repair_records(&self) -> Result<(), StoreError> {
         // Without the extras: a damaged record of them is replaced by the next publication.
-        let own = keys::PublicKeys::read(&self.dir)?.trusted();
-        match reader::read_manifest(&self.dir.join(signed::MANIFEST), &own) {
-            Ok((manifest, signed)) => {
-                Metadata::open(&self.dir)?.publish(&signed, manifest.created_unix_secs)?;
-                self.write_records(&manifest, Hash32::of(&signed))
+        match reader::read_manifest(&self.dir.join(manifest_file::MANIFEST)) {
+            Ok((manifest, bytes)) => {
+                Metadata::open(&self.dir)?.publish(&bytes, manifest.created_unix_secs)?;
+                self.write_records(&manifest, Hash32::of(&bytes))
             }
             Err(StoreError::NotPublished { .. }) => Ok(()),
             Err(e) => Err(e),

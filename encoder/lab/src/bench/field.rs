@@ -165,8 +165,6 @@ impl<'a> FieldWriter<'a> {
             scene: "generated-field".into(),
             generation: self.store.next_generation()?,
             created_unix_secs: 0,
-            expires_unix_secs: None,
-            next_key: None,
             metric: true,
             geo_reference: None,
             encoder: EncoderRecord {

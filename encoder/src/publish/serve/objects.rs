@@ -22,17 +22,18 @@ use super::state::{AppState, Snapshot};
 
 /// Pieces in which objects are read and sent.
 const PIECE_BYTES: usize = 64 << 10;
+const JSON: [(HeaderName, &str); 1] = [(header::CONTENT_TYPE, "application/json")];
 const BINARY: [(HeaderName, &str); 1] = [(header::CONTENT_TYPE, "application/octet-stream")];
 
 pub(super) async fn manifest(State(service): AppState, headers: HeaderMap) -> Result<Response, Problem> {
     let published = |snapshot: &Snapshot| Ok((snapshot.reader.current().hash, snapshot.manifest.clone()));
-    let (hash, signed) = service.with_current(published).await?;
+    let (hash, bytes) = service.with_current(published).await?;
     let tag = EntityTag::new(hash);
     let about = [(header::ETAG, tag.as_str()), (header::CACHE_CONTROL, "no-cache")];
     if tag.is_known_to(&headers) {
         return Ok((StatusCode::NOT_MODIFIED, about).into_response());
     }
-    Ok((about, BINARY, signed).into_response())
+    Ok((about, JSON, bytes).into_response())
 }
 
 pub(super) async fn object(

@@ -44,7 +44,7 @@ pub fn router(dir: &Path, limits: Limits, access: Access) -> Result<Router, Stor
 pub(super) fn routes() -> Routes<Arc<Service>> {
     let parameter = |name, example, summary: &str| Parameter { name, example, summary: summary.to_owned() };
     Routes::default()
-        .get("/v1/manifest", "signed manifest of the current generation, with ETag", objects::manifest)
+        .get("/v1/manifest", "manifest of the current generation, with ETag", objects::manifest)
         .get("/v1/metadata/{name}", "TUF metadata, such as timestamp.json", metadata::metadata)
         .get("/v1/targets/{name}", "the TUF target SHA256.manifest", metadata::target)
         .get("/v1/objects/{hash}", "shard of the current or previous manifest; byte ranges", objects::object)

@@ -26,7 +26,7 @@ const RETRY_PAUSE: Duration = Duration::from_secs(10);
 /// One generation, as it is served.
 pub(super) struct Snapshot {
     pub(super) reader: StoreReader,
-    /// The signed manifest.
+    /// The manifest.
     pub(super) manifest: Bytes,
     pub(super) index: CellIndex,
     /// Lengths of the shards that may be fetched: those of the current manifest and of the one before.
@@ -39,13 +39,13 @@ impl Snapshot {
     fn open(dir: &Path) -> Result<Self, StoreError> {
         let reader = StoreReader::open(dir)?;
         let both = || [reader.previous(), Some(reader.current())].into_iter().flatten();
-        let target = |signed: &[u8]| {
-            let name = TargetFile::of(signed).file_name(manifest::TARGET).ok()?;
-            Some((name, Bytes::copy_from_slice(signed)))
+        let target = |bytes: &[u8]| {
+            let name = TargetFile::of(bytes).file_name(manifest::TARGET).ok()?;
+            Some((name, Bytes::copy_from_slice(bytes)))
         };
         Ok(Self {
-            targets: both().filter_map(|published| target(&published.signed)).collect(),
-            manifest: reader.current().signed.clone().into(),
+            targets: both().filter_map(|published| target(&published.bytes)).collect(),
+            manifest: reader.current().bytes.clone().into(),
             index: CellIndex::new(&reader.manifest().cells),
             objects: both().flat_map(|published| published.shard_lens()).collect(),
             reader,

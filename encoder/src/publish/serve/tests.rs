@@ -10,7 +10,7 @@ use glam::DVec3;
 use serde_json::Value;
 use slag_common::Hash32;
 use slag_common::frames::{Aabb, GeoReference, Geographic};
-use slag_common::manifest::{Manifest, TrustedKeys};
+use slag_common::manifest::Manifest;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tower::ServiceExt;
 
@@ -112,14 +112,12 @@ async fn get_with(router: &Router, path: &str, headers: &[(&str, &str)]) -> Answ
 }
 
 #[tokio::test]
-async fn manifest_is_tagged_and_verifies() {
+async fn manifest_is_tagged() {
     let fixture = fixture();
     let router = fixture.router();
     let answer = get_with(&router, "/v1/manifest", &[]).await;
     assert_eq!(answer.status, StatusCode::OK);
-    let key = Hash32(fixture.store.signing_key().verifying_key().to_bytes());
-    let (verified, _) = Manifest::verify(&answer.body, &TrustedKeys::Only(vec![key])).expect("signed");
-    assert_eq!(verified.generation, 2);
+    assert_eq!(Manifest::parse(&answer.body).expect("a manifest").generation, 2);
     let tag = answer.header(header::ETAG).to_owned();
     assert_eq!(tag, format!("\"{}\"", Hash32::of(&answer.body)));
     for (condition, status) in [
@@ -197,12 +195,12 @@ async fn only_what_is_listed_is_served() {
         format!("/v1/objects/{}", Hash32::of(b"unknown")),
         "/v1/objects".to_owned(),
         "/v1/objects/".to_owned(),
-        "/keys/ed25519".to_owned(),
+        "/keys/targets.key".to_owned(),
     ] {
         get_with(&router, &path, &[]).await.problem(StatusCode::NOT_FOUND);
     }
     let upper = fixture.shards[2].0.to_string().to_uppercase();
-    for name in [upper.as_str(), "..%2F..%2Fkeys%2Fed25519", "00", "%FF"] {
+    for name in [upper.as_str(), "..%2F..%2Fkeys%2Ftargets.key", "00", "%FF"] {
         get_with(&router, &format!("/v1/objects/{name}"), &[]).await.problem(StatusCode::BAD_REQUEST);
     }
     let (hash, _) = fixture.shards[2];

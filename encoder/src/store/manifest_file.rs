@@ -1,9 +1,8 @@
-//! Names and bytes of signed manifests and key files, as they lie on disk; nothing here is verified.
+//! Names and bytes of manifests, as they lie on disk.
 
 use std::io::{self, Read};
 use std::path::Path;
 
-use slag_common::Hash32;
 use slag_common::manifest::{self, ManifestError};
 
 use super::error::StoreError;
@@ -13,8 +12,8 @@ pub(super) const MANIFEST: &str = "manifest";
 /// The one before it, which fetches in progress may still need.
 pub(super) const MANIFEST_PREVIOUS: &str = "manifest.previous";
 
-/// Reads a signed manifest's bytes, unverified; `None` if there is no such file.
-pub(super) fn read_signed(path: &Path) -> Result<Option<Vec<u8>>, StoreError> {
+/// Reads a manifest's bytes; `None` if there is no such file.
+pub(super) fn read_bytes(path: &Path) -> Result<Option<Vec<u8>>, StoreError> {
     let file = match fs_err::File::open(path) {
         Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
         file => file?,
@@ -26,16 +25,4 @@ pub(super) fn read_signed(path: &Path) -> Result<Option<Vec<u8>>, StoreError> {
         return Err(StoreError::Manifest { path: path.to_owned(), cause });
     }
     Ok(Some(bytes))
-}
-
-/// Reads 32 bytes of hex and a line end.
-pub(super) fn read_hex_key(path: &Path) -> Result<Hash32, StoreError> {
-    let mut text = String::new();
-    let file = fs_err::File::open(path)?;
-    let wrong = || StoreError::Key { path: path.to_owned() };
-    match file.take(256).read_to_string(&mut text) {
-        Err(e) if e.kind() == io::ErrorKind::InvalidData => return Err(wrong()),
-        read => read?,
-    };
-    text.trim_end().parse().map_err(|_| wrong())
 }

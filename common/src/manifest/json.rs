@@ -1,0 +1,57 @@
+//! Manifests as bytes.
+
+use super::error::ManifestError;
+use super::records::{MAX_BYTES, Manifest, VERSION};
+use crate::frames::Aabb;
+use crate::shard::MAX_DIM;
+
+impl Manifest {
+    /// Returns the JSON text.
+    ///
+    /// # Panics
+    /// Never: a manifest has no map with other keys than strings.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        serde_json::to_vec(self).expect("a manifest has no map with other keys than strings")
+    }
+
+    /// Reads the JSON text. Whose it is, the metadata says that names it as a target.
+    ///
+    /// # Errors
+    /// [`ManifestError`].
+    pub fn parse(bytes: &[u8]) -> Result<Self, ManifestError> {
+        if bytes.len() as u64 > MAX_BYTES {
+            return Err(ManifestError::TooLong { len_bytes: bytes.len() as u64 });
+        }
+        let manifest: Self =
+            serde_json::from_slice(bytes).map_err(|e| ManifestError::Content { what: e.to_string() })?;
+        manifest.check_content()?;
+        Ok(manifest)
+    }
+
+    /// Checks the content, because the program of a publisher may be faulty too.
+    fn check_content(&self) -> Result<(), ManifestError> {
+        let refuse = |what: String| Err(ManifestError::Content { what });
+        if self.version != VERSION {
+            return refuse(format!("its version is {}", self.version));
+        }
+        if self.encoder.dim == 0 || self.encoder.dim as usize > MAX_DIM {
+            return refuse(format!(
+                "its embeddings have {} components, expected 1 to {MAX_DIM}",
+                self.encoder.dim
+            ));
+        }
+        if self.cells.windows(2).any(|pair| pair[0].cell_id >= pair[1].cell_id) {
+            return refuse("its cell ids do not ascend".into());
+        }
+        for cell in &self.cells {
+            let Aabb { min, max } = cell.bounds;
+            if !(min.is_finite() && max.is_finite() && min.cmple(max).all()) {
+                return refuse(format!(
+                    "the box {min}..{max} of cell {} is empty or not finite",
+                    cell.cell_id
+                ));
+            }
+        }
+        Ok(())
+    }
+}
