@@ -5,6 +5,7 @@
 //! measured again. Points with the same contributions share a store: the seconds of the views are those of the first
 //! point, all other seconds are each point's own.
 
+mod costs;
 mod error;
 mod figures;
 mod front;

@@ -4,8 +4,8 @@ use std::fmt;
 
 use serde::Serialize;
 
+use super::costs::FrontCosts;
 use super::figures::Figures;
-use super::front::FrontCosts;
 
 /// A point on a scene, predicted from the other scenes.
 #[derive(Clone, Debug, PartialEq, Serialize)]

@@ -6,11 +6,10 @@ mod lift;
 mod partition;
 mod raster;
 mod robot;
+mod sibling;
 mod tradeoff;
 
-use std::path::PathBuf;
-
-use anyhow::{Context, Result};
+use anyhow::Result;
 use clap::Subcommand;
 use slag_encoder::cli::Exit;
 use slag_encoder::progress::Progress;
@@ -44,10 +43,4 @@ pub(super) fn run(command: &BenchCommand, progress: &dyn Progress, json: bool) -
         BenchCommand::Robot(args) => robot::run(args, progress, json),
         BenchCommand::Tradeoff(args) => tradeoff::run(args, progress, json),
     }
-}
-
-/// Returns the path of a program beside this one.
-fn sibling(name: &str) -> Result<PathBuf> {
-    let lab = std::env::current_exe().context("cannot find the path of this program")?;
-    Ok(lab.with_file_name(format!("{name}{}", std::env::consts::EXE_SUFFIX)))
 }

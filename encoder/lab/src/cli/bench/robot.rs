@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::{Result, bail};
 use clap::Args;
 
-use super::sibling;
+use super::sibling::sibling;
 use crate::bench::robot::{self, Engine, RobotSettings};
 use slag_encoder::cli::Exit;
 use slag_encoder::cli::common::print;

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use anyhow::{Context, Result};
 use clap::Args;
 
-use super::sibling;
+use super::sibling::sibling;
 use crate::bench::tradeoff::{self, Equipment, Grid, LabelledScene, Programs, TradeoffSettings};
 use slag_encoder::cli::Exit;
 use slag_encoder::cli::common::{ModelArgs, open_models, print};
