@@ -160,7 +160,7 @@ test("negatives go to the service", () => opened(async (page, service) => {
   await drawn(page);
   await page.fill("#question", "chair -wall -floor");
   await answered(page, "chair -wall -floor");
-  assert.ok(service.behaviour.requests.includes("/v1/view/scores?text=chair&negative=wall%2Cfloor"));
+  assert.ok(service.behaviour.requests.includes("/v1/view/scores?text=chair&negative=wall&negative=floor"));
 }));
 
 test("the token is asked for once", () => opened(async (page, service) => {

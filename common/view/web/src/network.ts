@@ -103,7 +103,7 @@ export async function fetchCell(cell: number, generation: number): Promise<CellG
 
 export async function fetchScores(question: Question, signal: AbortSignal): Promise<Scores> {
   const parameters = new URLSearchParams({ text: question.text });
-  if (question.negatives.length > 0) parameters.set("negative", question.negatives.join(","));
+  for (const negative of question.negatives) parameters.append("negative", negative);
   return readScores(await (await get(`/v1/view/scores?${parameters}`, signal)).arrayBuffer());
 }
 
