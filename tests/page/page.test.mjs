@@ -160,8 +160,56 @@ test("negatives go to the service", () => opened(async (page, service) => {
   await drawn(page);
   await page.fill("#question", "chair -wall -floor");
   await answered(page, "chair -wall -floor");
-  assert.ok(service.behaviour.requests.includes("/v1/view/scores?text=chair&negative=wall&negative=floor"));
+  for (const path of ["/v1/view/scores?text=chair&negative=wall&negative=floor", "/v1/query?text=chair&negative=wall&negative=floor&limit=20"]) {
+    assert.ok(service.behaviour.requests.includes(path), path);
+  }
 }));
+
+test("a phrase lights its thing and tells what it is related to", () => opened(async (page) => {
+  await drawn(page);
+  await answered(page, "ball on the floor");
+  await page.locator("#answers button").click();
+  await page.locator("#details").getByText("holds to 0.93").waitFor();
+  assert.match(await page.locator("#details").innerText(), /ball[^]*48\.1000000, 11\.5000000[^]*To: floor/);
+  await page.evaluate((fragment) => { location.hash = fragment; location.reload(); }, `q=ball on the floor&camera=${CAMERA}`);
+  await drawn(page);
+  await answered(page, "ball on the floor");
+  const lit = await litPixels(page);
+  const ball = THINGS.find(({ name }) => name === "ball");
+  assert.ok(lit.length > 5000 && lit.every((pixel) => isInside(ball, pixel, 8)));
+}, { fragment: `q=ball on the floor&camera=${CAMERA}` }));
+
+test("a missing cell is told, and drawn once it is there", () => opened(async (page, service) => {
+  await page.getByText("1 of 3 cells missing").waitFor();
+  await page.check("#show-cells");
+  await picture(page, "cells");
+  assert.ok(!service.behaviour.requests.some((path) => path.startsWith("/v1/view/cells/2")));
+  service.behaviour.missing = [];
+  await drawn(page);
+  await page.getByText("Other cells are on board").waitFor();
+}, { behaviour: { missing: [2] } }));
+
+test("keys reach the question and move the camera", () => opened(async (page) => {
+  await drawn(page);
+  await page.keyboard.press("/");
+  await page.keyboard.type("ball");
+  await answered(page, "ball");
+  await page.locator("#canvas").focus();
+  await page.keyboard.down("KeyW");
+  await page.waitForTimeout(400);
+  await page.keyboard.up("KeyW");
+  const started = page.url();
+  await page.waitForFunction((url) => location.href !== url, started, { timeout: 10000 });
+  const camera = new URLSearchParams(new URL(page.url()).hash.slice(1)).get("camera").split(",").map(Number);
+  const moved = minus(camera.slice(0, 3), POSITION);
+  assert.ok(dot(moved, minus(TARGET, POSITION)) > 0.1, `moved by ${moved}`);
+}, { fragment: `camera=${CAMERA}` }));
+
+test("a service without a scene says so, and the page opens when it has one", () => opened(async (page, service) => {
+  await page.getByText("no scene to show").waitFor();
+  service.behaviour.hasScene = true;
+  await drawn(page);
+}, { behaviour: { hasScene: false }, expected: /404/ }));
 
 test("the token is asked for once", () => opened(async (page, service) => {
   await page.locator("#token").fill("secret");

@@ -14,6 +14,13 @@ export const THINGS = [
   { name: "ball", min: [-2, -1.5, 0], max: [-1, -0.5, 1], n: [12, 12, 12] },
 ];
 
+/** What the robot's routes take of what the page may send; they refuse the rest. */
+const PARAMETERS = {
+  "/v1/view": [],
+  "/v1/view/scores": ["text", "negative"],
+  "/v1/query": ["text", "negative", "limit"],
+};
+
 function half(value) {
   if (value === 0) return 0;
   const sign = value < 0 ? 0x8000 : 0;
@@ -62,7 +69,7 @@ function scoresMessage(text) {
 
 /** Starts it on a free port; `behaviour` may be changed while it runs. */
 export async function startService(behaviour = {}) {
-  Object.assign(behaviour, { token: null, generation: 1, isGone: false, requests: [], ...behaviour });
+  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], requests: [], ...behaviour });
   const json = (response, status, body) => response.writeHead(status, { "content-type": "application/json" }).end(JSON.stringify(body));
   const server = createServer((request, response) => {
     const url = new URL(request.url, "http://localhost");
@@ -76,24 +83,32 @@ export async function startService(behaviour = {}) {
       return createReadStream(path).pipe(response);
     }
     if (behaviour.token && request.headers.authorization !== `Bearer ${behaviour.token}`) return json(response, 401, { detail: "token" });
+    const known = PARAMETERS[url.pathname];
+    const foreign = [...url.searchParams.keys()].find((name) => known && !known.includes(name));
+    if (foreign) return json(response, 400, { detail: `unknown parameter ${foreign}` });
     const cell = url.pathname.match(/^\/v1\/view\/cells\/(\d+)$/);
     if (cell) return response.writeHead(200).end(cellMessage(THINGS[Number(cell[1])]));
     if (url.pathname === "/v1/view/scores") return response.writeHead(200).end(scoresMessage(url.searchParams.get("text")));
     if (url.pathname === "/v1/query") {
-      const thing = THINGS.find(({ name }) => name === url.searchParams.get("text"));
+      const [name, support] = url.searchParams.get("text").split(" on the ");
+      const thing = THINGS.find((entry) => entry.name === name);
+      const understood = support ? { thing: name, relation: { is: "on", of: { thing: support } } } : null;
       const answers = thing ? [{
+        ...(support ? { degree: 0.93, related_to: [{ thing: support, position_in_world: [0, 0, 0], score: 0.7 }] } : {}),
+        geographic: { latitude_deg: 48.1, longitude_deg: 11.5, height_m: 520 },
         id: "o1", score: 0.86, n_gaussians: 1536, position_in_world: thing.min.map((low, i) => (low + thing.max[i]) / 2),
         box_min_in_world: thing.min, box_max_in_world: thing.max,
       }] : [];
-      const none = thing ? null : { reason: "nothing-there", detail: "nothing found" };
-      return json(response, 200, { results: [{ answers, none, parts: [{ threshold: 0.5 }] }] });
+      const none = thing ? null : { kind: "nothing-there", detail: "nothing found", thing: null };
+      const thresholds = support ? { parts: [{ thing: name, n_found: 1, threshold: 0.5 }] } : { threshold: 0.5 };
+      return json(response, 200, { results: [{ question: {}, understood, answers, none, ...thresholds }] });
     }
-    if (url.pathname !== "/v1/view") return json(response, 404, { detail: "nothing here" });
+    if (url.pathname !== "/v1/view" || !behaviour.hasScene) return json(response, 404, { detail: "nothing here" });
     json(response, 200, {
       program: "slag-edge", scene: "test room", generation: behaviour.generation, dim: 8, up: [0, 0, 1], geographic: false, levels: [], views: [],
       n_gaussians: THINGS.reduce((sum, { n }) => sum + n[0] * n[1] * n[2], 0), position: { position_m: [-3, 3, 0], radius_m: 0.8 },
       cells: THINGS.map(({ min, max, n }, i) => ({
-        cell: i, n_gaussians: n[0] * n[1] * n[2], state: "on_board", appearance: true, box_m: { min, max }, origin_m: [0, 0, 0],
+        cell: i, n_gaussians: n[0] * n[1] * n[2], state: behaviour.missing.includes(i) ? "missing" : "on_board", appearance: true, box_m: { min, max }, origin_m: [0, 0, 0],
       })),
     });
   });

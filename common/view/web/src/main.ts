@@ -17,6 +17,8 @@ let drawing: Drawing;
 let streaming: Streaming;
 let scores: Scores | null = null;
 let answers: Answer[] = [];
+/** What the answers are. */
+let thing = "";
 let asking = new AbortController();
 let typing = 0;
 
@@ -41,9 +43,9 @@ function colour(level: number): void {
 }
 
 function choose(index: number | null): void {
-  showAnswers(parseQuestion(state.question).text, answers, index, choose);
+  showAnswers(thing, answers, index, choose);
   drawing.showAnswers(answers, index);
-  showDetails(parseQuestion(state.question).text, index === null ? null : answers[index], description.geographic);
+  showDetails(thing, index === null ? null : answers[index], description.geographic);
   if (index !== null) drawing.flyToAnswer(answers[index]);
 }
 
@@ -63,9 +65,12 @@ async function ask(line: string): Promise<void> {
     return;
   }
   try {
-    const [found, reply] = await Promise.all([fetchScores(question, signal), fetchAnswers(question, signal)]);
+    const [ofText, reply] = await Promise.all([fetchScores(question, signal), fetchAnswers(question, signal)]);
+    // The scores of "mug on the table" are those of mugs.
+    const found = reply.thing === question.text ? ofText : await fetchScores({ ...question, text: reply.thing }, signal);
     if (signal.aborted) return;
     scores = found;
+    thing = reply.thing;
     answers = reply.answers;
     colour(levelOf(state.threshold ?? reply.threshold ?? found.min + 0.6 * (found.max - found.min), found));
     choose(null);
@@ -107,11 +112,14 @@ function stream(): void {
   streaming.update();
 }
 
+const cellsOf = (seen: Description) => JSON.stringify(seen.cells.map(({ cell, state, n_gaussians }) => [cell, state, n_gaussians]));
+
 /** Looks what has changed: generation, cells, the robot's place, or that the service is gone. */
 async function look(): Promise<void> {
   try {
     const seen = await describe();
-    const isOther = seen.generation !== description.generation || seen.cells.length !== description.cells.length || seen.scene !== description.scene;
+    const isOtherGeneration = seen.generation !== description.generation || seen.scene !== description.scene;
+    const isOther = isOtherGeneration || cellsOf(seen) !== cellsOf(description);
     const wasOffline = document.documentElement.dataset.offline !== undefined;
     delete document.documentElement.dataset.offline;
     description = seen;
@@ -119,9 +127,10 @@ async function look(): Promise<void> {
     if (isOther) {
       streaming.stop();
       drawing.cells.clear();
+      drawing.marks.showCells(seen.cells);
       stream();
       if (state.question) await ask(state.question);
-      say(`The service has generation ${seen.generation} now.`);
+      say(isOtherGeneration ? `The service has generation ${seen.generation} now.` : "Other cells are on board now.");
     } else {
       streaming.update();
       if (wasOffline) say("The service is back.");
@@ -158,7 +167,13 @@ function listen(): void {
   });
   toggle(panel.showBoxes, () => drawing.marks.boxes);
   toggle(panel.showGrid, () => drawing.marks.ground);
+  toggle(panel.showCells, () => drawing.marks.cells);
   toggle(panel.showPhotos, () => drawing.marks.photos);
+  panel.copyLink.addEventListener("click", () => {
+    state.camera = drawing.pose();
+    writeState(state);
+    navigator.clipboard.writeText(location.href).then(() => say("The link is copied."), () => say("This browser does not let the page copy; take the link from its address bar.", true));
+  });
   panel.whole.addEventListener("click", () => drawing.showWhole());
   panel.canvas.addEventListener("click", (event) => {
     const index = drawing.answerAt(event.offsetX, event.offsetY);

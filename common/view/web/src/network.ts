@@ -44,10 +44,15 @@ export interface Answer {
   score: number;
   n_gaussians?: number;
   evidence?: { photo: string };
-  position_geographic?: { lat: number; lon: number };
+  geographic?: { latitude_deg: number; longitude_deg: number; height_m: number };
+  /** How well the relation of a phrase holds, 0.5 to 1. */
+  degree?: number;
+  related_to?: { thing: string; position_in_world: Vector; score?: number }[];
 }
 
 export interface Answers {
+  /** What was looked for: the question, or the thing of a phrase such as "mug on the table". */
+  thing: string;
   answers: Answer[];
   threshold: number | null;
   none: string | null;
@@ -63,6 +68,7 @@ export class NotFound extends Error {}
 export class Offline extends Error {}
 
 const TOKEN = "slag-token";
+const MAX_ANSWERS = 20;
 
 export function setToken(token: string): void {
   sessionStorage.setItem(TOKEN, token);
@@ -101,23 +107,33 @@ export async function fetchCell(cell: number, generation: number): Promise<CellG
   return readCell(await (await get(`/v1/view/cells/${cell}?generation=${generation}`)).arrayBuffer());
 }
 
-export async function fetchScores(question: Question, signal: AbortSignal): Promise<Scores> {
+function parametersOf(question: Question): URLSearchParams {
   const parameters = new URLSearchParams({ text: question.text });
   for (const negative of question.negatives) parameters.append("negative", negative);
-  return readScores(await (await get(`/v1/view/scores?${parameters}`, signal)).arrayBuffer());
+  return parameters;
 }
 
-/** The things that answer a question; the robot's `/v1/query`, or `/query` where that is absent. */
+export async function fetchScores(question: Question, signal: AbortSignal): Promise<Scores> {
+  return readScores(await (await get(`/v1/view/scores?${parametersOf(question)}`, signal)).arrayBuffer());
+}
+
+/** The things that answer a question; from the robot's `/v1/query`, or from `/query` where that is absent. */
 export async function fetchAnswers(question: Question, signal: AbortSignal): Promise<Answers> {
-  const parameters = new URLSearchParams({ text: question.text, limit: "20" });
-  if (question.negatives.length > 0) parameters.set("negatives", question.negatives.join(","));
+  const parameters = parametersOf(question);
+  parameters.set("limit", String(MAX_ANSWERS));
   try {
-    const reply = await (await get(`/v1/query?${parameters}`, signal)).json();
-    const result = reply.results[0];
-    return { answers: result.answers, threshold: result.parts?.[0]?.threshold ?? null, none: result.none?.detail ?? null };
+    const [result] = (await (await get(`/v1/query?${parameters}`, signal)).json()).results;
+    return {
+      thing: result.understood?.thing ?? question.text,
+      answers: result.answers,
+      threshold: result.threshold ?? result.parts?.[0]?.threshold ?? null,
+      none: result.none?.detail ?? null,
+    };
   } catch (error) {
     if (!(error instanceof NotFound)) throw error;
   }
-  const reply = await (await get(`/query?${parameters}`, signal)).json();
-  return { answers: reply.answers ?? [], threshold: reply.threshold ?? null, none: reply.none?.detail ?? null };
+  const short = new URLSearchParams({ text: question.text, limit: String(MAX_ANSWERS) });
+  if (question.negatives.length > 0) short.set("negatives", question.negatives.join(","));
+  const reply = await (await get(`/query?${short}`, signal)).json();
+  return { thing: question.text, answers: reply.answers ?? [], threshold: reply.threshold ?? null, none: reply.none?.detail ?? null };
 }

@@ -17,7 +17,9 @@ export const panel = {
   threshold: element<HTMLInputElement>("threshold"),
   showBoxes: element<HTMLInputElement>("show-boxes"),
   showGrid: element<HTMLInputElement>("show-grid"),
+  showCells: element<HTMLInputElement>("show-cells"),
   showPhotos: element<HTMLInputElement>("show-photos"),
+  copyLink: element<HTMLButtonElement>("copy-link"),
   whole: element<HTMLButtonElement>("whole"),
 };
 
@@ -97,7 +99,12 @@ export function showDetails(name: string, answer: Answer | null, isGeographic: b
     ["Size", metres(size)],
     ["Score", answer.score.toFixed(3)],
   ];
-  if (answer.position_geographic) rows.push(["Lat, lon", `${answer.position_geographic.lat.toFixed(7)}, ${answer.position_geographic.lon.toFixed(7)}`]);
+  if (answer.geographic) {
+    const { latitude_deg, longitude_deg, height_m } = answer.geographic;
+    rows.push(["Lat, lon", `${latitude_deg.toFixed(7)}, ${longitude_deg.toFixed(7)}`], ["Height", `${height_m.toFixed(2)} m`]);
+  }
+  if (answer.degree !== undefined) rows.push(["Relation", `holds to ${answer.degree.toFixed(2)}`]);
+  for (const other of answer.related_to ?? []) rows.push([`To: ${other.thing}`, metres(other.position_in_world)]);
   if (answer.evidence) rows.push(["Best photo", answer.evidence.photo]);
   if (answer.id) rows.push(["Id", answer.id]);
   const heading = document.createElement("h2");

@@ -43,6 +43,7 @@ export class Drawing {
     };
     themed();
     this.isDark.addEventListener("change", themed);
+    this.marks.showCells(description.cells);
     this.marks.showPhotos(description.views, this.radiusM / 40);
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.resize();

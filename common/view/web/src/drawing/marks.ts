@@ -15,13 +15,14 @@ function disposeAll(group: THREE.Group): void {
 export class Marks {
   readonly boxes = new THREE.Group();
   readonly ground = new THREE.Group();
+  readonly cells = new THREE.Group();
   readonly photos = new THREE.Group();
   readonly robot = new THREE.Group();
 
   constructor(parent: THREE.Object3D) {
-    this.photos.visible = false;
+    this.photos.visible = this.cells.visible = false;
     this.photos.renderOrder = this.robot.renderOrder = 5;
-    parent.add(this.boxes, this.ground, this.photos, this.robot);
+    parent.add(this.boxes, this.ground, this.cells, this.photos, this.robot);
   }
 
   /** Each box has a solid twin that is never drawn, for clicks. Only transparent things are drawn after the splats. */
@@ -58,6 +59,17 @@ export class Marks {
     this.ground.quaternion.setFromUnitVectors(new THREE.Vector3(0, 1, 0), up);
     this.ground.position.copy(centre).addScaledVector(up, lowest);
     return stepM;
+  }
+
+  /** Outlines of cells: grey on board, red missing. */
+  showCells(cells: Description["cells"]): void {
+    disposeAll(this.cells);
+    for (const { box_m, state } of cells) {
+      const box = new THREE.Box3(new THREE.Vector3(...box_m.min), new THREE.Vector3(...box_m.max));
+      const lines = new THREE.Box3Helper(box, state === "missing" ? 0xe05a4e : 0x8593a3);
+      (lines.material as THREE.LineBasicMaterial).transparent = true;
+      this.cells.add(lines);
+    }
   }
 
   showPhotos(photos: Photo[], lengthM: number): void {
