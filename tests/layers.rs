@@ -11,7 +11,7 @@ use syn::visit::{self, Visit};
 use syn::{Attribute, Item, UseTree, Visibility};
 
 /// Crates and their folders.
-const CRATES: [(&str, &str); 8] = [
+const CRATES: [(&str, &str); 10] = [
     ("slag_math", "common/math"),
     ("slag_common", "common"),
     ("slag_models", "common/models"),
@@ -20,6 +20,8 @@ const CRATES: [(&str, &str); 8] = [
     ("slag_encoder", "encoder"),
     ("slag_edge", "edge"),
     ("slag_lab", "encoder/lab"),
+    ("slag_robot", "doors/robot"),
+    ("slag_mcp", "doors/mcp"),
 ];
 
 /// A module's path, the crate's name first.
@@ -341,7 +343,7 @@ fn files_form_no_circle() {
 #[test]
 fn no_file_is_over_500_lines() {
     let mut open: Vec<PathBuf> =
-        ["common", "encoder", "edge", "tests", "fuzz"].map(|folder| root().join(folder)).into();
+        ["common", "encoder", "edge", "doors", "tests", "fuzz"].map(|folder| root().join(folder)).into();
     let mut long = Vec::new();
     while let Some(folder) = open.pop() {
         for entry in fs_err::read_dir(&folder).expect("a folder") {

@@ -1,0 +1,10 @@
+//! Lets language models ask a robot: its answers as tools of the Model Context Protocol.
+//!
+//! The tools ask `slag-edge serve` over HTTP and change nothing there.
+
+mod find;
+pub mod http;
+mod place;
+mod tools;
+
+pub use tools::Tools;

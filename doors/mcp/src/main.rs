@@ -1,0 +1,82 @@
+//! `slag-mcp`: a robot's answers as tools of the Model Context Protocol.
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::{Context, Result};
+use clap::Parser;
+use rmcp::ServiceExt;
+use slag_mcp::{Tools, http};
+use slag_robot::{Robot, read_token};
+use slag_service::listen::{Listen, bind};
+use slag_service::stop::stop_signal;
+use tracing_subscriber::EnvFilter;
+
+/// Async threads: they only forward requests.
+const ASYNC_THREADS: usize = 2;
+/// Questions to the robot at a time.
+const MAX_QUESTIONS: usize = 8;
+
+/// Lets language models ask a robot, over the Model Context Protocol: on stdin and stdout, or over HTTP.
+#[derive(Debug, Parser)]
+#[command(name = "slag-mcp", version)]
+struct Args {
+    /// Address of the robot's `slag-edge serve`.
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7734", env = "SLAG_ROBOT")]
+    robot: String,
+    /// File with the token of the robot's --token-file.
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
+    /// Speak streamable HTTP at /mcp of this address, instead of stdin and stdout.
+    #[arg(long, value_name = "IP:PORT|unix:PATH")]
+    listen: Option<Listen>,
+    /// Name that clients call this machine by, besides localhost and the address listened on; other names are refused.
+    /// May be repeated.
+    #[arg(long, value_name = "NAME", requires = "listen")]
+    host: Vec<String>,
+}
+
+fn main() -> ExitCode {
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("warn"));
+    tracing_subscriber::fmt().with_env_filter(filter).with_ansi(false).with_writer(io::stderr).init();
+    match run(Args::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("slag-mcp: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(args: Args) -> Result<()> {
+    let token = args.token_file.as_deref().map(read_token).transpose()?;
+    let tools = Tools::new(Robot::new(&args.robot, token.as_deref()));
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(ASYNC_THREADS)
+        .max_blocking_threads(MAX_QUESTIONS)
+        .enable_all()
+        .build()?;
+    runtime.block_on(async {
+        match args.listen {
+            None => speak_on_stdio(tools).await,
+            Some(listen) => {
+                let stop = stop_signal()?;
+                let listener = bind(&listen).await?;
+                // For scripts that let the system choose a port.
+                writeln!(io::stdout(), "listening on {}{}", listener.url()?, http::PATH)?;
+                http::serve(tools, listener, http::hosts(&listen, args.host), stop).await
+            }
+        }
+    })?;
+    // Standard input cannot be interrupted.
+    runtime.shutdown_background();
+    Ok(())
+}
+
+/// Speaks until stdin ends.
+async fn speak_on_stdio(tools: Tools) -> Result<()> {
+    let service = tools.serve(rmcp::transport::stdio()).await.context("no MCP client on stdin")?;
+    service.waiting().await?;
+    Ok(())
+}

@@ -1,0 +1,67 @@
+//! The tools.
+
+use rmcp::handler::server::router::tool::ToolRouter;
+use rmcp::handler::server::wrapper::Parameters;
+use rmcp::model::{Implementation, ServerCapabilities, ServerConfig};
+use rmcp::{Json, ServerHandler, tool, tool_handler, tool_router};
+use slag_robot::{Robot, RobotError};
+
+use crate::find::{Found, Wanted};
+use crate::place::{Asked, Description};
+
+const INSTRUCTIONS: &str = "Answers where things are on the robot's map of its surroundings. All positions are in the \
+    map's world frame and belong to the generation that the answer names. The map is a record of the past: things may \
+    have moved since. Ask describe_place first if you do not know how large the map is; ask find for each thing.";
+
+/// The tools over a robot.
+#[derive(Clone, Debug)]
+pub struct Tools {
+    robot: Robot,
+    router: ToolRouter<Self>,
+}
+
+#[tool_router(router = router)]
+impl Tools {
+    /// Makes the tools over a robot.
+    pub fn new(robot: Robot) -> Self {
+        Self { robot, router: Self::router() }
+    }
+
+    /// Find things on the robot's map by words. Gives positions, sizes and how well each matches, best first; or why
+    /// there is none.
+    #[tool(annotations(title = "Find things", read_only_hint = true, open_world_hint = false))]
+    async fn find(&self, Parameters(wanted): Parameters<Wanted>) -> Result<Json<Found>, String> {
+        let request = wanted.request()?;
+        let refused = |error: RobotError| error.to_string();
+        self.blocking(move |robot| Found::new(robot.ask(&request).map_err(refused)?)).await.map(Json)
+    }
+
+    /// Describe what the robot's map covers: its extent, age and gaps, and how many things match each of some words.
+    #[tool(annotations(title = "Describe the place", read_only_hint = true, open_world_hint = false))]
+    async fn describe_place(
+        &self,
+        Parameters(asked): Parameters<Asked>,
+    ) -> Result<Json<Description>, String> {
+        self.blocking(move |robot| asked.describe(robot)).await.map(Json)
+    }
+
+    /// Asks the robot on a thread that may wait.
+    async fn blocking<T: Send + 'static>(
+        &self,
+        ask: impl FnOnce(&Robot) -> Result<T, String> + Send + 'static,
+    ) -> Result<T, String> {
+        let robot = self.robot.clone();
+        let asked = tokio::task::spawn_blocking(move || ask(&robot)).await;
+        asked.map_err(|error| format!("slag-mcp failed: {error}"))?
+    }
+}
+
+#[tool_handler(router = self.router)]
+impl ServerHandler for Tools {
+    fn get_info(&self) -> ServerConfig {
+        let program = Implementation::new("slag-mcp", env!("CARGO_PKG_VERSION"));
+        ServerConfig::new(ServerCapabilities::builder().enable_tools().build())
+            .with_server_info(program)
+            .with_instructions(INSTRUCTIONS)
+    }
+}

@@ -1,0 +1,120 @@
+"""Drives slag-mcp with the client of the MCP project.
+
+python3 against_the_program.py PROGRAM ROBOT_URL WORD [MCP_URL]
+
+WORD: something that the robot's scene has. MCP_URL: slag-mcp over HTTP, in front of the same robot.
+"""
+
+import asyncio
+import json
+import sys
+import urllib.error
+import urllib.request
+
+from mcp import Client, StdioServerParameters
+
+
+def get(url):
+    with urllib.request.urlopen(url, timeout=20) as reply:
+        return json.load(reply)
+
+
+async def check(client, robot, word):
+    assert client.server_info.name == "slag-mcp", client.server_info
+    assert "world frame" in client.instructions
+    tools = {tool.name: tool for tool in (await client.list_tools()).tools}
+    assert sorted(tools) == ["describe_place", "find"], sorted(tools)
+    for tool in tools.values():
+        assert tool.description and tool.annotations.read_only_hint, tool
+        assert tool.output_schema["type"] == "object", tool.output_schema
+
+    # What the robot itself says is the truth. The client holds answers against the tool's schema.
+    truth = get(f"{robot}/v1/query?text={word}&near=1,2,0&limit=2")
+    found = await client.call_tool("find", {"what": word, "near": [1, 2, 0], "limit": 2})
+    assert not found.is_error, found
+    found = found.structured_content
+    assert found["generation"] == truth["generation"] and found["unit"] == truth["unit"]
+    answers = truth["results"][0]["answers"]
+    assert answers and len(found["things"]) == len(answers), found
+    for thing, answer in zip(found["things"], answers):
+        for member in ("id", "position_in_world", "size", "distance"):
+            assert thing[member] == answer[member], (member, thing, answer)
+    assert found["more"] == (truth["results"][0]["next_offset"] is not None)
+
+    # A ball around the best one holds it, a ball far away holds nothing and says why.
+    centre = answers[0]["position_in_world"]
+    inside = await client.call_tool("find", {"what": word, "near": centre, "radius": 1.0})
+    assert answers[0]["id"] in [thing["id"] for thing in inside.structured_content["things"]], inside
+    away = [centre[0] + 1000, centre[1], centre[2]]
+    outside = await client.call_tool("find", {"what": word, "near": away, "radius": 1.0})
+    outside = outside.structured_content
+    assert outside["things"] == [] and outside["none"]["kind"] and outside["none"]["detail"], outside
+
+    related = await client.call_tool("find", {"what": f"nearest {word}", "near": [1, 2, 0]})
+    related = related.structured_content
+    assert related["understood"]["pick"]["by"] == "nearest" and len(related["things"]) == 1, related
+    assert related["things"][0]["related_to"][0]["thing"] == "me", related
+
+    place = get(f"{robot}/v1/map")
+    here = (await client.call_tool("describe_place", {"words": [word]})).structured_content
+    assert here["n_things"] == place["n_objects"] and here["scene"] == place["scene"], here
+    assert here["is_complete"] == (not any(cell["is_wanted"] for cell in place["missing"]))
+    assert here["box_in_world"][0][0] == min(cell["box_min_in_world"][0] for cell in place["cells"])
+    assert here["kinds"][0]["word"] == word and here["kinds"][0]["n"] >= len(answers), here
+    there = await client.call_tool("describe_place", {"near": away, "radius": 1.0})
+    there = there.structured_content
+    assert there["n_things"] == 0 and not there["is_complete"] and there["kinds"] == [], there
+
+    # What is wrong is told to the model, which can correct it.
+    for name, asked, expected in [
+        ("find", {"what": word, "limit": 0}, "expected 1 to 50"),
+        ("find", {"what": word, "radius": 1.0}, "radius needs near"),
+        ("find", {"what": ""}, "text"),
+        ("find", {"what": word, "near": [0, 0, 0], "radius": -1.0}, "radius"),
+        ("describe_place", {"near": [0, 0, 0]}, "go together"),
+    ]:
+        refused = await client.call_tool(name, asked)
+        assert refused.is_error and expected in refused.content[0].text, (asked, refused)
+    return len(found["things"])
+
+
+def status(url, headers):
+    body = {"jsonrpc": "2.0", "id": 1, "method": "initialize", "params": {
+        "protocolVersion": "2025-06-18", "capabilities": {}, "clientInfo": {"name": "page", "version": "1"}}}
+    headers = {"content-type": "application/json", "accept": "application/json, text/event-stream", **headers}
+    request = urllib.request.Request(url, json.dumps(body).encode(), headers)
+    try:
+        with urllib.request.urlopen(request, timeout=20) as reply:
+            return reply.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def check_strangers(url):
+    """Pages of strangers, and pages whose name was made to point here, are refused."""
+    assert status(url, {}) == 200
+    assert status(url, {"host": "evil.example"}) == 403
+    assert status(url, {"origin": "http://evil.example"}) == 403
+    assert status(url, {"origin": "null"}) == 403
+    assert status(url, {"x": "y" * 20000}) in (400, 431)
+
+
+async def main(program, robot, word, url=None):
+    over_stdio = StdioServerParameters(command=program, args=["--robot", robot])
+    async with Client(over_stdio) as client:
+        n = await check(client, robot, word)
+    said = [f"stdio: {n} things"]
+    if url is not None:
+        async with Client(url) as client:
+            n = await check(client, robot, word)
+        check_strangers(url)
+        said.append(f"http: {n} things")
+    # A robot that does not answer is an error of the call; the door stays open.
+    async with Client(StdioServerParameters(command=program, args=["--robot", "http://127.0.0.1:9"])) as client:
+        refused = await client.call_tool("find", {"what": word})
+        assert refused.is_error and "slag-edge serve" in refused.content[0].text, refused
+    print(", ".join(said))
+
+
+if __name__ == "__main__":
+    asyncio.run(main(*sys.argv[1:]))

@@ -1,0 +1,125 @@
+//! Asking a robot.
+
+use std::path::Path;
+use std::time::Duration;
+
+use serde::de::DeserializeOwned;
+use serde_json::{Value, json};
+
+use crate::error::RobotError;
+use crate::place::Place;
+use crate::reply::{PointAnswer, Reply};
+
+/// Longest reply that is read: ten thousand answers are 10 MB.
+const MAX_REPLY_BYTES: u64 = 64 << 20;
+/// Time for a request and its reply.
+const TIMEOUT: Duration = Duration::from_secs(20);
+
+/// A robot's `slag-edge serve`. Calls block.
+#[derive(Clone, Debug)]
+pub struct Robot {
+    agent: ureq::Agent,
+    url: String,
+    /// The header that a request with a body needs.
+    authorization: Option<String>,
+}
+
+/// Reads the file that `slag-edge serve --token-file` names.
+///
+/// # Errors
+/// The file cannot be read.
+pub fn read_token(path: &Path) -> std::io::Result<String> {
+    Ok(fs_err::read_to_string(path)?.trim().to_owned())
+}
+
+impl Robot {
+    /// Takes the address of a robot, and the token of its `--token-file` if it has one. Nothing is asked yet.
+    pub fn new(url: &str, token: Option<&str>) -> Self {
+        let config = ureq::Agent::config_builder().timeout_global(Some(TIMEOUT)).http_status_as_error(false);
+        Self {
+            agent: config.build().into(),
+            url: url.trim_end_matches('/').to_owned(),
+            authorization: token.map(|token| format!("Bearer {token}")),
+        }
+    }
+
+    /// Asks what `POST /v1/query` takes.
+    ///
+    /// # Errors
+    /// [`RobotError`].
+    pub fn ask(&self, request: &Value) -> Result<Reply, RobotError> {
+        self.post("/v1/query", request)
+    }
+
+    /// Asks what `POST /v1/query` takes, for the Gaussians that match.
+    ///
+    /// # Errors
+    /// [`RobotError`].
+    pub fn ask_points(&self, request: &Value) -> Result<Reply<PointAnswer>, RobotError> {
+        let mut request = request.clone();
+        request["kind"] = json!("gaussians");
+        self.post("/v1/query", &request)
+    }
+
+    /// Returns what is on board.
+    ///
+    /// # Errors
+    /// [`RobotError`].
+    pub fn place(&self) -> Result<Place, RobotError> {
+        self.get("/v1/map")
+    }
+
+    /// Returns the number of things on board, or of those in a ball.
+    ///
+    /// # Errors
+    /// [`RobotError`].
+    pub fn n_objects(&self, ball: Option<([f64; 3], f64)>) -> Result<u64, RobotError> {
+        let filter = ball.map(|([x, y, z], radius)| format!("&near={x},{y},{z}&radius={radius}"));
+        let path = format!("/v1/objects?limit=1{}", filter.unwrap_or_default());
+        let page: Value = self.get(&path)?;
+        page["n_objects"].as_u64().ok_or_else(|| self.foreign(&path, "n_objects is no number"))
+    }
+
+    /// Says where the robot is, as `POST /position` takes it; a robot that follows then fetches what is around it.
+    ///
+    /// # Errors
+    /// [`RobotError`]; one that does not follow refuses.
+    pub fn post_position(&self, position: &Value) -> Result<(), RobotError> {
+        self.post::<Value>("/position", position).map(drop)
+    }
+
+    fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, RobotError> {
+        self.read(path, self.agent.get(self.address(path)).call())
+    }
+
+    fn post<T: DeserializeOwned>(&self, path: &str, body: &Value) -> Result<T, RobotError> {
+        let mut request = self.agent.post(self.address(path)).header("content-type", "application/json");
+        if let Some(authorization) = &self.authorization {
+            request = request.header("authorization", authorization);
+        }
+        self.read(path, request.send(body.to_string()))
+    }
+
+    fn read<T: DeserializeOwned>(
+        &self,
+        path: &str,
+        response: Result<ureq::http::Response<ureq::Body>, ureq::Error>,
+    ) -> Result<T, RobotError> {
+        let unreachable = |cause| RobotError::Unreachable { url: self.address(path), cause: Box::new(cause) };
+        let mut response = response.map_err(unreachable)?;
+        let body = response.body_mut().with_config().limit(MAX_REPLY_BYTES).read_to_string();
+        let (status, body) = (response.status(), body.map_err(unreachable)?);
+        if !status.is_success() {
+            return Err(RobotError::refused(status.as_u16(), &body));
+        }
+        serde_json::from_str(&body).map_err(|cause| self.foreign(path, cause))
+    }
+
+    fn address(&self, path: &str) -> String {
+        format!("{}{path}", self.url)
+    }
+
+    fn foreign(&self, path: &str, cause: impl ToString) -> RobotError {
+        RobotError::Foreign { url: self.address(path), cause: cause.to_string() }
+    }
+}

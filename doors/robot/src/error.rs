@@ -1,0 +1,60 @@
+//! Why the robot gave no answer.
+
+use serde_json::Value;
+
+/// Why the robot gave no answer.
+#[derive(Debug, thiserror::Error)]
+pub enum RobotError {
+    /// The program does not answer.
+    #[error(
+        "{url} does not answer: {cause}; start `slag-edge serve` there, or give its address with --robot"
+    )]
+    Unreachable {
+        /// What was asked.
+        url: String,
+        /// The network's error.
+        cause: Box<ureq::Error>,
+    },
+    /// The program refused the request, and says why.
+    #[error("the robot refused ({status}): {detail}")]
+    Refused {
+        /// HTTP status.
+        status: u16,
+        /// What the program says: what was found and what it expects.
+        detail: String,
+    },
+    /// The answer is none of `slag-edge`.
+    #[error(
+        "{url} answers, but not as slag-edge does: {cause}; see that --robot names a slag-edge of this version"
+    )]
+    Foreign {
+        /// What was asked.
+        url: String,
+        /// What is wrong with the answer.
+        cause: String,
+    },
+}
+
+impl RobotError {
+    /// Reads a refusal: problem details (RFC 9457), or the start of any other text.
+    pub(crate) fn refused(status: u16, body: &str) -> Self {
+        let problem: Option<Value> = serde_json::from_str(body).ok();
+        let detail = problem.as_ref().and_then(|problem| problem["detail"].as_str());
+        let detail = detail.map_or_else(|| body.chars().take(200).collect(), str::to_owned);
+        Self::Refused { status, detail }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_refusal_says_what_the_robot_said() {
+        let told = |status, body: &str| RobotError::refused(status, body).to_string();
+        let problem = r#"{"type": "bad-parameter", "detail": "limit is 0, expected 1 to 10000"}"#;
+        assert_eq!(told(400, problem), "the robot refused (400): limit is 0, expected 1 to 10000");
+        assert_eq!(told(502, "Bad gateway"), "the robot refused (502): Bad gateway");
+        assert_eq!(told(500, &"x".repeat(9999)).len(), "the robot refused (500): ".len() + 200);
+    }
+}

@@ -1,0 +1,11 @@
+//! The robot's HTTP interface as its clients see it: `slag-edge serve`, asked over `/v1` (docs/api.md).
+
+mod client;
+mod error;
+mod place;
+mod reply;
+
+pub use client::{Robot, read_token};
+pub use error::RobotError;
+pub use place::{Box3, Cell, Place};
+pub use reply::{Answer, Geographic, Nothing, OrientedBox, PointAnswer, Reply, Results, Witness};

@@ -1,0 +1,116 @@
+//! The reply to `/v1/query`.
+
+use serde::Deserialize;
+
+/// The results of a request, one for each question. Members that clients here do not need are left out.
+#[derive(Clone, Debug, Deserialize)]
+pub struct Reply<A = Answer> {
+    /// Name of the scene.
+    pub scene: String,
+    /// The published state that all positions belong to.
+    pub generation: u64,
+    /// Frame of the positions.
+    pub frame: String,
+    /// `m`, or `world` for scenes whose scale is unknown.
+    pub unit: String,
+    /// One for each question, in their order.
+    pub results: Vec<Results<A>>,
+}
+
+/// The answers to a question.
+#[derive(Clone, Debug, Deserialize)]
+pub struct Results<A = Answer> {
+    /// The phrase that a text with a relation was understood as.
+    pub understood: Option<serde_json::Value>,
+    /// Why there is no answer.
+    pub none: Option<Nothing>,
+    /// Offset of the next page, if there is one.
+    pub next_offset: Option<u64>,
+    /// Best first.
+    pub answers: Vec<A>,
+}
+
+/// Why nothing was found.
+#[derive(Clone, Debug, Deserialize)]
+pub struct Nothing {
+    /// `below-threshold`, `no-such-thing`, `no-such-pair` ...
+    pub kind: String,
+    /// The same in a sentence.
+    pub detail: String,
+    /// The part of a phrase that failed.
+    pub thing: Option<String>,
+    /// Best score of anything on board.
+    pub best_score: Option<f32>,
+}
+
+/// A thing.
+#[derive(Clone, Debug, Deserialize)]
+pub struct Answer {
+    /// 1 is the best.
+    pub rank: u32,
+    /// Stable within a generation.
+    pub id: String,
+    /// Its middle.
+    pub position_in_world: [f64; 3],
+    /// The same on the earth, where the scene is geo-referenced.
+    pub geographic: Option<Geographic>,
+    /// Least corner of its box along the axes.
+    pub box_min_in_world: [f64; 3],
+    /// Greatest corner.
+    pub box_max_in_world: [f64; 3],
+    /// Edges of that box.
+    pub size: [f64; 3],
+    /// Its box along its own axes.
+    pub oriented_box: OrientedBox,
+    /// How well it matches.
+    pub score: f32,
+    /// Distance from the asker, if the request had a position.
+    pub distance: Option<f64>,
+    /// How well the relation holds, 0 to 1.
+    pub degree: Option<f64>,
+    /// The things that the relation holds with.
+    #[serde(default)]
+    pub related_to: Vec<Witness>,
+}
+
+/// A Gaussian that matches.
+#[derive(Clone, Copy, Debug, Deserialize)]
+pub struct PointAnswer {
+    /// Its middle.
+    pub position_in_world: [f64; 3],
+    /// How well it matches.
+    pub score: f32,
+}
+
+/// A box along a thing's own axes.
+#[derive(Clone, Copy, Debug, Deserialize)]
+pub struct OrientedBox {
+    /// Its middle.
+    pub centre_in_world: [f64; 3],
+    /// Its edges along its own axes.
+    pub size: [f64; 3],
+    /// Rotation from its axes to the world's, as a quaternion x, y, z, w.
+    pub rotation_world_from_box: [f64; 4],
+}
+
+/// A place on the earth (WGS 84).
+#[derive(Clone, Copy, Debug, Deserialize)]
+pub struct Geographic {
+    /// Latitude, north positive.
+    pub latitude_deg: f64,
+    /// Longitude, east positive.
+    pub longitude_deg: f64,
+    /// Height, in the datum of the source.
+    pub height_m: f64,
+}
+
+/// A thing that a relation holds with.
+#[derive(Clone, Debug, Deserialize)]
+pub struct Witness {
+    /// The words that it answers to.
+    pub thing: String,
+    /// Its id; absent for the asker.
+    pub id: Option<String>,
+    /// Where it is.
+    pub position_in_world: [f64; 3],
+}
