@@ -44,7 +44,7 @@ function colour(level: number): void {
 
 function choose(index: number | null): void {
   showAnswers(thing, answers, index, choose);
-  drawing.showAnswers(answers, index);
+  drawing.showAnswers(thing, answers, index);
   showDetails(thing, index === null ? null : answers[index], description.geographic);
   if (index !== null) drawing.flyToAnswer(answers[index]);
 }
@@ -105,6 +105,7 @@ function open(): void {
 function stream(): void {
   streaming = new Streaming(description, drawing, () => {
     document.documentElement.dataset.firstPictureMs ??= performance.now().toFixed(0);
+    if (streaming.isComplete) document.documentElement.dataset.complete = "";
     document.documentElement.dataset.gaussians = String(drawing.cells.nGaussians);
     showFacts(description, drawing.cells.nGaussians, drawing.stepM);
   }, report);
@@ -172,7 +173,9 @@ function listen(): void {
   panel.copyLink.addEventListener("click", () => {
     state.camera = drawing.pose();
     writeState(state);
-    navigator.clipboard.writeText(location.href).then(() => say("The link is copied."), () => say("This browser does not let the page copy; take the link from its address bar.", true));
+    // Browsers give pages a clipboard over HTTPS and on this machine only.
+    const copied = navigator.clipboard?.writeText(location.href) ?? Promise.reject(new Error("no clipboard"));
+    copied.then(() => say("The link is copied."), () => say("The browser does not let this page copy; take the link from the address bar."));
   });
   panel.whole.addEventListener("click", () => drawing.showWhole());
   panel.canvas.addEventListener("click", (event) => {

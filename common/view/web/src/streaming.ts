@@ -10,6 +10,7 @@ const MAX_GAUSSIANS = 4_000_000;
 export class Streaming {
   private readonly underWay = new Set<number>();
   private isStopped = false;
+  private isLoaded = false;
 
   constructor(private readonly description: Description, private readonly drawing: Drawing,
     private readonly onCell: () => void, private readonly onError: (error: unknown) => void) {}
@@ -27,11 +28,22 @@ export class Streaming {
       Math.hypot(...at.map((v, i) => Math.max(min[i] - v, 0, v - max[i])));
     cells.sort((a, b) => distance(a.cell.box_m) - distance(b.cell.box_m) || a.index - b.index);
     let nGaussians = 0;
+    let isLoaded = true;
     for (const { cell, index } of cells) {
       nGaussians += cell.n_gaussians;
-      if (nGaussians > MAX_GAUSSIANS && index !== cells[0].index) this.drawing.cells.remove(index);
-      else if (!this.drawing.cells.has(index) && this.underWay.size < AT_A_TIME) void this.load(cell.cell, index);
+      if (nGaussians > MAX_GAUSSIANS && index !== cells[0].index) {
+        this.drawing.cells.remove(index);
+      } else if (!this.drawing.cells.has(index)) {
+        isLoaded = false;
+        if (this.underWay.size < AT_A_TIME) void this.load(cell.cell, index);
+      }
     }
+    this.isLoaded = isLoaded;
+  }
+
+  /** Whether all cells that the budget allows are drawn. */
+  get isComplete(): boolean {
+    return this.isLoaded;
   }
 
   private async load(cell: number, index: number): Promise<void> {
@@ -43,8 +55,8 @@ export class Streaming {
       this.drawing.cells.add(index, gaussians);
       this.drawing.redraw();
       this.underWay.delete(index);
-      this.onCell();
       this.update();
+      this.onCell();
     } catch (error) {
       // The next look at the service tries again.
       this.underWay.delete(index);

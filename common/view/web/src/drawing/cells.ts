@@ -1,7 +1,7 @@
 // One mesh of splats a cell, each around its own origin because centres are half floats.
 
 import { PackedSplats, RgbaArray, SplatMesh } from "@sparkjsdev/spark";
-import type * as THREE from "three";
+import * as THREE from "three";
 import type { CellGaussians, Scores } from "../messages";
 import { colourByScore } from "./ramp";
 
@@ -16,7 +16,8 @@ export class Cells {
   private scores: Scores | null = null;
   private threshold = 0;
 
-  constructor(private readonly parent: THREE.Object3D) {}
+  /** `box` holds the scene; where a cell has no colours, heights in it give shades. */
+  constructor(private readonly parent: THREE.Object3D, private readonly box: THREE.Box3, private readonly up: THREE.Vector3) {}
 
   has(cell: number): boolean {
     return this.drawn.has(cell);
@@ -28,6 +29,7 @@ export class Cells {
 
   add(cell: number, gaussians: CellGaussians): void {
     this.remove(cell);
+    if (!gaussians.hasAppearance) this.shadeByHeight(gaussians);
     const packedSplats = new PackedSplats({ packedArray: gaussians.packed, numSplats: gaussians.n });
     const mesh = new SplatMesh({ packedSplats });
     mesh.position.set(...gaussians.originM);
@@ -55,6 +57,20 @@ export class Cells {
     this.scores = scores;
     this.threshold = threshold;
     for (const [cell, drawn] of this.drawn) this.colourOne(cell, drawn);
+  }
+
+  /** Without colours, a scene in one grey could not be read: what is high is light. */
+  private shadeByHeight({ packed, n, originM }: CellGaussians): void {
+    const heights = [this.box.min, this.box.max].map((corner) => corner.dot(this.up));
+    const [low, high] = [Math.min(...heights), Math.max(...heights)];
+    const origin = new THREE.Vector3(...originM).dot(this.up);
+    const { fromHalfFloat } = THREE.DataUtils;
+    for (let i = 0; i < n; i++) {
+      const [xy, z] = [packed[4 * i + 1], packed[4 * i + 2]];
+      const height = origin + fromHalfFloat(xy & 0xffff) * this.up.x + fromHalfFloat(xy >>> 16) * this.up.y + fromHalfFloat(z & 0xffff) * this.up.z;
+      const grey = Math.round(80 + 130 * Math.min(Math.max((height - low) / (high - low || 1), 0), 1));
+      packed[4 * i] = (packed[4 * i] & 0xff000000) | (grey << 16) | (grey << 8) | grey;
+    }
   }
 
   private colourOne(cell: number, drawn: Drawn): void {

@@ -33,7 +33,7 @@ export class Drawing {
     if (this.box.isEmpty()) this.box.set(new THREE.Vector3(-1, -1, -1), new THREE.Vector3(1, 1, 1));
     this.world.position.copy(this.box.getCenter(new THREE.Vector3())).negate();
     this.scene.add(new SparkRenderer({ renderer: this.renderer, onDirty: () => this.redraw() }), this.world);
-    this.cells = new Cells(this.world);
+    this.cells = new Cells(this.world, this.box, this.up);
     this.marks = new Marks(this.world);
     this.camera = new Camera(canvas, this.up, () => this.redraw());
     const themed = () => {
@@ -68,12 +68,12 @@ export class Drawing {
     this.redraw();
   }
 
-  showAnswers(answers: Answer[], chosen: number | null): void {
+  showAnswers(name: string, answers: Answer[], chosen: number | null): void {
     this.answers = answers;
     this.marks.showAnswers(answers, chosen);
     this.labels.replaceChildren(...answers.slice(0, MAX_LABELS).map((answer) => {
       const label = document.createElement("span");
-      label.textContent = answer.score.toFixed(2);
+      label.textContent = `${name} ${answer.score.toFixed(2)}`;
       return label;
     }));
     this.redraw();
@@ -130,14 +130,19 @@ export class Drawing {
     this.placeLabels();
   }
 
+  /** Puts labels above their boxes; one that would cover a better answer's is left out. */
   private placeLabels(): void {
+    const taken: [number, number][] = [];
     [...this.labels.children].forEach((label, i) => {
       const answer = this.answers[i];
       if (!answer || !(label instanceof HTMLElement)) return;
       const box = boxOf(answer);
       const point = new THREE.Vector3(...box.centre).addScaledVector(this.up, box.size[2] / 2).add(this.world.position).project(this.camera.camera);
-      label.hidden = point.z > 1 || !this.marks.boxes.visible;
-      label.style.transform = `translate(${((point.x + 1) / 2) * this.canvas.clientWidth}px, ${((1 - point.y) / 2) * this.canvas.clientHeight - 24}px)`;
+      const [xPx, yPx] = [((point.x + 1) / 2) * this.canvas.clientWidth, ((1 - point.y) / 2) * this.canvas.clientHeight - 24];
+      const isCovering = taken.some(([x, y]) => Math.abs(x - xPx) < label.offsetWidth + 4 && Math.abs(y - yPx) < 24);
+      label.style.visibility = point.z > 1 || isCovering || !this.marks.boxes.visible ? "hidden" : "visible";
+      label.style.transform = `translate(${xPx}px, ${yPx}px)`;
+      if (!isCovering) taken.push([xPx, yPx]);
     });
   }
 }
