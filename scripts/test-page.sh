@@ -3,4 +3,4 @@
 # usage: test-page.sh      after `scripts/setup.sh page` and `scripts/build-page.sh`
 set -eu
 cd "$(dirname "$0")/.."
-timeout 300 node --test --test-timeout=240000 tests/page/page.test.mjs
+timeout 180 node --test --test-timeout=60000 tests/page/page.test.mjs
