@@ -5,25 +5,30 @@ use std::process::Command;
 
 use slag_tests::*;
 
-/// A robot that knows a generated room by its colours.
-struct Robot {
-    service: Service,
-    _store: Service,
-    _dir: tempfile::TempDir,
+/// A store of a generated room, and a robot that fetched from it and knows things by their colours.
+struct World {
+    store: Service,
+    dir: tempfile::TempDir,
 }
 
-impl Robot {
-    fn start(flags: &[&str]) -> Self {
+impl World {
+    fn make() -> Self {
         let dir = tempfile::tempdir().expect("a temporary folder");
         let (room, store, cache) =
             (dir.path().join("room"), dir.path().join("store"), dir.path().join("cache"));
         run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "12"]));
         run(encode_room(&room, &store).args(["--models", "colours"]));
-        let served = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
-        run(edge(&["fetch", "--trust-first", "--from", &served.url, "--at", "3.5,2.7,0"])
+        let store = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
+        run(edge(&["fetch", "--trust-first", "--from", &store.url, "--at", "3.5,2.7,0"])
             .args(["--cache", text(&cache)]));
+        Self { store, dir }
+    }
+
+    /// Starts the robot, which follows positions.
+    fn robot(&self) -> Service {
+        let cache = self.dir.path().join("cache");
         let mut serve = edge(&["serve", "--models", "colours", "--cache", text(&cache)]);
-        Self { service: Service::start(serve.args(flags)), _store: served, _dir: dir }
+        Service::start(serve.args(["--follow", &self.store.url]))
     }
 }
 
@@ -53,17 +58,30 @@ fn python_with(door: &str) -> Option<PathBuf> {
 /// Runs a door's judge, which prints what it saw.
 fn judge(python: &Path, script: &str, args: &[&str]) -> String {
     let script = root().join("doors").join(script);
-    let judged = run(Command::new(python).arg(&script).args(args));
+    let judged = run(Command::new(python).arg(&script).args(args).env("PYTHONDONTWRITEBYTECODE", "1"));
     String::from_utf8_lossy(&judged.stdout).into_owned()
 }
 
 #[test]
 fn the_client_of_the_mcp_project_asks_a_robot() {
     let Some(python) = python_with("mcp") else { return };
-    let robot = Robot::start(&[]);
-    let robot = &robot.service.url;
+    let world = World::make();
+    let robot = world.robot();
     let mcp = program("slag-mcp");
-    let door = Service::start(Command::new(&mcp).args(["--robot", robot]));
-    let said = judge(&python, "mcp/tests/against_the_program.py", &[text(&mcp), robot, "red", &door.url]);
+    let door = Service::start(Command::new(&mcp).args(["--robot", &robot.url]));
+    let said =
+        judge(&python, "mcp/tests/against_the_program.py", &[text(&mcp), &robot.url, "red", &door.url]);
     assert!(said.contains("stdio: ") && said.contains("http: "), "{said}");
+}
+
+#[test]
+fn cyclone_dds_asks_a_robot() {
+    let Some(python) = python_with("ros") else { return };
+    let world = World::make();
+    let robot = world.robot();
+    let ros = program("slag-ros");
+    // Runs of the tests at the same time do not hear each other.
+    let domain = (50 + std::process::id() % 40).to_string();
+    let said = judge(&python, "ros/tests/against_the_program.py", &[text(&ros), &robot.url, "red", &domain]);
+    assert!(said.contains(" points, service, tf, odometry, fix"), "{said}");
 }

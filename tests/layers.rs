@@ -11,7 +11,7 @@ use syn::visit::{self, Visit};
 use syn::{Attribute, Item, UseTree, Visibility};
 
 /// Crates and their folders.
-const CRATES: [(&str, &str); 10] = [
+const CRATES: [(&str, &str); 11] = [
     ("slag_math", "common/math"),
     ("slag_common", "common"),
     ("slag_models", "common/models"),
@@ -22,6 +22,7 @@ const CRATES: [(&str, &str); 10] = [
     ("slag_lab", "encoder/lab"),
     ("slag_robot", "doors/robot"),
     ("slag_mcp", "doors/mcp"),
+    ("slag_ros", "doors/ros"),
 ];
 
 /// A module's path, the crate's name first.

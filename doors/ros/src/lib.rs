@@ -1,0 +1,9 @@
+//! Puts a robot's answers on ROS 2 topics and services, without a ROS installation: a node over DDS in front of
+//! `slag-edge serve`.
+
+mod answers;
+mod geometry;
+mod messages;
+pub mod node;
+mod position;
+mod transforms;

@@ -1,0 +1,351 @@
+//! The node: what it listens to, what it says.
+
+use std::net::IpAddr;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, anyhow};
+use ros2_client::qos::{Durability, History, WhenFull};
+use ros2_client::{
+    Context, MessageTypeName, Name, Node, NodeName, NodeOptions, Publisher, QosProfile, Server,
+    ServiceMapping, ServiceTypeName, Subscription,
+};
+use rustdds::DomainParticipantBuilder;
+use serde::Serialize;
+use serde_json::{Value, json};
+use slag_robot::{Answer, PointAnswer, Robot};
+
+use crate::answers;
+use crate::messages::{
+    Detection3DArray, FindReply, FindRequest, MarkerArray, NavSatFix, Odometry, PointCloud2, PoseStamped,
+    Text, Transforms as TransformMessages,
+};
+use crate::position;
+use crate::transforms::Transforms;
+
+/// Messages kept for those who join later: the clouds of an answer.
+const KEPT: usize = 4;
+/// Longest pause for subscribers that do not keep up.
+const WRITE_TIMEOUT: Duration = Duration::from_secs(2);
+/// Pause after a failed read, so that a broken topic does not burn the CPU.
+const READ_PAUSE: Duration = Duration::from_millis(100);
+
+/// Where the robot's position comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PositionSource {
+    /// Nowhere: positions are not posted.
+    Nowhere,
+    /// The place of `base_frame`, from `/tf`.
+    Transforms,
+    /// `/odom`, in a frame that `/tf` connects to the scene's.
+    Odometry,
+    /// `/fix`.
+    Fix,
+}
+
+/// How services travel, which differs between the programs that ROS sends messages with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Middleware {
+    /// `rmw_fastrtps_cpp`, the default of Humble and Jazzy.
+    FastDds,
+    /// `rmw_cyclonedds_cpp`.
+    CycloneDds,
+}
+
+/// What the node is told.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Name of the node, and the namespace of its topics.
+    pub name: String,
+    /// DDS domain.
+    pub domain_id: u16,
+    /// Addresses of the interfaces to use; empty: all.
+    pub interfaces: Vec<IpAddr>,
+    /// How services travel.
+    pub middleware: Middleware,
+    /// Frame of the scene in ROS.
+    pub scene_frame: String,
+    /// Frame of the robot.
+    pub base_frame: String,
+    /// Where the robot's position comes from.
+    pub position: PositionSource,
+    /// Least time between two positions that are posted.
+    pub position_period: Duration,
+    /// Most things in an answer, unless the request says otherwise.
+    pub limit: u32,
+    /// Most points in the clouds of an answer.
+    pub n_points: u32,
+}
+
+/// What all parts of the node share.
+struct Shared {
+    settings: Settings,
+    robot: Robot,
+    frames: Mutex<Transforms>,
+    /// Place of the robot in the scene, and when it was posted last.
+    place: Mutex<(Option<[f64; 3]>, Option<Instant>)>,
+    detections: Publisher<Detection3DArray>,
+    markers: Publisher<MarkerArray>,
+    points: Publisher<PointCloud2>,
+    best_pose: Publisher<PoseStamped>,
+}
+
+/// The answers to a text.
+struct Found {
+    answers: Vec<Answer>,
+    points: Vec<PointAnswer>,
+    /// Why there are none.
+    reason: String,
+}
+
+/// Runs the node until `stop` completes.
+///
+/// # Errors
+/// A name that ROS does not take, or a domain that cannot be joined.
+pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()>) -> Result<()> {
+    let mut participant = DomainParticipantBuilder::new(settings.domain_id);
+    if !settings.interfaces.is_empty() {
+        participant = participant.with_only_networks(settings.interfaces.iter().copied());
+    }
+    let joined =
+        participant.build().map_err(|e| anyhow!("cannot join domain {}: {e}", settings.domain_id))?;
+    let context = Context::from_domain_participant(joined).map_err(|e| anyhow!("cannot start DDS: {e}"))?;
+    let name = NodeName::new("/", &settings.name)
+        .map_err(|e| anyhow!("{:?} is no name of a node: {e}", settings.name))?;
+    let node = context.new_node(name, NodeOptions::new().enable_rosout(true));
+    let mut node = node.map_err(|e| anyhow!("cannot make the node: {e:?}"))?;
+    let own = |topic: &str| Name::new(&format!("/{}", settings.name), topic);
+    let kept = reliable(KEPT).durability(Durability::TransientLocal);
+    let shared = Arc::new(Shared {
+        detections: publisher(&mut node, own("detections")?, ("vision_msgs", "Detection3DArray"), &kept)?,
+        markers: publisher(&mut node, own("markers")?, ("visualization_msgs", "MarkerArray"), &kept)?,
+        points: publisher(&mut node, own("points")?, ("sensor_msgs", "PointCloud2"), &kept)?,
+        best_pose: publisher(&mut node, own("best_pose")?, ("geometry_msgs", "PoseStamped"), &kept)?,
+        frames: Mutex::default(),
+        place: Mutex::default(),
+        robot,
+        settings: settings.clone(),
+    });
+    let (volatile, latched) = (reliable(10), reliable(100).durability(Durability::TransientLocal));
+    let sensor = QosProfile::subscription_default();
+
+    let texts = subscription::<Text>(&mut node, own("query")?, ("std_msgs", "String"), &volatile)?;
+    let asked = Arc::clone(&shared);
+    tokio::spawn(listen(texts, async move |text: Text| Arc::clone(&asked).publish_answers(text.data).await));
+
+    let mapping = match settings.middleware {
+        Middleware::FastDds => ServiceMapping::Enhanced,
+        Middleware::CycloneDds => ServiceMapping::Cyclone,
+    };
+    let kind = ServiceTypeName::new("slag_msgs", "Find");
+    let server = node.create_server(mapping, &own("find")?, &kind, volatile.clone(), volatile);
+    tokio::spawn(serve(server.map_err(|e| anyhow!("cannot offer find: {e}"))?, Arc::clone(&shared)));
+
+    if matches!(settings.position, PositionSource::Transforms | PositionSource::Odometry) {
+        for (topic, qos) in [("tf", &reliable(100)), ("tf_static", &latched)] {
+            let told = subscription(&mut node, Name::new("/", topic)?, ("tf2_msgs", "TFMessage"), qos)?;
+            let shared = Arc::clone(&shared);
+            tokio::spawn(listen(told, async move |told| Arc::clone(&shared).hear_transforms(told).await));
+        }
+    }
+    match settings.position {
+        PositionSource::Odometry => {
+            let told = subscription(&mut node, Name::new("/", "odom")?, ("nav_msgs", "Odometry"), &sensor)?;
+            tokio::spawn(listen(told, async move |told| Arc::clone(&shared).hear_odometry(told).await));
+        }
+        PositionSource::Fix => {
+            let told =
+                subscription(&mut node, Name::new("/", "fix")?, ("sensor_msgs", "NavSatFix"), &sensor)?;
+            tokio::spawn(listen(told, async move |told| Arc::clone(&shared).hear_fix(told).await));
+        }
+        PositionSource::Transforms | PositionSource::Nowhere => {}
+    }
+    let spinner = node.spinner().map_err(|e| anyhow!("cannot start the node: {e}"))?;
+    tokio::spawn(spinner.spin());
+    tracing::info!("/{} listens in domain {}", settings.name, settings.domain_id);
+    stop.await;
+    Ok(())
+}
+
+/// Returns the usual quality of topics: every message, the last few of them.
+fn reliable(depth: usize) -> QosProfile {
+    QosProfile::publisher_default()
+        .reliability_reliable(WhenFull::Wait(WRITE_TIMEOUT))
+        .history(History::KeepLast { depth })
+}
+
+fn publisher<M: Serialize>(
+    node: &mut Node,
+    name: Name,
+    (package, kind): (&str, &str),
+    qos: &QosProfile,
+) -> Result<Publisher<M>> {
+    let topic =
+        node.create_topic(&name, MessageTypeName::new(package, kind), qos).map_err(|e| anyhow!("{e}"));
+    let topic = topic.with_context(|| format!("topic {name:?}"))?;
+    node.create_publisher(&topic, None).map_err(|e| anyhow!("topic {name:?}: {e}"))
+}
+
+fn subscription<M: 'static>(
+    node: &mut Node,
+    name: Name,
+    (package, kind): (&str, &str),
+    qos: &QosProfile,
+) -> Result<Subscription<M>> {
+    let topic =
+        node.create_topic(&name, MessageTypeName::new(package, kind), qos).map_err(|e| anyhow!("{e}"));
+    let topic = topic.with_context(|| format!("topic {name:?}"))?;
+    node.create_subscription(&topic, None).map_err(|e| anyhow!("topic {name:?}: {e}"))
+}
+
+/// Handles the messages of a topic, one after the other.
+async fn listen<M: ros2_client::Message + 'static>(topic: Subscription<M>, handle: impl AsyncFn(M)) {
+    loop {
+        match topic.async_take().await {
+            Ok((message, _)) => handle(message).await,
+            Err(error) => {
+                tracing::warn!("a message cannot be read: {error}");
+                tokio::time::sleep(READ_PAUSE).await;
+            }
+        }
+    }
+}
+
+/// Answers the calls of the service.
+async fn serve(server: Server<FindRequest, FindReply>, shared: Arc<Shared>) {
+    loop {
+        let (id, request) = match server.async_receive_request().await {
+            Ok(received) => received,
+            Err(error) => {
+                tracing::warn!("a call cannot be read: {error}");
+                tokio::time::sleep(READ_PAUSE).await;
+                continue;
+            }
+        };
+        let text = request.text.clone();
+        let header = answers::header(&shared.settings.scene_frame);
+        let reply = match Arc::clone(&shared).ask(request, false).await {
+            Ok(found) => FindReply {
+                success: !found.answers.is_empty(),
+                message: found.reason,
+                detections: answers::detections(&header, &text, &found.answers),
+            },
+            Err(message) => {
+                FindReply { success: false, message, detections: answers::detections(&header, &text, &[]) }
+            }
+        };
+        if let Err(error) = server.async_send_response(id, reply).await {
+            tracing::warn!("the reply to {text:?} cannot be sent: {error:?}");
+        }
+    }
+}
+
+impl Shared {
+    /// Asks the robot on a thread that may wait.
+    async fn ask(self: Arc<Self>, request: FindRequest, with_points: bool) -> Result<Found, String> {
+        let asked = tokio::task::spawn_blocking(move || self.ask_now(&request, with_points)).await;
+        asked.map_err(|error| format!("slag-ros failed: {error}"))?
+    }
+
+    fn ask_now(&self, request: &FindRequest, with_points: bool) -> Result<Found, String> {
+        let limit = if request.limit == 0 { self.settings.limit } else { request.limit };
+        let mut asked = json!({"texts": [request.text], "limit": limit});
+        if let Some(place) = self.place.lock().expect("no holder panics").0 {
+            asked["near"] = json!(place);
+        }
+        let reply = self.robot.ask(&asked).map_err(|e| e.to_string())?;
+        let result = reply.results.into_iter().next().ok_or("the robot gave no result")?;
+        let mut points = Vec::new();
+        // A phrase has things, but no Gaussians of its own.
+        if with_points && result.understood.is_none() && !result.answers.is_empty() {
+            asked["limit"] = json!(self.settings.n_points);
+            let reply = self.robot.ask_points(&asked).map_err(|e| e.to_string())?;
+            points = reply.results.into_iter().next().map(|result| result.answers).unwrap_or_default();
+        }
+        let reason = result.none.map(|none| none.detail).unwrap_or_default();
+        Ok(Found { answers: result.answers, points, reason })
+    }
+
+    /// Answers a text on all topics. Nothing found is an empty answer, which clears viewers.
+    async fn publish_answers(self: Arc<Self>, text: String) {
+        let request = FindRequest { text: text.clone(), limit: 0 };
+        let found = match Arc::clone(&self).ask(request, true).await {
+            Ok(found) => found,
+            Err(error) => return tracing::warn!("{text:?}: {error}"),
+        };
+        if found.answers.is_empty() {
+            tracing::info!("{text:?}: {}", found.reason);
+        }
+        let header = answers::header(&self.settings.scene_frame);
+        publish(&self.detections, answers::detections(&header, &text, &found.answers)).await;
+        publish(&self.markers, answers::markers(&header, &text, &found.answers)).await;
+        for cloud in answers::clouds(&header, &found.points) {
+            publish(&self.points, cloud).await;
+        }
+        if let Some(pose) = answers::best_pose(&header, &found.answers) {
+            publish(&self.best_pose, pose).await;
+        }
+    }
+
+    async fn hear_transforms(self: Arc<Self>, told: TransformMessages) {
+        let place = {
+            let mut frames = self.frames.lock().expect("no holder panics");
+            told.transforms.into_iter().for_each(|transform| frames.insert(transform));
+            position::of_frame(&frames, &self.settings.scene_frame, &self.settings.base_frame)
+        };
+        if self.settings.position == PositionSource::Transforms
+            && let Some(place) = place
+        {
+            self.moved_to(place).await;
+        }
+    }
+
+    async fn hear_odometry(self: Arc<Self>, told: Odometry) {
+        let place = {
+            let frames = self.frames.lock().expect("no holder panics");
+            position::of_odometry(&frames, &self.settings.scene_frame, &told)
+        };
+        match place {
+            Some(place) => self.moved_to(place).await,
+            None => tracing::debug!("nothing connects {} to the scene", told.header.frame_id),
+        }
+    }
+
+    async fn hear_fix(self: Arc<Self>, told: NavSatFix) {
+        if let Some(place) = position::of_fix(&told)
+            && self.is_due()
+        {
+            self.post(place).await;
+        }
+    }
+
+    async fn moved_to(self: Arc<Self>, [x, y, z]: [f64; 3]) {
+        self.place.lock().expect("no holder panics").0 = Some([x, y, z]);
+        if self.is_due() {
+            self.post(json!({"x": x, "y": y, "z": z})).await;
+        }
+    }
+
+    /// Returns whether a position may be posted, and if so counts from here.
+    fn is_due(&self) -> bool {
+        let (_, posted) = &mut *self.place.lock().expect("no holder panics");
+        let is_due = posted.is_none_or(|posted| posted.elapsed() >= self.settings.position_period);
+        if is_due {
+            *posted = Some(Instant::now());
+        }
+        is_due
+    }
+
+    async fn post(self: Arc<Self>, place: Value) {
+        let posted = tokio::task::spawn_blocking(move || self.robot.post_position(&place)).await;
+        if let Ok(Err(error)) = posted {
+            tracing::warn!("the position is not taken: {error}");
+        }
+    }
+}
+
+async fn publish<M: Serialize>(to: &Publisher<M>, message: M) {
+    if let Err(error) = to.async_publish(message).await {
+        tracing::warn!("a message cannot be published: {:?}", error.forget_data());
+    }
+}

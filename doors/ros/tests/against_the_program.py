@@ -1,0 +1,231 @@
+"""Drives slag-ros through Cyclone DDS, on this machine only.
+
+python3 against_the_program.py PROGRAM ROBOT_URL WORD DOMAIN_ID
+
+WORD: something that the robot's scene has. The robot follows, so that it takes positions.
+"""
+
+import json
+import os
+import struct
+import subprocess
+import sys
+import time
+import urllib.request
+
+from ros_messages import (
+    Detection3DArray, FindRequest, FindResponse, Header, MarkerArray, NavSatFix, NavSatStatus, Odometry, Point,
+    PointCloud2, Pose, PoseStamped, PoseWithCovariance, Quaternion, String, TFMessage, Time, Transform,
+    TransformStamped, Twist, TwistWithCovariance, Vector3,
+)
+
+LOOPBACK = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
+<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>
+<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
+os.environ["CYCLONEDDS_URI"] = LOOPBACK
+
+from cyclonedds.core import Policy, Qos  # noqa: E402
+from cyclonedds.domain import DomainParticipant  # noqa: E402
+from cyclonedds.pub import DataWriter  # noqa: E402
+from cyclonedds.sub import DataReader  # noqa: E402
+from cyclonedds.topic import Topic  # noqa: E402
+from cyclonedds.util import duration  # noqa: E402
+
+RELIABLE = Policy.Reliability.Reliable(duration(seconds=5))
+# What `ros2 topic` and RViz ask for, and what late joiners ask for.
+PLAIN = Qos(RELIABLE, Policy.Durability.Volatile, Policy.History.KeepLast(10))
+LATCHED = Qos(RELIABLE, Policy.Durability.TransientLocal, Policy.History.KeepLast(10))
+TIMEOUT_SECS = 20.0
+
+
+def get(url):
+    with urllib.request.urlopen(url, timeout=20) as reply:
+        return json.load(reply)
+
+
+def until(what, ready, timeout=TIMEOUT_SECS):
+    end = time.monotonic() + timeout
+    while time.monotonic() < end:
+        found = ready()
+        if found:
+            return found
+        time.sleep(0.05)
+    raise AssertionError(f"no {what} within {timeout} s")
+
+
+class Ros:
+    def __init__(self, domain):
+        self.participant = DomainParticipant(domain)
+        self.kept = []
+
+    def topic(self, name, kind, qos):
+        topic = Topic(self.participant, name, kind)
+        self.kept.append((topic, qos))
+        return topic
+
+    def reader(self, name, kind, qos=PLAIN):
+        return DataReader(self.participant, self.topic(name, kind, qos), qos=qos)
+
+    def writer(self, name, kind, qos=PLAIN):
+        """Returns a writer that the node hears."""
+        writer = DataWriter(self.participant, self.topic(name, kind, qos), qos=qos)
+        until(f"reader of {name}", lambda: writer.get_matched_subscriptions())
+        return writer
+
+
+def header(frame):
+    return Header(Time(1, 2), frame)
+
+
+def close(a, b, tolerance=1e-9):
+    return all(abs(x - y) <= tolerance for x, y in zip(a, b))
+
+
+def xyz(v):
+    return [v.x, v.y, v.z]
+
+
+def check_answers(ros, robot, word):
+    truth = get(f"{robot}/v1/query?text={word}")["results"][0]["answers"]
+    detections = ros.reader("rt/slag/detections", Detection3DArray)
+    markers = ros.reader("rt/slag/markers", MarkerArray)
+    clouds = ros.reader("rt/slag/points", PointCloud2)
+    poses = ros.reader("rt/slag/best_pose", PoseStamped)
+    query = ros.writer("rt/slag/query", String)
+    for reader in (detections, markers, clouds, poses):
+        until("writer", lambda reader=reader: reader.get_matched_publications())
+    query.write(String(word))
+
+    [found] = until("detections", detections.take)
+    assert found.header.frame_id == "map" and found.header.stamp.sec > 1_600_000_000, found.header
+    assert len(found.detections) == len(truth) > 0
+    for detection, answer in zip(found.detections, truth):
+        box = answer["oriented_box"]
+        assert detection.id == answer["id"] and detection.results[0].hypothesis.class_id == word
+        assert abs(detection.results[0].hypothesis.score - answer["score"]) < 1e-6
+        assert close(xyz(detection.bbox.center.position), box["centre_in_world"]), (detection, answer)
+        assert close(xyz(detection.bbox.size), box["size"])
+        turned = detection.bbox.center.orientation
+        assert close([turned.x, turned.y, turned.z, turned.w], box["rotation_world_from_box"])
+        assert list(detection.results[0].pose.covariance) == [0.0] * 36
+    [shown] = until("markers", markers.take)
+    assert shown.markers[0].action == 3 and len(shown.markers) == 1 + 2 * len(truth)
+    boxes = [marker for marker in shown.markers if marker.ns == "boxes"]
+    assert all(marker.type == 1 and marker.color.a > 0 for marker in boxes)
+    assert close(xyz(boxes[0].pose.position), truth[0]["oriented_box"]["centre_in_world"])
+    words = [marker for marker in shown.markers if marker.ns == "words"]
+    assert all(marker.type == 9 and marker.text.startswith(word) for marker in words)
+
+    expected = get(f"{robot}/v1/query?text={word}&kind=gaussians&limit=3500")["results"][0]["answers"]
+    [cloud] = until("a cloud", clouds.take)
+    assert [field.name for field in cloud.fields] == ["x", "y", "z", "score"]
+    assert cloud.width == len(expected) > 0 and len(cloud.data) == 16 * cloud.width
+    for at, point in enumerate(expected):
+        x, y, z, score = struct.unpack_from("<4f", bytes(cloud.data), 16 * at)
+        assert close([x, y, z, score], [*point["position_in_world"], point["score"]], 1e-5)
+    [pose] = until("a pose", poses.take)
+    assert close(xyz(pose.pose.position), truth[0]["oriented_box"]["centre_in_world"])
+
+    # Those who join later see the last answer.
+    [late] = until("kept detections", ros.reader("rt/slag/detections", Detection3DArray, LATCHED).take)
+    assert [one.id for one in late.detections] == [one["id"] for one in truth]
+    return len(truth), len(expected)
+
+
+def check_service(ros, word):
+    # rmw_cyclonedds_cpp offers Find_Request_ and Find_Response_ on these topics.
+    replies = ros.reader("rr/slag/findReply", FindResponse)
+    calls = ros.writer("rq/slag/findRequest", FindRequest)
+    until("a server", replies.get_matched_publications)
+    for number, (text, limit, success) in enumerate([(word, 1, True), (word, 0, True), ("", 0, False)], 7):
+        calls.write(FindRequest(0x1234_5678_9ABC_DEF0, number, text, limit))
+        [reply] = until(f"a reply to {text!r}", replies.take)
+        assert (reply.client, reply.number) == (0x1234_5678_9ABC_DEF0, number), reply
+        assert reply.success == success and bool(reply.message) != success, reply
+        assert len(reply.detections.detections) == 1 if limit == 1 else success == bool(reply.detections.detections)
+
+
+def stamped(parent, child, translation, rotation):
+    turned = Transform(Vector3(*translation), Quaternion(*rotation))
+    return TransformStamped(header(parent), child, turned)
+
+
+def followed(robot, place):
+    """Returns whether the robot knows that it is at a place."""
+    position = get(f"{robot}/status")["following"]["position"] or {}
+    return "world" in position and close(position["world"], place, 1e-6)
+
+
+def check_transforms(ros, robot):
+    half = 0.5**0.5
+    static = ros.writer("rt/tf_static", TFMessage, LATCHED)
+    static.write(TFMessage([stamped("map", "odom", (3.0, 2.0, 0.0), (0.0, 0.0, half, half))]))
+    moving = ros.writer("rt/tf", TFMessage)
+
+    def there():
+        moving.write(TFMessage([stamped("odom", "base_link", (0.25, 0.5, 0.0), (0.0, 0.0, 0.0, 1.0))]))
+        time.sleep(0.1)
+        return followed(robot, [2.5, 2.25, 0.0])
+
+    until("position from tf", there)
+
+
+def check_odometry(ros, robot):
+    static = ros.writer("rt/tf_static", TFMessage, LATCHED)
+    static.write(TFMessage([stamped("map", "odom", (1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))]))
+    odometry = ros.writer("rt/odom", Odometry)
+    pose = PoseWithCovariance(Pose(Point(2.0, 2.5, 0.0), Quaternion(0.0, 0.0, 0.0, 1.0)), [0.0] * 36)
+    twist = TwistWithCovariance(Twist(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0)), [0.0] * 36)
+
+    def there():
+        odometry.write(Odometry(header("odom"), "base_link", pose, twist))
+        time.sleep(0.1)
+        return followed(robot, [3.0, 2.5, 0.0])
+
+    until("position from odometry", there)
+
+
+def check_fix(ros, robot):
+    fixes = ros.writer("rt/fix", NavSatFix)
+
+    def told(status, latitude):
+        where = (latitude, 8.5, float("nan"))
+        fixes.write(NavSatFix(header("gps"), NavSatStatus(status, 1), *where, [0.0] * 9, 0))
+        time.sleep(0.15)
+        return get(f"{robot}/status")["following"]["position"].get("geographic", {}).get("latitude_deg") == latitude
+
+    until("position from a fix", lambda: told(0, 47.25))
+    # Without a fix the receiver's numbers are no place.
+    assert not any(told(-1, 47.5) for _ in range(5))
+
+
+class Node:
+    def __init__(self, program, robot, domain, *flags):
+        command = [program, "--robot", robot, "--domain-id", str(domain), "--localhost-only", "1"]
+        command += ["--rmw", "rmw_cyclonedds_cpp", "--position-period", "0.1", *flags]
+        self.process = subprocess.Popen(command)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.terminate()
+        self.process.wait(10)
+
+
+def main(program, robot, word, domain):
+    domain = int(domain)
+    with Node(program, robot, domain):
+        ros = Ros(domain)
+        n_things, n_points = check_answers(ros, robot, word)
+        check_service(ros, word)
+        check_transforms(ros, robot)
+    with Node(program, robot, domain + 1, "--position", "odom"):
+        check_odometry(Ros(domain + 1), robot)
+    with Node(program, robot, domain + 2, "--position", "fix"):
+        check_fix(Ros(domain + 2), robot)
+    print(f"{n_things} things, {n_points} points, service, tf, odometry, fix")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
