@@ -23,6 +23,8 @@ missing=
 for pair in $wanted; do
     command -v "${pair%%:*}" >/dev/null 2>&1 || missing="$missing ${pair#*:}"
 done
+# Tests install clients of other projects into environments of their own.
+[ "${1:-}" = demo ] || python3 -c 'import ensurepip' 2>/dev/null || missing="$missing python3-venv"
 # Without a GPU the program runs all the same; tests of the GPU rasteriser need one, or this.
 if command -v apt-get >/dev/null 2>&1 && [ "${1:-}" != demo ]; then
     ls /usr/lib/*/libvulkan.so.1 >/dev/null 2>&1 || missing="$missing libvulkan1"

@@ -8,6 +8,12 @@ use std::sync::OnceLock;
 use serde_json::Value;
 pub use slag_test_support::{needs_shared, shared};
 
+mod python;
+mod site;
+
+pub use python::{judge, python_with};
+pub use site::Site;
+
 /// Returns the project's root.
 pub fn root() -> PathBuf {
     slag_test_support::workspace_root()
