@@ -2,10 +2,6 @@
 //!
 //! `SLAG_FUZZ_SECS` sets the seconds per target, instead of a fixed number of mutations.
 
-#![expect(unsafe_code, reason = "an allocator that counts")]
-
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};
 
@@ -13,7 +9,7 @@ use std::time::{Duration, Instant};
 mod targets;
 
 use slag_math::random::Random;
-use slag_test_support::shared_folder;
+use slag_test_support::{CountingAllocator, memory_of, shared_folder};
 
 /// Memory a decoder may take in addition to [`MAX_EXPANSION`] times its input: buffers and small images.
 const FREE_BYTES: usize = 64 << 20;
@@ -25,51 +21,8 @@ const N_MUTATIONS: u64 = 3000;
 const INTERESTING: [u64; 12] =
     [0, 1, 2, 0x7f, 0x80, 0xff, 0xffff, 0x7fff_ffff, 0x8000_0000, 0xffff_ffff, u64::MAX >> 1, u64::MAX];
 
-/// Counts the bytes allocated by the current thread, now and at their peak.
-struct Counting;
-
-thread_local! {
-    static LIVE_BYTES: Cell<isize> = const { Cell::new(0) };
-    static PEAK_BYTES: Cell<isize> = const { Cell::new(0) };
-}
-
-fn count(change: isize) {
-    let live = LIVE_BYTES.get() + change;
-    LIVE_BYTES.set(live);
-    PEAK_BYTES.set(PEAK_BYTES.get().max(live));
-}
-
-// SAFETY: every call is forwarded unchanged to the system's allocator.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        count(layout.size() as isize);
-        // SAFETY: the caller meets the system allocator's requirements.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
-        count(layout.size() as isize);
-        // SAFETY: the caller meets the system allocator's requirements.
-        unsafe { System.alloc_zeroed(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        count(-(layout.size() as isize));
-        // SAFETY: the caller meets the system allocator's requirements.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
-
-/// Returns the result of `work` and the peak of its allocated bytes.
-fn peak_bytes<T>(work: impl FnOnce() -> T) -> (T, usize) {
-    let before = LIVE_BYTES.get();
-    PEAK_BYTES.set(before);
-    let result = work();
-    (result, (PEAK_BYTES.get() - before) as usize)
-}
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 /// Mutates a seed as fuzzers do: bits, numbers, digits, truncation, copies, pieces of another seed.
 fn mutated(seeds: &[Vec<u8>], random: &mut Random) -> Vec<u8> {
@@ -137,7 +90,8 @@ fn no_decoder_panics() {
         while budget.map_or(n < N_MUTATIONS, |budget| start.elapsed() < budget) {
             let input = mutated(&seeds, &mut random);
             let run = || catch_unwind(AssertUnwindSafe(|| targets::run(target.name, &input)));
-            let (ended, peak_bytes) = peak_bytes(run);
+            let (ended, taken) = memory_of(run);
+            let peak_bytes = taken.peak_bytes;
             let message = || format!("{} at mutation {n}; the input: {}", target.name, input.escape_ascii());
             n_accepted += usize::from(ended.unwrap_or_else(|_| panic!("{}", message())));
             largest_bytes = largest_bytes.max(peak_bytes);

@@ -1,55 +1,11 @@
 //! Damaged pose files give an error or a valid result, never a panic or an allocation out of proportion to the file.
-#![expect(unsafe_code, reason = "a global allocator that measures is unsafe to implement")]
-
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
 
 use slag_common::poses::{self, PoseError};
 use slag_math::random::Random;
-
-thread_local! {
-    static LARGEST_BYTES: Cell<usize> = const { Cell::new(0) };
-}
-
-/// The system's allocator; it records the largest request of each thread.
-struct Measuring;
-
-// SAFETY: every call is forwarded unchanged to the system's allocator.
-unsafe impl GlobalAlloc for Measuring {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        LARGEST_BYTES.with(|largest| largest.set(largest.get().max(layout.size())));
-        // SAFETY: the caller meets the system allocator's requirements.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller meets the system allocator's requirements.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
+use slag_test_support::{CountingAllocator, damaged, memory_of};
 
 #[global_allocator]
-static ALLOCATOR: Measuring = Measuring;
-
-/// Returns a file with its end cut off, a few bits flipped, or eight bytes set to ones.
-fn damaged(bytes: &[u8], random: &mut Random) -> Vec<u8> {
-    let mut bytes = bytes.to_vec();
-    match random.below(3) {
-        0 => bytes.truncate(random.below(bytes.len())),
-        1 => {
-            for _ in 0..=random.below(4) {
-                let at = random.below(bytes.len());
-                bytes[at] ^= 1 << random.below(8);
-            }
-        }
-        _ => {
-            let at = random.below(bytes.len());
-            let end = (at + 8).min(bytes.len());
-            bytes[at..end].fill(0xFF);
-        }
-    }
-    bytes
-}
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 fn text_model() -> [(&'static str, Vec<u8>); 2] {
     let cameras =
@@ -123,11 +79,9 @@ fn survive(files: &[(&'static str, Vec<u8>)]) -> usize {
         for round in 0..1_000 {
             let bad = damaged(bytes, &mut random);
             write(name, &bad);
-            LARGEST_BYTES.set(0);
-            let result = poses::read(dir.path(), None);
-            let largest_bytes = LARGEST_BYTES.get();
+            let (result, taken) = memory_of(|| poses::read(dir.path(), None));
             // The read buffer (8 KiB) and growing lists of small records; counts are never trusted.
-            assert!(largest_bytes <= 16_384 + 8 * bad.len(), "{name} {round}: {largest_bytes} bytes");
+            assert!(taken.largest_bytes <= 16_384 + 8 * bad.len(), "{name} {round}: {taken:?}");
             match result {
                 Ok(set) => {
                     n_read += 1;

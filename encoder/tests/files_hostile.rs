@@ -8,23 +8,10 @@ use slag_encoder::lift::{
     CellField, Contribution, ContributionError, ContributionIndex, PartContributions, RegionTable,
     ViewContributions,
 };
-use slag_math::random::mix64;
+use slag_math::random::Random;
+use slag_test_support::damaged;
 
 const N_MUTATIONS: u64 = 1000;
-
-/// Returns a damaged copy: truncated for every fourth seed, else with one to three flipped bits.
-fn damaged(bytes: &[u8], seed: u64) -> Vec<u8> {
-    let random = |salt: u64| mix64(seed * 31 + salt) as usize;
-    if seed.is_multiple_of(4) {
-        return bytes[..random(0) % bytes.len()].to_vec();
-    }
-    let mut damaged = bytes.to_vec();
-    for flip in 1..=1 + seed % 3 {
-        let at = random(flip) % bytes.len();
-        damaged[at] ^= 1 << (random(flip + 10) % 8);
-    }
-    damaged
-}
 
 fn contributions() -> ViewContributions {
     let entry = |local, region| Contribution { local, region, weight: 2.5 };
@@ -59,7 +46,7 @@ fn contributions_regions_and_fields_refuse_damage() {
     let mut n_refused = 0;
     for seed in 0..N_MUTATIONS {
         fs_err::remove_file(&path).expect("removes");
-        fs_err::write(&path, damaged(&file, seed)).expect("writes");
+        fs_err::write(&path, damaged(&file, &mut Random::new(seed))).expect("writes");
         match read_contributions(&path) {
             Ok(read) => assert_eq!(read, (table.clone(), parts.clone()), "seed {seed}"),
             Err(error) => {
@@ -67,11 +54,14 @@ fn contributions_regions_and_fields_refuse_damage() {
                 n_refused += 1;
             }
         }
-        match RegionTable::from_bytes(&AlignedBytes::copy_of(&damaged(&table_file, seed))) {
+        match RegionTable::from_bytes(&AlignedBytes::copy_of(&damaged(&table_file, &mut Random::new(seed)))) {
             Ok(read) => assert_eq!(read, table, "seed {seed}"),
             Err(error) => assert!(!error.to_string().is_empty()),
         }
-        match CellField::from_bytes(&AlignedBytes::copy_of(&damaged(&field_file, seed)), table.len()) {
+        match CellField::from_bytes(
+            &AlignedBytes::copy_of(&damaged(&field_file, &mut Random::new(seed))),
+            table.len(),
+        ) {
             Ok(read) => assert_eq!(read, field, "seed {seed}"),
             Err(error) => assert!(!error.to_string().is_empty()),
         }
@@ -89,7 +79,7 @@ fn geo_references_are_read_or_refused() {
     read_geo_reference(&path).expect("valid");
     for seed in 0..N_MUTATIONS {
         fs_err::remove_file(&path).expect("removes");
-        fs_err::write(&path, damaged(text, seed)).expect("writes");
+        fs_err::write(&path, damaged(text, &mut Random::new(seed))).expect("writes");
         match read_geo_reference(&path) {
             Ok(geo) => assert!(geo.origin.latitude_deg.abs() <= 90.0 && geo.origin.height_m.is_finite()),
             Err(error) => assert!(error.to_string().contains("geo.json"), "{error}"),

@@ -1,11 +1,7 @@
 //! Damaged mask files: an error or a valid result, never a panic, and no allocation that the size
 //! of file and image does not justify.
-#![expect(unsafe_code, reason = "a global allocator that measures is unsafe to implement")]
 
 mod common;
-
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
 
 use glam::DAffine3;
 use image::RgbImage;
@@ -14,54 +10,13 @@ use slag_encoder::masks::Mask;
 use slag_encoder::masks::rle::Rle;
 use slag_encoder::segment::{GivenMasks, SegmentError, SegmentInput};
 use slag_math::random::Random;
-
-thread_local! {
-    static LARGEST_BYTES: Cell<usize> = const { Cell::new(0) };
-}
-
-/// The system's allocator, noting the largest request of each thread.
-struct Measuring;
-
-// SAFETY: every call is passed on to the system's allocator unchanged.
-unsafe impl GlobalAlloc for Measuring {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        LARGEST_BYTES.with(|largest| largest.set(largest.get().max(layout.size())));
-        // SAFETY: the caller's promises are the system allocator's.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promises are the system allocator's.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
+use slag_test_support::{CountingAllocator, damaged, memory_of};
 
 #[global_allocator]
-static ALLOCATOR: Measuring = Measuring;
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 const WIDTH_PX: u32 = 64;
 const HEIGHT_PX: u32 = 48;
-
-/// A file with its end cut off, a few bits flipped or up to eight bytes overwritten.
-fn damaged(bytes: &[u8], random: &mut Random) -> Vec<u8> {
-    let mut bytes = bytes.to_vec();
-    match random.below(3) {
-        0 => bytes.truncate(random.below(bytes.len())),
-        1 => {
-            for _ in 0..=random.below(4) {
-                let at = random.below(bytes.len());
-                bytes[at] ^= 1 << random.below(8);
-            }
-        }
-        _ => {
-            let at = random.below(bytes.len());
-            let end = (at + 1 + random.below(8)).min(bytes.len());
-            let value = [0xFF, b'9', b'o', 0][random.below(4)];
-            bytes[at..end].fill(value);
-        }
-    }
-    bytes
-}
 
 fn check(masks: &[Mask]) {
     for mask in masks {
@@ -100,7 +55,6 @@ fn survive(name: &str, bytes: &[u8], whole: bool) {
     let path = dir.path().join(name);
     let load = |bytes: &[u8]| {
         fs_err::write(&path, bytes).unwrap();
-        LARGEST_BYTES.set(0);
         GivenMasks::open(if whole { &path } else { dir.path() }, Vec::new())?.load(&input)
     };
     assert!(load(bytes).unwrap().is_some_and(|masks| masks.len() > 1));
@@ -108,10 +62,9 @@ fn survive(name: &str, bytes: &[u8], whole: bool) {
     let (mut n_read, mut n_errors) = (0, 0);
     for round in 0..1_000 {
         let bad = damaged(bytes, &mut random);
-        let result = load(&bad);
-        let largest_bytes = LARGEST_BYTES.get();
+        let (result, taken) = memory_of(|| load(&bad));
         // The table of 16-bit ids is the largest fixed part; JSON is buffered value by value.
-        assert!(largest_bytes <= (3 << 19) + 64 * bad.len(), "{name} {round}: {largest_bytes} bytes");
+        assert!(taken.largest_bytes <= (3 << 19) + 64 * bad.len(), "{name} {round}: {taken:?}");
         match result {
             Ok(masks) => {
                 n_read += 1;
@@ -154,10 +107,10 @@ fn an_id_image_that_unpacks_to_much() {
     let input =
         SegmentInput { view: &view, image: &image, valid: None, undistorter: None, depth: None, pool: None };
     let given = GivenMasks::open(dir.path(), Vec::new()).unwrap();
-    LARGEST_BYTES.set(0);
-    let error = given.load(&input).unwrap_err();
+    let (loaded, taken) = memory_of(|| given.load(&input));
+    let error = loaded.unwrap_err();
     assert!(matches!(error, SegmentError::Size { found_px: [6_000, 6_000], .. }), "{error}");
-    assert!(LARGEST_BYTES.get() < 100_000, "{} bytes", LARGEST_BYTES.get());
+    assert!(taken.largest_bytes < 100_000, "{taken:?}");
 }
 
 #[test]

@@ -6,25 +6,12 @@ use std::collections::BTreeMap;
 
 use common::model_dir;
 use safetensors::tensor::{Dtype, TensorView};
-use slag_math::random::mix64;
+use slag_math::random::Random;
 use slag_models::phrases::PhraseEncoder;
 use slag_models::{ModelDir, TextEncoder, tensors};
+use slag_test_support::damaged;
 
 const N_MUTATIONS: u64 = 1000;
-
-/// Returns a damaged copy: cut for every fourth seed, else with one to three flipped bits.
-fn damaged(bytes: &[u8], seed: u64) -> Vec<u8> {
-    let random = |salt: u64| mix64(seed * 31 + salt) as usize;
-    if seed.is_multiple_of(4) {
-        return bytes[..random(0) % bytes.len()].to_vec();
-    }
-    let mut damaged = bytes.to_vec();
-    for flip in 1..=1 + seed % 3 {
-        let at = random(flip) % bytes.len();
-        damaged[at] ^= 1 << (random(flip + 10) % 8);
-    }
-    damaged
-}
 
 #[test]
 fn descriptions_are_used_or_refused() {
@@ -34,7 +21,7 @@ fn descriptions_are_used_or_refused() {
     let mut n_refused = 0;
     for seed in 0..N_MUTATIONS {
         let _ = fs_err::remove_file(&path);
-        fs_err::write(&path, damaged(&text, seed)).expect("it is writable");
+        fs_err::write(&path, damaged(&text, &mut Random::new(seed))).expect("it is writable");
         if let Err(error) = ModelDir::open(folder.path()) {
             assert!(!error.to_string().is_empty());
             n_refused += 1;
@@ -63,11 +50,11 @@ fn vectors_and_phrases_are_used_or_refused() {
     write(&vectors, phrases);
     assert_eq!(open().expect("valid").encode("table").expect("known").len(), 4);
     for seed in 0..N_MUTATIONS {
-        write(&damaged(&vectors, seed), phrases);
+        write(&damaged(&vectors, &mut Random::new(seed)), phrases);
         if let Err(error) = tensors::read(&vectors_path, "vectors", Some(3), 4) {
             assert!(error.to_string().contains("vectors.safetensors"), "{error}");
         }
-        write(&vectors, &damaged(phrases, seed));
+        write(&vectors, &damaged(phrases, &mut Random::new(seed)));
         if let Ok(mut encoder) = open() {
             let vector = encoder.encode("floor lamp").unwrap_or_else(|_| vec![0.0; 4]);
             assert!(vector.iter().all(|v| v.is_finite()));

@@ -1,64 +1,18 @@
 //! Damaged files of every format give an error that names the file, or consistent columns; never a panic, and never
 //! memory out of proportion.
 
-#![expect(unsafe_code, reason = "an allocator that counts")]
-
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
 use std::io::Read;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
 use slag_math::random::Random;
+use slag_test_support::{CountingAllocator, memory_of};
 
 use crate::generated::{gzip, write_sog_v1};
 use crate::{assert_columns_agree, needs_shared, read_all, shared};
 
-/// Counts the bytes allocated by the current thread, now and at their peak.
-struct Counting;
-
-thread_local! {
-    static LIVE_BYTES: Cell<isize> = const { Cell::new(0) };
-    static PEAK_BYTES: Cell<isize> = const { Cell::new(0) };
-}
-
-fn count(change: isize) {
-    let live = LIVE_BYTES.get() + change;
-    LIVE_BYTES.set(live);
-    PEAK_BYTES.set(PEAK_BYTES.get().max(live));
-}
-
-// SAFETY: every call is forwarded unchanged to the system's allocator.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        count(layout.size() as isize);
-        // SAFETY: the caller meets the system allocator's requirements.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
-        count(layout.size() as isize);
-        // SAFETY: the caller meets the system allocator's requirements.
-        unsafe { System.alloc_zeroed(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        count(-(layout.size() as isize));
-        // SAFETY: the caller meets the system allocator's requirements.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
-
-/// Returns the result of `work` and the peak of its allocated bytes.
-pub fn peak_bytes<T>(work: impl FnOnce() -> T) -> (T, usize) {
-    let before = LIVE_BYTES.get();
-    PEAK_BYTES.set(before);
-    let result = work();
-    (result, (PEAK_BYTES.get() - before) as usize)
-}
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 /// Damages a file: truncates it, flips bits, overwrites a word with an extreme value, or changes a digit. Half of the
 /// places lie near the front, among the headers.
@@ -92,10 +46,10 @@ fn damaged(bytes: &[u8], random: &mut Random) -> Vec<u8> {
 
 /// Reads `path` (`len_bytes` in all its files) and asserts what the module states; returns whether it was read.
 fn assert_survives(path: &Path, len_bytes: usize, what: &str) -> bool {
-    let (result, peak) = peak_bytes(|| catch_unwind(AssertUnwindSafe(|| read_all(path))));
+    let (result, taken) = memory_of(|| catch_unwind(AssertUnwindSafe(|| read_all(path))));
     let result = result.unwrap_or_else(|_| panic!("{what}: panicked"));
     let most = (64 << 20) + 64 * len_bytes;
-    assert!(peak <= most, "{what}: {peak} bytes allocated for {len_bytes}");
+    assert!(taken.peak_bytes <= most, "{what}: {taken:?} for {len_bytes} bytes");
     match result {
         Ok(gaussians) => {
             assert_columns_agree(&gaussians);

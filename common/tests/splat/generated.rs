@@ -8,6 +8,7 @@ use flate2::Compression;
 use flate2::write::GzEncoder;
 use image::codecs::webp::WebPEncoder;
 use ruzstd::encoding::{CompressionLevel, compress_to_vec};
+use slag_test_support::memory_of;
 
 use crate::{assert_near, read_all, read_bytes};
 
@@ -178,10 +179,10 @@ fn zstandard_bombs_are_refused() {
             out.extend((column.len() as u64).to_le_bytes());
         }
         out.extend(streams.concat());
-        let (result, peak_bytes) = crate::damage::peak_bytes(|| read_bytes(folder.path(), "bomb.spz", &out));
+        let (result, taken) = memory_of(|| read_bytes(folder.path(), "bomb.spz", &out));
         let error = result.expect_err("is refused").to_string();
         assert!(error.contains("bomb.spz: byte ") && error.contains(expected), "{error}");
-        assert!(peak_bytes < 40 << 20, "{peak_bytes} bytes");
+        assert!(taken.peak_bytes < 40 << 20, "{taken:?}");
     }
 }
 

@@ -1,11 +1,16 @@
-//! Finds the test data beside the project.
+//! What tests of several crates share: the test data beside the project, damaged files, and an allocator that counts.
 //!
 //! Some tests use scenes and models that are too large for the repository. They lie in `../shared`, or in the folder
 //! that `SLAG_SHARED` names. Mark such a test with [`needs_shared`]: where the data is absent, `cargo test` lists the
 //! test as ignored; in CI it runs and fails.
 
+mod damage;
+mod memory;
+
 use std::path::{Path, PathBuf};
 
+pub use damage::damaged;
+pub use memory::{CountingAllocator, Taken, memory_of};
 pub use slag_test_needs::needs_shared;
 
 /// Returns the root of the workspace.

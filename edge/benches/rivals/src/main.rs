@@ -3,6 +3,7 @@
 
 mod dense;
 mod dump;
+mod graph;
 mod measure;
 mod qdrant;
 mod usearch_index;

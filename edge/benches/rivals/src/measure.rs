@@ -12,11 +12,6 @@ use crate::qdrant::Qdrant;
 use crate::usearch_index::Usearch;
 use crate::{Args, Engine, Index};
 
-/// Edges of a node of a graph.
-pub const EDGES: usize = 16;
-/// Candidates while a graph is built.
-pub const CANDIDATES: usize = 100;
-
 /// Figures of an engine.
 #[derive(Debug, Serialize)]
 pub struct Report {

@@ -48,8 +48,8 @@ fn has_graph(engine: Engine) -> bool {
 fn config(dim: usize, engine: Engine) -> Result<EdgeConfig> {
     let graph = HnswIndexConfig {
         // Without edges there is no graph: every search scans.
-        m: if has_graph(engine) { crate::measure::EDGES } else { 0 },
-        ef_construct: crate::measure::CANDIDATES,
+        m: if has_graph(engine) { crate::graph::EDGES } else { 0 },
+        ef_construct: crate::graph::CANDIDATES,
         full_scan_threshold: if has_graph(engine) { 1 } else { usize::MAX / 1024 },
         max_indexing_threads: std::thread::available_parallelism().map_or(0, Into::into),
         on_disk: Some(false),

@@ -19,8 +19,8 @@ impl Usearch {
             dimensions: dim,
             metric: MetricKind::IP,
             quantization: if engine == Engine::UsearchHnswInt8 { ScalarKind::I8 } else { ScalarKind::F32 },
-            connectivity: crate::measure::EDGES,
-            expansion_add: crate::measure::CANDIDATES,
+            connectivity: crate::graph::EDGES,
+            expansion_add: crate::graph::CANDIDATES,
             expansion_search: 0,
             multi: false,
         };
