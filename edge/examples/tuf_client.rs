@@ -38,7 +38,8 @@ fn main() -> anyhow::Result<()> {
                 if fs_err::read(&into).is_ok_and(|held| target.check(path, &held).is_ok()) {
                     continue;
                 }
-                let url = format!("{}/{}", flag("target-base-url")?, target.file_name(path)?);
+                let base = flag("target-base-url")?.trim_end_matches('/');
+                let url = format!("{base}/{}", target.file_name(path)?);
                 let bytes = get(&url, target.length.min(MAX_FILE_BYTES))?.context("404")?;
                 target.check(path, &bytes)?;
                 fs_err::write(into, bytes)?;
