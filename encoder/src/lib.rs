@@ -34,6 +34,7 @@ pub mod diff;
 pub mod embed;
 pub mod encode;
 pub mod ingest;
+pub mod lanes;
 pub mod lift;
 pub mod masks;
 pub mod memory;

@@ -175,7 +175,7 @@ fn the_identity_holds_the_hash_of_the_embedded_weights() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let runtime = root.join("target/onnxruntime").join(std::env::consts::ARCH);
     let session = SessionOptions::new(find_runtime(None, &[runtime]).unwrap());
-    let learnt = GraphSegmenter::learnt(GraphSettings::learnt(2), &session).unwrap().identity();
+    let learnt = GraphSegmenter::learnt(GraphSettings::learnt(2), &session, &[0]).unwrap().identity();
     assert!(learnt.contains("022b1998a06e68a24361831df459ece1fc55716bd7e2f94986447f869f940d9d"), "{learnt}");
     let without = GraphSegmenter::new(GraphSettings::learnt(2)).identity();
     assert_ne!(learnt, without, "the model's absence shows");

@@ -11,6 +11,7 @@
 //!
 //! Nothing here prints, reads the environment or starts threads, except the prompt of [`commands::ask`].
 
+mod bound;
 pub mod boundaries;
 pub mod clean;
 pub mod colours;
@@ -18,12 +19,16 @@ pub mod commands;
 mod crop;
 mod described;
 pub mod description;
+mod device_memory;
 mod encoder;
 pub mod encoder_id;
 mod error;
 mod file_ref;
+mod floats;
+pub mod gpus;
 pub mod hub;
 pub mod image;
+mod levels;
 mod model_dir;
 mod model_file;
 pub mod phrases;
@@ -42,6 +47,7 @@ pub use crop::Crop;
 pub use encoder::{ImageEncoder, TextEncoder};
 pub use encoder_id::EncoderId;
 pub use error::{InferenceError, ModelError, PhrasesError, TokenizerError};
+pub use floats::Floats;
 pub use model_dir::ModelDir;
 pub use model_file::ModelFile;
 pub use placement::Placement;

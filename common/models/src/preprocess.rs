@@ -96,6 +96,12 @@ impl Preprocess {
         self.size_px
     }
 
+    /// Returns a and b of pixel value = a * level + b, per channel RGB.
+    pub(crate) fn scale_and_offset(&self) -> ([f32; 3], [f32; 3]) {
+        let scale = |of_level: [f32; 256]| (f64::from(of_level[255]) - f64::from(of_level[0])) / 255.0;
+        (self.values.map(|of_level| scale(of_level) as f32), self.values.map(|of_level| of_level[0]))
+    }
+
     /// Returns the resized size of an image and the window of it that is kept. The window is smaller than the
     /// square only with [`Resize::Pad`].
     ///

@@ -49,12 +49,15 @@ impl Provider {
         }
     }
 
-    /// Registers it with `builder`.
-    pub(crate) fn register(self, builder: SessionBuilder) -> ort::Result<SessionBuilder> {
+    /// Registers it with `builder`; `gpu`: the NVIDIA GPU to run on, as CUDA numbers them.
+    pub(crate) fn register(self, builder: SessionBuilder, gpu: u32) -> ort::Result<SessionBuilder> {
+        let gpu = i32::try_from(gpu).map_err(|_| ort::Error::new("there is no GPU of that number"))?;
         let (is_built_in, dispatch): (_, ExecutionProviderDispatch) = match self {
             Self::Cpu => return Ok(builder),
-            Self::Cuda => (ep::CUDA::is_available()?, ep::CUDA::default().build()),
-            Self::TensorRt => (ep::TensorRT::is_available()?, ep::TensorRT::default().build()),
+            Self::Cuda => (ep::CUDA::is_available()?, ep::CUDA::default().with_device_id(gpu).build()),
+            Self::TensorRt => {
+                (ep::TensorRT::is_available()?, ep::TensorRT::default().with_device_id(gpu).build())
+            }
             Self::CoreMl => (ep::CoreML::is_available()?, ep::CoreML::default().build()),
             Self::DirectMl => (ep::DirectML::is_available()?, ep::DirectML::default().build()),
         };

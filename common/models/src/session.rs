@@ -7,17 +7,18 @@ use std::{
     sync::{Mutex, PoisonError},
 };
 
-use half::f16;
 use ort::{
     ErrorCode,
     environment::Environment,
     session::{Session, SessionInputValue},
     value::{
-        DynValue, Outlet, PrimitiveTensorElementType, Tensor as OwnedTensor, TensorElementType, TensorRef,
-        ValueType,
+        DynTensor, DynTensorValueType, DynValue, Outlet, PrimitiveTensorElementType, Tensor as OwnedTensor,
+        TensorElementType, TensorRef, ValueType,
     },
 };
 
+use crate::device_memory::DeviceMemory;
+use crate::floats::Floats;
 use crate::model_file::ModelFile;
 use crate::placement::{Listener, Placement};
 use crate::provider::{Provider, names};
@@ -36,12 +37,14 @@ pub struct SessionOptions {
     /// The devices to run on, in order of preference. Without the CPU in the list, it is an error if none of them can
     /// be used.
     pub providers: Vec<Provider>,
+    /// The GPU to run on, as CUDA numbers them.
+    pub gpu: u32,
 }
 
 impl SessionOptions {
     /// Returns the options for one thread on the CPU.
     pub fn new(runtime: PathBuf) -> Self {
-        Self { runtime, intra_op_threads: 1, providers: vec![Provider::Cpu] }
+        Self { runtime, intra_op_threads: 1, providers: vec![Provider::Cpu], gpu: 0 }
     }
 
     /// Returns whether models run on the CPU only.
@@ -64,7 +67,7 @@ fn warn_once(message: String) {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Tensor {
     pub(crate) shape: Vec<i64>,
-    pub(crate) values: Vec<f32>,
+    pub(crate) values: Floats,
 }
 
 /// An input or output: its name, and for tensors element type and shape; -1 is any size.
@@ -89,6 +92,8 @@ pub(crate) struct Model {
     path: PathBuf,
     session: Session,
     placement: Placement,
+    /// The memory of the GPU that runs the model; `None` where tensors cannot be bound to it.
+    memory: Option<DeviceMemory>,
 }
 
 /// An input or output of a model.
@@ -103,6 +108,15 @@ pub(crate) struct Slot {
 
 impl Model {
     pub(crate) fn open(file: &ModelFile, options: &SessionOptions) -> Result<Self, SessionError> {
+        Self::open_sized(file, options, None)
+    }
+
+    /// Opens the model for one size of a named dimension: all that follows from it is computed now, not in every run.
+    pub(crate) fn open_sized(
+        file: &ModelFile,
+        options: &SessionOptions,
+        size: Option<(&str, i64)>,
+    ) -> Result<Self, SessionError> {
         let path = &*file.path;
         // Checked before the library is loaded, so that a missing model is reported as such.
         if file.embedded_bytes().is_none() {
@@ -116,7 +130,7 @@ impl Model {
         wanted.truncate(end.unwrap_or(wanted.len()));
         let asked = wanted.clone();
         let (session, placement) = loop {
-            match Self::commit(file, options, &environment, &wanted, !asked.is_empty()) {
+            match Self::commit(file, options, &environment, (&wanted, !asked.is_empty()), size) {
                 Err(SessionError::Provider { provider, cause }) => {
                     wanted.retain(|&p| p != provider);
                     let error = SessionError::Provider { provider, cause };
@@ -137,7 +151,11 @@ impl Model {
             warn_once(format!("{} runs on the CPU instead of {asked}", path.display()));
         }
         tracing::debug!("{} runs on {placement}", path.display());
-        Ok(Self { path: path.to_owned(), session, placement })
+        let memory = matches!(placement.provider(), Provider::Cuda | Provider::TensorRt)
+            .then(|| DeviceMemory::of_gpu(&session, options.gpu))
+            .transpose()
+            .map_err(|cause| SessionError::Load { path: path.to_owned(), cause })?;
+        Ok(Self { path: path.to_owned(), session, placement, memory })
     }
 
     /// Opens the model with `providers`; `listens`: determine the placement of its nodes.
@@ -145,8 +163,8 @@ impl Model {
         file: &ModelFile,
         options: &SessionOptions,
         environment: &Environment,
-        providers: &[Provider],
-        listens: bool,
+        (providers, listens): (&[Provider], bool),
+        size: Option<(&str, i64)>,
     ) -> Result<(Session, Placement), SessionError> {
         let load = |cause: ort::Error| {
             let says = cause.message();
@@ -162,13 +180,19 @@ impl Model {
             // Idle threads must not take cores from the other stages.
             .and_then(|b| b.with_intra_op_spinning(false).map_err(ort::Error::from))
             .map_err(load)?;
+        if let Some((dimension, size)) = size {
+            builder = builder
+                .with_dimension_override(dimension, size)
+                .map_err(|cause| load(ort::Error::from(cause)))?;
+        }
         let listener = Listener::default();
         if listens {
             builder = listener.attach(builder).map_err(load)?;
         }
         for &provider in providers {
-            builder =
-                provider.register(builder).map_err(|cause| SessionError::Provider { provider, cause })?;
+            builder = provider
+                .register(builder, options.gpu)
+                .map_err(|cause| SessionError::Provider { provider, cause })?;
         }
         let committed = match file.embedded_bytes() {
             Some(bytes) => builder.commit_from_memory(bytes),
@@ -186,6 +210,35 @@ impl Model {
 
     pub(crate) fn placement(&self) -> &Placement {
         &self.placement
+    }
+
+    /// Takes the memory to bind tensors to, if the model runs on a GPU that allows it.
+    pub(crate) fn take_memory(&mut self) -> Option<DeviceMemory> {
+        self.memory.take()
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    pub(crate) fn session(&self) -> &Session {
+        &self.session
+    }
+
+    pub(crate) fn session_mut(&mut self) -> &mut Session {
+        &mut self.session
+    }
+
+    pub(crate) fn run_error(&self, cause: ort::Error) -> SessionError {
+        SessionError::Run { path: self.path.clone(), cause }
+    }
+
+    /// Returns the name of a dimension of any size of input `name`.
+    pub(crate) fn dimension(&self, name: &str, axis: usize) -> Option<String> {
+        let input = self.session.inputs().iter().find(|input| input.name() == name)?;
+        let ValueType::Tensor { shape, dimension_symbols, .. } = input.dtype() else { return None };
+        let symbol = dimension_symbols.get(axis).filter(|symbol| !symbol.is_empty())?;
+        (shape.get(axis) == Some(&-1)).then(|| symbol.clone())
     }
 
     /// Returns the element type of input `name`, if it exists and is a tensor.
@@ -324,7 +377,7 @@ impl Model {
         name: &str,
         shape: &[i64],
     ) -> Result<Vec<f32>, SessionError> {
-        Ok(self.run_all(inputs, &[(name, shape)])?.swap_remove(0).values)
+        Ok(self.run_all(inputs, &[(name, shape)])?.swap_remove(0).values.into_vec())
     }
 
     /// Runs the model on `inputs` and returns the given f32 outputs in order; -1 in a shape is any size.
@@ -333,26 +386,32 @@ impl Model {
         inputs: Vec<(&str, SessionInputValue<'_>)>,
         outputs: &[(&str, &[i64])],
     ) -> Result<Vec<Tensor>, SessionError> {
-        let run = |path: &Path, cause| SessionError::Run { path: path.to_owned(), cause };
-        let mut found = self.session.run(inputs).map_err(|cause| run(&self.path, cause))?;
-        let values: Vec<_> = outputs.iter().map(|(name, _)| found.remove(name)).collect();
+        let mut found =
+            self.session.run(inputs).map_err(|cause| SessionError::Run { path: self.path.clone(), cause })?;
+        let tensor = |value: DynValue| value.downcast::<DynTensorValueType>().ok();
+        let values: Vec<_> = outputs.iter().map(|(name, _)| found.remove(name).and_then(tensor)).collect();
         drop(found);
-        let take = |(value, &(name, shape)): (&Option<DynValue>, &(&str, &[i64]))| {
-            let wrong = |found| self.shape_error("output", name, found, TensorElementType::Float32, shape);
-            let value = value.as_ref().ok_or_else(|| wrong("absent".to_owned()))?;
-            let extracted = match value.dtype().tensor_type() {
-                Some(TensorElementType::Float16) => value
-                    .try_extract_tensor::<f16>()
-                    .map(|(found, values)| (found, values.iter().map(|x| x.to_f32()).collect())),
-                _ => value.try_extract_tensor::<f32>().map(|(found, values)| (found, values.to_vec())),
-            };
-            let (found, values) = extracted.map_err(|cause| run(&self.path, cause))?;
-            match shapes_fit(found, shape) {
-                true => Ok(Tensor { shape: found.to_vec(), values }),
-                false => Err(wrong(format!("{} {:?}", TensorElementType::Float32, &found[..]))),
-            }
-        };
-        values.iter().zip(outputs).map(take).collect()
+        values
+            .into_iter()
+            .zip(outputs)
+            .map(|(value, (name, shape))| self.floats(value, name, shape))
+            .collect()
+    }
+
+    /// Returns the values of output `name`, f32 or f16, which must fit `shape`; -1 is any size.
+    pub(crate) fn floats(
+        &self,
+        value: Option<DynTensor>,
+        name: &str,
+        shape: &[i64],
+    ) -> Result<Tensor, SessionError> {
+        let wrong = |found| self.shape_error("output", name, found, TensorElementType::Float32, shape);
+        let value = value.ok_or_else(|| wrong("absent".to_owned()))?;
+        let (found, values) = Floats::of(value).map_err(|cause| self.run_error(cause))?;
+        match shapes_fit(&found, shape) {
+            true => Ok(Tensor { shape: found, values }),
+            false => Err(wrong(format!("{} {found:?}", TensorElementType::Float32))),
+        }
     }
 
     /// Returns `values` as an input of `shape`.
@@ -364,9 +423,17 @@ impl Model {
     where
         T: PrimitiveTensorElementType + Clone + Debug + 'static,
     {
-        let tensor = TensorRef::from_array_view((shape, values))
-            .map_err(|cause| SessionError::Run { path: self.path.clone(), cause })?;
+        let tensor = TensorRef::from_array_view((shape, values)).map_err(|cause| self.run_error(cause))?;
         Ok(tensor.into())
+    }
+
+    /// Returns `values` as a bound input of `shape`.
+    pub(crate) fn owned<T>(&self, shape: Vec<i64>, values: Vec<T>) -> Result<DynTensor, SessionError>
+    where
+        T: PrimitiveTensorElementType + Clone + Debug + 'static,
+    {
+        let tensor = OwnedTensor::from_array((shape, values)).map_err(|cause| self.run_error(cause))?;
+        Ok(tensor.upcast())
     }
 
     /// Returns `values` as an input of `shape`, i32 or i64.
@@ -383,7 +450,7 @@ impl Model {
                 false => OwnedTensor::from_array((shape, values.map(i64::from).collect::<Vec<_>>()))
                     .map(Into::into),
             };
-        tensor.map_err(|cause| SessionError::Run { path: self.path.clone(), cause })
+        tensor.map_err(|cause| self.run_error(cause))
     }
 }
 

@@ -6,6 +6,7 @@ use anyhow::{Context, Result, anyhow};
 use clap::{Args, FromArgMatches};
 use slag_common::ByteSize;
 use slag_common::shard::Profile;
+use slag_models::gpus::GpuChoice;
 
 use super::common::{
     InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs, open_models,
@@ -23,7 +24,7 @@ use crate::codebook::basis::MAX_COMPONENTS;
 use crate::embed::Background;
 use crate::encode::coverage::CoverageReport;
 use crate::encode::{
-    self, CellReport, CellSettings, EncodeSettings, EncodeSummary, Engines, InputSettings, Masks,
+    self, CellReport, CellSettings, EncodeSettings, EncodeSummary, Engines, GpuReport, InputSettings, Masks,
     OutputSettings, Preset, RasterWidth, Regions, RunSettings, StageReport, ViewSettings, ViewsLimit,
     ViewsReport,
 };
@@ -92,6 +93,9 @@ pub struct EncodeArgs {
     /// Masks with fewer pixels are left out [default: the preset's].
     #[arg(long, value_name = "PX")]
     pub min_mask_px: Option<u32>,
+    /// NVIDIA GPUs that share the work of models, where --provider names cuda or tensorrt: all, or numbers such as 0,1.
+    #[arg(long, value_name = "all|N,...", default_value_t)]
+    pub gpus: GpuChoice,
     /// Keeps slivers, which ragged edges of overlapping masks leave, as regions; without it they join their neighbours.
     #[arg(long)]
     pub keep_slivers: bool,
@@ -218,6 +222,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             strict: args.input.strict,
             restart: args.restart,
             keep_views: args.refine.keep_views || args.views.changes_photos(),
+            gpus: vec![0],
         },
     })
 }
@@ -252,6 +257,7 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     }
     let (models, session) = open_models(&args.models)?;
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());
+    settings.run.gpus = args.gpus.numbers(&session);
     let devices = Devices::open(args.device, GpuOptions::default())?;
     let engines = Engines::new(&models, &session, &devices);
     let summary = encode::encode(&settings, &engines, progress, cancel_flag()?.as_ref())?;
@@ -259,8 +265,13 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
         summary.busy_secs.iter().map(|(stage, s)| format!("{stage} {s:.1}")).collect::<Vec<_>>().join(", ");
     let of_views: String = (summary.view_stages.iter())
         .map(|stage| {
-            let StageReport { stage, n_slots, busy_secs, busy_share } = stage;
-            format!("  {stage:<9}{n_slots:>8}{busy_secs:>10.1}{:>7.0} %\n", 100.0 * busy_share)
+            let StageReport { stage, n_slots, busy_secs, busy_share, gpus } = stage;
+            let line = |name: &str, n: usize, secs: f64, share: f64| {
+                format!("  {name:<9}{n:>8}{secs:>10.1}{:>7.0} %\n", 100.0 * share)
+            };
+            let of_gpu =
+                |g: &GpuReport| line(&format!("  GPU {}", g.gpu), g.n_lanes, g.busy_secs, g.busy_share);
+            line(stage, *n_slots, *busy_secs, *busy_share) + &gpus.iter().map(of_gpu).collect::<String>()
         })
         .collect();
     let sizes = summary

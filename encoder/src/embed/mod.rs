@@ -1,5 +1,7 @@
 //! Embedding: a crop for each mask, and a vector for each crop.
 
+mod shared;
+
 use std::num::NonZeroUsize;
 
 use image::{Rgb, RgbImage, imageops};
@@ -9,6 +11,8 @@ use slag_models::{
 };
 
 use crate::masks::{BoxPx, Mask};
+
+pub use shared::{Failure, OpenEncoder, SharedEncoders};
 
 /// Reason why masks cannot be embedded.
 #[derive(Debug, thiserror::Error)]

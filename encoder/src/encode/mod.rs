@@ -41,7 +41,7 @@ pub use engines::{Engines, Perturbation};
 pub use error::EncodeError;
 pub use inputs::count_inputs;
 pub use preset::{Choices, Preset};
-pub use report::{CellReport, EncodeSummary, PhaseReport, SkippedView, StageReport, ViewsReport};
+pub use report::{CellReport, EncodeSummary, GpuReport, PhaseReport, SkippedView, StageReport, ViewsReport};
 pub use settings::{
     CellSettings, DEFAULT_MASK_LEVELS, EncodeSettings, InputSettings, Masks, OutputSettings, RasterWidth,
     Regions, RunSettings, ViewOrder, ViewSettings, ViewsLimit,

@@ -104,6 +104,7 @@ pub(super) fn run<T: Send, E: Send>(
         n_slots: stage.n_slots,
         busy_secs,
         busy_share: busy_secs / (wall_secs * stage.n_slots as f64),
+        gpus: Vec::new(),
     };
     Ok(stages.iter().zip(busy_secs).map(report).collect())
 }

@@ -14,6 +14,7 @@ use super::inputs::{self, Inputs};
 use super::job::Job;
 use super::settings::{EncodeSettings, Masks, Regions, RunSettings, ViewOrder};
 use crate::cells::CellSplit;
+use crate::embed::SharedEncoders;
 use crate::lift::refine::Refinement;
 use crate::memory::MemoryPlan;
 use crate::objects;
@@ -52,7 +53,12 @@ pub(super) fn plan<'a>(
     inputs: &'a Inputs,
     context: &RunContext<'_>,
 ) -> Result<Plan<'a>, EncodeError> {
-    let memory = memory_plan(settings, inputs, engines.models.dim());
+    let mut memory = memory_plan(settings, inputs, engines.models.dim());
+    if let (false, Some(preprocess)) = (engines.session.is_on_cpu(), engines.models.preprocess()) {
+        // A byte a channel, and one for the mask.
+        let square_bytes = 4 * u64::from(preprocess.size_px()).pow(2);
+        SharedEncoders::reserve(&mut memory, &settings.run.gpus, square_bytes);
+    }
     memory.rest(0)?;
     let regions = settings.view.regions;
     if regions.have_patches() && engines.models.patches_per_side().is_none() {
@@ -60,7 +66,9 @@ pub(super) fn plan<'a>(
     }
     let segmenter: Box<dyn Segmenter> = match regions {
         Regions::Patches => Box::new(NoMasks),
-        Regions::Masks | Regions::Both => open_segmenter(&settings.view.masks, engines.session)?,
+        Regions::Masks | Regions::Both => {
+            open_segmenter(&settings.view.masks, engines.session, &settings.run.gpus)?
+        }
     };
     let ids = context.time("identity", || {
         context.install(|| identity::identities(settings, engines, segmenter.as_ref(), inputs))
@@ -104,17 +112,21 @@ fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, dim: usize) -> Memory
     memory
 }
 
-fn open_segmenter(masks: &Masks, session: &SessionOptions) -> Result<Box<dyn Segmenter>, EncodeError> {
+fn open_segmenter(
+    masks: &Masks,
+    session: &SessionOptions,
+    gpus: &[u32],
+) -> Result<Box<dyn Segmenter>, EncodeError> {
     Ok(match masks {
         Masks::Auto { n_levels } => {
             let settings = GraphSettings::learnt(*n_levels);
-            Box::new(GraphSegmenter::learnt(settings, session).map_err(SegmentError::from)?)
+            Box::new(GraphSegmenter::learnt(settings, session, gpus).map_err(SegmentError::from)?)
         }
         Masks::Graph => Box::new(GraphSegmenter::default()),
         Masks::Given { dir, ignore_ids } => Box::new(GivenMasks::open(dir, ignore_ids.clone())?),
         Masks::Sam { dir, settings, n_model_threads } => {
             let session = SessionOptions { intra_op_threads: *n_model_threads, ..session.clone() };
-            Box::new(SamSegmenter::open(dir, settings.clone(), &session)?)
+            Box::new(SamSegmenter::open(dir, settings.clone(), &session, gpus)?)
         }
     })
 }

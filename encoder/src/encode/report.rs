@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use super::coverage::CoverageReport;
 use super::settings::ViewOrder;
+use crate::lanes::GpuLoad;
 use crate::objects::ObjectsReport;
 
 /// A view that was left out.
@@ -64,6 +65,35 @@ pub struct StageReport {
     pub busy_secs: f64,
     /// Mean share of the time in which its slots were busy, 0 to 1.
     pub busy_share: f64,
+    /// The load of each GPU that runs the stage's models; empty on the processor.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub gpus: Vec<GpuReport>,
+}
+
+/// The load of a GPU by the models of one stage.
+#[derive(Clone, Debug, Serialize)]
+pub struct GpuReport {
+    /// The GPU, as CUDA numbers it.
+    pub gpu: u32,
+    /// Lanes: models that may be at work at once.
+    pub n_lanes: usize,
+    /// Seconds in which any of them was.
+    pub busy_secs: f64,
+    /// Their share of the time, 0 to 1.
+    pub busy_share: f64,
+}
+
+impl StageReport {
+    /// Adds the loads of GPUs over `wall_secs`.
+    pub(super) fn add_gpus(&mut self, loads: Vec<GpuLoad>, wall_secs: f64) {
+        let report = |GpuLoad { gpu, n_lanes, busy_secs }| GpuReport {
+            gpu,
+            n_lanes,
+            busy_secs,
+            busy_share: busy_secs / wall_secs,
+        };
+        self.gpus = loads.into_iter().map(report).collect();
+    }
 }
 
 /// A part of the run. The parts follow each other and add up to the run's time.

@@ -204,6 +204,9 @@ pub struct RunSettings {
     pub restart: bool,
     /// Whether the views' contributions are kept after publication, for an encode with another aggregation.
     pub keep_views: bool,
+    /// The NVIDIA GPUs that share the work of models, as CUDA numbers them, at least one; without an NVIDIA provider they
+    /// mean nothing.
+    pub gpus: Vec<u32>,
 }
 
 /// How many views are used at most.
@@ -285,6 +288,7 @@ impl EncodeSettings {
                 strict: false,
                 restart: false,
                 keep_views: false,
+                gpus: vec![0],
             },
         }
     }
@@ -300,6 +304,7 @@ impl EncodeSettings {
         let is_error = |x: f32| x >= 0.0 && x.is_finite();
         let checks = [
             ("threads", run.threads > 0, "0 threads; expected at least 1"),
+            ("gpus", !run.gpus.is_empty(), "none; expected at least one number"),
             (
                 "views_limit",
                 !matches!(run.views_limit, ViewsLimit::Share(share) if !(0.0..=1.0).contains(&share)),

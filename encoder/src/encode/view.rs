@@ -1,12 +1,12 @@
 //! The stages of one view: decode, (depth,) segment, crop, embed, raster, write.
 
-use std::sync::{Mutex, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Instant;
 
 use image::RgbImage;
 use slag_common::{Intrinsics, View};
 use slag_models::preprocess::Preprocess;
-use slag_models::{Crop, ImageEncoder};
+use slag_models::{Crop, ImageEncoder, SessionOptions};
 
 use super::context::RunContext;
 use super::error::EncodeError;
@@ -14,8 +14,9 @@ use super::job::ViewRecord;
 use super::pipeline::Stage;
 use super::plan::Plan;
 use super::settings::{LONG_BORDERS, MAX_RASTER_WIDTH_PX, RasterWidth};
-use crate::embed;
+use crate::embed::{self, EmbedError, SharedEncoders};
 use crate::ingest::{self, LoadedImage};
+use crate::lanes::GpuLoad;
 use crate::lift::ViewContributions;
 use crate::lift::photos::MaskOutline;
 use crate::masks::patches::patch_masks;
@@ -24,19 +25,23 @@ use crate::masks::{Mask, RegionMap};
 use crate::raster::{RasterError, RasterView};
 use crate::segment::SegmentInput;
 
-/// Views at once in a GPU's image encoder: one is computed while the pixel values of others are made and copied.
-const GPU_EMBED_SLOTS: usize = 3;
-
 /// The stages of a view, with what every view needs.
 pub(super) struct ViewStages<'a> {
     plan: &'a Plan<'a>,
     context: &'a RunContext<'a>,
     /// How crops become the image encoder's squares; `None` if it takes crops of any size.
     preprocess: Option<Preprocess>,
-    /// Image encoders that are not at work; opened as they are needed.
-    encoders: Mutex<Vec<Box<dyn ImageEncoder>>>,
+    encoders: Encoders<'a>,
     /// The device that runs the image model, once it is open.
-    images_on: OnceLock<Option<String>>,
+    images_on: Arc<OnceLock<Option<String>>>,
+}
+
+/// The image encoders.
+enum Encoders<'a> {
+    /// One for each view at work, on the processor; those that are not at work. They are opened as they are needed.
+    OfViews(Mutex<Vec<Box<dyn ImageEncoder>>>),
+    /// On GPUs, for the crops of all views.
+    Shared(SharedEncoders<'a>),
 }
 
 /// A view between two stages, with what the next one needs.
@@ -97,8 +102,28 @@ impl<'v> Work<'v> {
 impl<'a> ViewStages<'a> {
     /// Makes the stages; models are opened when the first view needs them.
     pub(super) fn new(plan: &'a Plan<'a>, context: &'a RunContext<'a>) -> Self {
-        let preprocess = plan.engines.models.preprocess();
-        Self { plan, context, preprocess, encoders: Mutex::default(), images_on: OnceLock::new() }
+        let (models, session) = (plan.engines.models, plan.engines.session);
+        let images_on = Arc::<OnceLock<_>>::default();
+        let is_on = Arc::clone(&images_on);
+        let open = move |gpu| {
+            let encoder = models.image_encoder(&SessionOptions { gpu, ..session.clone() })?;
+            is_on.get_or_init(|| encoder.placement().map(ToString::to_string));
+            Ok(encoder)
+        };
+        let encoders = match session.is_on_cpu() {
+            true => Encoders::OfViews(Mutex::default()),
+            false => Encoders::Shared(SharedEncoders::new(&plan.settings.run.gpus, Box::new(open))),
+        };
+        Self { plan, context, preprocess: models.preprocess(), encoders, images_on }
+    }
+
+    /// Returns the load of each GPU by the models of a stage.
+    pub(super) fn loads(&self, stage: &str) -> Vec<GpuLoad> {
+        match (stage, &self.encoders) {
+            ("segment", _) => self.plan.segmenter.loads(),
+            ("embed", Encoders::Shared(encoders)) => encoders.loads(),
+            _ => Vec::new(),
+        }
     }
 
     /// Returns the device that ran the image model, if it ran.
@@ -114,7 +139,10 @@ impl<'a> ViewStages<'a> {
             Some(n_slots) => Stage { name, n_slots, on_cpu: false },
             None => on_cpu(name),
         };
-        let embed_slots = (!self.plan.engines.session.is_on_cpu()).then_some(GPU_EMBED_SLOTS);
+        let embed_slots = match &self.encoders {
+            Encoders::OfViews(_) => None,
+            Encoders::Shared(_) => Some(SharedEncoders::n_views(&self.plan.settings.run.gpus)),
+        };
         let mut stages = vec![on_cpu("decode")];
         if self.plan.segmenter.wants_depth() {
             stages.push(on_device("depth", self.plan.scene.concurrency()));
@@ -179,7 +207,7 @@ impl<'a> ViewStages<'a> {
                 Next::Embed(crops, patches, partition)
             }
             Next::Embed(crops, patches, partition) => {
-                let mut vectors = self.embed(view, &crops, patches.as_ref())?;
+                let mut vectors = self.embed(view, crops, patches.as_ref())?;
                 if let Some(perturbation) = self.plan.engines.perturbation {
                     perturbation.vectors(&view.name, &mut vectors, self.plan.engines.models.dim());
                 }
@@ -254,33 +282,60 @@ impl<'a> ViewStages<'a> {
         Partition { raster_view, regions, masks_of_region, outlines, weight_scale }
     }
 
-    /// Returns a vector per mask, then one per patch, from an idle encoder or a new one.
-    fn embed(&self, view: &View, crops: &Crops, patches: Option<&Patches>) -> Result<Vec<f32>, EncodeError> {
-        if patches.is_none() && matches!(crops, Crops::Squares(crops) if crops.is_empty()) {
+    /// Returns a vector per mask, then one per patch.
+    fn embed(&self, view: &View, crops: Crops, patches: Option<&Patches>) -> Result<Vec<f32>, EncodeError> {
+        if patches.is_none() && matches!(&crops, Crops::Squares(crops) if crops.is_empty()) {
             return Ok(Vec::new());
         }
-        let encoders = || self.encoders.lock().unwrap_or_else(PoisonError::into_inner);
-        let free = encoders().pop();
-        let mut encoder = match free {
-            Some(encoder) => encoder,
-            None => self.plan.engines.models.image_encoder(self.plan.engines.session)?,
-        };
-        self.images_on.get_or_init(|| encoder.placement().map(ToString::to_string));
-        let mut vectors = match crops {
-            Crops::Squares(crops) => embed::embed_crops(crops, 0, encoder.as_mut()),
-            Crops::Uncut(loaded, masks) => {
-                let background = self.plan.settings.view.background;
-                embed::embed_masks(&loaded.image, masks, encoder.as_mut(), background, None)
+        let failed = |source| EncodeError::Embed { view: view.name.clone(), source };
+        match (&self.encoders, crops) {
+            (Encoders::OfViews(idle), crops) => {
+                let idle = || idle.lock().unwrap_or_else(PoisonError::into_inner);
+                let free = idle().pop();
+                let mut encoder = match free {
+                    Some(encoder) => encoder,
+                    None => self.plan.engines.models.image_encoder(self.plan.engines.session)?,
+                };
+                self.images_on.get_or_init(|| encoder.placement().map(ToString::to_string));
+                let vectors = self.embed_with(encoder.as_mut(), &crops, patches);
+                idle().push(encoder);
+                vectors.map_err(failed)
             }
-        };
-        if let (Ok(vectors), Some(Patches { photo, of })) = (&mut vectors, patches) {
-            match embed::embed_patches(photo, of, encoder.as_mut()) {
-                Ok(mut of_patches) => vectors.append(&mut of_patches),
-                Err(error) => return Err(EncodeError::Embed { view: view.name.clone(), source: error }),
+            (Encoders::Shared(encoders), Crops::Squares(crops)) => {
+                let mut vectors = encoders.embed(crops).map_err(|failure| match failure {
+                    embed::Failure::Model(error) => error.into(),
+                    embed::Failure::Embed(source) => failed(source),
+                })?;
+                if let Some(Patches { photo, of }) = patches {
+                    let of_patches =
+                        encoders.with_encoder(|encoder| embed::embed_patches(photo, of, encoder))?;
+                    vectors.append(&mut of_patches.map_err(failed)?);
+                }
+                Ok(vectors)
+            }
+            (Encoders::Shared(encoders), crops) => {
+                encoders.with_encoder(|encoder| self.embed_with(encoder, &crops, patches))?.map_err(failed)
             }
         }
-        encoders().push(encoder);
-        vectors.map_err(|source| EncodeError::Embed { view: view.name.clone(), source })
+    }
+
+    fn embed_with(
+        &self,
+        encoder: &mut dyn ImageEncoder,
+        crops: &Crops,
+        patches: Option<&Patches>,
+    ) -> Result<Vec<f32>, EmbedError> {
+        let mut vectors = match crops {
+            Crops::Squares(crops) => embed::embed_crops(crops, 0, encoder)?,
+            Crops::Uncut(loaded, masks) => {
+                let background = self.plan.settings.view.background;
+                embed::embed_masks(&loaded.image, masks, encoder, background, None)?
+            }
+        };
+        if let Some(Patches { photo, of }) = patches {
+            vectors.append(&mut embed::embed_patches(photo, of, encoder)?);
+        }
+        Ok(vectors)
     }
 }
 

@@ -86,7 +86,8 @@ fn run_open_views(
         .map(|(i, view)| (i < n_alone, Work::begin(view)));
     let skipped = Mutex::new(Vec::new());
     let list = stages.stages();
-    let reports = pipeline::run(&list, run.threads, source, |at, (is_alone, work)| {
+    let start = Instant::now();
+    let mut reports = pipeline::run(&list, run.threads, source, |at, (is_alone, work)| {
         let view = work.view();
         // The run's threads do the processor's work. Those that wait for a device or the disk must not hold one.
         let result = match list[at].on_cpu {
@@ -105,6 +106,10 @@ fn run_open_views(
             result => result.map(|work| Some((is_alone, work?))),
         }
     })?;
+    let wall_secs = start.elapsed().as_secs_f64();
+    for report in &mut reports {
+        report.add_gpus(stages.loads(&report.stage), wall_secs);
+    }
     if context.is_cancelled() {
         let n_done = plan.job.done_views()?.len();
         return Err(EncodeError::Interrupted { n_done, n_views: plan.order.len() });

@@ -6,6 +6,7 @@
 
 use std::borrow::Cow;
 use std::collections::HashMap;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 use slag_math::graph_segmentation::Components;
@@ -95,14 +96,23 @@ pub struct GraphSegmenter {
 #[derive(Debug)]
 struct ModelPool {
     options: SessionOptions,
+    /// The GPUs that instances are opened on, in turn.
+    gpus: Vec<u32>,
+    n_opened: AtomicUsize,
     idle: Mutex<Vec<Boundaries>>,
 }
 
 impl ModelPool {
+    fn open(&self) -> Result<Boundaries, SessionError> {
+        let n = self.n_opened.fetch_add(1, Ordering::Relaxed);
+        let gpu = self.gpus.get(n % self.gpus.len().max(1)).copied().unwrap_or_default();
+        Boundaries::open(&SessionOptions { gpu, ..self.options.clone() })
+    }
+
     fn boundaries(&self, image: &RgbImage) -> Result<Vec<f32>, SessionError> {
         let idle = || self.idle.lock().unwrap_or_else(PoisonError::into_inner);
         let taken = idle().pop();
-        let mut model = taken.map_or_else(|| Boundaries::open(&self.options), Ok)?;
+        let mut model = taken.map_or_else(|| self.open(), Ok)?;
         let boundaries = model.of(image);
         idle().push(model);
         boundaries
@@ -118,16 +128,25 @@ impl GraphSegmenter {
         Self { settings, identity, model: None }
     }
 
-    /// Creates a segmenter with the embedded model, which runs on one thread per image.
+    /// Creates a segmenter with the embedded model, which runs on one thread per image; `gpus`: those that share the
+    /// photos, where the session asks for GPUs.
     ///
     /// # Errors
     /// [`SessionError`] if ONNX Runtime does not load.
-    pub fn learnt(settings: GraphSettings, session: &SessionOptions) -> Result<Self, SessionError> {
+    pub fn learnt(
+        settings: GraphSettings,
+        session: &SessionOptions,
+        gpus: &[u32],
+    ) -> Result<Self, SessionError> {
         let options = SessionOptions { intra_op_threads: 1, ..session.clone() };
-        let idle = Mutex::new(vec![Boundaries::open(&options)?]);
+        let pool =
+            ModelPool { options, gpus: gpus.to_vec(), n_opened: AtomicUsize::new(0), idle: Mutex::default() };
+        // Now, so that a runtime that does not load is an error before the first photo.
+        let first = pool.open()?;
+        pool.idle.lock().unwrap_or_else(PoisonError::into_inner).push(first);
         let without = Self::new(settings);
         let identity = format!("{}, boundaries {}", without.identity, Boundaries::sha256());
-        Ok(Self { model: Some(ModelPool { options, idle }), identity, ..without })
+        Ok(Self { model: Some(pool), identity, ..without })
     }
 }
 

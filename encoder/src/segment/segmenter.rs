@@ -6,6 +6,7 @@ use slag_common::{Hash32, View};
 
 use super::error::SegmentError;
 use crate::ingest::{LoadedImage, Undistorter};
+use crate::lanes::GpuLoad;
 use crate::masks::Mask;
 
 /// Limit on the masks of one view: the total area of their boxes, one byte per pixel.
@@ -34,6 +35,11 @@ pub trait Segmenter: Sync {
     /// the caller's thread.
     fn concurrency(&self) -> Option<usize> {
         None
+    }
+
+    /// Returns the load of each GPU that runs its models; none on the processor.
+    fn loads(&self) -> Vec<GpuLoad> {
+        Vec::new()
     }
 
     /// Returns the masks of a photo; they may overlap.

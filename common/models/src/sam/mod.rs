@@ -30,12 +30,15 @@ use std::path::Path;
 use std::sync::{Mutex, PoisonError};
 
 use image::RgbImage;
+use ort::value::DynTensor;
 
-use crate::ModelError;
+use crate::bound::Place;
 use crate::description::FILE_NAME;
+use crate::device_memory::DeviceMemory;
 use crate::model_dir::{checked, sha256_of};
 use crate::preprocess::{Filter, Window, resample, values_of_levels};
 use crate::session::{Model, SessionError, SessionOptions, Tensor};
+use crate::{Floats, ModelError};
 use names::Names;
 
 pub use description::{SamDescription, SamFiles, SegmentDescription};
@@ -53,21 +56,36 @@ pub struct Sam {
     encoder: Mutex<Model>,
     decoder: Mutex<Model>,
     names: Names,
+    /// The memory of the GPU that runs both files, if one does: embeddings then stay there.
+    memory: Option<DeviceMemory>,
+    /// Prompts of every call of the decoder, where it was opened for one number of them.
+    prompts_per_call: Option<usize>,
 }
 
 /// The encoder's output for an image.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub struct Embedding {
     /// Tensors by the name of the decoder's input.
-    tensors: Vec<(String, Tensor)>,
+    tensors: Vec<(String, Held)>,
     /// Placement of the image in the encoder's square.
     pub letterbox: Letterbox,
 }
 
+/// Where a tensor of an embedding is.
+#[derive(Debug)]
+enum Held {
+    Host(Tensor),
+    /// On the GPU that the decoder runs on, too.
+    Device(DynTensor),
+}
+
 impl Embedding {
-    /// Returns the tensors: name of the decoder's input, shape, values.
+    /// Returns the tensors in the processor's memory: name of the decoder's input, shape, values.
     pub fn tensors(&self) -> impl Iterator<Item = (&str, &[i64], &[f32])> {
-        self.tensors.iter().map(|(name, tensor)| (name.as_str(), &tensor.shape[..], &tensor.values[..]))
+        self.tensors.iter().filter_map(|(name, held)| match held {
+            Held::Host(tensor) => Some((name.as_str(), &tensor.shape[..], &tensor.values[..])),
+            Held::Device(_) => None,
+        })
     }
 }
 
@@ -79,7 +97,7 @@ pub struct Decoded {
     /// The model's logit of each prompt that there is an object at all, `[prompts]`; empty if the model does not tell.
     pub object_logits: Vec<f32>,
     /// Logits of the whole square, padding included: `[prompts][MASKS_PER_PROMPT][rows][columns]`.
-    pub logits: Vec<f32>,
+    pub logits: Floats,
     /// Columns and rows of the logits.
     pub logits_px: [u32; 2],
 }
@@ -89,6 +107,17 @@ impl Sam {
     /// # Errors
     /// [`ModelError`] if a file is absent or not as described, or ONNX Runtime does not load.
     pub fn open(dir: &Path, options: &SessionOptions) -> Result<Self, ModelError> {
+        Self::open_for(dir, options, None)
+    }
+
+    /// Opens the directory `dir` with a decoder for `n_prompts` at a time, which is quicker on GPUs: fewer are filled up.
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn open_for(
+        dir: &Path,
+        options: &SessionOptions,
+        n_prompts: Option<usize>,
+    ) -> Result<Self, ModelError> {
         let path = dir.join(FILE_NAME);
         let description = SamDescription::read(&path)?;
         let files_root = dir.join(&description.files_root);
@@ -99,10 +128,17 @@ impl Sam {
                 id = format!("{id} {}", hex::encode(sha256_of(&files_root, part)?));
             }
         }
-        let encoder = Model::open(&checked(&files_root, &sam.image_encoder)?.into(), options)?;
-        let decoder = Model::open(&checked(&files_root, &sam.mask_decoder)?.into(), options)?;
+        let mut encoder = Model::open(&checked(&files_root, &sam.image_encoder)?.into(), options)?;
+        let decoder_file = checked(&files_root, &sam.mask_decoder)?.into();
+        let mut decoder = Model::open(&decoder_file, options)?;
         let size_px = u32::from(sam.size_px);
         let names = Names::discover(&encoder, &decoder, i64::from(size_px))?;
+        let mut prompts_per_call = None;
+        if let (Some(n), Some(dimension)) = (n_prompts, decoder.dimension(&names.points, 1)) {
+            decoder = Model::open_sized(&decoder_file, options, Some((&dimension, n as i64)))?;
+            prompts_per_call = Some(n);
+        }
+        let memory = encoder.take_memory().zip(decoder.take_memory()).map(|(memory, _)| memory);
         Ok(Self {
             id: format!("{id} {:?} {:?} {size_px} px", sam.mean, sam.std),
             size_px,
@@ -111,6 +147,8 @@ impl Sam {
             encoder: Mutex::new(encoder),
             decoder: Mutex::new(decoder),
             names,
+            memory,
+            prompts_per_call,
         })
     }
 
@@ -149,11 +187,24 @@ impl Sam {
     /// [`SessionError`] if the model fails.
     pub fn embed(&self, image: &RgbImage) -> Result<Embedding, SessionError> {
         let (size, pixels) = (i64::from(self.size_px), self.pixel_values(image));
+        let shape = vec![1, 3, size, size];
+        let (name, links) = (self.names.pixels.as_str(), &self.names.embeddings);
         let mut encoder = self.encoder.lock().unwrap_or_else(PoisonError::into_inner);
-        let input = encoder.tensor(vec![1, 3, size, size], &pixels)?;
-        let links = &self.names.embeddings;
-        let outputs: Vec<_> = links.iter().map(|link| (link.output.as_str(), &link.shape[..])).collect();
-        let found = encoder.run_all(vec![(self.names.pixels.as_str(), input)], &outputs)?;
+        let found: Vec<Held> = match &self.memory {
+            Some(memory) => {
+                let input = encoder.owned(shape, pixels)?;
+                let outputs: Vec<_> =
+                    links.iter().map(|link| (link.output.as_str(), Place::Device)).collect();
+                let found = encoder.run_bound(memory, &[(name, &input)], &outputs)?;
+                found.into_iter().map(Held::Device).collect()
+            }
+            None => {
+                let input = encoder.tensor(shape, &pixels)?;
+                let outputs: Vec<_> =
+                    links.iter().map(|link| (link.output.as_str(), &link.shape[..])).collect();
+                encoder.run_all(vec![(name, input)], &outputs)?.into_iter().map(Held::Host).collect()
+            }
+        };
         let inputs = links.iter().map(|link| link.input.clone());
         Ok(Embedding { tensors: inputs.zip(found).collect(), letterbox: self.letterbox_of(image) })
     }
@@ -172,12 +223,24 @@ impl Sam {
         labels: &[i64],
     ) -> Result<Decoded, SessionError> {
         let mut decoder = self.decoder.lock().unwrap_or_else(PoisonError::into_inner);
-        let per_call = if self.names.is_one_by_one { 1 } else { n_prompts.max(1) };
+        let per_call = match self.names.is_one_by_one {
+            true => 1,
+            false => self.prompts_per_call.unwrap_or(n_prompts).max(1),
+        };
         let n_points = points.len() / n_prompts.max(1);
         let mut decoded = Decoded::default();
         let calls = points.chunks(per_call * n_points.max(1)).zip(labels.chunks(per_call * n_points.max(1)));
         for (points, labels) in calls {
-            decoded.append(self.decode_call(&mut decoder, embedding, n_points, (points, labels))?);
+            let missing = self.prompts_per_call.map_or(0, |n| n * n_points - points.len());
+            if missing == 0 {
+                decoded.append(self.decode_call(&mut decoder, embedding, n_points, (points, labels))?);
+                continue;
+            }
+            let points: Vec<_> = points.iter().chain(points.iter().cycle().take(missing)).copied().collect();
+            let labels: Vec<_> = labels.iter().chain(labels.iter().cycle().take(missing)).copied().collect();
+            let mut found = self.decode_call(&mut decoder, embedding, n_points, (&points, &labels))?;
+            found.truncate(per_call - missing / n_points.max(1));
+            decoded.append(found);
         }
         Ok(decoded)
     }
@@ -193,21 +256,44 @@ impl Sam {
         let n = (points.len() / n_points.max(1)) as i64;
         let n_points = n_points as i64;
         let names = &self.names;
-        let mut inputs = vec![
-            (names.points.as_str(), decoder.tensor(vec![1, n, n_points, 2], points.as_flattened())?),
-            (names.labels.as_str(), decoder.tensor(vec![1, n, n_points], labels)?),
-        ];
-        if let Some(boxes) = &names.boxes {
-            inputs.push((boxes.as_str(), decoder.tensor::<f32>(vec![1, 0, 4], &[])?));
-        }
-        for (name, tensor) in &embedding.tensors {
-            inputs.push((name.as_str(), decoder.tensor(tensor.shape.clone(), &tensor.values)?));
-        }
         let n_masks = MASKS_PER_PROMPT as i64;
         let (scores, masks, objects) = (&[1, n, n_masks][..], &[1, n, n_masks, -1, -1][..], &[1, n, 1][..]);
         let mut outputs = vec![(names.scores.as_str(), scores), (names.masks.as_str(), masks)];
         outputs.extend(names.objects.iter().map(|name| (name.as_str(), objects)));
-        let mut found = decoder.run_all(inputs, &outputs)?.into_iter();
+        let (points_shape, labels_shape) = (vec![1, n, n_points, 2], vec![1, n, n_points]);
+        let found = match &self.memory {
+            Some(memory) => {
+                let points = decoder.owned(points_shape, points.as_flattened().to_vec())?;
+                let labels = decoder.owned(labels_shape, labels.to_vec())?;
+                let boxes = decoder.owned::<f32>(vec![1, 0, 4], Vec::new())?;
+                let mut inputs = vec![(names.points.as_str(), &points), (names.labels.as_str(), &labels)];
+                inputs.extend(names.boxes.iter().map(|name| (name.as_str(), &boxes)));
+                inputs.extend(embedding.tensors.iter().filter_map(|(name, held)| match held {
+                    Held::Device(value) => Some((name.as_str(), value)),
+                    Held::Host(_) => None,
+                }));
+                let places: Vec<_> = outputs.iter().map(|(name, _)| (*name, Place::Host)).collect();
+                let found = decoder.run_bound(memory, &inputs, &places)?;
+                let floats = |(value, (name, shape)): (DynTensor, &(&str, &[i64]))| {
+                    decoder.floats(Some(value), name, shape)
+                };
+                found.into_iter().zip(&outputs).map(floats).collect::<Result<Vec<_>, _>>()?
+            }
+            None => {
+                let mut inputs = vec![
+                    (names.points.as_str(), decoder.tensor(points_shape, points.as_flattened())?),
+                    (names.labels.as_str(), decoder.tensor(labels_shape, labels)?),
+                ];
+                if let Some(boxes) = &names.boxes {
+                    inputs.push((boxes.as_str(), decoder.tensor::<f32>(vec![1, 0, 4], &[])?));
+                }
+                for (name, shape, values) in embedding.tensors() {
+                    inputs.push((name, decoder.tensor(shape.to_vec(), values)?));
+                }
+                decoder.run_all(inputs, &outputs)?
+            }
+        };
+        let mut found = found.into_iter();
         let mut next = || found.next().unwrap_or_default();
         let (scores, masks, objects) = (next(), next(), next());
         let logits_px = [masks.shape[4] as u32, masks.shape[3] as u32];
@@ -218,17 +304,82 @@ impl Sam {
                 decoder.layout_error(format!("masks are {} x {} px", logits_px[0], logits_px[1]), expected)
             );
         }
-        let (predicted_ious, logits, object_logits) = (scores.values, masks.values, objects.values);
-        Ok(Decoded { predicted_ious, object_logits, logits, logits_px })
+        Ok(Decoded {
+            predicted_ious: scores.values.into_vec(),
+            object_logits: objects.values.into_vec(),
+            logits: masks.values,
+            logits_px,
+        })
     }
 }
 
 impl Decoded {
+    /// Keeps the output for the first `n` prompts.
+    fn truncate(&mut self, n: usize) {
+        let n_masks = n * MASKS_PER_PROMPT;
+        self.predicted_ious.truncate(n_masks);
+        self.object_logits.truncate(n);
+        let mut logits = std::mem::take(&mut self.logits).into_vec();
+        logits.truncate(n_masks * self.logits_px[0] as usize * self.logits_px[1] as usize);
+        self.logits = logits.into();
+    }
+
     /// Appends the output for further prompts of the same image.
     fn append(&mut self, mut more: Self) {
         self.predicted_ious.append(&mut more.predicted_ious);
         self.object_logits.append(&mut more.object_logits);
-        self.logits.append(&mut more.logits);
+        self.logits = match self.logits.is_empty() {
+            true => more.logits,
+            false => {
+                let mut logits = std::mem::take(&mut self.logits).into_vec();
+                logits.extend_from_slice(&more.logits);
+                logits.into()
+            }
+        };
         self.logits_px = more.logits_px;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Tensors that stay in place between the two files give the same bits as copies of them.
+    #[slag_test_support::needs_shared]
+    #[test]
+    fn bound_tensors_give_the_same_masks() {
+        let options = SessionOptions::new(slag_test_support::onnx_runtime());
+        let dir = tempfile::tempdir().expect("a folder");
+        for file in ["vision_encoder.onnx", "prompt_encoder_mask_decoder.onnx"] {
+            let from = slag_test_support::shared("models/sam_tiny").join(file);
+            fs_err::copy(from, dir.path().join(file)).expect("copies");
+        }
+        let description = "name = 'tiny'\nlicence = 'MIT'\n[segment]\nkind = 'sam'\n\
+                           image_encoder = { path = 'vision_encoder.onnx' }\n\
+                           mask_decoder = { path = 'prompt_encoder_mask_decoder.onnx' }\n";
+        fs_err::write(dir.path().join(FILE_NAME), description).expect("writes");
+        let mut sam = Sam::open(dir.path(), &options).expect("opens");
+        let image = RgbImage::from_fn(90, 61, |x, y| image::Rgb([x as u8 * 2, y as u8 * 4, (x * y) as u8]));
+        let decoded = |sam: &Sam| {
+            let embedding = sam.embed(&image).expect("runs");
+            let points = [[10.0, 20.0], [200.0, 90.0], [77.5, 31.25]].map(|at| embedding.letterbox.point(at));
+            sam.decode(&embedding, 3, &points, &[1; 3]).expect("runs")
+        };
+        let plain = decoded(&sam);
+        assert!(plain.logits.iter().any(|logit| *logit > 0.0) && plain.predicted_ious.len() == 9);
+        sam.memory = Some(DeviceMemory::of_processor());
+        assert!(decoded(&sam) == plain);
+        // A decoder for two prompts runs twice, the second time filled up.
+        let mut sam = Sam::open_for(dir.path(), &options, Some(2)).expect("opens");
+        assert_eq!(sam.prompts_per_call, Some(2));
+        for memory in [None, Some(DeviceMemory::of_processor())] {
+            sam.memory = memory;
+            let found = decoded(&sam);
+            assert_eq!(found.logits.len(), plain.logits.len());
+            let pairs = found.logits.iter().zip(&*plain.logits);
+            let others = found.predicted_ious.iter().zip(&plain.predicted_ious);
+            let off = pairs.chain(others).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(off < 1e-4, "{off}");
+        }
     }
 }

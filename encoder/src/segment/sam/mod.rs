@@ -16,7 +16,7 @@ mod tests;
 mod upsample;
 
 use std::path::Path;
-use std::sync::mpsc;
+use std::sync::{Arc, mpsc};
 
 use image::imageops;
 use slag_models::sam::{Decoded, Sam};
@@ -24,6 +24,7 @@ use slag_models::{ModelError, SessionOptions};
 
 use super::error::SegmentError;
 use super::segmenter::{MAX_MASK_BYTES, SegmentInput, Segmenter};
+use crate::lanes::{GpuLoad, Lanes};
 use crate::masks::{BoxPx, Mask};
 use candidate::Candidate;
 use filter::Filters;
@@ -31,36 +32,65 @@ use upsample::Upsampler;
 
 pub use settings::{SamLevels, SamSettings, ScoreFilter};
 
+/// Opened models on each GPU: while the masks of some photos are filtered, the GPU has others.
+const MODELS_PER_GPU: usize = 2;
+
+/// Photos at a time in an opened model: one is embedded while the points of another are decoded.
+const PHOTOS_PER_MODEL: usize = 2;
+
 /// Finds masks with SAM.
 #[derive(Debug)]
 pub struct SamSegmenter {
-    sam: Sam,
+    lanes: Lanes<Arc<Sam>>,
+    is_on_gpus: bool,
     settings: SamSettings,
     identity: String,
 }
 
 impl SamSegmenter {
-    /// Opens a model directory with a `[segment]` section in `model.toml`.
+    /// Opens a model directory with a `[segment]` section in `model.toml`; `gpus`: those that share the photos, where the
+    /// session asks for GPUs.
     ///
     /// # Errors
     /// [`ModelError`] if a file is missing or does not match its description, or ONNX Runtime does not load.
-    pub fn open(dir: &Path, settings: SamSettings, session: &SessionOptions) -> Result<Self, ModelError> {
-        let sam = Sam::open(dir, session)?;
+    pub fn open(
+        dir: &Path,
+        settings: SamSettings,
+        session: &SessionOptions,
+        gpus: &[u32],
+    ) -> Result<Self, ModelError> {
+        let is_on_gpus = !session.is_on_cpu();
+        let (gpus, n_models) = if is_on_gpus { (gpus, MODELS_PER_GPU) } else { (&[0][..], 1) };
+        let mut id = String::new();
+        let mut of_gpus = Vec::new();
+        for &gpu in gpus {
+            let mut models = Vec::new();
+            for _ in 0..n_models {
+                let session = SessionOptions { gpu, ..session.clone() };
+                let sam =
+                    Sam::open_for(dir, &session, is_on_gpus.then_some(settings.points_per_batch as usize))?;
+                sam.id().clone_into(&mut id);
+                models.push(Arc::new(sam));
+            }
+            // The first of each model, then the second.
+            of_gpus.push((gpu, models.iter().cloned().cycle().take(n_models * PHOTOS_PER_MODEL).collect()));
+        }
         // The number of threads may change the order of sums in matrix products.
-        let identity = format!("{} {settings:?} on {} threads", sam.id(), session.intra_op_threads);
-        Ok(Self { sam, settings, identity })
+        let identity = format!("{id} {settings:?} on {} threads", session.intra_op_threads);
+        Ok(Self { lanes: Lanes::new(of_gpus), is_on_gpus, settings, identity })
     }
 
     /// Returns the masks of one crop, in pixels of the image, by list.
     fn masks_of_crop(
         &self,
+        sam: &Sam,
         input: &SegmentInput<'_>,
         (crop, layer): (BoxPx, u32),
         filters: Filters<'_>,
     ) -> Result<Vec<Vec<Candidate>>, SegmentError> {
         let (width_px, height_px) = (crop.width_px(), crop.height_px());
         let cropped = imageops::crop_imm(input.image, crop.x0, crop.y0, width_px, height_px).to_image();
-        let embedding = self.sam.embed(&cropped)?;
+        let embedding = sam.embed(&cropped)?;
         let SamSettings { points_per_side, points_per_batch, crop_points_divisor, .. } = self.settings;
         let n_per_side = (points_per_side / crop_points_divisor.saturating_pow(layer)).max(1);
         let points = points::grid(n_per_side, width_px, height_px);
@@ -84,7 +114,7 @@ impl SamSegmenter {
                 Some(found)
             });
             for batch in points.chunks(points_per_batch as usize) {
-                let decoded = self.sam.decode(&embedding, batch.len(), batch, &labels[..batch.len()])?;
+                let decoded = sam.decode(&embedding, batch.len(), batch, &labels[..batch.len()])?;
                 if sender.send(decoded).is_err() {
                     break;
                 }
@@ -106,9 +136,13 @@ impl Segmenter for SamSegmenter {
         self.identity.clone()
     }
 
-    /// One image is embedded while the points of another are decoded; the model has its own threads.
+    /// The models have their own threads.
     fn concurrency(&self) -> Option<usize> {
-        Some(2)
+        Some(self.lanes.len())
+    }
+
+    fn loads(&self) -> Vec<GpuLoad> {
+        if self.is_on_gpus { self.lanes.loads() } else { Vec::new() }
     }
 
     fn segment(&self, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError> {
@@ -117,12 +151,14 @@ impl Segmenter for SamSegmenter {
         let crops = points::crops(width_px, height_px, self.settings.crop_layers, self.settings.crop_overlap);
         let mut found = vec![Vec::new(); self.settings.levels.lists().len()];
         let mut left_bytes = MAX_MASK_BYTES;
+        let sam = self.lanes.take();
         for &crop in &crops {
-            let of_crop = self.masks_of_crop(input, crop, filters)?;
+            let of_crop = self.masks_of_crop(&sam, input, crop, filters)?;
             let len_bytes: u64 = of_crop.iter().flatten().map(|candidate| candidate.mask.len_bytes()).sum();
             left_bytes = left_bytes.checked_sub(len_bytes).ok_or_else(|| too_many(input))?;
             found.iter_mut().zip(of_crop).for_each(|(list, of_crop)| list.extend(of_crop));
         }
+        drop(sam);
         let unique = |list| filters.unique_in_image(list, crops.len());
         let kept: Vec<Candidate> = input.install(|| found.into_iter().flat_map(unique).collect());
         let area = |b: BoxPx| u64::from(b.width_px()) * u64::from(b.height_px());

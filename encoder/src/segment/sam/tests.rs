@@ -87,7 +87,7 @@ fn blobs(n: usize, seed: u64, extent: [f64; 2]) -> Vec<Blob> {
 fn decoded(blobs: &[Blob]) -> Decoded {
     Decoded {
         predicted_ious: blobs.iter().map(|blob| blob.predicted_iou).collect(),
-        logits: blobs.iter().flat_map(logits).collect(),
+        logits: blobs.iter().flat_map(logits).collect::<Vec<_>>().into(),
         logits_px: [LOGITS_PX; 2],
         object_logits: Vec::new(),
     }
@@ -443,7 +443,8 @@ fn crops_equal_a_plain_recomputation() {
 
 fn tiny(settings: SamSettings) -> SamSegmenter {
     let session = SessionOptions::new(onnx_runtime());
-    SamSegmenter::open(&workspace_root().join("tests/models/sam_tiny"), settings, &session).expect("it opens")
+    SamSegmenter::open(&workspace_root().join("tests/models/sam_tiny"), settings, &session, &[0])
+        .expect("it opens")
 }
 
 fn array<T: npyz::Deserialize>(npz: &Path, name: &str) -> (Vec<u64>, Vec<T>) {
@@ -461,10 +462,11 @@ fn enlarged_masks_equal_the_recorded_ones() {
     let golden = shared("models/sam_tiny/golden.npz");
     let (shape, levels) = array::<u8>(&golden, "image");
     let photo = image::RgbImage::from_raw(shape[1] as u32, shape[0] as u32, levels).expect("RGB");
-    let embedding = segmenter.sam.embed(&photo).expect("it runs");
+    let embedding = segmenter.lanes.take().embed(&photo).expect("it runs");
     let (_, points) = array::<f32>(&golden, "input_points");
     let (_, labels) = array::<i64>(&golden, "input_labels");
-    let decoded = segmenter.sam.decode(&embedding, 3, points.as_chunks::<2>().0, &labels).expect("it runs");
+    let decoded =
+        segmenter.lanes.take().decode(&embedding, 3, points.as_chunks::<2>().0, &labels).expect("it runs");
     let (shape, recorded) = array::<u8>(&golden, "masks_original_size");
     let upsampler = Upsampler::new(&embedding.letterbox, decoded.logits_px);
     let n_logits = (decoded.logits_px[0] * decoded.logits_px[1]) as usize;

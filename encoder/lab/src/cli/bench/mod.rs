@@ -2,6 +2,7 @@
 
 mod codec;
 mod field;
+mod inference;
 mod lift;
 mod partition;
 mod raster;
@@ -21,6 +22,8 @@ pub enum BenchCommand {
     Codec(codec::CodecBenchArgs),
     /// Publishes a store of a generated field for `slag-edge bench query`.
     Field(field::FieldBenchArgs),
+    /// Times image models and Segment Anything on GPUs, as `encode` runs them.
+    Inference(inference::InferenceArgs),
     /// Times the weights of a view: each device on generated scenes, or on a recorded one.
     Raster(raster::RasterBenchArgs),
     /// Times the way from the contributions of all views to embeddings, on a synthetic scene.
@@ -37,6 +40,7 @@ pub(super) fn run(command: &BenchCommand, progress: &dyn Progress, json: bool) -
     match command {
         BenchCommand::Codec(args) => codec::run(args, json),
         BenchCommand::Field(args) => field::run(args, progress),
+        BenchCommand::Inference(args) => inference::run(args, json),
         BenchCommand::Raster(args) => raster::run(args, progress, json),
         BenchCommand::Lift(args) => lift::run(args, json),
         BenchCommand::Partition(args) => partition::run(args, progress, json),

@@ -8,7 +8,7 @@ use crate::segment::SegmentInput;
 fn open(settings: SamSettings) -> SamSegmenter {
     let session = SessionOptions::new(onnx_runtime());
     let dir = workspace_root().join("tests/models/sam2_tiny");
-    SamSegmenter::open(&dir, settings, &session).expect("it opens")
+    SamSegmenter::open(&dir, settings, &session, &[0]).expect("it opens")
 }
 
 fn photo() -> image::RgbImage {
@@ -50,8 +50,9 @@ fn masks_are_those_of_prompts_with_an_object() {
     let golden = workspace_root().join("tests/models/sam2_tiny/golden.npz");
     let (_, objects) = array::<f32>(&golden, "object_score_logits");
     let (_, points) = array::<f32>(&golden, "points");
-    let embedding = segmenter.sam.embed(&photo).expect("it runs");
-    let decoded = segmenter.sam.decode(&embedding, 9, points.as_chunks::<2>().0, &[1; 9]).expect("it runs");
+    let embedding = segmenter.lanes.take().embed(&photo).expect("it runs");
+    let decoded =
+        segmenter.lanes.take().decode(&embedding, 9, points.as_chunks::<2>().0, &[1; 9]).expect("it runs");
     let size = [photo.width() as usize, photo.height() as usize];
     let mut expected: Vec<(u8, Vec<bool>)> = Vec::new();
     for (k, logits) in decoded.logits.chunks_exact(64 * 64).enumerate() {
@@ -80,10 +81,10 @@ fn masks_are_enlarged_in_one_step() {
     let segmenter = open(all(3));
     let golden = workspace_root().join("tests/models/sam2_tiny/golden.npz");
     let photo = photo();
-    let embedding = segmenter.sam.embed(&photo).expect("it runs");
+    let embedding = segmenter.lanes.take().embed(&photo).expect("it runs");
     let (_, points) = array::<f32>(&golden, "points");
     let decoded =
-        segmenter.sam.decode(&embedding, 1, &points.as_chunks::<2>().0[..1], &[1]).expect("it runs");
+        segmenter.lanes.take().decode(&embedding, 1, &points.as_chunks::<2>().0[..1], &[1]).expect("it runs");
     let (shape, expected) = array::<f32>(&golden, "first_masks_enlarged_sub3");
     let upsampler = Upsampler::new(&embedding.letterbox, decoded.logits_px);
     let mut n_inside = 0;

@@ -1,0 +1,114 @@
+//! Turns squares of 8-bit levels into pixel values on the GPU that the image model runs on.
+//!
+//! A byte a value crosses to the GPU, where it becomes two or four; the processor only copies rows of bytes.
+
+use std::path::Path;
+
+use half::f16;
+use image::RgbImage;
+use ort::value::DynTensor;
+
+use crate::ModelFile;
+use crate::bound::Place;
+use crate::device_memory::DeviceMemory;
+use crate::floats::bytes_mut;
+use crate::preprocess::Preprocess;
+use crate::session::{Model, SessionError, SessionOptions};
+
+/// `embedded/levels.py` makes them.
+const F16: &[u8] = include_bytes!("../embedded/levels_f16.onnx");
+const F32: &[u8] = include_bytes!("../embedded/levels_f32.onnx");
+
+/// A batch of squares that a GPU turns into pixel values.
+#[derive(Debug)]
+pub(crate) struct Levels {
+    model: Model,
+    /// `[batch][size_px][size_px][3]`, u8; reused by every batch.
+    squares: DynTensor,
+    /// Bytes of a square.
+    square_bytes: usize,
+    scale: DynTensor,
+    offset: DynTensor,
+}
+
+impl Levels {
+    /// Opens the conversion for batches of `batch` squares; `is_f16`: the type of pixel values.
+    pub(crate) fn open(
+        batch: usize,
+        preprocess: &Preprocess,
+        is_f16: bool,
+        memory: &DeviceMemory,
+        options: &SessionOptions,
+    ) -> Result<Self, SessionError> {
+        let (name, bytes) = if is_f16 { ("levels_f16.onnx", F16) } else { ("levels_f32.onnx", F32) };
+        let model = Model::open(&ModelFile::embedded(Path::new(name), bytes), options)?;
+        let size = i64::from(preprocess.size_px());
+        let shape = [batch as i64, size, size, 3];
+        let squares = memory.bytes(model.session(), &shape).map_err(|cause| model.run_error(cause))?;
+        let of_channels = |values: [f32; 3]| match is_f16 {
+            true => model.owned(vec![3, 1, 1], values.map(f16::from_f32).to_vec()),
+            false => model.owned(vec![3, 1, 1], values.to_vec()),
+        };
+        let (scale, offset) = preprocess.scale_and_offset();
+        let (scale, offset) = (of_channels(scale)?, of_channels(offset)?);
+        Ok(Self { squares, square_bytes: (3 * size * size) as usize, model, scale, offset })
+    }
+
+    /// Returns the pixel values of a whole batch, `[batch][3][size_px][size_px]`, on the GPU. Places beyond `squares` have
+    /// any values: every batch has one shape, so that a vector does not depend on how many others are computed with it.
+    pub(crate) fn values<'a>(
+        &mut self,
+        memory: &DeviceMemory,
+        squares: impl Iterator<Item = std::borrow::Cow<'a, RgbImage>>,
+    ) -> Result<DynTensor, SessionError> {
+        let failed = |cause| SessionError::Run { path: self.model.path().to_owned(), cause };
+        let places = bytes_mut(&mut self.squares).map_err(failed)?.chunks_exact_mut(self.square_bytes);
+        places.zip(squares).for_each(|(place, square)| place.copy_from_slice(square.as_raw()));
+        let inputs = [("levels", &self.squares), ("scale", &self.scale), ("offset", &self.offset)];
+        let mut found = self.model.run_bound(memory, &inputs, &[("values", Place::Device)])?;
+        Ok(found.swap_remove(0))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::borrow::Cow;
+
+    use super::*;
+    use crate::floats::Floats;
+    use crate::preprocess::{Filter, Resize};
+
+    /// Oracle: the table of values by level, which the processor's way uses. In 16 bits a value of up to 4 is off by half
+    /// a unit in its last place (0.001), and so are scale times level and offset.
+    #[test]
+    fn levels_become_the_pixel_values_of_the_table() {
+        let preprocess = Preprocess::new(
+            16,
+            Resize::ShortestEdge,
+            Filter::Bicubic,
+            [0.481_454_66, 0.457_827_5, 0.408_210_73],
+            [0.268_629_54, 0.261_302_58, 0.275_777_11],
+        );
+        let square = |k: usize| {
+            RgbImage::from_fn(16, 16, |x, y| {
+                image::Rgb(std::array::from_fn(|c| (x as usize * 16 + y as usize + 89 * (k + c)) as u8))
+            })
+        };
+        let options = SessionOptions::new(slag_test_support::onnx_runtime());
+        let memory = DeviceMemory::of_processor();
+        for (is_f16, tolerance) in [(false, 1e-6), (true, 4e-3)] {
+            let mut levels = Levels::open(3, &preprocess, is_f16, &memory, &options).expect("opens");
+            // The second batch is not full, and must not be mixed up with the first.
+            for batch in [vec![0, 1, 2], vec![5, 6]] {
+                let squares = batch.iter().map(|k| Cow::Owned(square(*k)));
+                let (shape, found) =
+                    Floats::of(levels.values(&memory, squares).expect("runs")).expect("readable");
+                assert_eq!(shape, [3, 3, 16, 16]);
+                let mut expected = Vec::new();
+                batch.iter().for_each(|k| preprocess.append_pixel_values(&square(*k), &mut expected));
+                let off = expected.iter().zip(&*found).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+                assert!(off <= tolerance, "f16: {is_f16}, off by {off}");
+            }
+        }
+    }
+}

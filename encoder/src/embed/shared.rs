@@ -1,0 +1,344 @@
+//! Crops of several views in common batches, for image models on GPUs.
+//!
+//! A GPU is quickest with hundreds of crops at once, more than one view has. Views leave their crops in a queue; whoever
+//! waits for vectors runs the next batch on a free lane, with crops of whichever views, until its own are done. Nobody
+//! waits for a batch to be full: while the lanes are at work the queue grows, and batches with it.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+
+use slag_models::{Crop, ImageEncoder, InferenceError, ModelError};
+
+use super::EmbedError;
+use crate::lanes::{GpuLoad, Lane, Lanes};
+use crate::memory::{MemoryPlan, Phase};
+
+/// Lanes of a GPU: one computes, one copies, one is filled.
+const LANES_PER_GPU: usize = 3;
+
+/// Views that may wait for each lane: with a usual number of masks they fill two batches.
+const VIEWS_PER_LANE: usize = 12;
+/// Crops of so many views, or of fewer with many masks.
+const CROPS_PER_LANE: u64 = 512;
+
+/// Opens an image encoder on a GPU.
+pub type OpenEncoder<'a> = dyn Fn(u32) -> Result<Box<dyn ImageEncoder>, ModelError> + Sync + 'a;
+
+/// Image encoders on GPUs that work off the crops of all views.
+pub struct SharedEncoders<'a> {
+    open: Box<OpenEncoder<'a>>,
+    /// Encoders are opened where they are first needed.
+    lanes: Lanes<Option<Box<dyn ImageEncoder>>>,
+    queue: Mutex<Queue>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct Queue {
+    waiting: VecDeque<Waiting>,
+    /// By number of the request.
+    requests: BTreeMap<u64, Request>,
+    next_request: u64,
+    /// Whether a batch ended in a panic, and its crops with it.
+    is_abandoned: bool,
+}
+
+struct Waiting {
+    crop: Crop,
+    request: u64,
+    /// Its place among the request's crops.
+    at: usize,
+}
+
+struct Request {
+    vectors: Vec<Vec<f32>>,
+    n_left: usize,
+    error: Option<Failure>,
+}
+
+/// Reason why crops could not be embedded.
+#[derive(Debug, thiserror::Error)]
+pub enum Failure {
+    /// The model does not open.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// The model fails on these crops.
+    #[error(transparent)]
+    Embed(#[from] EmbedError),
+}
+
+impl<'a> SharedEncoders<'a> {
+    /// Returns encoders for the GPUs; `open` is called once a lane.
+    pub fn new(gpus: &[u32], open: Box<OpenEncoder<'a>>) -> Self {
+        Self::with_lanes(gpus, LANES_PER_GPU, open)
+    }
+
+    /// Returns encoders with a number of lanes on each GPU.
+    pub fn with_lanes(gpus: &[u32], n_lanes: usize, open: Box<OpenEncoder<'a>>) -> Self {
+        let lanes = Lanes::new(gpus.iter().map(|gpu| (*gpu, (0..n_lanes).map(|_| None).collect())));
+        Self { open, lanes, queue: Mutex::default(), changed: Condvar::new() }
+    }
+
+    /// Returns the number of views that should wait at once for the lanes to be at work.
+    pub fn n_views(gpus: &[u32]) -> usize {
+        gpus.len() * LANES_PER_GPU * VIEWS_PER_LANE
+    }
+
+    /// Reserves the squares that wait, each of `square_bytes`.
+    pub fn reserve(memory: &mut MemoryPlan, gpus: &[u32], square_bytes: u64) {
+        let n = gpus.len() as u64 * LANES_PER_GPU as u64 * CROPS_PER_LANE;
+        memory.reserve(Phase::Views, "crops that wait for GPUs", n * square_bytes);
+    }
+
+    /// Returns the load of each GPU.
+    pub fn loads(&self) -> Vec<GpuLoad> {
+        self.lanes.loads()
+    }
+
+    fn queue(&self) -> MutexGuard<'_, Queue> {
+        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes a lane for work of the caller's own.
+    ///
+    /// # Errors
+    /// [`ModelError`] if the model does not open.
+    pub fn with_encoder<T>(&self, work: impl FnOnce(&mut dyn ImageEncoder) -> T) -> Result<T, ModelError> {
+        let mut lane = self.lanes.take();
+        let result = self.opened(&mut lane).map(work);
+        drop(lane);
+        self.wake();
+        result
+    }
+
+    /// Wakes those who wait for a lane or for vectors.
+    fn wake(&self) {
+        // With the lock, so that nobody is between looking and waiting.
+        let queue = self.queue();
+        self.changed.notify_all();
+        drop(queue);
+    }
+
+    fn opened<'l>(
+        &self,
+        lane: &'l mut Lane<'_, Option<Box<dyn ImageEncoder>>>,
+    ) -> Result<&'l mut dyn ImageEncoder, ModelError> {
+        if lane.is_none() {
+            **lane = Some((self.open)(lane.gpu())?);
+        }
+        Ok(lane.as_mut().expect("opened").as_mut())
+    }
+
+    /// Returns a unit vector per crop, `[crops][dim]`.
+    ///
+    /// # Errors
+    /// [`Failure`]; crops of other views are not affected.
+    pub fn embed(&self, crops: Vec<Crop>) -> Result<Vec<f32>, Failure> {
+        if crops.is_empty() {
+            return Ok(Vec::new());
+        }
+        let mut queue = self.queue();
+        let own = queue.next_request;
+        queue.next_request += 1;
+        let (vectors, n_left) = (vec![Vec::new(); crops.len()], crops.len());
+        queue.requests.insert(own, Request { vectors, n_left, error: None });
+        queue.waiting.extend(crops.into_iter().enumerate().map(|(at, crop)| Waiting {
+            crop,
+            request: own,
+            at,
+        }));
+        loop {
+            if queue.requests.get(&own).is_none_or(|request| request.n_left == 0) {
+                let done = queue.requests.remove(&own);
+                drop(queue);
+                return match done {
+                    Some(Request { error: Some(error), .. }) => Err(error),
+                    done => Ok(done.map(|request| request.vectors.concat()).unwrap_or_default()),
+                };
+            }
+            // The panic that lost the crops is passed on by the thread that had it.
+            assert!(!queue.is_abandoned, "a batch of crops was lost");
+            let lane = if queue.waiting.is_empty() { None } else { self.lanes.try_take() };
+            let Some(mut lane) = lane else {
+                queue = self.changed.wait(queue).unwrap_or_else(PoisonError::into_inner);
+                continue;
+            };
+            drop(queue);
+            let lost = Lost(self);
+            let done = self.run_batch(&mut lane);
+            drop(lane);
+            std::mem::forget(lost);
+            queue = self.queue();
+            queue.keep(done);
+            self.changed.notify_all();
+        }
+    }
+
+    /// Runs the crops at the head of the queue, at most a batch.
+    fn run_batch(&self, lane: &mut Lane<'_, Option<Box<dyn ImageEncoder>>>) -> Vec<Done> {
+        let encoder = match self.opened(lane) {
+            Ok(encoder) => encoder,
+            // The crops at the head wait for it in vain; all others find the same.
+            Err(error) => {
+                let Some(Waiting { request, at, .. }) = self.queue().waiting.pop_front() else {
+                    return Vec::new();
+                };
+                return vec![Done { request, at, result: Err(error.into()) }];
+            }
+        };
+        let batch: Vec<Waiting> = {
+            let mut queue = self.queue();
+            let n = queue.waiting.len().min(encoder.preferred_batch());
+            queue.waiting.drain(..n).collect()
+        };
+        if batch.is_empty() {
+            return Vec::new();
+        }
+        let dim = encoder.dim();
+        let (crops, places): (Vec<Crop>, Vec<(u64, usize)>) =
+            batch.into_iter().map(|waiting| (waiting.crop, (waiting.request, waiting.at))).unzip();
+        if let Ok(vectors) = encoder.encode(&crops) {
+            let done = |((request, at), vector): ((u64, usize), &[f32])| Done {
+                request,
+                at,
+                result: Ok(vector.to_vec()),
+            };
+            return places.into_iter().zip(vectors.chunks_exact(dim)).map(done).collect();
+        }
+        // One by one, so that only the view of a bad crop fails.
+        let alone = |((request, at), crop): ((u64, usize), &Crop)| {
+            let result = encoder.encode(std::slice::from_ref(crop));
+            let failed = |cause: InferenceError| {
+                Failure::Embed(EmbedError::Encode { first: at, last: at, cause: Box::new(cause) })
+            };
+            Done { request, at, result: result.map_err(failed) }
+        };
+        places.into_iter().zip(&crops).map(alone).collect()
+    }
+}
+
+/// Tells the others if it is dropped, which only a panic does.
+struct Lost<'l, 'a>(&'l SharedEncoders<'a>);
+
+impl Drop for Lost<'_, '_> {
+    fn drop(&mut self) {
+        self.0.queue().is_abandoned = true;
+        self.0.wake();
+    }
+}
+
+/// A crop that is done.
+struct Done {
+    request: u64,
+    at: usize,
+    result: Result<Vec<f32>, Failure>,
+}
+
+impl Queue {
+    fn keep(&mut self, done: Vec<Done>) {
+        for Done { request: number, at, result } in done {
+            let Some(request) = self.requests.get_mut(&number) else { continue };
+            match result {
+                Ok(vector) => {
+                    request.vectors[at] = vector;
+                    request.n_left = request.n_left.saturating_sub(1);
+                }
+                Err(error) => {
+                    request.error = Some(error);
+                    request.n_left = 0;
+                    self.waiting.retain(|waiting| waiting.request != number);
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use image::{Rgb, RgbImage};
+    use slag_models::{ModelDir, SessionOptions};
+
+    use super::*;
+
+    fn crop(seed: usize) -> Crop {
+        Crop::whole(RgbImage::from_fn(64, 64, |x, y| {
+            Rgb([0, 1, 2].map(|c| ((x as usize + c * 40) * (seed % 13 + 1) + y as usize * (seed % 7)) as u8))
+        }))
+    }
+
+    /// Views of 1 to 29 crops: each gets the vectors that an encoder of its own gives, for any number of GPUs and lanes.
+    #[test]
+    fn views_that_share_batches_get_the_vectors_of_their_own() {
+        let models = ModelDir::embedded().expect("opens");
+        let session = SessionOptions::new(slag_test_support::onnx_runtime());
+        let views: Vec<Vec<Crop>> =
+            (0..12).map(|view| (0..1 + view * 17 % 29).map(|k| crop(view * 31 + k)).collect()).collect();
+        let mut own = models.image_encoder(&session).expect("opens");
+        let expected: Vec<Vec<f32>> = views.iter().map(|crops| own.encode(crops).expect("runs")).collect();
+        for (gpus, n_lanes) in [(&[0][..], 1), (&[0], 3), (&[0, 1], 2)] {
+            let n_opened = AtomicUsize::new(0);
+            let open = |_| {
+                n_opened.fetch_add(1, Ordering::SeqCst);
+                models.image_encoder(&session)
+            };
+            let shared = SharedEncoders::with_lanes(gpus, n_lanes, Box::new(open));
+            std::thread::scope(|scope| {
+                for (crops, expected) in views.iter().zip(&expected) {
+                    let shared = &shared;
+                    scope.spawn(move || {
+                        let found = shared.embed(crops.clone()).expect("runs");
+                        assert!(&found == expected, "{} crops", crops.len());
+                    });
+                }
+            });
+            assert!((1..=gpus.len() * n_lanes).contains(&n_opened.load(Ordering::SeqCst)));
+            assert!(shared.queue().requests.is_empty() && shared.queue().waiting.is_empty());
+        }
+    }
+
+    /// An empty crop fails with its own view; others of the same batch get their vectors.
+    #[test]
+    fn a_bad_crop_fails_with_its_view_alone() {
+        let models = ModelDir::embedded().expect("opens");
+        let session = SessionOptions::new(slag_test_support::onnx_runtime());
+        let expected = models.image_encoder(&session).expect("opens").encode(&[crop(1)]).expect("runs");
+        let open = |_| models.image_encoder(&session);
+        let shared = SharedEncoders::with_lanes(&[0], 1, Box::new(open));
+        let all_began = std::sync::Barrier::new(8);
+        std::thread::scope(|scope| {
+            for view in 0..8 {
+                let (shared, all_began, expected) = (&shared, &all_began, &expected);
+                scope.spawn(move || {
+                    all_began.wait();
+                    let bad = Crop::whole(RgbImage::new(0, 0));
+                    match shared.embed(if view % 4 == 3 { vec![crop(0), bad] } else { vec![crop(1)] }) {
+                        Ok(found) => assert!(view % 4 != 3 && &found == expected),
+                        Err(Failure::Embed(EmbedError::Encode { first: 1, last: 1, .. })) => {
+                            assert_eq!(view % 4, 3)
+                        }
+                        Err(error) => panic!("{error}"),
+                    }
+                });
+            }
+        });
+    }
+
+    /// A model that does not open is an error for whoever waits.
+    #[test]
+    fn a_model_that_does_not_open_is_an_error_for_all() {
+        let models = ModelDir::embedded().expect("opens");
+        let absent = SessionOptions::new("/absent/libonnxruntime.so".into());
+        let shared = SharedEncoders::with_lanes(&[0], 2, Box::new(|_| models.image_encoder(&absent)));
+        std::thread::scope(|scope| {
+            for view in 0..4 {
+                let shared = &shared;
+                scope.spawn(move || {
+                    let failed = shared.embed((0..=view).map(crop).collect());
+                    assert!(matches!(failed, Err(Failure::Model(_))), "{failed:?}");
+                });
+            }
+        });
+    }
+}

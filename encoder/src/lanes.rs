@@ -1,0 +1,176 @@
+//! Opened models that GPUs share out: each GPU has a few, its lanes, and work goes to the GPU with the most free ones.
+//!
+//! While one lane of a GPU computes, another copies. The load of a GPU is the time in which any of its lanes is at work.
+
+use std::ops::{Deref, DerefMut};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use serde::Serialize;
+
+/// The load of a GPU by one stage.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct GpuLoad {
+    /// The GPU, as CUDA numbers it.
+    pub gpu: u32,
+    /// Lanes: models that may be at work at once.
+    pub n_lanes: usize,
+    /// Seconds in which any of them was.
+    pub busy_secs: f64,
+}
+
+/// Things of which each works on one piece at a time, by GPU.
+#[derive(Debug)]
+pub struct Lanes<T> {
+    state: Mutex<State<T>>,
+    freed: Condvar,
+}
+
+#[derive(Debug)]
+struct State<T> {
+    gpus: Vec<Gpu<T>>,
+}
+
+#[derive(Debug)]
+struct Gpu<T> {
+    number: u32,
+    n_lanes: usize,
+    free: Vec<T>,
+    busy_since: Option<Instant>,
+    busy: Duration,
+}
+
+/// A lane at work; it is free again when this is dropped.
+#[derive(Debug)]
+pub struct Lane<'a, T> {
+    lanes: &'a Lanes<T>,
+    gpu: usize,
+    /// Present until it is dropped.
+    held: Option<T>,
+}
+
+impl<T> Lanes<T> {
+    /// Makes lanes of GPUs: numbers, and the lanes of each.
+    pub fn new(gpus: impl IntoIterator<Item = (u32, Vec<T>)>) -> Self {
+        let gpu = |(number, free): (u32, Vec<T>)| Gpu {
+            number,
+            n_lanes: free.len(),
+            free,
+            busy_since: None,
+            busy: Duration::ZERO,
+        };
+        let gpus = gpus.into_iter().map(gpu).collect();
+        Self { state: Mutex::new(State { gpus }), freed: Condvar::new() }
+    }
+
+    fn state(&self) -> MutexGuard<'_, State<T>> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Returns the number of lanes.
+    pub fn len(&self) -> usize {
+        self.state().gpus.iter().map(|gpu| gpu.n_lanes).sum()
+    }
+
+    /// Returns whether there are no lanes.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Takes a lane, if one is free.
+    pub fn try_take(&self) -> Option<Lane<'_, T>> {
+        self.take_of(&mut self.state())
+    }
+
+    /// Takes a lane, and waits for one where none is free. There must be one.
+    pub fn take(&self) -> Lane<'_, T> {
+        let mut state = self.state();
+        loop {
+            match self.take_of(&mut state) {
+                Some(lane) => return lane,
+                None => state = self.freed.wait(state).unwrap_or_else(PoisonError::into_inner),
+            }
+        }
+    }
+
+    fn take_of(&self, state: &mut State<T>) -> Option<Lane<'_, T>> {
+        // The first of equals: `max_by_key` returns the last.
+        let (gpu, of_gpu) = state.gpus.iter_mut().enumerate().rev().max_by_key(|(_, gpu)| gpu.free.len())?;
+        let held = of_gpu.free.pop()?;
+        of_gpu.busy_since.get_or_insert_with(Instant::now);
+        Some(Lane { lanes: self, gpu, held: Some(held) })
+    }
+
+    /// Returns the load of each GPU so far.
+    pub fn loads(&self) -> Vec<GpuLoad> {
+        let load = |gpu: &Gpu<T>| GpuLoad {
+            gpu: gpu.number,
+            n_lanes: gpu.n_lanes,
+            busy_secs: (gpu.busy + gpu.busy_since.map_or(Duration::ZERO, |since| since.elapsed()))
+                .as_secs_f64(),
+        };
+        self.state().gpus.iter().map(load).collect()
+    }
+}
+
+impl<T> Lane<'_, T> {
+    /// Returns the number of its GPU.
+    pub fn gpu(&self) -> u32 {
+        self.lanes.state().gpus[self.gpu].number
+    }
+}
+
+impl<T> Deref for Lane<'_, T> {
+    type Target = T;
+
+    fn deref(&self) -> &T {
+        self.held.as_ref().expect("held until it is dropped")
+    }
+}
+
+impl<T> DerefMut for Lane<'_, T> {
+    fn deref_mut(&mut self) -> &mut T {
+        self.held.as_mut().expect("held until it is dropped")
+    }
+}
+
+impl<T> Drop for Lane<'_, T> {
+    fn drop(&mut self) {
+        let mut state = self.lanes.state();
+        let gpu = &mut state.gpus[self.gpu];
+        gpu.free.extend(self.held.take());
+        if gpu.free.len() == gpu.n_lanes {
+            gpu.busy += gpu.busy_since.take().map_or(Duration::ZERO, |since| since.elapsed());
+        }
+        drop(state);
+        self.lanes.freed.notify_one();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Two GPUs of two lanes: work alternates between them, a fifth piece waits, and a GPU is busy while one lane is.
+    #[test]
+    fn work_goes_to_the_gpu_with_the_most_free_lanes() {
+        let lanes = Lanes::new([(4, vec!['a', 'b']), (7, vec!['c', 'd'])]);
+        assert_eq!(lanes.len(), 4);
+        let mut held: Vec<_> = (0..4).map(|_| lanes.take()).collect();
+        assert_eq!(held.iter().map(Lane::gpu).collect::<Vec<_>>(), [4, 7, 4, 7]);
+        assert!(lanes.try_take().is_none());
+        std::thread::scope(|scope| {
+            let waiting = scope.spawn(|| lanes.take().gpu());
+            held.remove(1);
+            assert_eq!(waiting.join().expect("no panic"), 7);
+        });
+        // GPU 4 stays at work, GPU 7 has one lane at work.
+        let before = lanes.loads();
+        held.retain(|lane| lane.gpu() == 4);
+        let [four, seven] = &lanes.loads()[..] else { panic!("two GPUs") };
+        assert!(four.busy_secs > before[0].busy_secs && four.n_lanes == 2 && seven.busy_secs > 0.0);
+        assert_eq!(lanes.loads()[1], *seven, "its time stands still");
+        drop(held);
+        assert_eq!(lanes.loads(), lanes.loads());
+    }
+}
