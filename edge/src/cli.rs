@@ -2,6 +2,7 @@
 
 mod args;
 mod bench;
+mod config;
 mod failure;
 mod fetch;
 mod follow;
@@ -12,13 +13,18 @@ mod progress;
 mod query;
 mod serve;
 mod status;
+mod supervisor;
 mod text;
 mod trust;
 
-use clap::{Parser, Subcommand};
+use std::ffi::OsString;
+use std::path::PathBuf;
+
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use bench::BenchCommand;
-use failure::Exit;
+use config::ConfigError;
+use failure::{Exit, Failure};
 use fetch::FetchArgs;
 use models::ModelsArgs;
 use query::QueryArgs;
@@ -28,7 +34,7 @@ use trust::TrustCommand;
 
 /// Keeps the shards around a robot and answers text queries offline.
 #[derive(Debug, Parser)]
-#[command(name = "slag-edge", version)]
+#[command(name = "slag-edge", version, after_help = config::HELP)]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -38,6 +44,9 @@ pub struct Cli {
     /// Log errors only, and show no progress.
     #[arg(short, long, global = true, conflicts_with = "verbose")]
     quiet: bool,
+    /// File of flags that the command line does not give [default: /etc/slag/edge.toml if it is there].
+    #[arg(long, global = true, value_name = "FILE")]
+    config: Option<PathBuf>,
 }
 
 #[derive(Debug, Subcommand)]
@@ -58,6 +67,20 @@ enum Command {
     /// Measure a service and this machine; prints JSON.
     #[command(subcommand)]
     Bench(BenchCommand),
+}
+
+/// Parses this process's command line, environment and configuration.
+///
+/// # Errors
+/// The exit code: the error is told, or the help text that was asked for.
+pub fn parse() -> Result<Cli, Exit> {
+    let line: Vec<OsString> = std::env::args_os().collect();
+    let parsed = config::parse(Cli::command(), &line, &args::variable);
+    match parsed.and_then(|matches| Ok(Cli::from_arg_matches(&matches)?)) {
+        Ok(cli) => Ok(cli),
+        Err(ConfigError::Line(error)) => error.exit(),
+        Err(error) => Err(Failure::Usage(error.into()).report(false)),
+    }
 }
 
 impl Cli {
@@ -106,7 +129,6 @@ mod tests {
 
     #[test]
     fn the_definition_is_sound() {
-        use clap::CommandFactory;
         Cli::command().debug_assert();
     }
 

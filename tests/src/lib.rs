@@ -54,7 +54,10 @@ pub fn lab(args: &[&str]) -> Command {
 
 /// Returns a command of the robot's program.
 pub fn edge(args: &[&str]) -> Command {
-    command("slag-edge", args)
+    let mut command = command("slag-edge", args);
+    // Not this machine's own configuration.
+    command.env("SLAG_EDGE_CONFIG", "");
+    command
 }
 
 fn command(name: &str, args: &[&str]) -> Command {

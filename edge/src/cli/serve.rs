@@ -16,9 +16,10 @@ use slag_service::listen::{Listen, bind};
 use slag_service::stop::stop_signal;
 use slag_service::tls::TlsFiles;
 
-use super::args::{CacheArgs, DownloadArgs, ModelArgs, ThreadArgs, engine};
+use super::args::{CacheArgs, DownloadArgs, ModelArgs, ThreadArgs, engine, variable};
 use super::failure::Failure;
 use super::follow::{FollowArgs, follow_in_background};
+use super::supervisor::Supervisor;
 
 /// Async threads: they only forward requests.
 const ASYNC_THREADS: usize = 2;
@@ -70,6 +71,12 @@ pub struct ServeArgs {
 pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     args.threads.apply()?;
     let access = access(&mut args)?;
+    // One of them may come from the configuration.
+    if args.tls_cert.is_some() != args.tls_key.is_some() {
+        return Err(Failure::Usage(anyhow!(
+            "TLS needs both --tls-cert and --tls-key; give both, or neither"
+        )));
+    }
     let files = args.tls_cert.take().zip(args.tls_key.take());
     let tls = args.listen.tls(files.map(|(cert, key)| TlsFiles { cert, key }));
     let tls = tls.map_err(|e| Failure::Usage(e.into()))?;
@@ -112,6 +119,16 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
                 Some(follow_in_background(request, ca, settings, cache, following, Arc::clone(&app))?)
             }
             None => None,
+        };
+        let supervisor = Supervisor::of(&variable).map(Arc::new);
+        if let Some(supervisor) = supervisor.clone() {
+            supervisor.ready();
+            let app = Arc::clone(&app);
+            tokio::spawn(async move { supervisor.pulse(|| http::is_alive(Arc::clone(&app))).await });
+        }
+        let stop = async {
+            stop.await;
+            supervisor.iter().for_each(|supervisor| supervisor.stopping());
         };
         let served = http::serve(app, listener, stop).await;
         // A fetch in progress need not be awaited: the next one resumes it.

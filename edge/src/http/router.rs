@@ -4,11 +4,13 @@ use std::io;
 use std::sync::Arc;
 
 use axum::Router;
-use axum::http::{HeaderName, HeaderValue, header};
+use axum::body::Body;
+use axum::http::{HeaderName, HeaderValue, Request, StatusCode, header};
 use slag_service::listen::Listener;
 use slag_service::listener;
 use slag_service::request::observed;
 use slag_service::routes::Routes;
+use tower::ServiceExt;
 
 use super::app::App;
 use super::{params, position, query, status, v1};
@@ -51,6 +53,13 @@ pub(super) fn router(app: Arc<App>) -> Router {
     let (responses, access) = (Arc::clone(&app.metrics.responses), app.settings.access.clone());
     let (router, _) = routes().with_help(TITLE);
     observed(router.with_state(app), responses, access)
+}
+
+/// Returns whether the service answers `GET /healthz` to itself: its threads, its routes and their limits work.
+pub async fn is_alive(app: Arc<App>) -> bool {
+    let Ok(request) = Request::get("/healthz").body(Body::empty()) else { return false };
+    let answered = router(app).oneshot(request).await;
+    answered.is_ok_and(|response| response.status() == StatusCode::OK)
 }
 
 /// Serves until `stop` completes, then lets requests in progress finish within the drain deadline.

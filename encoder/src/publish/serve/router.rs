@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use axum::error_handling::HandleErrorLayer;
 use axum::extract::State;
-use axum::http::StatusCode;
+use axum::http::{StatusCode, header};
+use axum::response::IntoResponse;
 use axum::{BoxError, Json, Router};
 use serde_json::json;
 use slag_service::access::Access;
@@ -26,6 +27,8 @@ use crate::store::StoreError;
 
 /// First line of the help text.
 const TITLE: &str = "slag-encoder serves a scene's shards to robots.";
+/// The description for programs, kept by hand; a test compares it with every route and parameter.
+pub(super) const OPENAPI: &str = include_str!("openapi.json");
 /// No request here needs a body; a few bytes of a careless client do no harm.
 const REQUEST_BODY_BYTES: usize = 1024;
 
@@ -61,6 +64,7 @@ pub(super) fn routes() -> Routes<Arc<Service>> {
         .get("/v1/coverage.geojson", "footprints of the cells on the earth", cells::coverage)
         .get("/healthz", "whether the process is alive, and the generation served", health)
         .get("/metrics", "counters in Prometheus' text format", metrics)
+        .get("/openapi.json", "description of this service for programs", openapi)
 }
 
 /// Puts the limits around routes, and a problem as the body of every error.
@@ -79,6 +83,10 @@ pub(super) fn bounded(
         .layer(RequestBodyLimitLayer::new(REQUEST_BODY_BYTES))
         .layer(timeout);
     observed(routes.layer(shed), responses, access)
+}
+
+async fn openapi() -> impl IntoResponse {
+    ([(header::CONTENT_TYPE, "application/json")], OPENAPI)
 }
 
 async fn health(State(service): AppState) -> Result<Json<serde_json::Value>, Problem> {

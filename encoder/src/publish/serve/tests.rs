@@ -18,6 +18,8 @@ use super::*;
 use crate::store::tests::{manifest, manifest_of_boxes};
 use crate::store::{Extras, Store, StoreReader};
 
+mod openapi;
+
 /// A store with generations 1 (shards 0 and 1) and 2 (shards 1 and 2), and the shards' bytes.
 struct Fixture {
     dir: tempfile::TempDir,

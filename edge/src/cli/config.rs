@@ -1,0 +1,319 @@
+//! Flags from the environment and from a file, where the command line does not give them.
+//!
+//! In the file, a table holds a command's flags by their long names, and keys before the first table count for every command
+//! that has the flag. The environment's names are made of the same words: `SLAG_EDGE_FETCH_RADIUS` for `fetch --radius`,
+//! `SLAG_EDGE_CACHE` for `--cache` of every command. Values become the flags' defaults, so clap parses them, and `--help`
+//! shows them.
+
+use std::collections::BTreeSet;
+use std::ffi::OsString;
+use std::io::{self, Read};
+use std::path::PathBuf;
+
+use clap::{Arg, ArgAction, ArgMatches, Command, parser::ValueSource};
+use toml::{Table, Value};
+
+/// The file that is read if it is there and no other is named.
+const DEFAULT_FILE: &str = "/etc/slag/edge.toml";
+/// What `--help` says of this.
+pub const HELP: &str = "Flags may also come from the environment (SLAG_EDGE_CACHE for --cache, SLAG_EDGE_FETCH_RADIUS for fetch --radius) \
+    and from the configuration file (cache = \"DIR\", and radius = 20 under [fetch]); the command line comes first, then \
+    the environment, then the file.";
+/// What every name in the environment begins with.
+const PREFIX: &str = "SLAG_EDGE";
+/// The flag that names the file; `SLAG_EDGE_CONFIG` in the environment.
+const FILE_FLAG: &str = "config";
+/// Longest file.
+const MAX_FILE_BYTES: u64 = 1 << 20;
+
+/// Why the command line, the environment and the file do not make a command.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("the configuration {} cannot be read: {cause}", path.display())]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// The system's error.
+        cause: io::Error,
+    },
+    /// A value is wrong, or its key is none.
+    #[error("{place}: {what}")]
+    Wrong {
+        /// File and key, or the variable.
+        place: String,
+        /// What is wrong, and what is expected.
+        what: String,
+    },
+    /// The command line is wrong, or asks for help.
+    #[error(transparent)]
+    Line(#[from] clap::Error),
+}
+
+/// Parses a command line; `variable` looks up the environment.
+///
+/// # Errors
+/// [`ConfigError`]. The whole file is checked, whichever command is asked for.
+pub fn parse(
+    command: Command,
+    line: &[OsString],
+    variable: &dyn Fn(&str) -> Option<OsString>,
+) -> Result<ArgMatches, ConfigError> {
+    // Without the checks of what is missing: the file may have it.
+    let first = command.clone().ignore_errors(true).try_get_matches_from(line);
+    let Ok(first) = first else { return Ok(command.try_get_matches_from(line)?) };
+    let named = first.try_get_one::<PathBuf>(FILE_FLAG).ok().flatten().cloned();
+    let mut settings = Settings { variable, file: read(named, variable)?, explicit: BTreeSet::new() };
+    settings.explicit = explicit(&first);
+    let command = settings.apply(command, &[])?;
+    settings.refuse_unknown(&command)?;
+    Ok(command.try_get_matches_from(line)?)
+}
+
+/// A file, or none.
+struct File {
+    path: PathBuf,
+    table: Table,
+}
+
+fn read(
+    named: Option<PathBuf>,
+    variable: &dyn Fn(&str) -> Option<OsString>,
+) -> Result<Option<File>, ConfigError> {
+    let from_environment = || variable(&format!("{PREFIX}_CONFIG")).map(PathBuf::from);
+    let named = named.or_else(from_environment);
+    // An empty name stands for no file.
+    if named.as_ref().is_some_and(|path| path.as_os_str().is_empty()) {
+        return Ok(None);
+    }
+    let is_default = named.is_none();
+    let path = named.unwrap_or_else(|| DEFAULT_FILE.into());
+    let mut text = String::new();
+    let read =
+        std::fs::File::open(&path).and_then(|file| file.take(MAX_FILE_BYTES + 1).read_to_string(&mut text));
+    match read {
+        Err(cause) if is_default && cause.kind() == io::ErrorKind::NotFound => return Ok(None),
+        Err(cause) => return Err(ConfigError::Unreadable { path, cause }),
+        Ok(_) => {}
+    }
+    let wrong = |what: String| ConfigError::Wrong { place: path.display().to_string(), what };
+    if text.len() as u64 > MAX_FILE_BYTES {
+        return Err(wrong(format!("longer than {MAX_FILE_BYTES} bytes, expected a few lines of flags")));
+    }
+    let table = text.parse::<Table>().map_err(|e| wrong(e.to_string().trim_end().to_owned()))?;
+    Ok(Some(File { path, table }))
+}
+
+/// Returns the ids of all arguments that the command line gives.
+fn explicit(matches: &ArgMatches) -> BTreeSet<String> {
+    let is_given = |id: &&clap::Id| matches.value_source(id.as_str()) == Some(ValueSource::CommandLine);
+    let mut ids: BTreeSet<String> = matches.ids().filter(is_given).map(ToString::to_string).collect();
+    if let Some((_, below)) = matches.subcommand() {
+        ids.extend(explicit(below));
+    }
+    ids
+}
+
+/// Returns the flags of a command that a file may set: all but those that must be given on the command line each time.
+fn flags(command: &Command) -> impl Iterator<Item = &Arg> {
+    let by_hand = |arg: &&Arg| {
+        let is_choice = |group: &&clap::ArgGroup| group.is_required_set();
+        !command.get_groups().filter(is_choice).any(|group| group.get_args().any(|id| id == arg.get_id()))
+    };
+    command.get_arguments().filter(|arg| arg.get_long().is_some_and(|long| long != FILE_FLAG)).filter(by_hand)
+}
+
+struct Settings<'a> {
+    variable: &'a dyn Fn(&str) -> Option<OsString>,
+    file: Option<File>,
+    explicit: BTreeSet<String>,
+}
+
+impl Settings<'_> {
+    /// Makes the values of the environment and the file the defaults of a command and those below it.
+    fn apply(&self, command: Command, path: &[&str]) -> Result<Command, ConfigError> {
+        let mut defaults: Vec<(clap::Id, Vec<String>)> = Vec::new();
+        for arg in flags(&command) {
+            if let Some(values) = self.value(arg, path)?
+                && !self.is_overruled(&command, arg)
+            {
+                defaults.push((arg.get_id().clone(), values));
+            }
+        }
+        let mut command = command;
+        for (id, values) in defaults {
+            // clap keeps names and defaults for as long as the program runs.
+            let values: Vec<&'static str> = values.into_iter().map(|value| &*value.leak()).collect();
+            command = command.mut_arg(id, |arg| arg.default_values(values).required(false));
+        }
+        let below: Vec<String> = command.get_subcommands().map(|below| below.get_name().to_owned()).collect();
+        for name in below {
+            let mut failed = Ok(());
+            let path: Vec<&str> = path.iter().copied().chain([name.as_str()]).collect();
+            command = command.mut_subcommand(&name, |below| match self.apply(below.clone(), &path) {
+                Ok(applied) => applied,
+                Err(error) => {
+                    failed = Err(error);
+                    below
+                }
+            });
+            failed?;
+        }
+        Ok(command)
+    }
+
+    /// Returns whether the command line gives a flag that this one cannot stand beside.
+    fn is_overruled(&self, command: &Command, arg: &Arg) -> bool {
+        let is_given = |other: &Arg| self.explicit.contains(other.get_id().as_str());
+        let against = |one: &Arg, other: &Arg| {
+            command.get_arg_conflicts_with(one).iter().any(|against| against.get_id() == other.get_id())
+        };
+        command.get_arguments().any(|other| is_given(other) && (against(arg, other) || against(other, arg)))
+    }
+
+    /// Returns the values of a flag: the environment's, else the file's; its own command's, else those for all.
+    fn value(&self, arg: &Arg, path: &[&str]) -> Result<Option<Vec<String>>, ConfigError> {
+        let Some(long) = arg.get_long() else { return Ok(None) };
+        let whole = |words: &mut dyn Iterator<Item = &str>| {
+            words.collect::<Vec<_>>().join("_").replace('-', "_").to_uppercase()
+        };
+        let names = [
+            whole(&mut [PREFIX].into_iter().chain(path.iter().copied()).chain([long])),
+            whole(&mut [PREFIX, long].into_iter()),
+        ];
+        for name in names {
+            if let Some(text) = (self.variable)(&name) {
+                let text = text.into_string().map_err(|_| wrong(&name, "not text in UTF-8"))?;
+                return checked(arg, from_text(arg, &text), &name).map(Some);
+            }
+        }
+        let Some(file) = &self.file else { return Ok(None) };
+        for path in [path, &[]] {
+            if let Some(value) = table_at(&file.table, path)
+                .and_then(|table| table.get(long))
+                .filter(|value| !value.is_table())
+            {
+                let place = file.place(path, long);
+                let texts = from_value(arg, value).map_err(|what| wrong(&place, &what))?;
+                return checked(arg, texts, &place).map(Some);
+            }
+        }
+        Ok(None)
+    }
+
+    /// Refuses keys of the file that are no flag of any command.
+    fn refuse_unknown(&self, command: &Command) -> Result<(), ConfigError> {
+        match &self.file {
+            Some(file) => file.refuse_unknown(command, &file.table, &mut Vec::new()),
+            None => Ok(()),
+        }
+    }
+}
+
+impl File {
+    /// Names a key, as `/etc/slag/edge.toml: serve.listen`.
+    fn place(&self, path: &[&str], key: &str) -> String {
+        let key: Vec<&str> = path.iter().copied().chain([key]).collect();
+        format!("{}: {}", self.path.display(), key.join("."))
+    }
+
+    fn refuse_unknown<'a>(
+        &'a self,
+        command: &Command,
+        table: &'a Table,
+        path: &mut Vec<&'a str>,
+    ) -> Result<(), ConfigError> {
+        let names = |command: &Command| -> BTreeSet<String> {
+            flags(command).filter_map(|arg| arg.get_long().map(str::to_owned)).collect()
+        };
+        let mut known = names(command);
+        if path.is_empty() {
+            let mut waiting: Vec<&Command> = command.get_subcommands().collect();
+            while let Some(below) = waiting.pop() {
+                known.extend(names(below));
+                waiting.extend(below.get_subcommands());
+            }
+        }
+        for (key, value) in table {
+            if let (Some(below), Value::Table(table)) = (command.find_subcommand(key), value) {
+                path.push(key);
+                self.refuse_unknown(below, table, path)?;
+                path.pop();
+            } else if !known.contains(key) {
+                let commands: Vec<&str> = command.get_subcommands().map(Command::get_name).collect();
+                let known = known.into_iter().collect::<Vec<_>>().join(", ");
+                let tables = if commands.is_empty() {
+                    String::new()
+                } else {
+                    format!("; tables: {}", commands.join(", "))
+                };
+                return Err(wrong(
+                    &self.place(path, key),
+                    &format!("no flag of this name, expected one of {known}{tables}"),
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+fn table_at<'a>(table: &'a Table, path: &[&str]) -> Option<&'a Table> {
+    path.iter().try_fold(table, |table, name| table.get(*name)?.as_table())
+}
+
+fn wrong(place: &str, what: &str) -> ConfigError {
+    ConfigError::Wrong { place: place.to_owned(), what: what.to_owned() }
+}
+
+fn is_list(arg: &Arg) -> bool {
+    matches!(arg.get_action(), ArgAction::Append)
+}
+
+fn from_text(arg: &Arg, text: &str) -> Vec<String> {
+    match is_list(arg) {
+        true => text.split(',').map(|part| part.trim().to_owned()).filter(|part| !part.is_empty()).collect(),
+        false => vec![text.to_owned()],
+    }
+}
+
+fn from_value(arg: &Arg, value: &Value) -> Result<Vec<String>, String> {
+    let one = |value: &Value| match (value, arg.get_action()) {
+        (Value::Boolean(value), ArgAction::SetTrue) => Ok(value.to_string()),
+        (_, ArgAction::SetTrue) => Err(format!("found {}, expected true or false", value.type_str())),
+        (Value::String(text), _) => Ok(text.clone()),
+        (Value::Integer(number), _) => Ok(number.to_string()),
+        (Value::Float(number), _) => Ok(number.to_string()),
+        _ => Err(format!("found {}, expected a text or a number", value.type_str())),
+    };
+    match value {
+        Value::Array(values) if is_list(arg) => values.iter().map(one).collect(),
+        Value::Array(_) => Err("found a list, expected one value".to_owned()),
+        value => Ok(vec![one(value)?]),
+    }
+}
+
+/// Checks values as clap would: a default that does not parse is our own fault to it.
+fn checked(arg: &Arg, values: Vec<String>, place: &str) -> Result<Vec<String>, ConfigError> {
+    let long = arg.get_long().unwrap_or_default().to_owned();
+    let refused = |e: clap::Error| {
+        let text = e.to_string();
+        let line = text.lines().next().unwrap_or_default();
+        wrong(place, line.strip_prefix("error: ").unwrap_or(line))
+    };
+    let parser = match arg.get_action() {
+        ArgAction::SetTrue => clap::value_parser!(bool),
+        ArgAction::Count => clap::value_parser!(u8).into(),
+        _ => arg.get_value_parser().clone(),
+    };
+    let mut alone =
+        Arg::new("value").long(&*long.clone().leak()).action(ArgAction::Append).value_parser(parser);
+    if let Some(delimiter) = arg.get_value_delimiter() {
+        alone = alone.value_delimiter(delimiter);
+    }
+    let line = values.iter().map(|value| format!("--{long}={value}"));
+    Command::new("values").no_binary_name(true).arg(alone).try_get_matches_from(line).map_err(refused)?;
+    Ok(values)
+}
+
+#[cfg(test)]
+mod tests;

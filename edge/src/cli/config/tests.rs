@@ -1,0 +1,133 @@
+use clap::CommandFactory;
+
+use super::*;
+use crate::cli::Cli;
+
+/// Parses a line with an environment and a file; returns a flag's values at the end of the chain of commands.
+fn parsed(line: &str, environment: &[(&str, &str)], file: &str) -> Result<ArgMatches, ConfigError> {
+    let dir = tempfile::tempdir().expect("a folder");
+    let path = dir.path().join("edge.toml");
+    std::fs::write(&path, file).expect("written");
+    let line: Vec<OsString> = line.split(' ').map(Into::into).collect();
+    let variable = |name: &str| -> Option<OsString> {
+        let given = environment.iter().find(|(known, _)| *known == name).map(|(_, value)| (*value).into());
+        given.or_else(|| (name == "SLAG_EDGE_CONFIG").then(|| path.clone().into()))
+    };
+    parse(Cli::command(), &line, &variable)
+}
+
+fn values(matches: &ArgMatches, id: &str) -> Vec<String> {
+    let mut leaf = matches;
+    while let Some((_, below)) = leaf.subcommand() {
+        leaf = below;
+    }
+    let raw = leaf.get_raw(id).into_iter().flatten();
+    raw.map(|value| value.to_string_lossy().into_owned()).collect()
+}
+
+const SERVE: &str = "cache = 'all'\nprofile = 'exact'\n[serve]\nlisten = '127.0.0.1:1'\nradius = 7.5\nhost = ['a', 'b']\n\
+    trust-first = true\nrefresh-secs = 9\n[fetch]\nat = '1,2,3'\n[bench.load]\nurl = 'http://a:1'\n";
+
+#[test]
+fn the_line_comes_before_the_environment_and_that_before_the_file() {
+    let environment =
+        [("SLAG_EDGE_SERVE_RADIUS", "8"), ("SLAG_EDGE_CACHE", "env"), ("SLAG_EDGE_HOST", "c, d")];
+    for (line, environment, id, expected) in [
+        ("slag-edge serve", &environment[..0], "radius", &["7.5"][..]),
+        ("slag-edge serve", &environment, "radius", &["8"]),
+        ("slag-edge serve --radius 9", &environment, "radius", &["9"]),
+        // The environment's value for all comes before the file's for this command.
+        ("slag-edge serve", &environment[..0], "host", &["a", "b"]),
+        ("slag-edge serve", &environment, "host", &["c", "d"]),
+        ("slag-edge serve --host e", &environment, "host", &["e"]),
+        ("slag-edge serve", &environment, "cache", &["env"]),
+        ("slag-edge status", &environment[..0], "cache", &["all"]),
+        ("slag-edge status --cache line", &environment, "cache", &["line"]),
+        ("slag-edge fetch", &environment, "radius", &["50"]),
+        ("slag-edge fetch", &environment, "profile", &["exact"]),
+        ("slag-edge serve", &environment, "trust_first", &["true"]),
+        ("slag-edge serve", &[("SLAG_EDGE_TRUST_FIRST", "false")], "trust_first", &["false"]),
+        ("slag-edge serve", &environment, "refresh_secs", &["9"]),
+        // A value of the file does not stand beside another of the line that excludes it.
+        ("slag-edge fetch", &environment, "at", &["1,2,3"]),
+        ("slag-edge fetch --at-geo 4,5", &environment, "at", &[]),
+        // A file may have what the line must have otherwise.
+        ("slag-edge bench load", &environment, "url", &["http://a:1"]),
+    ] {
+        let matches = parsed(line, environment, SERVE).unwrap_or_else(|e| panic!("{line}: {e}"));
+        assert_eq!(values(&matches, id), expected, "{line}: {id}");
+    }
+    let quiet = parsed("slag-edge -q status", &[], "verbose = 2").expect("parses");
+    assert_eq!(values(&quiet, "verbose"), ["0"]);
+}
+
+#[test]
+fn errors_name_the_file_and_the_key() {
+    for (file, key, what) in [
+        ("[serve]\nlisten = 'nowhere'", "serve.listen", "IP:PORT or unix:PATH"),
+        ("[serve]\nlisten = 7734", "serve.listen", "IP:PORT or unix:PATH"),
+        ("[fetch]\nradius = 'far'", "fetch.radius", "invalid float"),
+        ("[fetch]\nradius = [1, 2]", "fetch.radius", "expected one value"),
+        ("[fetch]\nradius = 1979-05-27", "fetch.radius", "expected a text or a number"),
+        ("[fetch]\nwatch = 'yes'", "fetch.watch", "expected true or false"),
+        ("[fetch]\nprofile = 'tiny'", "fetch.profile", "invalid value 'tiny'"),
+        ("[fetch]\nmax_bytes = 1", "fetch.max_bytes", "max-bytes"),
+        ("cash = 'x'", "cash", "cache"),
+        ("config = 'x'", "config", "no flag of this name"),
+        ("[fetsch]\nradius = 1", "fetsch", "tables: fetch, serve"),
+        ("[query]\ntext = 'chair'", "query.text", "no flag of this name"),
+        // First trust is a step that somebody takes.
+        ("[trust.add]\ntrust-first = true", "trust.add.trust-first", "no flag of this name"),
+        // Commands that are not asked for are checked as well.
+        ("[bench.pause]\ngaussians = 1", "bench.pause.gaussians", "1 is not in 1000..=16000000"),
+    ] {
+        let error = parsed("slag-edge status", &[], file).expect_err(file).to_string();
+        assert!(error.contains(&format!("edge.toml: {key}: ")) && error.contains(what), "{file}: {error}");
+    }
+    let error = parsed("slag-edge status", &[], "[fetch").expect_err("no TOML").to_string();
+    assert!(error.contains("edge.toml: ") && error.contains("line 1"), "{error}");
+    let environment = [("SLAG_EDGE_SERVE_LISTEN", "nowhere")];
+    let error = parsed("slag-edge serve", &environment, "").expect_err("no address").to_string();
+    assert!(error.starts_with("SLAG_EDGE_SERVE_LISTEN: ") && error.contains("IP:PORT"), "{error}");
+    let error = parsed("slag-edge --config nowhere.toml status", &[], "").expect_err("no file").to_string();
+    assert!(error.contains("nowhere.toml cannot be read"), "{error}");
+    assert!(parsed("slag-edge status", &[("SLAG_EDGE_CONFIG", "")], "[no").is_ok(), "no file is read");
+}
+
+/// Returns the keys of all flags that a file may set, as `serve.listen`.
+fn keys(command: &Command, path: &str) -> BTreeSet<String> {
+    let own = flags(command).filter_map(|arg| arg.get_long()).map(|long| format!("{path}{long}"));
+    let below =
+        command.get_subcommands().flat_map(|below| keys(below, &format!("{path}{}.", below.get_name())));
+    own.chain(below).collect()
+}
+
+/// Returns the keys of a table.
+fn written(table: &Table, path: &str) -> BTreeSet<String> {
+    let keys = table.iter().flat_map(|(key, value)| match value {
+        Value::Table(below) => written(below, &format!("{path}{key}.")),
+        _ => BTreeSet::from([format!("{path}{key}")]),
+    });
+    keys.collect()
+}
+
+#[test]
+fn the_sample_has_every_flag() {
+    let sample = include_str!("../../../../jetson/edge.toml");
+    let is_setting = |line: &str| line.split_once(" = ").is_some_and(|(key, _)| !key.contains(' '));
+    let uncommented =
+        sample.lines().map(|line| line.strip_prefix("# ").filter(|line| is_setting(line)).unwrap_or(line));
+    let uncommented: String = uncommented.flat_map(|line| [line, "\n"]).collect();
+    parsed("slag-edge status", &[], sample).expect("as it is installed");
+    parsed("slag-edge status", &[], &uncommented).expect("every example is valid");
+    let written = written(&uncommented.parse().expect("TOML"), "");
+    let all = keys(&Cli::command(), "");
+    for key in &all {
+        let flag = key.rsplit('.').next().expect("a flag");
+        assert!(written.contains(key) || written.contains(flag), "{key} is missing in jetson/edge.toml");
+    }
+    for key in written {
+        let is_known = all.contains(&key) || all.iter().any(|known| known.ends_with(&format!(".{key}")));
+        assert!(is_known, "{key} is no flag");
+    }
+}
