@@ -4,6 +4,8 @@
 set -eu
 cd "$(dirname "$0")"
 sh scripts/setup.sh
+# So that the programs need not be built again for the page's own tests; the Rust tests do without it.
+sh scripts/build-page.sh --if-possible
 # Mesa's Vulkan layer for the choice of a device asks libwayland, which prints an error on machines without a desktop.
 export NODEVICE_SELECT=1
 

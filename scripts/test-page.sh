@@ -1,6 +1,8 @@
 #!/bin/sh
-# Tests the built page in Chromium, without a GPU.
-# usage: test-page.sh      after `scripts/setup.sh page` and `scripts/build-page.sh`
+# Tests the page in Chromium, without a GPU: over a small known scene with faults, and in the real programs over a generated room.
+# usage: test-page.sh      after `scripts/setup.sh page` and `scripts/build-page.sh`; builds the programs that embed the page
 set -eu
 cd "$(dirname "$0")/.."
-timeout 180 node --test --test-timeout=60000 tests/page/page.test.mjs
+cargo build --workspace --bins --locked
+export SLAG_PROGRAMS="${CARGO_TARGET_DIR:-$PWD/target}/debug"
+timeout 420 node --test --test-concurrency=1 --test-timeout=400000 tests/page/page.test.mjs tests/page/real.test.mjs

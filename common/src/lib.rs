@@ -4,6 +4,7 @@
 //! Nothing here accesses the network, runs models or starts threads.
 #![forbid(unsafe_code)]
 
+pub mod appearance;
 pub mod byte_size;
 pub mod camera;
 pub mod container;

@@ -46,3 +46,4 @@ pub mod raster;
 pub mod segment;
 pub mod shard;
 pub mod store;
+pub mod view;

@@ -244,6 +244,7 @@ fn exact_shard(vectors: &[Vec<f32>], means_in_world: Vec<DVec3>) -> AlignedBytes
         codebook: CodebookSettings::default(),
         position_error: PositionError::Within(0.01),
         input_indices: false,
+        appearance: false,
     };
     let score_context = ScoreMetricContext { metric, bank, spread };
     let built = shard::build(&scene, 0, cell, &embeddings, Hash32([0; 32]), &score_context, &settings, None);

@@ -89,6 +89,10 @@ pub fn shard(data: &[u8]) -> bool {
     }
     std::hint::black_box(view.scores(&vec![1.0; view.header.dim as usize]));
     std::hint::black_box((view.bounds(), view.encoder_id()));
+    if let Some(appearance) = layout.appearance(&bytes) {
+        let columns = [appearance.colours.len(), appearance.sizes.len(), appearance.rotations.len()];
+        assert_eq!(columns, [view.header.n_gaussians as usize; 3]);
+    }
     if let Some(objects) = layout.objects(&bytes) {
         let n: u32 = objects.runs().map(|(run, object)| object.map_or(0, |_| run.len() as u32)).sum();
         assert_eq!(n, objects.records.iter().map(|record| record.n_gaussians_here).sum::<u32>());

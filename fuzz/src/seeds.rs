@@ -6,12 +6,13 @@ use std::path::Path;
 
 use glam::DVec3;
 use half::f16;
+use slag_common::appearance::Appearance;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader};
 use slag_common::shard::{
-    Basis, ExactColumns, Fine, IndexColumn, Positions, Profile, Residuals, ScoreErrors, ShardHeader,
-    ShardView,
+    Additions, Basis, ExactColumns, Fine, IndexColumn, Positions, Profile, Residuals, ScoreErrors,
+    ShardHeader, ShardView,
 };
 use slag_common::{Hash32, container};
 
@@ -171,7 +172,10 @@ fn shard(is_exact: bool) -> Vec<u8> {
         run_objects: &[1, NO_OBJECT, 0, 1],
         photos: b"a.jpg",
     };
-    view.write_with(&mut out, is_exact.then_some(&objects)).expect("writes to memory");
+    let appearance = Appearance { colours: &[[1; 4]; 6], sizes: &[[2; 3]; 6], rotations: &[[3; 3]; 6] };
+    let additions =
+        Additions { objects: is_exact.then_some(&objects), appearance: is_exact.then_some(appearance) };
+    view.write_with(&mut out, additions).expect("writes to memory");
     out
 }
 

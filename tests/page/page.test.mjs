@@ -1,14 +1,10 @@
-// The built page in Chromium with a software GPU: what is lit is compared with the boxes that are true.
+// The built page in Chromium over a small known scene, whose service can refuse, vanish and publish at will: what is lit is compared
+// with the boxes that are true. `real.test.mjs` asks the real programs.
 
 import assert from "node:assert/strict";
-import { mkdirSync, readFileSync } from "node:fs";
-import { createRequire } from "node:module";
 import { after, before, test } from "node:test";
+import { axe, closeBrowser, litPixels as litBeside, openBrowser, opened as openedAt, picture } from "./browser.mjs";
 import { startService, THINGS } from "./service.mjs";
-
-const fromPage = createRequire(new URL("../../common/view/web/package.json", import.meta.url));
-const { chromium } = fromPage("playwright-core");
-const axe = readFileSync(fromPage.resolve("axe-core/axe.min.js"), "utf8");
 
 const [WIDTH, HEIGHT] = [1100, 640];
 const PANEL_PX = 360;
@@ -16,83 +12,24 @@ const POSITION = [0.5, -6, 4];
 const TARGET = [0, 0, 0.5];
 const CAMERA = [...POSITION, ...TARGET].join(",");
 const FIELD_OF_VIEW_DEG = 55;
-const PICTURES = process.env.SLAG_PAGE_PICTURES;
 
-let browser;
-before(async () => {
-  browser = await chromium.launch({
-    executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
-    args: ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"],
-  });
-});
-after(() => browser?.close());
+before(openBrowser);
+after(closeBrowser);
 
-/** A page of a fresh service; fails at errors in the console and requests to others, but for those expected. */
-async function opened(run, { behaviour = {}, fragment = "", options = {}, expected = null } = {}) {
+/** A page of a fresh service. */
+async function opened(run, { behaviour = {}, ...how } = {}) {
   const service = await startService(behaviour);
-  const context = await browser.newContext({ viewport: { width: WIDTH, height: HEIGHT }, colorScheme: "dark", reducedMotion: "reduce", bypassCSP: false, ...options });
-  const page = await context.newPage();
-  const wrong = [];
-  page.on("console", (message) => message.type() === "error" && wrong.push(message.text()));
-  page.on("pageerror", (error) => wrong.push(String(error)));
-  page.on("request", (request) => {
-    const url = request.url();
-    if (!url.startsWith(service.url) && !url.startsWith("blob:") && !url.startsWith("data:")) wrong.push(`foreign request: ${url}`);
-  });
   try {
-    await page.goto(`${service.url}/view#${fragment}`);
-    await run(page, service);
-    assert.deepEqual(wrong.filter((text) => !expected?.test(text)), []);
+    await openedAt(service.url, (page) => run(page, service), how);
   } finally {
-    await context.close();
     await service.stop();
   }
 }
 
+const litPixels = (page, name) => litBeside(page, PANEL_PX, name);
+
 const drawn = (page) => page.waitForFunction(() => document.documentElement.dataset.gaussians === "7360", null, { timeout: 30000 });
 const answered = (page, question) => page.waitForFunction((q) => document.documentElement.dataset.answered === q, question, { timeout: 30000 });
-
-/** Waits until two pictures in a row are equal. */
-async function picture(page, name) {
-  let last = null;
-  for (let i = 0; i < 40; i++) {
-    const next = await page.screenshot();
-    if (last?.equals(next)) break;
-    last = next;
-    await page.waitForTimeout(250);
-  }
-  if (PICTURES && name) {
-    mkdirSync(PICTURES, { recursive: true });
-    await page.screenshot({ path: `${PICTURES}/${name}.png` });
-  }
-  return last;
-}
-
-/** Pixels of strong colour beside the panel; the scene itself is grey. */
-async function litPixels(page, name) {
-  await page.uncheck("#show-boxes");
-  await page.uncheck("#show-grid");
-  const png = (await picture(page, name)).toString("base64");
-  const scratch = await browser.newPage();
-  try {
-    return await scratch.evaluate(async ([data, left]) => {
-      const image = await createImageBitmap(new Blob([Uint8Array.from(atob(data), (c) => c.charCodeAt(0))]));
-      const context = new OffscreenCanvas(image.width, image.height).getContext("2d");
-      context.drawImage(image, 0, 0);
-      const { data: rgba, width, height } = context.getImageData(0, 0, image.width, image.height);
-      const found = [];
-      for (let y = 0; y < height; y++) {
-        for (let x = left; x < width; x++) {
-          const [r, g, b] = rgba.subarray(4 * (y * width + x), 4 * (y * width + x) + 3);
-          if (r > 90 && r - Math.min(g, b) > 45) found.push([x, y]);
-        }
-      }
-      return found;
-    }, [png, PANEL_PX]);
-  } finally {
-    await scratch.close();
-  }
-}
 
 const minus = (a, b) => a.map((v, i) => v - b[i]);
 const dot = (a, b) => a.reduce((sum, v, i) => sum + v * b[i], 0);

@@ -52,7 +52,7 @@ function cellMessage(thing) {
   return bytes;
 }
 
-function scoresMessage(text) {
+function scoresMessage(text, generation) {
   const counts = THINGS.map((thing) => thing.n.reduce((a, b) => a * b));
   const head = Buffer.alloc(24 + 8 * THINGS.length);
   head.write("SLGS");
@@ -60,6 +60,7 @@ function scoresMessage(text) {
   head.writeFloatLE(0, 8);
   head.writeFloatLE(1, 12);
   head.writeUInt32LE(THINGS.length, 16);
+  head.writeUInt32LE(generation, 20);
   counts.forEach((n, i) => {
     head.writeUInt32LE(i, 24 + 8 * i);
     head.writeUInt32LE(n, 28 + 8 * i);
@@ -83,12 +84,14 @@ export async function startService(behaviour = {}) {
       return createReadStream(path).pipe(response);
     }
     if (behaviour.token && request.headers.authorization !== `Bearer ${behaviour.token}`) return json(response, 401, { detail: "token" });
+    // A robot that tells nothing new.
+    if (url.pathname === "/v1/events") return response.writeHead(200, { "content-type": "text/event-stream" }).flushHeaders();
     const known = PARAMETERS[url.pathname];
     const foreign = [...url.searchParams.keys()].find((name) => known && !known.includes(name));
     if (foreign) return json(response, 400, { detail: `unknown parameter ${foreign}` });
     const cell = url.pathname.match(/^\/v1\/view\/cells\/(\d+)$/);
     if (cell) return response.writeHead(200).end(cellMessage(THINGS[Number(cell[1])]));
-    if (url.pathname === "/v1/view/scores") return response.writeHead(200).end(scoresMessage(url.searchParams.get("text")));
+    if (url.pathname === "/v1/view/scores") return response.writeHead(200).end(scoresMessage(url.searchParams.get("text"), behaviour.generation));
     if (url.pathname === "/v1/query") {
       const [name, support] = url.searchParams.get("text").split(" on the ");
       const thing = THINGS.find((entry) => entry.name === name);
@@ -105,10 +108,10 @@ export async function startService(behaviour = {}) {
     }
     if (url.pathname !== "/v1/view" || !behaviour.hasScene) return json(response, 404, { detail: "nothing here" });
     json(response, 200, {
-      program: "slag-edge", scene: "test room", generation: behaviour.generation, dim: 8, up: [0, 0, 1], geographic: false, levels: [], views: [],
-      n_gaussians: THINGS.reduce((sum, { n }) => sum + n[0] * n[1] * n[2], 0), position: { position_m: [-3, 3, 0], radius_m: 0.8 },
+      program: "slag-edge", scene: "test room", generation: behaviour.generation, up: [0, 0, 1], metric: true, geographic: false, can_ask: true, views: [],
+      n_gaussians: THINGS.reduce((sum, { n }) => sum + n[0] * n[1] * n[2], 0), position_m: [-3, 3, 0], fetched: { centre_m: [-3, 3, 0], radius_m: 0.8 },
       cells: THINGS.map(({ min, max, n }, i) => ({
-        cell: i, n_gaussians: n[0] * n[1] * n[2], state: behaviour.missing.includes(i) ? "missing" : "on_board", appearance: true, box_m: { min, max }, origin_m: [0, 0, 0],
+        cell: i, n_gaussians: n[0] * n[1] * n[2], state: behaviour.missing.includes(i) ? "missing" : "on_board", generation: behaviour.generation, box_m: { min, max },
       })),
     });
   });

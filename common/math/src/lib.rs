@@ -11,6 +11,7 @@ pub mod graph_segmentation;
 pub mod matrix;
 pub mod nearest;
 pub mod random;
+pub mod relevancy;
 pub mod simd;
 pub mod stats;
 pub mod union_find;

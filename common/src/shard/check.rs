@@ -102,6 +102,14 @@ impl ShardLayout {
             Some(_) => Some(packed_indices(&layout, bytes, n)?),
         };
         let objects = ObjectsLayout::check(bytes, &layout, header.n_gaussians, m)?;
+        let appearance = match layout.find(section::COLOURS) {
+            None => None,
+            Some(_) => Some([
+                layout.column::<[u8; 4]>(section::COLOURS, "colours", n)?,
+                layout.column::<[u8; 3]>(section::SIZES, "sizes", n)?,
+                layout.column::<[u8; 3]>(section::ROTATIONS, "rotations", n)?,
+            ]),
+        };
         Ok(Self {
             header,
             positions,
@@ -114,6 +122,7 @@ impl ShardLayout {
             fine,
             packed_indices,
             objects,
+            appearance,
         })
     }
 }

@@ -59,6 +59,17 @@ impl ShardView<'_> {
         (0..self.n_with_evidence()).map(score).collect()
     }
 
+    /// Returns the score of every centroid for a query (`[dim]`); products are in float64.
+    pub fn centroid_scores(&self, query: &[f32]) -> Vec<f32> {
+        let (offset, of_components) = self.components_of_query(query);
+        let step = f64::from(self.header.centroid_step);
+        let score = |centroid: usize| {
+            let components = self.centroids[centroid * of_components.len()..][..of_components.len()].iter();
+            offset + step * components.zip(&of_components).map(|(c, q)| f64::from(*c) * q).sum::<f64>()
+        };
+        (0..self.header.n_centroids as usize).map(|centroid| score(centroid) as f32).collect()
+    }
+
     /// Returns the products of a query (`[dim]`) with the mean and with each basis vector (`[m]`), in float64.
     ///
     /// The score of a vector with components c is the first plus the sum of `c[i]` times the second.

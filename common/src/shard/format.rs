@@ -60,6 +60,12 @@ pub mod section {
     pub const PACKED_INDICES_HEADER: u32 = 27;
     /// `[ceil(N * width_bits / 32)]` u32.
     pub const PACKED_INDICES: u32 = 28;
+    /// `[N][4]` u8, see [`crate::appearance::Appearance`].
+    pub const COLOURS: u32 = 40;
+    /// `[N][3]` u8.
+    pub const SIZES: u32 = 41;
+    /// `[N][3]` u8.
+    pub const ROTATIONS: u32 = 42;
 }
 
 /// Absolute errors of a profile's scores, measured over a bank of text vectors and a sample of the Gaussians.

@@ -7,6 +7,7 @@ use bytemuck::Pod;
 use super::columns::{Basis, ExactColumns, Fine, Positions, Residuals, ShardView};
 use super::format::{ScoreErrors, ShardHeader};
 use super::indices::{IndicesHeader, PackedIndices};
+use crate::appearance::Appearance;
 use crate::objects::{Objects, ObjectsLayout};
 
 /// The header of a checked shard and the places of its columns; [`ShardLayout::view`] gives the columns.
@@ -24,6 +25,7 @@ pub struct ShardLayout {
     pub(super) fine: Option<(ScoreErrors, [Range<usize>; 3])>,
     pub(super) packed_indices: Option<(IndicesHeader, Range<usize>)>,
     pub(super) objects: Option<ObjectsLayout>,
+    pub(super) appearance: Option<[Range<usize>; 3]>,
 }
 
 impl ShardLayout {
@@ -33,6 +35,19 @@ impl ShardLayout {
     /// As [`ShardLayout::view`], with an 8-byte aligned address.
     pub fn objects<'a>(&self, bytes: &'a [u8]) -> Option<Objects<'a>> {
         self.objects.as_ref().map(|objects| objects.view(bytes))
+    }
+
+    /// Returns how the Gaussians look, if the checked shard tells.
+    ///
+    /// # Panics
+    /// If `bytes` are shorter than those checked.
+    pub fn appearance<'a>(&self, bytes: &'a [u8]) -> Option<Appearance<'a>> {
+        let [colours, sizes, rotations] = self.appearance.clone()?.map(|range| &bytes[range]);
+        Some(Appearance {
+            colours: bytemuck::cast_slice(colours),
+            sizes: bytemuck::cast_slice(sizes),
+            rotations: bytemuck::cast_slice(rotations),
+        })
     }
 
     /// Returns the columns in the checked bytes.

@@ -32,3 +32,4 @@ pub use format::{
 pub use indices::{IndexColumn, IndicesHeader, PackedIndices};
 pub use layout::ShardLayout;
 pub use profile::Profile;
+pub use write::Additions;

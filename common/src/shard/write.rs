@@ -4,8 +4,24 @@ use std::io;
 
 use super::columns::ShardView;
 use super::format::{MAGIC, VERSION, section};
+use crate::appearance::Appearance;
 use crate::container;
 use crate::objects::Objects;
+
+/// What a shard may carry beyond what questions need.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Additions<'a> {
+    /// The objects of its Gaussians.
+    pub objects: Option<&'a Objects<'a>>,
+    /// How its Gaussians look.
+    pub appearance: Option<Appearance<'a>>,
+}
+
+impl<'a> From<Option<&'a Objects<'a>>> for Additions<'a> {
+    fn from(objects: Option<&'a Objects<'a>>) -> Self {
+        Self { objects, ..Self::default() }
+    }
+}
 
 impl ShardView<'_> {
     /// Writes the shard.
@@ -13,14 +29,15 @@ impl ShardView<'_> {
     /// # Errors
     /// Those of the writer.
     pub fn write(&self, out: impl io::Write) -> io::Result<()> {
-        self.write_with(out, None)
+        self.write_with(out, Additions::default())
     }
 
-    /// Writes the shard with the objects of its Gaussians.
+    /// Writes the shard and its additions.
     ///
     /// # Errors
     /// Those of the writer.
-    pub fn write_with(&self, out: impl io::Write, objects: Option<&Objects<'_>>) -> io::Result<()> {
+    pub fn write_with<'a>(&self, out: impl io::Write, additions: impl Into<Additions<'a>>) -> io::Result<()> {
+        let Additions { objects, appearance } = additions.into();
         let mut sections = vec![
             (section::HEADER, bytemuck::bytes_of(&self.header)),
             (section::POSITIONS, self.positions.bytes()),
@@ -55,6 +72,11 @@ impl ShardView<'_> {
             sections.push((section::PACKED_INDICES, container::bytes_of(indices.words)));
         }
         sections.extend(objects.iter().flat_map(|objects| objects.sections()));
+        if let Some(Appearance { colours, sizes, rotations }) = &appearance {
+            sections.push((section::COLOURS, container::bytes_of(colours)));
+            sections.push((section::SIZES, container::bytes_of(sizes)));
+            sections.push((section::ROTATIONS, container::bytes_of(rotations)));
+        }
         container::write(out, MAGIC, VERSION, &sections)
     }
 }

@@ -1,5 +1,12 @@
 //! The page that draws a scene, asks it and shows the answers. `scripts/build-page.sh` builds it from `web/` into `dist/`;
 //! the build embeds it compressed, and [`router`] serves it under `/view` without a network or files.
+//!
+//! The program that serves the page describes its scene ([`Description`]) and sends Gaussians ([`cell_message`]) and scores
+//! ([`ScoresMessage`]) in the layouts of `docs/view.md`.
+
+mod cell;
+mod description;
+mod scores;
 
 use std::io::Read;
 
@@ -12,6 +19,11 @@ use axum::http::header::{
 use axum::http::{HeaderMap, HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
+use slag_service::problem::Problem;
+
+pub use cell::{CELL_HEAD_BYTES, GAUSSIAN_BYTES, cell_message};
+pub use description::{Cell, CellState, Corners, Description, Fetched, Photo};
+pub use scores::ScoresMessage;
 
 /// A file of the page.
 struct File {
@@ -30,8 +42,8 @@ static FILES: &[File] = include!(concat!(env!("OUT_DIR"), "/files.rs"));
 const POLICY: &str = include_str!("csp.txt");
 
 /// Answer of a program that was built without the page.
-const NOT_BUILT: &str = "This program was built without its page.\n\
-    Run scripts/build-page.sh (it needs Node.js), then build the program again.\n";
+const NOT_BUILT: &str = "this program was built without its page; run scripts/build-page.sh, which needs Node.js, and build the \
+                         program again";
 
 /// Whether the page was built into this program.
 pub fn is_built() -> bool {
@@ -63,11 +75,13 @@ fn content_type(path: &str) -> &'static str {
 
 fn reply(path: &str, headers: &HeaderMap) -> Response {
     if !is_built() {
-        return (StatusCode::SERVICE_UNAVAILABLE, [(CONTENT_TYPE, "text/plain; charset=utf-8")], NOT_BUILT)
-            .into_response();
+        let status = StatusCode::SERVICE_UNAVAILABLE;
+        return Problem::new(status, "no-page", "No page", NOT_BUILT).into_response();
     }
     let Some(file) = FILES.iter().find(|file| file.path == path) else {
-        return (StatusCode::NOT_FOUND, format!("the page has no file {path:?}\n")).into_response();
+        let shown: String = path.chars().take(80).collect();
+        let detail = format!("the page has no file {shown:?}; reload it");
+        return Problem::new(StatusCode::NOT_FOUND, "not-found", "Not found", detail).into_response();
     };
     // Names under assets/ hold a hash of the content.
     let caching =

@@ -16,7 +16,8 @@ use super::app::App;
 use super::{params, position, query, status, v1};
 
 /// First line of the help text.
-const TITLE: &str = "slag-edge answers text queries about the scene around the robot.";
+const TITLE: &str =
+    "slag-edge answers text queries about the scene around the robot. /view is a page that draws it.";
 /// The description for programs. It is kept by hand, not by `utoipa`: a test compares it with every route, parameter and
 /// answer, and most of its text is no doc comment of a type.
 pub(super) const OPENAPI: &str = include_str!("openapi.json");
@@ -52,7 +53,7 @@ pub(super) fn routes() -> Routes<Arc<App>> {
 pub(super) fn router(app: Arc<App>) -> Router {
     let (responses, access) = (Arc::clone(&app.metrics.responses), app.settings.access.clone());
     let (router, _) = routes().with_help(TITLE);
-    observed(router.with_state(app), responses, access)
+    observed(router.merge(slag_view::router()).with_state(app), responses, access)
 }
 
 /// Returns whether the service answers `GET /healthz` to itself: its threads, its routes and their limits work.

@@ -29,6 +29,7 @@ mod attacks;
 mod openapi;
 mod ply;
 mod v1;
+mod view;
 
 struct Service {
     dir: TempDir,

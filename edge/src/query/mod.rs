@@ -26,6 +26,7 @@ mod scale;
 mod scene;
 mod status;
 mod threshold;
+mod view;
 
 pub use answer::answer;
 pub use answers::{

@@ -4,6 +4,7 @@ use std::io;
 use std::path::Path;
 
 use slag_common::Hash32;
+use slag_common::appearance::Appearance;
 use slag_common::manifest::{CellRecord, Manifest};
 use slag_common::objects::Objects;
 use slag_common::shard::{Profile, ShardLayout, ShardView};
@@ -30,6 +31,11 @@ impl OpenShard {
     /// Returns its columns.
     pub fn view(&self) -> ShardView<'_> {
         self.layout.view(&self.bytes)
+    }
+
+    /// Returns how its Gaussians look, if the shard tells.
+    pub fn appearance(&self) -> Option<Appearance<'_>> {
+        self.layout.appearance(&self.bytes)
     }
 
     /// Returns its objects, if the shard has any.

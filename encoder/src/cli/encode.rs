@@ -141,6 +141,10 @@ pub struct EncodeArgs {
     /// 4 bytes a Gaussian, 2.5 in a scene of a million.
     #[arg(long)]
     pub input_indices: bool,
+    /// Shards tell how their Gaussians look, so that the page at /view shows colours on a robot, too: 10 bytes a Gaussian
+    /// in every profile.
+    #[arg(long)]
+    pub appearance: bool,
     /// Search for objects.
     #[command(flatten)]
     pub objects: ObjectArgs,
@@ -246,6 +250,7 @@ fn shard_settings(args: &EncodeArgs, preset: CodebookSettings, metric: bool) -> 
             .position_error
             .map_or_else(|| PositionError::default_for(metric), PositionError::Within),
         input_indices: args.input_indices,
+        appearance: args.appearance,
     }
 }
 

@@ -19,6 +19,7 @@ mod sam;
 mod serve;
 mod store;
 mod target;
+mod view;
 mod views;
 
 use anyhow::Result;
@@ -78,6 +79,8 @@ pub enum Command {
     Diff(diff::DiffArgs),
     /// Serves a store's manifest and shards over HTTP.
     Serve(serve::ServeArgs),
+    /// Draws a store or a splat on a page, and asks it.
+    View(Box<view::ViewArgs>),
     /// Shows, makes and rotates the key that a store signs with.
     #[command(subcommand)]
     Keys(keys::KeysCommand),
@@ -105,6 +108,7 @@ pub fn run(cli: Cli) -> Exit {
         Command::Query(args) => query::run(&args, json),
         Command::Diff(args) => diff::run(&args, json),
         Command::Serve(args) => serve::run(&args),
+        Command::View(args) => view::run(&args),
         Command::Keys(command) => keys::run(&command, json),
         Command::Store(command) => store::run(&command, progress.as_ref(), json),
         Command::Models(command) => models::run(&command, json),

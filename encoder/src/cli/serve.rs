@@ -7,9 +7,11 @@ use clap::Args;
 use slag_service::listen::Listen;
 use slag_service::tls::TlsFiles;
 
-use super::common::{runtime, stopped};
+use super::common::{ModelArgs, runtime, stopped};
 use super::exit::Exit;
+use super::view::open_text;
 use crate::publish::serve::{self, Access, AccessSettings};
+use crate::view::{self, Shown, Viewer};
 
 /// `serve`.
 #[derive(Debug, Args)]
@@ -33,6 +35,9 @@ pub struct ServeArgs {
     /// Private key of --tls-cert (PEM).
     #[arg(long, value_name = "FILE", requires = "tls_cert")]
     pub tls_key: Option<PathBuf>,
+    /// Models of the page at /view; they must be those that the store was encoded with.
+    #[command(flatten)]
+    pub models: ModelArgs,
 }
 
 pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
@@ -46,7 +51,12 @@ pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
         // On stdout: with port 0 this is where a script learns the port.
         let listening = |url| println!("listening on {url}");
         let limits = serve::Limits::default();
-        serve::serve(&args.store, args.listen.clone(), limits, access, tls, listening, stopped()).await
+        let open_text = open_text(args.models.clone());
+        let shown =
+            Shown { store: Some(args.store.clone()), splat: None, views: Vec::new(), up: None, open_text };
+        let page = view::router(Viewer::new(shown));
+        let router = serve::router_with(&args.store, limits, access, page)?;
+        serve::serve_router(router, args.listen.clone(), limits, tls, listening, stopped()).await
     })?;
     Ok(Exit::Done)
 }

@@ -275,6 +275,7 @@ impl EncodeSettings {
                     codebook: CodebookSettings::default(),
                     position_error: PositionError::default_for(metric),
                     input_indices: false,
+                    appearance: false,
                 },
                 objects: true,
             },

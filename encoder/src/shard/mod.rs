@@ -5,9 +5,11 @@ pub mod positions;
 use half::f16;
 use rayon::prelude::*;
 use slag_common::Gaussians;
+use slag_common::appearance::AppearanceColumns;
 use slag_common::hash::Hash32;
 use slag_common::shard::{
-    Basis, ExactColumns, Fine, IndexColumn, Profile, Residuals, ScoreErrors, ShardHeader, ShardView,
+    Additions, Basis, ExactColumns, Fine, IndexColumn, Profile, Residuals, ScoreErrors, ShardHeader,
+    ShardView,
 };
 
 use crate::cells::{Cell, CellSplit};
@@ -58,6 +60,8 @@ pub struct ShardSettings {
     pub position_error: PositionError,
     /// Whether compact and balanced shards have the indices of their Gaussians in the input splat file, too.
     pub input_indices: bool,
+    /// Whether shards tell how their Gaussians look.
+    pub appearance: bool,
 }
 
 /// The embeddings of a cell's Gaussians.
@@ -111,6 +115,7 @@ pub fn build(
     let locals: Vec<u32> = in_order.chain(without.iter().copied()).collect();
 
     let in_input = || locals.iter().map(|local| cell.gaussians[*local as usize]).collect::<Vec<u32>>();
+    let appearance = settings.appearance.then(|| AppearanceColumns::of(scene, &in_input()));
     let packed_indices = settings.input_indices.then(|| IndexColumn::pack(&in_input()));
     let positions = QuantisedPositions::new(scene, cell, &locals, settings.position_error);
     let header = ShardHeader {
@@ -163,7 +168,9 @@ pub fn build(
     let spread = codebook.errors.spread;
     let built = |profile, view: &ShardView<'_>| {
         let mut bytes = Vec::new();
-        view.write_with(&mut bytes, objects.as_ref()).expect("writing to memory cannot fail");
+        let appearance = appearance.as_ref().map(AppearanceColumns::view);
+        let additions = Additions { objects: objects.as_ref(), appearance };
+        view.write_with(&mut bytes, additions).expect("writing to memory cannot fail");
         let (score_error_bound, score_errors) = match profile {
             Profile::Exact => (F16_ROUNDING, ScoreErrors { spread, ..ScoreErrors::default() }),
             _ => (largest(view.radii), view.header.errors),

@@ -3,24 +3,30 @@
 import "./style.css";
 import { Drawing } from "./drawing/drawing";
 import type { Scores } from "./messages";
-import { type Answer, type Description, describe, fetchAnswers, fetchScores, NotFound, parseQuestion, setToken, Unauthorized } from "./network";
-import { askToken, panel, say, showAnswers, showDetails, showFacts, showHistory, showLegend } from "./panel";
+import { type Answer, type Answers, type Description, describe, fetchAnswers, fetchPhoto, fetchScores, follow, NotFound, parseQuestion, setToken, Unauthorized } from "./network";
+import { askToken, panel, say, showAnswers, showDetails, showFacts, showHistory, showLegend, showPhoto, showSecond } from "./panel";
 import { readHistory, readState, remember, writeState } from "./state";
 import { Streaming } from "./streaming";
 
 const PAUSE_IN_TYPING_MS = 150;
 const LOOK_EVERY_MS = 4000;
+/** Gaussians of a thing that was found are lit from this share of the range of scores, if not from a lower score. */
+const SHARE_OF_RANGE = 0.75;
 
 const state = readState();
 let description: Description;
 let drawing: Drawing;
 let streaming: Streaming;
 let scores: Scores | null = null;
+/** Of the second question, and its level of threshold. */
+let second: { scores: Scores; threshold: number } | null = null;
 let answers: Answer[] = [];
 /** What the answers are. */
 let thing = "";
 let asking = new AbortController();
 let typing = 0;
+let looking = 0;
+let photoOpened = 0;
 
 const levelOf = (score: number, range: Scores) => Math.min(255, Math.max(1, Math.round(((score - range.min) / (range.max - range.min || 1)) * 255)));
 
@@ -37,7 +43,7 @@ async function withToken<T>(request: () => Promise<T>): Promise<T> {
 }
 
 function colour(level: number): void {
-  drawing.cells.colour(scores, level);
+  drawing.cells.colour(scores && { scores, threshold: level }, second);
   showLegend(scores, level);
   drawing.redraw();
 }
@@ -45,39 +51,77 @@ function colour(level: number): void {
 function choose(index: number | null): void {
   showAnswers(thing, answers, index, choose);
   drawing.showAnswers(thing, answers, index);
-  showDetails(thing, index === null ? null : answers[index], description.geographic);
-  if (index !== null) drawing.flyToAnswer(answers[index]);
+  const answer = index === null ? null : answers[index];
+  showDetails(thing, answer, description.geographic);
+  if (!answer) return;
+  drawing.flyToAnswer(answer);
+  const photo = description.views.findIndex(({ name }) => name === answer.evidence?.photo);
+  if (photo >= 0) void openPhoto(photo, answer.evidence?.box_px ?? null);
 }
 
-async function ask(line: string): Promise<void> {
+/** Shows a photo with a box in it. */
+async function openPhoto(index: number, boxPx: number[] | null): Promise<void> {
+  const photo = description.views[index];
+  const opened = ++photoOpened;
+  try {
+    const picture = photo.has_picture ? URL.createObjectURL(await fetchPhoto(index)) : null;
+    if (opened !== photoOpened) return;
+    leavePhoto();
+    if (picture) panel.blend.src = picture;
+    showPhoto(photo, picture, boxPx, () => drawing.standAt(photo), (share) => {
+      drawing.standAt(photo);
+      panel.blend.hidden = share === 0;
+      // Opacity as a property: the page's policy allows no style attributes in HTML.
+      panel.blend.style.opacity = String(share);
+    });
+  } catch (error) {
+    report(error);
+  }
+}
+
+function leavePhoto(): void {
+  panel.blend.hidden = true;
+  const share = document.querySelector<HTMLInputElement>("#blend-share");
+  if (share) share.value = "0";
+}
+
+/** Asks one line of words; nothing for an empty one. */
+async function fetchBoth(line: string, signal: AbortSignal): Promise<[Scores, Answers] | null> {
+  const question = parseQuestion(line);
+  if (!question.text) return null;
+  const [ofText, reply] = await Promise.all([fetchScores(question, signal), fetchAnswers(question, signal)]);
+  // The scores of "mug on the table" are those of mugs.
+  return [reply.thing === question.text ? ofText : await fetchScores({ ...question, text: reply.thing }, signal), reply];
+}
+
+/** Things are found by the average of their masks, which their Gaussians at edges and in shade stay below: with answers, three quarters of the range is enough. */
+function levelFrom(found: Scores, { threshold, answers }: Pick<Answers, "threshold" | "answers">): number {
+  const high = found.min + SHARE_OF_RANGE * (found.max - found.min);
+  return levelOf(answers.length > 0 ? Math.min(threshold ?? high, high) : (threshold ?? high), found);
+}
+
+async function ask(): Promise<void> {
   asking.abort();
   asking = new AbortController();
   const { signal } = asking;
-  state.question = line.trim();
   writeState(state);
-  const question = parseQuestion(line);
-  if (!question.text) {
-    scores = null;
-    answers = [];
-    colour(0);
-    choose(null);
-    say("");
-    return;
-  }
   try {
-    const [ofText, reply] = await Promise.all([fetchScores(question, signal), fetchAnswers(question, signal)]);
-    // The scores of "mug on the table" are those of mugs.
-    const found = reply.thing === question.text ? ofText : await fetchScores({ ...question, text: reply.thing }, signal);
+    const [first, beside] = await Promise.all([fetchBoth(state.question, signal), fetchBoth(state.second, signal)]);
     if (signal.aborted) return;
-    scores = found;
-    thing = reply.thing;
-    answers = reply.answers;
-    colour(levelOf(state.threshold ?? reply.threshold ?? found.min + 0.6 * (found.max - found.min), found));
+    // Scores of another generation than the cells would light the wrong Gaussians; the next look finds it, too.
+    if ([first, beside].some((found) => found && found[0].generation !== description.generation % 2 ** 32)) return void lookSoon();
+    scores = first?.[0] ?? null;
+    thing = first?.[1].thing ?? "";
+    answers = first?.[1].answers ?? [];
+    second = beside && { scores: beside[0], threshold: levelFrom(beside[0], beside[1]) };
+    showSecond(beside && `${beside[1].thing}: ${beside[1].answers.length} found`);
+    if (first && state.threshold !== null) colour(levelOf(state.threshold, first[0]));
+    else colour(first ? levelFrom(...first) : 0);
     choose(null);
-    say(answers.length > 0 ? `${answers.length} found` : (reply.none ?? "Nothing found"));
-    remember(state.question);
+    say(first ? (answers.length > 0 ? `${answers.length} found` : (first[1].none ?? "Nothing found")) : "");
+    if (first) remember(state.question);
     showHistory(readHistory());
-    document.documentElement.dataset.answered = state.question;
+    document.documentElement.dataset.answered = [state.question, state.second].filter(Boolean).join(" | ");
   } catch (error) {
     if (!signal.aborted) report(error);
   }
@@ -85,21 +129,21 @@ async function ask(line: string): Promise<void> {
 
 function report(error: unknown): void {
   if (error instanceof Unauthorized) {
-    void withToken(describe).then(() => ask(state.question));
+    void withToken(describe).then(ask);
     return;
   }
   say(error instanceof Error ? error.message : String(error), true);
 }
 
 function open(): void {
-  drawing = new Drawing(panel.canvas, panel.labels, description);
+  drawing = new Drawing(panel.canvas, panel.labels, description, leavePhoto);
+  panel.form.hidden = !description.can_ask;
   if (state.camera) drawing.placeAt(state.camera);
-  drawing.showRobot(description.position);
+  drawing.showRobot(description);
   stream();
-  if (state.question) {
-    panel.question.value = state.question;
-    void ask(state.question);
-  }
+  panel.question.value = state.question;
+  panel.second.value = state.second;
+  if (description.can_ask && (state.question || state.second)) void ask();
 }
 
 function stream(): void {
@@ -113,7 +157,7 @@ function stream(): void {
   streaming.update();
 }
 
-const cellsOf = (seen: Description) => JSON.stringify(seen.cells.map(({ cell, state, n_gaussians }) => [cell, state, n_gaussians]));
+const cellsOf = (seen: Description) => JSON.stringify(seen.cells.map(({ cell, state, generation, n_gaussians }) => [cell, state, generation, n_gaussians]));
 
 /** Looks what has changed: generation, cells, the robot's place, or that the service is gone. */
 async function look(): Promise<void> {
@@ -124,13 +168,13 @@ async function look(): Promise<void> {
     const wasOffline = document.documentElement.dataset.offline !== undefined;
     delete document.documentElement.dataset.offline;
     description = seen;
-    drawing.showRobot(seen.position);
+    drawing.showRobot(seen);
     if (isOther) {
       streaming.stop();
       drawing.cells.clear();
       drawing.marks.showCells(seen.cells);
       stream();
-      if (state.question) await ask(state.question);
+      if (description.can_ask && (state.question || state.second)) await ask();
       say(isOtherGeneration ? `The service has generation ${seen.generation} now.` : "Other cells are on board now.");
     } else {
       streaming.update();
@@ -142,19 +186,45 @@ async function look(): Promise<void> {
   }
   state.camera = drawing.pose();
   writeState(state);
-  setTimeout(() => void look(), LOOK_EVERY_MS);
+  lookSoon(LOOK_EVERY_MS);
+}
+
+/** Looks after a while, once. */
+function lookSoon(afterMs = 0): void {
+  clearTimeout(looking);
+  looking = window.setTimeout(() => void look(), afterMs);
+}
+
+/** A robot tells where it is and what it has at once; without its events, the next look finds out. */
+async function hearEvents(): Promise<void> {
+  try {
+    await follow((name, data) => {
+      if (name === "generation" && (data as { generation?: number } | null)?.generation !== description.generation) lookSoon();
+      if (name === "following") lookSoon();
+    });
+  } catch {
+    // The page looks every few seconds anyway.
+  }
+  setTimeout(() => void hearEvents(), 5 * LOOK_EVERY_MS);
 }
 
 function listen(): void {
+  const read = () => {
+    clearTimeout(typing);
+    if (panel.question.value.trim() !== state.question) state.threshold = null;
+    [state.question, state.second] = [panel.question.value.trim(), panel.second.value.trim()];
+    void ask();
+  };
   panel.form.addEventListener("submit", (event) => {
     event.preventDefault();
-    clearTimeout(typing);
-    void ask(panel.question.value);
+    read();
   });
-  panel.question.addEventListener("input", () => {
-    clearTimeout(typing);
-    typing = window.setTimeout(() => void ask(panel.question.value), PAUSE_IN_TYPING_MS);
-  });
+  for (const box of [panel.question, panel.second]) {
+    box.addEventListener("input", () => {
+      clearTimeout(typing);
+      typing = window.setTimeout(read, PAUSE_IN_TYPING_MS);
+    });
+  }
   panel.threshold.addEventListener("input", () => {
     if (!scores) return;
     const level = Number(panel.threshold.value);
@@ -180,7 +250,9 @@ function listen(): void {
   panel.whole.addEventListener("click", () => drawing.showWhole());
   panel.canvas.addEventListener("click", (event) => {
     const index = drawing.answerAt(event.offsetX, event.offsetY);
-    if (index !== null) choose(index);
+    if (index !== null) return choose(index);
+    const photo = drawing.photoAt(description.views, event.offsetX, event.offsetY);
+    if (photo !== null) void openPhoto(photo, null).then(() => drawing.standAt(description.views[photo]));
   });
   document.addEventListener("keydown", (event) => {
     if (event.key !== "/" || event.target instanceof HTMLInputElement) return;
@@ -205,7 +277,8 @@ async function start(): Promise<void> {
   say("");
   open();
   listen();
-  setTimeout(() => void look(), LOOK_EVERY_MS);
+  lookSoon(LOOK_EVERY_MS);
+  if (description.program === "slag-edge") void hearEvents();
 }
 
 void start();

@@ -13,7 +13,9 @@ export interface CellGaussians {
 export interface Scores {
   min: number;
   max: number;
-  /** By index into the cells of `/v1/view`. */
+  /** Which generation they are of, modulo 2^32. */
+  generation: number;
+  /** By the cells' ids. */
   byCell: Map<number, Uint8Array>;
 }
 
@@ -61,5 +63,5 @@ export function readScores(buffer: ArrayBuffer): Scores {
     byCell.set(view.getUint32(24 + 8 * i, true), new Uint8Array(buffer, offset, n));
     offset += n;
   }
-  return { min: view.getFloat32(8, true), max: view.getFloat32(12, true), byCell };
+  return { min: view.getFloat32(8, true), max: view.getFloat32(12, true), generation: view.getUint32(20, true), byCell };
 }

@@ -7,10 +7,10 @@ export type Vector = [number, number, number];
 export interface Cell {
   cell: number;
   n_gaussians: number;
-  state: "on_board" | "missing";
-  appearance: boolean;
+  /** Stale: of an earlier generation. */
+  state: "on_board" | "stale" | "missing";
+  generation: number;
   box_m: { min: Vector; max: Vector };
-  origin_m: Vector;
 }
 
 export interface Photo {
@@ -20,6 +20,8 @@ export interface Photo {
   width_px: number;
   height_px: number;
   focal_px: number;
+  /** Whether `/v1/view/photos/{name}` has the picture. */
+  has_picture: boolean;
 }
 
 /** Reply of `GET /v1/view`. */
@@ -29,10 +31,15 @@ export interface Description {
   generation: number;
   n_gaussians: number;
   up: Vector;
+  metric: boolean;
   geographic: boolean;
+  can_ask: boolean;
   cells: Cell[];
   views: Photo[];
-  position: { position_m?: Vector; radius_m?: number } | null;
+  /** What a robot fetched. */
+  fetched?: { centre_m: Vector; radius_m: number };
+  /** Where a robot is. */
+  position_m?: Vector;
 }
 
 export interface Answer {
@@ -43,7 +50,7 @@ export interface Answer {
   oriented_box?: { centre_in_world: Vector; size: Vector; rotation_world_from_box: [number, number, number, number] };
   score: number;
   n_gaussians?: number;
-  evidence?: { photo: string };
+  evidence?: { photo: string; box_px: [number, number, number, number] };
   geographic?: { latitude_deg: number; longitude_deg: number; height_m: number };
   /** How well the relation of a phrase holds, 0.5 to 1. */
   degree?: number;
@@ -101,6 +108,28 @@ async function get(path: string, signal?: AbortSignal): Promise<Response> {
 
 export async function describe(): Promise<Description> {
   return (await get("/v1/view")).json();
+}
+
+/** The picture of a photo, by its index in the description. */
+export async function fetchPhoto(index: number): Promise<Blob> {
+  return (await get(`/v1/view/photos/${index}`)).blob();
+}
+
+/** Hands on a robot's events until the connection ends. */
+export async function follow(onEvent: (name: string, data: unknown) => void): Promise<void> {
+  const reader = (await get("/v1/events")).body?.pipeThrough(new TextDecoderStream()).getReader();
+  let text = "";
+  for (;;) {
+    const read = await reader?.read();
+    if (!read || read.done) return;
+    text += read.value;
+    const events = text.split("\n\n");
+    text = events.pop() ?? "";
+    for (const event of events) {
+      const [name, data] = ["event: ", "data: "].map((field) => event.split("\n").find((line) => line.startsWith(field))?.slice(field.length));
+      if (name && data) onEvent(name, JSON.parse(data));
+    }
+  }
 }
 
 export async function fetchCell(cell: number, generation: number): Promise<CellGaussians> {

@@ -1,7 +1,7 @@
 // The panel's elements, and what is written in them.
 
 import { rampColour } from "./drawing/ramp";
-import type { Answer, Description } from "./network";
+import type { Answer, Description, Photo } from "./network";
 
 function element<T extends HTMLElement>(id: string): T {
   const found = document.getElementById(id);
@@ -14,6 +14,8 @@ export const panel = {
   labels: element("labels"),
   form: element<HTMLFormElement>("ask"),
   question: element<HTMLInputElement>("question"),
+  second: element<HTMLInputElement>("second"),
+  blend: element<HTMLImageElement>("blend"),
   threshold: element<HTMLInputElement>("threshold"),
   showBoxes: element<HTMLInputElement>("show-boxes"),
   showGrid: element<HTMLInputElement>("show-grid"),
@@ -32,13 +34,15 @@ export function say(text: string, isError = false): void {
 
 export function showFacts(description: Description, nDrawn: number, stepM: number): void {
   const missing = description.cells.filter((cell) => cell.state === "missing").length;
+  const stale = description.cells.filter((cell) => cell.state === "stale").length;
   document.title = `${description.scene} · SLAG`;
   element("scene").textContent = description.scene;
   element("facts").textContent = [
     `${count.format(nDrawn)} of ${count.format(description.n_gaussians)} Gaussians`,
     `generation ${description.generation}`,
     missing > 0 ? `${missing} of ${description.cells.length} cells missing` : "",
-    `grid ${stepM} m`,
+    stale > 0 ? `${stale} of an earlier generation` : "",
+    `grid ${stepM} ${description.metric ? "m" : "units"}`,
   ].filter(Boolean).join(" · ");
   element("photos-label").hidden = description.views.length === 0;
 }
@@ -62,6 +66,11 @@ export function showLegend(range: { min: number; max: number } | null, level: nu
     context.fillStyle = `rgb(${r} ${g} ${b})`;
     context.fillRect(l, 0, 1, 1);
   }
+}
+
+export function showSecond(text: string | null): void {
+  element("second-legend").hidden = text === null;
+  element("second-legend").textContent = text ?? "";
 }
 
 export function showAnswers(name: string, answers: Answer[], chosen: number | null, onChoose: (index: number) => void): void {
@@ -117,6 +126,49 @@ export function showDetails(name: string, answer: Answer | null, isGeographic: b
     list.append(dt, dd);
   }
   section.replaceChildren(heading, list);
+}
+
+const SVG = "http://www.w3.org/2000/svg";
+
+/** Shows a photo in the details: the picture, where there is one, with a box in it, and a button that goes there. */
+export function showPhoto(photo: Photo, picture: string | null, boxPx: number[] | null, onGo: () => void, onBlend: (share: number) => void): void {
+  const figure = document.createElement("figure");
+  if (picture) {
+    const svg = document.createElementNS(SVG, "svg");
+    svg.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
+    svg.setAttribute("role", "img");
+    svg.setAttribute("aria-label", `Photo ${photo.name}`);
+    const image = document.createElementNS(SVG, "image");
+    const put = (to: Element, values: Record<string, number | string>) => Object.entries(values).forEach(([name, value]) => to.setAttribute(name, String(value)));
+    put(image, { href: picture, width: photo.width_px, height: photo.height_px });
+    svg.append(image);
+    if (boxPx) {
+      const box = document.createElementNS(SVG, "rect");
+      put(box, { x: boxPx[0], y: boxPx[1], width: boxPx[2] - boxPx[0], height: boxPx[3] - boxPx[1] });
+      svg.append(box);
+    }
+    figure.append(svg);
+  }
+  const caption = document.createElement("figcaption");
+  const name = document.createElement("span");
+  name.textContent = photo.name;
+  const go = document.createElement("button");
+  go.type = "button";
+  go.textContent = "Stand here";
+  go.addEventListener("click", onGo);
+  caption.append(name, go);
+  if (picture) {
+    const blend = document.createElement("input");
+    Object.assign(blend, { type: "range", min: "0", max: "100", value: "0", id: "blend-share" });
+    blend.setAttribute("aria-label", "Photo over the scene");
+    blend.addEventListener("input", () => onBlend(Number(blend.value) / 100));
+    caption.append(blend);
+  }
+  figure.append(caption);
+  const section = element("details");
+  section.querySelector("figure")?.remove();
+  section.hidden = false;
+  section.append(figure);
 }
 
 /** Asks for the service's token. */

@@ -1,9 +1,11 @@
-// What a link to the page holds: question, threshold and camera, in the address's fragment; and the history of questions.
+// What a link to the page holds: questions, threshold and camera, in the address's fragment; and the history of questions.
 
 import type { Vector } from "./network";
 
 export interface State {
   question: string;
+  /** A second one, beside it. */
+  second: string;
   /** A score, or null for the encoder's own threshold. */
   threshold: number | null;
   camera: { position: Vector; target: Vector } | null;
@@ -18,6 +20,7 @@ export function readState(fragment = location.hash): State {
   const isCamera = numbers.length === 6 && numbers.every(Number.isFinite);
   return {
     question: (parameters.get("q") ?? "").slice(0, 500),
+    second: (parameters.get("and") ?? "").slice(0, 500),
     threshold: Number.isFinite(threshold) ? threshold : null,
     camera: isCamera ? { position: numbers.slice(0, 3) as Vector, target: numbers.slice(3) as Vector } : null,
   };
@@ -26,6 +29,7 @@ export function readState(fragment = location.hash): State {
 export function writeState(state: State): void {
   const parameters = new URLSearchParams();
   if (state.question) parameters.set("q", state.question);
+  if (state.second) parameters.set("and", state.second);
   if (state.threshold !== null) parameters.set("threshold", state.threshold.toFixed(3));
   if (state.camera) parameters.set("camera", [...state.camera.position, ...state.camera.target].map((v) => v.toFixed(3)).join(","));
   history.replaceState(null, "", `#${parameters}`);

@@ -23,19 +23,19 @@ export class Streaming {
   update(): void {
     if (this.isStopped) return;
     const at = this.drawing.pose().position;
-    const cells = this.description.cells.map((cell, index) => ({ cell, index })).filter(({ cell }) => cell.state === "on_board");
+    const cells = this.description.cells.filter(({ state }) => state !== "missing");
     const distance = ({ min, max }: { min: number[]; max: number[] }) =>
       Math.hypot(...at.map((v, i) => Math.max(min[i] - v, 0, v - max[i])));
-    cells.sort((a, b) => distance(a.cell.box_m) - distance(b.cell.box_m) || a.index - b.index);
+    cells.sort((a, b) => distance(a.box_m) - distance(b.box_m) || a.cell - b.cell);
     let nGaussians = 0;
     let isLoaded = true;
-    for (const { cell, index } of cells) {
-      nGaussians += cell.n_gaussians;
-      if (nGaussians > MAX_GAUSSIANS && index !== cells[0].index) {
-        this.drawing.cells.remove(index);
-      } else if (!this.drawing.cells.has(index)) {
+    for (const { cell, n_gaussians } of cells) {
+      nGaussians += n_gaussians;
+      if (nGaussians > MAX_GAUSSIANS && cell !== cells[0].cell) {
+        this.drawing.cells.remove(cell);
+      } else if (!this.drawing.cells.has(cell)) {
         isLoaded = false;
-        if (this.underWay.size < AT_A_TIME) void this.load(cell.cell, index);
+        if (this.underWay.size < AT_A_TIME) void this.load(cell);
       }
     }
     this.isLoaded = isLoaded;
@@ -46,20 +46,20 @@ export class Streaming {
     return this.isLoaded;
   }
 
-  private async load(cell: number, index: number): Promise<void> {
-    if (this.underWay.has(index)) return;
-    this.underWay.add(index);
+  private async load(cell: number): Promise<void> {
+    if (this.underWay.has(cell)) return;
+    this.underWay.add(cell);
     try {
       const gaussians = await fetchCell(cell, this.description.generation);
       if (this.isStopped) return;
-      this.drawing.cells.add(index, gaussians);
+      this.drawing.cells.add(cell, gaussians);
       this.drawing.redraw();
-      this.underWay.delete(index);
+      this.underWay.delete(cell);
       this.update();
       this.onCell();
     } catch (error) {
       // The next look at the service tries again.
-      this.underWay.delete(index);
+      this.underWay.delete(cell);
       if (!this.isStopped) this.onError(error);
     }
   }

@@ -124,7 +124,8 @@ impl Body {
     }
 }
 
-fn negatives(phrases: Vec<String>) -> Negatives {
+/// Returns negative prompts as the engine takes them.
+pub fn negatives(phrases: Vec<String>) -> Negatives {
     match phrases.as_slice() {
         [] => Negatives::None,
         [one] if one == "canonical" => Negatives::Canonical,

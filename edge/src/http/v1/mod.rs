@@ -7,6 +7,7 @@ mod objects;
 mod params;
 mod query;
 mod reply;
+mod view;
 
 use std::sync::Arc;
 
@@ -28,5 +29,14 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         .parameters(params::objects_parameters())
         .get("/v1/objects/{id}", "one thing on board", objects::one)
         .get("/v1/map", "the area on board, its age, and what is missing", map::map)
+        .get(
+            "/v1/view",
+            "the scene on board as the page at /view draws it: cells, fetched area, robot",
+            view::describe,
+        )
+        .get("/v1/view/scores", "the score of every Gaussian on board, a byte each, in binary", view::scores)
+        .parameters(view::scores_parameters())
+        .get("/v1/view/cells/{id}", "the Gaussians of a cell, 16 bytes each, in binary", view::cell)
+        .parameters(view::cell_parameters())
         .get("/v1/events", "server-sent events: generations and fetches as they happen", events::events)
 }

@@ -288,6 +288,7 @@ fn shards(
         codebook,
         position_error: PositionError::Within(0.01),
         input_indices: false,
+        appearance: false,
     };
     let mut decoded = vec![0.0f32; embeddings.vectors.len()];
     let (mut bytes, mut position_bytes, mut ms, mut first) = (0, 0, 0.0, 0);

@@ -117,6 +117,12 @@ impl DemoReport {
     pub fn all_right(&self) -> bool {
         self.questions.iter().all(|q| q.right)
     }
+
+    /// Returns the link that opens the robot's page with the first question, if the page is in the programs.
+    fn link(&self) -> Option<String> {
+        let question = self.questions.first().filter(|_| slag_view::is_built())?;
+        Some(format!("http://127.0.0.1:7734/view#q={}", question.text.replace(' ', "+")))
+    }
 }
 
 impl Demo {
@@ -131,6 +137,9 @@ impl Demo {
         let mut shards =
             shards.arg("serve").arg("--store").arg(store).spawn().context("cannot serve the store")?;
         println!("try: curl 'http://127.0.0.1:7734/query?text=chair'");
+        if let Some(link) = self.report.link() {
+            println!("see: {link}");
+        }
         let status = Command::new(&self.edge).arg("serve").arg("--cache").arg(&self.cache).status();
         // It may have ended already: ctrl-c reaches all processes of the terminal.
         let _ = shards.kill();
@@ -167,6 +176,8 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
     settings.output.created_unix_secs = options.created_unix_secs;
     settings.run.memory_bytes = 1 << 30;
     settings.run.strict = true;
+    // The page then shows colours on the robot, too.
+    settings.cells.shards.appearance = true;
     // Small cells, so that the demo has several.
     settings.cells.limits = CellLimits { max_gaussians: 16_384, max_width: Some(25.0) };
     let engines = Engines::new(&models, &options.session, &CpuRasterizer);
@@ -325,6 +336,13 @@ impl fmt::Display for DemoReport {
             writeln!(f, "{:<24} {answer:<46} {:>7.0}  {right:<7} {truth}", q.text, q.process_ms)?;
         }
         writeln!(f, "\nmodel: {}", self.about_model)?;
-        writeln!(f, "pictures: {}, {}", self.pictures[0].display(), self.pictures[1].display())
+        writeln!(f, "pictures: {}, {}", self.pictures[0].display(), self.pictures[1].display())?;
+        match self.link() {
+            Some(link) => writeln!(f, "page: with --keep, {link} shows the scene and asks it"),
+            None => writeln!(
+                f,
+                "page: not in these programs; ./demo.sh builds it where Node.js and npm are installed"
+            ),
+        }
     }
 }

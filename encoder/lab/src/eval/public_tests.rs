@@ -92,6 +92,7 @@ impl Wall {
                 codebook: CodebookSettings::default(),
                 position_error: PositionError::Within(0.01),
                 input_indices: false,
+                appearance: false,
             },
             objects: false,
         };

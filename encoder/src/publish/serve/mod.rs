@@ -19,7 +19,7 @@ use slag_service::tls::Tls;
 
 use crate::store::StoreError;
 pub use limits::Limits;
-pub use router::router;
+pub use router::{bounded, router, router_with};
 pub use slag_service::access::{Access, AccessSettings};
 
 /// Why the service does not start.
@@ -49,7 +49,22 @@ pub async fn serve(
     on_listening: impl FnOnce(String),
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), ServeError> {
-    let (router, listen) = (router(dir, limits, access)?, listen.into());
+    serve_router(router(dir, limits, access)?, listen, limits, tls, on_listening, shutdown).await
+}
+
+/// Serves routes as [`serve`] does.
+///
+/// # Errors
+/// [`ServeError::Listen`].
+pub async fn serve_router(
+    router: axum::Router,
+    listen: impl Into<Listen>,
+    limits: Limits,
+    tls: Option<Tls>,
+    on_listening: impl FnOnce(String),
+    shutdown: impl Future<Output = ()>,
+) -> Result<(), ServeError> {
+    let listen = listen.into();
     let listener = bind(&listen).await?.with_tls(tls);
     on_listening(listener.url().map_err(|cause| ListenError { address: listen, cause })?);
     if let Err(cut_off) = listener::serve(router, listener, limits.connections, shutdown).await {

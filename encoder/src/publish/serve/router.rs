@@ -37,10 +37,23 @@ const REQUEST_BODY_BYTES: usize = 1024;
 /// # Errors
 /// [`StoreError`] if nothing is published or the store cannot be read.
 pub fn router(dir: &Path, limits: Limits, access: Access) -> Result<Router, StoreError> {
+    router_with(dir, limits, access, Router::new())
+}
+
+/// As [`router`], with a page's routes beside the store's.
+///
+/// # Errors
+/// As [`router`].
+pub fn router_with(dir: &Path, limits: Limits, access: Access, page: Router) -> Result<Router, StoreError> {
     let service = Arc::new(Service::open(dir, &limits)?);
     let responses = Arc::clone(&service.responses);
     let (router, _) = routes().with_help(TITLE);
-    Ok(bounded(router.with_state(service), limits, responses, access))
+    Ok(counted(router.with_state(service).merge(page), limits, responses, access))
+}
+
+/// Puts the limits around routes of a page, and a problem as the body of every error.
+pub fn bounded(routes: Router, limits: Limits, access: Access) -> Router {
+    counted(routes, limits, Arc::default(), access)
 }
 
 /// Returns the routes.
@@ -68,7 +81,7 @@ pub(super) fn routes() -> Routes<Arc<Service>> {
 }
 
 /// Puts the limits around routes, and a problem as the body of every error.
-pub(super) fn bounded(
+pub(super) fn counted(
     routes: Router,
     limits: Limits,
     responses: Arc<ResponseCounts>,

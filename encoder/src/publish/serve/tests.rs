@@ -372,7 +372,7 @@ async fn overload_and_timeout_are_problems() {
     let routes = || Router::new().route("/quick", get(async || "done"));
     let limits = Limits { n_requests: 1, ..Limits::default() };
     let router =
-        router::bounded(routes().route("/wait", get(wait)), limits, Arc::default(), Access::default());
+        router::counted(routes().route("/wait", get(wait)), limits, Arc::default(), Access::default());
     let held = tokio::spawn(router.clone().oneshot(request("/wait", &[])));
     inside.recv().await.expect("the handler runs");
     let turned_away = get_with(&router, "/quick", &[]).await;
@@ -384,7 +384,7 @@ async fn overload_and_timeout_are_problems() {
 
     let limits = Limits { answer_timeout: Duration::from_millis(20), ..Limits::default() };
     let never = get(async || std::future::pending::<()>().await);
-    let router = router::bounded(routes().route("/never", never), limits, Arc::default(), Access::default());
+    let router = router::counted(routes().route("/never", never), limits, Arc::default(), Access::default());
     let late = get_with(&router, "/never", &[]).await;
     assert!(late.problem(StatusCode::SERVICE_UNAVAILABLE).contains("too long"));
     assert_eq!(late.header(header::RETRY_AFTER), "2");

@@ -19,16 +19,22 @@ export class Camera {
   private readonly pressed = new Set<string>();
   private glide: Glide | null = null;
   private lastMs = 0;
+  private isAtPhoto = false;
 
-  constructor(canvas: HTMLCanvasElement, private readonly up: THREE.Vector3, onMove: () => void) {
+  /** `onLeave` is called when the camera leaves a photo's pose. */
+  constructor(canvas: HTMLCanvasElement, private readonly up: THREE.Vector3, onMove: () => void, private readonly onLeave: () => void) {
     this.camera.up.copy(up);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.addEventListener("change", onMove);
-    this.controls.addEventListener("start", () => (this.glide = null));
+    this.controls.addEventListener("start", () => {
+      this.glide = null;
+      this.leavePhoto();
+    });
     canvas.addEventListener("keydown", (event) => {
       if (!KEYS.includes(event.code) || event.ctrlKey || event.metaKey || event.altKey) return;
       event.preventDefault();
       this.glide = null;
+      this.leavePhoto();
       this.pressed.add(event.code);
       onMove();
     });
@@ -42,7 +48,27 @@ export class Camera {
     this.controls.update();
   }
 
+  /** Takes a photo's pose and field of view, until the camera is moved. `rotation`: world from camera as three.js has it. */
+  standAt(position: THREE.Vector3, rotation: THREE.Quaternion, fieldOfViewDeg: number, distance: number): void {
+    this.glide = null;
+    this.place(position, new THREE.Vector3(0, 0, -distance).applyQuaternion(rotation).add(position));
+    // The controls keep the horizon level; a photo need not be.
+    this.camera.quaternion.copy(rotation);
+    this.camera.fov = fieldOfViewDeg;
+    this.camera.updateProjectionMatrix();
+    this.isAtPhoto = true;
+  }
+
+  private leavePhoto(): void {
+    if (!this.isAtPhoto) return;
+    this.isAtPhoto = false;
+    this.camera.fov = FIELD_OF_VIEW_DEG;
+    this.camera.updateProjectionMatrix();
+    this.onLeave();
+  }
+
   flyTo(position: THREE.Vector3, target: THREE.Vector3): void {
+    this.leavePhoto();
     if (matchMedia("(prefers-reduced-motion: reduce)").matches) return this.place(position, target);
     this.glide = { startMs: performance.now(), from: [this.camera.position.clone(), this.controls.target.clone()], to: [position, target] };
   }

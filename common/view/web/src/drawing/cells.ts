@@ -3,7 +3,13 @@
 import { PackedSplats, RgbaArray, SplatMesh } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import type { CellGaussians, Scores } from "../messages";
-import { colourByScore } from "./ramp";
+import { type Lit, colourByScore } from "./ramp";
+
+/** A question's scores, and the level from which they are lit. */
+export interface Question {
+  scores: Scores;
+  threshold: number;
+}
 
 interface Drawn {
   gaussians: CellGaussians;
@@ -13,8 +19,7 @@ interface Drawn {
 
 export class Cells {
   private readonly drawn = new Map<number, Drawn>();
-  private scores: Scores | null = null;
-  private threshold = 0;
+  private questions: [Question | null, Question | null] = [null, null];
 
   /** `box` holds the scene; where a cell has no colours, heights in it give shades. */
   constructor(private readonly parent: THREE.Object3D, private readonly box: THREE.Box3, private readonly up: THREE.Vector3) {}
@@ -52,10 +57,9 @@ export class Cells {
     for (const cell of [...this.drawn.keys()]) this.remove(cell);
   }
 
-  /** Colours by scores, lit from a level on; null gives the scene's own colours back. */
-  colour(scores: Scores | null, threshold: number): void {
-    this.scores = scores;
-    this.threshold = threshold;
+  /** Colours by one question or two; by none, the scene has its own colours again. */
+  colour(first: Question | null, second: Question | null): void {
+    this.questions = [first, second];
     for (const [cell, drawn] of this.drawn) this.colourOne(cell, drawn);
   }
 
@@ -75,18 +79,20 @@ export class Cells {
 
   private colourOne(cell: number, drawn: Drawn): void {
     const { gaussians, mesh } = drawn;
-    if (!this.scores) {
+    if (this.questions.every((question) => question === null)) {
       if (mesh.splatRgba === null) return;
       mesh.splatRgba = null;
       mesh.updateGenerator();
       return;
     }
-    const found = this.scores.byCell.get(cell);
-    const levels = found?.length === gaussians.n ? found : new Uint8Array(gaussians.n);
+    const lit = (question: Question | null): Lit | null => {
+      const found = question?.scores.byCell.get(cell);
+      return question && found?.length === gaussians.n ? { levels: found, threshold: question.threshold } : null;
+    };
     drawn.rgba ??= new RgbaArray({ array: new Uint8Array(gaussians.packed.length), count: gaussians.n });
     const array = drawn.rgba.array;
     if (!array) return;
-    colourByScore(array, gaussians.packed, gaussians.n, levels, this.threshold);
+    colourByScore(array, gaussians.packed, gaussians.n, lit(this.questions[0]), lit(this.questions[1]));
     drawn.rgba.needsUpdate = true;
     if (mesh.splatRgba === null) {
       mesh.splatRgba = drawn.rgba;

@@ -2,7 +2,7 @@
 
 import { SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
-import type { Answer, Description, Vector } from "../network";
+import type { Answer, Description, Photo, Vector } from "../network";
 import { Camera } from "./camera";
 import { Cells } from "./cells";
 import { boxOf, Marks } from "./marks";
@@ -25,7 +25,7 @@ export class Drawing {
   private answers: Answer[] = [];
   private isDirty = true;
 
-  constructor(private readonly canvas: HTMLCanvasElement, private readonly labels: HTMLElement, description: Description) {
+  constructor(private readonly canvas: HTMLCanvasElement, private readonly labels: HTMLElement, description: Description, onLeavePhoto: () => void) {
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.up = new THREE.Vector3(...description.up).normalize();
@@ -35,7 +35,7 @@ export class Drawing {
     this.scene.add(new SparkRenderer({ renderer: this.renderer, onDirty: () => this.redraw() }), this.world);
     this.cells = new Cells(this.world, this.box, this.up);
     this.marks = new Marks(this.world);
-    this.camera = new Camera(canvas, this.up, () => this.redraw());
+    this.camera = new Camera(canvas, this.up, () => this.redraw(), onLeavePhoto);
     const themed = () => {
       this.scene.background = new THREE.Color(this.isDark.matches ? 0x14181d : 0xeceff2);
       this.stepM = this.marks.showGround(this.box, this.up, description.geographic, this.isDark.matches);
@@ -94,8 +94,33 @@ export class Drawing {
     return hit ? (hit.object.userData.index as number) : null;
   }
 
-  showRobot(position: Description["position"]): void {
-    this.marks.showRobot(position, this.up);
+  /** Looks as a photo does; the picture laid over the whole canvas, contained in it, then fits. */
+  standAt(photo: Photo): void {
+    const flipped = new THREE.Quaternion().setFromAxisAngle(new THREE.Vector3(1, 0, 0), Math.PI);
+    const rotation = new THREE.Quaternion(...photo.rotation_xyzw).multiply(flipped);
+    const aspect = this.canvas.clientWidth / Math.max(this.canvas.clientHeight, 1);
+    // A canvas narrower than the photo shows all of its width.
+    const halfHeight = Math.max(photo.height_px, photo.width_px / aspect) / 2;
+    const fieldOfViewDeg = (Math.atan(halfHeight / photo.focal_px) * 360) / Math.PI;
+    const position = new THREE.Vector3(...photo.position_m).add(this.world.position);
+    this.camera.standAt(position, rotation, fieldOfViewDeg, Math.max(this.radiusM * 0.2, 0.5));
+    this.redraw();
+  }
+
+  /** Index of the photo whose camera is under a point of the canvas, if photos are shown. */
+  photoAt(photos: Photo[], xPx: number, yPx: number): number | null {
+    if (!this.marks.photos.visible) return null;
+    const distances = photos.map((photo) => {
+      const point = new THREE.Vector3(...photo.position_m).add(this.world.position).project(this.camera.camera);
+      const [x, y] = [((point.x + 1) / 2) * this.canvas.clientWidth, ((1 - point.y) / 2) * this.canvas.clientHeight];
+      return Math.abs(point.z) > 1 ? Infinity : Math.hypot(x - xPx, y - yPx);
+    });
+    const nearest = distances.indexOf(Math.min(...distances));
+    return nearest >= 0 && distances[nearest] < 14 ? nearest : null;
+  }
+
+  showRobot(description: Description): void {
+    this.marks.showRobot(description, this.up);
     this.redraw();
   }
 

@@ -3,6 +3,8 @@
 import * as THREE from "three";
 import type { Answer, Description, Photo, Vector } from "../network";
 
+const CELL_COLOURS = { on_board: 0x8593a3, stale: 0xd99a2b, missing: 0xe05a4e };
+
 function disposeAll(group: THREE.Group): void {
   group.traverse((object) => {
     if (!(object instanceof THREE.Mesh || object instanceof THREE.LineSegments)) return;
@@ -61,12 +63,12 @@ export class Marks {
     return stepM;
   }
 
-  /** Outlines of cells: grey on board, red missing. */
+  /** Outlines of cells: grey on board, amber of an earlier generation, red missing. */
   showCells(cells: Description["cells"]): void {
     disposeAll(this.cells);
     for (const { box_m, state } of cells) {
       const box = new THREE.Box3(new THREE.Vector3(...box_m.min), new THREE.Vector3(...box_m.max));
-      const lines = new THREE.Box3Helper(box, state === "missing" ? 0xe05a4e : 0x8593a3);
+      const lines = new THREE.Box3Helper(box, CELL_COLOURS[state]);
       (lines.material as THREE.LineBasicMaterial).transparent = true;
       this.cells.add(lines);
     }
@@ -86,19 +88,25 @@ export class Marks {
     this.photos.add(new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(points), new THREE.LineBasicMaterial({ color: 0x6fbf8b, transparent: true })));
   }
 
-  showRobot(position: Description["position"], up: THREE.Vector3): void {
+  /** A post where the robot is, and a ring around what it fetched. */
+  showRobot({ position_m, fetched }: Description, up: THREE.Vector3): void {
     disposeAll(this.robot);
-    if (!position?.position_m) return;
-    const at = new THREE.Vector3(...position.position_m);
-    const points: THREE.Vector3[] = [at.clone(), at.clone().addScaledVector(up, 1)];
     const turn = new THREE.Quaternion().setFromUnitVectors(new THREE.Vector3(0, 0, 1), up);
-    for (const radius of [0.3, position.radius_m ?? 0].filter((radius) => radius > 0)) {
+    const points: THREE.Vector3[] = [];
+    const ring = (centre: Vector, radius: number) => {
       for (let i = 0; i < 64; i++) {
         for (const angle of [i, i + 1].map((k) => (k * Math.PI) / 32)) {
-          points.push(new THREE.Vector3(Math.cos(angle) * radius, Math.sin(angle) * radius, 0).applyQuaternion(turn).add(at));
+          points.push(new THREE.Vector3(Math.cos(angle) * radius, Math.sin(angle) * radius, 0).applyQuaternion(turn).add(new THREE.Vector3(...centre)));
         }
       }
+    };
+    if (fetched) ring(fetched.centre_m, fetched.radius_m);
+    if (position_m) {
+      const at = new THREE.Vector3(...position_m);
+      points.push(at, at.clone().addScaledVector(up, 1));
+      ring(position_m, 0.3);
     }
+    if (points.length === 0) return;
     this.robot.add(new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(points), new THREE.LineBasicMaterial({ color: 0x4fd1a5, transparent: true })));
   }
 }

@@ -90,6 +90,7 @@ fn publish(settings: &PartitionSettings, site: &Site, width: f64, store: &Path) 
         codebook: CodebookSettings::default(),
         position_error: PositionError::Within(0.01),
         input_indices: false,
+        appearance: false,
     };
     let mut writer = FieldWriter::create(store, &site.field, settings.dim, &shards)?;
     let limits = CellLimits { max_gaussians: settings.max_gaussians, max_width: Some(width) };

@@ -153,6 +153,7 @@ impl<'a> Scene<'a> {
             codebook: CodebookSettings::default(),
             position_error: PositionError::Within(0.01),
             input_indices: false,
+            appearance: false,
         };
         let (n, dim) = (self.n_gaussians as usize, self.settings.dim as usize);
         field::publish(n, dim, &self.store(), &shards, progress)?;

@@ -43,6 +43,7 @@ pub(super) fn run(args: &FieldBenchArgs, progress: &dyn Progress) -> Result<Exit
         codebook: CodebookSettings { balanced_error: args.balanced_error, ..CodebookSettings::default() },
         position_error: PositionError::Within(0.01),
         input_indices: false,
+        appearance: false,
     };
     let report =
         field::publish(args.gaussians as usize, args.dim as usize, &args.store, &settings, progress)?;

@@ -1,0 +1,152 @@
+//! A Gaussian's appearance in ten bytes: colour and opacity, size, rotation. Renderers of splats take these bytes as they
+//! are, so a page draws a cell without decoding it. The byte table is in `docs/formats.md`.
+
+use std::f32::consts::PI;
+
+use crate::Gaussians;
+
+/// Bytes of a Gaussian's appearance.
+pub const BYTES: usize = 10;
+/// Natural logarithm of the smallest size.
+const LN_SIZE_MIN: f32 = -12.0;
+/// Natural logarithm of the largest size.
+const LN_SIZE_MAX: f32 = 9.0;
+/// Codes of sizes beside 0, which is no extent at all: neighbouring ones differ by 8.6 %.
+const LAST_SIZE_STEP: f32 = 254.0;
+/// Largest value of a byte.
+const LARGEST: f32 = 255.0;
+/// Rotations by less have no axis.
+const LEAST_AXIS: f32 = 1e-6;
+
+/// The appearance of a cell's Gaussians, a column a field.
+#[derive(Clone, Copy, Debug)]
+pub struct Appearance<'a> {
+    /// `[N]`: red, green, blue (`0.5 + SH_C0 * sh_dc`, clamped) and opacity, 0..=255 for 0..=1.
+    pub colours: &'a [[u8; 4]],
+    /// `[N]`: codes of the standard deviations along the Gaussian's own axes, see [`size_code`].
+    pub sizes: &'a [[u8; 3]],
+    /// `[N]`: codes of the rotations, see [`rotation_code`].
+    pub rotations: &'a [[u8; 3]],
+}
+
+/// The appearance of some Gaussians.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct AppearanceColumns {
+    colours: Vec<[u8; 4]>,
+    sizes: Vec<[u8; 3]>,
+    rotations: Vec<[u8; 3]>,
+}
+
+impl AppearanceColumns {
+    /// Rounds the appearance of some of a scene's Gaussians, in the order of `indices`.
+    ///
+    /// # Panics
+    /// If an index is not below [`Gaussians::len`].
+    pub fn of(scene: &Gaussians, indices: &[u32]) -> Self {
+        let at = |index: &u32| *index as usize;
+        let colour = |index: &u32| {
+            let [r, g, b] = scene.rgb_dc(at(index)).map(unit_code);
+            [r, g, b, unit_code(scene.opacities[at(index)])]
+        };
+        Self {
+            colours: indices.iter().map(colour).collect(),
+            sizes: indices.iter().map(|index| scene.scales[at(index)].map(size_code)).collect(),
+            rotations: indices.iter().map(|index| rotation_code(scene.rotations_wxyz[at(index)])).collect(),
+        }
+    }
+
+    /// Returns the columns.
+    pub fn view(&self) -> Appearance<'_> {
+        Appearance { colours: &self.colours, sizes: &self.sizes, rotations: &self.rotations }
+    }
+}
+
+/// Returns the byte of a value of 0..=1; others are clamped, NaN is 0.
+fn unit_code(value: f32) -> u8 {
+    (value * LARGEST).round() as u8
+}
+
+/// Returns the byte of a standard deviation, world units: 0 for 0, else `1 + 254 * (ln size + 12) / 21`, rounded and clamped to
+/// 1..=255. Sizes from 6e-6 to 8,000 are off by at most 4.3 %.
+pub fn size_code(size: f32) -> u8 {
+    if size <= 0.0 || size.is_nan() {
+        return 0;
+    }
+    let step = (size.ln() - LN_SIZE_MIN) / (LN_SIZE_MAX - LN_SIZE_MIN) * LAST_SIZE_STEP;
+    (1.0 + step.round()).clamp(1.0, LARGEST) as u8
+}
+
+/// Returns the bytes of a rotation (unit quaternion): its axis in the octahedral map (Meyer et al. 2010), two bytes, and its
+/// angle from 0 to pi, one byte. The decoded rotation is off by at most 1.9 degrees.
+pub fn rotation_code([w, x, y, z]: [f32; 4]) -> [u8; 3] {
+    // q and -q are one rotation; the one with w >= 0 turns by at most pi.
+    let sign = if w < 0.0 { -1.0 } else { 1.0 };
+    let angle = 2.0 * (w * sign).min(1.0).acos();
+    let length = (x * x + y * y + z * z).sqrt();
+    let [x, y, z] = if length < LEAST_AXIS { [1.0, 0.0, 0.0] } else { [x, y, z].map(|c| c * sign / length) };
+    // The octahedron |x| + |y| + |z| = 1, its lower half folded outward over the upper one.
+    let sum = x.abs() + y.abs() + z.abs();
+    let (u, v) = (x / sum, y / sum);
+    let outward = |of: f32, other: f32| (1.0 - other.abs()) * if of >= 0.0 { 1.0 } else { -1.0 };
+    let (u, v) = if z < 0.0 { (outward(u, v), outward(v, u)) } else { (u, v) };
+    [unit_code(u * 0.5 + 0.5), unit_code(v * 0.5 + 0.5), unit_code(angle / PI)]
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{DQuat, DVec3};
+    use slag_math::random::Random;
+
+    use super::*;
+
+    /// The renderer's decoder, in float64: the inverse map, then axis and angle.
+    fn decoded([u, v, angle]: [u8; 3]) -> DQuat {
+        let [u, v] = [u, v].map(|c| f64::from(c) / 127.5 - 1.0);
+        let z = 1.0 - u.abs() - v.abs();
+        let fold = (-z).max(0.0);
+        let moved = |c: f64| if c >= 0.0 { c - fold } else { c + fold };
+        let axis = DVec3::new(moved(u), moved(v), z).normalize();
+        DQuat::from_axis_angle(axis, f64::from(angle) / 255.0 * std::f64::consts::PI)
+    }
+
+    #[test]
+    fn rotations_come_back_within_the_stated_error() {
+        let mut random = Random::new(20);
+        let mut worst = 0.0f64;
+        for _ in 0..20_000 {
+            let [w, x, y, z] = random.unit_vector(4)[..] else { unreachable!("four components") };
+            let expected = DQuat::from_xyzw(x.into(), y.into(), z.into(), w.into()).normalize();
+            worst = worst.max(expected.angle_between(decoded(rotation_code([w, x, y, z]))).to_degrees());
+        }
+        assert!((0.5..1.9).contains(&worst), "{worst}");
+        let still = decoded(rotation_code([-1.0, 0.0, 0.0, 0.0]));
+        assert!(still.angle_between(DQuat::IDENTITY) < 1e-6);
+    }
+
+    #[test]
+    fn sizes_come_back_within_the_stated_error() {
+        for step in 0..2000 {
+            let size = (-11.9f32 + step as f32 * 0.0104).exp();
+            let code = f32::from(size_code(size));
+            let back = ((code - 1.0) * 21.0 / 254.0 - 12.0).exp();
+            assert!((back / size - 1.0).abs() < 0.043, "{size}: {back}");
+        }
+        let extremes = [0.0, -1.0, f32::NAN, f32::MIN_POSITIVE, f32::MAX, f32::INFINITY];
+        assert_eq!(extremes.map(size_code), [0, 0, 0, 1, 255, 255]);
+    }
+
+    #[test]
+    fn columns_follow_the_indices() {
+        let scene = Gaussians {
+            means_in_world: vec![DVec3::ZERO; 2],
+            rotations_wxyz: vec![[1.0, 0.0, 0.0, 0.0]; 2],
+            scales: vec![[1.0; 3], [0.1; 3]],
+            opacities: vec![0.0, 0.6],
+            sh_dc: vec![[0.0; 3], [9.0, -9.0, 0.0]],
+            ..Gaussians::default()
+        };
+        let columns = AppearanceColumns::of(&scene, &[1, 0]);
+        assert_eq!(columns.view().colours, [[255, 0, 128, 153], [128, 128, 128, 0]]);
+        assert!(columns.view().sizes[0] < columns.view().sizes[1]);
+    }
+}

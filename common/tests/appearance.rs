@@ -1,0 +1,82 @@
+//! Shards with an appearance: it comes back, and columns of another length are refused.
+
+use slag_common::appearance::Appearance;
+use slag_common::container::{self, AlignedBytes, Layout};
+use slag_common::shard::{
+    Additions, MAGIC, Positions, ScoreErrors, ShardHeader, ShardLayout, ShardView, VERSION, section,
+};
+
+fn written(appearance: Option<Appearance<'_>>) -> Vec<u8> {
+    let header = ShardHeader {
+        cell_id: 1,
+        n_gaussians: 2,
+        n_centroids: 1,
+        dim: 2,
+        n_components: 2,
+        n_subspaces: 0,
+        position_bits: [11, 11, 10, 0],
+        centroid_step: 0.5,
+        origin_in_world: [0.0; 3],
+        position_step: [0.1; 3],
+        box_min: [0.0; 3],
+        box_max: [1.0; 3],
+        errors: ScoreErrors::default(),
+        encoder_id: [0; 32],
+    };
+    let shard = ShardView {
+        header,
+        positions: Positions::Packed(&[0, 1]),
+        centroid_starts: &[0, 2],
+        centroids: &[1, -2],
+        radii: &[0.0],
+        basis: None,
+        residuals: None,
+        exact: None,
+        packed_indices: None,
+    };
+    // By hand: the centroid is (0.5, -1).
+    assert_eq!(shard.centroid_scores(&[1.0, 0.25]), [0.25]);
+    let mut out = Vec::new();
+    shard.write_with(&mut out, Additions { appearance, ..Additions::default() }).expect("writes to memory");
+    out
+}
+
+const COLOURS: [[u8; 4]; 2] = [[1, 2, 3, 4], [5, 6, 7, 8]];
+const SIZES: [[u8; 3]; 2] = [[9; 3], [10; 3]];
+const ROTATIONS: [[u8; 3]; 2] = [[11; 3], [12; 3]];
+
+#[test]
+fn appearances_come_back() {
+    let appearance = Appearance { colours: &COLOURS, sizes: &SIZES, rotations: &ROTATIONS };
+    let bytes = AlignedBytes::copy_of(&written(Some(appearance)));
+    let layout = ShardLayout::check(&bytes).expect("valid");
+    let found = layout.appearance(&bytes).expect("an appearance");
+    assert_eq!((found.colours, found.sizes, found.rotations), (&COLOURS[..], &SIZES[..], &ROTATIONS[..]));
+    let bytes = AlignedBytes::copy_of(&written(None));
+    assert!(ShardLayout::check(&bytes).expect("valid").appearance(&bytes).is_none());
+}
+
+#[test]
+fn columns_of_another_length_are_refused() {
+    let appearance = Appearance { colours: &COLOURS, sizes: &SIZES, rotations: &ROTATIONS };
+    let bytes = AlignedBytes::copy_of(&written(Some(appearance)));
+    let layout = Layout::check(&bytes, MAGIC, VERSION).expect("valid");
+    for cut in [section::COLOURS, section::SIZES, section::ROTATIONS] {
+        for without in [false, true] {
+            if without && cut == section::COLOURS {
+                continue;
+            }
+            let ids = (1..=5).chain([section::COLOURS, section::SIZES, section::ROTATIONS]);
+            let sections: Vec<(u32, &[u8])> = ids
+                .filter(|id| !(without && *id == cut))
+                .map(|id| {
+                    let bytes = &bytes[layout.find(id).expect("there")];
+                    (id, if id == cut { &bytes[..bytes.len() - 1] } else { bytes })
+                })
+                .collect();
+            let mut out = Vec::new();
+            container::write(&mut out, MAGIC, VERSION, &sections).expect("writes");
+            assert!(ShardLayout::check(&out).is_err(), "section {cut}, {without}");
+        }
+    }
+}

@@ -1,0 +1,111 @@
+//! `GET /v1/view/cells/{id}`: a cell's Gaussians, 16 bytes each.
+
+use glam::{DVec3, Vec3};
+use half::f16;
+use slag_common::appearance::{Appearance, size_code};
+
+/// First bytes of the message.
+const MAGIC: [u8; 4] = *b"SLGG";
+const VERSION: u32 = 1;
+/// Bytes before the columns.
+pub const CELL_HEAD_BYTES: usize = 32;
+/// Bytes of a Gaussian.
+pub const GAUSSIAN_BYTES: usize = 16;
+/// Colour and opacity of Gaussians whose appearance is not known; the page shades them by height.
+const PLAIN: [u8; 4] = [160, 160, 160, 230];
+/// No rotation, see [`slag_common::appearance::rotation_code`].
+const UNTURNED: [u8; 3] = [255, 128, 0];
+
+/// Writes a cell's message: magic, version, N (u32), the origin in the world (three f32), flags (u32; 1: the appearance is
+/// known), 4 zero bytes; then a column each of centres less the origin (three f16), colours, opacities, sizes and rotations.
+///
+/// `positions`: `[N]`, world. Without an appearance, Gaussians are as large as their distances to their neighbours in
+/// the order of the shard, which follows a curve through space.
+pub fn cell_message(positions: &[DVec3], appearance: Option<Appearance<'_>>) -> Vec<u8> {
+    let low = positions.iter().copied().reduce(DVec3::min).unwrap_or_default();
+    let high = positions.iter().copied().reduce(DVec3::max).unwrap_or_default();
+    // As the page reads it: what rounding takes from the origin goes to the centres.
+    let origin: Vec3 = ((low + high) / 2.0).as_vec3();
+    let n = positions.len();
+    let mut message = Vec::with_capacity(CELL_HEAD_BYTES + GAUSSIAN_BYTES * n);
+    message.extend(MAGIC);
+    message.extend(VERSION.to_le_bytes());
+    message.extend((n as u32).to_le_bytes());
+    origin.to_array().iter().for_each(|axis| message.extend(axis.to_le_bytes()));
+    message.extend(u32::from(appearance.is_some()).to_le_bytes());
+    message.extend([0; 4]);
+    for position in positions {
+        let offset = *position - origin.as_dvec3();
+        offset.to_array().iter().for_each(|axis| message.extend(f16::from_f64(*axis).to_le_bytes()));
+    }
+    match appearance {
+        Some(Appearance { colours, sizes, rotations }) => {
+            message.extend(colours.iter().flat_map(|[r, g, b, _]| [*r, *g, *b]));
+            message.extend(colours.iter().map(|[.., opacity]| *opacity));
+            message.extend_from_slice(sizes.as_flattened());
+            message.extend_from_slice(rotations.as_flattened());
+        }
+        None => {
+            let [r, g, b, opacity] = PLAIN;
+            message.extend(std::iter::repeat_n([r, g, b], n).flatten());
+            message.extend(std::iter::repeat_n(opacity, n));
+            message.extend(sizes(positions).into_iter().flat_map(|size| [size_code(size); 3]));
+            message.extend(std::iter::repeat_n(UNTURNED, n).flatten());
+        }
+    }
+    message
+}
+
+/// Returns half the distance of each position to the nearer of its neighbours in the order, within a quarter and twice
+/// the median.
+fn sizes(positions: &[DVec3]) -> Vec<f32> {
+    let apart: Vec<f32> = positions.windows(2).map(|pair| pair[0].distance(pair[1]) as f32).collect();
+    let mut sorted: Vec<f32> = apart.iter().copied().filter(|d| *d > 0.0).collect();
+    let middle = sorted.len() / 2;
+    let median = match sorted.is_empty() {
+        true => 0.02,
+        false => *sorted.select_nth_unstable_by(middle, f32::total_cmp).1 / 2.0,
+    };
+    let distance = |at: Option<usize>| at.and_then(|at| apart.get(at)).copied().unwrap_or(f32::INFINITY);
+    (0..positions.len())
+        .map(|at| distance(at.checked_sub(1)).min(distance(Some(at))) / 2.0)
+        .map(|half| half.clamp(median / 4.0, median * 2.0))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn f16_at(message: &[u8], at: usize) -> f64 {
+        f16::from_le_bytes([message[at], message[at + 1]]).to_f64()
+    }
+
+    #[test]
+    fn messages_have_the_layout_of_the_documents() {
+        let positions = [DVec3::new(1e5, 2.0, 3.0), DVec3::new(1e5 + 1.0, 2.5, 3.0)];
+        let appearance = Appearance {
+            colours: &[[1, 2, 3, 4], [5, 6, 7, 8]],
+            sizes: &[[9, 10, 11], [12, 13, 14]],
+            rotations: &[[15, 16, 17], [18, 19, 20]],
+        };
+        let message = cell_message(&positions, Some(appearance));
+        assert_eq!((&message[..4], message[8], message[24]), (b"SLGG".as_slice(), 2, 1));
+        let origin = f32::from_le_bytes(message[12..16].try_into().expect("4 bytes"));
+        for (at, position) in positions.iter().enumerate() {
+            assert!((f64::from(origin) + f16_at(&message, 32 + 6 * at) - position.x).abs() < 1e-3);
+        }
+        let expected = [1, 2, 3, 5, 6, 7, 4, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20];
+        assert_eq!(message[44..], expected);
+        assert_eq!(cell_message(&[], None).len(), CELL_HEAD_BYTES);
+    }
+
+    #[test]
+    fn unknown_sizes_follow_the_distances() {
+        let line: Vec<DVec3> = [0.0, 0.1, 0.2, 0.3, 9.0].map(|x| DVec3::new(x, 0.0, 0.0)).to_vec();
+        let found = sizes(&line);
+        assert!(found[..4].iter().all(|size| (size - 0.05).abs() < 1e-6), "{found:?}");
+        assert!((found[4] - 0.1).abs() < 1e-6, "a stray one is no balloon: {found:?}");
+        assert_eq!(sizes(&[DVec3::ZERO]), [0.04]);
+    }
+}

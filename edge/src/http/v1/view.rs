@@ -1,0 +1,101 @@
+//! `GET /v1/view` and below: what the page needs to draw the scene and to colour it by a question.
+
+use std::sync::Arc;
+
+use axum::Json;
+use axum::extract::rejection::QueryRejection;
+use axum::extract::{Path, State};
+use axum::http::{StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use slag_service::problem::Problem;
+use slag_service::routes::Parameter;
+use slag_view::Description;
+
+use super::body;
+use super::params::{self, Pairs, number};
+use crate::http::app::App;
+use crate::http::problem::{overloaded, parameter_problem, query_problem, timeout};
+use crate::query::{Negatives, QueryError, RequestError};
+use crate::score::Budget;
+
+/// Returns the parameters of `/v1/view/scores`.
+pub fn scores_parameters() -> [Parameter; 2] {
+    let parameter = |name, example, summary: &str| Parameter { name, example, summary: summary.to_owned() };
+    [
+        parameter("text", "mug", "what to look for"),
+        parameter("negative", "wall", "a negative prompt, commas included; may be repeated; or canonical"),
+    ]
+}
+
+/// Returns the parameters of `/v1/view/cells/{id}`.
+pub fn cell_parameters() -> [Parameter; 1] {
+    let summary = "the generation that the cell must be of: 404 from another one on".to_owned();
+    [Parameter { name: "generation", example: "12", summary }]
+}
+
+pub async fn describe(State(app): State<Arc<App>>) -> Result<Json<Description>, Problem> {
+    app.blocking(|app| {
+        app.reload_if_stale();
+        let posted = app.following.as_ref().and_then(|following| following.status().position);
+        let described = app.engine.view(|snapshot| posted?.in_world(&snapshot.manifest).ok());
+        described.map(Json).map_err(query_problem)
+    })
+    .await
+}
+
+pub async fn scores(
+    State(app): State<Arc<App>>,
+    pairs: Result<Pairs, QueryRejection>,
+) -> Result<Response, Problem> {
+    let (text, negatives) = parse_scores(&params::pairs(pairs)?).map_err(parameter_problem)?;
+    message(&app, move |app, budget| Ok(Some(app.engine.view_scores(&text, negatives, budget)?))).await
+}
+
+pub async fn cell(
+    State(app): State<Arc<App>>,
+    Path(id): Path<String>,
+    pairs: Result<Pairs, QueryRejection>,
+) -> Result<Response, Problem> {
+    let (cell_id, generation) = parse_cell(&id, &params::pairs(pairs)?).map_err(parameter_problem)?;
+    message(&app, move |app, budget| app.engine.view_cell(cell_id, generation, budget)).await
+}
+
+/// Makes a message within the limits of a query.
+async fn message(
+    app: &Arc<App>,
+    make: impl FnOnce(&App, &Budget) -> Result<Option<Vec<u8>>, QueryError> + Send + 'static,
+) -> Result<Response, Problem> {
+    let permit =
+        Arc::clone(&app.permits).try_acquire_owned().map_err(|_| overloaded(app.settings.max_queries))?;
+    let making = app.blocking(move |app| {
+        // Held until the work is done, even if the client has given up.
+        let _permit = permit;
+        app.reload_if_stale();
+        let made = make(app, &app.query_budget()).map_err(query_problem)?;
+        made.ok_or_else(|| {
+            let detail =
+                "the cell is not on board, or of another generation; GET /v1/view lists those that are";
+            Problem::new(StatusCode::NOT_FOUND, "no-such-cell", "No such cell", detail)
+        })
+    });
+    let limit = app.settings.query_timeout;
+    let bytes = tokio::time::timeout(limit, making).await.map_err(|_| timeout(limit))??;
+    Ok(([(header::CONTENT_TYPE, "application/octet-stream")], bytes).into_response())
+}
+
+fn parse_scores(pairs: &[(String, String)]) -> Result<(String, Negatives), RequestError> {
+    params::check_names(pairs, &scores_parameters(), &["negative"])?;
+    let of = |wanted: &'static str| {
+        pairs.iter().filter(move |(name, _)| name == wanted).map(|(_, value)| value.clone())
+    };
+    let text = of("text").next();
+    let text = text.ok_or_else(|| RequestError::new("text", "nothing", "words to look for"))?;
+    Ok((text, body::negatives(of("negative").collect())))
+}
+
+fn parse_cell(id: &str, pairs: &[(String, String)]) -> Result<(u32, Option<u64>), RequestError> {
+    params::check_names(pairs, &cell_parameters(), &[])?;
+    let cell_id = number("id", id, "a cell's id, a whole number")?;
+    let generation = pairs.first().map(|(name, value)| number(name, value, "a whole number"));
+    Ok((cell_id, generation.transpose()?))
+}

@@ -1,0 +1,134 @@
+//! What the page needs to draw the Gaussians on board, and to colour them by a question.
+
+use glam::{DVec3, Vec3};
+use slag_common::shard::ShardView;
+use slag_view::{
+    CELL_HEAD_BYTES, Cell, CellState, Description, Fetched, GAUSSIAN_BYTES, ScoresMessage, cell_message,
+};
+
+use super::engine::{Engine, QueryError};
+use super::map::MapStatus;
+use super::request::{Negatives, QueryRequest};
+use crate::score::{Budget, Precision, Question, Region, ScoreError, Scratch, Search, relevancy};
+use crate::store::Snapshot;
+
+/// Below every cosine, and below every difference of two cosines.
+const BELOW_ALL: f32 = -4.0;
+/// The program's name in a description.
+const PROGRAM: &str = "slag-edge";
+
+impl Engine {
+    /// Describes the scene on board. `robot_in_world`: where the robot is, if that is known.
+    ///
+    /// # Errors
+    /// [`QueryError::NoScene`].
+    pub fn view(
+        &self,
+        robot_in_world: impl Fn(&Snapshot) -> Option<DVec3>,
+    ) -> Result<Description, QueryError> {
+        let snapshot = self.snapshot()?;
+        let map = MapStatus::of(&snapshot, 0, None);
+        let on_board = map.cells.iter().map(|cell| Cell {
+            cell: cell.cell_id,
+            n_gaussians: cell.n_gaussians,
+            state: if cell.generation == map.generation { CellState::OnBoard } else { CellState::Stale },
+            generation: cell.generation,
+            box_m: slag_view::Corners { min: cell.box_min_in_world, max: cell.box_max_in_world },
+        });
+        let missing = map.missing.iter().map(|cell| Cell {
+            cell: cell.cell_id,
+            n_gaussians: 0,
+            state: CellState::Missing,
+            generation: map.generation,
+            box_m: slag_view::Corners { min: cell.box_min_in_world, max: cell.box_max_in_world },
+        });
+        let mut cells: Vec<Cell> = on_board.chain(missing).collect();
+        cells.sort_by_key(|cell| cell.cell);
+        Ok(Description {
+            program: PROGRAM,
+            scene: map.scene,
+            generation: map.generation,
+            n_gaussians: map.n_gaussians,
+            up: Vec3::Z,
+            metric: snapshot.manifest.metric,
+            geographic: map.geo_reference.is_some(),
+            can_ask: self.check_encoder(&snapshot).is_ok(),
+            cells,
+            views: Vec::new(),
+            fetched: Some(Fetched { centre_m: map.centre_in_world, radius_m: map.radius }),
+            position_m: robot_in_world(&snapshot),
+        })
+    }
+
+    /// Returns the message of a cell's Gaussians, or nothing if the cell is not on board or of another generation than
+    /// `generation`, where that is given.
+    ///
+    /// # Errors
+    /// [`QueryError`].
+    pub fn view_cell(
+        &self,
+        cell_id: u32,
+        generation: Option<u64>,
+        budget: &Budget,
+    ) -> Result<Option<Vec<u8>>, QueryError> {
+        let snapshot = self.snapshot()?;
+        let is_asked_for = generation.is_none_or(|asked| asked == snapshot.manifest.generation);
+        let found = snapshot.shards.iter().find(|shard| shard.cell.cell_id == cell_id);
+        let Some(shard) = found.filter(|_| is_asked_for) else { return Ok(None) };
+        let view = shard.view();
+        let n_gaussians = view.header.n_gaussians as usize;
+        budget.take(CELL_HEAD_BYTES + n_gaussians * (GAUSSIAN_BYTES + size_of::<DVec3>()));
+        budget.check().map_err(ScoreError::from)?;
+        let positions: Vec<DVec3> = (0..n_gaussians).map(|at| view.position_in_world(at)).collect();
+        Ok(Some(cell_message(&positions, shard.appearance())))
+    }
+
+    /// Returns the message of every Gaussian's score: its centroid's cosine, or with negatives its relevancy.
+    ///
+    /// # Errors
+    /// [`QueryError`].
+    pub fn view_scores(
+        &self,
+        text: &str,
+        negatives: Negatives,
+        budget: &Budget,
+    ) -> Result<Vec<u8>, QueryError> {
+        let request = QueryRequest { negatives, ..QueryRequest::new(text) };
+        request.check()?;
+        let snapshot = self.snapshot()?;
+        self.check_encoder(&snapshot)?;
+        let question =
+            Question { vector: self.encode_text(text)?, negatives: self.encode_negatives(&request)? };
+        let generation = snapshot.manifest.generation;
+        let message = self.on_scene(&snapshot, budget, |scratch, scene| {
+            scores_message(scratch, scene.shards, &question, generation)
+        });
+        Ok(message?)
+    }
+}
+
+fn scores_message(
+    scratch: &mut Scratch,
+    shards: &[ShardView<'_>],
+    question: &Question,
+    generation: u64,
+) -> Result<Vec<u8>, ScoreError> {
+    let budget = scratch.budget().clone();
+    let cells: Vec<(u32, u32)> =
+        shards.iter().map(|shard| (shard.header.cell_id, shard.header.n_gaussians)).collect();
+    budget.take(ScoresMessage::len(cells.len(), cells.iter().map(|(_, n)| *n as usize).sum()));
+    let search = Search::reusing(scratch, shards, question, Region::default(), Precision::Centroids)?;
+    let mut runs = search.matching(BELOW_ALL).runs;
+    // A search that runs out of its budget stops early.
+    budget.check()?;
+    if !question.negatives.is_empty() {
+        runs.iter_mut().for_each(|run| run.score = relevancy(run.score));
+    }
+    let least = runs.iter().map(|run| run.score).reduce(f32::min).unwrap_or(0.0);
+    let largest = runs.iter().map(|run| run.score).reduce(f32::max).unwrap_or(0.0);
+    let mut message = ScoresMessage::new(generation, [least, largest], &cells);
+    for run in runs {
+        message.fill(run.shard as usize, run.start as usize..run.end as usize, run.score);
+    }
+    Ok(message.into_bytes())
+}

@@ -1,0 +1,173 @@
+//! `view`: a page that draws a store or a splat, and asks it.
+
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+
+use anyhow::{Context, Result, anyhow};
+use clap::{Args, ValueEnum};
+use glam::Vec3;
+use slag_common::splat::{self, ReadOptions};
+use slag_common::{View, poses};
+use slag_service::access::AccessSettings;
+use slag_service::listen::Listen;
+
+use super::common::{ModelArgs, parse_frame, runtime, stopped, text_encoder_of};
+use super::exit::Exit;
+use crate::ingest::{self, FrameChoice};
+use crate::publish::serve::{self, Access};
+use crate::view::{OpenText, Shown, Splat, Viewer, router, up_of};
+
+/// `view`.
+#[derive(Debug, Args)]
+pub struct ViewArgs {
+    /// Store to draw and to ask.
+    #[arg(long, value_name = "DIR", required_unless_present = "scene")]
+    pub store: Option<PathBuf>,
+    /// Splat to draw: alone, or the one that the store was encoded from. The store is then drawn with its colours and
+    /// scored in full precision.
+    #[arg(long, value_name = "FILE")]
+    pub scene: Option<PathBuf>,
+    /// Poses of the photos, which are then shown where they were taken, with the answer's box drawn in its best photo.
+    #[arg(long, value_name = "PATH")]
+    pub views: Option<PathBuf>,
+    /// Folder of the photos, if they are not beside the poses.
+    #[arg(long, value_name = "DIR", requires = "views")]
+    pub images: Option<PathBuf>,
+    /// Says how the splat's frame follows from that of the poses, as for `encode`.
+    #[arg(long, value_name = "auto|none|FILE", default_value = "auto", value_parser = parse_frame)]
+    pub splat_frame: FrameChoice,
+    /// Axis of the world that points up [default: z in metric stores, else up in most photos, else z].
+    #[arg(long, value_enum, allow_hyphen_values = true)]
+    pub up: Option<UpAxis>,
+    /// Models; they must be those that the store was encoded with.
+    #[command(flatten)]
+    pub models: ModelArgs,
+    /// Question that the page opens with.
+    #[arg(long, value_name = "TEXT", requires = "store")]
+    pub ask: Option<String>,
+    /// Address to listen on.
+    #[arg(long, value_name = "IP:PORT", default_value = "127.0.0.1:7735")]
+    pub listen: Listen,
+    /// Prints the link and opens no browser.
+    #[arg(long)]
+    pub no_open: bool,
+}
+
+/// An axis of the world.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum UpAxis {
+    /// x.
+    X,
+    /// y.
+    Y,
+    /// z.
+    Z,
+    /// Against x.
+    #[value(name = "-x")]
+    AgainstX,
+    /// Against y.
+    #[value(name = "-y")]
+    AgainstY,
+    /// Against z.
+    #[value(name = "-z")]
+    AgainstZ,
+}
+
+impl UpAxis {
+    fn vector(self) -> Vec3 {
+        match self {
+            Self::X => Vec3::X,
+            Self::Y => Vec3::Y,
+            Self::Z => Vec3::Z,
+            Self::AgainstX => Vec3::NEG_X,
+            Self::AgainstY => Vec3::NEG_Y,
+            Self::AgainstZ => Vec3::NEG_Z,
+        }
+    }
+}
+
+/// Returns what opens the text encoder of a store.
+pub(super) fn open_text(models: ModelArgs) -> OpenText {
+    Box::new(move |reader| text_encoder_of(reader, &models).map_err(|error| format!("{error:#}")))
+}
+
+pub(super) fn run(args: &ViewArgs) -> Result<Exit> {
+    if !slag_view::is_built() {
+        return Err(anyhow!(
+            "this program was built without its page; run scripts/build-page.sh, which needs Node.js, and build it again"
+        ));
+    }
+    let shown = shown(args)?;
+    let access = Access::new(&args.listen, AccessSettings::default())?;
+    let viewer = serve::bounded(router(Viewer::new(shown)), serve::Limits::default(), access);
+    runtime()?.block_on(async {
+        let opened = |url: String| {
+            let link = link(&url, args.ask.as_deref());
+            println!("{link}");
+            if !args.no_open {
+                open_browser(&link);
+            }
+        };
+        serve::serve_router(viewer, args.listen.clone(), serve::Limits::default(), None, opened, stopped())
+            .await
+    })?;
+    Ok(Exit::Done)
+}
+
+/// Reads what is shown.
+fn shown(args: &ViewArgs) -> Result<Shown> {
+    let set = args.views.as_deref().map(|path| poses::read(path, args.images.as_deref())).transpose()?;
+    let splat = match &args.scene {
+        None => None,
+        Some(path) => {
+            let mut scene = splat::read(path, &ReadOptions { with_sh_rest: false })?;
+            if let Some(set) = &set
+                && let Some(frame) = ingest::find_frame(path, &args.splat_frame, set.source, set.applied)?
+            {
+                tracing::info!("{frame}; the splat is brought into the world of the poses");
+                frame.to_poses(&mut scene);
+            }
+            let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            Some(Splat::new(name, scene, args.store.is_none()))
+        }
+    };
+    let views: Vec<View> = set.map(|set| set.views).unwrap_or_default();
+    let up = args.up.map(UpAxis::vector).or_else(|| up_of(&views));
+    Ok(Shown { store: args.store.clone(), splat, views, up, open_text: open_text(args.models.clone()) })
+}
+
+/// Returns the link that opens the page with a question.
+fn link(url: &str, question: Option<&str>) -> String {
+    let encode = |byte: u8| match byte {
+        b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'_' | b'.' => char::from(byte).to_string(),
+        other => format!("%{other:02X}"),
+    };
+    let question = question.map(|text| format!("#q={}", text.bytes().map(encode).collect::<String>()));
+    format!("{url}/view{}", question.unwrap_or_default())
+}
+
+/// Opens a link; where that fails, the link stands on the terminal already.
+fn open_browser(link: &str) {
+    let (program, arguments): (&str, &[&str]) = match std::env::consts::OS {
+        "macos" => ("open", &[]),
+        "windows" => ("rundll32", &["url.dll,FileProtocolHandler"]),
+        _ => ("xdg-open", &[]),
+    };
+    let mut command = Command::new(program);
+    command.args(arguments).arg(link).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+    if let Err(error) = command.spawn().with_context(|| format!("cannot start {program}")) {
+        tracing::info!("no browser was opened ({error:#}); open the link yourself");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn links_hold_the_question() {
+        assert_eq!(link("http://127.0.0.1:1", None), "http://127.0.0.1:1/view");
+        let asked = link("http://127.0.0.1:1", Some("Stuhl & Tür"));
+        assert_eq!(asked, "http://127.0.0.1:1/view#q=Stuhl%20%26%20T%C3%BCr");
+    }
+}

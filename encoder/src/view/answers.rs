@@ -1,0 +1,101 @@
+//! Answers of `GET /v1/query` as the page reads them: the things that match, best first. A part of the robot's reply.
+
+use std::collections::BTreeMap;
+
+use serde_json::{Value, json};
+use slag_common::manifest::{Calibration, Manifest};
+use slag_common::objects::ObjectRecord;
+
+use super::error::ViewError;
+use super::shards::{Shard, combined, smallest_shard};
+use crate::store::StoreReader;
+
+/// Spreads above the mean from which a score is an answer, as on robots.
+const SPREADS_ABOVE_MEAN: f32 = 3.0;
+/// Relevancy from which a question with negatives is answered, as on robots.
+const RELEVANCY_THRESHOLD: f32 = 0.5;
+
+/// The things of a generation: each is scored in the first shard that has it.
+pub(super) struct Things {
+    /// Shards, and which of their objects are scored there.
+    shards: Vec<(Shard, Vec<usize>)>,
+    calibration: Option<Calibration>,
+}
+
+impl Things {
+    /// Reads the objects of the smallest shards.
+    pub(super) fn read(reader: &StoreReader) -> Result<Self, ViewError> {
+        let (mut first, mut shards, mut calibration) = (BTreeMap::new(), Vec::new(), None);
+        for cell in &reader.manifest().cells {
+            let Some(shard) = smallest_shard(reader, cell)? else { continue };
+            let Some(objects) = shard.layout.objects(&shard.bytes) else { continue };
+            let (score_mean, score_spread) = (objects.header.score_mean, objects.header.score_spread);
+            calibration.get_or_insert(Calibration { score_mean, score_spread });
+            let is_first = |at: &usize| first.insert(objects.records[*at].id, ()).is_none();
+            let here: Vec<usize> = (0..objects.records.len()).filter(is_first).collect();
+            if !here.is_empty() {
+                shards.push((shard, here));
+            }
+        }
+        Ok(Self { shards, calibration })
+    }
+
+    /// Answers a question, the first of `vectors`, against its negatives.
+    pub(super) fn answers(
+        &self,
+        manifest: &Manifest,
+        text: &str,
+        vectors: &[Vec<f32>],
+        limit: usize,
+    ) -> Value {
+        let encoder = &manifest.encoder;
+        let threshold = match self.calibration.filter(|_| encoder.calibration.is_some()) {
+            _ if vectors.len() > 1 => RELEVANCY_THRESHOLD,
+            Some(of) => of.score_mean + SPREADS_ABOVE_MEAN * of.score_spread,
+            None => encoder.default_threshold,
+        };
+        let mut found: Vec<(f32, ObjectRecord, String)> = Vec::new();
+        for (shard, here) in &self.shards {
+            let Some(objects) = shard.layout.objects(&shard.bytes) else { continue };
+            let view = shard.layout.view(&shard.bytes);
+            let scores =
+                combined(vectors.iter().map(|vector| view.object_scores(&objects, vector)).collect());
+            let matching = here.iter().filter(|at| scores[**at] >= threshold);
+            found.extend(matching.map(|at| {
+                let record = objects.records[*at];
+                (scores[*at], record, objects.photo(&record).to_owned())
+            }));
+        }
+        found.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.id.cmp(&b.1.id)));
+        found.truncate(limit);
+        let answers = found.iter().zip(1..).map(|(found, rank)| answer(manifest, rank, found));
+        let answers: Vec<Value> = answers.collect();
+        let none = answers.is_empty().then(|| {
+            let (kind, detail) = match self.shards.is_empty() {
+                true => {
+                    ("no-objects", "The store has no objects; the Gaussians that match are lit.".to_owned())
+                }
+                false => ("below-threshold", format!("No object reaches {threshold:.3}.")),
+            };
+            json!({ "kind": kind, "detail": detail, "thing": text })
+        });
+        json!({ "results": [{
+            "question": { "text": text }, "understood": null, "kind": "objects", "threshold": threshold,
+            "none": none, "answers": answers,
+        }] })
+    }
+}
+
+fn answer(manifest: &Manifest, rank: usize, (score, record, photo): &(f32, ObjectRecord, String)) -> Value {
+    let (position, bounds) = (record.position(), record.bounds());
+    let mut answer = json!({
+        "rank": rank, "id": format!("o{:016x}", record.id), "frame": "world", "generation": manifest.generation,
+        "position_in_world": position, "box_min_in_world": bounds.min, "box_max_in_world": bounds.max,
+        "score": score, "n_gaussians": record.n_gaussians,
+        "evidence": { "photo": photo, "box_px": record.photo_box_px },
+    });
+    if let Some(geo) = manifest.geo_reference {
+        answer["geographic"] = json!(geo.geographic_from_world(position));
+    }
+    answer
+}

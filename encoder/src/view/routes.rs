@@ -1,0 +1,133 @@
+//! The routes of the page, with the limits of the service for robots around them.
+
+use std::sync::Arc;
+
+use axum::extract::rejection::QueryRejection;
+use axum::extract::{Path, Query, State};
+use axum::http::{StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use axum::{Json, Router};
+use serde_json::Value;
+use slag_service::problem::Problem;
+use slag_view::Description;
+
+use super::error::ViewError;
+use super::viewer::Viewer;
+
+/// Answers in a page of `/v1/query` unless the request says otherwise.
+const DEFAULT_LIMIT: usize = 10;
+/// Most answers in a page.
+const MAX_LIMIT: usize = 1000;
+/// Most negatives of a question.
+const MAX_NEGATIVES: usize = 32;
+/// Longest photo that is sent.
+const MAX_PHOTO_BYTES: u64 = 64 << 20;
+const BINARY: [(header::HeaderName, &str); 1] = [(header::CONTENT_TYPE, "application/octet-stream")];
+
+type AppState = State<Arc<Viewer>>;
+type Pairs = Result<Query<Vec<(String, String)>>, QueryRejection>;
+
+/// Returns the page and its routes.
+pub fn router(viewer: Viewer) -> Router {
+    Router::new()
+        .route("/v1/view", axum::routing::get(describe))
+        .route("/v1/view/scores", axum::routing::get(scores))
+        .route("/v1/view/cells/{id}", axum::routing::get(cell))
+        .route("/v1/view/photos/{number}", axum::routing::get(photo))
+        .route("/v1/query", axum::routing::get(query))
+        .merge(slag_view::router())
+        .with_state(Arc::new(viewer))
+}
+
+/// Runs work off the asynchronous threads.
+async fn blocking<T: Send + 'static>(
+    viewer: Arc<Viewer>,
+    work: impl FnOnce(&Viewer) -> Result<T, ViewError> + Send + 'static,
+) -> Result<T, Problem> {
+    let done = tokio::task::spawn_blocking(move || work(&viewer)).await.map_err(Problem::internal)?;
+    Ok(done?)
+}
+
+async fn describe(State(viewer): AppState) -> Result<Json<Description>, Problem> {
+    blocking(viewer, Viewer::describe).await.map(Json)
+}
+
+async fn cell(State(viewer): AppState, Path(id): Path<String>, pairs: Pairs) -> Result<Response, Problem> {
+    let pairs = read(pairs, &["generation"])?;
+    let cell_id = number("id", &id)?;
+    let generation = pairs.first().map(|(name, value)| number(name, value)).transpose()?;
+    let bytes = blocking(viewer, move |viewer| viewer.cell(cell_id, generation)).await?;
+    Ok((BINARY, bytes).into_response())
+}
+
+async fn scores(State(viewer): AppState, pairs: Pairs) -> Result<Response, Problem> {
+    let (text, negatives) = question(&read(pairs, &["text", "negative"])?)?;
+    let work = move |viewer: &Viewer| {
+        viewer.asked(&text, &negatives, |generation, vectors| generation.scores(vectors))
+    };
+    Ok((BINARY, blocking(viewer, work).await?).into_response())
+}
+
+async fn query(State(viewer): AppState, pairs: Pairs) -> Result<Json<Value>, Problem> {
+    let pairs = read(pairs, &["text", "negative", "limit"])?;
+    let (text, negatives) = question(&pairs)?;
+    let limit = pairs.iter().find(|(name, _)| name == "limit");
+    let limit = limit.map_or(Ok(DEFAULT_LIMIT), |(name, value)| number(name, value))?.min(MAX_LIMIT);
+    let work = move |viewer: &Viewer| {
+        viewer.asked(&text, &negatives, |generation, vectors| {
+            Ok(generation.things.answers(generation.reader.manifest(), &text, vectors, limit))
+        })
+    };
+    blocking(viewer, work).await.map(Json)
+}
+
+/// Sends a photo as it lies on disk, by its number in the description.
+async fn photo(State(viewer): AppState, Path(number): Path<String>) -> Result<Response, Problem> {
+    let number: usize = self::number("number", &number)?;
+    let path = viewer.photo(number);
+    let gone = |detail: String| Problem::new(StatusCode::NOT_FOUND, "no-such-photo", "No such photo", detail);
+    let path = path.ok_or_else(|| gone(format!("there is no photo {number}; GET /v1/view lists them")))?;
+    let work = move || match std::fs::metadata(&path) {
+        Ok(about) if about.is_file() && about.len() <= MAX_PHOTO_BYTES => fs_err::read(&path).ok(),
+        _ => None,
+    };
+    let bytes = tokio::task::spawn_blocking(work).await.map_err(Problem::internal)?;
+    let bytes =
+        bytes.ok_or_else(|| gone(format!("the file of photo {number} cannot be read, or is too long")))?;
+    let kind = image::guess_format(&bytes).map_or("application/octet-stream", |format| format.to_mime_type());
+    Ok(([(header::CONTENT_TYPE, kind)], bytes).into_response())
+}
+
+fn bad(detail: impl Into<String>) -> Problem {
+    Problem::new(StatusCode::BAD_REQUEST, "bad-parameter", "Bad parameter", detail)
+}
+
+/// Returns the parameters; refuses unknown ones.
+fn read(pairs: Pairs, known: &[&str]) -> Result<Vec<(String, String)>, Problem> {
+    let Query(pairs) = pairs.map_err(|e| bad(e.body_text()))?;
+    match pairs.iter().find(|(name, _)| !known.contains(&name.as_str())) {
+        Some((name, _)) => {
+            let name: String = name.chars().take(40).collect();
+            Err(bad(format!("{:?} is unknown, expected one of {}", name, known.join(", "))))
+        }
+        None => Ok(pairs),
+    }
+}
+
+fn number<T: std::str::FromStr>(name: &str, value: &str) -> Result<T, Problem> {
+    let shown = || value.chars().take(40).collect::<String>();
+    value.parse().map_err(|_| bad(format!("{name} is {:?}, expected a whole number", shown())))
+}
+
+/// Returns a question and its negatives.
+fn question(pairs: &[(String, String)]) -> Result<(String, Vec<String>), Problem> {
+    let of = |wanted: &'static str| {
+        pairs.iter().filter(move |(name, _)| name == wanted).map(|(_, value)| value.clone())
+    };
+    let negatives: Vec<String> = of("negative").collect();
+    if negatives.len() > MAX_NEGATIVES {
+        return Err(bad(format!("{} negatives, expected at most {MAX_NEGATIVES}", negatives.len())));
+    }
+    let text = of("text").next().filter(|text| !text.trim().is_empty());
+    Ok((text.ok_or_else(|| bad("text is missing: say what to look for"))?, negatives))
+}

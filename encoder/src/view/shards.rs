@@ -1,0 +1,50 @@
+//! The smallest shard of a cell, and scores of questions with negatives.
+
+use slag_common::container::AlignedBytes;
+use slag_common::manifest::CellRecord;
+use slag_common::shard::ShardLayout;
+use slag_math::relevancy::relevancy;
+
+use super::error::ViewError;
+use crate::store::StoreReader;
+
+/// A cell's smallest shard.
+pub(super) struct Shard {
+    pub(super) bytes: AlignedBytes,
+    pub(super) layout: ShardLayout,
+}
+
+impl Shard {
+    /// Returns the score of each Gaussian's centroid; NaN without one.
+    pub(super) fn scores(&self, vectors: &[Vec<f32>]) -> Vec<f32> {
+        let view = self.layout.view(&self.bytes);
+        let of_centroids = combined(vectors.iter().map(|vector| view.centroid_scores(vector)).collect());
+        let mut scores = vec![f32::NAN; view.header.n_gaussians as usize];
+        for (centroid, score) in of_centroids.iter().enumerate() {
+            scores[view.members(centroid)].fill(*score);
+        }
+        scores
+    }
+}
+
+/// Combines the scores of a question with those of its negatives: the relevancy (LERF, Kerr et al. 2023, section 3.3), or the
+/// question's own where there are none.
+pub(super) fn combined(mut of_vectors: Vec<Vec<f32>>) -> Vec<f32> {
+    let mut own = of_vectors.swap_remove(0);
+    if !of_vectors.is_empty() {
+        for (k, score) in own.iter_mut().enumerate() {
+            let closest = of_vectors.iter().map(|of| of[k]).fold(f32::NEG_INFINITY, f32::max);
+            *score = if score.is_nan() { f32::NAN } else { relevancy(*score - closest) };
+        }
+    }
+    own
+}
+
+/// Reads the smallest shard of a cell.
+pub(super) fn smallest_shard(reader: &StoreReader, cell: &CellRecord) -> Result<Option<Shard>, ViewError> {
+    let Some(record) = cell.shards.values().next() else { return Ok(None) };
+    let bytes = reader.read_object(record.hash)?;
+    let layout =
+        ShardLayout::check(&bytes).map_err(|source| ViewError::Shard { cell_id: cell.cell_id, source })?;
+    Ok(Some(Shard { bytes, layout }))
+}

@@ -1,0 +1,79 @@
+//! A splat: positions and appearance of Gaussians in full precision.
+
+use glam::{DVec3, Vec3};
+use slag_common::Gaussians;
+use slag_common::appearance::AppearanceColumns;
+use slag_view::{Cell, CellState, Description, cell_message};
+
+use super::error::ViewError;
+use crate::cells::{self, CellLimits, CellSplit};
+
+/// The program's name in a description.
+pub(super) const PROGRAM: &str = "slag-encoder";
+/// Gaussians of a cell where a splat is shown alone: the first cell is small enough for a first picture within a second.
+const MAX_GAUSSIANS: usize = 65_536;
+
+/// A splat, cut into cells of its own where there is no store.
+pub struct Splat {
+    name: String,
+    pub(super) scene: Gaussians,
+    split: CellSplit,
+}
+
+impl Splat {
+    /// Takes a splat; `is_alone`: there is no store whose cells count.
+    pub fn new(name: String, scene: Gaussians, is_alone: bool) -> Self {
+        let limits = CellLimits { max_gaussians: MAX_GAUSSIANS, max_width: None };
+        let split = match is_alone {
+            true => cells::split(&scene, limits),
+            false => CellSplit {
+                cells: Vec::new(),
+                cell_of_gaussian: Vec::new(),
+                local_of_gaussian: Vec::new(),
+                n_rejected: 0,
+            },
+        };
+        Self { name, scene, split }
+    }
+
+    pub(super) fn describe(&self) -> Description {
+        let cells = self.split.cells.iter().zip(0..).map(|(cell, id)| Cell {
+            cell: id,
+            n_gaussians: cell.gaussians.len() as u32,
+            state: CellState::OnBoard,
+            generation: 0,
+            // Not of the extents: those of a few huge Gaussians of the sky would be the whole picture.
+            box_m: cell.mean_bounds.into(),
+        });
+        Description {
+            program: PROGRAM,
+            scene: self.name.clone(),
+            generation: 0,
+            n_gaussians: self.split.cells.iter().map(|cell| cell.gaussians.len() as u64).sum(),
+            up: Vec3::Z,
+            metric: false,
+            geographic: false,
+            can_ask: false,
+            cells: cells.collect(),
+            views: Vec::new(),
+            fetched: None,
+            position_m: None,
+        }
+    }
+
+    /// Returns the message of one of the splat's own cells.
+    pub(super) fn cell(&self, cell_id: u32) -> Result<Vec<u8>, ViewError> {
+        let cell = self.split.cells.get(cell_id as usize).ok_or(ViewError::NoCell { cell_id })?;
+        Ok(self.message(&cell.gaussians))
+    }
+
+    /// Returns the message of some Gaussians.
+    ///
+    /// # Panics
+    /// If an index is not one of the splat.
+    pub(super) fn message(&self, indices: &[u32]) -> Vec<u8> {
+        let positions: Vec<DVec3> =
+            indices.iter().map(|index| self.scene.means_in_world[*index as usize]).collect();
+        cell_message(&positions, Some(AppearanceColumns::of(&self.scene, indices).view()))
+    }
+}

@@ -1,0 +1,121 @@
+//! Answers the page from what is shown.
+
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use glam::Vec3;
+use slag_common::{Hash32, View};
+use slag_models::TextEncoder;
+use slag_view::Description;
+
+use super::error::ViewError;
+use super::generation::Generation;
+use super::photos;
+use super::splat::Splat;
+use crate::store::StoreReader;
+
+/// Opens the text encoder of a store; the error says what to do.
+pub type OpenText = Box<dyn Fn(&StoreReader) -> Result<Box<dyn TextEncoder>, String> + Send + Sync>;
+
+/// What is shown.
+pub struct Shown {
+    /// The store.
+    pub store: Option<PathBuf>,
+    /// The splat; of the store, if there is one.
+    pub splat: Option<Splat>,
+    /// The photos, in the world of the splat.
+    pub views: Vec<View>,
+    /// Upward; the world's z if absent.
+    pub up: Option<Vec3>,
+    /// Opens the store's text encoder, at the first question.
+    pub open_text: OpenText,
+}
+
+/// A text encoder and the id of its space.
+type OpenedText = (Hash32, Box<dyn TextEncoder>);
+
+/// Answers the page.
+pub struct Viewer {
+    shown: Shown,
+    /// Locked while another generation is opened, so that one request opens it.
+    generation: Mutex<Option<Arc<Generation>>>,
+    /// Locked while a question is scored: one at a time bounds memory.
+    text: Mutex<Option<OpenedText>>,
+}
+
+impl Viewer {
+    /// Makes a viewer; nothing is opened yet.
+    pub fn new(shown: Shown) -> Self {
+        Self { shown, generation: Mutex::default(), text: Mutex::default() }
+    }
+
+    /// Returns the store's current generation; blocks while it is read. A generation that does not open leaves the one before.
+    fn generation(&self) -> Result<Arc<Generation>, ViewError> {
+        let Some(store) = &self.shown.store else { return Err(ViewError::NoStore) };
+        let mut opened = locked(&self.generation);
+        if let Some(generation) = opened.as_ref().filter(|generation| generation.reader.is_current()) {
+            return Ok(Arc::clone(generation));
+        }
+        let fresh = StoreReader::open(store)
+            .map_err(ViewError::from)
+            .and_then(|reader| Generation::open(reader, self.shown.splat.as_ref()));
+        match (fresh, opened.as_ref()) {
+            (Ok(fresh), _) => Ok(Arc::clone(opened.insert(Arc::new(fresh)))),
+            (Err(error), Some(before)) => {
+                tracing::warn!("the page stays at the generation before: {error}");
+                Ok(Arc::clone(before))
+            }
+            (Err(error), None) => Err(error),
+        }
+    }
+
+    /// Describes what there is to draw.
+    pub(super) fn describe(&self) -> Result<Description, ViewError> {
+        let mut description = match (&self.shown.store, &self.shown.splat) {
+            (None, Some(splat)) => splat.describe(),
+            _ => self.generation()?.describe(),
+        };
+        if let Some(up) = self.shown.up.filter(|_| !description.metric) {
+            description.up = up;
+        }
+        description.views = photos::describe(&self.shown.views);
+        Ok(description)
+    }
+
+    /// Returns the message of a cell's Gaussians.
+    pub(super) fn cell(&self, cell_id: u32, generation: Option<u64>) -> Result<Vec<u8>, ViewError> {
+        match (&self.shown.store, &self.shown.splat) {
+            (None, Some(splat)) => splat.cell(cell_id),
+            (_, splat) => self.generation()?.cell(cell_id, generation, splat.as_ref()),
+        }
+    }
+
+    /// Returns the file of a photo, by its number in the description.
+    pub(super) fn photo(&self, number: usize) -> Option<PathBuf> {
+        self.shown.views.get(number).map(|view| view.image_path.clone())
+    }
+
+    /// Runs work on a question and its negatives as vectors of the current generation's space.
+    pub(super) fn asked<T>(
+        &self,
+        text: &str,
+        negatives: &[String],
+        work: impl FnOnce(&Generation, &[Vec<f32>]) -> Result<T, ViewError>,
+    ) -> Result<T, ViewError> {
+        let generation = self.generation()?;
+        let encoder_id = generation.reader.manifest().encoder.id;
+        let mut opened = locked(&self.text);
+        if opened.as_ref().is_none_or(|(id, _)| *id != encoder_id) {
+            let text = (self.shown.open_text)(&generation.reader).map_err(ViewError::Models)?;
+            *opened = Some((encoder_id, text));
+        }
+        let Some((_, encoder)) = opened.as_mut() else { return Err(ViewError::NoStore) };
+        let texts = std::iter::once(text).chain(negatives.iter().map(String::as_str));
+        let vectors = texts.map(|text| encoder.encode(text)).collect::<Result<Vec<_>, _>>()?;
+        work(&generation, &vectors)
+    }
+}
+
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,84 @@
+//! What the page is sent, by both programs, against the scores that the command line prints.
+
+use slag_tests::*;
+
+/// A message of scores: for each cell its id and the scores of its Gaussians; `None` where no view shows one.
+fn scores_of(service: &Service, query: &str) -> Vec<(u32, Vec<Option<f64>>)> {
+    let url = format!("{}/v1/view/scores?{query}", service.url);
+    let bytes = ureq::get(url).call().expect("answers").body_mut().read_to_vec().expect("bytes");
+    let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("4 bytes"));
+    let [least, largest] = [8, 12].map(|at| f64::from(f32::from_bits(word(at))));
+    assert_eq!(&bytes[..4], b"SLGS");
+    let mut start = 24 + 8 * word(16) as usize;
+    let cell = |at: usize| {
+        let (id, n) = (word(24 + 8 * at), word(28 + 8 * at) as usize);
+        let levels = &bytes[start..start + n];
+        start += n;
+        let score = |level: &u8| least + f64::from(*level) / 255.0 * (largest - least);
+        (id, levels.iter().map(|level| (*level > 0).then(|| score(level))).collect())
+    };
+    let cells = (0..word(16) as usize).map(cell).collect();
+    assert_eq!(start, bytes.len());
+    cells
+}
+
+/// The robot scores centroids in integers and the store's service in float64; `query` decodes every Gaussian.
+#[test]
+fn scores_are_those_of_the_command_line() {
+    let site = Site::new();
+    let robot = site.robot(&[]);
+    let (of_store, of_robot) = (scores_of(&site.store, "text=red"), scores_of(&robot, "text=red"));
+    let described = site.store.get("/v1/view");
+    assert_eq!(described["can_ask"], true);
+    assert_eq!(of_store.len(), described["cells"].as_array().expect("cells").len());
+    let mut n_compared = 0;
+    for (id, on_robot) in &of_robot {
+        let (_, in_store) = of_store.iter().find(|(other, _)| other == id).expect("a cell of the store");
+        assert_eq!(in_store.len(), on_robot.len());
+        for (a, b) in in_store.iter().zip(on_robot) {
+            match (a, b) {
+                (Some(a), Some(b)) => assert!((a - b).abs() < 0.02, "{a} {b}"),
+                (None, None) => {}
+                other => panic!("{other:?}"),
+            }
+            n_compared += 1;
+        }
+    }
+    assert!(n_compared > 1000, "{n_compared}");
+
+    let file = site.cache().with_file_name("scores.npy");
+    let store = site.cache().with_file_name("store");
+    let query = ["query", "--store", text(&store), "--models", "colours", "--profile", "compact", "red"];
+    run(encoder(&query).args(["--scores", text(&file)]));
+    let mut expected: Vec<f32> = read_npy::<f32>(&file).into_iter().filter(|score| !score.is_nan()).collect();
+    let mut found: Vec<f64> = of_store.iter().flat_map(|(_, scores)| scores).copied().flatten().collect();
+    assert_eq!(found.len(), expected.len());
+    expected.sort_by(f32::total_cmp);
+    found.sort_by(f64::total_cmp);
+    for (found, expected) in found.iter().zip(&expected) {
+        assert!((found - f64::from(*expected)).abs() < 0.01, "{found} {expected}");
+    }
+    assert!(expected[expected.len() - 1] - expected[0] > 0.5, "the question tells Gaussians apart");
+}
+
+/// Answers of the store's service are the robot's: same things, scores and places.
+#[test]
+fn the_store_finds_what_the_robot_finds() {
+    let site = Site::new();
+    let robot = site.robot(&[]);
+    let ask = |service: &Service| service.get("/v1/query?text=red&limit=100")["results"][0].clone();
+    let (of_store, of_robot) = (ask(&site.store), ask(&robot));
+    let places = |result: &serde_json::Value| {
+        let mut found: Vec<(String, f64)> = (result["answers"].as_array().expect("answers").iter())
+            .map(|a| (a["id"].as_str().expect("an id").to_owned(), a["score"].as_f64().expect("a score")))
+            .collect();
+        found.sort_by(|a, b| a.0.cmp(&b.0));
+        found
+    };
+    let (of_store, of_robot) = (places(&of_store), places(&of_robot));
+    assert!(!of_robot.is_empty());
+    for (id, score) in &of_robot {
+        let (_, same) = of_store.iter().find(|(other, _)| other == id).expect("the store has it, too");
+        assert!((same - score).abs() < 0.02, "{id}: {same} {score}");
+    }
+}

@@ -1,0 +1,84 @@
+// Chromium with a software GPU, and what tests look at in it.
+
+import assert from "node:assert/strict";
+import { mkdirSync, readFileSync } from "node:fs";
+import { createRequire } from "node:module";
+
+const fromPage = createRequire(new URL("../../common/view/web/package.json", import.meta.url));
+const { chromium } = fromPage("playwright-core");
+export const axe = readFileSync(fromPage.resolve("axe-core/axe.min.js"), "utf8");
+
+const PICTURES = process.env.SLAG_PAGE_PICTURES;
+const SIZE = { width: 1100, height: 640 };
+
+let browser;
+export async function openBrowser() {
+  browser = await chromium.launch({
+    executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
+    args: ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"],
+  });
+}
+
+export const closeBrowser = () => browser?.close();
+
+/** Opens the page of a service; fails at errors in the console and requests to others, but for those expected. */
+export async function opened(url, run, { fragment = "", options = {}, expected = null } = {}) {
+  const context = await browser.newContext({ viewport: SIZE, colorScheme: "dark", reducedMotion: "reduce", bypassCSP: false, ...options });
+  const page = await context.newPage();
+  const wrong = [];
+  page.on("console", (message) => message.type() === "error" && wrong.push(message.text()));
+  page.on("pageerror", (error) => wrong.push(String(error)));
+  page.on("request", (request) => {
+    const asked = request.url();
+    if (!asked.startsWith(url) && !asked.startsWith("blob:") && !asked.startsWith("data:")) wrong.push(`foreign request: ${asked}`);
+  });
+  try {
+    await page.goto(`${url}/view#${fragment}`);
+    await run(page);
+    assert.deepEqual(wrong.filter((text) => !expected?.test(text)), []);
+  } finally {
+    await context.close();
+  }
+}
+
+/** Waits until two pictures in a row are equal. */
+export async function picture(page, name) {
+  let last = null;
+  for (let i = 0; i < 40; i++) {
+    const next = await page.screenshot();
+    if (last?.equals(next)) break;
+    last = next;
+    await page.waitForTimeout(250);
+  }
+  if (PICTURES && name) {
+    mkdirSync(PICTURES, { recursive: true });
+    await page.screenshot({ path: `${PICTURES}/${name}.png` });
+  }
+  return last;
+}
+
+/** Pixels of strong colour beside the panel; the scene itself is grey. */
+export async function litPixels(page, leftPx, name) {
+  await page.uncheck("#show-boxes");
+  await page.uncheck("#show-grid");
+  const png = (await picture(page, name)).toString("base64");
+  const scratch = await browser.newPage();
+  try {
+    return await scratch.evaluate(async ([data, left]) => {
+      const image = await createImageBitmap(new Blob([Uint8Array.from(atob(data), (c) => c.charCodeAt(0))]));
+      const context = new OffscreenCanvas(image.width, image.height).getContext("2d");
+      context.drawImage(image, 0, 0);
+      const { data: rgba, width, height } = context.getImageData(0, 0, image.width, image.height);
+      const found = [];
+      for (let y = 0; y < height; y++) {
+        for (let x = left; x < width; x++) {
+          const [r, g, b] = rgba.subarray(4 * (y * width + x), 4 * (y * width + x) + 3);
+          if (r > 90 && r - Math.min(g, b) > 45) found.push([x, y]);
+        }
+      }
+      return found;
+    }, [png, leftPx]);
+  } finally {
+    await scratch.close();
+  }
+}
