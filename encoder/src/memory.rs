@@ -70,8 +70,7 @@ impl fmt::Display for MemoryError {
 /// The reservations of a run, within a budget.
 ///
 /// The plan covers the scene, the photos in work, cells, codebooks, objects, superpoints, mask vectors and
-/// contributions. It does not cover models, and the lists of similar masks from which objects are found: their length is
-/// known only once they are made.
+/// contributions. It does not cover models: ONNX Runtime states no bound.
 #[derive(Clone, Debug)]
 pub struct MemoryPlan {
     available_bytes: u64,

@@ -190,6 +190,9 @@ impl<'a> CellBuilder<'a> {
         table.reserve(&mut memory);
         index.reserve(&mut memory);
         Refinement::reserve_regions(&mut memory, &plan.settings.aggregation, table.len());
+        if plan.settings.cells.objects {
+            objects::reserve_masks(&mut memory, &table, n_gaussians.iter().sum(), photos.len());
+        }
         let rest_bytes = memory.rest(index.largest_part_bytes())?;
         let cell_bytes =
             shard::largest_cell_bytes(&plan.inputs.split, models.dim()) + index.largest_part_bytes();

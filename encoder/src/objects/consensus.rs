@@ -89,8 +89,6 @@ struct Judged {
     agreement: f64,
     /// Mean agreement of the other views.
     consensus: f64,
-    /// The masks that show the same thing, including itself, ascending.
-    same: Vec<u32>,
 }
 
 /// Counts by mask and by view, cleared after each use.
@@ -124,7 +122,10 @@ pub fn cluster_masks<'a>(
         .into_par_iter()
         .map_init(
             || Counts::new(masks),
-            |counts, mask| if is_cancelled() { Judged::default() } else { consensus.judge(mask, counts) },
+            |counts, mask| match is_cancelled() {
+                true => Judged::default(),
+                false => consensus.judge(mask as u32, counts).0,
+            },
         )
         .collect();
     let clusters = consensus.gather(&judged, &is_cancelled);
@@ -205,11 +206,12 @@ impl<'a> Consensus<'a> {
         self.samples_of(mask).len() >= MIN_SAMPLES
     }
 
-    /// Judges a mask by all views.
-    fn judge(&self, mask: usize, counts: &mut Counts) -> Judged {
-        let (mask, mut judged) = (mask as u32, Judged { agreement: 0.0, consensus: 0.0, same: Vec::new() });
+    /// Judges a mask by all views. Also returns the masks that show the same thing, including itself, ascending; they are
+    /// kept for no mask, since their number is known only once they are found.
+    fn judge(&self, mask: u32, counts: &mut Counts) -> (Judged, Vec<u32>) {
+        let (mut judged, mut same) = (Judged::default(), Vec::new());
         if !self.is_large_enough(mask) {
-            return judged;
+            return (judged, same);
         }
         counts.add(self.samples_of(mask), self.sightings, self.masks);
         let (own_view, n) = (self.view_of(mask), self.samples_of(mask).len());
@@ -224,7 +226,7 @@ impl<'a> Consensus<'a> {
                 let iou = both as f64 / (of_view + self.n_seen(*other, own_view) - both) as f64;
                 best = best.max(iou);
                 if iou >= SAME_IOU && self.is_large_enough(*other) {
-                    judged.same.push(*other);
+                    same.push(*other);
                 }
             }
             if of_view > 0 && of_view * 10 >= n * OBSERVED_TENTHS {
@@ -237,7 +239,7 @@ impl<'a> Consensus<'a> {
             judged.consensus = (judged.agreement - 1.0) / (n_judges - 1) as f64;
         }
         counts.clear();
-        judged
+        (judged, same)
     }
 
     /// Makes clusters: the masks with most agreement, in turn, gather those like them.
@@ -265,7 +267,8 @@ impl<'a> Consensus<'a> {
             if std::mem::replace(&mut is_gathered[seed as usize], true) {
                 continue;
             }
-            let samples = shape.majority(self, &judged[seed as usize].same);
+            let (_, same) = self.judge(seed, &mut counts);
+            let samples = shape.majority(self, &same);
             counts.add(&samples, self.sightings, self.masks);
             if let Some((members, consensus)) = self.members(samples.len(), &counts) {
                 members.iter().for_each(|mask| is_gathered[*mask as usize] = true);

@@ -24,6 +24,7 @@ pub mod shards;
 pub mod sightings;
 pub mod vectors;
 
+use crate::lift::RegionTable;
 use crate::memory::MemoryPlan;
 pub use find::{MIN_GAUSSIANS, find};
 pub use object::{NONE, Object, ObjectsReport, SceneObjects};
@@ -33,6 +34,12 @@ pub use scene::Scene;
 pub fn reserve(memory: &mut MemoryPlan, n_gaussians: usize, n_views: usize) {
     members::reserve(memory, n_gaussians);
     sightings::reserve(memory, n_gaussians, n_views);
+}
+
+/// Reserves what depends on the masks, once all views are done.
+pub fn reserve_masks(memory: &mut MemoryPlan, table: &RegionTable, n_gaussians: usize, n_views: usize) {
+    let most_masks = (0..table.len()).map(|region| table.all_masks_of(region).len()).max().unwrap_or(0);
+    sightings::reserve_masks(memory, n_gaussians, n_views, (table.n_masks(), most_masks));
 }
 
 #[cfg(test)]

@@ -25,6 +25,20 @@ pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize, n_views: usiz
     memory.reserve(Phase::Objects, "views of sampled Gaussians", len_bytes as u64);
 }
 
+/// Reserves the lists of the masks that show the sampled Gaussians: at most `most_masks` in a region, and for each mask the
+/// views that see some of its Gaussians.
+pub(super) fn reserve_masks(
+    memory: &mut MemoryPlan,
+    n_gaussians: usize,
+    n_views: usize,
+    (n_masks, most_masks): (usize, usize),
+) {
+    let n_sightings = n_gaussians / sample_step(n_gaussians) * n_views;
+    let samples_bytes = n_sightings * most_masks * size_of::<u32>();
+    let seen_bytes = n_masks * n_views * size_of::<(u32, u32)>();
+    memory.reserve(Phase::Objects, "masks of sampled Gaussians", (samples_bytes + seen_bytes) as u64);
+}
+
 /// Gathers the sightings of every `step`-th Gaussian of each cell. Returns `None` if cancelled.
 ///
 /// # Errors

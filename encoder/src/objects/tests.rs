@@ -442,3 +442,17 @@ fn vectors_are_kept_in_the_basis_of_centroids() {
         assert!(product.abs() < 1e-4, "{c}: {product}");
     }
 }
+
+/// By hand: 10 Gaussians in 3 views with at most 2 masks each are 60 entries of 4 bytes; 4 masks in 3 views, 12 of 8.
+#[test]
+fn lists_of_masks_are_reserved() {
+    let plan = |available_bytes: u64| {
+        let mut plan = MemoryPlan::new(available_bytes);
+        plan.views_are_done();
+        sightings::reserve_masks(&mut plan, 10, 3, (4, 2));
+        plan
+    };
+    assert_eq!(plan(336).rest(0), Ok(0));
+    let refused = plan(335).rest(0).expect_err("a byte is missing").to_string();
+    assert!(refused.contains("336 for masks of sampled Gaussians"), "{refused}");
+}
