@@ -38,6 +38,7 @@ pub mod lift;
 pub mod masks;
 pub mod memory;
 pub mod objects;
+pub mod occupancy;
 pub mod progress;
 pub mod publish;
 pub mod query;

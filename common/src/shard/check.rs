@@ -11,6 +11,7 @@ use super::indices::{self, IndicesHeader, PackedIndices};
 use super::layout::ShardLayout;
 use crate::container::{ContainerError, Layout};
 use crate::objects::ObjectsLayout;
+use crate::occupancy::OccupancyLayout;
 
 /// Largest length accepted: embeddings have unit length, and components are scaled to about that.
 const MAX_LENGTH: f32 = 4096.0;
@@ -102,6 +103,7 @@ impl ShardLayout {
             Some(_) => Some(packed_indices(&layout, bytes, n)?),
         };
         let objects = ObjectsLayout::check(bytes, &layout, header.n_gaussians, m)?;
+        let occupancy = OccupancyLayout::check(bytes, &layout)?;
         Ok(Self {
             header,
             positions,
@@ -114,6 +116,7 @@ impl ShardLayout {
             fine,
             packed_indices,
             objects,
+            occupancy,
         })
     }
 }

@@ -8,6 +8,7 @@ use super::columns::{Basis, ExactColumns, Fine, Positions, Residuals, ShardView}
 use super::format::{ScoreErrors, ShardHeader};
 use super::indices::{IndicesHeader, PackedIndices};
 use crate::objects::{Objects, ObjectsLayout};
+use crate::occupancy::{Occupancy, OccupancyLayout};
 
 /// The header of a checked shard and the places of its columns; [`ShardLayout::view`] gives the columns.
 #[derive(Clone, Debug)]
@@ -24,6 +25,7 @@ pub struct ShardLayout {
     pub(super) fine: Option<(ScoreErrors, [Range<usize>; 3])>,
     pub(super) packed_indices: Option<(IndicesHeader, Range<usize>)>,
     pub(super) objects: Option<ObjectsLayout>,
+    pub(super) occupancy: Option<OccupancyLayout>,
 }
 
 impl ShardLayout {
@@ -33,6 +35,14 @@ impl ShardLayout {
     /// As [`ShardLayout::view`], with an 8-byte aligned address.
     pub fn objects<'a>(&self, bytes: &'a [u8]) -> Option<Objects<'a>> {
         self.objects.as_ref().map(|objects| objects.view(bytes))
+    }
+
+    /// Returns which places of the checked bytes' cell are free, if the shard says so.
+    ///
+    /// # Panics
+    /// As [`ShardLayout::objects`].
+    pub fn occupancy<'a>(&self, bytes: &'a [u8]) -> Option<Occupancy<'a>> {
+        self.occupancy.as_ref().map(|occupancy| occupancy.view(bytes))
     }
 
     /// Returns the columns in the checked bytes.

@@ -116,7 +116,7 @@ fn round_trip() {
     // Writing both at once gives the same bytes; a shard without objects has none.
     let again = objects;
     let mut out = Vec::new();
-    layout.view(&bytes).write_with(&mut out, Some(&again)).expect("writes to memory");
+    layout.view(&bytes).write_with(&mut out, Some(&again), None).expect("writes to memory");
     assert_eq!(out, &bytes[..]);
     out.clear();
     layout.view(&bytes).write(&mut out).expect("writes to memory");

@@ -6,6 +6,7 @@ use super::columns::ShardView;
 use super::format::{MAGIC, VERSION, section};
 use crate::container;
 use crate::objects::Objects;
+use crate::occupancy::Occupancy;
 
 impl ShardView<'_> {
     /// Writes the shard.
@@ -13,14 +14,19 @@ impl ShardView<'_> {
     /// # Errors
     /// Those of the writer.
     pub fn write(&self, out: impl io::Write) -> io::Result<()> {
-        self.write_with(out, None)
+        self.write_with(out, None, None)
     }
 
-    /// Writes the shard with the objects of its Gaussians.
+    /// Writes the shard with the objects of its Gaussians and the free places of its cell.
     ///
     /// # Errors
     /// Those of the writer.
-    pub fn write_with(&self, out: impl io::Write, objects: Option<&Objects<'_>>) -> io::Result<()> {
+    pub fn write_with(
+        &self,
+        out: impl io::Write,
+        objects: Option<&Objects<'_>>,
+        occupancy: Option<&Occupancy<'_>>,
+    ) -> io::Result<()> {
         let mut sections = vec![
             (section::HEADER, bytemuck::bytes_of(&self.header)),
             (section::POSITIONS, self.positions.bytes()),
@@ -55,6 +61,7 @@ impl ShardView<'_> {
             sections.push((section::PACKED_INDICES, container::bytes_of(indices.words)));
         }
         sections.extend(objects.iter().flat_map(|objects| objects.sections()));
+        sections.extend(occupancy.iter().flat_map(|occupancy| occupancy.sections()));
         container::write(out, MAGIC, VERSION, &sections)
     }
 }

@@ -205,7 +205,7 @@ fn shard(cell_id: u32, n: usize, spec: &SceneSpec) -> (Vec<u8>, Aabb, u32) {
         exact: None,
         packed_indices: None,
     }
-    .write_with(&mut bytes, of_objects.as_ref().map(CellObjects::view).as_ref())
+    .write_with(&mut bytes, of_objects.as_ref().map(CellObjects::view).as_ref(), None)
     .expect("writes to memory");
     (bytes, bounds, k as u32)
 }

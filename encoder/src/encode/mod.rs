@@ -4,6 +4,7 @@
 //! |---|---|---|
 //! | plan | inputs read and checked, memory reserved, the order of views | `plan.rs` |
 //! | run views | a file of contributions per view, in the job's folder | `views.rs`, `view.rs`, `pipeline.rs`, `job.rs` |
+//! | look around | free and occupied places, if they are asked for | `views.rs` |
 //! | build cells | objects, fields and shards in the store | `cells.rs` |
 //! | publish | the manifest and its metadata, the summary | `publish.rs` |
 //!
@@ -66,8 +67,9 @@ pub fn encode(
     let plan = plan::plan(settings, engines, &store, &inputs, &context)?;
     context.begin_phase(Phase::Views);
     let views = views::run_views(&plan, &context)?;
+    let occupancy = views::look_around(&plan, &views, &context)?;
     context.begin_phase(Phase::Merge);
-    let built = cells::build_cells(&plan, &views, &context)?;
+    let built = cells::build_cells(&plan, &views, occupancy, &context)?;
     context.begin_phase(Phase::Publish);
     publish::publish(plan, views, built, &context)
 }

@@ -6,6 +6,7 @@ use half::f16;
 use rayon::prelude::*;
 use slag_common::Gaussians;
 use slag_common::hash::Hash32;
+use slag_common::occupancy::Occupancy;
 use slag_common::shard::{
     Basis, ExactColumns, Fine, IndexColumn, Profile, Residuals, ScoreErrors, ShardHeader, ShardView,
 };
@@ -87,7 +88,16 @@ pub fn reserve(memory: &mut MemoryPlan, split: &CellSplit, dim: usize) {
     memory.reserve(Phase::Cells, "the largest cell", largest_cell_bytes(split, dim));
 }
 
-/// Builds a cell's shards, with the objects of the scene if it has any.
+/// What a cell's shards carry besides Gaussians and their embeddings.
+#[derive(Default)]
+pub struct CellExtras<'a> {
+    /// The objects of the scene, if it has any.
+    pub objects: Option<&'a SceneObjects>,
+    /// The free and occupied places of the cell, if they were asked for.
+    pub occupancy: Option<Occupancy<'a>>,
+}
+
+/// Builds a cell's shards.
 #[expect(clippy::too_many_arguments, reason = "the parts of a cell")]
 pub fn build(
     scene: &Gaussians,
@@ -97,7 +107,7 @@ pub fn build(
     encoder_id: Hash32,
     score_context: &ScoreMetricContext,
     settings: &ShardSettings,
-    objects: Option<&SceneObjects>,
+    extras: &CellExtras<'_>,
 ) -> BuiltCell {
     let dim = embeddings.dim;
     let (with, without): (Vec<u32>, Vec<u32>) =
@@ -156,14 +166,16 @@ pub fn build(
         }),
         ..compact
     });
-    let objects = objects
-        .map(|objects| CellObjects::new(objects, cell_id, &locals, &CentroidBasis::new(dim, compact.basis)));
+    let of_cell =
+        |objects| CellObjects::new(objects, cell_id, &locals, &CentroidBasis::new(dim, compact.basis));
+    let objects = extras.objects.map(of_cell);
     let objects = objects.as_ref().map(CellObjects::view);
     let largest = |radii: &[f32]| radii.iter().copied().fold(0.0, f32::max);
     let spread = codebook.errors.spread;
     let built = |profile, view: &ShardView<'_>| {
         let mut bytes = Vec::new();
-        view.write_with(&mut bytes, objects.as_ref()).expect("writing to memory cannot fail");
+        view.write_with(&mut bytes, objects.as_ref(), extras.occupancy.as_ref())
+            .expect("writing to memory cannot fail");
         let (score_error_bound, score_errors) = match profile {
             Profile::Exact => (F16_ROUNDING, ScoreErrors { spread, ..ScoreErrors::default() }),
             _ => (largest(view.radii), view.header.errors),

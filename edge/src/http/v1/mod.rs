@@ -2,6 +2,7 @@
 
 mod body;
 mod events;
+mod goal;
 mod map;
 mod objects;
 mod params;
@@ -28,5 +29,9 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         .parameters(params::objects_parameters())
         .get("/v1/objects/{id}", "one thing on board", objects::one)
         .get("/v1/map", "the area on board, its age, and what is missing", map::map)
+        .get("/v1/goal", "places to stand near a thing: reached, clear, and in sight of it", goal::goal)
+        .parameters(goal::parameters())
+        .get("/v1/floor", "the ground around the robot: unknown, obstacle, ground, reached", goal::floor)
+        .parameters(goal::floor_parameters())
         .get("/v1/events", "server-sent events: generations and fetches as they happen", events::events)
 }

@@ -94,6 +94,7 @@ impl Wall {
                 input_indices: false,
             },
             objects: false,
+            occupancy: None,
         };
         settings.run.threads = 1;
         settings.run.memory_bytes = 1 << 28;
