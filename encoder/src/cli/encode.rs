@@ -140,6 +140,10 @@ pub struct EncodeArgs {
     /// Search for objects.
     #[command(flatten)]
     pub objects: ObjectArgs,
+    /// Views and cells by other machines.
+    #[cfg(feature = "fleet")]
+    #[command(flatten)]
+    pub fleet: super::fleet::CoordinatorArgs,
     /// Drops an unfinished encode of another splat or with other settings in the store.
     #[arg(long)]
     pub restart: bool,
@@ -254,7 +258,7 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());
     let devices = Devices::open(args.device, GpuOptions::default())?;
     let engines = Engines::new(&models, &session, &devices);
-    let summary = encode::encode(&settings, &engines, progress, cancel_flag()?.as_ref())?;
+    let summary = encode_with(args, &settings, &engines, progress)?;
     let busy =
         summary.busy_secs.iter().map(|(stage, s)| format!("{stage} {s:.1}")).collect::<Vec<_>>().join(", ");
     let of_views: String = (summary.view_stages.iter())
@@ -326,6 +330,21 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     );
     print(json, &summary, lines)?;
     Ok(if summary.skipped_views.is_empty() { Exit::Done } else { Exit::Partly })
+}
+
+/// Encodes on this machine, or by the fleet that the flags name.
+fn encode_with(
+    #[cfg_attr(not(feature = "fleet"), expect(unused_variables, reason = "no fleet"))] args: &EncodeArgs,
+    settings: &EncodeSettings,
+    engines: &Engines<'_>,
+    progress: &dyn Progress,
+) -> Result<EncodeSummary> {
+    let cancel = cancel_flag()?;
+    #[cfg(feature = "fleet")]
+    if let Some(coordinator) = args.fleet.coordinator()? {
+        return Ok(coordinator.encode(settings, engines, progress, &cancel)?);
+    }
+    Ok(encode::encode(settings, engines, progress, &cancel)?)
 }
 
 /// Returns the line that names the most expensive view and cell.
