@@ -207,9 +207,10 @@ impl<'a> CellBuilder<'a> {
         Ok(Self { plan, context, encoder_id, index, table, score_context, group_bytes, n_at_once, photos })
     }
 
-    /// Finds the objects of the scene if the settings ask for them; `None` if cancelled, too.
+    /// Finds the objects of the scene if the settings publish or mix them; `None` if cancelled, too.
     fn objects(&self) -> Result<Option<SceneObjects>, EncodeError> {
-        if !self.plan.settings.cells.objects {
+        let settings = self.plan.settings;
+        if !settings.cells.objects && !settings.aggregation.needs_objects() {
             return Ok(None);
         }
         let scene = objects::Scene {
@@ -263,9 +264,10 @@ impl<'a> CellBuilder<'a> {
             let contributions = (&self.index, &mut self.table);
             let scene = (&inputs.scene, &inputs.split);
             let cancel = self.context.cancel();
-            let photos = &self.photos;
+            let object_of = objects.as_ref().map_or(&[][..], |objects| &objects.object_of);
+            let (photos, bytes) = (&self.photos, self.group_bytes);
             let prepare =
-                || Refinement::prepare(aggregation, contributions, scene, photos, self.group_bytes, cancel);
+                || Refinement::prepare(aggregation, contributions, scene, object_of, photos, bytes, cancel);
             self.context.install(prepare)
         })?;
         if self.context.is_cancelled() {
@@ -278,6 +280,7 @@ impl<'a> CellBuilder<'a> {
         let regions = self.context.install(|| store.put_object(|out| self.table.write(out)))?.0;
         built.extras.insert(EXTRA_REGIONS.into(), regions);
         self.context.begin_phase(Phase::Cells);
+        let objects = objects.filter(|_| settings.cells.objects);
         let Some(finished) = self.build_shards(refinement.as_ref(), objects.as_ref())? else {
             return Ok(None);
         };

@@ -98,7 +98,7 @@ fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, dim: usize) -> Memory
     inputs::reserve_photos(&mut memory, &inputs.views, settings.run.threads);
     shard::reserve(&mut memory, &inputs.split, dim);
     Refinement::reserve(&mut memory, &settings.aggregation, n_gaussians);
-    if settings.cells.objects {
+    if settings.cells.objects || settings.aggregation.needs_objects() {
         objects::reserve(&mut memory, n_gaussians, inputs.views.len());
     }
     memory

@@ -1,4 +1,4 @@
-//! The plain average beside the default, on labelled scenes, with true and with automatic masks, by Gaussian and by
+//! The plain average beside the default, and beside the default with shares of objects if asked for, on labelled scenes, with true and with automatic masks, by Gaussian and by
 //! object: the figures that a default is chosen and judged by.
 
 use std::fmt;
@@ -25,6 +25,8 @@ pub struct DefaultsSettings {
     pub scenes: Vec<PathBuf>,
     /// Folder for the stores; a later run reuses the views there.
     pub out: PathBuf,
+    /// Weight of the object's mean in further rows; `None` for no such rows.
+    pub object: Option<f32>,
     /// All other settings; the comparison sets inputs, masks, aggregation, objects and store.
     pub encode: EncodeSettings,
 }
@@ -39,6 +41,28 @@ pub enum MaskSource {
     Automatic,
 }
 
+/// How contributions become embeddings.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Method {
+    /// The plain average.
+    Plain,
+    /// The default.
+    Default,
+    /// The default, and a share of each Gaussian's object.
+    Objects,
+}
+
+impl Method {
+    fn name(self) -> &'static str {
+        match self {
+            Self::Plain => "plain",
+            Self::Default => "default",
+            Self::Objects => "default, objects mixed in",
+        }
+    }
+}
+
 /// Figures of one scene with one source of masks.
 #[derive(Clone, Debug, Serialize)]
 pub struct DefaultsRow {
@@ -46,8 +70,8 @@ pub struct DefaultsRow {
     pub scene: String,
     /// Where masks came from.
     pub masks: MaskSource,
-    /// Whether it is the default rather than the plain average.
-    pub is_default: bool,
+    /// How contributions became embeddings.
+    pub method: Method,
     /// What was scored.
     pub kind: EvalKind,
     /// Mean intersection over union of the argmax over all categories.
@@ -96,23 +120,28 @@ pub fn run(
             let store = settings.out.join(&scene.name).join(folder);
             let mut encode = scene.encode_settings(&settings.encode, store)?;
             encode.view.masks = masks;
-            for is_default in [false, true] {
-                encode.aggregation = if is_default { Aggregation::REFINED } else { Aggregation::PLAIN };
-                encode.cells.objects = is_default;
+            let plain_and_default =
+                [(Method::Plain, Aggregation::PLAIN), (Method::Default, Aggregation::REFINED)];
+            let with_objects = settings.object.map(|object| Aggregation { object, ..Aggregation::REFINED });
+            let methods =
+                plain_and_default.into_iter().chain(with_objects.map(|with| (Method::Objects, with)));
+            for (method, aggregation) in methods {
+                encode.aggregation = aggregation;
+                encode.cells.objects = method != Method::Plain;
                 let engines = Engines::new(models, session, rasterizer);
                 let start = std::time::Instant::now();
                 encode::encode(&encode, &engines, &Silent, cancel).map_err(Box::new)?;
                 let encode_secs = start.elapsed().as_secs_f64();
                 let reader = StoreReader::open(&encode.output.store)?;
                 let kinds = [EvalKind::Gaussians, EvalKind::Objects];
-                for kind in &kinds[..1 + usize::from(is_default)] {
+                for kind in &kinds[..1 + usize::from(encode.cells.objects)] {
                     let eval = EvalSettings { kind: Some(*kind), ..EvalSettings::default() };
                     let report =
                         labelled(&reader, &scene.truth, &scene.gaussians, &mut *text, &CpuRasterizer, &eval)?;
                     let row = DefaultsRow {
                         scene: scene.name.clone(),
                         masks: source,
-                        is_default,
+                        method,
                         kind: *kind,
                         miou: report.multi_class.first().and_then(|all| all.miou),
                         average_precision: report.mean_average_precision,
@@ -142,7 +171,7 @@ impl fmt::Display for DefaultsReport {
                 MaskSource::Given => "given",
                 MaskSource::Automatic => "automatic",
             };
-            let method = if row.is_default { "default" } else { "plain" };
+            let method = row.method.name();
             let kind = match row.kind {
                 EvalKind::Gaussians => "Gaussian",
                 EvalKind::Objects => "object",

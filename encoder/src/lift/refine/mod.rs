@@ -9,11 +9,12 @@
 //! | `equalise` | `equalisation` | views count more evenly, whatever their distance and slant |
 //! | `median` | `median_steps` | views that disagree count less: steps towards the geometric median |
 //! | `mixture` | `superpoint`, `coarse` | a Gaussian takes a share of its superpoint, then of a larger one |
+//! | `mixture` | `object` | then a share of its object's mean |
 //! | `mixture` | `fill` | a Gaussian without evidence takes its superpoint's mean |
 //!
 //! The result is again sparse contributions over regions. Weights of masks go into the [`RegionTable`], and a superpoint is
 //! one more region of it: a mixture of masks. So scores, shards and the published field need no special case, and a
-//! Gaussian gets at most two more entries.
+//! Gaussian gets at most three more entries.
 //!
 //! All decisions are made in principal coordinates of the mask vectors (`points`) and in one order: the result depends
 //! neither on threads nor on the memory budget.
@@ -38,7 +39,7 @@ use super::contributions::ContributionError;
 use super::index::ContributionIndex;
 use super::part::PartContributions;
 use super::photos::Photo;
-use super::superpoint::{Graph, Sketches, SuperpointSettings, Superpoints};
+use super::superpoint::{Graph, NO_SUPERPOINT, Sketches, SuperpointSettings, Superpoints};
 use super::table::RegionTable;
 use crate::cells::CellSplit;
 use crate::memory::{MemoryPlan, Phase};
@@ -91,12 +92,16 @@ impl Refinement {
     /// Decides the weights of masks and the mixtures of superpoints, in up to three passes over all contributions, and adds
     /// both to the table. Returns `None` if cancelled, and for the plain average.
     ///
+    /// `object_of`: `[cell][N of the cell]`, the object of each Gaussian, [`NO_SUPERPOINT`] for none; empty where no
+    /// objects are known.
+    ///
     /// # Errors
     /// [`ContributionError`].
     pub fn prepare(
         settings: Aggregation,
         (index, table): (&ContributionIndex, &mut RegionTable),
         (scene, split): (&Gaussians, &CellSplit),
+        object_of: &[Vec<u32>],
         photos: &[Photo],
         group_bytes: u64,
         cancel: &AtomicBool,
@@ -126,8 +131,21 @@ impl Refinement {
         if settings.agreement > 0.0 {
             goes_on = refinement.weigh_by_agreement(&passes, table, mask_points, mask_weights)?;
         }
+        let mut scales = Vec::new();
         if goes_on && settings.needs_superpoints() {
-            goes_on = refinement.make_mixtures(&passes, table, mask_points, (scene, split))?;
+            goes_on = match refinement.find_superpoints(&passes, table, (scene, split))? {
+                Some(superpoints) => {
+                    scales.extend(superpoints);
+                    true
+                }
+                None => false,
+            };
+        }
+        if settings.needs_objects() {
+            scales.push((settings.object, groups_of_objects(object_of, split, scene.len())));
+        }
+        if goes_on && !scales.is_empty() {
+            goes_on = refinement.make_mixtures(&passes, table, mask_points, split, scales)?;
         }
         Ok(goes_on.then_some(refinement))
     }
@@ -156,14 +174,13 @@ impl Refinement {
         Ok(done)
     }
 
-    /// Finds superpoints and appends their mixtures to the table; returns false if cancelled.
-    fn make_mixtures(
-        &mut self,
+    /// Finds superpoints at two scales, as far as needed, each with its weight; `None` if cancelled.
+    fn find_superpoints(
+        &self,
         passes: &Passes<'_>,
-        table: &mut RegionTable,
-        mask_points: &[Point],
+        table: &RegionTable,
         (scene, split): (&Gaussians, &CellSplit),
-    ) -> Result<bool, ContributionError> {
+    ) -> Result<Option<Vec<(f32, Superpoints)>>, ContributionError> {
         let mut sketches = vec![0; scene.len() * AXES];
         let of_part = |mut contributions: PartContributions| {
             self.refine_own(&mut contributions);
@@ -176,7 +193,7 @@ impl Refinement {
             }
         })?;
         if !done {
-            return Ok(false);
+            return Ok(None);
         }
         let sketches = Sketches { width: AXES, values: &sketches };
         let graph = Graph::new(scene, Some(sketches), &SuperpointSettings::default());
@@ -188,8 +205,19 @@ impl Refinement {
             || partition(superpoint, superpoint > 0.0 || fill, SuperpointSettings::default()),
             || partition(coarse, coarse > 0.0, SuperpointSettings::coarse()),
         );
-        let scales: Vec<(f32, Superpoints)> = fine.into_iter().chain(larger).collect();
-        drop(graph);
+        Ok(Some(fine.into_iter().chain(larger).collect()))
+    }
+
+    /// Appends the mixtures of groups of Gaussians to the table; returns false if cancelled. `scales`: a partition of the
+    /// Gaussians and the weight of its mixtures, in the order in which they are applied.
+    fn make_mixtures(
+        &mut self,
+        passes: &Passes<'_>,
+        table: &mut RegionTable,
+        mask_points: &[Point],
+        split: &CellSplit,
+        scales: Vec<(f32, Superpoints)>,
+    ) -> Result<bool, ContributionError> {
         let mut sums: Vec<SuperpointSums> = scales.iter().map(|(_, of)| SuperpointSums::new(of.n)).collect();
         let of_part = |mut contributions: PartContributions| -> Vec<PartSums> {
             self.refine_own(&mut contributions);
@@ -205,7 +233,7 @@ impl Refinement {
         for ((weight, superpoints), sums) in scales.into_iter().zip(sums) {
             self.mixtures.push(Mixtures::new(weight, superpoints, sums, table, mask_points));
         }
-        // The larger superpoints are mixed with rows that hold entries of the finer ones.
+        // Later mixtures are mixed with rows that hold entries of earlier ones.
         let of_mixtures = points::of_regions(table, mask_points, self.region_points.len()..table.len());
         self.region_points.extend(of_mixtures);
         Ok(true)
@@ -214,14 +242,17 @@ impl Refinement {
     /// Reserves the lists over all Gaussians: the superpoints' graph while masks are weighed, and each Gaussian's
     /// superpoints until the last cell.
     pub fn reserve(memory: &mut MemoryPlan, settings: &Aggregation, n_gaussians: usize) {
-        if !settings.needs_superpoints() {
+        if !settings.needs_mixtures() {
             return;
         }
-        let sketches_bytes = (n_gaussians * (AXES + size_of::<u32>())) as u64;
-        let graph_bytes = Superpoints::working_bytes(n_gaussians, &SuperpointSettings::default());
-        memory.reserve(Phase::Refine, "superpoints of all Gaussians", sketches_bytes + graph_bytes);
-        let n_scales =
-            usize::from(settings.superpoint > 0.0 || settings.fill) + usize::from(settings.coarse > 0.0);
+        if settings.needs_superpoints() {
+            let sketches_bytes = (n_gaussians * (AXES + size_of::<u32>())) as u64;
+            let graph_bytes = Superpoints::working_bytes(n_gaussians, &SuperpointSettings::default());
+            memory.reserve(Phase::Refine, "superpoints of all Gaussians", sketches_bytes + graph_bytes);
+        }
+        let n_scales = usize::from(settings.superpoint > 0.0 || settings.fill)
+            + usize::from(settings.coarse > 0.0)
+            + usize::from(settings.needs_objects());
         let labels_bytes = (n_gaussians * n_scales * size_of::<u32>()) as u64;
         memory.reserve(Phase::Cells, "the superpoints of each Gaussian", labels_bytes);
     }
@@ -259,6 +290,18 @@ impl Refinement {
     fn prune(&self, contributions: &mut PartContributions) {
         prune::prune(contributions, &self.settings, &self.first_regions, &self.mask_counts);
     }
+}
+
+/// Returns the objects as a partition of the scene's `n` Gaussians.
+fn groups_of_objects(object_of: &[Vec<u32>], split: &CellSplit, n: usize) -> Superpoints {
+    let mut groups = Superpoints { of_gaussian: vec![NO_SUPERPOINT; n], n: 0 };
+    for (cell, of_cell) in split.cells.iter().zip(object_of) {
+        for (gaussian, object) in cell.gaussians.iter().zip(of_cell).filter(|(_, o)| **o != NO_SUPERPOINT) {
+            groups.of_gaussian[*gaussian as usize] = *object;
+            groups.n = groups.n.max(*object as usize + 1);
+        }
+    }
+    groups
 }
 
 #[cfg(test)]

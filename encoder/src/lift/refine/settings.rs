@@ -29,8 +29,15 @@ pub struct Aggregation {
     pub superpoint: f32,
     /// Weight of the larger superpoint's mean, relative to the result so far.
     pub coarse: f32,
+    /// Weight of the object's mean, relative to the result so far. Absent from the published record where it is 0.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub object: f32,
     /// Whether Gaussians without evidence take their superpoint's mean.
     pub fill: bool,
+}
+
+fn is_zero(weight: &f32) -> bool {
+    *weight == 0.0
 }
 
 impl Aggregation {
@@ -45,6 +52,7 @@ impl Aggregation {
         median_steps: 0,
         superpoint: 0.0,
         coarse: 0.0,
+        object: 0.0,
         fill: false,
     };
     /// The refinements that help both on trained splats and on generated ones (docs/accuracy.md). Pruning by region helps
@@ -74,6 +82,7 @@ impl Aggregation {
             ("superpoints", Self { superpoint: refined.superpoint, ..plain }),
             ("coarse", Self { coarse: refined.coarse, ..plain }),
             ("fill", Self { fill: true, ..plain }),
+            ("objects", Self { object: 1.0, ..plain }),
             ("refined", refined),
         ]
     }
@@ -83,8 +92,18 @@ impl Aggregation {
         self.superpoint > 0.0 || self.coarse > 0.0 || self.fill
     }
 
+    /// Returns whether Gaussians share evidence at all.
+    pub(super) fn needs_mixtures(&self) -> bool {
+        self.needs_superpoints() || self.needs_objects()
+    }
+
+    /// Returns whether Gaussians share evidence within objects.
+    pub fn needs_objects(&self) -> bool {
+        self.object > 0.0
+    }
+
     /// Returns whether the vectors of regions are needed, in principal coordinates.
     pub(super) fn needs_points(&self) -> bool {
-        self.agreement != 0.0 || self.median_steps != 0 || self.needs_superpoints()
+        self.agreement != 0.0 || self.median_steps != 0 || self.needs_mixtures()
     }
 }

@@ -96,6 +96,10 @@ struct Lifted {
 }
 
 fn lifted(settings: Aggregation, group_bytes: u64) -> Lifted {
+    lifted_with_objects(settings, group_bytes, &[])
+}
+
+fn lifted_with_objects(settings: Aggregation, group_bytes: u64, object_of: &[Vec<u32>]) -> Lifted {
     let mut opened = open(&views(), DIM, &[N], u64::MAX);
     let Scene { index, table, .. } = &mut opened;
     let (scene, split) = (gaussians(), split());
@@ -103,6 +107,7 @@ fn lifted(settings: Aggregation, group_bytes: u64) -> Lifted {
         settings,
         (index, table),
         (&scene, &split),
+        object_of,
         &photos(),
         group_bytes,
         &AtomicBool::new(false),
@@ -230,6 +235,7 @@ fn the_plain_average_is_left_alone_and_its_file_is_what_it_was() {
         Aggregation::PLAIN,
         (index, table),
         (&scene, &split),
+        &[],
         &photos(),
         u64::MAX,
         &AtomicBool::new(false),
@@ -369,6 +375,55 @@ fn the_gate_takes_the_evidence_of_what_hardly_shows() {
     assert!((10..80).contains(&n_gated), "{n_gated}");
 }
 
+/// Oracle: the definition in float64. One object is half of a patch, one lies in two patches.
+#[test]
+fn an_object_gives_its_part_to_its_gaussians_alone() {
+    let object_at = |k: usize| match k {
+        0..15 => Some(0),
+        35..70 => Some(1),
+        _ => None,
+    };
+    let object_of: Vec<u32> = (0..N).map(|k| object_at(k).unwrap_or(NO_SUPERPOINT)).collect();
+    let views = views();
+    let sum_of = |k: usize| -> Vec<f64> {
+        let mut sum = vec![0.0; DIM];
+        for (view, entries) in views.iter().zip(row(&views, k)) {
+            contribution(view, &entries, &[1.0; 6]).iter().zip(&mut sum).for_each(|(x, sum)| *sum += x);
+        }
+        sum
+    };
+    let unit = |v: &[f64]| -> Vec<f64> { v.iter().map(|x| x / norm(v).max(1e-12)).collect() };
+    let settings = Aggregation { object: 0.75, ..Aggregation::PLAIN };
+    let Lifted { table, embeddings, .. } = lifted_with_objects(settings, u64::MAX, &[object_of.clone()]);
+    assert_eq!(table.len(), 7 * 9 + 2);
+    for k in (0..N).filter(|k| !UNSEEN.contains(k)) {
+        let mut expected = unit(&sum_of(k));
+        if object_at(k).is_some() {
+            let mut of_object = vec![0.0; DIM];
+            for other in (0..N).filter(|other| object_at(*other) == object_at(k)) {
+                sum_of(other).iter().zip(&mut of_object).for_each(|(x, sum)| *sum += x);
+            }
+            expected.iter_mut().zip(unit(&of_object)).for_each(|(own, x)| *own += 0.75 * x);
+        }
+        assert_near(&embeddings[k * DIM..][..DIM], &expected, &format!("Gaussian {k}"));
+    }
+    // Without its objects, the same setting changes nothing.
+    assert_eq!(lifted(settings, u64::MAX).embeddings, lifted(Aggregation::PLAIN, u64::MAX).embeddings);
+}
+
+/// The record of a setting that is off does not change what is published.
+#[test]
+fn the_record_names_the_object_weight_only_where_it_is_used() {
+    let record = |settings: &Aggregation| serde_json::to_string(settings).expect("it is JSON");
+    assert!(!record(&Aggregation::REFINED).contains("object"));
+    let mixed = Aggregation { object: 0.5, ..Aggregation::REFINED };
+    assert!(record(&mixed).contains("\"object\":0.5"));
+    for settings in [Aggregation::REFINED, mixed] {
+        let read: Aggregation = serde_json::from_str(&record(&settings)).expect("it reads");
+        assert_eq!(read, settings);
+    }
+}
+
 #[test]
 fn threads_and_budget_do_not_show() {
     let settings = Aggregation { median_steps: 2, ..Aggregation::REFINED };
@@ -403,6 +458,7 @@ fn a_single_view_keeps_its_evidence() {
         Aggregation::REFINED,
         contributions,
         (&scene, &split),
+        &[],
         &photos,
         u64::MAX,
         &cancel,

@@ -12,8 +12,10 @@ use slag_encoder::progress::Progress;
 use slag_encoder::raster::devices::Devices;
 use slag_encoder::raster::gpu::GpuOptions;
 
-/// Rows of a scene: given and automatic masks; the plain average, and the default by Gaussian and by object.
-const ROWS_PER_SCENE: usize = 6;
+/// Rows of a scene with given and automatic masks: the plain average by Gaussian; each other method by Gaussian and by object.
+const fn rows_per_scene(n_methods: usize) -> usize {
+    2 * (2 * n_methods - 1)
+}
 
 /// `eval defaults`.
 #[derive(Debug, Args)]
@@ -21,6 +23,9 @@ pub struct EvalDefaultsArgs {
     /// Scenes, models and output.
     #[command(flatten)]
     on: ComparisonArgs,
+    /// Adds rows of the default with this weight of the object's mean, as `encode --object`.
+    #[arg(long, value_name = "TIMES")]
+    object: Option<f32>,
 }
 
 pub(super) fn run(args: &EvalDefaultsArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
@@ -28,8 +33,10 @@ pub(super) fn run(args: &EvalDefaultsArgs, progress: &dyn Progress, json: bool) 
     let devices = Devices::open(args.on.device, GpuOptions::default())?;
     let mut encode = encode_settings("defaults");
     encode.cells.shards.profiles = vec![Profile::Exact];
-    let settings = DefaultsSettings { scenes: args.on.scene.clone(), out: args.on.out.clone(), encode };
-    progress.begin("defaults", "row", (args.on.scene.len() * ROWS_PER_SCENE) as u64, 0);
+    let n_rows = args.on.scene.len() * rows_per_scene(2 + usize::from(args.object.is_some()));
+    let (scenes, out) = (args.on.scene.clone(), args.on.out.clone());
+    let settings = DefaultsSettings { scenes, out, object: args.object, encode };
+    progress.begin("defaults", "row", n_rows as u64, 0);
     let mut on_row = |row: &DefaultsRow| {
         tracing::info!("{} {:?}: AP {:.4?}", row.scene, row.masks, row.average_precision);
         progress.advance(1);
