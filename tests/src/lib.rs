@@ -121,7 +121,7 @@ impl Service {
         let url = loop {
             let line =
                 lines.next().unwrap_or_else(|| panic!("ended before it listened: {seen}")).expect("text");
-            if let Some(at) = line.find("http://") {
+            if let Some(at) = line.find("http") {
                 break line[at..].split_whitespace().next().expect("a URL").to_owned();
             }
             seen += &line;

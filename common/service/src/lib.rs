@@ -5,7 +5,7 @@
 //! | stage | where | what is decided there |
 //! |---|---|---|
 //! | accept | [`listener`] | number of connections, in all, for each peer, and for health alone |
-//! | bytes | [`connection`] | time without progress, for idle clients, slow requests and slow readers alike |
+//! | bytes | [`connection`], [`tls`] | time without progress, for idle clients, slow requests and slow readers alike |
 //! | head | [`listener`] | length of the request head, and time for it |
 //! | request | [`request`], [`access`] | id, log line, counters, error body; `Host`, `Origin`, bearer token, CORS |
 //! | route | [`routes`] | path and method; type and length of a request body, and time for it |
@@ -26,3 +26,4 @@ pub mod range;
 pub mod request;
 pub mod routes;
 pub mod stop;
+pub mod tls;

@@ -11,6 +11,8 @@ use tokio::net::TcpListener;
 #[cfg(unix)]
 use tokio::net::UnixListener;
 
+use crate::tls::{Tls, TlsError, TlsFiles};
+
 /// What a Unix socket's address begins with.
 const UNIX: &str = "unix:";
 
@@ -29,6 +31,18 @@ impl Listen {
         match self {
             Self::Tcp(address) => address.ip().to_canonical().is_loopback(),
             Self::Unix(_) => true,
+        }
+    }
+
+    /// Reads the certificate of a service that listens here, if it has one.
+    ///
+    /// # Errors
+    /// [`TlsError`].
+    pub fn tls(&self, files: Option<TlsFiles>) -> Result<Option<Tls>, TlsError> {
+        match (self, files) {
+            (_, None) => Ok(None),
+            (Self::Unix(_), Some(_)) => Err(TlsError::UnixSocket),
+            (Self::Tcp(_), Some(files)) => Tls::open(files).map(Some),
         }
     }
 }
@@ -76,6 +90,7 @@ pub struct ListenError {
 #[derive(Debug)]
 pub struct Listener {
     socket: Socket,
+    tls: Option<Tls>,
 }
 
 #[derive(Debug)]
@@ -87,7 +102,7 @@ enum Socket {
 
 impl From<TcpListener> for Listener {
     fn from(socket: TcpListener) -> Self {
-        Self { socket: Socket::Tcp(socket) }
+        Self { socket: Socket::Tcp(socket), tls: None }
     }
 }
 
@@ -107,7 +122,7 @@ pub async fn bind(listen: &Listen) -> Result<Listener, ListenError> {
         Listen::Unix(path) => bind_unix(path).await,
     };
     let socket = bound.map_err(|cause| ListenError { address: listen.clone(), cause })?;
-    Ok(Listener { socket })
+    Ok(Listener { socket, tls: None })
 }
 
 #[cfg(unix)]
@@ -129,13 +144,28 @@ async fn bind_unix(_: &std::path::Path) -> io::Result<Socket> {
 }
 
 impl Listener {
-    /// Returns the address to connect to: `http://IP:PORT` or `unix:PATH`.
+    /// Speaks TLS on the connections.
+    #[must_use]
+    pub fn with_tls(mut self, tls: Option<Tls>) -> Self {
+        self.tls = tls;
+        self
+    }
+
+    /// Returns what makes TLS connections out of the accepted ones.
+    pub(crate) fn tls(&self) -> Option<Tls> {
+        self.tls.clone()
+    }
+
+    /// Returns the address to connect to: `http://IP:PORT`, with TLS `https://IP:PORT`, or `unix:PATH`.
     ///
     /// # Errors
     /// The system's error.
     pub fn url(&self) -> io::Result<String> {
         match &self.socket {
-            Socket::Tcp(socket) => Ok(format!("http://{}", socket.local_addr()?)),
+            Socket::Tcp(socket) => {
+                let scheme = if self.tls.is_some() { "https" } else { "http" };
+                Ok(format!("{scheme}://{}", socket.local_addr()?))
+            }
             #[cfg(unix)]
             Socket::Unix(_, path) => Ok(format!("{UNIX}{}", path.display())),
         }

@@ -17,6 +17,7 @@ use crate::body::TimedBody;
 use crate::connection::Stalling;
 use crate::listen::{Listener, Stream};
 use crate::permits::{Permit, Permits, Reserved};
+use crate::tls::Tls;
 
 /// Pause after a failed accept. Out of file descriptors, an immediate retry would only burn the CPU.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
@@ -34,7 +35,7 @@ pub struct ConnectionLimits {
     pub n_reserved: usize,
     /// Length of a request head; a longer one is answered with 431.
     pub head_bytes: usize,
-    /// Time for a request head, and time that a connection may idle.
+    /// Time for a request head, for the handshake of TLS before it, and that a connection may idle.
     pub head_timeout: Duration,
     /// Time for a request body, from the end of its head; a slower one is answered with 408.
     pub body_timeout: Duration,
@@ -87,6 +88,7 @@ pub async fn serve(
     stop: impl Future<Output = ()>,
 ) -> Result<(), CutOff> {
     let listener = listener.into();
+    let tls = listener.tls();
     let permits = Permits::new(limits.n_connections, limits.n_per_peer, limits.n_reserved);
     let graceful = GracefulShutdown::new();
     let mut stop = std::pin::pin!(stop);
@@ -104,7 +106,7 @@ pub async fn serve(
             }
         };
         let permit = permits.admit(peer);
-        tokio::spawn(converse(router.clone(), stream, permit, limits, graceful.watcher()));
+        tokio::spawn(converse(router.clone(), stream, tls.clone(), permit, limits, graceful.watcher()));
     }
     drop(listener);
     let drained = tokio::time::timeout(limits.drain_timeout, graceful.shutdown()).await;
@@ -115,6 +117,7 @@ pub async fn serve(
 async fn converse(
     router: Router,
     stream: Box<dyn Stream>,
+    tls: Option<Tls>,
     mut permit: Permit,
     limits: ConnectionLimits,
     watcher: Watcher,
@@ -129,12 +132,28 @@ async fn converse(
         }
         router.call(request)
     });
+    let stream = Stalling::new(stream, at_most(limits.stall_timeout));
+    let handshake = async {
+        let stream: Box<dyn Stream> = match tls {
+            Some(tls) => Box::new(tls.acceptor().accept(stream).await?),
+            None => Box::new(stream),
+        };
+        Ok::<_, io::Error>(stream)
+    };
+    let stream = tokio::select! {
+        shaken = tokio::time::timeout(at_most(limits.head_timeout), handshake) => match shaken {
+            Ok(Ok(stream)) => stream,
+            Ok(Err(error)) => return tracing::debug!("a TLS handshake failed: {error}"),
+            Err(_) => return tracing::debug!("a TLS handshake took too long"),
+        },
+        () = permit.ended() => return tracing::debug!("a connection made room for another"),
+    };
     let connection = http1::Builder::new()
         .timer(TokioTimer::new())
         .keep_alive(!is_reserved)
         .header_read_timeout(at_most(limits.head_timeout))
         .max_buf_size(limits.head_bytes)
-        .serve_connection(TokioIo::new(Stalling::new(stream, at_most(limits.stall_timeout))), service);
+        .serve_connection(TokioIo::new(stream), service);
     tokio::select! {
         ended = watcher.watch(connection) => {
             if let Err(error) = ended {

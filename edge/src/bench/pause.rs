@@ -122,6 +122,7 @@ pub fn run(options: &PauseOptions) -> Result<PauseReport, PauseError> {
     };
     let cancel = AtomicBool::new(false);
     let environment = Environment {
+        ca: None,
         now_unix_secs: crate::clock::now_unix_secs(),
         cancel: &cancel,
         progress: &(),

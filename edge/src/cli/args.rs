@@ -50,6 +50,9 @@ pub struct DownloadArgs {
     /// At the first contact, trust whoever answers at the address. Safer: `slag-edge trust add` beforehand.
     #[arg(long)]
     pub trust_first: bool,
+    /// Certificates (PEM) of the authorities that may vouch for an https:// address, in place of the public ones.
+    #[arg(long, value_name = "FILE")]
+    pub ca: Option<PathBuf>,
     /// Most bytes kept on disk for shards [default: twice the bytes of the shards within the radius].
     #[arg(long, value_name = "N")]
     pub max_bytes: Option<u64>,

@@ -56,6 +56,7 @@ pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
         (None, None) => None,
     };
     let settings = args.follow.settings(args.download.radius)?;
+    let ca = args.download.ca.clone();
     let request = FetchRequest { scene: args.scene, ..args.download.request(args.from, at) };
     let cache = args.cache.open()?;
     let cancel = Arc::new(AtomicBool::new(false));
@@ -64,9 +65,9 @@ pub fn run(args: FetchArgs, quiet: bool) -> Result<(), Failure> {
         .map_err(|e| Failure::Failed("signals", e.into()))?;
     let bar = Bar::new(!quiet && !args.json && io::stderr().is_terminal());
     if args.watch {
-        return watch(&cache, &request, settings, &cancel, &bar, args.json);
+        return watch(&cache, &request, ca.as_deref(), settings, &cancel, &bar, args.json);
     }
-    let result = fetch_once(&cache, &request, &cancel, &bar);
+    let result = fetch_once(&cache, &request, ca.as_deref(), &cancel, &bar);
     bar.finish();
     match result {
         Ok(report) => {

@@ -1,6 +1,7 @@
 //! Following a robot, for `fetch --watch` and `serve --follow`.
 
 use std::io;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -52,6 +53,7 @@ impl FollowArgs {
 pub fn watch(
     cache: &EdgeCache,
     request: &FetchRequest,
+    ca: Option<&Path>,
     settings: FollowSettings,
     cancel: &AtomicBool,
     bar: &Bar,
@@ -80,7 +82,7 @@ pub fn watch(
         settings,
         &following,
         FollowEnvironment {
-            fetch: &mut |request| fetch_once(cache, request, cancel, bar),
+            fetch: &mut |request| fetch_once(cache, request, ca, cancel, bar),
             report: &mut |outcome| {
                 bar.finish();
                 let result = match outcome {
@@ -109,6 +111,7 @@ pub fn watch(
 /// panics is reported by the service, and begins again.
 pub fn follow_in_background(
     request: FetchRequest,
+    ca: Option<PathBuf>,
     settings: FollowSettings,
     cache: EdgeCache,
     following: Arc<Following>,
@@ -119,7 +122,7 @@ pub fn follow_in_background(
     std::thread::Builder::new().name("follow".into()).spawn(move || {
         let followed = keep_following(&following, RESTARTS, &stop, || {
             let environment = FollowEnvironment {
-                fetch: &mut |request| fetch_once(&cache, request, &stop, &()),
+                fetch: &mut |request| fetch_once(&cache, request, ca.as_deref(), &stop, &()),
                 report: &mut |outcome| match outcome {
                     Ok(report) => {
                         let (n, generation) = (report.downloaded.n_shards, report.generation);

@@ -1,6 +1,7 @@
 //! Fetching with the real clock and network.
 
 use std::hash::{BuildHasher, Hasher, RandomState};
+use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use slag_edge::fetch::{self, Environment, FetchError, FetchReport, FetchRequest, NetworkLimits, Progress};
@@ -12,19 +13,25 @@ use super::failure::Failure;
 pub fn fetch_once(
     cache: &EdgeCache,
     request: &FetchRequest,
+    ca: Option<&Path>,
     cancel: &AtomicBool,
     progress: &dyn Progress,
 ) -> Result<FetchReport, FetchError> {
-    fetch::fetch(cache, request, &environment(cancel, progress))
+    fetch::fetch(cache, request, &environment(ca, cancel, progress))
 }
 
 /// Returns the real surroundings.
-pub fn environment<'a>(cancel: &'a AtomicBool, progress: &'a dyn Progress) -> Environment<'a> {
+pub fn environment<'a>(
+    ca: Option<&'a Path>,
+    cancel: &'a AtomicBool,
+    progress: &'a dyn Progress,
+) -> Environment<'a> {
     Environment {
         now_unix_secs: slag_edge::now_unix_secs(),
         cancel,
         progress,
         random: &random,
+        ca,
         limits: NetworkLimits::default(),
     }
 }

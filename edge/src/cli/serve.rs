@@ -4,6 +4,7 @@ use std::io::{self, Write};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::time::Duration;
 
 use anyhow::anyhow;
 use clap::Args;
@@ -13,6 +14,7 @@ use slag_edge::store::StoreError;
 use slag_service::access::{Access, AccessSettings};
 use slag_service::listen::{Listen, bind};
 use slag_service::stop::stop_signal;
+use slag_service::tls::TlsFiles;
 
 use super::args::{CacheArgs, DownloadArgs, ModelArgs, ThreadArgs, engine};
 use super::failure::Failure;
@@ -38,6 +40,18 @@ pub struct ServeArgs {
     /// File with the bearer token that POST needs; beyond this machine nothing is taken without one.
     #[arg(long, value_name = "FILE")]
     pub token_file: Option<PathBuf>,
+    /// Speak TLS with this certificate and the chain to its authority (PEM); it is read anew when it changes.
+    #[arg(long, value_name = "FILE", requires = "tls_key")]
+    pub tls_cert: Option<PathBuf>,
+    /// Private key of --tls-cert (PEM).
+    #[arg(long, value_name = "FILE", requires = "tls_cert")]
+    pub tls_key: Option<PathBuf>,
+    /// Most memory that one query may use, bytes; all in progress together may use four times as many.
+    #[arg(long, value_name = "N", default_value_t = 256 << 20, value_parser = clap::value_parser!(u64).range(1 << 20..))]
+    pub max_query_bytes: u64,
+    /// Most time that one query may take, seconds.
+    #[arg(long, value_name = "S", default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=3600))]
+    pub max_query_secs: u64,
     /// Follow the robot: fetch from this store around the positions posted to POST /position.
     #[arg(long, value_name = "URL")]
     pub follow: Option<String>,
@@ -56,6 +70,9 @@ pub struct ServeArgs {
 pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     args.threads.apply()?;
     let access = access(&mut args)?;
+    let files = args.tls_cert.take().zip(args.tls_key.take());
+    let tls = args.listen.tls(files.map(|(cert, key)| TlsFiles { cert, key }));
+    let tls = tls.map_err(|e| Failure::Usage(e.into()))?;
     let cache = std::mem::replace(&mut args.cache, CacheArgs { cache: None }).open()?;
     let engine = engine(cache.clone(), &args.models)?;
     match engine.reload() {
@@ -70,7 +87,8 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     {
         tracing::warn!("{error}");
     }
-    let settings = Settings { access, ..Settings::default() };
+    let query_timeout = Duration::from_secs(args.max_query_secs);
+    let settings = Settings { access, ..Settings::with_budget(args.max_query_bytes, query_timeout) };
     let (drain, blocking_threads) =
         (settings.connections.drain_timeout, settings.max_queries + SPARE_BLOCKING_THREADS);
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -81,6 +99,7 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
     let served = runtime.block_on(async {
         let stop = stop_signal()?;
         let listener = bind(&args.listen).await.map_err(|e| Failure::Failed("listen", e.into()))?;
+        let listener = listener.with_tls(tls);
         // For scripts that let the system choose a port.
         writeln!(io::stdout(), "listening on {}", listener.url()?)?;
         let following = args.follow.is_some().then(Arc::<Following>::default);
@@ -88,8 +107,9 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
         let follower = match following {
             Some(following) => {
                 let settings = args.following.settings(args.download.radius)?;
+                let ca = args.download.ca.clone();
                 let request = args.download.request(args.follow, None);
-                Some(follow_in_background(request, settings, cache, following, Arc::clone(&app))?)
+                Some(follow_in_background(request, ca, settings, cache, following, Arc::clone(&app))?)
             }
             None => None,
         };

@@ -46,6 +46,9 @@ pub struct AddArgs {
     /// Trust whoever answers at the address now: everything later depends on it.
     #[arg(long)]
     pub trust_first: bool,
+    /// Certificates (PEM) of the authorities that may vouch for an https:// address, in place of the public ones.
+    #[arg(long, value_name = "FILE")]
+    pub ca: Option<PathBuf>,
     /// Trust this root in place of another one.
     #[arg(long)]
     pub replace: bool,
@@ -81,7 +84,8 @@ fn add(args: AddArgs) -> Result<(), Failure> {
     };
     let cache = args.cache.open()?;
     let cancel = AtomicBool::new(false);
-    let added = add_root(&cache, &root, args.replace, &environment(&cancel, &())).map_err(failure)?;
+    let added = add_root(&cache, &root, args.replace, &environment(args.ca.as_deref(), &cancel, &()))
+        .map_err(failure)?;
     if args.json {
         return print_json(&added);
     }

@@ -9,6 +9,7 @@ use slag_common::Hash32;
 use slag_common::retry::{Backoff, Retries};
 use slag_common::tuf::TufError;
 use ureq::http::{Response, StatusCode, Uri, header};
+use ureq::tls::{PemItem, RootCerts, TlsConfig, parse_pem};
 
 use super::environment::Environment;
 use super::error::{DownloadFailure, FetchError};
@@ -17,6 +18,8 @@ use crate::store::files::Files;
 /// Downloads of a shard with wrong content before it is given up: one for a partial file that a power cut
 /// damaged, two for the network.
 const MAX_WRONG_HASHES: u32 = 3;
+/// Most bytes read of a file of authorities; that of all public ones has a quarter.
+const MAX_CA_BYTES: u64 = 1 << 20;
 /// Longest sleep between looks at the cancel flag.
 const NAP: Duration = Duration::from_millis(50);
 
@@ -50,7 +53,15 @@ impl From<std::io::Error> for Stop {
 
 impl From<ureq::Error> for Stop {
     fn from(e: ureq::Error) -> Self {
-        Self::Failed(DownloadFailure::Transport(Box::new(e)))
+        let failure = match &e {
+            ureq::Error::Rustls(tls) => DownloadFailure::Tls(tls.to_string()),
+            // What rustls finds wrong while it reads and writes.
+            ureq::Error::Io(io) if io.kind() == std::io::ErrorKind::InvalidData => {
+                DownloadFailure::Tls(io.to_string())
+            }
+            _ => DownloadFailure::Transport(Box::new(e)),
+        };
+        Self::Failed(failure)
     }
 }
 
@@ -81,6 +92,7 @@ impl<'a> Client<'a> {
         }
         let limits = &environment.limits;
         let agent = ureq::Agent::config_builder()
+            .tls_config(tls(environment.ca)?)
             .http_status_as_error(false)
             // Neither redirects nor a proxy from the environment: requests go to the given address only.
             .max_redirects(0)
@@ -315,6 +327,25 @@ impl<'a> Client<'a> {
             true => Err(FetchError::Cancelled),
             false => Ok(()),
         }
+    }
+}
+
+/// Returns whose certificates count.
+fn tls(ca: Option<&Path>) -> Result<TlsConfig, FetchError> {
+    let Some(path) = ca else { return Ok(TlsConfig::default()) };
+    let unfit = |what: String| FetchError::Ca { path: path.to_owned(), what };
+    let mut pem = Vec::new();
+    let read = std::fs::File::open(path).and_then(|file| file.take(MAX_CA_BYTES).read_to_end(&mut pem));
+    read.map_err(|e| unfit(e.to_string()))?;
+    let mut authorities = Vec::new();
+    for item in parse_pem(&pem) {
+        if let PemItem::Certificate(certificate) = item.map_err(|e| unfit(e.to_string()))? {
+            authorities.push(certificate);
+        }
+    }
+    match authorities.is_empty() {
+        true => Err(unfit("no certificate is there".to_owned())),
+        false => Ok(TlsConfig::builder().root_certs(RootCerts::from(authorities)).build()),
     }
 }
 

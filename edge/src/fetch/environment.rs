@@ -1,5 +1,6 @@
 //! The surroundings of a fetch: clock, cancel flag, random numbers, progress and network limits.
 
+use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use super::error::DownloadFailure;
@@ -27,6 +28,8 @@ pub struct Environment<'a> {
     pub progress: &'a dyn Progress,
     /// Returns numbers within 0..1, to spread retries.
     pub random: &'a (dyn Fn() -> f64 + Sync),
+    /// Certificates (PEM) of the authorities that may vouch for `https://` addresses; absent: those that browsers trust.
+    pub ca: Option<&'a Path>,
     /// Network timeouts and retry limits.
     pub limits: NetworkLimits,
 }

@@ -31,6 +31,14 @@ pub enum FetchError {
         /// What is wrong.
         what: String,
     },
+    /// The file of certificate authorities is of no use.
+    #[error("{}: {what}, expected certificates of authorities in PEM; check --ca", path.display())]
+    Ca {
+        /// The file.
+        path: PathBuf,
+        /// The fault.
+        what: String,
+    },
     /// The records cannot be used.
     #[error(transparent)]
     Records(#[from] RecordsError),
@@ -158,6 +166,9 @@ pub enum DownloadFailure {
     /// The connection failed.
     #[error("{0}")]
     Transport(#[from] Box<ureq::Error>),
+    /// The server's certificate is refused, or TLS failed otherwise.
+    #[error("TLS failed: {0}; give the authority that vouches for the server with --ca FILE")]
+    Tls(String),
     /// The body broke off.
     #[error("the body ended at byte {found_bytes} of {expected_bytes}")]
     Cut {
@@ -202,7 +213,8 @@ impl DownloadFailure {
     /// Returns whether another attempt may help.
     pub(super) fn is_passing(&self) -> bool {
         match self {
-            Self::Redirect { .. } => false,
+            // A certificate does not become another one by asking again.
+            Self::Redirect { .. } | Self::Tls(_) => false,
             Self::Status { status, .. } => *status >= 500 || matches!(status, 408 | 416 | 429),
             Self::Transport(e) => !matches!(**e, ureq::Error::BadUri(_) | ureq::Error::Http(_)),
             Self::Cut { .. } | Self::Length { .. } | Self::Hash { .. } => true,

@@ -5,6 +5,9 @@ use std::time::Duration;
 use slag_service::access::Access;
 use slag_service::listener::ConnectionLimits;
 
+/// Time for a request and for sending its answer, besides that for the query.
+const STALL_BEYOND_QUERY: Duration = Duration::from_secs(50);
+
 /// Bounds of the service.
 #[derive(Clone, Debug)]
 pub struct Settings {
@@ -26,12 +29,14 @@ pub struct Settings {
     pub stream_timeout: Duration,
 }
 
-impl Default for Settings {
-    fn default() -> Self {
+impl Settings {
+    /// Returns bounds for a machine with a few cores, with a budget of memory and time for each query. All queries
+    /// together may use four times the memory.
+    pub fn with_budget(query_bytes: u64, query_timeout: Duration) -> Self {
         let connections = ConnectionLimits {
             n_connections: 512,
             n_per_peer: 384,
-            stall_timeout: Duration::from_secs(60),
+            stall_timeout: query_timeout + STALL_BEYOND_QUERY,
             drain_timeout: Duration::from_secs(5),
             ..ConnectionLimits::default()
         };
@@ -40,10 +45,16 @@ impl Default for Settings {
             access: Access::default(),
             max_queries: 32,
             max_listeners: 32,
-            query_timeout: Duration::from_secs(10),
-            query_bytes: 256 << 20,
-            all_queries_bytes: 1 << 30,
+            query_timeout,
+            query_bytes,
+            all_queries_bytes: query_bytes.saturating_mul(4),
             stream_timeout: Duration::from_secs(60),
         }
+    }
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self::with_budget(256 << 20, Duration::from_secs(10))
     }
 }

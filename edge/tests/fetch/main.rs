@@ -77,7 +77,7 @@ impl Robot {
 
     fn environment<'a>(&self, progress: &'a dyn Progress, cancel: &'a AtomicBool) -> Environment<'a> {
         let (now_unix_secs, limits) = (self.now_unix_secs, self.limits.clone());
-        Environment { now_unix_secs, cancel, progress, random: &|| 0.5, limits }
+        Environment { ca: None, now_unix_secs, cancel, progress, random: &|| 0.5, limits }
     }
 
     fn add_root(&self, root: &FirstRoot, replace: bool) -> Result<AddedRoot, FetchError> {

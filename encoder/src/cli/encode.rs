@@ -1,6 +1,6 @@
 //! `encode`: a scene into a store.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow};
 use clap::{Args, FromArgMatches};
@@ -8,7 +8,7 @@ use slag_common::ByteSize;
 use slag_common::shard::Profile;
 
 use super::common::{
-    InputArgs, ModelArgs, available_threads, cancel_flag, lasting_name, now_unix_secs, open_models,
+    InputArgs, ModelArgs, OutputArgs, available_threads, cancel_flag, lasting_name, now_unix_secs, open_models,
     parse_error, print, profile_parser,
 };
 use super::exit::Exit;
@@ -22,6 +22,7 @@ use crate::codebook::CodebookSettings;
 use crate::codebook::basis::MAX_COMPONENTS;
 use crate::embed::Background;
 use crate::encode::coverage::CoverageReport;
+use crate::encode::front::Expectation;
 use crate::encode::{
     self, CellReport, CellSettings, EncodeSettings, EncodeSummary, Engines, InputSettings, Masks,
     OutputSettings, Preset, RasterWidth, Regions, RunSettings, StageReport, ViewSettings, ViewsLimit,
@@ -33,6 +34,7 @@ use crate::raster::devices::{DeviceChoice, Devices};
 use crate::raster::gpu::GpuOptions;
 use crate::shard::ShardSettings;
 use crate::shard::positions::PositionError;
+use crate::store::CommandRecord;
 
 /// `encode`.
 #[derive(Clone, Debug, Args)]
@@ -208,6 +210,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             scene_name: args.name.clone().or(folder_name).unwrap_or_else(|| "scene".into()),
             created_unix_secs,
             models: args.models.models.as_deref().map(lasting_name),
+            command: None,
         },
         run: RunSettings {
             threads: args.threads.map_or_else(available_threads, |n| n as usize),
@@ -244,12 +247,45 @@ fn shard_settings(args: &EncodeArgs, preset: CodebookSettings, metric: bool) -> 
     }
 }
 
-pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    let mut settings = settings(args)?;
-    let expected = args.target.choose(&settings.inputs)?;
-    if let Some(expected) = &expected {
-        settings = self::settings(&with_setting(args, &expected.setting.flags)?)?;
+/// Returns the settings of the flags, with those that a target chooses, and what it expects.
+fn settings_and_target(args: &EncodeArgs) -> Result<(EncodeSettings, Option<Expectation>)> {
+    let settings = settings(args)?;
+    match args.target.choose(&settings.inputs)? {
+        Some(expected) => {
+            Ok((self::settings(&with_setting(args, &expected.setting.flags)?)?, Some(expected)))
+        }
+        None => Ok((settings, None)),
     }
+}
+
+/// Returns this command, for the store's catalogue; `None` where the folder is gone.
+fn this_command() -> Option<CommandRecord> {
+    let words = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
+    Some(CommandRecord { folder: std::env::current_dir().ok()?, words })
+}
+
+/// Makes the objects of a store's generation again, by the command that made it, from the views that are kept.
+pub(super) fn remake(command: &CommandRecord, store: &Path, progress: &dyn Progress) -> Result<()> {
+    let words = command.words.iter().skip_while(|word| *word != "encode").skip(1);
+    let parser = OutputArgs::augment_args(EncodeArgs::augment_args(clap::Command::new("encode")));
+    let mut args = parser
+        .no_binary_name(true)
+        .try_get_matches_from(words)
+        .and_then(|matches| EncodeArgs::from_arg_matches(&matches))
+        .with_context(|| format!("the command that made it is not understood: {:?}", command.words))?;
+    args.store = std::path::absolute(store)?;
+    let folder = &command.folder;
+    std::env::set_current_dir(folder).with_context(|| format!("the encode ran in {}", folder.display()))?;
+    let (settings, _) = settings_and_target(&args)?;
+    let (models, session) = open_models(&args.models)?;
+    let devices = Devices::open(args.device, GpuOptions::default())?;
+    let engines = Engines::new(&models, &session, &devices);
+    Ok(encode::remake(&settings, &engines, progress, cancel_flag()?.as_ref())?)
+}
+
+pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    let (mut settings, expected) = settings_and_target(args)?;
+    settings.output.command = this_command();
     let (models, session) = open_models(&args.models)?;
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());
     let devices = Devices::open(args.device, GpuOptions::default())?;

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::Result;
 use clap::Args;
 use slag_service::listen::Listen;
+use slag_service::tls::TlsFiles;
 
 use super::common::{runtime, stopped};
 use super::exit::Exit;
@@ -26,6 +27,12 @@ pub struct ServeArgs {
     /// Let pages of this origin read answers (CORS), such as https://map.example. May be repeated.
     #[arg(long, value_name = "ORIGIN")]
     pub cors: Vec<String>,
+    /// Speak TLS with this certificate and the chain to its authority (PEM); it is read anew when it changes.
+    #[arg(long, value_name = "FILE", requires = "tls_key")]
+    pub tls_cert: Option<PathBuf>,
+    /// Private key of --tls-cert (PEM).
+    #[arg(long, value_name = "FILE", requires = "tls_cert")]
+    pub tls_key: Option<PathBuf>,
 }
 
 pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
@@ -33,11 +40,13 @@ pub(super) fn run(args: &ServeArgs) -> Result<Exit> {
     let settings = AccessSettings { hosts: args.host.clone(), origins: args.cors.clone(), token_file: None };
     let access = Access::new(&args.listen, settings)?;
     let access = if is_any_host { access.with_any_host() } else { access };
+    let files = args.tls_cert.clone().zip(args.tls_key.clone());
+    let tls = args.listen.tls(files.map(|(cert, key)| TlsFiles { cert, key }))?;
     runtime()?.block_on(async {
         // On stdout: with port 0 this is where a script learns the port.
         let listening = |url| println!("listening on {url}");
         let limits = serve::Limits::default();
-        serve::serve(&args.store, args.listen.clone(), limits, access, listening, stopped()).await
+        serve::serve(&args.store, args.listen.clone(), limits, access, tls, listening, stopped()).await
     })?;
     Ok(Exit::Done)
 }

@@ -1,9 +1,9 @@
 //! `store`: what a store holds, whether it is whole, and what can go.
 
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use anyhow::Result;
+use anyhow::{Result, anyhow};
 use clap::{Args, Subcommand};
 use serde::Serialize;
 use slag_common::Hash32;
@@ -11,18 +11,25 @@ use slag_common::byte_size::ByteSize;
 use slag_common::tuf::format_utc;
 
 use super::common::print;
+use super::encode;
 use super::exit::Exit;
+use crate::encode::{JobStatus, job_status};
 use crate::progress::Progress;
 use crate::store::metadata::{Metadata, TIMESTAMP_DAYS, clock_unix_secs};
-use crate::store::{Fault, Published, Store, StoreReader, Verified};
+use crate::store::{BadObject, Fault, GenerationRecord, Published, Store, StoreReader, Verified};
 
 /// `store`.
 #[derive(Debug, Subcommand)]
 pub enum StoreCommand {
     /// Lists the generations of a store with their cells and bytes.
     Ls(StoreArgs),
-    /// Reads every byte that a store publishes, and names what is damaged or missing. `encode` writes it anew.
+    /// Reads every byte that a store publishes, and names what is damaged or missing. `repair` and `encode` write it anew.
     Verify(StoreArgs),
+    /// Makes what is damaged or missing again: the catalogue and metadata from the manifest, objects from the views that
+    /// the encode kept (`--keep-views`), by the command that the catalogue has of it.
+    ///
+    /// Publishes nothing: robots fetch the same files as before.
+    Repair(StoreArgs),
     /// Removes what neither the current generation nor the one before it needs.
     Gc(StoreArgs),
     /// Signs a new timestamp, so that clients can tell a store without news from one that hides them.
@@ -51,7 +58,20 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
         StoreCommand::Ls(at) => {
             let reader = StoreReader::open(&at.store)?;
             let of = |published: &Published| Generation::of(published);
-            let listed = Listed { current: of(reader.current()), previous: reader.previous().map(of) };
+            let mut listed = Listed {
+                current: of(reader.current()),
+                previous: reader.previous().map(of),
+                history: Vec::new(),
+                job: None,
+            };
+            match Store::create_or_open(&at.store) {
+                Ok(store) => {
+                    listed.history = store.generations()?;
+                    listed.job = job_status(&store)?;
+                }
+                // An encode may run; manifests are there in any case.
+                Err(error) => tracing::warn!("without the catalogue: {error}"),
+            }
             print(json, &listed, &listed)?;
             Ok(Exit::Done)
         }
@@ -64,6 +84,7 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
             print(json, &verified, Lines(&verified))?;
             Ok(if verified.bad.is_empty() { Exit::Done } else { Exit::Failed })
         }
+        StoreCommand::Repair(at) => repair(&at.store, progress, json),
         StoreCommand::Gc(at) => {
             // A mistyped path must not create a store.
             StoreReader::open(&at.store)?;
@@ -84,10 +105,78 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
     }
 }
 
+/// Verifies, makes again what is bad, and verifies that.
+fn repair(path: &Path, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    let reader = StoreReader::open(path)?;
+    // Mends metadata and catalogue on its way.
+    let store = Store::create_or_open(path)?;
+    let verify = || {
+        let listing = reader.listing();
+        progress.begin("verify", "object", listing.n_objects() as u64, 0);
+        let verified = listing.verify(|| progress.advance(1));
+        progress.end();
+        verified
+    };
+    let before = verify();
+    let generation = reader.manifest().generation;
+    let record = store.generations()?.into_iter().find(|record| record.generation == generation);
+    drop(store);
+    let mut failure = None;
+    if !before.bad.is_empty() {
+        let command = record.and_then(|record| record.command);
+        let remade = match &command {
+            Some(command) => encode::remake(command, path, progress),
+            None => Err(anyhow!("the command that made generation {generation} is not known")),
+        };
+        failure = remade.err().map(|error| format!("{error:#}"));
+    }
+    let after = if before.bad.is_empty() { before.clone() } else { verify() };
+    let is_mended = |bad: &&BadObject| after.bad.iter().all(|still| still.hash != bad.hash);
+    let repaired = Repaired {
+        n_objects: after.n_objects,
+        mended: before.bad.iter().filter(is_mended).cloned().collect(),
+        bad: after.bad,
+        failure,
+    };
+    print(json, &repaired, &repaired)?;
+    Ok(if repaired.bad.is_empty() { Exit::Done } else { Exit::Failed })
+}
+
+/// The result of a repair.
+#[derive(Serialize)]
+struct Repaired {
+    n_objects: usize,
+    /// Objects that were bad and are whole.
+    mended: Vec<BadObject>,
+    /// Objects that still are bad.
+    bad: Vec<BadObject>,
+    /// Why nothing could be made again.
+    failure: Option<String>,
+}
+
+impl fmt::Display for Repaired {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for object in &self.mended {
+            writeln!(f, "{}: made again ({})", object.path.display(), object.holds.join("; "))?;
+        }
+        for object in &self.bad {
+            writeln!(f, "{}: still bad ({})", object.path.display(), object.holds.join("; "))?;
+        }
+        if let Some(failure) = &self.failure {
+            writeln!(f, "nothing was made again: {failure}")?;
+        }
+        writeln!(f, "{} objects, {} made again, {} bad", self.n_objects, self.mended.len(), self.bad.len())
+    }
+}
+
 #[derive(Serialize)]
 struct Listed {
     current: Generation,
     previous: Option<Generation>,
+    /// Every generation ever published, from the catalogue.
+    history: Vec<GenerationRecord>,
+    /// The encode that the store keeps views of.
+    job: Option<JobStatus>,
 }
 
 #[derive(Serialize)]
@@ -133,6 +222,16 @@ impl fmt::Display for Listed {
                 "generation {generation} of {scene}: {n_gaussians} Gaussians in {n_cells} cells by {encoder}, {n_objects} objects, {bytes} of shards"
             )?;
         }
+        if let (Some(first), n @ 3..) = (self.history.first(), self.history.len()) {
+            writeln!(f, "{n} generations since generation {}", first.generation)?;
+        }
+        if let Some(JobStatus { n_views, is_published, step }) = &self.job {
+            let step = step.as_deref().unwrap_or("begin");
+            match is_published {
+                true => writeln!(f, "contributions of {n_views} views are kept")?,
+                false => writeln!(f, "unfinished encode: {n_views} views done, at step {step}")?,
+            }
+        }
         Ok(())
     }
 }
@@ -151,6 +250,10 @@ impl fmt::Display for Lines<'_> {
             writeln!(f, "{}: {fault} ({})", object.path.display(), object.holds.join("; "))?;
         }
         write!(f, "{n_objects} objects, {} read, {} bad", ByteSize(*len_bytes), bad.len())?;
-        writeln!(f, "{}", if bad.is_empty() { "" } else { "; encode again: what is bad is written anew" })
+        writeln!(
+            f,
+            "{}",
+            if bad.is_empty() { "" } else { "; `store repair` or another encode writes what is bad anew" }
+        )
     }
 }

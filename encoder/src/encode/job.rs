@@ -15,6 +15,8 @@ const TREE: &str = "job";
 const IDENTITY_KEY: &[u8] = b"identity";
 /// Present while every finished view of the job is published.
 const PUBLISHED_KEY: &[u8] = b"published";
+/// The step that the job is at.
+const STEP_KEY: &[u8] = b"step";
 /// Followed by the view's identity.
 const VIEW_PREFIX: &str = "view/";
 
@@ -25,6 +27,35 @@ pub(super) struct ViewRecord {
     pub(super) raster_width_px: u32,
     /// Seconds in its stages before this record.
     pub(super) secs: f32,
+}
+
+/// What a store knows of the encode that it keeps views of.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct JobStatus {
+    /// Views whose contributions are on disk.
+    pub n_views: usize,
+    /// Whether all of them are published; otherwise the encode is unfinished.
+    pub is_published: bool,
+    /// The step that it is at, or ended at.
+    pub step: Option<String>,
+}
+
+/// Returns the state of the encode that a store keeps views of, if there is one.
+///
+/// # Errors
+/// [`EncodeError::Records`].
+pub fn job_status(store: &Store) -> Result<Option<JobStatus>, EncodeError> {
+    let records = |source| records_error(store, source);
+    let tree = store.db().open_tree(TREE).map_err(records)?;
+    if !tree.contains_key(IDENTITY_KEY).map_err(records)? {
+        return Ok(None);
+    }
+    let step = tree.get(STEP_KEY).map_err(records)?;
+    Ok(Some(JobStatus {
+        n_views: tree.scan_prefix(VIEW_PREFIX).count(),
+        is_published: tree.contains_key(PUBLISHED_KEY).map_err(records)?,
+        step: step.map(|name| String::from_utf8_lossy(&name).into_owned()),
+    }))
 }
 
 /// The unfinished encode of a store.
@@ -51,6 +82,7 @@ impl<'a> Job<'a> {
         let folder = store.job_dir()?;
         let records = store.db().open_tree(TREE).map_err(|source| records_error(store, source))?;
         let job = Self { store, records, folder, id_of_view };
+        job.adopt()?;
         let found = job.records.get(IDENTITY_KEY).map_err(|source| records_error(store, source))?;
         let same = found.as_deref() == Some(&of_scene.0);
         let published =
@@ -68,6 +100,7 @@ impl<'a> Job<'a> {
             job.flush()?;
         }
         fs_err::create_dir_all(job.views_folder())?;
+        slag_common::durable::write(&job.identity_path(), of_scene.to_string().as_bytes())?;
         Ok(job)
     }
 
@@ -125,6 +158,20 @@ impl<'a> Job<'a> {
         self.flush()
     }
 
+    /// Records the step that begins.
+    pub(super) fn begin(&self, step: &str) -> Result<(), EncodeError> {
+        self.records.insert(STEP_KEY, step).map_err(|source| records_error(self.store, source))?;
+        self.flush()
+    }
+
+    /// Returns whether the store keeps views of an encode of this scene.
+    pub(super) fn is_kept(store: &Store, of_scene: Hash32) -> Result<bool, EncodeError> {
+        let records = |source| records_error(store, source);
+        let tree = store.db().open_tree(TREE).map_err(records)?;
+        let found = tree.get(IDENTITY_KEY).map_err(records)?;
+        Ok(found.as_deref() == Some(&of_scene.0) && tree.scan_prefix(VIEW_PREFIX).next().is_some())
+    }
+
     /// Forgets the job: it was published.
     pub(super) fn finish(self) -> Result<(), EncodeError> {
         self.clear()
@@ -149,6 +196,38 @@ impl<'a> Job<'a> {
             }
         }
         Ok(())
+    }
+
+    /// Takes up the files of a job whose records are lost: a catalogue that was made anew has none. A file of contributions
+    /// is renamed into place when it and its outlines are whole.
+    fn adopt(&self) -> Result<(), EncodeError> {
+        let records = |source| records_error(self.store, source);
+        if self.records.contains_key(IDENTITY_KEY).map_err(records)? {
+            return Ok(());
+        }
+        let written = fs_err::read_to_string(self.identity_path()).ok();
+        let Some(of_scene) = written.and_then(|text| text.parse::<Hash32>().ok()) else { return Ok(()) };
+        if !self.views_folder().is_dir() {
+            return Ok(());
+        }
+        let mut batch = sled::Batch::default();
+        batch.insert(IDENTITY_KEY, &of_scene.0);
+        for entry in fs_err::read_dir(self.views_folder())? {
+            let path = entry?.path();
+            let id =
+                path.file_stem().and_then(|stem| stem.to_str()).and_then(|stem| stem.parse::<Hash32>().ok());
+            let is_contributions = path.extension().is_some_and(|extension| extension == "contributions");
+            if let Some(id) = id.filter(|_| is_contributions) {
+                let record = serde_json::to_vec(&ViewRecord::default()).map_err(std::io::Error::from)?;
+                batch.insert(record_key(id), record);
+            }
+        }
+        self.records.apply_batch(batch).map_err(records)?;
+        self.flush()
+    }
+
+    fn identity_path(&self) -> PathBuf {
+        self.folder.join("identity")
     }
 
     fn views_folder(&self) -> PathBuf {
@@ -222,6 +301,27 @@ mod tests {
         kept.keep_published().expect("publishes");
         assert!(of_a.exists() && !of_b.exists());
         assert_eq!(names(&open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("goes on")), ["a"]);
+    }
+
+    /// Records that are lost with the catalogue are made again from the files: nothing is done twice, and another scene does
+    /// not drop them.
+    #[test]
+    fn a_job_outlives_its_records() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let store = Store::create_or_open(dir.path()).expect("opens");
+        let job = open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("begins");
+        job.begin("views").expect("records");
+        keep(&job, "a");
+        let status = job_status(&store).expect("reads").expect("a job");
+        assert_eq!((status.n_views, status.is_published, status.step.as_deref()), (1, false, Some("views")));
+        drop(job);
+        drop(store);
+        fs_err::remove_dir_all(dir.path().join("db")).expect("there");
+        let store = Store::create_or_open(dir.path()).expect("opens");
+        assert_eq!(job_status(&store).expect("reads"), None);
+        let done = |job: &Job<'_>| job.done_views().expect("reads").into_keys().collect::<Vec<_>>();
+        assert_eq!(done(&open_with(&store, 1, &[("a", 1), ("b", 2)]).expect("goes on")), ["a"]);
+        assert!(matches!(open_with(&store, 2, &[("a", 1)]), Err(EncodeError::OtherJob { n_done: 1, .. })));
     }
 
     /// A published job may be dropped, but not the views that a later run adds to it before it is published again.

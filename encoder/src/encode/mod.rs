@@ -40,6 +40,7 @@ pub use crate::memory::{MemoryError, Reservation};
 pub use engines::{Engines, Perturbation};
 pub use error::EncodeError;
 pub use inputs::count_inputs;
+pub use job::{JobStatus, job_status};
 pub use preset::{Choices, Preset};
 pub use report::{CellReport, EncodeSummary, PhaseReport, SkippedView, StageReport, ViewsReport};
 pub use settings::{
@@ -65,9 +66,33 @@ pub fn encode(
     context.begin_phase(Phase::Plan);
     let plan = plan::plan(settings, engines, &store, &inputs, &context)?;
     context.begin_phase(Phase::Views);
+    plan.job.begin("views")?;
     let views = views::run_views(&plan, &context)?;
     context.begin_phase(Phase::Merge);
+    plan.job.begin("cells")?;
     let built = cells::build_cells(&plan, &views, &context)?;
     context.begin_phase(Phase::Publish);
+    plan.job.begin("publish")?;
     publish::publish(plan, views, built, &context)
+}
+
+/// Makes the objects of a generation again from the views that an encode kept, and puts those that are missing or damaged
+/// back into the store. Publishes nothing: what is made again has the hashes that the manifest lists.
+///
+/// # Errors
+/// [`EncodeError`]; [`EncodeError::NotKept`] where no views of this scene and these settings are kept.
+pub fn remake(
+    settings: &EncodeSettings,
+    engines: &Engines<'_>,
+    progress: &dyn Progress,
+    cancel: &AtomicBool,
+) -> Result<(), EncodeError> {
+    settings.validate()?;
+    let context = RunContext::new(settings.run.threads, progress, cancel)?;
+    let store = Store::create_or_open(&settings.output.store)?;
+    let inputs = inputs::Inputs::read(settings, &context)?;
+    let plan = plan::plan_of_kept(settings, engines, &store, &inputs, &context)?;
+    let views = views::kept_views(&plan)?;
+    cells::build_cells(&plan, &views, &context)?;
+    Ok(())
 }

@@ -52,6 +52,31 @@ pub(super) fn plan<'a>(
     inputs: &'a Inputs,
     context: &RunContext<'_>,
 ) -> Result<Plan<'a>, EncodeError> {
+    make_plan(settings, engines, store, inputs, context, false)
+}
+
+/// As [`plan`], for views that are kept: refuses where there are none, and drops nothing.
+///
+/// # Errors
+/// [`EncodeError`].
+pub(super) fn plan_of_kept<'a>(
+    settings: &'a EncodeSettings,
+    engines: &'a Engines<'a>,
+    store: &'a Store,
+    inputs: &'a Inputs,
+    context: &RunContext<'_>,
+) -> Result<Plan<'a>, EncodeError> {
+    make_plan(settings, engines, store, inputs, context, true)
+}
+
+fn make_plan<'a>(
+    settings: &'a EncodeSettings,
+    engines: &'a Engines<'a>,
+    store: &'a Store,
+    inputs: &'a Inputs,
+    context: &RunContext<'_>,
+    only_kept: bool,
+) -> Result<Plan<'a>, EncodeError> {
     let memory = memory_plan(settings, inputs, engines.models.dim());
     memory.rest(0)?;
     let regions = settings.view.regions;
@@ -66,6 +91,9 @@ pub(super) fn plan<'a>(
         context.install(|| identity::identities(settings, engines, segmenter.as_ref(), inputs))
     })?;
     let id_of_view = inputs.views.iter().map(|view| view.name.clone()).zip(ids.of_view).collect();
+    if only_kept && !Job::is_kept(store, ids.of_scene)? {
+        return Err(EncodeError::NotKept { path: store.dir().to_owned() });
+    }
     let job = Job::open(store, ids.of_scene, id_of_view, settings.run.restart)?;
     let scene = context.time("raster", || context.install(|| engines.rasterizer.load(&inputs.scene)))?;
     let start = Instant::now();

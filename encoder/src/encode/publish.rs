@@ -27,7 +27,7 @@ pub(super) fn publish(
 ) -> Result<EncodeSummary, EncodeError> {
     let generation = plan.store.next_generation()?;
     let manifest = manifest(&plan, &built, generation);
-    plan.store.publish(&manifest, &built.extras)?;
+    plan.store.publish_by(&manifest, &built.extras, plan.settings.output.command.clone())?;
     let models = plan.settings.output.models.clone();
     plan.store.remember_models(&ModelsRecord { encoder: manifest.encoder.id, models })?;
     let mut summary = summary(&plan, &views, built, &manifest);

@@ -18,6 +18,7 @@ use crate::raster::WeightKind;
 use crate::segment::SamSettings;
 use crate::shard::ShardSettings;
 use crate::shard::positions::PositionError;
+use crate::store::CommandRecord;
 
 /// Number of scales at which the built-in segmenter looks by default. A fourth scale gives a third more masks and no
 /// better answers (generated scenes of seeds 601 to 605, and the labelled house).
@@ -183,6 +184,8 @@ pub struct OutputSettings {
     pub created_unix_secs: u64,
     /// Name or folder of the models, as later queries on this machine open them; `None` for the embedded ones.
     pub models: Option<PathBuf>,
+    /// The command that asked for it, which `store repair` runs again.
+    pub command: Option<CommandRecord>,
 }
 
 /// How a run goes.
@@ -275,7 +278,13 @@ impl EncodeSettings {
                 },
                 objects: true,
             },
-            output: OutputSettings { store, scene_name: "scene".into(), created_unix_secs: 0, models: None },
+            output: OutputSettings {
+                store,
+                scene_name: "scene".into(),
+                created_unix_secs: 0,
+                models: None,
+                command: None,
+            },
             run: RunSettings {
                 threads: std::thread::available_parallelism().map_or(1, usize::from),
                 memory_bytes: 2 << 30,

@@ -9,7 +9,7 @@
 //! | `models.json` | name or folder of the models of the last encode, for queries on this machine |
 //! | `keys/` | signing keys (mode 0600), hex: see [`ceremony`] |
 //! | `metadata/` | metadata of The Update Framework: see [`metadata`] |
-//! | `db/` | sled: scene, generation, cells, state of jobs and pushes; opened by writers alone |
+//! | `db/` | sled: see [`catalogue`]; a damaged one is renamed to `db.damaged` |
 //! | `job/` | working files of an unfinished encode |
 //! | `tmp/` | files being written |
 //!
@@ -18,9 +18,10 @@
 //! `extras/NEW`, then `manifest.previous` becomes the current one, then `manifest` is replaced. That
 //! last rename is the commit for readers of this machine: since extras are named by the hash of the manifest
 //! they belong to, it switches both at once. Clients of the metadata follow `metadata/timestamp.json`, which
-//! comes after it. The records in sled only repeat the manifest, for ordered look-ups. What a crash left out
+//! comes after it. The catalogue in sled repeats the manifests, and knows the generations before them. What a crash left out
 //! of metadata and records is made good at the next [`Store::create_or_open`].
 
+mod catalogue;
 pub mod ceremony;
 #[cfg(test)]
 mod ceremony_tests;
@@ -38,6 +39,8 @@ pub(crate) mod tests;
 mod verify;
 mod writer;
 
+pub(crate) use catalogue::Catalogue;
+pub use catalogue::{CommandRecord, GenerationRecord};
 pub use error::StoreError;
 pub use models::ModelsRecord;
 pub(crate) use reader::Stamp;

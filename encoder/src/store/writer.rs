@@ -5,11 +5,12 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use slag_common::Hash32;
 use slag_common::manifest::{CellRecord, Manifest};
 
+use super::catalogue::{Catalogue, CommandRecord, GenerationRecord};
 use super::error::StoreError;
 use super::files::{self, Access, HashingWriter};
 use super::manifest_file;
@@ -17,18 +18,8 @@ use super::metadata::Metadata;
 use super::models::ModelsRecord;
 use super::reader::{self, Extras, Published, StoreReader};
 
-/// sled keeps whole pages in memory; the records are small.
-const RECORD_CACHE_BYTES: u64 = 16 << 20;
 /// Time to wait for the lock: sled releases the lock of a writer that has just ended on a thread of its own.
 const LOCK_PATIENCE: Duration = Duration::from_secs(2);
-const LOCK_PAUSE: Duration = Duration::from_millis(20);
-/// Tree of the records that repeat the manifest.
-const PUBLISHED_TREE: &str = "published";
-const SCENE_KEY: &[u8] = b"scene";
-const GENERATION_KEY: &[u8] = b"generation";
-const MANIFEST_KEY: &[u8] = b"manifest";
-/// Followed by the cell id, big-endian, so that cells come in order.
-const CELL_PREFIX: &[u8] = b"cell/";
 
 /// The result of [`Store::prune`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
@@ -43,8 +34,7 @@ pub struct Pruned {
 #[derive(Debug)]
 pub struct Store {
     pub(super) dir: PathBuf,
-    db: sled::Db,
-    published: sled::Tree,
+    catalogue: Catalogue,
     n_parts: AtomicU64,
     /// Objects whose content this writer has hashed.
     read: Mutex<BTreeSet<Hash32>>,
@@ -65,30 +55,13 @@ impl Store {
             files::ensure_folder_unsynced(&dir.join("objects").join(hex::encode([first])))?;
         }
         files::sync_folder(&dir.join("objects"))?;
-        let db_path = dir.join("db");
-        let config = sled::Config::new().path(&db_path).cache_capacity(RECORD_CACHE_BYTES);
-        let start = Instant::now();
-        let db = loop {
-            match config.open() {
-                Ok(db) => break db,
-                // sled has no error kind of its own for this.
-                Err(sled::Error::Io(e)) if e.to_string().contains("could not acquire lock") => {
-                    if start.elapsed() > LOCK_PATIENCE {
-                        return Err(StoreError::Locked { store: dir.to_owned() });
-                    }
-                    std::thread::sleep(LOCK_PAUSE);
-                }
-                Err(cause) => return Err(StoreError::Records { path: db_path, cause }),
-            }
-        };
+        let catalogue = Catalogue::open(dir, LOCK_PATIENCE)?;
         // The lock is held, so the files in tmp/ belong to a writer that died.
         for entry in fs_err::read_dir(dir.join("tmp"))? {
             fs_err::remove_file(entry?.path())?;
         }
-        let published =
-            db.open_tree(PUBLISHED_TREE).map_err(|cause| StoreError::Records { path: db_path, cause })?;
         let n_parts = AtomicU64::new(0);
-        let store = Self { dir: dir.to_owned(), db, published, n_parts, read: Mutex::default() };
+        let store = Self { dir: dir.to_owned(), catalogue, n_parts, read: Mutex::default() };
         store.repair_records()?;
         Ok(store)
     }
@@ -110,7 +83,7 @@ impl Store {
 
     /// Returns the record database, for the state of jobs and pushes. Records are durable once flushed.
     pub fn db(&self) -> &sled::Db {
-        &self.db
+        self.catalogue.db()
     }
 
     /// Returns a reader of what is published.
@@ -175,7 +148,7 @@ impl Store {
     /// # Errors
     /// [`StoreError::Records`].
     pub fn next_generation(&self) -> Result<u64, StoreError> {
-        Ok(self.generation()?.map_or(1, |current| current.saturating_add(1)))
+        Ok(self.catalogue.last_generation()?.map_or(1, |current| current.saturating_add(1)))
     }
 
     /// Signs a manifest and makes it, with the objects it lists, the current one; returns its hash.
@@ -188,6 +161,19 @@ impl Store {
     /// [`StoreError::MissingObject`] if an object listed is not there in full, [`StoreError::ObjectHash`] if it is damaged,
     /// [`StoreError::Generation`] unless the generation is above the current one.
     pub fn publish(&self, manifest: &Manifest, extras: &Extras) -> Result<Hash32, StoreError> {
+        self.publish_by(manifest, extras, None)
+    }
+
+    /// As [`Store::publish`]; the catalogue remembers the command that made the generation.
+    ///
+    /// # Errors
+    /// As [`Store::publish`].
+    pub fn publish_by(
+        &self,
+        manifest: &Manifest,
+        extras: &Extras,
+        command: Option<CommandRecord>,
+    ) -> Result<Hash32, StoreError> {
         let shards = manifest.cells.iter().flat_map(|cell| cell.shards.values());
         let shards = shards.map(|shard| (shard.hash, Some(shard.len_bytes)));
         for (hash, len_bytes) in shards.chain(extras.values().map(|hash| (*hash, None))) {
@@ -200,7 +186,7 @@ impl Store {
         let hash = Hash32::of(&bytes);
         let current = manifest_file::read_bytes(&path)?;
         let again = current.as_deref() == Some(&bytes);
-        match self.generation()? {
+        match self.catalogue.last_generation()? {
             Some(generation) if manifest.generation <= generation && !again => {
                 return Err(StoreError::Generation { found: manifest.generation, current: generation });
             }
@@ -215,7 +201,7 @@ impl Store {
             self.replace(&path, &bytes)?;
         }
         Metadata::open(&self.dir)?.publish(&bytes, manifest.created_unix_secs)?;
-        self.write_records(manifest, hash)?;
+        self.catalogue.record(manifest, hash, command)?;
         Ok(hash)
     }
 
@@ -255,63 +241,46 @@ impl Store {
                 }
             }
         }
+        self.catalogue.keep_cells_of(&extras.into_iter().collect::<Vec<_>>())?;
         Ok(pruned)
     }
 
-    /// Returns the published cells in order of their ids, from the records.
+    /// Returns the published cells in order of their ids, from the catalogue; none before the first publication.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub fn cells(&self) -> Result<Vec<CellRecord>, StoreError> {
+        match manifest_file::read_bytes(&self.dir.join(manifest_file::MANIFEST))? {
+            Some(manifest) => self.catalogue.cells(Hash32::of(&manifest)),
+            None => Ok(Vec::new()),
+        }
+    }
+
+    /// Returns all generations ever published, the oldest first, from the catalogue.
     ///
     /// # Errors
     /// [`StoreError::Records`].
-    pub fn cells(&self) -> Result<Vec<CellRecord>, StoreError> {
-        let decode = |bytes: sled::IVec| {
-            serde_json::from_slice(&bytes).map_err(|e| sled::Error::ReportableBug(e.to_string()))
-        };
-        let cells: Result<Vec<CellRecord>, sled::Error> =
-            self.published.scan_prefix(CELL_PREFIX).values().map(|value| decode(value?)).collect();
-        cells.map_err(|cause| self.records_error(cause))
+    pub fn generations(&self) -> Result<Vec<GenerationRecord>, StoreError> {
+        self.catalogue.generations()
     }
 
-    /// Returns the highest generation published, from the records.
-    fn generation(&self) -> Result<Option<u64>, StoreError> {
-        let value = self.published.get(GENERATION_KEY).map_err(|cause| self.records_error(cause))?;
-        Ok(value.and_then(|bytes| Some(u64::from_be_bytes(bytes.as_ref().try_into().ok()?))))
-    }
-
-    /// Writes the records of a manifest in one atomic batch, unless they are current.
-    fn write_records(&self, manifest: &Manifest, hash: Hash32) -> Result<(), StoreError> {
-        let write = || -> sled::Result<()> {
-            if self.published.get(MANIFEST_KEY)?.is_some_and(|found| *found == hash.0[..]) {
-                return Ok(());
-            }
-            let mut batch = sled::Batch::default();
-            let mut gone: BTreeSet<sled::IVec> =
-                self.published.scan_prefix(CELL_PREFIX).keys().collect::<Result<_, _>>()?;
-            for cell in &manifest.cells {
-                let key = [CELL_PREFIX, &cell.cell_id.to_be_bytes()].concat();
-                gone.remove(key.as_slice());
-                batch.insert(key, serde_json::to_vec(cell).expect("a cell record is JSON"));
-            }
-            gone.into_iter().for_each(|key| batch.remove(key));
-            batch.insert(SCENE_KEY, manifest.scene.as_bytes());
-            batch.insert(GENERATION_KEY, &manifest.generation.to_be_bytes());
-            batch.insert(MANIFEST_KEY, &hash.0);
-            self.published.apply_batch(batch)?;
-            self.published.flush().map(drop)
-        };
-        write().map_err(|cause| self.records_error(cause))
-    }
-
-    /// Brings the records up to the manifest, which a crash may have left ahead of them.
+    /// Brings metadata and catalogue up to the manifests, which a crash may have left ahead of them.
     fn repair_records(&self) -> Result<(), StoreError> {
         // Without the extras: a damaged record of them is replaced by the next publication.
-        match reader::read_manifest(&self.dir.join(manifest_file::MANIFEST)) {
-            Ok((manifest, bytes)) => {
-                Metadata::open(&self.dir)?.publish(&bytes, manifest.created_unix_secs)?;
-                self.write_records(&manifest, Hash32::of(&bytes))
-            }
-            Err(StoreError::NotPublished { .. }) => Ok(()),
+        let read = |name: &str| match reader::read_manifest(&self.dir.join(name)) {
+            Ok(read) => Ok(Some(read)),
+            Err(StoreError::NotPublished { .. }) => Ok(None),
             Err(e) => Err(e),
+        };
+        // It only serves fetches under way.
+        if let Ok(Some((manifest, bytes))) = read(manifest_file::MANIFEST_PREVIOUS) {
+            self.catalogue.record(&manifest, Hash32::of(&bytes), None)?;
         }
+        if let Some((manifest, bytes)) = read(manifest_file::MANIFEST)? {
+            Metadata::open(&self.dir)?.publish(&bytes, manifest.created_unix_secs)?;
+            self.catalogue.record(&manifest, Hash32::of(&bytes), None)?;
+        }
+        Ok(())
     }
 
     fn check_object(&self, hash: Hash32, expected_bytes: Option<u64>) -> Result<(), StoreError> {
@@ -349,10 +318,6 @@ impl Store {
     pub(super) fn part_path(&self) -> PathBuf {
         let part = self.n_parts.fetch_add(1, Ordering::Relaxed);
         self.dir.join("tmp").join(format!("{part}.part"))
-    }
-
-    fn records_error(&self, cause: sled::Error) -> StoreError {
-        StoreError::Records { path: self.dir.join("db"), cause }
     }
 }
 

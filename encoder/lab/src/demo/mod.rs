@@ -184,7 +184,7 @@ pub async fn run(options: &DemoOptions, progress: &dyn Progress, cancel: &Atomic
             let _ = stopped.await;
         };
         let address = std::net::SocketAddr::from(([127, 0, 0, 1], 0));
-        serve::serve(&store, address, Limits::default(), Access::default(), on_listening, stopped).await
+        serve::serve(&store, address, Limits::default(), Access::default(), None, on_listening, stopped).await
     });
     let Ok(url) = listening.await else {
         serving.await.context("serve")?.context("serve")?;

@@ -15,6 +15,7 @@ use std::path::Path;
 
 use slag_service::listen::{Listen, ListenError, bind};
 use slag_service::listener;
+use slag_service::tls::Tls;
 
 use crate::store::StoreError;
 pub use limits::Limits;
@@ -34,7 +35,7 @@ pub enum ServeError {
 
 /// Serves a store until `shutdown` completes, then lets answers in progress finish within the drain deadline.
 ///
-/// `on_listening` gets the address to connect to, `http://IP:PORT` or `unix:PATH`: the system chooses the port if
+/// `on_listening` gets the address to connect to, `http://IP:PORT` (`https` with TLS) or `unix:PATH`: the system chooses the port if
 /// `listen` has port 0.
 ///
 /// # Errors
@@ -44,11 +45,12 @@ pub async fn serve(
     listen: impl Into<Listen>,
     limits: Limits,
     access: Access,
+    tls: Option<Tls>,
     on_listening: impl FnOnce(String),
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), ServeError> {
     let (router, listen) = (router(dir, limits, access)?, listen.into());
-    let listener = bind(&listen).await?;
+    let listener = bind(&listen).await?.with_tls(tls);
     on_listening(listener.url().map_err(|cause| ListenError { address: listen, cause })?);
     if let Err(cut_off) = listener::serve(router, listener, limits.connections, shutdown).await {
         // A robot continues its download at the next start.

@@ -17,7 +17,7 @@ use slag_service::problem::Problem;
 use tokio::sync::Semaphore;
 
 use super::limits::Limits;
-use crate::store::{Stamp, StoreError, StoreReader};
+use crate::store::{Catalogue, Published, Stamp, StoreError, StoreReader};
 
 /// Pause before a manifest that did not open is read again. The fault may lie in another file or pass by
 /// itself (no file descriptors left), so the manifest's own change is not the only sign.
@@ -46,7 +46,7 @@ impl Snapshot {
         Ok(Self {
             targets: both().filter_map(|published| target(&published.bytes)).collect(),
             manifest: reader.current().bytes.clone().into(),
-            index: CellIndex::new(&reader.manifest().cells),
+            index: index_of(dir, reader.current()),
             objects: both().flat_map(|published| published.shard_lens()).collect(),
             reader,
         })
@@ -54,6 +54,19 @@ impl Snapshot {
 
     pub(super) fn world(&self) -> &Manifest {
         self.reader.manifest()
+    }
+}
+
+/// Makes the index of a generation's cells, from the catalogue where no writer holds it.
+fn index_of(dir: &Path, published: &Published) -> CellIndex {
+    let cells = &published.manifest.cells;
+    match Catalogue::peek(dir, published.hash, Duration::ZERO) {
+        Some(known) if known == *cells => CellIndex::new(&known),
+        Some(_) => {
+            tracing::warn!("the catalogue of {} differs from the manifest, which counts", dir.display());
+            CellIndex::new(cells)
+        }
+        None => CellIndex::new(cells),
     }
 }
 

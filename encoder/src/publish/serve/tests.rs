@@ -419,7 +419,7 @@ async fn start(dir: &Path, limits: Limits) -> Running {
             let _ = stopped.await;
         };
         let told = |url: String| told.send(url).expect("awaited");
-        serve(&dir, any_port, limits, Access::default(), told, shutdown).await
+        serve(&dir, any_port, limits, Access::default(), None, told, shutdown).await
     });
     let url = listening.await.expect("listens");
     let address = url.strip_prefix("http://").and_then(|address| address.parse().ok()).expect("an address");
@@ -459,7 +459,8 @@ async fn nothing_published_is_an_error_at_the_start() {
     let dir = tempfile::tempdir().expect("temporary folder");
     let any_port = SocketAddr::from(([127, 0, 0, 1], 0));
     let limits = Limits::default();
-    let ended = serve(dir.path(), any_port, limits, Access::default(), |_| (), std::future::pending()).await;
+    let ended =
+        serve(dir.path(), any_port, limits, Access::default(), None, |_| (), std::future::pending()).await;
     assert!(matches!(ended, Err(ServeError::Store(StoreError::NotPublished { .. }))));
 }
 

@@ -1,0 +1,172 @@
+//! TLS: a certificate and its key from PEM files, read anew when they change.
+//!
+//! Whoever renews a certificate replaces two files, one after the other. A pair that does not fit together is left aside
+//! with a warning, and the one before it stays in use.
+
+use std::fmt;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::SystemTime;
+
+use rustls::crypto::{CryptoProvider, ring};
+use rustls::pki_types::pem::{self, PemObject};
+use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use rustls::server::{ClientHello, ResolvesServerCert};
+use rustls::sign::CertifiedKey;
+use rustls::{ConfigBuilder, ServerConfig, WantsVerifier};
+use tokio_rustls::TlsAcceptor;
+
+/// The certificate's files.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TlsFiles {
+    /// Certificate and the chain that leads to its authority, PEM.
+    pub cert: PathBuf,
+    /// The certificate's private key, PEM.
+    pub key: PathBuf,
+}
+
+/// The file that is of no use.
+#[derive(Debug, thiserror::Error)]
+pub enum TlsError {
+    /// It cannot be read, or is not PEM of what is expected.
+    #[error("{}: {cause}, expected {expected} in PEM", path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// What it should hold.
+        expected: &'static str,
+        /// The fault.
+        cause: String,
+    },
+    /// A Unix socket has no network between its ends.
+    #[error("TLS is for IP:PORT, not for a Unix socket; leave --tls-cert and --tls-key out")]
+    UnixSocket,
+    /// Certificate and key do not fit together.
+    #[error("{} and {}: {cause}, expected a certificate and its own key", cert.display(), key.display())]
+    Pair {
+        /// The certificate's file.
+        cert: PathBuf,
+        /// The key's file.
+        key: PathBuf,
+        /// The fault.
+        cause: rustls::Error,
+    },
+}
+
+/// The versions of both files, read without their content.
+type Stamps = [Option<(SystemTime, u64)>; 2];
+
+struct State {
+    stamps: Stamps,
+    key: Arc<CertifiedKey>,
+}
+
+/// The certificate in use.
+struct Certificate {
+    files: TlsFiles,
+    provider: Arc<CryptoProvider>,
+    state: Mutex<State>,
+}
+
+/// Makes TLS connections out of accepted ones.
+#[derive(Clone)]
+pub struct Tls(TlsAcceptor);
+
+impl fmt::Debug for Tls {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Tls")
+    }
+}
+
+impl Tls {
+    /// Reads a certificate and its key.
+    ///
+    /// # Errors
+    /// [`TlsError`].
+    pub fn open(files: TlsFiles) -> Result<Self, TlsError> {
+        let provider = Arc::new(ring::default_provider());
+        let stamps = stamps_of(&files);
+        let state = Mutex::new(State { stamps, key: Arc::new(read(&files, &provider)?) });
+        let certificate = Arc::new(Certificate { files, provider: Arc::clone(&provider), state });
+        let config = versions(provider).with_no_client_auth().with_cert_resolver(certificate);
+        Ok(Self(TlsAcceptor::from(Arc::new(config))))
+    }
+
+    pub(crate) fn acceptor(&self) -> &TlsAcceptor {
+        &self.0
+    }
+}
+
+fn versions(provider: Arc<CryptoProvider>) -> ConfigBuilder<ServerConfig, WantsVerifier> {
+    let versions = ServerConfig::builder_with_provider(provider).with_safe_default_protocol_versions();
+    versions.expect("ring has the cipher suites of TLS 1.3")
+}
+
+impl fmt::Debug for Certificate {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Certificate").field("files", &self.files).finish_non_exhaustive()
+    }
+}
+
+impl ResolvesServerCert for Certificate {
+    /// Returns the certificate for a connection: two `stat` calls, and a few kilobytes read where a file changed.
+    fn resolve(&self, _: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let stamps = stamps_of(&self.files);
+        if stamps != state.stamps {
+            // Also after a failure: a pair is read once, and again when one of its files changes.
+            state.stamps = stamps;
+            match read(&self.files, &self.provider) {
+                Ok(key) => {
+                    state.key = Arc::new(key);
+                    tracing::info!("{} was read anew", self.files.cert.display());
+                }
+                Err(error) => tracing::warn!("{error}; the certificate before it stays in use"),
+            }
+        }
+        Some(Arc::clone(&state.key))
+    }
+}
+
+fn stamps_of(files: &TlsFiles) -> Stamps {
+    [&files.cert, &files.key].map(|path| {
+        let metadata = std::fs::metadata(path).ok()?;
+        Some((metadata.modified().ok()?, metadata.len()))
+    })
+}
+
+fn read(files: &TlsFiles, provider: &CryptoProvider) -> Result<CertifiedKey, TlsError> {
+    let chain = read_pem(&files.cert, "a certificate", |bytes| {
+        let chain = CertificateDer::pem_slice_iter(bytes).collect::<Result<Vec<_>, _>>()?;
+        if chain.is_empty() { Err(pem::Error::NoItemsFound) } else { Ok(chain) }
+    })?;
+    let key = read_pem(&files.key, "a private key", PrivateKeyDer::from_pem_slice)?;
+    let pair = |cause| TlsError::Pair { cert: files.cert.clone(), key: files.key.clone(), cause };
+    CertifiedKey::from_der(chain, key, provider).map_err(pair)
+}
+
+fn read_pem<T>(
+    path: &Path,
+    expected: &'static str,
+    parse: impl FnOnce(&[u8]) -> Result<T, pem::Error>,
+) -> Result<T, TlsError> {
+    let file = |cause: String| TlsError::File { path: path.to_owned(), expected, cause };
+    let bytes = read_short(path).map_err(|e| file(e.to_string()))?;
+    parse(&bytes).map_err(|e| match e {
+        pem::Error::NoItemsFound => file("none is there".to_owned()),
+        e => file(e.to_string()),
+    })
+}
+
+/// Reads a file of at most a megabyte, ten times the longest chain in use.
+fn read_short(path: &Path) -> io::Result<Vec<u8>> {
+    use io::Read;
+
+    let mut bytes = Vec::new();
+    std::fs::File::open(path)?.take(1 << 20).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+#[cfg(test)]
+mod tests;
