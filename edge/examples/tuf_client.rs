@@ -50,7 +50,7 @@ fn main() -> anyhow::Result<()> {
     }
 }
 
-/// Updates what is kept, does `work` with it, and keeps what was accepted, also after an error.
+/// Loads the kept metadata, runs `work` on it, and saves the accepted metadata, also after an error.
 fn update(
     dir: &Path,
     url: &str,

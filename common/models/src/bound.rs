@@ -1,5 +1,5 @@
-//! Runs a model whose tensors are bound to memory: what the next model takes stays on the GPU, and the rest comes into
-//! page-locked memory, which a GPU copies to at the full speed of its link.
+//! Runs a model with its tensors bound to memory: inputs of the next model stay on the GPU, and other outputs go to
+//! page-locked memory, to which a GPU copies at the full speed of its link.
 
 use ort::logging::LogLevel;
 use ort::session::RunOptions;

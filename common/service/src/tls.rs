@@ -29,7 +29,7 @@ pub struct TlsFiles {
 /// The file that is of no use.
 #[derive(Debug, thiserror::Error)]
 pub enum TlsError {
-    /// It cannot be read, or is not PEM of what is expected.
+    /// The file cannot be read, or does not hold the PEM that is expected.
     #[error("{}: {cause}, expected {expected} in PEM", path.display())]
     File {
         /// The file.
