@@ -192,7 +192,8 @@ fn answer(shared: &Shared, mut stream: TcpStream) -> std::io::Result<()> {
             416
         }
         (_, Some(start)) => {
-            let start = start + if let Fault::ShiftedRange(by) = fault { by } else { 0 };
+            let by = if let Fault::ShiftedRange(by) = fault { by } else { 0 };
+            let start = (start + by).min(body.len() - 1);
             head += &format!("Content-Range: bytes {start}-{}/{}\r\n", body.len() - 1, body.len());
             body.drain(..start);
             206
