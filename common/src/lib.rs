@@ -17,6 +17,7 @@ pub mod manifest;
 pub mod npy;
 pub mod npz;
 pub mod objects;
+pub mod occupancy;
 pub mod poses;
 mod quantise;
 pub mod retry;

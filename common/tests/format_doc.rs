@@ -3,6 +3,7 @@
 use std::mem::offset_of;
 
 use slag_common::objects::{self, ObjectRecord, ObjectsHeader};
+use slag_common::occupancy::{self, OccupancyHeader};
 use slag_common::shard::{self, ShardHeader, section};
 use slag_common::{container, manifest};
 
@@ -69,6 +70,14 @@ fn objects_match_the_structs() {
     field!(ObjectRecord, photo_box_px, 16, "u32 x 4");
     field!(ObjectRecord, photo_start, 4, "u32");
     field!(ObjectRecord, photo_bytes, 4, "u32");
+    field!(OccupancyHeader, voxel, 8, "f64");
+    field!(OccupancyHeader, first_block, 12, "i32 x 3");
+    field!(OccupancyHeader, n_blocks, 12, "u32 x 3");
+    field!(OccupancyHeader, n_runs, 4, "u32");
+    field!(OccupancyHeader, n_mixed, 4, "u32");
+    field!(OccupancyHeader, min_opacity, 4, "f32");
+    field!(OccupancyHeader, min_views, 4, "u32");
+    assert_eq!(size_of::<OccupancyHeader>(), 48, "a field is missing");
     assert_eq!([size_of::<ObjectsHeader>(), size_of::<ObjectRecord>()], [28, 112], "a field is missing");
 }
 
@@ -106,6 +115,9 @@ fn sections_and_versions_match_the_code() {
         (objects::section::RUN_ENDS, "run_ends"),
         (objects::section::RUN_OBJECTS, "run_objects"),
         (objects::section::PHOTOS, "photos"),
+        (occupancy::section::HEADER, "occupancy_header"),
+        (occupancy::section::RUNS, "block_runs"),
+        (occupancy::section::MASKS, "block_masks"),
     ];
     for (id, name) in sections {
         assert!(has(&[&id.to_string(), name]), "section {id} {name}");

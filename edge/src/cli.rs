@@ -6,6 +6,7 @@ mod config;
 mod failure;
 mod fetch;
 mod follow;
+mod goal;
 mod models;
 mod network;
 mod output;
@@ -26,6 +27,7 @@ use bench::BenchCommand;
 use config::ConfigError;
 use failure::{Exit, Failure};
 use fetch::FetchArgs;
+use goal::GoalArgs;
 use models::ModelsArgs;
 use query::QueryArgs;
 use serve::ServeArgs;
@@ -57,6 +59,8 @@ enum Command {
     Serve(ServeArgs),
     /// Answer one question from the shards on board.
     Query(QueryArgs),
+    /// Find places to stand near a thing: reached, clear, and in sight of it.
+    Goal(GoalArgs),
     /// Show what is on board.
     Status(StatusArgs),
     /// Whom this robot believes.
@@ -101,6 +105,7 @@ impl Cli {
             Command::Fetch(args) => (args.json, fetch::run(args, self.quiet)),
             Command::Serve(args) => (false, serve::run(args)),
             Command::Query(args) => (args.json, query::run(args)),
+            Command::Goal(args) => (args.json, goal::run(args)),
             Command::Status(args) => (args.json, status::run(args)),
             Command::Trust(command) => (command.is_json(), trust::run(command)),
             Command::Models(args) => (args.json, models::run(args)),
@@ -188,6 +193,14 @@ mod tests {
         let bounds = Aabb { min: DVec3::new(-1.0, -5.0, 3.0), max: DVec3::new(4.0, 2.0, 6.0) };
         assert_eq!((query.bounds, query.precision), (Some(bounds), Precision::Centroids));
         assert_eq!(query.negatives, Negatives::Phrases(vec!["wall".into(), "floor".into()]));
+        let Command::Goal(goal) =
+            parse("slag-edge goal chair --near 1,-2,0 --radius-m 0.25 --reach-m 1 --map m.pgm")
+                .expect("parses")
+                .command
+        else {
+            panic!("goal")
+        };
+        assert_eq!((goal.radius_m, goal.reach_m, goal.limit), (0.25, 1.0, 3));
         assert!(parse("slag-edge status --json --cache d").is_ok());
         assert!(parse("slag-edge models pull clip --accept-licence apple-amlr --json").is_ok());
         assert!(
@@ -209,6 +222,8 @@ mod tests {
             "slag-edge query chair --limit -1",
             "slag-edge query chair --box 1,2,3",
             "slag-edge query chair --negatives ,",
+            "slag-edge goal",
+            "slag-edge goal chair --near 1,2",
             "slag-edge fetch --at 1,2,3 --at-geo 1,2",
             "slag-edge fetch --at-geo 91,0",
             "slag-edge trust add http://a",

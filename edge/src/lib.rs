@@ -3,6 +3,7 @@
 pub mod bench;
 mod clock;
 pub mod fetch;
+pub mod goal;
 pub mod http;
 pub mod query;
 pub mod score;

@@ -13,8 +13,10 @@ use slag_common::container::AlignedBytes;
 use slag_common::hash::Hash32;
 use slag_common::manifest::{self, Calibration, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, quantise_vectors};
+use slag_common::occupancy::BuiltOccupancy;
 use slag_common::shard::{
-    ExactColumns, IndexColumn, Positions, Profile, ScoreErrors, ShardHeader, ShardLayout, ShardView, quantise,
+    Additions, ExactColumns, IndexColumn, Positions, Profile, ScoreErrors, ShardHeader, ShardLayout,
+    ShardView, quantise,
 };
 use slag_models::{InferenceError, TextEncoder};
 
@@ -64,6 +66,16 @@ pub struct TestObject {
 impl BuiltShard {
     /// Rewrites the shard with objects: boxes around the origin, photos named by their ids.
     pub fn with_objects(&self, objects: &[TestObject], calibration: Calibration) -> Self {
+        self.with_objects_and_places(objects, calibration, None)
+    }
+
+    /// Rewrites the shard with objects, as [`Self::with_objects`] does, and with free and occupied places.
+    pub fn with_objects_and_places(
+        &self,
+        objects: &[TestObject],
+        calibration: Calibration,
+        places: Option<&BuiltOccupancy>,
+    ) -> Self {
         let shard = self.view();
         let m = shard.header.n_components as usize;
         let mut object_of = vec![NO_OBJECT; shard.header.n_gaussians as usize];
@@ -106,7 +118,10 @@ impl BuiltShard {
             photos: photos.as_bytes(),
         };
         let mut bytes = Vec::new();
-        shard.write_with(&mut bytes, Some(&objects)).expect("writes to memory");
+        let occupancy = places.map(BuiltOccupancy::view);
+        let additions =
+            Additions { objects: Some(&objects), occupancy: occupancy.as_ref(), appearance: None };
+        shard.write_with(&mut bytes, additions).expect("writes to memory");
         let bytes = AlignedBytes::copy_of(&bytes);
         let layout = ShardLayout::check(&bytes).expect("a valid shard");
         Self { bytes, layout, embeddings: self.embeddings.clone() }

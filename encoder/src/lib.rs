@@ -39,6 +39,7 @@ pub mod lift;
 pub mod masks;
 pub mod memory;
 pub mod objects;
+pub mod occupancy;
 pub mod progress;
 pub mod publish;
 pub mod query;

@@ -12,7 +12,7 @@ use slag_encoder::cells;
 use slag_encoder::codebook::{CodebookSettings, ScoreMetric, ScoreMetricContext, TextBank};
 use slag_encoder::lift::{CellField, Contribution, ContributionIndex, RegionTable, ViewContributions};
 use slag_encoder::shard::positions::PositionError;
-use slag_encoder::shard::{self, CellEmbeddings, ShardSettings};
+use slag_encoder::shard::{self, CellEmbeddings, CellExtras, ShardSettings};
 use slag_math::matrix::Rows;
 use slag_math::random::Random;
 
@@ -247,7 +247,16 @@ fn exact_shard(vectors: &[Vec<f32>], means_in_world: Vec<DVec3>) -> AlignedBytes
         appearance: false,
     };
     let score_context = ScoreMetricContext { metric, bank, spread };
-    let built = shard::build(&scene, 0, cell, &embeddings, Hash32([0; 32]), &score_context, &settings, None);
+    let built = shard::build(
+        &scene,
+        0,
+        cell,
+        &embeddings,
+        Hash32([0; 32]),
+        &score_context,
+        &settings,
+        &CellExtras::default(),
+    );
     AlignedBytes::copy_of(&built.shards[0].bytes)
 }
 

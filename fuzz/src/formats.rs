@@ -93,6 +93,20 @@ pub fn shard(data: &[u8]) -> bool {
         let columns = [appearance.colours.len(), appearance.sizes.len(), appearance.rotations.len()];
         assert_eq!(columns, [view.header.n_gaussians as usize; 3]);
     }
+    if let Some(occupancy) = layout.occupancy(&bytes) {
+        let n_blocks: u32 = occupancy.header.n_blocks.iter().product();
+        let mut end = 0;
+        for run in occupancy.runs() {
+            assert!(
+                end <= run.blocks.start && run.blocks.start < run.blocks.end && run.blocks.end <= n_blocks
+            );
+            end = run.blocks.end;
+            for block in [run.blocks.start, run.blocks.end - 1] {
+                let [occupied, free] = run.masks_of(block);
+                assert_eq!(occupied & free, 0, "{:?}", occupancy.block_at(block));
+            }
+        }
+    }
     if let Some(objects) = layout.objects(&bytes) {
         let n: u32 = objects.runs().map(|(run, object)| object.map_or(0, |_| run.len() as u32)).sum();
         assert_eq!(n, objects.records.iter().map(|record| record.n_gaussians_here).sum::<u32>());

@@ -10,6 +10,7 @@ use slag_common::appearance::Appearance;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader};
+use slag_common::occupancy::{Block, BuiltOccupancy};
 use slag_common::shard::{
     Additions, Basis, ExactColumns, Fine, IndexColumn, Positions, Profile, Residuals, ScoreErrors,
     ShardHeader, ShardView,
@@ -173,8 +174,14 @@ fn shard(is_exact: bool) -> Vec<u8> {
         photos: b"a.jpg",
     };
     let appearance = Appearance { colours: &[[1; 4]; 6], sizes: &[[2; 3]; 6], rotations: &[[3; 3]; 6] };
-    let additions =
-        Additions { objects: is_exact.then_some(&objects), appearance: is_exact.then_some(appearance) };
+    let block = |z, occupied, free| Block { at: [0, 0, z], occupied, free };
+    let places = BuiltOccupancy::pack(0.05, 0.1, 2, &[block(0, 1, 2), block(1, 0, !0), block(5, !0, 0)]);
+    let occupancy = places.view();
+    let additions = Additions {
+        objects: is_exact.then_some(&objects),
+        appearance: is_exact.then_some(appearance),
+        occupancy: is_exact.then_some(&occupancy),
+    };
     view.write_with(&mut out, additions).expect("writes to memory");
     out
 }

@@ -17,7 +17,7 @@ impl Site {
         let dir = tempfile::tempdir().expect("a temporary folder");
         let (room, store) = (dir.path().join("room"), dir.path().join("store"));
         run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "12"]));
-        run(encode_room(&room, &store).args(["--models", "colours"]));
+        run(encode_room(&room, &store).args(["--models", "colours", "--occupancy", "0.1"]));
         let store = Service::start(&mut encoder(&["serve", "--store", text(&store)]));
         let site = Self { store, dir };
         let at = ["fetch", "--trust-first", "--from", &site.store.url, "--at", "3.5,2.7,0"];

@@ -103,6 +103,34 @@ class Reply:
 
 
 @dataclass(frozen=True)
+class Goal:
+    """A pose to stand in: the ground below the robot's middle, x forward, y left, z up (REP-103). Lengths in metres."""
+
+    position_in_world: Sequence[float]
+    yaw_rad: float
+    orientation_xyzw: Sequence[float]
+    sensor_in_world: Sequence[float]
+    clearance_m: float
+    visible_share: float
+    path_m: float
+    distance_m: float
+    cost_m: float
+    geographic: Optional[Mapping[str, float]] = None
+
+
+@dataclass(frozen=True)
+class Goals:
+    """Places to stand near a thing, best first, or why there is none."""
+
+    generation: int
+    frame: str
+    goals: Sequence[Goal]
+    none: Optional[Nothing]
+    more: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    """The whole reply as the robot sent it."""
+
+
+@dataclass(frozen=True)
 class Event:
     """Something that happened: `generation` or `following`."""
 
@@ -201,6 +229,22 @@ class Robot:
         """Returns the area on board, its age, and what is missing."""
         place: dict[str, Any] = self._send("/v1/map")
         return place
+
+    def goal(self, text: Optional[str] = None, near: Optional[Sequence[float]] = None, **parameters: Any) -> Goals:
+        """Returns places to stand near a thing: by text, or by id="o...", with radius_m, reach_m, sensor_height_m ..."""
+        if text is not None:
+            parameters["text"] = text
+        if near is not None:
+            parameters["near"] = ",".join(str(of_axis) for of_axis in near)
+        reply = self._send("/v1/goal?" + urllib.parse.urlencode(parameters))
+        goals = tuple(Goal(**_known(Goal, goal)) for goal in reply["goals"])
+        none = None if reply["none"] is None else Nothing(**_known(Nothing, reply["none"]))
+        return Goals(reply["generation"], reply["frame"], goals, none, reply)
+
+    def floor(self, **parameters: Any) -> dict[str, Any]:
+        """Returns the ground around the robot as `GET /v1/floor` describes it."""
+        ground: dict[str, Any] = self._send("/v1/floor?" + urllib.parse.urlencode(parameters))
+        return ground
 
     def events(self, timeout_secs: float = 60.0) -> Iterator[Event]:
         """Yields events as they happen. The robot is heard at least every 15 s; silence longer than that is an error."""

@@ -43,6 +43,12 @@ def main(url: str, word: str) -> None:
             assert (error.status, error.kind, error.parameter) == (400, "bad-parameter", parameter), error.problem
         else:
             raise AssertionError(f"{request} was taken")
+    try:
+        goals = robot.goal(word, near=[0.0, 0.0, 0.0], radius_m=0.25)
+        assert (goals.none is None) == bool(goals.goals) and goals.generation == place["generation"], goals
+    except SlagError as error:
+        # Scenes may be encoded without --occupancy.
+        assert (error.status, error.kind) == (409, "no-occupancy"), error.problem
     event = next(iter(robot.events()))
     assert event.name == "generation" and event.data["generation"] == place["generation"], event
     print(f"{len(things)} things, {len(result.answers)} answers")

@@ -5,6 +5,7 @@
 
 pub mod axes;
 pub mod cholesky;
+pub mod distance_transform;
 mod dot;
 pub mod eigen;
 pub mod graph_segmentation;

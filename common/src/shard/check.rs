@@ -11,6 +11,7 @@ use super::indices::{self, IndicesHeader, PackedIndices};
 use super::layout::ShardLayout;
 use crate::container::{ContainerError, Layout};
 use crate::objects::ObjectsLayout;
+use crate::occupancy::OccupancyLayout;
 
 /// Largest length accepted: embeddings have unit length, and components are scaled to about that.
 const MAX_LENGTH: f32 = 4096.0;
@@ -110,6 +111,7 @@ impl ShardLayout {
                 layout.column::<[u8; 3]>(section::ROTATIONS, "rotations", n)?,
             ]),
         };
+        let occupancy = OccupancyLayout::check(bytes, &layout)?;
         Ok(Self {
             header,
             positions,
@@ -123,6 +125,7 @@ impl ShardLayout {
             packed_indices,
             objects,
             appearance,
+            occupancy,
         })
     }
 }

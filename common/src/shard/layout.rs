@@ -9,6 +9,7 @@ use super::format::{ScoreErrors, ShardHeader};
 use super::indices::{IndicesHeader, PackedIndices};
 use crate::appearance::Appearance;
 use crate::objects::{Objects, ObjectsLayout};
+use crate::occupancy::{Occupancy, OccupancyLayout};
 
 /// The header of a checked shard and the places of its columns; [`ShardLayout::view`] gives the columns.
 #[derive(Clone, Debug)]
@@ -26,6 +27,7 @@ pub struct ShardLayout {
     pub(super) packed_indices: Option<(IndicesHeader, Range<usize>)>,
     pub(super) objects: Option<ObjectsLayout>,
     pub(super) appearance: Option<[Range<usize>; 3]>,
+    pub(super) occupancy: Option<OccupancyLayout>,
 }
 
 impl ShardLayout {
@@ -48,6 +50,14 @@ impl ShardLayout {
             sizes: bytemuck::cast_slice(sizes),
             rotations: bytemuck::cast_slice(rotations),
         })
+    }
+
+    /// Returns which places of the checked bytes' cell are free, if the shard says so.
+    ///
+    /// # Panics
+    /// As [`ShardLayout::objects`].
+    pub fn occupancy<'a>(&self, bytes: &'a [u8]) -> Option<Occupancy<'a>> {
+        self.occupancy.as_ref().map(|occupancy| occupancy.view(bytes))
     }
 
     /// Returns the columns in the checked bytes.

@@ -7,6 +7,7 @@ use super::format::{MAGIC, VERSION, section};
 use crate::appearance::Appearance;
 use crate::container;
 use crate::objects::Objects;
+use crate::occupancy::Occupancy;
 
 /// What a shard may carry beyond what questions need.
 #[derive(Clone, Copy, Debug, Default)]
@@ -15,6 +16,8 @@ pub struct Additions<'a> {
     pub objects: Option<&'a Objects<'a>>,
     /// How its Gaussians look.
     pub appearance: Option<Appearance<'a>>,
+    /// Which places of its cell are free.
+    pub occupancy: Option<&'a Occupancy<'a>>,
 }
 
 impl<'a> From<Option<&'a Objects<'a>>> for Additions<'a> {
@@ -37,7 +40,7 @@ impl ShardView<'_> {
     /// # Errors
     /// Those of the writer.
     pub fn write_with<'a>(&self, out: impl io::Write, additions: impl Into<Additions<'a>>) -> io::Result<()> {
-        let Additions { objects, appearance } = additions.into();
+        let Additions { objects, appearance, occupancy } = additions.into();
         let mut sections = vec![
             (section::HEADER, bytemuck::bytes_of(&self.header)),
             (section::POSITIONS, self.positions.bytes()),
@@ -77,6 +80,7 @@ impl ShardView<'_> {
             sections.push((section::SIZES, container::bytes_of(sizes)));
             sections.push((section::ROTATIONS, container::bytes_of(rotations)));
         }
+        sections.extend(occupancy.iter().flat_map(|occupancy| occupancy.sections()));
         container::write(out, MAGIC, VERSION, &sections)
     }
 }

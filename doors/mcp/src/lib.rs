@@ -5,6 +5,7 @@
 mod find;
 pub mod http;
 mod place;
+mod stand;
 mod tools;
 
 pub use tools::Tools;

@@ -8,10 +8,12 @@ use slag_robot::{Robot, RobotError};
 
 use crate::find::{Found, Wanted};
 use crate::place::{Asked, Description};
+use crate::stand::{Going, Stands};
 
 const INSTRUCTIONS: &str = "Answers where things are on the robot's map of its surroundings. All positions are in the \
     map's world frame and belong to the generation that the answer names. The map is a record of the past: things may \
-    have moved since. Ask describe_place first if you do not know how large the map is; ask find for each thing.";
+    have moved since. Ask describe_place first if you do not know how large the map is; ask find for each thing, and where_to_stand before \
+    going to one.";
 
 /// The tools over a robot.
 #[derive(Clone, Debug)]
@@ -34,6 +36,16 @@ impl Tools {
         let request = wanted.request()?;
         let refused = |error: RobotError| error.to_string();
         self.blocking(move |robot| Found::new(robot.ask(&request).map_err(refused)?)).await.map(Json)
+    }
+
+    /// Find where the robot can stand near a thing: places that it reaches, has room at, and sees the thing from, best first; or
+    /// why there is none. Where the map does not say which places are free, the answer is an error that says so.
+    #[tool(annotations(title = "Where to stand", read_only_hint = true, open_world_hint = false))]
+    async fn where_to_stand(&self, Parameters(going): Parameters<Going>) -> Result<Json<Stands>, String> {
+        let refused = |error: RobotError| error.to_string();
+        self.blocking(move |robot| robot.goal(&going.parameters()).map(Stands::from).map_err(refused))
+            .await
+            .map(Json)
     }
 
     /// Describe what the robot's map covers: its extent, age and gaps, and how many things match each of some words.

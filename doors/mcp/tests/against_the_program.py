@@ -23,7 +23,7 @@ async def check(client, robot, word):
     assert client.server_info.name == "slag-mcp", client.server_info
     assert "world frame" in client.instructions
     tools = {tool.name: tool for tool in (await client.list_tools()).tools}
-    assert sorted(tools) == ["describe_place", "find"], sorted(tools)
+    assert sorted(tools) == ["describe_place", "find", "where_to_stand"], sorted(tools)
     for tool in tools.values():
         assert tool.description and tool.annotations.read_only_hint, tool
         assert tool.output_schema["type"] == "object", tool.output_schema
@@ -55,6 +55,17 @@ async def check(client, robot, word):
     assert related["understood"]["pick"]["by"] == "nearest" and len(related["things"]) == 1, related
     assert related["things"][0]["related_to"][0]["thing"] == "me", related
 
+    # The site is encoded with its places: the robot's own answer is the truth, poses or the reason.
+    truth = get(f"{robot}/v1/goal?text={word}&near=1,2,0&radius_m=0.2")
+    stand = await client.call_tool("where_to_stand", {"what": word, "near": [1, 2, 0], "radius_m": 0.2})
+    assert not stand.is_error, stand
+    stand = stand.structured_content
+    assert bool(stand["places"]) != ("none" in stand), stand
+    assert [place["position_in_world"] for place in stand["places"]] == \
+        [goal["position_in_world"] for goal in truth["goals"]], (stand, truth)
+    if truth["none"] is not None:
+        assert stand["none"]["kind"] == truth["none"]["kind"], (stand, truth)
+
     place = get(f"{robot}/v1/map")
     here = (await client.call_tool("describe_place", {"words": [word]})).structured_content
     assert here["n_things"] == place["n_objects"] and here["scene"] == place["scene"], here
@@ -72,6 +83,7 @@ async def check(client, robot, word):
         ("find", {"what": ""}, "text"),
         ("find", {"what": word, "near": [0, 0, 0], "radius": -1.0}, "radius"),
         ("describe_place", {"near": [0, 0, 0]}, "go together"),
+        ("where_to_stand", {"what": word, "radius_m": 9.0}, "radius_m"),
     ]:
         refused = await client.call_tool(name, asked)
         assert refused.is_error and expected in refused.content[0].text, (asked, refused)

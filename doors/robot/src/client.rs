@@ -7,6 +7,7 @@ use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
 use crate::error::RobotError;
+use crate::goal::Goals;
 use crate::place::Place;
 use crate::reply::{PointAnswer, Reply};
 
@@ -78,6 +79,16 @@ impl Robot {
         let path = format!("/v1/objects?limit=1{}", filter.unwrap_or_default());
         let page: Value = self.get(&path)?;
         page["n_objects"].as_u64().ok_or_else(|| self.foreign(&path, "n_objects is no number"))
+    }
+
+    /// Returns places to stand, by the parameters of `GET /v1/goal`.
+    ///
+    /// # Errors
+    /// [`RobotError`].
+    pub fn goal(&self, parameters: &[(&str, String)]) -> Result<Goals, RobotError> {
+        let path = "/v1/goal";
+        let pairs = parameters.iter().map(|(name, value)| (*name, value.as_str()));
+        self.read(path, self.agent.get(self.address(path)).query_pairs(pairs).call())
     }
 
     /// Says where the robot is, as `POST /position` takes it; a robot that follows then fetches what is around it.

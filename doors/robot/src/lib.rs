@@ -2,10 +2,12 @@
 
 mod client;
 mod error;
+mod goal;
 mod place;
 mod reply;
 
 pub use client::{Robot, read_token};
 pub use error::RobotError;
+pub use goal::{Goal, GoalMiss, GoalThing, Goals};
 pub use place::{Box3, Cell, Place};
 pub use reply::{Answer, Geographic, Nothing, OrientedBox, PointAnswer, Reply, Results, Witness};

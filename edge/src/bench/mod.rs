@@ -1,6 +1,7 @@
 //! Measurements: each returns a report that describes the machine.
 
 mod dump;
+pub mod goal;
 pub mod http;
 pub mod load;
 mod machine;

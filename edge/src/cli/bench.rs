@@ -6,6 +6,7 @@ use std::time::Duration;
 use anyhow::{Context, anyhow};
 use clap::{Args, Subcommand};
 use slag_common::shard::ShardView;
+use slag_edge::bench::goal::time_goal;
 use slag_edge::bench::http::time_http;
 use slag_edge::bench::load::{self, LoadOptions};
 use slag_edge::bench::objects::time_objects;
@@ -26,10 +27,27 @@ pub enum BenchCommand {
     Query(BenchQueryArgs),
     /// Measure the longest wait of a query while fetches replace the generation.
     Pause(PauseArgs),
+    /// Time the search for places to stand in a made yard.
+    Goal(BenchGoalArgs),
     /// Load a service with more queries than it can answer.
     Load(LoadArgs),
     /// Time the text model.
     Text(BenchTextArgs),
+}
+
+#[derive(Debug, Args)]
+pub struct BenchGoalArgs {
+    /// How far around the robot ground is looked at.
+    #[arg(long, value_name = "M", default_value_t = 20.0)]
+    range_m: f64,
+    /// Edge of a voxel.
+    #[arg(long, value_name = "M", default_value_t = 0.05)]
+    voxel_m: f64,
+    /// Searches.
+    #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    runs: u32,
+    #[command(flatten)]
+    threads: ThreadArgs,
 }
 
 #[derive(Debug, Args)]
@@ -127,6 +145,11 @@ const WARM_UP: Duration = Duration::from_secs(2);
 pub fn run(command: BenchCommand) -> Result<(), Failure> {
     match command {
         BenchCommand::Query(args) => bench_query_command(args),
+        BenchCommand::Goal(args) => {
+            args.threads.apply()?;
+            let report = time_goal(args.range_m, args.voxel_m, args.runs as usize);
+            print_json(&report.map_err(|e| Failure::Usage(e.into()))?)
+        }
         BenchCommand::Pause(args) => bench_pause(args),
         BenchCommand::Load(args) => bench_load(args),
         BenchCommand::Text(args) => bench_text(args),

@@ -4,6 +4,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use glam::DVec3;
+use slag_common::manifest::Manifest;
 use slag_service::problem::Problem;
 use tokio::sync::{Semaphore, watch};
 
@@ -62,6 +64,11 @@ impl App {
     pub(super) fn query_budget_within(&self, time: Option<Duration>) -> Budget {
         let time = time.map_or(self.settings.query_timeout, |time| time.min(self.settings.query_timeout));
         Budget::new(self.settings.query_bytes, time, &self.query_memory)
+    }
+
+    /// Returns where the robot was last, if it is followed and the scene knows the place.
+    pub(super) fn last_position(&self, manifest: &Manifest) -> Option<DVec3> {
+        self.following.as_ref()?.status().position?.in_world(manifest).ok()
     }
 
     /// Returns a counter of finished attempts to load another generation.

@@ -81,17 +81,31 @@ impl Engine {
 
     /// Returns an object of a generation.
     pub fn object(&self, snapshot: &Snapshot, id: u64) -> Option<ObjectOnBoard> {
+        self.on_scene(snapshot, &Budget::default(), |_, scene| Some(describe(scene, number_of(scene, id)?)))
+    }
+
+    /// Returns the positions of Gaussians of an object on board inside its box, evenly spread over their order, at most `limit`.
+    pub fn object_points(&self, snapshot: &Snapshot, id: u64, limit: usize) -> Vec<DVec3> {
         self.on_scene(snapshot, &Budget::default(), |_, scene| {
-            // Objects are in order of their ids.
-            let (mut low, mut high) = (0, scene.index.len());
-            while low < high {
-                let middle = low.midpoint(high);
-                if objects::record(scene, middle).id < id { low = middle + 1 } else { high = middle }
-            }
-            let is_it = low < scene.index.len() && objects::record(scene, low).id == id;
-            is_it.then(|| describe(scene, low))
+            let Some(object) = number_of(scene, id) else { return Vec::new() };
+            let bounds = objects::record(scene, object).bounds();
+            let mut points = objects::all_points(scene, object);
+            points.retain(|point| bounds.contains(*point));
+            let step = points.len().div_ceil(limit.max(1)).max(1);
+            points.into_iter().step_by(step).collect()
         })
     }
+}
+
+/// Returns the number of an object in the index.
+fn number_of(scene: &Scene<'_>, id: u64) -> Option<usize> {
+    // Objects are in order of their ids.
+    let (mut low, mut high) = (0, scene.index.len());
+    while low < high {
+        let middle = low.midpoint(high);
+        if objects::record(scene, middle).id < id { low = middle + 1 } else { high = middle }
+    }
+    (low < scene.index.len() && objects::record(scene, low).id == id).then_some(low)
 }
 
 fn page(scene: &Scene<'_>, filter: &ObjectFilter, limit: usize) -> ObjectPage {

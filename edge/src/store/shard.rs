@@ -7,6 +7,7 @@ use slag_common::Hash32;
 use slag_common::appearance::Appearance;
 use slag_common::manifest::{CellRecord, Manifest};
 use slag_common::objects::Objects;
+use slag_common::occupancy::Occupancy;
 use slag_common::shard::{Profile, ShardLayout, ShardView};
 
 use super::bad_cell::cell_of;
@@ -41,6 +42,11 @@ impl OpenShard {
     /// Returns its objects, if the shard has any.
     pub fn objects(&self) -> Option<Objects<'_>> {
         self.layout.objects(&self.bytes)
+    }
+
+    /// Returns which places of its cell are free, if the shard says so.
+    pub fn occupancy(&self) -> Option<Occupancy<'_>> {
+        self.layout.occupancy(&self.bytes)
     }
 
     /// Returns its length.

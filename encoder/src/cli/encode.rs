@@ -29,6 +29,7 @@ use crate::encode::{
     OutputSettings, Preset, RasterWidth, Regions, RunSettings, StageReport, ViewSettings, ViewsLimit,
     ViewsReport,
 };
+use crate::occupancy::OccupancySettings;
 use crate::progress::Progress;
 use crate::raster::WeightKind;
 use crate::raster::devices::{DeviceChoice, Devices};
@@ -147,6 +148,10 @@ pub struct EncodeArgs {
     /// in every profile.
     #[arg(long)]
     pub appearance: bool,
+    /// Shards say which places are free, occupied or unknown, so that robots find places to stand; with a value: the edge of
+    /// a voxel, metres, 0.02 to 0.5. For metric scenes.
+    #[arg(long, value_name = "M", num_args = 0..=1, default_missing_value = "0.05")]
+    pub occupancy: Option<f64>,
     /// Search for objects.
     #[command(flatten)]
     pub objects: ObjectArgs,
@@ -212,6 +217,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             },
             shards: shard_settings(args, preset.codebook, metric),
             objects: preset.objects && !args.objects.no_objects && !args.regions.have_patches(),
+            occupancy: args.occupancy.map(|voxel_m| OccupancySettings { voxel_m }),
         },
         output: OutputSettings {
             store: args.store.clone(),
@@ -336,6 +342,11 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
             found.n_gaussians
         )
     });
+    let occupancy = summary.occupancy.as_ref().map_or(String::new(), |found| {
+        let (free, occupied, bytes) = (found.n_free, found.n_occupied, ByteSize(found.len_bytes));
+        let (voxel_m, secs) = (found.voxel_m, found.secs);
+        format!("places     {free} voxels of {voxel_m} m free, {occupied} occupied; {bytes} in {secs:.1} s\n")
+    });
     let most = most_spent(&summary);
     let images_on = summary.images_on.as_ref().map_or(String::new(), |on| format!("images on  {on}\n"));
     let of_target = expected.as_ref().map_or(String::new(), |e| {
@@ -356,7 +367,7 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
          views      {} of {} ({} resumed, {} without masks)\n{coverage}{skipped}{images_on}\
          masks      {} in {} regions, {} contributions\n\
          cells      {} with {} centroids\n\
-         {objects}shards     {sizes}\n{most}\
+         {objects}{occupancy}shards     {sizes}\n{most}\
          seconds    {:.1}; by stage, all threads: {busy}\n\
          views took {:.1} s\n  stage    at once   seconds    busy\n{of_views}",
         summary.generation,

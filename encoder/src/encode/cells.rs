@@ -26,7 +26,8 @@ use crate::lift::{
     Aggregation, CellField, ContributionError, ContributionIndex, PartContributions, RegionTable,
 };
 use crate::objects::{self, ObjectsReport, SceneObjects};
-use crate::shard::{self, BuiltShard, CellEmbeddings};
+use crate::occupancy::{OccupancyReport, SceneOccupancy};
+use crate::shard::{self, BuiltShard, CellEmbeddings, CellExtras};
 use crate::store::Extras;
 
 /// The cells of a scene, all objects of them in the store.
@@ -41,6 +42,7 @@ pub(super) struct BuiltCells {
     pub(super) n_without_evidence: u64,
     /// The search for objects, if there was one.
     pub(super) objects: Option<ObjectsReport>,
+    pub(super) occupancy: Option<OccupancyReport>,
     pub(super) counts: Counts,
     /// Sums over the Gaussians with evidence of mean score and mean squared score, and their number.
     score_sums: [f64; 3],
@@ -105,11 +107,12 @@ impl BuiltCells {
 pub(super) fn build_cells(
     plan: &Plan<'_>,
     views: &DoneViews<'_>,
+    occupancy: Option<SceneOccupancy>,
     context: &RunContext<'_>,
 ) -> Result<BuiltCells, EncodeError> {
     let mut builder = context.install(|| {
         let bank = text_bank(plan, context);
-        CellBuilder::open(plan, views, bank, context)
+        CellBuilder::open(plan, views, bank, occupancy, context)
     })?;
     context.progress().begin("cells", "cell", plan.inputs.split.cells.len() as u64, 0);
     let built = builder.build(views)?;
@@ -158,6 +161,7 @@ struct CellBuilder<'a> {
     n_at_once: usize,
     /// Each view's masks in its photo.
     photos: Vec<Photo>,
+    occupancy: Option<SceneOccupancy>,
 }
 
 impl<'a> CellBuilder<'a> {
@@ -169,6 +173,7 @@ impl<'a> CellBuilder<'a> {
         plan: &'a Plan<'a>,
         views: &DoneViews<'_>,
         bank: TextBank,
+        occupancy: Option<SceneOccupancy>,
         context: &'a RunContext<'a>,
     ) -> Result<Self, EncodeError> {
         let (models, job) = (plan.engines.models, &plan.job);
@@ -188,6 +193,7 @@ impl<'a> CellBuilder<'a> {
         let mut memory = plan.memory.clone();
         memory.views_are_done();
         table.reserve(&mut memory);
+        occupancy.iter().for_each(|occupancy| occupancy.reserve(&mut memory));
         index.reserve(&mut memory);
         Refinement::reserve_regions(&mut memory, &plan.settings.aggregation, table.len());
         if plan.settings.cells.objects {
@@ -207,7 +213,18 @@ impl<'a> CellBuilder<'a> {
         });
         let encoder_id = Hash32(models.encoder_id().hash());
         let n_at_once = 1 + n_more as usize;
-        Ok(Self { plan, context, encoder_id, index, table, score_context, group_bytes, n_at_once, photos })
+        Ok(Self {
+            plan,
+            context,
+            encoder_id,
+            index,
+            table,
+            score_context,
+            group_bytes,
+            n_at_once,
+            photos,
+            occupancy,
+        })
     }
 
     /// Finds the objects of the scene if the settings ask for them; `None` if cancelled, too.
@@ -254,6 +271,7 @@ impl<'a> CellBuilder<'a> {
             extras: Extras::new(),
             n_without_evidence: 0,
             objects: None,
+            occupancy: self.occupancy.as_ref().map(|occupancy| occupancy.report),
             counts: self.counts(views),
             score_sums: [0.0; 3],
         };
@@ -381,8 +399,10 @@ impl<'a> CellBuilder<'a> {
         let (scene, settings) = (&self.plan.inputs.scene, &self.plan.settings.cells.shards);
         let encoder_id = self.encoder_id;
         let embeddings = &in_work.embeddings;
+        let occupancy = self.occupancy.as_ref().map(|scene| scene.cells[cell_id as usize].view());
+        let extras = CellExtras { objects, occupancy };
         let made = self.context.time("codebook", || {
-            shard::build(scene, cell_id, cell, embeddings, encoder_id, &self.score_context, settings, objects)
+            shard::build(scene, cell_id, cell, embeddings, encoder_id, &self.score_context, settings, &extras)
         });
         let record = |shard: &BuiltShard| -> Result<(Profile, ShardRecord), EncodeError> {
             let (hash, len_bytes) = self.context.time("write", || self.plan.store.put_bytes(&shard.bytes))?;

@@ -25,6 +25,8 @@ pub(super) enum Phase {
     Plan,
     /// Views are segmented, embedded and rasterised.
     Views,
+    /// Free and occupied places are found.
+    Occupancy,
     /// The views' contributions are opened.
     Merge,
     Objects,
@@ -40,6 +42,7 @@ impl Phase {
             Self::Read => "read",
             Self::Plan => "plan",
             Self::Views => "views",
+            Self::Occupancy => "occupancy",
             Self::Merge => "merge",
             Self::Objects => "objects",
             Self::Refine => "refine",

@@ -4,6 +4,7 @@
 //! |---|---|---|
 //! | plan | inputs read and checked, memory reserved, the order of views | `plan.rs` |
 //! | run views | a file of contributions per view, in the job's folder | `views.rs`, `view.rs`, `pipeline.rs`, `job.rs` |
+//! | look around | free and occupied places, if they are asked for | `views.rs` |
 //! | build cells | objects, fields and shards in the store | `cells.rs` |
 //! | publish | the manifest and its metadata, the summary | `publish.rs` |
 //!
@@ -68,9 +69,10 @@ pub fn encode(
     context.begin_phase(Phase::Views);
     plan.job.begin("views")?;
     let views = views::run_views(&plan, &context)?;
+    let occupancy = views::look_around(&plan, &views, &context)?;
     context.begin_phase(Phase::Merge);
     plan.job.begin("cells")?;
-    let built = cells::build_cells(&plan, &views, &context)?;
+    let built = cells::build_cells(&plan, &views, occupancy, &context)?;
     context.begin_phase(Phase::Publish);
     plan.job.begin("publish")?;
     publish::publish(plan, views, built, &context)
@@ -93,6 +95,7 @@ pub fn remake(
     let inputs = inputs::Inputs::read(settings, &context)?;
     let plan = plan::plan_of_kept(settings, engines, &store, &inputs, &context)?;
     let views = views::kept_views(&plan)?;
-    cells::build_cells(&plan, &views, &context)?;
+    let occupancy = views::look_around(&plan, &views, &context)?;
+    cells::build_cells(&plan, &views, occupancy, &context)?;
     Ok(())
 }

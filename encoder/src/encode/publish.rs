@@ -102,6 +102,7 @@ fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: 
         n_cells: cells.len(),
         n_centroids: cells.iter().map(|cell| u64::from(cell.n_centroids)).sum(),
         objects: built.objects,
+        occupancy: built.occupancy,
         shard_bytes,
         cells,
         views: views_report,

@@ -8,6 +8,7 @@ use super::coverage::CoverageReport;
 use super::settings::ViewOrder;
 use crate::lanes::GpuLoad;
 use crate::objects::ObjectsReport;
+use crate::occupancy::OccupancyReport;
 
 /// A view that was left out.
 #[derive(Clone, Debug, Serialize)]
@@ -99,7 +100,7 @@ impl StageReport {
 /// A part of the run. The parts follow each other and add up to the run's time.
 #[derive(Clone, Debug, Serialize)]
 pub struct PhaseReport {
-    /// The part: read, plan, views, merge, objects, refine, cells, publish.
+    /// The part: read, plan, views, occupancy, merge, objects, refine, cells, publish.
     pub phase: String,
     /// Seconds.
     pub secs: f64,
@@ -144,6 +145,8 @@ pub struct EncodeSummary {
     pub n_centroids: u64,
     /// The search for objects, if there was one.
     pub objects: Option<ObjectsReport>,
+    /// Free and occupied places, if they were asked for.
+    pub occupancy: Option<OccupancyReport>,
     /// Bytes of all shards, by profile.
     pub shard_bytes: BTreeMap<String, u64>,
     /// The cost of each cell.

@@ -14,6 +14,7 @@ use crate::codebook::basis::MAX_COMPONENTS;
 use crate::embed::Background;
 use crate::ingest::FrameChoice;
 use crate::lift::Aggregation;
+use crate::occupancy::OccupancySettings;
 use crate::raster::WeightKind;
 use crate::segment::SamSettings;
 use crate::shard::ShardSettings;
@@ -171,6 +172,8 @@ pub struct CellSettings {
     pub shards: ShardSettings,
     /// Whether masks that views agree on become objects.
     pub objects: bool,
+    /// How free and occupied places are told apart, if shards have them.
+    pub occupancy: Option<OccupancySettings>,
 }
 
 /// What is published, and where.
@@ -281,6 +284,7 @@ impl EncodeSettings {
                     appearance: false,
                 },
                 objects: true,
+                occupancy: None,
             },
             output: OutputSettings {
                 store,
@@ -311,6 +315,7 @@ impl EncodeSettings {
         let Self { view, aggregation, cells, run, .. } = self;
         let codebook = &cells.shards.codebook;
         let is_positive = |x: f64| x > 0.0 && x.is_finite();
+        let is_metric = self.inputs.metric || self.inputs.geo.is_some();
         let is_error = |x: f32| x >= 0.0 && x.is_finite();
         let checks = [
             ("threads", run.threads > 0, "0 threads; expected at least 1"),
@@ -350,6 +355,16 @@ impl EncodeSettings {
             ),
             ("compact_error", is_error(codebook.compact_error), "expected a finite error, at least 0"),
             ("balanced_error", is_error(codebook.balanced_error), "expected a finite error, at least 0"),
+            (
+                "occupancy",
+                cells.occupancy.is_none_or(|of| (0.02..=0.5).contains(&of.voxel_m)),
+                "expected voxels of 0.02 to 0.5 metres",
+            ),
+            (
+                "occupancy",
+                cells.occupancy.is_none() || is_metric,
+                "a robot's size is in metres, the scene's units are not known to be; give --metric if they are metres",
+            ),
             (
                 "position_error",
                 !matches!(cells.shards.position_error, PositionError::Within(error) if !is_positive(error)),
@@ -406,6 +421,12 @@ mod tests {
             refused(&|s| s.cells.shards.position_error = PositionError::Within(0.0)),
             "position_error"
         );
+        assert_eq!(refused(&|s| s.cells.occupancy = Some(OccupancySettings { voxel_m: 0.0 })), "occupancy");
+        let without_unit = |s: &mut EncodeSettings| {
+            s.inputs.metric = false;
+            s.cells.occupancy = Some(OccupancySettings { voxel_m: 0.05 });
+        };
+        assert_eq!(refused(&without_unit), "occupancy");
         assert_eq!(refused(&|s| s.aggregation.superpoint = f32::INFINITY), "aggregation");
     }
 }

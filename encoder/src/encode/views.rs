@@ -6,14 +6,16 @@ use std::time::Instant;
 
 use slag_common::View;
 
-use super::context::RunContext;
+use super::context::{Phase, RunContext};
 use super::coverage::CoverageReport;
 use super::error::EncodeError;
+use super::inputs::Inputs;
 use super::job::ViewRecord;
 use super::pipeline;
 use super::plan::Plan;
 use super::report::{SkippedView, StageReport};
 use super::view::{ViewStages, Work};
+use crate::occupancy::{self, SceneOccupancy};
 
 /// The views of a run, done or left out.
 pub(super) struct DoneViews<'a> {
@@ -89,6 +91,26 @@ pub(super) fn kept_views<'a>(plan: &Plan<'a>) -> Result<DoneViews<'a>, EncodeErr
         secs: 0.0,
         images_on: None,
     })
+}
+
+/// Finds the free and occupied places that the used views show; `None` if the settings do not ask for them.
+///
+/// # Errors
+/// [`EncodeError::Raster`], [`EncodeError::Interrupted`].
+pub(super) fn look_around(
+    plan: &Plan<'_>,
+    views: &DoneViews<'_>,
+    context: &RunContext<'_>,
+) -> Result<Option<SceneOccupancy>, EncodeError> {
+    let Some(settings) = plan.settings.cells.occupancy else { return Ok(None) };
+    context.begin_phase(Phase::Occupancy);
+    let Inputs { scene, split, .. } = plan.inputs;
+    let find = || occupancy::find(scene, split, plan.scene.as_ref(), &views.used, settings, context.cancel());
+    let found = context.time("occupancy", || context.install(find));
+    let found = found
+        .map_err(|(at, source)| EncodeError::Raster { view: views.used[at].name.clone(), source })?
+        .ok_or(EncodeError::Interrupted { n_done: views.used.len(), n_views: views.used.len() })?;
+    Ok(Some(found))
 }
 
 /// Works off the views without a record. Returns the load of the stages, and the views that were left out.

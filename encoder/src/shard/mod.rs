@@ -7,6 +7,7 @@ use rayon::prelude::*;
 use slag_common::Gaussians;
 use slag_common::appearance::AppearanceColumns;
 use slag_common::hash::Hash32;
+use slag_common::occupancy::Occupancy;
 use slag_common::shard::{
     Additions, Basis, ExactColumns, Fine, IndexColumn, Profile, Residuals, ScoreErrors, ShardHeader,
     ShardView,
@@ -91,7 +92,16 @@ pub fn reserve(memory: &mut MemoryPlan, split: &CellSplit, dim: usize) {
     memory.reserve(Phase::Cells, "the largest cell", largest_cell_bytes(split, dim));
 }
 
-/// Builds a cell's shards, with the objects of the scene if it has any.
+/// What a cell's shards carry besides Gaussians and their embeddings.
+#[derive(Default)]
+pub struct CellExtras<'a> {
+    /// The objects of the scene, if it has any.
+    pub objects: Option<&'a SceneObjects>,
+    /// The free and occupied places of the cell, if they were asked for.
+    pub occupancy: Option<Occupancy<'a>>,
+}
+
+/// Builds a cell's shards.
 #[expect(clippy::too_many_arguments, reason = "the parts of a cell")]
 pub fn build(
     scene: &Gaussians,
@@ -101,7 +111,7 @@ pub fn build(
     encoder_id: Hash32,
     score_context: &ScoreMetricContext,
     settings: &ShardSettings,
-    objects: Option<&SceneObjects>,
+    extras: &CellExtras<'_>,
 ) -> BuiltCell {
     let dim = embeddings.dim;
     let (with, without): (Vec<u32>, Vec<u32>) =
@@ -161,15 +171,17 @@ pub fn build(
         }),
         ..compact
     });
-    let objects = objects
-        .map(|objects| CellObjects::new(objects, cell_id, &locals, &CentroidBasis::new(dim, compact.basis)));
+    let of_cell =
+        |objects| CellObjects::new(objects, cell_id, &locals, &CentroidBasis::new(dim, compact.basis));
+    let objects = extras.objects.map(of_cell);
     let objects = objects.as_ref().map(CellObjects::view);
     let largest = |radii: &[f32]| radii.iter().copied().fold(0.0, f32::max);
     let spread = codebook.errors.spread;
     let built = |profile, view: &ShardView<'_>| {
         let mut bytes = Vec::new();
         let appearance = appearance.as_ref().map(AppearanceColumns::view);
-        let additions = Additions { objects: objects.as_ref(), appearance };
+        let additions =
+            Additions { objects: objects.as_ref(), appearance, occupancy: extras.occupancy.as_ref() };
         view.write_with(&mut bytes, additions).expect("writing to memory cannot fail");
         let (score_error_bound, score_errors) = match profile {
             Profile::Exact => (F16_ROUNDING, ScoreErrors { spread, ..ScoreErrors::default() }),

@@ -11,7 +11,7 @@ use crate::query::{AnswerKind, Format};
 use crate::score::Precision;
 use crate::testing::TestObject;
 
-fn description() -> Value {
+pub(super) fn description() -> Value {
     serde_json::from_str(OPENAPI).expect("JSON")
 }
 
@@ -20,7 +20,7 @@ fn names<'a>(names: impl IntoIterator<Item = &'a str>) -> BTreeSet<&'a str> {
 }
 
 /// Checks a value against a schema: types, names (none undescribed, none of the required missing), enums.
-fn check(schema: &Value, value: &Value, at: &str) -> Result<(), String> {
+pub(super) fn check(schema: &Value, value: &Value, at: &str) -> Result<(), String> {
     if let Some(name) = schema["$ref"].as_str() {
         let schema = description().pointer(name.trim_start_matches('#')).cloned();
         return check(&schema.ok_or(format!("{at}: no {name}"))?, value, at);
@@ -182,6 +182,11 @@ async fn every_answer_is_as_described() {
         ("/v1/view", ""),
         ("/v1/view/scores", "text=0&limit=1"),
         ("/v1/view/cells/{id}", "4294967295"),
+        ("/v1/goal", "text=0&near=0,0,0"),
+        ("/v1/goal", "near=0,0,0"),
+        ("/v1/goal", "text=sofa"),
+        ("/v1/floor", "radius_m=9"),
+        ("/v1/floor", ""),
         ("/v1/objects/{id}", "o0000000000000005"),
         ("/v1/objects/{id}", "o0000000000000006"),
         ("/v1/objects/{id}", "5"),

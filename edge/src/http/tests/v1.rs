@@ -2,6 +2,7 @@
 
 use axum::body::Bytes;
 use slag_common::manifest::Calibration;
+use slag_common::occupancy::BuiltOccupancy;
 
 use super::*;
 use crate::testing::TestObject;
@@ -26,6 +27,11 @@ fn lattice(from: [u16; 3], to: [u16; 3], n: [u16; 3], axis: usize) -> Vec<Member
 /// Two mugs (axis 0), one of them on a table (axis 1), and nothing of axis 2. Metres: the table is 1.6 x 0.9 x 0.74 in a
 /// corner of the world, the other mug stands 3 m along x on the floor.
 fn room() -> [BuiltShard; 1] {
+    room_with(None)
+}
+
+/// The same, with its free and occupied places.
+pub(super) fn room_with(places: Option<&BuiltOccupancy>) -> [BuiltShard; 1] {
     let mugs = [
         lattice([50, 40, 75], [60, 50, 88], [4, 4, 4], 0),
         lattice([300, 40, 0], [310, 50, 13], [4, 4, 4], 0),
@@ -40,7 +46,8 @@ fn room() -> [BuiltShard; 1] {
         n_gaussians: ends[at + 1] - ends[at],
     };
     let objects = [object(1, 0, 0), object(2, 0, 1), object(3, 1, 2)];
-    [shard.with_objects(&objects, Calibration { score_mean: 0.0, score_spread: 0.1 })]
+    let calibration = Calibration { score_mean: 0.0, score_spread: 0.1 };
+    [shard.with_objects_and_places(&objects, calibration, places)]
 }
 
 async fn post(service: &Service, body: &Value) -> (StatusCode, HeaderMap, Value) {

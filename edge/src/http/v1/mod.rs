@@ -2,6 +2,7 @@
 
 mod body;
 mod events;
+mod goal;
 mod map;
 mod objects;
 mod params;
@@ -38,5 +39,9 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         .parameters(view::scores_parameters())
         .get("/v1/view/cells/{id}", "the Gaussians of a cell, 16 bytes each, in binary", view::cell)
         .parameters(view::cell_parameters())
+        .get("/v1/goal", "places to stand near a thing: reached, clear, and in sight of it", goal::goal)
+        .parameters(goal::parameters())
+        .get("/v1/floor", "the ground around the robot: unknown, obstacle, ground, reached", goal::floor)
+        .parameters(goal::floor_parameters())
         .get("/v1/events", "server-sent events: generations and fetches as they happen", events::events)
 }

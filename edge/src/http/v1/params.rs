@@ -164,7 +164,8 @@ fn numbers(name: &str, value: &str) -> Result<Vec<f64>, RequestError> {
     numbers.ok_or_else(|| RequestError::new(name, value, "pairs of numbers, separated by commas"))
 }
 
-fn lat_lon(name: &str, value: &str) -> Result<LatLon, RequestError> {
+/// Reads a geographic position.
+pub fn lat_lon(name: &str, value: &str) -> Result<LatLon, RequestError> {
     let numbers: Option<Vec<f64>> = value.split(',').map(|number| number.trim().parse().ok()).collect();
     match numbers.as_deref() {
         Some([lat, lon]) => Ok(LatLon { lat: *lat, lon: *lon, height: None }),

@@ -18,7 +18,7 @@ use slag_encoder::cells::{CellLimits, split};
 use slag_encoder::codebook::residual::trained;
 use slag_encoder::codebook::{CodebookSettings, ScoreMetric, ScoreMetricContext, TextBank};
 use slag_encoder::shard::positions::PositionError;
-use slag_encoder::shard::{self, CellEmbeddings, ShardSettings};
+use slag_encoder::shard::{self, CellEmbeddings, CellExtras, ShardSettings};
 use slag_encoder::store::{StoreError, StoreReader};
 use slag_math::matrix::{Panels, Rows};
 use slag_math::stats::{Rank, quantile};
@@ -311,8 +311,9 @@ fn shards(
             .copied()
             .collect();
         let cell = CellEmbeddings { dim, vectors: in_order, has_evidence: vec![true; *n] };
+        let (id, extras) = (Hash32([0; 32]), CellExtras::default());
         let (built, took) = timed_ms(|| {
-            shard::build(&scene, 0, &cells.cells[0], &cell, Hash32([0; 32]), score_context, &settings, None)
+            shard::build(&scene, 0, &cells.cells[0], &cell, id, score_context, &settings, &extras)
         });
         ms += took;
         n_centroids += built.n_centroids;

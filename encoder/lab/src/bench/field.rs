@@ -15,7 +15,7 @@ use crate::generate::field::{Field, place_in_cube};
 use slag_encoder::cells::{Cell, CellLimits, split};
 use slag_encoder::codebook::{ScoreMetric, ScoreMetricContext};
 use slag_encoder::progress::Progress;
-use slag_encoder::shard::{self, CellEmbeddings, ShardSettings};
+use slag_encoder::shard::{self, CellEmbeddings, CellExtras, ShardSettings};
 use slag_encoder::store::{Extras, Store, StoreError};
 use slag_math::matrix::Rows;
 
@@ -128,7 +128,16 @@ impl<'a> FieldWriter<'a> {
         let embeddings = CellEmbeddings { dim, vectors, has_evidence: vec![true; n] };
         let (context, settings) = (&self.score_context, self.settings);
         let (built, ms) = timed_ms(|| {
-            shard::build(scene, cell_id, cell, &embeddings, encoder_id(), context, settings, None)
+            shard::build(
+                scene,
+                cell_id,
+                cell,
+                &embeddings,
+                encoder_id(),
+                context,
+                settings,
+                &CellExtras::default(),
+            )
         });
         self.coding_ms += ms;
         self.report.n_gaussians += n as u64;

@@ -95,6 +95,7 @@ impl Wall {
                 appearance: false,
             },
             objects: false,
+            occupancy: None,
         };
         settings.run.threads = 1;
         settings.run.memory_bytes = 1 << 28;

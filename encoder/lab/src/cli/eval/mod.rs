@@ -3,6 +3,7 @@
 mod comparison;
 mod defaults;
 mod encoder;
+mod goal;
 mod labelled;
 mod lerf;
 mod noise;
@@ -32,6 +33,8 @@ pub enum EvalCommand {
     Defaults(defaults::EvalDefaultsArgs),
     /// Measures the accuracy of each aggregation method with errors in the masks.
     Noise(noise::EvalNoiseArgs),
+    /// Asks the robot's program for places to stand near the things of generated scenes, and compares with their true surfaces.
+    Goal(goal::EvalGoalArgs),
     /// Asks the robot's program for things by their relations in generated scenes, beside the plain phrase and the noun.
     Relations(relations::EvalRelationsArgs),
 }
@@ -45,6 +48,7 @@ pub(super) fn run(command: &EvalCommand, progress: &dyn Progress, json: bool) ->
         EvalCommand::Encoder(args) => encoder::run(args, progress, json),
         EvalCommand::Defaults(args) => defaults::run(args, progress, json),
         EvalCommand::Noise(args) => noise::run(args, progress, json),
+        EvalCommand::Goal(args) => goal::run(args, progress, json),
         EvalCommand::Relations(args) => relations::run(args, progress, json),
     }
 }

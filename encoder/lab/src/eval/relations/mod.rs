@@ -2,12 +2,10 @@
 //! plain phrase, and by the noun alone, and the answers are compared with the layout.
 
 mod report;
-mod robot;
 mod truth;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
 
 use anyhow::{Context, Result, anyhow};
 use glam::DVec3;
@@ -17,9 +15,9 @@ use slag_common::frames::Aabb;
 use slag_encoder::progress::Progress;
 
 pub use report::{Counts, RelationsReport, Way};
-use robot::Service;
 pub use truth::{Asked, TrueThing};
 
+use crate::eval::robot::{Prepared, Service};
 use crate::generate::grammar::SceneKind;
 
 /// Things with fewer pixels over all photos are not asked about.
@@ -74,7 +72,16 @@ pub fn run(settings: &RelationsSettings, progress: &dyn Progress) -> Result<Rela
             let name = clap::ValueEnum::to_possible_value(kind).map(|value| value.get_name().to_owned());
             let name = name.ok_or_else(|| anyhow!("{kind:?} has no name"))?;
             let dir = settings.out.join(format!("{name}-{seed}"));
-            prepare(settings, &dir, &name, *seed).with_context(|| dir.display().to_string())?;
+            let (programs, encode_flags) = (&settings.programs, &[]);
+            let scene = Prepared {
+                programs,
+                dir: &dir,
+                kind: &name,
+                seed: *seed,
+                n_views: settings.n_views,
+                encode_flags,
+            };
+            scene.make().with_context(|| dir.display().to_string())?;
             judge(settings, &dir, &mut report).with_context(|| dir.display().to_string())?;
             report.scenes.push(format!("{name}-{seed}"));
             progress.advance(1);
@@ -82,50 +89,6 @@ pub fn run(settings: &RelationsSettings, progress: &dyn Progress) -> Result<Rela
     }
     progress.end();
     Ok(report)
-}
-
-/// Generates, encodes and fetches a scene, as far as that was not done before.
-fn prepare(settings: &RelationsSettings, dir: &Path, kind: &str, seed: u64) -> Result<()> {
-    let program = |name: &str| settings.programs.join(format!("{name}{}", std::env::consts::EXE_SUFFIX));
-    let (scene, store, cache) = (dir.join("scene"), dir.join("store"), dir.join("cache"));
-    let (poses, splat) = (scene.join("transforms.json"), scene.join("scene.ply"));
-    if !poses.is_file() {
-        let (seed, n_views) = (seed.to_string(), settings.n_views.to_string());
-        let mut command = Command::new(program("slag-lab"));
-        command.args(["generate", "scene", "--kind", kind, "--seed", &seed, "--n-views", &n_views, "--out"]);
-        finish(command.arg(&scene))?;
-    }
-    if !store.join("manifest").is_file() {
-        let mut command = Command::new(program("slag-encoder"));
-        command.args(["encode", "--metric", "--scene"]).arg(&splat).arg("--views").arg(&poses);
-        finish(command.arg("--store").arg(&store))?;
-    }
-    if !cache.join("current").is_file() {
-        let server = Service::start(&program("slag-encoder"), &["--store"], &store)?;
-        let mut command = Command::new(program("slag-edge"));
-        command.args([
-            "fetch",
-            "--trust-first",
-            "--at",
-            "0,0,0",
-            "--radius",
-            "1e6",
-            "--from",
-            &server.url(),
-            "--cache",
-        ]);
-        finish(command.arg(&cache))?;
-    }
-    Ok(())
-}
-
-fn finish(command: &mut Command) -> Result<()> {
-    let output =
-        command.stdin(Stdio::null()).output().with_context(|| format!("cannot start {command:?}"))?;
-    if output.status.success() {
-        return Ok(());
-    }
-    Err(anyhow!("{command:?}: {}", String::from_utf8_lossy(&output.stderr).trim()))
 }
 
 /// Asks a robot about a scene.

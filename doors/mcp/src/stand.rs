@@ -1,0 +1,115 @@
+//! What `where_to_stand` takes and gives.
+
+use rmcp::schemars::{self, JsonSchema};
+use serde::{Deserialize, Serialize};
+use slag_robot::Goals;
+
+/// A thing to go to, and the robot that goes.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Going {
+    /// A thing in a few words, as for `find`.
+    #[schemars(length(min = 1, max = 512))]
+    pub what: String,
+    /// Where the robot is, [x, y, z] in the world frame. Absent: where the robot itself says it is.
+    pub near: Option<[f64; 3]>,
+    /// Radius of the robot, metres, seen from above; 0.3 if absent.
+    #[schemars(range(min = 0.05, max = 2.0))]
+    pub radius_m: Option<f64>,
+    /// How close its middle must come to the thing's surface, metres; 0.8 if absent.
+    #[schemars(range(min = 0.0, max = 10.0))]
+    pub reach_m: Option<f64>,
+    /// Height of its camera above the ground, metres; 0.4 if absent.
+    #[schemars(range(min = 0.05, max = 2.3))]
+    pub sensor_height_m: Option<f64>,
+}
+
+/// Places to stand, best first.
+#[derive(Debug, Serialize, JsonSchema)]
+pub struct Stands {
+    /// Name of the scene.
+    pub scene: String,
+    /// The state of the map; positions of different generations are not comparable.
+    pub generation: u64,
+    /// The thing; its id and its middle in the world frame.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub thing: Option<Target>,
+    /// Best first. Empty: see `none`.
+    pub places: Vec<Stand>,
+    /// Why there is none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub none: Option<NoStand>,
+}
+
+/// The thing that the places are near.
+#[derive(Debug, Serialize, JsonSchema)]
+pub struct Target {
+    /// Its name within this generation.
+    pub id: String,
+    /// Its middle.
+    pub position_in_world: [f64; 3],
+}
+
+/// A place to stand that the robot reaches, and from which it sees the thing.
+#[derive(Debug, Serialize, JsonSchema)]
+pub struct Stand {
+    /// The ground below the robot's middle, metres.
+    pub position_in_world: [f64; 3],
+    /// Where the robot looks: radians from the world's x axis towards y.
+    pub yaw_rad: f64,
+    /// The same as a quaternion x, y, z, w.
+    pub orientation_xyzw: [f64; 4],
+    /// Distance from the robot's middle to what it must not touch, metres.
+    pub clearance_m: f64,
+    /// Share of the thing that is seen from there, 0 to 1.
+    pub visible_share: f64,
+    /// Length of the way, metres.
+    pub way_m: f64,
+    /// Latitude and longitude (WGS 84), where the scene is geo-referenced.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lat_lon_deg: Option<[f64; 2]>,
+}
+
+/// Why there is no place.
+#[derive(Debug, Serialize, JsonSchema)]
+pub struct NoStand {
+    /// "no-such-thing", "unreachable", "unknown-ground" or "not-visible".
+    pub kind: String,
+    /// The same in a sentence.
+    pub detail: String,
+}
+
+impl Going {
+    /// Returns the parameters of `GET /v1/goal`.
+    pub fn parameters(&self) -> Vec<(&'static str, String)> {
+        let number = |name, value: Option<f64>| value.map(|value| (name, value.to_string()));
+        let near = self.near.map(|[x, y, z]| ("near", format!("{x},{y},{z}")));
+        let robot = [
+            number("radius_m", self.radius_m),
+            number("reach_m", self.reach_m),
+            number("sensor_height_m", self.sensor_height_m),
+        ];
+        [Some(("text", self.what.clone())), near].into_iter().chain(robot).flatten().collect()
+    }
+}
+
+impl From<Goals> for Stands {
+    fn from(goals: Goals) -> Self {
+        let stand = |goal: slag_robot::Goal| Stand {
+            position_in_world: goal.position_in_world,
+            yaw_rad: goal.yaw_rad,
+            orientation_xyzw: goal.orientation_xyzw,
+            clearance_m: goal.clearance_m,
+            visible_share: goal.visible_share,
+            way_m: goal.path_m,
+            lat_lon_deg: goal.geographic.map(|place| [place.latitude_deg, place.longitude_deg]),
+        };
+        Self {
+            scene: goals.scene,
+            generation: goals.generation,
+            thing: goals.thing.map(|of| Target { id: of.id, position_in_world: of.position_in_world }),
+            places: goals.goals.into_iter().map(stand).collect(),
+            none: goals.none.map(|none| NoStand { kind: none.kind, detail: none.detail }),
+        }
+    }
+}

@@ -1,0 +1,120 @@
+//! `goal`.
+
+use std::io::Write;
+use std::path::PathBuf;
+
+use clap::Args;
+use glam::DVec3;
+use slag_edge::goal::{self, Goal, GoalError, GoalReply, GoalRequest, GoalTarget};
+use slag_edge::query::{object_id, parse_point};
+use slag_edge::score::Budget;
+
+use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
+use super::failure::{Failure, store_failure};
+use super::output::print_json;
+use super::text::{table, visible};
+
+#[derive(Debug, Args)]
+pub struct GoalArgs {
+    /// The thing to go to, in words or by its id (o and 16 hex digits).
+    pub thing: String,
+    /// Where the robot is, world frame [default: the middle of the area on board].
+    #[arg(long, value_name = "X,Y,Z", value_parser = parse_point, allow_hyphen_values = true)]
+    pub near: Option<DVec3>,
+    /// Radius of the robot, seen from above.
+    #[arg(long, value_name = "M", default_value_t = 0.3)]
+    pub radius_m: f64,
+    /// Largest horizontal distance from the robot's middle to the thing's surface.
+    #[arg(long, value_name = "M", default_value_t = 0.8)]
+    pub reach_m: f64,
+    /// Height of the sensor above the ground.
+    #[arg(long, value_name = "M", default_value_t = 0.4)]
+    pub sensor_height_m: f64,
+    /// Height of the robot [default: 0.1 above the sensor].
+    #[arg(long, value_name = "M")]
+    pub height_m: Option<f64>,
+    /// Highest step that it climbs.
+    #[arg(long, value_name = "M", default_value_t = 0.1)]
+    pub step_m: f64,
+    /// How far around it ground is looked at.
+    #[arg(long, value_name = "M", default_value_t = 20.0)]
+    pub range_m: f64,
+    /// Least share of the thing that the sensor must see.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.1)]
+    pub min_visible: f64,
+    /// Most poses.
+    #[arg(long, default_value_t = 3)]
+    pub limit: usize,
+    /// Write the ground around the robot as a picture: black what it must not touch, grey what is unknown, white where it
+    /// can go.
+    #[arg(long, value_name = "FILE.pgm")]
+    pub map: Option<PathBuf>,
+    #[command(flatten)]
+    pub threads: ThreadArgs,
+    #[command(flatten)]
+    pub cache: CacheArgs,
+    #[command(flatten)]
+    pub models: ModelArgs,
+    /// Print the poses as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+pub fn run(args: GoalArgs) -> Result<(), Failure> {
+    let target =
+        object_id(&args.thing).map_or_else(|| GoalTarget::Text(args.thing.clone()), GoalTarget::Object);
+    let request = GoalRequest {
+        near: args.near,
+        radius_m: args.radius_m,
+        reach_m: args.reach_m,
+        sensor_height_m: args.sensor_height_m,
+        height_m: args.height_m,
+        step_m: args.step_m,
+        range_m: args.range_m,
+        min_visible: args.min_visible,
+        limit: args.limit,
+        ..GoalRequest::new(target)
+    };
+    request.check().map_err(|e| Failure::Usage(e.into()))?;
+    args.threads.apply()?;
+    let engine = engine(args.cache.open()?, &args.models)?;
+    engine.reload().map_err(store_failure)?;
+    if let Some(path) = &args.map {
+        let map = goal::floor_map(&engine, &request).map_err(failure)?;
+        map.write_pgm(std::io::BufWriter::new(fs_err::File::create(path)?))?;
+    }
+    let reply = goal::find(&engine, &request, &Budget::default()).map_err(failure)?;
+    if args.json {
+        return print_json(&reply);
+    }
+    Ok(std::io::stdout().write_all(lines(&reply).as_bytes())?)
+}
+
+fn failure(error: GoalError) -> Failure {
+    match error {
+        GoalError::Query(error) => error.into(),
+        other => Failure::Failed(other.kind(), other.into()),
+    }
+}
+
+fn lines(reply: &GoalReply) -> String {
+    let mut text = String::new();
+    if let Some(thing) = &reply.thing {
+        let [x, y, z] = thing.position_in_world.to_array();
+        text.push_str(&format!("{} at {x:.2}, {y:.2}, {z:.2}\n", thing.id));
+        let row = |goal: &Goal| {
+            let [x, y, z] = goal.position_in_world.to_array();
+            let lengths = [x, y, z, goal.yaw_rad, goal.clearance_m, goal.path_m, goal.distance_m];
+            let mut row: Vec<String> = lengths.iter().map(|length| format!("{length:.2}")).collect();
+            row.push(format!("{:.0} %", 100.0 * goal.visible_share));
+            row
+        };
+        let rows: Vec<Vec<String>> = reply.goals.iter().map(row).collect();
+        let head = ["x", "y", "z", "yaw", "clearance m", "way m", "distance m", "visible"];
+        text.push_str(&table(&head, &rows));
+    }
+    if let Some(none) = &reply.none {
+        text.push_str(&format!("no place to stand: {}\n", visible(&none.detail)));
+    }
+    text
+}

@@ -1,0 +1,160 @@
+//! Candidates around a thing, their costs, and the best of them.
+
+use glam::DVec3;
+use rayon::prelude::*;
+use slag_math::distance_transform::{FAR, squared_distances};
+
+use super::ground::Floor;
+use super::reply::{Goal, NoGoal};
+use super::request::GoalRequest;
+use super::sight;
+use super::space::Window;
+use super::surroundings::Around;
+
+/// Gaussians of a thing that are looked at.
+pub const SAMPLES: usize = 128;
+/// Edge of the squares of which only the cheapest candidate is looked at closely, metres.
+const SQUARE_M: f64 = 0.2;
+/// Most candidates that are looked at closely: half of them the cheapest, half spread over the others.
+const MAX_CANDIDATES: usize = 256;
+/// Least distance between two poses of a reply, metres.
+const APART_M: f64 = 0.5;
+/// Clearance beyond the robot's radius above which more is worth nothing, metres.
+const COMFORT_M: f64 = 0.3;
+/// Metres of way that a pose without any comfort is worse than one with all.
+const CLEARANCE_WEIGHT_M: f64 = 2.0;
+/// Metres of way that a pose that sees nothing would be worse than one that sees all.
+const SIGHT_WEIGHT_M: f64 = 4.0;
+
+/// A place near the thing.
+#[derive(Clone, Copy)]
+struct Candidate {
+    cell: usize,
+    /// Way and clearance; what is seen is not known yet.
+    cost_m: f64,
+}
+
+/// Returns the best poses near the thing with a surface at `points`, or why there is none.
+pub fn choose(around: &Around<'_>, request: &GoalRequest, points: &[DVec3]) -> Result<Vec<Goal>, NoGoal> {
+    let window = &around.space.window;
+    let near = cells_near(window, points, request.reach_m + window.voxel * 0.5f64.sqrt());
+    let reached: Vec<Candidate> = near.iter().filter_map(|cell| candidate(around, request, *cell)).collect();
+    if reached.is_empty() {
+        return Err(missing(around, &near));
+    }
+    let goals: Vec<Goal> = sifted(window, reached)
+        .into_par_iter()
+        .filter_map(|candidate| goal(around, request, points, candidate))
+        .collect();
+    if goals.is_empty() {
+        return Err(NoGoal::Unreachable);
+    }
+    let mut seeing: Vec<Goal> =
+        goals.into_iter().filter(|goal| goal.visible_share >= request.min_visible).collect();
+    if seeing.is_empty() {
+        return Err(NoGoal::NotVisible);
+    }
+    seeing.sort_by(|a, b| a.cost_m.total_cmp(&b.cost_m).then_with(|| place(a).total_cmp(&place(b))));
+    let mut best: Vec<Goal> = Vec::new();
+    for goal in seeing {
+        let is_apart = |other: &Goal| other.position_in_world.distance(goal.position_in_world) >= APART_M;
+        if best.len() < request.limit && best.iter().all(is_apart) {
+            best.push(goal);
+        }
+    }
+    Ok(best)
+}
+
+fn place(goal: &Goal) -> f64 {
+    goal.position_in_world.x + 1e3 * goal.position_in_world.y
+}
+
+/// Returns the cells with a point within a horizontal distance, and those cells alone, in the order of their numbers.
+fn cells_near(window: &Window, points: &[DVec3], distance: f64) -> Vec<usize> {
+    let voxels: Vec<[i64; 2]> =
+        points.iter().map(|point| window.voxel_of(*point)).map(|[x, y, _]| [x.into(), y.into()]).collect();
+    let reach = (distance / window.voxel).ceil() as i64;
+    let n = window.cells().map(|n| n as i64);
+    let bound = |axis: usize| {
+        let of_axis = voxels.iter().map(|voxel| voxel[axis]);
+        let (low, high) = (of_axis.clone().min().unwrap_or(0), of_axis.max().unwrap_or(-1));
+        // Points outside the window count, too: their own cells are within the margin if they matter.
+        (low - reach).max(-reach)..(high + reach + 1).min(n[axis] + reach)
+    };
+    let (xs, ys) = (bound(0), bound(1));
+    if xs.is_empty() || ys.is_empty() {
+        return Vec::new();
+    }
+    let width = (ys.end - ys.start) as usize;
+    let mut has_point = vec![false; width * (xs.end - xs.start) as usize];
+    for [x, y] in voxels.into_iter().filter(|[x, y]| xs.contains(x) && ys.contains(y)) {
+        has_point[(x - xs.start) as usize * width + (y - ys.start) as usize] = true;
+    }
+    let limit = (distance / window.voxel).powi(2);
+    let squared = squared_distances(&has_point, width);
+    let near = squared.iter().enumerate().filter(|(_, d2)| **d2 != FAR && f64::from(**d2) <= limit);
+    let cell = near.map(|(at, _)| [xs.start + (at / width) as i64, ys.start + (at % width) as i64]);
+    cell.filter(|[x, y]| (0..n[0]).contains(x) && (0..n[1]).contains(y))
+        .map(|[x, y]| (x * n[1] + y) as usize)
+        .collect()
+}
+
+fn candidate(around: &Around<'_>, request: &GoalRequest, cell: usize) -> Option<Candidate> {
+    let path_m = around.paths.to(cell)? * around.space.window.voxel;
+    let spare_m = (around.clearance(cell) - request.radius_m).clamp(0.0, COMFORT_M);
+    Some(Candidate { cell, cost_m: path_m + CLEARANCE_WEIGHT_M * (1.0 - spare_m / COMFORT_M) })
+}
+
+/// Returns the cheapest candidate of each square, and of those at most [`MAX_CANDIDATES`].
+fn sifted(window: &Window, candidates: Vec<Candidate>) -> Vec<Candidate> {
+    let square = (SQUARE_M / window.voxel).round().max(1.0) as usize;
+    let n_y = window.cells()[1];
+    let key = |of: &Candidate| (of.cell / n_y / square, of.cell % n_y / square);
+    let mut sorted = candidates;
+    sorted.sort_by(|a, b| key(a).cmp(&key(b)).then(a.cost_m.total_cmp(&b.cost_m)).then(a.cell.cmp(&b.cell)));
+    sorted.dedup_by_key(|of| key(of));
+    sorted.sort_by(|a, b| a.cost_m.total_cmp(&b.cost_m).then(a.cell.cmp(&b.cell)));
+    if sorted.len() <= MAX_CANDIDATES {
+        return sorted;
+    }
+    let rest = sorted.split_off(MAX_CANDIDATES / 2);
+    let step = rest.len().div_ceil(MAX_CANDIDATES / 2);
+    sorted.extend(rest.into_iter().step_by(step));
+    sorted
+}
+
+/// Returns the pose at a candidate; `None` if the thing is out of reach after all.
+fn goal(around: &Around<'_>, request: &GoalRequest, points: &[DVec3], of: Candidate) -> Option<Goal> {
+    let window = &around.space.window;
+    let [x, y] = window.centre_of(of.cell);
+    let distance_m = points.iter().map(|p| (p.x - x).hypot(p.y - y)).fold(f64::INFINITY, f64::min);
+    if distance_m > request.reach_m {
+        return None;
+    }
+    let position_in_world = DVec3::new(x, y, around.floor_height(of.cell)?);
+    let sensor_in_world = position_in_world + DVec3::Z * request.sensor_height_m;
+    let seen: Vec<DVec3> =
+        points.iter().copied().filter(|point| sight::sees(around.space, sensor_in_world, *point)).collect();
+    let visible_share = seen.len() as f64 / points.len() as f64;
+    let looked_at = if seen.is_empty() { points } else { &seen[..] };
+    let middle = looked_at.iter().sum::<DVec3>() / looked_at.len() as f64;
+    let yaw_rad = (middle.y - y).atan2(middle.x - x);
+    Some(Goal {
+        position_in_world,
+        geographic: None,
+        yaw_rad,
+        orientation_xyzw: [0.0, 0.0, (yaw_rad / 2.0).sin(), (yaw_rad / 2.0).cos()],
+        sensor_in_world,
+        clearance_m: around.clearance(of.cell),
+        visible_share,
+        path_m: around.paths.to(of.cell)? * window.voxel,
+        distance_m,
+        cost_m: of.cost_m + SIGHT_WEIGHT_M * (1.0 - visible_share),
+    })
+}
+
+/// Returns why no way leads to any of the cells near a thing.
+fn missing(around: &Around<'_>, near: &[usize]) -> NoGoal {
+    let n_unknown = near.iter().filter(|cell| around.ground.floors[**cell] == Floor::Unknown).count();
+    if near.is_empty() || 2 * n_unknown > near.len() { NoGoal::UnknownGround } else { NoGoal::Unreachable }
+}

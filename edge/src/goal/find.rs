@@ -1,0 +1,157 @@
+//! From a request to poses.
+
+use glam::DVec3;
+use slag_common::occupancy::Occupancy;
+
+use super::choose::{SAMPLES, choose};
+use super::error::GoalError;
+use super::reply::{Goal, GoalMiss, GoalReply, MissedThing, NoGoal, TargetThing};
+use super::request::{GoalRequest, GoalTarget};
+use super::surroundings::{START_M, Surroundings};
+use crate::query::{Ask, Asked, Engine, Outcome, Point, QueryRequest, object_id, relations};
+use crate::score::Budget;
+use crate::store::Snapshot;
+
+/// Things that are tried, best first.
+const MAX_THINGS: usize = 5;
+/// Finds places to stand near a thing. Blocks for tens of milliseconds.
+///
+/// # Errors
+/// [`GoalError`]. That there is no such place is a reply.
+pub fn find(engine: &Engine, request: &GoalRequest, budget: &Budget) -> Result<GoalReply, GoalError> {
+    request.check()?;
+    let snapshot = engine.snapshot()?;
+    let manifest = &snapshot.manifest;
+    if snapshot.objects.is_empty() {
+        return Err(GoalError::NoObjects);
+    }
+    let near = request.near.unwrap_or(snapshot.current.centre_in_world);
+    let things = match things(engine, &snapshot, request, near, budget)? {
+        Ok(things) => things,
+        Err(detail) => {
+            let mut reply = GoalReply::empty(&manifest.scene, manifest.generation, 0.0, near);
+            reply.none = Some(GoalMiss { kind: NoGoal::NoSuchThing, detail });
+            return Ok(reply);
+        }
+    };
+    let seen = Surroundings::look(&snapshot, request, near)?;
+    let voxel = seen.space.window.voxel;
+    let mut reply = GoalReply::empty(&manifest.scene, manifest.generation, voxel, near);
+    let Some(start) = seen.start(near, request.radius_m) else {
+        let detail = format!(
+            "within {START_M} m of [{:.2}, {:.2}], where the robot is taken to be, no known ground is {} m clear",
+            near.x, near.y, request.radius_m
+        );
+        reply.none = Some(GoalMiss { kind: NoGoal::UnknownGround, detail });
+        return Ok(reply);
+    };
+    let around = seen.around(start);
+    for (id, thing) in things {
+        let points = engine.object_points(&snapshot, id, SAMPLES);
+        match choose(&around, request, &points) {
+            Ok(mut goals) => {
+                for goal in &mut goals {
+                    goal.geographic =
+                        manifest.geo_reference.map(|geo| geo.geographic_from_world(goal.position_in_world));
+                }
+                return Ok(GoalReply { thing: Some(thing), goals, ..reply });
+            }
+            Err(none) => reply.missed.push(MissedThing { thing, none }),
+        }
+    }
+    reply.none =
+        reply.missed.first().map(|missed| GoalMiss { kind: missed.none, detail: detail(missed, request) });
+    Ok(reply)
+}
+
+/// Finds the best poses near the thing with a surface at `points`, or why there is none, in the places of some occupancies.
+///
+/// # Errors
+/// [`GoalError::NoOccupancy`]; a range with too many places.
+pub fn stand(
+    occupancies: &[Occupancy<'_>],
+    request: &GoalRequest,
+    near: DVec3,
+    points: &[DVec3],
+) -> Result<Result<Vec<Goal>, NoGoal>, GoalError> {
+    let seen = Surroundings::of(occupancies, request, near)?;
+    let Some(start) = seen.start(near, request.radius_m) else { return Ok(Err(NoGoal::UnknownGround)) };
+    Ok(choose(&seen.around(start), request, points))
+}
+
+fn detail(missed: &MissedThing, request: &GoalRequest) -> String {
+    let MissedThing { thing: TargetThing { id, .. }, none } = missed;
+    let GoalRequest { radius_m, reach_m, range_m, min_visible, sensor_height_m, .. } = request;
+    match none {
+        NoGoal::NoSuchThing => format!("{id} is not on board"),
+        NoGoal::Unreachable => format!(
+            "no way for a robot of {radius_m} m radius leads within {reach_m} m of {id}; a larger reach_m or a smaller radius_m may"
+        ),
+        NoGoal::UnknownGround => format!(
+            "most ground within {reach_m} m of {id} is not known, or farther than {range_m} m from the robot"
+        ),
+        NoGoal::NotVisible => format!(
+            "from no place within {reach_m} m a sensor {sensor_height_m} m above the ground sees {:.0} % of {id}",
+            100.0 * min_visible
+        ),
+    }
+}
+
+type Things = Vec<(u64, TargetThing)>;
+
+/// Returns the things to go to, best first, or why there is none.
+fn things(
+    engine: &Engine,
+    snapshot: &Snapshot,
+    request: &GoalRequest,
+    near: DVec3,
+    budget: &Budget,
+) -> Result<Result<Things, String>, GoalError> {
+    let text = match &request.target {
+        GoalTarget::Object(id) => {
+            let Some(object) = engine.object(snapshot, *id) else {
+                let generation = snapshot.manifest.generation;
+                return Ok(Err(format!("generation {generation} has no object o{id:016x} on board")));
+            };
+            let thing =
+                TargetThing { id: object.id, position_in_world: object.position_in_world, score: None };
+            return Ok(Ok(vec![(*id, thing)]));
+        }
+        GoalTarget::Text(text) => text,
+    };
+    let phrase = relations::understand(text).filter(|phrase| phrase.check().is_ok());
+    let ask = Ask {
+        asked: vec![phrase.map_or_else(|| Asked::Text(text.clone()), Asked::Phrase)],
+        request: QueryRequest { limit: Some(MAX_THINGS), ..QueryRequest::new("") },
+        area: Default::default(),
+        near: Some(Point::World(near.to_array())),
+        heading_rad: None,
+        offset: 0,
+    };
+    let found = engine.ask(&ask, budget)?;
+    let thing = |answer: &crate::query::ClusterAnswer| {
+        let thing = TargetThing {
+            id: answer.id.clone(),
+            position_in_world: answer.position_in_world,
+            score: Some(answer.score),
+        };
+        Some((object_id(&answer.id)?, thing))
+    };
+    let (things, none): (Things, Option<&str>) = match found.outcomes.first() {
+        Some(Outcome::Plain(answers)) => {
+            let crate::query::Found::Clusters(clusters) = &answers.answers else { return Ok(Ok(Vec::new())) };
+            let none = answers.reason.as_ref().map(|reason| reason.detail.as_str());
+            (clusters.iter().filter_map(thing).take(MAX_THINGS).collect(), none)
+        }
+        Some(Outcome::Related(related)) => {
+            let none = related.miss.as_ref().map(|miss| miss.detail.as_str());
+            (related.answers.iter().filter_map(|(of, ..)| thing(of)).take(MAX_THINGS).collect(), none)
+        }
+        None => (Vec::new(), None),
+    };
+    Ok(if things.is_empty() {
+        Err(none.unwrap_or("nothing on board matches").to_owned())
+    } else {
+        Ok(things)
+    })
+}

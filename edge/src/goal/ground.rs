@@ -1,0 +1,139 @@
+//! The ground: in each column of voxels the lowest surface with headroom.
+
+use rayon::prelude::*;
+use slag_common::occupancy::BLOCK_EDGE;
+
+use super::space::{Space, Stacked};
+
+/// How far a surface lies below the upper side of its highest occupied voxel, in edges of a voxel: voxels are occupied up to 0.94
+/// edges from a surface, so it lies 0.94 to 1.44 edges below (`docs/numerics.md`).
+pub const SURFACE_DEPTH: f64 = 1.2;
+
+/// What a cell, a column of voxels, holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Floor {
+    /// Nothing that is known to be ground.
+    Unknown,
+    /// Something that leaves no headroom.
+    Blocked,
+    /// Ground; its highest occupied voxel, from the window's lower side.
+    At(u8),
+}
+
+/// The ground of a space, by cell.
+pub struct Ground {
+    /// `[n_x][n_y]`.
+    pub floors: Vec<Floor>,
+    /// Cells along y.
+    pub n_y: usize,
+}
+
+impl Ground {
+    /// Finds the ground. `headroom`: free voxels that must lie above, 1 to 128. `step`: columns without ground are obstacles
+    /// where more than `step`, and at most `headroom` or `step`, voxels above their lowest occupied voxel another one is: what is
+    /// higher, such as a ceiling, is not in a robot's way.
+    pub fn find(space: &Space, headroom: u32, step: u32) -> Self {
+        let edge = BLOCK_EDGE as usize;
+        let [n_columns_x, n_columns_y] = space.window.n;
+        let n_y = n_columns_y * edge;
+        let mut floors = vec![Floor::Unknown; n_columns_x * edge * n_y];
+        // A piece for each x of the columns: four rows of cells.
+        floors.par_chunks_mut(edge * n_y).enumerate().for_each(|(x, rows)| {
+            for y in 0..n_columns_y {
+                let voxels = voxels_of(space.column(x * n_columns_y + y));
+                for (cell, [occupied, free]) in voxels.into_iter().enumerate() {
+                    rows[cell / edge * n_y + y * edge + cell % edge] = floor(occupied, free, headroom, step);
+                }
+            }
+        });
+        Self { floors, n_y }
+    }
+}
+
+/// Returns occupied and free voxels of the 16 columns of voxels in a column of blocks; bit z is the voxel at height z.
+fn voxels_of(blocks: &[Stacked]) -> [[u128; 2]; 16] {
+    let mut voxels = [[0u128; 2]; 16];
+    for block in blocks {
+        let shift = u32::from(block.z) * BLOCK_EDGE as u32;
+        for (cell, [occupied, free]) in voxels.iter_mut().enumerate() {
+            *occupied |= u128::from(block.occupied >> (4 * cell) & 15) << shift;
+            *free |= u128::from(block.free >> (4 * cell) & 15) << shift;
+        }
+    }
+    voxels
+}
+
+/// Returns a mask of the lowest `n` bits.
+fn low_bits(n: u32) -> u128 {
+    1u128.checked_shl(n).map_or(!0, |bit| bit - 1)
+}
+
+fn floor(occupied: u128, free: u128, headroom: u32, step: u32) -> Floor {
+    if occupied == 0 {
+        return Floor::Unknown;
+    }
+    // Bit z: the voxels z to z + headroom - 1 are free.
+    let (mut above, mut n) = (free, 1);
+    while n < headroom {
+        let shift = n.min(headroom - n);
+        above &= above >> shift;
+        n += shift;
+    }
+    let ground = occupied & !(occupied >> 1) & (above >> 1);
+    if ground != 0 {
+        return Floor::At(ground.trailing_zeros() as u8);
+    }
+    let lowest = occupied.trailing_zeros();
+    let over_step = (occupied >> lowest) & !low_bits(step + 1);
+    if over_step & low_bits(step.max(headroom) + 1) != 0 { Floor::Blocked } else { Floor::Unknown }
+}
+
+#[cfg(test)]
+mod tests {
+    use slag_math::random::Random;
+
+    use super::*;
+
+    /// Oracle: the definition, voxel by voxel.
+    #[test]
+    fn the_ground_is_the_lowest_surface_with_headroom() {
+        let mut random = Random::new(4);
+        let wide = |random: &mut Random| u128::from(random.bits()) << 64 | u128::from(random.bits());
+        for round in 0..20_000 {
+            let headroom = 1 + (random.bits() % 12) as u32;
+            let occupied = wide(&mut random) & wide(&mut random) & wide(&mut random);
+            // Mostly free, or there would hardly be headroom.
+            let unknown = wide(&mut random) & wide(&mut random) & wide(&mut random) & wide(&mut random);
+            let free = !occupied & !unknown;
+            let bit = |mask: u128, z: u32| z < 128 && mask >> z & 1 == 1;
+            let expected = (0..128).find(|z| bit(occupied, *z) && (1..=headroom).all(|h| bit(free, z + h)));
+            match floor(occupied, free, headroom, 3) {
+                Floor::At(found) => assert_eq!(Some(u32::from(found)), expected, "{round}"),
+                _ => assert_eq!(expected, None, "{round}"),
+            }
+        }
+    }
+
+    /// By hand: a floor at 3 with free voxels 4 to 8, then a table top at 9.
+    #[test]
+    fn tables_are_ground_only_without_room_below() {
+        let (occupied, free) = (1 << 3 | 1 << 9, 0b11111 << 4 | 0xfff << 10);
+        assert_eq!(floor(occupied, free, 5, 2), Floor::At(3));
+        assert_eq!(floor(occupied, free, 6, 2), Floor::At(9));
+        assert_eq!(floor(occupied, free, 13, 2), Floor::Blocked);
+        assert_eq!(floor(1 << 3, 0, 1, 2), Floor::Unknown, "nobody has seen the place above");
+        assert_eq!(floor(0, !0, 1, 2), Floor::Unknown, "no ground");
+    }
+
+    /// By hand: nobody has looked at the air between a floor at 3 and a ceiling at 60; a wall; a kerb.
+    #[test]
+    fn a_ceiling_blocks_nobody() {
+        assert_eq!(floor(1 << 3 | 1 << 60, 0, 10, 2), Floor::Unknown);
+        assert_eq!(floor(1 << 3 | 1 << 14 | 1 << 60, 0, 10, 2), Floor::Unknown);
+        assert_eq!(floor(1 << 3 | 1 << 13 | 1 << 60, 0, 10, 2), Floor::Blocked);
+        assert_eq!(floor(!0 << 3, 0, 10, 2), Floor::Blocked);
+        assert_eq!(floor(0b111 << 3, 0, 10, 2), Floor::Unknown);
+        assert_eq!(floor(1 | 1 << 127, 0, 128, 127), Floor::Unknown);
+        assert_eq!(floor(1 | 1 << 127, 0, 128, 126), Floor::Blocked);
+    }
+}

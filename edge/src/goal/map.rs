@@ -1,0 +1,90 @@
+//! The ground around a robot as a picture: for people, and for programs that plan by themselves.
+
+use std::io::{self, Write};
+
+use glam::DVec3;
+
+use super::error::GoalError;
+use super::ground::Floor;
+use super::paths::Paths;
+use super::request::GoalRequest;
+use super::surroundings::Surroundings;
+use crate::query::Engine;
+
+/// What a cell of a floor map is to a robot.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Place {
+    /// Nobody has seen ground there.
+    Unknown,
+    /// It must not be touched.
+    Obstacle,
+    /// Ground; the robot's middle may not or cannot go there.
+    Ground,
+    /// The robot's middle can go there.
+    Reached,
+}
+
+/// The ground around a robot.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FloorMap {
+    /// Edge of a cell, metres.
+    pub cell_m: f64,
+    /// Corner of the first cell: the least x and y.
+    pub origin_in_world: DVec3,
+    /// Cells along x and y.
+    pub size: [usize; 2],
+    /// `[size.y][size.x]`, as ROS numbers them: x first.
+    pub places: Vec<Place>,
+}
+
+/// Maps the ground around a robot; the request's thing counts for nothing.
+///
+/// # Errors
+/// [`GoalError`].
+pub fn floor_map(engine: &Engine, request: &GoalRequest) -> Result<FloorMap, GoalError> {
+    request.check()?;
+    let snapshot = engine.snapshot()?;
+    let near = request.near.unwrap_or(snapshot.current.centre_in_world);
+    let seen = Surroundings::look(&snapshot, request, near)?;
+    let start = seen.start(near, request.radius_m);
+    let paths = start.map(|start| Paths::from(start, &seen.is_safe, &seen.ground, seen.step));
+    let window = &seen.space.window;
+    let [n_x, n_y] = window.cells();
+    let place = |x: usize, y: usize| {
+        let cell = x * n_y + y;
+        match seen.ground.floors[cell] {
+            Floor::Unknown => Place::Unknown,
+            Floor::Blocked => Place::Obstacle,
+            Floor::At(_) if seen.squared[cell] == 0 => Place::Obstacle,
+            Floor::At(_) if paths.as_ref().is_some_and(|paths| paths.to(cell).is_some()) => Place::Reached,
+            Floor::At(_) => Place::Ground,
+        }
+    };
+    let [x, y] = window.centre_of(0);
+    Ok(FloorMap {
+        cell_m: window.voxel,
+        origin_in_world: DVec3::new(x - window.voxel / 2.0, y - window.voxel / 2.0, near.z),
+        size: [n_x, n_y],
+        places: (0..n_y).flat_map(|y| (0..n_x).map(move |x| (x, y))).map(|(x, y)| place(x, y)).collect(),
+    })
+}
+
+impl FloorMap {
+    /// Writes a PGM, north (y) up: unknown 128, obstacles 0, ground 200, ground that the robot reaches 255. ROS's map_server
+    /// reads it.
+    ///
+    /// # Errors
+    /// Those of the writer.
+    pub fn write_pgm(&self, mut out: impl Write) -> io::Result<()> {
+        let [width, height] = self.size;
+        write!(out, "P5\n{width} {height}\n255\n")?;
+        let grey = |place: &Place| match place {
+            Place::Unknown => 128u8,
+            Place::Obstacle => 0,
+            Place::Ground => 200,
+            Place::Reached => 255,
+        };
+        let rows = self.places.chunks_exact(width.max(1)).rev();
+        rows.into_iter().try_for_each(|row| out.write_all(&row.iter().map(grey).collect::<Vec<u8>>()))
+    }
+}

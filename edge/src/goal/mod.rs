@@ -1,0 +1,33 @@
+//! Places to stand: poses near a thing that a robot reaches, and sees the thing from. The definitions are in
+//! `docs/numerics.md`.
+//!
+//! | step | result | file |
+//! |---|---|---|
+//! | space | the blocks around the robot, in columns | `space.rs` |
+//! | ground | the lowest surface with headroom, in each column of voxels | `ground.rs` |
+//! | clearance | distance of each place to what the robot must not touch | `clearance.rs` |
+//! | paths | length of the way from the robot | `paths.rs` |
+//! | sight | what a sensor sees of the thing | `sight.rs` |
+//! | choose | candidates, their costs, the best | `choose.rs` |
+
+mod choose;
+mod clearance;
+mod error;
+mod find;
+mod ground;
+mod map;
+mod paths;
+mod reply;
+mod request;
+mod sight;
+mod space;
+mod surroundings;
+
+#[cfg(test)]
+mod tests;
+
+pub use error::GoalError;
+pub use find::{find, stand};
+pub use map::{FloorMap, Place, floor_map};
+pub use reply::{Goal, GoalMiss, GoalReply, MissedThing, NoGoal, TargetThing};
+pub use request::{GoalRequest, GoalTarget};

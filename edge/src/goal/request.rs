@@ -1,0 +1,93 @@
+//! What a robot asks for, and its size.
+
+use glam::DVec3;
+
+use crate::query::RequestError;
+
+/// The thing to go to.
+#[derive(Clone, Debug, PartialEq)]
+pub enum GoalTarget {
+    /// What matches a text, best first; a text may name relations, as in `/v1/query`.
+    Text(String),
+    /// An object by its id.
+    Object(u64),
+}
+
+/// A request for places to stand. Lengths in metres.
+#[derive(Clone, Debug, PartialEq)]
+pub struct GoalRequest {
+    /// The thing to go to.
+    pub target: GoalTarget,
+    /// Where the robot is, world frame; the centre of the area on board if absent.
+    pub near: Option<DVec3>,
+    /// Radius of the robot's outline, seen from above.
+    pub radius_m: f64,
+    /// Largest horizontal distance from the robot's middle to the thing's surface.
+    pub reach_m: f64,
+    /// Height of the sensor above the ground.
+    pub sensor_height_m: f64,
+    /// Height of the robot; 0.1 m above the sensor if absent.
+    pub height_m: Option<f64>,
+    /// Highest step that it climbs.
+    pub step_m: f64,
+    /// How far around the robot ground is looked at.
+    pub range_m: f64,
+    /// Least share of the thing's Gaussians that the sensor must see.
+    pub min_visible: f64,
+    /// Most poses.
+    pub limit: usize,
+}
+
+impl GoalRequest {
+    /// Asks for places to stand near a thing, for a robot of 0.3 m radius with a sensor 0.4 m above the ground.
+    pub fn new(target: GoalTarget) -> Self {
+        Self {
+            target,
+            near: None,
+            radius_m: 0.3,
+            reach_m: 0.8,
+            sensor_height_m: 0.4,
+            height_m: None,
+            step_m: 0.1,
+            range_m: 20.0,
+            min_visible: 0.1,
+            limit: 3,
+        }
+    }
+
+    /// Returns the robot's height.
+    pub fn height(&self) -> f64 {
+        self.height_m.unwrap_or(self.sensor_height_m + 0.1)
+    }
+
+    /// Checks every limit that does not depend on the scene.
+    ///
+    /// # Errors
+    /// The first parameter that is out of its range.
+    pub fn check(&self) -> Result<(), RequestError> {
+        // Places are known up to 2.4 m above a surface.
+        let ranges = [
+            ("radius_m", self.radius_m, 0.05, 2.0),
+            ("reach_m", self.reach_m, 0.0, 10.0),
+            ("sensor_height_m", self.sensor_height_m, 0.05, 2.3),
+            ("height_m", self.height(), self.sensor_height_m, 2.4),
+            ("step_m", self.step_m, 0.0, 0.5),
+            ("range_m", self.range_m, 1.0, 50.0),
+            ("min_visible", self.min_visible, 0.01, 1.0),
+        ];
+        for (name, value, low, high) in ranges {
+            if !(low..=high).contains(&value) {
+                return Err(RequestError::new(name, &value.to_string(), format!("{low} to {high}")));
+            }
+        }
+        if !(1..=20).contains(&self.limit) {
+            return Err(RequestError::new("limit", &self.limit.to_string(), "1 to 20 poses"));
+        }
+        match self.near {
+            Some(near) if !near.is_finite() || near.abs().max_element() >= 1e9 => {
+                Err(RequestError::new("near", &near.to_string(), "a position within a million kilometres"))
+            }
+            _ => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,200 @@
+use glam::DVec3;
+use slag_common::occupancy::{Block, BuiltOccupancy};
+
+use super::*;
+
+const VOXEL: f64 = 0.05;
+
+/// What a made world is at a point.
+#[derive(Clone, Copy, PartialEq)]
+enum At {
+    Free,
+    Solid,
+    Unseen,
+}
+
+/// Packs a world of 6 by 6 by 1.6 m: the state of a voxel is that of its centre.
+fn packed(world: impl Fn(DVec3) -> At) -> BuiltOccupancy {
+    let mut blocks = Vec::new();
+    for at in (-2..32).flat_map(|x| (-2..32).flat_map(move |y| (-2..8).map(move |z| [x, y, z]))) {
+        let mut block = Block { at, occupied: 0, free: 0 };
+        for bit in 0..64i32 {
+            let voxel = [4 * at[0] + bit / 16, 4 * at[1] + bit / 4 % 4, 4 * at[2] + bit % 4];
+            match world((DVec3::from(voxel.map(f64::from)) + 0.5) * VOXEL) {
+                At::Free => block.free |= 1 << bit,
+                At::Solid => block.occupied |= 1 << bit,
+                At::Unseen => {}
+            }
+        }
+        blocks.push(block);
+    }
+    BuiltOccupancy::pack(VOXEL, 0.1, 2, &blocks)
+}
+
+fn inside(point: DVec3, low: [f64; 3], high: [f64; 3]) -> bool {
+    point.cmpge(low.into()).all() && point.cmplt(high.into()).all()
+}
+
+/// A hall of 6 by 6 m with a floor at z = 0 and a box of 0.4 m at its middle, and more.
+fn hall(more: impl Fn(DVec3) -> Option<At>) -> impl Fn(DVec3) -> At {
+    move |p| match () {
+        () if !inside(p, [0.0, 0.0, -0.1], [6.0, 6.0, 1.5]) => At::Unseen,
+        () if p.z < 0.0 || inside(p, [2.8, 2.8, 0.0], [3.2, 3.2, 0.4]) => At::Solid,
+        () => more(p).unwrap_or(At::Free),
+    }
+}
+
+/// The surface of the box.
+fn points() -> Vec<DVec3> {
+    let steps = [2.8, 2.9, 3.0, 3.1, 3.2];
+    let all = steps
+        .into_iter()
+        .flat_map(|x| steps.into_iter().flat_map(move |y| [0.1, 0.2, 0.3, 0.4].map(|z| DVec3::new(x, y, z))));
+    all.filter(|p| p.x == 2.8 || p.x == 3.2 || p.y == 2.8 || p.y == 3.2 || p.z == 0.4).collect()
+}
+
+const START: DVec3 = DVec3::new(0.6, 3.0, 0.0);
+
+fn goals_with(world: &BuiltOccupancy, request: &GoalRequest) -> Result<Vec<Goal>, NoGoal> {
+    stand(&[world.view()], request, START, &points()).expect("places are known")
+}
+
+fn goals(more: impl Fn(DVec3) -> Option<At>) -> Result<Vec<Goal>, NoGoal> {
+    goals_with(&packed(hall(more)), &GoalRequest { limit: 5, ..GoalRequest::new(GoalTarget::Object(1)) })
+}
+
+/// Distances, clearances and headings by the hall's geometry.
+#[test]
+fn poses_are_in_reach_clear_and_turned_to_the_thing() {
+    let found = goals(|_| None).expect("poses");
+    assert!(found.len() > 1);
+    for goal in &found {
+        let Goal { position_in_world: at, distance_m, clearance_m, path_m, .. } = *goal;
+        let outside = |v: f64| (2.8 - v).max(v - 3.2).max(0.0);
+        let true_distance = outside(at.x).hypot(outside(at.y));
+        assert!(true_distance <= 0.8 && (true_distance - distance_m).abs() < 0.06, "{goal:?}");
+        // Cells are obstacles by their centres, up to half a voxel behind the surface.
+        assert!(clearance_m >= 0.3 && (clearance_m - true_distance).abs() < 0.06, "{goal:?}");
+        assert!(at.z.abs() < 0.1, "{goal:?}");
+        let line = at.distance(START);
+        assert!(path_m > line - 0.1 && path_m < 1.09 * line + 0.1, "{goal:?}");
+        // The near sides and the top are seen, the far sides are not.
+        assert!(goal.visible_share > 0.3 && goal.visible_share < 0.85, "{goal:?}");
+        let heading = DVec3::new(goal.yaw_rad.cos(), goal.yaw_rad.sin(), 0.0);
+        let towards = (DVec3::new(3.0, 3.0, 0.0) - at).with_z(0.0).normalize();
+        assert!(heading.dot(towards) > 0.9, "{goal:?}");
+        let [x, y, z, w] = goal.orientation_xyzw;
+        let turned = glam::DQuat::from_xyzw(x, y, z, w) * DVec3::X;
+        assert!((turned - heading).length() < 1e-9, "{goal:?}");
+    }
+    // The best one is on the robot's side.
+    assert!(found[0].position_in_world.x < 2.8, "{:?}", found[0]);
+    let apart = |a: &Goal, b: &Goal| a.position_in_world.distance(b.position_in_world) >= 0.5;
+    assert!((1..found.len()).all(|i| (0..i).all(|j| apart(&found[i], &found[j]))));
+}
+
+#[test]
+fn what_is_walled_off_is_unreachable() {
+    let wall = |p: DVec3| inside(p, [1.5, 0.0, 0.0], [1.6, 6.0, 1.5]).then_some(At::Solid);
+    assert_eq!(goals(wall), Err(NoGoal::Unreachable));
+    // With a door of 0.8 m it is reached, with one of 0.5 m it is not.
+    let door = |half: f64| move |p: DVec3| wall(p).filter(|_| (p.y - 5.0).abs() > half);
+    let found = goals(door(0.4)).expect("poses");
+    assert!(
+        found[0].path_m > START.distance(DVec3::new(1.5, 5.0, 0.0)),
+        "by way of the door: {:?}",
+        found[0]
+    );
+    assert_eq!(goals(door(0.25)), Err(NoGoal::Unreachable));
+}
+
+#[test]
+fn unknown_is_never_free() {
+    // Nobody has looked at a strip of ground across the hall.
+    let strip = |p: DVec3| inside(p, [1.5, 0.0, -0.1], [2.0, 6.0, 1.5]).then_some(At::Unseen);
+    assert_eq!(goals(strip), Err(NoGoal::Unreachable));
+    // Ground that was seen, below air that was not.
+    let air = |p: DVec3| inside(p, [1.5, 0.0, 0.3], [2.0, 6.0, 1.5]).then_some(At::Unseen);
+    assert_eq!(goals(air), Err(NoGoal::Unreachable));
+    let around_thing = |p: DVec3| inside(p, [1.5, 1.5, -0.1], [4.5, 4.5, 1.5]).then_some(At::Unseen);
+    assert_eq!(goals(around_thing), Err(NoGoal::UnknownGround));
+    let at_robot = |p: DVec3| inside(p, [0.0, 1.5, -0.1], [2.0, 4.5, 1.5]).then_some(At::Unseen);
+    assert_eq!(goals(at_robot), Err(NoGoal::UnknownGround));
+    // Fog between the robot's places and the thing hides it.
+    let ring = |p: DVec3| {
+        let d = (p.x - 3.0).abs().max((p.y - 3.0).abs());
+        (p.z > 0.05 && d > 0.3 && d < 0.45).then_some(At::Unseen)
+    };
+    assert_eq!(goals(ring), Err(NoGoal::NotVisible));
+}
+
+#[test]
+fn a_screen_hides_the_thing_from_low_sensors() {
+    let screen = |p: DVec3| {
+        let d = (p.x - 3.0).abs().max((p.y - 3.0).abs());
+        (p.z < 0.6 && d > 0.35 && d < 0.4).then_some(At::Solid)
+    };
+    let world = packed(hall(screen));
+    let request =
+        |sensor_height_m| GoalRequest { sensor_height_m, ..GoalRequest::new(GoalTarget::Object(1)) };
+    assert_eq!(goals_with(&world, &request(0.4)), Err(NoGoal::NotVisible));
+    goals_with(&world, &request(1.3)).expect("over the screen it is seen");
+}
+
+#[test]
+fn steps_and_slopes_count() {
+    let ramp = |rise: f64| {
+        move |p: DVec3| {
+            let height = ((p.x - 1.2) * rise).clamp(0.0, 0.3);
+            (p.x < 2.5 && p.z < height)
+                .then_some(At::Solid)
+                .or_else(|| (p.z < 0.3 && p.x >= 2.5 && p.x < 2.6).then_some(At::Solid))
+        }
+    };
+    // Up a ramp, to a drop of 0.3 m at 2.6 m: from its upper side the box is 0.5 m away, closer no way leads.
+    let world = packed(hall(ramp(0.3)));
+    let within = |reach_m| GoalRequest { reach_m, ..GoalRequest::new(GoalTarget::Object(1)) };
+    let found = goals_with(&world, &within(0.8)).expect("poses");
+    assert!(found.iter().all(|goal| goal.position_in_world.x <= 2.31), "{found:?}");
+    assert_eq!(goals_with(&world, &within(0.45)), Err(NoGoal::Unreachable));
+    // A threshold of 5 cm is climbed, one of 15 cm is not.
+    let threshold =
+        |height: f64| move |p: DVec3| (inside(p, [1.5, 0.0, 0.0], [2.0, 6.0, height])).then_some(At::Solid);
+    goals(threshold(0.05)).expect("poses");
+    assert_eq!(goals(threshold(0.15)), Err(NoGoal::Unreachable));
+    let world = packed(hall(threshold(0.15)));
+    let request = GoalRequest { step_m: 0.2, ..GoalRequest::new(GoalTarget::Object(1)) };
+    goals_with(&world, &request).expect("a robot that climbs 20 cm");
+    // A slope that is reached by a ramp on both sides.
+    let hill = |p: DVec3| (p.z < (0.5 - (p.x - 1.8).abs()).max(0.0) * 0.6).then_some(At::Solid);
+    goals(hill).expect("over the hill");
+}
+
+#[test]
+fn tables_are_driven_under_or_around() {
+    // A table of 0.7 m over the whole way: a low robot drives below, a high one cannot.
+    let table = |p: DVec3| inside(p, [1.4, 0.0, 0.65], [2.0, 6.0, 0.7]).then_some(At::Solid);
+    let world = packed(hall(table));
+    goals_with(&world, &GoalRequest::new(GoalTarget::Object(1))).expect("below the table");
+    let high = GoalRequest { height_m: Some(0.9), ..GoalRequest::new(GoalTarget::Object(1)) };
+    assert_eq!(goals_with(&world, &high), Err(NoGoal::Unreachable));
+}
+
+#[test]
+fn requests_out_of_range_name_the_parameter() {
+    let refused = |change: &dyn Fn(&mut GoalRequest)| {
+        let mut request = GoalRequest::new(GoalTarget::Object(1));
+        request.check().expect("the default is valid");
+        change(&mut request);
+        request.check().expect_err("refused").parameter
+    };
+    assert_eq!(refused(&|r| r.radius_m = 0.0), "radius_m");
+    assert_eq!(refused(&|r| r.reach_m = f64::NAN), "reach_m");
+    assert_eq!(refused(&|r| r.height_m = Some(0.2)), "height_m");
+    assert_eq!(refused(&|r| r.sensor_height_m = 2.4), "sensor_height_m");
+    assert_eq!(refused(&|r| r.step_m = -0.1), "step_m");
+    assert_eq!(refused(&|r| r.range_m = 51.0), "range_m");
+    assert_eq!(refused(&|r| r.min_visible = 0.0), "min_visible");
+    assert_eq!(refused(&|r| r.limit = 0), "limit");
+    assert_eq!(refused(&|r| r.near = Some(DVec3::splat(f64::INFINITY))), "near");
+}

@@ -1,0 +1,113 @@
+//! Which places are free, occupied or unknown, for robots that move. The definition is in `docs/numerics.md`.
+//!
+//! | step | result | file |
+//! |---|---|---|
+//! | density | voxels with a surface, from all Gaussians | `density.rs` |
+//! | seen | voxels that views have looked through, from depth pictures | `seen.rs` |
+//! | owners | the cell that stores each block | `owners.rs` |
+
+mod density;
+mod lattice;
+mod owners;
+mod seen;
+
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use serde::Serialize;
+use slag_common::occupancy::{Block, BuiltOccupancy};
+use slag_common::{Gaussians, View};
+
+use crate::cells::{CellSplit, NO_CELL};
+use crate::memory::{MemoryPlan, Phase};
+use crate::raster::{LoadedScene, RasterError, RasterView};
+use lattice::Lattice;
+
+pub use density::{MAX_SIGMAS, MIN_OPACITY, VOXEL_VARIANCE};
+pub use seen::MIN_VIEWS;
+
+/// How places are told apart.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct OccupancySettings {
+    /// Edge of a voxel, metres.
+    pub voxel_m: f64,
+}
+
+/// The occupancy of a scene.
+pub struct SceneOccupancy {
+    /// By cell.
+    pub cells: Vec<BuiltOccupancy>,
+    /// What was found.
+    pub report: OccupancyReport,
+}
+
+/// What was found of a scene's places.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct OccupancyReport {
+    /// Edge of a voxel, metres.
+    pub voxel_m: f64,
+    /// Voxels with a surface.
+    pub n_occupied: u64,
+    /// Voxels that views have looked through.
+    pub n_free: u64,
+    /// Gaussians too large to be a thing, which were left out.
+    pub n_background: usize,
+    /// Bytes of all cells, in each profile.
+    pub len_bytes: u64,
+    /// Seconds.
+    pub secs: f64,
+}
+
+impl SceneOccupancy {
+    /// Reserves what is held until the last shard is written.
+    pub fn reserve(&self, memory: &mut MemoryPlan) {
+        memory.reserve(Phase::Always, "free and occupied places", self.report.len_bytes);
+    }
+}
+
+/// Finds the free and occupied places of a scene from its Gaussians and the views that look at it; `None` if cancelled.
+///
+/// # Errors
+/// A view cannot be drawn: its index in `views`, and the cause.
+pub fn find(
+    gaussians: &Gaussians,
+    split: &CellSplit,
+    scene: &dyn LoadedScene,
+    views: &[&View],
+    settings: OccupancySettings,
+    cancel: &AtomicBool,
+) -> Result<Option<SceneOccupancy>, (usize, RasterError)> {
+    let start = std::time::Instant::now();
+    let lattice = Lattice { voxel: settings.voxel_m };
+    let in_cells = (0u32..).zip(&split.cell_of_gaussian).filter(|(_, cell)| **cell != NO_CELL);
+    let usable: Vec<u32> = in_cells.map(|(index, _)| index).collect();
+    let occupied = density::occupied(gaussians, &usable, lattice);
+    let mut candidates = seen::candidates(&occupied.blocks, lattice);
+    for (at, view) in views.iter().enumerate() {
+        if cancel.load(Ordering::Relaxed) {
+            return Ok(None);
+        }
+        let width_px = seen::DEPTH_WIDTH_PX.min(view.intrinsics.width_px);
+        let intrinsics = view.intrinsics.without_distortion().scaled_to_width(width_px);
+        let view = RasterView { camera_from_world: view.camera_from_world, intrinsics };
+        let drawing = scene.draw(&view, [0.0; 3]).map_err(|source| (at, source))?;
+        seen::Depth::new(view, &drawing).look(lattice, &mut candidates);
+    }
+    let blocks: Vec<Block> = candidates
+        .iter()
+        .map(|block| Block { at: block.at, occupied: block.occupied, free: block.seen & !block.occupied })
+        .filter(|block| block.occupied | block.free != 0)
+        .collect();
+    drop(candidates);
+    let of_cell = owners::by_cell(&blocks, split, lattice);
+    let pack = |blocks: &Vec<Block>| BuiltOccupancy::pack(settings.voxel_m, MIN_OPACITY, MIN_VIEWS, blocks);
+    let cells: Vec<BuiltOccupancy> = of_cell.iter().map(pack).collect();
+    let report = OccupancyReport {
+        voxel_m: settings.voxel_m,
+        n_occupied: blocks.iter().map(|block| u64::from(block.occupied.count_ones())).sum(),
+        n_free: blocks.iter().map(|block| u64::from(block.free.count_ones())).sum(),
+        n_background: occupied.n_background,
+        len_bytes: cells.iter().map(BuiltOccupancy::len_bytes).sum(),
+        secs: start.elapsed().as_secs_f64(),
+    };
+    Ok(Some(SceneOccupancy { cells, report }))
+}
