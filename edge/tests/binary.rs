@@ -20,16 +20,22 @@ use slag_models::{ModelDir, SessionOptions};
 /// Returns the manifest and the one shard of a scene with 40 red Gaussians around x = 2 and 60 blue
 /// ones around x = 8, in the colour stand-in's space.
 fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
-    let text =
-        TextService::open(&ModelDir::colours(), &SessionOptions::new("not-needed".into())).expect("built in");
     let mut positions: Vec<[u16; 3]> = (0..40).map(|i| [2000 + i, 0, 0]).collect();
     positions.extend((0..60).map(|i| [8000 + i, 0, 0]));
+    painted(&positions, 40)
+}
+
+/// Returns the manifest and the one shard of a scene whose first Gaussians are red and the others blue; positions in millimetres.
+fn painted(positions: &[[u16; 3]], n_red: u32) -> (Vec<u8>, Vec<u8>) {
+    let n_gaussians = positions.len() as u32;
+    let text =
+        TextService::open(&ModelDir::colours(), &SessionOptions::new("not-needed".into())).expect("built in");
     let vector = |word: &str| text.encode(word).expect("known").to_vec();
     let (centroids, centroid_step) = quantise(&[vector("red"), vector("blue")].concat());
     let bounds = Aabb { min: DVec3::ZERO, max: DVec3::splat(10.0) };
     let header = ShardHeader {
         cell_id: 0,
-        n_gaussians: 100,
+        n_gaussians,
         n_centroids: 2,
         dim: text.info().dim,
         n_components: text.info().dim,
@@ -46,8 +52,8 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
     let mut shard = Vec::new();
     ShardView {
         header,
-        positions: Positions::Wide(&positions),
-        centroid_starts: &[0, 40, 100],
+        positions: Positions::Wide(positions),
+        centroid_starts: &[0, n_red, n_gaussians],
         centroids: &centroids,
         radii: &[0.05; 2],
         basis: None,
@@ -80,10 +86,10 @@ fn red_and_blue() -> (Vec<u8>, Vec<u8>) {
             default_threshold: 0.8,
             calibration: None,
         },
-        n_gaussians: 100,
+        n_gaussians: n_gaussians.into(),
         n_without_evidence: 0,
         n_rejected: 0,
-        cells: vec![CellRecord { cell_id: 0, bounds, n_gaussians: 100, shards }],
+        cells: vec![CellRecord { cell_id: 0, bounds, n_gaussians, shards }],
     };
     (manifest.to_bytes(), shard)
 }
@@ -356,4 +362,33 @@ fn the_image_model_stays_with_the_encoder() {
         program.windows(middle.len()).any(|bytes| bytes == middle)
     };
     assert_eq!((carries("text.onnx"), carries("image.onnx")), (true, false));
+}
+
+/// The question of the memory attack: every Gaussian matches, and is a cluster of its own, whatever the limit.
+const ATTACK: &str = "kind=clusters&threshold=-1&min_count=1&voxel=1e-9&limit=1";
+
+/// The flags set the budget of a query, and a refusal names it.
+#[test]
+fn budgets_of_queries_come_from_flags() {
+    let grid = |i: u32| [i % 100, i / 100 % 100, i / 10_000].map(|at| at as u16 * 100);
+    let positions: Vec<[u16; 3]> = (0..120_000).map(grid).collect();
+    let (listed, shard) = painted(&positions, 60_000);
+    let dir = tempfile::tempdir().expect("a folder");
+    let from = store(listed, shard);
+    assert_eq!(run(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]).0, Some(0));
+    let texts = ["text=red", "text=blue"].repeat(16).join("&");
+    for (bytes, secs, question, statuses, expected) in [
+        ("1048576", "60", "text=red", &[422][..], "1048576 bytes"),
+        ("1073741824", "60", "text=red", &[200], ""),
+        // Whichever of the two notices first: the computing, or the service that waits for it.
+        ("4294967296", "1", &texts, &[422, 503], "1 s"),
+    ] {
+        let flags = ["--max-query-bytes", bytes, "--max-query-secs", secs];
+        let (serving, url) = serve(dir.path(), &flags);
+        let (found, answer) = get(&format!("{url}/query?{question}&{ATTACK}"));
+        stop(serving);
+        assert!(statuses.contains(&found), "{flags:?}: {found}: {answer}");
+        let detail = answer["detail"].as_str().unwrap_or_default();
+        assert!(detail.contains(expected), "{flags:?}: {detail}");
+    }
 }

@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::anyhow;
@@ -53,6 +53,10 @@ pub struct ServeArgs {
     /// Most time that one query may take, seconds.
     #[arg(long, value_name = "S", default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=3600))]
     pub max_query_secs: u64,
+    /// Read every shard on board again within this time, seconds, evenly; 0: never. One that rotted costs its cell only, and the
+    /// next fetch replaces it.
+    #[arg(long, value_name = "S", default_value_t = 24 * 3600)]
+    pub scrub_secs: u64,
     /// Follow the robot: fetch from this store around the positions posted to POST /position.
     #[arg(long, value_name = "URL")]
     pub follow: Option<String>,
@@ -120,6 +124,7 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
             }
             None => None,
         };
+        let scrub = scrub_in_background(&app, args.scrub_secs)?;
         let supervisor = Supervisor::of(&variable).map(Arc::new);
         if let Some(supervisor) = supervisor.clone() {
             supervisor.ready();
@@ -132,12 +137,24 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
         };
         let served = http::serve(app, listener, stop).await;
         // A fetch in progress need not be awaited: the next one resumes it.
-        follower.inspect(|cancel| cancel.store(true, Ordering::Relaxed));
+        [follower, scrub].iter().flatten().for_each(|cancel| cancel.store(true, Ordering::Relaxed));
         Ok(served?)
     });
     // A query that does not end must not keep the process alive.
     runtime.shutdown_timeout(drain);
     served
+}
+
+/// Scrubs on a thread of its own until the returned flag is set.
+fn scrub_in_background(app: &Arc<App>, secs: u64) -> Result<Option<Arc<AtomicBool>>, Failure> {
+    if secs == 0 {
+        return Ok(None);
+    }
+    let (app, cancel) = (Arc::clone(app), Arc::<AtomicBool>::default());
+    let stop = Arc::clone(&cancel);
+    let scrub = move || http::keep_scrubbing(&app, Duration::from_secs(secs), &stop);
+    std::thread::Builder::new().name("scrub".into()).spawn(scrub)?;
+    Ok(Some(cancel))
 }
 
 /// Returns who may ask.

@@ -109,6 +109,11 @@ impl Follower {
         }
     }
 
+    /// Forgets what is on board: a fetch is due wherever the robot is.
+    pub fn forget(&mut self) {
+        self.covered = None;
+    }
+
     /// Records a successful fetch and its start.
     pub fn fetched(&mut self, began: Duration, centre_in_world: DVec3) {
         (self.covered, self.attempted) = (Some((centre_in_world, began)), Some(began));
@@ -146,6 +151,8 @@ pub struct FollowStatus {
 struct Inbox {
     status: FollowStatus,
     n_posted: u64,
+    /// Whether a fetch is due at the position where the robot is.
+    is_due: bool,
     is_over: bool,
     /// Failures of the follower itself since the last fetch that ended.
     n_failures_in_a_row: u64,
@@ -163,6 +170,14 @@ impl Following {
     pub fn post(&self, position: Position) {
         let mut inbox = self.lock();
         inbox.status.position = Some(position);
+        inbox.n_posted += 1;
+        self.changed.notify_all();
+    }
+
+    /// Makes a fetch due at the robot's position: something on board was lost.
+    pub fn refresh(&self) {
+        let mut inbox = self.lock();
+        inbox.is_due = true;
         inbox.n_posted += 1;
         self.changed.notify_all();
     }
@@ -253,10 +268,13 @@ pub fn follow(
         if environment.cancel.load(Ordering::Relaxed) {
             return Err(FetchError::Cancelled);
         }
-        let (position, n_seen, is_over) = {
-            let inbox = following.lock();
-            (inbox.status.position, inbox.n_posted, inbox.is_over)
+        let (position, n_seen, is_over, is_due) = {
+            let mut inbox = following.lock();
+            (inbox.status.position, inbox.n_posted, inbox.is_over, std::mem::take(&mut inbox.is_due))
         };
+        if is_due {
+            follower.forget();
+        }
         let Some(position) = position else {
             if is_over {
                 return Ok(());

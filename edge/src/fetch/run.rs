@@ -21,7 +21,7 @@ use super::scrub::{digests, scrub};
 use super::staging::{clear_manifests, clear_staging, held_shards, part_path, put, staging};
 use super::trust::trust_first;
 use super::usage::Usage;
-use crate::store::{Current, EdgeCache, StoreError};
+use crate::store::{Current, EdgeCache, StoreError, damaged};
 
 /// Most bytes of a cell in `current`.
 const CELL_BYTES: u64 = 512;
@@ -96,7 +96,8 @@ pub fn fetch(
     let wanted = Wanted { profile, centre_in_world, radius, max_bytes };
     let mut plan = Plan::new(&offer.manifest, &wanted, &held)?;
     let check = Check::new(&offer.manifest, profile, &plan.cells);
-    let scrubbed = scrub(cache, &check, &plan.keep, &usage, environment.now_unix_secs);
+    let marked = damaged::marked(cache);
+    let scrubbed = scrub(cache, &check, &plan.keep, &marked, &usage, environment.now_unix_secs);
     if !scrubbed.unfit.is_empty() {
         held.retain(|hash, _| !scrubbed.unfit.contains(hash));
         plan = Plan::new(&offer.manifest, &wanted, &held)?;
@@ -120,6 +121,7 @@ pub fn fetch(
         check_space(cache, &plan.download, other_bytes)?;
         let check = Check::new(&offer.manifest, profile, &plan.cells);
         let mut downloaded = download_all(cache, &client, &check, &plan.download, request.parallel)?;
+        damaged::unmark(cache, marked.intersection(&downloaded.good))?;
         let current = assemble(before, &offer, &wanted, &plan, &downloaded.bad);
         for (hash, (_, error)) in &downloaded.bad {
             let cell_id = check.cell(*hash).map_or(0, |cell| cell.cell_id);
@@ -131,7 +133,8 @@ pub fn fetch(
                 return Err(error);
             }
         }
-        if old.as_ref() != Some(&current) {
+        // Readers open the generation again where a shard of it was replaced.
+        if old.as_ref() != Some(&current) || !downloaded.good.is_empty() {
             put(cache, &offer.bytes, &cache.manifest_path(offer.manifest_hash))?;
             let bytes = serde_json::to_vec(&current).map_err(io::Error::from)?;
             put(cache, &bytes, &cache.current_path())?;
@@ -149,7 +152,8 @@ pub fn fetch(
     let manifests = current.old_shards().map(|(_, old)| old.manifest_hash).chain([offer.manifest_hash]);
     clear_manifests(cache, &manifests.collect())?;
     clear_staging(cache, &[])?;
-    let on_board = in_use.iter().chain(&plan.spare).copied().collect();
+    let on_board: BTreeSet<Hash32> = in_use.iter().chain(&plan.spare).copied().collect();
+    damaged::unmark(cache, marked.difference(&on_board))?;
     usage.finish(&in_use, &digests, &on_board, environment.now_unix_secs);
     let tally = |hashes: &BTreeSet<Hash32>| Tally::of(hashes.iter().map(|hash| held[hash].len_bytes));
     let is_downloaded = |object: &&Object| downloaded.contains(&object.hash);

@@ -29,17 +29,18 @@ pub struct Scrubbed {
     pub sound: BTreeSet<Hash32>,
 }
 
-/// Checks the objects of a plan that are on board.
+/// Checks the objects of a plan that are on board. `damaged`: those that readers marked; they are not read.
 pub fn scrub(
     cache: &EdgeCache,
     check: &Check<'_>,
     kept: &BTreeSet<Hash32>,
+    damaged: &BTreeSet<Hash32>,
     usage: &Usage,
     now_unix_secs: u64,
 ) -> Scrubbed {
     let mut due = Vec::new();
     let mut unchanged = Vec::new();
-    for hash in kept {
+    for hash in kept.difference(damaged) {
         let digest = digest(cache, check, *hash);
         match usage.checked(*hash).filter(|checked| Some(checked.digest) == digest) {
             Some(checked) => unchanged.push((*hash, checked)),
@@ -53,7 +54,7 @@ pub fn scrub(
         (*hash, mapped.and_then(|bytes| check.object(&path, *hash, &bytes)).err())
     };
     let faults: Vec<_> = store::beside_queries(|| due.par_iter().map(fault).collect());
-    let mut scrubbed = Scrubbed::default();
+    let mut scrubbed = Scrubbed { unfit: kept & damaged, ..Scrubbed::default() };
     for (hash, fault) in faults {
         match fault {
             Some(e) => {

@@ -1,10 +1,12 @@
 //! The service's state.
 
-use std::sync::Arc;
+use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use glam::DVec3;
+use slag_common::Hash32;
 use slag_common::manifest::Manifest;
 use slag_service::problem::Problem;
 use tokio::sync::{Semaphore, watch};
@@ -30,6 +32,8 @@ pub struct App {
     /// Whether the service stops: what never ends by itself ends then.
     pub(super) stopping: watch::Sender<bool>,
     is_reloading: AtomicBool,
+    /// Unreadable shards for which a fetch was asked.
+    asked: Mutex<BTreeSet<Hash32>>,
     n_reload_attempts: watch::Sender<u64>,
 }
 
@@ -41,7 +45,7 @@ impl App {
 
     /// Serves an engine as [`App::new`] does, and hands the positions of `POST /position` to `following`.
     pub fn following(engine: Engine, settings: Settings, following: Option<Arc<Following>>) -> Arc<Self> {
-        Arc::new(Self {
+        let app = Self {
             engine,
             permits: Arc::new(Semaphore::new(settings.max_queries)),
             query_memory: Pool::new(settings.all_queries_bytes),
@@ -51,8 +55,11 @@ impl App {
             metrics: Metrics::default(),
             following,
             is_reloading: AtomicBool::new(false),
+            asked: Mutex::default(),
             n_reload_attempts: watch::Sender::new(0),
-        })
+        };
+        app.ask_for_unreadable();
+        Arc::new(app)
     }
 
     /// Returns what a query that begins now may use.
@@ -106,13 +113,27 @@ impl App {
         }
         let _attempt = Attempt(self);
         let counter = match self.engine.reload() {
-            Ok(()) => &self.metrics.reloads,
+            Ok(()) => {
+                self.ask_for_unreadable();
+                &self.metrics.reloads
+            }
             Err(error) => {
                 tracing::warn!("the newest generation does not open: {}", crate::error_line(&error));
                 &self.metrics.reload_failures
             }
         };
         counter.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Has the follower fetch shards that do not open, once each.
+    fn ask_for_unreadable(&self) {
+        let (Some(following), Ok(snapshot)) = (&self.following, self.engine.snapshot()) else { return };
+        let unreadable: BTreeSet<Hash32> = snapshot.unreadable().collect();
+        let mut asked = self.asked.lock().unwrap_or_else(PoisonError::into_inner);
+        if !unreadable.is_subset(&asked) {
+            following.refresh();
+        }
+        *asked = unreadable;
     }
 
     /// Runs blocking or computing work off the async threads.

@@ -8,6 +8,7 @@ mod position;
 mod problem;
 mod query;
 mod router;
+mod scrub;
 mod settings;
 mod status;
 mod v1;
@@ -16,6 +17,7 @@ pub use app::App;
 pub use follower::{RESTARTS, keep_following};
 pub use query::parse_query;
 pub use router::{is_alive, serve};
+pub use scrub::keep_scrubbing;
 pub use settings::Settings;
 
 #[cfg(test)]

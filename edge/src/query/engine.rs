@@ -139,8 +139,9 @@ impl Engine {
         let mut loaded = self.loaded.write().unwrap_or_else(PoisonError::into_inner);
         match opened {
             Ok(snapshot) => {
-                let (tried, snapshot) = (snapshot.current_stat, Some(Arc::new(snapshot)));
-                let before = std::mem::replace(&mut *loaded, Loaded { snapshot, tried, failed_at: None });
+                let (tried, failed_at) = (snapshot.current_stat, snapshot.may_recover.then(Instant::now));
+                let snapshot = Some(Arc::new(snapshot));
+                let before = std::mem::replace(&mut *loaded, Loaded { snapshot, tried, failed_at });
                 // Unmapping many shards takes a while; others must not wait for the lock.
                 drop(loaded);
                 drop(before);

@@ -1,4 +1,4 @@
-//! Cells whose shards could not be fetched: each costs that cell only.
+//! Cells whose shards could not be fetched, or not be opened: each costs that cell only.
 
 use std::fmt;
 
@@ -16,9 +16,11 @@ pub enum CellFault {
     Damaged,
     /// It has its hash, but is not the shard that the manifest describes.
     Invalid,
+    /// Its file on board is missing, damaged or cannot be read.
+    Unreadable,
 }
 
-/// A cell whose shard is not on board, although it is within the radius.
+/// A cell whose shard does not answer, although it is within the radius.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BadCell {
@@ -38,6 +40,7 @@ impl fmt::Display for BadCell {
             CellFault::Missing => "missing",
             CellFault::Damaged => "damaged",
             CellFault::Invalid => "invalid",
+            CellFault::Unreadable => "unreadable on board",
         };
         write!(f, "{cell_id} ({fault}")?;
         match old {

@@ -99,6 +99,11 @@ impl EdgeCache {
         self.dir.join("shards").join(hash.to_string())
     }
 
+    /// Returns the folder of the marks of damaged shards.
+    pub(super) fn damaged_dir(&self) -> PathBuf {
+        self.dir.join("damaged")
+    }
+
     /// Returns the path of a manifest.
     pub fn manifest_path(&self, hash: Hash32) -> PathBuf {
         self.dir.join("manifests").join(hash.to_string())

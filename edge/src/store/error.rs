@@ -34,6 +34,12 @@ pub enum StoreError {
         /// The file.
         path: PathBuf,
     },
+    /// A shard was found damaged before, and not replaced since.
+    #[error("{path} was found damaged; fetch again, which replaces it", path = path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+    },
     /// A file's content does not match its name.
     #[error("{path}: content has hash {found}, expected {expected}; fetch again, which replaces it", path = path.display())]
     Hash {

@@ -6,6 +6,7 @@
 //! | `manifests/HASH` | verified manifests, immutable | fetch: renamed in, removed |
 //! | `current` | [`Current`]: the generation in use | fetch: replaced whole |
 //! | `staging/` | partial downloads | fetch |
+//! | `damaged/HASH` | marks of shards that were found damaged | readers: added; fetch: removed |
 //! | `trust/` | accepted metadata and scene, in two copies | fetch |
 //! | `db/` | which shards were used and checked | fetch |
 //! | `lock` | locked by the one fetch | |
@@ -15,16 +16,19 @@
 
 mod bad_cell;
 mod cache;
+pub mod damaged;
 mod error;
 pub mod files;
 pub mod mmap;
 pub mod objects;
+mod scrubber;
 mod shard;
 mod snapshot;
 
 pub use bad_cell::{BadCell, CellFault, OldShard, can_stand_in, cell_of};
 pub use cache::{Current, CurrentCell, EdgeCache};
 pub use error::StoreError;
+pub use scrubber::{Scrubbed, Scrubber};
 pub use shard::{OpenShard, check_shard};
 pub use snapshot::Snapshot;
 pub(crate) use snapshot::beside_queries;

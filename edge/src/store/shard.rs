@@ -49,6 +49,11 @@ impl OpenShard {
         self.layout.occupancy(&self.bytes)
     }
 
+    /// Returns the hash of its bytes, by the manifest.
+    pub fn hash(&self, profile: Profile) -> Option<Hash32> {
+        self.cell.shards.get(&profile).map(|shard| shard.hash)
+    }
+
     /// Returns its length.
     pub fn len_bytes(&self) -> u64 {
         self.bytes.len() as u64

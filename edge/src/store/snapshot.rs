@@ -3,10 +3,12 @@
 use std::sync::{Arc, OnceLock};
 
 use rayon::prelude::*;
+use slag_common::Hash32;
 use slag_common::manifest::Manifest;
 
-use super::bad_cell::{BadCell, can_stand_in};
+use super::bad_cell::{BadCell, CellFault, can_stand_in};
 use super::cache::{Current, CurrentCell, EdgeCache};
+use super::damaged;
 use super::error::StoreError;
 use super::files::Stat;
 use super::objects::ObjectIndex;
@@ -26,17 +28,20 @@ pub struct Snapshot {
     pub manifest: Manifest,
     /// The shards, by cell id, ascending; shared with snapshots of other generations that list them.
     pub shards: Vec<Arc<OpenShard>>,
-    /// Cells within the radius whose shards could not be fetched; some have an earlier generation's shard.
+    /// Cells within the radius whose shards could not be fetched or opened; some have an earlier generation's shard.
     pub bad_cells: Vec<BadCell>,
+    /// Whether a shard could not be opened for a reason that may pass, such as too many open files.
+    pub may_recover: bool,
     /// Their objects.
     pub objects: ObjectIndex,
 }
 
 impl Snapshot {
-    /// Opens the current generation: maps and checks every shard once.
+    /// Opens the current generation: maps and checks every shard once. One that does not open costs its cell only, and is marked
+    /// for the next fetch.
     ///
     /// # Errors
-    /// [`StoreError`]. A fetch that replaces `current` meanwhile is not an error.
+    /// [`StoreError`]; that of the first shard if none opens. A fetch that replaces `current` meanwhile is not an error.
     pub fn open(cache: &EdgeCache) -> Result<Self, StoreError> {
         Self::open_after(cache, None)
     }
@@ -52,12 +57,10 @@ impl Snapshot {
             let current_stat = cache.current_stat()?;
             let current =
                 cache.current()?.ok_or_else(|| StoreError::Empty { path: cache.dir().to_owned() })?;
-            match Self::open_current(cache, current.clone(), current_stat, before) {
-                // A fetch removes the files of the old `current` after it has put the new one in place.
-                Err(StoreError::Missing { path }) if seen.as_ref() == Some(&current) => {
-                    return Err(StoreError::Missing { path });
-                }
-                Err(StoreError::Missing { .. }) => seen = Some(current),
+            // A fetch removes the files of the old `current` after it has put the new one in place.
+            let is_settled = seen.as_ref() == Some(&current);
+            match Self::open_current(cache, current.clone(), current_stat, before, is_settled) {
+                Err(StoreError::Missing { .. }) if !is_settled => seen = Some(current),
                 other => return other,
             }
         }
@@ -70,10 +73,15 @@ impl Snapshot {
         current: Current,
         current_stat: Option<Stat>,
         before: Option<&Self>,
+        is_settled: bool,
     ) -> Result<Self, StoreError> {
         let manifest = cache.read_manifest(current.manifest_hash)?;
         let profile = current.profile;
+        let marked = damaged::marked(cache);
         let open = |manifest: &Manifest, cell: &CurrentCell| {
+            if marked.contains(&cell.hash) {
+                return Err(StoreError::Damaged { path: cache.shard_path(cell.hash) });
+            }
             let held = before.map_or(&[][..], |before| &before.shards);
             let held =
                 held.binary_search_by_key(&cell.cell_id, |shard| shard.cell.cell_id).ok().map(|at| &held[at]);
@@ -84,8 +92,18 @@ impl Snapshot {
         };
         let opened: Vec<Result<Arc<OpenShard>, StoreError>> =
             beside_queries(|| current.cells.par_iter().map(|cell| open(&manifest, cell)).collect());
-        let mut shards: Vec<Arc<OpenShard>> = opened.into_iter().collect::<Result<_, _>>()?;
         let mut bad_cells = current.bad_cells.clone();
+        let (mut shards, mut failures) = (Vec::with_capacity(opened.len()), Vec::new());
+        for (cell, opened) in current.cells.iter().zip(opened) {
+            match opened {
+                Ok(shard) => shards.push(shard),
+                // Not the shard's fault, but that of `current`; or that of a reader who is late.
+                Err(e @ StoreError::Unlisted { .. }) => return Err(e),
+                Err(e @ StoreError::Missing { .. }) if !is_settled => return Err(e),
+                Err(e) => failures.push((cell, e)),
+            }
+        }
+        let may_recover = failures.iter().any(|(_, e)| matches!(e, StoreError::Io(_)));
         for bad in &mut bad_cells {
             let Some(old) = bad.old else { continue };
             let cell = CurrentCell { cell_id: bad.cell_id, hash: old.hash, len_bytes: old.len_bytes };
@@ -103,10 +121,31 @@ impl Snapshot {
                 }
             }
         }
+        for (cell, e) in &failures {
+            if matches!(e, StoreError::Shard { .. } | StoreError::Mismatch { .. }) {
+                damaged::mark(cache, cell.hash);
+            }
+            tracing::warn!("cell {} does not answer: {}", cell.cell_id, crate::error_line(e));
+            bad_cells.push(BadCell { cell_id: cell.cell_id, fault: CellFault::Unreadable, old: None });
+        }
+        match failures.into_iter().next() {
+            Some((_, e)) if shards.is_empty() => return Err(e),
+            _ => {}
+        }
+        bad_cells.sort_by_key(|bad| bad.cell_id);
         shards.sort_by_key(|shard| shard.cell.cell_id);
         let objects = shards.iter().map(|shard| shard.objects()).collect::<Vec<_>>();
         let objects = ObjectIndex::new(&objects);
-        Ok(Self { current, current_stat, manifest, shards, bad_cells, objects })
+        Ok(Self { current, current_stat, manifest, shards, bad_cells, may_recover, objects })
+    }
+
+    /// Returns the shards on board that do not open.
+    pub fn unreadable(&self) -> impl Iterator<Item = Hash32> + '_ {
+        let cells = self.bad_cells.iter().filter(|bad| bad.fault == CellFault::Unreadable);
+        cells.filter_map(|bad| {
+            let at = self.current.cells.binary_search_by_key(&bad.cell_id, |cell| cell.cell_id).ok()?;
+            Some(self.current.cells[at].hash)
+        })
     }
 }
 

@@ -60,11 +60,14 @@ fn place(position: [f64; 3]) -> Place {
     position.map(|v| (v * 1e6).round() as i64)
 }
 
+pub fn text_service() -> TextService {
+    let info = EncoderInfo { name: "e".into(), id: ENCODER, dim: DIM, execution_provider: "none" };
+    TextService::start(info, Box::new(FirstAxis)).expect("a thread")
+}
+
 /// Asks for everything; returns the generation that answered and the positions found.
 fn ask(cache: EdgeCache) -> Result<(u64, BTreeSet<Place>), String> {
-    let info = EncoderInfo { name: "e".into(), id: ENCODER, dim: DIM, execution_provider: "none" };
-    let text = TextService::start(info, Box::new(FirstAxis)).expect("a thread");
-    let engine = Engine::new(cache, text);
+    let engine = Engine::new(cache, text_service());
     engine.reload().map_err(|e| slag_edge::error_line(&e))?;
     let request =
         QueryRequest { kind: Some(AnswerKind::Gaussians), limit: Some(10_000), ..QueryRequest::new("x") };

@@ -154,3 +154,22 @@ fn a_frozen_store_is_noticed() {
     assert!(matches!(trial.refuses(expiring(NOW - 1000, 2)), TufError::Expired { .. }));
     trial.accepts(expiring(NOW - 999, 2));
 }
+
+/// Time is the later of the clock and the newest signed time. A clock that is ahead stops fetches while it is ahead, and
+/// leaves nothing behind; at 1970, what the newest signed time allows is taken.
+#[test]
+fn a_clock_that_is_wrong_costs_no_more_than_fetches() {
+    let mut trial = Trial::new(of(1, &[FIRST], 1));
+    let wrong = [NOW + 1000, NOW + (10 << 30), u64::MAX];
+    for ahead in wrong {
+        trial.robot.now_unix_secs = ahead;
+        let error = trial.refuses(of(2, &[FIRST], 2));
+        assert!(matches!(error, TufError::Expired { .. }), "{ahead}: {error}");
+    }
+    trial.robot.now_unix_secs = NOW;
+    trial.accepts(of(2, &[FIRST], 2));
+    for (version, clock) in [(3, 0), (4, NOW - 2000), (5, NOW + 999)] {
+        trial.robot.now_unix_secs = clock;
+        trial.accepts(of(version, &[FIRST], version));
+    }
+}

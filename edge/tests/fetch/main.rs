@@ -6,6 +6,7 @@ mod follow;
 mod hostile;
 mod keys;
 mod partial;
+mod rot;
 mod scene;
 mod server;
 mod sim;

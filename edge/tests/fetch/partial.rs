@@ -22,7 +22,7 @@ fn at_cells(
 }
 
 /// Returns the cells that answer, with the hash of each shard's content.
-fn answering(snapshot: &Snapshot) -> Vec<(u32, Hash32)> {
+pub fn answering(snapshot: &Snapshot) -> Vec<(u32, Hash32)> {
     let hash = |shard: &slag_edge::store::OpenShard| {
         let view = shard.view();
         let positions = (0..view.header.n_gaussians as usize).map(|i| view.position_in_world(i).to_string());

@@ -1,0 +1,37 @@
+//! Shards on board that a reader found damaged. Readers hold no lock, so that they only leave a mark: an empty file
+//! `damaged/HASH`. A marked shard is not opened any more, and the next fetch downloads it again, unread: a sector that cannot be
+//! read would end the program that maps it.
+
+use std::collections::BTreeSet;
+
+use slag_common::Hash32;
+
+use super::cache::EdgeCache;
+
+/// Marks a shard. Without the mark it is found within a day.
+pub fn mark(cache: &EdgeCache, hash: Hash32) {
+    let dir = cache.damaged_dir();
+    let marked = cache.files().create_dir(&dir).and_then(|()| {
+        let path = dir.join(hash.to_string());
+        cache.files().write_from(&path, 0, &[])
+    });
+    if let Err(e) = marked {
+        tracing::warn!("a damaged shard is not marked, so that it is downloaded again later: {e}");
+    }
+}
+
+/// Returns the marked shards.
+pub fn marked(cache: &EdgeCache) -> BTreeSet<Hash32> {
+    // Without a folder nothing is marked.
+    let names = cache.files().list(&cache.damaged_dir()).unwrap_or_default();
+    names.iter().filter_map(|name| name.parse().ok()).collect()
+}
+
+/// Removes marks: the shards are replaced, or no longer on board.
+///
+/// # Errors
+/// The file system's.
+pub fn unmark<'a>(cache: &EdgeCache, hashes: impl IntoIterator<Item = &'a Hash32>) -> std::io::Result<()> {
+    let dir = cache.damaged_dir();
+    hashes.into_iter().try_for_each(|hash| cache.files().remove(&dir.join(hash.to_string())))
+}

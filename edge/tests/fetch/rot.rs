@@ -1,0 +1,180 @@
+//! A shard that rots on board costs its cell only, is named, and is fetched again.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc;
+use std::time::Duration;
+
+use slag_common::shard::Profile;
+use slag_edge::fetch::follow::{FollowEnvironment, FollowSettings, Following, follow};
+use slag_edge::http::{App, Settings, keep_scrubbing};
+use slag_edge::query::Engine;
+use slag_edge::store::{BadCell, CellFault, Scrubber, Snapshot};
+
+use super::faults::text_service;
+use super::partial::answering;
+use super::scene::Published;
+use super::server::Server;
+use super::sim::SimFiles;
+use super::{Robot, assert_holds, at};
+
+const UNREADABLE: BadCell = BadCell { cell_id: 1, fault: CellFault::Unreadable, old: None };
+
+/// Flips a bit of a file, and leaves its time as it was: no fetch would read it before a day has passed.
+pub fn flip_unseen(path: &std::path::Path) {
+    let modified = fs_err::metadata(path).expect("there").modified().expect("known");
+    let mut bytes = fs_err::read(path).expect("there");
+    bytes[600] ^= 1;
+    fs_err::write(path, &bytes).expect("written");
+    std::fs::OpenOptions::new().write(true).open(path).expect("there").set_modified(modified).expect("set");
+}
+
+fn cells(snapshot: &Snapshot) -> Vec<u32> {
+    snapshot.shards.iter().map(|shard| shard.cell.cell_id).collect()
+}
+
+#[test]
+fn a_rotten_shard_costs_its_cell_only() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let scene = Published::new(1, &[0; 3], 40);
+    let server = Server::start(scene.clone());
+    let robot = Robot::on_disk(dir.path(), &server.url());
+    robot.fetch().expect("works");
+    // Older than the grain of file times, so that fetches do not read the files again.
+    std::thread::sleep(std::time::Duration::from_millis(150));
+    robot.fetch().expect("nothing new");
+    let path = robot.cache.shard_path(scene.hash(1, Profile::Compact));
+    let faults: [(&str, &dyn Fn()); 3] = [
+        ("a flipped bit", &|| flip_unseen(&path)),
+        ("another file", &|| fs_err::write(&path, b"x").expect("written")),
+        ("no file", &|| fs_err::remove_file(&path).expect("there")),
+    ];
+    for (name, damage) in faults {
+        damage();
+        // However often it is opened, and whatever an earlier snapshot holds.
+        let mut before: Option<Snapshot> = None;
+        for _ in 0..2 {
+            let snapshot = Snapshot::open_after(&robot.cache, before.as_ref()).expect(name);
+            assert_eq!((cells(&snapshot), &snapshot.bad_cells), (vec![0, 2], &vec![UNREADABLE]), "{name}");
+            before = Some(snapshot);
+        }
+        let stat = robot.cache.current_stat().expect("there");
+        assert_eq!(robot.fetch().expect("heals").downloaded.n_shards, 1, "{name}");
+        assert_ne!(
+            robot.cache.current_stat().expect("there"),
+            stat,
+            "{name}: readers see that they may open it"
+        );
+        let snapshot = robot.snapshot();
+        assert_holds(&snapshot, &scene, 0..3);
+        assert_eq!(snapshot.bad_cells, [], "{name}");
+        assert_eq!(robot.fetch().expect("nothing new").downloaded.n_shards, 0, "{name}");
+        std::thread::sleep(std::time::Duration::from_millis(150));
+        robot.fetch().expect("nothing new");
+    }
+}
+
+/// Whichever bit of whichever shards flips: the others answer, and so does a rotten one whose columns are whole (padding).
+#[test]
+fn any_rot_costs_its_cells_only() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let scene = Published::new(1, &[0; 3], 40);
+    let server = Server::start(scene.clone());
+    let files = Arc::new(SimFiles::default());
+    let robot = Robot::on_sim(dir.path(), files.clone(), &server.url());
+    robot.fetch().expect("works");
+    let whole = answering(&robot.snapshot());
+    let mut n_lost = 0;
+    for seed in 0..200u64 {
+        let mut random = slag_math::random::Random::new(seed);
+        let files = Arc::new(files.fork(None, seed));
+        let robot = Robot::on_sim(dir.path(), files.clone(), &server.url());
+        let rotten = 1 + seed % 7;
+        for id in (0..3u32).filter(|id| rotten >> id & 1 == 1) {
+            files.flip(&robot.cache.shard_path(scene.hash(id, Profile::Compact)), &mut random);
+        }
+        let expected: Vec<u32> = (0..3).filter(|id| rotten >> id & 1 == 0).collect();
+        match Snapshot::open(&robot.cache) {
+            Ok(snapshot) => {
+                let found = answering(&snapshot);
+                assert!(found.iter().all(|cell| whole.contains(cell)), "seed {seed}: another answer");
+                assert!(
+                    expected.iter().all(|id| cells(&snapshot).contains(id)),
+                    "seed {seed}: a whole cell is lost"
+                );
+                assert_eq!(found.len() + snapshot.bad_cells.len(), 3, "seed {seed}");
+                n_lost += snapshot.bad_cells.len();
+            }
+            Err(e) => assert_eq!(rotten, 7, "seed {seed}: {e}"),
+        }
+        robot.fetch().expect("heals");
+        assert_holds(&robot.snapshot(), &scene, 0..3);
+    }
+    assert!(n_lost > 100, "{n_lost}");
+}
+
+/// All shards are read in turn, the one that rotted is marked, and no snapshot takes it over.
+#[test]
+fn a_scrub_reads_each_shard_and_marks_the_rotten_one() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let scene = Published::new(1, &[0; 3], 40);
+    let server = Server::start(scene.clone());
+    let robot = Robot::on_disk(dir.path(), &server.url());
+    robot.fetch().expect("works");
+    std::thread::sleep(Duration::from_millis(150));
+    robot.fetch().expect("nothing new");
+    let (snapshot, mut scrubber) = (robot.snapshot(), Scrubber::default());
+    let mut steps = |n: usize| -> Vec<(u32, bool)> {
+        let step = |_| scrubber.step(&robot.cache, &snapshot).map(|step| (step.cell_id, step.is_sound));
+        (0..n).filter_map(step).collect()
+    };
+    assert_eq!(steps(6), [0, 1, 2, 0, 1, 2].map(|id| (id, true)));
+    flip_unseen(&robot.cache.shard_path(scene.hash(1, Profile::Compact)));
+    assert_eq!(steps(2), [(0, true), (1, false)]);
+    let after = Snapshot::open_after(&robot.cache, Some(&snapshot)).expect("the others are whole");
+    assert_eq!((cells(&after), &after.bad_cells), (vec![0, 2], &vec![UNREADABLE]));
+    assert_eq!(robot.fetch().expect("heals").downloaded.n_shards, 1);
+    assert_holds(&robot.snapshot(), &scene, 0..3);
+}
+
+/// A robot in service finds rot by itself and fetches the shard, although nothing else makes a fetch due.
+#[test]
+fn a_robot_in_service_heals_rot() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let scene = Published::new(1, &[0; 3], 40);
+    let server = Server::start(scene.clone());
+    let robot = Robot::on_disk(dir.path(), &server.url());
+    let (following, cancel) = (Arc::<Following>::default(), AtomicBool::new(false));
+    let engine = Engine::new(robot.cache.clone(), text_service());
+    let app = App::following(engine, Settings::default(), Some(Arc::clone(&following)));
+    let settings = FollowSettings {
+        radius: 20.0,
+        min_interval: Duration::ZERO,
+        refresh: None,
+        ..FollowSettings::default()
+    };
+    let (fetched, fetches) = mpsc::channel();
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            let environment = FollowEnvironment {
+                fetch: &mut |_| robot.fetch(),
+                report: &mut |outcome| {
+                    app.reload_now();
+                    fetched.send(outcome.as_ref().expect("works").downloaded.n_shards).expect("awaited");
+                },
+                random: &|| 0.5,
+                cancel: &cancel,
+            };
+            follow(&robot.cache, &robot.request, settings, &following, environment)
+        });
+        following.post(at(5.0));
+        let next = || fetches.recv_timeout(Duration::from_secs(60)).ok();
+        let first = next();
+        flip_unseen(&robot.cache.shard_path(scene.hash(1, Profile::Compact)));
+        scope.spawn(|| keep_scrubbing(&app, Duration::ZERO, &cancel));
+        let second = next();
+        cancel.store(true, Ordering::Relaxed);
+        assert_eq!((first, second), (Some(3), Some(1)));
+    });
+    assert_holds(&robot.snapshot(), &scene, 0..3);
+}
