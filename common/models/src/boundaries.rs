@@ -1,11 +1,11 @@
-//! The embedded segmentation model: predicts boundaries between objects of any kind in a photo.
+//! The embedded segmentation model: predicts boundaries between objects of any kind in a photo and its depths.
 //!
-//! A small U-Net (Ronneberger et al. 2015), trained on generated photos
+//! A small U-Net (Ronneberger et al. 2015), trained on generated photos painted anew
 //! (`embedded/train_segmenter.py`). The graph segmenter joins pixels by its predictions.
 
 use std::path::Path;
 
-use ::image::{Rgb, RgbImage};
+use ::image::RgbImage;
 use ort::value::TensorElementType;
 use sha2::{Digest, Sha256};
 
@@ -17,8 +17,14 @@ use crate::{
 const SEGMENT: &[u8] = include_bytes!("../embedded/segment.onnx");
 const INPUT: &str = "pixel_values";
 const OUTPUT: &str = "boundaries";
-/// Width and height must be multiples of this: the model halves them four times.
-const MULTIPLE: u32 = 16;
+/// Width and height must be multiples of this: the model halves them five times.
+const MULTIPLE: u32 = 32;
+/// Red, green, blue, and those of [`depth_channels`].
+const N_CHANNELS: usize = 7;
+/// Slopes of the logarithm of depth are taken from this many pixels before to as many after.
+const SLOPE_REACH_PX: usize = 2;
+/// Slopes of this size, per [`SLOPE_REACH_PX`] both ways, are halfway to the largest that the model tells apart.
+const SLOPE_SCALE: f32 = 20.0;
 /// Neighbours of a pixel with a predicted boundary: right, below left, below, below right.
 pub const N_NEIGHBOURS: usize = 4;
 
@@ -32,7 +38,7 @@ impl Boundaries {
     /// [`SessionError`] if ONNX Runtime does not load.
     pub fn open(options: &SessionOptions) -> Result<Self, SessionError> {
         let model = Model::open(&ModelFile::embedded(Path::new("segment.onnx"), SEGMENT), options)?;
-        model.expect_input(INPUT, TensorElementType::Float32, &[1, 3, -1, -1])?;
+        model.expect_input(INPUT, TensorElementType::Float32, &[1, N_CHANNELS as i64, -1, -1])?;
         Ok(Self(model))
     }
 
@@ -43,27 +49,100 @@ impl Boundaries {
 
     /// Returns the probability that each pixel and its neighbour show different objects, `[4][height][width]`:
     /// right, below left, below, below right.
+    ///
+    /// `depth_m`: `[height][width]`, along the camera's axis; 0, less or NaN where it is unknown.
     /// # Errors
     /// [`SessionError::Run`].
-    pub fn of(&mut self, image: &RgbImage) -> Result<Vec<f32>, SessionError> {
+    pub fn of(&mut self, image: &RgbImage, depth_m: Option<&[f32]>) -> Result<Vec<f32>, SessionError> {
         let (width, height) = image.dimensions();
         let [wide, high] = [width, height].map(|side| side.next_multiple_of(MULTIPLE));
-        let mut pixels = Vec::with_capacity(3 * wide as usize * high as usize);
-        for channel in 0..3 {
+        let of_depth = depth_m.map(|depth_m| depth_channels(depth_m, width as usize));
+        let mut pixels = Vec::with_capacity(N_CHANNELS * wide as usize * high as usize);
+        for channel in 0..N_CHANNELS {
             for y in 0..high {
                 // The last row and column are repeated beyond the border.
-                pixels.extend((0..wide).map(|x| {
-                    let Rgb(rgb) = image.get_pixel(x.min(width - 1), y.min(height - 1));
-                    f32::from(rgb[channel]) / 127.5 - 1.0
+                let inside = (0..wide).map(|x| (x.min(width - 1), y.min(height - 1)));
+                pixels.extend(inside.map(|(x, y)| match channel.checked_sub(3) {
+                    None => f32::from(image.get_pixel(x, y).0[channel]) / 127.5 - 1.0,
+                    Some(channel) => {
+                        of_depth.as_ref().map_or(0.0, |of| of[(y * width + x) as usize][channel])
+                    }
                 }));
             }
         }
         let shape = [i64::from(high), i64::from(wide)];
-        let input = self.0.tensor(vec![1, 3, shape[0], shape[1]], &pixels)?;
+        let input = self.0.tensor(vec![1, N_CHANNELS as i64, shape[0], shape[1]], &pixels)?;
         let padded =
             self.0.run(vec![(INPUT, input)], OUTPUT, &[1, N_NEIGHBOURS as i64, shape[0], shape[1]])?;
         let rows = padded.chunks_exact(wide as usize);
         let inside = rows.enumerate().filter(|(row, _)| *row as u32 % high < height);
         Ok(inside.flat_map(|(_, row)| row[..width as usize].iter().copied()).collect())
+    }
+}
+
+/// Returns what the model sees of depth at each pixel: half the logarithm of depth over the median depth, its slopes to
+/// the right and down, and 1. Where depth is unknown all are 0, and so is a slope that one end of is unknown.
+///
+/// None of these changes with the scene's scale. `depth_m`: `[height][width_px]`.
+fn depth_channels(depth_m: &[f32], width_px: usize) -> Vec<[f32; 4]> {
+    let logs: Vec<f32> =
+        depth_m.iter().map(|depth_m| if *depth_m > 0.0 { depth_m.ln() } else { f32::NAN }).collect();
+    let mut known: Vec<f32> = logs.iter().copied().filter(|log| log.is_finite()).collect();
+    let middle = known.len().saturating_sub(1) / 2;
+    let median = match known.is_empty() {
+        true => 0.0,
+        false => *known.select_nth_unstable_by(middle, f32::total_cmp).1,
+    };
+    let height_px = depth_m.len() / width_px.max(1);
+    let slope = |from: usize, to: usize| match (SLOPE_SCALE * (logs[to] - logs[from])).tanh() {
+        slope if slope.is_finite() => slope,
+        _ => 0.0,
+    };
+    let of = |pixel: usize| {
+        let (x, y) = (pixel % width_px, pixel / width_px);
+        let around =
+            |at: usize, len: usize| (at.saturating_sub(SLOPE_REACH_PX), (at + SLOPE_REACH_PX).min(len - 1));
+        let ((left, right), (up, down)) = (around(x, width_px), around(y, height_px));
+        let right = slope(y * width_px + left, y * width_px + right);
+        let down = slope(up * width_px + x, down * width_px + x);
+        match logs[pixel].is_finite() {
+            true => [((logs[pixel] - median) / 2.0).clamp(-2.0, 2.0), right, down, 1.0],
+            false => [0.0, right, down, 0.0],
+        }
+    };
+    (0..height_px * width_px).map(of).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Depth grows by a hundredth a column, so that the logarithm's slope over four columns is 0.04; worked out by hand.
+    #[test]
+    fn depth_is_seen_as_slopes_whatever_its_scale() {
+        for scale in [1.0, 300.0] {
+            let depth_m: Vec<f32> = (0..9 * 5).map(|i| scale * (0.01 * (i % 9) as f32).exp()).collect();
+            let channels = depth_channels(&depth_m, 9);
+            let [relative, right, down, known] = channels[2 * 9 + 6];
+            assert!((relative - 0.01).abs() < 1e-6, "two columns beyond the median: {relative}");
+            assert!((right - 0.8_f32.tanh()).abs() < 1e-5, "{right}");
+            assert_eq!((down, known), (0.0, 1.0));
+            assert!(
+                (channels[0][1] - 0.4_f32.tanh()).abs() < 1e-5,
+                "at the border half as far: {:?}",
+                channels[0]
+            );
+        }
+    }
+
+    #[test]
+    fn unknown_depth_is_zero() {
+        let mut depth_m = vec![2.0; 6 * 6];
+        (depth_m[14], depth_m[15]) = (0.0, f32::NAN);
+        let channels = depth_channels(&depth_m, 6);
+        assert_eq!(channels[14], [0.0; 4]);
+        assert_eq!(channels[15], [0.0; 4]);
+        assert_eq!(channels[12], [0.0, 0.0, 0.0, 1.0], "the slope ends at an unknown depth");
+        assert_eq!(depth_channels(&[0.0; 12], 4), [[0.0; 4]; 12]);
     }
 }

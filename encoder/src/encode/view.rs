@@ -172,7 +172,11 @@ impl<'a> ViewStages<'a> {
                 // A GPU waits for colours that these threads compute, rather than they for it.
                 let draw = || self.plan.scene.draw(&raster_view, [0.0; 3]);
                 let drawing = self.context.install(draw).map_err(raster_failed)?;
-                let depth = enlarge(&drawing.depth, &raster_view, &loaded);
+                let seen = drawing.depth.iter().zip(&drawing.coverage);
+                // What shows through the scene's holes is nobody's depth.
+                let seen: Vec<f32> =
+                    seen.map(|(depth, share)| if *share > 0.5 { *depth } else { 0.0 }).collect();
+                let depth = enlarge(&seen, &raster_view, &loaded);
                 Next::Segment(loaded, Some(depth))
             }
             Next::Segment(loaded, depth) => {

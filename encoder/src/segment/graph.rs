@@ -1,8 +1,8 @@
 //! The built-in segmenter: graph-based segmentation at several scales (Felzenszwalb and Huttenlocher, "Efficient
 //! Graph-Based Image Segmentation", IJCV 59(2), 2004).
 //!
-//! The weights of edges combine the object boundaries predicted by a small model, differences of colour in CIE L*a*b*
-//! (where distances are about proportional to perceived differences), and jumps of depth.
+//! The weights of edges combine the object boundaries that a small model predicts from the photo and the splat's depth,
+//! differences of colour in CIE L*a*b* (where distances are about proportional to perceived differences), and jumps of depth.
 
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -75,8 +75,8 @@ impl GraphSettings {
     /// Returns the settings for use with the boundary model, with the `n_scales` coarsest scales.
     pub fn learnt(n_scales: usize) -> Self {
         Self {
-            scales: [1500.0, 800.0, 400.0, 200.0].into_iter().take(n_scales).collect(),
-            colour_weight: 0.3,
+            scales: [1500.0, 400.0, 100.0, 40.0].into_iter().take(n_scales).collect(),
+            colour_weight: 0.2,
             boundary_weight: 40.0,
             depth_weight: 0.0,
             ..Self::default()
@@ -109,11 +109,11 @@ impl ModelPool {
         Boundaries::open(&SessionOptions { gpu, ..self.options.clone() })
     }
 
-    fn boundaries(&self, image: &RgbImage) -> Result<Vec<f32>, SessionError> {
+    fn boundaries(&self, image: &RgbImage, depth_m: Option<&[f32]>) -> Result<Vec<f32>, SessionError> {
         let idle = || self.idle.lock().unwrap_or_else(PoisonError::into_inner);
         let taken = idle().pop();
         let mut model = taken.map_or_else(|| self.open(), Ok)?;
-        let boundaries = model.of(image);
+        let boundaries = model.of(image, depth_m);
         idle().push(model);
         boundaries
     }
@@ -162,7 +162,7 @@ impl Segmenter for GraphSegmenter {
     }
 
     fn wants_depth(&self) -> bool {
-        self.settings.depth_weight > 0.0
+        self.settings.depth_weight > 0.0 || self.model.is_some()
     }
 
     fn segment(&self, input: &SegmentInput<'_>) -> Result<Vec<Mask>, SegmentError> {
@@ -171,7 +171,8 @@ impl Segmenter for GraphSegmenter {
             return Ok(Vec::new());
         }
         let (image, raster) = Raster::new(input, &self.settings);
-        let boundaries = self.model.as_ref().map(|model| model.boundaries(&image)).transpose()?;
+        let depth_m = raster.depth_m.as_deref();
+        let boundaries = self.model.as_ref().map(|model| model.boundaries(&image, depth_m)).transpose()?;
         let edges = raster.edges_by_weight(&self.settings, boundaries.as_deref());
         let n_pixels = raster.lab.len();
         let min_area_px = ((n_pixels as f32 * self.settings.min_area_share) as u32).max(MIN_AREA_PX);
@@ -227,8 +228,8 @@ struct Raster {
     height_px: u32,
     /// Smoothed colour, L* a* b*.
     lab: Vec<[f32; 3]>,
-    /// Inverse depth, NaN if unknown; empty without depth.
-    inverse_depth: Vec<f32>,
+    /// Metres along the camera's axis, 0 if unknown; none without depth.
+    depth_m: Option<Vec<f32>>,
     /// Pixels inside the lens image.
     valid: Vec<bool>,
 }
@@ -252,15 +253,14 @@ impl Raster {
         smooth(&mut lab, width_px as usize, settings.smoothing_px);
 
         let (columns, rows) = (nearest(full_width, width_px), nearest(full_height, height_px));
-        let inverse_depth = input.depth.map_or_else(Vec::new, |depth| {
-            let inverse = |z: &f32| if *z > 0.0 { 1.0 / z } else { f32::NAN };
-            sample(full_width, &columns, &rows, |at| depth.get(at).map_or(f32::NAN, inverse))
+        let depth_m = input.depth.map(|depth_m| {
+            sample(full_width, &columns, &rows, |at| depth_m.get(at).copied().unwrap_or_default())
         });
         let valid = input.valid.map_or_else(
             || vec![true; lab.len()],
             |valid| sample(full_width, &columns, &rows, |at| valid.get(at) == Some(&true)),
         );
-        (image, Self { width_px, height_px, lab, inverse_depth, valid })
+        (image, Self { width_px, height_px, lab, depth_m, valid })
     }
 
     /// Returns the pixel at the other end of an edge; `None` outside the image.
@@ -275,15 +275,17 @@ impl Raster {
     /// The inverse depth of a plane is linear in the image. So the slope on each side is extrapolated across the edge, and
     /// the jump is the smaller of the two residuals. A slanted floor and the fold between floor and wall have no jump.
     fn depth_jump(&self, a: usize, b: usize, step: (i64, i64)) -> f32 {
-        let Some((at_a, at_b)) = self.inverse_depth.get(a).zip(self.inverse_depth.get(b)) else { return 0.0 };
+        let Some(depth_m) = &self.depth_m else { return 0.0 };
+        let inverse = |pixel: usize| if depth_m[pixel] > 0.0 { 1.0 / depth_m[pixel] } else { f32::NAN };
+        let (at_a, at_b) = (inverse(a), inverse(b));
         let carried_on = |near: f32, far: f32, beyond: Option<usize>| {
-            let beyond = beyond.map_or(near, |pixel| self.inverse_depth[pixel]);
+            let beyond = beyond.map_or(near, inverse);
             let slope = if beyond.is_nan() { 0.0 } else { near - beyond };
             (far - near - slope).abs().min((far - near).abs())
         };
-        let from_a = carried_on(*at_a, *at_b, self.neighbour(a, (-step.0, -step.1)));
-        let from_b = carried_on(*at_b, *at_a, self.neighbour(b, step));
-        let relative = from_a.min(from_b) / at_a.max(*at_b);
+        let from_a = carried_on(at_a, at_b, self.neighbour(a, (-step.0, -step.1)));
+        let from_b = carried_on(at_b, at_a, self.neighbour(b, step));
+        let relative = from_a.min(from_b) / at_a.max(at_b);
         if relative.is_finite() { relative } else { 0.0 }
     }
 

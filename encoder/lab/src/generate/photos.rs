@@ -15,8 +15,9 @@ use slag_math::random::Xorshift;
 /// Photos per scene.
 const N_PHOTOS: u32 = 4;
 
-/// Writes photos of the scenes of some seeds: `photos.npy` (u8 `[n][height][width][3]`) and `things.npy` (u16
-/// `[n][height][width]`: the thing's number, 65535 for the sky). Returns the number of photos.
+/// Writes photos of the scenes of some seeds: `photos.npy` (u8 `[n][height][width][3]`), `things.npy` (u16
+/// `[n][height][width]`: the thing's number, 65535 for the sky) and `depths.npy` (f32 `[n][height][width]`: metres along the
+/// camera's axis, infinite for the sky). Returns the number of photos.
 ///
 /// # Errors
 /// [`GenerateError`].
@@ -45,5 +46,7 @@ pub fn write(
     let things: Vec<u16> = photos.iter().flat_map(|photo| photo.thing_of_pixel.iter().copied()).collect();
     debug_assert_eq!(NOTHING, u16::MAX);
     npy::write_file(&folder.join("things.npy"), &shape, &things)?;
+    let depths_m: Vec<f32> = photos.iter().flat_map(|photo| photo.depth_m.iter().copied()).collect();
+    npy::write_file(&folder.join("depths.npy"), &shape, &depths_m)?;
     Ok(photos.len())
 }

@@ -69,6 +69,8 @@ pub struct Photo {
     pub image: RgbImage,
     /// Index of the thing at each pixel, row-major; [`NOTHING`] for the sky.
     pub thing_of_pixel: Vec<u16>,
+    /// Depth at each pixel along the camera's axis, metres; infinite for the sky.
+    pub depth_m: Vec<f32>,
     /// Pixels that each thing would have without the other things.
     pub unhidden_px: Vec<u32>,
 }
@@ -232,12 +234,13 @@ impl Solids {
                 let mut pixels = Vec::with_capacity((TILE_PX * TILE_PX) as usize);
                 for (x, y) in (y0..y1).flat_map(|y| (x0..x1).map(move |x| (x, y))) {
                     let direction = ray(f64::from(x) + 0.5, f64::from(y) + 0.5);
-                    let (rgb, thing) = match self.nearest(&candidates, origin, direction, &mut seen) {
-                        Some(hit) => (self.shade(&hit, origin, direction), hit.thing as u16),
-                        None => (sky(direction), NOTHING),
+                    let (rgb, thing, t) = match self.nearest(&candidates, origin, direction, &mut seen) {
+                        Some(hit) => (self.shade(&hit, origin, direction), hit.thing as u16, hit.t),
+                        None => (sky(direction), NOTHING, f64::INFINITY),
                     };
                     let rgb = rgb.map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8);
-                    pixels.push((x, y, rgb, thing));
+                    let depth_m = t * direction.dot(world_from_camera.matrix3.z_axis);
+                    pixels.push((x, y, rgb, thing, depth_m as f32));
                 }
                 (pixels, seen)
             })
@@ -245,12 +248,14 @@ impl Solids {
         let mut photo = Photo {
             image: RgbImage::new(k.width_px, k.height_px),
             thing_of_pixel: vec![NOTHING; (k.width_px * k.height_px) as usize],
+            depth_m: vec![f32::INFINITY; (k.width_px * k.height_px) as usize],
             unhidden_px: vec![0; self.things.len()],
         };
         for (pixels, seen) in tiles {
-            for (x, y, rgb, thing) in pixels {
+            for (x, y, rgb, thing, depth_m) in pixels {
                 photo.image.put_pixel(x, y, Rgb(rgb));
                 photo.thing_of_pixel[(y * k.width_px + x) as usize] = thing;
+                photo.depth_m[(y * k.width_px + x) as usize] = depth_m;
             }
             photo.unhidden_px.iter_mut().zip(seen).for_each(|(sum, n)| *sum += n);
         }
