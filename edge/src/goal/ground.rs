@@ -9,6 +9,9 @@ use super::space::{Space, Stacked};
 /// edges from a surface, so it lies 0.94 to 1.44 edges below (`docs/numerics.md`).
 pub const SURFACE_DEPTH: f64 = 1.2;
 
+/// Voxels that a level surface occupies at most: those with centres up to 0.94 edges from it.
+const SURFACE_VOXELS: u32 = 2;
+
 /// What a cell, a column of voxels, holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Floor {
@@ -29,9 +32,9 @@ pub struct Ground {
 }
 
 impl Ground {
-    /// Finds the ground. `headroom`: free voxels that must lie above, 1 to 128. `step`: columns without ground are obstacles
-    /// where more than `step`, and at most `headroom` or `step`, voxels above their lowest occupied voxel another one is: what is
-    /// higher, such as a ceiling, is not in a robot's way.
+    /// Finds the ground. `headroom`: free voxels that must lie above, 1 to 128. Columns without ground are obstacles where their
+    /// lowest surface is higher than a `step`, in voxels, or another one lies within the headroom above it: what is higher, such
+    /// as a ceiling, is in no robot's way.
     pub fn find(space: &Space, headroom: u32, step: u32) -> Self {
         let edge = BLOCK_EDGE as usize;
         let [n_columns_x, n_columns_y] = space.window.n;
@@ -83,9 +86,10 @@ fn floor(occupied: u128, free: u128, headroom: u32, step: u32) -> Floor {
     if ground != 0 {
         return Floor::At(ground.trailing_zeros() as u8);
     }
-    let lowest = occupied.trailing_zeros();
-    let over_step = (occupied >> lowest) & !low_bits(step + 1);
-    if over_step & low_bits(step.max(headroom) + 1) != 0 { Floor::Blocked } else { Floor::Unknown }
+    let from_lowest = occupied >> occupied.trailing_zeros();
+    let thickness = from_lowest.trailing_ones();
+    let above = from_lowest.unbounded_shr(thickness) & low_bits(headroom);
+    if thickness > SURFACE_VOXELS + step || above != 0 { Floor::Blocked } else { Floor::Unknown }
 }
 
 #[cfg(test)]
@@ -129,11 +133,11 @@ mod tests {
     #[test]
     fn a_ceiling_blocks_nobody() {
         assert_eq!(floor(1 << 3 | 1 << 60, 0, 10, 2), Floor::Unknown);
-        assert_eq!(floor(1 << 3 | 1 << 14 | 1 << 60, 0, 10, 2), Floor::Unknown);
-        assert_eq!(floor(1 << 3 | 1 << 13 | 1 << 60, 0, 10, 2), Floor::Blocked);
-        assert_eq!(floor(!0 << 3, 0, 10, 2), Floor::Blocked);
-        assert_eq!(floor(0b111 << 3, 0, 10, 2), Floor::Unknown);
-        assert_eq!(floor(1 | 1 << 127, 0, 128, 127), Floor::Unknown);
-        assert_eq!(floor(1 | 1 << 127, 0, 128, 126), Floor::Blocked);
+        assert_eq!(floor(0b11 << 3 | 1 << 15 | 1 << 60, 0, 10, 2), Floor::Unknown);
+        assert_eq!(floor(0b11 << 3 | 1 << 14 | 1 << 60, 0, 10, 2), Floor::Blocked);
+        assert_eq!(floor(0b1111 << 3, 0, 10, 2), Floor::Unknown);
+        assert_eq!(floor(0b11111 << 3, 0, 10, 2), Floor::Blocked);
+        assert_eq!(floor(!0, 0, 128, 100), Floor::Blocked);
+        assert_eq!(floor(1 | 1 << 127, 0, 128, 1), Floor::Blocked);
     }
 }

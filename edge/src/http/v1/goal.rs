@@ -23,7 +23,7 @@ pub fn parameters() -> Vec<Parameter> {
         parameter("text", "chair", "the thing to go to; may name relations"),
         parameter("id", "o0123456789abcdef", "the same by its id, instead of text"),
         parameter("reach_m", "0.8", "largest horizontal distance to the thing's surface (default: 0.8)"),
-        parameter("min_visible", "0.1", "least share of the thing that the sensor must see (default: 0.1)"),
+        parameter("min_visible", "0.05", "least share of the thing that the sensor must see (default: 0.05)"),
         parameter("limit", "3", "most poses (default: 3, at most 20)"),
     ];
     of_goal.into_iter().chain(floor_parameters()).collect()

@@ -8,5 +8,7 @@ pub const SENSOR_HEIGHT_M: f64 = 0.4;
 pub const HEIGHT_M: f64 = 0.5;
 /// Highest step.
 pub const STEP_M: f64 = 0.1;
-/// Least share of the thing that must be seen.
-pub const MIN_VISIBLE: f64 = 0.1;
+/// Least share of the thing's Gaussians that must be seen. From one side hardly half of them are.
+pub const MIN_VISIBLE: f64 = 0.05;
+/// Least share of the thing's outline that must truly be shown.
+pub const MIN_SHOWN: f64 = 0.1;

@@ -6,7 +6,7 @@ use std::fmt;
 use serde::Serialize;
 use slag_math::stats::median;
 
-use super::asked::MIN_VISIBLE;
+use super::asked::MIN_SHOWN;
 use super::voxels::Voxels;
 
 /// Clearance by which a pose may fall short: a cell of the true map on either side.
@@ -25,7 +25,7 @@ pub enum Verdict {
 
 impl Verdict {
     fn is_shown(&self) -> bool {
-        matches!(self, Self::Pose { shown, .. } if *shown >= MIN_VISIBLE)
+        matches!(self, Self::Pose { shown, .. } if *shown >= MIN_SHOWN)
     }
 
     /// Returns whether it is wrong.

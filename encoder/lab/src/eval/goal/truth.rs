@@ -7,7 +7,7 @@ use glam::{DVec2, DVec3};
 use slag_encoder::raster::RasterView;
 use slag_math::distance_transform::squared_distances;
 
-use super::asked::{HEIGHT_M, MIN_VISIBLE, REACH_M, SENSOR_HEIGHT_M, STEP_M};
+use super::asked::{HEIGHT_M, MIN_SHOWN, REACH_M, SENSOR_HEIGHT_M, STEP_M};
 use crate::generate::compose::{Layout, looking, pinhole};
 use crate::generate::render::Solids;
 
@@ -120,7 +120,7 @@ impl<'a> Truth<'a> {
         places.into_iter().step_by(step).any(|cell| {
             let at = self.origin
                 + DVec2::new((cell % self.width) as f64 + 0.5, (cell / self.width) as f64 + 0.5) * CELL_M;
-            self.shown(thing, at.extend(SENSOR_HEIGHT_M)) >= MIN_VISIBLE
+            self.shown(thing, at.extend(SENSOR_HEIGHT_M)) >= MIN_SHOWN
         })
     }
 
