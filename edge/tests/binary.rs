@@ -367,15 +367,56 @@ fn the_image_model_stays_with_the_encoder() {
 /// The question of the memory attack: every Gaussian matches, and is a cluster of its own, whatever the limit.
 const ATTACK: &str = "kind=clusters&threshold=-1&min_count=1&voxel=1e-9&limit=1";
 
-/// The flags set the budget of a query, and a refusal names it.
-#[test]
-fn budgets_of_queries_come_from_flags() {
+/// Returns a cache with 120,000 Gaussians, 0.1 m apart.
+fn grid_cache() -> tempfile::TempDir {
     let grid = |i: u32| [i % 100, i / 100 % 100, i / 10_000].map(|at| at as u16 * 100);
     let positions: Vec<[u16; 3]> = (0..120_000).map(grid).collect();
     let (listed, shard) = painted(&positions, 60_000);
     let dir = tempfile::tempdir().expect("a folder");
     let from = store(listed, shard);
     assert_eq!(run(dir.path(), &["fetch", "--trust-first", "--from", &from, "--at", "0,0,0"]).0, Some(0));
+    dir
+}
+
+/// 32 at once, three times: what they take together is bounded, and who gets no memory is told the budget.
+#[test]
+#[cfg(target_os = "linux")]
+fn the_memory_attack_stays_within_the_budget() {
+    const QUERY_BYTES: u64 = 64 << 20;
+    let dir = grid_cache();
+    let (serving, url) =
+        serve(dir.path(), &["--max-query-secs", "600", "--max-query-bytes", &QUERY_BYTES.to_string()]);
+    let peak_bytes = || {
+        let status = fs_err::read_to_string(format!("/proc/{}/status", serving.id())).expect("Linux");
+        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).expect("known");
+        line.trim().trim_end_matches(" kB").parse::<u64>().expect("a number") << 10
+    };
+    let before = peak_bytes();
+    let ask = || (0..3).map(|_| get(&format!("{url}/query?text=red&{ATTACK}"))).collect::<Vec<_>>();
+    let answers: Vec<(u16, Value)> = std::thread::scope(|scope| {
+        let clients: Vec<_> = (0..32).map(|_| scope.spawn(ask)).collect();
+        clients.into_iter().flat_map(|client| client.join().expect("asks")).collect()
+    });
+    let grown = peak_bytes() - before;
+    stop(serving);
+    let n_answered = answers.iter().filter(|(status, _)| *status == 200).count();
+    println!("{n_answered} of 96 answered; memory grew from {before} by {grown} bytes");
+    for (status, answer) in &answers {
+        let refusal = answer["detail"].as_str().unwrap_or_default();
+        assert!(
+            *status == 200 || *status == 503 && refusal.contains(&(4 * QUERY_BYTES).to_string()),
+            "{answer}"
+        );
+    }
+    assert!(n_answered > 0);
+    // Four queries' worth, and twice as much again for what is not counted: text models, stacks, what the allocator keeps.
+    assert!(grown < 12 * QUERY_BYTES, "{grown}");
+}
+
+/// The flags set the budget of a query, and a refusal names it.
+#[test]
+fn budgets_of_queries_come_from_flags() {
+    let dir = grid_cache();
     let texts = ["text=red", "text=blue"].repeat(16).join("&");
     for (bytes, secs, question, statuses, expected) in [
         ("1048576", "60", "text=red", &[422][..], "1048576 bytes"),
