@@ -7,6 +7,8 @@
 mod formats;
 #[path = "seeds.rs"]
 pub mod seeds;
+#[path = "services.rs"]
+mod services;
 
 /// A decoder to fuzz.
 pub struct Target {
@@ -17,16 +19,17 @@ pub struct Target {
 }
 
 macro_rules! targets {
-    ($($name:ident),+ $(,)?) => {
+    ($($module:ident: $($name:ident),+;)+) => {
         /// All decoders.
         pub const TARGETS: &[Target] =
-            &[$(Target { name: stringify!($name), run: formats::$name }),+];
+            &[$($(Target { name: stringify!($name), run: $module::$name }),+),+];
     };
 }
 
 targets! {
-    container, shard, manifest, current, ply, splat, spz, sog, sog_meta, colmap_text, colmap_bin, transforms,
-    scannet, splat_frame, rle, coco, model_toml, tensors, phrases, contributions, region_table, cell_field, npz, geo, query, position,
+    formats: container, shard, manifest, current, ply, splat, spz, sog, sog_meta, colmap_text, colmap_bin, transforms,
+    scannet, splat_frame, rle, coco, model_toml, tensors, phrases, contributions, region_table, cell_field, npz, geo, query, position;
+    services: http_request, tuf;
 }
 
 /// Runs a target by name.

@@ -20,6 +20,16 @@ use slag_common::{Hash32, container};
 /// Longest shared file used: in longer ones mutations rarely hit anything that matters.
 const MAX_SHARED_BYTES: usize = 100_000;
 
+/// Requests of all kinds, and one whose body is no JSON.
+const HTTP_REQUESTS: &[&str] = &[
+    "GET /query?text=red%20chair&near=1,2,3&limit=2 HTTP/1.1\r\nHost: localhost:7734\r\nAccept: application/json\r\nX-Request-Id: a-1\r\n\r\n",
+    "POST /v1/query HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\nContent-Length: 41\r\n\r\n{\"texts\":[\"red\",\"blue mug\"],\"threshold\":0}",
+    "POST /position HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n5\r\n{\"x\":\r\n2\r\n1}\r\n0\r\n\r\n",
+    "OPTIONS /v1/query HTTP/1.1\r\nHost: localhost\r\nOrigin: https://map.example\r\nAccess-Control-Request-Method: POST\r\n\r\n",
+    "GET /v1/objects?limit=3&prompt_id=0 HTTP/1.1\r\nHost: localhost\r\nSec-Fetch-Site: same-origin\r\nAuthorization: Bearer abcdefghijklmnop\r\n\r\nHEAD /status HTTP/1.0\r\n\r\n",
+    "GET /metrics HTTP/1.1\r\nHost: [::1]:7734\r\nExpect: 100-continue\r\n\r\n",
+];
+
 /// Returns the seeds of a target; `shared` is the folder of shared test data, if it exists.
 pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
     let text = |text: &str| vec![text.as_bytes().to_vec()];
@@ -65,6 +75,8 @@ pub fn of(target: &str, shared: Option<&Path>) -> Vec<Vec<u8>> {
         "query" => text(
             "text=a+red%20chair&limit=10&threshold=0.1&near=1,2,3&radius=4&kind=gaussians&voxel=0.2&min_count=3",
         ),
+        "tuf" => super::services::tuf_seeds(),
+        "http_request" => HTTP_REQUESTS.iter().map(|request| request.as_bytes().to_vec()).collect(),
         "position" => text("1 2 3\n46.8,-91.9,150\n{\"x\":1,\"y\":2,\"z\":3}\n{\"lat\":1,\"lon\":2}\n"),
         _ => Vec::new(),
     };

@@ -1,0 +1,133 @@
+//! Targets that need more than a function: the robot's service, and a repository of The Update Framework.
+
+use std::collections::BTreeMap;
+use std::io::{Read, Write};
+use std::os::unix::net::UnixStream;
+use std::path::PathBuf;
+use std::sync::OnceLock;
+use std::time::Duration;
+
+use ed25519_dalek::SigningKey;
+use slag_common::tuf::{
+    FileMeta, Kept, Key, RoleKeys, Root, Snapshot, Source, TargetFile, Targets, Timestamp, add_signatures,
+    find_target, refresh, sign,
+};
+use slag_edge::http::{self, App, Settings};
+use slag_edge::query::Engine;
+use slag_edge::store::EdgeCache;
+use slag_edge::text::TextService;
+use slag_models::{ModelDir, SessionOptions};
+use slag_service::listen::{Listen, bind};
+
+/// Asks for little, and ends the connection; what comes before may be whole or not.
+const LAST: &[u8] = b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n";
+/// Most bytes of an answer that are read.
+const MAX_ANSWER_BYTES: u64 = 1 << 20;
+
+/// Starts the robot's service without a scene, once; returns its socket.
+fn service() -> &'static PathBuf {
+    static SOCKET: OnceLock<PathBuf> = OnceLock::new();
+    SOCKET.get_or_init(|| {
+        let folder = std::env::temp_dir().join(format!("slag-fuzz-{}", std::process::id()));
+        fs_err::create_dir_all(&folder).expect("a folder");
+        let options = SessionOptions::new("not-needed".into());
+        let text = TextService::open(&ModelDir::colours(), &options).expect("built in");
+        let app = App::new(Engine::new(EdgeCache::open(folder.join("cache")), text), Settings::default());
+        let socket = folder.join("socket");
+        let listen = Listen::Unix(socket.clone());
+        let (ready, is_ready) = std::sync::mpsc::channel();
+        std::thread::spawn(move || {
+            let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
+            runtime.expect("a runtime").block_on(async {
+                let listener = bind(&listen).await.expect("binds");
+                ready.send(()).expect("waited for");
+                http::serve(app, listener, std::future::pending()).await
+            })
+        });
+        is_ready.recv().expect("listens");
+        socket
+    })
+}
+
+/// The bytes of a connection to the robot's service: whatever they are, no handler panics, and the service answers on.
+pub fn http_request(data: &[u8]) -> bool {
+    let mut stream = UnixStream::connect(service()).expect("the service listens");
+    // A request that is not whole gets no answer for seconds.
+    stream.set_read_timeout(Some(Duration::from_millis(20))).expect("set");
+    // The service may have closed the connection already.
+    let _ = stream.write_all(data).and_then(|()| stream.write_all(LAST));
+    let mut answer = Vec::new();
+    let _ = stream.take(MAX_ANSWER_BYTES).read_to_end(&mut answer);
+    let answer = String::from_utf8_lossy(&answer);
+    assert!(!answer.contains("HTTP/1.1 500"), "{answer}");
+    answer.starts_with("HTTP/1.1 2")
+}
+
+fn key() -> SigningKey {
+    SigningKey::from_bytes(&[7; 32])
+}
+
+/// The files of a repository whose roles state versions alone, so that each may be replaced.
+fn repository() -> &'static BTreeMap<&'static str, Vec<u8>> {
+    static FILES: OnceLock<BTreeMap<&'static str, Vec<u8>>> = OnceLock::new();
+    FILES.get_or_init(|| {
+        let (key, never) = (key(), u64::MAX);
+        let public = Key::of(&key);
+        let role = RoleKeys { keyids: vec![public.id()], threshold: 1 };
+        let roles = ["root", "targets", "snapshot", "timestamp"].map(|name| (name.to_owned(), role.clone()));
+        let keys = BTreeMap::from([(public.id(), public)]);
+        let root = Root { consistent_snapshot: true, keys, roles: roles.into() };
+        let meta = |name: &str| {
+            BTreeMap::from([(name.to_owned(), FileMeta { version: 1, length: None, hashes: None })])
+        };
+        let targets = BTreeMap::from([("manifest".to_owned(), TargetFile::of(b"x"))]);
+        let targets = Targets { targets, delegations: None };
+        let snapshot = Snapshot { meta: meta("targets.json") };
+        let timestamp = Timestamp { meta: meta("snapshot.json"), signed_at: None };
+        BTreeMap::from([
+            ("1.root.json", sign(1, never, &root, &[&key])),
+            ("2.root.json", sign(2, never, &root, &[&key])),
+            ("timestamp.json", sign(1, never, &timestamp, &[&key])),
+            ("1.snapshot.json", sign(1, never, &snapshot, &[&key])),
+            ("1.targets.json", sign(1, never, &targets, &[&key])),
+        ])
+    })
+}
+
+/// The file that the first byte of an input names.
+const REPLACED: [&str; 4] = ["2.root.json", "timestamp.json", "1.snapshot.json", "1.targets.json"];
+
+/// Returns a seed for each role: its byte, and what it signs.
+pub fn tuf_seeds() -> Vec<Vec<u8>> {
+    let seed = |(number, name): (usize, &&str)| {
+        let text = String::from_utf8(repository()[name].clone()).expect("JSON is text");
+        let at = text.find("\"signed\":").expect("signed") + "\"signed\":".len();
+        [&[b'0' + number as u8], &text.as_bytes()[at..text.len() - 1]].concat()
+    };
+    REPLACED.iter().enumerate().map(seed).collect()
+}
+
+struct Files(BTreeMap<&'static str, Vec<u8>>);
+
+impl Source for Files {
+    fn metadata(&mut self, name: &str, max_bytes: u64) -> Result<Option<Vec<u8>>, String> {
+        Ok(self.0.get(name).map(|bytes| bytes.iter().copied().take(max_bytes as usize + 1).collect()))
+    }
+}
+
+/// One role's metadata, signed by its key as far as it can be, in an honest repository.
+pub fn tuf(data: &[u8]) -> bool {
+    let Some((role, signed)) = data.split_first() else { return false };
+    let envelope = [b"{\"signatures\":[],\"signed\":", signed, b"}"].concat();
+    let bytes = add_signatures("a role", &envelope, &[key()]).unwrap_or(envelope);
+    let mut source = Files(repository().clone());
+    source.0.insert(REPLACED[usize::from(role % 4)], bytes);
+    let mut kept = Kept::from_root(&source.0["1.root.json"]).expect("an honest root");
+    let Ok(mut trusted) = refresh(&mut kept, &mut source, 1_800_000_000) else { return false };
+    for path in ["manifest", "scene/manifest"] {
+        if let Ok(Some(target)) = find_target(&mut trusted, &mut kept, &mut source, path) {
+            std::hint::black_box((target.file_name(path).is_ok(), target.check(path, b"x").is_ok()));
+        }
+    }
+    true
+}
