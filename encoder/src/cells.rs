@@ -19,7 +19,7 @@ const EXTENT_SIGMAS: f64 = 3.0;
 const MIN_GAUSSIANS_TO_NARROW: usize = 512;
 
 /// Limits of a cell's size.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct CellLimits {
     /// Most Gaussians of a cell.
     pub max_gaussians: usize,

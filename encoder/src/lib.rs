@@ -26,6 +26,8 @@
 //! # }
 //! ```
 
+#[cfg(feature = "fleet")]
+pub mod blobs;
 pub mod cells;
 pub mod check;
 pub mod cli;
@@ -33,6 +35,8 @@ pub mod codebook;
 pub mod diff;
 pub mod embed;
 pub mod encode;
+#[cfg(feature = "fleet")]
+pub mod fleet;
 pub mod ingest;
 pub mod lanes;
 pub mod lift;

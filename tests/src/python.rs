@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::{Mutex, PoisonError};
 
 use crate::{program, root, run};
 
@@ -12,6 +13,9 @@ use crate::{program, root, run};
 /// # Panics
 /// If it cannot be made; `scripts/setup.sh` installs Python and its `venv`.
 pub fn python_with(folder: &str) -> PathBuf {
+    // Tests of one program ask at once.
+    static MAKING: Mutex<()> = Mutex::new(());
+    let _alone = MAKING.lock().unwrap_or_else(PoisonError::into_inner);
     let requirements = root().join(folder).join("requirements.txt");
     let wanted = fs_err::read_to_string(&requirements).expect("requirements");
     let programs = program("slag-edge");

@@ -16,6 +16,7 @@ use super::exit::Exit;
 use super::memory::{default_memory_bytes, parse_memory};
 use super::refine::RefineArgs;
 use super::sam::SamArgs;
+use super::spent::most_spent;
 use super::target::{REFINEMENTS, TUNED, TargetArgs};
 use super::views::{ViewsArgs, parse_raster_width, parse_views_limit};
 use crate::cells::CellLimits;
@@ -25,9 +26,8 @@ use crate::embed::Background;
 use crate::encode::coverage::CoverageReport;
 use crate::encode::front::Expectation;
 use crate::encode::{
-    self, CellReport, CellSettings, EncodeSettings, EncodeSummary, Engines, GpuReport, InputSettings, Masks,
-    OutputSettings, Preset, RasterWidth, Regions, RunSettings, StageReport, ViewSettings, ViewsLimit,
-    ViewsReport,
+    self, CellSettings, EncodeSettings, Engines, GpuReport, InputSettings, Masks, OutputSettings, Preset,
+    RasterWidth, Regions, RunSettings, StageReport, ViewSettings, ViewsLimit,
 };
 use crate::occupancy::OccupancySettings;
 use crate::progress::Progress;
@@ -155,6 +155,9 @@ pub struct EncodeArgs {
     /// Search for objects.
     #[command(flatten)]
     pub objects: ObjectArgs,
+    /// Views and cells by other machines.
+    #[command(flatten)]
+    pub fleet: super::fleet::CoordinatorArgs,
     /// Drops an unfinished encode of another splat or with other settings in the store.
     #[arg(long)]
     pub restart: bool,
@@ -307,7 +310,7 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     settings.run.gpus = args.gpus.numbers(&session);
     let devices = Devices::open(args.device, GpuOptions::default())?;
     let engines = Engines::new(&models, &session, &devices);
-    let summary = encode::encode(&settings, &engines, progress, cancel_flag()?.as_ref())?;
+    let summary = args.fleet.encode(&settings, &engines, progress, cancel_flag()?.as_ref())?;
     let busy =
         summary.busy_secs.iter().map(|(stage, s)| format!("{stage} {s:.1}")).collect::<Vec<_>>().join(", ");
     let of_views: String = (summary.view_stages.iter())
@@ -389,22 +392,6 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     );
     print(json, &summary, lines)?;
     Ok(if summary.skipped_views.is_empty() { Exit::Done } else { Exit::Partly })
-}
-
-/// Returns the line that names the most expensive view and cell.
-fn most_spent(summary: &EncodeSummary) -> String {
-    let (views, cells) = (&summary.views, &summary.cells);
-    let most = (0..views.view.len()).max_by(|a, b| views.secs[*a].total_cmp(&views.secs[*b]));
-    let (Some(at), Some(cell)) = (most, cells.iter().max_by_key(|cell| cell.n_centroids)) else {
-        return String::new();
-    };
-    let ViewsReport { view, raster_width_px, n_masks, n_regions, n_entries, secs } = views;
-    let CellReport { cell_id, n_gaussians, n_centroids, .. } = cell;
-    format!(
-        "most on    view {}, {:.1} s ({} masks, {} regions, {} contributions, {} px wide); cell {cell_id}, {n_centroids} centroids \
-         ({n_gaussians} Gaussians)\n",
-        view[at], secs[at], n_masks[at], n_regions[at], n_entries[at], raster_width_px[at]
-    )
 }
 
 /// Returns the arguments with the choices of a setting's flags.

@@ -7,6 +7,8 @@ mod diff;
 mod encode;
 pub mod environment;
 mod exit;
+#[cfg_attr(not(feature = "fleet"), path = "no_fleet.rs")]
+mod fleet;
 mod keys;
 pub mod memory;
 mod models;
@@ -17,6 +19,7 @@ mod query;
 pub mod refine;
 mod sam;
 mod serve;
+mod spent;
 mod store;
 mod target;
 mod view;
@@ -56,6 +59,8 @@ impl Cli {
             && match &self.command {
                 Command::Check(args) => args.device != DeviceChoice::Cpu,
                 Command::Encode(args) => args.device != DeviceChoice::Cpu,
+                #[cfg(feature = "fleet")]
+                Command::Worker(args) => args.device != DeviceChoice::Cpu,
                 Command::Devices => true,
                 _ => false,
             }
@@ -73,6 +78,9 @@ pub enum Command {
     Check(check::CheckArgs),
     /// Encodes a scene into a store.
     Encode(Box<encode::EncodeArgs>),
+    /// Does views and cells of an encode that another machine coordinates (`encode --blobs`), until it is published.
+    #[cfg(feature = "fleet")]
+    Worker(Box<fleet::WorkerArgs>),
     /// Scores every Gaussian of a store against a text, in full precision.
     Query(query::QueryArgs),
     /// Lists the things that appeared, went or moved between two generations, and what robots have to fetch.
@@ -105,6 +113,8 @@ pub fn run(cli: Cli) -> Exit {
     let result = match cli.command {
         Command::Check(args) => check::run(&args, json),
         Command::Encode(args) => encode::run(&args, progress.as_ref(), json),
+        #[cfg(feature = "fleet")]
+        Command::Worker(args) => fleet::run(&args, json),
         Command::Query(args) => query::run(&args, json),
         Command::Diff(args) => diff::run(&args, json),
         Command::Serve(args) => serve::run(&args),

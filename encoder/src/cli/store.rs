@@ -16,7 +16,9 @@ use super::exit::Exit;
 use crate::encode::{JobStatus, job_status};
 use crate::progress::Progress;
 use crate::store::metadata::{Metadata, TIMESTAMP_DAYS, clock_unix_secs};
-use crate::store::{BadObject, Fault, GenerationRecord, Published, Store, StoreReader, Verified};
+use crate::store::{
+    BadObject, Exported, Fault, GenerationRecord, Published, Store, StoreReader, Verified, export,
+};
 
 /// `store`.
 #[derive(Debug, Subcommand)]
@@ -32,6 +34,15 @@ pub enum StoreCommand {
     Repair(StoreArgs),
     /// Removes what neither the current generation nor the one before it needs.
     Gc(StoreArgs),
+    /// Writes the store as static files, from which robots fetch over any web server; again after each encode and refresh.
+    Export {
+        /// The store.
+        #[command(flatten)]
+        at: StoreArgs,
+        /// Folder that the web server serves; what robots ask for lies under `v1/`.
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+    },
     /// Signs a new timestamp, so that clients can tell a store without news from one that hides them.
     ///
     /// For a timer; an encode that runs is no hindrance.
@@ -91,6 +102,14 @@ pub(super) fn run(command: &StoreCommand, progress: &dyn Progress, json: bool) -
             let pruned = Store::create_or_open(&at.store)?.prune()?;
             let lines = format!("{} objects removed, {}\n", pruned.n_objects, ByteSize(pruned.len_bytes));
             print(json, &pruned, lines)?;
+            Ok(Exit::Done)
+        }
+        StoreCommand::Export { at, out } => {
+            let exported = export(&at.store, out)?;
+            let Exported { n_objects, len_bytes, n_removed } = exported;
+            let lines =
+                format!("{n_objects} objects written, {}; {n_removed} removed\n", ByteSize(len_bytes));
+            print(json, &exported, lines)?;
             Ok(Exit::Done)
         }
         StoreCommand::Refresh { at, days } => {

@@ -4,7 +4,7 @@ use super::basis::MAX_COMPONENTS;
 
 /// How fine a codebook is. Errors are means of `|score error|`, relative to the spread of scores (their
 /// standard deviation over the scene).
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct CodebookSettings {
     /// Largest accepted error of the compact profile.
     pub compact_error: f32,

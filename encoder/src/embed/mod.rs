@@ -53,7 +53,7 @@ pub enum EmbedError {
 }
 
 /// Content of a crop outside its mask.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum, serde::Serialize, serde::Deserialize)]
 pub enum Background {
     /// White.
     White,

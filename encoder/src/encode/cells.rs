@@ -3,31 +3,27 @@
 //! Contributions are read cell by cell. Several cells at once are lifted and become codebooks and shards, as many as the
 //! memory plan holds. A cell's bytes do not depend on the others'.
 
-use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
-use slag_common::manifest::{Calibration, CellRecord, ShardRecord};
-use slag_common::shard::Profile;
+use slag_common::manifest::{Calibration, CellRecord};
 use slag_common::{Hash32, View};
 
+use super::cell::{FinishedCell, Merged};
 use super::context::{Phase, RunContext};
 use super::error::EncodeError;
-use super::job::ViewRecord;
+use super::executor::{CellsToBuild, Executor};
 use super::plan::Plan;
 use super::report::ViewsReport;
+use super::sink::ViewRecord;
 use super::views::DoneViews;
 use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
 use crate::lift::photos::{self, Photo};
-use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS, extra_field};
+use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS};
 use crate::lift::refine::Refinement;
-use crate::lift::{
-    Aggregation, CellField, ContributionError, ContributionIndex, PartContributions, RegionTable,
-};
+use crate::lift::{Aggregation, ContributionError, ContributionIndex, RegionTable};
 use crate::objects::{self, ObjectsReport, SceneObjects};
 use crate::occupancy::{OccupancyReport, SceneOccupancy};
-use crate::shard::{self, BuiltShard, CellEmbeddings, CellExtras};
+use crate::shard;
 use crate::store::Extras;
 
 /// The cells of a scene, all objects of them in the store.
@@ -45,31 +41,6 @@ pub(super) struct BuiltCells {
     pub(super) occupancy: Option<OccupancyReport>,
     pub(super) counts: Counts,
     /// Sums over the Gaussians with evidence of mean score and mean squared score, and their number.
-    score_sums: [f64; 3],
-}
-
-/// A cell whose parts are being lifted.
-struct CellInWork {
-    embeddings: CellEmbeddings,
-    /// Fields in the store, by name.
-    fields: Vec<(String, Hash32)>,
-}
-
-impl CellInWork {
-    fn empty(dim: usize) -> Self {
-        let embeddings = CellEmbeddings { dim, vectors: Vec::new(), has_evidence: Vec::new() };
-        Self { embeddings, fields: Vec::new() }
-    }
-}
-
-/// A cell whose shards are in the store.
-struct FinishedCell {
-    record: CellRecord,
-    /// As of the cell in work.
-    fields: Vec<(String, Hash32)>,
-    n_subspaces: u32,
-    n_without_evidence: u64,
-    /// As of all cells.
     score_sums: [f64; 3],
 }
 
@@ -108,6 +79,7 @@ pub(super) fn build_cells(
     plan: &Plan<'_>,
     views: &DoneViews<'_>,
     occupancy: Option<SceneOccupancy>,
+    executor: &dyn Executor,
     context: &RunContext<'_>,
 ) -> Result<BuiltCells, EncodeError> {
     let mut builder = context.install(|| {
@@ -115,7 +87,7 @@ pub(super) fn build_cells(
         CellBuilder::open(plan, views, bank, occupancy, context)
     })?;
     context.progress().begin("cells", "cell", plan.inputs.split.cells.len() as u64, 0);
-    let built = builder.build(views)?;
+    let built = builder.build(views, executor)?;
     context.progress().end();
     built.ok_or(EncodeError::Interrupted { n_done: views.used.len(), n_views: views.used.len() })
 }
@@ -260,7 +232,11 @@ impl<'a> CellBuilder<'a> {
     ///
     /// # Errors
     /// [`EncodeError`].
-    fn build(&mut self, views: &DoneViews<'_>) -> Result<Option<BuiltCells>, EncodeError> {
+    fn build(
+        &mut self,
+        views: &DoneViews<'_>,
+        executor: &dyn Executor,
+    ) -> Result<Option<BuiltCells>, EncodeError> {
         let Plan { inputs, store, settings, .. } = *self.plan;
         let mut n_entries = vec![0; inputs.split.cells.len()];
         self.index.parts().iter().for_each(|part| n_entries[part.cell_id as usize] += part.n_entries);
@@ -299,179 +275,24 @@ impl<'a> CellBuilder<'a> {
         let regions = self.context.install(|| store.put_object(|out| self.table.write(out)))?.0;
         built.extras.insert(EXTRA_REGIONS.into(), regions);
         self.context.begin_phase(Phase::Cells);
-        let Some(finished) = self.build_shards(refinement.as_ref(), objects.as_ref())? else {
-            return Ok(None);
+        let cells = CellsToBuild {
+            plan: self.plan,
+            views: &views.used,
+            index: &self.index,
+            merged: Merged {
+                table: &self.table,
+                score_context: &self.score_context,
+                refinement: refinement.as_ref(),
+                objects: objects.as_ref(),
+                occupancy: self.occupancy.as_ref(),
+            },
+            encoder_id: self.encoder_id,
+            group_bytes: self.group_bytes,
+            n_at_once: self.n_at_once,
         };
+        let Some(finished) = executor.build_cells(&cells, self.context)? else { return Ok(None) };
         finished.into_iter().for_each(|cell| built.add(cell));
         built.objects = objects.map(|objects| objects.report);
         Ok(Some(built))
     }
-
-    /// Lifts the cells and makes their shards, several at once; `None` if cancelled.
-    ///
-    /// # Errors
-    /// [`EncodeError`]: of the first cell that failed.
-    fn build_shards(
-        &self,
-        refinement: Option<&Refinement>,
-        objects: Option<&SceneObjects>,
-    ) -> Result<Option<Vec<FinishedCell>>, EncodeError> {
-        let dim = self.table.dim();
-        // The vectors of a large cell are allocated once and used again; they are neither copied nor cleared.
-        let free = FreeCells::new((0..self.n_at_once).map(|_| CellInWork::empty(dim)).collect());
-        let finished: Mutex<BTreeMap<u32, Result<FinishedCell, EncodeError>>> = Mutex::default();
-        let has_failed = AtomicBool::new(false);
-        let is_stopped = || self.context.is_cancelled() || has_failed.load(Ordering::Relaxed);
-        let workers = self.context.workers();
-        let n_alone = workers.n_alone(self.plan.inputs.split.cells.len(), self.n_at_once);
-        std::thread::scope(|scope| -> Result<(), EncodeError> {
-            let mut parts =
-                self.context.install(|| self.index.transposed_parts(&self.table, self.group_bytes));
-            let mut next_part = || self.context.time("merge", || self.context.install(|| parts.next()));
-            let mut lent = free.take();
-            while let Some(contributions) = next_part() {
-                if is_stopped() {
-                    break;
-                }
-                let contributions = contributions?;
-                let cell_id = contributions.part.cell_id;
-                let n_gaussians = self.plan.inputs.split.cells[cell_id as usize].gaussians.len();
-                if contributions.part.locals.end < n_gaussians {
-                    // A large cell comes in parts, so that only one of them is held.
-                    self.context.install(|| self.add_part(contributions, refinement, &mut lent.cell))?;
-                    continue;
-                }
-                let (finished, has_failed) = (&finished, &has_failed);
-                let work = move || {
-                    if !is_stopped() {
-                        let added = self.add_part(contributions, refinement, &mut lent.cell);
-                        let result = added.and_then(|()| self.finish_cell(cell_id, &mut lent.cell, objects));
-                        has_failed.fetch_or(result.is_err(), Ordering::Relaxed);
-                        locked(finished).insert(cell_id, result);
-                        self.context.progress().advance(1);
-                    }
-                    drop(lent);
-                };
-                scope.spawn(move || workers.run((cell_id as usize) < n_alone, work));
-                lent = free.take();
-            }
-            Ok(())
-        })?;
-        let finished = finished.into_inner().unwrap_or_else(PoisonError::into_inner);
-        let finished: Vec<FinishedCell> = finished.into_values().collect::<Result<_, _>>()?;
-        Ok((!self.context.is_cancelled()).then_some(finished))
-    }
-
-    /// Adds the next part's embeddings to its cell's, and publishes its field.
-    fn add_part(
-        &self,
-        mut contributions: PartContributions,
-        refinement: Option<&Refinement>,
-        cell: &mut CellInWork,
-    ) -> Result<(), EncodeError> {
-        let part = contributions.part.clone();
-        let gaussians = &self.plan.inputs.split.cells[part.cell_id as usize].gaussians;
-        let CellInWork { embeddings: cell, fields } = cell;
-        let len = cell.vectors.len().max(gaussians.len() * cell.dim);
-        cell.vectors.reserve_exact(len - cell.vectors.len());
-        cell.vectors.resize(len, 0.0);
-        let vectors = &mut cell.vectors[part.locals.start * cell.dim..part.locals.end * cell.dim];
-        let field = self.context.time("lift", || {
-            if let Some(refinement) = refinement {
-                refinement.apply(&mut contributions, &gaussians[part.locals.clone()]);
-            }
-            CellField::new(gaussians[part.locals.clone()].to_vec(), contributions, &self.table, vectors)
-        });
-        cell.has_evidence.extend((0..field.len()).map(|k| field.has_evidence(k)));
-        let (hash, _) = self.context.time("write", || self.plan.store.put_object(|out| field.write(out)))?;
-        fields.push((extra_field(part.cell_id, part.number), hash));
-        Ok(())
-    }
-
-    /// Makes a cell's codebook and shards from its embeddings.
-    fn finish_cell(
-        &self,
-        cell_id: u32,
-        in_work: &mut CellInWork,
-        objects: Option<&SceneObjects>,
-    ) -> Result<FinishedCell, EncodeError> {
-        let cell = &self.plan.inputs.split.cells[cell_id as usize];
-        let (scene, settings) = (&self.plan.inputs.scene, &self.plan.settings.cells.shards);
-        let encoder_id = self.encoder_id;
-        let embeddings = &in_work.embeddings;
-        let occupancy = self.occupancy.as_ref().map(|scene| scene.cells[cell_id as usize].view());
-        let extras = CellExtras { objects, occupancy };
-        let made = self.context.time("codebook", || {
-            shard::build(scene, cell_id, cell, embeddings, encoder_id, &self.score_context, settings, &extras)
-        });
-        let record = |shard: &BuiltShard| -> Result<(Profile, ShardRecord), EncodeError> {
-            let (hash, len_bytes) = self.context.time("write", || self.plan.store.put_bytes(&shard.bytes))?;
-            let record = ShardRecord {
-                hash,
-                len_bytes,
-                n_centroids: made.n_centroids,
-                score_error_bound: shard.score_error_bound,
-                score_errors: shard.score_errors,
-                position_error: made.position_error,
-            };
-            Ok((shard.profile, record))
-        };
-        let shards = made.shards.iter().map(record).collect::<Result<_, EncodeError>>()?;
-        let n_with = (cell.gaussians.len() - made.n_without_evidence) as f64;
-        Ok(FinishedCell {
-            record: CellRecord {
-                cell_id,
-                bounds: cell.bounds,
-                n_gaussians: cell.gaussians.len() as u32,
-                shards,
-            },
-            fields: std::mem::take(&mut in_work.fields),
-            n_subspaces: made.n_subspaces,
-            n_without_evidence: made.n_without_evidence as u64,
-            score_sums: [made.moments.mean * n_with, made.moments.mean_square * n_with, n_with],
-        })
-    }
-}
-
-/// Cells that are not in work.
-struct FreeCells {
-    cells: Mutex<Vec<CellInWork>>,
-    given_back: Condvar,
-}
-
-impl FreeCells {
-    fn new(cells: Vec<CellInWork>) -> Self {
-        Self { cells: Mutex::new(cells), given_back: Condvar::new() }
-    }
-
-    /// Waits until one is free.
-    fn take(&self) -> LentCell<'_> {
-        let mut cells = locked(&self.cells);
-        loop {
-            match cells.pop() {
-                Some(cell) => return LentCell { cell, owner: self },
-                None => cells = self.given_back.wait(cells).unwrap_or_else(PoisonError::into_inner),
-            }
-        }
-    }
-}
-
-/// A cell that goes back, emptied, whatever becomes of the work.
-struct LentCell<'a> {
-    cell: CellInWork,
-    owner: &'a FreeCells,
-}
-
-impl Drop for LentCell<'_> {
-    fn drop(&mut self) {
-        let mut cell = std::mem::replace(&mut self.cell, CellInWork::empty(0));
-        cell.embeddings.has_evidence.clear();
-        cell.fields.clear();
-        locked(&self.owner.cells).push(cell);
-        self.owner.given_back.notify_one();
-    }
-}
-
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

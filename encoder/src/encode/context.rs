@@ -53,7 +53,7 @@ impl Phase {
 }
 
 /// The state that the steps of one run share.
-pub(super) struct RunContext<'a> {
+pub(crate) struct RunContext<'a> {
     start: Instant,
     progress: &'a dyn Progress,
     cancel: &'a AtomicBool,
@@ -68,7 +68,7 @@ impl<'a> RunContext<'a> {
     ///
     /// # Errors
     /// [`EncodeError::Threads`].
-    pub(super) fn new(
+    pub(crate) fn new(
         n_threads: usize,
         progress: &'a dyn Progress,
         cancel: &'a AtomicBool,
@@ -102,37 +102,37 @@ impl<'a> RunContext<'a> {
     }
 
     /// Returns the receiver of progress.
-    pub(super) fn progress(&self) -> &'a dyn Progress {
+    pub(crate) fn progress(&self) -> &'a dyn Progress {
         self.progress
     }
 
     /// Returns the flag that asks the run to stop, for steps that poll it themselves.
-    pub(super) fn cancel(&self) -> &'a AtomicBool {
+    pub(crate) fn cancel(&self) -> &'a AtomicBool {
         self.cancel
     }
 
     /// Returns whether the user has asked the run to stop.
-    pub(super) fn is_cancelled(&self) -> bool {
+    pub(crate) fn is_cancelled(&self) -> bool {
         self.cancel.load(Ordering::Relaxed)
     }
 
     /// Returns the run's threads, for a step that waits for a device and needs them only in between.
-    pub(super) fn pool(&self) -> &ThreadPool {
+    pub(crate) fn pool(&self) -> &ThreadPool {
         self.workers.shared()
     }
 
     /// Returns the run's threads.
-    pub(super) fn workers(&self) -> &Workers {
+    pub(crate) fn workers(&self) -> &Workers {
         &self.workers
     }
 
     /// Runs work on the run's threads: parallel iterators inside use these alone.
-    pub(super) fn install<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
+    pub(crate) fn install<T: Send>(&self, work: impl FnOnce() -> T + Send) -> T {
         self.workers.run(false, work)
     }
 
     /// Runs work and adds its time to a stage.
-    pub(super) fn time<T>(&self, stage: &'static str, work: impl FnOnce() -> T) -> T {
+    pub(crate) fn time<T>(&self, stage: &'static str, work: impl FnOnce() -> T) -> T {
         let start = Instant::now();
         let result = work();
         let secs = start.elapsed().as_secs_f64();
@@ -141,7 +141,7 @@ impl<'a> RunContext<'a> {
     }
 
     /// Returns the seconds spent in each stage so far.
-    pub(super) fn busy_secs(&self) -> BTreeMap<String, f64> {
+    pub(crate) fn busy_secs(&self) -> BTreeMap<String, f64> {
         let times = self.times.0.lock().unwrap_or_else(PoisonError::into_inner);
         times.iter().map(|(stage, secs)| ((*stage).to_owned(), *secs)).collect()
     }

@@ -167,6 +167,9 @@ pub enum EncodeError {
     /// The memory budget is too small.
     #[error(transparent)]
     Memory(#[from] MemoryError),
+    /// The bucket or the fleet.
+    #[error(transparent)]
+    Fleet(Box<dyn std::error::Error + Send + Sync>),
     /// The user stopped the encode; a rerun resumes.
     #[error("interrupted after {n_done} of {n_views} views; run the same command again to resume")]
     Interrupted {
@@ -179,7 +182,7 @@ pub enum EncodeError {
 
 impl EncodeError {
     /// Returns whether the error lies in one view's input, so that the other views may go on.
-    pub(super) fn is_of_one_view(&self) -> bool {
+    pub(crate) fn is_of_one_view(&self) -> bool {
         match self {
             Self::Ingest(_) | Self::Contributions(ContributionError::TooManyRegions { .. }) => true,
             Self::Segment(error) => !matches!(error, SegmentError::Model(_)),

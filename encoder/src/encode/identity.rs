@@ -69,21 +69,7 @@ pub(super) fn identities(
     segmenter: &dyn Segmenter,
     inputs: &Inputs,
 ) -> Result<Identities, EncodeError> {
-    let Engines { models, session, perturbation, .. } = engines;
-    let of_scene = hash_of(&SceneIdentity {
-        program: env!("CARGO_PKG_VERSION"),
-        regions: (REGIONS_VERSION, LONG_BORDERS, MAX_RASTER_WIDTH_PX),
-        encoder: Hash32(models.encoder_id().hash()),
-        session: Session {
-            providers: session.providers.iter().map(ToString::to_string).collect(),
-            n_threads: session.intra_op_threads,
-        },
-        segmenter: segmenter.identity(),
-        perturbation: perturbation.map(|perturbation| perturbation.identity()),
-        scene: hash_scene(&inputs.scene),
-        settings: &settings.view,
-        cells: settings.cells.limits,
-    })?;
+    let of_scene = of_scene(&settings.view, settings.cells.limits, engines, segmenter, &inputs.scene)?;
     let of_view = |view: &View| -> Result<Hash32, EncodeError> {
         hash_of(&ViewIdentity {
             of_scene,
@@ -96,6 +82,34 @@ pub(super) fn identities(
     };
     let of_view = inputs.views.par_iter().map(of_view).collect::<Result<_, _>>()?;
     Ok(Identities { of_scene, of_view })
+}
+
+/// Returns the hash of everything on which the contributions of all views depend.
+///
+/// # Errors
+/// None that is known: settings can be serialised.
+pub(crate) fn of_scene(
+    settings: &ViewSettings,
+    cells: CellLimits,
+    engines: &Engines<'_>,
+    segmenter: &dyn Segmenter,
+    scene: &Gaussians,
+) -> Result<Hash32, EncodeError> {
+    let Engines { models, session, perturbation, .. } = engines;
+    hash_of(&SceneIdentity {
+        program: env!("CARGO_PKG_VERSION"),
+        regions: (REGIONS_VERSION, LONG_BORDERS, MAX_RASTER_WIDTH_PX),
+        encoder: Hash32(models.encoder_id().hash()),
+        session: Session {
+            providers: session.providers.iter().map(ToString::to_string).collect(),
+            n_threads: session.intra_op_threads,
+        },
+        segmenter: segmenter.identity(),
+        perturbation: perturbation.map(|perturbation| perturbation.identity()),
+        scene: hash_scene(scene),
+        settings,
+        cells,
+    })
 }
 
 fn hash_of(identity: &impl Serialize) -> Result<Hash32, EncodeError> {

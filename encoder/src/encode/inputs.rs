@@ -21,11 +21,11 @@ use crate::memory::{MemoryPlan, Phase};
 const PHOTO_BYTES_PER_PX: u64 = 3 + 3 + 1 + 4 + 4;
 
 /// The inputs of an encode.
-pub(super) struct Inputs {
-    pub(super) scene: Gaussians,
-    pub(super) split: CellSplit,
+pub(crate) struct Inputs {
+    pub(crate) scene: Gaussians,
+    pub(crate) split: CellSplit,
     /// The views whose photo exists, in the order of their names.
-    pub(super) views: Vec<View>,
+    pub(crate) views: Vec<View>,
     /// The views whose photo is missing, in the same order.
     pub(super) missing: Vec<SkippedView>,
     pub(super) geo_reference: Option<GeoReference>,
@@ -63,7 +63,7 @@ pub(super) fn reserve(memory: &mut MemoryPlan, scene: &Gaussians) {
 }
 
 /// Reserves the photos in work: one a thread, the largest ones.
-pub(super) fn reserve_photos(memory: &mut MemoryPlan, views: &[View], threads: usize) {
+pub(crate) fn reserve_photos(memory: &mut MemoryPlan, views: &[View], threads: usize) {
     let mut areas_px: Vec<u64> = views.iter().map(ingest::photo_area_px).collect();
     areas_px.sort_unstable_by(|a, b| b.cmp(a));
     let in_work_px: u64 = areas_px.iter().take(threads).sum();

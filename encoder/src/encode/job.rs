@@ -3,10 +3,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
-use serde::{Deserialize, Serialize};
-use slag_common::Hash32;
+use serde::Serialize;
+use slag_common::{Hash32, View};
 
 use super::error::EncodeError;
+use super::sink::{ViewRecord, ViewSink};
 use crate::lift::ViewContributions;
 use crate::lift::photos::{self, MaskOutline};
 use crate::store::Store;
@@ -19,15 +20,6 @@ const PUBLISHED_KEY: &[u8] = b"published";
 const STEP_KEY: &[u8] = b"step";
 /// Followed by the view's identity.
 const VIEW_PREFIX: &str = "view/";
-
-/// The record of a finished view.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub(super) struct ViewRecord {
-    /// Width at which its weights were rasterised.
-    pub(super) raster_width_px: u32,
-    /// Seconds in its stages before this record.
-    pub(super) secs: f32,
-}
 
 /// What a store knows of the encode that it keeps views of.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -59,10 +51,12 @@ pub fn job_status(store: &Store) -> Result<Option<JobStatus>, EncodeError> {
 }
 
 /// The unfinished encode of a store.
-pub(super) struct Job<'a> {
+pub(crate) struct Job<'a> {
     store: &'a Store,
     records: sled::Tree,
     folder: PathBuf,
+    #[cfg_attr(not(feature = "fleet"), expect(dead_code, reason = "for a fleet"))]
+    of_scene: Hash32,
     /// The identity of each view of this encode, by name.
     id_of_view: BTreeMap<String, Hash32>,
 }
@@ -81,7 +75,7 @@ impl<'a> Job<'a> {
     ) -> Result<Self, EncodeError> {
         let folder = store.job_dir()?;
         let records = store.db().open_tree(TREE).map_err(|source| records_error(store, source))?;
-        let job = Self { store, records, folder, id_of_view };
+        let job = Self { store, records, folder, of_scene, id_of_view };
         job.adopt()?;
         let found = job.records.get(IDENTITY_KEY).map_err(|source| records_error(store, source))?;
         let same = found.as_deref() == Some(&of_scene.0);
@@ -105,7 +99,7 @@ impl<'a> Job<'a> {
     }
 
     /// Returns the views of this encode whose contributions are on disk.
-    pub(super) fn done_views(&self) -> Result<BTreeMap<String, ViewRecord>, EncodeError> {
+    pub(crate) fn done_views(&self) -> Result<BTreeMap<String, ViewRecord>, EncodeError> {
         let mut done = BTreeMap::new();
         for (name, id) in &self.id_of_view {
             let record = self.records.get(record_key(*id));
@@ -121,26 +115,36 @@ impl<'a> Job<'a> {
     ///
     /// # Panics
     /// If the view is none of this encode's.
-    pub(super) fn contributions_path(&self, view: &str) -> PathBuf {
+    pub(crate) fn contributions_path(&self, view: &str) -> PathBuf {
         // By identity: a photo that is replaced gets another file, and a record never names the old one's.
         self.views_folder().join(format!("{}.contributions", self.id_of_view[view]))
     }
 
     /// Returns the file of the outlines of a view's masks.
-    pub(super) fn outlines_path(&self, view: &str) -> PathBuf {
+    pub(crate) fn outlines_path(&self, view: &str) -> PathBuf {
         self.contributions_path(view).with_extension("outlines")
     }
 
-    /// Keeps a view's contributions and its masks' outlines: the files first, then the record that marks it as done.
-    pub(super) fn keep(
-        &self,
-        view: &str,
-        contributions: &ViewContributions,
-        outlines: &[MaskOutline],
-        record: ViewRecord,
-    ) -> Result<(), EncodeError> {
-        photos::write_outlines(&self.outlines_path(view), outlines)?;
-        contributions.write(&self.contributions_path(view))?;
+    /// Returns the hash of everything on which the contributions of all views depend.
+    #[cfg(feature = "fleet")]
+    pub(crate) fn of_scene(&self) -> Hash32 {
+        self.of_scene
+    }
+
+    /// Returns the identity of a view.
+    ///
+    /// # Panics
+    /// If the view is none of this encode's.
+    #[cfg(feature = "fleet")]
+    pub(crate) fn id_of(&self, view: &str) -> Hash32 {
+        self.id_of_view[view]
+    }
+
+    /// Marks a view as done, whose files are durable.
+    ///
+    /// # Errors
+    /// [`EncodeError::Records`].
+    pub(crate) fn mark_done(&self, view: &str, record: ViewRecord) -> Result<(), EncodeError> {
         let record = serde_json::to_vec(&record).map_err(std::io::Error::from)?;
         // In one step: with a view that was not published, the job may no longer be dropped silently.
         let mut batch = sled::Batch::default();
@@ -250,6 +254,25 @@ impl<'a> Job<'a> {
     }
 }
 
+impl ViewSink for Job<'_> {
+    fn n_at_once(&self) -> usize {
+        1
+    }
+
+    /// The files come first, then the record that marks the view as done.
+    fn keep(
+        &self,
+        view: &View,
+        contributions: &ViewContributions,
+        outlines: &[MaskOutline],
+        record: ViewRecord,
+    ) -> Result<(), EncodeError> {
+        photos::write_outlines(&self.outlines_path(&view.name), outlines)?;
+        contributions.write(&self.contributions_path(&view.name))?;
+        self.mark_done(&view.name, record)
+    }
+}
+
 fn record_key(id: Hash32) -> Vec<u8> {
     format!("{VIEW_PREFIX}{id}").into_bytes()
 }
@@ -269,7 +292,18 @@ mod tests {
             masks_of_region: Vec::new(),
             entries_of_cell: Vec::new(),
         };
-        job.keep(view, &contributions, &[], ViewRecord::default()).expect("keeps");
+        let intrinsics = slag_common::Intrinsics {
+            width_px: 1,
+            height_px: 1,
+            focal_x_px: 1.0,
+            focal_y_px: 1.0,
+            centre_x_px: 0.5,
+            centre_y_px: 0.5,
+            distortion: slag_common::Distortion::None,
+        };
+        let (name, image_path) = (view.to_owned(), PathBuf::new());
+        let view = View { name, image_path, intrinsics, camera_from_world: glam::DAffine3::IDENTITY };
+        job.keep(&view, &contributions, &[], ViewRecord::default()).expect("keeps");
     }
 
     fn open_with<'a>(store: &'a Store, of_scene: u8, views: &[(&str, u8)]) -> Result<Job<'a>, EncodeError> {

@@ -5,19 +5,24 @@
 //! | plan | inputs read and checked, memory reserved, the order of views | `plan.rs` |
 //! | run views | a file of contributions per view, in the job's folder | `views.rs`, `view.rs`, `pipeline.rs`, `job.rs` |
 //! | look around | free and occupied places, if they are asked for | `views.rs` |
-//! | build cells | objects, fields and shards in the store | `cells.rs` |
+//! | build cells | objects, fields and shards in the store | `cells.rs`, `cell.rs` |
 //! | publish | the manifest and its metadata, the summary | `publish.rs` |
+//!
+//! Views and cells are done by an `Executor` (`executor.rs`): this machine (`here.rs`), or a fleet.
 //!
 //! Views are independent: a killed encode resumes after the last finished view, if it is the same encode
 //! (`identity.rs`). The later steps read the contributions in the order of the views' names, so the store's bytes do
 //! not depend on threads, on the order of views or on interruptions.
 
+mod cell;
 mod cells;
 mod context;
 pub mod coverage;
 mod engines;
 mod error;
+mod executor;
 pub mod front;
+mod here;
 mod identity;
 mod inputs;
 mod job;
@@ -27,6 +32,7 @@ mod preset;
 mod publish;
 mod report;
 mod settings;
+mod sink;
 mod view;
 mod views;
 mod workers;
@@ -36,6 +42,7 @@ use std::sync::atomic::AtomicBool;
 use crate::progress::Progress;
 use crate::store::Store;
 use context::{Phase, RunContext};
+use executor::Executor;
 
 pub use crate::memory::{MemoryError, Reservation};
 pub use engines::{Engines, Perturbation};
@@ -49,11 +56,39 @@ pub use settings::{
     Regions, RunSettings, ViewOrder, ViewSettings, ViewsLimit,
 };
 
+/// The parts of which a fleet makes its own encode.
+#[cfg(feature = "fleet")]
+pub(crate) mod fleet_parts {
+    pub(crate) use super::cell::{CellInWork, CellMaker, FinishedCell, Merged};
+    pub(crate) use super::context::RunContext;
+    pub(crate) use super::executor::{CellsToBuild, Executor, ViewsRun};
+    pub(crate) use super::here::work_off;
+    pub(crate) use super::identity::of_scene;
+    pub(crate) use super::inputs::reserve_photos;
+    pub(crate) use super::plan::{Plan, segmenter_of};
+    pub(crate) use super::sink::{ObjectSink, PhotoSource, ViewRecord, ViewSink, WriteObject};
+    pub(crate) use super::view::{ViewStages, ViewTools};
+}
+
 /// Encodes a scene into a store and publishes the result as its next generation.
 ///
 /// # Errors
 /// [`EncodeError`]; the store keeps its current generation, and finished views are not done again.
 pub fn encode(
+    settings: &EncodeSettings,
+    engines: &Engines<'_>,
+    progress: &dyn Progress,
+    cancel: &AtomicBool,
+) -> Result<EncodeSummary, EncodeError> {
+    encode_by(&here::Here, settings, engines, progress, cancel)
+}
+
+/// Encodes a scene as [`encode`] does. `executor` does the views and cells.
+///
+/// # Errors
+/// As of [`encode`].
+pub(crate) fn encode_by(
+    executor: &dyn Executor,
     settings: &EncodeSettings,
     engines: &Engines<'_>,
     progress: &dyn Progress,
@@ -68,14 +103,14 @@ pub fn encode(
     let plan = plan::plan(settings, engines, &store, &inputs, &context)?;
     context.begin_phase(Phase::Views);
     plan.job.begin("views")?;
-    let views = views::run_views(&plan, &context)?;
+    let views = views::run_views(&plan, executor, &context)?;
     let occupancy = views::look_around(&plan, &views, &context)?;
     context.begin_phase(Phase::Merge);
     plan.job.begin("cells")?;
-    let built = cells::build_cells(&plan, &views, occupancy, &context)?;
+    let built = cells::build_cells(&plan, &views, occupancy, executor, &context)?;
     context.begin_phase(Phase::Publish);
     plan.job.begin("publish")?;
-    publish::publish(plan, views, built, &context)
+    publish::publish(plan, views, built, executor, &context)
 }
 
 /// Makes the objects of a generation again from the views that an encode kept, and puts those that are missing or damaged
@@ -96,6 +131,6 @@ pub fn remake(
     let plan = plan::plan_of_kept(settings, engines, &store, &inputs, &context)?;
     let views = views::kept_views(&plan)?;
     let occupancy = views::look_around(&plan, &views, &context)?;
-    cells::build_cells(&plan, &views, occupancy, &context)?;
+    cells::build_cells(&plan, &views, occupancy, &here::Here, &context)?;
     Ok(())
 }

@@ -37,7 +37,8 @@ enum Failure<E> {
     Panic(Box<dyn Any + Send>),
 }
 
-/// Takes what `source` yields through the stages, `n_cores` at a time on the processor.
+/// Takes what `source` yields through the stages, `n_cores` at a time on the processor. A source that has nothing may have
+/// more later: it is asked again whenever a stage has room, until nothing is under way.
 ///
 /// `step` does the work of a stage (its index) and returns what the next one takes; `None` ends an item's way.
 ///
@@ -51,7 +52,7 @@ pub(super) fn run<T: Send, E: Send>(
 ) -> Result<Vec<StageReport>, E> {
     let start = Instant::now();
     let state = Mutex::new(State {
-        source: source.fuse(),
+        source,
         waiting: stages.iter().map(|_| VecDeque::new()).collect(),
         n_running: vec![0; stages.len()],
         busy_secs: vec![0.0; stages.len()],

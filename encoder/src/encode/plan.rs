@@ -12,7 +12,8 @@ use super::error::EncodeError;
 use super::identity;
 use super::inputs::{self, Inputs};
 use super::job::Job;
-use super::settings::{EncodeSettings, Masks, Regions, RunSettings, ViewOrder};
+use super::settings::{EncodeSettings, Masks, Regions, RunSettings, ViewOrder, ViewSettings};
+use super::view::ViewTools;
 use crate::cells::CellSplit;
 use crate::embed::SharedEncoders;
 use crate::lift::refine::Refinement;
@@ -27,19 +28,36 @@ use crate::shard;
 use crate::store::Store;
 
 /// What was decided.
-pub(super) struct Plan<'a> {
-    pub(super) settings: &'a EncodeSettings,
-    pub(super) engines: &'a Engines<'a>,
-    pub(super) inputs: &'a Inputs,
-    pub(super) store: &'a Store,
+pub(crate) struct Plan<'a> {
+    pub(crate) settings: &'a EncodeSettings,
+    pub(crate) engines: &'a Engines<'a>,
+    pub(crate) inputs: &'a Inputs,
+    pub(crate) store: &'a Store,
     pub(super) memory: MemoryPlan,
-    pub(super) segmenter: Box<dyn Segmenter>,
-    pub(super) job: Job<'a>,
+    pub(crate) segmenter: Box<dyn Segmenter>,
+    pub(crate) job: Job<'a>,
     pub(super) scene: Box<dyn LoadedScene + 'a>,
     /// The views to use, as numbers in the order in which they are taken.
-    pub(super) order: Vec<usize>,
+    pub(crate) order: Vec<usize>,
     pub(super) coverage: Option<Coverage>,
     pub(super) coverage_secs: f64,
+}
+
+impl Plan<'_> {
+    /// Returns what every view needs on its way on this machine.
+    pub(super) fn view_tools(&self) -> ViewTools<'_> {
+        ViewTools {
+            engines: self.engines,
+            settings: &self.settings.view,
+            n_threads: self.settings.run.threads,
+            gpus: &self.settings.run.gpus,
+            segmenter: self.segmenter.as_ref(),
+            scene: self.scene.as_ref(),
+            split: &self.inputs.split,
+            photos: None,
+            sink: &self.job,
+        }
+    }
 }
 
 /// Checks the budget, opens segmenter and job, loads the scene and chooses the views.
@@ -85,16 +103,7 @@ fn make_plan<'a>(
         SharedEncoders::reserve(&mut memory, &settings.run.gpus, square_bytes);
     }
     memory.rest(0)?;
-    let regions = settings.view.regions;
-    if regions.have_patches() && engines.models.patches_per_side().is_none() {
-        return Err(EncodeError::NoPatches { model: engines.models.encoder_id().to_string() });
-    }
-    let segmenter: Box<dyn Segmenter> = match regions {
-        Regions::Patches => Box::new(NoMasks),
-        Regions::Masks | Regions::Both => {
-            open_segmenter(&settings.view.masks, engines.session, &settings.run.gpus)?
-        }
-    };
+    let segmenter = segmenter_of(&settings.view, &settings.run.gpus, engines)?;
     let ids = context.time("identity", || {
         context.install(|| identity::identities(settings, engines, segmenter.as_ref(), inputs))
     })?;
@@ -138,6 +147,25 @@ fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, dim: usize) -> Memory
         objects::reserve(&mut memory, n_gaussians, inputs.views.len());
     }
     memory
+}
+
+/// Opens the segmenter of some settings, on some GPUs.
+///
+/// # Errors
+/// [`EncodeError::NoPatches`], [`EncodeError::Segment`].
+pub(crate) fn segmenter_of(
+    settings: &ViewSettings,
+    gpus: &[u32],
+    engines: &Engines<'_>,
+) -> Result<Box<dyn Segmenter>, EncodeError> {
+    let regions = settings.regions;
+    if regions.have_patches() && engines.models.patches_per_side().is_none() {
+        return Err(EncodeError::NoPatches { model: engines.models.encoder_id().to_string() });
+    }
+    Ok(match regions {
+        Regions::Patches => Box::new(NoMasks),
+        Regions::Masks | Regions::Both => open_segmenter(&settings.masks, engines.session, gpus)?,
+    })
 }
 
 fn open_segmenter(

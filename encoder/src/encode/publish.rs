@@ -10,6 +10,7 @@ use slag_common::shard::ScoreErrors;
 use super::cells::{BuiltCells, Counts};
 use super::context::RunContext;
 use super::error::EncodeError;
+use super::executor::Executor;
 use super::plan::Plan;
 use super::report::{CellReport, EncodeSummary};
 use super::views::DoneViews;
@@ -23,10 +24,12 @@ pub(super) fn publish(
     plan: Plan<'_>,
     views: DoneViews<'_>,
     built: BuiltCells,
+    executor: &dyn Executor,
     context: &RunContext<'_>,
 ) -> Result<EncodeSummary, EncodeError> {
     let generation = plan.store.next_generation()?;
     let manifest = manifest(&plan, &built, generation);
+    executor.begin_publication()?;
     plan.store.publish_by(&manifest, &built.extras, plan.settings.output.command.clone())?;
     let models = plan.settings.output.models.clone();
     plan.store.remember_models(&ModelsRecord { encoder: manifest.encoder.id, models })?;

@@ -4,7 +4,7 @@ use std::num::NonZeroU32;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use slag_common::shard::Profile;
 
 use super::error::EncodeError;
@@ -75,7 +75,7 @@ pub struct InputSettings {
 }
 
 /// How a view becomes contributions: all of it is part of the encode's identity.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ViewSettings {
     /// Where masks come from.
     pub masks: Masks,
@@ -90,12 +90,12 @@ pub struct ViewSettings {
     /// Whether slivers between masks join their neighbours.
     pub merges_slivers: bool,
     /// Which parts of a photo have vectors.
-    #[serde(skip_serializing_if = "Regions::are_masks")]
+    #[serde(default, skip_serializing_if = "Regions::are_masks")]
     pub regions: Regions,
 }
 
 /// Which parts of a photo have vectors.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Regions {
     /// Masks, by a crop each.
@@ -119,7 +119,7 @@ impl Regions {
 }
 
 /// Where masks come from.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Masks {
     /// From the built-in segmenter with the embedded model.
@@ -150,7 +150,7 @@ pub enum Masks {
 }
 
 /// Width of the rasters of views.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum RasterWidth {
     /// As [`Self::Photo`], and twice as wide in views whose regions have long borders (`LONG_BORDERS`).

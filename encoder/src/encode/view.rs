@@ -9,11 +9,12 @@ use slag_models::preprocess::Preprocess;
 use slag_models::{Crop, ImageEncoder, SessionOptions};
 
 use super::context::RunContext;
+use super::engines::Engines;
 use super::error::EncodeError;
-use super::job::ViewRecord;
 use super::pipeline::Stage;
-use super::plan::Plan;
-use super::settings::{LONG_BORDERS, MAX_RASTER_WIDTH_PX, RasterWidth};
+use super::settings::{LONG_BORDERS, MAX_RASTER_WIDTH_PX, RasterWidth, ViewSettings};
+use super::sink::{PhotoSource, ViewRecord, ViewSink};
+use crate::cells::CellSplit;
 use crate::embed::{self, EmbedError, SharedEncoders};
 use crate::ingest::{self, LoadedImage};
 use crate::lanes::GpuLoad;
@@ -22,12 +23,28 @@ use crate::lift::photos::MaskOutline;
 use crate::masks::patches::patch_masks;
 use crate::masks::regions::{absorb_slivers, border_share, partition};
 use crate::masks::{Mask, RegionMap};
-use crate::raster::{RasterError, RasterView};
-use crate::segment::SegmentInput;
+use crate::raster::{LoadedScene, RasterError, RasterView};
+use crate::segment::{SegmentInput, Segmenter};
+
+/// What every view needs on its way.
+#[derive(Clone, Copy)]
+pub(crate) struct ViewTools<'a> {
+    pub(crate) engines: &'a Engines<'a>,
+    pub(crate) settings: &'a ViewSettings,
+    pub(crate) n_threads: usize,
+    /// GPUs for the models.
+    pub(crate) gpus: &'a [u32],
+    pub(crate) segmenter: &'a dyn Segmenter,
+    pub(crate) scene: &'a dyn LoadedScene,
+    pub(crate) split: &'a CellSplit,
+    /// Brings photos to this machine; `None` where they are.
+    pub(crate) photos: Option<&'a dyn PhotoSource>,
+    pub(crate) sink: &'a dyn ViewSink,
+}
 
 /// The stages of a view, with what every view needs.
-pub(super) struct ViewStages<'a> {
-    plan: &'a Plan<'a>,
+pub(crate) struct ViewStages<'a> {
+    tools: ViewTools<'a>,
     context: &'a RunContext<'a>,
     /// How crops become the image encoder's squares; `None` if it takes crops of any size.
     preprocess: Option<Preprocess>,
@@ -45,7 +62,7 @@ enum Encoders<'a> {
 }
 
 /// A view between two stages, with what the next one needs.
-pub(super) struct Work<'v> {
+pub(crate) struct Work<'v> {
     view: &'v View,
     next: Next,
     /// Seconds of the stages so far.
@@ -54,6 +71,7 @@ pub(super) struct Work<'v> {
 
 #[expect(clippy::large_enum_variant, reason = "a handful at a time, moved a few times a view")]
 enum Next {
+    Fetch,
     Decode,
     Depth(LoadedImage),
     Segment(LoadedImage, Option<Vec<f32>>),
@@ -90,8 +108,8 @@ struct Partition {
 }
 
 impl<'v> Work<'v> {
-    pub(super) fn begin(view: &'v View) -> Self {
-        Self { view, next: Next::Decode, secs: 0.0 }
+    pub(super) fn begin(view: &'v View, is_here: bool) -> Self {
+        Self { view, next: if is_here { Next::Decode } else { Next::Fetch }, secs: 0.0 }
     }
 
     pub(super) fn view(&self) -> &'v View {
@@ -101,8 +119,8 @@ impl<'v> Work<'v> {
 
 impl<'a> ViewStages<'a> {
     /// Makes the stages; models are opened when the first view needs them.
-    pub(super) fn new(plan: &'a Plan<'a>, context: &'a RunContext<'a>) -> Self {
-        let (models, session) = (plan.engines.models, plan.engines.session);
+    pub(crate) fn new(tools: ViewTools<'a>, context: &'a RunContext<'a>) -> Self {
+        let (models, session) = (tools.engines.models, tools.engines.session);
         let images_on = Arc::<OnceLock<_>>::default();
         let is_on = Arc::clone(&images_on);
         let open = move |gpu| {
@@ -112,28 +130,33 @@ impl<'a> ViewStages<'a> {
         };
         let encoders = match session.is_on_cpu() {
             true => Encoders::OfViews(Mutex::default()),
-            false => Encoders::Shared(SharedEncoders::new(&plan.settings.run.gpus, Box::new(open))),
+            false => Encoders::Shared(SharedEncoders::new(tools.gpus, Box::new(open))),
         };
-        Self { plan, context, preprocess: models.preprocess(), encoders, images_on }
+        Self { tools, context, preprocess: models.preprocess(), encoders, images_on }
     }
 
     /// Returns the load of each GPU by the models of a stage.
     pub(super) fn loads(&self, stage: &str) -> Vec<GpuLoad> {
         match (stage, &self.encoders) {
-            ("segment", _) => self.plan.segmenter.loads(),
+            ("segment", _) => self.tools.segmenter.loads(),
             ("embed", Encoders::Shared(encoders)) => encoders.loads(),
             _ => Vec::new(),
         }
     }
 
+    /// Returns whether photos are on this machine.
+    pub(super) fn has_photos(&self) -> bool {
+        self.tools.photos.is_none()
+    }
+
     /// Returns the device that ran the image model, if it ran.
-    pub(super) fn images_on(&self) -> Option<String> {
+    pub(crate) fn images_on(&self) -> Option<String> {
         self.images_on.get().cloned().flatten()
     }
 
     /// Returns the stages, in the order in which [`Self::step`] goes through them.
     pub(super) fn stages(&self) -> Vec<Stage> {
-        let n_cores = self.plan.settings.run.threads;
+        let n_cores = self.tools.n_threads;
         let on_cpu = |name| Stage { name, n_slots: n_cores, on_cpu: true };
         let on_device = |name, n_slots: Option<usize>| match n_slots {
             Some(n_slots) => Stage { name, n_slots, on_cpu: false },
@@ -141,18 +164,19 @@ impl<'a> ViewStages<'a> {
         };
         let embed_slots = match &self.encoders {
             Encoders::OfViews(_) => None,
-            Encoders::Shared(_) => Some(SharedEncoders::n_views(&self.plan.settings.run.gpus)),
+            Encoders::Shared(_) => Some(SharedEncoders::n_views(self.tools.gpus)),
         };
-        let mut stages = vec![on_cpu("decode")];
-        if self.plan.segmenter.wants_depth() {
-            stages.push(on_device("depth", self.plan.scene.concurrency()));
+        let fetch = self.tools.photos.map(|photos| on_device("fetch", Some(photos.n_at_once())));
+        let mut stages: Vec<Stage> = fetch.into_iter().chain([on_cpu("decode")]).collect();
+        if self.tools.segmenter.wants_depth() {
+            stages.push(on_device("depth", self.tools.scene.concurrency()));
         }
         stages.extend([
-            on_device("segment", self.plan.segmenter.concurrency()),
+            on_device("segment", self.tools.segmenter.concurrency()),
             on_cpu("crop"),
             on_device("embed", embed_slots),
-            on_device("raster", self.plan.scene.concurrency()),
-            on_device("write", Some(1)),
+            on_device("raster", self.tools.scene.concurrency()),
+            on_device("write", Some(self.tools.sink.n_at_once())),
         ]);
         stages
     }
@@ -163,14 +187,20 @@ impl<'a> ViewStages<'a> {
         let view = work.view;
         let raster_failed = |source: RasterError| EncodeError::Raster { view: view.name.clone(), source };
         let next = match work.next {
+            Next::Fetch => {
+                if let Some(photos) = self.tools.photos {
+                    photos.fetch(view)?;
+                }
+                Next::Decode
+            }
             Next::Decode => match ingest::load_image(view)? {
-                loaded if self.plan.segmenter.wants_depth() => Next::Depth(loaded),
+                loaded if self.tools.segmenter.wants_depth() => Next::Depth(loaded),
                 loaded => Next::Segment(loaded, None),
             },
             Next::Depth(loaded) => {
                 let raster_view = raster_view(&loaded, self.base_width_px(&loaded));
                 // A GPU waits for colours that these threads compute, rather than they for it.
-                let draw = || self.plan.scene.draw(&raster_view, [0.0; 3]);
+                let draw = || self.tools.scene.draw(&raster_view, [0.0; 3]);
                 let drawing = self.context.install(draw).map_err(raster_failed)?;
                 let seen = drawing.depth.iter().zip(&drawing.coverage);
                 // What shows through the scene's holes is nobody's depth.
@@ -182,18 +212,18 @@ impl<'a> ViewStages<'a> {
             Next::Segment(loaded, depth) => {
                 let pool = Some(self.context.pool());
                 let input = SegmentInput { pool, ..SegmentInput::new(&loaded, depth.as_deref()) };
-                let mut masks = self.plan.segmenter.segment(&input)?;
-                if let Some(perturbation) = self.plan.engines.perturbation {
+                let mut masks = self.tools.segmenter.segment(&input)?;
+                if let Some(perturbation) = self.tools.engines.perturbation {
                     masks = perturbation.masks(&view.name, masks, loaded.image.dimensions().into());
                 }
-                masks.retain(|mask| mask.area_px >= self.plan.settings.view.min_mask_px);
+                masks.retain(|mask| mask.area_px >= self.tools.settings.min_mask_px);
                 Next::Crop(loaded, masks)
             }
             Next::Crop(loaded, masks) => {
                 let mut regions = masks.clone();
-                let patches = self.plan.engines.models.patches_per_side();
+                let patches = self.tools.engines.models.patches_per_side();
                 let patches =
-                    patches.filter(|_| self.plan.settings.view.regions.have_patches()).map(|per_side| {
+                    patches.filter(|_| self.tools.settings.regions.have_patches()).map(|per_side| {
                         let (width_px, height_px) = loaded.image.dimensions();
                         let (of, of_patches): (Vec<_>, Vec<_>) =
                             patch_masks(per_side, width_px, height_px).into_iter().unzip();
@@ -203,7 +233,7 @@ impl<'a> ViewStages<'a> {
                 let partition = self.partition(&loaded, &regions);
                 let crops = match &self.preprocess {
                     Some(preprocess) => Crops::Squares(
-                        embed::squares(&loaded.image, &masks, self.plan.settings.view.background, preprocess)
+                        embed::squares(&loaded.image, &masks, self.tools.settings.background, preprocess)
                             .map_err(|source| EncodeError::Embed { view: view.name.clone(), source })?,
                     ),
                     None => Crops::Uncut(loaded, masks),
@@ -212,32 +242,27 @@ impl<'a> ViewStages<'a> {
             }
             Next::Embed(crops, patches, partition) => {
                 let mut vectors = self.embed(view, crops, patches.as_ref())?;
-                if let Some(perturbation) = self.plan.engines.perturbation {
-                    perturbation.vectors(&view.name, &mut vectors, self.plan.engines.models.dim());
+                if let Some(perturbation) = self.tools.engines.perturbation {
+                    perturbation.vectors(&view.name, &mut vectors, self.tools.engines.models.dim());
                 }
                 Next::Raster(vectors, partition)
             }
             Next::Raster(vectors, partition) => {
                 let Partition { raster_view, regions, masks_of_region, outlines, weight_scale } = partition;
                 let mut weights = self
-                    .plan
+                    .tools
                     .scene
-                    .weights(&raster_view, &regions, self.plan.settings.view.weights)
+                    .weights(&raster_view, &regions, self.tools.settings.weights)
                     .map_err(raster_failed)?;
                 weights.entries.iter_mut().for_each(|entry| entry.weight *= weight_scale);
-                let dim = self.plan.engines.models.dim();
-                let contributions = ViewContributions::new(
-                    &weights.entries,
-                    masks_of_region,
-                    vectors,
-                    dim,
-                    &self.plan.inputs.split,
-                );
+                let dim = self.tools.engines.models.dim();
+                let contributions =
+                    ViewContributions::new(&weights.entries, masks_of_region, vectors, dim, self.tools.split);
                 Next::Write(contributions, outlines, raster_view.intrinsics.width_px)
             }
             Next::Write(contributions, outlines, raster_width_px) => {
                 let record = ViewRecord { raster_width_px, secs: work.secs };
-                self.plan.job.keep(&view.name, &contributions, &outlines, record)?;
+                self.tools.sink.keep(view, &contributions, &outlines, record)?;
                 self.context.progress().advance(1);
                 return Ok(None);
             }
@@ -247,7 +272,7 @@ impl<'a> ViewStages<'a> {
 
     /// Returns the width of the raster before the view's content is known.
     fn base_width_px(&self, loaded: &LoadedImage) -> u32 {
-        match self.plan.settings.view.raster_width {
+        match self.tools.settings.raster_width {
             RasterWidth::Px(width_px) => width_px,
             RasterWidth::ByContent | RasterWidth::Photo | RasterWidth::Twice => {
                 loaded.view.intrinsics.width_px.min(MAX_RASTER_WIDTH_PX)
@@ -263,14 +288,14 @@ impl<'a> ViewStages<'a> {
             let (image, valid) = (&loaded.image, loaded.valid.as_deref());
             let (mut regions, mut masks_of_region) =
                 partition(masks, image.width(), image.height(), width_px, height_px, valid);
-            if self.plan.settings.view.merges_slivers {
+            if self.tools.settings.merges_slivers {
                 absorb_slivers(&mut regions, &mut masks_of_region);
             }
             (raster_view, regions, masks_of_region)
         };
         let base_px = self.base_width_px(loaded);
         // Twice the width keeps pixels in step with those of the photo, so that masks keep their outlines.
-        let (width_px, made) = match self.plan.settings.view.raster_width {
+        let (width_px, made) = match self.tools.settings.raster_width {
             RasterWidth::Twice => (2 * base_px, regions_at(2 * base_px)),
             RasterWidth::ByContent => match regions_at(base_px) {
                 made if border_share(&made.1) > LONG_BORDERS => (2 * base_px, regions_at(2 * base_px)),
@@ -298,7 +323,7 @@ impl<'a> ViewStages<'a> {
                 let free = idle().pop();
                 let mut encoder = match free {
                     Some(encoder) => encoder,
-                    None => self.plan.engines.models.image_encoder(self.plan.engines.session)?,
+                    None => self.tools.engines.models.image_encoder(self.tools.engines.session)?,
                 };
                 self.images_on.get_or_init(|| encoder.placement().map(ToString::to_string));
                 let vectors = self.embed_with(encoder.as_mut(), &crops, patches);
@@ -332,7 +357,7 @@ impl<'a> ViewStages<'a> {
         let mut vectors = match crops {
             Crops::Squares(crops) => embed::embed_crops(crops, 0, encoder)?,
             Crops::Uncut(loaded, masks) => {
-                let background = self.plan.settings.view.background;
+                let background = self.tools.settings.background;
                 embed::embed_masks(&loaded.image, masks, encoder, background, None)?
             }
         };

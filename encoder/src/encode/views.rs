@@ -1,7 +1,6 @@
 //! The second step: every view becomes a file of contributions.
 
 use std::collections::BTreeMap;
-use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use slag_common::View;
@@ -9,12 +8,11 @@ use slag_common::View;
 use super::context::{Phase, RunContext};
 use super::coverage::CoverageReport;
 use super::error::EncodeError;
+use super::executor::{Executor, ViewsRun};
 use super::inputs::Inputs;
-use super::job::ViewRecord;
-use super::pipeline;
 use super::plan::Plan;
 use super::report::{SkippedView, StageReport};
-use super::view::{ViewStages, Work};
+use super::sink::ViewRecord;
 use crate::occupancy::{self, SceneOccupancy};
 
 /// The views of a run, done or left out.
@@ -40,14 +38,17 @@ pub(super) struct DoneViews<'a> {
 ///
 /// # Errors
 /// [`EncodeError`]; finished views stay finished.
-pub(super) fn run_views<'a>(plan: &Plan<'a>, context: &RunContext<'_>) -> Result<DoneViews<'a>, EncodeError> {
+pub(super) fn run_views<'a>(
+    plan: &Plan<'a>,
+    executor: &dyn Executor,
+    context: &RunContext<'_>,
+) -> Result<DoneViews<'a>, EncodeError> {
     let views = &plan.inputs.views;
     let done = plan.job.done_views()?;
     let n_resumed = plan.order.iter().filter(|view| done.contains_key(&views[**view].name)).count();
-    let stages = ViewStages::new(plan, context);
     let start = Instant::now();
     context.progress().begin("views", "view", plan.order.len() as u64, n_resumed as u64);
-    let (reports, failed) = run_open_views(plan, &stages, &done, context)?;
+    let ViewsRun { stages, skipped: failed, images_on } = executor.run_views(plan, &done, context)?;
     context.progress().end();
     let secs = start.elapsed().as_secs_f64();
     let n_failed = failed.len();
@@ -63,8 +64,7 @@ pub(super) fn run_views<'a>(plan: &Plan<'a>, context: &RunContext<'_>) -> Result
     }
     let coverage = plan.coverage.as_ref().map(|coverage| coverage.report(used.iter().copied()));
     let used = used.into_iter().map(|view| &views[view]).collect();
-    let images_on = stages.images_on();
-    Ok(DoneViews { used, records, skipped, n_failed, n_resumed, coverage, stages: reports, secs, images_on })
+    Ok(DoneViews { used, records, skipped, n_failed, n_resumed, coverage, stages, secs, images_on })
 }
 
 /// Returns the views whose contributions are kept, without taking any further.
@@ -111,86 +111,4 @@ pub(super) fn look_around(
         .map_err(|(at, source)| EncodeError::Raster { view: views.used[at].name.clone(), source })?
         .ok_or(EncodeError::Interrupted { n_done: views.used.len(), n_views: views.used.len() })?;
     Ok(Some(found))
-}
-
-/// Works off the views without a record. Returns the load of the stages, and the views that were left out.
-fn run_open_views(
-    plan: &Plan<'_>,
-    stages: &ViewStages<'_>,
-    done: &BTreeMap<String, ViewRecord>,
-    context: &RunContext<'_>,
-) -> Result<(Vec<StageReport>, Vec<SkippedView>), EncodeError> {
-    let run = &plan.settings.run;
-    let views = || plan.order.iter().map(|view| &plan.inputs.views[*view]);
-    let open = views().filter(|view| !done.contains_key(&view.name));
-    let deadline = run.time_budget.and_then(|budget| context.start().checked_add(budget));
-    let is_over = || deadline.is_some_and(|deadline| Instant::now() >= deadline);
-    let mut budget = Budget { has_some: views().any(|view| done.contains_key(&view.name)) };
-    // After ctrl-c no view is begun; those in work are finished.
-    let n_alone = context.workers().n_alone(open.clone().count(), run.threads);
-    let source = open
-        .take_while(|_| !context.is_cancelled() && budget.may_begin(is_over()))
-        .enumerate()
-        .map(|(i, view)| (i < n_alone, Work::begin(view)));
-    let skipped = Mutex::new(Vec::new());
-    let list = stages.stages();
-    let start = Instant::now();
-    let mut reports = pipeline::run(&list, run.threads, source, |at, (is_alone, work)| {
-        let view = work.view();
-        // The run's threads do the processor's work. Those that wait for a device or the disk must not hold one.
-        let result = match list[at].on_cpu {
-            true => context.workers().run(is_alone, || stages.step(work)),
-            false => stages.step(work),
-        };
-        match result {
-            // One bad photo or mask file of a thousand must not end an encode. A model that fails on one view fails
-            // on the others too.
-            Err(error) if !run.strict && error.is_of_one_view() => {
-                tracing::warn!("view {} is left out: {error}", view.name);
-                let skip = SkippedView { view: view.name.clone(), reason: error.to_string() };
-                skipped.lock().unwrap_or_else(PoisonError::into_inner).push(skip);
-                Ok(None)
-            }
-            result => result.map(|work| Some((is_alone, work?))),
-        }
-    })?;
-    let wall_secs = start.elapsed().as_secs_f64();
-    for report in &mut reports {
-        report.add_gpus(stages.loads(&report.stage), wall_secs);
-    }
-    if context.is_cancelled() {
-        let n_done = plan.job.done_views()?.len();
-        return Err(EncodeError::Interrupted { n_done, n_views: plan.order.len() });
-    }
-    Ok((reports, skipped.into_inner().unwrap_or_else(PoisonError::into_inner)))
-}
-
-/// Lets views begin until the time is over, but always a first one.
-struct Budget {
-    /// Whether a view is done or begun.
-    has_some: bool,
-}
-
-impl Budget {
-    /// Returns whether another view may begin, and counts it as begun.
-    fn may_begin(&mut self, is_over: bool) -> bool {
-        let is_first = !std::mem::replace(&mut self.has_some, true);
-        !is_over || is_first
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn no_view_begins_after_the_time_but_a_first_one() {
-        let mut fresh = Budget { has_some: false };
-        assert!(fresh.may_begin(false) && fresh.may_begin(false));
-        assert!(!fresh.may_begin(true));
-        let mut late = Budget { has_some: false };
-        assert!(late.may_begin(true) && !late.may_begin(true));
-        let mut resumed = Budget { has_some: true };
-        assert!(!resumed.may_begin(true) && resumed.may_begin(false));
-    }
 }

@@ -12,7 +12,7 @@ use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
 const STACK_BYTES: usize = 8 << 20;
 
 /// The threads of a run.
-pub(super) struct Workers {
+pub(crate) struct Workers {
     shared: ThreadPool,
     /// Pools of one thread that have no work; made as they are needed.
     alone: Mutex<Vec<ThreadPool>>,
@@ -27,24 +27,24 @@ impl Workers {
     ///
     /// # Errors
     /// If the system starts no more threads.
-    pub(super) fn start(n_threads: usize) -> Result<Self, ThreadPoolBuildError> {
+    pub(crate) fn start(n_threads: usize) -> Result<Self, ThreadPoolBuildError> {
         Ok(Self { shared: start(n_threads)?, alone: Mutex::default() })
     }
 
     /// Returns the threads that share work.
-    pub(super) fn shared(&self) -> &ThreadPool {
+    pub(crate) fn shared(&self) -> &ThreadPool {
         &self.shared
     }
 
     /// Returns how many of `n_pieces`, the first ones, get a thread of their own where `n_at_once` are worked on at a time.
-    pub(super) fn n_alone(&self, n_pieces: usize, n_at_once: usize) -> usize {
+    pub(crate) fn n_alone(&self, n_pieces: usize, n_at_once: usize) -> usize {
         let n_threads = self.shared.current_num_threads();
         // Fewer pieces than threads would leave threads without work.
         if n_threads == 1 || n_at_once < n_threads { 0 } else { n_pieces - n_pieces % n_at_once }
     }
 
     /// Runs a piece of work on a thread of its own, or on all threads. The caller is none of them and only waits.
-    pub(super) fn run<T: Send>(&self, is_alone: bool, work: impl FnOnce() -> T + Send) -> T {
+    pub(crate) fn run<T: Send>(&self, is_alone: bool, work: impl FnOnce() -> T + Send) -> T {
         let free = || self.alone.lock().unwrap_or_else(PoisonError::into_inner);
         let pool = is_alone.then(|| free().pop().map_or_else(|| start(1), Ok));
         match pool {

@@ -133,8 +133,8 @@ pub enum ContributionError {
     },
 }
 
-/// Returns the CRC-32 of some entries. The file never leaves the machine, and at a gigabyte per scene a cryptographic hash
-/// would be the slowest step of the lift.
+/// Returns the CRC-32 of some entries: at a gigabyte per scene a cryptographic hash would be the slowest step of the lift.
+/// Storage and network have checksums of their own.
 fn checksum(entries: &[PackedEntry]) -> u64 {
     u64::from(crc32fast::hash(bytemuck::cast_slice(entries)))
 }
@@ -170,6 +170,14 @@ impl ViewContributions {
     /// # Errors
     /// [`ContributionError::Io`], [`ContributionError::TooManyRegions`].
     pub fn write(&self, path: &Path) -> Result<(), ContributionError> {
+        Ok(slag_common::durable::write(path, &self.to_bytes(path)?)?)
+    }
+
+    /// Returns the file's bytes. `path`: its name, for errors.
+    ///
+    /// # Errors
+    /// [`ContributionError::TooManyRegions`].
+    pub fn to_bytes(&self, path: &Path) -> Result<Vec<u8>, ContributionError> {
         let found = self.masks_of_region.len();
         if found > MAX_REGIONS {
             return Err(ContributionError::TooManyRegions { path: path.to_owned(), found });
@@ -214,20 +222,20 @@ impl ViewContributions {
         let mut bytes = Vec::new();
         container::write(&mut bytes, MAGIC, VERSION, &sections)?;
         bytes.extend(container::bytes_of(&entries));
-        Ok(slag_common::durable::write(path, &bytes)?)
+        Ok(bytes)
     }
 }
 
 /// A contribution file, checked except for the contributions: these are checked on reading.
 #[derive(Clone, Debug)]
 pub struct ContributionFile {
-    path: PathBuf,
-    n_regions: usize,
-    n_entries: u64,
+    pub(super) path: PathBuf,
+    pub(super) n_regions: usize,
+    pub(super) n_entries: u64,
     /// Offset of the first entry.
-    entries_at_bytes: u64,
+    pub(super) entries_at_bytes: u64,
     /// By (cell, slice), ascending.
-    runs: Vec<Run>,
+    pub(super) runs: Vec<Run>,
 }
 
 /// The regions of a view, and their masks.
@@ -318,19 +326,56 @@ impl ContributionFile {
     /// # Errors
     /// [`ContributionError`].
     pub(super) fn read(&self, runs: Range<usize>) -> Result<Vec<PackedEntry>, ContributionError> {
+        let bytes = self.bytes_of_runs(runs.clone());
+        let mut entries =
+            vec![PackedEntry::zeroed(); (bytes.end - bytes.start) as usize / size_of::<PackedEntry>()];
+        if !runs.is_empty() {
+            let mut file = fs_err::File::open(&self.path)?;
+            file.seek(SeekFrom::Start(bytes.start))?;
+            file.read_exact(bytemuck::cast_slice_mut(&mut entries))?;
+            self.check_runs(runs, &entries)?;
+        }
+        Ok(entries)
+    }
+
+    /// Checks the entries of some runs, whose bytes were read elsewhere, and returns them.
+    ///
+    /// # Errors
+    /// [`ContributionError::Damaged`].
+    pub(super) fn parse_runs(
+        &self,
+        runs: Range<usize>,
+        bytes: &[u8],
+    ) -> Result<Vec<PackedEntry>, ContributionError> {
+        let expected = self.bytes_of_runs(runs.clone());
+        if bytes.len() as u64 != expected.end - expected.start {
+            let source = ContainerError::Length {
+                expected_bytes: expected.end,
+                found_bytes: expected.start + bytes.len() as u64,
+            };
+            return Err(ContributionError::Damaged { path: self.path.clone(), source });
+        }
+        let entries = bytemuck::pod_collect_to_vec(bytes);
+        self.check_runs(runs, &entries)?;
+        Ok(entries)
+    }
+
+    /// Returns the place of some runs' entries in the file.
+    pub(super) fn bytes_of_runs(&self, runs: Range<usize>) -> Range<u64> {
         if runs.is_empty() {
-            return Ok(Vec::new());
+            return 0..0;
         }
         let (start, end) = (self.entries_of_run(runs.start).start, self.entries_of_run(runs.end - 1).end);
-        let mut entries = vec![PackedEntry::zeroed(); (end - start) as usize];
-        let mut file = fs_err::File::open(&self.path)?;
-        file.seek(SeekFrom::Start(self.offset_bytes(start)))?;
-        file.read_exact(bytemuck::cast_slice_mut(&mut entries))?;
+        self.offset_bytes(start)..self.offset_bytes(end)
+    }
+
+    fn check_runs(&self, runs: Range<usize>, entries: &[PackedEntry]) -> Result<(), ContributionError> {
+        let start = if runs.is_empty() { 0 } else { self.entries_of_run(runs.start).start };
         for run in runs {
             let range = self.entries_of_run(run);
             self.check(run, &entries[(range.start - start) as usize..(range.end - start) as usize])?;
         }
-        Ok(entries)
+        Ok(())
     }
 
     fn offset_bytes(&self, entry: u64) -> u64 {

@@ -3,8 +3,8 @@
 //! Each view's file is ordered by cell and slice, so that any range of cells is one range of each file.
 
 use std::ops::Range;
-use std::path::PathBuf;
-use std::sync::OnceLock;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, OnceLock};
 
 use rayon::prelude::*;
 use slag_common::container::ContainerError;
@@ -16,7 +16,7 @@ use crate::memory::{MemoryPlan, Phase};
 
 /// Most entries of a part. A constant, not a share of the budget: parts are published, and a store must not depend on
 /// the memory of the machine that made it.
-const PART_ENTRIES: u64 = 1 << 22;
+pub(super) const PART_ENTRIES: u64 = 1 << 22;
 /// Most entries of a group that is transposed, even where the budget allows more: a larger one leaves the processor's
 /// caches. As many as a part's.
 const GROUP_ENTRIES: u64 = PART_ENTRIES;
@@ -28,12 +28,13 @@ const BYTES_PER_ENTRY: u64 = size_of::<PackedEntry>() as u64 + BYTES_PER_TRANSPO
 const BYTES_PER_GAUSSIAN: u64 = (size_of::<u64>() + 3 * size_of::<f32>()) as u64;
 
 /// A view's file, and the place of its regions and runs in the whole scene.
+#[derive(Debug)]
 pub(super) struct IndexedView {
     pub(super) file: ContributionFile,
     /// Slice of each run, ascending.
     pub(super) slices: Vec<u32>,
     pub(super) first_region: u32,
-    n_masks: usize,
+    pub(super) n_masks: usize,
 }
 
 /// The files of all views, in the order of the views' names.
@@ -43,8 +44,19 @@ pub struct ContributionIndex {
     /// The Gaussians of each slice, by their index within its cell.
     pub(super) locals_of_slice: Vec<Range<usize>>,
     n_views_without_masks: usize,
+    /// Reads the views' files, where they are not on this machine.
+    pub(super) elsewhere: Option<Arc<dyn RangeReader>>,
     /// The transposed parts, once a pass has read them and the budget holds them.
     pub(super) kept: OnceLock<Vec<PartContributions>>,
+}
+
+/// Reads the views' files where they are not on this machine: in a bucket.
+pub trait RangeReader: Send + Sync {
+    /// Returns bytes of the views' files, in the order given: the number of a view, and the range.
+    ///
+    /// # Errors
+    /// If a range cannot be read.
+    fn read(&self, wanted: &[(usize, Range<u64>)]) -> std::io::Result<Vec<Vec<u8>>>;
 }
 
 /// The entries of a group of parts, in the order of the files.
@@ -74,6 +86,25 @@ impl ContributionIndex {
         n_gaussians_of_cell: &[usize],
         part_entries: u64,
     ) -> Result<(Self, RegionTable), ContributionError> {
+        let mut table = RegionTable::new(dim);
+        let mut files = Vec::with_capacity(paths.len());
+        for path in paths {
+            let (file, regions) = ContributionFile::open(path)?;
+            if regions.dim != dim {
+                return Err(of_another_scene(path));
+            }
+            let first_region = table.append(&regions.mask_vectors, regions.masks_of_region());
+            files.push((file, first_region, regions.mask_vectors.len() / dim));
+        }
+        Ok((Self::of_files(files, n_gaussians_of_cell, part_entries)?, table))
+    }
+
+    /// Makes the index of opened files: each with its first region and its number of masks.
+    pub(super) fn of_files(
+        files: Vec<(ContributionFile, u32, usize)>,
+        n_gaussians_of_cell: &[usize],
+        part_entries: u64,
+    ) -> Result<Self, ContributionError> {
         let mut first_slice_of_cell = vec![0];
         let mut locals_of_slice = Vec::new();
         for n in n_gaussians_of_cell {
@@ -81,29 +112,23 @@ impl ContributionIndex {
             locals_of_slice.extend(starts.map(|start| start..(start + GAUSSIANS_PER_SLICE).min(*n)));
             first_slice_of_cell.push(locals_of_slice.len());
         }
-        let mut table = RegionTable::new(dim);
         let mut n_views_without_masks = 0;
-        let mut views = Vec::with_capacity(paths.len());
+        let mut views = Vec::with_capacity(files.len());
         let mut entries_of_slice = vec![0u64; locals_of_slice.len()];
-        for path in paths {
-            let (file, regions) = ContributionFile::open(path)?;
+        for (file, first_region, n_masks) in files {
             let slices = file.runs().iter().map(|run| {
                 let of_cell = first_slice_of_cell.get(run.cell_id as usize..=run.cell_id as usize + 1)?;
                 let slice = of_cell[0] + run.slice as usize;
                 (slice < of_cell[1]).then_some(slice as u32)
             });
-            let Some(slices) = slices.collect::<Option<Vec<u32>>>().filter(|_| regions.dim == dim) else {
-                let what = "the contributions belong to another scene or model".into();
-                let source = ContainerError::Damaged { offset_bytes: 0, what };
-                return Err(ContributionError::Damaged { path: path.clone(), source });
+            let Some(slices) = slices.collect::<Option<Vec<u32>>>() else {
+                return Err(of_another_scene(file.path()));
             };
             for (run, slice) in slices.iter().enumerate() {
                 let range = file.entries_of_run(run);
                 entries_of_slice[*slice as usize] += range.end - range.start;
             }
-            n_views_without_masks += usize::from(regions.mask_vectors.is_empty());
-            let first_region = table.append(&regions.mask_vectors, regions.masks_of_region());
-            let n_masks = regions.mask_vectors.len() / dim;
+            n_views_without_masks += usize::from(n_masks == 0);
             views.push(IndexedView { file, slices, first_region, n_masks });
         }
         let parts = first_slice_of_cell
@@ -114,7 +139,7 @@ impl ContributionIndex {
             })
             .collect();
         let kept = OnceLock::new();
-        Ok((Self { views, parts, locals_of_slice, n_views_without_masks, kept }, table))
+        Ok(Self { views, parts, locals_of_slice, n_views_without_masks, elsewhere: None, kept })
     }
 
     /// Returns the parts, ascending by cell and within it.
@@ -203,12 +228,26 @@ impl ContributionIndex {
     /// [`ContributionError`].
     pub fn read(&self, parts: Range<usize>) -> Result<RawGroup, ContributionError> {
         let slices = self.slices_of(&parts);
-        let read = |view: &IndexedView| {
+        let runs_of = |view: &IndexedView| {
             let at = |slice: usize| view.slices.partition_point(|s| (*s as usize) < slice);
-            let runs = at(slices.start)..at(slices.end);
-            Ok((runs.clone(), view.file.read(runs)?))
+            at(slices.start)..at(slices.end)
         };
-        let views = self.views.par_iter().map(read).collect::<Result<_, ContributionError>>()?;
+        let Some(elsewhere) = &self.elsewhere else {
+            let read = |view: &IndexedView| {
+                let runs = runs_of(view);
+                Ok((runs.clone(), view.file.read(runs)?))
+            };
+            let views = self.views.par_iter().map(read).collect::<Result<_, ContributionError>>()?;
+            return Ok(RawGroup { parts, views });
+        };
+        let wanted = |(i, view): (usize, &IndexedView)| (i, view.file.bytes_of_runs(runs_of(view)));
+        let mut wanted: Vec<(usize, Range<u64>)> = self.views.iter().enumerate().map(wanted).collect();
+        wanted.retain(|(_, bytes)| !bytes.is_empty());
+        let mut views: Vec<_> = self.views.iter().map(|view| (runs_of(view), Vec::new())).collect();
+        for ((i, _), bytes) in wanted.iter().zip(elsewhere.read(&wanted)?) {
+            let (runs, entries) = &mut views[*i];
+            *entries = self.views[*i].file.parse_runs(runs.clone(), &bytes)?;
+        }
         Ok(RawGroup { parts, views })
     }
 
@@ -220,6 +259,12 @@ impl ContributionIndex {
             _ => 0..0,
         }
     }
+}
+
+fn of_another_scene(path: &Path) -> ContributionError {
+    let what = "the contributions belong to another scene or model".into();
+    let source = ContainerError::Damaged { offset_bytes: 0, what };
+    ContributionError::Damaged { path: path.to_owned(), source }
 }
 
 fn part_bytes(part: &Part) -> u64 {

@@ -66,11 +66,19 @@ impl MaskOutline {
 /// # Errors
 /// [`ContributionError::Io`].
 pub fn write_outlines(path: &Path, outlines: &[MaskOutline]) -> Result<(), ContributionError> {
+    Ok(slag_common::durable::write(path, &outlines_to_bytes(outlines)?)?)
+}
+
+/// Returns the bytes of the file of the outlines of a view's masks.
+///
+/// # Errors
+/// None: memory takes what is written.
+pub fn outlines_to_bytes(outlines: &[MaskOutline]) -> std::io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let n = outlines.len() as u64;
     let sections = [(1, bytemuck::bytes_of(&n)), (2, container::bytes_of(outlines))];
     container::write(&mut bytes, MAGIC, VERSION, &sections)?;
-    Ok(slag_common::durable::write(path, &bytes)?)
+    Ok(bytes)
 }
 
 /// Reads the outlines of a view of `n_masks` masks.

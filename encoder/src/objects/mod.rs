@@ -12,10 +12,12 @@
 //! | [`vectors`] | the few vectors that represent an object's masks |
 //! | [`shards`] | the objects of a cell, as its shards store them |
 //! | `object` | the result |
+//! | `file` | its file form, for machines that build cells |
 //!
 //! The contributions are needed twice, part by part; the result takes four bytes a Gaussian.
 
 pub mod consensus;
+mod file;
 mod find;
 pub mod members;
 mod object;

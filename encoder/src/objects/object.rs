@@ -1,7 +1,7 @@
 //! The objects of a scene.
 
 use glam::DVec3;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use slag_common::frames::Aabb;
 use slag_common::manifest::Calibration;
 
@@ -9,7 +9,7 @@ use slag_common::manifest::Calibration;
 pub const NONE: u32 = u32::MAX;
 
 /// A thing that several views agree on.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Object {
     /// First 8 bytes of the BLAKE3 hash of its Gaussians' indices in the input, ascending, u32 little-endian.
     pub id: u64,
@@ -22,6 +22,7 @@ pub struct Object {
     /// From the 2nd to the 98th percentile of its means along each axis.
     pub box_in_world: Aabb,
     /// `[n][dim]`, unit: the mean of its masks' vectors, then the medoids of these.
+    #[serde(skip)]
     pub vectors: Vec<f32>,
     /// Name of the view that shows it best.
     pub photo: String,

@@ -1,7 +1,7 @@
 //! The result of rasterising a view: the weight of each Gaussian in each region.
 
 /// Quantity that is summed over the pixels of a region.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize, clap::ValueEnum)]
 pub enum WeightKind {
     /// `alpha * T`: the Gaussian's contribution to the picture, attenuated by the Gaussians in front of it.
     Blend,

@@ -8,7 +8,7 @@ mod sam;
 mod segmenter;
 
 pub use error::SegmentError;
-pub use given::GivenMasks;
+pub use given::{GivenMasks, file_of as mask_file};
 pub use graph::{GraphSegmenter, GraphSettings};
 pub use none::NoMasks;
 pub use sam::{SamLevels, SamSegmenter, SamSettings, ScoreFilter};

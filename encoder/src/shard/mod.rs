@@ -51,7 +51,7 @@ pub struct BuiltCell {
 }
 
 /// The profiles to build, and their precision.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct ShardSettings {
     /// Profiles.
     pub profiles: Vec<Profile>,

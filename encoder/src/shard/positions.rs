@@ -8,7 +8,7 @@ use slag_math::stats::{Rank, quantile};
 use crate::cells::Cell;
 
 /// Largest error of a position, per axis.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub enum PositionError {
     /// World units.
     Within(f64),

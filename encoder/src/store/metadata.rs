@@ -258,6 +258,6 @@ fn read_file(store: &Path, name: &str, max_bytes: u64) -> Result<Option<Vec<u8>>
     }
 }
 
-fn folder(store: &Path) -> PathBuf {
+pub(super) fn folder(store: &Path) -> PathBuf {
     store.join("metadata")
 }

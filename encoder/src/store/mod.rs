@@ -26,6 +26,7 @@ pub mod ceremony;
 #[cfg(test)]
 mod ceremony_tests;
 mod error;
+mod export;
 mod files;
 mod manifest_file;
 pub mod metadata;
@@ -42,6 +43,7 @@ mod writer;
 pub(crate) use catalogue::Catalogue;
 pub use catalogue::{CommandRecord, GenerationRecord};
 pub use error::StoreError;
+pub use export::{Exported, export};
 pub use models::ModelsRecord;
 pub(crate) use reader::Stamp;
 pub use reader::{Extras, Published, StoreReader};

@@ -83,10 +83,10 @@ fn summed_by_key(mut entries: Vec<(u32, f32)>) -> Vec<(u32, f32)> {
 }
 
 /// The region of a mixture, and the length of its point.
-#[derive(Clone, Copy)]
-struct MixtureRegion {
-    region: u32,
-    length: f32,
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct MixtureRegion {
+    pub(super) region: u32,
+    pub(super) length: f32,
 }
 
 /// The entry that a Gaussian gets, and the share of its own entries that remains.
@@ -97,13 +97,14 @@ struct AddedEntry {
 }
 
 /// The superpoints of a scene as regions of its table.
+#[derive(Debug, PartialEq)]
 pub(super) struct Mixtures {
     /// Weight of a mixture, relative to the Gaussian's own entries.
-    weight: f32,
+    pub(super) weight: f32,
     /// `[N]`: superpoint of each Gaussian of the scene.
-    of_gaussian: Vec<u32>,
+    pub(super) of_gaussian: Vec<u32>,
     /// The region of each superpoint; `None` without evidence.
-    regions: Vec<Option<MixtureRegion>>,
+    pub(super) regions: Vec<Option<MixtureRegion>>,
 }
 
 impl Mixtures {

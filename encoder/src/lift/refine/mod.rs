@@ -20,6 +20,7 @@
 
 mod agreement;
 mod equalise;
+mod file;
 mod median;
 mod mixture;
 mod points;
@@ -48,7 +49,8 @@ use points::{AXES, Point};
 pub use settings::Aggregation;
 use views::FirstRegions;
 
-/// The refinements of a scene, ready to be applied part by part.
+/// The refinements of a scene, ready to be applied part by part. `file` has its file form.
+#[derive(Debug, PartialEq)]
 pub struct Refinement {
     settings: Aggregation,
     first_regions: FirstRegions,

@@ -13,6 +13,7 @@ pub(super) struct ViewEntries {
 }
 
 /// The first region of each view, ascending.
+#[derive(Debug, PartialEq)]
 pub(super) struct FirstRegions(pub(super) Vec<u32>);
 
 impl FirstRegions {

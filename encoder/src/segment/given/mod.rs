@@ -121,8 +121,8 @@ impl Segmenter for GivenMasks {
     }
 }
 
-/// Returns the file with a view's masks, if there is one.
-fn file_of(dir: &Path, view: &View) -> Option<PathBuf> {
+/// Returns the file with a view's masks in a folder of masks, if there is one.
+pub fn file_of(dir: &Path, view: &View) -> Option<PathBuf> {
     let image = dir.join(&view.name);
     let appended = |ending| dir.join(format!("{}.{ending}", view.name));
     [image.with_extension("png"), appended("png"), image.with_extension("json"), appended("json")]

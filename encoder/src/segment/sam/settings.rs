@@ -1,7 +1,9 @@
 //! The settings of automatic mask generation.
 
 /// Which of the three masks of a prompt are used.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, clap::ValueEnum)]
+#[derive(
+    Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize, clap::ValueEnum,
+)]
 #[serde(rename_all = "lowercase")]
 pub enum SamLevels {
     /// All three in one list: a duplicate goes, whatever its level, as in the reference implementation.
@@ -31,7 +33,7 @@ impl SamLevels {
 }
 
 /// Thresholds of LangSplat's filter. A mask's score is its predicted IoU times its stability.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct ScoreFilter {
     /// Masks need a score above this; where none has it, the best three stay.
     pub min_score: f64,
@@ -48,7 +50,7 @@ impl ScoreFilter {
 }
 
 /// Settings for the prompts and the filters of masks. The defaults are those of the reference implementation.
-#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct SamSettings {
     /// Points along each side of the grid.
     pub points_per_side: u32,

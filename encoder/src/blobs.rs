@@ -1,0 +1,259 @@
+//! A bucket: a shared folder or an object store, with conditional puts.
+//!
+//! Keys are relative to the prefix that the URL names. All calls block; they are made from threads of the program, never
+//! from those of the bucket's own runtime.
+
+use std::ops::Range;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use axum::body::Bytes;
+use futures_util::{StreamExt, TryStreamExt};
+use object_store::local::LocalFileSystem;
+use object_store::path::Path as Key;
+use object_store::{ObjectStore, ObjectStoreExt, PutMode, PutOptions};
+use reqwest::Url;
+use tokio::runtime::{Builder, Runtime};
+
+/// Threads that wait for the network.
+const N_THREADS: usize = 2;
+
+/// A bucket cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum BlobError {
+    /// The address is no bucket's.
+    #[error(
+        "{url}: {problem}; expected file:///FOLDER, s3://BUCKET/PREFIX, or gs:// and az:// where the program was built with them"
+    )]
+    Address {
+        /// The address.
+        url: String,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// A request failed, after the client's own retries.
+    #[error(
+        "{url}/{key}: {source}; check the address, the credentials (for S3 AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION, AWS_ENDPOINT) and the free space"
+    )]
+    Request {
+        /// The bucket.
+        url: String,
+        /// The key.
+        key: String,
+        /// The cause.
+        source: object_store::Error,
+    },
+    /// The folder cannot be made, or the bucket's threads cannot be started.
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+    /// An object that must be there is not.
+    #[error("{url}/{key} is missing; was the prefix emptied while it was in use?")]
+    Missing {
+        /// The bucket.
+        url: String,
+        /// The key.
+        key: String,
+    },
+}
+
+/// A bucket, from a prefix on.
+#[derive(Clone, Debug)]
+pub struct Bucket {
+    store: Arc<dyn ObjectStore>,
+    prefix: Key,
+    url: String,
+    is_local: bool,
+    runtime: Arc<Runtime>,
+}
+
+impl Bucket {
+    /// Opens the bucket that a URL, or the path of a folder, names. `variables`: of the environment, where object stores
+    /// have their credentials.
+    ///
+    /// # Errors
+    /// [`BlobError::Address`]; the bucket itself is first asked by a request.
+    pub fn open(
+        address: &str,
+        variables: impl IntoIterator<Item = (String, String)>,
+    ) -> Result<Self, BlobError> {
+        let refuse = |problem: String| BlobError::Address { url: address.to_owned(), problem };
+        // Also done by the other users of TLS here; only the first counts.
+        let _ = rustls::crypto::ring::default_provider().install_default();
+        let runtime = Builder::new_multi_thread().worker_threads(N_THREADS).enable_all().build()?;
+        let runtime = Arc::new(runtime);
+        let folder = match address.strip_prefix("file://") {
+            Some(path) => Some(PathBuf::from(path)),
+            None if address.contains("://") => None,
+            None => Some(std::path::absolute(address)?),
+        };
+        if let Some(folder) = folder {
+            if !folder.is_absolute() {
+                return Err(refuse("the path is not absolute".into()));
+            }
+            fs_err::create_dir_all(&folder)?;
+            let store = LocalFileSystem::new_with_prefix(&folder).map_err(|e| refuse(e.to_string()))?;
+            let store: Arc<dyn ObjectStore> = Arc::new(store.with_fsync(true));
+            let url = format!("file://{}", folder.display());
+            return Ok(Self { store, prefix: Key::default(), url, is_local: true, runtime });
+        }
+        let url = Url::parse(address).map_err(|e| refuse(e.to_string()))?;
+        let (store, prefix) =
+            object_store::parse_url_opts(&url, variables).map_err(|e| refuse(e.to_string()))?;
+        let url = address.trim_end_matches('/').to_owned();
+        Ok(Self { store: Arc::from(store), prefix, url, is_local: false, runtime })
+    }
+
+    /// Returns the address.
+    pub fn url(&self) -> &str {
+        &self.url
+    }
+
+    /// Returns whether it is a folder, which answers at once.
+    pub fn is_local(&self) -> bool {
+        self.is_local
+    }
+
+    /// Returns the threads that wait for the network.
+    pub fn runtime(&self) -> &Arc<Runtime> {
+        &self.runtime
+    }
+
+    fn key(&self, key: &str) -> Key {
+        self.prefix.parts().chain(Key::from(key).parts()).map(|part| part.as_ref().to_owned()).collect()
+    }
+
+    fn failed(&self, key: &str, source: object_store::Error) -> BlobError {
+        match source {
+            object_store::Error::NotFound { .. } => {
+                BlobError::Missing { url: self.url.clone(), key: key.to_owned() }
+            }
+            source => BlobError::Request { url: self.url.clone(), key: key.to_owned(), source },
+        }
+    }
+
+    /// Returns an object; `None` if it is not there.
+    ///
+    /// # Errors
+    /// [`BlobError::Request`].
+    pub fn get(&self, key: &str) -> Result<Option<Bytes>, BlobError> {
+        let at = self.key(key);
+        match self.runtime.block_on(async { self.store.get(&at).await?.bytes().await }) {
+            Ok(bytes) => Ok(Some(bytes)),
+            Err(object_store::Error::NotFound { .. }) => Ok(None),
+            Err(source) => Err(self.failed(key, source)),
+        }
+    }
+
+    /// Returns an object that must be there.
+    ///
+    /// # Errors
+    /// [`BlobError`].
+    pub fn require(&self, key: &str) -> Result<Bytes, BlobError> {
+        let missing = || BlobError::Missing { url: self.url.clone(), key: key.to_owned() };
+        self.get(key)?.ok_or_else(missing)
+    }
+
+    /// Returns ranges of objects, in the order given, `n_at_once` requests at a time.
+    ///
+    /// # Errors
+    /// [`BlobError`]: of the first that fails.
+    pub fn get_ranges(
+        &self,
+        wanted: &[(String, Range<u64>)],
+        n_at_once: usize,
+    ) -> Result<Vec<Bytes>, BlobError> {
+        let read = |(key, range): &(String, Range<u64>)| {
+            let (at, key, range) = (self.key(key), key.clone(), range.clone());
+            async move {
+                let read = self.store.get_range(&at, range).await;
+                read.map_err(|source| self.failed(&key, source))
+            }
+        };
+        let reads = wanted.iter().map(read).collect::<Vec<_>>();
+        let reads = futures_util::stream::iter(reads).buffered(n_at_once.max(1));
+        self.runtime.block_on(reads.try_collect())
+    }
+
+    /// Returns the length of an object; `None` if it is not there.
+    ///
+    /// # Errors
+    /// [`BlobError::Request`].
+    pub fn len_of(&self, key: &str) -> Result<Option<u64>, BlobError> {
+        match self.runtime.block_on(self.store.head(&self.key(key))) {
+            Ok(found) => Ok(Some(found.size)),
+            Err(object_store::Error::NotFound { .. }) => Ok(None),
+            Err(source) => Err(self.failed(key, source)),
+        }
+    }
+
+    fn put_with(&self, key: &str, bytes: Bytes, mode: PutMode) -> Result<bool, BlobError> {
+        let options = PutOptions { mode, ..PutOptions::default() };
+        let at = self.key(key);
+        match self.runtime.block_on(self.store.put_opts(&at, bytes.into(), options)) {
+            Ok(_) => Ok(true),
+            Err(object_store::Error::AlreadyExists { .. } | object_store::Error::Precondition { .. }) => {
+                Ok(false)
+            }
+            Err(source) => Err(self.failed(key, source)),
+        }
+    }
+
+    /// Puts an object unless there is one; returns whether there was none.
+    ///
+    /// # Errors
+    /// [`BlobError::Request`].
+    pub fn put_new(&self, key: &str, bytes: impl Into<Bytes>) -> Result<bool, BlobError> {
+        self.put_with(key, bytes.into(), PutMode::Create)
+    }
+
+    /// Puts an object in place of what is there.
+    ///
+    /// # Errors
+    /// [`BlobError::Request`].
+    pub fn put(&self, key: &str, bytes: impl Into<Bytes>) -> Result<(), BlobError> {
+        self.put_with(key, bytes.into(), PutMode::Overwrite).map(drop)
+    }
+
+    /// Returns the names of the objects in a folder, without the folder's name, ascending.
+    ///
+    /// # Errors
+    /// [`BlobError::Request`].
+    pub fn list(&self, folder: &str) -> Result<Vec<String>, BlobError> {
+        let at = self.key(folder);
+        let listed = self.runtime.block_on(self.store.list(Some(&at)).try_collect::<Vec<_>>());
+        let listed = listed.map_err(|source| self.failed(folder, source))?;
+        let name = |meta: &object_store::ObjectMeta| {
+            let rest = meta.location.prefix_match(&at)?;
+            Some(rest.map(|part| part.as_ref().to_owned()).collect::<Vec<_>>().join("/"))
+        };
+        let mut names: Vec<String> = listed.iter().filter_map(name).collect();
+        names.sort_unstable();
+        Ok(names)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A conditional put is one for all who have the folder open; names come without their folder, in order.
+    #[test]
+    fn the_first_put_wins_and_ranges_are_of_the_object() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let open = || Bucket::open(dir.path().to_str().expect("UTF-8"), []).expect("opens");
+        let (one, other) = (open(), open());
+        assert!(one.put_new("jobs/2/plan.json", "first").expect("puts"));
+        assert!(!other.put_new("jobs/2/plan.json", "second").expect("puts"));
+        one.put("jobs/1/end.json", "0123456789").expect("puts");
+        assert_eq!(other.get("jobs/2/plan.json").expect("reads").as_deref(), Some(&b"first"[..]));
+        assert_eq!(other.list("jobs").expect("lists"), ["1/end.json", "2/plan.json"]);
+        assert!(other.list("none").expect("lists").is_empty() && other.get("none").expect("reads").is_none());
+        let ranges = [("jobs/1/end.json".to_owned(), 8..10), ("jobs/2/plan.json".to_owned(), 0..2)];
+        assert_eq!(other.get_ranges(&ranges, 2).expect("reads"), ["89", "fi"]);
+        assert_eq!(other.len_of("jobs/1/end.json").expect("asks"), Some(10));
+        let refused = Bucket::open("ftp://somewhere/else", []).expect_err("no bucket").to_string();
+        assert!(refused.contains("ftp://somewhere/else"), "{refused}");
+        let missing = other.require("jobs/3").expect_err("missing").to_string();
+        assert!(missing.contains("jobs/3 is missing"), "{missing}");
+    }
+}

@@ -1,0 +1,192 @@
+//! The flags of a fleet, and `worker`.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use anyhow::{Result, anyhow};
+use clap::Args;
+use slag_models::commands;
+use slag_models::gpus::GpuChoice;
+
+use super::common::{ModelArgs, available_threads, cancel_flag, open_models, print};
+use super::exit::Exit;
+use super::memory::{default_memory_bytes, parse_memory};
+use crate::blobs::Bucket;
+use crate::encode::{self, EncodeSettings, EncodeSummary, Engines};
+use crate::fleet::{Coordinator, Dispatch, QueueSettings, WorkerSettings, work};
+use crate::progress::{Progress, Silent};
+use crate::raster::devices::{DeviceChoice, Devices};
+use crate::raster::gpu::GpuOptions;
+
+/// The queue of a fleet.
+#[derive(Clone, Debug, Args)]
+#[command(next_help_heading = "Fleet")]
+pub struct QueueArgs {
+    /// NATS server with JetStream that hands out the work; without it, workers have shares. TLS with tls://.
+    #[arg(long, value_name = "nats://HOST:PORT")]
+    fleet: Option<String>,
+    /// Credentials file for the NATS server.
+    #[arg(long, value_name = "FILE", requires = "fleet", env = "NATS_CREDS")]
+    nats_credentials: Option<PathBuf>,
+    /// File with the seed of an nkey for the NATS server.
+    #[arg(long, value_name = "FILE", requires = "fleet", conflicts_with = "nats_credentials")]
+    nats_nkey: Option<PathBuf>,
+    /// Certificates of the authority that signed the NATS server's.
+    #[arg(long, value_name = "FILE", requires = "fleet")]
+    nats_ca: Option<PathBuf>,
+    /// Seconds without a sign of life after which a worker's view or cell goes to another.
+    #[arg(long, value_name = "SECS", default_value = "60", value_parser = parse_secs)]
+    ack_wait: Duration,
+    /// Times that a view or cell is handed out; then the view is left out.
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    max_deliver: u32,
+}
+
+impl QueueArgs {
+    fn settings(&self) -> Option<QueueSettings> {
+        Some(QueueSettings {
+            url: self.fleet.clone()?,
+            credentials: self.nats_credentials.clone(),
+            nkey: self.nats_nkey.clone(),
+            ca: self.nats_ca.clone(),
+            ack_wait: self.ack_wait,
+            max_deliver: self.max_deliver,
+        })
+    }
+}
+
+/// `encode` by a fleet.
+#[derive(Clone, Debug, Args)]
+#[command(next_help_heading = "Fleet")]
+pub struct CoordinatorArgs {
+    /// Bucket over which workers do the views and cells: file:///FOLDER that all machines see, or s3://BUCKET/PREFIX,
+    /// with credentials in the usual variables. Start `slag-encoder worker` with the same bucket.
+    #[arg(long, value_name = "URL", conflicts_with = "time_budget")]
+    blobs: Option<String>,
+    /// The queue.
+    #[command(flatten)]
+    queue: QueueArgs,
+}
+
+impl CoordinatorArgs {
+    /// Encodes by the fleet that the flags name, or on this machine.
+    ///
+    /// # Errors
+    /// If the bucket cannot be opened, or the encode fails.
+    pub(super) fn encode(
+        &self,
+        settings: &EncodeSettings,
+        engines: &Engines<'_>,
+        progress: &dyn Progress,
+        cancel: &AtomicBool,
+    ) -> Result<EncodeSummary> {
+        let queue = self.queue.settings();
+        match &self.blobs {
+            Some(url) => {
+                let coordinator = Coordinator::new(open_bucket(url)?, queue);
+                Ok(coordinator.encode(settings, engines, progress, cancel)?)
+            }
+            None if queue.is_some() => Err(anyhow!("--fleet needs the bucket of the fleet: give --blobs")),
+            None => Ok(encode::encode(settings, engines, progress, cancel)?),
+        }
+    }
+}
+
+/// `worker`.
+#[derive(Debug, Args)]
+pub struct WorkerArgs {
+    /// Bucket of the fleet, as `encode --blobs` has it.
+    #[arg(long, value_name = "URL")]
+    blobs: String,
+    /// Number of this worker, from 0, where there is no queue.
+    #[arg(long, value_name = "I", requires = "of", conflicts_with = "fleet", env = "SLAG_WORKER_INDEX")]
+    index: Option<u32>,
+    /// Number of workers.
+    #[arg(long, value_name = "N", env = "SLAG_WORKER_COUNT", value_parser = clap::value_parser!(u32).range(1..))]
+    of: Option<u32>,
+    /// Seconds without work after which a worker does what others have left of their shares.
+    #[arg(long, value_name = "SECS", default_value = "120", value_parser = parse_secs)]
+    help_after: Duration,
+    /// The queue.
+    #[command(flatten)]
+    queue: QueueArgs,
+    /// Models, as the coordinator has them.
+    #[command(flatten)]
+    models: ModelArgs,
+    /// Segment Anything, where the coordinator uses it: a folder with model.toml, or the name of a pulled model.
+    #[arg(long, value_name = "NAME|DIR")]
+    segmenter: Option<PathBuf>,
+    /// NVIDIA GPUs for the models, as for `encode`.
+    #[arg(long, value_name = "all|N,...", default_value_t)]
+    gpus: GpuChoice,
+    /// Where weights are rasterised, as for `encode`.
+    #[arg(long, value_name = "DEVICE", default_value_t)]
+    pub device: DeviceChoice,
+    /// Threads [default: all cores].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    threads: Option<u32>,
+    /// Memory for the scene, photos and lists [default: half of the free memory].
+    #[arg(long, value_name = "BYTES", value_parser = parse_memory)]
+    memory: Option<u64>,
+    /// Folder for photos in work [default: the system's for temporary files].
+    #[arg(long, value_name = "DIR")]
+    scratch: Option<PathBuf>,
+    /// Seconds to wait for an encode to begin.
+    #[arg(long, value_name = "SECS", default_value = "600", value_parser = parse_secs)]
+    wait: Duration,
+    /// Goes on to the next encode when one is published.
+    #[arg(long)]
+    stay: bool,
+}
+
+pub(super) fn run(args: &WorkerArgs, json: bool) -> Result<Exit> {
+    let dispatch = match (args.queue.settings(), args.index, args.of) {
+        (Some(queue), _, _) => Dispatch::Queue(queue),
+        (None, Some(index), Some(of)) if index < of => {
+            Dispatch::Share { index: index as usize, of: of as usize, help_after: args.help_after }
+        }
+        (None, Some(index), Some(of)) => {
+            return Err(anyhow!("--index {index} --of {of}: workers are numbered from 0 to {}", of - 1));
+        }
+        (None, _, _) => return Err(anyhow!("give --fleet nats://HOST:PORT, or --index I --of N")),
+    };
+    let bucket = open_bucket(&args.blobs)?;
+    let (models, session) = open_models(&args.models)?;
+    let resolve = |name: &PathBuf| commands::resolve(name, &|name| std::env::var_os(name));
+    let settings = WorkerSettings {
+        dispatch,
+        n_threads: args.threads.map_or_else(available_threads, |n| n as usize),
+        gpus: args.gpus.numbers(&session),
+        memory_bytes: args.memory.unwrap_or_else(default_memory_bytes),
+        folder: args.scratch.clone().unwrap_or_else(std::env::temp_dir),
+        segmenter: args.segmenter.as_ref().map(resolve).transpose()?,
+        patience: args.wait,
+        stays: args.stay,
+    };
+    tracing::info!("models: {} ({})", models.encoder_id(), models.about());
+    let devices = Devices::open(args.device, GpuOptions::default())?;
+    let engines = Engines::new(&models, &session, &devices);
+    let cancel = cancel_flag()?;
+    // The coordinator shows the progress of the fleet.
+    let report = work(&bucket, &settings, &engines, &Silent, cancel.as_ref())?;
+    let lines =
+        format!("{} runs: {} views and {} cells done here\n", report.n_runs, report.n_views, report.n_cells);
+    print(json, &report, lines)?;
+    Ok(if cancel.load(Ordering::Relaxed) { Exit::Interrupted } else { Exit::Done })
+}
+
+/// Opens a bucket with the credentials of the environment.
+pub(super) fn open_bucket(url: &str) -> Result<Arc<Bucket>> {
+    // Variables that are no text name nothing here.
+    let variables =
+        std::env::vars_os().filter_map(|(k, v)| Some((k.into_string().ok()?, v.into_string().ok()?)));
+    Ok(Arc::new(Bucket::open(url, variables)?))
+}
+
+fn parse_secs(text: &str) -> Result<Duration, String> {
+    let secs = text.parse().ok().filter(|secs: &f64| *secs >= 0.1);
+    secs.and_then(|secs| Duration::try_from_secs_f64(secs).ok())
+        .ok_or_else(|| "expected seconds, at least 0.1".into())
+}

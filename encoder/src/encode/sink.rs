@@ -1,0 +1,68 @@
+//! What comes in and goes out where an encode is spread over machines: photos, contributions, objects.
+
+use std::io::{self, Write};
+
+use serde::{Deserialize, Serialize};
+use slag_common::{Hash32, View};
+
+use super::error::EncodeError;
+use crate::lift::ViewContributions;
+use crate::lift::photos::MaskOutline;
+use crate::store::Store;
+
+/// The record of a finished view.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct ViewRecord {
+    /// Width at which its weights were rasterised.
+    pub(crate) raster_width_px: u32,
+    /// Seconds in its stages before this record.
+    pub(crate) secs: f32,
+}
+
+/// Brings photos and mask files to this machine.
+pub(crate) trait PhotoSource: Sync {
+    /// Returns the number of views that it brings at once.
+    fn n_at_once(&self) -> usize;
+
+    /// Brings the files of a view to where the view says.
+    ///
+    /// # Errors
+    /// [`EncodeError`].
+    fn fetch(&self, view: &View) -> Result<(), EncodeError>;
+}
+
+/// Keeps what a view leaves.
+pub(crate) trait ViewSink: Sync {
+    /// Returns the number of views that it keeps at once.
+    fn n_at_once(&self) -> usize;
+
+    /// Keeps a view's contributions and the outlines of its masks; on return they survive a power cut.
+    ///
+    /// # Errors
+    /// [`EncodeError`].
+    fn keep(
+        &self,
+        view: &View,
+        contributions: &ViewContributions,
+        outlines: &[MaskOutline],
+        record: ViewRecord,
+    ) -> Result<(), EncodeError>;
+}
+
+/// Writes the bytes of an object.
+pub(crate) type WriteObject<'a> = &'a mut (dyn FnMut(&mut dyn Write) -> io::Result<()> + Send);
+
+/// Keeps objects by the hash of their content.
+pub(crate) trait ObjectSink: Sync {
+    /// Keeps an object and returns its hash and length; on return it survives a power cut.
+    ///
+    /// # Errors
+    /// [`EncodeError`].
+    fn put(&self, write: WriteObject<'_>) -> Result<(Hash32, u64), EncodeError>;
+}
+
+impl ObjectSink for Store {
+    fn put(&self, write: WriteObject<'_>) -> Result<(Hash32, u64), EncodeError> {
+        Ok(self.put_object(write)?)
+    }
+}

@@ -1,0 +1,139 @@
+//! The JSON documents in a bucket, and the keys of all objects.
+
+use glam::DAffine3;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use slag_common::{Hash32, Intrinsics};
+
+use super::error::FleetError;
+use crate::blobs::Bucket;
+use crate::cells::CellLimits;
+use crate::encode::ViewSettings;
+use crate::shard::ShardSettings;
+
+/// Version of the documents and objects.
+const FORMAT: u32 = 1;
+
+/// Returns the version of this program, as documents state it.
+pub(super) fn own_version() -> String {
+    format!("{}, fleet format {FORMAT}", env!("CARGO_PKG_VERSION"))
+}
+
+/// The first thing read of a plan: the rest may have another form in another version.
+#[derive(Deserialize)]
+pub(super) struct PlannedBy {
+    pub(super) program: String,
+}
+
+/// An input file: its content's hash, and its ending.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct InputFile {
+    pub(super) hash: Hash32,
+    pub(super) ending: String,
+}
+
+/// A view of a run.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct PlannedView {
+    pub(super) name: String,
+    pub(super) id: Hash32,
+    pub(super) photo: InputFile,
+    /// Its mask file, where masks are given as a folder.
+    pub(super) masks: Option<InputFile>,
+    pub(super) intrinsics: Intrinsics,
+    pub(super) camera_from_world: DAffine3,
+}
+
+/// `jobs/N/plan.json`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct RunPlan {
+    pub(super) program: String,
+    /// Models and segmenter, for messages.
+    pub(super) engines: String,
+    /// Hash of everything on which the contributions of all views depend.
+    pub(super) of_scene: Hash32,
+    /// The scene's object among the inputs.
+    pub(super) scene: Hash32,
+    pub(super) settings: ViewSettings,
+    pub(super) limits: CellLimits,
+    /// The data set of masks, where they are given as one file.
+    pub(super) data_set: Option<InputFile>,
+    /// The views to do, costly ones first.
+    pub(super) views: Vec<PlannedView>,
+}
+
+/// A view's object, as cells read it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct MergedView {
+    pub(super) id: Hash32,
+    pub(super) name: String,
+    /// Where the contributions begin in the object.
+    pub(super) contributions_at_bytes: u64,
+}
+
+/// `jobs/N/cells.json`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct CellsPlan {
+    /// Hash of everything on which the cells depend.
+    pub(super) id: Hash32,
+    pub(super) merged: Hash32,
+    pub(super) encoder_id: Hash32,
+    pub(super) settings: ShardSettings,
+    /// The views, in the order of the index of contributions.
+    pub(super) views: Vec<MergedView>,
+    /// All cells, costly ones first.
+    pub(super) order: Vec<u32>,
+}
+
+/// `jobs/N/failed/VIEW.json`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct FailedView {
+    pub(super) reason: String,
+}
+
+/// `jobs/N/end.json`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum End {
+    /// Its coordinator publishes it.
+    Published,
+    /// Another coordinator began the next run.
+    Superseded,
+}
+
+pub(super) fn input_key(hash: Hash32) -> String {
+    format!("inputs/{hash}")
+}
+
+pub(super) fn view_key(id: Hash32) -> String {
+    format!("views/{id}")
+}
+
+pub(super) fn object_key(hash: Hash32) -> String {
+    format!("objects/{hash}")
+}
+
+pub(super) fn merged_key(hash: Hash32) -> String {
+    format!("merged/{hash}")
+}
+
+pub(super) fn cells_folder(id: Hash32) -> String {
+    format!("cells/{id}")
+}
+
+pub(super) fn cell_key(id: Hash32, cell: u32) -> String {
+    format!("{}/{cell:06}.json", cells_folder(id))
+}
+
+/// Reads a document.
+///
+/// # Errors
+/// [`FleetError::Damaged`] if it is not of the form expected.
+pub(super) fn parse<T: DeserializeOwned>(bucket: &Bucket, key: &str, bytes: &[u8]) -> Result<T, FleetError> {
+    serde_json::from_slice(bytes).map_err(|e| FleetError::damaged(bucket, key, e))
+}
+
+/// Returns a document's bytes.
+pub(super) fn to_bytes(document: &impl Serialize) -> Result<Vec<u8>, FleetError> {
+    Ok(serde_json::to_vec(document).map_err(std::io::Error::from)?)
+}

@@ -1,0 +1,135 @@
+//! A run on a worker: the scene and settings, brought from the bucket and checked.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use slag_common::{Gaussians, View};
+
+use super::documents::{self, RunPlan};
+use super::error::FleetError;
+use super::inputs::{ViewFiles, engines_text, fetch_file, fetch_input};
+use super::run::Run;
+use super::scene_object;
+use crate::blobs::Bucket;
+use crate::cells::{self, CellSplit};
+use crate::encode::fleet_parts::{RunContext, of_scene};
+use crate::encode::{EncodeError, Engines, Masks, ViewSettings};
+use crate::memory::MemoryPlan;
+use crate::raster::project::Prepared as PreparedScene;
+use crate::segment::Segmenter;
+use crate::{encode::fleet_parts::reserve_photos, shard};
+
+/// A run on a worker.
+pub(super) struct Prepared {
+    pub(super) run: Run,
+    pub(super) plan: RunPlan,
+    pub(super) settings: ViewSettings,
+    pub(super) scene: Gaussians,
+    pub(super) split: CellSplit,
+    /// The views, by their numbers in the plan.
+    pub(super) views: Vec<View>,
+    pub(super) number_of: HashMap<String, usize>,
+    pub(super) files: ViewFiles,
+}
+
+impl Prepared {
+    /// Brings scene and masks to `folder`. `segmenter`: this machine's mask model.
+    ///
+    /// # Errors
+    /// [`FleetError`].
+    pub(super) fn fetch(
+        bucket: &Arc<Bucket>,
+        (run, plan): (Run, RunPlan),
+        folder: &Path,
+        segmenter: Option<&PathBuf>,
+        context: &RunContext<'_>,
+    ) -> Result<Self, FleetError> {
+        let bytes = fetch_input(bucket, plan.scene)?;
+        let key = documents::input_key(plan.scene);
+        let scene = scene_object::unpack(&bytes).map_err(|e| FleetError::damaged(bucket, &key, e))?;
+        drop(bytes);
+        let split = context.install(|| cells::split(&scene, plan.limits));
+        let files = ViewFiles::new(Arc::clone(bucket), folder, plan.views.clone());
+        let mut settings = plan.settings.clone();
+        match (&mut settings.masks, &plan.data_set) {
+            (Masks::Given { dir, .. }, Some(data_set)) => {
+                *dir = folder.join("masks.json");
+                fetch_file(bucket, data_set, dir)?;
+            }
+            (Masks::Given { dir, .. }, None) => {
+                *dir = files.mask_folder();
+                fs_err::create_dir_all(&dir)?;
+            }
+            (Masks::Sam { dir, .. }, _) => match segmenter {
+                Some(own) => dir.clone_from(own),
+                None => {
+                    let (planned, own) = (plan.engines.clone(), "no --segmenter".into());
+                    return Err(FleetError::Identity { run: run.0, planned, own });
+                }
+            },
+            (Masks::Auto { .. } | Masks::Graph, _) => {}
+        }
+        let views = files.views()?;
+        let number_of = views.iter().enumerate().map(|(i, view)| (view.name.clone(), i)).collect();
+        Ok(Self { run, plan, settings, scene, split, views, number_of, files })
+    }
+
+    /// Refuses to work where the contributions would be others than the coordinator expects.
+    ///
+    /// # Errors
+    /// [`FleetError::Identity`].
+    pub(super) fn check(
+        &self,
+        engines: &Engines<'_>,
+        segmenter: &dyn Segmenter,
+        context: &RunContext<'_>,
+    ) -> Result<(), FleetError> {
+        let found =
+            context.install(|| of_scene(&self.settings, self.plan.limits, engines, segmenter, &self.scene));
+        match found.map_err(FleetError::from)? == self.plan.of_scene {
+            true => Ok(()),
+            false => Err(FleetError::Identity {
+                run: self.run.0,
+                planned: self.plan.engines.clone(),
+                own: engines_text(engines.models.encoder_id(), &segmenter.identity()),
+            }),
+        }
+    }
+
+    /// Returns the number of Gaussians of each cell.
+    pub(super) fn n_gaussians_of_cell(&self) -> Vec<usize> {
+        self.split.cells.iter().map(|cell| cell.gaussians.len()).collect()
+    }
+
+    /// Reserves what the worker holds for scene, views and a cell, and checks that it fits.
+    ///
+    /// # Errors
+    /// [`FleetError::Memory`].
+    pub(super) fn memory(
+        &self,
+        memory_bytes: u64,
+        n_threads: usize,
+        dim: usize,
+    ) -> Result<MemoryPlan, FleetError> {
+        let mut memory = MemoryPlan::new(memory_bytes);
+        memory.reserve(crate::memory::Phase::Always, "the scene", self.scene.len_bytes());
+        CellSplit::reserve(&mut memory, self.scene.len());
+        PreparedScene::reserve(&mut memory, self.scene.len());
+        reserve_photos(&mut memory, &self.views, n_threads);
+        shard::reserve(&mut memory, &self.split, dim);
+        memory.rest(0)?;
+        Ok(memory)
+    }
+}
+
+/// Returns the error of a view or cell as the fleet's.
+pub(super) fn of_encode(error: EncodeError) -> FleetError {
+    match error {
+        EncodeError::Fleet(inner) => match inner.downcast::<FleetError>() {
+            Ok(error) => *error,
+            Err(inner) => FleetError::Encode(EncodeError::Fleet(inner)),
+        },
+        error => FleetError::Encode(error),
+    }
+}

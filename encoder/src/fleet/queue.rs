@@ -1,0 +1,361 @@
+//! A run's queue on NATS JetStream: a stream with work-queue retention for each run, and one durable pull consumer that all
+//! workers share. It only hands out work: the coordinator fills it again from what the bucket lacks.
+//!
+//! A worker holds few messages at a time, says that it is at work on each of them every third of the time after which the
+//! server would hand it to another, and acknowledges a message once its result is in the bucket.
+
+use std::collections::{HashMap, VecDeque};
+use std::fmt::Display;
+use std::path::PathBuf;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError, Weak};
+use std::time::{Duration, Instant};
+
+use async_nats::ConnectOptions;
+use async_nats::jetstream::consumer::{AckPolicy, PullConsumer, pull};
+use async_nats::jetstream::stream::{self, RetentionPolicy};
+use async_nats::jetstream::{self, AckKind, Context, Message};
+use futures_util::StreamExt;
+use slag_common::Hash32;
+use tokio::runtime::Runtime;
+
+use super::dispatch::{Dispatcher, Item, Kind, OpenItems};
+use super::error::{FleetError, QueueError};
+use super::run::Run;
+
+/// The consumer that all workers share.
+const CONSUMER: &str = "workers";
+/// Time that a request for work waits at the server.
+const PULL_WAIT: Duration = Duration::from_secs(1);
+/// Pause before a request that failed is made again: the server may be down, or its stream not made yet.
+const RETRY_PAUSE: Duration = Duration::from_millis(300);
+/// Time between two looks of the coordinator at the stream.
+const LOOK_INTERVAL: Duration = Duration::from_secs(1);
+
+/// Where work is handed out, and how patiently.
+#[derive(Clone, Debug)]
+pub struct QueueSettings {
+    /// `nats://HOST:PORT` or `tls://HOST:PORT`, several with commas.
+    pub url: String,
+    /// A credentials file.
+    pub credentials: Option<PathBuf>,
+    /// A file with the seed of an nkey.
+    pub nkey: Option<PathBuf>,
+    /// Certificates of authorities that sign the server's, beside the system's.
+    pub ca: Option<PathBuf>,
+    /// Time after which work of which nothing is heard goes to another worker.
+    pub ack_wait: Duration,
+    /// How often an item is handed out before it is given up.
+    pub max_deliver: u32,
+}
+
+impl QueueSettings {
+    async fn connect(&self) -> Result<Context, QueueError> {
+        let refuse = |problem: &dyn Display| QueueError::Connect {
+            url: self.url.clone(),
+            problem: problem.to_string(),
+        };
+        let mut options = ConnectOptions::new().name("slag-encoder");
+        if let Some(path) = &self.credentials {
+            options = options.credentials_file(path).await.map_err(|e| refuse(&e))?;
+        }
+        if let Some(path) = &self.nkey {
+            let seed = fs_err::read_to_string(path).map_err(|e| refuse(&e))?;
+            options = options.nkey(seed.trim().to_owned());
+        }
+        if let Some(path) = &self.ca {
+            options = options.add_root_certificates(path.clone()).require_tls(true);
+        }
+        let addresses: Vec<String> = self.url.split(',').map(str::to_owned).collect();
+        let client = options.connect(addresses).await.map_err(|e| refuse(&e))?;
+        Ok(jetstream::new(client))
+    }
+}
+
+/// Returns the name of a run's stream.
+fn stream_name(run: Run, of_scene: Hash32) -> String {
+    format!("SLAG-{}-{}", &of_scene.to_string()[..16], run.0)
+}
+
+/// Fills the queue of a run.
+pub(super) struct Enqueuer {
+    runtime: Arc<Runtime>,
+    context: Context,
+    settings: QueueSettings,
+    stream: String,
+    last_look: Option<Instant>,
+    /// The kind of items that it was filled with.
+    filled: Option<Kind>,
+    /// Whether the last look found an empty queue although items were open.
+    was_empty: bool,
+}
+
+impl Enqueuer {
+    /// Connects; the stream is made when it is filled.
+    ///
+    /// # Errors
+    /// [`QueueError::Connect`].
+    pub(super) fn open(
+        runtime: &Arc<Runtime>,
+        settings: &QueueSettings,
+        run: Run,
+        of_scene: Hash32,
+    ) -> Result<Self, QueueError> {
+        let context = runtime.block_on(settings.connect())?;
+        Ok(Self {
+            runtime: Arc::clone(runtime),
+            context,
+            settings: settings.clone(),
+            stream: stream_name(run, of_scene),
+            last_look: None,
+            filled: None,
+            was_empty: false,
+        })
+    }
+
+    /// Fills the queue with the items that are not done where the stream is gone, was never filled, or has lost them.
+    ///
+    /// A server that refuses or does not answer is asked again later.
+    pub(super) fn keep_filled(&mut self, open: &[Item]) {
+        let is_due = self.last_look.is_none_or(|last| last.elapsed() >= LOOK_INTERVAL);
+        let is_new = open.first().is_some_and(|item| Some(item.kind()) != self.filled);
+        if !(is_due || is_new) || open.is_empty() {
+            return;
+        }
+        let runtime = Arc::clone(&self.runtime);
+        if let Err(problem) = runtime.block_on(self.look(open)) {
+            tracing::warn!("{}: {problem}; the queue is looked at again", self.settings.url);
+        }
+        self.last_look = Some(Instant::now());
+    }
+
+    async fn look(&mut self, open: &[Item]) -> Result<(), String> {
+        let kind = open.first().map(|item| item.kind());
+        if self.filled == kind {
+            match self.n_left().await {
+                Some(0) if self.was_empty => tracing::warn!("the queue has lost {} items", open.len()),
+                // A worker may have taken the last one to the bucket since the bucket was listed.
+                Some(0) => {
+                    self.was_empty = true;
+                    return Ok(());
+                }
+                Some(_) => {
+                    self.was_empty = false;
+                    return Ok(());
+                }
+                None => tracing::warn!("the queue is gone; it is filled again from the bucket"),
+            }
+        }
+        self.fill(open).await?;
+        (self.was_empty, self.filled) = (false, kind);
+        Ok(())
+    }
+
+    /// Returns the number of items that are waiting or at work; `None` if there is no queue.
+    async fn n_left(&self) -> Option<u64> {
+        let stream = self.context.get_stream(&self.stream).await.ok()?;
+        let mut consumer: PullConsumer = stream.get_consumer(CONSUMER).await.ok()?;
+        let info = consumer.info().await.ok()?;
+        Some(info.num_pending + info.num_ack_pending as u64)
+    }
+
+    async fn fill(&self, open: &[Item]) -> Result<(), String> {
+        let config = stream::Config {
+            name: self.stream.clone(),
+            subjects: vec![format!("slag.{}.>", self.stream)],
+            retention: RetentionPolicy::WorkQueue,
+            ..stream::Config::default()
+        };
+        let stream = self.context.get_or_create_stream(config).await.map_err(|e| e.to_string())?;
+        // Workers give an item up, so that its end is recorded in the bucket.
+        let consumer = pull::Config {
+            durable_name: Some(CONSUMER.into()),
+            ack_policy: AckPolicy::Explicit,
+            ack_wait: self.settings.ack_wait,
+            max_deliver: -1,
+            max_ack_pending: -1,
+            ..pull::Config::default()
+        };
+        stream.get_or_create_consumer(CONSUMER, consumer).await.map_err(|e| e.to_string())?;
+        let mut stored = Vec::with_capacity(open.len());
+        for item in open {
+            let body = serde_json::to_vec(item).map_err(|e| e.to_string())?;
+            let subject = format!("slag.{}.work", self.stream);
+            stored.push(self.context.publish(subject, body.into()).await.map_err(|e| e.to_string())?);
+        }
+        for stored in stored {
+            stored.await.map_err(|e| e.to_string())?;
+        }
+        Ok(())
+    }
+
+    /// Removes the queue of a run that is published; one that stays does no harm.
+    pub(super) fn close(&mut self) {
+        let runtime = Arc::clone(&self.runtime);
+        if let Err(error) = runtime.block_on(self.context.delete_stream(&self.stream)) {
+            tracing::warn!("{}: {error}", self.stream);
+        }
+    }
+}
+
+/// The queue of a run, as a worker has it.
+pub(super) struct Queue {
+    held: Arc<Held>,
+    max_deliver: i64,
+}
+
+/// The messages that a worker holds.
+struct Held {
+    runtime: tokio::runtime::Handle,
+    n_most: usize,
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Default)]
+struct State {
+    /// Not begun.
+    waiting: VecDeque<Item>,
+    dead: Vec<Item>,
+    messages: HashMap<Item, Arc<Message>>,
+}
+
+impl Held {
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn add(&self, message: Message, max_deliver: i64) {
+        let Ok(item) = serde_json::from_slice::<Item>(&message.payload) else {
+            tracing::warn!("the queue has a message that is no work: it is left to others");
+            return;
+        };
+        let is_dead = message.info().is_ok_and(|info| info.delivered > max_deliver);
+        let mut state = self.state();
+        let is_new = state.messages.insert(item, Arc::new(message)).is_none();
+        match is_dead {
+            true => state.dead.push(item),
+            // An item that comes again while it is at work here is the same work.
+            false if is_new => state.waiting.push_back(item),
+            false => {}
+        }
+        drop(state);
+        self.changed.notify_all();
+    }
+}
+
+impl Queue {
+    /// Connects, and asks for at most `n_most` items at a time from then on, until it is dropped.
+    ///
+    /// # Errors
+    /// [`QueueError::Connect`].
+    pub(super) fn open(
+        runtime: &Arc<Runtime>,
+        settings: &QueueSettings,
+        run: Run,
+        of_scene: Hash32,
+        n_most: usize,
+    ) -> Result<Self, QueueError> {
+        let context = runtime.block_on(settings.connect())?;
+        let held = Arc::new(Held {
+            runtime: runtime.handle().clone(),
+            n_most,
+            state: Mutex::default(),
+            changed: Condvar::new(),
+        });
+        let max_deliver = i64::from(settings.max_deliver);
+        let stream = stream_name(run, of_scene);
+        runtime.spawn(pull_work(Arc::downgrade(&held), context, stream, max_deliver));
+        runtime.spawn(send_heartbeats(Arc::downgrade(&held), settings.ack_wait / 3));
+        Ok(Self { held, max_deliver })
+    }
+}
+
+/// Asks for work for as long as the worker holds fewer items than it may.
+async fn pull_work(held: Weak<Held>, context: Context, stream: String, max_deliver: i64) {
+    let mut consumer: Option<PullConsumer> = None;
+    loop {
+        let Some(n_free) = held.upgrade().map(|held| {
+            let n_held = held.state().messages.len();
+            held.n_most.saturating_sub(n_held)
+        }) else {
+            return;
+        };
+        if n_free == 0 {
+            tokio::time::sleep(RETRY_PAUSE / 10).await;
+            continue;
+        }
+        let Some(open) = consumer.take() else {
+            // The stream is made by the coordinator, perhaps anew.
+            match context.get_consumer_from_stream(CONSUMER, &stream).await {
+                Ok(found) => consumer = Some(found),
+                Err(_) => tokio::time::sleep(RETRY_PAUSE).await,
+            }
+            continue;
+        };
+        let Ok(mut batch) = open.fetch().max_messages(n_free).expires(PULL_WAIT).messages().await else {
+            tokio::time::sleep(RETRY_PAUSE).await;
+            continue;
+        };
+        let mut is_sound = true;
+        while let Some(message) = batch.next().await {
+            match (message, held.upgrade()) {
+                (Ok(message), Some(held)) => held.add(message, max_deliver),
+                (Err(_), _) => is_sound = false,
+                (_, None) => return,
+            }
+        }
+        match is_sound {
+            true => consumer = Some(open),
+            false => tokio::time::sleep(RETRY_PAUSE).await,
+        }
+    }
+}
+
+/// Tells the server that the worker is at work on what it holds.
+async fn send_heartbeats(held: Weak<Held>, interval: Duration) {
+    loop {
+        tokio::time::sleep(interval).await;
+        let Some(held) = held.upgrade() else { return };
+        let messages: Vec<Arc<Message>> = held.state().messages.values().cloned().collect();
+        for message in messages {
+            // One that is lost is redelivered, and its work done twice.
+            let _ = message.ack_with(AckKind::Progress).await;
+        }
+    }
+}
+
+impl Dispatcher for Queue {
+    fn offer(&self, _open: OpenItems<'_>) -> Result<(), FleetError> {
+        Ok(())
+    }
+
+    fn take(&self, kind: Kind) -> Option<Item> {
+        self.held.state().waiting.pop_front_if(|item| item.kind() == kind)
+    }
+
+    fn done(&self, item: Item) {
+        let Some(message) = self.held.state().messages.remove(&item) else { return };
+        self.held.runtime.spawn(async move {
+            // Where it is lost, the item comes again and is found done.
+            let _ = message.double_ack().await;
+        });
+    }
+
+    fn wait(&self, kind: Kind, pause: Duration) -> bool {
+        let has_some = |state: &State| {
+            state.waiting.front().is_some_and(|item| item.kind() == kind) || !state.dead.is_empty()
+        };
+        let state = self.held.state();
+        let waited = self.held.changed.wait_timeout_while(state, pause, |state| !has_some(state));
+        let (state, _) = waited.unwrap_or_else(PoisonError::into_inner);
+        has_some(&state)
+    }
+
+    fn take_dead(&self) -> Vec<Item> {
+        let dead = std::mem::take(&mut self.held.state().dead);
+        for item in &dead {
+            tracing::warn!("{item:?} was handed out more than {} times; it is given up", self.max_deliver);
+        }
+        dead
+    }
+}

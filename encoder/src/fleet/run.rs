@@ -1,0 +1,188 @@
+//! The runs in a bucket. They have consecutive numbers, and the highest one counts. A run ends once: by its coordinator's
+//! word that it publishes, or by that of the next run's coordinator. Both put the same object on condition that it is
+//! not there, so one put decides whether a run is published.
+
+use super::documents::{self, CellsPlan, End, PlannedBy, RunPlan};
+use super::error::FleetError;
+use crate::blobs::Bucket;
+
+/// A run of an encode.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Run(pub(super) u64);
+
+/// What became of a run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum State {
+    /// Views are to be done.
+    Views,
+    /// Cells are to be done.
+    Cells,
+    /// Published or superseded.
+    Ended,
+}
+
+impl Run {
+    fn folder(self) -> String {
+        format!("jobs/{:08}", self.0)
+    }
+
+    fn key(self, name: &str) -> String {
+        format!("{}/{name}", self.folder())
+    }
+
+    pub(super) fn failed_folder(self) -> String {
+        self.key("failed")
+    }
+
+    /// Returns the key of the record of a view that failed, by its number in the plan.
+    pub(super) fn failed_key(self, view: usize) -> String {
+        format!("{}/{view:06}.json", self.failed_folder())
+    }
+
+    /// Returns the newest run, and whether it has ended.
+    fn newest(bucket: &Bucket) -> Result<Option<(Self, bool)>, FleetError> {
+        let names = bucket.list("jobs")?;
+        let number = |name: &String| name.strip_suffix("/plan.json")?.parse().ok();
+        let newest = names.iter().filter_map(number).max().map(Self);
+        let ended = |run: Self| names.iter().any(|name| *name == format!("{:08}/end.json", run.0));
+        Ok(newest.map(|run| (run, ended(run))))
+    }
+
+    /// Begins the next run; one that has not ended is superseded.
+    ///
+    /// # Errors
+    /// [`FleetError::Superseded`] if another coordinator begins one at the same moment.
+    pub(super) fn begin(bucket: &Bucket, plan: &RunPlan) -> Result<Self, FleetError> {
+        let newest = Self::newest(bucket)?;
+        if let Some((run, false)) = newest {
+            let end = documents::to_bytes(&End::Superseded)?;
+            if bucket.put_new(&run.key("end.json"), end)? {
+                tracing::info!("run {} had not ended; this one takes its place", run.0);
+            }
+        }
+        let next = Self(newest.map_or(1, |(run, _)| run.0 + 1));
+        match bucket.put_new(&next.key("plan.json"), documents::to_bytes(plan)?)? {
+            true => Ok(next),
+            false => Err(FleetError::Superseded { run: next.0, url: bucket.url().to_owned() }),
+        }
+    }
+
+    /// Returns the newest run and its plan, unless it has ended.
+    ///
+    /// # Errors
+    /// [`FleetError::Version`] if another version of the program planned it.
+    pub(super) fn open(bucket: &Bucket) -> Result<Option<(Self, RunPlan)>, FleetError> {
+        let Some((run, false)) = Self::newest(bucket)? else { return Ok(None) };
+        let key = run.key("plan.json");
+        let bytes = bucket.require(&key)?;
+        let PlannedBy { program: planned } = documents::parse(bucket, &key, &bytes)?;
+        let own = documents::own_version();
+        if planned != own {
+            return Err(FleetError::Version { run: run.0, planned, own });
+        }
+        Ok(Some((run, documents::parse(bucket, &key, &bytes)?)))
+    }
+
+    /// Returns what is to be done.
+    ///
+    /// # Errors
+    /// [`FleetError::Blob`].
+    pub(super) fn state(self, bucket: &Bucket) -> Result<State, FleetError> {
+        if bucket.len_of(&self.key("end.json"))?.is_some() {
+            return Ok(State::Ended);
+        }
+        Ok(match bucket.len_of(&self.key("cells.json"))? {
+            Some(_) => State::Cells,
+            None => State::Views,
+        })
+    }
+
+    /// Fails if another coordinator has taken the run's place.
+    ///
+    /// # Errors
+    /// [`FleetError::Superseded`].
+    pub(super) fn check(self, bucket: &Bucket) -> Result<(), FleetError> {
+        match self.state(bucket)? {
+            State::Ended => Err(FleetError::Superseded { run: self.0, url: bucket.url().to_owned() }),
+            State::Views | State::Cells => Ok(()),
+        }
+    }
+
+    /// Ends the run by its publication.
+    ///
+    /// # Errors
+    /// [`FleetError::Superseded`] if another coordinator was first.
+    pub(super) fn publish(self, bucket: &Bucket) -> Result<(), FleetError> {
+        match bucket.put_new(&self.key("end.json"), documents::to_bytes(&End::Published)?)? {
+            true => Ok(()),
+            false => Err(FleetError::Superseded { run: self.0, url: bucket.url().to_owned() }),
+        }
+    }
+
+    /// Lets workers begin with the cells.
+    ///
+    /// # Errors
+    /// [`FleetError::Blob`].
+    pub(super) fn begin_cells(self, bucket: &Bucket, plan: &CellsPlan) -> Result<(), FleetError> {
+        Ok(bucket.put(&self.key("cells.json"), documents::to_bytes(plan)?)?)
+    }
+
+    /// Returns the plan of the cells, which must have begun.
+    ///
+    /// # Errors
+    /// [`FleetError`].
+    pub(super) fn cells(self, bucket: &Bucket) -> Result<CellsPlan, FleetError> {
+        let key = self.key("cells.json");
+        documents::parse(bucket, &key, &bucket.require(&key)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use slag_common::Hash32;
+
+    use super::*;
+    use crate::cells::CellLimits;
+    use crate::encode::EncodeSettings;
+
+    fn plan() -> RunPlan {
+        let settings = EncodeSettings::new("a".into(), "b".into(), "c".into(), true);
+        RunPlan {
+            program: documents::own_version(),
+            engines: "none".into(),
+            of_scene: Hash32([1; 32]),
+            scene: Hash32([2; 32]),
+            settings: settings.view,
+            limits: CellLimits { max_gaussians: 5, max_width: None },
+            data_set: None,
+            views: Vec::new(),
+        }
+    }
+
+    /// A second coordinator takes the place of the first, which cannot publish any more; a published run is not
+    /// superseded, but followed.
+    #[test]
+    fn one_put_decides_who_publishes() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let bucket = Bucket::open(dir.path().to_str().expect("UTF-8"), []).expect("opens");
+        assert!(Run::open(&bucket).expect("reads").is_none());
+        let first = Run::begin(&bucket, &plan()).expect("begins");
+        assert_eq!(Run::open(&bucket).expect("reads").map(|(run, _)| run), Some(first));
+        assert_eq!(first.state(&bucket).expect("reads"), State::Views);
+        let second = Run::begin(&bucket, &plan()).expect("begins");
+        first.check(&bucket).expect_err("superseded");
+        assert!(matches!(first.publish(&bucket), Err(FleetError::Superseded { run: 1, .. })));
+        second.publish(&bucket).expect("publishes");
+        assert!(Run::open(&bucket).expect("reads").is_none());
+        assert_eq!(Run::begin(&bucket, &plan()).expect("begins"), Run(3));
+    }
+
+    #[test]
+    fn a_plan_of_another_version_is_refused() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let bucket = Bucket::open(dir.path().to_str().expect("UTF-8"), []).expect("opens");
+        bucket.put("jobs/00000001/plan.json", r#"{"program": "7.0.0", "news": 1}"#).expect("puts");
+        let message = Run::open(&bucket).expect_err("another version").to_string();
+        assert!(message.contains("7.0.0") && message.contains(env!("CARGO_PKG_VERSION")), "{message}");
+    }
+}

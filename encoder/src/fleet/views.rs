@@ -1,0 +1,117 @@
+//! Views on a worker: through the pipeline, with the bucket at both ends.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use slag_common::View;
+
+use super::dispatch::{Dispatcher, Item, Kind};
+use super::documents::{self, FailedView};
+use super::error::FleetError;
+use super::prepared::{Prepared, of_encode};
+use super::view_object;
+use crate::blobs::Bucket;
+use crate::encode::fleet_parts::{RunContext, ViewRecord, ViewSink, ViewStages, ViewTools, work_off};
+use crate::encode::{EncodeError, Engines};
+use crate::lift::ViewContributions;
+use crate::lift::photos::{MaskOutline, outlines_to_bytes};
+use crate::raster::LoadedScene;
+use crate::segment::Segmenter;
+
+/// Views whose objects are put at once.
+const N_PUTS: usize = 2;
+
+/// What views are done with.
+pub(super) struct ViewWork<'a> {
+    pub(super) bucket: &'a Arc<Bucket>,
+    pub(super) prepared: &'a Prepared,
+    pub(super) engines: &'a Engines<'a>,
+    pub(super) segmenter: &'a dyn Segmenter,
+    pub(super) scene: &'a dyn LoadedScene,
+    pub(super) dispatcher: &'a dyn Dispatcher,
+    pub(super) n_threads: usize,
+    pub(super) gpus: &'a [u32],
+    /// Views whose objects this worker put.
+    pub(super) n_done: AtomicUsize,
+}
+
+impl ViewWork<'_> {
+    /// Does the views that there are; ends when no more are to be had at present.
+    ///
+    /// # Errors
+    /// [`FleetError`] that lies in no view.
+    pub(super) fn run(&self, context: &RunContext<'_>) -> Result<(), FleetError> {
+        let prepared = self.prepared;
+        let tools = ViewTools {
+            engines: self.engines,
+            settings: &prepared.settings,
+            n_threads: self.n_threads,
+            gpus: self.gpus,
+            segmenter: self.segmenter,
+            scene: self.scene,
+            split: &prepared.split,
+            photos: Some(&prepared.files),
+            sink: self,
+        };
+        let stages = ViewStages::new(tools, context);
+        let source = std::iter::from_fn(|| {
+            while !context.is_cancelled() {
+                match self.dispatcher.take(Kind::View)? {
+                    Item::View(number) if number < prepared.views.len() => {
+                        // Another worker may have done it meanwhile.
+                        let key = documents::view_key(prepared.plan.views[number].id);
+                        match self.bucket.len_of(&key) {
+                            Ok(Some(_)) => self.dispatcher.done(Item::View(number)),
+                            Ok(None) | Err(_) => return Some((true, &prepared.views[number])),
+                        }
+                    }
+                    foreign => self.dispatcher.done(foreign),
+                }
+            }
+            None
+        });
+        let reports = work_off(&stages, self.n_threads, source, context, |view, error| {
+            tracing::warn!("view {} fails: {error}", view.name);
+            Ok(self.fail(view, &error.to_string())?)
+        });
+        reports.map(drop).map_err(of_encode)
+    }
+
+    /// Records that a view cannot be done.
+    fn fail(&self, view: &View, reason: &str) -> Result<(), FleetError> {
+        let number = self.prepared.number_of[&view.name];
+        let document = documents::to_bytes(&FailedView { reason: reason.to_owned() })?;
+        self.bucket.put_new(&self.prepared.run.failed_key(number), document)?;
+        self.finish(view);
+        Ok(())
+    }
+
+    fn finish(&self, view: &View) {
+        self.prepared.files.remove(view);
+        self.dispatcher.done(Item::View(self.prepared.number_of[&view.name]));
+    }
+}
+
+impl ViewSink for ViewWork<'_> {
+    fn n_at_once(&self) -> usize {
+        N_PUTS
+    }
+
+    fn keep(
+        &self,
+        view: &View,
+        contributions: &ViewContributions,
+        outlines: &[MaskOutline],
+        record: ViewRecord,
+    ) -> Result<(), EncodeError> {
+        let contributions = contributions.to_bytes(&view.image_path)?;
+        let bytes = view_object::pack(record, &outlines_to_bytes(outlines)?, &contributions)?;
+        let id = self.prepared.plan.views[self.prepared.number_of[&view.name]].id;
+        // Where another worker was first, its object has the same content.
+        if self.bucket.put_new(&documents::view_key(id), bytes)? {
+            self.n_done.fetch_add(1, Ordering::Relaxed);
+        }
+        self.finish(view);
+        Ok(())
+    }
+}

@@ -1,0 +1,245 @@
+//! A worker: waits for a run, does views until none is left, then cells, until the run ends.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
+
+use serde::Serialize;
+
+use super::cells::CellWork;
+use super::dispatch::{Dispatcher, Item, Kind};
+use super::documents::{self, FailedView, RunPlan};
+use super::error::FleetError;
+use super::prepared::Prepared;
+use super::queue::{Queue, QueueSettings};
+use super::run::{Run, State};
+use super::share::Share;
+use super::views::ViewWork;
+use crate::blobs::Bucket;
+use crate::encode::Engines;
+use crate::encode::fleet_parts::{RunContext, segmenter_of};
+use crate::progress::Progress;
+
+/// Pause between two looks at the state of a run: in a folder, and over a network.
+const PAUSES: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(1)];
+
+/// Which views and cells a worker takes.
+#[derive(Clone, Debug)]
+pub enum Dispatch {
+    /// Every `of`-th, from `index` on; after `help_after` without work, what others left.
+    Share {
+        /// Number of this worker, from 0.
+        index: usize,
+        /// Number of workers.
+        of: usize,
+        /// Time to wait for the others.
+        help_after: Duration,
+    },
+    /// What a queue hands out.
+    Queue(QueueSettings),
+}
+
+/// How a worker works.
+#[derive(Clone, Debug)]
+pub struct WorkerSettings {
+    /// Which views and cells it takes.
+    pub dispatch: Dispatch,
+    /// Threads, and views worked on at a time.
+    pub n_threads: usize,
+    /// GPUs for the models.
+    pub gpus: Vec<u32>,
+    /// Working memory.
+    pub memory_bytes: u64,
+    /// Folder for photos in work; it need not outlast the worker.
+    pub folder: PathBuf,
+    /// The mask model, where the coordinator uses one.
+    pub segmenter: Option<PathBuf>,
+    /// Time to wait for a run to begin.
+    pub patience: Duration,
+    /// Whether it goes on to the next run when one is published.
+    pub stays: bool,
+}
+
+/// What a worker did.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct WorkReport {
+    /// Runs that it took part in.
+    pub n_runs: usize,
+    /// Views that it was the first to finish.
+    pub n_views: usize,
+    /// Cells that it was the first to finish.
+    pub n_cells: usize,
+}
+
+pub(super) fn pause(bucket: &Bucket) -> Duration {
+    PAUSES[usize::from(!bucket.is_local())]
+}
+
+/// Works for the runs in a bucket.
+///
+/// # Errors
+/// [`FleetError`]: what it had begun is left to others.
+pub fn work(
+    bucket: &Arc<Bucket>,
+    settings: &WorkerSettings,
+    engines: &Engines<'_>,
+    progress: &dyn Progress,
+    cancel: &AtomicBool,
+) -> Result<WorkReport, FleetError> {
+    let context = RunContext::new(settings.n_threads, progress, cancel)?;
+    let mut report = WorkReport::default();
+    let mut waiting_since = Instant::now();
+    while !context.is_cancelled() {
+        if let Some(run) = Run::open(bucket)? {
+            let number = run.0.0;
+            tracing::info!("run {number}: {} views", run.1.views.len());
+            work_for(bucket, run, settings, engines, &context, &mut report)?;
+            report.n_runs += 1;
+            waiting_since = Instant::now();
+        } else if (report.n_runs > 0 && !settings.stays) || waiting_since.elapsed() >= settings.patience {
+            break;
+        } else {
+            std::thread::sleep(pause(bucket));
+        }
+    }
+    Ok(report)
+}
+
+/// A folder that goes with the run.
+struct RunFolder(PathBuf);
+
+impl RunFolder {
+    fn make(parent: &Path, run: Run) -> Result<Self, FleetError> {
+        let folder = parent.join(format!("slag-worker-{}-{}", std::process::id(), run.0));
+        fs_err::create_dir_all(&folder)?;
+        Ok(Self(folder))
+    }
+}
+
+impl Drop for RunFolder {
+    fn drop(&mut self) {
+        if let Err(error) = fs_err::remove_dir_all(&self.0) {
+            tracing::warn!("{error}");
+        }
+    }
+}
+
+fn work_for(
+    bucket: &Arc<Bucket>,
+    (run, plan): (Run, RunPlan),
+    settings: &WorkerSettings,
+    engines: &Engines<'_>,
+    context: &RunContext<'_>,
+    report: &mut WorkReport,
+) -> Result<(), FleetError> {
+    let folder = RunFolder::make(&settings.folder, run)?;
+    let of_scene = plan.of_scene;
+    let prepared = Prepared::fetch(bucket, (run, plan), &folder.0, settings.segmenter.as_ref(), context)?;
+    let segmenter = segmenter_of(&prepared.settings, &settings.gpus, engines)?;
+    prepared.check(engines, segmenter.as_ref(), context)?;
+    let memory = prepared.memory(settings.memory_bytes, settings.n_threads, engines.models.dim())?;
+    let dispatcher: Box<dyn Dispatcher> = match &settings.dispatch {
+        Dispatch::Share { index, of, help_after } => Box::new(Share::new(*index, *of, *help_after)),
+        Dispatch::Queue(queue) => {
+            let n_held = settings.n_threads + 1;
+            Box::new(Queue::open(bucket.runtime(), queue, run, of_scene, n_held)?)
+        }
+    };
+    let dispatcher = dispatcher.as_ref();
+    if run.state(bucket)? == State::Views {
+        let scene = context
+            .install(|| engines.rasterizer.load(&prepared.scene))
+            .map_err(crate::encode::EncodeError::from)?;
+        let work = ViewWork {
+            bucket,
+            prepared: &prepared,
+            engines,
+            segmenter: segmenter.as_ref(),
+            scene: scene.as_ref(),
+            dispatcher,
+            n_threads: settings.n_threads,
+            gpus: &settings.gpus,
+            n_done: AtomicUsize::new(0),
+        };
+        let mut open = || open_views(bucket, &prepared);
+        let result =
+            while_open(bucket, run, dispatcher, Kind::View, &mut open, context, &mut |_| work.run(context));
+        report.n_views += work.n_done.load(Ordering::Relaxed);
+        result?;
+    }
+    if !context.is_cancelled() && run.state(bucket)? == State::Cells {
+        let work = CellWork::fetch(bucket, &prepared, dispatcher, memory, context)?;
+        let mut open = || {
+            let done = work.done()?;
+            Ok(work.all().filter(|item| !done.contains(item)).collect())
+        };
+        let result = while_open(bucket, run, dispatcher, Kind::Cell, &mut open, context, &mut |n_open| {
+            work.run(n_open, context)
+        });
+        report.n_cells += work.n_done.load(Ordering::Relaxed);
+        result?;
+    }
+    Ok(())
+}
+
+/// Returns the views of a run that are neither done nor given up, costly ones first.
+fn open_views(bucket: &Bucket, prepared: &Prepared) -> Result<Vec<Item>, FleetError> {
+    let done: BTreeSet<String> = bucket.list("views")?.into_iter().collect();
+    let failed = bucket.list(&prepared.run.failed_folder())?;
+    let failed: BTreeSet<usize> =
+        failed.iter().filter_map(|name| name.strip_suffix(".json")?.parse().ok()).collect();
+    let views = prepared.plan.views.iter().enumerate();
+    let open =
+        views.filter(|(number, view)| !done.contains(&view.id.to_string()) && !failed.contains(number));
+    Ok(open.map(|(number, _)| Item::View(number)).collect())
+}
+
+/// Does the items of a kind for as long as the run asks for them.
+fn while_open(
+    bucket: &Bucket,
+    run: Run,
+    dispatcher: &dyn Dispatcher,
+    kind: Kind,
+    open: &mut dyn FnMut() -> Result<Vec<Item>, FleetError>,
+    context: &RunContext<'_>,
+    work: &mut dyn FnMut(usize) -> Result<(), FleetError>,
+) -> Result<(), FleetError> {
+    let asked = match kind {
+        Kind::View => State::Views,
+        Kind::Cell => State::Cells,
+    };
+    loop {
+        let mut n_open = usize::MAX;
+        dispatcher.offer(&mut || {
+            let items = open()?;
+            n_open = items.len();
+            Ok(items)
+        })?;
+        work(n_open)?;
+        loop {
+            bury(bucket, run, dispatcher)?;
+            if context.is_cancelled() || run.state(bucket)? != asked {
+                return Ok(());
+            }
+            if dispatcher.wait(kind, pause(bucket)) {
+                break;
+            }
+        }
+    }
+}
+
+/// Records the items that ended several workers, so that the run goes on without them.
+fn bury(bucket: &Bucket, run: Run, dispatcher: &dyn Dispatcher) -> Result<(), FleetError> {
+    for item in dispatcher.take_dead() {
+        let reason = "it was given to workers several times, and none left a result; their logs say why";
+        let key = match item {
+            Item::View(number) => run.failed_key(number),
+            Item::Cell(cell) => format!("{}/cell-{cell:06}.json", run.failed_folder()),
+        };
+        bucket.put_new(&key, documents::to_bytes(&FailedView { reason: reason.into() })?)?;
+        dispatcher.done(item);
+    }
+    Ok(())
+}

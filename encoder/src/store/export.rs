@@ -1,0 +1,96 @@
+//! A store as static files, laid out as robots ask for them, for any web server.
+//!
+//! | path | content |
+//! |---|---|
+//! | `v1/objects/HASH` | shards of the current generation and of the one before it |
+//! | `v1/targets/SHA256.manifest`, `v1/manifest` | their manifests; the current one |
+//! | `v1/metadata/` | metadata of The Update Framework; robots follow `timestamp.json`, which is written last |
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use rayon::prelude::*;
+use serde::Serialize;
+use slag_common::tuf::TargetFile;
+use slag_common::{Hash32, durable, manifest};
+
+use super::error::StoreError;
+use super::metadata::{self, TIMESTAMP_FILE};
+use super::reader::{Published, StoreReader};
+
+/// What an export wrote.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Exported {
+    /// Shards that were not there.
+    pub n_objects: usize,
+    /// Their bytes.
+    pub len_bytes: u64,
+    /// Shards removed that neither generation needs.
+    pub n_removed: usize,
+}
+
+/// Writes what robots need of a store into a folder, or brings one up to date. Robots that fetch meanwhile find the old
+/// generation or the new one.
+///
+/// # Errors
+/// [`StoreError`]; [`StoreError::ObjectHash`] for a damaged shard, before anything names it.
+pub fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
+    let (reader, metadata) = loop {
+        let reader = StoreReader::open(store)?;
+        let metadata = read_metadata(store)?;
+        // The manifest is published before the metadata that names it.
+        if reader.is_current() {
+            break (reader, metadata);
+        }
+    };
+    let folder = to.join("v1");
+    let [objects, targets, of_metadata] = ["objects", "targets", "metadata"].map(|name| folder.join(name));
+    for folder in [&objects, &targets, &of_metadata] {
+        fs_err::create_dir_all(folder)?;
+    }
+    let generations = || reader.previous().into_iter().chain([reader.current()]);
+    let lens: BTreeMap<Hash32, u64> = generations().flat_map(Published::shard_lens).collect();
+    let is_there = |(hash, len_bytes): &(&Hash32, &u64)| {
+        let found = std::fs::metadata(objects.join(hash.to_string()));
+        found.is_ok_and(|found| found.len() == **len_bytes)
+    };
+    let fresh: Vec<(&Hash32, &u64)> = lens.iter().filter(|object| !is_there(object)).collect();
+    fresh.par_iter().try_for_each(|(hash, _)| {
+        let bytes = reader.read_object(**hash)?;
+        Ok::<_, StoreError>(durable::write(&objects.join(hash.to_string()), &bytes)?)
+    })?;
+    for published in generations() {
+        // The name has no folder in it.
+        if let Ok(name) = TargetFile::of(&published.bytes).file_name(manifest::TARGET) {
+            durable::write(&targets.join(name), &published.bytes)?;
+        }
+    }
+    for (name, bytes) in &metadata {
+        durable::write(&of_metadata.join(name), bytes)?;
+    }
+    durable::write(&folder.join(manifest::TARGET), &reader.current().bytes)?;
+    let mut n_removed = 0;
+    for entry in fs_err::read_dir(&objects)? {
+        let entry = entry?;
+        let hash: Option<Hash32> = entry.file_name().to_str().and_then(|name| name.parse().ok());
+        if !hash.is_some_and(|hash| lens.contains_key(&hash)) {
+            fs_err::remove_file(entry.path())?;
+            n_removed += 1;
+        }
+    }
+    let len_bytes = fresh.iter().map(|(_, len_bytes)| **len_bytes).sum();
+    Ok(Exported { n_objects: fresh.len(), len_bytes, n_removed })
+}
+
+/// Returns the files of metadata by name, the timestamp last: roots, targets and snapshots are there before it names them.
+fn read_metadata(store: &Path) -> Result<Vec<(String, Vec<u8>)>, StoreError> {
+    let mut files = Vec::new();
+    for entry in fs_err::read_dir(metadata::folder(store))? {
+        let name = entry?.file_name().to_string_lossy().into_owned();
+        if let Some(bytes) = metadata::read_published(store, &name)? {
+            files.push((name, bytes));
+        }
+    }
+    files.sort_by_key(|(name, _)| name == TIMESTAMP_FILE);
+    Ok(files)
+}

@@ -1,0 +1,7 @@
+//! Fleets of real workers against the bytes that one process makes.
+
+mod faults;
+mod folder;
+mod nats;
+mod s3;
+mod support;

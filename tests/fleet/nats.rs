@@ -1,0 +1,132 @@
+//! Workers that a queue hands work to: a real nats-server with JetStream.
+
+use std::process::{Command, Stdio};
+
+use super::support::*;
+use slag_tests::*;
+
+/// A nats-server, killed when dropped.
+pub struct Server {
+    running: Running,
+    port: u16,
+}
+
+impl Server {
+    /// Starts a server on a port, with its files in the test's folder.
+    fn start(scene: &Scene, port: u16) -> Self {
+        let program = python_with("tests/fleet").with_file_name("nats-server");
+        let mut command = Command::new(program);
+        command.args(["--jetstream", "--addr", "127.0.0.1", "--port", &port.to_string()]);
+        command.args(["--store_dir", text(&scene.path("nats"))]).stdin(Stdio::null());
+        let running = Running::start_quiet(&mut command);
+        wait_until("nats-server", || std::net::TcpStream::connect(("127.0.0.1", port)).is_ok());
+        Self { running, port }
+    }
+
+    fn url(&self) -> String {
+        format!("nats://127.0.0.1:{}", self.port)
+    }
+}
+
+/// A fleet over a queue and a folder.
+pub struct Fleet {
+    pub scene: Scene,
+    bucket: String,
+    url: String,
+}
+
+impl Fleet {
+    pub fn new(port: u16) -> (Self, Server) {
+        let scene = Scene::new();
+        let server = Server::start(&scene, port);
+        let (bucket, url) = (text(&scene.path("bucket")).to_owned(), server.url());
+        (Self { scene, bucket, url }, server)
+    }
+
+    /// Starts the coordinator; `flags` are for it and the workers alike.
+    pub fn coordinator(&self, flags: &[&str]) -> Running {
+        let mut command = self.scene.encode("store");
+        Running::start(command.args(["--blobs", &self.bucket, "--fleet", &self.url]).args(flags))
+    }
+
+    pub fn worker(&self, flags: &[&str]) -> Running {
+        Running::start(worker(&self.bucket).args(["--fleet", &self.url, "--threads", "1"]).args(flags))
+    }
+
+    /// Kills the server and starts it again: with its files, or with nothing.
+    pub fn restart(&self, server: Server, is_lost: bool) -> Server {
+        let Server { running, port, .. } = server;
+        running.kill();
+        if is_lost {
+            fs_err::remove_dir_all(self.scene.path("nats")).expect("removed");
+        }
+        Server::start(&self.scene, port)
+    }
+
+    fn n_views_done(&self) -> usize {
+        n_objects(&self.scene.path("bucket/views"))
+    }
+}
+
+/// One worker is killed, one stands still for longer than the queue waits for it and goes on; the server is killed in the
+/// middle and comes back with nothing.
+#[test]
+fn killed_and_paused_workers_and_an_empty_server_give_the_same_bytes() {
+    let (fleet, server) = Fleet::new(free_port());
+    let flags = ["--ack-wait", "1"];
+    let coordinator = fleet.coordinator(&flags);
+    let killed = fleet.worker(&flags);
+    wait_until("a first view", || fleet.n_views_done() > 0);
+    killed.kill();
+    let mut paused = fleet.worker(&flags);
+    let n_done = fleet.n_views_done();
+    wait_until("a view of the second", || fleet.n_views_done() > n_done);
+    paused.signal("STOP");
+    let _server = fleet.restart(server, true);
+    assert!(fleet.n_views_done() < N_VIEWS, "the faults came too late");
+    let third = fleet.worker(&flags);
+    wait_until("all views", || fleet.n_views_done() == N_VIEWS);
+    paused.signal("CONT");
+    let summary = coordinator.json();
+    assert_eq!((&summary["n_views"], &summary["skipped_views"]), (&N_VIEWS.into(), &serde_json::json!([])));
+    let [paused, third] = [paused, third].map(Running::json);
+    let n_cells = paused["n_cells"].as_u64().zip(third["n_cells"].as_u64()).map(|(a, b)| a + b);
+    assert_eq!(n_cells, summary["n_cells"].as_u64(), "{paused} {third}");
+    fleet.scene.assert_same("store");
+}
+
+/// Views that a worker took down with it are given up once they were handed out too often: they are named, and the encode
+/// is one of the others. Without the queue's limit they are done by the next encode.
+#[test]
+fn views_that_end_workers_are_given_up_and_named() {
+    let (fleet, _server) = Fleet::new(free_port());
+    let flags = ["--ack-wait", "1", "--max-deliver", "1"];
+    let coordinator = fleet.coordinator(&flags);
+    let killed = fleet.worker(&flags);
+    wait_until("a first view", || fleet.n_views_done() > 0);
+    killed.kill();
+    // Work that the worker held in the queue's eyes, and did not finish.
+    let survivor = fleet.worker(&flags);
+    let output = coordinator.output();
+    assert_eq!(output.status.code(), Some(3), "{}", String::from_utf8_lossy(&output.stderr));
+    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    let skipped = summary["skipped_views"].as_array().expect("a list");
+    assert!(!skipped.is_empty() && skipped.len() < N_VIEWS, "{skipped:?}");
+    assert!(skipped[0]["reason"].as_str().expect("text").contains("several times"), "{skipped:?}");
+    assert_eq!(survivor.json()["n_cells"], summary["n_cells"]);
+    let (again, helper) = (fleet.coordinator(&[]), fleet.worker(&[]));
+    assert_eq!(again.json()["n_views"], N_VIEWS);
+    assert_eq!(helper.json()["n_views"], skipped.len());
+}
+
+/// Work that takes longer than the queue waits is not handed out again, as its worker says that it is at it.
+#[test]
+fn work_in_progress_is_not_handed_out_again() {
+    let (fleet, _server) = Fleet::new(free_port());
+    let flags = ["--ack-wait", "0.1", "--max-deliver", "1", "--strict"];
+    let coordinator = fleet.coordinator(&flags);
+    let worker = fleet.worker(&flags[..4]);
+    assert_eq!(coordinator.json()["n_views"], N_VIEWS);
+    assert_eq!(worker.json()["n_views"], N_VIEWS);
+    fleet.scene.assert_same("store");
+}

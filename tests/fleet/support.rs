@@ -1,0 +1,167 @@
+//! A scene, the store that one process makes of it, and the programs of a fleet.
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::sync::OnceLock;
+use std::time::Duration;
+
+use serde_json::Value;
+use slag_tests::*;
+
+/// Flags that coordinator and workers share.
+const MODELS: [&str; 4] = ["--models", "colours", "--device", "cpu"];
+
+/// Flags of the encode: one profile, so that codebooks take less time than views.
+const ENCODE: [&str; 4] = ["--name", "room", "--profiles", "compact"];
+
+/// Photos of the room.
+pub const N_VIEWS: usize = 6;
+
+/// A generated room, which all tests encode, and the folder of one test.
+pub struct Scene {
+    dir: tempfile::TempDir,
+}
+
+impl Scene {
+    pub fn new() -> Self {
+        Self { dir: tempfile::tempdir().expect("a temporary folder") }
+    }
+
+    /// Returns the room, and what one process makes of it.
+    fn room() -> &'static (PathBuf, Vec<u8>) {
+        static ROOM: OnceLock<(PathBuf, Vec<u8>)> = OnceLock::new();
+        ROOM.get_or_init(|| {
+            // Beside the built programs: nothing is dropped at a program's end.
+            let dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join("fleet");
+            if dir.exists() {
+                fs_err::remove_dir_all(&dir).expect("removed");
+            }
+            let (room, alone) = (dir.join("room"), dir.join("alone"));
+            run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", &N_VIEWS.to_string()]));
+            run(encode_room(&room, &alone).args(MODELS).args(ENCODE));
+            let manifest = fs_err::read(alone.join("manifest")).expect("published");
+            (room, manifest)
+        })
+    }
+
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.dir.path().join(name)
+    }
+
+    /// Returns the command that encodes the room into a store.
+    pub fn encode(&self, store: &str) -> Command {
+        let mut command = encode_room(&Self::room().0, &self.path(store));
+        command.args(MODELS).args(ENCODE);
+        command
+    }
+
+    /// Fails unless a store has the manifest of the one that a single process made, and its objects.
+    pub fn assert_same(&self, store: &str) {
+        let manifest = fs_err::read(self.path(store).join("manifest")).expect("published");
+        assert!(manifest == Self::room().1, "{store}: another manifest than one process makes");
+        run(&mut encoder(&["store", "verify", "--store", text(&self.path(store))]));
+    }
+}
+
+/// Returns the command of a worker; `bucket`: an address.
+pub fn worker(bucket: &str) -> Command {
+    let mut command = encoder(&["worker", "--json", "--blobs", bucket, "--wait", "30"]);
+    command.args(MODELS);
+    command
+}
+
+/// A program in the background, killed when dropped.
+pub struct Running {
+    child: Option<Child>,
+    what: String,
+}
+
+impl Running {
+    pub fn start(command: &mut Command) -> Self {
+        let what = format!("{command:?}");
+        let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("starts");
+        Self { child: Some(child), what }
+    }
+
+    /// As [`Self::start`]; what the program prints is discarded.
+    pub fn start_quiet(command: &mut Command) -> Self {
+        let what = format!("{command:?}");
+        let child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("starts");
+        Self { child: Some(child), what }
+    }
+
+    fn child(&mut self) -> &mut Child {
+        self.child.as_mut().expect("it runs")
+    }
+
+    pub fn is_running(&mut self) -> bool {
+        self.child().try_wait().expect("waits").is_none()
+    }
+
+    /// Kills it (-9), while it runs.
+    pub fn kill(mut self) {
+        assert!(self.is_running(), "{} has ended", self.what);
+        self.child().kill().expect("killed");
+        self.child().wait().expect("waits");
+        self.child = None;
+    }
+
+    /// Sends it a signal, such as STOP.
+    pub fn signal(&mut self, name: &str) {
+        let id = self.child().id().to_string();
+        run(Command::new("kill").args(["-s", name, &id]));
+    }
+
+    /// Waits for its end.
+    pub fn output(mut self) -> Output {
+        self.child.take().expect("it runs").wait_with_output().expect("waits")
+    }
+
+    /// Waits for its end, which must be a good one, and returns the JSON that it prints.
+    pub fn json(self) -> Value {
+        let what = self.what.clone();
+        let output = self.output();
+        let errors = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{what}: {}\n{errors}", output.status);
+        serde_json::from_slice(&output.stdout).expect("one JSON object on stdout")
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        if let Some(mut child) = self.child.take() {
+            // It may have ended by itself.
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+    }
+}
+
+/// Returns the number of objects in a folder of a bucket that is a folder.
+pub fn n_objects(folder: &Path) -> usize {
+    // An object on its way has a `#` in its name; a killed worker leaves it so.
+    let is_whole = |entry: &std::io::Result<std::fs::DirEntry>| {
+        entry.as_ref().is_ok_and(|entry| !entry.file_name().to_string_lossy().contains('#'))
+    };
+    std::fs::read_dir(folder).map_or(0, |entries| entries.filter(is_whole).count())
+}
+
+/// Waits until something is so.
+///
+/// # Panics
+/// After a minute.
+pub fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
+    for _ in 0..12_000 {
+        if is_so() {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    panic!("{what}: not after a minute");
+}
+
+/// Returns a port of this machine that nobody listens on.
+pub fn free_port() -> u16 {
+    let listener = std::net::TcpListener::bind(("127.0.0.1", 0)).expect("binds");
+    listener.local_addr().expect("an address").port()
+}
