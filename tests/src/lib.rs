@@ -107,7 +107,7 @@ pub fn copy_dir(from: &Path, to: &Path) {
     }
 }
 
-/// A service of the project, stopped when dropped.
+/// A service, stopped when dropped.
 pub struct Service {
     child: Child,
     /// Where it listens.
@@ -115,17 +115,22 @@ pub struct Service {
 }
 
 impl Service {
-    /// Starts a service on a free port and waits until it listens.
+    /// Starts a service of ours on a free port and waits until it listens.
     pub fn start(command: &mut Command) -> Self {
-        let mut child =
-            command.args(["--listen", "127.0.0.1:0"]).stdout(Stdio::piped()).spawn().expect("starts");
+        Self::start_as(command.args(["--listen", "127.0.0.1:0"]))
+    }
+
+    /// Starts any service that prints its address, and waits until it does.
+    pub fn start_as(command: &mut Command) -> Self {
+        let mut child = command.stdout(Stdio::piped()).spawn().expect("starts");
         let mut lines = BufReader::new(child.stdout.take().expect("piped")).lines();
         let mut seen = String::new();
         let url = loop {
             let line =
                 lines.next().unwrap_or_else(|| panic!("ended before it listened: {seen}")).expect("text");
             if let Some(at) = line.find("http") {
-                break line[at..].split_whitespace().next().expect("a URL").to_owned();
+                let url = line[at..].split_whitespace().next().expect("a URL");
+                break url.trim_end_matches(['/', ')']).to_owned();
             }
             seen += &line;
         };
