@@ -75,8 +75,8 @@ impl GraphSettings {
     /// Returns the settings for use with the boundary model, with the `n_scales` coarsest scales.
     pub fn learnt(n_scales: usize) -> Self {
         Self {
-            scales: [1500.0, 400.0, 100.0, 40.0].into_iter().take(n_scales).collect(),
-            colour_weight: 0.2,
+            scales: [1500.0, 800.0, 400.0, 100.0].into_iter().take(n_scales).collect(),
+            colour_weight: 0.3,
             boundary_weight: 40.0,
             depth_weight: 0.0,
             ..Self::default()
