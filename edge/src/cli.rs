@@ -2,6 +2,7 @@
 
 mod args;
 mod bench;
+mod changes;
 mod config;
 mod failure;
 mod fetch;
@@ -24,6 +25,7 @@ use std::path::PathBuf;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use bench::BenchCommand;
+use changes::ChangesArgs;
 use config::ConfigError;
 use failure::{Exit, Failure};
 use fetch::FetchArgs;
@@ -61,6 +63,8 @@ enum Command {
     Query(QueryArgs),
     /// Find places to stand near a thing: reached, clear, and in sight of it.
     Goal(GoalArgs),
+    /// Show what changed between two generations that this robot has had.
+    Changes(ChangesArgs),
     /// Show what is on board.
     Status(StatusArgs),
     /// Whom this robot believes.
@@ -106,6 +110,7 @@ impl Cli {
             Command::Serve(args) => (false, serve::run(args)),
             Command::Query(args) => (args.json, query::run(args)),
             Command::Goal(args) => (args.json, goal::run(args)),
+            Command::Changes(args) => (args.json, changes::run(args)),
             Command::Status(args) => (args.json, status::run(args)),
             Command::Trust(command) => (command.is_json(), trust::run(command)),
             Command::Models(args) => (args.json, models::run(args)),
@@ -201,6 +206,7 @@ mod tests {
             panic!("goal")
         };
         assert_eq!((goal.radius_m, goal.reach_m, goal.limit), (0.25, 1.0, 3));
+        assert!(parse("slag-edge changes chair mug --from 3 --to 5 --json").is_ok());
         assert!(parse("slag-edge status --json --cache d").is_ok());
         assert!(parse("slag-edge models pull clip --accept-licence apple-amlr --json").is_ok());
         assert!(
@@ -223,6 +229,7 @@ mod tests {
             "slag-edge query chair --box 1,2,3",
             "slag-edge query chair --negatives ,",
             "slag-edge goal",
+            "slag-edge changes --from first",
             "slag-edge goal chair --near 1,2",
             "slag-edge fetch --at 1,2,3 --at-geo 1,2",
             "slag-edge fetch --at-geo 91,0",

@@ -131,6 +131,44 @@ class Goals:
 
 
 @dataclass(frozen=True)
+class Changed:
+    """A thing as it is, or as it was. `like`: the text that it is most like, with the cosine, if texts were given."""
+
+    id: str
+    position_in_world: Sequence[float]
+    box_min_in_world: Sequence[float]
+    box_max_in_world: Sequence[float]
+    n_gaussians_in_scene: int
+    photo: str
+    geographic: Optional[Mapping[str, float]] = None
+    like: Optional[Mapping[str, Any]] = None
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A thing that lies elsewhere."""
+
+    before: Changed
+    now: Changed
+    distance: float
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What changed from one generation to another; `none` says why nothing was compared."""
+
+    from_generation: Optional[int]
+    to_generation: int
+    frame: str
+    appeared: Sequence[Changed]
+    went: Sequence[Changed]
+    moved: Sequence[Moved]
+    none: Optional[Nothing]
+    more: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    """The whole reply as the robot sent it."""
+
+
+@dataclass(frozen=True)
 class Event:
     """Something that happened: `generation` or `following`."""
 
@@ -164,6 +202,10 @@ def _known(made: Any, members: Mapping[str, Any]) -> dict[str, Any]:
 def _answer(members: Mapping[str, Any]) -> Answer:
     related = tuple(Witness(**_known(Witness, witness)) for witness in members.get("related_to", ()))
     return Answer(**{**_known(Answer, members), "related_to": related, "more": members})
+
+
+def _changed(members: Mapping[str, Any]) -> Changed:
+    return Changed(**_known(Changed, members))
 
 
 def _result(members: Mapping[str, Any]) -> Result:
@@ -245,6 +287,20 @@ class Robot:
         """Returns the ground around the robot as `GET /v1/floor` describes it."""
         ground: dict[str, Any] = self._send("/v1/floor?" + urllib.parse.urlencode(parameters))
         return ground
+
+    def changes(self, texts: Sequence[str] = (), near: Optional[Sequence[float]] = None, **parameters: Any) -> Changes:
+        """Returns what changed between two generations: from_, to, radius as `GET /v1/changes` takes them. `texts`: kinds of
+        things; each changed thing names the one that it is most like."""
+        pairs = [("text", text) for text in texts]
+        if near is not None:
+            pairs.append(("near", ",".join(str(of_axis) for of_axis in near)))
+        pairs += [(name.rstrip("_"), str(value)) for name, value in parameters.items()]
+        reply = self._send("/v1/changes?" + urllib.parse.urlencode(pairs))
+        things = {name: tuple(_changed(of) for of in reply[name]) for name in ("appeared", "went")}
+        moved = tuple(Moved(_changed(of["from"]), _changed(of["to"]), of["distance"]) for of in reply["moved"])
+        none = None if reply["none"] is None else Nothing(**_known(Nothing, reply["none"]))
+        earlier = None if reply["from"] is None else reply["from"]["generation"]
+        return Changes(earlier, reply["to"]["generation"], reply["frame"], **things, moved=moved, none=none, more=reply)
 
     def events(self, timeout_secs: float = 60.0) -> Iterator[Event]:
         """Yields events as they happen. The robot is heard at least every 15 s; silence longer than that is an error."""

@@ -49,6 +49,15 @@ def main(url: str, word: str) -> None:
     except SlagError as error:
         # Scenes may be encoded without --occupancy.
         assert (error.status, error.kind) == (409, "no-occupancy"), error.problem
+    changes = robot.changes([word], near=[0.0, 0.0, 0.0], radius=100)
+    assert changes.to_generation == place["generation"] and changes.frame == "world", changes
+    assert (changes.none is None) == (changes.from_generation is not None), changes
+    try:
+        robot.changes(from_=10**6, to=10**6 + 1)
+    except SlagError as error:
+        assert (error.status, error.kind) == (404, "no-such-generation"), error.problem
+    else:
+        raise AssertionError("a generation that never was")
     event = next(iter(robot.events()))
     assert event.name == "generation" and event.data["generation"] == place["generation"], event
     print(f"{len(things)} things, {len(result.answers)} answers")

@@ -27,6 +27,13 @@ pub struct Parameter {
     pub summary: String,
 }
 
+impl Parameter {
+    /// Describes a parameter.
+    pub fn new(name: &'static str, example: &'static str, summary: impl Into<String>) -> Self {
+        Self { name, example, summary: summary.into() }
+    }
+}
+
 /// A route.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Route {

@@ -5,11 +5,15 @@
 //! own: readers that do not know them skip them.
 
 mod build;
+mod changes;
 mod columns;
 mod layout;
+mod thing;
 
 pub use build::{collect_runs, quantise_vectors};
+pub use changes::{Changes, Moved, changes};
 pub use columns::{
     MAX_PHOTO_BYTES, MAX_VECTORS, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, object_score, section,
 };
 pub(crate) use layout::ObjectsLayout;
+pub use thing::Thing;

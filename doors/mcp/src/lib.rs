@@ -2,6 +2,7 @@
 //!
 //! The tools ask `slag-edge serve` over HTTP and change nothing there.
 
+mod changes;
 mod find;
 pub mod http;
 mod place;

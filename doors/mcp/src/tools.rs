@@ -6,6 +6,7 @@ use rmcp::model::{Implementation, ServerCapabilities, ServerConfig};
 use rmcp::{Json, ServerHandler, tool, tool_handler, tool_router};
 use slag_robot::{Robot, RobotError};
 
+use crate::changes::{Compare, Difference};
 use crate::find::{Found, Wanted};
 use crate::place::{Asked, Description};
 use crate::stand::{Going, Stands};
@@ -55,6 +56,20 @@ impl Tools {
         Parameters(asked): Parameters<Asked>,
     ) -> Result<Json<Description>, String> {
         self.blocking(move |robot| asked.describe(robot)).await.map(Json)
+    }
+
+    /// Find what changed on the robot's map since an earlier state of it: things that appeared, went or moved.
+    #[tool(annotations(title = "What changed", read_only_hint = true, open_world_hint = false))]
+    async fn what_changed(
+        &self,
+        Parameters(compare): Parameters<Compare>,
+    ) -> Result<Json<Difference>, String> {
+        let refused = |error: RobotError| error.to_string();
+        self.blocking(move |robot| {
+            robot.changes(&compare.parameters()).map(Difference::from).map_err(refused)
+        })
+        .await
+        .map(Json)
     }
 
     /// Asks the robot on a thread that may wait.

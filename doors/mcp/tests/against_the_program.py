@@ -23,7 +23,7 @@ async def check(client, robot, word):
     assert client.server_info.name == "slag-mcp", client.server_info
     assert "world frame" in client.instructions
     tools = {tool.name: tool for tool in (await client.list_tools()).tools}
-    assert sorted(tools) == ["describe_place", "find", "where_to_stand"], sorted(tools)
+    assert sorted(tools) == ["describe_place", "find", "what_changed", "where_to_stand"], sorted(tools)
     for tool in tools.values():
         assert tool.description and tool.annotations.read_only_hint, tool
         assert tool.output_schema["type"] == "object", tool.output_schema
@@ -66,6 +66,22 @@ async def check(client, robot, word):
     if truth["none"] is not None:
         assert stand["none"]["kind"] == truth["none"]["kind"], (stand, truth)
 
+    # The robot has had two generations; ids, places and words are those that it tells itself.
+    truth = get(f"{robot}/v1/changes?text={word}&text=blue")
+    changed = await client.call_tool("what_changed", {"words": [word, "blue"]})
+    assert not changed.is_error, changed
+    changed = changed.structured_content
+    assert changed["from_generation"] == truth["from"]["generation"] < changed["to_generation"] == truth["to"]["generation"]
+    assert "none" not in changed and truth["appeared"] and truth["went"], (changed, truth)
+    for name in ("appeared", "went"):
+        told = [(one["id"], one["position_in_world"], one["most_like"]) for one in changed[name]]
+        assert told == [(one["id"], one["position_in_world"], one["like"]["text"]) for one in truth[name]], (told, truth)
+    assert [move["distance"] for move in changed["moved"]] == [move["distance"] for move in truth["moved"]]
+    assert changed["n_unchanged"] == truth["n_same"] + truth["n_stayed"], (changed, truth)
+    beyond = await client.call_tool("what_changed", {"near": away, "radius": 1.0})
+    beyond = beyond.structured_content
+    assert beyond["appeared"] == beyond["went"] == beyond["moved"] == [], beyond
+
     place = get(f"{robot}/v1/map")
     here = (await client.call_tool("describe_place", {"words": [word]})).structured_content
     assert here["n_things"] == place["n_objects"] and here["scene"] == place["scene"], here
@@ -84,6 +100,8 @@ async def check(client, robot, word):
         ("find", {"what": word, "near": [0, 0, 0], "radius": -1.0}, "radius"),
         ("describe_place", {"near": [0, 0, 0]}, "go together"),
         ("where_to_stand", {"what": word, "radius_m": 9.0}, "radius_m"),
+        ("what_changed", {"from_generation": 10**6}, "generation"),
+        ("what_changed", {"radius": 1.0}, "near"),
     ]:
         refused = await client.call_tool(name, asked)
         assert refused.is_error and expected in refused.content[0].text, (asked, refused)

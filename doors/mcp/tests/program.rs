@@ -9,6 +9,7 @@ use slag_tests::*;
 fn the_client_of_the_mcp_project_asks_a_robot() {
     let python = python_with("doors/mcp/tests");
     let site = Site::new();
+    site.publish_another();
     let robot = site.robot(&[]);
     let mcp = Path::new(env!("CARGO_BIN_EXE_slag-mcp"));
     let door = Service::start(Command::new(mcp).args(["--robot", &robot.url]));

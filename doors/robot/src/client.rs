@@ -6,6 +6,7 @@ use std::time::Duration;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
+use crate::changes::Changes;
 use crate::error::RobotError;
 use crate::goal::Goals;
 use crate::place::Place;
@@ -87,6 +88,16 @@ impl Robot {
     /// [`RobotError`].
     pub fn goal(&self, parameters: &[(&str, String)]) -> Result<Goals, RobotError> {
         let path = "/v1/goal";
+        let pairs = parameters.iter().map(|(name, value)| (*name, value.as_str()));
+        self.read(path, self.agent.get(self.address(path)).query_pairs(pairs).call())
+    }
+
+    /// Returns what changed between two generations, by the parameters of `GET /v1/changes`.
+    ///
+    /// # Errors
+    /// [`RobotError`].
+    pub fn changes(&self, parameters: &[(&str, String)]) -> Result<Changes, RobotError> {
+        let path = "/v1/changes";
         let pairs = parameters.iter().map(|(name, value)| (*name, value.as_str()));
         self.read(path, self.agent.get(self.address(path)).query_pairs(pairs).call())
     }

@@ -1,11 +1,13 @@
 //! The robot's HTTP interface as its clients see it: `slag-edge serve`, asked over `/v1` (docs/api.md).
 
+mod changes;
 mod client;
 mod error;
 mod goal;
 mod place;
 mod reply;
 
+pub use changes::{Changed, Changes, Compared, Like, Miss, Moved};
 pub use client::{Robot, read_token};
 pub use error::RobotError;
 pub use goal::{Goal, GoalMiss, GoalThing, Goals};

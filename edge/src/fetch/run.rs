@@ -11,6 +11,7 @@ use super::download::Client;
 use super::environment::Environment;
 use super::error::FetchError;
 use super::generation::{Before, assemble};
+use super::history;
 use super::objects::{Check, download_all};
 use super::offer::Offer;
 use super::plan::{Object, Plan, Wanted};
@@ -113,12 +114,20 @@ pub fn fetch(
     for hash in plan.free.difference(&in_use) {
         cache.files().remove(&cache.shard_path(*hash))?;
     }
+    if let (Some(old), Some(on_board)) = (&old, &on_board) {
+        history::note(cache, old, &on_board.manifest, offer.manifest_hash, &plan.cells);
+    }
     clear_staging(cache, &plan.download)?;
     environment.progress.planned(planned.n_shards, planned.bytes);
     let before = Before { cache, current: old.as_ref(), offer: on_board.as_ref() };
     let work = || {
         let other_bytes = offer.bytes.len() as u64 + plan.cells.len() as u64 * CELL_BYTES + SPARE_BYTES;
-        check_space(cache, &plan.download, other_bytes)?;
+        if let Err(error) = check_space(cache, &plan.download, other_bytes) {
+            match history::forget(cache) {
+                true => check_space(cache, &plan.download, other_bytes)?,
+                false => return Err(error),
+            }
+        }
         let check = Check::new(&offer.manifest, profile, &plan.cells);
         let mut downloaded = download_all(cache, &client, &check, &plan.download, request.parallel)?;
         damaged::unmark(cache, marked.intersection(&downloaded.good))?;

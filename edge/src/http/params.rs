@@ -13,36 +13,46 @@ use crate::score::Precision;
 
 /// Returns the parameters, with the values and defaults of the types behind them.
 pub fn parameters() -> [Parameter; 12] {
-    let parameter = |name, example, summary: String| Parameter { name, example, summary };
-    let text = |name, example, summary: &str| parameter(name, example, summary.to_owned());
     let (kind, precision, format) =
         (list(&AnswerKind::ALL), list(&Precision::ALL), list(Format::available()));
     let default_precision = Precision::default();
     [
-        text("text", "chair", "what to look for; several are answered in one pass, as a batch"),
-        text(
+        Parameter::new("text", "chair", "what to look for; several are answered in one pass, as a batch"),
+        Parameter::new(
             "negatives",
             "canonical",
             "or none, or a,b,c: scores are relevancy against these (default: none)",
         ),
-        parameter("limit", "10", format!("most answers to a text (default: {DEFAULT_LIMIT})")),
-        text("threshold", "0.1", "least cosine, or relevancy with negatives (default: the scene's)"),
-        text("near", "x,y,z", "where the asker is: answers have distances and nearer ones rank higher"),
-        text("radius", "r", "only within this distance of near"),
-        text("box", "x,y,z,x,y,z", "only between two corners"),
-        parameter(
+        Parameter::new("limit", "10", format!("most answers to a text (default: {DEFAULT_LIMIT})")),
+        Parameter::new(
+            "threshold",
+            "0.1",
+            "least cosine, or relevancy with negatives (default: the scene's)",
+        ),
+        Parameter::new(
+            "near",
+            "x,y,z",
+            "where the asker is: answers have distances and nearer ones rank higher",
+        ),
+        Parameter::new("radius", "r", "only within this distance of near"),
+        Parameter::new("box", "x,y,z,x,y,z", "only between two corners"),
+        Parameter::new(
             "kind",
             "clusters",
             format!("{kind} (default: objects where the scene has them, else clusters)"),
         ),
-        text("voxel", "v", "edge of the voxels that join Gaussians to clusters"),
-        parameter("min_count", "n", format!("smaller clusters are dropped (default: {DEFAULT_MIN_COUNT})")),
-        parameter(
+        Parameter::new("voxel", "v", "edge of the voxels that join Gaussians to clusters"),
+        Parameter::new(
+            "min_count",
+            "n",
+            format!("smaller clusters are dropped (default: {DEFAULT_MIN_COUNT})"),
+        ),
+        Parameter::new(
             "precision",
             "measured",
             format!("{precision}, fastest first (default: {default_precision})"),
         ),
-        parameter(
+        Parameter::new(
             "format",
             "json",
             format!("{format}; arrow: Gaussians as columns; ply: the answers' Gaussians as points"),

@@ -26,6 +26,7 @@ use slag_common::tuf::{Kept, SignedMetadata, Timestamp, generate_key, one_key_re
 
 mod answers;
 mod attacks;
+mod changes;
 mod goal;
 mod openapi;
 mod ply;

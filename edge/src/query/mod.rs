@@ -6,6 +6,7 @@ mod area;
 #[cfg(feature = "arrow")]
 mod arrow;
 mod ask;
+mod changes;
 pub mod cluster;
 mod engine;
 mod extent;
@@ -35,6 +36,10 @@ pub use answers::{
 };
 pub use area::{Area, AreaBall, AreaBox};
 pub use ask::{Ask, AskReply, Asked, MAX_PAGE, Outcome, RelatedAnswers};
+pub use changes::{
+    ChangedThing, ChangesError, ChangesReply, ChangesRequest, ComparedGeneration, Likeness, MovedThing,
+    NotCompared,
+};
 pub use engine::{Engine, QueryError};
 pub use format::Format;
 pub use inventory::{FRAME, ObjectFilter, ObjectOnBoard, ObjectPage, object_id};

@@ -7,6 +7,7 @@
 //! | `current` | [`Current`]: the generation in use | fetch: replaced whole |
 //! | `staging/` | partial downloads | fetch |
 //! | `damaged/HASH` | marks of shards that were found damaged | readers: added; fetch: removed |
+//! | `history/GENERATION` | the objects of earlier generations; may be lost | fetch: replaced whole, removed |
 //! | `trust/` | accepted metadata and scene, in two copies | fetch |
 //! | `db/` | which shards were used and checked | fetch |
 //! | `lock` | locked by the one fetch | |
@@ -19,6 +20,7 @@ mod cache;
 pub mod damaged;
 mod error;
 pub mod files;
+pub mod history;
 pub mod mmap;
 pub mod objects;
 mod scrubber;

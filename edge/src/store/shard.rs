@@ -77,7 +77,11 @@ impl OpenShard {
         is_listed && is_named && is_readable && is_unchanged
     }
 
-    pub(super) fn open(
+    /// Maps and checks a shard of the cache.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub fn open(
         cache: &EdgeCache,
         manifest: &Manifest,
         profile: Profile,

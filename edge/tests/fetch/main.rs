@@ -3,6 +3,7 @@
 mod crash;
 mod faults;
 mod follow;
+mod history;
 mod hostile;
 mod keys;
 mod partial;

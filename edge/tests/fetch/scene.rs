@@ -6,9 +6,13 @@ use ed25519_dalek::SigningKey;
 use glam::DVec3;
 use half::f16;
 use slag_common::Hash32;
+use slag_common::container::AlignedBytes;
 use slag_common::frames::{Aabb, GeoReference};
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord, VERSION};
-use slag_common::shard::{ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardView, quantise};
+use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, collect_runs, quantise_vectors};
+use slag_common::shard::{
+    Additions, ExactColumns, Positions, Profile, ScoreErrors, ShardHeader, ShardLayout, ShardView, quantise,
+};
 use slag_common::tuf::{
     FileMeta, Key, RoleKeys, Root, Snapshot, TargetFile, Targets, Timestamp, format_utc, sign,
 };
@@ -97,7 +101,88 @@ pub fn shard(spec: &ShardSpec) -> Vec<u8> {
     out
 }
 
+/// A thing of a scene: an object of one Gaussian.
+#[derive(Clone, Copy)]
+pub struct TestThing {
+    pub cell_id: u32,
+    pub id: u64,
+    /// Middle of its box, which is 1 wide; y and z are those of the row.
+    pub x: f64,
+    /// The only axis of its vector.
+    pub axis: usize,
+}
+
+/// Writes a shard again, with things.
+fn with_things(bytes: &[u8], things: &[TestThing]) -> Vec<u8> {
+    let bytes = AlignedBytes::copy_of(bytes);
+    let layout = ShardLayout::check(&bytes).expect("sound");
+    let shard = layout.view(&bytes);
+    let mut objects = vec![NO_OBJECT; shard.header.n_gaussians as usize];
+    let (mut records, mut vectors, mut steps, mut photos) = (vec![], vec![], vec![], String::new());
+    for (at, thing) in things.iter().enumerate() {
+        objects[at] = at as u16;
+        let middle = DVec3::new(thing.x, 0.0, 105.0);
+        let photo = format!("{}.png", thing.id);
+        records.push(ObjectRecord {
+            id: thing.id,
+            position_in_world: middle.into(),
+            box_min: (middle - 0.5).into(),
+            box_max: (middle + 0.5).into(),
+            n_gaussians: 1,
+            n_gaussians_here: 1,
+            photo_box_px: [0, 0, 1, 1],
+            photo_start: photos.len() as u32,
+            photo_bytes: photo.len() as u32,
+        });
+        photos += &photo;
+        let vector: Vec<f32> = (0..DIM as usize).map(|axis| f32::from(axis == thing.axis)).collect();
+        let (components, of_vectors) = quantise_vectors(&vector, DIM as usize, 2);
+        vectors.extend(components);
+        steps.extend(of_vectors);
+    }
+    let (run_ends, run_objects) = collect_runs(objects);
+    let header = ObjectsHeader {
+        n_objects: records.len() as u32,
+        n_vectors: 2,
+        n_runs: run_ends.len() as u32,
+        photos_bytes: photos.len() as u32,
+        score_mean: 0.0,
+        score_spread: 0.1,
+        score_error_bound: 0.01,
+    };
+    let objects = Objects {
+        header,
+        records: &records,
+        vectors: &vectors,
+        steps: &steps,
+        run_ends: &run_ends,
+        run_objects: &run_objects,
+        photos: photos.as_bytes(),
+    };
+    let mut out = Vec::new();
+    let additions = Additions { objects: Some(&objects), occupancy: None, appearance: None };
+    shard.write_with(&mut out, additions).expect("writes to memory");
+    out
+}
+
 impl Published {
+    /// Gives every shard the things of its cell.
+    pub fn with_things(mut self, things: &[TestThing]) -> Self {
+        let mut objects = BTreeMap::new();
+        let mut manifest = self.manifest.clone();
+        for cell in &mut manifest.cells {
+            let is_here = |thing: &&TestThing| thing.cell_id == cell.cell_id;
+            let here: Vec<TestThing> = things.iter().filter(is_here).copied().collect();
+            for shard in cell.shards.values_mut() {
+                let bytes = with_things(&self.objects[&shard.hash], &here);
+                (shard.hash, shard.len_bytes) = (Hash32::of(&bytes), bytes.len() as u64);
+                objects.insert(shard.hash, bytes);
+            }
+        }
+        self.objects = objects;
+        self.edited(|old| *old = manifest)
+    }
+
     /// Publishes cells `0..contents.len()` in both profiles; equal content numbers give equal shards.
     pub fn new(generation: u64, contents: &[u64], n_gaussians: u32) -> Self {
         let mut objects = BTreeMap::new();

@@ -6,10 +6,11 @@ use std::path::PathBuf;
 use anyhow::{Result, anyhow};
 use clap::Args;
 use slag_common::ByteSize;
+use slag_common::objects::Thing;
 
 use super::common::print;
 use super::exit::Exit;
-use crate::diff::{self, Diff, Generation, Thing};
+use crate::diff::{self, Diff, Generation};
 use crate::store::{Published, StoreReader};
 
 /// `diff`.

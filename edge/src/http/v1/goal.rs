@@ -18,32 +18,34 @@ use crate::query::{FRAME, Point, RequestError, object_id, parse_point};
 
 /// Returns the parameters of `/v1/goal`.
 pub fn parameters() -> Vec<Parameter> {
-    let parameter = |name, example, summary: &str| Parameter { name, example, summary: summary.to_owned() };
     let of_goal = [
-        parameter("text", "chair", "the thing to go to; may name relations"),
-        parameter("id", "o0123456789abcdef", "the same by its id, instead of text"),
-        parameter("reach_m", "0.8", "largest horizontal distance to the thing's surface (default: 0.8)"),
-        parameter("min_visible", "0.05", "least share of the thing that the sensor must see (default: 0.05)"),
-        parameter("limit", "3", "most poses (default: 3, at most 20)"),
+        Parameter::new("text", "chair", "the thing to go to; may name relations"),
+        Parameter::new("id", "o0123456789abcdef", "the same by its id, instead of text"),
+        Parameter::new("reach_m", "0.8", "largest horizontal distance to the thing's surface (default: 0.8)"),
+        Parameter::new(
+            "min_visible",
+            "0.05",
+            "least share of the thing that the sensor must see (default: 0.05)",
+        ),
+        Parameter::new("limit", "3", "most poses (default: 3, at most 20)"),
     ];
     of_goal.into_iter().chain(floor_parameters()).collect()
 }
 
 /// Returns the parameters of `/v1/floor`.
 pub fn floor_parameters() -> Vec<Parameter> {
-    let parameter = |name, example, summary: &str| Parameter { name, example, summary: summary.to_owned() };
     vec![
-        parameter(
+        Parameter::new(
             "near",
             "x,y,z",
             "where the robot is (default: its last position if it is followed, else the middle of the area on board)",
         ),
-        parameter("near_lat_lon", "lat,lon", "the same on the earth"),
-        parameter("radius_m", "0.3", "radius of the robot, seen from above (default: 0.3)"),
-        parameter("sensor_height_m", "0.4", "height of its sensor above the ground (default: 0.4)"),
-        parameter("height_m", "0.5", "height of the robot (default: 0.1 above the sensor)"),
-        parameter("step_m", "0.1", "highest step that it climbs (default: 0.1)"),
-        parameter("range_m", "20", "how far around it ground is looked at (default: 20)"),
+        Parameter::new("near_lat_lon", "lat,lon", "the same on the earth"),
+        Parameter::new("radius_m", "0.3", "radius of the robot, seen from above (default: 0.3)"),
+        Parameter::new("sensor_height_m", "0.4", "height of its sensor above the ground (default: 0.4)"),
+        Parameter::new("height_m", "0.5", "height of the robot (default: 0.1 above the sensor)"),
+        Parameter::new("step_m", "0.1", "highest step that it climbs (default: 0.1)"),
+        Parameter::new("range_m", "20", "how far around it ground is looked at (default: 20)"),
     ]
 }
 

@@ -1,6 +1,7 @@
 //! The API for programs, version 1: one shape of reply for every question.
 
 mod body;
+mod changes;
 mod events;
 mod goal;
 mod map;
@@ -30,6 +31,8 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         .parameters(params::objects_parameters())
         .get("/v1/objects/{id}", "one thing on board", objects::one)
         .get("/v1/map", "the area on board, its age, and what is missing", map::map)
+        .get("/v1/changes", "things that appeared, went or moved between two generations", changes::changes)
+        .parameters(changes::parameters())
         .get(
             "/v1/view",
             "the scene on board as the page at /view draws it: cells, fetched area, robot",

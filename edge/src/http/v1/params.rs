@@ -18,50 +18,56 @@ pub type Pairs = Query<Vec<(String, String)>>;
 
 /// Returns the parameters of `/v1/query`.
 pub fn query_parameters() -> [Parameter; 18] {
-    let parameter = |name, example, summary: &str| Parameter { name, example, summary: summary.to_owned() };
     [
-        parameter("text", "mug on the table", "what to look for; may be repeated"),
-        parameter("relations", "off", "take texts as they are, even if they name a relation"),
-        parameter(
+        Parameter::new("text", "mug on the table", "what to look for; may be repeated"),
+        Parameter::new("relations", "off", "take texts as they are, even if they name a relation"),
+        Parameter::new(
             "negative",
             "wall, floor",
             "a negative prompt, commas included; may be repeated; or canonical",
         ),
-        parameter("kind", "objects", "objects, clusters or gaussians"),
-        parameter("limit", "10", &format!("answers to a text in a page (default: {DEFAULT_LIMIT})")),
-        parameter("offset", "0", "answers to a text before the page"),
-        parameter("min_score", "0.1", "least cosine, or relevancy with negatives (default: the scene's)"),
-        parameter(
+        Parameter::new("kind", "objects", "objects, clusters or gaussians"),
+        Parameter::new("limit", "10", format!("answers to a text in a page (default: {DEFAULT_LIMIT})")),
+        Parameter::new("offset", "0", "answers to a text before the page"),
+        Parameter::new(
+            "min_score",
+            "0.1",
+            "least cosine, or relevancy with negatives (default: the scene's)",
+        ),
+        Parameter::new(
             "near",
             "x,y,z",
             "where the asker is: relations are seen from there, and nearer answers rank higher",
         ),
-        parameter(
+        Parameter::new(
             "near_lat_lon",
             "lat,lon",
             "the same on the earth, with the height if it is known: lat,lon,height",
         ),
-        parameter("heading_rad", "1.57", "where the asker looks, from x towards y"),
-        parameter("radius", "r", "only within this distance of the asker"),
-        parameter("box", "x,y,z,x,y,z", "only between two corners"),
-        parameter("polygon", "x,y,x,y,x,y", "only inside this outline, seen from above"),
-        parameter("polygon_lat_lon", "lat,lon,...", "the same on the earth"),
-        parameter("min_count", "n", &format!("least Gaussians of an answer (default: {DEFAULT_MIN_COUNT})")),
-        parameter("voxel", "v", "edge of the voxels that join Gaussians to clusters"),
-        parameter("precision", "measured", "centroids, measured or exact (default: exact)"),
-        parameter("time_budget_ms", "500", "give up after this time"),
+        Parameter::new("heading_rad", "1.57", "where the asker looks, from x towards y"),
+        Parameter::new("radius", "r", "only within this distance of the asker"),
+        Parameter::new("box", "x,y,z,x,y,z", "only between two corners"),
+        Parameter::new("polygon", "x,y,x,y,x,y", "only inside this outline, seen from above"),
+        Parameter::new("polygon_lat_lon", "lat,lon,...", "the same on the earth"),
+        Parameter::new(
+            "min_count",
+            "n",
+            format!("least Gaussians of an answer (default: {DEFAULT_MIN_COUNT})"),
+        ),
+        Parameter::new("voxel", "v", "edge of the voxels that join Gaussians to clusters"),
+        Parameter::new("precision", "measured", "centroids, measured or exact (default: exact)"),
+        Parameter::new("time_budget_ms", "500", "give up after this time"),
     ]
 }
 
 /// Returns the parameters of `/v1/objects`.
 pub fn objects_parameters() -> [Parameter; 5] {
-    let parameter = |name, example, summary: &str| Parameter { name, example, summary: summary.to_owned() };
     [
-        parameter("limit", "100", "objects in a page (default: 100, at most 1000)"),
-        parameter("after", "o0123456789abcdef", "the id that the page begins after"),
-        parameter("near", "x,y,z", "with radius: only objects within this distance"),
-        parameter("radius", "r", "with near"),
-        parameter("min_size", "0.5", "least length of the box's longest edge, world units"),
+        Parameter::new("limit", "100", "objects in a page (default: 100, at most 1000)"),
+        Parameter::new("after", "o0123456789abcdef", "the id that the page begins after"),
+        Parameter::new("near", "x,y,z", "with radius: only objects within this distance"),
+        Parameter::new("radius", "r", "with near"),
+        Parameter::new("min_size", "0.5", "least length of the box's longest edge, world units"),
     ]
 }
 

@@ -20,17 +20,20 @@ use crate::score::Budget;
 
 /// Returns the parameters of `/v1/view/scores`.
 pub fn scores_parameters() -> [Parameter; 2] {
-    let parameter = |name, example, summary: &str| Parameter { name, example, summary: summary.to_owned() };
     [
-        parameter("text", "mug", "what to look for"),
-        parameter("negative", "wall", "a negative prompt, commas included; may be repeated; or canonical"),
+        Parameter::new("text", "mug", "what to look for"),
+        Parameter::new(
+            "negative",
+            "wall",
+            "a negative prompt, commas included; may be repeated; or canonical",
+        ),
     ]
 }
 
 /// Returns the parameters of `/v1/view/cells/{id}`.
 pub fn cell_parameters() -> [Parameter; 1] {
-    let summary = "the generation that the cell must be of: 404 from another one on".to_owned();
-    [Parameter { name: "generation", example: "12", summary }]
+    let summary = "the generation that the cell must be of: 404 from another one on";
+    [Parameter::new("generation", "12", summary)]
 }
 
 pub async fn describe(State(app): State<Arc<App>>) -> Result<Json<Description>, Problem> {

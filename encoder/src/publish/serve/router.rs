@@ -58,7 +58,6 @@ pub fn bounded(routes: Router, limits: Limits, access: Access) -> Router {
 
 /// Returns the routes.
 pub(super) fn routes() -> Routes<Arc<Service>> {
-    let parameter = |name, example, summary: &str| Parameter { name, example, summary: summary.to_owned() };
     Routes::default()
         .get("/v1/manifest", "manifest of the current generation, with ETag", objects::manifest)
         .get("/v1/metadata/{name}", "TUF metadata, such as timestamp.json", metadata::metadata)
@@ -66,13 +65,13 @@ pub(super) fn routes() -> Routes<Arc<Service>> {
         .get("/v1/objects/{hash}", "shard of the current or previous manifest; byte ranges", objects::object)
         .get("/v1/cells", "cells near a point, with distances and shards", cells::cells)
         .parameters([
-            parameter("x", "1", "centre in the world frame, with y and z"),
-            parameter("y", "2", ""),
-            parameter("z", "3", ""),
-            parameter("lat", "46.8", "or centre on the earth, degrees WGS 84, with lon"),
-            parameter("lon", "-92", ""),
-            parameter("height", "158.5", "metres above the ellipsoid (default: the scene's origin)"),
-            parameter("radius", "50", "distance from the centre, units of the world frame"),
+            Parameter::new("x", "1", "centre in the world frame, with y and z"),
+            Parameter::new("y", "2", ""),
+            Parameter::new("z", "3", ""),
+            Parameter::new("lat", "46.8", "or centre on the earth, degrees WGS 84, with lon"),
+            Parameter::new("lon", "-92", ""),
+            Parameter::new("height", "158.5", "metres above the ellipsoid (default: the scene's origin)"),
+            Parameter::new("radius", "50", "distance from the centre, units of the world frame"),
         ])
         .get("/v1/coverage.geojson", "footprints of the cells on the earth", cells::coverage)
         .get("/healthz", "whether the process is alive, and the generation served", health)

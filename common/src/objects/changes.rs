@@ -5,9 +5,9 @@
 
 use glam::DVec3;
 use serde::Serialize;
-use slag_common::frames::Aabb;
 
-use super::things::Thing;
+use super::thing::Thing;
+use crate::frames::Aabb;
 
 /// Least cosine of the vectors of a thing that stayed. Other photos change a thing's vector; another thing at its place
 /// differs more.
@@ -20,6 +20,9 @@ const MOVED_COSINE: f64 = 0.9;
 const MOVED_SIZE_RATIO: f64 = 1.5;
 /// Boxes are widened on each side by this share of their diagonal, so that flat things overlap as thick ones do.
 const MARGIN: f64 = 0.05;
+/// Things of the later list that one of the earlier may be paired with, those of lowest cost: bounds memory where thousands
+/// are alike.
+const MAX_CANDIDATES: usize = 32;
 
 /// A thing that lies elsewhere.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -34,16 +37,31 @@ pub struct Moved {
 
 /// The changes from one list of things to another.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct Changes {
-    pub(super) n_same: usize,
-    pub(super) n_stayed: usize,
-    pub(super) appeared: Vec<Thing>,
-    pub(super) went: Vec<Thing>,
-    pub(super) moved: Vec<Moved>,
+pub struct Changes {
+    /// Things of exactly the same Gaussians.
+    pub n_same: usize,
+    /// Things at the same place whose Gaussians changed.
+    pub n_stayed: usize,
+    /// Things whose place only one of the lists knows.
+    pub n_not_compared: usize,
+    /// Things of the later list alone, by id.
+    pub appeared: Vec<Thing>,
+    /// Things of the earlier list alone, by id.
+    pub went: Vec<Thing>,
+    /// Things that lie elsewhere, by the ids that they had.
+    pub moved: Vec<Moved>,
 }
 
 /// Returns the changes between two lists, each ascending by id.
-pub(super) fn changes(old: Vec<Thing>, new: Vec<Thing>) -> Changes {
+///
+/// `new_knows` says whether the later list would have a thing of the earlier one if it were still there, `old_knows` the
+/// reverse; other things are matched where they lie, and not compared otherwise.
+pub fn changes(
+    old: Vec<Thing>,
+    new: Vec<Thing>,
+    new_knows: impl Fn(&Thing) -> bool,
+    old_knows: impl Fn(&Thing) -> bool,
+) -> Changes {
     let is_in = |things: &[Thing], id: u64| things.binary_search_by_key(&id, |thing| thing.id).is_ok();
     let n_same = new.iter().filter(|thing| is_in(&old, thing.id)).count();
     let went: Vec<Thing> = old.iter().filter(|thing| !is_in(&new, thing.id)).cloned().collect();
@@ -52,7 +70,11 @@ pub(super) fn changes(old: Vec<Thing>, new: Vec<Thing>) -> Changes {
         let overlap = overlap(&old.box_in_world, &new.box_in_world);
         (overlap >= STAYED_OVERLAP && cosine(old, new) >= STAYED_COSINE).then_some(-overlap)
     });
-    let [went, appeared] = without(went, appeared, &stayed);
+    let [mut went, mut appeared] = without(went, appeared, &stayed);
+    let n_rest = went.len() + appeared.len();
+    went.retain(new_knows);
+    appeared.retain(old_knows);
+    let n_not_compared = n_rest - went.len() - appeared.len();
     let moved = pairs(&went, &appeared, |old, new| {
         let distance = old.position_in_world.distance(new.position_in_world);
         (have_one_size(old, new) && cosine(old, new) >= MOVED_COSINE).then_some(distance)
@@ -64,7 +86,7 @@ pub(super) fn changes(old: Vec<Thing>, new: Vec<Thing>) -> Changes {
     let mut list: Vec<Moved> = moved.iter().map(of_pair).collect();
     list.sort_by_key(|moved| moved.from.id);
     let [went, appeared] = without(went, appeared, &moved);
-    Changes { n_same, n_stayed: stayed.len(), appeared, went, moved: list }
+    Changes { n_same, n_stayed: stayed.len(), n_not_compared, appeared, went, moved: list }
 }
 
 /// Pairs the things of two lists, lowest cost first; `None` for what cannot be a pair.
@@ -72,7 +94,12 @@ fn pairs(old: &[Thing], new: &[Thing], cost: impl Fn(&Thing, &Thing) -> Option<f
     let mut candidates: Vec<(f64, usize, usize)> = Vec::new();
     for (at_old, old) in old.iter().enumerate() {
         let of_old = new.iter().enumerate().filter_map(|(at, new)| Some((cost(old, new)?, at_old, at)));
+        let first = candidates.len();
         candidates.extend(of_old);
+        if candidates.len() > first + MAX_CANDIDATES {
+            candidates[first..].sort_by(|a, b| a.0.total_cmp(&b.0).then(a.2.cmp(&b.2)));
+            candidates.truncate(first + MAX_CANDIDATES);
+        }
     }
     candidates.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
     let (mut old_is_free, mut new_is_free) = (vec![true; old.len()], vec![true; new.len()]);
@@ -143,6 +170,10 @@ mod tests {
         }
     }
 
+    fn all(old: Vec<Thing>, new: Vec<Thing>) -> Changes {
+        changes(old, new, |_| true, |_| true)
+    }
+
     const CHAIR: [f64; 2] = [1.0, 0.0];
     const TABLE: [f64; 2] = [0.0, 1.0];
 
@@ -163,7 +194,7 @@ mod tests {
             thing(7, [20.0, 0.0, 0.0], [1.0; 3], CHAIR),
         ];
         let ids = |things: &[Thing]| things.iter().map(|thing| thing.id).collect::<Vec<_>>();
-        let found = changes(old, new);
+        let found = all(old, new);
         assert_eq!((found.n_same, found.n_stayed), (1, 1));
         assert_eq!(
             (ids(&found.went), ids(&found.appeared)),
@@ -178,8 +209,7 @@ mod tests {
     #[test]
     fn a_thing_is_matched_once_and_to_the_nearest() {
         let at = |id, x: f64, size: f64| thing(id, [x, 0.0, 0.0], [size; 3], CHAIR);
-        let found =
-            changes(vec![at(1, 0.0, 1.0), at(2, 10.0, 1.0)], vec![at(3, 13.0, 1.0), at(4, 12.0, 3.0)]);
+        let found = all(vec![at(1, 0.0, 1.0), at(2, 10.0, 1.0)], vec![at(3, 13.0, 1.0), at(4, 12.0, 3.0)]);
         assert_eq!(found.moved.iter().map(|m| (m.from.id, m.to.id)).collect::<Vec<_>>(), [(2, 3)]);
         assert_eq!((found.went[0].id, found.appeared[0].id), (1, 4));
     }
@@ -191,5 +221,32 @@ mod tests {
         assert!((overlap(&of(0.0, 1.0), &of(0.5, 1.0)) - 0.402).abs() < 2e-3);
         assert!((overlap(&of(0.0, 0.0), &of(0.0, 0.0)) - 1.0).abs() < 1e-12, "a flat thing");
         assert_eq!(overlap(&of(0.0, 1.0), &of(3.0, 1.0)), 0.0);
+    }
+
+    /// Both lists end at x = 10, the earlier one at x = 0 as well. By hand: a thing that only one can know is neither new nor
+    /// gone, one across the border that changed a little stays, and one does not move to where it may have been all the time.
+    #[test]
+    fn what_one_list_cannot_know_is_not_compared() {
+        let at = |id, x: f64| thing(id, [x, 0.0, 0.0], [1.0; 3], CHAIR);
+        let old_knows = |of: &Thing| of.box_in_world.min.x >= 0.0 && of.box_in_world.max.x <= 10.0;
+        let new_knows = |of: &Thing| of.box_in_world.max.x <= 10.0;
+        let old = vec![at(1, 10.0), at(2, 20.0), at(3, 5.0)];
+        let new = vec![at(4, 10.1), at(5, -5.0), at(6, 7.0)];
+        let found = changes(old, new, new_knows, old_knows);
+        assert_eq!((found.n_same, found.n_stayed, found.n_not_compared), (0, 1, 2));
+        assert!(found.went.is_empty() && found.appeared.is_empty(), "{found:?}");
+        assert_eq!(found.moved.iter().map(|m| (m.from.id, m.to.id)).collect::<Vec<_>>(), [(3, 6)]);
+    }
+
+    /// A hundred alike things that all moved by one: each is matched, though each has more candidates than are kept.
+    #[test]
+    fn many_alike_things_are_all_matched() {
+        let row = |first: u64, shift: f64| -> Vec<Thing> {
+            let at = |n: u64| thing(first + n, [10.0 * n as f64 + shift, 0.0, 0.0], [1.0; 3], CHAIR);
+            (0..100).map(at).collect()
+        };
+        let found = all(row(0, 0.0), row(1000, 3.0));
+        assert_eq!((found.moved.len(), found.went.len(), found.appeared.len()), (100, 0, 0));
+        assert!(found.moved.iter().all(|moved| moved.to.id == moved.from.id + 1000));
     }
 }

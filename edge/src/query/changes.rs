@@ -1,0 +1,319 @@
+//! What changed between two generations that the robot has had.
+
+use glam::DVec3;
+use serde::Serialize;
+use slag_common::frames::Geographic;
+use slag_common::manifest::Manifest;
+use slag_common::objects::{self, Moved, Thing};
+
+use super::engine::{Engine, QueryError};
+use super::inventory::FRAME;
+use super::objects::public_id;
+use super::request::RequestError;
+use crate::store::history::{self, Record};
+use crate::store::{EdgeCache, Snapshot};
+
+/// Which changes are asked for.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ChangesRequest {
+    /// The earlier generation; the newest before `to` that is remembered if absent.
+    pub from: Option<u64>,
+    /// The later one; that on board if absent.
+    pub to: Option<u64>,
+    /// Only changes within this distance of a point; of a move, one end counts.
+    pub ball: Option<(DVec3, f64)>,
+    /// Kinds of things: each changed thing is given the one that it is most like.
+    pub texts: Vec<String>,
+}
+
+/// Why generations are not compared.
+#[derive(Debug, thiserror::Error)]
+pub enum ChangesError {
+    /// The request is refused, or there is no scene.
+    #[error(transparent)]
+    Query(#[from] QueryError),
+    /// The robot does not remember a generation.
+    #[error("generation {wanted} is not remembered; those that are: {}", list(known))]
+    NoSuchGeneration {
+        /// The generation.
+        wanted: u64,
+        /// Those that can be compared.
+        known: Vec<u64>,
+    },
+    /// The generations' vectors do not compare.
+    #[error(
+        "generations {from} and {to} were encoded with different models, so that their things do not compare"
+    )]
+    Encoders {
+        /// The earlier one.
+        from: u64,
+        /// The later one.
+        to: u64,
+    },
+    /// The scene has no objects.
+    #[error(
+        "generation {0} has no objects on board to compare; encode the scene without --no-objects, publish it, and fetch it again"
+    )]
+    NoObjects(u64),
+}
+
+fn list(generations: &[u64]) -> String {
+    let numbers: Vec<String> = generations.iter().map(u64::to_string).collect();
+    numbers.join(", ")
+}
+
+impl ChangesError {
+    /// Returns the stable name of the error's kind, for programs.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Query(error) => error.kind(),
+            Self::NoSuchGeneration { .. } => "no-such-generation",
+            Self::Encoders { .. } => "encoders-differ",
+            Self::NoObjects(_) => "no-objects",
+        }
+    }
+}
+
+/// The changes from one generation to another.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ChangesReply {
+    /// Name of the scene.
+    pub scene: String,
+    /// Frame of every position.
+    pub frame: &'static str,
+    /// Unit of every position and length: `m`, or `world` if the scene is not metric.
+    pub unit: &'static str,
+    /// The earlier generation; absent if the robot remembers none.
+    pub from: Option<ComparedGeneration>,
+    /// The later one.
+    pub to: ComparedGeneration,
+    /// All generations that can be compared, ascending.
+    pub generations: Vec<u64>,
+    /// Things of exactly the same Gaussians, anywhere.
+    pub n_same: usize,
+    /// Things at the same place whose Gaussians changed, anywhere.
+    pub n_stayed: usize,
+    /// Things whose place only one of the generations knows, anywhere: whether they changed is unknown.
+    pub n_not_compared: usize,
+    /// Things that are new.
+    pub appeared: Vec<ChangedThing>,
+    /// Things that are gone.
+    pub went: Vec<ChangedThing>,
+    /// Things that lie elsewhere.
+    pub moved: Vec<MovedThing>,
+    /// Why nothing was compared.
+    pub none: Option<NotCompared>,
+}
+
+/// A generation that was compared.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct ComparedGeneration {
+    /// Its number.
+    pub generation: u64,
+    /// When it was made, Unix seconds.
+    pub created_unix_secs: u64,
+}
+
+/// Why nothing was compared.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct NotCompared {
+    /// `no-earlier-generation`.
+    pub kind: &'static str,
+    /// The same in a sentence.
+    pub detail: String,
+}
+
+/// A thing as it is or was.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ChangedThing {
+    /// Its id in its generation: `o` and 16 hex digits.
+    pub id: String,
+    /// Mean of its Gaussians inside the box.
+    pub position_in_world: DVec3,
+    /// The same on the earth, if the scene is geo-referenced.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub geographic: Option<Geographic>,
+    /// Smallest corner of its box.
+    pub box_min_in_world: DVec3,
+    /// Largest corner.
+    pub box_max_in_world: DVec3,
+    /// Its Gaussians in the whole scene.
+    pub n_gaussians_in_scene: u32,
+    /// Name of the photo that shows it best.
+    pub photo: String,
+    /// The text that it is most like, if the request has any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub like: Option<Likeness>,
+}
+
+/// The text that a thing is most like.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Likeness {
+    /// The text.
+    pub text: String,
+    /// Cosine of its vector and the mean of the thing's masks' vectors.
+    pub score: f32,
+}
+
+/// A thing that lies elsewhere.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct MovedThing {
+    /// As it was.
+    pub from: ChangedThing,
+    /// As it is.
+    pub to: ChangedThing,
+    /// Between the positions.
+    pub distance: f64,
+}
+
+impl Engine {
+    /// Compares two generations that the robot has had. What only one of them knows is not called changed. Blocks for
+    /// milliseconds; for a second where thousands of things changed.
+    ///
+    /// # Errors
+    /// [`ChangesError`]. That nothing is remembered yet is a reply.
+    pub fn changes(&self, request: &ChangesRequest) -> Result<ChangesReply, ChangesError> {
+        let snapshot = self.snapshot()?;
+        let manifest = &snapshot.manifest;
+        if !request.texts.is_empty() {
+            self.check_encoder(&snapshot)?;
+        }
+        let texts = request.texts.iter().map(|text| Ok((text.clone(), self.encode_text(text)?.to_vec())));
+        let words = Words(texts.collect::<Result<_, QueryError>>()?);
+        let generations = known(self.cache(), manifest);
+        let to =
+            generation(self.cache(), &snapshot, request.to.unwrap_or(manifest.generation), &generations)?;
+        let from = match request.from {
+            Some(from) if from >= to.generation => {
+                let expected = format!("less than {}, the generation to compare with", to.generation);
+                let error = RequestError::new("from", &from.to_string(), expected);
+                return Err(QueryError::from(error).into());
+            }
+            Some(from) => Some(generation(self.cache(), &snapshot, from, &generations)?),
+            None => {
+                let before = generations.iter().rev().find(|of| **of < to.generation);
+                before.map(|of| generation(self.cache(), &snapshot, *of, &generations)).transpose()?
+            }
+        };
+        if let Some(from) = &from
+            && from.encoder_id != to.encoder_id
+        {
+            return Err(ChangesError::Encoders { from: from.generation, to: to.generation });
+        }
+        Ok(reply(from, to, manifest, generations, request, &words))
+    }
+}
+
+/// Returns the generations that can be compared, ascending.
+fn known(cache: &EdgeCache, manifest: &Manifest) -> Vec<u64> {
+    let mut known = history::generations(cache);
+    known.retain(|of| *of < manifest.generation && history::read(cache, &manifest.scene, *of).is_some());
+    known.push(manifest.generation);
+    known
+}
+
+/// Returns what the robot knows of a generation.
+fn generation(
+    cache: &EdgeCache,
+    snapshot: &Snapshot,
+    wanted: u64,
+    known: &[u64],
+) -> Result<Record, ChangesError> {
+    let Snapshot { manifest, current, bad_cells, .. } = snapshot;
+    let remembered = history::read(cache, &manifest.scene, wanted);
+    if wanted != manifest.generation {
+        return remembered.ok_or_else(|| ChangesError::NoSuchGeneration { wanted, known: known.to_vec() });
+    }
+    // The shards of earlier generations that stand in for bad cells say nothing about this one.
+    let is_own = |cell_id: u32| !bad_cells.iter().any(|bad| bad.cell_id == cell_id);
+    let shards = snapshot.shards.iter().map(|shard| &**shard).filter(|shard| is_own(shard.cell.cell_id));
+    let on_board = Record::collect(manifest, current.centre_in_world, shards);
+    // What it left behind in this generation counts as well.
+    match (remembered, on_board) {
+        (Some(remembered), Some(on_board)) => Ok(remembered.with(on_board)),
+        (None, Some(record)) | (Some(record), None) => Ok(record),
+        (None, None) => Err(ChangesError::NoObjects(wanted)),
+    }
+}
+
+fn reply(
+    from: Option<Record>,
+    to: Record,
+    manifest: &Manifest,
+    generations: Vec<u64>,
+    request: &ChangesRequest,
+    words: &Words,
+) -> ChangesReply {
+    let compared = |of: &Record| ComparedGeneration {
+        generation: of.generation,
+        created_unix_secs: of.created_unix_secs,
+    };
+    let mut reply = ChangesReply {
+        scene: manifest.scene.clone(),
+        frame: FRAME,
+        unit: if manifest.metric { "m" } else { "world" },
+        from: from.as_ref().map(compared),
+        to: compared(&to),
+        generations,
+        n_same: 0,
+        n_stayed: 0,
+        n_not_compared: 0,
+        appeared: Vec::new(),
+        went: Vec::new(),
+        moved: Vec::new(),
+        none: None,
+    };
+    let Some(mut from) = from else {
+        let detail = format!("the robot has had no generation with objects before {}", to.generation);
+        reply.none = Some(NotCompared { kind: "no-earlier-generation", detail });
+        return reply;
+    };
+    let mut to = to;
+    let (old, new) = (std::mem::take(&mut from.things), std::mem::take(&mut to.things));
+    let found = objects::changes(old, new, |thing| to.knows(thing), |thing| from.knows(thing));
+    let is_asked = |thing: &Thing| {
+        request.ball.is_none_or(|(centre, radius)| thing.position_in_world.distance(centre) <= radius)
+    };
+    let describe = |thing: &Thing| words.describe(thing, manifest);
+    let some = |things: &[Thing]| things.iter().filter(|of| is_asked(of)).map(describe).collect();
+    (reply.n_same, reply.n_stayed, reply.n_not_compared) =
+        (found.n_same, found.n_stayed, found.n_not_compared);
+    (reply.appeared, reply.went) = (some(&found.appeared), some(&found.went));
+    let moved = found.moved.iter().filter(|moved| is_asked(&moved.from) || is_asked(&moved.to));
+    let describe_move = |moved: &Moved| MovedThing {
+        from: describe(&moved.from),
+        to: describe(&moved.to),
+        distance: moved.distance,
+    };
+    reply.moved = moved.map(describe_move).collect();
+    reply
+}
+
+/// The request's texts and their vectors, of unit length.
+struct Words(Vec<(String, Vec<f32>)>);
+
+impl Words {
+    fn describe(&self, thing: &Thing, manifest: &Manifest) -> ChangedThing {
+        let position_in_world = thing.position_in_world;
+        ChangedThing {
+            id: public_id(thing.id),
+            position_in_world,
+            geographic: manifest.geo_reference.map(|geo| geo.geographic_from_world(position_in_world)),
+            box_min_in_world: thing.box_in_world.min,
+            box_max_in_world: thing.box_in_world.max,
+            n_gaussians_in_scene: thing.n_gaussians,
+            photo: thing.photo.clone(),
+            like: self.like(&thing.vector),
+        }
+    }
+
+    fn like(&self, vector: &[f64]) -> Option<Likeness> {
+        let cosine = |text: &[f32]| -> f32 {
+            let length = vector.iter().map(|v| v * v).sum::<f64>().sqrt().max(f64::MIN_POSITIVE);
+            (vector.iter().zip(text).map(|(a, b)| a * f64::from(*b)).sum::<f64>() / length) as f32
+        };
+        let scored = self.0.iter().map(|(text, of_text)| (text, cosine(of_text)));
+        let best = scored.reduce(|best, other| if other.1 > best.1 { other } else { best });
+        best.map(|(text, score)| Likeness { text: text.clone(), score })
+    }
+}

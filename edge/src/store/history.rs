@@ -1,0 +1,195 @@
+//! The objects of generations that the robot has had: a small record of each, `history/GENERATION`, so that generations can be
+//! compared after their shards are gone.
+//!
+//! A record is a container (`slag_common::container`) of JSON, vectors (`[n][dim]` i8) and their steps (`[n]` f32). It may be
+//! lost at any time: one that is missing or damaged only means that its generation is not compared.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use glam::DVec3;
+use serde::{Deserialize, Serialize};
+use slag_common::Hash32;
+use slag_common::container::{self, AlignedBytes, ContainerError, Layout};
+use slag_common::frames::Aabb;
+use slag_common::manifest::Manifest;
+use slag_common::objects::{Thing, quantise_vectors};
+
+use super::cache::EdgeCache;
+use super::shard::OpenShard;
+
+/// Generations that are remembered, the newest.
+pub const MAX_GENERATIONS: usize = 8;
+/// Things of a generation that are remembered: those of the cells nearest to the fetch's centre.
+const MAX_THINGS: usize = 4096;
+/// Cells without a shard that are listed; a generation with more is not remembered.
+const MAX_MISSING: usize = 16_384;
+/// A longer record is not read: 4096 things with 1,024 components and long names take less.
+const MAX_BYTES: u64 = 8 << 20;
+const MAGIC: [u8; 8] = *b"SLAGHIST";
+const VERSION: u32 = 1;
+/// Section ids.
+const ABOUT: u32 = 1;
+const VECTORS: u32 = 2;
+const STEPS: u32 = 3;
+
+/// The objects of a generation, and the cells whose objects are not known.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Record {
+    /// Name of the scene.
+    pub scene: String,
+    /// The generation.
+    pub generation: u64,
+    /// When it was made, Unix seconds.
+    pub created_unix_secs: u64,
+    /// The space of the vectors.
+    pub encoder_id: Hash32,
+    /// Cells of the generation whose objects are not known, by id. Where no cell is, nothing is.
+    missing: Vec<Missing>,
+    /// The objects, by id.
+    pub things: Vec<Thing>,
+    /// Components of a vector.
+    dim: u32,
+}
+
+/// A cell whose objects are not known.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+struct Missing {
+    cell_id: u32,
+    bounds: Aabb,
+}
+
+impl Record {
+    /// Collects the objects of shards of one generation, those nearest to `centre` first if they are too many. `None`: there
+    /// are none, or there is too much to remember.
+    pub fn collect<'a>(
+        manifest: &Manifest,
+        centre: DVec3,
+        shards: impl IntoIterator<Item = &'a OpenShard>,
+    ) -> Option<Self> {
+        let distance = |of: &Aabb| of.min.max(centre.min(of.max)).distance_squared(centre);
+        let with_objects = |shard: &&OpenShard| shard.objects().is_some();
+        let mut shards: Vec<&OpenShard> = shards.into_iter().filter(with_objects).collect();
+        shards.sort_by(|a, b| {
+            let by_distance = distance(&a.cell.bounds).total_cmp(&distance(&b.cell.bounds));
+            by_distance.then(a.cell.cell_id.cmp(&b.cell.cell_id))
+        });
+        let (mut things, mut known) = (BTreeMap::new(), Vec::new());
+        for shard in shards {
+            let Some(objects) = shard.objects() else { continue };
+            if things.len() + objects.records.len() > MAX_THINGS {
+                break;
+            }
+            Thing::add_all(&mut things, &shard.view(), &objects);
+            known.push(shard.cell.cell_id);
+        }
+        known.sort_unstable();
+        let missing = manifest.cells.iter().filter(|cell| known.binary_search(&cell.cell_id).is_err());
+        let missing = missing.map(|cell| Missing { cell_id: cell.cell_id, bounds: cell.bounds });
+        let record = Self {
+            scene: manifest.scene.clone(),
+            generation: manifest.generation,
+            created_unix_secs: manifest.created_unix_secs,
+            encoder_id: manifest.encoder.id,
+            missing: missing.take(MAX_MISSING + 1).collect(),
+            things: things.into_values().collect(),
+            dim: manifest.encoder.dim,
+        };
+        (!known.is_empty() && record.missing.len() <= MAX_MISSING).then_some(record)
+    }
+
+    /// Adds a record of the same generation, made elsewhere. If both are too much together, the newer one is kept.
+    #[must_use]
+    pub fn with(self, newer: Self) -> Self {
+        let mut things: BTreeMap<u64, Thing> = self.things.into_iter().map(|of| (of.id, of)).collect();
+        things.extend(newer.things.iter().cloned().map(|of| (of.id, of)));
+        if things.len() > MAX_THINGS {
+            return newer;
+        }
+        let is_in_both =
+            |of: &Missing| newer.missing.binary_search_by_key(&of.cell_id, |other| other.cell_id).is_ok();
+        let missing = self.missing.into_iter().filter(is_in_both).collect();
+        Self { missing, things: things.into_values().collect(), ..newer }
+    }
+
+    /// Returns whether a thing's box touches no cell whose objects are not known: were it in this generation, it would be
+    /// listed.
+    pub fn knows(&self, thing: &Thing) -> bool {
+        let touches = |of: &Aabb| {
+            let Aabb { min, max } = thing.box_in_world;
+            min.cmple(of.max).all() && of.min.cmple(max).all()
+        };
+        !self.missing.iter().any(|cell| touches(&cell.bounds))
+    }
+
+    /// Returns the record as a file.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let about = serde_json::to_vec(self).expect("numbers and text become JSON");
+        let (mut vectors, mut steps) = (Vec::new(), Vec::new());
+        for thing in &self.things {
+            let vector: Vec<f32> = thing.vector.iter().map(|v| *v as f32).collect();
+            let (components, step) = quantise_vectors(&vector, self.dim as usize, 1);
+            vectors.extend(components);
+            steps.extend(step);
+        }
+        let sections: [(u32, &[u8]); 3] =
+            [(ABOUT, &about), (VECTORS, container::bytes_of(&vectors)), (STEPS, container::bytes_of(&steps))];
+        let mut bytes = Vec::new();
+        container::write(&mut bytes, MAGIC, VERSION, &sections).expect("writes to memory");
+        bytes
+    }
+
+    /// Reads a record.
+    ///
+    /// # Errors
+    /// [`ContainerError`] for anything that [`Record::to_bytes`] does not write.
+    pub fn parse(bytes: &[u8]) -> Result<Self, ContainerError> {
+        let bytes = AlignedBytes::copy_of(bytes);
+        let layout = Layout::check(&bytes, MAGIC, VERSION)?;
+        let about = layout.find(ABOUT).ok_or(ContainerError::Missing { id: ABOUT, name: "about" })?;
+        let damaged = |what: String| ContainerError::Damaged { offset_bytes: about.start as u64, what };
+        let mut record: Self =
+            serde_json::from_slice(&bytes[about.clone()]).map_err(|e| damaged(e.to_string()))?;
+        let (n, dim) = (record.things.len(), record.dim as usize);
+        let len = n.checked_mul(dim).ok_or_else(|| damaged(format!("{n} things of {dim} components")))?;
+        let vectors = layout.column::<i8>(VECTORS, "vectors", len)?;
+        let steps = layout.column::<f32>(STEPS, "steps", n)?;
+        if !record.things.is_sorted_by(|a, b| a.id < b.id) {
+            return Err(damaged("the ids do not ascend".into()));
+        }
+        let vectors: &[i8] = bytemuck::cast_slice(&bytes[vectors]);
+        let steps: &[f32] = bytemuck::cast_slice(&bytes[steps]);
+        for ((thing, vector), step) in record.things.iter_mut().zip(vectors.chunks(dim.max(1))).zip(steps) {
+            thing.vector = vector.iter().map(|v| f64::from(*v) * f64::from(*step)).collect();
+        }
+        Ok(record)
+    }
+}
+
+/// Returns the folder of the records.
+pub fn dir(cache: &EdgeCache) -> PathBuf {
+    cache.dir().join("history")
+}
+
+/// Returns the path of a record.
+pub fn path(cache: &EdgeCache, generation: u64) -> PathBuf {
+    dir(cache).join(generation.to_string())
+}
+
+/// Returns the generations that have a record, ascending.
+pub fn generations(cache: &EdgeCache) -> Vec<u64> {
+    let names = cache.files().list(&dir(cache)).unwrap_or_default();
+    let mut generations: Vec<u64> = names.iter().filter_map(|name| name.parse().ok()).collect();
+    generations.sort_unstable();
+    generations
+}
+
+/// Returns the record of a generation of a scene; `None` if it is missing, damaged, or of another scene.
+pub fn read(cache: &EdgeCache, scene: &str, generation: u64) -> Option<Record> {
+    let bytes = cache.files().read(&path(cache, generation), MAX_BYTES).ok()?;
+    let record = Record::parse(&bytes).inspect_err(|e| {
+        tracing::warn!("history of generation {generation}: {}", crate::error_line(e));
+    });
+    record.ok().filter(|record| record.scene == scene && record.generation == generation)
+}

@@ -1,0 +1,131 @@
+//! What changed between the generations that a robot has had, whatever happens to it meanwhile.
+
+use std::sync::Arc;
+
+use slag_edge::query::{ChangesError, ChangesReply, ChangesRequest, Engine};
+use slag_edge::store::history;
+
+use super::faults::text_service;
+use super::scene::{Published, TestThing};
+use super::server::Server;
+use super::sim::SimFiles;
+use super::{Robot, at};
+
+fn thing(id: u64, x: f64, axis: usize) -> TestThing {
+    TestThing { cell_id: (x / 10.0) as u32, id, x, axis }
+}
+
+/// Seven cells, of which the robot at x = 5 holds three.
+fn published(generation: u64, things: &[TestThing]) -> Published {
+    Published::new(generation, &[0; 7], 20).with_things(things)
+}
+
+fn before() -> Published {
+    published(1, &[thing(1, 2.0, 0), thing(2, 12.0, 1), thing(3, 25.0, 2), thing(9, 55.0, 0)])
+}
+
+/// By hand: 1 stays, 2 goes, 3 moves to x = 5, 5 appears. 9, beyond the robot's cells, goes as well, and 10 appears there.
+fn after() -> Published {
+    published(2, &[thing(1, 2.0, 0), thing(4, 5.0, 2), thing(5, 18.0, 3), thing(10, 45.0, 3)])
+}
+
+fn changes(robot: &Robot, from: Option<u64>) -> Result<ChangesReply, ChangesError> {
+    let engine = Engine::new(robot.cache.clone(), text_service());
+    engine.reload().expect("a whole generation");
+    engine.changes(&ChangesRequest { from, ..ChangesRequest::default() })
+}
+
+/// Returns the ids that appeared, that went, and that things had and have which moved.
+fn ids(reply: &ChangesReply) -> (Vec<u64>, Vec<u64>, Vec<(u64, u64)>) {
+    let id = |text: &str| u64::from_str_radix(&text[1..], 16).expect("hex digits");
+    let of = |things: &[slag_edge::query::ChangedThing]| things.iter().map(|thing| id(&thing.id)).collect();
+    let moved = reply.moved.iter().map(|moved| (id(&moved.from.id), id(&moved.to.id))).collect();
+    (of(&reply.appeared), of(&reply.went), moved)
+}
+
+fn assert_changed(robot: &Robot, context: &str) {
+    let reply = changes(robot, None).unwrap_or_else(|e| panic!("{context}: {e}"));
+    assert_eq!(ids(&reply), (vec![5], vec![2], vec![(3, 4)]), "{context}: {reply:?}");
+    assert_eq!((reply.n_same, reply.moved[0].distance), (1, 20.0), "{context}");
+}
+
+#[test]
+fn changes_are_told_where_both_generations_are_known() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let server = Server::start(before());
+    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    robot.fetch().expect("works");
+    let reply = changes(&robot, None).expect("a reply");
+    assert_eq!(reply.none.map(|none| none.kind), Some("no-earlier-generation"));
+    server.publish(after());
+    robot.fetch().expect("works");
+    assert_changed(&robot, "after the fetch");
+    // It leaves; what it knew of both generations is still compared, what it knows of one alone is not.
+    robot.request.at = Some(at(55.0));
+    robot.request.radius = 14.0;
+    robot.request.max_bytes = Some(after().bytes(4..7));
+    robot.fetch().expect("works");
+    let on_board: Vec<u32> = robot.snapshot().shards.iter().map(|shard| shard.cell.cell_id).collect();
+    assert_eq!(on_board, [4, 5, 6], "the cells left behind are gone");
+    assert_changed(&robot, "from elsewhere");
+    assert_eq!(changes(&robot, Some(1)).expect("a reply").n_not_compared, 1, "10");
+    // Generations that it never had are refused by name.
+    match changes(&robot, Some(0)).expect_err("refused") {
+        ChangesError::NoSuchGeneration { wanted, known } => assert_eq!((wanted, known), (0, vec![1, 2])),
+        other => panic!("{other}"),
+    }
+    assert_eq!(changes(&robot, Some(2)).expect_err("refused").kind(), "bad-parameter");
+    // A damaged record is as none.
+    let path = history::path(&robot.cache, 1);
+    let mut bytes = fs_err::read(&path).expect("there");
+    bytes[200] ^= 1;
+    fs_err::write(&path, bytes).expect("writes");
+    let reply = changes(&robot, None).expect("a reply");
+    assert_eq!(reply.none.map(|none| none.kind), Some("no-earlier-generation"));
+}
+
+/// The records are written before anything goes: at whatever step the power fails, they are there after the next fetch.
+#[test]
+fn a_power_cut_loses_no_history() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let server = Server::start(before());
+    let files = Arc::new(SimFiles::default());
+    Robot::on_sim(dir.path(), Arc::clone(&files), &server.url()).fetch().expect("works");
+    let start = files.fork(None, 0);
+    server.publish(after());
+    let fetch = |files: &Arc<SimFiles>| {
+        let robot = Robot::on_sim(dir.path(), Arc::clone(files), &server.url());
+        (robot.fetch(), robot)
+    };
+    let whole = Arc::new(start.fork(None, 0));
+    fetch(&whole).0.expect("works");
+    for step in 1..=whole.n_steps() {
+        for seed in step * 100..step * 100 + 3 {
+            let cut = Arc::new(start.fork(Some(step), seed));
+            fetch(&cut).0.expect_err("cut");
+            let (fetched, robot) = fetch(&Arc::new(cut.after_power_cut(seed)));
+            fetched.unwrap_or_else(|e| panic!("step {step} seed {seed}: {e}"));
+            assert_changed(&robot, &format!("step {step} seed {seed}"));
+        }
+    }
+}
+
+#[test]
+fn history_is_bounded_and_of_one_scene() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let server = Server::start(before());
+    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    robot.fetch().expect("works");
+    for generation in 2..=12 {
+        server.publish(published(generation, &[thing(1, 2.0, 0), thing(generation, 12.0, 1)]));
+        robot.fetch().expect("works");
+    }
+    assert_eq!(history::generations(&robot.cache), (4..=11).collect::<Vec<u64>>());
+    let reply = changes(&robot, Some(7)).expect("a reply");
+    assert_eq!((reply.n_same, reply.n_stayed), (1, 1), "{reply:?}");
+    // Another scene: its generations are none of these.
+    server.publish(published(13, &[thing(1, 2.0, 0)]).edited(|manifest| manifest.scene = "house".into()));
+    robot.request.scene = Some("house".into());
+    robot.fetch().expect("works");
+    assert_eq!(changes(&robot, None).expect("a reply").generations, [13]);
+}
