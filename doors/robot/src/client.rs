@@ -8,6 +8,7 @@ use serde_json::{Value, json};
 
 use crate::changes::Changes;
 use crate::error::RobotError;
+use crate::floor::Floor;
 use crate::goal::Goals;
 use crate::place::Place;
 use crate::reply::{PointAnswer, Reply};
@@ -98,6 +99,16 @@ impl Robot {
     /// [`RobotError`].
     pub fn changes(&self, parameters: &[(&str, String)]) -> Result<Changes, RobotError> {
         let path = "/v1/changes";
+        let pairs = parameters.iter().map(|(name, value)| (*name, value.as_str()));
+        self.read(path, self.agent.get(self.address(path)).query_pairs(pairs).call())
+    }
+
+    /// Returns the ground around the robot, by the parameters of `GET /v1/floor`.
+    ///
+    /// # Errors
+    /// [`RobotError`].
+    pub fn floor(&self, parameters: &[(&str, String)]) -> Result<Floor, RobotError> {
+        let path = "/v1/floor";
         let pairs = parameters.iter().map(|(name, value)| (*name, value.as_str()));
         self.read(path, self.agent.get(self.address(path)).query_pairs(pairs).call())
     }

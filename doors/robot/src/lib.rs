@@ -3,6 +3,7 @@
 mod changes;
 mod client;
 mod error;
+mod floor;
 mod goal;
 mod place;
 mod reply;
@@ -10,6 +11,7 @@ mod reply;
 pub use changes::{Changed, Changes, Compared, Like, Miss, Moved};
 pub use client::{Robot, read_token};
 pub use error::RobotError;
+pub use floor::{Floor, Place as FloorPlace};
 pub use goal::{Goal, GoalMiss, GoalThing, Goals};
 pub use place::{Box3, Cell, Place};
 pub use reply::{Answer, Geographic, Nothing, OrientedBox, PointAnswer, Reply, Results, Witness};

@@ -17,6 +17,10 @@ ARGUMENTS = {
     "position_period": "1.0",
     "limit": "10",
     "points": "3500",
+    "robot_radius": "0.3",
+    "sensor_height": "0.4",
+    "reach": "0.8",
+    "send_goals": "false",
 }
 
 

@@ -1,7 +1,7 @@
 //! Answers as messages.
 
 use ros2_client::builtin_interfaces::{Duration, Time};
-use slag_robot::{Answer, PointAnswer};
+use slag_robot::{Answer, Goal, PointAnswer};
 
 use crate::geometry::{Point, Pose};
 use crate::messages::{
@@ -49,6 +49,12 @@ pub fn detections(header: &Header, text: &str, answers: &[Answer]) -> Detection3
         id: answer.id.clone(),
     };
     Detection3DArray { header: header.clone(), detections: answers.iter().map(detection).collect() }
+}
+
+/// Returns a place to stand.
+pub fn goal_pose(header: &Header, goal: &Goal) -> PoseStamped {
+    let pose = Pose { position: goal.position_in_world.into(), orientation: goal.orientation_xyzw.into() };
+    PoseStamped { header: header.clone(), pose }
 }
 
 /// Returns where the best answer is.

@@ -3,7 +3,9 @@
 
 mod answers;
 mod geometry;
+mod ground;
 mod messages;
 pub mod node;
 mod position;
+pub mod stand;
 mod transforms;

@@ -10,6 +10,7 @@ use anyhow::Result;
 use clap::{Parser, ValueEnum};
 use slag_robot::{Robot, read_token};
 use slag_ros::node::{self, Middleware, PositionSource, Settings};
+use slag_ros::stand::Body;
 use slag_service::stop::stop_signal;
 use tracing_subscriber::EnvFilter;
 
@@ -56,6 +57,18 @@ struct Args {
     /// Most things in an answer.
     #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..=1000))]
     limit: u32,
+    /// Radius of the robot seen from above, metres, for places to stand.
+    #[arg(long, value_name = "M", default_value_t = 0.3)]
+    robot_radius: f64,
+    /// Height of its sensor above the ground, metres.
+    #[arg(long, value_name = "M", default_value_t = 0.4)]
+    sensor_height: f64,
+    /// How close its middle must come to a thing's surface, metres.
+    #[arg(long, value_name = "M", default_value_t = 0.8)]
+    reach: f64,
+    /// true: send places to stand to /goal_pose as well, where Nav2 takes them and drives.
+    #[arg(long, value_name = "true|false", default_value_t = false, action = clap::ArgAction::Set)]
+    send_goals: bool,
     /// Most points in the clouds of an answer.
     #[arg(long, default_value_t = 3500, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     points: u32,
@@ -106,6 +119,12 @@ impl Args {
             position_period: Duration::try_from_secs_f64(self.position_period)?,
             limit: self.limit,
             n_points: self.points,
+            body: Body {
+                radius_m: self.robot_radius,
+                sensor_height_m: self.sensor_height,
+                reach_m: self.reach,
+            },
+            sends_goals: self.send_goals,
         })
     }
 }

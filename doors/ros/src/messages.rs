@@ -65,6 +65,16 @@ messages! {
     }
     /// `visualization_msgs/MarkerArray`.
     MarkerArray { markers: Vec<Marker> }
+    /// `nav_msgs/MapMetaData`.
+    MapMetaData { map_load_time: Time, resolution: f32, width: u32, height: u32, origin: Pose }
+    /// `nav_msgs/OccupancyGrid`: 0 free, 100 occupied, -1 unknown.
+    OccupancyGrid { header: Header, info: MapMetaData, data: Vec<i8> }
+    /// Request of `slag_msgs/srv/Stand`.
+    StandRequest { text: String }
+    /// Reply of `slag_msgs/srv/Stand`.
+    StandReply {
+        success: bool, message: String, pose: PoseStamped, clearance_m: f64, visible_share: f64, way_m: f64,
+    }
     /// Request of `slag_msgs/srv/Find`.
     FindRequest { text: String, limit: u32 }
     /// Reply of `slag_msgs/srv/Find`.

@@ -17,10 +17,11 @@ use slag_robot::{Answer, PointAnswer, Robot};
 
 use crate::answers;
 use crate::messages::{
-    Detection3DArray, FindReply, FindRequest, MarkerArray, NavSatFix, Odometry, PointCloud2, PoseStamped,
-    Text, Transforms as TransformMessages,
+    Detection3DArray, FindReply, FindRequest, MarkerArray, NavSatFix, OccupancyGrid, Odometry, PointCloud2,
+    PoseStamped, StandReply, StandRequest, Text, Transforms as TransformMessages,
 };
 use crate::position;
+use crate::stand::{self, Body};
 use crate::transforms::Transforms;
 
 /// Messages kept for those who join later: the clouds of an answer.
@@ -75,6 +76,10 @@ pub struct Settings {
     pub limit: u32,
     /// Most points in the clouds of an answer.
     pub n_points: u32,
+    /// The robot's size and reach, for places to stand.
+    pub body: Body,
+    /// Whether places to stand are sent to `/goal_pose` as well, where Nav2 takes them.
+    pub sends_goals: bool,
 }
 
 /// What all parts of the node share.
@@ -88,6 +93,10 @@ struct Shared {
     markers: Publisher<MarkerArray>,
     points: Publisher<PointCloud2>,
     best_pose: Publisher<PoseStamped>,
+    goal: Publisher<PoseStamped>,
+    ground: Publisher<OccupancyGrid>,
+    /// `/goal_pose`, if goals are sent there.
+    navigation: Option<Publisher<PoseStamped>>,
 }
 
 /// The answers to a text.
@@ -116,11 +125,26 @@ pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()
     let mut node = node.map_err(|e| anyhow!("cannot make the node: {e:?}"))?;
     let own = |topic: &str| Name::new(&format!("/{}", settings.name), topic);
     let kept = reliable(KEPT).durability(Durability::TransientLocal);
+    // As map_server offers its map.
+    let latest = reliable(1).durability(Durability::TransientLocal);
+    let pose = ("geometry_msgs", "PoseStamped");
+    let navigation = settings.sends_goals.then(|| {
+        publisher(
+            &mut node,
+            Name::new("/", "goal_pose")?,
+            pose,
+            &reliable(1).durability(Durability::Volatile),
+        )
+    });
+    let navigation = navigation.transpose()?;
     let shared = Arc::new(Shared {
         detections: publisher(&mut node, own("detections")?, ("vision_msgs", "Detection3DArray"), &kept)?,
         markers: publisher(&mut node, own("markers")?, ("visualization_msgs", "MarkerArray"), &kept)?,
         points: publisher(&mut node, own("points")?, ("sensor_msgs", "PointCloud2"), &kept)?,
         best_pose: publisher(&mut node, own("best_pose")?, ("geometry_msgs", "PoseStamped"), &kept)?,
+        goal: publisher(&mut node, own("goal")?, ("geometry_msgs", "PoseStamped"), &kept)?,
+        ground: publisher(&mut node, own("ground")?, ("nav_msgs", "OccupancyGrid"), &latest)?,
+        navigation,
         frames: Mutex::default(),
         place: Mutex::default(),
         robot,
@@ -133,13 +157,24 @@ pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()
     let asked = Arc::clone(&shared);
     tokio::spawn(listen(texts, async move |text: Text| Arc::clone(&asked).publish_answers(text.data).await));
 
+    let going = subscription::<Text>(&mut node, own("go_to")?, ("std_msgs", "String"), &volatile)?;
+    let asked = Arc::clone(&shared);
+    tokio::spawn(listen(going, async move |text: Text| {
+        if let Err(reason) = Arc::clone(&asked).go(text.data.clone()).await {
+            tracing::warn!("{:?}: {reason}", text.data);
+        }
+    }));
+
     let mapping = match settings.middleware {
         Middleware::FastDds => ServiceMapping::Enhanced,
         Middleware::CycloneDds => ServiceMapping::Cyclone,
     };
     let kind = ServiceTypeName::new("slag_msgs", "Find");
-    let server = node.create_server(mapping, &own("find")?, &kind, volatile.clone(), volatile);
+    let server = node.create_server(mapping, &own("find")?, &kind, volatile.clone(), volatile.clone());
     tokio::spawn(serve(server.map_err(|e| anyhow!("cannot offer find: {e}"))?, Arc::clone(&shared)));
+    let kind = ServiceTypeName::new("slag_msgs", "Stand");
+    let server = node.create_server(mapping, &own("stand")?, &kind, volatile.clone(), volatile);
+    tokio::spawn(serve_stand(server.map_err(|e| anyhow!("cannot offer stand: {e}"))?, Arc::clone(&shared)));
 
     if matches!(settings.position, PositionSource::Transforms | PositionSource::Odometry) {
         for (topic, qos) in [("tf", &reliable(100)), ("tf_static", &latched)] {
@@ -240,7 +275,57 @@ async fn serve(server: Server<FindRequest, FindReply>, shared: Arc<Shared>) {
     }
 }
 
+/// Answers the calls for places to stand. A place that was asked for is not a goal yet: nothing is sent to navigation.
+async fn serve_stand(server: Server<StandRequest, StandReply>, shared: Arc<Shared>) {
+    loop {
+        let (id, request) = match server.async_receive_request().await {
+            Ok(received) => received,
+            Err(error) => {
+                tracing::warn!("a call cannot be read: {error}");
+                tokio::time::sleep(READ_PAUSE).await;
+                continue;
+            }
+        };
+        let reply = Arc::clone(&shared).stand(request.text.clone()).await;
+        if let Err(error) = server.async_send_response(id, reply).await {
+            tracing::warn!("the reply to {:?} cannot be sent: {error:?}", request.text);
+        }
+    }
+}
+
 impl Shared {
+    /// Asks the robot for a place to stand, on a thread that may wait.
+    async fn stand(self: Arc<Self>, text: String) -> StandReply {
+        let place = self.place.lock().expect("no holder panics").0;
+        let frame = self.settings.scene_frame.clone();
+        let asked =
+            tokio::task::spawn_blocking(move || self.settings.body.stand(&self.robot, &text, place)).await;
+        stand::reply(&frame, asked.unwrap_or_else(|error| Err(format!("slag-ros failed: {error}"))))
+    }
+
+    /// Publishes a place to stand near a thing and the ground that leads there, or says why there is none.
+    async fn go(self: Arc<Self>, text: String) -> Result<(), String> {
+        let shared = Arc::clone(&self);
+        let ground = tokio::task::spawn_blocking(move || {
+            let place = shared.place.lock().expect("no holder panics").0;
+            let Settings { body, scene_frame, .. } = &shared.settings;
+            body.ground(&shared.robot, scene_frame, place)
+        });
+        let ground = ground.await.map_err(|error| format!("slag-ros failed: {error}"))??;
+        if let Some(ground) = ground {
+            publish(&self.ground, ground).await;
+        }
+        let reply = Arc::clone(&self).stand(text).await;
+        if !reply.success {
+            return Err(reply.message);
+        }
+        publish(&self.goal, reply.pose.clone()).await;
+        if let Some(navigation) = &self.navigation {
+            publish(navigation, reply.pose).await;
+        }
+        Ok(())
+    }
+
     /// Asks the robot on a thread that may wait.
     async fn ask(self: Arc<Self>, request: FindRequest, with_points: bool) -> Result<Found, String> {
         let asked = tokio::task::spawn_blocking(move || self.ask_now(&request, with_points)).await;

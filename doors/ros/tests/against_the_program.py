@@ -7,6 +7,7 @@ WORD: something that the robot's scene has. The robot follows, so that it takes 
 
 import json
 import os
+import re
 import struct
 import subprocess
 import sys
@@ -15,8 +16,8 @@ import urllib.request
 
 from ros_messages import (
     Detection3DArray, FindRequest, FindResponse, Header, MarkerArray, NavSatFix, NavSatStatus, Odometry, Point,
-    PointCloud2, Pose, PoseStamped, PoseWithCovariance, Quaternion, String, TFMessage, Time, Transform,
-    TransformStamped, Twist, TwistWithCovariance, Vector3,
+    OccupancyGrid, PointCloud2, Pose, PoseStamped, PoseWithCovariance, Quaternion, StandRequest, StandResponse, String,
+    TFMessage, Time, Transform, TransformStamped, Twist, TwistWithCovariance, Vector3,
 )
 
 LOOPBACK = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
@@ -145,6 +146,73 @@ def check_service(ros, word):
         assert len(reply.detections.detections) == 1 if limit == 1 else success == bool(reply.detections.detections)
 
 
+BODY = {"radius_m": 0.2, "sensor_height_m": 1.2, "reach_m": 1.5}
+
+
+def check_places(ros, robot):
+    """The node was told BODY, and `check_transforms` told it where it is."""
+    robot_parameters = "&".join(f"{name}={value}" for name, value in BODY.items() if name != "reach_m")
+    near = "near=2.5,2.25,0"
+    words = ["red", "blue", "green", "yellow", "white", "brown", "grey", "black"]
+    asked = {word: get(f"{robot}/v1/goal?text={word}&{near}&{robot_parameters}&reach_m={BODY['reach_m']}") for word in words}
+    word, truth = next((word, reply) for word, reply in asked.items() if reply["goals"])
+    best = truth["goals"][0]
+    goals = ros.reader("rt/slag/goal", PoseStamped)
+    sent = ros.reader("rt/goal_pose", PoseStamped)
+    maps = ros.reader("rt/slag/ground", OccupancyGrid, LATCHED)
+    going = ros.writer("rt/slag/go_to", String)
+    for reader in (goals, sent, maps):
+        until("writer", lambda reader=reader: reader.get_matched_publications())
+    going.write(String(word))
+    [goal] = until("a goal", goals.take)
+    assert goal.header.frame_id == "map", goal
+    for pose in (goal.pose, until("a goal for Nav2", sent.take)[0].pose):
+        assert close(xyz(pose.position), best["position_in_world"]), (pose, best)
+        turned = pose.orientation
+        assert close([turned.x, turned.y, turned.z, turned.w], best["orientation_xyzw"]), (pose, best)
+
+    # The map against the robot's own: free is reached or within the radius of it, and never an obstacle.
+    [shown] = until("a map", maps.take)
+    info, n_free = shown.info, 0
+    floor = get(f"{robot}/v1/floor?{near}&{robot_parameters}")
+    cells = "".join(letter * int(count) for letter, count in re.findall(r"([a-z])(\d+)", floor["runs"]))
+    width, cell = floor["size"][0], floor["cell_m"]
+    assert len(shown.data) == info.width * info.height <= 60_000 and set(shown.data) <= {-1, 0, 100}
+
+    def cells_of(x, y):
+        """The robot's cells in a cell of the map, by their numbers along x and y."""
+        corner = [info.origin.position.x + x * info.resolution, info.origin.position.y + y * info.resolution]
+        first = [round((corner[axis] - floor["origin_in_world"][axis]) / cell) for axis in (0, 1)]
+        n = round(info.resolution / cell)
+        return [(first[0] + i, first[1] + j) for i in range(n) for j in range(n)]
+
+    for at, value in enumerate(shown.data):
+        own = [cells[j * width + i] for i, j in cells_of(at % info.width, at // info.width)
+               if i < width and j < floor["size"][1]]
+        assert (value == 100) == ("o" in own), (at, value, own)
+        assert value != 0 or set(own) <= {"r", "g"}, (at, own)
+        n_free += value == 0
+    assert n_free > 100, n_free
+    x, y = [int((best["position_in_world"][axis] - [info.origin.position.x, info.origin.position.y][axis]) / info.resolution)
+            for axis in (0, 1)]
+    assert shown.data[y * info.width + x] != 100
+
+    replies = ros.reader("rr/slag/standReply", StandResponse)
+    calls = ros.writer("rq/slag/standRequest", StandRequest)
+    until("a server", replies.get_matched_publications)
+    for number, text in enumerate([word, ""], 3):
+        calls.write(StandRequest(5, number, text))
+        [reply] = until(f"a reply to {text!r}", replies.take)
+        assert (reply.client, reply.number) == (5, number) and reply.success == bool(text), reply
+        assert bool(reply.message) != reply.success, reply
+    calls.write(StandRequest(5, 9, word))
+    [reply] = until("a reply", replies.take)
+    assert close(xyz(reply.pose.pose.position), best["position_in_world"]), reply
+    assert close([reply.clearance_m, reply.visible_share, reply.way_m],
+                 [best["clearance_m"], best["visible_share"], best["path_m"]]), (reply, best)
+    return n_free
+
+
 def stamped(parent, child, translation, rotation):
     turned = Transform(Vector3(*translation), Quaternion(*rotation))
     return TransformStamped(header(parent), child, turned)
@@ -215,16 +283,18 @@ class Node:
 
 def main(program, robot, word, domain):
     domain = int(domain)
-    with Node(program, robot, domain):
+    body = ["--robot-radius", str(BODY["radius_m"]), "--sensor-height", str(BODY["sensor_height_m"])]
+    with Node(program, robot, domain, *body, "--reach", str(BODY["reach_m"]), "--send-goals", "true"):
         ros = Ros(domain)
         n_things, n_points = check_answers(ros, robot, word)
         check_service(ros, word)
         check_transforms(ros, robot)
+        n_free = check_places(ros, robot)
     with Node(program, robot, domain + 1, "--position", "odom"):
         check_odometry(Ros(domain + 1), robot)
     with Node(program, robot, domain + 2, "--position", "fix"):
         check_fix(Ros(domain + 2), robot)
-    print(f"{n_things} things, {n_points} points, service, tf, odometry, fix")
+    print(f"{n_things} things, {n_points} points, service, tf, odometry, fix, {n_free} free cells")
 
 
 if __name__ == "__main__":

@@ -11,5 +11,5 @@ fn cyclone_dds_asks_a_robot() {
     let domain = (50 + std::process::id() % 40).to_string();
     let args = [env!("CARGO_BIN_EXE_slag-ros"), &robot.url, "red", &domain];
     let printed = judge(&python, "doors/ros/tests/against_the_program.py", &args);
-    assert!(printed.contains(" points, service, tf, odometry, fix"), "{printed}");
+    assert!(printed.contains(" points, service, tf, odometry, fix, "), "{printed}");
 }

@@ -232,6 +232,22 @@ class MarkerArray(IdlStruct, typename="visualization_msgs::msg::dds_::MarkerArra
     markers: sequence[Marker]
 
 
+@dataclass
+class MapMetaData(IdlStruct, typename="nav_msgs::msg::dds_::MapMetaData_"):
+    map_load_time: Time
+    resolution: float32
+    width: uint32
+    height: uint32
+    origin: Pose
+
+
+@dataclass
+class OccupancyGrid(IdlStruct, typename="nav_msgs::msg::dds_::OccupancyGrid_"):
+    header: Header
+    info: MapMetaData
+    data: sequence[int8]
+
+
 # rmw_cyclonedds_cpp puts the caller and the number of the call before the members.
 @dataclass
 class FindRequest(IdlStruct, typename="slag_msgs::srv::dds_::Find_Request_"):
@@ -248,3 +264,22 @@ class FindResponse(IdlStruct, typename="slag_msgs::srv::dds_::Find_Response_"):
     success: bool
     message: str
     detections: Detection3DArray
+
+
+@dataclass
+class StandRequest(IdlStruct, typename="slag_msgs::srv::dds_::Stand_Request_"):
+    client: uint64
+    number: int64
+    text: str
+
+
+@dataclass
+class StandResponse(IdlStruct, typename="slag_msgs::srv::dds_::Stand_Response_"):
+    client: uint64
+    number: int64
+    success: bool
+    message: str
+    pose: PoseStamped
+    clearance_m: float64
+    visible_share: float64
+    way_m: float64
