@@ -18,6 +18,7 @@ pub mod npy;
 pub mod npz;
 pub mod objects;
 pub mod occupancy;
+pub mod photo_poses;
 pub mod poses;
 mod quantise;
 pub mod retry;

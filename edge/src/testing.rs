@@ -120,7 +120,7 @@ impl BuiltShard {
         let mut bytes = Vec::new();
         let occupancy = places.map(BuiltOccupancy::view);
         let additions =
-            Additions { objects: Some(&objects), occupancy: occupancy.as_ref(), appearance: None };
+            Additions { objects: Some(&objects), occupancy: occupancy.as_ref(), ..Additions::default() };
         shard.write_with(&mut bytes, additions).expect("writes to memory");
         let bytes = AlignedBytes::copy_of(&bytes);
         let layout = ShardLayout::check(&bytes).expect("a valid shard");
@@ -240,13 +240,15 @@ pub fn open_gate(gate: &Gate) {
 /// A text encoder whose texts are numbers of axes; `wait` waits for the gate, `panic` panics.
 pub struct Axes {
     dim: usize,
+    words: Vec<String>,
     gate: Gate,
     n_encoded: Arc<AtomicUsize>,
 }
 
 impl Axes {
     pub fn new(dim: usize) -> Self {
-        Self { dim, gate: Gate::default(), n_encoded: Arc::default() }
+        let words = (0..dim).map(|axis| axis.to_string()).collect();
+        Self { dim, words, gate: Gate::default(), n_encoded: Arc::default() }
     }
 
     /// Returns the count of texts that it encodes.
@@ -267,6 +269,10 @@ impl TextEncoder for Axes {
 
     fn dim(&self) -> usize {
         self.dim
+    }
+
+    fn vocabulary(&self) -> Option<&[String]> {
+        Some(&self.words)
     }
 
     fn encode(&mut self, text: &str) -> Result<Vec<f32>, InferenceError> {

@@ -64,6 +64,7 @@ struct Job {
 /// A text encoder owned by one thread, with a cache of recent vectors.
 pub struct TextService {
     info: EncoderInfo,
+    vocabulary: Vec<String>,
     jobs: Option<SyncSender<Job>>,
     thread: Option<JoinHandle<()>>,
     cache: Mutex<Cache>,
@@ -90,9 +91,11 @@ impl TextService {
     /// The thread does not start.
     pub fn start(info: EncoderInfo, encoder: Box<dyn TextEncoder>) -> io::Result<Self> {
         let (jobs, waiting) = sync_channel(MAX_WAITING);
+        let vocabulary = encoder.vocabulary().unwrap_or_default().to_vec();
         let thread = std::thread::Builder::new().name("text-model".into()).spawn(|| run(encoder, waiting))?;
         Ok(Self {
             info,
+            vocabulary,
             jobs: Some(jobs),
             thread: Some(thread),
             cache: Mutex::default(),
@@ -103,6 +106,11 @@ impl TextService {
     /// Returns the encoder in use.
     pub fn info(&self) -> &EncoderInfo {
         &self.info
+    }
+
+    /// Returns the phrases or words that it accepts; none if it accepts any text.
+    pub fn vocabulary(&self) -> &[String] {
+        &self.vocabulary
     }
 
     /// Returns whether the encoder's thread has answered every request.

@@ -37,6 +37,7 @@ pub mod embed;
 pub mod encode;
 #[cfg(feature = "fleet")]
 pub mod fleet;
+pub mod html;
 pub mod ingest;
 pub mod lanes;
 pub mod lift;
@@ -48,7 +49,9 @@ pub mod progress;
 pub mod publish;
 pub mod query;
 pub mod raster;
+pub mod report;
 pub mod segment;
 pub mod shard;
 pub mod store;
 pub mod view;
+pub mod watch;

@@ -1,5 +1,9 @@
 //! Progress of long work. The library itself never prints.
 
+use image::RgbImage;
+use slag_common::View;
+use slag_common::frames::Aabb;
+
 /// Receives the progress of one run. Stages follow one another.
 pub trait Progress: Sync {
     /// Begins a stage of `total` steps, each a `unit`; an earlier run has done `done` of them.
@@ -8,6 +12,33 @@ pub trait Progress: Sync {
     fn advance(&self, n: u64);
     /// Ends the stage.
     fn end(&self);
+    /// Tells what an encode is going to do: its views, each with whether an earlier run has done it, and its cells.
+    fn plan(&self, _views: &[(&View, bool)], _cells: &[Aabb]) {}
+    /// Tells which part of the run begins.
+    fn begin_phase(&self, _name: &'static str) {}
+    /// Counts time that a view spent in a stage.
+    fn spend(&self, _stage: &'static str, _secs: f64) {}
+    /// Tells what becomes of a view.
+    fn view(&self, _name: &str, _event: ViewEvent<'_>) {}
+}
+
+/// What becomes of a view.
+pub enum ViewEvent<'a> {
+    /// Its photo has masks. `draw` draws them over the photo, reduced; it takes milliseconds, so it is called by receivers that
+    /// show the picture alone.
+    Segmented {
+        /// Masks.
+        n_masks: usize,
+        /// Draws them.
+        draw: &'a dyn Fn() -> RgbImage,
+    },
+    /// Its contributions are kept.
+    Done,
+    /// It is left out.
+    LeftOut {
+        /// Why.
+        reason: String,
+    },
 }
 
 /// Discards progress events.

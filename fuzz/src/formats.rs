@@ -93,6 +93,9 @@ pub fn shard(data: &[u8]) -> bool {
         let columns = [appearance.colours.len(), appearance.sizes.len(), appearance.rotations.len()];
         assert_eq!(columns, [view.header.n_gaussians as usize; 3]);
     }
+    for (pose, name) in layout.photo_poses(&bytes).iter().flat_map(|photos| photos.iter()) {
+        assert!(pose.offset.iter().all(|c| c.is_finite()) && pose.focal_px > 0.0 && name.len() <= 1024);
+    }
     if let Some(occupancy) = layout.occupancy(&bytes) {
         let n_blocks: u32 = occupancy.header.n_blocks.iter().product();
         let mut end = 0;

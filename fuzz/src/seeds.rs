@@ -4,18 +4,19 @@ use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::Path;
 
-use glam::DVec3;
+use glam::{DAffine3, DVec3};
 use half::f16;
 use slag_common::appearance::Appearance;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{self, CellRecord, EncoderRecord, Manifest, ShardRecord};
 use slag_common::objects::{NO_OBJECT, ObjectRecord, Objects, ObjectsHeader};
 use slag_common::occupancy::{Block, BuiltOccupancy};
+use slag_common::photo_poses::BuiltPhotoPoses;
 use slag_common::shard::{
     Additions, Basis, ExactColumns, Fine, IndexColumn, Positions, Profile, Residuals, ScoreErrors,
     ShardHeader, ShardView,
 };
-use slag_common::{Hash32, container};
+use slag_common::{Distortion, Hash32, Intrinsics, View, container};
 
 /// Longest shared file used: in longer ones mutations rarely hit anything that matters.
 const MAX_SHARED_BYTES: usize = 100_000;
@@ -189,13 +190,32 @@ fn shard(is_exact: bool) -> Vec<u8> {
     let block = |z, occupied, free| Block { at: [0, 0, z], occupied, free };
     let places = BuiltOccupancy::pack(0.05, 0.1, 2, &[block(0, 1, 2), block(1, 0, !0), block(5, !0, 0)]);
     let occupancy = places.view();
+    let mut photos = BuiltPhotoPoses::default();
+    for name in ["a.jpg", "b.jpg"] {
+        photos.push(DVec3::ONE, &photo(name));
+    }
     let additions = Additions {
         objects: is_exact.then_some(&objects),
         appearance: is_exact.then_some(appearance),
         occupancy: is_exact.then_some(&occupancy),
+        photo_poses: photos.view().filter(|_| is_exact),
     };
     view.write_with(&mut out, additions).expect("writes to memory");
     out
+}
+
+fn photo(name: &str) -> View {
+    let (width_px, height_px, focal) = (64, 48, 50.0);
+    let intrinsics = Intrinsics {
+        width_px,
+        height_px,
+        focal_x_px: focal,
+        focal_y_px: focal,
+        centre_x_px: 32.0,
+        centre_y_px: 24.0,
+        distortion: Distortion::None,
+    };
+    View { name: name.into(), image_path: name.into(), intrinsics, camera_from_world: DAffine3::IDENTITY }
 }
 
 fn manifest() -> Vec<u8> {

@@ -9,6 +9,8 @@ const { chromium } = fromPage("playwright-core");
 export const axe = readFileSync(fromPage.resolve("axe-core/axe.min.js"), "utf8");
 
 const PICTURES = process.env.SLAG_PAGE_PICTURES;
+/** With SLAG_PAGE_DIST=1 the page's files are those last built, not those in the programs: no build of them while the page is worked on. */
+const DIST = process.env.SLAG_PAGE_DIST ? new URL("../../common/view/dist/", import.meta.url) : null;
 const SIZE = { width: 1100, height: 640 };
 
 let browser;
@@ -32,6 +34,8 @@ export async function opened(url, run, { fragment = "", options = {}, expected =
     const asked = request.url();
     if (!asked.startsWith(url) && !asked.startsWith("blob:") && !asked.startsWith("data:")) wrong.push(`foreign request: ${asked}`);
   });
+  const name = (asked) => new URL(asked).pathname.replace(/^\/view\/?/, "") || "index.html";
+  if (DIST) await context.route(({ pathname }) => /^\/view(\/|$)/.test(pathname), (route) => route.fulfill({ path: new URL(name(route.request().url()), DIST).pathname }));
   try {
     await page.goto(`${url}/view#${fragment}`);
     await run(page);
@@ -61,10 +65,16 @@ export async function picture(page, name) {
 export async function litPixels(page, leftPx, name) {
   await page.uncheck("#show-boxes");
   await page.uncheck("#show-grid");
-  const png = (await picture(page, name)).toString("base64");
+  return pixels(page, leftPx, (r, g, b) => r > 90 && r - Math.min(g, b) > 45, name);
+}
+
+/** Pixels beside the panel for which a function of red, green and blue is true, in a picture that stands still, or at once. */
+export async function pixels(page, leftPx, test, name, isStill = true) {
+  const png = (isStill ? await picture(page, name) : await page.screenshot()).toString("base64");
   const scratch = await browser.newPage();
   try {
-    return await scratch.evaluate(async ([data, left]) => {
+    return await scratch.evaluate(async ([data, left, source]) => {
+      const test = new Function(`return ${source}`)();
       const image = await createImageBitmap(new Blob([Uint8Array.from(atob(data), (c) => c.charCodeAt(0))]));
       const context = new OffscreenCanvas(image.width, image.height).getContext("2d");
       context.drawImage(image, 0, 0);
@@ -72,12 +82,11 @@ export async function litPixels(page, leftPx, name) {
       const found = [];
       for (let y = 0; y < height; y++) {
         for (let x = left; x < width; x++) {
-          const [r, g, b] = rgba.subarray(4 * (y * width + x), 4 * (y * width + x) + 3);
-          if (r > 90 && r - Math.min(g, b) > 45) found.push([x, y]);
+          if (test(...rgba.subarray(4 * (y * width + x), 4 * (y * width + x) + 3))) found.push([x, y]);
         }
       }
       return found;
-    }, [png, leftPx]);
+    }, [png, leftPx, String(test)]);
   } finally {
     await scratch.close();
   }

@@ -3,59 +3,12 @@
 
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
-import { axe, closeBrowser, litPixels as litBeside, openBrowser, opened as openedAt, picture } from "./browser.mjs";
-import { startService, THINGS } from "./service.mjs";
-
-const [WIDTH, HEIGHT] = [1100, 640];
-const PANEL_PX = 360;
-const POSITION = [0.5, -6, 4];
-const TARGET = [0, 0, 0.5];
-const CAMERA = [...POSITION, ...TARGET].join(",");
-const FIELD_OF_VIEW_DEG = 55;
+import { axe, closeBrowser, openBrowser, picture } from "./browser.mjs";
+import { answered, CAMERA, dot, drawn, HEIGHT, isInside, litPixels, minus, opened, PANEL_PX, POSITION, project, TARGET, WIDTH } from "./scene.mjs";
+import { THINGS } from "./service.mjs";
 
 before(openBrowser);
 after(closeBrowser);
-
-/** A page of a fresh service. */
-async function opened(run, { behaviour = {}, ...how } = {}) {
-  const service = await startService(behaviour);
-  try {
-    await openedAt(service.url, (page) => run(page, service), how);
-  } finally {
-    await service.stop();
-  }
-}
-
-const litPixels = (page, name) => litBeside(page, PANEL_PX, name);
-
-const drawn = (page) => page.waitForFunction(() => document.documentElement.dataset.gaussians === "7360", null, { timeout: 30000 });
-const answered = (page, question) => page.waitForFunction((q) => document.documentElement.dataset.answered === q, question, { timeout: 30000 });
-
-const minus = (a, b) => a.map((v, i) => v - b[i]);
-const dot = (a, b) => a.reduce((sum, v, i) => sum + v * b[i], 0);
-const cross = ([a, b, c], [d, e, f]) => [b * f - c * e, c * d - a * f, a * e - b * d];
-const unit = (v) => v.map((x) => x / Math.hypot(...v));
-
-/** Pixel of a world point, computed apart from the page. */
-function project(point) {
-  const forward = unit(minus(TARGET, POSITION));
-  const right = unit(cross(forward, [0, 0, 1]));
-  const ray = minus(point, POSITION);
-  const focal = HEIGHT / 2 / Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360);
-  const depth = dot(ray, forward);
-  return [WIDTH / 2 + (focal * dot(ray, right)) / depth, HEIGHT / 2 - (focal * dot(ray, cross(right, forward))) / depth];
-}
-
-/** The true mask: pixels inside the hull of a box's projected corners, which `grownPx` moves outward. */
-function isInside(thing, [x, y], grownPx) {
-  const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((i) => project(thing.min.map((low, k) => ((i >> k) & 1 ? thing.max[k] : low))));
-  // Inside the hull if no direction separates the point from all corners.
-  for (let i = 0; i < 72; i++) {
-    const [dx, dy] = [Math.cos((i * Math.PI) / 36), Math.sin((i * Math.PI) / 36)];
-    if (x * dx + y * dy > Math.max(...corners.map(([cx, cy]) => cx * dx + cy * dy)) + grownPx) return false;
-  }
-  return true;
-}
 
 for (const name of ["chair", "ball"]) {
   test(`pixels that "${name}" lights are those of the truth`, () => opened(async (page) => {

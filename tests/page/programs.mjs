@@ -19,21 +19,21 @@ export async function serve(name, args) {
   const child = spawn(program(name), args, { stdio: ["ignore", "pipe", "pipe"] });
   let said = "";
   let complaint = "";
-  child.stderr.on("data", (data) => { complaint += data; });
   const ended = new Promise((resolve) => child.on("exit", resolve));
   const url = await new Promise((resolve, reject) => {
-    child.stdout.on("data", (data) => {
-      said += data;
-      const found = said.match(/http:\/\/[^\s/]+/);
+    const look = (text) => {
+      const found = text.match(/http:\/\/[^\s/]+/);
       if (found) resolve(found[0]);
-    });
+    };
+    child.stdout.on("data", (data) => look(said += data));
+    child.stderr.on("data", (data) => look(complaint += data));
     ended.then((code) => reject(new Error(`${name} ended with ${code}: ${complaint}`)));
   });
   const stop = async () => {
     child.kill();
     await ended;
   };
-  return { url, stop, child };
+  return { url, stop, child, said: () => said };
 }
 
 /** Generates and encodes a room; `close` removes it. */
@@ -42,8 +42,8 @@ export function makeRoom() {
   const [room, store, cache] = ["room", "store", "cache"].map((name) => join(folder, name));
   run("slag-lab", ["generate", "scene", "--out", room, "--n-views", "24"]);
   // Kept views make the next generation quick.
-  const encode = () => run("slag-encoder", ["encode", "--scene", join(room, "scene.ply"), "--views", join(room, "transforms.json"),
-    "--metric", "--store", store, "--appearance", "--keep-views", "--quiet"]);
+  const encode = (...flags) => run("slag-encoder", ["encode", "--scene", join(room, "scene.ply"), "--views", join(room, "transforms.json"),
+    "--metric", "--store", store, "--appearance", "--photo-poses", "--occupancy", "--keep-views", "--quiet", ...flags]);
   encode();
   const fetch = (url) => run("slag-edge", ["fetch", "--trust-first", "--from", url, "--at", "0,0,0", "--radius", "100", "--cache", cache, "--quiet"]);
   return { room, store, cache, encode, fetch, close: () => rmSync(folder, { recursive: true, force: true }) };

@@ -89,6 +89,34 @@ test("slag-edge: a click on an answer shows its place and photo, and what is abs
   assert.match(await page.locator("#message").innerText(), /\w/);
 }, { fragment: `q=${THING}` }));
 
+test("slag-edge: places to stand are those of the robot's own route", () => opened(robot.url, async (page) => {
+  await drawn(page);
+  await answered(page, THING);
+  const [{ answers: [{ id }] }] = (await (await fetch(`${robot.url}/v1/query?text=${THING}`)).json()).results;
+  const reply = await (await fetch(`${robot.url}/v1/goal?id=${id}`)).json();
+  await page.locator("#answers button").first().click();
+  await page.locator("#places").waitFor();
+  const shown = await page.locator("#places button").allInnerTexts();
+  assert.deepEqual(shown.map((text) => text.split(" m ")[0]), reply.goals.map(({ position_in_world: [x, y] }) => `${x.toFixed(2)}, ${y.toFixed(2)}`));
+  if (reply.none) assert.match(await page.locator("#places").innerText(), new RegExp(reply.none.kind.replaceAll("-", " ")));
+  assert.ok(reply.goals.length > 0 || reply.none);
+}, { fragment: `q=${THING}` }));
+
+test("slag-edge: cameras are where the poses say, without pictures", () => opened(robot.url, async (page) => {
+  await drawn(page);
+  const { frames } = JSON.parse(readFileSync(join(room.room, "transforms.json"), "utf8"));
+  const { views } = await (await fetch(`${robot.url}/v1/view`)).json();
+  assert.equal(views.length, frames.length);
+  for (const { name, position_m, rotation_xyzw: [x, y, z, w], has_picture } of views) {
+    const { transform_matrix: matrix } = frames.find(({ file_path }) => file_path.endsWith(name));
+    // The camera's z is forward, where OpenGL's cameras look against z.
+    const forward = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)];
+    for (const k of [0, 1, 2]) assert.ok(Math.abs(position_m[k] - matrix[k][3]) < 1e-4 && Math.abs(forward[k] + matrix[k][2]) < 1e-4, `${name}: ${position_m}, ${forward}`);
+    assert.equal(has_picture, false);
+  }
+  assert.ok(await page.locator("#show-photos").isVisible());
+}));
+
 test("slag-encoder view: the photo has the answer's box, and a second question is beside the first", async () => {
   const viewer = await serve("slag-encoder", ["view", "--store", room.store, "--scene", join(room.room, "scene.ply"),
     "--views", join(room.room, "transforms.json"), "--listen", "127.0.0.1:0", "--no-open"]);

@@ -14,11 +14,22 @@ export const THINGS = [
   { name: "ball", min: [-2, -1.5, 0], max: [-1, -0.5, 1], n: [12, 12, 12] },
 ];
 
+/** Two places to stand near the chair, as `/v1/goal` names them. */
+export const GOALS = [
+  { position_in_world: [1.2, -1, 0], yaw_rad: 1.571, sensor_in_world: [1.2, -1, 0.4], clearance_m: 0.75, visible_share: 0.61, path_m: 4.25 },
+  { position_in_world: [-0.2, 0.9, 0], yaw_rad: -0.1, sensor_in_world: [-0.2, 0.9, 0.4], clearance_m: 0.52, visible_share: 0.44, path_m: 5.5 },
+];
+
+const WORDS = [["chair", 1], ["ball", 1], ["wall", 0], ["armchair", 0], ["red wall", 0]].map(([word, n_things]) => ({ word, n_things }));
+
 /** What the robot's routes take of what the page may send; they refuse the rest. */
 const PARAMETERS = {
   "/v1/view": [],
   "/v1/view/scores": ["text", "negative"],
   "/v1/query": ["text", "negative", "limit"],
+  "/v1/goal": ["id", "radius_m"],
+  "/v1/view/words": [],
+  "/v1/changes": [],
 };
 
 function half(value) {
@@ -70,7 +81,7 @@ function scoresMessage(text, generation) {
 
 /** Starts it on a free port; `behaviour` may be changed while it runs. */
 export async function startService(behaviour = {}) {
-  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], requests: [], ...behaviour });
+  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], requests: [], goal: "no-occupancy", program: "slag-edge", changes: null, work: null, photos: [], ...behaviour });
   const json = (response, status, body) => response.writeHead(status, { "content-type": "application/json" }).end(JSON.stringify(body));
   const server = createServer((request, response) => {
     const url = new URL(request.url, "http://localhost");
@@ -92,6 +103,15 @@ export async function startService(behaviour = {}) {
     const cell = url.pathname.match(/^\/v1\/view\/cells\/(\d+)$/);
     if (cell) return response.writeHead(200).end(cellMessage(THINGS[Number(cell[1])]));
     if (url.pathname === "/v1/view/scores") return response.writeHead(200).end(scoresMessage(url.searchParams.get("text"), behaviour.generation));
+    if (url.pathname === "/v1/view/words") return json(response, 200, { generation: behaviour.generation, words: WORDS });
+    if (url.pathname === "/v1/changes") return behaviour.changes ? json(response, 200, behaviour.changes) : json(response, 409, { detail: "the store has one generation alone" });
+    if (url.pathname === "/v1/work") return json(response, 200, behaviour.work);
+    if (url.pathname === "/v1/goal") {
+      if (behaviour.goal === "no-occupancy") return json(response, 409, { detail: "the scene does not say which places are free; encode it with --occupancy" });
+      const isReached = behaviour.goal === "reached";
+      const none = isReached ? null : { kind: behaviour.goal, detail: "within reach of it, no ground is reached" };
+      return json(response, 200, { goals: isReached ? GOALS : [], thing: isReached ? { id: "o1", position_in_world: [1.2, 0.8, 0.5] } : null, none });
+    }
     if (url.pathname === "/v1/query") {
       const [name, support] = url.searchParams.get("text").split(" on the ");
       const thing = THINGS.find((entry) => entry.name === name);
@@ -108,7 +128,7 @@ export async function startService(behaviour = {}) {
     }
     if (url.pathname !== "/v1/view" || !behaviour.hasScene) return json(response, 404, { detail: "nothing here" });
     json(response, 200, {
-      program: "slag-edge", scene: "test room", generation: behaviour.generation, up: [0, 0, 1], metric: true, geographic: false, can_ask: true, views: [],
+      program: behaviour.program, scene: "test room", generation: behaviour.generation, up: [0, 0, 1], metric: true, geographic: false, can_ask: true, views: behaviour.photos,
       n_gaussians: THINGS.reduce((sum, { n }) => sum + n[0] * n[1] * n[2], 0), position_m: [-3, 3, 0], fetched: { centre_m: [-3, 3, 0], radius_m: 0.8 },
       cells: THINGS.map(({ min, max, n }, i) => ({
         cell: i, n_gaussians: n[0] * n[1] * n[2], state: behaviour.missing.includes(i) ? "missing" : "on_board", generation: behaviour.generation, box_m: { min, max },

@@ -12,6 +12,7 @@ use super::layout::ShardLayout;
 use crate::container::{ContainerError, Layout};
 use crate::objects::ObjectsLayout;
 use crate::occupancy::OccupancyLayout;
+use crate::photo_poses::PhotoPosesLayout;
 
 /// Largest length accepted: embeddings have unit length, and components are scaled to about that.
 const MAX_LENGTH: f32 = 4096.0;
@@ -112,6 +113,7 @@ impl ShardLayout {
             ]),
         };
         let occupancy = OccupancyLayout::check(bytes, &layout)?;
+        let photo_poses = PhotoPosesLayout::check(bytes, &layout)?;
         Ok(Self {
             header,
             positions,
@@ -126,6 +128,7 @@ impl ShardLayout {
             objects,
             appearance,
             occupancy,
+            photo_poses,
         })
     }
 }

@@ -10,6 +10,7 @@ use super::indices::{IndicesHeader, PackedIndices};
 use crate::appearance::Appearance;
 use crate::objects::{Objects, ObjectsLayout};
 use crate::occupancy::{Occupancy, OccupancyLayout};
+use crate::photo_poses::{PhotoPoses, PhotoPosesLayout};
 
 /// The header of a checked shard and the places of its columns; [`ShardLayout::view`] gives the columns.
 #[derive(Clone, Debug)]
@@ -28,6 +29,7 @@ pub struct ShardLayout {
     pub(super) objects: Option<ObjectsLayout>,
     pub(super) appearance: Option<[Range<usize>; 3]>,
     pub(super) occupancy: Option<OccupancyLayout>,
+    pub(super) photo_poses: Option<PhotoPosesLayout>,
 }
 
 impl ShardLayout {
@@ -58,6 +60,14 @@ impl ShardLayout {
     /// As [`ShardLayout::objects`].
     pub fn occupancy<'a>(&self, bytes: &'a [u8]) -> Option<Occupancy<'a>> {
         self.occupancy.as_ref().map(|occupancy| occupancy.view(bytes))
+    }
+
+    /// Returns where the photos of the checked bytes' cell were taken, if the shard says so.
+    ///
+    /// # Panics
+    /// As [`ShardLayout::objects`].
+    pub fn photo_poses<'a>(&self, bytes: &'a [u8]) -> Option<PhotoPoses<'a>> {
+        self.photo_poses.as_ref().map(|photos| photos.view(bytes))
     }
 
     /// Returns the columns in the checked bytes.

@@ -8,6 +8,7 @@ use crate::appearance::Appearance;
 use crate::container;
 use crate::objects::Objects;
 use crate::occupancy::Occupancy;
+use crate::photo_poses::PhotoPoses;
 
 /// What a shard may carry beyond what questions need.
 #[derive(Clone, Copy, Debug, Default)]
@@ -18,6 +19,8 @@ pub struct Additions<'a> {
     pub appearance: Option<Appearance<'a>>,
     /// Which places of its cell are free.
     pub occupancy: Option<&'a Occupancy<'a>>,
+    /// Where the photos of its cell were taken.
+    pub photo_poses: Option<PhotoPoses<'a>>,
 }
 
 impl<'a> From<Option<&'a Objects<'a>>> for Additions<'a> {
@@ -40,7 +43,7 @@ impl ShardView<'_> {
     /// # Errors
     /// Those of the writer.
     pub fn write_with<'a>(&self, out: impl io::Write, additions: impl Into<Additions<'a>>) -> io::Result<()> {
-        let Additions { objects, appearance, occupancy } = additions.into();
+        let Additions { objects, appearance, occupancy, photo_poses } = additions.into();
         let mut sections = vec![
             (section::HEADER, bytemuck::bytes_of(&self.header)),
             (section::POSITIONS, self.positions.bytes()),
@@ -81,6 +84,7 @@ impl ShardView<'_> {
             sections.push((section::ROTATIONS, container::bytes_of(rotations)));
         }
         sections.extend(occupancy.iter().flat_map(|occupancy| occupancy.sections()));
+        sections.extend(photo_poses.iter().flat_map(|photos| photos.sections()));
         container::write(out, MAGIC, VERSION, &sections)
     }
 }

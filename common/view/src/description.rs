@@ -3,6 +3,7 @@
 use glam::{DVec3, Vec3};
 use serde::Serialize;
 use slag_common::frames::Aabb;
+use slag_common::photo_poses::PhotoPoses;
 
 /// The scene as the page first sees it. Lengths are in world units, metres in a metric scene.
 #[derive(Clone, Debug, Serialize)]
@@ -27,6 +28,9 @@ pub struct Description {
     pub cells: Vec<Cell>,
     /// The photos whose poses are known.
     pub views: Vec<Photo>,
+    /// Whether the program is making the scene: `GET /v1/work` tells how far it is.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub at_work: bool,
     /// What the robot fetched.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fetched: Option<Fetched>,
@@ -94,6 +98,50 @@ pub struct Photo {
     pub focal_px: f32,
     /// Whether the program has the picture itself.
     pub has_picture: bool,
+}
+
+impl Photo {
+    /// Describes the photos of a shard with this origin, whose pictures were not published.
+    pub fn of_shard<'a>(origin: DVec3, photos: PhotoPoses<'a>) -> impl Iterator<Item = Self> + use<'a> {
+        photos.iter().map(move |(pose, name)| Self {
+            name: name.to_owned(),
+            position_m: origin + DVec3::from(pose.offset.map(f64::from)),
+            rotation_xyzw: pose.rotation_xyzw,
+            width_px: pose.width_px,
+            height_px: pose.height_px,
+            focal_px: pose.focal_px,
+            has_picture: false,
+        })
+    }
+}
+
+/// Reply of `GET /v1/view/words`: what the page suggests.
+#[derive(Clone, Debug, Serialize)]
+pub struct Words {
+    /// The generation whose things are counted.
+    pub generation: u64,
+    /// The words that the text model knows, those of most things first; none if it takes any text.
+    pub words: Vec<Word>,
+}
+
+impl Words {
+    /// Most words that are counted: lists of phrases for people are shorter.
+    pub const MAX: usize = 2048;
+
+    /// Orders words by their things; equal ones stay in the model's order.
+    pub fn new(generation: u64, mut words: Vec<Word>) -> Self {
+        words.sort_by_key(|word| std::cmp::Reverse(word.n_things));
+        Self { generation, words }
+    }
+}
+
+/// A word that the text model knows.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Word {
+    /// The word, or phrase.
+    pub word: String,
+    /// Things that are found by it.
+    pub n_things: usize,
 }
 
 /// The area that a robot fetched.

@@ -22,7 +22,7 @@ use axum::routing::get;
 use slag_service::problem::Problem;
 
 pub use cell::{CELL_HEAD_BYTES, GAUSSIAN_BYTES, cell_message};
-pub use description::{Cell, CellState, Corners, Description, Fetched, Photo};
+pub use description::{Cell, CellState, Corners, Description, Fetched, Photo, Word, Words};
 pub use scores::ScoresMessage;
 
 /// A file of the page.

@@ -113,6 +113,11 @@ impl Engine {
         self.text.info()
     }
 
+    /// Returns the words that the text model knows; none if it takes any text.
+    pub(super) fn vocabulary(&self) -> &[String] {
+        self.text.vocabulary()
+    }
+
     /// Returns whether the text model runs.
     pub fn text_is_alive(&self) -> bool {
         self.text.is_alive()

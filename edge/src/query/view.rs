@@ -3,19 +3,26 @@
 use glam::{DVec3, Vec3};
 use slag_common::shard::ShardView;
 use slag_view::{
-    CELL_HEAD_BYTES, Cell, CellState, Description, Fetched, GAUSSIAN_BYTES, ScoresMessage, cell_message,
+    CELL_HEAD_BYTES, Cell, CellState, Description, Fetched, GAUSSIAN_BYTES, Photo, ScoresMessage, Word,
+    Words, cell_message,
 };
 
 use super::engine::{Engine, QueryError};
 use super::map::MapStatus;
+use super::objects;
 use super::request::{Negatives, QueryRequest};
-use crate::score::{Budget, Precision, Question, Region, ScoreError, Scratch, Search, relevancy};
+use super::threshold::calibrated_threshold;
+use crate::score::{
+    Budget, Precision, Question, Region, ScoreError, Scratch, Search, relevancy, score_objects,
+};
 use crate::store::Snapshot;
 
 /// Below every cosine, and below every difference of two cosines.
 const BELOW_ALL: f32 = -4.0;
 /// The program's name in a description.
 const PROGRAM: &str = "slag-edge";
+/// Words that are scored at a time: bounds the scores in memory.
+const WORDS_TOGETHER: usize = 64;
 
 impl Engine {
     /// Describes the scene on board. `robot_in_world`: where the robot is, if that is known.
@@ -44,6 +51,10 @@ impl Engine {
         });
         let mut cells: Vec<Cell> = on_board.chain(missing).collect();
         cells.sort_by_key(|cell| cell.cell);
+        let photos = snapshot.shards.iter().flat_map(|shard| {
+            let origin = DVec3::from(shard.view().header.origin_in_world);
+            shard.photo_poses().into_iter().flat_map(move |photos| Photo::of_shard(origin, photos))
+        });
         Ok(Description {
             program: PROGRAM,
             scene: map.scene,
@@ -54,7 +65,8 @@ impl Engine {
             geographic: map.geo_reference.is_some(),
             can_ask: self.check_encoder(&snapshot).is_ok(),
             cells,
-            views: Vec::new(),
+            views: photos.collect(),
+            at_work: false,
             fetched: Some(Fetched { centre_m: map.centre_in_world, radius_m: map.radius }),
             position_m: robot_in_world(&snapshot),
         })
@@ -81,6 +93,34 @@ impl Engine {
         budget.check().map_err(ScoreError::from)?;
         let positions: Vec<DVec3> = (0..n_gaussians).map(|at| view.position_in_world(at)).collect();
         Ok(Some(cell_message(&positions, shard.appearance())))
+    }
+
+    /// Returns the words that the text model knows, each with the number of objects on board that it finds.
+    ///
+    /// # Errors
+    /// [`QueryError`].
+    pub fn view_words(&self, budget: &Budget) -> Result<Words, QueryError> {
+        let snapshot = self.snapshot()?;
+        self.check_encoder(&snapshot)?;
+        let known = self.vocabulary();
+        let mut words = Vec::new();
+        for known in known[..known.len().min(Words::MAX)].chunks(WORDS_TOGETHER) {
+            let question =
+                |word: &String| Ok(Question { vector: self.encode_text(word)?, negatives: Vec::new() });
+            let questions = known.iter().map(question).collect::<Result<Vec<_>, QueryError>>()?;
+            budget.check().map_err(ScoreError::from)?;
+            let scored = self.on_scene(&snapshot, budget, |_, scene| {
+                let encoder = &scene.manifest.encoder;
+                let calibration = encoder.calibration.and(objects::calibration(scene.objects));
+                let (threshold, _) = calibrated_threshold(encoder.default_threshold, calibration);
+                let scored = score_objects(scene.shards, scene.objects, scene.index, &questions)?;
+                let count = |scores: &[f32]| scores.iter().filter(|score| **score >= threshold).count();
+                Ok::<_, ScoreError>(scored.iter().map(|of_word| count(&of_word.scores)).collect::<Vec<_>>())
+            })?;
+            let word = |(word, n_things): (&String, usize)| Word { word: word.clone(), n_things };
+            words.extend(known.iter().zip(scored).map(word));
+        }
+        Ok(Words::new(snapshot.manifest.generation, words))
     }
 
     /// Returns the message of every Gaussian's score: its centroid's cosine, or with negatives its relevancy.

@@ -8,6 +8,7 @@ use slag_common::appearance::Appearance;
 use slag_common::manifest::{CellRecord, Manifest};
 use slag_common::objects::Objects;
 use slag_common::occupancy::Occupancy;
+use slag_common::photo_poses::PhotoPoses;
 use slag_common::shard::{Profile, ShardLayout, ShardView};
 
 use super::bad_cell::cell_of;
@@ -47,6 +48,11 @@ impl OpenShard {
     /// Returns which places of its cell are free, if the shard says so.
     pub fn occupancy(&self) -> Option<Occupancy<'_>> {
         self.layout.occupancy(&self.bytes)
+    }
+
+    /// Returns where the photos of its cell were taken, if the shard says so.
+    pub fn photo_poses(&self) -> Option<PhotoPoses<'_>> {
+        self.layout.photo_poses(&self.bytes)
     }
 
     /// Returns the hash of its bytes, by the manifest.

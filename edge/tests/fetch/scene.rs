@@ -160,7 +160,7 @@ fn with_things(bytes: &[u8], things: &[TestThing]) -> Vec<u8> {
         photos: photos.as_bytes(),
     };
     let mut out = Vec::new();
-    let additions = Additions { objects: Some(&objects), occupancy: None, appearance: None };
+    let additions = Additions { objects: Some(&objects), ..Additions::default() };
     shard.write_with(&mut out, additions).expect("writes to memory");
     out
 }

@@ -4,7 +4,6 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow};
 use clap::{Args, FromArgMatches};
-use slag_common::ByteSize;
 use slag_common::shard::Profile;
 use slag_models::gpus::GpuChoice;
 
@@ -16,18 +15,18 @@ use super::exit::Exit;
 use super::memory::{default_memory_bytes, parse_memory};
 use super::refine::RefineArgs;
 use super::sam::SamArgs;
-use super::spent::most_spent;
+use super::summary::lines;
 use super::target::{REFINEMENTS, TUNED, TargetArgs};
 use super::views::{ViewsArgs, parse_raster_width, parse_views_limit};
+use super::watched::{WatchArgs, Watched};
 use crate::cells::CellLimits;
 use crate::codebook::CodebookSettings;
 use crate::codebook::basis::MAX_COMPONENTS;
 use crate::embed::Background;
-use crate::encode::coverage::CoverageReport;
 use crate::encode::front::Expectation;
 use crate::encode::{
-    self, CellSettings, EncodeSettings, Engines, GpuReport, InputSettings, Masks, OutputSettings, Preset,
-    RasterWidth, Regions, RunSettings, StageReport, ViewSettings, ViewsLimit,
+    self, CellSettings, EncodeSettings, Engines, InputSettings, Masks, OutputSettings, Preset, RasterWidth,
+    Regions, RunSettings, ViewSettings, ViewsLimit,
 };
 use crate::occupancy::OccupancySettings;
 use crate::progress::Progress;
@@ -152,12 +151,20 @@ pub struct EncodeArgs {
     /// a voxel, metres, 0.02 to 0.5. For metric scenes.
     #[arg(long, value_name = "M", num_args = 0..=1, default_missing_value = "0.05")]
     pub occupancy: Option<f64>,
+    /// Shards say where their photos were taken, so that the page at /view shows cameras on a robot, too: 44 bytes and the
+    /// name a photo in every profile. Pictures are not published.
+    #[arg(long)]
+    #[cfg_attr(feature = "fleet", arg(conflicts_with = "blobs"))]
+    pub photo_poses: bool,
     /// Search for objects.
     #[command(flatten)]
     pub objects: ObjectArgs,
     /// Views and cells by other machines.
     #[command(flatten)]
     pub fleet: super::fleet::CoordinatorArgs,
+    /// A page that watches, and one that reports.
+    #[command(flatten)]
+    pub watch: WatchArgs,
     /// Drops an unfinished encode of another splat or with other settings in the store.
     #[arg(long)]
     pub restart: bool,
@@ -221,6 +228,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             shards: shard_settings(args, preset.codebook, metric),
             objects: preset.objects && !args.objects.no_objects && !args.regions.have_patches(),
             occupancy: args.occupancy.map(|voxel_m| OccupancySettings { voxel_m }),
+            photo_poses: args.photo_poses,
         },
         output: OutputSettings {
             store: args.store.clone(),
@@ -310,87 +318,13 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     settings.run.gpus = args.gpus.numbers(&session);
     let devices = Devices::open(args.device, GpuOptions::default())?;
     let engines = Engines::new(&models, &session, &devices);
-    let summary = args.fleet.encode(&settings, &engines, progress, cancel_flag()?.as_ref())?;
-    let busy =
-        summary.busy_secs.iter().map(|(stage, s)| format!("{stage} {s:.1}")).collect::<Vec<_>>().join(", ");
-    let of_views: String = (summary.view_stages.iter())
-        .map(|stage| {
-            let StageReport { stage, n_slots, busy_secs, busy_share, gpus } = stage;
-            let line = |name: &str, n: usize, secs: f64, share: f64| {
-                format!("  {name:<9}{n:>8}{secs:>10.1}{:>7.0} %\n", 100.0 * share)
-            };
-            let of_gpu =
-                |g: &GpuReport| line(&format!("  GPU {}", g.gpu), g.n_lanes, g.busy_secs, g.busy_share);
-            line(stage, *n_slots, *busy_secs, *busy_share) + &gpus.iter().map(of_gpu).collect::<String>()
-        })
-        .collect();
-    let sizes = summary
-        .shard_bytes
-        .iter()
-        .map(|(p, b)| format!("{p} {}", ByteSize(*b)))
-        .collect::<Vec<_>>()
-        .join(", ");
-    let skipped = match summary.skipped_views.len() {
-        0 => String::new(),
-        n => format!("left out   {n} views, the first: {}\n", summary.skipped_views[0].reason),
-    };
-    let coverage = summary.coverage.map_or(String::new(), |CoverageReport { coverage, seen }| {
-        let (coverage, seen, secs) = (100.0 * coverage, 100.0 * seen, summary.coverage_secs);
-        format!("coverage   {coverage:.1} % of all views, {seen:.1} % of the Gaussians seen; found in {secs:.1} s\n")
-    });
-    let objects = summary.objects.as_ref().map_or(String::new(), |found| {
-        let (n, of_masks, aside) = (found.n_objects, found.n_masks_of_objects, found.n_masks_set_aside);
-        format!(
-            "objects    {n} of {of_masks} masks, {} Gaussians; {aside} masks set aside\n",
-            found.n_gaussians
-        )
-    });
-    let occupancy = summary.occupancy.as_ref().map_or(String::new(), |found| {
-        let (free, occupied, bytes) = (found.n_free, found.n_occupied, ByteSize(found.len_bytes));
-        let (voxel_m, secs) = (found.voxel_m, found.secs);
-        format!("places     {free} voxels of {voxel_m} m free, {occupied} occupied; {bytes} in {secs:.1} s\n")
-    });
-    let most = most_spent(&summary);
-    let images_on = summary.images_on.as_ref().map_or(String::new(), |on| format!("images on  {on}\n"));
-    let of_target = expected.as_ref().map_or(String::new(), |e| {
-        let profile = e.setting.profile.name();
-        let bytes = summary.shard_bytes.get(profile).map_or("none made".into(), |b| ByteSize(*b).to_string());
-        format!(
-            "target     {} ({}): {:.1} s and {} of {profile} shards expected; {:.1} s and {bytes} used\n",
-            e.setting.name,
-            e.setting.flags,
-            e.seconds,
-            ByteSize(e.bytes as u64),
-            summary.wall_secs
-        )
-    });
-    let lines = format!(
-        "{of_target}published  generation {} in {}\n\
-         Gaussians  {} ({} without evidence, {} unusable)\n\
-         views      {} of {} ({} resumed, {} without masks)\n{coverage}{skipped}{images_on}\
-         masks      {} in {} regions, {} contributions\n\
-         cells      {} with {} centroids\n\
-         {objects}{occupancy}shards     {sizes}\n{most}\
-         seconds    {:.1}; by stage, all threads: {busy}\n\
-         views took {:.1} s\n  stage    at once   seconds    busy\n{of_views}",
-        summary.generation,
-        settings.output.store.display(),
-        summary.n_gaussians,
-        summary.n_without_evidence,
-        summary.n_rejected,
-        summary.n_views,
-        summary.n_views_with_photo,
-        summary.n_views_resumed,
-        summary.n_views_without_masks,
-        summary.n_masks,
-        summary.n_regions,
-        summary.n_entries,
-        summary.n_cells,
-        summary.n_centroids,
-        summary.wall_secs,
-        summary.views_secs,
-    );
+    let cancel = cancel_flag()?;
+    let watched = Watched::begin(&args.watch, &settings, &args.models, &cancel)?;
+    let encode = |progress: &dyn Progress| args.fleet.encode(&settings, &engines, progress, cancel.as_ref());
+    let summary = watched.encode(progress, encode)?;
+    let lines = lines(&settings, &summary, expected.as_ref());
     print(json, &summary, lines)?;
+    watched.end(&settings, &summary)?;
     Ok(if summary.skipped_views.is_empty() { Exit::Done } else { Exit::Partly })
 }
 

@@ -19,11 +19,12 @@ mod query;
 pub mod refine;
 mod sam;
 mod serve;
-mod spent;
 mod store;
+mod summary;
 mod target;
 mod view;
 mod views;
+mod watched;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};

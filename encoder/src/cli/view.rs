@@ -92,11 +92,7 @@ pub(super) fn open_text(models: ModelArgs) -> OpenText {
 }
 
 pub(super) fn run(args: &ViewArgs) -> Result<Exit> {
-    if !slag_view::is_built() {
-        return Err(anyhow!(
-            "this program was built without its page; run scripts/build-page.sh, which needs Node.js, and build it again"
-        ));
-    }
+    check_page()?;
     let shown = shown(args)?;
     let access = Access::new(&args.listen, AccessSettings::default())?;
     let viewer = serve::bounded(router(Viewer::new(shown)), serve::Limits::default(), access);
@@ -112,6 +108,16 @@ pub(super) fn run(args: &ViewArgs) -> Result<Exit> {
             .await
     })?;
     Ok(Exit::Done)
+}
+
+/// Refuses where the page is missing.
+pub(super) fn check_page() -> Result<()> {
+    match slag_view::is_built() {
+        true => Ok(()),
+        false => Err(anyhow!(
+            "this program was built without its page; run scripts/build-page.sh, which needs Node.js, and build it again"
+        )),
+    }
 }
 
 /// Reads what is shown.
@@ -133,7 +139,8 @@ fn shown(args: &ViewArgs) -> Result<Shown> {
     };
     let views: Vec<View> = set.map(|set| set.views).unwrap_or_default();
     let up = args.up.map(UpAxis::vector).or_else(|| up_of(&views));
-    Ok(Shown { store: args.store.clone(), splat, views, up, open_text: open_text(args.models.clone()) })
+    let open_text = open_text(args.models.clone());
+    Ok(Shown { store: args.store.clone(), splat, views, up, open_text, work: None })
 }
 
 /// Returns the link that opens the page with a question.
@@ -147,7 +154,7 @@ fn link(url: &str, question: Option<&str>) -> String {
 }
 
 /// Opens a link; where that fails, the link stands on the terminal already.
-fn open_browser(link: &str) {
+pub(super) fn open_browser(link: &str) {
     let (program, arguments): (&str, &[&str]) = match std::env::consts::OS {
         "macos" => ("open", &[]),
         "windows" => ("rundll32", &["url.dll,FileProtocolHandler"]),

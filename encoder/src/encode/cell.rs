@@ -3,6 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 use slag_common::manifest::{CellRecord, ShardRecord};
+use slag_common::photo_poses::BuiltPhotoPoses;
 use slag_common::shard::Profile;
 use slag_common::{Gaussians, Hash32};
 
@@ -46,18 +47,21 @@ pub(crate) struct CellInWork {
     pub(super) embeddings: CellEmbeddings,
     /// Fields in the store, by name.
     pub(super) fields: Vec<(String, Hash32)>,
+    /// Its photos, if its shards say where they were taken.
+    pub(super) photo_poses: BuiltPhotoPoses,
 }
 
 impl CellInWork {
     pub(crate) fn empty(dim: usize) -> Self {
         let embeddings = CellEmbeddings { dim, vectors: Vec::new(), has_evidence: Vec::new() };
-        Self { embeddings, fields: Vec::new() }
+        Self { embeddings, fields: Vec::new(), photo_poses: BuiltPhotoPoses::default() }
     }
 
     /// Makes room for the next cell; the vectors of a large cell are allocated once and used again.
     pub(crate) fn clear(&mut self) {
         self.embeddings.has_evidence.clear();
         self.fields.clear();
+        self.photo_poses = BuiltPhotoPoses::default();
     }
 }
 
@@ -85,7 +89,7 @@ impl CellMaker<'_> {
     ) -> Result<(), EncodeError> {
         let part = contributions.part.clone();
         let gaussians = &self.split.cells[part.cell_id as usize].gaussians;
-        let CellInWork { embeddings: cell, fields } = cell;
+        let CellInWork { embeddings: cell, fields, .. } = cell;
         let len = cell.vectors.len().max(gaussians.len() * cell.dim);
         cell.vectors.reserve_exact(len - cell.vectors.len());
         cell.vectors.resize(len, 0.0);
@@ -115,7 +119,8 @@ impl CellMaker<'_> {
         let Self { scene, settings, encoder_id, merged, .. } = *self;
         let Merged { score_context, objects, .. } = merged;
         let occupancy = merged.occupancy.map(|scene| scene.cells[cell_id as usize].view());
-        let extras = CellExtras { objects, occupancy };
+        let photo_poses = in_work.photo_poses.view();
+        let extras = CellExtras { objects, occupancy, photo_poses };
         let embeddings = &in_work.embeddings;
         let made = self.context.time("codebook", || {
             shard::build(scene, cell_id, cell, embeddings, encoder_id, score_context, settings, &extras)

@@ -275,6 +275,8 @@ impl<'a> CellBuilder<'a> {
         let regions = self.context.install(|| store.put_object(|out| self.table.write(out)))?.0;
         built.extras.insert(EXTRA_REGIONS.into(), regions);
         self.context.begin_phase(Phase::Cells);
+        let has_poses = settings.cells.photo_poses;
+        let photo_poses = has_poses.then(|| shard::photo_poses(&inputs.split, &views.used));
         let cells = CellsToBuild {
             plan: self.plan,
             views: &views.used,
@@ -286,6 +288,7 @@ impl<'a> CellBuilder<'a> {
                 objects: objects.as_ref(),
                 occupancy: self.occupancy.as_ref(),
             },
+            photo_poses: photo_poses.as_deref(),
             encoder_id: self.encoder_id,
             group_bytes: self.group_bytes,
             n_at_once: self.n_at_once,

@@ -82,6 +82,7 @@ impl<'a> RunContext<'a> {
 
     /// Ends the present phase and begins the next.
     pub(super) fn begin_phase(&self, phase: Phase) {
+        self.progress.begin_phase(phase.name());
         self.phases.lock().unwrap_or_else(PoisonError::into_inner).push((phase, Instant::now()));
     }
 

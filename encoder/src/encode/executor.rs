@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use slag_common::photo_poses::BuiltPhotoPoses;
 use slag_common::{Hash32, View};
 
 use super::cell::{FinishedCell, Merged};
@@ -63,6 +64,8 @@ pub(crate) struct CellsToBuild<'a> {
     pub(crate) index: &'a ContributionIndex,
     pub(crate) merged: Merged<'a>,
     pub(crate) encoder_id: Hash32,
+    /// Where the photos of each cell were taken, if its shards say so; a fleet is not asked for it.
+    pub(crate) photo_poses: Option<&'a [BuiltPhotoPoses]>,
     /// Bytes for the contributions of a group of cells.
     pub(crate) group_bytes: u64,
     /// Cells whose embeddings are held at once.

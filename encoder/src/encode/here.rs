@@ -16,6 +16,7 @@ use super::plan::Plan;
 use super::report::{SkippedView, StageReport};
 use super::sink::ViewRecord;
 use super::view::{ViewStages, Work};
+use crate::progress::ViewEvent;
 
 /// This machine.
 pub(super) struct Here;
@@ -47,7 +48,9 @@ impl Executor for Here {
                 return Err(error);
             }
             tracing::warn!("view {} is left out: {error}", view.name);
-            locked(&skipped).push(SkippedView { view: view.name.clone(), reason: error.to_string() });
+            let reason = error.to_string();
+            context.progress().view(&view.name, ViewEvent::LeftOut { reason: reason.clone() });
+            locked(&skipped).push(SkippedView { view: view.name.clone(), reason });
             Ok(())
         })?;
         let wall_secs = start.elapsed().as_secs_f64();
@@ -88,10 +91,12 @@ pub(crate) fn work_off<'v>(
     pipeline::run(&list, n_threads, source, |at, (is_alone, work)| {
         let view = work.view();
         // The run's threads do the processor's work. Those that wait for a device or the disk must not hold one.
+        let start = Instant::now();
         let result = match list[at].on_cpu {
             true => context.workers().run(is_alone, || stages.step(work)),
             false => stages.step(work),
         };
+        context.progress().spend(list[at].name, start.elapsed().as_secs_f64());
         match result {
             // One bad photo or mask file of a thousand must not end an encode. A model that fails on one view fails
             // on the others too.
@@ -157,6 +162,9 @@ fn build_cells(
                 // A large cell comes in parts, so that only one of them is held.
                 context.install(|| maker.add_part(contributions, &mut lent.cell))?;
                 continue;
+            }
+            if let Some(of_cells) = cells.photo_poses {
+                lent.cell.photo_poses = of_cells[cell_id as usize].clone();
             }
             let (finished, has_failed) = (&finished, &has_failed);
             let work = move || {

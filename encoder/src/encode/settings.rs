@@ -174,6 +174,8 @@ pub struct CellSettings {
     pub objects: bool,
     /// How free and occupied places are told apart, if shards have them.
     pub occupancy: Option<OccupancySettings>,
+    /// Whether shards say where the photos of their cells were taken.
+    pub photo_poses: bool,
 }
 
 /// What is published, and where.
@@ -285,6 +287,7 @@ impl EncodeSettings {
                 },
                 objects: true,
                 occupancy: None,
+                photo_poses: false,
             },
             output: OutputSettings {
                 store,

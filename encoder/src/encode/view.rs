@@ -22,9 +22,13 @@ use crate::lift::ViewContributions;
 use crate::lift::photos::MaskOutline;
 use crate::masks::patches::patch_masks;
 use crate::masks::regions::{absorb_slivers, border_share, partition};
-use crate::masks::{Mask, RegionMap};
+use crate::masks::{self, Mask, RegionMap};
+use crate::progress::ViewEvent;
 use crate::raster::{LoadedScene, RasterError, RasterView};
 use crate::segment::{SegmentInput, Segmenter};
+
+/// Width of pictures of masks for people.
+const PICTURE_WIDTH_PX: u32 = 480;
 
 /// What every view needs on its way.
 #[derive(Clone, Copy)]
@@ -217,6 +221,9 @@ impl<'a> ViewStages<'a> {
                     masks = perturbation.masks(&view.name, masks, loaded.image.dimensions().into());
                 }
                 masks.retain(|mask| mask.area_px >= self.tools.settings.min_mask_px);
+                let draw = || masks::overlay(&loaded.image, &masks, PICTURE_WIDTH_PX);
+                let event = ViewEvent::Segmented { n_masks: masks.len(), draw: &draw };
+                self.context.progress().view(&view.name, event);
                 Next::Crop(loaded, masks)
             }
             Next::Crop(loaded, masks) => {
@@ -263,6 +270,7 @@ impl<'a> ViewStages<'a> {
             Next::Write(contributions, outlines, raster_width_px) => {
                 let record = ViewRecord { raster_width_px, secs: work.secs };
                 self.tools.sink.keep(view, &contributions, &outlines, record)?;
+                self.context.progress().view(&view.name, ViewEvent::Done);
                 self.context.progress().advance(1);
                 return Ok(None);
             }

@@ -46,6 +46,10 @@ pub(super) fn run_views<'a>(
     let views = &plan.inputs.views;
     let done = plan.job.done_views()?;
     let n_resumed = plan.order.iter().filter(|view| done.contains_key(&views[**view].name)).count();
+    let planned = plan.order.iter().map(|view| &views[*view]);
+    let planned: Vec<_> = planned.map(|view| (view, done.contains_key(&view.name))).collect();
+    let cells: Vec<_> = plan.inputs.split.cells.iter().map(|cell| cell.mean_bounds).collect();
+    context.progress().plan(&planned, &cells);
     let start = Instant::now();
     context.progress().begin("views", "view", plan.order.len() as u64, n_resumed as u64);
     let ViewsRun { stages, skipped: failed, images_on } = executor.run_views(plan, &done, context)?;

@@ -2,10 +2,12 @@
 
 mod labels;
 mod mask;
+mod overlay;
 pub mod patches;
 pub mod regions;
 pub mod rle;
 
 pub use labels::masks_of_labels;
 pub use mask::{BoxPx, Mask};
+pub use overlay::overlay;
 pub use regions::{NO_REGION, RegionMap};

@@ -1,5 +1,6 @@
 //! Stage 6: a cell's field becomes its shards.
 
+mod photos;
 pub mod positions;
 
 use half::f16;
@@ -8,6 +9,7 @@ use slag_common::Gaussians;
 use slag_common::appearance::AppearanceColumns;
 use slag_common::hash::Hash32;
 use slag_common::occupancy::Occupancy;
+use slag_common::photo_poses::PhotoPoses;
 use slag_common::shard::{
     Additions, Basis, ExactColumns, Fine, IndexColumn, Profile, Residuals, ScoreErrors, ShardHeader,
     ShardView,
@@ -19,6 +21,7 @@ use crate::codebook::{self, CodebookSettings, ScoreMetricContext};
 use crate::memory::{MemoryPlan, Phase};
 use crate::objects::SceneObjects;
 use crate::objects::shards::{CellObjects, CentroidBasis};
+pub use photos::photo_poses;
 use positions::{PositionError, QuantisedPositions};
 use slag_math::matrix::Rows;
 
@@ -99,6 +102,8 @@ pub struct CellExtras<'a> {
     pub objects: Option<&'a SceneObjects>,
     /// The free and occupied places of the cell, if they were asked for.
     pub occupancy: Option<Occupancy<'a>>,
+    /// Where the photos of the cell were taken, if that was asked for.
+    pub photo_poses: Option<PhotoPoses<'a>>,
 }
 
 /// Builds a cell's shards.
@@ -180,8 +185,12 @@ pub fn build(
     let built = |profile, view: &ShardView<'_>| {
         let mut bytes = Vec::new();
         let appearance = appearance.as_ref().map(AppearanceColumns::view);
-        let additions =
-            Additions { objects: objects.as_ref(), appearance, occupancy: extras.occupancy.as_ref() };
+        let additions = Additions {
+            objects: objects.as_ref(),
+            appearance,
+            occupancy: extras.occupancy.as_ref(),
+            photo_poses: extras.photo_poses,
+        };
         view.write_with(&mut bytes, additions).expect("writing to memory cannot fail");
         let (score_error_bound, score_errors) = match profile {
             Profile::Exact => (F16_ROUNDING, ScoreErrors { spread, ..ScoreErrors::default() }),

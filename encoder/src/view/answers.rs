@@ -1,14 +1,12 @@
 //! Answers of `GET /v1/query` as the page reads them: the things that match, best first. A part of the robot's reply.
 
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 
 use serde_json::{Value, json};
 use slag_common::manifest::{Calibration, Manifest};
 use slag_common::objects::ObjectRecord;
 
-use super::error::ViewError;
-use super::shards::{Shard, combined, smallest_shard};
-use crate::store::StoreReader;
+use super::shards::{Shard, combined};
 
 /// Spreads above the mean from which a score is an answer, as on robots.
 const SPREADS_ABOVE_MEAN: f32 = 3.0;
@@ -16,28 +14,47 @@ const SPREADS_ABOVE_MEAN: f32 = 3.0;
 const RELEVANCY_THRESHOLD: f32 = 0.5;
 
 /// The things of a generation: each is scored in the first shard that has it.
+#[derive(Default)]
 pub(super) struct Things {
     /// Shards, and which of their objects are scored there.
     shards: Vec<(Shard, Vec<usize>)>,
     calibration: Option<Calibration>,
+    /// Ids of the objects.
+    ids: BTreeSet<u64>,
 }
 
 impl Things {
-    /// Reads the objects of the smallest shards.
-    pub(super) fn read(reader: &StoreReader) -> Result<Self, ViewError> {
-        let (mut first, mut shards, mut calibration) = (BTreeMap::new(), Vec::new(), None);
-        for cell in &reader.manifest().cells {
-            let Some(shard) = smallest_shard(reader, cell)? else { continue };
-            let Some(objects) = shard.layout.objects(&shard.bytes) else { continue };
-            let (score_mean, score_spread) = (objects.header.score_mean, objects.header.score_spread);
-            calibration.get_or_insert(Calibration { score_mean, score_spread });
-            let is_first = |at: &usize| first.insert(objects.records[*at].id, ()).is_none();
-            let here: Vec<usize> = (0..objects.records.len()).filter(is_first).collect();
-            if !here.is_empty() {
-                shards.push((shard, here));
-            }
+    /// Adds the objects of the next cell's smallest shard.
+    pub(super) fn add(&mut self, shard: Shard) {
+        let Some(objects) = shard.layout.objects(&shard.bytes) else { return };
+        let (score_mean, score_spread) = (objects.header.score_mean, objects.header.score_spread);
+        self.calibration.get_or_insert(Calibration { score_mean, score_spread });
+        let is_first = |at: &usize| self.ids.insert(objects.records[*at].id);
+        let here: Vec<usize> = (0..objects.records.len()).filter(is_first).collect();
+        if !here.is_empty() {
+            self.shards.push((shard, here));
         }
-        Ok(Self { shards, calibration })
+    }
+
+    /// Returns the score from which a thing answers a question with negatives, or one without.
+    fn threshold(&self, manifest: &Manifest, has_negatives: bool) -> f32 {
+        let encoder = &manifest.encoder;
+        match self.calibration.filter(|_| encoder.calibration.is_some()) {
+            _ if has_negatives => RELEVANCY_THRESHOLD,
+            Some(of) => of.score_mean + SPREADS_ABOVE_MEAN * of.score_spread,
+            None => encoder.default_threshold,
+        }
+    }
+
+    /// Returns the number of things that a word finds.
+    pub(super) fn count(&self, manifest: &Manifest, word: &[f32]) -> usize {
+        let threshold = self.threshold(manifest, false);
+        let of_shard = |(shard, here): &(Shard, Vec<usize>)| {
+            let Some(objects) = shard.layout.objects(&shard.bytes) else { return 0 };
+            let scores = shard.layout.view(&shard.bytes).object_scores(&objects, word);
+            here.iter().filter(|at| scores[**at] >= threshold).count()
+        };
+        self.shards.iter().map(of_shard).sum()
     }
 
     /// Answers a question, the first of `vectors`, against its negatives.
@@ -48,12 +65,7 @@ impl Things {
         vectors: &[Vec<f32>],
         limit: usize,
     ) -> Value {
-        let encoder = &manifest.encoder;
-        let threshold = match self.calibration.filter(|_| encoder.calibration.is_some()) {
-            _ if vectors.len() > 1 => RELEVANCY_THRESHOLD,
-            Some(of) => of.score_mean + SPREADS_ABOVE_MEAN * of.score_spread,
-            None => encoder.default_threshold,
-        };
+        let threshold = self.threshold(manifest, vectors.len() > 1);
         let mut found: Vec<(f32, ObjectRecord, String)> = Vec::new();
         for (shard, here) in &self.shards {
             let Some(objects) = shard.layout.objects(&shard.bytes) else { continue };

@@ -5,6 +5,7 @@ use slag_common::container::ContainerError;
 use slag_models::InferenceError;
 use slag_service::problem::Problem;
 
+use crate::diff::DiffError;
 use crate::lift::published::ReadFieldError;
 use crate::store::StoreError;
 
@@ -44,6 +45,12 @@ pub enum ViewError {
         /// The cell.
         cell_id: u32,
     },
+    /// There is nothing to compare with.
+    #[error("the store has one generation alone; encode again into it, and what changed is shown")]
+    OneGeneration,
+    /// Two generations cannot be compared.
+    #[error(transparent)]
+    Changes(#[from] DiffError),
     /// The text model cannot be opened.
     #[error("{0}")]
     Models(String),
@@ -62,6 +69,10 @@ impl From<ViewError> for Problem {
             }
             ViewError::Text(InferenceError::UnknownPhrase { .. } | InferenceError::UnknownWords { .. }) => {
                 (StatusCode::UNPROCESSABLE_ENTITY, "unknown-words", "Unknown words")
+            }
+            ViewError::OneGeneration => (StatusCode::CONFLICT, "one-generation", "One generation"),
+            ViewError::Changes(DiffError::NoObjects { .. } | DiffError::Encoders { .. }) => {
+                (StatusCode::CONFLICT, "not-comparable", "Not comparable")
             }
             ViewError::Models(_) => (StatusCode::CONFLICT, "encoder-mismatch", "No text model"),
             ViewError::OtherSplat { .. } => (StatusCode::CONFLICT, "other-splat", "Another splat"),

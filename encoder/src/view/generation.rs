@@ -3,7 +3,7 @@
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use slag_common::manifest::CellRecord;
-use slag_view::{Cell, CellState, Description, ScoresMessage, cell_message};
+use slag_view::{Cell, CellState, Description, Photo, ScoresMessage, cell_message};
 
 use super::answers::Things;
 use super::error::ViewError;
@@ -17,6 +17,8 @@ use crate::store::StoreReader;
 pub(super) struct Generation {
     pub(super) reader: StoreReader,
     pub(super) things: Things,
+    /// Photos whose poses were published.
+    photos: Vec<Photo>,
     scored: Scored,
 }
 
@@ -31,8 +33,13 @@ enum Scored {
 impl Generation {
     /// Opens a generation: its objects, and its fields if there is a splat.
     pub(super) fn open(reader: StoreReader, splat: Option<&Splat>) -> Result<Self, ViewError> {
-        let things = Things::read(&reader)?;
-        let Some(splat) = splat else { return Ok(Self { reader, things, scored: Scored::Shards }) };
+        let (mut things, mut photos) = (Things::default(), Vec::new());
+        for cell in &reader.manifest().cells {
+            let Some(shard) = smallest_shard(&reader, cell)? else { continue };
+            photos.extend(shard.photos());
+            things.add(shard);
+        }
+        let Some(splat) = splat else { return Ok(Self { reader, things, photos, scored: Scored::Shards }) };
         let manifest = reader.manifest();
         let (expected, found) = (manifest.n_gaussians + manifest.n_rejected, splat.scene.len());
         if found as u64 != expected {
@@ -47,7 +54,7 @@ impl Generation {
             }
         };
         let fields = manifest.cells.par_iter().map(field).collect::<Result<Vec<_>, ViewError>>()?;
-        Ok(Self { things, scored: Scored::Fields(table, fields), reader })
+        Ok(Self { things, photos, scored: Scored::Fields(table, fields), reader })
     }
 
     pub(super) fn describe(&self) -> Description {
@@ -70,7 +77,8 @@ impl Generation {
             geographic: manifest.geo_reference.is_some(),
             can_ask: true,
             cells: cells.collect(),
-            views: Vec::new(),
+            views: self.photos.clone(),
+            at_work: false,
             fetched: None,
             position_m: None,
         }

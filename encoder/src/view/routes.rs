@@ -9,10 +9,12 @@ use axum::response::{IntoResponse, Response};
 use axum::{Json, Router};
 use serde_json::Value;
 use slag_service::problem::Problem;
-use slag_view::Description;
+use slag_view::{Description, Words};
 
 use super::error::ViewError;
 use super::viewer::Viewer;
+use crate::diff::Diff;
+use crate::watch::{Watch, Work};
 
 /// Answers in a page of `/v1/query` unless the request says otherwise.
 const DEFAULT_LIMIT: usize = 10;
@@ -30,8 +32,12 @@ type Pairs = Result<Query<Vec<(String, String)>>, QueryRejection>;
 /// Returns the page and its routes.
 pub fn router(viewer: Viewer) -> Router {
     Router::new()
+        .route("/v1/work", axum::routing::get(work))
+        .route("/v1/work/pictures/{number}", axum::routing::get(work_picture))
+        .route("/v1/changes", axum::routing::get(changes))
         .route("/v1/view", axum::routing::get(describe))
         .route("/v1/view/scores", axum::routing::get(scores))
+        .route("/v1/view/words", axum::routing::get(words))
         .route("/v1/view/cells/{id}", axum::routing::get(cell))
         .route("/v1/view/photos/{number}", axum::routing::get(photo))
         .route("/v1/query", axum::routing::get(query))
@@ -50,6 +56,10 @@ async fn blocking<T: Send + 'static>(
 
 async fn describe(State(viewer): AppState) -> Result<Json<Description>, Problem> {
     blocking(viewer, Viewer::describe).await.map(Json)
+}
+
+async fn words(State(viewer): AppState) -> Result<Json<Words>, Problem> {
+    blocking(viewer, Viewer::words).await.map(Json)
 }
 
 async fn cell(State(viewer): AppState, Path(id): Path<String>, pairs: Pairs) -> Result<Response, Problem> {
@@ -79,6 +89,27 @@ async fn query(State(viewer): AppState, pairs: Pairs) -> Result<Json<Value>, Pro
         })
     };
     blocking(viewer, work).await.map(Json)
+}
+
+/// Tells what the encode does that this page watches; null where it watches none.
+async fn work(State(viewer): AppState) -> Json<Option<Work>> {
+    Json(viewer.work().map(Watch::look))
+}
+
+/// Sends a picture of masks, by its number in the state of the encode.
+async fn work_picture(State(viewer): AppState, Path(number): Path<String>) -> Result<Response, Problem> {
+    let number = self::number("number", &number)?;
+    let picture = viewer.work().and_then(|watch| watch.picture(number)).map(|jpeg| jpeg.to_vec());
+    let picture = picture.ok_or_else(|| {
+        let detail = format!("picture {number} is not kept any more; GET /v1/work lists the last ones");
+        Problem::new(StatusCode::NOT_FOUND, "no-such-picture", "No such picture", detail)
+    })?;
+    Ok(([(header::CONTENT_TYPE, "image/jpeg")], picture).into_response())
+}
+
+/// Compares the published generation with the one before it.
+async fn changes(State(viewer): AppState) -> Result<Json<Diff>, Problem> {
+    blocking(viewer, |viewer| viewer.changes()).await.map(Json)
 }
 
 /// Sends a photo as it lies on disk, by its number in the description.

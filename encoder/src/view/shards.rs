@@ -1,9 +1,11 @@
 //! The smallest shard of a cell, and scores of questions with negatives.
 
+use glam::DVec3;
 use slag_common::container::AlignedBytes;
 use slag_common::manifest::CellRecord;
 use slag_common::shard::ShardLayout;
 use slag_math::relevancy::relevancy;
+use slag_view::Photo;
 
 use super::error::ViewError;
 use crate::store::StoreReader;
@@ -15,6 +17,13 @@ pub(super) struct Shard {
 }
 
 impl Shard {
+    /// Returns the photos whose poses it has.
+    pub(super) fn photos(&self) -> Vec<Photo> {
+        let origin = DVec3::from(self.layout.header.origin_in_world);
+        let photos = self.layout.photo_poses(&self.bytes);
+        photos.into_iter().flat_map(|photos| Photo::of_shard(origin, photos)).collect()
+    }
+
     /// Returns the score of each Gaussian's centroid; NaN without one.
     pub(super) fn scores(&self, vectors: &[Vec<f32>]) -> Vec<f32> {
         let view = self.layout.view(&self.bytes);

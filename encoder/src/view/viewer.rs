@@ -6,13 +6,15 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use glam::Vec3;
 use slag_common::{Hash32, View};
 use slag_models::TextEncoder;
-use slag_view::Description;
+use slag_view::{Description, Word, Words};
 
 use super::error::ViewError;
 use super::generation::Generation;
 use super::photos;
 use super::splat::Splat;
+use crate::diff::{self, Diff};
 use crate::store::StoreReader;
+use crate::watch::Watch;
 
 /// Opens the text encoder of a store; the error says what to do.
 pub type OpenText = Box<dyn Fn(&StoreReader) -> Result<Box<dyn TextEncoder>, String> + Send + Sync>;
@@ -29,6 +31,8 @@ pub struct Shown {
     pub up: Option<Vec3>,
     /// Opens the store's text encoder, at the first question.
     pub open_text: OpenText,
+    /// The encode into the store that is watched.
+    pub work: Option<Arc<Watch>>,
 }
 
 /// A text encoder and the id of its space.
@@ -78,8 +82,26 @@ impl Viewer {
         if let Some(up) = self.shown.up.filter(|_| !description.metric) {
             description.up = up;
         }
-        description.views = photos::describe(&self.shown.views);
+        // Photos that are at hand count more than published poses: they have pictures.
+        if !self.shown.views.is_empty() {
+            description.views = photos::describe(&self.shown.views);
+        }
+        description.at_work = self.shown.work.is_some();
         Ok(description)
+    }
+
+    /// Returns the encode that is watched.
+    pub(super) fn work(&self) -> Option<&Watch> {
+        self.shown.work.as_deref()
+    }
+
+    /// Compares the store's current generation with the one before it.
+    pub(super) fn changes(&self) -> Result<Diff, ViewError> {
+        let generation = self.generation()?;
+        let reader = &generation.reader;
+        let before = reader.previous().ok_or(ViewError::OneGeneration)?;
+        let of = |published| diff::Generation { reader, published };
+        Ok(diff::diff(of(before), of(reader.current()))?)
     }
 
     /// Returns the message of a cell's Gaussians.
@@ -102,6 +124,33 @@ impl Viewer {
         negatives: &[String],
         work: impl FnOnce(&Generation, &[Vec<f32>]) -> Result<T, ViewError>,
     ) -> Result<T, ViewError> {
+        self.with_text_encoder(|generation, encoder| {
+            let texts = std::iter::once(text).chain(negatives.iter().map(String::as_str));
+            let vectors = texts.map(|text| encoder.encode(text)).collect::<Result<Vec<_>, _>>()?;
+            work(generation, &vectors)
+        })
+    }
+
+    /// Returns the words that the current generation's text model knows, each with the number of things that it finds.
+    pub(super) fn words(&self) -> Result<Words, ViewError> {
+        self.with_text_encoder(|generation, encoder| {
+            let known = encoder.vocabulary().unwrap_or_default();
+            let known = known[..known.len().min(Words::MAX)].to_vec();
+            let manifest = generation.reader.manifest();
+            let mut count = |word: String| -> Result<Word, ViewError> {
+                let n_things = generation.things.count(manifest, &encoder.encode(&word)?);
+                Ok(Word { word, n_things })
+            };
+            let words = known.into_iter().map(&mut count).collect::<Result<_, ViewError>>()?;
+            Ok(Words::new(manifest.generation, words))
+        })
+    }
+
+    /// Runs work with the current generation's text encoder.
+    fn with_text_encoder<T>(
+        &self,
+        work: impl FnOnce(&Generation, &mut dyn TextEncoder) -> Result<T, ViewError>,
+    ) -> Result<T, ViewError> {
         let generation = self.generation()?;
         let encoder_id = generation.reader.manifest().encoder.id;
         let mut opened = locked(&self.text);
@@ -110,9 +159,7 @@ impl Viewer {
             *opened = Some((encoder_id, text));
         }
         let Some((_, encoder)) = opened.as_mut() else { return Err(ViewError::NoStore) };
-        let texts = std::iter::once(text).chain(negatives.iter().map(String::as_str));
-        let vectors = texts.map(|text| encoder.encode(text)).collect::<Result<Vec<_>, _>>()?;
-        work(&generation, &vectors)
+        work(&generation, &mut **encoder)
     }
 }
 

@@ -1,12 +1,16 @@
 // Ties the three modules together: state.ts (what a link holds), network.ts (what is asked), drawing/ (what is seen).
 
 import "./style.css";
+import { ChangesPanel } from "./changes";
 import { Drawing } from "./drawing/drawing";
 import type { Scores } from "./messages";
-import { type Answer, type Answers, type Description, describe, fetchAnswers, fetchPhoto, fetchScores, follow, NotFound, parseQuestion, setToken, Unauthorized } from "./network";
-import { askToken, panel, say, showAnswers, showDetails, showFacts, showHistory, showLegend, showPhoto, showSecond } from "./panel";
+import { type Answer, type Answers, type Description, describe, fetchAnswers, fetchPhoto, fetchScores, fetchWords, fetchWork, follow, NotFound, parseQuestion, setToken, Unauthorized, type Word } from "./network";
+import { askToken, panel, say, showAnswers, showDetails, showFacts, showLegend, showPhoto, showSecond } from "./panel";
+import { PlacesToStand } from "./places";
 import { readHistory, readState, remember, writeState } from "./state";
 import { Streaming } from "./streaming";
+import { Combobox, suggest } from "./suggestions";
+import { WorkPanel } from "./work";
 
 const PAUSE_IN_TYPING_MS = 150;
 const LOOK_EVERY_MS = 4000;
@@ -17,6 +21,10 @@ const state = readState();
 let description: Description;
 let drawing: Drawing;
 let streaming: Streaming;
+let places: PlacesToStand;
+let changes: ChangesPanel;
+/** Of the encode that the page watches. */
+let work: WorkPanel | null = null;
 let scores: Scores | null = null;
 /** Of the second question, and its level of threshold. */
 let second: { scores: Scores; threshold: number } | null = null;
@@ -27,6 +35,9 @@ let asking = new AbortController();
 let typing = 0;
 let looking = 0;
 let photoOpened = 0;
+/** Of the generation that is drawn. */
+let words: Word[] = [];
+const comboboxes: Combobox[] = [];
 
 const levelOf = (score: number, range: Scores) => Math.min(255, Math.max(1, Math.round(((score - range.min) / (range.max - range.min || 1)) * 255)));
 
@@ -53,6 +64,7 @@ function choose(index: number | null): void {
   drawing.showAnswers(thing, answers, index);
   const answer = index === null ? null : answers[index];
   showDetails(thing, answer, description.geographic);
+  void places.ask(answer, description);
   if (!answer) return;
   drawing.flyToAnswer(answer);
   const photo = description.views.findIndex(({ name }) => name === answer.evidence?.photo);
@@ -120,7 +132,6 @@ async function ask(): Promise<void> {
     choose(null);
     say(first ? (answers.length > 0 ? `${answers.length} found` : (first[1].none ?? "Nothing found")) : "");
     if (first) remember(state.question);
-    showHistory(readHistory());
     document.documentElement.dataset.answered = [state.question, state.second].filter(Boolean).join(" | ");
   } catch (error) {
     if (!signal.aborted) report(error);
@@ -137,6 +148,8 @@ function report(error: unknown): void {
 
 function open(): void {
   drawing = new Drawing(panel.canvas, panel.labels, description, leavePhoto);
+  places = new PlacesToStand(drawing);
+  changes = new ChangesPanel(drawing, panel.changes);
   panel.form.hidden = !description.can_ask;
   if (state.camera) drawing.placeAt(state.camera);
   drawing.showRobot(description);
@@ -146,7 +159,14 @@ function open(): void {
   if (description.can_ask && (state.question || state.second)) void ask();
 }
 
+/** Learns which words the model knows; without them, only the history is suggested. */
+async function learnWords(): Promise<void> {
+  words = description.can_ask ? await fetchWords().catch(() => []) : [];
+  for (const combobox of comboboxes) combobox.refresh();
+}
+
 function stream(): void {
+  void learnWords();
   streaming = new Streaming(description, drawing, () => {
     document.documentElement.dataset.firstPictureMs ??= performance.now().toFixed(0);
     if (streaming.isComplete) document.documentElement.dataset.complete = "";
@@ -174,6 +194,7 @@ async function look(): Promise<void> {
       drawing.cells.clear();
       drawing.marks.showCells(seen.cells);
       stream();
+      if (panel.showChanges.checked) void changes.show();
       if (description.can_ask && (state.question || state.second)) await ask();
       say(isOtherGeneration ? `The service has generation ${seen.generation} now.` : "Other cells are on board now.");
     } else {
@@ -219,7 +240,8 @@ function listen(): void {
     event.preventDefault();
     read();
   });
-  for (const box of [panel.question, panel.second]) {
+  for (const [box, list] of [[panel.question, panel.questionSuggestions], [panel.second, panel.secondSuggestions]] as const) {
+    comboboxes.push(new Combobox(box, list, (line) => suggest(line, readHistory(), words), read));
     box.addEventListener("input", () => {
       clearTimeout(typing);
       typing = window.setTimeout(read, PAUSE_IN_TYPING_MS);
@@ -240,6 +262,7 @@ function listen(): void {
   toggle(panel.showGrid, () => drawing.marks.ground);
   toggle(panel.showCells, () => drawing.marks.cells);
   toggle(panel.showPhotos, () => drawing.marks.photos);
+  panel.showChanges.addEventListener("change", () => (panel.showChanges.checked ? void changes.show() : changes.hide()));
   panel.copyLink.addEventListener("click", () => {
     state.camera = drawing.pose();
     writeState(state);
@@ -249,6 +272,7 @@ function listen(): void {
   });
   panel.whole.addEventListener("click", () => drawing.showWhole());
   panel.canvas.addEventListener("click", (event) => {
+    if (places.chooseAt(event.offsetX, event.offsetY)) return;
     const index = drawing.answerAt(event.offsetX, event.offsetY);
     if (index !== null) return choose(index);
     const photo = drawing.photoAt(description.views, event.offsetX, event.offsetY);
@@ -261,20 +285,34 @@ function listen(): void {
   });
 }
 
+/** Shows the encode that the program is at, if it is at one. */
+async function watchWork(): Promise<boolean> {
+  if (work) return true;
+  if (!(await fetchWork().catch(() => null))) return false;
+  work = new WorkPanel(panel.work, () => {
+    // The first generation is found by the next try to open, another one by the next look.
+    if (description) lookSoon();
+  });
+  void work.follow();
+  return true;
+}
+
 async function start(): Promise<void> {
   if (!document.createElement("canvas").getContext("webgl2")) {
     return say("This browser has no WebGL 2, which drawing the scene needs. Switch on hardware acceleration or take another browser.", true);
   }
-  showHistory(readHistory());
   say("Opening…");
   try {
     description = await withToken(describe);
   } catch (error) {
-    say(error instanceof NotFound ? "This service has no scene to show (it does not answer /v1/view)." : String((error as Error).message), true);
+    const isAtWork = await watchWork();
+    if (isAtWork) say("Nothing is published yet.");
+    else say(error instanceof NotFound ? "This service has no scene to show (it does not answer /v1/view)." : String((error as Error).message), true);
     setTimeout(() => void start(), LOOK_EVERY_MS);
     return;
   }
   say("");
+  if (description.at_work) void watchWork();
   open();
   listen();
   lookSoon(LOOK_EVERY_MS);

@@ -34,6 +34,8 @@ export interface Description {
   metric: boolean;
   geographic: boolean;
   can_ask: boolean;
+  /** Whether the program is making the scene. */
+  at_work?: boolean;
   cells: Cell[];
   views: Photo[];
   /** What a robot fetched. */
@@ -55,6 +57,61 @@ export interface Answer {
   /** How well the relation of a phrase holds, 0.5 to 1. */
   degree?: number;
   related_to?: { thing: string; position_in_world: Vector; score?: number }[];
+}
+
+/** A thing of a generation. */
+export interface Thing {
+  id: string;
+  position_in_world: Vector;
+  box_in_world: { min: Vector; max: Vector };
+}
+
+/** Reply of `/v1/changes`: from the generation before to the present one. */
+export interface Changes {
+  old_generation: number;
+  new_generation: number;
+  n_same: number;
+  n_stayed: number;
+  appeared: Thing[];
+  went: Thing[];
+  moved: { from: Thing; to: Thing }[];
+}
+
+/** Reply of `/v1/work`: an encode, as far as it is. */
+export interface Work {
+  /** How it ended. */
+  ended: string | null;
+  secs: number;
+  counted: { stage: string; unit: string; total: number; done: number };
+  phases: { phase: string; secs: number }[];
+  busy_secs: Record<string, number>;
+  views: { name: string; position_m: Vector; state: string; n_masks: number | null; reason?: string }[];
+  cells: { min: Vector; max: Vector }[];
+  /** Number, view and masks of the last pictures. */
+  pictures: [number, string, number][];
+}
+
+/** A word that the text model knows, and how many things are found by it. */
+export interface Word {
+  word: string;
+  n_things: number;
+}
+
+/** A place to stand; `/v1/goal` says more. */
+export interface Goal {
+  position_in_world: Vector;
+  yaw_rad: number;
+  sensor_in_world: Vector;
+  clearance_m: number;
+  visible_share: number;
+  path_m: number;
+}
+
+/** Places to stand near a thing, or the reason why there is none. */
+export interface Goals {
+  goals: Goal[];
+  thing: Vector | null;
+  none: { kind: string; detail: string } | null;
 }
 
 export interface Answers {
@@ -110,6 +167,35 @@ export async function describe(): Promise<Description> {
   return (await get("/v1/view")).json();
 }
 
+/** The encode that the program is at; null where it is at none. */
+export async function fetchWork(): Promise<Work | null> {
+  return (await get("/v1/work")).json();
+}
+
+/** A picture of masks, by its number. */
+export async function fetchWorkPicture(number: number): Promise<Blob> {
+  return (await get(`/v1/work/pictures/${number}`)).blob();
+}
+
+/** What changed since the generation before, from a store's page or a robot's. */
+export async function fetchChanges(): Promise<Changes> {
+  const reply = await (await get("/v1/changes")).json();
+  if (reply.to === undefined) return reply;
+  if (reply.none) throw new Error(reply.none.detail);
+  const thing = (of: { id: string; position_in_world: Vector; box_min_in_world: Vector; box_max_in_world: Vector }): Thing =>
+    ({ id: of.id, position_in_world: of.position_in_world, box_in_world: { min: of.box_min_in_world, max: of.box_max_in_world } });
+  return {
+    old_generation: reply.from.generation, new_generation: reply.to.generation, n_same: reply.n_same, n_stayed: reply.n_stayed,
+    appeared: reply.appeared.map(thing), went: reply.went.map(thing),
+    moved: reply.moved.map(({ from, to }: { from: Parameters<typeof thing>[0]; to: Parameters<typeof thing>[0] }) => ({ from: thing(from), to: thing(to) })),
+  };
+}
+
+/** The words that the text model knows, those of most things first; none if it takes any text. */
+export async function fetchWords(): Promise<Word[]> {
+  return (await (await get("/v1/view/words")).json()).words;
+}
+
 /** The picture of a photo, by its index in the description. */
 export async function fetchPhoto(index: number): Promise<Blob> {
   return (await get(`/v1/view/photos/${index}`)).blob();
@@ -144,6 +230,13 @@ function parametersOf(question: Question): URLSearchParams {
 
 export async function fetchScores(question: Question, signal: AbortSignal): Promise<Scores> {
   return readScores(await (await get(`/v1/view/scores?${parametersOf(question)}`, signal)).arrayBuffer());
+}
+
+/** Places to stand near a thing, by its id; a robot's radius in metres. */
+export async function fetchGoals(id: string, radiusM: number, signal: AbortSignal): Promise<Goals> {
+  const parameters = new URLSearchParams({ id, radius_m: String(radiusM) });
+  const reply = await (await get(`/v1/goal?${parameters}`, signal)).json();
+  return { goals: reply.goals, thing: reply.thing?.position_in_world ?? null, none: reply.none };
 }
 
 /** The things that answer a question; from the robot's `/v1/query`, or from `/query` where that is absent. */

@@ -1,7 +1,7 @@
 // The panel's elements, and what is written in them.
 
 import { rampColour } from "./drawing/ramp";
-import type { Answer, Description, Photo } from "./network";
+import type { Answer, Description, Goal, Photo } from "./network";
 
 function element<T extends HTMLElement>(id: string): T {
   const found = document.getElementById(id);
@@ -15,12 +15,17 @@ export const panel = {
   form: element<HTMLFormElement>("ask"),
   question: element<HTMLInputElement>("question"),
   second: element<HTMLInputElement>("second"),
+  questionSuggestions: element("question-suggestions"),
+  secondSuggestions: element("second-suggestions"),
   blend: element<HTMLImageElement>("blend"),
   threshold: element<HTMLInputElement>("threshold"),
   showBoxes: element<HTMLInputElement>("show-boxes"),
   showGrid: element<HTMLInputElement>("show-grid"),
   showCells: element<HTMLInputElement>("show-cells"),
   showPhotos: element<HTMLInputElement>("show-photos"),
+  showChanges: element<HTMLInputElement>("show-changes"),
+  work: element("work"),
+  changes: element("changes"),
   copyLink: element<HTMLButtonElement>("copy-link"),
   whole: element<HTMLButtonElement>("whole"),
 };
@@ -45,10 +50,7 @@ export function showFacts(description: Description, nDrawn: number, stepM: numbe
     `grid ${stepM} ${description.metric ? "m" : "units"}`,
   ].filter(Boolean).join(" · ");
   element("photos-label").hidden = description.views.length === 0;
-}
-
-export function showHistory(questions: string[]): void {
-  element("history").replaceChildren(...questions.map((question) => new Option(question, question)));
+  element("changes-label").hidden = description.generation < 2;
 }
 
 export function showLegend(range: { min: number; max: number } | null, level: number): void {
@@ -126,6 +128,39 @@ export function showDetails(name: string, answer: Answer | null, isGeographic: b
     list.append(dt, dd);
   }
   section.replaceChildren(heading, list);
+}
+
+/** Lists places to stand in the details, or says why there is none. */
+export function showPlaces(goals: Goal[], none: string | null, chosen: number | null, onChoose: (index: number) => void): void {
+  const places = document.createElement("div");
+  places.id = "places";
+  const heading = document.createElement("h3");
+  heading.textContent = "Places to stand";
+  places.append(heading);
+  const list = document.createElement("ol");
+  list.append(...goals.map((goal, index) => {
+    const button = document.createElement("button");
+    button.type = "button";
+    button.setAttribute("aria-pressed", String(index === chosen));
+    const [x, y] = goal.position_in_world.map((v) => v.toFixed(2));
+    button.textContent = `${x}, ${y} m · sees ${Math.round(goal.visible_share * 100)} % · clear by ${goal.clearance_m.toFixed(2)} m · way ${goal.path_m.toFixed(1)} m`;
+    button.addEventListener("click", () => onChoose(index));
+    const item = document.createElement("li");
+    item.append(button);
+    return item;
+  }));
+  if (goals.length > 0) places.append(list);
+  if (none) {
+    const reason = document.createElement("p");
+    reason.textContent = none;
+    places.append(reason);
+  }
+  const section = element("details");
+  const before = section.querySelector("#places");
+  const focused = [...(before?.querySelectorAll("button") ?? [])].indexOf(document.activeElement as HTMLButtonElement);
+  if (before) before.replaceWith(places);
+  else section.append(places);
+  if (focused >= 0) places.querySelectorAll("button")[focused]?.focus();
 }
 
 const SVG = "http://www.w3.org/2000/svg";

@@ -1,10 +1,14 @@
 //! The messages of the page, read as the page reads them and compared with the other routes.
 
+use std::path::PathBuf;
+
+use glam::DAffine3;
 use half::f16;
-use slag_common::Gaussians;
 use slag_common::appearance::AppearanceColumns;
 use slag_common::container::AlignedBytes;
+use slag_common::photo_poses::BuiltPhotoPoses;
 use slag_common::shard::{Additions, ShardLayout};
+use slag_common::{Distortion, Gaussians, Intrinsics, View};
 
 use super::*;
 
@@ -153,4 +157,60 @@ async fn page_is_beside_the_api() {
     let expected = if slag_view::is_built() { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
     assert_eq!(status, expected, "{body}");
     assert!(!slag_view::is_built() || headers.contains_key("content-security-policy"));
+}
+
+#[tokio::test]
+async fn photo_poses_on_board_are_handed_on() {
+    let [near, _] = two_cells();
+    let (x, z) = (near.view().header.origin_in_world[0], near.view().header.origin_in_world[2]);
+    let view = View {
+        name: "a.jpg".into(),
+        image_path: PathBuf::new(),
+        intrinsics: Intrinsics {
+            width_px: 64,
+            height_px: 48,
+            focal_x_px: 50.0,
+            focal_y_px: 50.0,
+            centre_x_px: 32.0,
+            centre_y_px: 24.0,
+            distortion: Distortion::None,
+        },
+        camera_from_world: DAffine3::from_translation(DVec3::new(-2.0, 0.0, 1.5)),
+    };
+    let mut photos = BuiltPhotoPoses::default();
+    photos.push(DVec3::new(x, 0.0, z), &view);
+    let mut bytes = Vec::new();
+    let additions = Additions { photo_poses: photos.view(), ..Additions::default() };
+    near.view().write_with(&mut bytes, additions).expect("writes to memory");
+    let bytes = AlignedBytes::copy_of(&bytes);
+    let layout = ShardLayout::check(&bytes).expect("a valid shard");
+    let shard = BuiltShard { layout, bytes, embeddings: near.embeddings.clone() };
+    let service = Service::new(Some(&[shard]), Settings::default());
+    let (_, _, described) = service.get("/v1/view").await;
+    let [photo] = &described["views"].as_array().expect("photos")[..] else { panic!("one: {described}") };
+    let y = near.view().header.origin_in_world[1];
+    assert_eq!(photo["position_m"], serde_json::json!([2.0, y, -1.5]));
+    assert_eq!((&photo["name"], &photo["has_picture"]), (&"a.jpg".into(), &false.into()));
+}
+
+/// The things of a word are those that the query route answers it with.
+#[tokio::test]
+async fn words_are_counted_as_they_are_answered() {
+    let service = Service::new(Some(&v1::room_with(None)), Settings::default());
+    let (status, _, words) = service.get("/v1/view/words").await;
+    assert_eq!(status, StatusCode::OK);
+    // Two mugs, a table, and nothing of axis 2.
+    let expected = serde_json::json!([
+        { "word": "0", "n_things": 2 }, { "word": "1", "n_things": 1 }, { "word": "2", "n_things": 0 }
+    ]);
+    assert_eq!(words["words"], expected);
+    let listed = words["words"].as_array().expect("words");
+    let counts: Vec<u64> = listed.iter().map(|word| word["n_things"].as_u64().expect("a count")).collect();
+    assert!(counts.is_sorted_by(|a, b| a >= b), "{words}");
+    for word in listed {
+        let uri = format!("/v1/query?kind=objects&text={}", word["word"].as_str().expect("a word"));
+        let (_, _, reply) = service.get(&uri).await;
+        let answers = reply["results"][0]["answers"].as_array().expect("answers");
+        assert_eq!(word["n_things"], answers.len(), "{uri}");
+    }
 }

@@ -40,6 +40,11 @@ pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
         )
         .get("/v1/view/scores", "the score of every Gaussian on board, a byte each, in binary", view::scores)
         .parameters(view::scores_parameters())
+        .get(
+            "/v1/view/words",
+            "the words that the text model knows, and how many things on board each finds",
+            view::words,
+        )
         .get("/v1/view/cells/{id}", "the Gaussians of a cell, 16 bytes each, in binary", view::cell)
         .parameters(view::cell_parameters())
         .get("/v1/goal", "places to stand near a thing: reached, clear, and in sight of it", goal::goal)

@@ -9,7 +9,7 @@ use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use slag_service::problem::Problem;
 use slag_service::routes::Parameter;
-use slag_view::Description;
+use slag_view::{Description, Words};
 
 use super::body;
 use super::params::{self, Pairs, number};
@@ -63,27 +63,41 @@ pub async fn cell(
     message(&app, move |app, budget| app.engine.view_cell(cell_id, generation, budget)).await
 }
 
+pub async fn words(State(app): State<Arc<App>>) -> Result<Json<Words>, Problem> {
+    within_limits(&app, |app, budget| app.engine.view_words(budget).map_err(query_problem)).await.map(Json)
+}
+
 /// Makes a message within the limits of a query.
 async fn message(
     app: &Arc<App>,
     make: impl FnOnce(&App, &Budget) -> Result<Option<Vec<u8>>, QueryError> + Send + 'static,
 ) -> Result<Response, Problem> {
-    let permit =
-        Arc::clone(&app.permits).try_acquire_owned().map_err(|_| overloaded(app.settings.max_queries))?;
-    let making = app.blocking(move |app| {
-        // Held until the work is done, even if the client has given up.
-        let _permit = permit;
-        app.reload_if_stale();
-        let made = make(app, &app.query_budget()).map_err(query_problem)?;
+    let making = within_limits(app, move |app, budget| {
+        let made = make(app, budget).map_err(query_problem)?;
         made.ok_or_else(|| {
             let detail =
                 "the cell is not on board, or of another generation; GET /v1/view lists those that are";
             Problem::new(StatusCode::NOT_FOUND, "no-such-cell", "No such cell", detail)
         })
     });
+    Ok(([(header::CONTENT_TYPE, "application/octet-stream")], making.await?).into_response())
+}
+
+/// Runs work within the limits of a query.
+async fn within_limits<T: Send + 'static>(
+    app: &Arc<App>,
+    work: impl FnOnce(&App, &Budget) -> Result<T, Problem> + Send + 'static,
+) -> Result<T, Problem> {
+    let permit =
+        Arc::clone(&app.permits).try_acquire_owned().map_err(|_| overloaded(app.settings.max_queries))?;
+    let making = app.blocking(move |app| {
+        // Held until the work is done, even if the client has given up.
+        let _permit = permit;
+        app.reload_if_stale();
+        work(app, &app.query_budget())
+    });
     let limit = app.settings.query_timeout;
-    let bytes = tokio::time::timeout(limit, making).await.map_err(|_| timeout(limit))??;
-    Ok(([(header::CONTENT_TYPE, "application/octet-stream")], bytes).into_response())
+    tokio::time::timeout(limit, making).await.map_err(|_| timeout(limit))?
 }
 
 fn parse_scores(pairs: &[(String, String)]) -> Result<(String, Negatives), RequestError> {

@@ -28,8 +28,7 @@ pub struct Cli {
 pub enum Command {
     /// Evaluates stores and encoders against labels.
     #[cfg(feature = "measure")]
-    #[command(subcommand)]
-    Eval(eval::EvalCommand),
+    Eval(eval::EvalArgs),
     /// Generates scenes, crops and photos with known contents.
     #[command(subcommand)]
     Generate(generate::GenerateCommand),
@@ -48,7 +47,7 @@ pub fn run(cli: Cli) -> Exit {
     let progress = progress.as_ref();
     let result = match cli.command {
         #[cfg(feature = "measure")]
-        Command::Eval(command) => eval::run(&command, progress, json),
+        Command::Eval(args) => eval::run(&args, progress, json),
         Command::Generate(command) => generate::run(&command, progress),
         Command::Demo(args) => demo::run(&args, progress, json),
         #[cfg(feature = "measure")]

@@ -2,17 +2,22 @@
 
 import { SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
-import type { Answer, Description, Photo, Vector } from "../network";
+import type { Change } from "../changes";
+import type { Answer, Description, Goal, Photo, Vector } from "../network";
 import { Camera } from "./camera";
 import { Cells } from "./cells";
 import { boxOf, Marks } from "./marks";
+import { Places } from "./places";
 
 const MAX_LABELS = 8;
+/** A click this near to a mark means it. */
+const NEAR_PX = 14;
 
 export class Drawing {
   readonly camera: Camera;
   readonly cells: Cells;
   readonly marks: Marks;
+  readonly places: Places;
   /** Side of a square of the grid. */
   stepM = 1;
   private readonly renderer: THREE.WebGLRenderer;
@@ -35,6 +40,7 @@ export class Drawing {
     this.scene.add(new SparkRenderer({ renderer: this.renderer, onDirty: () => this.redraw() }), this.world);
     this.cells = new Cells(this.world, this.box, this.up);
     this.marks = new Marks(this.world);
+    this.places = new Places(this.world);
     this.camera = new Camera(canvas, this.up, () => this.redraw(), onLeavePhoto);
     const themed = () => {
       this.scene.background = new THREE.Color(this.isDark.matches ? 0x14181d : 0xeceff2);
@@ -81,8 +87,16 @@ export class Drawing {
 
   flyToAnswer(answer: Answer): void {
     const box = boxOf(answer);
-    const centre = new THREE.Vector3(...box.centre).add(this.world.position);
-    this.camera.flyTo(...this.camera.frame(centre, Math.max(new THREE.Vector3(...box.size).length() * 1.5, 0.5)));
+    this.flyTo(new THREE.Vector3(...box.centre), new THREE.Vector3(...box.size));
+  }
+
+  flyToBox({ min, max }: { min: Vector; max: Vector }): void {
+    const [low, high] = [new THREE.Vector3(...min), new THREE.Vector3(...max)];
+    this.flyTo(low.clone().add(high).multiplyScalar(0.5), high.sub(low));
+  }
+
+  showChanges(changes: Change[]): void {
+    this.marks.showChanges(changes);
     this.redraw();
   }
 
@@ -110,13 +124,19 @@ export class Drawing {
   /** Index of the photo whose camera is under a point of the canvas, if photos are shown. */
   photoAt(photos: Photo[], xPx: number, yPx: number): number | null {
     if (!this.marks.photos.visible) return null;
-    const distances = photos.map((photo) => {
-      const point = new THREE.Vector3(...photo.position_m).add(this.world.position).project(this.camera.camera);
-      const [x, y] = [((point.x + 1) / 2) * this.canvas.clientWidth, ((1 - point.y) / 2) * this.canvas.clientHeight];
-      return Math.abs(point.z) > 1 ? Infinity : Math.hypot(x - xPx, y - yPx);
-    });
-    const nearest = distances.indexOf(Math.min(...distances));
-    return nearest >= 0 && distances[nearest] < 14 ? nearest : null;
+    return this.nearest(photos.map((photo) => photo.position_m), xPx, yPx);
+  }
+
+  /** Index of the place to stand under a point of the canvas. */
+  placeUnder(goals: Goal[], xPx: number, yPx: number): number | null {
+    return this.nearest(goals.map((goal) => goal.position_in_world), xPx, yPx);
+  }
+
+  /** Looks as a robot at a place does, at the thing. */
+  lookFrom(goal: Goal, thing: Vector): void {
+    const local = (point: Vector) => new THREE.Vector3(...point).add(this.world.position);
+    this.camera.flyTo(local(goal.sensor_in_world), local(thing));
+    this.redraw();
   }
 
   showRobot(description: Description): void {
@@ -132,6 +152,22 @@ export class Drawing {
   placeAt(pose: { position: Vector; target: Vector }): void {
     const local = (point: Vector) => new THREE.Vector3(...point).add(this.world.position);
     this.camera.place(local(pose.position), local(pose.target));
+    this.redraw();
+  }
+
+  /** Index of the point of the world that is drawn within a few pixels of a point of the canvas. */
+  private nearest(points: Vector[], xPx: number, yPx: number): number | null {
+    const distances = points.map((place) => {
+      const point = new THREE.Vector3(...place).add(this.world.position).project(this.camera.camera);
+      const [x, y] = [((point.x + 1) / 2) * this.canvas.clientWidth, ((1 - point.y) / 2) * this.canvas.clientHeight];
+      return Math.abs(point.z) > 1 ? Infinity : Math.hypot(x - xPx, y - yPx);
+    });
+    const nearest = distances.indexOf(Math.min(...distances));
+    return nearest >= 0 && distances[nearest] < NEAR_PX ? nearest : null;
+  }
+
+  private flyTo(centre: THREE.Vector3, size: THREE.Vector3): void {
+    this.camera.flyTo(...this.camera.frame(centre.add(this.world.position), Math.max(size.length() * 1.5, 0.5)));
     this.redraw();
   }
 

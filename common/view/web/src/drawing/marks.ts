@@ -1,11 +1,13 @@
 // What stands over the splat: boxes of answers, the ground grid, photos' frusta, and the robot.
 
 import * as THREE from "three";
+import type { Change } from "../changes";
 import type { Answer, Description, Photo, Vector } from "../network";
 
+const CHANGE_COLOURS = { appeared: 0x4fd17a, went: 0xe05a4e, moved: 0xf2b134 };
 const CELL_COLOURS = { on_board: 0x8593a3, stale: 0xd99a2b, missing: 0xe05a4e };
 
-function disposeAll(group: THREE.Group): void {
+export function disposeAll(group: THREE.Group): void {
   group.traverse((object) => {
     if (!(object instanceof THREE.Mesh || object instanceof THREE.LineSegments)) return;
     object.geometry.dispose();
@@ -20,11 +22,12 @@ export class Marks {
   readonly cells = new THREE.Group();
   readonly photos = new THREE.Group();
   readonly robot = new THREE.Group();
+  readonly changes = new THREE.Group();
 
   constructor(parent: THREE.Object3D) {
     this.photos.visible = this.cells.visible = false;
     this.photos.renderOrder = this.robot.renderOrder = 5;
-    parent.add(this.boxes, this.ground, this.cells, this.photos, this.robot);
+    parent.add(this.boxes, this.ground, this.cells, this.photos, this.robot, this.changes);
   }
 
   /** Each box has a solid twin that is never drawn, for clicks. Only transparent things are drawn after the splats. */
@@ -71,6 +74,24 @@ export class Marks {
       const lines = new THREE.Box3Helper(box, CELL_COLOURS[state]);
       (lines.material as THREE.LineBasicMaterial).transparent = true;
       this.cells.add(lines);
+    }
+  }
+
+  /** Boxes of things that changed, coloured by the kind of change; a line leads from where one was that moved. */
+  showChanges(changes: Change[]): void {
+    disposeAll(this.changes);
+    for (const { kind, box, from, to } of changes) {
+      const [min, max] = [new THREE.Vector3(...box.min), new THREE.Vector3(...box.max)];
+      const edges = new THREE.EdgesGeometry(new THREE.BoxGeometry(...max.clone().sub(min).toArray()));
+      const material = new THREE.LineBasicMaterial({ color: CHANGE_COLOURS[kind], depthTest: false, transparent: true });
+      const lines = new THREE.LineSegments(edges, material);
+      lines.position.copy(min.add(max).multiplyScalar(0.5));
+      lines.renderOrder = 11;
+      this.changes.add(lines);
+      if (!from) continue;
+      const way = new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints([new THREE.Vector3(...from), new THREE.Vector3(...to)]), material.clone());
+      way.renderOrder = 11;
+      this.changes.add(way);
     }
   }
 

@@ -10,6 +10,7 @@ use super::figures::Figures;
 use super::paper::PaperRow;
 use super::prediction::{Prediction, Ratios};
 use crate::bench::machine::Machine;
+use slag_encoder::html::Page;
 
 /// Figures of a measured grid.
 #[derive(Clone, Debug, Serialize)]
@@ -49,8 +50,8 @@ pub fn pareto(points: &[(f64, f64)]) -> Vec<bool> {
 }
 
 impl TradeoffReport {
-    /// Writes `tradeoff.csv`, `tradeoff.json`, `tradeoff.txt`, `front.json` and the plots: one per scene and cost, and of
-    /// several scenes one of their mean.
+    /// Writes `tradeoff.csv`, `tradeoff.json`, `tradeoff.txt`, `front.json`, the plots (one per scene and cost, and of several
+    /// scenes one of their mean), and `tradeoff.html`, which has the plots and tables in one page.
     pub(super) fn write(&self, out: &Path) -> Result<(), TradeoffError> {
         fs_err::write(out.join("tradeoff.csv"), self.csv())?;
         fs_err::write(
@@ -60,6 +61,7 @@ impl TradeoffReport {
         fs_err::write(out.join("tradeoff.txt"), self.to_string())?;
         let front = serde_json::to_vec_pretty(&self.front()).map_err(std::io::Error::from)?;
         fs_err::write(out.join("front.json"), front)?;
+        let mut page = Page::new("Accuracy against time, bytes and latency");
         let scenes = self.scenes();
         let mut pictures: Vec<(&str, &[&str])> =
             scenes.iter().map(|s| (*s, std::slice::from_ref(s))).collect();
@@ -69,11 +71,14 @@ impl TradeoffReport {
         for (name, scenes) in pictures {
             for cost in &COSTS {
                 if let Some(svg) = self.svg(name, scenes, cost) {
+                    page.drawing(&svg, &format!("{name}: accuracy by {}", cost.axis));
                     fs_err::write(out.join(format!("{name}-{}.svg", cost.file)), svg)?;
                 }
             }
         }
-        Ok(())
+        page.plain(&self.to_string());
+        page.value(&serde_json::to_value(self).map_err(std::io::Error::from)?);
+        Ok(fs_err::write(out.join("tradeoff.html"), page.finish())?)
     }
 
     /// Returns the paper's encode times as a sentence.

@@ -79,6 +79,12 @@ fn reports_name_every_point_and_mark_the_front() {
     let json: serde_json::Value = serde_json::from_str(&read("tradeoff.json")).expect("JSON");
     assert_eq!(json["figures"][1]["name"], "1/4");
     assert!(read("room-seconds.svg").contains("Pareto front") && !dir.path().join("room-query.svg").exists());
+    let page = read("tradeoff.html");
+    let is_inline = |name: &str| page.contains(read(name).trim());
+    assert!(is_inline("room-seconds.svg") && is_inline("room-bytes.svg"), "{page}");
+    // The note of the point that was not run, and every point with its flags, escaped.
+    assert!(page.contains("not run: masks / true") && page.contains("<td>1/4</td>"), "{page}");
+    assert!(page.contains("--a &quot;b&quot;") && !page.contains("<script") && !page.contains(" src=\"http"));
 }
 
 /// Oracle: for every budget, the best accuracy of all points that it pays for.

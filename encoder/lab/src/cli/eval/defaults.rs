@@ -4,10 +4,11 @@ use anyhow::Result;
 use clap::Args;
 
 use super::comparison::{ComparisonArgs, encode_settings};
+use super::output::Output;
 use crate::eval::defaults::{self, DefaultsRow, DefaultsSettings};
 use slag_common::shard::Profile;
 use slag_encoder::cli::Exit;
-use slag_encoder::cli::common::{cancel_flag, open_models, print};
+use slag_encoder::cli::common::{cancel_flag, open_models};
 use slag_encoder::progress::Progress;
 use slag_encoder::raster::devices::Devices;
 use slag_encoder::raster::gpu::GpuOptions;
@@ -23,7 +24,7 @@ pub struct EvalDefaultsArgs {
     on: ComparisonArgs,
 }
 
-pub(super) fn run(args: &EvalDefaultsArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+pub(super) fn run(args: &EvalDefaultsArgs, progress: &dyn Progress, output: &Output<'_>) -> Result<Exit> {
     let (models, session) = open_models(&args.on.models)?;
     let devices = Devices::open(args.on.device, GpuOptions::default())?;
     let mut encode = encode_settings("defaults");
@@ -37,6 +38,6 @@ pub(super) fn run(args: &EvalDefaultsArgs, progress: &dyn Progress, json: bool) 
     let cancel = cancel_flag()?;
     let report = defaults::run(&settings, (&models, &session), &devices, &mut on_row, cancel.as_ref())?;
     progress.end();
-    print(json, &report, &report)?;
+    output.print(&report)?;
     Ok(Exit::Done)
 }

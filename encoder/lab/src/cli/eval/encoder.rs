@@ -5,9 +5,10 @@ use std::path::PathBuf;
 use anyhow::Result;
 use clap::Args;
 use slag_encoder::cli::Exit;
-use slag_encoder::cli::common::{ModelArgs, open_models, print};
+use slag_encoder::cli::common::{ModelArgs, open_models};
 use slag_encoder::progress::Progress;
 
+use super::output::Output;
 use crate::eval::encoder;
 use crate::generate::grammar;
 
@@ -28,11 +29,11 @@ pub struct EvalEncoderArgs {
     confusion: Option<PathBuf>,
 }
 
-pub(super) fn run(args: &EvalEncoderArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+pub(super) fn run(args: &EvalEncoderArgs, progress: &dyn Progress, output: &Output<'_>) -> Result<Exit> {
     let (models, session) = open_models(&args.models)?;
     let nouns = grammar::nouns(None)?;
     let seeds = args.seed..args.seed + args.n_scenes;
     let report = encoder::evaluate(&models, &session, &nouns, seeds, args.confusion.as_deref(), progress)?;
-    print(json, &report, &report)?;
+    output.print(&report)?;
     Ok(Exit::Done)
 }

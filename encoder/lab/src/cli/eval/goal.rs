@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use anyhow::{Result, anyhow};
 use clap::Args;
 use slag_encoder::cli::Exit;
-use slag_encoder::cli::common::print;
 use slag_encoder::progress::Progress;
 
+use super::output::Output;
 use crate::eval::goal::{self, GoalSettings};
 use crate::generate::grammar::SceneKind;
 
@@ -34,7 +34,7 @@ pub struct EvalGoalArgs {
     pub list: bool,
 }
 
-pub(super) fn run(args: &EvalGoalArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+pub(super) fn run(args: &EvalGoalArgs, progress: &dyn Progress, output: &Output<'_>) -> Result<Exit> {
     let exe = std::env::current_exe()?;
     let programs = exe.parent().ok_or_else(|| anyhow!("{} is in no folder", exe.display()))?.to_owned();
     let settings = GoalSettings {
@@ -47,6 +47,6 @@ pub(super) fn run(args: &EvalGoalArgs, progress: &dyn Progress, json: bool) -> R
         programs,
     };
     let report = goal::run(&settings, progress)?;
-    print(json, &report, &report)?;
+    output.print(&report)?;
     Ok(Exit::Done)
 }

@@ -7,10 +7,11 @@ use clap::Args;
 use slag_common::shard::Profile;
 use slag_common::splat;
 use slag_encoder::cli::Exit;
-use slag_encoder::cli::common::{ModelArgs, print, text_encoder_of};
+use slag_encoder::cli::common::{ModelArgs, text_encoder_of};
 use slag_encoder::raster::CpuRasterizer;
 use slag_encoder::store::StoreReader;
 
+use super::output::Output;
 use crate::eval::{self, EvalKind, EvalSettings, Filter, Truth};
 
 /// `eval labelled`.
@@ -48,7 +49,7 @@ pub struct EvalLabelledArgs {
     pub kind: Option<EvalKind>,
 }
 
-pub(super) fn run(args: &EvalLabelledArgs, json: bool) -> Result<Exit> {
+pub(super) fn run(args: &EvalLabelledArgs, output: &Output<'_>) -> Result<Exit> {
     let reader = StoreReader::open(&args.store)?;
     let mut encoder = text_encoder_of(&reader, &args.models)?;
     let scene = splat::read(&args.scene, &splat::ReadOptions { with_sh_rest: false })?;
@@ -62,6 +63,6 @@ pub(super) fn run(args: &EvalLabelledArgs, json: bool) -> Result<Exit> {
         by_mask_level: args.by_mask_level,
     };
     let report = eval::labelled(&reader, &truth, &scene, &mut *encoder, &CpuRasterizer, &settings)?;
-    print(json, &report, &report)?;
+    output.print(&report)?;
     Ok(Exit::Done)
 }

@@ -7,11 +7,12 @@ use clap::Args;
 use slag_common::shard::Profile;
 use slag_common::{poses, splat};
 use slag_encoder::cli::Exit;
-use slag_encoder::cli::common::{ModelArgs, parse_frame, print, text_encoder_of};
+use slag_encoder::cli::common::{ModelArgs, parse_frame, text_encoder_of};
 use slag_encoder::ingest::{self, FrameChoice};
 use slag_encoder::raster::CpuRasterizer;
 use slag_encoder::store::StoreReader;
 
+use super::output::Output;
 use crate::eval::EvalSettings;
 use crate::eval::lerf::{self, LerfLabels};
 
@@ -47,7 +48,7 @@ pub struct EvalLerfArgs {
     threshold: Option<f32>,
 }
 
-pub(super) fn run(args: &EvalLerfArgs, json: bool) -> Result<Exit> {
+pub(super) fn run(args: &EvalLerfArgs, output: &Output<'_>) -> Result<Exit> {
     let reader = StoreReader::open(&args.store)?;
     let mut encoder = text_encoder_of(&reader, &args.models)?;
     let views = poses::read(&args.views, None)?;
@@ -65,7 +66,7 @@ pub(super) fn run(args: &EvalLerfArgs, json: bool) -> Result<Exit> {
         ..EvalSettings::default()
     };
     let report = lerf::lerf(&reader, &labels, &scene, &mut *encoder, &CpuRasterizer, &settings)?;
-    print(json, &report, &report)?;
+    output.print(&report)?;
     let is_complete = report.unknown_words.is_empty() && report.frames_without_view.is_empty();
     Ok(if is_complete { Exit::Done } else { Exit::Partly })
 }

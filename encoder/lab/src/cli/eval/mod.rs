@@ -7,16 +7,32 @@ mod goal;
 mod labelled;
 mod lerf;
 mod noise;
+mod output;
 mod protocol;
 mod relations;
 mod scannet;
 
-use anyhow::Result;
-use clap::Subcommand;
+use std::path::PathBuf;
+
+use anyhow::{Result, anyhow};
+use clap::{Args, Subcommand};
 use slag_encoder::cli::Exit;
 use slag_encoder::progress::Progress;
 
+use output::Output;
+
 /// `eval`.
+#[derive(Debug, Args)]
+pub struct EvalArgs {
+    /// Writes the result as one HTML file, too.
+    #[arg(long, global = true, value_name = "FILE")]
+    html: Option<PathBuf>,
+    /// What is judged.
+    #[command(subcommand)]
+    command: EvalCommand,
+}
+
+/// The evaluations.
 #[derive(Debug, Subcommand)]
 pub enum EvalCommand {
     /// Evaluates a store of a scene with a label for every Gaussian, such as those of `generate scene`.
@@ -39,16 +55,20 @@ pub enum EvalCommand {
     Relations(relations::EvalRelationsArgs),
 }
 
-pub(super) fn run(command: &EvalCommand, progress: &dyn Progress, json: bool) -> Result<Exit> {
-    match command {
-        EvalCommand::Labelled(args) => labelled::run(args, json),
-        EvalCommand::Lerf(args) => lerf::run(args, json),
-        EvalCommand::Scannet(args) => scannet::run(args, json),
+pub(super) fn run(args: &EvalArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+    let output = &Output { json, html: args.html.as_deref() };
+    match &args.command {
+        EvalCommand::Labelled(args) => labelled::run(args, output),
+        EvalCommand::Lerf(args) => lerf::run(args, output),
+        EvalCommand::Scannet(args) => scannet::run(args, output),
+        EvalCommand::Report(_) if output.html.is_some() => {
+            Err(anyhow!("`eval report` writes Markdown to --out; leave out --html"))
+        }
         EvalCommand::Report(args) => protocol::run(args),
-        EvalCommand::Encoder(args) => encoder::run(args, progress, json),
-        EvalCommand::Defaults(args) => defaults::run(args, progress, json),
-        EvalCommand::Noise(args) => noise::run(args, progress, json),
-        EvalCommand::Goal(args) => goal::run(args, progress, json),
-        EvalCommand::Relations(args) => relations::run(args, progress, json),
+        EvalCommand::Encoder(args) => encoder::run(args, progress, output),
+        EvalCommand::Defaults(args) => defaults::run(args, progress, output),
+        EvalCommand::Noise(args) => noise::run(args, progress, output),
+        EvalCommand::Goal(args) => goal::run(args, progress, output),
+        EvalCommand::Relations(args) => relations::run(args, progress, output),
     }
 }

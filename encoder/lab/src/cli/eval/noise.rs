@@ -4,10 +4,11 @@ use anyhow::{Result, anyhow};
 use clap::Args;
 
 use super::comparison::{ComparisonArgs, encode_settings};
+use super::output::Output;
 use crate::eval::noise::{self, NoiseRow, NoiseSettings};
 use slag_common::shard::Profile;
 use slag_encoder::cli::Exit;
-use slag_encoder::cli::common::{cancel_flag, open_models, print};
+use slag_encoder::cli::common::{cancel_flag, open_models};
 use slag_encoder::embed::Background;
 use slag_encoder::encode::{ViewOrder, ViewsLimit};
 use slag_encoder::lift::Aggregation;
@@ -41,7 +42,7 @@ pub struct EvalNoiseArgs {
     background: Background,
 }
 
-pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, output: &Output<'_>) -> Result<Exit> {
     let known = Aggregation::methods();
     let wanted = |name: &str| args.methods.is_empty() || args.methods.iter().any(|method| method == name);
     if let Some(unknown) = args.methods.iter().find(|name| !known.iter().any(|(known, _)| known == name)) {
@@ -78,6 +79,6 @@ pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, json: bool) -> 
     };
     let report = noise::run(&settings, (&models, &session), &devices, &mut on_row, cancel_flag()?.as_ref())?;
     progress.end();
-    print(json, &report, &report)?;
+    output.print(&report)?;
     Ok(Exit::Done)
 }

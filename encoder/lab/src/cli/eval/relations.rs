@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use anyhow::{Result, anyhow};
 use clap::Args;
 use slag_encoder::cli::Exit;
-use slag_encoder::cli::common::print;
 use slag_encoder::progress::Progress;
 
+use super::output::Output;
 use crate::eval::relations::{self, RelationsSettings};
 use crate::generate::grammar::SceneKind;
 
@@ -28,7 +28,7 @@ pub struct EvalRelationsArgs {
     pub n_views: u32,
 }
 
-pub(super) fn run(args: &EvalRelationsArgs, progress: &dyn Progress, json: bool) -> Result<Exit> {
+pub(super) fn run(args: &EvalRelationsArgs, progress: &dyn Progress, output: &Output<'_>) -> Result<Exit> {
     let exe = std::env::current_exe()?;
     let programs = exe.parent().ok_or_else(|| anyhow!("{} is in no folder", exe.display()))?.to_owned();
     let settings = RelationsSettings {
@@ -39,6 +39,6 @@ pub(super) fn run(args: &EvalRelationsArgs, progress: &dyn Progress, json: bool)
         programs,
     };
     let report = relations::run(&settings, progress)?;
-    print(json, &report, &report)?;
+    output.print(&report)?;
     Ok(Exit::Done)
 }

@@ -8,10 +8,11 @@ use slag_common::poses::PoseSource;
 use slag_common::shard::Profile;
 use slag_common::splat;
 use slag_encoder::cli::Exit;
-use slag_encoder::cli::common::{ModelArgs, parse_frame, print, text_encoder_of};
+use slag_encoder::cli::common::{ModelArgs, parse_frame, text_encoder_of};
 use slag_encoder::ingest::{self, FrameChoice};
 use slag_encoder::store::StoreReader;
 
+use super::output::Output;
 use crate::eval::EvalSettings;
 use crate::eval::scan::Scan;
 use crate::eval::scannet::{self, Matching, ScannetReport, Segments};
@@ -49,7 +50,7 @@ pub struct EvalScannetArgs {
     profile: Option<Profile>,
 }
 
-pub(super) fn run(args: &EvalScannetArgs, json: bool) -> Result<Exit> {
+pub(super) fn run(args: &EvalScannetArgs, output: &Output<'_>) -> Result<Exit> {
     let (n_scans, n_stores, n_scenes) = (args.scan.len(), args.store.len(), args.scene.len());
     if n_stores != n_scans || n_scenes != n_scans {
         return Err(anyhow!(
@@ -81,7 +82,7 @@ pub(super) fn run(args: &EvalScannetArgs, json: bool) -> Result<Exit> {
         )?);
     }
     let report = ScannetReport::new(scenes);
-    print(json, &report, &report)?;
+    output.print(&report)?;
     let is_complete = |s: &scannet::ScanReport| s.unknown_words.is_empty() && s.unknown_labels.is_empty();
     Ok(if report.scenes.iter().all(is_complete) { Exit::Done } else { Exit::Partly })
 }

@@ -1,0 +1,268 @@
+//! A page of results in one file: headings, tables and pictures inline, no scripts, nothing from elsewhere. It opens from a
+//! disk, an e-mail or a web server alike.
+
+use std::fmt::Write as _;
+
+use serde_json::Value;
+
+/// Letters of base64 (RFC 4648).
+const BASE64: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+/// Rows of a table; the rest is counted. A browser takes long to lay out more.
+const MAX_ROWS: usize = 5000;
+/// Inline styles and pictures, and nothing else.
+const POLICY: &str = "default-src 'none'; style-src 'unsafe-inline'; img-src data:";
+const STYLE: &str = "\
+:root{color-scheme:light dark;font:15px/1.5 system-ui,sans-serif}\
+body{margin:0 auto;max-width:1100px;padding:24px}\
+h1{font-size:22px}h2{font-size:17px;margin-top:32px}\
+p{max-width:75ch}pre{overflow:auto}\
+.wide{overflow:auto;max-height:70vh}\
+table{border-collapse:collapse;font-size:13px;font-variant-numeric:tabular-nums}\
+caption{text-align:left;padding:4px 0}\
+th,td{padding:3px 10px;border-bottom:1px solid #8886;text-align:left;vertical-align:top}\
+td.n{text-align:right;white-space:nowrap}thead th{position:sticky;top:0;background:Canvas}\
+figure{margin:12px 0;display:inline-block;vertical-align:top}figcaption{font-size:13px}\
+img,svg{max-width:100%;height:auto}svg{background:#fff;color:#111}";
+
+/// A page in the making.
+pub struct Page {
+    title: String,
+    body: String,
+}
+
+/// Returns text with the letters that HTML gives a meaning replaced.
+pub fn escaped(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for letter in text.chars() {
+        match letter {
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '"' => out.push_str("&quot;"),
+            other => out.push(other),
+        }
+    }
+    out
+}
+
+/// Returns bytes in base64.
+fn base64(bytes: &[u8]) -> String {
+    let mut out = String::with_capacity(bytes.len().div_ceil(3) * 4);
+    for chunk in bytes.chunks(3) {
+        let word =
+            chunk.iter().fold(0u32, |word, byte| word << 8 | u32::from(*byte)) << (8 * (3 - chunk.len()));
+        for at in 0..4 {
+            let letter = BASE64[(word >> (18 - 6 * at) & 63) as usize];
+            out.push(if at <= chunk.len() { char::from(letter) } else { '=' });
+        }
+    }
+    out
+}
+
+impl Page {
+    /// Begins a page.
+    pub fn new(title: &str) -> Self {
+        Self { title: escaped(title), body: String::new() }
+    }
+
+    fn add(&mut self, what: std::fmt::Arguments<'_>) {
+        // Writing to a string does not fail.
+        self.body.write_fmt(what).unwrap_or_default();
+    }
+
+    /// Adds a heading.
+    pub fn heading(&mut self, text: &str) {
+        self.add(format_args!("<h2>{}</h2>\n", escaped(text)));
+    }
+
+    /// Adds a paragraph.
+    pub fn paragraph(&mut self, text: &str) {
+        self.add(format_args!("<p>{}</p>\n", escaped(text)));
+    }
+
+    /// Adds text as it is laid out.
+    pub fn plain(&mut self, text: &str) {
+        self.add(format_args!("<pre>{}</pre>\n", escaped(text)));
+    }
+
+    /// Adds a drawing: SVG of this program, which is not escaped.
+    pub fn drawing(&mut self, svg: &str, caption: &str) {
+        self.add(format_args!("<figure>{svg}<figcaption>{}</figcaption></figure>\n", escaped(caption)));
+    }
+
+    /// Adds a picture, JPEG.
+    pub fn picture(&mut self, jpeg: &[u8], caption: &str) {
+        let (data, caption) = (base64(jpeg), escaped(caption));
+        self.add(format_args!(
+            "<figure><img alt=\"{caption}\" src=\"data:image/jpeg;base64,{data}\"><figcaption>{caption}</figcaption></figure>\n"
+        ));
+    }
+
+    /// Adds a table; a row of fewer cells than columns ends early. Cells that read as numbers stand right.
+    pub fn table(&mut self, columns: &[&str], rows: &[Vec<String>]) {
+        self.body.push_str("<div class=\"wide\" tabindex=\"0\"><table><thead><tr>");
+        for column in columns {
+            self.add(format_args!("<th scope=\"col\">{}</th>", escaped(column)));
+        }
+        self.body.push_str("</tr></thead><tbody>\n");
+        for row in rows.iter().take(MAX_ROWS) {
+            self.body.push_str("<tr>");
+            for cell in row {
+                let class = if cell.parse::<f64>().is_ok() { " class=\"n\"" } else { "" };
+                self.add(format_args!("<td{class}>{}</td>", escaped(cell)));
+            }
+            self.body.push_str("</tr>\n");
+        }
+        self.body.push_str("</tbody></table></div>\n");
+        if let Some(more) = rows.len().checked_sub(MAX_ROWS).filter(|more| *more > 0) {
+            self.paragraph(&format!("{more} more rows are left out."));
+        }
+    }
+
+    /// Adds a result as its JSON has it: what is single as one table, then a table for each list of records and each record of
+    /// columns, under its name.
+    pub fn value(&mut self, value: &Value) {
+        let Some(members) = value.as_object() else { return self.plain(&shown(value)) };
+        let is_single = |value: &&Value| !is_list_of_records(value) && !is_of_columns(value);
+        let single: Vec<Vec<String>> = (members.iter())
+            .filter(|(_, value)| is_single(value))
+            .map(|(name, value)| vec![name.replace('_', " "), shown(value)])
+            .collect();
+        if !single.is_empty() {
+            self.table(&["", ""], &single);
+        }
+        for (name, value) in members.iter().filter(|(_, value)| !is_single(value)) {
+            self.heading(&name.replace('_', " "));
+            self.records(value);
+        }
+    }
+
+    /// Adds the table of a list of records, or of a record of columns, of a result's JSON.
+    pub fn records(&mut self, value: &Value) {
+        if let Some(columns) = value.as_object().filter(|_| is_of_columns(value)) {
+            let names: Vec<&str> = columns.keys().map(String::as_str).collect();
+            let n = columns.values().filter_map(|column| column.as_array()).map(Vec::len).max().unwrap_or(0);
+            let row = |at| columns.values().map(|column| shown(&column[at])).collect();
+            return self.table(&names, &(0..n).map(row).collect::<Vec<_>>());
+        }
+        let records: Vec<_> = value.as_array().into_iter().flatten().filter_map(Value::as_object).collect();
+        let mut names: Vec<&str> = Vec::new();
+        for name in records.iter().flat_map(|record| record.keys()) {
+            if !names.contains(&name.as_str()) {
+                names.push(name);
+            }
+        }
+        let row = |record: &&serde_json::Map<String, Value>| {
+            names.iter().map(|name| record.get(*name).map_or(String::new(), shown)).collect()
+        };
+        let rows: Vec<Vec<String>> = records.iter().map(row).collect();
+        self.table(&names.clone(), &rows);
+    }
+
+    /// Ends the page.
+    pub fn finish(self) -> String {
+        let Self { title, body } = self;
+        format!(
+            "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
+             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\
+             <meta http-equiv=\"Content-Security-Policy\" content=\"{POLICY}\">\
+             <title>{title}</title><style>{STYLE}</style></head>\n<body><h1>{title}</h1>\n{body}</body></html>\n"
+        )
+    }
+}
+
+fn is_list_of_records(value: &Value) -> bool {
+    value.as_array().is_some_and(|list| !list.is_empty() && list.iter().all(Value::is_object))
+}
+
+/// Returns whether a value is a record of lists of the same length.
+fn is_of_columns(value: &Value) -> bool {
+    let Some(members) = value.as_object() else { return false };
+    let mut lens = members.values().map(|column| column.as_array().map(Vec::len));
+    let first = lens.next().flatten();
+    first.is_some() && lens.all(|len| len == first)
+}
+
+/// Returns a value as people read it: numbers of four digits, lists with commas.
+fn shown(value: &Value) -> String {
+    match value {
+        Value::Null => String::new(),
+        Value::String(text) => text.clone(),
+        Value::Number(number) => match number.as_f64().filter(|_| number.is_f64()) {
+            Some(float) if float != 0.0 && float.abs() < 0.001 => format!("{float:.3e}"),
+            Some(float) => {
+                let n_decimals = (3.0 - float.abs().max(1.0).log10().floor()).max(0.0) as usize;
+                format!("{float:.n_decimals$}")
+            }
+            None => number.to_string(),
+        },
+        Value::Array(list) => list.iter().map(shown).collect::<Vec<_>>().join(", "),
+        Value::Object(members) => members
+            .iter()
+            .map(|(name, value)| format!("{name} {}", shown(value)))
+            .collect::<Vec<_>>()
+            .join(", "),
+        other => other.to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn base64_is_that_of_the_standard() {
+        // RFC 4648, section 10.
+        for (bytes, expected) in [
+            ("", ""),
+            ("f", "Zg=="),
+            ("fo", "Zm8="),
+            ("foo", "Zm9v"),
+            ("foob", "Zm9vYg=="),
+            ("foobar", "Zm9vYmFy"),
+        ] {
+            assert_eq!(base64(bytes.as_bytes()), expected);
+        }
+    }
+
+    #[test]
+    fn foreign_text_stays_text() {
+        let mut page = Page::new("<b>");
+        page.heading("a < b");
+        page.table(&["x & y"], &[vec!["<script>alert(1)</script>".into()], vec!["\" onload=\"".into()]]);
+        page.picture(b"foo", "\"><img src=x>");
+        let html = page.finish();
+        assert_eq!(
+            html.matches("<script").count() + html.matches("<b>").count() + html.matches("<img src").count(),
+            0
+        );
+        assert!(
+            html.contains("a &lt; b") && html.contains("x &amp; y") && html.contains("base64,Zm9v\""),
+            "{html}"
+        );
+    }
+
+    #[test]
+    fn results_become_tables() {
+        let mut page = Page::new("t");
+        page.value(&json!({
+            "n_views": 3, "share": 0.123456, "names": ["a", "b"],
+            "cells": [{ "id": 1, "bytes": 20 }, { "id": 2, "error": 1.5e-5 }],
+            "views": { "view": ["p", "q"], "secs": [1.25, 2000.5] },
+        }));
+        let html = page.finish();
+        for expected in [
+            "<td>n views</td><td class=\"n\">3</td>",
+            "<td>share</td><td class=\"n\">0.123</td>",
+            "<td>names</td><td>a, b</td>",
+            "<tr><td class=\"n\">20</td><td class=\"n\">1</td><td></td></tr>",
+            "<tr><td></td><td class=\"n\">2</td><td class=\"n\">1.500e-5</td></tr>",
+            "<tr><td class=\"n\">1.250</td><td>p</td></tr>",
+            "<tr><td class=\"n\">2000</td><td>q</td></tr>",
+        ] {
+            assert!(html.contains(expected), "{expected}: {html}");
+        }
+    }
+}

@@ -1,0 +1,94 @@
+//! The report of an encode: one page with its views, masks, objects, cells, errors by profile, and what was left out and why.
+
+mod map;
+
+use serde_json::Value;
+
+use crate::encode::EncodeSummary;
+use crate::html::Page;
+use crate::watch::Watch;
+
+/// Makes the page. `watch` watched the encode.
+///
+/// # Errors
+/// None: the summary is a record of numbers and texts.
+pub fn of_encode(scene: &str, summary: &EncodeSummary, watch: &Watch) -> serde_json::Result<String> {
+    let work = watch.look();
+    let mut rest = serde_json::to_value(summary)?;
+    let mut take = |name: &str| rest.as_object_mut().and_then(|members| members.remove(name));
+    let lists = ["skipped_views", "views", "cells", "phases", "view_stages"].map(&mut take);
+    let [skipped, views, cells, phases, stages] = lists.map(Option::unwrap_or_default);
+    let [objects, occupancy, bytes, busy] =
+        ["objects", "occupancy", "shard_bytes", "busy_secs"].map(&mut take).map(Option::unwrap_or_default);
+    let mut page = Page::new(&format!("{scene}, generation {}", summary.generation));
+    page.paragraph(&format!(
+        "{} Gaussians in {} cells, from {} masks of {} photos, in {:.1} s with {}.",
+        summary.n_gaussians,
+        summary.n_cells,
+        summary.n_masks,
+        summary.n_views,
+        summary.wall_secs,
+        summary.encoder
+    ));
+    page.heading("Left out");
+    match summary.skipped_views.len() {
+        0 => page.paragraph("No view was left out."),
+        n => {
+            page.paragraph(&format!("{n} views were left out."));
+            page.records(&skipped);
+        }
+    }
+    page.paragraph(&format!(
+        "{} views have no mask; {} Gaussians are seen by no mask and have no embedding; {} are unusable.",
+        summary.n_views_without_masks, summary.n_without_evidence, summary.n_rejected
+    ));
+    page.heading("Map");
+    page.drawing(&map::svg(&work), "Seen from above: cells, and the cameras by their number of masks");
+    let pictures = watch.pictures_of_report();
+    if !pictures.is_empty() {
+        page.heading("Masks");
+        for picture in &pictures {
+            page.picture(&picture.jpeg, &format!("{}: {} masks", picture.view, picture.n_masks));
+        }
+    }
+    page.heading("Objects");
+    match objects {
+        Value::Null => page.paragraph("Objects were not looked for."),
+        found => page.value(&found),
+    }
+    if !occupancy.is_null() {
+        page.heading("Free and occupied places");
+        page.value(&occupancy);
+    }
+    page.heading("Profiles");
+    page.paragraph(
+        "Bytes of the shards, and the error of their scores relative to the spread of scores: mean over the cells by Gaussians, \
+         and that of the worst cell.",
+    );
+    page.table(&["profile", "bytes", "mean error", "worst cell"], &profiles(summary, &bytes));
+    page.heading("Time");
+    page.records(&phases);
+    page.paragraph("Stages of the views:");
+    page.records(&stages);
+    page.paragraph("Seconds by stage, added over threads:");
+    page.value(&busy);
+    page.heading("Cells");
+    page.records(&cells);
+    page.heading("Views");
+    page.records(&views);
+    page.heading("All else");
+    page.value(&rest);
+    Ok(page.finish())
+}
+
+/// Returns a row a profile: name, bytes, mean and largest relative error.
+fn profiles(summary: &EncodeSummary, bytes: &Value) -> Vec<Vec<String>> {
+    let row = |(profile, bytes): (&String, &Value)| {
+        let errors = || summary.cells.iter().filter_map(|cell| Some((cell, *cell.score_error.get(profile)?)));
+        let n: f64 = errors().map(|(cell, _)| f64::from(cell.n_gaussians)).sum();
+        let sum: f64 = errors().map(|(cell, error)| f64::from(cell.n_gaussians) * f64::from(error)).sum();
+        let worst = errors().map(|(_, error)| error).fold(0.0, f32::max);
+        vec![profile.clone(), bytes.to_string(), format!("{:.4}", sum / n.max(1.0)), format!("{worst:.4}")]
+    };
+    bytes.as_object().into_iter().flatten().map(row).collect()
+}

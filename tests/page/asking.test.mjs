@@ -1,0 +1,95 @@
+// Asking with suggestions, and places to stand near what was found, over the small known scene.
+
+import assert from "node:assert/strict";
+import { after, before, test } from "node:test";
+import { axe, closeBrowser, openBrowser, pixels } from "./browser.mjs";
+import { answered, CAMERA, drawn, opened, PANEL_PX, project } from "./scene.mjs";
+import { GOALS } from "./service.mjs";
+
+before(openBrowser);
+after(closeBrowser);
+
+const ROBOT_RADIUS_M = 0.3;
+const isViolet = (r, g, b) => Math.abs(r - 0xc7) < 14 && Math.abs(g - 0x7d) < 14 && Math.abs(b - 0xff) < 14;
+
+/** Where the camera is, as the address says. */
+async function cameraOf(page) {
+  await page.click("#copy-link");
+  const numbers = new URLSearchParams(new URL(page.url()).hash.slice(1)).get("camera").split(",").map(Number);
+  return [numbers.slice(0, 3), numbers.slice(3)];
+}
+
+test("a thing's places to stand are drawn on the ground with their directions, and a click looks from there", () => opened(async (page, service) => {
+  await drawn(page);
+  await answered(page, "chair");
+  await page.locator("#answers button").click();
+  await page.locator("#places button").first().waitFor();
+  assert.ok(service.behaviour.requests.includes("/v1/goal?id=o1&radius_m=0.3"));
+  assert.deepEqual(await page.locator("#places button").allInnerTexts(), [
+    "1.20, -1.00 m · sees 61 % · clear by 0.75 m · way 4.3 m", "-0.20, 0.90 m · sees 44 % · clear by 0.52 m · way 5.5 m",
+  ]);
+  await page.uncheck("#show-boxes");
+  const [from, to] = await cameraOf(page);
+  const violet = await pixels(page, PANEL_PX, isViolet, "places");
+  for (const { position_in_world: [x, y, z], yaw_rad } of GOALS) {
+    // The nose is filled ahead of the middle; behind it, only the outline is drawn.
+    const isFilled = (along) => {
+      const [u, v] = project([x + along * ROBOT_RADIUS_M * Math.cos(yaw_rad), y + along * ROBOT_RADIUS_M * Math.sin(yaw_rad), z], from, to);
+      assert.ok(u > PANEL_PX && v > 0, `outside the picture: ${u}, ${v}`);
+      return violet.some(([a, b]) => Math.hypot(a + 0.5 - u, b + 0.5 - v) < 1.5);
+    };
+    assert.deepEqual([0.5, 0, -0.4, -0.8].map(isFilled), [true, true, true, false], `${x}, ${y}`);
+  }
+  const [u, v] = project(GOALS[1].position_in_world, from, to);
+  await page.mouse.click(u, v);
+  await page.locator("#places button[aria-pressed=true]").filter({ hasText: "-0.20, 0.90" }).waitFor();
+  assert.deepEqual(await cameraOf(page), [GOALS[1].sensor_in_world, [1.2, 0.8, 0.5]]);
+}, { behaviour: { goal: "reached" }, fragment: `q=chair&camera=${CAMERA}` }));
+
+for (const [goal, said] of [["unreachable", "None: unreachable."], ["not-visible", "None: not visible."], ["no-occupancy", "encode it with --occupancy"]]) {
+  test(`a plain message where there is no place to stand: ${goal}`, () => opened(async (page) => {
+    await drawn(page);
+    await answered(page, "chair");
+    await page.locator("#answers button").click();
+    await page.locator("#places").getByText(said).waitFor();
+    assert.equal(await page.locator("#places button").count(), 0);
+  }, { behaviour: { goal }, fragment: "q=chair", expected: /409/ }));
+}
+
+test("keys choose a suggestion, and screen readers are told which", () => opened(async (page) => {
+  await drawn(page);
+  const box = page.getByRole("combobox", { name: "Ask the scene" });
+  await box.focus();
+  const options = page.locator("#question-suggestions [role=option]");
+  // Nothing is typed: things on board, no others.
+  assert.deepEqual(await options.allInnerTexts(), ["chair\n1 on board", "ball\n1 on board"]);
+  await box.pressSequentially("wa");
+  assert.deepEqual(await options.allInnerTexts(), ["wall\na word of the model", "red wall\na word of the model"]);
+  assert.equal(await box.getAttribute("aria-expanded"), "true");
+  assert.equal(await box.getAttribute("aria-activedescendant"), null);
+  await page.keyboard.press("ArrowUp");
+  const active = page.locator(`[id="${await box.getAttribute("aria-activedescendant")}"]`);
+  assert.deepEqual([await active.innerText(), await active.getAttribute("aria-selected")], ["red wall\na word of the model", "true"]);
+  const found = await page.evaluate(`(() => { ${axe}; return axe.run("#ask"); })()`);
+  assert.deepEqual(found.violations.map(({ id, nodes }) => `${id}: ${nodes[0].html}`), []);
+  await page.keyboard.press("ArrowUp");
+  await page.keyboard.press("Enter");
+  await answered(page, "wall");
+  assert.deepEqual([await box.inputValue(), await box.getAttribute("aria-expanded"), await options.count()], ["wall", "false", 0]);
+  // The negative that is begun is completed, and the words before it stay.
+  await box.fill("chair -ba");
+  assert.deepEqual(await options.allInnerTexts(), ["chair -ball\n1 on board"]);
+  await page.keyboard.press("Escape");
+  assert.deepEqual([await options.count(), await box.inputValue()], [0, "chair -ba"]);
+  await box.fill("");
+  assert.deepEqual((await options.allInnerTexts())[0], "wall\nasked before");
+}));
+
+test("a click chooses a suggestion, and a second question has its own", () => opened(async (page, service) => {
+  await drawn(page);
+  await page.locator("#second").pressSequentially("b");
+  await page.locator("#second-suggestions").getByText("ball").click();
+  await answered(page, "ball");
+  assert.ok(await page.locator("#question-suggestions").isHidden());
+  assert.ok(service.behaviour.requests.includes("/v1/view/scores?text=ball"));
+}));

@@ -1,0 +1,105 @@
+// What the page shows besides answers, over the small known scene: changes, cameras of photos, an encode at work.
+
+import assert from "node:assert/strict";
+import { after, before, test } from "node:test";
+import { closeBrowser, openBrowser, pixels } from "./browser.mjs";
+import { CAMERA, drawn, opened, PANEL_PX, project } from "./scene.mjs";
+
+before(openBrowser);
+after(closeBrowser);
+
+/** Source of a function that tells whether a pixel has a colour: it runs in the browser. */
+const isColour = ([r, g, b]) => `(r, g, b) => Math.hypot(r - ${r}, g - ${g}, b - ${b}) < 24`;
+const COLOURS = { appeared: [0x4f, 0xd1, 0x7a], went: [0xe0, 0x5a, 0x4e], moved: [0xf2, 0xb1, 0x34] };
+
+const thing = (id, [x, y, z], half = 0.3) => ({
+  id, position_in_world: [x, y, z], box_in_world: { min: [x - half, y - half, z - half], max: [x + half, y + half, z + half] },
+});
+const CHANGES = {
+  old_generation: 1, new_generation: 2, n_same: 3, n_stayed: 1,
+  appeared: [thing("a1", [1.2, 0.8, 0.5])], went: [thing("b1", [-1.5, -1, 0.5])], moved: [{ from: thing("c0", [0, 2, 0.4]), to: thing("c1", [1, 2.5, 0.4]) }],
+};
+
+test("what appeared, went and moved is listed and boxed in the colour of its kind", () => opened(async (page) => {
+  await drawn(page);
+  await page.uncheck("#show-grid");
+  await page.check("#show-changes");
+  await page.locator("#changes").getByText("1 appeared, 1 went, 1 moved, 4 stayed").waitFor();
+  assert.deepEqual(await page.locator("#changes button").allInnerTexts(), [
+    "Appeared: 1.20, 0.80, 0.50 m", "Went: -1.50, -1.00, 0.50 m", "Moved by 1.12 m: 1.00, 2.50, 0.40 m",
+  ]);
+  const boxes = { appeared: CHANGES.appeared[0], went: CHANGES.went[0], moved: CHANGES.moved[0].to };
+  for (const [kind, colour] of Object.entries(COLOURS)) {
+    const found = await pixels(page, PANEL_PX, isColour(colour), kind);
+    const { min, max } = boxes[kind].box_in_world;
+    const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((i) => project(min.map((low, k) => ((i >> k) & 1 ? max[k] : low))));
+    for (const [u, v] of corners.filter(([x]) => x > PANEL_PX + 4)) {
+      assert.ok(found.some(([x, y]) => Math.hypot(x + 0.5 - u, y + 0.5 - v) < 3), `${kind}: no line ends at ${u}, ${v}`);
+    }
+  }
+  await page.uncheck("#show-changes");
+  assert.ok(await page.locator("#changes").isHidden());
+}, { behaviour: { program: "slag-encoder", generation: 2, changes: CHANGES }, fragment: `camera=${CAMERA}` }));
+
+/** A thing as a robot describes it. */
+const onRobot = ({ id, position_in_world, box_in_world: { min, max } }) => ({ id, position_in_world, box_min_in_world: min, box_max_in_world: max });
+const OF_ROBOT = {
+  from: { generation: 4 }, to: { generation: 7 }, n_same: 2, n_stayed: 0, none: null,
+  appeared: CHANGES.appeared.map(onRobot), went: [], moved: CHANGES.moved.map(({ from, to }) => ({ from: onRobot(from), to: onRobot(to) })),
+};
+
+test("a robot's changes are listed, and its reason where it has none", () => opened(async (page, service) => {
+  await drawn(page);
+  await page.check("#show-changes");
+  await page.locator("#changes").getByText("Generation 4 to 7").waitFor();
+  assert.deepEqual(await page.locator("#changes button").allInnerTexts(), ["Appeared: 1.20, 0.80, 0.50 m", "Moved by 1.12 m: 1.00, 2.50, 0.40 m"]);
+  service.behaviour.changes = { ...OF_ROBOT, from: null, none: { kind: "no-earlier-generation", detail: "the robot has had one generation" } };
+  await page.uncheck("#show-changes");
+  await page.check("#show-changes");
+  await page.locator("#changes").getByText("the robot has had one generation").waitFor();
+}, { behaviour: { generation: 7, changes: OF_ROBOT } }));
+
+test("without a generation before, the service's words say so", () => opened(async (page) => {
+  await drawn(page);
+  await page.check("#show-changes");
+  await page.locator("#changes").getByText("one generation alone").waitFor();
+}, { behaviour: { program: "slag-encoder", generation: 2 }, expected: /409/ }));
+
+// Where the test's camera is, it would be under the panel: this one looks at the scene's middle from the other side.
+const PHOTO = { name: "roof/12.jpg", position_m: [1.5, 1.5, 1.2], rotation_xyzw: [0.7071068, 0, 0, 0.7071068], width_px: 640, height_px: 480, focal_px: 500, has_picture: false };
+
+test("a camera without its picture can be clicked and stood in", () => opened(async (page) => {
+  await drawn(page);
+  await page.check("#show-photos");
+  const [u, v] = project(PHOTO.position_m);
+  await page.mouse.click(u, v);
+  await page.locator("#details").getByText("roof/12.jpg").waitFor();
+  assert.equal(await page.locator("#details svg").count(), 0);
+  await page.click("#copy-link");
+  const camera = new URLSearchParams(new URL(page.url()).hash.slice(1)).get("camera").split(",").map(Number);
+  // Its rotation turns z, forward, to -y.
+  assert.deepEqual(camera.slice(0, 3), PHOTO.position_m);
+  assert.ok(Math.abs(camera[3] - 1.5) < 0.01 && camera[4] < 1.5 - 0.4 && Math.abs(camera[5] - 1.2) < 0.01, String(camera));
+}, { behaviour: { photos: [PHOTO] }, fragment: `camera=${CAMERA}` }));
+
+test("an encode is watched before there is a scene, and the scene is opened once it is published", () => opened(async (page, service) => {
+  await page.locator("#work").getByText("At work: views").waitFor();
+  await page.locator("#work").getByText("2 of 3 views").waitFor();
+  await page.locator("#work").getByText("b.jpg is left out: too dark").waitFor();
+  assert.deepEqual(await page.locator("#work circle").evaluateAll((all) => all.map((circle) => circle.getAttribute("class"))), ["done", "left-out", "waiting"]);
+  assert.equal(await page.locator("#work svg").getAttribute("aria-label"), "Map: 1 of 3 views done, 1 left out");
+  service.behaviour.work = { ...service.behaviour.work, ended: "Generation 1 is published." };
+  service.behaviour.hasScene = true;
+  await page.locator("#work").getByText("Generation 1 is published.").waitFor();
+  await drawn(page);
+}, {
+  behaviour: {
+    hasScene: false,
+    work: {
+      ended: null, secs: 2.5, counted: { stage: "views", unit: "view", total: 3, done: 2 }, phases: [{ phase: "read", secs: 0.5 }, { phase: "views", secs: 2 }],
+      busy_secs: { segment: 1.25 }, cells: [{ min: [0, 0, 0], max: [4, 2, 1] }], pictures: [],
+      views: [["a.jpg", "done"], ["b.jpg", "left-out", "too dark"], ["c.jpg", "waiting"]].map(([name, state, reason], i) => ({ name, state, reason, position_m: [i, 1, 0], n_masks: null })),
+    },
+  },
+  expected: /404/,
+}));
