@@ -1,10 +1,12 @@
-//! Seeded faults: any part of a fleet is killed, stands still or comes back with nothing, and the bytes stay the same.
+//! Seeded faults: any part of a fleet is killed, stands still, is cut off, or comes back with nothing, and the bytes stay the same.
 
+use std::fmt;
 use std::time::Duration;
 
 use slag_math::random::Random;
 
 use super::nats::Fleet;
+use super::network::{Network, Weather};
 use super::support::*;
 
 /// Seeds, unless `SLAG_FAULT_RUNS` gives another number; `SLAG_FAULT_SEED` is the first one.
@@ -17,58 +19,106 @@ fn seeded_faults_do_not_show() {
         std::env::var(name).ok().map_or(default, |text| text.parse().expect("a number"))
     };
     let (first, n_runs) = (number("SLAG_FAULT_SEED", 1), number("SLAG_FAULT_RUNS", N_RUNS));
-    let mut counts = [0; 5];
+    let mut all = Faults::default();
     for seed in first..first + n_runs {
-        let n = run_with_faults(seed);
-        counts.iter_mut().zip(n).for_each(|(sum, n)| *sum += n);
-        println!("seed {seed}: same bytes; {n:?}");
+        let faults = run_with_faults(seed);
+        println!("seed {seed}: same bytes; {faults}");
+        all.add(faults);
     }
-    let [workers, pauses, servers, lost, coordinators] = counts;
-    println!(
-        "{n_runs} runs: {workers} workers killed, {pauses} paused, {servers} servers killed ({lost} came back empty), \
-         {coordinators} coordinators killed"
-    );
+    println!("{n_runs} runs: {all}");
 }
 
-/// Returns the number of workers killed, paused, of servers killed, come back empty, of coordinators killed.
-fn run_with_faults(seed: u64) -> [u64; 5] {
+/// What befell a fleet.
+#[derive(Clone, Copy, Default)]
+struct Faults {
+    n_workers_killed: u64,
+    n_workers_paused: u64,
+    n_partitions: u64,
+    n_slow_networks: u64,
+    n_servers_killed: u64,
+    n_servers_emptied: u64,
+    n_coordinators_killed: u64,
+}
+
+impl Faults {
+    fn add(&mut self, other: Self) {
+        self.n_workers_killed += other.n_workers_killed;
+        self.n_workers_paused += other.n_workers_paused;
+        self.n_partitions += other.n_partitions;
+        self.n_slow_networks += other.n_slow_networks;
+        self.n_servers_killed += other.n_servers_killed;
+        self.n_servers_emptied += other.n_servers_emptied;
+        self.n_coordinators_killed += other.n_coordinators_killed;
+    }
+}
+
+impl fmt::Display for Faults {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "{} workers killed, {} paused, {} cut off, {} on a slow network, {} servers killed ({} came back empty), \
+             {} coordinators killed",
+            self.n_workers_killed,
+            self.n_workers_paused,
+            self.n_partitions,
+            self.n_slow_networks,
+            self.n_servers_killed,
+            self.n_servers_emptied,
+            self.n_coordinators_killed
+        )
+    }
+}
+
+fn run_with_faults(seed: u64) -> Faults {
     let mut random = Random::new(seed);
     let (fleet, server) = Fleet::new(free_port());
     let flags = ["--ack-wait", "1", "--max-deliver", "100"];
+    let networks = [0, 1].map(|_| Network::to(server.port(), random.bits()));
+    let start = |which: usize| fleet.worker_over(&networks[which], &flags);
     let mut server = Some(server);
     let mut coordinator = fleet.coordinator(&flags);
-    let mut workers: Vec<Running> = (0..2).map(|_| fleet.worker(&flags)).collect();
-    let mut counts = [0; 5];
-    for _ in 0..1 + (random.unit() * 6.0) as usize {
-        std::thread::sleep(Duration::from_secs_f64(0.2 + 2.0 * random.unit()));
+    let mut workers = [start(0), start(1)];
+    let mut faults = Faults::default();
+    for _ in 0..1 + random.below(7usize) {
+        std::thread::sleep(Duration::from_secs_f64(0.1 + 1.5 * random.unit()));
         if !coordinator.is_running() {
             break;
         }
-        let which = (random.unit() * workers.len() as f64) as usize;
-        match (random.unit() * 10.0) as usize {
-            0..4 => {
+        let which = random.below(workers.len());
+        match random.below(12u32) {
+            0..3 => {
                 // One that has ended by itself, as no run was open, is replaced as well.
-                let new = fleet.worker(&flags);
-                drop(std::mem::replace(&mut workers[which], new));
-                counts[0] += 1;
+                drop(std::mem::replace(&mut workers[which], start(which)));
+                faults.n_workers_killed += 1;
             }
-            4..6 if workers[which].is_running() => {
+            3..5 if workers[which].is_running() => {
                 workers[which].signal("STOP");
                 std::thread::sleep(Duration::from_secs_f64(2.0 * random.unit()));
                 workers[which].signal("CONT");
-                counts[1] += 1;
+                faults.n_workers_paused += 1;
             }
-            6..8 => {
+            5..7 => {
+                networks[which].set(Weather { is_cut: true, ..Weather::default() });
+                std::thread::sleep(Duration::from_secs_f64(3.0 * random.unit()));
+                networks[which].set(Weather::default());
+                faults.n_partitions += 1;
+            }
+            7..9 => {
+                let delay = Duration::from_secs_f64(0.05 * random.unit());
+                networks[which].set(Weather { delay, loss: 0.1 * random.unit(), is_cut: false });
+                faults.n_slow_networks += 1;
+            }
+            9..11 => {
                 let is_lost = random.unit() < 0.5;
                 let old = server.take().expect("one runs");
-                counts[2] += 1;
-                counts[3] += u64::from(is_lost);
+                faults.n_servers_killed += 1;
+                faults.n_servers_emptied += u64::from(is_lost);
                 server = Some(fleet.restart(old, is_lost));
             }
-            8..10 => {
+            11 => {
                 drop(coordinator);
                 coordinator = fleet.coordinator(&flags);
-                counts[4] += 1;
+                faults.n_coordinators_killed += 1;
             }
             _ => {}
         }
@@ -76,9 +126,9 @@ fn run_with_faults(seed: u64) -> [u64; 5] {
     // Workers that ended because a run was published, or failed because the server was away, are replaced: they are a
     // scheduler's business.
     while coordinator.is_running() {
-        for worker in &mut workers {
+        for (which, worker) in workers.iter_mut().enumerate() {
             if !worker.is_running() {
-                *worker = fleet.worker(&flags);
+                *worker = start(which);
             }
         }
         std::thread::sleep(Duration::from_millis(100));
@@ -86,5 +136,5 @@ fn run_with_faults(seed: u64) -> [u64; 5] {
     let summary = coordinator.json();
     assert_eq!(summary["skipped_views"], serde_json::json!([]), "seed {seed}");
     fleet.scene.assert_same("store");
-    counts
+    faults
 }

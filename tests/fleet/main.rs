@@ -3,5 +3,6 @@
 mod faults;
 mod folder;
 mod nats;
+mod network;
 mod s3;
 mod support;

@@ -2,6 +2,7 @@
 
 use std::process::{Command, Stdio};
 
+use super::network::Network;
 use super::support::*;
 use slag_tests::*;
 
@@ -23,34 +24,47 @@ impl Server {
         Self { running, port }
     }
 
-    fn url(&self) -> String {
-        format!("nats://127.0.0.1:{}", self.port)
+    pub fn port(&self) -> u16 {
+        self.port
     }
+}
+
+fn url(port: u16) -> String {
+    format!("nats://127.0.0.1:{port}")
 }
 
 /// A fleet over a queue and a folder.
 pub struct Fleet {
     pub scene: Scene,
     bucket: String,
-    url: String,
+    port: u16,
 }
 
 impl Fleet {
     pub fn new(port: u16) -> (Self, Server) {
         let scene = Scene::new();
         let server = Server::start(&scene, port);
-        let (bucket, url) = (text(&scene.path("bucket")).to_owned(), server.url());
-        (Self { scene, bucket, url }, server)
+        let bucket = text(&scene.path("bucket")).to_owned();
+        (Self { scene, bucket, port }, server)
     }
 
     /// Starts the coordinator; `flags` are for it and the workers alike.
     pub fn coordinator(&self, flags: &[&str]) -> Running {
         let mut command = self.scene.encode("store");
-        Running::start(command.args(["--blobs", &self.bucket, "--fleet", &self.url]).args(flags))
+        Running::start(command.args(["--blobs", &self.bucket, "--fleet", &url(self.port)]).args(flags))
     }
 
     pub fn worker(&self, flags: &[&str]) -> Running {
-        Running::start(worker(&self.bucket).args(["--fleet", &self.url, "--threads", "1"]).args(flags))
+        self.worker_at(self.port, flags)
+    }
+
+    /// Starts a worker that reaches the server over a network.
+    pub fn worker_over(&self, network: &Network, flags: &[&str]) -> Running {
+        self.worker_at(network.port(), flags)
+    }
+
+    fn worker_at(&self, port: u16, flags: &[&str]) -> Running {
+        Running::start(worker(&self.bucket).args(["--fleet", &url(port), "--threads", "1"]).args(flags))
     }
 
     /// Kills the server and starts it again: with its files, or with nothing.

@@ -11,8 +11,8 @@ use slag_tests::*;
 /// Flags that coordinator and workers share.
 const MODELS: [&str; 4] = ["--models", "colours", "--device", "cpu"];
 
-/// Flags of the encode: one profile, so that codebooks take less time than views.
-const ENCODE: [&str; 4] = ["--name", "room", "--profiles", "compact"];
+/// Flags of the encode: one profile, so that codebooks take less time than views; and places, which cells carry.
+const ENCODE: [&str; 6] = ["--name", "room", "--profiles", "compact", "--occupancy", "0.1"];
 
 /// Photos of the room.
 pub const N_VIEWS: usize = 6;
@@ -31,8 +31,9 @@ impl Scene {
     fn room() -> &'static (PathBuf, Vec<u8>) {
         static ROOM: OnceLock<(PathBuf, Vec<u8>)> = OnceLock::new();
         ROOM.get_or_init(|| {
-            // Beside the built programs: nothing is dropped at a program's end.
-            let dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join("fleet");
+            // Beside the built programs: nothing is dropped at a program's end. Seeded faults may run as several programs.
+            let seed = std::env::var("SLAG_FAULT_SEED").unwrap_or_default();
+            let dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("fleet{seed}"));
             if dir.exists() {
                 fs_err::remove_dir_all(&dir).expect("removed");
             }

@@ -133,7 +133,7 @@ pub struct WorkerArgs {
     /// Folder for photos in work [default: the system's for temporary files].
     #[arg(long, value_name = "DIR")]
     scratch: Option<PathBuf>,
-    /// Seconds to wait for an encode to begin.
+    /// Seconds to wait for an encode to begin, and for a sign of life of the machine that began it.
     #[arg(long, value_name = "SECS", default_value = "600", value_parser = parse_secs)]
     wait: Duration,
     /// Goes on to the next encode when one is published.

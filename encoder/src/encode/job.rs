@@ -20,6 +20,8 @@ const PUBLISHED_KEY: &[u8] = b"published";
 const STEP_KEY: &[u8] = b"step";
 /// Followed by the view's identity.
 const VIEW_PREFIX: &str = "view/";
+/// Folder of the views' files in the job's.
+const VIEWS_FOLDER: &str = "views";
 
 /// What a store knows of the encode that it keeps views of.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -48,6 +50,33 @@ pub fn job_status(store: &Store) -> Result<Option<JobStatus>, EncodeError> {
         is_published: tree.contains_key(PUBLISHED_KEY).map_err(records)?,
         step: step.map(|name| String::from_utf8_lossy(&name).into_owned()),
     }))
+}
+
+/// What a view took and left.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ViewCost {
+    /// Seconds in its stages.
+    pub secs: f64,
+    /// Bytes of its contributions.
+    pub len_bytes: u64,
+}
+
+/// Returns the costs of the views that a store keeps, by identity.
+///
+/// # Errors
+/// [`EncodeError::Records`]; a file of contributions is missing.
+pub fn view_costs(store: &Store) -> Result<Vec<ViewCost>, EncodeError> {
+    let records = |source| records_error(store, source);
+    let folder = store.job_dir()?.join(VIEWS_FOLDER);
+    let tree = store.db().open_tree(TREE).map_err(records)?;
+    let costs = tree.scan_prefix(VIEW_PREFIX).map(|entry| {
+        let (key, value) = entry.map_err(records)?;
+        let record: ViewRecord = serde_json::from_slice(&value).unwrap_or_default();
+        let id = String::from_utf8_lossy(&key[VIEW_PREFIX.len()..]).into_owned();
+        let len_bytes = fs_err::metadata(folder.join(format!("{id}.contributions")))?.len();
+        Ok(ViewCost { secs: f64::from(record.secs), len_bytes })
+    });
+    costs.collect()
 }
 
 /// The unfinished encode of a store.
@@ -235,7 +264,7 @@ impl<'a> Job<'a> {
     }
 
     fn views_folder(&self) -> PathBuf {
-        self.folder.join("views")
+        self.folder.join(VIEWS_FOLDER)
     }
 
     /// Records go first: a file without a record is redone, a record without a file would be an error.

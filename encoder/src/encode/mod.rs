@@ -48,7 +48,7 @@ pub use crate::memory::{MemoryError, Reservation};
 pub use engines::{Engines, Perturbation};
 pub use error::EncodeError;
 pub use inputs::count_inputs;
-pub use job::{JobStatus, job_status};
+pub use job::{JobStatus, ViewCost, job_status, view_costs};
 pub use preset::{Choices, Preset};
 pub use report::{CellReport, EncodeSummary, GpuReport, PhaseReport, SkippedView, StageReport, ViewsReport};
 pub use settings::{

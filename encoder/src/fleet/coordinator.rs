@@ -10,6 +10,7 @@ use slag_common::{Hash32, durable};
 use super::dispatch::Item;
 use super::documents::{self, CellsPlan, FailedView, MergedView};
 use super::error::FleetError;
+use super::pulse::Heart;
 use super::queue::{Enqueuer, QueueSettings};
 use super::run::Run;
 use super::worker::pause;
@@ -26,7 +27,14 @@ pub struct Coordinator {
     bucket: Arc<Bucket>,
     queue: Option<QueueSettings>,
     /// The run, once it has begun.
-    run: Mutex<Option<(Run, Option<Enqueuer>)>>,
+    run: Mutex<Option<OpenRun>>,
+}
+
+/// A run that has begun.
+struct OpenRun {
+    run: Run,
+    queue: Option<Enqueuer>,
+    _heart: Heart,
 }
 
 impl Coordinator {
@@ -46,9 +54,6 @@ impl Coordinator {
         progress: &dyn Progress,
         cancel: &AtomicBool,
     ) -> Result<EncodeSummary, EncodeError> {
-        if settings.cells.occupancy.is_some() {
-            return Err(FleetError::Occupancy.into());
-        }
         encode::encode_by(self, settings, engines, progress, cancel)
     }
 
@@ -72,7 +77,8 @@ impl Coordinator {
             .as_ref()
             .map(|queue| Enqueuer::open(self.bucket.runtime(), queue, run, run_plan.of_scene))
             .transpose()?;
-        *self.run.lock().unwrap_or_else(PoisonError::into_inner) = Some((run, queue));
+        let open_run = OpenRun { run, queue, _heart: Heart::start(&self.bucket, run) };
+        *self.run.lock().unwrap_or_else(PoisonError::into_inner) = Some(open_run);
         let url = self.bucket.url();
         tracing::info!(
             "run {}: {} views to do; workers join with `slag-encoder worker --blobs {url}`",
@@ -122,7 +128,7 @@ impl Coordinator {
     ) -> Result<T, FleetError> {
         let mut run = self.run.lock().unwrap_or_else(PoisonError::into_inner);
         match &mut *run {
-            Some((run, queue)) => work(*run, queue.as_mut()),
+            Some(OpenRun { run, queue, .. }) => work(*run, queue.as_mut()),
             None => Err(FleetError::Io(std::io::Error::other("cells before views"))),
         }
     }

@@ -12,7 +12,7 @@ use crate::encode::ViewSettings;
 use crate::shard::ShardSettings;
 
 /// Version of the documents and objects.
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
 
 /// Returns the version of this program, as documents state it.
 pub(super) fn own_version() -> String {

@@ -57,9 +57,18 @@ pub enum FleetError {
         /// This worker's.
         own: String,
     },
-    /// Shards of fleets have no occupancy.
-    #[error("workers do not make free and occupied places; leave out --occupancy, or encode without --blobs")]
-    Occupancy,
+    /// The coordinator has died, or cannot reach the bucket.
+    #[error(
+        "run {run}: its coordinator has shown no sign of life for {secs} s. What is done lies in {url}: start the same encode again, then its workers"
+    )]
+    Abandoned {
+        /// Number of the run.
+        run: u64,
+        /// Time without a sign.
+        secs: u64,
+        /// The bucket.
+        url: String,
+    },
     /// Another coordinator has taken the run's place.
     #[error(
         "run {run} was superseded: another `encode --blobs` uses {url}. Let one of them finish, or give the other another prefix"

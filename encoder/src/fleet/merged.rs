@@ -1,5 +1,5 @@
-//! The object of what all views together say about every cell: regions, text bank, refinements, objects, and the index of
-//! the views' contributions.
+//! The object of what all views together say about every cell: regions, text bank, refinements, objects, places, and the
+//! index of the views' contributions.
 
 use std::ops::Range;
 use std::path::PathBuf;
@@ -14,9 +14,10 @@ use crate::encode::fleet_parts::{CellsToBuild, Merged};
 use crate::lift::refine::Refinement;
 use crate::lift::{ContributionError, ContributionIndex, RangeReader, RegionTable};
 use crate::objects::SceneObjects;
+use crate::occupancy::SceneOccupancy;
 
 const MAGIC: [u8; 8] = *b"SLAGMERG";
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 /// Requests under way for the contributions of a cell.
 const N_REQUESTS: usize = 32;
@@ -26,15 +27,16 @@ const N_REQUESTS: usize = 32;
 /// # Errors
 /// None: memory takes what is written.
 pub(super) fn pack(cells: &CellsToBuild<'_>) -> std::io::Result<Vec<u8>> {
-    let Merged { table, score_context, refinement, objects, occupancy: _ } = cells.merged;
+    let Merged { table, score_context, refinement, objects, occupancy } = cells.merged;
     let (mut of_table, mut of_index) = (Vec::new(), Vec::new());
     table.write(&mut of_table)?;
     cells.index.write(&mut of_index)?;
     let bank = &score_context.bank;
     let bank_dim = bank.dim as u64;
-    let (mut of_refinement, mut of_objects) = (Vec::new(), Vec::new());
+    let (mut of_refinement, mut of_objects, mut of_places) = (Vec::new(), Vec::new(), Vec::new());
     refinement.map_or(Ok(()), |refinement| refinement.write(&mut of_refinement))?;
     objects.map_or(Ok(()), |objects| objects.write(&mut of_objects))?;
+    occupancy.map_or(Ok(()), |occupancy| occupancy.write(&mut of_places))?;
     let sections = [
         (1, &of_table[..]),
         (2, &of_index[..]),
@@ -43,6 +45,7 @@ pub(super) fn pack(cells: &CellsToBuild<'_>) -> std::io::Result<Vec<u8>> {
         (5, bytemuck::bytes_of(&score_context.spread)),
         (6, &of_refinement[..]),
         (7, &of_objects[..]),
+        (8, &of_places[..]),
     ];
     let mut bytes = Vec::new();
     container::write(&mut bytes, MAGIC, VERSION, &sections)?;
@@ -56,6 +59,7 @@ pub(super) struct Unpacked {
     pub(super) score_context: ScoreMetricContext,
     pub(super) refinement: Option<Refinement>,
     pub(super) objects: Option<SceneObjects>,
+    pub(super) occupancy: Option<SceneOccupancy>,
 }
 
 impl Unpacked {
@@ -66,8 +70,7 @@ impl Unpacked {
             score_context: &self.score_context,
             refinement: self.refinement.as_ref(),
             objects: self.objects.as_ref(),
-            // Refused before a run begins.
-            occupancy: None,
+            occupancy: self.occupancy.as_ref(),
         }
     }
 }
@@ -110,13 +113,17 @@ pub(super) fn unpack(
         let objects = (!of_objects.is_empty())
             .then(|| SceneObjects::from_bytes(&of_objects, n_gaussians_of_cell))
             .transpose()?;
-        Ok((table, score_context, refinement, objects, section(2, "index")?))
+        let of_places = section(8, "places")?;
+        let occupancy = (!of_places.is_empty())
+            .then(|| SceneOccupancy::from_bytes(&of_places, n_gaussians_of_cell.len()))
+            .transpose()?;
+        Ok((table, score_context, refinement, objects, occupancy, section(2, "index")?))
     };
-    let (table, score_context, refinement, objects, of_index) = parse().map_err(damaged)?;
+    let (table, score_context, refinement, objects, occupancy, of_index) = parse().map_err(damaged)?;
     let names = views.iter().map(|view| PathBuf::from(&view.name)).collect();
     let reader = Arc::new(ViewObjects { bucket: Arc::clone(bucket), views: views.to_vec() });
     let index = ContributionIndex::read_shipped(&of_index, names, reader, n_gaussians_of_cell)?;
-    Ok(Unpacked { table, index, score_context, refinement, objects })
+    Ok(Unpacked { table, index, score_context, refinement, objects, occupancy })
 }
 
 /// The views' contributions in the bucket.

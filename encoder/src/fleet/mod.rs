@@ -7,13 +7,14 @@
 //! | `jobs/N/plan.json` | the plan of run N: settings and views; the highest N counts |
 //! | `jobs/N/cells.json` | the cells of run N, once all views are brought together |
 //! | `jobs/N/failed/VIEW.json` | views that are left out, and why |
+//! | `jobs/N/pulse` | the coordinator's last sign of life |
 //! | `jobs/N/end.json` | how run N ended: published, or superseded by the next. The first one to put it decides |
 //! | `views/IDENTITY` | a view's contributions: it is done when this is there |
 //! | `merged/HASH` | what all views together say about every cell |
 //! | `cells/IDENTITY/CELL.json` | the record of a cell, whose shards are in `objects/`: it is done when this is there |
 //! | `objects/HASH` | shards and fields |
 //!
-//! All but `end.json` are named by what they are made of, and puts are conditional: work that is done twice, by a worker
+//! All but `end.json` and `pulse` are named by what they are made of, and put on condition that they are not there: work that is done twice, by a worker
 //! that was thought dead, changes nothing, and a run takes up what earlier ones left.
 //!
 //! | file | job |
@@ -21,7 +22,7 @@
 //! | [`coordinator`] | the executor of `encode --blobs` |
 //! | [`worker`] | `worker`: prepares a run, and does its views and cells |
 //! | `share`, `queue` | which views and cells a worker takes: its share, or what JetStream hands out |
-//! | `run` | the runs in a bucket, and their fence |
+//! | `run`, `pulse` | the runs in a bucket, their fence, and whether their coordinator lives |
 //! | `documents`, `view_object`, `scene_object`, `merged` | what lies in the bucket |
 //! | `inputs` | photos and masks on their way to and from the bucket |
 
@@ -33,6 +34,7 @@ mod error;
 mod inputs;
 mod merged;
 mod prepared;
+mod pulse;
 mod queue;
 mod run;
 mod scene_object;

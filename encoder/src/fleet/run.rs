@@ -39,6 +39,11 @@ impl Run {
         format!("{}/{view:06}.json", self.failed_folder())
     }
 
+    /// Returns the key of the coordinator's sign of life.
+    pub(super) fn pulse_key(self) -> String {
+        self.key("pulse")
+    }
+
     /// Returns the newest run, and whether it has ended.
     fn newest(bucket: &Bucket) -> Result<Option<(Self, bool)>, FleetError> {
         let names = bucket.list("jobs")?;

@@ -13,6 +13,7 @@ use super::dispatch::{Dispatcher, Item, Kind};
 use super::documents::{self, FailedView, RunPlan};
 use super::error::FleetError;
 use super::prepared::Prepared;
+use super::pulse::Pulse;
 use super::queue::{Queue, QueueSettings};
 use super::run::{Run, State};
 use super::share::Share;
@@ -56,7 +57,7 @@ pub struct WorkerSettings {
     pub folder: PathBuf,
     /// The mask model, where the coordinator uses one.
     pub segmenter: Option<PathBuf>,
-    /// Time to wait for a run to begin.
+    /// Time to wait for a run to begin, and for a sign of life of its coordinator.
     pub patience: Duration,
     /// Whether it goes on to the next run when one is published.
     pub stays: bool,
@@ -148,6 +149,7 @@ fn work_for(
         }
     };
     let dispatcher = dispatcher.as_ref();
+    let mut watch = Watch { bucket, run, pulse: Pulse::new(run, settings.patience) };
     if run.state(bucket)? == State::Views {
         let scene = context
             .install(|| engines.rasterizer.load(&prepared.scene))
@@ -165,7 +167,7 @@ fn work_for(
         };
         let mut open = || open_views(bucket, &prepared);
         let result =
-            while_open(bucket, run, dispatcher, Kind::View, &mut open, context, &mut |_| work.run(context));
+            while_open(&mut watch, dispatcher, Kind::View, &mut open, context, &mut |_| work.run(context));
         report.n_views += work.n_done.load(Ordering::Relaxed);
         result?;
     }
@@ -175,7 +177,7 @@ fn work_for(
             let done = work.done()?;
             Ok(work.all().filter(|item| !done.contains(item)).collect())
         };
-        let result = while_open(bucket, run, dispatcher, Kind::Cell, &mut open, context, &mut |n_open| {
+        let result = while_open(&mut watch, dispatcher, Kind::Cell, &mut open, context, &mut |n_open| {
             work.run(n_open, context)
         });
         report.n_cells += work.n_done.load(Ordering::Relaxed);
@@ -196,10 +198,16 @@ fn open_views(bucket: &Bucket, prepared: &Prepared) -> Result<Vec<Item>, FleetEr
     Ok(open.map(|(number, _)| Item::View(number)).collect())
 }
 
+/// A run as a worker without work looks at it.
+struct Watch<'a> {
+    bucket: &'a Bucket,
+    run: Run,
+    pulse: Pulse,
+}
+
 /// Does the items of a kind for as long as the run asks for them.
 fn while_open(
-    bucket: &Bucket,
-    run: Run,
+    watch: &mut Watch<'_>,
     dispatcher: &dyn Dispatcher,
     kind: Kind,
     open: &mut dyn FnMut() -> Result<Vec<Item>, FleetError>,
@@ -210,6 +218,7 @@ fn while_open(
         Kind::View => State::Views,
         Kind::Cell => State::Cells,
     };
+    let (bucket, run) = (watch.bucket, watch.run);
     loop {
         let mut n_open = usize::MAX;
         dispatcher.offer(&mut || {
@@ -223,6 +232,7 @@ fn while_open(
             if context.is_cancelled() || run.state(bucket)? != asked {
                 return Ok(());
             }
+            watch.pulse.check(bucket)?;
             if dispatcher.wait(kind, pause(bucket)) {
                 break;
             }

@@ -3,6 +3,7 @@
 pub mod arrays;
 pub mod codec;
 pub mod field;
+pub mod fleet;
 pub mod inference;
 pub mod lift;
 pub mod machine;

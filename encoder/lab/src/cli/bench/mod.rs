@@ -2,6 +2,7 @@
 
 mod codec;
 mod field;
+mod fleet;
 mod inference;
 mod lift;
 mod partition;
@@ -22,6 +23,8 @@ pub enum BenchCommand {
     Codec(codec::CodecBenchArgs),
     /// Publishes a store of a generated field for `slag-edge bench query`.
     Field(field::FieldBenchArgs),
+    /// Simulates fleets of many machines with the measured times and bytes of an encode, beside fixed batches.
+    Fleet(fleet::FleetArgs),
     /// Times image models and Segment Anything on GPUs, as `encode` runs them.
     Inference(inference::InferenceArgs),
     /// Times the weights of a view: each device on generated scenes, or on a recorded one.
@@ -40,6 +43,7 @@ pub(super) fn run(command: &BenchCommand, progress: &dyn Progress, json: bool) -
     match command {
         BenchCommand::Codec(args) => codec::run(args, json),
         BenchCommand::Field(args) => field::run(args, progress),
+        BenchCommand::Fleet(args) => fleet::run(args, json),
         BenchCommand::Inference(args) => inference::run(args, json),
         BenchCommand::Raster(args) => raster::run(args, progress, json),
         BenchCommand::Lift(args) => lift::run(args, json),

@@ -1,0 +1,90 @@
+//! The network between a worker and the queue, as a proxy on loopback: delay, loss and partitions.
+//!
+//! TCP hides a lost packet as a wait for its retransmission, and a partition as silence until it ends; so does the proxy.
+
+use std::io::{Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use slag_math::random::Random;
+
+/// Least time after which TCP sends a packet again (RFC 6298 in Linux's form).
+const RETRANSMISSION: Duration = Duration::from_millis(200);
+
+/// How a network is at present.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Weather {
+    /// Time that each piece of data takes.
+    pub delay: Duration,
+    /// Share of the pieces that are lost and sent again.
+    pub loss: f64,
+    /// Whether nothing comes through.
+    pub is_cut: bool,
+}
+
+/// A network of its own between a port of this machine and another.
+pub struct Network {
+    port: u16,
+    weather: Arc<Mutex<Weather>>,
+}
+
+impl Network {
+    /// Makes a network to a port, with seeded loss.
+    pub fn to(upstream: u16, seed: u64) -> Self {
+        let listener = TcpListener::bind(("127.0.0.1", 0)).expect("binds");
+        let port = listener.local_addr().expect("an address").port();
+        let weather = Arc::new(Mutex::new(Weather::default()));
+        let shared = Arc::clone(&weather);
+        std::thread::spawn(move || {
+            let mut random = Random::new(seed);
+            for near in listener.incoming().flatten() {
+                wait_for_calm(&shared);
+                // A server that is away refuses; the peer sees its connection closed.
+                let Ok(far) = TcpStream::connect(("127.0.0.1", upstream)) else { continue };
+                let copies = near.try_clone().and_then(|copy| Ok((copy, far.try_clone()?)));
+                let Ok((near_copy, far_copy)) = copies else { continue };
+                for (from, to) in [(near, far_copy), (far, near_copy)] {
+                    let (weather, random) = (Arc::clone(&shared), Random::new(random.bits()));
+                    std::thread::spawn(move || carry(from, to, &weather, random));
+                }
+            }
+        });
+        Self { port, weather }
+    }
+
+    pub fn port(&self) -> u16 {
+        self.port
+    }
+
+    pub fn set(&self, weather: Weather) {
+        *self.weather.lock().unwrap_or_else(PoisonError::into_inner) = weather;
+    }
+}
+
+/// Returns the weather once it is no partition.
+fn wait_for_calm(weather: &Mutex<Weather>) -> Weather {
+    loop {
+        let now = *weather.lock().unwrap_or_else(PoisonError::into_inner);
+        if !now.is_cut {
+            return now;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// Carries data one way until an end is closed.
+fn carry(mut from: TcpStream, mut to: TcpStream, weather: &Mutex<Weather>, mut random: Random) {
+    let mut piece = vec![0; 1400];
+    while let Ok(n @ 1..) = from.read(&mut piece) {
+        let Weather { delay, loss, .. } = wait_for_calm(weather);
+        let lost = random.unit() < loss;
+        std::thread::sleep(delay + if lost { RETRANSMISSION } else { Duration::ZERO });
+        if to.write_all(&piece[..n]).is_err() {
+            break;
+        }
+    }
+    // The other direction ends as well; it may have ended before.
+    let _ = to.shutdown(std::net::Shutdown::Both);
+    let _ = from.shutdown(std::net::Shutdown::Both);
+}
