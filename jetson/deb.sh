@@ -1,5 +1,5 @@
 #!/bin/sh
-# Makes a Debian package of slag-edge: program, unit, ONNX Runtime, configuration. The same files make the same bytes.
+# Makes a Debian package of slag-edge: program, unit, ONNX Runtime, configuration, manual pages, completions. The same files make the same bytes.
 # usage: deb.sh amd64|arm64 BINARY OUT      OUT/slag-edge_VERSION_ARCH.deb is written, and its path printed
 set -eu
 cd "$(dirname "$0")/.."
@@ -11,10 +11,14 @@ arm64) machine=aarch64 ;;
 esac
 arch=$1 binary=$2 out=$3
 # DEB_VERSION: for tests of upgrades.
-version=${DEB_VERSION:-$(sed -n '/^\[workspace.package\]/,/^$/s/^version = "\(.*\)"/\1/p' Cargo.toml)}
+version=${DEB_VERSION:-$(sh scripts/version.sh)}
 # The time of all files; a commit's own where git knows it.
 SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git log -1 --format=%ct 2>/dev/null || echo 0)}
 export SOURCE_DATE_EPOCH
+[ -f target/manual/slag-edge.1 ] || {
+    echo "deb: no manual pages in target/manual; make them: cargo run -p slag-manual --locked -- target/manual" >&2
+    exit 1
+}
 runtime=$(sh scripts/get-onnxruntime.sh "$machine")
 
 root=$(mktemp -d)
@@ -30,16 +34,14 @@ put 644 LICENSE-MIT usr/share/doc/slag-edge/copyright
 sed -n '1,$p' LICENSE-APACHE >>"$root/usr/share/doc/slag-edge/copyright"
 gzip -9n <CHANGELOG.md >"$root/usr/share/doc/slag-edge/changelog.gz"
 chmod 644 "$root/usr/share/doc/slag-edge/changelog.gz"
-# Manual pages and completions, where the tests have written them (target/manual).
 for page in target/manual/slag-edge*.1; do
-    [ -f "$page" ] || continue
     install -d "$root/usr/share/man/man1"
     gzip -9n <"$page" >"$root/usr/share/man/man1/${page##*/}.gz"
     chmod 644 "$root/usr/share/man/man1/${page##*/}.gz"
 done
-[ ! -f target/manual/slag-edge.bash ] || put 644 target/manual/slag-edge.bash usr/share/bash-completion/completions/slag-edge
-[ ! -f target/manual/_slag-edge ] || put 644 target/manual/_slag-edge usr/share/zsh/vendor-completions/_slag-edge
-[ ! -f target/manual/slag-edge.fish ] || put 644 target/manual/slag-edge.fish usr/share/fish/vendor_completions.d/slag-edge.fish
+put 644 target/manual/slag-edge.bash usr/share/bash-completion/completions/slag-edge
+put 644 target/manual/_slag-edge usr/share/zsh/vendor-completions/_slag-edge
+put 644 target/manual/slag-edge.fish usr/share/fish/vendor_completions.d/slag-edge.fish
 
 # The newest interface of the C library that program and runtime name.
 glibc=$(readelf -V "$binary" "$runtime" | grep -o 'GLIBC_[0-9.]*' | sed 's/GLIBC_//' | sort -V | tail -n 1)

@@ -22,8 +22,9 @@ mount -t proc proc "$root/proc"
 inside() {
     chroot "$root" /usr/bin/env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root DEBIAN_FRONTEND=noninteractive "$@"
 }
+# In place of the shell that runs it in the background, so that ending that ends the service.
 as_slag() {
-    inside setpriv --reuid slag --regid slag --clear-groups "$@"
+    exec chroot "$root" /usr/bin/env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root setpriv --reuid slag --regid slag --clear-groups "$@"
 }
 
 cp "$deb" "$root/old.deb"
@@ -31,7 +32,12 @@ cp "$newer" "$root/new.deb"
 inside dpkg --install /old.deb
 inside getent passwd slag >/dev/null || fail "there is no user slag"
 [ "$(inside stat -c %U /var/lib/slag)" = slag ] || fail "/var/lib/slag is not slag's"
-inside slag-edge --version
+[ "$(inside slag-edge --version)" = "slag-edge $(dpkg-deb --field "$deb" Version)" ] || fail "program and package have different versions"
+# Debian's minimal systems leave manual pages out unless asked to, so the package itself is read.
+for file in $(sed -n 's/^Documentation=man:\(.*\)(\(.\))$/.\/usr\/share\/man\/man\2\/\1.\2.gz/p' jetson/slag-edge.service) \
+    ./usr/share/man/man1/slag-edge-fetch.1.gz ./usr/share/bash-completion/completions/slag-edge; do
+    dpkg-deb --fsys-tarfile "$deb" | tar -tf - "$file" >/dev/null || fail "the package lacks $file"
+done
 # The unit's own command, as its user; the configuration names the folder, and the model opens ONNX Runtime from the package.
 as_slag slag-edge serve --listen 127.0.0.1:0 >"$work/out" 2>"$work/err" &
 service=$!

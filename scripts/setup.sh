@@ -14,6 +14,8 @@ fail() {
 
 # "command:package" pairs; the packages are Debian 12's, pinned by its major versions where it has several.
 wanted="cc:gcc-12 cc:gcc ld:binutils python3:python3 pip3:python3-pip"
+# Tests read manual pages as people do.
+[ "${1:-}" = demo ] || wanted="$wanted man:man-db"
 [ "${1:-}" = cross ] &&
     wanted="$wanted aarch64-linux-gnu-gcc:gcc-aarch64-linux-gnu aarch64-linux-gnu-gcc:libc6-dev-arm64-cross qemu-aarch64-static:qemu-user-static debootstrap:debootstrap systemd-analyze:systemd"
 

@@ -27,7 +27,8 @@ use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use bench::BenchCommand;
 use changes::ChangesArgs;
 use config::ConfigError;
-use failure::{Exit, Failure};
+pub use failure::Exit;
+use failure::Failure;
 use fetch::FetchArgs;
 use goal::GoalArgs;
 use models::ModelsArgs;
@@ -125,11 +126,11 @@ impl Cli {
 
 #[cfg(test)]
 mod tests {
+    use crate::query::{AnswerKind, Negatives};
+    use crate::score::Precision;
     use glam::DVec3;
     use slag_common::frames::Aabb;
     use slag_common::shard::Profile;
-    use slag_edge::query::{AnswerKind, Negatives};
-    use slag_edge::score::Precision;
 
     use super::*;
 

@@ -1,10 +1,9 @@
 //! `slag-edge`: fetches shards and answers questions about them.
 
-mod cli;
-
 use std::io::IsTerminal;
 use std::process::ExitCode;
 
+use slag_edge::cli;
 use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {

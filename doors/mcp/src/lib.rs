@@ -2,6 +2,7 @@
 //!
 //! The tools ask `slag-edge serve` over HTTP and change nothing there.
 
+mod args;
 mod changes;
 mod find;
 pub mod http;
@@ -9,4 +10,5 @@ mod place;
 mod stand;
 mod tools;
 
+pub use args::Args;
 pub use tools::Tools;

@@ -1,15 +1,14 @@
 //! `slag-mcp`: a robot's answers as tools of the Model Context Protocol.
 
 use std::io::{self, Write};
-use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, Result};
 use clap::Parser;
 use rmcp::ServiceExt;
-use slag_mcp::{Tools, http};
+use slag_mcp::{Args, Tools, http};
 use slag_robot::{Robot, read_token};
-use slag_service::listen::{Listen, bind};
+use slag_service::listen::bind;
 use slag_service::stop::stop_signal;
 use tracing_subscriber::EnvFilter;
 
@@ -17,25 +16,6 @@ use tracing_subscriber::EnvFilter;
 const ASYNC_THREADS: usize = 2;
 /// Questions to the robot at a time.
 const MAX_QUESTIONS: usize = 8;
-
-/// Lets language models ask a robot, over the Model Context Protocol: on stdin and stdout, or over HTTP.
-#[derive(Debug, Parser)]
-#[command(name = "slag-mcp", version)]
-struct Args {
-    /// Address of the robot's `slag-edge serve`.
-    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7734", env = "SLAG_ROBOT")]
-    robot: String,
-    /// File with the token of the robot's --token-file.
-    #[arg(long, value_name = "FILE")]
-    token_file: Option<PathBuf>,
-    /// Speak streamable HTTP at /mcp of this address, instead of stdin and stdout.
-    #[arg(long, value_name = "IP:PORT|unix:PATH")]
-    listen: Option<Listen>,
-    /// Name that clients call this machine by, besides localhost and the address listened on; other names are refused.
-    /// May be repeated.
-    #[arg(long, value_name = "NAME", requires = "listen")]
-    host: Vec<String>,
-}
 
 fn main() -> ExitCode {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("warn"));

@@ -2,6 +2,7 @@
 //! `slag-edge serve`.
 
 mod answers;
+mod args;
 mod geometry;
 mod ground;
 mod messages;
@@ -9,3 +10,5 @@ pub mod node;
 mod position;
 pub mod stand;
 mod transforms;
+
+pub use args::Args;

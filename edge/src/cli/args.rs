@@ -4,14 +4,14 @@ use std::ffi::OsString;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
+use crate::fetch::{FetchRequest, Position};
+use crate::query::Engine;
+use crate::store::EdgeCache;
+use crate::text::TextService;
 use anyhow::anyhow;
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use slag_common::shard::Profile;
-use slag_edge::fetch::{FetchRequest, Position};
-use slag_edge::query::Engine;
-use slag_edge::store::EdgeCache;
-use slag_edge::text::TextService;
 use slag_models::commands::{self as model_commands, MODELS_HELP, RunArgs};
 use slag_models::hub::cache_folder;
 use slag_models::session::SessionError;

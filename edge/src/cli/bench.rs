@@ -3,19 +3,19 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use crate::bench::goal::time_goal;
+use crate::bench::http::time_http;
+use crate::bench::load::{self, LoadOptions};
+use crate::bench::objects::time_objects;
+use crate::bench::pause::{self, PauseOptions};
+use crate::bench::query::bench_query;
+use crate::bench::text::{self, TextSettings};
+use crate::bench::{Settings, dump_ids, dump_vectors, make_queries};
+use crate::score::Precision;
+use crate::store::Snapshot;
 use anyhow::{Context, anyhow};
 use clap::{Args, Subcommand};
 use slag_common::shard::ShardView;
-use slag_edge::bench::goal::time_goal;
-use slag_edge::bench::http::time_http;
-use slag_edge::bench::load::{self, LoadOptions};
-use slag_edge::bench::objects::time_objects;
-use slag_edge::bench::pause::{self, PauseOptions};
-use slag_edge::bench::query::bench_query;
-use slag_edge::bench::text::{self, TextSettings};
-use slag_edge::bench::{Settings, dump_ids, dump_vectors, make_queries};
-use slag_edge::score::Precision;
-use slag_edge::store::Snapshot;
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, text_model};
 use super::failure::{Failure, store_failure};

@@ -2,8 +2,8 @@
 
 use std::io::Write;
 
+use crate::query::{ChangedThing, ChangesError, ChangesReply, ChangesRequest, MovedThing};
 use clap::Args;
-use slag_edge::query::{ChangedThing, ChangesError, ChangesReply, ChangesRequest, MovedThing};
 
 use super::args::{CacheArgs, ModelArgs, engine};
 use super::failure::{Failure, store_failure};

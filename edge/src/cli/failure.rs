@@ -3,8 +3,8 @@
 use std::io::{self, Write};
 use std::process::ExitCode;
 
-use slag_edge::query::QueryError;
-use slag_edge::store::StoreError;
+use crate::query::QueryError;
+use crate::store::StoreError;
 
 use super::text::visible;
 
@@ -55,14 +55,14 @@ impl Failure {
             Self::BrokenPipe => return Exit::Done,
             Self::Partial(error) => {
                 // The report is on stdout already, and names the cells.
-                let _ = writeln!(io::stderr(), "error: {}", visible(&slag_edge::error_line(&*error)));
+                let _ = writeln!(io::stderr(), "error: {}", visible(&crate::error_line(&*error)));
                 return Exit::Partial;
             }
             Self::Usage(error) => (Exit::Usage, "usage", error),
             Self::Failed(kind, error) => (Exit::Failed, kind, error),
             Self::Interrupted(error) => (Exit::Interrupted, "interrupted", error),
         };
-        let detail = slag_edge::error_line(&*error);
+        let detail = crate::error_line(&*error);
         // If even this cannot be written, there is nothing left to do.
         let _ = match json {
             true => writeln!(
@@ -108,7 +108,7 @@ mod tests {
     fn causes_are_told_once() {
         let io = io::Error::new(io::ErrorKind::NotFound, "no such file");
         let error = anyhow::Error::from(io).context("a: no such file; look").context("b");
-        assert_eq!(slag_edge::error_line(&*error), "b: a: no such file; look");
+        assert_eq!(crate::error_line(&*error), "b: a: no such file; look");
     }
 
     #[test]

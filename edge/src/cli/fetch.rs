@@ -4,11 +4,11 @@ use std::io::{self, IsTerminal};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use crate::fetch::{FetchRequest, Position};
+use crate::query::parse_point;
 use anyhow::anyhow;
 use clap::Args;
 use glam::DVec3;
-use slag_edge::fetch::{FetchRequest, Position};
-use slag_edge::query::parse_point;
 
 use super::args::{CacheArgs, DownloadArgs};
 use super::failure::Failure;

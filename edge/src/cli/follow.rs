@@ -6,12 +6,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use crate::fetch::FetchRequest;
+use crate::fetch::follow::{FollowEnvironment, FollowSettings, Following, follow, read_positions};
+use crate::http::{App, RESTARTS, keep_following};
+use crate::store::EdgeCache;
 use anyhow::anyhow;
 use clap::Args;
-use slag_edge::fetch::FetchRequest;
-use slag_edge::fetch::follow::{FollowEnvironment, FollowSettings, Following, follow, read_positions};
-use slag_edge::http::{App, RESTARTS, keep_following};
-use slag_edge::store::EdgeCache;
 
 use super::failure::Failure;
 use super::network::{failure, fetch_once, random};
@@ -89,7 +89,7 @@ pub fn watch(
                     Ok(report) if json => print_json(report),
                     Ok(report) => print_line(report),
                     Err(error) => {
-                        tracing::warn!("{}", slag_edge::error_line(error));
+                        tracing::warn!("{}", crate::error_line(error));
                         Ok(())
                     }
                 };
@@ -129,7 +129,7 @@ pub fn follow_in_background(
                         tracing::info!("fetched {n} shards of generation {generation}");
                         app.reload_now();
                     }
-                    Err(error) => tracing::warn!("{}", slag_edge::error_line(error)),
+                    Err(error) => tracing::warn!("{}", crate::error_line(error)),
                 },
                 random: &random,
                 cancel: &stop,

@@ -3,11 +3,11 @@
 use std::io::Write;
 use std::path::PathBuf;
 
+use crate::goal::{self, Goal, GoalError, GoalReply, GoalRequest, GoalTarget};
+use crate::query::{object_id, parse_point};
+use crate::score::Budget;
 use clap::Args;
 use glam::DVec3;
-use slag_edge::goal::{self, Goal, GoalError, GoalReply, GoalRequest, GoalTarget};
-use slag_edge::query::{object_id, parse_point};
-use slag_edge::score::Budget;
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
 use super::failure::{Failure, store_failure};

@@ -4,8 +4,8 @@ use std::hash::{BuildHasher, Hasher, RandomState};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use slag_edge::fetch::{self, Environment, FetchError, FetchReport, FetchRequest, NetworkLimits, Progress};
-use slag_edge::store::EdgeCache;
+use crate::fetch::{self, Environment, FetchError, FetchReport, FetchRequest, NetworkLimits, Progress};
+use crate::store::EdgeCache;
 
 use super::failure::Failure;
 
@@ -27,7 +27,7 @@ pub fn environment<'a>(
     progress: &'a dyn Progress,
 ) -> Environment<'a> {
     Environment {
-        now_unix_secs: slag_edge::now_unix_secs(),
+        now_unix_secs: crate::now_unix_secs(),
         cancel,
         progress,
         random: &random,

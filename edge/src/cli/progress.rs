@@ -3,8 +3,8 @@
 use std::io::{self, Write};
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use crate::fetch::{DownloadFailure, FetchReport, Progress, Tally};
 use slag_common::ByteSize;
-use slag_edge::fetch::{DownloadFailure, FetchReport, Progress, Tally};
 
 use super::failure::Failure;
 use super::output::print_pairs;

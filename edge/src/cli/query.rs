@@ -3,14 +3,14 @@
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use clap::Args;
-use glam::DVec3;
-use slag_common::frames::Aabb;
-use slag_edge::query::{
+use crate::query::{
     AnswerKind, Answers, DEFAULT_MIN_COUNT, Format, Found, Negatives, QueryRequest, Reply, ThresholdSource,
     parse_box, parse_point,
 };
-use slag_edge::score::{Budget, Precision};
+use crate::score::{Budget, Precision};
+use clap::Args;
+use glam::DVec3;
+use slag_common::frames::Aabb;
 
 use super::args::{CacheArgs, ModelArgs, ThreadArgs, engine};
 use super::failure::{Failure, store_failure};

@@ -6,11 +6,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use crate::fetch::follow::Following;
+use crate::http::{self, App, Settings};
+use crate::store::StoreError;
 use anyhow::anyhow;
 use clap::Args;
-use slag_edge::fetch::follow::Following;
-use slag_edge::http::{self, App, Settings};
-use slag_edge::store::StoreError;
 use slag_service::access::{Access, AccessSettings};
 use slag_service::listen::{Listen, bind};
 use slag_service::stop::stop_signal;
@@ -91,7 +91,7 @@ pub fn run(mut args: ServeArgs) -> Result<(), Failure> {
         Err(StoreError::Empty { path }) => {
             tracing::warn!("{} holds no scene yet; a scene fetched there is served at once", path.display());
         }
-        Err(error) => tracing::warn!("no scene is loaded: {}", slag_edge::error_line(&error)),
+        Err(error) => tracing::warn!("no scene is loaded: {}", crate::error_line(&error)),
     }
     if let Ok(snapshot) = engine.snapshot()
         && let Err(error) = engine.check_encoder(&snapshot)

@@ -1,10 +1,10 @@
 //! `status`.
 
+use crate::fetch::accepted;
+use crate::query::Status;
+use crate::store::Snapshot;
 use clap::Args;
 use serde::Serialize;
-use slag_edge::fetch::accepted;
-use slag_edge::query::Status;
-use slag_edge::store::Snapshot;
 
 use super::args::CacheArgs;
 use super::failure::{Failure, store_failure};
@@ -24,7 +24,7 @@ pub fn run(args: StatusArgs) -> Result<(), Failure> {
     let snapshot = Snapshot::open(&cache).map_err(store_failure)?;
     let accepted = accepted(&cache);
     let expires_unix_secs = accepted.as_ref().and_then(|accepted| accepted.expires_unix_secs);
-    let is_expired = expires_unix_secs.is_some_and(|expires| expires <= slag_edge::now_unix_secs());
+    let is_expired = expires_unix_secs.is_some_and(|expires| expires <= crate::now_unix_secs());
     let pinned_scene = accepted.and_then(|accepted| accepted.scene);
     let status = Status::of(&snapshot);
     if args.json {

@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
+use crate::fetch::{AddedRoot, FirstRoot, accepted, add_root};
 use anyhow::anyhow;
 use clap::{ArgGroup, Args, Subcommand};
 use slag_common::tuf::{MAX_ROOT_BYTES, format_utc};
-use slag_edge::fetch::{AddedRoot, FirstRoot, accepted, add_root};
 
 use super::args::CacheArgs;
 use super::failure::Failure;

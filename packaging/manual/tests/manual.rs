@@ -1,0 +1,133 @@
+//! Manual pages and completions, against what the programs themselves print and how `man` and bash read the files.
+
+use std::path::Path;
+use std::process::Command;
+
+use slag_tests::{judge, program, run, text};
+
+/// The programs, and the least number of pages that each has.
+const PROGRAMS: [(&str, usize); 4] =
+    [("slag-encoder", 20), ("slag-edge", 15), ("slag-mcp", 1), ("slag-ros", 1)];
+
+fn manual() -> tempfile::TempDir {
+    let out = tempfile::tempdir().expect("a folder");
+    run(Command::new(env!("CARGO_BIN_EXE_slag-manual")).arg(out.path()));
+    out
+}
+
+/// Returns a text with single spaces.
+fn words(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+/// Returns what a program prints as its help, in long lines.
+fn help(path: &[&str]) -> String {
+    let mut command = Command::new(program(path[0]));
+    command.args(&path[1..]).arg("--help").env("COLUMNS", "10000").env("SLAG_EDGE_CONFIG", "");
+    String::from_utf8(run(&mut command).stdout).expect("text")
+}
+
+/// Returns the flags of a help text, each with the first paragraph of its help.
+fn flags(help: &str) -> Vec<(String, String)> {
+    let mut flags: Vec<(String, String)> = Vec::new();
+    let mut is_open = false;
+    for line in help.lines() {
+        let trimmed = line.trim_start();
+        let indent = line.len() - trimmed.len();
+        if trimmed.starts_with('-') && (2..=6).contains(&indent) {
+            let (head, rest) = trimmed.split_once("  ").unwrap_or((trimmed, ""));
+            let flag = head.split([' ', ',']).rfind(|word| word.starts_with("--")).unwrap_or(head);
+            flags.push((flag.trim_end_matches("...").to_owned(), rest.trim().to_owned()));
+            is_open = true;
+        } else if is_open && indent > 6 && !trimmed.is_empty() {
+            let (_, help) = flags.last_mut().expect("a flag before its help");
+            *help += " ";
+            *help += trimmed;
+        } else {
+            is_open = false;
+        }
+    }
+    for (_, help) in &mut flags {
+        // Defaults and the like stand elsewhere in a page.
+        let end =
+            [" [default:", " [env:", " [possible", " [alias"].iter().filter_map(|mark| help.find(mark)).min();
+        *help = words(&help[..end.unwrap_or(help.len())]);
+    }
+    flags
+}
+
+/// Returns the commands below a command, by its help text.
+fn commands(help: &str) -> Vec<&str> {
+    let below = help.split("\nCommands:\n").nth(1).unwrap_or_default();
+    let lines = below.lines().take_while(|line| !line.is_empty());
+    let is_name = |line: &&str| line.starts_with("  ") && !line.starts_with("   ");
+    lines
+        .filter(is_name)
+        .filter_map(|line| line.split_whitespace().next())
+        .filter(|name| *name != "help")
+        .collect()
+}
+
+/// Returns a page as `man` shows it; it must not warn.
+fn page(path: &Path) -> String {
+    let shown = Command::new("man")
+        .args(["--warnings=w", "--nh", "--nj", "--encoding=UTF-8", "-l", text(path)])
+        .env("MANWIDTH", "10000")
+        .env("LC_ALL", "C.UTF-8")
+        .env("GROFF_NO_SGR", "1")
+        .output()
+        .expect("man runs (Debian: man-db)");
+    assert!(shown.status.success() && shown.stderr.is_empty(), "{}: {shown:?}", path.display());
+    words(&String::from_utf8(shown.stdout).expect("text"))
+}
+
+/// Compares the pages of a command and those below it; returns how many there are, and how many flags they have.
+fn compare(path: &[&str], manual: &Path) -> (usize, usize) {
+    let help = help(path);
+    let name = format!("{}.1", path.join("-"));
+    let page = page(&manual.join(&name));
+    let (mut n_pages, mut n_flags) = (1, 0);
+    for (flag, help) in flags(&help) {
+        assert!(page.contains(&flag), "{name} lacks {flag}: {page}");
+        assert!(page.contains(&help), "{name}: {flag}: {help:?} is not in the page: {page}");
+        n_flags += 1;
+    }
+    for below in commands(&help) {
+        let path: Vec<&str> = path.iter().copied().chain([below]).collect();
+        let (pages, flags) = compare(&path, manual);
+        n_pages += pages;
+        n_flags += flags;
+    }
+    (n_pages, n_flags)
+}
+
+/// Oracle: `--help` of the real programs, and `man`.
+#[test]
+fn every_flag_is_in_its_page_with_its_help() {
+    let manual = manual();
+    for (program, least) in PROGRAMS {
+        let (n_pages, n_flags) = compare(&[program], manual.path());
+        assert!(n_pages >= least && n_flags >= 4 * n_pages, "{program}: {n_pages} pages, {n_flags} flags");
+    }
+}
+
+/// A person's keys in an interactive bash.
+#[test]
+fn bash_completes_commands_flags_and_values() {
+    let manual = manual();
+    for (program, keys, completed) in [
+        ("slag-edge", "fetch --max-by", "fetch --max-bytes"),
+        ("slag-edge", "bench pau", "bench pause"),
+        ("slag-encoder", "encode --occupanc", "encode --occupancy"),
+        ("slag-mcp", "--rob", "--robot"),
+        ("slag-ros", "--rmw rmw_cyc", "--rmw rmw_cyclonedds_cpp"),
+    ] {
+        let script = manual.path().join(format!("{program}.bash"));
+        let line = judge(
+            Path::new("python3"),
+            "packaging/manual/tests/complete.py",
+            &[text(&script), &format!("{program} {keys}")],
+        );
+        assert!(line.starts_with(&format!("{program} {completed}")), "{program} {keys}: {line:?}");
+    }
+}
