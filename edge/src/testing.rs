@@ -338,6 +338,7 @@ pub fn manifest_of(shards: &[BuiltShard], generation: u64) -> Manifest {
             dim: header.dim,
             default_threshold: 0.5,
             calibration: None,
+            text_model: None,
         },
         n_gaussians: shards.iter().map(|s| u64::from(s.view().header.n_gaussians)).sum(),
         n_without_evidence: 0,

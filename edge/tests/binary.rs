@@ -85,6 +85,7 @@ fn painted(positions: &[[u16; 3]], n_red: u32) -> (Vec<u8>, Vec<u8>) {
             dim: header.dim,
             default_threshold: 0.8,
             calibration: None,
+            text_model: None,
         },
         n_gaussians: n_gaussians.into(),
         n_without_evidence: 0,

@@ -248,6 +248,7 @@ fn manifest() -> Vec<u8> {
             dim: 4,
             default_threshold: 0.1,
             calibration: None,
+            text_model: None,
         },
         n_gaussians: 10,
         n_without_evidence: 1,

@@ -62,9 +62,10 @@ pub struct InfoArgs {
 
 /// The name of the stand-in in `--models`.
 const COLOURS: &str = "colours";
-/// Help text of `--models` in every program: the cases of [`open`].
+/// Help text of the robot's `--models`: the cases of [`open`].
 pub const MODELS_HELP: &str = "Folder with model.toml, or name of a pulled model (`models list`), or `colours`, \
-    which recognises only colours and needs no ONNX Runtime [default: the embedded encoders]";
+    which recognises only colours and needs no ONNX Runtime [default: the text model that the scene carries, else \
+    the embedded one]";
 
 /// Options of running models.
 #[derive(Clone, Debug, Args)]

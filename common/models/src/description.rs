@@ -61,7 +61,6 @@
 //! Unknown fields are refused. On a robot, which has only the text files, the image file's `sha256` must be
 //! recorded, because the encoder id covers both.
 
-use std::fmt;
 use std::path::{Component, Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -69,6 +68,7 @@ use serde::{Deserialize, Serialize};
 use crate::encoder_id::EncoderId;
 pub use crate::file_ref::{FileRef, Sha256};
 use crate::preprocess::{Filter, Preprocess, Resize};
+pub use crate::score::ScoreDescription;
 
 /// The file name of the description in a model directory.
 pub const FILE_NAME: &str = "model.toml";
@@ -92,6 +92,14 @@ pub enum DescriptionError {
         path: PathBuf,
         /// The parser's error, with line and column.
         cause: Box<toml::de::Error>,
+    },
+    /// The description of a text model from a store is not JSON, or has missing or unknown fields.
+    #[error("{}: {cause}; use a robot program and an encoder of matching versions", path.display())]
+    Json {
+        /// The description.
+        path: PathBuf,
+        /// The parser's error.
+        cause: serde_json::Error,
     },
     /// A field has an invalid value.
     #[error("{}: {field} is {found}, expected {expected}; correct it", path.display())]
@@ -277,62 +285,12 @@ pub struct CentreDescription {
     pub tensor: String,
 }
 
-/// The interpretation of scores: as a cosine, or as the sigmoid of a scaled cosine.
-#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ScoreDescription {
-    /// The cosine from which something counts as found, by default.
-    threshold: Option<f32>,
-    /// The factor from cosine to logit.
-    logit_scale: Option<f64>,
-    /// The bias added to the logit.
-    logit_bias: Option<f64>,
-    /// The probability from which something counts as found, by default.
-    probability: Option<f64>,
-}
-
-/// Shows the fields that are given.
-impl fmt::Display for ScoreDescription {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { threshold, logit_scale, logit_bias, probability } = *self;
-        let given = [
-            ("threshold", threshold.map(f64::from)),
-            ("logit_scale", logit_scale),
-            ("logit_bias", logit_bias),
-            ("probability", probability),
-        ];
-        let given = given.into_iter().filter_map(|(name, value)| Some(format!("{name} = {}", value?)));
-        f.write_str(&given.collect::<Vec<_>>().join(", "))
-    }
-}
-
-impl ScoreDescription {
-    /// Returns the cosine from which something counts as found: the threshold, or the solution of
-    /// 1 / (1 + exp(-(scale * cosine + bias))) = probability (Zhai et al. 2023, equation 1).
-    ///
-    /// `None` if the fields are not those of exactly one of the two, or give no cosine.
-    pub fn threshold(&self) -> Option<f32> {
-        let threshold = match *self {
-            Self { threshold, logit_scale: None, logit_bias: None, probability: None } => {
-                f64::from(threshold?)
-            }
-            Self { threshold: None, logit_scale, logit_bias, probability } => {
-                let probability = probability.unwrap_or(0.5);
-                ((probability / (1.0 - probability)).ln() - logit_bias?) / logit_scale.filter(|s| *s > 0.0)?
-            }
-            _ => return None,
-        };
-        (-1.0..=1.0).contains(&threshold).then_some(threshold as f32)
-    }
-}
-
 impl Description {
     /// Reads and checks `path`.
     /// # Errors
     /// [`DescriptionError`] if it cannot be read or is invalid.
     pub fn read(path: &Path) -> Result<Self, DescriptionError> {
-        let text = fs_err::read_to_string(path).map_err(|cause| DescriptionError::Read { cause })?;
-        Self::parse(path, &text)
+        Self::parse(path, &read_text(path)?)
     }
 
     /// Parses and checks a description; `path` is for messages.
@@ -344,8 +302,22 @@ impl Description {
         Ok(description)
     }
 
+    /// Parses and checks a description in JSON, as stores carry it; `path` is for messages.
+    pub(crate) fn from_json(path: &Path, bytes: &[u8]) -> Result<Self, DescriptionError> {
+        let parsed: Result<Self, _> = serde_json::from_slice(bytes);
+        let description = parsed.map_err(|cause| DescriptionError::Json { path: path.to_owned(), cause })?;
+        description.check(path)?;
+        Ok(description)
+    }
+
     /// Returns the files with their roles, image first; a file of weights has the role of its model.
     pub fn files(&self) -> Vec<(&'static str, &FileRef)> {
+        let files = self.files_by_role().into_iter();
+        files.flat_map(|(role, file)| file.parts().map(move |part| (role, part))).collect()
+    }
+
+    /// Returns the files with their roles, image first, without the files of weights.
+    pub(crate) fn files_by_role(&self) -> Vec<(&'static str, &FileRef)> {
         let mut files = vec![("image.model", &self.image.file)];
         match &self.text {
             TextDescription::Onnx(text) => {
@@ -356,10 +328,10 @@ impl Description {
             }
         }
         files.extend(self.text_centre.iter().map(|centre| ("text.centre", &centre.file)));
-        files.into_iter().flat_map(|(role, file)| file.parts().map(move |part| (role, part))).collect()
+        files
     }
 
-    /// Mutable [`Self::files`], without the files of weights.
+    /// Mutable [`Self::files_by_role`].
     pub(crate) fn files_mut(&mut self) -> Vec<(&'static str, &mut FileRef)> {
         let mut files = vec![("image.model", &mut self.image.file)];
         match &mut self.text {
@@ -436,8 +408,12 @@ impl Description {
 
 /// Reads TOML.
 pub(crate) fn read_toml<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, DescriptionError> {
-    let text = fs_err::read_to_string(path).map_err(|cause| DescriptionError::Read { cause })?;
-    parse_toml(path, &text)
+    parse_toml(path, &read_text(path)?)
+}
+
+/// Reads the text of a description.
+pub(crate) fn read_text(path: &Path) -> Result<String, DescriptionError> {
+    fs_err::read_to_string(path).map_err(|cause| DescriptionError::Read { cause })
 }
 
 fn parse_toml<T: serde::de::DeserializeOwned>(path: &Path, text: &str) -> Result<T, DescriptionError> {

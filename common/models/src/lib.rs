@@ -38,10 +38,12 @@ mod provider;
 mod runtime;
 mod runtime_log;
 pub mod sam;
+mod score;
 pub mod session;
 mod session_error;
 pub mod tensors;
 pub mod text;
+mod text_side;
 
 pub use crop::Crop;
 pub use encoder::{ImageEncoder, TextEncoder};
@@ -54,3 +56,4 @@ pub use placement::Placement;
 pub use provider::{NoProvider, Provider};
 pub use runtime::find_runtime;
 pub use session::SessionOptions;
+pub use text_side::{TextSide, TextSideError};

@@ -16,12 +16,13 @@ mod embedded {
 
 use crate::{
     EncoderId, ImageEncoder, ModelError, ModelFile, SessionOptions, TextEncoder, colours,
-    description::{Description, DescriptionError, FILE_NAME, FileRef, TextDescription},
+    description::{self, Description, DescriptionError, FILE_NAME, FileRef, TextDescription},
     image::OnnxImageEncoder,
     phrases::PhraseEncoder,
     preprocess::Preprocess,
     tensors,
     text::OnnxTextEncoder,
+    text_side::{TextSide, TextSideError},
 };
 
 /// A pair of image and text encoders: a directory with a description, or built into the program.
@@ -34,7 +35,23 @@ pub struct ModelDir {
 #[derive(Clone, Debug)]
 enum Source {
     Colours,
-    Files { files: Files, description: Box<Description>, batch: Arc<Mutex<Option<usize>>> },
+    Files { files: Files, description: Box<Documented>, batch: Arc<Mutex<Option<usize>>> },
+}
+
+/// A description and its text.
+#[derive(Clone, Debug)]
+struct Documented {
+    /// TOML; empty for one from a store, which has no image side to encode with.
+    document: String,
+    description: Description,
+}
+
+impl std::ops::Deref for Documented {
+    type Target = Description;
+
+    fn deref(&self) -> &Description {
+        &self.description
+    }
 }
 
 /// The location of a description's files.
@@ -70,9 +87,11 @@ impl ModelDir {
     /// # Errors
     /// [`ModelError::Description`] if the description is invalid, or a file without a recorded hash is absent.
     pub fn open(path: &Path) -> Result<Self, ModelError> {
-        let description = Description::read(&path.join(FILE_NAME))?;
+        let file = path.join(FILE_NAME);
+        let document = description::read_text(&file)?;
+        let description = Description::parse(&file, &document)?;
         let files_root = path.join(&description.files_root);
-        Self::with(description, Files::Folder(files_root))
+        Self::with(Documented { document, description }, Files::Folder(files_root))
     }
 
     /// Returns the encoders embedded in the program: trained on generated scenes, poor on real photos
@@ -81,23 +100,39 @@ impl ModelDir {
     /// [`ModelError::Description`] if the embedded description is invalid, which tests rule out.
     pub fn embedded() -> Result<Self, ModelError> {
         let description = Description::parse(Path::new("(embedded)/model.toml"), embedded::DESCRIPTION)?;
-        Self::with(description, Files::Embedded)
+        Self::with(Documented { document: embedded::DESCRIPTION.to_owned(), description }, Files::Embedded)
     }
 
-    fn with(description: Description, files: Files) -> Result<Self, ModelError> {
-        let mut hashed = description.clone();
-        for (_, file) in hashed.files_mut() {
-            let root = match &files {
-                Files::Folder(root) => root,
-                // Not used: the embedded description records every hash.
-                Files::Embedded => Path::new(""),
-            };
-            file.for_each_part(|part| {
-                part.sha256 = Some(crate::description::Sha256(sha256_of(root, part)?));
-                Ok::<_, DescriptionError>(())
-            })?;
-        }
-        let id = hashed.encoder_id();
+    /// Opens the text side that a store carries. `description`: [`TextSide::description`]; `path`: of the description, for
+    /// messages; `folder`: where its files lie, by their hashes. Their content is compared with the description when the
+    /// encoder is opened.
+    /// # Errors
+    /// [`ModelError::Description`] if the description is invalid.
+    pub fn carried(description: &[u8], path: &Path, folder: &Path) -> Result<Self, ModelError> {
+        let description = Description::from_json(path, description)?;
+        let described = Documented { document: String::new(), description };
+        Self::with(described, Files::Folder(folder.to_owned()))
+    }
+
+    /// Returns the text side, for a store to carry.
+    /// # Errors
+    /// [`TextSideError`]: the licence does not permit it, or files are not as described.
+    pub fn text_side(&self) -> Result<TextSide, TextSideError> {
+        let built_in = || TextSideError::BuiltIn { model: self.id.name.clone() };
+        let Source::Files { files: files @ Files::Folder(root), description, .. } = &self.source else {
+            return Err(built_in());
+        };
+        let hashed = hashed(&description.description, root)?;
+        TextSide::new(&self.id, &description.document, &hashed, |file| files.open(file, &[]))
+    }
+
+    fn with(description: Documented, files: Files) -> Result<Self, ModelError> {
+        let root = match &files {
+            Files::Folder(root) => root,
+            // Not used: the embedded description records every hash.
+            Files::Embedded => Path::new(""),
+        };
+        let id = hashed(&description.description, root)?.encoder_id();
         let source = Source::Files { files, description: Box::new(description), batch: Arc::default() };
         Ok(Self { id, source })
     }
@@ -202,6 +237,18 @@ impl ModelDir {
     }
 }
 
+/// Returns a description with the hash of every file.
+fn hashed(description: &Description, root: &Path) -> Result<Description, DescriptionError> {
+    let mut hashed = description.clone();
+    for (_, file) in hashed.files_mut() {
+        file.for_each_part(|part| {
+            part.sha256 = Some(crate::description::Sha256(sha256_of(root, part)?));
+            Ok::<_, DescriptionError>(())
+        })?;
+    }
+    Ok(hashed)
+}
+
 /// Returns the recorded hash of `file`, or else computes it.
 pub(crate) fn sha256_of(files_root: &Path, file: &FileRef) -> Result<[u8; 32], DescriptionError> {
     let path = files_root.join(&file.path);
@@ -248,7 +295,8 @@ mod tests {
     fn id_of(description: &str) -> [u8; 32] {
         let description =
             Description::parse(Path::new("model.toml"), description).expect("a valid description");
-        ModelDir::with(description, Files::Embedded).expect("every hash is recorded").encoder_id().hash()
+        let described = Documented { document: String::new(), description };
+        ModelDir::with(described, Files::Embedded).expect("every hash is recorded").encoder_id().hash()
     }
 
     /// The id depends on everything that affects vectors, and not on prose, paths or batch sizes.

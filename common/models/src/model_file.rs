@@ -2,7 +2,7 @@
 
 use std::{
     borrow::Cow,
-    io,
+    io::{self, Read},
     path::{Path, PathBuf},
 };
 
@@ -23,6 +23,17 @@ impl ModelFile {
     /// Returns its bytes if it is embedded.
     pub(crate) fn embedded_bytes(&self) -> Option<&'static [u8]> {
         self.embedded
+    }
+
+    /// Opens it for reading from its start.
+    ///
+    /// # Errors
+    /// The operating system's error, with the path.
+    pub fn reader(&self) -> io::Result<Box<dyn Read>> {
+        Ok(match self.embedded {
+            Some(bytes) => Box::new(bytes),
+            None => Box::new(fs_err::File::open(&self.path)?),
+        })
     }
 
     /// Returns its bytes.

@@ -1,7 +1,7 @@
 //! Manifests as bytes.
 
 use super::error::ManifestError;
-use super::records::{MAX_BYTES, Manifest, VERSION};
+use super::records::{MAX_BYTES, MAX_TEXT_FILES, Manifest, VERSION};
 use crate::frames::Aabb;
 use crate::shard::MAX_DIM;
 
@@ -38,6 +38,12 @@ impl Manifest {
             return refuse(format!(
                 "its embeddings have {} components, expected 1 to {MAX_DIM}",
                 self.encoder.dim
+            ));
+        }
+        let n_text_files = self.encoder.text_model.as_ref().map_or(0, |model| model.files.len());
+        if n_text_files > MAX_TEXT_FILES {
+            return refuse(format!(
+                "its text model has {n_text_files} files, expected at most {MAX_TEXT_FILES}"
             ));
         }
         if self.cells.windows(2).any(|pair| pair[0].cell_id >= pair[1].cell_id) {

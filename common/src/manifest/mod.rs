@@ -13,5 +13,6 @@ mod tests;
 pub use error::ManifestError;
 pub use index::CellIndex;
 pub use records::{
-    Calibration, CellRecord, EncoderRecord, MAX_BYTES, Manifest, ShardRecord, TARGET, VERSION,
+    Calibration, CellRecord, EncoderRecord, MAX_BYTES, MAX_TEXT_FILES, Manifest, ObjectRecord, ShardRecord,
+    TARGET, TextModelRecord, VERSION,
 };

@@ -12,6 +12,8 @@ use crate::shard::{Profile, ScoreErrors};
 pub const VERSION: u32 = 2;
 /// Path of the manifest among a store's targets.
 pub const TARGET: &str = "manifest";
+/// Most files of a text model.
+pub const MAX_TEXT_FILES: usize = 16;
 /// Largest manifest read: a cell takes about 600 bytes, so this allows 100,000 cells.
 pub const MAX_BYTES: u64 = 64 << 20;
 
@@ -59,6 +61,36 @@ pub struct EncoderRecord {
     /// Distribution of scores in this scene; present if the model states no threshold.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub calibration: Option<Calibration>,
+    /// Its text side, if the store carries it.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub text_model: Option<TextModelRecord>,
+}
+
+/// The text side of an encoder as objects of the store.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TextModelRecord {
+    /// The description in JSON, which names the files by their BLAKE3 hashes.
+    pub description: ObjectRecord,
+    /// The files, each once, in the order of the description.
+    pub files: Vec<ObjectRecord>,
+}
+
+impl TextModelRecord {
+    /// Returns all objects: the description, then the files.
+    pub fn objects(&self) -> impl Iterator<Item = ObjectRecord> + '_ {
+        std::iter::once(self.description).chain(self.files.iter().copied())
+    }
+}
+
+/// An object that is no shard: an immutable file named by its hash.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ObjectRecord {
+    /// BLAKE3 of the file.
+    pub hash: Hash32,
+    /// Length of the file.
+    pub len_bytes: u64,
 }
 
 /// The distribution of the scores of a bank of texts in a scene.

@@ -22,6 +22,7 @@ fn manifest(n_cells: u32) -> Manifest {
             dim: 512,
             default_threshold: 0.1,
             calibration: None,
+            text_model: None,
         },
         n_gaussians: 10,
         n_without_evidence: 1,
@@ -41,6 +42,23 @@ fn manifest(n_cells: u32) -> Manifest {
                 CellRecord { cell_id, bounds: Aabb { min, max: min + DVec3::ONE }, n_gaussians: 5, shards }
             })
             .collect(),
+    }
+}
+
+/// A manifest without a text model has the bytes that it had before there were any.
+#[test]
+fn text_models_are_optional_and_bounded() {
+    let plain = manifest(1);
+    assert!(!String::from_utf8(plain.to_bytes()).expect("JSON").contains("text_model"));
+    let object = |byte| ObjectRecord { hash: Hash32([byte; 32]), len_bytes: 5 };
+    let mut carrying = plain;
+    for n_files in [0, 16, 17] {
+        let files = (0..n_files).map(object).collect();
+        carrying.encoder.text_model = Some(TextModelRecord { description: object(99), files });
+        match Manifest::parse(&carrying.to_bytes()) {
+            Ok(read) => assert!(read == carrying && n_files <= 16),
+            Err(error) => assert!(n_files == 17 && error.to_string().contains("17 files"), "{error}"),
+        }
     }
 }
 

@@ -117,6 +117,7 @@ impl Generator {
                 dim: self.dim,
                 default_threshold: THRESHOLD,
                 calibration: None,
+                text_model: None,
             },
             n_gaussians: u64::from(self.n_gaussians),
             n_without_evidence: 0,

@@ -53,7 +53,7 @@ pub struct DownloadArgs {
     /// Certificates (PEM) of the authorities that may vouch for an https:// address, in place of the public ones.
     #[arg(long, value_name = "FILE")]
     pub ca: Option<PathBuf>,
-    /// Most bytes kept on disk for shards [default: twice the bytes of the shards within the radius].
+    /// Most bytes kept on disk for shards and text models [default: twice the bytes of those within the radius].
     #[arg(long, value_name = "N")]
     pub max_bytes: Option<u64>,
 }
@@ -97,11 +97,14 @@ pub struct ModelArgs {
     pub how: RunArgs,
 }
 
-/// Makes an engine from a cache and a text model.
+/// Makes an engine from a cache and a text model; without one given, scenes that carry theirs are asked by it.
 pub fn engine(cache: EdgeCache, models: &ModelArgs) -> Result<Engine, Failure> {
-    let (models, options) = text_model(models)?;
-    let text = TextService::open(&models, &options);
-    Ok(Engine::new(cache, text.map_err(|e| Failure::Failed("models", e.into()))?))
+    let (given, options) = text_model(models)?;
+    let open = || TextService::open(&given, &options).map_err(|e| Failure::Failed("models", e.into()));
+    match &models.models {
+        Some(_) => Ok(Engine::new(cache, open()?)),
+        None => Engine::with_carried(cache, options.clone(), open),
+    }
 }
 
 /// Returns the models of the text model and the options it runs with.

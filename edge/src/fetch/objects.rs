@@ -7,7 +7,7 @@ use std::sync::PoisonError;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use slag_common::Hash32;
-use slag_common::manifest::Manifest;
+use slag_common::manifest::{Manifest, TextModelRecord};
 use slag_common::shard::Profile;
 
 use super::download::Client;
@@ -24,11 +24,25 @@ pub struct Check<'a> {
     pub manifest: &'a Manifest,
     pub profile: Profile,
     cells: BTreeMap<Hash32, &'a CurrentCell>,
+    /// Lengths of the files of the text model.
+    text_model: BTreeMap<Hash32, u64>,
 }
 
 impl<'a> Check<'a> {
     pub fn new(manifest: &'a Manifest, profile: Profile, cells: &'a [CurrentCell]) -> Self {
-        Self { manifest, profile, cells: cells.iter().map(|cell| (cell.hash, cell)).collect() }
+        let text_model = manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects);
+        let text_model = text_model.map(|object| (object.hash, object.len_bytes)).collect();
+        Self { manifest, profile, cells: cells.iter().map(|cell| (cell.hash, cell)).collect(), text_model }
+    }
+
+    /// Returns whether an object belongs to the text model.
+    pub fn is_of_text_model(&self, hash: Hash32) -> bool {
+        self.text_model.contains_key(&hash)
+    }
+
+    /// Returns the length of an object that the manifest lists.
+    pub fn len_bytes(&self, hash: Hash32) -> Option<u64> {
+        self.cell(hash).map(|cell| cell.len_bytes).or_else(|| self.text_model.get(&hash).copied())
     }
 
     /// Returns the cell of an object.
@@ -36,11 +50,14 @@ impl<'a> Check<'a> {
         self.cells.get(&hash).copied()
     }
 
-    /// Checks that bytes are the shard that the manifest describes.
+    /// Checks that bytes are the shard, or the file of the text model, that the manifest describes.
     pub fn object(&self, path: &Path, hash: Hash32, bytes: &[u8]) -> Result<(), StoreError> {
-        match self.cell(hash) {
-            Some(cell) => store::check_shard(path, bytes, cell, self.profile, self.manifest).map(drop),
-            None => Ok(()),
+        if let Some(cell) = self.cell(hash) {
+            return store::check_shard(path, bytes, cell, self.profile, self.manifest).map(drop);
+        }
+        match Hash32::of(bytes) {
+            found if found == hash => Ok(()),
+            found => Err(StoreError::Hash { path: path.to_owned(), expected: hash, found }),
         }
     }
 }

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use glam::DVec3;
 use slag_common::Hash32;
-use slag_common::manifest::{CellIndex, Manifest};
+use slag_common::manifest::{CellIndex, Manifest, ObjectRecord, TextModelRecord};
 use slag_common::shard::Profile;
 
 use super::plan_error::PlanError;
@@ -28,7 +28,7 @@ pub struct Wanted {
     pub centre_in_world: DVec3,
     /// Cells within this distance are needed, world units.
     pub radius: f64,
-    /// Byte budget for shards; absent: twice the length of the needed ones.
+    /// Byte budget for shards and text models; absent: twice the length of the needed ones.
     pub max_bytes: Option<u64>,
 }
 
@@ -83,7 +83,7 @@ impl Plan {
             });
         }
         let cells = cells_at(manifest, profile, &positions)?;
-        let needs = objects(&cells)?;
+        let needs = objects(&cells, manifest)?;
         let needed: BTreeSet<Hash32> = needs.iter().map(|object| object.hash).collect();
         let needed_bytes = needs.iter().fold(0u64, |sum, object| sum.saturating_add(object.len_bytes));
         let budget_bytes = max_bytes.unwrap_or(needed_bytes.saturating_mul(2));
@@ -135,14 +135,22 @@ fn cells_at(
     listed.collect()
 }
 
-/// Returns the objects that must be on board before these cells become current.
-fn objects(cells: &[CurrentCell]) -> Result<Vec<Object>, PlanError> {
+/// Returns the objects that must be on board before these cells become current: their shards, and the text model that the scene
+/// carries.
+fn objects(cells: &[CurrentCell], manifest: &Manifest) -> Result<Vec<Object>, PlanError> {
     let mut seen = BTreeSet::new();
     let object = |cell: &CurrentCell| match seen.insert(cell.hash) {
         true => Ok(Object { hash: cell.hash, len_bytes: cell.len_bytes }),
         false => Err(PlanError::Conflict { cell_id: cell.cell_id, hash: cell.hash }),
     };
-    cells.iter().map(object).collect()
+    let mut objects: Vec<Object> = cells.iter().map(object).collect::<Result<_, _>>()?;
+    let text_model = manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects);
+    objects.extend(
+        text_model
+            .filter(|object| seen.insert(object.hash))
+            .map(|ObjectRecord { hash, len_bytes }| Object { hash, len_bytes }),
+    );
+    Ok(objects)
 }
 
 #[cfg(test)]
@@ -185,6 +193,7 @@ mod tests {
                 dim: 4,
                 default_threshold: 0.1,
                 calibration: None,
+                text_model: None,
             },
             n_gaussians: boxes.len() as u64,
             n_without_evidence: 0,

@@ -25,6 +25,15 @@ impl Tally {
     }
 }
 
+/// The text model that a scene carries.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct TextModelTally {
+    /// Length of its files.
+    pub bytes: u64,
+    /// Length of those that were downloaded.
+    pub downloaded_bytes: u64,
+}
+
 /// Report of a fetch.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct FetchReport {
@@ -60,7 +69,10 @@ pub struct FetchReport {
     pub spare: Tally,
     /// Shards removed.
     pub freed: Tally,
-    /// Bytes of the downloaded shards left by an interrupted fetch.
+    /// The text model, if the scene carries one; not counted among the shards.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub text_model: Option<TextModelTally>,
+    /// Bytes of the downloaded objects left by an interrupted fetch.
     pub resumed_bytes: u64,
     /// Attempts beyond the first.
     pub retries: u64,

@@ -5,6 +5,7 @@ use std::io;
 use std::time::Instant;
 
 use slag_common::Hash32;
+use slag_common::manifest::{Manifest, ObjectRecord, TextModelRecord};
 use slag_common::tuf::Kept;
 
 use super::download::Client;
@@ -16,7 +17,7 @@ use super::objects::{Check, download_all};
 use super::offer::Offer;
 use super::plan::{Object, Plan, Wanted};
 use super::records::{LastFetch, Records, RecordsError};
-use super::report::{FetchReport, Tally};
+use super::report::{FetchReport, Tally, TextModelTally};
 use super::request::FetchRequest;
 use super::scrub::{digests, scrub};
 use super::staging::{clear_manifests, clear_staging, held_shards, part_path, put, staging};
@@ -110,7 +111,9 @@ pub fn fetch(
     let accepted = records.accept(cache, &LastFetch { from, at }, &offer.manifest.scene);
     accepted.map_err(|e| disk_full(e.into(), planned.bytes))?;
 
-    let in_use: BTreeSet<Hash32> = old.iter().flat_map(Current::shards).collect();
+    let text_of = |offer: &Offer| text_model(&offer.manifest).map(|object| object.hash).collect::<Vec<_>>();
+    let of_old = old.iter().flat_map(Current::shards).chain(on_board.iter().flat_map(text_of));
+    let in_use: BTreeSet<Hash32> = of_old.collect();
     for hash in plan.free.difference(&in_use) {
         cache.files().remove(&cache.shard_path(*hash))?;
     }
@@ -131,6 +134,11 @@ pub fn fetch(
         let check = Check::new(&offer.manifest, profile, &plan.cells);
         let mut downloaded = download_all(cache, &client, &check, &plan.download, request.parallel)?;
         damaged::unmark(cache, marked.intersection(&downloaded.good))?;
+        // Without its text model the scene would not answer; the generation on board does.
+        let of_text_model = downloaded.bad.keys().find(|hash| check.is_of_text_model(**hash)).copied();
+        if let Some((_, error)) = of_text_model.and_then(|hash| downloaded.bad.remove(&hash)) {
+            return Err(error);
+        }
         let current = assemble(before, &offer, &wanted, &plan, &downloaded.bad);
         for (hash, (_, error)) in &downloaded.bad {
             let cell_id = check.cell(*hash).map_or(0, |cell| cell.cell_id);
@@ -153,7 +161,7 @@ pub fn fetch(
     };
     let (digests, downloaded, current) = work().map_err(|e| disk_full(e, planned.bytes))?;
 
-    let in_use: BTreeSet<Hash32> = current.shards().collect();
+    let in_use: BTreeSet<Hash32> = current.shards().chain(text_of(&offer)).collect();
     plan.free.retain(|hash| !in_use.contains(hash));
     for hash in &plan.free {
         cache.files().remove(&cache.shard_path(*hash))?;
@@ -164,9 +172,20 @@ pub fn fetch(
     let on_board: BTreeSet<Hash32> = in_use.iter().chain(&plan.spare).copied().collect();
     damaged::unmark(cache, marked.difference(&on_board))?;
     usage.finish(&in_use, &digests, &on_board, environment.now_unix_secs);
-    let tally = |hashes: &BTreeSet<Hash32>| Tally::of(hashes.iter().map(|hash| held[hash].len_bytes));
-    let is_downloaded = |object: &&Object| downloaded.contains(&object.hash);
+    let text: BTreeSet<Hash32> = text_of(&offer).into_iter().collect();
+    let tally =
+        |hashes: &BTreeSet<Hash32>| Tally::of(hashes.difference(&text).map(|hash| held[hash].len_bytes));
+    let is_downloaded = |object: &&Object| downloaded.contains(&object.hash) && !text.contains(&object.hash);
+    let text_model = offer.manifest.encoder.text_model.as_ref().map(|model| TextModelTally {
+        bytes: model.objects().map(|object| object.len_bytes).sum(),
+        downloaded_bytes: model
+            .objects()
+            .filter(|object| downloaded.contains(&object.hash))
+            .map(|object| object.len_bytes)
+            .sum(),
+    });
     Ok(FetchReport {
+        text_model,
         downloaded: Tally::of(plan.download.iter().filter(is_downloaded).map(|object| object.len_bytes)),
         kept: tally(&plan.keep),
         spare: tally(&plan.spare),
@@ -187,6 +206,11 @@ pub fn fetch(
         retries: client.retries.into_inner(),
         seconds: started.elapsed().as_secs_f64(),
     })
+}
+
+/// Returns the objects of the text model that a scene carries.
+fn text_model(manifest: &Manifest) -> impl Iterator<Item = ObjectRecord> + '_ {
+    manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects)
 }
 
 /// Refuses a download for which there is no space, before it begins. `other_bytes`: what is written besides.

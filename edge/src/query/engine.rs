@@ -5,11 +5,13 @@ use std::sync::{Arc, Mutex, PoisonError, RwLock};
 use std::time::{Duration, Instant};
 
 use slag_common::Hash32;
+use slag_common::manifest::Manifest;
 use slag_common::objects::Objects;
 use slag_common::shard::ShardView;
-use slag_models::InferenceError;
+use slag_models::{InferenceError, SessionOptions};
 
 use super::answer::answer;
+use super::carried;
 use super::reply::Reply;
 use super::request::{QueryRequest, RequestError};
 use super::scene::Scene;
@@ -41,7 +43,7 @@ pub enum QueryError {
     NoScene,
     /// Text model and scene use different embedding spaces.
     #[error(
-        "the text model is {models_name} ({models_id}), but the scene was encoded with {scene_name} ({scene_id}); pass the folder of {scene_name} to --models, or fetch a scene encoded with {models_name}"
+        "the text model is {models_name} ({models_id}), but the scene was encoded with {scene_name} ({scene_id}); pass the folder of {scene_name} to --models, publish the scene with `slag-encoder encode --text-model`, or fetch a scene encoded with {models_name}"
     )]
     EncoderMismatch {
         /// Name of the text model's space.
@@ -80,27 +82,54 @@ impl QueryError {
     }
 }
 
-#[derive(Default)]
 struct Loaded {
+    text: Arc<TextService>,
     snapshot: Option<Arc<Snapshot>>,
     /// State of `current` at the last attempt to load it.
     tried: Option<Stat>,
     failed_at: Option<Instant>,
 }
 
+/// Opens the text model that a scene carries; one that does not open is logged.
+fn open_carried(cache: &EdgeCache, manifest: &Manifest, options: &SessionOptions) -> Option<TextService> {
+    carried::open(cache, manifest, options).unwrap_or_else(|error| {
+        tracing::warn!("the scene's text model does not open: {}", crate::error_line(&error));
+        None
+    })
+}
+
 /// Answers questions from the newest generation of a cache.
 pub struct Engine {
     cache: EdgeCache,
-    text: TextService,
+    /// Options to open the text models with that scenes carry; absent if the text model is given.
+    carried: Option<SessionOptions>,
     loaded: RwLock<Loaded>,
     /// Buffers of finished answers, one for each answer computed at a time.
     idle: Mutex<Vec<Scratch>>,
 }
 
 impl Engine {
-    /// Makes an engine without loading anything yet.
+    /// Makes an engine of a text model without loading a scene yet.
     pub fn new(cache: EdgeCache, text: TextService) -> Self {
-        Self { cache, text, loaded: RwLock::default(), idle: Mutex::default() }
+        let loaded = Loaded { text: Arc::new(text), snapshot: None, tried: None, failed_at: None };
+        Self { cache, carried: None, loaded: RwLock::new(loaded), idle: Mutex::default() }
+    }
+
+    /// Makes an engine that takes the text model of each scene which carries one, and that of `otherwise` before.
+    ///
+    /// # Errors
+    /// Those of `otherwise`. A carried model that does not open is logged.
+    pub fn with_carried<E>(
+        cache: EdgeCache,
+        options: SessionOptions,
+        otherwise: impl FnOnce() -> Result<TextService, E>,
+    ) -> Result<Self, E> {
+        let manifest =
+            cache.current().ok().flatten().map(|current| cache.read_manifest(current.manifest_hash));
+        let opened =
+            manifest.and_then(Result::ok).and_then(|manifest| open_carried(&cache, &manifest, &options));
+        let text = opened.map_or_else(otherwise, Ok)?;
+        Ok(Self { carried: Some(options), ..Self::new(cache, text) })
     }
 
     /// Returns the cache.
@@ -109,18 +138,22 @@ impl Engine {
     }
 
     /// Returns the text encoder in use.
-    pub fn encoder(&self) -> &EncoderInfo {
-        self.text.info()
+    pub fn encoder(&self) -> EncoderInfo {
+        self.text().info().clone()
+    }
+
+    fn text(&self) -> Arc<TextService> {
+        Arc::clone(&self.loaded.read().unwrap_or_else(PoisonError::into_inner).text)
     }
 
     /// Returns the words that the text model knows; none if it takes any text.
-    pub(super) fn vocabulary(&self) -> &[String] {
-        self.text.vocabulary()
+    pub(super) fn vocabulary(&self) -> Vec<String> {
+        self.text().vocabulary().to_vec()
     }
 
     /// Returns whether the text model runs.
     pub fn text_is_alive(&self) -> bool {
-        self.text.is_alive()
+        self.text().is_alive()
     }
 
     /// Returns whether the cache's `current` differs from the one loaded (one `stat` call), or loading it
@@ -132,7 +165,7 @@ impl Engine {
     }
 
     /// Opens the cache's current generation and makes it the one in use; questions in progress keep theirs.
-    /// If it does not open, the previous one stays in use.
+    /// If it does not open, the previous one stays in use. A text model that the scene carries comes into use with it.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -141,12 +174,19 @@ impl Engine {
         let before = self.snapshot().ok();
         let opened = Snapshot::open_after(&self.cache, before.as_deref());
         drop(before);
+        let in_use = self.text();
+        let text = match (&self.carried, &opened) {
+            (Some(options), Ok(snapshot)) if snapshot.manifest.encoder.id != in_use.info().id => {
+                open_carried(&self.cache, &snapshot.manifest, options).map_or(in_use, Arc::new)
+            }
+            _ => in_use,
+        };
         let mut loaded = self.loaded.write().unwrap_or_else(PoisonError::into_inner);
         match opened {
             Ok(snapshot) => {
                 let (tried, failed_at) = (snapshot.current_stat, snapshot.may_recover.then(Instant::now));
                 let snapshot = Some(Arc::new(snapshot));
-                let before = std::mem::replace(&mut *loaded, Loaded { snapshot, tried, failed_at });
+                let before = std::mem::replace(&mut *loaded, Loaded { text, snapshot, tried, failed_at });
                 // Unmapping many shards takes a while; others must not wait for the lock.
                 drop(loaded);
                 drop(before);
@@ -197,8 +237,9 @@ impl Engine {
         let snapshot = self.snapshot()?;
         self.check_encoder(&snapshot)?;
         let negatives = self.encode_negatives(request)?;
+        let model = self.text();
         let question =
-            |text: &String| Ok(Question { vector: self.text.encode(text)?, negatives: negatives.clone() });
+            |text: &String| Ok(Question { vector: model.encode(text)?, negatives: negatives.clone() });
         let questions = request.texts.iter().map(question).collect::<Result<Vec<_>, TextError>>()?;
         let work = |scratch: &mut Scratch, scene: &Scene<'_>| answer(scratch, scene, &questions, request);
         let answers = self.on_scene(&snapshot, budget, work)?;
@@ -207,12 +248,13 @@ impl Engine {
 
     /// Returns the vector of a text.
     pub(super) fn encode_text(&self, text: &str) -> Result<Arc<[f32]>, QueryError> {
-        Ok(self.text.encode(text)?)
+        Ok(self.text().encode(text)?)
     }
 
     /// Returns the vectors of a request's negatives.
     pub(super) fn encode_negatives(&self, request: &QueryRequest) -> Result<Vec<Arc<[f32]>>, QueryError> {
-        let negatives = request.negatives.phrases().into_iter().map(|phrase| self.text.encode(phrase));
+        let model = self.text();
+        let negatives = request.negatives.phrases().into_iter().map(|phrase| model.encode(phrase));
         negatives.collect::<Result<_, _>>().map_err(QueryError::Negatives)
     }
 

@@ -6,6 +6,7 @@ mod area;
 #[cfg(feature = "arrow")]
 mod arrow;
 mod ask;
+mod carried;
 mod changes;
 pub mod cluster;
 mod engine;

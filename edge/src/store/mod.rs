@@ -2,7 +2,7 @@
 //!
 //! | path | content | changed by |
 //! |---|---|---|
-//! | `shards/HASH` | verified shards, immutable | fetch: renamed in, removed |
+//! | `shards/HASH` | verified shards and files of text models, immutable | fetch: renamed in, removed |
 //! | `manifests/HASH` | verified manifests, immutable | fetch: renamed in, removed |
 //! | `current` | [`Current`]: the generation in use | fetch: replaced whole |
 //! | `staging/` | partial downloads | fetch |

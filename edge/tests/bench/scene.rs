@@ -84,6 +84,7 @@ pub fn write_cache(dir: &Path, spec: &SceneSpec) {
             dim: spec.dim as u32,
             default_threshold: 0.2,
             calibration: None,
+            text_model: None,
         },
         n_gaussians: spec.n_gaussians as u64,
         n_without_evidence: 0,

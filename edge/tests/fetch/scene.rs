@@ -224,6 +224,7 @@ impl Published {
                 dim: DIM,
                 default_threshold: 0.1,
                 calibration: None,
+                text_model: None,
             },
             n_gaussians: u64::from(n_gaussians) * contents.len() as u64,
             n_without_evidence: 0,

@@ -156,6 +156,10 @@ pub struct EncodeArgs {
     #[arg(long)]
     #[cfg_attr(feature = "fleet", arg(conflicts_with = "blobs"))]
     pub photo_poses: bool,
+    /// The store carries the text side of --models, signed as all else: robots fetch it with the scene and need no --models.
+    /// Refused unless the licence in model.toml permits passing the weights on.
+    #[arg(long)]
+    pub text_model: bool,
     /// Search for objects.
     #[command(flatten)]
     pub objects: ObjectArgs,
@@ -235,6 +239,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             scene_name: args.name.clone().or(folder_name).unwrap_or_else(|| "scene".into()),
             created_unix_secs,
             models: args.models.models.as_deref().map(lasting_name),
+            text_model: args.text_model,
             command: None,
         },
         run: RunSettings {

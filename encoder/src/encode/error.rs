@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use slag_common::poses::PoseError;
 use slag_common::splat::SplatError;
-use slag_models::ModelError;
+use slag_models::{ModelError, TextSideError};
 
 use crate::embed::EmbedError;
 use crate::ingest::{GeoError, IngestError};
@@ -33,6 +33,9 @@ pub enum EncodeError {
         /// The model.
         model: String,
     },
+    /// The store cannot carry the text model.
+    #[error("--text-model: {0}")]
+    TextModel(#[from] TextSideError),
     /// The worker threads cannot be started.
     #[error("cannot start {n_threads} threads: {source}; use fewer with --threads")]
     Threads {

@@ -33,6 +33,7 @@ mod publish;
 mod report;
 mod settings;
 mod sink;
+mod text_model;
 mod view;
 mod views;
 mod workers;
@@ -132,5 +133,8 @@ pub fn remake(
     let views = views::kept_views(&plan)?;
     let occupancy = views::look_around(&plan, &views, &context)?;
     cells::build_cells(&plan, &views, occupancy, &here::Here, &context)?;
+    if settings.output.text_model {
+        text_model::carry(&store, engines.models)?;
+    }
     Ok(())
 }

@@ -103,6 +103,10 @@ fn make_plan<'a>(
         SharedEncoders::reserve(&mut memory, &settings.run.gpus, square_bytes);
     }
     memory.rest(0)?;
+    if settings.output.text_model {
+        // What cannot be carried is refused before the work.
+        engines.models.text_side()?;
+    }
     let segmenter = segmenter_of(&settings.view, &settings.run.gpus, engines)?;
     let ids = context.time("identity", || {
         context.install(|| identity::identities(settings, engines, segmenter.as_ref(), inputs))

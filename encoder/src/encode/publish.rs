@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::time::Instant;
 
 use slag_common::Hash32;
-use slag_common::manifest::{self, Calibration, CellRecord, EncoderRecord, Manifest};
+use slag_common::manifest::{self, Calibration, CellRecord, EncoderRecord, Manifest, TextModelRecord};
 use slag_common::shard::ScoreErrors;
 
 use super::cells::{BuiltCells, Counts};
@@ -13,6 +13,7 @@ use super::error::EncodeError;
 use super::executor::Executor;
 use super::plan::Plan;
 use super::report::{CellReport, EncodeSummary};
+use super::text_model::carry;
 use super::views::DoneViews;
 use crate::store::ModelsRecord;
 
@@ -28,7 +29,9 @@ pub(super) fn publish(
     context: &RunContext<'_>,
 ) -> Result<EncodeSummary, EncodeError> {
     let generation = plan.store.next_generation()?;
-    let manifest = manifest(&plan, &built, generation);
+    let text_model =
+        plan.settings.output.text_model.then(|| carry(plan.store, plan.engines.models)).transpose()?;
+    let manifest = manifest(&plan, &built, generation, text_model);
     executor.begin_publication()?;
     plan.store.publish_by(&manifest, &built.extras, plan.settings.output.command.clone())?;
     let models = plan.settings.output.models.clone();
@@ -51,7 +54,12 @@ pub(super) fn publish(
     Ok(summary)
 }
 
-fn manifest(plan: &Plan<'_>, built: &BuiltCells, generation: u64) -> Manifest {
+fn manifest(
+    plan: &Plan<'_>,
+    built: &BuiltCells,
+    generation: u64,
+    text_model: Option<TextModelRecord>,
+) -> Manifest {
     let (settings, inputs, models) = (plan.settings, plan.inputs, plan.engines.models);
     // Robots take a score as an answer from three spreads above the mean on.
     let of_calibration = || {
@@ -71,6 +79,7 @@ fn manifest(plan: &Plan<'_>, built: &BuiltCells, generation: u64) -> Manifest {
             dim: models.dim() as u32,
             default_threshold: models.threshold().unwrap_or_else(of_calibration),
             calibration: models.threshold().is_none().then(|| built.calibration()),
+            text_model,
         },
         n_gaussians: (inputs.scene.len() - inputs.split.n_rejected) as u64,
         n_without_evidence: built.n_without_evidence,

@@ -189,6 +189,8 @@ pub struct OutputSettings {
     pub created_unix_secs: u64,
     /// Name or folder of the models, as later queries on this machine open them; `None` for the embedded ones.
     pub models: Option<PathBuf>,
+    /// Whether the store carries the text side of the models.
+    pub text_model: bool,
     /// The command that asked for it, which `store repair` runs again.
     pub command: Option<CommandRecord>,
 }
@@ -294,6 +296,7 @@ impl EncodeSettings {
                 scene_name: "scene".into(),
                 created_unix_secs: 0,
                 models: None,
+                text_model: false,
                 command: None,
             },
             run: RunSettings {

@@ -2,7 +2,7 @@
 //!
 //! | path | content |
 //! |---|---|
-//! | `v1/objects/HASH` | shards of the current generation and of the one before it |
+//! | `v1/objects/HASH` | shards, and text models, of the current generation and of the one before it |
 //! | `v1/targets/SHA256.manifest`, `v1/manifest` | their manifests; the current one |
 //! | `v1/metadata/` | metadata of The Update Framework; robots follow `timestamp.json`, which is written last |
 
@@ -21,11 +21,11 @@ use super::reader::{Published, StoreReader};
 /// What an export wrote.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Exported {
-    /// Shards that were not there.
+    /// Objects that were not there.
     pub n_objects: usize,
     /// Their bytes.
     pub len_bytes: u64,
-    /// Shards removed that neither generation needs.
+    /// Objects removed that neither generation needs.
     pub n_removed: usize,
 }
 
@@ -49,7 +49,7 @@ pub fn export(store: &Path, to: &Path) -> Result<Exported, StoreError> {
         fs_err::create_dir_all(folder)?;
     }
     let generations = || reader.previous().into_iter().chain([reader.current()]);
-    let lens: BTreeMap<Hash32, u64> = generations().flat_map(Published::shard_lens).collect();
+    let lens: BTreeMap<Hash32, u64> = generations().flat_map(Published::object_lens).collect();
     let is_there = |(hash, len_bytes): &(&Hash32, &u64)| {
         let found = std::fs::metadata(objects.join(hash.to_string()));
         found.is_ok_and(|found| found.len() == **len_bytes)

@@ -7,7 +7,7 @@ use std::time::SystemTime;
 
 use slag_common::Hash32;
 use slag_common::container::AlignedBytes;
-use slag_common::manifest::Manifest;
+use slag_common::manifest::{Manifest, TextModelRecord};
 
 use super::error::StoreError;
 use super::manifest_file;
@@ -46,9 +46,16 @@ impl Published {
         shards.map(|shard| (shard.hash, shard.len_bytes)).collect()
     }
 
-    /// Returns the hashes of shards and extras.
+    /// Returns the lengths of all that robots may fetch, by hash: the shards and, if there is one, the text model.
+    pub fn object_lens(&self) -> BTreeMap<Hash32, u64> {
+        let text_model = self.manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects);
+        let text_model = text_model.map(|object| (object.hash, object.len_bytes));
+        self.shard_lens().into_iter().chain(text_model).collect()
+    }
+
+    /// Returns the hashes of all that robots may fetch, and of extras.
     pub(super) fn all_objects(&self) -> BTreeSet<Hash32> {
-        self.shard_lens().into_keys().chain(self.extras.values().copied()).collect()
+        self.object_lens().into_keys().chain(self.extras.values().copied()).collect()
     }
 }
 

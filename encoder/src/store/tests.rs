@@ -31,6 +31,7 @@ pub(crate) fn manifest_of_boxes(boxes: &[Aabb]) -> Manifest {
             dim: 4,
             default_threshold: 0.5,
             calibration: None,
+            text_model: None,
         },
         n_gaussians: boxes.len() as u64,
         n_without_evidence: 0,

@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use rayon::prelude::*;
 use serde::Serialize;
 use slag_common::Hash32;
+use slag_common::manifest::TextModelRecord;
 
 use super::files;
 use super::reader::{Published, StoreReader};
@@ -105,6 +106,8 @@ fn contents(published: &Published) -> Vec<(Hash32, Option<u64>, String)> {
         };
         cell.shards.iter().map(of_profile).collect::<Vec<_>>()
     });
+    let text_model = published.manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects);
+    let text_model = text_model.map(|object| (object.hash, Some(object.len_bytes), "text model".to_owned()));
     let extras = published.extras.iter().map(|(name, hash)| (*hash, None, name.clone()));
-    shards.chain(extras).collect()
+    shards.chain(text_model).chain(extras).collect()
 }

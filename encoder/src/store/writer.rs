@@ -8,7 +8,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use slag_common::Hash32;
-use slag_common::manifest::{CellRecord, Manifest};
+use slag_common::manifest::{CellRecord, Manifest, TextModelRecord};
 
 use super::catalogue::{Catalogue, CommandRecord, GenerationRecord};
 use super::error::StoreError;
@@ -176,7 +176,9 @@ impl Store {
     ) -> Result<Hash32, StoreError> {
         let shards = manifest.cells.iter().flat_map(|cell| cell.shards.values());
         let shards = shards.map(|shard| (shard.hash, Some(shard.len_bytes)));
-        for (hash, len_bytes) in shards.chain(extras.values().map(|hash| (*hash, None))) {
+        let text_model = manifest.encoder.text_model.iter().flat_map(TextModelRecord::objects);
+        let text_model = text_model.map(|object| (object.hash, Some(object.len_bytes)));
+        for (hash, len_bytes) in shards.chain(text_model).chain(extras.values().map(|hash| (*hash, None))) {
             self.check_object(hash, len_bytes)?;
         }
         let bytes = manifest.to_bytes();

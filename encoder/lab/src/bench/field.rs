@@ -182,6 +182,7 @@ impl<'a> FieldWriter<'a> {
                 dim: self.dim as u32,
                 default_threshold: 0.5,
                 calibration: None,
+                text_model: None,
             },
             n_gaussians: self.report.n_gaussians,
             n_without_evidence: 0,

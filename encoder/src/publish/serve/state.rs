@@ -47,7 +47,7 @@ impl Snapshot {
             targets: both().filter_map(|published| target(&published.bytes)).collect(),
             manifest: reader.current().bytes.clone().into(),
             index: index_of(dir, reader.current()),
-            objects: both().flat_map(|published| published.shard_lens()).collect(),
+            objects: both().flat_map(|published| published.object_lens()).collect(),
             reader,
         })
     }

@@ -1,0 +1,187 @@
+//! The text side of a model as a store carries it to robots: files that are named by their content, and a description in JSON
+//! that names them so.
+
+use std::path::PathBuf;
+
+use serde_json::Value;
+use slag_common::Hash32;
+
+use crate::EncoderId;
+use crate::description::{Description, DescriptionError, FileRef, Sha256};
+use crate::model_file::ModelFile;
+
+/// Licences under which weights may be passed on, by their SPDX names.
+const REDISTRIBUTABLE: [&str; 10] = [
+    "Apache-2.0",
+    "BSD-2-Clause",
+    "BSD-3-Clause",
+    "BSL-1.0",
+    "CC-BY-4.0",
+    "CC0-1.0",
+    "ISC",
+    "MIT",
+    "Unlicense",
+    "Zlib",
+];
+
+/// Reasons for which a store cannot carry a text model.
+#[derive(Debug, thiserror::Error)]
+pub enum TextSideError {
+    /// Every robot has the model.
+    #[error("{model} is part of every robot's program, so a store need not carry it; leave --text-model out")]
+    BuiltIn {
+        /// The model.
+        model: String,
+    },
+    /// The licence is not known to permit it.
+    #[error(
+        "the licence of {model} is {licence:?}, which is not known to permit passing its weights on ({}); pull the model on each robot with `slag-edge models pull`, or correct `licence` in model.toml",
+        REDISTRIBUTABLE.join(", ")
+    )]
+    Licence {
+        /// The model.
+        model: String,
+        /// Its licence.
+        licence: String,
+    },
+    /// The weights lie beside the ONNX file, which names them.
+    #[error("{}: its weights lie in a file of their own, which a store cannot carry; save the model as one file", path.display())]
+    SeparateWeights {
+        /// The ONNX file.
+        path: PathBuf,
+    },
+    /// A file differs from the description, or cannot be read.
+    #[error(transparent)]
+    Description(#[from] DescriptionError),
+    /// The description in JSON would describe another space.
+    #[error("{model}: its description does not survive as JSON ({what}); report this with the model.toml")]
+    Other {
+        /// The model.
+        model: String,
+        /// What differs.
+        what: String,
+    },
+}
+
+/// The text side of a model: its files, and the description without their new names.
+#[derive(Debug)]
+pub struct TextSide {
+    id: EncoderId,
+    description: Value,
+    files: Vec<TextFile>,
+}
+
+/// A file of the text side.
+#[derive(Debug)]
+struct TextFile {
+    /// Where the description names it.
+    pointers: Vec<&'static str>,
+    file: ModelFile,
+    sha256: Sha256,
+}
+
+/// Where a description in JSON names the file of a role.
+fn pointer(role: &str) -> &'static str {
+    match role {
+        "image.model" => "/image/file",
+        "text.tokenizer" => "/text/tokenizer",
+        "text.vectors" => "/text/vectors",
+        "text.centre" => "/text_centre/file",
+        _ => "/text/file",
+    }
+}
+
+/// Returns whether a licence expression is known to permit redistribution: every part of it joined by AND, or any joined by OR.
+fn may_be_passed_on(licence: &str) -> bool {
+    let is_known = |name: &str| REDISTRIBUTABLE.contains(&name.trim_matches(['(', ')', ' ']));
+    licence.split(" OR ").any(|part| part.split(" AND ").all(is_known))
+}
+
+impl TextSide {
+    /// Takes a description apart. `document`: its TOML text; `hashed`: what it parses to, with the hash of every file;
+    /// `open`: returns a file of it after comparing its hash.
+    pub(crate) fn new(
+        id: &EncoderId,
+        document: &str,
+        hashed: &Description,
+        open: impl Fn(&FileRef) -> Result<ModelFile, DescriptionError>,
+    ) -> Result<Self, TextSideError> {
+        let model = || hashed.name.clone();
+        if !may_be_passed_on(&hashed.licence) {
+            return Err(TextSideError::Licence { model: model(), licence: hashed.licence.clone() });
+        }
+        let other = |what: String| TextSideError::Other { model: model(), what };
+        let table: toml::Table = toml::from_str(document).map_err(|e| other(e.to_string()))?;
+        let mut description = serde_json::to_value(table).map_err(|e| other(e.to_string()))?;
+        if let Some(fields) = description.as_object_mut() {
+            // The files lie beside each other.
+            fields.remove("files_root");
+        }
+        let mut files: Vec<TextFile> = Vec::new();
+        for (role, file) in hashed.files_by_role() {
+            let Some(sha256) = file.sha256 else { return Err(other(format!("{role} has no hash"))) };
+            let at = pointer(role);
+            let named = description.pointer_mut(at).and_then(Value::as_object_mut);
+            let named = named.ok_or_else(|| other(format!("{at} is missing")))?;
+            named.insert("sha256".into(), sha256.to_string().into());
+            if role == "image.model" {
+                // It stays behind; the encoder id needs its hashes.
+                if let (Some(data), Some(Value::Object(named))) = (&file.data, named.get_mut("data")) {
+                    named.insert("sha256".into(), data.sha256.map(|hash| hash.to_string()).into());
+                }
+                continue;
+            }
+            if file.data.is_some() {
+                return Err(TextSideError::SeparateWeights { path: file.path.clone() });
+            }
+            match files.iter_mut().find(|known| known.sha256 == sha256) {
+                Some(known) => known.pointers.push(at),
+                None => files.push(TextFile { pointers: vec![at], file: open(file)?, sha256 }),
+            }
+        }
+        Ok(Self { id: id.clone(), description, files })
+    }
+
+    /// Returns the files, each once.
+    pub fn files(&self) -> impl Iterator<Item = &ModelFile> {
+        self.files.iter().map(|file| &file.file)
+    }
+
+    /// Returns the description in JSON. `names`: BLAKE3 of each of [`Self::files`].
+    ///
+    /// # Errors
+    /// [`TextSideError::Other`] if it is not one of the same space, which would be a fault of this program.
+    pub fn description(&self, names: &[Hash32]) -> Result<Vec<u8>, TextSideError> {
+        let mut description = self.description.clone();
+        let other = |what: String| TextSideError::Other { model: self.id.name.clone(), what };
+        for (TextFile { pointers, .. }, name) in self.files.iter().zip(names) {
+            for at in pointers {
+                let named = description.pointer_mut(at).ok_or_else(|| other(format!("{at} is missing")))?;
+                named["path"] = name.to_string().into();
+            }
+        }
+        let bytes = serde_json::to_vec(&description).map_err(|e| other(e.to_string()))?;
+        let read = Description::from_json("text model".as_ref(), &bytes)?;
+        match read.encoder_id() == self.id {
+            true => Ok(bytes),
+            false => Err(other("its encoder id changes".into())),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_permissive_licences_are_passed_on() {
+        for licence in
+            ["MIT", "Apache-2.0", "apple-amlr OR MIT", "(MIT OR Apache-2.0)", "MIT AND BSD-3-Clause"]
+        {
+            assert!(may_be_passed_on(licence), "{licence}");
+        }
+        for licence in ["", "apple-amlr", "CC-BY-NC-4.0", "MIT AND apple-amlr", "mit-like", "unknown"] {
+            assert!(!may_be_passed_on(licence), "{licence}");
+        }
+    }
+}

@@ -1,0 +1,50 @@
+//! The text model that a scene brings along.
+
+use std::path::PathBuf;
+
+use slag_common::Hash32;
+use slag_common::manifest::Manifest;
+use slag_models::{ModelDir, SessionOptions};
+
+use crate::store::{EdgeCache, StoreError};
+use crate::text::{TextOpenError, TextService};
+
+/// Longest description read; those of public models take two thousand bytes.
+const MAX_DESCRIPTION_BYTES: u64 = 1 << 20;
+
+/// Reasons for which a scene's text model does not open.
+#[derive(Debug, thiserror::Error)]
+pub enum CarriedError {
+    /// The description cannot be read, or differs from the manifest.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The description or a file of it is not as expected.
+    #[error("{path}: {cause}; fetch again, which replaces what is damaged", path = path.display())]
+    Open {
+        /// The description.
+        path: PathBuf,
+        /// The reason.
+        cause: Box<TextOpenError>,
+    },
+}
+
+/// Opens the text model that a scene carries; `None` if it carries none.
+pub(super) fn open(
+    cache: &EdgeCache,
+    manifest: &Manifest,
+    options: &SessionOptions,
+) -> Result<Option<TextService>, CarriedError> {
+    let Some(record) = &manifest.encoder.text_model else { return Ok(None) };
+    let expected = record.description.hash;
+    let path = cache.shard_path(expected);
+    let bytes = cache.files().read(&path, MAX_DESCRIPTION_BYTES).map_err(StoreError::Io)?;
+    let found = Hash32::of(&bytes);
+    if found != expected {
+        return Err(StoreError::Hash { path, expected, found }.into());
+    }
+    let folder = path.parent().unwrap_or(cache.dir());
+    let opened = ModelDir::carried(&bytes, &path, folder)
+        .map_err(TextOpenError::Model)
+        .and_then(|models| TextService::open(&models, options));
+    opened.map(Some).map_err(|cause| CarriedError::Open { path, cause: Box::new(cause) })
+}
