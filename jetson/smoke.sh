@@ -3,8 +3,7 @@
 # answers with those of a native build.
 set -eu
 cd "$(dirname "$0")/.."
-encoder=target/debug/slag-encoder
-lab=target/debug/slag-lab
+. jetson/room.sh
 native=target/debug/slag-edge
 # After `test.sh` they are there; alone, cargo would build them again, with the features of fewer packages.
 [ -n "${SLAG_PROGRAMS_ARE_BUILT:-}" ] || cargo build --locked --bin slag-encoder --bin slag-lab --bin slag-edge
@@ -15,18 +14,7 @@ arm() {
 work=$(mktemp -d)
 server=
 trap '[ -z "$server" ] || kill "$server" 2>/dev/null; rm -rf "$work"' EXIT
-$lab --quiet generate scene --out "$work/room" --n-views 12 >/dev/null
-$encoder --quiet encode --scene "$work/room/scene.ply" --views "$work/room/transforms.json" --metric \
-    --models colours --cell-gaussians 8192 --store "$work/store" >/dev/null
-$encoder serve --store "$work/store" --listen 127.0.0.1:0 >"$work/log" &
-server=$!
-url=
-for _ in 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20; do
-    url=$(sed -n 's/.*\(http:[^ ]*\).*/\1/p' "$work/log" | head -n 1)
-    [ -n "$url" ] && break
-    sleep 0.5
-done
-[ -n "$url" ] || { cat "$work/log" >&2; exit 1; }
+serve_room "$work" --models colours
 
 $native fetch --trust-first --from "$url" --at 3.5,2.7,0 --radius 3 --cache "$work/native" --json >/dev/null
 arm fetch --trust-first --from "$url" --at 3.5,2.7,0 --radius 3 --cache "$work/arm" --json

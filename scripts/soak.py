@@ -44,7 +44,7 @@ def ask(url: str, body: object = None) -> tuple[int, bytes]:
     data = None if body is None else json.dumps(body).encode()
     request = urllib.request.Request(url, data, {"Content-Type": "application/json"})
     try:
-        with urllib.request.urlopen(request, timeout=60) as answer:
+        with urllib.request.urlopen(request, timeout=600) as answer:
             return answer.status, answer.read()
     except urllib.error.HTTPError as error:
         return error.code, error.read()
@@ -127,7 +127,8 @@ def main() -> None:
                 run(encoder, "keys", "rotate", "timestamp", "snapshot", "targets", "--store", store, "--quiet")
                 n_rotations += 1
             if turn % 6 == 4:
-                with open(filler, "wb") as file:
+                # Unbuffered: a buffer would be written once more when the file is closed.
+                with open(filler, "wb", buffering=0) as file:
                     try:
                         while True:
                             file.write(bytes(1 << 16))

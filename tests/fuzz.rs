@@ -1,8 +1,10 @@
-//! Runs every fuzz target on a stable compiler, on seeds and thousands of seeded mutations of them.
+//! Runs every fuzz target on seeds, on what fuzzing guided by coverage found (`fuzz/corpus`), and on thousands of seeded mutations of
+//! both.
 //!
 //! `SLAG_FUZZ_SECS` sets the seconds per target, instead of a fixed number of mutations.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 #[path = "../fuzz/src/lib.rs"]
@@ -67,6 +69,15 @@ fn mutated(seeds: &[Vec<u8>], random: &mut Random) -> Vec<u8> {
     bytes
 }
 
+/// Returns the inputs that fuzzing guided by coverage kept for a target, in order of their names.
+fn corpus(name: &str) -> Vec<Vec<u8>> {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fuzz/corpus").join(name);
+    let Ok(entries) = fs_err::read_dir(folder) else { return Vec::new() };
+    let mut paths: Vec<_> = entries.map(|entry| entry.expect("readable").path()).collect();
+    paths.sort();
+    paths.iter().map(|path| fs_err::read(path).expect("readable")).collect()
+}
+
 #[test]
 fn no_decoder_panics() {
     let folder = shared_folder();
@@ -75,7 +86,7 @@ fn no_decoder_panics() {
         .map(|secs| Duration::from_secs(secs.parse().expect("SLAG_FUZZ_SECS is a number of seconds")));
     let mut without_valid_seed = Vec::new();
     for target in targets::TARGETS {
-        let seeds = targets::seeds::of(target.name, folder.as_deref());
+        let mut seeds = targets::seeds::of(target.name, folder.as_deref());
         assert!(!seeds.is_empty() || folder.is_none(), "{} has no seeds", target.name);
         if seeds.is_empty() {
             continue;
@@ -87,8 +98,10 @@ fn no_decoder_panics() {
         if n_accepted == 0 {
             without_valid_seed.push(target.name);
         }
-        while budget.map_or(n < N_MUTATIONS, |budget| start.elapsed() < budget) {
-            let input = mutated(&seeds, &mut random);
+        let mut corpus = corpus(target.name);
+        seeds.extend_from_slice(&corpus);
+        while !corpus.is_empty() || budget.map_or(n < N_MUTATIONS, |budget| start.elapsed() < budget) {
+            let input = corpus.pop().unwrap_or_else(|| mutated(&seeds, &mut random));
             let run = || catch_unwind(AssertUnwindSafe(|| targets::run(target.name, &input)));
             let (ended, taken) = memory_of(run);
             let peak_bytes = taken.peak_bytes;

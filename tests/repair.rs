@@ -1,5 +1,7 @@
 //! A store that rots: its files are made again from what the encode kept, and its catalogue from the files.
 
+use std::path::Path;
+
 use slag_tests::*;
 
 #[test]
@@ -7,10 +9,16 @@ fn a_store_is_repaired_from_kept_views() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let (room, store) = (dir.path().join("room"), dir.path().join("store"));
     run(&mut lab(&["generate", "scene", "--out", text(&room), "--n-views", "4"]));
-    run(encode_room(&room, &store).args(["--models", "colours", "--device", "cpu", "--keep-views"]));
+    // Its paths are relative to its own folder, not to that of the repair.
+    run(encode_room(Path::new("room"), Path::new("store")).current_dir(dir.path()).args([
+        "--models",
+        "colours",
+        "--device",
+        "cpu",
+        "--keep-views",
+    ]));
     let command = |name: &str| {
         let mut command = encoder(&["store", name, "--store", text(&store), "--json"]);
-        // The command of the encode had relative paths of its own folder, whatever this one is.
         command.current_dir("/");
         command
     };

@@ -131,3 +131,16 @@ fn the_sample_has_every_flag() {
         assert!(is_known, "{key} is no flag");
     }
 }
+
+/// By default all queries together may use four times the budget of one; the unit's limit has room for that, half as much again
+/// for what no budget counts, and the program itself.
+#[test]
+fn the_unit_has_room_for_all_queries() {
+    let unit = include_str!("../../../../jetson/slag-edge.service");
+    let limit =
+        unit.lines().find_map(|line| line.strip_prefix("MemoryMax=")?.strip_suffix('G')).expect("a limit");
+    let limit_bytes = limit.parse::<u64>().expect("gigabytes") << 30;
+    let query_bytes = &values(&parsed("slag-edge serve", &[], "").expect("parses"), "max_query_bytes")[0];
+    let query_bytes: u64 = query_bytes.parse().expect("bytes");
+    assert!(limit_bytes >= 4 * query_bytes * 3 / 2 + (256 << 20), "{limit_bytes} for {query_bytes} a query");
+}
