@@ -16,6 +16,14 @@ pub struct Work {
 }
 
 impl Work {
+    /// Returns the same work with other models: views take `secs` on average, and differ by the same factors.
+    pub fn with_view_secs(mut self, secs: f64) -> Self {
+        let sum: f64 = self.views.iter().map(|view| view.secs).sum();
+        let factor = secs * self.views.len() as f64 / sum.max(f64::MIN_POSITIVE);
+        self.views.iter_mut().for_each(|view| view.secs *= factor);
+        self
+    }
+
     /// Returns the work of a scene with this many views: this one, over and over.
     pub fn repeated(&self, n_views: usize) -> Self {
         let times = n_views as f64 / self.views.len() as f64;

@@ -41,5 +41,7 @@ fn more_machines_pay_up_to_the_number_of_views() {
     let report = FleetReport::simulate(&work, &FAST, 256);
     assert_eq!((report.n_views, report.pays_until), (64, [64, 64]));
     assert!(report.rows.iter().all(|row| row.n > 64 || (row.efficiency - 1.0).abs() < 1e-9));
+    let of_other_models = work.with_view_secs(3.0);
+    assert!(of_other_models.views.iter().all(|view| (view.secs - 3.0).abs() < 1e-12));
     assert!(report.svg().contains("batches made beforehand"));
 }

@@ -21,6 +21,9 @@ pub struct FleetArgs {
     /// Views of the simulated scene: the measured one, over and over.
     #[arg(long, value_name = "N", default_value_t = 10_000, value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
     views: u32,
+    /// Seconds of a machine a view, on average, for other models; views differ by the same factors [default: as measured].
+    #[arg(long, value_name = "S", value_parser = positive)]
+    view_secs: Option<f64>,
     /// Most machines.
     #[arg(long, value_name = "N", default_value_t = 512, value_parser = clap::value_parser!(u32).range(1..=65_536))]
     machines: u32,
@@ -38,8 +41,17 @@ pub struct FleetArgs {
     svg: Option<PathBuf>,
 }
 
+fn positive(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|v| (1e-6..=1e6).contains(v));
+    value.ok_or_else(|| "expected seconds, more than 0".into())
+}
+
 pub(super) fn run(args: &FleetArgs, json: bool) -> Result<Exit> {
-    let work = fleet::measured(&args.store, &args.summary)?.repeated(args.views as usize);
+    let mut work = fleet::measured(&args.store, &args.summary)?;
+    if let Some(secs) = args.view_secs {
+        work = work.with_view_secs(secs);
+    }
+    let work = work.repeated(args.views as usize);
     let links = Links {
         worker_bits_per_s: f64::from(args.worker_mbit) * 1e6,
         coordinator_bits_per_s: f64::from(args.coordinator_mbit) * 1e6,
