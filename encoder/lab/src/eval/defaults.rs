@@ -133,9 +133,9 @@ impl fmt::Display for DefaultsReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,
-            "| scene | masks | aggregation | by | mIoU | AP | AUC | things found at IoU 0.25, 0.5 |"
+            "| scene | masks | aggregation | by | mIoU | AP | AUC | things found at IoU 0.25, 0.5 | objects that are two things, of all; things split |"
         )?;
-        writeln!(f, "|---|---|---|---|---|---|---|---|")?;
+        writeln!(f, "|---|---|---|---|---|---|---|---|---|")?;
         for row in &self.rows {
             let show = |value: Option<f64>| value.map_or("-".into(), |v| format!("{v:.3}"));
             let masks = match row.masks {
@@ -148,7 +148,10 @@ impl fmt::Display for DefaultsReport {
                 EvalKind::Objects => "object",
             };
             let figures = [row.miou, row.average_precision, row.area_under_roc].map(show).join(" | ");
-            let found = row.instances.as_ref().map_or(String::new(), |instances| instances.any.to_string());
+            let found = row.instances.as_ref().map_or(" | ".into(), |found| {
+                let InstanceReport { any, n_merged_objects, n_objects, n_split_things, .. } = found;
+                format!("{any} | {n_merged_objects} of {n_objects}; {n_split_things}")
+            });
             writeln!(f, "| {} | {masks} | {method} | {kind} | {figures} | {found} |", row.scene)?;
         }
         Ok(())

@@ -8,6 +8,9 @@ use serde::Serialize;
 use super::truth::Truth;
 use slag_encoder::objects::NONE;
 
+/// Share of an object or a thing that counts as a piece of it.
+const PIECE: f64 = 0.25;
+
 /// Counts of things found.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Recall {
@@ -38,6 +41,10 @@ impl fmt::Display for Recall {
 pub struct InstanceReport {
     /// Number of objects.
     pub n_objects: usize,
+    /// Objects that are two things (under-segmentation): two labels, floors and walls included, have a quarter of it each.
+    pub n_merged_objects: usize,
+    /// Things that are two objects (over-segmentation): two objects have a quarter of it each.
+    pub n_split_things: usize,
     /// Recall by any object, whatever its word: the quality of the segmentation alone.
     pub any: Recall,
     /// Recall by objects that reach the threshold for the thing's word.
@@ -75,6 +82,16 @@ pub(super) fn report(
         };
         of_thing.map(iou).fold(0.0, f64::max)
     };
+    let mut n_labels_of_object = vec![0usize; n_objects];
+    let mut n_objects_of_thing: BTreeMap<u16, usize> = BTreeMap::new();
+    for ((label, object), both) in &n_of_both {
+        let is_piece = |of: u64| *both as f64 >= PIECE * of as f64;
+        n_labels_of_object[*object as usize] += usize::from(is_piece(n_of_object[*object as usize]));
+        *n_objects_of_thing.entry(*label).or_default() += usize::from(is_piece(n_of_thing[label]));
+    }
+    let is_split = |id: &u16| n_objects_of_thing.get(id).is_some_and(|n| *n > 1);
+    let n_split_things = truth.things.iter().filter(|thing| is_split(&thing.id)).count();
+    let n_merged_objects = n_labels_of_object.iter().filter(|n| **n > 1).count();
     let [mut any, mut of_words, mut best_of_words] = [Recall::default(); 3];
     // Things without Gaussians cannot be found.
     let things = truth.things.iter().map(|thing| thing.id).filter(|id| n_of_thing.contains_key(id));
@@ -89,7 +106,7 @@ pub(super) fn report(
             best_of_words.count(best_iou(thing, &|object| order.contains(&object)));
         }
     }
-    InstanceReport { n_objects, any, of_words, best_of_words }
+    InstanceReport { n_objects, n_merged_objects, n_split_things, any, of_words, best_of_words }
 }
 
 #[cfg(test)]
@@ -118,6 +135,9 @@ mod tests {
         let classes = [("chair".to_owned(), vec![7, 8]), ("table".to_owned(), vec![9])];
         // IoU: 3/4; 1/4 with object 1, 2/6 with object 2.
         let found = |chair: Vec<f32>| report(&truth, &object_of, 3, &classes, &[chair, vec![0.9; 3]], 0.5);
+        // Object 2 is half thing and half wall; thing 8 is a quarter of object 1 and half of object 2.
+        let whole = found(vec![0.0; 3]);
+        assert_eq!((whole.n_objects, whole.n_merged_objects, whole.n_split_things), (3, 1, 1));
         let recall = |n, n_at_25, n_at_50| Recall { n, n_at_25, n_at_50 };
         let report = found(vec![0.9, 0.6, 0.1]);
         assert_eq!(

@@ -121,8 +121,13 @@ impl fmt::Display for EvalReport {
         )?;
         writeln!(f, "negative queries: {} of {} found nothing", self.abstained[0], self.abstained[1])?;
         if let Some(found) = &self.instances {
-            let InstanceReport { n_objects, any, of_words, best_of_words } = found;
+            let InstanceReport { n_objects, n_merged_objects, n_split_things, any, of_words, best_of_words } =
+                found;
             writeln!(f, "{n_objects} objects; instance recall at IoU 0.25 and 0.5, by any object: {any}")?;
+            writeln!(
+                f,
+                "  objects that are two things: {n_merged_objects}; things that are two objects: {n_split_things}"
+            )?;
             writeln!(
                 f,
                 "  by objects above the threshold for the word: {of_words}; by the word's best objects: {best_of_words}"
