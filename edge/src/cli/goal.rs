@@ -40,7 +40,7 @@ pub struct GoalArgs {
     #[arg(long, value_name = "M", default_value_t = 20.0)]
     pub range_m: f64,
     /// Least share of the thing that the sensor must see.
-    #[arg(long, value_name = "SHARE", default_value_t = 0.05)]
+    #[arg(long, value_name = "SHARE", default_value_t = 0.02)]
     pub min_visible: f64,
     /// Most poses.
     #[arg(long, default_value_t = 3)]

@@ -23,6 +23,8 @@ const APART_M: f64 = 0.5;
 const COMFORT_M: f64 = 0.3;
 /// Metres of way that a pose without any comfort is worse than one with all.
 const CLEARANCE_WEIGHT_M: f64 = 2.0;
+/// A pose must see this share of what the best one sees, whatever its cost.
+const SHARE_OF_BEST: f64 = 0.5;
 /// Metres of way that a pose that sees nothing would be worse than one that sees all.
 const SIGHT_WEIGHT_M: f64 = 4.0;
 
@@ -49,8 +51,9 @@ pub fn choose(around: &Around<'_>, request: &GoalRequest, points: &[DVec3]) -> R
     if goals.is_empty() {
         return Err(NoGoal::Unreachable);
     }
-    let mut seeing: Vec<Goal> =
-        goals.into_iter().filter(|goal| goal.visible_share >= request.min_visible).collect();
+    let best_share = goals.iter().map(|goal| goal.visible_share).fold(0.0, f64::max);
+    let least = request.min_visible.max(SHARE_OF_BEST * best_share);
+    let mut seeing: Vec<Goal> = goals.into_iter().filter(|goal| goal.visible_share >= least).collect();
     if seeing.is_empty() {
         return Err(NoGoal::NotVisible);
     }
@@ -133,8 +136,15 @@ fn goal(around: &Around<'_>, request: &GoalRequest, points: &[DVec3], of: Candid
     }
     let position_in_world = DVec3::new(x, y, around.floor_height(of.cell)?);
     let sensor_in_world = position_in_world + DVec3::Z * request.sensor_height_m;
-    let seen: Vec<DVec3> =
-        points.iter().copied().filter(|point| sight::sees(around.space, sensor_in_world, *point)).collect();
+    // From below, what a thing stands on hides it, and the voxels of the two are the same.
+    let bottom = points.iter().map(|point| point.z).fold(f64::INFINITY, f64::min);
+    let from_below = sensor_in_world.z < bottom;
+    let least_z = if from_below { bottom + sight::TOLERANCE * window.voxel } else { f64::NEG_INFINITY };
+    let seen: Vec<DVec3> = points
+        .iter()
+        .copied()
+        .filter(|point| point.z >= least_z && sight::sees(around.space, sensor_in_world, *point))
+        .collect();
     let visible_share = seen.len() as f64 / points.len() as f64;
     let looked_at = if seen.is_empty() { points } else { &seen[..] };
     let middle = looked_at.iter().sum::<DVec3>() / looked_at.len() as f64;

@@ -50,7 +50,7 @@ impl GoalRequest {
             height_m: None,
             step_m: 0.1,
             range_m: 20.0,
-            min_visible: 0.05,
+            min_visible: 0.02,
             limit: 3,
         }
     }

@@ -5,8 +5,8 @@ use glam::DVec3;
 use super::space::Space;
 
 /// Distance from a point of the thing within which the line need not be free, in edges of a voxel: the thing's own surface, and
-/// the voxels before it that no view looks through whole, are occupied or unknown.
-const TOLERANCE: f64 = 2.5;
+/// the voxels just before it, are occupied or unknown.
+pub const TOLERANCE: f64 = 2.0;
 
 /// Returns whether a point is seen: every voxel on the line from the sensor is free up to [`TOLERANCE`] before the point.
 ///

@@ -141,6 +141,27 @@ fn a_screen_hides_the_thing_from_low_sensors() {
     goals_with(&world, &request(1.3)).expect("over the screen it is seen");
 }
 
+/// A board with a thing on it, over the whole way: the robot drives below, and sees nothing of the thing through the board.
+#[test]
+fn nothing_is_seen_through_what_a_thing_stands_on() {
+    let board = |p: DVec3| inside(p, [1.4, 1.4, 0.65], [4.6, 4.6, 0.7]).then_some(At::Solid);
+    let no_box = |p: DVec3| match hall(board)(p) {
+        At::Solid if p.z > 0.0 && board(p).is_none() => At::Free,
+        at => at,
+    };
+    let world = packed(no_box);
+    let on_board: Vec<DVec3> = points().into_iter().map(|p| p + DVec3::Z * 0.6).collect();
+    let request = GoalRequest::new(GoalTarget::Object(1));
+    let found = stand(&[world.view()], &request, START, &on_board).expect("places are known");
+    assert_eq!(found, Err(NoGoal::NotVisible));
+    // A thing that hangs there is seen from below.
+    let empty = packed(|p: DVec3| match no_box(p) {
+        At::Solid if p.z > 0.0 => At::Free,
+        at => at,
+    });
+    stand(&[empty.view()], &request, START, &on_board).expect("places are known").expect("poses");
+}
+
 #[test]
 fn steps_and_slopes_count() {
     let ramp = |rise: f64| {

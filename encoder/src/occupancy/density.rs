@@ -28,13 +28,16 @@ const TILE_BLOCKS: i32 = 16;
 /// Voxels along an edge of a tile.
 const TILE_EDGE: usize = (TILE_BLOCKS * BLOCK_EDGE) as usize;
 /// Tiles along an axis that a Gaussian may reach into: larger ones are sky and other background that no robot drives into.
-const MAX_TILES: i32 = 64;
+const MAX_TILES: i32 = 8;
+/// Standard deviation along its shortest axis, world units, above which a Gaussian is fog, sky or other background: the
+/// Gaussians of a surface are thin.
+pub const MAX_THICKNESS: f32 = 0.2;
 
 /// The occupied voxels of a scene.
 pub(super) struct Occupied {
     /// By place: voxels of each block with at least one.
     pub(super) blocks: Vec<(BlockAt, u64)>,
-    /// Gaussians left out because they are larger than 64 tiles.
+    /// Gaussians left out as background: larger than 8 tiles, or thicker than [`MAX_THICKNESS`].
     pub(super) n_background: usize,
 }
 
@@ -51,6 +54,9 @@ struct Ellipsoid {
 impl Ellipsoid {
     fn new(scene: &Gaussians, index: usize, lattice: Lattice) -> Option<Self> {
         let mean = lattice.in_voxels(scene.means_in_world[index])?;
+        if scene.scales[index].into_iter().all(|scale| scale > MAX_THICKNESS) {
+            return None;
+        }
         let [w, x, y, z] = scene.rotations_wxyz[index].map(f64::from);
         let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
         let scales = DVec3::from(scene.scales[index].map(f64::from)) / lattice.voxel;
@@ -224,6 +230,22 @@ mod tests {
             assert_eq!(is_occupied, opacity >= 0.1, "{voxel:?}: {opacity}");
         }
         assert!(n_occupied > 200 && n_undecided < n_occupied / 20, "{n_occupied} {n_undecided}");
+    }
+
+    /// By hand: a wide thin Gaussian is a surface; a ball of fog and a Gaussian that is wider than 8 tiles of 64 voxels are not.
+    #[test]
+    fn background_is_left_out() {
+        let mut scene = Gaussians::default();
+        for (k, scales) in [[1.0, 1.0, 0.02], [0.3, 0.25, 0.3], [4.4, 4.4, 0.02]].into_iter().enumerate() {
+            scene.means_in_world.push(DVec3::X * 100.0 * k as f64);
+            scene.rotations_wxyz.push([1.0, 0.0, 0.0, 0.0]);
+            scene.scales.push(scales);
+            scene.opacities.push(0.9);
+            scene.sh_dc.push([0.0; 3]);
+        }
+        let found = occupied(&scene, &[0, 1, 2], Lattice { voxel: 0.05 });
+        assert_eq!(found.n_background, 2);
+        assert!(!found.blocks.is_empty() && found.blocks.iter().all(|([x, ..], _)| x.abs() < 20));
     }
 
     /// A plane of opaque Gaussians, 2 mm thick, in any direction: every voxel that it cuts is occupied, and none whose centre

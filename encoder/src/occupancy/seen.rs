@@ -49,36 +49,21 @@ pub(super) fn candidates(occupied: &[(BlockAt, u64)], lattice: Lattice) -> Vec<C
 /// A depth picture: how far each pixel looks.
 pub(super) struct Depth {
     view: RasterView,
-    /// Camera z up to which the pixel and its neighbours look through, row-major; infinite where only sky is.
+    /// Camera z up to which the pixel looks through, row-major; infinite where only sky is.
     until: Vec<f32>,
 }
 
 impl Depth {
-    /// Takes the smallest depth of each pixel and its eight neighbours: at an edge, a pixel's depth lies between those of
-    /// the two surfaces.
+    /// Takes the depth of each pixel. At an edge it lies between those of the two surfaces, whose voxels are occupied, so that at
+    /// most places behind the nearer one are looked through: a pixel's width of them, and two views must agree.
     pub(super) fn new(view: RasterView, drawing: &Drawing) -> Self {
-        let (width, height) = (drawing.width_px as usize, drawing.height_px as usize);
         let of_pixel = |pixel: usize| match drawing.coverage[pixel] {
             coverage if coverage >= MIN_COVERAGE => drawing.depth[pixel],
             coverage if coverage <= MAX_SKY => f32::INFINITY,
             _ => 0.0,
         };
-        let own: Vec<f32> = (0..width * height).map(of_pixel).collect();
-        let along_x: Vec<f32> = (0..width * height)
-            .map(|pixel| {
-                let (row, x) = (pixel - pixel % width, pixel % width);
-                own[row + x.saturating_sub(1)..=row + (x + 1).min(width - 1)]
-                    .iter()
-                    .copied()
-                    .fold(f32::INFINITY, f32::min)
-            })
-            .collect();
-        let until = (0..width * height).map(|pixel| {
-            let (x, y) = (pixel % width, pixel / width);
-            let rows = y.saturating_sub(1)..=(y + 1).min(height - 1);
-            rows.map(|y| along_x[y * width + x]).fold(f32::INFINITY, f32::min)
-        });
-        Self { view, until: until.collect() }
+        let until = (0..drawing.coverage.len()).map(of_pixel).collect();
+        Self { view, until }
     }
 
     /// Notes the voxels of the candidates that this view looks through. The order of views does not matter.
@@ -119,8 +104,6 @@ impl Depth {
         }
         let m = camera_from_world.matrix3 * lattice.voxel;
         let first = camera_from_world.transform_point3(lattice.corner(candidate.at) + 0.5 * lattice.voxel);
-        // The whole voxel lies before the surface, not its centre alone.
-        let margin = lattice.voxel * 0.75f64.sqrt();
         let mut mask = 0;
         for x in 0..BLOCK_EDGE {
             for y in 0..BLOCK_EDGE {
@@ -136,7 +119,7 @@ impl Depth {
                         continue;
                     }
                     let until = self.until[v as usize * width_px as usize + u as usize];
-                    let sees = at.z + margin <= f64::from(until);
+                    let sees = at.z <= f64::from(until);
                     mask |= u64::from(sees) << (z + BLOCK_EDGE * (y + BLOCK_EDGE * x));
                 }
             }
@@ -203,17 +186,14 @@ mod tests {
         let of = &view.intrinsics;
         let x = (of.focal_x_px * at.x / at.z + of.centre_x_px).floor();
         let y = (of.focal_y_px * at.y / at.z + of.centre_y_px).floor();
-        let is_inside = |x: f64, y: f64| x >= 0.0 && y >= 0.0 && x < 40.0 && y < 30.0;
-        let half_diagonal = LATTICE.voxel * 3f64.sqrt() / 2.0;
-        let beside = (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| (x + f64::from(dx), y + f64::from(dy))));
-        is_inside(x, y)
-            && beside.filter(|(x, y)| is_inside(*x, *y)).all(|(x, y)| {
-                let pixel = y as usize * 40 + x as usize;
-                match drawing.coverage[pixel] {
-                    0.5.. => at.z + half_diagonal <= f64::from(drawing.depth[pixel]),
-                    coverage => coverage <= 0.1,
-                }
-            })
+        let is_inside = x >= 0.0 && y >= 0.0 && x < 40.0 && y < 30.0;
+        is_inside && {
+            let pixel = y as usize * 40 + x as usize;
+            match drawing.coverage[pixel] {
+                0.5.. => at.z <= f64::from(drawing.depth[pixel]),
+                coverage => coverage <= 0.1,
+            }
+        }
     }
 
     /// Oracle: the definition, for every voxel and every view.

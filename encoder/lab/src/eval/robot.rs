@@ -9,6 +9,8 @@ use std::time::Duration;
 use anyhow::{Context, Result, anyhow};
 use serde_json::Value;
 
+use crate::generate::compose::Walk;
+
 /// Longest wait for an answer.
 const TIMEOUT: Duration = Duration::from_secs(60);
 
@@ -90,6 +92,8 @@ pub struct Prepared<'a> {
     pub seed: u64,
     /// Its photos.
     pub n_views: u32,
+    /// Where they are taken.
+    pub walk: Walk,
     /// Further flags of `encode`; `SCENE` in them stands for the scene's folder.
     pub encode_flags: &'a [&'a str],
 }
@@ -116,6 +120,8 @@ impl Prepared<'_> {
                 &seed,
                 "--n-views",
                 &n_views,
+                "--walk",
+                self.walk.name(),
                 "--out",
             ]);
             finish(command.arg(&scene))?;

@@ -18,6 +18,8 @@ pub(super) const PHOTO_PX: [u32; 2] = [640, 480];
 pub(super) const FIELD_OF_VIEW_RAD: f64 = 75.0 * std::f64::consts::PI / 180.0;
 /// Height of a walking camera over the ground.
 const CAMERA_HEIGHT_M: f64 = 1.5;
+/// Height of a robot's camera over the ground.
+const ROBOT_HEIGHT_M: f64 = 0.6;
 /// Gap between things on the ground, so that cameras can walk around them.
 const GAP_M: f64 = 0.3;
 /// Smallest distance between a camera and a thing.
@@ -40,6 +42,26 @@ pub struct Placed {
     pub bounds: Aabb,
     /// Whether it belongs to the scene's shell, such as floor and walls.
     pub shell: bool,
+}
+
+/// Where a scene's photos are taken.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Walk {
+    /// On an oval through the middle of each area.
+    #[default]
+    Oval,
+    /// All over each area, as of somebody who shows a robot where it may drive.
+    Everywhere,
+}
+
+impl Walk {
+    /// Returns the name that programs take.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Oval => "oval",
+            Self::Everywhere => "everywhere",
+        }
+    }
 }
 
 /// A piece of ground that things stand on and cameras walk through.
@@ -249,6 +271,24 @@ impl Layout {
             && self.placed.iter().filter(|p| !p.shell).all(|p| p.bounds.distance_to(at) > CAMERA_CLEARANCE_M)
     }
 
+    /// Returns cameras all over the walkable places: places and headings are low-discrepancy sequences (Roberts' R2, and the golden
+    /// angle). They are fewer than asked for if there is hardly room.
+    pub fn roam(&self, n_views: u32, intrinsics: Intrinsics) -> Vec<RasterView> {
+        const STEP: DVec2 = DVec2::new(0.754_877_666_246_692_7, 0.569_840_290_998_053_2);
+        const GOLDEN_ANGLE: f64 = 2.399_963_229_728_653;
+        let tries = (0..20 * n_views).flat_map(|i| self.areas.iter().map(move |area| (f64::from(i), area)));
+        let cameras = tries.filter_map(|(i, area)| {
+            let at = area.corner + area.size * (0.5 + STEP * (i + 1.0)).fract();
+            // Every second one is a robot's, which looks below tables.
+            let (height, down) = if i % 2.0 == 0.0 { (CAMERA_HEIGHT_M, 0.5) } else { (ROBOT_HEIGHT_M, 0.2) };
+            let position = at.extend(height);
+            let heading = DVec3::new((GOLDEN_ANGLE * i).cos(), (GOLDEN_ANGLE * i).sin(), -down);
+            let camera_from_world = looking(position, heading);
+            self.is_walkable(position).then_some(RasterView { camera_from_world, intrinsics })
+        });
+        cameras.take(n_views as usize).collect()
+    }
+
     /// Returns cameras on an oval walk through each area, which look outwards and across in turn. The first stands `start`
     /// steps along the oval.
     pub fn walk(&self, n_views: u32, start: f64, intrinsics: Intrinsics) -> Vec<RasterView> {
@@ -352,6 +392,11 @@ pub fn looking(position: DVec3, heading: DVec3) -> DAffine3 {
     let down = forward.cross(right);
     let camera_from_world = DMat3::from_cols(right, down, forward).transpose();
     DAffine3::from_mat3_translation(camera_from_world, -(camera_from_world * position))
+}
+
+/// Returns the intrinsics of a scene's photos.
+pub fn photo_intrinsics() -> Intrinsics {
+    pinhole(PHOTO_PX, FIELD_OF_VIEW_RAD)
 }
 
 /// Returns the intrinsics of an ideal pinhole with square pixels.

@@ -9,6 +9,7 @@ use slag_encoder::progress::Progress;
 
 use super::output::Output;
 use crate::eval::goal::{self, GoalSettings};
+use crate::generate::compose::Walk;
 use crate::generate::grammar::SceneKind;
 
 /// `eval goal`.
@@ -24,8 +25,11 @@ pub struct EvalGoalArgs {
     #[arg(long, value_name = "N", value_delimiter = ',', default_values_t = [21, 22, 23, 24])]
     pub seeds: Vec<u64>,
     /// Photos of each scene.
-    #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u32).range(1..=10_000))]
+    #[arg(long, value_name = "N", default_value_t = 96, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub n_views: u32,
+    /// Where they are taken.
+    #[arg(long, value_enum, default_value = "everywhere")]
+    pub walk: Walk,
     /// Radius of the robot.
     #[arg(long, value_name = "M", default_value_t = 0.3)]
     pub radius_m: f64,
@@ -42,6 +46,7 @@ pub(super) fn run(args: &EvalGoalArgs, progress: &dyn Progress, output: &Output<
         kinds: args.kind.clone(),
         seeds: args.seeds.clone(),
         n_views: args.n_views,
+        walk: args.walk,
         radius_m: args.radius_m,
         lists_faults: args.list,
         programs,

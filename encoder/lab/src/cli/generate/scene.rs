@@ -8,6 +8,7 @@ use slag_encoder::cli::Exit;
 use slag_encoder::progress::Progress;
 
 use crate::generate::Scene;
+use crate::generate::compose::Walk;
 use crate::generate::grammar::{self, SceneKind};
 
 /// `generate scene`.
@@ -25,6 +26,9 @@ pub struct GenerateSceneArgs {
     /// Number of photos.
     #[arg(long, value_name = "N", default_value_t = 36, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     pub n_views: u32,
+    /// Where the photos are taken.
+    #[arg(long, value_enum, default_value = "oval")]
+    pub walk: Walk,
     /// Folder of object files (`NOUN.txt`) instead of the built-in ones.
     #[arg(long, value_name = "DIR")]
     pub objects: Option<PathBuf>,
@@ -33,6 +37,9 @@ pub struct GenerateSceneArgs {
 pub(super) fn run(args: &GenerateSceneArgs, progress: &dyn Progress) -> Result<Exit> {
     let nouns = grammar::nouns(args.objects.as_deref())?;
     let mut scene = Scene::new(&args.kind, args.seed, args.n_views, &nouns);
+    if args.walk == Walk::Everywhere {
+        scene.roam(args.n_views);
+    }
     let written = scene.write(&args.out, progress)?;
     println!(
         "{} Gaussians, {} things, {} photos in {}",

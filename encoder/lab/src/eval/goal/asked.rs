@@ -9,6 +9,6 @@ pub const HEIGHT_M: f64 = 0.5;
 /// Highest step.
 pub const STEP_M: f64 = 0.1;
 /// Least share of the thing's Gaussians that must be seen. From one side hardly half of them are.
-pub const MIN_VISIBLE: f64 = 0.05;
+pub const MIN_VISIBLE: f64 = 0.02;
 /// Least share of the thing's outline that must truly be shown.
 pub const MIN_SHOWN: f64 = 0.1;

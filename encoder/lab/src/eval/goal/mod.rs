@@ -16,8 +16,7 @@ use slag_common::frames::Aabb;
 use slag_encoder::progress::Progress;
 
 use super::robot::{Prepared, Service};
-use crate::generate::Scene;
-use crate::generate::compose::Layout;
+use crate::generate::compose::{Layout, Walk, photo_intrinsics};
 use crate::generate::grammar::{self, SceneKind};
 use asked::{HEIGHT_M, MIN_VISIBLE, REACH_M, SENSOR_HEIGHT_M, STEP_M};
 pub use report::GoalReport;
@@ -39,6 +38,8 @@ pub struct GoalSettings {
     pub seeds: Vec<u64>,
     /// Photos of each scene.
     pub n_views: u32,
+    /// Where they are taken.
+    pub walk: Walk,
     /// Radius of the robot.
     pub radius_m: f64,
     /// Whether each fault is logged.
@@ -61,8 +62,9 @@ pub fn run(settings: &GoalSettings, progress: &dyn Progress) -> Result<GoalRepor
             let dir = settings.out.join(format!("{name}-{seed}"));
             // The objects' outlines are the true ones: places are judged here, not segmentation.
             let encode_flags = &["--occupancy", "--masks", "SCENE/gt/masks"];
-            let (programs, n_views) = (&settings.programs, settings.n_views);
-            let scene = Prepared { programs, dir: &dir, kind: &name, seed: *seed, n_views, encode_flags };
+            let (programs, n_views, walk) = (&settings.programs, settings.n_views, settings.walk);
+            let scene =
+                Prepared { programs, dir: &dir, kind: &name, seed: *seed, n_views, walk, encode_flags };
             scene.make().with_context(|| dir.display().to_string())?;
             judge(settings, &scene, *kind, &mut report).with_context(|| dir.display().to_string())?;
             report.scenes.push(format!("{name}-{seed}"));
@@ -76,9 +78,12 @@ pub fn run(settings: &GoalSettings, progress: &dyn Progress) -> Result<GoalRepor
 fn judge(settings: &GoalSettings, at: &Prepared<'_>, kind: SceneKind, report: &mut GoalReport) -> Result<()> {
     let nouns = grammar::nouns(None)?;
     let layout = Layout::new(&[kind], at.seed, &nouns, &|_, _| true);
-    let scene = Scene::new(&[kind], at.seed, settings.n_views, &nouns);
     report.voxels.add(voxels::compare(&layout, &at.dir.join("store"))?);
-    let cameras = scene.views.iter().map(|view| view.camera_from_world.inverse().translation);
+    let views = match settings.walk {
+        Walk::Oval => layout.walk(settings.n_views, 0.0, photo_intrinsics()),
+        Walk::Everywhere => layout.roam(settings.n_views, photo_intrinsics()),
+    };
+    let cameras = views.iter().map(|view| view.camera_from_world.inverse().translation);
     let truth = Truth::new(&layout, settings.radius_m, cameras)?;
     let pixels = pixels_of_things(at.dir)?;
     let service = Service::start(&at.program("slag-edge"), &["--cache"], &at.dir.join("cache"))?;

@@ -18,6 +18,7 @@ pub use report::{Counts, RelationsReport, Way};
 pub use truth::{Asked, TrueThing};
 
 use crate::eval::robot::{Prepared, Service};
+use crate::generate::compose::Walk;
 use crate::generate::grammar::SceneKind;
 
 /// Things with fewer pixels over all photos are not asked about.
@@ -79,6 +80,7 @@ pub fn run(settings: &RelationsSettings, progress: &dyn Progress) -> Result<Rela
                 kind: &name,
                 seed: *seed,
                 n_views: settings.n_views,
+                walk: Walk::Oval,
                 encode_flags,
             };
             scene.make().with_context(|| dir.display().to_string())?;
