@@ -20,7 +20,7 @@ ARGUMENTS = {
     "robot_radius": "0.3",
     "sensor_height": "0.4",
     "reach": "0.8",
-    "send_goals": "false",
+    "send_goals": "none",
 }
 
 

@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::Result;
 use clap::{Parser, ValueEnum};
 
-use crate::node::{Middleware, PositionSource, Settings};
+use crate::node::{GoalSink, Middleware, PositionSource, Settings};
 use crate::stand::Body;
 
 /// Puts a robot's answers on ROS 2 topics and services, without a ROS installation.
@@ -59,9 +59,9 @@ pub struct Args {
     /// How close its middle must come to a thing's surface, metres.
     #[arg(long, value_name = "M", default_value_t = 0.8)]
     reach: f64,
-    /// true: send places to stand to /goal_pose as well, where Nav2 takes them and drives.
-    #[arg(long, value_name = "true|false", default_value_t = false, action = clap::ArgAction::Set)]
-    send_goals: bool,
+    /// Where places to stand are sent to, besides the node's own topic, so that Nav2 drives there.
+    #[arg(long, default_value = "none")]
+    send_goals: Goals,
     /// Most points in the clouds of an answer.
     #[arg(long, default_value_t = 3500, value_parser = clap::value_parser!(u32).range(1..=10_000))]
     points: u32,
@@ -73,6 +73,18 @@ enum Rmw {
     FastDds,
     #[value(name = "rmw_cyclonedds_cpp")]
     CycloneDds,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Goals {
+    /// Nowhere.
+    #[value(alias = "false")]
+    None,
+    /// The topic /goal_pose, as RViz does: nothing tells how it ended.
+    #[value(alias = "true")]
+    Topic,
+    /// The action /navigate_to_pose: /slag/navigation tells how it goes.
+    Action,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -121,7 +133,11 @@ impl Args {
                 sensor_height_m: self.sensor_height,
                 reach_m: self.reach,
             },
-            sends_goals: self.send_goals,
+            goals: match self.send_goals {
+                Goals::None => GoalSink::Nowhere,
+                Goals::Topic => GoalSink::Topic,
+                Goals::Action => GoalSink::Action,
+            },
         })
     }
 }

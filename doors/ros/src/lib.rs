@@ -6,6 +6,7 @@ mod args;
 mod geometry;
 mod ground;
 mod messages;
+mod navigation;
 pub mod node;
 mod position;
 pub mod stand;

@@ -69,6 +69,13 @@ messages! {
     MapMetaData { map_load_time: Time, resolution: f32, width: u32, height: u32, origin: Pose }
     /// `nav_msgs/OccupancyGrid`: 0 free, 100 occupied, -1 unknown.
     OccupancyGrid { header: Header, info: MapMetaData, data: Vec<i8> }
+    /// Goal of `nav2_msgs/NavigateToPose`.
+    NavigationGoal { pose: PoseStamped, behavior_tree: String }
+    /// Its feedback.
+    NavigationFeedback {
+        current_pose: PoseStamped, navigation_time: Duration, estimated_time_remaining: Duration,
+        number_of_recoveries: i16, distance_remaining: f32,
+    }
     /// Request of `slag_msgs/srv/Stand`.
     StandRequest { text: String }
     /// Reply of `slag_msgs/srv/Stand`.
@@ -79,4 +86,16 @@ messages! {
     FindRequest { text: String, limit: u32 }
     /// Reply of `slag_msgs/srv/Find`.
     FindReply { success: bool, message: String, detections: Detection3DArray }
+}
+
+// A message without members has one on the wire. Later versions add an error text behind the code, which is not read.
+#[cfg(not(feature = "jazzy"))]
+messages! {
+    /// Result of `nav2_msgs/NavigateToPose`.
+    NavigationResult { structure_needs_at_least_one_member: u8 }
+}
+#[cfg(feature = "jazzy")]
+messages! {
+    /// Result of `nav2_msgs/NavigateToPose`.
+    NavigationResult { error_code: u16 }
 }

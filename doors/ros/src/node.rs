@@ -14,12 +14,15 @@ use rustdds::DomainParticipantBuilder;
 use serde::Serialize;
 use serde_json::{Value, json};
 use slag_robot::{Answer, PointAnswer, Robot};
+use tokio::runtime::Handle;
+use tokio::sync::oneshot;
 
 use crate::answers;
 use crate::messages::{
     Detection3DArray, FindReply, FindRequest, MarkerArray, NavSatFix, OccupancyGrid, Odometry, PointCloud2,
     PoseStamped, StandReply, StandRequest, Text, Transforms as TransformMessages,
 };
+use crate::navigation::Navigator;
 use crate::position;
 use crate::stand::{self, Body};
 use crate::transforms::Transforms;
@@ -53,6 +56,17 @@ pub enum Middleware {
     CycloneDds,
 }
 
+/// Where places to stand are sent to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum GoalSink {
+    /// Nowhere.
+    Nowhere,
+    /// To the topic `/goal_pose`.
+    Topic,
+    /// To the action `/navigate_to_pose`.
+    Action,
+}
+
 /// What the node is told.
 #[derive(Clone, Debug)]
 pub struct Settings {
@@ -78,8 +92,8 @@ pub struct Settings {
     pub n_points: u32,
     /// The robot's size and reach, for places to stand.
     pub body: Body,
-    /// Whether places to stand are sent to `/goal_pose` as well, where Nav2 takes them.
-    pub sends_goals: bool,
+    /// Where places to stand are sent to, besides the node's own topic.
+    pub goals: GoalSink,
 }
 
 /// What all parts of the node share.
@@ -96,7 +110,17 @@ struct Shared {
     goal: Publisher<PoseStamped>,
     ground: Publisher<OccupancyGrid>,
     /// `/goal_pose`, if goals are sent there.
-    navigation: Option<Publisher<PoseStamped>>,
+    goal_pose: Option<Publisher<PoseStamped>>,
+    navigation: Option<Navigation>,
+}
+
+/// The action that drives, if goals are sent there.
+struct Navigation {
+    navigator: Navigator,
+    /// How the newest goal stands.
+    state: Publisher<Text>,
+    /// Ends the following of the newest goal when it is dropped; Nav2 gives up the one before.
+    newest: Mutex<Option<oneshot::Sender<()>>>,
 }
 
 /// The answers to a text.
@@ -128,13 +152,26 @@ pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()
     // As map_server offers its map.
     let latest = reliable(1).durability(Durability::TransientLocal);
     let pose = ("geometry_msgs", "PoseStamped");
-    let navigation = settings.sends_goals.then(|| {
+    let goal_pose = (settings.goals == GoalSink::Topic).then(|| {
         publisher(
             &mut node,
             Name::new("/", "goal_pose")?,
             pose,
             &reliable(1).durability(Durability::Volatile),
         )
+    });
+    let goal_pose = goal_pose.transpose()?;
+    let (volatile, latched) = (reliable(10), reliable(100).durability(Durability::TransientLocal));
+    let mapping = match settings.middleware {
+        Middleware::FastDds => ServiceMapping::Enhanced,
+        Middleware::CycloneDds => ServiceMapping::Cyclone,
+    };
+    let navigation = (settings.goals == GoalSink::Action).then(|| -> Result<Navigation> {
+        Ok(Navigation {
+            navigator: Navigator::new(&mut node, mapping, [&volatile, &volatile, &latest])?,
+            state: publisher(&mut node, own("navigation")?, ("std_msgs", "String"), &latest)?,
+            newest: Mutex::default(),
+        })
     });
     let navigation = navigation.transpose()?;
     let shared = Arc::new(Shared {
@@ -144,13 +181,13 @@ pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()
         best_pose: publisher(&mut node, own("best_pose")?, ("geometry_msgs", "PoseStamped"), &kept)?,
         goal: publisher(&mut node, own("goal")?, ("geometry_msgs", "PoseStamped"), &kept)?,
         ground: publisher(&mut node, own("ground")?, ("nav_msgs", "OccupancyGrid"), &latest)?,
+        goal_pose,
         navigation,
         frames: Mutex::default(),
         place: Mutex::default(),
         robot,
         settings: settings.clone(),
     });
-    let (volatile, latched) = (reliable(10), reliable(100).durability(Durability::TransientLocal));
     let sensor = QosProfile::subscription_default();
 
     let texts = subscription::<Text>(&mut node, own("query")?, ("std_msgs", "String"), &volatile)?;
@@ -165,10 +202,6 @@ pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()
         }
     }));
 
-    let mapping = match settings.middleware {
-        Middleware::FastDds => ServiceMapping::Enhanced,
-        Middleware::CycloneDds => ServiceMapping::Cyclone,
-    };
     let kind = ServiceTypeName::new("slag_msgs", "Find");
     let server = node.create_server(mapping, &own("find")?, &kind, volatile.clone(), volatile.clone());
     tokio::spawn(serve(server.map_err(|e| anyhow!("cannot offer find: {e}"))?, Arc::clone(&shared)));
@@ -315,15 +348,43 @@ impl Shared {
         if let Some(ground) = ground {
             publish(&self.ground, ground).await;
         }
-        let reply = Arc::clone(&self).stand(text).await;
+        let reply = Arc::clone(&self).stand(text.clone()).await;
         if !reply.success {
             return Err(reply.message);
         }
         publish(&self.goal, reply.pose.clone()).await;
+        if let Some(goal_pose) = &self.goal_pose {
+            publish(goal_pose, reply.pose.clone()).await;
+        }
         if let Some(navigation) = &self.navigation {
-            publish(navigation, reply.pose).await;
+            let (newest, replaced) = oneshot::channel();
+            *navigation.newest.lock().expect("no holder panics") = Some(newest);
+            let (shared, tokio) = (Arc::clone(&self), Handle::current());
+            // The streams of an action are not Send, so its task has a thread.
+            std::thread::spawn(move || {
+                tokio.block_on(async {
+                    tokio::select! {
+                        _ = replaced => {}
+                        () = shared.drive(text, reply.pose) => {}
+                    }
+                });
+            });
         }
         Ok(())
+    }
+
+    /// Sends a place to Nav2, and says how that goes.
+    async fn drive(self: Arc<Self>, text: String, pose: PoseStamped) {
+        let Some(Navigation { navigator, state, .. }) = &self.navigation else { return };
+        let say = async |how: String| publish(state, Text { data: format!("{text}: {how}") }).await;
+        let remaining = async |metres: f32| say(format!("{metres:.2} m remain")).await;
+        match navigator.drive(pose, remaining).await {
+            Ok(()) => say("reached".into()).await,
+            Err(reason) => {
+                tracing::warn!("{text:?}: {reason}");
+                say(format!("failed: {reason}")).await;
+            }
+        }
     }
 
     /// Asks the robot on a thread that may wait.

@@ -1,6 +1,6 @@
 """Drives slag-ros through Cyclone DDS, on this machine only.
 
-python3 against_the_program.py PROGRAM ROBOT_URL WORD DOMAIN_ID
+python3 against_the_program.py PROGRAM ROBOT_URL WORD DOMAIN_ID humble|jazzy
 
 WORD: something that the robot's scene has. The robot follows, so that it takes positions.
 """
@@ -15,8 +15,10 @@ import time
 import urllib.request
 
 from ros_messages import (
-    Detection3DArray, FindRequest, FindResponse, Header, MarkerArray, NavSatFix, NavSatStatus, Odometry, Point,
-    OccupancyGrid, PointCloud2, Pose, PoseStamped, PoseWithCovariance, Quaternion, StandRequest, StandResponse, String,
+    Detection3DArray, Duration, FeedbackMessage, FindRequest, FindResponse, GetResultRequest, Header, HumbleResult,
+    JazzyResult, MarkerArray, NavigateFeedback, NavSatFix, NavSatStatus, Odometry, Point,
+    OccupancyGrid, PointCloud2, Pose, PoseStamped, PoseWithCovariance, Quaternion, SendGoalRequest, SendGoalResponse,
+    StandRequest, StandResponse, String,
     TFMessage, Time, Transform, TransformStamped, Twist, TwistWithCovariance, Vector3,
 )
 
@@ -210,7 +212,48 @@ def check_places(ros, robot):
     assert close(xyz(reply.pose.pose.position), best["position_in_world"]), reply
     assert close([reply.clearance_m, reply.visible_share, reply.way_m],
                  [best["clearance_m"], best["visible_share"], best["path_m"]]), (reply, best)
-    return n_free
+    return n_free, word
+
+
+def check_action(ros, word, distribution):
+    """Stands in for Nav2's server: takes a goal, tells how far it is, and ends it; then one that it gives up; then rejects."""
+    action = "navigate_to_pose/_action"
+    goals = ros.reader("rt/slag/goal", PoseStamped)
+    states = ros.reader("rt/slag/navigation", String)
+    going = ros.writer("rt/slag/go_to", String)
+    until("writer", goals.get_matched_publications)
+    asked = ros.reader(f"rq/{action}/send_goalRequest", SendGoalRequest)
+    taken = ros.writer(f"rr/{action}/send_goalReply", SendGoalResponse)
+    waiting = ros.reader(f"rq/{action}/get_resultRequest", GetResultRequest)
+    kind = JazzyResult if distribution == "jazzy" else HumbleResult
+    results = ros.writer(f"rr/{action}/get_resultReply", kind)
+    feedback = ros.writer(f"rt/{action}/feedback", FeedbackMessage)
+    for reader in (asked, waiting, states):
+        until("writer", reader.get_matched_publications)
+    failed = "Aborted, error code 9003" if distribution == "jazzy" else "Aborted"
+    ends = [(True, 4, 0, f"{word}: reached"), (True, 6, 9003, f"{word}: failed: Nav2 ends the goal: {failed}"),
+            (False, 0, 0, f"{word}: failed: Nav2 rejects the goal")]
+    for accepted, status, code, said in ends:
+        going.write(String(word))
+        [goal] = until("a goal", goals.take)
+        [request] = until("a goal for the action", asked.take)
+        assert request.goal.behavior_tree == "" and request.goal.pose.header.frame_id == "map", request
+        place = request.goal.pose.pose
+        assert close(xyz(place.position), xyz(goal.pose.position)) and close([place.orientation.z], [goal.pose.orientation.z])
+        assert any(request.goal_id.uuid)
+        taken.write(SendGoalResponse(request.client, request.number, accepted, Time(1, 2)))
+        if accepted:
+            [result] = until("a call for the result", waiting.take)
+            assert list(result.goal_id.uuid) == list(request.goal_id.uuid)
+            told = NavigateFeedback(goal, Duration(1, 0), Duration(2, 0), 0, 1.25)
+            feedback.write(FeedbackMessage(request.goal_id, told))
+            [state] = until("feedback", states.take)
+            assert state.data == f"{word}: 1.25 m remain", state
+            own = (code, "too late") if kind is JazzyResult else (0,)
+            results.write(kind(result.client, result.number, status, *own))
+        [state] = until("the end", states.take)
+        assert state.data == said, state
+    return len(ends)
 
 
 def stamped(parent, child, translation, rotation):
@@ -281,20 +324,24 @@ class Node:
         self.process.wait(10)
 
 
-def main(program, robot, word, domain):
+def main(program, robot, word, domain, distribution):
     domain = int(domain)
     body = ["--robot-radius", str(BODY["radius_m"]), "--sensor-height", str(BODY["sensor_height_m"])]
-    with Node(program, robot, domain, *body, "--reach", str(BODY["reach_m"]), "--send-goals", "true"):
+    with Node(program, robot, domain, *body, "--reach", str(BODY["reach_m"]), "--send-goals", "topic"):
         ros = Ros(domain)
         n_things, n_points = check_answers(ros, robot, word)
         check_service(ros, word)
         check_transforms(ros, robot)
-        n_free = check_places(ros, robot)
+        n_free, place = check_places(ros, robot)
+    with Node(program, robot, domain + 3, *body, "--reach", str(BODY["reach_m"]), "--send-goals", "action"):
+        ros = Ros(domain + 3)
+        check_transforms(ros, robot)
+        n_goals = check_action(ros, place, distribution)
     with Node(program, robot, domain + 1, "--position", "odom"):
         check_odometry(Ros(domain + 1), robot)
     with Node(program, robot, domain + 2, "--position", "fix"):
         check_fix(Ros(domain + 2), robot)
-    print(f"{n_things} things, {n_points} points, service, tf, odometry, fix, {n_free} free cells")
+    print(f"{n_things} things, {n_points} points, service, tf, odometry, fix, {n_free} free cells, {n_goals} goals")
 
 
 if __name__ == "__main__":

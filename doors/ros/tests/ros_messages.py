@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, float32, float64, int8, int32, int64, sequence, uint8, uint16, uint32, uint64
+from cyclonedds.idl.types import array, float32, float64, int8, int16, int32, int64, sequence, uint8, uint16, uint32, uint64
 
 
 @dataclass
@@ -283,3 +283,70 @@ class StandResponse(IdlStruct, typename="slag_msgs::srv::dds_::Stand_Response_")
     clearance_m: float64
     visible_share: float64
     way_m: float64
+
+
+@dataclass
+class UUID(IdlStruct, typename="unique_identifier_msgs::msg::dds_::UUID_"):
+    uuid: array[uint8, 16]
+
+
+@dataclass
+class NavigateGoal(IdlStruct, typename="nav2_msgs::action::dds_::NavigateToPose_Goal_"):
+    pose: PoseStamped
+    behavior_tree: str
+
+
+@dataclass
+class SendGoalRequest(IdlStruct, typename="nav2_msgs::action::dds_::NavigateToPose_SendGoal_Request_"):
+    client: uint64
+    number: int64
+    goal_id: UUID
+    goal: NavigateGoal
+
+
+@dataclass
+class SendGoalResponse(IdlStruct, typename="nav2_msgs::action::dds_::NavigateToPose_SendGoal_Response_"):
+    client: uint64
+    number: int64
+    accepted: bool
+    stamp: Time
+
+
+@dataclass
+class GetResultRequest(IdlStruct, typename="nav2_msgs::action::dds_::NavigateToPose_GetResult_Request_"):
+    client: uint64
+    number: int64
+    goal_id: UUID
+
+
+# Humble's result is std_msgs/Empty, which has one member on the wire. Jazzy's is an error code, later with a text.
+@dataclass
+class HumbleResult(IdlStruct, typename="nav2_msgs::action::dds_::NavigateToPose_GetResult_Response_"):
+    client: uint64
+    number: int64
+    status: int8
+    structure_needs_at_least_one_member: uint8
+
+
+@dataclass
+class JazzyResult(IdlStruct, typename="nav2_msgs::action::dds_::NavigateToPose_GetResult_Response_"):
+    client: uint64
+    number: int64
+    status: int8
+    error_code: uint16
+    error_msg: str
+
+
+@dataclass
+class NavigateFeedback(IdlStruct, typename="nav2_msgs::action::dds_::NavigateToPose_Feedback_"):
+    current_pose: PoseStamped
+    navigation_time: Duration
+    estimated_time_remaining: Duration
+    number_of_recoveries: int16
+    distance_remaining: float32
+
+
+@dataclass
+class FeedbackMessage(IdlStruct, typename="nav2_msgs::action::dds_::NavigateToPose_FeedbackMessage_"):
+    goal_id: UUID
+    feedback: NavigateFeedback
