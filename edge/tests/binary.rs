@@ -323,6 +323,31 @@ fn a_robot_is_followed_by_its_service() {
     assert!(stop(serving).contains("fetched 1 shards of generation 3"));
 }
 
+/// A sector of flash that cannot be read, as a file that lost its pages while it was mapped: the program ends, its next start
+/// does not answer from that shard, and the next fetch brings it again.
+#[test]
+#[cfg(target_os = "linux")]
+fn a_page_that_cannot_be_read_ends_the_program_and_is_fetched_again() {
+    use std::os::unix::process::ExitStatusExt;
+    const SIGBUS: i32 = 7;
+    let (listed, shard) = red_and_blue();
+    let dir = tempfile::tempdir().expect("a folder");
+    let path = dir.path().join("shards").join(Hash32::of(&shard).to_string());
+    let from = store(listed, shard);
+    let fetch = ["fetch", "--trust-first", "--from", &from, "--at", "0,0,0", "--json"];
+    assert_eq!(run(dir.path(), &fetch).0, Some(0));
+    let (mut serving, url) = serve(dir.path(), &[]);
+    assert_eq!(get(&format!("{url}/query?text=blue")).0, 200);
+    fs_err::OpenOptions::new().write(true).open(&path).expect("on board").set_len(0).expect("cut");
+    assert!(ureq::get(format!("{url}/query?text=blue")).call().is_err());
+    assert_eq!(serving.wait().expect("ends").signal(), Some(SIGBUS));
+    let (code, out, err) = run(dir.path(), &["query", "blue", "--json"]);
+    assert_eq!(code, Some(1), "{out}{err}");
+    let (code, out, err) = run(dir.path(), &fetch);
+    assert_eq!((code, &json(&out)["downloaded"]["n_shards"]), (Some(0), &1.into()), "{out}{err}");
+    assert_eq!(run(dir.path(), &["query", "blue"]).0, Some(0));
+}
+
 /// Ten times more queries than the service can answer: some are answered quickly, the others are refused.
 #[test]
 fn overload_is_turned_away_and_memory_stays() {
