@@ -1,45 +1,8 @@
 //! TLS between the real programs, with certificates of an authority of our own.
 
-use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use rcgen::{BasicConstraints, CertificateParams, DnType, IsCa, Issuer, KeyPair};
 use slag_tests::*;
-
-/// A certificate authority, and the file of its certificate.
-struct Authority {
-    issuer: Issuer<'static, KeyPair>,
-    file: PathBuf,
-}
-
-impl Authority {
-    fn new(file: PathBuf) -> Self {
-        let mut params = CertificateParams::default();
-        params.distinguished_name.push(DnType::CommonName, text(&file));
-        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
-        let key = KeyPair::generate().expect("a key");
-        fs_err::write(&file, params.self_signed(&key).expect("signed").pem()).expect("written");
-        Self { issuer: Issuer::new(params, key), file }
-    }
-
-    /// Writes a certificate for this machine, and its key.
-    fn issue(&self, cert: &Path, key: &Path) {
-        let own = KeyPair::generate().expect("a key");
-        let params = CertificateParams::new(["127.0.0.1".to_owned()]).expect("an address");
-        fs_err::write(key, own.serialize_pem()).expect("written");
-        fs_err::write(cert, params.signed_by(&own, &self.issuer).expect("signed").pem()).expect("written");
-    }
-
-    /// Asks a service, as a client that knows this authority alone.
-    fn get(&self, url: &str) -> Result<String, ureq::Error> {
-        let pem = fs_err::read(&self.file).expect("there");
-        let root = ureq::tls::Certificate::from_pem(&pem).expect("a certificate");
-        let roots = ureq::tls::RootCerts::new_with_certs(&[root]);
-        let tls = ureq::tls::TlsConfig::builder().root_certs(roots).build();
-        let agent = ureq::Agent::config_builder().tls_config(tls).build().new_agent();
-        agent.get(url).call()?.body_mut().read_to_string()
-    }
-}
 
 #[test]
 fn robots_and_stores_speak_tls() {

@@ -5,4 +5,5 @@ mod folder;
 mod nats;
 mod network;
 mod s3;
+mod secured;
 mod support;

@@ -1,17 +1,42 @@
-//! A fleet over S3: moto's server, with conditional puts.
+//! A fleet over S3: two servers that nobody here wrote, with conditional puts.
 
 use std::process::{Command, Stdio};
 
-use super::support::*;
+use hyper_util::rt::{TokioExecutor, TokioIo};
+use hyper_util::server::conn::auto::Builder;
+use s3s::auth::SimpleAuth;
+use s3s::service::S3ServiceBuilder;
 use slag_tests::*;
 
-/// A server of S3 with one bucket, stopped when dropped.
-struct S3 {
-    _server: Running,
-    endpoint: String,
+use super::support::*;
+
+const KEY: &str = "robot";
+const SECRET: &str = "secret";
+
+/// A server of S3 with a bucket named `scenes`.
+trait S3 {
+    /// Returns its address.
+    fn endpoint(&self) -> String;
+
+    /// Returns the number of objects whose key starts with `room/` and a prefix that ends with `/` or is a key.
+    fn n_objects(&self, prefix: &str) -> usize;
+
+    /// Gives a command the credentials.
+    fn known_to(&self, mut command: Command) -> Command {
+        command.env("AWS_ENDPOINT", self.endpoint()).env("AWS_ALLOW_HTTP", "true");
+        command.env("AWS_ACCESS_KEY_ID", KEY).env("AWS_SECRET_ACCESS_KEY", SECRET);
+        command.env("AWS_REGION", "us-east-1");
+        command
+    }
 }
 
-impl S3 {
+/// moto, stopped when dropped. It believes every signature.
+struct Moto {
+    _server: Running,
+    port: u16,
+}
+
+impl Moto {
     fn start() -> Self {
         let port = free_port();
         let program = python_with("tests/fleet").with_file_name("moto_server");
@@ -20,24 +45,76 @@ impl S3 {
         // It prints a line a request, which nobody reads.
         let server = Running::start_quiet(command.stdin(Stdio::null()));
         wait_until("moto", || std::net::TcpStream::connect(("127.0.0.1", port)).is_ok());
-        let endpoint = format!("http://127.0.0.1:{port}");
-        ureq::put(format!("{endpoint}/scenes")).send_empty().expect("a bucket");
-        Self { _server: server, endpoint }
+        let moto = Self { _server: server, port };
+        ureq::put(format!("{}/scenes", moto.endpoint())).send_empty().expect("a bucket");
+        moto
+    }
+}
+
+impl S3 for Moto {
+    fn endpoint(&self) -> String {
+        format!("http://127.0.0.1:{}", self.port)
     }
 
-    /// Gives a command the credentials.
-    fn known_to(&self, mut command: Command) -> Command {
-        command.env("AWS_ENDPOINT", &self.endpoint).env("AWS_ALLOW_HTTP", "true");
-        command.env("AWS_ACCESS_KEY_ID", "robot").env("AWS_SECRET_ACCESS_KEY", "secret");
-        command.env("AWS_REGION", "us-east-1");
-        command
+    fn n_objects(&self, prefix: &str) -> usize {
+        let url = format!("{}/scenes?list-type=2&prefix=room/{prefix}", self.endpoint());
+        let listed = ureq::get(url).call().expect("lists").body_mut().read_to_string().expect("text");
+        listed.matches("<Key>").count()
+    }
+}
+
+/// s3s-fs, in threads of this process. It checks signatures, and keeps an object as a file.
+struct S3s {
+    runtime: Option<tokio::runtime::Runtime>,
+    dir: tempfile::TempDir,
+    port: u16,
+}
+
+impl S3s {
+    fn start() -> Self {
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        fs_err::create_dir(dir.path().join("scenes")).expect("a bucket");
+        let mut service = S3ServiceBuilder::new(s3s_fs::FileSystem::new(dir.path()).expect("opens"));
+        service.set_auth(SimpleAuth::from_single(KEY, SECRET));
+        let service = service.build();
+        let runtime =
+            tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().expect("runs");
+        let listener = runtime.block_on(tokio::net::TcpListener::bind(("127.0.0.1", 0))).expect("binds");
+        let port = listener.local_addr().expect("an address").port();
+        runtime.spawn(async move {
+            while let Ok((socket, _)) = listener.accept().await {
+                let service = service.clone();
+                tokio::spawn(async move {
+                    let http = Builder::new(TokioExecutor::new());
+                    // A killed worker breaks its connection.
+                    let _ = http.serve_connection(TokioIo::new(socket), service).await;
+                });
+            }
+        });
+        Self { runtime: Some(runtime), dir, port }
+    }
+}
+
+impl Drop for S3s {
+    fn drop(&mut self) {
+        // Without waiting for open connections.
+        self.runtime.take().into_iter().for_each(tokio::runtime::Runtime::shutdown_background);
+    }
+}
+
+impl S3 for S3s {
+    fn endpoint(&self) -> String {
+        format!("http://127.0.0.1:{}", self.port)
+    }
+
+    fn n_objects(&self, prefix: &str) -> usize {
+        let path = self.dir.path().join("scenes/room").join(prefix);
+        if path.is_file() { 1 } else { n_objects(&path) }
     }
 }
 
 /// A coordinator is fenced by a second one, and a worker is killed; puts of the bucket decide, and ranges are read from it.
-#[test]
-fn s3_fences_a_coordinator_and_gives_the_same_bytes() {
-    let s3 = S3::start();
+fn fences_a_coordinator_and_gives_the_same_bytes(s3: &dyn S3) {
     let scene = Scene::new();
     let bucket = "s3://scenes/room";
     let coordinate = |store: &str| {
@@ -49,11 +126,7 @@ fn s3_fences_a_coordinator_and_gives_the_same_bytes() {
         worker.args(["--index", index, "--of", "2", "--help-after", "0.5", "--threads", "1"]);
         Running::start(&mut worker)
     };
-    let list = |prefix: &str| {
-        let url = format!("{}/scenes?list-type=2&prefix=room/{prefix}", s3.endpoint);
-        let listed = ureq::get(url).call().expect("lists").body_mut().read_to_string().expect("text");
-        listed.matches("<Key>").count()
-    };
+    let list = |prefix: &str| s3.n_objects(prefix);
     let first = coordinate("first");
     wait_until("a plan", || list("jobs/00000001/plan.json") == 1);
     let second = coordinate("second");
@@ -71,4 +144,14 @@ fn s3_fences_a_coordinator_and_gives_the_same_bytes() {
     assert_eq!(report["n_views"], N_VIEWS - n_of_killed, "{report}");
     assert_eq!(report["n_cells"], summary["n_cells"], "{report}");
     scene.assert_same("second");
+}
+
+#[test]
+fn moto_fences_a_coordinator_and_gives_the_same_bytes() {
+    fences_a_coordinator_and_gives_the_same_bytes(&Moto::start());
+}
+
+#[test]
+fn s3s_fences_a_coordinator_and_gives_the_same_bytes() {
+    fences_a_coordinator_and_gives_the_same_bytes(&S3s::start());
 }

@@ -78,11 +78,22 @@ fn each_role_has_its_key_and_no_more() {
         assert!(output.status.code() == Some(1) && errors.contains(expected), "{errors}");
     };
     refused(fleet.coordinator("other.nk"), "authorization violation");
-    refused(fleet.coordinator("worker.nk"), "check the address");
     let mut stranger = fleet.scene.encode("store");
-    stranger.args(["--blobs", text(&fleet.path("bucket")), "--nats-nkey", text(&fleet.path("coordinator.nk"))]);
+    stranger.args([
+        "--blobs",
+        text(&fleet.path("bucket")),
+        "--nats-nkey",
+        text(&fleet.path("coordinator.nk")),
+    ]);
     stranger.args(["--fleet", &format!("tls://127.0.0.1:{}", fleet.port)]);
     refused(stranger, "certificate");
+
+    // The server does not answer what the key may not ask; the coordinator says so and tries again until somebody stops it.
+    let mut weak = Running::start(&mut fleet.coordinator("worker.nk"));
+    std::thread::sleep(std::time::Duration::from_secs(7));
+    weak.signal("INT");
+    let warnings = String::from_utf8_lossy(&weak.output().stderr).into_owned();
+    assert!(warnings.contains("the queue is looked at again"), "{warnings}");
 
     let coordinator = Running::start(&mut fleet.coordinator("coordinator.nk"));
     let worker = Running::start(&mut fleet.worker("worker.nk"));

@@ -8,9 +8,11 @@ use std::sync::OnceLock;
 use serde_json::Value;
 pub use slag_test_support::{needs_shared, shared};
 
+mod authority;
 mod python;
 mod site;
 
+pub use authority::Authority;
 pub use python::{judge, python_with};
 pub use site::Site;
 

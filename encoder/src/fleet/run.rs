@@ -102,6 +102,19 @@ impl Run {
         })
     }
 
+    /// Returns whether another coordinator has taken the run's place: its own run follows at once.
+    ///
+    /// # Errors
+    /// [`FleetError::Blob`]; a document that is none.
+    pub(super) fn is_superseded(self, bucket: &Bucket) -> Result<bool, FleetError> {
+        let key = self.key("end.json");
+        if bucket.len_of(&key)?.is_none() {
+            return Ok(false);
+        }
+        let end: End = documents::parse(bucket, &key, &bucket.require(&key)?)?;
+        Ok(end == End::Superseded)
+    }
+
     /// Fails if another coordinator has taken the run's place.
     ///
     /// # Errors

@@ -59,7 +59,7 @@ pub struct WorkerSettings {
     pub segmenter: Option<PathBuf>,
     /// Time to wait for a run to begin, and for a sign of life of its coordinator.
     pub patience: Duration,
-    /// Whether it goes on to the next run when one is published.
+    /// Whether it goes on to the next run when one is published; to the run that takes a run's place it always does.
     pub stays: bool,
 }
 
@@ -92,14 +92,16 @@ pub fn work(
     let context = RunContext::new(settings.n_threads, progress, cancel)?;
     let mut report = WorkReport::default();
     let mut waiting_since = Instant::now();
+    let mut awaits_another = true;
     while !context.is_cancelled() {
         if let Some(run) = Run::open(bucket)? {
-            let number = run.0.0;
-            tracing::info!("run {number}: {} views", run.1.views.len());
+            let id = run.0;
+            tracing::info!("run {}: {} views", id.0, run.1.views.len());
             work_for(bucket, run, settings, engines, &context, &mut report)?;
             report.n_runs += 1;
             waiting_since = Instant::now();
-        } else if (report.n_runs > 0 && !settings.stays) || waiting_since.elapsed() >= settings.patience {
+            awaits_another = settings.stays || id.is_superseded(bucket)?;
+        } else if !awaits_another || waiting_since.elapsed() >= settings.patience {
             break;
         } else {
             std::thread::sleep(pause(bucket));
