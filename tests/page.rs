@@ -82,3 +82,21 @@ fn the_store_finds_what_the_robot_finds() {
         assert!((same - score).abs() < 0.02, "{id}: {same} {score}");
     }
 }
+
+/// The encoder of colours has no list of words: everyday words that find things are suggested, and no others.
+#[test]
+fn words_of_a_model_without_a_list_are_those_that_find_something() {
+    let site = Site::new();
+    let robot = site.robot(&[]);
+    for service in [&site.store, &robot] {
+        let found = service.get("/v1/view/words");
+        assert_eq!(found["complete"], true);
+        let words = found["words"].as_array().expect("words");
+        let red = words.iter().find(|word| word["word"] == "red").expect("red things are on board");
+        assert!(words.iter().all(|word| word["n_things"].as_u64() > Some(0)), "{found}");
+        assert!(words.iter().all(|word| word["word"] != "person"), "{found}");
+        let answers = service.get("/v1/query?text=red&limit=1000");
+        let answers = answers["results"][0]["answers"].as_array().expect("answers").len();
+        assert_eq!(red["n_things"], answers, "{found}");
+    }
+}

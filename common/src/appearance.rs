@@ -76,6 +76,15 @@ pub fn size_code(size: f32) -> u8 {
     (1.0 + step.round()).clamp(1.0, LARGEST) as u8
 }
 
+/// Returns the byte of a standard deviation that is `times` as large as that of another byte, `times` at least 1.
+pub fn larger_size_code(code: u8, times: f32) -> u8 {
+    if code == 0 {
+        return 0;
+    }
+    let steps = times.ln() / (LN_SIZE_MAX - LN_SIZE_MIN) * LAST_SIZE_STEP;
+    code.saturating_add(steps.round() as u8)
+}
+
 /// Returns the bytes of a rotation (unit quaternion): its axis in the octahedral map (Meyer et al. 2010), two bytes, and its
 /// angle from 0 to pi, one byte. The decoded rotation is off by at most 1.9 degrees.
 pub fn rotation_code([w, x, y, z]: [f32; 4]) -> [u8; 3] {

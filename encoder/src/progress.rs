@@ -1,5 +1,6 @@
 //! Progress of long work. The library itself never prints.
 
+use glam::DVec3;
 use image::RgbImage;
 use slag_common::View;
 use slag_common::frames::Aabb;
@@ -20,6 +21,25 @@ pub trait Progress: Sync {
     fn spend(&self, _stage: &'static str, _secs: f64) {}
     /// Tells what becomes of a view.
     fn view(&self, _name: &str, _event: ViewEvent<'_>) {}
+    /// Tells the things that were found.
+    fn objects(&self, _objects: &mut dyn Iterator<Item = FoundObject>) {}
+}
+
+/// A thing that an encode found.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FoundObject {
+    /// Its id, as answers name it.
+    pub id: String,
+    /// Where it is, world.
+    pub position_m: DVec3,
+    /// Its box.
+    pub bounds: Aabb,
+    /// Its Gaussians.
+    pub n_gaussians: u32,
+    /// Masks that show it.
+    pub n_masks: u32,
+    /// Name of the view that shows it best.
+    pub photo: String,
 }
 
 /// What becomes of a view.

@@ -12,7 +12,7 @@ use serde::Serialize;
 use slag_common::View;
 use slag_common::frames::Aabb;
 
-use crate::progress::{Progress, ViewEvent};
+use crate::progress::{FoundObject, Progress, ViewEvent};
 
 /// Pictures of the last masks that are kept for the page.
 const N_LAST: usize = 6;
@@ -127,6 +127,7 @@ struct State {
     drawn: Option<Instant>,
     asked: Option<Instant>,
     of_report: Vec<Picture>,
+    objects: Vec<FoundObject>,
 }
 
 /// Receives the progress of an encode, beside the terminal.
@@ -184,6 +185,13 @@ impl Watch {
         self.state().pictures.iter().find(|picture| picture.number == number).map(|p| Arc::clone(&p.jpeg))
     }
 
+    /// Returns the things that were found, the largest first; only for a report.
+    pub fn found_objects(&self) -> Vec<FoundObject> {
+        let mut objects = self.state().objects.clone();
+        objects.sort_by(|a, b| b.n_gaussians.cmp(&a.n_gaussians).then_with(|| a.id.cmp(&b.id)));
+        objects
+    }
+
     /// Returns the pictures for the report, in the order of their views' names.
     pub fn pictures_of_report(&self) -> Vec<Picture> {
         let mut pictures = self.state().of_report.clone();
@@ -234,6 +242,12 @@ impl Progress for Watch {
 
     fn spend(&self, stage: &'static str, secs: f64) {
         *self.state().busy_secs.entry(stage).or_default() += secs;
+    }
+
+    fn objects(&self, objects: &mut dyn Iterator<Item = FoundObject>) {
+        if self.for_report {
+            self.state().objects = objects.collect();
+        }
     }
 
     fn view(&self, name: &str, event: ViewEvent<'_>) {
@@ -309,6 +323,10 @@ impl Progress for Both<'_> {
 
     fn view(&self, name: &str, event: ViewEvent<'_>) {
         self.0.view(name, event);
+    }
+
+    fn objects(&self, objects: &mut dyn Iterator<Item = FoundObject>) {
+        self.0.objects(objects);
     }
 }
 

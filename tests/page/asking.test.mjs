@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
 import { axe, closeBrowser, openBrowser, pixels } from "./browser.mjs";
-import { answered, CAMERA, drawn, opened, PANEL_PX, project } from "./scene.mjs";
+import { answered, CAMERA, cameraOf, drawn, opened, PANEL_PX, project } from "./scene.mjs";
 import { GOALS } from "./service.mjs";
 
 before(openBrowser);
@@ -11,13 +11,6 @@ after(closeBrowser);
 
 const ROBOT_RADIUS_M = 0.3;
 const isViolet = (r, g, b) => Math.abs(r - 0xc7) < 14 && Math.abs(g - 0x7d) < 14 && Math.abs(b - 0xff) < 14;
-
-/** Where the camera is, as the address says. */
-async function cameraOf(page) {
-  await page.click("#copy-link");
-  const numbers = new URLSearchParams(new URL(page.url()).hash.slice(1)).get("camera").split(",").map(Number);
-  return [numbers.slice(0, 3), numbers.slice(3)];
-}
 
 test("a thing's places to stand are drawn on the ground with their directions, and a click looks from there", () => opened(async (page, service) => {
   await drawn(page);
@@ -93,3 +86,44 @@ test("a click chooses a suggestion, and a second question has its own", () => op
   assert.ok(await page.locator("#question-suggestions").isHidden());
   assert.ok(service.behaviour.requests.includes("/v1/view/scores?text=ball"));
 }));
+
+// A model that takes any text counts everyday words, some at a time.
+test("things on board are suggested of a model without a list of words, as they are counted", () => opened(async (page, service) => {
+  await drawn(page);
+  await page.locator("#question").focus();
+  const options = page.locator("#question-suggestions [role=option]");
+  await options.getByText("chair").waitFor();
+  assert.deepEqual(await options.allInnerTexts(), ["chair\n1 on board"]);
+  Object.assign(service.behaviour, { words: [{ word: "chair", n_things: 1 }, { word: "street lamp", n_things: 2 }], hasAllWords: true });
+  await options.getByText("street lamp").waitFor({ timeout: 15000 });
+  await page.locator("#question").pressSequentially("lamp");
+  assert.deepEqual(await options.allInnerTexts(), ["street lamp\n2 on board"]);
+  const asked = () => service.behaviour.requests.filter((path) => path === "/v1/view/words").length;
+  const n = asked();
+  // It has looked again, and asks no more.
+  const looked = service.behaviour.requests.length;
+  await page.waitForFunction(() => performance.getEntriesByType("resource").filter(({ name }) => name.endsWith("/v1/view")).length > 3, null, { timeout: 30000 });
+  assert.ok(service.behaviour.requests.length > looked);
+  assert.equal(asked(), n);
+}, { behaviour: { words: [{ word: "chair", n_things: 1 }], hasAllWords: false } }));
+
+test("a link shows the same questions, threshold and camera to others", () => opened(async (page) => {
+  await drawn(page);
+  await page.fill("#question", "chair");
+  await answered(page, "chair");
+  await page.fill("#second", "ball");
+  await answered(page, "chair | ball");
+  await page.locator("#threshold").fill("200");
+  const shown = async (of) => [await of.inputValue("#question"), await of.inputValue("#second"), await of.inputValue("#threshold"), ...(await cameraOf(of))];
+  const first = await shown(page);
+  const other = await page.context().newPage();
+  await other.goto(page.url());
+  await drawn(other);
+  await answered(other, "chair | ball");
+  assert.deepEqual(await shown(other), first);
+  assert.deepEqual(first.slice(0, 3), ["chair", "ball", "200"]);
+  // Both are lit, each in its own colours.
+  for (const [colour, n] of [["(r, g, b) => r > 90 && r - Math.min(g, b) > 45", 2000], ["(r, g, b) => b > 90 && b - r > 45", 2000]]) {
+    assert.ok((await pixels(other, PANEL_PX, colour)).length > n, colour);
+  }
+}, { fragment: `camera=${CAMERA}` }));

@@ -23,8 +23,8 @@ export async function openBrowser() {
 
 export const closeBrowser = () => browser?.close();
 
-/** Opens the page of a service; fails at errors in the console and requests to others, but for those expected. */
-export async function opened(url, run, { fragment = "", options = {}, expected = null } = {}) {
+/** Opens the page of a service, or "about:blank" of one with this origin; fails at errors in the console and requests to others, but for those expected. */
+export async function opened(url, run, { fragment = "", options = {}, expected = null, origin = url } = {}) {
   const context = await browser.newContext({ viewport: SIZE, colorScheme: "dark", reducedMotion: "reduce", bypassCSP: false, ...options });
   const page = await context.newPage();
   const wrong = [];
@@ -32,16 +32,31 @@ export async function opened(url, run, { fragment = "", options = {}, expected =
   page.on("pageerror", (error) => wrong.push(String(error)));
   page.on("request", (request) => {
     const asked = request.url();
-    if (!asked.startsWith(url) && !asked.startsWith("blob:") && !asked.startsWith("data:")) wrong.push(`foreign request: ${asked}`);
+    if (!asked.startsWith(origin) && !asked.startsWith("blob:") && !asked.startsWith("data:")) wrong.push(`foreign request: ${asked}`);
   });
   const name = (asked) => new URL(asked).pathname.replace(/^\/view\/?/, "") || "index.html";
   if (DIST) await context.route(({ pathname }) => /^\/view(\/|$)/.test(pathname), (route) => route.fulfill({ path: new URL(name(route.request().url()), DIST).pathname }));
   try {
-    await page.goto(`${url}/view#${fragment}`);
+    await page.goto(url === "about:blank" ? url : `${url}/view#${fragment}`);
     await run(page);
     assert.deepEqual(wrong.filter((text) => !expected?.test(text)), []);
   } finally {
     await context.close();
+  }
+}
+
+/** Opens a file on its own; fails at errors in the console and at any request but for the file. */
+export async function openedFile(path, run) {
+  const page = await browser.newPage({ viewport: SIZE });
+  const wrong = [];
+  page.on("console", (message) => message.type() === "error" && wrong.push(message.text()));
+  page.on("request", (request) => !/^(file|data):/.test(request.url()) && wrong.push(request.url()));
+  try {
+    await page.goto(`file://${path}`);
+    await run(page);
+    assert.deepEqual(wrong, []);
+  } finally {
+    await page.close();
   }
 }
 

@@ -36,17 +36,24 @@ export async function serve(name, args) {
   return { url, stop, child, said: () => said };
 }
 
-/** Generates and encodes a room; `close` removes it. */
-export function makeRoom() {
+/** Generates a room; `close` removes it. */
+export function generateRoom(nViews) {
   const folder = mkdtempSync(join(tmpdir(), "slag-page-"));
-  const [room, store, cache] = ["room", "store", "cache"].map((name) => join(folder, name));
-  run("slag-lab", ["generate", "scene", "--out", room, "--n-views", "24"]);
+  const room = join(folder, "room");
+  run("slag-lab", ["generate", "scene", "--out", room, "--n-views", String(nViews)]);
+  return { folder, room, close: () => rmSync(folder, { recursive: true, force: true }) };
+}
+
+/** Generates and encodes a room. */
+export function makeRoom() {
+  const { folder, room, close } = generateRoom(24);
+  const [store, cache] = ["store", "cache"].map((name) => join(folder, name));
   // Kept views make the next generation quick.
   const encode = (...flags) => run("slag-encoder", ["encode", "--scene", join(room, "scene.ply"), "--views", join(room, "transforms.json"),
     "--metric", "--store", store, "--appearance", "--photo-poses", "--occupancy", "--keep-views", "--quiet", ...flags]);
   encode();
   const fetch = (url) => run("slag-edge", ["fetch", "--trust-first", "--from", url, "--at", "0,0,0", "--radius", "100", "--cache", cache, "--quiet"]);
-  return { room, store, cache, encode, fetch, close: () => rmSync(folder, { recursive: true, force: true }) };
+  return { room, store, cache, encode, fetch, close };
 }
 
 /** Reads a grey PNG of 16 bits that is not interlaced (PNG, third edition, section 9 has the filters). */

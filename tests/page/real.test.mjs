@@ -5,7 +5,7 @@ import { readFileSync } from "node:fs";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
 import { closeBrowser, litPixels, openBrowser, opened, picture } from "./browser.mjs";
-import { makeRoom, readGrey16, serve } from "./programs.mjs";
+import { makeRoom, readGrey16, run, serve } from "./programs.mjs";
 
 const [WIDTH, HEIGHT] = [1100, 640];
 const PANEL_PX = 360;
@@ -102,6 +102,19 @@ test("slag-edge: places to stand are those of the robot's own route", () => open
   assert.ok(reply.goals.length > 0 || reply.none);
 }, { fragment: `q=${THING}` }));
 
+test("slag-edge: suggested words have as many things as they are answered with", () => opened(robot.url, async (page) => {
+  await drawn(page);
+  await page.locator("#question").focus();
+  const options = page.locator("#question-suggestions [role=option]");
+  await options.first().waitFor();
+  const suggested = await options.allInnerTexts();
+  assert.ok(suggested.length > 2, String(suggested));
+  for (const [word, note] of suggested.map((text) => text.split("\n"))) {
+    const [{ answers }] = (await (await fetch(`${robot.url}/v1/query?limit=1000&text=${encodeURIComponent(word)}`)).json()).results;
+    assert.equal(note, `${answers.length} on board`, word);
+  }
+}));
+
 test("slag-edge: cameras are where the poses say, without pictures", () => opened(robot.url, async (page) => {
   await drawn(page);
   const { frames } = JSON.parse(readFileSync(join(room.room, "transforms.json"), "utf8"));
@@ -149,12 +162,32 @@ test("slag-encoder view: a splat alone is drawn and not asked", async () => {
   }
 });
 
+/** Flags that leave out every other photo. */
+function dropped() {
+  const { frames } = JSON.parse(readFileSync(join(room.room, "transforms.json"), "utf8"));
+  return frames.filter((_, i) => i % 2 === 1).flatMap(({ file_path }) => ["--drop", file_path.replace(/^(.*\/)?images\//, "")]);
+}
+
 test("another generation is told while the page is open, and a robot that goes and comes back", () => opened(robot.url, async (page) => {
   await drawn(page);
-  room.encode();
+  // Without some photos, some things are other ones.
+  room.encode(...dropped());
   room.fetch(store.url);
   await page.getByText("generation 2 now").waitFor({ timeout: 30000 });
   await answered(page, THING);
+  // The store's page counts what its program's own command does, the robot's what its own route does.
+  const { appeared, went, moved, n_same, n_stayed } = JSON.parse(run("slag-encoder", ["diff", room.store, "--json"]));
+  assert.ok(appeared.length + went.length + moved.length > 0);
+  await opened(store.url, async (of) => {
+    await drawn(of);
+    await of.check("#show-changes");
+    await of.locator("#changes").getByText(`${appeared.length} appeared, ${went.length} went, ${moved.length} moved, ${n_same + n_stayed} stayed`).waitFor();
+    assert.equal(await of.locator("#changes button").count(), appeared.length + went.length + moved.length);
+  });
+  const ofRobot = await (await fetch(`${robot.url}/v1/changes`)).json();
+  await page.check("#show-changes");
+  const kinds = ["appeared", "went", "moved"];
+  await page.locator("#changes").getByText(kinds.map((kind) => `${ofRobot[kind].length} ${kind}`).join(", ")).waitFor();
   const at = robot.url;
   await robot.stop();
   await page.getByText("cannot be reached").waitFor({ timeout: 30000 });

@@ -25,6 +25,13 @@ export const litPixels = (page, name) => litBeside(page, PANEL_PX, name);
 export const drawn = (page) => page.waitForFunction(() => document.documentElement.dataset.gaussians === "7360", null, { timeout: 30000 });
 export const answered = (page, question) => page.waitForFunction((q) => document.documentElement.dataset.answered === q, question, { timeout: 30000 });
 
+/** Where the camera is and what it looks at, as the address says. */
+export async function cameraOf(page) {
+  await page.click("#copy-link");
+  const numbers = new URLSearchParams(new URL(page.url()).hash.slice(1)).get("camera").split(",").map(Number);
+  return [numbers.slice(0, 3), numbers.slice(3)];
+}
+
 export const minus = (a, b) => a.map((v, i) => v - b[i]);
 export const dot = (a, b) => a.reduce((sum, v, i) => sum + v * b[i], 0);
 const cross = ([a, b, c], [d, e, f]) => [b * f - c * e, c * d - a * f, a * e - b * d];

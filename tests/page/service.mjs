@@ -25,6 +25,7 @@ const WORDS = [["chair", 1], ["ball", 1], ["wall", 0], ["armchair", 0], ["red wa
 /** What the robot's routes take of what the page may send; they refuse the rest. */
 const PARAMETERS = {
   "/v1/view": [],
+  "/v1/view/cells": ["generation", "step"],
   "/v1/view/scores": ["text", "negative"],
   "/v1/query": ["text", "negative", "limit"],
   "/v1/goal": ["id", "radius_m"],
@@ -39,8 +40,9 @@ function half(value) {
   return exponent < -14 ? sign : sign | ((exponent + 15) << 10) | Math.floor((Math.abs(value) / 2 ** exponent - 1) * 1024);
 }
 
-function cellMessage(thing) {
-  const n = thing.n.reduce((a, b) => a * b);
+/** Every `step`-th of a thing's Gaussians; a few larger ones stand for all. */
+function cellMessage(thing, step) {
+  const n = Math.ceil(thing.n.reduce((a, b) => a * b) / step);
   const origin = thing.min.map((low, i) => (low + thing.max[i]) / 2);
   const bytes = Buffer.alloc(32 + 16 * n);
   bytes.write("SLGG");
@@ -48,9 +50,11 @@ function cellMessage(thing) {
   bytes.writeUInt32LE(n, 8);
   origin.forEach((v, i) => bytes.writeFloatLE(v, 12 + 4 * i));
   bytes.writeUInt32LE(1, 24);
-  const sigma = thing.min.map((low, i) => ((thing.max[i] - low) / thing.n[i]) * 0.5);
+  bytes.writeUInt32LE(step, 28);
+  const sigma = thing.min.map((low, i) => ((thing.max[i] - low) / thing.n[i]) * 0.5 * Math.sqrt(step));
   for (let i = 0; i < n; i++) {
-    const at = [i % thing.n[0], Math.floor(i / thing.n[0]) % thing.n[1], Math.floor(i / thing.n[0] / thing.n[1])];
+    const of = i * step;
+    const at = [of % thing.n[0], Math.floor(of / thing.n[0]) % thing.n[1], Math.floor(of / thing.n[0] / thing.n[1])];
     for (let k = 0; k < 3; k++) {
       const centre = thing.min[k] + ((at[k] + 0.5) / thing.n[k]) * (thing.max[k] - thing.min[k]) - origin[k];
       bytes.writeUInt16LE(half(centre), 32 + 6 * i + 2 * k);
@@ -63,25 +67,25 @@ function cellMessage(thing) {
   return bytes;
 }
 
-function scoresMessage(text, generation) {
-  const counts = THINGS.map((thing) => thing.n.reduce((a, b) => a * b));
-  const head = Buffer.alloc(24 + 8 * THINGS.length);
+function scoresMessage(things, text, generation) {
+  const counts = things.map((thing) => thing.n.reduce((a, b) => a * b));
+  const head = Buffer.alloc(24 + 8 * things.length);
   head.write("SLGS");
   head.writeUInt32LE(1, 4);
   head.writeFloatLE(0, 8);
   head.writeFloatLE(1, 12);
-  head.writeUInt32LE(THINGS.length, 16);
+  head.writeUInt32LE(things.length, 16);
   head.writeUInt32LE(generation, 20);
   counts.forEach((n, i) => {
     head.writeUInt32LE(i, 24 + 8 * i);
     head.writeUInt32LE(n, 28 + 8 * i);
   });
-  return Buffer.concat([head, ...THINGS.map((thing, i) => Buffer.alloc(counts[i], thing.name === text ? 220 : 30))]);
+  return Buffer.concat([head, ...things.map((thing, i) => Buffer.alloc(counts[i], thing.name === text ? 220 : 30))]);
 }
 
 /** Starts it on a free port; `behaviour` may be changed while it runs. */
 export async function startService(behaviour = {}) {
-  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], requests: [], goal: "no-occupancy", program: "slag-edge", changes: null, work: null, photos: [], ...behaviour });
+  Object.assign(behaviour, { token: null, generation: 1, isGone: false, hasScene: true, missing: [], stale: [], requests: [], goal: "no-occupancy", things: THINGS, words: WORDS, hasAllWords: true, program: "slag-edge", changes: null, geographic: false, position: [-3, 3, 0], work: null, photos: [], ...behaviour });
   const json = (response, status, body) => response.writeHead(status, { "content-type": "application/json" }).end(JSON.stringify(body));
   const server = createServer((request, response) => {
     const url = new URL(request.url, "http://localhost");
@@ -95,15 +99,17 @@ export async function startService(behaviour = {}) {
       return createReadStream(path).pipe(response);
     }
     if (behaviour.token && request.headers.authorization !== `Bearer ${behaviour.token}`) return json(response, 401, { detail: "token" });
-    // A robot that tells nothing new.
-    if (url.pathname === "/v1/events") return response.writeHead(200, { "content-type": "text/event-stream" }).flushHeaders();
-    const known = PARAMETERS[url.pathname];
+    if (url.pathname === "/v1/events") {
+      behaviour.tell = (name, data) => response.write(`event: ${name}\ndata: ${JSON.stringify(data)}\n\n`);
+      return response.writeHead(200, { "content-type": "text/event-stream" }).flushHeaders();
+    }
+    const known = PARAMETERS[url.pathname.replace(/\/\d+$/, "")];
     const foreign = [...url.searchParams.keys()].find((name) => known && !known.includes(name));
     if (foreign) return json(response, 400, { detail: `unknown parameter ${foreign}` });
     const cell = url.pathname.match(/^\/v1\/view\/cells\/(\d+)$/);
-    if (cell) return response.writeHead(200).end(cellMessage(THINGS[Number(cell[1])]));
-    if (url.pathname === "/v1/view/scores") return response.writeHead(200).end(scoresMessage(url.searchParams.get("text"), behaviour.generation));
-    if (url.pathname === "/v1/view/words") return json(response, 200, { generation: behaviour.generation, words: WORDS });
+    if (cell) return response.writeHead(200).end(cellMessage(behaviour.things[Number(cell[1])], Number(url.searchParams.get("step") ?? 1)));
+    if (url.pathname === "/v1/view/scores") return response.writeHead(200).end(scoresMessage(behaviour.things, url.searchParams.get("text"), behaviour.generation));
+    if (url.pathname === "/v1/view/words") return json(response, 200, { generation: behaviour.generation, words: behaviour.words, complete: behaviour.hasAllWords });
     if (url.pathname === "/v1/changes") return behaviour.changes ? json(response, 200, behaviour.changes) : json(response, 409, { detail: "the store has one generation alone" });
     if (url.pathname === "/v1/work") return json(response, 200, behaviour.work);
     if (url.pathname === "/v1/goal") {
@@ -128,10 +134,10 @@ export async function startService(behaviour = {}) {
     }
     if (url.pathname !== "/v1/view" || !behaviour.hasScene) return json(response, 404, { detail: "nothing here" });
     json(response, 200, {
-      program: behaviour.program, scene: "test room", generation: behaviour.generation, up: [0, 0, 1], metric: true, geographic: false, can_ask: true, views: behaviour.photos,
-      n_gaussians: THINGS.reduce((sum, { n }) => sum + n[0] * n[1] * n[2], 0), position_m: [-3, 3, 0], fetched: { centre_m: [-3, 3, 0], radius_m: 0.8 },
-      cells: THINGS.map(({ min, max, n }, i) => ({
-        cell: i, n_gaussians: n[0] * n[1] * n[2], state: behaviour.missing.includes(i) ? "missing" : "on_board", generation: behaviour.generation, box_m: { min, max },
+      program: behaviour.program, scene: "test room", generation: behaviour.generation, up: [0, 0, 1], metric: true, geographic: behaviour.geographic, can_ask: true, views: behaviour.photos,
+      n_gaussians: behaviour.things.reduce((sum, { n }) => sum + n[0] * n[1] * n[2], 0), position_m: behaviour.position, fetched: { centre_m: [-3, 3, 0], radius_m: 0.8 },
+      cells: behaviour.things.map(({ min, max, n }, i) => ({
+        cell: i, n_gaussians: n[0] * n[1] * n[2], state: behaviour.missing.includes(i) ? "missing" : behaviour.stale.includes(i) ? "stale" : "on_board", generation: behaviour.generation - (behaviour.stale.includes(i) ? 1 : 0), box_m: { min, max },
       })),
     });
   });

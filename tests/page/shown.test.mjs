@@ -3,7 +3,8 @@
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
 import { closeBrowser, openBrowser, pixels } from "./browser.mjs";
-import { CAMERA, drawn, opened, PANEL_PX, project } from "./scene.mjs";
+import { answered, CAMERA, cameraOf, drawn, opened, PANEL_PX, project } from "./scene.mjs";
+import { THINGS } from "./service.mjs";
 
 before(openBrowser);
 after(closeBrowser);
@@ -103,3 +104,70 @@ test("an encode is watched before there is a scene, and the scene is opened once
   },
   expected: /404/,
 }));
+
+test("missing and earlier cells are told and outlined, and the robot is where it says", () => opened(async (page, service) => {
+  await page.getByText("1 of 3 cells missing · 1 of an earlier generation").waitFor({ timeout: 30000 });
+  await page.uncheck("#show-grid");
+  await page.check("#show-cells");
+  // A corner of a box, or the foot of the robot's post, is drawn in its colour.
+  const isDrawnAt = async (colour, point) => {
+    const [u, v] = project(point);
+    const found = await pixels(page, PANEL_PX, isColour(colour));
+    return found.some(([x, y]) => Math.hypot(x + 0.5 - u, y + 0.5 - v) < 3);
+  };
+  const [, chair, ball] = service.behaviour.things;
+  assert.ok(await isDrawnAt(COLOURS.went, [ball.max[0], ball.max[1], ball.max[2]]));
+  assert.ok(await isDrawnAt([0xd9, 0x9a, 0x2b], chair.max));
+  const ROBOT = [0x4f, 0xd1, 0xa5];
+  assert.ok(await isDrawnAt(ROBOT, [1, 2, 1]));
+  service.behaviour.position = [2, 1, 0];
+  service.behaviour.tell("following", {});
+  await page.waitForFunction(() => performance.getEntriesByType("resource").filter(({ name }) => name.endsWith("/v1/view")).length > 1);
+  assert.ok(await isDrawnAt(ROBOT, [2, 1, 1]) && !(await isDrawnAt(ROBOT, [1, 2, 1])));
+}, { behaviour: { missing: [2], stale: [1], position: [1, 2, 0] }, fragment: `camera=${CAMERA}` }));
+
+test("a geo-referenced scene has east, north and up, latitude and longitude, and an arrow to the north", () => opened(async (page) => {
+  await drawn(page);
+  await answered(page, "chair");
+  const red = await pixels(page, PANEL_PX, isColour([0xe0, 0x5a, 0x4e]));
+  // The arrow leaves the middle of the ground along y; beyond the floor it is seen.
+  const [u, v] = project([0, 5.5, -0.1]);
+  assert.ok(red.some(([x, y]) => Math.hypot(x + 0.5 - u, y + 0.5 - v) < 3));
+  await page.locator("#answers button").click();
+  assert.match(await page.locator("#details").innerText(), /East, north, up\s+1\.20, 0\.80, 0\.50 m[^]*48\.1000000, 11\.5000000/);
+}, { behaviour: { geographic: true, goal: "unreachable" }, fragment: `q=chair&camera=${CAMERA}` }));
+
+test("fingers choose and turn", () => opened(async (page) => {
+  await drawn(page);
+  await answered(page, "chair");
+  const before = await cameraOf(page);
+  const touch = await page.context().newCDPSession(page);
+  const send = (type, points) => touch.send("Input.dispatchTouchEvent", { type, touchPoints: points.map(([x, y]) => ({ x, y })) });
+  await send("touchStart", [[700, 520]]);
+  for (let i = 1; i <= 5; i++) await send("touchMove", [[700 + 20 * i, 520]]);
+  await send("touchEnd", []);
+  const [from, to] = await cameraOf(page);
+  assert.ok(Math.hypot(...from.map((value, i) => value - before[0][i])) > 0.5 && to.every((value, i) => Math.abs(value - before[1][i]) < 0.01), `${from}, ${to}`);
+  const [u, v] = project([1.2, 0.8, 0.5], from, to);
+  await page.touchscreen.tap(u, v);
+  await page.locator("#details").getByText("1.20, 0.80, 0.50 m").waitFor();
+}, { behaviour: { goal: "unreachable" }, options: { hasTouch: true }, fragment: `q=chair&camera=${CAMERA}` }));
+
+/** A floor of so many Gaussians that the first picture has a part of them. */
+const LARGE = THINGS.map((thing) => (thing.name === "floor" ? { ...thing, n: [700, 700, 1] } : thing));
+
+test("of a large scene a part is drawn at first, then all, and fewer again where frames take long", () => opened(async (page, service) => {
+  const steps = () => service.behaviour.requests.filter((path) => path.startsWith("/v1/view/cells/")).map((path) => [Number(path.match(/cells\/(\d+)/)[1]), Number(path.match(/step=(\d+)/)[1])]);
+  await page.waitForFunction(() => document.documentElement.dataset.complete !== undefined, null, { timeout: 120000 });
+  const [first, second] = [steps().slice(0, 3), steps().slice(3)];
+  for (const asked of [first, second]) assert.deepEqual(asked.map(([cell]) => cell).sort(), [0, 1, 2]);
+  assert.deepEqual([first, second].map((asked) => [...new Set(asked.map(([, step]) => step))]), [[4], [1]]);
+  assert.match(await page.locator("#facts").innerText(), /^493,264 of 493,264 Gaussians/);
+  // A software GPU draws so many less than 25 times a second.
+  await page.locator("#canvas").focus();
+  await page.keyboard.down("ArrowLeft");
+  await page.locator("#facts").getByText("246,632 of 493,264").waitFor({ timeout: 120000 });
+  await page.keyboard.up("ArrowLeft");
+  // Not even the nearest cell, the floor, fits into the budget in full.
+  assert.deepEqual(steps().slice(6).sort(), [[0, 2], [1, 2], [2, 2]]);
+}, { behaviour: { things: LARGE }, fragment: `camera=${CAMERA}` }));

@@ -1,8 +1,9 @@
-//! `GET /v1/view/cells/{id}`: a cell's Gaussians, 16 bytes each.
+//! `GET /v1/view/cells/{id}`: a cell's Gaussians, 16 bytes each; all of them, or for a first picture and for far cells every
+//! few.
 
 use glam::{DVec3, Vec3};
 use half::f16;
-use slag_common::appearance::{Appearance, size_code};
+use slag_common::appearance::{Appearance, larger_size_code, size_code};
 
 /// First bytes of the message.
 const MAGIC: [u8; 4] = *b"SLGG";
@@ -17,11 +18,12 @@ const PLAIN: [u8; 4] = [160, 160, 160, 230];
 const UNTURNED: [u8; 3] = [255, 128, 0];
 
 /// Writes a cell's message: magic, version, N (u32), the origin in the world (three f32), flags (u32; 1: the appearance is
-/// known), 4 zero bytes; then a column each of centres less the origin (three f16), colours, opacities, sizes and rotations.
+/// known), `step` (u32); then a column each of centres less the origin (three f16), colours, opacities, sizes and rotations.
 ///
-/// `positions`: `[N]`, world. Without an appearance, Gaussians are as large as their distances to their neighbours in
-/// the order of the shard, which follows a curve through space.
-pub fn cell_message(positions: &[DVec3], appearance: Option<Appearance<'_>>) -> Vec<u8> {
+/// `positions`: `[N]`, world, those of every `step`-th Gaussian of the cell, the first one included; `appearance`: of all its
+/// Gaussians. Those that are sent stand for the others: each has the area of `step` of them. Without an appearance,
+/// Gaussians are as large as their distances to their neighbours in the order of the shard, which follows a curve through space.
+pub fn cell_message(positions: &[DVec3], appearance: Option<Appearance<'_>>, step: Step) -> Vec<u8> {
     let low = positions.iter().copied().reduce(DVec3::min).unwrap_or_default();
     let high = positions.iter().copied().reduce(DVec3::max).unwrap_or_default();
     // As the page reads it: what rounding takes from the origin goes to the centres.
@@ -33,17 +35,18 @@ pub fn cell_message(positions: &[DVec3], appearance: Option<Appearance<'_>>) -> 
     message.extend((n as u32).to_le_bytes());
     origin.to_array().iter().for_each(|axis| message.extend(axis.to_le_bytes()));
     message.extend(u32::from(appearance.is_some()).to_le_bytes());
-    message.extend([0; 4]);
+    message.extend((step.0 as u32).to_le_bytes());
     for position in positions {
         let offset = *position - origin.as_dvec3();
         offset.to_array().iter().for_each(|axis| message.extend(f16::from_f64(*axis).to_le_bytes()));
     }
     match appearance {
         Some(Appearance { colours, sizes, rotations }) => {
-            message.extend(colours.iter().flat_map(|[r, g, b, _]| [*r, *g, *b]));
-            message.extend(colours.iter().map(|[.., opacity]| *opacity));
-            message.extend_from_slice(sizes.as_flattened());
-            message.extend_from_slice(rotations.as_flattened());
+            let times = (step.0 as f32).sqrt();
+            message.extend(step.of(colours).flat_map(|[r, g, b, _]| [*r, *g, *b]));
+            message.extend(step.of(colours).map(|[.., opacity]| *opacity));
+            message.extend(step.of(sizes).flatten().map(|code| larger_size_code(*code, times)));
+            message.extend(step.of(rotations).flatten());
         }
         None => {
             let [r, g, b, opacity] = PLAIN;
@@ -54,6 +57,36 @@ pub fn cell_message(positions: &[DVec3], appearance: Option<Appearance<'_>>) -> 
         }
     }
     message
+}
+
+/// Which Gaussians of a cell are sent: every n-th.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Step(usize);
+
+impl Step {
+    /// All.
+    pub const ALL: Self = Self(1);
+    /// The largest step.
+    pub const MAX: usize = 1 << 16;
+
+    /// Reads a step from 1 to [`Self::MAX`]; the error says what is expected.
+    ///
+    /// # Errors
+    /// Another number, or none.
+    pub fn parse(text: &str) -> Result<Self, &'static str> {
+        let step = text.parse().ok().filter(|step| (1..=Self::MAX).contains(step));
+        step.map(Self).ok_or("a whole number from 1 to 65536")
+    }
+
+    /// Returns the items that are sent.
+    pub fn of<T>(self, all: &[T]) -> impl Iterator<Item = &T> {
+        all.iter().step_by(self.0)
+    }
+
+    /// Returns the indices that are sent of `n` Gaussians.
+    pub fn indices(self, n: usize) -> impl ExactSizeIterator<Item = usize> {
+        (0..n).step_by(self.0)
+    }
 }
 
 /// Returns half the distance of each position to the nearer of its neighbours in the order, within a quarter and twice
@@ -89,15 +122,33 @@ mod tests {
             sizes: &[[9, 10, 11], [12, 13, 14]],
             rotations: &[[15, 16, 17], [18, 19, 20]],
         };
-        let message = cell_message(&positions, Some(appearance));
-        assert_eq!((&message[..4], message[8], message[24]), (b"SLGG".as_slice(), 2, 1));
+        let message = cell_message(&positions, Some(appearance), Step::ALL);
+        assert_eq!((&message[..4], message[8], message[24], message[28]), (b"SLGG".as_slice(), 2, 1, 1));
         let origin = f32::from_le_bytes(message[12..16].try_into().expect("4 bytes"));
         for (at, position) in positions.iter().enumerate() {
             assert!((f64::from(origin) + f16_at(&message, 32 + 6 * at) - position.x).abs() < 1e-3);
         }
         let expected = [1, 2, 3, 5, 6, 7, 4, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20];
         assert_eq!(message[44..], expected);
-        assert_eq!(cell_message(&[], None).len(), CELL_HEAD_BYTES);
+        assert_eq!(cell_message(&[], None, Step::ALL).len(), CELL_HEAD_BYTES);
+    }
+
+    /// Of nine surfels two are sent, each 2.83 times as wide: 1 + 254 * (ln s + 12) / 21 grows by 12.6.
+    #[test]
+    fn few_gaussians_cover_what_all_did() {
+        let all: Vec<DVec3> = (0..9).map(|i| DVec3::new(f64::from(i), 0.0, 0.0)).collect();
+        let sizes: Vec<[u8; 3]> = (0..9).map(|i| [100 + i, 0, 250]).collect();
+        let colours: Vec<[u8; 4]> = (0..9).map(|i| [i, 0, 0, 10 + i]).collect();
+        let rotations: Vec<[u8; 3]> = (0..9).map(|i| [20 + i, 0, 0]).collect();
+        let appearance = Appearance { colours: &colours, sizes: &sizes, rotations: &rotations };
+        let step = Step::parse("8").expect("a step");
+        let positions: Vec<DVec3> = step.indices(9).map(|at| all[at]).collect();
+        let message = cell_message(&positions, Some(appearance), step);
+        assert_eq!((message[8], message[28], message.len()), (2, 8, CELL_HEAD_BYTES + 2 * GAUSSIAN_BYTES));
+        assert_eq!(message[44..], [0, 0, 0, 8, 0, 0, 10, 18, 113, 0, 255, 121, 0, 255, 20, 0, 0, 28, 0, 0]);
+        for wrong in ["0", "65537", "-1", "x", ""] {
+            assert!(Step::parse(wrong).is_err(), "{wrong}");
+        }
     }
 
     #[test]

@@ -1,5 +1,7 @@
 //! `GET /v1/view`: what there is to draw.
 
+use std::time::Duration;
+
 use glam::{DVec3, Vec3};
 use serde::Serialize;
 use slag_common::frames::Aabb;
@@ -120,22 +122,27 @@ impl Photo {
 pub struct Words {
     /// The generation whose things are counted.
     pub generation: u64,
-    /// The words that the text model knows, those of most things first; none if it takes any text.
+    /// Those of most things first: the words that the text model knows, or of one that takes any text everyday words that find
+    /// something.
     pub words: Vec<Word>,
+    /// Whether all are counted; if not, the next request goes on.
+    pub complete: bool,
 }
 
 impl Words {
     /// Most words that are counted: lists of phrases for people are shorter.
     pub const MAX: usize = 2048;
+    /// Time after which a request encodes no further everyday word: questions wait meanwhile.
+    pub const ENCODING: Duration = Duration::from_millis(500);
 
     /// Orders words by their things; equal ones stay in the model's order.
-    pub fn new(generation: u64, mut words: Vec<Word>) -> Self {
+    pub fn new(generation: u64, mut words: Vec<Word>, complete: bool) -> Self {
         words.sort_by_key(|word| std::cmp::Reverse(word.n_things));
-        Self { generation, words }
+        Self { generation, words, complete }
     }
 }
 
-/// A word that the text model knows.
+/// A word to ask for.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Word {
     /// The word, or phrase.

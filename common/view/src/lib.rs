@@ -21,7 +21,7 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use slag_service::problem::Problem;
 
-pub use cell::{CELL_HEAD_BYTES, GAUSSIAN_BYTES, cell_message};
+pub use cell::{CELL_HEAD_BYTES, GAUSSIAN_BYTES, Step, cell_message};
 pub use description::{Cell, CellState, Corners, Description, Fetched, Photo, Word, Words};
 pub use scores::ScoresMessage;
 

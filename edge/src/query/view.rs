@@ -1,10 +1,14 @@
 //! What the page needs to draw the Gaussians on board, and to colour them by a question.
 
+use std::sync::Arc;
+use std::time::Instant;
+
 use glam::{DVec3, Vec3};
 use slag_common::shard::ShardView;
+use slag_models::everyday_words;
 use slag_view::{
-    CELL_HEAD_BYTES, Cell, CellState, Description, Fetched, GAUSSIAN_BYTES, Photo, ScoresMessage, Word,
-    Words, cell_message,
+    CELL_HEAD_BYTES, Cell, CellState, Description, Fetched, GAUSSIAN_BYTES, Photo, ScoresMessage, Step,
+    Word, Words, cell_message,
 };
 
 use super::engine::{Engine, QueryError};
@@ -16,6 +20,7 @@ use crate::score::{
     Budget, Precision, Question, Region, ScoreError, Scratch, Search, relevancy, score_objects,
 };
 use crate::store::Snapshot;
+use crate::text::TextError;
 
 /// Below every cosine, and below every difference of two cosines.
 const BELOW_ALL: f32 = -4.0;
@@ -72,7 +77,7 @@ impl Engine {
         })
     }
 
-    /// Returns the message of a cell's Gaussians, or nothing if the cell is not on board or of another generation than
+    /// Returns the message of a cell's Gaussians, all or every few, or nothing if the cell is not on board or of another generation than
     /// `generation`, where that is given.
     ///
     /// # Errors
@@ -81,6 +86,7 @@ impl Engine {
         &self,
         cell_id: u32,
         generation: Option<u64>,
+        step: Step,
         budget: &Budget,
     ) -> Result<Option<Vec<u8>>, QueryError> {
         let snapshot = self.snapshot()?;
@@ -88,26 +94,36 @@ impl Engine {
         let found = snapshot.shards.iter().find(|shard| shard.cell.cell_id == cell_id);
         let Some(shard) = found.filter(|_| is_asked_for) else { return Ok(None) };
         let view = shard.view();
-        let n_gaussians = view.header.n_gaussians as usize;
-        budget.take(CELL_HEAD_BYTES + n_gaussians * (GAUSSIAN_BYTES + size_of::<DVec3>()));
+        let sent = step.indices(view.header.n_gaussians as usize);
+        budget.take(CELL_HEAD_BYTES + sent.len() * (GAUSSIAN_BYTES + size_of::<DVec3>()));
         budget.check().map_err(ScoreError::from)?;
-        let positions: Vec<DVec3> = (0..n_gaussians).map(|at| view.position_in_world(at)).collect();
-        Ok(Some(cell_message(&positions, shard.appearance())))
+        let positions: Vec<DVec3> = sent.map(|at| view.position_in_world(at)).collect();
+        Ok(Some(cell_message(&positions, shard.appearance(), step)))
     }
 
-    /// Returns the words that the text model knows, each with the number of objects on board that it finds.
+    /// Returns the words that the text model knows, each with the number of objects on board that it finds; of a model that
+    /// takes any text, everyday words that find something.
     ///
     /// # Errors
     /// [`QueryError`].
     pub fn view_words(&self, budget: &Budget) -> Result<Words, QueryError> {
         let snapshot = self.snapshot()?;
         self.check_encoder(&snapshot)?;
-        let known = self.vocabulary();
+        let vocabulary = self.vocabulary();
+        let takes_any = vocabulary.is_empty();
+        let (known, is_complete) = match takes_any {
+            true => self.everyday_vectors()?,
+            false => {
+                let vector = |word: &String| Ok((word.clone(), self.encode_text(word)?));
+                let known = vocabulary.iter().take(Words::MAX).map(vector);
+                (known.collect::<Result<Vec<_>, QueryError>>()?, true)
+            }
+        };
         let mut words = Vec::new();
-        for known in known[..known.len().min(Words::MAX)].chunks(WORDS_TOGETHER) {
+        for known in known.chunks(WORDS_TOGETHER) {
             let question =
-                |word: &String| Ok(Question { vector: self.encode_text(word)?, negatives: Vec::new() });
-            let questions = known.iter().map(question).collect::<Result<Vec<_>, QueryError>>()?;
+                |(_, vector): &(String, Arc<[f32]>)| Question { vector: Arc::clone(vector), negatives: Vec::new() };
+            let questions: Vec<Question> = known.iter().map(question).collect();
             budget.check().map_err(ScoreError::from)?;
             let scored = self.on_scene(&snapshot, budget, |_, scene| {
                 let encoder = &scene.manifest.encoder;
@@ -117,10 +133,29 @@ impl Engine {
                 let count = |scores: &[f32]| scores.iter().filter(|score| **score >= threshold).count();
                 Ok::<_, ScoreError>(scored.iter().map(|of_word| count(&of_word.scores)).collect::<Vec<_>>())
             })?;
-            let word = |(word, n_things): (&String, usize)| Word { word: word.clone(), n_things };
-            words.extend(known.iter().zip(scored).map(word));
+            let counted = known.iter().zip(scored);
+            let counted = counted.map(|((word, _), n_things)| Word { word: word.clone(), n_things });
+            words.extend(counted.filter(|word| !takes_any || word.n_things > 0));
         }
-        Ok(Words::new(snapshot.manifest.generation, words))
+        Ok(Words::new(snapshot.manifest.generation, words, is_complete))
+    }
+
+    /// Returns the vectors of everyday words that the text model knows, and whether these are all: a model takes a while for
+    /// each, and encodes some more at the next request.
+    fn everyday_vectors(&self) -> Result<(Vec<(String, Arc<[f32]>)>, bool), QueryError> {
+        let started = Instant::now();
+        let mut known = Vec::new();
+        for word in everyday_words() {
+            if started.elapsed() > Words::ENCODING {
+                return Ok((known, false));
+            }
+            match self.encode_text(word) {
+                Ok(vector) => known.push((word.to_owned(), vector)),
+                Err(QueryError::Text(TextError::Encode(_))) => {}
+                Err(error) => return Err(error),
+            }
+        }
+        Ok((known, true))
     }
 
     /// Returns the message of every Gaussian's score: its centroid's cosine, or with negatives its relevancy.

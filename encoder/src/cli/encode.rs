@@ -400,6 +400,16 @@ mod tests {
         }
     }
 
+    /// Workers of a fleet do not know the poses of other views.
+    #[cfg(feature = "fleet")]
+    #[test]
+    fn a_fleet_is_not_asked_for_poses_of_photos() {
+        assert!(parse("--photo-poses").expect("parses").photo_poses);
+        assert!(parse("--blobs file:///b").is_ok());
+        let message = parse("--photo-poses --blobs file:///b").expect_err("refused").to_string();
+        assert!(message.contains("--photo-poses") && message.contains("--blobs"), "{message}");
+    }
+
     #[test]
     fn a_target_excludes_what_it_chooses() {
         for tuned in TUNED.iter().chain(&REFINEMENTS) {

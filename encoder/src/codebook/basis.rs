@@ -2,7 +2,7 @@
 
 use half::f16;
 
-use slag_models::TextEncoder;
+use slag_models::{TextEncoder, everyday_texts};
 
 use slag_math::axes::moments_of;
 use slag_math::cholesky::{SmallPivots, cholesky};
@@ -39,7 +39,7 @@ impl TextBank {
     pub fn of_model(encoder: &mut dyn TextEncoder) -> Self {
         let words: Vec<String> = match encoder.vocabulary() {
             Some(words) => words.to_vec(),
-            None => include_str!("texts.txt").lines().map(str::to_owned).collect(),
+            None => everyday_texts().map(str::to_owned).collect(),
         };
         let stride = words.len().div_ceil(MAX_TEXTS).max(1);
         let dim = encoder.dim();

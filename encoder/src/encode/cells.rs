@@ -21,7 +21,7 @@ use crate::lift::photos::{self, Photo};
 use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS};
 use crate::lift::refine::Refinement;
 use crate::lift::{Aggregation, ContributionError, ContributionIndex, RegionTable};
-use crate::objects::{self, ObjectsReport, SceneObjects};
+use crate::objects::{self, Object, ObjectsReport, SceneObjects};
 use crate::occupancy::{OccupancyReport, SceneOccupancy};
 use crate::shard;
 use crate::store::Extras;
@@ -254,6 +254,9 @@ impl<'a> CellBuilder<'a> {
         // Objects are found from all masks alike, before refinement gives some less weight.
         self.context.begin_phase(Phase::Objects);
         let objects = self.context.install(|| self.objects())?;
+        if let Some(found) = &objects {
+            self.context.progress().objects(&mut found.objects.iter().map(Object::found));
+        }
         self.context.begin_phase(Phase::Refine);
         let aggregation = settings.aggregation;
         let refinement = self.context.time("refine", || {

@@ -5,6 +5,8 @@ use serde::{Deserialize, Serialize};
 use slag_common::frames::Aabb;
 use slag_common::manifest::Calibration;
 
+use crate::progress::FoundObject;
+
 /// Marks a mask without a cluster, and a Gaussian without an object.
 pub const NONE: u32 = u32::MAX;
 
@@ -28,6 +30,20 @@ pub struct Object {
     pub photo: String,
     /// Box of its mask there, pixels of the undistorted photo: x0, y0, x1, y1, the last two exclusive.
     pub photo_box_px: [u32; 4],
+}
+
+impl Object {
+    /// Returns what is told of it while an encode is watched.
+    pub fn found(&self) -> FoundObject {
+        FoundObject {
+            id: format!("o{:016x}", self.id),
+            position_m: self.position_in_world,
+            bounds: self.box_in_world,
+            n_gaussians: self.n_gaussians,
+            n_masks: self.n_masks,
+            photo: self.photo.clone(),
+        }
+    }
 }
 
 /// The objects of a scene.

@@ -2,10 +2,12 @@
 
 mod map;
 
+use glam::DVec3;
 use serde_json::Value;
 
 use crate::encode::EncodeSummary;
 use crate::html::Page;
+use crate::progress::FoundObject;
 use crate::watch::Watch;
 
 /// Makes the page. `watch` watched the encode.
@@ -52,9 +54,16 @@ pub fn of_encode(scene: &str, summary: &EncodeSummary, watch: &Watch) -> serde_j
         }
     }
     page.heading("Objects");
-    match objects {
-        Value::Null => page.paragraph("Objects were not looked for."),
-        found => page.value(&found),
+    match summary.objects.as_ref().map(|found| found.n_objects) {
+        None => page.paragraph("Objects were not looked for."),
+        Some(0) => page.paragraph("No object was found: no mask is shared by several views."),
+        Some(_) => {
+            let columns = ["id", "x, y, z", "size", "Gaussians", "masks", "best photo"];
+            page.table(&columns, &watch.found_objects().iter().map(row_of).collect::<Vec<_>>());
+        }
+    }
+    if !objects.is_null() {
+        page.value(&objects);
     }
     if !occupancy.is_null() {
         page.heading("Free and occupied places");
@@ -79,6 +88,15 @@ pub fn of_encode(scene: &str, summary: &EncodeSummary, watch: &Watch) -> serde_j
     page.heading("All else");
     page.value(&rest);
     Ok(page.finish())
+}
+
+/// Returns the row of a thing.
+fn row_of(object: &FoundObject) -> Vec<String> {
+    let numbers = |of: DVec3| of.to_array().map(|axis| format!("{axis:.2}")).join(", ");
+    let FoundObject { id, position_m, bounds, n_gaussians, n_masks, photo } = object;
+    let size = bounds.max - bounds.min;
+    let [n_gaussians, n_masks] = [n_gaussians, n_masks].map(u32::to_string);
+    vec![id.clone(), numbers(*position_m), numbers(size), n_gaussians, n_masks, photo.clone()]
 }
 
 /// Returns a row a profile: name, bytes, mean and largest relative error.

@@ -3,7 +3,7 @@
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use slag_common::manifest::CellRecord;
-use slag_view::{Cell, CellState, Description, Photo, ScoresMessage, cell_message};
+use slag_view::{Cell, CellState, Description, Photo, ScoresMessage, Step, cell_message};
 
 use super::answers::Things;
 use super::error::ViewError;
@@ -89,6 +89,7 @@ impl Generation {
         &self,
         cell_id: u32,
         generation: Option<u64>,
+        step: Step,
         splat: Option<&Splat>,
     ) -> Result<Vec<u8>, ViewError> {
         let manifest = self.reader.manifest();
@@ -96,14 +97,14 @@ impl Generation {
         let is_asked_for = generation.is_none_or(|asked| asked == manifest.generation);
         let at = at.filter(|_| is_asked_for).ok_or(ViewError::NoCell { cell_id })?;
         match (&self.scored, splat) {
-            (Scored::Fields(_, fields), Some(splat)) => Ok(splat.message(&fields[at].input_indices)),
+            (Scored::Fields(_, fields), Some(splat)) => Ok(splat.message(&fields[at].input_indices, step)),
             _ => {
                 let shard = smallest_shard(&self.reader, &manifest.cells[at])?;
                 let Shard { bytes, layout } = shard.ok_or(ViewError::NoCell { cell_id })?;
                 let view = layout.view(&bytes);
                 let n_gaussians = view.header.n_gaussians as usize;
-                let positions: Vec<DVec3> = (0..n_gaussians).map(|at| view.position_in_world(at)).collect();
-                Ok(cell_message(&positions, layout.appearance(&bytes)))
+                let positions = step.indices(n_gaussians).map(|at| view.position_in_world(at));
+                Ok(cell_message(&positions.collect::<Vec<DVec3>>(), layout.appearance(&bytes), step))
             }
         }
     }

@@ -9,7 +9,7 @@ use axum::response::{IntoResponse, Response};
 use axum::{Json, Router};
 use serde_json::Value;
 use slag_service::problem::Problem;
-use slag_view::{Description, Words};
+use slag_view::{Description, Step, Words};
 
 use super::error::ViewError;
 use super::viewer::Viewer;
@@ -63,10 +63,13 @@ async fn words(State(viewer): AppState) -> Result<Json<Words>, Problem> {
 }
 
 async fn cell(State(viewer): AppState, Path(id): Path<String>, pairs: Pairs) -> Result<Response, Problem> {
-    let pairs = read(pairs, &["generation"])?;
+    let pairs = read(pairs, &["generation", "step"])?;
     let cell_id = number("id", &id)?;
-    let generation = pairs.first().map(|(name, value)| number(name, value)).transpose()?;
-    let bytes = blocking(viewer, move |viewer| viewer.cell(cell_id, generation)).await?;
+    let of = |wanted: &str| pairs.iter().find(|(name, _)| name == wanted);
+    let generation = of("generation").map(|(name, value)| number(name, value)).transpose()?;
+    let step = of("step").map_or(Ok(Step::ALL), |(_, value)| Step::parse(value));
+    let step = step.map_err(|expected| bad(format!("step: expected {expected}")))?;
+    let bytes = blocking(viewer, move |viewer| viewer.cell(cell_id, generation, step)).await?;
     Ok((BINARY, bytes).into_response())
 }
 

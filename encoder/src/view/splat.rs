@@ -3,7 +3,7 @@
 use glam::{DVec3, Vec3};
 use slag_common::Gaussians;
 use slag_common::appearance::AppearanceColumns;
-use slag_view::{Cell, CellState, Description, cell_message};
+use slag_view::{Cell, CellState, Description, Step, cell_message};
 
 use super::error::ViewError;
 use crate::cells::{self, CellLimits, CellSplit};
@@ -63,18 +63,18 @@ impl Splat {
     }
 
     /// Returns the message of one of the splat's own cells.
-    pub(super) fn cell(&self, cell_id: u32) -> Result<Vec<u8>, ViewError> {
+    pub(super) fn cell(&self, cell_id: u32, step: Step) -> Result<Vec<u8>, ViewError> {
         let cell = self.split.cells.get(cell_id as usize).ok_or(ViewError::NoCell { cell_id })?;
-        Ok(self.message(&cell.gaussians))
+        Ok(self.message(&cell.gaussians, step))
     }
 
-    /// Returns the message of some Gaussians.
+    /// Returns the message of a cell with these Gaussians.
     ///
     /// # Panics
     /// If an index is not one of the splat.
-    pub(super) fn message(&self, indices: &[u32]) -> Vec<u8> {
+    pub(super) fn message(&self, indices: &[u32], step: Step) -> Vec<u8> {
         let positions: Vec<DVec3> =
-            indices.iter().map(|index| self.scene.means_in_world[*index as usize]).collect();
-        cell_message(&positions, Some(AppearanceColumns::of(&self.scene, indices).view()))
+            step.of(indices).map(|index| self.scene.means_in_world[*index as usize]).collect();
+        cell_message(&positions, Some(AppearanceColumns::of(&self.scene, indices).view()), step)
     }
 }

@@ -2,11 +2,12 @@
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
 
 use glam::Vec3;
 use slag_common::{Hash32, View};
-use slag_models::TextEncoder;
-use slag_view::{Description, Word, Words};
+use slag_models::{TextEncoder, everyday_words};
+use slag_view::{Description, Step, Word, Words};
 
 use super::error::ViewError;
 use super::generation::Generation;
@@ -35,8 +36,31 @@ pub struct Shown {
     pub work: Option<Arc<Watch>>,
 }
 
-/// A text encoder and the id of its space.
-type OpenedText = (Hash32, Box<dyn TextEncoder>);
+/// A text encoder.
+struct OpenedText {
+    /// Id of its space.
+    id: Hash32,
+    encoder: Box<dyn TextEncoder>,
+    /// Vectors of everyday words, as far as they were needed; `None` of one that it does not know.
+    everyday: Vec<Option<Vec<f32>>>,
+}
+
+impl OpenedText {
+    /// Encodes some more everyday words. Returns those that it knows, and whether these are all.
+    fn everyday_words(&mut self) -> (Vec<(&'static str, &[f32])>, bool) {
+        let started = Instant::now();
+        let n_words = everyday_words().count();
+        for word in everyday_words().skip(self.everyday.len()) {
+            if started.elapsed() > Words::ENCODING {
+                break;
+            }
+            self.everyday.push(self.encoder.encode(word).ok());
+        }
+        let known = everyday_words().zip(&self.everyday);
+        let known = known.filter_map(|(word, vector)| Some((word, vector.as_deref()?))).collect();
+        (known, self.everyday.len() == n_words)
+    }
+}
 
 /// Answers the page.
 pub struct Viewer {
@@ -105,10 +129,15 @@ impl Viewer {
     }
 
     /// Returns the message of a cell's Gaussians.
-    pub(super) fn cell(&self, cell_id: u32, generation: Option<u64>) -> Result<Vec<u8>, ViewError> {
+    pub(super) fn cell(
+        &self,
+        cell_id: u32,
+        generation: Option<u64>,
+        step: Step,
+    ) -> Result<Vec<u8>, ViewError> {
         match (&self.shown.store, &self.shown.splat) {
-            (None, Some(splat)) => splat.cell(cell_id),
-            (_, splat) => self.generation()?.cell(cell_id, generation, splat.as_ref()),
+            (None, Some(splat)) => splat.cell(cell_id, step),
+            (_, splat) => self.generation()?.cell(cell_id, generation, step, splat.as_ref()),
         }
     }
 
@@ -124,42 +153,49 @@ impl Viewer {
         negatives: &[String],
         work: impl FnOnce(&Generation, &[Vec<f32>]) -> Result<T, ViewError>,
     ) -> Result<T, ViewError> {
-        self.with_text_encoder(|generation, encoder| {
+        self.with_text_encoder(|generation, OpenedText { encoder, .. }| {
             let texts = std::iter::once(text).chain(negatives.iter().map(String::as_str));
             let vectors = texts.map(|text| encoder.encode(text)).collect::<Result<Vec<_>, _>>()?;
             work(generation, &vectors)
         })
     }
 
-    /// Returns the words that the current generation's text model knows, each with the number of things that it finds.
+    /// Returns the words that the current generation's text model knows, each with the number of things that it finds; of a
+    /// model that takes any text, everyday words that find something.
     pub(super) fn words(&self) -> Result<Words, ViewError> {
-        self.with_text_encoder(|generation, encoder| {
-            let known = encoder.vocabulary().unwrap_or_default();
-            let known = known[..known.len().min(Words::MAX)].to_vec();
+        self.with_text_encoder(|generation, opened| {
             let manifest = generation.reader.manifest();
-            let mut count = |word: String| -> Result<Word, ViewError> {
-                let n_things = generation.things.count(manifest, &encoder.encode(&word)?);
-                Ok(Word { word, n_things })
+            let count = |word: &str, vector: &[f32]| {
+                let n_things = generation.things.count(manifest, vector);
+                Word { word: word.to_owned(), n_things }
             };
-            let words = known.into_iter().map(&mut count).collect::<Result<_, ViewError>>()?;
-            Ok(Words::new(manifest.generation, words))
+            let Some(known) = opened.encoder.vocabulary() else {
+                let (known, is_complete) = opened.everyday_words();
+                let words = known.into_iter().map(|(word, vector)| count(word, vector));
+                let words = words.filter(|word| word.n_things > 0).collect();
+                return Ok(Words::new(manifest.generation, words, is_complete));
+            };
+            let known = known[..known.len().min(Words::MAX)].to_vec();
+            let encoded = |word: &String| Ok(count(word, &opened.encoder.encode(word)?));
+            let words = known.iter().map(encoded).collect::<Result<_, ViewError>>()?;
+            Ok(Words::new(manifest.generation, words, true))
         })
     }
 
     /// Runs work with the current generation's text encoder.
     fn with_text_encoder<T>(
         &self,
-        work: impl FnOnce(&Generation, &mut dyn TextEncoder) -> Result<T, ViewError>,
+        work: impl FnOnce(&Generation, &mut OpenedText) -> Result<T, ViewError>,
     ) -> Result<T, ViewError> {
         let generation = self.generation()?;
         let encoder_id = generation.reader.manifest().encoder.id;
         let mut opened = locked(&self.text);
-        if opened.as_ref().is_none_or(|(id, _)| *id != encoder_id) {
-            let text = (self.shown.open_text)(&generation.reader).map_err(ViewError::Models)?;
-            *opened = Some((encoder_id, text));
+        if opened.as_ref().is_none_or(|opened| opened.id != encoder_id) {
+            let encoder = (self.shown.open_text)(&generation.reader).map_err(ViewError::Models)?;
+            *opened = Some(OpenedText { id: encoder_id, encoder, everyday: Vec::new() });
         }
-        let Some((_, encoder)) = opened.as_mut() else { return Err(ViewError::NoStore) };
-        work(&generation, &mut **encoder)
+        let Some(opened) = opened.as_mut() else { return Err(ViewError::NoStore) };
+        work(&generation, opened)
     }
 }
 

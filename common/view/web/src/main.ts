@@ -35,8 +35,9 @@ let asking = new AbortController();
 let typing = 0;
 let looking = 0;
 let photoOpened = 0;
-/** Of the generation that is drawn. */
+/** Of the generation that is drawn, and whether they are all. */
 let words: Word[] = [];
+let hasAllWords = false;
 const comboboxes: Combobox[] = [];
 
 const levelOf = (score: number, range: Scores) => Math.min(255, Math.max(1, Math.round(((score - range.min) / (range.max - range.min || 1)) * 255)));
@@ -113,6 +114,7 @@ function levelFrom(found: Scores, { threshold, answers }: Pick<Answers, "thresho
 }
 
 async function ask(): Promise<void> {
+  const start = performance.now();
   asking.abort();
   asking = new AbortController();
   const { signal } = asking;
@@ -130,6 +132,7 @@ async function ask(): Promise<void> {
     if (first && state.threshold !== null) colour(levelOf(state.threshold, first[0]));
     else colour(first ? levelFrom(...first) : 0);
     choose(null);
+    drawing.onceDrawn(() => performance.measure("answered", { start }));
     say(first ? (answers.length > 0 ? `${answers.length} found` : (first[1].none ?? "Nothing found")) : "");
     if (first) remember(state.question);
     document.documentElement.dataset.answered = [state.question, state.second].filter(Boolean).join(" | ");
@@ -147,7 +150,7 @@ function report(error: unknown): void {
 }
 
 function open(): void {
-  drawing = new Drawing(panel.canvas, panel.labels, description, leavePhoto);
+  drawing = new Drawing(panel.canvas, panel.labels, description, leavePhoto, (share) => streaming.isComplete && streaming.lower(share));
   places = new PlacesToStand(drawing);
   changes = new ChangesPanel(drawing, panel.changes);
   panel.form.hidden = !description.can_ask;
@@ -159,9 +162,12 @@ function open(): void {
   if (description.can_ask && (state.question || state.second)) void ask();
 }
 
-/** Learns which words the model knows; without them, only the history is suggested. */
+/** Learns which words find something; without them, only the history is suggested. */
 async function learnWords(): Promise<void> {
-  words = description.can_ask ? await fetchWords().catch(() => []) : [];
+  const learnt = description.can_ask ? await fetchWords().catch(() => null) : null;
+  words = learnt?.words ?? [];
+  // A model that takes any text counts some words at a time.
+  hasAllWords = learnt?.complete ?? true;
   for (const combobox of comboboxes) combobox.refresh();
 }
 
@@ -169,9 +175,10 @@ function stream(): void {
   void learnWords();
   streaming = new Streaming(description, drawing, () => {
     document.documentElement.dataset.firstPictureMs ??= performance.now().toFixed(0);
-    if (streaming.isComplete) document.documentElement.dataset.complete = "";
-    document.documentElement.dataset.gaussians = String(drawing.cells.nGaussians);
-    showFacts(description, drawing.cells.nGaussians, drawing.stepM);
+    if (streaming.isWhole) document.documentElement.dataset.wholePictureMs ??= performance.now().toFixed(0);
+    document.documentElement.toggleAttribute("data-complete", streaming.isComplete);
+    document.documentElement.dataset.gaussians = String(drawing.cells.nDrawn);
+    showFacts(description, drawing.cells.nDrawn, drawing.stepM);
   }, report);
   showFacts(description, 0, drawing.stepM);
   streaming.update();
@@ -199,6 +206,7 @@ async function look(): Promise<void> {
       say(isOtherGeneration ? `The service has generation ${seen.generation} now.` : "Other cells are on board now.");
     } else {
       streaming.update();
+      if (!hasAllWords) void learnWords();
       if (wasOffline) say("The service is back.");
     }
   } catch (error) {

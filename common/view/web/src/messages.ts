@@ -4,6 +4,8 @@ const WIDTH = 2048; // textures of splats are this wide, and arrays are padded t
 
 export interface CellGaussians {
   n: number;
+  /** They are every so many-th of the cell. */
+  step: number;
   originM: [number, number, number];
   hasAppearance: boolean;
   /** Four words a Gaussian, as the renderer packs them. */
@@ -48,7 +50,7 @@ export function readCell(buffer: ArrayBuffer): CellGaussians {
     packed[4 * i + 3] = scale[k] | (scale[k + 1] << 8) | (scale[k + 2] << 16) | (rotation[k + 2] << 24);
   }
   const originM: [number, number, number] = [view.getFloat32(12, true), view.getFloat32(16, true), view.getFloat32(20, true)];
-  return { n, originM, hasAppearance: (view.getUint32(24, true) & 1) === 1, packed };
+  return { n, step: view.getUint32(28, true), originM, hasAppearance: (view.getUint32(24, true) & 1) === 1, packed };
 }
 
 export function readScores(buffer: ArrayBuffer): Scores {

@@ -91,7 +91,7 @@ export interface Work {
   pictures: [number, string, number][];
 }
 
-/** A word that the text model knows, and how many things are found by it. */
+/** A word to ask for, and how many things are found by it. */
 export interface Word {
   word: string;
   n_things: number;
@@ -191,9 +191,9 @@ export async function fetchChanges(): Promise<Changes> {
   };
 }
 
-/** The words that the text model knows, those of most things first; none if it takes any text. */
-export async function fetchWords(): Promise<Word[]> {
-  return (await (await get("/v1/view/words")).json()).words;
+/** Words to ask for, those of most things first; `complete`: whether all are counted. */
+export async function fetchWords(): Promise<{ words: Word[]; complete: boolean }> {
+  return (await get("/v1/view/words")).json();
 }
 
 /** The picture of a photo, by its index in the description. */
@@ -218,8 +218,9 @@ export async function follow(onEvent: (name: string, data: unknown) => void): Pr
   }
 }
 
-export async function fetchCell(cell: number, generation: number): Promise<CellGaussians> {
-  return readCell(await (await get(`/v1/view/cells/${cell}?generation=${generation}`)).arrayBuffer());
+/** The Gaussians of a cell, every `step`-th. */
+export async function fetchCell(cell: number, generation: number, step: number): Promise<CellGaussians> {
+  return readCell(await (await get(`/v1/view/cells/${cell}?generation=${generation}&step=${step}`)).arrayBuffer());
 }
 
 function parametersOf(question: Question): URLSearchParams {

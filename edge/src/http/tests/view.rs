@@ -114,6 +114,20 @@ async fn appearances_on_board_are_handed_on() {
     assert!(gaussians[32 + 9 * 25..32 + 10 * 25].iter().all(|opacity| *opacity == 128));
     let sizes: Vec<u8> = gaussians[32 + 10 * 25..32 + 13 * 25].chunks(3).map(|of| of[0]).collect();
     assert!(sizes.is_sorted() && sizes[0] < sizes[24]);
+    // Every eighth, where and as they are among all, but for their sizes.
+    let (_, few) = bytes_of(&service, "/v1/view/cells/1?generation=1&step=8").await;
+    assert_eq!((u32_at(&few, 8), u32_at(&few, 28), few.len()), (4, 8, 32 + 16 * 4));
+    for (at, of) in [0, 8, 16, 24].into_iter().enumerate() {
+        for axis in 0..3 {
+            let place = |message: &[u8], at: usize| {
+                f32_at(message, 12 + 4 * axis) + f16_at(message, 32 + 6 * at + 2 * axis)
+            };
+            assert!((place(&few, at) - place(&gaussians, of)).abs() < 1e-3);
+        }
+        assert_eq!(few[32 + 6 * 4 + 3 * at..][..3], gaussians[32 + 6 * 25 + 3 * of..][..3]);
+        assert_eq!(few[32 + 13 * 4 + 3 * at..][..3], gaussians[32 + 13 * 25 + 3 * of..][..3]);
+        assert!(few[32 + 10 * 4 + 3 * at] > gaussians[32 + 10 * 25 + 3 * of]);
+    }
 }
 
 #[tokio::test]
@@ -134,6 +148,8 @@ async fn wrong_requests_are_refused() {
         ("/v1/view/scores?text=sofa", StatusCode::UNPROCESSABLE_ENTITY),
         ("/v1/view/cells/x", StatusCode::BAD_REQUEST),
         ("/v1/view/cells/1?generation=x", StatusCode::BAD_REQUEST),
+        ("/v1/view/cells/1?step=0", StatusCode::BAD_REQUEST),
+        ("/v1/view/cells/1?generation=1&step=65537", StatusCode::BAD_REQUEST),
         ("/v1/view/cells/1?generation=2", StatusCode::NOT_FOUND),
         ("/v1/view/cells/4294967295", StatusCode::NOT_FOUND),
     ] {
@@ -203,7 +219,7 @@ async fn words_are_counted_as_they_are_answered() {
     let expected = serde_json::json!([
         { "word": "0", "n_things": 2 }, { "word": "1", "n_things": 1 }, { "word": "2", "n_things": 0 }
     ]);
-    assert_eq!(words["words"], expected);
+    assert_eq!((&words["words"], &words["complete"]), (&expected, &true.into()));
     let listed = words["words"].as_array().expect("words");
     let counts: Vec<u64> = listed.iter().map(|word| word["n_things"].as_u64().expect("a count")).collect();
     assert!(counts.is_sorted_by(|a, b| a >= b), "{words}");

@@ -9,7 +9,7 @@ use axum::http::{StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use slag_service::problem::Problem;
 use slag_service::routes::Parameter;
-use slag_view::{Description, Words};
+use slag_view::{Description, Step, Words};
 
 use super::body;
 use super::params::{self, Pairs, number};
@@ -31,9 +31,12 @@ pub fn scores_parameters() -> [Parameter; 2] {
 }
 
 /// Returns the parameters of `/v1/view/cells/{id}`.
-pub fn cell_parameters() -> [Parameter; 1] {
+pub fn cell_parameters() -> [Parameter; 2] {
     let summary = "the generation that the cell must be of: 404 from another one on";
-    [Parameter::new("generation", "12", summary)]
+    [
+        Parameter::new("generation", "12", summary),
+        Parameter::new("step", "8", "sends every so many-th Gaussian, 1 to 65536, each larger; all by default"),
+    ]
 }
 
 pub async fn describe(State(app): State<Arc<App>>) -> Result<Json<Description>, Problem> {
@@ -59,8 +62,8 @@ pub async fn cell(
     Path(id): Path<String>,
     pairs: Result<Pairs, QueryRejection>,
 ) -> Result<Response, Problem> {
-    let (cell_id, generation) = parse_cell(&id, &params::pairs(pairs)?).map_err(parameter_problem)?;
-    message(&app, move |app, budget| app.engine.view_cell(cell_id, generation, budget)).await
+    let (cell_id, generation, step) = parse_cell(&id, &params::pairs(pairs)?).map_err(parameter_problem)?;
+    message(&app, move |app, budget| app.engine.view_cell(cell_id, generation, step, budget)).await
 }
 
 pub async fn words(State(app): State<Arc<App>>) -> Result<Json<Words>, Problem> {
@@ -110,9 +113,13 @@ fn parse_scores(pairs: &[(String, String)]) -> Result<(String, Negatives), Reque
     Ok((text, body::negatives(of("negative").collect())))
 }
 
-fn parse_cell(id: &str, pairs: &[(String, String)]) -> Result<(u32, Option<u64>), RequestError> {
+fn parse_cell(id: &str, pairs: &[(String, String)]) -> Result<(u32, Option<u64>, Step), RequestError> {
     params::check_names(pairs, &cell_parameters(), &[])?;
     let cell_id = number("id", id, "a cell's id, a whole number")?;
-    let generation = pairs.first().map(|(name, value)| number(name, value, "a whole number"));
-    Ok((cell_id, generation.transpose()?))
+    let of = |wanted: &str| pairs.iter().find(|(name, _)| name == wanted).map(|(_, value)| value);
+    let generation = of("generation").map(|value| number("generation", value, "a whole number"));
+    let step = of("step").map_or(Ok(Step::ALL), |value| {
+        Step::parse(value).map_err(|expected| RequestError::new("step", value, expected))
+    });
+    Ok((cell_id, generation.transpose()?, step?))
 }

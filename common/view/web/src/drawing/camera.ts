@@ -20,6 +20,7 @@ export class Camera {
   private glide: Glide | null = null;
   private lastMs = 0;
   private isAtPhoto = false;
+  private isDragged = false;
 
   /** `onLeave` is called when the camera leaves a photo's pose. */
   constructor(canvas: HTMLCanvasElement, private readonly up: THREE.Vector3, onMove: () => void, private readonly onLeave: () => void) {
@@ -29,7 +30,9 @@ export class Camera {
     this.controls.addEventListener("start", () => {
       this.glide = null;
       this.leavePhoto();
+      this.isDragged = true;
     });
+    this.controls.addEventListener("end", () => (this.isDragged = false));
     canvas.addEventListener("keydown", (event) => {
       if (!KEYS.includes(event.code) || event.ctrlKey || event.metaKey || event.altKey) return;
       event.preventDefault();
@@ -96,6 +99,11 @@ export class Camera {
     }
     if (this.pressed.size > 0) this.moveByKeys(seconds);
     return this.glide !== null || this.pressed.size > 0;
+  }
+
+  /** Whether it glides, or keys or a pointer move it. */
+  get isMoving(): boolean {
+    return this.glide !== null || this.pressed.size > 0 || this.isDragged;
   }
 
   private moveByKeys(seconds: number): void {

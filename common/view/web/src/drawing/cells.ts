@@ -24,11 +24,12 @@ export class Cells {
   /** `box` holds the scene; where a cell has no colours, heights in it give shades. */
   constructor(private readonly parent: THREE.Object3D, private readonly box: THREE.Box3, private readonly up: THREE.Vector3) {}
 
-  has(cell: number): boolean {
-    return this.drawn.has(cell);
+  /** The step of a cell's Gaussians: 1 if all are drawn, null if the cell is not. */
+  stepOf(cell: number): number | null {
+    return this.drawn.get(cell)?.gaussians.step ?? null;
   }
 
-  get nGaussians(): number {
+  get nDrawn(): number {
     return [...this.drawn.values()].reduce((sum, cell) => sum + cell.gaussians.n, 0);
   }
 
@@ -87,12 +88,13 @@ export class Cells {
     }
     const lit = (question: Question | null): Lit | null => {
       const found = question?.scores.byCell.get(cell);
-      return question && found?.length === gaussians.n ? { levels: found, threshold: question.threshold } : null;
+      const isOfCell = found && Math.ceil(found.length / gaussians.step) === gaussians.n;
+      return question && isOfCell ? { levels: found, threshold: question.threshold } : null;
     };
     drawn.rgba ??= new RgbaArray({ array: new Uint8Array(gaussians.packed.length), count: gaussians.n });
     const array = drawn.rgba.array;
     if (!array) return;
-    colourByScore(array, gaussians.packed, gaussians.n, lit(this.questions[0]), lit(this.questions[1]));
+    colourByScore(array, gaussians, lit(this.questions[0]), lit(this.questions[1]));
     drawn.rgba.needsUpdate = true;
     if (mesh.splatRgba === null) {
       mesh.splatRgba = drawn.rgba;

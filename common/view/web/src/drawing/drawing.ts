@@ -7,6 +7,7 @@ import type { Answer, Description, Goal, Photo, Vector } from "../network";
 import { Camera } from "./camera";
 import { Cells } from "./cells";
 import { boxOf, Marks } from "./marks";
+import { Frames } from "./frames";
 import { Places } from "./places";
 
 const MAX_LABELS = 8;
@@ -29,8 +30,12 @@ export class Drawing {
   private readonly isDark = matchMedia("(prefers-color-scheme: dark)");
   private answers: Answer[] = [];
   private isDirty = true;
+  private readonly frames: Frames;
+  private waiting: (() => void)[] = [];
 
-  constructor(private readonly canvas: HTMLCanvasElement, private readonly labels: HTMLElement, description: Description, onLeavePhoto: () => void) {
+  /** `onSlow` is told which share of the Gaussians would be drawn fast enough. */
+  constructor(private readonly canvas: HTMLCanvasElement, private readonly labels: HTMLElement, description: Description, onLeavePhoto: () => void, onSlow: (share: number) => void) {
+    this.frames = new Frames(onSlow);
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.up = new THREE.Vector3(...description.up).normalize();
@@ -59,6 +64,12 @@ export class Drawing {
 
   redraw(): void {
     this.isDirty = true;
+  }
+
+  /** Calls back once, after the next frame. */
+  onceDrawn(then: () => void): void {
+    this.waiting.push(then);
+    this.redraw();
   }
 
   stop(): void {
@@ -185,10 +196,12 @@ export class Drawing {
 
   private step(nowMs: number): void {
     if (this.camera.step(nowMs)) this.redraw();
+    this.frames.count(nowMs, this.camera.isMoving && this.isDirty);
     if (!this.isDirty) return;
     this.isDirty = false;
     this.renderer.render(this.scene, this.camera.camera);
     this.placeLabels();
+    for (const then of this.waiting.splice(0)) then();
   }
 
   /** Puts labels above their boxes; one that would cover a better answer's is left out. */

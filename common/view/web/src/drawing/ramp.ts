@@ -18,24 +18,34 @@ export function rampColour(share: number, stops = WARM): [number, number, number
   return [mix(0), mix(1), mix(2)];
 }
 
-/** Writes RGBA of `n` Gaussians from their packed words. Where both questions light one, the one that is farther above its threshold counts. */
-export function colourByScore(rgba: Uint8Array, packed: Uint32Array, n: number, first: Lit | null, second: Lit | null): void {
-  const share = (level: number, { threshold }: Lit) => (level >= threshold && level > 0 ? (level - threshold) / Math.max(255 - threshold, 1) : -1);
-  const tables = [WARM, COLD].map((stops) => {
-    const table = new Uint8Array(256 * 3);
-    for (let step = 0; step < 256; step++) table.set(rampColour(step / 255, stops), 3 * step);
-    return table;
-  });
+const TABLES = [WARM, COLD].map((stops) => {
+  const table = new Uint8Array(256 * 3);
+  for (let step = 0; step < 256; step++) table.set(rampColour(step / 255, stops), 3 * step);
+  return table;
+});
+
+/** For each level how far above the threshold it is, 0 to 255, or -1 below it. */
+function sharesOf(lit: Lit | null): Int16Array {
+  const threshold = Math.max(lit?.threshold ?? 256, 1);
+  return Int16Array.from({ length: 256 }, (_, level) => (level >= threshold ? Math.round((255 * (level - threshold)) / Math.max(255 - threshold, 1)) : -1));
+}
+
+/** Writes RGBA of Gaussians from their packed words. Where both questions light one, the one that is farther above its threshold counts. */
+export function colourByScore(rgba: Uint8Array, { packed, n, step }: { packed: Uint32Array; n: number; step: number }, first: Lit | null, second: Lit | null): void {
+  const [ofFirst, ofSecond] = [sharesOf(first), sharesOf(second)];
+  const none = new Uint8Array(0);
+  const [firstLevels, secondLevels] = [first?.levels ?? none, second?.levels ?? none];
   for (let i = 0; i < n; i++) {
     const word = packed[4 * i];
     const r = word & 255;
     const g = (word >> 8) & 255;
     const b = (word >> 16) & 255;
-    const [a, z] = [first ? share(first.levels[i], first) : -1, second ? share(second.levels[i], second) : -1];
+    const a = first ? ofFirst[firstLevels[i * step]] : -1;
+    const z = second ? ofSecond[secondLevels[i * step]] : -1;
     const best = Math.max(a, z);
     if (best >= 0) {
-      const table = tables[a >= z ? 0 : 1];
-      const at = 3 * Math.round(best * 255);
+      const table = TABLES[a >= z ? 0 : 1];
+      const at = 3 * best;
       rgba[4 * i] = r + (table[at] - r) * SHARE_OF_RAMP;
       rgba[4 * i + 1] = g + (table[at + 1] - g) * SHARE_OF_RAMP;
       rgba[4 * i + 2] = b + (table[at + 2] - b) * SHARE_OF_RAMP;
