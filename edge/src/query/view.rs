@@ -7,8 +7,8 @@ use glam::{DVec3, Vec3};
 use slag_common::shard::ShardView;
 use slag_models::everyday_words;
 use slag_view::{
-    CELL_HEAD_BYTES, Cell, CellState, Description, Fetched, GAUSSIAN_BYTES, Photo, ScoresMessage, Step,
-    Word, Words, cell_message,
+    CELL_HEAD_BYTES, Cell, CellState, Description, Fetched, GAUSSIAN_BYTES, Photo, ScoresMessage, Step, Word,
+    Words, cell_message,
 };
 
 use super::engine::{Engine, QueryError};
@@ -121,8 +121,10 @@ impl Engine {
         };
         let mut words = Vec::new();
         for known in known.chunks(WORDS_TOGETHER) {
-            let question =
-                |(_, vector): &(String, Arc<[f32]>)| Question { vector: Arc::clone(vector), negatives: Vec::new() };
+            let question = |(_, vector): &(String, Arc<[f32]>)| Question {
+                vector: Arc::clone(vector),
+                negatives: Vec::new(),
+            };
             let questions: Vec<Question> = known.iter().map(question).collect();
             budget.check().map_err(ScoreError::from)?;
             let scored = self.on_scene(&snapshot, budget, |_, scene| {

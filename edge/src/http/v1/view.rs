@@ -35,7 +35,11 @@ pub fn cell_parameters() -> [Parameter; 2] {
     let summary = "the generation that the cell must be of: 404 from another one on";
     [
         Parameter::new("generation", "12", summary),
-        Parameter::new("step", "8", "sends every so many-th Gaussian, 1 to 65536, each larger; all by default"),
+        Parameter::new(
+            "step",
+            "8",
+            "sends every so many-th Gaussian, 1 to 65536, each larger; all by default",
+        ),
     ]
 }
 
