@@ -29,6 +29,9 @@ const PROGRAM: &str = "slag-edge";
 /// Words that are scored at a time: bounds the scores in memory.
 const WORDS_TOGETHER: usize = 64;
 
+/// A word and its vector.
+type WordVector = (String, Arc<[f32]>);
+
 impl Engine {
     /// Describes the scene on board. `robot_in_world`: where the robot is, if that is known.
     ///
@@ -121,10 +124,8 @@ impl Engine {
         };
         let mut words = Vec::new();
         for known in known.chunks(WORDS_TOGETHER) {
-            let question = |(_, vector): &(String, Arc<[f32]>)| Question {
-                vector: Arc::clone(vector),
-                negatives: Vec::new(),
-            };
+            let question =
+                |(_, vector): &WordVector| Question { vector: Arc::clone(vector), negatives: Vec::new() };
             let questions: Vec<Question> = known.iter().map(question).collect();
             budget.check().map_err(ScoreError::from)?;
             let scored = self.on_scene(&snapshot, budget, |_, scene| {
@@ -144,7 +145,7 @@ impl Engine {
 
     /// Returns the vectors of everyday words that the text model knows, and whether these are all: a model takes a while for
     /// each, and encodes some more at the next request.
-    fn everyday_vectors(&self) -> Result<(Vec<(String, Arc<[f32]>)>, bool), QueryError> {
+    fn everyday_vectors(&self) -> Result<(Vec<WordVector>, bool), QueryError> {
         let started = Instant::now();
         let mut known = Vec::new();
         for word in everyday_words() {
