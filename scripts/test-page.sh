@@ -5,4 +5,4 @@ set -eu
 cd "$(dirname "$0")/.."
 cargo build --workspace --bins --locked
 export SLAG_PROGRAMS="${CARGO_TARGET_DIR:-$PWD/target}/debug"
-timeout 600 node --test --test-concurrency=1 --test-timeout=400000 tests/page/*.test.mjs
+timeout 1200 node --test --test-concurrency=1 --test-timeout=400000 tests/page/*.test.mjs
