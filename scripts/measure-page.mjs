@@ -13,8 +13,10 @@ import { serve } from "../tests/page/programs.mjs";
 
 const [out, camera, questionsIn, program, ...flags] = process.argv.slice(2);
 const questions = questionsIn.split(",").filter(Boolean);
-const N_ASKED = 7;
+const N_ASKED = Number(process.env.N_ASKED ?? 7);
 const TURN_MS = Number(process.env.TURN_MS ?? 20000);
+/** Pause after which frames of what came before are drawn. */
+const SETTLING_MS = 5000;
 const WAIT = { timeout: 600000 };
 
 /** Runs in the page before its scripts: looks at every frame what is drawn, and times the renderer's sorting. */
@@ -73,6 +75,8 @@ await openBrowser();
 const result = { machine: `${hostname()}, ${cpus().length} x ${cpus()[0].model}`, program: execFileSync("git", ["rev-parse", "--short", "HEAD"]).toString().trim(), load_before: loadavg().map(rounded) };
 try {
   await opened("about:blank", async (page) => {
+    // A software GPU takes seconds for a frame.
+    page.setDefaultTimeout(WAIT.timeout);
     await page.addInitScript(watchFrames);
     await page.goto(`${service.url}/view${camera === "whole" ? "" : `#camera=${camera}`}`);
     await page.waitForFunction(() => document.documentElement.dataset.complete !== undefined && window.watched.firstPictureMs !== null, null, WAIT);
@@ -88,7 +92,7 @@ try {
         drawn_gaussians: Number(gaussians), n_cells_fetched: cells.length, bytes_of_cells: cells.reduce((sum, { encodedBodySize }) => sum + encodedBodySize, 0),
       };
     }));
-    await picture(page, null);
+    await page.waitForTimeout(SETTLING_MS);
 
     if (questions.length > 0) {
       const asked = [];
@@ -97,7 +101,7 @@ try {
         await page.evaluate(() => performance.clearResourceTimings());
         await page.fill("#question", question);
         await page.waitForFunction((n) => performance.getEntriesByName("answered").length > n, i, WAIT);
-        await picture(page, null);
+        await page.waitForTimeout(SETTLING_MS);
         asked.push(await page.evaluate(() => {
           const { startTime, duration } = performance.getEntriesByName("answered").at(-1);
           const of = (path) => performance.getEntriesByType("resource").find(({ name }) => new URL(name).pathname === path);
@@ -136,6 +140,7 @@ try {
 
   if (out !== "none") {
     await opened(service.url, async (page) => {
+      page.setDefaultTimeout(WAIT.timeout);
       await page.waitForFunction(() => document.documentElement.dataset.complete !== undefined, null, WAIT);
       if (questions[0]) await page.waitForFunction((q) => document.documentElement.dataset.answered === q, questions[0], WAIT);
       await picture(page, null);
