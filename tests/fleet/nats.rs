@@ -138,7 +138,7 @@ fn views_that_end_workers_are_given_up_and_named() {
 fn work_in_progress_is_not_handed_out_again() {
     let (fleet, _server) = Fleet::new(free_port());
     // Large rasters: a view takes longer than the queue waits.
-    let flags = ["--ack-wait", "0.3", "--max-deliver", "1", "--strict", "--raster-width", "2600"];
+    let flags = ["--ack-wait", "1", "--max-deliver", "1", "--strict", "--raster-width", "2600"];
     let coordinator = fleet.coordinator(&flags);
     let worker = fleet.worker(&flags[..4]);
     assert_eq!(coordinator.json()["n_views"], N_VIEWS);
