@@ -1,8 +1,9 @@
-// Measures the page in Chromium and prints one JSON object: first picture, what a question takes and on what, frames while turning.
+// Measures the page in Chromium: time to the first picture, time of a question and its parts, frames a second while the camera turns.
 // usage: node scripts/measure-page.mjs OUT.png CAMERA QUESTION,QUESTION PROGRAM FLAGS...
-//   after `scripts/setup.sh page` and a build with the page. PROGRAM FLAGS: slag-encoder view .., slag-edge serve .., with a free port.
-//   CAMERA: X,Y,Z,X,Y,Z, where it is and what it looks at, or `whole`. OUT.png: the first question at its end, or `none`. `SLAG_PROGRAMS`: the
-//   folder of the programs [default: target/debug]. Without a GPU, frames are those of a software one (SwiftShader): `renderer` says which.
+//   OUT.png             picture of the first question's answer, or `none`
+//   CAMERA              X,Y,Z,X,Y,Z: position and target, or `whole`
+//   PROGRAM FLAGS...    slag-encoder view .. or slag-edge serve .., with a free port, built with the page; from SLAG_PROGRAMS [default: target/debug]
+// N_ASKED and TURN_MS: questions, and milliseconds of turning. Prints one JSON object; its `renderer` names the GPU, in software SwiftShader.
 
 import { execFileSync } from "node:child_process";
 import { mkdirSync } from "node:fs";
@@ -15,8 +16,6 @@ const [out, camera, questionsIn, program, ...flags] = process.argv.slice(2);
 const questions = questionsIn.split(",").filter(Boolean);
 const N_ASKED = Number(process.env.N_ASKED ?? 7);
 const TURN_MS = Number(process.env.TURN_MS ?? 20000);
-/** Pause after which frames of what came before are drawn. */
-const SETTLING_MS = 5000;
 const WAIT = { timeout: 600000 };
 
 /** Runs in the page before its scripts: looks at every frame what is drawn, and times the renderer's sorting. */
@@ -25,7 +24,7 @@ function watchFrames() {
   HTMLCanvasElement.prototype.getContext = function (kind, options, ...rest) {
     return getContext.call(this, kind, kind === "webgl2" ? { ...options, preserveDrawingBuffer: true } : options, ...rest);
   };
-  const watched = (window.watched = { firstPictureMs: null, changes: [], drawn: [], sorts: [], nSplats: 0 });
+  const watched = (window.watched = { firstPictureMs: null, changes: [], drawn: [], sorts: [] });
   const draw = WebGL2RenderingContext.prototype.drawElementsInstanced;
   WebGL2RenderingContext.prototype.drawElementsInstanced = function (...args) {
     watched.drawn.push(performance.now());
@@ -46,16 +45,21 @@ function watchFrames() {
   };
   const [width, height] = [110, 64];
   let before = "";
+  let nSeen = 0;
   const look = (context) => {
     requestAnimationFrame(() => look(context));
     const canvas = document.getElementById("canvas");
-    if (!canvas || window.isUnwatched) return;
+    // Reading a picture back waits for it: each is read once.
+    if (!canvas || window.isUnwatched || watched.drawn.length === nSeen) return;
+    nSeen = watched.drawn.length;
+    context.fillStyle = "#000008";
+    context.fillRect(0, 0, width, height);
     context.drawImage(canvas, 0, 0, width, height);
     const { data } = context.getImageData(0, 0, width, height);
     let [nDrawn, sum] = [0, 0];
     for (let i = 0; i < data.length; i += 4) {
-      // The grid and the background are darker.
-      if (Math.max(data[i], data[i + 1], data[i + 2]) > 110) nDrawn++;
+      // Grid and background are bluish and darker.
+      if (data[i] >= data[i + 2] || Math.max(data[i], data[i + 1], data[i + 2]) > 110) nDrawn++;
       sum = (sum * 31 + data[i] + 7 * data[i + 1] + 13 * data[i + 2]) % 1000003;
     }
     if (nDrawn > (width * height) / 200) watched.firstPictureMs ??= performance.now();
@@ -66,6 +70,9 @@ function watchFrames() {
   requestAnimationFrame(() => look(context));
 }
 
+/** Waits until nothing is drawn any more. */
+const quiet = (page) => page.waitForFunction(() => performance.now() - (window.watched.drawn.at(-1) ?? Infinity) > 1500, null, WAIT);
+
 const median = (values) => [...values].sort((a, b) => a - b)[Math.floor(values.length / 2)] ?? null;
 const rounded = (value) => (value === null || value === undefined ? null : Math.round(value * 10) / 10);
 const spread = (values) => ({ median: rounded(median(values)), worst: rounded(Math.max(...values)), n: values.length });
@@ -75,7 +82,6 @@ await openBrowser();
 const result = { machine: `${hostname()}, ${cpus().length} x ${cpus()[0].model}`, program: execFileSync("git", ["rev-parse", "--short", "HEAD"]).toString().trim(), load_before: loadavg().map(rounded) };
 try {
   await opened("about:blank", async (page) => {
-    // A software GPU takes seconds for a frame.
     page.setDefaultTimeout(WAIT.timeout);
     await page.addInitScript(watchFrames);
     await page.goto(`${service.url}/view${camera === "whole" ? "" : `#camera=${camera}`}`);
@@ -92,7 +98,7 @@ try {
         drawn_gaussians: Number(gaussians), n_cells_fetched: cells.length, bytes_of_cells: cells.reduce((sum, { encodedBodySize }) => sum + encodedBodySize, 0),
       };
     }));
-    await page.waitForTimeout(SETTLING_MS);
+    await quiet(page);
 
     if (questions.length > 0) {
       const asked = [];
@@ -101,7 +107,7 @@ try {
         await page.evaluate(() => performance.clearResourceTimings());
         await page.fill("#question", question);
         await page.waitForFunction((n) => performance.getEntriesByName("answered").length > n, i, WAIT);
-        await page.waitForTimeout(SETTLING_MS);
+        await quiet(page);
         asked.push(await page.evaluate(() => {
           const { startTime, duration } = performance.getEntriesByName("answered").at(-1);
           const of = (path) => performance.getEntriesByType("resource").find(({ name }) => new URL(name).pathname === path);
@@ -131,7 +137,7 @@ try {
       const { drawn, sorts } = window.watched;
       const end = performance.now();
       const during = (from, to) => drawn.filter((at, i) => at >= from && at < to && (i === 0 || at - drawn[i - 1] > 1)).length / ((to - from) / 1000);
-      resolve({ first: during(end - ms, end - ms * 0.8), last: during(end - ms * 0.3, end), sorts, gaussians: Number(document.documentElement.dataset.gaussians), facts: document.getElementById("facts").innerText });
+      resolve({ first: during(end - ms, end - ms * 0.8), last: during(end - ms * 0.3, end), sorts, gaussians: Number(document.documentElement.dataset.gaussians) });
     }, ms)), TURN_MS);
     await page.keyboard.up("ArrowLeft");
     result.turning = { frames_a_second_at_first: rounded(turn.first), at_last: rounded(turn.last), gaussians_at_last: turn.gaussians, sort_ms: spread(turn.sorts) };

@@ -1,7 +1,5 @@
 //! Workers that a queue hands work to: a real nats-server with JetStream.
 
-use std::process::{Command, Stdio};
-
 use super::network::Network;
 use super::support::*;
 use slag_tests::*;
@@ -15,13 +13,9 @@ pub struct Server {
 impl Server {
     /// Starts a server on a port, with its files in the test's folder.
     fn start(scene: &Scene, port: u16) -> Self {
-        let program = python_with("tests/fleet").with_file_name("nats-server");
-        let mut command = Command::new(program);
-        command.args(["--jetstream", "--addr", "127.0.0.1", "--port", &port.to_string()]);
-        command.args(["--store_dir", text(&scene.path("nats"))]).stdin(Stdio::null());
-        let running = Running::start_quiet(&mut command);
-        wait_until("nats-server", || std::net::TcpStream::connect(("127.0.0.1", port)).is_ok());
-        Self { running, port }
+        let (at, folder) = (port.to_string(), scene.path("nats"));
+        let args = ["--jetstream", "--addr", "127.0.0.1", "--port", &at, "--store_dir", text(&folder)];
+        Self { running: start_server("nats-server", port, &args), port }
     }
 
     pub fn port(&self) -> u16 {
@@ -138,11 +132,15 @@ fn views_that_end_workers_are_given_up_and_named() {
 fn work_in_progress_is_not_handed_out_again() {
     let (fleet, _server) = Fleet::new(free_port());
     // Large rasters: a view takes longer than the queue waits.
-    let flags = ["--ack-wait", "1", "--max-deliver", "1", "--strict", "--raster-width", "2600"];
-    let coordinator = fleet.coordinator(&flags);
-    let worker = fleet.worker(&flags[..4]);
+    let width = ["--raster-width", "2600"];
+    let wait = ["--ack-wait", "1", "--max-deliver", "1"];
+    let coordinator = fleet.coordinator(&[&wait[..], &["--strict"], &width].concat());
+    let worker = fleet.worker(&wait);
     assert_eq!(coordinator.json()["n_views"], N_VIEWS);
     assert_eq!(worker.json()["n_views"], N_VIEWS);
     // Also where a view that was given up is finished after all.
     assert_eq!(n_objects(&fleet.scene.path("bucket/jobs/00000001/failed")), 0);
+    run(fleet.scene.encode("alone").args(width));
+    let alone = fs_err::read(fleet.scene.path("alone/manifest")).expect("published");
+    fleet.scene.assert_has("store", &alone);
 }

@@ -1,12 +1,11 @@
 //! A fleet over S3: two servers that nobody here wrote, with conditional puts.
 
-use std::process::{Command, Stdio};
+use std::process::Command;
 
 use hyper_util::rt::{TokioExecutor, TokioIo};
 use hyper_util::server::conn::auto::Builder;
 use s3s::auth::SimpleAuth;
 use s3s::service::S3ServiceBuilder;
-use slag_tests::*;
 
 use super::support::*;
 
@@ -15,8 +14,13 @@ const SECRET: &str = "secret";
 
 /// A server of S3 with a bucket named `scenes`.
 trait S3 {
+    /// Returns the port of this machine that it listens on.
+    fn port(&self) -> u16;
+
     /// Returns its address.
-    fn endpoint(&self) -> String;
+    fn endpoint(&self) -> String {
+        format!("http://127.0.0.1:{}", self.port())
+    }
 
     /// Returns the number of objects whose key starts with `room/` and a prefix that ends with `/` or is a key.
     fn n_objects(&self, prefix: &str) -> usize;
@@ -39,21 +43,16 @@ struct Moto {
 impl Moto {
     fn start() -> Self {
         let port = free_port();
-        let program = python_with("tests/fleet").with_file_name("moto_server");
-        let mut command = Command::new(program);
-        command.args(["--host", "127.0.0.1", "--port", &port.to_string()]);
-        // It prints a line a request, which nobody reads.
-        let server = Running::start_quiet(command.stdin(Stdio::null()));
-        wait_until("moto", || std::net::TcpStream::connect(("127.0.0.1", port)).is_ok());
-        let moto = Self { _server: server, port };
+        let args = ["--host", "127.0.0.1", "--port", &port.to_string()];
+        let moto = Self { _server: start_server("moto_server", port, &args), port };
         ureq::put(format!("{}/scenes", moto.endpoint())).send_empty().expect("a bucket");
         moto
     }
 }
 
 impl S3 for Moto {
-    fn endpoint(&self) -> String {
-        format!("http://127.0.0.1:{}", self.port)
+    fn port(&self) -> u16 {
+        self.port
     }
 
     fn n_objects(&self, prefix: &str) -> usize {
@@ -103,8 +102,8 @@ impl Drop for S3s {
 }
 
 impl S3 for S3s {
-    fn endpoint(&self) -> String {
-        format!("http://127.0.0.1:{}", self.port)
+    fn port(&self) -> u16 {
+        self.port
     }
 
     fn n_objects(&self, prefix: &str) -> usize {
@@ -126,9 +125,8 @@ fn fences_a_coordinator_and_gives_the_same_bytes(s3: &dyn S3) {
         worker.args(["--index", index, "--of", "2", "--help-after", "0.5", "--threads", "1"]);
         Running::start(&mut worker)
     };
-    let list = |prefix: &str| s3.n_objects(prefix);
     let first = coordinate("first");
-    wait_until("a plan", || list("jobs/00000001/plan.json") == 1);
+    wait_until("a plan", || s3.n_objects("jobs/00000001/plan.json") == 1);
     let second = coordinate("second");
     let fenced = first.output();
     let errors = String::from_utf8_lossy(&[fenced.stdout, fenced.stderr].concat()).into_owned();
@@ -136,9 +134,9 @@ fn fences_a_coordinator_and_gives_the_same_bytes(s3: &dyn S3) {
     assert!(errors.contains("superseded") && !scene.path("first/manifest").exists(), "{errors}");
 
     let killed = share("0");
-    wait_until("a first view", || list("views/") > 0);
+    wait_until("a first view", || s3.n_objects("views/") > 0);
     killed.kill();
-    let n_of_killed = list("views/");
+    let n_of_killed = s3.n_objects("views/");
     let report = share("1").json();
     let summary = second.json();
     assert_eq!(report["n_views"], N_VIEWS - n_of_killed, "{report}");

@@ -1,14 +1,14 @@
 //! A fleet over the server that `encoder/deploy/nats.conf` describes: TLS, and a key for each role.
 
 use std::path::PathBuf;
-use std::process::{Command, Stdio};
+use std::process::Command;
 
 use nkeys::KeyPair;
 use slag_tests::*;
 
 use super::support::*;
 
-/// nats-server with the configuration as it is shipped, but for its port, folder and keys.
+/// nats-server with the configuration as it is shipped, but for its port, folders and keys.
 struct Secured {
     _server: Running,
     authority: Authority,
@@ -30,6 +30,8 @@ impl Secured {
         };
         set("0.0.0.0:4222", &format!("127.0.0.1:{port}"));
         set("store_dir: nats", &format!("store_dir: {:?}", text(&at("nats"))));
+        set("cert_file: server.pem", &format!("cert_file: {:?}", text(&at("server.pem"))));
+        set("key_file: server.key", &format!("key_file: {:?}", text(&at("server.key"))));
         for (role, name) in [("UCOORDINATOR", "coordinator.nk"), ("UWORKER", "worker.nk")] {
             let key = KeyPair::new_user();
             fs_err::write(at(name), key.seed().expect("made here")).expect("written");
@@ -37,10 +39,7 @@ impl Secured {
         }
         fs_err::write(at("other.nk"), KeyPair::new_user().seed().expect("made here")).expect("written");
         fs_err::write(at("nats.conf"), conf).expect("written");
-        let mut command = Command::new(python_with("tests/fleet").with_file_name("nats-server"));
-        command.args(["--config", text(&at("nats.conf"))]).current_dir(at("")).stdin(Stdio::null());
-        let server = Running::start_quiet(&mut command);
-        wait_until("nats-server", || std::net::TcpStream::connect(("127.0.0.1", port)).is_ok());
+        let server = start_server("nats-server", port, &["--config", text(&at("nats.conf"))]);
         Self { _server: server, authority, scene, port }
     }
 

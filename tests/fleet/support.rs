@@ -58,8 +58,13 @@ impl Scene {
 
     /// Fails unless a store has the manifest of the one that a single process made, and its objects.
     pub fn assert_same(&self, store: &str) {
+        self.assert_has(store, &Self::room().1);
+    }
+
+    /// Fails unless a store has a manifest that one process made, and its objects.
+    pub fn assert_has(&self, store: &str, expected: &[u8]) {
         let manifest = fs_err::read(self.path(store).join("manifest")).expect("published");
-        assert!(manifest == Self::room().1, "{store}: another manifest than one process makes");
+        assert!(manifest == expected, "{store}: another manifest than one process makes");
         run(&mut encoder(&["store", "verify", "--store", text(&self.path(store))]));
     }
 }
@@ -159,6 +164,14 @@ pub fn wait_until(what: &str, mut is_so: impl FnMut() -> bool) {
         std::thread::sleep(Duration::from_millis(5));
     }
     panic!("{what}: not after a minute");
+}
+
+/// Starts a server that Python's packages bring; returns it once it listens on its port. Nobody reads what it prints.
+pub fn start_server(name: &str, port: u16, args: &[&str]) -> Running {
+    let mut command = Command::new(python_with("tests/fleet").with_file_name(name));
+    let server = Running::start_quiet(command.args(args).stdin(Stdio::null()));
+    wait_until(name, || std::net::TcpStream::connect(("127.0.0.1", port)).is_ok());
+    server
 }
 
 /// Returns a port of this machine that nobody listens on.

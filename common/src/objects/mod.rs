@@ -16,4 +16,4 @@ pub use columns::{
     MAX_PHOTO_BYTES, MAX_VECTORS, NO_OBJECT, ObjectRecord, Objects, ObjectsHeader, object_score, section,
 };
 pub(crate) use layout::ObjectsLayout;
-pub use thing::Thing;
+pub use thing::{Thing, public_id};

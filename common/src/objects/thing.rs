@@ -28,6 +28,11 @@ pub struct Thing {
     pub vector: Vec<f64>,
 }
 
+/// Returns an object's id as answers name it: `o` and 16 hex digits.
+pub fn public_id(id: u64) -> String {
+    format!("o{id:016x}")
+}
+
 fn as_hex<S: Serializer>(id: &u64, serializer: S) -> Result<S::Ok, S::Error> {
     // JSON numbers have 53 bits.
     serializer.collect_str(&format_args!("{id:016x}"))

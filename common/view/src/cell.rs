@@ -69,10 +69,10 @@ impl Step {
     /// The largest step.
     pub const MAX: usize = 1 << 16;
 
-    /// Reads a step from 1 to [`Self::MAX`]; the error says what is expected.
+    /// Parses a step.
     ///
     /// # Errors
-    /// Another number, or none.
+    /// The numbers that are valid, 1 to [`Self::MAX`], as a message can name them.
     pub fn parse(text: &str) -> Result<Self, &'static str> {
         let step = text.parse().ok().filter(|step| (1..=Self::MAX).contains(step));
         step.map(Self).ok_or("a whole number from 1 to 65536")

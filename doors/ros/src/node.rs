@@ -373,7 +373,7 @@ impl Shared {
         Ok(())
     }
 
-    /// Sends a place to Nav2, and says how that goes.
+    /// Sends a goal to Nav2 and publishes its progress and its end.
     async fn drive(self: Arc<Self>, text: String, pose: PoseStamped) {
         let Some(Navigation { navigator, state, .. }) = &self.navigation else { return };
         let say = async |how: String| publish(state, Text { data: format!("{text}: {how}") }).await;

@@ -23,7 +23,7 @@ const APART_M: f64 = 0.5;
 const COMFORT_M: f64 = 0.3;
 /// Metres of way that a pose without any comfort is worse than one with all.
 const CLEARANCE_WEIGHT_M: f64 = 2.0;
-/// A pose must see this share of what the best one sees, whatever its cost.
+/// Least visible share of a pose, relative to that of the pose that sees most.
 const SHARE_OF_BEST: f64 = 0.5;
 /// Metres of way that a pose that sees nothing would be worse than one that sees all.
 const SIGHT_WEIGHT_M: f64 = 4.0;
@@ -136,7 +136,7 @@ fn goal(around: &Around<'_>, request: &GoalRequest, points: &[DVec3], of: Candid
     }
     let position_in_world = DVec3::new(x, y, around.floor_height(of.cell)?);
     let sensor_in_world = position_in_world + DVec3::Z * request.sensor_height_m;
-    // From below, what a thing stands on hides it, and the voxels of the two are the same.
+    // A sensor below the thing looks at the board or the table that carries it, and the lowest voxels belong to both.
     let bottom = points.iter().map(|point| point.z).fold(f64::INFINITY, f64::min);
     let from_below = sensor_in_world.z < bottom;
     let least_z = if from_below { bottom + sight::TOLERANCE * window.voxel } else { f64::NEG_INFINITY };

@@ -1,6 +1,7 @@
 //! From a request to poses.
 
 use glam::DVec3;
+use slag_common::objects::public_id;
 use slag_common::occupancy::Occupancy;
 
 use super::choose::{SAMPLES, choose};
@@ -111,7 +112,7 @@ fn things(
         GoalTarget::Object(id) => {
             let Some(object) = engine.object(snapshot, *id) else {
                 let generation = snapshot.manifest.generation;
-                return Ok(Err(format!("generation {generation} has no object o{id:016x} on board")));
+                return Ok(Err(format!("generation {generation} has no object {} on board", public_id(*id))));
             };
             let thing =
                 TargetThing { id: object.id, position_in_world: object.position_in_world, score: None };

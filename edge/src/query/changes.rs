@@ -4,11 +4,10 @@ use glam::DVec3;
 use serde::Serialize;
 use slag_common::frames::Geographic;
 use slag_common::manifest::Manifest;
-use slag_common::objects::{self, Moved, Thing};
+use slag_common::objects::{self, Moved, Thing, public_id};
 
 use super::engine::{Engine, QueryError};
 use super::inventory::FRAME;
-use super::objects::public_id;
 use super::request::RequestError;
 use crate::store::history::{self, Record};
 use crate::store::{EdgeCache, Snapshot};

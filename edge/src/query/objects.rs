@@ -5,7 +5,7 @@
 
 use glam::DVec3;
 use slag_common::manifest::Calibration;
-use slag_common::objects::{ObjectRecord, Objects};
+use slag_common::objects::{ObjectRecord, Objects, public_id};
 
 use super::extent::{Extent, TRIMMED};
 use super::oriented::{Alignment, OrientedBox};
@@ -40,11 +40,6 @@ impl FoundObject<'_> {
     pub fn public_id(&self) -> String {
         public_id(self.record.id)
     }
-}
-
-/// Returns an object's id as answers name it: `o` and 16 hex digits.
-pub fn public_id(id: u64) -> String {
-    format!("o{id:016x}")
 }
 
 /// Returns whether at least `min_count` of an object's Gaussians, and at least one, lie in a region.

@@ -108,11 +108,8 @@ impl Run {
     /// [`FleetError::Blob`]; a document that is none.
     pub(super) fn is_superseded(self, bucket: &Bucket) -> Result<bool, FleetError> {
         let key = self.key("end.json");
-        if bucket.len_of(&key)?.is_none() {
-            return Ok(false);
-        }
-        let end: End = documents::parse(bucket, &key, &bucket.require(&key)?)?;
-        Ok(end == End::Superseded)
+        let Some(bytes) = bucket.get(&key)? else { return Ok(false) };
+        Ok(documents::parse::<End>(bucket, &key, &bytes)? == End::Superseded)
     }
 
     /// Fails if another coordinator has taken the run's place.

@@ -4,6 +4,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use slag_common::frames::Aabb;
 use slag_common::manifest::Calibration;
+use slag_common::objects::public_id;
 
 use crate::progress::FoundObject;
 
@@ -33,10 +34,10 @@ pub struct Object {
 }
 
 impl Object {
-    /// Returns what is told of it while an encode is watched.
+    /// Returns its row of an encode's report.
     pub fn found(&self) -> FoundObject {
         FoundObject {
-            id: format!("o{:016x}", self.id),
+            id: public_id(self.id),
             position_m: self.position_in_world,
             bounds: self.box_in_world,
             n_gaussians: self.n_gaussians,

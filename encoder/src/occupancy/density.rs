@@ -31,7 +31,7 @@ const TILE_EDGE: usize = (TILE_BLOCKS * BLOCK_EDGE) as usize;
 const MAX_TILES: i32 = 8;
 /// Standard deviation along its shortest axis, world units, above which a Gaussian is fog, sky or other background: the
 /// Gaussians of a surface are thin.
-pub const MAX_THICKNESS: f32 = 0.2;
+const MAX_THICKNESS: f32 = 0.2;
 
 /// The occupied voxels of a scene.
 pub(super) struct Occupied {

@@ -54,8 +54,8 @@ pub(super) struct Depth {
 }
 
 impl Depth {
-    /// Takes the depth of each pixel. At an edge it lies between those of the two surfaces, whose voxels are occupied, so that at
-    /// most places behind the nearer one are looked through: a pixel's width of them, and two views must agree.
+    /// Takes the depth of each pixel. At the edge of a surface it lies between that surface and the one behind it, so such a pixel may look through
+    /// what the nearer surface hides. It is one pixel wide, voxels with a surface are occupied in any case, and two views must agree.
     pub(super) fn new(view: RasterView, drawing: &Drawing) -> Self {
         let of_pixel = |pixel: usize| match drawing.coverage[pixel] {
             coverage if coverage >= MIN_COVERAGE => drawing.depth[pixel],

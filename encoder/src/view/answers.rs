@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use serde_json::{Value, json};
 use slag_common::manifest::{Calibration, Manifest};
-use slag_common::objects::ObjectRecord;
+use slag_common::objects::{ObjectRecord, public_id};
 
 use super::shards::{Shard, combined};
 
@@ -101,7 +101,7 @@ impl Things {
 fn answer(manifest: &Manifest, rank: usize, (score, record, photo): &(f32, ObjectRecord, String)) -> Value {
     let (position, bounds) = (record.position(), record.bounds());
     let mut answer = json!({
-        "rank": rank, "id": format!("o{:016x}", record.id), "frame": "world", "generation": manifest.generation,
+        "rank": rank, "id": public_id(record.id), "frame": "world", "generation": manifest.generation,
         "position_in_world": position, "box_min_in_world": bounds.min, "box_max_in_world": bounds.max,
         "score": score, "n_gaussians": record.n_gaussians,
         "evidence": { "photo": photo, "box_px": record.photo_box_px },

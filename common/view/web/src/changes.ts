@@ -1,17 +1,8 @@
 // What changed between the scene's generation and the one before it: listed in the panel, and drawn as boxes by kind of change.
 
 import type { Drawing } from "./drawing/drawing";
+import type { Change } from "./drawing/marks";
 import { type Changes, fetchChanges, type Vector } from "./network";
-
-/** A thing that changed, as it is listed and drawn. */
-export interface Change {
-  kind: "appeared" | "went" | "moved";
-  id: string;
-  box: { min: Vector; max: Vector };
-  /** Where it was, if it moved. */
-  from?: Vector;
-  to: Vector;
-}
 
 const TITLES = { appeared: "Appeared", went: "Went", moved: "Moved" };
 

@@ -1,5 +1,6 @@
 //! A generated scene on a robot, and the robot's own program, asked over HTTP.
 
+use std::fmt::Debug;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
@@ -7,6 +8,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 use anyhow::{Context, Result, anyhow};
+use clap::ValueEnum;
 use serde_json::Value;
 
 use crate::generate::compose::Walk;
@@ -80,6 +82,12 @@ impl Drop for Service {
     }
 }
 
+/// Returns a value as flags take it.
+pub fn flag_value(value: &(impl ValueEnum + Debug)) -> Result<String> {
+    let name = value.to_possible_value().map(|value| value.get_name().to_owned());
+    name.ok_or_else(|| anyhow!("{value:?} has no name"))
+}
+
 /// A generated scene on a robot, in a folder: `scene`, `store` and `cache`.
 pub struct Prepared<'a> {
     /// Folder of the programs.
@@ -121,7 +129,7 @@ impl Prepared<'_> {
                 "--n-views",
                 &n_views,
                 "--walk",
-                self.walk.name(),
+                &flag_value(&self.walk)?,
                 "--out",
             ]);
             finish(command.arg(&scene))?;

@@ -54,16 +54,6 @@ pub enum Walk {
     Everywhere,
 }
 
-impl Walk {
-    /// Returns the name that programs take.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Oval => "oval",
-            Self::Everywhere => "everywhere",
-        }
-    }
-}
-
 /// A piece of ground that things stand on and cameras walk through.
 #[derive(Clone, Copy, Debug)]
 struct Area {
@@ -271,9 +261,17 @@ impl Layout {
             && self.placed.iter().filter(|p| !p.shell).all(|p| p.bounds.distance_to(at) > CAMERA_CLEARANCE_M)
     }
 
+    /// Returns the cameras of a scene's photos.
+    pub fn photos(&self, walk: Walk, n_views: u32) -> Vec<RasterView> {
+        match walk {
+            Walk::Oval => self.walk(n_views, 0.0, photo_intrinsics()),
+            Walk::Everywhere => self.roam(n_views, photo_intrinsics()),
+        }
+    }
+
     /// Returns cameras all over the walkable places: places and headings are low-discrepancy sequences (Roberts' R2, and the golden
     /// angle). They are fewer than asked for if there is hardly room.
-    pub fn roam(&self, n_views: u32, intrinsics: Intrinsics) -> Vec<RasterView> {
+    fn roam(&self, n_views: u32, intrinsics: Intrinsics) -> Vec<RasterView> {
         const STEP: DVec2 = DVec2::new(0.754_877_666_246_692_7, 0.569_840_290_998_053_2);
         const GOLDEN_ANGLE: f64 = 2.399_963_229_728_653;
         let tries = (0..20 * n_views).flat_map(|i| self.areas.iter().map(move |area| (f64::from(i), area)));

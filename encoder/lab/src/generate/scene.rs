@@ -11,7 +11,7 @@ use slag_encoder::progress::Progress;
 use slag_encoder::raster::RasterView;
 use slag_math::random::Xorshift;
 
-use super::compose::{Layout, photo_intrinsics};
+use super::compose::{Layout, Walk, photo_intrinsics};
 use super::grammar::{Noun, SceneKind};
 use super::output::GenerateError;
 use super::render::NOTHING;
@@ -129,15 +129,14 @@ impl Scene {
                 train_pixels: 0,
             });
         }
-        let intrinsics = photo_intrinsics();
-        let views = layout.walk(n_views, 0.0, intrinsics);
-        let test_views = layout.walk(N_TEST_VIEWS, 0.37, intrinsics);
+        let views = layout.photos(Walk::Oval, n_views);
+        let test_views = layout.walk(N_TEST_VIEWS, 0.37, photo_intrinsics());
         Self { gaussians, id_of_gaussian, objects, views, test_views, layout }
     }
 
-    /// Takes the photos all over the scene, not on an oval.
-    pub fn roam(&mut self, n_views: u32) {
-        self.views = self.layout.roam(n_views, photo_intrinsics());
+    /// Takes other photos.
+    pub fn photograph(&mut self, walk: Walk, n_views: u32) {
+        self.views = self.layout.photos(walk, n_views);
     }
 
     /// Writes `scene.ply`, `images/`, `transforms.json`; the held-out views in `test/`; and the labels in `gt/`: `masks/` and

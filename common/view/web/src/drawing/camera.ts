@@ -98,12 +98,16 @@ export class Camera {
       this.place(from[0].clone().lerp(to[0], eased), from[1].clone().lerp(to[1], eased));
     }
     if (this.pressed.size > 0) this.moveByKeys(seconds);
+    return this.isUnderWay;
+  }
+
+  private get isUnderWay(): boolean {
     return this.glide !== null || this.pressed.size > 0;
   }
 
   /** Whether it glides, or keys or a pointer move it. */
   get isMoving(): boolean {
-    return this.glide !== null || this.pressed.size > 0 || this.isDragged;
+    return this.isUnderWay || this.isDragged;
   }
 
   private moveByKeys(seconds: number): void {

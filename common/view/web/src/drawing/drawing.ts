@@ -2,11 +2,10 @@
 
 import { SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
-import type { Change } from "../changes";
 import type { Answer, Description, Goal, Photo, Vector } from "../network";
 import { Camera } from "./camera";
 import { Cells } from "./cells";
-import { boxOf, Marks } from "./marks";
+import { boxOf, type Change, Marks } from "./marks";
 import { Frames } from "./frames";
 import { Places } from "./places";
 

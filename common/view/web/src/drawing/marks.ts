@@ -1,8 +1,17 @@
 // What stands over the splat: boxes of answers, the ground grid, photos' frusta, and the robot.
 
 import * as THREE from "three";
-import type { Change } from "../changes";
 import type { Answer, Description, Photo, Vector } from "../network";
+
+/** A thing that changed, as it is listed and drawn. */
+export interface Change {
+  kind: "appeared" | "went" | "moved";
+  id: string;
+  box: { min: Vector; max: Vector };
+  /** Where it was, if it moved. */
+  from?: Vector;
+  to: Vector;
+}
 
 const CHANGE_COLOURS = { appeared: 0x4fd17a, went: 0xe05a4e, moved: 0xf2b134 };
 const CELL_COLOURS = { on_board: 0x8593a3, stale: 0xd99a2b, missing: 0xe05a4e };

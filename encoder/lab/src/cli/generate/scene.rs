@@ -37,9 +37,7 @@ pub struct GenerateSceneArgs {
 pub(super) fn run(args: &GenerateSceneArgs, progress: &dyn Progress) -> Result<Exit> {
     let nouns = grammar::nouns(args.objects.as_deref())?;
     let mut scene = Scene::new(&args.kind, args.seed, args.n_views, &nouns);
-    if args.walk == Walk::Everywhere {
-        scene.roam(args.n_views);
-    }
+    scene.photograph(args.walk, args.n_views);
     let written = scene.write(&args.out, progress)?;
     println!(
         "{} Gaussians, {} things, {} photos in {}",

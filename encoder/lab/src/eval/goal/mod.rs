@@ -15,8 +15,8 @@ use serde_json::Value;
 use slag_common::frames::Aabb;
 use slag_encoder::progress::Progress;
 
-use super::robot::{Prepared, Service};
-use crate::generate::compose::{Layout, Walk, photo_intrinsics};
+use super::robot::{Prepared, Service, flag_value};
+use crate::generate::compose::{Layout, Walk};
 use crate::generate::grammar::{self, SceneKind};
 use asked::{HEIGHT_M, MIN_VISIBLE, REACH_M, SENSOR_HEIGHT_M, STEP_M};
 pub use report::GoalReport;
@@ -57,8 +57,7 @@ pub fn run(settings: &GoalSettings, progress: &dyn Progress) -> Result<GoalRepor
     progress.begin("goal", "scene", (settings.kinds.len() * settings.seeds.len()) as u64, 0);
     for kind in &settings.kinds {
         for seed in &settings.seeds {
-            let name = clap::ValueEnum::to_possible_value(kind).map(|value| value.get_name().to_owned());
-            let name = name.ok_or_else(|| anyhow!("{kind:?} has no name"))?;
+            let name = flag_value(kind)?;
             let dir = settings.out.join(format!("{name}-{seed}"));
             // The objects' outlines are the true ones: places are judged here, not segmentation.
             let encode_flags = &["--occupancy", "--masks", "SCENE/gt/masks"];
@@ -79,10 +78,7 @@ fn judge(settings: &GoalSettings, at: &Prepared<'_>, kind: SceneKind, report: &m
     let nouns = grammar::nouns(None)?;
     let layout = Layout::new(&[kind], at.seed, &nouns, &|_, _| true);
     report.voxels.add(voxels::compare(&layout, &at.dir.join("store"))?);
-    let views = match settings.walk {
-        Walk::Oval => layout.walk(settings.n_views, 0.0, photo_intrinsics()),
-        Walk::Everywhere => layout.roam(settings.n_views, photo_intrinsics()),
-    };
+    let views = layout.photos(settings.walk, settings.n_views);
     let cameras = views.iter().map(|view| view.camera_from_world.inverse().translation);
     let truth = Truth::new(&layout, settings.radius_m, cameras)?;
     let pixels = pixels_of_things(at.dir)?;

@@ -17,7 +17,7 @@ use slag_encoder::progress::Progress;
 pub use report::{Counts, RelationsReport, Way};
 pub use truth::{Asked, TrueThing};
 
-use crate::eval::robot::{Prepared, Service};
+use crate::eval::robot::{Prepared, Service, flag_value};
 use crate::generate::compose::Walk;
 use crate::generate::grammar::SceneKind;
 
@@ -70,8 +70,7 @@ pub fn run(settings: &RelationsSettings, progress: &dyn Progress) -> Result<Rela
     progress.begin("relations", "scene", (settings.kinds.len() * settings.seeds.len()) as u64, 0);
     for kind in &settings.kinds {
         for seed in &settings.seeds {
-            let name = clap::ValueEnum::to_possible_value(kind).map(|value| value.get_name().to_owned());
-            let name = name.ok_or_else(|| anyhow!("{kind:?} has no name"))?;
+            let name = flag_value(kind)?;
             let dir = settings.out.join(format!("{name}-{seed}"));
             let (programs, encode_flags) = (&settings.programs, &[]);
             let scene = Prepared {
