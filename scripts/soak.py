@@ -84,6 +84,8 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60)
     parser.add_argument("--bin", type=pathlib.Path, default=pathlib.Path("target/debug"))
     parser.add_argument("--clients", type=int, default=320)
+    # A question whose answer costs many refusals, which share the cores with it.
+    parser.add_argument("--with", dest="rest", default="kind=clusters&threshold=-1&min_count=1&voxel=0.02&limit=1")
     args = parser.parse_args()
     encoder, edge, lab = (args.bin / name for name in ("slag-encoder", "slag-edge", "slag-lab"))
     work = pathlib.Path(tempfile.mkdtemp())
@@ -118,7 +120,7 @@ def main() -> None:
         checked.look()
         end = time.monotonic() + 60 * args.minutes
         load = subprocess.Popen([str(edge), "bench", "load", "--url", robot.url, "--seconds",
-                                 str(int(60 * args.minutes)), "--clients", str(args.clients),
+                                 str(int(60 * args.minutes)), "--clients", str(args.clients), "--with", args.rest,
                                  "--pid", str(robot.process.pid)], stdout=subprocess.PIPE, text=True)
         filler, turn = args.disk / "filler", 0
         while time.monotonic() < end and load.poll() is None:

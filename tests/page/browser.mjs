@@ -13,12 +13,15 @@ const PICTURES = process.env.SLAG_PAGE_PICTURES;
 const DIST = process.env.SLAG_PAGE_DIST ? new URL("../../common/view/dist/", import.meta.url) : null;
 const SIZE = { width: 1100, height: 640 };
 
+/** Starts Chromium. CHROMIUM: its program; CHROMIUM_GPU: the flags that choose a GPU, instead of those of one in software. */
+export const launch = () => chromium.launch({
+  executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
+  args: ["--no-sandbox", ...(process.env.CHROMIUM_GPU ?? "--use-angle=swiftshader --enable-unsafe-swiftshader").split(" ")],
+});
+
 let browser;
 export async function openBrowser() {
-  browser = await chromium.launch({
-    executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
-    args: ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"],
-  });
+  browser = await launch();
 }
 
 export const closeBrowser = () => browser?.close();

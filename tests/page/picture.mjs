@@ -1,16 +1,10 @@
 // Takes a picture of the page in Chromium: picture.mjs LINK OUT.png [WIDTHxHEIGHT]
 
-import { createRequire } from "node:module";
-
-const fromPage = createRequire(new URL("../../common/view/web/package.json", import.meta.url));
-const { chromium } = fromPage("playwright-core");
+import { launch } from "./browser.mjs";
 
 const [link, out, size = "1280x720"] = process.argv.slice(2);
 const [width, height] = size.split("x").map(Number);
-const browser = await chromium.launch({
-  executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium",
-  args: ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"],
-});
+const browser = await launch();
 try {
   const page = await browser.newPage({ viewport: { width, height }, colorScheme: "dark", reducedMotion: "reduce" });
   page.on("console", (message) => message.type() === "error" && console.error(message.text()));

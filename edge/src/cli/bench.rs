@@ -74,6 +74,9 @@ pub struct LoadArgs {
     /// Text to look for.
     #[arg(long, default_value = "red")]
     text: String,
+    /// The rest of the query string: costlier questions, with which refusals cost less than answers.
+    #[arg(long, value_name = "NAME=VALUE&...", default_value = "limit=10")]
+    with: String,
     /// Queries per second, as a multiple of the service's capacity.
     #[arg(long, value_name = "X", default_value_t = 10.0)]
     overload: f64,
@@ -234,7 +237,7 @@ fn bench_load(args: LoadArgs) -> Result<(), Failure> {
     let text: String = args.text.bytes().map(percent_encoded).collect();
     let options = LoadOptions {
         address: address.ok_or_else(advice)?.to_owned(),
-        path: format!("/query?text={text}"),
+        path: format!("/query?text={text}&{}", args.with),
         n_clients: args.clients as usize,
         overload: args.overload,
         warm_up: WARM_UP,
