@@ -3,6 +3,7 @@
 # another machine's packages also qemu-user-static with binfmt.
 # usage: test-deb.sh amd64|arm64 DEB NEWER_DEB [ROOT]       ROOT: a root file system to use, instead of a new one
 set -eu
+cd "$(dirname "$0")/.."
 [ $# -ge 3 ] || { echo "usage: jetson/test-deb.sh amd64|arm64 DEB NEWER_DEB [ROOT]" >&2; exit 2; }
 arch=$1 deb=$2 newer=$3
 fail() {
@@ -13,11 +14,7 @@ work=$(mktemp -d)
 service=
 trap '[ -z "$service" ] || kill "$service" 2>/dev/null || true; umount "$root/proc" 2>/dev/null || true; rm -rf "$work"' EXIT
 root=${4:-$work/root}
-if [ $# -lt 4 ]; then
-    # The mirror that this machine installs from.
-    site=$(apt-get indextargets --format '$(REPO_URI) $(CODENAME)' 'Created-By: Packages' | awk '$2 == "bookworm" { print $1; exit }')
-    debootstrap --variant=minbase --arch="$arch" bookworm "$root" "$site" >"$work/log" 2>&1 || { tail "$work/log" >&2; fail "debootstrap"; }
-fi
+[ $# -ge 4 ] || jetson/root.sh "$arch" "$root"
 mount -t proc proc "$root/proc"
 inside() {
     chroot "$root" /usr/bin/env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root DEBIAN_FRONTEND=noninteractive "$@"

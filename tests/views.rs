@@ -187,6 +187,64 @@ fn photos_are_added_and_withdrawn() {
     };
     assert!(fails(&["--add", text(&second)]).contains("has a pose already"));
     assert!(fails(&["--drop", "absent.png"]).contains("absent.png"));
+
+    // The splat was trained again: of its Gaussians, backwards, a hundred are gone and fifty have moved by a bit.
+    let scene = room.join("scene.ply");
+    let mut ply = fs_err::read(&scene).expect("reads");
+    let end = b"end_header\n";
+    let head = ply.windows(end.len()).position(|part| part == end).expect("a header") + end.len();
+    let header = String::from_utf8_lossy(&ply[..head]).into_owned();
+    let n: usize = header
+        .lines()
+        .find_map(|line| line.strip_prefix("element vertex "))
+        .and_then(|n| n.parse().ok())
+        .expect("a count");
+    let row = (ply.len() - head) / n;
+    let rows = ply.split_off(head);
+    let kept = rows.chunks(row).rev().skip(100).enumerate();
+    for (i, gaussian) in kept {
+        ply.extend(gaussian);
+        // The lowest byte of its x, the first property.
+        let at = ply.len() - row;
+        ply[at] ^= u8::from(i < 50);
+    }
+    fs_err::write(
+        &scene,
+        header.replace(&format!("vertex {n}\n"), &format!("vertex {}\n", n - 100)).into_bytes(),
+    )
+    .expect("writes");
+    let body = &ply[head..];
+    std::io::Write::write_all(
+        &mut fs_err::OpenOptions::new().append(true).open(&scene).expect("opens"),
+        body,
+    )
+    .expect("writes");
+    let summary = || {
+        let (scene, store) = (room.join("scene.ply"), dir.path().join("grown"));
+        let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views), "--metric"]);
+        command.args([
+            "--masks",
+            text(&masks),
+            "--store",
+            text(&store),
+            "--raster-width",
+            "320",
+            "--name",
+            "room",
+        ]);
+        run_json(command.args(["--keep-views", "--views-limit", "2"]))
+    };
+    let retrained = summary();
+    assert_eq!(retrained["n_views_resumed"], 0);
+    let lost = &retrained["lost_views"];
+    assert_eq!(
+        lost["splat"],
+        serde_json::json!({"n_same": n - 150, "n_before": n, "n_now": n - 100}),
+        "{lost}"
+    );
+    assert_eq!(lost["n_views"], 10);
+    assert!(lost["reason"].as_str().expect("text").contains("no view is taken over"), "{lost}");
+    assert_eq!(summary()["lost_views"], Value::Null);
 }
 
 /// Returns the files in a folder and its subfolders.

@@ -7,9 +7,10 @@ use slag_tests::*;
 #[test]
 fn a_folder_and_two_workers_of_which_one_is_killed_give_the_same_bytes() {
     let scene = Scene::new();
-    let bucket = scene.path("bucket");
+    let (bucket, scratch) = (scene.path("bucket"), scene.path("scratch"));
     let share = |index: &str| {
         let mut worker = worker(text(&bucket));
+        worker.args(["--scratch", text(&scratch)]);
         worker.args(["--index", index, "--of", "2", "--help-after", "0.2", "--threads", "1"]);
         worker
     };
@@ -18,6 +19,7 @@ fn a_folder_and_two_workers_of_which_one_is_killed_give_the_same_bytes() {
     wait_until("a first view", || n_objects(&bucket.join("views")) > 0);
     killed.kill();
     let n_of_killed = n_objects(&bucket.join("views"));
+    assert_eq!(n_objects(&scratch), 1, "a worker that is killed leaves its folder");
     assert!(n_of_killed < N_VIEWS / 2, "it was killed too late");
 
     // Another image model makes other vectors.
@@ -26,10 +28,23 @@ fn a_folder_and_two_workers_of_which_one_is_killed_give_the_same_bytes() {
     let refused = worker_output(&mut other);
     assert!(refused.contains("colours") && refused.contains("--models"), "{refused}");
 
+    let mut interrupted = Running::start(&mut share("1"));
+    let own = format!("slag-worker-{}-", interrupted.id());
+    wait_until("a folder of the next worker alone, without that of the killed one", || {
+        let folders = std::fs::read_dir(&scratch).expect("there").flatten();
+        let names: Vec<_> = folders.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
+        matches!(&names[..], [name] if name.starts_with(&own))
+    });
+    interrupted.signal("TERM");
+    assert_eq!(interrupted.output().status.code(), Some(130));
+    assert_eq!(n_objects(&scratch), 0, "a worker that is interrupted takes its folder with it");
+
+    let n_before = n_objects(&bucket.join("views"));
     let report = Running::start(&mut share("1")).json();
     let summary = coordinator.json();
+    assert_eq!(n_objects(&scratch), 0);
     assert_eq!(summary["n_views"], N_VIEWS);
-    assert_eq!(report["n_views"], N_VIEWS - n_of_killed, "{report}");
+    assert_eq!(report["n_views"], N_VIEWS - n_before, "{report}");
     assert_eq!(report["n_cells"], summary["n_cells"], "{report}");
     scene.assert_same("store");
 

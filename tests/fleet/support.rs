@@ -112,9 +112,14 @@ impl Running {
         self.child = None;
     }
 
+    /// Returns the number of its process.
+    pub fn id(&mut self) -> String {
+        self.child().id().to_string()
+    }
+
     /// Sends it a signal, such as STOP.
     pub fn signal(&mut self, name: &str) {
-        let id = self.child().id().to_string();
+        let id = self.id();
         run(Command::new("kill").args(["-s", name, &id]));
     }
 

@@ -51,6 +51,8 @@ pub(super) fn lines(
         let (voxel_m, secs) = (found.voxel_m, found.secs);
         format!("places     {free} voxels of {voxel_m} m free, {occupied} occupied; {bytes} in {secs:.1} s\n")
     });
+    let lost =
+        summary.lost_views.as_ref().map_or(String::new(), |lost| format!("kept       {}\n", lost.reason));
     let most = most_spent(summary);
     let images_on = summary.images_on.as_ref().map_or(String::new(), |on| format!("images on  {on}\n"));
     let of_target = expected.map_or(String::new(), |e| {
@@ -68,7 +70,7 @@ pub(super) fn lines(
     format!(
         "{of_target}published  generation {} in {}\n\
          Gaussians  {} ({} without evidence, {} unusable)\n\
-         views      {} of {} ({} resumed, {} without masks)\n{coverage}{skipped}{images_on}\
+         views      {} of {} ({} resumed, {} without masks)\n{lost}{coverage}{skipped}{images_on}\
          masks      {} in {} regions, {} contributions\n\
          cells      {} with {} centroids\n\
          {objects}{occupancy}shards     {sizes}\n{most}\

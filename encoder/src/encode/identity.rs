@@ -7,6 +7,7 @@ use slag_common::{Gaussians, Hash32, Intrinsics, View};
 use super::engines::Engines;
 use super::error::EncodeError;
 use super::inputs::Inputs;
+use super::kept::InputsRecord;
 use super::settings::{EncodeSettings, LONG_BORDERS, MAX_RASTER_WIDTH_PX, ViewSettings};
 use crate::cells::CellLimits;
 use crate::ingest;
@@ -19,6 +20,8 @@ const REGIONS_VERSION: u32 = 3;
 pub(super) struct Identities {
     /// Hash of everything on which the contributions of all views depend.
     pub(super) of_scene: Hash32,
+    /// Its two parts.
+    pub(super) inputs: InputsRecord,
     /// `[n_views]`: hash of everything on which the contributions of a view depend, in the order of the views. That
     /// includes `of_scene`, but no other view: photos can be added and withdrawn.
     pub(super) of_view: Vec<Hash32>,
@@ -69,7 +72,11 @@ pub(super) fn identities(
     segmenter: &dyn Segmenter,
     inputs: &Inputs,
 ) -> Result<Identities, EncodeError> {
-    let of_scene = of_scene(&settings.view, settings.cells.limits, engines, segmenter, &inputs.scene)?;
+    let scene = hash_scene(&inputs.scene);
+    let of =
+        |scene| hash_of(&scene_identity(&settings.view, settings.cells.limits, engines, segmenter, scene));
+    let of_scene = of(scene)?;
+    let record = InputsRecord { scene, settings: of(Hash32([0; 32]))? };
     let of_view = |view: &View| -> Result<Hash32, EncodeError> {
         hash_of(&ViewIdentity {
             of_scene,
@@ -81,7 +88,7 @@ pub(super) fn identities(
         })
     };
     let of_view = inputs.views.par_iter().map(of_view).collect::<Result<_, _>>()?;
-    Ok(Identities { of_scene, of_view })
+    Ok(Identities { of_scene, inputs: record, of_view })
 }
 
 /// Returns the hash of everything on which the contributions of all views depend.
@@ -95,8 +102,18 @@ pub(crate) fn of_scene(
     segmenter: &dyn Segmenter,
     scene: &Gaussians,
 ) -> Result<Hash32, EncodeError> {
+    hash_of(&scene_identity(settings, cells, engines, segmenter, hash_scene(scene)))
+}
+
+fn scene_identity<'a>(
+    settings: &'a ViewSettings,
+    cells: CellLimits,
+    engines: &Engines<'_>,
+    segmenter: &dyn Segmenter,
+    scene: Hash32,
+) -> SceneIdentity<'a> {
     let Engines { models, session, perturbation, .. } = engines;
-    hash_of(&SceneIdentity {
+    SceneIdentity {
         program: env!("CARGO_PKG_VERSION"),
         regions: (REGIONS_VERSION, LONG_BORDERS, MAX_RASTER_WIDTH_PX),
         encoder: Hash32(models.encoder_id().hash()),
@@ -106,10 +123,10 @@ pub(crate) fn of_scene(
         },
         segmenter: segmenter.identity(),
         perturbation: perturbation.map(|perturbation| perturbation.identity()),
-        scene: hash_scene(scene),
+        scene,
         settings,
         cells,
-    })
+    }
 }
 
 fn hash_of(identity: &impl Serialize) -> Result<Hash32, EncodeError> {

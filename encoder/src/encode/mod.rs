@@ -26,6 +26,7 @@ mod here;
 mod identity;
 mod inputs;
 mod job;
+mod kept;
 mod pipeline;
 mod plan;
 mod preset;
@@ -50,6 +51,7 @@ pub use engines::{Engines, Perturbation};
 pub use error::EncodeError;
 pub use inputs::count_inputs;
 pub use job::{JobStatus, ViewCost, job_status, view_costs};
+pub use kept::{LostViews, SharedGaussians};
 pub use preset::{Choices, Preset};
 pub use report::{CellReport, EncodeSummary, GpuReport, PhaseReport, SkippedView, StageReport, ViewsReport};
 pub use settings::{

@@ -2,7 +2,7 @@
 
 use std::time::Instant;
 
-use slag_common::View;
+use slag_common::{Hash32, View};
 use slag_models::SessionOptions;
 
 use super::context::RunContext;
@@ -11,7 +11,8 @@ use super::engines::Engines;
 use super::error::EncodeError;
 use super::identity;
 use super::inputs::{self, Inputs};
-use super::job::Job;
+use super::job::{Job, job_status};
+use super::kept::{self, InputsRecord, LostViews};
 use super::settings::{EncodeSettings, Masks, Regions, RunSettings, ViewOrder, ViewSettings};
 use super::view::ViewTools;
 use crate::cells::CellSplit;
@@ -36,6 +37,9 @@ pub(crate) struct Plan<'a> {
     pub(super) memory: MemoryPlan,
     pub(crate) segmenter: Box<dyn Segmenter>,
     pub(crate) job: Job<'a>,
+    pub(super) inputs_record: InputsRecord,
+    /// Kept views that are done anew.
+    pub(super) lost_views: Option<LostViews>,
     pub(super) scene: Box<dyn LoadedScene + 'a>,
     /// The views to use, as numbers in the order in which they are taken.
     pub(crate) order: Vec<usize>,
@@ -115,6 +119,7 @@ fn make_plan<'a>(
     if only_kept && !Job::is_kept(store, ids.of_scene)? {
         return Err(EncodeError::NotKept { path: store.dir().to_owned() });
     }
+    let lost_views = lost_views(store, ids.of_scene, &ids.inputs, inputs, context)?;
     let job = Job::open(store, ids.of_scene, id_of_view, settings.run.restart)?;
     let scene = context.time("raster", || context.install(|| engines.rasterizer.load(&inputs.scene)))?;
     let start = Instant::now();
@@ -129,11 +134,32 @@ fn make_plan<'a>(
         memory,
         segmenter,
         job,
+        inputs_record: ids.inputs,
+        lost_views,
         scene,
         order,
         coverage,
         coverage_secs,
     })
+}
+
+/// Returns which kept views cannot be taken over, and says so; an encode that is unfinished is refused later, not replaced.
+fn lost_views(
+    store: &Store,
+    of_scene: Hash32,
+    record: &InputsRecord,
+    inputs: &Inputs,
+    context: &RunContext<'_>,
+) -> Result<Option<LostViews>, EncodeError> {
+    let kept = job_status(store)?.filter(|status| status.n_views > 0);
+    let Some(kept) = kept.filter(|status| status.is_published) else { return Ok(None) };
+    if Job::is_kept(store, of_scene)? {
+        return Ok(None);
+    }
+    let job = store.job_dir()?;
+    let lost = context.install(|| kept::lost(&job, kept.n_views, record, &inputs.scene));
+    tracing::warn!("{}", lost.reason);
+    Ok(Some(lost))
 }
 
 /// Reserves what is known before the first view; what depends on masks and contributions is reserved once the views

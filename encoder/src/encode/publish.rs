@@ -11,6 +11,7 @@ use super::cells::{BuiltCells, Counts};
 use super::context::RunContext;
 use super::error::EncodeError;
 use super::executor::Executor;
+use super::kept;
 use super::plan::Plan;
 use super::report::{CellReport, EncodeSummary};
 use super::text_model::carry;
@@ -40,7 +41,11 @@ pub(super) fn publish(
     // With views left to do the contributions stay: the next encode goes on from them.
     let has_open = views.records.len() + views.n_failed < plan.inputs.views.len();
     match plan.settings.run.keep_views || has_open {
-        true => plan.job.keep_published()?,
+        true => {
+            let job = plan.store.job_dir()?;
+            context.install(|| kept::remember(&job, &plan.inputs_record, &plan.inputs.scene))?;
+            plan.job.keep_published()?;
+        }
         false => plan.job.finish()?,
     }
     plan.store.prune()?;
@@ -106,6 +111,7 @@ fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: 
         coverage: views.coverage,
         coverage_secs: plan.coverage_secs,
         n_views_resumed: views.n_resumed,
+        lost_views: plan.lost_views.clone(),
         n_views_without_masks,
         skipped_views: views.skipped.clone(),
         n_masks,

@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 
 use super::coverage::CoverageReport;
+use super::kept::LostViews;
 use super::settings::ViewOrder;
 use crate::lanes::GpuLoad;
 use crate::objects::ObjectsReport;
@@ -129,6 +130,8 @@ pub struct EncodeSummary {
     pub coverage_secs: f64,
     /// Used views that an earlier run had finished.
     pub n_views_resumed: usize,
+    /// Kept views that were done anew, and why; absent where none were kept, or those could be taken over.
+    pub lost_views: Option<LostViews>,
     /// Views without any mask: no mask file, or no mask that is large enough.
     pub n_views_without_masks: usize,
     /// Views that were left out.

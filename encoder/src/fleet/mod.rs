@@ -24,6 +24,7 @@
 //! | `share`, `queue` | which views and cells a worker takes: its share, or what JetStream hands out |
 //! | `run`, `pulse` | the runs in a bucket, their fence, and whether their coordinator lives |
 //! | `documents`, `view_object`, `scene_object`, `merged` | what lies in the bucket |
+//! | `run_folder` | a worker's folder for photos in work |
 //! | `inputs` | photos and masks on their way to and from the bucket |
 
 mod cells;
@@ -37,6 +38,7 @@ mod prepared;
 mod pulse;
 mod queue;
 mod run;
+mod run_folder;
 mod scene_object;
 mod share;
 mod view_object;

@@ -1,7 +1,7 @@
 //! A worker: waits for a run, does views until none is left, then cells, until the run ends.
 
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -16,6 +16,7 @@ use super::prepared::Prepared;
 use super::pulse::Pulse;
 use super::queue::{Queue, QueueSettings};
 use super::run::{Run, State};
+use super::run_folder::RunFolder;
 use super::share::Share;
 use super::views::ViewWork;
 use crate::blobs::Bucket;
@@ -110,25 +111,6 @@ pub fn work(
     Ok(report)
 }
 
-/// A folder that goes with the run.
-struct RunFolder(PathBuf);
-
-impl RunFolder {
-    fn make(parent: &Path, run: Run) -> Result<Self, FleetError> {
-        let folder = parent.join(format!("slag-worker-{}-{}", std::process::id(), run.0));
-        fs_err::create_dir_all(&folder)?;
-        Ok(Self(folder))
-    }
-}
-
-impl Drop for RunFolder {
-    fn drop(&mut self) {
-        if let Err(error) = fs_err::remove_dir_all(&self.0) {
-            tracing::warn!("{error}");
-        }
-    }
-}
-
 fn work_for(
     bucket: &Arc<Bucket>,
     (run, plan): (Run, RunPlan),
@@ -139,7 +121,7 @@ fn work_for(
 ) -> Result<(), FleetError> {
     let folder = RunFolder::make(&settings.folder, run)?;
     let of_scene = plan.of_scene;
-    let prepared = Prepared::fetch(bucket, (run, plan), &folder.0, settings.segmenter.as_ref(), context)?;
+    let prepared = Prepared::fetch(bucket, (run, plan), folder.path(), settings.segmenter.as_ref(), context)?;
     let segmenter = segmenter_of(&prepared.settings, &settings.gpus, engines)?;
     prepared.check(engines, segmenter.as_ref(), context)?;
     let memory = prepared.memory(settings.memory_bytes, settings.n_threads, engines.models.dim())?;

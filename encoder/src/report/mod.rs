@@ -44,6 +44,10 @@ pub fn of_encode(scene: &str, summary: &EncodeSummary, watch: &Watch) -> serde_j
         "{} views have no mask; {} Gaussians are seen by no mask and have no embedding; {} are unusable.",
         summary.n_views_without_masks, summary.n_without_evidence, summary.n_rejected
     ));
+    if let Some(lost) = &summary.lost_views {
+        page.heading("Kept views");
+        page.paragraph(&lost.reason);
+    }
     page.heading("Map");
     page.drawing(&map::svg(&work), "Seen from above: cells, and the cameras by their number of masks");
     let pictures = watch.pictures_of_report();
