@@ -4,7 +4,9 @@
 # usage: root.sh amd64|arm64 ROOT [PACKAGE,PACKAGE...]
 set -eu
 [ $# -ge 2 ] || { echo "usage: jetson/root.sh amd64|arm64 ROOT [PACKAGE,...]" >&2; exit 2; }
-arch=$1 root=$2 packages=${3:-}
+arch=$1 packages=${3:-}
+mkdir -p "$2"
+root=$(realpath "$2")
 site=$(apt-get indextargets --format '$(REPO_URI) $(CODENAME)' 'Created-By: Packages' | awk '$2 == "bookworm" { print $1; exit }')
 log=$(mktemp)
 trap 'rm -f "$log"' EXIT
