@@ -71,7 +71,16 @@ const PHOTO = { name: "roof/12.jpg", position_m: [1.5, 1.5, 1.2], rotation_xyzw:
 
 test("a camera without its picture can be clicked and stood in", () => opened(async (page) => {
   await drawn(page);
+  await page.uncheck("#show-grid");
   await page.check("#show-photos");
+  // A frustum as long as a fortieth of the scene's radius: its forward z is -y of the world, its down y is z.
+  const green = await pixels(page, PANEL_PX, isColour([0x6f, 0xbf, 0x8b]));
+  const length = Math.hypot(8, 8, 1.1) / 2 / 40;
+  for (const [x, y] of [[-1, -1], [1, -1], [1, 1], [-1, 1]]) {
+    const offset = [(x * PHOTO.width_px) / 2 / PHOTO.focal_px, -1, (y * PHOTO.height_px) / 2 / PHOTO.focal_px];
+    const [u, v] = project(PHOTO.position_m.map((value, i) => value + length * offset[i]));
+    assert.ok(green.some(([px, py]) => Math.hypot(px + 0.5 - u, py + 0.5 - v) < 2), `no corner at ${u}, ${v}`);
+  }
   const [u, v] = project(PHOTO.position_m);
   await page.mouse.click(u, v);
   await page.locator("#details").getByText("roof/12.jpg").waitFor();
