@@ -17,7 +17,7 @@ container=
 [ $# -ge 2 ] || { echo "usage: jetson/boot-deb.sh [--container] amd64|arm64 DEB [ROOT]" >&2; exit 2; }
 arch=$1 deb=$2
 PACKAGES=systemd,systemd-sysv,curl
-BOOT_SECS=300
+BOOT_SECS=600
 if [ -z "$container" ]; then
     PACKAGES=$PACKAGES,linux-image-$arch,initramfs-tools
     BOOT_SECS=1500
