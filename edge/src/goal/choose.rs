@@ -11,12 +11,14 @@ use super::sight;
 use super::space::Window;
 use super::surroundings::Around;
 
-/// Gaussians of a thing that are looked at.
-pub const SAMPLES: usize = 128;
+/// Points of a thing's surface that are looked at.
+const SAMPLES: usize = 128;
 /// Edge of the squares of which only the cheapest candidate is looked at closely, metres.
 const SQUARE_M: f64 = 0.2;
 /// Most candidates that are looked at closely: half of them the cheapest, half spread over the others.
 const MAX_CANDIDATES: usize = 256;
+/// Most candidates of any square that are looked at if none of those sees the thing, spread over all.
+const MAX_MORE: usize = 2048;
 /// Least distance between two poses of a reply, metres.
 const APART_M: f64 = 0.5;
 /// Clearance beyond the robot's radius above which more is worth nothing, metres.
@@ -44,10 +46,16 @@ pub fn choose(around: &Around<'_>, request: &GoalRequest, points: &[DVec3]) -> R
     if reached.is_empty() {
         return Err(missing(around, &near));
     }
-    let goals: Vec<Goal> = sifted(window, reached)
-        .into_par_iter()
-        .filter_map(|candidate| goal(around, request, points, candidate))
-        .collect();
+    let target = Target::new(window, points);
+    let looked_at = |candidates: Vec<Candidate>| -> Vec<Goal> {
+        candidates.into_par_iter().filter_map(|of| goal(around, request, &target, of)).collect()
+    };
+    let mut goals = looked_at(sifted(window, reached.clone()));
+    // Past the edge of what a thing stands on it is often seen from a strip that is narrower than a square.
+    if goals.iter().all(|goal| goal.visible_share < request.min_visible) {
+        let step = reached.len().div_ceil(MAX_MORE);
+        goals = looked_at(reached.into_iter().step_by(step).collect());
+    }
     if goals.is_empty() {
         return Err(NoGoal::Unreachable);
     }
@@ -126,27 +134,42 @@ fn sifted(window: &Window, candidates: Vec<Candidate>) -> Vec<Candidate> {
     sorted
 }
 
+/// The thing to stand at.
+struct Target<'a> {
+    /// Points of its surface.
+    points: &'a [DVec3],
+    /// Those that are looked at.
+    samples: Vec<DVec3>,
+    thing: sight::Thing,
+}
+
+impl<'a> Target<'a> {
+    fn new(window: &Window, points: &'a [DVec3]) -> Self {
+        let step = points.len().div_ceil(SAMPLES).max(1);
+        let samples = points.iter().copied().step_by(step).collect();
+        Self { points, samples, thing: sight::Thing::new(window, points) }
+    }
+}
+
 /// Returns the pose at a candidate; `None` if the thing is out of reach after all.
-fn goal(around: &Around<'_>, request: &GoalRequest, points: &[DVec3], of: Candidate) -> Option<Goal> {
+fn goal(around: &Around<'_>, request: &GoalRequest, target: &Target<'_>, of: Candidate) -> Option<Goal> {
+    let Target { points, samples, thing } = target;
     let window = &around.space.window;
     let [x, y] = window.centre_of(of.cell);
-    let distance_m = points.iter().map(|p| (p.x - x).hypot(p.y - y)).fold(f64::INFINITY, f64::min);
+    let squared = |p: &DVec3| (p.x - x).powi(2) + (p.y - y).powi(2);
+    let distance_m = points.iter().map(squared).fold(f64::INFINITY, f64::min).sqrt();
     if distance_m > request.reach_m {
         return None;
     }
     let position_in_world = DVec3::new(x, y, around.floor_height(of.cell)?);
     let sensor_in_world = position_in_world + DVec3::Z * request.sensor_height_m;
-    // A sensor below the thing looks at the board or the table that carries it, and the lowest voxels belong to both.
-    let bottom = points.iter().map(|point| point.z).fold(f64::INFINITY, f64::min);
-    let from_below = sensor_in_world.z < bottom;
-    let least_z = if from_below { bottom + sight::TOLERANCE * window.voxel } else { f64::NEG_INFINITY };
-    let seen: Vec<DVec3> = points
+    let seen: Vec<DVec3> = samples
         .iter()
         .copied()
-        .filter(|point| point.z >= least_z && sight::sees(around.space, sensor_in_world, *point))
+        .filter(|point| sight::sees(around.space, thing, sensor_in_world, *point))
         .collect();
-    let visible_share = seen.len() as f64 / points.len() as f64;
-    let looked_at = if seen.is_empty() { points } else { &seen[..] };
+    let visible_share = seen.len() as f64 / samples.len() as f64;
+    let looked_at = if seen.is_empty() { samples } else { &seen };
     let middle = looked_at.iter().sum::<DVec3>() / looked_at.len() as f64;
     let yaw_rad = (middle.y - y).atan2(middle.x - x);
     Some(Goal {

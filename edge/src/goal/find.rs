@@ -4,7 +4,7 @@ use glam::DVec3;
 use slag_common::objects::public_id;
 use slag_common::occupancy::Occupancy;
 
-use super::choose::{SAMPLES, choose};
+use super::choose::choose;
 use super::error::GoalError;
 use super::reply::{Goal, GoalMiss, GoalReply, MissedThing, NoGoal, TargetThing};
 use super::request::{GoalRequest, GoalTarget};
@@ -15,6 +15,9 @@ use crate::store::Snapshot;
 
 /// Things that are tried, best first.
 const MAX_THINGS: usize = 5;
+/// Most points of a thing's surface.
+const MAX_POINTS: usize = 4096;
+
 /// Finds places to stand near a thing. Blocks for tens of milliseconds.
 ///
 /// # Errors
@@ -48,7 +51,7 @@ pub fn find(engine: &Engine, request: &GoalRequest, budget: &Budget) -> Result<G
     };
     let around = seen.around(start);
     for (id, thing) in things {
-        let points = engine.object_points(&snapshot, id, SAMPLES);
+        let points = engine.object_points(&snapshot, id, MAX_POINTS);
         match choose(&around, request, &points) {
             Ok(mut goals) => {
                 for goal in &mut goals {

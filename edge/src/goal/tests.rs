@@ -162,6 +162,59 @@ fn nothing_is_seen_through_what_a_thing_stands_on() {
     stand(&[empty.view()], &request, START, &on_board).expect("places are known").expect("poses");
 }
 
+/// A plate on a wall, from below: the line to it goes along the wall, through voxels that wall and plate share, for longer than
+/// two edges. A bump of the wall below it hides it.
+#[test]
+fn what_hangs_on_a_wall_is_seen_from_below() {
+    let wall = |p: DVec3| (p.x > 4.9 && p.x < 5.1).then_some(At::Solid);
+    let on_wall: Vec<DVec3> = (0..9)
+        .flat_map(|y| {
+            (0..9).map(move |z| DVec3::new(4.98, 2.8 + 0.05 * f64::from(y), 1.0 + 0.05 * f64::from(z)))
+        })
+        .collect();
+    let request = GoalRequest { reach_m: 0.45, ..GoalRequest::new(GoalTarget::Object(1)) };
+    let world = packed(hall(wall));
+    let found = stand(&[world.view()], &request, START, &on_wall).expect("places are known").expect("poses");
+    // Lines to its lower part enter the wall below it.
+    assert!(found[0].visible_share > 0.3, "{found:?}");
+    let bump =
+        |p: DVec3| wall(p).or_else(|| inside(p, [4.7, 2.0, 0.75], [4.9, 4.0, 0.85]).then_some(At::Solid));
+    let world = packed(hall(bump));
+    let found = stand(&[world.view()], &request, START, &on_wall).expect("places are known");
+    assert_eq!(found, Err(NoGoal::NotVisible));
+}
+
+/// A pole behind a screen with a slit of one voxel: it is seen from a strip of 10 cm, and the cheapest place of its square is not
+/// on the strip, as the robot comes from beside it.
+#[test]
+fn a_narrow_strip_from_which_a_thing_is_seen_is_found() {
+    let screen = |slit: bool| {
+        move |p: DVec3| {
+            let d = (p.x - 3.0).abs().max((p.y - 3.0).abs());
+            let is_slit = slit && p.x < 2.7 && inside(p, [2.0, 3.1, 0.0], [2.7, 3.15, 1.5]);
+            match () {
+                () if d < 0.35 && p.z > 0.0 => Some(At::Free),
+                () => (d > 0.35 && d < 0.4 && !is_slit).then_some(At::Solid),
+            }
+        }
+    };
+    let pole: Vec<DVec3> = (2..16).map(|k| DVec3::new(3.0, 3.125, 0.05 * f64::from(k))).collect();
+    let world = |slit| {
+        let with_screen = screen(slit);
+        packed(move |p: DVec3| match hall(|_| None)(p) {
+            At::Unseen => At::Unseen,
+            at => with_screen(p).unwrap_or(at),
+        })
+    };
+    let found = |slit| {
+        let request = GoalRequest::new(GoalTarget::Object(1));
+        stand(&[world(slit).view()], &request, DVec3::new(0.6, 0.6, 0.0), &pole).expect("places are known")
+    };
+    let seeing = found(true).expect("poses");
+    assert!(seeing.iter().all(|goal| (goal.position_in_world.y - 3.125).abs() < 0.1), "{seeing:?}");
+    assert_eq!(found(false), Err(NoGoal::NotVisible));
+}
+
 #[test]
 fn steps_and_slopes_count() {
     let ramp = |rise: f64| {

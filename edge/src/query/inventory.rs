@@ -1,16 +1,19 @@
 //! The things on board, and the area that they lie in.
 
+use std::cmp::Reverse;
+
 use glam::DVec3;
 use serde::Serialize;
 use slag_common::frames::{Aabb, Geographic};
 
 use super::answers::Evidence;
+use super::cluster::{Grouping, cluster};
 use super::engine::Engine;
 use super::extent::Extent;
 use super::objects::{self, FoundObject};
 use super::oriented::OrientedBox;
-use super::scene::{Scene, alignment};
-use crate::score::{Budget, Region};
+use super::scene::{Scene, alignment, default_voxel};
+use crate::score::{Budget, Region, Run};
 use crate::store::Snapshot;
 
 /// Name of the frame of every position: the scene's world frame (`docs/api.md`).
@@ -84,17 +87,34 @@ impl Engine {
         self.on_scene(snapshot, &Budget::default(), |_, scene| Some(describe(scene, number_of(scene, id)?)))
     }
 
-    /// Returns the positions of Gaussians of an object on board inside its box, evenly spread over their order, at most `limit`.
+    /// Returns the positions of Gaussians of an object on board, evenly spread over their order, at most `limit`: those of its
+    /// largest cluster inside the cluster's box. Masks give things strays, of which some objects have nearly as many.
     pub fn object_points(&self, snapshot: &Snapshot, id: u64, limit: usize) -> Vec<DVec3> {
         self.on_scene(snapshot, &Budget::default(), |_, scene| {
             let Some(object) = number_of(scene, id) else { return Vec::new() };
-            let bounds = objects::record(scene, object).bounds();
-            let mut points = objects::all_points(scene, object);
-            points.retain(|point| bounds.contains(*point));
+            let points: Vec<DVec3> = largest_cluster(scene, object);
             let step = points.len().div_ceil(limit.max(1)).max(1);
             points.into_iter().step_by(step).collect()
         })
     }
+}
+
+pub(super) fn largest_cluster(scene: &Scene<'_>, object: usize) -> Vec<DVec3> {
+    let runs = objects::members(scene, object, &Region::default(), 1.0);
+    let grouping = Grouping {
+        voxel: default_voxel(scene.manifest),
+        min_count: 1,
+        threshold: 1.0,
+        alignment: alignment(scene.manifest),
+        with_members: true,
+    };
+    let clusters = cluster(scene.shards, &runs, &grouping, &Budget::default()).clusters;
+    let Some(largest) = clusters.into_iter().max_by_key(|of| (of.n_gaussians, Reverse(of.first))) else {
+        return Vec::new();
+    };
+    let point = |run: &Run, index: u32| scene.shards[run.shard as usize].position_in_world(index as usize);
+    let all = largest.members.iter().flat_map(|run| (run.start..run.end).map(move |index| point(run, index)));
+    all.filter(|point| largest.extent.box_in_world.contains(*point)).collect()
 }
 
 /// Returns the number of an object in the index.

@@ -112,12 +112,6 @@ pub fn oriented_box(
     OrientedBox::around(&points, |point| bounds.contains(*point), alignment, TRIMMED)
 }
 
-/// Returns the positions of an object's Gaussians on board.
-pub fn all_points(scene: &Scene<'_>, object: usize) -> Vec<DVec3> {
-    let everywhere = Region::default();
-    scene.index.parts(object).iter().flat_map(|part| points(scene, *part, &everywhere)).collect()
-}
-
 /// Returns an object's Gaussians in a region, by shard and index. `score`: the object's.
 pub fn members(scene: &Scene<'_>, object: usize, region: &Region, score: f32) -> Vec<Run> {
     let mut members: Vec<Run> = Vec::new();

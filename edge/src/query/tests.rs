@@ -32,21 +32,25 @@ fn ask_about(
     let (mut request, mut manifest) = (QueryRequest::new("thing"), manifest_of(built, 7));
     edit(&mut request, &mut manifest);
     request.check().expect("a sound request");
+    on_scene_of(built, &manifest, |scene| {
+        let mut scratch = Scratch::default();
+        let answers = answer(&mut scratch, scene, questions, &request).expect("answers");
+        assert!(
+            answers.iter().all(|answers| (answers.kind == AnswerKind::Objects) == scratch.is_untouched())
+        );
+        answers
+    })
+}
+
+fn on_scene<T>(built: &[BuiltShard], work: impl FnOnce(&Scene<'_>) -> T) -> T {
+    on_scene_of(built, &manifest_of(built, 7), work)
+}
+
+fn on_scene_of<T>(built: &[BuiltShard], manifest: &Manifest, work: impl FnOnce(&Scene<'_>) -> T) -> T {
     let shards: Vec<_> = built.iter().map(BuiltShard::view).collect();
     let objects: Vec<_> = built.iter().map(|shard| shard.layout.objects(&shard.bytes)).collect();
     let (index, fetched) = (ObjectIndex::new(&objects), (DVec3::ZERO, 50.0));
-    let scene = Scene {
-        shards: &shards,
-        objects: &objects,
-        index: &index,
-        manifest: &manifest,
-        fetched,
-        bad_cells: &[],
-    };
-    let mut scratch = Scratch::default();
-    let answers = answer(&mut scratch, &scene, questions, &request).expect("answers");
-    assert!(answers.iter().all(|answers| (answers.kind == AnswerKind::Objects) == scratch.is_untouched()));
-    answers
+    work(&Scene { shards: &shards, objects: &objects, index: &index, manifest, fetched, bad_cells: &[] })
 }
 
 fn described(built: &[BuiltShard], answers: &Answers, near: Option<DVec3>) -> Vec<GaussianAnswer> {

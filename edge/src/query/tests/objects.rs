@@ -136,3 +136,12 @@ fn objects_abstain_and_keep_to_the_region() {
     assert!(answers.reason.is_some_and(|r| r.detail.contains("kind=clusters")));
     assert_eq!(ask(&yard(), |_, _| ()).kind, AnswerKind::Clusters);
 }
+
+/// By hand: of object 21's Gaussians 30 lie from 20.10 to 20.39, and 12 strays 1.6 m away.
+#[test]
+fn points_of_an_object_are_those_of_its_largest_cluster() {
+    let built = scene_of_objects();
+    let points = on_scene(&built, |scene| inventory::largest_cluster(scene, 0));
+    let inside = |point: &DVec3| point.x > 20.095 && point.x < 20.395;
+    assert!((28..=30).contains(&points.len()) && points.iter().all(inside), "{points:?}");
+}

@@ -2,17 +2,17 @@
 //! robot's program gives for each thing.
 
 mod asked;
+mod labels;
 mod report;
 mod truth;
 mod voxels;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow};
 use glam::DVec3;
 use serde_json::Value;
-use slag_common::frames::Aabb;
 use slag_encoder::progress::Progress;
 
 use super::robot::{Prepared, Service, flag_value};
@@ -25,8 +25,6 @@ use truth::Truth;
 
 /// Things with fewer pixels over all photos are not asked about.
 const MIN_PIXELS: u64 = 4000;
-/// Least intersection over union of the box of an object on board and that of a thing.
-const MIN_IOU: f64 = 0.1;
 /// What to judge on.
 #[derive(Clone, Debug)]
 pub struct GoalSettings {
@@ -81,26 +79,15 @@ fn judge(settings: &GoalSettings, at: &Prepared<'_>, kind: SceneKind, report: &m
     let views = layout.photos(settings.walk, settings.n_views);
     let cameras = views.iter().map(|view| view.camera_from_world.inverse().translation);
     let truth = Truth::new(&layout, settings.radius_m, cameras)?;
-    let pixels = pixels_of_things(at.dir)?;
+    let labels = labels::read(&at.dir.join("scene"), &at.dir.join("store"))?;
     let service = Service::start(&at.program("slag-edge"), &["--cache"], &at.dir.join("cache"))?;
     let start = truth.start();
-    let things = service.get("/v1/objects?limit=1000")?;
-    let mut on_board: Vec<(String, Aabb)> = Vec::new();
-    for object in things["objects"].as_array().into_iter().flatten() {
-        let corner = |name: &str| serde_json::from_value::<DVec3>(object[name].clone());
-        let bounds = Aabb { min: corner("box_min_in_world")?, max: corner("box_max_in_world")? };
-        on_board.push((object["id"].as_str().unwrap_or_default().to_owned(), bounds));
-    }
     for (index, placed) in layout.placed.iter().enumerate().filter(|(_, placed)| !placed.shell) {
-        if pixels.get(index).is_none_or(|n| *n < MIN_PIXELS) {
-            continue;
-        }
+        let Some(label) = labels.get(index).filter(|label| label.n_pixels >= MIN_PIXELS) else { continue };
         let is_reachable = truth.is_reachable(index);
-        let overlap = |(_, of): &(String, Aabb)| iou(of, &placed.bounds);
-        let object = on_board.iter().max_by(|a, b| overlap(a).total_cmp(&overlap(b)));
-        let verdict = match object.filter(|object| overlap(object) >= MIN_IOU) {
+        let verdict = match &label.object {
             None => Verdict::NoObject,
-            Some((id, _)) => {
+            Some(id) => {
                 let asked = Instant::now();
                 let path = format!(
                     "/v1/goal?id={id}&near={},{},0&radius_m={}&reach_m={REACH_M}&sensor_height_m={SENSOR_HEIGHT_M}&height_m={HEIGHT_M}&step_m={STEP_M}&min_visible={MIN_VISIBLE}",
@@ -113,7 +100,8 @@ fn judge(settings: &GoalSettings, at: &Prepared<'_>, kind: SceneKind, report: &m
         };
         let noun = &nouns[placed.noun].name;
         if settings.lists_faults && verdict.is_fault(is_reachable) {
-            tracing::warn!("{}-{} {noun} (reachable: {is_reachable}): {verdict:?}", at.kind, at.seed);
+            let id = label.object.as_deref().unwrap_or("no object");
+            tracing::warn!("{}-{} {noun} {id} (reachable: {is_reachable}): {verdict:?}", at.kind, at.seed);
         }
         report.count(settings.radius_m, is_reachable, &verdict);
     }
@@ -133,19 +121,4 @@ fn verdict(truth: &Truth<'_>, thing: usize, reply: &Value) -> Result<Verdict> {
     let (clearance_m, is_reached) = truth.at(position);
     let (shown, height_error_m) = (truth.shown(thing, sensor), position.z.abs());
     Ok(Verdict::Pose { clearance_m, is_reached, shown, height_error_m })
-}
-
-/// Returns the pixels that show each thing, in the order of the layout.
-fn pixels_of_things(dir: &Path) -> Result<Vec<u64>> {
-    let labels: Value = serde_json::from_slice(&fs_err::read(dir.join("scene/gt/instances.json"))?)?;
-    let list = |name: &str| labels[name].as_array().cloned().unwrap_or_default();
-    // Shell and things are listed apart, each in the order of the layout; shell nouns are placed first.
-    let all = [list("background"), list("instances")].concat();
-    Ok(all.iter().map(|thing| thing["train_pixels"].as_u64().unwrap_or(0)).collect())
-}
-
-fn iou(a: &Aabb, b: &Aabb) -> f64 {
-    let shared = (a.max.min(b.max) - a.min.max(b.min)).max(DVec3::ZERO).element_product();
-    let both = a.size().element_product() + b.size().element_product() - shared;
-    if both > 0.0 { shared / both } else { 0.0 }
 }
