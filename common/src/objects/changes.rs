@@ -248,5 +248,6 @@ mod tests {
         let found = all(row(0, 0.0), row(1000, 3.0));
         assert_eq!((found.moved.len(), found.went.len(), found.appeared.len()), (100, 0, 0));
         assert!(found.moved.iter().all(|moved| moved.to.id == moved.from.id + 1000));
+        assert!(found.moved.is_sorted_by_key(|moved| moved.from.id));
     }
 }

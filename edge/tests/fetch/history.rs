@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use slag_common::Hash32;
 use slag_edge::query::{ChangesError, ChangesReply, ChangesRequest, Engine};
 use slag_edge::store::history;
 
@@ -75,13 +76,37 @@ fn changes_are_told_where_both_generations_are_known() {
         other => panic!("{other}"),
     }
     assert_eq!(changes(&robot, Some(2)).expect_err("refused").kind(), "bad-parameter");
-    // A damaged record is as none.
+    // Vectors of other models do not compare.
     let path = history::path(&robot.cache, 1);
+    let record = history::read(&robot.cache, &after().manifest.scene, 1).expect("there");
+    let mut of_others = record.clone();
+    of_others.encoder_id = Hash32::of(b"other models");
+    fs_err::write(&path, of_others.to_bytes()).expect("writes");
+    assert_eq!(changes(&robot, Some(1)).expect_err("refused").kind(), "encoders-differ");
+    fs_err::write(&path, record.to_bytes()).expect("writes");
+    // A damaged record is as none.
     let mut bytes = fs_err::read(&path).expect("there");
     bytes[200] ^= 1;
     fs_err::write(&path, bytes).expect("writes");
     let reply = changes(&robot, None).expect("a reply");
     assert_eq!(reply.none.map(|none| none.kind), Some("no-earlier-generation"));
+}
+
+/// The robot had the places of 1, 2 and 3 on board in the earlier generation alone, that of 10 in the later one.
+#[test]
+fn what_is_left_behind_has_not_gone() {
+    let dir = tempfile::tempdir().expect("temporary folder");
+    let server = Server::start(before());
+    let mut robot = Robot::on_disk(dir.path(), &server.url());
+    robot.fetch().expect("works");
+    server.publish(after());
+    robot.request.at = Some(at(55.0));
+    robot.request.radius = 14.0;
+    robot.request.max_bytes = Some(after().bytes(4..7));
+    robot.fetch().expect("works");
+    let reply = changes(&robot, None).expect("a reply");
+    assert_eq!(ids(&reply), (vec![], vec![], vec![]), "{reply:?}");
+    assert_eq!(reply.n_not_compared, 4, "{reply:?}");
 }
 
 /// The records are written before anything goes: at whatever step the power fails, they are there after the next fetch.
@@ -123,6 +148,8 @@ fn history_is_bounded_and_of_one_scene() {
     assert_eq!(history::generations(&robot.cache), (4..=11).collect::<Vec<u64>>());
     let reply = changes(&robot, Some(7)).expect("a reply");
     assert_eq!((reply.n_same, reply.n_stayed), (1, 1), "{reply:?}");
+    let newest = changes(&robot, None).expect("a reply").from.map(|from| from.generation);
+    assert_eq!(newest, Some(11), "without a number the newest before");
     // Another scene: its generations are none of these.
     server.publish(published(13, &[thing(1, 2.0, 0)]).edited(|manifest| manifest.scene = "house".into()));
     robot.request.scene = Some("house".into());

@@ -4,6 +4,7 @@ use slag_common::manifest::Calibration;
 
 use super::openapi::{check, description};
 use super::*;
+use crate::query::MAX_TEXTS;
 use crate::store::{Snapshot, history};
 use crate::testing::TestObject;
 
@@ -62,6 +63,8 @@ async fn generations_are_compared_over_http() {
     // Of a move, one end in the ball counts.
     let (_, near) = get("?near=10,0,0&radius=2").await;
     assert_eq!((near["moved"].as_array().map(Vec::len), &near["went"]), (Some(1), &json!([])), "{near:#}");
+    let (_, near) = get("?near=22,0,0&radius=1").await;
+    assert_eq!((near["moved"].as_array().map(Vec::len), &near["went"]), (Some(1), &json!([])), "{near:#}");
     // Texts are axes: 33 is along axis 0, 20 along axis 2.
     let (_, named) = get("?text=0&text=2").await;
     assert_eq!(named["appeared"][0]["like"]["text"], "0", "{named:#}");
@@ -73,6 +76,8 @@ async fn generations_are_compared_over_http() {
         ("?radius=3", StatusCode::BAD_REQUEST),
         ("?near=1,2,3&radius=0", StatusCode::BAD_REQUEST),
         ("?text=sofa", StatusCode::UNPROCESSABLE_ENTITY),
+        (&format!("?text=0{}", "&text=0".repeat(MAX_TEXTS)), StatusCode::BAD_REQUEST),
+        ("?word=0", StatusCode::BAD_REQUEST),
     ] {
         let (found, body) = get(query).await;
         assert_eq!(found, status, "{query}: {body:#}");
