@@ -85,7 +85,7 @@ def main() -> None:
     parser.add_argument("--bin", type=pathlib.Path, default=pathlib.Path("target/debug"))
     parser.add_argument("--clients", type=int, default=320)
     # A question whose answer costs many refusals, which share the cores with it.
-    parser.add_argument("--with", dest="rest", default="kind=clusters&threshold=-1&min_count=1&voxel=0.02&limit=1")
+    parser.add_argument("--with", dest="rest", default="kind=clusters&threshold=-1&min_count=1&voxel=0.2&limit=1")
     args = parser.parse_args()
     encoder, edge, lab = (args.bin / name for name in ("slag-encoder", "slag-edge", "slag-lab"))
     work = pathlib.Path(tempfile.mkdtemp())

@@ -65,6 +65,8 @@ pub struct LoadReport {
     pub n_other_status: u64,
     /// Broken connections and missing answers.
     pub n_broken: u64,
+    /// Kept connections that were closed when the next query came, which a new one then carried.
+    pub n_reopened: u64,
     /// Memory of the sampled process.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory: Option<Memory>,
@@ -104,6 +106,7 @@ struct Tally {
     n_without_retry_after: u64,
     n_other_status: u64,
     n_broken: u64,
+    n_reopened: u64,
 }
 
 impl Tally {
@@ -114,6 +117,7 @@ impl Tally {
         self.n_without_retry_after += other.n_without_retry_after;
         self.n_other_status += other.n_other_status;
         self.n_broken += other.n_broken;
+        self.n_reopened += other.n_reopened;
     }
 }
 
@@ -153,6 +157,7 @@ pub async fn run(options: &LoadOptions) -> io::Result<LoadReport> {
         n_without_retry_after: tally.n_without_retry_after,
         n_other_status: tally.n_other_status,
         n_broken: tally.n_broken,
+        n_reopened: tally.n_reopened,
         memory,
     })
 }
@@ -198,28 +203,39 @@ async fn client(options: LoadOptions, first: Instant, period: Duration, end: Ins
         }
         tally.n_sent += 1;
         let answered = tokio::time::timeout(ANSWER_TIMEOUT, async {
-            let mut stream = match connection.take() {
-                Some(stream) => stream,
-                None => BufReader::new(TcpStream::connect(&options.address).await?),
-            };
-            stream.get_mut().write_all(request.as_bytes()).await?;
-            let answer = read_answer(&mut stream).await?;
-            connection = Some(stream);
-            io::Result::Ok(answer)
-        });
-        let took = |began: Instant| began.elapsed();
-        match answered.await {
-            Ok(Ok(Answer { status: 200, .. })) => tally.accepted.add(took(began)),
-            Ok(Ok(Answer { status: 503, has_retry_after })) => {
-                tally.refused.add(took(began));
-                tally.n_without_retry_after += u64::from(!has_retry_after);
+            // The service may have closed a connection that was idle since the last query.
+            if let Some(kept) = connection.take() {
+                match ask(kept, &request).await {
+                    Ok(answer) => return Ok(answer),
+                    Err(_) => tally.n_reopened += 1,
+                }
             }
-            Ok(Ok(_)) => tally.n_other_status += 1,
+            ask(BufReader::new(TcpStream::connect(&options.address).await?), &request).await
+        });
+        match answered.await {
+            Ok(Ok((answer, kept))) => {
+                connection = Some(kept);
+                match answer {
+                    Answer { status: 200, .. } => tally.accepted.add(began.elapsed()),
+                    Answer { status: 503, has_retry_after } => {
+                        tally.refused.add(began.elapsed());
+                        tally.n_without_retry_after += u64::from(!has_retry_after);
+                    }
+                    Answer { .. } => tally.n_other_status += 1,
+                }
+            }
             Ok(Err(_)) | Err(_) => tally.n_broken += 1,
         }
         // Missed queries are not made up for: the load never exceeds the rate.
         next = (next + period).max(Instant::now());
     }
+}
+
+/// Sends a request and reads its answer; returns the connection, too.
+async fn ask(mut stream: BufReader<TcpStream>, request: &str) -> io::Result<(Answer, BufReader<TcpStream>)> {
+    stream.get_mut().write_all(request.as_bytes()).await?;
+    let answer = read_answer(&mut stream).await?;
+    Ok((answer, stream))
 }
 
 struct Answer {

@@ -1,4 +1,4 @@
-//! The plain average beside the default, on labelled scenes, with true and with automatic masks, by Gaussian and by
+//! The preset `plain` beside the default, on labelled scenes, with true and with automatic masks, by Gaussian and by
 //! object: the figures that a default is chosen and judged by.
 
 use std::fmt;
@@ -12,7 +12,7 @@ use super::instances::InstanceReport;
 use super::labelled::labelled;
 use super::labelled_scene::{CompareError, LabelledScene};
 use super::settings::{EvalKind, EvalSettings};
-use slag_encoder::encode::{self, DEFAULT_MASK_LEVELS, EncodeSettings, Engines, Masks};
+use slag_encoder::encode::{self, DEFAULT_MASK_LEVELS, EncodeSettings, Engines, Masks, Preset};
 use slag_encoder::lift::Aggregation;
 use slag_encoder::progress::Silent;
 use slag_encoder::raster::{CpuRasterizer, Rasterizer};
@@ -25,7 +25,7 @@ pub struct DefaultsSettings {
     pub scenes: Vec<PathBuf>,
     /// Folder for the stores; a later run reuses the views there.
     pub out: PathBuf,
-    /// All other settings; the comparison sets inputs, masks, aggregation, objects and store.
+    /// The default's settings; the comparison sets inputs, masks and store, and what `plain` does otherwise.
     pub encode: EncodeSettings,
 }
 
@@ -89,16 +89,21 @@ pub fn run(
     for dir in &settings.scenes {
         let scene = LabelledScene::open(dir, &settings.encode.inputs)?;
         for source in [MaskSource::Given, MaskSource::Automatic] {
-            let (masks, folder) = match source {
+            let (masks, masks_name) = match source {
                 MaskSource::Given => (scene.true_masks(), "given"),
                 MaskSource::Automatic => (Masks::Auto { n_levels: DEFAULT_MASK_LEVELS }, "automatic"),
             };
-            let store = settings.out.join(&scene.name).join(folder);
-            let mut encode = scene.encode_settings(&settings.encode, store)?;
-            encode.view.masks = masks;
             for is_default in [false, true] {
-                encode.aggregation = if is_default { Aggregation::REFINED } else { Aggregation::PLAIN };
-                encode.cells.objects = is_default;
+                let method = if is_default { "default" } else { "plain" };
+                let store = settings.out.join(&scene.name).join(masks_name).join(method);
+                let mut encode = scene.encode_settings(&settings.encode, store)?;
+                encode.view.masks = masks.clone();
+                if !is_default {
+                    let plain = Preset::Plain.choices();
+                    encode.aggregation = plain.aggregation;
+                    encode.cells.objects = plain.objects;
+                    encode.view.raster_width = plain.raster_width;
+                }
                 let engines = Engines::new(models, session, rasterizer);
                 let start = std::time::Instant::now();
                 encode::encode(&encode, &engines, &Silent, cancel).map_err(Box::new)?;
