@@ -58,12 +58,12 @@ if [ -z "$built" ]; then
     sh scripts/setup.sh
     sh scripts/setup.sh page
     sh scripts/build-page.sh
-    cargo build --profile dist --locked -p slag-encoder -p slag-edge -p slag-mcp -p slag-ros -p slag-manual
+    cargo build --profile dist --locked -p slag-encoder -p slag-edge -p slag-mcap -p slag-mcp -p slag-ros -p slag-manual
     built=target/dist
 fi
 rm -rf target/manual
 "$built/slag-manual" target/manual
-for program in slag-encoder slag-edge slag-mcp slag-ros; do
+for program in slag-encoder slag-edge slag-mcap slag-mcp slag-ros; do
     [ "$("$built/$program" --version)" = "$program $version" ] || fail "$built/$program is of another version"
 done
 
@@ -71,7 +71,7 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 name=slag_${version}_amd64
 mkdir "$work/$name"
-for program in slag-encoder slag-edge slag-mcp slag-ros; do
+for program in slag-encoder slag-edge slag-mcap slag-mcp slag-ros; do
     cp "$built/$program" "$work/$name/"
 done
 cp -r target/manual LICENSE-MIT LICENSE-APACHE "$work/$name/"

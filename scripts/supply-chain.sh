@@ -28,7 +28,7 @@ mkdir -p "$out"
 # The robot's platform and the servers'.
 cargo metadata --locked --offline --format-version 1 --filter-platform x86_64-unknown-linux-gnu \
     --filter-platform aarch64-unknown-linux-gnu >"$out/metadata"
-for package in slag-encoder slag-edge slag-lab slag-mcp slag-ros; do
+for package in slag-encoder slag-edge slag-lab slag-mcap slag-mcp slag-ros; do
     "$environment/bin/python" scripts/supply-chain/sbom.py "$out/metadata" "$package" "$out/$package.cdx.json"
 done
 rm "$out/metadata"

@@ -21,6 +21,7 @@ const CRATES: [(&str, &str); 11] = [
     ("slag_edge", "edge"),
     ("slag_lab", "encoder/lab"),
     ("slag_robot", "doors/robot"),
+    ("slag_mcap", "doors/mcap"),
     ("slag_mcp", "doors/mcp"),
     ("slag_ros", "doors/ros"),
 ];

@@ -11,7 +11,7 @@ const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 #[test]
 fn programs_state_the_version_of_the_workspace() {
-    for name in ["slag-encoder", "slag-edge", "slag-lab", "slag-mcp", "slag-ros"] {
+    for name in ["slag-encoder", "slag-edge", "slag-lab", "slag-mcap", "slag-mcp", "slag-ros"] {
         let stated = run(Command::new(program(name)).arg("--version")).stdout;
         assert_eq!(String::from_utf8_lossy(&stated).trim(), format!("{name} {VERSION}"));
     }

@@ -39,6 +39,17 @@ test("slag-encoder encode: --view shows the encode, then the scene; --report has
       summary = JSON.parse(encode.said());
       const classes = await page.locator("#work circle").evaluateAll((all) => all.map((circle) => circle.getAttribute("class")));
       assert.deepEqual(classes.sort(), [...Array(N_VIEWS - 1).fill("done"), "left-out"]);
+      // The map has each camera where its pose is, x to the right and y up, and the one that was left out is the broken photo's.
+      const circles = await page.locator("#work circle").evaluateAll((all) => all.map((c) => ({ state: c.getAttribute("class"), x: Number(c.getAttribute("cx")), y: -Number(c.getAttribute("cy")) })));
+      const poses = frames.map((frame) => ({ broken: frame.file_path === broken, x: frame.transform_matrix[0][3], y: frame.transform_matrix[1][3] }));
+      const least = (all, axis) => Math.min(...all.map((one) => one[axis]));
+      const [px, m] = [circles, poses].map((all) => Math.max(...all.map(({ x }) => x)) - least(all, "x"));
+      for (const pose of poses) {
+        const off = (c) => Math.hypot(...["x", "y"].map((axis) => ((c[axis] - least(circles, axis)) * m) / px - pose[axis] + least(poses, axis)));
+        assert.ok(circles.some((c) => off(c) < 0.02 * m && (c.state === "left-out") === pose.broken), JSON.stringify({ pose, circles }));
+      }
+      const shown = await page.locator("#work img").evaluateAll((all) => all.map((image) => image.naturalWidth));
+      assert.ok(shown.length > 0 && shown.every((width) => width > 100), String(shown));
       await page.locator("#work").getByText("is left out:").waitFor();
       answers = (await (await fetch(`${encode.url}/v1/query?text=sofa&limit=1000`)).json()).results[0].answers;
     }, { expected: /50[03]|404/ });

@@ -7,7 +7,7 @@ use anyhow::{Context, Result};
 use clap::{Command, CommandFactory, Parser};
 use clap_complete::Shell;
 
-/// Writes manual pages and shell completions of slag-encoder, slag-edge, slag-mcp and slag-ros.
+/// Writes manual pages and shell completions of slag-encoder, slag-edge, slag-mcap, slag-mcp and slag-ros.
 ///
 /// A page for each command: slag-edge-fetch.1. Completions under the names that bash, zsh and fish look for: slag-edge.bash,
 /// _slag-edge, slag-edge.fish.
@@ -24,6 +24,7 @@ fn main() -> Result<()> {
     for program in [
         slag_encoder::cli::Cli::command(),
         slag_edge::cli::Cli::command(),
+        slag_mcap::Args::command(),
         slag_mcp::Args::command(),
         slag_ros::Args::command(),
     ] {

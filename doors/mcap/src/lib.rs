@@ -1,0 +1,62 @@
+//! A robot's answers and the ground around it as an MCAP file, which Foxglove and the MCAP libraries read (docs/api.md).
+
+mod args;
+mod file;
+mod messages;
+mod schemas;
+
+use std::time::SystemTime;
+
+use anyhow::{Context, Result};
+use serde_json::json;
+use slag_robot::{Robot, read_token};
+
+pub use args::Args;
+use file::File;
+use messages::Stamp;
+
+/// Asks a robot and writes its answers; returns the number of messages. A robot that refuses leaves no file.
+///
+/// # Errors
+/// The token's file, the robot's refusal, or the file to write.
+pub fn record(args: &Args) -> Result<usize> {
+    let token = args.token_file.as_deref().map(read_token).transpose()?;
+    let robot = Robot::new(&args.robot, token.as_deref());
+    let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+    let time_ns = since_1970.context("the clock is before 1970")?.as_nanos() as u64;
+    let mut messages = Vec::new();
+    for text in &args.text {
+        let reply = robot.ask(&json!({"texts": [text], "limit": args.limit}))?;
+        let stamp = Stamp { time_ns, frame: &reply.frame };
+        for found in &reply.results {
+            if let Some(none) = &found.none {
+                eprintln!("{text}: {}", none.detail);
+            }
+            let things = messages::things(stamp, text, &found.answers);
+            messages.push((format!("/slag/things/{text}"), schemas::THINGS, things));
+        }
+        // A relation is between things; only words have Gaussians that match.
+        let is_relation = reply.results.iter().any(|found| found.understood.is_some());
+        if args.points > 0 && !is_relation {
+            let reply = robot.ask_points(&json!({"texts": [text], "limit": args.points}))?;
+            let stamp = Stamp { time_ns, frame: &reply.frame };
+            for found in &reply.results {
+                let points = messages::points(stamp, &found.answers);
+                messages.push((format!("/slag/points/{text}"), schemas::POINTS, points));
+            }
+        }
+    }
+    if args.ground {
+        let frame = robot.place()?.frame;
+        let floor = robot.floor(&[])?;
+        let ground = messages::ground(Stamp { time_ns, frame: &frame }, &floor);
+        let ground = ground.context("the robot's ground has other cells than it says")?;
+        messages.push(("/slag/ground".to_owned(), schemas::GROUND, ground));
+    }
+    let mut file = File::create(&args.out, time_ns)?;
+    for (topic, schema, message) in &messages {
+        file.write(topic, *schema, message)?;
+    }
+    file.finish().with_context(|| args.out.display().to_string())?;
+    Ok(messages.len())
+}

@@ -1,0 +1,94 @@
+//! What a robot says, as Foxglove's messages in JSON (foxglove.dev/docs/sdk/schemas): positions in metres in the scene's frame.
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD as BASE64;
+use serde_json::{Value, json};
+use slag_robot::{Answer, Floor, FloorPlace, PointAnswer};
+
+/// Foxglove's numbers of the types of fields.
+const UINT8: u32 = 1;
+const FLOAT32: u32 = 7;
+/// Height of letters, metres.
+const LETTERS_M: f64 = 0.15;
+
+/// When and where a message holds.
+#[derive(Clone, Copy, Debug)]
+pub struct Stamp<'a> {
+    /// Nanoseconds since 1970.
+    pub time_ns: u64,
+    /// Frame of all positions.
+    pub frame: &'a str,
+}
+
+impl Stamp<'_> {
+    fn time(&self) -> Value {
+        json!({"sec": self.time_ns / 1_000_000_000, "nsec": self.time_ns % 1_000_000_000})
+    }
+}
+
+fn vector([x, y, z]: [f64; 3]) -> Value {
+    json!({"x": x, "y": y, "z": z})
+}
+
+fn pose(position: [f64; 3], [x, y, z, w]: [f64; 4]) -> Value {
+    json!({"position": vector(position), "orientation": {"x": x, "y": y, "z": z, "w": w}})
+}
+
+/// Returns a `foxglove.SceneUpdate` with the box and the words of each thing.
+pub fn things(stamp: Stamp<'_>, text: &str, answers: &[Answer]) -> Value {
+    let entity = |answer: &Answer| {
+        let of = &answer.oriented_box;
+        let [x, y, _] = answer.position_in_world;
+        let above = [x, y, answer.box_max_in_world[2] + LETTERS_M];
+        json!({
+            "timestamp": stamp.time(), "frame_id": stamp.frame, "id": format!("{text}/{}", answer.rank),
+            "lifetime": {"sec": 0, "nsec": 0}, "frame_locked": false,
+            "metadata": [
+                {"key": "text", "value": text}, {"key": "id", "value": answer.id}, {"key": "score", "value": answer.score.to_string()},
+            ],
+            "arrows": [], "spheres": [], "cylinders": [], "lines": [], "triangles": [], "models": [],
+            "cubes": [{
+                "pose": pose(of.centre_in_world, of.rotation_world_from_box), "size": vector(of.size),
+                "color": {"r": 0.2, "g": 0.7, "b": 1.0, "a": 0.3},
+            }],
+            "texts": [{
+                "pose": pose(above, [0.0, 0.0, 0.0, 1.0]), "billboard": true, "font_size": LETTERS_M, "scale_invariant": false,
+                "color": {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0}, "text": format!("{text} {:.2}", answer.score),
+            }],
+        })
+    };
+    json!({"deletions": [], "entities": answers.iter().map(entity).collect::<Vec<_>>()})
+}
+
+/// Returns a `foxglove.PointCloud` of Gaussians: x, y, z and score of each as little-endian f32.
+pub fn points(stamp: Stamp<'_>, answers: &[PointAnswer]) -> Value {
+    let numbers = answers.iter().flat_map(|answer| {
+        let [x, y, z] = answer.position_in_world.map(|metres| metres as f32);
+        [x, y, z, answer.score]
+    });
+    let data: Vec<u8> = numbers.flat_map(f32::to_le_bytes).collect();
+    let field = |(name, offset): (&str, u32)| json!({"name": name, "offset": offset, "type": FLOAT32});
+    let fields = [("x", 0), ("y", 4), ("z", 8), ("score", 12)].map(field);
+    json!({
+        "timestamp": stamp.time(), "frame_id": stamp.frame, "pose": pose([0.0; 3], [0.0, 0.0, 0.0, 1.0]), "point_stride": 16,
+        "fields": fields, "data": BASE64.encode(data),
+    })
+}
+
+/// Returns a `foxglove.Grid` of the ground: 0 unknown, 1 ground that the robot cannot reach, 2 reached, 3 obstacle. `None` if the
+/// robot's runs are not as many cells as it says.
+pub fn ground(stamp: Stamp<'_>, floor: &Floor) -> Option<Value> {
+    let number = |place: FloorPlace| match place {
+        FloorPlace::Unknown => 0,
+        FloorPlace::Ground => 1,
+        FloorPlace::Reached => 2,
+        FloorPlace::Obstacle => 3,
+    };
+    let data: Vec<u8> = floor.cells()?.into_iter().map(number).collect();
+    let [n_columns, _] = floor.size;
+    Some(json!({
+        "timestamp": stamp.time(), "frame_id": stamp.frame, "pose": pose(floor.origin_in_world, [0.0, 0.0, 0.0, 1.0]),
+        "column_count": n_columns, "cell_size": {"x": floor.cell_m, "y": floor.cell_m}, "row_stride": n_columns, "cell_stride": 1,
+        "fields": [{"name": "ground", "offset": 0, "type": UINT8}], "data": BASE64.encode(data),
+    }))
+}
