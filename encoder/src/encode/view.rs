@@ -202,9 +202,7 @@ impl<'a> ViewStages<'a> {
                 loaded => Next::Segment(loaded, None),
             },
             Next::Depth(loaded) => {
-                let photo_px = loaded.view.intrinsics.width_px.min(MAX_RASTER_WIDTH_PX);
-                // Depths of a trained splat are noise from pixel to pixel, which half the width evens out (docs/accuracy.md).
-                let raster_view = raster_view(&loaded, photo_px.div_ceil(2));
+                let raster_view = raster_view(&loaded, self.base_width_px(&loaded));
                 // A GPU waits for colours that these threads compute, rather than they for it.
                 let draw = || self.tools.scene.draw(&raster_view, [0.0; 3]);
                 let drawing = self.context.install(draw).map_err(raster_failed)?;
