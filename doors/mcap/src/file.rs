@@ -18,7 +18,7 @@ pub struct File<W: Write + Seek> {
 }
 
 impl File<BufWriter<fs_err::File>> {
-    /// Creates a file whose messages all have one time.
+    /// Creates a file. `time_ns`: time of all its messages, nanoseconds since 1970.
     ///
     /// # Errors
     /// The file cannot be created.

@@ -51,7 +51,7 @@ pub fn choose(around: &Around<'_>, request: &GoalRequest, points: &[DVec3]) -> R
         candidates.into_par_iter().filter_map(|of| goal(around, request, &target, of)).collect()
     };
     let mut goals = looked_at(sifted(window, reached.clone()));
-    // Past the edge of what a thing stands on it is often seen from a strip that is narrower than a square.
+    // Over the edge of a table, the thing on it is often seen only from a strip that is narrower than a square.
     if goals.iter().all(|goal| goal.visible_share < request.min_visible) {
         let step = reached.len().div_ceil(MAX_MORE);
         goals = looked_at(reached.into_iter().step_by(step).collect());

@@ -11,7 +11,7 @@ use super::space::{Space, Window};
 /// the voxels just before it, are occupied or unknown.
 const TOLERANCE: f64 = 2.0;
 
-/// A thing whose surface is looked at.
+/// A thing, as lines of sight meet it.
 pub struct Thing {
     /// By block: the voxels that its surface may occupy, those with a point of it and their neighbours. Voxels are occupied up to
     /// 0.94 edges from a surface, so there are no others.

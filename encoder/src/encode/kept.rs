@@ -1,5 +1,5 @@
-//! What the views that a store keeps were made from, so that an encode that can take none of them over says why, and how much
-//! of the splat is the same.
+//! The inputs of the views that a store keeps: an encode that cannot reuse these views says why, and how many Gaussians of the splat
+//! are the same.
 
 use std::io::{BufReader, Read};
 use std::path::{Path, PathBuf};
@@ -14,7 +14,7 @@ const FILE: &str = "inputs";
 /// Bytes of the line, at most: it has two hashes.
 const MAX_LINE_BYTES: usize = 1024;
 
-/// What all views depend on, in two parts.
+/// The inputs that all views depend on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) struct InputsRecord {
     /// The splat: means, rotations, scales and opacities.

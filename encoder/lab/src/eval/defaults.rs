@@ -46,7 +46,7 @@ pub struct DefaultsRow {
     pub scene: String,
     /// Where masks came from.
     pub masks: MaskSource,
-    /// Whether it is the default rather than the plain average.
+    /// Whether it is the default rather than the preset `plain`.
     pub is_default: bool,
     /// What was scored.
     pub kind: EvalKind,
@@ -94,8 +94,7 @@ pub fn run(
                 MaskSource::Automatic => (Masks::Auto { n_levels: DEFAULT_MASK_LEVELS }, "automatic"),
             };
             for is_default in [false, true] {
-                let method = if is_default { "default" } else { "plain" };
-                let store = settings.out.join(&scene.name).join(masks_name).join(method);
+                let store = settings.out.join(&scene.name).join(masks_name).join(method_name(is_default));
                 let mut encode = scene.encode_settings(&settings.encode, store)?;
                 encode.view.masks = masks.clone();
                 if !is_default {
@@ -134,6 +133,11 @@ pub fn run(
     Ok(DefaultsReport { encoder: models.encoder_id().to_string(), aggregation: Aggregation::REFINED, rows })
 }
 
+/// Returns the name of the default or of the preset that it is compared with.
+fn method_name(is_default: bool) -> &'static str {
+    if is_default { "default" } else { "plain" }
+}
+
 impl fmt::Display for DefaultsReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
@@ -147,7 +151,7 @@ impl fmt::Display for DefaultsReport {
                 MaskSource::Given => "given",
                 MaskSource::Automatic => "automatic",
             };
-            let method = if row.is_default { "default" } else { "plain" };
+            let method = method_name(row.is_default);
             let kind = match row.kind {
                 EvalKind::Gaussians => "Gaussian",
                 EvalKind::Objects => "object",
