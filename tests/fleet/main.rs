@@ -2,6 +2,7 @@
 
 mod faults;
 mod folder;
+mod hosts;
 mod nats;
 mod network;
 mod s3;
