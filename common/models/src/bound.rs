@@ -1,6 +1,9 @@
 //! Runs a model with its tensors bound to memory: inputs of the next model stay on the GPU, and other outputs go to
 //! page-locked memory, to which a GPU copies at the full speed of its link.
 
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
 use ort::logging::LogLevel;
 use ort::session::RunOptions;
 use ort::value::{DynTensor, DynTensorValueType};
@@ -15,6 +18,14 @@ pub(crate) enum Place {
     Host,
     /// On the GPU, for the next model.
     Device,
+}
+
+/// Returns the turn of a GPU: whoever holds it runs a large model there. Several at once take no less time in all, and each
+/// then ends late.
+pub(crate) fn turn_of(gpu: u32) -> Arc<Mutex<()>> {
+    static TURNS: Mutex<BTreeMap<u32, Arc<Mutex<()>>>> = Mutex::new(BTreeMap::new());
+    let mut turns = TURNS.lock().unwrap_or_else(PoisonError::into_inner);
+    Arc::clone(turns.entry(gpu).or_default())
 }
 
 impl Model {

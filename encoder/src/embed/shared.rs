@@ -1,11 +1,13 @@
 //! Crops of several views in common batches, for image models on GPUs.
 //!
-//! A GPU is quickest with hundreds of crops at once, more than one view has. Views leave their crops in a queue; whoever
-//! waits for vectors runs the next batch on a free lane, with crops of whichever views, until its own are done. Nobody
-//! waits for a batch to be full: while the lanes are at work the queue grows, and batches with it.
+//! A GPU is quickest with hundreds of crops at once, more than one view has. Views leave their crops in a queue and sleep until
+//! theirs are done; each lane has a thread that runs the next batch, with crops of whichever views. Nobody waits for a batch to
+//! be full: while the lanes are at work the queue grows, and batches with it. Views are woken one by one: all at once would be
+//! in the way of the threads that feed the GPUs.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
 
 use slag_models::{Crop, ImageEncoder, InferenceError, ModelError};
 
@@ -22,15 +24,21 @@ const VIEWS_PER_LANE: usize = 12;
 const CROPS_PER_LANE: u64 = 512;
 
 /// Opens an image encoder on a GPU.
-pub type OpenEncoder<'a> = dyn Fn(u32) -> Result<Box<dyn ImageEncoder>, ModelError> + Sync + 'a;
+pub type OpenEncoder = dyn Fn(u32) -> Result<Box<dyn ImageEncoder>, ModelError> + Send + Sync;
 
 /// Image encoders on GPUs that work off the crops of all views.
-pub struct SharedEncoders<'a> {
-    open: Box<OpenEncoder<'a>>,
+pub struct SharedEncoders {
+    shared: Arc<Shared>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+struct Shared {
+    open: Box<OpenEncoder>,
     /// Encoders are opened where they are first needed.
     lanes: Lanes<Option<Box<dyn ImageEncoder>>>,
     queue: Mutex<Queue>,
-    changed: Condvar,
+    /// Wakes a lane's thread: there are crops, or there will be none.
+    has_work: Condvar,
 }
 
 #[derive(Default)]
@@ -41,6 +49,7 @@ struct Queue {
     next_request: u64,
     /// Whether a batch ended in a panic, and its crops with it.
     is_abandoned: bool,
+    is_closed: bool,
 }
 
 struct Waiting {
@@ -54,6 +63,8 @@ struct Request {
     vectors: Vec<Vec<f32>>,
     n_left: usize,
     error: Option<Failure>,
+    /// Wakes its view.
+    is_done: Arc<Condvar>,
 }
 
 /// Reason why crops could not be embedded.
@@ -67,16 +78,22 @@ pub enum Failure {
     Embed(#[from] EmbedError),
 }
 
-impl<'a> SharedEncoders<'a> {
+impl SharedEncoders {
     /// Returns encoders for the GPUs; `open` is called once a lane.
-    pub fn new(gpus: &[u32], open: Box<OpenEncoder<'a>>) -> Self {
+    pub fn new(gpus: &[u32], open: Box<OpenEncoder>) -> Self {
         Self::with_lanes(gpus, LANES_PER_GPU, open)
     }
 
     /// Returns encoders with a number of lanes on each GPU.
-    pub fn with_lanes(gpus: &[u32], n_lanes: usize, open: Box<OpenEncoder<'a>>) -> Self {
+    pub fn with_lanes(gpus: &[u32], n_lanes: usize, open: Box<OpenEncoder>) -> Self {
         let lanes = Lanes::new(gpus.iter().map(|gpu| (*gpu, (0..n_lanes).map(|_| None).collect())));
-        Self { open, lanes, queue: Mutex::default(), changed: Condvar::new() }
+        let shared = Arc::new(Shared { open, lanes, queue: Mutex::default(), has_work: Condvar::new() });
+        let work = |_| {
+            let shared = Arc::clone(&shared);
+            std::thread::spawn(move || shared.work())
+        };
+        let threads = (0..gpus.len() * n_lanes).map(work).collect();
+        Self { shared, threads }
     }
 
     /// Returns the number of views that should wait at once for the lanes to be at work.
@@ -92,11 +109,7 @@ impl<'a> SharedEncoders<'a> {
 
     /// Returns the load of each GPU.
     pub fn loads(&self) -> Vec<GpuLoad> {
-        self.lanes.loads()
-    }
-
-    fn queue(&self) -> MutexGuard<'_, Queue> {
-        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+        self.shared.lanes.loads()
     }
 
     /// Takes a lane for work of the caller's own.
@@ -104,29 +117,7 @@ impl<'a> SharedEncoders<'a> {
     /// # Errors
     /// [`ModelError`] if the model does not open.
     pub fn with_encoder<T>(&self, work: impl FnOnce(&mut dyn ImageEncoder) -> T) -> Result<T, ModelError> {
-        let mut lane = self.lanes.take();
-        let result = self.opened(&mut lane).map(work);
-        drop(lane);
-        self.wake();
-        result
-    }
-
-    /// Wakes those who wait for a lane or for vectors.
-    fn wake(&self) {
-        // With the lock, so that nobody is between looking and waiting.
-        let queue = self.queue();
-        self.changed.notify_all();
-        drop(queue);
-    }
-
-    fn opened<'l>(
-        &self,
-        lane: &'l mut Lane<'_, Option<Box<dyn ImageEncoder>>>,
-    ) -> Result<&'l mut dyn ImageEncoder, ModelError> {
-        if lane.is_none() {
-            **lane = Some((self.open)(lane.gpu())?);
-        }
-        Ok(lane.as_mut().expect("opened").as_mut())
+        self.shared.opened(&mut self.shared.lanes.take()).map(work)
     }
 
     /// Returns a unit vector per crop, `[crops][dim]`.
@@ -137,41 +128,70 @@ impl<'a> SharedEncoders<'a> {
         if crops.is_empty() {
             return Ok(Vec::new());
         }
-        let mut queue = self.queue();
+        let is_done = Arc::new(Condvar::new());
+        let (vectors, n_left) = (vec![Vec::new(); crops.len()], crops.len());
+        let request = Request { vectors, n_left, error: None, is_done: Arc::clone(&is_done) };
+        let mut queue = self.shared.queue();
         let own = queue.next_request;
         queue.next_request += 1;
-        let (vectors, n_left) = (vec![Vec::new(); crops.len()], crops.len());
-        queue.requests.insert(own, Request { vectors, n_left, error: None });
-        queue.waiting.extend(crops.into_iter().enumerate().map(|(at, crop)| Waiting {
-            crop,
-            request: own,
-            at,
-        }));
-        loop {
-            if queue.requests.get(&own).is_none_or(|request| request.n_left == 0) {
-                let done = queue.requests.remove(&own);
-                drop(queue);
-                return match done {
-                    Some(Request { error: Some(error), .. }) => Err(error),
-                    done => Ok(done.map(|request| request.vectors.concat()).unwrap_or_default()),
-                };
-            }
-            // The panic that lost the crops is passed on by the thread that had it.
+        queue.requests.insert(own, request);
+        let waiting = |(at, crop)| Waiting { crop, request: own, at };
+        queue.waiting.extend(crops.into_iter().enumerate().map(waiting));
+        self.shared.has_work.notify_one();
+        while queue.requests.get(&own).is_some_and(|request| request.n_left > 0) {
+            // The panic that lost the crops is told by the thread that had it.
             assert!(!queue.is_abandoned, "a batch of crops was lost");
-            let lane = if queue.waiting.is_empty() { None } else { self.lanes.try_take() };
-            let Some(mut lane) = lane else {
-                queue = self.changed.wait(queue).unwrap_or_else(PoisonError::into_inner);
+            queue = is_done.wait(queue).unwrap_or_else(PoisonError::into_inner);
+        }
+        let done = queue.requests.remove(&own);
+        drop(queue);
+        match done {
+            Some(Request { error: Some(error), .. }) => Err(error),
+            done => Ok(done.map(|request| request.vectors.concat()).unwrap_or_default()),
+        }
+    }
+}
+
+impl Drop for SharedEncoders {
+    fn drop(&mut self) {
+        self.shared.queue().is_closed = true;
+        self.shared.has_work.notify_all();
+        // A panic has left its message, and views that waited for the batch have panicked.
+        self.threads.drain(..).for_each(|thread| drop(thread.join()));
+    }
+}
+
+impl Shared {
+    fn queue(&self) -> MutexGuard<'_, Queue> {
+        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Runs batches until there will be no more.
+    fn work(&self) {
+        let lost = Lost(self);
+        let mut queue = self.queue();
+        while !queue.is_closed {
+            if queue.waiting.is_empty() {
+                queue = self.has_work.wait(queue).unwrap_or_else(PoisonError::into_inner);
                 continue;
-            };
+            }
             drop(queue);
-            let lost = Lost(self);
-            let done = self.run_batch(&mut lane);
-            drop(lane);
-            std::mem::forget(lost);
+            let done = self.run_batch(&mut self.lanes.take());
             queue = self.queue();
             queue.keep(done);
-            self.changed.notify_all();
         }
+        drop(queue);
+        std::mem::forget(lost);
+    }
+
+    fn opened<'l>(
+        &self,
+        lane: &'l mut Lane<'_, Option<Box<dyn ImageEncoder>>>,
+    ) -> Result<&'l mut dyn ImageEncoder, ModelError> {
+        if lane.is_none() {
+            **lane = Some((self.open)(lane.gpu())?);
+        }
+        Ok(lane.as_mut().expect("opened").as_mut())
     }
 
     /// Runs the crops at the head of the queue, at most a batch.
@@ -189,7 +209,11 @@ impl<'a> SharedEncoders<'a> {
         let batch: Vec<Waiting> = {
             let mut queue = self.queue();
             let n = queue.waiting.len().min(encoder.preferred_batch());
-            queue.waiting.drain(..n).collect()
+            let batch = queue.waiting.drain(..n).collect();
+            if !queue.waiting.is_empty() {
+                self.has_work.notify_one();
+            }
+            batch
         };
         if batch.is_empty() {
             return Vec::new();
@@ -217,13 +241,14 @@ impl<'a> SharedEncoders<'a> {
     }
 }
 
-/// Tells the others if it is dropped, which only a panic does.
-struct Lost<'l, 'a>(&'l SharedEncoders<'a>);
+/// Tells the views that wait if it is dropped, which only a panic does.
+struct Lost<'l>(&'l Shared);
 
-impl Drop for Lost<'_, '_> {
+impl Drop for Lost<'_> {
     fn drop(&mut self) {
-        self.0.queue().is_abandoned = true;
-        self.0.wake();
+        let mut queue = self.0.queue();
+        queue.is_abandoned = true;
+        queue.requests.values().for_each(|request| request.is_done.notify_one());
     }
 }
 
@@ -248,6 +273,9 @@ impl Queue {
                     request.n_left = 0;
                     self.waiting.retain(|waiting| waiting.request != number);
                 }
+            }
+            if request.n_left == 0 {
+                request.is_done.notify_one();
             }
         }
     }
@@ -278,9 +306,10 @@ mod tests {
         let mut own = models.image_encoder(&session).expect("opens");
         let expected: Vec<Vec<f32>> = views.iter().map(|crops| own.encode(crops).expect("runs")).collect();
         for (gpus, n_lanes) in [(&[0][..], 1), (&[0], 3), (&[0, 1], 2)] {
-            let n_opened = AtomicUsize::new(0);
-            let open = |_| {
-                n_opened.fetch_add(1, Ordering::SeqCst);
+            let n_opened = Arc::new(AtomicUsize::new(0));
+            let (opened, models, session) = (Arc::clone(&n_opened), models.clone(), session.clone());
+            let open = move |_| {
+                opened.fetch_add(1, Ordering::SeqCst);
                 models.image_encoder(&session)
             };
             let shared = SharedEncoders::with_lanes(gpus, n_lanes, Box::new(open));
@@ -294,7 +323,7 @@ mod tests {
                 }
             });
             assert!((1..=gpus.len() * n_lanes).contains(&n_opened.load(Ordering::SeqCst)));
-            assert!(shared.queue().requests.is_empty() && shared.queue().waiting.is_empty());
+            assert!(shared.shared.queue().requests.is_empty() && shared.shared.queue().waiting.is_empty());
         }
     }
 
@@ -304,7 +333,7 @@ mod tests {
         let models = ModelDir::embedded().expect("opens");
         let session = SessionOptions::new(slag_test_support::onnx_runtime());
         let expected = models.image_encoder(&session).expect("opens").encode(&[crop(1)]).expect("runs");
-        let open = |_| models.image_encoder(&session);
+        let open = move |_| models.image_encoder(&session);
         let shared = SharedEncoders::with_lanes(&[0], 1, Box::new(open));
         let all_began = std::sync::Barrier::new(8);
         std::thread::scope(|scope| {
@@ -330,7 +359,7 @@ mod tests {
     fn a_model_that_does_not_open_is_an_error_for_all() {
         let models = ModelDir::embedded().expect("opens");
         let absent = SessionOptions::new("/absent/libonnxruntime.so".into());
-        let shared = SharedEncoders::with_lanes(&[0], 2, Box::new(|_| models.image_encoder(&absent)));
+        let shared = SharedEncoders::with_lanes(&[0], 2, Box::new(move |_| models.image_encoder(&absent)));
         std::thread::scope(|scope| {
             for view in 0..4 {
                 let shared = &shared;

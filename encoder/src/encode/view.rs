@@ -52,17 +52,17 @@ pub(crate) struct ViewStages<'a> {
     context: &'a RunContext<'a>,
     /// How crops become the image encoder's squares; `None` if it takes crops of any size.
     preprocess: Option<Preprocess>,
-    encoders: Encoders<'a>,
+    encoders: Encoders,
     /// The device that runs the image model, once it is open.
     images_on: Arc<OnceLock<Option<String>>>,
 }
 
 /// The image encoders.
-enum Encoders<'a> {
+enum Encoders {
     /// One for each view at work, on the processor; those that are not at work. They are opened as they are needed.
     OfViews(Mutex<Vec<Box<dyn ImageEncoder>>>),
     /// On GPUs, for the crops of all views.
-    Shared(SharedEncoders<'a>),
+    Shared(SharedEncoders),
 }
 
 /// A view between two stages, with what the next one needs.
@@ -124,7 +124,9 @@ impl<'v> Work<'v> {
 impl<'a> ViewStages<'a> {
     /// Makes the stages; models are opened when the first view needs them.
     pub(crate) fn new(tools: ViewTools<'a>, context: &'a RunContext<'a>) -> Self {
-        let (models, session) = (tools.engines.models, tools.engines.session);
+        let (models, session) = (tools.engines.models.clone(), tools.engines.session.clone());
+        let preprocess = models.preprocess();
+        let is_on_cpu = session.is_on_cpu();
         let images_on = Arc::<OnceLock<_>>::default();
         let is_on = Arc::clone(&images_on);
         let open = move |gpu| {
@@ -132,11 +134,11 @@ impl<'a> ViewStages<'a> {
             is_on.get_or_init(|| encoder.placement().map(ToString::to_string));
             Ok(encoder)
         };
-        let encoders = match session.is_on_cpu() {
+        let encoders = match is_on_cpu {
             true => Encoders::OfViews(Mutex::default()),
             false => Encoders::Shared(SharedEncoders::new(tools.gpus, Box::new(open))),
         };
-        Self { tools, context, preprocess: models.preprocess(), encoders, images_on }
+        Self { tools, context, preprocess, encoders, images_on }
     }
 
     /// Returns the load of each GPU by the models of a stage.

@@ -142,7 +142,8 @@ fn between(before: &[GpuLoad], after: &[GpuLoad], secs: f64) -> Vec<f64> {
 }
 
 fn crops(models: &ModelDir, gpus: &[u32], options: &InferenceOptions) -> anyhow::Result<Measured> {
-    let open = |gpu| models.image_encoder(&SessionOptions { gpu, ..options.session.clone() });
+    let (of_lanes, session) = (models.clone(), options.session.clone());
+    let open = move |gpu| of_lanes.image_encoder(&SessionOptions { gpu, ..session.clone() });
     let encoders = SharedEncoders::new(gpus, Box::new(open));
     let size_px = models.preprocess().map_or(224, |preprocess| preprocess.size_px());
     let view: Vec<Crop> =
