@@ -54,7 +54,7 @@ pub struct CellSplit {
 impl CellSplit {
     /// Reserves the partition: each Gaussian's cell, its index there, and its place in the cell's list.
     pub fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
-        memory.reserve(
+        memory.reserve_held(
             Phase::Always,
             "the cell of each Gaussian",
             (n_gaussians * 3 * size_of::<u32>()) as u64,

@@ -10,6 +10,7 @@ use rayon::ThreadPool;
 use super::error::EncodeError;
 use super::report::PhaseReport;
 use super::workers::Workers;
+use crate::memory;
 use crate::progress::Progress;
 
 /// The time spent in each stage, added over all threads.
@@ -52,14 +53,21 @@ impl Phase {
     }
 }
 
+/// The beginning of a phase.
+struct Began {
+    phase: Phase,
+    at: Instant,
+    /// The most memory of the process until then, bytes.
+    peak_before: Option<u64>,
+}
+
 /// The state that the steps of one run share.
 pub(crate) struct RunContext<'a> {
     start: Instant,
     progress: &'a dyn Progress,
     cancel: &'a AtomicBool,
     times: StageTimes,
-    /// When each phase began.
-    phases: Mutex<Vec<(Phase, Instant)>>,
+    phases: Mutex<Vec<Began>>,
     workers: Workers,
 }
 
@@ -76,23 +84,28 @@ impl<'a> RunContext<'a> {
         let start = Instant::now();
         let workers =
             Workers::start(n_threads).map_err(|source| EncodeError::Threads { n_threads, source })?;
-        let phases = Mutex::new(vec![(Phase::Read, start)]);
+        let phases = Mutex::new(vec![Began { phase: Phase::Read, at: start, peak_before: None }]);
         Ok(Self { start, progress, cancel, times: StageTimes::default(), phases, workers })
     }
 
     /// Ends the present phase and begins the next.
     pub(super) fn begin_phase(&self, phase: Phase) {
+        // Before anything of the phase is there, so that phases do not come on top of each other.
+        memory::give_back();
         self.progress.begin_phase(phase.name());
-        self.phases.lock().unwrap_or_else(PoisonError::into_inner).push((phase, Instant::now()));
+        let began = Began { phase, at: Instant::now(), peak_before: memory::peak_bytes() };
+        self.phases.lock().unwrap_or_else(PoisonError::into_inner).push(began);
     }
 
     /// Returns the phases so far, of which the last one ends at `end`: they add up to the time since the start.
     pub(super) fn phases(&self, end: Instant) -> Vec<PhaseReport> {
         let phases = self.phases.lock().unwrap_or_else(PoisonError::into_inner);
-        let ends = phases.iter().skip(1).map(|(_, began)| *began).chain([end]);
-        let report = |((phase, began), ended): (&(Phase, Instant), Instant)| PhaseReport {
+        let began = phases.iter().skip(1).map(|Began { at, peak_before, .. }| (*at, *peak_before));
+        let ends = began.chain([(end, memory::peak_bytes())]);
+        let report = |(Began { phase, at, .. }, (ended, peak_bytes)): (&Began, _)| PhaseReport {
             phase: phase.name().to_owned(),
-            secs: ended.duration_since(*began).as_secs_f64(),
+            secs: Instant::duration_since(&ended, *at).as_secs_f64(),
+            peak_bytes,
         };
         phases.iter().zip(ends).map(report).collect()
     }

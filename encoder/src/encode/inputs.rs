@@ -59,7 +59,7 @@ impl Inputs {
 
 /// Reserves the scene's columns.
 pub(super) fn reserve(memory: &mut MemoryPlan, scene: &Gaussians) {
-    memory.reserve(Phase::Always, "the scene", scene.len_bytes());
+    memory.reserve_held(Phase::Always, "the scene", scene.len_bytes());
 }
 
 /// Reserves the photos in work: one a thread, the largest ones.

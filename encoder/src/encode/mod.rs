@@ -21,6 +21,7 @@ pub mod coverage;
 mod engines;
 mod error;
 mod executor;
+mod expected;
 pub mod front;
 mod here;
 mod identity;
@@ -53,7 +54,9 @@ pub use inputs::count_inputs;
 pub use job::{JobStatus, ViewCost, job_status, view_costs};
 pub use kept::{LostViews, SharedGaussians};
 pub use preset::{Choices, Preset};
-pub use report::{CellReport, EncodeSummary, GpuReport, PhaseReport, SkippedView, StageReport, ViewsReport};
+pub use report::{
+    CellReport, EncodeSummary, GpuReport, MemoryReport, PhaseReport, SkippedView, StageReport, ViewsReport,
+};
 pub use settings::{
     CellSettings, DEFAULT_MASK_LEVELS, EncodeSettings, InputSettings, Masks, OutputSettings, RasterWidth,
     Regions, RunSettings, ViewOrder, ViewSettings, ViewsLimit,

@@ -9,6 +9,7 @@ use super::context::RunContext;
 use super::coverage::{self, Coverage};
 use super::engines::Engines;
 use super::error::EncodeError;
+use super::expected;
 use super::identity;
 use super::inputs::{self, Inputs};
 use super::job::{Job, job_status};
@@ -18,7 +19,7 @@ use super::view::ViewTools;
 use crate::cells::CellSplit;
 use crate::embed::SharedEncoders;
 use crate::lift::refine::Refinement;
-use crate::memory::MemoryPlan;
+use crate::memory::{self, MemoryPlan, PlannedPeak};
 use crate::objects;
 use crate::raster::project::Prepared;
 use crate::raster::{LoadedScene, RasterView};
@@ -35,6 +36,8 @@ pub(crate) struct Plan<'a> {
     pub(crate) inputs: &'a Inputs,
     pub(crate) store: &'a Store,
     pub(super) memory: MemoryPlan,
+    /// The most memory that the run is expected to take; `None` where the system does not tell what it has now.
+    pub(super) planned_peak: Option<PlannedPeak>,
     pub(crate) segmenter: Box<dyn Segmenter>,
     pub(crate) job: Job<'a>,
     pub(super) inputs_record: InputsRecord,
@@ -126,12 +129,21 @@ fn make_plan<'a>(
     let (order, coverage) =
         context.install(|| choose_views(&settings.run, scene.as_ref(), inputs, context))?;
     let coverage_secs = coverage.as_ref().map_or(0.0, |_| start.elapsed().as_secs_f64());
+    let views: Vec<&View> = order.iter().map(|i| &inputs.views[*i]).collect();
+    let of_models = (engines.models.image_bytes(), engines.models.dim());
+    context.install(|| expected::reserve(&mut memory, settings, inputs, (scene.as_ref(), &views), of_models));
+    memory::give_back();
+    let planned_peak = memory::held_bytes().map(|held_bytes| memory.planned_peak(held_bytes));
+    if let Some(PlannedPeak { len_bytes, phase }) = planned_peak {
+        tracing::info!("at most about {} MB of memory, in {phase:?}", len_bytes / 1_000_000);
+    }
     Ok(Plan {
         settings,
         engines,
         inputs,
         store,
         memory,
+        planned_peak,
         segmenter,
         job,
         inputs_record: ids.inputs,
@@ -258,11 +270,11 @@ mod tests {
     use super::*;
     use slag_common::{Distortion, Gaussians, Intrinsics};
 
-    /// Superpoints take 204 bytes a Gaussian, once all views are done: a budget below that is refused before.
+    /// Superpoints take 224 bytes a Gaussian, once all views are done: a budget below that is refused before.
     #[test]
     fn what_refinement_takes_is_refused_before_the_first_view() {
         let mut settings = EncodeSettings::new(PathBuf::new(), PathBuf::new(), PathBuf::new(), true);
-        settings.run.memory_bytes = 100_000 * 204;
+        settings.run.memory_bytes = 100_000 * 224;
         let scene = Gaussians { means_in_world: vec![glam::DVec3::ZERO; 100_000], ..Gaussians::default() };
         let split = CellSplit {
             cells: Vec::new(),

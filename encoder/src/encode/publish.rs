@@ -13,9 +13,10 @@ use super::error::EncodeError;
 use super::executor::Executor;
 use super::kept;
 use super::plan::Plan;
-use super::report::{CellReport, EncodeSummary};
+use super::report::{CellReport, EncodeSummary, MemoryReport};
 use super::text_model::carry;
 use super::views::DoneViews;
+use crate::memory;
 use crate::store::ModelsRecord;
 
 /// Publishes the built cells, ends the job and returns the summary.
@@ -56,6 +57,11 @@ pub(super) fn publish(
     let end = Instant::now();
     summary.wall_secs = end.duration_since(context.start()).as_secs_f64();
     summary.phases = context.phases(end);
+    summary.memory = plan.planned_peak.zip(memory::peak_bytes()).map(|(planned, peak_bytes)| MemoryReport {
+        planned_bytes: planned.len_bytes,
+        planned_phase: planned.phase,
+        peak_bytes,
+    });
     Ok(summary)
 }
 
@@ -126,6 +132,7 @@ fn summary(plan: &Plan<'_>, views: &DoneViews<'_>, built: BuiltCells, manifest: 
         views: views_report,
         busy_secs: BTreeMap::new(),
         view_stages: views.stages.clone(),
+        memory: None,
         phases: Vec::new(),
         views_secs: views.secs,
         wall_secs: 0.0,

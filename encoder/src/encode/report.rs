@@ -8,6 +8,7 @@ use super::coverage::CoverageReport;
 use super::kept::LostViews;
 use super::settings::ViewOrder;
 use crate::lanes::GpuLoad;
+use crate::memory::Phase;
 use crate::objects::ObjectsReport;
 use crate::occupancy::OccupancyReport;
 
@@ -105,6 +106,19 @@ pub struct PhaseReport {
     pub phase: String,
     /// Seconds.
     pub secs: f64,
+    /// The most memory of the process until its end, bytes; absent where the system does not tell.
+    pub peak_bytes: Option<u64>,
+}
+
+/// The memory of the run.
+#[derive(Clone, Debug, Serialize)]
+pub struct MemoryReport {
+    /// The most that the process was expected to hold, as planned before the first view, bytes.
+    pub planned_bytes: u64,
+    /// The step that was expected to need it.
+    pub planned_phase: Phase,
+    /// The most that it held, bytes.
+    pub peak_bytes: u64,
 }
 
 /// The result of an encode.
@@ -160,6 +174,8 @@ pub struct EncodeSummary {
     pub busy_secs: BTreeMap<String, f64>,
     /// The load of the views' stages, in their order.
     pub view_stages: Vec<StageReport>,
+    /// Memory, planned and used; absent where the system does not tell.
+    pub memory: Option<MemoryReport>,
     /// The parts of the run, in their order.
     pub phases: Vec<PhaseReport>,
     /// Seconds from the first view to the last.

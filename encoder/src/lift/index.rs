@@ -202,6 +202,18 @@ impl ContributionIndex {
         self.parts.iter().map(of_part).sum()
     }
 
+    /// Returns the bytes that `n_entries` of `n_gaussians` are expected to take where the plan leaves `rest_bytes`: those that
+    /// are kept for the next pass, and those of the parts that all threads work on at a time.
+    pub fn expected_bytes(n_entries: u64, n_gaussians: u64, n_threads: u64, rest_bytes: u64) -> (u64, u64) {
+        let all_bytes = n_entries * BYTES_PER_TRANSPOSED_ENTRY + n_gaussians * BYTES_PER_GAUSSIAN;
+        let n_at_once = n_entries.min(n_threads * GROUP_ENTRIES);
+        let group_bytes = all_bytes * n_at_once / n_entries.max(1);
+        match 2 * all_bytes <= rest_bytes {
+            true => (all_bytes, group_bytes),
+            false => (0, group_bytes.min(rest_bytes)),
+        }
+    }
+
     /// Cuts the parts into groups that take at most `budget_bytes` each, or hold a single part. `n_largest`: how many of
     /// the largest parts a group may hold where the budget allows more.
     pub fn groups(&self, budget_bytes: u64, n_largest: u64) -> Vec<Range<usize>> {

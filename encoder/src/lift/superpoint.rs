@@ -159,11 +159,13 @@ impl Superpoints {
         Graph::new(scene, sketches, settings).superpoints(settings)
     }
 
-    /// Returns the bytes that partitioning `n_gaussians` takes: neighbours while they are searched, then with the edges.
-    pub fn working_bytes(n_gaussians: usize, settings: &SuperpointSettings) -> u64 {
+    /// Returns the bytes that partitioning `n_gaussians` takes, at `n_scales` at once: neighbours while they are searched, then
+    /// with the edges and what joins them.
+    pub fn working_bytes(n_gaussians: usize, n_scales: usize, settings: &SuperpointSettings) -> u64 {
         let n = settings.n_neighbours;
         let searched = size_of::<[f64; 3]>() + nearest::working_bytes_per_point(n);
-        let joined = n * (size_of::<u32>() + size_of::<Edge>()) + size_of::<Look>() + 4 * size_of::<u32>();
+        let joined =
+            n * (size_of::<u32>() + size_of::<Edge>()) + size_of::<Look>() + n_scales * 5 * size_of::<u32>();
         n_gaussians as u64 * (size_of::<u32>() + searched.max(joined)) as u64
     }
 }

@@ -31,6 +31,7 @@ use crate::memory::MemoryPlan;
 pub use find::{MIN_GAUSSIANS, find};
 pub use object::{NONE, Object, ObjectsReport, SceneObjects};
 pub use scene::Scene;
+pub use sightings::expected_bytes;
 
 /// Reserves what finding the objects of a scene takes, and the object of each Gaussian.
 pub fn reserve(memory: &mut MemoryPlan, n_gaussians: usize, n_views: usize) {

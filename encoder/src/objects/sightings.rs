@@ -22,7 +22,12 @@ pub fn sample_step(n_gaussians: usize) -> usize {
 pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize, n_views: usize) {
     let n_sampled = n_gaussians / sample_step(n_gaussians);
     let len_bytes = n_sampled * (size_of::<usize>() + n_views * 2 * size_of::<u32>());
-    memory.reserve(Phase::Objects, "views of sampled Gaussians", len_bytes as u64);
+    memory.reserve_expecting(Phase::Objects, "views of sampled Gaussians", len_bytes as u64, 0);
+}
+
+/// Returns the bytes of the sightings among `n_entries` contributions, and of their masks.
+pub fn expected_bytes(n_entries: u64, n_gaussians: usize) -> u64 {
+    n_entries / sample_step(n_gaussians) as u64 * 3 * size_of::<u32>() as u64
 }
 
 /// Reserves the lists of the masks that show the sampled Gaussians: at most `most_masks` in a region, and for each mask the

@@ -92,7 +92,13 @@ pub fn largest_cell_bytes(split: &CellSplit, dim: usize) -> u64 {
 
 /// Reserves the bytes of the largest cell.
 pub fn reserve(memory: &mut MemoryPlan, split: &CellSplit, dim: usize) {
-    memory.reserve(Phase::Cells, "the largest cell", largest_cell_bytes(split, dim));
+    memory.reserve_expecting(Phase::Cells, "the largest cell", largest_cell_bytes(split, dim), 0);
+}
+
+/// Returns the bytes that a cell of at most `len_bytes` is expected to take: the precision of the default needs half of the
+/// coordinates, and without the exact profile there are no embeddings in f16.
+pub fn expected_bytes(len_bytes: u64) -> u64 {
+    len_bytes / 2
 }
 
 /// What a cell's shards carry besides Gaussians and their embeddings.

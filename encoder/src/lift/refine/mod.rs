@@ -42,7 +42,7 @@ use super::photos::Photo;
 use super::superpoint::{Graph, Sketches, SuperpointSettings, Superpoints};
 use super::table::RegionTable;
 use crate::cells::CellSplit;
-use crate::memory::{MemoryPlan, Phase};
+use crate::memory::{self, MemoryPlan, Phase};
 use agreement::Votes;
 use mixture::{Mixtures, PartSums, SuperpointSums};
 use points::{AXES, Point};
@@ -180,6 +180,8 @@ impl Refinement {
         if !done {
             return Ok(false);
         }
+        // The parts of the pass are gone; without this the graph would come on top of them.
+        memory::give_back();
         let sketches = Sketches { width: AXES, values: &sketches };
         let graph = Graph::new(scene, Some(sketches), &SuperpointSettings::default());
         let Aggregation { superpoint, coarse, fill, .. } = self.settings;
@@ -219,11 +221,12 @@ impl Refinement {
         if !settings.needs_superpoints() {
             return;
         }
-        let sketches_bytes = (n_gaussians * (AXES + size_of::<u32>())) as u64;
-        let graph_bytes = Superpoints::working_bytes(n_gaussians, &SuperpointSettings::default());
-        memory.reserve(Phase::Refine, "superpoints of all Gaussians", sketches_bytes + graph_bytes);
         let n_scales =
             usize::from(settings.superpoint > 0.0 || settings.fill) + usize::from(settings.coarse > 0.0);
+        let sketches_bytes = (n_gaussians * (AXES + size_of::<u32>())) as u64;
+        let settings = SuperpointSettings::default();
+        let graph_bytes = Superpoints::working_bytes(n_gaussians, n_scales, &settings);
+        memory.reserve(Phase::Refine, "superpoints of all Gaussians", sketches_bytes + graph_bytes);
         let labels_bytes = (n_gaussians * n_scales * size_of::<u32>()) as u64;
         memory.reserve(Phase::Cells, "the superpoints of each Gaussian", labels_bytes);
     }

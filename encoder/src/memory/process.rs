@@ -1,0 +1,59 @@
+//! The memory that this process really has, as Linux counts it.
+
+/// Returns the bytes that the process holds now; `None` on other systems than Linux.
+pub fn held_bytes() -> Option<u64> {
+    status_bytes("VmRSS:")
+}
+
+/// Returns the most bytes that the process has held so far; `None` on other systems than Linux.
+pub fn peak_bytes() -> Option<u64> {
+    status_bytes("VmHWM:")
+}
+
+fn status_bytes(name: &str) -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix(name))?;
+    let kib: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(kib * 1024)
+}
+
+/// Gives freed memory back to the system. The allocator of glibc keeps what threads freed for these threads alone, so that
+/// each phase would come on top of the one before.
+pub fn give_back() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    trim();
+}
+
+#[cfg(all(target_os = "linux", target_env = "gnu"))]
+#[expect(unsafe_code, reason = "glibc offers it as a C function alone")]
+fn trim() {
+    // SAFETY: it takes a number, locks each arena of the allocator, and touches pages that lie in free chunks alone, so
+    // that no value can change. It may be called at any time from any thread.
+    unsafe { libc::malloc_trim(0) };
+}
+
+#[cfg(all(test, target_os = "linux", target_env = "gnu"))]
+mod tests {
+    use super::*;
+
+    /// A thread frees 64 MB in pieces that the allocator keeps, with pieces between them that live on: given back, they are no
+    /// longer held, and the others are as they were.
+    #[test]
+    fn freed_memory_is_given_back_and_the_rest_is_kept() {
+        let kept: Vec<Vec<u8>> = std::thread::spawn(|| {
+            let pieces: Vec<Vec<u8>> = (0..2048u32).map(|i| vec![(i % 251) as u8; 1 << 15]).collect();
+            // Dropped: all but one of 64.
+            pieces.into_iter().enumerate().filter(|(i, _)| i % 64 == 0).map(|(_, piece)| piece).collect()
+        })
+        .join()
+        .expect("no panic");
+        let before = held_bytes().expect("Linux");
+        give_back();
+        let after = held_bytes().expect("Linux");
+        assert!(after + (32 << 20) < before, "{before} bytes, then {after}");
+        for (i, piece) in kept.iter().enumerate() {
+            assert!(piece.iter().all(|x| *x == (64 * i % 251) as u8), "piece {i}");
+        }
+        assert!(peak_bytes().expect("Linux") >= before);
+    }
+}
