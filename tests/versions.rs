@@ -22,13 +22,9 @@ fn programs_state_the_version_of_the_workspace() {
 
 #[test]
 fn descriptions_and_clients_state_the_version_of_the_workspace() {
-    let empty = tempfile::tempdir().expect("a folder");
-    let robot = Service::start(&mut edge(&["serve", "--models", "colours", "--cache", text(empty.path())]));
-    assert_eq!(robot.get("/openapi.json")["info"]["version"], VERSION);
-    for file in ["encoder/src/publish/serve/openapi.json", "edge/src/http/openapi.json"] {
-        let text = fs_err::read_to_string(root().join(file)).expect("there");
-        let description: Value = serde_json::from_str(&text).expect("JSON");
-        assert_eq!(description["info"]["version"], VERSION, "{file}");
+    let site = Site::new();
+    for service in [&site.store, &site.robot(&[])] {
+        assert_eq!(service.get("/openapi.json")["info"]["version"], VERSION);
     }
     for (file, line) in [
         ("clients/python/pyproject.toml", format!("version = \"{VERSION}\"")),

@@ -13,6 +13,7 @@
 //! `mean_in_camera = camera_from_world * mean_in_world`.
 
 use glam::DVec3;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Semi-major axis of the WGS 84 ellipsoid (NIMA TR8350.2, table 3.1).
@@ -21,7 +22,7 @@ pub const WGS84_SEMI_MAJOR_M: f64 = 6_378_137.0;
 pub const WGS84_FLATTENING: f64 = 1.0 / 298.257_223_563;
 
 /// A geographic position: WGS 84 latitude and longitude in degrees, height in metres.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Geographic {
     /// Latitude, degrees, north positive, within -90..=90.
     pub latitude_deg: f64,
@@ -74,7 +75,7 @@ impl Geographic {
 }
 
 /// The position of the `world` frame on the earth: `world` is east-north-up at this origin.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct GeoReference {
     /// The origin of the world frame.
     pub origin: Geographic,
@@ -112,11 +113,13 @@ impl GeoReference {
 }
 
 /// An axis-aligned box in the world frame.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Aabb {
     /// Smallest corner.
+    #[schemars(with = "[f64; 3]")]
     pub min: DVec3,
     /// Largest corner.
+    #[schemars(with = "[f64; 3]")]
     pub max: DVec3,
 }
 

@@ -7,6 +7,7 @@ use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
+use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::Hash32;
 use slag_models::{InferenceError, ModelDir, ModelError, SessionOptions, TextEncoder};
@@ -44,7 +45,7 @@ pub enum TextOpenError {
 }
 
 /// The text encoder in use.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct EncoderInfo {
     /// Name of the embedding space.
     pub name: String,

@@ -11,7 +11,7 @@
 //! | route | [`routes`] | path and method; type and length of a request body, and time for it |
 //! | handler | the service's own | parameters, admission of expensive work, the answer |
 //!
-//! [`listen`] has the addresses to listen on, [`problem`] is the body of every error, [`range`] reads byte ranges and entity tags, [`metrics`] writes
+//! [`openapi`] describes routes and their types for programs, [`listen`] has the addresses to listen on, [`problem`] is the body of every error, [`range`] reads byte ranges and entity tags, [`metrics`] writes
 //! Prometheus' text format, [`stop`] waits for the signals to stop.
 
 pub mod access;
@@ -20,6 +20,7 @@ pub mod connection;
 pub mod listen;
 pub mod listener;
 pub mod metrics;
+pub mod openapi;
 mod permits;
 pub mod problem;
 pub mod range;

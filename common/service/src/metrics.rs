@@ -58,6 +58,9 @@ pub struct Exposition {
 }
 
 impl Exposition {
+    /// Its media type.
+    pub const MEDIA_TYPE: &str = "text/plain; version=0.0.4";
+
     /// Starts a text whose metrics' names begin with `prefix` and an underscore.
     pub fn new(prefix: &'static str) -> Self {
         Self { prefix, text: String::new() }
@@ -117,7 +120,7 @@ impl Exposition {
 
 impl IntoResponse for Exposition {
     fn into_response(self) -> Response {
-        let content_type = HeaderValue::from_static("text/plain; version=0.0.4");
+        let content_type = HeaderValue::from_static(Self::MEDIA_TYPE);
         ([(header::CONTENT_TYPE, content_type)], self.text).into_response()
     }
 }

@@ -4,7 +4,32 @@ use std::fmt;
 
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use serde_json::{Map, Value};
+use schemars::JsonSchema;
+use serde::Serialize;
+use serde_json::{Map, Value, json};
+
+/// The body of an error (RFC 9457).
+#[derive(Serialize, JsonSchema)]
+#[schemars(rename = "Problem")]
+pub struct ProblemBody<M> {
+    /// A URI that names the kind of error; it never changes its meaning.
+    #[serde(rename = "type")]
+    kind: String,
+    /// The kind in words.
+    title: &'static str,
+    /// Status of the response.
+    status: u16,
+    /// This error in words, and what to do.
+    detail: String,
+    /// Path and number of the request, as in the log and in x-request-id.
+    instance: String,
+    #[serde(flatten)]
+    members: M,
+}
+
+/// The members of problems that have none of their own.
+#[derive(Serialize, JsonSchema)]
+pub struct NoMembers {}
 
 /// One error, as a client sees it.
 ///
@@ -60,9 +85,11 @@ impl Problem {
         self
     }
 
-    /// Adds a member beyond those of RFC 9457.
-    pub fn with(mut self, member: &str, value: impl Into<Value>) -> Self {
-        self.members.insert(member.to_owned(), value.into());
+    /// Adds members beyond those of RFC 9457, those of the type that the service's description names.
+    pub fn with(mut self, members: &impl Serialize) -> Self {
+        if let Value::Object(members) = json!(members) {
+            self.members.extend(members);
+        }
         self
     }
 
@@ -99,12 +126,14 @@ impl Problem {
     /// Writes the body into a response that this problem made.
     pub(crate) fn render(self, response: Response, instance: String) -> Response {
         let (mut head, _) = response.into_parts();
-        let mut body = self.members;
-        body.insert("type".into(), format!("urn:slag:problem:{}", self.kind).into());
-        body.insert("title".into(), self.title.into());
-        body.insert("status".into(), self.status.as_u16().into());
-        body.insert("detail".into(), self.detail.into());
-        body.insert("instance".into(), instance.into());
+        let body = ProblemBody {
+            kind: format!("urn:slag:problem:{}", self.kind),
+            title: self.title,
+            status: self.status.as_u16(),
+            detail: self.detail,
+            instance,
+            members: self.members,
+        };
         for replaced in [header::CONTENT_LENGTH, header::TRANSFER_ENCODING] {
             head.headers.remove(replaced);
         }
@@ -112,7 +141,7 @@ impl Problem {
         let content_type = HeaderValue::from_static("application/problem+json");
         head.headers.insert(header::CONTENT_TYPE, content_type);
         head.headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
-        Response::from_parts(head, Value::Object(body).to_string().into())
+        Response::from_parts(head, json!(body).to_string().into())
     }
 }
 

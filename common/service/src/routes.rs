@@ -1,23 +1,49 @@
-//! The table of a service's routes, from which the router and the help text are made.
+//! The table of a service's routes, from which the router, the help text and the description for programs are made.
 
 use std::convert::Infallible;
 use std::fmt::Write;
+use std::sync::{Arc, OnceLock};
 
-use axum::Router;
 use axum::extract::Request;
 use axum::handler::Handler;
-use axum::http::Method;
+use axum::http::{Method, header};
 use axum::middleware::{Next, from_fn};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodRouter, get, post};
+use axum::{Json, Router};
+use schemars::{JsonSchema, SchemaGenerator};
+use serde_json::{Map, Value};
 
 use crate::body;
+use crate::openapi::{self, About, Answering, As, Described, Reply, SchemaOf};
 
 /// Column in which the help text's summaries begin.
 const SUMMARY_COLUMN: usize = 36;
 
-/// A query parameter of a route.
-#[derive(Clone, Debug, PartialEq, Eq)]
+/// Where a parameter stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Place {
+    /// In the query string.
+    Query,
+    /// In the path.
+    Path,
+    /// Among the headers.
+    Header,
+}
+
+impl Place {
+    /// Returns its name in OpenAPI.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Query => "query",
+            Self::Path => "path",
+            Self::Header => "header",
+        }
+    }
+}
+
+/// A parameter of a route.
+#[derive(Clone, Debug)]
 pub struct Parameter {
     /// Name.
     pub name: &'static str,
@@ -25,17 +51,86 @@ pub struct Parameter {
     pub example: &'static str,
     /// Meaning, one line.
     pub summary: String,
+    /// More about it, for the description.
+    pub details: Option<&'static str>,
+    /// Where it stands.
+    pub place: Place,
+    /// Whether it must be there.
+    pub is_required: bool,
+    /// Most values; absent: one.
+    pub most: Option<usize>,
+    pub(crate) schema: SchemaOf,
+    pub(crate) limits: Map<String, Value>,
 }
 
 impl Parameter {
-    /// Describes a parameter.
-    pub fn new(name: &'static str, example: &'static str, summary: impl Into<String>) -> Self {
-        Self { name, example, summary: summary.into() }
+    /// Describes a query parameter whose values are those of a type.
+    pub fn new<T: JsonSchema>(name: &'static str, example: &'static str, summary: impl Into<String>) -> Self {
+        Self {
+            name,
+            example,
+            summary: summary.into(),
+            details: None,
+            place: Place::Query,
+            is_required: false,
+            most: None,
+            schema: SchemaGenerator::subschema_for::<T>,
+            limits: Map::new(),
+        }
+    }
+
+    /// Describes a part of the path.
+    pub fn of_path<T: JsonSchema>(name: &'static str, summary: impl Into<String>) -> Self {
+        Self { place: Place::Path, is_required: true, ..Self::new::<T>(name, "", summary) }
+    }
+
+    /// Describes a header.
+    pub fn of_header(name: &'static str, summary: impl Into<String>) -> Self {
+        Self { place: Place::Header, ..Self::new::<String>(name, "", summary) }
+    }
+
+    /// Says more about it.
+    pub fn details(self, details: &'static str) -> Self {
+        Self { details: Some(details), ..self }
+    }
+
+    /// It must be there.
+    pub fn required(self) -> Self {
+        Self { is_required: true, ..self }
+    }
+
+    /// It may be there several times.
+    pub fn repeated(self, most: usize) -> Self {
+        Self { most: Some(most), ..self }
+    }
+
+    /// Restricts its values by a keyword of JSON Schema.
+    pub fn limit(mut self, keyword: &str, value: impl Into<Value>) -> Self {
+        self.limits.insert(keyword.to_owned(), value.into());
+        self
+    }
+
+    /// Restricts it to a range, both ends included.
+    pub fn within(self, least: impl Into<Value>, most: impl Into<Value>) -> Self {
+        self.limit("minimum", least).limit("maximum", most)
+    }
+
+    /// Restricts it to texts of a form, a regular expression.
+    pub fn of_form(self, pattern: impl Into<String>) -> Self {
+        self.limit("pattern", pattern.into())
+    }
+
+    /// States the value that stands for an absent one.
+    pub fn or(mut self, default: impl Into<Value>) -> Self {
+        let default = default.into();
+        let shown = default.as_str().map_or_else(|| default.to_string(), str::to_owned);
+        self.summary.push_str(&format!(" (default: {shown})"));
+        self.limit("default", default)
     }
 }
 
 /// A route.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug)]
 pub struct Route {
     /// Method; a GET route takes HEAD as well.
     pub method: Method,
@@ -43,8 +138,21 @@ pub struct Route {
     pub path: &'static str,
     /// The answer, one line.
     pub summary: &'static str,
-    /// Query parameters.
+    /// More about it, for the description.
+    pub details: Option<&'static str>,
+    /// Parameters.
     pub parameters: Vec<Parameter>,
+    /// Statuses and meanings of its own errors.
+    pub errors: Vec<(u16, &'static str)>,
+    pub(crate) body: Option<SchemaOf>,
+    pub(crate) replies: fn(&mut SchemaGenerator) -> Vec<Reply>,
+}
+
+impl Route {
+    /// Returns the parameters of the query string.
+    pub fn query(&self) -> impl Iterator<Item = &Parameter> {
+        self.parameters.iter().filter(|parameter| parameter.place == Place::Query)
+    }
 }
 
 /// Routes under construction.
@@ -60,7 +168,7 @@ impl<S: Clone + Send + Sync + 'static> Default for Routes<S> {
 }
 
 impl<S: Clone + Send + Sync + 'static> Routes<S> {
-    fn add(
+    fn add<D: Described>(
         mut self,
         method: Method,
         path: &'static str,
@@ -68,51 +176,84 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         handler: MethodRouter<S, Infallible>,
     ) -> Self {
         self.router = self.router.route(path, handler);
-        self.table.push(Route { method, path, summary, parameters: Vec::new() });
+        let (details, parameters, errors, body) = (None, Vec::new(), Vec::new(), None);
+        let replies = D::replies;
+        self.table.push(Route { method, path, summary, details, parameters, errors, body, replies });
         self
     }
 
     /// Adds a resource that is read.
-    pub fn get<T: 'static>(
+    pub fn get<T: 'static, H: Handler<T, S> + Answering<T>>(
         self,
         path: &'static str,
         summary: &'static str,
-        handler: impl Handler<T, S>,
+        handler: H,
     ) -> Self {
-        self.add(Method::GET, path, summary, get(handler))
+        self.add::<H::Answer>(Method::GET, path, summary, get(handler))
     }
 
-    /// Adds a resource that takes a JSON body of at most `max_body_bytes`. The body is read, and bodies of another type,
-    /// longer ones and slow ones are refused, before the handler is called.
-    pub fn post<T: 'static>(
+    /// Adds a resource that takes a `B` in JSON, of at most `max_body_bytes`. The body is read, and bodies of another type,
+    /// longer ones and slow ones are refused, before the handler is called; the handler parses it.
+    pub fn post<B: JsonSchema, T: 'static, H: Handler<T, S> + Answering<T>>(
         self,
         path: &'static str,
         summary: &'static str,
         max_body_bytes: usize,
-        handler: impl Handler<T, S>,
+        handler: H,
     ) -> Self {
         let whole = from_fn(move |request: Request, next: Next| whole_body(max_body_bytes, request, next));
         let handler = post(handler).route_layer(whole);
-        self.add(Method::POST, path, summary, handler)
+        let mut routes = self.add::<H::Answer>(Method::POST, path, summary, handler);
+        routes.last(|route| route.body = Some(SchemaGenerator::subschema_for::<B>));
+        routes
     }
 
-    /// Describes the query parameters of the route added last.
-    pub fn parameters(mut self, parameters: impl IntoIterator<Item = Parameter>) -> Self {
+    fn last(&mut self, change: impl FnOnce(&mut Route)) {
         if let Some(route) = self.table.last_mut() {
-            route.parameters.extend(parameters);
+            change(route);
         }
+    }
+
+    /// Describes the parameters of the route added last.
+    pub fn parameters(mut self, parameters: impl IntoIterator<Item = Parameter>) -> Self {
+        self.last(|route| route.parameters.extend(parameters));
         self
     }
 
-    /// Adds `GET /`, a text for people: `title`, then every route and parameter. Returns the router and the
-    /// table.
-    pub fn with_help(mut self, title: &str) -> (Router<S>, Vec<Route>) {
-        let (path, summary) = ("/", "this list");
-        self.table.push(Route { method: Method::GET, path, summary, parameters: Vec::new() });
-        let text = help(title, &self.table);
-        let router = self.router.route(path, get(async move || text));
-        (router, self.table)
+    /// Says more about the route added last.
+    pub fn details(mut self, details: &'static str) -> Self {
+        self.last(|route| route.details = Some(details));
+        self
     }
+
+    /// Describes errors of the route added last, beyond those that its parameters and its body can cause.
+    pub fn errors(mut self, errors: &[(u16, &'static str)]) -> Self {
+        self.last(|route| route.errors.extend_from_slice(errors));
+        self
+    }
+
+    /// Adds `GET /`, a text for people: every route and parameter; and `GET /openapi.json`, the same for programs with all
+    /// types, made on the first request. `M`: members of the service's problems beyond those of RFC 9457. Returns the router
+    /// and the table.
+    pub fn described<M: JsonSchema>(self, about: About) -> (Router<S>, Vec<Route>) {
+        let table = Arc::<OnceLock<Vec<Route>>>::default();
+        let (of_help, of_document) = (Arc::clone(&table), Arc::clone(&table));
+        let made = Arc::<OnceLock<String>>::default();
+        let described = self
+            .get("/openapi.json", "this list for programs, with the types of all messages", async move || {
+                let text = made.get_or_init(|| openapi::document::<M>(&about, rows(&of_document))).clone();
+                As::<Json<Map<String, Value>>>::new(([(header::CONTENT_TYPE, "application/json")], text))
+            })
+            .get("/", "this list", async move || {
+                As::<&'static str>::new(help(about.summary, rows(&of_help)))
+            });
+        let rows = table.get_or_init(|| described.table).clone();
+        (described.router, rows)
+    }
+}
+
+fn rows(table: &OnceLock<Vec<Route>>) -> &[Route] {
+    table.get().map(Vec::as_slice).unwrap_or_default()
 }
 
 /// Hands a request on with its body read.
@@ -136,7 +277,7 @@ fn help(title: &str, table: &[Route]) -> String {
     };
     for route in table {
         line(format!("{} {}", route.method, route.path), route.summary);
-        for Parameter { name, example, summary } in &route.parameters {
+        for Parameter { name, example, summary, .. } in route.query() {
             line(format!("    {name}={example}"), summary);
         }
     }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::frames::{Aabb, GeoReference};
@@ -18,10 +19,11 @@ pub const MAX_TEXT_FILES: usize = 16;
 pub const MAX_BYTES: u64 = 64 << 20;
 
 /// A list of the shards of one generation of a scene.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
     /// Format version.
+    #[schemars(extend("const" = VERSION))]
     pub version: u32,
     /// Name of the scene.
     pub scene: String,
@@ -47,7 +49,7 @@ pub struct Manifest {
 }
 
 /// The encoder that made a scene's embeddings.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct EncoderRecord {
     /// Its name, for display.
@@ -67,7 +69,7 @@ pub struct EncoderRecord {
 }
 
 /// The text side of an encoder as objects of the store.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TextModelRecord {
     /// The description in JSON, which names the files by their BLAKE3 hashes.
@@ -84,7 +86,7 @@ impl TextModelRecord {
 }
 
 /// An object that is no shard: an immutable file named by its hash.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ObjectRecord {
     /// BLAKE3 of the file.
@@ -97,7 +99,7 @@ pub struct ObjectRecord {
 ///
 /// Nearly all pairs of text and Gaussian do not match, so this is the distribution of non-matches in this scene with this
 /// encoder.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Calibration {
     /// Mean of the scores of all pairs.
@@ -107,7 +109,7 @@ pub struct Calibration {
 }
 
 /// A cell: a piece of space and its shards.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CellRecord {
     /// The cell.
@@ -121,7 +123,7 @@ pub struct CellRecord {
 }
 
 /// A shard: an immutable file named by its hash.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ShardRecord {
     /// BLAKE3 of the file.

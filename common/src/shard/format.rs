@@ -1,6 +1,7 @@
 //! Constants, section ids and the header of the shard format.
 
 use bytemuck::{Pod, Zeroable};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// First bytes of a shard.
@@ -70,7 +71,7 @@ pub mod section {
 }
 
 /// Absolute errors of a profile's scores, measured over a bank of text vectors and a sample of the Gaussians.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 #[repr(C)]
 pub struct ScoreErrors {

@@ -1,9 +1,10 @@
 //! Profiles: the sizes in which a cell is published.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The amount of data that a shard carries.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Profile {
     /// Centroids and positions.

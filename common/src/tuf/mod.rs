@@ -32,7 +32,7 @@ pub use metadata::{
     sha256_hex,
 };
 pub use repository::one_key_repository;
-pub use signed::{Head, MetadataSignature, SignedMetadata, add_signatures, sign};
+pub use signed::{Envelope, Head, MetadataSignature, SignedMetadata, add_signatures, sign};
 pub use time::{format_utc, parse_utc};
 pub use trusted::{Offered, Trusted};
 pub use update::{Source, find_target, refresh};

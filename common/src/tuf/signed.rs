@@ -3,8 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use ed25519_dalek::{Signer, SigningKey};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use serde_json::{Map, Value};
 
 use super::canonical::canonical_json;
 use super::error::TufError;
@@ -27,7 +28,7 @@ pub struct Head {
 }
 
 /// A signature in metadata.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct MetadataSignature {
     /// Id of the key.
     pub keyid: String,
@@ -35,9 +36,14 @@ pub struct MetadataSignature {
     pub sig: String,
 }
 
-#[derive(Serialize, Deserialize)]
-struct Envelope {
+/// A signed document of The Update Framework.
+#[derive(Serialize, Deserialize, JsonSchema)]
+#[schemars(rename = "Metadata")]
+pub struct Envelope {
+    /// Signatures of its canonical form.
     signatures: Vec<MetadataSignature>,
+    /// What is signed.
+    #[schemars(with = "Map<String, Value>")]
     signed: Value,
 }
 

@@ -1,14 +1,15 @@
 //! `GET /v1/view`: what there is to draw.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use glam::{DVec3, Vec3};
+use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::frames::Aabb;
 use slag_common::photo_poses::PhotoPoses;
 
 /// The scene as the page first sees it. Lengths are in world units, metres in a metric scene.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, JsonSchema)]
 pub struct Description {
     /// The program that answers.
     pub program: &'static str,
@@ -19,6 +20,7 @@ pub struct Description {
     /// Gaussians of all cells that can be drawn.
     pub n_gaussians: u64,
     /// Unit vector upward.
+    #[schemars(with = "[f32; 3]")]
     pub up: Vec3,
     /// Whether a world unit is a metre.
     pub metric: bool,
@@ -38,11 +40,12 @@ pub struct Description {
     pub fetched: Option<Fetched>,
     /// Where the robot is.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(with = "Option<[f64; 3]>")]
     pub position_m: Option<DVec3>,
 }
 
 /// A cell.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, JsonSchema)]
 pub struct Cell {
     /// Its id.
     pub cell: u32,
@@ -57,7 +60,7 @@ pub struct Cell {
 }
 
 /// Whether a cell can be drawn.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum CellState {
     /// Yes.
@@ -69,11 +72,13 @@ pub enum CellState {
 }
 
 /// The corners of a box.
-#[derive(Clone, Copy, Debug, Serialize)]
+#[derive(Clone, Copy, Debug, Serialize, JsonSchema)]
 pub struct Corners {
     /// Smallest.
+    #[schemars(with = "[f64; 3]")]
     pub min: DVec3,
     /// Largest.
+    #[schemars(with = "[f64; 3]")]
     pub max: DVec3,
 }
 
@@ -84,11 +89,12 @@ impl From<Aabb> for Corners {
 }
 
 /// A photo's name and pose.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, JsonSchema)]
 pub struct Photo {
     /// Its name.
     pub name: String,
     /// Where it was taken.
+    #[schemars(with = "[f64; 3]")]
     pub position_m: DVec3,
     /// World from camera (x right, y down, z forward).
     pub rotation_xyzw: [f32; 4],
@@ -118,7 +124,7 @@ impl Photo {
 }
 
 /// Reply of `GET /v1/view/words`: what the page suggests.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, JsonSchema)]
 pub struct Words {
     /// The generation whose things are counted.
     pub generation: u64,
@@ -133,7 +139,25 @@ impl Words {
     /// Most words that are counted: lists of phrases for people are shorter.
     pub const MAX: usize = 2048;
     /// Time after which a request encodes no further everyday word: questions wait meanwhile.
-    pub const ENCODING: Duration = Duration::from_millis(500);
+    const ENCODING: Duration = Duration::from_millis(500);
+
+    /// Encodes words as long as there is time for it. Returns what `encode` made of them, and whether all were encoded.
+    ///
+    /// # Errors
+    /// The first of `encode`.
+    pub fn encode<'a, V, E>(
+        words: impl IntoIterator<Item = &'a str>,
+        mut encode: impl FnMut(&'a str) -> Result<V, E>,
+    ) -> Result<(Vec<V>, bool), E> {
+        let (started, mut encoded) = (Instant::now(), Vec::new());
+        for word in words {
+            if started.elapsed() > Self::ENCODING {
+                return Ok((encoded, false));
+            }
+            encoded.push(encode(word)?);
+        }
+        Ok((encoded, true))
+    }
 
     /// Orders words by their things; equal ones stay in the model's order.
     pub fn new(generation: u64, mut words: Vec<Word>, complete: bool) -> Self {
@@ -143,7 +167,7 @@ impl Words {
 }
 
 /// A word to ask for.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, JsonSchema)]
 pub struct Word {
     /// The word, or phrase.
     pub word: String,
@@ -152,10 +176,33 @@ pub struct Word {
 }
 
 /// The area that a robot fetched.
-#[derive(Clone, Copy, Debug, Serialize)]
+#[derive(Clone, Copy, Debug, Serialize, JsonSchema)]
 pub struct Fetched {
     /// Its middle.
+    #[schemars(with = "[f64; 3]")]
     pub centre_m: DVec3,
     /// Its radius.
     pub radius_m: f64,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn words_are_encoded_while_there_is_time() {
+        let of = |pause: Duration| {
+            Words::encode(["mug", "chair", "lamp"], |word| {
+                std::thread::sleep(pause);
+                Ok::<_, ()>(word.len())
+            })
+        };
+        assert_eq!(of(Duration::ZERO), Ok((vec![3, 5, 4], true)));
+        // What has begun is finished.
+        assert_eq!(of(Words::ENCODING), Ok((vec![3], false)));
+        assert_eq!(
+            Words::encode(["mug", "chair"], |word| if word == "mug" { Ok(()) } else { Err(word) }),
+            Err("chair")
+        );
+    }
 }

@@ -11,6 +11,7 @@ use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
+use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::manifest::Manifest;
 use slag_common::retry::Backoff;
@@ -131,7 +132,7 @@ impl Follower {
 }
 
 /// Status of following, for people and monitors.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, JsonSchema)]
 pub struct FollowStatus {
     /// The robot's last known position.
     pub position: Option<Position>,

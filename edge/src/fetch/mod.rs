@@ -39,7 +39,7 @@ pub use error::{DownloadFailure, FetchError};
 pub use limits::NetworkLimits;
 pub use plan::{Held, Object, Plan, Wanted};
 pub use plan_error::PlanError;
-pub use position::{NotAPosition, Position};
+pub use position::{NotAPosition, Position, Spoken};
 pub use records::{Accepted, LastFetch, Records, RecordsError, accepted};
 pub use report::{FetchReport, Tally};
 pub use request::{DEFAULT_PARALLEL, DEFAULT_RADIUS, FetchRequest};

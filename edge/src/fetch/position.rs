@@ -3,6 +3,7 @@
 use std::str::FromStr;
 
 use glam::{DVec2, DVec3};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use slag_common::frames::{Aabb, Geographic};
 use slag_common::manifest::Manifest;
@@ -13,19 +14,19 @@ use super::plan_error::PlanError;
 pub const MAX_TEXT_BYTES: usize = 256;
 
 /// Position of a robot.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
+#[schemars(rename = "KnownPosition")]
 pub enum Position {
     /// In the world frame.
-    World(DVec3),
+    World(#[schemars(with = "[f64; 3]")] DVec3),
     /// Geographic; needs a geo-referenced scene.
     Geographic {
         /// Latitude, degrees, north positive (WGS 84).
         latitude_deg: f64,
         /// Longitude, degrees, east positive.
         longitude_deg: f64,
-        /// Height in metres, in the datum of the scene's origin; absent: the scene's own height there (see
-        /// [`Position::in_world`]).
+        /// Height in metres, in the datum of the scene's origin; absent: the scene's own height there.
         height_m: Option<f64>,
     },
 }
@@ -40,12 +41,31 @@ pub struct NotAPosition {
     pub found: String,
 }
 
-/// A position as JSON.
-#[derive(Deserialize)]
+/// In the world frame, or on the earth in degrees and metres.
+#[derive(Deserialize, JsonSchema)]
 #[serde(untagged, deny_unknown_fields)]
-enum Spoken {
-    World { x: f64, y: f64, z: f64 },
-    Geographic { lat: f64, lon: f64, height: Option<f64> },
+#[schemars(rename = "Position")]
+pub enum Spoken {
+    /// In the world frame.
+    World {
+        /// Along x.
+        x: f64,
+        /// Along y.
+        y: f64,
+        /// Along z.
+        z: f64,
+    },
+    /// On the earth, WGS 84.
+    Geographic {
+        /// Latitude, north positive.
+        #[schemars(range(min = -90, max = 90))]
+        lat: f64,
+        /// Longitude, east positive.
+        #[schemars(range(min = -180, max = 180))]
+        lon: f64,
+        /// Height in metres; the scene's own height there if absent.
+        height: Option<f64>,
+    },
 }
 
 impl FromStr for Position {

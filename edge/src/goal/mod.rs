@@ -18,7 +18,7 @@ mod ground;
 mod map;
 mod paths;
 mod reply;
-mod request;
+pub mod request;
 mod sight;
 mod space;
 mod surroundings;

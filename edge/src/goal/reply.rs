@@ -1,15 +1,17 @@
 //! Poses, or why there is none.
 
 use glam::DVec3;
+use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::frames::Geographic;
 
 use crate::query::FRAME;
 
 /// A pose to stand in, in the scene's world frame: x forward, y left, z up (REP-103).
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct Goal {
     /// The ground below the robot's middle.
+    #[schemars(with = "[f64; 3]")]
     pub position_in_world: DVec3,
     /// The same on the earth, if the scene is geo-referenced.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -19,6 +21,7 @@ pub struct Goal {
     /// The same as a quaternion: x, y, z, w.
     pub orientation_xyzw: [f64; 4],
     /// The sensor.
+    #[schemars(with = "[f64; 3]")]
     pub sensor_in_world: DVec3,
     /// Horizontal distance from the robot's middle to what it must not touch.
     pub clearance_m: f64,
@@ -33,7 +36,7 @@ pub struct Goal {
 }
 
 /// Why there is no pose.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum NoGoal {
     /// Nothing on board matches.
@@ -47,7 +50,7 @@ pub enum NoGoal {
 }
 
 /// Why there is no pose, for programs and people.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct GoalMiss {
     /// The reason.
     pub kind: NoGoal,
@@ -56,11 +59,12 @@ pub struct GoalMiss {
 }
 
 /// The thing to go to.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct TargetThing {
     /// Its id.
     pub id: String,
     /// Mean of its Gaussians.
+    #[schemars(with = "[f64; 3]")]
     pub position_in_world: DVec3,
     /// Its score with the text; absent if it was asked for by id.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -68,7 +72,7 @@ pub struct TargetThing {
 }
 
 /// A thing that matches better, but without a pose.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct MissedThing {
     /// The thing.
     #[serde(flatten)]
@@ -78,17 +82,19 @@ pub struct MissedThing {
 }
 
 /// The places to stand.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct GoalReply {
     /// Name of the scene.
     pub scene: String,
     /// Its generation.
     pub generation: u64,
     /// Frame of every position.
+    #[schemars(extend("enum" = [FRAME]))]
     pub frame: &'static str,
     /// Edge of the voxels that places are known by.
     pub voxel_m: f64,
     /// Where the robot was taken to be.
+    #[schemars(with = "[f64; 3]")]
     pub near_in_world: DVec3,
     /// The best match with a pose.
     pub thing: Option<TargetThing>,

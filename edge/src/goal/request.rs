@@ -4,6 +4,23 @@ use glam::DVec3;
 
 use crate::query::RequestError;
 
+/// Least and largest radius of the robot.
+pub const RADIUS_M: [f64; 2] = [0.05, 2.0];
+/// Least and largest reach.
+pub const REACH_M: [f64; 2] = [0.0, 10.0];
+/// Least and largest height of the sensor.
+pub const SENSOR_HEIGHT_M: [f64; 2] = [0.05, 2.3];
+/// Least and largest height of the robot: places are known up to 2.4 m above a surface.
+pub const HEIGHT_M: [f64; 2] = [0.05, 2.4];
+/// Least and largest step.
+pub const STEP_M: [f64; 2] = [0.0, 0.5];
+/// Least and largest range.
+pub const RANGE_M: [f64; 2] = [1.0, 50.0];
+/// Least and largest share that must be visible.
+pub const MIN_VISIBLE: [f64; 2] = [0.01, 1.0];
+/// Most poses of a reply.
+pub const MAX_POSES: usize = 20;
+
 /// The thing to go to.
 #[derive(Clone, Debug, PartialEq)]
 pub enum GoalTarget {
@@ -65,23 +82,23 @@ impl GoalRequest {
     /// # Errors
     /// The first parameter that is out of its range.
     pub fn check(&self) -> Result<(), RequestError> {
-        // Places are known up to 2.4 m above a surface.
         let ranges = [
-            ("radius_m", self.radius_m, 0.05, 2.0),
-            ("reach_m", self.reach_m, 0.0, 10.0),
-            ("sensor_height_m", self.sensor_height_m, 0.05, 2.3),
-            ("height_m", self.height(), self.sensor_height_m, 2.4),
-            ("step_m", self.step_m, 0.0, 0.5),
-            ("range_m", self.range_m, 1.0, 50.0),
-            ("min_visible", self.min_visible, 0.01, 1.0),
+            ("radius_m", self.radius_m, RADIUS_M),
+            ("reach_m", self.reach_m, REACH_M),
+            ("sensor_height_m", self.sensor_height_m, SENSOR_HEIGHT_M),
+            ("height_m", self.height(), [self.sensor_height_m, HEIGHT_M[1]]),
+            ("step_m", self.step_m, STEP_M),
+            ("range_m", self.range_m, RANGE_M),
+            ("min_visible", self.min_visible, MIN_VISIBLE),
         ];
-        for (name, value, low, high) in ranges {
+        for (name, value, [low, high]) in ranges {
             if !(low..=high).contains(&value) {
                 return Err(RequestError::new(name, &value.to_string(), format!("{low} to {high}")));
             }
         }
-        if !(1..=20).contains(&self.limit) {
-            return Err(RequestError::new("limit", &self.limit.to_string(), "1 to 20 poses"));
+        if !(1..=MAX_POSES).contains(&self.limit) {
+            let expected = format!("1 to {MAX_POSES} poses");
+            return Err(RequestError::new("limit", &self.limit.to_string(), expected));
         }
         match self.near {
             Some(near) if !near.is_finite() || near.abs().max_element() >= 1e9 => {

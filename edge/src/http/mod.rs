@@ -2,6 +2,7 @@
 
 mod app;
 mod follower;
+mod forms;
 mod metrics;
 mod params;
 mod position;

@@ -1,67 +1,60 @@
 //! The parameters of `/query`.
 
-use std::fmt::Display;
 use std::str::FromStr;
 
 use axum::http::{HeaderMap, header};
 use slag_service::routes::Parameter;
 
+use super::forms;
 use crate::query::{
-    AnswerKind, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, Format, QueryRequest, RequestError, parse_box, parse_point,
+    AnswerKind, DEFAULT_LIMIT, Format, MAX_GAUSSIANS, MAX_TEXTS, QueryRequest, RequestError, parse_box,
+    parse_point,
 };
-use crate::score::Precision;
 
 /// Returns the parameters, with the values and defaults of the types behind them.
 pub fn parameters() -> [Parameter; 12] {
-    let (kind, precision, format) =
-        (list(&AnswerKind::ALL), list(&Precision::ALL), list(Format::available()));
-    let default_precision = Precision::default();
+    let formats = Format::available().iter().map(|format| format.name());
+    let kinds = AnswerKind::ALL.map(AnswerKind::name).join(", ");
     [
-        Parameter::new("text", "chair", "what to look for; several are answered in one pass, as a batch"),
-        Parameter::new(
+        forms::text("chair", "what to look for; several are answered in one pass, as a batch")
+            .required()
+            .repeated(MAX_TEXTS),
+        Parameter::new::<String>(
             "negatives",
             "canonical",
-            "or none, or a,b,c: scores are relevancy against these (default: none)",
-        ),
-        Parameter::new("limit", "10", format!("most answers to a text (default: {DEFAULT_LIMIT})")),
-        Parameter::new(
-            "threshold",
-            "0.1",
-            "least cosine, or relevancy with negatives (default: the scene's)",
-        ),
-        Parameter::new(
-            "near",
-            "x,y,z",
-            "where the asker is: answers have distances and nearer ones rank higher",
-        ),
-        Parameter::new("radius", "r", "only within this distance of near"),
-        Parameter::new("box", "x,y,z,x,y,z", "only between two corners"),
-        Parameter::new(
+            "or none, or a,b,c: scores are relevancy against these",
+        )
+        .details(
+            "canonical: object, things, stuff, texture. At most 16 phrases. Relevancy is LERF's, 1 / (1 + exp(-10 (q.E - max n.E))).",
+        )
+        .or("none"),
+        Parameter::new::<usize>("limit", "10", "most answers to a text")
+            .details("Over all texts at most 10,000 clusters or 1,000,000 Gaussians.")
+            .within(1, MAX_GAUSSIANS)
+            .or(DEFAULT_LIMIT),
+        forms::least_score("threshold"),
+        forms::near("where the asker is: answers have distances and nearer ones rank higher"),
+        forms::length("radius", "r", "only within this distance of near, world units"),
+        forms::bounds(),
+        Parameter::new::<AnswerKind>(
             "kind",
             "clusters",
-            format!("{kind} (default: objects where the scene has them, else clusters)"),
+            format!("{kinds} (default: objects where the scene has them, else clusters)"),
         ),
-        Parameter::new("voxel", "v", "edge of the voxels that join Gaussians to clusters"),
-        Parameter::new(
-            "min_count",
-            "n",
-            format!("smaller clusters are dropped (default: {DEFAULT_MIN_COUNT})"),
-        ),
-        Parameter::new(
-            "precision",
-            "measured",
-            format!("{precision}, fastest first (default: {default_precision})"),
-        ),
-        Parameter::new(
+        forms::voxel(),
+        forms::min_count(),
+        forms::precision(),
+        Parameter::new::<String>(
             "format",
             "json",
-            format!("{format}; arrow: Gaussians as columns; ply: the answers' Gaussians as points"),
-        ),
+            "arrow: Gaussians as columns; ply: the answers' Gaussians as points",
+        )
+        .details(
+            "arrow is for kind=gaussians only. Accept: application/vnd.apache.arrow.stream has the same effect.",
+        )
+        .limit("enum", formats.collect::<Vec<_>>())
+        .or(Format::default().name()),
     ]
-}
-
-fn list(values: &[impl Display]) -> String {
-    values.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
 }
 
 /// Reads a question and the format of its answer from decoded `name=value` pairs; [`QueryRequest::check`]

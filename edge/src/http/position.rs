@@ -6,7 +6,9 @@ use axum::Json;
 use axum::body::Bytes;
 use axum::extract::State;
 use axum::http::StatusCode;
-use serde_json::{Value, json};
+use schemars::{JsonSchema, SchemaGenerator};
+use serde::Serialize;
+use slag_service::openapi::{As, Described, Reply};
 use slag_service::problem::Problem;
 
 use super::app::App;
@@ -19,10 +21,21 @@ use crate::query::RequestError;
 pub const MAX_BODY_BYTES: usize = 1024;
 const EXPECTED: &str = r#"{"x":..,"y":..,"z":..} or {"lat":..,"lon":..,"height":..}"#;
 
-pub async fn position(
-    State(app): State<Arc<App>>,
-    body: Bytes,
-) -> Result<(StatusCode, Json<Value>), Problem> {
+/// The position as the follower takes it.
+#[derive(Serialize, JsonSchema)]
+pub struct Accepted {
+    /// The position.
+    position: Position,
+}
+
+impl Described for Accepted {
+    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
+        let ok = Reply::ok("application/json", schemas.subschema_for::<Self>());
+        vec![Reply { status: StatusCode::ACCEPTED, ..ok }]
+    }
+}
+
+pub async fn position(State(app): State<Arc<App>>, body: Bytes) -> Result<As<Accepted>, Problem> {
     let Some(following) = &app.following else { return Err(not_following()) };
     let text = String::from_utf8_lossy(&body);
     let refused = |e: NotAPosition| parameter_problem(RequestError::new("body", &e.found, EXPECTED));
@@ -31,6 +44,6 @@ pub async fn position(
     following.post(position);
     match following.failure() {
         Some(failure) => Err(follower_failed(&failure)),
-        None => Ok((StatusCode::ACCEPTED, Json(json!({ "position": position })))),
+        None => Ok(As::new((StatusCode::ACCEPTED, Json(Accepted { position })))),
     }
 }

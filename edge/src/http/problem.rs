@@ -3,7 +3,9 @@
 use std::time::Duration;
 
 use axum::http::StatusCode;
-use serde_json::json;
+use schemars::JsonSchema;
+use serde::Serialize;
+use slag_common::Hash32;
 use slag_models::InferenceError;
 use slag_service::problem::Problem;
 
@@ -15,6 +17,55 @@ use crate::text::TextError;
 const RETRY_SECS: u32 = 1;
 /// Time after which a follower that failed may follow again.
 const FOLLOWER_RETRY_SECS: u32 = 5;
+
+/// Errors of whatever needs a scene.
+pub const SCENE: [(u16, &str); 2] = [
+    (500, "The service failed."),
+    (
+        503,
+        "No scene is loaded, too much is asked at once, or the answer took too long; Retry-After has the pause before the next attempt.",
+    ),
+];
+/// Errors of whatever asks the text model.
+pub const TEXTS: [(u16, &str); 2] = [
+    (409, "The text model does not fit the scene."),
+    (422, "The text model does not know the words, or the answer needs more memory or time than its budget."),
+];
+/// Error of whatever needs to know which places are free.
+pub const NO_PLACES: (u16, &str) =
+    (409, "No shard on board says which places are free, or the scene has no objects.");
+
+/// What this service's problems tell beyond RFC 9457.
+#[derive(Default, Serialize, JsonSchema)]
+pub struct Members {
+    /// The parameter that is refused.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    parameter: Option<String>,
+    /// Its value.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    found: Option<String>,
+    /// Values that are taken.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    expected: Option<String>,
+    /// Words that the model knows.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    suggestions: Option<Vec<String>>,
+    /// The text model.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    models: Option<EncoderName>,
+    /// The scene's encoder.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    scene: Option<EncoderName>,
+}
+
+/// An encoder.
+#[derive(Serialize, JsonSchema)]
+struct EncoderName {
+    /// Its name.
+    name: String,
+    /// Its id.
+    id: Hash32,
+}
 
 /// The limit of queries in progress is reached.
 pub fn overloaded(limit: usize) -> Problem {
@@ -49,10 +100,14 @@ pub fn follower_failed(failure: &str) -> Problem {
 
 /// Returns the problem of a parameter that is refused.
 pub fn parameter_problem(error: RequestError) -> Problem {
-    Problem::new(StatusCode::BAD_REQUEST, "bad-parameter", "Bad parameter", error.to_string())
-        .with("parameter", error.parameter)
-        .with("found", error.found)
-        .with("expected", error.expected)
+    Problem::new(StatusCode::BAD_REQUEST, "bad-parameter", "Bad parameter", error.to_string()).with(
+        &Members {
+            parameter: Some(error.parameter),
+            found: Some(error.found),
+            expected: Some(error.expected),
+            ..Members::default()
+        },
+    )
 }
 
 /// Returns the problem of a query that has no answer.
@@ -63,11 +118,13 @@ pub fn query_problem(error: QueryError) -> Problem {
     };
     let parameter = if matches!(error, QueryError::Negatives(_)) { "negatives" } else { "text" };
     let unknown_words = |found: String, expected: String, suggestions: Vec<String>| {
-        Problem::new(StatusCode::UNPROCESSABLE_ENTITY, kind, "Unknown words", detail.clone())
-            .with("parameter", parameter)
-            .with("found", found)
-            .with("expected", expected)
-            .with("suggestions", suggestions)
+        Problem::new(StatusCode::UNPROCESSABLE_ENTITY, kind, "Unknown words", detail.clone()).with(&Members {
+            parameter: Some(parameter.into()),
+            found: Some(found),
+            expected: Some(expected),
+            suggestions: Some(suggestions),
+            ..Members::default()
+        })
     };
     match error {
         QueryError::Request(error) => parameter_problem(error),
@@ -80,9 +137,13 @@ pub fn query_problem(error: QueryError) -> Problem {
             Problem::new(StatusCode::UNPROCESSABLE_ENTITY, kind, "Over budget", detail)
         }
         QueryError::EncoderMismatch { models_name, models_id, scene_name, scene_id } => {
-            Problem::new(StatusCode::CONFLICT, kind, "Text model does not fit the scene", detail)
-                .with("models", json!({ "name": models_name, "id": models_id }))
-                .with("scene", json!({ "name": scene_name, "id": scene_id }))
+            Problem::new(StatusCode::CONFLICT, kind, "Text model does not fit the scene", detail).with(
+                &Members {
+                    models: Some(EncoderName { name: models_name, id: models_id }),
+                    scene: Some(EncoderName { name: scene_name, id: scene_id }),
+                    ..Members::default()
+                },
+            )
         }
         QueryError::Text(TextError::Encode(error)) | QueryError::Negatives(TextError::Encode(error)) => {
             match error {

@@ -11,18 +11,22 @@ use axum::body::{Body, Bytes};
 use axum::extract::rejection::QueryRejection;
 use axum::extract::{Query, State};
 use axum::http::{HeaderMap, HeaderValue, Uri, header};
-use axum::response::{IntoResponse, Response};
 use hyper::body::Frame;
+use schemars::SchemaGenerator;
+use slag_service::openapi::{As, Binary, Described, Reply};
 use slag_service::problem::Problem;
 use tokio::sync::mpsc::{Receiver, Sender, channel};
 
 use super::app::App;
 use super::params;
 use super::problem::{overloaded, parameter_problem, query_problem, timeout};
-use crate::query::{QueryRequest, RequestError};
+use crate::query::{AnswersOrBatch, Format, QueryRequest, RequestError};
 
 /// Pieces made ahead of the client.
 const PIECES_AHEAD: usize = 2;
+
+const ARROW: &str = "Columns question (u32, of a batch), x, y, z (f64), score (f32), cell, index (u32). Metadata: scene, generation, frame, unit, score_kind, threshold, score_error_bound, questions (JSON: Answers of each text, without answers), geo_reference.";
+const PLY: &str = "format=ply: a binary little-endian PLY with an element vertex of uint question (of a batch), answer (rank of the answer, from 1), double x, y, z, float score, uint cell, index, and input_index (in the input splat file) if every shard knows it. Comments: text, scene, generation, unit.";
 
 type Pairs = Query<Vec<(String, String)>>;
 
@@ -45,7 +49,7 @@ pub async fn query(
     State(app): State<Arc<App>>,
     headers: HeaderMap,
     pairs: Result<Pairs, QueryRejection>,
-) -> Result<Response, Problem> {
+) -> Result<As<Formats>, Problem> {
     let started = Instant::now();
     let answer = answer(&app, &headers, pairs).await;
     app.metrics.query_times.observe(started.elapsed());
@@ -56,7 +60,7 @@ async fn answer(
     app: &Arc<App>,
     headers: &HeaderMap,
     pairs: Result<Pairs, QueryRejection>,
-) -> Result<Response, Problem> {
+) -> Result<As<Formats>, Problem> {
     let Query(pairs) = pairs.map_err(|e| parameter_problem(no_pairs(&e.body_text())))?;
     let (request, format) = params::parse(&pairs, headers).map_err(parameter_problem)?;
     request.check().map_err(parameter_problem)?;
@@ -89,7 +93,31 @@ async fn answer(
             Body::new(Pieces { receiver, is_complete: false })
         }
     };
-    Ok(([(header::CONTENT_TYPE, HeaderValue::from_static(format.media_type()))], body).into_response())
+    Ok(As::new(([(header::CONTENT_TYPE, HeaderValue::from_static(format.media_type()))], body)))
+}
+
+/// Answers in any format of this build.
+pub struct Formats;
+
+impl Described for Formats {
+    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
+        let formats = Format::available().iter().map(|format| {
+            let mut bytes = Binary::schema();
+            let schema = match format {
+                Format::Json => schemas.subschema_for::<AnswersOrBatch>(),
+                Format::Arrow => {
+                    bytes.insert("description".into(), ARROW.into());
+                    bytes
+                }
+                Format::Ply => {
+                    bytes.insert("description".into(), PLY.into());
+                    bytes
+                }
+            };
+            (format.media_type(), schema)
+        });
+        vec![Reply { content: formats.collect(), ..Reply::ok("", Binary::schema()) }]
+    }
 }
 
 /// A message to the body.

@@ -5,54 +5,74 @@ use std::sync::Arc;
 
 use axum::Router;
 use axum::body::Body;
-use axum::http::{HeaderName, HeaderValue, Request, StatusCode, header};
+use axum::http::{Request, StatusCode};
 use slag_service::listen::Listener;
 use slag_service::listener;
+use slag_service::openapi::About;
 use slag_service::request::observed;
-use slag_service::routes::Routes;
+use slag_service::routes::{Route, Routes};
 use tower::ServiceExt;
 
 use super::app::App;
+use super::problem::{Members, SCENE, TEXTS};
 use super::{params, position, query, status, v1};
+use crate::fetch::Spoken;
 
-/// First line of the help text.
-const TITLE: &str =
-    "slag-edge answers text queries about the scene around the robot. /view is a page that draws it.";
-/// The description for programs. It is kept by hand, not by `utoipa`: a test compares it with every route, parameter and
-/// answer, and most of its text is no doc comment of a type.
-pub(super) const OPENAPI: &str = include_str!("openapi.json");
-const JSON: (HeaderName, HeaderValue) = (header::CONTENT_TYPE, HeaderValue::from_static("application/json"));
+/// This service, as its help text and description name it.
+pub(super) const ABOUT: About = About {
+    name: "slag-edge",
+    version: env!("CARGO_PKG_VERSION"),
+    license: env!("CARGO_PKG_LICENSE"),
+    summary: "slag-edge answers text queries about the scene around the robot. /view is a page that draws it.",
+    errors: &[],
+};
 
 /// Returns the routes.
-pub(super) fn routes() -> Routes<Arc<App>> {
+fn routes() -> Routes<Arc<App>> {
     v1::routes(Routes::default())
         .get("/query", "objects, clusters or Gaussians that match texts, best first", query::query)
+        .details("Long answers are sent in chunks; a cut-off answer ends without the last chunk.")
         .parameters(params::parameters())
+        .errors(&SCENE)
+        .errors(&TEXTS)
         .get(
             "/status",
             "scene, generation, encoder, shards, and whether the scene is past its expiry",
             status::status,
         )
-        .post(
+        .post::<Spoken, _, _>(
             "/position",
             "where the robot is, if it is followed; JSON: x, y, z, or lat, lon, height",
             position::MAX_BODY_BYTES,
             position::position,
         )
+        .errors(&[
+            (409, "Positions are not followed."),
+            (503, "The position is kept, but the follower has failed; it begins again by itself."),
+        ])
         .get("/healthz", "whether the process is alive", async || "alive\n")
         .get(
             "/readyz",
             "whether a scene is loaded and fits the text model, and positions are followed",
             status::ready,
         )
+        .errors(&[
+            TEXTS[0],
+            (500, "The text model has stopped."),
+            (503, "No scene is loaded, or the follower has failed; Retry-After has the pause before the next attempt."),
+        ])
         .get("/metrics", "counters in Prometheus' text format", status::metrics)
-        .get("/openapi.json", "description of this service for programs", async || ([JSON], OPENAPI))
+}
+
+/// Returns the routes with their descriptions, and their table.
+pub(super) fn described() -> (Router<Arc<App>>, Vec<Route>) {
+    routes().described::<Members>(ABOUT)
 }
 
 /// Returns the service, without a listener.
 pub(super) fn router(app: Arc<App>) -> Router {
     let (responses, access) = (Arc::clone(&app.metrics.responses), app.settings.access.clone());
-    let (router, _) = routes().with_help(TITLE);
+    let (router, _) = described();
     observed(router.merge(slag_view::router()).with_state(app), responses, access)
 }
 

@@ -4,14 +4,41 @@ use std::sync::Arc;
 
 use axum::Json;
 use axum::extract::State;
-use serde_json::{Value, json};
+use schemars::JsonSchema;
+use serde::Serialize;
 use slag_service::metrics::Exposition;
 use slag_service::problem::Problem;
 
 use super::app::App;
 use super::problem::{follower_failed, query_problem};
 use crate::fetch::accepted;
+use crate::fetch::follow::FollowStatus;
 use crate::query::Status;
+use crate::text::EncoderInfo;
+
+/// State of the service.
+#[derive(Serialize, JsonSchema)]
+#[schemars(rename = "Status")]
+pub struct ServiceStatus {
+    /// Version of the program.
+    version: &'static str,
+    /// Whether queries are answered.
+    is_ready: bool,
+    /// Why not.
+    error: Option<String>,
+    /// The text encoder.
+    text_model: EncoderInfo,
+    /// The scene on board.
+    scene: Option<Status>,
+    /// The only scene that the robot accepts; null before the first fetch, or if its records are damaged.
+    pinned_scene: Option<String>,
+    /// When the newest timestamp of the store expires.
+    expires_unix_secs: Option<u64>,
+    /// Whether the store's newest timestamp has expired, so that there may be news; the scene still answers.
+    is_expired: bool,
+    /// How the robot is followed, if it is.
+    following: Option<FollowStatus>,
+}
 
 pub async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Problem> {
     app.blocking(|app| {
@@ -29,7 +56,7 @@ pub async fn ready(State(app): State<Arc<App>>) -> Result<&'static str, Problem>
     .await
 }
 
-pub async fn status(State(app): State<Arc<App>>) -> Result<Json<Value>, Problem> {
+pub async fn status(State(app): State<Arc<App>>) -> Result<Json<ServiceStatus>, Problem> {
     app.blocking(|app| {
         app.reload_if_stale();
         let snapshot = app.engine.snapshot();
@@ -46,12 +73,18 @@ pub async fn status(State(app): State<Arc<App>>) -> Result<Json<Value>, Problem>
         let scene = snapshot.as_ref().ok().map(|snapshot| Status::of(snapshot));
         let is_ready = error.is_none() && app.engine.text_is_alive();
         let version = env!("CARGO_PKG_VERSION");
-        let text_model = app.engine.encoder();
-        Ok(Json(json!({
-            "version": version, "is_ready": is_ready, "error": error, "text_model": text_model, "scene": scene,
-            "pinned_scene": pinned_scene,
-            "expires_unix_secs": expires_unix_secs, "is_expired": is_expired, "following": following,
-        })))
+        let text_model = app.engine.encoder().clone();
+        Ok(Json(ServiceStatus {
+            version,
+            is_ready,
+            error,
+            text_model,
+            scene,
+            pinned_scene,
+            expires_unix_secs,
+            is_expired,
+            following,
+        }))
     })
     .await
 }

@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use super::answers::{Answers, BadCellAnswer, ClusterAnswer, Clustering, Evidence, Found, Whole};
 use super::cluster::{Cluster, Grouping, cluster};
 use super::extent::Extent;
+use super::frame::unit;
 use super::objects::{self, FoundObject};
 use super::rank::{Order, Ranked};
 use super::reason;
@@ -175,7 +176,7 @@ fn empty(
         kind,
         scene: manifest.scene.clone(),
         generation: manifest.generation,
-        unit: if manifest.metric { "m" } else { "world" },
+        unit: unit(manifest),
         score_kind: scale.0,
         threshold,
         threshold_source,

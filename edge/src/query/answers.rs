@@ -1,18 +1,20 @@
 //! The contents of an answer.
 
 use glam::DVec3;
+use schemars::JsonSchema;
 use serde::Serialize;
 use serde::ser::{SerializeSeq, Serializer};
 use slag_common::frames::Geographic;
 use slag_common::shard::ShardView;
 
+use super::frame::UNITS;
 use super::oriented::OrientedBox;
 use super::request::AnswerKind;
 use super::threshold::ThresholdSource;
 use crate::score::{Hit, Run};
 
 /// Meaning of scores and thresholds.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum ScoreKind {
     /// `q · E_k`, -1..1.
@@ -22,7 +24,7 @@ pub enum ScoreKind {
 }
 
 /// Answers to one question. `answers` is the last field, so that long lists can be sent piece by piece.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct Answers {
     /// The question.
     pub text: String,
@@ -36,6 +38,7 @@ pub struct Answers {
     /// Generation of the scene.
     pub generation: u64,
     /// Unit of every position and length: `m`, or `world` if the scene is not metric.
+    #[schemars(extend("enum" = UNITS))]
     pub unit: &'static str,
     /// Meaning of scores.
     pub score_kind: ScoreKind,
@@ -68,19 +71,43 @@ pub struct Answers {
     /// Reason for an empty answer.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reason: Option<Reason>,
-    /// The answers, best first. Serialised as an empty list, which [`super::Reply::pieces`] fills.
+    /// The answers, best first.
+    // Serialised as an empty list, which `Reply::pieces` fills.
     #[serde(serialize_with = "empty_list")]
+    #[schemars(with = "Vec<AnyAnswer>")]
     pub answers: Found,
 }
 
 /// A cell whose shard could not be fetched.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
 pub struct BadCellAnswer {
     /// The cell.
     pub cell_id: u32,
     /// The earlier generation that answers for it; absent: nothing of it is on board.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub generation: Option<u64>,
+}
+
+/// Answers to one text, or to several in their order: the schema of a reply, which is written piece by piece.
+#[derive(JsonSchema)]
+#[schemars(untagged)]
+pub enum AnswersOrBatch {
+    /// To one.
+    Answers(Answers),
+    /// To several.
+    Batch {
+        /// The answers to each.
+        batch: Vec<Answers>,
+    },
+}
+
+/// A cluster, an object or a Gaussian.
+#[derive(JsonSchema)]
+#[schemars(untagged)]
+#[expect(dead_code, reason = "the schema of the answers' list, which is written piece by piece")]
+enum AnyAnswer {
+    Cluster(ClusterAnswer),
+    Gaussian(GaussianAnswer),
 }
 
 /// Answers of either kind.
@@ -123,7 +150,7 @@ fn empty_list<S: Serializer>(_: &Found, to: S) -> Result<S::Ok, S::Error> {
 }
 
 /// How matches were grouped.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct Clustering {
     /// Edge of the voxels.
     pub voxel: f64,
@@ -138,7 +165,7 @@ pub struct Clustering {
 }
 
 /// A cluster of matching Gaussians, or an object.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct ClusterAnswer {
     /// Position in the list, from 1.
     pub rank: usize,
@@ -146,15 +173,19 @@ pub struct ClusterAnswer {
     /// and 16 hex digits: valid as long as its Gaussians stay the same.
     pub id: String,
     /// Mean of its Gaussians inside the box.
+    #[schemars(with = "[f64; 3]")]
     pub position_in_world: DVec3,
     /// The same as latitude, longitude and height, if the scene is geo-referenced.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub geographic: Option<Geographic>,
     /// Smallest corner of its box: the 2nd percentile along each axis, so that floaters do not count.
+    #[schemars(with = "[f64; 3]")]
     pub box_min_in_world: DVec3,
     /// Largest corner: 98th percentile.
+    #[schemars(with = "[f64; 3]")]
     pub box_max_in_world: DVec3,
     /// Edges of the box.
+    #[schemars(with = "[f64; 3]")]
     pub size: DVec3,
     /// Its box along axes of its own, upright if the world has a known up.
     pub oriented_box: OrientedBox,
@@ -173,7 +204,8 @@ pub struct ClusterAnswer {
     /// For an object: the photo that shows it best.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub evidence: Option<Evidence>,
-    /// Ranking key, see [`super::relevance`].
+    /// Key of the ranking: (score - base) / (1 + distance / 10 m), 0 below base; base is the mean score of unrelated texts for
+    /// cosines, 0 for relevancies; without a metric scale 10 m is 40 default voxels.
     pub relevance: f32,
     /// Distance of the position from `near`.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -184,18 +216,21 @@ pub struct ClusterAnswer {
 }
 
 /// Where the whole of an object is.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct Whole {
     /// Mean of its Gaussians inside its box.
+    #[schemars(with = "[f64; 3]")]
     pub position_in_world: DVec3,
     /// Smallest corner of its box.
+    #[schemars(with = "[f64; 3]")]
     pub box_min_in_world: DVec3,
     /// Largest corner.
+    #[schemars(with = "[f64; 3]")]
     pub box_max_in_world: DVec3,
 }
 
 /// The photo that shows an object best.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, JsonSchema)]
 pub struct Evidence {
     /// Name of the view.
     pub photo: String,
@@ -204,7 +239,7 @@ pub struct Evidence {
 }
 
 /// A matching Gaussian.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct GaussianAnswer {
     /// Position in the list, from 1.
     pub rank: usize,
@@ -216,6 +251,7 @@ pub struct GaussianAnswer {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub input_index: Option<u32>,
     /// Its mean.
+    #[schemars(with = "[f64; 3]")]
     pub position_in_world: DVec3,
     /// Its score.
     pub score: f32,
@@ -241,7 +277,7 @@ impl GaussianAnswer {
 }
 
 /// Kind of reason for an empty answer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum ReasonKind {
     /// No Gaussian or object reaches the threshold.
@@ -253,7 +289,7 @@ pub enum ReasonKind {
 }
 
 /// Reason for an empty answer, with the nearest miss.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct Reason {
     /// Kind.
     pub kind: ReasonKind,
@@ -264,5 +300,6 @@ pub struct Reason {
     pub best_score: Option<f32>,
     /// Position of the best score.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(with = "Option<[f64; 3]>")]
     pub best_position_in_world: Option<DVec3>,
 }

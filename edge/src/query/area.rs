@@ -2,16 +2,17 @@
 
 use std::sync::Arc;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use slag_common::frames::Aabb;
 use slag_common::manifest::Manifest;
 
 use super::point::{Corner, Point};
 use super::request::{QueryRequest, RequestError};
-use crate::score::{Ball, MAX_CORNERS, Polygon};
+use crate::score::{Ball, MAX_COORDINATE, MAX_CORNERS, Polygon};
 
 /// A ball, a box and a polygon, each optional; what lies in all of them is asked for.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Area {
     /// A ball.
@@ -20,23 +21,25 @@ pub struct Area {
     /// A box along the axes of the world frame.
     #[serde(rename = "box", skip_serializing_if = "Option::is_none")]
     pub bounds: Option<AreaBox>,
-    /// A polygon, seen from above.
+    /// A polygon of 3 to 256 corners, seen from above.
+    #[schemars(length(max = MAX_CORNERS))]
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub polygon: Vec<Corner>,
 }
 
 /// A ball.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct AreaBall {
     /// Its centre.
     pub centre: Point,
     /// Its radius, world units.
+    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = MAX_COORDINATE))]
     pub radius: f64,
 }
 
 /// A box, by two opposite corners.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct AreaBox {
     /// One corner.

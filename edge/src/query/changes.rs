@@ -1,16 +1,20 @@
 //! What changed between two generations that the robot has had.
 
 use glam::DVec3;
+use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::frames::Geographic;
 use slag_common::manifest::Manifest;
 use slag_common::objects::{self, Moved, Thing, public_id};
 
 use super::engine::{Engine, QueryError};
-use super::inventory::FRAME;
+use super::frame::{FRAME, UNITS, unit};
 use super::request::RequestError;
 use crate::store::history::{self, Record};
 use crate::store::{EdgeCache, Snapshot};
+
+/// Why nothing was compared: the robot remembers no earlier generation.
+const NO_EARLIER: &str = "no-earlier-generation";
 
 /// Which changes are asked for.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -74,13 +78,15 @@ impl ChangesError {
 }
 
 /// The changes from one generation to another.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct ChangesReply {
     /// Name of the scene.
     pub scene: String,
     /// Frame of every position.
+    #[schemars(extend("enum" = [FRAME]))]
     pub frame: &'static str,
     /// Unit of every position and length: `m`, or `world` if the scene is not metric.
+    #[schemars(extend("enum" = UNITS))]
     pub unit: &'static str,
     /// The earlier generation; absent if the robot remembers none.
     pub from: Option<ComparedGeneration>,
@@ -105,7 +111,7 @@ pub struct ChangesReply {
 }
 
 /// A generation that was compared.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct ComparedGeneration {
     /// Its number.
     pub generation: u64,
@@ -114,27 +120,31 @@ pub struct ComparedGeneration {
 }
 
 /// Why nothing was compared.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct NotCompared {
-    /// `no-earlier-generation`.
+    /// The reason.
+    #[schemars(extend("enum" = [NO_EARLIER]))]
     pub kind: &'static str,
     /// The same in a sentence.
     pub detail: String,
 }
 
 /// A thing as it is or was.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct ChangedThing {
     /// Its id in its generation: `o` and 16 hex digits.
     pub id: String,
     /// Mean of its Gaussians inside the box.
+    #[schemars(with = "[f64; 3]")]
     pub position_in_world: DVec3,
     /// The same on the earth, if the scene is geo-referenced.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub geographic: Option<Geographic>,
     /// Smallest corner of its box.
+    #[schemars(with = "[f64; 3]")]
     pub box_min_in_world: DVec3,
     /// Largest corner.
+    #[schemars(with = "[f64; 3]")]
     pub box_max_in_world: DVec3,
     /// Its Gaussians in the whole scene.
     pub n_gaussians_in_scene: u32,
@@ -146,7 +156,7 @@ pub struct ChangedThing {
 }
 
 /// The text that a thing is most like.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct Likeness {
     /// The text.
     pub text: String,
@@ -155,7 +165,7 @@ pub struct Likeness {
 }
 
 /// A thing that lies elsewhere.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct MovedThing {
     /// As it was.
     pub from: ChangedThing,
@@ -250,7 +260,7 @@ fn reply(
     let mut reply = ChangesReply {
         scene: manifest.scene.clone(),
         frame: FRAME,
-        unit: if manifest.metric { "m" } else { "world" },
+        unit: unit(manifest),
         from: from.as_ref().map(compared),
         to: compared(&to),
         generations,
@@ -264,7 +274,7 @@ fn reply(
     };
     let Some(mut from) = from else {
         let detail = format!("the robot has had no generation with objects before {}", to.generation);
-        reply.none = Some(NotCompared { kind: "no-earlier-generation", detail });
+        reply.none = Some(NotCompared { kind: NO_EARLIER, detail });
         return reply;
     };
     let mut to = to;

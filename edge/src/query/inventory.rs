@@ -3,6 +3,7 @@
 use std::cmp::Reverse;
 
 use glam::DVec3;
+use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::frames::{Aabb, Geographic};
 
@@ -10,14 +11,15 @@ use super::answers::Evidence;
 use super::cluster::{Grouping, cluster};
 use super::engine::Engine;
 use super::extent::Extent;
+use super::frame::{FRAME, UNITS, unit};
 use super::objects::{self, FoundObject};
 use super::oriented::OrientedBox;
 use super::scene::{Scene, alignment, default_voxel};
 use crate::score::{Budget, Region, Run};
 use crate::store::Snapshot;
 
-/// Name of the frame of every position: the scene's world frame (`docs/api.md`).
-pub const FRAME: &str = "world";
+/// The form of an object's id.
+pub const OBJECT_ID: &str = "^o[0-9a-f]{16}$";
 
 /// Which objects are listed.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -31,22 +33,26 @@ pub struct ObjectFilter {
 }
 
 /// An object on board.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct ObjectOnBoard {
     /// Its id: `o` and 16 hex digits.
     pub id: String,
     /// Frame of every position.
+    #[schemars(extend("enum" = [FRAME]))]
     pub frame: &'static str,
     /// Generation that they belong to.
     pub generation: u64,
     /// Mean of its Gaussians inside the box.
+    #[schemars(with = "[f64; 3]")]
     pub position_in_world: DVec3,
     /// The same on the earth, if the scene is geo-referenced.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub geographic: Option<Geographic>,
     /// Smallest corner of its box.
+    #[schemars(with = "[f64; 3]")]
     pub box_min_in_world: DVec3,
     /// Largest corner.
+    #[schemars(with = "[f64; 3]")]
     pub box_max_in_world: DVec3,
     /// Its box along axes of its own; of the part on board.
     pub oriented_box: OrientedBox,
@@ -59,11 +65,21 @@ pub struct ObjectOnBoard {
 }
 
 /// A page of the objects on board.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct ObjectPage {
-    /// Objects that pass the filter but for `after`.
-    pub n_matching: usize,
-    /// The id to go on after, if there are more.
+    /// Name of the scene.
+    pub scene: String,
+    /// Its generation.
+    pub generation: u64,
+    /// Frame of every position: the scene's world frame.
+    #[schemars(extend("enum" = [FRAME]))]
+    pub frame: &'static str,
+    /// Unit of every position and length: `m`, or `world` if the scene is not metric.
+    #[schemars(extend("enum" = UNITS))]
+    pub unit: &'static str,
+    /// Objects that pass the filter, over all pages.
+    pub n_objects: usize,
+    /// `after` of the next page; null if there is none.
     pub next_after: Option<String>,
     /// The objects, by id.
     pub objects: Vec<ObjectOnBoard>,
@@ -139,7 +155,16 @@ fn page(scene: &Scene<'_>, filter: &ObjectFilter, limit: usize) -> ObjectPage {
     let mut rest = all.iter().copied().filter(is_after);
     let objects: Vec<ObjectOnBoard> = rest.by_ref().take(limit).map(|at| describe(scene, at)).collect();
     let next_after = rest.next().and_then(|_| objects.last()).map(|last| last.id.clone());
-    ObjectPage { n_matching: all.len(), next_after, objects }
+    let manifest = scene.manifest;
+    ObjectPage {
+        scene: manifest.scene.clone(),
+        generation: manifest.generation,
+        frame: FRAME,
+        unit: unit(manifest),
+        n_objects: all.len(),
+        next_after,
+        objects,
+    }
 }
 
 fn describe(scene: &Scene<'_>, object: usize) -> ObjectOnBoard {

@@ -1,22 +1,25 @@
 //! The area on board.
 
 use glam::DVec3;
+use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::frames::{Aabb, GeoReference};
 
-use super::inventory::FRAME;
+use super::frame::{FRAME, UNITS, unit};
 use crate::store::{BadCell, Snapshot};
 
 /// The area on board, its age, and what is missing.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct MapStatus {
     /// Name of the scene.
     pub scene: String,
     /// Its generation.
     pub generation: u64,
     /// Frame of every position: the scene's world frame.
+    #[schemars(extend("enum" = [FRAME]))]
     pub frame: &'static str,
     /// Unit of every position and length: `m`, or `world` if the scene is not metric.
+    #[schemars(extend("enum" = UNITS))]
     pub unit: &'static str,
     /// Whether z points up.
     pub z_is_up: bool,
@@ -33,6 +36,7 @@ pub struct MapStatus {
     /// Whether it is past that.
     pub is_expired: bool,
     /// Centre of the area that was fetched.
+    #[schemars(with = "[f64; 3]")]
     pub centre_in_world: DVec3,
     /// Its radius.
     pub radius: f64,
@@ -47,13 +51,15 @@ pub struct MapStatus {
 }
 
 /// A cell on board.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct MapCell {
     /// Its id.
     pub cell_id: u32,
     /// Smallest corner.
+    #[schemars(with = "[f64; 3]")]
     pub box_min_in_world: DVec3,
     /// Largest corner.
+    #[schemars(with = "[f64; 3]")]
     pub box_max_in_world: DVec3,
     /// Its Gaussians.
     pub n_gaussians: u32,
@@ -62,13 +68,15 @@ pub struct MapCell {
 }
 
 /// A cell that is not on board.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct MissingCell {
     /// Its id.
     pub cell_id: u32,
     /// Smallest corner.
+    #[schemars(with = "[f64; 3]")]
     pub box_min_in_world: DVec3,
     /// Largest corner.
+    #[schemars(with = "[f64; 3]")]
     pub box_max_in_world: DVec3,
     /// Whether it lies within the area that was asked for, so that a fetch failed to bring it.
     pub is_wanted: bool,
@@ -110,7 +118,7 @@ impl MapStatus {
             scene: manifest.scene.clone(),
             generation: manifest.generation,
             frame: FRAME,
-            unit: if manifest.metric { "m" } else { "world" },
+            unit: unit(manifest),
             z_is_up: manifest.metric || manifest.geo_reference.is_some(),
             geo_reference: manifest.geo_reference,
             created_unix_secs: manifest.created_unix_secs,

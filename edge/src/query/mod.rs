@@ -12,6 +12,7 @@ pub mod cluster;
 mod engine;
 mod extent;
 mod format;
+mod frame;
 mod inventory;
 mod json;
 mod map;
@@ -32,8 +33,8 @@ mod view;
 
 pub use answer::answer;
 pub use answers::{
-    Answers, BadCellAnswer, ClusterAnswer, Clustering, Evidence, Found, GaussianAnswer, Reason, ReasonKind,
-    ScoreKind,
+    Answers, AnswersOrBatch, BadCellAnswer, ClusterAnswer, Clustering, Evidence, Found, GaussianAnswer,
+    Reason, ReasonKind, ScoreKind,
 };
 pub use area::{Area, AreaBall, AreaBox};
 pub use ask::{Ask, AskReply, Asked, MAX_PAGE, Outcome, RelatedAnswers};
@@ -43,7 +44,8 @@ pub use changes::{
 };
 pub use engine::{Engine, QueryError};
 pub use format::Format;
-pub use inventory::{FRAME, ObjectFilter, ObjectOnBoard, ObjectPage, object_id};
+pub use frame::{FRAME, UNITS, unit};
+pub use inventory::{OBJECT_ID, ObjectFilter, ObjectOnBoard, ObjectPage, object_id};
 pub use map::{MapCell, MapStatus, MissingCell};
 pub use oriented::{Alignment, OrientedBox};
 pub use point::{Corner, LatLon, Point};

@@ -1,11 +1,12 @@
 //! Oriented boxes of points: principal axes, or upright where the world has a known up.
 
 use glam::{DMat3, DQuat, DVec2, DVec3};
+use schemars::JsonSchema;
 use serde::Serialize;
 use slag_math::stats::trimmed_range;
 
 /// Permitted orientations of a box.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Alignment {
     /// Upright: rotated about the world's z axis only, which points up.
@@ -15,13 +16,16 @@ pub enum Alignment {
 }
 
 /// A box along axes of its own.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct OrientedBox {
     /// Its centre.
+    #[schemars(with = "[f64; 3]")]
     pub centre_in_world: DVec3,
     /// Its edges along its own axes; x is the longest (of the horizontal ones, if upright).
+    #[schemars(with = "[f64; 3]")]
     pub size: DVec3,
     /// Unit quaternion x, y, z, w that rotates the box's axes into the world's.
+    #[schemars(with = "[f64; 4]")]
     pub rotation_world_from_box: DQuat,
     /// The orientations permitted.
     pub alignment: Alignment,

@@ -6,6 +6,7 @@ use std::io;
 use slag_common::splat::ply::{Point, PointProperties};
 
 use super::answers::{Answers, Found};
+use super::frame::unit;
 use super::reply::Reply;
 use crate::score::Run;
 
@@ -45,7 +46,7 @@ impl<R: Borrow<Reply>> Pieces<R> {
     fn header(&self) -> String {
         let reply = self.reply.borrow();
         let manifest = &reply.snapshot.manifest;
-        let unit = if manifest.metric { "m" } else { "world" };
+        let unit = unit(manifest);
         let mut comments: Vec<String> =
             reply.answers.iter().map(|answers| format!("text {}", answers.text)).collect();
         comments.push(format!("scene {}", manifest.scene));

@@ -1,6 +1,7 @@
 //! Points as clients write them: in the world frame, or as latitude and longitude.
 
 use glam::{DVec2, DVec3};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use slag_common::frames::Geographic;
 use slag_common::manifest::Manifest;
@@ -9,32 +10,34 @@ use super::request::RequestError;
 use crate::score::MAX_COORDINATE;
 
 /// A point of a request.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged)]
 pub enum Point {
     /// In the world frame: x, y, z.
-    World([f64; 3]),
+    World(#[schemars(inner(range(min = -MAX_COORDINATE, max = MAX_COORDINATE)))] [f64; 3]),
     /// WGS 84; needs a geo-referenced scene.
     Geographic(LatLon),
 }
 
 /// A corner of a polygon.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(untagged)]
 pub enum Corner {
     /// In the world frame: x, y.
-    World([f64; 2]),
+    World(#[schemars(inner(range(min = -MAX_COORDINATE, max = MAX_COORDINATE)))] [f64; 2]),
     /// WGS 84; needs a geo-referenced scene.
     Geographic(LatLon),
 }
 
 /// A geographic position.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct LatLon {
     /// Latitude, degrees, north positive.
+    #[schemars(range(min = -90, max = 90))]
     pub lat: f64,
     /// Longitude, degrees, east positive.
+    #[schemars(range(min = -180, max = 180))]
     pub lon: f64,
     /// Height in metres; that of the scene's origin if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -5,6 +5,7 @@ use std::str::FromStr;
 use std::sync::Arc;
 
 use glam::DVec3;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use slag_common::frames::Aabb;
 
@@ -49,7 +50,7 @@ impl RequestError {
 }
 
 /// Kind of answers.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum AnswerKind {
     /// Objects, which the masks of several views agree on, scored as a whole.

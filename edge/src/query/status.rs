@@ -1,6 +1,7 @@
 //! Status of the loaded generation.
 
 use glam::DVec3;
+use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::Hash32;
 use slag_common::frames::GeoReference;
@@ -8,8 +9,9 @@ use slag_common::shard::Profile;
 
 use crate::store::{BadCell, Snapshot};
 
-/// The loaded generation, for people and monitors.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+/// The scene on board.
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[schemars(rename = "Scene")]
 pub struct Status {
     /// Name of the scene.
     pub scene: String,
@@ -31,6 +33,7 @@ pub struct Status {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub geo_reference: Option<GeoReference>,
     /// Centre of the last fetch.
+    #[schemars(with = "[f64; 3]")]
     pub centre_in_world: DVec3,
     /// Radius of the last fetch, world units.
     pub radius: f64,
@@ -47,7 +50,7 @@ pub struct Status {
 }
 
 /// A shard on board.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct ShardStatus {
     /// Its cell.
     pub cell_id: u32,

@@ -1,5 +1,6 @@
 //! Default thresholds and their sources.
 
+use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::manifest::Calibration;
 
@@ -15,7 +16,7 @@ const MIN_SPREAD: f32 = 1e-3;
 pub const RELEVANCY_THRESHOLD: f32 = 0.5;
 
 /// Source of a threshold.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum ThresholdSource {
     /// The request states it.

@@ -1,7 +1,6 @@
 //! What the page needs to draw the Gaussians on board, and to colour them by a question.
 
 use std::sync::Arc;
-use std::time::Instant;
 
 use glam::{DVec3, Vec3};
 use slag_common::shard::ShardView;
@@ -146,19 +145,12 @@ impl Engine {
     /// Returns the vectors of everyday words that the text model knows, and whether these are all: a model takes a while for
     /// each, and encodes some more at the next request.
     fn everyday_vectors(&self) -> Result<(Vec<WordVector>, bool), QueryError> {
-        let started = Instant::now();
-        let mut known = Vec::new();
-        for word in everyday_words() {
-            if started.elapsed() > Words::ENCODING {
-                return Ok((known, false));
-            }
-            match self.encode_text(word) {
-                Ok(vector) => known.push((word.to_owned(), vector)),
-                Err(QueryError::Text(TextError::Encode(_))) => {}
-                Err(error) => return Err(error),
-            }
-        }
-        Ok((known, true))
+        let (vectors, is_complete) = Words::encode(everyday_words(), |word| match self.encode_text(word) {
+            Ok(vector) => Ok(Some((word.to_owned(), vector))),
+            Err(QueryError::Text(TextError::Encode(_))) => Ok(None),
+            Err(error) => Err(error),
+        })?;
+        Ok((vectors.into_iter().flatten().collect(), is_complete))
     }
 
     /// Returns the message of every Gaussian's score: its centroid's cosine, or with negatives its relevancy.

@@ -1,16 +1,17 @@
 //! The data that scores come from.
 
+use schemars::JsonSchema;
 use serde::Serialize;
 
 /// The data that scores come from.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Precision {
     /// Codebook centroids only: fastest; every score is within the stated bound.
     Centroids,
     /// As `Exact`, but in shards with exact embeddings reads only those that the measured errors of codes and
-    /// fine residuals leave undecided. Finds nearly all of the exact answer, tens of times faster;
-    /// [`super::Search::measured_errors`] states the errors of its scores.
+    /// fine residuals leave undecided. Finds nearly all of the exact answer, tens of times faster; answers state the likely
+    /// errors of its scores.
     Measured,
     /// Centroids, and where they cannot decide, the shard's exact embeddings or residual codes.
     #[default]

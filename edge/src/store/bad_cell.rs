@@ -2,12 +2,13 @@
 
 use std::fmt;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use slag_common::Hash32;
 use slag_common::manifest::{CellRecord, Manifest};
 
 /// Why a cell's shard is not on board.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum CellFault {
     /// The store does not have it.
@@ -21,7 +22,7 @@ pub enum CellFault {
 }
 
 /// A cell whose shard does not answer, although it is within the radius.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct BadCell {
     /// The cell.
@@ -51,7 +52,7 @@ impl fmt::Display for BadCell {
 }
 
 /// A shard of an earlier generation.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct OldShard {
     /// The generation.

@@ -1,8 +1,8 @@
 //! Answers the page from what is shown.
 
+use std::convert::Infallible;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Instant;
 
 use glam::Vec3;
 use slag_common::{Hash32, View};
@@ -48,17 +48,12 @@ struct OpenedText {
 impl OpenedText {
     /// Encodes some more everyday words. Returns those that it knows, and whether these are all.
     fn everyday_words(&mut self) -> (Vec<(&'static str, &[f32])>, bool) {
-        let started = Instant::now();
-        let n_words = everyday_words().count();
-        for word in everyday_words().skip(self.everyday.len()) {
-            if started.elapsed() > Words::ENCODING {
-                break;
-            }
-            self.everyday.push(self.encoder.encode(word).ok());
-        }
+        let rest = everyday_words().skip(self.everyday.len());
+        let Ok((vectors, is_complete)) =
+            Words::encode(rest, |word| Ok::<_, Infallible>(self.encoder.encode(word).ok()));
+        self.everyday.extend(vectors);
         let known = everyday_words().zip(&self.everyday);
-        let known = known.filter_map(|(word, vector)| Some((word, vector.as_deref()?))).collect();
-        (known, self.everyday.len() == n_words)
+        (known.filter_map(|(word, vector)| Some((word, vector.as_deref()?))).collect(), is_complete)
     }
 }
 

@@ -10,6 +10,8 @@ use tokio::task::JoinHandle;
 use super::*;
 use crate::access::Access;
 use crate::listen::{Listen, bind};
+use crate::openapi::{About, As};
+use crate::problem::NoMembers;
 use crate::request::observed;
 use crate::routes::Routes;
 
@@ -28,8 +30,9 @@ async fn start(limits: ConnectionLimits) -> Running {
     let routes = Routes::default()
         .get("/quick", "an answer", async || "done")
         .get("/healthz", "whether it lives", async || "alive")
-        .post("/things", "takes a thing", 64, async |body: Bytes| body);
-    let router = routes.with_help("").0.route("/long", get(async || vec![7u8; LONG_BYTES]));
+        .post::<u8, _, _>("/things", "takes a thing", 64, async |body: Bytes| As::<&'static str>::new(body));
+    let about = About { name: "test", version: "1", license: "MIT", summary: "", errors: &[] };
+    let router = routes.described::<NoMembers>(about).0.route("/long", get(async || vec![7u8; LONG_BYTES]));
     let router = observed(router, std::sync::Arc::default(), Access::default());
     let (stop, stopped) = oneshot::channel();
     let any_port: SocketAddr = "127.0.0.1:0".parse().expect("an address");

@@ -12,7 +12,7 @@ async fn broken() {
 }
 
 async fn refused() -> Problem {
-    Problem::overloaded("come back later", 7).with("limit", 3)
+    Problem::overloaded("come back later", 7).with(&serde_json::json!({ "limit": 3 }))
 }
 
 fn router(responses: &Arc<ResponseCounts>) -> Router {

@@ -3,20 +3,27 @@ use axum::http::{Request, StatusCode};
 use tower::ServiceExt;
 
 use super::*;
+use crate::problem::NoMembers;
+
+const ABOUT: About = About {
+    name: "test",
+    version: "1",
+    license: "MIT",
+    summary: "A service.",
+    errors: &[(503, "Too busy.")],
+};
 
 fn routes() -> Routes<()> {
-    let near = Parameter { name: "near", example: "x,y,z", summary: "rank by distance too".into() };
-    Routes::default().get("/query", "things that match", async || "found").parameters([near]).post(
-        "/position",
-        "where the robot is",
-        4,
-        async |body: Bytes| body,
-    )
+    let near = Parameter::new::<String>("near", "x,y,z", "rank by distance too").or("0,0,0");
+    let route = Routes::default().get("/query", "things that match", async || "found").parameters([near]);
+    route.post::<[u8; 3], _, _>("/position", "where the robot is", 4, async |body: Bytes| {
+        As::<&'static str>::new(body)
+    })
 }
 
 #[tokio::test]
 async fn the_help_lists_what_the_router_serves() {
-    let (router, table) = routes().with_help("A service.");
+    let (router, table) = routes().described::<NoMembers>(ABOUT);
     let ask = async |method: &Method, path: &str, body: &'static str| {
         let request = Request::builder().method(method).uri(path).header("content-type", "application/json");
         let request = request.body(Body::from(body)).expect("a request");
@@ -33,6 +40,9 @@ async fn the_help_lists_what_the_router_serves() {
         assert_eq!(ask(method, path, "1 2").await.0, StatusCode::OK, "{method} {path}");
         assert!(lines.contains(&vec![format!("{method} {path}").as_str(), summary]), "{help}");
     }
-    assert!(help.contains("\n    near=x,y,z  ") && help.contains(" rank by distance too\n"), "{help}");
+    assert!(
+        help.contains("\n    near=x,y,z  ") && help.contains(" rank by distance too (default: 0,0,0)\n"),
+        "{help}"
+    );
     assert_eq!(ask(&Method::POST, "/position", "1 2 3").await.0, StatusCode::PAYLOAD_TOO_LARGE);
 }

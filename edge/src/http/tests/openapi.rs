@@ -3,16 +3,19 @@
 use std::collections::BTreeSet;
 
 use slag_common::manifest::Calibration;
+use slag_service::openapi::document;
 use slag_service::routes::Route;
 
-use super::router::{OPENAPI, routes};
+use super::problem::Members;
+use super::router::{ABOUT, described};
 use super::*;
 use crate::query::{AnswerKind, Format};
 use crate::score::Precision;
 use crate::testing::TestObject;
 
 pub(super) fn description() -> Value {
-    serde_json::from_str(OPENAPI).expect("JSON")
+    let (_, table) = described();
+    serde_json::from_str(&document::<Members>(&ABOUT, &table)).expect("JSON")
 }
 
 fn names<'a>(names: impl IntoIterator<Item = &'a str>) -> BTreeSet<&'a str> {
@@ -25,7 +28,7 @@ pub(super) fn check(schema: &Value, value: &Value, at: &str) -> Result<(), Strin
         let schema = description().pointer(name.trim_start_matches('#')).cloned();
         return check(&schema.ok_or(format!("{at}: no {name}"))?, value, at);
     }
-    if let Some(kinds) = schema["oneOf"].as_array() {
+    if let Some(kinds) = schema["anyOf"].as_array().or(schema["oneOf"].as_array()) {
         let errors: Vec<String> = kinds.iter().filter_map(|kind| check(kind, value, at).err()).collect();
         let fits = kinds.len() - errors.len();
         return if fits == 1 { Ok(()) } else { Err(format!("{at}: fits {fits} kinds: {errors:?}")) };
@@ -51,6 +54,7 @@ pub(super) fn check(schema: &Value, value: &Value, at: &str) -> Result<(), Strin
         check(&schema["items"], item, &format!("{at}[{i}]"))?;
     }
     if let (Some(members), Some(described)) = (value.as_object(), schema["properties"].as_object()) {
+        assert_eq!(schema["additionalProperties"], false, "{at}: a client may not rely on other members");
         let required = schema["required"].as_array().into_iter().flatten().filter_map(Value::as_str);
         if let Some(missing) = required.into_iter().find(|name| !members.contains_key(*name)) {
             return Err(format!("{at}: {missing} is missing"));
@@ -74,7 +78,7 @@ async fn every_route_and_parameter_is_described() {
     let api = description();
     assert_eq!(served, api);
     assert_eq!(api["info"]["version"], env!("CARGO_PKG_VERSION"));
-    let (_, table) = routes().with_help("");
+    let (_, table) = described();
     // Events end when the service stops.
     service.app.stopping.send_replace(true);
     let paths = api["paths"].as_object().expect("paths");
@@ -86,8 +90,9 @@ async fn every_route_and_parameter_is_described() {
         assert_ne!(service.get(&uri).await.0, StatusCode::NOT_FOUND, "{path} is described, not served");
         let described = api["paths"][path][&method]["parameters"].as_array().cloned().unwrap_or_default();
         let of_query = described.iter().filter(|p| p["in"] == "query").filter_map(|p| p["name"].as_str());
-        let known = route.parameters.iter().map(|parameter| parameter.name);
-        assert_eq!(names(of_query), names(known), "{path}");
+        assert_eq!(names(of_query), names(route.query().map(|parameter| parameter.name)), "{path}");
+        let of_path = described.iter().filter(|p| p["in"] == "path").count();
+        assert_eq!(of_path, path.matches('{').count(), "{path}");
     }
     let described = api["paths"]["/query"]["get"]["parameters"].as_array().expect("parameters");
     let known = params::parameters().map(|parameter| parameter.name);
@@ -104,9 +109,10 @@ async fn every_route_and_parameter_is_described() {
         let parameter = described.iter().find(|p| p["name"] == name).expect("described");
         (parameter["schema"]["enum"].clone(), parameter["schema"]["default"].clone())
     };
-    assert_eq!(schema("kind"), (json!(AnswerKind::ALL.map(AnswerKind::name)), Value::Null));
-    let (values, default) = (Precision::ALL.map(Precision::name), Precision::default().name());
-    assert_eq!(schema("precision"), (json!(values), default.into()));
+    let named = |name: &str| api["components"]["schemas"][name]["enum"].clone();
+    assert_eq!(named("AnswerKind"), json!(AnswerKind::ALL.map(AnswerKind::name)));
+    assert_eq!(named("Precision"), json!(Precision::ALL.map(Precision::name)));
+    assert_eq!(schema("precision").1, Precision::default().name());
     let formats: Vec<&str> = Format::available().iter().map(|format| format.name()).collect();
     if formats.len() == 3 {
         assert_eq!(schema("format"), (json!(formats), Format::default().name().into()));
@@ -117,6 +123,42 @@ async fn every_route_and_parameter_is_described() {
     assert!(known.iter().all(|name| help.contains(&format!("    {name}="))), "{help}");
     let listed = |route: &Route| help.contains(&format!("\n{} {} ", route.method, route.path));
     assert!(table.iter().all(listed), "{help}");
+}
+
+/// Descriptions come from doc comments: they must make sense to someone who does not see the program.
+#[test]
+fn descriptions_are_for_clients() {
+    fn walk(value: &Value, at: &str, found: &mut impl FnMut(&str, &str, &Value)) {
+        for (key, member) in value.as_object().into_iter().flatten() {
+            found(at, key, member);
+            walk(member, &format!("{at}/{key}"), found);
+        }
+        value.as_array().into_iter().flatten().for_each(|item| walk(item, at, found));
+    }
+    let api = description();
+    let mut n_refs = 0;
+    walk(&api, "", &mut |at, key, member| match (key, member) {
+        ("description" | "summary", Value::String(text)) => {
+            assert!(text.ends_with('.') || text.ends_with(')'), "{at}: {text}");
+            assert!(!text.contains("[`") && !text.contains("::"), "{at}: {text}");
+        }
+        ("$ref", Value::String(to)) => {
+            n_refs += 1;
+            assert!(api.pointer(to.trim_start_matches('#')).is_some_and(Value::is_object), "{at}: {to}");
+        }
+        // The only member of a variant is described with the variant.
+        ("properties", Value::Object(properties))
+            if !at.ends_with("/properties") && !at.ends_with("/oneOf") =>
+        {
+            for (name, property) in properties {
+                let is_described = property["description"].is_string() || property["$ref"].is_string();
+                assert!(is_described, "{at}: {name} has no description");
+            }
+        }
+        _ => {}
+    });
+    assert!(n_refs > 50, "{n_refs}");
+    assert_eq!(api, description(), "the same bytes each time");
 }
 
 #[tokio::test]

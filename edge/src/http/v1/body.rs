@@ -2,30 +2,39 @@
 
 use std::time::Duration;
 
+use schemars::JsonSchema;
 use serde::Deserialize;
 
+use super::reply::AskedFor;
+use crate::http::forms::Words;
 use crate::query::relations::{self, Phrase};
 use crate::query::{
-    AnswerKind, Area, Ask, Asked, DEFAULT_MIN_COUNT, MAX_TEXTS, Negatives, Point, QueryRequest, RequestError,
+    AnswerKind, Area, Ask, Asked, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, MAX_NEGATIVES, MAX_PAGE, MAX_TEXTS,
+    Negatives, Point, QueryRequest, RequestError,
 };
-use crate::score::Precision;
+use crate::score::{MAX_COORDINATE, Precision};
 
 /// Longest body: 32 vectors of 2048 components as text.
 pub const MAX_BODY_BYTES: usize = 1 << 20;
 
-/// A request for answers. Everything but what is asked for is optional.
-#[derive(Clone, Debug, Default, Deserialize)]
+/// What is asked for: at least one text, vector or phrase, 32 together at most. Everything else is optional.
+#[derive(Clone, Debug, Default, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
+#[schemars(rename = "Ask")]
 pub struct Body {
     /// Texts for the text model; those that name a relation are understood as phrases.
+    #[schemars(with = "Vec<Words>", length(max = MAX_TEXTS))]
     pub texts: Vec<String>,
-    /// Vectors of the scene's embedding space.
+    /// Vectors of the scene's embedding space; their lengths do not count.
+    #[schemars(length(max = MAX_TEXTS))]
     pub vectors: Vec<Vec<f32>>,
     /// Things by their relations.
+    #[schemars(length(max = MAX_TEXTS))]
     pub phrases: Vec<Phrase>,
     /// Whether texts that name a relation are understood as phrases; true if absent.
     pub relations: Option<bool>,
-    /// Negative prompts; `canonical` alone stands for LERF's.
+    /// Negative prompts; canonical alone stands for LERF's: object, things, stuff, texture.
+    #[schemars(with = "Vec<Words>", length(max = MAX_NEGATIVES))]
     pub negatives: Vec<String>,
     /// Kind of answers.
     pub kind: Option<AnswerKind>,
@@ -36,18 +45,24 @@ pub struct Body {
     /// The asker's heading, from x towards y, radians.
     pub heading_rad: Option<f64>,
     /// Least score of a match.
+    #[schemars(range(min = -1, max = 1))]
     pub min_score: Option<f32>,
     /// Answers to each question in a page.
+    #[schemars(range(min = 1, max = MAX_PAGE), extend("default" = DEFAULT_LIMIT))]
     pub limit: Option<usize>,
     /// Answers to each question before the page.
     pub offset: usize,
     /// Least Gaussians of an answer.
+    #[schemars(range(min = 1), extend("default" = DEFAULT_MIN_COUNT))]
     pub min_count: Option<u64>,
     /// Edge of the voxels that join Gaussians to clusters.
+    #[schemars(extend("exclusiveMinimum" = 0, "maximum" = MAX_COORDINATE))]
     pub voxel: Option<f64>,
     /// Where scores come from.
+    #[schemars(with = "Option<Precision>", extend("default" = Precision::default().name()))]
     pub precision: Option<String>,
     /// Most time to compute, milliseconds.
+    #[schemars(range(min = 1))]
     pub time_budget_ms: Option<u64>,
 }
 
@@ -55,7 +70,7 @@ pub struct Body {
 pub struct Understood {
     pub ask: Ask,
     /// The question of each answer, as the client wrote it.
-    pub questions: Vec<serde_json::Value>,
+    pub questions: Vec<AskedFor>,
     pub time_budget: Option<Duration>,
 }
 
@@ -86,18 +101,18 @@ impl Body {
         let with_relations = self.relations.unwrap_or(true) && has_objects && is_of_objects;
         let (mut asked, mut questions) = (Vec::with_capacity(n), Vec::with_capacity(n));
         for text in self.texts {
-            questions.push(serde_json::json!({ "text": text }));
+            questions.push(AskedFor { text: Some(text.clone()), ..AskedFor::default() });
             let phrase = if with_relations { relations::understand(&text) } else { None };
             // A phrase that breaks a limit is one text for the text model, as one without relations is.
             let phrase = phrase.filter(|phrase| phrase.check().is_ok());
             asked.push(phrase.map_or(Asked::Text(text), Asked::Phrase));
         }
         for (at, vector) in self.vectors.into_iter().enumerate() {
-            questions.push(serde_json::json!({ "vector": at }));
+            questions.push(AskedFor { vector: Some(at), ..AskedFor::default() });
             asked.push(Asked::Vector(vector));
         }
         for phrase in self.phrases {
-            questions.push(serde_json::json!({ "phrase": phrase }));
+            questions.push(AskedFor { phrase: Some(phrase.clone()), ..AskedFor::default() });
             asked.push(Asked::Phrase(phrase));
         }
         let precision = match &self.precision {

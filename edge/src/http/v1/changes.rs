@@ -6,35 +6,36 @@ use axum::Json;
 use axum::extract::State;
 use axum::extract::rejection::QueryRejection;
 use axum::http::StatusCode;
-use serde_json::{Value, json};
 use slag_service::problem::Problem;
 use slag_service::routes::Parameter;
 
 use super::params::{self, Pairs, lat_lon, number};
 use crate::http::app::App;
+use crate::http::forms;
 use crate::http::problem::{overloaded, parameter_problem, query_problem, timeout};
-use crate::query::{ChangesError, ChangesRequest, MAX_TEXTS, Point, RequestError, parse_point};
+use crate::query::{ChangesError, ChangesReply, ChangesRequest, MAX_TEXTS, Point, RequestError, parse_point};
 
 /// Returns the parameters of `/v1/changes`.
 pub fn parameters() -> [Parameter; 6] {
     [
-        Parameter::new("from", "3", "the earlier generation (default: the newest before that is remembered)"),
-        Parameter::new("to", "4", "the later generation (default: that on board)"),
-        Parameter::new("near", "x,y,z", "with radius: only changes within this distance"),
-        Parameter::new("near_lat_lon", "lat,lon", "the same on the earth"),
-        Parameter::new("radius", "r", "with near"),
-        Parameter::new(
-            "text",
-            "chair",
-            "a kind of thing: each thing names the one it is most like; may be repeated",
+        Parameter::new::<u64>(
+            "from",
+            "3",
+            "the earlier generation (default: the newest before the later one that is remembered)",
         ),
+        Parameter::new::<u64>("to", "4", "the later generation (default: that on board)"),
+        forms::near("with radius: only changes within this distance; of a move, one end counts"),
+        forms::near_lat_lon(),
+        forms::length("radius", "r", "with near"),
+        forms::text("chair", "a kind of thing: each thing names the one it is most like; may be repeated")
+            .repeated(MAX_TEXTS),
     ]
 }
 
 pub async fn changes(
     State(app): State<Arc<App>>,
     pairs: Result<Pairs, QueryRejection>,
-) -> Result<Json<Value>, Problem> {
+) -> Result<Json<ChangesReply>, Problem> {
     let (mut request, near, radius) = parse(&params::pairs(pairs)?).map_err(parameter_problem)?;
     let limit = app.settings.query_timeout;
     let permit =
@@ -45,7 +46,7 @@ pub async fn changes(
         let snapshot = app.engine.snapshot().map_err(query_problem)?;
         let near = near.map(|near| near.in_world("near", &snapshot.manifest)).transpose();
         request.ball = near.map_err(parameter_problem)?.zip(radius);
-        app.engine.changes(&request).map(|reply| Json(json!(reply))).map_err(problem)
+        app.engine.changes(&request).map(Json).map_err(problem)
     });
     tokio::time::timeout(limit, answering).await.map_err(|_| timeout(limit))?
 }
@@ -66,7 +67,7 @@ fn problem(error: ChangesError) -> Problem {
 type Parsed = (ChangesRequest, Option<Point>, Option<f64>);
 
 fn parse(pairs: &[(String, String)]) -> Result<Parsed, RequestError> {
-    params::check_names(pairs, &parameters(), &["text"])?;
+    params::check_names(pairs, &parameters())?;
     let (mut request, mut near, mut radius) = (ChangesRequest::default(), None, None);
     for (name, value) in pairs {
         let refused = |expected: String| RequestError::new(name, value, expected);

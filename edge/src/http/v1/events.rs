@@ -9,9 +9,10 @@ use std::time::Duration;
 use axum::body::{Body, Bytes};
 use axum::extract::State;
 use axum::http::{HeaderValue, header};
-use axum::response::{IntoResponse, Response};
 use hyper::body::Frame;
+use schemars::SchemaGenerator;
 use serde_json::{Value, json};
+use slag_service::openapi::{As, Described, Reply};
 use slag_service::problem::Problem;
 use tokio::sync::mpsc::{Receiver, channel};
 
@@ -20,6 +21,7 @@ use crate::http::app::App;
 use crate::http::problem::too_many_listeners;
 use crate::query::FRAME;
 
+const MEDIA_TYPE: &str = "text/event-stream";
 /// Time between looks at what is on board.
 const TICK: Duration = Duration::from_millis(500);
 /// Time without an event after which a comment is sent: a client that is gone is noticed.
@@ -27,7 +29,7 @@ const KEEP_ALIVE: Duration = Duration::from_secs(15);
 /// Events made ahead of the client.
 const EVENTS_AHEAD: usize = 4;
 
-pub async fn events(State(app): State<Arc<App>>) -> Result<Response, Problem> {
+pub async fn events(State(app): State<Arc<App>>) -> Result<As<Events>, Problem> {
     let permit = Arc::clone(&app.listeners).try_acquire_owned();
     let permit = permit.map_err(|_| too_many_listeners(app.settings.max_listeners))?;
     let (sender, receiver) = channel::<Bytes>(EVENTS_AHEAD);
@@ -56,10 +58,10 @@ pub async fn events(State(app): State<Arc<App>>) -> Result<Response, Problem> {
     };
     tokio::spawn(telling);
     let headers = [
-        (header::CONTENT_TYPE, HeaderValue::from_static("text/event-stream")),
+        (header::CONTENT_TYPE, HeaderValue::from_static(MEDIA_TYPE)),
         (header::CACHE_CONTROL, HeaderValue::from_static("no-store")),
     ];
-    Ok((headers, Body::new(Events(receiver))).into_response())
+    Ok(As::new((headers, Body::new(Events(receiver)))))
 }
 
 /// What a client was told.
@@ -102,7 +104,13 @@ fn push(text: &mut String, name: &str, data: &Value) {
 }
 
 /// A body of events, which ends when the service stops.
-struct Events(Receiver<Bytes>);
+pub struct Events(Receiver<Bytes>);
+
+impl Described for Events {
+    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
+        vec![Reply::ok(MEDIA_TYPE, schemas.subschema_for::<String>())]
+    }
+}
 
 impl hyper::body::Body for Events {
     type Data = Bytes;

@@ -6,88 +6,98 @@ use axum::Json;
 use axum::extract::State;
 use axum::extract::rejection::QueryRejection;
 use axum::http::StatusCode;
-use serde_json::{Value, json};
+use glam::DVec3;
+use schemars::JsonSchema;
+use serde::Serialize;
 use slag_service::problem::Problem;
 use slag_service::routes::Parameter;
 
 use super::params::{self, Pairs, lat_lon, number};
-use crate::goal::{self, FloorMap, GoalError, GoalRequest, GoalTarget, Place};
+use crate::goal::{self, FloorMap, GoalError, GoalReply, GoalRequest, GoalTarget, Place, request};
 use crate::http::app::App;
+use crate::http::forms;
 use crate::http::problem::{overloaded, parameter_problem, query_problem, timeout};
 use crate::query::{FRAME, Point, RequestError, object_id, parse_point};
 
 /// Returns the parameters of `/v1/goal`.
 pub fn parameters() -> Vec<Parameter> {
+    let usual = GoalRequest::new(GoalTarget::Text(String::new()));
     let of_goal = [
-        Parameter::new("text", "chair", "the thing to go to; may name relations"),
-        Parameter::new("id", "o0123456789abcdef", "the same by its id, instead of text"),
-        Parameter::new("reach_m", "0.8", "largest horizontal distance to the thing's surface (default: 0.8)"),
-        Parameter::new(
+        forms::text("chair", "the thing to go to; may name relations"),
+        forms::object_id("id", "the same by its id, instead of text"),
+        length("reach_m", "0.8", "largest horizontal distance to the thing's surface", request::REACH_M)
+            .or(usual.reach_m),
+        Parameter::new::<f64>(
             "min_visible",
             "0.05",
-            "least share of the thing that the sensor must see (default: 0.05)",
-        ),
-        Parameter::new("limit", "3", "most poses (default: 3, at most 20)"),
+            "least share of the thing's Gaussians that the sensor must see",
+        )
+        .within(request::MIN_VISIBLE[0], request::MIN_VISIBLE[1])
+        .or(usual.min_visible),
+        Parameter::new::<usize>("limit", "3", "most poses, at most 20")
+            .within(1, request::MAX_POSES)
+            .or(usual.limit),
     ];
     of_goal.into_iter().chain(floor_parameters()).collect()
 }
 
 /// Returns the parameters of `/v1/floor`.
 pub fn floor_parameters() -> Vec<Parameter> {
+    let usual = GoalRequest::new(GoalTarget::Text(String::new()));
     vec![
-        Parameter::new(
-            "near",
-            "x,y,z",
+        forms::near(
             "where the robot is (default: its last position if it is followed, else the middle of the area on board)",
         ),
-        Parameter::new("near_lat_lon", "lat,lon", "the same on the earth"),
-        Parameter::new("radius_m", "0.3", "radius of the robot, seen from above (default: 0.3)"),
-        Parameter::new("sensor_height_m", "0.4", "height of its sensor above the ground (default: 0.4)"),
-        Parameter::new("height_m", "0.5", "height of the robot (default: 0.1 above the sensor)"),
-        Parameter::new("step_m", "0.1", "highest step that it climbs (default: 0.1)"),
-        Parameter::new("range_m", "20", "how far around it ground is looked at (default: 20)"),
+        forms::near_lat_lon(),
+        length("radius_m", "0.3", "radius of the robot, seen from above", request::RADIUS_M)
+            .or(usual.radius_m),
+        length("sensor_height_m", "0.4", "height of its sensor above the ground", request::SENSOR_HEIGHT_M)
+            .or(usual.sensor_height_m),
+        length("height_m", "0.5", "height of the robot (default: 0.1 above the sensor)", request::HEIGHT_M),
+        length("step_m", "0.1", "highest step that it climbs", request::STEP_M).or(usual.step_m),
+        length("range_m", "20", "how far around it ground is looked at", request::RANGE_M).or(usual.range_m),
     ]
+}
+
+fn length(name: &'static str, example: &'static str, summary: &str, [low, high]: [f64; 2]) -> Parameter {
+    Parameter::new::<f64>(name, example, summary).within(low, high)
 }
 
 pub async fn goal(
     State(app): State<Arc<App>>,
     pairs: Result<Pairs, QueryRejection>,
-) -> Result<Json<Value>, Problem> {
+) -> Result<Json<GoalReply>, Problem> {
     let pairs = params::pairs(pairs)?;
-    params::check_names(&pairs, &parameters(), &[]).map_err(parameter_problem)?;
+    params::check_names(&pairs, &parameters()).map_err(parameter_problem)?;
     let (request, near) = parse(&pairs).map_err(parameter_problem)?;
     let is_text = matches!(&request.target, GoalTarget::Text(text) if text.trim().is_empty());
     if is_text {
         let refused = RequestError::new("text", "nothing", "the thing to go to, or its id as id");
         return Err(parameter_problem(refused));
     }
-    answer(&app, near, request, |app, request| {
-        let reply = goal::find(&app.engine, request, &app.query_budget())?;
-        Ok(json!(reply))
-    })
-    .await
+    answer(&app, near, request, |app, request| goal::find(&app.engine, request, &app.query_budget())).await
 }
 
 pub async fn floor(
     State(app): State<Arc<App>>,
     pairs: Result<Pairs, QueryRejection>,
-) -> Result<Json<Value>, Problem> {
+) -> Result<Json<Floor>, Problem> {
     let pairs = params::pairs(pairs)?;
-    params::check_names(&pairs, &floor_parameters(), &[]).map_err(parameter_problem)?;
+    params::check_names(&pairs, &floor_parameters()).map_err(parameter_problem)?;
     let (request, near) = parse(&pairs).map_err(parameter_problem)?;
     answer(&app, near, request, |app, request| {
         let generation = app.engine.snapshot()?.manifest.generation;
-        Ok(described(generation, &goal::floor_map(&app.engine, request)?))
+        Ok(Floor::new(generation, &goal::floor_map(&app.engine, request)?))
     })
     .await
 }
 
-async fn answer(
+async fn answer<T: Send + 'static>(
     app: &Arc<App>,
     near: Option<Point>,
     mut request: GoalRequest,
-    work: impl FnOnce(&App, &GoalRequest) -> Result<Value, GoalError> + Send + 'static,
-) -> Result<Json<Value>, Problem> {
+    work: impl FnOnce(&App, &GoalRequest) -> Result<T, GoalError> + Send + 'static,
+) -> Result<Json<T>, Problem> {
     let limit = app.settings.query_timeout;
     let permit =
         Arc::clone(&app.permits).try_acquire_owned().map_err(|_| overloaded(app.settings.max_queries))?;
@@ -113,21 +123,44 @@ fn problem(error: GoalError) -> Problem {
     }
 }
 
-/// Describes a map: cells as runs of equal ones, x first.
-fn described(generation: u64, map: &FloorMap) -> Value {
-    let runs: Vec<(Place, usize)> =
-        map.places.chunk_by(|a, b| a == b).map(|run| (run[0], run.len())).collect();
-    let code = |place: &Place| match place {
-        Place::Unknown => 'u',
-        Place::Obstacle => 'o',
-        Place::Ground => 'g',
-        Place::Reached => 'r',
-    };
-    let text: String = runs.iter().map(|(place, n)| format!("{}{n}", code(place))).collect();
-    json!({
-        "generation": generation, "frame": FRAME, "cell_m": map.cell_m, "origin_in_world": map.origin_in_world,
-        "size": map.size, "runs": text,
-    })
+/// The ground around the robot, in square cells.
+#[derive(Serialize, JsonSchema)]
+pub struct Floor {
+    /// Generation that answers.
+    generation: u64,
+    /// Frame of every position: the scene's world frame.
+    #[schemars(extend("enum" = [FRAME]))]
+    frame: &'static str,
+    /// Edge of a cell.
+    cell_m: f64,
+    /// Corner of the first cell.
+    #[schemars(with = "[f64; 3]")]
+    origin_in_world: DVec3,
+    /// Cells along x and y.
+    size: [usize; 2],
+    /// A letter and a count for each run of equal cells, x first: u unknown, o obstacle, g ground, r ground that the robot
+    /// reaches.
+    runs: String,
+}
+
+impl Floor {
+    fn new(generation: u64, map: &FloorMap) -> Self {
+        let code = |place: &Place| match place {
+            Place::Unknown => 'u',
+            Place::Obstacle => 'o',
+            Place::Ground => 'g',
+            Place::Reached => 'r',
+        };
+        let runs = map.places.chunk_by(|a, b| a == b).map(|run| format!("{}{}", code(&run[0]), run.len()));
+        Self {
+            generation,
+            frame: FRAME,
+            cell_m: map.cell_m,
+            origin_in_world: map.origin_in_world,
+            size: map.size,
+            runs: runs.collect(),
+        }
+    }
 }
 
 /// Reads the parameters that both have; names were checked before.

@@ -4,7 +4,6 @@ use std::sync::Arc;
 
 use axum::Json;
 use axum::extract::State;
-use serde_json::{Value, json};
 use slag_service::problem::Problem;
 
 use crate::fetch::accepted;
@@ -12,12 +11,12 @@ use crate::http::app::App;
 use crate::http::problem::query_problem;
 use crate::query::MapStatus;
 
-pub async fn map(State(app): State<Arc<App>>) -> Result<Json<Value>, Problem> {
+pub async fn map(State(app): State<Arc<App>>) -> Result<Json<MapStatus>, Problem> {
     app.blocking(|app| {
         app.reload_if_stale();
         let snapshot = app.engine.snapshot().map_err(query_problem)?;
         let expires_unix_secs = accepted(app.engine.cache()).and_then(|accepted| accepted.expires_unix_secs);
-        Ok(Json(json!(MapStatus::of(&snapshot, crate::now_unix_secs(), expires_unix_secs))))
+        Ok(Json(MapStatus::of(&snapshot, crate::now_unix_secs(), expires_unix_secs)))
     })
     .await
 }

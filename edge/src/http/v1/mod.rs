@@ -13,43 +13,93 @@ mod view;
 
 use std::sync::Arc;
 
-use slag_service::routes::Routes;
+use slag_service::routes::{Parameter, Routes};
 
 use super::app::App;
+use super::problem::{NO_PLACES, SCENE, TEXTS};
+use crate::query::OBJECT_ID;
 
 /// Adds the routes.
 pub fn routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
-    to.get("/v1/query", "things that match texts or relations, best first, in one shape of reply", query::get)
+    let to = view_routes(to)
+        .get(
+            "/v1/query",
+            "things that match texts or relations, best first, in one shape of reply",
+            query::get,
+        )
         .parameters(params::query_parameters())
-        .post(
+        .errors(&SCENE)
+        .errors(&TEXTS)
+        .post::<body::Body, _, _>(
             "/v1/query",
             "the same, asked in JSON: texts, vectors, phrases, areas",
             body::MAX_BODY_BYTES,
             query::post,
         )
+        .errors(&SCENE)
+        .errors(&TEXTS)
         .get("/v1/objects", "all things on board, by id, in pages", objects::list)
-        .parameters(params::objects_parameters())
+        .parameters(objects::parameters())
+        .errors(&SCENE)
         .get("/v1/objects/{id}", "one thing on board", objects::one)
+        .parameters([Parameter::of_path::<String>("id", "o and 16 hex digits").of_form(OBJECT_ID)])
+        .errors(&SCENE)
+        .errors(&[(404, "No such thing is on board.")])
         .get("/v1/map", "the area on board, its age, and what is missing", map::map)
+        .errors(&SCENE)
         .get("/v1/changes", "things that appeared, went or moved between two generations", changes::changes)
         .parameters(changes::parameters())
-        .get(
-            "/v1/view",
-            "the scene on board as the page at /view draws it: cells, fetched area, robot",
-            view::describe,
-        )
-        .get("/v1/view/scores", "the score of every Gaussian on board, a byte each, in binary", view::scores)
-        .parameters(view::scores_parameters())
-        .get(
-            "/v1/view/words",
-            "the words that the text model knows, and how many things on board each finds",
-            view::words,
-        )
-        .get("/v1/view/cells/{id}", "the Gaussians of a cell, 16 bytes each, in binary", view::cell)
-        .parameters(view::cell_parameters())
+        .errors(&SCENE)
+        .errors(&[
+            (404, "The robot does not remember a generation."),
+            (409, "The generations were encoded with different models, or have no objects."),
+            (422, "The text model does not know the words."),
+        ])
         .get("/v1/goal", "places to stand near a thing: reached, clear, and in sight of it", goal::goal)
         .parameters(goal::parameters())
+        .errors(&SCENE)
+        .errors(&[NO_PLACES, TEXTS[1]])
         .get("/v1/floor", "the ground around the robot: unknown, obstacle, ground, reached", goal::floor)
         .parameters(goal::floor_parameters())
-        .get("/v1/events", "server-sent events: generations and fetches as they happen", events::events)
+        .errors(&SCENE)
+        .errors(&[NO_PLACES]);
+    to.get("/v1/events", "server-sent events: generations and fetches as they happen", events::events)
+        .details(
+            "At first the present state. event: generation, with scene, generation, frame, n_cells, n_objects and n_bad_cells, or null without a scene; event: following, as the member following of /status. The stream ends when the service stops.",
+        )
+        .errors(&[(503, "Too many clients listen to events.")])
+}
+
+/// Adds what the page asks for.
+fn view_routes(to: Routes<Arc<App>>) -> Routes<Arc<App>> {
+    to.get(
+        "/v1/view",
+        "the scene on board as the page at /view draws it: cells, fetched area, robot",
+        view::describe,
+    )
+    .errors(&SCENE)
+    .get("/v1/view/scores", "the score of every Gaussian on board, a byte each, in binary", view::scores)
+    .details(
+        "Little-endian: the bytes SLGS, version 1 (u32), least and largest score (f32 each), number of cells and generation (u32 each); for each cell its id and number of Gaussians (u32 each); then a byte b for each Gaussian: 0 if no view shows it, else its centroid's score is least + b / 255 * (largest - least). With negatives, scores are relevancies.",
+    )
+    .parameters(view::scores_parameters())
+    .errors(&SCENE)
+    .errors(&TEXTS)
+    .get("/v1/view/words", "words to ask for, and how many things on board each finds", view::words)
+    .details(
+        "Those of most things first: all that the text model knows, or of one that takes any text everyday words that find something.",
+    )
+    .errors(&SCENE)
+    .errors(&TEXTS)
+    .get("/v1/view/cells/{id}", "the Gaussians of a cell, 16 bytes each, in binary", view::cell)
+    .details(
+        "Little-endian: the bytes SLGG, version 1 and number of Gaussians N (u32 each), origin in the world (f32 x 3), flags (u32; 1: the appearance is known), step (u32); then columns: centres less the origin (f16 x 3), colours (u8 x 3), opacities (u8), sizes and rotations (u8 x 3 each, see docs/formats.md).",
+    )
+    .parameters([Parameter::of_path::<u32>("id", "the cell's id").within(0, u32::MAX)])
+    .parameters(view::cell_parameters())
+    .errors(&SCENE)
+    .errors(&[
+        (404, "The cell is not on board, or another generation is."),
+        (422, "The answer needs more than the budget."),
+    ])
 }

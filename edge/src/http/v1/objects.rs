@@ -6,39 +6,51 @@ use axum::Json;
 use axum::extract::rejection::QueryRejection;
 use axum::extract::{Path, State};
 use axum::http::StatusCode;
-use serde_json::{Value, json};
 use slag_service::problem::Problem;
+use slag_service::routes::Parameter;
 
 use super::params::{self, Pairs, number};
 use crate::http::app::App;
+use crate::http::forms;
 use crate::http::problem::{parameter_problem, query_problem};
-use crate::query::{FRAME, ObjectFilter, RequestError, object_id, parse_point};
+use crate::query::{ObjectFilter, ObjectOnBoard, ObjectPage, RequestError, object_id, parse_point};
 
 /// Objects in a page unless the request says otherwise.
 const DEFAULT_PAGE: usize = 100;
 /// Most objects in a page.
 const MAX_PAGE: usize = 1000;
 
+/// Returns the parameters of `/v1/objects`.
+pub fn parameters() -> [Parameter; 5] {
+    [
+        Parameter::new::<usize>("limit", "100", "objects in a page, at most 1000")
+            .within(1, MAX_PAGE)
+            .or(DEFAULT_PAGE),
+        forms::object_id("after", "the id that the page begins after: next_after of the page before"),
+        forms::near("with radius: only objects with their position within this distance"),
+        forms::length("radius", "r", "with near"),
+        Parameter::new::<f64>("min_size", "0.5", "least length of the box's longest edge, world units")
+            .limit("minimum", 0),
+    ]
+}
+
 pub async fn list(
     State(app): State<Arc<App>>,
     pairs: Result<Pairs, QueryRejection>,
-) -> Result<Json<Value>, Problem> {
+) -> Result<Json<ObjectPage>, Problem> {
     let (filter, limit) = parse(&params::pairs(pairs)?).map_err(parameter_problem)?;
     app.blocking(move |app| {
         app.reload_if_stale();
         let snapshot = app.engine.snapshot().map_err(query_problem)?;
-        let page = app.engine.objects(&snapshot, &filter, limit);
-        let manifest = &snapshot.manifest;
-        Ok(Json(json!({
-            "scene": manifest.scene, "generation": manifest.generation, "frame": FRAME,
-            "unit": if manifest.metric { "m" } else { "world" },
-            "n_objects": page.n_matching, "next_after": page.next_after, "objects": page.objects,
-        })))
+        Ok(Json(app.engine.objects(&snapshot, &filter, limit)))
     })
     .await
 }
 
-pub async fn one(State(app): State<Arc<App>>, Path(id): Path<String>) -> Result<Json<Value>, Problem> {
+pub async fn one(
+    State(app): State<Arc<App>>,
+    Path(id): Path<String>,
+) -> Result<Json<ObjectOnBoard>, Problem> {
     let refused = || parameter_problem(RequestError::new("id", &id, "o and 16 hex digits"));
     let wanted = object_id(&id).ok_or_else(refused)?;
     app.blocking(move |app| {
@@ -51,13 +63,13 @@ pub async fn one(State(app): State<Arc<App>>, Path(id): Path<String>) -> Result<
             );
             return Err(Problem::new(StatusCode::NOT_FOUND, "no-such-object", "No such object", detail));
         };
-        serde_json::to_value(object).map(Json).map_err(Problem::internal)
+        Ok(Json(object))
     })
     .await
 }
 
 fn parse(pairs: &[(String, String)]) -> Result<(ObjectFilter, usize), RequestError> {
-    params::check_names(pairs, &params::objects_parameters(), &[])?;
+    params::check_names(pairs, &parameters())?;
     let (mut filter, mut limit, mut near) = (ObjectFilter::default(), DEFAULT_PAGE, None);
     let mut radius = None;
     for (name, value) in pairs {

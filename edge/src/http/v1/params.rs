@@ -1,17 +1,19 @@
-//! The query parameters of `/v1/query` and `/v1/objects`.
+//! The query parameters of `/v1/query`, and reading those of all routes.
 
 use std::str::FromStr;
 
 use axum::extract::Query;
 use axum::extract::rejection::QueryRejection;
+use serde_json::json;
 use slag_service::problem::Problem;
 use slag_service::routes::Parameter;
 
 use super::body::Body;
+use crate::http::forms::{self, Words};
 use crate::http::problem::parameter_problem;
 use crate::query::{
-    AreaBall, AreaBox, Corner, DEFAULT_LIMIT, DEFAULT_MIN_COUNT, LatLon, Point, RequestError, parse_box,
-    parse_point,
+    AnswerKind, AreaBall, AreaBox, Corner, DEFAULT_LIMIT, LatLon, MAX_NEGATIVES, MAX_PAGE, MAX_TEXTS, Point,
+    RequestError, parse_box, parse_point,
 };
 
 pub type Pairs = Query<Vec<(String, String)>>;
@@ -19,56 +21,48 @@ pub type Pairs = Query<Vec<(String, String)>>;
 /// Returns the parameters of `/v1/query`.
 pub fn query_parameters() -> [Parameter; 18] {
     [
-        Parameter::new("text", "mug on the table", "what to look for; may be repeated"),
-        Parameter::new("relations", "off", "take texts as they are, even if they name a relation"),
-        Parameter::new(
-            "negative",
-            "wall, floor",
-            "a negative prompt, commas included; may be repeated; or canonical",
+        forms::text("mug on the table", "what to look for; may be repeated")
+            .details("A text that names a relation (mug on the table) is understood as a phrase.")
+            .required()
+            .repeated(MAX_TEXTS),
+        Parameter::new::<String>(
+            "relations",
+            "off",
+            "off: take texts as they are, even if they name a relation",
+        )
+        .limit("enum", json!(["on", "off"]))
+        .or("on"),
+        negative(),
+        Parameter::new::<AnswerKind>(
+            "kind",
+            "objects",
+            "objects, clusters or gaussians (default: objects where the scene has them, else clusters)",
         ),
-        Parameter::new("kind", "objects", "objects, clusters or gaussians"),
-        Parameter::new("limit", "10", format!("answers to a text in a page (default: {DEFAULT_LIMIT})")),
-        Parameter::new("offset", "0", "answers to a text before the page"),
-        Parameter::new(
-            "min_score",
-            "0.1",
-            "least cosine, or relevancy with negatives (default: the scene's)",
-        ),
-        Parameter::new(
-            "near",
-            "x,y,z",
-            "where the asker is: relations are seen from there, and nearer answers rank higher",
-        ),
-        Parameter::new(
-            "near_lat_lon",
-            "lat,lon",
-            "the same on the earth, with the height if it is known: lat,lon,height",
-        ),
-        Parameter::new("heading_rad", "1.57", "where the asker looks, from x towards y"),
-        Parameter::new("radius", "r", "only within this distance of the asker"),
-        Parameter::new("box", "x,y,z,x,y,z", "only between two corners"),
-        Parameter::new("polygon", "x,y,x,y,x,y", "only inside this outline, seen from above"),
-        Parameter::new("polygon_lat_lon", "lat,lon,...", "the same on the earth"),
-        Parameter::new(
-            "min_count",
-            "n",
-            format!("least Gaussians of an answer (default: {DEFAULT_MIN_COUNT})"),
-        ),
-        Parameter::new("voxel", "v", "edge of the voxels that join Gaussians to clusters"),
-        Parameter::new("precision", "measured", "centroids, measured or exact (default: exact)"),
-        Parameter::new("time_budget_ms", "500", "give up after this time"),
+        Parameter::new::<usize>("limit", "10", "answers to a text in a page; 10,000 over all texts at most")
+            .within(1, MAX_PAGE)
+            .or(DEFAULT_LIMIT),
+        Parameter::new::<usize>("offset", "0", "answers to a text before the page").or(0),
+        forms::least_score("min_score"),
+        forms::near("where the asker is: relations are seen from there, and nearer answers rank higher"),
+        forms::near_lat_lon(),
+        Parameter::new::<f64>("heading_rad", "1.57", "where the asker looks, from the world's x towards y"),
+        forms::length("radius", "r", "only within this distance of the asker, world units"),
+        forms::bounds(),
+        forms::polygon(),
+        forms::polygon_lat_lon(),
+        forms::min_count(),
+        forms::voxel(),
+        forms::precision(),
+        Parameter::new::<u64>("time_budget_ms", "500", "give up after this time").limit("minimum", 1),
     ]
 }
 
-/// Returns the parameters of `/v1/objects`.
-pub fn objects_parameters() -> [Parameter; 5] {
-    [
-        Parameter::new("limit", "100", "objects in a page (default: 100, at most 1000)"),
-        Parameter::new("after", "o0123456789abcdef", "the id that the page begins after"),
-        Parameter::new("near", "x,y,z", "with radius: only objects within this distance"),
-        Parameter::new("radius", "r", "with near"),
-        Parameter::new("min_size", "0.5", "least length of the box's longest edge, world units"),
-    ]
+/// Returns the parameter `negative`.
+pub fn negative() -> Parameter {
+    let summary = "a negative prompt, commas included; may be repeated; or canonical";
+    Parameter::new::<Words>("negative", "wall, floor", summary)
+        .details("canonical alone stands for object, things, stuff, texture.")
+        .repeated(MAX_NEGATIVES)
 }
 
 /// Returns the pairs of a query string.
@@ -79,20 +73,16 @@ pub fn pairs(pairs: Result<Pairs, QueryRejection>) -> Result<Vec<(String, String
     pairs.map(|Query(pairs)| pairs).map_err(refused)
 }
 
-/// Refuses parameters that are unknown or repeated.
-pub fn check_names(
-    pairs: &[(String, String)],
-    known: &[Parameter],
-    repeatable: &[&str],
-) -> Result<(), RequestError> {
+/// Refuses parameters that are unknown, or repeated where only one can be.
+pub fn check_names(pairs: &[(String, String)], known: &[Parameter]) -> Result<(), RequestError> {
     for (at, (name, value)) in pairs.iter().enumerate() {
-        if !known.iter().any(|parameter| parameter.name == name) {
+        let Some(parameter) = known.iter().find(|parameter| parameter.name == name) else {
             let names = known.iter().map(|parameter| parameter.name).collect::<Vec<_>>().join(", ");
             let name: String = name.chars().take(40).collect();
             let name = name.escape_debug().to_string();
             return Err(RequestError::new(&name, value, format!("one of {names}")));
-        }
-        if !repeatable.contains(&name.as_str()) && pairs[..at].iter().any(|(before, _)| before == name) {
+        };
+        if parameter.most.is_none() && pairs[..at].iter().any(|(before, _)| before == name) {
             return Err(RequestError::new(name, value, "one value"));
         }
     }
@@ -104,7 +94,7 @@ pub fn check_names(
 /// # Errors
 /// The first parameter that is unknown, repeated or does not parse.
 pub fn parse(pairs: &[(String, String)]) -> Result<Body, RequestError> {
-    check_names(pairs, &query_parameters(), &["text", "negative"])?;
+    check_names(pairs, &query_parameters())?;
     let mut body = Body::default();
     let mut radius = None;
     for (name, value) in pairs {

@@ -4,11 +4,12 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
+use axum::Json;
 use axum::body::Bytes;
 use axum::extract::State;
 use axum::extract::rejection::QueryRejection;
 use axum::http::header;
-use axum::response::{IntoResponse, Response};
+use slag_service::openapi::As;
 use slag_service::problem::Problem;
 
 use super::body::{Body, Understood};
@@ -18,24 +19,27 @@ use crate::http::app::App;
 use crate::http::problem::{overloaded, parameter_problem, query_problem, timeout};
 use crate::query::Asked;
 
+/// A reply, written where it was computed.
+type Answer = As<Json<Replied<'static>>>;
+
 pub async fn get(
     State(app): State<Arc<App>>,
     pairs: Result<Pairs, QueryRejection>,
-) -> Result<Response, Problem> {
+) -> Result<Answer, Problem> {
     let body = params::pairs(pairs).and_then(|pairs| params::parse(&pairs).map_err(parameter_problem));
     answer(&app, body).await
 }
 
-pub async fn post(State(app): State<Arc<App>>, bytes: Bytes) -> Result<Response, Problem> {
+pub async fn post(State(app): State<Arc<App>>, bytes: Bytes) -> Result<Answer, Problem> {
     answer(&app, Body::parse(&bytes).map_err(parameter_problem)).await
 }
 
-async fn answer(app: &Arc<App>, body: Result<Body, Problem>) -> Result<Response, Problem> {
+async fn answer(app: &Arc<App>, body: Result<Body, Problem>) -> Result<Answer, Problem> {
     let started = Instant::now();
     let answer = answer_within(app, body).await;
     app.metrics.query_times.observe(started.elapsed());
     let body = answer?;
-    Ok(([(header::CONTENT_TYPE, "application/json")], body).into_response())
+    Ok(As::new(([(header::CONTENT_TYPE, "application/json")], body)))
 }
 
 async fn answer_within(app: &Arc<App>, body: Result<Body, Problem>) -> Result<Vec<u8>, Problem> {

@@ -6,7 +6,7 @@ use axum::Json;
 use axum::extract::rejection::QueryRejection;
 use axum::extract::{Path, State};
 use axum::http::{StatusCode, header};
-use axum::response::{IntoResponse, Response};
+use slag_service::openapi::{As, Binary};
 use slag_service::problem::Problem;
 use slag_service::routes::Parameter;
 use slag_view::{Description, Step, Words};
@@ -14,32 +14,27 @@ use slag_view::{Description, Step, Words};
 use super::body;
 use super::params::{self, Pairs, number};
 use crate::http::app::App;
+use crate::http::forms;
 use crate::http::problem::{overloaded, parameter_problem, query_problem, timeout};
 use crate::query::{Negatives, QueryError, RequestError};
 use crate::score::Budget;
 
 /// Returns the parameters of `/v1/view/scores`.
 pub fn scores_parameters() -> [Parameter; 2] {
-    [
-        Parameter::new("text", "mug", "what to look for"),
-        Parameter::new(
-            "negative",
-            "wall",
-            "a negative prompt, commas included; may be repeated; or canonical",
-        ),
-    ]
+    [forms::text("mug", "what to look for").required(), params::negative()]
 }
 
-/// Returns the parameters of `/v1/view/cells/{id}`.
+/// Returns the parameters of the query string of `/v1/view/cells/{id}`.
 pub fn cell_parameters() -> [Parameter; 2] {
-    let summary = "the generation that the cell must be of: 404 from another one on";
     [
-        Parameter::new("generation", "12", summary),
-        Parameter::new(
-            "step",
-            "8",
-            "sends every so many-th Gaussian, 1 to 65536, each larger; all by default",
+        Parameter::new::<u64>(
+            "generation",
+            "12",
+            "the generation that must be on board: 404 if another one is",
         ),
+        Parameter::new::<usize>("step", "8", "sends every so many-th Gaussian, each larger; 1 sends all")
+            .within(1, Step::MAX)
+            .or(1),
     ]
 }
 
@@ -56,7 +51,7 @@ pub async fn describe(State(app): State<Arc<App>>) -> Result<Json<Description>, 
 pub async fn scores(
     State(app): State<Arc<App>>,
     pairs: Result<Pairs, QueryRejection>,
-) -> Result<Response, Problem> {
+) -> Result<As<Binary>, Problem> {
     let (text, negatives) = parse_scores(&params::pairs(pairs)?).map_err(parameter_problem)?;
     message(&app, move |app, budget| Ok(Some(app.engine.view_scores(&text, negatives, budget)?))).await
 }
@@ -65,7 +60,7 @@ pub async fn cell(
     State(app): State<Arc<App>>,
     Path(id): Path<String>,
     pairs: Result<Pairs, QueryRejection>,
-) -> Result<Response, Problem> {
+) -> Result<As<Binary>, Problem> {
     let (cell_id, generation, step) = parse_cell(&id, &params::pairs(pairs)?).map_err(parameter_problem)?;
     message(&app, move |app, budget| app.engine.view_cell(cell_id, generation, step, budget)).await
 }
@@ -78,7 +73,7 @@ pub async fn words(State(app): State<Arc<App>>) -> Result<Json<Words>, Problem> 
 async fn message(
     app: &Arc<App>,
     make: impl FnOnce(&App, &Budget) -> Result<Option<Vec<u8>>, QueryError> + Send + 'static,
-) -> Result<Response, Problem> {
+) -> Result<As<Binary>, Problem> {
     let making = within_limits(app, move |app, budget| {
         let made = make(app, budget).map_err(query_problem)?;
         made.ok_or_else(|| {
@@ -87,7 +82,7 @@ async fn message(
             Problem::new(StatusCode::NOT_FOUND, "no-such-cell", "No such cell", detail)
         })
     });
-    Ok(([(header::CONTENT_TYPE, "application/octet-stream")], making.await?).into_response())
+    Ok(As::new(([(header::CONTENT_TYPE, "application/octet-stream")], making.await?)))
 }
 
 /// Runs work within the limits of a query.
@@ -108,7 +103,7 @@ async fn within_limits<T: Send + 'static>(
 }
 
 fn parse_scores(pairs: &[(String, String)]) -> Result<(String, Negatives), RequestError> {
-    params::check_names(pairs, &scores_parameters(), &["negative"])?;
+    params::check_names(pairs, &scores_parameters())?;
     let of = |wanted: &'static str| {
         pairs.iter().filter(move |(name, _)| name == wanted).map(|(_, value)| value.clone())
     };
@@ -118,7 +113,7 @@ fn parse_scores(pairs: &[(String, String)]) -> Result<(String, Negatives), Reque
 }
 
 fn parse_cell(id: &str, pairs: &[(String, String)]) -> Result<(u32, Option<u64>, Step), RequestError> {
-    params::check_names(pairs, &cell_parameters(), &[])?;
+    params::check_names(pairs, &cell_parameters())?;
     let cell_id = number("id", id, "a cell's id, a whole number")?;
     let of = |wanted: &str| pairs.iter().find(|(name, _)| name == wanted).map(|(_, value)| value);
     let generation = of("generation").map(|value| number("generation", value, "a whole number"));

@@ -1,6 +1,7 @@
 //! The objects that may be meant by the words of a phrase.
 
 use rayon::prelude::*;
+use schemars::JsonSchema;
 use serde::Serialize;
 use slag_common::manifest::Manifest;
 
@@ -33,7 +34,8 @@ pub struct Candidate<'a> {
 }
 
 /// What was found for one thing of a phrase.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[schemars(rename = "Part")]
 pub struct Found {
     /// The thing.
     pub thing: String,

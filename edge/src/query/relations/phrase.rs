@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::query::RequestError;
@@ -15,10 +16,10 @@ pub const MAX_NTH: usize = 100;
 pub const ASKER: [&str; 4] = ["me", "myself", "us", "here"];
 
 /// A thing, chosen by what it is, where it is, and how it compares with others of its kind.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Phrase {
-    /// What it is, in the text model's words; [`ASKER`] stands for the asker.
+    /// What it is, in the text model's words; me, inside another phrase, is the asker.
     pub thing: String,
     /// Which one, if several fit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -29,7 +30,7 @@ pub struct Phrase {
 }
 
 /// Where a thing is: a relation to another thing.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Place {
     /// The relation.
@@ -42,7 +43,7 @@ pub struct Place {
 }
 
 /// A relation between things.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum Relation {
     /// Rests on it, or hangs on it.
@@ -120,13 +121,14 @@ impl fmt::Display for Relation {
 }
 
 /// Which of several things is meant.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Pick {
     /// What they are compared by.
     pub by: By,
     /// Which one in that order, from 1.
     #[serde(default = "first")]
+    #[schemars(range(min = 1, max = MAX_NTH))]
     pub n: usize,
     /// For `nearest` and `farthest`: from what; from the asker if absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -138,7 +140,7 @@ fn first() -> usize {
 }
 
 /// What things are compared by.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum By {
     /// Volume of the box, falling.

@@ -1,6 +1,7 @@
 //! From candidates to the things that a phrase means, best first, or the part of the phrase that failed.
 
 use glam::DVec3;
+use schemars::JsonSchema;
 use serde::Serialize;
 
 use super::candidates::{Candidate, Things};
@@ -25,7 +26,7 @@ pub struct Related {
 }
 
 /// A thing that another is related to.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct Witness {
     /// The words that it answers to.
     pub thing: String,
@@ -33,6 +34,7 @@ pub struct Witness {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub id: Option<String>,
     /// Where it is.
+    #[schemars(with = "[f64; 3]")]
     pub position_in_world: DVec3,
     /// Its score with the words; absent for the asker.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -40,7 +42,7 @@ pub struct Witness {
 }
 
 /// Which part of a phrase failed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum MissKind {
     /// Nothing on board is such a thing.

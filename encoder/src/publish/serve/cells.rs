@@ -6,13 +6,15 @@ use axum::Json;
 use axum::extract::rejection::QueryRejection;
 use axum::extract::{Query, State};
 use axum::http::header;
-use axum::response::{IntoResponse, Response};
 use glam::DVec3;
+use schemars::{JsonSchema, SchemaGenerator};
 use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
 use slag_common::Hash32;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{Manifest, ShardRecord};
 use slag_common::shard::Profile;
+use slag_service::openapi::{As, Described, Reply};
 use slag_service::problem::Problem;
 
 use super::problem::{bad_parameter, not_geo_referenced};
@@ -60,20 +62,31 @@ impl CellsQuery {
     }
 }
 
-#[derive(Serialize)]
+/// Cells, by their distance.
+#[derive(Serialize, JsonSchema)]
+#[schemars(rename = "Cells")]
 pub(super) struct CellsAnswer {
+    /// Generation served.
     generation: u64,
+    /// The encoder of its embeddings.
     encoder_id: Hash32,
+    /// The cells.
     cells: Vec<CellAnswer>,
 }
 
-#[derive(Serialize)]
+/// A cell near the centre.
+#[derive(Serialize, JsonSchema)]
 struct CellAnswer {
+    /// The cell.
     cell_id: u32,
+    /// Box around the extents of its Gaussians, world frame.
     bounds: Aabb,
+    /// Gaussians.
     n_gaussians: u32,
     /// From the centre to the box, world units; 0 inside.
+    #[schemars(range(min = 0))]
     distance: f64,
+    /// Its shards, one per profile.
     shards: BTreeMap<Profile, ShardRecord>,
 }
 
@@ -99,11 +112,30 @@ pub(super) async fn cells(
     service.with_current(search).await.map(Json)
 }
 
-pub(super) async fn coverage(State(service): AppState) -> Result<Response, Problem> {
+/// A GeoJSON feature for each cell.
+#[derive(JsonSchema)]
+#[expect(dead_code, reason = "the schema of a document that the geojson crate writes")]
+pub(super) struct FeatureCollection {
+    /// FeatureCollection.
+    #[schemars(rename = "type", extend("const" = "FeatureCollection"))]
+    kind: String,
+    /// The features.
+    features: Vec<Map<String, Value>>,
+}
+
+const GEO_JSON: &str = "application/geo+json";
+
+impl Described for FeatureCollection {
+    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
+        vec![Reply::ok(GEO_JSON, schemas.subschema_for::<Self>())]
+    }
+}
+
+pub(super) async fn coverage(State(service): AppState) -> Result<As<FeatureCollection>, Problem> {
     let draw = |snapshot: &Snapshot| {
         let drawn = geographic::coverage(snapshot.world()).map_err(not_geo_referenced)?;
         Ok(drawn.to_string())
     };
     let text = service.with_current(draw).await?;
-    Ok(([(header::CONTENT_TYPE, "application/geo+json")], text).into_response())
+    Ok(As::new(([(header::CONTENT_TYPE, GEO_JSON)], text)))
 }

@@ -1,16 +1,21 @@
 //! `GET /v1/manifest` and `GET /v1/objects/{hash}`.
 
 use std::io;
+use std::marker::PhantomData;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
+use axum::Json;
 use axum::body::Body;
 use axum::extract::rejection::PathRejection;
 use axum::extract::{Path as UrlPath, State};
 use axum::http::{HeaderMap, HeaderName, Method, StatusCode, header};
-use axum::response::{IntoResponse, Response};
+use axum::response::IntoResponse;
+use schemars::SchemaGenerator;
 use slag_common::Hash32;
+use slag_common::manifest::Manifest;
+use slag_service::openapi::{As, Binary, Described, Reply};
 use slag_service::problem::Problem;
 use slag_service::range::{EntityTag, Selection};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncSeekExt, ReadBuf};
@@ -25,15 +30,45 @@ const PIECE_BYTES: usize = 64 << 10;
 const JSON: [(HeaderName, &str); 1] = [(header::CONTENT_TYPE, "application/json")];
 const BINARY: [(HeaderName, &str); 1] = [(header::CONTENT_TYPE, "application/octet-stream")];
 
-pub(super) async fn manifest(State(service): AppState, headers: HeaderMap) -> Result<Response, Problem> {
+/// Content with its hash as an entity tag: `D`, or nothing where the client has it.
+pub(super) struct Tagged<D>(PhantomData<D>);
+
+const ETAG: &[(&str, &str)] = &[("etag", "Hash of the content.")];
+
+impl<D: Described> Described for Tagged<D> {
+    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
+        let mut replies = D::replies(schemas);
+        replies.push(Reply { status: StatusCode::NOT_MODIFIED, content: Vec::new(), headers: ETAG });
+        replies.iter_mut().for_each(|reply| reply.headers = ETAG);
+        replies
+    }
+}
+
+/// Bytes, or a range of them.
+pub(super) struct Parts;
+
+impl Described for Parts {
+    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
+        let statuses = [StatusCode::OK, StatusCode::PARTIAL_CONTENT].into_iter();
+        let with = |status| Binary::replies(schemas).into_iter().map(move |reply| Reply { status, ..reply });
+        statuses.flat_map(with).collect()
+    }
+}
+
+type TaggedManifest = As<Tagged<Json<Manifest>>>;
+
+pub(super) async fn manifest(
+    State(service): AppState,
+    headers: HeaderMap,
+) -> Result<TaggedManifest, Problem> {
     let published = |snapshot: &Snapshot| Ok((snapshot.reader.current().hash, snapshot.manifest.clone()));
     let (hash, bytes) = service.with_current(published).await?;
     let tag = EntityTag::new(hash);
     let about = [(header::ETAG, tag.as_str()), (header::CACHE_CONTROL, "no-cache")];
     if tag.is_known_to(&headers) {
-        return Ok((StatusCode::NOT_MODIFIED, about).into_response());
+        return Ok(As::new((StatusCode::NOT_MODIFIED, about)));
     }
-    Ok((about, JSON, bytes).into_response())
+    Ok(As::new((about, JSON, bytes)))
 }
 
 pub(super) async fn object(
@@ -41,7 +76,7 @@ pub(super) async fn object(
     method: Method,
     hash: Result<UrlPath<Hash32>, PathRejection>,
     headers: HeaderMap,
-) -> Result<Response, Problem> {
+) -> Result<As<Tagged<Parts>>, Problem> {
     let UrlPath(hash) = hash.map_err(|e| problem::bad_parameter(e.body_text()))?;
     let tag = EntityTag::new(hash);
     let about = [
@@ -52,7 +87,7 @@ pub(super) async fn object(
     let is_known = tag.is_known_to(&headers);
     let opened = service.with_current(move |snapshot| open_object(snapshot, hash, !is_known)).await?;
     let Opened { file: Some(file), len_bytes } = opened else {
-        return Ok((StatusCode::NOT_MODIFIED, about).into_response());
+        return Ok(As::new((StatusCode::NOT_MODIFIED, about)));
     };
     let (status, start, n_bytes) = match Selection::of_request(&method, &headers, &tag, len_bytes) {
         Selection::Unsatisfiable => return Err(problem::range_not_satisfiable(len_bytes)),
@@ -79,7 +114,7 @@ pub(super) async fn object(
         let value = value.parse().map_err(|_| Problem::internal(format!("header {name}: {value}")))?;
         response.headers_mut().insert(name, value);
     }
-    Ok(response)
+    Ok(As::new(response))
 }
 
 /// A listed object: its length, and its file where the content is needed.

@@ -5,15 +5,18 @@ use std::sync::Arc;
 
 use axum::error_handling::HandleErrorLayer;
 use axum::extract::State;
-use axum::http::{StatusCode, header};
-use axum::response::IntoResponse;
+use axum::http::StatusCode;
 use axum::{BoxError, Json, Router};
+use schemars::JsonSchema;
+use serde::Serialize;
 use serde_json::json;
+use slag_common::Hash32;
 use slag_service::access::Access;
 use slag_service::metrics::ResponseCounts;
-use slag_service::problem::Problem;
+use slag_service::openapi::About;
+use slag_service::problem::{NoMembers, Problem};
 use slag_service::request::observed;
-use slag_service::routes::{Parameter, Routes};
+use slag_service::routes::{Parameter, Route, Routes};
 use tower::ServiceBuilder;
 use tower::limit::GlobalConcurrencyLimitLayer;
 use tower::load_shed::LoadShedLayer;
@@ -24,11 +27,18 @@ use super::limits::Limits;
 use super::state::{AppState, Service, metrics};
 use super::{cells, metadata, objects, problem};
 use crate::store::StoreError;
+use crate::store::metadata::TIMESTAMP_FILE;
 
-/// First line of the help text.
-const TITLE: &str = "slag-encoder serves a scene's shards to robots.";
-/// The description for programs, kept by hand; a test compares it with every route and parameter.
-pub(super) const OPENAPI: &str = include_str!("openapi.json");
+/// This service, as its help text and description name it.
+const ABOUT: About = About {
+    name: "slag-encoder serve",
+    version: env!("CARGO_PKG_VERSION"),
+    license: env!("CARGO_PKG_LICENSE"),
+    summary: "slag-encoder serves a scene's shards to robots.",
+    errors: &[(503, "Too much is asked at once, or the answer took too long.")],
+};
+/// Errors of whatever reads the store.
+const STORE: [(u16, &str); 1] = [(500, "The service failed.")];
 /// No request here needs a body; a few bytes of a careless client do no harm.
 const REQUEST_BODY_BYTES: usize = 1024;
 
@@ -47,7 +57,7 @@ pub fn router(dir: &Path, limits: Limits, access: Access) -> Result<Router, Stor
 pub fn router_with(dir: &Path, limits: Limits, access: Access, page: Router) -> Result<Router, StoreError> {
     let service = Arc::new(Service::open(dir, &limits)?);
     let responses = Arc::clone(&service.responses);
-    let (router, _) = routes().with_help(TITLE);
+    let (router, _) = described();
     Ok(counted(router.with_state(service).merge(page), limits, responses, access))
 }
 
@@ -56,27 +66,67 @@ pub fn bounded(routes: Router, limits: Limits, access: Access) -> Router {
     counted(routes, limits, Arc::default(), access)
 }
 
-/// Returns the routes.
-pub(super) fn routes() -> Routes<Arc<Service>> {
+/// Returns the routes with their descriptions, and their table.
+pub(super) fn described() -> (Router<Arc<Service>>, Vec<Route>) {
+    routes().described::<NoMembers>(ABOUT)
+}
+
+fn routes() -> Routes<Arc<Service>> {
+    let name = |summary| Parameter::of_path::<String>("name", summary);
+    let known = Parameter::of_header("If-None-Match", "the etag of what the client has");
     Routes::default()
         .get("/v1/manifest", "manifest of the current generation, with ETag", objects::manifest)
+        .parameters([known.clone()])
+        .errors(&STORE)
         .get("/v1/metadata/{name}", "TUF metadata, such as timestamp.json", metadata::metadata)
+        .parameters([name(
+            "timestamp.json, or VERSION.root.json, VERSION.snapshot.json, VERSION.targets.json",
+        )
+        .limit("examples", json!([TIMESTAMP_FILE]))])
+        .errors(&STORE)
+        .errors(&[(404, "The store has no such metadata.")])
         .get("/v1/targets/{name}", "the TUF target SHA256.manifest", metadata::target)
+        .parameters([name("SHA256.manifest, as the metadata states it")])
+        .errors(&STORE)
+        .errors(&[(404, "It is no target of the current or the previous generation.")])
         .get("/v1/objects/{hash}", "shard of the current or previous manifest; byte ranges", objects::object)
-        .get("/v1/cells", "cells near a point, with distances and shards", cells::cells)
         .parameters([
-            Parameter::new("x", "1", "centre in the world frame, with y and z"),
-            Parameter::new("y", "2", ""),
-            Parameter::new("z", "3", ""),
-            Parameter::new("lat", "46.8", "or centre on the earth, degrees WGS 84, with lon"),
-            Parameter::new("lon", "-92", ""),
-            Parameter::new("height", "158.5", "metres above the ellipsoid (default: the scene's origin)"),
-            Parameter::new("radius", "50", "distance from the centre, units of the world frame"),
+            Parameter::of_path::<Hash32>("hash", "BLAKE3 of the shard, as the manifest states it"),
+            known,
+            Parameter::of_header("Range", "bytes=FIRST-LAST, one range; others are ignored"),
+            Parameter::of_header("If-Range", "the etag of what the client has begun to download"),
         ])
-        .get("/v1/coverage.geojson", "footprints of the cells on the earth", cells::coverage)
+        .errors(&STORE)
+        .errors(&[
+            (404, "It is no shard of the current or the previous generation."),
+            (416, "No byte of the range is in the shard."),
+        ])
+        .get("/v1/cells", "cells near a point, with distances and shards", cells::cells)
+        .details("The point is x, y and z, or lat and lon.")
+        .parameters([
+            Parameter::new::<f64>("x", "1", "centre in the world frame, with y and z"),
+            Parameter::new::<f64>("y", "2", ""),
+            Parameter::new::<f64>("z", "3", ""),
+            Parameter::new::<f64>("lat", "46.8", "or centre on the earth, degrees WGS 84, with lon")
+                .within(-90, 90),
+            Parameter::new::<f64>("lon", "-92", "").within(-180, 180),
+            Parameter::new::<f64>(
+                "height",
+                "158.5",
+                "metres above the ellipsoid (default: the scene's origin)",
+            ),
+            Parameter::new::<f64>("radius", "50", "distance from the centre, units of the world frame")
+                .required()
+                .limit("minimum", 0),
+        ])
+        .errors(&STORE)
+        .get("/v1/coverage.geojson", "footprints of the cells on the earth (RFC 7946)", cells::coverage)
+        .errors(&STORE)
+        .errors(&[(409, "The scene is not geo-referenced.")])
         .get("/healthz", "whether the process is alive, and the generation served", health)
+        .errors(&STORE)
         .get("/metrics", "counters in Prometheus' text format", metrics)
-        .get("/openapi.json", "description of this service for programs", openapi)
+        .errors(&STORE)
 }
 
 /// Puts the limits around routes, and a problem as the body of every error.
@@ -97,11 +147,17 @@ pub(super) fn counted(
     observed(routes.layer(shed), responses, access)
 }
 
-async fn openapi() -> impl IntoResponse {
-    ([(header::CONTENT_TYPE, "application/json")], OPENAPI)
+/// That the service answers.
+#[derive(Serialize, JsonSchema)]
+struct Health {
+    /// ok.
+    #[schemars(extend("const" = "ok"))]
+    status: &'static str,
+    /// The generation served.
+    generation: u64,
 }
 
-async fn health(State(service): AppState) -> Result<Json<serde_json::Value>, Problem> {
+async fn health(State(service): AppState) -> Result<Json<Health>, Problem> {
     let generation = service.with_current(|snapshot| Ok(snapshot.world().generation)).await?;
-    Ok(Json(json!({ "status": "ok", "generation": generation })))
+    Ok(Json(Health { status: "ok", generation }))
 }

@@ -8,7 +8,6 @@ use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
 use axum::extract::State;
-use axum::response::IntoResponse;
 use slag_common::Hash32;
 use slag_common::manifest::{self, CellIndex, Manifest};
 use slag_common::tuf::TargetFile;
@@ -168,7 +167,7 @@ impl Service {
 }
 
 /// Answers `GET /metrics`.
-pub(super) async fn metrics(State(service): AppState) -> Result<impl IntoResponse, Problem> {
+pub(super) async fn metrics(State(service): AppState) -> Result<Exposition, Problem> {
     let generation = service.with_current(|snapshot| Ok(snapshot.world().generation)).await?;
     let mut text = Exposition::new("slag_store");
     text.responses(&service.responses);

@@ -472,7 +472,7 @@ async fn the_help_lists_every_resource_and_parameter() {
     let router = fixture.router();
     let help = get_with(&router, "/", &[]).await;
     let help = String::from_utf8(help.body.to_vec()).expect("text");
-    let (_, table) = router::routes().with_help("");
+    let (_, table) = router::described();
     assert!(table.len() >= 7, "{table:?}");
     for route in &table {
         assert!(help.contains(&format!("\n{} {} ", route.method, route.path)), "{}: {help}", route.path);
@@ -484,7 +484,7 @@ async fn the_help_lists_every_resource_and_parameter() {
         let status = get_with(&router, &path, &[]).await.status;
         assert_ne!(status, StatusCode::NOT_FOUND, "{path}");
         // The handler knows each parameter: it names another one than this in its refusal.
-        for parameter in &route.parameters {
+        for parameter in route.query() {
             let answer = get_with(&router, &format!("{path}?{}=1", parameter.name), &[]).await;
             let detail = answer.problem(StatusCode::BAD_REQUEST);
             assert!(!detail.contains("unknown field"), "{detail}");
