@@ -140,3 +140,82 @@ impl From<Changes> for Difference {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    /// Every parameter has its name in the robot's interface; what is absent is not sent.
+    #[test]
+    fn asks_for_what_is_given() {
+        let compare: Compare = serde_json::from_value(json!({
+            "words": ["chair", "a box"], "from_generation": 3, "near": [1.5, -2.0, 0.25], "radius": 4.5,
+        }))
+        .expect("fits");
+        let expected =
+            [("text", "chair"), ("text", "a box"), ("from", "3"), ("near", "1.5,-2,0.25"), ("radius", "4.5")];
+        let found = compare.parameters();
+        assert_eq!(found.iter().map(|(name, value)| (*name, value.as_str())).collect::<Vec<_>>(), expected);
+        let nothing: Compare = serde_json::from_value(json!({})).expect("fits");
+        assert!(nothing.parameters().is_empty());
+    }
+
+    /// A reply with every member, and what becomes of each: 5400 s are 1.5 h, 3 + 4 things are unchanged, a box from (1, 2, 3) to
+    /// (2, 4, 6) has edges of 1, 2 and 3.
+    #[test]
+    fn replies_become_differences() {
+        let thing = |id: &str| {
+            json!({
+                "id": id, "position_in_world": [1.5, 3.0, 4.5],
+                "box_min_in_world": [1.0, 2.0, 3.0], "box_max_in_world": [2.0, 4.0, 6.0],
+                "n_gaussians_in_scene": 9, "photo": "p.jpg", "like": { "text": "chair", "score": 0.5 },
+            })
+        };
+        let bare = json!({
+            "id": "o2", "position_in_world": [0.0, 0.0, 0.0],
+            "box_min_in_world": [-1.0, -1.0, -1.0], "box_max_in_world": [1.0, 1.0, 1.0],
+        });
+        let reply = json!({
+            "scene": "yard", "unit": "m", "frame": "world", "generations": [4, 6],
+            "from": { "generation": 4, "created_unix_secs": 1000 },
+            "to": { "generation": 6, "created_unix_secs": 6400 },
+            "n_same": 3, "n_stayed": 4, "n_not_compared": 5,
+            "appeared": [thing("o1")], "went": [bare],
+            "moved": [{ "from": thing("o3"), "to": thing("o4"), "distance": 2.5 }], "none": null,
+        });
+        let of = |reply: &serde_json::Value| {
+            let changes: Changes = serde_json::from_value(reply.clone()).expect("a reply");
+            json!(Difference::from(changes))
+        };
+        let shown = |id: &str| {
+            json!({
+                "id": id, "position_in_world": [1.5, 3.0, 4.5], "size": [1.0, 2.0, 3.0],
+                "most_like": "chair", "likeness": 0.5,
+            })
+        };
+        let expected = json!({
+            "scene": "yard", "unit": "m", "from_generation": 4, "to_generation": 6, "hours": 1.5,
+            "appeared": [shown("o1")],
+            "went": [{ "id": "o2", "position_in_world": [0.0, 0.0, 0.0], "size": [2.0, 2.0, 2.0] }],
+            "moved": [{ "from": shown("o3"), "to": shown("o4"), "distance": 2.5 }],
+            "n_unchanged": 7, "n_not_compared": 5,
+        });
+        assert_eq!(of(&reply), expected);
+
+        // The clock of the machine that encoded may have gone backwards; and there may be nothing to compare with.
+        let mut early = reply.clone();
+        early["to"]["created_unix_secs"] = 500.into();
+        assert_eq!(of(&early)["hours"], 0.0);
+        let mut none = reply;
+        (none["from"], none["none"]) =
+            (json!(null), json!({ "kind": "no-earlier-generation", "detail": "the robot has had none" }));
+        let none = of(&none);
+        assert_eq!(
+            none["none"],
+            json!({ "kind": "no-earlier-generation", "detail": "the robot has had none" })
+        );
+        assert!(none.get("hours").is_none() && none.get("from_generation").is_none());
+    }
+}

@@ -75,3 +75,6 @@ pub fn diff(old: Generation<'_>, new: Generation<'_>) -> Result<Diff, DiffError>
         fetch_bytes,
     })
 }
+
+#[cfg(test)]
+mod tests;

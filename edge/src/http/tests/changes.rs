@@ -1,31 +1,55 @@
 //! What changed between generations: `GET /v1/changes`.
 
-use slag_common::manifest::Calibration;
+use slag_common::frames::{GeoReference, Geographic};
+use slag_common::manifest::{Calibration, Manifest};
 
 use super::openapi::{check, description};
 use super::*;
 use crate::query::MAX_TEXTS;
-use crate::store::{Snapshot, history};
-use crate::testing::TestObject;
+use crate::store::{BadCell, CellFault, OldShard, Snapshot, history};
+use crate::testing::{TestObject, manifest_of, write_manifest};
 
 /// 20 Gaussians at x = 3, and objects at x = their ids, each along the axis of its id modulo 3.
 fn shards(ids: &[u64]) -> [BuiltShard; 1] {
+    [with_things(&chair(None)[0], ids, |id| (0..3).map(|axis| f32::from(axis == id % 3)).collect())]
+}
+
+fn with_things(shard: &BuiltShard, ids: &[u64], vector: impl Fn(u64) -> Vec<f32>) -> BuiltShard {
     let objects = (0u32..).zip(ids).map(|(at, id)| TestObject {
         id: *id,
-        vectors: (0..3).map(|axis| f32::from(axis == id % 3)).collect(),
+        vectors: vector(*id),
         runs: std::iter::once(2 * at..2 * at + 2).collect(),
         n_gaussians: 40,
     });
     let calibration = Calibration { score_mean: 0.0, score_spread: 0.1 };
-    [chair(None)[0].with_objects(&objects.collect::<Vec<_>>(), calibration)]
+    shard.with_objects(&objects.collect::<Vec<_>>(), calibration)
+}
+
+/// 20 Gaussians of axis 0 in a cell of 656 units from x on.
+fn cell(cell_id: u32, x: f64) -> BuiltShard {
+    let member = |i: u16| Member { steps: [i, 0, 0], embedding: vec![1.0, 0.0, 0.0] };
+    let shard = TestShard::new(vec![(0..20).map(member).collect()]);
+    TestShard { cell_id, origin: DVec3::new(x, 0.0, 0.0), ..shard }.build(false)
+}
+
+/// Keeps a record of what is on board, as a fetch of the next generation does.
+fn remember(cache: &EdgeCache) -> history::Record {
+    let snapshot = Snapshot::open(cache).expect("opens");
+    let shards = snapshot.shards.iter().map(|shard| &**shard);
+    let record = history::Record::collect(&snapshot.manifest, DVec3::ZERO, shards).expect("objects");
+    fs_err::create_dir_all(history::dir(cache)).expect("a folder");
+    fs_err::write(history::path(cache, snapshot.manifest.generation), record.to_bytes()).expect("writes");
+    record
+}
+
+fn ids<'a>(body: &'a Value, list: &str) -> Vec<&'a str> {
+    body[list].as_array().expect("a list").iter().filter_map(|thing| thing["id"].as_str()).collect()
 }
 
 #[tokio::test]
 async fn generations_are_compared_over_http() {
     let service = Service::new(Some(&shards(&[6, 10, 20])), Settings::default());
-    let snapshot = Snapshot::open(service.app.engine.cache()).expect("opens");
-    let shards_of = snapshot.shards.iter().map(|shard| &**shard);
-    let record = history::Record::collect(&snapshot.manifest, DVec3::ZERO, shards_of).expect("objects");
+    let record = remember(service.app.engine.cache());
     let read = history::Record::parse(&record.to_bytes()).expect("what it wrote");
     for (read, written) in read.things.iter().zip(&record.things) {
         assert_eq!(
@@ -34,8 +58,6 @@ async fn generations_are_compared_over_http() {
         );
         assert!(read.vector.iter().zip(&written.vector).all(|(a, b)| (a - b).abs() < 0.01), "{read:?}");
     }
-    fs_err::create_dir_all(history::dir(service.app.engine.cache())).expect("a folder");
-    fs_err::write(history::path(service.app.engine.cache(), 1), record.to_bytes()).expect("writes");
     // By hand: 6 stays, 10 and 20 go; 33 is as 6, and 22 as 10, which moved by 12; 20 has no successor.
     write_cache(service.dir.path(), &shards(&[6, 22, 33]), 2);
     service.app.reload_now();
@@ -48,12 +70,9 @@ async fn generations_are_compared_over_http() {
         (status, body)
     };
     let (_, body) = get("").await;
-    let ids = |name: &str| -> Vec<&str> {
-        body[name].as_array().expect("a list").iter().filter_map(|thing| thing["id"].as_str()).collect()
-    };
     assert_eq!((&body["from"]["generation"], &body["to"]["generation"]), (&json!(1), &json!(2)));
-    assert_eq!(ids("appeared"), ["o0000000000000021"], "{body:#}");
-    assert_eq!(ids("went"), ["o0000000000000014"], "{body:#}");
+    assert_eq!(ids(&body, "appeared"), ["o0000000000000021"], "{body:#}");
+    assert_eq!(ids(&body, "went"), ["o0000000000000014"], "{body:#}");
     let moved = &body["moved"][0];
     assert_eq!(
         (&moved["from"]["id"], &moved["to"]["id"]),
@@ -65,6 +84,9 @@ async fn generations_are_compared_over_http() {
     assert_eq!((near["moved"].as_array().map(Vec::len), &near["went"]), (Some(1), &json!([])), "{near:#}");
     let (_, near) = get("?near=22,0,0&radius=1").await;
     assert_eq!((near["moved"].as_array().map(Vec::len), &near["went"]), (Some(1), &json!([])), "{near:#}");
+    // Places on the earth are in the world frame where the scene has an origin; this one has none.
+    let (status, refused) = get("?near_lat_lon=46,7&radius=2").await;
+    assert_eq!((status, &refused["parameter"]), (StatusCode::BAD_REQUEST, &json!("near")), "{refused:#}");
     // Texts are axes: 33 is along axis 0, 20 along axis 2.
     let (_, named) = get("?text=0&text=2").await;
     assert_eq!(named["appeared"][0]["like"]["text"], "0", "{named:#}");
@@ -82,4 +104,119 @@ async fn generations_are_compared_over_http() {
         let (found, body) = get(query).await;
         assert_eq!(found, status, "{query}: {body:#}");
     }
+}
+
+/// Cell 2 of the second generation did not come: its shard of the first stands in. By hand: 10 went from cell 1; whether 1002 is
+/// still in cell 2 is not known, although the old shard on board has it.
+#[tokio::test]
+async fn shards_that_stand_in_say_nothing_of_their_generation() {
+    let axis_0 = |_| vec![1.0, 0.0, 0.0];
+    let things = |cell_1: &[u64], cell_2: &[u64]| {
+        [with_things(&cell(1, 3.0), cell_1, axis_0), with_things(&cell(2, 1000.0), cell_2, axis_0)]
+    };
+    let old = things(&[6, 10], &[1002]);
+    let service = Service::new(Some(&old), Settings::default());
+    let cache = service.app.engine.cache();
+    remember(cache);
+    let first = cache.current().expect("reads").expect("there");
+    write_cache(service.dir.path(), &things(&[6], &[1002, 1005]), 2);
+    let mut current = cache.current().expect("reads").expect("there");
+    let stand_in = &first.cells[1];
+    current.cells.truncate(1);
+    current.bad_cells = vec![BadCell {
+        cell_id: 2,
+        fault: CellFault::Missing,
+        old: Some(OldShard {
+            generation: 1,
+            manifest_hash: first.manifest_hash,
+            hash: stand_in.hash,
+            len_bytes: stand_in.len_bytes,
+        }),
+    }];
+    fs_err::write(cache.current_path(), serde_json::to_vec(&current).expect("JSON")).expect("writes");
+    service.app.reload_now();
+    let (_, _, body) = service.get("/v1/changes").await;
+    assert_eq!(ids(&body, "went"), ["o000000000000000a"], "{body:#}");
+    let counts = ["n_same", "n_stayed", "n_not_compared"].map(|name| &body[name]);
+    assert_eq!(counts, [&json!(1), &json!(0), &json!(1)], "{body:#}");
+    assert_eq!((&body["appeared"], &body["moved"]), (&json!([]), &json!([])), "{body:#}");
+}
+
+/// The middle of the earth's map is the scene's origin; 1 degree of latitude is 111 km.
+#[tokio::test]
+async fn changes_are_placed_on_the_earth() {
+    let service = Service::new(Some(&shards(&[6, 10])), Settings::default());
+    remember(service.app.engine.cache());
+    let origin = Geographic { latitude_deg: 46.0, longitude_deg: 7.0, height_m: 500.0 };
+    let shards = shards(&[6]);
+    let manifest = Manifest { geo_reference: Some(GeoReference { origin }), ..manifest_of(&shards, 2) };
+    write_manifest(service.dir.path(), &shards, manifest);
+    service.app.reload_now();
+    let went = async |query: &str| {
+        let (status, _, body) = service.get(&format!("/v1/changes?{query}")).await;
+        assert_eq!(status, StatusCode::OK, "{body:#}");
+        body["went"].clone()
+    };
+    // 10 m east of the origin lies what went.
+    let thing = &went("near_lat_lon=46,7&radius=11").await[0];
+    assert_eq!(thing["id"], "o000000000000000a");
+    let east = thing["geographic"]["longitude_deg"].as_f64().expect("a number") - 7.0;
+    let by_hand = (10.0 / (6_378_137.0 * 46f64.to_radians().cos())).to_degrees();
+    assert!((east / by_hand - 1.0).abs() < 0.01, "{east} {by_hand}");
+    assert_eq!(went("near_lat_lon=46,7&radius=9").await, json!([]));
+    assert_eq!(went("near_lat_lon=46.001,7&radius=11").await, json!([]));
+    assert_eq!(went("near_lat_lon=46,7,600&radius=11").await, json!([]), "100 m above");
+}
+
+/// A vector of length 2 along the diagonal of axes 0 and 1 has the cosine of 45 degrees with both.
+#[tokio::test]
+async fn likeness_is_a_cosine_whatever_the_lengths() {
+    let of = |ids: &[u64]| {
+        [with_things(&chair(None)[0], ids, |id| {
+            if id == 10 { vec![1.4142, 1.4142, 0.0] } else { vec![0.0, 0.0, 3.0] }
+        })]
+    };
+    let service = Service::new(Some(&of(&[6])), Settings::default());
+    remember(service.app.engine.cache());
+    write_cache(service.dir.path(), &of(&[6, 10]), 2);
+    service.app.reload_now();
+    let (_, _, body) = service.get("/v1/changes?text=2&text=1").await;
+    let like = &body["appeared"][0]["like"];
+    let score = like["score"].as_f64().expect("a number");
+    assert!(like["text"] == "1" && (score - 0.7071).abs() < 0.01, "{body:#}");
+}
+
+/// Vectors of another encoder do not compare with a text's; things alone still compare.
+#[tokio::test]
+async fn texts_need_the_encoder_of_the_scene() {
+    let of = |ids: &[u64]| [with_things(&chair(Some(Hash32([9; 32])))[0], ids, |_| vec![1.0, 0.0, 0.0])];
+    let service = Service::new(Some(&of(&[6])), Settings::default());
+    remember(service.app.engine.cache());
+    write_cache(service.dir.path(), &of(&[6, 10]), 2);
+    service.app.reload_now();
+    let (status, _, body) = service.get("/v1/changes?text=0").await;
+    assert_eq!(
+        (status, &body["type"]),
+        (StatusCode::CONFLICT, &json!("urn:slag:problem:encoder-mismatch")),
+        "{body:#}"
+    );
+    let (status, _, body) = service.get("/v1/changes").await;
+    assert_eq!((status, ids(&body, "appeared")), (StatusCode::OK, vec!["o000000000000000a"]), "{body:#}");
+}
+
+/// Whoever only asks for changes sees the generation that a fetch has put in place: the request that finds it has the service
+/// load it.
+#[tokio::test]
+async fn a_fetched_generation_is_found_by_asking_for_changes() {
+    let service = Service::new(Some(&shards(&[6])), Settings::default());
+    remember(service.app.engine.cache());
+    write_cache(service.dir.path(), &shards(&[6, 10]), 2);
+    let mut attempts = service.app.reload_attempts();
+    service.get("/v1/changes").await;
+    tokio::time::timeout(Duration::from_secs(20), attempts.changed())
+        .await
+        .expect("in time")
+        .expect("is told");
+    let (_, _, body) = service.get("/v1/changes").await;
+    assert_eq!((&body["to"]["generation"], ids(&body, "appeared")), (&json!(2), vec!["o000000000000000a"]));
 }
