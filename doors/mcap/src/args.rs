@@ -3,17 +3,15 @@
 use std::path::PathBuf;
 
 use clap::Parser;
+use slag_robot::RobotArgs;
 
 /// Writes a robot's answers and the ground around it to an MCAP file, which Foxglove and its libraries read.
 #[derive(Debug, Parser)]
 #[command(name = "slag-mcap", version)]
 pub struct Args {
-    /// Address of the robot's `slag-edge serve`.
-    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7734", env = "SLAG_ROBOT")]
-    pub robot: String,
-    /// File with the token of the robot's --token-file.
-    #[arg(long, value_name = "FILE")]
-    pub token_file: Option<PathBuf>,
+    /// The robot to ask.
+    #[command(flatten)]
+    pub robot: RobotArgs,
     /// Text to look for, which may name a relation; may be repeated.
     #[arg(long, required_unless_present = "ground")]
     pub text: Vec<String>,

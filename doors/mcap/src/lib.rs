@@ -9,7 +9,7 @@ use std::time::SystemTime;
 
 use anyhow::{Context, Result};
 use serde_json::json;
-use slag_robot::{Robot, read_token};
+use slag_robot::Robot;
 
 pub use args::Args;
 use file::File;
@@ -20,8 +20,7 @@ use messages::Stamp;
 /// # Errors
 /// The token's file, the robot's refusal, or the file to write.
 pub fn record(args: &Args) -> Result<usize> {
-    let token = args.token_file.as_deref().map(read_token).transpose()?;
-    let robot = Robot::new(&args.robot, token.as_deref());
+    let robot = args.robot.open()?;
     let since_1970 = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
     let time_ns = since_1970.context("the clock is before 1970")?.as_nanos() as u64;
     let mut messages = Vec::new();

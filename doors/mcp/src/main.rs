@@ -7,7 +7,6 @@ use anyhow::{Context, Result};
 use clap::Parser;
 use rmcp::ServiceExt;
 use slag_mcp::{Args, Tools, http};
-use slag_robot::{Robot, read_token};
 use slag_service::listen::bind;
 use slag_service::stop::stop_signal;
 use tracing_subscriber::EnvFilter;
@@ -30,8 +29,7 @@ fn main() -> ExitCode {
 }
 
 fn run(args: Args) -> Result<()> {
-    let token = args.token_file.as_deref().map(read_token).transpose()?;
-    let tools = Tools::new(Robot::new(&args.robot, token.as_deref()));
+    let tools = Tools::new(args.robot.open()?);
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(ASYNC_THREADS)
         .max_blocking_threads(MAX_QUESTIONS)

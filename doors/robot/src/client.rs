@@ -1,6 +1,5 @@
 //! Asking a robot.
 
-use std::path::Path;
 use std::time::Duration;
 
 use serde::de::DeserializeOwned;
@@ -25,14 +24,6 @@ pub struct Robot {
     url: String,
     /// The header that a request with a body needs.
     authorization: Option<String>,
-}
-
-/// Reads the file that `slag-edge serve --token-file` names.
-///
-/// # Errors
-/// The file cannot be read.
-pub fn read_token(path: &Path) -> std::io::Result<String> {
-    Ok(fs_err::read_to_string(path)?.trim().to_owned())
 }
 
 impl Robot {

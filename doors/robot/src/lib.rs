@@ -1,5 +1,6 @@
 //! The robot's HTTP interface as its clients see it: `slag-edge serve`, asked over `/v1` (docs/api.md).
 
+mod args;
 mod changes;
 mod client;
 mod error;
@@ -8,8 +9,9 @@ mod goal;
 mod place;
 mod reply;
 
+pub use args::RobotArgs;
 pub use changes::{Changed, Changes, Compared, Like, Miss, Moved};
-pub use client::{Robot, read_token};
+pub use client::Robot;
 pub use error::RobotError;
 pub use floor::{Floor, Place as FloorPlace};
 pub use goal::{Goal, GoalMiss, GoalThing, Goals};

@@ -1,11 +1,11 @@
 //! The command line.
 
 use std::net::{IpAddr, Ipv4Addr};
-use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::Result;
 use clap::{Parser, ValueEnum};
+use slag_robot::RobotArgs;
 
 use crate::node::{GoalSink, Middleware, PositionSource, Settings};
 use crate::stand::Body;
@@ -14,12 +14,9 @@ use crate::stand::Body;
 #[derive(Debug, Parser)]
 #[command(name = "slag-ros", version)]
 pub struct Args {
-    /// Address of the robot's `slag-edge serve`.
-    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7734", env = "SLAG_ROBOT")]
-    pub robot: String,
-    /// File with the token of the robot's --token-file.
-    #[arg(long, value_name = "FILE")]
-    pub token_file: Option<PathBuf>,
+    /// The robot to ask.
+    #[command(flatten)]
+    pub robot: RobotArgs,
     /// Name of the node, and namespace of its topics.
     #[arg(long, default_value = "slag")]
     name: String,

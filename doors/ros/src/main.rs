@@ -5,7 +5,6 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::Parser;
-use slag_robot::{Robot, read_token};
 use slag_ros::{Args, node};
 use slag_service::stop::stop_signal;
 use tracing_subscriber::EnvFilter;
@@ -27,8 +26,7 @@ fn main() -> ExitCode {
 }
 
 fn run(args: &Args) -> Result<()> {
-    let token = args.token_file.as_deref().map(read_token).transpose()?;
-    let (settings, robot) = (args.settings()?, Robot::new(&args.robot, token.as_deref()));
+    let (settings, robot) = (args.settings()?, args.robot.open()?);
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(ASYNC_THREADS).enable_all().build()?;
     runtime.block_on(async { node::run(settings, robot, stop_signal()?).await })?;

@@ -1,0 +1,30 @@
+//! The flags of every door that say which robot it asks.
+
+use std::io;
+use std::path::PathBuf;
+
+use clap::Args;
+
+use crate::client::Robot;
+
+/// The robot to ask.
+#[derive(Clone, Debug, Args)]
+pub struct RobotArgs {
+    /// Address of the robot's `slag-edge serve`.
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7734", env = "SLAG_ROBOT")]
+    robot: String,
+    /// File with the token of the robot's --token-file.
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
+}
+
+impl RobotArgs {
+    /// Returns the robot, with the token of the file. Nothing is asked yet.
+    ///
+    /// # Errors
+    /// The file cannot be read.
+    pub fn open(&self) -> io::Result<Robot> {
+        let token = self.token_file.as_ref().map(fs_err::read_to_string).transpose()?;
+        Ok(Robot::new(&self.robot, token.as_deref().map(str::trim)))
+    }
+}
