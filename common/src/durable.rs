@@ -63,6 +63,27 @@ pub fn move_into_place(part: &Path, path: &Path) -> io::Result<()> {
 /// # Errors
 /// The file system's error, with the path.
 pub fn sync_folder(path: &Path) -> io::Result<()> {
+    // The folder of a name alone is the empty path, which cannot be opened.
+    let path = if path.as_os_str().is_empty() { Path::new(".") } else { path };
     // Other systems cannot open a folder to sync it; their file systems order renames.
     if cfg!(unix) { File::open(path)?.sync_all() } else { Ok(()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A process has one current folder, so this file lies in that of all tests for a moment.
+    #[test]
+    fn a_name_alone_is_a_file_of_the_current_folder() {
+        let name = format!("durable-test-{}", std::process::id());
+        let path = Path::new(&name);
+        for bytes in [b"old", b"new"] {
+            let written = write(path, bytes);
+            let read = std::fs::read(path);
+            assert!(written.is_ok() && read.is_ok_and(|read| read == bytes), "{written:?}");
+        }
+        std::fs::remove_file(path).expect("written above");
+        assert!(!std::fs::exists(format!("{name}.part")).expect("a path"));
+    }
 }

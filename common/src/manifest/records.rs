@@ -119,6 +119,7 @@ pub struct CellRecord {
     /// Gaussians.
     pub n_gaussians: u32,
     /// Its shards, one per profile.
+    #[schemars(extend("propertyNames" = serde_json::json!({ "enum": Profile::ALL.map(Profile::name) })))]
     pub shards: BTreeMap<Profile, ShardRecord>,
 }
 

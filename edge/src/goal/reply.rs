@@ -60,6 +60,7 @@ pub struct GoalMiss {
 
 /// The thing to go to.
 #[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[schemars(rename = "GoalThing")]
 pub struct TargetThing {
     /// Its id.
     pub id: String,

@@ -14,6 +14,7 @@ const LAT_LON: &str = r"-?[0-8]?[0-9](\.[0-9]{1,9})?,-?(1[0-7][0-9]|[0-9]{1,2})(
 
 /// At most 512 bytes of UTF-8, without control characters.
 #[derive(JsonSchema)]
+#[schemars(rename = "Text")]
 #[expect(dead_code, reason = "the schema of texts, which handlers take as strings")]
 pub struct Words(
     #[schemars(

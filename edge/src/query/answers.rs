@@ -166,6 +166,7 @@ pub struct Clustering {
 
 /// A cluster of matching Gaussians, or an object.
 #[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[schemars(rename = "Cluster")]
 pub struct ClusterAnswer {
     /// Position in the list, from 1.
     pub rank: usize,
@@ -240,6 +241,7 @@ pub struct Evidence {
 
 /// A matching Gaussian.
 #[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[schemars(rename = "Gaussian")]
 pub struct GaussianAnswer {
     /// Position in the list, from 1.
     pub rank: usize,

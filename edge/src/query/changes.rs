@@ -79,6 +79,7 @@ impl ChangesError {
 
 /// The changes from one generation to another.
 #[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[schemars(rename = "Changes")]
 pub struct ChangesReply {
     /// Name of the scene.
     pub scene: String,
@@ -112,6 +113,7 @@ pub struct ChangesReply {
 
 /// A generation that was compared.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, JsonSchema)]
+#[schemars(rename = "Compared")]
 pub struct ComparedGeneration {
     /// Its number.
     pub generation: u64,

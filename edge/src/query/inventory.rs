@@ -34,6 +34,7 @@ pub struct ObjectFilter {
 
 /// An object on board.
 #[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[schemars(rename = "Object")]
 pub struct ObjectOnBoard {
     /// Its id: `o` and 16 hex digits.
     pub id: String,

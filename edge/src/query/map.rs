@@ -10,6 +10,7 @@ use crate::store::{BadCell, Snapshot};
 
 /// The area on board, its age, and what is missing.
 #[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+#[schemars(rename = "Map")]
 pub struct MapStatus {
     /// Name of the scene.
     pub scene: String,

@@ -26,7 +26,7 @@ struct Thing {
     /// What it rests on.
     #[serde(skip_serializing_if = "Option::is_none")]
     on: Option<Box<Thing>>,
-    /// Its number, 1 if absent.
+    /// Its number, 0 if absent.
     #[serde(default)]
     number: u8,
     /// Its place.
@@ -125,19 +125,15 @@ fn schemas_come_from_types() {
         "description": "How it is placed. on-top: Rests on something. alone: Stands alone.",
     });
     assert_eq!(schemas["Place"], place);
-    let thing = |name: &str, required: &[&str], default: Option<u8>| {
-        let mut number = json!({
-            "type": "integer", "format": "uint8", "minimum": 0, "maximum": 255,
-            "description": "Its number, 1 if absent.",
-        });
-        if let Some(default) = default {
-            number["default"] = default.into();
-        }
+    let thing = |name: &str, required: &[&str]| {
         json!({
             "type": "object", "description": "A thing.", "required": required, "additionalProperties": false,
             "properties": {
                 "name": { "type": "string", "minLength": 1, "description": "Its name, on two lines." },
-                "number": number,
+                "number": {
+                    "type": "integer", "format": "uint8", "minimum": 0, "maximum": 255, "default": 0,
+                    "description": "Its number, 0 if absent.",
+                },
                 // Absent instead of null.
                 "on": { "$ref": format!("#/components/schemas/{name}"), "description": "What it rests on." },
                 "place": { "$ref": "#/components/schemas/Place", "description": "Its place." },
@@ -145,8 +141,8 @@ fn schemas_come_from_types() {
         })
     };
     // What a request may leave out is always there in a reply.
-    assert_eq!(schemas["ThingRequest"], thing("ThingRequest", &["name"], Some(0)));
-    assert_eq!(schemas["Thing"], thing("Thing", &["name", "number"], None));
+    assert_eq!(schemas["ThingRequest"], thing("ThingRequest", &["name"]));
+    assert_eq!(schemas["Thing"], thing("Thing", &["name", "number"]));
     let next = &schemas["Things"]["properties"]["next"];
     assert_eq!(next["type"], json!(["integer", "null"]));
     assert_eq!(schemas["Things"]["required"], json!(["things", "next"]));

@@ -19,6 +19,9 @@ use crate::http::problem::{overloaded, parameter_problem, query_problem, timeout
 use crate::query::{Negatives, QueryError, RequestError};
 use crate::score::Budget;
 
+/// Largest generation that a request can name: the largest integer that every client of JSON keeps.
+const MAX_GENERATION: u64 = (1 << 53) - 1;
+
 /// Returns the parameters of `/v1/view/scores`.
 pub fn scores_parameters() -> [Parameter; 2] {
     [forms::text("mug", "what to look for").required(), params::negative()]
@@ -31,7 +34,8 @@ pub fn cell_parameters() -> [Parameter; 2] {
             "generation",
             "12",
             "the generation that must be on board: 404 if another one is",
-        ),
+        )
+        .within(0, MAX_GENERATION),
         Parameter::new::<usize>("step", "8", "sends every so many-th Gaussian, each larger; 1 sends all")
             .within(1, Step::MAX)
             .or(1),

@@ -87,6 +87,7 @@ struct CellAnswer {
     #[schemars(range(min = 0))]
     distance: f64,
     /// Its shards, one per profile.
+    #[schemars(extend("propertyNames" = serde_json::json!({ "enum": Profile::ALL.map(Profile::name) })))]
     shards: BTreeMap<Profile, ShardRecord>,
 }
 
