@@ -40,7 +40,7 @@ class Boundaries(nn.Module):
     """[n, channels, h, w], h and w multiples of 32 -> [n, 4, h, w]: logits of a boundary between each pixel and its
     neighbours. Channels: red, green, blue, (level / 255 - 0.5) / 0.5; then those of `depth_channels`."""
 
-    def __init__(self, channels, widths=(24, 48, 72, 96, 128)):
+    def __init__(self, channels, widths=(32, 64, 96, 128, 192)):
         super().__init__()
         self.stem = nn.Sequential(nn.Conv2d(channels, widths[0], 4, stride=2, padding=1, bias=False), nn.BatchNorm2d(widths[0]), nn.ReLU())
         self.down = nn.ModuleList(Block(a, b) for a, b in zip((widths[0],) + widths[:-1], widths))
@@ -111,9 +111,11 @@ def paint(x, things, depth_m, corner):
     # Blots and grain: waves that bend each other.
     bent = torch.sin(q[..., 0] + 1.7 * torch.sin(1.3 * q[..., 1]) + 1.1 * torch.sin(2.3 * q[..., 2]))
     grain = 0.5 * bent + 0.3 * torch.sin(3.1 * q[..., 1] + 2 * bent) + 0.2 * torch.sin(7.3 * q[..., 2] + 3 * bent)
-    kind = of(torch.randint(0, 7, (n, PATTERNS, 1), device=device).float())[..., 0]
+    # Windows and other panels.
+    panels = 2 * ((s[..., 0] > -0.3) & (s[..., 1] > -0.3)).float() - 1
+    kind = of(torch.randint(0, 8, (n, PATTERNS, 1), device=device).float())[..., 0]
     hard = of((rand(n, PATTERNS, 1) < 0.5).float())[..., 0] > 0
-    pattern = torch.where(kind == 0, stripes, torch.where(kind == 1, checks, torch.where(kind == 2, 2 * tiles - 1, torch.where(kind == 3, bent, grain))))
+    pattern = torch.where(kind == 0, stripes, torch.where(kind == 1, checks, torch.where(kind == 2, 2 * tiles - 1, torch.where(kind == 3, bent, torch.where(kind == 7, panels, grain)))))
     pattern = torch.where(hard, (4 * pattern).clamp(-1, 1), pattern)
     # Beyond what a pixel resolves, patterns fade.
     per_px = depth / FOCAL_PX * axes.norm(dim=-1).amax(-1)
@@ -126,10 +128,10 @@ def paint(x, things, depth_m, corner):
     recoloured = of((rand(n, PATTERNS, 1) < 0.5).float())
     spread = torch.where(rand(n, 1, 1) < 0.17, 0.15, 1.0)
     base = rand(n, 1, 3)
-    colour = of((base + spread * (rand(n, PATTERNS, 3) - base)).clamp(0.03, 1))
+    colour = of((base + spread * (rand(n, PATTERNS, 3) - base)).clamp(0.12, 1))
     x = x.permute(0, 2, 3, 1)
     grey = x.mean(-1, keepdim=True)
-    level = of(0.5 + rand(n, PATTERNS, 1))
+    level = of(0.7 + rand(n, PATTERNS, 1))
     painted = torch.where(recoloured > 0, grey * level * colour * 1.5, x)
     return (painted * factor).permute(0, 3, 1, 2)
 
@@ -225,13 +227,20 @@ def main():
     began, step, mean = time.time(), 0, 0.0
     height, width = photos.shape[1:3]
     seen = lambda x, depth_m: torch.cat([(x - 0.5) / 0.5, depth_channels(depth_m)], 1) if args.depth else (x - 0.5) / 0.5
+    coarse = things[:, ::16, ::16].cpu().numpy()
+
+    def full_place():
+        """The place with the most things of three."""
+        places = [(np.random.randint(len(photos)), np.random.randint(height - PATCH + 1), np.random.randint(width - PATCH + 1)) for _ in range(3)]
+        return max(places, key=lambda p: len(np.unique(coarse[p[0], p[1] // 16:(p[1] + PATCH) // 16, p[2] // 16:(p[2] + PATCH) // 16])))
+
     while True:
         done = (time.time() - began) / args.seconds
         if done >= 1:
             break
         for group in optimiser.param_groups:
             group["lr"] = args.rate * min(1, (step + 1) / 200) * (0.5 + 0.5 * math.cos(math.pi * done))
-        places = [(np.random.randint(len(photos)), np.random.randint(height - PATCH + 1), np.random.randint(width - PATCH + 1)) for _ in range(args.batch)]
+        places = [full_place() for _ in range(args.batch)]
         with torch.no_grad():
             x, ids, depth_m = pixels(photos, things, depths, places)
             corner = torch.tensor([(x0, y0) for _, y0, x0 in places], device=device, dtype=torch.float32)
