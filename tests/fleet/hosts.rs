@@ -58,7 +58,7 @@ impl Hosts {
         let mut there = Command::new("ip");
         there.args(["netns", "exec", &format!("{}{host}", self.prefix)]);
         there.arg(command.get_program()).args(command.get_args());
-        command.get_envs().for_each(|(name, value)| drop(there.env(name, value.expect("set"))));
+        there.envs(command.get_envs().map(|(name, value)| (name, value.expect("set"))));
         there
     }
 

@@ -9,7 +9,6 @@ use std::time::SystemTime;
 
 use anyhow::{Context, Result};
 use serde_json::json;
-use slag_robot::Robot;
 
 pub use args::Args;
 use file::File;

@@ -37,23 +37,27 @@ mod tests {
     use super::*;
 
     /// A thread frees 64 MB in pieces that the allocator keeps, with pieces between them that live on: given back, they are no
-    /// longer held, and the others are as they were.
+    /// longer held, and the others are as they were. Other tests of this process may take as much meanwhile, so there are
+    /// several attempts.
     #[test]
     fn freed_memory_is_given_back_and_the_rest_is_kept() {
-        let kept: Vec<Vec<u8>> = std::thread::spawn(|| {
-            let pieces: Vec<Vec<u8>> = (0..2048u32).map(|i| vec![(i % 251) as u8; 1 << 15]).collect();
-            // Dropped: all but one of 64.
-            pieces.into_iter().enumerate().filter(|(i, _)| i % 64 == 0).map(|(_, piece)| piece).collect()
-        })
-        .join()
-        .expect("no panic");
-        let before = held_bytes().expect("Linux");
-        give_back();
-        let after = held_bytes().expect("Linux");
-        assert!(after + (32 << 20) < before, "{before} bytes, then {after}");
-        for (i, piece) in kept.iter().enumerate() {
-            assert!(piece.iter().all(|x| *x == (64 * i % 251) as u8), "piece {i}");
-        }
-        assert!(peak_bytes().expect("Linux") >= before);
+        let is_less_held = || {
+            let kept: Vec<Vec<u8>> = std::thread::spawn(|| {
+                let pieces: Vec<Vec<u8>> = (0..2048u32).map(|i| vec![(i % 251) as u8; 1 << 15]).collect();
+                // Dropped: all but one of 64.
+                pieces.into_iter().enumerate().filter(|(i, _)| i % 64 == 0).map(|(_, piece)| piece).collect()
+            })
+            .join()
+            .expect("no panic");
+            let before = held_bytes().expect("Linux");
+            give_back();
+            let after = held_bytes().expect("Linux");
+            for (i, piece) in kept.iter().enumerate() {
+                assert!(piece.iter().all(|x| *x == (64 * i % 251) as u8), "piece {i}");
+            }
+            assert!(peak_bytes().expect("Linux") >= before);
+            after + (32 << 20) < before
+        };
+        assert!((0..10).any(|_| is_less_held()));
     }
 }
