@@ -93,7 +93,7 @@ pub struct BadCellAnswer {
 #[schemars(untagged)]
 pub enum AnswersOrBatch {
     /// To one.
-    Answers(Answers),
+    Answers(Box<Answers>),
     /// To several.
     Batch {
         /// The answers to each.
@@ -106,7 +106,7 @@ pub enum AnswersOrBatch {
 #[schemars(untagged)]
 #[expect(dead_code, reason = "the schema of the answers' list, which is written piece by piece")]
 enum AnyAnswer {
-    Cluster(ClusterAnswer),
+    Cluster(Box<ClusterAnswer>),
     Gaussian(GaussianAnswer),
 }
 

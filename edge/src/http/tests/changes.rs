@@ -168,14 +168,15 @@ async fn changes_are_placed_on_the_earth() {
     assert_eq!(went("near_lat_lon=46,7,600&radius=11").await, json!([]), "100 m above");
 }
 
-/// A vector of length 2 along the diagonal of axes 0 and 1 has the cosine of 45 degrees with both.
+/// A vector longer than 1 along the diagonal of axes 0 and 1 has the cosine of 45 degrees with both.
 #[tokio::test]
 async fn likeness_is_a_cosine_whatever_the_lengths() {
-    let of = |ids: &[u64]| {
-        [with_things(&chair(None)[0], ids, |id| {
-            if id == 10 { vec![1.4142, 1.4142, 0.0] } else { vec![0.0, 0.0, 3.0] }
-        })]
-    };
+    let of =
+        |ids: &[u64]| {
+            [with_things(&chair(None)[0], ids, |id| {
+                if id == 10 { vec![1.5, 1.5, 0.0] } else { vec![0.0, 0.0, 3.0] }
+            })]
+        };
     let service = Service::new(Some(&of(&[6])), Settings::default());
     remember(service.app.engine.cache());
     write_cache(service.dir.path(), &of(&[6, 10]), 2);
@@ -183,7 +184,7 @@ async fn likeness_is_a_cosine_whatever_the_lengths() {
     let (_, _, body) = service.get("/v1/changes?text=2&text=1").await;
     let like = &body["appeared"][0]["like"];
     let score = like["score"].as_f64().expect("a number");
-    assert!(like["text"] == "1" && (score - 0.7071).abs() < 0.01, "{body:#}");
+    assert!(like["text"] == "1" && (score - std::f64::consts::FRAC_1_SQRT_2).abs() < 0.01, "{body:#}");
 }
 
 /// Vectors of another encoder do not compare with a text's; things alone still compare.
