@@ -11,7 +11,7 @@
 //! | route | [`routes`] | path and method; type and length of a request body, and time for it |
 //! | handler | the service's own | parameters, admission of expensive work, the answer |
 //!
-//! [`openapi`] describes routes and their types for programs, [`listen`] has the addresses to listen on, [`problem`] is the body of every error, [`range`] reads byte ranges and entity tags, [`metrics`] writes
+//! [`openapi`] describes routes and their types for programs, [`replies`] what handlers return, [`listen`] has the addresses to listen on, [`problem`] is the body of every error, [`range`] reads byte ranges and entity tags, [`metrics`] writes
 //! Prometheus' text format, [`stop`] waits for the signals to stop.
 
 pub mod access;
@@ -24,6 +24,7 @@ pub mod openapi;
 mod permits;
 pub mod problem;
 pub mod range;
+pub mod replies;
 pub mod request;
 pub mod routes;
 pub mod stop;

@@ -2,21 +2,17 @@
 
 mod schemas;
 
-use std::marker::PhantomData;
+use std::sync::{Arc, OnceLock};
 
-use axum::Json;
-use axum::http::StatusCode;
-use axum::response::{IntoResponse, Response};
-use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
+use axum::http::header;
+use axum::{Json, Router};
+use schemars::JsonSchema;
 use serde_json::{Map, Value, json};
 
 use self::schemas::{Schemas, tidied};
-use crate::metrics::Exposition;
-use crate::problem::{Problem, ProblemBody};
-use crate::routes::{Parameter, Place, Route};
-
-/// Makes the schema of a type.
-pub type SchemaOf = fn(&mut SchemaGenerator) -> Schema;
+use crate::problem::ProblemBody;
+use crate::replies::As;
+use crate::routes::{Parameter, Place, Route, Routes, help};
 
 /// A service, as its description and help text name it.
 #[derive(Clone, Copy, Debug)]
@@ -33,118 +29,30 @@ pub struct About {
     pub errors: &'static [(u16, &'static str)],
 }
 
-/// A successful reply.
-pub struct Reply {
-    /// Its status.
-    pub status: StatusCode,
-    /// Media types of the body, each with its schema; empty: no body.
-    pub content: Vec<(&'static str, Schema)>,
-    /// Headers that it always has, and their meaning.
-    pub headers: &'static [(&'static str, &'static str)],
-}
-
-impl Reply {
-    /// Describes a reply with status 200 and a body of one type.
-    pub fn ok(media_type: &'static str, schema: Schema) -> Self {
-        Self { status: StatusCode::OK, content: vec![(media_type, schema)], headers: &[] }
+impl<S: Clone + Send + Sync + 'static> Routes<S> {
+    /// Adds `GET /`, a text for people: every route and parameter; and `GET /openapi.json`, the same for programs with all
+    /// types, made on the first request. `M`: members of the service's problems beyond those of RFC 9457. Returns the router
+    /// and the table.
+    pub fn described<M: JsonSchema>(self, about: About) -> (Router<S>, Vec<Route>) {
+        let table = Arc::<OnceLock<Vec<Route>>>::default();
+        let (of_help, of_document) = (Arc::clone(&table), Arc::clone(&table));
+        let made = Arc::<OnceLock<String>>::default();
+        let described = self
+            .get("/openapi.json", "this list for programs, with the types of all messages", async move || {
+                let text = made.get_or_init(|| document::<M>(&about, rows(&of_document))).clone();
+                As::<Json<Map<String, Value>>>::new(([(header::CONTENT_TYPE, "application/json")], text))
+            })
+            .get("/", "this list", async move || {
+                As::<&'static str>::new(help(about.summary, rows(&of_help)))
+            });
+        let (router, rows) = described.into_parts();
+        (router, table.get_or_init(|| rows).clone())
     }
 }
 
-/// What a handler returns.
-pub trait Described {
-    /// Describes the successful replies.
-    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply>;
+fn rows(table: &OnceLock<Vec<Route>>) -> &[Route] {
+    table.get().map(Vec::as_slice).unwrap_or_default()
 }
-
-impl<T: JsonSchema> Described for Json<T> {
-    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
-        vec![Reply::ok("application/json", schemas.subschema_for::<T>())]
-    }
-}
-
-impl<T: Described> Described for Result<T, Problem> {
-    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
-        T::replies(schemas)
-    }
-}
-
-impl Described for &'static str {
-    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
-        vec![Reply::ok("text/plain", schemas.subschema_for::<String>())]
-    }
-}
-
-impl Described for Exposition {
-    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
-        vec![Reply::ok(Self::MEDIA_TYPE, schemas.subschema_for::<String>())]
-    }
-}
-
-/// Bytes without a schema.
-pub struct Binary;
-
-impl Binary {
-    /// Returns the schema of bytes.
-    pub fn schema() -> Schema {
-        json_schema!({ "type": "string", "format": "binary" })
-    }
-}
-
-impl Described for Binary {
-    fn replies(_: &mut SchemaGenerator) -> Vec<Reply> {
-        vec![Reply::ok("application/octet-stream", Self::schema())]
-    }
-}
-
-/// A response that is what `D` describes: a body that was written elsewhere, or is sent in pieces.
-pub struct As<D> {
-    response: Response,
-    described: PhantomData<D>,
-}
-
-impl<D> As<D> {
-    /// Takes a response.
-    pub fn new(response: impl IntoResponse) -> Self {
-        Self { response: response.into_response(), described: PhantomData }
-    }
-}
-
-impl<D> IntoResponse for As<D> {
-    fn into_response(self) -> Response {
-        self.response
-    }
-}
-
-impl<D: Described> Described for As<D> {
-    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
-        D::replies(schemas)
-    }
-}
-
-/// A handler whose replies are described.
-pub trait Answering<T> {
-    /// What it returns.
-    type Answer: Described;
-}
-
-macro_rules! answering {
-    ($($argument:ident),*) => {
-        impl<F, Answer, Marker, $($argument),*> Answering<(Marker, $($argument,)*)> for F
-        where
-            F: FnOnce($($argument),*) -> Answer,
-            Answer: Future,
-            Answer::Output: Described,
-        {
-            type Answer = Answer::Output;
-        }
-    };
-}
-
-answering!();
-answering!(A);
-answering!(A, B);
-answering!(A, B, C);
-answering!(A, B, C, D);
 
 /// Returns the description of a service. `M`: members of its problems beyond those of RFC 9457.
 pub fn document<M: JsonSchema>(about: &About, table: &[Route]) -> String {

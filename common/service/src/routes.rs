@@ -1,21 +1,20 @@
-//! The table of a service's routes, from which the router, the help text and the description for programs are made.
+//! The table of a service's routes, from which the router and the help text are made.
 
 use std::convert::Infallible;
 use std::fmt::Write;
-use std::sync::{Arc, OnceLock};
 
+use axum::Router;
 use axum::extract::Request;
 use axum::handler::Handler;
-use axum::http::{Method, header};
+use axum::http::Method;
 use axum::middleware::{Next, from_fn};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodRouter, get, post};
-use axum::{Json, Router};
 use schemars::{JsonSchema, SchemaGenerator};
 use serde_json::{Map, Value};
 
 use crate::body;
-use crate::openapi::{self, About, Answering, As, Described, Reply, SchemaOf};
+use crate::replies::{Answering, Described, Reply, SchemaOf};
 
 /// Column in which the help text's summaries begin.
 const SUMMARY_COLUMN: usize = 36;
@@ -64,7 +63,7 @@ pub struct Parameter {
 }
 
 impl Parameter {
-    /// Describes a query parameter whose values are those of a type.
+    /// Describes a query parameter with values of type `T`.
     pub fn new<T: JsonSchema>(name: &'static str, example: &'static str, summary: impl Into<String>) -> Self {
         Self {
             name,
@@ -232,28 +231,10 @@ impl<S: Clone + Send + Sync + 'static> Routes<S> {
         self
     }
 
-    /// Adds `GET /`, a text for people: every route and parameter; and `GET /openapi.json`, the same for programs with all
-    /// types, made on the first request. `M`: members of the service's problems beyond those of RFC 9457. Returns the router
-    /// and the table.
-    pub fn described<M: JsonSchema>(self, about: About) -> (Router<S>, Vec<Route>) {
-        let table = Arc::<OnceLock<Vec<Route>>>::default();
-        let (of_help, of_document) = (Arc::clone(&table), Arc::clone(&table));
-        let made = Arc::<OnceLock<String>>::default();
-        let described = self
-            .get("/openapi.json", "this list for programs, with the types of all messages", async move || {
-                let text = made.get_or_init(|| openapi::document::<M>(&about, rows(&of_document))).clone();
-                As::<Json<Map<String, Value>>>::new(([(header::CONTENT_TYPE, "application/json")], text))
-            })
-            .get("/", "this list", async move || {
-                As::<&'static str>::new(help(about.summary, rows(&of_help)))
-            });
-        let rows = table.get_or_init(|| described.table).clone();
-        (described.router, rows)
+    /// Returns the router and the table.
+    pub(crate) fn into_parts(self) -> (Router<S>, Vec<Route>) {
+        (self.router, self.table)
     }
-}
-
-fn rows(table: &OnceLock<Vec<Route>>) -> &[Route] {
-    table.get().map(Vec::as_slice).unwrap_or_default()
 }
 
 /// Hands a request on with its body read.
@@ -269,7 +250,8 @@ async fn whole_body(max_bytes: usize, request: Request, next: Next) -> Response 
     }
 }
 
-fn help(title: &str, table: &[Route]) -> String {
+/// Returns the text for people: every route and parameter.
+pub(crate) fn help(title: &str, table: &[Route]) -> String {
     let mut text = format!("{title}\n\n");
     let mut line = |what: String, summary: &str| {
         // Writing to a String cannot fail.

@@ -147,7 +147,7 @@ mod tests {
 
     use super::*;
 
-    /// Every parameter has its name in the robot's interface; what is absent is not sent.
+    /// Each parameter is sent under its name in the robot's interface, and an absent one is not sent.
     #[test]
     fn asks_for_what_is_given() {
         let compare: Compare = serde_json::from_value(json!({

@@ -8,8 +8,8 @@ use axum::extract::State;
 use axum::http::StatusCode;
 use schemars::{JsonSchema, SchemaGenerator};
 use serde::Serialize;
-use slag_service::openapi::{As, Described, Reply};
 use slag_service::problem::Problem;
+use slag_service::replies::{As, Described, Reply};
 
 use super::app::App;
 use super::problem::{follower_failed, not_following, parameter_problem};

@@ -13,8 +13,8 @@ use axum::extract::{Query, State};
 use axum::http::{HeaderMap, HeaderValue, Uri, header};
 use hyper::body::Frame;
 use schemars::SchemaGenerator;
-use slag_service::openapi::{As, Binary, Described, Reply};
 use slag_service::problem::Problem;
+use slag_service::replies::{As, Binary, Described, Reply};
 use tokio::sync::mpsc::{Receiver, Sender, channel};
 
 use super::app::App;

@@ -10,8 +10,9 @@ use tokio::task::JoinHandle;
 use super::*;
 use crate::access::Access;
 use crate::listen::{Listen, bind};
-use crate::openapi::{About, As};
+use crate::openapi::About;
 use crate::problem::NoMembers;
+use crate::replies::As;
 use crate::request::observed;
 use crate::routes::Routes;
 

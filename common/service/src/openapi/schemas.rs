@@ -7,7 +7,7 @@ use schemars::transform::{Transform, transform_subschemas};
 use schemars::{JsonSchema, Schema};
 use serde_json::{Map, Value, json};
 
-use super::{Reply, SchemaOf};
+use crate::replies::{Reply, SchemaOf};
 
 /// Where a description keeps its schemas.
 const SCHEMAS: &str = "#/components/schemas/";
@@ -101,7 +101,7 @@ pub fn tidied(mut schema: Schema, is_reply: bool) -> Value {
     schema.to_value()
 }
 
-/// Says with fewer words, and more strictly, what a type's schema says.
+/// Shortens a type's schema and closes it: members that it does not list are not allowed.
 #[derive(Clone, Copy)]
 struct Tidy {
     is_reply: bool,
@@ -160,7 +160,7 @@ fn without_null(property: &mut Value) {
         kinds.retain(|kind| !is_null(kind));
         let [only] = kinds.as_mut_slice() else { continue };
         match only.take() {
-            // What is said of the member goes before what is said of its type.
+            // A member's own description wins over that of its type.
             Value::Object(only) => {
                 members.remove(list);
                 for (key, value) in only {

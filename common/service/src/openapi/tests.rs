@@ -2,7 +2,8 @@ use axum::extract::Path;
 use serde::{Deserialize, Serialize};
 
 use super::*;
-use crate::problem::NoMembers;
+use crate::problem::{NoMembers, Problem};
+use crate::replies::Binary;
 use crate::routes::{Parameter, Routes};
 
 /// How it is placed.

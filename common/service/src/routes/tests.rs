@@ -3,7 +3,9 @@ use axum::http::{Request, StatusCode};
 use tower::ServiceExt;
 
 use super::*;
+use crate::openapi::About;
 use crate::problem::NoMembers;
+use crate::replies::As;
 
 const ABOUT: About = About {
     name: "test",

@@ -32,7 +32,7 @@ fn cell(cell_id: u32, x: f64) -> BuiltShard {
     TestShard { cell_id, origin: DVec3::new(x, 0.0, 0.0), ..shard }.build(false)
 }
 
-/// Keeps a record of what is on board, as a fetch of the next generation does.
+/// Records the generation on board as an earlier one, as fetching the next generation does.
 fn remember(cache: &EdgeCache) -> history::Record {
     let snapshot = Snapshot::open(cache).expect("opens");
     let shards = snapshot.shards.iter().map(|shard| &**shard);

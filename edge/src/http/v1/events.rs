@@ -12,8 +12,8 @@ use axum::http::{HeaderValue, header};
 use hyper::body::Frame;
 use schemars::SchemaGenerator;
 use serde_json::{Value, json};
-use slag_service::openapi::{As, Described, Reply};
 use slag_service::problem::Problem;
+use slag_service::replies::{As, Described, Reply};
 use tokio::sync::mpsc::{Receiver, channel};
 
 use crate::fetch::follow::FollowStatus;

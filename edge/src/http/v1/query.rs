@@ -9,8 +9,8 @@ use axum::body::Bytes;
 use axum::extract::State;
 use axum::extract::rejection::QueryRejection;
 use axum::http::header;
-use slag_service::openapi::As;
 use slag_service::problem::Problem;
+use slag_service::replies::As;
 
 use super::body::{Body, Understood};
 use super::params::{self, Pairs};

@@ -6,8 +6,8 @@ use axum::Json;
 use axum::extract::rejection::QueryRejection;
 use axum::extract::{Path, State};
 use axum::http::{StatusCode, header};
-use slag_service::openapi::{As, Binary};
 use slag_service::problem::Problem;
+use slag_service::replies::{As, Binary};
 use slag_service::routes::Parameter;
 use slag_view::{Description, Step, Words};
 

@@ -14,8 +14,8 @@ use slag_common::Hash32;
 use slag_common::frames::Aabb;
 use slag_common::manifest::{Manifest, ShardRecord};
 use slag_common::shard::Profile;
-use slag_service::openapi::{As, Described, Reply};
 use slag_service::problem::Problem;
+use slag_service::replies::{As, Described, Reply};
 
 use super::problem::{bad_parameter, not_geo_referenced};
 use super::state::{AppState, Snapshot};

@@ -5,8 +5,8 @@ use axum::extract::rejection::PathRejection;
 use axum::extract::{Path as UrlPath, State};
 use axum::http::header;
 use slag_common::tuf::Envelope;
-use slag_service::openapi::{As, Binary};
 use slag_service::problem::Problem;
+use slag_service::replies::{As, Binary};
 
 use super::problem;
 use super::state::AppState;

@@ -1,0 +1,127 @@
+//! What handlers return, as the description of the service says it.
+
+use std::marker::PhantomData;
+
+use axum::Json;
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
+
+use crate::metrics::Exposition;
+use crate::problem::Problem;
+
+/// Makes the schema of a type.
+pub type SchemaOf = fn(&mut SchemaGenerator) -> Schema;
+
+/// A successful reply.
+pub struct Reply {
+    /// Its status.
+    pub status: StatusCode,
+    /// Media types of the body, each with its schema; empty: no body.
+    pub content: Vec<(&'static str, Schema)>,
+    /// Headers that it always has, and their meaning.
+    pub headers: &'static [(&'static str, &'static str)],
+}
+
+impl Reply {
+    /// Describes a reply with status 200 and a body of one type.
+    pub fn ok(media_type: &'static str, schema: Schema) -> Self {
+        Self { status: StatusCode::OK, content: vec![(media_type, schema)], headers: &[] }
+    }
+}
+
+/// What a handler returns.
+pub trait Described {
+    /// Describes the successful replies.
+    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply>;
+}
+
+impl<T: JsonSchema> Described for Json<T> {
+    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
+        vec![Reply::ok("application/json", schemas.subschema_for::<T>())]
+    }
+}
+
+impl<T: Described> Described for Result<T, Problem> {
+    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
+        T::replies(schemas)
+    }
+}
+
+impl Described for &'static str {
+    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
+        vec![Reply::ok("text/plain", schemas.subschema_for::<String>())]
+    }
+}
+
+impl Described for Exposition {
+    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
+        vec![Reply::ok(Self::MEDIA_TYPE, schemas.subschema_for::<String>())]
+    }
+}
+
+/// Bytes without a schema.
+pub struct Binary;
+
+impl Binary {
+    /// Returns the schema of bytes.
+    pub fn schema() -> Schema {
+        json_schema!({ "type": "string", "format": "binary" })
+    }
+}
+
+impl Described for Binary {
+    fn replies(_: &mut SchemaGenerator) -> Vec<Reply> {
+        vec![Reply::ok("application/octet-stream", Self::schema())]
+    }
+}
+
+/// A response that is what `D` describes: a body that was written elsewhere, or is sent in pieces.
+pub struct As<D> {
+    response: Response,
+    described: PhantomData<D>,
+}
+
+impl<D> As<D> {
+    /// Takes a response.
+    pub fn new(response: impl IntoResponse) -> Self {
+        Self { response: response.into_response(), described: PhantomData }
+    }
+}
+
+impl<D> IntoResponse for As<D> {
+    fn into_response(self) -> Response {
+        self.response
+    }
+}
+
+impl<D: Described> Described for As<D> {
+    fn replies(schemas: &mut SchemaGenerator) -> Vec<Reply> {
+        D::replies(schemas)
+    }
+}
+
+/// A handler that says what it returns.
+pub trait Answering<T> {
+    /// What it returns.
+    type Answer: Described;
+}
+
+macro_rules! answering {
+    ($($argument:ident),*) => {
+        impl<F, Answer, Marker, $($argument),*> Answering<(Marker, $($argument,)*)> for F
+        where
+            F: FnOnce($($argument),*) -> Answer,
+            Answer: Future,
+            Answer::Output: Described,
+        {
+            type Answer = Answer::Output;
+        }
+    };
+}
+
+answering!();
+answering!(A);
+answering!(A, B);
+answering!(A, B, C);
+answering!(A, B, C, D);
