@@ -64,7 +64,7 @@ pub struct EncodeArgs {
     #[arg(long, value_name = "ID", value_delimiter = ',')]
     pub ignore_mask_ids: Vec<u32>,
     /// Bundle of choices; other flags override single choices.
-    #[arg(long, value_enum, default_value = "balanced")]
+    #[arg(long, value_parser = Preset::parser(), default_value = "balanced")]
     pub preset: Preset,
     /// A target instead of a preset.
     #[command(flatten)]
@@ -398,6 +398,15 @@ mod tests {
             let message = with_setting(&args, wrong).expect_err("refused").to_string();
             assert!(message.contains(wrong), "{message}");
         }
+    }
+
+    #[test]
+    fn a_removed_preset_names_its_replacement() {
+        assert_eq!(parse("--preset balanced").expect("parses").preset, Preset::Balanced);
+        let message = parse("--preset accurate").expect_err("refused").to_string();
+        assert!(message.contains("--raster-width twice"), "{message}");
+        let others = parse("--preset best").expect_err("refused").to_string();
+        assert!(others.contains("[possible values: paper, plain, fast, balanced]"), "{others}");
     }
 
     /// Workers of a fleet do not know the poses of other views.

@@ -1,6 +1,7 @@
 //! Presets: bundles of choices with a name.
 
 use clap::ValueEnum;
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 
 use super::settings::{DEFAULT_MASK_LEVELS, RasterWidth, ViewsLimit};
 use crate::codebook::CodebookSettings;
@@ -22,8 +23,6 @@ pub enum Preset {
     Fast,
     /// All views; refined contributions.
     Balanced,
-    /// As `balanced`, with rasters of twice the photo's width in every view.
-    Accurate,
 }
 
 /// The choices of a preset.
@@ -54,6 +53,16 @@ pub struct Choices {
 }
 
 impl Preset {
+    /// Parses a preset's name; a preset that is gone is refused with its replacement.
+    pub fn parser() -> impl TypedValueParser<Value = Self> {
+        const REMOVED: &str = "accurate";
+        let names = Self::value_variants().iter().filter_map(ValueEnum::to_possible_value);
+        PossibleValuesParser::new(names.chain([PossibleValue::new(REMOVED).hide(true)])).try_map(|name| match &*name {
+            REMOVED => Err("it was no more accurate than balanced on unseen scenes (docs/accuracy.md) and is gone; its rasters are --raster-width twice".into()),
+            name => Self::from_str(name, false),
+        })
+    }
+
     /// Returns the choices of the preset.
     pub fn choices(self) -> Choices {
         let balanced = Choices {
@@ -94,8 +103,6 @@ impl Preset {
                 raster_width: RasterWidth::Px(320),
                 ..balanced
             },
-            // Finer shards are no choice here: exact vectors answer no better than compact ones (docs/accuracy.md).
-            Self::Accurate => Choices { raster_width: RasterWidth::Twice, ..balanced },
         }
     }
 }
@@ -129,16 +136,13 @@ mod tests {
     /// The others differ in what their descriptions say.
     #[test]
     fn presets_are_what_they_are_called() {
-        let [plain, fast, balanced, accurate] =
-            [Preset::Plain, Preset::Fast, Preset::Balanced, Preset::Accurate].map(Preset::choices);
+        let [plain, fast, balanced] = [Preset::Plain, Preset::Fast, Preset::Balanced].map(Preset::choices);
         // The same masks, so that only what is made of them differs.
         assert_eq!((plain.aggregation, plain.objects), (Aggregation::default(), false));
         assert_eq!((plain.mask_levels, plain.views_limit), (balanced.mask_levels, ViewsLimit::All));
         assert_eq!(fast.views_limit.of(96), 48);
         assert_eq!((fast.mask_levels, fast.raster_width), (2, RasterWidth::Px(320)));
         assert_eq!(fast.aggregation, balanced.aggregation);
-        assert_eq!((accurate.raster_width, accurate.codebook), (RasterWidth::Twice, balanced.codebook));
-        assert_eq!(accurate.aggregation, balanced.aggregation);
     }
 
     /// Oracle: the paper's text and LangSplat's `preprocess.py`, copied by hand.
