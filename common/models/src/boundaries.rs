@@ -81,7 +81,7 @@ impl Boundaries {
 }
 
 /// Returns what the model sees of depth at each pixel: half the logarithm of depth over the median depth, its slopes to
-/// the right and down, and 1. Where depth is unknown all are 0, and so is a slope that one end of is unknown.
+/// the right and down, and 1. The first and last are 0 where depth is unknown, and a slope where it is unknown at either end.
 ///
 /// None of these changes with the scene's scale. `depth_m`: `[height][width_px]`.
 fn depth_channels(depth_m: &[f32], width_px: usize) -> Vec<[f32; 4]> {
@@ -132,6 +132,31 @@ mod tests {
                 "at the border half as far: {:?}",
                 channels[0]
             );
+        }
+    }
+
+    /// A map of depths and what the training made of it.
+    #[derive(serde::Deserialize)]
+    struct Recorded {
+        width_px: usize,
+        depth_m: Vec<Option<f32>>,
+        channels: Vec<[f32; 4]>,
+    }
+
+    /// Recorded from the training's own function (`tests/models/depth_channels/export.py`).
+    #[test]
+    fn depth_is_seen_as_in_training() {
+        let golden = include_str!("../../../tests/models/depth_channels/golden.json");
+        let maps: Vec<Recorded> = serde_json::from_str(golden).expect("it is JSON");
+        assert_eq!(maps.len(), 4);
+        for Recorded { width_px, depth_m, channels } in maps {
+            let depth_m: Vec<f32> = depth_m.into_iter().map(|depth_m| depth_m.unwrap_or(f32::NAN)).collect();
+            let found = depth_channels(&depth_m, width_px);
+            assert_eq!(found.len(), channels.len());
+            for (pixel, (found, expected)) in found.iter().zip(&channels).enumerate() {
+                let is_near = found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 2e-5);
+                assert!(is_near, "width {width_px}, pixel {pixel}: {found:?}, in training {expected:?}");
+            }
         }
     }
 
