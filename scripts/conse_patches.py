@@ -1,13 +1,16 @@
-"""Makes a model with vectors of patches of the ConSE encoder: what its classes say at each place, as class activation maps
-do (Zhou et al. 2016), before the average over the photo. With it `encode --regions patches|both` was measured against crops
-(docs/accuracy.md).
+"""Makes a model with vectors of patches of the ConSE encoder: the words of its classes at each place, as class activation maps
+show them (Zhou et al. 2016), before the average over the photo. `encode --regions patches|both` was measured against crops
+with it (docs/accuracy.md).
 
-    conse_patches.py MODELS OUT SIZE_PX    # MODELS: the folder with image_encoder/ and clip_text/; SIZE_PX: a multiple of 224
+    conse_patches.py MODELS CONSE OUT SIZE_PX
 
-Needs onnx and numpy. Crops are seen at 224 pixels as without patches: they are halved until they have that size.
+MODELS: the folder with image_encoder/ and clip_text/; CONSE: the model.toml of the encoder; SIZE_PX: 224 times a power of 2.
+Needs onnx and numpy. Crops are halved to 224 pixels, the size of the encoder, so their vectors hardly change.
 """
 import hashlib
 import pathlib
+import re
+import shutil
 import sys
 
 import numpy as np
@@ -15,55 +18,67 @@ import onnx
 from onnx import helper, numpy_helper
 
 STRIDE_PX, CROP_PX = 32, 224
-models, out, size_px = pathlib.Path(sys.argv[1]).resolve(), pathlib.Path(sys.argv[2]), int(sys.argv[3])
-out.mkdir(parents=True, exist_ok=True)
-graph = onnx.load(models / "image_encoder/conse_mnv2_int8.onnx").graph
-weights = {tensor.name for tensor in graph.initializer}
-[pool] = [node for node in graph.node if node.op_type == "GlobalAveragePool"]
-constants = [numpy_helper.from_array(np.array(value, np.int64), name) for name, value in [("last", [-1]), ("row", [2])]]
-
-
-def patches():
-    """The network without its pooling; from its logits on, along the last axis of [n, places, classes]."""
-    rename, nodes = {pool.output[0]: pool.input[0]}, []
-    of = lambda name: name if name in weights or name == "image" else rename.get(name, f"p_{name}")
-    rename = {name: f"p_{to}" for name, to in rename.items()}
-    for node in graph.node:
-        if node is pool:
-            continue
-        made = helper.make_node(node.op_type, [of(x) for x in node.input], [of(x) for x in node.output])
-        made.attribute.extend(node.attribute)
-        attributes = {a.name: a for a in made.attribute}
-        if node.op_type == "Flatten":
-            flat, turned = f"{made.output[0]}_flat", made.output[0]
-            nodes.append(helper.make_node("Reshape", [made.input[0], "places"], [flat]))
-            nodes.append(helper.make_node("Transpose", [flat], [turned], perm=[0, 2, 1]))
-            continue
-        if node.op_type in ("TopK", "Softmax") or (node.op_type == "Gather" and node.input[0].startswith("flatten")):
-            helper_axis = [attribute for attribute in made.attribute if attribute.name != "axis"]
-            del made.attribute[:]
-            made.attribute.extend([*helper_axis, helper.make_attribute("axis", -1)])
-        if node.op_type in ("Unsqueeze", "Squeeze"):
-            made.input[1] = "row"
-        if node.op_type == "ReduceL2":
-            attributes["axes"].ints[:] = [-1]
-        nodes.append(made)
-    nodes[-1].output[0] = "patch_embeddings"
-    return nodes
-
-
-crops = []
-halves = "image"
-for k in range((size_px // CROP_PX).bit_length() - 1):
-    crops.append(helper.make_node("AveragePool", [halves], [f"half_{k}"], kernel_shape=[2, 2], strides=[2, 2]))
-    halves = f"half_{k}"
-for node in graph.node:
-    node.input[:] = [halves if name == "image" else name for name in node.input]
-crops += list(graph.node)
-for node in graph.node:
-    node.input[:] = ["image" if name == halves else name for name in node.input]
-dense = patches()
-for node in crops:
-    node.input[:] = [halves if name == "image" and node.op_type != "AveragePool" else name for name in node.input]
+models, conse, out = (pathlib.Path(path).resolve() for path in sys.argv[1:4])
+size_px = int(sys.argv[4])
 side = size_px // STRIDE_PX
-constants.append(numpy_helper.from_array(np.array([0, 0, side * side], np.int64)[[0, 0, 2]], "places"))
+out.mkdir(parents=True, exist_ok=True)
+model = onnx.load(models / "image_encoder/conse_mnv2_int8.onnx")
+graph = model.graph
+weights = {tensor.name for tensor in graph.initializer}
+nodes = []
+
+
+def copied(node, prefix, entry, axis=None, inputs=None):
+    """Adds a node whose tensors, but for weights, get a prefix; `entry` stands for the photo."""
+    named = lambda name: name if name in weights else entry if name == "image" else f"{prefix}{name}"
+    made = helper.make_node(node.op_type, inputs or [named(x) for x in node.input], [named(x) for x in node.output])
+    made.attribute.extend(a for a in node.attribute if axis is None or a.name not in ("axis", "axes"))
+    if axis is not None:
+        made.attribute.append(helper.make_attribute("axes" if node.op_type == "ReduceL2" else "axis", axis))
+    nodes.append(made)
+    return named
+
+
+# Crops: halved, then as they were.
+entry = "image"
+for k in range((size_px // CROP_PX).bit_length() - 1):
+    nodes.append(helper.make_node("AveragePool", [entry], [f"half_{k}"], kernel_shape=[2, 2], strides=[2, 2]))
+    entry = f"half_{k}"
+for node in graph.node:
+    copied(node, "crop_", entry)
+# Patches: all places of the last feature map in place of their mean; then [n, places, classes], and the classes' axis is the last.
+is_head = False
+for node in graph.node:
+    if node.op_type == "GlobalAveragePool":
+        nodes.append(helper.make_node("Identity", [f"at_{node.input[0]}"], [f"at_{node.output[0]}"]))
+    elif node.op_type == "Flatten":
+        is_head = True
+        nodes.append(helper.make_node("Reshape", [f"at_{node.input[0]}", "places"], ["at_flat"]))
+        nodes.append(helper.make_node("Transpose", ["at_flat"], [f"at_{node.output[0]}"], perm=[0, 2, 1]))
+    elif is_head and node.op_type in ("Unsqueeze", "Squeeze"):
+        copied(node, "at_", "image", inputs=[f"at_{node.input[0]}", "row"])
+    elif is_head and node.op_type == "ReduceL2":
+        copied(node, "at_", "image", axis=[-1])
+    elif is_head and (node.op_type in ("TopK", "Softmax") or node.op_type == "Gather" and node.input[1].startswith("keep")):
+        copied(node, "at_", "image", axis=-1)
+    else:
+        copied(node, "at_", "image")
+made = helper.make_graph(
+    nodes, "conse_patches",
+    [helper.make_tensor_value_info("image", onnx.TensorProto.FLOAT, ["N", 3, size_px, size_px])],
+    [helper.make_tensor_value_info("crop_embedding", onnx.TensorProto.FLOAT, ["N", 512]),
+     helper.make_tensor_value_info("at_embedding", onnx.TensorProto.FLOAT, ["N", side * side, 512])],
+    [*graph.initializer, numpy_helper.from_array(np.array([0, -1, side * side], np.int64), "places"),
+     numpy_helper.from_array(np.array([2], np.int64), "row")])
+path = out / "image.onnx"
+onnx.save(helper.make_model(made, opset_imports=model.opset_import, ir_version=model.ir_version), path)
+
+text = conse.read_text()
+shutil.copytree(models / "clip_text", out / "clip_text", dirs_exist_ok=True)
+sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+text = re.sub(r"files_root = .*\n", "", text)
+text = re.sub(r'file = { path = "image_encoder[^}]*}', f'file = {{ path = "image.onnx", sha256 = "{sha256}" }}', text)
+text = text.replace('output = "embedding"', 'output = "crop_embedding"').replace("size_px = 224", f"size_px = {size_px}")
+text = text.replace("normalise = false\n", f'normalise = false\npatches = {{ output = "at_embedding", patch_px = {STRIDE_PX} }}\n')
+text = text.replace('name = "conse-mobilenetv2"', f'name = "conse-patches-{size_px}"').replace("batch = 16\n", "batch = 4\n")
+(out / "model.toml").write_text(text)

@@ -64,8 +64,7 @@ fn pixel_values_equal_the_processors() {
 fn image_vectors_equal_the_recorded_ones() {
     let (folder, golden) =
         (tempfile::tempdir().expect("a folder"), model_dir("siglip2_tiny").join("golden.npz"));
-    let mut encoder =
-        pulled(folder.path(), |as_it_is| as_it_is).image_encoder(&options()).expect("it loads");
+    let mut encoder = pulled(folder.path(), |as_it_is| as_it_is).image_encoder(&options()).expect("it loads");
     let crops: Vec<Crop> = (0..3).map(|k| Crop::whole(image(&golden, &format!("image_{k}")))).collect();
     let found = encoder.encode(&crops).expect("it encodes");
     let (_, expected) = array::<f32>(&golden, "image_embeds");
@@ -104,8 +103,7 @@ fn text_vectors_equal_the_recorded_ones() {
     }
     // With the description's own prompt the noun alone has the first vector.
     let other = tempfile::tempdir().expect("a folder");
-    let mut encoder =
-        pulled(other.path(), |as_it_is| as_it_is).text_encoder(&options()).expect("it loads");
+    let mut encoder = pulled(other.path(), |as_it_is| as_it_is).text_encoder(&options()).expect("it loads");
     let found = encoder.encode(" Chair").expect("it encodes");
     assert!(max_difference(&found, &vectors[0]) < 1e-5);
     assert!(max_difference(&found, &vectors[1]) > 0.01, "vectors of texts differ");

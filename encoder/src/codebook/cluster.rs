@@ -30,6 +30,22 @@ struct Cluster {
     squared_error: f64,
 }
 
+impl Clusters {
+    /// Drops the clusters without points, and renumbers the others.
+    pub fn drop_empty(&mut self, width: usize) {
+        let mut numbers = vec![None; self.centres.len() / width];
+        let mut kept = Vec::with_capacity(self.centres.len());
+        for code in &mut self.codes {
+            let centre = *code as usize;
+            *code = *numbers[centre].get_or_insert_with(|| {
+                kept.extend_from_slice(&self.centres[centre * width..][..width]);
+                (kept.len() / width - 1) as u32
+            });
+        }
+        self.centres = kept;
+    }
+}
+
 /// Finds clusters whose points are, as root mean square over all, within `max_rms` of their centres, but
 /// no more than `max_clusters`. The result depends on the points alone, not on threads.
 pub fn clusters(points: Rows<'_>, max_rms: f32, max_clusters: usize) -> Clusters {

@@ -2,7 +2,8 @@
 //!
 //! Embeddings cluster strongly, so a cell stores K centroids, and each Gaussian belongs to one. Centroids and residuals are
 //! stored in the cell's own coordinates ([`basis`]), in which equal distances are equal errors of scores. K and the
-//! length of the code follow from the requested errors ([`cluster`], [`residual`]). Hard radii are computed from the
+//! length of the code follow from the requested errors ([`cluster`], [`residual`]); a few centroids more bring the farthest
+//! Gaussians nearer ([`outliers`]). Hard radii are computed from the
 //! full embeddings; errors of scores are measured over a bank of texts ([`measure`]).
 
 pub mod basis;
@@ -11,6 +12,7 @@ mod compare;
 mod decoder;
 mod fine;
 pub mod measure;
+mod outliers;
 pub mod residual;
 mod settings;
 
@@ -32,6 +34,10 @@ pub use settings::CodebookSettings;
 /// Ratio of the root mean square of errors to their mean absolute value: 1.3 to 1.4 measured on the labelled house, whose
 /// errors have heavy tails; 1.25 for normally distributed errors.
 const RMS_OF_MEAN: f32 = 1.35;
+/// Bytes of a centroid in a compact shard beside its components: start and radius.
+const BYTES_BESIDE_COMPONENTS: usize = 8;
+/// One centroid of an outlier for so many components of an embedding, in a cell of any size: a sixteenth of the bytes of its basis.
+const OUTLIERS_OF_DIM: usize = 16;
 /// Share of the residual code's error budget that the dimensions without a component may take.
 const TAIL_SHARE: f32 = 0.3;
 
@@ -109,7 +115,12 @@ pub fn build(
     let m = fitted.n_components;
     let points = fitted.components(embeddings);
     let max_centroids = (embeddings.len() / settings.min_gaussians_per_centroid.max(1)).max(1);
-    let found = cluster::clusters(Rows::all(&points, m), rms(settings.compact_error), max_centroids);
+    let mut found = cluster::clusters(Rows::all(&points, m), rms(settings.compact_error), max_centroids);
+    if settings.outlier_bytes > 0.0 {
+        let n_more = settings.outlier_bytes * embeddings.len() as f32 / (m + BYTES_BESIDE_COMPONENTS) as f32;
+        let n_more = n_more as usize + dim / OUTLIERS_OF_DIM;
+        outliers::separate(embeddings, &fitted, Rows::all(&points, m), &mut found, n_more);
+    }
     let (order, centroid_starts) = sorted(&found.codes, found.centres.len() / m);
 
     // Rotated to the residuals' eigenvectors; each residual is divided by its centroid's scale.

@@ -15,6 +15,9 @@ pub struct CodebookSettings {
     pub max_components: usize,
     /// Fewest Gaussians per centroid, on average.
     pub min_gaussians_per_centroid: usize,
+    /// Bytes per Gaussian that centroids of outliers may take, beside a sixteenth of the basis: they lower the hard bound
+    /// of scores. 0: no such centroids.
+    pub outlier_bytes: f32,
     /// Most subspaces of the residual code (half a byte each); below 2 there is no code.
     pub max_subspaces: usize,
     /// Whether residuals are also stored in 8 bits per component, as in exact shards.
@@ -29,6 +32,7 @@ impl Default for CodebookSettings {
             balanced_error: 0.02,
             max_components: MAX_COMPONENTS,
             min_gaussians_per_centroid: 45,
+            outlier_bytes: 0.25,
             max_subspaces: 32,
             has_fine: false,
         }
