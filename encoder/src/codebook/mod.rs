@@ -119,7 +119,15 @@ pub fn build(
     if settings.outlier_bytes > 0.0 {
         let n_more = settings.outlier_bytes * embeddings.len() as f32 / (m + BYTES_BESIDE_COMPONENTS) as f32;
         let n_more = n_more as usize + dim / OUTLIERS_OF_DIM;
-        outliers::separate(embeddings, &fitted, Rows::all(&points, m), &mut found, n_more);
+        // A bound within the spread of scores tells them apart.
+        outliers::separate(
+            embeddings,
+            &fitted,
+            Rows::all(&points, m),
+            &mut found,
+            n_more,
+            score_context.spread,
+        );
     }
     let (order, centroid_starts) = sorted(&found.codes, found.centres.len() / m);
 

@@ -21,13 +21,14 @@ struct Outlier {
 /// Makes up to `n_more` centres out of the Gaussians farthest from theirs, one by one, each with the outliers that it is nearer
 /// to (Gonzalez 1985: as many other centres beside the given ones would leave about half of the radius at least).
 ///
-/// `points`: the components of the embeddings, in which the clusters were found. Distances are those of the embeddings.
+/// Ends when no distance is above `enough`. `points`: the components of the embeddings, in which the clusters were found. Distances are those of the embeddings.
 pub(super) fn separate(
     embeddings: Rows<'_>,
     basis: &Basis,
     points: Rows<'_>,
     found: &mut Clusters,
     n_more: usize,
+    enough: f32,
 ) {
     let (m, dim) = (basis.n_components, embeddings.width);
     let mean: Vec<f32> = basis.mean.iter().map(|v| v.to_f32()).collect();
@@ -53,7 +54,7 @@ pub(super) fn separate(
         .collect();
     outliers.sort_by(|a, b| b.squared_distance.total_cmp(&a.squared_distance).then(a.at.cmp(&b.at)));
     let rest = outliers.split_off(outliers.len().div_ceil(OUTLIER_STEP));
-    let least = rest.first().map_or(0.0, |nearest| nearest.squared_distance);
+    let least = rest.first().map_or(0.0, |nearest| nearest.squared_distance).max(enough * enough);
     for _ in 0..n_more {
         let farther = |a: &'_ Outlier, b: &'_ Outlier| b.squared_distance > a.squared_distance;
         let Some(farthest) = outliers.iter().reduce(|a, b| if farther(a, b) { b } else { a }) else { return };
@@ -80,7 +81,7 @@ pub(super) fn separate(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codebook::{ScoreMetric, TextBank};
+    use crate::codebook::basis::{ScoreMetric, TextBank};
     use slag_math::random::Random;
 
     /// Oracle: farthest-point picks over all Gaussians in float64, each vector decoded in full. The basis keeps all components, so
@@ -103,7 +104,7 @@ mod tests {
         let m = basis.n_components;
         let points = basis.components(rows);
         let mut found = Clusters { codes: vec![0; n], centres: vec![0.0; m] };
-        separate(rows, &basis, Rows::all(&points, m), &mut found, n_more);
+        separate(rows, &basis, Rows::all(&points, m), &mut found, n_more, 0.0);
 
         let decode = |c: &[f32]| -> Vec<f64> {
             let of =
