@@ -221,6 +221,16 @@ impl Module {
         }
         self.imports.insert(name, path);
     }
+
+    /// Arguments of macros and attributes are tokens; their paths are found by separators.
+    fn visit_tokens(&mut self, tokens: &impl ToString) {
+        let text = tokens.to_string().replace(" :: ", "::");
+        for word in text.split(|c: char| !(c.is_alphanumeric() || c == '_' || c == ':')) {
+            if word.contains("::") {
+                self.paths.insert(word.split("::").filter(|s| !s.is_empty()).map(str::to_owned).collect());
+            }
+        }
+    }
 }
 
 impl<'ast> Visit<'ast> for Module {
@@ -249,14 +259,14 @@ impl<'ast> Visit<'ast> for Module {
     }
 
     fn visit_macro(&mut self, item: &'ast syn::Macro) {
-        // Macro arguments are tokens; their paths are found by separators.
-        let text = item.tokens.to_string().replace(" :: ", "::");
-        for word in text.split(|c: char| !(c.is_alphanumeric() || c == '_' || c == ':')) {
-            if word.starts_with("crate::") || word.starts_with("super::") {
-                self.paths.insert(word.split("::").filter(|s| !s.is_empty()).map(str::to_owned).collect());
-            }
-        }
+        self.visit_tokens(&item.tokens);
         visit::visit_macro(self, item);
+    }
+
+    fn visit_attribute(&mut self, attribute: &'ast Attribute) {
+        if let syn::Meta::List(list) = &attribute.meta {
+            self.visit_tokens(&list.tokens);
+        }
     }
 }
 
