@@ -8,6 +8,7 @@ mod machine;
 pub mod objects;
 pub mod pause;
 pub mod query;
+pub mod robot;
 mod scene;
 pub mod text;
 mod times;

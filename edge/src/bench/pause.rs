@@ -4,22 +4,17 @@
 use std::io;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use glam::DVec3;
 use serde::Serialize;
 use slag_common::tuf::generate_key;
-use tokio::net::TcpListener;
 
 use super::machine::Machine;
-use super::scene::{Generator, Shelf, store, text_service};
+use super::robot::{Robot, RobotError};
+use super::scene::{Generator, Shelf};
 use super::times::{Percentiles, Times};
 use super::timing::quantile;
-use crate::fetch::{Environment, FetchError, FetchRequest, NetworkLimits, Position, fetch};
-use crate::http::{self, App, Settings};
-use crate::query::Engine;
-use crate::store::{EdgeCache, StoreError};
 
 /// Parameters of the measurement.
 #[derive(Clone, Debug)]
@@ -61,26 +56,6 @@ pub struct PauseReport {
     pub n_generations_seen: usize,
 }
 
-/// Reasons for a failed measurement.
-#[derive(Debug, thiserror::Error)]
-pub enum PauseError {
-    /// A socket or file failed.
-    #[error("{0}; check the work folder and the loopback network")]
-    Io(#[from] io::Error),
-    /// A fetch failed.
-    #[error(transparent)]
-    Fetch(#[from] FetchError),
-    /// The generation does not open.
-    #[error(transparent)]
-    Store(#[from] StoreError),
-    /// A query got no answer.
-    #[error("a query got no answer: {what}; see the service's log")]
-    Query {
-        /// The answer received instead.
-        what: String,
-    },
-}
-
 /// One answered query.
 struct Asked {
     began: Instant,
@@ -91,8 +66,8 @@ struct Asked {
 /// Runs the measurement.
 ///
 /// # Errors
-/// [`PauseError`].
-pub fn run(options: &PauseOptions) -> Result<PauseReport, PauseError> {
+/// [`RobotError`].
+pub fn run(options: &PauseOptions) -> Result<PauseReport, RobotError> {
     let PauseOptions { n_gaussians, dim, n_fetches, idle, .. } = *options;
     let generator = Generator { n_gaussians, dim, key: generate_key() };
     let shelf = Shelf::default();
@@ -102,63 +77,33 @@ pub fn run(options: &PauseOptions) -> Result<PauseReport, PauseError> {
         Ok(())
     };
     put(1)?;
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
-    let cache = EdgeCache::open(options.work_dir.join("cache"));
-    let app = App::new(Engine::new(cache.clone(), text_service(dim)?), Settings::default());
-    let (from, service) = runtime.block_on(async {
-        let (cloud, robot) =
-            (TcpListener::bind("127.0.0.1:0").await?, TcpListener::bind("127.0.0.1:0").await?);
-        let urls = (format!("http://{}", cloud.local_addr()?), format!("http://{}", robot.local_addr()?));
-        tokio::spawn(axum::serve(cloud, store(Arc::clone(&shelf))).into_future());
-        tokio::spawn(http::serve(Arc::clone(&app), robot, std::future::pending()));
-        Ok::<_, io::Error>(urls)
-    })?;
-    let request = FetchRequest {
-        from: Some(from),
-        at: Some(Position::World(DVec3::ZERO)),
-        radius: 1e6,
-        trust_first: true,
-        ..FetchRequest::default()
-    };
-    let cancel = AtomicBool::new(false);
-    let environment = Environment {
-        ca: None,
-        now_unix_secs: crate::clock::now_unix_secs(),
-        cancel: &cancel,
-        progress: &(),
-        random: &|| 0.5,
-        limits: NetworkLimits::default(),
-    };
-    fetch(&cache, &request, &environment)?;
-    app.reload_now();
+    let robot = Robot::start(&shelf, dim, &options.work_dir)?;
+    robot.fetch()?;
 
     let (is_over, asked) = (AtomicBool::new(false), Mutex::new(Vec::<Asked>::new()));
     let (mut fetches, mut publishings) = (Vec::new(), Vec::new());
     let mut bytes = 0;
-    let mut work = || -> Result<(), PauseError> {
+    let mut work = || -> Result<(), RobotError> {
         std::thread::sleep(idle);
         for generation in 2..u64::from(n_fetches) + 2 {
             let publishing = Instant::now();
             put(generation)?;
             let began = Instant::now();
             publishings.push((publishing, began));
-            bytes += fetch(&cache, &request, &environment)?.downloaded.bytes;
-            app.reload_now();
+            bytes += robot.fetch()?;
             fetches.push((began, Instant::now()));
         }
         Ok(())
     };
     let (worked, queried) = std::thread::scope(|scope| {
-        let client = scope.spawn(|| ask_until(&is_over, &service, &asked));
+        let client = scope.spawn(|| ask_until(&is_over, &robot.service, &asked));
         let worked = work();
         is_over.store(true, Ordering::Relaxed);
         (worked, client.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
     });
-    runtime.shutdown_background();
+    robot.end()?;
     worked?;
     queried?;
-    // The generated cache is of no further use.
-    fs_err::remove_dir_all(cache.dir())?;
 
     let asked = asked.into_inner().unwrap_or_else(PoisonError::into_inner);
     let (mut quiet, mut busy) = (Times::default(), Times::default());
@@ -190,9 +135,9 @@ pub fn run(options: &PauseOptions) -> Result<PauseReport, PauseError> {
 }
 
 /// Sends one query after the other, without a pause.
-fn ask_until(is_over: &AtomicBool, service: &str, asked: &Mutex<Vec<Asked>>) -> Result<(), PauseError> {
+fn ask_until(is_over: &AtomicBool, service: &str, asked: &Mutex<Vec<Asked>>) -> Result<(), RobotError> {
     let agent: ureq::Agent = ureq::Agent::config_builder().proxy(None).build().into();
-    let fail = |e: &dyn ToString| PauseError::Query { what: e.to_string() };
+    let fail = |e: &dyn ToString| RobotError::Query { what: e.to_string() };
     for number in 0u64.. {
         if is_over.load(Ordering::Relaxed) {
             break;

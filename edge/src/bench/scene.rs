@@ -23,7 +23,7 @@ use slag_math::random::Random;
 const CELL_GAUSSIANS: u32 = 65_536;
 const CENTROIDS_PER_CELL: u32 = 256;
 /// Number of concepts; a query asks for one of them.
-const N_CONCEPTS: u64 = 64;
+pub(super) const N_CONCEPTS: u64 = 64;
 const CELL_WIDTH_M: f64 = 25.0;
 /// Between the scores of a concept's centroids (0.9 and more) and those of others (0.2 and less at 512
 /// components).
@@ -35,12 +35,13 @@ fn unit(mut vector: Vec<f32>) -> Vec<f32> {
     vector
 }
 
-fn concept(number: u64, dim: u32) -> Vec<f32> {
+/// Returns the vector of a text that is a number.
+pub(super) fn concept(number: u64, dim: u32) -> Vec<f32> {
     let mut random = Random::new(number % N_CONCEPTS + 1);
     unit((0..dim).map(|_| random.signed()).collect())
 }
 
-fn encoder_id() -> Hash32 {
+pub(super) fn encoder_id() -> Hash32 {
     Hash32::of(b"slag-edge bench")
 }
 
@@ -75,34 +76,31 @@ pub(super) struct Published {
     objects: BTreeMap<Hash32, Vec<u8>>,
 }
 
-/// Generates successive generations of a scene; half of the cells change from one to the next.
-pub(super) struct Generator {
+/// A cell and its shard.
+pub(super) struct Cell {
+    pub bounds: Aabb,
     pub n_gaussians: u32,
-    pub dim: u32,
-    pub key: ed25519_dalek::SigningKey,
+    pub n_centroids: u32,
+    pub shard: Vec<u8>,
 }
 
-impl Generator {
-    pub fn generation(&self, generation: u64) -> io::Result<Published> {
-        let mut published = Published::default();
-        let mut cells = Vec::new();
-        for cell_id in 0..self.n_gaussians.div_ceil(CELL_GAUSSIANS) {
-            let n = CELL_GAUSSIANS.min(self.n_gaussians - cell_id * CELL_GAUSSIANS);
-            let content = (generation + u64::from(cell_id)) / 2;
-            let shard = self.shard(cell_id, n, content)?;
-            let (hash, len_bytes, bounds) = (Hash32::of(&shard), shard.len() as u64, bounds(cell_id));
-            published.objects.insert(hash, shard);
-            let n_centroids = CENTROIDS_PER_CELL.min(n);
+impl Published {
+    /// Lists and signs the cells of a generation.
+    pub fn new(cells: Vec<Cell>, generation: u64, dim: u32, key: &ed25519_dalek::SigningKey) -> Self {
+        let mut published = Self::default();
+        let mut records = Vec::new();
+        for (cell_id, Cell { bounds, n_gaussians, n_centroids, shard }) in (0..).zip(cells) {
             let record = ShardRecord {
-                hash,
-                len_bytes,
+                hash: Hash32::of(&shard),
+                len_bytes: shard.len() as u64,
                 n_centroids,
                 score_error_bound: 0.1,
                 score_errors: ScoreErrors::default(),
                 position_error: 2e-4,
             };
+            published.objects.insert(record.hash, shard);
             let shards = BTreeMap::from([(Profile::Compact, record)]);
-            cells.push(CellRecord { cell_id, bounds, n_gaussians: n, shards });
+            records.push(CellRecord { cell_id, bounds, n_gaussians, shards });
         }
         let manifest = Manifest {
             version: manifest::VERSION,
@@ -114,19 +112,40 @@ impl Generator {
             encoder: EncoderRecord {
                 name: "concepts".into(),
                 id: encoder_id(),
-                dim: self.dim,
+                dim,
                 default_threshold: THRESHOLD,
                 calibration: None,
                 text_model: None,
             },
-            n_gaussians: u64::from(self.n_gaussians),
+            n_gaussians: records.iter().map(|cell| u64::from(cell.n_gaussians)).sum(),
             n_without_evidence: 0,
             n_rejected: 0,
-            cells,
+            cells: records,
         };
         published.manifest = manifest.to_bytes();
-        published.metadata = one_key_repository(&self.key, generation, manifest::TARGET, &published.manifest);
-        Ok(published)
+        published.metadata = one_key_repository(key, generation, manifest::TARGET, &published.manifest);
+        published
+    }
+}
+
+/// Generates successive generations of a scene; half of the cells change from one to the next.
+pub(super) struct Generator {
+    pub n_gaussians: u32,
+    pub dim: u32,
+    pub key: ed25519_dalek::SigningKey,
+}
+
+impl Generator {
+    pub fn generation(&self, generation: u64) -> io::Result<Published> {
+        let cell = |cell_id: u32| {
+            let n_gaussians = CELL_GAUSSIANS.min(self.n_gaussians - cell_id * CELL_GAUSSIANS);
+            let content = (generation + u64::from(cell_id)) / 2;
+            let shard = self.shard(cell_id, n_gaussians, content)?;
+            let n_centroids = CENTROIDS_PER_CELL.min(n_gaussians);
+            Ok(Cell { bounds: bounds(cell_id), n_gaussians, n_centroids, shard })
+        };
+        let cells: io::Result<Vec<Cell>> = (0..self.n_gaussians.div_ceil(CELL_GAUSSIANS)).map(cell).collect();
+        Ok(Published::new(cells?, generation, self.dim, &self.key))
     }
 
     fn shard(&self, cell_id: u32, n: u32, content: u64) -> io::Result<Vec<u8>> {

@@ -11,6 +11,7 @@ use crate::bench::pause::{self, PauseOptions};
 use crate::bench::query::bench_query;
 use crate::bench::text::{self, TextSettings};
 use crate::bench::{Settings, dump_ids, dump_vectors, make_queries};
+use crate::goal::{GoalRequest, GoalTarget};
 use crate::score::Precision;
 use crate::store::Snapshot;
 use anyhow::{Context, anyhow};
@@ -27,7 +28,7 @@ pub enum BenchCommand {
     Query(BenchQueryArgs),
     /// Measure the longest wait of a query while fetches replace the generation.
     Pause(PauseArgs),
-    /// Time the search for places to stand in a made yard.
+    /// Time `GET /v1/goal`, the search for places to stand, in a made yard.
     Goal(BenchGoalArgs),
     /// Load a service with more queries than it can answer.
     Load(LoadArgs),
@@ -46,6 +47,9 @@ pub struct BenchGoalArgs {
     /// Searches.
     #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     runs: u32,
+    /// Work folder [default: a new temporary folder].
+    #[arg(long, value_name = "DIR")]
+    work: Option<PathBuf>,
     #[command(flatten)]
     threads: ThreadArgs,
 }
@@ -150,8 +154,11 @@ pub fn run(command: BenchCommand) -> Result<(), Failure> {
         BenchCommand::Query(args) => bench_query_command(args),
         BenchCommand::Goal(args) => {
             args.threads.apply()?;
-            let report = time_goal(args.range_m, args.voxel_m, args.runs as usize);
-            print_json(&report.map_err(|e| Failure::Usage(e.into()))?)
+            let request = GoalRequest { range_m: args.range_m, ..GoalRequest::new(GoalTarget::Object(0)) };
+            request.check().map_err(|e| Failure::Usage(e.into()))?;
+            let work_dir = args.work.unwrap_or_else(|| temporary("goal"));
+            let report = time_goal(args.range_m, args.voxel_m, u64::from(args.runs), &work_dir);
+            print_json(&report.map_err(|e| Failure::Failed("bench", e.into()))?)
         }
         BenchCommand::Pause(args) => bench_pause(args),
         BenchCommand::Load(args) => bench_load(args),
@@ -217,15 +224,18 @@ fn bench_text(args: BenchTextArgs) -> Result<(), Failure> {
 }
 
 fn bench_pause(args: PauseArgs) -> Result<(), Failure> {
-    let in_temporary = || std::env::temp_dir().join(format!("slag-bench-pause-{}", std::process::id()));
     let options = PauseOptions {
         n_gaussians: args.gaussians,
         dim: args.dim,
         n_fetches: args.fetches,
         idle: IDLE,
-        work_dir: args.work.unwrap_or_else(in_temporary),
+        work_dir: args.work.unwrap_or_else(|| temporary("pause")),
     };
     print_json(&pause::run(&options).map_err(|e| Failure::Failed("bench", e.into()))?)
+}
+
+fn temporary(of: &str) -> PathBuf {
+    std::env::temp_dir().join(format!("slag-bench-{of}-{}", std::process::id()))
 }
 
 fn bench_load(args: LoadArgs) -> Result<(), Failure> {

@@ -39,9 +39,11 @@ struct Candidate {
 }
 
 /// Returns the best poses near the thing with a surface at `points`, or why there is none.
-pub fn choose(around: &Around<'_>, request: &GoalRequest, points: &[DVec3]) -> Result<Vec<Goal>, NoGoal> {
+pub fn choose(around: &mut Around<'_>, request: &GoalRequest, points: &[DVec3]) -> Result<Vec<Goal>, NoGoal> {
     let window = &around.space.window;
     let near = cells_near(window, points, request.reach_m + window.voxel * 0.5f64.sqrt());
+    around.paths.find(near.iter().copied());
+    let around = &*around;
     let reached: Vec<Candidate> = near.iter().filter_map(|cell| candidate(around, request, *cell)).collect();
     if reached.is_empty() {
         return Err(missing(around, &near));

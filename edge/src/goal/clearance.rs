@@ -1,7 +1,7 @@
 //! The distance of each place to what the robot must not touch.
 
 use rayon::prelude::*;
-use slag_math::distance_transform::{Envelope, along_row};
+use slag_math::distance_transform::along_row;
 
 use super::ground::{Floor, Ground};
 
@@ -30,42 +30,69 @@ pub fn obstacles(ground: &Ground, step: u8) -> Vec<bool> {
     obstacles
 }
 
-/// Returns the squared distance of each cell to the nearest obstacle, in cells; places outside the grid are obstacles.
-pub fn squared_distances(obstacles: &[bool], n_y: usize) -> Vec<u32> {
-    let n_x = obstacles.len().checked_div(n_y).unwrap_or(0);
-    // A border of obstacles on all four sides.
-    let (width, height) = (n_y + 2, n_x + 2);
-    let mut rows = vec![0u32; width * height];
-    rows.par_chunks_mut(width).enumerate().for_each(|(row, out)| {
-        let of_row =
-            row.checked_sub(1).and_then(|x| obstacles.get(x * n_y..(x + 1) * n_y)).unwrap_or_default();
-        let at = |y: usize| y.checked_sub(1).and_then(|y| of_row.get(y)).copied().unwrap_or(true);
-        along_row((0..width).map(at), out);
-    });
-    let columns = transposed(&rows, width);
-    let mut lowest = rows;
-    let of_columns = lowest.par_chunks_mut(height).zip(columns.par_chunks(height));
-    of_columns.for_each_init(Envelope::default, |envelope, (out, column)| envelope.lowest(column, out));
-    let rows = transposed(&lowest, height);
-    (0..n_x).flat_map(|x| rows[(x + 1) * width + 1..][..n_y].iter().copied()).collect()
+/// The exact distance of each cell to the nearest obstacle; places outside the grid are obstacles.
+pub struct Clearance {
+    /// `[n_x][n_y]`: squared distance along y.
+    along_y: Vec<u32>,
+    n_y: usize,
 }
 
-/// Returns a grid with rows and columns exchanged, in tiles that fit the cache.
-fn transposed(rows: &[u32], width: usize) -> Vec<u32> {
-    const TILE: usize = 32;
-    let height = rows.len() / width.max(1);
-    let mut columns = vec![0; rows.len()];
-    columns.par_chunks_mut(TILE * height.max(1)).enumerate().for_each(|(tile, out)| {
-        let xs = tile * TILE..width.min((tile + 1) * TILE);
-        for y0 in (0..height).step_by(TILE) {
-            for x in xs.clone() {
-                for y in y0..height.min(y0 + TILE) {
-                    out[(x - tile * TILE) * height + y] = rows[y * width + x];
-                }
+impl Clearance {
+    /// Measures along y; the rest is done for the cells that are asked for.
+    pub fn new(obstacles: &[bool], n_y: usize) -> Self {
+        let mut along_y = vec![0u32; obstacles.len()];
+        along_y.par_chunks_mut(n_y.max(1)).zip(obstacles.par_chunks(n_y.max(1))).for_each(|(out, row)| {
+            along_row(row.iter().copied(), out);
+            for (y, out) in out.iter_mut().enumerate() {
+                let border = (y + 1).min(n_y - y) as u32;
+                *out = (*out).min(border * border);
             }
+        });
+        Self { along_y, n_y }
+    }
+
+    /// Returns whether a cell is an obstacle.
+    pub fn is_obstacle(&self, cell: usize) -> bool {
+        self.along_y[cell] == 0
+    }
+
+    /// Returns the squared distance of a cell, in cells.
+    pub fn squared(&self, cell: usize) -> u32 {
+        let (x, y) = (cell / self.n_y, cell % self.n_y);
+        let n_x = self.along_y.len() / self.n_y;
+        let border = (x + 1).min(n_x - x);
+        let mut least = (border * border) as u32;
+        // Beyond the border there is nothing nearer.
+        for distance in 0..border {
+            let of_rows = (distance * distance) as u32;
+            if of_rows >= least {
+                break;
+            }
+            let nearer = [x - distance, x + distance].map(|x| self.along_y[x * self.n_y + y]);
+            least = least.min(of_rows + nearer[0].min(nearer[1]));
         }
-    });
-    columns
+        least
+    }
+
+    /// Returns which cells have a squared distance of at least `least`, 1 or more.
+    pub fn at_least(&self, least: u32) -> Vec<bool> {
+        let n_x = self.along_y.len().checked_div(self.n_y).unwrap_or(0) as i64;
+        let reach = i64::from((least - 1).isqrt());
+        let mut is_clear = vec![false; self.along_y.len()];
+        is_clear.par_chunks_mut(self.n_y.max(1)).enumerate().for_each(|(x, row)| {
+            let x = x as i64;
+            if (x + 1).min(n_x - x) <= reach {
+                return;
+            }
+            row.fill(true);
+            for distance in -reach..=reach {
+                let along_y = &self.along_y[(x + distance) as usize * self.n_y..][..self.n_y];
+                let needed = least - (distance * distance) as u32;
+                row.iter_mut().zip(along_y).for_each(|(clear, squared)| *clear &= *squared >= needed);
+            }
+        });
+        is_clear
+    }
 }
 
 #[cfg(test)]
@@ -80,16 +107,22 @@ mod tests {
         let mut random = Random::new(2);
         for (n_x, n_y) in [(1usize, 1usize), (5, 70), (70, 5), (33, 40)] {
             let obstacles: Vec<bool> = (0..n_x * n_y).map(|_| random.unit() < 0.01).collect();
-            let found = squared_distances(&obstacles, n_y);
+            let clearance = Clearance::new(&obstacles, n_y);
+            let is_clear = [1, 2, 5, 9, 30].map(|least| (least, clearance.at_least(least)));
             let inside = |x: i64, y: i64| x >= 0 && y >= 0 && x < n_x as i64 && y < n_y as i64;
             let places = (-1..=n_x as i64).flat_map(|x| (-1..=n_y as i64).map(move |y| (x, y)));
             let all: Vec<(i64, i64)> = places
                 .filter(|(x, y)| !inside(*x, *y) || obstacles[*x as usize * n_y + *y as usize])
                 .collect();
-            for (cell, found) in found.iter().enumerate() {
+            for cell in 0..n_x * n_y {
                 let (x, y) = ((cell / n_y) as i64, (cell % n_y) as i64);
                 let least = all.iter().map(|(a, b)| (a - x).pow(2) + (b - y).pow(2)).min();
-                assert_eq!(Some(i64::from(*found)), least, "{n_x} x {n_y}: {cell}");
+                let found = i64::from(clearance.squared(cell));
+                assert_eq!(Some(found), least, "{n_x} x {n_y}: {cell}");
+                assert_eq!(clearance.is_obstacle(cell), found == 0, "{n_x} x {n_y}: {cell}");
+                for (least, is_clear) in &is_clear {
+                    assert_eq!(is_clear[cell], found >= i64::from(*least), "{n_x} x {n_y}: {cell}, {least}");
+                }
             }
         }
     }

@@ -2,11 +2,10 @@
 
 use glam::DVec3;
 use slag_common::objects::public_id;
-use slag_common::occupancy::Occupancy;
 
 use super::choose::choose;
 use super::error::GoalError;
-use super::reply::{Goal, GoalMiss, GoalReply, MissedThing, NoGoal, TargetThing};
+use super::reply::{GoalMiss, GoalReply, MissedThing, NoGoal, TargetThing};
 use super::request::{GoalRequest, GoalTarget};
 use super::surroundings::{START_M, Surroundings};
 use crate::query::{Ask, Asked, Engine, Outcome, Point, QueryRequest, object_id, relations};
@@ -49,10 +48,10 @@ pub fn find(engine: &Engine, request: &GoalRequest, budget: &Budget) -> Result<G
         reply.none = Some(GoalMiss { kind: NoGoal::UnknownGround, detail });
         return Ok(reply);
     };
-    let around = seen.around(start);
+    let mut around = seen.around(start);
     for (id, thing) in things {
         let points = engine.object_points(&snapshot, id, MAX_POINTS);
-        match choose(&around, request, &points) {
+        match choose(&mut around, request, &points) {
             Ok(mut goals) => {
                 for goal in &mut goals {
                     goal.geographic =
@@ -66,21 +65,6 @@ pub fn find(engine: &Engine, request: &GoalRequest, budget: &Budget) -> Result<G
     reply.none =
         reply.missed.first().map(|missed| GoalMiss { kind: missed.none, detail: detail(missed, request) });
     Ok(reply)
-}
-
-/// Finds the best poses near the thing with a surface at `points`, or why there is none, in the places of some occupancies.
-///
-/// # Errors
-/// [`GoalError::NoOccupancy`]; a range with too many places.
-pub fn stand(
-    occupancies: &[Occupancy<'_>],
-    request: &GoalRequest,
-    near: DVec3,
-    points: &[DVec3],
-) -> Result<Result<Vec<Goal>, NoGoal>, GoalError> {
-    let seen = Surroundings::of(occupancies, request, near)?;
-    let Some(start) = seen.start(near, request.radius_m) else { return Ok(Err(NoGoal::UnknownGround)) };
-    Ok(choose(&seen.around(start), request, points))
 }
 
 fn detail(missed: &MissedThing, request: &GoalRequest) -> String {

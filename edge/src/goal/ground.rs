@@ -56,13 +56,20 @@ impl Ground {
 /// Returns occupied and free voxels of the 16 columns of voxels in a column of blocks; bit z is the voxel at height z.
 fn voxels_of(blocks: &[Stacked]) -> [[u128; 2]; 16] {
     let mut voxels = [[0u128; 2]; 16];
+    // Most blocks are free as a whole.
+    let mut all_free = 0;
     for block in blocks {
         let shift = u32::from(block.z) * BLOCK_EDGE as u32;
+        if block.free == !0 {
+            all_free |= 15 << shift;
+            continue;
+        }
         for (cell, [occupied, free]) in voxels.iter_mut().enumerate() {
             *occupied |= u128::from(block.occupied >> (4 * cell) & 15) << shift;
             *free |= u128::from(block.free >> (4 * cell) & 15) << shift;
         }
     }
+    voxels.iter_mut().for_each(|[_, free]| *free |= all_free);
     voxels
 }
 
@@ -75,16 +82,13 @@ fn floor(occupied: u128, free: u128, headroom: u32, step: u32) -> Floor {
     if occupied == 0 {
         return Floor::Unknown;
     }
-    // Bit z: the voxels z to z + headroom - 1 are free.
-    let (mut above, mut n) = (free, 1);
-    while n < headroom {
-        let shift = n.min(headroom - n);
-        above &= above >> shift;
-        n += shift;
-    }
-    let ground = occupied & !(occupied >> 1) & (above >> 1);
-    if ground != 0 {
-        return Floor::At(ground.trailing_zeros() as u8);
+    let mut tops = occupied & !(occupied >> 1);
+    while tops != 0 {
+        let z = tops.trailing_zeros();
+        if !(free >> z >> 1) & low_bits(headroom) == 0 {
+            return Floor::At(z as u8);
+        }
+        tops &= tops - 1;
     }
     let from_lowest = occupied >> occupied.trailing_zeros();
     let thickness = from_lowest.trailing_ones();

@@ -47,7 +47,11 @@ pub fn floor_map(engine: &Engine, request: &GoalRequest) -> Result<FloorMap, Goa
     let near = request.near.unwrap_or(snapshot.current.centre_in_world);
     let seen = Surroundings::look(&snapshot, request, near)?;
     let start = seen.start(near, request.radius_m);
-    let paths = start.map(|start| Paths::from(start, &seen.is_safe, &seen.ground, seen.step));
+    let paths = start.map(|start| {
+        let mut paths = Paths::from(start, &seen.is_safe, &seen.ground, seen.step);
+        paths.find(0..seen.is_safe.len());
+        paths
+    });
     let window = &seen.space.window;
     let [n_x, n_y] = window.cells();
     let place = |x: usize, y: usize| {
@@ -55,7 +59,7 @@ pub fn floor_map(engine: &Engine, request: &GoalRequest) -> Result<FloorMap, Goa
         match seen.ground.floors[cell] {
             Floor::Unknown => Place::Unknown,
             Floor::Blocked => Place::Obstacle,
-            Floor::At(_) if seen.squared[cell] == 0 => Place::Obstacle,
+            Floor::At(_) if seen.clearance.is_obstacle(cell) => Place::Obstacle,
             Floor::At(_) if paths.as_ref().is_some_and(|paths| paths.to(cell).is_some()) => Place::Reached,
             Floor::At(_) => Place::Ground,
         }

@@ -27,7 +27,7 @@ mod surroundings;
 mod tests;
 
 pub use error::GoalError;
-pub use find::{find, stand};
+pub use find::find;
 pub use map::{FloorMap, Place, floor_map};
 pub use reply::{Goal, GoalMiss, GoalReply, MissedThing, NoGoal, TargetThing};
 pub use request::{GoalRequest, GoalTarget};

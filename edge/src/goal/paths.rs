@@ -1,5 +1,7 @@
 //! The length of the way to each place.
 
+use rayon::prelude::*;
+
 use super::ground::{Floor, Ground};
 
 /// Cost of a step to a neighbour along an axis; diagonal ones cost 17: their ratio is within 0.2 % of the square root of 2.
@@ -8,60 +10,101 @@ const DIAGONAL: u32 = 17;
 /// No way leads here.
 pub const UNREACHED: u32 = u32::MAX;
 
-/// The ways from a robot to the places that it reaches.
+/// Height of a place where no robot's middle may be; others are below 128, and steps at most 100.
+const CLOSED: u8 = u8::MAX;
+
+/// The ways from a robot to the places around it: shortest ones over safe cells along eight directions, whose neighbours differ
+/// by a step at most (Dijkstra's algorithm with Dial's buckets: lengths are whole numbers, and a step costs at most 17). They are
+/// found from the nearest place on, as far as they are asked for.
 pub struct Paths {
-    /// By cell: length in twelfths of a cell, or [`UNREACHED`].
+    /// By cell, with a border of closed ones: height of the ground.
+    heights: Vec<u8>,
+    /// Cells along y of the grid, without the border.
+    n_y: usize,
+    step: u8,
+    /// By cell, with the border: length in twelfths of a cell, or [`UNREACHED`]; final if below `length`.
     lengths: Vec<u32>,
+    /// Cells by the remainder of their length.
+    buckets: [Vec<u32>; DIAGONAL as usize + 1],
+    length: u32,
+    n_waiting: usize,
 }
 
 impl Paths {
-    /// Finds the shortest ways over safe cells from one of them, along eight directions; neighbours may differ by a step of
-    /// `step` voxels (Dijkstra's algorithm with Dial's buckets: lengths are whole numbers, and a step costs at most 17).
+    /// Begins at a safe cell. `step`: in voxels.
     pub fn from(start: usize, is_safe: &[bool], ground: &Ground, step: u8) -> Self {
         let n_y = ground.n_y;
-        let mut lengths = vec![UNREACHED; is_safe.len()];
-        let mut buckets: [Vec<u32>; DIAGONAL as usize + 1] = Default::default();
-        lengths[start] = 0;
-        buckets[0].push(start as u32);
-        let (mut length, mut n_waiting) = (0u32, 1usize);
-        let n_buckets = buckets.len();
-        while n_waiting > 0 {
-            while let Some(cell) = buckets[length as usize % n_buckets].pop() {
-                n_waiting -= 1;
-                let cell = cell as usize;
-                if lengths[cell] != length {
-                    continue;
-                }
-                let Floor::At(here) = ground.floors[cell] else { continue };
-                let y = cell % n_y;
-                for (dx, dy) in [(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)] {
-                    if dy < 0 && y == 0 || dy > 0 && y + 1 == n_y {
-                        continue;
-                    }
-                    let beside = cell as i64 + i64::from(dx) * n_y as i64 + i64::from(dy);
-                    let Some(beside) =
-                        usize::try_from(beside).ok().filter(|at| is_safe.get(*at) == Some(&true))
-                    else {
-                        continue;
-                    };
-                    let is_step =
-                        matches!(ground.floors[beside], Floor::At(there) if here.abs_diff(there) <= step);
-                    let next = length + if dx != 0 && dy != 0 { DIAGONAL } else { STRAIGHT };
-                    if is_step && next < lengths[beside] {
-                        lengths[beside] = next;
-                        buckets[next as usize % n_buckets].push(beside as u32);
-                        n_waiting += 1;
+        let mut heights = vec![CLOSED; (is_safe.len() / n_y + 2) * (n_y + 2)];
+        let rows = heights[n_y + 2..].par_chunks_mut(n_y + 2);
+        rows.zip(is_safe.par_chunks(n_y)).zip(ground.floors.par_chunks(n_y)).for_each(
+            |((row, safe), floors)| {
+                for ((height, is_safe), floor) in row[1..].iter_mut().zip(safe).zip(floors) {
+                    if let (true, Floor::At(z)) = (is_safe, floor) {
+                        *height = *z;
                     }
                 }
-            }
-            length += 1;
-        }
-        Self { lengths }
+            },
+        );
+        let lengths = vec![UNREACHED; heights.len()];
+        let mut paths =
+            Self { heights, n_y, step, lengths, buckets: Default::default(), length: 0, n_waiting: 1 };
+        let start = paths.bordered(start);
+        paths.lengths[start] = 0;
+        paths.buckets[0].push(start as u32);
+        paths
     }
 
-    /// Returns the length of the way to a cell, in cells; `None` if no way leads there.
+    fn bordered(&self, cell: usize) -> usize {
+        (cell / self.n_y + 1) * (self.n_y + 2) + cell % self.n_y + 1
+    }
+
+    /// Finds the ways to some cells.
+    pub fn find(&mut self, cells: impl IntoIterator<Item = usize>) {
+        for cell in cells {
+            let cell = self.bordered(cell);
+            while self.n_waiting > 0 && self.heights[cell] != CLOSED && self.lengths[cell] >= self.length {
+                self.find_next();
+            }
+        }
+    }
+
+    /// Finds the ways of the next length.
+    fn find_next(&mut self) {
+        let width = self.n_y + 2;
+        let beside = [
+            (width.wrapping_neg(), STRAIGHT),
+            (1usize.wrapping_neg(), STRAIGHT),
+            (1, STRAIGHT),
+            (width, STRAIGHT),
+            ((width + 1).wrapping_neg(), DIAGONAL),
+            ((width - 1).wrapping_neg(), DIAGONAL),
+            (width - 1, DIAGONAL),
+            (width + 1, DIAGONAL),
+        ];
+        let n_buckets = self.buckets.len();
+        let mut cells = std::mem::take(&mut self.buckets[self.length as usize % n_buckets]);
+        self.n_waiting -= cells.len();
+        for cell in cells.drain(..).map(|cell| cell as usize) {
+            if self.lengths[cell] != self.length {
+                continue;
+            }
+            let here = self.heights[cell];
+            for (offset, cost) in beside {
+                let (to, next) = (cell.wrapping_add(offset), self.length + cost);
+                if self.heights[to].abs_diff(here) <= self.step && next < self.lengths[to] {
+                    self.lengths[to] = next;
+                    self.buckets[next as usize % n_buckets].push(to as u32);
+                    self.n_waiting += 1;
+                }
+            }
+        }
+        self.buckets[self.length as usize % n_buckets] = cells;
+        self.length += 1;
+    }
+
+    /// Returns the length of the way to a cell that was asked for, in cells; `None` if no way leads there.
     pub fn to(&self, cell: usize) -> Option<f64> {
-        let length = self.lengths[cell];
+        let length = self.lengths[self.bordered(cell)];
         (length != UNREACHED).then(|| f64::from(length) / f64::from(STRAIGHT))
     }
 }
@@ -83,7 +126,7 @@ mod tests {
                 let is_safe: Vec<bool> = (0..n).map(|_| random.unit() < 0.8).collect();
                 let Some(start) = is_safe.iter().position(|safe| *safe) else { continue };
                 let ground = Ground { floors: floors.clone(), n_y };
-                let found = Paths::from(start, &is_safe, &ground, 1);
+                let mut found = Paths::from(start, &is_safe, &ground, 1);
                 let mut expected = vec![f64::INFINITY; n];
                 expected[start] = 0.0;
                 for _ in 0..n {
@@ -96,7 +139,9 @@ mod tests {
                         }
                     }
                 }
+                // Asked for one by one, so the search goes on from where it was.
                 for (cell, expected) in expected.iter().enumerate() {
+                    found.find([cell]);
                     let found = found.to(cell).unwrap_or(f64::INFINITY);
                     assert!(
                         found == *expected || (found - expected).abs() < 1e-9,

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use slag_common::occupancy::Occupancy;
 
-use super::clearance;
+use super::clearance::{self, Clearance};
 use super::error::GoalError;
 use super::ground::{Floor, Ground, SURFACE_DEPTH};
 use super::paths::Paths;
@@ -22,14 +22,13 @@ pub struct Around<'a> {
     pub space: &'a Space,
     pub ground: &'a Ground,
     pub paths: Paths,
-    /// Squared distance to the nearest obstacle, in cells.
-    squared: &'a [u32],
+    clearance: &'a Clearance,
 }
 
 impl Around<'_> {
     /// Returns the distance of a cell to the nearest obstacle, metres.
     pub fn clearance(&self, cell: usize) -> f64 {
-        f64::from(self.squared[cell]).sqrt() * self.space.window.voxel
+        f64::from(self.clearance.squared(cell)).sqrt() * self.space.window.voxel
     }
 
     /// Returns the height of the ground of a cell, world frame.
@@ -48,7 +47,7 @@ impl Around<'_> {
 pub(super) struct Surroundings {
     pub(super) space: Space,
     pub(super) ground: Ground,
-    pub(super) squared: Vec<u32>,
+    pub(super) clearance: Clearance,
     pub(super) is_safe: Vec<bool>,
     /// Highest step, voxels.
     pub(super) step: u8,
@@ -88,16 +87,16 @@ impl Surroundings {
         let step = (request.step_m / voxel - 0.5).floor().clamp(1.0, 100.0) as u8;
         let ground = Ground::find(&space, headroom, u32::from(step));
         let obstacles = clearance::obstacles(&ground, step);
-        let squared = clearance::squared_distances(&obstacles, ground.n_y);
+        let clearance = Clearance::new(&obstacles, ground.n_y);
         let least = (request.radius_m / voxel).powi(2).ceil() as u32;
-        let is_safe = squared.iter().map(|d2| *d2 >= least.max(1)).collect();
-        Ok(Self { space, ground, squared, is_safe, step })
+        let is_safe = clearance.at_least(least.max(1));
+        Ok(Self { space, ground, clearance, is_safe, step })
     }
 
-    /// Finds the ways from a safe cell.
+    /// Begins the ways from a safe cell.
     pub(super) fn around(&self, start: usize) -> Around<'_> {
         let paths = Paths::from(start, &self.is_safe, &self.ground, self.step);
-        Around { space: &self.space, ground: &self.ground, paths, squared: &self.squared }
+        Around { space: &self.space, ground: &self.ground, paths, clearance: &self.clearance }
     }
 
     /// Returns the safe cell nearest to the robot, at most [`START_M`] or its radius away.

@@ -1,6 +1,8 @@
 use glam::DVec3;
 use slag_common::occupancy::{Block, BuiltOccupancy};
 
+use super::choose::choose;
+use super::surroundings::Surroundings;
 use super::*;
 
 const VOXEL: f64 = 0.05;
@@ -55,8 +57,20 @@ fn points() -> Vec<DVec3> {
 
 const START: DVec3 = DVec3::new(0.6, 3.0, 0.0);
 
+/// Finds the best poses near the thing with a surface at `points`.
+fn stand(
+    world: &BuiltOccupancy,
+    request: &GoalRequest,
+    near: DVec3,
+    points: &[DVec3],
+) -> Result<Vec<Goal>, NoGoal> {
+    let seen = Surroundings::of(&[world.view()], request, near).expect("places are known");
+    let start = seen.start(near, request.radius_m).ok_or(NoGoal::UnknownGround)?;
+    choose(&mut seen.around(start), request, points)
+}
+
 fn goals_with(world: &BuiltOccupancy, request: &GoalRequest) -> Result<Vec<Goal>, NoGoal> {
-    stand(&[world.view()], request, START, &points()).expect("places are known")
+    stand(world, request, START, &points())
 }
 
 fn goals(more: impl Fn(DVec3) -> Option<At>) -> Result<Vec<Goal>, NoGoal> {
@@ -152,14 +166,14 @@ fn nothing_is_seen_through_what_a_thing_stands_on() {
     let world = packed(no_box);
     let on_board: Vec<DVec3> = points().into_iter().map(|p| p + DVec3::Z * 0.6).collect();
     let request = GoalRequest::new(GoalTarget::Object(1));
-    let found = stand(&[world.view()], &request, START, &on_board).expect("places are known");
+    let found = stand(&world, &request, START, &on_board);
     assert_eq!(found, Err(NoGoal::NotVisible));
     // A thing that hangs there is seen from below.
     let empty = packed(|p: DVec3| match no_box(p) {
         At::Solid if p.z > 0.0 => At::Free,
         at => at,
     });
-    stand(&[empty.view()], &request, START, &on_board).expect("places are known").expect("poses");
+    stand(&empty, &request, START, &on_board).expect("poses");
 }
 
 /// A plate on a wall, from below: the line to it goes along the wall, through voxels that wall and plate share, for longer than
@@ -174,13 +188,13 @@ fn what_hangs_on_a_wall_is_seen_from_below() {
         .collect();
     let request = GoalRequest { reach_m: 0.45, ..GoalRequest::new(GoalTarget::Object(1)) };
     let world = packed(hall(wall));
-    let found = stand(&[world.view()], &request, START, &on_wall).expect("places are known").expect("poses");
+    let found = stand(&world, &request, START, &on_wall).expect("poses");
     // Lines to its lower part enter the wall below it.
     assert!(found[0].visible_share > 0.3, "{found:?}");
     let bump =
         |p: DVec3| wall(p).or_else(|| inside(p, [4.7, 2.0, 0.75], [4.9, 4.0, 0.85]).then_some(At::Solid));
     let world = packed(hall(bump));
-    let found = stand(&[world.view()], &request, START, &on_wall).expect("places are known");
+    let found = stand(&world, &request, START, &on_wall);
     assert_eq!(found, Err(NoGoal::NotVisible));
 }
 
@@ -208,7 +222,7 @@ fn a_narrow_strip_from_which_a_thing_is_seen_is_found() {
     };
     let found = |slit| {
         let request = GoalRequest::new(GoalTarget::Object(1));
-        stand(&[world(slit).view()], &request, DVec3::new(0.6, 0.6, 0.0), &pole).expect("places are known")
+        stand(&world(slit), &request, DVec3::new(0.6, 0.6, 0.0), &pole)
     };
     let seeing = found(true).expect("poses");
     assert!(seeing.iter().all(|goal| (goal.position_in_world.y - 3.125).abs() < 0.1), "{seeing:?}");
