@@ -39,8 +39,7 @@ impl Thing {
         Self { blocks, first_above_bottom: z.saturating_add(1), bottom }
     }
 
-    fn may_occupy(&self, at: [i32; 3]) -> bool {
-        let (block, bit) = place(at);
+    fn may_occupy(&self, block: [i32; 3], bit: u64) -> bool {
         self.blocks.get(&block).is_some_and(|mask| mask & bit != 0)
     }
 }
@@ -81,11 +80,17 @@ pub fn sees(space: &Space, thing: &Thing, sensor: DVec3, point: DVec3) -> bool {
         }
     }
     let (mut entered, mut is_at_thing) = (0.0, false);
+    // A line stays in a block for several voxels.
+    let (mut known, mut free) = (None, 0);
     loop {
-        let is_free = space.is_free(at);
+        let (block, bit) = place(at);
+        if known != Some(block) {
+            (known, free) = (Some(block), space.free(block));
+        }
+        let is_free = free & bit != 0;
         if !is_free || is_at_thing {
             is_at_thing = true;
-            let is_near = entered >= length - TOLERANCE * voxel || thing.may_occupy(at);
+            let is_near = entered >= length - TOLERANCE * voxel || thing.may_occupy(block, bit);
             if !is_near || !is_free && at[2] < lowest {
                 return false;
             }

@@ -136,25 +136,17 @@ impl Space {
         &self.blocks[self.starts[column] as usize..self.starts[column + 1] as usize]
     }
 
-    /// Returns whether a voxel is free: seen through, without a surface. `voxel`: counted from the window's corner.
-    pub fn is_free(&self, [x, y, z]: [i32; 3]) -> bool {
-        let [n_x, n_y] = self.window.cells();
-        if x < 0
-            || y < 0
-            || z < 0
-            || x as usize >= n_x
-            || y as usize >= n_y
-            || z >= COLUMN_BLOCKS * BLOCK_EDGE
-        {
-            return false;
+    /// Returns the free voxels of a block, counted from the window's corner: those seen through, without a surface. Beyond the
+    /// window none is known to be free.
+    pub fn free(&self, [x, y, z]: [i32; 3]) -> u64 {
+        let [n_x, n_y] = self.window.n;
+        let is_inside = x >= 0 && y >= 0 && (x as usize) < n_x && (y as usize) < n_y;
+        if !is_inside || !(0..COLUMN_BLOCKS).contains(&z) {
+            return 0;
         }
-        let edge = BLOCK_EDGE;
-        let column = (x / edge) as usize * self.window.n[1] + (y / edge) as usize;
-        let of_column = self.column(column);
-        let Ok(at) = of_column.binary_search_by_key(&((z / edge) as u8), |block| block.z) else {
-            return false;
-        };
-        of_column[at].free >> (z % edge + edge * (y % edge + edge * (x % edge))) & 1 == 1
+        let of_column = self.column(x as usize * n_y + y as usize);
+        let found = of_column.binary_search_by_key(&(z as u8), |block| block.z);
+        found.map_or(0, |at| of_column[at].free)
     }
 }
 
