@@ -70,3 +70,57 @@ fn lines(reply: &ChangesReply) -> String {
     ));
     text
 }
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+
+    use super::*;
+    use crate::query::{ComparedGeneration, Likeness, NotCompared};
+
+    fn thing(id: &str, x: f64, like: Option<&str>) -> ChangedThing {
+        let at = DVec3::new(x, 2.0, 0.5);
+        ChangedThing {
+            id: id.into(),
+            position_in_world: at,
+            geographic: None,
+            box_min_in_world: at - 1.0,
+            box_max_in_world: at + 1.0,
+            n_gaussians_in_scene: 9,
+            photo: "p.jpg".into(),
+            like: like.map(|text| Likeness { text: text.into(), score: 0.5 }),
+        }
+    }
+
+    /// One of each kind; the machine that encoded the later generation had an earlier time.
+    #[test]
+    fn each_change_has_its_line() {
+        let of = |generation, created_unix_secs| ComparedGeneration { generation, created_unix_secs };
+        let (from, to) = (thing("o3", 3.0, None), thing("o4", 5.5, Some("chair")));
+        let mut reply = ChangesReply {
+            scene: "yard".into(),
+            frame: "world",
+            unit: "m",
+            from: Some(of(4, 1000)),
+            to: of(6, 500),
+            generations: vec![4, 6],
+            n_same: 3,
+            n_stayed: 4,
+            n_not_compared: 5,
+            appeared: vec![thing("o1", 1.0, Some("box"))],
+            went: vec![thing("o2", -2.0, None)],
+            moved: vec![MovedThing { from, to, distance: 2.5 }],
+            none: None,
+        };
+        let expected = "generation 4 to 6\n\
+            appeared  o1 at 1.00, 2.00, 0.50, like \"box\" (0.50)\n\
+            went      o2 at -2.00, 2.00, 0.50\n\
+            moved     2.50 m: o4 at 5.50, 2.00, 0.50, like \"chair\" (0.50); was o3 at 3.00, 2.00, 0.50\n\
+            things    7 stayed, 3 of them unchanged; 5 not compared: one generation alone knows their place\n";
+        assert_eq!(lines(&reply), expected);
+        reply.unit = "world";
+        assert!(lines(&reply).contains("moved     2.50: o4"), "{}", lines(&reply));
+        reply.none = Some(NotCompared { kind: "no-earlier-generation", detail: "there is none".into() });
+        assert_eq!(lines(&reply), "there is none\n");
+    }
+}

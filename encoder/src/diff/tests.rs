@@ -131,6 +131,8 @@ fn two_generations_of_a_store_by_hand() {
     assert_eq!((ids(&found.appeared), ids(&found.went)), (vec![15], vec![]), "{found:?}");
     let [moved] = &found.moved[..] else { panic!("{:?}", found.moved) };
     assert_eq!((moved.from.id, moved.to.id, moved.distance), (10, 14, 4.0));
+    let of_box = [moved.from.box_in_world.min.x, moved.to.box_in_world.min.x, moved.to.box_in_world.max.x];
+    assert_eq!(of_box, [9.5, 13.5, 14.5]);
     assert_eq!((found.n_cells, found.n_cells_changed), (3, 2));
     let fetched = BTreeMap::from([("compact".to_owned(), n_changed + n_same), ("exact".to_owned(), n_exact)]);
     assert_eq!(found.fetch_bytes, fetched);

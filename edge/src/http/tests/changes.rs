@@ -58,8 +58,11 @@ async fn generations_are_compared_over_http() {
         );
         assert!(read.vector.iter().zip(&written.vector).all(|(a, b)| (a - b).abs() < 0.01), "{read:?}");
     }
-    // By hand: 6 stays, 10 and 20 go; 33 is as 6, and 22 as 10, which moved by 12; 20 has no successor.
-    write_cache(service.dir.path(), &shards(&[6, 22, 33]), 2);
+    // By hand: 6 stays, 10 and 20 go; 33 is as 6, and 22 as 10, which moved by 12; 20 has no successor. The clock of the machine that
+    // encoded has gone back: generations count by their numbers.
+    let later = shards(&[6, 22, 33]);
+    let manifest = Manifest { created_unix_secs: record.created_unix_secs - 60, ..manifest_of(&later, 2) };
+    write_manifest(service.dir.path(), &later, manifest);
     service.app.reload_now();
     let get = async |query: &str| {
         let (status, _, body) = service.get(&format!("/v1/changes{query}")).await;
@@ -71,6 +74,8 @@ async fn generations_are_compared_over_http() {
     };
     let (_, body) = get("").await;
     assert_eq!((&body["from"]["generation"], &body["to"]["generation"]), (&json!(1), &json!(2)));
+    let created = ["from", "to"].map(|end| body[end]["created_unix_secs"].as_u64());
+    assert_eq!(created, [Some(record.created_unix_secs), Some(record.created_unix_secs - 60)]);
     assert_eq!(ids(&body, "appeared"), ["o0000000000000021"], "{body:#}");
     assert_eq!(ids(&body, "went"), ["o0000000000000014"], "{body:#}");
     let moved = &body["moved"][0];
@@ -79,6 +84,11 @@ async fn generations_are_compared_over_http() {
         (&json!("o000000000000000a"), &json!("o0000000000000016"))
     );
     assert_eq!((&moved["distance"], &body["n_same"]), (&json!(12.0), &json!(1)), "{body:#}");
+    let went = &body["went"][0];
+    assert_eq!(
+        [&went["box_min_in_world"], &went["box_max_in_world"], &went["n_gaussians_in_scene"], &went["photo"]],
+        [&json!([19.0, -1.0, -1.0]), &json!([21.0, 1.0, 1.0]), &json!(40), &json!("20.jpg")]
+    );
     // Of a move, one end in the ball counts.
     let (_, near) = get("?near=10,0,0&radius=2").await;
     assert_eq!((near["moved"].as_array().map(Vec::len), &near["went"]), (Some(1), &json!([])), "{near:#}");

@@ -5,6 +5,7 @@ use slag_common::manifest::Calibration;
 use slag_common::occupancy::BuiltOccupancy;
 
 use super::*;
+use crate::query::MapStatus;
 use crate::testing::TestObject;
 
 /// Gaussians on a lattice between two corners, in steps of 0.01.
@@ -275,6 +276,14 @@ async fn things_on_board_are_listed_in_pages() {
     assert_eq!(
         (&map["n_objects"], &map["cells"][0]["generation"], &map["missing"], &map["z_is_up"]),
         (&json!(3), &json!(1), &json!([]), &json!(true))
+    );
+    // Before a generation's time, as where the robot's clock is behind, it has no age.
+    let snapshot = service.app.engine.snapshot().expect("loaded");
+    let made = snapshot.manifest.created_unix_secs;
+    let at = |now| MapStatus::of(&snapshot, now, Some(made + 30));
+    assert_eq!(
+        [made - 60, made + 60].map(|now| (at(now).age_secs, at(now).is_expired)),
+        [(0, false), (60, true)]
     );
 }
 

@@ -71,7 +71,6 @@ pub struct Understood {
     pub ask: Ask,
     /// The question of each answer, as the client wrote it.
     pub questions: Vec<AskedFor>,
-    pub time_budget: Option<Duration>,
 }
 
 impl Body {
@@ -84,6 +83,17 @@ impl Body {
             RequestError::new("body", &e.to_string(), "a request as GET /openapi.json describes it")
         };
         serde_json::from_slice(bytes).map_err(refused)
+    }
+
+    /// Returns the most time to compute.
+    ///
+    /// # Errors
+    /// It is nothing.
+    pub fn time_budget(&self) -> Result<Option<Duration>, RequestError> {
+        match self.time_budget_ms {
+            Some(0) => Err(RequestError::new("time_budget_ms", "0", "at least 1")),
+            time => Ok(time.map(Duration::from_millis)),
+        }
     }
 
     /// Checks the number of questions, and understands texts. `has_objects`: whether relations can be answered; where they
@@ -119,10 +129,6 @@ impl Body {
             Some(name) => name.parse().map_err(|e: String| RequestError::new("precision", name, e))?,
             None => Precision::default(),
         };
-        let time_budget = match self.time_budget_ms {
-            Some(0) => return Err(RequestError::new("time_budget_ms", "0", "at least 1")),
-            time => time.map(Duration::from_millis),
-        };
         let request = QueryRequest {
             negatives: negatives(self.negatives),
             limit: self.limit,
@@ -135,7 +141,7 @@ impl Body {
         };
         let (near, heading_rad, offset) = (self.near, self.heading_rad, self.offset);
         let ask = Ask { asked, request, area: self.region, near, heading_rad, offset };
-        Ok(Understood { ask, questions, time_budget })
+        Ok(Understood { ask, questions })
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use axum::Json;
 use axum::body::Bytes;
@@ -44,8 +44,9 @@ async fn answer(app: &Arc<App>, body: Result<Body, Problem>) -> Result<Answer, P
 
 async fn answer_within(app: &Arc<App>, body: Result<Body, Problem>) -> Result<Vec<u8>, Problem> {
     let body = body?;
-    let asked_for = body.time_budget_ms.map(Duration::from_millis);
-    let limit = asked_for.map_or(app.settings.query_timeout, |time| time.min(app.settings.query_timeout));
+    // Before time runs: a budget of nothing is refused, not overrun.
+    let time_budget = body.time_budget().map_err(parameter_problem)?;
+    let limit = time_budget.map_or(app.settings.query_timeout, |time| time.min(app.settings.query_timeout));
     let permit =
         Arc::clone(&app.permits).try_acquire_owned().map_err(|_| overloaded(app.settings.max_queries))?;
     let answering = app.blocking(move |app| {
@@ -53,8 +54,7 @@ async fn answer_within(app: &Arc<App>, body: Result<Body, Problem>) -> Result<Ve
         let _permit = permit;
         app.reload_if_stale();
         let has_objects = !app.engine.snapshot().map_err(query_problem)?.objects.is_empty();
-        let Understood { ask, questions, time_budget } =
-            body.understand(has_objects).map_err(parameter_problem)?;
+        let Understood { ask, questions } = body.understand(has_objects).map_err(parameter_problem)?;
         let budget = app.query_budget_within(time_budget);
         let found = app.engine.ask(&ask, &budget).map_err(query_problem)?;
         let n_empty = found.outcomes.iter().filter(|outcome| outcome.is_empty()).count();
