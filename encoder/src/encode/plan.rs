@@ -129,11 +129,16 @@ fn make_plan<'a>(
     let (order, coverage) =
         context.install(|| choose_views(&settings.run, scene.as_ref(), inputs, context))?;
     let coverage_secs = coverage.as_ref().map_or(0.0, |_| start.elapsed().as_secs_f64());
-    let views: Vec<&View> = order.iter().map(|i| &inputs.views[*i]).collect();
-    let of_models = (engines.models.image_bytes(), engines.models.dim());
-    context.install(|| expected::reserve(&mut memory, settings, inputs, (scene.as_ref(), &views), of_models));
-    memory::give_back();
-    let planned_peak = memory::held_bytes().map(|held_bytes| memory.planned_peak(held_bytes));
+    // Only an encode plans and reports its peak; what kept views give again needs no view drawn for it.
+    let mut planned_peak = None;
+    if !only_kept {
+        let views: Vec<&View> = order.iter().map(|i| &inputs.views[*i]).collect();
+        let of_models = (engines.models.image_bytes(), engines.models.dim());
+        let of_scene = (scene.as_ref(), &views[..]);
+        context.install(|| expected::reserve(&mut memory, settings, inputs, of_scene, of_models));
+        memory::give_back();
+        planned_peak = memory::held_bytes().map(|held_bytes| memory.planned_peak(held_bytes));
+    }
     if let Some(PlannedPeak { len_bytes, phase }) = planned_peak {
         tracing::info!("at most about {} MB of memory, in {phase:?}", len_bytes / 1_000_000);
     }
