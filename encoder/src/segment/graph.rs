@@ -19,6 +19,7 @@ use image::{RgbImage, imageops};
 
 use super::error::SegmentError;
 use super::segmenter::{SegmentInput, Segmenter};
+use super::support;
 use crate::masks::regions::nearest;
 use crate::masks::{BoxPx, Mask, NO_REGION, masks_of_labels};
 
@@ -51,6 +52,8 @@ pub struct GraphSettings {
     pub depth_weight: f32,
     /// A mask is dropped if its intersection over union with a mask of a coarser level exceeds this.
     pub max_overlap_iou: f32,
+    /// A mask is dropped if the boundaries predicted along its outline are less than this on average; 0 keeps all.
+    pub min_support: f32,
     /// Largest number of masks per image; the largest masks are kept.
     pub max_masks: usize,
 }
@@ -66,6 +69,7 @@ impl Default for GraphSettings {
             boundary_weight: 0.0,
             depth_weight: 100.0,
             max_overlap_iou: 0.9,
+            min_support: 0.0,
             max_masks: 400,
         }
     }
@@ -79,6 +83,7 @@ impl GraphSettings {
             colour_weight: 0.3,
             boundary_weight: 40.0,
             depth_weight: 0.0,
+            min_support: 0.5,
             ..Self::default()
         }
     }
@@ -186,11 +191,17 @@ impl Segmenter for GraphSegmenter {
         let mut masks = Vec::new();
         for (level, labels) in levels.iter().enumerate() {
             let repeats = labels.repeats_of(&levels[..level], self.settings.max_overlap_iou);
-            let all = masks_of_labels(&labels.of_pixel, raster.width_px, labels.area_px.len(), u64::MAX);
-            let kept = all
-                .unwrap_or_default()
-                .into_iter()
-                .filter(|(label, mask)| mask.area_px >= min_area_px && !repeats[*label as usize]);
+            let n_components = labels.area_px.len();
+            let support = boundaries.as_deref().map(|boundaries| {
+                support::of_outlines(&labels.of_pixel, raster.width_px as usize, n_components, boundaries)
+            });
+            let is_confirmed =
+                |label: usize| support.as_ref().is_none_or(|of| of[label] >= self.settings.min_support);
+            let all = masks_of_labels(&labels.of_pixel, raster.width_px, n_components, u64::MAX);
+            let kept = all.unwrap_or_default().into_iter().filter(|(label, mask)| {
+                let label = *label as usize;
+                mask.area_px >= min_area_px && !repeats[label] && is_confirmed(label)
+            });
             masks.extend(kept.map(|(_, mask)| Mask { level: level as u8, ..mask }));
         }
         self.keep_largest(&mut masks);

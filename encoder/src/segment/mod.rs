@@ -6,6 +6,7 @@ mod graph;
 mod none;
 mod sam;
 mod segmenter;
+mod support;
 
 pub use error::SegmentError;
 pub use given::{GivenMasks, file_of as mask_file};
