@@ -55,7 +55,8 @@ mod tests {
             for (i, piece) in kept.iter().enumerate() {
                 assert!(piece.iter().all(|x| *x == (64 * i % 251) as u8), "piece {i}");
             }
-            assert!(peak_bytes().expect("Linux") >= before);
+            // The kernel counts the peak in batches of pages for each processor.
+            assert!(peak_bytes().expect("Linux") + (4 << 20) >= before);
             after + (32 << 20) < before
         };
         assert!((0..10).any(|_| is_less_held()));
