@@ -136,7 +136,7 @@ fn the_robots_service_answers() {
     let robot = Service::start(&mut edge(&["serve", "--cache", text(&cache)]));
     let reply = robot.get("/query?text=red&near=3.5,2.7,0");
     assert!(!reply["answers"].as_array().expect("answers").is_empty(), "{reply}");
-    let reply = robot.get("/query?text=pink");
+    let reply = robot.get("/query?text=elephant");
     assert!(
         reply["answers"].as_array().expect("answers").is_empty() && reply["reason"]["detail"].is_string(),
         "{reply}"

@@ -73,8 +73,8 @@ fn what_was_spent_goes_by_content_and_is_reported() {
         let (scene, views, store) =
             (room.join("scene.ply"), room.join("transforms.json"), dir.path().join(name));
         let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views), "--metric"]);
-        // Few enough masks that some views have long borders and others have not.
-        command.args(["--store", text(&store), "--preset", "plain", "--mask-levels", "2"]);
+        // As many masks that some views have long borders and others have not.
+        command.args(["--store", text(&store), "--preset", "plain", "--mask-levels", "4"]);
         run_json(command.args(more))
     };
     let column = |summary: &Value, name: &str| {

@@ -17,6 +17,7 @@ use slag_models::session::SessionError;
 
 use image::{RgbImage, imageops};
 
+use super::colour::{distance, lab_of, smooth};
 use super::error::SegmentError;
 use super::segmenter::{SegmentInput, Segmenter};
 use super::support;
@@ -427,60 +428,6 @@ fn sample<T>(width_px: u32, columns: &[u32], rows: &[u32], value_at: impl Fn(usi
         values.extend(columns.iter().map(|x| value_at(start + *x as usize)));
     }
     values
-}
-
-fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
-    let [l, m, n] = [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
-    (l * l + m * m + n * n).sqrt()
-}
-
-/// Converts sRGB (IEC 61966-2-1) to CIE L*a*b* of illuminant D65 (CIE 15).
-fn lab_of(image: &RgbImage) -> Vec<[f32; 3]> {
-    let linear: Vec<f32> = (0..=255_u8)
-        .map(|value| {
-            let v = f32::from(value) / 255.0;
-            if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }
-        })
-        .collect();
-    let root = |t: f32| if t > 216.0 / 24389.0 { t.cbrt() } else { (24389.0 / 27.0 * t + 16.0) / 116.0 };
-    let lab = |pixel: &image::Rgb<u8>| {
-        let [r, g, b] = pixel.0.map(|value| linear[usize::from(value)]);
-        let x = root((0.4124564 * r + 0.3575761 * g + 0.1804375 * b) / 0.95047);
-        let y = root(0.2126729 * r + 0.7151522 * g + 0.072175 * b);
-        let z = root((0.0193339 * r + 0.119192 * g + 0.9503041 * b) / 1.08883);
-        [116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)]
-    };
-    image.pixels().map(lab).collect()
-}
-
-/// Smooths with a Gaussian truncated at four standard deviations; border pixels are repeated outwards.
-fn smooth(lab: &mut [[f32; 3]], width: usize, sigma_px: f32) {
-    let radius = (4.0 * sigma_px).ceil().clamp(0.0, 64.0) as usize;
-    if radius == 0 || width == 0 {
-        return;
-    }
-    let mut kernel: Vec<f32> =
-        (0..=2 * radius).map(|i| (-0.5 * ((i as f32 - radius as f32) / sigma_px).powi(2)).exp()).collect();
-    let sum: f32 = kernel.iter().sum();
-    kernel.iter_mut().for_each(|weight| *weight /= sum);
-
-    let height = lab.len() / width;
-    let mut line = Vec::new();
-    let mut along = |start: usize, stride: usize, len: usize| {
-        line.clear();
-        line.extend(
-            (0..len + 2 * radius).map(|i| lab[start + i.saturating_sub(radius).min(len - 1) * stride]),
-        );
-        for (i, window) in line.windows(kernel.len()).enumerate() {
-            let mut sum = [0.0; 3];
-            for (weight, colour) in kernel.iter().zip(window) {
-                (0..3).for_each(|c| sum[c] += weight * colour[c]);
-            }
-            lab[start + i * stride] = sum;
-        }
-    };
-    (0..height).for_each(|y| along(y * width, 1, width));
-    (0..width).for_each(|x| along(x, width, height));
 }
 
 /// Scales a mask up; `None` if the result is empty.

@@ -1,5 +1,6 @@
 //! Segmentation: finds the masks of a photo.
 
+mod colour;
 mod error;
 mod given;
 mod graph;
