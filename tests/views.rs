@@ -73,7 +73,7 @@ fn what_was_spent_goes_by_content_and_is_reported() {
         let (scene, views, store) =
             (room.join("scene.ply"), room.join("transforms.json"), dir.path().join(name));
         let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views), "--metric"]);
-        // As many masks that some views have long borders and others have not.
+        // Enough masks that some views have long borders and others do not.
         command.args(["--store", text(&store), "--preset", "plain", "--mask-levels", "4"]);
         run_json(command.args(more))
     };

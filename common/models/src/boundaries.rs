@@ -135,7 +135,7 @@ mod tests {
         }
     }
 
-    /// A map of depths and what the training made of it.
+    /// A depth map and the channels that the training script computes from it.
     #[derive(serde::Deserialize)]
     struct Recorded {
         width_px: usize,

@@ -192,8 +192,8 @@ fn blocks(range_m: f64, voxel_m: f64, things: &[Thing]) -> Vec<Block> {
     blocks
 }
 
-/// Returns the cell of a quarter of the yard: each thing in it is an object with a centroid of its own, and thing `i` is what the
-/// text `i` asks for.
+/// Returns the cell of one quarter of the yard. Each thing in it is an object with its own centroid; the text `i` asks for
+/// thing `i`.
 fn cell(quarter: u32, range_m: f64, voxel_m: f64, things: &[Thing], blocks: &[Block]) -> io::Result<Cell> {
     let is_here = |x: bool, y: bool| u32::from(x) + 2 * u32::from(y) == quarter;
     let here = (0u64..).zip(things).filter(|(_, thing)| is_here(thing.at.x >= 0.0, thing.at.y >= 0.0));

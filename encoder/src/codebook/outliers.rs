@@ -61,7 +61,7 @@ pub(super) fn separate(
         let centre = points.get(farthest.at);
         let length = squared_lengths(centre)[0];
         let left = distance(farthest.at, farthest.squared_length, centre, length);
-        // No centroid takes away what the basis leaves of an embedding.
+        // A centroid cannot reduce the part of an embedding that lies outside the basis.
         if farthest.squared_distance <= least || left >= farthest.squared_distance {
             break;
         }

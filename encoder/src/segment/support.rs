@@ -1,7 +1,7 @@
 //! How much of a component's outline the boundary model confirms.
 //!
 //! Components also end where the graph had to stop somewhere: across a carpet, or around two things with nothing between
-//! them that looks like a border. Such a mask is of no thing.
+//! them that looks like a border. Such a mask shows no single thing.
 
 use crate::masks::NO_REGION;
 
