@@ -11,7 +11,7 @@ use super::sight;
 use super::space::Window;
 use super::surroundings::Around;
 
-/// Points of a thing's surface that are looked at.
+/// Points of a thing's surface that are looked at: bits of a `u128`.
 const SAMPLES: usize = 128;
 /// Edge of the squares of which only the cheapest candidate is looked at closely, metres.
 const SQUARE_M: f64 = 0.2;
@@ -48,38 +48,38 @@ pub fn choose(around: &mut Around<'_>, request: &GoalRequest, points: &[DVec3]) 
     if reached.is_empty() {
         return Err(missing(around, &near));
     }
-    let target = Target::new(window, points);
-    let looked_at = |candidates: Vec<Candidate>| -> Vec<Goal> {
-        candidates.into_par_iter().filter_map(|of| goal(around, request, &target, of)).collect()
+    let target = Target::new(around, request, points);
+    let looked_at = |candidates: Vec<Candidate>| -> Vec<Look> {
+        candidates.into_par_iter().filter_map(|of| look(around, request, &target, of)).collect()
     };
-    let mut goals = looked_at(sifted(window, reached.clone()));
+    let mut looks = looked_at(sifted(window, reached.clone()));
     // Over the edge of a table, the thing on it is often seen only from a strip that is narrower than a square.
-    if goals.iter().all(|goal| goal.visible_share < request.min_visible) {
+    if looks.iter().all(|look| look.visible_share < request.min_visible) {
         let step = reached.len().div_ceil(MAX_MORE);
-        goals = looked_at(reached.into_iter().step_by(step).collect());
+        looks = looked_at(reached.into_iter().step_by(step).collect());
     }
-    if goals.is_empty() {
+    if looks.is_empty() {
         return Err(NoGoal::Unreachable);
     }
-    let best_share = goals.iter().map(|goal| goal.visible_share).fold(0.0, f64::max);
+    let best_share = looks.iter().map(|look| look.visible_share).fold(0.0, f64::max);
     let least = request.min_visible.max(SHARE_OF_BEST * best_share);
-    let mut seeing: Vec<Goal> = goals.into_iter().filter(|goal| goal.visible_share >= least).collect();
+    let mut seeing: Vec<Look> = looks.into_iter().filter(|look| look.visible_share >= least).collect();
     if seeing.is_empty() {
         return Err(NoGoal::NotVisible);
     }
     seeing.sort_by(|a, b| a.cost_m.total_cmp(&b.cost_m).then_with(|| place(a).total_cmp(&place(b))));
-    let mut best: Vec<Goal> = Vec::new();
-    for goal in seeing {
-        let is_apart = |other: &Goal| other.position_in_world.distance(goal.position_in_world) >= APART_M;
+    let mut best: Vec<Look> = Vec::new();
+    for look in seeing {
+        let is_apart = |other: &Look| other.position_in_world.distance(look.position_in_world) >= APART_M;
         if best.len() < request.limit && best.iter().all(is_apart) {
-            best.push(goal);
+            best.push(look);
         }
     }
-    Ok(best)
+    Ok(best.iter().filter_map(|look| goal(around, &target, look)).collect())
 }
 
-fn place(goal: &Goal) -> f64 {
-    goal.position_in_world.x + 1e3 * goal.position_in_world.y
+fn place(look: &Look) -> f64 {
+    look.position_in_world.x + 1e3 * look.position_in_world.y
 }
 
 /// Returns the cells with a point within a horizontal distance, and those cells alone, in the order of their numbers.
@@ -142,43 +142,64 @@ struct Target<'a> {
     points: &'a [DVec3],
     /// Those that are looked at.
     samples: Vec<DVec3>,
-    thing: sight::Thing,
+    thing: sight::Thing<'a>,
 }
 
 impl<'a> Target<'a> {
-    fn new(window: &Window, points: &'a [DVec3]) -> Self {
+    fn new(around: &Around<'a>, request: &GoalRequest, points: &'a [DVec3]) -> Self {
         let step = points.len().div_ceil(SAMPLES).max(1);
         let samples = points.iter().copied().step_by(step).collect();
-        Self { points, samples, thing: sight::Thing::new(window, points) }
+        Self { points, samples, thing: sight::Thing::new(around.space, points, request.reach_m) }
+    }
+
+    /// Returns the horizontal distance to the nearest of some points.
+    fn distance(points: &[DVec3], [x, y]: [f64; 2]) -> f64 {
+        // Several minima at a time, as each waits for the one before.
+        let mut least = [f64::INFINITY; 8];
+        for points in points.chunks(least.len()) {
+            for (least, p) in least.iter_mut().zip(points) {
+                *least = least.min((p.x - x).powi(2) + (p.y - y).powi(2));
+            }
+        }
+        least.into_iter().fold(f64::INFINITY, f64::min).sqrt()
     }
 }
 
-/// Returns the pose at a candidate; `None` if the thing is out of reach after all.
-fn goal(around: &Around<'_>, request: &GoalRequest, target: &Target<'_>, of: Candidate) -> Option<Goal> {
-    let Target { points, samples, thing } = target;
-    let window = &around.space.window;
-    let [x, y] = window.centre_of(of.cell);
-    // Several minima at a time, as each waits for the one before.
-    let mut least = [f64::INFINITY; 8];
-    for points in points.chunks(least.len()) {
-        for (least, p) in least.iter_mut().zip(points) {
-            *least = least.min((p.x - x).powi(2) + (p.y - y).powi(2));
-        }
-    }
-    let distance_m = least.into_iter().fold(f64::INFINITY, f64::min).sqrt();
-    if distance_m > request.reach_m {
+/// What a sensor at a candidate sees.
+struct Look {
+    of: Candidate,
+    position_in_world: DVec3,
+    sensor_in_world: DVec3,
+    /// By sample: whether it is seen.
+    seen: u128,
+    visible_share: f64,
+    /// With what is seen.
+    cost_m: f64,
+}
+
+/// Looks at the thing from a candidate; `None` if the thing is out of reach after all.
+fn look(around: &Around<'_>, request: &GoalRequest, target: &Target<'_>, of: Candidate) -> Option<Look> {
+    let [x, y] = around.space.window.centre_of(of.cell);
+    let mut pieces = target.points.chunks(64);
+    if !pieces.any(|points| Target::distance(points, [x, y]) <= request.reach_m) {
         return None;
     }
     let position_in_world = DVec3::new(x, y, around.floor_height(of.cell)?);
     let sensor_in_world = position_in_world + DVec3::Z * request.sensor_height_m;
-    let seen: Vec<DVec3> = samples
-        .iter()
-        .copied()
-        .filter(|point| sight::sees(around.space, thing, sensor_in_world, *point))
-        .collect();
-    let visible_share = seen.len() as f64 / samples.len() as f64;
-    let looked_at = if seen.is_empty() { samples } else { &seen };
-    let middle = looked_at.iter().sum::<DVec3>() / looked_at.len() as f64;
+    let voxel = around.space.window.voxel_of(sensor_in_world);
+    let sees = |point: &DVec3| u128::from(sight::sees(&target.thing, sensor_in_world, voxel, *point));
+    let seen = (0..).zip(&target.samples).map(|(bit, point)| sees(point) << bit).fold(0, |all, of| all | of);
+    let visible_share = f64::from(seen.count_ones()) / target.samples.len() as f64;
+    let cost_m = of.cost_m + SIGHT_WEIGHT_M * (1.0 - visible_share);
+    Some(Look { of, position_in_world, sensor_in_world, seen, visible_share, cost_m })
+}
+
+/// Returns the pose of a candidate that sees the thing.
+fn goal(around: &Around<'_>, target: &Target<'_>, look: &Look) -> Option<Goal> {
+    let Look { of, position_in_world, sensor_in_world, seen, visible_share, cost_m } = *look;
+    let [x, y] = [position_in_world.x, position_in_world.y];
+    let points = (0..).zip(&target.samples).filter(|(bit, _)| seen >> bit & 1 != 0).map(|(_, point)| point);
+    let middle = points.sum::<DVec3>() / f64::from(seen.count_ones());
     let yaw_rad = (middle.y - y).atan2(middle.x - x);
     Some(Goal {
         position_in_world,
@@ -188,9 +209,9 @@ fn goal(around: &Around<'_>, request: &GoalRequest, target: &Target<'_>, of: Can
         sensor_in_world,
         clearance_m: around.clearance(of.cell),
         visible_share,
-        path_m: around.paths.to(of.cell)? * window.voxel,
-        distance_m,
-        cost_m: of.cost_m + SIGHT_WEIGHT_M * (1.0 - visible_share),
+        path_m: around.paths.to(of.cell)? * around.space.window.voxel,
+        distance_m: Target::distance(target.points, [x, y]),
+        cost_m,
     })
 }
 

@@ -54,7 +54,7 @@ impl Ground {
 }
 
 /// Returns occupied and free voxels of the 16 columns of voxels in a column of blocks; bit z is the voxel at height z.
-fn voxels_of(blocks: &[Stacked]) -> [[u128; 2]; 16] {
+pub fn voxels_of(blocks: &[Stacked]) -> [[u128; 2]; 16] {
     let mut voxels = [[0u128; 2]; 16];
     // Most blocks are free as a whole.
     let mut all_free = 0;

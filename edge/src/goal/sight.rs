@@ -1,46 +1,117 @@
 //! What a sensor sees of a thing: straight lines through free places.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::HashSet;
 
 use glam::DVec3;
 use slag_common::occupancy::BLOCK_EDGE;
 
-use super::space::{Space, Window};
+use super::ground::voxels_of;
+use super::space::{COLUMN_BLOCKS, Space};
 
 /// Distance from a point of the thing within which the line need not be free, in edges of a voxel: the thing's own surface, and
 /// the voxels just before it, are occupied or unknown.
 const TOLERANCE: f64 = 2.0;
+/// Voxels of a column.
+const HEIGHT: i32 = COLUMN_BLOCKS * BLOCK_EDGE;
+/// Most columns of voxels that are kept at hand, 17 MB: lines to larger things look up every voxel.
+const MAX_AT_HAND: usize = 1 << 19;
+
+/// The voxels of a column, by height.
+type Bits = [u64; HEIGHT as usize / 64];
 
 /// A thing, as lines of sight meet it.
-pub struct Thing {
-    /// By block: the voxels that its surface may occupy, those with a point of it and their neighbours. Voxels are occupied up to
-    /// 0.94 edges from a surface, so there are no others.
-    blocks: HashMap<[i32; 3], u64>,
+pub struct Thing<'a> {
+    space: &'a Space,
+    /// The cells around it: first, and along x and y.
+    first: [i32; 2],
+    n: [usize; 2],
+    /// By those cells: free voxels.
+    free: Vec<Bits>,
+    /// Voxels that its surface may occupy, those with a point of it and their neighbours. Voxels are occupied up to 0.94 edges
+    /// from a surface, so there are no others.
+    own: Vec<Bits>,
+    /// Those outside the cells at hand.
+    own_elsewhere: HashSet<[i32; 3]>,
     /// The lowest voxel that lies wholly above its bottom.
     first_above_bottom: i32,
     /// Height of its bottom, world frame.
     bottom: f64,
 }
 
-impl Thing {
-    /// Makes the thing with a surface at `points`.
-    pub fn new(window: &Window, points: &[DVec3]) -> Self {
-        let voxels: BTreeSet<[i32; 3]> = points.iter().map(|point| window.voxel_of(*point)).collect();
-        let mut blocks: HashMap<[i32; 3], u64> = HashMap::new();
-        for [x, y, z] in voxels {
-            let beside = |of: i32| of.saturating_sub(1)..=of.saturating_add(1);
-            for at in beside(x).flat_map(|x| beside(y).flat_map(move |y| beside(z).map(move |z| [x, y, z]))) {
-                let (block, bit) = place(at);
-                *blocks.entry(block).or_default() |= bit;
+impl<'a> Thing<'a> {
+    /// Makes the thing with a surface at `points`, for sensors up to `reach_m` from it.
+    pub fn new(space: &'a Space, points: &[DVec3], reach_m: f64) -> Self {
+        let window = &space.window;
+        let edge = BLOCK_EDGE as usize;
+        let voxels = || points.iter().map(|point| window.voxel_of(*point));
+        let reach = (reach_m / window.voxel).ceil() as i32 + 2;
+        // Whole columns of blocks inside the window.
+        let blocks = |axis: usize| {
+            let of_axis = || voxels().map(|voxel| voxel[axis]);
+            let low = of_axis().min().unwrap_or(0).saturating_sub(reach).div_euclid(BLOCK_EDGE);
+            let high = of_axis().max().unwrap_or(0).saturating_add(reach).div_euclid(BLOCK_EDGE);
+            let clip = |at: i32| at.clamp(0, window.n[axis] as i32) as usize;
+            clip(low)..clip(high + 1)
+        };
+        let [xs, mut ys] = [blocks(0), blocks(1)];
+        if xs.len() * ys.len() * edge * edge > MAX_AT_HAND {
+            ys = 0..0;
+        }
+        let n = [xs.len() * edge, ys.len() * edge];
+        let mut free = vec![Bits::default(); n[0] * n[1]];
+        for (x, y) in xs.clone().flat_map(|x| ys.clone().map(move |y| (x, y))) {
+            let corner = (x - xs.start) * edge * n[1] + (y - ys.start) * edge;
+            for (cell, [_, of_cell]) in voxels_of(space.column(x * window.n[1] + y)).into_iter().enumerate() {
+                free[corner + cell / edge * n[1] + cell % edge] = [of_cell as u64, (of_cell >> 64) as u64];
             }
         }
         let bottom = points.iter().map(|point| point.z).fold(f64::INFINITY, f64::min);
         let [.., z] = window.voxel_of(DVec3::Z * bottom);
-        Self { blocks, first_above_bottom: z.saturating_add(1), bottom }
+        let mut thing = Self {
+            space,
+            first: [xs.start, ys.start].map(|at| at as i32 * BLOCK_EDGE),
+            n,
+            own: vec![Bits::default(); free.len()],
+            free,
+            own_elsewhere: HashSet::new(),
+            first_above_bottom: z.saturating_add(1),
+            bottom,
+        };
+        for [x, y, z] in voxels() {
+            let beside = |of: i32| of.saturating_sub(1)..=of.saturating_add(1);
+            for at in beside(x).flat_map(|x| beside(y).flat_map(move |y| beside(z).map(move |z| [x, y, z]))) {
+                match thing.cell(at) {
+                    Some(cell) => thing.own[cell][at[2] as usize / 64] |= 1 << (at[2] % 64),
+                    None => _ = thing.own_elsewhere.insert(at),
+                }
+            }
+        }
+        thing
     }
 
-    fn may_occupy(&self, block: [i32; 3], bit: u64) -> bool {
-        self.blocks.get(&block).is_some_and(|mask| mask & bit != 0)
+    /// Returns the cell at hand with a voxel.
+    fn cell(&self, [x, y, z]: [i32; 3]) -> Option<usize> {
+        let x = x.wrapping_sub(self.first[0]) as u32 as usize;
+        let y = y.wrapping_sub(self.first[1]) as u32 as usize;
+        let is_at_hand = x < self.n[0] && y < self.n[1] && (0..HEIGHT).contains(&z);
+        is_at_hand.then(|| x * self.n[1] + y)
+    }
+
+    fn is_free(&self, at: [i32; 3]) -> bool {
+        match self.cell(at) {
+            Some(cell) => self.free[cell][at[2] as usize / 64] >> (at[2] % 64) & 1 != 0,
+            None => {
+                let (block, bit) = place(at);
+                self.space.free(block) & bit != 0
+            }
+        }
+    }
+
+    fn may_occupy(&self, at: [i32; 3]) -> bool {
+        match self.cell(at) {
+            Some(cell) => self.own[cell][at[2] as usize / 64] >> (at[2] % 64) & 1 != 0,
+            None => self.own_elsewhere.contains(&at),
+        }
     }
 }
 
@@ -50,7 +121,7 @@ fn place(at: [i32; 3]) -> ([i32; 3], u64) {
     (at.map(|v| v.div_euclid(BLOCK_EDGE)), 1 << (z + BLOCK_EDGE * (y + BLOCK_EDGE * x)))
 }
 
-/// Returns whether a point of a thing is seen: every voxel on the line from the sensor is free until the line enters voxels that
+/// Returns whether a point of a thing is seen by a sensor in the voxel `at`: every voxel on the line from the sensor is free until the line enters voxels that
 /// the thing's own surface may occupy, which it does not leave, or comes within [`TOLERANCE`] of the point.
 ///
 /// A sensor below the whole thing looks at the board or the table that carries it. Their highest voxels belong to both, so only
@@ -58,8 +129,9 @@ fn place(at: [i32; 3]) -> ([i32; 3], u64) {
 ///
 /// The voxels that a line passes are those of Amanatides and Woo, "A Fast Voxel Traversal Algorithm" (1987). Unknown ones hide
 /// what is behind them.
-pub fn sees(space: &Space, thing: &Thing, sensor: DVec3, point: DVec3) -> bool {
-    let voxel = space.window.voxel;
+pub fn sees(thing: &Thing<'_>, sensor: DVec3, at: [i32; 3], point: DVec3) -> bool {
+    let window = &thing.space.window;
+    let voxel = window.voxel;
     let line = point - sensor;
     let length = line.length();
     if length <= 0.0 {
@@ -67,11 +139,9 @@ pub fn sees(space: &Space, thing: &Thing, sensor: DVec3, point: DVec3) -> bool {
     }
     let lowest = if sensor.z < thing.bottom { thing.first_above_bottom } else { i32::MIN };
     let direction = line / length;
-    let mut at = space.window.voxel_of(sensor);
-    let corner = DVec3::from(space.window.first.map(|b| f64::from(b * BLOCK_EDGE))) * voxel;
-    // Distance along the line to the next side of a voxel, and between two sides.
-    let mut next = DVec3::INFINITY;
-    let between = (voxel / direction).abs();
+    let corner = DVec3::from(window.first.map(|b| f64::from(b * BLOCK_EDGE))) * voxel;
+    let mut next = [f64::INFINITY; 3];
+    let between = (voxel / direction).abs().to_array();
     for axis in 0..3 {
         if direction[axis] != 0.0 {
             let side =
@@ -79,28 +149,96 @@ pub fn sees(space: &Space, thing: &Thing, sensor: DVec3, point: DVec3) -> bool {
             next[axis] = (side - sensor[axis]) / direction[axis];
         }
     }
-    let (mut entered, mut is_at_thing) = (0.0, false);
-    // A line stays in a block for several voxels.
-    let (mut known, mut free) = (None, 0);
+    let step = direction.to_array().map(|along| if along > 0.0 { 1 } else { -1 });
+    let mut walk = Walk { at, entered: 0.0, next, between, step };
+    let mut is_at_thing = false;
     loop {
-        let (block, bit) = place(at);
-        if known != Some(block) {
-            (known, free) = (Some(block), space.free(block));
-        }
-        let is_free = free & bit != 0;
+        let is_free = thing.is_free(walk.at);
         if !is_free || is_at_thing {
             is_at_thing = true;
-            let is_near = entered >= length - TOLERANCE * voxel || thing.may_occupy(block, bit);
-            if !is_near || !is_free && at[2] < lowest {
+            let is_near = walk.entered >= length - TOLERANCE * voxel || thing.may_occupy(walk.at);
+            if !is_near || !is_free && walk.at[2] < lowest {
                 return false;
             }
         }
-        let axis = (0..3).fold(0, |least, axis| if next[axis] < next[least] { axis } else { least });
-        if next[axis] >= length {
+        walk.go_on();
+        if walk.entered >= length {
             return true;
         }
-        entered = next[axis];
-        at[axis] += if direction[axis] > 0.0 { 1 } else { -1 };
-        next[axis] += between[axis];
+    }
+}
+
+/// Goes from voxel to voxel along a line.
+struct Walk {
+    at: [i32; 3],
+    /// Distances along the line: to where it entered the voxel, to the next side across each axis, and between two sides.
+    entered: f64,
+    next: [f64; 3],
+    between: [f64; 3],
+    step: [i32; 3],
+}
+
+impl Walk {
+    fn go_on(&mut self) {
+        let [x, y, z] = self.next;
+        // Each axis in a branch of its own: no address to wait for.
+        match (y < x, z < x.min(y)) {
+            (_, true) => self.pass(2),
+            (true, _) => self.pass(1),
+            _ => self.pass(0),
+        }
+    }
+
+    #[inline(always)]
+    fn pass(&mut self, axis: usize) {
+        self.entered = self.next[axis];
+        self.at[axis] += self.step[axis];
+        self.next[axis] += self.between[axis];
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use slag_common::occupancy::{Block, BuiltOccupancy, VoxelState};
+    use slag_math::random::Random;
+
+    use super::*;
+    use crate::goal::space::Window;
+
+    /// Oracle: the states of two shards' voxels, and every point beside every voxel, at hand or not.
+    #[test]
+    fn voxels_around_a_thing_are_those_of_the_shards() {
+        let mut random = Random::new(6);
+        let window = Window::around(DVec3::ZERO, 1.0, 0.1);
+        let all = (-3..3).flat_map(|x| (-3..3).flat_map(move |y| (-8..30).map(move |z| [x, y, z])));
+        let blocks: Vec<Block> =
+            all.map(|at| Block { at, occupied: 0, free: random.bits() | random.bits() }).collect();
+        let of_shard = |odd: bool| -> Vec<Block> {
+            blocks.iter().copied().filter(|block| (block.at.iter().sum::<i32>() % 2 != 0) == odd).collect()
+        };
+        let packed = [false, true].map(|odd| BuiltOccupancy::pack(0.1, 0.1, 2, &of_shard(odd)));
+        let shards = [packed[0].view(), packed[1].view()];
+        let space = Space::gather(window, &shards).expect("few blocks");
+        let n = window.cells().map(|n| n as i32);
+        // Also a thing that reaches out of the window.
+        for (centre, reach_m) in [(0.0, 0.0), (0.2, 0.3), (-1.2, 0.2), (0.0, 9.0)] {
+            let point = |random: &mut Random| {
+                DVec3::new(0.0, 0.0, 0.4) + DVec3::from([0; 3].map(|_| centre + random.between(-0.3, 0.3)))
+            };
+            let points: Vec<DVec3> = (0..9).map(|_| point(&mut random)).collect();
+            let thing = Thing::new(&space, &points, reach_m);
+            let voxels: Vec<[i32; 3]> = points.iter().map(|point| window.voxel_of(*point)).collect();
+            let is_beside = |of: &[i32; 3], at: [i32; 3]| (0..3).all(|axis| (of[axis] - at[axis]).abs() <= 1);
+            for at in (-9..n[0] + 2)
+                .flat_map(|x| (-9..n[1] + 2).flat_map(move |y| (-2..130).map(move |z| [x, y, z])))
+            {
+                let on_lattice = [0, 1, 2].map(|axis| at[axis] + window.first[axis] * BLOCK_EDGE);
+                let is_inside = (0..3).all(|axis| at[axis] >= 0 && at[axis] < [n[0], n[1], HEIGHT][axis]);
+                let is_free = shards.iter().any(|shard| shard.state(on_lattice) == VoxelState::Free);
+                assert_eq!(thing.is_free(at), is_inside && is_free, "{at:?}");
+                let is_own = voxels.iter().any(|of| is_beside(of, at));
+                assert_eq!(thing.may_occupy(at), is_own, "{at:?}");
+            }
+        }
     }
 }
