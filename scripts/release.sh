@@ -9,6 +9,8 @@
 # The version is that of the workspace (Cargo.toml); CHANGELOG.md needs its section, as "## 0.1.0".
 set -eu
 cd "$(dirname "$0")/.."
+# All below looks in target.
+unset CARGO_TARGET_DIR
 fail() {
     echo "release: $*" >&2
     exit 1
@@ -84,6 +86,7 @@ if has arm64; then
     jetson/deb.sh arm64 target/aarch64-unknown-linux-gnu/dist/slag-edge "$out"
 fi
 if has image; then
+    sh scripts/setup.sh image
     encoder/deploy/image.sh amd64 "$built/slag-encoder" "$out"
 fi
 if has sbom; then
