@@ -34,6 +34,9 @@ pub struct RefineArgs {
     /// Weight of the larger superpoint's mean, relative to the result so far
     #[arg(long, value_name = "TIMES", value_parser = amount)]
     coarse: Option<f32>,
+    /// Weight of the mean of the Gaussian's object, relative to the result so far
+    #[arg(long, value_name = "TIMES", value_parser = amount)]
+    object: Option<f32>,
     /// Whether Gaussians without evidence take their superpoint's mean
     #[arg(long, value_name = "BOOL")]
     fill: Option<bool>,
@@ -55,6 +58,7 @@ impl RefineArgs {
             median_steps: self.median_steps.unwrap_or(preset.median_steps),
             superpoint: self.superpoint.unwrap_or(preset.superpoint),
             coarse: self.coarse.unwrap_or(preset.coarse),
+            object: self.object.unwrap_or(preset.object),
             fill: self.fill.unwrap_or(preset.fill),
         }
     }

@@ -26,7 +26,7 @@ pub(super) const TUNED: [&str; 13] = [
     "segmenter",
 ];
 /// Flags of the refinements, which a front may set as well.
-pub(super) const REFINEMENTS: [&str; 10] = [
+pub(super) const REFINEMENTS: [&str; 11] = [
     "min_region_share",
     "min_view_share",
     "min_weight",
@@ -36,6 +36,7 @@ pub(super) const REFINEMENTS: [&str; 10] = [
     "median_steps",
     "superpoint",
     "coarse",
+    "object",
     "fill",
 ];
 

@@ -19,7 +19,7 @@ use super::views::DoneViews;
 use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
 use crate::lift::photos::{self, Photo};
 use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS};
-use crate::lift::refine::Refinement;
+use crate::lift::refine::{Refinement, Subject};
 use crate::lift::{Aggregation, ContributionError, ContributionIndex, RegionTable};
 use crate::objects::{self, Object, ObjectsReport, SceneObjects};
 use crate::occupancy::{OccupancyReport, SceneOccupancy};
@@ -261,11 +261,12 @@ impl<'a> CellBuilder<'a> {
         let aggregation = settings.aggregation;
         let refinement = self.context.time("refine", || {
             let contributions = (&self.index, &mut self.table);
-            let scene = (&inputs.scene, &inputs.split);
+            let object_of = objects.as_ref().map_or(&[][..], |objects| &objects.object_of);
+            let subject = Subject { scene: &inputs.scene, split: &inputs.split, object_of };
             let cancel = self.context.cancel();
             let photos = &self.photos;
             let prepare =
-                || Refinement::prepare(aggregation, contributions, scene, photos, self.group_bytes, cancel);
+                || Refinement::prepare(aggregation, contributions, subject, photos, self.group_bytes, cancel);
             self.context.install(prepare)
         })?;
         if self.context.is_cancelled() {

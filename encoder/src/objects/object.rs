@@ -6,10 +6,11 @@ use slag_common::frames::Aabb;
 use slag_common::manifest::Calibration;
 use slag_common::objects::public_id;
 
+use crate::lift::superpoint::NO_SUPERPOINT;
 use crate::progress::FoundObject;
 
 /// Marks a mask without a cluster, and a Gaussian without an object.
-pub const NONE: u32 = u32::MAX;
+pub const NONE: u32 = NO_SUPERPOINT;
 
 /// A thing that several views agree on.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

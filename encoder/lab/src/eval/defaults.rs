@@ -52,6 +52,8 @@ pub struct DefaultsRow {
     pub kind: EvalKind,
     /// Mean intersection over union of the argmax over all categories.
     pub miou: Option<f64>,
+    /// The same, with words compared by how near a score is to the word's own best ones.
+    pub miou_by_own_best: Option<f64>,
     /// Mean average precision over words.
     pub average_precision: Option<f64>,
     /// Mean area under the ROC curve over words.
@@ -119,6 +121,7 @@ pub fn run(
                         is_default,
                         kind: *kind,
                         miou: report.multi_class.first().and_then(|all| all.miou),
+                        miou_by_own_best: report.multi_class_by_own_best.first().and_then(|all| all.miou),
                         average_precision: report.mean_average_precision,
                         area_under_roc: report.mean_area_under_roc,
                         instances: report.instances,
@@ -142,9 +145,9 @@ impl fmt::Display for DefaultsReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,
-            "| scene | masks | aggregation | by | mIoU | AP | AUC | things found at IoU 0.25, 0.5 | objects that are two things, of all; things split |"
+            "| scene | masks | aggregation | by | mIoU | by own best | AP | AUC | things found at IoU 0.25, 0.5 | objects that are two things, of all; things split |"
         )?;
-        writeln!(f, "|---|---|---|---|---|---|---|---|---|")?;
+        writeln!(f, "|---|---|---|---|---|---|---|---|---|---|")?;
         for row in &self.rows {
             let show = |value: Option<f64>| value.map_or("-".into(), |v| format!("{v:.3}"));
             let masks = match row.masks {
@@ -156,7 +159,8 @@ impl fmt::Display for DefaultsReport {
                 EvalKind::Gaussians => "Gaussian",
                 EvalKind::Objects => "object",
             };
-            let figures = [row.miou, row.average_precision, row.area_under_roc].map(show).join(" | ");
+            let figures = [row.miou, row.miou_by_own_best, row.average_precision, row.area_under_roc];
+            let figures = figures.map(show).join(" | ");
             let found = row.instances.as_ref().map_or(" | ".into(), |found| {
                 let InstanceReport { any, n_merged_objects, n_objects, n_split_things, .. } = found;
                 format!("{any} | {n_merged_objects} of {n_objects}; {n_split_things}")

@@ -15,6 +15,7 @@ use super::filter::{self, Filter};
 use super::instances;
 use super::metrics::{Confusion, area_under_roc, average_precision, iou_of_sets, mean};
 use super::on_views::on_views;
+use super::own_best;
 use super::report::{EvalReport, Subset, WordReport};
 use super::settings::{ABSENT, EvalKind, EvalSettings};
 use super::truth::Truth;
@@ -134,12 +135,16 @@ pub fn labelled(
         .filter(|id| !thing_ids.contains(id) && !truth.background.iter().any(|thing| thing.id == **id))
         .count();
     let class_of = |gaussian: usize| class_of_id.get(&truth.id_of_gaussian[gaussian]).copied();
-    let confusion = |n_classes: usize| {
+    let own_best = own_best::offsets(&scores);
+    let confusion = |n_classes: usize, offsets: &[f32]| {
+        let score = |class: usize, gaussian: usize| {
+            scores[class][gaussian] - offsets.get(class).copied().unwrap_or_default()
+        };
         let mut confusion = Confusion::new(n_classes);
         let best = |gaussian: usize| {
             (0..n_classes)
                 .filter(|c| !scores[*c][gaussian].is_nan())
-                .max_by(|a, b| scores[*a][gaussian].total_cmp(&scores[*b][gaussian]).then(b.cmp(a)))
+                .max_by(|a, b| score(*a, gaussian).total_cmp(&score(*b, gaussian)).then(b.cmp(a)))
         };
         let mut answers: Vec<Option<usize>> = (0..truth.id_of_gaussian.len()).map(best).collect();
         if let (Some(Filter::Majority), Some(superpoints)) = (settings.filter, &superpoints) {
@@ -153,18 +158,16 @@ pub fn labelled(
         confusion
     };
     let n_classes = classes.len();
-    let whole = confusion(n_classes);
-    let multi_class = std::iter::once(n_classes)
-        .chain(SUBSETS.into_iter().filter(|n| *n < n_classes))
-        .map(|n| {
-            let confusion = if n == n_classes { whole.clone() } else { confusion(n) };
-            Subset {
-                n_classes: n,
-                miou: mean((0..n).map(|c| confusion.iou(c))),
-                macc: mean((0..n).map(|c| confusion.accuracy(c))),
-            }
-        })
-        .collect();
+    let whole = confusion(n_classes, &[]);
+    let subsets = |offsets: &[f32]| -> Vec<Subset> {
+        let sizes = std::iter::once(n_classes).chain(SUBSETS.into_iter().filter(|n| *n < n_classes));
+        let subset = |n: usize| {
+            let confusion = confusion(n, offsets);
+            let (iou, accuracy) = (|c| confusion.iou(c), |c| confusion.accuracy(c));
+            Subset { n_classes: n, miou: mean((0..n).map(iou)), macc: mean((0..n).map(accuracy)) }
+        };
+        sizes.map(subset).collect()
+    };
     let n_without_evidence =
         of_things.iter().filter(|i| class_of(**i).is_some() && scores[0][**i].is_nan()).count();
 
@@ -201,7 +204,8 @@ pub fn labelled(
         kind: if objects.is_some() { EvalKind::Objects } else { EvalKind::Gaussians },
         instances,
         threshold,
-        multi_class,
+        multi_class: subsets(&[]),
+        multi_class_by_own_best: subsets(&own_best),
         mean_iou_at_threshold: mean(words.iter().map(|w| w.iou_at_threshold)),
         mean_average_precision: mean(words.iter().map(|w| w.average_precision)),
         mean_area_under_roc: mean(words.iter().map(|w| w.area_under_roc)),

@@ -18,6 +18,7 @@ pub mod mask_noise;
 pub mod metrics;
 pub mod noise;
 mod on_views;
+mod own_best;
 pub mod protocol;
 #[cfg(test)]
 mod public_tests;

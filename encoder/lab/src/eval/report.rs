@@ -68,6 +68,8 @@ pub struct EvalReport {
     pub words: Vec<WordReport>,
     /// All classes, and the largest ones.
     pub multi_class: Vec<Subset>,
+    /// The same, with words compared by how near a score is to the word's own best ones (`own_best`).
+    pub multi_class_by_own_best: Vec<Subset>,
     /// Mean over words.
     pub mean_iou_at_threshold: Option<f64>,
     /// Mean over words.
@@ -106,8 +108,9 @@ impl fmt::Display for EvalReport {
             let figures = figures.map(|v| format!("{:>8}", show(v))).join(" ");
             writeln!(f, "{:<20} {:>9} {figures} {:>8}", w.word, w.n_gaussians, w.n_views)?;
         }
-        for s in &self.multi_class {
-            writeln!(f, "{} classes: mIoU {}, mAcc {}", s.n_classes, show(s.miou), show(s.macc))?;
+        for (s, own) in self.multi_class.iter().zip(&self.multi_class_by_own_best) {
+            write!(f, "{} classes: mIoU {}, mAcc {}; ", s.n_classes, show(s.miou), show(s.macc))?;
+            writeln!(f, "by each word's own best scores {}, {}", show(own.miou), show(own.macc))?;
         }
         writeln!(
             f,

@@ -1,4 +1,4 @@
-//! Gaussians share evidence within superpoints: each superpoint becomes one more region, a mixture of the masks of its
+//! Gaussians share evidence within superpoints and objects: each superpoint becomes one more region, a mixture of the masks of its
 //! Gaussians, and its Gaussians get an entry of that region.
 
 use rayon::prelude::*;

@@ -8,12 +8,12 @@
 //! | `agreement` | `agreement` | masks that other views contradict count less |
 //! | `equalise` | `equalisation` | views count more evenly, whatever their distance and slant |
 //! | `median` | `median_steps` | views that disagree count less: steps towards the geometric median |
-//! | `mixture` | `superpoint`, `coarse` | a Gaussian takes a share of its superpoint, then of a larger one |
+//! | `mixture` | `superpoint`, `coarse`, `object` | a Gaussian takes a share of its superpoint, then of a larger one, then of its object |
 //! | `mixture` | `fill` | a Gaussian without evidence takes its superpoint's mean |
 //!
-//! The result is again sparse contributions over regions. Weights of masks go into the [`RegionTable`], and a superpoint is
-//! one more region of it: a mixture of masks. So scores, shards and the published field need no special case, and a
-//! Gaussian gets at most two more entries.
+//! The result is again sparse contributions over regions. Weights of masks go into the [`RegionTable`], and a superpoint or
+//! object is one more region of it: a mixture of masks. So scores, shards and the published field need no special case, and a
+//! Gaussian gets at most three more entries.
 //!
 //! All decisions are made in principal coordinates of the mask vectors (`points`) and in one order: the result depends
 //! neither on threads nor on the memory budget.
@@ -39,7 +39,7 @@ use super::contributions::ContributionError;
 use super::index::ContributionIndex;
 use super::part::PartContributions;
 use super::photos::Photo;
-use super::superpoint::{Graph, Sketches, SuperpointSettings, Superpoints};
+use super::superpoint::{Graph, NO_SUPERPOINT, Sketches, SuperpointSettings, Superpoints};
 use super::table::RegionTable;
 use crate::cells::CellSplit;
 use crate::memory::{self, MemoryPlan, Phase};
@@ -58,8 +58,33 @@ pub struct Refinement {
     mask_counts: Vec<f32>,
     /// `[n_regions]`: each region's vector; empty where none is needed.
     region_points: Vec<Point>,
-    /// Of the finer superpoints, then of the larger ones.
+    /// Of the finer superpoints, then of the larger ones, then of the objects.
     mixtures: Vec<Mixtures>,
+}
+
+/// The Gaussians that contributions are refined for.
+#[derive(Clone, Copy)]
+pub struct Subject<'a> {
+    /// The scene.
+    pub scene: &'a Gaussians,
+    /// Its cells.
+    pub split: &'a CellSplit,
+    /// `[cell][N of the cell]`: the object of each Gaussian, [`NO_SUPERPOINT`] where it has none; empty without objects.
+    pub object_of: &'a [Vec<u32>],
+}
+
+impl Subject<'_> {
+    /// Returns the objects as a partition of the scene.
+    fn objects(&self) -> Superpoints {
+        let mut of_gaussian = vec![NO_SUPERPOINT; self.scene.len()];
+        for (cell, of_cell) in self.split.cells.iter().zip(self.object_of) {
+            for (gaussian, object) in cell.gaussians.iter().zip(of_cell) {
+                of_gaussian[*gaussian as usize] = *object;
+            }
+        }
+        let last = self.object_of.iter().flatten().filter(|object| **object != NO_SUPERPOINT).max();
+        Superpoints { of_gaussian, n: last.map_or(0, |last| *last as usize + 1) }
+    }
 }
 
 /// The passes over a scene's contributions that the refinements need.
@@ -98,7 +123,7 @@ impl Refinement {
     pub fn prepare(
         settings: Aggregation,
         (index, table): (&ContributionIndex, &mut RegionTable),
-        (scene, split): (&Gaussians, &CellSplit),
+        subject: Subject<'_>,
         photos: &[Photo],
         group_bytes: u64,
         cancel: &AtomicBool,
@@ -128,8 +153,8 @@ impl Refinement {
         if settings.agreement > 0.0 {
             goes_on = refinement.weigh_by_agreement(&passes, table, mask_points, mask_weights)?;
         }
-        if goes_on && settings.needs_superpoints() {
-            goes_on = refinement.make_mixtures(&passes, table, mask_points, (scene, split))?;
+        if goes_on && settings.needs_mixtures() {
+            goes_on = refinement.make_mixtures(&passes, table, mask_points, subject)?;
         }
         Ok(goes_on.then_some(refinement))
     }
@@ -158,14 +183,13 @@ impl Refinement {
         Ok(done)
     }
 
-    /// Finds superpoints and appends their mixtures to the table; returns false if cancelled.
-    fn make_mixtures(
-        &mut self,
+    /// Returns the superpoints of each scale with their weights; `None` if cancelled.
+    fn superpoints(
+        &self,
         passes: &Passes<'_>,
-        table: &mut RegionTable,
-        mask_points: &[Point],
-        (scene, split): (&Gaussians, &CellSplit),
-    ) -> Result<bool, ContributionError> {
+        table: &RegionTable,
+        Subject { scene, split, .. }: Subject<'_>,
+    ) -> Result<Option<Vec<(f32, Superpoints)>>, ContributionError> {
         let mut sketches = vec![0; scene.len() * AXES];
         let of_part = |mut contributions: PartContributions| {
             self.refine_own(&mut contributions);
@@ -178,7 +202,7 @@ impl Refinement {
             }
         })?;
         if !done {
-            return Ok(false);
+            return Ok(None);
         }
         // The parts of the pass are gone; without this the graph would come on top of them.
         memory::give_back();
@@ -192,8 +216,26 @@ impl Refinement {
             || partition(superpoint, superpoint > 0.0 || fill, SuperpointSettings::default()),
             || partition(coarse, coarse > 0.0, SuperpointSettings::coarse()),
         );
-        let scales: Vec<(f32, Superpoints)> = fine.into_iter().chain(larger).collect();
-        drop(graph);
+        Ok(Some(fine.into_iter().chain(larger).collect()))
+    }
+
+    /// Finds superpoints and appends their mixtures, and those of objects, to the table; returns false if cancelled.
+    fn make_mixtures(
+        &mut self,
+        passes: &Passes<'_>,
+        table: &mut RegionTable,
+        mask_points: &[Point],
+        subject: Subject<'_>,
+    ) -> Result<bool, ContributionError> {
+        let mut scales = Vec::new();
+        if self.settings.needs_superpoints() {
+            let Some(found) = self.superpoints(passes, table, subject)? else { return Ok(false) };
+            scales = found;
+        }
+        if self.settings.object > 0.0 {
+            scales.push((self.settings.object, subject.objects()));
+        }
+        let split = subject.split;
         let mut sums: Vec<SuperpointSums> = scales.iter().map(|(_, of)| SuperpointSums::new(of.n)).collect();
         let of_part = |mut contributions: PartContributions| -> Vec<PartSums> {
             self.refine_own(&mut contributions);
@@ -209,7 +251,7 @@ impl Refinement {
         for ((weight, superpoints), sums) in scales.into_iter().zip(sums) {
             self.mixtures.push(Mixtures::new(weight, superpoints, sums, table, mask_points));
         }
-        // The larger superpoints are mixed with rows that hold entries of the finer ones.
+        // The next scale is mixed with rows that hold entries of those before it.
         let of_mixtures = points::of_regions(table, mask_points, self.region_points.len()..table.len());
         self.region_points.extend(of_mixtures);
         Ok(true)
@@ -218,16 +260,16 @@ impl Refinement {
     /// Reserves the lists over all Gaussians: the superpoints' graph while masks are weighed, and each Gaussian's
     /// superpoints until the last cell.
     pub fn reserve(memory: &mut MemoryPlan, settings: &Aggregation, n_gaussians: usize) {
-        if !settings.needs_superpoints() {
-            return;
-        }
         let n_scales =
             usize::from(settings.superpoint > 0.0 || settings.fill) + usize::from(settings.coarse > 0.0);
-        let sketches_bytes = (n_gaussians * (AXES + size_of::<u32>())) as u64;
-        let settings = SuperpointSettings::default();
-        let graph_bytes = Superpoints::working_bytes(n_gaussians, n_scales, &settings);
-        memory.reserve(Phase::Refine, "superpoints of all Gaussians", sketches_bytes + graph_bytes);
-        let labels_bytes = (n_gaussians * n_scales * size_of::<u32>()) as u64;
+        if settings.needs_superpoints() {
+            let sketches_bytes = (n_gaussians * (AXES + size_of::<u32>())) as u64;
+            let settings = SuperpointSettings::default();
+            let graph_bytes = Superpoints::working_bytes(n_gaussians, n_scales, &settings);
+            memory.reserve(Phase::Refine, "superpoints of all Gaussians", sketches_bytes + graph_bytes);
+        }
+        let n_partitions = n_scales + usize::from(settings.object > 0.0);
+        let labels_bytes = (n_gaussians * n_partitions * size_of::<u32>()) as u64;
         memory.reserve(Phase::Cells, "the superpoints of each Gaussian", labels_bytes);
     }
 

@@ -29,6 +29,8 @@ pub struct Aggregation {
     pub superpoint: f32,
     /// Weight of the larger superpoint's mean, relative to the result so far.
     pub coarse: f32,
+    /// Weight of the mean of the Gaussian's object, relative to the result so far.
+    pub object: f32,
     /// Whether Gaussians without evidence take their superpoint's mean.
     pub fill: bool,
 }
@@ -45,6 +47,7 @@ impl Aggregation {
         median_steps: 0,
         superpoint: 0.0,
         coarse: 0.0,
+        object: 0.0,
         fill: false,
     };
     /// The refinements that help both on trained splats and on generated ones (docs/accuracy.md). Pruning by region helps
@@ -55,6 +58,7 @@ impl Aggregation {
         truncation_power: 2.0,
         superpoint: 1.5,
         coarse: 0.5,
+        object: 0.25,
         fill: true,
         ..Self::PLAIN
     };
@@ -83,8 +87,13 @@ impl Aggregation {
         self.superpoint > 0.0 || self.coarse > 0.0 || self.fill
     }
 
+    /// Returns whether Gaussians share evidence at all.
+    pub(super) fn needs_mixtures(&self) -> bool {
+        self.needs_superpoints() || self.object > 0.0
+    }
+
     /// Returns whether the vectors of regions are needed, in principal coordinates.
     pub(super) fn needs_points(&self) -> bool {
-        self.agreement != 0.0 || self.median_steps != 0 || self.needs_superpoints()
+        self.agreement != 0.0 || self.median_steps != 0 || self.needs_mixtures()
     }
 }

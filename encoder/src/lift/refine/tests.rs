@@ -42,6 +42,11 @@ fn split() -> CellSplit {
     CellSplit { cells: vec![cell], cell_of_gaussian: vec![0; N], local_of_gaussian, n_rejected: 0 }
 }
 
+/// Objects: the first two patches but for every fourth Gaussian, which has none.
+fn object_of() -> [Vec<u32>; 1] {
+    [(0..N).map(|i| if i < 60 && i % 4 > 0 { i as u32 / 30 } else { NO_SUPERPOINT }).collect()]
+}
+
 /// Views of two masks a patch, which overlap; the masks of view 3 have the others' vectors turned round.
 fn views() -> Vec<ViewContributions> {
     let view = |v: u64| {
@@ -102,7 +107,7 @@ fn lifted(settings: Aggregation, group_bytes: u64) -> Lifted {
     let refinement = Refinement::prepare(
         settings,
         (index, table),
-        (&scene, &split),
+        Subject { scene: &scene, split: &split, object_of: &object_of() },
         &photos(),
         group_bytes,
         &AtomicBool::new(false),
@@ -229,7 +234,7 @@ fn the_plain_average_is_left_alone_and_its_file_is_what_it_was() {
     let none = Refinement::prepare(
         Aggregation::PLAIN,
         (index, table),
-        (&scene, &split),
+        Subject { scene: &scene, split: &split, object_of: &object_of() },
         &photos(),
         u64::MAX,
         &AtomicBool::new(false),
@@ -330,6 +335,43 @@ fn a_superpoint_gives_its_part_and_fills_what_no_view_sees() {
     }
 }
 
+/// Oracle: in float64, a third of a row is the sum of its object's Gaussians, by length; others are left as they are. Superpoints
+/// come first.
+#[test]
+fn an_object_gives_its_part_to_its_gaussians() {
+    let views = views();
+    let [object_of] = object_of();
+    let of = |k: usize| -> Vec<f64> {
+        let mut sum = vec![0.0; DIM];
+        for (view, entries) in views.iter().zip(row(&views, k)) {
+            contribution(view, &entries, &[1.0; 6]).iter().enumerate().for_each(|(c, x)| sum[c] += x);
+        }
+        sum
+    };
+    let unit = |v: &[f64]| -> Vec<f64> { v.iter().map(|x| x / norm(v).max(1e-12)).collect() };
+    let sum_of = |members: &dyn Fn(usize) -> bool| {
+        let mut sum = vec![0.0; DIM];
+        (0..N).filter(|k| members(*k)).for_each(|k| of(k).iter().enumerate().for_each(|(c, x)| sum[c] += x));
+        unit(&sum)
+    };
+    for superpoint in [0.0, 1.0] {
+        let found = lifted(Aggregation { superpoint, object: 0.5, ..Aggregation::PLAIN }, u64::MAX);
+        for k in (0..N).filter(|k| !UNSEEN.contains(k)) {
+            let patch = sum_of(&|other| other / 30 == k / 30);
+            let mut expected = unit(&of(k));
+            expected =
+                unit(&(0..DIM).map(|c| expected[c] + f64::from(superpoint) * patch[c]).collect::<Vec<_>>());
+            if object_of[k] != NO_SUPERPOINT {
+                let object = sum_of(&|other| object_of[other] == object_of[k]);
+                expected = (0..DIM).map(|c| expected[c] + 0.5 * object[c]).collect();
+            }
+            assert_near(&found.embeddings[k * DIM..][..DIM], &expected, &format!("{superpoint} {k}"));
+        }
+        assert_eq!(found.table.len(), 7 * 9 + if superpoint > 0.0 { 3 } else { 0 } + 2);
+        assert!(UNSEEN.iter().all(|k| !found.field.has_evidence(*k)));
+    }
+}
+
 /// Oracle: what Weiszfeld's steps lead to has the smallest sum of distances; the mean has a larger one.
 #[test]
 fn the_median_leaves_the_view_that_contradicts() {
@@ -402,7 +444,7 @@ fn a_single_view_keeps_its_evidence() {
     let refinement = Refinement::prepare(
         Aggregation::REFINED,
         contributions,
-        (&scene, &split),
+        Subject { scene: &scene, split: &split, object_of: &object_of() },
         &photos,
         u64::MAX,
         &cancel,
