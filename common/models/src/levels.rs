@@ -1,6 +1,6 @@
 //! Turns squares of 8-bit levels into pixel values on the GPU that the image model runs on.
 //!
-//! A byte a value crosses to the GPU, where it becomes two or four; the processor only copies rows of bytes.
+//! A byte a value crosses to the GPU, where it becomes two or four; the processor only parts pixels into planes.
 
 use std::path::Path;
 
@@ -23,7 +23,7 @@ const F32: &[u8] = include_bytes!("../embedded/levels_f32.onnx");
 #[derive(Debug)]
 pub(crate) struct Levels {
     model: Model,
-    /// `[batch][size_px][size_px][3]`, u8; reused by every batch.
+    /// `[batch][3][size_px][size_px]`, u8; reused by every batch.
     squares: DynTensor,
     /// Bytes of a square.
     square_bytes: usize,
@@ -43,7 +43,7 @@ impl Levels {
         let (name, bytes) = if is_f16 { ("levels_f16.onnx", F16) } else { ("levels_f32.onnx", F32) };
         let model = Model::open(&ModelFile::embedded(Path::new(name), bytes), options)?;
         let size = i64::from(preprocess.size_px());
-        let shape = [batch as i64, size, size, 3];
+        let shape = [batch as i64, 3, size, size];
         let squares = memory.bytes(model.session(), &shape).map_err(|cause| model.run_error(cause))?;
         let of_channels = |values: [f32; 3]| match is_f16 {
             true => model.owned(vec![3, 1, 1], values.map(f16::from_f32).to_vec()),
@@ -63,10 +63,20 @@ impl Levels {
     ) -> Result<DynTensor, SessionError> {
         let failed = |cause| SessionError::Run { path: self.model.path().to_owned(), cause };
         let places = bytes_mut(&mut self.squares).map_err(failed)?.chunks_exact_mut(self.square_bytes);
-        places.zip(squares).for_each(|(place, square)| place.copy_from_slice(square.as_raw()));
+        places.zip(squares).for_each(|(place, square)| part(square.as_raw(), place));
         let inputs = [("levels", &self.squares), ("scale", &self.scale), ("offset", &self.offset)];
         let mut found = self.model.run_bound(memory, &inputs, &[("values", Place::Device)])?;
         Ok(found.swap_remove(0))
+    }
+}
+
+/// Parts pixels `[n][3]` into planes `[3][n]`.
+fn part(pixels: &[u8], planes: &mut [u8]) {
+    let (reds, rest) = planes.split_at_mut(planes.len() / 3);
+    let (greens, blues) = rest.split_at_mut(reds.len());
+    let places = reds.iter_mut().zip(greens).zip(blues);
+    for (pixel, ((red, green), blue)) in pixels.as_chunks::<3>().0.iter().zip(places) {
+        [*red, *green, *blue] = *pixel;
     }
 }
 
