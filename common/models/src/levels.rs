@@ -19,6 +19,9 @@ use crate::session::{Model, SessionError, SessionOptions};
 const F16: &[u8] = include_bytes!("../embedded/levels_f16.onnx");
 const F32: &[u8] = include_bytes!("../embedded/levels_f32.onnx");
 
+/// Threads that part the pixels of a batch: one alone takes longer than the model.
+const N_THREADS: usize = 4;
+
 /// A batch of squares that a GPU turns into pixel values.
 #[derive(Debug)]
 pub(crate) struct Levels {
@@ -62,8 +65,18 @@ impl Levels {
         squares: impl Iterator<Item = std::borrow::Cow<'a, RgbImage>>,
     ) -> Result<DynTensor, SessionError> {
         let failed = |cause| SessionError::Run { path: self.model.path().to_owned(), cause };
-        let places = bytes_mut(&mut self.squares).map_err(failed)?.chunks_exact_mut(self.square_bytes);
-        places.zip(squares).for_each(|(place, square)| part(square.as_raw(), place));
+        let (places, square_bytes) = (bytes_mut(&mut self.squares).map_err(failed)?, self.square_bytes);
+        let squares: Vec<_> = squares.collect();
+        let n_of_thread = squares.len().div_ceil(N_THREADS).max(1);
+        std::thread::scope(|scope| {
+            let places = places.chunks_mut(n_of_thread * square_bytes);
+            for (squares, places) in squares.chunks(n_of_thread).zip(places) {
+                let places = places.chunks_exact_mut(square_bytes);
+                scope.spawn(|| {
+                    squares.iter().zip(places).for_each(|(square, place)| part(square.as_raw(), place))
+                });
+            }
+        });
         let inputs = [("levels", &self.squares), ("scale", &self.scale), ("offset", &self.offset)];
         let mut found = self.model.run_bound(memory, &inputs, &[("values", Place::Device)])?;
         Ok(found.swap_remove(0))
