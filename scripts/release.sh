@@ -9,7 +9,7 @@
 # The version is that of the workspace (Cargo.toml); CHANGELOG.md needs its section, as "## 0.1.0".
 set -eu
 cd "$(dirname "$0")/.."
-# All below looks in target.
+# Everything below expects the programs in target.
 unset CARGO_TARGET_DIR
 fail() {
     echo "release: $*" >&2

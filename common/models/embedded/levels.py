@@ -1,7 +1,7 @@
 """Makes levels_f16.onnx and levels_f32.onnx: levels of an image's channels to pixel values, on the device of the model.
 
-values[n][c][y][x] = levels[n][c][y][x] * scale[c] + offset[c]. Levels come plane by plane: a GPU takes longer to part pixels
-into planes than to do all else.
+values[n][c][y][x] = levels[n][c][y][x] * scale[c] + offset[c]. Levels come plane by plane: a GPU takes longer to split pixels
+into planes than to do everything else.
 usage: levels.py FOLDER
 needs: onnx 1.23
 """

@@ -1,6 +1,6 @@
 //! Turns squares of 8-bit levels into pixel values on the GPU that the image model runs on.
 //!
-//! A byte a value crosses to the GPU, where it becomes two or four; the processor only parts pixels into planes.
+//! A byte a value crosses to the GPU, where it becomes two or four; the processor only splits pixels into planes.
 
 use std::path::Path;
 
@@ -19,7 +19,7 @@ use crate::session::{Model, SessionError, SessionOptions};
 const F16: &[u8] = include_bytes!("../embedded/levels_f16.onnx");
 const F32: &[u8] = include_bytes!("../embedded/levels_f32.onnx");
 
-/// Threads that part the pixels of a batch: one alone takes longer than the model.
+/// Threads that split the pixels of a batch into planes: a single one takes longer than the model.
 const N_THREADS: usize = 4;
 
 /// A batch of squares that a GPU turns into pixel values.
@@ -83,7 +83,7 @@ impl Levels {
     }
 }
 
-/// Parts pixels `[n][3]` into planes `[3][n]`.
+/// Splits pixels `[n][3]` into planes `[3][n]`.
 fn part(pixels: &[u8], planes: &mut [u8]) {
     let (reds, rest) = planes.split_at_mut(planes.len() / 3);
     let (greens, blues) = rest.split_at_mut(reds.len());

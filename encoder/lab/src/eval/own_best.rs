@@ -1,16 +1,16 @@
 //! Words compared by how near a score is to the word's own best ones.
 //!
 //! Some words score high with everything (hubs), so the argmax gives them the Gaussians of words that score low even where they are
-//! right. Cross-domain similarity local scaling (Conneau et al. 2018, equation 4) takes from each score the mean of the word's
-//! best ones. Half of that mean is theirs, where both sides are scaled; here a Gaussian's own neighbourhood is the same
-//! for all words. For words that the scene has: one that it lacks has a low best score, and would gain.
+//! right. Cross-domain similarity local scaling (Conneau et al. 2018, equation 4) subtracts from each score half the mean of the
+//! word's best scores, and half that of the Gaussian's. The latter is the same for all words, so it is left out here.
+//! This is for words that the scene has: the best score of an absent word is low, so the word would gain.
 
-/// Share of the mean that is taken away.
+/// Share of the mean that is subtracted.
 const SHARE: f32 = 0.4;
 /// Best scores of a word.
 const N_BEST: usize = 100;
 
-/// Returns what is taken from each word's scores: NaN scores count for nothing.
+/// Returns the offset to subtract from each word's scores. NaN scores are ignored.
 pub(super) fn offsets(scores: &[Vec<f32>]) -> Vec<f32> {
     let offset = |scores: &Vec<f32>| {
         let mut known: Vec<f32> = scores.iter().copied().filter(|score| !score.is_nan()).collect();

@@ -42,7 +42,7 @@ fn split() -> CellSplit {
     CellSplit { cells: vec![cell], cell_of_gaussian: vec![0; N], local_of_gaussian, n_rejected: 0 }
 }
 
-/// Objects: the first two patches but for every fourth Gaussian, which has none.
+/// The first two patches are objects, except that every fourth Gaussian belongs to none.
 fn object_of() -> [Vec<u32>; 1] {
     [(0..N).map(|i| if i < 60 && i % 4 > 0 { i as u32 / 30 } else { NO_SUPERPOINT }).collect()]
 }
