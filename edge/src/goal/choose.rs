@@ -19,6 +19,8 @@ const SQUARE_M: f64 = 0.2;
 const MAX_CANDIDATES: usize = 256;
 /// Most candidates of any square that are looked at if none of those sees the thing, spread over all.
 const MAX_MORE: usize = 2048;
+/// Candidates that are looked at one after the other: mostly the same hides the thing from them.
+const NEIGHBOURS: usize = 64;
 /// Least distance between two poses of a reply, metres.
 const APART_M: f64 = 0.5;
 /// Clearance beyond the robot's radius above which more is worth nothing, metres.
@@ -50,7 +52,11 @@ pub fn choose(around: &mut Around<'_>, request: &GoalRequest, points: &[DVec3]) 
     }
     let target = Target::new(around, request, points);
     let looked_at = |candidates: Vec<Candidate>| -> Vec<Look> {
-        candidates.into_par_iter().filter_map(|of| look(around, request, &target, of)).collect()
+        let of_piece = |piece: &[Candidate]| {
+            let mut hints = [sight::Hint::NONE; SAMPLES];
+            piece.iter().filter_map(|of| look(around, request, &target, &mut hints, *of)).collect::<Vec<_>>()
+        };
+        candidates.par_chunks(NEIGHBOURS).flat_map_iter(of_piece).collect()
     };
     let mut looks = looked_at(sifted(window, reached.clone()));
     // Over the edge of a table, the thing on it is often seen only from a strip that is narrower than a square.
@@ -177,8 +183,14 @@ struct Look {
     cost_m: f64,
 }
 
-/// Looks at the thing from a candidate; `None` if the thing is out of reach after all.
-fn look(around: &Around<'_>, request: &GoalRequest, target: &Target<'_>, of: Candidate) -> Option<Look> {
+/// Looks at the thing from a candidate; `None` if the thing is out of reach after all. `hints`: by sample.
+fn look(
+    around: &Around<'_>,
+    request: &GoalRequest,
+    target: &Target<'_>,
+    hints: &mut [sight::Hint; SAMPLES],
+    of: Candidate,
+) -> Option<Look> {
     let [x, y] = around.space.window.centre_of(of.cell);
     let mut pieces = target.points.chunks(64);
     if !pieces.any(|points| Target::distance(points, [x, y]) <= request.reach_m) {
@@ -187,8 +199,10 @@ fn look(around: &Around<'_>, request: &GoalRequest, target: &Target<'_>, of: Can
     let position_in_world = DVec3::new(x, y, around.floor_height(of.cell)?);
     let sensor_in_world = position_in_world + DVec3::Z * request.sensor_height_m;
     let voxel = around.space.window.voxel_of(sensor_in_world);
-    let sees = |point: &DVec3| u128::from(sight::sees(&target.thing, sensor_in_world, voxel, *point));
-    let seen = (0..).zip(&target.samples).map(|(bit, point)| sees(point) << bit).fold(0, |all, of| all | of);
+    let mut seen = 0u128;
+    for ((bit, point), hint) in (0..).zip(&target.samples).zip(hints) {
+        seen |= u128::from(sight::sees(&target.thing, sensor_in_world, voxel, *point, hint)) << bit;
+    }
     let visible_share = f64::from(seen.count_ones()) / target.samples.len() as f64;
     let cost_m = of.cost_m + SIGHT_WEIGHT_M * (1.0 - visible_share);
     Some(Look { of, position_in_world, sensor_in_world, seen, visible_share, cost_m })

@@ -5,6 +5,9 @@ use slag_math::distance_transform::along_row;
 
 use super::ground::{Floor, Ground};
 
+/// Instead of the height of a cell without ground; heights are below 128.
+const NO_GROUND: u8 = u8::MAX;
+
 /// Returns which cells the robot must not touch: those without ground, and those with a drop beside them that is higher than a
 /// step (in voxels).
 ///
@@ -13,18 +16,20 @@ pub fn obstacles(ground: &Ground, step: u8) -> Vec<bool> {
     let (floors, n_y) = (&ground.floors, ground.n_y);
     let mut obstacles = vec![false; floors.len()];
     obstacles.par_chunks_mut(n_y.max(1)).enumerate().for_each(|(x, row)| {
-        for (y, is_obstacle) in row.iter_mut().enumerate() {
-            let cell = x * n_y + y;
-            let Floor::At(here) = floors[cell] else {
-                *is_obstacle = true;
-                continue;
-            };
-            let drops = |beside: Option<&Floor>| matches!(beside, Some(Floor::At(z)) if here > z.saturating_add(step));
-            let before = |distance: usize| cell.checked_sub(distance).and_then(|at| floors.get(at));
-            *is_obstacle = drops(before(n_y))
-                || drops(floors.get(cell + n_y))
-                || y > 0 && drops(before(1))
-                || y + 1 < n_y && drops(floors.get(cell + 1));
+        // Heights of a row of the grid, with a border.
+        let heights = |x: Option<usize>| {
+            let of_row = x.and_then(|x| floors.get(x * n_y..(x + 1) * n_y)).unwrap_or_default();
+            let mut heights = vec![NO_GROUND; n_y + 2];
+            for (height, floor) in heights[1..].iter_mut().zip(of_row) {
+                *height = if let Floor::At(z) = floor { *z } else { NO_GROUND };
+            }
+            heights
+        };
+        let [before, here, after] = [x.checked_sub(1), Some(x), Some(x + 1)].map(heights);
+        let beside = here.iter().zip(&here[2..]).zip(before[1..].iter().zip(&after[1..]));
+        for ((is_obstacle, here), ((a, b), (c, d))) in row.iter_mut().zip(&here[1..]).zip(beside) {
+            let lowest = *a.min(b).min(c).min(d);
+            *is_obstacle = *here == NO_GROUND || *here > lowest.saturating_add(step);
         }
     });
     obstacles

@@ -42,10 +42,15 @@ impl Ground {
         let mut floors = vec![Floor::Unknown; n_columns_x * edge * n_y];
         // A piece for each x of the columns: four rows of cells.
         floors.par_chunks_mut(edge * n_y).enumerate().for_each(|(x, rows)| {
+            let mut last = (0, 0, Floor::Unknown);
             for y in 0..n_columns_y {
                 let voxels = voxels_of(space.column(x * n_columns_y + y));
                 for (cell, [occupied, free]) in voxels.into_iter().enumerate() {
-                    rows[cell / edge * n_y + y * edge + cell % edge] = floor(occupied, free, headroom, step);
+                    // Most columns of voxels are as the one before.
+                    if (occupied ^ last.0) | (free ^ last.1) != 0 {
+                        last = (occupied, free, floor(occupied, free, headroom, step));
+                    }
+                    rows[cell / edge * n_y + y * edge + cell % edge] = last.2;
                 }
             }
         });
@@ -55,7 +60,8 @@ impl Ground {
 
 /// Returns occupied and free voxels of the 16 columns of voxels in a column of blocks; bit z is the voxel at height z.
 pub fn voxels_of(blocks: &[Stacked]) -> [[u128; 2]; 16] {
-    let mut voxels = [[0u128; 2]; 16];
+    // Lower and upper half, by cell.
+    let (mut occupied, mut free) = ([[0u64; 16]; 2], [[0u64; 16]; 2]);
     // Most blocks are free as a whole.
     let mut all_free = 0;
     for block in blocks {
@@ -64,13 +70,18 @@ pub fn voxels_of(blocks: &[Stacked]) -> [[u128; 2]; 16] {
             all_free |= 15 << shift;
             continue;
         }
-        for (cell, [occupied, free]) in voxels.iter_mut().enumerate() {
-            *occupied |= u128::from(block.occupied >> (4 * cell) & 15) << shift;
-            *free |= u128::from(block.free >> (4 * cell) & 15) << shift;
-        }
+        let add = |bits: u64, halves: &mut [[u64; 16]; 2]| {
+            if bits != 0 {
+                let half = &mut halves[shift as usize / 64];
+                (0..16).for_each(|cell| half[cell] |= (bits >> (4 * cell) & 15) << (shift % 64));
+            }
+        };
+        add(block.occupied, &mut occupied);
+        add(block.free, &mut free);
     }
-    voxels.iter_mut().for_each(|[_, free]| *free |= all_free);
-    voxels
+    let whole =
+        |[low, high]: [[u64; 16]; 2], cell: usize| u128::from(high[cell]) << 64 | u128::from(low[cell]);
+    std::array::from_fn(|cell| [whole(occupied, cell), whole(free, cell) | all_free])
 }
 
 /// Returns a mask of the lowest `n` bits.

@@ -10,6 +10,10 @@ const DIAGONAL: u32 = 17;
 /// No way leads here.
 pub const UNREACHED: u32 = u32::MAX;
 
+/// Most connected places, 10 square metres in voxels of 5 cm, that are looked through before a search for a way to one of them:
+/// the tops of things have no way, so the search would go everywhere.
+const MAX_CONNECTED: usize = 4096;
+
 /// Height of a place where no robot's middle may be; others are below 128, and steps at most 100.
 const CLOSED: u8 = u8::MAX;
 
@@ -19,6 +23,8 @@ const CLOSED: u8 = u8::MAX;
 pub struct Paths {
     /// By cell, with a border of closed ones: height of the ground.
     heights: Vec<u8>,
+    /// By cell, with the border: whether it is connected with a way or with many cells.
+    is_open: Vec<bool>,
     /// Cells along y of the grid, without the border.
     n_y: usize,
     step: u8,
@@ -46,8 +52,9 @@ impl Paths {
             },
         );
         let lengths = vec![UNREACHED; heights.len()];
-        let mut paths =
-            Self { heights, n_y, step, lengths, buckets: Default::default(), length: 0, n_waiting: 1 };
+        let is_open = vec![false; heights.len()];
+        let buckets = Default::default();
+        let mut paths = Self { heights, is_open, n_y, step, lengths, buckets, length: 0, n_waiting: 1 };
         let start = paths.bordered(start);
         paths.lengths[start] = 0;
         paths.buckets[0].push(start as u32);
@@ -62,16 +69,19 @@ impl Paths {
     pub fn find(&mut self, cells: impl IntoIterator<Item = usize>) {
         for cell in cells {
             let cell = self.bordered(cell);
+            if self.n_waiting > 0 && self.lengths[cell] == UNREACHED {
+                self.close_island(cell, MAX_CONNECTED);
+            }
             while self.n_waiting > 0 && self.heights[cell] != CLOSED && self.lengths[cell] >= self.length {
                 self.find_next();
             }
         }
     }
 
-    /// Finds the ways of the next length.
-    fn find_next(&mut self) {
+    /// Returns the offsets to the neighbours of a cell, with the cost of a step.
+    fn beside(&self) -> [(usize, u32); 8] {
         let width = self.n_y + 2;
-        let beside = [
+        [
             (width.wrapping_neg(), STRAIGHT),
             (1usize.wrapping_neg(), STRAIGHT),
             (1, STRAIGHT),
@@ -80,7 +90,42 @@ impl Paths {
             ((width - 1).wrapping_neg(), DIAGONAL),
             (width - 1, DIAGONAL),
             (width + 1, DIAGONAL),
-        ];
+        ]
+    }
+
+    /// Closes the cells connected with a cell if they are at most `most` and no way has come to any of them: none will.
+    fn close_island(&mut self, cell: usize, most: usize) {
+        if self.heights[cell] == CLOSED || self.is_open[cell] {
+            return;
+        }
+        let beside = self.beside();
+        let mut connected = vec![(cell, self.heights[cell])];
+        self.heights[cell] = CLOSED;
+        let mut is_open = false;
+        let mut next = 0;
+        while let (false, Some((cell, here))) = (is_open, connected.get(next).copied()) {
+            for to in beside.map(|(offset, _)| cell.wrapping_add(offset)) {
+                let height = self.heights[to];
+                if height.abs_diff(here) <= self.step {
+                    is_open |= self.is_open[to] || self.lengths[to] != UNREACHED;
+                    self.heights[to] = CLOSED;
+                    connected.push((to, height));
+                }
+            }
+            is_open |= connected.len() > most;
+            next += 1;
+        }
+        if is_open {
+            for (cell, height) in connected {
+                self.heights[cell] = height;
+                self.is_open[cell] = true;
+            }
+        }
+    }
+
+    /// Finds the ways of the next length.
+    fn find_next(&mut self) {
+        let beside = self.beside();
         let n_buckets = self.buckets.len();
         let mut cells = std::mem::take(&mut self.buckets[self.length as usize % n_buckets]);
         self.n_waiting -= cells.len();
@@ -138,6 +183,14 @@ mod tests {
                             expected[b] = expected[b].min(expected[a] + step);
                         }
                     }
+                }
+                for most in [3, 8] {
+                    (0..n).for_each(|cell| {
+                        let cell = found.bordered(cell);
+                        if found.lengths[cell] == UNREACHED {
+                            found.close_island(cell, most);
+                        }
+                    });
                 }
                 // Asked for one by one, so the search goes on from where it was.
                 for (cell, expected) in expected.iter().enumerate() {

@@ -15,7 +15,7 @@ const MAX_BLOCK: f64 = (1u32 << 28) as f64;
 const MAX_BLOCKS: usize = 8 << 20;
 
 /// A block in its column.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, bytemuck::Zeroable)]
 pub struct Stacked {
     /// Height in blocks above the window's lower side, below [`COLUMN_BLOCKS`].
     pub z: u8,
@@ -111,7 +111,7 @@ impl Space {
         }
         (0..n_columns).for_each(|column| starts[column + 1] += starts[column]);
         let mut next = starts.clone();
-        let mut blocks = vec![Stacked::default(); n_blocks];
+        let mut blocks = bytemuck::zeroed_vec::<Stacked>(n_blocks);
         for occupancy in of_lattice() {
             for_columns(occupancy, &window, |column, z, masks| {
                 let next = &mut next[column];
