@@ -3,7 +3,7 @@
 # checksums signed by a key of yours (ssh-keygen -t ed25519 makes one). Nothing is uploaded.
 # usage: release.sh KEY OUT [--built DIR] [--without PART]...
 #   KEY            private key, in the form of ssh-keygen; one in an agent works by its public file
-#   --built DIR    takes the programs for this machine from DIR, built before, instead of building them; a trial: CHANGELOG may have
+#   --built DIR    takes the programs for this machine, slag-lab among them, from DIR, built before, instead of building them; a trial: CHANGELOG may have
 #                  no section of this version yet, and the tree may be changed
 #   --without PART leaves out arm64 (package of the Jetson), image or sbom
 # The version is that of the workspace (Cargo.toml); CHANGELOG.md needs its section, as "## 0.1.0".
@@ -60,7 +60,7 @@ if [ -z "$built" ]; then
     sh scripts/setup.sh
     sh scripts/setup.sh page
     sh scripts/build-page.sh
-    cargo build --profile dist --locked -p slag-encoder -p slag-edge -p slag-mcap -p slag-mcp -p slag-ros -p slag-manual
+    cargo build --profile dist --locked -p slag-encoder -p slag-edge -p slag-mcap -p slag-mcp -p slag-ros -p slag-manual -p slag-lab
     built=target/dist
 fi
 rm -rf target/manual
@@ -88,6 +88,9 @@ fi
 if has image; then
     sh scripts/setup.sh image
     encoder/deploy/image.sh amd64 "$built/slag-encoder" "$out"
+    as_root=
+    [ "$(id -u)" = 0 ] || as_root=sudo
+    $as_root encoder/deploy/test-image.sh "$out/slag-encoder_${version}_amd64.oci.tar" "$built/slag-lab"
 fi
 if has sbom; then
     sh scripts/supply-chain.sh

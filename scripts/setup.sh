@@ -2,7 +2,7 @@
 # Installs what SLAG needs beside Rust: a C linker, Python's pip (to unpack ONNX Runtime), ONNX Runtime, and
 # Vulkan with a software GPU, on which the GPU rasteriser is tested where there is no other.
 # usage: setup.sh [demo|cross|page|image]     demo: without the software GPU; cross: also what the aarch64 build and its smoke test need;
-#                                       page: also what building and testing the page needs; image: also what lays out the encoder's image
+#                                       page: also what building and testing the page needs; image: also what lays out and judges the encoder's image
 # Does nothing where all is there already. Made for Debian 12; elsewhere install the same by hand.
 set -eu
 cd "$(dirname "$0")/.."
@@ -19,7 +19,7 @@ wanted="cc:gcc-12 cc:gcc ld:binutils python3:python3 pip3:python3-pip"
 [ "${1:-}" = cross ] &&
     wanted="$wanted aarch64-linux-gnu-gcc:gcc-aarch64-linux-gnu aarch64-linux-gnu-gcc:libc6-dev-arm64-cross qemu-aarch64-static:qemu-user-static debootstrap:debootstrap systemd-analyze:systemd"
 
-[ "${1:-}" = image ] && wanted="$wanted mmdebstrap:mmdebstrap"
+[ "${1:-}" = image ] && wanted="$wanted mmdebstrap:mmdebstrap skopeo:skopeo umoci:umoci"
 [ "${1:-}" = page ] && wanted="$wanted node:nodejs npm:npm chromium:chromium"
 
 missing=

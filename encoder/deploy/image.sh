@@ -68,7 +68,7 @@ cat >"$work/manifest" <<JSON
 JSON
 manifest=$(blob "$work/manifest")
 cat >"$layout/index.json" <<JSON
-{"schemaVersion":2,"manifests":[{"mediaType":"application/vnd.oci.image.manifest.v1+json",$manifest,"platform":{"architecture":"$arch","os":"linux"},"annotations":{"org.opencontainers.image.ref.name":"$version"}}]}
+{"schemaVersion":2,"manifests":[{"mediaType":"application/vnd.oci.image.manifest.v1+json",$manifest,"platform":{"architecture":"$arch","os":"linux"},"annotations":{"org.opencontainers.image.ref.name":"slag-encoder:$version"}}]}
 JSON
 echo '{"imageLayoutVersion":"1.0.0"}' >"$layout/oci-layout"
 mkdir -p "$out"

@@ -21,8 +21,8 @@ assert config["config"]["Labels"]["org.opencontainers.image.version"] == sys.arg
 PYTHON
 mkdir "$work/layout"
 tar -xf "$image" -C "$work/layout"
-# umoci compares every blob with its digest, and the layers with the configuration.
-umoci unpack --image "$work/layout:$version" "$work/bundle" >/dev/null 2>"$work/log" || { cat "$work/log" >&2; fail "umoci does not unpack it"; }
+# By the name that podman load gives it. umoci compares every blob with its digest, and the layers with the configuration.
+umoci unpack --image "$work/layout:slag-encoder:$version" "$work/bundle" >/dev/null 2>"$work/log" || { cat "$work/log" >&2; fail "umoci does not unpack it"; }
 root=$work/bundle/rootfs
 mount -t proc proc "$root/proc"
 inside() {
