@@ -149,7 +149,7 @@ pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()
     let mut node = node.map_err(|e| anyhow!("cannot make the node: {e:?}"))?;
     let own = |topic: &str| Name::new(&format!("/{}", settings.name), topic);
     let kept = reliable(KEPT).durability(Durability::TransientLocal);
-    // As map_server offers its map.
+    // Those who join later hear no earlier answer, which they would take for the last; so map_server offers its map.
     let latest = reliable(1).durability(Durability::TransientLocal);
     let pose = ("geometry_msgs", "PoseStamped");
     let goal_pose = (settings.goals == GoalSink::Topic).then(|| {
@@ -175,11 +175,11 @@ pub async fn run(settings: Settings, robot: Robot, stop: impl Future<Output = ()
     });
     let navigation = navigation.transpose()?;
     let shared = Arc::new(Shared {
-        detections: publisher(&mut node, own("detections")?, ("vision_msgs", "Detection3DArray"), &kept)?,
-        markers: publisher(&mut node, own("markers")?, ("visualization_msgs", "MarkerArray"), &kept)?,
+        detections: publisher(&mut node, own("detections")?, ("vision_msgs", "Detection3DArray"), &latest)?,
+        markers: publisher(&mut node, own("markers")?, ("visualization_msgs", "MarkerArray"), &latest)?,
         points: publisher(&mut node, own("points")?, ("sensor_msgs", "PointCloud2"), &kept)?,
-        best_pose: publisher(&mut node, own("best_pose")?, ("geometry_msgs", "PoseStamped"), &kept)?,
-        goal: publisher(&mut node, own("goal")?, ("geometry_msgs", "PoseStamped"), &kept)?,
+        best_pose: publisher(&mut node, own("best_pose")?, ("geometry_msgs", "PoseStamped"), &latest)?,
+        goal: publisher(&mut node, own("goal")?, ("geometry_msgs", "PoseStamped"), &latest)?,
         ground: publisher(&mut node, own("ground")?, ("nav_msgs", "OccupancyGrid"), &latest)?,
         goal_pose,
         navigation,
