@@ -135,13 +135,15 @@ def check_answers(ros, robot, word):
     assert last.header.stamp != found.header.stamp
 
     def kept():
+        # Every new reader must acknowledge, too.
+        time.sleep(6.5)
         reader = ros.reader("rt/slag/detections", Detection3DArray, LATCHED)
         heard = until("kept detections", reader.take)
         time.sleep(0.2)
         heard += reader.take()
         return heard if [one.header.stamp for one in heard] == [last.header.stamp] else None
 
-    [late] = until("the last detections alone", kept)
+    [late] = until("the last detections alone", kept, timeout=40)
     assert [one.id for one in late.detections] == [one["id"] for one in truth]
     return len(truth), len(expected)
 
