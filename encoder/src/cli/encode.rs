@@ -56,10 +56,11 @@ pub struct EncodeArgs {
     /// Segment Anything instead of the built-in segmenter.
     #[command(flatten)]
     pub sam: SamArgs,
-    /// What of a photo has vectors: masks by their crops, the patches of an image model that aligns them with text
-    /// (model.toml: image.patches), or both. With patches, no objects are found.
-    #[arg(long, value_enum, default_value = "masks")]
-    pub regions: Regions,
+    /// What of a photo has vectors: masks, by their crops and the patches within them of an image model that aligns patches
+    /// with text (model.toml: image.patches); masks by crops alone; or patches alone, and then no objects are found
+    /// [default: the preset's].
+    #[arg(long, value_enum)]
+    pub regions: Option<Regions>,
     /// Ids in mask PNGs that are no masks; 0 never is one.
     #[arg(long, value_name = "ID", value_delimiter = ',')]
     pub ignore_mask_ids: Vec<u32>,
@@ -185,6 +186,7 @@ pub struct ObjectArgs {
 /// Returns the settings of the flags.
 fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
     let preset = args.preset.choices();
+    let regions = args.regions.unwrap_or(preset.regions);
     let views_limit = args.views_limit.unwrap_or(preset.views_limit);
     // A geo-reference beside the scene belongs to it.
     let beside = args.input.scene.with_file_name("geo.json");
@@ -221,7 +223,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
             raster_width: args.raster_width.unwrap_or(preset.raster_width),
             weights: args.weights.unwrap_or(preset.weights),
             merges_slivers: preset.merges_slivers && !args.keep_slivers,
-            regions: args.regions,
+            regions,
         },
         aggregation: args.refine.aggregation(preset.aggregation),
         cells: CellSettings {
@@ -230,7 +232,7 @@ fn settings(args: &EncodeArgs) -> Result<EncodeSettings> {
                 max_width: metric.then_some(args.cell_width_m),
             },
             shards: shard_settings(args, preset.codebook, metric),
-            objects: preset.objects && !args.objects.no_objects && !args.regions.have_patches(),
+            objects: preset.objects && !args.objects.no_objects && regions.have_masks(),
             occupancy: args.occupancy.map(|voxel_m| OccupancySettings { voxel_m }),
             photo_poses: args.photo_poses,
         },

@@ -1,5 +1,6 @@
 //! Embedding: a crop for each mask, and a vector for each crop.
 
+mod patches;
 mod shared;
 
 use std::num::NonZeroUsize;
@@ -12,6 +13,7 @@ use slag_models::{
 
 use crate::masks::{BoxPx, Mask};
 
+pub use patches::PhotoPatches;
 pub use shared::{Failure, OpenEncoder, SharedEncoders};
 
 /// Reason why masks cannot be embedded.
@@ -158,21 +160,6 @@ pub fn embed_crops(
         last: (first + crops.len()).saturating_sub(1),
         cause: Box::new(cause),
     })
-}
-
-/// Returns a unit vector per patch of `of`, `[of][dim]`, numbers of patches row by row; none if the encoder has no vectors
-/// of patches.
-/// # Errors
-/// [`EmbedError::Patches`] where the encoder fails.
-pub fn embed_patches(
-    photo: &RgbImage,
-    of: &[usize],
-    encoder: &mut dyn ImageEncoder,
-) -> Result<Vec<f32>, EmbedError> {
-    let vectors =
-        encoder.encode_patches(photo).map_err(|cause| EmbedError::Patches { cause: Box::new(cause) })?;
-    let (vectors, dim) = (vectors.unwrap_or_default(), encoder.dim());
-    Ok(of.iter().filter_map(|&k| vectors.get(k * dim..(k + 1) * dim)).flatten().copied().collect())
 }
 
 /// Returns a unit vector per mask, `[masks][dim]`.

@@ -27,7 +27,7 @@ pub enum EncodeError {
     },
     /// Patches are asked for, but the image model has none.
     #[error(
-        "{model} has no vectors of patches; give a model whose model.toml has image.patches, or use --regions masks"
+        "{model} has no vectors of patches; give a model whose model.toml has image.patches, or leave --regions out"
     )]
     NoPatches {
         /// The model.

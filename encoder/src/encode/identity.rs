@@ -14,7 +14,7 @@ use crate::ingest;
 use crate::segment::Segmenter;
 
 /// Version of the steps from masks to contributions; another number is another encode.
-const REGIONS_VERSION: u32 = 3;
+const REGIONS_VERSION: u32 = 4;
 
 /// The identities of an encode.
 pub(super) struct Identities {

@@ -14,7 +14,7 @@ use super::identity;
 use super::inputs::{self, Inputs};
 use super::job::{Job, job_status};
 use super::kept::{self, InputsRecord, LostViews};
-use super::settings::{EncodeSettings, Masks, Regions, RunSettings, ViewOrder, ViewSettings};
+use super::settings::{EncodeSettings, Masks, RunSettings, ViewOrder, ViewSettings};
 use super::view::ViewTools;
 use crate::cells::CellSplit;
 use crate::embed::SharedEncoders;
@@ -205,14 +205,13 @@ pub(crate) fn segmenter_of(
     gpus: &[u32],
     engines: &Engines<'_>,
 ) -> Result<Box<dyn Segmenter>, EncodeError> {
-    let regions = settings.regions;
-    if regions.have_patches() && engines.models.patches_per_side().is_none() {
-        return Err(EncodeError::NoPatches { model: engines.models.encoder_id().to_string() });
+    if settings.regions.have_masks() {
+        open_segmenter(&settings.masks, engines.session, gpus)
+    } else if engines.models.patches_per_side().is_some() {
+        Ok(Box::new(NoMasks))
+    } else {
+        Err(EncodeError::NoPatches { model: engines.models.encoder_id().to_string() })
     }
-    Ok(match regions {
-        Regions::Patches => Box::new(NoMasks),
-        Regions::Masks | Regions::Both => open_segmenter(&settings.masks, engines.session, gpus)?,
-    })
 }
 
 fn open_segmenter(

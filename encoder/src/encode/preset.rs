@@ -3,7 +3,7 @@
 use clap::ValueEnum;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 
-use super::settings::{DEFAULT_MASK_LEVELS, RasterWidth, ViewsLimit};
+use super::settings::{DEFAULT_MASK_LEVELS, RasterWidth, Regions, ViewsLimit};
 use crate::codebook::CodebookSettings;
 use crate::embed::Background;
 use crate::lift::Aggregation;
@@ -30,6 +30,8 @@ pub enum Preset {
 pub struct Choices {
     /// What fills a crop outside its mask.
     pub background: Background,
+    /// What of a photo has vectors.
+    pub regions: Regions,
     /// Which weight is summed.
     pub weights: WeightKind,
     /// How contributions become embeddings.
@@ -67,6 +69,7 @@ impl Preset {
     pub fn choices(self) -> Choices {
         let balanced = Choices {
             background: Background::White,
+            regions: Regions::Masks,
             weights: WeightKind::Blend,
             aggregation: Aggregation::REFINED,
             objects: true,
@@ -81,6 +84,7 @@ impl Preset {
         match self {
             Self::Balanced => balanced,
             Self::Plain => Choices {
+                regions: Regions::Crops,
                 aggregation: Aggregation::PLAIN,
                 objects: false,
                 raster_width: RasterWidth::Photo,
@@ -88,6 +92,7 @@ impl Preset {
             },
             // Section "Settings" of the paper (IEEE RA-L 2025): grid 16, whole level, ScanNet's raster of 648 x 484.
             Self::Paper => Choices {
+                regions: Regions::Crops,
                 aggregation: Aggregation::PLAIN,
                 objects: false,
                 mask_levels: 1,
@@ -126,6 +131,7 @@ mod tests {
         assert_eq!(balanced.raster_width, library.view.raster_width);
         assert_eq!(balanced.min_mask_px, library.view.min_mask_px);
         assert_eq!(balanced.background, library.view.background);
+        assert_eq!(balanced.regions, library.view.regions);
         assert_eq!(balanced.weights, library.view.weights);
         assert_eq!(balanced.codebook, library.cells.shards.codebook);
         let levels = balanced.mask_levels;
@@ -150,6 +156,7 @@ mod tests {
     fn paper_has_the_papers_settings() {
         let Choices {
             background,
+            regions,
             weights,
             aggregation,
             objects,
@@ -160,8 +167,8 @@ mod tests {
             ..
         } = Preset::Paper.choices();
         assert_eq!(
-            (background, weights, aggregation),
-            (Background::White, WeightKind::Blend, Aggregation::default())
+            (background, regions, weights, aggregation),
+            (Background::White, Regions::Crops, WeightKind::Blend, Aggregation::default())
         );
         assert_eq!(
             (objects, min_mask_px, merges_slivers, raster_width),

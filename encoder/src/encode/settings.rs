@@ -98,13 +98,13 @@ pub struct ViewSettings {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Regions {
-    /// Masks, by a crop each.
+    /// Masks: by a crop each and, where the image model has patches that are aligned with text, by the patches within them.
     #[default]
     Masks,
-    /// Patches of an image model whose patches are aligned with text: neither masks nor crops.
+    /// Masks, by a crop each.
+    Crops,
+    /// Patches of the image model: neither masks nor crops.
     Patches,
-    /// Both: a pixel counts for its masks and its patch.
-    Both,
 }
 
 impl Regions {
@@ -112,9 +112,9 @@ impl Regions {
         *self == Self::Masks
     }
 
-    /// Returns whether patches have vectors.
-    pub fn have_patches(self) -> bool {
-        self != Self::Masks
+    /// Returns whether there are masks, of which objects are made.
+    pub fn have_masks(self) -> bool {
+        self != Self::Patches
     }
 }
 

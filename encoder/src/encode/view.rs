@@ -12,10 +12,10 @@ use super::context::RunContext;
 use super::engines::Engines;
 use super::error::EncodeError;
 use super::pipeline::Stage;
-use super::settings::{LONG_BORDERS, MAX_RASTER_WIDTH_PX, RasterWidth, ViewSettings};
+use super::settings::{LONG_BORDERS, MAX_RASTER_WIDTH_PX, RasterWidth, Regions, ViewSettings};
 use super::sink::{PhotoSource, ViewRecord, ViewSink};
 use crate::cells::CellSplit;
-use crate::embed::{self, EmbedError, SharedEncoders};
+use crate::embed::{self, EmbedError, PhotoPatches, SharedEncoders};
 use crate::ingest::{self, LoadedImage};
 use crate::lanes::GpuLoad;
 use crate::lift::ViewContributions;
@@ -80,7 +80,7 @@ enum Next {
     Depth(LoadedImage),
     Segment(LoadedImage, Option<Vec<f32>>),
     Crop(LoadedImage, Vec<Mask>),
-    Embed(Crops, Option<Patches>, Partition),
+    Embed(Crops, Option<PhotoPatches>, Partition),
     Raster(Vec<f32>, Partition),
     Write(ViewContributions, Vec<MaskOutline>, u32),
 }
@@ -92,13 +92,6 @@ enum Crops {
     Squares(Vec<Crop>),
     /// For a model that takes crops of any size: they are cut a batch at a time.
     Uncut(LoadedImage, Vec<Mask>),
-}
-
-/// The patches of a photo to embed.
-struct Patches {
-    photo: RgbImage,
-    /// Their numbers, row by row.
-    of: Vec<usize>,
 }
 
 /// The regions of a view, the masks that cover each, and the outlines of masks.
@@ -229,17 +222,11 @@ impl<'a> ViewStages<'a> {
                 Next::Crop(loaded, masks)
             }
             Next::Crop(loaded, masks) => {
-                let mut regions = masks.clone();
-                let patches = self.tools.engines.models.patches_per_side();
-                let patches =
-                    patches.filter(|_| self.tools.settings.regions.have_patches()).map(|per_side| {
-                        let (width_px, height_px) = loaded.image.dimensions();
-                        let (of, of_patches): (Vec<_>, Vec<_>) =
-                            patch_masks(per_side, width_px, height_px).into_iter().unzip();
-                        regions.extend(of_patches);
-                        Patches { photo: loaded.image.clone(), of }
-                    });
-                let partition = self.partition(&loaded, &regions);
+                let (patches, of_patches) = self.patches(&loaded.image, &masks);
+                let partition = match of_patches {
+                    Some(regions) => self.partition(&loaded, &regions),
+                    None => self.partition(&loaded, &masks),
+                };
                 let crops = match &self.preprocess {
                     Some(preprocess) => Crops::Squares(
                         embed::squares(&loaded.image, &masks, self.tools.settings.background, preprocess)
@@ -290,6 +277,21 @@ impl<'a> ViewStages<'a> {
         }
     }
 
+    /// Returns the patches of a photo that have vectors, and the regions that they are, where masks are not.
+    fn patches(&self, photo: &RgbImage, masks: &[Mask]) -> (Option<PhotoPatches>, Option<Vec<Mask>>) {
+        let Some(per_side) = self.tools.engines.models.patches_per_side() else { return (None, None) };
+        match self.tools.settings.regions {
+            Regions::Crops => (None, None),
+            Regions::Masks if masks.is_empty() => (None, None),
+            Regions::Masks => (Some(PhotoPatches::of_masks(photo.clone(), masks, per_side)), None),
+            Regions::Patches => {
+                let (width_px, height_px) = photo.dimensions();
+                let (numbers, regions) = patch_masks(per_side, width_px, height_px).into_iter().unzip();
+                (Some(PhotoPatches::regions(photo.clone(), numbers)), Some(regions))
+            }
+        }
+    }
+
     /// Makes the regions of a view's masks: on a finer raster where their borders are long, if the settings ask for it.
     fn partition(&self, loaded: &LoadedImage, masks: &[Mask]) -> Partition {
         let regions_at = |width_px| {
@@ -321,8 +323,13 @@ impl<'a> ViewStages<'a> {
         Partition { raster_view, regions, masks_of_region, outlines, weight_scale }
     }
 
-    /// Returns a vector per mask, then one per patch.
-    fn embed(&self, view: &View, crops: Crops, patches: Option<&Patches>) -> Result<Vec<f32>, EncodeError> {
+    /// Returns a vector per mask, or per patch that is a region.
+    fn embed(
+        &self,
+        view: &View,
+        crops: Crops,
+        patches: Option<&PhotoPatches>,
+    ) -> Result<Vec<f32>, EncodeError> {
         if patches.is_none() && matches!(&crops, Crops::Squares(crops) if crops.is_empty()) {
             return Ok(Vec::new());
         }
@@ -345,10 +352,10 @@ impl<'a> ViewStages<'a> {
                     embed::Failure::Model(error) => error.into(),
                     embed::Failure::Embed(source) => failed(source),
                 })?;
-                if let Some(Patches { photo, of }) = patches {
-                    let of_patches =
-                        encoders.with_encoder(|encoder| embed::embed_patches(photo, of, encoder))?;
-                    vectors.append(&mut of_patches.map_err(failed)?);
+                if let Some(patches) = patches {
+                    encoders
+                        .with_encoder(|encoder| patches.add_to(&mut vectors, encoder))?
+                        .map_err(failed)?;
                 }
                 Ok(vectors)
             }
@@ -362,7 +369,7 @@ impl<'a> ViewStages<'a> {
         &self,
         encoder: &mut dyn ImageEncoder,
         crops: &Crops,
-        patches: Option<&Patches>,
+        patches: Option<&PhotoPatches>,
     ) -> Result<Vec<f32>, EmbedError> {
         let mut vectors = match crops {
             Crops::Squares(crops) => embed::embed_crops(crops, 0, encoder)?,
@@ -371,8 +378,8 @@ impl<'a> ViewStages<'a> {
                 embed::embed_masks(&loaded.image, masks, encoder, background, None)?
             }
         };
-        if let Some(Patches { photo, of }) = patches {
-            vectors.append(&mut embed::embed_patches(photo, of, encoder)?);
+        if let Some(patches) = patches {
+            patches.add_to(&mut vectors, encoder)?;
         }
         Ok(vectors)
     }

@@ -1,5 +1,7 @@
 //! The patches of an image model as masks: cells of a square grid that is stretched over the photo.
 
+use std::collections::BTreeMap;
+
 use super::mask::{BoxPx, Mask};
 
 /// Returns the patches of a photo that have pixels, with their numbers, row by row. Patch `k` of `per_side` covers the pixels
@@ -24,6 +26,26 @@ pub fn patch_masks(per_side: u32, width_px: u32, height_px: u32) -> Vec<(usize, 
         }
     }
     patches
+}
+
+/// Returns the share of a mask's pixels in each patch where it has some, by number of the patch. Patches are those of
+/// [`patch_masks`].
+pub fn shares(mask: &Mask, per_side: u32, width_px: u32, height_px: u32) -> Vec<(usize, f32)> {
+    // The patch of a pixel's centre: floor((x + 1/2) * per_side / edge).
+    let patch = |x: u32, edge_px: u32| {
+        ((2 * u64::from(x) + 1) * u64::from(per_side) / (2 * u64::from(edge_px.max(1)))) as usize
+    };
+    let BoxPx { x0, y0, x1, y1 } = mask.box_px;
+    let columns: Vec<usize> = (x0..x1).map(|x| patch(x, width_px)).collect();
+    let mut counts = BTreeMap::<usize, u32>::new();
+    for (y, row) in (y0..y1).zip(mask.inside.chunks_exact(columns.len().max(1))) {
+        let first = patch(y, height_px) * per_side as usize;
+        for (column, _) in columns.iter().zip(row).filter(|(_, inside)| **inside) {
+            *counts.entry(first + column).or_default() += 1;
+        }
+    }
+    let n: u32 = counts.values().sum();
+    counts.into_iter().map(|(patch, count)| (patch, count as f32 / n as f32)).collect()
 }
 
 #[cfg(test)]

@@ -104,6 +104,7 @@ pub fn run(
                     encode.aggregation = plain.aggregation;
                     encode.cells.objects = plain.objects;
                     encode.view.raster_width = plain.raster_width;
+                    encode.view.regions = plain.regions;
                 }
                 let engines = Engines::new(models, session, rasterizer);
                 let start = std::time::Instant::now();
