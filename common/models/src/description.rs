@@ -19,6 +19,8 @@
 //! std = [0.27, 0.26, 0.28]
 //! normalise = true                 # false: the model's vectors are of unit length already
 //! batch = 16                       # crops in a run; default: measured (see `OnnxImageEncoder`)
+//! windows = [3]                    # optional, for a model that learnt from whole photos: windows of a third of a photo's
+//!                                  # edges, half of one apart, of which masks take a share
 //! patches = { output = "patch_embeddings", patch_px = 14 }  # optional: a vector of the same space for each patch of the
 //!                                  # square, f32 or f16 [n,(size_px/patch_px)^2,dim], row by row; photos are stretched
 //!
@@ -189,6 +191,10 @@ pub struct ImageDescription {
     /// Crops in a run; default: measured.
     #[serde(skip_serializing)]
     pub batch: Option<u16>,
+    /// Windows of a photo that masks take a share of, for a model that learnt from whole photos: each a number of windows along
+    /// an edge; none where it has patches.
+    #[serde(default, skip_serializing)]
+    pub windows: Vec<u8>,
     /// The vectors of patches, if the model has them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub patches: Option<PatchDescription>,
@@ -377,6 +383,8 @@ impl Description {
             format!("{:?}", image.std),
             "three numbers above 0",
         )?;
+        let fits = image.windows.len() <= 4 && image.windows.iter().all(|size| (1..=8).contains(size));
+        require(fits, "image.windows", format!("{:?}", image.windows), "at most 4 numbers from 1 to 8")?;
         if let Some(PatchDescription { patch_px, .. }) = image.patches {
             let fits = (1..=image.size_px).contains(&patch_px)
                 && image.size_px.is_multiple_of(patch_px)

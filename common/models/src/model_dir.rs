@@ -196,6 +196,14 @@ impl ModelDir {
         }
     }
 
+    /// Returns the sizes of windows of a photo that masks take a share of; none if the model should see things alone.
+    pub fn windows(&self) -> &[u8] {
+        match &self.source {
+            Source::Colours => &[],
+            Source::Files { description, .. } => &description.image.windows,
+        }
+    }
+
     /// Opens the image encoder.
     /// # Errors
     /// [`ModelError`] if a file is absent or not as described, or ONNX Runtime does not load.

@@ -2,6 +2,7 @@
 
 mod patches;
 mod shared;
+mod surroundings;
 
 use std::num::NonZeroUsize;
 
@@ -13,8 +14,9 @@ use slag_models::{
 
 use crate::masks::{BoxPx, Mask};
 
-pub use patches::PhotoPatches;
+pub use patches::{PatchUse, PhotoPatches};
 pub use shared::{Failure, OpenEncoder, SharedEncoders};
+pub use surroundings::Surroundings;
 
 /// Reason why masks cannot be embedded.
 #[derive(Debug, thiserror::Error)]

@@ -35,6 +35,8 @@ struct SceneIdentity<'a> {
     program: &'static str,
     regions: (u32, f64, u32),
     encoder: Hash32,
+    /// Windows are no part of the encoder's id: they change no vector of a crop.
+    windows: &'a [u8],
     session: Session,
     segmenter: String,
     perturbation: Option<String>,
@@ -108,7 +110,7 @@ pub(crate) fn of_scene(
 fn scene_identity<'a>(
     settings: &'a ViewSettings,
     cells: CellLimits,
-    engines: &Engines<'_>,
+    engines: &Engines<'a>,
     segmenter: &dyn Segmenter,
     scene: Hash32,
 ) -> SceneIdentity<'a> {
@@ -117,6 +119,7 @@ fn scene_identity<'a>(
         program: env!("CARGO_PKG_VERSION"),
         regions: (REGIONS_VERSION, LONG_BORDERS, MAX_RASTER_WIDTH_PX),
         encoder: Hash32(models.encoder_id().hash()),
+        windows: models.windows(),
         session: Session {
             providers: session.providers.iter().map(ToString::to_string).collect(),
             n_threads: session.intra_op_threads,

@@ -19,7 +19,7 @@ pub enum Preset {
     Paper,
     /// The paper's method with the masks of `balanced`: rasters as wide as photos, the plain average, no objects.
     Plain,
-    /// Half of the views, by coverage; two scales of masks; coarse rasters; refined contributions.
+    /// Half of the views, by coverage; two scales of masks, by their crops alone; coarse rasters; refined contributions.
     Fast,
     /// All views; refined contributions.
     Balanced,
@@ -103,6 +103,7 @@ impl Preset {
                 ..balanced
             },
             Self::Fast => Choices {
+                regions: Regions::Crops,
                 mask_levels: 2,
                 views_limit: ViewsLimit::Share(0.5),
                 raster_width: RasterWidth::Px(320),

@@ -98,7 +98,8 @@ pub struct ViewSettings {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Regions {
-    /// Masks: by a crop each and, where the image model has patches that are aligned with text, by the patches within them.
+    /// Masks: by a crop each and, where the image model has patches that are aligned with text, by the patches within them;
+    /// else, where the model wants them, by windows over the photo.
     #[default]
     Masks,
     /// Masks, by a crop each.

@@ -15,13 +15,14 @@ use super::pipeline::Stage;
 use super::settings::{LONG_BORDERS, MAX_RASTER_WIDTH_PX, RasterWidth, Regions, ViewSettings};
 use super::sink::{PhotoSource, ViewRecord, ViewSink};
 use crate::cells::CellSplit;
-use crate::embed::{self, EmbedError, PhotoPatches, SharedEncoders};
+use crate::embed::{self, EmbedError, PatchUse, PhotoPatches, SharedEncoders, Surroundings};
 use crate::ingest::{self, LoadedImage};
 use crate::lanes::GpuLoad;
 use crate::lift::ViewContributions;
 use crate::lift::photos::MaskOutline;
 use crate::masks::patches::patch_masks;
 use crate::masks::regions::{absorb_slivers, border_share, partition};
+use crate::masks::windows::Windows;
 use crate::masks::{self, Mask, RegionMap};
 use crate::progress::ViewEvent;
 use crate::raster::{LoadedScene, RasterError, RasterView};
@@ -80,7 +81,7 @@ enum Next {
     Depth(LoadedImage),
     Segment(LoadedImage, Option<Vec<f32>>),
     Crop(LoadedImage, Vec<Mask>),
-    Embed(Crops, Option<PhotoPatches>, Partition),
+    Embed(Crops, Option<PhotoPatches>, Option<Surroundings>, Partition),
     Raster(Vec<f32>, Partition),
     Write(ViewContributions, Vec<MaskOutline>, u32),
 }
@@ -221,12 +222,14 @@ impl<'a> ViewStages<'a> {
                 self.context.progress().view(&view.name, event);
                 Next::Crop(loaded, masks)
             }
-            Next::Crop(loaded, masks) => {
-                let (patches, of_patches) = self.patches(&loaded.image, &masks);
-                let partition = match of_patches {
-                    Some(regions) => self.partition(&loaded, &regions),
-                    None => self.partition(&loaded, &masks),
-                };
+            Next::Crop(loaded, mut masks) => {
+                let (patches, regions) = self.patches(&loaded.image, &masks);
+                let partition = self.partition(&loaded, regions.as_ref().unwrap_or(&masks));
+                let windows = self.windows(&loaded.image, &masks).map(|windows| {
+                    let of = Surroundings::of_windows(&masks, &windows);
+                    masks.extend(windows.masks());
+                    of
+                });
                 let crops = match &self.preprocess {
                     Some(preprocess) => Crops::Squares(
                         embed::squares(&loaded.image, &masks, self.tools.settings.background, preprocess)
@@ -234,10 +237,15 @@ impl<'a> ViewStages<'a> {
                     ),
                     None => Crops::Uncut(loaded, masks),
                 };
-                Next::Embed(crops, patches, partition)
+                Next::Embed(crops, patches, windows, partition)
             }
-            Next::Embed(crops, patches, partition) => {
+            Next::Embed(crops, patches, windows, partition) => {
                 let mut vectors = self.embed(view, crops, patches.as_ref())?;
+                if let Some(windows) = windows {
+                    let dim = self.tools.engines.models.dim();
+                    let of_windows = vectors.split_off(windows.n_masks() * dim);
+                    windows.mix(&mut vectors, &of_windows, dim);
+                }
                 if let Some(perturbation) = self.tools.engines.perturbation {
                     perturbation.vectors(&view.name, &mut vectors, self.tools.engines.models.dim());
                 }
@@ -277,19 +285,31 @@ impl<'a> ViewStages<'a> {
         }
     }
 
-    /// Returns the patches of a photo that have vectors, and the regions that they are, where masks are not.
+    /// Returns the patches of a photo that have vectors, and the regions that they are in place of masks.
     fn patches(&self, photo: &RgbImage, masks: &[Mask]) -> (Option<PhotoPatches>, Option<Vec<Mask>>) {
         let Some(per_side) = self.tools.engines.models.patches_per_side() else { return (None, None) };
+        let patches = |uses| Some(PhotoPatches { photo: photo.clone(), uses });
+        let (width_px, height_px) = photo.dimensions();
         match self.tools.settings.regions {
             Regions::Crops => (None, None),
             Regions::Masks if masks.is_empty() => (None, None),
-            Regions::Masks => (Some(PhotoPatches::of_masks(photo.clone(), masks, per_side)), None),
+            Regions::Masks => {
+                let of = Surroundings::of_patches(masks, per_side, (width_px, height_px));
+                (patches(PatchUse::Masks(of)), None)
+            }
             Regions::Patches => {
-                let (width_px, height_px) = photo.dimensions();
                 let (numbers, regions) = patch_masks(per_side, width_px, height_px).into_iter().unzip();
-                (Some(PhotoPatches::regions(photo.clone(), numbers)), Some(regions))
+                (patches(PatchUse::Regions(numbers)), Some(regions))
             }
         }
+    }
+
+    /// Returns the windows that masks take a share of: of a model that wants them, and has no patches.
+    fn windows(&self, photo: &RgbImage, masks: &[Mask]) -> Option<Windows> {
+        let models = self.tools.engines.models;
+        let has_patches = models.patches_per_side().is_some();
+        let wanted = self.tools.settings.regions == Regions::Masks && !has_patches && !masks.is_empty();
+        wanted.then(|| Windows::new(models.windows(), photo.width(), photo.height()))
     }
 
     /// Makes the regions of a view's masks: on a finer raster where their borders are long, if the settings ask for it.

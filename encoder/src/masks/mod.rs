@@ -6,6 +6,7 @@ mod overlay;
 pub mod patches;
 pub mod regions;
 pub mod rle;
+pub mod windows;
 
 pub use labels::masks_of_labels;
 pub use mask::{BoxPx, Mask};
