@@ -53,6 +53,46 @@ fn the_field_agrees_with_the_independent_reference() {
     check_words(&house, &store, &models, dir.path());
 }
 
+/// A model that wants windows over the photo gets them: vectors turn, as far as a share of 0.35 can turn them, and their number is that of the masks.
+/// Oracle: unit vectors a and b give |0.65 a + 0.35 b| >= 0.3, and an angle to a of at most asin(0.35 / 0.65).
+#[needs_shared]
+#[test]
+fn masks_take_a_share_of_windows() {
+    let (house, _) = (shared("scenes/house_a"), shared("models/image_encoder"));
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let encode = |regions: &str| {
+        let store = dir.path().join(regions);
+        let (scene, views, masks) =
+            (house.join("point_cloud.ply"), house.join("sparse/0"), house.join("gt/masks"));
+        let mut command = encoder(&["encode", "--scene", text(&scene), "--views", text(&views)]);
+        command.args(["--masks", text(&masks), "--models", text(&root().join("tests/models/conse"))]);
+        command.args(["--preset", "plain", "--regions", regions, "--store", text(&store)]);
+        run_json(command.args([
+            "--views-limit",
+            "2",
+            "--view-order",
+            "nth",
+            "--raster-width",
+            "160",
+            "--metric",
+        ]));
+        read_regions(&StoreReader::open(&store).expect("a published store")).expect("regions")
+    };
+    let (with, without) = (encode("masks"), encode("crops"));
+    assert_eq!(with.n_masks(), without.n_masks());
+    let cosine = |a: &[f32], b: &[f32]| {
+        let dot =
+            |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(x, y)| f64::from(*x) * f64::from(*y)).sum::<f64>();
+        dot(a, b) / (dot(a, a) * dot(b, b)).sqrt()
+    };
+    let cosines: Vec<f64> = (0..with.n_masks())
+        .map(|k| cosine(with.mask_vectors().get(k), without.mask_vectors().get(k)))
+        .collect();
+    println!("{} masks: cosines {cosines:.3?}", cosines.len());
+    let least = (1.0 - (0.35_f64 / 0.65).powi(2)).sqrt();
+    assert!(!cosines.is_empty() && cosines.iter().all(|cosine| (least - 1e-3..0.9999).contains(cosine)));
+}
+
 /// The GPU's field equals the CPU's within the bound of docs/numerics.md: contributions differ only at pixels across a cut,
 /// together by less than a 50,000th. A machine without a GPU uses a software adapter.
 #[needs_shared]
