@@ -1,5 +1,5 @@
 """Makes a model with vectors of patches of the ConSE encoder: the words of its classes at each place, as class activation maps
-show them (Zhou et al. 2016), before the average over the photo. `encode --regions patches|both` was measured against crops
+show them (Zhou et al. 2016), before the average over the photo. Patches were measured against crops
 with it (docs/accuracy.md).
 
     conse_patches.py MODELS CONSE OUT SIZE_PX
