@@ -19,8 +19,8 @@
 //! std = [0.27, 0.26, 0.28]
 //! normalise = true                 # false: the model's vectors are of unit length already
 //! batch = 16                       # crops in a run; default: measured (see `OnnxImageEncoder`)
-//! windows = [3]                    # optional, for a model that learnt from whole photos: windows of a third of a photo's
-//!                                  # edges, half of one apart, of which masks take a share
+//! windows = [3]                    # optional, for a model that learnt from whole photos: masks take a share of windows, a
+//!                                  # third as wide and high as the photo, each overlapping the next by half
 //! patches = { output = "patch_embeddings", patch_px = 14 }  # optional: a vector of the same space for each patch of the
 //!                                  # square, f32 or f16 [n,(size_px/patch_px)^2,dim], row by row; photos are stretched
 //!
@@ -191,8 +191,8 @@ pub struct ImageDescription {
     /// Crops in a run; default: measured.
     #[serde(skip_serializing)]
     pub batch: Option<u16>,
-    /// Windows of a photo that masks take a share of, for a model that learnt from whole photos: each a number of windows along
-    /// an edge; none where it has patches.
+    /// Sizes of the windows over a photo that masks take a share of, for a model that learnt from whole photos: the photo's
+    /// edge over the window's. Not used where the model has patches.
     #[serde(default, skip_serializing)]
     pub windows: Vec<u8>,
     /// The vectors of patches, if the model has them.

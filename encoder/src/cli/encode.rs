@@ -56,9 +56,9 @@ pub struct EncodeArgs {
     /// Segment Anything instead of the built-in segmenter.
     #[command(flatten)]
     pub sam: SamArgs,
-    /// What of a photo has vectors: masks, by their crops and by what the photo shows in and around them, as patches of the
-    /// image model (model.toml: image.patches) or windows over the photo (image.windows); masks by crops alone; or patches
-    /// alone, and then no objects are found [default: the preset's].
+    /// Which parts of a photo get vectors: `masks`, from their crops and from what the photo shows in and around them (the
+    /// image model's patches, or windows over the photo: image.patches and image.windows in model.toml); `crops`, masks from
+    /// their crops alone; `patches`, without masks, so no objects are found [default: the preset's].
     #[arg(long, value_enum)]
     pub regions: Option<Regions>,
     /// Ids in mask PNGs that are no masks; 0 never is one.

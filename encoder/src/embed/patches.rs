@@ -6,15 +6,15 @@ use slag_models::ImageEncoder;
 use super::EmbedError;
 use super::surroundings::Surroundings;
 
-/// A photo whose patches have vectors, and what becomes of them.
+/// A photo to embed patch by patch, and how the vectors are used.
 pub struct PhotoPatches {
     /// The photo.
     pub photo: RgbImage,
-    /// What becomes of the vectors.
+    /// How the vectors are used.
     pub uses: PatchUse,
 }
 
-/// What becomes of the vectors of patches.
+/// How the vectors of patches are used.
 pub enum PatchUse {
     /// Each of these patches is a region with a vector of its own; numbers row by row.
     Regions(Vec<usize>),

@@ -92,7 +92,7 @@ mod tests {
             (0..dim).for_each(|d| by_patch[d] += f64::from(of_patches[patch * dim + d]));
             let mut first = 0;
             for size in [1u32, 2, 4] {
-                // Windows of a size whose half-window cells hold the pixel.
+                // The windows of this size that contain the pixel: each covers two by two cells half a window wide.
                 let n = 2 * size - 1;
                 let cell =
                     |x: u32, edge: u32| ((f64::from(x) + 0.5) * f64::from(2 * size) / f64::from(edge)) as u32;

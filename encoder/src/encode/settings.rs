@@ -113,7 +113,7 @@ impl Regions {
         *self == Self::Masks
     }
 
-    /// Returns whether there are masks, of which objects are made.
+    /// Returns whether masks are made. Objects need them.
     pub fn have_masks(self) -> bool {
         self != Self::Patches
     }
