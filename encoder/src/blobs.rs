@@ -3,12 +3,15 @@
 //! Keys are relative to the prefix that the URL names. All calls block; they are made from threads of the program, never
 //! from those of the bucket's own runtime.
 
+use std::error::Error;
 use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
 use futures_util::{StreamExt, TryStreamExt};
+use object_store::client::{HttpError, HttpErrorKind};
 use object_store::local::LocalFileSystem;
 use object_store::path::Path as Key;
 use object_store::{ObjectStore, ObjectStoreExt, PutMode, PutOptions};
@@ -17,6 +20,9 @@ use tokio::runtime::{Builder, Runtime};
 
 /// Threads that wait for the network.
 const N_THREADS: usize = 2;
+/// Time for which a request that the network broke off is made again, and the pause before that.
+const PATIENCE: Duration = Duration::from_secs(60);
+const RETRY_PAUSE: Duration = Duration::from_millis(300);
 
 /// A bucket cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -118,6 +124,13 @@ impl Bucket {
         &self.runtime
     }
 
+    fn ask<T, F>(&self, request: impl Fn() -> F) -> object_store::Result<T>
+    where
+        F: Future<Output = object_store::Result<T>>,
+    {
+        self.runtime.block_on(answered(request))
+    }
+
     fn key(&self, key: &str) -> Key {
         self.prefix.parts().chain(Key::from(key).parts()).map(|part| part.as_ref().to_owned()).collect()
     }
@@ -137,7 +150,7 @@ impl Bucket {
     /// [`BlobError::Request`].
     pub fn get(&self, key: &str) -> Result<Option<Bytes>, BlobError> {
         let at = self.key(key);
-        match self.runtime.block_on(async { self.store.get(&at).await?.bytes().await }) {
+        match self.ask(|| async { self.store.get(&at).await?.bytes().await }) {
             Ok(bytes) => Ok(Some(bytes)),
             Err(object_store::Error::NotFound { .. }) => Ok(None),
             Err(source) => Err(self.failed(key, source)),
@@ -165,7 +178,7 @@ impl Bucket {
         let read = |(key, range): &(String, Range<u64>)| {
             let (at, key, range) = (self.key(key), key.clone(), range.clone());
             async move {
-                let read = self.store.get_range(&at, range).await;
+                let read = answered(|| self.store.get_range(&at, range.clone())).await;
                 read.map_err(|source| self.failed(&key, source))
             }
         };
@@ -179,7 +192,8 @@ impl Bucket {
     /// # Errors
     /// [`BlobError::Request`].
     pub fn len_of(&self, key: &str) -> Result<Option<u64>, BlobError> {
-        match self.runtime.block_on(self.store.head(&self.key(key))) {
+        let at = self.key(key);
+        match self.ask(|| self.store.head(&at)) {
             Ok(found) => Ok(Some(found.size)),
             Err(object_store::Error::NotFound { .. }) => Ok(None),
             Err(source) => Err(self.failed(key, source)),
@@ -189,7 +203,7 @@ impl Bucket {
     fn put_with(&self, key: &str, bytes: Bytes, mode: PutMode) -> Result<bool, BlobError> {
         let options = PutOptions { mode, ..PutOptions::default() };
         let at = self.key(key);
-        match self.runtime.block_on(self.store.put_opts(&at, bytes.into(), options)) {
+        match self.ask(|| self.store.put_opts(&at, bytes.clone().into(), options.clone())) {
             Ok(_) => Ok(true),
             Err(object_store::Error::AlreadyExists { .. } | object_store::Error::Precondition { .. }) => {
                 Ok(false)
@@ -198,12 +212,22 @@ impl Bucket {
         }
     }
 
-    /// Puts an object unless there is one; returns whether there was none.
+    /// Puts an object unless there is one; returns whether there was none. Where the answer is lost, the next one says that
+    /// there is one: who must know whose it is uses [`Self::claim`].
     ///
     /// # Errors
     /// [`BlobError::Request`].
     pub fn put_new(&self, key: &str, bytes: impl Into<Bytes>) -> Result<bool, BlobError> {
         self.put_with(key, bytes.into(), PutMode::Create)
+    }
+
+    /// Puts an object that no one else would put unless there is one; returns whether it is the one that is there.
+    ///
+    /// # Errors
+    /// [`BlobError`].
+    pub fn claim(&self, key: &str, bytes: impl Into<Bytes>) -> Result<bool, BlobError> {
+        let bytes = bytes.into();
+        Ok(self.put_new(key, bytes.clone())? || self.require(key)? == bytes)
     }
 
     /// Puts an object in place of what is there.
@@ -220,7 +244,7 @@ impl Bucket {
     /// [`BlobError::Request`].
     pub fn list(&self, folder: &str) -> Result<Vec<String>, BlobError> {
         let at = self.key(folder);
-        let listed = self.runtime.block_on(self.store.list(Some(&at)).try_collect::<Vec<_>>());
+        let listed = self.ask(|| self.store.list(Some(&at)).try_collect::<Vec<_>>());
         let listed = listed.map_err(|source| self.failed(folder, source))?;
         let name = |meta: &object_store::ObjectMeta| {
             let rest = meta.location.prefix_match(&at)?;
@@ -232,8 +256,39 @@ impl Bucket {
     }
 }
 
+/// Makes a request, and again where the network broke it off after it was sent.
+///
+/// The client does so itself, but not with a conditional put, which may find its own object: see [`Bucket::claim`].
+async fn answered<T, F>(request: impl Fn() -> F) -> object_store::Result<T>
+where
+    F: Future<Output = object_store::Result<T>>,
+{
+    let since = Instant::now();
+    loop {
+        match request().await {
+            Err(error) if is_broken_off(&error) && since.elapsed() < PATIENCE => {
+                tracing::info!("{error}; the request is made again");
+                tokio::time::sleep(RETRY_PAUSE).await;
+            }
+            answer => return answer,
+        }
+    }
+}
+
+/// Returns whether it is unknown if a request reached the server, or its answer came in part.
+fn is_broken_off(error: &object_store::Error) -> bool {
+    use HttpErrorKind::{Decode, Interrupted, Request, Timeout};
+    let first: &(dyn Error + 'static) = error;
+    let http = std::iter::successors(Some(first), |cause| (*cause).source())
+        .find_map(|cause| cause.downcast_ref::<HttpError>());
+    http.is_some_and(|error| matches!(error.kind(), Decode | Interrupted | Request | Timeout))
+}
+
 #[cfg(test)]
 mod tests {
+    use std::io::{Read, Write};
+    use std::net::{TcpListener, TcpStream};
+
     use super::*;
 
     /// A conditional put is one for all who have the folder open; names come without their folder, in order.
@@ -255,5 +310,64 @@ mod tests {
         assert!(refused.contains("ftp://somewhere/else"), "{refused}");
         let missing = other.require("jobs/3").expect_err("missing").to_string();
         assert!(missing.contains("jobs/3 is missing"), "{missing}");
+    }
+
+    /// Reads a request; returns how its target begins.
+    fn read_request(stream: &mut TcpStream, n_bytes: usize) -> String {
+        let mut request = vec![0; n_bytes];
+        stream.read_exact(&mut request).expect("a request");
+        String::from_utf8_lossy(&request).into_owned()
+    }
+
+    /// A server takes an object and resets the connection; the put is made again, and finds the object in place.
+    #[test]
+    fn a_put_whose_answer_is_lost_is_made_again() {
+        let server = TcpListener::bind("127.0.0.1:0").expect("a port");
+        let endpoint = format!("http://{}", server.local_addr().expect("an address"));
+        let serve = move || {
+            let (mut first, _) = server.accept().expect("a request");
+            // What is left unread when a connection is closed resets it.
+            let mut whole = [0; 4096];
+            while !first.peek(&mut whole).is_ok_and(|n| whole[..n].ends_with(b"mine")) {}
+            let begin = read_request(&mut first, 4);
+            drop(first);
+            let mut answer = |status: &str, body: &str| {
+                let (mut stream, _) = server.accept().expect("a request");
+                let mut request = Vec::new();
+                while !request.ends_with(b"mine")
+                    && !(request.starts_with(b"GET") && request.ends_with(b"\r\n\r\n"))
+                {
+                    request.extend(read_request(&mut stream, 1).bytes());
+                }
+                let len = body.len();
+                let head = format!("HTTP/1.1 {status}\r\nContent-Length: {len}\r\nConnection: close\r\n");
+                let about = "Last-Modified: Thu, 26 Nov 2026 12:00:00 GMT\r\nETag: \"1\"\r\n";
+                write!(stream, "{head}{about}\r\n{body}").expect("an answer");
+            };
+            answer("412 Precondition Failed", "");
+            answer("200 OK", "mine");
+            begin
+        };
+        let served = std::thread::spawn(serve);
+        let variables = [
+            ("AWS_ENDPOINT", endpoint.as_str()),
+            ("AWS_ALLOW_HTTP", "true"),
+            ("AWS_ACCESS_KEY_ID", "robot"),
+            ("AWS_SECRET_ACCESS_KEY", "secret"),
+            ("AWS_REGION", "here"),
+        ];
+        let variables = variables.map(|(name, value)| (name.to_owned(), value.to_owned()));
+        let bucket = Bucket::open("s3://scenes/room", variables).expect("opens");
+        assert!(bucket.claim("jobs/1/end.json", "mine").expect("claims"));
+        assert_eq!(served.join().expect("served"), "PUT ");
+    }
+
+    /// What is there already is one's own if it has the same bytes.
+    #[test]
+    fn a_claim_is_one_for_all() {
+        let dir = tempfile::tempdir().expect("a folder");
+        let bucket = Bucket::open(dir.path().to_str().expect("UTF-8"), []).expect("opens");
+        assert!(bucket.claim("end", "mine").expect("claims") && bucket.claim("end", "mine").expect("claims"));
+        assert!(!bucket.claim("end", "another's").expect("claims"));
     }
 }

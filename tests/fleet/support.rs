@@ -132,8 +132,9 @@ impl Running {
     pub fn json(self) -> Value {
         let what = self.what.clone();
         let output = self.output();
-        let errors = String::from_utf8_lossy(&output.stderr);
-        assert!(output.status.success(), "{what}: {}\n{errors}", output.status);
+        let (printed, errors) =
+            (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+        assert!(output.status.success(), "{what}: {}\n{errors}\n{printed}", output.status);
         serde_json::from_slice(&output.stdout).expect("one JSON object on stdout")
     }
 }

@@ -12,7 +12,7 @@ use crate::encode::ViewSettings;
 use crate::shard::ShardSettings;
 
 /// Version of the documents and objects.
-const FORMAT: u32 = 2;
+const FORMAT: u32 = 3;
 
 /// Returns the version of this program, as documents state it.
 pub(super) fn own_version() -> String {
@@ -48,6 +48,8 @@ pub(super) struct PlannedView {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct RunPlan {
     pub(super) program: String,
+    /// A random number, by which a coordinator knows its own plan again.
+    pub(super) coordinator: u64,
     /// Models and segmenter, for messages.
     pub(super) engines: String,
     /// Hash of everything on which the contributions of all views depend.

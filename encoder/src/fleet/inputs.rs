@@ -1,6 +1,7 @@
 //! Photos, masks and the scene on their way to the bucket, and from there to a worker.
 
 use std::collections::BTreeSet;
+use std::hash::{BuildHasher, Hasher, RandomState};
 use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 
@@ -70,6 +71,8 @@ pub(super) fn upload(
     views.sort_by_key(|(cost, _)| std::cmp::Reverse(*cost));
     Ok(RunPlan {
         program: documents::own_version(),
+        // The standard library's random hash keys are new for each call.
+        coordinator: RandomState::new().build_hasher().finish(),
         engines: engines_text(plan.engines.models.encoder_id(), &plan.segmenter.identity()),
         of_scene: plan.job.of_scene(),
         scene: scene_hash,

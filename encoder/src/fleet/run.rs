@@ -66,7 +66,7 @@ impl Run {
             }
         }
         let next = Self(newest.map_or(1, |(run, _)| run.0 + 1));
-        match bucket.put_new(&next.key("plan.json"), documents::to_bytes(plan)?)? {
+        match bucket.claim(&next.key("plan.json"), documents::to_bytes(plan)?)? {
             true => Ok(next),
             false => Err(FleetError::Superseded { run: next.0, url: bucket.url().to_owned() }),
         }
@@ -128,7 +128,8 @@ impl Run {
     /// # Errors
     /// [`FleetError::Superseded`] if another coordinator was first.
     pub(super) fn publish(self, bucket: &Bucket) -> Result<(), FleetError> {
-        match bucket.put_new(&self.key("end.json"), documents::to_bytes(&End::Published)?)? {
+        // Only the run's own coordinator puts this.
+        match bucket.claim(&self.key("end.json"), documents::to_bytes(&End::Published)?)? {
             true => Ok(()),
             false => Err(FleetError::Superseded { run: self.0, url: bucket.url().to_owned() }),
         }
@@ -164,6 +165,7 @@ mod tests {
         let settings = EncodeSettings::new("a".into(), "b".into(), "c".into(), true);
         RunPlan {
             program: documents::own_version(),
+            coordinator: 1,
             engines: "none".into(),
             of_scene: Hash32([1; 32]),
             scene: Hash32([2; 32]),
