@@ -331,7 +331,7 @@ mod tests {
             while !first.peek(&mut whole).is_ok_and(|n| whole[..n].ends_with(b"mine")) {}
             let begin = read_request(&mut first, 4);
             drop(first);
-            let mut answer = |status: &str, body: &str| {
+            let answer = |status: &str, body: &str| {
                 let (mut stream, _) = server.accept().expect("a request");
                 let mut request = Vec::new();
                 while !request.ends_with(b"mine")

@@ -19,7 +19,8 @@ use super::views::DoneViews;
 use crate::codebook::{ScoreMetric, ScoreMetricContext, TextBank};
 use crate::lift::photos::{self, Photo};
 use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS};
-use crate::lift::refine::{Refinement, Subject};
+use crate::lift::refine::{Begun, Passes, Refinement, Subject};
+use crate::lift::superpoint::Superpoints;
 use crate::lift::{Aggregation, ContributionError, ContributionIndex, RegionTable};
 use crate::objects::{self, Object, ObjectsReport, SceneObjects};
 use crate::occupancy::{OccupancyReport, SceneOccupancy};
@@ -200,7 +201,7 @@ impl<'a> CellBuilder<'a> {
     }
 
     /// Finds the objects of the scene if the settings ask for them; `None` if cancelled, too.
-    fn objects(&self) -> Result<Option<SceneObjects>, EncodeError> {
+    fn objects(&self, superpoints: Option<&Superpoints>) -> Result<Option<SceneObjects>, EncodeError> {
         if !self.plan.settings.cells.objects {
             return Ok(None);
         }
@@ -209,6 +210,7 @@ impl<'a> CellBuilder<'a> {
             table: &self.table,
             gaussians: &self.plan.inputs.scene,
             split: &self.plan.inputs.split,
+            superpoints,
             photos: &self.photos,
             score_context: &self.score_context,
             group_bytes: self.group_bytes,
@@ -251,23 +253,30 @@ impl<'a> CellBuilder<'a> {
             counts: self.counts(views),
             score_sums: [0.0; 3],
         };
-        // Objects are found from all masks alike, before refinement gives some less weight.
+        let aggregation = settings.aggregation;
+        let passes =
+            Passes { index: &self.index, group_bytes: self.group_bytes, cancel: self.context.cancel() };
+        let subject = Subject { scene: &inputs.scene, split: &inputs.split };
+        self.context.begin_phase(Phase::Superpoints);
+        let begun = self.context.time("superpoints", || {
+            let begin = || Refinement::begin(aggregation, passes, &mut self.table, subject, &self.photos);
+            self.context.install(begin)
+        })?;
+        if self.context.is_cancelled() {
+            return Ok(None);
+        }
+        // From all masks alike, whatever weight they have in the refinement.
         self.context.begin_phase(Phase::Objects);
-        let objects = self.context.install(|| self.objects())?;
+        let superpoints = begun.as_ref().and_then(Begun::superpoints);
+        let objects = self.context.install(|| self.objects(superpoints))?;
         if let Some(found) = &objects {
             self.context.progress().objects(&mut found.objects.iter().map(Object::found));
         }
         self.context.begin_phase(Phase::Refine);
-        let aggregation = settings.aggregation;
+        let object_of = objects.as_ref().map_or(&[][..], |objects| &objects.object_of);
         let refinement = self.context.time("refine", || {
-            let contributions = (&self.index, &mut self.table);
-            let object_of = objects.as_ref().map_or(&[][..], |objects| &objects.object_of);
-            let subject = Subject { scene: &inputs.scene, split: &inputs.split, object_of };
-            let cancel = self.context.cancel();
-            let photos = &self.photos;
-            let prepare =
-                || Refinement::prepare(aggregation, contributions, subject, photos, self.group_bytes, cancel);
-            self.context.install(prepare)
+            let finish = |begun: Begun| begun.finish(passes, &mut self.table, subject, object_of);
+            self.context.install(|| begun.map_or(Ok(None), finish))
         })?;
         if self.context.is_cancelled() {
             return Ok(None);

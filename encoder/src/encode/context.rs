@@ -30,6 +30,8 @@ pub(super) enum Phase {
     Occupancy,
     /// The views' contributions are opened.
     Merge,
+    /// Masks are weighed and superpoints found.
+    Superpoints,
     Objects,
     Refine,
     /// Cells become codebooks and shards.
@@ -45,6 +47,7 @@ impl Phase {
             Self::Views => "views",
             Self::Occupancy => "occupancy",
             Self::Merge => "merge",
+            Self::Superpoints => "superpoints",
             Self::Objects => "objects",
             Self::Refine => "refine",
             Self::Cells => "cells",

@@ -102,7 +102,7 @@ impl StageReport {
 /// A part of the run. The parts follow each other and add up to the run's time.
 #[derive(Clone, Debug, Serialize)]
 pub struct PhaseReport {
-    /// The part: read, plan, views, occupancy, merge, objects, refine, cells, publish.
+    /// The part: read, plan, views, occupancy, merge, superpoints, objects, refine, cells, publish.
     pub phase: String,
     /// Seconds.
     pub secs: f64,

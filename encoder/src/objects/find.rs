@@ -41,6 +41,9 @@ pub fn find(scene: &Scene<'_>) -> Result<Option<SceneObjects>, ContributionError
     drop(sightings);
     let Some(clusters) = clusters else { return Ok(None) };
     let Some(mut members) = Members::assign(scene, &clusters)? else { return Ok(None) };
+    if let Some(superpoints) = scene.superpoints {
+        members.settle(scene, superpoints);
+    }
     members.drop_small(MIN_GAUSSIANS);
     let objects = describe(scene, &members, &view_of_mask);
     let calibration = vectors::calibrate(&objects, scene.score_context, table.dim());

@@ -4,12 +4,17 @@ use rayon::prelude::*;
 
 use super::consensus::MaskClusters;
 use super::object::NONE;
+use super::pieces;
 use super::scene::Scene;
+use super::views::ViewsOfClusters;
+use crate::lift::superpoint::Superpoints;
 use crate::lift::{ContributionError, PartContributions, RegionTable};
 use crate::memory::{MemoryPlan, Phase};
 
-/// Smallest share of a Gaussian's weight under an object's masks: a majority.
-const MIN_WEIGHT_SHARE: f32 = 0.5;
+/// Smallest share of a Gaussian's weight that lies under an object's masks, in the views that have such masks.
+const MIN_SHARE_WHERE_SHOWN: f32 = 0.6;
+/// The same in all views: few masks say little.
+const MIN_SHARE: f32 = 0.2;
 
 /// The Gaussians and masks of each object.
 pub struct Members {
@@ -19,7 +24,7 @@ pub struct Members {
     pub masks: Vec<Vec<u32>>,
     /// `[n_masks]`: blending weight of all Gaussians under the mask, pixels.
     pub mask_weights: Vec<f64>,
-    /// `[n_masks]`: of that, the weight of its object's Gaussians.
+    /// `[n_masks]`: of that, the weight of the Gaussians that are its object's by their own weights.
     pub own_weights: Vec<f64>,
 }
 
@@ -52,19 +57,43 @@ impl ClustersOfRegion {
     }
 }
 
+/// What decides a Gaussian's object.
+struct Choice<'a> {
+    clusters: &'a MaskClusters,
+    of_region: ClustersOfRegion,
+    views: ViewsOfClusters,
+    view_of_region: Vec<u32>,
+}
+
+/// Working memory of a choice.
+struct Sums {
+    /// By cluster: the Gaussian's weight under its masks. Zeros between choices.
+    weights: Vec<f32>,
+    /// Clusters with a weight.
+    touched: Vec<u32>,
+    /// The Gaussian's weight in each view.
+    views: Vec<(u32, f32)>,
+}
+
 /// Reserves the object of each Gaussian.
 pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
     memory.reserve(Phase::Always, "the object of each Gaussian", (n_gaussians * size_of::<u32>()) as u64);
 }
 
 impl Members {
-    /// Assigns each Gaussian to the cluster with the largest product of its weight there and the cluster's consensus, among
-    /// clusters with most of its weight. Returns `None` if cancelled.
+    /// Assigns each Gaussian to the cluster with the largest product of the cluster's consensus and the share of the
+    /// Gaussian's weight that its masks have in the views that have such masks: a view without any says nothing, since
+    /// segmenters miss things in many views. Returns `None` if cancelled.
     ///
     /// # Errors
     /// [`ContributionError`].
     pub fn assign(scene: &Scene<'_>, clusters: &MaskClusters) -> Result<Option<Self>, ContributionError> {
-        let of_region = ClustersOfRegion::new(scene.table, clusters);
+        let choice = Choice {
+            clusters,
+            of_region: ClustersOfRegion::new(scene.table, clusters),
+            views: ViewsOfClusters::new(clusters, &scene.view_of_mask()),
+            view_of_region: scene.view_of_region(),
+        };
         let n_masks = scene.table.n_masks();
         let mut masks = vec![Vec::new(); clusters.consensus.len()];
         for (mask, cluster) in clusters.cluster_of_mask.iter().enumerate().filter(|(_, c)| **c != NONE) {
@@ -84,9 +113,11 @@ impl Members {
             let found: Vec<u32> = (0..contributions.part.locals.len())
                 .into_par_iter()
                 .map_init(
-                    || (vec![0.0f32; clusters.consensus.len()], Vec::new()),
-                    |(weights, touched), k| {
-                        best_cluster(&contributions, k, &of_region, clusters, weights, touched)
+                    || Sums::new(clusters.consensus.len()),
+                    |sums, k| {
+                        let entries = contributions.entries_of(k);
+                        let regions = &contributions.regions[entries.clone()];
+                        choice.of(regions, &contributions.weights[entries], sums)
                     },
                 )
                 .collect();
@@ -122,6 +153,11 @@ impl Members {
         }
     }
 
+    /// Gives each superpoint to one object.
+    pub fn settle(&mut self, scene: &Scene<'_>, superpoints: &Superpoints) {
+        pieces::settle(&mut self.object_of, self.masks.len(), scene.split, superpoints);
+    }
+
     /// Drops objects with fewer Gaussians and renumbers the others in order.
     pub fn drop_small(&mut self, min_gaussians: usize) {
         let mut n_of = vec![0usize; self.masks.len()];
@@ -148,36 +184,136 @@ impl Members {
     }
 }
 
-/// Returns the cluster of a Gaussian. `weights`, `touched`: working memory, zeros and empty.
-fn best_cluster(
-    contributions: &PartContributions,
-    k: usize,
-    of_region: &ClustersOfRegion,
-    clusters: &MaskClusters,
-    weights: &mut [f32],
-    touched: &mut Vec<u32>,
-) -> u32 {
-    let mut total = 0.0;
-    for entry in contributions.starts[k] as usize..contributions.starts[k + 1] as usize {
-        let weight = contributions.weights[entry];
-        total += weight;
-        for cluster in of_region.of(contributions.regions[entry]) {
-            let sum = &mut weights[*cluster as usize];
-            if *sum == 0.0 {
-                touched.push(*cluster);
+impl Sums {
+    fn new(n_clusters: usize) -> Self {
+        Self { weights: vec![0.0; n_clusters], touched: Vec::new(), views: Vec::new() }
+    }
+}
+
+impl Choice<'_> {
+    /// Returns the cluster of a Gaussian, or [`NONE`]. Its entries are by view.
+    fn of(&self, regions: &[u32], weights_of_regions: &[f32], sums: &mut Sums) -> u32 {
+        let Sums { weights, touched, views } = sums;
+        views.clear();
+        for (region, weight) in regions.iter().zip(weights_of_regions) {
+            let view = self.view_of_region[*region as usize];
+            match views.last_mut() {
+                Some((last, sum)) if *last == view => *sum += weight,
+                _ => views.push((view, *weight)),
             }
-            *sum += weight;
+            for cluster in self.of_region.of(*region) {
+                let sum = &mut weights[*cluster as usize];
+                if *sum == 0.0 {
+                    touched.push(*cluster);
+                }
+                *sum += weight;
+            }
+        }
+        touched.sort_unstable();
+        touched.dedup();
+        let total: f32 = views.iter().map(|(_, weight)| weight).sum();
+        let (mut best, mut most) = (NONE, 0.0);
+        for cluster in touched.drain(..) {
+            let weight = std::mem::take(&mut weights[cluster as usize]);
+            let is_shown = |(view, _): &&(u32, f32)| self.views.has(cluster, *view);
+            let shown: f32 = views.iter().filter(is_shown).map(|(_, weight)| weight).sum();
+            let merit = f64::from(weight / shown) * self.clusters.consensus[cluster as usize];
+            if weight >= MIN_SHARE_WHERE_SHOWN * shown && weight >= MIN_SHARE * total && merit > most {
+                (best, most) = (cluster, merit);
+            }
+        }
+        best
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use slag_math::random::Random;
+
+    use super::*;
+
+    const N_VIEWS: u32 = 70;
+    const MASKS_PER_VIEW: u32 = 4;
+
+    /// Every set of a view's masks is a region. Some masks are in no cluster, some clusters have none in a view.
+    fn random_choice<'a>(
+        random: &mut Random,
+        table: &mut RegionTable,
+        clusters: &'a mut MaskClusters,
+    ) -> Choice<'a> {
+        let regions: Vec<Vec<u32>> = (0..1 << MASKS_PER_VIEW)
+            .map(|set| (0..MASKS_PER_VIEW).filter(|m| set >> m & 1 == 1).collect())
+            .collect();
+        for _ in 0..N_VIEWS {
+            table.append(&vec![1.0; MASKS_PER_VIEW as usize], regions.iter().map(Vec::as_slice));
+        }
+        clusters.cluster_of_mask =
+            (0..N_VIEWS * MASKS_PER_VIEW).map(|_| [0, 1, 2, 3, NONE][random.below(5) as usize]).collect();
+        clusters.consensus = vec![0.9, 0.6, 0.7, 0.8];
+        let view_of_mask: Vec<u32> =
+            (0..N_VIEWS * MASKS_PER_VIEW).map(|mask| mask / MASKS_PER_VIEW).collect();
+        Choice {
+            of_region: ClustersOfRegion::new(table, clusters),
+            views: ViewsOfClusters::new(clusters, &view_of_mask),
+            view_of_region: (0..table.len() as u32).map(|region| region >> MASKS_PER_VIEW).collect(),
+            clusters,
         }
     }
-    touched.sort_unstable();
-    touched.dedup();
-    let (mut best, mut most) = (NONE, 0.0);
-    for cluster in touched.drain(..) {
-        let weight = std::mem::take(&mut weights[cluster as usize]);
-        let merit = f64::from(weight) * clusters.consensus[cluster as usize];
-        if weight >= MIN_WEIGHT_SHARE * total && merit > most {
-            (best, most) = (cluster, merit);
+
+    /// Oracle: the definition in float64, over all masks of all views. Returns the cluster, and whether rounding may change it.
+    fn oracle(row: &[(u32, f32)], table: &RegionTable, clusters: &MaskClusters) -> (u32, bool) {
+        let view_of = |region: u32| region >> MASKS_PER_VIEW;
+        let sum = |counts: &dyn Fn(u32) -> bool| -> f64 {
+            row.iter().filter(|(region, _)| counts(*region)).map(|(_, weight)| f64::from(*weight)).sum()
+        };
+        let (mut best, mut most, mut is_near) = (NONE, 0.0, false);
+        for (cluster, consensus) in (0u32..).zip(&clusters.consensus) {
+            let is_of = |mask: u32| clusters.cluster_of_mask[mask as usize] == cluster;
+            let under = sum(&|region| table.all_masks_of(region as usize).iter().any(|mask| is_of(*mask)));
+            let shown =
+                sum(&|region| (0..MASKS_PER_VIEW).any(|mask| is_of(view_of(region) * MASKS_PER_VIEW + mask)));
+            let total = sum(&|_| true);
+            let merit = under / shown * consensus;
+            let from_a_border = [under - 0.6 * shown, under - 0.2 * total, merit - most].map(f64::abs);
+            is_near |= under > 0.0 && from_a_border.iter().any(|distance| *distance < 1e-5);
+            if under > 0.0 && under >= 0.6 * shown && under >= 0.2 * total && merit > most {
+                (best, most) = (cluster, merit);
+            }
         }
+        (best, is_near)
     }
-    best
+
+    #[test]
+    fn a_gaussian_is_of_the_object_that_the_definition_says() {
+        let (mut n_of, mut n_near) = ([0; 5], 0);
+        for seed in 0..40 {
+            let mut random = Random::new(seed);
+            let (mut table, mut clusters) = (RegionTable::new(1), MaskClusters::default());
+            let choice = random_choice(&mut random, &mut table, &mut clusters);
+            let mut sums = Sums::new(4);
+            for _ in 0..50 {
+                // Few views, so that one view's mask matters, in order; one region or two of each.
+                let first = random.below(60) as u32;
+                let mut row: Vec<(u32, f32)> = Vec::new();
+                for view in (first..first + 10).filter(|_| random.below(3) > 0).collect::<Vec<u32>>() {
+                    for _ in 0..1 + random.below(2) {
+                        let region = view << MASKS_PER_VIEW | random.below(1 << MASKS_PER_VIEW) as u32;
+                        row.push((region, 0.1 + random.below(1000) as f32 / 300.0));
+                    }
+                }
+                row.sort_by_key(|(region, _)| *region);
+                let (regions, weights): (Vec<u32>, Vec<f32>) = row.iter().copied().unzip();
+                let (expected, is_near) = oracle(&row, &table, choice.clusters);
+                if is_near {
+                    n_near += 1;
+                    continue;
+                }
+                assert_eq!(choice.of(&regions, &weights, &mut sums), expected, "{seed} {row:?}");
+                n_of[expected.min(4) as usize] += 1;
+                // Nothing is left from one Gaussian to the next.
+                assert_eq!(choice.of(&[], &[], &mut sums), NONE);
+            }
+        }
+        assert!(n_of.iter().all(|n| *n > 20) && n_near < 100, "{n_of:?} {n_near}");
+    }
 }

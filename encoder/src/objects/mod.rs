@@ -1,6 +1,7 @@
 //! Stage 5: masks of different views that cover the same Gaussians become objects.
 //!
-//! No model and no training are needed: the contributions tell which Gaussians each mask shows.
+//! No model and no training are needed: the contributions tell which Gaussians each mask shows. Superpoints, where the
+//! refinements make them, say where a thing ends.
 //!
 //! | file | job |
 //! |---|---|
@@ -9,6 +10,8 @@
 //! | [`sightings`] | the region of each sampled Gaussian in each view |
 //! | [`consensus`] | clusters of masks that views agree to show one thing |
 //! | [`members`] | each Gaussian's object, by its weight under the objects' masks |
+//! | `views` | the views that have masks of an object |
+//! | [`pieces`] | each superpoint's object, by its Gaussians |
 //! | [`vectors`] | the few vectors that represent an object's masks |
 //! | [`shards`] | the objects of a cell, as its shards store them |
 //! | `object` | the result |
@@ -21,10 +24,12 @@ mod file;
 mod find;
 pub mod members;
 mod object;
+pub mod pieces;
 mod scene;
 pub mod shards;
 pub mod sightings;
 pub mod vectors;
+mod views;
 
 use crate::lift::RegionTable;
 use crate::memory::MemoryPlan;
@@ -36,6 +41,7 @@ pub use sightings::expected_bytes;
 /// Reserves what finding the objects of a scene takes, and the object of each Gaussian.
 pub fn reserve(memory: &mut MemoryPlan, n_gaussians: usize, n_views: usize) {
     members::reserve(memory, n_gaussians);
+    pieces::reserve(memory, n_gaussians);
     sightings::reserve(memory, n_gaussians, n_views);
 }
 

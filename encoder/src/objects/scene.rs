@@ -7,6 +7,7 @@ use slag_common::Gaussians;
 use crate::cells::CellSplit;
 use crate::codebook::ScoreMetricContext;
 use crate::lift::photos::Photo;
+use crate::lift::superpoint::Superpoints;
 use crate::lift::{ContributionIndex, RegionTable};
 
 /// A scene to find objects in.
@@ -19,6 +20,8 @@ pub struct Scene<'a> {
     pub gaussians: &'a Gaussians,
     /// Their cells.
     pub split: &'a CellSplit,
+    /// Small pieces of its surface, each of which belongs to one object; without them each Gaussian stands for itself.
+    pub superpoints: Option<&'a Superpoints>,
     /// Each view's masks, in the order of the contributions.
     pub photos: &'a [Photo],
     /// Texts to calibrate scores by.

@@ -324,7 +324,9 @@ impl World {
 
     fn objects_unless(&self, group_bytes: u64, cancel: &AtomicBool) -> Option<SceneObjects> {
         let Self { gaussians, split, index, table, photos, score_context, .. } = self;
-        let scene = Scene { index, table, gaussians, split, photos, score_context, group_bytes, cancel };
+        let superpoints = None;
+        let scene =
+            Scene { index, table, gaussians, split, superpoints, photos, score_context, group_bytes, cancel };
         find(&scene).expect("finds")
     }
 }

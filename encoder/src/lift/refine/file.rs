@@ -68,7 +68,7 @@ impl Refinement {
         container::write(out, MAGIC, VERSION, &sections)
     }
 
-    /// Reads the file form. `n_gaussians`: of the scene; `n_regions`: of the table that [`Refinement::prepare`] left.
+    /// Reads the file form. `n_gaussians`: of the scene; `n_regions`: of the table that [`super::Begun::finish`] left.
     ///
     /// # Errors
     /// [`ContainerError`], naming the byte; also if it belongs to another scene or table.

@@ -69,29 +69,41 @@ pub struct Subject<'a> {
     pub scene: &'a Gaussians,
     /// Its cells.
     pub split: &'a CellSplit,
-    /// `[cell][N of the cell]`: the object of each Gaussian, [`NO_SUPERPOINT`] where it has none; empty without objects.
-    pub object_of: &'a [Vec<u32>],
 }
 
 impl Subject<'_> {
-    /// Returns the objects as a partition of the scene.
-    fn objects(&self) -> Superpoints {
+    /// Returns objects, as [`Begun::finish`] takes them, as a partition of the scene.
+    fn objects(&self, object_of: &[Vec<u32>]) -> Superpoints {
         let mut of_gaussian = vec![NO_SUPERPOINT; self.scene.len()];
-        for (cell, of_cell) in self.split.cells.iter().zip(self.object_of) {
+        for (cell, of_cell) in self.split.cells.iter().zip(object_of) {
             for (gaussian, object) in cell.gaussians.iter().zip(of_cell) {
                 of_gaussian[*gaussian as usize] = *object;
             }
         }
-        let last = self.object_of.iter().flatten().filter(|object| **object != NO_SUPERPOINT).max();
+        let last = object_of.iter().flatten().filter(|object| **object != NO_SUPERPOINT).max();
         Superpoints { of_gaussian, n: last.map_or(0, |last| *last as usize + 1) }
     }
 }
 
 /// The passes over a scene's contributions that the refinements need.
-struct Passes<'a> {
-    index: &'a ContributionIndex,
-    group_bytes: u64,
-    cancel: &'a AtomicBool,
+#[derive(Clone, Copy)]
+pub struct Passes<'a> {
+    /// The contributions of all views.
+    pub index: &'a ContributionIndex,
+    /// Bytes for the contributions of a group of parts.
+    pub group_bytes: u64,
+    /// Set when the user asks to stop.
+    pub cancel: &'a AtomicBool,
+}
+
+/// Refinements whose masks are weighed and whose superpoints are found. Objects, which are made of superpoints, are found
+/// before Gaussians share evidence within both.
+pub struct Begun {
+    refinement: Refinement,
+    /// `[n_masks]`: each mask's vector in principal coordinates; empty where none is needed.
+    mask_points: Vec<Point>,
+    /// The superpoints of each scale with their weights, the finer ones first.
+    scales: Vec<(f32, Superpoints)>,
 }
 
 impl Passes<'_> {
@@ -115,19 +127,18 @@ impl Passes<'_> {
 }
 
 impl Refinement {
-    /// Decides the weights of masks and the mixtures of superpoints, in up to three passes over all contributions, and adds
-    /// both to the table. Returns `None` if cancelled, and for the plain average.
+    /// Decides the weights of masks and finds superpoints, in up to two passes over all contributions. Returns `None` if
+    /// cancelled, and for the plain average.
     ///
     /// # Errors
     /// [`ContributionError`].
-    pub fn prepare(
+    pub fn begin(
         settings: Aggregation,
-        (index, table): (&ContributionIndex, &mut RegionTable),
+        passes: Passes<'_>,
+        table: &mut RegionTable,
         subject: Subject<'_>,
         photos: &[Photo],
-        group_bytes: u64,
-        cancel: &AtomicBool,
-    ) -> Result<Option<Self>, ContributionError> {
+    ) -> Result<Option<Begun>, ContributionError> {
         if settings == Aggregation::PLAIN {
             return Ok(None);
         }
@@ -135,28 +146,30 @@ impl Refinement {
         if settings.truncation_power > 0.0 {
             table.set_mask_weights(&mask_weights);
         }
-        let mut refinement = Self {
+        let refinement = Self {
             settings,
-            first_regions: FirstRegions(index.first_regions()),
+            first_regions: FirstRegions(passes.index.first_regions()),
             mask_counts: table.mask_counts(0..table.len()),
             region_points: Vec::new(),
             mixtures: Vec::new(),
         };
+        let mut begun = Begun { refinement, mask_points: Vec::new(), scales: Vec::new() };
         if !settings.needs_points() || table.is_empty() {
-            return Ok(Some(refinement));
+            return Ok(Some(begun));
         }
-        let mask_points = principal_coordinates(table.mask_vectors(), AXES);
-        let mask_points: &[Point] = mask_points.as_chunks().0;
+        begun.mask_points = principal_coordinates(table.mask_vectors(), AXES).as_chunks().0.to_vec();
+        let Begun { refinement, mask_points, scales } = &mut begun;
         refinement.region_points = points::of_regions(table, mask_points, 0..table.len());
-        let passes = Passes { index, group_bytes, cancel };
-        let mut goes_on = true;
-        if settings.agreement > 0.0 {
-            goes_on = refinement.weigh_by_agreement(&passes, table, mask_points, mask_weights)?;
+        if settings.agreement > 0.0
+            && !refinement.weigh_by_agreement(&passes, table, mask_points, mask_weights)?
+        {
+            return Ok(None);
         }
-        if goes_on && settings.needs_mixtures() {
-            goes_on = refinement.make_mixtures(&passes, table, mask_points, subject)?;
+        if settings.needs_superpoints() {
+            let Some(found) = refinement.superpoints(&passes, table, subject)? else { return Ok(None) };
+            *scales = found;
         }
-        Ok(goes_on.then_some(refinement))
+        Ok(Some(begun))
     }
 
     /// Multiplies the weights of masks by their agreement; returns false if cancelled.
@@ -219,23 +232,14 @@ impl Refinement {
         Ok(Some(fine.into_iter().chain(larger).collect()))
     }
 
-    /// Finds superpoints and appends their mixtures, and those of objects, to the table; returns false if cancelled.
+    /// Appends the mixtures of superpoints and objects to the table; returns false if cancelled.
     fn make_mixtures(
         &mut self,
         passes: &Passes<'_>,
         table: &mut RegionTable,
         mask_points: &[Point],
-        subject: Subject<'_>,
+        (split, scales): (&CellSplit, Vec<(f32, Superpoints)>),
     ) -> Result<bool, ContributionError> {
-        let mut scales = Vec::new();
-        if self.settings.needs_superpoints() {
-            let Some(found) = self.superpoints(passes, table, subject)? else { return Ok(false) };
-            scales = found;
-        }
-        if self.settings.object > 0.0 {
-            scales.push((self.settings.object, subject.objects()));
-        }
-        let split = subject.split;
         let mut sums: Vec<SuperpointSums> = scales.iter().map(|(_, of)| SuperpointSums::new(of.n)).collect();
         let of_part = |mut contributions: PartContributions| -> Vec<PartSums> {
             self.refine_own(&mut contributions);
@@ -268,6 +272,8 @@ impl Refinement {
             let graph_bytes = Superpoints::working_bytes(n_gaussians, n_scales, &settings);
             memory.reserve(Phase::Refine, "superpoints of all Gaussians", sketches_bytes + graph_bytes);
         }
+        let scales_bytes = (n_gaussians * n_scales * size_of::<u32>()) as u64;
+        memory.reserve(Phase::Objects, "the superpoints of each Gaussian", scales_bytes);
         let n_partitions = n_scales + usize::from(settings.object > 0.0);
         let labels_bytes = (n_gaussians * n_partitions * size_of::<u32>()) as u64;
         memory.reserve(Phase::Cells, "the superpoints of each Gaussian", labels_bytes);
@@ -305,6 +311,40 @@ impl Refinement {
 
     fn prune(&self, contributions: &mut PartContributions) {
         prune::prune(contributions, &self.settings, &self.first_regions, &self.mask_counts);
+    }
+}
+
+impl Begun {
+    /// Returns the finer superpoints, if the settings ask for them.
+    pub fn superpoints(&self) -> Option<&Superpoints> {
+        let Aggregation { superpoint, fill, .. } = self.refinement.settings;
+        self.scales.first().filter(|_| superpoint > 0.0 || fill).map(|(_, superpoints)| superpoints)
+    }
+
+    /// Adds mixtures of the masks of superpoints and objects to the table, in one pass over all contributions. Returns `None`
+    /// if cancelled.
+    ///
+    /// `object_of`: `[cell][N of the cell]`: the object of each Gaussian, [`NO_SUPERPOINT`] where it has none; empty without
+    /// objects.
+    ///
+    /// # Errors
+    /// [`ContributionError`].
+    pub fn finish(
+        self,
+        passes: Passes<'_>,
+        table: &mut RegionTable,
+        subject: Subject<'_>,
+        object_of: &[Vec<u32>],
+    ) -> Result<Option<Refinement>, ContributionError> {
+        let Self { mut refinement, mask_points, mut scales } = self;
+        if refinement.settings.object > 0.0 && !object_of.is_empty() {
+            scales.push((refinement.settings.object, subject.objects(object_of)));
+        }
+        if scales.is_empty() || table.is_empty() {
+            return Ok(Some(refinement));
+        }
+        let done = refinement.make_mixtures(&passes, table, &mask_points, (subject.split, scales))?;
+        Ok(done.then_some(refinement))
     }
 }
 

@@ -104,15 +104,12 @@ fn lifted(settings: Aggregation, group_bytes: u64) -> Lifted {
     let mut opened = open(&views(), DIM, &[N], u64::MAX);
     let Scene { index, table, .. } = &mut opened;
     let (scene, split) = (gaussians(), split());
-    let refinement = Refinement::prepare(
-        settings,
-        (index, table),
-        Subject { scene: &scene, split: &split, object_of: &object_of() },
-        &photos(),
-        group_bytes,
-        &AtomicBool::new(false),
-    )
-    .expect("reads");
+    let subject = Subject { scene: &scene, split: &split };
+    let passes = Passes { index, group_bytes, cancel: &AtomicBool::new(false) };
+    let begun = Refinement::begin(settings, passes, table, subject, &photos()).expect("reads");
+    let finish =
+        |begun: Begun| begun.finish(passes, table, subject, &object_of()).expect("reads").expect("refines");
+    let refinement = begun.map(finish);
     let raw = index.read(0..1).expect("reads");
     let mut contributions = index.transpose(&raw, table).expect("transposes").remove(0);
     if let Some(refinement) = refinement {
@@ -231,14 +228,9 @@ fn the_plain_average_is_left_alone_and_its_file_is_what_it_was() {
     let Scene { index, table, .. } = &mut opened;
     let before = table.clone();
     let (scene, split) = (gaussians(), split());
-    let none = Refinement::prepare(
-        Aggregation::PLAIN,
-        (index, table),
-        Subject { scene: &scene, split: &split, object_of: &object_of() },
-        &photos(),
-        u64::MAX,
-        &AtomicBool::new(false),
-    );
+    let subject = Subject { scene: &scene, split: &split };
+    let passes = Passes { index, group_bytes: u64::MAX, cancel: &AtomicBool::new(false) };
+    let none = Refinement::begin(Aggregation::PLAIN, passes, table, subject, &photos());
     assert!(none.expect("reads").is_none());
     assert_eq!(*table, before);
     assert_eq!(Aggregation::default(), Aggregation::PLAIN);
@@ -436,20 +428,15 @@ fn a_single_view_keeps_its_evidence() {
     let mut opened = open(&[view], 64, &[N], u64::MAX);
     let Scene { index, table, .. } = &mut opened;
     let (scene, split) = (gaussians(), split());
-    let (contributions, cancel) = ((&*index, &mut *table), AtomicBool::new(false));
     let photos = [Photo {
         name: "0".into(),
         outlines: vec![MaskOutline { box_px: [0, 0, 8, 8], ..MaskOutline::default() }],
     }];
-    let refinement = Refinement::prepare(
-        Aggregation::REFINED,
-        contributions,
-        Subject { scene: &scene, split: &split, object_of: &object_of() },
-        &photos,
-        u64::MAX,
-        &cancel,
-    );
-    let refinement = refinement.expect("reads").expect("refines");
+    let subject = Subject { scene: &scene, split: &split };
+    let passes = Passes { index, group_bytes: u64::MAX, cancel: &AtomicBool::new(false) };
+    let begun = Refinement::begin(Aggregation::REFINED, passes, table, subject, &photos);
+    let begun = begun.expect("reads").expect("begins");
+    let refinement = begun.finish(passes, table, subject, &object_of()).expect("reads").expect("refines");
     let raw = index.read(0..1).expect("reads");
     let mut contributions = index.transpose(&raw, table).expect("transposes").remove(0);
     refinement.apply(&mut contributions, &split.cells[0].gaussians);
