@@ -312,11 +312,18 @@ mod tests {
         assert!(missing.contains("jobs/3 is missing"), "{missing}");
     }
 
-    /// Reads a request; returns how its target begins.
-    fn read_request(stream: &mut TcpStream, n_bytes: usize) -> String {
-        let mut request = vec![0; n_bytes];
-        stream.read_exact(&mut request).expect("a request");
-        String::from_utf8_lossy(&request).into_owned()
+    /// Reads a request up to the end of its head, or of the body `mine`; returns its method.
+    fn read_request(stream: &mut TcpStream) -> String {
+        let is_whole = |request: &[u8]| {
+            request.ends_with(b"mine") || request.starts_with(b"GET") && request.ends_with(b"\r\n\r\n")
+        };
+        let mut request = Vec::new();
+        while !is_whole(&request) {
+            let mut byte = [0];
+            stream.read_exact(&mut byte).expect("a request");
+            request.extend(byte);
+        }
+        String::from_utf8_lossy(&request).split(' ').take(1).collect()
     }
 
     /// A server takes an object and resets the connection; the put is made again, and finds the object in place.
@@ -329,24 +336,18 @@ mod tests {
             // What is left unread when a connection is closed resets it.
             let mut whole = [0; 4096];
             while !first.peek(&mut whole).is_ok_and(|n| whole[..n].ends_with(b"mine")) {}
-            let begin = read_request(&mut first, 4);
+            first.read_exact(&mut [0]).expect("a request");
             drop(first);
-            let answer = |status: &str, body: &str| {
+            ["412 Precondition Failed", "200 OK"].map(|status| {
                 let (mut stream, _) = server.accept().expect("a request");
-                let mut request = Vec::new();
-                while !request.ends_with(b"mine")
-                    && !(request.starts_with(b"GET") && request.ends_with(b"\r\n\r\n"))
-                {
-                    request.extend(read_request(&mut stream, 1).bytes());
-                }
+                let method = read_request(&mut stream);
+                let body = if method == "GET" { "mine" } else { "" };
                 let len = body.len();
                 let head = format!("HTTP/1.1 {status}\r\nContent-Length: {len}\r\nConnection: close\r\n");
                 let about = "Last-Modified: Thu, 26 Nov 2026 12:00:00 GMT\r\nETag: \"1\"\r\n";
                 write!(stream, "{head}{about}\r\n{body}").expect("an answer");
-            };
-            answer("412 Precondition Failed", "");
-            answer("200 OK", "mine");
-            begin
+                method
+            })
         };
         let served = std::thread::spawn(serve);
         let variables = [
@@ -359,7 +360,7 @@ mod tests {
         let variables = variables.map(|(name, value)| (name.to_owned(), value.to_owned()));
         let bucket = Bucket::open("s3://scenes/room", variables).expect("opens");
         assert!(bucket.claim("jobs/1/end.json", "mine").expect("claims"));
-        assert_eq!(served.join().expect("served"), "PUT ");
+        assert_eq!(served.join().expect("served"), ["PUT", "GET"]);
     }
 
     /// What is there already is one's own if it has the same bytes.
