@@ -155,7 +155,7 @@ impl Members {
 
     /// Gives each superpoint to one object.
     pub fn settle(&mut self, scene: &Scene<'_>, superpoints: &Superpoints) {
-        pieces::settle(&mut self.object_of, self.masks.len(), scene.split, superpoints);
+        pieces::settle(&mut self.object_of, scene.split, superpoints);
     }
 
     /// Drops objects with fewer Gaussians and renumbers the others in order.

@@ -7,9 +7,6 @@ use crate::cells::CellSplit;
 use crate::lift::superpoint::{NO_SUPERPOINT, Superpoints};
 use crate::memory::{MemoryPlan, Phase};
 
-/// Smaller objects keep their Gaussians: they may be parts of a superpoint, which has 20 at least.
-const MIN_GAUSSIANS: u32 = 30;
-
 /// Reserves the lists that [`settle`] sorts.
 pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
     let len_bytes = n_gaussians * size_of::<(u32, u32)>();
@@ -17,13 +14,9 @@ pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
 }
 
 /// Gives the Gaussians of each superpoint the object that most of them have, or none; of equally many the first object.
-/// Those of small objects keep theirs.
 ///
-/// `object_of`: `[cell][N of the cell]`: the object of each Gaussian, below `n_objects`, or [`NONE`].
-pub fn settle(object_of: &mut [Vec<u32>], n_objects: usize, split: &CellSplit, superpoints: &Superpoints) {
-    let mut n_of_object = vec![0; n_objects];
-    object_of.iter().flatten().filter(|o| **o != NONE).for_each(|o| n_of_object[*o as usize] += 1);
-    let is_small = |object: u32| n_of_object.get(object as usize).is_some_and(|n| *n < MIN_GAUSSIANS);
+/// `object_of`: `[cell][N of the cell]`: the object of each Gaussian, or [`NONE`].
+pub fn settle(object_of: &mut [Vec<u32>], split: &CellSplit, superpoints: &Superpoints) {
     let superpoint_of = |gaussian: u32| superpoints.of_gaussian[gaussian as usize];
     let cells = split.cells.par_iter().zip(&*object_of);
     let mut pairs: Vec<(u32, u32)> = cells
@@ -42,8 +35,7 @@ pub fn settle(object_of: &mut [Vec<u32>], n_objects: usize, split: &CellSplit, s
         }
     }
     split.cells.par_iter().zip(object_of).for_each(|(cell, of_cell)| {
-        for (gaussian, object) in cell.gaussians.iter().zip(of_cell).filter(|(_, object)| !is_small(**object))
-        {
+        for (gaussian, object) in cell.gaussians.iter().zip(of_cell) {
             if let Some((_, of_superpoint)) = chosen.get(superpoint_of(*gaussian) as usize) {
                 *object = *of_superpoint;
             }
@@ -60,9 +52,9 @@ mod tests {
     use crate::cells::Cell;
 
     /// Two cells of 50 Gaussians. By hand: of superpoint 0, which crosses the border, 40 of 60 are object 0; of superpoint 1 most
-    /// are none; superpoint 2 is half object 0 and half none; the last Gaussian has no superpoint. Object 1 has 3 Gaussians.
+    /// are none; superpoint 2 is half object 0 and half none; the last Gaussian has no superpoint. Object 1 is a part of superpoint 0.
     #[test]
-    fn a_superpoint_is_of_one_object_and_small_objects_stay() {
+    fn a_superpoint_is_of_one_object_or_none() {
         let nowhere = Aabb { min: DVec3::ZERO, max: DVec3::ZERO };
         let cell = |from: u32| Cell {
             gaussians: (from..from + 50).collect(),
@@ -84,8 +76,7 @@ mod tests {
             _ => NONE,
         };
         let after = |i: usize| match i {
-            0..40 | 43..60 | 89..99 | 99 => 0,
-            40..43 => 1,
+            0..60 | 89..100 => 0,
             _ => NONE,
         };
         let by_cell = |object: &dyn Fn(usize) -> u32| -> Vec<Vec<u32>> {
@@ -93,7 +84,7 @@ mod tests {
         };
         let superpoints = Superpoints { of_gaussian: (0..100).map(superpoint).collect(), n: 3 };
         let mut object_of = by_cell(&before);
-        settle(&mut object_of, 2, &split, &superpoints);
+        settle(&mut object_of, &split, &superpoints);
         assert_eq!(object_of, by_cell(&after));
     }
 }
