@@ -212,8 +212,8 @@ impl Bucket {
         }
     }
 
-    /// Puts an object unless there is one; returns whether there was none. Where the answer is lost, the next one says that
-    /// there is one: who must know whose it is uses [`Self::claim`].
+    /// Puts an object unless there is one; returns whether there was none. If the answer is lost, the put is made again
+    /// and may find its own object; where it matters who put it, use [`Self::claim`].
     ///
     /// # Errors
     /// [`BlobError::Request`].
@@ -221,7 +221,8 @@ impl Bucket {
         self.put_with(key, bytes.into(), PutMode::Create)
     }
 
-    /// Puts an object that no one else would put unless there is one; returns whether it is the one that is there.
+    /// Puts an object unless there is one; returns whether the one that is there has these bytes, which only the caller would
+    /// put.
     ///
     /// # Errors
     /// [`BlobError`].

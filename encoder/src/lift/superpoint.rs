@@ -154,6 +154,28 @@ impl Graph {
 }
 
 impl Superpoints {
+    /// Returns each superpoint's most frequent label, of equally many the first; `None` where it has none. `labels`: of
+    /// Gaussians, in any order.
+    pub fn most_frequent<L: Copy + Ord + Send>(
+        &self,
+        labels: impl ParallelIterator<Item = (u32, L)>,
+    ) -> Vec<Option<L>> {
+        let mut pairs: Vec<(u32, L)> = labels
+            .map(|(gaussian, label)| (self.of_gaussian[gaussian as usize], label))
+            .filter(|(superpoint, _)| *superpoint != NO_SUPERPOINT)
+            .collect();
+        pairs.par_sort_unstable();
+        let mut found = vec![(0, None); self.n];
+        for run in pairs.chunk_by(|a, b| a == b) {
+            let (superpoint, label) = run[0];
+            let most = &mut found[superpoint as usize];
+            if run.len() > most.0 {
+                *most = (run.len(), Some(label));
+            }
+        }
+        found.into_iter().map(|(_, label)| label).collect()
+    }
+
     /// Partitions a scene. The result does not depend on threads.
     pub fn new(scene: &Gaussians, sketches: Option<Sketches<'_>>, settings: &SuperpointSettings) -> Self {
         Graph::new(scene, sketches, settings).superpoints(settings)

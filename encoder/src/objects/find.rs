@@ -9,7 +9,7 @@ use super::consensus::{self, Masks};
 use super::members::Members;
 use super::object::{NONE, Object, ObjectsReport, SceneObjects};
 use super::scene::Scene;
-use super::{sightings, vectors};
+use super::{pieces, sightings, vectors};
 use crate::lift::ContributionError;
 use crate::lift::photos::MaskOutline;
 
@@ -42,7 +42,7 @@ pub fn find(scene: &Scene<'_>) -> Result<Option<SceneObjects>, ContributionError
     let Some(clusters) = clusters else { return Ok(None) };
     let Some(mut members) = Members::assign(scene, &clusters)? else { return Ok(None) };
     if let Some(superpoints) = scene.superpoints {
-        members.settle(scene, superpoints);
+        pieces::settle(&mut members.object_of, split, superpoints);
     }
     members.drop_small(MIN_GAUSSIANS);
     let objects = describe(scene, &members, &view_of_mask);

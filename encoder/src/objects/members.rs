@@ -4,10 +4,8 @@ use rayon::prelude::*;
 
 use super::consensus::MaskClusters;
 use super::object::NONE;
-use super::pieces;
 use super::scene::Scene;
 use super::views::ViewsOfClusters;
-use crate::lift::superpoint::Superpoints;
 use crate::lift::{ContributionError, PartContributions, RegionTable};
 use crate::memory::{MemoryPlan, Phase};
 
@@ -81,9 +79,9 @@ pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
 }
 
 impl Members {
-    /// Assigns each Gaussian to the cluster with the largest product of the cluster's consensus and the share of the
-    /// Gaussian's weight that its masks have in the views that have such masks: a view without any says nothing, since
-    /// segmenters miss things in many views. Returns `None` if cancelled.
+    /// Assigns each Gaussian to a cluster. Only the views that have masks of a cluster count for it, since segmenters miss
+    /// things in many views: the cluster wins whose masks have the largest share of the Gaussian's weight in those views,
+    /// times the cluster's consensus. Returns `None` if cancelled.
     ///
     /// # Errors
     /// [`ContributionError`].
@@ -151,11 +149,6 @@ impl Members {
                 }
             }
         }
-    }
-
-    /// Gives each superpoint to one object.
-    pub fn settle(&mut self, scene: &Scene<'_>, superpoints: &Superpoints) {
-        pieces::settle(&mut self.object_of, scene.split, superpoints);
     }
 
     /// Drops objects with fewer Gaussians and renumbers the others in order.

@@ -2,12 +2,11 @@
 
 use rayon::prelude::*;
 
-use super::object::NONE;
 use crate::cells::CellSplit;
-use crate::lift::superpoint::{NO_SUPERPOINT, Superpoints};
+use crate::lift::superpoint::Superpoints;
 use crate::memory::{MemoryPlan, Phase};
 
-/// Reserves the lists that [`settle`] sorts.
+/// Reserves the list that [`settle`] sorts.
 pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
     let len_bytes = n_gaussians * size_of::<(u32, u32)>();
     memory.reserve_expecting(Phase::Objects, "objects of superpoints", len_bytes as u64, 0);
@@ -15,28 +14,16 @@ pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
 
 /// Gives the Gaussians of each superpoint the object that most of them have, or none; of equally many the first object.
 ///
-/// `object_of`: `[cell][N of the cell]`: the object of each Gaussian, or [`NONE`].
+/// `object_of`: `[cell][N of the cell]`: the object of each Gaussian, or [`NONE`](super::NONE).
 pub fn settle(object_of: &mut [Vec<u32>], split: &CellSplit, superpoints: &Superpoints) {
-    let superpoint_of = |gaussian: u32| superpoints.of_gaussian[gaussian as usize];
-    let cells = split.cells.par_iter().zip(&*object_of);
-    let mut pairs: Vec<(u32, u32)> = cells
-        .flat_map_iter(|(cell, of_cell)| {
-            cell.gaussians.iter().zip(of_cell).map(|(gaussian, object)| (superpoint_of(*gaussian), *object))
-        })
-        .filter(|(superpoint, _)| *superpoint != NO_SUPERPOINT)
-        .collect();
-    pairs.par_sort_unstable();
-    let mut chosen = vec![(0, NONE); superpoints.n];
-    for run in pairs.chunk_by(|a, b| a == b) {
-        let (superpoint, object) = run[0];
-        let most = &mut chosen[superpoint as usize];
-        if run.len() > most.0 {
-            *most = (run.len(), object);
-        }
-    }
+    let labels = split.cells.par_iter().zip(&*object_of);
+    let labels =
+        labels.flat_map_iter(|(cell, of_cell)| cell.gaussians.iter().copied().zip(of_cell.iter().copied()));
+    let chosen = superpoints.most_frequent(labels);
     split.cells.par_iter().zip(object_of).for_each(|(cell, of_cell)| {
         for (gaussian, object) in cell.gaussians.iter().zip(of_cell) {
-            if let Some((_, of_superpoint)) = chosen.get(superpoint_of(*gaussian) as usize) {
+            let superpoint = superpoints.of_gaussian[*gaussian as usize];
+            if let Some(Some(of_superpoint)) = chosen.get(superpoint as usize) {
                 *object = *of_superpoint;
             }
         }
@@ -50,6 +37,8 @@ mod tests {
 
     use super::*;
     use crate::cells::Cell;
+    use crate::lift::superpoint::NO_SUPERPOINT;
+    use crate::objects::NONE;
 
     /// Two cells of 50 Gaussians. By hand: of superpoint 0, which crosses the border, 40 of 60 are object 0; of superpoint 1 most
     /// are none; superpoint 2 is half object 0 and half none; the last Gaussian has no superpoint. Object 1 is a part of superpoint 0.

@@ -20,7 +20,7 @@ pub struct Scene<'a> {
     pub gaussians: &'a Gaussians,
     /// Their cells.
     pub split: &'a CellSplit,
-    /// Small pieces of its surface, each of which belongs to one object; without them each Gaussian stands for itself.
+    /// Small pieces of the surface: all Gaussians of a piece get the same object. Without them each is decided by itself.
     pub superpoints: Option<&'a Superpoints>,
     /// Each view's masks, in the order of the contributions.
     pub photos: &'a [Photo],

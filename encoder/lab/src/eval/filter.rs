@@ -1,7 +1,6 @@
 //! The paper's prediction filter: the Gaussians of a superpoint answer together.
 
-use std::collections::BTreeMap;
-
+use rayon::prelude::*;
 use slag_encoder::lift::superpoint::{NO_SUPERPOINT, Superpoints};
 
 /// How a superpoint's Gaussians agree on an answer.
@@ -33,16 +32,8 @@ pub(super) fn average(scores: &mut [f32], superpoints: &Superpoints) {
 
 /// Gives all Gaussians of a superpoint their most frequent class.
 pub(super) fn vote(classes: &mut [Option<usize>], superpoints: &Superpoints) {
-    let mut votes: Vec<BTreeMap<usize, usize>> = vec![BTreeMap::new(); superpoints.n];
-    for (class, superpoint) in classes.iter().zip(&superpoints.of_gaussian) {
-        if let (Some(class), Some(votes)) = (class, votes.get_mut(*superpoint as usize)) {
-            *votes.entry(*class).or_default() += 1;
-        }
-    }
-    let winner = |votes: &BTreeMap<usize, usize>| {
-        votes.iter().max_by(|a, b| a.1.cmp(b.1).then(b.0.cmp(a.0))).map(|(class, _)| *class)
-    };
-    let winners: Vec<Option<usize>> = votes.iter().map(winner).collect();
+    let labels = (0u32..).zip(&*classes).filter_map(|(gaussian, class)| Some((gaussian, (*class)?)));
+    let winners = superpoints.most_frequent(labels.collect::<Vec<_>>().into_par_iter());
     for (class, superpoint) in classes.iter_mut().zip(&superpoints.of_gaussian) {
         if let Some(winner) = winners.get(*superpoint as usize) {
             *class = *winner;

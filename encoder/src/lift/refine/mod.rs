@@ -96,8 +96,8 @@ pub struct Passes<'a> {
     pub cancel: &'a AtomicBool,
 }
 
-/// Refinements whose masks are weighed and whose superpoints are found. Objects, which are made of superpoints, are found
-/// before Gaussians share evidence within both.
+/// A refinement half done: masks are weighed and superpoints found. Objects come next, made of superpoints; then Gaussians
+/// share evidence within both.
 pub struct Begun {
     refinement: Refinement,
     /// `[n_masks]`: each mask's vector in principal coordinates; empty where none is needed.
