@@ -2,7 +2,7 @@
 //! page-locked memory, to which a GPU copies at the full speed of its link.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
 
 use ort::logging::LogLevel;
 use ort::session::RunOptions;
@@ -20,12 +20,43 @@ pub(crate) enum Place {
     Device,
 }
 
-/// Returns the turn of a GPU: whoever holds it runs a large model there. Several at once take no less time in all, and each
-/// then ends late.
-pub(crate) fn turn_of(gpu: u32) -> Arc<Mutex<()>> {
-    static TURNS: Mutex<BTreeMap<u32, Arc<Mutex<()>>>> = Mutex::new(BTreeMap::new());
-    let mut turns = TURNS.lock().unwrap_or_else(PoisonError::into_inner);
-    Arc::clone(turns.entry(gpu).or_default())
+/// Runs of large models that a GPU has at once: the second one fills the gaps before and after the first. More take no less
+/// time in all, and each then ends late.
+const RUNS_AT_ONCE: usize = 2;
+
+/// The turns of a GPU: whoever has one runs a large model there.
+#[derive(Debug)]
+pub(crate) struct Turns {
+    n_free: Mutex<usize>,
+    is_free: Condvar,
+}
+
+/// A turn, until it is dropped.
+pub(crate) struct Turn<'a>(&'a Turns);
+
+impl Turns {
+    /// Returns the turns of a GPU, as CUDA numbers them.
+    pub(crate) fn of(gpu: u32) -> Arc<Self> {
+        static TURNS: Mutex<BTreeMap<u32, Arc<Turns>>> = Mutex::new(BTreeMap::new());
+        let mut turns = TURNS.lock().unwrap_or_else(PoisonError::into_inner);
+        let all_free = || Arc::new(Self { n_free: Mutex::new(RUNS_AT_ONCE), is_free: Condvar::new() });
+        Arc::clone(turns.entry(gpu).or_insert_with(all_free))
+    }
+
+    /// Waits for a turn.
+    pub(crate) fn take(&self) -> Turn<'_> {
+        let n_free = self.n_free.lock().unwrap_or_else(PoisonError::into_inner);
+        let free = self.is_free.wait_while(n_free, |n_free| *n_free == 0);
+        *free.unwrap_or_else(PoisonError::into_inner) -= 1;
+        Turn(self)
+    }
+}
+
+impl Drop for Turn<'_> {
+    fn drop(&mut self) {
+        *self.0.n_free.lock().unwrap_or_else(PoisonError::into_inner) += 1;
+        self.0.is_free.notify_one();
+    }
 }
 
 impl Model {
@@ -67,5 +98,35 @@ impl Model {
             found.remove(name).ok_or_else(|| absent(name))?.downcast::<DynTensorValueType>()
         };
         outputs.iter().map(take).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use super::*;
+
+    /// Eight threads take turns of one GPU: never more than two at once, and two do meet.
+    #[test]
+    fn a_gpu_has_two_turns() {
+        let (turns, other) = (Turns::of(97), Turns::of(98));
+        let (n_now, most) = (AtomicUsize::new(0), AtomicUsize::new(0));
+        std::thread::scope(|scope| {
+            for _ in 0..8 {
+                scope.spawn(|| {
+                    for _ in 0..20 {
+                        let _turn = turns.take();
+                        most.fetch_max(n_now.fetch_add(1, Ordering::SeqCst) + 1, Ordering::SeqCst);
+                        std::thread::sleep(std::time::Duration::from_micros(200));
+                        n_now.fetch_sub(1, Ordering::SeqCst);
+                    }
+                });
+            }
+        });
+        assert_eq!(most.into_inner(), RUNS_AT_ONCE);
+        // Another GPU has its own.
+        let _held = [turns.take(), turns.take()];
+        drop(other.take());
     }
 }

@@ -1,7 +1,7 @@
 //! Image encoders in ONNX.
 
 use std::borrow::Cow;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use half::f16;
@@ -10,7 +10,7 @@ use ort::value::TensorElementType;
 
 use crate::{
     Crop, ImageEncoder, InferenceError, ModelError, ModelFile,
-    bound::{Place, turn_of},
+    bound::{Place, Turns},
     description::ImageDescription,
     device_memory::DeviceMemory,
     encoder::normalise,
@@ -61,7 +61,7 @@ pub struct OnnxImageEncoder {
 struct OnGpu {
     memory: DeviceMemory,
     levels: Levels,
-    turn: Arc<Mutex<()>>,
+    turns: Arc<Turns>,
 }
 
 impl OnnxImageEncoder {
@@ -116,7 +116,7 @@ impl OnnxImageEncoder {
     fn bind(&mut self, memory: DeviceMemory, options: &SessionOptions) -> Result<(), SessionError> {
         let batch = *self.batch.get_or_insert(GPU_BATCH);
         let levels = Levels::open(batch, &self.preprocess, self.is_f16, &memory, options)?;
-        self.on_gpu = Some(OnGpu { memory, levels, turn: turn_of(options.gpu) });
+        self.on_gpu = Some(OnGpu { memory, levels, turns: Turns::of(options.gpu) });
         Ok(())
     }
 
@@ -174,7 +174,7 @@ impl OnnxImageEncoder {
 
     /// Returns the vectors of at most a batch of crops, `[n][dim]`.
     fn vectors(&mut self, crops: &[Crop]) -> Result<Vec<f32>, SessionError> {
-        let Some(OnGpu { memory, levels, turn }) = &mut self.on_gpu else {
+        let Some(OnGpu { memory, levels, turns }) = &mut self.on_gpu else {
             let mut pixels = Vec::new();
             for crop in crops {
                 self.preprocess.append_pixel_values(crop.image(), &mut pixels);
@@ -188,7 +188,7 @@ impl OnnxImageEncoder {
         });
         let pixels = levels.values(memory, squares)?;
         let inputs = [(self.input.as_str(), &pixels)];
-        let turn = turn.lock().unwrap_or_else(PoisonError::into_inner);
+        let turn = turns.take();
         let mut found = self.model.run_bound(memory, &inputs, &[(&self.output, Place::Host)])?;
         drop(turn);
         let vectors = self.model.floats(found.pop(), &self.output, &[-1, self.dim as i64])?.values;

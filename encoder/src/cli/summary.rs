@@ -40,9 +40,10 @@ pub(super) fn lines(
         format!("coverage   {coverage:.1} % of all views, {seen:.1} % of the Gaussians seen; found in {secs:.1} s\n")
     });
     let objects = summary.objects.as_ref().map_or(String::new(), |found| {
-        let (n, of_masks, aside) = (found.n_objects, found.n_masks_of_objects, found.n_masks_set_aside);
+        let (n, of_masks) = (found.n_objects, found.n_masks_of_objects);
+        let n_others = found.n_masks - of_masks;
         format!(
-            "objects    {n} of {of_masks} masks, {} Gaussians; {aside} masks set aside\n",
+            "objects    {n} of {of_masks} masks, {} Gaussians; {n_others} other masks\n",
             found.n_gaussians
         )
     });

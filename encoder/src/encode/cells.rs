@@ -170,7 +170,7 @@ impl<'a> CellBuilder<'a> {
         index.reserve(&mut memory);
         Refinement::reserve_regions(&mut memory, &plan.settings.aggregation, table.len());
         if plan.settings.cells.objects {
-            objects::reserve_masks(&mut memory, &table, n_gaussians.iter().sum(), photos.len());
+            objects::reserve_contributions(&mut memory, index.n_entries());
         }
         let rest_bytes = memory.rest(index.largest_part_bytes())?;
         let cell_bytes =

@@ -191,7 +191,7 @@ fn memory_plan(settings: &EncodeSettings, inputs: &Inputs, dim: usize) -> Memory
     shard::reserve(&mut memory, &inputs.split, dim);
     Refinement::reserve(&mut memory, &settings.aggregation, n_gaussians);
     if settings.cells.objects {
-        objects::reserve(&mut memory, n_gaussians, inputs.views.len());
+        objects::reserve(&mut memory, n_gaussians, settings.aggregation.has_fine_superpoints());
     }
     memory
 }

@@ -1,17 +1,22 @@
 //! Finds the objects of a scene, step by step.
 
+use std::borrow::Cow;
+
 use glam::DVec3;
 use rayon::prelude::*;
 use slag_common::frames::Aabb;
 use slag_math::stats::trimmed_range;
 
-use super::consensus::{self, Masks};
+use super::choice::{self, Sizes};
 use super::members::Members;
 use super::object::{NONE, Object, ObjectsReport, SceneObjects};
 use super::scene::Scene;
-use super::{pieces, sightings, vectors};
+use super::shown::Shown;
+use super::tree::Tree;
+use super::{affinity, near, vectors};
 use crate::lift::ContributionError;
 use crate::lift::photos::MaskOutline;
+use crate::lift::superpoint::{NO_SUPERPOINT, SuperpointSettings, Superpoints};
 
 /// Smaller objects are dropped, as the robot drops smaller clusters.
 pub const MIN_GAUSSIANS: usize = 10;
@@ -24,36 +29,38 @@ const TRIMMED: f64 = 0.02;
 /// # Errors
 /// [`ContributionError`].
 pub fn find(scene: &Scene<'_>) -> Result<Option<SceneObjects>, ContributionError> {
-    let Scene { table, split, .. } = scene;
-    let n_gaussians: usize = split.cells.iter().map(|cell| cell.gaussians.len()).sum();
-    let sample_step = sightings::sample_step(n_gaussians);
-    let view_of_mask = scene.view_of_mask();
-    let Some(sightings) = sightings::gather(scene, sample_step)? else { return Ok(None) };
-    let clusters = consensus::cluster_masks(
-        &sightings,
-        &Masks {
-            of_region: &|region| table.all_masks_of(region as usize),
-            view_of_mask: &view_of_mask,
-            n_views: scene.photos.len(),
-        },
-        scene.cancel,
-    );
-    drop(sightings);
-    let Some(clusters) = clusters else { return Ok(None) };
-    let Some(mut members) = Members::assign(scene, &clusters)? else { return Ok(None) };
-    if let Some(superpoints) = scene.superpoints {
-        pieces::settle(&mut members.object_of, split, superpoints);
+    let Scene { table, gaussians, .. } = scene;
+    let superpoints = match scene.superpoints {
+        Some(superpoints) => Cow::Borrowed(superpoints),
+        None => Cow::Owned(Superpoints::new(gaussians, None, &SuperpointSettings::default())),
+    };
+    let Some(shown) = Shown::gather(scene, &superpoints)? else { return Ok(None) };
+    let pairs = affinity::of_pairs(&shown, &near::pairs(gaussians, &superpoints));
+    if scene.is_cancelled() {
+        return Ok(None);
     }
-    members.drop_small(MIN_GAUSSIANS);
-    let objects = describe(scene, &members, &view_of_mask);
+    let tree = Tree::new(superpoints.n, &pairs);
+    drop(pairs);
+    if scene.is_cancelled() {
+        return Ok(None);
+    }
+    let mut n_of_mask = vec![0; table.n_masks()];
+    shown.masks().for_each(|(_, of_mask)| n_of_mask[of_mask.mask as usize] += of_mask.n);
+    let mut n_of_superpoint = vec![0; superpoints.n];
+    let known = superpoints.of_gaussian.iter().filter(|superpoint| **superpoint != NO_SUPERPOINT);
+    known.for_each(|superpoint| n_of_superpoint[*superpoint as usize] += 1);
+    let sizes =
+        Sizes { of_masks: &n_of_mask, of_superpoints: &n_of_superpoint, min_gaussians: MIN_GAUSSIANS as u32 };
+    let object_of = choice::things(&tree, &shown, sizes);
+    let object_of_mask = choice::things_of_masks(&object_of, &shown, &n_of_mask);
+    let members = Members::new(scene, &superpoints, &shown, &object_of, &object_of_mask);
+    let objects = describe(scene, &members, &scene.view_of_mask());
     let calibration = vectors::calibrate(&objects, scene.score_context, table.dim());
     let report = ObjectsReport {
         n_objects: objects.len(),
         n_gaussians: objects.iter().map(|object| object.n_gaussians as usize).sum(),
-        sample_step,
         n_masks: table.n_masks(),
         n_masks_of_objects: objects.iter().map(|object| object.n_masks as usize).sum(),
-        n_masks_set_aside: clusters.n_set_aside,
     };
     Ok(Some(SceneObjects { objects, object_of: members.object_of, calibration, report }))
 }

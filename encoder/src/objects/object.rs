@@ -9,7 +9,7 @@ use slag_common::objects::public_id;
 use crate::lift::superpoint::NO_SUPERPOINT;
 use crate::progress::FoundObject;
 
-/// Marks a mask without a cluster, and a Gaussian without an object.
+/// Marks a Gaussian without an object.
 pub const NONE: u32 = NO_SUPERPOINT;
 
 /// A thing that several views agree on.
@@ -51,7 +51,7 @@ impl Object {
 /// The objects of a scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneObjects {
-    /// In the order of their first masks.
+    /// In the order of their first superpoints.
     pub objects: Vec<Object>,
     /// `[cell][N of the cell]`: index of each Gaussian's object, or [`NONE`].
     pub object_of: Vec<Vec<u32>>,
@@ -68,12 +68,8 @@ pub struct ObjectsReport {
     pub n_objects: usize,
     /// Gaussians that belong to one.
     pub n_gaussians: usize,
-    /// Every n-th Gaussian of a cell was sampled.
-    pub sample_step: usize,
     /// Masks.
     pub n_masks: usize,
-    /// Masks that belong to an object.
+    /// Masks that show an object; others cover several things, or parts.
     pub n_masks_of_objects: usize,
-    /// Masks without consensus: they cover several things.
-    pub n_masks_set_aside: usize,
 }

@@ -20,7 +20,7 @@ pub struct Scene<'a> {
     pub gaussians: &'a Gaussians,
     /// Their cells.
     pub split: &'a CellSplit,
-    /// Small pieces of the surface: all Gaussians of a piece get the same object. Without them each is decided by itself.
+    /// Small pieces of the surface, of which objects are made; absent: they are found by colour and shape.
     pub superpoints: Option<&'a Superpoints>,
     /// Each view's masks, in the order of the contributions.
     pub photos: &'a [Photo],

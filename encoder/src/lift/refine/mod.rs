@@ -264,8 +264,7 @@ impl Refinement {
     /// Reserves the lists over all Gaussians: the superpoints' graph while masks are weighed, and each Gaussian's
     /// superpoints until the last cell.
     pub fn reserve(memory: &mut MemoryPlan, settings: &Aggregation, n_gaussians: usize) {
-        let n_scales =
-            usize::from(settings.superpoint > 0.0 || settings.fill) + usize::from(settings.coarse > 0.0);
+        let n_scales = usize::from(settings.has_fine_superpoints()) + usize::from(settings.coarse > 0.0);
         if settings.needs_superpoints() {
             let sketches_bytes = (n_gaussians * (AXES + size_of::<u32>())) as u64;
             let settings = SuperpointSettings::default();
@@ -317,8 +316,8 @@ impl Refinement {
 impl Begun {
     /// Returns the finer superpoints, if the settings ask for them.
     pub fn superpoints(&self) -> Option<&Superpoints> {
-        let Aggregation { superpoint, fill, .. } = self.refinement.settings;
-        self.scales.first().filter(|_| superpoint > 0.0 || fill).map(|(_, superpoints)| superpoints)
+        let has_fine = self.refinement.settings.has_fine_superpoints();
+        self.scales.first().filter(|_| has_fine).map(|(_, superpoints)| superpoints)
     }
 
     /// Adds mixtures of the masks of superpoints and objects to the table, in one pass over all contributions. Returns `None`

@@ -82,9 +82,14 @@ impl Aggregation {
         ]
     }
 
+    /// Returns whether the finer superpoints are found.
+    pub fn has_fine_superpoints(&self) -> bool {
+        self.superpoint > 0.0 || self.fill
+    }
+
     /// Returns whether Gaussians share evidence within superpoints.
     pub(super) fn needs_superpoints(&self) -> bool {
-        self.superpoint > 0.0 || self.coarse > 0.0 || self.fill
+        self.has_fine_superpoints() || self.coarse > 0.0
     }
 
     /// Returns whether Gaussians share evidence at all.

@@ -1,0 +1,191 @@
+//! Which nodes of the tree are things: those that views agree on.
+//!
+//! A view agrees with a node by the best intersection over union of one of its masks with what it sees of the node; a node's
+//! consensus is the mean over the views that see enough of it (as MaskClustering, Yan et al., CVPR 2024, judges masks). The
+//! nodes are chosen, none part of another, for which the sum of consensus^8 n^(1/4) is largest, n the number of Gaussians: a thing
+//! wins over its parts if views agree on it nearly as well. A node without consensus is no thing.
+
+use std::collections::BTreeMap;
+
+use rayon::prelude::*;
+
+use super::shown::{OfView, Shown};
+use super::tree::Tree;
+
+/// A view judges a node of which it sees at least this share, in tenths: one side.
+const OBSERVED_TENTHS: u64 = 1;
+/// Nodes below this consensus are no things.
+const MIN_CONSENSUS: f64 = 0.3;
+/// A mask with this intersection over union shows the node: a majority of their union.
+pub const SAME_IOU: f64 = 0.5;
+/// Fewest views whose masks show the node: one cannot agree with others.
+const MIN_VIEWS: usize = 2;
+
+/// What a view shows of a node.
+#[derive(Clone, Debug, Default, PartialEq)]
+struct NodeView {
+    /// Gaussians that the view sees.
+    n: u32,
+    /// Of these, those under each mask, by mask.
+    masks: Vec<(u32, u32)>,
+    /// The best intersection over union of a mask.
+    agreement: f64,
+}
+
+/// What all views show of a node.
+type NodeViews = BTreeMap<u32, NodeView>;
+
+/// Numbers of Gaussians.
+#[derive(Clone, Copy)]
+pub struct Sizes<'a> {
+    /// `[n_masks]`: sightings under each mask.
+    pub of_masks: &'a [u32],
+    /// `[n]`: Gaussians of each superpoint.
+    pub of_superpoints: &'a [u32],
+    /// Fewest Gaussians of a thing.
+    pub min_gaussians: u32,
+}
+
+impl NodeView {
+    fn of(of_view: &OfView<'_>) -> Self {
+        let masks = of_view.masks.iter().filter(|of| of.n > 0).map(|of| (of.mask, of.n)).collect();
+        Self { n: of_view.n, masks, agreement: 0.0 }
+    }
+
+    /// Adds what the view shows of other Gaussians.
+    fn add(&mut self, other: Self) {
+        self.n += other.n;
+        self.masks.extend(other.masks);
+        self.masks.sort_unstable_by_key(|(mask, _)| *mask);
+        self.masks.dedup_by(|next, kept| {
+            let is_same = next.0 == kept.0;
+            if is_same {
+                kept.1 += next.1;
+            }
+            is_same
+        });
+    }
+
+    /// Returns the masks with their intersections over union.
+    fn ious(&self, n_of_mask: &[u32]) -> impl Iterator<Item = (u32, f64)> {
+        self.masks.iter().map(|(mask, both)| {
+            let union = self.n + n_of_mask[*mask as usize] - both;
+            (*mask, f64::from(*both) / f64::from(union))
+        })
+    }
+
+    fn judge(&mut self, n_of_mask: &[u32]) {
+        self.agreement = self.ious(n_of_mask).map(|(_, iou)| iou).fold(0.0, f64::max);
+    }
+}
+
+/// Returns what views show of a superpoint.
+fn views_of(shown: &Shown, superpoint: usize, n_of_mask: &[u32]) -> NodeViews {
+    let of_view = |of_view: OfView<'_>| {
+        let mut view = NodeView::of(&of_view);
+        view.judge(n_of_mask);
+        (of_view.view, view)
+    };
+    shown.of(superpoint).filter(|of_view| of_view.n > 0).map(of_view).collect()
+}
+
+/// Returns the worth of a node of `n` Gaussians as a thing; 0 if it is none.
+fn worth(views: &NodeViews, n: u32, min_gaussians: u32) -> f64 {
+    let judges = views.values().filter(|view| u64::from(view.n) * 10 >= u64::from(n) * OBSERVED_TENTHS);
+    let (mut sum, mut n_judges, mut n_same) = (0.0, 0u32, 0);
+    for view in judges {
+        (sum, n_judges) = (sum + view.agreement, n_judges + 1);
+        n_same += usize::from(view.agreement >= SAME_IOU);
+    }
+    let consensus = sum / f64::from(n_judges.max(1));
+    if n < min_gaussians || n_same < MIN_VIEWS || consensus < MIN_CONSENSUS {
+        return 0.0;
+    }
+    let square = consensus * consensus;
+    let fourth = square * square;
+    // Only operations that give the same bits everywhere.
+    fourth * fourth * f64::from(n).sqrt().sqrt()
+}
+
+/// Returns the thing of each superpoint, or `None`; things are numbered in the order of their first superpoints.
+pub fn things(tree: &Tree, shown: &Shown, sizes: Sizes<'_>) -> Vec<Option<u32>> {
+    let worths = worths(tree, shown, sizes);
+    // The best choice within each node: the node itself, or the best of its parts.
+    let mut best = worths.clone();
+    for node in tree.n_leaves..tree.len() {
+        let of_parts: f64 = tree.parts_of(node).into_iter().flatten().map(|part| best[part]).sum();
+        best[node] = best[node].max(of_parts);
+    }
+    let mut node_of: Vec<Option<usize>> = vec![None; tree.n_leaves];
+    let mut waiting: Vec<(usize, Option<usize>)> = tree.roots().map(|root| (root, None)).collect();
+    while let Some((node, within)) = waiting.pop() {
+        let is_thing = worths[node] > 0.0 && worths[node] >= best[node];
+        let within = within.or(is_thing.then_some(node));
+        match tree.parts_of(node) {
+            Some(parts) => waiting.extend(parts.map(|part| (part, within))),
+            None => node_of[node] = within,
+        }
+    }
+    let mut numbers = BTreeMap::new();
+    let number = |node: usize| {
+        let next = numbers.len() as u32;
+        *numbers.entry(node).or_insert(next)
+    };
+    let mut number = number;
+    node_of.into_iter().map(|node| node.map(&mut number)).collect()
+}
+
+/// Returns the worth of each node.
+fn worths(tree: &Tree, shown: &Shown, sizes: Sizes<'_>) -> Vec<f64> {
+    let Sizes { of_masks, of_superpoints, min_gaussians } = sizes;
+    let alone = |superpoint: usize| {
+        worth(&views_of(shown, superpoint, of_masks), of_superpoints[superpoint], min_gaussians)
+    };
+    let mut worths: Vec<f64> = (0..tree.n_leaves).into_par_iter().map(alone).collect();
+    let mut n_of = of_superpoints.to_vec();
+    let mut views_of_node: BTreeMap<usize, NodeViews> = BTreeMap::new();
+    for node in tree.n_leaves..tree.len() {
+        let Some(parts) = tree.parts_of(node) else { continue };
+        let mut take = |part: usize| match views_of_node.remove(&part) {
+            Some(views) => views,
+            None => views_of(shown, part, of_masks),
+        };
+        let [mut views, mut fewer] = parts.map(&mut take);
+        if fewer.len() > views.len() {
+            std::mem::swap(&mut views, &mut fewer);
+        }
+        for (view, other) in fewer {
+            let of_view = views.entry(view).or_default();
+            of_view.add(other);
+            of_view.judge(of_masks);
+        }
+        let n = parts.iter().map(|part| n_of[*part]).sum();
+        n_of.push(n);
+        worths.push(worth(&views, n, min_gaussians));
+        views_of_node.insert(node, views);
+    }
+    worths
+}
+
+/// Returns the thing that each mask shows, or `None`: the first with [`SAME_IOU`]. `thing_of`: of each superpoint.
+pub fn things_of_masks(thing_of: &[Option<u32>], shown: &Shown, n_of_mask: &[u32]) -> Vec<Option<u32>> {
+    let n_things = thing_of.iter().flatten().max().map_or(0, |last| *last as usize + 1);
+    let mut superpoints: Vec<Vec<usize>> = vec![Vec::new(); n_things];
+    for (superpoint, thing) in thing_of.iter().enumerate() {
+        thing.iter().for_each(|thing| superpoints[*thing as usize].push(superpoint));
+    }
+    let same = |superpoints: &Vec<usize>| -> Vec<u32> {
+        let mut views = NodeViews::new();
+        for of_view in superpoints.iter().flat_map(|superpoint| shown.of(*superpoint)).filter(|of| of.n > 0) {
+            views.entry(of_view.view).or_default().add(NodeView::of(&of_view));
+        }
+        let masks = views.values().flat_map(|view| view.ious(n_of_mask).filter(|(_, iou)| *iou >= SAME_IOU));
+        masks.map(|(mask, _)| mask).collect()
+    };
+    let same: Vec<Vec<u32>> = superpoints.par_iter().map(same).collect();
+    let mut thing_of_mask = vec![None; n_of_mask.len()];
+    for (thing, masks) in (0u32..).zip(same) {
+        masks.iter().for_each(|mask| _ = thing_of_mask[*mask as usize].get_or_insert(thing));
+    }
+    thing_of_mask
+}

@@ -1,0 +1,237 @@
+//! What each view shows of each superpoint: how many of its Gaussians, and under which masks.
+
+use rayon::prelude::*;
+
+use super::scene::Scene;
+use crate::lift::superpoint::{NO_SUPERPOINT, Superpoints};
+use crate::lift::{ContributionError, PartContributions, RegionTable};
+use crate::memory::{MemoryPlan, Phase};
+
+/// A view sees a Gaussian if its weight there is at least this share of that in its best view: remnants behind other
+/// Gaussians say nothing.
+const MIN_WEIGHT_SHARE: f32 = 0.1;
+/// Gaussians that a thread goes through at once.
+const GAUSSIANS_PER_TASK: usize = 1 << 12;
+/// Contributions for each pair of superpoint and region: those of the Gaussians of a superpoint, and of labelled scenes a
+/// fifteenth.
+const ENTRIES_PER_REGION: u64 = 5;
+const EXPECTED_ENTRIES_PER_REGION: u64 = 15;
+
+/// What a view shows of a superpoint.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct OfView<'a> {
+    /// The view.
+    pub view: u32,
+    /// The superpoint's Gaussians that it sees.
+    pub n: u32,
+    /// The masks that show it, ascending.
+    pub masks: &'a [OfMask],
+}
+
+/// What a mask shows of a superpoint.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct OfMask {
+    /// The mask.
+    pub mask: u32,
+    /// The superpoint's Gaussians that the view sees under it.
+    pub n: u32,
+    /// Blending weight of its Gaussians under the mask, pixels.
+    pub weight: f64,
+}
+
+/// What all views show of all superpoints.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Shown {
+    /// `[n + 1]`: where each superpoint's views start.
+    starts: Vec<usize>,
+    /// View, Gaussians, and where its masks start; one more at the end.
+    views: Vec<(u32, u32, usize)>,
+    masks: Vec<OfMask>,
+}
+
+/// What a region shows of a superpoint.
+#[derive(Clone, Copy)]
+struct Entry {
+    superpoint: u32,
+    region: u32,
+    n: u32,
+    weight: f64,
+}
+
+/// Reserves what views show of superpoints, among `n_entries` contributions.
+pub(super) fn reserve(memory: &mut MemoryPlan, n_entries: u64) {
+    let bytes = |per_region: u64| n_entries / per_region * (size_of::<Entry>() + size_of::<OfMask>()) as u64;
+    memory.reserve_expecting(Phase::Objects, "masks of superpoints", bytes(ENTRIES_PER_REGION), 0);
+}
+
+/// Returns the bytes of what views show of superpoints, expected of `n_entries` contributions.
+pub fn expected_bytes(n_entries: u64) -> u64 {
+    n_entries / EXPECTED_ENTRIES_PER_REGION * (size_of::<Entry>() + size_of::<OfMask>()) as u64
+}
+
+impl Shown {
+    /// Gathers what the views show, in one pass over all contributions. Returns `None` if cancelled.
+    ///
+    /// # Errors
+    /// [`ContributionError`].
+    pub fn gather(scene: &Scene<'_>, superpoints: &Superpoints) -> Result<Option<Self>, ContributionError> {
+        let view_of_region = scene.view_of_region();
+        let mut entries = Vec::new();
+        for contributions in scene.index.transposed_parts(scene.table, scene.group_bytes) {
+            if scene.is_cancelled() {
+                return Ok(None);
+            }
+            let contributions = contributions?;
+            let gaussians = contributions.part.gaussians(scene.split);
+            let chunks = gaussians.par_chunks(GAUSSIANS_PER_TASK).enumerate();
+            let found: Vec<Vec<Entry>> = chunks
+                .map(|(at, gaussians)| {
+                    let first = at * GAUSSIANS_PER_TASK;
+                    of_gaussians(&contributions, first, gaussians, superpoints, &view_of_region)
+                })
+                .collect();
+            found.into_iter().for_each(|mut found| entries.append(&mut found));
+        }
+        // Of one pair in the order of the parts: sums are the same every time.
+        entries.par_sort_by_key(|entry| (entry.superpoint, entry.region));
+        Ok(Some(Self::new(superpoints.n, &join(entries), scene.table, &view_of_region)))
+    }
+
+    fn new(n: usize, entries: &[Entry], table: &RegionTable, view_of_region: &[u32]) -> Self {
+        let mut shown = Self { starts: Vec::with_capacity(n + 1), views: Vec::new(), masks: Vec::new() };
+        let view_of = |entry: &Entry| view_of_region[entry.region as usize];
+        let mut rest = entries;
+        for superpoint in 0..n as u32 {
+            shown.starts.push(shown.views.len());
+            let own;
+            (own, rest) = rest.split_at(rest.partition_point(|entry| entry.superpoint <= superpoint));
+            for of_view in own.chunk_by(|a, b| view_of(a) == view_of(b)) {
+                let first = shown.masks.len();
+                let n_seen = of_view.iter().map(|entry| entry.n).sum();
+                shown.views.push((view_of(&of_view[0]), n_seen, first));
+                let of_entry = |entry: &Entry| {
+                    let masks = table.all_masks_of(entry.region as usize).iter();
+                    let (n, weight) = (entry.n, entry.weight);
+                    masks.map(move |mask| OfMask { mask: *mask, n, weight })
+                };
+                shown.masks.extend(of_view.iter().flat_map(of_entry));
+                shown.masks[first..].sort_by_key(|of_mask| of_mask.mask);
+                let mut last = first;
+                for at in first + 1..shown.masks.len() {
+                    let OfMask { mask, n, weight } = shown.masks[at];
+                    if mask == shown.masks[last].mask {
+                        shown.masks[last].n += n;
+                        shown.masks[last].weight += weight;
+                    } else {
+                        last += 1;
+                        shown.masks[last] = shown.masks[at];
+                    }
+                }
+                shown.masks.truncate((last + 1).min(shown.masks.len()));
+            }
+        }
+        shown.starts.push(shown.views.len());
+        shown.views.push((0, 0, shown.masks.len()));
+        shown
+    }
+
+    /// Returns the number of superpoints.
+    pub fn len(&self) -> usize {
+        self.starts.len().saturating_sub(1)
+    }
+
+    /// Returns whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Returns what each view shows of a superpoint, views ascending.
+    pub fn of(&self, superpoint: usize) -> impl Iterator<Item = OfView<'_>> {
+        (self.starts[superpoint]..self.starts[superpoint + 1]).map(|at| {
+            let (view, n, first) = self.views[at];
+            OfView { view, n, masks: &self.masks[first..self.views[at + 1].2] }
+        })
+    }
+
+    /// Returns what each mask shows of each superpoint, superpoint by superpoint.
+    pub fn masks(&self) -> impl Iterator<Item = (usize, &OfMask)> {
+        (0..self.len())
+            .flat_map(|at| self.of(at).flat_map(move |of_view| of_view.masks.iter().map(move |of| (at, of))))
+    }
+}
+
+/// Returns what regions show of the superpoints of some Gaussians, which are consecutive in a part.
+fn of_gaussians(
+    contributions: &PartContributions,
+    first: usize,
+    gaussians: &[u32],
+    superpoints: &Superpoints,
+    view_of_region: &[u32],
+) -> Vec<Entry> {
+    let mut found = Vec::new();
+    for (k, gaussian) in (first..).zip(gaussians) {
+        let superpoint = superpoints.of_gaussian[*gaussian as usize];
+        if superpoint == NO_SUPERPOINT {
+            continue;
+        }
+        let entries = contributions.entries_of(k);
+        let (regions, weights) = (&contributions.regions[entries.clone()], &contributions.weights[entries]);
+        let seen = seen(regions, weights, view_of_region);
+        let mut seen = seen.iter().peekable();
+        found.extend(regions.iter().zip(weights).map(|(region, weight)| {
+            let n = u32::from(seen.next_if_eq(&region).is_some());
+            Entry { superpoint, region: *region, n, weight: f64::from(*weight) }
+        }));
+    }
+    found.sort_by_key(|entry| (entry.superpoint, entry.region));
+    join(found)
+}
+
+/// Adds entries of one pair together; they are sorted by pair.
+fn join(mut entries: Vec<Entry>) -> Vec<Entry> {
+    entries.dedup_by(|next, kept| {
+        let is_same = (next.superpoint, next.region) == (kept.superpoint, kept.region);
+        if is_same {
+            kept.n += next.n;
+            kept.weight += next.weight;
+        }
+        is_same
+    });
+    entries
+}
+
+/// Returns, for each view that sees a Gaussian, the region with most of its weight there. Entries are by view, then region.
+fn seen(regions: &[u32], weights: &[f32], view_of_region: &[u32]) -> Vec<u32> {
+    let mut views: Vec<(u32, f32, u32, f32)> = Vec::new();
+    for (region, weight) in regions.iter().zip(weights) {
+        let view = view_of_region[*region as usize];
+        match views.last_mut() {
+            Some((last, total, best, most)) if *last == view => {
+                *total += weight;
+                if weight > most {
+                    (*best, *most) = (*region, *weight);
+                }
+            }
+            _ => views.push((view, *weight, *region, *weight)),
+        }
+    }
+    let most = views.iter().map(|(_, total, ..)| *total).fold(0.0, f32::max);
+    let is_seen = |(_, total, ..): &&(u32, f32, u32, f32)| *total > 0.0 && *total >= MIN_WEIGHT_SHARE * most;
+    views.iter().filter(is_seen).map(|(_, _, region, _)| *region).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Computed by hand: view 0 shows regions 0 and 1, view 1 regions 2 to 4, view 2 less than a tenth, view 3 nothing.
+    #[test]
+    fn a_gaussian_shows_the_region_of_most_weight_where_it_is_seen() {
+        let view_of_region = [0, 0, 1, 1, 1, 2, 3];
+        let (regions, weights) = ([0, 1, 2, 3, 4, 5, 6], [1.0, 3.0, 4.0, 4.0, 2.0, 0.9, 0.0]);
+        assert_eq!(seen(&regions, &weights, &view_of_region), [1, 2]);
+        // A tenth of the best is enough.
+        assert_eq!(seen(&regions, &[1.0, 3.0, 4.0, 4.0, 2.0, 1.0, 0.0], &view_of_region).len(), 3);
+        assert!(seen(&[], &[], &view_of_region).is_empty());
+    }
+}
