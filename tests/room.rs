@@ -134,7 +134,7 @@ fn the_robots_service_answers() {
         text(&cache),
     ]));
     let robot = Service::start(&mut edge(&["serve", "--cache", text(&cache)]));
-    let reply = robot.get("/query?text=red&near=3.5,2.7,0");
+    let reply = robot.get("/query?text=sofa&near=3.5,2.7,0");
     assert!(!reply["answers"].as_array().expect("answers").is_empty(), "{reply}");
     let reply = robot.get("/query?text=elephant");
     assert!(

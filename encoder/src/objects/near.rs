@@ -9,11 +9,12 @@ use crate::memory::{MemoryPlan, Phase};
 
 /// Gaussians that stand for a superpoint.
 const MAX_SAMPLES: usize = 4;
+/// Gaussians for each sample, where superpoints are so small that there would be more samples.
+const GAUSSIANS_PER_SAMPLE: usize = 8;
+/// The same in labelled scenes.
+const EXPECTED_PER_SAMPLE: usize = 25;
 /// Samples that are near a sample: with those of its own superpoint, those of a dozen.
 const N_NEIGHBOURS: usize = 48;
-/// Gaussians of a superpoint, at least, but for a few; and of labelled scenes.
-const MIN_GAUSSIANS: usize = 20;
-const EXPECTED_GAUSSIANS: usize = 100;
 
 /// Reserves the search.
 pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
@@ -21,8 +22,8 @@ pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
         + size_of::<[f64; 3]>()
         + nearest::working_bytes_per_point(N_NEIGHBOURS)
         + N_NEIGHBOURS / 2 * size_of::<(u32, u32)>();
-    let bytes = |of_superpoint: usize| (n_gaussians / of_superpoint * MAX_SAMPLES * per_sample) as u64;
-    let (len_bytes, expected_bytes) = (bytes(MIN_GAUSSIANS), bytes(EXPECTED_GAUSSIANS));
+    let bytes = |of_sample: usize| (n_gaussians / of_sample * per_sample) as u64;
+    let (len_bytes, expected_bytes) = (bytes(GAUSSIANS_PER_SAMPLE), bytes(EXPECTED_PER_SAMPLE));
     memory.reserve_expecting(Phase::Objects, "superpoints near each other", len_bytes, expected_bytes);
 }
 
@@ -53,13 +54,15 @@ fn samples(superpoints: &Superpoints) -> Vec<(u32, u32)> {
     let mut n_of = vec![0usize; superpoints.n];
     let known = superpoints.of_gaussian.iter().filter(|superpoint| **superpoint != NO_SUPERPOINT);
     known.for_each(|superpoint| n_of[*superpoint as usize] += 1);
+    let most = superpoints.of_gaussian.len() / GAUSSIANS_PER_SAMPLE / superpoints.n.max(1);
+    let most = most.clamp(1, MAX_SAMPLES);
     let mut n_before = vec![0usize; superpoints.n];
     let is_sample = |(_, superpoint): &(u32, &u32)| {
         if **superpoint == NO_SUPERPOINT {
             return false;
         }
         let (n, before) = (n_of[**superpoint as usize], &mut n_before[**superpoint as usize]);
-        let n_samples = n.min(MAX_SAMPLES);
+        let n_samples = n.min(most);
         // The j-th sample comes after j * n / n_samples others.
         let is_sample = (0..n_samples).any(|j| j * n / n_samples == *before);
         *before += 1;
@@ -88,6 +91,10 @@ mod tests {
         };
         let mut of_gaussian: Vec<u32> = (0..n).map(|i| i / 10).collect();
         of_gaussian[0] = NO_SUPERPOINT;
+        let few = samples(&Superpoints { of_gaussian: of_gaussian.clone(), n: 40 });
+        assert_eq!((few.len(), &few[..3]), (40, &[(0, 1), (1, 10), (2, 20)][..]));
+        // Others without a superpoint: there are Gaussians enough for four samples each.
+        of_gaussian.resize(1300, NO_SUPERPOINT);
         let superpoints = Superpoints { of_gaussian, n: 40 };
         let found = samples(&superpoints);
         assert_eq!(found[..8], [(0, 1), (0, 3), (0, 5), (0, 7), (1, 10), (1, 12), (1, 15), (1, 17)]);

@@ -14,7 +14,7 @@ const MIN_WEIGHT_SHARE: f32 = 0.1;
 const GAUSSIANS_PER_TASK: usize = 1 << 12;
 /// Contributions for each pair of superpoint and region: those of the Gaussians of a superpoint, and of labelled scenes a
 /// fifteenth.
-const ENTRIES_PER_REGION: u64 = 5;
+const ENTRIES_PER_REGION: u64 = 8;
 const EXPECTED_ENTRIES_PER_REGION: u64 = 15;
 
 /// What a view shows of a superpoint.

@@ -233,7 +233,7 @@ fn vectors_are_kept_in_the_basis_of_centroids() {
     }
 }
 
-/// By hand: of 100 contributions a fifth, each with an entry of 24 bytes and one of 16.
+/// By hand: of 100 contributions an eighth, each with an entry of 24 bytes and one of 16.
 #[test]
 fn lists_are_reserved() {
     let rest = |available_bytes: u64, n_entries: u64| {
@@ -242,9 +242,9 @@ fn lists_are_reserved() {
         reserve_contributions(&mut plan, n_entries);
         plan.rest(0)
     };
-    assert_eq!(rest(800, 100), Ok(0));
-    let refused = rest(799, 100).expect_err("a byte is missing").to_string();
-    assert!(refused.contains("800 for masks of superpoints"), "{refused}");
+    assert_eq!(rest(480, 100), Ok(0));
+    let refused = rest(479, 100).expect_err("a byte is missing").to_string();
+    assert!(refused.contains("480 for masks of superpoints"), "{refused}");
 }
 
 mod definition;
