@@ -15,7 +15,7 @@ use super::EmbedError;
 use crate::lanes::{GpuLoad, Lane, Lanes};
 use crate::memory::{MemoryPlan, Phase};
 
-/// Lanes of a GPU: one computes, one copies, one is filled.
+/// Lanes of a GPU: two compute, one copies or is filled.
 const LANES_PER_GPU: usize = 3;
 
 /// Views that may wait for each lane: with a usual number of masks they fill two batches.
