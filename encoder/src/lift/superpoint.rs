@@ -154,6 +154,14 @@ impl Graph {
 }
 
 impl Superpoints {
+    /// Returns the number of Gaussians of each superpoint.
+    pub fn sizes(&self) -> Vec<u32> {
+        let mut sizes = vec![0; self.n];
+        let known = self.of_gaussian.iter().filter(|superpoint| **superpoint != NO_SUPERPOINT);
+        known.for_each(|superpoint| sizes[*superpoint as usize] += 1);
+        sizes
+    }
+
     /// Returns each superpoint's most frequent label, of equally many the first; `None` where it has none. `labels`: of
     /// Gaussians, in any order.
     pub fn most_frequent<L: Copy + Ord + Send>(

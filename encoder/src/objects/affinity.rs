@@ -57,7 +57,7 @@ fn of_pair(shown: &Shown, a: usize, b: usize) -> Evidence {
             Ordering::Greater => drop(of_b.next()),
             Ordering::Equal => {
                 let (n_both, n_either) = shared(a, b);
-                // Without masks the view says nothing.
+                // A view with no mask of either is no evidence.
                 if let Some(share) = (n_both * SHARE).checked_div(n_either) {
                     let n = u64::from(a.n.min(b.n));
                     evidence += Evidence { together: n * share, n };

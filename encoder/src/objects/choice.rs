@@ -1,7 +1,7 @@
 //! Which nodes of the tree are things: those that views agree on.
 //!
-//! A view agrees with a node by the best intersection over union of one of its masks with what it sees of the node; a node's
-//! consensus is the mean over the views that see enough of it (as MaskClustering, Yan et al., CVPR 2024, judges masks). The
+//! A view's agreement with a node is the best intersection over union between one of its masks and what it sees of the node. A
+//! node's consensus is the mean agreement of the views that see enough of it (as MaskClustering, Yan et al., CVPR 2024, judges masks). The
 //! nodes are chosen, none part of another, for which the sum of consensus^8 n^(1/4) is largest, n the number of Gaussians: a thing
 //! wins over its parts if views agree on it nearly as well. A node without consensus is no thing.
 
@@ -12,13 +12,13 @@ use rayon::prelude::*;
 use super::shown::{OfView, Shown};
 use super::tree::Tree;
 
-/// A view judges a node of which it sees at least this share, in tenths: one side.
+/// A view judges a node if it sees at least this share of it, in tenths: one side is enough.
 const OBSERVED_TENTHS: u64 = 1;
 /// Nodes below this consensus are no things.
 const MIN_CONSENSUS: f64 = 0.3;
 /// A mask with this intersection over union shows the node: a majority of their union.
 pub const SAME_IOU: f64 = 0.5;
-/// Fewest views whose masks show the node: one cannot agree with others.
+/// A thing needs masks in this many views: a single view has none to agree with.
 const MIN_VIEWS: usize = 2;
 
 /// What a view shows of a node.
@@ -127,11 +127,10 @@ pub fn things(tree: &Tree, shown: &Shown, sizes: Sizes<'_>) -> Vec<Option<u32>> 
         }
     }
     let mut numbers = BTreeMap::new();
-    let number = |node: usize| {
+    let mut number = |node: usize| {
         let next = numbers.len() as u32;
         *numbers.entry(node).or_insert(next)
     };
-    let mut number = number;
     node_of.into_iter().map(|node| node.map(&mut number)).collect()
 }
 

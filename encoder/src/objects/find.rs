@@ -16,7 +16,7 @@ use super::tree::Tree;
 use super::{affinity, near, vectors};
 use crate::lift::ContributionError;
 use crate::lift::photos::MaskOutline;
-use crate::lift::superpoint::{NO_SUPERPOINT, SuperpointSettings, Superpoints};
+use crate::lift::superpoint::{SuperpointSettings, Superpoints};
 
 /// Smaller objects are dropped, as the robot drops smaller clusters.
 pub const MIN_GAUSSIANS: usize = 10;
@@ -46,9 +46,7 @@ pub fn find(scene: &Scene<'_>) -> Result<Option<SceneObjects>, ContributionError
     }
     let mut n_of_mask = vec![0; table.n_masks()];
     shown.masks().for_each(|(_, of_mask)| n_of_mask[of_mask.mask as usize] += of_mask.n);
-    let mut n_of_superpoint = vec![0; superpoints.n];
-    let known = superpoints.of_gaussian.iter().filter(|superpoint| **superpoint != NO_SUPERPOINT);
-    known.for_each(|superpoint| n_of_superpoint[*superpoint as usize] += 1);
+    let n_of_superpoint = superpoints.sizes();
     let sizes =
         Sizes { of_masks: &n_of_mask, of_superpoints: &n_of_superpoint, min_gaussians: MIN_GAUSSIANS as u32 };
     let object_of = choice::things(&tree, &shown, sizes);

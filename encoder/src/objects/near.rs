@@ -27,8 +27,8 @@ pub(super) fn reserve(memory: &mut MemoryPlan, n_gaussians: usize) {
     memory.reserve_expecting(Phase::Objects, "superpoints near each other", len_bytes, expected_bytes);
 }
 
-/// Returns the pairs of superpoints of which a sampled Gaussian of one is among the nearest of one of the other; the lower
-/// number first, ascending.
+/// Returns the pairs of superpoints that lie near each other: a sampled Gaussian of one is among the nearest neighbours of a
+/// sample of the other. The lower number comes first; pairs are ascending.
 pub fn pairs(scene: &Gaussians, superpoints: &Superpoints) -> Vec<(u32, u32)> {
     let samples = samples(superpoints);
     let points: Vec<[f64; 3]> =
@@ -51,9 +51,7 @@ pub fn pairs(scene: &Gaussians, superpoints: &Superpoints) -> Vec<(u32, u32)> {
 /// Returns up to [`MAX_SAMPLES`] Gaussians of each superpoint, spread evenly over its own in the order of the scene: superpoint
 /// and Gaussian, ascending.
 fn samples(superpoints: &Superpoints) -> Vec<(u32, u32)> {
-    let mut n_of = vec![0usize; superpoints.n];
-    let known = superpoints.of_gaussian.iter().filter(|superpoint| **superpoint != NO_SUPERPOINT);
-    known.for_each(|superpoint| n_of[*superpoint as usize] += 1);
+    let sizes = superpoints.sizes();
     let most = superpoints.of_gaussian.len() / GAUSSIANS_PER_SAMPLE / superpoints.n.max(1);
     let most = most.clamp(1, MAX_SAMPLES);
     let mut n_before = vec![0usize; superpoints.n];
@@ -61,7 +59,7 @@ fn samples(superpoints: &Superpoints) -> Vec<(u32, u32)> {
         if **superpoint == NO_SUPERPOINT {
             return false;
         }
-        let (n, before) = (n_of[**superpoint as usize], &mut n_before[**superpoint as usize]);
+        let (n, before) = (sizes[**superpoint as usize] as usize, &mut n_before[**superpoint as usize]);
         let n_samples = n.min(most);
         // The j-th sample comes after j * n / n_samples others.
         let is_sample = (0..n_samples).any(|j| j * n / n_samples == *before);

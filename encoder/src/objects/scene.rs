@@ -20,7 +20,7 @@ pub struct Scene<'a> {
     pub gaussians: &'a Gaussians,
     /// Their cells.
     pub split: &'a CellSplit,
-    /// Small pieces of the surface, of which objects are made; absent: they are found by colour and shape.
+    /// The pieces of surface that objects are made of. If absent, they are found from colour and shape.
     pub superpoints: Option<&'a Superpoints>,
     /// Each view's masks, in the order of the contributions.
     pub photos: &'a [Photo],

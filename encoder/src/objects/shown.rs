@@ -114,20 +114,17 @@ impl Shown {
                     let (n, weight) = (entry.n, entry.weight);
                     masks.map(move |mask| OfMask { mask: *mask, n, weight })
                 };
-                shown.masks.extend(of_view.iter().flat_map(of_entry));
-                shown.masks[first..].sort_by_key(|of_mask| of_mask.mask);
-                let mut last = first;
-                for at in first + 1..shown.masks.len() {
-                    let OfMask { mask, n, weight } = shown.masks[at];
-                    if mask == shown.masks[last].mask {
-                        shown.masks[last].n += n;
-                        shown.masks[last].weight += weight;
-                    } else {
-                        last += 1;
-                        shown.masks[last] = shown.masks[at];
+                let mut masks: Vec<OfMask> = of_view.iter().flat_map(of_entry).collect();
+                masks.sort_by_key(|of_mask| of_mask.mask);
+                masks.dedup_by(|next, kept| {
+                    let is_same = next.mask == kept.mask;
+                    if is_same {
+                        kept.n += next.n;
+                        kept.weight += next.weight;
                     }
-                }
-                shown.masks.truncate((last + 1).min(shown.masks.len()));
+                    is_same
+                });
+                shown.masks.append(&mut masks);
             }
         }
         shown.starts.push(shown.views.len());
