@@ -45,7 +45,7 @@ pub struct GpuOptions {
     pub max_resident_bytes: u64,
     /// Initial capacity for visible Gaussians, pairs and contributions; it grows when a view needs more.
     pub first_capacity: u32,
-    /// Views processed at once: while one is copied back, others compute.
+    /// Views processed at once, fewer where the device's memory does not suffice: while one is copied back, others compute.
     pub views_in_flight: usize,
 }
 
@@ -55,7 +55,7 @@ impl Default for GpuOptions {
             max_binding_bytes: u64::MAX,
             max_resident_bytes: u64::MAX,
             first_capacity: 1 << 19,
-            views_in_flight: 3,
+            views_in_flight: 8,
         }
     }
 }

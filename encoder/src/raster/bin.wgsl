@@ -157,3 +157,47 @@ fn find_ranges(
         }
     }
 }
+
+@group(0) @binding(10) var<storage, read> tile_ranges: array<Range>;
+@group(0) @binding(11) var<storage, read_write> tile_order: array<u32>;
+
+// Classes of tiles by their number of pairs, four for each power of two.
+const N_CLASSES = 128u;
+var<workgroup> class_counts: array<atomic<u32>, N_CLASSES>;
+
+// Returns the class of a tile; fuller tiles have lower ones.
+fn class_of(tile: u32) -> u32 {
+    let n = tile_ranges[tile].end - tile_ranges[tile].start;
+    if n < 4u {
+        return N_CLASSES - 1u - n;
+    }
+    let exponent = firstLeadingBit(n);
+    return N_CLASSES - 1u - (exponent * 4u + ((n >> (exponent - 2u)) & 3u) - 4u);
+}
+
+// Orders the tiles by their number of pairs, the fullest first: the last ones to be blended are then soon done. One
+// workgroup orders all tiles.
+@compute @workgroup_size(WORKGROUP_SIZE)
+fn order_tiles(@builtin(local_invocation_index) thread: u32) {
+    let n_tiles = view.tile_columns * (view.end_tile_row - view.first_tile_row);
+    if thread < N_CLASSES {
+        atomicStore(&class_counts[thread], 0u);
+    }
+    workgroupBarrier();
+    for (var tile = thread; tile < n_tiles; tile += WORKGROUP_SIZE) {
+        atomicAdd(&class_counts[class_of(tile)], 1u);
+    }
+    workgroupBarrier();
+    var n = 0u;
+    if thread < N_CLASSES {
+        n = atomicLoad(&class_counts[thread]);
+    }
+    let before = block_scan(n, thread);
+    if thread < N_CLASSES {
+        atomicStore(&class_counts[thread], before);
+    }
+    workgroupBarrier();
+    for (var tile = thread; tile < n_tiles; tile += WORKGROUP_SIZE) {
+        tile_order[atomicAdd(&class_counts[class_of(tile)], 1u)] = tile;
+    }
+}

@@ -12,6 +12,8 @@
 // Row-major, within the band.
 @group(0) @binding(5) var<storage, read> region_of_pixel: array<u32>;
 @group(0) @binding(6) var<storage, read_write> entries: array<Entry>;
+// The order in which tiles are blended.
+@group(0) @binding(7) var<storage, read> tile_order: array<u32>;
 
 // Gaussians with weights summed in one step.
 const STEP = 8u;
@@ -19,8 +21,8 @@ const STEP = 8u;
 const LOAD = 64u;
 // Consecutive pixels that a thread sums.
 const RUN = 8u;
-// One word of padding per run keeps the threads of a Gaussian in different memory banks.
-const WEIGHTS_STRIDE = WORKGROUP_SIZE + WORKGROUP_SIZE / RUN;
+// A word of padding per run and per Gaussian keeps neighbouring threads in different memory banks.
+const WEIGHTS_STRIDE = WORKGROUP_SIZE + WORKGROUP_SIZE / RUN + 1u;
 const N_SUMS = 2048u;
 const NO_SLOT = 0xffffu;
 const PIXEL_BITS = 8u;
@@ -61,8 +63,9 @@ fn sum_regions(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    let x_px = group.x * TILE_SIZE_PX;
-    let y_px = (view.first_tile_row + group.y) * TILE_SIZE_PX;
+    let tile = tile_order[group.y * view.tile_columns + group.x];
+    let x_px = tile % view.tile_columns * TILE_SIZE_PX;
+    let y_px = (view.first_tile_row + tile / view.tile_columns) * TILE_SIZE_PX;
     {
         let x = x_px + thread % TILE_SIZE_PX;
         let y = y_px + thread / TILE_SIZE_PX;
@@ -89,7 +92,7 @@ fn sum_regions(
     }
     if thread == WORKGROUP_SIZE - 1u {
         n_slots_shared = slot + u32(has_region);
-        let range = ranges[group.y * view.tile_columns + group.x];
+        let range = ranges[tile];
         range_shared = vec2<u32>(range.start, min(range.end, view.capacity_pairs));
         atomicStore(&n_live, 0u);
         atomicStore(&n_found, 0u);
@@ -112,9 +115,12 @@ fn sum_regions(
         atomicAdd(&n_live, 1u);
     }
     let is_falloff = view.falloff != 0u;
-    // The run of pixels that this thread sums, for one Gaussian of a step.
-    let of_step = thread / (WORKGROUP_SIZE / STEP);
-    let run = thread % (WORKGROUP_SIZE / STEP);
+    // The run of pixels that this thread sums, for one Gaussian of a step: neighbours sum for different Gaussians, so that
+    // few of them add to one sum at a time.
+    let of_step = thread % STEP;
+    let run = thread / STEP;
+    // Most runs lie in one region; pixels are in the order of their regions.
+    let is_of_one = slots[run * RUN] == slots[run * RUN + RUN - 1u];
     // Number of Gaussians with sums in workgroup memory before they are written out.
     let per_round = min(N_SUMS / n_slots / STEP * STEP, LOAD);
 
@@ -136,45 +142,44 @@ fn sum_regions(
         }
         let n_loaded = min(per_round, range.y - start);
         for (var step = 0u; step < n_loaded; step += STEP) {
+            // Without branches, so that all threads go the same way. No alpha counts beyond the reach.
+            let was_live = is_live;
             for (var i = 0u; i < STEP; i++) {
                 let g = gaussians[step + i];
-                var weight = 0.0;
-                if is_live {
-                    let u = g.u0 + g.u_y * f32(local_y) + g.u_x * f32(local_x);
-                    let v = g.v0 + g.v_y * f32(local_y);
-                    // No alpha counts beyond the reach; most Gaussians reach few pixels of a tile.
-                    if u * u + v * v <= g.reach2 {
-                        let falloff = exp_of_minus(0.5 * u * u + 0.5 * v * v);
-                        let alpha = min(g.opacity * falloff, MAX_ALPHA);
-                        let next = transmittance * (1.0 - alpha);
-                        if alpha < MIN_ALPHA {
-                            // The alpha is too small.
-                        } else if is_falloff {
-                            weight = falloff;
-                        } else if next > MIN_TRANSMITTANCE {
-                            weight = alpha * transmittance;
-                            transmittance = next;
-                        } else {
-                            is_live = false;
-                            atomicSub(&n_live, 1u);
-                        }
-                    }
-                }
-                weights[i * WEIGHTS_STRIDE + thread + thread / RUN] = weight;
+                let u = g.u0 + g.u_y * f32(local_y) + g.u_x * f32(local_x);
+                let v = g.v0 + g.v_y * f32(local_y);
+                let falloff = exp_of_minus(0.5 * u * u + 0.5 * v * v);
+                let alpha = min(g.opacity * falloff, MAX_ALPHA);
+                let counts = is_live && u * u + v * v <= g.reach2 && alpha >= MIN_ALPHA;
+                let next = transmittance * (1.0 - alpha);
+                let is_summed = counts && (is_falloff || next > MIN_TRANSMITTANCE);
+                let weight = select(alpha * transmittance, falloff, is_falloff);
+                weights[i * WEIGHTS_STRIDE + thread + thread / RUN] = select(0.0, weight, is_summed);
+                transmittance = select(transmittance, next, is_summed && !is_falloff);
+                is_live = is_live && (is_summed || !counts);
+            }
+            if was_live && !is_live {
+                atomicSub(&n_live, 1u);
             }
             workgroupBarrier();
             let first_weight = of_step * WEIGHTS_STRIDE + run * (RUN + 1u);
             let first_sum = (step + of_step) * n_slots;
             var sum = 0.0;
             var slot_of_run = slots[run * RUN];
-            for (var i = 0u; i < RUN; i++) {
-                let slot_of_pixel = slots[run * RUN + i];
-                if slot_of_pixel != slot_of_run {
-                    add(first_sum, slot_of_run, sum);
-                    sum = 0.0;
-                    slot_of_run = slot_of_pixel;
+            if is_of_one {
+                for (var i = 0u; i < RUN; i++) {
+                    sum += weights[first_weight + i];
                 }
-                sum += weights[first_weight + i];
+            } else {
+                for (var i = 0u; i < RUN; i++) {
+                    let slot_of_pixel = slots[run * RUN + i];
+                    if slot_of_pixel != slot_of_run {
+                        add(first_sum, slot_of_run, sum);
+                        sum = 0.0;
+                        slot_of_run = slot_of_pixel;
+                    }
+                    sum += weights[first_weight + i];
+                }
             }
             add(first_sum, slot_of_run, sum);
             workgroupBarrier();

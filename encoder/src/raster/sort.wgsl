@@ -1,4 +1,4 @@
-// Stable radix sort of indices by a 32-bit key, 4 bits per pass: count, scan, scatter.
+// Stable radix sort of indices by a 32-bit key, 5 bits per pass: count, scan, scatter.
 //
 // Every thread owns a run of consecutive items, so ranks follow the order of the input without subgroups or
 // atomics, and the result is the same on every device.
@@ -6,9 +6,10 @@
 struct SortPass {
     // Counter with the number of items.
     items: u32,
-    // The key of item i is `keys[i * stride + offset] >> shift`.
+    // The key of item i is `(keys[i * stride + offset] - least) >> shift`.
     stride: u32,
     offset: u32,
+    least: u32,
     shift: u32,
     // The first pass takes the items in their original order and reads no input order.
     is_first: u32,
@@ -23,10 +24,9 @@ struct SortPass {
 @group(0) @binding(5) var<storage, read_write> order_out: array<u32>;
 
 const PER_THREAD = SORT_BLOCK / WORKGROUP_SIZE;
-const RADIX = 16u;
-
-// Counts per (digit, thread), then the start of the thread's items with the digit.
-var<workgroup> counts: array<u32, RADIX * WORKGROUP_SIZE>;
+// A word counts two digits, in its halves: a digit and that `ROWS` above it. Counts within a block fit.
+const ROWS = RADIX / 2u;
+const HALF_WORD_BITS = 16u;
 
 fn n_items() -> u32 {
     return min(counters[job.items], job.capacity);
@@ -40,7 +40,7 @@ fn item(at: u32) -> u32 {
 }
 
 fn digit(item: u32) -> u32 {
-    return (keys[item * job.stride + job.offset] >> job.shift) & (RADIX - 1u);
+    return ((keys[item * job.stride + job.offset] - job.least) >> job.shift) % RADIX;
 }
 
 var<workgroup> block_histogram: array<atomic<u32>, RADIX>;
@@ -72,6 +72,12 @@ fn count_digits(
     }
 }
 
+// Counts per (digit, thread), then the ranks of the thread's items within the digit.
+var<workgroup> counts: array<u32, ROWS * WORKGROUP_SIZE>;
+// Ranks of the first items of the digits within the block, and their places in the output.
+var<workgroup> first_ranks: array<u32, ROWS>;
+var<workgroup> digit_starts: array<u32, RADIX>;
+
 @compute @workgroup_size(WORKGROUP_SIZE)
 fn scatter(
     @builtin(workgroup_id) group: vec3<u32>,
@@ -81,8 +87,11 @@ fn scatter(
     let n = n_items();
     let n_blocks = (n + SORT_BLOCK - 1u) / SORT_BLOCK;
     for (var block = group.x; block < n_blocks; block += groups.x) {
-        for (var d = 0u; d < RADIX; d++) {
+        for (var d = 0u; d < ROWS; d++) {
             counts[d * WORKGROUP_SIZE + thread] = 0u;
+        }
+        if thread < RADIX {
+            digit_starts[thread] = histogram[thread * n_blocks + block];
         }
         var items: array<u32, PER_THREAD>;
         var digits: array<u32, PER_THREAD>;
@@ -92,34 +101,35 @@ fn scatter(
             if first + i < n {
                 items[i] = item(first + i);
                 digits[i] = digit(items[i]);
-                counts[digits[i] * WORKGROUP_SIZE + thread] += 1u;
+                counts[digits[i] % ROWS * WORKGROUP_SIZE + thread] += 1u << (digits[i] / ROWS * HALF_WORD_BITS);
             }
         }
         workgroupBarrier();
-        // Thread t scans 16 consecutive counts, those of digit t / 16.
+        // A thread scans as many consecutive counts as there are digits in a half, all of one digit.
         var sum = 0u;
-        var own: array<u32, RADIX>;
-        for (var i = 0u; i < RADIX; i++) {
+        var own: array<u32, ROWS>;
+        for (var i = 0u; i < ROWS; i++) {
             own[i] = sum;
-            sum += counts[thread * RADIX + i];
+            sum += counts[thread * ROWS + i];
         }
         let before = block_scan(sum, thread);
-        let in_digit = thread * RADIX / WORKGROUP_SIZE;
-        // Ranks are relative to the first item of the digit.
-        if thread * RADIX % WORKGROUP_SIZE == 0u {
-            atomicStore(&block_histogram[in_digit], before);
+        let of_digit = thread * ROWS / WORKGROUP_SIZE;
+        if thread * ROWS % WORKGROUP_SIZE == 0u {
+            first_ranks[of_digit] = before;
         }
         workgroupBarrier();
-        let rank = before - atomicLoad(&block_histogram[in_digit]) + histogram[in_digit * n_blocks + block];
-        for (var i = 0u; i < RADIX; i++) {
-            counts[thread * RADIX + i] = rank + own[i];
+        let rank = before - first_ranks[of_digit];
+        for (var i = 0u; i < ROWS; i++) {
+            counts[thread * ROWS + i] = rank + own[i];
         }
         workgroupBarrier();
         for (var i = 0u; i < PER_THREAD; i++) {
             if digits[i] < RADIX {
-                let slot = digits[i] * WORKGROUP_SIZE + thread;
-                order_out[counts[slot]] = items[i];
-                counts[slot] += 1u;
+                let slot = digits[i] % ROWS * WORKGROUP_SIZE + thread;
+                let shift = digits[i] / ROWS * HALF_WORD_BITS;
+                let in_digit = (counts[slot] >> shift) & ((1u << HALF_WORD_BITS) - 1u);
+                order_out[digit_starts[digits[i]] + in_digit] = items[i];
+                counts[slot] += 1u << shift;
             }
         }
         workgroupBarrier();

@@ -7,7 +7,7 @@ use super::jobs::{
     DISPATCH_BYTES, ENTRY_WORDS, JOB_STRIDE_BYTES, MAX_PASSES, PAIR_WORDS, SCAN_JOBS, write_jobs,
 };
 use super::layout::{Capacities, screen_layout};
-use super::shader::{Counter, SORT_BLOCK, WORKGROUP_SIZE};
+use super::shader::{Counter, RADIX, SORT_BLOCK, WORKGROUP_SIZE};
 
 /// Size of the counters, bytes.
 pub const COUNTERS_BYTES: u64 = 64;
@@ -40,6 +40,7 @@ pub struct Buffers {
     pub pair_order: [wgpu::Buffer; 2],
     pub members: wgpu::Buffer,
     pub ranges: wgpu::Buffer,
+    pub tile_order: wgpu::Buffer,
     pub regions: wgpu::Buffer,
     pub entries: wgpu::Buffer,
     pub entry_order: [wgpu::Buffer; 2],
@@ -70,7 +71,7 @@ impl Buffers {
                 "block counts",
                 largest.max(n_chunk.into()).div_ceil(WORKGROUP_SIZE.into()),
             )?,
-            histogram: storage("histogram", 16 * largest.div_ceil(SORT_BLOCK.into()))?,
+            histogram: storage("histogram", u64::from(RADIX) * largest.div_ceil(SORT_BLOCK.into()))?,
             screen: storage("screen", visible * u64::from(screen_bytes / 4))?,
             tile_counts: storage("tile counts", visible)?,
             visible_order: [storage("order of visible", visible)?, storage("order of visible", visible)?],
@@ -78,6 +79,7 @@ impl Buffers {
             pair_order: [storage("order of pairs", pairs)?, storage("order of pairs", pairs)?],
             members: storage("members", pairs)?,
             ranges: storage("ranges", 2 * u64::from(n_tiles))?,
+            tile_order: storage("order of tiles", n_tiles.into())?,
             regions: storage("regions", n_px.into())?,
             entries: storage("entries", entries * u64::from(ENTRY_WORDS))?,
             entry_order: [storage("order of entries", entries)?, storage("order of entries", entries)?],

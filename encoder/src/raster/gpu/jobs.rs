@@ -2,7 +2,8 @@
 
 use super::device::Device;
 use super::layout::{Capacities, ScanJob, SortPass, screen_layout};
-use super::shader::{Counter, NONE, SORT_BLOCK, WORKGROUP_SIZE};
+use super::shader::{Counter, NONE, RADIX, SORT_BLOCK, WORKGROUP_SIZE};
+use crate::raster::constants::{FAR_Z, NEAR_Z};
 
 /// Distance between records, bytes; bindings must be aligned.
 pub const JOB_STRIDE_BYTES: u64 = 256;
@@ -34,9 +35,9 @@ pub enum SortKey {
 
 const SORT_KEYS: [SortKey; 4] = [SortKey::Depth, SortKey::Tile, SortKey::Region, SortKey::Member];
 /// Bits per sort pass.
-pub const DIGIT_BITS: u32 = 4;
+pub const DIGIT_BITS: u32 = RADIX.ilog2();
 /// Passes for a 32-bit key.
-pub const MAX_PASSES: u32 = 8;
+pub const MAX_PASSES: u32 = u32::BITS.div_ceil(DIGIT_BITS);
 
 impl SortKey {
     /// Returns the counter with the number of items.
@@ -47,6 +48,13 @@ impl SortKey {
             Self::Region | Self::Member => Counter::Entries,
         }
     }
+}
+
+/// Returns the least depth key, and the bits of the largest one beyond it: depths are floats between the near and far
+/// plane, whose bits have the same order.
+pub fn depth_keys() -> (u32, u32) {
+    let [least, most] = [NEAR_Z, FAR_Z].map(|z| (z as f32).to_bits());
+    (least, bits_of(most - least + 1))
 }
 
 /// Number of scan records.
@@ -103,7 +111,7 @@ pub fn write_jobs(device: &Device, jobs: &wgpu::Buffer, capacities: Capacities) 
         (Counter::Pairs, capacities.pairs),
         (Counter::Entries, capacities.entries),
     ] {
-        let job = scan(counter as u32, most, SORT_BLOCK, 16, NONE);
+        let job = scan(counter as u32, most, SORT_BLOCK, RADIX, NONE);
         write(Scan::Digits(counter).index(), bytemuck::bytes_of(&job));
     }
     for (kind, job) in [
@@ -131,6 +139,7 @@ pub fn write_jobs(device: &Device, jobs: &wgpu::Buffer, capacities: Capacities) 
                 items: key.counter() as u32,
                 stride,
                 offset,
+                least: if key == SortKey::Depth { depth_keys().0 } else { 0 },
                 shift: pass * DIGIT_BITS,
                 is_first: u32::from(pass == 0 && key != SortKey::Member),
                 capacity,

@@ -97,6 +97,8 @@ pub struct SortPass {
     pub stride: u32,
     /// Word of the first key.
     pub offset: u32,
+    /// Subtracted from each key.
+    pub least: u32,
     /// Position of the digit, bits.
     pub shift: u32,
     /// 1 if the items are in their original order.
@@ -267,7 +269,7 @@ mod tests {
         assert_eq!(layout_of("project", "SceneGaussian", Precision::F32).1, size_of::<SceneGaussian>());
         assert_layout!("project", Chunk; first_gaussian, n_gaussians);
         assert_layout!("scan", ScanJob; items, n_most, block, columns, total);
-        assert_layout!("sort", SortPass; items, stride, offset, shift, is_first, capacity);
+        assert_layout!("sort", SortPass; items, stride, offset, least, shift, is_first, capacity);
         assert_layout!("draw", Background; rgb, padding);
         assert_layout!("compact", RegionSum; gaussian, region, low, high);
         assert_eq!(layout_of("compact", "RegionSum", Precision::F32).1, size_of::<RegionSum>());

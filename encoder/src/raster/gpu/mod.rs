@@ -81,7 +81,6 @@ impl Rasterizer for GpuRasterizer {
 struct GpuScene<'s> {
     device: Arc<Device>,
     scene: &'s Gaussians,
-    options: GpuOptions,
     max_binding_bytes: u64,
     /// Centre of the scene; means relative to it need fewer digits.
     origin_in_world: DVec3,
@@ -95,6 +94,8 @@ struct GpuScene<'s> {
 struct Pool {
     idle: Vec<Workspace>,
     n_made: usize,
+    /// Workspaces that may be made; fewer once the device's memory did not suffice.
+    n_most: usize,
     /// Capacities of new workspaces: the largest that any view has needed so far.
     capacities: Capacities,
 }
@@ -112,13 +113,13 @@ impl<'s> GpuScene<'s> {
             n_unusable: usable.iter().filter(|usable| !**usable).count(),
             device,
             scene,
-            options,
             max_binding_bytes,
             origin_in_world,
             chunks: Vec::new(),
             workspaces: Mutex::new(Pool {
                 idle: Vec::new(),
                 n_made: 0,
+                n_most: options.views_in_flight.max(1),
                 capacities: Capacities { visible: 0, pairs: 0, entries: 0 },
             }),
             returned: Condvar::new(),
@@ -191,7 +192,7 @@ impl<'s> GpuScene<'s> {
             if let Some(workspace) = pool.idle.pop() {
                 return Some(workspace);
             }
-            if pool.n_made < self.options.views_in_flight.max(1) {
+            if pool.n_made < pool.n_most {
                 pool.n_made += 1;
                 return None;
             }
@@ -206,6 +207,17 @@ impl<'s> GpuScene<'s> {
             None => pool.n_made -= 1,
         }
         self.returned.notify_one();
+    }
+
+    /// Gives up the place of a workspace for which there was no memory, unless it is the only one.
+    fn give_up_workspace(&self) -> bool {
+        let mut pool = self.pool();
+        let is_one_of_several = pool.n_made > 1;
+        if is_one_of_several {
+            pool.n_made -= 1;
+            pool.n_most = pool.n_made;
+        }
+        is_one_of_several
     }
 
     fn make_workspace(
@@ -265,7 +277,16 @@ impl<'s> GpuScene<'s> {
                 old => {
                     drop(old);
                     let capacities = self.pool().capacities;
-                    self.make_workspace(capacities, n_tiles, n_px)?
+                    match self.make_workspace(capacities, n_tiles, n_px) {
+                        Ok(made) => made,
+                        Err(_) if self.give_up_workspace() => {
+                            // Waits for another view's.
+                            *workspace = self.take_workspace();
+                            bands.push([first, end]);
+                            continue;
+                        }
+                        Err(error) => return Err(error),
+                    }
                 }
             };
             let capacities = current.capacities;
@@ -424,5 +445,36 @@ impl LoadedScene for GpuScene<'_> {
                 Ok(counts)
             })?;
         Ok(drawing)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Three views, and memory for one of them: the places of two are given up, the last one is kept, and none is made anew.
+    #[test]
+    fn fewer_views_are_in_flight_where_memory_does_not_suffice() {
+        let Some(adapter) = adapters().into_iter().next() else {
+            println!("skipped: no GPU");
+            return;
+        };
+        let device = Arc::new(adapter.open(adapter.report.precision).expect("opens"));
+        let (gaussians, options) =
+            (Gaussians::default(), GpuOptions { views_in_flight: 3, ..GpuOptions::default() });
+        let scene = GpuScene::new(device, options, &gaussians).expect("loads");
+        (0..3).for_each(|_| assert!(scene.take_workspace().is_none(), "to be made"));
+        assert_eq!([(); 3].map(|()| scene.give_up_workspace()), [true, true, false]);
+        let counts = |pool: MutexGuard<'_, Pool>| (pool.n_made, pool.n_most);
+        assert_eq!(counts(scene.pool()), (1, 1));
+        let small = Capacities { visible: 1, pairs: 1, entries: 1 };
+        std::thread::scope(|scope| {
+            let waiting = scope.spawn(|| scene.take_workspace().is_some());
+            scene.return_workspace(Some(scene.make_workspace(small, 1, 1).expect("there is memory")));
+            assert!(
+                waiting.join().expect("no panic"),
+                "the view that waited has the one that was given back"
+            );
+        });
     }
 }

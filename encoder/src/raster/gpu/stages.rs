@@ -166,6 +166,14 @@ impl Stages {
             group,
             (&self.buffers.dispatches, dispatch_offset(Counter::Pairs, false)),
         );
+        let bound = [
+            (0, whole(&self.buffers.view)),
+            (10, whole(&self.buffers.ranges)),
+            (11, whole(&self.buffers.tile_order)),
+        ];
+        let kernel = &device.kernels.order_tiles;
+        let group = cached(&mut self.groups, ("order_tiles", 0), || bind(device, kernel, &bound));
+        dispatch(pass, kernel, group, [1, 1]);
     }
 
     /// Blends all tiles and sums their weights over regions.
@@ -178,6 +186,7 @@ impl Stages {
             &self.buffers.ranges,
             &self.buffers.regions,
             &self.buffers.entries,
+            &self.buffers.tile_order,
         ]
         .map(whole);
         let kernel = &device.kernels.sum_regions;

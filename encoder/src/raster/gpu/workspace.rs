@@ -10,7 +10,7 @@ use super::bindings::{bind, dispatch, number, whole};
 use super::buffers::{Buffers, COUNTERS_BYTES, Size};
 use super::chunk::SceneChunk;
 use super::device::Device;
-use super::jobs::{SortKey, bits_of};
+use super::jobs::{SortKey, bits_of, depth_keys};
 use super::layout::{Background, Capacities, RegionSum};
 use super::shader::Counter;
 use super::stages::Stages;
@@ -177,7 +177,7 @@ impl Workspace {
         }
         let [columns, rows] = band.tiles();
         let mut pass = self.timestamps.pass(&mut encoder, 1, (true, true));
-        let depth_order = self.stages.sort(device, &mut pass, &[(SortKey::Depth, 32)]);
+        let depth_order = self.stages.sort(device, &mut pass, &[(SortKey::Depth, depth_keys().1)]);
         drop(pass);
         let mut pass = self.timestamps.pass(&mut encoder, 2, (true, true));
         self.stages.pair(device, &mut pass, depth_order);
