@@ -57,17 +57,25 @@ impl Boundaries {
         let (width, height) = image.dimensions();
         let [wide, high] = [width, height].map(|side| side.next_multiple_of(MULTIPLE));
         let of_depth = depth_m.map(|depth_m| depth_channels(depth_m, width as usize));
+        let (colours, _) = image.as_raw().as_chunks::<3>();
         let mut pixels = Vec::with_capacity(N_CHANNELS * wide as usize * high as usize);
         for channel in 0..N_CHANNELS {
             for y in 0..high {
-                // The last row and column are repeated beyond the border.
-                let inside = (0..wide).map(|x| (x.min(width - 1), y.min(height - 1)));
-                pixels.extend(inside.map(|(x, y)| match channel.checked_sub(3) {
-                    None => f32::from(image.get_pixel(x, y).0[channel]) / 127.5 - 1.0,
-                    Some(channel) => {
-                        of_depth.as_ref().map_or(0.0, |of| of[(y * width + x) as usize][channel])
+                let start = pixels.len();
+                let row = (y.min(height - 1) * width) as usize..;
+                match (channel.checked_sub(3), &of_depth) {
+                    (None, _) => {
+                        let row = colours[row].iter().take(width as usize);
+                        pixels.extend(row.map(|colour| f32::from(colour[channel]) / 127.5 - 1.0));
                     }
-                }));
+                    (Some(channel), Some(of)) => {
+                        pixels.extend(of[row].iter().take(width as usize).map(|of| of[channel]));
+                    }
+                    (Some(_), None) => pixels.resize(start + width as usize, 0.0),
+                }
+                // The last row and column are repeated beyond the border.
+                let last = pixels.last().copied().unwrap_or_default();
+                pixels.resize(start + wide as usize, last);
             }
         }
         let shape = [i64::from(high), i64::from(wide)];

@@ -38,21 +38,25 @@ pub(super) fn smooth(lab: &mut [[f32; 3]], width: usize, sigma_px: f32) {
     let sum: f32 = kernel.iter().sum();
     kernel.iter_mut().for_each(|weight| *weight /= sum);
 
+    // Along rows, then along columns. Sums run over whole rows at once, so that they need no pixel by itself.
     let height = lab.len() / width;
-    let mut line = Vec::new();
-    let mut along = |start: usize, stride: usize, len: usize| {
-        line.clear();
-        line.extend(
-            (0..len + 2 * radius).map(|i| lab[start + i.saturating_sub(radius).min(len - 1) * stride]),
-        );
-        for (i, window) in line.windows(kernel.len()).enumerate() {
-            let mut sum = [0.0; 3];
-            for (weight, colour) in kernel.iter().zip(window) {
-                (0..3).for_each(|c| sum[c] += weight * colour[c]);
-            }
-            lab[start + i * stride] = sum;
-        }
+    let add = |sums: &mut [[f32; 3]], weight: f32, colours: &[[f32; 3]]| {
+        let (sums, colours) = (sums.as_flattened_mut().iter_mut(), colours.as_flattened());
+        sums.zip(colours).for_each(|(sum, colour)| *sum += weight * colour);
     };
-    (0..height).for_each(|y| along(y * width, 1, width));
-    (0..width).for_each(|x| along(x, width, height));
+    let mut padded = Vec::new();
+    for row in lab.chunks_exact_mut(width) {
+        padded.clear();
+        padded.extend((0..width + 2 * radius).map(|i| row[i.saturating_sub(radius).min(width - 1)]));
+        row.fill([0.0; 3]);
+        kernel.iter().zip(padded.windows(width)).for_each(|(weight, shifted)| add(row, *weight, shifted));
+    }
+    let rows = lab.to_vec();
+    for (y, row) in lab.chunks_exact_mut(width).enumerate() {
+        row.fill([0.0; 3]);
+        for (i, weight) in kernel.iter().enumerate() {
+            let from = (y + i).saturating_sub(radius).min(height - 1) * width;
+            add(row, *weight, &rows[from..from + width]);
+        }
+    }
 }

@@ -6,6 +6,7 @@
 
 use std::borrow::Cow;
 use std::collections::HashMap;
+use std::iter;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
@@ -306,15 +307,22 @@ impl Raster {
     /// `boundaries`: `[neighbour][pixel]`, 0 to 1.
     fn edges_by_weight(&self, settings: &GraphSettings, boundaries: Option<&[f32]>) -> Vec<(Edge, u16)> {
         let mut edges = Vec::with_capacity(4 * self.lab.len());
-        for pixel in 0..self.lab.len() {
+        let (width, height) = (self.width_px as usize, self.height_px as usize);
+        let has_depth = settings.depth_weight > 0.0;
+        for (pixel, (y, x)) in (0..height).flat_map(|y| (0..width).map(move |x| (y, x))).enumerate() {
             for (direction, step) in NEIGHBOURS.into_iter().enumerate() {
-                let Some(other) = self.neighbour(pixel, step) else { continue };
+                let (beside, below) = (x.wrapping_add_signed(step.0 as isize), y + step.1 as usize);
+                if beside >= width || below >= height {
+                    continue;
+                }
+                let other = below * width + beside;
                 if !(self.valid[pixel] && self.valid[other]) {
                     continue;
                 }
                 let colour = settings.colour_weight * distance(self.lab[pixel], self.lab[other]);
                 // A jump of relative inverse depth 1/2 is one to twice the depth.
-                let depth = 2.0 * settings.depth_weight * self.depth_jump(pixel, other, step);
+                let jump = if has_depth { self.depth_jump(pixel, other, step) } else { 0.0 };
+                let depth = 2.0 * settings.depth_weight * jump;
                 let boundary = boundaries.map_or(0.0, |of| of[direction * self.lab.len() + pixel]);
                 let weight = colour + depth + settings.boundary_weight * boundary;
                 let weight = (weight * WEIGHT_STEPS) as u16;
@@ -341,12 +349,9 @@ impl Raster {
     /// its most similar neighbour.
     fn components(&self, edges: &[(Edge, u16)], scale: f32, min_area_px: u32) -> Labels {
         let mut components = Components::new(self.lab.len(), scale);
-        let ends = |edge: Edge| {
-            let pixel = edge as usize / 4;
-            let (dx, dy) = NEIGHBOURS[edge as usize % 4];
-            // Inside the image, because edges exist only there.
-            (pixel as u32, (pixel as i64 + dy * i64::from(self.width_px) + dx) as u32)
-        };
+        // Inside the image, because edges exist only there.
+        let steps = NEIGHBOURS.map(|(dx, dy)| (dy * i64::from(self.width_px) + dx) as u32);
+        let ends = |edge: Edge| (edge / 4, (edge / 4).wrapping_add(steps[edge as usize % 4]));
         let mut open = Vec::new();
         for (edge, weight) in edges {
             let (a, b) = ends(*edge);
@@ -408,8 +413,11 @@ impl Labels {
         let mut repeats = vec![false; self.area_px.len()];
         for other in coarser {
             let mut unsorted_overlaps: HashMap<(u32, u32), u32> = HashMap::new();
-            for (a, b) in self.of_pixel.iter().zip(&other.of_pixel).filter(|(a, _)| **a != NO_REGION) {
-                *unsorted_overlaps.entry((*a, *b)).or_default() += 1;
+            // Neighbours are mostly of the same two components.
+            let pairs: Vec<(u32, u32)> =
+                iter::zip(&self.of_pixel, &other.of_pixel).map(|(a, b)| (*a, *b)).collect();
+            for same in pairs.chunk_by(|a, b| a == b).filter(|same| same[0].0 != NO_REGION) {
+                *unsorted_overlaps.entry(same[0]).or_default() += same.len() as u32;
             }
             for ((a, b), overlap_px) in unsorted_overlaps {
                 let union_px = self.area_px[a as usize] + other.area_px[b as usize] - overlap_px;
