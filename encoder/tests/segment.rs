@@ -10,7 +10,7 @@ use image::{GrayImage, ImageBuffer, Luma, RgbImage};
 use proptest::prelude::*;
 use slag_common::{Distortion, Intrinsics, View, poses};
 use slag_encoder::ingest::{Undistorter, load_image};
-use slag_encoder::masks::regions::{absorb_slivers, border_share, partition};
+use slag_encoder::masks::regions::{absorb_slivers, partition};
 use slag_encoder::masks::rle::{Rle, RleError};
 use slag_encoder::masks::{BoxPx, Mask, NO_REGION, RegionMap};
 use slag_encoder::segment::{GivenMasks, SegmentError, SegmentInput, Segmenter};
@@ -440,16 +440,6 @@ fn a_mask_cut_into_slivers_keeps_one() {
     assert_eq!(set(33, 151), &[3, 9]);
     assert_eq!(set(25, 150), &[2]);
     assert_eq!(masks_of_region.iter().filter(|set| set.contains(&9)).count(), 1);
-}
-
-#[test]
-fn borders_over_area() {
-    let square = mask(10, 10, |x, y| (3..7).contains(&x) && (3..7).contains(&y)).unwrap();
-    let halves = [mask(10, 10, |x, _| x < 5).unwrap(), mask(10, 10, |x, _| x >= 5).unwrap()];
-    let share = |masks: &[Mask], width| border_share(&partition(masks, 10, 10, width, width, None).0);
-    assert_eq!((share(&halves, 10), share(&halves, 20)), (0.1, 0.05));
-    assert_eq!(share(std::slice::from_ref(&square), 10), 1.0);
-    assert_eq!(share(&[], 10), 0.0);
 }
 
 /// Regions of a real photo's masks, written as 16-bit ids, are read back as the same masks.

@@ -88,10 +88,9 @@ pub struct EncodeArgs {
     /// Where weights are rasterised: auto (GPUs, else the CPU), gpu, cpu, or an adapter's number.
     #[arg(long, value_name = "DEVICE", default_value_t)]
     pub device: DeviceChoice,
-    /// Width at which weights are rasterised: a number of pixels, `photo` for the photo's own width, at most 1024,
-    /// `twice` for twice that width, or `auto` for `twice` in views with long borders of masks alone [default: the
-    /// preset's].
-    #[arg(long, value_name = "auto|photo|twice|PX", value_parser = parse_raster_width)]
+    /// Width at which weights are rasterised: a number of pixels, `photo` for the photo's own width, at most 1024, or
+    /// `twice` for twice that width [default: the preset's].
+    #[arg(long, value_name = "photo|twice|PX", value_parser = parse_raster_width)]
     pub raster_width: Option<RasterWidth>,
     /// Masks with fewer pixels are left out [default: the preset's].
     #[arg(long, value_name = "PX")]

@@ -62,14 +62,14 @@ impl ViewsArgs {
 /// Parses the width of rasters.
 pub(super) fn parse_raster_width(text: &str) -> Result<RasterWidth, String> {
     match text {
-        "auto" => Ok(RasterWidth::ByContent),
+        "auto" => Err("it was no more accurate than `photo` (docs/accuracy.md) and is gone".into()),
         "photo" => Ok(RasterWidth::Photo),
         "twice" => Ok(RasterWidth::Twice),
         _ => {
             let width_px = text.parse().ok().filter(|px| (16..=8192).contains(px));
             width_px
                 .map(RasterWidth::Px)
-                .ok_or_else(|| format!("{text:?} is none of: auto, photo, twice, 16 to 8192 pixels"))
+                .ok_or_else(|| format!("{text:?} is none of: photo, twice, 16 to 8192 pixels"))
         }
     }
 }
@@ -104,7 +104,7 @@ mod tests {
     fn limits_and_widths_are_numbers_or_words() {
         assert_eq!(parse_views_limit("7"), Ok(ViewsLimit::Count(7)));
         assert_eq!(parse_views_limit("12.5%"), Ok(ViewsLimit::Share(0.125)));
-        assert_eq!(parse_raster_width("auto"), Ok(RasterWidth::ByContent));
+        assert!(parse_raster_width("auto").expect_err("gone").contains("`photo`"));
         assert_eq!(parse_raster_width("photo"), Ok(RasterWidth::Photo));
         assert_eq!(parse_raster_width("16"), Ok(RasterWidth::Px(16)));
         assert!(parse_raster_width("8193").is_err() && parse_views_limit("-1").is_err());

@@ -22,6 +22,7 @@ use crate::lift::published::{EXTRA_AGGREGATION, EXTRA_REGIONS};
 use crate::lift::refine::{Begun, Passes, Refinement, Subject};
 use crate::lift::superpoint::Superpoints;
 use crate::lift::{Aggregation, ContributionError, ContributionIndex, RegionTable};
+use crate::memory;
 use crate::objects::{self, Object, ObjectsReport, SceneObjects};
 use crate::occupancy::{OccupancyReport, SceneOccupancy};
 use crate::shard;
@@ -128,8 +129,10 @@ struct CellBuilder<'a> {
     table: RegionTable,
     /// What errors of scores are measured by.
     score_context: ScoreMetricContext,
-    /// Bytes for the contributions of a group of cells.
-    group_bytes: u64,
+    /// Bytes for the contributions that a pass of the refinement or of objects holds.
+    pass_bytes: u64,
+    /// Bytes for the contributions that are held while cells are built.
+    cells_bytes: u64,
     /// Cells whose embeddings are held at once.
     n_at_once: usize,
     /// Each view's masks in its photo.
@@ -172,13 +175,15 @@ impl<'a> CellBuilder<'a> {
         if plan.settings.cells.objects {
             objects::reserve_contributions(&mut memory, index.n_entries());
         }
-        let rest_bytes = memory.rest(index.largest_part_bytes())?;
+        let pass_bytes = memory.rest(index.largest_part_bytes())?;
         let cell_bytes =
             shard::largest_cell_bytes(&plan.inputs.split, models.dim()) + index.largest_part_bytes();
-        // Cells come second: contributions that are not kept in memory are read six times.
-        let spare_bytes = rest_bytes - index.budget_bytes(rest_bytes);
+        // Cells come second: contributions that are not kept in memory are read six times. But what superpoints and objects
+        // took is free again.
+        let rest_bytes = memory.rest_of(memory::Phase::Cells);
+        let spare_bytes = rest_bytes - index.budget_bytes(pass_bytes);
         let n_more = (spare_bytes / cell_bytes.max(1)).min(context.pool().current_num_threads() as u64 - 1);
-        let group_bytes = rest_bytes - n_more * cell_bytes;
+        let cells_bytes = (rest_bytes - n_more * cell_bytes).min(pass_bytes);
         let score_context = context.time("texts", || {
             let metric = ScoreMetric::new(models.dim(), &bank);
             let spread = metric.spread(table.mask_vectors());
@@ -186,6 +191,7 @@ impl<'a> CellBuilder<'a> {
         });
         let encoder_id = Hash32(models.encoder_id().hash());
         let n_at_once = 1 + n_more as usize;
+        tracing::debug!("{n_at_once} cells at once, {cell_bytes} bytes each");
         Ok(Self {
             plan,
             context,
@@ -193,7 +199,8 @@ impl<'a> CellBuilder<'a> {
             index,
             table,
             score_context,
-            group_bytes,
+            pass_bytes,
+            cells_bytes,
             n_at_once,
             photos,
             occupancy,
@@ -213,7 +220,7 @@ impl<'a> CellBuilder<'a> {
             superpoints,
             photos: &self.photos,
             score_context: &self.score_context,
-            group_bytes: self.group_bytes,
+            group_bytes: self.pass_bytes,
             cancel: self.context.cancel(),
         };
         Ok(self.context.time("objects", || objects::find(&scene))?)
@@ -255,7 +262,7 @@ impl<'a> CellBuilder<'a> {
         };
         let aggregation = settings.aggregation;
         let passes =
-            Passes { index: &self.index, group_bytes: self.group_bytes, cancel: self.context.cancel() };
+            Passes { index: &self.index, group_bytes: self.pass_bytes, cancel: self.context.cancel() };
         let subject = Subject { scene: &inputs.scene, split: &inputs.split };
         self.context.begin_phase(Phase::Superpoints);
         let begun = self.context.time("superpoints", || {
@@ -303,7 +310,7 @@ impl<'a> CellBuilder<'a> {
             },
             photo_poses: photo_poses.as_deref(),
             encoder_id: self.encoder_id,
-            group_bytes: self.group_bytes,
+            group_bytes: self.cells_bytes,
             n_at_once: self.n_at_once,
         };
         let Some(finished) = executor.build_cells(&cells, self.context)? else { return Ok(None) };

@@ -3,7 +3,9 @@
 //! The number of contributions decides. A few views are rasterised beforehand, each as one region; masks divide what they
 //! see, but a Gaussian seldom lies in two of them.
 
-use slag_common::View;
+use glam::DVec3;
+use rayon::prelude::*;
+use slag_common::{Intrinsics, View};
 
 use super::inputs::Inputs;
 use super::settings::{EncodeSettings, MAX_RASTER_WIDTH_PX, RasterWidth};
@@ -17,6 +19,8 @@ use crate::shard;
 /// One view of so many is rasterised to count its contributions, but no more than [`MAX_SAMPLES`].
 const VIEWS_PER_SAMPLE: usize = 16;
 const MAX_SAMPLES: usize = 6;
+/// Gaussians that are looked at for all views, to tell how far they see.
+const MAX_TESTS: usize = 1 << 24;
 // Measured with the embedded models, 1 to 4 threads and 0.1 to 2.1 million Gaussians.
 /// ONNX Runtime's code, as far as models use it, its environment, and what they leave behind.
 const RUNTIME_BYTES: u64 = 40 << 20;
@@ -37,7 +41,7 @@ pub(super) fn reserve(
     (model_bytes, dim): (Option<u64>, usize),
 ) {
     let (n_threads, n_gaussians) = (settings.run.threads as u64, inputs.scene.len() as u64);
-    let of_view = OfView::mean(settings, scene, views);
+    let of_view = OfView::mean(settings, inputs, scene, views);
     let n_entries = of_view.n_entries * views.len() as u64;
     let mut expect = |phase, purpose, len_bytes| memory.reserve_expecting(phase, purpose, 0, len_bytes);
     if let Some(model_bytes) = model_bytes {
@@ -51,6 +55,7 @@ pub(super) fn reserve(
         expect(Phase::Views, "views that are rasterised", n_threads * of_view_bytes);
     }
     let rest_bytes = memory.rest(0).unwrap_or(0);
+    let cells_bytes = memory.rest_of(Phase::Cells);
     let (kept_bytes, group_bytes) =
         ContributionIndex::expected_bytes(n_entries, n_gaussians, n_threads, rest_bytes);
     let mut expect = |phase, purpose, len_bytes| memory.reserve_expecting(phase, purpose, 0, len_bytes);
@@ -59,7 +64,7 @@ pub(super) fn reserve(
     }
     let n_cells = (inputs.split.cells.len() as u64).min(n_threads);
     let largest_bytes = shard::largest_cell_bytes(&inputs.split, dim);
-    let n_at_once = n_cells.min(rest_bytes.saturating_sub(2 * kept_bytes) / largest_bytes.max(1)).max(1);
+    let n_at_once = n_cells.min(cells_bytes.saturating_sub(2 * kept_bytes) / largest_bytes.max(1)).max(1);
     expect(Phase::Cells, "cells at once", n_at_once * shard::expected_bytes(largest_bytes));
     if settings.cells.objects {
         expect(Phase::Objects, "masks of superpoints", objects::expected_bytes(n_entries));
@@ -67,8 +72,7 @@ pub(super) fn reserve(
     }
 }
 
-/// Gaussians of a view.
-#[derive(Clone, Copy, Default)]
+/// Gaussians of the mean view.
 struct OfView {
     /// In its frustum.
     n_visible: u64,
@@ -77,29 +81,53 @@ struct OfView {
 }
 
 impl OfView {
-    /// Returns the means of a few views.
-    fn mean(settings: &EncodeSettings, scene: &dyn LoadedScene, views: &[&View]) -> Self {
+    /// Rasterises a few views, and estimates from them what all see: few see far, but these hold the most.
+    fn mean(settings: &EncodeSettings, inputs: &Inputs, scene: &dyn LoadedScene, views: &[&View]) -> Self {
         let n_samples = (views.len() / VIEWS_PER_SAMPLE).clamp(1, MAX_SAMPLES);
-        let count = |sample: usize| {
-            let view = views.get((2 * sample + 1) * views.len() / (2 * n_samples))?;
-            let photo_px = view.intrinsics.width_px.min(MAX_RASTER_WIDTH_PX);
-            let width_px = match settings.view.raster_width {
-                RasterWidth::Px(width_px) => width_px,
-                RasterWidth::Twice => 2 * photo_px,
-                RasterWidth::ByContent | RasterWidth::Photo => photo_px,
-            };
-            let intrinsics = view.intrinsics.scaled_to_width(width_px);
-            let raster_view = RasterView { camera_from_world: view.camera_from_world, intrinsics };
-            let [width_px, height_px] = [intrinsics.width_px, intrinsics.height_px];
-            let region_of_pixel = vec![0; width_px as usize * height_px as usize];
-            let whole = RegionMap { width_px, height_px, region_of_pixel, n_regions: 1 };
-            // A view that cannot be rasterised is reported when its turn comes.
-            let weights = scene.weights(&raster_view, &whole, settings.view.weights).ok()?;
-            let n_visible = weights.counters.visible as u64;
-            Some(Self { n_visible, n_entries: weights.entries.len() as u64 })
+        let sampled = (0..n_samples).filter_map(|k| views.get((2 * k + 1) * views.len() / (2 * n_samples)));
+        // A view that cannot be rasterised is reported when its turn comes.
+        let counted = sampled.filter_map(|view| Some((*view, count(settings, scene, view)?)));
+        let (sampled, counts): (Vec<&View>, Vec<[u64; 2]>) = counted.unzip();
+        let means = &inputs.scene.means_in_world;
+        let step = (means.len() * views.len() / MAX_TESTS).max(1);
+        let before = |views: &[&View]| -> f64 {
+            let n: u64 = views.par_iter().map(|view| n_before(means, step, view)).sum();
+            n as f64 / views.len().max(1) as f64
         };
-        let counts: Vec<Self> = (0..n_samples).filter_map(count).collect();
-        let mean = |of: fn(&Self) -> u64| counts.iter().map(of).sum::<u64>() / (counts.len() as u64).max(1);
-        Self { n_visible: mean(|view| view.n_visible), n_entries: mean(|view| view.n_entries) }
+        let more = before(views) / before(&sampled).max(1.0);
+        let [n_visible, n_entries] =
+            [0, 1].map(|k| counts.iter().map(|counts| counts[k]).sum::<u64>() / (counts.len() as u64).max(1));
+        Self { n_visible: (more * n_visible as f64) as u64, n_entries }
     }
+}
+
+/// Rasterises a view as one region; returns how many Gaussians are visible and how many contribute.
+fn count(settings: &EncodeSettings, scene: &dyn LoadedScene, view: &View) -> Option<[u64; 2]> {
+    let photo_px = view.intrinsics.width_px.min(MAX_RASTER_WIDTH_PX);
+    let width_px = match settings.view.raster_width {
+        RasterWidth::Px(width_px) => width_px,
+        RasterWidth::Twice => 2 * photo_px,
+        RasterWidth::Photo => photo_px,
+    };
+    let intrinsics = view.intrinsics.scaled_to_width(width_px);
+    let raster_view = RasterView { camera_from_world: view.camera_from_world, intrinsics };
+    let [width_px, height_px] = [intrinsics.width_px, intrinsics.height_px];
+    let region_of_pixel = vec![0; width_px as usize * height_px as usize];
+    let whole = RegionMap { width_px, height_px, region_of_pixel, n_regions: 1 };
+    let weights = scene.weights(&raster_view, &whole, settings.view.weights).ok()?;
+    Some([weights.counters.visible as u64, weights.entries.len() as u64])
+}
+
+/// Returns how many of every `step`-th mean lie before a view.
+fn n_before(means_in_world: &[DVec3], step: usize, view: &View) -> u64 {
+    let Intrinsics { focal_x_px, focal_y_px, centre_x_px, centre_y_px, width_px, height_px, .. } =
+        view.intrinsics;
+    let is_before = |mean: &&DVec3| {
+        let at = view.camera_from_world.transform_point3(**mean);
+        let (x_px, y_px) = (focal_x_px * at.x / at.z + centre_x_px, focal_y_px * at.y / at.z + centre_y_px);
+        at.z > 0.0
+            && (0.0..f64::from(width_px)).contains(&x_px)
+            && (0.0..f64::from(height_px)).contains(&y_px)
+    };
+    means_in_world.iter().step_by(step).filter(is_before).count() as u64
 }

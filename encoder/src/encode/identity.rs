@@ -8,7 +8,7 @@ use super::engines::Engines;
 use super::error::EncodeError;
 use super::inputs::Inputs;
 use super::kept::InputsRecord;
-use super::settings::{EncodeSettings, LONG_BORDERS, MAX_RASTER_WIDTH_PX, ViewSettings};
+use super::settings::{EncodeSettings, MAX_RASTER_WIDTH_PX, ViewSettings};
 use crate::cells::CellLimits;
 use crate::ingest;
 use crate::segment::Segmenter;
@@ -33,7 +33,7 @@ pub(super) struct Identities {
 #[derive(Serialize)]
 struct SceneIdentity<'a> {
     program: &'static str,
-    regions: (u32, f64, u32),
+    regions: (u32, u32),
     encoder: Hash32,
     /// Windows are no part of the encoder's id: they change no vector of a crop.
     windows: &'a [u8],
@@ -117,7 +117,7 @@ fn scene_identity<'a>(
     let Engines { models, session, perturbation, .. } = engines;
     SceneIdentity {
         program: env!("CARGO_PKG_VERSION"),
-        regions: (REGIONS_VERSION, LONG_BORDERS, MAX_RASTER_WIDTH_PX),
+        regions: (REGIONS_VERSION, MAX_RASTER_WIDTH_PX),
         encoder: Hash32(models.encoder_id().hash()),
         windows: models.windows(),
         session: Session {

@@ -78,7 +78,7 @@ impl Preset {
             merges_slivers: true,
             sam: SamSettings::default(),
             views_limit: ViewsLimit::All,
-            raster_width: RasterWidth::ByContent,
+            raster_width: RasterWidth::Photo,
             codebook: CodebookSettings::default(),
         };
         match self {
@@ -87,7 +87,6 @@ impl Preset {
                 regions: Regions::Crops,
                 aggregation: Aggregation::PLAIN,
                 objects: false,
-                raster_width: RasterWidth::Photo,
                 ..balanced
             },
             // Section "Settings" of the paper (IEEE RA-L 2025): grid 16, whole level, ScanNet's raster of 648 x 484.

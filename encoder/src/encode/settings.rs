@@ -24,13 +24,8 @@ use crate::store::CommandRecord;
 /// Number of scales at which the built-in segmenter looks by default. A fourth scale gives a third more masks and no
 /// better answers (generated scenes of seeds 601 to 605, and the labelled house).
 pub const DEFAULT_MASK_LEVELS: usize = 3;
-/// Widest raster where regions do not ask for more: masks are coarser than this, and time grows with the square.
+/// Widest raster where the settings do not ask for more: masks are coarser than this, and time grows with the square.
 pub const MAX_RASTER_WIDTH_PX: u32 = 1024;
-/// Length of the borders of a view's regions over their area, in pixels of the raster, above which the raster gets
-/// twice the width. The raster blurs Gaussians by half a pixel, and their loss to neighbouring regions grows with
-/// this ratio. Measured on generated scenes: mIoU 0.01 to 0.03 higher for a sixth more time. Half the width where
-/// borders are short was no faster on the labelled house, and a little worse.
-pub const LONG_BORDERS: f64 = 0.04;
 /// Gaussians of a cell at most: shards number them with 16 bits.
 const MAX_CELL_GAUSSIANS: usize = 65_536;
 
@@ -154,8 +149,6 @@ pub enum Masks {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum RasterWidth {
-    /// As [`Self::Photo`], and twice as wide in views whose regions have long borders (`LONG_BORDERS`).
-    ByContent,
     /// The photo's own width, at most `MAX_RASTER_WIDTH_PX`.
     Photo,
     /// Twice the width of [`Self::Photo`] in every view.
@@ -273,7 +266,7 @@ impl EncodeSettings {
                 masks: Masks::Auto { n_levels: DEFAULT_MASK_LEVELS },
                 min_mask_px: 200,
                 background: Background::White,
-                raster_width: RasterWidth::ByContent,
+                raster_width: RasterWidth::Photo,
                 weights: WeightKind::Blend,
                 merges_slivers: true,
                 regions: Regions::Masks,

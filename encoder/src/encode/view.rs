@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::Instant;
 
 use image::RgbImage;
-use slag_common::{Intrinsics, View};
+use slag_common::View;
 use slag_models::preprocess::Preprocess;
 use slag_models::{Crop, ImageEncoder, SessionOptions};
 
@@ -12,7 +12,7 @@ use super::context::RunContext;
 use super::engines::Engines;
 use super::error::EncodeError;
 use super::pipeline::Stage;
-use super::settings::{LONG_BORDERS, MAX_RASTER_WIDTH_PX, RasterWidth, Regions, ViewSettings};
+use super::settings::{MAX_RASTER_WIDTH_PX, RasterWidth, Regions, ViewSettings};
 use super::sink::{PhotoSource, ViewRecord, ViewSink};
 use crate::cells::CellSplit;
 use crate::embed::{self, EmbedError, PatchUse, PhotoPatches, SharedEncoders, Surroundings};
@@ -21,7 +21,7 @@ use crate::lanes::GpuLoad;
 use crate::lift::ViewContributions;
 use crate::lift::photos::MaskOutline;
 use crate::masks::patches::patch_masks;
-use crate::masks::regions::{absorb_slivers, border_share, partition};
+use crate::masks::regions::{absorb_slivers, partition};
 use crate::masks::windows::Windows;
 use crate::masks::{self, Mask, RegionMap};
 use crate::progress::ViewEvent;
@@ -275,11 +275,11 @@ impl<'a> ViewStages<'a> {
         Ok(Some(Work { view, next, secs: work.secs + start.elapsed().as_secs_f32() }))
     }
 
-    /// Returns the width of the raster before the view's content is known.
+    /// Returns the width of the photo's own raster.
     fn base_width_px(&self, loaded: &LoadedImage) -> u32 {
         match self.tools.settings.raster_width {
             RasterWidth::Px(width_px) => width_px,
-            RasterWidth::ByContent | RasterWidth::Photo | RasterWidth::Twice => {
+            RasterWidth::Photo | RasterWidth::Twice => {
                 loaded.view.intrinsics.width_px.min(MAX_RASTER_WIDTH_PX)
             }
         }
@@ -312,34 +312,22 @@ impl<'a> ViewStages<'a> {
         wanted.then(|| Windows::new(models.windows(), photo.width(), photo.height()))
     }
 
-    /// Makes the regions of a view's masks: on a finer raster where their borders are long, if the settings ask for it.
+    /// Makes the regions of a view's masks.
     fn partition(&self, loaded: &LoadedImage, masks: &[Mask]) -> Partition {
-        let regions_at = |width_px| {
-            let raster_view = raster_view(loaded, width_px);
-            let Intrinsics { width_px, height_px, .. } = raster_view.intrinsics;
-            let (image, valid) = (&loaded.image, loaded.valid.as_deref());
-            let (mut regions, mut masks_of_region) =
-                partition(masks, image.width(), image.height(), width_px, height_px, valid);
-            if self.tools.settings.merges_slivers {
-                absorb_slivers(&mut regions, &mut masks_of_region);
-            }
-            (raster_view, regions, masks_of_region)
-        };
         let base_px = self.base_width_px(loaded);
         // Twice the width keeps pixels in step with those of the photo, so that masks keep their outlines.
-        let (width_px, made) = match self.tools.settings.raster_width {
-            RasterWidth::Twice => (2 * base_px, regions_at(2 * base_px)),
-            RasterWidth::ByContent => match regions_at(base_px) {
-                made if border_share(&made.1) > LONG_BORDERS => (2 * base_px, regions_at(2 * base_px)),
-                made => (base_px, made),
-            },
-            RasterWidth::Photo | RasterWidth::Px(_) => (base_px, regions_at(base_px)),
-        };
-        let (raster_view, regions, masks_of_region) = made;
-        let weight_scale = (f64::from(base_px) / f64::from(width_px)).powi(2) as f32;
-        let (width_px, height_px) = loaded.image.dimensions();
-        let outline = |mask| MaskOutline::of(mask, width_px, height_px, loaded.valid.as_deref());
-        let outlines = masks.iter().map(outline).collect();
+        let is_twice = self.tools.settings.raster_width == RasterWidth::Twice;
+        let raster_view = raster_view(loaded, if is_twice { 2 * base_px } else { base_px });
+        let raster_px = [raster_view.intrinsics.width_px, raster_view.intrinsics.height_px];
+        let (image, valid) = (&loaded.image, loaded.valid.as_deref());
+        let (width_px, height_px) = image.dimensions();
+        let (mut regions, mut masks_of_region) =
+            partition(masks, width_px, height_px, raster_px[0], raster_px[1], valid);
+        if self.tools.settings.merges_slivers {
+            absorb_slivers(&mut regions, &mut masks_of_region);
+        }
+        let weight_scale = (f64::from(base_px) / f64::from(raster_px[0])).powi(2) as f32;
+        let outlines = masks.iter().map(|mask| MaskOutline::of(mask, width_px, height_px, valid)).collect();
         Partition { raster_view, regions, masks_of_region, outlines, weight_scale }
     }
 

@@ -107,18 +107,6 @@ pub fn partition(
     number_regions(class_of_pixel, size_of_class.len(), masks, &columns, &rows)
 }
 
-/// Returns the ratio of a partition's border length to its area.
-///
-/// The length is the number of neighbouring pixel pairs with different labels, the area the number of pixels in any
-/// region. The ratio falls with the width of the raster.
-pub fn border_share(map: &RegionMap) -> f64 {
-    let (pixels, width) = (&map.region_of_pixel, (map.width_px as usize).max(1));
-    let in_rows = pixels.chunks(width).map(|row| row.windows(2).filter(|pair| pair[0] != pair[1]).count());
-    let in_columns = pixels.iter().zip(pixels.iter().skip(width)).filter(|(a, b)| a != b).count();
-    let n_covered = pixels.iter().filter(|region| **region != NO_REGION).count();
-    (in_rows.sum::<usize>() + in_columns) as f64 / n_covered.max(1) as f64
-}
-
 /// Merges slivers, which ragged edges of overlapping masks leave, into their neighbours.
 ///
 /// A sliver has fewer pixels than a 10,000th of the raster and than an eighth of every mask that covers it. It joins

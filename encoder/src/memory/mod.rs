@@ -126,8 +126,7 @@ impl MemoryPlan {
     /// Returns the peak of a process that holds `held_bytes` now.
     pub fn planned_peak(&self, held_bytes: u64) -> PlannedPeak {
         let of_phase = |phase: Phase| {
-            let of_phase = self.reservations.iter().filter(|r| r.phase == phase || r.phase == Phase::Always);
-            of_phase.fold(held_bytes, |sum, r| sum.saturating_add(r.expected_bytes))
+            self.of_phase(phase).fold(held_bytes, |sum, r| sum.saturating_add(r.expected_bytes))
         };
         let phases = [Phase::Views, Phase::Objects, Phase::Refine, Phase::Cells];
         let phase = phases.into_iter().max_by_key(|phase| of_phase(*phase)).unwrap_or(Phase::Always);
@@ -139,6 +138,20 @@ impl MemoryPlan {
         self.is_before_views = false;
     }
 
+    /// Returns the bytes that a phase leaves; [`Self::rest`] is what the most expensive one leaves.
+    pub fn rest_of(&self, phase: Phase) -> u64 {
+        self.available_bytes.saturating_sub(self.reserved_bytes(phase))
+    }
+
+    /// Returns the bytes set aside for a phase, with what is always held.
+    fn reserved_bytes(&self, phase: Phase) -> u64 {
+        self.of_phase(phase).fold(0u64, |sum, r| sum.saturating_add(r.len_bytes))
+    }
+
+    fn of_phase(&self, phase: Phase) -> impl Iterator<Item = Reservation> + '_ {
+        self.reservations.iter().filter(move |r| r.phase == phase || r.phase == Phase::Always).copied()
+    }
+
     /// Returns the bytes that the most expensive phase leaves for the contributions that are read at a time.
     ///
     /// # Errors
@@ -146,16 +159,11 @@ impl MemoryPlan {
     pub fn rest(&self, contributions_bytes: u64) -> Result<u64, MemoryError> {
         let phases = [Phase::Views, Phase::Objects, Phase::Refine, Phase::Cells];
         let phases = &phases[usize::from(!self.is_before_views)..];
-        let held = |phase: Phase| {
-            let of_phase =
-                self.reservations.iter().filter(move |r| r.phase == phase || r.phase == Phase::Always);
-            of_phase.copied()
-        };
-        let len = |phase: Phase| held(phase).fold(0u64, |sum, r| sum.saturating_add(r.len_bytes));
-        let most = phases.iter().copied().max_by_key(|phase| len(*phase)).unwrap_or(Phase::Always);
-        let needed_bytes = len(most).saturating_add(contributions_bytes);
+        let most = phases.iter().copied().max_by_key(|phase| self.reserved_bytes(*phase));
+        let most = most.unwrap_or(Phase::Always);
+        let needed_bytes = self.reserved_bytes(most).saturating_add(contributions_bytes);
         if needed_bytes <= self.available_bytes {
-            return Ok(self.available_bytes - len(most));
+            return Ok(self.rest_of(most));
         }
         let contributions = Reservation {
             purpose: "contributions of a part of a cell",
@@ -164,7 +172,7 @@ impl MemoryPlan {
             expected_bytes: 0,
         };
         let mut parts: Vec<Reservation> =
-            held(most).chain([contributions]).filter(|r| r.len_bytes > 0).collect();
+            self.of_phase(most).chain([contributions]).filter(|r| r.len_bytes > 0).collect();
         parts.sort_by_key(|r| std::cmp::Reverse(r.len_bytes));
         let Self { available_bytes, is_before_views, .. } = *self;
         Err(MemoryError { available_bytes, needed_bytes, is_before_views, phase: most, parts })
@@ -190,6 +198,11 @@ mod tests {
         assert_eq!(plan(100).rest(30), Ok(30));
         assert_eq!(plan(200).rest(30), Ok(130));
         assert_eq!(MemoryPlan::new(7).rest(7), Ok(7));
+        assert_eq!(
+            [Phase::Views, Phase::Refine, Phase::Cells].map(|phase| plan(100).rest_of(phase)),
+            [40, 50, 30]
+        );
+        assert_eq!(plan(69).rest_of(Phase::Cells), 0);
     }
 
     /// By hand: what is held counts once, a bound with what is expected of it, and the largest phase decides.
