@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use slag_common::{Intrinsics, View};
 
 use super::inputs::Inputs;
-use super::settings::{EncodeSettings, MAX_RASTER_WIDTH_PX, RasterWidth};
+use super::settings::EncodeSettings;
 use crate::lift::ContributionIndex;
 use crate::masks::RegionMap;
 use crate::memory::{MemoryPlan, Phase};
@@ -41,8 +41,8 @@ pub(super) fn reserve(
     (model_bytes, dim): (Option<u64>, usize),
 ) {
     let (n_threads, n_gaussians) = (settings.run.threads as u64, inputs.scene.len() as u64);
-    let of_view = OfView::mean(settings, inputs, scene, views);
-    let n_entries = of_view.n_entries * views.len() as u64;
+    let sample = Sample::of(settings, scene, views);
+    let n_entries = sample.n_entries * views.len() as u64;
     let mut expect = |phase, purpose, len_bytes| memory.reserve_expecting(phase, purpose, 0, len_bytes);
     if let Some(model_bytes) = model_bytes {
         expect(Phase::Always, "ONNX Runtime", RUNTIME_BYTES);
@@ -50,8 +50,8 @@ pub(super) fn reserve(
     }
     expect(Phase::Always, "sessions and allocations of each thread", n_threads * SESSION_BYTES);
     if scene.concurrency().is_none() {
-        let of_view_bytes =
-            of_view.n_visible * RASTER_BYTES_PER_VISIBLE + of_view.n_entries * RASTER_BYTES_PER_ENTRY;
+        let n_visible = sample.n_visible_in_mean_of(views, &inputs.scene.means_in_world);
+        let of_view_bytes = n_visible * RASTER_BYTES_PER_VISIBLE + sample.n_entries * RASTER_BYTES_PER_ENTRY;
         expect(Phase::Views, "views that are rasterised", n_threads * of_view_bytes);
     }
     let rest_bytes = memory.rest(0).unwrap_or(0);
@@ -72,43 +72,41 @@ pub(super) fn reserve(
     }
 }
 
-/// Gaussians of the mean view.
-struct OfView {
-    /// In its frustum.
+/// A few views that were rasterised.
+struct Sample<'v> {
+    views: Vec<&'v View>,
+    /// Gaussians in the frustum of the mean one.
     n_visible: u64,
-    /// With a contribution.
+    /// Gaussians with a contribution, in the mean one.
     n_entries: u64,
 }
 
-impl OfView {
-    /// Rasterises a few views, and estimates from them what all see: few see far, but these hold the most.
-    fn mean(settings: &EncodeSettings, inputs: &Inputs, scene: &dyn LoadedScene, views: &[&View]) -> Self {
+impl<'v> Sample<'v> {
+    fn of(settings: &EncodeSettings, scene: &dyn LoadedScene, views: &[&'v View]) -> Self {
         let n_samples = (views.len() / VIEWS_PER_SAMPLE).clamp(1, MAX_SAMPLES);
-        let sampled = (0..n_samples).filter_map(|k| views.get((2 * k + 1) * views.len() / (2 * n_samples)));
+        let chosen = (0..n_samples).filter_map(|k| views.get((2 * k + 1) * views.len() / (2 * n_samples)));
         // A view that cannot be rasterised is reported when its turn comes.
-        let counted = sampled.filter_map(|view| Some((*view, count(settings, scene, view)?)));
+        let counted = chosen.filter_map(|view| Some((*view, count(settings, scene, view)?)));
         let (sampled, counts): (Vec<&View>, Vec<[u64; 2]>) = counted.unzip();
-        let means = &inputs.scene.means_in_world;
-        let step = (means.len() * views.len() / MAX_TESTS).max(1);
-        let before = |views: &[&View]| -> f64 {
-            let n: u64 = views.par_iter().map(|view| n_before(means, step, view)).sum();
-            n as f64 / views.len().max(1) as f64
-        };
-        let more = before(views) / before(&sampled).max(1.0);
         let [n_visible, n_entries] =
             [0, 1].map(|k| counts.iter().map(|counts| counts[k]).sum::<u64>() / (counts.len() as u64).max(1));
-        Self { n_visible: (more * n_visible as f64) as u64, n_entries }
+        Self { views: sampled, n_visible, n_entries }
+    }
+
+    /// Returns how many Gaussians are in the frustum of the mean of all views: few see far, but these hold the most.
+    fn n_visible_in_mean_of(&self, views: &[&View], means_in_world: &[DVec3]) -> u64 {
+        let step = (means_in_world.len() * views.len() / MAX_TESTS).max(1);
+        let before = |views: &[&View]| -> f64 {
+            let n: u64 = views.par_iter().map(|view| n_before(means_in_world, step, view)).sum();
+            n as f64 / views.len().max(1) as f64
+        };
+        (before(views) / before(&self.views).max(1.0) * self.n_visible as f64) as u64
     }
 }
 
 /// Rasterises a view as one region; returns how many Gaussians are visible and how many contribute.
 fn count(settings: &EncodeSettings, scene: &dyn LoadedScene, view: &View) -> Option<[u64; 2]> {
-    let photo_px = view.intrinsics.width_px.min(MAX_RASTER_WIDTH_PX);
-    let width_px = match settings.view.raster_width {
-        RasterWidth::Px(width_px) => width_px,
-        RasterWidth::Twice => 2 * photo_px,
-        RasterWidth::Photo => photo_px,
-    };
+    let width_px = settings.view.raster_width.px(view.intrinsics.width_px);
     let intrinsics = view.intrinsics.scaled_to_width(width_px);
     let raster_view = RasterView { camera_from_world: view.camera_from_world, intrinsics };
     let [width_px, height_px] = [intrinsics.width_px, intrinsics.height_px];

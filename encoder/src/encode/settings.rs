@@ -157,6 +157,22 @@ pub enum RasterWidth {
     Px(u32),
 }
 
+impl RasterWidth {
+    /// Returns the width in which weights are counted, for a photo of this width.
+    pub(crate) fn base_px(self, photo_px: u32) -> u32 {
+        match self {
+            Self::Px(width_px) => width_px,
+            Self::Photo | Self::Twice => photo_px.min(MAX_RASTER_WIDTH_PX),
+        }
+    }
+
+    /// Returns the width of the raster of a photo of this width.
+    pub(crate) fn px(self, photo_px: u32) -> u32 {
+        // Twice the width keeps pixels in step with those of the photo, so that masks keep their outlines.
+        self.base_px(photo_px) * if self == Self::Twice { 2 } else { 1 }
+    }
+}
+
 /// How embeddings become shards.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CellSettings {

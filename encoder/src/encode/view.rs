@@ -12,7 +12,7 @@ use super::context::RunContext;
 use super::engines::Engines;
 use super::error::EncodeError;
 use super::pipeline::Stage;
-use super::settings::{MAX_RASTER_WIDTH_PX, RasterWidth, Regions, ViewSettings};
+use super::settings::{Regions, ViewSettings};
 use super::sink::{PhotoSource, ViewRecord, ViewSink};
 use crate::cells::CellSplit;
 use crate::embed::{self, EmbedError, PatchUse, PhotoPatches, SharedEncoders, Surroundings};
@@ -198,7 +198,8 @@ impl<'a> ViewStages<'a> {
                 loaded => Next::Segment(loaded, None),
             },
             Next::Depth(loaded) => {
-                let raster_view = raster_view(&loaded, self.base_width_px(&loaded));
+                let width = self.tools.settings.raster_width;
+                let raster_view = raster_view(&loaded, width.base_px(loaded.view.intrinsics.width_px));
                 // A GPU waits for colours that these threads compute, rather than they for it.
                 let draw = || self.tools.scene.draw(&raster_view, [0.0; 3]);
                 let drawing = self.context.install(draw).map_err(raster_failed)?;
@@ -275,16 +276,6 @@ impl<'a> ViewStages<'a> {
         Ok(Some(Work { view, next, secs: work.secs + start.elapsed().as_secs_f32() }))
     }
 
-    /// Returns the width of the photo's own raster.
-    fn base_width_px(&self, loaded: &LoadedImage) -> u32 {
-        match self.tools.settings.raster_width {
-            RasterWidth::Px(width_px) => width_px,
-            RasterWidth::Photo | RasterWidth::Twice => {
-                loaded.view.intrinsics.width_px.min(MAX_RASTER_WIDTH_PX)
-            }
-        }
-    }
-
     /// Returns the patches of a photo that have vectors, and the regions that they are in place of masks.
     fn patches(&self, photo: &RgbImage, masks: &[Mask]) -> (Option<PhotoPatches>, Option<Vec<Mask>>) {
         let Some(per_side) = self.tools.engines.models.patches_per_side() else { return (None, None) };
@@ -314,10 +305,8 @@ impl<'a> ViewStages<'a> {
 
     /// Makes the regions of a view's masks.
     fn partition(&self, loaded: &LoadedImage, masks: &[Mask]) -> Partition {
-        let base_px = self.base_width_px(loaded);
-        // Twice the width keeps pixels in step with those of the photo, so that masks keep their outlines.
-        let is_twice = self.tools.settings.raster_width == RasterWidth::Twice;
-        let raster_view = raster_view(loaded, if is_twice { 2 * base_px } else { base_px });
+        let (width, photo_px) = (self.tools.settings.raster_width, loaded.view.intrinsics.width_px);
+        let raster_view = raster_view(loaded, width.px(photo_px));
         let raster_px = [raster_view.intrinsics.width_px, raster_view.intrinsics.height_px];
         let (image, valid) = (&loaded.image, loaded.valid.as_deref());
         let (width_px, height_px) = image.dimensions();
@@ -326,7 +315,7 @@ impl<'a> ViewStages<'a> {
         if self.tools.settings.merges_slivers {
             absorb_slivers(&mut regions, &mut masks_of_region);
         }
-        let weight_scale = (f64::from(base_px) / f64::from(raster_px[0])).powi(2) as f32;
+        let weight_scale = (f64::from(width.base_px(photo_px)) / f64::from(raster_px[0])).powi(2) as f32;
         let outlines = masks.iter().map(|mask| MaskOutline::of(mask, width_px, height_px, valid)).collect();
         Partition { raster_view, regions, masks_of_region, outlines, weight_scale }
     }

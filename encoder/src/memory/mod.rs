@@ -138,12 +138,12 @@ impl MemoryPlan {
         self.is_before_views = false;
     }
 
-    /// Returns the bytes that a phase leaves; [`Self::rest`] is what the most expensive one leaves.
+    /// Returns the bytes of the budget that are free during a phase. [`Self::rest`] are those that are free during all.
     pub fn rest_of(&self, phase: Phase) -> u64 {
         self.available_bytes.saturating_sub(self.reserved_bytes(phase))
     }
 
-    /// Returns the bytes set aside for a phase, with what is always held.
+    /// Returns the bytes that are set aside during a phase.
     fn reserved_bytes(&self, phase: Phase) -> u64 {
         self.of_phase(phase).fold(0u64, |sum, r| sum.saturating_add(r.len_bytes))
     }

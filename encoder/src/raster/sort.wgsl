@@ -1,4 +1,4 @@
-// Stable radix sort of indices by a 32-bit key, 5 bits per pass: count, scan, scatter.
+// Stable radix sort of indices by a 32-bit key, a digit below RADIX per pass: count, scan, scatter.
 //
 // Every thread owns a run of consecutive items, so ranks follow the order of the input without subgroups or
 // atomics, and the result is the same on every device.

@@ -277,9 +277,15 @@ impl Raster {
     }
 
     /// Returns the pixel at the other end of an edge; `None` outside the image.
-    fn neighbour(&self, pixel: usize, (dx, dy): (i64, i64)) -> Option<usize> {
+    fn neighbour(&self, pixel: usize, step: (i64, i64)) -> Option<usize> {
+        let width = self.width_px as usize;
+        self.neighbour_of((pixel % width, pixel / width), step)
+    }
+
+    /// Returns the pixel beside the one at (x, y); `None` outside the image.
+    fn neighbour_of(&self, (x, y): (usize, usize), (dx, dy): (i64, i64)) -> Option<usize> {
         let (width, height) = (i64::from(self.width_px), i64::from(self.height_px));
-        let (x, y) = (pixel as i64 % width + dx, pixel as i64 / width + dy);
+        let (x, y) = (x as i64 + dx, y as i64 + dy);
         ((0..width).contains(&x) && (0..height).contains(&y)).then_some((y * width + x) as usize)
     }
 
@@ -309,13 +315,9 @@ impl Raster {
         let mut edges = Vec::with_capacity(4 * self.lab.len());
         let (width, height) = (self.width_px as usize, self.height_px as usize);
         let has_depth = settings.depth_weight > 0.0;
-        for (pixel, (y, x)) in (0..height).flat_map(|y| (0..width).map(move |x| (y, x))).enumerate() {
+        for (pixel, at) in (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).enumerate() {
             for (direction, step) in NEIGHBOURS.into_iter().enumerate() {
-                let (beside, below) = (x.wrapping_add_signed(step.0 as isize), y + step.1 as usize);
-                if beside >= width || below >= height {
-                    continue;
-                }
-                let other = below * width + beside;
+                let Some(other) = self.neighbour_of(at, step) else { continue };
                 if !(self.valid[pixel] && self.valid[other]) {
                     continue;
                 }

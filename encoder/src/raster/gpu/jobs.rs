@@ -50,8 +50,8 @@ impl SortKey {
     }
 }
 
-/// Returns the least depth key, and the bits of the largest one beyond it: depths are floats between the near and far
-/// plane, whose bits have the same order.
+/// Returns the least key of a depth, and how many bits keys have once it is subtracted. A key is the bits of a float between
+/// the near and the far plane: positive floats and their bits have the same order.
 pub fn depth_keys() -> (u32, u32) {
     let [least, most] = [NEAR_Z, FAR_Z].map(|z| (z as f32).to_bits());
     (least, bits_of(most - least + 1))
