@@ -55,7 +55,7 @@ impl Default for GpuOptions {
             max_binding_bytes: u64::MAX,
             max_resident_bytes: u64::MAX,
             first_capacity: 1 << 19,
-            views_in_flight: 8,
+            views_in_flight: 12,
         }
     }
 }

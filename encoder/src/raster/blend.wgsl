@@ -9,8 +9,8 @@
 @group(0) @binding(2) var<storage, read> screen: array<Screen>;
 @group(0) @binding(3) var<storage, read> members: array<u32>;
 @group(0) @binding(4) var<storage, read> ranges: array<Range>;
-// Row-major, within the band.
-@group(0) @binding(5) var<storage, read> region_of_pixel: array<u32>;
+// Row-major, within the band, two a word.
+@group(0) @binding(5) var<storage, read> regions_of_pixels: array<u32>;
 @group(0) @binding(6) var<storage, read_write> entries: array<Entry>;
 // The order in which tiles are blended.
 @group(0) @binding(7) var<storage, read> tile_order: array<u32>;
@@ -26,6 +26,8 @@ const WEIGHTS_STRIDE = WORKGROUP_SIZE + WORKGROUP_SIZE / RUN + 1u;
 const N_SUMS = 2048u;
 const NO_SLOT = 0xffffu;
 const PIXEL_BITS = 8u;
+// Whether weights are falloffs, not shares of a pixel.
+override IS_FALLOFF: bool = false;
 const NO_REGION_KEY = (1u << REGION_BITS) - 1u;
 
 var<workgroup> pixel_keys: array<u32, WORKGROUP_SIZE>;
@@ -71,7 +73,8 @@ fn sum_regions(
         let y = y_px + thread / TILE_SIZE_PX;
         var region = NO_REGION_KEY;
         if x < view.width_px && y < view.height_px {
-            region = min(region_of_pixel[(y - view.first_tile_row * TILE_SIZE_PX) * view.width_px + x], NO_REGION_KEY);
+            let at = (y - view.first_tile_row * TILE_SIZE_PX) * view.width_px + x;
+            region = regions_of_pixels[at / 2u] >> (at % 2u * REGION_BITS) & NO_REGION_KEY;
         }
         pixel_keys[thread] = (region << PIXEL_BITS) | thread;
     }
@@ -114,7 +117,6 @@ fn sum_regions(
     if is_live {
         atomicAdd(&n_live, 1u);
     }
-    let is_falloff = view.falloff != 0u;
     // The run of pixels that this thread sums, for one Gaussian of a step: neighbours sum for different Gaussians, so that
     // few of them add to one sum at a time.
     let of_step = thread % STEP;
@@ -152,10 +154,10 @@ fn sum_regions(
                 let alpha = min(g.opacity * falloff, MAX_ALPHA);
                 let counts = is_live && u * u + v * v <= g.reach2 && alpha >= MIN_ALPHA;
                 let next = transmittance * (1.0 - alpha);
-                let is_summed = counts && (is_falloff || next > MIN_TRANSMITTANCE);
-                let weight = select(alpha * transmittance, falloff, is_falloff);
+                let is_summed = counts && (IS_FALLOFF || next > MIN_TRANSMITTANCE);
+                let weight = select(alpha * transmittance, falloff, IS_FALLOFF);
                 weights[i * WEIGHTS_STRIDE + thread + thread / RUN] = select(0.0, weight, is_summed);
-                transmittance = select(transmittance, next, is_summed && !is_falloff);
+                transmittance = select(transmittance, next, is_summed && !IS_FALLOFF);
                 is_live = is_live && (is_summed || !counts);
             }
             if was_live && !is_live {

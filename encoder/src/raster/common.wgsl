@@ -17,8 +17,6 @@ struct View {
     end_tile_row: u32,
     // Tiles per row.
     tile_columns: u32,
-    falloff: u32,
-    n_regions: u32,
     capacity_visible: u32,
     capacity_pairs: u32,
     capacity_entries: u32,

@@ -258,6 +258,15 @@ impl SharedScene<'_> {
 }
 
 impl LoadedScene for SharedScene<'_> {
+    fn weights(
+        &self,
+        view: &RasterView,
+        regions: &RegionMap,
+        kind: WeightKind,
+    ) -> Result<ViewWeights, RasterError> {
+        self.run(|scene| scene.weights(view, regions, kind))
+    }
+
     fn weights_timed(
         &self,
         view: &RasterView,

@@ -62,7 +62,8 @@ pub trait LoadedScene: Send + Sync {
         Ok(self.weights_timed(view, regions, kind)?.0)
     }
 
-    /// Returns [`Self::weights`] and the duration of each stage, in order; empty if the backend does not measure them.
+    /// Returns [`Self::weights`] and the duration of each stage, in order; empty if the backend does not measure them. To
+    /// measure may take time.
     ///
     /// # Errors
     /// Those of [`Self::weights`].

@@ -1,4 +1,4 @@
-// Stable radix sort of indices by a 32-bit key, a digit below RADIX per pass: count, scan, scatter.
+// Stable radix sort of indices by a key of one word or two, a digit below RADIX per pass: count, scan, scatter.
 //
 // Every thread owns a run of consecutive items, so ranks follow the order of the input without subgroups or
 // atomics, and the result is the same on every device.
@@ -6,13 +6,13 @@
 struct SortPass {
     // Counter with the number of items.
     items: u32,
-    // The key of item i is `(keys[i * stride + offset] - least) >> shift`.
+    // The upper word of item i is `keys[i * stride + offset] - least`; the lower word, the next one, has `low_bits` bits.
     stride: u32,
     offset: u32,
     least: u32,
+    low_bits: u32,
+    // Position of the digit in the key. The first pass, at 0, takes the items in their original order.
     shift: u32,
-    // The first pass takes the items in their original order and reads no input order.
-    is_first: u32,
     capacity: u32,
 }
 
@@ -33,14 +33,18 @@ fn n_items() -> u32 {
 }
 
 fn item(at: u32) -> u32 {
-    if job.is_first != 0u {
+    if job.shift == 0u {
         return at;
     }
     return order_in[at];
 }
 
 fn digit(item: u32) -> u32 {
-    return ((keys[item * job.stride + job.offset] - job.least) >> job.shift) % RADIX;
+    let word = item * job.stride + job.offset;
+    if job.shift >= job.low_bits {
+        return ((keys[word] - job.least) >> (job.shift - job.low_bits)) % RADIX;
+    }
+    return (keys[word + 1u] >> job.shift | keys[word] << (job.low_bits - job.shift)) % RADIX;
 }
 
 var<workgroup> block_histogram: array<atomic<u32>, RADIX>;

@@ -66,7 +66,7 @@ impl Buffers {
                 2 * Counter::ALL.len() as u64 * DISPATCH_BYTES,
                 Usage::STORAGE | Usage::INDIRECT,
             )?,
-            jobs: storage("jobs", (SCAN_JOBS + 4 * u64::from(MAX_PASSES)) * JOB_STRIDE_BYTES / 4)?,
+            jobs: storage("jobs", (SCAN_JOBS + 3 * u64::from(MAX_PASSES)) * JOB_STRIDE_BYTES / 4)?,
             block_counts: storage(
                 "block counts",
                 largest.max(n_chunk.into()).div_ceil(WORKGROUP_SIZE.into()),
@@ -80,7 +80,7 @@ impl Buffers {
             members: storage("members", pairs)?,
             ranges: storage("ranges", 2 * u64::from(n_tiles))?,
             tile_order: storage("order of tiles", n_tiles.into())?,
-            regions: storage("regions", n_px.into())?,
+            regions: storage("regions", n_px.div_ceil(2).into())?,
             entries: storage("entries", entries * u64::from(ENTRY_WORDS))?,
             entry_order: [storage("order of entries", entries)?, storage("order of entries", entries)?],
             region_sums: storage("region sums", entries * 4)?,

@@ -134,7 +134,7 @@ impl Device {
         RasterError::DeviceCapacity { adapter: self.report.name.clone(), what }
     }
 
-    /// Creates a buffer; `None` if the device memory does not suffice.
+    /// Creates a buffer, mapped if the host writes it; `None` if the device memory does not suffice.
     pub(super) fn buffer(
         &self,
         label: &str,
@@ -146,7 +146,7 @@ impl Device {
             label: Some(label),
             size: size_bytes.next_multiple_of(16).max(256),
             usage,
-            mapped_at_creation: false,
+            mapped_at_creation: usage.contains(wgpu::BufferUsages::MAP_WRITE),
         };
         let buffer = self.device.create_buffer(&descriptor);
         block_on(scope.pop()).is_none().then_some(buffer)

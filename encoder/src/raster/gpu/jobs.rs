@@ -2,7 +2,7 @@
 
 use super::device::Device;
 use super::layout::{Capacities, ScanJob, SortPass, screen_layout};
-use super::shader::{Counter, NONE, RADIX, SORT_BLOCK, WORKGROUP_SIZE};
+use super::shader::{Counter, NONE, RADIX, REGION_BITS, SORT_BLOCK, WORKGROUP_SIZE};
 use crate::raster::constants::{FAR_Z, NEAR_Z};
 
 /// Distance between records, bytes; bindings must be aligned.
@@ -27,17 +27,18 @@ pub enum Scan {
 /// The sort keys.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub enum SortKey {
+    /// Depth of a visible Gaussian.
     Depth,
+    /// Tile of a pair.
     Tile,
-    Region,
-    Member,
+    /// Visible Gaussian of an entry, then its region.
+    MemberRegion,
 }
 
-const SORT_KEYS: [SortKey; 4] = [SortKey::Depth, SortKey::Tile, SortKey::Region, SortKey::Member];
 /// Bits per sort pass.
 pub const DIGIT_BITS: u32 = RADIX.ilog2();
-/// Passes for a 32-bit key.
-pub const MAX_PASSES: u32 = u32::BITS.div_ceil(DIGIT_BITS);
+/// Passes for the longest key.
+pub const MAX_PASSES: u32 = (u32::BITS + REGION_BITS).div_ceil(DIGIT_BITS);
 
 impl SortKey {
     /// Returns the counter with the number of items.
@@ -45,7 +46,7 @@ impl SortKey {
         match self {
             Self::Depth => Counter::Visible,
             Self::Tile => Counter::Pairs,
-            Self::Region | Self::Member => Counter::Entries,
+            Self::MemberRegion => Counter::Entries,
         }
     }
 }
@@ -99,9 +100,8 @@ pub fn part(buffer: &wgpu::Buffer, index: u64) -> wgpu::BufferBinding<'_> {
     }
 }
 
-/// Writes the records of all scans and sorts for the given capacities.
+/// Writes the records of all scans, and of the sorts by depth and tile, for the given capacities.
 pub fn write_jobs(device: &Device, jobs: &wgpu::Buffer, capacities: Capacities) {
-    let (screen_bytes, depth_word) = screen_layout(device.report.precision);
     let write = |index: u64, bytes: &[u8]| {
         device.queue.write_buffer(jobs, index * JOB_STRIDE_BYTES, bytes);
     };
@@ -127,24 +127,33 @@ pub fn write_jobs(device: &Device, jobs: &wgpu::Buffer, capacities: Capacities) 
     ] {
         write(kind.index(), bytemuck::bytes_of(&job));
     }
-    for key in SORT_KEYS {
-        let (stride, offset, capacity) = match key {
-            SortKey::Depth => (screen_bytes / 4, depth_word, capacities.visible),
-            SortKey::Tile => (PAIR_WORDS, 0, capacities.pairs),
-            SortKey::Region => (ENTRY_WORDS, 1, capacities.entries),
-            SortKey::Member => (ENTRY_WORDS, 0, capacities.entries),
+    write_sort_jobs(device, jobs, capacities, (SortKey::Depth, 0));
+    write_sort_jobs(device, jobs, capacities, (SortKey::Tile, 0));
+}
+
+/// Writes the records of a sort whose keys have `low_bits` bits of a second word.
+pub fn write_sort_jobs(
+    device: &Device,
+    jobs: &wgpu::Buffer,
+    capacities: Capacities,
+    (key, low_bits): (SortKey, u32),
+) {
+    let (screen_bytes, depth_word) = screen_layout(device.report.precision);
+    let (stride, offset, capacity) = match key {
+        SortKey::Depth => (screen_bytes / 4, depth_word, capacities.visible),
+        SortKey::Tile => (PAIR_WORDS, 0, capacities.pairs),
+        SortKey::MemberRegion => (ENTRY_WORDS, 0, capacities.entries),
+    };
+    for pass in 0..MAX_PASSES {
+        let job = SortPass {
+            items: key.counter() as u32,
+            stride,
+            offset,
+            least: if key == SortKey::Depth { depth_keys().0 } else { 0 },
+            low_bits,
+            shift: pass * DIGIT_BITS,
+            capacity,
         };
-        for pass in 0..MAX_PASSES {
-            let job = SortPass {
-                items: key.counter() as u32,
-                stride,
-                offset,
-                least: if key == SortKey::Depth { depth_keys().0 } else { 0 },
-                shift: pass * DIGIT_BITS,
-                is_first: u32::from(pass == 0 && key != SortKey::Member),
-                capacity,
-            };
-            write(sort_job(key, pass), bytemuck::bytes_of(&job));
-        }
+        device.queue.write_buffer(jobs, sort_job(key, pass) * JOB_STRIDE_BYTES, bytemuck::bytes_of(&job));
     }
 }

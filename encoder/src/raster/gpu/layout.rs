@@ -97,12 +97,12 @@ pub struct SortPass {
     pub stride: u32,
     /// Word of the first key.
     pub offset: u32,
-    /// Subtracted from each key.
+    /// Subtracted from each word at `offset`.
     pub least: u32,
+    /// Bits of the key that come from the word after that at `offset`, the lower ones.
+    pub low_bits: u32,
     /// Position of the digit, bits.
     pub shift: u32,
-    /// 1 if the items are in their original order.
-    pub is_first: u32,
     /// Capacity for items.
     pub capacity: u32,
 }
@@ -160,17 +160,15 @@ pub struct ViewBlock {
     /// `rotation` (9), `position_high` (3), `position_low` (3), focal lengths, centre.
     pub reals: [f64; 19],
     /// From `width_px` to `capacity_entries`.
-    pub words: [u32; 10],
+    pub words: [u32; 8],
 }
 
 impl ViewBlock {
-    /// Prepares a band of a view. `tile_rows` and whether the weights are of kind `Falloff` select the work;
-    /// `origin_in_world` is the origin of the means on the device.
+    /// Prepares the band of a view with these rows of tiles; `origin_in_world` is the origin of the means on the device.
     pub fn new(
         view: &RasterView,
         origin_in_world: DVec3,
-        (tile_rows, is_falloff): ([u32; 2], bool),
-        n_regions: u32,
+        tile_rows: [u32; 2],
         capacities: Capacities,
     ) -> Self {
         let camera = &view.intrinsics;
@@ -194,8 +192,6 @@ impl ViewBlock {
             tile_rows[0],
             tile_rows[1],
             camera.width_px.div_ceil(TILE_SIZE_PX as u32),
-            u32::from(is_falloff),
-            n_regions,
             capacities.visible,
             capacities.pairs,
             capacities.entries,
@@ -269,7 +265,7 @@ mod tests {
         assert_eq!(layout_of("project", "SceneGaussian", Precision::F32).1, size_of::<SceneGaussian>());
         assert_layout!("project", Chunk; first_gaussian, n_gaussians);
         assert_layout!("scan", ScanJob; items, n_most, block, columns, total);
-        assert_layout!("sort", SortPass; items, stride, offset, least, shift, is_first, capacity);
+        assert_layout!("sort", SortPass; items, stride, offset, least, low_bits, shift, capacity);
         assert_layout!("draw", Background; rgb, padding);
         assert_layout!("compact", RegionSum; gaussian, region, low, high);
         assert_eq!(layout_of("compact", "RegionSum", Precision::F32).1, size_of::<RegionSum>());
@@ -295,8 +291,6 @@ mod tests {
                     "first_tile_row",
                     "end_tile_row",
                     "tile_columns",
-                    "falloff",
-                    "n_regions",
                     "capacity_visible",
                     "capacity_pairs",
                     "capacity_entries",
@@ -306,7 +300,7 @@ mod tests {
             assert!(columns.windows(2).all(|w| w[0].1 + w[0].2 == w[1].1), "no gaps: {columns:?}");
             let width = columns.iter().find(|c| c.0 == "width_px").expect("width_px").1;
             assert_eq!(width, 19 * real_bytes);
-            let block = ViewBlock { reals: [0.0; 19], words: [0; 10] };
+            let block = ViewBlock { reals: [0.0; 19], words: [0; 8] };
             assert_eq!(block.to_bytes(precision).len(), size_bytes);
         }
     }

@@ -44,7 +44,7 @@ use chunk::{SCENE_GAUSSIAN_BYTES, SceneChunk};
 pub use device::{Adapter, Device, adapters};
 use layout::{Capacities, RegionSum, SceneGaussian, ViewBlock, screen_layout};
 use shader::{Counter, MAX_DISPATCH, REGION_BITS, WORKGROUP_SIZE};
-use workspace::{Counts, PIXEL_BYTES, Workspace};
+use workspace::{Counts, PIXEL_BYTES, REGION_BYTES, Workspace};
 
 /// A backend on one GPU.
 pub struct GpuRasterizer {
@@ -236,12 +236,11 @@ impl<'s> GpuScene<'s> {
     fn each_band(
         &self,
         view: &RasterView,
-        (kind, n_regions): (WeightKind, u32),
         px_bytes: u64,
         mut work: impl FnMut(&mut Workspace, &Band<'_>, Rows) -> Result<Counts, RasterError>,
     ) -> Result<ViewCounters, RasterError> {
         let mut workspace = self.take_workspace();
-        let result = self.bands_of(&mut workspace, view, (kind, n_regions), px_bytes, &mut work);
+        let result = self.bands_of(&mut workspace, view, px_bytes, &mut work);
         self.return_workspace(workspace);
         result
     }
@@ -250,7 +249,6 @@ impl<'s> GpuScene<'s> {
         &self,
         workspace: &mut Option<Workspace>,
         view: &RasterView,
-        (kind, n_regions): (WeightKind, u32),
         px_bytes: u64,
         work: &mut dyn FnMut(&mut Workspace, &Band<'_>, Rows) -> Result<Counts, RasterError>,
     ) -> Result<ViewCounters, RasterError> {
@@ -290,9 +288,7 @@ impl<'s> GpuScene<'s> {
                 }
             };
             let capacities = current.capacities;
-            let is_falloff = kind == WeightKind::Falloff;
-            let rows_and_kind = ([first, end], is_falloff);
-            let block = ViewBlock::new(view, self.origin_in_world, rows_and_kind, n_regions, capacities);
+            let block = ViewBlock::new(view, self.origin_in_world, [first, end], capacities);
             let band = Band { device: &self.device, chunks: &self.chunks, upload: &upload, view: &block };
             let first_px = (first * tile * width_px) as usize;
             let rows = Rows { px: first_px..first_px + n_px as usize, is_whole: end - first == n_rows };
@@ -384,13 +380,15 @@ struct Rows {
 /// Largest number of regions in a view; the next number stands for "no region".
 const MAX_REGIONS: u32 = (1 << REGION_BITS) - 1;
 
-impl LoadedScene for GpuScene<'_> {
-    fn weights_timed(
+impl GpuScene<'_> {
+    /// Returns the contributions of a view, and adds the duration of each stage to `times`.
+    fn contributions(
         &self,
         view: &RasterView,
         regions: &RegionMap,
         kind: WeightKind,
-    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
+        mut times: Option<&mut Vec<StageTime>>,
+    ) -> Result<ViewWeights, RasterError> {
         check_view(view)?;
         check_regions(regions, &view.intrinsics)?;
         if regions.n_regions > MAX_REGIONS {
@@ -400,22 +398,44 @@ impl LoadedScene for GpuScene<'_> {
         if self.chunks.is_empty() {
             return Ok(Default::default());
         }
-        let mut times = Vec::new();
         let mut entries: Vec<RegionWeight> = Vec::new();
         let mut sums: Vec<RegionSum> = Vec::new();
-        let counters = self.each_band(view, (kind, regions.n_regions), 4, |workspace, band, rows| {
+        let counters = self.each_band(view, REGION_BYTES, |workspace, band, rows| {
             let mut take = |found: &[RegionSum]| match rows.is_whole {
                 true => entries.extend(found.iter().map(|sum| sum.weight(sum.fixed()))),
                 false => sums.extend(found),
             };
-            workspace.contributions(band, &regions.region_of_pixel[rows.px], &mut times, &mut take)
+            let regions_and_kind = (&regions.region_of_pixel[rows.px], regions.n_regions, kind);
+            workspace.contributions(band, regions_and_kind, times.as_deref_mut(), &mut take)
         })?;
         sums.sort_unstable_by_key(|sum| (sum.gaussian, sum.region));
         entries.extend(
             sums.chunk_by(|a, b| (a.gaussian, a.region) == (b.gaussian, b.region))
                 .map(|same| same[0].weight(same.iter().map(RegionSum::fixed).sum())),
         );
-        Ok((ViewWeights { entries, counters }, times))
+        Ok(ViewWeights { entries, counters })
+    }
+}
+
+impl LoadedScene for GpuScene<'_> {
+    fn weights(
+        &self,
+        view: &RasterView,
+        regions: &RegionMap,
+        kind: WeightKind,
+    ) -> Result<ViewWeights, RasterError> {
+        self.contributions(view, regions, kind, None)
+    }
+
+    fn weights_timed(
+        &self,
+        view: &RasterView,
+        regions: &RegionMap,
+        kind: WeightKind,
+    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
+        let mut times = Vec::new();
+        let weights = self.contributions(view, regions, kind, Some(&mut times))?;
+        Ok((weights, times))
     }
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {
@@ -434,16 +454,15 @@ impl LoadedScene for GpuScene<'_> {
             coverage: vec![0.0; n_px],
             ..Drawing::default()
         };
-        drawing.counters =
-            self.each_band(view, (WeightKind::Blend, 0), PIXEL_BYTES, |workspace, band, rows| {
-                let (counts, pixels) = workspace.draw(band, background, &colours)?;
-                for (i, pixel) in rows.px.zip(pixels.chunks_exact(5)) {
-                    drawing.rgb[3 * i..][..3].copy_from_slice(&pixel[..3]);
-                    drawing.depth[i] = pixel[3];
-                    drawing.coverage[i] = pixel[4];
-                }
-                Ok(counts)
-            })?;
+        drawing.counters = self.each_band(view, PIXEL_BYTES, |workspace, band, rows| {
+            let (counts, pixels) = workspace.draw(band, background, &colours)?;
+            for (i, pixel) in rows.px.zip(pixels.chunks_exact(5)) {
+                drawing.rgb[3 * i..][..3].copy_from_slice(&pixel[..3]);
+                drawing.depth[i] = pixel[3];
+                drawing.coverage[i] = pixel[4];
+            }
+            Ok(counts)
+        })?;
         Ok(drawing)
     }
 }

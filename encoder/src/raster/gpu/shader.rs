@@ -9,6 +9,7 @@ use crate::raster::constants::{
     COVARIANCE_BLUR_PX2, FAR_Z, FOV_MARGIN, MAX_ALPHA, MAX_VARIANCE_PX2, MIN_ALPHA, MIN_TRANSMITTANCE,
     NEAR_Z, TILE_SIZE_PX,
 };
+use crate::raster::weights::WeightKind;
 
 /// Threads of a workgroup, equal to the pixels of a tile.
 pub const WORKGROUP_SIZE: u32 = (TILE_SIZE_PX * TILE_SIZE_PX) as u32;
@@ -20,8 +21,8 @@ pub const RADIX: u32 = 32;
 pub const MAX_DISPATCH: u32 = 65_535;
 /// Fraction bits of fixed-point weights; with the 2^28 pixels of the largest image, sums need 63 bits.
 pub const SUM_FRACTION_BITS: u32 = 35;
-/// Bits of a region number; a region and a pixel of its tile share a word.
-pub const REGION_BITS: u32 = 24;
+/// Bits of a region number: two share a word, and so do a region and a pixel of its tile.
+pub const REGION_BITS: u32 = 16;
 /// Stands for "no counter".
 pub const NONE: u32 = u32::MAX;
 
@@ -142,7 +143,8 @@ pub struct Kernels {
     pub write_pairs: wgpu::ComputePipeline,
     pub find_ranges: wgpu::ComputePipeline,
     pub order_tiles: wgpu::ComputePipeline,
-    pub sum_regions: wgpu::ComputePipeline,
+    /// One for each [`WeightKind`].
+    pub sum_regions: [wgpu::ComputePipeline; 2],
     pub count_heads: wgpu::ComputePipeline,
     pub add_up: wgpu::ComputePipeline,
     pub draw: wgpu::ComputePipeline,
@@ -151,7 +153,7 @@ pub struct Kernels {
 impl Kernels {
     /// Compiles all stages.
     pub fn new(device: &wgpu::Device, precision: Precision) -> Self {
-        let kernel = |stage: &str, entry: &str| {
+        let with_constants = |stage: &str, entry: &str, constants: &[(&str, f64)]| {
             let descriptor = wgpu::ShaderModuleDescriptor {
                 label: Some(stage),
                 source: wgpu::ShaderSource::Wgsl(Cow::Owned(module_text(stage, precision))),
@@ -171,13 +173,14 @@ impl Kernels {
                 module: &module,
                 entry_point: Some(entry),
                 compilation_options: wgpu::PipelineCompilationOptions {
+                    constants,
                     // All shaders write workgroup memory before they read it.
                     zero_initialize_workgroup_memory: false,
-                    ..Default::default()
                 },
                 cache: None,
             })
         };
+        let kernel = |stage: &str, entry: &str| with_constants(stage, entry, &[]);
         Self {
             count_visible: kernel("project", "count_visible"),
             write_visible: kernel("project", "write_visible"),
@@ -188,7 +191,10 @@ impl Kernels {
             write_pairs: kernel("bin", "write_pairs"),
             find_ranges: kernel("bin", "find_ranges"),
             order_tiles: kernel("bin", "order_tiles"),
-            sum_regions: kernel("blend", "sum_regions"),
+            sum_regions: [WeightKind::Blend, WeightKind::Falloff].map(|kind| {
+                let is_falloff = f64::from(u8::from(kind == WeightKind::Falloff));
+                with_constants("blend", "sum_regions", &[("IS_FALLOFF", is_falloff)])
+            }),
             count_heads: kernel("compact", "count_heads"),
             add_up: kernel("compact", "add_up"),
             draw: kernel("draw", "draw"),

@@ -8,6 +8,7 @@ use super::chunk::SceneChunk;
 use super::device::Device;
 use super::jobs::{DIGIT_BITS, Scan, SortKey, dispatch_offset, part, sort_job};
 use super::shader::{Counter, WORKGROUP_SIZE};
+use crate::raster::weights::WeightKind;
 
 /// Records the stages of one view in flight.
 pub struct Stages {
@@ -79,47 +80,44 @@ impl Stages {
         dispatch(pass, &device.kernels.scan, group, [1, 1]);
     }
 
-    /// Sorts by several keys, the least significant first. Returns the index of the buffer with the order.
+    /// Sorts by a key with so many bits. Returns the index of the buffer with the order.
     pub fn sort(
         &mut self,
         device: &Device,
         pass: &mut wgpu::ComputePass<'_>,
-        keys: &[(SortKey, u32)],
+        (key, bits): (SortKey, u32),
     ) -> usize {
-        let mut current = 0;
-        for &(key, bits) in keys {
-            for digit in 0..bits.div_ceil(DIGIT_BITS).max(1) {
-                let (values, order) = match key {
-                    SortKey::Depth => (&self.buffers.screen, &self.buffers.visible_order),
-                    SortKey::Tile => (&self.buffers.pairs, &self.buffers.pair_order),
-                    SortKey::Region | SortKey::Member => (&self.buffers.entries, &self.buffers.entry_order),
-                };
-                let job = sort_job(key, digit);
-                let bound = number(&[
-                    part(&self.buffers.jobs, job),
-                    whole(&self.buffers.counters),
-                    whole(values),
-                    whole(&order[current]),
-                    whole(&self.buffers.histogram),
-                    whole(&order[1 - current]),
-                ]);
-                let name = job as u32 * 2 + current as u32;
-                let kernels = &device.kernels;
-                let count = cached(&mut self.groups, ("count_digits", name), || {
-                    bind(device, &kernels.count_digits, &bound[..5])
-                })
-                .clone();
-                let scatter =
-                    cached(&mut self.groups, ("scatter", name), || bind(device, &kernels.scatter, &bound))
-                        .clone();
-                let offset = dispatch_offset(key.counter(), true);
-                dispatch_indirect(pass, &kernels.count_digits, &count, (&self.buffers.dispatches, offset));
-                self.scan(device, pass, Scan::Digits(key.counter()));
-                dispatch_indirect(pass, &kernels.scatter, &scatter, (&self.buffers.dispatches, offset));
-                current = 1 - current;
-            }
+        let n_passes = bits.div_ceil(DIGIT_BITS).max(1);
+        let kernels = &device.kernels;
+        let offset = dispatch_offset(key.counter(), true);
+        for digit in 0..n_passes {
+            let (values, order) = match key {
+                SortKey::Depth => (&self.buffers.screen, &self.buffers.visible_order),
+                SortKey::Tile => (&self.buffers.pairs, &self.buffers.pair_order),
+                SortKey::MemberRegion => (&self.buffers.entries, &self.buffers.entry_order),
+            };
+            let (from, to) = (digit as usize % 2, 1 - digit as usize % 2);
+            let job = sort_job(key, digit);
+            let bound = number(&[
+                part(&self.buffers.jobs, job),
+                whole(&self.buffers.counters),
+                whole(values),
+                whole(&order[from]),
+                whole(&self.buffers.histogram),
+                whole(&order[to]),
+            ]);
+            let [count, scatter] =
+                [("count_digits", &kernels.count_digits, 5), ("scatter", &kernels.scatter, 6)].map(
+                    |(name, kernel, n)| {
+                        cached(&mut self.groups, (name, job as u32), || bind(device, kernel, &bound[..n]))
+                            .clone()
+                    },
+                );
+            dispatch_indirect(pass, &kernels.count_digits, &count, (&self.buffers.dispatches, offset));
+            self.scan(device, pass, Scan::Digits(key.counter()));
+            dispatch_indirect(pass, &kernels.scatter, &scatter, (&self.buffers.dispatches, offset));
         }
-        current
+        n_passes as usize % 2
     }
 
     /// Lists the (tile, Gaussian) pairs of the visible Gaussians.
@@ -176,8 +174,14 @@ impl Stages {
         dispatch(pass, kernel, group, [1, 1]);
     }
 
-    /// Blends all tiles and sums their weights over regions.
-    pub fn blend(&mut self, device: &Device, pass: &mut wgpu::ComputePass<'_>, columns: u32, rows: u32) {
+    /// Blends all tiles and sums their weights of this kind over regions.
+    pub fn blend(
+        &mut self,
+        device: &Device,
+        pass: &mut wgpu::ComputePass<'_>,
+        (columns, rows): (u32, u32),
+        kind: WeightKind,
+    ) {
         let bound = [
             &self.buffers.view,
             &self.buffers.counters,
@@ -189,8 +193,9 @@ impl Stages {
             &self.buffers.tile_order,
         ]
         .map(whole);
-        let kernel = &device.kernels.sum_regions;
-        let group = cached(&mut self.groups, ("sum_regions", 0), || bind(device, kernel, &number(&bound)));
+        let kernel = &device.kernels.sum_regions[kind as usize];
+        let group =
+            cached(&mut self.groups, ("sum_regions", kind as u32), || bind(device, kernel, &number(&bound)));
         dispatch(pass, kernel, group, [columns, rows]);
         self.scan(device, pass, Scan::Entries);
     }

@@ -15,6 +15,8 @@ const STAGES: [&str; 5] = ["project", "sort", "bin", "blend", "compact"];
 pub struct GpuTimestamps {
     queries: Option<(wgpu::QuerySet, wgpu::Buffer)>,
     period_ns: f32,
+    /// Whether passes are timed; each timestamp keeps the device from going on for a while.
+    pub is_asked: bool,
 }
 
 impl GpuTimestamps {
@@ -30,7 +32,11 @@ impl GpuTimestamps {
         } else {
             None
         };
-        Some(Self { queries, period_ns: device.queue.get_timestamp_period() })
+        Some(Self { queries, period_ns: device.queue.get_timestamp_period(), is_asked: false })
+    }
+
+    fn asked(&self) -> Option<&(wgpu::QuerySet, wgpu::Buffer)> {
+        self.queries.as_ref().filter(|_| self.is_asked)
     }
 
     /// Begins a pass of a stage. `ends` states whether it is the first and the last pass of the stage.
@@ -40,7 +46,7 @@ impl GpuTimestamps {
         stage: u32,
         ends: (bool, bool),
     ) -> wgpu::ComputePass<'e> {
-        let timestamp_writes = self.queries.as_ref().filter(|_| ends.0 || ends.1).map(|(query_set, _)| {
+        let timestamp_writes = self.asked().filter(|_| ends.0 || ends.1).map(|(query_set, _)| {
             wgpu::ComputePassTimestampWrites {
                 query_set,
                 beginning_of_pass_write_index: ends.0.then_some(2 * stage),
@@ -55,7 +61,7 @@ impl GpuTimestamps {
 
     /// Records the copy of the timestamps to `staging`.
     pub fn resolve(&self, encoder: &mut wgpu::CommandEncoder, staging: &wgpu::Buffer, offset: u64) {
-        if let Some((queries, resolved)) = &self.queries {
+        if let Some((queries, resolved)) = self.asked() {
             let n = 2 * STAGES.len() as u32;
             encoder.resolve_query_set(queries, 0..n, resolved, 0);
             encoder.copy_buffer_to_buffer(resolved, 0, staging, offset, u64::from(n) * 8);
@@ -64,7 +70,7 @@ impl GpuTimestamps {
 
     /// Converts the copied timestamps to the duration of each stage.
     pub fn read(&self, bytes: &[u8]) -> Vec<StageTime> {
-        if self.queries.is_none() {
+        if self.asked().is_none() {
             return Vec::new();
         }
         let ticks = |i: usize| u64::from_le_bytes(bytes[8 * i..][..8].try_into().unwrap_or_default());

@@ -10,19 +10,30 @@ use super::bindings::{bind, dispatch, number, whole};
 use super::buffers::{Buffers, COUNTERS_BYTES, Size};
 use super::chunk::SceneChunk;
 use super::device::Device;
-use super::jobs::{SortKey, bits_of, depth_keys};
+use super::jobs::{SortKey, bits_of, depth_keys, write_sort_jobs};
 use super::layout::{Background, Capacities, RegionSum};
 use super::shader::Counter;
 use super::stages::Stages;
 use super::timestamps::{GpuTimestamps, TIMESTAMPS_BYTES};
 use crate::raster::error::RasterError;
-use crate::raster::weights::StageTime;
+use crate::raster::weights::{StageTime, WeightKind};
 
 /// The values of all counters after a band.
 pub type Counts = [u32; Counter::ALL.len()];
 
 /// Size of the data before the contributions in the staging buffer: counters and timestamps.
 const HEAD_BYTES: u64 = (COUNTERS_BYTES + TIMESTAMPS_BYTES).next_multiple_of(256);
+
+/// Size of the parameters of a band in its buffers, bytes.
+const VIEW_BYTES: u64 = 256;
+
+/// Returns the size of the regions of so many pixels, in whole words, bytes.
+fn region_bytes(n_px: usize) -> u64 {
+    (n_px as u64 * REGION_BYTES).next_multiple_of(4)
+}
+
+/// Size of a pixel's region, bytes.
+pub const REGION_BYTES: u64 = 2;
 
 /// Size of a drawn pixel, bytes.
 pub const PIXEL_BYTES: u64 = 20;
@@ -34,25 +45,32 @@ pub struct Workspace {
     n_tiles: u32,
     n_px: u32,
     stages: Stages,
+    /// What the host gives to a band: its view, then its regions. Mapped between bands.
+    uploads: wgpu::Buffer,
     staging: wgpu::Buffer,
     /// Contributions that are copied back together with the counters.
     n_copied: u32,
     timestamps: GpuTimestamps,
+    /// Bits of a region in the records of the entries' sort.
+    region_bits: u32,
 }
 
 impl Workspace {
     /// Creates a workspace; `None` if the device memory does not suffice.
     pub fn new(device: &Device, size: Size) -> Option<Self> {
         let Size { capacities, n_tiles, n_px, .. } = size;
+        let uploads_bytes = VIEW_BYTES + region_bytes(n_px as usize);
         let n_copied = (capacities.entries / 4).clamp(1, 1 << 16);
         Some(Self {
             capacities,
             n_tiles,
             n_px,
             stages: Stages::new(Buffers::new(device, size)?),
+            uploads: device.buffer("uploads", uploads_bytes, Usage::MAP_WRITE | Usage::COPY_SRC)?,
             staging: Self::staging(device, n_copied)?,
             n_copied,
             timestamps: GpuTimestamps::new(device)?,
+            region_bits: u32::MAX,
         })
     }
 
@@ -71,29 +89,31 @@ impl Workspace {
     pub fn contributions(
         &mut self,
         band: &Band<'_>,
-        regions: &[u32],
-        times: &mut Vec<StageTime>,
+        (regions, n_regions, kind): (&[u32], u32, WeightKind),
+        mut times: Option<&mut Vec<StageTime>>,
         take: &mut dyn FnMut(&[RegionSum]),
     ) -> Result<Counts, RasterError> {
         let start = Instant::now();
         let device = band.device;
-        device.queue.write_buffer(&self.stages.buffers.regions, 0, bytemuck::cast_slice(regions));
-        let mut encoder = self.bin(band)?;
+        self.timestamps.is_asked = times.is_some();
+        self.set_region_bits(device, bits_of(n_regions));
+        let mut encoder = self.bin(band, regions)?;
         let [columns, rows] = band.tiles();
         let mut pass = self.timestamps.pass(&mut encoder, 3, (true, true));
-        self.stages.blend(device, &mut pass, columns, rows);
+        self.stages.blend(device, &mut pass, (columns, rows), kind);
         drop(pass);
         let mut pass = self.timestamps.pass(&mut encoder, 4, (true, true));
-        let n_regions = band.view.words[6];
-        let keys =
-            [(SortKey::Region, bits_of(n_regions)), (SortKey::Member, bits_of(self.capacities.visible))];
-        let entry_order = self.stages.sort(device, &mut pass, &keys);
+        let bits = bits_of(self.capacities.visible) + self.region_bits;
+        let entry_order = self.stages.sort(device, &mut pass, (SortKey::MemberRegion, bits));
         self.stages.compact(device, &mut pass, entry_order);
         drop(pass);
         self.timestamps.resolve(&mut encoder, &self.staging, COUNTERS_BYTES);
         self.copy_back(&mut encoder);
         let submission = device.queue.submit([encoder.finish()]);
-        times.push(StageTime { stage: "submit", ms: start.elapsed().as_secs_f64() * 1e3 });
+        self.uploads.map_async(wgpu::MapMode::Write, .., |_| {});
+        if let Some(times) = &mut times {
+            times.push(StageTime { stage: "submit", ms: start.elapsed().as_secs_f64() * 1e3 });
+        }
         let counts = self.read_back(device, submission, times, take)?;
         let n_contributions = counts[Counter::RegionSums as usize];
         if !self.fits(&counts) || n_contributions <= self.n_copied {
@@ -106,7 +126,16 @@ impl Workspace {
         let mut encoder = device.device.create_command_encoder(&Default::default());
         self.copy_back(&mut encoder);
         let submission = device.queue.submit([encoder.finish()]);
-        self.read_back(device, submission, &mut Vec::new(), take)
+        self.read_back(device, submission, None, take)
+    }
+
+    /// Writes the records of the entries' sort, unless those there are for as many bits.
+    fn set_region_bits(&mut self, device: &Device, region_bits: u32) {
+        if self.region_bits != region_bits {
+            self.region_bits = region_bits;
+            let key = (SortKey::MemberRegion, region_bits);
+            write_sort_jobs(device, &self.stages.buffers.jobs, self.capacities, key);
+        }
     }
 
     /// Draws a band and returns its counts and pixels: red, green, blue, depth, coverage.
@@ -117,7 +146,8 @@ impl Workspace {
         colours: &wgpu::Buffer,
     ) -> Result<(Counts, Vec<f32>), RasterError> {
         let device = band.device;
-        let mut encoder = self.bin(band)?;
+        self.timestamps.is_asked = false;
+        let mut encoder = self.bin(band, &[])?;
         let [columns, rows] = band.tiles();
         let n_bytes = u64::from(self.n_px) * PIXEL_BYTES;
         let no_memory = || device.capacity_error("out of memory for a picture".into());
@@ -144,6 +174,7 @@ impl Workspace {
         encoder.copy_buffer_to_buffer(&self.stages.buffers.counters, 0, &staging, 0, COUNTERS_BYTES);
         encoder.copy_buffer_to_buffer(&pixels, 0, &staging, COUNTERS_BYTES, n_bytes);
         let submission = device.queue.submit([encoder.finish()]);
+        self.uploads.map_async(wgpu::MapMode::Write, .., |_| {});
         staging.map_async(wgpu::MapMode::Read, .., |_| {});
         device.wait(submission)?;
         let bytes = staging.get_mapped_range(..).map_err(|e| device.error(e.to_string()))?;
@@ -153,11 +184,38 @@ impl Workspace {
         Ok((counts, bytemuck::cast_slice(rest).to_vec()))
     }
 
+    /// Records the upload of a band's view and regions.
+    fn upload(
+        &self,
+        encoder: &mut wgpu::CommandEncoder,
+        band: &Band<'_>,
+        regions: &[u32],
+    ) -> Result<(), RasterError> {
+        let device = band.device;
+        let mut bytes = band.view.to_bytes(device.report.precision);
+        bytes.resize(VIEW_BYTES as usize, 0);
+        // Two a word: `NO_REGION` stays the largest number.
+        bytes.extend(regions.iter().flat_map(|region| (*region as u16).to_le_bytes()));
+        bytes.resize((VIEW_BYTES + region_bytes(regions.len())) as usize, 0);
+        let mut mapped = self
+            .uploads
+            .get_mapped_range_mut(..bytes.len() as u64)
+            .map_err(|e| device.error(e.to_string()))?;
+        mapped.copy_from_slice(&bytes);
+        drop(mapped);
+        self.uploads.unmap();
+        let Buffers { view, regions, .. } = &self.stages.buffers;
+        encoder.copy_buffer_to_buffer(&self.uploads, 0, view, 0, VIEW_BYTES);
+        let n_bytes = bytes.len() as u64 - VIEW_BYTES;
+        encoder.copy_buffer_to_buffer(&self.uploads, VIEW_BYTES, regions, 0, n_bytes);
+        Ok(())
+    }
+
     /// Records the stages up to the list of Gaussians of each tile.
-    fn bin(&mut self, band: &Band<'_>) -> Result<wgpu::CommandEncoder, RasterError> {
-        let Band { device, chunks, upload, view } = *band;
-        device.queue.write_buffer(&self.stages.buffers.view, 0, &view.to_bytes(device.report.precision));
+    fn bin(&mut self, band: &Band<'_>, regions: &[u32]) -> Result<wgpu::CommandEncoder, RasterError> {
+        let Band { device, chunks, upload, .. } = *band;
         let mut encoder = device.device.create_command_encoder(&Default::default());
+        self.upload(&mut encoder, band, regions)?;
         encoder.clear_buffer(&self.stages.buffers.counters, 0, None);
         encoder.clear_buffer(&self.stages.buffers.ranges, 0, None);
         for (index, chunk) in chunks.iter().enumerate() {
@@ -177,11 +235,11 @@ impl Workspace {
         }
         let [columns, rows] = band.tiles();
         let mut pass = self.timestamps.pass(&mut encoder, 1, (true, true));
-        let depth_order = self.stages.sort(device, &mut pass, &[(SortKey::Depth, depth_keys().1)]);
+        let depth_order = self.stages.sort(device, &mut pass, (SortKey::Depth, depth_keys().1));
         drop(pass);
         let mut pass = self.timestamps.pass(&mut encoder, 2, (true, true));
         self.stages.pair(device, &mut pass, depth_order);
-        let pair_order = self.stages.sort(device, &mut pass, &[(SortKey::Tile, bits_of(columns * rows))]);
+        let pair_order = self.stages.sort(device, &mut pass, (SortKey::Tile, bits_of(columns * rows)));
         self.stages.find_ranges(device, &mut pass, pair_order);
         drop(pass);
         Ok(encoder)
@@ -210,7 +268,7 @@ impl Workspace {
         &self,
         device: &Device,
         submission: wgpu::SubmissionIndex,
-        times: &mut Vec<StageTime>,
+        times: Option<&mut Vec<StageTime>>,
         take: &mut dyn FnMut(&[RegionSum]),
     ) -> Result<Counts, RasterError> {
         let start = Instant::now();
@@ -222,15 +280,17 @@ impl Workspace {
         counts.copy_from_slice(
             &bytemuck::cast_slice::<u8, u32>(&bytes[..COUNTERS_BYTES as usize])[..Counter::ALL.len()],
         );
-        let stages = self.timestamps.read(&bytes[COUNTERS_BYTES as usize..HEAD_BYTES as usize]);
-        let on_device_ms: f64 = stages.iter().map(|stage| stage.ms).sum();
-        times.extend(stages);
-        times.push(StageTime { stage: "copy", ms: (waited_ms - on_device_ms).max(0.0) });
         let n_contributions = counts[Counter::RegionSums as usize];
         if self.fits(&counts) && n_contributions <= self.n_copied {
             let start = Instant::now();
             take(&bytemuck::cast_slice(&bytes[HEAD_BYTES as usize..])[..n_contributions as usize]);
-            times.push(StageTime { stage: "read", ms: start.elapsed().as_secs_f64() * 1e3 });
+            if let Some(times) = times {
+                let stages = self.timestamps.read(&bytes[COUNTERS_BYTES as usize..HEAD_BYTES as usize]);
+                let on_device_ms: f64 = stages.iter().map(|stage| stage.ms).sum();
+                times.extend(stages);
+                times.push(StageTime { stage: "copy", ms: (waited_ms - on_device_ms).max(0.0) });
+                times.push(StageTime { stage: "read", ms: start.elapsed().as_secs_f64() * 1e3 });
+            }
         }
         drop(bytes);
         self.staging.unmap();
@@ -267,6 +327,7 @@ mod tests {
         let capacities = Capacities { visible: 1, pairs: 1, entries: 70_000 };
         let size = Size { capacities, n_tiles: 1, n_px: 1, n_chunk: 1 };
         let mut workspace = Workspace::new(&device, size).expect("there is memory");
+        workspace.set_region_bits(&device, bits_of(300));
         for n in [0, 1, 2, 255, 256, 257, 2047, 2048, 2049, 4096, 70_000] {
             let key = |i: u32, salt: u32| (i ^ salt).wrapping_mul(0x9e37_79b9) >> 8;
             let entries: Vec<[u32; 4]> =
@@ -278,8 +339,7 @@ mod tests {
             let mut encoder = device.device.create_command_encoder(&Default::default());
             let mut pass = encoder.begin_compute_pass(&Default::default());
             workspace.stages.scan(&device, &mut pass, Scan::Entries);
-            let keys = [(SortKey::Region, bits_of(300)), (SortKey::Member, 32)];
-            let last = workspace.stages.sort(&device, &mut pass, &keys);
+            let last = workspace.stages.sort(&device, &mut pass, (SortKey::MemberRegion, 32 + bits_of(300)));
             drop(pass);
             let staging = device
                 .buffer("staging", u64::from(n) * 4, Usage::MAP_READ | Usage::COPY_DST)
