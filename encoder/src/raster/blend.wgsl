@@ -74,7 +74,7 @@ fn sum_regions(
         var region = NO_REGION_KEY;
         if x < view.width_px && y < view.height_px {
             let at = (y - view.first_tile_row * TILE_SIZE_PX) * view.width_px + x;
-            region = regions_of_pixels[at / 2u] >> (at % 2u * REGION_BITS) & NO_REGION_KEY;
+            region = (regions_of_pixels[at / 2u] >> (at % 2u * REGION_BITS)) & NO_REGION_KEY;
         }
         pixel_keys[thread] = (region << PIXEL_BITS) | thread;
     }

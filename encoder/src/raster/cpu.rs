@@ -45,11 +45,12 @@ struct CpuScene<'s> {
 }
 
 impl LoadedScene for CpuScene<'_> {
-    fn weights_timed(
+    fn weights_and_times(
         &self,
         view: &RasterView,
         regions: &RegionMap,
         kind: WeightKind,
+        _: bool,
     ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
         check_view(view)?;
         check_regions(regions, &view.intrinsics)?;

@@ -258,22 +258,14 @@ impl SharedScene<'_> {
 }
 
 impl LoadedScene for SharedScene<'_> {
-    fn weights(
+    fn weights_and_times(
         &self,
         view: &RasterView,
         regions: &RegionMap,
         kind: WeightKind,
-    ) -> Result<ViewWeights, RasterError> {
-        self.run(|scene| scene.weights(view, regions, kind))
-    }
-
-    fn weights_timed(
-        &self,
-        view: &RasterView,
-        regions: &RegionMap,
-        kind: WeightKind,
+        is_timed: bool,
     ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
-        self.run(|scene| scene.weights_timed(view, regions, kind))
+        self.run(|scene| scene.weights_and_times(view, regions, kind, is_timed))
     }
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {

@@ -59,11 +59,11 @@ pub trait LoadedScene: Send + Sync {
         regions: &RegionMap,
         kind: WeightKind,
     ) -> Result<ViewWeights, RasterError> {
-        Ok(self.weights_timed(view, regions, kind)?.0)
+        Ok(self.weights_and_times(view, regions, kind, false)?.0)
     }
 
-    /// Returns [`Self::weights`] and the duration of each stage, in order; empty if the backend does not measure them. To
-    /// measure may take time.
+    /// Returns [`Self::weights`] and the duration of each stage, in order; empty if the backend does not measure them.
+    /// Measuring may slow the view down.
     ///
     /// # Errors
     /// Those of [`Self::weights`].
@@ -72,6 +72,20 @@ pub trait LoadedScene: Send + Sync {
         view: &RasterView,
         regions: &RegionMap,
         kind: WeightKind,
+    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
+        self.weights_and_times(view, regions, kind, true)
+    }
+
+    /// Returns what [`Self::weights_timed`] returns; where no times are wanted, there may be none.
+    ///
+    /// # Errors
+    /// Those of [`Self::weights`].
+    fn weights_and_times(
+        &self,
+        view: &RasterView,
+        regions: &RegionMap,
+        kind: WeightKind,
+        is_timed: bool,
     ) -> Result<(ViewWeights, Vec<StageTime>), RasterError>;
 
     /// Draws the scene over a background colour, in the colour space of its training.

@@ -44,7 +44,7 @@ fn digit(item: u32) -> u32 {
     if job.shift >= job.low_bits {
         return ((keys[word] - job.least) >> (job.shift - job.low_bits)) % RADIX;
     }
-    return (keys[word + 1u] >> job.shift | keys[word] << (job.low_bits - job.shift)) % RADIX;
+    return ((keys[word + 1u] >> job.shift) | (keys[word] << (job.low_bits - job.shift))) % RADIX;
 }
 
 var<workgroup> block_histogram: array<atomic<u32>, RADIX>;

@@ -7,10 +7,21 @@ use super::jobs::{
     DISPATCH_BYTES, ENTRY_WORDS, JOB_STRIDE_BYTES, MAX_PASSES, PAIR_WORDS, SCAN_JOBS, write_jobs,
 };
 use super::layout::{Capacities, screen_layout};
-use super::shader::{Counter, RADIX, SORT_BLOCK, WORKGROUP_SIZE};
+use super::shader::{Counter, RADIX, REGION_BITS, SORT_BLOCK, WORKGROUP_SIZE};
 
 /// Size of the counters, bytes.
 pub const COUNTERS_BYTES: u64 = 64;
+
+/// Size of the parameters of a band, with room to spare, bytes.
+pub const VIEW_BYTES: u64 = 256;
+
+/// Size of a pixel's region, bytes.
+pub const REGION_BYTES: u64 = REGION_BITS as u64 / 8;
+
+/// Returns the size of the regions of so many pixels, in whole words, bytes.
+pub fn regions_bytes(n_px: usize) -> u64 {
+    (n_px as u64 * REGION_BYTES).next_multiple_of(4)
+}
 
 /// Sizes for which buffers are created.
 #[derive(Clone, Copy)]
@@ -59,7 +70,7 @@ impl Buffers {
             (u64::from(capacities.visible), u64::from(capacities.pairs), u64::from(capacities.entries));
         let largest = visible.max(pairs).max(entries);
         let buffers = Self {
-            view: storage("view", 64)?,
+            view: storage("view", VIEW_BYTES / 4)?,
             counters: storage("counters", COUNTERS_BYTES / 4)?,
             dispatches: device.buffer(
                 "dispatches",
@@ -80,7 +91,7 @@ impl Buffers {
             members: storage("members", pairs)?,
             ranges: storage("ranges", 2 * u64::from(n_tiles))?,
             tile_order: storage("order of tiles", n_tiles.into())?,
-            regions: storage("regions", n_px.div_ceil(2).into())?,
+            regions: storage("regions", regions_bytes(n_px as usize) / 4)?,
             entries: storage("entries", entries * u64::from(ENTRY_WORDS))?,
             entry_order: [storage("order of entries", entries)?, storage("order of entries", entries)?],
             region_sums: storage("region sums", entries * 4)?,

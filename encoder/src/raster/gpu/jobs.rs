@@ -131,7 +131,7 @@ pub fn write_jobs(device: &Device, jobs: &wgpu::Buffer, capacities: Capacities) 
     write_sort_jobs(device, jobs, capacities, (SortKey::Tile, 0));
 }
 
-/// Writes the records of a sort whose keys have `low_bits` bits of a second word.
+/// Writes the records of the passes of a sort. `low_bits` of the key lie in its second word; 0 if it has one word.
 pub fn write_sort_jobs(
     device: &Device,
     jobs: &wgpu::Buffer,

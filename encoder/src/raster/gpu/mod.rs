@@ -39,12 +39,12 @@ use super::view::RasterView;
 use super::weights::{RegionWeight, StageTime, ViewCounters, ViewWeights, WeightKind};
 use crate::masks::RegionMap;
 use band::{Band, band_size};
-use buffers::Size;
+use buffers::{REGION_BYTES, Size};
 use chunk::{SCENE_GAUSSIAN_BYTES, SceneChunk};
 pub use device::{Adapter, Device, adapters};
 use layout::{Capacities, RegionSum, SceneGaussian, ViewBlock, screen_layout};
 use shader::{Counter, MAX_DISPATCH, REGION_BITS, WORKGROUP_SIZE};
-use workspace::{Counts, PIXEL_BYTES, REGION_BYTES, Workspace};
+use workspace::{Counts, PIXEL_BYTES, Workspace};
 
 /// A backend on one GPU.
 pub struct GpuRasterizer {
@@ -380,15 +380,14 @@ struct Rows {
 /// Largest number of regions in a view; the next number stands for "no region".
 const MAX_REGIONS: u32 = (1 << REGION_BITS) - 1;
 
-impl GpuScene<'_> {
-    /// Returns the contributions of a view, and adds the duration of each stage to `times`.
-    fn contributions(
+impl LoadedScene for GpuScene<'_> {
+    fn weights_and_times(
         &self,
         view: &RasterView,
         regions: &RegionMap,
         kind: WeightKind,
-        mut times: Option<&mut Vec<StageTime>>,
-    ) -> Result<ViewWeights, RasterError> {
+        is_timed: bool,
+    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
         check_view(view)?;
         check_regions(regions, &view.intrinsics)?;
         if regions.n_regions > MAX_REGIONS {
@@ -398,6 +397,7 @@ impl GpuScene<'_> {
         if self.chunks.is_empty() {
             return Ok(Default::default());
         }
+        let mut times = is_timed.then(Vec::new);
         let mut entries: Vec<RegionWeight> = Vec::new();
         let mut sums: Vec<RegionSum> = Vec::new();
         let counters = self.each_band(view, REGION_BYTES, |workspace, band, rows| {
@@ -406,36 +406,14 @@ impl GpuScene<'_> {
                 false => sums.extend(found),
             };
             let regions_and_kind = (&regions.region_of_pixel[rows.px], regions.n_regions, kind);
-            workspace.contributions(band, regions_and_kind, times.as_deref_mut(), &mut take)
+            workspace.contributions(band, regions_and_kind, times.as_mut(), &mut take)
         })?;
         sums.sort_unstable_by_key(|sum| (sum.gaussian, sum.region));
         entries.extend(
             sums.chunk_by(|a, b| (a.gaussian, a.region) == (b.gaussian, b.region))
                 .map(|same| same[0].weight(same.iter().map(RegionSum::fixed).sum())),
         );
-        Ok(ViewWeights { entries, counters })
-    }
-}
-
-impl LoadedScene for GpuScene<'_> {
-    fn weights(
-        &self,
-        view: &RasterView,
-        regions: &RegionMap,
-        kind: WeightKind,
-    ) -> Result<ViewWeights, RasterError> {
-        self.contributions(view, regions, kind, None)
-    }
-
-    fn weights_timed(
-        &self,
-        view: &RasterView,
-        regions: &RegionMap,
-        kind: WeightKind,
-    ) -> Result<(ViewWeights, Vec<StageTime>), RasterError> {
-        let mut times = Vec::new();
-        let weights = self.contributions(view, regions, kind, Some(&mut times))?;
-        Ok((weights, times))
+        Ok((ViewWeights { entries, counters }, times.unwrap_or_default()))
     }
 
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError> {

@@ -7,7 +7,7 @@ use wgpu::BufferUsages as Usage;
 
 use super::band::Band;
 use super::bindings::{bind, dispatch, number, whole};
-use super::buffers::{Buffers, COUNTERS_BYTES, Size};
+use super::buffers::{Buffers, COUNTERS_BYTES, Size, VIEW_BYTES, regions_bytes};
 use super::chunk::SceneChunk;
 use super::device::Device;
 use super::jobs::{SortKey, bits_of, depth_keys, write_sort_jobs};
@@ -23,17 +23,6 @@ pub type Counts = [u32; Counter::ALL.len()];
 
 /// Size of the data before the contributions in the staging buffer: counters and timestamps.
 const HEAD_BYTES: u64 = (COUNTERS_BYTES + TIMESTAMPS_BYTES).next_multiple_of(256);
-
-/// Size of the parameters of a band in its buffers, bytes.
-const VIEW_BYTES: u64 = 256;
-
-/// Returns the size of the regions of so many pixels, in whole words, bytes.
-fn region_bytes(n_px: usize) -> u64 {
-    (n_px as u64 * REGION_BYTES).next_multiple_of(4)
-}
-
-/// Size of a pixel's region, bytes.
-pub const REGION_BYTES: u64 = 2;
 
 /// Size of a drawn pixel, bytes.
 pub const PIXEL_BYTES: u64 = 20;
@@ -59,7 +48,7 @@ impl Workspace {
     /// Creates a workspace; `None` if the device memory does not suffice.
     pub fn new(device: &Device, size: Size) -> Option<Self> {
         let Size { capacities, n_tiles, n_px, .. } = size;
-        let uploads_bytes = VIEW_BYTES + region_bytes(n_px as usize);
+        let uploads_bytes = VIEW_BYTES + regions_bytes(n_px as usize);
         let n_copied = (capacities.entries / 4).clamp(1, 1 << 16);
         Some(Self {
             capacities,
@@ -196,7 +185,7 @@ impl Workspace {
         bytes.resize(VIEW_BYTES as usize, 0);
         // Two a word: `NO_REGION` stays the largest number.
         bytes.extend(regions.iter().flat_map(|region| (*region as u16).to_le_bytes()));
-        bytes.resize((VIEW_BYTES + region_bytes(regions.len())) as usize, 0);
+        bytes.resize((VIEW_BYTES + regions_bytes(regions.len())) as usize, 0);
         let mut mapped = self
             .uploads
             .get_mapped_range_mut(..bytes.len() as u64)
