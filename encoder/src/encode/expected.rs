@@ -21,15 +21,18 @@ const VIEWS_PER_SAMPLE: usize = 16;
 const MAX_SAMPLES: usize = 6;
 /// Gaussians that are looked at for all views, to tell how far they see.
 const MAX_TESTS: usize = 1 << 24;
-// Measured with the embedded models, 1 to 4 threads and 0.1 to 2.1 million Gaussians.
+// Measured with the embedded models, 1 to 16 threads and 0.1 to 2.1 million Gaussians.
 /// ONNX Runtime's code, as far as models use it, its environment, and what they leave behind.
-const RUNTIME_BYTES: u64 = 40 << 20;
+const RUNTIME_BYTES: u64 = 60 << 20;
 /// What a session takes beside its weights, and what the allocator keeps for each thread.
-const SESSION_BYTES: u64 = 18 << 20;
+const SESSION_BYTES: u64 = 4 << 20;
+/// What a GPU's driver keeps in the process, and what each view takes that is with it: copies of all that goes there and back.
+const DEVICE_BYTES: u64 = 140 << 20;
+const DEVICE_BYTES_PER_VIEW: u64 = 10 << 20;
 /// What the processor's rasteriser takes for each Gaussian in a view's frustum, most of them hidden: projected and in tiles.
-const RASTER_BYTES_PER_VISIBLE: u64 = 190;
+const RASTER_BYTES_PER_VISIBLE: u64 = 110;
 /// And for each Gaussian that the view shows: blended.
-const RASTER_BYTES_PER_ENTRY: u64 = 300;
+const RASTER_BYTES_PER_ENTRY: u64 = 200;
 
 /// Reserves what the views and their contributions are expected to take. `models`: bytes of the image model's files, if it
 /// has any.
@@ -49,10 +52,14 @@ pub(super) fn reserve(
         expect(Phase::Views, "a model of each thread", n_threads * model_bytes);
     }
     expect(Phase::Always, "sessions and allocations of each thread", n_threads * SESSION_BYTES);
-    if scene.concurrency().is_none() {
-        let n_visible = sample.n_visible_in_mean_of(views, &inputs.scene.means_in_world);
-        let of_view_bytes = n_visible * RASTER_BYTES_PER_VISIBLE + sample.n_entries * RASTER_BYTES_PER_ENTRY;
-        expect(Phase::Views, "views that are rasterised", n_threads * of_view_bytes);
+    if let Some(n_at_once) = scene.concurrency() {
+        expect(Phase::Always, "a GPU's driver", DEVICE_BYTES);
+        expect(Phase::Views, "views on a GPU", n_at_once as u64 * DEVICE_BYTES_PER_VIEW);
+    } else {
+        let n_visible = sample.n_visible_at_once(views, &inputs.scene.means_in_world, settings.run.threads);
+        let n_entries = n_threads * sample.n_entries;
+        let len_bytes = n_visible * RASTER_BYTES_PER_VISIBLE + n_entries * RASTER_BYTES_PER_ENTRY;
+        expect(Phase::Views, "views that are rasterised", len_bytes);
     }
     let rest_bytes = memory.rest(0).unwrap_or(0);
     let cells_bytes = memory.rest_of(Phase::Cells);
@@ -62,10 +69,12 @@ pub(super) fn reserve(
     for phase in [Phase::Objects, Phase::Refine, Phase::Cells] {
         expect(phase, "contributions of all views", kept_bytes);
     }
-    let n_cells = (inputs.split.cells.len() as u64).min(n_threads);
+    expect(Phase::Cells, "contributions that are gone through", group_bytes);
     let largest_bytes = shard::largest_cell_bytes(&inputs.split, dim);
-    let n_at_once = n_cells.min(cells_bytes.saturating_sub(2 * kept_bytes) / largest_bytes.max(1)).max(1);
-    expect(Phase::Cells, "cells at once", n_at_once * shard::expected_bytes(largest_bytes));
+    let n_that_fit = cells_bytes.saturating_sub(2 * kept_bytes) / largest_bytes.max(1);
+    let n_at_once = n_threads.min(n_that_fit).max(1) as usize;
+    let cells_bytes = shard::largest_cells_bytes(&inputs.split, dim, n_at_once);
+    expect(Phase::Cells, "cells at once", shard::expected_bytes(cells_bytes));
     if settings.cells.objects {
         expect(Phase::Objects, "masks of superpoints", objects::expected_bytes(n_entries));
         expect(Phase::Objects, "contributions that are gone through", group_bytes);
@@ -93,15 +102,24 @@ impl<'v> Sample<'v> {
         Self { views: sampled, n_visible, n_entries }
     }
 
-    /// Returns how many Gaussians are in the frustum of the mean of all views: few see far, but these hold the most.
-    fn n_visible_in_mean_of(&self, views: &[&View], means_in_world: &[DVec3]) -> u64 {
+    /// Returns how many Gaussians are in the frusta of views that are worked on at the same time, at most: of `n_at_once` that
+    /// follow one another. Few views see far, but these hold the most, and they lie together.
+    fn n_visible_at_once(&self, views: &[&View], means_in_world: &[DVec3], n_at_once: usize) -> u64 {
         let step = (means_in_world.len() * views.len() / MAX_TESTS).max(1);
-        let before = |views: &[&View]| -> f64 {
-            let n: u64 = views.par_iter().map(|view| n_before(means_in_world, step, view)).sum();
-            n as f64 / views.len().max(1) as f64
+        let before = |views: &[&View]| -> Vec<u64> {
+            views.par_iter().map(|view| n_before(means_in_world, step, view)).collect()
         };
-        (before(views) / before(&self.views).max(1.0) * self.n_visible as f64) as u64
+        let of_sample: u64 = before(&self.views).iter().sum();
+        let n_sampled = self.n_visible * self.views.len() as u64;
+        let most = most_in_a_row(&before(views), n_at_once);
+        (most as f64 / of_sample.max(1) as f64 * n_sampled as f64) as u64
     }
+}
+
+/// Returns the largest sum of `n` numbers that follow one another, or of all if they are fewer.
+fn most_in_a_row(numbers: &[u64], n: usize) -> u64 {
+    let n = n.clamp(1, numbers.len().max(1));
+    numbers.windows(n).map(|numbers| numbers.iter().sum()).max().unwrap_or(0)
 }
 
 /// Rasterises a view as one region; returns how many Gaussians are visible and how many contribute.
@@ -128,4 +146,18 @@ fn n_before(means_in_world: &[DVec3], step: usize, view: &View) -> u64 {
             && (0.0..f64::from(height_px)).contains(&y_px)
     };
     means_in_world.iter().step_by(step).filter(is_before).count() as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// By hand.
+    #[test]
+    fn views_that_see_far_lie_together() {
+        assert_eq!(most_in_a_row(&[1, 5, 4, 1, 7], 2), 9);
+        assert_eq!(most_in_a_row(&[1, 5, 4, 1, 7], 1), 7);
+        assert_eq!(most_in_a_row(&[1, 5], 16), 6);
+        assert_eq!(most_in_a_row(&[], 2), 0);
+    }
 }

@@ -90,15 +90,22 @@ pub fn largest_cell_bytes(split: &CellSplit, dim: usize) -> u64 {
     working_bytes(split.cells.iter().map(|cell| cell.gaussians.len()).max().unwrap_or(0), dim)
 }
 
+/// Returns the bytes that building the shards of a scene's `n` largest cells takes at the same time.
+pub fn largest_cells_bytes(split: &CellSplit, dim: usize, n: usize) -> u64 {
+    let mut sizes: Vec<usize> = split.cells.iter().map(|cell| cell.gaussians.len()).collect();
+    sizes.sort_unstable_by_key(|n_gaussians| std::cmp::Reverse(*n_gaussians));
+    sizes.iter().take(n).map(|n_gaussians| working_bytes(*n_gaussians, dim)).sum()
+}
+
 /// Reserves the bytes of the largest cell.
 pub fn reserve(memory: &mut MemoryPlan, split: &CellSplit, dim: usize) {
     memory.reserve_expecting(Phase::Cells, "the largest cell", largest_cell_bytes(split, dim), 0);
 }
 
-/// Returns the bytes that a cell of at most `len_bytes` is expected to take: the precision of the default needs half of the
-/// coordinates, and without the exact profile there are no embeddings in f16.
+/// Returns the bytes that cells of at most `len_bytes` are expected to take, as measured: the precision of the default needs half
+/// of the coordinates, and without the exact profile there are no embeddings in f16.
 pub fn expected_bytes(len_bytes: u64) -> u64 {
-    len_bytes / 2
+    len_bytes / 20 * 9
 }
 
 /// What a cell's shards carry besides Gaussians and their embeddings.
