@@ -62,7 +62,7 @@ pub(super) fn reserve(
         expect(Phase::Views, "views that are rasterised", len_bytes);
     }
     let rest_bytes = memory.rest(0).unwrap_or(0);
-    let cells_bytes = memory.rest_of(Phase::Cells);
+    let free_for_cells_bytes = memory.rest_of(Phase::Cells);
     let (kept_bytes, group_bytes) =
         ContributionIndex::expected_bytes(n_entries, n_gaussians, n_threads, rest_bytes);
     let mut expect = |phase, purpose, len_bytes| memory.reserve_expecting(phase, purpose, 0, len_bytes);
@@ -71,7 +71,7 @@ pub(super) fn reserve(
     }
     expect(Phase::Cells, "contributions that are gone through", group_bytes);
     let largest_bytes = shard::largest_cell_bytes(&inputs.split, dim);
-    let n_that_fit = cells_bytes.saturating_sub(2 * kept_bytes) / largest_bytes.max(1);
+    let n_that_fit = free_for_cells_bytes.saturating_sub(2 * kept_bytes) / largest_bytes.max(1);
     let n_at_once = n_threads.min(n_that_fit).max(1) as usize;
     let cells_bytes = shard::largest_cells_bytes(&inputs.split, dim, n_at_once);
     expect(Phase::Cells, "cells at once", shard::expected_bytes(cells_bytes));

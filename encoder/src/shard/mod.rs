@@ -87,7 +87,7 @@ pub fn working_bytes(n_gaussians: usize, dim: usize) -> u64 {
 
 /// Returns the bytes that building the shards of a scene's largest cell takes.
 pub fn largest_cell_bytes(split: &CellSplit, dim: usize) -> u64 {
-    working_bytes(split.cells.iter().map(|cell| cell.gaussians.len()).max().unwrap_or(0), dim)
+    largest_cells_bytes(split, dim, 1)
 }
 
 /// Returns the bytes that building the shards of a scene's `n` largest cells takes at the same time.
