@@ -24,7 +24,7 @@ pub struct CheckArgs {
     /// Views to render, evenly spread.
     #[arg(long, default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..))]
     pub samples: u32,
-    /// Device to render on: auto, gpu, cpu, or the number of an adapter (`devices`).
+    /// Device to render on: auto, gpu, cpu, or numbers of adapters (`devices`).
     #[arg(long, value_name = "DEVICE", default_value_t)]
     pub device: DeviceChoice,
     /// Width to render at, pixels.
@@ -90,7 +90,7 @@ pub(super) fn run(args: &CheckArgs, json: bool) -> Result<Exit> {
         frames,
         ..CheckOptions::default()
     };
-    let devices = Devices::open(args.device, GpuOptions::default())?;
+    let devices = Devices::open(&args.device, GpuOptions::default())?;
     let mut report = check::check(&scene, views, &devices, &options)?;
     // Cameras were in the stated frame already; what is reported and written begins at the poses.
     if let (Some(stated), Some(diagnosis)) = (stated, &mut report.diagnosis) {

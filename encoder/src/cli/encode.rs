@@ -85,7 +85,8 @@ pub struct EncodeArgs {
     /// Which views come first, and how long to go on.
     #[command(flatten)]
     pub views: ViewsArgs,
-    /// Where weights are rasterised: auto (GPUs, else the CPU), gpu, cpu, or an adapter's number.
+    /// Where weights are rasterised: auto (all GPUs, else the CPU), gpu, cpu, or numbers of `slag-encoder devices` such as
+    /// 0,1. --gpus names the GPUs of models.
     #[arg(long, value_name = "DEVICE", default_value_t)]
     pub device: DeviceChoice,
     /// Width at which weights are rasterised: a number of pixels, `photo` for the photo's own width, at most 1024, or
@@ -311,7 +312,7 @@ pub(super) fn remake(command: &CommandRecord, store: &Path, progress: &dyn Progr
     std::env::set_current_dir(folder).with_context(|| format!("the encode ran in {}", folder.display()))?;
     let (settings, _) = settings_and_target(&args)?;
     let (models, session) = open_models(&args.models)?;
-    let devices = Devices::open(args.device, GpuOptions::default())?;
+    let devices = Devices::open(&args.device, GpuOptions::default())?;
     let engines = Engines::new(&models, &session, &devices);
     Ok(encode::remake(&settings, &engines, progress, cancel_flag()?.as_ref())?)
 }
@@ -322,7 +323,7 @@ pub(super) fn run(args: &EncodeArgs, progress: &dyn Progress, json: bool) -> Res
     let (models, session) = open_models(&args.models)?;
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());
     settings.run.gpus = args.gpus.numbers(&session);
-    let devices = Devices::open(args.device, GpuOptions::default())?;
+    let devices = Devices::open(&args.device, GpuOptions::default())?;
     let engines = Engines::new(&models, &session, &devices);
     let cancel = cancel_flag()?;
     let watched = Watched::begin(&args.watch, &settings, &args.models, &cancel)?;

@@ -166,7 +166,7 @@ pub(super) fn run(args: &WorkerArgs, json: bool) -> Result<Exit> {
         stays: args.stay,
     };
     tracing::info!("models: {} ({})", models.encoder_id(), models.about());
-    let devices = Devices::open(args.device, GpuOptions::default())?;
+    let devices = Devices::open(&args.device, GpuOptions::default())?;
     let engines = Engines::new(&models, &session, &devices);
     let cancel = cancel_flag()?;
     // The coordinator shows the progress of the fleet.

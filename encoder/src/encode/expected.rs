@@ -5,7 +5,7 @@
 
 use glam::DVec3;
 use rayon::prelude::*;
-use slag_common::{Intrinsics, View};
+use slag_common::View;
 
 use super::inputs::Inputs;
 use super::settings::EncodeSettings;
@@ -23,7 +23,7 @@ const MAX_SAMPLES: usize = 6;
 const MAX_TESTS: usize = 1 << 24;
 // Measured with the embedded models, 1 to 16 threads and 0.1 to 2.1 million Gaussians.
 /// ONNX Runtime's code, as far as models use it, its environment, and what they leave behind.
-const RUNTIME_BYTES: u64 = 60 << 20;
+const RUNTIME_BYTES: u64 = 56 << 20;
 /// What a session takes beside its weights, and what the allocator keeps for each thread.
 const SESSION_BYTES: u64 = 4 << 20;
 /// What a GPU's driver keeps in the process, and what each view takes that is with it: copies of all that goes there and back.
@@ -52,9 +52,9 @@ pub(super) fn reserve(
         expect(Phase::Views, "a model of each thread", n_threads * model_bytes);
     }
     expect(Phase::Always, "sessions and allocations of each thread", n_threads * SESSION_BYTES);
-    if let Some(n_at_once) = scene.concurrency() {
-        expect(Phase::Always, "a GPU's driver", DEVICE_BYTES);
-        expect(Phase::Views, "views on a GPU", n_at_once as u64 * DEVICE_BYTES_PER_VIEW);
+    if let Some(gpus) = scene.gpus() {
+        expect(Phase::Always, "drivers of GPUs", gpus.n_gpus as u64 * DEVICE_BYTES);
+        expect(Phase::Views, "views on GPUs", gpus.n_views() as u64 * DEVICE_BYTES_PER_VIEW);
     } else {
         let n_visible = sample.n_visible_at_once(views, &inputs.scene.means_in_world, settings.run.threads);
         let n_entries = n_threads * sample.n_entries;
@@ -136,14 +136,12 @@ fn count(settings: &EncodeSettings, scene: &dyn LoadedScene, view: &View) -> Opt
 
 /// Returns how many of every `step`-th mean lie before a view.
 fn n_before(means_in_world: &[DVec3], step: usize, view: &View) -> u64 {
-    let Intrinsics { focal_x_px, focal_y_px, centre_x_px, centre_y_px, width_px, height_px, .. } =
-        view.intrinsics;
     let is_before = |mean: &&DVec3| {
         let at = view.camera_from_world.transform_point3(**mean);
-        let (x_px, y_px) = (focal_x_px * at.x / at.z + centre_x_px, focal_y_px * at.y / at.z + centre_y_px);
+        let [x_px, y_px] = view.intrinsics.pixel_from_distorted([at.x / at.z, at.y / at.z]);
         at.z > 0.0
-            && (0.0..f64::from(width_px)).contains(&x_px)
-            && (0.0..f64::from(height_px)).contains(&y_px)
+            && (0.0..f64::from(view.intrinsics.width_px)).contains(&x_px)
+            && (0.0..f64::from(view.intrinsics.height_px)).contains(&y_px)
     };
     means_in_world.iter().step_by(step).filter(is_before).count() as u64
 }

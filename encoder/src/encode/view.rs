@@ -25,7 +25,7 @@ use crate::masks::regions::{absorb_slivers, partition};
 use crate::masks::windows::Windows;
 use crate::masks::{self, Mask, RegionMap};
 use crate::progress::ViewEvent;
-use crate::raster::{LoadedScene, RasterError, RasterView};
+use crate::raster::{GpuSlots, LoadedScene, RasterError, RasterView};
 use crate::segment::{SegmentInput, Segmenter};
 
 /// Width of pictures of masks for people.
@@ -157,6 +157,7 @@ impl<'a> ViewStages<'a> {
     /// Returns the stages, in the order in which [`Self::step`] goes through them.
     pub(super) fn stages(&self) -> Vec<Stage> {
         let n_cores = self.tools.n_threads;
+        let raster_slots = self.tools.scene.gpus().map(GpuSlots::n_views);
         let on_cpu = |name| Stage { name, n_slots: n_cores, on_cpu: true };
         let on_device = |name, n_slots: Option<usize>| match n_slots {
             Some(n_slots) => Stage { name, n_slots, on_cpu: false },
@@ -169,13 +170,13 @@ impl<'a> ViewStages<'a> {
         let fetch = self.tools.photos.map(|photos| on_device("fetch", Some(photos.n_at_once())));
         let mut stages: Vec<Stage> = fetch.into_iter().chain([on_cpu("decode")]).collect();
         if self.tools.segmenter.wants_depth() {
-            stages.push(on_device("depth", self.tools.scene.concurrency()));
+            stages.push(on_device("depth", raster_slots));
         }
         stages.extend([
             on_device("segment", self.tools.segmenter.concurrency()),
             on_cpu("crop"),
             on_device("embed", embed_slots),
-            on_device("raster", self.tools.scene.concurrency()),
+            on_device("raster", raster_slots),
             on_device("write", Some(self.tools.sink.n_at_once())),
         ]);
         stages

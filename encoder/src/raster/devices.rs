@@ -1,5 +1,6 @@
 //! The devices for rasterisation: GPUs that share the views, or the CPU.
 
+use std::collections::BTreeSet;
 use std::fmt;
 use std::str::FromStr;
 use std::sync::{Condvar, Mutex, PoisonError};
@@ -10,13 +11,13 @@ use super::cpu::CpuRasterizer;
 use super::draw::Drawing;
 use super::error::RasterError;
 use super::gpu::{Adapter, GpuOptions, GpuRasterizer, adapters};
-use super::rasterizer::{LoadedScene, Rasterizer};
+use super::rasterizer::{GpuSlots, LoadedScene, Rasterizer};
 use super::view::RasterView;
 use super::weights::{StageTime, ViewWeights, WeightKind};
 use crate::masks::RegionMap;
 
 /// The choice of the user.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum DeviceChoice {
     /// All GPUs, or the CPU if there are none. Software adapters (llvmpipe, WARP) are ignored.
     #[default]
@@ -25,23 +26,30 @@ pub enum DeviceChoice {
     Gpu,
     /// The CPU.
     Cpu,
-    /// The adapter with this number in the list.
-    Adapter(usize),
+    /// The adapters with these numbers in the list.
+    Adapters(Vec<usize>),
 }
 
 impl FromStr for DeviceChoice {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
+        let wrong = || {
+            format!(
+                "{text:?}: expected auto, gpu, cpu or numbers of adapters such as 0,1, listed by `slag-encoder devices`"
+            )
+        };
         match text {
             "auto" => Ok(Self::Auto),
             "gpu" => Ok(Self::Gpu),
             "cpu" => Ok(Self::Cpu),
-            _ => text.parse().map(Self::Adapter).map_err(|_| {
-                format!(
-                    "{text:?}: expected auto, gpu, cpu or the number of an adapter, listed by `slag-encoder devices`"
-                )
-            }),
+            _ => {
+                let numbers: Option<Vec<usize>> =
+                    text.split(',').map(|number| number.trim().parse().ok()).collect();
+                let is_distinct =
+                    |numbers: &Vec<usize>| numbers.iter().collect::<BTreeSet<_>>().len() == numbers.len();
+                numbers.filter(is_distinct).map(Self::Adapters).ok_or_else(wrong)
+            }
         }
     }
 }
@@ -52,7 +60,9 @@ impl fmt::Display for DeviceChoice {
             Self::Auto => f.write_str("auto"),
             Self::Gpu => f.write_str("gpu"),
             Self::Cpu => f.write_str("cpu"),
-            Self::Adapter(number) => write!(f, "{number}"),
+            Self::Adapters(numbers) => {
+                f.write_str(&numbers.iter().map(ToString::to_string).collect::<Vec<_>>().join(","))
+            }
         }
     }
 }
@@ -90,16 +100,19 @@ impl Devices {
     ///
     /// # Errors
     /// [`DeviceError`] if no chosen device works and the choice excludes the CPU.
-    pub fn open(choice: DeviceChoice, options: GpuOptions) -> Result<Self, DeviceError> {
+    pub fn open(choice: &DeviceChoice, options: GpuOptions) -> Result<Self, DeviceError> {
         let views_in_flight = options.views_in_flight.max(1);
-        let all = if choice == DeviceChoice::Cpu { Vec::new() } else { adapters() };
+        let all = if *choice == DeviceChoice::Cpu { Vec::new() } else { adapters() };
         let n_adapters = all.len();
         let chosen: Vec<Adapter> = match choice {
             DeviceChoice::Cpu => Vec::new(),
-            DeviceChoice::Adapter(number) => match all.into_iter().nth(number) {
-                Some(adapter) => vec![adapter],
-                None => return Err(DeviceError::NoSuchAdapter { number, n_adapters }),
-            },
+            DeviceChoice::Adapters(numbers) => {
+                if let Some(number) = numbers.iter().copied().find(|number| *number >= n_adapters) {
+                    return Err(DeviceError::NoSuchAdapter { number, n_adapters });
+                }
+                let chosen = all.into_iter().enumerate().filter(|(number, _)| numbers.contains(number));
+                chosen.map(|(_, adapter)| adapter).collect()
+            }
             DeviceChoice::Auto | DeviceChoice::Gpu => {
                 // A GPU appears once per graphics interface; within the interface of the best adapter, GPUs are distinct.
                 let backend = all.first().map(|a| a.report.backend.clone());
@@ -107,7 +120,7 @@ impl Devices {
                     .into_iter()
                     .filter(|a| Some(&a.report.backend) == backend.as_ref())
                     .partition(|a| a.report.is_software());
-                if hardware.is_empty() && choice == DeviceChoice::Gpu { software } else { hardware }
+                if hardware.is_empty() && *choice == DeviceChoice::Gpu { software } else { hardware }
             }
         };
         let mut gpus = Vec::new();
@@ -272,7 +285,7 @@ impl LoadedScene for SharedScene<'_> {
         self.run(|scene| scene.draw(view, background))
     }
 
-    fn concurrency(&self) -> Option<usize> {
-        Some(self.gpus.len() * self.views_in_flight)
+    fn gpus(&self) -> Option<GpuSlots> {
+        Some(GpuSlots { n_gpus: self.gpus.len(), views_in_flight: self.views_in_flight })
     }
 }

@@ -38,6 +38,6 @@ mod weights;
 pub use cpu::{CpuRasterizer, CpuWith};
 pub use draw::Drawing;
 pub use error::RasterError;
-pub use rasterizer::{LoadedScene, Rasterizer};
+pub use rasterizer::{GpuSlots, LoadedScene, Rasterizer};
 pub use view::RasterView;
 pub use weights::{RegionWeight, StageTime, ViewCounters, ViewWeights, WeightKind};

@@ -8,6 +8,22 @@ use super::view::RasterView;
 use super::weights::{StageTime, ViewWeights, WeightKind};
 use crate::masks::RegionMap;
 
+/// The GPUs that rasterise a scene.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct GpuSlots {
+    /// Number of GPUs.
+    pub n_gpus: usize,
+    /// Views that each of them works on at once.
+    pub views_in_flight: usize,
+}
+
+impl GpuSlots {
+    /// Returns the number of views that all of them work on at once.
+    pub fn n_views(self) -> usize {
+        self.n_gpus * self.views_in_flight
+    }
+}
+
 /// A backend that rasterises scenes.
 pub trait Rasterizer: Send + Sync {
     /// Prepares a scene: validates it and, on a device with its own memory, uploads it.
@@ -94,8 +110,8 @@ pub trait LoadedScene: Send + Sync {
     /// [`RasterError`] for inconsistent input or if a device fails.
     fn draw(&self, view: &RasterView, background: [f32; 3]) -> Result<Drawing, RasterError>;
 
-    /// Returns the number of views that GPUs process at once; `None` if views are rasterised on the caller's threads.
-    fn concurrency(&self) -> Option<usize> {
+    /// Returns the GPUs that rasterise; `None` if views are rasterised on the caller's threads.
+    fn gpus(&self) -> Option<GpuSlots> {
         None
     }
 }

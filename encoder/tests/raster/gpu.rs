@@ -185,21 +185,27 @@ fn choices() {
         ("auto", DeviceChoice::Auto),
         ("gpu", DeviceChoice::Gpu),
         ("cpu", DeviceChoice::Cpu),
-        ("3", DeviceChoice::Adapter(3)),
+        ("3", DeviceChoice::Adapters(vec![3])),
+        ("1,0", DeviceChoice::Adapters(vec![1, 0])),
     ] {
-        assert_eq!(text.parse(), Ok(choice));
         assert_eq!(choice.to_string(), text);
+        assert_eq!(text.parse(), Ok(choice));
     }
-    assert!("fast".parse::<DeviceChoice>().unwrap_err().contains("\"fast\""));
-    let open = |choice| Devices::open(choice, GpuOptions::default());
+    for wrong in ["fast", "", "0,,1", "1,1", "-1"] {
+        assert!(wrong.parse::<DeviceChoice>().unwrap_err().contains(&format!("{wrong:?}")));
+    }
+    let open = |choice| Devices::open(&choice, GpuOptions::default());
     assert!(open(DeviceChoice::Cpu).unwrap().gpus().is_empty());
-    let error = open(DeviceChoice::Adapter(999)).err().unwrap();
+    let error = open(DeviceChoice::Adapters(vec![999, 0])).err().unwrap();
     assert!(matches!(error, DeviceError::NoSuchAdapter { number: 999, .. }), "{error}");
     // Imitated GPUs are slower than the CPU itself.
     let auto = open(DeviceChoice::Auto).unwrap();
     assert!(auto.gpus().iter().all(|gpu| !gpu.report().is_software()));
     match open(DeviceChoice::Gpu) {
-        Ok(devices) => assert!(!devices.gpus().is_empty()),
+        Ok(devices) => {
+            assert!(!devices.gpus().is_empty());
+            assert_eq!(open(DeviceChoice::Adapters(vec![0])).unwrap().gpus().len(), 1);
+        }
         Err(error) => assert!(matches!(error, DeviceError::NoAdapter) && !gpu_is_expected(), "{error}"),
     }
 }

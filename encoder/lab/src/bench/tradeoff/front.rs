@@ -14,10 +14,11 @@ impl TradeoffReport {
         let scenes = self.scenes();
         let per_view = |f: &Figures| Some(FrontCosts::of(f).seconds_per_view);
         let rest = |f: &Figures| Some(FrontCosts::of(f).seconds_per_million_gaussians);
-        let seconds = means(&self.figures, &scenes, |f| Some(f.seconds));
-        let view_costs = means(&self.figures, &scenes, per_view);
-        let rests = means(&self.figures, &scenes, rest);
-        let bytes = means(&self.figures, &scenes, |f| Some(f.bytes_per_gaussian));
+        let miou = |f: &Figures| Some(f.miou);
+        let seconds = means(&self.figures, &scenes, |f| Some(f.seconds), miou);
+        let view_costs = means(&self.figures, &scenes, per_view, miou);
+        let rests = means(&self.figures, &scenes, rest, miou);
+        let bytes = means(&self.figures, &scenes, |f| Some(f.bytes_per_gaussian), miou);
         let mut settings: Vec<(f64, FrontSetting)> = Vec::new();
         for (((seconds, view), rest), bytes) in seconds.iter().zip(view_costs).zip(rests).zip(bytes) {
             let point = seconds.point;
@@ -33,8 +34,8 @@ impl TradeoffReport {
                 seconds_per_view: view.cost,
                 seconds_per_million_gaussians: rest.cost,
                 bytes_per_gaussian: bytes.cost,
-                miou: seconds.miou,
-                miou_spread: seconds.miou_spread,
+                miou: seconds.accuracy,
+                miou_spread: seconds.spread,
             };
             settings.push((seconds.cost, setting));
         }

@@ -11,10 +11,10 @@ pub(super) struct Mean<'a> {
     pub(super) n_scenes: usize,
     /// Cost.
     pub(super) cost: f64,
-    /// Multi-class mIoU.
-    pub(super) miou: f64,
+    /// Accuracy.
+    pub(super) accuracy: f64,
     /// Its standard deviation over scenes; 0 for one scene.
-    pub(super) miou_spread: f64,
+    pub(super) spread: f64,
 }
 
 /// Returns the mean of each point that all of these scenes have, in the order of the first scene.
@@ -22,6 +22,7 @@ pub(super) fn means<'a>(
     figures: &'a [Figures],
     scenes: &[&str],
     cost: impl Fn(&Figures) -> Option<f64>,
+    accuracy: impl Fn(&Figures) -> Option<f64>,
 ) -> Vec<Mean<'a>> {
     let first = figures.iter().filter(|f| Some(f.scene.as_str()) == scenes.first().copied());
     first
@@ -30,16 +31,17 @@ pub(super) fn means<'a>(
             let of_point: Vec<&Figures> =
                 figures.iter().filter(|f| f.point == *point && scenes.contains(&f.scene.as_str())).collect();
             let costs: Vec<f64> = of_point.iter().filter_map(|f| cost(f)).collect();
+            let accuracies: Vec<f64> = of_point.iter().filter_map(|f| accuracy(f)).collect();
             let n = scenes.len();
-            if costs.len() != n {
+            if costs.len() != n || accuracies.len() != n {
                 return None;
             }
-            let mean = |values: &mut dyn Iterator<Item = f64>| values.sum::<f64>() / n as f64;
-            let miou = mean(&mut of_point.iter().map(|f| f.miou));
-            let squares = of_point.iter().map(|f| (f.miou - miou).powi(2)).sum::<f64>();
+            let mean = |values: &[f64]| values.iter().sum::<f64>() / n as f64;
+            let accuracy = mean(&accuracies);
+            let squares = accuracies.iter().map(|a| (a - accuracy).powi(2)).sum::<f64>();
             // Of a sample: divided by one less than their number.
-            let miou_spread = (squares / (n.max(2) - 1) as f64).sqrt();
-            Some(Mean { point, n_scenes: n, cost: mean(&mut costs.into_iter()), miou, miou_spread })
+            let spread = (squares / (n.max(2) - 1) as f64).sqrt();
+            Some(Mean { point, n_scenes: n, cost: mean(&costs), accuracy, spread })
         })
         .collect()
 }

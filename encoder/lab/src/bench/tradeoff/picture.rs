@@ -3,14 +3,20 @@
 use super::grid::Point;
 use super::means::means;
 use super::paper::PAPER;
-use super::report::{Cost, TradeoffReport, pareto};
+use super::report::{Accuracy, Cost, TradeoffReport, pareto};
 use crate::bench::plot::{Plot, Scale, Series, Style};
 
 impl TradeoffReport {
-    /// Draws accuracy against a cost, mean and standard deviation over scenes: a series per axis of the grid, the Pareto
+    /// Draws an accuracy against a cost, mean and standard deviation over scenes: a series per axis of the grid, the Pareto
     /// front as a staircase, and beside times those of the paper.
-    pub(super) fn svg(&self, title: &str, scenes: &[&str], cost: &Cost) -> Option<String> {
-        let means = means(&self.figures, scenes, cost.of);
+    pub(super) fn svg(
+        &self,
+        title: &str,
+        scenes: &[&str],
+        cost: &Cost,
+        accuracy: &Accuracy,
+    ) -> Option<String> {
+        let means = means(&self.figures, scenes, cost.of, accuracy.of);
         if means.is_empty() {
             return None;
         }
@@ -25,14 +31,14 @@ impl TradeoffReport {
                 series.push(Series { name: axis.clone(), style, points, labels, spreads });
             }
             if let Some(of_axis) = series.iter_mut().find(|series| series.name == *axis) {
-                of_axis.points.push((mean.cost, mean.miou));
+                of_axis.points.push((mean.cost, mean.accuracy));
                 of_axis.labels.push(label(mean.point));
                 if mean.n_scenes > 1 {
-                    of_axis.spreads.push(mean.miou_spread);
+                    of_axis.spreads.push(mean.spread);
                 }
             }
         }
-        let all: Vec<(f64, f64)> = means.iter().map(|mean| (mean.cost, mean.miou)).collect();
+        let all: Vec<(f64, f64)> = means.iter().map(|mean| (mean.cost, mean.accuracy)).collect();
         let mut front: Vec<(f64, f64)> =
             all.iter().zip(pareto(&all)).filter(|(_, front)| *front).map(|(point, _)| *point).collect();
         front.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -46,16 +52,16 @@ impl TradeoffReport {
         });
         let spread = match scenes.len() {
             1 => String::new(),
-            n => format!(" Mean and standard deviation of mIoU over {n} scenes."),
+            n => format!(" Mean and standard deviation over {n} scenes."),
         };
         let plot = Plot {
             title: format!("{title}: accuracy against {}", cost.axis),
             note: format!("{}, {} threads.{spread}", self.machine.cpu, self.machine.n_threads),
             across: cost.axis,
-            up: "multi-class mIoU",
+            up: accuracy.axis,
             up_scale: Scale::Linear,
         };
-        let beside = (cost.file == "seconds").then(|| {
+        let beside = (cost.file == "seconds" && accuracy.file.is_empty()).then(|| {
             let plot = Plot {
                 title: "the paper: SAM grid / image step".into(),
                 note: "Szilagyi et al. 2025, RA-L: ScanNet scene0000_00, 19 classes, 16 A100.".into(),

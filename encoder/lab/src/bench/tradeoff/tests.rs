@@ -29,7 +29,7 @@ fn figures(axis: &str, name: &str, seconds: f64, miou: f64) -> Figures {
         coverage: Some(0.5),
         miou,
         macc: miou,
-        map: None,
+        map: Some(miou / 2.0),
         auc: Some(0.75),
         localised: None,
         iou_on_views: None,
@@ -117,6 +117,7 @@ fn several_scenes_have_a_mean_and_a_front() {
     given.point.views = "--masks {masks}".into();
     let mut given_a = given.clone();
     given_a.scene = "a".into();
+    given_a.map = None;
     let report = TradeoffReport {
         machine: Machine::here(),
         paper: PAPER,
@@ -156,6 +157,10 @@ fn several_scenes_have_a_mean_and_a_front() {
     }
     // Presets have no order: the front is the only line.
     assert_eq!(svg.matches("<polyline").count(), 1, "{svg}");
+    // The same by average precision, without the point that has none in one scene, nor the paper's mIoU.
+    let svg = fs_err::read_to_string(dir.path().join("mean-seconds-ap.svg")).expect("reads");
+    assert!(svg.contains("mean average precision") && svg.contains(">fast<"), "{svg}");
+    assert!(!svg.contains(">given<") && !svg.contains(">16/20<"), "{svg}");
 }
 
 /// By hand. Scene a takes 0.1 s a view and 2 s a million, b 0.3 s and 4 s; each is predicted by the other's.

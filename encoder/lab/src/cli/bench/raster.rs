@@ -54,7 +54,7 @@ pub struct RasterBenchArgs {
 }
 
 /// A device to measure.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum BenchDevice {
     /// The devices of a choice.
     Chosen(DeviceChoice),
@@ -80,7 +80,7 @@ pub(super) fn run(args: &RasterBenchArgs, progress: &dyn Progress, json: bool) -
         match device {
             BenchDevice::Chosen(choice) => {
                 let options = GpuOptions { views_in_flight: args.views as usize, ..GpuOptions::default() };
-                let opened = Devices::open(*choice, options)?;
+                let opened = Devices::open(choice, options)?;
                 devices.push(Device { name: opened.names().join(", "), rasterizer: Box::new(opened) });
             }
             BenchDevice::CpuEach => devices.extend(

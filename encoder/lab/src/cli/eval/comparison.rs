@@ -17,7 +17,7 @@ pub struct ComparisonArgs {
     /// Models.
     #[command(flatten)]
     pub models: ModelArgs,
-    /// Device that rasterises: auto (GPUs, else the CPU), gpu, cpu, or an adapter's number.
+    /// Device that rasterises: auto (GPUs, else the CPU), gpu, cpu, or numbers of adapters.
     #[arg(long, value_name = "DEVICE", default_value_t)]
     pub device: DeviceChoice,
     /// Folder for the stores; a later run reuses the views there.

@@ -26,7 +26,7 @@ pub struct EvalDefaultsArgs {
 
 pub(super) fn run(args: &EvalDefaultsArgs, progress: &dyn Progress, output: &Output<'_>) -> Result<Exit> {
     let (models, session) = open_models(&args.on.models)?;
-    let devices = Devices::open(args.on.device, GpuOptions::default())?;
+    let devices = Devices::open(&args.on.device, GpuOptions::default())?;
     let mut encode = encode_settings("defaults");
     encode.cells.shards.profiles = vec![Profile::Exact];
     let settings = DefaultsSettings { scenes: args.on.scene.clone(), out: args.on.out.clone(), encode };

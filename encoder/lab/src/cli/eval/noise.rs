@@ -50,7 +50,7 @@ pub(super) fn run(args: &EvalNoiseArgs, progress: &dyn Progress, output: &Output
         return Err(anyhow!("unknown aggregation method {unknown:?}; expected one of: {}", names.join(", ")));
     }
     let (models, session) = open_models(&args.on.models)?;
-    let devices = Devices::open(args.on.device, GpuOptions::default())?;
+    let devices = Devices::open(&args.on.device, GpuOptions::default())?;
     let methods: Vec<(String, Aggregation)> = known
         .into_iter()
         .filter(|(name, _)| wanted(name))
