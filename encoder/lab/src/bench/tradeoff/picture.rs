@@ -3,7 +3,7 @@
 use super::grid::Point;
 use super::means::means;
 use super::paper::PAPER;
-use super::report::{Accuracy, Cost, TradeoffReport, pareto};
+use super::report::{Measure, TradeoffReport, pareto};
 use crate::bench::plot::{Plot, Scale, Series, Style};
 
 impl TradeoffReport {
@@ -13,8 +13,8 @@ impl TradeoffReport {
         &self,
         title: &str,
         scenes: &[&str],
-        cost: &Cost,
-        accuracy: &Accuracy,
+        cost: &Measure,
+        accuracy: &Measure,
     ) -> Option<String> {
         let means = means(&self.figures, scenes, cost.of, accuracy.of);
         if means.is_empty() {

@@ -29,32 +29,24 @@ pub struct TradeoffReport {
     pub predictions: Vec<Prediction>,
 }
 
-/// A cost to plot accuracy against.
-pub(super) struct Cost {
+/// A cost or an accuracy, for one axis of a plot.
+pub(super) struct Measure {
     /// Part of the plots' file names.
     pub(super) file: &'static str,
     pub(super) axis: &'static str,
     pub(super) of: fn(&Figures) -> Option<f64>,
 }
 
-const COSTS: [Cost; 3] = [
-    Cost { file: "seconds", axis: "seconds of the encode", of: |f| Some(f.seconds) },
-    Cost { file: "bytes", axis: "bytes per Gaussian", of: |f| Some(f.bytes_per_gaussian) },
-    Cost { file: "query", axis: "milliseconds per query", of: |f| f.query_ms },
+const COSTS: [Measure; 3] = [
+    Measure { file: "seconds", axis: "seconds of the encode", of: |f| Some(f.seconds) },
+    Measure { file: "bytes", axis: "bytes per Gaussian", of: |f| Some(f.bytes_per_gaussian) },
+    Measure { file: "query", axis: "milliseconds per query", of: |f| f.query_ms },
 ];
 
-/// An accuracy to plot.
-pub(super) struct Accuracy {
-    /// Part of the plots' file names.
-    pub(super) file: &'static str,
-    pub(super) axis: &'static str,
-    pub(super) of: fn(&Figures) -> Option<f64>,
-}
-
 /// Which word wins at a Gaussian, and which Gaussians come first for a word, as the paper and as a search judge.
-const ACCURACIES: [Accuracy; 2] = [
-    Accuracy { file: "", axis: "multi-class mIoU", of: |f| Some(f.miou) },
-    Accuracy { file: "-ap", axis: "mean average precision", of: |f| f.map },
+const ACCURACIES: [Measure; 2] = [
+    Measure { file: "", axis: "multi-class mIoU", of: |f| Some(f.miou) },
+    Measure { file: "-ap", axis: "mean average precision", of: |f| f.map },
 ];
 
 /// Returns which (cost, accuracy) points are Pareto-optimal: no other point is at least as cheap and as accurate, and differs.
@@ -64,8 +56,8 @@ pub fn pareto(points: &[(f64, f64)]) -> Vec<bool> {
 }
 
 impl TradeoffReport {
-    /// Writes `tradeoff.csv`, `tradeoff.json`, `tradeoff.txt`, `front.json`, the plots (one per scene, cost and accuracy, and of several
-    /// scenes one of their mean), and `tradeoff.html`, which has the plots and tables in one page.
+    /// Writes `tradeoff.csv`, `tradeoff.json`, `tradeoff.txt`, `front.json`, the plots (one per scene, cost and accuracy,
+    /// and of several scenes one of their mean), and `tradeoff.html`, which has the plots and tables in one page.
     pub(super) fn write(&self, out: &Path) -> Result<(), TradeoffError> {
         fs_err::write(out.join("tradeoff.csv"), self.csv())?;
         fs_err::write(
@@ -116,7 +108,7 @@ impl TradeoffReport {
 
     /// Returns for each cost which points of a scene are Pareto-optimal.
     fn fronts(&self, scene: &str) -> Vec<Vec<bool>> {
-        let of_cost = |cost: &Cost| {
+        let of_cost = |cost: &Measure| {
             // A point without this cost is never optimal.
             let value = |f: &&Figures| (cost.of)(f).map_or((f64::MAX, f64::MIN), |value| (value, f.miou));
             let points: Vec<(f64, f64)> = self.of(scene).iter().map(value).collect();
